@@ -1,0 +1,15 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// All of DSSM's C++ API.
+#pragma once
+
+#include <dssm/describe.hpp>
+#include <dssm/error.hpp>
+#include <dssm/playback_clock.hpp>
+#include <dssm/reader.hpp>
+#include <dssm/result.hpp>
+#include <dssm/sample.hpp>
+#include <dssm/session.hpp>
+#include <dssm/stream.hpp>
+#include <dssm/time.hpp>
+#include <dssm/writer.hpp>

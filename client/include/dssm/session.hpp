@@ -1,0 +1,198 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A Session is this process's connection to its PC's dssmd: it creates, opens, lists and watches
+// streams. Reading and writing itself goes past dssmd, through shared memory.
+//
+// When dssmd goes away (restart, crash), readers and writers keep working; the session reconnects
+// by itself, offers back the rings it still holds, and calls that need dssmd wait for it up to
+// `request_timeout`.
+//
+//   threads  all functions may be called from any thread. A session runs one thread of its own,
+//            with all signals blocked.
+//   fork     a child must connect a session of its own; using the parent's there is undefined
+//   errors   besides those named at each function: daemon_away (no answer in time), protocol
+#pragma once
+
+#include <dssm/playback_clock.hpp>
+#include <dssm/reader.hpp>
+#include <dssm/stream.hpp>
+#include <dssm/writer.hpp>
+
+#include <functional>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+namespace dssm {
+
+namespace detail {
+class Client;
+}
+
+struct SessionOptions {
+  std::string socket_path;  // empty: $DSSM_SOCKET, else /run/dssm/dssmd.sock
+  std::string program;      // shown by dssmctl; empty: this program's name
+  Duration request_timeout = std::chrono::seconds(5);
+};
+
+// A process connected to dssmd, in the order of connection.
+struct ClientInfo {
+  std::int32_t pid = 0;
+  std::uint32_t uid = 0;
+  std::string program;
+};
+
+// One stream opened by one process, in the order of opening.
+struct OpenInfo {
+  StreamId stream;
+  std::int32_t creator_pid = 0;  // who created the stream
+  std::int32_t opener_pid = 0;
+  std::uint32_t tag = 0;  // as given to open_reader() or open_writer(); SSM keeps its open mode here
+  Role role = Role::reader;
+};
+
+struct DaemonInfo {
+  std::string host;
+  std::string version;
+  std::int32_t pid = 0;
+  std::uint64_t streams = 0;
+  std::uint64_t memory_bytes = 0;        // of all rings
+  std::uint64_t memory_limit_bytes = 0;  // for all rings
+};
+
+// What a watcher is told.
+struct StreamEvent {
+  enum class Kind : std::uint8_t { added, removed };
+  Kind kind = Kind::added;
+  StreamInfo stream;  // for removed: identity only
+};
+
+class Session {
+ public:
+  // Connects. Fails with no_daemon (nothing listens), no_permission (not in the socket's group),
+  // protocol (dssmd speaks an incompatible version).
+  static Result<Session> connect(SessionOptions options = {});
+
+  Session(const Session&);  // copies share the connection
+  Session& operator=(const Session&);
+  Session(Session&&) noexcept;
+  Session& operator=(Session&&) noexcept;
+  ~Session();
+
+  // --- streams --------------------------------------------------------------------------------
+
+  // Creates the stream and opens it for writing. When it exists with the same payload size, its
+  // ring is kept, whatever history was asked for, and the writer continues its tids.
+  //   fails  invalid_argument (name, sizes), type_mismatch (exists with another size or type),
+  //          limit_exceeded, no_memory
+  Result<RawWriter> create_raw(const StreamId& id, const TypeInfo& type, const History& history,
+                               std::uint32_t tag = 0);
+
+  // Opens an existing stream. With `wanted`, fails with type_mismatch unless
+  // TypeInfo::check_usable_as(wanted).
+  //   fails  not_found, type_mismatch
+  Result<RawWriter> open_raw_writer(const StreamId& id, const TypeInfo* wanted = nullptr,
+                                    std::uint32_t tag = 0);
+  Result<RawReader> open_raw_reader(const StreamId& id, const TypeInfo* wanted = nullptr,
+                                    std::uint32_t tag = 0);
+
+  // Opens a stream for reading, waiting for it to be created until `deadline`.
+  //   fails  as open_raw_reader(); not_found when the deadline passed
+  Result<RawReader> await_raw_reader(const StreamId& id, MonoTime deadline,
+                                     const TypeInfo* wanted = nullptr);
+
+  // The same with a type; `name` as StreamId::parse() reads it.
+  template <Payload T>
+  Result<Writer<T>> create(std::string_view name, const History& history) {
+    return typed<Writer<T>>(name, [&](const StreamId& id) {
+      return create_raw(id, type_of<T>(), history);
+    });
+  }
+  template <Payload T>
+  Result<Writer<T>> create(std::string_view name, Duration life, Duration cycle) {
+    Result<History> history = History::of(life, cycle);
+    if (!history) return std::move(history).error();
+    return create<T>(name, *history);
+  }
+  template <Payload T>
+  Result<Writer<T>> open_writer(std::string_view name) {
+    const TypeInfo type = type_of<T>();
+    return typed<Writer<T>>(name, [&](const StreamId& id) { return open_raw_writer(id, &type); });
+  }
+  template <Payload T>
+  Result<Reader<T>> open_reader(std::string_view name) {
+    const TypeInfo type = type_of<T>();
+    return typed<Reader<T>>(name, [&](const StreamId& id) { return open_raw_reader(id, &type); });
+  }
+  template <Payload T>
+  Result<Reader<T>> await_reader(std::string_view name, MonoTime deadline = kNever) {
+    const TypeInfo type = type_of<T>();
+    return typed<Reader<T>>(
+        name, [&](const StreamId& id) { return await_raw_reader(id, deadline, &type); });
+  }
+
+  // Removes a stream: it leaves the list at once and can be created anew; processes that have it
+  // open keep their ring until they close it.
+  //   fails  not_found
+  Result<void> remove(const StreamId& id);
+
+  // All streams, in the order of creation.
+  Result<std::vector<StreamInfo>> list();
+
+  // One stream, with its users.
+  //   fails  not_found
+  Result<StreamInfo> info(const StreamId& id);
+
+  // Calls `on_event` for each stream that is there, then for each that comes or goes, until the
+  // watch is destroyed or the session's last copy is. Called from the session's thread: be short,
+  // and do not call the session from it. After a reconnect the streams that are there are told
+  // again, and those that are gone as removed.
+  class Watch {
+   public:
+    Watch(Watch&&) noexcept;
+    Watch& operator=(Watch&&) noexcept;
+    ~Watch();  // waits for a running callback
+
+   private:
+    friend class Session;
+    struct State;
+    explicit Watch(std::unique_ptr<State> state) noexcept;
+    std::unique_ptr<State> state_;
+  };
+  Result<Watch> watch(std::function<void(const StreamEvent&)> on_event);
+
+  // --- properties -----------------------------------------------------------------------------
+
+  // A small constant block attached to a stream. No open is needed. At most 16 MiB, or what dssmd
+  // is configured to take.
+  //   fails  not_found (no stream; for get also: none set), limit_exceeded
+  Result<void> set_property(const StreamId& id, std::span<const std::byte> property);
+  Result<std::vector<std::byte>> property(const StreamId& id);
+
+  // --- the rest -------------------------------------------------------------------------------
+
+  Result<PlaybackClock> playback_clock();
+  Result<std::vector<ClientInfo>> clients();
+  Result<std::vector<OpenInfo>> opens();
+  Result<DaemonInfo> daemon();
+
+  // Whether the connection stands at this moment.
+  bool connected() const noexcept;
+
+ private:
+  explicit Session(std::shared_ptr<detail::Client> client) noexcept;
+
+  template <class Typed, class Open>
+  static Result<Typed> typed(std::string_view name, Open open) {
+    Result<StreamId> id = StreamId::parse(name);
+    if (!id) return std::move(id).error();
+    auto raw = open(*id);
+    if (!raw) return std::move(raw).error();
+    return Typed(std::move(*raw));
+  }
+
+  std::shared_ptr<detail::Client> client_;
+};
+
+}  // namespace dssm

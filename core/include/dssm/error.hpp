@@ -1,0 +1,49 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Failures: what they are (Errc) and what a person reads about them (Error). docs/errors.md says
+// for each code when it is used and whether trying again helps.
+#pragma once
+
+#include <string>
+#include <string_view>
+#include <utility>
+
+namespace dssm {
+
+enum class Errc {
+  invalid_argument,   // the caller's words are wrong: a name, a size, a duration, a configuration
+  not_found,          // no such stream, or no property
+  already_exists,     // there is a stream of that name already, and it is not the same
+  type_mismatch,      // the stream has another payload size, alignment or type
+  limit_exceeded,     // a configured limit of dssmd, or one of the format
+  no_memory,          // the machine has no memory for it
+  no_permission,      // the operating system or dssmd refuses this user
+  no_daemon,          // nothing listens at the socket
+  daemon_away,        // dssmd was there and is gone; this process keeps trying
+  protocol,           // the other side speaks another version, or garbage
+  conflict,           // two things claim one name, e.g. a second dssmd in one folder
+  closed,             // the object was closed by this process
+  system,             // the operating system failed; the message has its words
+};
+
+// The code's name as written in docs/errors.md, e.g. "not_found". Static storage.
+std::string_view errc_name(Errc code) noexcept;
+
+// A value; copy and move freely.
+struct Error {
+  Errc code = Errc::system;
+  std::string message;  // what was tried, on what, why it failed, what to do; no trailing newline
+
+  // Puts "`what`: " in front, on the way up: the reader sees the outer intention first.
+  [[nodiscard]] Error context(std::string_view what) && {
+    message.insert(0, std::string(what) + ": ");
+    return std::move(*this);
+  }
+};
+
+// An Error from `errno_value` (default: errno): "`what`: No such file or directory".
+// EACCES and EPERM become no_permission, ENOMEM and ENOSPC no_memory, all others system.
+Error os_error(std::string_view what);
+Error os_error(std::string_view what, int errno_value);
+
+}  // namespace dssm

@@ -1,0 +1,124 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Names and descriptions of streams: what identifies one, what its samples look like, how much
+// history it keeps, and what is known about it at a moment. All plain values.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <dssm/sample.hpp>
+
+#include <cstdint>
+#include <string>
+#include <string_view>
+#include <vector>
+
+namespace dssm {
+
+// Limits of the format; dssmd's configuration may be narrower.
+inline constexpr std::size_t kMaxNameBytes = 31;       // SSM programs hold names in 32 bytes
+inline constexpr std::size_t kMaxFullNameBytes = 63;   // a DNS-SD instance name, RFC 6763 4.1.1
+inline constexpr std::size_t kMaxTypeNameBytes = 127;
+inline constexpr std::uint64_t kMaxPayloadBytes = 64ULL << 20;
+inline constexpr std::uint64_t kMinDepth = 2;
+inline constexpr std::uint64_t kMaxDepth = 1ULL << 24;
+
+// Identity of a stream, written `name:id@host`; ":0" and "@host" may be left out.
+struct StreamId {
+  std::string name;
+  std::int32_t id = 0;
+  std::string host;  // empty: wherever it is
+
+  // Reads "lidar", "lidar:1", "lidar:1@pc2". Fails with invalid_argument, saying what is wrong.
+  static Result<StreamId> parse(std::string_view text);
+
+  // Checks name and id: 1 to kMaxNameBytes bytes, no control characters, none of ':' '@',
+  // id >= 0, and the full name at most kMaxFullNameBytes.
+  Result<void> check() const;
+
+  // "name:id", with "@host" when there is a host.
+  std::string str() const;
+
+  friend bool operator==(const StreamId&, const StreamId&) = default;
+};
+
+// What a field of a payload is.
+enum class Scalar : std::uint8_t {
+  boolean = 1, character, int8, uint8, int16, uint16, int32, uint32, int64, uint64, float32, float64
+};
+
+std::uint32_t scalar_bytes(Scalar kind) noexcept;
+std::string_view scalar_name(Scalar kind) noexcept;  // "float64"; static storage
+
+// One field of a payload. Nested structs are written with dots: "pose.x". Arrays have count > 1;
+// for an array of structs each member is a field with the struct's size as stride: "points.x".
+struct Field {
+  std::string name;
+  Scalar kind = Scalar::uint8;
+  std::uint64_t offset_bytes = 0;
+  std::uint64_t count = 1;
+  std::uint64_t stride_bytes = 0;  // distance between elements; meaningful when count > 1
+
+  friend bool operator==(const Field&, const Field&) = default;
+};
+
+// What a payload is. An empty name means "just bytes" and matches every name.
+struct TypeInfo {
+  std::string name;
+  std::uint64_t payload_bytes = 0;
+  std::uint32_t alignment_bytes = 1;
+  std::vector<Field> fields;  // may be empty: not described
+
+  // "Odometry (40 bytes, aligned to 8)" or "40 bytes".
+  std::string str() const;
+
+  // Whether a program that expects `wanted` may work on this stream: same size, same alignment,
+  // and the same name where both have one. Fails with type_mismatch, naming both types.
+  Result<void> check_usable_as(const TypeInfo& wanted) const;
+
+  // Checks sizes, alignment (a power of two up to 64) and that each field lies inside the payload.
+  Result<void> check() const;
+
+  friend bool operator==(const TypeInfo&, const TypeInfo&) = default;
+};
+
+// How much a ring keeps.
+struct History {
+  std::uint64_t depth = 0;  // slots; depth - 1 samples are readable at any moment
+  Duration cycle{};         // expected time between two samples; only tools look at it
+
+  // Enough slots for `life` of history at one sample per `cycle`, with SSM's 20 % margin:
+  // trunc(1.2 * life / cycle + 1). Fails with invalid_argument unless 0 < cycle <= life, and with
+  // limit_exceeded when that is more than kMaxDepth.
+  static Result<History> of(Duration life, Duration cycle);
+};
+
+enum class Role : std::uint8_t { reader = 1, writer };
+
+// A process that has a stream open.
+struct StreamUser {
+  std::int32_t pid = 0;
+  std::uint32_t uid = 0;
+  std::string program;
+  Role role = Role::reader;
+};
+
+// What is known about a stream at the moment of asking.
+struct StreamInfo {
+  StreamId id;  // with its owner's host
+  TypeInfo type;
+  std::uint64_t depth = 0;
+  Duration cycle{};
+  std::uint64_t memory_bytes = 0;    // of the ring
+  std::uint64_t property_bytes = 0;  // 0: none set
+  std::uint64_t incarnation = 0;     // differs between two rings of one name
+  std::int32_t creator_pid = 0;
+  Tid oldest = kNoTid;  // oldest readable sample
+  Tid newest = kNoTid;
+  Time newest_time{};   // stamp of the newest sample; meaningless while newest is kNoTid
+  double rate_hz = 0;   // from the stamps of the newest samples; 0 when unknown
+  std::uint32_t writers = 0;
+  std::uint32_t readers = 0;
+  std::vector<StreamUser> users;  // filled by Session::info(), not by Session::list()
+};
+
+}  // namespace dssm

@@ -1,0 +1,65 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Time and durations. Three chrono types that do not convert into each other by accident: a point
+// on the wall clock, a point on the monotonic clock, and a duration. All count nanoseconds in a
+// signed 64-bit integer (design: "Times are signed 64-bit nanoseconds since the Unix epoch").
+#pragma once
+
+#include <chrono>
+#include <cstdint>
+#include <ctime>
+
+namespace dssm {
+
+using Duration = std::chrono::nanoseconds;
+
+// CLOCK_REALTIME: nanoseconds since 1970-01-01 00:00 UTC. Can be stepped; used for sample stamps
+// only.
+struct WallClock {
+  using duration = Duration;
+  using rep = duration::rep;
+  using period = duration::period;
+  using time_point = std::chrono::time_point<WallClock, Duration>;
+  static constexpr bool is_steady = false;
+  static time_point now() noexcept {
+    timespec ts{};
+    ::clock_gettime(CLOCK_REALTIME, &ts);
+    return time_point(std::chrono::seconds(ts.tv_sec) + Duration(ts.tv_nsec));
+  }
+};
+
+// CLOCK_MONOTONIC: nanoseconds since boot. Never steps; used for every deadline and time-out.
+struct MonoClock {
+  using duration = Duration;
+  using rep = duration::rep;
+  using period = duration::period;
+  using time_point = std::chrono::time_point<MonoClock, Duration>;
+  static constexpr bool is_steady = true;
+  static time_point now() noexcept {
+    timespec ts{};
+    ::clock_gettime(CLOCK_MONOTONIC, &ts);
+    return time_point(std::chrono::seconds(ts.tv_sec) + Duration(ts.tv_nsec));
+  }
+};
+
+using Time = WallClock::time_point;
+using MonoTime = MonoClock::time_point;
+
+// The bound on a stamp's error when nothing is known about the clock that made it.
+inline constexpr Duration kUnknownClockError = Duration::max();
+
+// A deadline that never comes.
+inline constexpr MonoTime kNever = MonoTime::max();
+
+// Nanoseconds since 1970 to a Time and back.
+constexpr Time time_from_ns(std::int64_t ns) noexcept { return Time(Duration(ns)); }
+constexpr std::int64_t to_ns(Time t) noexcept { return t.time_since_epoch().count(); }
+constexpr std::int64_t to_ns(Duration d) noexcept { return d.count(); }
+
+// The deadline `d` from now; a duration that would overflow gives kNever.
+inline MonoTime deadline_in(Duration d) noexcept {
+  const MonoTime now = MonoClock::now();
+  return d > kNever - now ? kNever : now + d;
+}
+
+}  // namespace dssm
