@@ -10,7 +10,7 @@
 
 #include <memory>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 namespace detail {
 struct PlaybackClockState;

@@ -23,7 +23,7 @@
 #include <span>
 #include <vector>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 namespace detail {
 struct ReaderState;

@@ -24,7 +24,7 @@
 #include <string>
 #include <vector>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 namespace detail {
 class Client;

@@ -19,7 +19,7 @@
 #include <memory>
 #include <span>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 namespace detail {
 struct WriterState;

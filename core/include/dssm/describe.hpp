@@ -20,7 +20,7 @@
 #include <cstddef>
 #include <type_traits>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 // What a sample may be: copied as bytes, aligned to a cache line at most.
 template <class T>

@@ -8,7 +8,7 @@
 #include <string_view>
 #include <utility>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 enum class Errc {
   invalid_argument,   // the caller's words are wrong: a name, a size, a duration, a configuration

@@ -12,7 +12,7 @@
 #include <utility>
 #include <variant>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 // What value() throws.
 class BadResult : public std::runtime_error {

@@ -8,7 +8,7 @@
 #include <cstdint>
 #include <string_view>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 // The number of a sample in its stream: 0, 1, 2 ... in write order.
 using Tid = std::int64_t;

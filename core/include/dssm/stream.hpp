@@ -12,7 +12,7 @@
 #include <string_view>
 #include <vector>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 // Limits of the format; dssmd's configuration may be narrower.
 inline constexpr std::size_t kMaxNameBytes = 31;       // SSM programs hold names in 32 bytes

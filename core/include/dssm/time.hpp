@@ -9,7 +9,7 @@
 #include <cstdint>
 #include <ctime>
 
-namespace dssm {
+namespace dssm [[gnu::visibility("default")]] {
 
 using Duration = std::chrono::nanoseconds;
 

@@ -1,0 +1,28 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Where things are in a ring: computed once from payload size and depth, checked when read from a
+// mapping.
+#pragma once
+
+#include <dssm/result.hpp>
+
+#include <cstdint>
+
+namespace dssm::ring {
+
+struct Geometry {
+  std::uint64_t payload_bytes = 0;
+  std::uint64_t depth = 0;
+  std::uint64_t slot_bytes = 0;    // distance between slots, multiple of 64
+  std::uint64_t times_offset = 0;  // of the time index, from the mapping's start
+  std::uint64_t slots_offset = 0;  // of slot 0
+  std::uint64_t total_bytes = 0;   // of the whole ring, multiple of the page size
+
+  // The one geometry for these. Fails with invalid_argument or limit_exceeded, naming value and
+  // range: payload 1 byte to 64 MiB, depth 2 to 2^24.
+  static Result<Geometry> of(std::uint64_t payload_bytes, std::uint64_t depth);
+
+  friend bool operator==(const Geometry&, const Geometry&) = default;
+};
+
+}  // namespace dssm::ring

@@ -1,0 +1,115 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The ring's layout in memory: the ABI between all processes that map one. docs/ring-layout.md
+// explains it byte by byte; tests/unit/ring/layout_test.cpp compares that document with this file.
+// Little endian. An incompatible change raises kLayoutVersion.
+//
+//   offset 0       RingHeader, one page; its first part is written once, before anybody maps it
+//   times_offset   depth * 8 bytes: time_ns of sample tid at index tid % depth ("time index")
+//   slots_offset   depth slots: SlotHeader, payload, at least kGuardBytes that belong to nobody
+#pragma once
+
+#include <pthread.h>
+
+#include <atomic>
+#include <cstddef>
+#include <cstdint>
+
+namespace dssm::ring {
+
+inline constexpr std::uint64_t kMagic = 0x474e49524d535344;  // "DSSMRING"
+inline constexpr std::uint32_t kLayoutVersion = 1;
+inline constexpr std::size_t kPageBytes = 4096;
+inline constexpr std::size_t kLineBytes = 64;
+
+// Behind each payload: one widespread SSM wrapper writes 8 bytes more than it asked for.
+inline constexpr std::size_t kGuardBytes = 64;
+
+static_assert(std::atomic<std::int64_t>::is_always_lock_free);
+static_assert(std::atomic<std::uint32_t>::is_always_lock_free);
+
+//   off  size field            unit   written by  order
+//     0     8 magic            -      dssmd       before the first hand-out, as all up to 320
+//     8     4 layout_version   -      dssmd
+//    12     4 alignment_bytes  bytes  dssmd
+//    16     8 payload_bytes    bytes  dssmd
+//    24     8 depth            slots  dssmd
+//    32     8 slot_bytes       bytes  dssmd
+//    40     8 times_offset     bytes  dssmd
+//    48     8 slots_offset     bytes  dssmd
+//    56     8 total_bytes      bytes  dssmd
+//    64     8 incarnation      -      dssmd
+//    72     8 cycle_ns         ns     dssmd
+//    80     4 stream_id        -      dssmd
+//    84     4 reserved         -      -           zero
+//    88    40 name             -      dssmd       zero-terminated
+//   128    64 host             -      dssmd       zero-terminated
+//   192   128 reserved         -      -           zero
+//   320    64 lock             -      writers     glibc's robust, process-shared pthread_mutex_t
+//   384    64 reserved         -      -           zero: keeps the lock's line from top's neighbour
+//   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
+//   520     8 run_start        tid    writer      before top; see "Search by time"
+//   528  3568 reserved         -      -           zero
+struct RingHeader {
+  std::uint64_t magic;
+  std::uint32_t layout_version;
+  std::uint32_t alignment_bytes;
+  std::uint64_t payload_bytes;
+  std::uint64_t depth;
+  std::uint64_t slot_bytes;
+  std::uint64_t times_offset;
+  std::uint64_t slots_offset;
+  std::uint64_t total_bytes;
+  std::uint64_t incarnation;
+  std::int64_t cycle_ns;
+  std::int32_t stream_id;
+  std::uint32_t reserved0;
+  char name[40];
+  char host[64];
+  std::byte reserved1[128];
+  union {
+    pthread_mutex_t lock;
+    std::byte lock_bytes[64];
+  };
+  std::byte reserved2[128];
+  std::atomic<std::int64_t> top;
+  std::atomic<std::int64_t> run_start;
+  std::byte reserved3[3568];
+};
+static_assert(sizeof(pthread_mutex_t) <= 64);
+static_assert(offsetof(RingHeader, incarnation) == 64 && offsetof(RingHeader, name) == 88);
+static_assert(offsetof(RingHeader, host) == 128 && offsetof(RingHeader, lock) == 320);
+static_assert(offsetof(RingHeader, top) == 512 && offsetof(RingHeader, run_start) == 520);
+static_assert(sizeof(RingHeader) == kPageBytes);
+
+//   off size field           unit  written by  order
+//     0    8 sequence        -     writer      2*tid+1 while being filled, 2*tid+2 when published
+//     8    8 tid             -     writer      inside the sequence bracket, as all below
+//    16    8 time_ns         ns    writer      signed, since 1970, CLOCK_REALTIME of the writer
+//    24    8 clock_error_ns  ns    writer      >= 0; 2^63-1: unknown
+//    32    8 run_start       tid   writer      first sample of the run this one belongs to
+//    40    8 run_parent      tid   writer      run_start's sample only: newest earlier sample with an
+//                                              earlier time; -1: none
+//    48    8 run_jump        tid   writer      run_start's sample only: start of an ancestor run
+//    56    8 run_level       -     writer      run_start's sample only: number of ancestor runs
+//    64    - payload
+struct SlotHeader {
+  std::atomic<std::uint64_t> sequence;
+  std::atomic<std::int64_t> tid, time_ns, clock_error_ns;
+  std::atomic<std::int64_t> run_start, run_parent, run_jump, run_level;
+};
+static_assert(offsetof(SlotHeader, time_ns) == 16 && offsetof(SlotHeader, run_level) == 56);
+static_assert(sizeof(SlotHeader) == kLineBytes);
+
+//   off  size field           written by           order
+//     0     4 word            writers, sleepers    seq_cst; bit 0: somebody sleeps; rest: a count
+//     4     4 doorbell_armed  dssmd                seq_cst; not 0: ring the stream's eventfd
+//     8  4088 reserved        -                    zero
+struct BellPage {
+  std::atomic<std::uint32_t> word;
+  std::atomic<std::uint32_t> doorbell_armed;
+  std::byte reserved[kPageBytes - 8];
+};
+static_assert(sizeof(BellPage) == kPageBytes);
+
+}  // namespace dssm::ring

@@ -1,0 +1,78 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The memory behind a ring: creating it, mapping it, and checking that what was mapped is a ring
+// before anybody trusts it. Both the daemon and the client library map rings through RingMapping,
+// and nobody reads the header's geometry a second time: another process may be scribbling over it.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <dssm/sample.hpp>
+#include <dssm/stream.hpp>
+
+#include "core/base/unique_fd.hpp"
+#include "core/ring/geometry.hpp"
+#include "core/ring/layout.hpp"
+
+#include <cstddef>
+#include <memory>
+#include <string>
+
+namespace dssm::ring {
+
+// What a ring says about itself, in its header.
+struct RingIdentity {
+  StreamId id;                    // with host
+  std::uint64_t incarnation = 0;  // random; differs between two rings of one name
+  Duration cycle{};
+  std::uint32_t alignment_bytes = 1;
+};
+
+enum class Access : unsigned char { read_only, read_write };
+
+// Creates the memfd of a new ring: header written, size sealed (F_SEAL_SHRINK, F_SEAL_GROW,
+// F_SEAL_SEAL), inode mode 0400, so that only its creator (and root) can open it anew through
+// /proc. Memory is taken as it is touched; see reserve().
+//   returns  a read-write descriptor
+Result<UniqueFd> create_ring(const RingIdentity& identity, const Geometry& geometry);
+
+// Takes all memory of the ring from the system now, charged to the calling process, so that no
+// write to it can fail later. May take a while: 1 GiB about a quarter of a second.
+//   fails  no_memory
+Result<void> reserve(int fd, const Geometry& geometry);
+
+// A second descriptor for the same ring that cannot be mapped or made writable. Only for the user
+// who created the ring.
+Result<UniqueFd> reopen_read_only(int fd);
+
+// The way back, for a daemon that got back only read-only descriptors of a ring it created once.
+Result<UniqueFd> reopen_read_write(int fd);
+
+// A mapped ring. Immutable after open(); share it by shared_ptr between readers and writers of one
+// process. Unmapped by the destructor.
+class RingMapping {
+ public:
+  // Maps the ring behind `fd` after checking that it is one: a sealed memfd, magic and layout
+  // version, and a geometry that follows from payload size and depth and fits the file's size.
+  // Does not keep `fd`.
+  //   fails  protocol (not a ring, or another layout version; the message says which), os errors
+  static Result<std::shared_ptr<const RingMapping>> open_untrusted(int fd, Access access);
+
+  RingMapping(const RingMapping&) = delete;
+  RingMapping& operator=(const RingMapping&) = delete;
+  ~RingMapping();
+
+  const Geometry& geometry() const noexcept { return geometry_; }
+  const RingIdentity& identity() const noexcept { return identity_; }
+  bool writable() const noexcept { return access_ == Access::read_write; }
+  std::byte* base() const noexcept { return base_; }
+  RingHeader& header() const noexcept { return *reinterpret_cast<RingHeader*>(base_); }
+
+ private:
+  RingMapping() = default;
+  std::byte* base_ = nullptr;
+  Access access_ = Access::read_only;
+  Geometry geometry_;
+  RingIdentity identity_;
+};
+
+}  // namespace dssm::ring

@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Reading from a mapped ring. No locks, no system calls, no trust: every number that comes from the
+// mapping is checked before it becomes an address, and every sample is validated by its sequence, so
+// that a hostile writer can make a read fail or return nonsense, but not fault or hang.
+//
+// Readable are the tids oldest(top) ... top: depth - 1 samples, because the slot of the oldest one
+// may be being overwritten at any moment.
+#pragma once
+
+#include <dssm/sample.hpp>
+
+#include "core/ring/ring_memory.hpp"
+#include "core/ring/slot_table.hpp"
+
+#include <span>
+
+namespace dssm::ring {
+
+// A value: a pointer and a few numbers. The mapping outlives it.
+//   threads  all functions are const and may run in any number of threads
+class RingReader {
+ public:
+  explicit RingReader(const RingMapping& mapping) noexcept
+      : header_(&mapping.header()), slots_(mapping) {}
+
+  Tid newest() const noexcept { return header_->top.load(std::memory_order_acquire); }
+  Tid oldest() const noexcept { return slots_.oldest_for(newest()); }
+
+  // Copies sample `tid` into `payload` (payload_bytes long; unspecified unless ok).
+  //   returns  ok | not_yet | too_old
+  ReadStatus read(Tid tid, std::span<std::byte> payload, SampleInfo& info) const noexcept;
+
+  // Copies the newest sample. Tries kMaxRetries times when the writer laps it.
+  //   returns  ok | not_yet | lapped
+  ReadStatus read_newest(std::span<std::byte> payload, SampleInfo& info) const noexcept;
+
+  // The stamps of sample `tid`.
+  //   returns  ok | not_yet | too_old
+  ReadStatus stamp(Tid tid, SampleInfo& info) const noexcept;
+
+  // Tid of the newest sample with time <= `t`; kNoTid with too_old when all lie after it.
+  //   returns  ok | not_yet (empty) | too_old | lapped
+  ReadStatus find(Time t, Tid& tid) const noexcept;
+
+  // In place: the payload of sample `tid` and the sequence that must still be in `sequence` when
+  // the work on it is done.
+  struct Place {
+    const std::byte* payload;
+    const std::atomic<std::uint64_t>* sequence;
+    std::uint64_t expected;
+  };
+  ReadStatus locate(Tid tid, Place& place, SampleInfo& info) const noexcept;
+
+  // Whether the sample at `place` was not touched since locate(): the loads before it are ordered
+  // before its own.
+  static bool still_valid(const std::atomic<std::uint64_t>& sequence, std::uint64_t expected) noexcept;
+
+  static constexpr int kMaxRetries = 1000;  // a reader this often lapped is not keeping up
+
+ private:
+  const RingHeader* header_;
+  SlotTable slots_;
+};
+
+}  // namespace dssm::ring

@@ -1,0 +1,39 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Bytes and file descriptors over a Unix stream socket.
+#pragma once
+
+#include <dssm/result.hpp>
+
+#include "core/base/unique_fd.hpp"
+
+#include <cstddef>
+#include <span>
+#include <string>
+#include <vector>
+
+namespace dssm::wire {
+
+// More descriptors in one message are a protocol error of the sender. We never send more than 4.
+inline constexpr std::size_t kMaxFdsPerMessage = 16;
+
+enum class IoStatus : unsigned char { ok, would_block, end };
+struct IoResult {
+  IoStatus status = IoStatus::ok;
+  std::size_t bytes = 0;
+};
+
+// Sends as much of `bytes` as the socket takes, with `fds` attached to the first byte (when at least
+// one byte went, the descriptors went). SIGPIPE is suppressed; a vanished peer is `end`.
+Result<IoResult> send_some(int socket, std::span<const std::byte> bytes, std::span<const int> fds);
+
+// Receives up to space.size() bytes; descriptors that came along are appended to `fds`,
+// close-on-exec. Fails with `protocol` when the kernel had to cut the descriptors.
+Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<UniqueFd>& fds);
+
+// Creates a Unix stream socket connected to `path`, close-on-exec and blocking.
+//   fails  no_daemon (no such socket, or nobody listens), no_permission, invalid_argument (path is
+//          longer than the 107 bytes that an address takes)
+Result<UniqueFd> connect_unix(const std::string& path);
+
+}  // namespace dssm::wire

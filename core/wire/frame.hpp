@@ -1,0 +1,47 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Varint-delimited protobuf frames in a byte stream: cutting them out of what arrives, and putting
+// them together. Used on the local socket, and made for the network channels as well.
+#pragma once
+
+#include <dssm/result.hpp>
+
+#include <cstddef>
+#include <cstdint>
+#include <optional>
+#include <span>
+#include <string>
+#include <vector>
+
+namespace google::protobuf {
+class MessageLite;
+}
+
+namespace dssm::wire {
+
+// One message with its length in front, ready to be sent.
+std::string encode_frame(const google::protobuf::MessageLite& message);
+
+// Collects bytes as they arrive and gives out whole frames. A value; one per connection.
+class FrameBuffer {
+ public:
+  // max_frame_bytes: a longer frame is an error, found from its length alone, before memory is
+  // taken for it.
+  explicit FrameBuffer(std::size_t max_frame_bytes) : max_frame_bytes_(max_frame_bytes) {}
+
+  // Room for at least 4 KiB of input; fill from its start, then commit() what was filled.
+  std::span<std::byte> space();
+  void commit(std::size_t bytes) noexcept { end_ += bytes; }
+
+  // The next whole frame's message, without its length; nullopt when more input is needed. The view
+  // holds until the next call of any member. Fails with `protocol` on a length that is too large or
+  // no varint; the stream is useless from then on.
+  Result<std::optional<std::span<const std::byte>>> next();
+
+ private:
+  std::size_t max_frame_bytes_;
+  std::vector<std::byte> buffer_;
+  std::size_t begin_ = 0, end_ = 0;  // buffer_[begin_, end_) is input not yet given out
+};
+
+}  // namespace dssm::wire

@@ -1,0 +1,164 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "tests/support/daemon_process.hpp"
+
+#include <fcntl.h>
+#include <poll.h>
+#include <signal.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <cerrno>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <filesystem>
+
+extern char** environ;
+
+namespace dssm::test {
+namespace {
+
+[[noreturn]] void fail(const std::string& what) {
+  std::fprintf(stderr, "test harness: %s: %s\n", what.c_str(), std::strerror(errno));
+  std::abort();
+}
+
+// fork + exec; every descriptor but stdin, stdout and stderr is close-on-exec by our convention.
+pid_t spawn(const std::vector<std::string>& argv, const std::vector<std::string>& environment,
+            int in_fd, int out_fd, int err_fd) {
+  std::vector<char*> args;
+  for (const std::string& word : argv) args.push_back(const_cast<char*>(word.c_str()));
+  args.push_back(nullptr);
+  std::vector<char*> vars;
+  for (char** var = environ; *var; ++var) vars.push_back(*var);
+  for (const std::string& var : environment) vars.insert(vars.begin(), const_cast<char*>(var.c_str()));
+  vars.push_back(nullptr);
+  const pid_t pid = ::fork();
+  if (pid < 0) fail("fork");
+  if (pid == 0) {
+    if (in_fd >= 0) ::dup2(in_fd, 0);
+    if (out_fd >= 0) ::dup2(out_fd, 1);
+    if (err_fd >= 0) ::dup2(err_fd, 2);
+    ::execvpe(args[0], args.data(), vars.data());
+    std::fprintf(stderr, "test harness: cannot start %s: %s\n", args[0], std::strerror(errno));
+    ::_exit(127);
+  }
+  return pid;
+}
+
+}  // namespace
+
+std::string built(const std::string& path) {
+  const char* root = std::getenv("DSSM_BUILD_ROOT");
+  if (!root) {
+    std::fprintf(stderr, "test harness: $DSSM_BUILD_ROOT is not set; run me through `meson test`\n");
+    std::abort();
+  }
+  return std::string(root) + "/" + path;
+}
+
+std::string make_temp_dir() {
+  std::string path = "/tmp/dssm-test-XXXXXX";
+  if (!::mkdtemp(path.data())) fail("mkdtemp");
+  ::chmod(path.c_str(), 0755);
+  return path;
+}
+
+void remove_tree(const std::string& path) { std::filesystem::remove_all(path); }
+
+int wait_for(pid_t pid) {
+  int status = 0;
+  while (::waitpid(pid, &status, 0) < 0) {
+    if (errno != EINTR) fail("waitpid");
+  }
+  return WIFSIGNALED(status) ? 128 + WTERMSIG(status) : WEXITSTATUS(status);
+}
+
+pid_t start(const std::vector<std::string>& argv, const std::vector<std::string>& environment,
+            int out_fd) {
+  return spawn(argv, environment, -1, out_fd >= 0 ? out_fd : 2, -1);
+}
+
+Finished run(const std::vector<std::string>& argv, const std::vector<std::string>& environment,
+             const std::string& input) {
+  int in[2], out[2], err[2];
+  if (::pipe2(in, O_CLOEXEC) || ::pipe2(out, O_CLOEXEC) || ::pipe2(err, O_CLOEXEC)) fail("pipe2");
+  const pid_t pid = spawn(argv, environment, in[0], out[1], err[1]);
+  ::close(in[0]), ::close(out[1]), ::close(err[1]);
+  if (!input.empty() && ::write(in[1], input.data(), input.size()) < 0) fail("write to stdin");
+  ::close(in[1]);
+  Finished result;
+  pollfd fds[2] = {{out[0], POLLIN, 0}, {err[0], POLLIN, 0}};
+  std::string* texts[2] = {&result.out, &result.err};
+  for (int open = 2; open > 0;) {
+    if (::poll(fds, 2, -1) < 0 && errno != EINTR) fail("poll");
+    for (int i = 0; i < 2; ++i) {
+      if (!fds[i].revents) continue;
+      char buffer[65536];
+      const ssize_t n = ::read(fds[i].fd, buffer, sizeof buffer);
+      if (n > 0) {
+        texts[i]->append(buffer, static_cast<std::size_t>(n));
+      } else {
+        ::close(fds[i].fd);
+        fds[i].fd = -1;
+        --open;
+      }
+    }
+  }
+  result.exit_status = wait_for(pid);
+  return result;
+}
+
+DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& host)
+    : dir_(make_temp_dir()) {
+  argv_ = {built("daemon/dssmd"), "--runtime-dir", dir_, "--name", host};
+  argv_.insert(argv_.end(), extra.begin(), extra.end());
+  start();
+}
+
+void DaemonProcess::start() {
+  const std::string notify_path = dir_ + "/notify";
+  const int notify = ::socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+  sockaddr_un address{};
+  address.sun_family = AF_UNIX;
+  std::strncpy(address.sun_path, notify_path.c_str(), sizeof address.sun_path - 1);
+  ::unlink(notify_path.c_str());
+  if (::bind(notify, reinterpret_cast<sockaddr*>(&address), sizeof address)) fail("bind notify socket");
+  pid_ = test::start(argv_, {"NOTIFY_SOCKET=" + notify_path});
+  for (;;) {  // a daemon that ends instead of answering is seen by its status
+    pollfd fd{notify, POLLIN, 0};
+    char text[256] = {};
+    if (::poll(&fd, 1, 100) > 0 && ::recv(notify, text, sizeof text - 1, 0) > 0 &&
+        std::strstr(text, "READY=1")) {
+      break;
+    }
+    if (::waitpid(pid_, nullptr, WNOHANG) == pid_) {
+      std::fprintf(stderr, "test harness: dssmd ended instead of getting ready\n");
+      std::abort();
+    }
+  }
+  ::close(notify);
+  ::unlink(notify_path.c_str());
+}
+
+void DaemonProcess::kill_hard() {
+  ::kill(pid_, SIGKILL);
+  wait_for(pid_);
+  pid_ = -1;
+}
+
+int DaemonProcess::stop() {
+  ::kill(pid_, SIGTERM);
+  const int status = wait_for(pid_);
+  pid_ = -1;
+  return status;
+}
+
+DaemonProcess::~DaemonProcess() {
+  if (pid_ > 0) kill_hard();
+  remove_tree(dir_);
+}
+
+}  // namespace dssm::test
