@@ -1,21 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The playback clock's shared segment: one setting for all programs of this PC, replaced as a whole.
-// Two records take turns; `generation` says which one counts (generation % 2). A setter fills the
-// other one under a robust lock and then raises the generation, so readers never see a mix, never
-// wait, and a setter killed half-way has changed nothing.
+// The playback clock's shared segment: one setting for all programs of this PC, replaced as a
+// whole. Two records take turns; `generation` says which one counts (generation % 2). A setter
+// fills the other one under a robust lock and then raises the generation, so readers never see a
+// mix, never wait, and a setter killed half-way has changed nothing.
 #pragma once
-
-#include <dssm/result.hpp>
-
-#include "core/base/unique_fd.hpp"
 
 #include <pthread.h>
 
 #include <atomic>
 #include <cstddef>
 #include <cstdint>
+#include <dssm/result.hpp>
 #include <memory>
+
+#include "core/base/unique_fd.hpp"
 
 namespace dssm::clock {
 
@@ -26,7 +25,9 @@ struct PlaybackSetting {
   double paused_at_s = 0;
 
   // SSM time when the real time is `real_s` (both seconds since 1970).
-  double at(double real_s) const noexcept { return paused ? paused_at_s : speed * real_s + offset_s; }
+  double at(double real_s) const noexcept {
+    return paused ? paused_at_s : speed * real_s + offset_s;
+  }
 };
 
 // Layout version 1, one page, little endian; doubles as their bits.
@@ -65,17 +66,19 @@ class PlaybackRecord {
 
   PlaybackSetting load() const noexcept;
 
-  // Replaces the setting by change(setting), under the lock.
+  // Replaces the setting by change(setting), under the lock. False, and nothing is changed, when a
+  // program has damaged the lock.
   template <class Change>
-  void update(Change change) noexcept {
-    lock();
+  bool update(Change change) noexcept {
+    if (!lock()) return false;
     store(change(load()));
     unlock();
+    return true;
   }
 
  private:
   PlaybackRecord() = default;
-  void lock() noexcept;
+  bool lock() noexcept;
   void unlock() noexcept;
   void store(const PlaybackSetting& setting) noexcept;
   PlaybackPage* page_ = nullptr;

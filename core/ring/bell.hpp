@@ -7,18 +7,17 @@
 //
 // Protocol (docs/ring-layout.md "Bell page"): bit 0 of `word` means "somebody sleeps", the other
 // bits count the rings. A sleeper sets bit 0, looks at the ring once more, and waits in the kernel
-// for the word to change. A writer that finds bit 0 set after publishing adds 1, which clears it and
-// changes the count, and wakes all. A sleeper that dies leaves at most one needless wake-up.
+// for the word to change. A writer that finds bit 0 set after publishing adds 1, which clears it
+// and changes the count, and wakes all. A sleeper that dies leaves at most one needless wake-up.
 #pragma once
 
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
+#include <memory>
+#include <span>
 
 #include "core/base/unique_fd.hpp"
 #include "core/ring/layout.hpp"
-
-#include <memory>
-#include <span>
 
 namespace dssm::ring {
 
@@ -67,8 +66,8 @@ class Bell {
 
   // Sleeps until one of several bells rings; at most 128 of them. announced[i] belongs to bells[i].
   // On a kernel without futex_waitv (before 5.16) it looks every millisecond instead.
-  static WaitStatus sleep_any(std::span<Bell* const> bells, std::span<const std::uint32_t> announced,
-                              MonoTime deadline) noexcept;
+  static WaitStatus sleep_any(std::span<Bell* const> bells,
+                              std::span<const std::uint32_t> announced, MonoTime deadline) noexcept;
 
  private:
   static constexpr std::uint32_t kSleeper = 1;

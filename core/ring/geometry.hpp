@@ -4,9 +4,8 @@
 // mapping.
 #pragma once
 
-#include <dssm/result.hpp>
-
 #include <cstdint>
+#include <dssm/result.hpp>
 
 namespace dssm::ring {
 

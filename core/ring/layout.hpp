@@ -88,7 +88,8 @@ static_assert(sizeof(RingHeader) == kPageBytes);
 //    16    8 time_ns         ns    writer      signed, since 1970, CLOCK_REALTIME of the writer
 //    24    8 clock_error_ns  ns    writer      >= 0; 2^63-1: unknown
 //    32    8 run_start       tid   writer      first sample of the run this one belongs to
-//    40    8 run_parent      tid   writer      run_start's sample only: newest earlier sample with an
+//    40    8 run_parent      tid   writer      run_start's sample only: newest earlier sample with
+//    an
 //                                              earlier time; -1: none
 //    48    8 run_jump        tid   writer      run_start's sample only: start of an ancestor run
 //    56    8 run_level       -     writer      run_start's sample only: number of ancestor runs

@@ -5,17 +5,16 @@
 // and nobody reads the header's geometry a second time: another process may be scribbling over it.
 #pragma once
 
+#include <cstddef>
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
 #include <dssm/stream.hpp>
+#include <memory>
+#include <string>
 
 #include "core/base/unique_fd.hpp"
 #include "core/ring/geometry.hpp"
 #include "core/ring/layout.hpp"
-
-#include <cstddef>
-#include <memory>
-#include <string>
 
 namespace dssm::ring {
 

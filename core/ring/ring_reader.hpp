@@ -1,19 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Reading from a mapped ring. No locks, no system calls, no trust: every number that comes from the
-// mapping is checked before it becomes an address, and every sample is validated by its sequence, so
-// that a hostile writer can make a read fail or return nonsense, but not fault or hang.
+// mapping is checked before it becomes an address, and every sample is validated by its sequence,
+// so that a hostile writer can make a read fail or return nonsense, but not fault or hang.
 //
 // Readable are the tids oldest(top) ... top: depth - 1 samples, because the slot of the oldest one
 // may be being overwritten at any moment.
 #pragma once
 
 #include <dssm/sample.hpp>
+#include <span>
 
 #include "core/ring/ring_memory.hpp"
 #include "core/ring/slot_table.hpp"
-
-#include <span>
 
 namespace dssm::ring {
 
@@ -54,7 +53,8 @@ class RingReader {
 
   // Whether the sample at `place` was not touched since locate(): the loads before it are ordered
   // before its own.
-  static bool still_valid(const std::atomic<std::uint64_t>& sequence, std::uint64_t expected) noexcept;
+  static bool still_valid(const std::atomic<std::uint64_t>& sequence,
+                          std::uint64_t expected) noexcept;
 
   static constexpr int kMaxRetries = 1000;  // a reader this often lapped is not keeping up
 

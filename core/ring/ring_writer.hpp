@@ -6,12 +6,11 @@
 #pragma once
 
 #include <dssm/sample.hpp>
+#include <span>
 
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "core/ring/slot_table.hpp"
-
-#include <span>
 
 namespace dssm::ring {
 
@@ -37,6 +36,8 @@ class RingWriter {
   bool lock() noexcept;
   void unlock() noexcept;
   void recover() noexcept;
+  Tid publish(Time time, Duration clock_error) noexcept;
+  void notify() noexcept;
 
   RingHeader* header_;
   SlotTable slots_;

@@ -3,14 +3,13 @@
 // Bytes and file descriptors over a Unix stream socket.
 #pragma once
 
-#include <dssm/result.hpp>
-
-#include "core/base/unique_fd.hpp"
-
 #include <cstddef>
+#include <dssm/result.hpp>
 #include <span>
 #include <string>
 #include <vector>
+
+#include "core/base/unique_fd.hpp"
 
 namespace dssm::wire {
 
@@ -23,8 +22,8 @@ struct IoResult {
   std::size_t bytes = 0;
 };
 
-// Sends as much of `bytes` as the socket takes, with `fds` attached to the first byte (when at least
-// one byte went, the descriptors went). SIGPIPE is suppressed; a vanished peer is `end`.
+// Sends as much of `bytes` as the socket takes, with `fds` attached to the first byte (when at
+// least one byte went, the descriptors went). SIGPIPE is suppressed; a vanished peer is `end`.
 Result<IoResult> send_some(int socket, std::span<const std::byte> bytes, std::span<const int> fds);
 
 // Receives up to space.size() bytes; descriptors that came along are appended to `fds`,

@@ -4,10 +4,9 @@
 // them together. Used on the local socket, and made for the network channels as well.
 #pragma once
 
-#include <dssm/result.hpp>
-
 #include <cstddef>
 #include <cstdint>
+#include <dssm/result.hpp>
 #include <optional>
 #include <span>
 #include <string>

@@ -13,7 +13,8 @@ namespace dssm::wire {
 
 inline constexpr std::uint32_t kLocalProtocolVersion = 1;
 inline constexpr std::size_t kMaxPropertyBytes = 16U << 20;
-inline constexpr std::size_t kMaxLocalFrameBytes = 17U << 20;  // the largest property and its stream
+inline constexpr std::size_t kMaxLocalFrameBytes = 17U
+                                                   << 20;  // the largest property and its stream
 inline constexpr std::size_t kMaxFields = 1024;
 inline constexpr std::size_t kMaxProgramBytes = 127;
 inline constexpr const char* kDefaultSocketPath = "/run/dssm/dssmd.sock";

@@ -33,7 +33,8 @@ pid_t spawn(const std::vector<std::string>& argv, const std::vector<std::string>
   args.push_back(nullptr);
   std::vector<char*> vars;
   for (char** var = environ; *var; ++var) vars.push_back(*var);
-  for (const std::string& var : environment) vars.insert(vars.begin(), const_cast<char*>(var.c_str()));
+  for (const std::string& var : environment)
+    vars.insert(vars.begin(), const_cast<char*>(var.c_str()));
   vars.push_back(nullptr);
   const pid_t pid = ::fork();
   if (pid < 0) fail("fork");
@@ -53,7 +54,8 @@ pid_t spawn(const std::vector<std::string>& argv, const std::vector<std::string>
 std::string built(const std::string& path) {
   const char* root = std::getenv("DSSM_BUILD_ROOT");
   if (!root) {
-    std::fprintf(stderr, "test harness: $DSSM_BUILD_ROOT is not set; run me through `meson test`\n");
+    std::fprintf(stderr,
+                 "test harness: $DSSM_BUILD_ROOT is not set; run me through `meson test`\n");
     std::abort();
   }
   return std::string(root) + "/" + path;
@@ -125,7 +127,8 @@ void DaemonProcess::start() {
   address.sun_family = AF_UNIX;
   std::strncpy(address.sun_path, notify_path.c_str(), sizeof address.sun_path - 1);
   ::unlink(notify_path.c_str());
-  if (::bind(notify, reinterpret_cast<sockaddr*>(&address), sizeof address)) fail("bind notify socket");
+  if (::bind(notify, reinterpret_cast<sockaddr*>(&address), sizeof address))
+    fail("bind notify socket");
   pid_ = test::start(argv_, {"NOTIFY_SOCKET=" + notify_path});
   for (;;) {  // a daemon that ends instead of answering is seen by its status
     pollfd fd{notify, POLLIN, 0};

@@ -3,8 +3,9 @@
 // A dssmd of the test's own: private runtime folder, private socket, ended by its pid.
 #pragma once
 
-#include <string>
 #include <sys/types.h>
+
+#include <string>
 #include <vector>
 
 namespace dssm::test {

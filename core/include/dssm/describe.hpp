@@ -14,10 +14,9 @@
 // `dssm::TypeInfo dssm_describe(const T*)` found by argument-dependent lookup.
 #pragma once
 
-#include <dssm/stream.hpp>
-
 #include <array>
 #include <cstddef>
+#include <dssm/stream.hpp>
 #include <type_traits>
 
 namespace dssm [[gnu::visibility("default")]] {
@@ -36,7 +35,8 @@ namespace detail {
 // T's name as the compiler spells it, e.g. "nav::Odometry".
 template <class T>
 std::string spelled_name() {
-  std::string_view text = __PRETTY_FUNCTION__;  // "... [with T = nav::Odometry; ...]" or "[T = nav::Odometry]"
+  std::string_view text =
+      __PRETTY_FUNCTION__;  // "... [with T = nav::Odometry; ...]" or "[T = nav::Odometry]"
   text.remove_prefix(text.find("T = ") + 4);
   return std::string(text.substr(0, text.find_first_of(";]")));
 }
@@ -55,10 +55,14 @@ consteval Scalar scalar_of() {
   } else {
     constexpr bool kSigned = std::is_signed_v<T>;
     switch (sizeof(T)) {
-      case 1: return kSigned ? Scalar::int8 : Scalar::uint8;
-      case 2: return kSigned ? Scalar::int16 : Scalar::uint16;
-      case 4: return kSigned ? Scalar::int32 : Scalar::uint32;
-      default: return kSigned ? Scalar::int64 : Scalar::uint64;
+      case 1:
+        return kSigned ? Scalar::int8 : Scalar::uint8;
+      case 2:
+        return kSigned ? Scalar::int16 : Scalar::uint16;
+      case 4:
+        return kSigned ? Scalar::int32 : Scalar::uint32;
+      default:
+        return kSigned ? Scalar::int64 : Scalar::uint64;
     }
   }
 }
@@ -123,7 +127,7 @@ TypeInfo type_of() {
   }
 }
 
-}  // namespace dssm
+}  // namespace gnu::visibility("default")]]
 
 // One step of a loop over macro arguments; 4^4 rescans allow 64 members and more.
 #define DSSM_DETAIL_PARENS ()
@@ -135,16 +139,16 @@ TypeInfo type_of() {
   DSSM_DETAIL_EXPAND1(DSSM_DETAIL_EXPAND1(DSSM_DETAIL_EXPAND1(__VA_ARGS__)))
 #define DSSM_DETAIL_EXPAND1(...) __VA_ARGS__
 #define DSSM_DETAIL_FIELDS(...) __VA_OPT__(DSSM_DETAIL_EXPAND(DSSM_DETAIL_FIELD(__VA_ARGS__)))
-#define DSSM_DETAIL_FIELD(member, ...)                                                       \
-  ::dssm::detail::append_field<decltype(DssmSelf::member)>(dssm_type.fields, #member,        \
-                                                           offsetof(DssmSelf, member));      \
+#define DSSM_DETAIL_FIELD(member, ...)                                                  \
+  ::dssm::detail::append_field<decltype(DssmSelf::member)>(dssm_type.fields, #member,   \
+                                                           offsetof(DssmSelf, member)); \
   __VA_OPT__(DSSM_DETAIL_FIELD_AGAIN DSSM_DETAIL_PARENS(__VA_ARGS__))
 #define DSSM_DETAIL_FIELD_AGAIN() DSSM_DETAIL_FIELD
 
-#define DSSM_DESCRIBE(Type, ...)                                                  \
-  [[maybe_unused]] inline ::dssm::TypeInfo dssm_describe(const Type*) {           \
-    using DssmSelf = Type;                                                        \
-    ::dssm::TypeInfo dssm_type{#Type, sizeof(Type), alignof(Type), {}};           \
-    DSSM_DETAIL_FIELDS(__VA_ARGS__)                                               \
-    return dssm_type;                                                             \
+#define DSSM_DESCRIBE(Type, ...)                                        \
+  [[maybe_unused]] inline ::dssm::TypeInfo dssm_describe(const Type*) { \
+    using DssmSelf = Type;                                              \
+    ::dssm::TypeInfo dssm_type{#Type, sizeof(Type), alignof(Type), {}}; \
+    DSSM_DETAIL_FIELDS(__VA_ARGS__)                                     \
+    return dssm_type;                                                   \
   }

@@ -3,9 +3,8 @@
 // What every sample carries beside its payload, and the outcomes of reading one.
 #pragma once
 
-#include <dssm/time.hpp>
-
 #include <cstdint>
+#include <dssm/time.hpp>
 #include <string_view>
 
 namespace dssm [[gnu::visibility("default")]] {
@@ -18,26 +17,26 @@ inline constexpr Tid kNoTid = -1;
 
 struct SampleInfo {
   Tid tid = kNoTid;
-  Time time{};                                 // when it was measured, by the writer's clock
-  Duration clock_error = kUnknownClockError;   // >= 0: how far `time` may be from the truth
+  Time time{};                                // when it was measured, by the writer's clock
+  Duration clock_error = kUnknownClockError;  // >= 0: how far `time` may be from the truth
 };
 
 // Outcomes of a read: part of normal work, no text, nothing allocated.
-enum class [[nodiscard]] ReadStatus : std::uint8_t {
-  ok,
-  not_yet,  // nothing is there yet: an empty stream, or a tid that is not written yet
-  too_old,  // the ring no longer holds it
-  lapped,   // the writer overtook this reader again and again; nothing torn was returned
+enum class [[nodiscard]] ReadStatus : std::uint8_t{
+    ok,
+    not_yet,  // nothing is there yet: an empty stream, or a tid that is not written yet
+    too_old,  // the ring no longer holds it
+    lapped,   // the writer overtook this reader again and again; nothing torn was returned
 };
 
 // Outcomes of a wait.
-enum class [[nodiscard]] WaitStatus : std::uint8_t {
-  ready,
-  timeout,      // the deadline passed
-  interrupted,  // a signal handler ran; wait again or leave
+enum class [[nodiscard]] WaitStatus : std::uint8_t{
+    ready,
+    timeout,      // the deadline passed
+    interrupted,  // a signal handler ran; wait again or leave
 };
 
 // "ok", "not_yet" ...; static storage.
 std::string_view status_name(ReadStatus status) noexcept;
 
-}  // namespace dssm
+}  // namespace gnu::visibility("default")]]

@@ -4,10 +4,9 @@
 // history it keeps, and what is known about it at a moment. All plain values.
 #pragma once
 
+#include <cstdint>
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
-
-#include <cstdint>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -15,8 +14,8 @@
 namespace dssm [[gnu::visibility("default")]] {
 
 // Limits of the format; dssmd's configuration may be narrower.
-inline constexpr std::size_t kMaxNameBytes = 31;       // SSM programs hold names in 32 bytes
-inline constexpr std::size_t kMaxFullNameBytes = 63;   // a DNS-SD instance name, RFC 6763 4.1.1
+inline constexpr std::size_t kMaxNameBytes = 31;      // SSM programs hold names in 32 bytes
+inline constexpr std::size_t kMaxFullNameBytes = 63;  // a DNS-SD instance name, RFC 6763 4.1.1
 inline constexpr std::size_t kMaxTypeNameBytes = 127;
 inline constexpr std::uint64_t kMaxPayloadBytes = 64ULL << 20;
 inline constexpr std::uint64_t kMinDepth = 2;
@@ -43,7 +42,18 @@ struct StreamId {
 
 // What a field of a payload is.
 enum class Scalar : std::uint8_t {
-  boolean = 1, character, int8, uint8, int16, uint16, int32, uint32, int64, uint64, float32, float64
+  boolean = 1,
+  character,
+  int8,
+  uint8,
+  int16,
+  uint16,
+  int32,
+  uint32,
+  int64,
+  uint64,
+  float32,
+  float64
 };
 
 std::uint32_t scalar_bytes(Scalar kind) noexcept;
@@ -114,11 +124,11 @@ struct StreamInfo {
   std::int32_t creator_pid = 0;
   Tid oldest = kNoTid;  // oldest readable sample
   Tid newest = kNoTid;
-  Time newest_time{};   // stamp of the newest sample; meaningless while newest is kNoTid
-  double rate_hz = 0;   // from the stamps of the newest samples; 0 when unknown
+  Time newest_time{};  // stamp of the newest sample; meaningless while newest is kNoTid
+  double rate_hz = 0;  // from the stamps of the newest samples; 0 when unknown
   std::uint32_t writers = 0;
   std::uint32_t readers = 0;
   std::vector<StreamUser> users;  // filled by Session::info(), not by Session::list()
 };
 
-}  // namespace dssm
+}  // namespace gnu::visibility("default")]]

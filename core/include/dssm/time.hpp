@@ -62,4 +62,4 @@ inline MonoTime deadline_in(Duration d) noexcept {
   return d > kNever - now ? kNever : now + d;
 }
 
-}  // namespace dssm
+}  // namespace gnu::visibility("default")]]

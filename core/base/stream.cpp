@@ -1,0 +1,203 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Names, types and histories: parsing, checking, and the words for what is wrong with them.
+#include <bit>
+#include <charconv>
+#include <dssm/stream.hpp>
+
+#include "core/base/utf8.hpp"
+
+namespace dssm {
+namespace {
+
+Error invalid(std::string message) { return Error{Errc::invalid_argument, std::move(message)}; }
+
+bool is_control(char c) noexcept {
+  const auto byte = static_cast<unsigned char>(c);
+  return byte < 0x20 || byte == 0x7f;
+}
+
+}  // namespace
+
+Result<StreamId> StreamId::parse(std::string_view text) {
+  StreamId id;
+  std::string_view rest = text;
+  if (const auto at = rest.find('@'); at != rest.npos) {
+    id.host = rest.substr(at + 1);
+    rest = rest.substr(0, at);
+    if (id.host.empty()) {
+      return invalid("stream name '" + std::string(text) +
+                     "': no host after '@'; write name:id@host");
+    }
+  }
+  if (const auto colon = rest.find(':'); colon != rest.npos) {
+    const std::string_view number = rest.substr(colon + 1);
+    const auto [end, error] = std::from_chars(number.data(), number.data() + number.size(), id.id);
+    if (error != std::errc() || end != number.data() + number.size() || number.empty()) {
+      return invalid("stream name '" + std::string(text) + "': '" + std::string(number) +
+                     "' after ':' is no id; write name:id with an id from 0 to 2147483647");
+    }
+    rest = rest.substr(0, colon);
+  }
+  id.name = rest;
+  if (Result<void> checked = id.check(); !checked) return std::move(checked).error();
+  return id;
+}
+
+Result<void> StreamId::check() const {
+  if (name.empty()) return invalid("a stream's name is empty; give it 1 to 31 bytes");
+  if (name.size() > kMaxNameBytes) {
+    return invalid("stream name '" + name + "' is " + std::to_string(name.size()) +
+                   " bytes long; at most " + std::to_string(kMaxNameBytes) + " are possible");
+  }
+  for (const char c : name) {
+    if (is_control(c) || c == ':' || c == '@') {
+      return invalid("stream name '" + name +
+                     "' holds a control character, ':' or '@'; take another character");
+    }
+  }
+  if (!is_utf8(name) || !is_utf8(host)) {
+    return invalid("stream name '" + name + "' is not UTF-8, which names of services have to be");
+  }
+  if (id < 0) {
+    return invalid("stream '" + name + "' has the id " + std::to_string(id) + "; ids start at 0");
+  }
+  for (const char c : host) {
+    if (is_control(c) || c == ':' || c == '@') {
+      return invalid("host name '" + host + "' holds a control character, ':' or '@'");
+    }
+  }
+  if (const std::string full = str(); full.size() > kMaxFullNameBytes) {
+    return invalid("stream name '" + full + "' is " + std::to_string(full.size()) +
+                   " bytes long with its host; at most " + std::to_string(kMaxFullNameBytes) +
+                   " fit into a DNS-SD instance name; shorten the name or the host's name");
+  }
+  return {};
+}
+
+std::string StreamId::str() const {
+  std::string text = name + ":" + std::to_string(id);
+  if (!host.empty()) text += "@" + host;
+  return text;
+}
+
+std::uint32_t scalar_bytes(Scalar kind) noexcept {
+  switch (kind) {
+    case Scalar::boolean:
+    case Scalar::character:
+    case Scalar::int8:
+    case Scalar::uint8:
+      return 1;
+    case Scalar::int16:
+    case Scalar::uint16:
+      return 2;
+    case Scalar::int32:
+    case Scalar::uint32:
+    case Scalar::float32:
+      return 4;
+    case Scalar::int64:
+    case Scalar::uint64:
+    case Scalar::float64:
+      return 8;
+  }
+  return 0;
+}
+
+std::string_view scalar_name(Scalar kind) noexcept {
+  switch (kind) {
+    case Scalar::boolean:
+      return "bool";
+    case Scalar::character:
+      return "char";
+    case Scalar::int8:
+      return "int8";
+    case Scalar::uint8:
+      return "uint8";
+    case Scalar::int16:
+      return "int16";
+    case Scalar::uint16:
+      return "uint16";
+    case Scalar::int32:
+      return "int32";
+    case Scalar::uint32:
+      return "uint32";
+    case Scalar::int64:
+      return "int64";
+    case Scalar::uint64:
+      return "uint64";
+    case Scalar::float32:
+      return "float32";
+    case Scalar::float64:
+      return "float64";
+  }
+  return "unknown";
+}
+
+std::string TypeInfo::str() const {
+  const std::string bytes =
+      std::to_string(payload_bytes) + (payload_bytes == 1 ? " byte" : " bytes");
+  if (name.empty()) return bytes;
+  return "'" + name + "' (" + bytes + ", aligned to " + std::to_string(alignment_bytes) + ")";
+}
+
+Result<void> TypeInfo::check_usable_as(const TypeInfo& wanted) const {
+  const bool names_differ = !name.empty() && !wanted.name.empty() && name != wanted.name;
+  // An untyped side knows no alignment worth comparing.
+  const bool alignments_differ =
+      !name.empty() && !wanted.name.empty() && alignment_bytes != wanted.alignment_bytes;
+  if (payload_bytes == wanted.payload_bytes && !names_differ && !alignments_differ) return {};
+  return Error{Errc::type_mismatch,
+               "the stream carries " + str() + ", this program wants " + wanted.str() +
+                   "; compile both sides with the same definition of the type"};
+}
+
+Result<void> TypeInfo::check() const {
+  if (name.size() > kMaxTypeNameBytes) {
+    return invalid("type name '" + name.substr(0, 40) + "...' is " + std::to_string(name.size()) +
+                   " bytes long; at most " + std::to_string(kMaxTypeNameBytes) + " are possible");
+  }
+  if (!is_utf8(name)) return invalid("type name '" + name + "' is not UTF-8");
+  if (payload_bytes < 1 || payload_bytes > kMaxPayloadBytes) {
+    return invalid("a payload of " + std::to_string(payload_bytes) +
+                   " bytes is not possible; it takes 1 byte to 64 MiB");
+  }
+  if (!std::has_single_bit(alignment_bytes) || alignment_bytes > 64) {
+    return invalid("an alignment of " + std::to_string(alignment_bytes) +
+                   " bytes is not possible; it takes a power of two up to 64");
+  }
+  for (const Field& field : fields) {
+    const std::uint64_t bytes = scalar_bytes(field.kind);
+    if (!is_utf8(field.name)) return invalid("field name '" + field.name + "' is not UTF-8");
+    const bool sane = bytes != 0 && field.count >= 1 && field.count <= payload_bytes &&
+                      field.stride_bytes <= payload_bytes && field.offset_bytes < payload_bytes;
+    if (!sane ||
+        field.offset_bytes + (field.count - 1) * field.stride_bytes + bytes > payload_bytes) {
+      return invalid("field '" + field.name + "' of type " + str() +
+                     " does not lie inside the payload; check its DSSM_DESCRIBE line");
+    }
+  }
+  return {};
+}
+
+Result<History> History::of(Duration life, Duration cycle) {
+  if (cycle <= Duration::zero()) {
+    return invalid("a cycle of " + std::to_string(to_ns(cycle)) +
+                   " ns is not possible; it takes the time between two samples, more than 0");
+  }
+  if (life < cycle) {
+    return invalid("a life of " + std::to_string(to_ns(life)) +
+                   " ns is shorter than the cycle of " + std::to_string(to_ns(cycle)) +
+                   " ns; keep at least one cycle of history");
+  }
+  const double slots =
+      1.2 * static_cast<double>(to_ns(life)) / static_cast<double>(to_ns(cycle)) + 1;
+  if (slots > static_cast<double>(kMaxDepth)) {
+    return Error{Errc::limit_exceeded, "a life of " + std::to_string(to_ns(life)) +
+                                           " ns at a cycle of " + std::to_string(to_ns(cycle)) +
+                                           " ns needs more than " + std::to_string(kMaxDepth) +
+                                           " slots; keep less history"};
+  }
+  return History{static_cast<std::uint64_t>(slots), cycle};
+}
+
+}  // namespace dssm

@@ -1,0 +1,113 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/ring/bell.hpp"
+
+#include <fcntl.h>
+#include <linux/futex.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <sys/syscall.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <cerrno>
+#include <climits>
+
+namespace dssm::ring {
+namespace {
+
+constexpr int kBellSeals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL;
+constexpr std::size_t kMaxBells = 128;  // FUTEX_WAITV_MAX
+
+// Linux 5.16's futex_waitv; Debian 12's headers have it, the C library has no wrapper.
+struct WaitVector {
+  std::uint64_t value;
+  std::uint64_t address;
+  std::uint32_t flags;
+  std::uint32_t reserved;
+};
+constexpr long kFutexWaitvNumber = 449;  // on every architecture
+constexpr std::uint32_t kFutex32 = 2;    // FUTEX_32; shared, as FUTEX_PRIVATE_FLAG is not set
+
+timespec to_timespec(MonoTime time) noexcept {
+  const std::int64_t ns = std::max<std::int64_t>(to_ns(time.time_since_epoch()), 0);
+  return {ns / 1'000'000'000, ns % 1'000'000'000};
+}
+
+// When to look up although nobody rang.
+MonoTime look_up(MonoTime deadline) noexcept { return std::min(deadline, deadline_in(kMaxSleep)); }
+
+WaitStatus outcome(long result, int error, MonoTime deadline) noexcept {
+  if (result >= 0 || error == EAGAIN) return WaitStatus::ready;
+  if (error == EINTR) return WaitStatus::interrupted;
+  return MonoClock::now() >= deadline ? WaitStatus::timeout : WaitStatus::ready;
+}
+
+}  // namespace
+
+Result<UniqueFd> create_bell() {
+  UniqueFd fd(::memfd_create("dssm-bell", MFD_CLOEXEC | MFD_ALLOW_SEALING));
+  if (!fd) return os_error("create a bell: memfd_create");
+  if (::ftruncate(fd.get(), sizeof(BellPage)) || ::fchmod(fd.get(), 0600) ||
+      ::fcntl(fd.get(), F_ADD_SEALS, kBellSeals)) {
+    return os_error("create a bell");
+  }
+  return fd;
+}
+
+Result<std::shared_ptr<Bell>> Bell::open_untrusted(int fd) {
+  struct stat file {};
+  const int seals = ::fcntl(fd, F_GET_SEALS);
+  if (seals < 0 || (seals & kBellSeals) != kBellSeals || ::fstat(fd, &file) ||
+      file.st_size != sizeof(BellPage)) {
+    return Error{Errc::protocol, "this is no bell: no memory file of one page with a sealed size"};
+  }
+  void* page = ::mmap(nullptr, sizeof(BellPage), PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+  if (page == MAP_FAILED) return os_error("map a bell");
+  std::shared_ptr<Bell> bell(new Bell);
+  bell->page_ = static_cast<BellPage*>(page);
+  return bell;
+}
+
+Bell::~Bell() {
+  if (page_) ::munmap(page_, sizeof(BellPage));
+}
+
+void Bell::ring_slowly() noexcept {
+  // The addition clears bit 0 and moves the count; between the load in ring() and here another
+  // writer may have done so, then it also woke all.
+  std::uint32_t word = page_->word.load(std::memory_order_relaxed);
+  while (word & kSleeper) {
+    if (page_->word.compare_exchange_weak(word, word + 1, std::memory_order_seq_cst)) {
+      ::syscall(SYS_futex, &page_->word, FUTEX_WAKE, INT_MAX, nullptr, nullptr, 0);
+      return;
+    }
+  }
+}
+
+WaitStatus Bell::sleep(std::uint32_t announced, MonoTime deadline) noexcept {
+  const timespec until = to_timespec(look_up(deadline));
+  const long result = ::syscall(SYS_futex, &page_->word, FUTEX_WAIT_BITSET, announced, &until,
+                                nullptr, FUTEX_BITSET_MATCH_ANY);
+  return outcome(result, errno, deadline);
+}
+
+WaitStatus Bell::sleep_any(std::span<Bell* const> bells, std::span<const std::uint32_t> announced,
+                           MonoTime deadline) noexcept {
+  std::array<WaitVector, kMaxBells> vectors;
+  const std::size_t count = std::min(bells.size(), kMaxBells);
+  for (std::size_t i = 0; i < count; ++i) {
+    vectors[i] = {announced[i], reinterpret_cast<std::uintptr_t>(&bells[i]->page_->word), kFutex32,
+                  0};
+  }
+  timespec until = to_timespec(look_up(deadline));
+  const long result =
+      ::syscall(kFutexWaitvNumber, vectors.data(), count, 0, &until, CLOCK_MONOTONIC);
+  if (result >= 0 || errno != ENOSYS) return outcome(result, errno, deadline);
+  until = to_timespec(std::min(deadline, deadline_in(std::chrono::milliseconds(1))));
+  const int error = ::clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, nullptr);
+  if (error == EINTR) return WaitStatus::interrupted;
+  return MonoClock::now() >= deadline ? WaitStatus::timeout : WaitStatus::ready;
+}
+
+}  // namespace dssm::ring

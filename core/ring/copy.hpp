@@ -1,0 +1,101 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Copying payloads in and out of a slot while the other side may be at it too, and the fences
+// around such a copy. Three forms of one thing (docs/ring-layout.md "Copying a payload" has the
+// argument):
+//
+//   plain       memcpy between fences; data that was overwritten meanwhile is thrown away after the
+//               sequence is checked. Sound on x86-64 and AArch64.
+//   large       from kLargeBytes on memcpy may use non-temporal stores and string instructions,
+//   which
+//               x86's usual ordering does not cover: full fences on both sides.
+//   ThreadSanitizer   words as atomics, stores release and loads acquire, so that no fence is
+//   needed
+//               (it cannot see them) and no race is reported that is none.
+#pragma once
+
+#include <atomic>
+#include <cstddef>
+#include <cstdint>
+#include <cstring>
+
+#if defined(__SANITIZE_THREAD__)
+#define DSSM_TSAN 1
+#elif defined(__has_feature)
+#if __has_feature(thread_sanitizer)
+#define DSSM_TSAN 1
+#endif
+#endif
+
+namespace dssm::ring {
+
+// Below this no memcpy that we know uses anything but ordinary loads and stores (glibc's
+// x86_rep_movsb_threshold starts at 2048 and its non-temporal threshold far above).
+inline constexpr std::size_t kLargeBytes = 2048;
+
+#if defined(DSSM_TSAN)
+
+namespace detail {
+template <class Word>
+void store_words(std::byte*& to, const std::byte*& from, std::size_t& bytes) noexcept {
+  for (; bytes >= sizeof(Word); bytes -= sizeof(Word), to += sizeof(Word), from += sizeof(Word)) {
+    Word word;
+    std::memcpy(&word, from, sizeof word);
+    std::atomic_ref<Word>(*reinterpret_cast<Word*>(to)).store(word, std::memory_order_release);
+  }
+}
+template <class Word>
+void load_words(std::byte*& to, const std::byte*& from, std::size_t& bytes) noexcept {
+  for (; bytes >= sizeof(Word); bytes -= sizeof(Word), to += sizeof(Word), from += sizeof(Word)) {
+    auto& slot_word = *reinterpret_cast<Word*>(const_cast<std::byte*>(from));
+    const Word word = std::atomic_ref<Word>(slot_word).load(std::memory_order_acquire);
+    std::memcpy(to, &word, sizeof word);
+  }
+}
+}  // namespace detail
+
+inline void fence_before_filling(bool) noexcept {}
+inline void fence_after_filling(bool) noexcept {}
+inline void fence_after_copying_out(bool) noexcept {}
+
+// Each store is a release: whoever sees a word also sees the odd sequence stored before it.
+inline void copy_in(std::byte* slot, const std::byte* from, std::size_t bytes) noexcept {
+  detail::store_words<std::uint64_t>(slot, from, bytes);
+  detail::store_words<std::uint8_t>(slot, from, bytes);
+}
+
+// Each load is an acquire: the sequence is looked at after all of them; pairs with copy_in().
+inline void copy_out(std::byte* to, const std::byte* slot, std::size_t bytes) noexcept {
+  detail::load_words<std::uint64_t>(to, slot, bytes);
+  detail::load_words<std::uint8_t>(to, slot, bytes);
+}
+
+#else
+
+// After the odd sequence, before the first byte of the payload: nobody sees new bytes under an even
+// sequence. Pairs with fence_after_copying_out().
+inline void fence_before_filling(bool large) noexcept {
+  std::atomic_thread_fence(large ? std::memory_order_seq_cst : std::memory_order_release);
+}
+
+// After the last byte, before the even sequence. The release store of the sequence orders ordinary
+// stores; a large copy may have used others.
+inline void fence_after_filling(bool large) noexcept {
+  if (large) std::atomic_thread_fence(std::memory_order_seq_cst);
+}
+
+// After the last byte was read, before the sequence is looked at again.
+inline void fence_after_copying_out(bool large) noexcept {
+  std::atomic_thread_fence(large ? std::memory_order_seq_cst : std::memory_order_acquire);
+}
+
+inline void copy_in(std::byte* slot, const std::byte* from, std::size_t bytes) noexcept {
+  std::memcpy(slot, from, bytes);
+}
+inline void copy_out(std::byte* to, const std::byte* slot, std::size_t bytes) noexcept {
+  std::memcpy(to, slot, bytes);
+}
+
+#endif
+
+}  // namespace dssm::ring

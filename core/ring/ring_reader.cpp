@@ -1,0 +1,106 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/ring/ring_reader.hpp"
+
+#include "core/ring/copy.hpp"
+#include "core/ring/time_search.hpp"
+
+namespace dssm::ring {
+namespace {
+
+// The stamps of a slot. Acquire, so that the sequence is looked at after all of them.
+SampleInfo load_info(const SlotHeader& slot, Tid tid) noexcept {
+  SampleInfo info;
+  info.tid = tid;
+  info.time = time_from_ns(slot.time_ns.load(std::memory_order_acquire));
+  info.clock_error = Duration(slot.clock_error_ns.load(std::memory_order_acquire));
+  return info;
+}
+
+}  // namespace
+
+ReadStatus RingReader::locate(Tid tid, Place& place, SampleInfo& info) const noexcept {
+  const Tid top = newest();
+  if (tid > top) return ReadStatus::not_yet;
+  if (tid < 0 || tid < slots_.oldest_for(top)) return ReadStatus::too_old;
+  SlotHeader& slot = slots_.slot(tid);
+  // Pairs with the release store of the even sequence in RingWriter: what was stored before it is
+  // seen after this.
+  if (slot.sequence.load(std::memory_order_acquire) != published_sequence(tid)) {
+    return ReadStatus::too_old;  // overwritten since `top` was read
+  }
+  const SampleInfo seen = load_info(slot, tid);
+  if (slot.sequence.load(std::memory_order_relaxed) != published_sequence(tid)) {
+    return ReadStatus::too_old;
+  }
+  place = {SlotTable::payload(slot), &slot.sequence, published_sequence(tid)};
+  info = seen;
+  return ReadStatus::ok;
+}
+
+bool RingReader::still_valid(const std::atomic<std::uint64_t>& sequence,
+                             std::uint64_t expected) noexcept {
+  fence_after_copying_out(true);
+  return sequence.load(std::memory_order_relaxed) == expected;
+}
+
+ReadStatus RingReader::read(Tid tid, std::span<std::byte> payload,
+                            SampleInfo& info) const noexcept {
+  const Tid top = newest();
+  if (tid > top) return ReadStatus::not_yet;
+  if (tid < 0 || tid < slots_.oldest_for(top)) return ReadStatus::too_old;
+  SlotHeader& slot = slots_.slot(tid);
+  const std::uint64_t published = published_sequence(tid);
+  if (slot.sequence.load(std::memory_order_acquire) != published) return ReadStatus::too_old;
+  const SampleInfo seen = load_info(slot, tid);
+  copy_out(payload.data(), SlotTable::payload(slot), slots_.payload_bytes());
+  fence_after_copying_out(slots_.payload_bytes() >= kLargeBytes);
+  if (slot.sequence.load(std::memory_order_relaxed) != published) return ReadStatus::too_old;
+  info = seen;
+  return ReadStatus::ok;
+}
+
+ReadStatus RingReader::read_newest(std::span<std::byte> payload, SampleInfo& info) const noexcept {
+  for (int attempt = 0; attempt < kMaxRetries; ++attempt) {
+    const Tid top = newest();
+    if (top < 0) return ReadStatus::not_yet;
+    if (read(top, payload, info) == ReadStatus::ok) return ReadStatus::ok;
+  }
+  return ReadStatus::lapped;
+}
+
+ReadStatus RingReader::stamp(Tid tid, SampleInfo& info) const noexcept {
+  Place place;
+  return locate(tid, place, info);
+}
+
+ReadStatus RingReader::find(Time t, Tid& tid) const noexcept {
+  for (int attempt = 0; attempt < kMaxRetries; ++attempt) {
+    const Tid top = newest();
+    if (top < 0) return ReadStatus::not_yet;
+    // Run starts only grow, and top's was stored before top: one that is not beyond top is top's.
+    // Beyond it: a backward step is just being written, or its writer died; the slot knows then.
+    Tid run_start = header_->run_start.load(std::memory_order_acquire);
+    if (run_start > top || run_start < 0) {
+      SlotHeader& slot = slots_.slot(top);
+      run_start = slot.run_start.load(std::memory_order_acquire);
+      if (run_start > top || run_start < 0 ||
+          slot.sequence.load(std::memory_order_relaxed) != published_sequence(top)) {
+        continue;
+      }
+    }
+    const FoundSample found =
+        find_newest_at_or_before(slots_, slots_.oldest_for(top), top, run_start, to_ns(t));
+    // The times looked at were those of the tids meant if none of them has left the ring since:
+    // whoever reuses a place in the index has published a top that says so before. Pairs with the
+    // release store to the index in RingWriter.
+    std::atomic_thread_fence(std::memory_order_acquire);
+    const Tid now = header_->top.load(std::memory_order_relaxed);
+    if (found.status == ReadStatus::lapped || found.lowest_probed < slots_.oldest_for(now))
+      continue;
+    if (found.status == ReadStatus::ok) tid = found.tid;
+    return found.status;
+  }
+  return ReadStatus::lapped;
+}
+
+}  // namespace dssm::ring

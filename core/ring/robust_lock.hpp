@@ -1,0 +1,40 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The lock between processes that survives its holder's death: glibc's robust, process-shared
+// mutex. The kernel marks it when a thread dies holding it, and the next locker is told. Lives in
+// shared memory, never destroyed: the memory just goes.
+//
+// Not the error-checking kind: it recognises "I hold it already" by the thread's number, and
+// threads in two containers may have the same one.
+#pragma once
+
+#include <pthread.h>
+
+#include <cerrno>
+
+namespace dssm::ring {
+
+inline void init_robust_lock(pthread_mutex_t& mutex) noexcept {
+  pthread_mutexattr_t attributes;
+  pthread_mutexattr_init(&attributes);
+  pthread_mutexattr_setpshared(&attributes, PTHREAD_PROCESS_SHARED);
+  pthread_mutexattr_setrobust(&attributes, PTHREAD_MUTEX_ROBUST);
+  pthread_mutex_init(&mutex, &attributes);
+  pthread_mutexattr_destroy(&attributes);
+}
+
+enum class LockResult : unsigned char {
+  locked,
+  recovered,  // locked; the last holder died: repair what it may have left half done
+  refused,    // somebody with write access has damaged the mutex
+};
+
+inline LockResult lock_robust(pthread_mutex_t& mutex) noexcept {
+  const int result = pthread_mutex_lock(&mutex);
+  if (result == 0) return LockResult::locked;
+  if (result != EOWNERDEAD) return LockResult::refused;
+  pthread_mutex_consistent(&mutex);
+  return LockResult::recovered;
+}
+
+}  // namespace dssm::ring

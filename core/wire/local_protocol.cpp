@@ -1,0 +1,120 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/wire/local_protocol.hpp"
+
+namespace dssm::wire {
+
+void to_message(const StreamId& id, local::StreamId& out) {
+  out.set_name(id.name);
+  out.set_id(id.id);
+  out.set_host(id.host);
+}
+
+void to_message(const TypeInfo& type, local::Type& out) {
+  out.set_name(type.name);
+  out.set_payload_bytes(type.payload_bytes);
+  out.set_alignment_bytes(type.alignment_bytes);
+  for (const Field& field : type.fields) {
+    local::Field& message = *out.add_fields();
+    message.set_name(field.name);
+    message.set_scalar(static_cast<std::uint32_t>(field.kind));
+    message.set_offset_bytes(field.offset_bytes);
+    message.set_count(field.count);
+    message.set_stride_bytes(field.stride_bytes);
+  }
+}
+
+void to_message(const StreamInfo& info, local::Stream& out) {
+  to_message(info.id, *out.mutable_id());
+  to_message(info.type, *out.mutable_type());
+  out.set_depth(info.depth);
+  out.set_cycle_ns(to_ns(info.cycle));
+  out.set_memory_bytes(info.memory_bytes);
+  out.set_property_bytes(info.property_bytes);
+  out.set_incarnation(info.incarnation);
+  out.set_creator_pid(info.creator_pid);
+  out.set_oldest(info.oldest);
+  out.set_newest(info.newest);
+  out.set_newest_time_ns(to_ns(info.newest_time));
+  out.set_rate_hz(info.rate_hz);
+  out.set_writers(info.writers);
+  out.set_readers(info.readers);
+  for (const StreamUser& user : info.users) {
+    local::User& message = *out.add_users();
+    message.set_pid(user.pid);
+    message.set_uid(user.uid);
+    message.set_program(user.program);
+    message.set_writer(user.role == Role::writer);
+  }
+}
+
+void to_message(const Error& error, local::Failure& out) {
+  out.set_code(std::string(errc_name(error.code)));
+  out.set_message(error.message);
+}
+
+Result<StreamId> stream_id_untrusted(const local::StreamId& message) {
+  StreamId id{message.name(), message.id(), message.host()};
+  if (Result<void> checked = id.check(); !checked) return std::move(checked).error();
+  return id;
+}
+
+Result<TypeInfo> type_untrusted(const local::Type& message) {
+  if (static_cast<std::size_t>(message.fields_size()) > kMaxFields) {
+    return Error{Errc::limit_exceeded, "a type with " + std::to_string(message.fields_size()) +
+                                           " fields; at most " + std::to_string(kMaxFields) +
+                                           " are taken: describe fewer"};
+  }
+  TypeInfo type{message.name(), message.payload_bytes(), message.alignment_bytes(), {}};
+  for (const local::Field& field : message.fields()) {
+    if (field.scalar() > 255) {
+      return Error{Errc::protocol, "field '" + field.name() + "' has the unknown kind " +
+                                       std::to_string(field.scalar())};
+    }
+    type.fields.push_back({field.name(), static_cast<Scalar>(field.scalar()), field.offset_bytes(),
+                           field.count(), field.stride_bytes()});
+  }
+  if (Result<void> checked = type.check(); !checked) return std::move(checked).error();
+  return type;
+}
+
+StreamInfo stream_info(const local::Stream& message) {
+  StreamInfo info;
+  info.id = {message.id().name(), message.id().id(), message.id().host()};
+  info.type = {
+      message.type().name(), message.type().payload_bytes(), message.type().alignment_bytes(), {}};
+  for (const local::Field& field : message.type().fields()) {
+    info.type.fields.push_back({field.name(), static_cast<Scalar>(field.scalar()),
+                                field.offset_bytes(), field.count(), field.stride_bytes()});
+  }
+  info.depth = message.depth();
+  info.cycle = Duration(message.cycle_ns());
+  info.memory_bytes = message.memory_bytes();
+  info.property_bytes = message.property_bytes();
+  info.incarnation = message.incarnation();
+  info.creator_pid = message.creator_pid();
+  info.oldest = message.oldest();
+  info.newest = message.newest();
+  info.newest_time = time_from_ns(message.newest_time_ns());
+  info.rate_hz = message.rate_hz();
+  info.writers = message.writers();
+  info.readers = message.readers();
+  for (const local::User& user : message.users()) {
+    info.users.push_back(
+        {user.pid(), user.uid(), user.program(), user.writer() ? Role::writer : Role::reader});
+  }
+  return info;
+}
+
+Error failure(const local::Failure& message) {
+  constexpr Errc kCodes[] = {Errc::invalid_argument, Errc::not_found,      Errc::already_exists,
+                             Errc::type_mismatch,    Errc::limit_exceeded, Errc::no_memory,
+                             Errc::no_permission,    Errc::no_daemon,      Errc::daemon_away,
+                             Errc::protocol,         Errc::conflict,       Errc::closed};
+  Errc code = Errc::system;
+  for (const Errc known : kCodes) {
+    if (errc_name(known) == message.code()) code = known;
+  }
+  return Error{code, message.message()};
+}
+
+}  // namespace dssm::wire
