@@ -1,0 +1,100 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/src/notifier.hpp"
+
+#include <sys/eventfd.h>
+#include <unistd.h>
+
+#include "client/src/quiet_thread.hpp"
+
+namespace dssm::detail {
+
+bool ReadyFd::look() noexcept {
+  const Tid newest = reader_.newest();
+  if (newest <= seen_) return false;
+  seen_ = newest;
+  const std::uint64_t one = 1;
+  [[maybe_unused]] const ssize_t written = ::write(event_.get(), &one, sizeof one);
+  return true;
+}
+
+void ReadyFd::clear() noexcept {
+  std::uint64_t count = 0;
+  [[maybe_unused]] const ssize_t got = ::read(event_.get(), &count, sizeof count);
+}
+
+Result<std::unique_ptr<Notifier>> Notifier::start() {
+  auto fd = ring::create_bell();
+  if (!fd) return std::move(fd).error();
+  auto bell = ring::Bell::open_untrusted(fd->get());
+  if (!bell) return std::move(bell).error();
+  std::unique_ptr<Notifier> notifier(new Notifier);
+  notifier->control_ = std::move(*bell);
+  notifier->thread_ = quiet_thread([self = notifier.get()] { self->run(); });
+  return notifier;
+}
+
+Notifier::~Notifier() {
+  {
+    const std::lock_guard guard(mutex_);
+    stopping_ = true;
+  }
+  control_->ring();
+  thread_.join();
+}
+
+bool Notifier::add(const std::shared_ptr<ReadyFd>& ready) {
+  {
+    const std::lock_guard guard(mutex_);
+    std::erase_if(watched_, [](const auto& entry) { return entry.expired(); });
+    if (watched_.size() == kMaxWatched) return false;
+    watched_.push_back(ready);
+  }
+  control_->ring();
+  return true;
+}
+
+void Notifier::run() {
+  std::vector<std::shared_ptr<ReadyFd>> awake;
+  std::vector<ring::Bell*> bells;
+  std::vector<std::uint32_t> announced;
+  for (;;) {
+    awake.clear(), bells.clear(), announced.clear();
+    // Announce first, look afterwards: what happens in between is not missed.
+    bells.push_back(control_.get());
+    announced.push_back(control_->announce());
+    {
+      const std::lock_guard guard(mutex_);
+      if (stopping_) return;
+      for (const auto& entry : watched_) {
+        if (auto ready = entry.lock()) awake.push_back(std::move(ready));
+      }
+    }
+    bool news = false;
+    for (const auto& ready : awake) {
+      bells.push_back(ready->ring_->bell.get());
+      announced.push_back(bells.back()->announce());
+      news |= ready->look();
+    }
+    if (news) continue;
+    // Readers that go away meanwhile stay mapped until the next wake-up; that is a second at most.
+    [[maybe_unused]] const WaitStatus woken = ring::Bell::sleep_any(bells, announced, kNever);
+  }
+}
+
+Result<std::shared_ptr<ReadyFd>> NotifierPool::watch(std::shared_ptr<const SharedRing> ring,
+                                                     Tid seen) {
+  UniqueFd event(::eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK));
+  if (!event) return os_error("create an eventfd for a reader");
+  auto ready = std::make_shared<ReadyFd>(std::move(ring), seen, std::move(event));
+  const std::lock_guard guard(mutex_);
+  for (const auto& notifier : notifiers_) {
+    if (notifier->add(ready)) return ready;
+  }
+  auto notifier = Notifier::start();
+  if (!notifier) return std::move(notifier).error();
+  (*notifier)->add(ready);
+  notifiers_.push_back(std::move(*notifier));
+  return ready;
+}
+
+}  // namespace dssm::detail

@@ -1,0 +1,250 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// RawReader on top of ring::RingReader: cursor, counting of losses, waiting.
+#include <algorithm>
+#include <array>
+#include <dssm/reader.hpp>
+
+#include "client/src/client.hpp"
+#include "client/src/states.hpp"
+#include "core/base/check.hpp"
+
+namespace dssm {
+namespace {
+
+// Waits until ready() or the deadline: look, announce, look again, sleep. An interruption is
+// reported only when there is nothing to report otherwise.
+template <class Ready>
+WaitStatus wait_until(ring::Bell& bell, MonoTime deadline, Ready ready) noexcept {
+  if (ready()) return WaitStatus::ready;
+  if (deadline != kNever && MonoClock::now() >= deadline) return WaitStatus::timeout;
+  for (;;) {
+    const std::uint32_t announced = bell.announce();
+    if (ready()) return WaitStatus::ready;
+    const WaitStatus status = bell.sleep(announced, deadline);
+    if (ready()) return WaitStatus::ready;
+    if (status != WaitStatus::ready) return status;
+  }
+}
+
+// The closer one of two stamps, the earlier sample when both are equally close. Unsigned, because
+// the distance of two int64 may not fit into one.
+Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
+  const auto distance = [](Time early, Time late) {
+    return static_cast<std::uint64_t>(to_ns(late)) - static_cast<std::uint64_t>(to_ns(early));
+  };
+  return distance(t, after.time) < distance(before.time, t) ? after.tid : before.tid;
+}
+
+}  // namespace
+
+bool BorrowedSample::still_valid() const noexcept {
+  return sequence_ &&
+         ring::RingReader::still_valid(*static_cast<const std::atomic<std::uint64_t>*>(sequence_),
+                                       ring::published_sequence(info_.tid));
+}
+
+RawReader::RawReader(std::unique_ptr<detail::ReaderState> state) noexcept
+    : state_(std::move(state)) {}
+RawReader::RawReader(RawReader&&) noexcept = default;
+RawReader& RawReader::operator=(RawReader&&) noexcept = default;
+RawReader::~RawReader() = default;
+
+ReadStatus RawReader::latest(std::span<std::byte> payload, SampleInfo& info) noexcept {
+  DSSM_CHECK(payload.size() == payload_bytes());
+  const ReadStatus status = state_->ring.read_newest(payload, info);
+  if (status == ReadStatus::ok) state_->took(info.tid);
+  return status;
+}
+
+ReadStatus RawReader::tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) noexcept {
+  DSSM_CHECK(payload.size() == payload_bytes());
+  const ReadStatus status = state_->ring.read(tid, payload, info);
+  if (status == ReadStatus::ok) state_->took(tid);
+  return status;
+}
+
+ReadStatus RawReader::next(std::span<std::byte> payload, SampleInfo& info) noexcept {
+  if (state_->fresh) return latest(payload, info);
+  DSSM_CHECK(payload.size() == payload_bytes());
+  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+    const Tid wanted = std::max(state_->cursor + 1, state_->ring.oldest());
+    const ReadStatus status = state_->ring.read(wanted, payload, info);
+    if (status == ReadStatus::too_old) continue;  // lapped just now: go on with the new oldest
+    if (status != ReadStatus::ok) return ReadStatus::not_yet;
+    state_->lost += static_cast<std::uint64_t>(wanted - (state_->cursor + 1));
+    state_->took(wanted);
+    return ReadStatus::ok;
+  }
+  return ReadStatus::lapped;
+}
+
+ReadStatus RawReader::previous(std::span<std::byte> payload, SampleInfo& info) noexcept {
+  if (state_->cursor < 0) return ReadStatus::not_yet;
+  return tid(state_->cursor - 1, payload, info);
+}
+
+ReadStatus RawReader::at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
+  DSSM_CHECK(payload.size() == payload_bytes());
+  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+    Tid found = kNoTid;
+    const ReadStatus status = state_->ring.find(t, found);
+    if (status != ReadStatus::ok) return status;
+    if (state_->ring.read(found, payload, info) == ReadStatus::ok) {
+      state_->took(found);
+      return ReadStatus::ok;
+    }
+  }
+  return ReadStatus::lapped;
+}
+
+ReadStatus RawReader::at_or_after(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
+  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+    // Behind the newest sample before `t` all samples have time >= t.
+    Tid before = kNoTid;
+    const ReadStatus found =
+        to_ns(t) == INT64_MIN ? ReadStatus::too_old : state_->ring.find(t - Duration(1), before);
+    if (found == ReadStatus::not_yet || found == ReadStatus::lapped) return found;
+    const Tid wanted = found == ReadStatus::too_old ? state_->ring.oldest() : before + 1;
+    const ReadStatus status = tid(wanted, payload, info);
+    if (status != ReadStatus::too_old) return status;
+  }
+  return ReadStatus::lapped;
+}
+
+ReadStatus RawReader::nearest(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
+  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+    Tid before = kNoTid;
+    const ReadStatus found = state_->ring.find(t, before);
+    if (found == ReadStatus::not_yet || found == ReadStatus::lapped) return found;
+    Tid wanted = before;
+    if (found == ReadStatus::too_old) {
+      wanted = state_->ring.oldest();
+    } else {
+      SampleInfo left, right;
+      if (state_->ring.stamp(before, left) != ReadStatus::ok) continue;
+      if (state_->ring.stamp(before + 1, right) == ReadStatus::ok) wanted = closer(t, left, right);
+    }
+    const ReadStatus status = tid(wanted, payload, info);
+    if (status != ReadStatus::too_old) return status;
+  }
+  return ReadStatus::lapped;
+}
+
+ReadStatus RawReader::neighbours(Time t, Neighbours& out) const noexcept {
+  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+    Tid before = kNoTid;
+    const ReadStatus found = state_->ring.find(t, before);
+    if (found != ReadStatus::ok) return found;
+    Neighbours seen;
+    const ReadStatus right = state_->ring.stamp(before + 1, seen.after);
+    if (right == ReadStatus::not_yet) return right;
+    if (right != ReadStatus::ok) continue;
+    if (state_->ring.stamp(before, seen.before) != ReadStatus::ok) continue;
+    // A sample that ran backwards may have come between: then it is the newest with time <= t.
+    if (seen.after.time <= t) continue;
+    out = seen;
+    return ReadStatus::ok;
+  }
+  return ReadStatus::lapped;
+}
+
+Tid RawReader::newest() const noexcept { return state_->ring.newest(); }
+Tid RawReader::oldest() const noexcept { return state_->ring.oldest(); }
+
+ReadStatus RawReader::stamp(Tid tid, SampleInfo& info) const noexcept {
+  return state_->ring.stamp(tid, info);
+}
+
+ReadStatus RawReader::find(Time t, SampleInfo& info) const noexcept {
+  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+    Tid found = kNoTid;
+    const ReadStatus status = state_->ring.find(t, found);
+    if (status != ReadStatus::ok) return status;
+    if (state_->ring.stamp(found, info) == ReadStatus::ok) return ReadStatus::ok;
+  }
+  return ReadStatus::lapped;
+}
+
+Tid RawReader::cursor() const noexcept { return state_->cursor; }
+
+void RawReader::seek(Tid tid) noexcept { state_->took(std::max(tid, kNoTid)); }
+
+std::uint64_t RawReader::lost() const noexcept { return state_->lost; }
+
+ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
+  ring::RingReader::Place place{};
+  const ReadStatus status = state_->ring.locate(tid, place, out.info_);
+  if (status != ReadStatus::ok) return status;
+  out.payload_ = {place.payload, payload_bytes()};
+  out.sequence_ = place.sequence;
+  state_->took(tid);
+  return ReadStatus::ok;
+}
+
+WaitStatus RawReader::wait(MonoTime deadline) noexcept {
+  return wait_for_tid(state_->cursor + 1, deadline);
+}
+
+WaitStatus RawReader::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
+  return wait_until(*state_->stream->ring->bell, deadline,
+                    [&] { return state_->ring.newest() >= tid; });
+}
+
+WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept {
+  DSSM_CHECK(!readers.empty() && readers.size() <= kMaxWaitAny);
+  const auto ready = [&] {
+    return std::any_of(readers.begin(), readers.end(),
+                       [](const RawReader* reader) { return reader->newest() > reader->cursor(); });
+  };
+  std::array<ring::Bell*, kMaxWaitAny> bells;
+  std::array<std::uint32_t, kMaxWaitAny> announced;
+  if (ready()) return WaitStatus::ready;
+  if (deadline != kNever && MonoClock::now() >= deadline) return WaitStatus::timeout;
+  for (;;) {
+    for (std::size_t i = 0; i < readers.size(); ++i) {
+      bells[i] = readers[i]->state_->stream->ring->bell.get();
+      announced[i] = bells[i]->announce();
+    }
+    if (ready()) return WaitStatus::ready;
+    const WaitStatus status =
+        ring::Bell::sleep_any(std::span(bells).first(readers.size()), announced, deadline);
+    if (ready()) return WaitStatus::ready;
+    if (status != WaitStatus::ready) return status;
+  }
+}
+
+Result<int> RawReader::ready_fd() noexcept {
+  if (!state_->ready) {
+    auto ready = state_->stream->client->notifiers().watch(state_->stream->ring, state_->cursor);
+    if (!ready) return std::move(ready).error();
+    state_->ready = std::move(*ready);
+  }
+  return state_->ready->fd();
+}
+
+void RawReader::clear_ready() noexcept {
+  if (state_->ready) state_->ready->clear();
+}
+
+const StreamId& RawReader::id() const noexcept { return state_->stream->id; }
+const TypeInfo& RawReader::type() const noexcept { return state_->stream->type; }
+
+std::uint64_t RawReader::payload_bytes() const noexcept {
+  return state_->stream->ring->mapping->geometry().payload_bytes;
+}
+std::uint64_t RawReader::depth() const noexcept {
+  return state_->stream->ring->mapping->geometry().depth;
+}
+Duration RawReader::cycle() const noexcept {
+  return state_->stream->ring->mapping->identity().cycle;
+}
+std::uint64_t RawReader::incarnation() const noexcept {
+  return state_->stream->ring->mapping->identity().incarnation;
+}
+
+Result<std::vector<std::byte>> RawReader::property() const {
+  return detail::get_property(*state_->stream->client, id());
+}
+
+}  // namespace dssm

@@ -1,0 +1,258 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Session's functions as requests to dssmd.
+#include <dssm/session.hpp>
+
+#include "client/src/client.hpp"
+#include "client/src/states.hpp"
+
+namespace dssm {
+namespace {
+
+using namespace std::chrono_literals;
+
+std::string quoted(const char* verb, const StreamId& id) {
+  return std::string(verb) + " '" + id.str() + "'";
+}
+
+// Opens and wraps; every failure says what was tried.
+template <class Raw, class State, class Wrap>
+Result<Raw> opened(Result<std::shared_ptr<detail::OpenStream>> stream, const std::string& what,
+                   Wrap wrap) {
+  if (!stream) return std::move(stream).error().context(what);
+  return wrap(std::make_unique<State>(std::move(*stream)));
+}
+
+Result<void> without_answer(Result<detail::Answer> answer, const std::string& what) {
+  if (!answer) return std::move(answer).error().context(what);
+  return {};
+}
+
+local::Request open_request(const StreamId& id, bool for_writing, std::uint32_t tag) {
+  local::Request request;
+  wire::to_message(id, *request.mutable_open()->mutable_id());
+  request.mutable_open()->set_for_writing(for_writing);
+  request.mutable_open()->set_tag(tag);
+  return request;
+}
+
+}  // namespace
+
+namespace detail {
+
+Result<std::vector<std::byte>> get_property(Client& client, const StreamId& id) {
+  local::Request request;
+  wire::to_message(id, *request.mutable_get_property()->mutable_id());
+  auto answer = client.call(std::move(request));
+  if (!answer) return std::move(answer).error().context(quoted("get the property of", id));
+  const std::string& text = answer->response.property().property();
+  const auto bytes = std::as_bytes(std::span(text));
+  return std::vector<std::byte>(bytes.begin(), bytes.end());
+}
+
+Result<void> set_property(Client& client, const StreamId& id, std::span<const std::byte> property) {
+  const std::string what = quoted("set the property of", id);
+  if (property.size() > wire::kMaxPropertyBytes) {
+    return Error{Errc::limit_exceeded, what + ": it has " + std::to_string(property.size()) +
+                                           " bytes, at most " +
+                                           std::to_string(wire::kMaxPropertyBytes) +
+                                           " are possible; put large data into a stream"};
+  }
+  local::Request request;
+  wire::to_message(id, *request.mutable_set_property()->mutable_id());
+  request.mutable_set_property()->set_property(property.data(), property.size());
+  return without_answer(client.call(std::move(request)), what);
+}
+
+}  // namespace detail
+
+Session::Session(std::shared_ptr<detail::Client> client) noexcept : client_(std::move(client)) {}
+Session::Session(const Session&) = default;
+Session& Session::operator=(const Session&) = default;
+Session::Session(Session&&) noexcept = default;
+Session& Session::operator=(Session&&) noexcept = default;
+Session::~Session() = default;
+
+Result<Session> Session::connect(SessionOptions options) {
+  auto client = detail::Client::connect(std::move(options));
+  if (!client) return std::move(client).error();
+  return Session(std::move(*client));
+}
+
+Result<RawWriter> Session::create_raw(const StreamId& id, const TypeInfo& type,
+                                      const History& history, std::uint32_t tag) {
+  const std::string what = quoted("create", id);
+  if (Result<void> checked = id.check(); !checked) return std::move(checked).error().context(what);
+  if (Result<void> checked = type.check(); !checked)
+    return std::move(checked).error().context(what);
+  local::Request request;
+  local::Create& create = *request.mutable_create();
+  wire::to_message(id, *create.mutable_id());
+  wire::to_message(type, *create.mutable_type());
+  create.set_depth(history.depth);
+  create.set_cycle_ns(to_ns(history.cycle));
+  create.set_tag(tag);
+  return opened<RawWriter, detail::WriterState>(
+      client_->open(std::move(request), Role::writer, tag), what,
+      [](auto state) { return RawWriter(std::move(state)); });
+}
+
+Result<RawWriter> Session::open_raw_writer(const StreamId& id, const TypeInfo* wanted,
+                                           std::uint32_t tag) {
+  const std::string what = quoted("open", id) + " for writing";
+  auto stream = client_->open(open_request(id, true, tag), Role::writer, tag);
+  if (stream && wanted) {
+    if (Result<void> usable = (*stream)->type.check_usable_as(*wanted); !usable) {
+      return std::move(usable).error().context(what);
+    }
+  }
+  return opened<RawWriter, detail::WriterState>(
+      std::move(stream), what, [](auto state) { return RawWriter(std::move(state)); });
+}
+
+Result<RawReader> Session::open_raw_reader(const StreamId& id, const TypeInfo* wanted,
+                                           std::uint32_t tag) {
+  const std::string what = quoted("open", id);
+  auto stream = client_->open(open_request(id, false, tag), Role::reader, tag);
+  if (stream && wanted) {
+    if (Result<void> usable = (*stream)->type.check_usable_as(*wanted); !usable) {
+      return std::move(usable).error().context(what);
+    }
+  }
+  return opened<RawReader, detail::ReaderState>(
+      std::move(stream), what, [](auto state) { return RawReader(std::move(state)); });
+}
+
+Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadline,
+                                            const TypeInfo* wanted) {
+  std::mutex mutex;
+  std::condition_variable came;
+  std::uint64_t times = 0;
+  auto watching = watch([&](const StreamEvent& event) {
+    if (event.kind != StreamEvent::Kind::added || event.stream.id.name != id.name ||
+        event.stream.id.id != id.id) {
+      return;
+    }
+    const std::lock_guard guard(mutex);
+    ++times;
+    came.notify_one();
+  });
+  if (!watching) return std::move(watching).error().context(quoted("wait for", id));
+  for (std::uint64_t seen = 0;;) {
+    auto reader = open_raw_reader(id, wanted);
+    if (reader || reader.error().code != Errc::not_found) return reader;
+    std::unique_lock lock(mutex);
+    // steady_clock is CLOCK_MONOTONIC too, with the same origin.
+    const std::chrono::steady_clock::time_point until(deadline.time_since_epoch());
+    if (deadline == kNever) {
+      came.wait(lock, [&] { return times > seen; });
+    } else if (!came.wait_until(lock, until, [&] { return times > seen; })) {
+      return std::move(reader).error();
+    }
+    seen = times;
+  }
+}
+
+Result<void> Session::remove(const StreamId& id) {
+  local::Request request;
+  wire::to_message(id, *request.mutable_remove()->mutable_id());
+  return without_answer(client_->call(std::move(request)), quoted("remove", id));
+}
+
+Result<std::vector<StreamInfo>> Session::list() {
+  local::Request request;
+  request.mutable_list();
+  auto answer = client_->call(std::move(request));
+  if (!answer) return std::move(answer).error().context("list the streams");
+  std::vector<StreamInfo> streams;
+  streams.reserve(static_cast<std::size_t>(answer->response.stream_list().streams_size()));
+  for (const local::Stream& stream : answer->response.stream_list().streams()) {
+    streams.push_back(wire::stream_info(stream));
+  }
+  return streams;
+}
+
+Result<StreamInfo> Session::info(const StreamId& id) {
+  local::Request request;
+  wire::to_message(id, *request.mutable_info()->mutable_id());
+  auto answer = client_->call(std::move(request));
+  if (!answer) return std::move(answer).error().context(quoted("look at", id));
+  if (answer->response.stream_list().streams_size() != 1) {
+    return Error{Errc::protocol, quoted("look at", id) + ": dssmd answered without the stream"};
+  }
+  return wire::stream_info(answer->response.stream_list().streams(0));
+}
+
+struct Session::Watch::State {
+  std::shared_ptr<detail::Client> client;
+  std::uint64_t key;
+  ~State() { client->remove_watch(key); }
+};
+
+Session::Watch::Watch(std::unique_ptr<State> state) noexcept : state_(std::move(state)) {}
+Session::Watch::Watch(Watch&&) noexcept = default;
+Session::Watch& Session::Watch::operator=(Watch&&) noexcept = default;
+Session::Watch::~Watch() = default;
+
+Result<Session::Watch> Session::watch(std::function<void(const StreamEvent&)> on_event) {
+  auto key = client_->add_watch(std::move(on_event));
+  if (!key) return std::move(key).error().context("watch the streams");
+  return Watch(std::unique_ptr<Watch::State>(new Watch::State{client_, *key}));
+}
+
+Result<void> Session::set_property(const StreamId& id, std::span<const std::byte> property) {
+  return detail::set_property(*client_, id, property);
+}
+
+Result<std::vector<std::byte>> Session::property(const StreamId& id) {
+  return detail::get_property(*client_, id);
+}
+
+Result<PlaybackClock> Session::playback_clock() {
+  auto record = client_->playback_clock();
+  if (!record) return std::move(record).error().context("open the playback clock");
+  return PlaybackClock(
+      std::make_shared<detail::PlaybackClockState>(detail::PlaybackClockState{*record}));
+}
+
+Result<std::vector<ClientInfo>> Session::clients() {
+  local::Request request;
+  request.mutable_list_clients();
+  auto answer = client_->call(std::move(request));
+  if (!answer) return std::move(answer).error().context("list the processes");
+  std::vector<ClientInfo> clients;
+  for (const local::Client& client : answer->response.client_list().clients()) {
+    clients.push_back({client.pid(), client.uid(), client.program()});
+  }
+  return clients;
+}
+
+Result<std::vector<OpenInfo>> Session::opens() {
+  local::Request request;
+  request.mutable_list_opens();
+  auto answer = client_->call(std::move(request));
+  if (!answer) return std::move(answer).error().context("list the open streams");
+  std::vector<OpenInfo> opens;
+  for (const local::OpenEntry& entry : answer->response.open_list().opens()) {
+    opens.push_back({{entry.id().name(), entry.id().id(), entry.id().host()},
+                     entry.creator_pid(),
+                     entry.opener_pid(),
+                     entry.tag(),
+                     entry.for_writing() ? Role::writer : Role::reader});
+  }
+  return opens;
+}
+
+Result<DaemonInfo> Session::daemon() {
+  local::Request request;
+  request.mutable_get_daemon();
+  auto answer = client_->call(std::move(request));
+  if (!answer) return std::move(answer).error().context("ask dssmd about itself");
+  const local::Daemon& daemon = answer->response.daemon();
+  return DaemonInfo{daemon.host(),    daemon.version(),      daemon.pid(),
+                    daemon.streams(), daemon.memory_bytes(), daemon.memory_limit_bytes()};
+}
+
+bool Session::connected() const noexcept { return client_->connected(); }
+
+}  // namespace dssm

@@ -1,0 +1,56 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <dssm/writer.hpp>
+
+#include "client/src/states.hpp"
+
+namespace dssm {
+
+Loan::Loan(detail::WriterState* state) noexcept : state_(state) {
+  if (std::byte* slot = state->ring.begin()) payload_ = {slot, state->payload_bytes};
+}
+
+Tid Loan::publish(Time time, Duration clock_error) noexcept {
+  if (payload_.empty()) return kNoTid;
+  payload_ = {};
+  return state_->ring.commit(time, clock_error);
+}
+
+void Loan::abandon() noexcept {
+  if (payload_.empty()) return;
+  payload_ = {};
+  state_->ring.cancel();
+}
+
+RawWriter::RawWriter(std::unique_ptr<detail::WriterState> state) noexcept
+    : state_(std::move(state)) {}
+RawWriter::RawWriter(RawWriter&&) noexcept = default;
+RawWriter& RawWriter::operator=(RawWriter&&) noexcept = default;
+RawWriter::~RawWriter() = default;
+
+Tid RawWriter::write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept {
+  if (payload.size() != state_->payload_bytes) return kNoTid;
+  return state_->ring.write(payload, time, clock_error);
+}
+
+Loan RawWriter::loan() noexcept { return Loan(state_.get()); }
+
+Result<void> RawWriter::set_property(std::span<const std::byte> property) {
+  return detail::set_property(*state_->stream->client, id(), property);
+}
+
+Tid RawWriter::newest() const noexcept { return state_->ring.newest(); }
+const StreamId& RawWriter::id() const noexcept { return state_->stream->id; }
+const TypeInfo& RawWriter::type() const noexcept { return state_->stream->type; }
+std::uint64_t RawWriter::payload_bytes() const noexcept { return state_->payload_bytes; }
+
+std::uint64_t RawWriter::depth() const noexcept {
+  return state_->stream->ring->mapping->geometry().depth;
+}
+Duration RawWriter::cycle() const noexcept {
+  return state_->stream->ring->mapping->identity().cycle;
+}
+std::uint64_t RawWriter::incarnation() const noexcept {
+  return state_->stream->ring->mapping->identity().incarnation;
+}
+
+}  // namespace dssm
