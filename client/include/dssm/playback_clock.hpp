@@ -10,7 +10,8 @@
 
 #include <memory>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 namespace detail {
 struct PlaybackClockState;
@@ -34,8 +35,8 @@ class PlaybackClock {
 
   // All setters keep the clock continuous unless they set the time itself. They are serialised by a
   // robust lock; a process killed inside one leaves the old or the new setting.
-  void reset() noexcept;                    // offset 0, speed 1, not paused
-  void set_time(double time_s) noexcept;    // SSM time becomes `time_s` now, paused or not
+  void reset() noexcept;                  // offset 0, speed 1, not paused
+  void set_time(double time_s) noexcept;  // SSM time becomes `time_s` now, paused or not
   void set_offset(double offset_s) noexcept;
   void set_speed(double speed) noexcept;
   void set_paused(bool paused) noexcept;
@@ -47,3 +48,4 @@ class PlaybackClock {
 };
 
 }  // namespace dssm
+#pragma GCC visibility pop

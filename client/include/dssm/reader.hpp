@@ -14,16 +14,16 @@
 //   moved    a moved-from reader may only be assigned to or destroyed
 #pragma once
 
+#include <cstddef>
 #include <dssm/describe.hpp>
 #include <dssm/sample.hpp>
 #include <dssm/stream.hpp>
-
-#include <cstddef>
 #include <memory>
 #include <span>
 #include <vector>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 namespace detail {
 struct ReaderState;
@@ -151,8 +151,8 @@ class RawReader {
 
   // --- about the stream -----------------------------------------------------------------------
 
-  const StreamId& id() const noexcept;      // with its owner's host
-  const TypeInfo& type() const noexcept;    // as stored with the stream
+  const StreamId& id() const noexcept;    // with its owner's host
+  const TypeInfo& type() const noexcept;  // as stored with the stream
   std::uint64_t payload_bytes() const noexcept;
   std::uint64_t depth() const noexcept;
   Duration cycle() const noexcept;
@@ -179,7 +179,9 @@ class Reader : public RawReader {
  public:
   explicit Reader(RawReader raw) noexcept : RawReader(std::move(raw)) {}
 
-  ReadStatus latest(T& out, SampleInfo& info) noexcept { return RawReader::latest(bytes(out), info); }
+  ReadStatus latest(T& out, SampleInfo& info) noexcept {
+    return RawReader::latest(bytes(out), info);
+  }
   ReadStatus tid(Tid n, T& out, SampleInfo& info) noexcept {
     return RawReader::tid(n, bytes(out), info);
   }
@@ -209,3 +211,4 @@ class Reader : public RawReader {
 };
 
 }  // namespace dssm
+#pragma GCC visibility pop

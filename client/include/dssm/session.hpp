@@ -17,14 +17,14 @@
 #include <dssm/reader.hpp>
 #include <dssm/stream.hpp>
 #include <dssm/writer.hpp>
-
 #include <functional>
 #include <memory>
 #include <optional>
 #include <string>
 #include <vector>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 namespace detail {
 class Client;
@@ -48,7 +48,8 @@ struct OpenInfo {
   StreamId stream;
   std::int32_t creator_pid = 0;  // who created the stream
   std::int32_t opener_pid = 0;
-  std::uint32_t tag = 0;  // as given to open_reader() or open_writer(); SSM keeps its open mode here
+  std::uint32_t tag =
+      0;  // as given to open_reader() or open_writer(); SSM keeps its open mode here
   Role role = Role::reader;
 };
 
@@ -105,9 +106,8 @@ class Session {
   // The same with a type; `name` as StreamId::parse() reads it.
   template <Payload T>
   Result<Writer<T>> create(std::string_view name, const History& history) {
-    return typed<Writer<T>>(name, [&](const StreamId& id) {
-      return create_raw(id, type_of<T>(), history);
-    });
+    return typed<Writer<T>>(
+        name, [&](const StreamId& id) { return create_raw(id, type_of<T>(), history); });
   }
   template <Payload T>
   Result<Writer<T>> create(std::string_view name, Duration life, Duration cycle) {
@@ -196,3 +196,4 @@ class Session {
 };
 
 }  // namespace dssm
+#pragma GCC visibility pop

@@ -11,15 +11,15 @@
 //   moved    a moved-from writer may only be assigned to or destroyed
 #pragma once
 
+#include <cstddef>
 #include <dssm/describe.hpp>
 #include <dssm/sample.hpp>
 #include <dssm/stream.hpp>
-
-#include <cstddef>
 #include <memory>
 #include <span>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 namespace detail {
 struct WriterState;
@@ -111,3 +111,4 @@ class Writer : public RawWriter {
 };
 
 }  // namespace dssm
+#pragma GCC visibility pop

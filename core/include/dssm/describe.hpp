@@ -19,7 +19,8 @@
 #include <dssm/stream.hpp>
 #include <type_traits>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 // What a sample may be: copied as bytes, aligned to a cache line at most.
 template <class T>
@@ -127,7 +128,8 @@ TypeInfo type_of() {
   }
 }
 
-}  // namespace gnu::visibility("default")]]
+}  // namespace dssm
+#pragma GCC visibility pop
 
 // One step of a loop over macro arguments; 4^4 rescans allow 64 members and more.
 #define DSSM_DETAIL_PARENS ()

@@ -8,7 +8,8 @@
 #include <string_view>
 #include <utility>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 enum class Errc {
   invalid_argument,  // the caller's words are wrong: a name, a size, a duration, a configuration
@@ -46,4 +47,5 @@ struct Error {
 Error os_error(std::string_view what);
 Error os_error(std::string_view what, int errno_value);
 
-}  // namespace gnu::visibility("default")]]
+}  // namespace dssm
+#pragma GCC visibility pop

@@ -11,7 +11,8 @@
 #include <utility>
 #include <variant>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 // What value() throws.
 class BadResult : public std::runtime_error {
@@ -85,4 +86,5 @@ class [[nodiscard]] Result<void> {
   bool failed_ = false;
 };
 
-}  // namespace gnu::visibility("default")]]
+}  // namespace dssm
+#pragma GCC visibility pop

@@ -7,7 +7,8 @@
 #include <dssm/time.hpp>
 #include <string_view>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 // The number of a sample in its stream: 0, 1, 2 ... in write order.
 using Tid = std::int64_t;
@@ -39,4 +40,5 @@ enum class [[nodiscard]] WaitStatus : std::uint8_t{
 // "ok", "not_yet" ...; static storage.
 std::string_view status_name(ReadStatus status) noexcept;
 
-}  // namespace gnu::visibility("default")]]
+}  // namespace dssm
+#pragma GCC visibility pop

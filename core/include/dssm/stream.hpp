@@ -11,7 +11,8 @@
 #include <string_view>
 #include <vector>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 // Limits of the format; dssmd's configuration may be narrower.
 inline constexpr std::size_t kMaxNameBytes = 31;      // SSM programs hold names in 32 bytes
@@ -131,4 +132,5 @@ struct StreamInfo {
   std::vector<StreamUser> users;  // filled by Session::info(), not by Session::list()
 };
 
-}  // namespace gnu::visibility("default")]]
+}  // namespace dssm
+#pragma GCC visibility pop

@@ -9,7 +9,8 @@
 #include <cstdint>
 #include <ctime>
 
-namespace dssm [[gnu::visibility("default")]] {
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 using Duration = std::chrono::nanoseconds;
 
@@ -62,4 +63,5 @@ inline MonoTime deadline_in(Duration d) noexcept {
   return d > kNever - now ? kNever : now + d;
 }
 
-}  // namespace gnu::visibility("default")]]
+}  // namespace dssm
+#pragma GCC visibility pop
