@@ -1,0 +1,101 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// mapper: draws the walls that the LIDAR saw and the way that the vehicle took. It follows the
+// stream "pose", fetches from "lidar" the scan of each pose's time, and writes a picture when the
+// drive is over: at the end mark, when nothing has come for a while, or when told to stop.
+#include <CLI/CLI.hpp>
+#include <cmath>
+#include <cstdio>
+#include <dssm/dssm.hpp>
+#include <string>
+#include <vector>
+
+#include "input.hpp"
+#include "map_picture.hpp"
+#include "occupancy_grid.hpp"
+#include "progress.hpp"
+#include "samples.hpp"
+#include "stop.hpp"
+
+namespace {
+
+int fail(const dssm::Error& error) {
+  std::fprintf(stderr, "mapper: %s\n", error.message.c_str());
+  return 1;
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  CLI::App app("Draws a map from poses and LIDAR scans.");
+  std::string out = "map.png";
+  double patience_s = 10;
+  bool late = false;
+  app.add_option("--out", out, "the picture to write (PNG)")->capture_default_str();
+  app.add_option("--patience", patience_s, "seconds without a pose after which the drive is over")
+      ->check(CLI::Range(0.1, 86400.0))
+      ->capture_default_str();
+  app.add_flag("--late", late, "take the newest drive also when it is over already");
+  CLI11_PARSE(app, argc, argv);
+  vehicle::stop_on_signals();
+  vehicle::Progress progress("mapper");
+  const dssm::Duration patience(std::llround(patience_s * 1e9));
+
+  dssm::Result<dssm::Session> session = dssm::Session::connect();
+  if (!session) return fail(session.error());
+  auto pose_reader =
+      vehicle::open_when_there<vehicle::Pose>(*session, vehicle::kPoseStream, progress);
+  if (!pose_reader) return fail(pose_reader.error());
+  if (!*pose_reader) return 0;
+  dssm::Reader<vehicle::Pose>& poses = **pose_reader;
+  vehicle::seek_to_drive(poses, late);
+  auto scan_reader =
+      vehicle::open_when_there<vehicle::Scan>(*session, vehicle::kScanStream, progress);
+  if (!scan_reader) return fail(scan_reader.error());
+  if (!*scan_reader) return 0;
+  dssm::Reader<vehicle::Scan>& lidar = **scan_reader;
+
+  vehicle::OccupancyGrid grid;
+  std::vector<vehicle::Pose2> way;
+  std::size_t without_scan = 0;
+  const auto summary = [&] {
+    std::string text = std::to_string(way.size()) + " scans drawn";
+    if (without_scan) text += ", " + std::to_string(without_scan) + " poses without their scan";
+    if (poses.lost()) text += ", " + std::to_string(poses.lost()) + " poses missed";
+    return text;
+  };
+  vehicle::Pose pose;
+  vehicle::Scan scan;
+  dssm::SampleInfo pose_info, scan_info;
+  dssm::MonoTime deadline = dssm::kNever;  // the first pose may take as long as it likes
+  while (!vehicle::stop_requested()) {
+    if (poses.next(pose, pose_info) != dssm::ReadStatus::ok) {
+      if (dssm::MonoClock::now() >= deadline) {
+        progress.say("no pose for " + std::to_string(std::lround(patience_s)) +
+                     " s and no end mark: the map shows what came until then");
+        break;
+      }
+      (void)poses.wait(dssm::deadline_in(vehicle::kSlice));
+      continue;
+    }
+    deadline = dssm::deadline_in(patience);
+    if (pose.is_end()) break;
+    if (lidar.at(pose_info.time, scan, scan_info) == dssm::ReadStatus::ok &&
+        scan_info.tid == pose.scan_tid) {
+      const vehicle::Pose2 laser{pose.x_m, pose.y_m, pose.theta_rad};
+      grid.add(laser, {scan.ranges(), scan.first_rad, scan.step_rad});
+      way.push_back(laser);
+    } else {
+      ++without_scan;
+    }
+    progress.update(summary);
+  }
+
+  if (dssm::Result<void> written = vehicle::write_png(vehicle::draw_map(grid, way), out);
+      !written) {
+    return fail(written.error());
+  }
+  progress.say(summary() + "; " + std::to_string(grid.count(vehicle::OccupancyGrid::Cell::wall)) +
+               " wall cells; the map is in '" + out + "'");
+  return 0;
+}

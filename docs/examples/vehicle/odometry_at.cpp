@@ -1,0 +1,43 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "odometry_at.hpp"
+
+#include <algorithm>
+#include <utility>
+
+#include "stop.hpp"
+
+namespace vehicle {
+
+OdometryAt::OdometryAt(dssm::Reader<Odometry> reader, dssm::Duration deadline)
+    : reader_(std::move(reader)), deadline_(deadline), newest_at_start_(reader_.newest()) {}
+
+std::optional<Pose2> OdometryAt::between(dssm::Time t, const dssm::Neighbours& readings) {
+  Odometry before, after;
+  dssm::SampleInfo info;
+  if (reader_.tid(readings.before.tid, before, info) != dssm::ReadStatus::ok ||
+      reader_.tid(readings.after.tid, after, info) != dssm::ReadStatus::ok) {
+    return std::nullopt;  // overwritten since the search: too old by now
+  }
+  return interpolate({before.x_m, before.y_m, before.theta_rad},
+                     {after.x_m, after.y_m, after.theta_rad},
+                     weight_of(dssm::to_ns(t), dssm::to_ns(readings.before.time),
+                               dssm::to_ns(readings.after.time)));
+}
+
+std::optional<Pose2> OdometryAt::at(dssm::Time t) {
+  const dssm::MonoTime deadline = dssm::deadline_in(deadline_);
+  while (!stop_requested()) {
+    const dssm::Tid newest = reader_.newest();  // before the search: what comes after it wakes us
+    dssm::Neighbours readings;
+    const dssm::ReadStatus status = reader_.neighbours(t, readings);
+    if (status == dssm::ReadStatus::ok) return between(t, readings);
+    // Too old for good, unless all there is stems from an earlier drive with later stamps.
+    if (status == dssm::ReadStatus::too_old && newest != newest_at_start_) return std::nullopt;
+    const dssm::MonoTime now = dssm::MonoClock::now();
+    if (now >= deadline) return std::nullopt;
+    (void)reader_.wait_for_tid(newest + 1, std::min(deadline, now + kSlice));
+  }
+  return std::nullopt;
+}
+
+}  // namespace vehicle

@@ -1,0 +1,34 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// "What did the encoder say when this scan was taken?": the question that DSSM is for.
+#pragma once
+
+#include <dssm/reader.hpp>
+#include <optional>
+
+#include "odometry.hpp"
+#include "pose.hpp"
+
+namespace vehicle {
+
+class OdometryAt {
+ public:
+  // `deadline` is how long at() waits for the encoder at most, by the clock on the wall of the
+  // laboratory: a replay at a higher speed needs less.
+  OdometryAt(dssm::Reader<Odometry> reader, dssm::Duration deadline);
+
+  // The vehicle's pose at `t`, in proportion between the readings before and after it. When the
+  // later one is not written yet, waits for it; in a live system it comes within one cycle.
+  // nullopt when it does not come in time, when the ring no longer holds the earlier one, or when
+  // a signal asks to stop.
+  std::optional<Pose2> at(dssm::Time t);
+
+ private:
+  std::optional<Pose2> between(dssm::Time t, const dssm::Neighbours& readings);
+
+  dssm::Reader<Odometry> reader_;
+  dssm::Duration deadline_;
+  dssm::Tid newest_at_start_;
+};
+
+}  // namespace vehicle
