@@ -1,0 +1,265 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/local/local_service.hpp"
+
+#include <algorithm>
+#include <utility>
+
+#include "core/base/utf8.hpp"
+#include "core/wire/frame.hpp"
+#include "core/wire/local_protocol.hpp"
+#include "daemon/service/message_ids.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+// What one client may have waiting during recovery.
+constexpr std::size_t kMaxHeldBytes = 1U << 20;
+
+local::Response failure_response(std::uint64_t serial, const Error& error) {
+  local::Response response;
+  response.set_serial(serial);
+  wire::to_message(error, *response.mutable_failure());
+  return response;
+}
+
+}  // namespace
+
+std::string last_words(const Error& error) {
+  return wire::encode_frame(failure_response(0, error));
+}
+
+LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
+                           Logger& logger, bool recovering)
+    : registry_(registry),
+      opens_(opens),
+      clock_(clock),
+      logger_(logger),
+      requests_(registry, opens, clock),
+      recovering_(recovering) {
+  registry_.observe(this);
+}
+
+LocalService::~LocalService() { registry_.observe(nullptr); }
+
+ClientNumber LocalService::connect(std::int32_t pid, std::uint32_t uid, ClientOutput& output) {
+  const ClientNumber number = next_client_++;
+  Client client;
+  client.identity = std::make_shared<ClientIdentity>(ClientIdentity{number, pid, uid, "?"});
+  client.output = &output;
+  clients_.emplace(number, std::move(client));
+  return number;
+}
+
+void LocalService::disconnect(ClientNumber number) {
+  const auto client = clients_.extract(number);
+  if (!client) return;
+  opens_.remove_all(number);
+  std::erase_if(held_, [number](const Held& held) { return held.client == number; });
+  if (client.mapped().greeted) {
+    logger_.debug("client left", {.peer = client.mapped().identity->str()});
+  }
+}
+
+bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
+                                      DescriptorQueue& descriptors) {
+  Client& client = clients_.at(number);
+  local::Request request;
+  if (!request.ParseFromArray(frame.data(), static_cast<int>(frame.size()))) {
+    return refuse(client, 0, {Errc::protocol, "the frame is no request of DSSM's local protocol"});
+  }
+  const std::uint64_t serial = request.serial();
+  if (serial == 0) {
+    return refuse(client, 0, {Errc::protocol, "the request has no serial; it takes one above 0"});
+  }
+  if (request.has_hello()) return greet(client, serial, request.hello());
+  if (!client.greeted) {
+    return refuse(client, serial,
+                  {Errc::protocol, "the first request on a connection has to be Hello"});
+  }
+  if (must_wait(request)) {
+    hold(client, request, frame.size());
+  } else {
+    serve(number, request, descriptors);
+    // Only something that came back can end a wait.
+    if (recovering_ && (request.has_offer() || request.has_open_clock())) release_held();
+  }
+  return true;
+}
+
+bool LocalService::refuse(const Client& client, std::uint64_t serial, const Error& error) {
+  logger_.warning("close a connection: " + error.message,
+                  {.peer = client.identity->str(), .message_id = message_id::kClientRefused});
+  send_failure(client, serial, error);
+  return false;
+}
+
+bool LocalService::greet(Client& client, std::uint64_t serial, const local::Hello& hello) {
+  if (client.greeted) {
+    return refuse(client, serial, {Errc::protocol, "Hello comes once, as the first request"});
+  }
+  ClientIdentity identity = *client.identity;
+  identity.program = printable(hello.program().substr(0, wire::kMaxProgramBytes));
+  while (!identity.program.empty() && !is_utf8(identity.program)) identity.program.pop_back();
+  client.identity = std::make_shared<ClientIdentity>(std::move(identity));
+  if (hello.protocol_version() != wire::kLocalProtocolVersion) {
+    return refuse(client, serial,
+                  {Errc::protocol,
+                   "this dssmd (" DSSM_VERSION ") speaks version " +
+                       std::to_string(wire::kLocalProtocolVersion) +
+                       " of the local protocol, the program speaks version " +
+                       std::to_string(hello.protocol_version()) +
+                       "; install the same version of DSSM on both sides and restart the older"});
+  }
+  client.greeted = true;
+  logger_.debug("client came", {.peer = client.identity->str()});
+  Reply reply;
+  local::Welcome& welcome = *reply.response.mutable_welcome();
+  welcome.set_protocol_version(wire::kLocalProtocolVersion);
+  welcome.set_host(registry_.host());
+  welcome.set_daemon_version(DSSM_VERSION);
+  send(client, serial, std::move(reply));
+  return true;
+}
+
+void LocalService::serve(ClientNumber number, const local::Request& request,
+                         DescriptorQueue& descriptors) {
+  if (request.has_watch()) return watch(number, request.serial());
+  if (request.has_list_clients()) return list_clients(clients_.at(number), request.serial());
+  const auto identity = clients_.at(number).identity;
+  Result<Reply> reply = requests_.handle_untrusted(identity, request, descriptors);
+  // Events of this request may have cost this very client its connection.
+  const auto client = clients_.find(number);
+  if (client == clients_.end()) return;
+  if (reply && request.has_offer()) {
+    logger_.info(
+        "took stream '" +
+            StreamId{request.offer().id().name(), request.offer().id().id(), registry_.host()}
+                .str() +
+            "' back from a program",
+        {.peer = identity->str(), .message_id = message_id::kStreamAdopted});
+  }
+  if (!reply && request.has_offer()) {
+    logger_.warning("refuse an offered stream: " + reply.error().message,
+                    {.peer = identity->str(), .message_id = message_id::kOfferRefused});
+  }
+  if (reply) {
+    send(client->second, request.serial(), *std::move(reply));
+  } else {
+    send_failure(client->second, request.serial(), reply.error());
+  }
+}
+
+void LocalService::watch(ClientNumber number, std::uint64_t serial) {
+  Reply reply;
+  reply.response.mutable_done();
+  clients_.at(number).watching = true;
+  send(clients_.at(number), serial, std::move(reply));
+  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
+    const auto client = clients_.find(number);
+    if (client == clients_.end()) return;
+    Reply event;
+    requests_.describe(*stream, *event.response.mutable_stream_event()->mutable_stream());
+    send(client->second, 0, std::move(event));
+  }
+}
+
+void LocalService::list_clients(const Client& client, std::uint64_t serial) {
+  Reply reply;
+  local::ClientList& list = *reply.response.mutable_client_list();
+  for (const auto& [number, other] : clients_) {
+    if (!other.greeted) continue;
+    local::Client& entry = *list.add_clients();
+    entry.set_pid(other.identity->pid);
+    entry.set_uid(other.identity->uid);
+    entry.set_program(other.identity->program);
+  }
+  send(client, serial, std::move(reply));
+}
+
+void LocalService::send(const Client& client, std::uint64_t serial, Reply reply) {
+  reply.response.set_serial(serial);
+  client.output->send(wire::encode_frame(reply.response), std::move(reply.descriptors));
+}
+
+void LocalService::send_failure(const Client& client, std::uint64_t serial, const Error& error) {
+  client.output->send(wire::encode_frame(failure_response(serial, error)), {});
+}
+
+void LocalService::broadcast(const local::StreamEvent& event) {
+  std::vector<ClientNumber> watchers;  // sending may end connections
+  for (const auto& [number, client] : clients_) {
+    if (client.watching) watchers.push_back(number);
+  }
+  if (watchers.empty()) return;
+  local::Response response;
+  *response.mutable_stream_event() = event;
+  const std::string frame = wire::encode_frame(response);
+  for (const ClientNumber number : watchers) {
+    if (const auto client = clients_.find(number); client != clients_.end()) {
+      client->second.output->send(frame, {});
+    }
+  }
+}
+
+void LocalService::on_stream_added(const Stream& stream) {
+  local::StreamEvent event;
+  requests_.describe(stream, *event.mutable_stream());
+  broadcast(event);
+  logger_.debug("stream '" + stream.id().str() + "' is there",
+                {.stream = stream.id().str(), .message_id = message_id::kStreamCreated});
+}
+
+void LocalService::on_stream_removed(const StreamId& id) {
+  local::StreamEvent event;
+  event.set_removed(true);
+  wire::to_message(id, *event.mutable_stream()->mutable_id());
+  broadcast(event);
+  logger_.debug("stream '" + id.str() + "' is removed",
+                {.stream = id.str(), .message_id = message_id::kStreamRemoved});
+}
+
+// --- recovery
+// -------------------------------------------------------------------------------------
+
+bool LocalService::must_wait(const local::Request& request) const {
+  if (!recovering_ || request.has_offer()) return false;
+  if (request.has_open_clock()) return !request.open_clock().offered() && !clock_.has_one();
+  const local::StreamId* subject = StreamRequests::subject(request);
+  if (!subject) return false;
+  // A name that is no name is refused at once.
+  const Result<StreamId> id = wire::stream_id_untrusted(*subject);
+  return id && !registry_.knows(*id);
+}
+
+void LocalService::hold(Client& client, const local::Request& request, std::size_t bytes) {
+  if (client.held_bytes + bytes > kMaxHeldBytes) {
+    return send_failure(client, request.serial(),
+                        {Errc::limit_exceeded,
+                         "dssmd was restarted and waits for streams that programs give back; this "
+                         "program has 1 MiB of requests waiting already: ask again in a second"});
+  }
+  client.held_bytes += bytes;
+  held_.push_back({client.identity->number, request, bytes});
+}
+
+void LocalService::release_held() {
+  std::vector<Held> ready;
+  const auto still_waiting = std::stable_partition(
+      held_.begin(), held_.end(), [this](const Held& held) { return must_wait(held.request); });
+  std::move(still_waiting, held_.end(), std::back_inserter(ready));
+  held_.erase(still_waiting, held_.end());
+  DescriptorQueue none;
+  for (const Held& held : ready) {
+    const auto client = clients_.find(held.client);
+    if (client == clients_.end()) continue;
+    client->second.held_bytes -= held.bytes;
+    serve(held.client, held.request, none);
+  }
+}
+
+void LocalService::end_recovery() {
+  recovering_ = false;
+  release_held();
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,106 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The local protocol without its socket: knows all clients of this PC, takes their frames, answers
+// them, and tells those who watch. Connection and Server carry the bytes; tests and fuzzers put
+// frames in directly.
+//
+// After a crash of the dssmd before this one, programs that still hold streams come back and offer
+// them. Until end_recovery() a request about a stream that nobody offered yet is held back, not
+// refused: otherwise a writer that starts anew could take the name of a ring that others still use.
+#pragma once
+
+#include <cstddef>
+#include <dssm/result.hpp>
+#include <map>
+#include <memory>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "daemon/local/stream_requests.hpp"
+#include "daemon/service/log.hpp"
+#include "daemon/streams/open_table.hpp"
+#include "daemon/streams/playback_clock_owner.hpp"
+#include "daemon/streams/registry.hpp"
+
+namespace dssm::daemon {
+
+// Where a client's frames go. send() must not call back into LocalService, but for disconnect() of
+// that same client.
+class ClientOutput {
+ public:
+  virtual void send(const std::string& frame, std::vector<UniqueFd> descriptors) = 0;
+
+ protected:
+  ~ClientOutput() = default;
+};
+
+// The answer to a peer that gets no further one: a failure that belongs to no request.
+std::string last_words(const Error& error);
+
+class LocalService final : private StreamObserver {
+ public:
+  // recovering: the dssmd before this one did not end properly.
+  LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock, Logger& logger,
+               bool recovering);
+  LocalService(const LocalService&) = delete;
+  LocalService& operator=(const LocalService&) = delete;
+  ~LocalService();
+
+  // A client connected; `output` stays until disconnect().
+  ClientNumber connect(std::int32_t pid, std::uint32_t uid, ClientOutput& output);
+  void disconnect(ClientNumber number);
+  std::size_t clients() const noexcept { return clients_.size(); }
+
+  // One frame of a client, without its length. Whatever is to be said goes to its output before
+  // this returns, or later for a request that is held back.
+  //   returns  false: the client does not keep to the protocol, the connection must end
+  bool on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
+                          DescriptorQueue& descriptors);
+
+  // The time to offer streams is over: held requests are answered.
+  void end_recovery();
+
+ private:
+  struct Client {
+    std::shared_ptr<const ClientIdentity> identity;
+    ClientOutput* output = nullptr;
+    bool greeted = false;
+    bool watching = false;
+    std::size_t held_bytes = 0;
+  };
+  struct Held {
+    ClientNumber client = 0;
+    local::Request request;
+    std::size_t bytes = 0;
+  };
+
+  bool refuse(const Client& client, std::uint64_t serial, const Error& error);
+  bool greet(Client& client, std::uint64_t serial, const local::Hello& hello);
+  void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
+  void watch(ClientNumber number, std::uint64_t serial);
+  void list_clients(const Client& client, std::uint64_t serial);
+  void send(const Client& client, std::uint64_t serial, Reply reply);
+  void send_failure(const Client& client, std::uint64_t serial, const Error& error);
+  void broadcast(const local::StreamEvent& event);
+
+  bool must_wait(const local::Request& request) const;
+  void hold(Client& client, const local::Request& request, std::size_t bytes);
+  void release_held();
+
+  void on_stream_added(const Stream& stream) override;
+  void on_stream_removed(const StreamId& id) override;
+
+  Registry& registry_;
+  OpenTable& opens_;
+  PlaybackClockOwner& clock_;
+  Logger& logger_;
+  StreamRequests requests_;
+  bool recovering_;
+  ClientNumber next_client_ = 1;
+  std::map<ClientNumber, Client> clients_;
+  std::vector<Held> held_;  // in the order of arrival
+};
+
+}  // namespace dssm::daemon

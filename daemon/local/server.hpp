@@ -1,0 +1,46 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Accepts the programs of this PC and keeps their connections.
+#pragma once
+
+#include <cstdint>
+#include <map>
+#include <memory>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "daemon/local/connection.hpp"
+#include "daemon/local/listener.hpp"
+#include "daemon/local/local_service.hpp"
+#include "daemon/service/event_loop.hpp"
+#include "daemon/service/log.hpp"
+
+namespace dssm::daemon {
+
+class Server {
+ public:
+  // Serves from the construction on; everything given outlives it.
+  Server(const EventLoop& loop, const Listener& listener, std::uint64_t max_clients,
+         LocalService& service, Logger& logger);
+  Server(const Server&) = delete;
+  Server& operator=(const Server&) = delete;
+
+ private:
+  void on_connection();
+  void accept(UniqueFd socket);
+  void turn_away(UniqueFd socket, const Error& error);
+  void make_room_to_refuse();
+
+  const EventLoop& loop_;
+  const Listener& listener_;
+  std::uint64_t max_clients_;
+  LocalService& service_;
+  Logger& logger_;
+  UniqueFd spare_;  // given up for a moment to refuse a client when descriptors run out
+  std::uint64_t next_ = 0;
+  std::map<std::uint64_t, std::unique_ptr<Connection>> connections_;
+  std::vector<std::uint64_t> ended_;  // to be destroyed outside of their own callbacks
+  EventSource incoming_, sweep_;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,284 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/local/stream_requests.hpp"
+
+#include <unistd.h>
+
+#include <utility>
+
+#include "core/wire/local_protocol.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+// Lists leave room for what frames them; fields of types go first when a list gets too long.
+constexpr std::size_t kMaxListBytes = wire::kMaxLocalFrameBytes - (1U << 20);
+
+Reply done() {
+  Reply reply;
+  reply.response.mutable_done();
+  return reply;
+}
+
+Error missing_descriptors(const std::string& wanted) {
+  return Error{Errc::protocol, "the request comes without its descriptors (" + wanted + ")"};
+}
+
+// The descriptors of the oldest message that brought any.
+std::vector<UniqueFd> take_descriptors(DescriptorQueue& queue) {
+  if (queue.empty()) return {};
+  std::vector<UniqueFd> taken = std::move(queue.front());
+  queue.pop_front();
+  return taken;
+}
+
+}  // namespace
+
+Result<Reply> StreamRequests::handle_untrusted(const Client& client, const local::Request& request,
+                                               DescriptorQueue& descriptors) {
+  switch (request.body_case()) {
+    case local::Request::kCreate:
+      return create(client, request.create());
+    case local::Request::kOpen:
+      return open(client, request.open());
+    case local::Request::kOffer:
+      return offer(client, request.offer(), descriptors);
+    case local::Request::kClose:
+      return close(client, request.close());
+    case local::Request::kRemove:
+      return remove(request.remove());
+    case local::Request::kList:
+      return list();
+    case local::Request::kInfo:
+      return info(request.info());
+    case local::Request::kSetProperty:
+      return set_property(request.set_property());
+    case local::Request::kGetProperty:
+      return get_property(request.get_property());
+    case local::Request::kOpenClock:
+      return open_clock(request.open_clock(), descriptors);
+    case local::Request::kListOpens:
+      return list_opens();
+    case local::Request::kGetDaemon:
+      return get_daemon();
+    case local::Request::kHello:
+    case local::Request::kWatch:
+    case local::Request::kListClients:
+    case local::Request::BODY_NOT_SET:
+      break;
+  }
+  return Error{Errc::protocol,
+               "this dssmd (" DSSM_VERSION
+               ") does not know such a request; install the same version of DSSM on both sides"};
+}
+
+const local::StreamId* StreamRequests::subject(const local::Request& request) noexcept {
+  switch (request.body_case()) {
+    case local::Request::kCreate:
+      return &request.create().id();
+    case local::Request::kOpen:
+      return &request.open().id();
+    case local::Request::kOffer:
+      return &request.offer().id();
+    case local::Request::kRemove:
+      return &request.remove().id();
+    case local::Request::kInfo:
+      return &request.info().id();
+    case local::Request::kSetProperty:
+      return &request.set_property().id();
+    case local::Request::kGetProperty:
+      return &request.get_property().id();
+    default:
+      return nullptr;
+  }
+}
+
+void StreamRequests::describe(const Stream& stream, local::Stream& out) const {
+  StreamInfo info = stream.info();
+  const OpenTable::Counts counts = opens_.counts(stream);
+  info.writers = counts.writers;
+  info.readers = counts.readers;
+  wire::to_message(info, out);
+}
+
+Result<std::shared_ptr<Stream>> StreamRequests::find_untrusted(const local::StreamId& id) const {
+  const Result<StreamId> checked = wire::stream_id_untrusted(id);
+  if (!checked) return checked.error();
+  return registry_.find(*checked);
+}
+
+void StreamRequests::note_open(const Client& client, const std::shared_ptr<Stream>& stream,
+                               Role role, std::uint32_t tag, local::Opened& opened) {
+  opened.set_handle(opens_.add({client, stream, role, tag}));
+  wire::to_message(stream->id(), *opened.mutable_id());
+  wire::to_message(stream->type(), *opened.mutable_type());
+}
+
+Result<Reply> StreamRequests::create(const Client& client, const local::Create& request) {
+  const Result<StreamId> id = wire::stream_id_untrusted(request.id());
+  if (!id) return id.error();
+  const Result<TypeInfo> type = wire::type_untrusted(request.type());
+  if (!type) return type.error();
+  if (Result<void> room = opens_.check_room(*client); !room) return std::move(room).error();
+  const Result<Registry::Created> created =
+      registry_.create(*id, *type, {request.depth(), Duration(request.cycle_ns())}, client->pid);
+  if (!created) return created.error();
+  Result<std::vector<UniqueFd>> descriptors = created->stream->descriptors_for(Role::writer);
+  if (!descriptors) {
+    // Nobody would know of it, and nothing was written to it: as if it had never been.
+    if (created->created) static_cast<void>(registry_.remove(created->stream->id()));
+    return std::move(descriptors).error();
+  }
+  Reply reply;
+  local::Opened& opened = *reply.response.mutable_opened();
+  note_open(client, created->stream, Role::writer, request.tag(), opened);
+  opened.set_created(created->created);
+  reply.descriptors = *std::move(descriptors);
+  return reply;
+}
+
+Result<Reply> StreamRequests::open(const Client& client, const local::Open& request) {
+  const Result<std::shared_ptr<Stream>> stream = find_untrusted(request.id());
+  if (!stream) return stream.error();
+  if (Result<void> room = opens_.check_room(*client); !room) return std::move(room).error();
+  const Role role = request.for_writing() ? Role::writer : Role::reader;
+  Result<std::vector<UniqueFd>> descriptors = (*stream)->descriptors_for(role);
+  if (!descriptors) return std::move(descriptors).error();
+  Reply reply;
+  note_open(client, *stream, role, request.tag(), *reply.response.mutable_opened());
+  reply.descriptors = *std::move(descriptors);
+  return reply;
+}
+
+Result<Reply> StreamRequests::offer(const Client& client, const local::Offer& request,
+                                    DescriptorQueue& descriptors) {
+  std::vector<UniqueFd> offered = take_descriptors(descriptors);
+  if (offered.size() < 3) return missing_descriptors("ring, bell, meta");
+  const Result<StreamId> id = wire::stream_id_untrusted(request.id());
+  if (!id) return id.error();
+  if (Result<void> room = opens_.check_room(*client); !room) return std::move(room).error();
+  const Role role = request.for_writing() ? Role::writer : Role::reader;
+  OfferedFiles files{std::move(offered[0]), std::move(offered[1]), std::move(offered[2]), {}};
+  if (offered.size() > 3 && role == Role::writer) files.doorbell = std::move(offered[3]);
+  const Result<std::shared_ptr<Stream>> stream = registry_.adopt_untrusted(*id, std::move(files));
+  if (!stream) return stream.error();
+  Reply reply;
+  note_open(client, *stream, role, request.tag(), *reply.response.mutable_opened());
+  return reply;
+}
+
+Result<Reply> StreamRequests::close(const Client& client, const local::Close& request) {
+  if (Result<void> closed = opens_.remove(client->number, request.handle()); !closed) {
+    return std::move(closed).error();
+  }
+  return done();
+}
+
+Result<Reply> StreamRequests::remove(const local::Remove& request) {
+  const Result<std::shared_ptr<Stream>> stream = find_untrusted(request.id());
+  if (!stream) return stream.error();
+  if (Result<void> removed = registry_.remove((*stream)->id()); !removed) {
+    return std::move(removed).error();
+  }
+  return done();
+}
+
+Result<Reply> StreamRequests::list() {
+  Reply reply;
+  local::StreamList& list = *reply.response.mutable_stream_list();
+  std::size_t bytes = 0;
+  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
+    local::Stream& entry = *list.add_streams();
+    describe(*stream, entry);
+    bytes += entry.ByteSizeLong();
+    if (bytes > kMaxListBytes) {
+      bytes -= entry.ByteSizeLong();
+      entry.mutable_type()->clear_fields();
+      bytes += entry.ByteSizeLong();
+    }
+  }
+  return reply;
+}
+
+Result<Reply> StreamRequests::info(const local::Info& request) {
+  const Result<std::shared_ptr<Stream>> stream = find_untrusted(request.id());
+  if (!stream) return stream.error();
+  Reply reply;
+  local::Stream& entry = *reply.response.mutable_stream_list()->add_streams();
+  describe(**stream, entry);
+  for (const StreamUser& user : opens_.users(**stream)) {
+    local::User& message = *entry.add_users();
+    message.set_pid(user.pid);
+    message.set_uid(user.uid);
+    message.set_program(user.program);
+    message.set_writer(user.role == Role::writer);
+  }
+  return reply;
+}
+
+Result<Reply> StreamRequests::set_property(const local::SetProperty& request) {
+  const Result<StreamId> id = wire::stream_id_untrusted(request.id());
+  if (!id) return id.error();
+  if (Result<void> set = registry_.set_property(*id, request.property()); !set) {
+    return std::move(set).error();
+  }
+  return done();
+}
+
+Result<Reply> StreamRequests::get_property(const local::GetProperty& request) {
+  const Result<std::shared_ptr<Stream>> stream = find_untrusted(request.id());
+  if (!stream) return stream.error();
+  Result<std::string> property = (*stream)->property();
+  if (!property) {
+    return std::move(property).error().context("stream '" + (*stream)->id().str() + "'");
+  }
+  Reply reply;
+  reply.response.mutable_property()->set_property(*std::move(property));
+  return reply;
+}
+
+Result<Reply> StreamRequests::open_clock(const local::OpenClock& request,
+                                         DescriptorQueue& descriptors) {
+  if (request.offered()) {
+    std::vector<UniqueFd> offered = take_descriptors(descriptors);
+    if (offered.empty()) return missing_descriptors("clock");
+    if (!clock_.has_one()) {
+      Result<void> adopted = clock_.adopt_untrusted(std::move(offered[0]));
+      if (!adopted) return std::move(adopted).error();
+    }
+  }
+  Result<UniqueFd> clock = clock_.get();
+  if (!clock) return std::move(clock).error();
+  Reply reply;
+  reply.response.mutable_clock();
+  reply.descriptors.push_back(*std::move(clock));
+  return reply;
+}
+
+Result<Reply> StreamRequests::list_opens() {
+  Reply reply;
+  local::OpenList& list = *reply.response.mutable_open_list();
+  for (const auto& [number, open] : opens_.entries()) {
+    if (open.stream->removed()) continue;
+    local::OpenEntry& entry = *list.add_opens();
+    wire::to_message(open.stream->id(), *entry.mutable_id());
+    entry.set_creator_pid(open.stream->creator_pid());
+    entry.set_opener_pid(open.client->pid);
+    entry.set_tag(open.tag);
+    entry.set_for_writing(open.role == Role::writer);
+  }
+  return reply;
+}
+
+Result<Reply> StreamRequests::get_daemon() {
+  Reply reply;
+  local::Daemon& daemon = *reply.response.mutable_daemon();
+  daemon.set_host(registry_.host());
+  daemon.set_version(DSSM_VERSION);
+  daemon.set_pid(::getpid());
+  daemon.set_streams(registry_.streams().size());
+  daemon.set_memory_bytes(registry_.budget().used());
+  daemon.set_memory_limit_bytes(registry_.budget().limit());
+  return reply;
+}
+
+}  // namespace dssm::daemon

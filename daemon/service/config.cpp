@@ -1,0 +1,219 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/service/config.hpp"
+
+#include <fcntl.h>
+#include <sys/un.h>
+#include <toml++/toml.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cstring>
+#include <map>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "core/base/utf8.hpp"
+#include "core/wire/local_protocol.hpp"
+#include "daemon/service/config_values.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+constexpr std::size_t kMaxFileBytes = 1U << 20;
+constexpr std::uint64_t kMostMemoryBytes = 1ULL << 50;
+constexpr Duration kLongestGrace = std::chrono::seconds(60);
+
+// Puts a parsed value into its place.
+template <class T, class U>
+Result<void> take(T& place, Result<U> value) {
+  if (!value) return std::move(value).error();
+  place = *std::move(value);
+  return {};
+}
+
+Result<void> set_runtime_dir(Config& config, std::string_view text) {
+  const auto error = [&](const std::string& why) {
+    return Error{Errc::invalid_argument, quoted(text) + " " + why};
+  };
+  if (!text.starts_with('/')) return error("does not begin with '/'");
+  if (text.find('\0') != text.npos) return error("holds a zero byte");
+  // "/dssmd.sock" and the end mark have to fit into a socket's address.
+  if (text.size() + 12 > sizeof(sockaddr_un::sun_path)) {
+    return error("is longer than the 96 bytes that leave room for a socket's name");
+  }
+  config.runtime_dir = text;
+  return {};
+}
+
+constexpr ConfigKey kKeys[] = {
+    {"name", "HOST",
+     "this host's name in 'stream:id@HOST'; default: the machine's name up to the "
+     "first dot",
+     ValueForm::text,
+     [](Config& c, std::string_view text) -> Result<void> {
+       if (Result<void> checked = check_host_name(text); !checked) return checked;
+       c.name = text;
+       return {};
+     }},
+    {"runtime_dir", "DIR", "folder of the socket 'dssmd.sock'; default: /run/dssm", ValueForm::text,
+     set_runtime_dir},
+    {"socket_group", "GROUP", "group that owns the socket; default: dssmd's own", ValueForm::text,
+     [](Config& c, std::string_view text) { return take(c.socket_group, parse_group(text)); }},
+    {"socket_mode", "MODE", "permissions of the socket, octal; default: 0660", ValueForm::text,
+     [](Config& c, std::string_view text) { return take(c.socket_mode, parse_mode(text)); }},
+    {"log_level", "LEVEL", "error, warning, notice, info or debug; default: info", ValueForm::text,
+     [](Config& c, std::string_view text) { return take(c.log_level, parse_log_level(text)); }},
+    {"max_clients", "COUNT", "connections at once; default: 4096", ValueForm::integer,
+     [](Config& c, std::string_view text) {
+       return take(c.max_clients, parse_count(text, 1, kMostClients));
+     }},
+    {"max_streams", "COUNT", "streams at once; default: 4096", ValueForm::integer,
+     [](Config& c, std::string_view text) {
+       return take(c.max_streams, parse_count(text, 1, kMostStreams));
+     }},
+    {"max_memory", "BYTES",
+     "memory of all rings and properties, e.g. '4 GiB' or '25%'; default: "
+     "half of the machine's",
+     ValueForm::integer_or_text,
+     [](Config& c, std::string_view text) {
+       return take(c.max_memory_bytes, parse_bytes(text, 64 << 10, kMostMemoryBytes));
+     }},
+    {"max_opens", "COUNT", "open streams of all clients together; default: 65536",
+     ValueForm::integer,
+     [](Config& c, std::string_view text) {
+       return take(c.max_opens, parse_count(text, 1, kMostOpens));
+     }},
+    {"max_opens_per_client", "COUNT", "open streams of one client; default: 16384",
+     ValueForm::integer,
+     [](Config& c, std::string_view text) {
+       return take(c.max_opens_per_client, parse_count(text, 1, kMostOpens));
+     }},
+    {"max_property", "BYTES", "size of one stream's property; default: 16 MiB",
+     ValueForm::integer_or_text,
+     [](Config& c, std::string_view text) {
+       return take(c.max_property_bytes, parse_bytes(text, 0, wire::kMaxPropertyBytes));
+     }},
+    {"recovery_grace", "TIME",
+     "how long after a crash programs may give their streams back before "
+     "new ones take their names; default: 500 ms",
+     ValueForm::text,
+     [](Config& c, std::string_view text) {
+       return take(c.recovery_grace, parse_duration(text, Duration::zero(), kLongestGrace));
+     }},
+};
+
+std::string place(const std::string& path, const toml::source_region& source) {
+  return path + ":" + std::to_string(source.begin.line) + ": ";
+}
+
+// The value as the flag would have it, or why it has the wrong type.
+Result<std::string> text_of(const toml::node& node, ValueForm form) {
+  if (form != ValueForm::integer && node.is_string()) return node.as_string()->get();
+  if (form != ValueForm::text && node.is_integer()) {
+    return std::to_string(node.as_integer()->get());
+  }
+  const char* wanted = form == ValueForm::text      ? "a text in quotes"
+                       : form == ValueForm::integer ? "a whole number"
+                                                    : "a whole number or a text in quotes";
+  std::string type = "another type";
+  if (node.is_string()) type = "a text";
+  if (node.is_integer()) type = "a whole number";
+  if (node.is_floating_point()) type = "a number with a point";
+  if (node.is_boolean()) type = "true or false";
+  if (node.is_array()) type = "a list";
+  if (node.is_table()) type = "a table";
+  return Error{Errc::invalid_argument, type + " stands where " + wanted + " belongs"};
+}
+
+std::string unknown_key(std::string_view name) {
+  std::string known;
+  for (const ConfigKey& key : kKeys) known.append(known.empty() ? "" : ", ").append(key.name);
+  return "key '" + printable(name) + "': unknown; the keys are " + known;
+}
+
+struct Mistake {
+  toml::source_index line;
+  std::string text;
+};
+
+Result<toml::table> parse_toml(std::string_view text, const std::string& path) {
+  // The one place where a library throws at us; its exception ends here.
+  try {
+    return toml::parse(text, path);
+  } catch (const toml::parse_error& error) {
+    return Error{Errc::invalid_argument,
+                 place(path, error.source()) + std::string(error.description())};
+  }
+}
+
+}  // namespace
+
+std::uint64_t Config::half_of_the_machines_memory() noexcept {
+  const std::uint64_t half = memory_of_the_machine() / 2;
+  return half > 0 ? half : 1ULL << 30;
+}
+
+std::span<const ConfigKey> config_keys() noexcept { return kKeys; }
+
+Result<void> apply_text_untrusted(Config& config, std::string_view text, const std::string& path) {
+  if (!is_utf8(text)) {
+    return Error{Errc::invalid_argument, path + ": the file is no UTF-8 text"};
+  }
+  const Result<toml::table> table = parse_toml(text, path);
+  if (!table) return table.error();
+  std::vector<Mistake> mistakes;
+  for (const auto& [name, node] : *table) {
+    const auto mistake = [&, where = name.source()](const std::string& why) {
+      mistakes.push_back({where.begin.line, place(path, where) + why});
+    };
+    const auto key = std::find_if(std::begin(kKeys), std::end(kKeys),
+                                  [&](const ConfigKey& k) { return k.name == name.str(); });
+    if (key == std::end(kKeys)) {
+      mistake(unknown_key(name.str()));
+      continue;
+    }
+    const Result<std::string> value = text_of(node, key->form);
+    const Result<void> set = value ? key->set(config, *value) : value.error();
+    if (!set) mistake("key '" + std::string(key->name) + "': " + set.error().message);
+  }
+  if (mistakes.empty()) return {};
+  std::stable_sort(mistakes.begin(), mistakes.end(),
+                   [](const Mistake& a, const Mistake& b) { return a.line < b.line; });
+  std::string all;
+  for (const Mistake& mistake : mistakes) all.append(all.empty() ? "" : "\n").append(mistake.text);
+  return Error{Errc::invalid_argument, all};
+}
+
+Result<void> apply_file(Config& config, const std::string& path) {
+  const std::string what = "read the configuration '" + path + "'";
+  const UniqueFd fd(::open(path.c_str(), O_RDONLY | O_CLOEXEC));
+  if (!fd) return os_error(what);
+  std::string text;
+  for (;;) {
+    char buffer[16384];
+    const ssize_t got = ::read(fd.get(), buffer, sizeof buffer);
+    if (got < 0) return os_error(what);
+    if (got == 0) break;
+    text.append(buffer, static_cast<std::size_t>(got));
+    if (text.size() > kMaxFileBytes) {
+      return Error{Errc::invalid_argument, what + ": it is larger than 1 MiB"};
+    }
+  }
+  return apply_text_untrusted(config, text, path);
+}
+
+Result<void> finish(Config& config) {
+  if (!config.name.empty()) return {};
+  char name[256] = {};
+  if (::gethostname(name, sizeof name - 1)) return os_error("ask for the machine's name");
+  const std::string_view first_label(name, ::strcspn(name, "."));
+  if (Result<void> checked = check_host_name(first_label); !checked) {
+    return Error{Errc::invalid_argument,
+                 "the machine's name cannot be the host's name: " + checked.error().message +
+                     "; choose one with --name or the key 'name'"};
+  }
+  config.name = first_label;
+  return {};
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,72 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmd's configuration: one table of keys that serves the file, the flags, the help text and the
+// checks alike. A key `max_streams` in the file is the flag --max-streams; both go through the same
+// words and the same range. docs/configuration.md explains each key to a person.
+#pragma once
+
+#include <sys/types.h>
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <optional>
+#include <span>
+#include <string>
+#include <string_view>
+
+#include "daemon/service/log.hpp"
+
+namespace dssm::daemon {
+
+// Most that one may configure; chosen so that a list of all streams, clients or opens still fits
+// into one frame of the local protocol (17 MiB) with the longest names.
+inline constexpr std::uint64_t kMostStreams = 32768;
+inline constexpr std::uint64_t kMostClients = 32768;
+inline constexpr std::uint64_t kMostOpens = 100'000;
+
+inline constexpr std::size_t kMaxHostBytes = 31;
+
+struct Config {
+  std::string name;  // of this host; empty until finish() puts the machine's name there
+  std::string runtime_dir = "/run/dssm";
+  std::optional<gid_t> socket_group;  // none: the group that dssmd runs in
+  mode_t socket_mode = 0660;
+  LogLevel log_level = LogLevel::info;
+  std::uint64_t max_clients = 4096;
+  std::uint64_t max_streams = 4096;
+  std::uint64_t max_memory_bytes = half_of_the_machines_memory();
+  std::uint64_t max_opens = 65536;
+  std::uint64_t max_opens_per_client = 16384;
+  std::uint64_t max_property_bytes = 16ULL << 20;
+  Duration recovery_grace = std::chrono::milliseconds(500);
+
+  static std::uint64_t half_of_the_machines_memory() noexcept;
+};
+
+// How a value is written in the file: in quotes, as a plain integer, or as either.
+enum class ValueForm : std::uint8_t { text, integer, integer_or_text };
+
+struct ConfigKey {
+  std::string_view name;   // "max_streams"
+  std::string_view value;  // what stands for the value in the help text: "COUNT"
+  std::string_view help;
+  ValueForm form;
+  // Takes over `text`; the failure says what is wrong with it, without naming the key.
+  Result<void> (*set)(Config& config, std::string_view text);
+};
+
+// In the order in which help text and documentation list them.
+std::span<const ConfigKey> config_keys() noexcept;
+
+// Takes over all keys of the TOML file `path`. Fails with invalid_argument and one line per
+// mistake, "FILE:LINE: key 'KEY': reason", having looked at the whole file.
+Result<void> apply_file(Config& config, const std::string& path);
+
+// The same from text; `path` is for the messages.
+Result<void> apply_text_untrusted(Config& config, std::string_view text, const std::string& path);
+
+// Fills in what was not given and checks what no single key can tell.
+Result<void> finish(Config& config);
+
+}  // namespace dssm::daemon

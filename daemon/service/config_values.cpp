@@ -1,0 +1,166 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/service/config_values.hpp"
+
+#include <grp.h>
+#include <sys/types.h>
+#include <unistd.h>
+
+#include <charconv>
+#include <string>
+#include <vector>
+
+#include "daemon/service/config.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+Error invalid(std::string why) { return Error{Errc::invalid_argument, std::move(why)}; }
+
+// a * b, or the greatest number there is: out of every range.
+std::uint64_t product(std::uint64_t a, std::uint64_t b) noexcept {
+  std::uint64_t result = 0;
+  return __builtin_mul_overflow(a, b, &result) ? UINT64_MAX : result;
+}
+
+// A whole number and what follows it, without the blanks between them.
+struct Quantity {
+  std::uint64_t number = 0;
+  std::string_view unit;
+};
+
+Result<Quantity> parse_quantity(std::string_view text) {
+  Quantity quantity;
+  const char* end = text.data() + text.size();
+  const auto [rest, error] = std::from_chars(text.data(), end, quantity.number);
+  if (error == std::errc::result_out_of_range) return invalid(quoted(text) + " is too large");
+  if (error != std::errc()) return invalid(quoted(text) + " does not begin with a whole number");
+  quantity.unit = std::string_view(rest, static_cast<std::size_t>(end - rest));
+  while (quantity.unit.starts_with(' ')) quantity.unit.remove_prefix(1);
+  return quantity;
+}
+
+Error out_of_range(std::string_view text, std::uint64_t least, std::uint64_t most,
+                   std::string_view unit) {
+  return invalid(quoted(text) + " is outside of " + std::to_string(least) + " to " +
+                 std::to_string(most) + std::string(unit));
+}
+
+}  // namespace
+
+Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t least, std::uint64_t most) {
+  const Result<Quantity> quantity = parse_quantity(text);
+  if (!quantity) return quantity.error();
+  if (!quantity->unit.empty()) return invalid(quoted(text) + " is no whole number");
+  if (quantity->number < least || quantity->number > most) {
+    return out_of_range(text, least, most, "");
+  }
+  return quantity->number;
+}
+
+Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, std::uint64_t most) {
+  const Result<Quantity> quantity = parse_quantity(text);
+  if (!quantity) return quantity.error();
+  std::uint64_t bytes = quantity->number;
+  if (quantity->unit == "%") {
+    if (quantity->number > 100) return invalid(quoted(text) + " is more than the whole memory");
+    bytes = memory_of_the_machine() / 100 * quantity->number;
+  } else if (quantity->unit == "KiB") {
+    bytes = product(bytes, 1ULL << 10);
+  } else if (quantity->unit == "MiB") {
+    bytes = product(bytes, 1ULL << 20);
+  } else if (quantity->unit == "GiB") {
+    bytes = product(bytes, 1ULL << 30);
+  } else if (quantity->unit == "TiB") {
+    bytes = product(bytes, 1ULL << 40);
+  } else if (!quantity->unit.empty()) {
+    return invalid(quoted(text) + " has an unknown unit; write bytes, KiB, MiB, GiB, TiB or %");
+  }
+  if (bytes < least || bytes > most) return out_of_range(text, least, most, " bytes");
+  return bytes;
+}
+
+Result<Duration> parse_duration(std::string_view text, Duration least, Duration most) {
+  const Result<Quantity> quantity = parse_quantity(text);
+  if (!quantity) return quantity.error();
+  std::uint64_t ns = quantity->number;
+  if (quantity->unit == "ms") {
+    ns = product(ns, 1'000'000);
+  } else if (quantity->unit == "s") {
+    ns = product(ns, 1'000'000'000);
+  } else {
+    return invalid(quoted(text) + " needs a unit: 'ms' or 's'");
+  }
+  if (ns < static_cast<std::uint64_t>(to_ns(least)) ||
+      ns > static_cast<std::uint64_t>(to_ns(most))) {
+    return out_of_range(text, static_cast<std::uint64_t>(to_ns(least)) / 1'000'000,
+                        static_cast<std::uint64_t>(to_ns(most)) / 1'000'000, " ms");
+  }
+  return Duration(static_cast<std::int64_t>(ns));
+}
+
+Result<mode_t> parse_mode(std::string_view text) {
+  unsigned mode = 0;
+  const char* end = text.data() + text.size();
+  const auto [rest, error] = std::from_chars(text.data(), end, mode, 8);
+  if (error != std::errc() || rest != end || mode > 0777) {
+    return invalid(quoted(text) + " are no permissions; write them in octal, e.g. \"0660\"");
+  }
+  if (!(mode & 0200)) {
+    return invalid(quoted(text) +
+                   " would lock out even dssmd's own user; connecting takes write permission, "
+                   "e.g. \"0660\"");
+  }
+  return mode;
+}
+
+Result<gid_t> parse_group(std::string_view name) {
+  const std::string wanted(name);
+  std::vector<char> space(16384);  // ample for one entry of the group file without its members
+  for (;;) {
+    group entry{};
+    group* found = nullptr;
+    const int failed = ::getgrnam_r(wanted.c_str(), &entry, space.data(), space.size(), &found);
+    if (failed == ERANGE && space.size() < (16U << 20)) {
+      space.resize(space.size() * 2);
+      continue;
+    }
+    if (failed) return os_error("look for the group " + quoted(name), failed);
+    if (!found) {
+      return invalid("there is no group " + quoted(name) + "; create it with `groupadd --system " +
+                     printable(name) + "`");
+    }
+    return found->gr_gid;
+  }
+}
+
+Result<LogLevel> parse_log_level(std::string_view text) {
+  if (text == "error") return LogLevel::error;
+  if (text == "warning") return LogLevel::warning;
+  if (text == "notice") return LogLevel::notice;
+  if (text == "info") return LogLevel::info;
+  if (text == "debug") return LogLevel::debug;
+  return invalid(quoted(text) + " is no level; write error, warning, notice, info or debug");
+}
+
+Result<void> check_host_name(std::string_view text) {
+  if (text.empty() || text.size() > kMaxHostBytes) {
+    return invalid(quoted(text) + " is " + std::to_string(text.size()) +
+                   " bytes long; a host's name takes 1 to " + std::to_string(kMaxHostBytes));
+  }
+  for (const char c : text) {
+    const bool good =
+        (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '-';
+    if (!good) {
+      return invalid(quoted(text) + " holds other characters than letters, digits and '-'");
+    }
+  }
+  return {};
+}
+
+std::uint64_t memory_of_the_machine() noexcept {
+  const long pages = ::sysconf(_SC_PHYS_PAGES), page_bytes = ::sysconf(_SC_PAGESIZE);
+  if (pages <= 0 || page_bytes <= 0) return 0;
+  return static_cast<std::uint64_t>(pages) * static_cast<std::uint64_t>(page_bytes);
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The values of configuration keys, from text. Each failure is a reason alone ("'5x' is no
+// number"), to which the caller adds file, line and key.
+#pragma once
+
+#include <sys/types.h>
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <string_view>
+
+#include "daemon/service/log.hpp"
+
+namespace dssm::daemon {
+
+// A whole number from `least` to `most`.
+Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t least, std::uint64_t most);
+
+// Bytes: "1048576", "512 KiB", "64 MiB", "2 GiB", "1 TiB", or "50%" of the machine's memory.
+Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, std::uint64_t most);
+
+// "0 ms", "500 ms", "2 s"; the unit must be there.
+Result<Duration> parse_duration(std::string_view text, Duration least, Duration most);
+
+// File permissions in octal, "0660"; only the nine ordinary bits, and the owner's write bit is set.
+Result<mode_t> parse_mode(std::string_view text);
+
+// The number of the group `name`, which must exist.
+Result<gid_t> parse_group(std::string_view name);
+
+// error, warning, notice, info, debug
+Result<LogLevel> parse_log_level(std::string_view text);
+
+// 1 to 31 bytes of letters, digits and '-': what stands behind '@' in a stream's name.
+Result<void> check_host_name(std::string_view text);
+
+// 0 when the system does not say.
+std::uint64_t memory_of_the_machine() noexcept;
+
+}  // namespace dssm::daemon

@@ -1,0 +1,70 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/service/event_loop.hpp"
+
+#include <event2/event.h>
+
+#include "core/base/check.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+void on_event(evutil_socket_t, short, void* callback) noexcept {
+  (*static_cast<EventSource::Callback*>(callback))();
+}
+
+}  // namespace
+
+Result<EventLoop> EventLoop::open() {
+  event_base* base = event_base_new();
+  if (!base) return os_error("create the event loop");
+  return EventLoop(base);
+}
+
+Result<void> EventLoop::run() {
+  if (event_base_loop(base_.get(), EVLOOP_NO_EXIT_ON_EMPTY) < 0) {
+    return os_error("run the event loop");
+  }
+  return {};
+}
+
+void EventLoop::stop() noexcept { event_base_loopbreak(base_.get()); }
+
+void EventLoop::Free::operator()(event_base* base) const noexcept { event_base_free(base); }
+
+EventSource::EventSource(const EventLoop& loop, int fd, short what, Callback callback)
+    : callback_(std::make_unique<Callback>(std::move(callback))),
+      event_(event_new(loop.base(), fd, what, on_event, callback_.get())) {
+  DSSM_CHECK(event_);  // fails only without memory for a few dozen bytes
+}
+
+EventSource EventSource::readable(const EventLoop& loop, int fd, Callback callback) {
+  return {loop, fd, EV_READ | EV_PERSIST, std::move(callback)};
+}
+
+EventSource EventSource::writable(const EventLoop& loop, int fd, Callback callback) {
+  return {loop, fd, EV_WRITE | EV_PERSIST, std::move(callback)};
+}
+
+EventSource EventSource::signal(const EventLoop& loop, int number, Callback callback) {
+  return {loop, number, EV_SIGNAL | EV_PERSIST, std::move(callback)};
+}
+
+EventSource EventSource::timer(const EventLoop& loop, Callback callback) {
+  return {loop, -1, 0, std::move(callback)};
+}
+
+void EventSource::enable() noexcept { DSSM_CHECK(event_add(event_.get(), nullptr) == 0); }
+
+void EventSource::enable_in(Duration delay) noexcept {
+  const auto microseconds = std::chrono::duration_cast<std::chrono::microseconds>(delay).count();
+  const timeval wait{microseconds / 1'000'000, microseconds % 1'000'000};
+  DSSM_CHECK(event_add(event_.get(), &wait) == 0);
+}
+
+void EventSource::disable() noexcept {
+  if (event_) event_del(event_.get());
+}
+
+void EventSource::Free::operator()(event* source) const noexcept { event_free(source); }
+
+}  // namespace dssm::daemon

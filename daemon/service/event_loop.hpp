@@ -1,0 +1,62 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// libevent with owners. One loop, one thread; everything in dssmd happens in callbacks of it, and
+// no callback waits for anything. Callbacks are called from C, so an exception that leaves one
+// (out of memory) ends the process: rings do not need it to live on.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <functional>
+#include <memory>
+
+struct event_base;
+struct event;
+
+namespace dssm::daemon {
+
+class EventLoop {
+ public:
+  static Result<EventLoop> open();
+
+  // Runs callbacks until stop().
+  Result<void> run();
+  // Lets the running callback finish, then ends run().
+  void stop() noexcept;
+
+  event_base* base() const noexcept { return base_.get(); }
+
+ private:
+  struct Free {
+    void operator()(event_base* base) const noexcept;
+  };
+  explicit EventLoop(event_base* base) : base_(base) {}
+  std::unique_ptr<event_base, Free> base_;
+};
+
+// Calls back when something happens; idle until enable(). The callback may disable its own source
+// but not destroy it. The loop outlives it.
+class EventSource {
+ public:
+  using Callback = std::function<void()>;
+
+  EventSource() = default;
+  static EventSource readable(const EventLoop& loop, int fd, Callback callback);
+  static EventSource writable(const EventLoop& loop, int fd, Callback callback);
+  static EventSource signal(const EventLoop& loop, int number, Callback callback);
+  static EventSource timer(const EventLoop& loop, Callback callback);
+
+  void enable() noexcept;
+  void enable_in(Duration delay) noexcept;  // timers: once, after `delay`
+  void disable() noexcept;
+
+ private:
+  struct Free {
+    void operator()(event* source) const noexcept;
+  };
+  EventSource(const EventLoop& loop, int fd, short what, Callback callback);
+  std::unique_ptr<Callback> callback_;  // on the heap: libevent keeps its address
+  std::unique_ptr<event, Free> event_;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,20 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Identities of the log entries that an operator may search for (journalctl MESSAGE_ID=...). Random
+// once, never reused for another meaning.
+#pragma once
+
+#include <string_view>
+
+namespace dssm::daemon::message_id {
+
+inline constexpr std::string_view kReady = "d2b6f171446b46fcb10bc6e779ecf04d";
+inline constexpr std::string_view kStopping = "d05ce614e0a64699b1f2416ba5ca513c";
+inline constexpr std::string_view kClientRefused = "c6801aea58fe472498f8d46ad3aa53cb";
+inline constexpr std::string_view kStreamCreated = "8637335716034850a755ed431ed47c14";
+inline constexpr std::string_view kStreamRemoved = "bdd6965dfe8a4d14a605fa127c652ae7";
+inline constexpr std::string_view kStreamAdopted = "a73f7306e3fa42bb87f7d49f265044f7";
+inline constexpr std::string_view kOfferRefused = "7a844fc7f25c4582beea94223502bb69";
+inline constexpr std::string_view kRecovering = "2e58a82ca63744cc956de7dd2a52e977";
+
+}  // namespace dssm::daemon::message_id

@@ -1,0 +1,15 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What dssmd asks of the operating system for itself.
+#pragma once
+
+namespace dssm::daemon {
+
+// Raises the number of descriptors this process may have to what its user allows: each stream takes
+// four, each client one.
+void raise_descriptor_limit() noexcept;
+
+// A program that vanished while it was written to is an error code, not the end.
+void ignore_broken_pipes() noexcept;
+
+}  // namespace dssm::daemon

@@ -1,0 +1,75 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The memory that rings and properties may take, all together (key max_memory). A stream's share is
+// given back when its last user lets go of it, not when its name disappears: a removed ring that
+// somebody still holds still takes memory.
+#pragma once
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <utility>
+
+namespace dssm::daemon {
+
+class MemoryBudget;
+
+// A share of a budget; given back by the destructor. The budget outlives it.
+class MemoryShare {
+ public:
+  MemoryShare() = default;
+  MemoryShare(MemoryShare&& other) noexcept
+      : budget_(other.budget_), bytes_(std::exchange(other.bytes_, 0)) {}
+  MemoryShare& operator=(MemoryShare&& other) noexcept {
+    if (this != &other) {
+      give_back();
+      budget_ = other.budget_;
+      bytes_ = std::exchange(other.bytes_, 0);
+    }
+    return *this;
+  }
+  ~MemoryShare() { give_back(); }
+
+  std::uint64_t bytes() const noexcept { return bytes_; }
+
+ private:
+  friend class MemoryBudget;
+  MemoryShare(MemoryBudget& budget, std::uint64_t bytes) : budget_(&budget), bytes_(bytes) {}
+  inline void give_back() noexcept;
+  MemoryBudget* budget_ = nullptr;
+  std::uint64_t bytes_ = 0;
+};
+
+class MemoryBudget {
+ public:
+  explicit MemoryBudget(std::uint64_t limit_bytes) : limit_(limit_bytes) {}
+  MemoryBudget(const MemoryBudget&) = delete;
+  MemoryBudget& operator=(const MemoryBudget&) = delete;
+
+  // Fails with limit_exceeded, naming the key and what is left.
+  Result<MemoryShare> take(std::uint64_t bytes) {
+    if (bytes <= limit_ - used_) {
+      used_ += bytes;
+      return MemoryShare(*this, bytes);
+    }
+    return Error{Errc::limit_exceeded,
+                 std::to_string(bytes) + " bytes of memory are needed and " +
+                     std::to_string(limit_ - used_) +
+                     " are left of max_memory = " + std::to_string(limit_) +
+                     " bytes; keep less history, remove streams (dssmctl rm), or raise the key "
+                     "max_memory"};
+  }
+
+  std::uint64_t used() const noexcept { return used_; }
+  std::uint64_t limit() const noexcept { return limit_; }
+
+ private:
+  friend class MemoryShare;
+  std::uint64_t limit_;
+  std::uint64_t used_ = 0;
+};
+
+inline void MemoryShare::give_back() noexcept {
+  if (budget_) budget_->used_ -= std::exchange(bytes_, 0);
+}
+
+}  // namespace dssm::daemon

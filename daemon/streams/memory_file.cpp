@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/streams/memory_file.hpp"
+
+#include <fcntl.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <string>
+
+namespace dssm::daemon {
+
+Result<void> check_own_memory_file(int fd, int seals, std::string_view what) {
+  const std::string name = "the offered " + std::string(what);
+  struct stat file {};
+  if (::fstat(fd, &file)) return os_error("look at " + name);
+  // Only memfds and files of a tmpfs answer, and the latter carry no such seals.
+  const int found = ::fcntl(fd, F_GET_SEALS);
+  if (found < 0 || (found & seals) != seals) {
+    return Error{Errc::protocol, name + " is no sealed memory file of dssmd's making"};
+  }
+  if (file.st_uid != ::geteuid()) {
+    return Error{Errc::no_permission, name + " belongs to user " + std::to_string(file.st_uid) +
+                                          ", not to dssmd's user " + std::to_string(::geteuid()) +
+                                          ": dssmd did not create it"};
+  }
+  return {};
+}
+
+bool same_file(int fd, int other_fd) noexcept {
+  struct stat one {
+  }, other{};
+  return ::fstat(fd, &one) == 0 && ::fstat(other_fd, &other) == 0 && one.st_dev == other.st_dev &&
+         one.st_ino == other.st_ino;
+}
+
+Result<UniqueFd> duplicate(int fd) {
+  UniqueFd copy(::fcntl(fd, F_DUPFD_CLOEXEC, 0));
+  if (!copy) return os_error("duplicate a descriptor");
+  return copy;
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,156 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/streams/meta_file.hpp"
+
+#include <fcntl.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <cerrno>
+#include <string>
+
+#include "core/ring/ring_memory.hpp"
+#include "core/wire/local_protocol.hpp"
+#include "daemon/streams/memory_file.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+constexpr int kMetaSeals = F_SEAL_SHRINK | F_SEAL_SEAL;
+constexpr std::uint64_t kPage = 4096;
+
+// No content that dssmd wrote is longer: it arrived in one frame, or in two that were shorter.
+constexpr std::uint64_t kMaxContentBytes = 2 * wire::kMaxLocalFrameBytes;
+
+constexpr std::uint64_t pages_up(std::uint64_t bytes) noexcept {
+  return (bytes + kPage - 1) / kPage * kPage;
+}
+
+Error not_a_meta_file(const std::string& why) {
+  return Error{Errc::protocol, "this is no meta file that can be used: " + why};
+}
+
+Result<void> write_all(int fd, std::string_view bytes, std::uint64_t offset) {
+  while (!bytes.empty()) {
+    const ssize_t written = ::pwrite(fd, bytes.data(), bytes.size(), static_cast<off_t>(offset));
+    if (written < 0) {
+      if (errno == EINTR) continue;
+      return os_error("write a stream's meta file");
+    }
+    bytes.remove_prefix(static_cast<std::size_t>(written));
+    offset += static_cast<std::uint64_t>(written);
+  }
+  return {};
+}
+
+// False when the file ends before.
+bool read_all(int fd, char* to, std::size_t bytes, std::uint64_t offset) noexcept {
+  while (bytes > 0) {
+    const ssize_t got = ::pread(fd, to, bytes, static_cast<off_t>(offset));
+    if (got < 0 && errno == EINTR) continue;
+    if (got <= 0) return false;
+    to += got;
+    bytes -= static_cast<std::size_t>(got);
+    offset += static_cast<std::uint64_t>(got);
+  }
+  return true;
+}
+
+Result<MetaHeader> read_header_untrusted(int fd) {
+  MetaHeader header;
+  if (!read_all(fd, reinterpret_cast<char*>(&header), sizeof header, 0)) {
+    return not_a_meta_file("it is shorter than its header");
+  }
+  if (header.magic != MetaHeader::kMagic) {
+    return not_a_meta_file("it does not begin with \"DSSMMETA\"");
+  }
+  if (header.version != MetaHeader::kVersion) {
+    return not_a_meta_file("it has the version " + std::to_string(header.version) +
+                           ", this dssmd knows " + std::to_string(MetaHeader::kVersion));
+  }
+  if (header.offset_bytes == 0 && header.length_bytes == 0) return header;
+  struct stat file {};
+  if (::fstat(fd, &file)) return os_error("look at a stream's meta file");
+  const auto file_bytes = static_cast<std::uint64_t>(file.st_size);
+  if (header.offset_bytes < kPage || header.offset_bytes % kPage != 0 || header.length_bytes == 0 ||
+      header.length_bytes > kMaxContentBytes || header.offset_bytes > file_bytes ||
+      header.length_bytes > file_bytes - header.offset_bytes) {
+    return not_a_meta_file("its header points outside of it");
+  }
+  return header;
+}
+
+}  // namespace
+
+Result<MetaFile> MetaFile::create(const local::StreamMeta& meta) {
+  UniqueFd fd(::memfd_create("dssm-meta", MFD_CLOEXEC | MFD_ALLOW_SEALING));
+  if (!fd) return os_error("create a stream's meta file");
+  MetaFile file(std::move(fd));
+  if (Result<void> done = file.write_header(MetaHeader{}); !done) return std::move(done).error();
+  if (Result<void> done = file.replace(meta); !done) return std::move(done).error();
+  if (::fcntl(file.fd(), F_ADD_SEALS, kMetaSeals) || ::fchmod(file.fd(), 0400)) {
+    return os_error("protect a stream's meta file");
+  }
+  return file;
+}
+
+Result<MetaFile> MetaFile::open_untrusted(UniqueFd fd) {
+  if (Result<void> own = check_own_memory_file(fd.get(), kMetaSeals, "meta file"); !own) {
+    return std::move(own).error();
+  }
+  const Result<MetaHeader> header = read_header_untrusted(fd.get());
+  if (!header) return header.error();
+  // One that was offered for writing might be shared with whoever offered it: take a new one.
+  Result<UniqueFd> writable = ring::reopen_read_write(fd.get());
+  if (!writable) return std::move(writable).error();
+  return MetaFile(*std::move(writable));
+}
+
+Result<local::StreamMeta> MetaFile::read_untrusted() const {
+  const Result<MetaHeader> header = read_header_untrusted(fd_.get());
+  if (!header) return header.error();
+  if (header->length_bytes == 0) {
+    return Error{Errc::not_found, "the stream was removed (dssmctl rm); create it anew"};
+  }
+  std::string content(header->length_bytes, '\0');
+  if (!read_all(fd_.get(), content.data(), content.size(), header->offset_bytes)) {
+    return not_a_meta_file("its content cannot be read");
+  }
+  local::StreamMeta meta;
+  if (!meta.ParseFromString(content)) return not_a_meta_file("its content is no StreamMeta");
+  return meta;
+}
+
+Result<void> MetaFile::replace(const local::StreamMeta& meta) {
+  const std::string content = meta.SerializeAsString();
+  if (content.empty() || content.size() > kMaxContentBytes) {
+    return Error{Errc::limit_exceeded, "a stream's description and property of " +
+                                           std::to_string(content.size()) +
+                                           " bytes are too much for its meta file"};
+  }
+  const Result<MetaHeader> current = read_header_untrusted(fd_.get());
+  if (!current) return current.error();
+  const bool fits_before =
+      current->offset_bytes == 0 || kPage + pages_up(content.size()) <= current->offset_bytes;
+  MetaHeader next;
+  next.offset_bytes = fits_before ? kPage : current->offset_bytes + pages_up(current->length_bytes);
+  next.length_bytes = content.size();
+  if (Result<void> done = write_all(fd_.get(), content, next.offset_bytes); !done) return done;
+  if (Result<void> done = write_header(next); !done) return done;
+  if (current->offset_bytes > 0) {
+    // Only gives memory back; without it everything is as correct.
+    ::fallocate(fd_.get(), FALLOC_FL_PUNCH_HOLE | FALLOC_FL_KEEP_SIZE,
+                static_cast<off_t>(current->offset_bytes),
+                static_cast<off_t>(pages_up(current->length_bytes)));
+  }
+  return {};
+}
+
+Result<void> MetaFile::mark_removed() { return write_header(MetaHeader{}); }
+
+Result<void> MetaFile::write_header(const MetaHeader& header) {
+  const std::string_view bytes(reinterpret_cast<const char*>(&header), sizeof header);
+  return write_all(fd_.get(), bytes, 0);
+}
+
+}  // namespace dssm::daemon

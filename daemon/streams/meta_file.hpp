@@ -1,0 +1,76 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The meta file: all that dssmd knows about a stream and that is not in its ring, in a memfd beside
+// it: type with fields, property, creator, place in the list. With ring, bell and this file alone a
+// new dssmd brings a stream back. Only dssmd writes it; clients hold a descriptor for reading, only
+// to offer it back. It is read with pread() and never mapped, so that its size cannot hurt anybody.
+//
+// Layout, little endian; the pages not named are holes:
+//
+//   off size field     unit   meaning
+//     0    8 magic     -      "DSSMMETA"
+//     8    4 version   -      1
+//    12    4 reserved  -      zero
+//    16    8 offset    bytes  where the content begins, a multiple of 4096; 0: the stream was
+//    removed 24    8 length    bytes  of the content, a protobuf message dssm.local.StreamMeta; 0:
+//    removed
+//
+// Replacing the content must survive `kill -9` at any instruction. So the new content goes to pages
+// that the current one does not use; then the header is replaced by one write of 32 bytes inside
+// one page, which the kernel copies without looking at signals in between; then the old pages are
+// given back. Whoever reads before the header changed gets the old content, afterwards the new one.
+// (Loss of power needs no thought: the file is memory.)
+//
+// The file is sealed against shrinking and further seals, its mode is 0400: a descriptor for
+// reading cannot be turned into one for writing but by dssmd's own user.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <dssm/result.hpp>
+
+#include "core/base/unique_fd.hpp"
+#include "local.pb.h"
+
+namespace dssm::daemon {
+
+struct MetaHeader {
+  static constexpr std::uint64_t kMagic = 0x4154454d4d535344;  // "DSSMMETA"
+  static constexpr std::uint32_t kVersion = 1;
+  std::uint64_t magic = kMagic;
+  std::uint32_t version = kVersion;
+  std::uint32_t reserved = 0;
+  std::uint64_t offset_bytes = 0;
+  std::uint64_t length_bytes = 0;
+};
+static_assert(offsetof(MetaHeader, offset_bytes) == 16 && sizeof(MetaHeader) == 32);
+
+// Owns a read-write descriptor.
+class MetaFile {
+ public:
+  // Creates one that holds `meta`.
+  static Result<MetaFile> create(const local::StreamMeta& meta);
+
+  // Takes one that dssmd created in an earlier life; `fd` may be for reading only. Fails with
+  // `protocol` when it is no meta file, no_permission when it is somebody else's.
+  static Result<MetaFile> open_untrusted(UniqueFd fd);
+
+  // The content. Fails with `protocol` when it is not in order, not_found when the stream was
+  // removed.
+  Result<local::StreamMeta> read_untrusted() const;
+
+  // Replaces the content, at once for all readers.
+  Result<void> replace(const local::StreamMeta& meta);
+
+  // Marks the stream as removed for ever: nobody can bring it back by offering it.
+  Result<void> mark_removed();
+
+  int fd() const noexcept { return fd_.get(); }
+
+ private:
+  explicit MetaFile(UniqueFd fd) : fd_(std::move(fd)) {}
+  Result<void> write_header(const MetaHeader& header);
+  UniqueFd fd_;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,79 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/streams/open_table.hpp"
+
+namespace dssm::daemon {
+
+std::string ClientIdentity::str() const {
+  return "'" + program + "' (pid " + std::to_string(pid) + ", uid " + std::to_string(uid) + ")";
+}
+
+Result<void> OpenTable::check_room(const ClientIdentity& client) const {
+  if (entries_.size() >= limits_.max_opens) {
+    return Error{Errc::limit_exceeded,
+                 "all programs together have max_opens = " + std::to_string(limits_.max_opens) +
+                     " streams open; close some or raise the key max_opens"};
+  }
+  const auto own = by_client_.find(client.number);
+  if (own != by_client_.end() && own->second.size() >= limits_.max_opens_per_client) {
+    return Error{
+        Errc::limit_exceeded,
+        "this program has max_opens_per_client = " + std::to_string(limits_.max_opens_per_client) +
+            " streams open; close some or raise the key max_opens_per_client"};
+  }
+  return {};
+}
+
+OpenNumber OpenTable::add(OpenEntry entry) {
+  const OpenNumber number = next_++;
+  by_client_[entry.client->number].insert(number);
+  OfStream& of_stream = by_stream_[entry.stream.get()];
+  of_stream.opens.insert(number);
+  ++(entry.role == Role::writer ? of_stream.counts.writers : of_stream.counts.readers);
+  entries_.emplace(number, std::move(entry));
+  return number;
+}
+
+Result<void> OpenTable::remove(ClientNumber client, OpenNumber number) {
+  const auto own = by_client_.find(client);
+  if (own == by_client_.end() || own->second.erase(number) == 0) {
+    return Error{Errc::not_found,
+                 "handle " + std::to_string(number) + " is not open on this connection"};
+  }
+  if (own->second.empty()) by_client_.erase(own);
+  forget(number);
+  return {};
+}
+
+void OpenTable::remove_all(ClientNumber client) {
+  const auto own = by_client_.extract(client);
+  if (!own) return;
+  for (const OpenNumber number : own.mapped()) forget(number);
+}
+
+void OpenTable::forget(OpenNumber number) {
+  const auto entry = entries_.find(number);
+  const auto of_stream = by_stream_.find(entry->second.stream.get());
+  of_stream->second.opens.erase(number);
+  Counts& counts = of_stream->second.counts;
+  --(entry->second.role == Role::writer ? counts.writers : counts.readers);
+  if (of_stream->second.opens.empty()) by_stream_.erase(of_stream);
+  entries_.erase(entry);
+}
+
+OpenTable::Counts OpenTable::counts(const Stream& stream) const {
+  const auto found = by_stream_.find(&stream);
+  return found == by_stream_.end() ? Counts{} : found->second.counts;
+}
+
+std::vector<StreamUser> OpenTable::users(const Stream& stream) const {
+  std::vector<StreamUser> users;
+  const auto found = by_stream_.find(&stream);
+  if (found == by_stream_.end()) return users;
+  for (const OpenNumber number : found->second.opens) {
+    const OpenEntry& entry = entries_.at(number);
+    users.push_back({entry.client->pid, entry.client->uid, entry.client->program, entry.role});
+  }
+  return users;
+}
+
+}  // namespace dssm::daemon

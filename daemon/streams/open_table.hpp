@@ -1,0 +1,86 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Who has which stream open: one entry per successful Create, Open or Offer, until its Close or the
+// end of the client's connection. An entry keeps its stream alive, also after the stream was
+// removed.
+#pragma once
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/stream.hpp>
+#include <map>
+#include <memory>
+#include <set>
+#include <string>
+#include <unordered_map>
+#include <vector>
+
+#include "daemon/streams/stream.hpp"
+
+namespace dssm::daemon {
+
+// A connection of this dssmd's life; rises, never used twice.
+using ClientNumber = std::uint64_t;
+
+// Who is at the other end: process and user from the kernel, the program's name from itself.
+struct ClientIdentity {
+  ClientNumber number = 0;
+  std::int32_t pid = 0;
+  std::uint32_t uid = 0;
+  std::string program;
+
+  std::string str() const;  // "'mapper' (pid 12, uid 1000)"
+};
+
+// Rises with each open; unique, so it serves as the protocol's handle.
+using OpenNumber = std::uint64_t;
+
+struct OpenEntry {
+  std::shared_ptr<const ClientIdentity> client;
+  std::shared_ptr<Stream> stream;
+  Role role = Role::reader;
+  std::uint32_t tag = 0;
+};
+
+class OpenTable {
+ public:
+  struct Limits {
+    std::uint64_t max_opens = 0;
+    std::uint64_t max_opens_per_client = 0;
+  };
+  struct Counts {
+    std::uint32_t writers = 0, readers = 0;
+  };
+
+  explicit OpenTable(const Limits& limits) : limits_(limits) {}
+
+  // Whether `client` may open one more. Fails with limit_exceeded, naming the key.
+  Result<void> check_room(const ClientIdentity& client) const;
+
+  OpenNumber add(OpenEntry entry);
+
+  // Fails with not_found unless `number` is an open of `client`.
+  Result<void> remove(ClientNumber client, OpenNumber number);
+  void remove_all(ClientNumber client);
+
+  Counts counts(const Stream& stream) const;
+  std::vector<StreamUser> users(const Stream& stream) const;  // in the order of opening
+
+  // In the order of opening.
+  const std::map<OpenNumber, OpenEntry>& entries() const noexcept { return entries_; }
+
+ private:
+  struct OfStream {
+    std::set<OpenNumber> opens;
+    Counts counts;
+  };
+  void forget(OpenNumber number);
+
+  Limits limits_;
+  OpenNumber next_ = 1;
+  std::map<OpenNumber, OpenEntry> entries_;
+  std::unordered_map<ClientNumber, std::set<OpenNumber>> by_client_;
+  std::unordered_map<const Stream*, OfStream> by_stream_;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,36 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/streams/playback_clock_owner.hpp"
+
+#include <fcntl.h>
+
+#include "core/clock/playback_record.hpp"
+#include "daemon/streams/memory_file.hpp"
+
+namespace dssm::daemon {
+
+Result<void> PlaybackClockOwner::adopt_untrusted(UniqueFd offered) {
+  constexpr int kSeals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL;
+  if (clock_) {
+    if (same_file(offered.get(), clock_.get())) return {};
+    return Error{Errc::conflict, "another playback clock is in use by now"};
+  }
+  if (Result<void> own = check_own_memory_file(offered.get(), kSeals, "playback clock"); !own) {
+    return own;
+  }
+  if (auto record = clock::PlaybackRecord::open_untrusted(offered.get()); !record) {
+    return std::move(record).error();
+  }
+  clock_ = std::move(offered);
+  return {};
+}
+
+Result<UniqueFd> PlaybackClockOwner::get() {
+  if (!clock_) {
+    Result<UniqueFd> made = clock::create_playback_clock();
+    if (!made) return std::move(made).error();
+    clock_ = *std::move(made);
+  }
+  return duplicate(clock_.get());
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,127 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/streams/registry.hpp"
+
+#include <algorithm>
+
+namespace dssm::daemon {
+
+Result<StreamId> Registry::own_id(StreamId id) const {
+  if (!id.host.empty() && id.host != host_) {
+    return Error{Errc::not_found, "stream '" + id.str() + "' belongs to host '" + id.host +
+                                      "', and this dssmd serves host '" + host_ +
+                                      "' only; leave '@" + id.host +
+                                      "' out, or ask the dssmd of that host"};
+  }
+  id.host = host_;
+  if (Result<void> checked = id.check(); !checked) return std::move(checked).error();
+  return id;
+}
+
+Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
+  const Result<StreamId> own = own_id(id);
+  if (!own) return own.error();
+  const auto found = by_name_.find(Key{own->name, own->id});
+  if (found != by_name_.end()) return found->second;
+  return Error{Errc::not_found, "there is no stream '" + own->str() +
+                                    "'; create it first (`dssmctl ls` lists those that are there)"};
+}
+
+Result<void> Registry::check_room() const {
+  if (by_name_.size() < limits_.max_streams) return {};
+  return Error{Errc::limit_exceeded,
+               "there are max_streams = " + std::to_string(limits_.max_streams) +
+                   " streams already; remove some (dssmctl rm) or raise the "
+                   "key max_streams"};
+}
+
+Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& type,
+                                           const History& history, std::int32_t creator_pid) {
+  const Result<StreamId> own = own_id(id);
+  if (!own) return own.error();
+  const std::string context = "stream '" + own->str() + "'";
+  if (const auto found = by_name_.find(Key{own->name, own->id}); found != by_name_.end()) {
+    if (Result<void> usable = found->second->type().check_usable_as(type); !usable) {
+      return std::move(usable).error().context(context);
+    }
+    return Created{found->second, false};
+  }
+  if (history.cycle <= Duration::zero()) {
+    return Error{Errc::invalid_argument, context + ": its cycle is " +
+                                             std::to_string(to_ns(history.cycle)) +
+                                             " ns; give the expected time between two samples"};
+  }
+  if (Result<void> room = check_room(); !room) return std::move(room).error().context(context);
+  Result<std::shared_ptr<Stream>> stream =
+      Stream::create({*own, type, history.depth, history.cycle, creator_pid, next_order_}, budget_);
+  if (!stream) return std::move(stream).error().context(context);
+  add(*stream);
+  return Created{*std::move(stream), true};
+}
+
+Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, OfferedFiles files) {
+  const Result<StreamId> own = own_id(id);
+  if (!own) return own.error();
+  const std::string context = "stream '" + own->str() + "'";
+  if (const auto found = by_name_.find(Key{own->name, own->id}); found != by_name_.end()) {
+    if (found->second->is_ring(files.ring.get())) {
+      found->second->take_doorbell_untrusted(std::move(files.doorbell));
+      return found->second;
+    }
+    return Error{Errc::conflict, context +
+                                     ": another ring has that name by now; close this one and open "
+                                     "the stream anew"};
+  }
+  if (Result<void> room = check_room(); !room) return std::move(room).error().context(context);
+  Result<std::shared_ptr<Stream>> stream = Stream::adopt_untrusted(std::move(files), budget_);
+  if (!stream) return std::move(stream).error().context(context);
+  if ((*stream)->id() != *own) {
+    return Error{Errc::protocol,
+                 context + ": the offered ring is that of '" + (*stream)->id().str() + "'"};
+  }
+  add(*stream);
+  return stream;
+}
+
+Result<void> Registry::remove(const StreamId& id) {
+  const Result<std::shared_ptr<Stream>> found = find(id);
+  if (!found) return found.error();
+  const std::shared_ptr<Stream> stream = *found;
+  if (Result<void> marked = stream->mark_removed(); !marked) {
+    return std::move(marked).error().context("stream '" + stream->id().str() + "'");
+  }
+  by_name_.erase(Key{stream->id().name, stream->id().id});
+  in_order_.erase(std::find(in_order_.begin(), in_order_.end(), stream));
+  if (observer_) observer_->on_stream_removed(stream->id());
+  return {};
+}
+
+Result<void> Registry::set_property(const StreamId& id, std::string_view property) {
+  const Result<std::shared_ptr<Stream>> stream = find(id);
+  if (!stream) return stream.error();
+  const std::string context = "stream '" + (*stream)->id().str() + "'";
+  if (property.size() > limits_.max_property_bytes) {
+    return Error{
+        Errc::limit_exceeded,
+        context + ": a property of " + std::to_string(property.size()) +
+            " bytes is longer than max_property = " + std::to_string(limits_.max_property_bytes) +
+            " bytes; shorten it or raise the key max_property"};
+  }
+  if (Result<void> set = (*stream)->set_property(property, budget_); !set) {
+    return std::move(set).error().context(context);
+  }
+  return {};
+}
+
+void Registry::add(std::shared_ptr<Stream> stream) {
+  by_name_.emplace(Key{stream->id().name, stream->id().id}, stream);
+  // Streams of an earlier life of dssmd come back in any order and find their places again.
+  const auto place = std::upper_bound(in_order_.begin(), in_order_.end(), stream->created_order(),
+                                      [](std::uint64_t order, const std::shared_ptr<Stream>& s) {
+                                        return order < s->created_order();
+                                      });
+  in_order_.insert(place, stream);
+  next_order_ = std::max(next_order_, stream->created_order() + 1);
+  if (observer_) observer_->on_stream_added(*stream);
+}
+
+}  // namespace dssm::daemon

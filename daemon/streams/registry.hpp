@@ -1,0 +1,95 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The streams that this host owns, by name. One thread, no sockets: who asked, and what for, is
+// settled elsewhere (daemon/local).
+#pragma once
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/stream.hpp>
+#include <map>
+#include <memory>
+#include <string>
+#include <string_view>
+#include <utility>
+#include <vector>
+
+#include "daemon/streams/memory_budget.hpp"
+#include "daemon/streams/stream.hpp"
+
+namespace dssm::daemon {
+
+// Told about streams that come and go.
+class StreamObserver {
+ public:
+  virtual void on_stream_added(const Stream& stream) = 0;
+  virtual void on_stream_removed(const StreamId& id) = 0;
+
+ protected:
+  ~StreamObserver() = default;
+};
+
+class Registry {
+ public:
+  struct Limits {
+    std::uint64_t max_streams = 0;
+    std::uint64_t max_memory_bytes = 0;
+    std::uint64_t max_property_bytes = 0;
+  };
+
+  Registry(std::string host, const Limits& limits)
+      : host_(std::move(host)), limits_(limits), budget_(limits.max_memory_bytes) {}
+  Registry(const Registry&) = delete;
+  Registry& operator=(const Registry&) = delete;
+
+  // At most one; nullptr: none. It outlives the registry or takes itself off.
+  void observe(StreamObserver* observer) noexcept { observer_ = observer; }
+
+  const std::string& host() const noexcept { return host_; }
+  const MemoryBudget& budget() const noexcept { return budget_; }
+
+  // In the order of creation.
+  const std::vector<std::shared_ptr<Stream>>& streams() const noexcept { return in_order_; }
+
+  // The stream of that name; a host in `id` must be this one.
+  //   fails  not_found
+  Result<std::shared_ptr<Stream>> find(const StreamId& id) const;
+  bool knows(const StreamId& id) const { return find(id).has_value(); }
+
+  // Creates a stream, or gives the one of that name when the type fits.
+  //   fails  invalid_argument, type_mismatch, limit_exceeded, os errors
+  struct Created {
+    std::shared_ptr<Stream> stream;
+    bool created = false;
+  };
+  Result<Created> create(const StreamId& id, const TypeInfo& type, const History& history,
+                         std::int32_t creator_pid);
+
+  // Takes back a stream that a client (or, later, systemd) kept while no dssmd ran; gives the
+  // registered one when it is the very same ring.
+  //   fails  conflict (another ring has that name), protocol, no_permission, limit_exceeded
+  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, OfferedFiles files);
+
+  // The name is free at once; whoever has the stream open keeps it.
+  //   fails  not_found
+  Result<void> remove(const StreamId& id);
+
+  //   fails  not_found, limit_exceeded
+  Result<void> set_property(const StreamId& id, std::string_view property);
+
+ private:
+  using Key = std::pair<std::string, std::int32_t>;
+  Result<StreamId> own_id(StreamId id) const;
+  Result<void> check_room() const;
+  void add(std::shared_ptr<Stream> stream);
+
+  std::string host_;
+  Limits limits_;
+  MemoryBudget budget_;  // before the streams, which hold shares of it
+  std::map<Key, std::shared_ptr<Stream>> by_name_;
+  std::vector<std::shared_ptr<Stream>> in_order_;
+  std::uint64_t next_order_ = 1;
+  StreamObserver* observer_ = nullptr;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,233 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/streams/stream.hpp"
+
+#include <fcntl.h>
+#include <sys/eventfd.h>
+#include <sys/random.h>
+#include <unistd.h>
+
+#include <algorithm>
+
+#include "core/ring/bell.hpp"
+#include "core/ring/ring_reader.hpp"
+#include "core/wire/local_protocol.hpp"
+#include "daemon/streams/memory_file.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+constexpr int kSizeSeals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL;
+
+// The rate is taken over this many of the newest samples.
+constexpr Tid kRateSamples = 100;
+
+// How often to look again when the writer overtakes us between two looks.
+constexpr int kLooks = 4;
+
+Result<std::uint64_t> new_incarnation() {
+  std::uint64_t value = 0;
+  if (::getrandom(&value, sizeof value, 0) != sizeof value) return os_error("get a random number");
+  return value;
+}
+
+Result<UniqueFd> create_doorbell() {
+  UniqueFd fd(::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC));
+  if (!fd) return os_error("create a doorbell");
+  return fd;
+}
+
+local::StreamMeta meta_of(const Stream::Plan& plan, std::string_view property) {
+  local::StreamMeta meta;
+  wire::to_message(plan.id, *meta.mutable_id());
+  wire::to_message(plan.type, *meta.mutable_type());
+  meta.set_property(std::string(property));
+  meta.set_creator_pid(plan.creator_pid);
+  meta.set_created_order(plan.created_order);
+  return meta;
+}
+
+// Takes the memory of a ring and of its type's description from the budget.
+Result<MemoryShare> take_share(MemoryBudget& budget, const TypeInfo& type,
+                               const ring::Geometry& geometry) {
+  local::Type message;
+  wire::to_message(type, message);
+  const std::size_t type_bytes = message.ByteSizeLong();
+  if (type_bytes > kMaxTypeBytes) {
+    return Error{Errc::limit_exceeded, "the description of its type takes " +
+                                           std::to_string(type_bytes) + " bytes; at most " +
+                                           std::to_string(kMaxTypeBytes) +
+                                           " are taken: describe fewer fields"};
+  }
+  return budget.take(geometry.total_bytes + type_bytes);
+}
+
+// The plan that `meta` and the ring agree on.
+Result<Stream::Plan> plan_untrusted(const local::StreamMeta& meta,
+                                    const ring::RingMapping& mapping) {
+  const Result<StreamId> id = wire::stream_id_untrusted(meta.id());
+  if (!id) return id.error();
+  const Result<TypeInfo> type = wire::type_untrusted(meta.type());
+  if (!type) return type.error();
+  const ring::RingIdentity& ring = mapping.identity();
+  if (*id != ring.id || type->payload_bytes != mapping.geometry().payload_bytes ||
+      type->alignment_bytes != ring.alignment_bytes) {
+    return Error{Errc::protocol, "the offered meta file describes '" + id->str() + "' with " +
+                                     type->str() + ", the offered ring is that of '" +
+                                     ring.id.str() + "' with " +
+                                     std::to_string(mapping.geometry().payload_bytes) + " bytes"};
+  }
+  return Stream::Plan{
+      *id, *type, mapping.geometry().depth, ring.cycle, meta.creator_pid(), meta.created_order()};
+}
+
+void fill_figures(const ring::RingMapping& mapping, StreamInfo& info) {
+  const ring::RingReader reader(mapping);
+  SampleInfo last;
+  for (int look = 0; look < kLooks; ++look) {
+    const Tid newest = reader.newest();
+    if (newest < 0 || reader.stamp(newest, last) != ReadStatus::ok) continue;
+    info.newest = newest;
+    info.newest_time = last.time;
+    break;
+  }
+  if (info.newest < 0) return;
+  info.oldest = std::clamp<Tid>(reader.oldest(), 0, info.newest);
+  for (Tid back = std::min(kRateSamples - 1, info.newest - info.oldest); back > 0; back /= 2) {
+    SampleInfo first;
+    if (reader.stamp(info.newest - back, first) != ReadStatus::ok) continue;
+    std::int64_t span_ns = 0;  // the stamps may be anything: their distance need not fit
+    if (__builtin_sub_overflow(to_ns(last.time), to_ns(first.time), &span_ns)) return;
+    if (span_ns > 0) info.rate_hz = static_cast<double>(back) * 1e9 / static_cast<double>(span_ns);
+    return;
+  }
+}
+
+}  // namespace
+
+Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& budget) {
+  const Result<ring::Geometry> geometry = ring::Geometry::of(plan.type.payload_bytes, plan.depth);
+  if (!geometry) return geometry.error();
+  Result<MemoryShare> share = take_share(budget, plan.type, *geometry);
+  if (!share) return std::move(share).error();
+  const Result<std::uint64_t> incarnation = new_incarnation();
+  if (!incarnation) return incarnation.error();
+  Result<UniqueFd> ring =
+      ring::create_ring({plan.id, *incarnation, plan.cycle, plan.type.alignment_bytes}, *geometry);
+  if (!ring) return std::move(ring).error();
+  Result<UniqueFd> bell = ring::create_bell();
+  if (!bell) return std::move(bell).error();
+  Result<UniqueFd> doorbell = create_doorbell();
+  if (!doorbell) return std::move(doorbell).error();
+  Result<MetaFile> meta = MetaFile::create(meta_of(plan, {}));
+  if (!meta) return std::move(meta).error();
+  auto mapping = ring::RingMapping::open_untrusted(ring->get(), ring::Access::read_only);
+  if (!mapping) return std::move(mapping).error();
+  return std::shared_ptr<Stream>(
+      new Stream(plan, Files{*std::move(ring), *std::move(bell), *std::move(doorbell)},
+                 *std::move(meta), *std::move(mapping), *std::move(share)));
+}
+
+Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, MemoryBudget& budget) {
+  if (Result<void> own = check_own_memory_file(files.ring.get(), kSizeSeals, "ring"); !own) {
+    return std::move(own).error();
+  }
+  if (Result<void> own = check_own_memory_file(files.bell.get(), kSizeSeals, "bell"); !own) {
+    return std::move(own).error();
+  }
+  auto mapping = ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_only);
+  if (!mapping) return std::move(mapping).error();
+  if (auto bell = ring::Bell::open_untrusted(files.bell.get()); !bell) {
+    return std::move(bell).error();
+  }
+  Result<MetaFile> meta = MetaFile::open_untrusted(std::move(files.meta));
+  if (!meta) return std::move(meta).error();
+  const Result<local::StreamMeta> content = meta->read_untrusted();
+  if (!content) return content.error();
+  Result<Plan> plan = plan_untrusted(*content, **mapping);
+  if (!plan) return std::move(plan).error();
+  Result<MemoryShare> share = take_share(budget, plan->type, (*mapping)->geometry());
+  if (!share) return std::move(share).error();
+  Result<MemoryShare> property_share = budget.take(content->property().size());
+  if (!property_share) return std::move(property_share).error();
+  // Always anew, whatever came: writers get a descriptor that does not depend on the client's.
+  Result<UniqueFd> ring = ring::reopen_read_write(files.ring.get());
+  if (!ring) return std::move(ring).error();
+  std::shared_ptr<Stream> stream(
+      new Stream(*std::move(plan), Files{*std::move(ring), std::move(files.bell), UniqueFd()},
+                 *std::move(meta), *std::move(mapping), *std::move(share)));
+  stream->property_share_ = *std::move(property_share);
+  stream->take_doorbell_untrusted(std::move(files.doorbell));
+  return stream;
+}
+
+StreamInfo Stream::info() const {
+  StreamInfo info;
+  info.id = plan_.id;
+  info.type = plan_.type;
+  info.depth = plan_.depth;
+  info.cycle = plan_.cycle;
+  info.memory_bytes = mapping_->geometry().total_bytes;
+  info.property_bytes = property_share_.bytes();
+  info.incarnation = mapping_->identity().incarnation;
+  info.creator_pid = plan_.creator_pid;
+  fill_figures(*mapping_, info);
+  return info;
+}
+
+Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role) {
+  if (role == Role::writer && !files_.doorbell) {
+    Result<UniqueFd> made = create_doorbell();
+    if (!made) return std::move(made).error();
+    files_.doorbell = *std::move(made);
+  }
+  Result<UniqueFd> all[] = {
+      role == Role::writer ? duplicate(files_.ring.get())
+                           : ring::reopen_read_only(files_.ring.get()),
+      duplicate(files_.bell.get()),
+      ring::reopen_read_only(meta_.fd()),
+      role == Role::writer ? duplicate(files_.doorbell.get()) : UniqueFd(),
+  };
+  std::vector<UniqueFd> descriptors;
+  for (Result<UniqueFd>& one : all) {
+    if (!one) return std::move(one).error();
+    if (*one) descriptors.push_back(*std::move(one));
+  }
+  return descriptors;
+}
+
+bool Stream::is_ring(int fd) const noexcept { return same_file(fd, files_.ring.get()); }
+
+void Stream::take_doorbell_untrusted(UniqueFd doorbell) {
+  if (!doorbell || files_.doorbell) return;
+  char kind[64] = {};
+  const std::string path = "/proc/self/fd/" + std::to_string(doorbell.get());
+  if (::readlink(path.c_str(), kind, sizeof kind - 1) < 0) return;
+  // A blocking one could stop whoever reads it.
+  const int flags = ::fcntl(doorbell.get(), F_GETFL);
+  if (std::string_view(kind) != "anon_inode:[eventfd]" || !(flags & O_NONBLOCK)) return;
+  files_.doorbell = std::move(doorbell);
+}
+
+Result<void> Stream::mark_removed() {
+  if (Result<void> marked = meta_.mark_removed(); !marked) return marked;
+  removed_ = true;
+  return {};
+}
+
+Result<std::string> Stream::property() const {
+  // Kept only in the meta file: dssmd's own memory stays small.
+  Result<local::StreamMeta> meta = meta_.read_untrusted();
+  if (!meta) return std::move(meta).error();
+  return std::move(*meta->mutable_property());
+}
+
+Result<void> Stream::set_property(std::string_view property, MemoryBudget& budget) {
+  // Old and new one exist side by side for a moment, so the new share is taken first.
+  Result<MemoryShare> share = budget.take(property.size());
+  if (!share) return std::move(share).error();
+  if (Result<void> done = meta_.replace(meta_of(plan_, property)); !done) return done;
+  property_share_ = *std::move(share);
+  return {};
+}
+
+}  // namespace dssm::daemon

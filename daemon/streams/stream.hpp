@@ -1,0 +1,104 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// One stream that this host owns: the memory files behind it and what dssmd knows about it. It
+// lives as long as it has a name in the Registry or somebody has it open; what programs hold of its
+// memory lives on by itself.
+//
+// dssmd never reads a payload here, and of the rings only the newest stamps, to tell how the stream
+// is doing.
+#pragma once
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/stream.hpp>
+#include <memory>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "core/ring/ring_memory.hpp"
+#include "daemon/streams/memory_budget.hpp"
+#include "daemon/streams/meta_file.hpp"
+
+namespace dssm::daemon {
+
+// A type's description may be this long, as dssm.local.Type: dssmd keeps it in its own memory.
+inline constexpr std::size_t kMaxTypeBytes = 64 << 10;
+
+// What a client offers of a stream that it held through a restart of dssmd.
+struct OfferedFiles {
+  UniqueFd ring, bell, meta;
+  UniqueFd doorbell;  // may be missing
+};
+
+class Stream {
+ public:
+  struct Plan {
+    StreamId id;  // with host
+    TypeInfo type;
+    std::uint64_t depth = 0;
+    Duration cycle{};
+    std::int32_t creator_pid = 0;
+    std::uint64_t created_order = 0;
+  };
+
+  // Creates the memory files, none of whose memory is taken yet but for three pages: the client
+  // that asked reserves the ring's.
+  static Result<std::shared_ptr<Stream>> create(const Plan& plan, MemoryBudget& budget);
+
+  // Brings a stream back from its memory files, after checking owner, seals, geometry, and that
+  // ring and meta file tell the same story. Serves clients' offers, and is made for systemd's
+  // descriptor store.
+  static Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles files, MemoryBudget& budget);
+
+  Stream(const Stream&) = delete;
+  Stream& operator=(const Stream&) = delete;
+
+  const StreamId& id() const noexcept { return plan_.id; }
+  const TypeInfo& type() const noexcept { return plan_.type; }
+  std::int32_t creator_pid() const noexcept { return plan_.creator_pid; }
+  std::uint64_t created_order() const noexcept { return plan_.created_order; }
+
+  // What is known now, but for the users. Costs two looks at the ring.
+  StreamInfo info() const;
+
+  // Descriptors to hand out, in the order of local.proto's Opened; the caller's own. For writers a
+  // missing doorbell is made.
+  Result<std::vector<UniqueFd>> descriptors_for(Role role);
+
+  // Whether `fd` is this stream's ring.
+  bool is_ring(int fd) const noexcept;
+
+  // Takes the doorbell that a writer kept, when there is none yet; whatever is no such eventfd is
+  // dropped.
+  void take_doorbell_untrusted(UniqueFd doorbell);
+
+  Result<std::string> property() const;
+  Result<void> set_property(std::string_view property, MemoryBudget& budget);
+
+  // So that no later offer brings it back.
+  Result<void> mark_removed();
+  bool removed() const noexcept { return removed_; }
+
+ private:
+  struct Files {
+    UniqueFd ring, bell, doorbell;
+  };
+  Stream(Plan plan, Files files, MetaFile meta, std::shared_ptr<const ring::RingMapping> mapping,
+         MemoryShare share)
+      : plan_(std::move(plan)),
+        files_(std::move(files)),
+        meta_(std::move(meta)),
+        mapping_(std::move(mapping)),
+        share_(std::move(share)) {}
+
+  Plan plan_;
+  Files files_;
+  MetaFile meta_;
+  std::shared_ptr<const ring::RingMapping> mapping_;  // read-only
+  MemoryShare share_, property_share_;                // of ring and type; of the property
+  bool removed_ = false;
+};
+
+}  // namespace dssm::daemon
