@@ -34,8 +34,8 @@ class SlotTable {
   // quotient or one less.
   std::uint64_t index(Tid tid) const noexcept {
     const std::uint64_t n = static_cast<std::uint64_t>(tid);
-    const std::uint64_t quotient =
-        static_cast<std::uint64_t>((static_cast<unsigned __int128>(n) * inverse_) >> 64);
+    __extension__ using Wide = unsigned __int128;
+    const auto quotient = static_cast<std::uint64_t>((static_cast<Wide>(n) * inverse_) >> 64);
     const std::uint64_t rest = n - quotient * depth_;
     return rest >= depth_ ? rest - depth_ : rest;
   }

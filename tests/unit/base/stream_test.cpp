@@ -1,0 +1,167 @@
+// SPDX-License-Identifier: Apache-2.0
+#include <gtest/gtest.h>
+
+#include <dssm/describe.hpp>
+#include <dssm/stream.hpp>
+
+#include "core/base/utf8.hpp"
+
+namespace dssm {
+
+struct Point {
+  double x, y;
+};
+DSSM_DESCRIBE(Point, x, y)
+
+enum class Gear : std::uint8_t { park, drive };
+
+struct Everything {
+  Point pose;
+  float speed[3];
+  std::array<Point, 2> corners;
+  std::int16_t grid[2][3];
+  Gear gear;
+  bool moving;
+  char name[8];
+};
+DSSM_DESCRIBE(Everything, pose, speed, corners, grid, gear, moving, name)
+
+struct Plain {
+  int a;
+};
+
+namespace {
+
+TEST(StreamId, ReadsEveryFormOfAName) {
+  EXPECT_EQ(StreamId::parse("lidar").value(), (StreamId{"lidar", 0, ""}));
+  EXPECT_EQ(StreamId::parse("lidar:7").value(), (StreamId{"lidar", 7, ""}));
+  EXPECT_EQ(StreamId::parse("lidar@pc2").value(), (StreamId{"lidar", 0, "pc2"}));
+  EXPECT_EQ(StreamId::parse("front lidar:1@pc2").value(), (StreamId{"front lidar", 1, "pc2"}));
+  EXPECT_EQ(StreamId::parse("lidar:7@pc2").value().str(), "lidar:7@pc2");
+}
+
+TEST(StreamId, RefusesBadNamesInWords) {
+  const std::pair<const char*, const char*> cases[] = {
+      {"", "empty"},
+      {":1", "empty"},
+      {"a:", "is no id"},
+      {"a:x", "'x' after ':' is no id"},
+      {"a:-1", "ids start at 0"},
+      {"a:99999999999", "is no id"},
+      {"a:1:2", "is no id"},
+      {"a@", "no host"},
+      {"a\nb", "control character"},
+      {"a\xff", "not UTF-8"},
+      {"12345678901234567890123456789012", "32 bytes long; at most 31"},
+      {"1234567890123456789012345678901:2147483647@a-host-with-a-long-name", "63"},
+  };
+  for (const auto& [text, why] : cases) {
+    const Result<StreamId> id = StreamId::parse(text);
+    ASSERT_FALSE(id) << text;
+    EXPECT_EQ(id.error().code, Errc::invalid_argument);
+    EXPECT_NE(id.error().message.find(why), std::string::npos) << id.error().message;
+  }
+  EXPECT_TRUE(StreamId::parse("1234567890123456789012345678901"));
+}
+
+TEST(TypeInfo, DescribesNestedStructsArraysEnumsAndText) {
+  const TypeInfo type = type_of<Everything>();
+  EXPECT_EQ(type.name, "Everything");
+  EXPECT_EQ(type.payload_bytes, sizeof(Everything));
+  EXPECT_EQ(type.alignment_bytes, alignof(Everything));
+  const std::vector<Field> wanted = {
+      {"pose.x", Scalar::float64, 0, 1, 8},
+      {"pose.y", Scalar::float64, 8, 1, 8},
+      {"speed", Scalar::float32, offsetof(Everything, speed), 3, 4},
+      {"corners.x", Scalar::float64, offsetof(Everything, corners), 2, 16},
+      {"corners.y", Scalar::float64, offsetof(Everything, corners) + 8, 2, 16},
+      {"grid", Scalar::int16, offsetof(Everything, grid), 6, 2},
+      {"gear", Scalar::uint8, offsetof(Everything, gear), 1, 1},
+      {"moving", Scalar::boolean, offsetof(Everything, moving), 1, 1},
+      {"name", Scalar::character, offsetof(Everything, name), 8, 1},
+  };
+  EXPECT_EQ(type.fields, wanted);
+  EXPECT_TRUE(type.check());
+}
+
+TEST(TypeInfo, NamesUndescribedTypesAsTheCompilerSpellsThem) {
+  EXPECT_EQ(type_of<Plain>().name, "dssm::Plain");
+  EXPECT_TRUE(type_of<Plain>().fields.empty());
+  EXPECT_EQ(type_of<double>().name, "double");
+  EXPECT_EQ(type_of<double>().fields.at(0).name, "value");
+}
+
+TEST(TypeInfo, NamesBothTypesWhenTheyDiffer) {
+  const TypeInfo odometry{"Odometry", 40, 8, {}}, other{"Pose", 40, 8, {}}, bytes{"", 40, 1, {}};
+  EXPECT_TRUE(odometry.check_usable_as(odometry));
+  EXPECT_TRUE(odometry.check_usable_as(bytes)) << "bytes match every type of their size";
+  EXPECT_TRUE(bytes.check_usable_as(odometry));
+  for (const TypeInfo& wanted : {other, TypeInfo{"Odometry", 48, 8, {}},
+                                 TypeInfo{"Odometry", 40, 4, {}}, TypeInfo{"", 48, 1, {}}}) {
+    const Result<void> usable = odometry.check_usable_as(wanted);
+    ASSERT_FALSE(usable);
+    EXPECT_EQ(usable.error().code, Errc::type_mismatch);
+    EXPECT_NE(usable.error().message.find(odometry.str()), std::string::npos);
+    EXPECT_NE(usable.error().message.find(wanted.str()), std::string::npos);
+  }
+}
+
+TEST(TypeInfo, RefusesFieldsOutsideThePayload) {
+  TypeInfo type{"T", 16, 8, {{"a", Scalar::float64, 8, 1, 8}}};
+  EXPECT_TRUE(type.check());
+  for (const Field& bad :
+       {Field{"a", Scalar::float64, 9, 1, 8}, Field{"a", Scalar::float64, 0, 3, 8},
+        Field{"a", Scalar::uint8, 0, UINT64_MAX, 8}, Field{"a", Scalar(99), 0, 1, 1},
+        Field{"a", Scalar::uint8, 1, 2, UINT64_MAX}, Field{"a", Scalar::uint8, 0, 0, 1},
+        Field{"\xff", Scalar::uint8, 0, 1, 1}}) {
+    type.fields = {bad};
+    EXPECT_FALSE(type.check());
+  }
+  EXPECT_FALSE((TypeInfo{"T", 16, 3, {}}.check()));
+  EXPECT_FALSE((TypeInfo{"T", 16, 128, {}}.check()));
+  EXPECT_FALSE((TypeInfo{"T", 0, 1, {}}.check()));
+  EXPECT_FALSE((TypeInfo{std::string(128, 'x'), 16, 1, {}}.check()));
+}
+
+TEST(History, HoldsTwentyPercentMoreThanAskedFor) {
+  using namespace std::chrono_literals;
+  EXPECT_EQ(History::of(1s, 100ms).value().depth, 13u);
+  EXPECT_EQ(History::of(5s, 5ms).value().depth, 1201u);
+  EXPECT_EQ(History::of(100ms, 100ms).value().depth, 2u);
+  EXPECT_EQ(History::of(1s, 0s).error().code, Errc::invalid_argument);
+  EXPECT_EQ(History::of(1s, -1s).error().code, Errc::invalid_argument);
+  EXPECT_EQ(History::of(0s, 1s).error().code, Errc::invalid_argument);
+  EXPECT_EQ(History::of(1h, 1ns).error().code, Errc::limit_exceeded);
+}
+
+TEST(Utf8, TellsWellFormedFromOtherText) {
+  for (const char* good : {"", "a", "\u00e9", "\u65e5\u672c", "\U0001F916", "\u07ff\uffff"}) {
+    EXPECT_TRUE(is_utf8(good)) << good;
+  }
+  for (const char* bad : {"\x80", "\xc3", "\xc0\x80", "\xe2\x82", "\xed\xa0\x80",
+                          "\xf4\x90\x80\x80", "\xe0\x80\x80", "a\xff"}) {
+    EXPECT_FALSE(is_utf8(bad));
+  }
+}
+
+TEST(Result, ThrowsAtTheEdgeOnlyWhenAsked) {
+  const Result<int> good = 3;
+  EXPECT_EQ(good.value(), 3);
+  const Result<int> bad = Error{Errc::not_found, "nothing there"}.context("open 'x'");
+  EXPECT_FALSE(bad);
+  try {
+    bad.value();
+    FAIL() << "value() of an error must throw";
+  } catch (const BadResult& thrown) {
+    EXPECT_STREQ(thrown.what(), "open 'x': nothing there");
+    EXPECT_EQ(thrown.error().code, Errc::not_found);
+  }
+}
+
+TEST(Time, DeadlinesDoNotOverflow) {
+  EXPECT_EQ(deadline_in(Duration::max()), kNever);
+  EXPECT_GT(deadline_in(std::chrono::hours(1)), MonoClock::now());
+}
+
+}  // namespace
+}  // namespace dssm
