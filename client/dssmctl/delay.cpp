@@ -1,0 +1,55 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmctl delay: how old samples are when they arrive here, that is the time on this PC's clock
+// when this program was woken for a sample, minus the sample's stamp.
+#include "client/dssmctl/json.hpp"
+#include "client/dssmctl/meter.hpp"
+#include "client/dssmctl/statistics.hpp"
+#include "client/dssmctl/text.hpp"
+#include "client/dssmctl/verbs.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+void print_json(const MeterState& state, const Statistics& delays, Output& out) {
+  const auto known = [&](auto value) { return delays.count > 0 ? Json(value) : Json(); };
+  Json json;
+  json["stream"] = state.stream.str();
+  json["samples"] = delays.count;
+  json["new_samples"] = state.new_samples;
+  json["seen_samples"] = state.seen;
+  json["lost_samples"] = state.lost;
+  json["final"] = state.final;
+  json["delay_mean_ns"] = known(delays.mean_ns);
+  json["delay_min_ns"] = known(to_ns(delays.min));
+  json["delay_max_ns"] = known(to_ns(delays.max));
+  json["delay_std_dev_ns"] = known(delays.std_dev_ns);
+  out.add(json_line(json));
+}
+
+void print_text(const MeterState& state, const Statistics& delays, Output& out) {
+  if (state.final) out.add(farewell(state));
+  if (!state.final && state.new_samples == 0) return out.add("no new samples\n");
+  if (delays.count == 0) return;
+  out.add("average delay: " + fixed_text(delays.mean_ns / 1e9, 9) + " s\n\tmin: " +
+          seconds_text(to_ns(delays.min)) + " s max: " + seconds_text(to_ns(delays.max)) +
+          " s std dev: " + fixed_text(delays.std_dev_ns / 1e9, 9) +
+          " s window: " + std::to_string(delays.count) + "\n");
+}
+
+}  // namespace
+
+Result<void> run_delay(const Options& options, Output& out) {
+  Window delays(options.window);
+  Meter meter;
+  meter.on_sample = [&](const SampleInfo& info, Time arrival) {
+    delays.add(saturating_sub(arrival, info.time));
+  };
+  meter.on_report = [&](const MeterState& state) {
+    const auto print = options.json ? print_json : print_text;
+    print(state, delays.statistics(), out);
+  };
+  return run_meter(options, out, meter);
+}
+
+}  // namespace dssm::ctl

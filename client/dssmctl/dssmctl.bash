@@ -1,0 +1,124 @@
+# SPDX-License-Identifier: Apache-2.0
+#
+# bash completion for dssmctl(1): verbs, options, and the names of the streams that there are, as
+# `dssmctl ls --names` tells them. Works with and without the bash-completion package, whose helper
+# functions it does not need. A test compares the words below with `dssmctl --help`.
+
+# The streams' names, one per line. $1: the words of the command line, for --socket.
+_dssmctl_streams() {
+  local socket=() i
+  for ((i = 1; i + 1 < ${#words[@]}; ++i)); do
+    [[ ${words[i]} == --socket ]] && socket=(--socket "${words[i + 1]}")
+  done
+  "${words[0]}" "${socket[@]}" ls --names 2>/dev/null
+}
+
+# Puts those lines of standard input into COMPREPLY that begin with what is being typed, quoted
+# for the shell. Bash has split the word at colons: what stands before the last one is not to be
+# replaced, so it is cut off.
+_dssmctl_offer() {
+  local line typed=${cur//\\/} before=""
+  [[ $typed == *:* && $COMP_WORDBREAKS == *:* ]] && before=${typed%"${typed##*:}"}
+  while IFS= read -r line; do
+    [[ -n $line && $line == "$typed"* ]] || continue
+    printf -v line %q "${line#"$before"}"
+    COMPREPLY+=("$line")
+  done
+}
+
+_dssmctl_offer_files() {
+  compopt -o filenames 2>/dev/null # fails only where a test calls us by hand
+  mapfile -t COMPREPLY < <(compgen -f -- "$cur")
+}
+
+_dssmctl() {
+  COMPREPLY=()
+  # Bash's own words, with those put together again that it split at colons.
+  local words=() cword=0 i word glue=0
+  for ((i = 0; i <= COMP_CWORD; ++i)); do
+    word=${COMP_WORDS[i]}
+    if [[ $word == :* && ${#words[@]} -gt 1 ]]; then
+      words[-1]+=$word
+      glue=1
+    elif ((glue)); then
+      words[-1]+=$word
+      glue=0
+    else
+      words+=("$word")
+    fi
+  done
+  cword=$((${#words[@]} - 1))
+  local cur=${words[cword]} prev=${words[cword - 1]}
+
+  # The verb, and how many words that are no options stand between it and the cursor.
+  local verb="" positional=0
+  for ((i = 1; i < cword; ++i)); do
+    case ${words[i]} in
+      --socket | --sort | --at | --count | -n | --field | --wait | --window | -w | --interval | -i | \
+        --size | --depth | --life | --cycle | --type | --align | --offset | --speed | --time)
+        ((++i))
+        ;;
+      -*) ;;
+      *)
+        case $verb in
+          "") verb=${words[i]} ;;
+          property | playback) verb+=" ${words[i]}" ;;
+          *) ((++positional)) ;;
+        esac
+        ;;
+    esac
+  done
+
+  case $prev in
+    --socket)
+      _dssmctl_offer_files
+      return
+      ;;
+    --sort)
+      mapfile -t COMPREPLY < <(compgen -W "created name id size depth cycle rate age writers \
+        readers type memory" -- "$cur")
+      return
+      ;;
+    --at | --count | -n | --field | --wait | --window | -w | --interval | -i | --size | --depth | \
+      --life | --cycle | --type | --align | --offset | --speed | --time)
+      return # a value that only the person knows
+      ;;
+  esac
+
+  local common="--help --json --socket" options=""
+  case $verb in
+    "") options="--version" ;;
+    ls) options="--names --reverse --sort" ;;
+    echo) options="--at --count --csv --field --full --last --wait" ;;
+    hz | bw | delay) options="--count --interval --wait --window" ;;
+    create) options="--align --cycle --depth --life --size --type" ;;
+    "playback set") options="--offset --speed --time" ;;
+  esac
+  if [[ $cur == -* ]]; then
+    mapfile -t COMPREPLY < <(compgen -W "$common $options" -- "$cur")
+    return
+  fi
+
+  case $verb in
+    "")
+      mapfile -t COMPREPLY < <(compgen -W \
+        "bw create delay echo hz info ls playback property rm" -- "$cur")
+      ;;
+    property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
+    playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;
+    rm) _dssmctl_offer < <(_dssmctl_streams) ;;
+    info | echo | hz | bw | delay)
+      ((positional == 0)) && _dssmctl_offer < <(_dssmctl_streams)
+      ;;
+    "property get" | "property set")
+      if ((positional == 0)); then
+        _dssmctl_offer < <(_dssmctl_streams)
+      elif ((positional == 1)); then
+        _dssmctl_offer_files
+      fi
+      ;;
+  esac
+  return 0
+}
+
+complete -F _dssmctl dssmctl

@@ -1,0 +1,190 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/dssmctl/fields.hpp"
+
+#include <algorithm>
+#include <array>
+#include <charconv>
+#include <cstring>
+#include <utility>
+#include <variant>
+
+#include "client/dssmctl/text.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+// One element, widened to the kinds that print differently.
+using Value = std::variant<bool, char, std::int64_t, std::uint64_t, float, double>;
+
+// Payloads are in the byte order of their PC, which is this one.
+template <class T>
+T load(const std::byte* place) {
+  T value;
+  std::memcpy(&value, place, sizeof value);
+  return value;
+}
+
+Value value_at(std::span<const std::byte> payload, const Field& field, std::uint64_t i) {
+  const std::byte* place = payload.data() + field.offset_bytes + i * field.stride_bytes;
+  switch (field.kind) {
+    case Scalar::boolean:
+      return load<std::uint8_t>(place) != 0;  // 2 in a bool is undefined to load
+    case Scalar::character:
+      return load<char>(place);
+    case Scalar::int8:
+      return std::int64_t{load<std::int8_t>(place)};
+    case Scalar::uint8:
+      return std::uint64_t{load<std::uint8_t>(place)};
+    case Scalar::int16:
+      return std::int64_t{load<std::int16_t>(place)};
+    case Scalar::uint16:
+      return std::uint64_t{load<std::uint16_t>(place)};
+    case Scalar::int32:
+      return std::int64_t{load<std::int32_t>(place)};
+    case Scalar::uint32:
+      return std::uint64_t{load<std::uint32_t>(place)};
+    case Scalar::int64:
+      return load<std::int64_t>(place);
+    case Scalar::uint64:
+      return load<std::uint64_t>(place);
+    case Scalar::float32:
+      return load<float>(place);
+    case Scalar::float64:
+      return load<double>(place);
+  }
+  return std::uint64_t{
+      0};  // not reached: readable_fields_untrusted() lets known kinds through only
+}
+
+// Numbers so short that reading them again gives the same bits.
+std::string bare_text(const Value& value) {
+  return std::visit(
+      [](auto v) -> std::string {
+        if constexpr (std::is_same_v<decltype(v), bool>) {
+          return v ? "true" : "false";
+        } else if constexpr (std::is_same_v<decltype(v), char>) {
+          return std::string(1, v);
+        } else {
+          std::array<char, 32> text{};
+          return std::string(text.data(),
+                             std::to_chars(text.data(), text.data() + text.size(), v).ptr);
+        }
+      },
+      value);
+}
+
+std::string quoted_text(const Value& value) {
+  if (const char* c = std::get_if<char>(&value)) {
+    return std::string("'").append(escaped({c, 1})).append("'");
+  }
+  return bare_text(value);
+}
+
+Json value_json(const Value& value) {
+  return std::visit(
+      [](auto v) -> Json {
+        if constexpr (std::is_same_v<decltype(v), char>) {
+          return std::string(1, v);
+        } else {
+          return v;  // NaN and infinity are dumped as null
+        }
+      },
+      value);
+}
+
+bool fits_untrusted(const Field& field, std::uint64_t payload_bytes) {
+  if (field.kind < Scalar::boolean || field.kind > Scalar::float64) return false;
+  const std::uint64_t element_bytes = scalar_bytes(field.kind);
+  if (field.count == 0 || field.offset_bytes > payload_bytes) return false;
+  const std::uint64_t room = payload_bytes - field.offset_bytes;
+  if (element_bytes > room) return false;
+  if (field.count == 1) return true;
+  // Elements that overlap would make a small payload endless.
+  return field.stride_bytes >= element_bytes &&
+         field.count - 1 <= (room - element_bytes) / field.stride_bytes;
+}
+
+bool asks_for(const std::string& wanted, const std::string& name) {
+  if (!name.starts_with(wanted)) return false;
+  return name.size() == wanted.size() || name[wanted.size()] == '.' || name[wanted.size()] == '[';
+}
+
+}  // namespace
+
+std::vector<Field> readable_fields_untrusted(const TypeInfo& type) {
+  const bool all_fit = std::all_of(type.fields.begin(), type.fields.end(), [&](const Field& field) {
+    return fits_untrusted(field, type.payload_bytes);
+  });
+  return all_fit ? type.fields : std::vector<Field>{};
+}
+
+Result<std::vector<Field>> select_fields(std::vector<Field> fields,
+                                         const std::vector<std::string>& wanted) {
+  for (const std::string& wish : wanted) {
+    const auto is_it = [&](const Field& field) { return asks_for(wish, field.name); };
+    if (std::any_of(fields.begin(), fields.end(), is_it)) continue;
+    std::string message = "no field '" + wish + "'";
+    if (fields.empty()) {
+      message += ": this stream's type does not describe its fields";
+    } else {
+      message += "; there are";
+      for (const Field& field : fields)
+        message += (&field == &fields[0] ? " '" : ", '") + field.name + "'";
+    }
+    return Error{Errc::invalid_argument, std::move(message)};
+  }
+  if (!wanted.empty()) {
+    std::erase_if(fields, [&](const Field& field) {
+      return std::none_of(wanted.begin(), wanted.end(),
+                          [&](const std::string& wish) { return asks_for(wish, field.name); });
+    });
+  }
+  return fields;
+}
+
+bool is_text(const Field& field) {
+  return field.kind == Scalar::character && field.count > 1 && field.stride_bytes == 1;
+}
+
+std::string text_of(std::span<const std::byte> payload, const Field& field) {
+  const auto* start = reinterpret_cast<const char*>(payload.data() + field.offset_bytes);
+  return std::string(start, ::strnlen(start, field.count));
+}
+
+std::string field_text(std::span<const std::byte> payload, const Field& field, std::size_t shown) {
+  if (is_text(field)) {
+    std::string text = text_of(payload, field);
+    const std::size_t hidden = text.size() > shown ? text.size() - shown : 0;
+    text.resize(text.size() - hidden);
+    std::string out = "\"";
+    for (const char c : text) out += c == '"' ? "\\\"" : escaped({&c, 1});
+    out += '"';
+    if (hidden > 0) out += " ... " + std::to_string(hidden) + " more";
+    return out;
+  }
+  if (field.count == 1) return quoted_text(value_at(payload, field, 0));
+  std::string out = "[";
+  const std::uint64_t end = std::min<std::uint64_t>(field.count, shown);
+  for (std::uint64_t i = 0; i < end; ++i) {
+    if (i > 0) out += ", ";
+    out += quoted_text(value_at(payload, field, i));
+  }
+  if (end < field.count) out += ", ... " + std::to_string(field.count - end) + " more";
+  return out + "]";
+}
+
+Json field_json(std::span<const std::byte> payload, const Field& field) {
+  if (is_text(field)) return text_of(payload, field);
+  if (field.count == 1) return value_json(value_at(payload, field, 0));
+  Json array = Json::array();
+  for (std::uint64_t i = 0; i < field.count; ++i) {
+    array.push_back(value_json(value_at(payload, field, i)));
+  }
+  return array;
+}
+
+std::string element_text(std::span<const std::byte> payload, const Field& field, std::uint64_t i) {
+  return is_text(field) ? text_of(payload, field) : bare_text(value_at(payload, field, i));
+}
+
+}  // namespace dssm::ctl

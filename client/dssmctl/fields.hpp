@@ -1,0 +1,42 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// From a payload's bytes and its type's description to values by name. The description came with
+// the stream, from a program that may have been wrong: readable_fields() checks every field against
+// the payload's size, and the other functions here take only fields that passed.
+#pragma once
+
+#include <cstddef>
+#include <dssm/stream.hpp>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "client/dssmctl/json.hpp"
+
+namespace dssm::ctl {
+
+// The fields of `type` when each of them lies inside the payload; none at all otherwise, because a
+// description with one wrong field describes something else.
+std::vector<Field> readable_fields_untrusted(const TypeInfo& type);
+
+// Those of `fields` that `wanted` asks for, in the order of the payload. "pose" stands for the
+// field pose and for all of pose.*; without any wish all are wanted. Fails with invalid_argument,
+// naming the fields there are.
+Result<std::vector<Field>> select_fields(std::vector<Field> fields,
+                                         const std::vector<std::string>& wanted);
+
+// Whether the field is text: an array of char without holes. It ends at its first zero byte.
+bool is_text(const Field& field);
+std::string text_of(std::span<const std::byte> payload, const Field& field);
+
+// For people: 1.5, true, 'a', "text", [1, 2, 3]; of more than `shown` elements the first `shown`
+// and how many are left out.
+std::string field_text(std::span<const std::byte> payload, const Field& field, std::size_t shown);
+
+// The same for programs: a number, boolean, string, or an array of them, always complete.
+Json field_json(std::span<const std::byte> payload, const Field& field);
+
+// One element as in field_text(), but text and characters bare.
+std::string element_text(std::span<const std::byte> payload, const Field& field, std::uint64_t i);
+
+}  // namespace dssm::ctl

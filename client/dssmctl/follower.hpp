@@ -1,0 +1,51 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Waiting on a stream that is being shown: for its next sample, the next report, Ctrl-C, the end of
+// whoever reads our output, and the stream's removal.
+//
+// It looks up every kLookUp because a signal that comes between the look at its mark and the sleep
+// on the ring would otherwise be noticed only with the next sample.
+#pragma once
+
+#include <atomic>
+#include <dssm/session.hpp>
+#include <memory>
+
+#include "client/dssmctl/output.hpp"
+
+namespace dssm::ctl {
+
+class Follower {
+ public:
+  enum class Wake : unsigned char {
+    sample,  // there is something newer than the reader's cursor
+    deadline,
+    stop,     // by signal, or because nobody reads our output any more
+    removed,  // the stream was removed; samples written before may still be unread
+  };
+
+  // `session`, `reader` and `out` outlive the follower.
+  static Result<Follower> open(Session& session, RawReader& reader, Output& out);
+
+  Wake wait(MonoTime deadline);
+
+ private:
+  Follower(Session& session, RawReader& reader, Output& out)
+      : session_(session), reader_(reader), out_(out) {}
+  bool removed();
+
+  static constexpr Duration kLookUp = std::chrono::milliseconds(100);
+
+  Session& session_;
+  RawReader& reader_;
+  Output& out_;
+  // Set by the session's thread when something happened to a stream of this name. Shared with the
+  // callback, which moves with the watch.
+  std::shared_ptr<std::atomic<bool>> suspicion_ = std::make_shared<std::atomic<bool>>(false);
+  std::optional<Session::Watch> watch_;
+};
+
+// What to say when `reader`'s stream was removed.
+Error removed_error(const RawReader& reader);
+
+}  // namespace dssm::ctl

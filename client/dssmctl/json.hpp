@@ -1,0 +1,24 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// JSON output: keys in the order in which they are written, whole numbers exact, NaN and infinity
+// as null, everything outside ASCII as \u escapes. Bytes that are no UTF-8 become U+FFFD.
+#pragma once
+
+#include <nlohmann/json.hpp>
+#include <string>
+
+namespace dssm::ctl {
+
+using Json = nlohmann::ordered_json;
+
+// One line, with its newline.
+inline std::string json_line(const Json& json) {
+  return json.dump(-1, ' ', true, Json::error_handler_t::replace) + "\n";
+}
+
+// A document for people and programs: indented.
+inline std::string json_document(const Json& json) {
+  return json.dump(2, ' ', true, Json::error_handler_t::replace) + "\n";
+}
+
+}  // namespace dssm::ctl

@@ -1,0 +1,103 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/dssmctl/meter.hpp"
+
+#include <algorithm>
+
+#include "client/dssmctl/follower.hpp"
+#include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/stop_signal.hpp"
+#include "client/dssmctl/text.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+// Reads the stamps of all samples after the reader's cursor, up to the newest one of this moment.
+class StampReader {
+ public:
+  StampReader(RawReader& reader, const Meter& meter, MeterState& state)
+      : reader_(reader), meter_(meter), state_(state) {}
+
+  void read_new() {
+    const Time arrival = WallClock::now();
+    const Tid newest = reader_.newest();
+    Tid tid = reader_.cursor() + 1;
+    while (tid <= newest) {
+      SampleInfo info;
+      if (reader_.stamp(tid, info) != ReadStatus::ok) {
+        const Tid next = std::max(reader_.oldest(), tid + 1);
+        state_.lost += static_cast<std::uint64_t>(next - tid);
+        if (meter_.on_gap) meter_.on_gap();
+        tid = next;
+        continue;
+      }
+      ++tid;
+      ++state_.seen;
+      ++state_.new_samples;
+      newest_time_ = info.time;
+      meter_.on_sample(info, arrival);
+    }
+    reader_.seek(tid - 1);
+    state_.age = saturating_sub(WallClock::now(), newest_time_);
+  }
+
+ private:
+  RawReader& reader_;
+  const Meter& meter_;
+  MeterState& state_;
+  Time newest_time_{};
+};
+
+// The last sample not to look at: before the newest `window` ones, or before what is to come.
+Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t window, bool awaited) {
+  const Tid newest = reader.newest();
+  if (!meter.from_history) return awaited ? kNoTid : newest;
+  return std::max(newest - static_cast<Tid>(window), reader.oldest() - 1);
+}
+
+}  // namespace
+
+Result<void> run_meter(const Options& options, Output& out, const Meter& meter) {
+  catch_stop_signals();
+  Result<Session> session = connect(options);
+  if (!session) return std::move(session).error();
+  Result<std::optional<OpenedStream>> opened = open_stream(*session, options);
+  if (!opened) return std::move(opened).error();
+  if (!*opened) return {};
+  RawReader& reader = (*opened)->reader;
+  Result<Follower> follower = Follower::open(*session, reader, out);
+  if (!follower) return std::move(follower).error();
+
+  MeterState state;
+  state.stream = reader.id();
+  state.payload_bytes = reader.payload_bytes();
+  StampReader stamps(reader, meter, state);
+  reader.seek(std::max(kNoTid, start_before(reader, meter, options.window, (*opened)->awaited)));
+  if (meter.from_history) stamps.read_new();
+
+  std::uint64_t reports = 0;
+  MonoTime due = deadline_in(options.interval);
+  while (true) {
+    const bool early = meter.from_history && reports == 0 && state.seen >= 2;
+    if (early || MonoClock::now() >= due) {
+      meter.on_report(state);
+      state.new_samples = 0;
+      if (!out.flush() || ++reports == options.count) return {};
+      due = deadline_in(options.interval);
+    }
+    const Follower::Wake wake = follower->wait(due);
+    stamps.read_new();
+    if (wake == Follower::Wake::stop || wake == Follower::Wake::removed) {
+      state.final = true;
+      meter.on_report(state);
+      if (wake == Follower::Wake::removed) return removed_error(reader);
+      return {};
+    }
+  }
+}
+
+std::string farewell(const MeterState& state) {
+  return "--- " + escaped(state.stream.str()) + ": " + std::to_string(state.seen) + " samples, " +
+         std::to_string(state.lost) + " lost ---\n";
+}
+
+}  // namespace dssm::ctl

@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What hz, bw and delay have in common: following a stream's stamps, without ever touching a
+// payload, and reporting every now and then.
+#pragma once
+
+#include <cstdint>
+#include <dssm/sample.hpp>
+#include <functional>
+#include <string>
+
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
+
+namespace dssm::ctl {
+
+// What a report may tell beside the measurements.
+struct MeterState {
+  StreamId stream;
+  std::uint64_t payload_bytes = 0;
+  std::uint64_t seen = 0;         // samples since the start
+  std::uint64_t new_samples = 0;  // since the last report
+  std::uint64_t lost = 0;         // overwritten before their stamps were read, since the start
+  Duration age{};                 // of the newest sample seen; meaningless while seen is 0
+  bool final = false;             // the last one, not after an interval
+};
+
+struct Meter {
+  // Whether to begin with the samples that the ring holds already; then the first report comes as
+  // soon as there are two samples, not after an interval.
+  bool from_history = false;
+  std::function<void(const SampleInfo& info, Time arrival)> on_sample;
+  std::function<void()> on_gap;  // the next sample does not follow the last one
+  std::function<void(const MeterState& state)> on_report;
+};
+
+// Runs until `options.count` reports are made; or until Ctrl-C or the removal of the stream, with
+// one more report.
+Result<void> run_meter(const Options& options, Output& out, const Meter& meter);
+
+// "--- odom:0@pc1: 12 samples, 0 lost ---", before a final report for people.
+std::string farewell(const MeterState& state);
+
+}  // namespace dssm::ctl

@@ -1,0 +1,50 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Standard output, gathered in one string and written with as few system calls as possible: a list
+// of a thousand streams is one write. A reader that goes away (`| head`) is no failure: writing
+// then stops quietly, and the program ends with success, as a person expects of a pipe.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <string>
+#include <string_view>
+
+namespace dssm::ctl {
+
+class Output {
+ public:
+  explicit Output(int fd);
+
+  // Appends to what the next flush() writes.
+  void add(std::string_view text) { pending_ += text; }
+
+  // Writes all that is pending. Whether it is worth to go on: false when the reader is gone or
+  // writing failed.
+  bool flush();
+
+  // Flushes when a good amount is pending: for verbs that print without end.
+  bool flush_some() { return pending_.size() < kBatchBytes ? !stopped_ : flush(); }
+
+  // Whether the other end of a pipe was closed, also while nothing is written.
+  bool reader_gone();
+
+  // What went wrong when writing; a closed pipe does not count.
+  const Result<void>& result() const { return result_; }
+
+  bool terminal() const { return terminal_; }
+
+  // `text` in bold where a person looks at a terminal and $NO_COLOR is not set.
+  std::string bold(std::string_view text) const;
+
+ private:
+  static constexpr std::size_t kBatchBytes = 64U << 10;
+
+  int fd_;
+  bool terminal_;
+  bool colour_;
+  bool stopped_ = false;
+  std::string pending_;
+  Result<void> result_;
+};
+
+}  // namespace dssm::ctl

@@ -1,0 +1,111 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmctl property get and set: bytes in, the same bytes out.
+#include <fcntl.h>
+#include <unistd.h>
+
+#include <cerrno>
+
+#include "client/dssmctl/json.hpp"
+#include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/text.hpp"
+#include "client/dssmctl/verbs.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+// A descriptor that is closed unless it is one of the standard ones.
+class File {
+ public:
+  explicit File(int fd) : fd_(fd) {}
+  File(const File&) = delete;
+  File& operator=(const File&) = delete;
+  ~File() {
+    if (fd_ > STDERR_FILENO) ::close(fd_);
+  }
+  int fd() const { return fd_; }
+
+ private:
+  int fd_;
+};
+
+// No property is longer; whoever feeds us /dev/zero shall hear so instead of filling the memory.
+constexpr std::size_t kMaxPropertyBytes = 16U << 20;
+
+Result<std::vector<std::byte>> read_all(const std::string& path) {
+  const bool standard = path == "-";
+  const std::string tried = "read '" + (standard ? "standard input" : path) + "'";
+  const File file(standard ? STDIN_FILENO : ::open(path.c_str(), O_RDONLY | O_CLOEXEC));
+  if (file.fd() < 0) return os_error(tried);
+  std::vector<std::byte> bytes;
+  constexpr std::size_t kStep = 64U << 10;
+  while (true) {
+    const std::size_t size = bytes.size();
+    bytes.resize(size + kStep);
+    const ssize_t got = ::read(file.fd(), bytes.data() + size, kStep);
+    const int reason = errno;
+    bytes.resize(size + (got > 0 ? static_cast<std::size_t>(got) : 0));
+    if (got == 0) return bytes;
+    if (got < 0 && reason != EINTR) return os_error(tried, reason);
+    if (bytes.size() > kMaxPropertyBytes) {
+      return Error{
+          Errc::limit_exceeded,
+          tried + ": longer than the " + bytes_text(kMaxPropertyBytes) + " a property may have"};
+    }
+  }
+}
+
+Result<void> write_all(const std::string& path, std::span<const std::byte> bytes) {
+  const std::string tried = "write '" + path + "'";
+  const File file(::open(path.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666));
+  if (file.fd() < 0) return os_error(tried);
+  while (!bytes.empty()) {
+    const ssize_t written = ::write(file.fd(), bytes.data(), bytes.size());
+    if (written < 0 && errno != EINTR) return os_error(tried);
+    if (written > 0) bytes = bytes.subspan(static_cast<std::size_t>(written));
+  }
+  return {};
+}
+
+}  // namespace
+
+Result<void> run_property_get(const Options& options, Output& out) {
+  Result<StreamId> id = StreamId::parse(options.stream);
+  if (!id) return std::move(id).error();
+  Result<Session> session = connect(options);
+  if (!session) return std::move(session).error();
+  Result<std::vector<std::byte>> property = session->property(*id);
+  if (!property) return with_similar_names(std::move(property).error(), *session, *id);
+  const bool to_file = options.file != "-";
+  if (to_file) {
+    if (Result<void> written = write_all(options.file, *property); !written) return written;
+  }
+  if (options.json) {
+    Json json{{"stream", id->str()}, {"property_bytes", property->size()}};
+    if (!to_file) json["property_hex"] = hex_text(*property);
+    out.add(json_document(json));
+  } else if (!to_file && out.terminal()) {
+    out.add(hex_dump(*property, ""));
+  } else if (!to_file) {
+    out.add({reinterpret_cast<const char*>(property->data()), property->size()});
+  }
+  return {};
+}
+
+Result<void> run_property_set(const Options& options, Output& out) {
+  Result<StreamId> id = StreamId::parse(options.stream);
+  if (!id) return std::move(id).error();
+  const Result<std::vector<std::byte>> property = read_all(options.file);
+  if (!property) return property.error();
+  Result<Session> session = connect(options);
+  if (!session) return std::move(session).error();
+  if (Result<void> set = session->set_property(*id, *property); !set) {
+    return with_similar_names(std::move(set).error(), *session, *id);
+  }
+  if (options.json) {
+    out.add(json_document({{"stream", id->str()}, {"property_bytes", property->size()}}));
+  }
+  return {};
+}
+
+}  // namespace dssm::ctl

@@ -1,0 +1,125 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/dssmctl/sample_printer.hpp"
+
+#include <algorithm>
+#include <limits>
+
+#include "client/dssmctl/fields.hpp"
+#include "client/dssmctl/json.hpp"
+#include "client/dssmctl/output.hpp"
+#include "client/dssmctl/text.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+// Enough to recognise a sample, few enough for a screen.
+constexpr std::size_t kShownElements = 32;
+constexpr std::size_t kShownBytes = 64;
+
+}  // namespace
+
+std::string csv_cell(std::string_view text) {
+  if (text.find_first_of(",\"\r\n") == std::string_view::npos) return std::string(text);
+  std::string out = "\"";
+  for (const char c : text) {
+    if (c == '"') out += '"';
+    out += c;
+  }
+  return out + "\"";
+}
+
+SamplePrinter::SamplePrinter(Output& out, SampleForm form, bool full, StreamId stream,
+                             std::vector<Field> fields)
+    : out_(out), form_(form), full_(full), stream_(std::move(stream)), fields_(std::move(fields)) {}
+
+// A terminal is no place for foreign control characters; a file gets the cell as it is.
+std::string SamplePrinter::cell(std::string_view text) const {
+  return csv_cell(out_.terminal() ? escaped(text) : std::string(text));
+}
+
+void SamplePrinter::begin() {
+  if (form_ != SampleForm::csv) return;
+  std::string line = "tid,time_ns,clock_error_ns";
+  for (const Field& field : fields_) {
+    if (field.count == 1 || is_text(field)) {
+      line.append(",").append(cell(field.name));
+      continue;
+    }
+    for (std::uint64_t i = 0; i < field.count; ++i) {
+      line.append(",").append(cell(field.name + "[" + std::to_string(i) + "]"));
+    }
+  }
+  if (fields_.empty()) line += ",payload_hex";
+  out_.add(line + "\n");
+}
+
+void SamplePrinter::sample(const SampleInfo& info, std::span<const std::byte> payload,
+                           std::uint64_t lost) {
+  switch (form_) {
+    case SampleForm::text:
+      return text_sample(info, payload, lost);
+    case SampleForm::json:
+      return json_sample(info, payload, lost);
+    case SampleForm::csv:
+      return csv_sample(info, payload);
+  }
+}
+
+void SamplePrinter::text_sample(const SampleInfo& info, std::span<const std::byte> payload,
+                                std::uint64_t lost) {
+  std::string text;
+  if (lost > 0) {
+    text += "# " + std::to_string(lost) + " samples were overwritten before they could be shown\n";
+  }
+  text += "tid: " + std::to_string(info.tid) + "\ntime: " + seconds_text(to_ns(info.time));
+  text += "\nclock_error: ";
+  text += info.clock_error == kUnknownClockError ? "unknown" : duration_text(info.clock_error);
+  text += '\n';
+  const std::size_t shown = full_ ? std::numeric_limits<std::size_t>::max() : kShownElements;
+  for (const Field& field : fields_) {
+    text += escaped(field.name) + ": " + field_text(payload, field, shown) + "\n";
+  }
+  if (fields_.empty()) {
+    text += "payload: " + bytes_text(payload.size()) + "\n";
+    const std::size_t end = full_ ? payload.size() : std::min(payload.size(), kShownBytes);
+    text += hex_dump(payload.first(end), "  ");
+    if (end < payload.size()) {
+      text += "  ... " + bytes_text(payload.size() - end) + " more (--full shows all)\n";
+    }
+  }
+  out_.add(text + "---\n");
+}
+
+void SamplePrinter::json_sample(const SampleInfo& info, std::span<const std::byte> payload,
+                                std::uint64_t lost) {
+  Json json;
+  json["stream"] = stream_.str();
+  json["tid"] = info.tid;
+  json["time_ns"] = to_ns(info.time);
+  json["clock_error_ns"] =
+      info.clock_error == kUnknownClockError ? Json() : Json(to_ns(info.clock_error));
+  json["lost"] = lost;
+  if (fields_.empty()) {
+    json["payload_bytes"] = payload.size();
+    json["payload_hex"] = hex_text(payload);
+  } else {
+    Json& values = json["fields"] = Json::object();
+    for (const Field& field : fields_) values[field.name] = field_json(payload, field);
+  }
+  out_.add(json_line(json));
+}
+
+void SamplePrinter::csv_sample(const SampleInfo& info, std::span<const std::byte> payload) {
+  std::string line = std::to_string(info.tid) + "," + std::to_string(to_ns(info.time)) + ",";
+  if (info.clock_error != kUnknownClockError) line += std::to_string(to_ns(info.clock_error));
+  for (const Field& field : fields_) {
+    const std::uint64_t cells = is_text(field) ? 1 : field.count;
+    for (std::uint64_t i = 0; i < cells; ++i) {
+      line.append(",").append(cell(element_text(payload, field, i)));
+    }
+  }
+  if (fields_.empty()) line.append(",").append(hex_text(payload));
+  out_.add(line + "\n");
+}
+
+}  // namespace dssm::ctl

@@ -1,0 +1,51 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// How `dssmctl echo` shows a sample: as text for people, as a JSON line, or as a CSV row.
+//
+// CSV is RFC 4180's, but for its line ends: a bare newline, so that cut, awk and gnuplot see no
+// carriage return in the last column.
+#pragma once
+
+#include <cstddef>
+#include <dssm/sample.hpp>
+#include <dssm/stream.hpp>
+#include <span>
+#include <string>
+#include <vector>
+
+namespace dssm::ctl {
+
+class Output;
+
+enum class SampleForm : unsigned char { text, json, csv };
+
+// One cell of a CSV row: in quotes where it holds a comma, a quote or a line end.
+std::string csv_cell(std::string_view text);
+
+class SamplePrinter {
+ public:
+  // `fields` passed readable_fields_untrusted(); none: the payload is shown as bytes. `full`: text
+  // leaves nothing out of long payloads.
+  SamplePrinter(Output& out, SampleForm form, bool full, StreamId stream,
+                std::vector<Field> fields);
+
+  // What stands before the first sample: CSV's header line.
+  void begin();
+
+  // One sample; `lost` samples before it were overwritten unread.
+  void sample(const SampleInfo& info, std::span<const std::byte> payload, std::uint64_t lost);
+
+ private:
+  void text_sample(const SampleInfo& info, std::span<const std::byte> payload, std::uint64_t lost);
+  void json_sample(const SampleInfo& info, std::span<const std::byte> payload, std::uint64_t lost);
+  void csv_sample(const SampleInfo& info, std::span<const std::byte> payload);
+  std::string cell(std::string_view text) const;
+
+  Output& out_;
+  SampleForm form_;
+  bool full_;
+  StreamId stream_;
+  std::vector<Field> fields_;
+};
+
+}  // namespace dssm::ctl

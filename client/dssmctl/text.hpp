@@ -1,0 +1,57 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Between numbers and what a person types or reads. Everything printed is plain ASCII: bytes from
+// streams' names and payloads are escaped, so that no stream can play tricks on a terminal, and a
+// column is as wide as it has bytes.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <span>
+#include <string>
+#include <string_view>
+
+namespace dssm::ctl {
+
+// `bytes` with control and non-ASCII bytes as \n, \t or \xNN, and backslash as \\ : what bash reads
+// back in $'...'.
+std::string escaped(std::string_view bytes);
+
+// The same for a whole sentence: newlines and backslashes stay.
+std::string escaped_message(std::string_view message);
+
+// A duration with three digits and its unit: "1.25 ms", "2h05m". For people only.
+std::string duration_text(Duration d);
+
+// Nanoseconds as exact seconds: "-1.500000000".
+std::string seconds_text(std::int64_t ns);
+
+// `value` with `decimals` digits after the point.
+std::string fixed_text(double value, int decimals);
+
+// "512 bytes", "1.5 MiB"; "1.50 MB/s" (decimal units, as networks count).
+std::string bytes_text(std::uint64_t bytes);
+std::string byte_rate_text(double bytes_per_second);
+
+// "00ff10"; a hex dump in lines of 16 bytes with offsets and printable characters, each line after
+// `indent`.
+std::string hex_text(std::span<const std::byte> bytes);
+std::string hex_dump(std::span<const std::byte> bytes, std::string_view indent);
+
+// Reads seconds, "1.5", "-0.25", "1e-3", as nanoseconds; exact unless there is an exponent. Digits
+// finer than a nanosecond are cut off. Fails with invalid_argument.
+Result<Duration> parse_seconds(std::string_view text);
+
+// Reads a whole number from `least` to `most`. Fails with invalid_argument.
+Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t least, std::uint64_t most);
+
+// Reads a finite number. Fails with invalid_argument.
+Result<double> parse_real(std::string_view text);
+
+// a - b and a + b, at the ends of the range where it would overflow: stamps may be anything.
+Duration saturating_sub(Time a, Time b);
+Time saturating_add(Time a, Duration b);
+
+}  // namespace dssm::ctl
