@@ -1,0 +1,136 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A writer that dies at any instruction of a write: the parent single-steps a child through one
+// write, kills it after 0, 1, 2 ... instructions, and each time readers and the next writer must
+// find a ring in order. Then the same with children killed at random moments while they write for
+// ever.
+#include <sys/prctl.h>
+#include <sys/ptrace.h>
+#include <sys/wait.h>
+
+#include <csignal>
+#include <cstdio>
+#include <random>
+
+#include "tests/unit/ring/test_ring.hpp"
+
+namespace dssm::ring {
+namespace {
+
+constexpr std::size_t kPayloadBytes = 64;
+
+// What every sample must be: payload_for its tid.
+void expect_whole(const RingReader& reader) {
+  std::byte out[kPayloadBytes];
+  for (Tid tid = std::max<Tid>(reader.oldest(), 0); tid <= reader.newest(); ++tid) {
+    SampleInfo info;
+    ASSERT_EQ(reader.read(tid, out, info), ReadStatus::ok) << "tid " << tid;
+    ASSERT_EQ(std::vector<std::byte>(out, out + kPayloadBytes), payload_for(tid, kPayloadBytes));
+    Tid found = kNoTid;
+    ASSERT_EQ(reader.find(info.time, found), ReadStatus::ok);
+    ASSERT_GE(found, tid) << "the newest sample at or before a sample's time is it or a newer one";
+    SampleInfo other;
+    ASSERT_EQ(reader.stamp(found, other), ReadStatus::ok);
+    ASSERT_LE(other.time, info.time);
+  }
+}
+
+// How the times of a test run; the step backwards takes another path through the writer.
+using TimeOf = std::int64_t (*)(Tid);
+std::int64_t forwards(Tid tid) { return 1000 * tid; }
+std::int64_t zigzag(Tid tid) { return 1000 * tid - (tid % 2 ? 1500 : 0); }
+
+struct Deaths {
+  int instructions = 0;  // that one write takes
+  int rings_checked = 0;
+};
+
+Deaths die_at_every_instruction(TimeOf time_of) {
+  const TestRing ring(kPayloadBytes, 5);
+  const RingReader reader = ring.reader();
+  RingWriter survivor = ring.writer();
+  Deaths deaths;
+  bool finished = false;
+  for (int steps = 0; !finished; ++steps) {
+    const Tid next = reader.newest() + 1;
+    const auto payload = payload_for(next, kPayloadBytes);
+    const pid_t child = ::fork();
+    if (child == 0) {
+      RingWriter writer = ring.writer();
+      ::ptrace(PTRACE_TRACEME, 0, nullptr, nullptr);
+      ::raise(SIGSTOP);
+      writer.write(payload, time_from_ns(time_of(next)), Duration(0));
+      ::_exit(0);
+    }
+    int status = 0;
+    ::waitpid(child, &status, 0);
+    for (int i = 0; i < steps && WIFSTOPPED(status); ++i) {
+      ::ptrace(PTRACE_SINGLESTEP, child, nullptr, nullptr);
+      ::waitpid(child, &status, 0);
+    }
+    finished = WIFEXITED(status);
+    if (!finished) {
+      ::kill(child, SIGKILL);
+      ::waitpid(child, &status, 0);
+    }
+    expect_whole(reader);
+    // The next writer gets the lock at once and continues the tids.
+    const Tid expected = reader.newest() + 1;
+    EXPECT_TRUE(expected == next || expected == next + 1);
+    EXPECT_EQ(survivor.write(payload_for(expected, kPayloadBytes), time_from_ns(time_of(expected)),
+                             Duration(0)),
+              expected);
+    expect_whole(reader);
+    if (testing::Test::HasFailure()) {
+      std::printf("after %d instructions\n", steps);
+      return deaths;
+    }
+    deaths.instructions = steps;
+    ++deaths.rings_checked;
+  }
+  return deaths;
+}
+
+TEST(KilledWriter, LeavesARingInOrderAtEveryInstruction) {
+  const Deaths deaths = die_at_every_instruction(forwards);
+  std::printf("killed after each of %d instructions\n", deaths.instructions);
+  EXPECT_GT(deaths.rings_checked, 50);
+}
+
+TEST(KilledWriter, LeavesARingInOrderAtEveryInstructionOfAStepBackwards) {
+  const Deaths deaths = die_at_every_instruction(zigzag);
+  std::printf("killed after each of %d instructions\n", deaths.instructions);
+  EXPECT_GT(deaths.rings_checked, 50);
+}
+
+TEST(KilledWriter, LeavesARingInOrderAtThousandsOfRandomMoments) {
+  const std::uint64_t seed = std::random_device{}();
+  std::mt19937_64 random(seed);
+  SCOPED_TRACE(testing::Message() << "seed " << seed);
+  const TestRing ring(kPayloadBytes, 7);
+  const RingReader reader = ring.reader();
+  for (int round = 0; round < 2000; ++round) {
+    const Tid before = reader.newest();
+    const pid_t child = ::fork();
+    if (child == 0) {
+      ::prctl(PR_SET_PDEATHSIG, SIGKILL);
+      RingWriter writer = ring.writer();
+      for (Tid tid = before + 1;; ++tid) {
+        writer.write(payload_for(tid, kPayloadBytes), time_from_ns(zigzag(tid)), Duration(0));
+      }
+    }
+    // Not a fixed time: until it has written a random number of samples.
+    const Tid enough = before + 1 + static_cast<Tid>(random() % 200);
+    while (reader.newest() < enough) {
+      const std::uint32_t announced = ring.bell->announce();
+      if (reader.newest() < enough) (void)ring.bell->sleep(announced, kNever);
+    }
+    ::kill(child, SIGKILL);
+    ::waitpid(child, nullptr, 0);
+    expect_whole(reader);
+    ASSERT_FALSE(HasFailure()) << "round " << round;
+  }
+}
+
+}  // namespace
+}  // namespace dssm::ring
