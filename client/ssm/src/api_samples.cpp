@@ -1,0 +1,164 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// <ssm.h>: reading, writing and waiting.
+#include <cstring>
+#include <optional>
+
+#include "../include/libssm.h"
+#include "messages.hpp"
+#include "process.hpp"
+#include "tid_convert.hpp"
+#include "time_convert.hpp"
+
+using dssm::ReadStatus;
+using dssm::ssm::remember_error;
+using dssm::ssm::ring_tid;
+using dssm::ssm::seconds_from_time;
+using dssm::ssm::SidUse;
+using dssm::ssm::ssm_tid;
+using dssm::ssm::Stream;
+using dssm::ssm::time_from_seconds;
+
+namespace {
+
+using ReadCallback = void (*)(const void* ssmp, void* data, void* user_data);
+using WriteCallback = void (*)(void* ssmp, const void* data, void* user_data);
+
+SSM_tid error_of(ReadStatus status) noexcept {
+  return status == ReadStatus::not_yet ? SSM_ERROR_NO_DATA : SSM_ERROR_PAST;
+}
+
+// Reads what `read` says and hands it to `take`, exactly once, when there is something.
+template <class Read, class Take>
+SSM_tid read_and_take(SSM_sid sid, ssmTimeT* ytime, Read read, Take take) {
+  const SidUse use(sid);
+  if (!use) return SSM_ERROR_NO_DATA;
+  Stream::Copy copy(*use);
+  if (const SSM_tid error = read(*use, copy); error < 0) return error;
+  take(copy.payload().data(), use->data_bytes());
+  if (ytime) *ytime = seconds_from_time(copy.info.time);
+  return ssm_tid(copy.info.tid);
+}
+
+SSM_tid read_tid(Stream& stream, Stream::Copy& copy, SSM_tid tid) {
+  if (tid < 0) {
+    const ReadStatus status = stream.latest(copy);
+    return status == ReadStatus::ok ? 0 : error_of(status);
+  }
+  switch (stream.tid(ring_tid(tid, stream.newest()), copy)) {
+    case ReadStatus::ok:
+      return 0;
+    case ReadStatus::not_yet:
+      return SSM_ERROR_FUTURE;
+    case ReadStatus::too_old:
+    case ReadStatus::lapped:
+      break;
+  }
+  return SSM_ERROR_PAST;
+}
+
+SSM_tid read_time(Stream& stream, Stream::Copy& copy, ssmTimeT time) {
+  const ReadStatus status =
+      time > 0 ? stream.at(time_from_seconds(time), copy) : stream.latest(copy);
+  return status == ReadStatus::ok ? 0 : error_of(status);
+}
+
+SSM_tid written(dssm::Tid tid) {
+  if (tid != dssm::kNoTid) return ssm_tid(tid);
+  remember_error("write : the stream cannot be written now");
+  return SSM_ERROR_NO_DATA;
+}
+
+}  // namespace
+
+extern "C" {
+
+SSM_tid getTID_top(SSM_sid sid) {
+  const SidUse use(sid);
+  return use ? ssm_tid(use->newest()) : SSM_ERROR_NO_DATA;
+}
+
+SSM_tid getTID_bottom(SSM_sid sid) {
+  const SidUse use(sid);
+  return use ? ssm_tid(use->oldest()) : SSM_ERROR_NO_DATA;
+}
+
+SSM_tid getTID(SSM_sid sid, ssmTimeT ytime) {
+  const SidUse use(sid);
+  if (!use) return SSM_ERROR_NO_DATA;
+  // Strictly before `ytime`: at most one nanosecond less.
+  const dssm::Time time = time_from_seconds(ytime);
+  dssm::SampleInfo info;
+  const ReadStatus status =
+      use->find(time > dssm::Time::min() ? time - dssm::Duration(1) : time, info);
+  return status == ReadStatus::ok ? ssm_tid(info.tid) : error_of(status);
+}
+
+int waitTID(SSM_sid sid, SSM_tid tid) {
+  const SidUse use(sid);
+  if (!use) return -1;
+  const dssm::Tid newest = use->newest();
+  if (tid < 0) return 1;
+  const dssm::Tid wanted = ring_tid(tid, newest);
+  const dssm::MonoTime deadline = dssm::deadline_in(std::chrono::seconds(1));
+  for (;;) {
+    if (use->newest() >= wanted) return 1;
+    if (use.closed()) return -1;  // by a signal handler, or another thread
+    if (use->wait_for_tid(wanted, deadline) == dssm::WaitStatus::timeout) {
+      return use.closed() ? -1 : use->newest() >= wanted ? 1 : 0;
+    }
+  }
+}
+
+SSM_tid readSSM(SSM_sid sid, void* data, ssmTimeT* ytime, SSM_tid tid) {
+  return read_and_take(
+      sid, ytime, [&](Stream& stream, Stream::Copy& copy) { return read_tid(stream, copy, tid); },
+      [&](const void* sample, std::size_t bytes) { std::memcpy(data, sample, bytes); });
+}
+
+SSM_tid readSSM_time(SSM_sid sid, void* data, ssmTimeT ytime, ssmTimeT* ret_time) {
+  return read_and_take(
+      sid, ret_time,
+      [&](Stream& stream, Stream::Copy& copy) { return read_time(stream, copy, ytime); },
+      [&](const void* sample, std::size_t bytes) { std::memcpy(data, sample, bytes); });
+}
+
+SSM_tid readSSMP(SSM_sid sid, void* adata, ssmTimeT* ytime, SSM_tid tid, ReadCallback callback,
+                 void* user_data) {
+  return read_and_take(
+      sid, ytime, [&](Stream& stream, Stream::Copy& copy) { return read_tid(stream, copy, tid); },
+      [&](const void* sample, std::size_t) { callback(sample, adata, user_data); });
+}
+
+SSM_tid readSSMP_time(SSM_sid sid, void* adata, ssmTimeT ytime, ssmTimeT* ret_time,
+                      ReadCallback callback, void* user_data) {
+  return read_and_take(
+      sid, ret_time,
+      [&](Stream& stream, Stream::Copy& copy) { return read_time(stream, copy, ytime); },
+      [&](const void* sample, std::size_t) { callback(sample, adata, user_data); });
+}
+
+SSM_tid writeSSM(SSM_sid sid, const void* data, ssmTimeT ytime) {
+  const SidUse use(sid);
+  if (!use) return SSM_ERROR_NO_DATA;
+  return written(use->write(data, time_from_seconds(ytime)));
+}
+
+SSM_tid writeSSM_time(SSM_sid sid, const void* data, ssmTimeT ytime) {
+  return writeSSM(sid, data, ytime);
+}
+
+SSM_tid writeSSMP(SSM_sid sid, const void* adata, ssmTimeT ytime, WriteCallback callback,
+                  void* user_data) {
+  const SidUse use(sid);
+  if (!use) return SSM_ERROR_NO_DATA;
+  return written(use->write_in_place([&](std::byte* slot) { callback(slot, adata, user_data); },
+                                     time_from_seconds(ytime)));
+}
+
+SSM_tid writeSSMP_time(SSM_sid sid, const void* adata, ssmTimeT ytime, WriteCallback callback,
+                       void* user_data) {
+  return writeSSMP(sid, adata, ytime, callback, user_data);
+}
+
+}  // extern "C"

@@ -1,0 +1,192 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "process.hpp"
+
+#include <pthread.h>
+#include <signal.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+#include <unistd.h>
+
+#include <cerrno>
+#include <cstring>
+#include <new>
+
+#include "socket_path.hpp"
+
+namespace dssm::ssm {
+namespace {
+
+// Trivially destructible and made when the library is loaded, so before any static object of the
+// program, and there until its last thread ends.
+Process the_process;
+
+thread_local int thread_id = 0;
+
+}  // namespace
+
+Process& process() noexcept { return the_process; }
+
+int this_thread_id() noexcept {
+  if (thread_id == 0) thread_id = ::gettid();
+  return thread_id;
+}
+
+void forget_thread_id() noexcept { thread_id = 0; }
+
+Process::Process() noexcept : sids_(wake_), clock_(wake_) { ::sem_init(&wake_, 0, 0); }
+
+bool Process::registered_locked() const noexcept {
+  return registration_ && registration_->ends == ends_.load();
+}
+
+// --- the reaper
+// ------------------------------------------------------------------------------------
+
+void* Process::run_reaper(void* self) {
+  auto& process = *static_cast<Process*>(self);
+  for (;;) {
+    while (::sem_wait(&process.wake_) != 0) continue;
+    const std::lock_guard guard(process.mutex_);
+    process.reap_locked();
+  }
+}
+
+void Process::reap_locked() {
+  sids_.reap(generation_);
+  clock_.reap(generation_);
+  if (registration_ && !registered_locked()) delete std::exchange(registration_, nullptr);
+}
+
+// What must be there before the first stream or registration.
+Result<void> Process::prepare_locked() {
+  if (!fork_handler_) {
+    if (const int error = ::pthread_atfork(nullptr, nullptr, &after_fork_in_child)) {
+      return os_error("prepare for fork", error);
+    }
+    fork_handler_ = true;
+  }
+  if (!reaper_) {
+    sigset_t all, before;  // signal handlers are the program's: they run in its own threads
+    ::sigfillset(&all);
+    ::pthread_sigmask(SIG_SETMASK, &all, &before);
+    pthread_t thread;
+    const int error = ::pthread_create(&thread, nullptr, &run_reaper, this);
+    ::pthread_sigmask(SIG_SETMASK, &before, nullptr);
+    if (error) return os_error("start libssm's thread", error);
+    ::pthread_detach(thread);
+    reaper_ = true;
+  }
+  return {};
+}
+
+// Only what is safe between fork and exec, and what other threads of the parent may have held.
+void Process::after_fork_in_child() {
+  Process& process = the_process;
+  forget_thread_id();
+  new (&process.mutex_) std::mutex;
+  ::sem_init(&process.wake_, 0, 0);
+  ++process.generation_;
+  process.reaper_ = false;
+  process.was_registered_.store(false);
+  if (Registration* const parents = std::exchange(process.registration_, nullptr)) {
+    parents->next = std::exchange(process.abandoned_, parents);
+  }
+  process.sids_.reset_after_fork();
+}
+
+// --- registration
+// ----------------------------------------------------------------------------------
+
+Result<void> Process::start() {
+  const std::lock_guard guard(mutex_);
+  const std::uint64_t ends = ends_.load();
+  if (Result<void> ready = prepare_locked(); !ready) return ready;
+  reap_locked();
+  if (registered_locked()) {
+    if (!registration_->session.connected()) {
+      return Error{Errc::daemon_away, "dssmd is gone; this program goes on when it is back"};
+    }
+    if (clock_.attached()) return {};
+    Result<PlaybackClock> clock = registration_->session.playback_clock();
+    if (!clock) return std::move(clock).error();
+    clock_.attach(std::move(*clock), generation_);
+    return {};
+  }
+  Error failure;
+  for (const std::string& path : socket_paths()) {
+    SessionOptions options;
+    options.socket_path = path;
+    Result<Session> session = Session::connect(std::move(options));
+    if (!session) {
+      // The first path is the one to talk about, unless a dssmd refused us at a later one.
+      if (failure.message.empty() || session.error().code != Errc::no_daemon) {
+        failure = std::move(session).error();
+      }
+      continue;
+    }
+    Result<PlaybackClock> clock = session->playback_clock();
+    if (!clock) return std::move(clock).error();
+    std::strncpy(socket_path_, path.c_str(), sizeof socket_path_ - 1);
+    registration_ = new Registration{std::move(*session), ends, nullptr};
+    clock_.attach(std::move(*clock), generation_);
+    was_registered_.store(true);
+    if (ends_.load() != ends) clock_.detach(), ::sem_post(&wake_);  // a handler ended it already
+    return {};
+  }
+  return failure;
+}
+
+bool Process::end() noexcept {
+  const int saved_errno = errno;
+  ends_.fetch_add(1);
+  clock_.detach();
+  ::sem_post(&wake_);
+  bool listens = false;
+  if (was_registered_.load()) {
+    // "Could the coordinator be told?" A handler can find out only by the system calls allowed in
+    // it.
+    sockaddr_un address{};
+    address.sun_family = AF_UNIX;
+    std::memcpy(address.sun_path, socket_path_, sizeof address.sun_path);
+    const int probe = ::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0);
+    listens = ::connect(probe, reinterpret_cast<sockaddr*>(&address), sizeof address) == 0 ||
+              errno == EAGAIN;  // busy, so there
+    ::close(probe);
+  }
+  errno = saved_errno;
+  return listens;
+}
+
+Result<Session> Process::session() {
+  const std::lock_guard guard(mutex_);
+  reap_locked();
+  if (!registered_locked()) {
+    return Error{Errc::closed, "this program is not registered; call initSSM first"};
+  }
+  return registration_->session;
+}
+
+Result<Session> Process::any_session() {
+  if (Result<Session> registered = session()) return registered;
+  SessionOptions options;
+  options.socket_path = socket_path_;
+  return Session::connect(std::move(options));
+}
+
+SSM_sid Process::add(std::unique_ptr<Stream> stream) {
+  const std::lock_guard guard(mutex_);
+  return sids_.add(std::move(stream), generation_);
+}
+
+bool Process::attach_clock() {
+  const std::lock_guard guard(mutex_);
+  reap_locked();
+  if (!registered_locked()) return false;
+  if (clock_.attached()) return true;
+  Result<PlaybackClock> clock = registration_->session.playback_clock();
+  if (!clock) return false;
+  clock_.attach(std::move(*clock), generation_);
+  return true;
+}
+
+}  // namespace dssm::ssm

@@ -1,0 +1,52 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A lock that the thread which holds it may take again. Programs read and write streams from signal
+// handlers; a handler that interrupts its own thread inside a read must get through, as it did in
+// the old library, which had no lock there.
+//
+//   signals  may be taken and given back in a handler
+//   fork     reset_after_fork() frees it in the child, where its holder may not exist
+#pragma once
+
+#include <unistd.h>
+
+#include <atomic>
+
+namespace dssm::ssm {
+
+// The kernel's id of this thread, asked once per thread.
+int this_thread_id() noexcept;
+void forget_thread_id() noexcept;  // in a forked child
+
+class ReentrantLock {
+ public:
+  void lock() noexcept {
+    const int me = this_thread_id();
+    if (owner_.load(std::memory_order_relaxed) == me) {  // only this thread stores its own id
+      ++depth_;
+      return;
+    }
+    for (int owner = 0; !owner_.compare_exchange_weak(owner, me, std::memory_order_acquire);) {
+      if (owner != 0) owner_.wait(owner, std::memory_order_relaxed);
+      owner = 0;
+    }
+    depth_ = 1;
+  }
+
+  void unlock() noexcept {
+    if (--depth_ > 0) return;
+    owner_.store(0, std::memory_order_release);
+    owner_.notify_one();
+  }
+
+  void reset_after_fork() noexcept {
+    owner_.store(0, std::memory_order_relaxed);
+    depth_ = 0;
+  }
+
+ private:
+  std::atomic<int> owner_{0};
+  int depth_ = 0;  // owner only
+};
+
+}  // namespace dssm::ssm

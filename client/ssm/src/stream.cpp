@@ -1,0 +1,156 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "stream.hpp"
+
+#include <cstring>
+#include <mutex>
+#include <new>
+
+#include "messages.hpp"
+
+namespace dssm::ssm {
+namespace {
+
+// Behind a copy as behind a slot: callbacks of real programs go a few bytes too far.
+constexpr std::size_t kGuardBytes = 64;
+constexpr std::align_val_t kAlignment{64};
+
+}  // namespace
+
+Stream::Stream(RawWriter writer, Connect connect)
+    : connect_(connect),
+      id_(writer.id()),
+      data_bytes_(ssm::data_bytes(writer.type())),
+      payload_bytes_(writer.payload_bytes()),
+      depth_(writer.depth()),
+      cycle_(writer.cycle()),
+      writer_(new RawWriter(std::move(writer))) {}
+
+Stream::Stream(RawReader reader, Connect connect)
+    : connect_(connect),
+      id_(reader.id()),
+      data_bytes_(ssm::data_bytes(reader.type())),
+      payload_bytes_(reader.payload_bytes()),
+      depth_(reader.depth()),
+      cycle_(reader.cycle()),
+      reader_(new RawReader(std::move(reader))) {}
+
+Stream::~Stream() {
+  delete reader_.load();
+  delete writer_.load();
+  ::operator delete(spare_.load(), kAlignment);
+}
+
+RawReader* Stream::reader() noexcept {
+  if (RawReader* open = reader_.load(std::memory_order_acquire)) return open;
+  const std::lock_guard guard(read_lock_);
+  if (RawReader* open = reader_.load(std::memory_order_relaxed)) return open;
+  Result<Session> session = connect_();
+  if (!session) return remember_error(session.error().message), nullptr;
+  Result<RawReader> opened = session->open_raw_reader(id_, nullptr, kTagHidden);
+  if (!opened) return remember_error(opened.error().message), nullptr;
+  reader_.store(new RawReader(std::move(*opened)), std::memory_order_release);
+  return reader_.load(std::memory_order_relaxed);
+}
+
+RawWriter* Stream::writer() noexcept {
+  if (RawWriter* open = writer_.load(std::memory_order_acquire)) return open;
+  const std::lock_guard guard(write_lock_);
+  if (RawWriter* open = writer_.load(std::memory_order_relaxed)) return open;
+  Result<Session> session = connect_();
+  if (!session) return remember_error(session.error().message), nullptr;
+  Result<RawWriter> opened = session->open_raw_writer(id_, nullptr, kTagHidden);
+  if (!opened) return remember_error(opened.error().message), nullptr;
+  writer_.store(new RawWriter(std::move(*opened)), std::memory_order_release);
+  return writer_.load(std::memory_order_relaxed);
+}
+
+Tid Stream::newest() const noexcept {
+  if (const RawReader* open = reader_.load(std::memory_order_acquire)) return open->newest();
+  return writer_.load(std::memory_order_acquire)->newest();
+}
+
+Tid Stream::oldest() const noexcept {
+  const Tid top = newest();
+  const Tid oldest = top - static_cast<Tid>(depth_) + 2;
+  return top < 0 ? kNoTid : oldest < 0 ? 0 : oldest;
+}
+
+// --- reading
+// ---------------------------------------------------------------------------------------
+
+Stream::Copy::Copy(Stream& stream)
+    : stream_(stream), bytes_(stream.spare_.exchange(nullptr, std::memory_order_acquire)) {
+  if (bytes_) return;
+  const std::size_t size = stream.payload_bytes_ + kGuardBytes;
+  bytes_ = static_cast<std::byte*>(::operator new(size, kAlignment));
+  std::memset(bytes_, 0, size);
+}
+
+Stream::Copy::~Copy() {
+  ::operator delete(stream_.spare_.exchange(bytes_, std::memory_order_acq_rel), kAlignment);
+}
+
+ReadStatus Stream::latest(Copy& out) noexcept {
+  RawReader* const open = reader();
+  if (!open) return ReadStatus::not_yet;
+  const std::lock_guard guard(read_lock_);
+  return open->latest(out.payload(), out.info);
+}
+
+ReadStatus Stream::tid(Tid tid, Copy& out) noexcept {
+  RawReader* const open = reader();
+  if (!open) return ReadStatus::not_yet;
+  const std::lock_guard guard(read_lock_);
+  return open->tid(tid, out.payload(), out.info);
+}
+
+ReadStatus Stream::at(Time t, Copy& out) noexcept {
+  RawReader* const open = reader();
+  if (!open) return ReadStatus::not_yet;
+  const std::lock_guard guard(read_lock_);
+  return open->at(t, out.payload(), out.info);
+}
+
+ReadStatus Stream::find(Time t, SampleInfo& info) noexcept {
+  RawReader* const open = reader();
+  if (!open) return ReadStatus::not_yet;
+  const std::lock_guard guard(read_lock_);
+  return open->find(t, info);
+}
+
+WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
+  RawReader* const open = reader();
+  if (!open) return WaitStatus::timeout;
+  // Without the lock, so that other threads may read meanwhile: a wait for a given tid uses nothing
+  // of the reader that reading changes.
+  return open->wait_for_tid(tid, deadline);
+}
+
+// --- writing
+// ---------------------------------------------------------------------------------------
+
+Tid Stream::write(const void* data, Time time) noexcept {
+  RawWriter* const open = writer();
+  if (!open) return kNoTid;
+  static constexpr std::byte kNothing{};
+  const auto* bytes = data_bytes_ > 0 ? static_cast<const std::byte*>(data) : &kNothing;
+  const std::lock_guard guard(write_lock_);
+  return open->write({bytes, payload_bytes_}, time);
+}
+
+Tid Stream::write_in_place(const std::function<void(std::byte*)>& fill, Time time) {
+  RawWriter* const open = writer();
+  if (!open) return kNoTid;
+  const std::lock_guard guard(write_lock_);
+  Loan loan = open->loan();
+  if (!loan) return kNoTid;
+  fill(loan.payload().data());
+  return loan.publish(time);
+}
+
+void Stream::reset_after_fork() noexcept {
+  read_lock_.reset_after_fork();
+  write_lock_.reset_after_fork();
+}
+
+}  // namespace dssm::ssm

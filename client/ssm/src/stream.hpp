@@ -1,0 +1,104 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What is behind an open sid: one stream, a reader and a writer of it. SSM's open modes restrict
+// nothing, so whichever of the two was not opened at first is opened when it is first used.
+//
+// Reads go through a private copy: what a caller's buffer or callback gets is a whole sample, and a
+// read that fails has not touched the buffer.
+//
+//   threads  all functions may be called from any thread, and from a signal handler once the reader
+//            and the writer are open
+#pragma once
+
+#include <atomic>
+#include <dssm/session.hpp>
+#include <functional>
+#include <memory>
+#include <span>
+
+#include "reentrant_lock.hpp"
+
+namespace dssm::ssm {
+
+// Kept with each open, for the lists of edges: the mode given to openSSM in the lower 8 bits.
+inline constexpr std::uint32_t kTagEdge = 1U << 8;    // openSSM: an edge of the graph
+inline constexpr std::uint32_t kTagHidden = 1U << 9;  // createSSM, and the second end of a sid
+
+// Type name of a stream created with size 0; its ring has one byte, as rings must.
+inline constexpr const char* kEmptyType = "ssm.empty";
+
+// Bytes per sample as SSM programs see it.
+inline std::uint64_t data_bytes(const TypeInfo& type) noexcept {
+  return type.name == kEmptyType ? 0 : type.payload_bytes;
+}
+
+class Stream {
+ public:
+  // Opens a missing end.
+  using Connect = Result<Session> (*)();
+
+  Stream(RawWriter writer, Connect connect);
+  Stream(RawReader reader, Connect connect);
+  Stream(const Stream&) = delete;
+  Stream& operator=(const Stream&) = delete;
+  ~Stream();
+
+  const StreamId& id() const noexcept { return id_; }
+  std::uint64_t data_bytes() const noexcept { return data_bytes_; }
+  std::uint64_t depth() const noexcept { return depth_; }
+  Duration cycle() const noexcept { return cycle_; }
+
+  // As in RawReader. One load.
+  Tid newest() const noexcept;
+  Tid oldest() const noexcept;
+
+  // A copy of a sample and its stamps; 64 bytes behind it belong to nobody.
+  class Copy {
+   public:
+    explicit Copy(Stream& stream);
+    Copy(const Copy&) = delete;
+    Copy& operator=(const Copy&) = delete;
+    ~Copy();
+    std::span<std::byte> payload() noexcept { return {bytes_, stream_.payload_bytes_}; }
+    SampleInfo info;
+
+   private:
+    Stream& stream_;
+    std::byte* bytes_;
+  };
+
+  // As in RawReader; not_yet also when the reader cannot be opened.
+  ReadStatus latest(Copy& out) noexcept;
+  ReadStatus tid(Tid tid, Copy& out) noexcept;
+  ReadStatus at(Time t, Copy& out) noexcept;
+  ReadStatus find(Time t, SampleInfo& info) noexcept;
+  WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
+
+  // Writes one sample; kNoTid when the writer cannot be opened or this thread is filling a slot.
+  Tid write(const void* data, Time time) noexcept;
+
+  // Lets `fill` write into the next slot and publishes it; what `fill` throws comes through, and
+  // nobody sees the slot then.
+  Tid write_in_place(const std::function<void(std::byte*)>& fill, Time time);
+
+  // In a forked child: locks that other threads of the parent held are free.
+  void reset_after_fork() noexcept;
+
+  Stream* next_abandoned = nullptr;  // in SidTable's list of the parent's streams
+
+ private:
+  RawReader* reader() noexcept;
+  RawWriter* writer() noexcept;
+
+  const Connect connect_;
+  const StreamId id_;
+  const std::uint64_t data_bytes_, payload_bytes_, depth_;
+  const Duration cycle_;
+
+  ReentrantLock read_lock_, write_lock_;
+  std::atomic<RawReader*> reader_{nullptr};  // set once, under its lock; owned
+  std::atomic<RawWriter*> writer_{nullptr};
+  std::atomic<std::byte*> spare_{nullptr};  // a copy's memory, for the next one
+};
+
+}  // namespace dssm::ssm
