@@ -11,12 +11,13 @@ namespace dssm::ctl {
 
 using Json = nlohmann::ordered_json;
 
-// One line, with its newline.
-inline std::string json_line(const Json& json) {
-  return json.dump(-1, ' ', true, Json::error_handler_t::replace) + "\n";
+inline std::string json_text(const Json& json) {
+  return json.dump(-1, ' ', true, Json::error_handler_t::replace);
 }
 
-// A document for people and programs: indented.
+inline std::string json_line(const Json& json) { return json_text(json) + "\n"; }
+
+// A document of its own: indented, because people look at it too.
 inline std::string json_document(const Json& json) {
   return json.dump(2, ' ', true, Json::error_handler_t::replace) + "\n";
 }

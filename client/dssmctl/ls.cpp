@@ -59,6 +59,19 @@ std::vector<std::string> row(const StreamInfo& stream, Time now) {
   };
 }
 
+// One document, but a line per stream: with a thousand of them neither a tree of values in memory
+// nor indentation is worth its time.
+void print_json(const std::vector<StreamInfo>& streams, Time now, Output& out) {
+  out.add("{\"streams\":[");
+  std::string_view separator = "\n";
+  for (const StreamInfo& stream : streams) {
+    out.add(separator);
+    out.add(json_text(stream_json(stream, now)));
+    separator = ",\n";
+  }
+  out.add("\n]}\n");
+}
+
 void print_table(const std::vector<StreamInfo>& streams, Time now, Output& out) {
   constexpr auto kRight = Table::Align::right;
   Table table({{"NAME"},
@@ -87,10 +100,7 @@ Result<void> run_ls(const Options& options, Output& out) {
 
   const Time now = WallClock::now();
   if (options.json) {
-    Json json;
-    Json& list = json["streams"] = Json::array();
-    for (const StreamInfo& stream : *streams) list.push_back(stream_json(stream, now));
-    out.add(json_document(json));
+    print_json(*streams, now, out);
   } else if (options.names) {
     // A program must get the name as it is; a terminal must not.
     for (const StreamInfo& stream : *streams) {

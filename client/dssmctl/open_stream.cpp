@@ -72,14 +72,10 @@ Error with_similar_names(Error error, Session& session, const StreamId& wanted) 
     names.push_back(short_name(stream.id));
   }
   const std::vector<std::string> similar = similar_names(short_name(wanted), std::move(names));
-  if (similar.empty()) {
-    error.message += "; 'dssmctl ls' shows what there is";
-    return error;
-  }
   for (const std::string& name : similar) {
     error.message += (&name == &similar.front() ? "; is it '" : "' or '") + escaped(name);
   }
-  error.message += "'?";
+  if (!similar.empty()) error.message += "'?";
   return error;
 }
 
