@@ -1,0 +1,122 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Writing and reading samples of several sizes through the public API, beside clock_gettime for
+// small ones and memcpy of the same size between the same buffers for large ones.
+#include <cstring>
+#include <dssm/dssm.hpp>
+
+#include "tests/bench/harness.hpp"
+#include "tests/support/daemon_process.hpp"
+
+using namespace dssm;
+using namespace dssm::bench;
+using namespace std::chrono_literals;
+
+namespace {
+
+void raw_clock() {
+  timespec ts;
+  ::clock_gettime(CLOCK_REALTIME, &ts);
+  keep(ts);
+}
+
+struct Stream {
+  RawWriter writer;
+  RawReader reader;
+};
+
+Stream make_stream(Session& session, const char* name, std::uint64_t bytes, std::uint64_t depth) {
+  const StreamId id{name, 0, ""};
+  RawWriter writer =
+      session.create_raw(id, TypeInfo{"", bytes, 1, {}}, History{depth, 1ms}).value();
+  RawReader reader = session.open_raw_reader(id).value();
+  return {std::move(writer), std::move(reader)};
+}
+
+void small(Session& session) {
+  Stream stream = make_stream(session, "small", 64, 1000);
+  std::byte payload[64] = {};
+  SampleInfo info;
+  std::int64_t time = 0;
+  const auto write = [&] { stream.writer.write(payload, time_from_ns(++time)); };
+  for (int i = 0; i < 2000; ++i) write();
+  print_pair("clock_gettime", "write 64 B, given time", measure(2000, 1000, raw_clock, write),
+             "<= 1.8");
+  const auto read = [&] {
+    if (stream.reader.latest(payload, info) != ReadStatus::ok) std::abort();
+    keep(payload);
+  };
+  print_pair("clock_gettime", "read newest 64 B", measure(2000, 1000, raw_clock, read), "<= 1.2");
+}
+
+// `rotating`: the buffers that memcpy goes through are as many as the ring's slots, so that both
+// miss the caches alike.
+void large(Session& session, std::uint64_t bytes, std::uint64_t depth, int batches) {
+  const std::string size = std::to_string(bytes / 1024) + " KiB";
+  Stream stream = make_stream(session, ("large" + std::to_string(bytes)).c_str(), bytes, depth);
+  std::vector<std::byte> mine(bytes, std::byte{1});
+  std::vector<std::byte> theirs((bytes + 64) * depth, std::byte{2});
+  std::uint64_t slot = 0;
+  SampleInfo info;
+  for (std::uint64_t i = 0; i < 2 * depth; ++i) stream.writer.write(mine, time_from_ns(1));
+  print_pair("memcpy " + size, "write " + size,
+             measure(
+                 batches, 1,
+                 [&] {
+                   slot = (slot + 1) % depth;
+                   std::memcpy(theirs.data() + slot * (bytes + 64), mine.data(), bytes);
+                   keep(theirs);
+                 },
+                 [&] { stream.writer.write(mine, time_from_ns(1)); }),
+             "<= 1.1");
+  print_pair("memcpy " + size, "read " + size,
+             measure(
+                 batches, 1,
+                 [&] {
+                   std::memcpy(mine.data(), theirs.data() + slot * (bytes + 64), bytes);
+                   keep(mine);
+                 },
+                 [&] {
+                   if (stream.reader.latest(mine, info) != ReadStatus::ok) std::abort();
+                   keep(mine);
+                 }),
+             "<= 1.1");
+  Stream tiny = make_stream(session, ("tiny" + std::to_string(bytes)).c_str(), 64, depth);
+  std::byte payload[64] = {};
+  print_pair("write 64 B", "loan and publish " + size,
+             measure(
+                 1000, 100, [&] { tiny.writer.write(payload, time_from_ns(1)); },
+                 [&] {
+                   Loan loan = stream.writer.loan();
+                   keep(loan);
+                   loan.publish(time_from_ns(1));
+                 }),
+             "as 64 B");
+  print_pair("read 64 B", "borrow and check " + size,
+             measure(
+                 1000, 100,
+                 [&] {
+                   if (tiny.reader.latest(payload, info) != ReadStatus::ok) std::abort();
+                   keep(payload);
+                 },
+                 [&] {
+                   BorrowedSample sample;
+                   if (stream.reader.borrow(stream.reader.newest(), sample) != ReadStatus::ok ||
+                       !sample.still_valid()) {
+                     std::abort();
+                   }
+                   keep(sample);
+                 }),
+             "as 64 B");
+}
+
+}  // namespace
+
+int main() {
+  test::DaemonProcess daemon;
+  Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
+  print_head();
+  small(session);
+  large(session, 64 << 10, 32, 4000);
+  large(session, 1 << 20, 16, 1000);
+}

@@ -1,0 +1,111 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Reading by time at random times, over depths and shapes of streams. The raw limit is the work
+// that no search can avoid, with its cache misses: looking at the right place of a dense index and
+// copying the right sample out of as many slots, when somebody tells its place.
+#include <cstring>
+#include <dssm/dssm.hpp>
+#include <random>
+
+#include "tests/bench/harness.hpp"
+#include "tests/support/daemon_process.hpp"
+
+using namespace dssm;
+using namespace dssm::bench;
+using namespace std::chrono_literals;
+
+namespace {
+
+constexpr int kQuestions = 1 << 16;
+
+// A copy of a ring's essentials, for the raw limit.
+struct Plain {
+  struct alignas(64) Slot {
+    std::int64_t stamps[8];
+    std::byte payload[64];
+    std::byte guard[64];
+  };
+  std::vector<std::int64_t> times;
+  std::vector<Slot> slots;
+};
+
+void shape(Session& session, const std::string& name, std::uint64_t depth, Duration cycle,
+           auto next_time, const std::string& target, int batches = 300) {
+  const StreamId id{"s" + std::to_string(depth) + name.substr(0, 4), 0, ""};
+  RawWriter writer = session.create_raw(id, TypeInfo{"", 64, 1, {}}, History{depth, cycle}).value();
+  RawReader reader = session.open_raw_reader(id).value();
+  Plain plain;
+  plain.times.resize(depth), plain.slots.resize(depth);
+  std::byte payload[64] = {};
+  std::int64_t time = 1'000'000'000;
+  std::mt19937_64 random(depth);
+  for (std::uint64_t i = 0; i < depth + depth / 2; ++i) {
+    time = next_time(time, random);
+    writer.write(payload, time_from_ns(time));
+    plain.times[i % depth] = time;
+  }
+  // Questions all over the window, and the places of their answers.
+  std::vector<Time> questions;
+  std::vector<std::uint64_t> places;
+  SampleInfo oldest, newest, found;
+  if (reader.stamp(reader.oldest() + 1, oldest) != ReadStatus::ok ||
+      reader.stamp(reader.newest(), newest) != ReadStatus::ok) {
+    std::abort();
+  }
+  while (questions.size() < kQuestions) {
+    SampleInfo any;
+    const Tid tid =
+        oldest.tid +
+        static_cast<Tid>(random() % static_cast<std::uint64_t>(newest.tid - oldest.tid + 1));
+    if (reader.stamp(tid, any) != ReadStatus::ok) std::abort();
+    const Time t = any.time + Duration(static_cast<std::int64_t>(random() % 500));
+    if (reader.find(t, found) != ReadStatus::ok) continue;  // before all that is left
+    questions.push_back(t);
+    places.push_back(static_cast<std::uint64_t>(found.tid) % depth);
+  }
+  std::size_t raw_at = 0, our_at = 0;
+  SampleInfo info;
+  const auto touch = [&] {
+    const std::uint64_t place = places[raw_at++ % kQuestions];
+    keep(plain.times[place]);
+    std::memcpy(payload, plain.slots[place].payload, 64);
+    keep(plain.slots[place].stamps[0] + plain.times[place]);
+    keep(payload);
+  };
+  const auto read = [&] {
+    if (reader.at(questions[our_at++ % kQuestions], payload, info) != ReadStatus::ok) std::abort();
+    keep(payload);
+  };
+  char label[80];
+  std::snprintf(label, sizeof label, "at(t), %s, depth %llu", name.c_str(),
+                static_cast<unsigned long long>(depth));
+  print_pair("the same place, told", label, measure(batches, 1000, touch, read), target);
+}
+
+}  // namespace
+
+int main() {
+  test::DaemonProcess daemon;
+  Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
+  const auto regular = [](std::int64_t last, auto&) { return last + 1'000'000; };
+  const auto jitter = [](std::int64_t last, auto& random) {
+    return last + 900'000 + static_cast<std::int64_t>(random() % 200'000);
+  };
+  const auto irregular = [](std::int64_t last, auto& random) {
+    return last + (std::int64_t{1} << (10 + random() % 20));
+  };
+  const auto zigzag = [up = 0](std::int64_t last, auto&) mutable {
+    return last + (++up % 2 ? 2'500'000 : -1'000'000);
+  };
+  print_head();
+  for (const std::uint64_t depth : {100, 1000, 10'000, 100'000, 1'000'000}) {
+    shape(session, "regular", depth, 1ms, regular,
+          depth == 100         ? "<= 60 ns"
+          : depth == 1'000'000 ? "<= 1.3 * depth 100, less misses"
+                               : "");
+  }
+  shape(session, "jitter of 10 %", 100'000, 1ms, jitter, "");
+  shape(session, "wrong cycle, 10 times", 100'000, 10ms, regular, "< 1 us");
+  shape(session, "irregular", 100'000, 1ms, irregular, "< 1 us");
+  shape(session, "every other sample backwards", 100'000, 1ms, zigzag, "< 1 us");
+}
