@@ -83,10 +83,10 @@ Error failed_read(const RawReader& reader, const std::string& what, ReadStatus s
   }
 }
 
-// The moment that --at means; `at` below zero counts back from the newest sample, because the
+// The moment that --at means. It counts back from the newest sample, not from now, because the
 // stamps of a recording have nothing to do with the time on the wall.
-Result<Time> moment(const RawReader& reader, Duration at) {
-  if (at >= Duration::zero()) return Time(at);
+Result<Time> moment(const RawReader& reader, const Options& options) {
+  if (!options.at_counts_back) return Time(*options.at);
   SampleInfo newest;
   ReadStatus status = ReadStatus::not_yet;
   do {  // the newest one may be overtaken between the two calls
@@ -94,14 +94,14 @@ Result<Time> moment(const RawReader& reader, Duration at) {
   } while (status == ReadStatus::too_old && reader.newest() != kNoTid);
   if (status != ReadStatus::ok)
     return failed_read(reader, "the newest sample", ReadStatus::not_yet);
-  return saturating_add(newest.time, at);
+  return saturating_add(newest.time, *options.at);
 }
 
 // Prints the sample that --at or --last asks for; without them puts the cursor before the first
 // sample to show.
 Result<void> begin(const Options& options, bool awaited, RawReader& reader, Echo& echo) {
   if (options.at) {
-    const Result<Time> time = moment(reader, *options.at);
+    const Result<Time> time = moment(reader, options);
     if (!time) return time.error();
     const ReadStatus status =
         echo.print([&](auto payload, auto& info) { return reader.at(*time, payload, info); });

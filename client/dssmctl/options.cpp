@@ -113,6 +113,7 @@ void add_echo(CLI::App& app, Options& options) {
                const Result<Duration> time = parse_seconds(text);
                if (!time) return time.error().message;
                options.at = *time;
+               options.at_counts_back = text.starts_with('-');  // also "-0"
                return {};
              })
       ->excludes(last);

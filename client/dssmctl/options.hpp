@@ -51,6 +51,7 @@ struct Options {
   // echo; `count` also for hz, bw, delay (reports)
   std::optional<std::uint64_t> count;
   std::optional<Duration> at;
+  bool at_counts_back = false;  // from the newest sample; `at` is then 0 or less
   bool last = false;
   bool csv = false;
   bool full = false;
