@@ -1,0 +1,210 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The configuration file and its values: what is taken, and what is said about what is not.
+#include "daemon/service/config.hpp"
+
+#include <gtest/gtest.h>
+
+#include <fstream>
+
+#include "daemon/service/config_values.hpp"
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+// The message about `text`, or "" when it is taken.
+std::string mistakes_in(const std::string& text) {
+  Config config;
+  const Result<void> applied = apply_text_untrusted(config, text, "dssmd.conf");
+  if (applied) return "";
+  EXPECT_EQ(applied.error().code, Errc::invalid_argument);
+  return applied.error().message;
+}
+
+TEST(Config, TakesEveryKeyFromTheFile) {
+  Config config;
+  const Result<void> applied = apply_text_untrusted(config, R"(
+name = "pc7"
+runtime_dir = "/run/elsewhere"
+socket_group = "root"
+socket_mode = "0600"
+log_level = "debug"
+max_clients = 10
+max_streams = 11
+max_memory = "12 MiB"
+max_opens = 13
+max_opens_per_client = 14
+max_property = 15
+recovery_grace = "16 ms"
+)",
+                                                    "dssmd.conf");
+  ASSERT_TRUE(applied) << applied.error().message;
+  EXPECT_EQ(config.name, "pc7");
+  EXPECT_EQ(config.runtime_dir, "/run/elsewhere");
+  EXPECT_EQ(config.socket_group, gid_t{0});
+  EXPECT_EQ(config.socket_mode, mode_t{0600});
+  EXPECT_EQ(config.log_level, LogLevel::debug);
+  EXPECT_EQ(config.max_clients, 10u);
+  EXPECT_EQ(config.max_streams, 11u);
+  EXPECT_EQ(config.max_memory_bytes, 12u << 20);
+  EXPECT_EQ(config.max_opens, 13u);
+  EXPECT_EQ(config.max_opens_per_client, 14u);
+  EXPECT_EQ(config.max_property_bytes, 15u);
+  EXPECT_EQ(config.recovery_grace, std::chrono::milliseconds(16));
+}
+
+TEST(Config, TakesAnEmptyFile) { EXPECT_EQ(mistakes_in(""), ""); }
+
+TEST(Config, NamesLineAndKeyOfAnUnknownKey) {
+  const std::string message = mistakes_in("name = \"pc1\"\n\nmax_stream = 5\n");
+  EXPECT_EQ(message.find("dssmd.conf:3: key 'max_stream': unknown"), 0u) << message;
+  EXPECT_NE(message.find("max_streams"), std::string::npos) << "the right key is not offered";
+}
+
+TEST(Config, NamesLineAndKeyOfAWrongType) {
+  EXPECT_EQ(mistakes_in("max_streams = \"five\"\n"),
+            "dssmd.conf:1: key 'max_streams': a text stands where a whole number belongs");
+  EXPECT_EQ(mistakes_in("\nname = 5\n"),
+            "dssmd.conf:2: key 'name': a whole number stands where a text in quotes belongs");
+  EXPECT_EQ(mistakes_in("max_memory = [1]\n"),
+            "dssmd.conf:1: key 'max_memory': a list stands where a whole number or a text in "
+            "quotes belongs");
+  EXPECT_NE(mistakes_in("[name]\nx = 1\n").find("a table stands"), std::string::npos);
+  EXPECT_NE(mistakes_in("max_clients = 1.5\n").find("a number with a point"), std::string::npos);
+  EXPECT_NE(mistakes_in("max_clients = true\n").find("true or false"), std::string::npos);
+}
+
+TEST(Config, NamesLineKeyAndRangeOfAValueOutOfRange) {
+  EXPECT_EQ(mistakes_in("max_streams = 0\n"),
+            "dssmd.conf:1: key 'max_streams': '0' is outside of 1 to 32768");
+  EXPECT_NE(mistakes_in("max_streams = -1\n").find("key 'max_streams'"), std::string::npos);
+  EXPECT_NE(mistakes_in("max_opens = 100001\n").find("outside of 1 to 100000"), std::string::npos);
+  EXPECT_NE(mistakes_in("recovery_grace = \"61 s\"\n").find("outside of 0 to 60000 ms"),
+            std::string::npos);
+}
+
+TEST(Config, ReportsAllMistakesInTheOrderOfTheFile) {
+  const std::string message = mistakes_in("zzz = 1\nmax_streams = 0\naaa = 2\n");
+  const std::size_t first = message.find("dssmd.conf:1: key 'zzz'");
+  const std::size_t second = message.find("\ndssmd.conf:2: key 'max_streams'");
+  const std::size_t third = message.find("\ndssmd.conf:3: key 'aaa'");
+  EXPECT_EQ(first, 0u) << message;
+  EXPECT_NE(third, std::string::npos) << message;
+  EXPECT_LT(second, third) << message;
+}
+
+TEST(Config, NamesTheLineOfASyntaxError) {
+  EXPECT_EQ(mistakes_in("name = \"pc1\"\nmax_streams = = 3\n").find("dssmd.conf:2: "), 0u);
+  EXPECT_NE(mistakes_in("name = \"\xff\"\n"), "");
+}
+
+TEST(Config, SaysThatAFileIsMissing) {
+  Config config;
+  const Result<void> applied = apply_file(config, "/nowhere/dssmd.conf");
+  ASSERT_FALSE(applied);
+  EXPECT_EQ(applied.error().message,
+            "read the configuration '/nowhere/dssmd.conf': No such file or directory");
+}
+
+TEST(Config, ReadsAFile) {
+  const std::string dir = test::make_temp_dir();
+  std::ofstream(dir + "/dssmd.conf") << "max_streams = 77\n";
+  Config config;
+  EXPECT_TRUE(apply_file(config, dir + "/dssmd.conf"));
+  EXPECT_EQ(config.max_streams, 77u);
+  test::remove_tree(dir);
+}
+
+TEST(Config, TakesTheDefaultFileOfTheProjectWithAllItsLinesInUse) {
+  const char* root = std::getenv("DSSM_SOURCE_ROOT");
+  ASSERT_TRUE(root);
+  std::ifstream file(std::string(root) + "/systemd/dssmd.conf");
+  ASSERT_TRUE(file) << "systemd/dssmd.conf is missing";
+  std::string text, in_use;
+  std::size_t keys = 0;
+  for (std::string line; std::getline(file, line);) {
+    text += line + "\n";
+    if (line.starts_with("#") && line.find(" = ") != std::string::npos && !line.starts_with("# ")) {
+      line.erase(0, 1);
+      if (line.starts_with("socket_group")) line = "socket_group = \"root\"";
+      ++keys;
+    }
+    in_use += line + "\n";
+  }
+  EXPECT_EQ(mistakes_in(text), "");
+  EXPECT_EQ(mistakes_in(in_use), "");
+  EXPECT_EQ(keys, config_keys().size()) << "each key once, commented out with its default";
+}
+
+TEST(Config, GivesTheMachinesNameUpToTheFirstDotWhenNoneIsSet) {
+  Config config;
+  config.name = "chosen";
+  ASSERT_TRUE(finish(config));
+  EXPECT_EQ(config.name, "chosen");
+  config.name.clear();
+  const Result<void> finished = finish(config);
+  if (finished) {
+    EXPECT_FALSE(config.name.empty());
+    EXPECT_EQ(config.name.find('.'), std::string::npos);
+  } else {  // a machine whose name is none for a host; then the way out is named
+    EXPECT_NE(finished.error().message.find("--name"), std::string::npos);
+  }
+}
+
+TEST(ConfigValues, TakeOnlyHostNamesThatFitIntoStreamNames) {
+  EXPECT_TRUE(check_host_name("pc1"));
+  EXPECT_TRUE(check_host_name("A-9"));
+  EXPECT_TRUE(check_host_name(std::string(31, 'x')));
+  EXPECT_FALSE(check_host_name(""));
+  EXPECT_FALSE(check_host_name(std::string(32, 'x')));
+  EXPECT_FALSE(check_host_name("pc1.local"));
+  EXPECT_FALSE(check_host_name("pc 1"));
+  EXPECT_FALSE(check_host_name("pc@1"));
+}
+
+TEST(ConfigValues, ReadBytesWithTheirUnits) {
+  const auto bytes = [](std::string_view text) {
+    const Result<std::uint64_t> parsed = parse_bytes(text, 0, 1ULL << 50);
+    return parsed ? *parsed : 1;
+  };
+  EXPECT_EQ(bytes("4096"), 4096u);
+  EXPECT_EQ(bytes("2KiB"), 2048u);
+  EXPECT_EQ(bytes("3 MiB"), 3u << 20);
+  EXPECT_EQ(bytes("4 GiB"), 4ULL << 30);
+  EXPECT_EQ(bytes("5 TiB"), 5ULL << 40);
+  EXPECT_EQ(bytes("50%"), memory_of_the_machine() / 100 * 50);
+  EXPECT_FALSE(parse_bytes("101%", 0, UINT64_MAX));
+  EXPECT_FALSE(parse_bytes("3 MB", 0, UINT64_MAX));
+  EXPECT_FALSE(parse_bytes("-3", 0, UINT64_MAX));
+  EXPECT_FALSE(parse_bytes("MiB", 0, UINT64_MAX));
+  EXPECT_FALSE(parse_bytes("99999999999999999999", 0, UINT64_MAX));
+  EXPECT_FALSE(parse_bytes("16777216 TiB", 0, UINT64_MAX - 1)) << "2^64 must not wrap to 0";
+}
+
+TEST(ConfigValues, ReadDurationsOnlyWithTheirUnits) {
+  const Duration zero{}, minute = std::chrono::minutes(1);
+  EXPECT_EQ(*parse_duration("500 ms", zero, minute), std::chrono::milliseconds(500));
+  EXPECT_EQ(*parse_duration("2s", zero, minute), std::chrono::seconds(2));
+  EXPECT_FALSE(parse_duration("2", zero, minute));
+  EXPECT_FALSE(parse_duration("2 h", zero, minute));
+  EXPECT_FALSE(parse_duration("18446744073709551615 s", zero, minute));
+}
+
+TEST(ConfigValues, ReadModesInOctal) {
+  EXPECT_EQ(*parse_mode("0660"), mode_t{0660});
+  EXPECT_EQ(*parse_mode("600"), mode_t{0600});
+  EXPECT_FALSE(parse_mode("0680"));
+  EXPECT_FALSE(parse_mode("01777"));
+  EXPECT_FALSE(parse_mode("0460"));
+  EXPECT_FALSE(parse_mode(""));
+}
+
+TEST(ConfigValues, RefuseAGroupThatIsNotThere) {
+  const Result<gid_t> group = parse_group("no-such-group-here");
+  ASSERT_FALSE(group);
+  EXPECT_NE(group.error().message.find("groupadd"), std::string::npos);
+}
+
+}  // namespace
+}  // namespace dssm::daemon
