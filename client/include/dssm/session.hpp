@@ -31,8 +31,8 @@ class Client;
 }
 
 struct SessionOptions {
-  std::string socket_path;  // empty: $DSSM_SOCKET, else /run/dssm/dssmd.sock
-  std::string program;      // shown by dssmctl; empty: this program's name
+  std::string socket_path = {};  // empty: $DSSM_SOCKET, else /run/dssm/dssmd.sock
+  std::string program = {};      // shown by dssmctl; empty: this program's name
   Duration request_timeout = std::chrono::seconds(5);
 };
 

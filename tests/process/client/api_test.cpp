@@ -1,0 +1,432 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// libdssm's public API against a real dssmd, as a user's program would use it.
+#include <gtest/gtest.h>
+#include <poll.h>
+#include <sys/resource.h>
+#include <sys/wait.h>
+
+#include <atomic>
+#include <csignal>
+#include <dssm/dssm.hpp>
+#include <filesystem>
+#include <mutex>
+#include <set>
+#include <thread>
+
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm {
+namespace {
+
+using namespace std::chrono_literals;
+using test::DaemonProcess;
+
+struct Odometry {
+  double x, y, theta;
+};
+DSSM_DESCRIBE(Odometry, x, y, theta)
+
+struct Turned {  // same size, other type
+  double a, b, c;
+};
+
+struct Api : testing::Test {
+  DaemonProcess daemon;
+  Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
+
+  Writer<Odometry> make(std::string_view name = "odometry", History history = {64, 10ms}) {
+    return session.create<Odometry>(name, history).value();
+  }
+};
+
+// The sample written as number `tid`: its time is 100 ms * tid.
+Odometry sample(Tid tid) { return {1.0 * static_cast<double>(tid), -1, 0.5}; }
+Time time_of(Tid tid) { return time_from_ns(tid * 100'000'000); }
+
+void write(Writer<Odometry>& writer, Tid tid) {
+  ASSERT_EQ(writer.write(sample(tid), time_of(tid)), tid);
+}
+
+TEST_F(Api, ReadsByTidByTimeAndInOrder) {
+  auto writer = make();
+  auto reader = session.open_reader<Odometry>("odometry").value();
+  Odometry out{};
+  SampleInfo info;
+  EXPECT_EQ(reader.latest(out, info), ReadStatus::not_yet);
+  EXPECT_EQ(reader.next(out, info), ReadStatus::not_yet);
+  EXPECT_EQ(reader.at(time_of(1), out, info), ReadStatus::not_yet);
+  for (Tid tid = 0; tid < 10; ++tid) write(writer, tid);
+
+  ASSERT_EQ(reader.next(out, info), ReadStatus::ok) << "a fresh reader begins with the newest";
+  EXPECT_EQ(info.tid, 9);
+  EXPECT_EQ(reader.next(out, info), ReadStatus::not_yet);
+  EXPECT_EQ(info.tid, 9) << "arguments stay as they were";
+  write(writer, 10);
+  ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 10);
+  ASSERT_EQ(reader.previous(out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 9);
+  ASSERT_EQ(reader.tid(3, out, info), ReadStatus::ok);
+  EXPECT_EQ(out.x, 3);
+  EXPECT_EQ(info.time, time_of(3));
+  ASSERT_EQ(reader.at(time_of(5) + 1ms, out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 5);
+  ASSERT_EQ(reader.at(time_of(5), out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 5);
+  ASSERT_EQ(reader.at(time_of(500), out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 10);
+  EXPECT_EQ(reader.at(time_of(0) - 1ns, out, info), ReadStatus::too_old);
+  ASSERT_EQ(reader.at_or_after(time_of(5) + 1ns, out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 6);
+  ASSERT_EQ(reader.at_or_after(time_of(5), out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 5);
+  ASSERT_EQ(reader.at_or_after(time_of(-5), out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 0);
+  EXPECT_EQ(reader.at_or_after(time_of(10) + 1ns, out, info), ReadStatus::not_yet);
+  ASSERT_EQ(reader.nearest(time_of(5) + 50ms, out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 5) << "the earlier one of two equally close ones";
+  ASSERT_EQ(reader.nearest(time_of(5) + 51ms, out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 6);
+  ASSERT_EQ(reader.nearest(time_of(-3), out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 0);
+  ASSERT_EQ(reader.nearest(time_of(33), out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 10);
+  Neighbours around;
+  ASSERT_EQ(reader.neighbours(time_of(5) + 30ms, around), ReadStatus::ok);
+  EXPECT_EQ(around.before.tid, 5);
+  EXPECT_EQ(around.after.tid, 6);
+  EXPECT_EQ(reader.neighbours(time_of(10), around), ReadStatus::not_yet);
+  EXPECT_EQ(reader.neighbours(time_of(0) - 1ns, around), ReadStatus::too_old);
+}
+
+TEST_F(Api, CountsWhatAReaderLostWhenItWasLapped) {
+  auto writer = make("odometry", {8, 10ms});
+  auto reader = session.open_reader<Odometry>("odometry").value();
+  Odometry out{};
+  SampleInfo info;
+  write(writer, 0);
+  ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+  for (Tid tid = 1; tid <= 20; ++tid) write(writer, tid);
+  ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 14) << "8 slots hold 7 samples";
+  EXPECT_EQ(reader.lost(), 13u);
+  for (Tid tid = 15; tid <= 20; ++tid) {
+    ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+    EXPECT_EQ(info.tid, tid);
+  }
+  EXPECT_EQ(reader.lost(), 13u);
+  reader.seek(kNoTid);
+  ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 14);
+}
+
+TEST_F(Api, LendsSlotsInPlace) {
+  auto writer = make();
+  auto reader = session.open_reader<Odometry>("odometry").value();
+  {
+    Loan loan = writer.loan();
+    ASSERT_TRUE(loan);
+    Writer<Odometry>::view(loan) = sample(0);
+    EXPECT_FALSE(writer.loan()) << "a second loan in the same thread would wait for ever";
+    EXPECT_EQ(loan.publish(time_of(0)), 0);
+    EXPECT_EQ(loan.publish(time_of(0)), kNoTid);
+  }
+  { Loan dropped = writer.loan(); }
+  EXPECT_EQ(writer.newest(), 0);
+  BorrowedSample borrowed;
+  ASSERT_EQ(reader.borrow(0, borrowed), ReadStatus::ok);
+  EXPECT_EQ(Reader<Odometry>::view(borrowed).theta, 0.5);
+  EXPECT_TRUE(borrowed.still_valid());
+  for (Tid tid = 1; tid <= 64; ++tid) write(writer, tid);
+  EXPECT_FALSE(borrowed.still_valid());
+}
+
+TEST_F(Api, KeepsAnExistingRingWhenCreatedAgain) {
+  auto first = make("odometry", {64, 10ms});
+  write(first, 0);
+  auto second = make("odometry", {10, 1s});
+  EXPECT_EQ(second.depth(), 64u);
+  EXPECT_EQ(second.incarnation(), first.incarnation());
+  write(second, 1);
+  write(first, 2);
+  auto reader = session.open_reader<Odometry>("odometry").value();
+  SampleInfo info;
+  ASSERT_EQ(reader.stamp(0, info), ReadStatus::ok);
+  EXPECT_EQ(info.time, time_of(0)) << "SSM zeroed all stamps here";
+}
+
+TEST_F(Api, NamesBothTypesWhenTheyDoNotMatch) {
+  auto writer = make();
+  for (const Error& error : {session.open_reader<Turned>("odometry").error(),
+                             session.open_writer<Turned>("odometry").error(),
+                             session.create<Turned>("odometry", History{64, 10ms}).error()}) {
+    EXPECT_EQ(error.code, Errc::type_mismatch);
+    EXPECT_NE(error.message.find("Odometry"), std::string::npos) << error.message;
+    EXPECT_NE(error.message.find("Turned"), std::string::npos) << error.message;
+  }
+  const Error size = session.open_reader<double>("odometry").error();
+  EXPECT_NE(size.message.find("24 bytes"), std::string::npos) << size.message;
+  EXPECT_NE(size.message.find("8 bytes"), std::string::npos) << size.message;
+  const Error bytes =
+      session.create_raw({"odometry", 0, ""}, TypeInfo{"", 25, 1, {}}, {64, 10ms}).error();
+  EXPECT_EQ(bytes.code, Errc::type_mismatch);
+}
+
+TEST_F(Api, SaysInWordsWhatIsWrongWithARequest) {
+  const auto expect = [](const Error& error, Errc code, const char* words) {
+    EXPECT_EQ(error.code, code) << error.message;
+    EXPECT_NE(error.message.find(words), std::string::npos) << error.message;
+  };
+  expect(session.open_reader<Odometry>("nothing").error(), Errc::not_found, "'nothing");
+  expect(session.create<Odometry>(std::string(32, 'x'), History{64, 1ms}).error(),
+         Errc::invalid_argument, "at most 31");
+  expect(session.create<Odometry>("a", 1s, 0s).error(), Errc::invalid_argument, "cycle of 0");
+  expect(session.create<Odometry>("a", 0s, 1s).error(), Errc::invalid_argument,
+         "shorter than the cycle");
+  expect(session.create<Odometry>("a", History{1, 1ms}).error(), Errc::invalid_argument,
+         "depth of 1");
+  expect(session.create<Odometry>("a", History{64, -1ms}).error(), Errc::invalid_argument, "cycle");
+  expect(session.create_raw({"a", 0, ""}, TypeInfo{"", 0, 1, {}}, {64, 1ms}).error(),
+         Errc::invalid_argument, "0 bytes");
+  expect(session.create_raw({"a", 0, ""}, TypeInfo{"", 64 << 20, 1, {}}, {1 << 20, 1ms}).error(),
+         Errc::limit_exceeded, "memory");
+  expect(session.remove({"nothing", 0, ""}).error(), Errc::not_found, "nothing");
+  expect(session.info({"nothing", 0, ""}).error(), Errc::not_found, "nothing");
+  expect(session.property({"nothing", 0, ""}).error(), Errc::not_found, "nothing");
+  make();
+  expect(session.property({"odometry", 0, ""}).error(), Errc::not_found, "property");
+  expect(Session::connect({.socket_path = daemon.runtime_dir() + "/nobody.sock"}).error(),
+         Errc::no_daemon, "start dssmd");
+  expect(Session::connect({.socket_path = std::string(200, 'x')}).error(), Errc::invalid_argument,
+         "107 bytes");
+}
+
+TEST_F(Api, KeepsPropertiesOfAnySizeUpToTheirLimit) {
+  auto writer = make();
+  for (const std::size_t bytes : {1, 100, 9000, 1 << 20, 5, 16 << 20}) {
+    std::vector<std::byte> property(bytes, static_cast<std::byte>(bytes % 251));
+    ASSERT_TRUE(writer.set_property(property));
+    EXPECT_EQ(session.property({"odometry", 0, ""}).value(), property);
+    EXPECT_EQ(session.info({"odometry", 0, ""}).value().property_bytes, bytes);
+  }
+  EXPECT_EQ(writer.set_property(std::vector<std::byte>((16 << 20) + 1)).error().code,
+            Errc::limit_exceeded);
+  ASSERT_TRUE(writer.set_property({}));
+  EXPECT_EQ(session.property({"odometry", 0, ""}).error().code, Errc::not_found);
+}
+
+TEST_F(Api, WaitsForSamplesWithADeadline) {
+  auto writer = make();
+  auto other = make("other");
+  auto reader = session.open_reader<Odometry>("odometry").value();
+  auto other_reader = session.open_reader<Odometry>("other").value();
+  EXPECT_EQ(reader.wait(MonoClock::now() - 1s), WaitStatus::timeout);
+  EXPECT_EQ(reader.wait(deadline_in(5ms)), WaitStatus::timeout);
+  RawReader* const both[] = {&reader, &other_reader};
+  EXPECT_EQ(wait_any(both, deadline_in(5ms)), WaitStatus::timeout);
+  std::thread later([&] { write(other, 0); });
+  EXPECT_EQ(wait_any(both, kNever), WaitStatus::ready);
+  later.join();
+  EXPECT_EQ(reader.wait(MonoClock::now() - 1s), WaitStatus::timeout);
+  EXPECT_EQ(other_reader.wait(MonoClock::now() - 1s), WaitStatus::ready) << "there already";
+  std::thread more([&] {
+    for (Tid tid = 0; tid < 5; ++tid) write(writer, tid);
+  });
+  EXPECT_EQ(reader.wait_for_tid(4, kNever), WaitStatus::ready);
+  EXPECT_EQ(reader.newest(), 4);
+  more.join();
+}
+
+TEST_F(Api, ReportsASignalThatInterruptsAWait) {
+  struct sigaction action {
+  }, before{};
+  action.sa_handler = [](int) {};
+  ::sigaction(SIGUSR1, &action, &before);
+  auto writer = make();
+  auto reader = session.open_reader<Odometry>("odometry").value();
+  const pthread_t self = ::pthread_self();
+  std::atomic<bool> done = false;
+  std::thread killer([&] {
+    while (!done) ::pthread_kill(self, SIGUSR1), std::this_thread::yield();
+  });
+  EXPECT_EQ(reader.wait(kNever), WaitStatus::interrupted);
+  done = true;
+  killer.join();
+  ::sigaction(SIGUSR1, &before, nullptr);
+}
+
+TEST_F(Api, OffersADescriptorToEventLoops) {
+  auto writer = make();
+  auto reader = session.open_reader<Odometry>("odometry").value();
+  const int fd = reader.ready_fd().value();
+  pollfd poller{fd, POLLIN, 0};
+  EXPECT_EQ(::poll(&poller, 1, 0), 0);
+  Odometry out{};
+  SampleInfo info;
+  for (Tid tid = 0; tid < 100; ++tid) {
+    write(writer, tid);
+    ASSERT_EQ(::poll(&poller, 1, -1), 1);
+    reader.clear_ready();
+    ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+    ASSERT_EQ(info.tid, tid);
+  }
+}
+
+TEST_F(Api, WatchesOver127Descriptors) {
+  std::vector<Writer<Odometry>> writers;
+  std::vector<Reader<Odometry>> readers;
+  std::vector<pollfd> fds;
+  for (int i = 0; i < 200; ++i) {
+    writers.push_back(make("s" + std::to_string(i), {4, 1ms}));
+    readers.push_back(session.open_reader<Odometry>("s" + std::to_string(i)).value());
+    fds.push_back({readers.back().ready_fd().value(), POLLIN, 0});
+  }
+  for (auto& writer : writers) write(writer, 0);
+  for (auto& fd : fds) EXPECT_EQ(::poll(&fd, 1, -1), 1);
+}
+
+TEST_F(Api, ListsStreamsWithTheirFigures) {
+  auto writer = make("odometry:2");
+  auto reader = session.open_reader<Odometry>("odometry:2").value();
+  for (Tid tid = 0; tid < 30; ++tid) write(writer, tid);
+  make("second");
+  const std::vector<StreamInfo> list = session.list().value();
+  ASSERT_EQ(list.size(), 2u);
+  const StreamInfo& first = list[0];
+  EXPECT_EQ(first.id, (StreamId{"odometry", 2, "pc1"}));
+  EXPECT_EQ(first.type, type_of<Odometry>());
+  EXPECT_EQ(first.depth, 64u);
+  EXPECT_EQ(first.cycle, 10ms);
+  EXPECT_EQ(first.newest, 29);
+  EXPECT_EQ(first.oldest, 0);
+  EXPECT_EQ(first.newest_time, time_of(29));
+  EXPECT_NEAR(first.rate_hz, 10, 1e-6);
+  EXPECT_EQ(first.writers, 1u);
+  EXPECT_EQ(first.readers, 1u);
+  EXPECT_EQ(first.creator_pid, ::getpid());
+  EXPECT_EQ(list[1].id.name, "second");
+  EXPECT_EQ(list[1].newest, kNoTid);
+  EXPECT_EQ(list[1].writers, 0u) << "its writer is gone";
+  const StreamInfo info = session.info({"odometry", 2, ""}).value();
+  ASSERT_EQ(info.users.size(), 2u);
+  EXPECT_EQ(info.users[0].pid, ::getpid());
+  EXPECT_EQ(session.info({"odometry", 2, "pc1"}).value().id, first.id);
+  EXPECT_EQ(session.info({"odometry", 2, "pc9"}).error().code, Errc::not_found);
+  EXPECT_EQ(session.daemon().value().host, "pc1");
+  EXPECT_EQ(session.daemon().value().pid, daemon.pid());
+  EXPECT_EQ(session.daemon().value().streams, 2u);
+  ASSERT_EQ(session.clients().value().size(), 1u);
+  EXPECT_EQ(session.clients().value()[0].pid, ::getpid());
+  ASSERT_EQ(session.opens().value().size(), 2u);
+}
+
+TEST_F(Api, RemovesAStreamButNotFromThoseWhoHoldIt) {
+  auto writer = make();
+  auto reader = session.open_reader<Odometry>("odometry").value();
+  write(writer, 0);
+  ASSERT_TRUE(session.remove({"odometry", 0, ""}));
+  EXPECT_EQ(session.open_reader<Odometry>("odometry").error().code, Errc::not_found);
+  write(writer, 1);
+  EXPECT_EQ(reader.newest(), 1);
+  auto anew = make();
+  EXPECT_NE(anew.incarnation(), writer.incarnation());
+  EXPECT_EQ(anew.newest(), kNoTid);
+}
+
+TEST_F(Api, TellsWatchersWhatComesAndGoes) {
+  make("before");
+  std::mutex mutex;
+  std::condition_variable changed;
+  std::vector<std::string> seen;
+  auto watch = session.watch([&](const StreamEvent& event) {
+    const std::lock_guard guard(mutex);
+    seen.push_back((event.kind == StreamEvent::Kind::added ? "+" : "-") + event.stream.id.name);
+    changed.notify_all();
+  });
+  ASSERT_TRUE(watch);
+  make("later");
+  ASSERT_TRUE(session.remove({"before", 0, ""}));
+  std::unique_lock lock(mutex);
+  changed.wait(lock, [&] { return seen.size() >= 3; });
+  EXPECT_EQ(seen, (std::vector<std::string>{"+before", "+later", "-before"}));
+}
+
+TEST_F(Api, AwaitsAStreamThatComesLater) {
+  EXPECT_EQ(session.await_reader<Odometry>("late", deadline_in(10ms)).error().code,
+            Errc::not_found);
+  std::thread creator([&] { make("late"); });
+  EXPECT_TRUE(session.await_reader<Odometry>("late"));
+  creator.join();
+}
+
+TEST_F(Api, SharesOnePlaybackClock) {
+  Session other = Session::connect({.socket_path = daemon.socket_path()}).value();
+  PlaybackClock clock = session.playback_clock().value(), seen = other.playback_clock().value();
+  EXPECT_EQ(seen.setting().speed, 1);
+  clock.set_paused(true);
+  clock.set_time(500);
+  EXPECT_EQ(seen.now_s(), 500);
+  clock.set_speed(-2);
+  EXPECT_EQ(seen.now_s(), 500);
+  EXPECT_EQ(seen.setting().speed, -2);
+  clock.reset();
+  EXPECT_EQ(seen.setting().offset_s, 0);
+  EXPECT_FALSE(seen.setting().paused);
+}
+
+std::size_t count_of(const std::string& folder) {
+  std::size_t count = 0;
+  for ([[maybe_unused]] const auto& entry : std::filesystem::directory_iterator(folder)) ++count;
+  return count;
+}
+
+TEST_F(Api, LeaksNothingIn10000OpensAndCloses) {
+  auto writer = make();
+  const auto files_of = [&](pid_t pid) { return "/proc/" + std::to_string(pid) + "/fd"; };
+  const auto once = [&] {
+    auto reader = session.open_reader<Odometry>("odometry").value();
+    auto second = session.open_writer<Odometry>("odometry").value();
+  };
+  once();
+  ASSERT_TRUE(session.list());  // an answer after the closes: they are done
+  const std::size_t ours = count_of(files_of(::getpid())), maps = count_of("/proc/self/map_files");
+  const std::size_t theirs = count_of(files_of(daemon.pid()));
+  for (int i = 0; i < 10'000; ++i) once();
+  ASSERT_TRUE(session.list());
+  EXPECT_EQ(count_of(files_of(::getpid())), ours);
+  EXPECT_LE(count_of("/proc/self/map_files"), maps + 4);  // malloc may map an arena
+  EXPECT_EQ(count_of(files_of(daemon.pid())), theirs);
+  EXPECT_EQ(session.info({"odometry", 0, ""}).value().writers, 1u);
+  EXPECT_EQ(session.opens().value().size(), 1u);
+}
+
+TEST_F(Api, Serves1000StreamsAnd1000Clients) {
+  rlimit files{};
+  ASSERT_EQ(::getrlimit(RLIMIT_NOFILE, &files), 0);
+  files.rlim_cur = files.rlim_max;
+  ASSERT_EQ(::setrlimit(RLIMIT_NOFILE, &files), 0);
+  ASSERT_GE(files.rlim_max, 12'000u) << "this machine's `ulimit -Hn` is too small for the test";
+  std::vector<Writer<double>> writers;
+  for (int i = 0; i < 1000; ++i) {
+    writers.push_back(session.create<double>("s" + std::to_string(i), History{4, 1ms}).value());
+    ASSERT_EQ(writers.back().write(i), 0);
+  }
+  std::vector<Session> sessions;
+  std::vector<Reader<double>> readers;
+  for (int i = 0; i < 1000; ++i) {
+    sessions.push_back(Session::connect({.socket_path = daemon.socket_path()}).value());
+    readers.push_back(sessions.back().open_reader<double>("s" + std::to_string(i)).value());
+  }
+  for (int i = 0; i < 1000; ++i) {
+    double out = 0;
+    SampleInfo info;
+    ASSERT_EQ(readers[static_cast<std::size_t>(i)].latest(out, info), ReadStatus::ok);
+    ASSERT_EQ(out, i);
+  }
+  EXPECT_EQ(session.list().value().size(), 1000u);
+  EXPECT_EQ(session.clients().value().size(), 1001u);
+}
+
+}  // namespace
+}  // namespace dssm

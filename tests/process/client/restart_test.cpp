@@ -1,0 +1,222 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmd killed and started again under load: readers and writers go on in their rings, offer them
+// back, and not one sample is lost, torn or delivered twice.
+#include <gtest/gtest.h>
+#include <sys/prctl.h>
+#include <sys/wait.h>
+
+#include <atomic>
+#include <csignal>
+#include <dssm/dssm.hpp>
+#include <thread>
+
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm {
+namespace {
+
+using namespace std::chrono_literals;
+using test::DaemonProcess;
+
+struct Counted {
+  std::int64_t number;
+  std::int64_t again[15];  // the same, to show tearing
+};
+DSSM_DESCRIBE(Counted, number, again)
+
+Counted counted(std::int64_t number) {
+  Counted sample{number, {}};
+  for (auto& word : sample.again) word = number;
+  return sample;
+}
+
+Session connect(const DaemonProcess& daemon) {
+  return Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 60s}).value();
+}
+
+TEST(Restart, LosesNoSampleWhenTheDaemonIsKilledUnderLoad) {
+  DaemonProcess daemon;
+  std::atomic<bool> done = false;
+  std::atomic<std::int64_t> written = 0;
+  Session writing = connect(daemon), reading = connect(daemon);
+  Writer<Counted> writer = writing.create<Counted>("load", History{1 << 16, 1ms}).value();
+  Reader<Counted> reader = reading.open_reader<Counted>("load").value();
+  const std::uint64_t incarnation = writer.incarnation();
+  reader.seek(kNoTid);
+  std::thread write([&] {
+    while (!done) {
+      ASSERT_EQ(writer.write(counted(written.load())), written.load());
+      ++written;
+      std::this_thread::sleep_for(200us);  // the load's rate, not a wait for anything
+    }
+  });
+  std::thread read([&] {
+    Counted sample{};
+    SampleInfo info;
+    for (std::int64_t expected = 0; !done || expected < written.load();) {
+      if (reader.wait(deadline_in(100ms)) != WaitStatus::ready) continue;
+      ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+      ASSERT_EQ(info.tid, expected);
+      ASSERT_EQ(sample.number, expected);
+      for (const std::int64_t word : sample.again) ASSERT_EQ(word, expected);
+      ++expected;
+    }
+  });
+  for (int round = 0; round < 5; ++round) {
+    const std::int64_t before = written.load();
+    daemon.kill_hard();
+    while (written.load() < before + 100) std::this_thread::yield();  // it goes on without
+    daemon.start();
+    // Both sessions are back with what they hold, under the same ring.
+    const StreamInfo info = [&] {
+      for (;;) {
+        auto seen = reading.info({"load", 0, ""});
+        if (seen && seen->writers == 1 && seen->readers == 1) return *seen;
+        std::this_thread::yield();
+      }
+    }();
+    EXPECT_EQ(info.incarnation, incarnation);
+    EXPECT_EQ(info.type, type_of<Counted>()) << "the description came back as well";
+    EXPECT_EQ(info.creator_pid, ::getpid());
+  }
+  // New readers and writers join the old ring.
+  Session later = connect(daemon);
+  EXPECT_EQ(later.open_reader<Counted>("load").value().incarnation(), incarnation);
+  EXPECT_EQ(later.create<Counted>("load", History{16, 1ms}).value().incarnation(), incarnation);
+  done = true;
+  write.join();
+  read.join();
+  EXPECT_EQ(reader.lost(), 0u);
+}
+
+TEST(Restart, BringsBackAStreamThatOnlyReadersHold) {
+  DaemonProcess daemon;
+  Session session = connect(daemon);
+  {
+    Writer<Counted> writer = session.create<Counted>("kept", History{16, 1ms}).value();
+    writer.write(counted(0));
+    ASSERT_TRUE(writer.set_property(std::vector<std::byte>(1000, std::byte{7})));
+  }
+  // Opened before the writer is closed in dssmd's order of requests, so it is there to be kept.
+  Reader<Counted> reader = session.open_reader<Counted>("kept").value();
+  daemon.kill_hard();
+  daemon.start();
+  auto writer = session.open_writer<Counted>("kept");
+  ASSERT_TRUE(writer) << writer.error().message;
+  EXPECT_EQ(writer->write(counted(1)), 1);
+  EXPECT_EQ(reader.newest(), 1);
+  EXPECT_EQ(session.property({"kept", 0, ""}).value(), std::vector<std::byte>(1000, std::byte{7}));
+}
+
+// The name is kept free for the ring that a living process is about to offer back.
+TEST(Restart, DoesNotLetAnEagerWriterReplaceAHeldRing) {
+  DaemonProcess daemon;
+  Session holding = connect(daemon);
+  Writer<Counted> writer = holding.create<Counted>("held", History{16, 1ms}).value();
+  for (int round = 0; round < 5; ++round) {
+    daemon.kill_hard();
+    daemon.start();
+    Session eager = connect(daemon);  // usually there before the holder is back
+    auto again = eager.create<Counted>("held", History{16, 1ms});
+    ASSERT_TRUE(again) << again.error().message;
+    EXPECT_EQ(again->incarnation(), writer.incarnation());
+  }
+}
+
+TEST(Restart, ForgetsStreamsThatNobodyHolds) {
+  DaemonProcess daemon;
+  Session session = connect(daemon);
+  session.create<Counted>("gone", History{16, 1ms}).value();
+  ASSERT_EQ(session.list().value().size(), 1u);
+  daemon.kill_hard();
+  daemon.start();
+  EXPECT_EQ(session.list().value().size(), 0u);
+}
+
+TEST(Restart, KeepsThePlaybackClock) {
+  DaemonProcess daemon;
+  Session session = connect(daemon);
+  PlaybackClock clock = session.playback_clock().value();
+  clock.set_paused(true);
+  clock.set_time(1234);
+  daemon.kill_hard();
+  daemon.start();
+  ASSERT_TRUE(session.list());  // back, and what it held offered
+  EXPECT_EQ(connect(daemon).playback_clock().value().now_s(), 1234);
+}
+
+TEST(Restart, TellsWatchersWhatIsGone) {
+  DaemonProcess daemon;
+  Session session = connect(daemon), other = connect(daemon);
+  std::mutex mutex;
+  std::condition_variable changed;
+  std::vector<std::string> seen;
+  auto watch = session.watch([&](const StreamEvent& event) {
+    const std::lock_guard guard(mutex);
+    seen.push_back((event.kind == StreamEvent::Kind::added ? "+" : "-") + event.stream.id.name);
+    changed.notify_all();
+  });
+  ASSERT_TRUE(watch);
+  auto kept = session.create<Counted>("kept", History{16, 1ms}).value();
+  other.create<Counted>("gone", History{16, 1ms}).value();
+  std::unique_lock lock(mutex);
+  changed.wait(lock, [&] { return seen.size() == 2; });
+  lock.unlock();
+  daemon.kill_hard();
+  daemon.start();
+  lock.lock();
+  changed.wait(lock, [&] { return seen.size() == 3; });
+  EXPECT_EQ(seen, (std::vector<std::string>{"+kept", "+gone", "-gone"}));
+}
+
+TEST(Restart, FailsRequestsInWordsWhileTheDaemonIsAway) {
+  DaemonProcess daemon;
+  Session session =
+      Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 50ms}).value();
+  Writer<Counted> writer = session.create<Counted>("s", History{16, 1ms}).value();
+  daemon.kill_hard();
+  const auto list = session.list();
+  ASSERT_FALSE(list);
+  EXPECT_EQ(list.error().code, Errc::daemon_away);
+  EXPECT_NE(list.error().message.find("list the streams"), std::string::npos);
+  EXPECT_EQ(writer.write(counted(0)), 0) << "writing needs no daemon";
+}
+
+// Clients die at any moment; a second later dssmd has nothing left of them.
+TEST(Restart, DaemonKeepsNothingOfClientsThatWereKilled) {
+  DaemonProcess daemon;
+  Session session = connect(daemon);
+  for (int round = 0; round < 50; ++round) {
+    int started[2];
+    ASSERT_EQ(::pipe(started), 0);
+    const pid_t child = ::fork();
+    if (child == 0) {
+      ::prctl(PR_SET_PDEATHSIG, SIGKILL);
+      Session mine = connect(daemon);
+      for (int i = 0;; ++i) {
+        auto writer =
+            mine.create<Counted>("victim:" + std::to_string(i % 3), History{16, 1ms}).value();
+        writer.write(counted(i));
+        auto reader = mine.open_reader<Counted>("victim:" + std::to_string(i % 3)).value();
+        if (i == round % 7) (void)!::write(started[1], "x", 1);
+      }
+    }
+    char byte = 0;
+    ASSERT_EQ(::read(started[0], &byte, 1), 1);
+    ::kill(child, SIGKILL);
+    ::waitpid(child, nullptr, 0);
+    ::close(started[0]), ::close(started[1]);
+  }
+  // Its sockets are closed by the kernel before its death is reported; dssmd has them on its loop.
+  while (session.clients().value().size() != 1) std::this_thread::yield();
+  EXPECT_EQ(session.opens().value().size(), 0u);
+  for (const StreamInfo& stream : session.list().value()) {
+    auto writer = session.open_writer<Counted>(stream.id.str());
+    ASSERT_TRUE(writer) << writer.error().message;
+    EXPECT_EQ(writer->write(counted(0)), stream.newest + 1) << "and its lock is free";
+  }
+}
+
+}  // namespace
+}  // namespace dssm
