@@ -1,0 +1,63 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The programs of docs/tutorial.md, built from its very text, talk to each other.
+#include <fcntl.h>
+#include <gtest/gtest.h>
+#include <signal.h>
+#include <unistd.h>
+
+#include <cstdio>
+#include <cstdlib>
+#include <regex>
+#include <string>
+#include <vector>
+
+#include "tests/support/daemon_process.hpp"
+
+namespace {
+
+std::string program(const std::string& name) {
+  return dssm::test::built("tests/process/vehicle/tutorial_" + name);
+}
+
+// Starts both, the reader first, and gives the first lines that the reader prints; none when it
+// ends early.
+std::vector<std::string> lines_read(const std::string& reader, const std::string& writer) {
+  constexpr std::size_t kEnough = 4;
+  const dssm::test::DaemonProcess daemon;
+  // A terminal of the test's own: into a pipe the reader would write only when a buffer is full.
+  const int terminal = ::posix_openpt(O_RDWR | O_NOCTTY | O_CLOEXEC);
+  EXPECT_EQ(::grantpt(terminal), 0);
+  EXPECT_EQ(::unlockpt(terminal), 0);
+  const int its_end = ::open(::ptsname(terminal), O_RDWR | O_NOCTTY | O_CLOEXEC);
+  const pid_t reading = dssm::test::start({program(reader)}, {daemon.environment()}, its_end);
+  ::close(its_end);
+  const pid_t writing = dssm::test::start({program(writer)}, {daemon.environment()});
+  std::vector<std::string> lines;
+  std::FILE* output = ::fdopen(terminal, "r");
+  char line[256];
+  while (lines.size() < kEnough && std::fgets(line, sizeof line, output)) lines.push_back(line);
+  std::fclose(output);
+  for (const pid_t pid : {reading, writing}) {
+    ::kill(pid, SIGTERM);
+    dssm::test::wait_for(pid);
+  }
+  return lines;
+}
+
+class Tutorial : public testing::TestWithParam<std::pair<const char*, const char*>> {};
+
+TEST_P(Tutorial, ProgramsShareTheStreamWhicheverApiTheyUse) {
+  const std::vector<std::string> lines = lines_read(GetParam().first, GetParam().second);
+  ASSERT_EQ(lines.size(), 4u);
+  const std::regex expected(R"(\d+: (19|20|21)\.\d\d degrees, [+-]0\.\d\d in a second\r\n)");
+  for (const std::string& line : lines) EXPECT_TRUE(std::regex_match(line, expected)) << line;
+}
+
+INSTANTIATE_TEST_SUITE_P(AllPairs, Tutorial,
+                         testing::Values(std::pair{"reader", "writer"},
+                                         std::pair{"ssm_reader", "ssm_writer"},
+                                         std::pair{"reader", "ssm_writer"},
+                                         std::pair{"ssm_reader", "writer"}));
+
+}  // namespace
