@@ -337,7 +337,7 @@ TEST(LocalService, ListsProgramsInTheOrderTheyCame) {
 }
 
 TEST(LocalService, LeavesOutFieldsWhenAListGetsTooLongForAFrame) {
-  Daemon daemon;
+  Daemon daemon(false, {.max_opens = 1000, .max_opens_per_client = 1000});
   FakeClient client(daemon.service, 5);
   client.greet();
   constexpr int kStreams = 300;  // with 60 KB of field names each: 18 MB
@@ -345,7 +345,8 @@ TEST(LocalService, LeavesOutFieldsWhenAListGetsTooLongForAFrame) {
     local::Request request = create_request("s");
     request.mutable_create()->mutable_id()->set_id(i);
     request.mutable_create()->mutable_type()->mutable_fields(0)->set_name(std::string(60'000, 'f'));
-    ASSERT_TRUE(client.ask(request).has_opened());
+    const local::Response created = client.ask(request);
+    ASSERT_TRUE(created.has_opened()) << created.failure().message();
   }
   const local::Response list = client.ask(list_request());  // fails on a frame that is too long
   ASSERT_EQ(list.stream_list().streams_size(), kStreams);

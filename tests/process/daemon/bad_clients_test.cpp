@@ -1,0 +1,255 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Programs that break the rules: each is told why where that is possible, loses its connection, and
+// nobody else notices.
+#include <fcntl.h>
+#include <gtest/gtest.h>
+#include <sys/socket.h>
+#include <unistd.h>
+
+#include <random>
+
+#include "core/wire/fd_socket.hpp"
+#include "tests/process/daemon/raw_client.hpp"
+
+namespace dssm::test {
+namespace {
+
+class BadClient : public testing::Test {
+ protected:
+  // Every test ends with a good client that is still served, and a dssmd without leftovers.
+  void TearDown() override {
+    EXPECT_TRUE(good_.ask(list_request()).response.has_stream_list());
+    EXPECT_TRUE(eventually([&] { return open_descriptors(daemon_.pid()) == descriptors_; }))
+        << "dssmd keeps descriptors of a client that is gone";
+  }
+
+  // Reads until the end; gives the last failure.
+  static std::string last_words(RawClient& client) {
+    std::string words;
+    for (;;) {
+      const Answer answer = client.receive();
+      if (answer.ended) return words;
+      if (answer.response.has_failure()) {
+        EXPECT_EQ(answer.response.failure().code(), "protocol");
+        words = answer.response.failure().message();
+      }
+    }
+  }
+
+  DaemonProcess daemon_{{"--log-level", "error"}};
+  RawClient good_{daemon_.socket_path()};
+  int descriptors_ = open_descriptors(daemon_.pid());
+};
+
+TEST_F(BadClient, ThatSendsGarbageIsToldSo) {
+  RawClient http(daemon_.socket_path(), false);
+  http.send_bytes("\x05HELLO");
+  EXPECT_NE(last_words(http).find("no request of DSSM's local protocol"), std::string::npos);
+  RawClient endless(daemon_.socket_path(), false);
+  endless.send_bytes(std::string(64, '\xff'));
+  EXPECT_NE(last_words(endless).find("no varint-delimited frame"), std::string::npos);
+}
+
+TEST_F(BadClient, ThatSendsRandomBytesCostsOnlyItself) {
+  const auto seed = std::random_device()();
+  SCOPED_TRACE("seed " + std::to_string(seed));
+  std::mt19937 random(seed);
+  for (int round = 0; round < 300; ++round) {
+    RawClient client(daemon_.socket_path(), round % 2 == 0);
+    std::string bytes(1 + random() % 5000, '\0');
+    for (char& c : bytes) c = static_cast<char>(random());
+    client.send_bytes(bytes);
+    ::shutdown(client.fd(), SHUT_WR);
+    while (!client.receive().ended) {
+    }
+  }
+}
+
+TEST_F(BadClient, ThatComesFromTheFutureIsToldBothVersions) {
+  RawClient client(daemon_.socket_path(), false);
+  local::Request hello;
+  hello.mutable_hello()->set_protocol_version(1000);
+  client.send(hello);
+  const std::string words = last_words(client);
+  EXPECT_NE(words.find("version 1000"), std::string::npos) << words;
+  EXPECT_NE(words.find("version 1 "), std::string::npos) << words;
+}
+
+TEST_F(BadClient, ThatAnnouncesAnEndlessFrameIsRefusedBeforeItSendsOne) {
+  RawClient client(daemon_.socket_path());
+  client.send_bytes(std::string("\xff\xff\xff\xff\x0f", 5));  // 2^32 - 1 bytes
+  EXPECT_NE(last_words(client).find("4294967295 bytes"), std::string::npos);
+}
+
+TEST_F(BadClient, ThatAsksBeforeHelloIsToldTheOrder) {
+  RawClient client(daemon_.socket_path(), false);
+  client.send(list_request());
+  EXPECT_NE(last_words(client).find("Hello"), std::string::npos);
+}
+
+TEST_F(BadClient, ThatAsksForSomethingUnknownIsAnsweredAndServedOn) {
+  RawClient client(daemon_.socket_path());
+  EXPECT_EQ(client.ask({}).response.failure().code(), "protocol");
+  EXPECT_TRUE(client.ask(list_request()).response.has_stream_list());
+  client.close();
+}
+
+TEST_F(BadClient, ThatSendsTooManyDescriptorsAtOnceIsRefused) {
+  RawClient client(daemon_.socket_path());
+  const int null = ::open("/dev/null", O_RDWR | O_CLOEXEC);
+  // By hand: our own send_some() would not.
+  const std::vector<int> flood(200, null);
+  std::vector<std::byte> control(CMSG_SPACE(flood.size() * sizeof(int)));
+  char byte = 1;
+  iovec part{&byte, 1};
+  msghdr message{};
+  message.msg_iov = &part;
+  message.msg_iovlen = 1;
+  message.msg_control = control.data();
+  message.msg_controllen = control.size();
+  cmsghdr* header = CMSG_FIRSTHDR(&message);
+  header->cmsg_level = SOL_SOCKET;
+  header->cmsg_type = SCM_RIGHTS;
+  header->cmsg_len = CMSG_LEN(flood.size() * sizeof(int));
+  std::memcpy(CMSG_DATA(header), flood.data(), flood.size() * sizeof(int));
+  ASSERT_EQ(::sendmsg(client.fd(), &message, MSG_NOSIGNAL), 1);
+  EXPECT_NE(last_words(client).find("descriptors"), std::string::npos);
+  ::close(null);
+}
+
+TEST_F(BadClient, ThatKeepsSendingDescriptorsNobodyAskedForIsRefused) {
+  RawClient client(daemon_.socket_path());
+  const int null = ::open("/dev/null", O_RDWR | O_CLOEXEC);
+  const std::vector<int> some(16, null);
+  for (int i = 0; i < 5; ++i) client.send(list_request(), some);
+  EXPECT_NE(last_words(client).find("descriptors"), std::string::npos);
+  ::close(null);
+}
+
+TEST_F(BadClient, ThatDoesNotReadIsClosedAtTheLimit) {
+  // Each answer has 8 MiB, so that some 8 of them reach the limit.
+  local::Request set, get;
+  set.mutable_set_property()->mutable_id()->set_name("large");
+  set.mutable_set_property()->set_property(std::string(8 << 20, 'p'));
+  get.mutable_get_property()->mutable_id()->set_name("large");
+  {
+    RawClient owner(daemon_.socket_path());
+    ASSERT_TRUE(owner.ask(create_request("large")).response.has_opened());
+    ASSERT_TRUE(owner.ask(set).response.has_done());
+  }
+  RawClient silent(daemon_.socket_path());
+  for (int i = 0; i < 12; ++i) silent.send(get);
+  EXPECT_TRUE(eventually([&] {
+    return good_.ask(list_clients_request()).response.client_list().clients_size() == 1;
+  })) << "the client that does not read is still there";
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("large");
+  EXPECT_TRUE(good_.ask(remove).response.has_done());
+}
+
+TEST_F(BadClient, ThatAsksWithoutPauseDoesNotKeepOthersWaiting) {
+  RawClient busy(daemon_.socket_path());
+  std::string many;
+  local::Request list = list_request();
+  for (std::uint64_t serial = 100; serial < 20'100; ++serial) {
+    list.set_serial(serial);
+    many += wire::encode_frame(list);
+  }
+  ::fcntl(busy.fd(), F_SETFL, O_NONBLOCK);
+  static_cast<void>(wire::send_some(busy.fd(), std::as_bytes(std::span(many)), {}));
+  for (int i = 0; i < 20; ++i) {
+    EXPECT_TRUE(good_.ask(list_request()).response.has_stream_list());
+  }
+  busy.close();
+}
+
+TEST_F(BadClient, ThatStopsInTheMiddleOfAFrameIsNotMissed) {
+  {
+    RawClient client(daemon_.socket_path());
+    local::Request request = create_request("half");
+    request.set_serial(5);
+    const std::string frame = wire::encode_frame(request);
+    for (std::size_t part = 1; part < frame.size(); ++part) {
+      RawClient other(daemon_.socket_path());
+      other.send_bytes(std::string_view(frame).substr(0, part));
+    }
+    client.send_bytes(std::string_view(frame).substr(0, frame.size() / 2));
+  }
+  EXPECT_EQ(good_.ask(list_request()).response.stream_list().streams_size(), 0);
+}
+
+TEST(Limits, OnClientsIsNamedToTheOneThatIsTooMany) {
+  DaemonProcess daemon({"--max-clients", "2", "--log-level", "error"});
+  RawClient one(daemon.socket_path()), two(daemon.socket_path());
+  {
+    RawClient three(daemon.socket_path(), false);
+    const Answer refused = three.receive();
+    EXPECT_EQ(refused.response.failure().code(), "limit_exceeded");
+    EXPECT_NE(refused.response.failure().message().find("max_clients = 2"), std::string::npos);
+    EXPECT_TRUE(three.receive().ended);
+  }
+  two.close();
+  EXPECT_TRUE(eventually(
+      [&] { return one.ask(list_clients_request()).response.client_list().clients_size() == 1; }));
+  RawClient again(daemon.socket_path());
+  EXPECT_TRUE(again.ask(list_request()).response.has_stream_list());
+}
+
+TEST(Limits, OnStreamsMemoryOpensAndPropertiesNameTheirKeys) {
+  DaemonProcess daemon({"--max-streams", "2", "--max-memory", "1 MiB", "--max-opens", "3",
+                        "--max-opens-per-client", "2", "--max-property", "10"});
+  RawClient client(daemon.socket_path()), other(daemon.socket_path());
+  const auto refusal = [](RawClient& by, local::Request request) {
+    const local::Response response = by.ask(std::move(request)).response;
+    EXPECT_EQ(response.failure().code(), "limit_exceeded");
+    return response.failure().message();
+  };
+  EXPECT_NE(refusal(client, create_request("x", 100'000)).find("max_memory = 1048576"),
+            std::string::npos);
+  EXPECT_TRUE(client.ask(create_request("a")).response.opened().created());
+  local::Request property;
+  property.mutable_set_property()->mutable_id()->set_name("a");
+  property.mutable_set_property()->set_property("eleven byte");
+  EXPECT_NE(refusal(client, property).find("max_property = 10"), std::string::npos);
+  EXPECT_TRUE(client.ask(create_request("b")).response.opened().created());
+  EXPECT_NE(refusal(client, open_request("a")).find("max_opens_per_client = 2"), std::string::npos);
+  EXPECT_NE(refusal(other, create_request("c")).find("max_streams = 2"), std::string::npos);
+  EXPECT_TRUE(other.ask(open_request("a")).response.has_opened());
+  EXPECT_NE(refusal(other, open_request("a")).find("max_opens = 3"), std::string::npos);
+}
+
+TEST(Limits, OnDescriptorsRefuseProgramsWithoutASpinningDssmd) {
+  // A dssmd with few descriptors, through the shell that sets its limit.
+  const std::string dir = make_temp_dir();
+  const pid_t pid = start({"/bin/sh", "-c",
+                           "ulimit -n 24; exec " + built("daemon/dssmd") + " --name pc1 " +
+                               "--log-level error --runtime-dir " + dir});
+  const std::string path = dir + "/dssmd.sock";
+  ASSERT_TRUE(eventually([&] { return wire::connect_unix(path).has_value(); }));
+  {
+    std::vector<RawClient> clients;
+    bool refused = false;
+    for (int i = 0; i < 40 && !refused; ++i) {
+      clients.emplace_back(path, false);
+      local::Request hello;
+      hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
+      clients.back().send(hello);
+      const Answer answer = clients.back().receive();
+      refused = answer.ended || answer.response.has_failure();
+      if (answer.response.has_failure()) {
+        EXPECT_NE(answer.response.failure().message().find("LimitNOFILE"), std::string::npos);
+      }
+    }
+    EXPECT_TRUE(refused);
+    // Those who are in are served on, and a stream that needs descriptors is refused with a reason.
+    EXPECT_TRUE(clients.front().ask(list_request()).response.has_stream_list());
+    EXPECT_TRUE(clients.front().ask(create_request("a")).response.has_failure());
+  }
+  ::kill(pid, SIGTERM);
+  EXPECT_EQ(wait_for(pid), 0);
+  remove_tree(dir);
+}
+
+}  // namespace
+}  // namespace dssm::test
