@@ -77,7 +77,7 @@ Result<void> run_rm(const Options& options, Output& out) {
       removed.push_back(id.str());
     } else {
       Error error = with_similar_names(std::move(result).error(), *session, id);
-      if (failure) error.message.insert(0, failure->message + "\ndssmctl: rm: ");
+      if (failure) error.message.insert(0, failure->message + "; and ");
       failure = std::move(error);
     }
   }

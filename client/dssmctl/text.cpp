@@ -86,7 +86,7 @@ std::string escaped(std::string_view bytes) {
 std::string escaped_message(std::string_view message) {
   std::string out;
   for (const char c : message) {
-    if (printable(c) || c == '\n') {
+    if (printable(c)) {
       out += c;
     } else {
       add_escaped(out, c);

@@ -19,7 +19,7 @@ namespace dssm::ctl {
 // back in $'...'.
 std::string escaped(std::string_view bytes);
 
-// The same for a whole sentence: newlines and backslashes stay.
+// The same for a message that is to be one line; backslashes stay, it may have been escaped before.
 std::string escaped_message(std::string_view message);
 
 // A duration with three digits and its unit: "1.25 ms", "2h05m". For people only.

@@ -19,8 +19,8 @@ TEST(Text, EscapesControlAndForeignBytesAsBashReadsThem) {
   EXPECT_EQ(escaped("a\\b"), "a\\\\b");
 }
 
-TEST(Text, EscapesMessagesButKeepsTheirLinesAndBackslashes) {
-  EXPECT_EQ(escaped_message("one\ntwo \\ \x1b"), "one\ntwo \\ \\x1b");
+TEST(Text, EscapesMessagesIntoOneLineButKeepsTheirBackslashes) {
+  EXPECT_EQ(escaped_message("one\ntwo \\ \x1b"), "one\\ntwo \\ \\x1b");
 }
 
 TEST(Text, WritesDurationsWithThreeDigitsAndAUnit) {

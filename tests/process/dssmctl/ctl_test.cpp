@@ -1,0 +1,116 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "tests/process/dssmctl/ctl_test.hpp"
+
+#include <fcntl.h>
+#include <signal.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <sstream>
+
+namespace dssm::test {
+
+Running::Running(std::vector<std::string> argv, const std::vector<std::string>& environment) {
+  int ends[2];
+  if (::pipe2(ends, O_CLOEXEC)) std::abort();
+  // The shell is replaced by the program at once, so its pid is the program's.
+  argv.insert(argv.begin(), {"/bin/sh", "-c", "exec \"$@\" 2>&1", "sh"});
+  pid_ = start(argv, environment, ends[1]);
+  ::close(ends[1]);
+  fd_ = ends[0];
+}
+
+Running::~Running() {
+  if (pid_ > 0) {
+    ::kill(pid_, SIGKILL);
+    wait_for(pid_);
+  }
+  close_output();
+}
+
+bool Running::take_line(std::string& line) {
+  const std::size_t end = text_.find('\n');
+  if (end == std::string::npos) return false;
+  line = text_.substr(0, end);
+  text_.erase(0, end + 1);
+  return true;
+}
+
+void Running::read_some(int timeout_ms) {
+  pollfd fd{fd_, POLLIN, 0};
+  if (::poll(&fd, 1, timeout_ms) <= 0) return;
+  char buffer[65536];
+  const ssize_t got = ::read(fd_, buffer, sizeof buffer);
+  if (got > 0) {
+    text_.append(buffer, static_cast<std::size_t>(got));
+  } else {
+    ended_ = true;
+  }
+}
+
+std::string Running::line() {
+  std::string line;
+  while (!take_line(line)) {
+    if (ended_) return {};
+    read_some(-1);
+  }
+  return line;
+}
+
+std::string Running::rest() {
+  while (!ended_) read_some(-1);
+  return std::exchange(text_, {});
+}
+
+void Running::close_output() {
+  if (fd_ >= 0) ::close(std::exchange(fd_, -1));
+}
+
+void Running::signal(int number) { ::kill(pid_, number); }
+
+void Running::stop() {
+  signal(SIGSTOP);
+  int status = 0;
+  ASSERT_EQ(::waitpid(pid_, &status, WUNTRACED), pid_);
+  ASSERT_TRUE(WIFSTOPPED(status));
+}
+
+int Running::status() { return wait_for(std::exchange(pid_, -1)); }
+
+std::vector<std::string> CtlTest::argv(std::vector<std::string> words) const {
+  words.insert(words.begin(), dssmctl_path());
+  return words;
+}
+
+Finished CtlTest::ctl(std::vector<std::string> words, const std::string& input) {
+  return run(argv(std::move(words)), environment(), input);
+}
+
+std::string CtlTest::output(std::vector<std::string> words) {
+  const Finished finished = ctl(std::move(words));
+  EXPECT_EQ(finished.exit_status, 0) << finished.err;
+  EXPECT_EQ(finished.err, "");
+  return finished.out;
+}
+
+Json CtlTest::json(std::vector<std::string> words) {
+  words.push_back("--json");
+  const std::string text = output(std::move(words));
+  Json parsed = Json::parse(text, nullptr, false);
+  EXPECT_FALSE(parsed.is_discarded()) << text;
+  return parsed;
+}
+
+std::vector<std::string> lines_of(const std::string& text) {
+  std::vector<std::string> lines;
+  std::istringstream stream(text);
+  for (std::string line; std::getline(stream, line);) lines.push_back(line);
+  return lines;
+}
+
+std::vector<std::string> words_of(const std::string& line) {
+  std::istringstream stream(line);
+  return {std::istream_iterator<std::string>(stream), {}};
+}
+
+}  // namespace dssm::test

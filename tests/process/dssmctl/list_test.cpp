@@ -1,0 +1,182 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmctl ls and info.
+#include <fcntl.h>
+#include <stdlib.h>
+#include <termios.h>
+#include <unistd.h>
+
+#include <array>
+
+#include "tests/process/dssmctl/ctl_test.hpp"
+
+namespace dssm::test {
+namespace {
+
+struct Pose {
+  double x;
+  float v[2];
+};
+DSSM_DESCRIBE(Pose, x, v)
+
+using Ls = CtlTest;
+using Info = CtlTest;
+using Strings = std::vector<std::string>;
+
+TEST_F(Ls, ShowsOnlyTheHeaderWithoutStreams) {
+  EXPECT_EQ(output({"ls"}), "NAME  ID  SIZE  DEPTH  CYCLE  RATE  AGE  WRITERS  READERS  TYPE\n");
+  EXPECT_EQ(output({"ls", "--names"}), "");
+  EXPECT_EQ(json({"ls"}), Json::parse(R"({"streams":[]})"));
+}
+
+TEST_F(Ls, ShowsWhatIsKnownOfEachStreamInAlignedColumns) {
+  auto pose = session_.create<Pose>("pose:3", depth_of(8)).value();
+  auto empty =
+      session_.create<std::array<std::byte, 100>>("a_rather_long_name", depth_of(4)).value();
+  auto reader = session_.open_reader<Pose>("pose:3").value();
+  for (int i = 0; i < 5; ++i) pose.write({}, at_ns(1'000'000'000 + i * 20'000'000));
+
+  const Strings lines = lines_of(output({"ls"}));
+  ASSERT_EQ(lines.size(), 3U);
+  const Strings row = words_of(lines[1]);
+  ASSERT_GE(row.size(), 12U);
+  EXPECT_EQ(Strings(row.begin(), row.begin() + 8),
+            (Strings{"pose", "3", "16", "8", "10.0", "ms", "50.0", "Hz"}));
+  EXPECT_EQ(Strings(row.end() - 3, row.end()), (Strings{"1", "1", "Pose"}));
+  const Strings other = words_of(lines[2]);
+  EXPECT_EQ(Strings(other.begin(), other.begin() + 10),
+            (Strings{"a_rather_long_name", "0", "100", "4", "10.0", "ms", "-", "-", "1", "0"}));
+  // Numbers end where their column's title ends, texts begin where it begins.
+  const std::size_t size_end = lines[0].find("SIZE") + 4;
+  EXPECT_EQ(lines[1].substr(size_end - 2, 2), "16");
+  EXPECT_EQ(lines[2].substr(size_end - 3, 3), "100");
+  EXPECT_EQ(lines[1].find("Pose"), lines[0].find("TYPE"));
+}
+
+TEST_F(Ls, TellsProgramsTheSameWithUnits) {
+  auto pose = session_.create<Pose>("pose:3", depth_of(8)).value();
+  const Time last = WallClock::now();
+  for (int i = 4; i >= 0; --i) pose.write({}, last - i * std::chrono::milliseconds(20));
+  auto raw = session_.create_raw({"raw", 0, ""}, {"", 7, 1, {}}, depth_of(4)).value();
+
+  const Time before = WallClock::now();
+  const Json streams = json({"ls"})["streams"];
+  ASSERT_EQ(streams.size(), 2U);
+  const Json& stream = streams[0];
+  EXPECT_EQ(stream["stream"], "pose:3@pc1");
+  EXPECT_EQ(stream["name"], "pose");
+  EXPECT_EQ(stream["id"], 3);
+  EXPECT_EQ(stream["host"], "pc1");
+  EXPECT_EQ(stream["type"], "Pose");
+  EXPECT_EQ(stream["payload_bytes"], 16);
+  EXPECT_EQ(stream["depth"], 8);
+  EXPECT_EQ(stream["cycle_ns"], 10'000'000);
+  EXPECT_DOUBLE_EQ(stream["rate_hz"].get<double>(), 50);
+  EXPECT_EQ(stream["newest_tid"], 4);
+  EXPECT_EQ(stream["oldest_tid"], 0);
+  EXPECT_EQ(stream["newest_time_ns"], to_ns(last));
+  EXPECT_GE(stream["age_ns"].get<std::int64_t>(), to_ns(before - last));
+  EXPECT_LE(stream["age_ns"].get<std::int64_t>(), to_ns(WallClock::now() - last));
+  EXPECT_EQ(stream["writers"], 1);
+  EXPECT_EQ(stream["readers"], 0);
+  EXPECT_EQ(stream["incarnation"], pose.incarnation());
+  EXPECT_EQ(stream["creator_pid"], ::getpid());
+  const Json& empty = streams[1];
+  for (const char* key :
+       {"type", "rate_hz", "age_ns", "newest_tid", "oldest_tid", "newest_time_ns"}) {
+    EXPECT_TRUE(empty[key].is_null()) << key;
+  }
+}
+
+TEST_F(Ls, SortsByWhatIsAskedAndByCreationOtherwise) {
+  auto b = session_.create_raw({"b", 0, ""}, {"T2", 30, 1, {}}, depth_of(4)).value();
+  auto a = session_.create_raw({"a", 1, ""}, {"T3", 10, 1, {}}, depth_of(8)).value();
+  auto c = session_.create_raw({"c", 2, ""}, {"T1", 20, 1, {}}, depth_of(2)).value();
+  const std::vector<std::byte> payload(10);
+  a.write(payload, at_ns(1));
+  c.write(std::vector<std::byte>(20), at_ns(2));
+  EXPECT_EQ(output({"ls", "--names"}), "b\na:1\nc:2\n");
+  EXPECT_EQ(output({"ls", "--names", "--sort", "name"}), "a:1\nb\nc:2\n");
+  EXPECT_EQ(output({"ls", "--names", "--sort", "id", "-r"}), "c:2\na:1\nb\n");
+  EXPECT_EQ(output({"ls", "--names", "--sort", "size"}), "a:1\nc:2\nb\n");
+  EXPECT_EQ(output({"ls", "--names", "--sort", "depth"}), "c:2\nb\na:1\n");
+  EXPECT_EQ(output({"ls", "--names", "--sort", "type"}), "c:2\nb\na:1\n");
+  EXPECT_EQ(output({"ls", "--names", "--sort", "age"}), "c:2\na:1\nb\n");
+}
+
+TEST_F(Ls, ShowsForeignNamesEscapedAndGivesThemToProgramsAsTheyAre) {
+  auto writer = session_.create<double>("caf\xc3\xa9", depth_of(4)).value();
+  EXPECT_EQ(words_of(lines_of(output({"ls"}))[1])[0], "caf\\xc3\\xa9");
+  EXPECT_EQ(output({"ls", "--names"}), "caf\xc3\xa9\n");
+  EXPECT_EQ(json({"ls"})["streams"][0]["name"], "caf\xc3\xa9");
+}
+
+// What a program prints when its standard output is a terminal.
+std::string on_terminal(const Strings& argv, const Strings& environment) {
+  const int master = ::posix_openpt(O_RDWR | O_NOCTTY | O_CLOEXEC);
+  EXPECT_EQ(::grantpt(master), 0);
+  EXPECT_EQ(::unlockpt(master), 0);
+  const int slave = ::open(::ptsname(master), O_RDWR | O_NOCTTY | O_CLOEXEC);
+  termios raw{};
+  ::tcgetattr(slave, &raw);
+  ::cfmakeraw(&raw);
+  ::tcsetattr(slave, TCSANOW, &raw);
+  const pid_t pid = start(argv, environment, slave);
+  EXPECT_EQ(wait_for(pid), 0);  // a terminal keeps 4 KiB for us: more than is printed here
+  ::close(slave);
+  std::string text(4096, '\0');
+  const ssize_t got = ::read(master, text.data(), text.size());
+  ::close(master);
+  text.resize(got > 0 ? static_cast<std::size_t>(got) : 0);
+  return text;
+}
+
+TEST_F(Ls, PrintsABoldHeaderOnATerminalUnlessNoColorIsSet) {
+  EXPECT_TRUE(
+      on_terminal(argv({"ls"}), {daemon_.environment(), "NO_COLOR="}).starts_with("\x1b[1mNAME"));
+  EXPECT_TRUE(on_terminal(argv({"ls"}), {daemon_.environment(), "NO_COLOR=1"}).starts_with("NAME"));
+}
+
+TEST_F(Ls, SendsNoForeignBytesToATerminal) {
+  auto writer = session_.create<double>("caf\xc3\xa9", depth_of(4)).value();
+  EXPECT_EQ(on_terminal(argv({"ls", "--names"}), environment()), "caf\\xc3\\xa9\n");
+}
+
+TEST_F(Info, ShowsFieldsUsersAndSamples) {
+  auto pose = session_.create<Pose>("pose", depth_of(8)).value();
+  auto reader = session_.open_reader<Pose>("pose").value();
+  pose.write({}, at_ns(1'500'000'000));
+  ASSERT_TRUE(pose.set_property_as(1.5));
+  const std::string text = output({"info", "pose"});
+  for (const char* part :
+       {"pose:0@pc1\n", "'Pose' (16 bytes, aligned to 8)", "8 slots", "tid 0 to 0", "1.500000000",
+        "8 bytes", "float64", "float32", "the test", "writer"}) {
+    EXPECT_NE(text.find(part), std::string::npos) << part << " in\n" << text;
+  }
+
+  const Json info = json({"info", "pose"});
+  EXPECT_EQ(info["fields"], Json::parse(R"([
+      {"name":"x","kind":"float64","offset_bytes":0,"count":1,"stride_bytes":8},
+      {"name":"v","kind":"float32","offset_bytes":8,"count":2,"stride_bytes":4}])"));
+  EXPECT_EQ(info["alignment_bytes"], 8);
+  EXPECT_EQ(info["property_bytes"], 8);
+  EXPECT_GT(info["memory_bytes"], 8 * 64);
+  EXPECT_EQ(info["incarnation"], pose.incarnation());
+  ASSERT_EQ(info["users"].size(), 2U);
+  EXPECT_EQ(info["users"][0]["role"], "writer");
+  EXPECT_EQ(info["users"][1]["role"], "reader");
+  EXPECT_EQ(info["users"][0]["pid"], ::getpid());
+  EXPECT_EQ(info["users"][0]["program"], "the test");
+}
+
+TEST_F(Info, TellsAboutTheDaemonWithoutAStream) {
+  auto pose = session_.create<Pose>("pose", depth_of(8)).value();
+  const Json info = json({"info"});
+  EXPECT_EQ(info["host"], "pc1");
+  EXPECT_EQ(info["pid"], daemon_.pid());
+  EXPECT_EQ(info["streams"], 1);
+  EXPECT_NE(output({"info"}).find("pc1"), std::string::npos);
+}
+
+}  // namespace
+}  // namespace dssm::test

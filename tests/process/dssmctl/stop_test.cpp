@@ -1,0 +1,115 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// How the verbs that run without end come to one.
+#include <signal.h>
+
+#include "tests/process/dssmctl/ctl_test.hpp"
+
+namespace dssm::test {
+namespace {
+
+const char* const kEndlessVerbs[] = {"echo", "hz", "bw", "delay"};
+
+struct Stop : CtlTest {
+  Writer<double> writer_ = session_.create<double>("s", depth_of(16)).value();
+
+  // Waits until `readers` processes read the stream, dssmctl among them.
+  void await_readers(std::uint32_t readers) {
+    while (session_.info(writer_.id()).value().readers != readers) {
+    }
+  }
+};
+
+TEST_F(Stop, EndsWithSuccessOnASignalWhileNothingIsWritten) {
+  for (const char* verb : kEndlessVerbs) {
+    for (const int number : {SIGINT, SIGTERM}) {
+      Running running(argv({verb, "s", "--wait", "1"}), environment());
+      await_readers(1);
+      running.signal(number);
+      running.rest();
+      EXPECT_EQ(running.status(), 0) << verb;
+      await_readers(0);
+    }
+  }
+}
+
+TEST_F(Stop, EndsWithSuccessOnASignalWhileAwaitingAStream) {
+  Running running(argv({"echo", "never", "--wait", "1000"}), environment());
+  // Nobody sees from outside that it waits; connected is as near as it gets.
+  while (session_.clients().value().size() < 2) {
+  }
+  running.signal(SIGINT);
+  EXPECT_EQ(running.rest(), "");
+  EXPECT_EQ(running.status(), 0);
+}
+
+TEST_F(Stop, EndsQuietlyWhenItsReaderHasEnough) {
+  Running echo(argv({"echo", "s"}), environment());
+  EXPECT_TRUE(echo.line([&] { writer_.write(1); }).starts_with("tid: "));
+  echo.close_output();
+  for (int i = 0; i < 1000; ++i) writer_.write(1);
+  EXPECT_EQ(echo.status(), 0);
+}
+
+TEST_F(Stop, EndsQuietlyWhenItsReaderHasEnoughWhileNothingIsWritten) {
+  for (const char* verb : kEndlessVerbs) {
+    Running running(argv({verb, "s", "--wait", "1"}), environment());
+    await_readers(1);
+    running.close_output();
+    EXPECT_EQ(running.status(), 0) << verb;
+    await_readers(0);
+  }
+}
+
+TEST_F(Stop, ShowsTheLastSamplesOfARemovedStreamAndFails) {
+  Running echo(argv({"echo", "s", "--csv"}), environment());
+  echo.line();
+  echo.line([&] { writer_.write(1); });
+  const Tid last = writer_.write(2);
+  ASSERT_TRUE(session_.remove(writer_.id()));
+  const std::vector<std::string> lines = lines_of(echo.rest());
+  EXPECT_EQ(echo.status(), 1);
+  ASSERT_GE(lines.size(), 2U);
+  EXPECT_TRUE(lines[lines.size() - 2].starts_with(std::to_string(last) + ","))
+      << lines[lines.size() - 2];
+  EXPECT_TRUE(lines.back().starts_with("dssmctl: echo: ")) << lines.back();
+  EXPECT_NE(lines.back().find("'s:0@pc1': it was removed"), std::string::npos) << lines.back();
+}
+
+TEST_F(Stop, MeasuresOnceMoreWhenTheStreamIsRemoved) {
+  writer_.write(1, at_ns(0));
+  writer_.write(1, at_ns(10'000'000));
+  Running hz(argv({"hz", "s", "--interval", "1000"}), environment());
+  EXPECT_EQ(hz.line(), "average rate: 100.000 Hz");
+  hz.line();
+  ASSERT_TRUE(session_.remove(writer_.id()));
+  EXPECT_EQ(hz.line(), "--- s:0@pc1: 2 samples, 0 lost ---");
+  EXPECT_NE(hz.rest().find("it was removed"), std::string::npos);
+  EXPECT_EQ(hz.status(), 1);
+}
+
+TEST_F(Stop, GoesOnWhileTheDaemonIsAwayAndAfterItsReturn) {
+  Running echo(argv({"echo", "s", "--json"}), environment());
+  std::int64_t tid = Json::parse(echo.line([&] { writer_.write(1); }))["tid"];
+  const auto follow = [&] {
+    const Tid written = writer_.write(1);
+    while (tid < written) {
+      const Json line = Json::parse(echo.line(), nullptr, false);
+      ASSERT_TRUE(line.is_object()) << line;
+      EXPECT_EQ(line["tid"], tid + 1);
+      tid = line["tid"];
+    }
+  };
+  daemon_.kill_hard();
+  follow();
+  daemon_.start();
+  while (session_.info(writer_.id()).value().readers != 1) {
+  }
+  follow();
+  ASSERT_TRUE(session_.remove(writer_.id()));
+  EXPECT_NE(echo.rest().find("it was removed"), std::string::npos);
+  EXPECT_EQ(echo.status(), 1);
+}
+
+}  // namespace
+}  // namespace dssm::test
