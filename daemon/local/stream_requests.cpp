@@ -231,6 +231,9 @@ Result<Reply> StreamRequests::get_property(const local::GetProperty& request) {
   if (!property) {
     return std::move(property).error().context("stream '" + (*stream)->id().str() + "'");
   }
+  if (property->empty()) {
+    return Error{Errc::not_found, "stream '" + (*stream)->id().str() + "' has no property set"};
+  }
   Reply reply;
   reply.response.mutable_property()->set_property(*std::move(property));
   return reply;

@@ -42,7 +42,8 @@ class [[nodiscard]] Result {
   // The value; undefined without one (check first).
   T& operator*() & noexcept { return *std::get_if<0>(&state_); }
   const T& operator*() const& noexcept { return *std::get_if<0>(&state_); }
-  T&& operator*() && noexcept { return std::move(*std::get_if<0>(&state_)); }
+  // By value, where std::expected gives T&&: so `for (auto& x : *list())` does not dangle.
+  T operator*() && { return std::move(*std::get_if<0>(&state_)); }
   T* operator->() noexcept { return std::get_if<0>(&state_); }
   const T* operator->() const noexcept { return std::get_if<0>(&state_); }
 
@@ -54,7 +55,7 @@ class [[nodiscard]] Result {
   // The value, or throws BadResult with the error.
   T& value() & { return check(), **this; }
   const T& value() const& { return check(), **this; }
-  T&& value() && { return check(), std::move(**this); }
+  T value() && { return check(), *std::move(*this); }
 
  private:
   void check() const {

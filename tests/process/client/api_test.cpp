@@ -174,31 +174,30 @@ TEST_F(Api, NamesBothTypesWhenTheyDoNotMatch) {
 }
 
 TEST_F(Api, SaysInWordsWhatIsWrongWithARequest) {
-  const auto expect = [](const Error& error, Errc code, const char* words) {
-    EXPECT_EQ(error.code, code) << error.message;
-    EXPECT_NE(error.message.find(words), std::string::npos) << error.message;
+  const auto expect = [](const auto& result, Errc code, const char* words) {
+    ASSERT_FALSE(result) << "should have failed with: " << words;
+    EXPECT_EQ(result.error().code, code) << result.error().message;
+    EXPECT_NE(result.error().message.find(words), std::string::npos) << result.error().message;
   };
-  expect(session.open_reader<Odometry>("nothing").error(), Errc::not_found, "'nothing");
-  expect(session.create<Odometry>(std::string(32, 'x'), History{64, 1ms}).error(),
-         Errc::invalid_argument, "at most 31");
-  expect(session.create<Odometry>("a", 1s, 0s).error(), Errc::invalid_argument, "cycle of 0");
-  expect(session.create<Odometry>("a", 0s, 1s).error(), Errc::invalid_argument,
-         "shorter than the cycle");
-  expect(session.create<Odometry>("a", History{1, 1ms}).error(), Errc::invalid_argument,
-         "depth of 1");
-  expect(session.create<Odometry>("a", History{64, -1ms}).error(), Errc::invalid_argument, "cycle");
-  expect(session.create_raw({"a", 0, ""}, TypeInfo{"", 0, 1, {}}, {64, 1ms}).error(),
+  expect(session.open_reader<Odometry>("nothing"), Errc::not_found, "'nothing");
+  expect(session.create<Odometry>(std::string(32, 'x'), History{64, 1ms}), Errc::invalid_argument,
+         "at most 31");
+  expect(session.create<Odometry>("a", 1s, 0s), Errc::invalid_argument, "cycle of 0");
+  expect(session.create<Odometry>("a", 0s, 1s), Errc::invalid_argument, "shorter than the cycle");
+  expect(session.create<Odometry>("a", History{1, 1ms}), Errc::invalid_argument, "depth of 1");
+  expect(session.create<Odometry>("a", History{64, -1ms}), Errc::invalid_argument, "cycle");
+  expect(session.create_raw({"a", 0, ""}, TypeInfo{"", 0, 1, {}}, {64, 1ms}),
          Errc::invalid_argument, "0 bytes");
-  expect(session.create_raw({"a", 0, ""}, TypeInfo{"", 64 << 20, 1, {}}, {1 << 20, 1ms}).error(),
+  expect(session.create_raw({"a", 0, ""}, TypeInfo{"", 64 << 20, 1, {}}, {1 << 20, 1ms}),
          Errc::limit_exceeded, "memory");
-  expect(session.remove({"nothing", 0, ""}).error(), Errc::not_found, "nothing");
-  expect(session.info({"nothing", 0, ""}).error(), Errc::not_found, "nothing");
-  expect(session.property({"nothing", 0, ""}).error(), Errc::not_found, "nothing");
+  expect(session.remove({"nothing", 0, ""}), Errc::not_found, "nothing");
+  expect(session.info({"nothing", 0, ""}), Errc::not_found, "nothing");
+  expect(session.property({"nothing", 0, ""}), Errc::not_found, "nothing");
   make();
-  expect(session.property({"odometry", 0, ""}).error(), Errc::not_found, "property");
-  expect(Session::connect({.socket_path = daemon.runtime_dir() + "/nobody.sock"}).error(),
-         Errc::no_daemon, "start dssmd");
-  expect(Session::connect({.socket_path = std::string(200, 'x')}).error(), Errc::invalid_argument,
+  expect(session.property({"odometry", 0, ""}), Errc::not_found, "property");
+  expect(Session::connect({.socket_path = daemon.runtime_dir() + "/nobody.sock"}), Errc::no_daemon,
+         "start dssmd");
+  expect(Session::connect({.socket_path = std::string(200, 'x')}), Errc::invalid_argument,
          "107 bytes");
 }
 
