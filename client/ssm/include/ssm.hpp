@@ -204,18 +204,23 @@ class SSMApiBase {
       if (isBlocking && waitTID(ssmId, 0) != 1) return false;
       return read(-1);
     }
-    SSM_tid target = after(timeId, dt);
-    const SSM_tid bottom = getTID_bottom(ssmId);
-    if (bottom >= 0 && isBefore(target, bottom)) {
+    const SSM_tid target = after(timeId, dt);
+    // Again when a fast writer overtakes us between looking and reading.
+    for (int attempt = 0; attempt < 100; ++attempt) {
+      if (!isGone(target)) {
+        if (isBlocking && waitTID(ssmId, target) != 1) return false;
+        if (target >= 0 && read(target)) return true;
+        if (!isGone(target)) return false;  // not there yet
+      }
+      const SSM_tid bottom = getTID_bottom(ssmId);
+      if (!read(bottom)) continue;
       if (isVerbose) {
         std::cerr << "SSM::readNext() : skipping read data  '" << getStreamName()
                   << "', id = " << streamId << " TID: " << target << " -> " << bottom << std::endl;
       }
-      target = bottom;
-    } else if (isBlocking && waitTID(ssmId, target) != 1) {
-      return false;
+      return true;
     }
-    return target >= 0 && read(target);
+    return false;
   }
 
   bool readBack(int dt = 1) { return dt <= timeId ? read(timeId - dt) : false; }
@@ -314,6 +319,10 @@ class SSMApiBase {
   static bool isBefore(SSM_tid a, SSM_tid b) {
     return a < 0 ||
            ((static_cast<uint32_t>(b) - static_cast<uint32_t>(a) - 1U) & 0x7fffffffU) < 0x40000000U;
+  }
+  bool isGone(SSM_tid tid) const {  // older than the oldest
+    const SSM_tid bottom = getTID_bottom(ssmId);
+    return bottom >= 0 && isBefore(tid, bottom);
   }
   bool isNewer(SSM_tid top) const { return top >= 0 && (timeId < 0 || isBefore(timeId, top)); }
 

@@ -14,6 +14,32 @@ namespace {
 constexpr std::size_t kGuardBytes = 64;
 constexpr std::align_val_t kAlignment{64};
 
+// A reader that the writer overtakes this often between two looks is not keeping up.
+constexpr int kAttempts = 1000;
+
+// The rings that this thread is writing to: a signal handler that interrupts a write must not wait
+// for the lock that its own thread holds.
+class Writing {
+ public:
+  explicit Writing(std::uint64_t ring) noexcept : ring_(ring), outer_(innermost) {
+    for (const Writing* write = outer_; write; write = write->outer_) {
+      allowed_ = allowed_ && write->ring_ != ring;
+    }
+    innermost = this;
+  }
+  Writing(const Writing&) = delete;
+  Writing& operator=(const Writing&) = delete;
+  ~Writing() { innermost = outer_; }
+  explicit operator bool() const noexcept { return allowed_; }
+
+ private:
+  static thread_local const Writing* innermost;
+  const std::uint64_t ring_;
+  const Writing* const outer_;
+  bool allowed_ = true;
+};
+thread_local const Writing* Writing::innermost = nullptr;
+
 }  // namespace
 
 Stream::Stream(RawWriter writer, Connect connect)
@@ -22,6 +48,7 @@ Stream::Stream(RawWriter writer, Connect connect)
       data_bytes_(ssm::data_bytes(writer.type())),
       payload_bytes_(writer.payload_bytes()),
       depth_(writer.depth()),
+      incarnation_(writer.incarnation()),
       cycle_(writer.cycle()),
       writer_(new RawWriter(std::move(writer))) {}
 
@@ -31,6 +58,7 @@ Stream::Stream(RawReader reader, Connect connect)
       data_bytes_(ssm::data_bytes(reader.type())),
       payload_bytes_(reader.payload_bytes()),
       depth_(reader.depth()),
+      incarnation_(reader.incarnation()),
       cycle_(reader.cycle()),
       reader_(new RawReader(std::move(reader))) {}
 
@@ -90,25 +118,31 @@ Stream::Copy::~Copy() {
   ::operator delete(stream_.spare_.exchange(bytes_, std::memory_order_acq_rel), kAlignment);
 }
 
-ReadStatus Stream::latest(Copy& out) noexcept {
+template <class Read>
+ReadStatus Stream::copy(Copy& out, Read read) noexcept {
   RawReader* const open = reader();
   if (!open) return ReadStatus::not_yet;
   const std::lock_guard guard(read_lock_);
-  return open->latest(out.payload(), out.info);
+  for (int attempt = 0; attempt < kAttempts; ++attempt) {
+    if (const ReadStatus status = read(*open); status != ReadStatus::ok) return status;
+    BorrowedSample place;  // the bytes behind the slot belong to nobody, so they are there to read
+    if (open->borrow(out.info.tid, place) != ReadStatus::ok) continue;
+    std::memcpy(out.bytes_ + payload_bytes_, place.payload().data() + payload_bytes_, kGuardBytes);
+    if (place.still_valid()) return ReadStatus::ok;
+  }
+  return ReadStatus::lapped;
+}
+
+ReadStatus Stream::latest(Copy& out) noexcept {
+  return copy(out, [&](RawReader& open) { return open.latest(out.payload(), out.info); });
 }
 
 ReadStatus Stream::tid(Tid tid, Copy& out) noexcept {
-  RawReader* const open = reader();
-  if (!open) return ReadStatus::not_yet;
-  const std::lock_guard guard(read_lock_);
-  return open->tid(tid, out.payload(), out.info);
+  return copy(out, [&](RawReader& open) { return open.tid(tid, out.payload(), out.info); });
 }
 
 ReadStatus Stream::at(Time t, Copy& out) noexcept {
-  RawReader* const open = reader();
-  if (!open) return ReadStatus::not_yet;
-  const std::lock_guard guard(read_lock_);
-  return open->at(t, out.payload(), out.info);
+  return copy(out, [&](RawReader& open) { return open.at(t, out.payload(), out.info); });
 }
 
 ReadStatus Stream::find(Time t, SampleInfo& info) noexcept {
@@ -134,6 +168,8 @@ Tid Stream::write(const void* data, Time time) noexcept {
   if (!open) return kNoTid;
   static constexpr std::byte kNothing{};
   const auto* bytes = data_bytes_ > 0 ? static_cast<const std::byte*>(data) : &kNothing;
+  const Writing writing(incarnation_);
+  if (!writing) return kNoTid;
   const std::lock_guard guard(write_lock_);
   return open->write({bytes, payload_bytes_}, time);
 }
@@ -141,6 +177,8 @@ Tid Stream::write(const void* data, Time time) noexcept {
 Tid Stream::write_in_place(const std::function<void(std::byte*)>& fill, Time time) {
   RawWriter* const open = writer();
   if (!open) return kNoTid;
+  const Writing writing(incarnation_);
+  if (!writing) return kNoTid;
   const std::lock_guard guard(write_lock_);
   Loan loan = open->loan();
   if (!loan) return kNoTid;

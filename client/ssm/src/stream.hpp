@@ -52,7 +52,8 @@ class Stream {
   Tid newest() const noexcept;
   Tid oldest() const noexcept;
 
-  // A copy of a sample and its stamps; 64 bytes behind it belong to nobody.
+  // A copy of a sample and its stamps. The 64 bytes behind its payload are those behind the slot:
+  // writing callbacks of real programs go a few bytes too far, and their reading ones as far.
   class Copy {
    public:
     explicit Copy(Stream& stream);
@@ -63,6 +64,7 @@ class Stream {
     SampleInfo info;
 
    private:
+    friend class Stream;
     Stream& stream_;
     std::byte* bytes_;
   };
@@ -74,7 +76,8 @@ class Stream {
   ReadStatus find(Time t, SampleInfo& info) noexcept;
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
 
-  // Writes one sample; kNoTid when the writer cannot be opened or this thread is filling a slot.
+  // Writes one sample; kNoTid when the writer cannot be opened or this thread is writing to the
+  // stream already, in a callback or under the signal handler that asks.
   Tid write(const void* data, Time time) noexcept;
 
   // Lets `fill` write into the next slot and publishes it; what `fill` throws comes through, and
@@ -89,10 +92,12 @@ class Stream {
  private:
   RawReader* reader() noexcept;
   RawWriter* writer() noexcept;
+  template <class Read>
+  ReadStatus copy(Copy& out, Read read) noexcept;
 
   const Connect connect_;
   const StreamId id_;
-  const std::uint64_t data_bytes_, payload_bytes_, depth_;
+  const std::uint64_t data_bytes_, payload_bytes_, depth_, incarnation_;
   const Duration cycle_;
 
   ReentrantLock read_lock_, write_lock_;

@@ -1,0 +1,243 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Signals: programs that close everything and end SSM inside their SIGINT handler, while the main
+// loop is anywhere; waits that signals end, and waits that they do not shorten.
+#include <libssm.h>
+#include <signal.h>
+#include <ssm.hpp>
+#include <sys/time.h>
+#include <sys/wait.h>
+
+#include "check.h"
+
+namespace {
+
+struct Sample {
+  double a[32];
+};
+
+volatile sig_atomic_t handled = 0;
+
+void on_signal(int number, void (*handler)(int), bool restart = false) {
+  struct sigaction action;
+  memset(&action, 0, sizeof(action));
+  action.sa_handler = handler;
+  action.sa_flags = restart ? SA_RESTART : 0;
+  sigaction(number, &action, NULL);
+}
+
+// SIGALRM after `first` and then every `next` microseconds (0: once).
+void alarm_after(int first, int next) {
+  itimerval timer;
+  memset(&timer, 0, sizeof(timer));
+  timer.it_value.tv_usec = first;
+  timer.it_interval.tv_usec = next;
+  setitimer(ITIMER_REAL, &timer, NULL);
+}
+
+// --- the storm: one child per round, ended by SIGINT at a random moment ---------------------------
+
+SSMApi<Sample> source("storm", 0), sink("storm", 1), opened("storm", 0);
+SSMApiBase *const all[] = {&source, &sink, &opened};
+
+void close_all_and_end(int) {
+  for (size_t i = 0; i < sizeof(all) / sizeof(all[0]); ++i) all[i]->close();
+  endSSM();
+  handled = 1;
+}
+
+void copy_in(void *ssmp, const void *data, void *) { memcpy(ssmp, data, sizeof(Sample)); }
+void copy_out(const void *ssmp, void *data, void *) { memcpy(data, ssmp, sizeof(Sample)); }
+
+void work(int kind) {
+  switch (kind) {
+    case 0:
+      source.readLast();
+      break;
+    case 1:
+      source.readTime(gettimeSSM() - 0.5);
+      break;
+    case 2:
+      sink.write();
+      break;
+    case 3:
+      source.setBlocking(true);
+      source.setVerbose(false);
+      source.readNext();
+      break;
+    case 4:
+      writeSSMP(sink.getSSMId(), &sink.data, 1.0, copy_in, NULL);
+      if (readSSMP(sink.getSSMId(), &sink.data, NULL, -1, copy_out, NULL) < -3) abort();
+      break;
+    case 5:
+      waitTID(sink.getSSMId(), 1 << 30);
+      break;
+    case 6:  // into the middle of asking dssmd, and of allocating
+      opened.setVerbose(false);
+      opened.open();
+      opened.close();
+      break;
+    case 7:
+      usleepSSM(100);
+      getSSM_info("storm", 0, NULL, NULL, NULL, NULL);
+      break;
+    default:
+      initSSM();  // again and again; the handler's endSSM may fall into it
+      break;
+  }
+}
+
+const int kKinds = 9;
+
+// The child of one round. Its exit status is 0 unless something went wrong.
+int storm_child(int kind, int ready_fd) {
+  alarm(60);  // a deadlock ends here, and is seen by the parent
+  if (!initSSM()) return 1;
+  if (!source.open() || !sink.create(1.0, 0.1)) return 2;
+  on_signal(SIGINT, close_all_and_end);
+  if (write(ready_fd, "r", 1) != 1) return 3;
+  while (!handled) work(kind);
+  // As real programs do: a call or two more, then everything once more.
+  usleepSSM(10);
+  source.readNew();
+  source.setBlocking(false);
+  sink.write();
+  if (kind != 6 && kind != 8) {
+    if (source.isOpen() || sink.isOpen() || source.readLast() || sink.write()) return 4;
+    const double real = gettimeSSM_real();
+    if (gettimeSSM() < real) return 5;
+  }
+  if (strcmp(source.getStreamName(), "storm") != 0) return 6;
+  for (size_t i = 0; i < sizeof(all) / sizeof(all[0]); ++i) all[i]->close();
+  endSSM();
+  return 0;
+}
+
+pid_t start_writer() {
+  const pid_t pid = fork();
+  if (pid > 0) return pid;
+  SSMApi<Sample> writer("storm", 0);
+  if (!initSSM() || !writer.create(0.3, 0.1)) _exit(1);
+  for (;;) writer.write();
+}
+
+void storm(int rounds, unsigned seed) {
+  printf("seed %u\n", seed);
+  srandom(seed);
+  const pid_t writer = start_writer();
+  SSMApi<Sample> there("storm", 0);
+  CHECK(initSSM() == 1 && there.openWait(0.0));
+  there.close();
+  CHECK_EQUAL(endSSM(), 1);
+  for (int round = 0; round < rounds; ++round) {
+    int ready[2];
+    if (pipe(ready) != 0) abort();
+    fflush(stdout);
+    const pid_t child = fork();
+    if (child == 0) _exit(storm_child(round % kKinds, ready[1]));
+    close(ready[1]);
+    char byte;
+    CHECK(read(ready[0], &byte, 1) == 1);
+    close(ready[0]);
+    usleep(static_cast<useconds_t>(random() % 1500));
+    kill(child, SIGINT);
+    int status = 0;
+    waitpid(child, &status, 0);
+    if (status != 0) printf("round %d, kind %d: wait status %x\n", round, round % kKinds, status);
+    CHECK_EQUAL(status, 0);
+  }
+  kill(writer, SIGKILL);
+  waitpid(writer, NULL, 0);
+}
+
+// --- waits and signals -----------------------------------------------------------------------------
+
+SSMApi<Sample> own("own", 0);
+int handler_reads = 0, handler_writes = 0;
+
+void count(int) { handled = handled + 1; }
+void close_own(int) { own.close(); }
+
+void signals_do_not_shorten_wait_tid(bool restart) {
+  CHECK(own.create(1.0, 0.1));
+  handled = 0;
+  on_signal(SIGALRM, count, restart);
+  alarm_after(20000, 20000);
+  const double before = gettimeSSM_real();
+  CHECK_EQUAL(waitTID(own.getSSMId(), getTID_top(own.getSSMId()) + 1), 0);
+  CHECK(gettimeSSM_real() - before > 0.9);
+  alarm_after(0, 0);
+  CHECK(handled > 5);
+}
+
+void closing_ends_wait_tid() {
+  CHECK(own.create(1.0, 0.1));
+  on_signal(SIGALRM, close_own);
+  alarm_after(20000, 0);
+  CHECK_EQUAL(waitTID(own.getSSMId(), 1 << 30), -1);  // not 0: it did not sit out the second
+  CHECK(!own.isOpen());
+}
+
+void signals_end_sleeps() {
+  on_signal(SIGALRM, count);
+  alarm_after(20000, 20000);
+  CHECK_EQUAL(usleepSSM(3600000000U), -1);
+  CHECK(!(!sleepSSM(3600.0)));
+  alarm_after(0, 0);
+}
+
+void signals_end_open_wait() {
+  SSMApi<Sample> never("never", 0);
+  never.setVerbose(false);
+  on_signal(SIGALRM, count, true);
+  for (int i = 0; i < 50; ++i) {  // one signal each; none may be missed
+    alarm_after(500 + i * 37, 0);
+    CHECK(!never.openWait());
+  }
+}
+
+// Control loops that read and write from a timer's handler, in the midst of the main loop's reads.
+void read_and_write(int) {
+  if (own.getSSMId() == 0) return;
+  Sample sample;
+  if (readSSM(own.getSSMId(), &sample, NULL, -1) >= 0) ++handler_reads;
+  if (writeSSM(own.getSSMId(), &sample, gettimeSSM()) >= 0) ++handler_writes;
+}
+
+void reading_in_handlers() {
+  CHECK(own.create(1.0, 0.1) && own.write() && own.readLast());  // both directions are open now
+  on_signal(SIGALRM, read_and_write);
+  alarm_after(200, 200);
+  long reads = 0;
+  while (handler_reads < 500) {
+    CHECK(own.readLast());
+    if (++reads % 16 == 0) own.write();  // may be refused while the handler writes, never hangs
+  }
+  alarm_after(0, 0);
+  CHECK(handler_writes > 0);
+  CHECK(own.write());
+}
+
+void sigpipe_is_the_programs() {
+  struct sigaction action;
+  sigaction(SIGPIPE, NULL, &action);
+  CHECK(action.sa_handler == SIG_DFL);
+}
+
+}  // namespace
+
+int main(int argc, char **argv) {
+  check_begin(argc, argv);
+  storm(360, argc > 2 ? static_cast<unsigned>(atoi(argv[2])) : static_cast<unsigned>(getpid()));
+  CHECK_EQUAL(initSSM(), 1);
+  while (getSSM_node_num() != 1) usleep(1000);  // none of the children is left behind
+  signals_do_not_shorten_wait_tid(false);
+  signals_do_not_shorten_wait_tid(true);
+  closing_ends_wait_tid();
+  signals_end_sleeps();
+  signals_end_open_wait();
+  reading_in_handlers();
+  sigpipe_is_the_programs();
+  CHECK_EQUAL(endSSM(), 1);
+  return check_result();
+}
