@@ -2,31 +2,43 @@
 # SPDX-License-Identifier: Apache-2.0
 """Counts what the test runs of ./check did.
 
-Reads the JUnit files that meson writes for each build folder, names every test that failed or was
-skipped, and closes with one line "N passed, N failed" (", N skipped" when there were any). Exits
-with 1 when a test failed or when there was none.
+Takes build folders. Reads what meson wrote there: testlog.json, a line for each test program, and
+testlog.junit.xml, an entry for each test in them. Names every test that failed or was skipped, and
+closes with one line "N passed, N failed" (", N skipped" when there were any). A program that ended
+badly without naming a failed test, a crash say, counts as one. Exits with 1 when a test failed or
+when there was none.
 """
 
+import json
+import pathlib
 import sys
 import xml.etree.ElementTree as ElementTree
 
 
-def main(paths: list[str]) -> int:
+def count(folder: pathlib.Path) -> tuple[int, int, int]:
+    """Passed, failed and skipped tests of one build folder; prints the latter two."""
     passed = failed = skipped = 0
-    for path in paths:
-        variant = path.split("/")[0]
-        for case in ElementTree.parse(path).getroot().iter("testcase"):
-            name = f"{variant}: {case.get('classname')}.{case.get('name')}"
-            if case.find("failure") is not None or case.find("error") is not None:
-                failed += 1
-                print(f"FAILED  {name}")
-            elif case.find("skipped") is not None or case.get("result") == "skipped":
-                skipped += 1
-                print(f"SKIPPED {name}")
-            else:
-                passed += 1
-    line = f"{passed} passed, {failed} failed"
-    print(line + (f", {skipped} skipped" if skipped else ""))
+    for case in ElementTree.parse(folder / "testlog.junit.xml").getroot().iter("testcase"):
+        name = f"{folder.parent.name}: {case.get('classname')}.{case.get('name')}"
+        if case.find("failure") is not None or case.find("error") is not None:
+            failed += 1
+            print(f"FAILED  {name}")
+        elif case.find("skipped") is not None or case.get("result") in ("skipped", "suppressed"):
+            skipped += 1
+            print(f"SKIPPED {name}")
+        else:
+            passed += 1
+    programs = [json.loads(line) for line in (folder / "testlog.json").read_text().splitlines()]
+    bad = [p for p in programs if p["result"] not in ("OK", "EXPECTEDFAIL", "SKIP")]
+    for program in bad:
+        print(f"FAILED  {folder.parent.name}: {program['name']} ({program['result']})")
+    return passed, max(failed, len(bad)), skipped
+
+
+def main(folders: list[str]) -> int:
+    counts = [count(pathlib.Path(folder) / "meson-logs") for folder in folders]
+    passed, failed, skipped = (sum(column) for column in zip(*counts))
+    print(f"{passed} passed, {failed} failed" + (f", {skipped} skipped" if skipped else ""))
     return 1 if failed or not passed else 0
 
 
