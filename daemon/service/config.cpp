@@ -131,6 +131,12 @@ std::string unknown_key(std::string_view name) {
   return "key '" + printable(name) + "': unknown; the keys are " + known;
 }
 
+const ConfigKey* find_key(std::string_view name) {
+  const auto key = std::find_if(std::begin(kKeys), std::end(kKeys),
+                                [&](const ConfigKey& k) { return k.name == name; });
+  return key == std::end(kKeys) ? nullptr : key;
+}
+
 struct Mistake {
   toml::source_index line;
   std::string text;
@@ -163,18 +169,18 @@ Result<void> apply_text_untrusted(Config& config, std::string_view text, const s
   if (!table) return table.error();
   std::vector<Mistake> mistakes;
   for (const auto& [name, node] : *table) {
-    const auto mistake = [&, where = name.source()](const std::string& why) {
+    const toml::source_region where = name.source();
+    const auto mistake = [&](const std::string& why) {
       mistakes.push_back({where.begin.line, place(path, where) + why});
     };
-    const auto key = std::find_if(std::begin(kKeys), std::end(kKeys),
-                                  [&](const ConfigKey& k) { return k.name == name.str(); });
-    if (key == std::end(kKeys)) {
+    const ConfigKey* key = find_key(name.str());
+    if (!key) {
       mistake(unknown_key(name.str()));
       continue;
     }
     const Result<std::string> value = text_of(node, key->form);
     const Result<void> set = value ? key->set(config, *value) : value.error();
-    if (!set) mistake("key '" + std::string(key->name) + "': " + set.error().message);
+    if (!set) mistake("key " + quoted(key->name) + ": " + set.error().message);
   }
   if (mistakes.empty()) return {};
   std::stable_sort(mistakes.begin(), mistakes.end(),

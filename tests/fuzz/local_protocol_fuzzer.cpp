@@ -1,0 +1,126 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Any bytes from a client that said hello: through the frame buffer, the decoding of requests, the
+// registry and its real memory files, down to the answers. A second client watches and holds a
+// stream, so that events and conflicts happen. An input's first two bytes choose whether dssmd is
+// recovering, which descriptors come along, and how its bytes are cut.
+#include <fcntl.h>
+
+#include <algorithm>
+#include <cstdlib>
+#include <cstring>
+
+#include "core/wire/frame.hpp"
+#include "core/wire/local_protocol.hpp"
+#include "daemon/local/local_service.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+class SilentLogger final : public Logger {
+ public:
+  void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
+};
+
+// Takes whatever is sent, and insists that it is a frame that clients accept.
+class Sink final : public ClientOutput {
+ public:
+  void send(const std::string& frame, std::vector<UniqueFd>) override {
+    if (frame.size() > wire::kMaxLocalFrameBytes + 10) std::abort();
+  }
+};
+
+struct Daemon {
+  explicit Daemon(bool recovering)
+      : registry("pc1",
+                 {.max_streams = 8, .max_memory_bytes = 1 << 20, .max_property_bytes = 4096}),
+        opens({.max_opens = 16, .max_opens_per_client = 8}),
+        service(registry, opens, clock, logger, recovering) {}
+  SilentLogger logger;
+  Registry registry;
+  OpenTable opens;
+  PlaybackClockOwner clock;
+  LocalService service;
+};
+
+void put(Daemon& daemon, ClientNumber client, const local::Request& request) {
+  const std::string bytes = request.SerializeAsString();
+  DescriptorQueue none;
+  daemon.service.on_frame_untrusted(client, std::as_bytes(std::span(bytes)), none);
+}
+
+local::Request hello() {
+  local::Request request;
+  request.set_serial(1);
+  request.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
+  return request;
+}
+
+// Descriptors of a stream "a" that an earlier dssmd had.
+const std::vector<UniqueFd>& kept_descriptors() {
+  static const std::vector<UniqueFd> kept = [] {
+    Registry before("pc1",
+                    {.max_streams = 1, .max_memory_bytes = 1 << 20, .max_property_bytes = 1});
+    const auto created =
+        before.create({"a", 0, ""}, {"T", 8, 8, {}}, {4, std::chrono::milliseconds(1)}, 1);
+    if (!created) std::abort();
+    return *created->stream->descriptors_for(Role::writer);
+  }();
+  return kept;
+}
+
+// Up to four of them, or other files, as `choice` says.
+std::vector<UniqueFd> descriptors(unsigned choice) {
+  std::vector<UniqueFd> result;
+  for (unsigned i = 0; i < choice % 5; ++i) {
+    const unsigned which = choice & 8 ? (i + choice / 16) % 4 : i;
+    result.emplace_back(::fcntl(kept_descriptors()[which].get(), F_DUPFD_CLOEXEC, 0));
+  }
+  return result;
+}
+
+void run(std::span<const std::uint8_t> input) {
+  if (input.size() < 2) return;
+  const unsigned control = input[0], cut = 1 + input[1];
+  input = input.subspan(2);
+  Daemon daemon(control & 1);
+  Sink sink;
+  const ClientNumber watcher = daemon.service.connect(1, 0, sink);
+  put(daemon, watcher, hello());
+  local::Request watch;
+  watch.set_serial(2);
+  watch.mutable_watch();
+  put(daemon, watcher, watch);
+  const ClientNumber client = daemon.service.connect(2, 0, sink);
+  put(daemon, client, hello());
+
+  wire::FrameBuffer buffer(1 << 16);
+  DescriptorQueue arrived;
+  if (control & 2) arrived.push_back(descriptors(control / 4));
+  if (control & 4) arrived.push_back(descriptors(3));
+  bool goes_on = true;
+  while (goes_on && !input.empty()) {
+    const auto space = buffer.space();
+    const std::size_t part = std::min({space.size(), input.size(), std::size_t{cut}});
+    std::memcpy(space.data(), input.data(), part);
+    buffer.commit(part);
+    input = input.subspan(part);
+    while (goes_on) {
+      const auto frame = buffer.next();
+      if (!frame) return;
+      if (!*frame) break;
+      goes_on = daemon.service.on_frame_untrusted(client, **frame, arrived);
+    }
+  }
+  daemon.service.end_recovery();
+  daemon.service.disconnect(client);
+  if (!daemon.opens.entries().empty()) std::abort();
+}
+
+}  // namespace
+}  // namespace dssm::daemon
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
+  dssm::daemon::run({data, size});
+  return 0;
+}
