@@ -8,6 +8,7 @@
 #include <unistd.h>
 
 #include <cerrno>
+#include <cstdlib>
 #include <cstring>
 #include <new>
 
@@ -47,8 +48,20 @@ void* Process::run_reaper(void* self) {
   for (;;) {
     while (::sem_wait(&process.wake_) != 0) continue;
     const std::lock_guard guard(process.mutex_);
-    process.reap_locked();
+    process.reaping_.store(true);
+    if (!process.exiting_.load()) process.reap_locked();
+    process.reaping_.store(false);
   }
+}
+
+// Most programs end right after endSSM: the reaper must not be half-way through while the static
+// objects of other libraries are destroyed. Bounded, because programs call exit() from handlers,
+// and the interrupted thread may hold what the reaper needs.
+void Process::at_exit() {
+  Process& process = the_process;
+  process.exiting_.store(true);
+  const MonoTime deadline = deadline_in(std::chrono::seconds(1));
+  while (process.reaping_.load() && MonoClock::now() < deadline) ::usleep(100);
 }
 
 void Process::reap_locked() {
@@ -59,11 +72,10 @@ void Process::reap_locked() {
 
 // What must be there before the first stream or registration.
 Result<void> Process::prepare_locked() {
-  if (!fork_handler_) {
-    if (const int error = ::pthread_atfork(nullptr, nullptr, &after_fork_in_child)) {
-      return os_error("prepare for fork", error);
-    }
-    fork_handler_ = true;
+  if (!handlers_) {
+    const int error = ::pthread_atfork(nullptr, nullptr, &after_fork_in_child);
+    if (error || std::atexit(&at_exit)) return os_error("prepare for fork and exit", ENOMEM);
+    handlers_ = true;
   }
   if (!reaper_) {
     sigset_t all, before;  // signal handlers are the program's: they run in its own threads
@@ -87,6 +99,7 @@ void Process::after_fork_in_child() {
   ::sem_init(&process.wake_, 0, 0);
   ++process.generation_;
   process.reaper_ = false;
+  process.reaping_.store(false);
   process.was_registered_.store(false);
   if (Registration* const parents = std::exchange(process.registration_, nullptr)) {
     parents->next = std::exchange(process.abandoned_, parents);

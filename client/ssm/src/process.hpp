@@ -58,17 +58,19 @@ class Process {
 
   static void* run_reaper(void* self);
   static void after_fork_in_child();
+  static void at_exit();
   Result<void> prepare_locked();
   void reap_locked();
   bool registered_locked() const noexcept;
 
   sem_t wake_{};
   std::mutex mutex_;  // guards what is not atomic
-  bool fork_handler_ = false;
+  bool handlers_ = false;
   bool reaper_ = false;
   std::uint64_t generation_ = 1;  // rises with each fork
   Registration* registration_ = nullptr;
   Registration* abandoned_ = nullptr;  // keeps the parents' reachable for leak checkers
+  std::atomic<bool> reaping_{false}, exiting_{false};  // between the reaper and at_exit()
   std::atomic<std::uint64_t> ends_{0};
   std::atomic<bool> was_registered_{false};
   char socket_path_[108] = {};  // where; written before was_registered_

@@ -3,10 +3,11 @@
 // The C++ interface, member by member, as the old headers offer it. Compiled in every dialect from
 // C++98 on.
 #include <libssm.h>
-#include <ssm.hpp>
-#include <ssmp.hpp>
 #include <ssmtype/bumper.h>
 #include <ssmtype/ultrasonic.h>
+
+#include <ssm.hpp>
+#include <ssmp.hpp>
 
 #include "check.h"
 
@@ -56,7 +57,7 @@ void without_buffer() {
   base.setVerbose(false);
   catch_stderr();
   const bool created = base.create(1, 0.1), opened = base.open(), waited = base.openWait();
-  const char *const text = caught_stderr();  // also when not verbose
+  const char* const text = caught_stderr();  // also when not verbose
   CHECK(!created && !opened && !waited);
   CHECK_TEXT(text, "SSM::create()");
   CHECK_TEXT(text, "SSM::open()");
@@ -138,8 +139,7 @@ void writing_and_reading() {
   for (int i = 3; i < 30; ++i) writer.write(10.0 + i);  // laps the 13 slots
   catch_stderr();
   CHECK(reader.readNext());
-  CHECK_TEXT(caught_stderr(),
-             "SSM::readNext() : skipping read data  'drive', id = 1 TID: 3 -> 18");
+  CHECK_TEXT(caught_stderr(), "SSM::readNext() : skipping read data  'drive', id = 1 TID: 3 -> 18");
   CHECK_EQUAL(reader.timeId, 18);
   CHECK_EQUAL(getTID_bottom(reader.getSSMId()), 18);
 
@@ -183,7 +183,7 @@ void open_wait() {
   double before = gettimeSSM_real();
   catch_stderr();
   const int waited = api.openWait(0.2);
-  const char *const text = caught_stderr();
+  const char* const text = caught_stderr();
   CHECK_TEXT(text, "SSM::openWait() : wait for stream 'later', id = 0");
   CHECK_TEXT(text, "SSM::open() : cannot open 'later', id = 0");
   CHECK_EQUAL(waited, 0);
@@ -261,7 +261,7 @@ void plain_base() {
   void *data = malloc(size), *property = malloc(property_size);
   base.setBuffer(data, size, property, property_size);
   CHECK(base.open() && base.readLast() && base.getProperty());
-  CHECK_SAME(static_cast<Odometry *>(base.data())->theta, 0.75);
+  CHECK_SAME(static_cast<Odometry*>(base.data())->theta, 0.75);
   Odometry half;
   base.setDataBuffer(&half, sizeof(half) / 2);  // changed under way: asked again
   catch_stderr();
@@ -275,10 +275,10 @@ void plain_base() {
   free(property);
 }
 
-void pack(void *ssmp, const void *data, void *) { memcpy(ssmp, data, 12); }
-void unpack(const void *ssmp, void *data, void *user) {
+void pack(void* ssmp, const void* data, void*) { memcpy(ssmp, data, 12); }
+void unpack(const void* ssmp, void* data, void* user) {
   memcpy(data, ssmp, 12);
-  ++*static_cast<int *>(user);
+  ++*static_cast<int*>(user);
 }
 
 void variable_size() {
@@ -306,7 +306,7 @@ void variable_size() {
 
 }  // namespace
 
-int main(int argc, char **argv) {
+int main(int argc, char** argv) {
   check_begin(argc, argv);
   initial_state();
   without_buffer();

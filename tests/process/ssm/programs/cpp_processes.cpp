@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Several processes: fork, restarted writers, writers killed inside a write, waiting for each other;
-// and what a process holds after many opens and closes.
+// Several processes: fork, restarted writers, writers killed inside a write, waiting for each
+// other; and what a process holds after many opens and closes.
 #include <dirent.h>
 #include <libssm.h>
 #include <signal.h>
-#include <ssm.hpp>
 #include <sys/wait.h>
 
 #include <fstream>
+#include <ssm.hpp>
 #include <string>
 
 #include "check.h"
@@ -96,7 +96,7 @@ void writers_come_and_go() {
   reader.close();
 }
 
-void die(void *, const void *, void *) { kill(getpid(), SIGKILL); }
+void die(void*, const void*, void*) { kill(getpid(), SIGKILL); }
 
 int killed_writer() {
   SSMApi<Sample> writer("killed", 0);
@@ -167,7 +167,7 @@ void edges_between_processes() {
   writer.release();
 }
 
-int lines_with(const char *word) {
+int lines_with(const char* word) {
   std::ifstream maps("/proc/self/maps");
   std::string line;
   int count = 0;
@@ -176,7 +176,7 @@ int lines_with(const char *word) {
 }
 
 int descriptors() {
-  DIR *dir = opendir("/proc/self/fd");
+  DIR* dir = opendir("/proc/self/fd");
   int count = 0;
   while (readdir(dir)) ++count;
   closedir(dir);
@@ -210,7 +210,7 @@ void scripts_find_the_process() { CHECK(lines_with("libssm.so") > 0); }
 
 }  // namespace
 
-int main(int argc, char **argv) {
+int main(int argc, char** argv) {
   check_begin(argc, argv);
   fork_and_init_again();
   writers_come_and_go();

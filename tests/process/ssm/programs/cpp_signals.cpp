@@ -4,9 +4,10 @@
 // loop is anywhere; waits that signals end, and waits that they do not shorten.
 #include <libssm.h>
 #include <signal.h>
-#include <ssm.hpp>
 #include <sys/time.h>
 #include <sys/wait.h>
+
+#include <ssm.hpp>
 
 #include "check.h"
 
@@ -35,10 +36,11 @@ void alarm_after(int first, int next) {
   setitimer(ITIMER_REAL, &timer, NULL);
 }
 
-// --- the storm: one child per round, ended by SIGINT at a random moment ---------------------------
+// --- the storm: one child per round, ended by SIGINT at a random moment
+// ---------------------------
 
 SSMApi<Sample> source("storm", 0), sink("storm", 1), opened("storm", 0);
-SSMApiBase *const all[] = {&source, &sink, &opened};
+SSMApiBase* const all[] = {&source, &sink, &opened};
 
 void close_all_and_end(int) {
   for (size_t i = 0; i < sizeof(all) / sizeof(all[0]); ++i) all[i]->close();
@@ -46,8 +48,8 @@ void close_all_and_end(int) {
   handled = 1;
 }
 
-void copy_in(void *ssmp, const void *data, void *) { memcpy(ssmp, data, sizeof(Sample)); }
-void copy_out(const void *ssmp, void *data, void *) { memcpy(data, ssmp, sizeof(Sample)); }
+void copy_in(void* ssmp, const void* data, void*) { memcpy(ssmp, data, sizeof(Sample)); }
+void copy_out(const void* ssmp, void* data, void*) { memcpy(data, ssmp, sizeof(Sample)); }
 
 void work(int kind) {
   switch (kind) {
@@ -150,7 +152,8 @@ void storm(int rounds, unsigned seed) {
   waitpid(writer, NULL, 0);
 }
 
-// --- waits and signals -----------------------------------------------------------------------------
+// --- waits and signals
+// -----------------------------------------------------------------------------
 
 SSMApi<Sample> own("own", 0);
 int handler_reads = 0, handler_writes = 0;
@@ -226,7 +229,7 @@ void sigpipe_is_the_programs() {
 
 }  // namespace
 
-int main(int argc, char **argv) {
+int main(int argc, char** argv) {
   check_begin(argc, argv);
   storm(360, argc > 2 ? static_cast<unsigned>(atoi(argv[2])) : static_cast<unsigned>(getpid()));
   CHECK_EQUAL(initSSM(), 1);

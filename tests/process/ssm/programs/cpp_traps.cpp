@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What real programs do with the C++ interface, one function per trap, in the words of old programs.
-// Signals, several processes and their ends have programs of their own.
-#include <ssm.hpp>
-
+// What real programs do with the C++ interface, one function per trap, in the words of old
+// programs. Signals, several processes and their ends have programs of their own.
 #include <list>
+#include <ssm.hpp>
 #include <stdexcept>
 #include <string>
 #include <vector>
@@ -41,7 +40,7 @@ static SSMApi<Pose> static_api("static", 1);
 namespace {
 
 template <typename T>
-void write_and_read(const char *name, const T &value) {
+void write_and_read(const char* name, const T& value) {
   SSMApi<T> writer(name, 0), reader(name, 0);
   CHECK(writer.create(0.2, 0.1) && reader.open());
   memcpy(&writer.data, &value, sizeof(T));
@@ -88,7 +87,7 @@ struct ScanProperty {
 
 class ScanApi : public SSMApi<Scan, ScanProperty> {
  public:
-  ScanApi(const char *name, int id) : SSMApi<Scan, ScanProperty>(name, id), calls(0) {}
+  ScanApi(const char* name, int id) : SSMApi<Scan, ScanProperty>(name, id), calls(0) {}
   bool write(ssmTimeT now = gettimeSSM()) {
     return (timeId = writeSSMP(ssmId, &data, now, writing, NULL)) >= 0 ? (time = now, true) : false;
   }
@@ -110,19 +109,18 @@ class ScanApi : public SSMApi<Scan, ScanProperty> {
   int calls;
 
  private:
-  static void writing(void *ssmp, const void *from, void *) {
-    const Scan &scan = *static_cast<const Scan *>(from);
+  static void writing(void* ssmp, const void* from, void*) {
+    const Scan& scan = *static_cast<const Scan*>(from);
     memcpy(ssmp, &scan.count, sizeof(size_t));
-    memcpy(static_cast<char *>(ssmp) + sizeof(size_t), &scan.points[0],
-           scan.count * sizeof(double));
+    memcpy(static_cast<char*>(ssmp) + sizeof(size_t), &scan.points[0], scan.count * sizeof(double));
   }
-  static void reading(const void *ssmp, void *to, void *) {
-    Scan &scan = *static_cast<Scan *>(to);
+  static void reading(const void* ssmp, void* to, void*) {
+    Scan& scan = *static_cast<Scan*>(to);
     size_t count = 0;
     memcpy(&count, ssmp, sizeof(size_t));
     if (count > scan.points.size()) throw std::runtime_error("scan does not fit");
     scan.count = count;
-    memcpy(&scan.points[0], static_cast<const char *>(ssmp) + sizeof(size_t),
+    memcpy(&scan.points[0], static_cast<const char*>(ssmp) + sizeof(size_t),
            count * sizeof(double));
   }
 };
@@ -169,14 +167,14 @@ void exceptions_from_callbacks() {
     std::string what;
     try {
       reader.readLast();
-    } catch (const std::runtime_error &error) {
+    } catch (const std::runtime_error& error) {
       what = error.what();
     }
     CHECK(what == "scan does not fit");
     what = "";
     try {
       reader.readTime(1.5);
-    } catch (const std::runtime_error &error) {
+    } catch (const std::runtime_error& error) {
       what = error.what();
     }
     CHECK(what == "scan does not fit");
@@ -186,7 +184,7 @@ void exceptions_from_callbacks() {
   CHECK(writer.write(2.0) && reader.readLast() && reader.data.count == 5);
 }
 
-void throw_half_way(void *ssmp, const void *, void *) {
+void throw_half_way(void* ssmp, const void*, void*) {
   memset(ssmp, 0xee, 4);
   throw 7;
 }
@@ -216,13 +214,13 @@ void containers_of_bases() {
   writer.create(1.0, 0.1);
   writer.data = pose;
   writer.write(1.5);
-  std::list<SSMApiBase *> all;
+  std::list<SSMApiBase*> all;
   all.push_back(new SSMApi<Pose>("poly", 1));
   all.push_back(new SSMApi<Pose, ScanProperty>("poly", 1));
-  for (std::list<SSMApiBase *>::iterator it = all.begin(); it != all.end(); ++it) {
-    SSMApiBase *api = *it;
+  for (std::list<SSMApiBase*>::iterator it = all.begin(); it != all.end(); ++it) {
+    SSMApiBase* api = *it;
     CHECK(api->open() && api->readLast() && api->readTime(2.0));
-    CHECK_SAME((*static_cast<Pose *>(api->data())).y, 4);
+    CHECK_SAME((*static_cast<Pose*>(api->data())).y, 4);
     CHECK(std::string(api->getStreamName()) == "poly");
     CHECK(api->getSSMId() != 0);
     delete api;
@@ -231,7 +229,7 @@ void containers_of_bases() {
 
 class Player {
  public:
-  explicit Player(const std::string &stream) : api(stream.c_str(), 2), buffer() {}
+  explicit Player(const std::string& stream) : api(stream.c_str(), 2), buffer() {}
   SSMApiBase api;
   Pose buffer;
 };
@@ -244,7 +242,7 @@ void copies() {
   std::vector<Player> players;
   for (int i = 0; i < 10; ++i) players.push_back(Player("copied"));
   for (size_t i = 0; i < players.size(); ++i) {
-    Player &player = players[i];
+    Player& player = players[i];
     player.api.setBuffer(&player.buffer, sizeof(player.buffer), NULL, 0);
     CHECK(player.api.open() && player.api.readLast());
     CHECK_SAME(player.buffer.x, 8);
@@ -269,8 +267,8 @@ void static_objects() {
 
 void kept_addresses() {
   SSMApi<Pose> writer("kept", 0), reader("kept", 0);
-  const Pose *const kept = &reader.data;
-  const ssmTimeT *const kept_time = &reader.time;
+  const Pose* const kept = &reader.data;
+  const ssmTimeT* const kept_time = &reader.time;
   writer.create(1.0, 0.1);
   reader.open();
   for (int i = 0; i < 30; ++i) {
@@ -362,7 +360,7 @@ void own_names() {
 
 }  // namespace
 
-int main(int argc, char **argv) {
+int main(int argc, char** argv) {
   check_begin(argc, argv);
   CHECK_EQUAL(initSSM(), 1);
   anything_as_type();

@@ -1,0 +1,122 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What a program meets before it runs: headers that compile everywhere without warnings, a library
+// that exports the documented names and nothing else, and a pkg-config file that fits C programs.
+#include <gtest/gtest.h>
+
+#include <cstdlib>
+#include <fstream>
+#include <iterator>
+#include <regex>
+#include <set>
+#include <sstream>
+
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm::test {
+namespace {
+
+std::string source(const std::string& path) {
+  return std::string(std::getenv("DSSM_SOURCE_ROOT")) + "/" + path;
+}
+
+// Compiles a program that includes `headers`, one by one and all, strictly.
+void compile(const std::string& compiler, const std::string& dialect, const std::string& suffix,
+             const std::vector<std::string>& headers) {
+  const std::string folder = make_temp_dir();
+  const std::string file = folder + "/program." + suffix;
+  std::vector<std::string> texts;
+  std::string all;
+  for (const std::string& header : headers) {
+    texts.push_back("#include <" + header + ">\nint main(void) { return 0; }\n");
+    all += "#include <" + header + ">\n";
+  }
+  texts.push_back(all + all + "int main(void) { return 0; }\n");
+  for (const std::string& text : texts) {
+    std::ofstream(file) << text;
+    std::vector<std::string> command = {
+        compiler,    "-std=" + dialect, "-fsyntax-only",
+        "-Werror",   "-Wall",           "-Wextra",
+        "-pedantic", "-Wshadow",        "-I" + source("client/ssm/include")};
+    if (suffix == "cpp") {
+      command.insert(command.end(), {"-Wold-style-cast", "-Wconversion", "-Wnon-virtual-dtor"});
+    } else {
+      command.insert(command.end(), {"-Wstrict-prototypes", "-Wmissing-prototypes"});
+    }
+    command.push_back(file);
+    const Finished finished = run(command);
+    EXPECT_EQ(finished.exit_status, 0) << dialect << "\n" << text << finished.err;
+  }
+  remove_tree(folder);
+}
+
+const std::vector<std::string> kCHeaders = {"ssm.h", "ssm-time.h", "libssm.h", "ssmtype/bumper.h",
+                                            "ssmtype/ultrasonic.h"};
+
+TEST(SsmHeaders, CompileWithoutWarningsInEveryDialectOfC) {
+  for (const char* dialect : {"gnu89", "c89", "c99", "gnu99", "c11", "gnu17"}) {
+    compile("cc", dialect, "c", kCHeaders);
+  }
+}
+
+TEST(SsmHeaders, CompileWithoutWarningsInEveryDialectOfCpp) {
+  std::vector<std::string> headers = kCHeaders;
+  headers.insert(headers.end(), {"ssm.hpp", "ssmp.hpp"});
+  for (const char* dialect : {"gnu++98", "c++11", "c++14", "c++17", "c++20"}) {
+    compile("c++", dialect, "cpp", headers);
+  }
+}
+
+TEST(SsmHeaders, TakeNoNamesThatProgramsUse) {
+  const std::string folder = make_temp_dir();
+  std::ofstream(folder + "/program.cpp")
+      << "#include <libssm.h>\n#include <ssm.hpp>\n#include <ssmp.hpp>\n"
+         "static void ctrlC(int) {}\nbool gShutOff;\nvoid setSigInt() {}\n"
+         "#ifdef PI\n#error PI\n#endif\nconst double PI = 3;\n"
+         "struct node {}; struct edge {}; int get_unit(); int Time, Duration, Stream, Error;\n"
+         "namespace dssm { int mine; }\n"
+         "int main() { ctrlC(0); setSigInt(); node n; edge e; (void)n; (void)e; }\n";
+  const Finished finished = run({"c++", "-std=gnu++98", "-fsyntax-only",
+                                 "-I" + source("client/ssm/include"), folder + "/program.cpp"});
+  EXPECT_EQ(finished.exit_status, 0) << finished.err;
+  remove_tree(folder);
+}
+
+// The names of libssm.map, all of them declared in a header, and those that the library exports.
+TEST(SsmLibrary, ExportsTheDocumentedNamesAndNothingElse) {
+  std::ifstream map(source("client/ssm/libssm.map"));
+  std::set<std::string> documented;
+  for (std::string word; map >> word;) {
+    if (word.back() != ';' || word == "*;" || word == "};") continue;
+    documented.insert(word.substr(0, word.size() - 1));
+  }
+  const Finished finished = run({"nm", "-D", "--defined-only", built("client/ssm/libssm.so")});
+  ASSERT_EQ(finished.exit_status, 0) << finished.err;
+  std::set<std::string> exported;
+  std::istringstream lines(finished.out);
+  for (std::string address, kind, name; lines >> address >> kind >> name;) {
+    if (kind == "A") continue;  // the version's own name
+    exported.insert(name.substr(0, name.find('@')));
+  }
+  EXPECT_EQ(exported, documented);
+  std::string headers;
+  for (const char* header : {"ssm.h", "ssm-time.h", "libssm.h", "ssm.hpp"}) {
+    std::ifstream file(source("client/ssm/include/") + header);
+    headers.append(std::istreambuf_iterator<char>(file), {});
+  }
+  for (const std::string& name : documented) {
+    EXPECT_TRUE(std::regex_search(headers, std::regex("\\b" + name + "[(;]"))) << name;
+  }
+}
+
+TEST(SsmLibrary, PkgConfigGivesPlainFlags) {
+  const std::string path = "PKG_CONFIG_PATH=" + built("meson-private");
+  const Finished libs = run({"pkg-config", "--libs", "ssm"}, {path});
+  EXPECT_EQ(libs.exit_status, 0) << libs.err;
+  EXPECT_NE(libs.out.find("-lssm"), std::string::npos) << libs.out;
+  const Finished flags = run({"pkg-config", "--cflags", "ssm"}, {path});
+  EXPECT_EQ(flags.out.find("-std="), std::string::npos) << flags.out;  // C and C++98 use it
+}
+
+}  // namespace
+}  // namespace dssm::test
