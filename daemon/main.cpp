@@ -29,6 +29,7 @@ constexpr int kFailed = 1, kUsage = 2;
 Result<void> run(const Config& config, Logger& logger) {
   raise_descriptor_limit();
   ignore_broken_pipes();
+  silence_protobuf();
   const Result<RuntimeDir> dir = RuntimeDir::open(config.runtime_dir);
   if (!dir) return dir.error();
   Result<EventLoop> loop = EventLoop::open();

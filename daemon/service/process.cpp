@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/service/process.hpp"
 
+#include <google/protobuf/stubs/logging.h>
 #include <signal.h>
 #include <sys/resource.h>
 
@@ -14,5 +15,7 @@ void raise_descriptor_limit() noexcept {
 }
 
 void ignore_broken_pipes() noexcept { ::signal(SIGPIPE, SIG_IGN); }
+
+void silence_protobuf() noexcept { google::protobuf::SetLogHandler(nullptr); }
 
 }  // namespace dssm::daemon

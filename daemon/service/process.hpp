@@ -12,4 +12,8 @@ void raise_descriptor_limit() noexcept;
 // A program that vanished while it was written to is an error code, not the end.
 void ignore_broken_pipes() noexcept;
 
+// libprotobuf writes a line to stderr for each malformed string that a client sends: unbounded, and
+// waiting where nobody reads stderr. dssmd says itself what it refuses.
+void silence_protobuf() noexcept;
+
 }  // namespace dssm::daemon

@@ -13,6 +13,7 @@
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/local/local_service.hpp"
+#include "daemon/service/process.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -119,6 +120,11 @@ void run(std::span<const std::uint8_t> input) {
 
 }  // namespace
 }  // namespace dssm::daemon
+
+extern "C" int LLVMFuzzerInitialize(int*, char***) {
+  dssm::daemon::silence_protobuf();
+  return 0;
+}
 
 extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
   dssm::daemon::run({data, size});

@@ -4,6 +4,7 @@
 // nobody else notices.
 #include <fcntl.h>
 #include <gtest/gtest.h>
+#include <signal.h>
 #include <sys/socket.h>
 #include <unistd.h>
 
@@ -177,6 +178,35 @@ TEST_F(BadClient, ThatStopsInTheMiddleOfAFrameIsNotMissed) {
     client.send_bytes(std::string_view(frame).substr(0, frame.size() / 2));
   }
   EXPECT_EQ(good_.ask(list_request()).response.stream_list().streams_size(), 0);
+}
+
+// stderr is a pipe that nobody reads: neither dssmd's own lines nor a library's may wait for it.
+TEST(BadClients, DoNotStopADssmdWhoseLogNobodyReads) {
+  const std::string dir = make_temp_dir(), path = dir + "/dssmd.sock";
+  int ends[2];
+  ASSERT_EQ(::pipe2(ends, O_CLOEXEC), 0);
+  const pid_t pid = ::fork();
+  ASSERT_GE(pid, 0);
+  if (pid == 0) {
+    ::dup2(ends[1], 2);
+    const std::string program = built("daemon/dssmd");
+    ::execl(program.c_str(), "dssmd", "--runtime-dir", dir.c_str(), "--name", "pc1", nullptr);
+    ::_exit(127);
+  }
+  ASSERT_TRUE(eventually([&] { return wire::connect_unix(path).has_value(); }));
+  for (int i = 0; i < 1000; ++i) {  // some 150 bytes of log each, a pipe holds 64 KiB
+    RawClient client(path, false);
+    client.send_bytes("\x05\x12\x03\x12\x01\xff");  // a Hello whose program is no UTF-8
+    while (!client.receive().ended) {
+    }
+  }
+  RawClient good(path);
+  EXPECT_TRUE(good.ask(list_request()).response.has_stream_list());
+  ::kill(pid, SIGTERM);
+  EXPECT_EQ(wait_for(pid), 0);
+  ::close(ends[0]);
+  ::close(ends[1]);
+  remove_tree(dir);
 }
 
 TEST(Limits, OnClientsIsNamedToTheOneThatIsTooMany) {
