@@ -145,6 +145,52 @@ void waiting_for_each_other() {
   reader.close();
 }
 
+struct Frame {
+  int numbers[16384];
+};
+
+int racing_writer() {
+  static SSMApi<Frame> writer("torn", 0);
+  if (!initSSM() || !writer.create(0.1, 0.1)) return 1;
+  for (int n = 0;; ++n) {
+    for (int i = 0; i < 16384; ++i) writer.data.numbers[i] = n;
+    if (!writer.write(n)) return 2;
+  }
+}
+
+void check_whole(const Frame& frame, int tid, ssmTimeT time) {
+  bool whole = true;
+  for (int i = 0; i < 16384; ++i) whole = whole && frame.numbers[i] == tid;
+  CHECK(whole);
+  CHECK_SAME(time, tid);
+}
+
+// Two slots, 64 KB, a writer at full speed: the worst case for mixtures of two samples.
+void no_torn_reads() {
+  fflush(stdout);
+  const pid_t pid = fork();
+  if (pid == 0) _exit(racing_writer());
+  static SSMApi<Frame> reader("torn", 0), untouched("torn", 0);
+  reader.setVerbose(false);
+  CHECK(reader.openWait() && untouched.openWait());
+  int good = 0;
+  while (good < 2000) {
+    if (!reader.readLast()) continue;
+    ++good;
+    check_whole(reader.data, reader.timeId, reader.time);
+    untouched.timeId = reader.timeId;
+    if (untouched.read(reader.timeId)) {  // as likely as not overtaken while it copies
+      check_whole(untouched.data, untouched.timeId, untouched.time);
+    } else if (untouched.time > 0) {  // a failed read has stored nothing
+      check_whole(untouched.data, static_cast<int>(untouched.time), untouched.time);
+    }
+  }
+  kill(pid, SIGKILL);
+  waitpid(pid, NULL, 0);
+  reader.close();
+  untouched.close();
+}
+
 int edge_child() {
   SSMApi<Sample> reader("edgy", 7);
   if (!initSSM() || !reader.open()) return 1;
@@ -216,6 +262,7 @@ int main(int argc, char** argv) {
   writers_come_and_go();
   a_killed_writer_blocks_nobody();
   waiting_for_each_other();
+  no_torn_reads();
   edges_between_processes();
   cycles(100);
   cycles(10000);
