@@ -85,8 +85,10 @@ struct Client::Handshake {
         if (!response.ParseFromArray((*message)->data(), static_cast<int>((*message)->size()))) {
           return Error{Errc::protocol, "dssmd's answer is no message of the local protocol"};
         }
+        if (response.has_failure() && (response.serial() == serial || response.serial() == 0)) {
+          return wire::failure(response.failure());  // serial 0: dssmd's last words
+        }
         if (response.serial() != serial) continue;  // an event, or an answer to what was given up
-        if (response.has_failure()) return wire::failure(response.failure());
         return response;
       }
       const auto space = input.space();

@@ -58,6 +58,9 @@ inline void fence_before_filling(bool) noexcept {}
 inline void fence_after_filling(bool) noexcept {}
 inline void fence_after_copying_out(bool) noexcept {}
 
+inline constexpr std::memory_order kProbe = std::memory_order_acquire;
+inline void fence_after_probing() noexcept {}
+
 // Each store is a release: whoever sees a word also sees the odd sequence stored before it.
 inline void copy_in(std::byte* slot, const std::byte* from, std::size_t bytes) noexcept {
   detail::store_words<std::uint64_t>(slot, from, bytes);
@@ -88,6 +91,11 @@ inline void fence_after_filling(bool large) noexcept {
 inline void fence_after_copying_out(bool large) noexcept {
   std::atomic_thread_fence(large ? std::memory_order_seq_cst : std::memory_order_acquire);
 }
+
+// Looks at many entries of the time index, then one fence before `top` is looked at again; pairs
+// with the release store to the index in RingWriter.
+inline constexpr std::memory_order kProbe = std::memory_order_relaxed;
+inline void fence_after_probing() noexcept { std::atomic_thread_fence(std::memory_order_acquire); }
 
 inline void copy_in(std::byte* slot, const std::byte* from, std::size_t bytes) noexcept {
   std::memcpy(slot, from, bytes);

@@ -91,9 +91,8 @@ ReadStatus RingReader::find(Time t, Tid& tid) const noexcept {
     const FoundSample found =
         find_newest_at_or_before(slots_, slots_.oldest_for(top), top, run_start, to_ns(t));
     // The times looked at were those of the tids meant if none of them has left the ring since:
-    // whoever reuses a place in the index has published a top that says so before. Pairs with the
-    // release store to the index in RingWriter.
-    std::atomic_thread_fence(std::memory_order_acquire);
+    // whoever reuses a place in the index has published a top that says so before.
+    fence_after_probing();
     const Tid now = header_->top.load(std::memory_order_relaxed);
     if (found.status == ReadStatus::lapped || found.lowest_probed < slots_.oldest_for(now))
       continue;

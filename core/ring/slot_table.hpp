@@ -51,8 +51,9 @@ class SlotTable {
   // Oldest readable tid when the newest is `top`; kNoTid for an empty ring. SSM's rule: one slot is
   // left out because it may be being overwritten.
   Tid oldest_for(Tid top) const noexcept {
+    if (top < 0) return kNoTid;
     const Tid oldest = top - static_cast<Tid>(depth_) + 2;
-    return top < 0 ? kNoTid : oldest < 0 ? 0 : oldest;
+    return oldest < 0 ? 0 : oldest;
   }
 
  private:

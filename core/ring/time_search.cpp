@@ -3,6 +3,8 @@
 
 #include <algorithm>
 
+#include "core/ring/copy.hpp"
+
 namespace dssm::ring {
 namespace {
 
@@ -13,8 +15,7 @@ class Probe {
 
   std::int64_t time(Tid tid) noexcept {
     lowest_ = std::min(lowest_, tid);
-    // Relaxed: the caller puts one acquire fence behind all probes before it looks at `top` again.
-    return slots_.time_ns(tid).load(std::memory_order_relaxed);
+    return slots_.time_ns(tid).load(kProbe);  // the caller calls fence_after_probing()
   }
   void touch(Tid tid) noexcept { lowest_ = std::min(lowest_, tid); }
   Tid lowest() const noexcept { return lowest_; }

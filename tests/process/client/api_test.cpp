@@ -201,6 +201,17 @@ TEST_F(Api, SaysInWordsWhatIsWrongWithARequest) {
          "107 bytes");
 }
 
+TEST(Connect, TellsWhyItWasTurnedAway) {
+  DaemonProcess daemon({"--max-clients", "1"});
+  auto first = Session::connect({.socket_path = daemon.socket_path()});
+  ASSERT_TRUE(first) << first.error().message;
+  auto second = Session::connect({.socket_path = daemon.socket_path()});
+  ASSERT_FALSE(second);
+  EXPECT_EQ(second.error().code, Errc::limit_exceeded) << second.error().message;
+  EXPECT_NE(second.error().message.find("max_clients"), std::string::npos)
+      << second.error().message;
+}
+
 TEST_F(Api, KeepsPropertiesOfAnySizeUpToTheirLimit) {
   auto writer = make();
   for (const std::size_t bytes : {1, 100, 9000, 1 << 20, 5, 16 << 20}) {

@@ -19,11 +19,6 @@ std::string page(const std::string& name) {
   return text;
 }
 
-std::set<std::string> mentioned_options(const std::string& text) {
-  static const std::regex kOption("--[a-z][a-z-]*");
-  return {std::sregex_token_iterator(text.begin(), text.end(), kOption), {}};
-}
-
 std::set<std::string> all_dssmctl_options() {
   std::set<std::string> all = help_options({});
   for (const std::string& verb : help_verbs({})) {
@@ -34,8 +29,7 @@ std::set<std::string> all_dssmctl_options() {
 }
 
 TEST(ManPage, OfDssmctlMentionsExactlyTheOptionsThereAre) {
-  std::set<std::string> mentioned = mentioned_options(page("dssmctl.1"));
-  EXPECT_EQ(mentioned, all_dssmctl_options());
+  EXPECT_EQ(long_options(page("dssmctl.1")), all_dssmctl_options());
 }
 
 TEST(ManPage, OfDssmctlHasASectionForEveryVerb) {
@@ -43,7 +37,10 @@ TEST(ManPage, OfDssmctlHasASectionForEveryVerb) {
   for (const std::string& verb : help_verbs({})) {
     EXPECT_NE(text.find("\n.SS " + verb), std::string::npos) << verb;
     for (const std::string& inner : help_verbs({verb})) {
-      EXPECT_TRUE(std::regex_search(text, std::regex("[^a-z]" + inner + "[^a-z]"))) << inner;
+      // "property get" has a section of its own, "playback pause" is a word of its section.
+      EXPECT_TRUE(text.find("\n.SS " + verb + " " + inner) != text.npos ||
+                  text.find(" " + inner + " ", text.find("\n.SS " + verb)) != text.npos)
+          << verb << " " << inner;
     }
   }
   EXPECT_GE(help_verbs({}).size(), 10U);  // the help text was understood at all
@@ -52,7 +49,7 @@ TEST(ManPage, OfDssmctlHasASectionForEveryVerb) {
 TEST(ManPage, OfDssmdMentionsExactlyTheOptionsThereAre) {
   const std::set<std::string> options = described_options(help_text({built("daemon/dssmd")}));
   EXPECT_TRUE(options.contains("--runtime-dir"));
-  EXPECT_EQ(mentioned_options(page("dssmd.8")), options);
+  EXPECT_EQ(long_options(page("dssmd.8")), options);
 }
 
 }  // namespace

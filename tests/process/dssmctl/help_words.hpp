@@ -7,7 +7,6 @@
 #include <gtest/gtest.h>
 
 #include <cstdlib>
-#include <regex>
 #include <set>
 #include <string>
 #include <vector>
@@ -34,12 +33,23 @@ inline std::string dssmctl_help(std::vector<std::string> verb) {
   return help_text(verb);
 }
 
-// The long options that a help text describes: those that begin a line.
-inline std::set<std::string> described_options(const std::string& help) {
-  static const std::regex kOption("(?:^|\\n)  (?:-\\w,)?(--[a-z][a-z-]*)");
+// The long options in a text: "--" and what may belong to an option's name.
+inline std::set<std::string> long_options(const std::string& text) {
+  static constexpr char kLetters[] = "abcdefghijklmnopqrstuvwxyz-";
   std::set<std::string> options;
-  for (std::sregex_iterator i(help.begin(), help.end(), kOption), end; i != end; ++i) {
-    options.insert((*i)[1]);
+  for (std::size_t at = text.find("--"); at != text.npos; at = text.find("--", at + 1)) {
+    const std::size_t end = text.find_first_not_of(kLetters, at);
+    if (end - at > 2) options.insert(text.substr(at, end - at));
+  }
+  return options;
+}
+
+// The long options that a help text describes: those that begin a line, as "--json" or
+// "-n,--count".
+inline std::set<std::string> described_options(const std::string& help) {
+  std::set<std::string> options;
+  for (const std::string& line : lines_of(help)) {
+    if (line.starts_with("  -")) options.merge(long_options(words_of(line).front()));
   }
   return options;
 }

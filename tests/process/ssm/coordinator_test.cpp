@@ -34,7 +34,7 @@ class Coordinator {
     out_ = out[0];
   }
   ~Coordinator() {
-    if (pid > 0) ::kill(pid, SIGKILL), wait_for(pid);
+    if (pid > 0) ::kill(pid, SIGTERM), wait_for(pid);
     ::close(out_);
     remove_tree(folder);
   }
