@@ -22,7 +22,7 @@ using namespace std::chrono_literals;
 
 namespace {
 
-using Payload = std::array<std::byte, 64>;
+using Bytes64 = std::array<std::byte, 64>;
 
 void pin(int cpu) {
   cpu_set_t set;
@@ -37,8 +37,8 @@ pid_t start_reader(const std::string& socket) {
   ::prctl(PR_SET_PDEATHSIG, SIGKILL);
   pin(1);
   Session session = Session::connect({.socket_path = socket}).value();
-  Reader<Payload> reader = session.await_reader<Payload>("busy").value();
-  Payload payload;
+  Reader<Bytes64> reader = session.await_reader<Bytes64>("busy").value();
+  Bytes64 payload;
   SampleInfo info;
   for (;;) {
     (void)reader.latest(payload, info);
@@ -51,9 +51,9 @@ void await_readers(Session& session, std::uint32_t wanted) {
   while (session.info(StreamId{"busy", 0, ""}).value().readers != wanted) ::usleep(1000);
 }
 
-std::vector<double> write_batches(Writer<Payload>& writer, int batches) {
+std::vector<double> write_batches(Writer<Bytes64>& writer, int batches) {
   std::vector<double> ns;
-  const Payload payload{};
+  const Bytes64 payload{};
   std::int64_t time = 0;
   auto write = [&] { writer.write(payload, time_from_ns(++time)); };
   for (int i = 0; i < batches; ++i) ns.push_back(time_batch(1000, write));
@@ -66,7 +66,7 @@ int main() {
   test::DaemonProcess daemon;
   pin(0);
   Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
-  Writer<Payload> writer = session.create<Payload>("busy", History{1000, 1ms}).value();
+  Writer<Bytes64> writer = session.create<Bytes64>("busy", History{1000, 1ms}).value();
   write_batches(writer, 1000);
   print_head();
   std::vector<pid_t> readers;
