@@ -73,6 +73,7 @@ struct Client::Handshake {
     while (!rest.empty()) {
       auto sent = wire::send_some(socket, rest, request_fds);
       if (!sent) return std::move(sent).error();
+      if (sent->status == wire::IoStatus::end) break;  // its last words may be there to read
       if (sent->status != wire::IoStatus::ok) return silence();
       rest = rest.subspan(sent->bytes);
       request_fds = {};
