@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // <ssm.h>: reading, writing and waiting.
+#include <algorithm>
 #include <cstring>
 #include <optional>
 
@@ -101,12 +102,15 @@ int waitTID(SSM_sid sid, SSM_tid tid) {
   if (tid < 0) return 1;
   const dssm::Tid wanted = ring_tid(tid, newest);
   const dssm::MonoTime deadline = dssm::deadline_in(std::chrono::seconds(1));
+  // A handler that closes the sid interrupts the wait; another thread's closing is seen by looking.
+  constexpr dssm::Duration kLook = std::chrono::milliseconds(100);
   for (;;) {
     if (use->newest() >= wanted) return 1;
-    if (use.closed()) return -1;  // by a signal handler, or another thread
-    if (use->wait_for_tid(wanted, deadline) == dssm::WaitStatus::timeout) {
-      return use.closed() ? -1 : use->newest() >= wanted ? 1 : 0;
-    }
+    if (use.closed()) return -1;
+    const dssm::MonoTime now = dssm::MonoClock::now();
+    if (now >= deadline) return 0;
+    const dssm::WaitStatus status = use->wait_for_tid(wanted, std::min(deadline, now + kLook));
+    if (status == dssm::WaitStatus::ready) return 1;
   }
 }
 

@@ -1,7 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "stream.hpp"
 
+#include <sys/mman.h>
+
+#include <algorithm>
 #include <cstring>
+#include <ctime>
 #include <mutex>
 #include <new>
 
@@ -12,7 +16,19 @@ namespace {
 
 // Behind a copy as behind a slot: callbacks of real programs go a few bytes too far.
 constexpr std::size_t kGuardBytes = 64;
-constexpr std::align_val_t kAlignment{64};
+
+// Memory for copies comes from the system and not from the heap: a handler that reads while its own
+// thread reads needs a second one, and may have interrupted malloc().
+std::byte* new_copy(std::size_t payload_bytes) {
+  void* const memory = ::mmap(nullptr, payload_bytes + kGuardBytes, PROT_READ | PROT_WRITE,
+                              MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+  if (memory == MAP_FAILED) throw std::bad_alloc();
+  return static_cast<std::byte*>(memory);
+}
+
+void free_copy(std::byte* copy, std::size_t payload_bytes) noexcept {
+  if (copy) ::munmap(copy, payload_bytes + kGuardBytes);
+}
 
 // A reader that the writer overtakes this often between two looks is not keeping up.
 constexpr int kAttempts = 1000;
@@ -65,7 +81,7 @@ Stream::Stream(RawReader reader, Connect connect)
 Stream::~Stream() {
   delete reader_.load();
   delete writer_.load();
-  ::operator delete(spare_.load(), kAlignment);
+  free_copy(spare_.load(), payload_bytes_);
 }
 
 RawReader* Stream::reader() noexcept {
@@ -108,14 +124,11 @@ Tid Stream::oldest() const noexcept {
 
 Stream::Copy::Copy(Stream& stream)
     : stream_(stream), bytes_(stream.spare_.exchange(nullptr, std::memory_order_acquire)) {
-  if (bytes_) return;
-  const std::size_t size = stream.payload_bytes_ + kGuardBytes;
-  bytes_ = static_cast<std::byte*>(::operator new(size, kAlignment));
-  std::memset(bytes_, 0, size);
+  if (!bytes_) bytes_ = new_copy(stream.payload_bytes_);
 }
 
 Stream::Copy::~Copy() {
-  ::operator delete(stream_.spare_.exchange(bytes_, std::memory_order_acq_rel), kAlignment);
+  free_copy(stream_.spare_.exchange(bytes_, std::memory_order_acq_rel), stream_.payload_bytes_);
 }
 
 template <class Read>
@@ -154,7 +167,11 @@ ReadStatus Stream::find(Time t, SampleInfo& info) noexcept {
 
 WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
   RawReader* const open = reader();
-  if (!open) return WaitStatus::timeout;
+  if (!open) {  // nothing to sleep on; the caller looks again
+    const Duration rest = std::max(Duration(0), deadline - MonoClock::now());
+    const timespec sleep{to_ns(rest) / 1'000'000'000, to_ns(rest) % 1'000'000'000};
+    return ::nanosleep(&sleep, nullptr) == 0 ? WaitStatus::timeout : WaitStatus::interrupted;
+  }
   // Without the lock, so that other threads may read meanwhile: a wait for a given tid uses nothing
   // of the reader that reading changes.
   return open->wait_for_tid(tid, deadline);
