@@ -2,6 +2,18 @@
 #include "core/wire/local_protocol.hpp"
 
 namespace dssm::wire {
+namespace {
+
+TypeInfo type_info(const local::Type& message) {
+  TypeInfo type{message.name(), message.payload_bytes(), message.alignment_bytes(), {}};
+  for (const local::Field& field : message.fields()) {
+    type.fields.push_back({field.name(), static_cast<Scalar>(field.scalar()), field.offset_bytes(),
+                           field.count(), field.stride_bytes()});
+  }
+  return type;
+}
+
+}  // namespace
 
 void to_message(const StreamId& id, local::StreamId& out) {
   out.set_name(id.name);
@@ -64,15 +76,13 @@ Result<TypeInfo> type_untrusted(const local::Type& message) {
                                            " fields; at most " + std::to_string(kMaxFields) +
                                            " are taken: describe fewer"};
   }
-  TypeInfo type{message.name(), message.payload_bytes(), message.alignment_bytes(), {}};
   for (const local::Field& field : message.fields()) {
     if (field.scalar() > 255) {
       return Error{Errc::protocol, "field '" + field.name() + "' has the unknown kind " +
                                        std::to_string(field.scalar())};
     }
-    type.fields.push_back({field.name(), static_cast<Scalar>(field.scalar()), field.offset_bytes(),
-                           field.count(), field.stride_bytes()});
   }
+  TypeInfo type = type_info(message);
   if (Result<void> checked = type.check(); !checked) return std::move(checked).error();
   return type;
 }
@@ -80,12 +90,7 @@ Result<TypeInfo> type_untrusted(const local::Type& message) {
 StreamInfo stream_info(const local::Stream& message) {
   StreamInfo info;
   info.id = {message.id().name(), message.id().id(), message.id().host()};
-  info.type = {
-      message.type().name(), message.type().payload_bytes(), message.type().alignment_bytes(), {}};
-  for (const local::Field& field : message.type().fields()) {
-    info.type.fields.push_back({field.name(), static_cast<Scalar>(field.scalar()),
-                                field.offset_bytes(), field.count(), field.stride_bytes()});
-  }
+  info.type = type_info(message.type());
   info.depth = message.depth();
   info.cycle = Duration(message.cycle_ns());
   info.memory_bytes = message.memory_bytes();

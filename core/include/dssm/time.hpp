@@ -14,34 +14,31 @@ namespace dssm {
 
 using Duration = std::chrono::nanoseconds;
 
-// CLOCK_REALTIME: nanoseconds since 1970-01-01 00:00 UTC. Can be stepped; used for sample stamps
-// only.
-struct WallClock {
+namespace detail {
+
+// A clock of the operating system, as <chrono> wants clocks.
+template <clockid_t kClock, bool kSteady>
+struct PosixClock {
   using duration = Duration;
   using rep = duration::rep;
   using period = duration::period;
-  using time_point = std::chrono::time_point<WallClock, Duration>;
-  static constexpr bool is_steady = false;
+  using time_point = std::chrono::time_point<PosixClock, Duration>;
+  static constexpr bool is_steady = kSteady;
   static time_point now() noexcept {
     timespec ts{};
-    ::clock_gettime(CLOCK_REALTIME, &ts);
+    ::clock_gettime(kClock, &ts);
     return time_point(std::chrono::seconds(ts.tv_sec) + Duration(ts.tv_nsec));
   }
 };
 
+}  // namespace detail
+
+// CLOCK_REALTIME: nanoseconds since 1970-01-01 00:00 UTC. Can be stepped; used for sample stamps
+// only.
+using WallClock = detail::PosixClock<CLOCK_REALTIME, false>;
+
 // CLOCK_MONOTONIC: nanoseconds since boot. Never steps; used for every deadline and time-out.
-struct MonoClock {
-  using duration = Duration;
-  using rep = duration::rep;
-  using period = duration::period;
-  using time_point = std::chrono::time_point<MonoClock, Duration>;
-  static constexpr bool is_steady = true;
-  static time_point now() noexcept {
-    timespec ts{};
-    ::clock_gettime(CLOCK_MONOTONIC, &ts);
-    return time_point(std::chrono::seconds(ts.tv_sec) + Duration(ts.tv_nsec));
-  }
-};
+using MonoClock = detail::PosixClock<CLOCK_MONOTONIC, true>;
 
 using Time = WallClock::time_point;
 using MonoTime = MonoClock::time_point;
