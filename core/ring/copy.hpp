@@ -56,7 +56,7 @@ void load_words(std::byte*& to, const std::byte*& from, std::size_t& bytes) noex
 
 inline void fence_before_filling(bool) noexcept {}
 inline void fence_after_filling(bool) noexcept {}
-inline void fence_after_copying_out(bool) noexcept {}
+inline void fence_after_copying_out() noexcept {}
 
 inline constexpr std::memory_order kProbe = std::memory_order_acquire;
 inline void fence_after_probing() noexcept {}
@@ -75,21 +75,31 @@ inline void copy_out(std::byte* to, const std::byte* slot, std::size_t bytes) no
 
 #else
 
+// Orders all stores before it before all stores after it, also those that x86 leaves unordered.
+inline void store_fence() noexcept {
+#if defined(__x86_64__)
+  __builtin_ia32_sfence();
+#else
+  std::atomic_thread_fence(std::memory_order_release);
+#endif
+}
+
 // After the odd sequence, before the first byte of the payload: nobody sees new bytes under an even
 // sequence. Pairs with fence_after_copying_out().
 inline void fence_before_filling(bool large) noexcept {
-  std::atomic_thread_fence(large ? std::memory_order_seq_cst : std::memory_order_release);
+  std::atomic_thread_fence(std::memory_order_release);
+  if (large) store_fence();
 }
 
 // After the last byte, before the even sequence. The release store of the sequence orders ordinary
 // stores; a large copy may have used others.
 inline void fence_after_filling(bool large) noexcept {
-  if (large) std::atomic_thread_fence(std::memory_order_seq_cst);
+  if (large) store_fence();
 }
 
 // After the last byte was read, before the sequence is looked at again.
-inline void fence_after_copying_out(bool large) noexcept {
-  std::atomic_thread_fence(large ? std::memory_order_seq_cst : std::memory_order_acquire);
+inline void fence_after_copying_out() noexcept {
+  std::atomic_thread_fence(std::memory_order_acquire);
 }
 
 // Looks at many entries of the time index, then one fence before `top` is looked at again; pairs

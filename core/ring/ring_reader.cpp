@@ -39,7 +39,7 @@ ReadStatus RingReader::locate(Tid tid, Place& place, SampleInfo& info) const noe
 
 bool RingReader::still_valid(const std::atomic<std::uint64_t>& sequence,
                              std::uint64_t expected) noexcept {
-  fence_after_copying_out(true);
+  fence_after_copying_out();
   return sequence.load(std::memory_order_relaxed) == expected;
 }
 
@@ -53,7 +53,7 @@ ReadStatus RingReader::read(Tid tid, std::span<std::byte> payload,
   if (slot.sequence.load(std::memory_order_acquire) != published) return ReadStatus::too_old;
   const SampleInfo seen = load_info(slot, tid);
   copy_out(payload.data(), SlotTable::payload(slot), slots_.payload_bytes());
-  fence_after_copying_out(slots_.payload_bytes() >= kLargeBytes);
+  fence_after_copying_out();
   if (slot.sequence.load(std::memory_order_relaxed) != published) return ReadStatus::too_old;
   info = seen;
   return ReadStatus::ok;

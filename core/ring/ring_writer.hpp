@@ -37,7 +37,7 @@ class RingWriter {
   void unlock() noexcept;
   void recover() noexcept;
   Tid publish(Time time, Duration clock_error) noexcept;
-  void notify() noexcept;
+  void follow_up(Tid tid) noexcept;
 
   RingHeader* header_;
   SlotTable slots_;

@@ -17,6 +17,12 @@ class Probe {
     lowest_ = std::min(lowest_, tid);
     return slots_.time_ns(tid).load(kProbe);  // the caller calls fence_after_probing()
   }
+  // Fetches the slot of a likely answer while its time is being looked at.
+  void expect(Tid tid) const noexcept {
+    const SlotHeader& slot = slots_.slot(tid);
+    __builtin_prefetch(&slot);
+    __builtin_prefetch(&slot + 1);  // the payload's first line
+  }
   void touch(Tid tid) noexcept { lowest_ = std::min(lowest_, tid); }
   Tid lowest() const noexcept { return lowest_; }
 
@@ -43,6 +49,7 @@ Tid search_run(Probe& probe, Tid low, Tid high, std::int64_t low_ns, std::int64_
   // streams with a gap; more would only delay the galloping on irregular ones.
   for (int step = 0; step < 2 && high - low > 1; ++step) {
     const Tid guess = interpolate(low, high, low_ns, high_ns, t_ns);
+    if (step == 0) probe.expect(guess);
     const std::int64_t guess_ns = probe.time(guess);
     Tid width = 1;
     if (guess_ns <= t_ns) {
