@@ -2,9 +2,9 @@
 //
 // dssmd killed and started again under load: readers and writers go on in their rings, offer them
 // back, and not one sample is lost, torn or delivered twice.
+#include <fcntl.h>
 #include <gtest/gtest.h>
-#include <sys/prctl.h>
-#include <sys/wait.h>
+#include <unistd.h>
 
 #include <atomic>
 #include <csignal>
@@ -189,32 +189,25 @@ TEST(Restart, DaemonKeepsNothingOfClientsThatWereKilled) {
   Session session = connect(daemon);
   for (int round = 0; round < 50; ++round) {
     int started[2];
-    ASSERT_EQ(::pipe(started), 0);
-    const pid_t child = ::fork();
-    if (child == 0) {
-      ::prctl(PR_SET_PDEATHSIG, SIGKILL);
-      Session mine = connect(daemon);
-      for (int i = 0;; ++i) {
-        auto writer =
-            mine.create<Counted>("victim:" + std::to_string(i % 3), History{16, 1ms}).value();
-        writer.write(counted(i));
-        auto reader = mine.open_reader<Counted>("victim:" + std::to_string(i % 3)).value();
-        if (i == round % 7) (void)!::write(started[1], "x", 1);
-      }
-    }
+    ASSERT_EQ(::pipe2(started, O_CLOEXEC), 0);
+    const pid_t victim =
+        test::start({test::built("tests/process/client/victim"), std::to_string(round % 7)},
+                    {daemon.environment()}, started[1]);
+    ::close(started[1]);
     char byte = 0;
-    ASSERT_EQ(::read(started[0], &byte, 1), 1);
-    ::kill(child, SIGKILL);
-    ::waitpid(child, nullptr, 0);
-    ::close(started[0]), ::close(started[1]);
+    ASSERT_EQ(::read(started[0], &byte, 1), 1) << "it ended by itself";
+    ::kill(victim, SIGKILL);
+    test::wait_for(victim);
+    ::close(started[0]);
   }
   // Its sockets are closed by the kernel before its death is reported; dssmd has them on its loop.
   while (session.clients().value().size() != 1) std::this_thread::yield();
   EXPECT_EQ(session.opens().value().size(), 0u);
   for (const StreamInfo& stream : session.list().value()) {
-    auto writer = session.open_writer<Counted>(stream.id.str());
+    auto writer = session.open_raw_writer(stream.id);
     ASSERT_TRUE(writer) << writer.error().message;
-    EXPECT_EQ(writer->write(counted(0)), stream.newest + 1) << "and its lock is free";
+    EXPECT_EQ(writer->write(std::vector<std::byte>(128), Time()), stream.newest + 1)
+        << "and its lock is free";
   }
 }
 
