@@ -7,7 +7,6 @@
 #include <cstdlib>
 #include <fstream>
 #include <iterator>
-#include <regex>
 #include <set>
 #include <sstream>
 
@@ -105,7 +104,11 @@ TEST(SsmLibrary, ExportsTheDocumentedNamesAndNothingElse) {
     headers.append(std::istreambuf_iterator<char>(file), {});
   }
   for (const std::string& name : documented) {
-    EXPECT_TRUE(std::regex_search(headers, std::regex("\\b" + name + "[(;]"))) << name;
+    const bool declared = headers.find(" " + name + "(") != std::string::npos ||
+                          headers.find("*" + name + "(") != std::string::npos ||
+                          headers.find("* " + name + "(") != std::string::npos ||
+                          headers.find("*" + name + ";") != std::string::npos;
+    EXPECT_TRUE(declared) << name;
   }
 }
 

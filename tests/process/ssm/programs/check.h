@@ -65,6 +65,7 @@ CHECK_HELPER static void check_begin(int argc, char **argv) {
     exit(2);
   }
   strcpy(check_folder, argv[1]);
+  setvbuf(stdout, NULL, _IOLBF, 0); /* what was found before a crash or a hang is seen */
 }
 
 CHECK_HELPER static void catch_stderr(void) {
