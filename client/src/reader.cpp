@@ -67,14 +67,16 @@ ReadStatus RawReader::tid(Tid tid, std::span<std::byte> payload, SampleInfo& inf
 ReadStatus RawReader::next(std::span<std::byte> payload, SampleInfo& info) noexcept {
   if (state_->fresh) return latest(payload, info);
   DSSM_CHECK(payload.size() == payload_bytes());
+  Tid wanted = state_->cursor + 1;
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
-    const Tid wanted = std::max(state_->cursor + 1, state_->ring.oldest());
     const ReadStatus status = state_->ring.read(wanted, payload, info);
-    if (status == ReadStatus::too_old) continue;  // lapped just now: go on with the new oldest
-    if (status != ReadStatus::ok) return ReadStatus::not_yet;
-    state_->lost += static_cast<std::uint64_t>(wanted - (state_->cursor + 1));
-    state_->took(wanted);
-    return ReadStatus::ok;
+    if (status == ReadStatus::not_yet) return status;
+    if (status == ReadStatus::ok) {
+      state_->lost += static_cast<std::uint64_t>(wanted - (state_->cursor + 1));
+      state_->took(wanted);
+      return status;
+    }
+    wanted = std::max(wanted, state_->ring.oldest());  // lapped: go on with the oldest there is
   }
   return ReadStatus::lapped;
 }

@@ -37,7 +37,8 @@ class Loan {
   explicit operator bool() const noexcept { return !payload_.empty(); }
 
   // The slot's payload, payload_bytes() long, aligned to 64 bytes; its content is unspecified. At
-  // least 64 bytes behind its end belong to nobody. Empty without a loan.
+  // least 64 bytes behind its end belong to nobody. Empty without a loan. Who fills it with
+  // non-temporal stores of their own ends them with a store fence (x86: sfence), as always.
   std::span<std::byte> payload() const noexcept { return payload_; }
 
   // Makes the sample visible, stamped with `time`, and gives its tid. kNoTid without a loan.
