@@ -68,7 +68,8 @@ Error with_similar_names(Error error, Session& session, const StreamId& wanted) 
   }
   std::vector<std::string> names;
   for (const StreamInfo& stream : *streams) {
-    if (stream.id == wanted) return error;  // it is there: something of it was not found
+    // It is there: something of it was not found.
+    if (stream.id.name == wanted.name && stream.id.id == wanted.id) return error;
     names.push_back(short_name(stream.id));
   }
   const std::vector<std::string> similar = similar_names(short_name(wanted), std::move(names));

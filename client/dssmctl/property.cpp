@@ -76,10 +76,6 @@ Result<void> run_property_get(const Options& options, Output& out) {
   if (!session) return std::move(session).error();
   Result<std::vector<std::byte>> property = session->property(*id);
   if (!property) return with_similar_names(std::move(property).error(), *session, *id);
-  if (property->empty()) {
-    return Error{Errc::not_found, "get the property of '" + id->str() +
-                                      "': none is set; 'dssmctl property set' sets one"};
-  }
   const bool to_file = options.file != "-";
   if (to_file) {
     if (Result<void> written = write_all(options.file, *property); !written) return written;

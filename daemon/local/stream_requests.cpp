@@ -232,7 +232,8 @@ Result<Reply> StreamRequests::get_property(const local::GetProperty& request) {
     return std::move(property).error().context("stream '" + (*stream)->id().str() + "'");
   }
   if (property->empty()) {
-    return Error{Errc::not_found, "stream '" + (*stream)->id().str() + "' has no property set"};
+    return Error{Errc::not_found, "stream '" + (*stream)->id().str() +
+                                      "' has no property set; `dssmctl property set` sets one"};
   }
   Reply reply;
   reply.response.mutable_property()->set_property(*std::move(property));

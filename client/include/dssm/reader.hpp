@@ -34,8 +34,8 @@ struct ReaderState;
 // then believe what was computed. Valid no longer than the reader it came from.
 class BorrowedSample {
  public:
-  // The payload; aligned to 64 bytes. May change while it is looked at: treat as untrusted until
-  // still_valid() says true.
+  // The payload; aligned to 64 bytes, and the 64 bytes behind it can be read as well. May change
+  // while it is looked at: treat as untrusted until still_valid() says true.
   std::span<const std::byte> payload() const noexcept { return payload_; }
   const SampleInfo& info() const noexcept { return info_; }
 
@@ -139,7 +139,7 @@ class RawReader {
   // (kNever: no limit; a deadline in the past: just look).
   WaitStatus wait(MonoTime deadline) noexcept;
 
-  // The same for newest() >= `tid`.
+  // The same for newest() >= `tid`. May run in one thread while another one uses this reader.
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
 
   // A descriptor for poll(), epoll or an event library: readable when there may be samples newer

@@ -4,6 +4,8 @@
 //
 //   threads  one writer object belongs to one thread at a time; several writers of one stream, in
 //            any threads and processes, are serialised by the ring's robust lock
+//   signals  not from a handler that may interrupt a write to the same stream in its own thread:
+//            it would wait for itself
 //   cost     a copy; no system call unless a reader sleeps on the stream or a remote one is
 //            subscribed. A writer that dies at any instruction blocks nobody.
 //   life     a writer keeps its ring mapped, and stays usable after its Session object is gone and

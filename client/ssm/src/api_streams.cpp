@@ -207,7 +207,6 @@ int get_propertySSM(const char* stream_name, int stream_id, void* data) {
   auto session = process().session();
   auto property = session ? session->property(*id) : std::move(session).error();
   if (!property) return remember_error(property.error().message), 0;
-  if (property->empty()) return 0;  // none is set
   std::memcpy(data, property->data(), property->size());
   return 1;
 }
@@ -226,7 +225,6 @@ int dssm_ssm_get_property(const char* stream_name, int stream_id, void* data, si
   auto session = process().session();
   auto property = session ? session->property(*id) : std::move(session).error();
   if (!property) return remember_error(property.error().message), 0;
-  if (property->empty()) return 0;  // none is set
   if (property->size() != size) {
     report_error("get the property of " + quoted(stream_name, stream_id) + " : it has " +
                  std::to_string(property->size()) + " bytes, this program's type " +
