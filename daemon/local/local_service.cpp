@@ -150,10 +150,8 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
 }
 
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
-  Reply reply;
-  reply.response.mutable_done();
-  clients_.at(number).watching = true;
-  send(clients_.at(number), serial, std::move(reply));
+  // First what is there, then the answer: who watched before a reconnect knows from it that it has
+  // been told all, and that what was not among it is gone.
   for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
     const auto client = clients_.find(number);
     if (client == clients_.end()) return;
@@ -161,6 +159,12 @@ void LocalService::watch(ClientNumber number, std::uint64_t serial) {
     requests_.describe(*stream, *event.response.mutable_stream_event()->mutable_stream());
     send(client->second, 0, std::move(event));
   }
+  const auto client = clients_.find(number);
+  if (client == clients_.end()) return;
+  client->second.watching = true;
+  Reply reply;
+  reply.response.mutable_done();
+  send(client->second, serial, std::move(reply));
 }
 
 void LocalService::list_clients(const Client& client, std::uint64_t serial) {

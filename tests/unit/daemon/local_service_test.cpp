@@ -306,8 +306,10 @@ TEST(LocalService, TellsWatchersWhatIsThereAndWhatChanges) {
   client.ask(create_request("a"));
   local::Request watch;
   watch.mutable_watch();
-  EXPECT_TRUE(watcher.ask(watch).has_done());
-  EXPECT_EQ(watcher.next().stream_event().stream().id().name(), "a");
+  const local::Response there = watcher.ask(watch);
+  EXPECT_EQ(there.serial(), 0u);
+  EXPECT_EQ(there.stream_event().stream().id().name(), "a");
+  EXPECT_TRUE(watcher.next().has_done()) << "the answer comes when all has been told";
   client.ask(create_request("b"));
   const local::Response added = watcher.next();
   EXPECT_EQ(added.serial(), 0u);
