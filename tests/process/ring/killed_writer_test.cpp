@@ -20,8 +20,11 @@ namespace {
 
 constexpr std::size_t kPayloadBytes = 64;
 
-#if defined(__SANITIZE_ADDRESS__) || defined(DSSM_TSAN)
 // A sanitizer multiplies instructions and the cost of a fork: it gets a sample of them.
+#if defined(DSSM_TSAN)
+constexpr int kStride = 197;
+constexpr int kRounds = 50;
+#elif defined(__SANITIZE_ADDRESS__)
 constexpr int kStride = 41;
 constexpr int kRounds = 100;
 #else
