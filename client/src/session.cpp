@@ -166,7 +166,7 @@ Result<std::vector<StreamInfo>> Session::list() {
   if (!answer) return std::move(answer).error().context("list the streams");
   std::vector<StreamInfo> streams;
   streams.reserve(static_cast<std::size_t>(answer->response.stream_list().streams_size()));
-  for (const local::Stream& stream : answer->response.stream_list().streams()) {
+  for (const proto::Stream& stream : answer->response.stream_list().streams()) {
     streams.push_back(wire::stream_info(stream));
   }
   return streams;

@@ -18,7 +18,7 @@
 namespace dssm::ring {
 
 inline constexpr std::uint64_t kMagic = 0x474e49524d535344;  // "DSSMRING"
-inline constexpr std::uint32_t kLayoutVersion = 1;
+inline constexpr std::uint32_t kLayoutVersion = 2;
 inline constexpr std::size_t kPageBytes = 4096;
 inline constexpr std::size_t kLineBytes = 64;
 
@@ -49,7 +49,8 @@ static_assert(std::atomic<std::uint32_t>::is_always_lock_free);
 //   384    64 reserved         -      -           zero: keeps the lock's line from top's neighbour
 //   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
 //   520     8 run_start        tid    writer      before top; see "Search by time"
-//   528  3568 reserved         -      -           zero
+//   528     8 first            tid    dssmd       before top; > 0 only in mirrors: see "Window"
+//   536  3560 reserved         -      -           zero
 struct RingHeader {
   std::uint64_t magic;
   std::uint32_t layout_version;
@@ -74,12 +75,14 @@ struct RingHeader {
   std::byte reserved2[128];
   std::atomic<std::int64_t> top;
   std::atomic<std::int64_t> run_start;
-  std::byte reserved3[3568];
+  std::atomic<std::int64_t> first;
+  std::byte reserved3[3560];
 };
 static_assert(sizeof(pthread_mutex_t) <= 64);
 static_assert(offsetof(RingHeader, incarnation) == 64 && offsetof(RingHeader, name) == 88);
 static_assert(offsetof(RingHeader, host) == 128 && offsetof(RingHeader, lock) == 320);
 static_assert(offsetof(RingHeader, top) == 512 && offsetof(RingHeader, run_start) == 520);
+static_assert(offsetof(RingHeader, first) == 528);
 static_assert(sizeof(RingHeader) == kPageBytes);
 
 //   off size field           unit  written by  order

@@ -61,6 +61,7 @@ Result<UniqueFd> create_ring(const RingIdentity& identity, const Geometry& geome
   init_robust_lock(header.lock);
   header.top.store(kNoTid, std::memory_order_relaxed);
   header.run_start.store(0, std::memory_order_relaxed);
+  header.first.store(0, std::memory_order_relaxed);
   header.layout_version = kLayoutVersion;
   header.magic = kMagic;
   ::munmap(page, sizeof(RingHeader));

@@ -10,7 +10,8 @@
 
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_memory.hpp"
-#include "core/ring/slot_table.hpp"
+#include "core/ring/robust_lock.hpp"
+#include "core/ring/sample_publisher.hpp"
 
 namespace dssm::ring {
 
@@ -24,26 +25,35 @@ class RingWriter {
   // holds the lock already (a loan).
   Tid write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
 
+  // The same without waiting for another writer: for dssmd, whose loop must not wait for a program.
+  struct Attempt {
+    enum class Outcome : unsigned char {
+      written,
+      busy,     // another writer is at it: try again soon
+      refused,  // somebody has damaged the lock
+    } outcome;
+    Tid tid;
+  };
+  Attempt try_write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
+
   // In place: begin() takes the lock and gives the next slot's payload (nullptr when this thread
   // holds it already); then exactly one of commit() and cancel(), in the same thread.
   std::byte* begin() noexcept;
   Tid commit(Time time, Duration clock_error) noexcept;
   void cancel() noexcept;
 
-  Tid newest() const noexcept { return header_->top.load(std::memory_order_acquire); }
+  Tid newest() const noexcept { return publisher_.newest(); }
 
  private:
   bool lock() noexcept;
+  bool take(LockResult result) noexcept;
   void unlock() noexcept;
-  void recover() noexcept;
-  Tid publish(Time time, Duration clock_error) noexcept;
+  Tid write_locked(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
   void follow_up(Tid tid) noexcept;
 
-  RingHeader* header_;
-  SlotTable slots_;
+  SamplePublisher publisher_;
   Bell* bell_;
   int doorbell_;
-  bool large_;  // payload so large that memcpy may use non-temporal stores
 };
 
 }  // namespace dssm::ring

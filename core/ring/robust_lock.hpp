@@ -26,15 +26,26 @@ inline void init_robust_lock(pthread_mutex_t& mutex) noexcept {
 enum class LockResult : unsigned char {
   locked,
   recovered,  // locked; the last holder died: repair what it may have left half done
+  busy,       // try_lock_robust() only: somebody holds it
   refused,    // somebody with write access has damaged the mutex
 };
 
-inline LockResult lock_robust(pthread_mutex_t& mutex) noexcept {
-  const int result = pthread_mutex_lock(&mutex);
+namespace detail {
+inline LockResult lock_result(pthread_mutex_t& mutex, int result) noexcept {
   if (result == 0) return LockResult::locked;
+  if (result == EBUSY) return LockResult::busy;
   if (result != EOWNERDEAD) return LockResult::refused;
   pthread_mutex_consistent(&mutex);
   return LockResult::recovered;
+}
+}  // namespace detail
+
+inline LockResult lock_robust(pthread_mutex_t& mutex) noexcept {
+  return detail::lock_result(mutex, pthread_mutex_lock(&mutex));
+}
+
+inline LockResult try_lock_robust(pthread_mutex_t& mutex) noexcept {
+  return detail::lock_result(mutex, pthread_mutex_trylock(&mutex));
 }
 
 }  // namespace dssm::ring

@@ -19,7 +19,8 @@ constexpr std::uint64_t published_sequence(Tid tid) noexcept {
 class SlotTable {
  public:
   explicit SlotTable(const RingMapping& mapping) noexcept
-      : times_(reinterpret_cast<std::atomic<std::int64_t>*>(mapping.base() +
+      : first_(&mapping.header().first),
+        times_(reinterpret_cast<std::atomic<std::int64_t>*>(mapping.base() +
                                                             mapping.geometry().times_offset)),
         slots_(mapping.base() + mapping.geometry().slots_offset),
         depth_(mapping.geometry().depth),
@@ -49,14 +50,18 @@ class SlotTable {
   std::atomic<std::int64_t>& time_ns(Tid tid) const noexcept { return times_[index(tid)]; }
 
   // Oldest readable tid when the newest is `top`; kNoTid for an empty ring. SSM's rule: one slot is
-  // left out because it may be being overwritten.
+  // left out because it may be being overwritten. A mirror holds nothing before `first`; one beyond
+  // `top` says that a gap is just being crossed: then only the newest sample is sure to be there.
   Tid oldest_for(Tid top) const noexcept {
     if (top < 0) return kNoTid;
+    const Tid first = first_->load(std::memory_order_acquire);
+    if (first > top) return top;
     const Tid oldest = top - static_cast<Tid>(depth_) + 2;
-    return oldest < 0 ? 0 : oldest;
+    return oldest < first ? first : oldest;
   }
 
  private:
+  const std::atomic<std::int64_t>* first_;
   std::atomic<std::int64_t>* times_;
   std::byte* slots_;
   std::uint64_t depth_, slot_bytes_, payload_bytes_, inverse_;

@@ -10,17 +10,12 @@
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
+#include "core/wire/io_result.hpp"
 
 namespace dssm::wire {
 
 // More descriptors in one message are a protocol error of the sender. We never send more than 4.
 inline constexpr std::size_t kMaxFdsPerMessage = 16;
-
-enum class IoStatus : unsigned char { ok, would_block, end };
-struct IoResult {
-  IoStatus status = IoStatus::ok;
-  std::size_t bytes = 0;
-};
 
 // Sends as much of `bytes` as the socket takes, with `fds` attached to the first byte (when at
 // least one byte went, the descriptors went). SIGPIPE is suppressed; a vanished peer is `end`.

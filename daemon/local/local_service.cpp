@@ -228,7 +228,7 @@ void LocalService::on_stream_removed(const StreamId& id) {
 bool LocalService::must_wait(const local::Request& request) const {
   if (!recovering_ || request.has_offer()) return false;
   if (request.has_open_clock()) return !request.open_clock().offered() && !clock_.has_one();
-  const local::StreamId* subject = StreamRequests::subject(request);
+  const proto::StreamId* subject = StreamRequests::subject(request);
   if (!subject) return false;
   // A name that is no name is refused at once.
   const Result<StreamId> id = wire::stream_id_untrusted(*subject);

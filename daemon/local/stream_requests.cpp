@@ -71,7 +71,7 @@ Result<Reply> StreamRequests::handle_untrusted(const Client& client, const local
                ") does not know such a request; install the same version of DSSM on both sides"};
 }
 
-const local::StreamId* StreamRequests::subject(const local::Request& request) noexcept {
+const proto::StreamId* StreamRequests::subject(const local::Request& request) noexcept {
   switch (request.body_case()) {
     case local::Request::kCreate:
       return &request.create().id();
@@ -92,7 +92,7 @@ const local::StreamId* StreamRequests::subject(const local::Request& request) no
   }
 }
 
-void StreamRequests::describe(const Stream& stream, local::Stream& out) const {
+void StreamRequests::describe(const Stream& stream, proto::Stream& out) const {
   StreamInfo info = stream.info();
   const OpenTable::Counts counts = opens_.counts(stream);
   info.writers = counts.writers;
@@ -100,7 +100,7 @@ void StreamRequests::describe(const Stream& stream, local::Stream& out) const {
   wire::to_message(info, out);
 }
 
-Result<std::shared_ptr<Stream>> StreamRequests::find_untrusted(const local::StreamId& id) const {
+Result<std::shared_ptr<Stream>> StreamRequests::find_untrusted(const proto::StreamId& id) const {
   const Result<StreamId> checked = wire::stream_id_untrusted(id);
   if (!checked) return checked.error();
   return registry_.find(*checked);
@@ -184,10 +184,10 @@ Result<Reply> StreamRequests::remove(const local::Remove& request) {
 
 Result<Reply> StreamRequests::list() {
   Reply reply;
-  local::StreamList& list = *reply.response.mutable_stream_list();
+  proto::StreamList& list = *reply.response.mutable_stream_list();
   std::size_t bytes = 0;
   for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
-    local::Stream& entry = *list.add_streams();
+    proto::Stream& entry = *list.add_streams();
     describe(*stream, entry);
     bytes += entry.ByteSizeLong();
     if (bytes > kMaxListBytes) {
@@ -203,10 +203,10 @@ Result<Reply> StreamRequests::info(const local::Info& request) {
   const Result<std::shared_ptr<Stream>> stream = find_untrusted(request.id());
   if (!stream) return stream.error();
   Reply reply;
-  local::Stream& entry = *reply.response.mutable_stream_list()->add_streams();
+  proto::Stream& entry = *reply.response.mutable_stream_list()->add_streams();
   describe(**stream, entry);
   for (const StreamUser& user : opens_.users(**stream)) {
-    local::User& message = *entry.add_users();
+    proto::User& message = *entry.add_users();
     message.set_pid(user.pid);
     message.set_uid(user.uid);
     message.set_program(user.program);

@@ -40,10 +40,10 @@ class StreamRequests {
                                  DescriptorQueue& descriptors);
 
   // The stream that `request` is about; nullptr for requests about none.
-  static const local::StreamId* subject(const local::Request& request) noexcept;
+  static const proto::StreamId* subject(const local::Request& request) noexcept;
 
   // What List and Info tell of a stream, without its users.
-  void describe(const Stream& stream, local::Stream& out) const;
+  void describe(const Stream& stream, proto::Stream& out) const;
 
  private:
   Result<Reply> create(const Client& client, const local::Create& request);
@@ -60,7 +60,7 @@ class StreamRequests {
   Result<Reply> list_opens();
   Result<Reply> get_daemon();
 
-  Result<std::shared_ptr<Stream>> find_untrusted(const local::StreamId& id) const;
+  Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
   void note_open(const Client& client, const std::shared_ptr<Stream>& stream, Role role,
                  std::uint32_t tag, local::Opened& opened);
 

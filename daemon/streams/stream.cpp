@@ -49,7 +49,7 @@ local::StreamMeta meta_of(const Stream::Plan& plan, std::string_view property) {
 // Takes the memory of a ring and of its type's description from the budget.
 Result<MemoryShare> take_share(MemoryBudget& budget, const TypeInfo& type,
                                const ring::Geometry& geometry) {
-  local::Type message;
+  proto::Type message;
   wire::to_message(type, message);
   const std::size_t type_bytes = message.ByteSizeLong();
   if (type_bytes > kMaxTypeBytes) {

@@ -66,7 +66,7 @@ TEST(KilledClient, LeavesNothingInDssmdWheneverItIsKilled) {
     ASSERT_EQ(watcher.ask(list_opens_request()).response.open_list().opens_size(), 0);
     const local::Response list = watcher.ask(list_request()).response;
     ASSERT_EQ(list.stream_list().streams_size(), 4) << "streams survive their users";
-    for (const local::Stream& stream : list.stream_list().streams()) {
+    for (const proto::Stream& stream : list.stream_list().streams()) {
       ASSERT_EQ(stream.writers() + stream.readers(), 0u);
     }
     ASSERT_EQ(open_descriptors(daemon.pid()), descriptors);

@@ -50,7 +50,7 @@ TEST(Load, ServesAThousandStreamsAndAThousandClientsAtOnce) {
   }
   const local::Response list = clients[0].ask(list_request()).response;
   ASSERT_EQ(list.stream_list().streams_size(), 1000);
-  for (const local::Stream& stream : list.stream_list().streams()) {
+  for (const proto::Stream& stream : list.stream_list().streams()) {
     ASSERT_EQ(stream.writers(), 1u);
     ASSERT_EQ(stream.readers(), 1u);
   }

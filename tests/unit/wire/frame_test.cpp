@@ -78,18 +78,18 @@ TEST(FrameBuffer, RefusesALengthThatIsNoVarint) {
 TEST(LocalProtocol, CarriesTypesThereAndBack) {
   const TypeInfo type{
       "Odometry", 40, 8, {{"x", Scalar::float64, 0, 1, 8}, {"v", Scalar::int32, 8, 8, 4}}};
-  local::Type message;
+  proto::Type message;
   to_message(type, message);
   EXPECT_EQ(type_untrusted(message).value(), type);
   const StreamId id{"lidar", 3, "pc2"};
-  local::StreamId id_message;
+  proto::StreamId id_message;
   to_message(id, id_message);
   EXPECT_EQ(stream_id_untrusted(id_message).value(), id);
 }
 
 TEST(LocalProtocol, CarriesEveryErrorCode) {
   for (int code = 0; code <= static_cast<int>(Errc::system); ++code) {
-    local::Failure message;
+    proto::Failure message;
     to_message(Error{static_cast<Errc>(code), "why"}, message);
     EXPECT_EQ(failure(message).code, static_cast<Errc>(code));
     EXPECT_EQ(failure(message).message, "why");
@@ -97,7 +97,7 @@ TEST(LocalProtocol, CarriesEveryErrorCode) {
 }
 
 TEST(LocalProtocol, ChecksTypesThatCome) {
-  local::Type message;
+  proto::Type message;
   message.set_payload_bytes(8);
   message.set_alignment_bytes(8);
   EXPECT_TRUE(type_untrusted(message));
@@ -105,7 +105,7 @@ TEST(LocalProtocol, ChecksTypesThatCome) {
   EXPECT_FALSE(type_untrusted(message));
   message.clear_fields();
   for (std::size_t i = 0; i <= kMaxFields; ++i) {
-    local::Field& field = *message.add_fields();
+    proto::Field& field = *message.add_fields();
     field.set_scalar(static_cast<std::uint32_t>(Scalar::uint8));
     field.set_count(1);
   }

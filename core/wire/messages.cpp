@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "core/wire/local_protocol.hpp"
+#include "core/wire/messages.hpp"
 
 namespace dssm::wire {
 namespace {
 
-TypeInfo type_info(const local::Type& message) {
+TypeInfo type_info(const proto::Type& message) {
   TypeInfo type{message.name(), message.payload_bytes(), message.alignment_bytes(), {}};
-  for (const local::Field& field : message.fields()) {
+  for (const proto::Field& field : message.fields()) {
     type.fields.push_back({field.name(), static_cast<Scalar>(field.scalar()), field.offset_bytes(),
                            field.count(), field.stride_bytes()});
   }
@@ -15,18 +15,18 @@ TypeInfo type_info(const local::Type& message) {
 
 }  // namespace
 
-void to_message(const StreamId& id, local::StreamId& out) {
+void to_message(const StreamId& id, proto::StreamId& out) {
   out.set_name(id.name);
   out.set_id(id.id);
   out.set_host(id.host);
 }
 
-void to_message(const TypeInfo& type, local::Type& out) {
+void to_message(const TypeInfo& type, proto::Type& out) {
   out.set_name(type.name);
   out.set_payload_bytes(type.payload_bytes);
   out.set_alignment_bytes(type.alignment_bytes);
   for (const Field& field : type.fields) {
-    local::Field& message = *out.add_fields();
+    proto::Field& message = *out.add_fields();
     message.set_name(field.name);
     message.set_scalar(static_cast<std::uint32_t>(field.kind));
     message.set_offset_bytes(field.offset_bytes);
@@ -35,7 +35,7 @@ void to_message(const TypeInfo& type, local::Type& out) {
   }
 }
 
-void to_message(const StreamInfo& info, local::Stream& out) {
+void to_message(const StreamInfo& info, proto::Stream& out) {
   to_message(info.id, *out.mutable_id());
   to_message(info.type, *out.mutable_type());
   out.set_depth(info.depth);
@@ -51,7 +51,7 @@ void to_message(const StreamInfo& info, local::Stream& out) {
   out.set_writers(info.writers);
   out.set_readers(info.readers);
   for (const StreamUser& user : info.users) {
-    local::User& message = *out.add_users();
+    proto::User& message = *out.add_users();
     message.set_pid(user.pid);
     message.set_uid(user.uid);
     message.set_program(user.program);
@@ -59,24 +59,24 @@ void to_message(const StreamInfo& info, local::Stream& out) {
   }
 }
 
-void to_message(const Error& error, local::Failure& out) {
+void to_message(const Error& error, proto::Failure& out) {
   out.set_code(std::string(errc_name(error.code)));
   out.set_message(error.message);
 }
 
-Result<StreamId> stream_id_untrusted(const local::StreamId& message) {
+Result<StreamId> stream_id_untrusted(const proto::StreamId& message) {
   StreamId id{message.name(), message.id(), message.host()};
   if (Result<void> checked = id.check(); !checked) return std::move(checked).error();
   return id;
 }
 
-Result<TypeInfo> type_untrusted(const local::Type& message) {
+Result<TypeInfo> type_untrusted(const proto::Type& message) {
   if (static_cast<std::size_t>(message.fields_size()) > kMaxFields) {
     return Error{Errc::limit_exceeded, "a type with " + std::to_string(message.fields_size()) +
                                            " fields; at most " + std::to_string(kMaxFields) +
                                            " are taken: describe fewer"};
   }
-  for (const local::Field& field : message.fields()) {
+  for (const proto::Field& field : message.fields()) {
     if (field.scalar() > 255) {
       return Error{Errc::protocol, "field '" + field.name() + "' has the unknown kind " +
                                        std::to_string(field.scalar())};
@@ -87,7 +87,7 @@ Result<TypeInfo> type_untrusted(const local::Type& message) {
   return type;
 }
 
-StreamInfo stream_info(const local::Stream& message) {
+StreamInfo stream_info(const proto::Stream& message) {
   StreamInfo info;
   info.id = {message.id().name(), message.id().id(), message.id().host()};
   info.type = type_info(message.type());
@@ -103,14 +103,14 @@ StreamInfo stream_info(const local::Stream& message) {
   info.rate_hz = message.rate_hz();
   info.writers = message.writers();
   info.readers = message.readers();
-  for (const local::User& user : message.users()) {
+  for (const proto::User& user : message.users()) {
     info.users.push_back(
         {user.pid(), user.uid(), user.program(), user.writer() ? Role::writer : Role::reader});
   }
   return info;
 }
 
-Error failure(const local::Failure& message) {
+Error failure(const proto::Failure& message) {
   constexpr Errc kCodes[] = {Errc::invalid_argument, Errc::not_found,      Errc::already_exists,
                              Errc::type_mismatch,    Errc::limit_exceeded, Errc::no_memory,
                              Errc::no_permission,    Errc::no_daemon,      Errc::daemon_away,

@@ -1,0 +1,172 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// PConnector: a stream of another PC for a process without a dssmd on its own PC. It speaks the
+// network protocol itself, over one TCP connection (a channel) to the dssmd that owns the stream.
+// Where a local dssmd runs, a Session is better: it finds streams by itself and shares one channel
+// among all readers.
+//
+//   threads  one object belongs to one thread at a time. It has no thread of its own: it reads its
+//            connection inside the calls, so a subscription that is not asked for a long time stays
+//            in the owner's ring, and what the ring then no longer holds is a counted gap
+//   cost     a read is one request and its answer: one round trip. A subscribed sample is one
+//            receive, straight into the caller's memory for large payloads
+//   trouble  when the connection breaks, calls reconnect (at most request_timeout, then
+//            daemon_away), subscriptions resume at the tid they had, and posted samples are sent
+//            again from where the owner stopped: each is written once
+//   moved    a moved-from object may only be assigned to or destroyed
+#pragma once
+
+#include <cstddef>
+#include <dssm/describe.hpp>
+#include <dssm/sample.hpp>
+#include <dssm/stream.hpp>
+#include <memory>
+#include <optional>
+#include <span>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
+
+namespace detail {
+struct PConnectorState;
+}
+
+struct PConnectorOptions {
+  // Where dssmd listens: "pc2", "10.0.0.2:13776", "[::1]:13776". Without a port $DSSM_PORT, else
+  // 13776. Empty: the host in the stream's name, else "127.0.0.1". A name that the system's
+  // resolver does not know is looked for in the catalog of this PC's dssmd, when there is one.
+  std::string address = {};
+  std::string program = {};  // shown on the other side; empty: this program's name
+  Duration request_timeout = std::chrono::seconds(5);
+  // Samples that post() keeps while the connection is down, beyond which the oldest are dropped and
+  // counted.
+  std::uint64_t max_unsent_samples = 1024;
+  std::uint64_t max_unsent_bytes = 64U << 20;
+};
+
+// Which samples a subscription brings.
+struct Subscription {
+  enum class Start : std::uint8_t {
+    now,     // what is written from now on
+    oldest,  // all that the owner's ring holds, then what is written
+    tid,     // from `tid` on, or the oldest held
+    time,    // from the newest sample with time <= `time` on, or the oldest held
+  };
+  Start start = Start::now;
+  Tid tid = 0;
+  Time time{};
+  double max_rate_hz = 0;  // > 0: at most so many per second, the newest one at each time
+};
+
+class PConnector {
+ public:
+  // Connects and opens an existing stream. With `wanted`, fails with type_mismatch unless
+  // TypeInfo::check_usable_as(wanted).
+  //   fails  no_daemon (nobody listens there), not_found, type_mismatch, protocol, daemon_away,
+  //          invalid_argument (address)
+  static Result<PConnector> open(const StreamId& id, PConnectorOptions options = {},
+                                 const TypeInfo* wanted = nullptr);
+  // The same, creating the stream there when it does not exist.
+  //   fails  besides: limit_exceeded, no_memory
+  static Result<PConnector> create(const StreamId& id, const TypeInfo& type, const History& history,
+                                   PConnectorOptions options = {});
+
+  // Streams that the dssmd at `options.address` owns.
+  static Result<std::vector<StreamInfo>> list(PConnectorOptions options = {});
+
+  PConnector(PConnector&&) noexcept;
+  PConnector& operator=(PConnector&&) noexcept;
+  ~PConnector();  // sends what was posted, at most for 1 s
+
+  // --- reading: one round trip each -----------------------------------------------------------
+  // `payload` is exactly payload_bytes() long; it and `info` are set only when the result is ok.
+  //   returns  as RawReader's functions of these names
+  //   fails    daemon_away, protocol
+  Result<ReadStatus> latest(std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> tid(Tid tid, std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> at(Time t, std::span<std::byte> payload, SampleInfo& info);
+  // The newest sample if its tid is above `than`, else not_yet.
+  Result<ReadStatus> newer(Tid than, std::span<std::byte> payload, SampleInfo& info);
+
+  // kNoTid while nothing is written.
+  Result<Tid> newest();
+  Result<Tid> oldest();
+  // Tid of the newest sample with time <= t; kNoTid when there is none.
+  Result<Tid> find(Time t);
+
+  // --- subscription ---------------------------------------------------------------------------
+
+  // Samples come by themselves from now on, to be taken by next(). A second call replaces the
+  // first subscription.
+  Result<void> subscribe(const Subscription& what);
+  Result<void> unsubscribe();  // opens the channel anew; samples under way are dropped
+
+  // Copies the next sample of the subscription, when it has come.
+  //   returns  ok | not_yet
+  //   fails    daemon_away (the connection is down and cannot be had back at the moment; call
+  //   again),
+  //            invalid_argument (no subscription)
+  Result<ReadStatus> next(std::span<std::byte> payload, SampleInfo& info);
+
+  // Waits until next() has something, or until the monotonic clock reaches `deadline`.
+  WaitStatus wait(MonoTime deadline);
+
+  // Samples that the owner's ring no longer held when their turn came.
+  std::uint64_t lost() const noexcept;
+  // How often the owner's ring was replaced by a new one, whose tids begin anew.
+  std::uint64_t restarts() const noexcept;
+
+  // To be polled for reading before next(). May change after a reconnect: ask before each poll.
+  int fd() const noexcept;
+
+  // --- writing --------------------------------------------------------------------------------
+
+  // Writes one sample and waits for its tid in the owner's ring.
+  Result<Tid> write(std::span<const std::byte> payload, Time time = WallClock::now(),
+                    Duration clock_error = kUnknownClockError);
+
+  // Writes one sample without waiting: it is sent, or, while the connection is down, kept and sent
+  // later, in order. For rate.
+  //   fails  invalid_argument (size)
+  Result<void> post(std::span<const std::byte> payload, Time time = WallClock::now(),
+                    Duration clock_error = kUnknownClockError);
+
+  // Waits until all that was posted is in the owner's ring, at most until `deadline`.
+  //   returns  the tid of the last one; kNoTid when nothing was posted
+  Result<Tid> flush(MonoTime deadline);
+
+  // Posted samples that were dropped because too many waited for the connection.
+  std::uint64_t dropped() const noexcept;
+
+  // --- about the stream -----------------------------------------------------------------------
+
+  Result<std::vector<std::byte>> property();
+  Result<void> set_property(std::span<const std::byte> property);
+
+  const StreamId& id() const noexcept;  // with its owner's host
+  const TypeInfo& type() const noexcept;
+  std::uint64_t payload_bytes() const noexcept;
+  std::uint64_t depth() const noexcept;
+  Duration cycle() const noexcept;
+  std::uint64_t incarnation() const noexcept;
+  bool connected() const noexcept;
+  const std::string& address() const noexcept;  // connected to, or to be
+
+  // How payloads moved inside this process, for tests and benchmarks: copied once out of the input
+  // buffer, or received where the caller wants them.
+  struct Counters {
+    std::uint64_t samples = 0, copied_payload_bytes = 0, direct_payload_bytes = 0;
+    std::uint64_t reconnects = 0;
+  };
+  Counters counters() const noexcept;
+
+ private:
+  explicit PConnector(std::unique_ptr<detail::PConnectorState> state) noexcept;
+  std::unique_ptr<detail::PConnectorState> state_;
+};
+
+}  // namespace dssm
+#pragma GCC visibility pop

@@ -1,0 +1,30 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The way between the messages of proto/common.proto and the public types, for both protocols. The
+// functions named *_untrusted check every value they take over.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <dssm/stream.hpp>
+
+#include "common.pb.h"
+
+namespace dssm::wire {
+
+inline constexpr std::size_t kMaxPropertyBytes = 16U << 20;
+inline constexpr std::size_t kMaxFields = 1024;
+inline constexpr std::size_t kMaxProgramBytes = 127;
+
+// Public types to messages.
+void to_message(const StreamId& id, proto::StreamId& out);
+void to_message(const TypeInfo& type, proto::Type& out);
+void to_message(const StreamInfo& info, proto::Stream& out);
+void to_message(const Error& error, proto::Failure& out);
+
+// Messages to public types.
+Result<StreamId> stream_id_untrusted(const proto::StreamId& message);
+Result<TypeInfo> type_untrusted(const proto::Type& message);
+StreamInfo stream_info(const proto::Stream& message);
+Error failure(const proto::Failure& message);
+
+}  // namespace dssm::wire

@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Shared by both ends of the network protocol: version, limits, and the greeting.
+#pragma once
+
+#include <array>
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <string>
+#include <vector>
+
+#include "core/wire/messages.hpp"
+#include "network.pb.h"
+
+namespace dssm::wire {
+
+inline constexpr std::uint32_t kNetworkProtocolVersion = 1;
+inline constexpr std::size_t kMaxNetworkFrameBytes = 17U << 20;  // without a payload
+inline constexpr std::size_t kMaxFeatures = 32;
+inline constexpr std::size_t kMaxFeatureBytes = 63;
+inline constexpr std::string_view kFeatureTorn = "torn";  // network.proto, Frame.torn
+
+// Heartbeats of control connections, and when their silence means death (design: within 3 s).
+inline constexpr Duration kHeartbeat = std::chrono::seconds(1);
+inline constexpr Duration kSilenceIsDeath = std::chrono::milliseconds(2800);
+// For the first Hello of a connection to be complete.
+inline constexpr Duration kHelloTimeout = std::chrono::seconds(3);
+
+using HostId = std::array<std::uint8_t, 16>;
+
+// Who is at one end of a connection. A value.
+struct Greeting {
+  std::string host;  // host's name, checked: 1 to 31 letters, digits and '-'
+  HostId host_id{};
+  std::uint64_t life = 0;  // differs between two lives of one process
+  std::string program;     // "dssmd", "mapper"
+  std::string version;
+  std::vector<std::string> features;
+  Duration clock_bound = kUnknownClockError;
+
+  bool has_feature(std::string_view feature) const noexcept;
+  std::string str() const;  // "'mapper' on host 'pc3'", "dssmd of host 'pc2'"
+};
+
+void to_message(const Greeting& greeting, net::Hello& out);
+
+// Takes over the other side's Hello.
+//   fails  protocol: another version (the message names both versions and both sides, and says what
+//          to do), or values out of their limits
+//   who    for the message: "dssmd at '10.0.0.2:13776'", "the program at '10.0.0.3:40000'"
+Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string& who);
+
+// This PC's id for a dssmd that calls its host `name`: from the machine id (machine-id(5)), which
+// is not told to others, and the name, so that several dssmd with different names on one machine
+// are different hosts. Without a machine id: random, and with it different after each start.
+HostId host_id_for(std::string_view name);
+
+// Random and never 0.
+std::uint64_t random_number();
+
+// The clock bound for the wire and back.
+Duration clock_bound_untrusted(const net::ClockStatus& status) noexcept;
+void to_message(Duration clock_bound, net::ClockStatus& out);
+
+}  // namespace dssm::wire

@@ -1,0 +1,40 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// TCP sockets as DSSM uses them: non-blocking, close-on-exec, without Nagle's delay, and with a
+// kernel that notices within about 3 s that the other PC is gone (keep-alive probes and
+// TCP_USER_TIMEOUT), so that idle channels need no heartbeats of their own.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <memory>
+
+#include "core/base/unique_fd.hpp"
+#include "core/wire/address.hpp"
+#include "core/wire/transport.hpp"
+
+namespace dssm::wire {
+
+// Listens at `address`; IPv6 sockets take IPv6 only, so that "0.0.0.0" and "::" go side by side.
+// Non-blocking; SO_REUSEADDR, so that a restarted dssmd gets its port back.
+//   fails  with what to do: the port is taken (by whom is for `ss -ltnp`), no such address here
+Result<UniqueFd> listen_tcp(const SocketAddress& address);
+
+// The address that a socket is bound to (after listening on port 0), or connected to.
+Result<SocketAddress> local_address(int socket);
+Result<SocketAddress> peer_address(int socket);
+
+// Begins to connect; the socket becomes writable when it is done or failed, then ask
+// finish_connect().
+Result<UniqueFd> start_connect(const SocketAddress& address);
+
+// How connecting ended; the error says whom and why ("connect to '10.0.0.2:13776': Connection
+// refused; is dssmd running there, and does it listen on that address?").
+Result<void> finish_connect(int socket, const SocketAddress& address);
+
+// Sets the options named above on a connected or accepted socket.
+void set_channel_options(int socket) noexcept;
+
+// A transport over a connected socket; takes it over.
+std::unique_ptr<Transport> make_tcp_transport(UniqueFd socket);
+
+}  // namespace dssm::wire

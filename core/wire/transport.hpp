@@ -1,0 +1,38 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The seam between frames and what carries them: TCP today, TLS over TCP in a later round, a pair
+// of buffers in tests.
+#pragma once
+
+#include <sys/uio.h>
+
+#include <dssm/result.hpp>
+#include <span>
+
+#include "core/wire/io_result.hpp"
+
+namespace dssm::wire {
+
+// One connection's bytes. A resource with one owner; one thread at a time. Never waits: the
+// descriptor is non-blocking, whoever wants to wait polls fd().
+class Transport {
+ public:
+  Transport() = default;
+  Transport(const Transport&) = delete;
+  Transport& operator=(const Transport&) = delete;
+  virtual ~Transport() = default;
+
+  // Sends as much of `parts` (at most 16), in order, as goes without waiting.
+  //   more  further bytes follow at once: the last packet may wait for them (MSG_MORE)
+  //   returns  ok with the number of bytes (0 < bytes) | would_block | end (the peer is gone)
+  virtual Result<IoResult> send(std::span<const iovec> parts, bool more) = 0;
+
+  // Receives into `spaces`, in order.
+  //   returns  ok with the number of bytes (0 < bytes) | would_block | end
+  virtual Result<IoResult> receive(std::span<const iovec> spaces) = 0;
+
+  // Readable or writable when receive() or send() may go on.
+  virtual int fd() const noexcept = 0;
+};
+
+}  // namespace dssm::wire

@@ -1,0 +1,97 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Keeps one outgoing connection up: looks the address up, connects, greets, and when the connection
+// breaks does it all again, after a pause that grows from kFirstPause to kLongestPause and never
+// gives up. Used by PeerLink (control connections), mirrors and remote writers (channels).
+#pragma once
+
+#include <functional>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "core/wire/address.hpp"
+#include "core/wire/network_protocol.hpp"
+#include "daemon/channel/frame_link.hpp"
+#include "daemon/service/event_loop.hpp"
+
+namespace dssm::daemon {
+
+// Looks names up without keeping the loop waiting: one thread, asked one name at a time. Destroyed,
+// it forgets what was asked. One per dssmd.
+class Resolver {
+ public:
+  explicit Resolver(const EventLoop& loop);
+  Resolver(const Resolver&) = delete;
+  Resolver& operator=(const Resolver&) = delete;
+  ~Resolver();
+
+  using Then = std::function<void(Result<std::vector<wire::SocketAddress>>)>;
+  // Calls `then` from the loop, later; not after the returned ticket is gone.
+  using Ticket = std::shared_ptr<void>;
+  Ticket resolve(const wire::Address& address, Then then);
+
+ private:
+  struct State;
+  std::unique_ptr<State> state_;
+};
+
+class Dialer final : private FrameLink::User {
+ public:
+  static constexpr Duration kFirstPause = std::chrono::milliseconds(50);
+  static constexpr Duration kLongestPause = std::chrono::seconds(2);
+  static constexpr Duration kConnectTimeout = std::chrono::seconds(2);  // of one address
+
+  class User {
+   public:
+    // Both greetings are exchanged: ask away. `link` is the dialer's and good until on_down().
+    virtual void on_up(FrameLink& link, const wire::Greeting& them) = 0;
+    virtual Result<void> on_frame(net::Frame& frame) = 0;
+    virtual Result<void> on_sample_begin(const wire::IncomingSample&, std::byte*&) {
+      return Error{Errc::protocol, "a sample came on a connection that carries none"};
+    }
+    virtual Result<void> on_sample_end(const wire::IncomingSample&, bool) { return {}; }
+    virtual void on_batch_end() {}
+    virtual void on_output_empty() {}
+    // The connection broke, or an attempt failed; the dialer goes on trying by itself. Called for
+    // each failed attempt too.
+    virtual void on_down(const Error& why) = 0;
+
+   protected:
+    ~User() = default;
+  };
+
+  struct Options {
+    wire::Address address;  // looked up anew for each round of attempts
+    wire::Greeting self;    // what to say
+    std::size_t max_queued_bytes = 1U << 20;
+  };
+
+  // Starts at once. resolver, loop and user outlive it. Destroying it, outside of its own
+  // callbacks, closes the connection.
+  Dialer(const EventLoop& loop, Resolver& resolver, Options options, User& user);
+  Dialer(const Dialer&) = delete;
+  Dialer& operator=(const Dialer&) = delete;
+  ~Dialer();
+
+  // Tries at once instead of waiting for the pause to end (the other side just showed up).
+  void hurry();
+  // Closes the connection, if there is one, and begins anew: on_down() follows from the loop.
+  void restart(const Error& why);
+
+  FrameLink* link() noexcept;             // nullptr unless up
+  std::string address() const;            // connected to, else as configured
+  bool crosses_network() const noexcept;  // connected to another address than loopback
+
+ private:
+  struct State;
+  std::unique_ptr<State> state_;
+  Result<void> on_frame(net::Frame& frame) override;
+  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
+  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
+  void on_batch_end() override;
+  void on_output_empty() override;
+  void on_closed(const Error& why) override;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,78 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What the programs of this PC may ask of other hosts, as LocalService sees it. Answers come later,
+// by a function that is called once, from the loop, or at once from within the call.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <dssm/stream.hpp>
+#include <functional>
+#include <memory>
+#include <string>
+#include <vector>
+
+#include "daemon/streams/stream.hpp"
+#include "local.pb.h"
+
+namespace dssm::daemon {
+
+class Fleet {
+ public:
+  template <class T>
+  using Then = std::function<void(Result<T>)>;
+
+  // Told about changes on other hosts.
+  class Observer {
+   public:
+    virtual void on_remote_stream_added(const StreamInfo& stream) = 0;
+    virtual void on_remote_stream_removed(const StreamId& id) = 0;
+    // Readers of `stream` (a mirror's ring) shall open it anew: there is a new ring.
+    virtual void on_ring_replaced(const Stream& stream) = 0;
+
+   protected:
+    ~Observer() = default;
+  };
+  virtual void observe(Observer* observer) = 0;  // nullptr: none
+
+  // Whether some other host owns `id`: `id` names another host, or it names none and a known host
+  // has it. Own streams are looked for first, by the caller.
+  virtual bool is_remote(const StreamId& id) const = 0;
+
+  // The mirror of a stream, filled with its history. Kept while its Stream is in the OpenTable, and
+  // some seconds longer.
+  virtual void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) = 0;
+
+  // A ring of this host that is published into the other host's stream. `plan`: create the stream
+  // there unless it exists; nullptr: it must exist.
+  struct CreatePlan {
+    TypeInfo type;
+    History history;
+  };
+  virtual void open_writer(const StreamId& id, const CreatePlan* plan,
+                           Then<std::shared_ptr<Stream>> then) = 0;
+
+  // A mirror's or remote writer's ring that a program held while dssmd was away, to be gone on
+  // with.
+  virtual Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
+                                                          OfferedFiles files) = 0;
+
+  virtual void info(const StreamId& id, Then<proto::Stream> then) = 0;  // with mirror, when it has
+  virtual void get_property(const StreamId& id, Then<std::string> then) = 0;
+  virtual void set_property(const StreamId& id, std::string property, Then<void> then) = 0;
+  virtual void remove(const StreamId& id, Then<void> then) = 0;
+
+  // The streams of all other hosts, with fresh figures of those that answer within kFreshTimeout,
+  // in the order of hosts' names, then of creation.
+  static constexpr Duration kFreshTimeout = std::chrono::milliseconds(500);
+  virtual void list(Then<std::vector<proto::Stream>> then) = 0;
+  // What is in the catalog now, without asking anybody: for Watch.
+  virtual std::vector<StreamInfo> known_streams() const = 0;
+
+  virtual std::vector<local::Host> hosts() const = 0;  // this one first
+  virtual void ping(const std::string& host, Then<local::RoundTrip> then) = 0;
+
+ protected:
+  ~Fleet() = default;
+};
+
+}  // namespace dssm::daemon
