@@ -11,6 +11,7 @@
 #include <string>
 #include <vector>
 
+#include "daemon/channel/remote_writer_keeper.hpp"
 #include "daemon/streams/stream.hpp"
 #include "local.pb.h"
 
@@ -43,13 +44,9 @@ class Fleet {
   virtual void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) = 0;
 
   // A ring of this host that is published into the other host's stream. `plan`: create the stream
-  // there unless it exists; nullptr: it must exist.
-  struct CreatePlan {
-    TypeInfo type;
-    History history;
-  };
+  // there unless it exists; nullptr: it must exist. `id` names the host unless `plan` is nullptr.
   virtual void open_writer(const StreamId& id, const CreatePlan* plan,
-                           Then<std::shared_ptr<Stream>> then) = 0;
+                           Then<OpenedRemoteWriter> then) = 0;
 
   // A mirror's or remote writer's ring that a program held while dssmd was away, to be gone on
   // with.
