@@ -25,6 +25,9 @@ constexpr timeval kSocketTimeout{.tv_sec = 2, .tv_usec = 0};
 constexpr Duration kFirstPause = 10ms;
 constexpr Duration kLongestPause = 200ms;
 
+// Of events about opens that are not noted yet: as many as threads may be opening at once.
+constexpr std::size_t kMaxReplacedEarly = 1024;
+
 std::string default_socket_path() {
   const char* path =
       std::getenv("DSSM_SOCKET");  // NOLINT(concurrency-mt-unsafe): read once, at connect
@@ -43,6 +46,14 @@ SessionOptions completed(SessionOptions options) {
   return options;
 }
 
+local::Request open_request(const StreamId& id, bool for_writing, std::uint32_t tag) {
+  local::Request request;
+  wire::to_message(id, *request.mutable_open()->mutable_id());
+  request.mutable_open()->set_for_writing(for_writing);
+  request.mutable_open()->set_tag(tag);
+  return request;
+}
+
 std::size_t fds_with_answer(const local::Request& request) {
   if (request.has_create()) return 4;
   if (request.has_open()) return request.open().for_writing() ? 4 : 3;
@@ -53,6 +64,11 @@ std::size_t fds_with_answer(const local::Request& request) {
 }  // namespace
 
 OpenStream::~OpenStream() { client->close(*this); }
+
+void OpenStream::supersede() const noexcept {
+  superseded->store(true, std::memory_order_release);
+  ring->bell->ring();  // who sleeps on the old ring shall look up
+}
 
 // --- setting up a connection
 // -----------------------------------------------------------------------
@@ -156,8 +172,16 @@ void Client::offer_streams(Handshake& link) {
                        held.ring->doorbell_fd.get()};
     auto opened =
         link.exchange(std::move(request), std::span(fds).first(held.role == Role::writer ? 4 : 3));
-    // Refused: another ring has that name by now. The holders keep this one, for themselves.
-    if (!opened || !opened->has_opened()) continue;
+    if (!opened || !opened->has_opened()) {
+      // Refused. The holders keep this ring, for themselves; readers go on with the one that has
+      // its name by now.
+      const std::lock_guard guard(mutex_);
+      const auto entry = open_streams_.find(held.key);
+      if (!opened && opened.error().code == Errc::conflict && entry != open_streams_.end()) {
+        entry->second->supersede();
+      }
+      continue;
+    }
     bool closed_meanwhile = true;
     {
       const std::lock_guard guard(mutex_);
@@ -267,6 +291,8 @@ Result<Answer> Client::call(local::Request request, std::span<const int> fds) {
 
 Result<std::shared_ptr<OpenStream>> Client::open(local::Request request, Role role,
                                                  std::uint32_t tag) {
+  const proto::StreamId& name = request.has_create() ? request.create().id() : request.open().id();
+  const StreamId asked{name.name(), name.id(), name.host()};
   auto answer = call(std::move(request));
   if (!answer) return std::move(answer).error();
   if (!answer->response.has_opened()) {
@@ -282,7 +308,7 @@ Result<std::shared_ptr<OpenStream>> Client::open(local::Request request, Role ro
                          opened.created());
   std::shared_ptr<OpenStream> stream;
   if (ring) {
-    stream = std::make_shared<OpenStream>(shared_from_this(), *id, *type, role, tag, *ring);
+    stream = std::make_shared<OpenStream>(shared_from_this(), asked, *id, *type, role, tag, *ring);
     if (Result<void> done = register_stream(*stream, *answer); !done)
       return std::move(done).error();
     if ((*ring)->mapping->geometry().payload_bytes != type->payload_bytes) {
@@ -300,6 +326,14 @@ Result<std::shared_ptr<OpenStream>> Client::open(local::Request request, Role ro
   return std::move(ring).error();
 }
 
+Result<std::shared_ptr<OpenStream>> Client::open_reader(const StreamId& id, std::uint32_t tag) {
+  return open(open_request(id, false, tag), Role::reader, tag);
+}
+
+Result<std::shared_ptr<OpenStream>> Client::open_writer(const StreamId& id, std::uint32_t tag) {
+  return open(open_request(id, true, tag), Role::writer, tag);
+}
+
 // Notes the stream under the handle of its answer. When the connection broke in between, a
 // restarted dssmd does not know of us: offer the ring.
 Result<void> Client::register_stream(OpenStream& stream, const Answer& answer) {
@@ -309,6 +343,7 @@ Result<void> Client::register_stream(OpenStream& stream, const Answer& answer) {
     open_streams_[stream.key] = &stream;
     if (answer.connection == connection_ && socket_) {
       stream.handle = answer.response.opened().handle();
+      if (std::erase(replaced_early_, stream.handle) > 0) stream.supersede();
       return {};
     }
     if (!socket_) return {};  // the keeper offers it with the others
@@ -407,6 +442,15 @@ void Client::on_stream_event(const local::StreamEvent& message) {
   for (const auto& [key, on_event] : watches_) on_event(event);
 }
 
+void Client::on_replaced(std::uint64_t handle) {
+  const std::lock_guard guard(mutex_);
+  for (const auto& [key, stream] : open_streams_) {
+    if (stream->handle == handle) return stream->supersede();
+  }
+  // Its open was answered, but the thread that asked has not noted it yet; or it is closed.
+  if (replaced_early_.size() < kMaxReplacedEarly) replaced_early_.push_back(handle);
+}
+
 // The answer to Watch comes behind the events for the streams that are there: what was not among
 // them went while dssmd was away.
 void Client::on_rewatched() {
@@ -446,6 +490,7 @@ void Client::start_using(UniqueFd socket) {
 void Client::stop_using() {
   const std::lock_guard guard(mutex_);
   socket_.reset();
+  replaced_early_.clear();
   for (auto& [serial, in_flight] : in_flight_) {
     if (in_flight.waiter) in_flight.waiter->broken = true;
   }
@@ -509,6 +554,7 @@ Result<void> Client::read_connection(int socket) {
 Result<void> Client::dispatch(local::Response response, std::vector<UniqueFd>& fds) {
   if (response.serial() == 0) {
     if (response.has_stream_event()) on_stream_event(response.stream_event());
+    if (response.has_replaced()) on_replaced(response.replaced().handle());
     return {};
   }
   std::unique_lock lock(mutex_);

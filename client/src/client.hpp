@@ -9,6 +9,7 @@
 // may be repeated without harm.
 #pragma once
 
+#include <atomic>
 #include <condition_variable>
 #include <dssm/session.hpp>
 #include <map>
@@ -26,9 +27,11 @@ class Client;
 
 // One stream opened by one reader or writer; ends at dssmd when destroyed.
 struct OpenStream {
-  OpenStream(std::shared_ptr<Client> owner, StreamId stream, TypeInfo payload_type, Role user_role,
-             std::uint32_t user_tag, std::shared_ptr<const SharedRing> shared)
+  OpenStream(std::shared_ptr<Client> owner, StreamId asked_for, StreamId stream,
+             TypeInfo payload_type, Role user_role, std::uint32_t user_tag,
+             std::shared_ptr<const SharedRing> shared)
       : client(std::move(owner)),
+        asked(std::move(asked_for)),
         id(std::move(stream)),
         type(std::move(payload_type)),
         role(user_role),
@@ -38,12 +41,18 @@ struct OpenStream {
   OpenStream& operator=(const OpenStream&) = delete;
   ~OpenStream();
 
+  // The stream has another ring by now: says so to the reader, awake or asleep.
+  void supersede() const noexcept;
+
   const std::shared_ptr<Client> client;
+  const StreamId asked;  // by which the user named it, perhaps without host
   const StreamId id;
   const TypeInfo type;
   const Role role;
   const std::uint32_t tag;
   const std::shared_ptr<const SharedRing> ring;
+  // Set once: the stream has another ring by now. Shared with the reader's ReadyFd.
+  const std::shared_ptr<std::atomic<bool>> superseded = std::make_shared<std::atomic<bool>>(false);
   std::uint64_t key = 0;     // ours, unique in the client; under Client's mutex, as is
   std::uint64_t handle = 0;  // dssmd's name for it; 0: none at the moment
 };
@@ -67,6 +76,8 @@ class Client : public std::enable_shared_from_this<Client> {
 
   // Opens for reading or writing by what `request` says (Create or Open).
   Result<std::shared_ptr<OpenStream>> open(local::Request request, Role role, std::uint32_t tag);
+  Result<std::shared_ptr<OpenStream>> open_reader(const StreamId& id, std::uint32_t tag);
+  Result<std::shared_ptr<OpenStream>> open_writer(const StreamId& id, std::uint32_t tag);
 
   Result<std::shared_ptr<clock::PlaybackRecord>> playback_clock();
 
@@ -100,6 +111,7 @@ class Client : public std::enable_shared_from_this<Client> {
   Result<void> read_connection(int socket);
   Result<void> dispatch(local::Response response, std::vector<UniqueFd>& fds);
   void on_stream_event(const local::StreamEvent& message);
+  void on_replaced(std::uint64_t handle);
   void on_rewatched();
   void start_using(UniqueFd socket);
   void stop_using();
@@ -123,6 +135,7 @@ class Client : public std::enable_shared_from_this<Client> {
   std::map<std::uint64_t, InFlight> in_flight_;
   std::uint64_t next_key_ = 1;
   std::map<std::uint64_t, OpenStream*> open_streams_;  // by OpenStream::key
+  std::vector<std::uint64_t> replaced_early_;          // handles told of before they were noted
   std::shared_ptr<clock::PlaybackRecord> clock_;
   UniqueFd clock_fd_;
 

@@ -8,13 +8,27 @@
 
 namespace dssm::detail {
 
+std::shared_ptr<const SharedRing> ReadyFd::ring() {
+  const std::lock_guard guard(mutex_);
+  return ring_.ring;
+}
+
 bool ReadyFd::look() noexcept {
-  const Tid newest = reader_.newest();
-  if (newest <= seen_) return false;
-  seen_ = newest;
+  const std::lock_guard guard(mutex_);
+  const Tid newest = ring::RingReader(*ring_.ring->mapping).newest();
+  const bool superseded = ring_.superseded->load(std::memory_order_acquire);
+  if (newest <= ring_.seen && superseded == told_superseded_) return false;
+  ring_.seen = newest;
+  told_superseded_ = superseded;
   const std::uint64_t one = 1;
   [[maybe_unused]] const ssize_t written = ::write(event_.get(), &one, sizeof one);
   return true;
+}
+
+void ReadyFd::follow(ReadyRing ring) {
+  const std::lock_guard guard(mutex_);
+  ring_ = std::move(ring);
+  told_superseded_ = false;
 }
 
 void ReadyFd::clear() noexcept {
@@ -55,10 +69,11 @@ bool Notifier::add(const std::shared_ptr<ReadyFd>& ready) {
 
 void Notifier::run() {
   std::vector<std::shared_ptr<ReadyFd>> awake;
+  std::vector<std::shared_ptr<const SharedRing>> rings;  // what the bells belong to
   std::vector<ring::Bell*> bells;
   std::vector<std::uint32_t> announced;
   for (;;) {
-    awake.clear(), bells.clear(), announced.clear();
+    awake.clear(), rings.clear(), bells.clear(), announced.clear();
     // Announce first, look afterwards: what happens in between is not missed.
     bells.push_back(control_.get());
     announced.push_back(control_->announce());
@@ -71,7 +86,8 @@ void Notifier::run() {
     }
     bool news = false;
     for (const auto& ready : awake) {
-      bells.push_back(ready->ring_->bell.get());
+      rings.push_back(ready->ring());
+      bells.push_back(rings.back()->bell.get());
       announced.push_back(bells.back()->announce());
       news |= ready->look();
     }
@@ -81,11 +97,16 @@ void Notifier::run() {
   }
 }
 
-Result<std::shared_ptr<ReadyFd>> NotifierPool::watch(std::shared_ptr<const SharedRing> ring,
-                                                     Tid seen) {
+void NotifierPool::follow(ReadyFd& ready, ReadyRing ring) {
+  ready.follow(std::move(ring));
+  const std::lock_guard guard(mutex_);
+  for (const auto& notifier : notifiers_) notifier->look_again();
+}
+
+Result<std::shared_ptr<ReadyFd>> NotifierPool::watch(ReadyRing ring) {
   UniqueFd event(::eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK));
   if (!event) return os_error("create an eventfd for a reader");
-  auto ready = std::make_shared<ReadyFd>(std::move(ring), seen, std::move(event));
+  auto ready = std::make_shared<ReadyFd>(std::move(ring), std::move(event));
   const std::lock_guard guard(mutex_);
   for (const auto& notifier : notifiers_) {
     if (notifier->add(ready)) return ready;

@@ -5,6 +5,7 @@
 // each that has news. It needs no dssmd.
 #pragma once
 
+#include <atomic>
 #include <dssm/sample.hpp>
 #include <memory>
 #include <mutex>
@@ -17,22 +18,32 @@
 
 namespace dssm::detail {
 
-// A reader's descriptor. Readable when the ring's newest tid rose since the last clear().
+// The ring that a reader's descriptor speaks of.
+struct ReadyRing {
+  std::shared_ptr<const SharedRing> ring;
+  std::shared_ptr<const std::atomic<bool>> superseded;  // by another ring
+  Tid seen = kNoTid;                                    // news is what is newer
+};
+
+// A reader's descriptor. Readable when the ring's newest tid rose since the last clear(), or when
+// the ring was superseded. Thread-safe.
 class ReadyFd {
  public:
-  ReadyFd(std::shared_ptr<const SharedRing> ring, Tid seen, UniqueFd event)
-      : ring_(std::move(ring)), reader_(*ring_->mapping), seen_(seen), event_(std::move(event)) {}
+  ReadyFd(ReadyRing ring, UniqueFd event) : ring_(std::move(ring)), event_(std::move(event)) {}
 
   int fd() const noexcept { return event_.get(); }
   void clear() noexcept;
 
  private:
   friend class Notifier;
+  friend class NotifierPool;
+  std::shared_ptr<const SharedRing> ring();
   bool look() noexcept;  // rings when there is news
+  void follow(ReadyRing ring);
 
-  std::shared_ptr<const SharedRing> ring_;
-  ring::RingReader reader_;
-  Tid seen_;  // notifier thread only
+  std::mutex mutex_;  // guards ring_ and told_
+  ReadyRing ring_;
+  bool told_superseded_ = false;
   UniqueFd event_;
 };
 
@@ -46,6 +57,7 @@ class Notifier {
 
   // False when it has no room.
   bool add(const std::shared_ptr<ReadyFd>& ready);
+  void look_again() noexcept { control_->ring(); }
 
  private:
   Notifier() = default;
@@ -61,7 +73,9 @@ class Notifier {
 // As many notifiers as are needed. Thread-safe.
 class NotifierPool {
  public:
-  Result<std::shared_ptr<ReadyFd>> watch(std::shared_ptr<const SharedRing> ring, Tid seen);
+  Result<std::shared_ptr<ReadyFd>> watch(ReadyRing ring);
+  // From now on `ready` speaks of another ring.
+  void follow(ReadyFd& ready, ReadyRing ring);
 
  private:
   std::mutex mutex_;

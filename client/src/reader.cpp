@@ -44,6 +44,52 @@ bool BorrowedSample::still_valid() const noexcept {
                                        ring::published_sequence(info_.tid));
 }
 
+namespace detail {
+
+bool ReaderState::restart() noexcept {
+  const MonoTime now = MonoClock::now();
+  Client& client = *stream->client;
+  // While dssmd is away nobody can give the new ring, and a read must not wait for it.
+  if (trouble || to_ns(now.time_since_epoch()) < next_attempt_ns || !client.connected()) {
+    return false;
+  }
+  next_attempt_ns = to_ns((now + kRestartPause).time_since_epoch());
+  auto anew = client.open_reader(stream->asked, stream->tag);
+  if (!anew) return false;
+  if (Result<void> usable = (*anew)->type.check_usable_as(stream->type); !usable) {
+    trouble =
+        std::move(usable).error().context("go on with the new ring of '" + (*anew)->id.str() + "'");
+    return false;
+  }
+  if ((*anew)->ring->mapping->identity().incarnation ==
+      stream->ring->mapping->identity().incarnation) {
+    return false;  // asked too early: try again
+  }
+  previous = stream->ring;
+  {
+    const std::lock_guard guard(stream_mutex);
+    stream = *std::move(anew);
+  }
+  ring = ring::RingReader(*stream->ring->mapping);
+  cursor = kNoTid;  // next() goes on with the first sample of the new ring; a fresh reader stays so
+  next_attempt_ns = 0;
+  ++restarts;
+  if (ready) client.notifiers().follow(*ready, {stream->ring, stream->superseded, kNoTid});
+  return true;
+}
+
+std::shared_ptr<OpenStream> ReaderState::stream_now() const {
+  const std::lock_guard guard(stream_mutex);
+  return stream;
+}
+
+bool ReaderState::restart_wakes(const OpenStream& on) const noexcept {
+  return on.superseded->load(std::memory_order_acquire) &&
+         to_ns(MonoClock::now().time_since_epoch()) >= next_attempt_ns;
+}
+
+}  // namespace detail
+
 RawReader::RawReader(std::unique_ptr<detail::ReaderState> state) noexcept
     : state_(std::move(state)) {}
 RawReader::RawReader(RawReader&&) noexcept = default;
@@ -51,6 +97,7 @@ RawReader& RawReader::operator=(RawReader&&) noexcept = default;
 RawReader::~RawReader() = default;
 
 ReadStatus RawReader::latest(std::span<std::byte> payload, SampleInfo& info) noexcept {
+  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read_newest(payload, info);
   if (status == ReadStatus::ok) state_->took(info.tid);
@@ -58,6 +105,7 @@ ReadStatus RawReader::latest(std::span<std::byte> payload, SampleInfo& info) noe
 }
 
 ReadStatus RawReader::tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) noexcept {
+  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read(tid, payload, info);
   if (status == ReadStatus::ok) state_->took(tid);
@@ -70,7 +118,10 @@ ReadStatus RawReader::next(std::span<std::byte> payload, SampleInfo& info) noexc
   Tid wanted = state_->cursor + 1;
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
     const ReadStatus status = state_->ring.read(wanted, payload, info);
-    if (status == ReadStatus::not_yet) return status;
+    if (status == ReadStatus::not_yet) {
+      // Only now: what the old ring held is read first.
+      return state_->restart_due() && state_->restart() ? ReadStatus::restarted : status;
+    }
     if (status == ReadStatus::ok) {
       state_->lost += static_cast<std::uint64_t>(wanted - (state_->cursor + 1));
       state_->took(wanted);
@@ -82,11 +133,13 @@ ReadStatus RawReader::next(std::span<std::byte> payload, SampleInfo& info) noexc
 }
 
 ReadStatus RawReader::previous(std::span<std::byte> payload, SampleInfo& info) noexcept {
+  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   if (state_->cursor < 0) return ReadStatus::not_yet;
   return tid(state_->cursor - 1, payload, info);
 }
 
 ReadStatus RawReader::at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
+  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == payload_bytes());
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
     Tid found = kNoTid;
@@ -101,6 +154,7 @@ ReadStatus RawReader::at(Time t, std::span<std::byte> payload, SampleInfo& info)
 }
 
 ReadStatus RawReader::at_or_after(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
+  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
     // Behind the newest sample before `t` all samples have time >= t.
     Tid before = kNoTid;
@@ -115,6 +169,7 @@ ReadStatus RawReader::at_or_after(Time t, std::span<std::byte> payload, SampleIn
 }
 
 ReadStatus RawReader::nearest(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
+  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
     Tid before = kNoTid;
     const ReadStatus found = state_->ring.find(t, before);
@@ -173,8 +228,11 @@ Tid RawReader::cursor() const noexcept { return state_->cursor; }
 void RawReader::seek(Tid tid) noexcept { state_->took(std::max(tid, kNoTid)); }
 
 std::uint64_t RawReader::lost() const noexcept { return state_->lost; }
+std::uint64_t RawReader::restarts() const noexcept { return state_->restarts; }
+std::optional<Error> RawReader::trouble() const { return state_->trouble; }
 
 ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
+  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   ring::RingReader::Place place{};
   const ReadStatus status = state_->ring.locate(tid, place, out.info_);
   if (status != ReadStatus::ok) return status;
@@ -189,15 +247,19 @@ WaitStatus RawReader::wait(MonoTime deadline) noexcept {
 }
 
 WaitStatus RawReader::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
-  return wait_until(*state_->stream->ring->bell, deadline,
-                    [&] { return state_->ring.newest() >= tid; });
+  const std::shared_ptr<detail::OpenStream> stream = state_->stream_now();
+  const ring::RingReader ring(*stream->ring->mapping);
+  return wait_until(*stream->ring->bell, deadline,
+                    [&] { return ring.newest() >= tid || state_->restart_wakes(*stream); });
 }
 
 WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept {
   DSSM_CHECK(!readers.empty() && readers.size() <= kMaxWaitAny);
   const auto ready = [&] {
-    return std::any_of(readers.begin(), readers.end(),
-                       [](const RawReader* reader) { return reader->newest() > reader->cursor(); });
+    return std::any_of(readers.begin(), readers.end(), [](const RawReader* reader) {
+      return reader->newest() > reader->cursor() ||
+             reader->state_->restart_wakes(*reader->state_->stream);
+    });
   };
   std::array<ring::Bell*, kMaxWaitAny> bells;
   std::array<std::uint32_t, kMaxWaitAny> announced;
@@ -218,7 +280,8 @@ WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noex
 
 Result<int> RawReader::ready_fd() noexcept {
   if (!state_->ready) {
-    auto ready = state_->stream->client->notifiers().watch(state_->stream->ring, state_->cursor);
+    auto ready = state_->stream->client->notifiers().watch(
+        {state_->stream->ring, state_->stream->superseded, state_->cursor});
     if (!ready) return std::move(ready).error();
     state_->ready = std::move(*ready);
   }

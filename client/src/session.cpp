@@ -28,14 +28,6 @@ Result<void> without_answer(Result<detail::Answer> answer, const std::string& wh
   return {};
 }
 
-local::Request open_request(const StreamId& id, bool for_writing, std::uint32_t tag) {
-  local::Request request;
-  wire::to_message(id, *request.mutable_open()->mutable_id());
-  request.mutable_open()->set_for_writing(for_writing);
-  request.mutable_open()->set_tag(tag);
-  return request;
-}
-
 }  // namespace
 
 namespace detail {
@@ -100,7 +92,7 @@ Result<RawWriter> Session::create_raw(const StreamId& id, const TypeInfo& type,
 Result<RawWriter> Session::open_raw_writer(const StreamId& id, const TypeInfo* wanted,
                                            std::uint32_t tag) {
   const std::string what = quoted("open", id) + " for writing";
-  auto stream = client_->open(open_request(id, true, tag), Role::writer, tag);
+  auto stream = client_->open_writer(id, tag);
   if (stream && wanted) {
     if (Result<void> usable = (*stream)->type.check_usable_as(*wanted); !usable) {
       return std::move(usable).error().context(what);
@@ -113,7 +105,7 @@ Result<RawWriter> Session::open_raw_writer(const StreamId& id, const TypeInfo* w
 Result<RawReader> Session::open_raw_reader(const StreamId& id, const TypeInfo* wanted,
                                            std::uint32_t tag) {
   const std::string what = quoted("open", id);
-  auto stream = client_->open(open_request(id, false, tag), Role::reader, tag);
+  auto stream = client_->open_reader(id, tag);
   if (stream && wanted) {
     if (Result<void> usable = (*stream)->type.check_usable_as(*wanted); !usable) {
       return std::move(usable).error().context(what);

@@ -3,8 +3,11 @@
 // What is behind the handles of the public API.
 #pragma once
 
+#include <atomic>
 #include <dssm/reader.hpp>
 #include <dssm/writer.hpp>
+#include <mutex>
+#include <optional>
 
 #include "client/src/client.hpp"
 #include "core/ring/ring_reader.hpp"
@@ -12,9 +15,21 @@
 
 namespace dssm::detail {
 
+// How long a reader waits before it tries again to open the ring that superseded its own.
+inline constexpr Duration kRestartPause = std::chrono::milliseconds(200);
+
 struct ReaderState {
   explicit ReaderState(std::shared_ptr<OpenStream> opened)
       : stream(std::move(opened)), ring(*stream->ring->mapping) {}
+
+  // Whether there is another ring to go on with, as far as is known without asking.
+  bool restart_due() const noexcept { return stream->superseded->load(std::memory_order_acquire); }
+  // Goes on with the new ring. False: it cannot be had now, the old one stays.
+  bool restart() noexcept;
+  // The stream as it is now, for a thread that waits beside the one that reads.
+  std::shared_ptr<OpenStream> stream_now() const;
+  // Whether a wait on `on` shall end so that the reader can try to restart.
+  bool restart_wakes(const OpenStream& on) const noexcept;
 
   // From now on next() goes on behind `tid`.
   void took(Tid tid) noexcept {
@@ -22,11 +37,17 @@ struct ReaderState {
     fresh = false;
   }
 
+  // Changed by restart() only, in the thread that reads; stream_mutex lets another one wait.
+  mutable std::mutex stream_mutex;
   std::shared_ptr<OpenStream> stream;
+  std::shared_ptr<const SharedRing> previous;  // so that what was borrowed stays mapped
   ring::RingReader ring;
   Tid cursor = kNoTid;
   bool fresh = true;  // next() has not been told where to start
   std::uint64_t lost = 0;
+  std::uint64_t restarts = 0;
+  std::optional<Error> trouble;
+  std::atomic<std::int64_t> next_attempt_ns = 0;  // monotonic: not before it restart() asks dssmd
   std::shared_ptr<ReadyFd> ready;
 };
 

@@ -48,6 +48,8 @@ std::string_view status_name(ReadStatus status) noexcept {
       return "too_old";
     case ReadStatus::lapped:
       return "lapped";
+    case ReadStatus::restarted:
+      return "restarted";
   }
   return "lapped";
 }

@@ -12,6 +12,10 @@
 //   life     a reader keeps its ring mapped, and stays usable after its Session object is gone and
 //            while dssmd is away
 //   moved    a moved-from reader may only be assigned to or destroyed
+//   anew     when the stream is removed and created anew, or its owner came back without its rings,
+//            the reader goes on with the new ring by itself: one read returns `restarted`, once
+//            (next() only after it has returned all that the old ring held), the cursor is kNoTid
+//            then, and tids begin anew. Until the new ring can be had the old one is read.
 #pragma once
 
 #include <cstddef>
@@ -19,6 +23,7 @@
 #include <dssm/sample.hpp>
 #include <dssm/stream.hpp>
 #include <memory>
+#include <optional>
 #include <span>
 #include <vector>
 
@@ -124,8 +129,16 @@ class RawReader {
   // the oldest held. Any value is allowed.
   void seek(Tid tid) noexcept;
 
-  // Samples that next() had to skip because the ring no longer held them.
+  // Samples that next() had to skip because the ring no longer held them: the writer was faster, or
+  // the link to the stream's host was down for longer than its ring reaches back.
   std::uint64_t lost() const noexcept;
+
+  // How often this reader went on with a new ring.
+  std::uint64_t restarts() const noexcept;
+
+  // Why this reader cannot go on with the stream's new ring (it has another type); nothing while
+  // all is well.
+  std::optional<Error> trouble() const;
 
   // --- in place -------------------------------------------------------------------------------
 
@@ -135,8 +148,8 @@ class RawReader {
 
   // --- waiting --------------------------------------------------------------------------------
 
-  // Waits until there is a sample newer than the cursor, or the monotonic clock reaches `deadline`
-  // (kNever: no limit; a deadline in the past: just look).
+  // Waits until there is a sample newer than the cursor, or the stream began anew, or the monotonic
+  // clock reaches `deadline` (kNever: no limit; a deadline in the past: just look).
   WaitStatus wait(MonoTime deadline) noexcept;
 
   // The same for newest() >= `tid`. May run in one thread while another one uses this reader.
@@ -151,6 +164,7 @@ class RawReader {
 
   // --- about the stream -----------------------------------------------------------------------
 
+  // References stay good until a read returns `restarted`.
   const StreamId& id() const noexcept;    // with its owner's host
   const TypeInfo& type() const noexcept;  // as stored with the stream
   std::uint64_t payload_bytes() const noexcept;

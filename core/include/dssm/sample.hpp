@@ -25,9 +25,11 @@ struct SampleInfo {
 // Outcomes of a read: part of normal work, no text, nothing allocated.
 enum class [[nodiscard]] ReadStatus : std::uint8_t{
     ok,
-    not_yet,  // nothing is there yet: an empty stream, or a tid that is not written yet
-    too_old,  // the ring no longer holds it
-    lapped,   // the writer overtook this reader again and again; nothing torn was returned
+    not_yet,    // nothing is there yet: an empty stream, or a tid that is not written yet
+    too_old,    // the ring no longer holds it
+    lapped,     // the writer overtook this reader again and again; nothing torn was returned
+    restarted,  // the stream began anew, with a new ring and new tids: the reader is on it now,
+                // call again
 };
 
 // Outcomes of a wait.
