@@ -50,13 +50,12 @@ bool ReaderState::restart() noexcept {
   const MonoTime now = MonoClock::now();
   Client& client = *stream->client;
   // While dssmd is away nobody can give the new ring, and a read must not wait for it.
-  if (trouble || to_ns(now.time_since_epoch()) < next_attempt_ns || !client.connected()) {
-    return false;
-  }
+  if (to_ns(now.time_since_epoch()) < next_attempt_ns || !client.connected()) return false;
   next_attempt_ns = to_ns((now + kRestartPause).time_since_epoch());
   auto anew = client.open_reader(stream->asked, stream->tag);
   if (!anew) return false;
   if (Result<void> usable = (*anew)->type.check_usable_as(stream->type); !usable) {
+    next_attempt_ns = INT64_MAX;
     trouble =
         std::move(usable).error().context("go on with the new ring of '" + (*anew)->id.str() + "'");
     return false;

@@ -34,6 +34,7 @@ TEST(Layout, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(RingHeader, lock), 320u);
   EXPECT_EQ(offsetof(RingHeader, top), 512u);
   EXPECT_EQ(offsetof(RingHeader, run_start), 520u);
+  EXPECT_EQ(offsetof(RingHeader, first), 528u);
   EXPECT_EQ(sizeof(SlotHeader), 64u);
   EXPECT_EQ(offsetof(SlotHeader, sequence), 0u);
   EXPECT_EQ(offsetof(SlotHeader, tid), 8u);
@@ -43,7 +44,7 @@ TEST(Layout, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(SlotHeader, run_parent), 40u);
   EXPECT_EQ(offsetof(SlotHeader, run_jump), 48u);
   EXPECT_EQ(offsetof(SlotHeader, run_level), 56u);
-  EXPECT_EQ(kLayoutVersion, 1u) << "raise it with every incompatible change, and mend this test";
+  EXPECT_EQ(kLayoutVersion, 2u) << "raise it with every incompatible change, and mend this test";
 }
 
 TEST(Geometry, RefusesWhatARingCannotBe) {
