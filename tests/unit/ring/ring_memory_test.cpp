@@ -98,7 +98,7 @@ std::string refusal(std::size_t offset, std::uint64_t value, std::size_t bytes) 
 
 TEST(RingMapping, RefusesAHeaderThatDoesNotFitTogether) {
   EXPECT_NE(refusal(0, 1, 8).find("DSSMRING"), std::string::npos);
-  EXPECT_NE(refusal(8, 2, 4).find("layout version 2"), std::string::npos);
+  EXPECT_NE(refusal(8, 99, 4).find("layout version 99"), std::string::npos);
   EXPECT_NE(refusal(12, 3, 4).find("alignment"), std::string::npos);
   EXPECT_NE(refusal(16, 65 + 128, 8).find("geometry"), std::string::npos);
   EXPECT_NE(refusal(16, 0, 8).find("payload of 0"), std::string::npos);
