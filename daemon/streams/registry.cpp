@@ -27,11 +27,16 @@ Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
 }
 
 Result<void> Registry::check_room() const {
-  if (by_name_.size() < limits_.max_streams) return {};
+  if (by_name_.size() + rooms_ < limits_.max_streams) return {};
   return Error{Errc::limit_exceeded,
                "there are max_streams = " + std::to_string(limits_.max_streams) +
-                   " streams already; remove some (dssmctl rm) or raise the "
-                   "key max_streams"};
+                   " streams already, counting those of other hosts that are read or written here; "
+                   "remove some (dssmctl rm) or raise the key max_streams"};
+}
+
+Result<RingRoom> Registry::take_room() {
+  if (Result<void> room = check_room(); !room) return std::move(room).error();
+  return RingRoom(rooms_);
 }
 
 Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& type,
@@ -77,6 +82,9 @@ Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, Of
   if ((*stream)->id() != *own) {
     return Error{Errc::protocol,
                  context + ": the offered ring is that of '" + (*stream)->id().str() + "'"};
+  }
+  if ((*stream)->purpose() != Purpose::own) {
+    return Error{Errc::protocol, context + ": the offered ring is a copy for another host"};
   }
   add(*stream);
   return stream;

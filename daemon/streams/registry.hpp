@@ -15,6 +15,7 @@
 #include <vector>
 
 #include "daemon/streams/memory_budget.hpp"
+#include "daemon/streams/ring_room.hpp"
 #include "daemon/streams/stream.hpp"
 
 namespace dssm::daemon {
@@ -47,6 +48,11 @@ class Registry {
 
   const std::string& host() const noexcept { return host_; }
   const MemoryBudget& budget() const noexcept { return budget_; }
+
+  // For rings that stand elsewhere (mirrors, remote writers) but count like those here. The
+  // registry outlives what it gives.
+  MemoryBudget& budget() noexcept { return budget_; }
+  Result<RingRoom> take_room();  // fails with limit_exceeded, naming the key
 
   // In the order of creation.
   const std::vector<std::shared_ptr<Stream>>& streams() const noexcept { return in_order_; }
@@ -85,7 +91,8 @@ class Registry {
 
   std::string host_;
   Limits limits_;
-  MemoryBudget budget_;  // before the streams, which hold shares of it
+  MemoryBudget budget_;      // before the streams, which hold shares of it
+  std::uint64_t rooms_ = 0;  // taken by take_room()
   std::map<Key, std::shared_ptr<Stream>> by_name_;
   std::vector<std::shared_ptr<Stream>> in_order_;
   std::uint64_t next_order_ = 1;

@@ -36,6 +36,10 @@ Result<UniqueFd> create_doorbell() {
   return fd;
 }
 
+static_assert(static_cast<int>(Purpose::own) == local::StreamMeta::OWN &&
+              static_cast<int>(Purpose::mirror) == local::StreamMeta::MIRROR &&
+              static_cast<int>(Purpose::remote_writer) == local::StreamMeta::REMOTE_WRITER);
+
 local::StreamMeta meta_of(const Stream::Plan& plan, std::string_view property) {
   local::StreamMeta meta;
   wire::to_message(plan.id, *meta.mutable_id());
@@ -43,6 +47,7 @@ local::StreamMeta meta_of(const Stream::Plan& plan, std::string_view property) {
   meta.set_property(std::string(property));
   meta.set_creator_pid(plan.creator_pid);
   meta.set_created_order(plan.created_order);
+  meta.set_purpose(static_cast<local::StreamMeta::Purpose>(plan.purpose));
   return meta;
 }
 
@@ -76,8 +81,19 @@ Result<Stream::Plan> plan_untrusted(const local::StreamMeta& meta,
                                      ring.id.str() + "' with " +
                                      std::to_string(mapping.geometry().payload_bytes) + " bytes"};
   }
-  return Stream::Plan{
-      *id, *type, mapping.geometry().depth, ring.cycle, meta.creator_pid(), meta.created_order()};
+  if (!local::StreamMeta::Purpose_IsValid(meta.purpose())) {
+    return Error{Errc::protocol, "the offered ring of '" + id->str() +
+                                     "' has a purpose that this dssmd does not know; install the "
+                                     "newer version of DSSM again"};
+  }
+  return Stream::Plan{*id,
+                      *type,
+                      mapping.geometry().depth,
+                      ring.cycle,
+                      meta.creator_pid(),
+                      meta.created_order(),
+                      static_cast<Purpose>(meta.purpose()),
+                      ring.incarnation};
 }
 
 void fill_figures(const ring::RingMapping& mapping, StreamInfo& info) {
@@ -109,7 +125,8 @@ Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& b
   if (!geometry) return geometry.error();
   Result<MemoryShare> share = take_share(budget, plan.type, *geometry);
   if (!share) return std::move(share).error();
-  const Result<std::uint64_t> incarnation = new_incarnation();
+  const Result<std::uint64_t> incarnation =
+      plan.incarnation != 0 ? Result(plan.incarnation) : new_incarnation();
   if (!incarnation) return incarnation.error();
   Result<UniqueFd> ring =
       ring::create_ring({plan.id, *incarnation, plan.cycle, plan.type.alignment_bytes}, *geometry);
@@ -193,6 +210,14 @@ Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role) {
     if (*one) descriptors.push_back(*std::move(one));
   }
   return descriptors;
+}
+
+Result<std::shared_ptr<const ring::RingMapping>> Stream::map_for_writing() const {
+  return ring::RingMapping::open_untrusted(files_.ring.get(), ring::Access::read_write);
+}
+
+Result<std::shared_ptr<ring::Bell>> Stream::map_bell() const {
+  return ring::Bell::open_untrusted(files_.bell.get());
 }
 
 bool Stream::is_ring(int fd) const noexcept { return same_file(fd, files_.ring.get()); }

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One stream that this host owns: the memory files behind it and what dssmd knows about it. It
-// lives as long as it has a name in the Registry or somebody has it open; what programs hold of its
-// memory lives on by itself.
+// One ring of this host: the memory files behind it and what dssmd knows about it. A stream that
+// this host owns lives as long as it has a name in the Registry or somebody has it open; mirrors
+// and the rings of remote writers as long as their keepers want. What programs hold of its memory
+// lives on by itself.
 //
 // dssmd never reads a payload here, and of the rings only the newest stamps, to tell how the stream
 // is doing.
@@ -17,6 +18,7 @@
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
+#include "core/ring/bell.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "daemon/streams/memory_budget.hpp"
 #include "daemon/streams/meta_file.hpp"
@@ -32,6 +34,13 @@ struct OfferedFiles {
   UniqueFd doorbell;  // may be missing
 };
 
+// What dssmd uses a ring for.
+enum class Purpose : std::uint8_t {
+  own,            // the stream is this host's
+  mirror,         // repeats the ring of another host; no program gets it for writing
+  remote_writer,  // what programs write to it is published into the stream of another host
+};
+
 class Stream {
  public:
   struct Plan {
@@ -41,6 +50,8 @@ class Stream {
     Duration cycle{};
     std::int32_t creator_pid = 0;
     std::uint64_t created_order = 0;
+    Purpose purpose = Purpose::own;
+    std::uint64_t incarnation = 0;  // a mirror's is its owner's; 0: a new one
   };
 
   // Creates the memory files, none of whose memory is taken yet but for three pages: the client
@@ -59,6 +70,8 @@ class Stream {
   const TypeInfo& type() const noexcept { return plan_.type; }
   std::int32_t creator_pid() const noexcept { return plan_.creator_pid; }
   std::uint64_t created_order() const noexcept { return plan_.created_order; }
+  Purpose purpose() const noexcept { return plan_.purpose; }
+  std::uint64_t incarnation() const noexcept { return mapping_->identity().incarnation; }
 
   // What is known now, but for the users. Costs two looks at the ring.
   StreamInfo info() const;
@@ -66,6 +79,11 @@ class Stream {
   // Descriptors to hand out, in the order of local.proto's Opened; the caller's own. For writers a
   // missing doorbell is made.
   Result<std::vector<UniqueFd>> descriptors_for(Role role);
+
+  // The ring for dssmd itself: to look at, to write to (mirrors), and its bell.
+  const ring::RingMapping& mapping() const noexcept { return *mapping_; }
+  Result<std::shared_ptr<const ring::RingMapping>> map_for_writing() const;
+  Result<std::shared_ptr<ring::Bell>> map_bell() const;
 
   // Whether `fd` is this stream's ring.
   bool is_ring(int fd) const noexcept;
