@@ -5,36 +5,16 @@
 // gives up. Used by PeerLink (control connections), mirrors and remote writers (channels).
 #pragma once
 
-#include <functional>
 #include <memory>
 #include <string>
-#include <vector>
 
 #include "core/wire/address.hpp"
 #include "core/wire/network_protocol.hpp"
 #include "daemon/channel/frame_link.hpp"
+#include "daemon/channel/resolver.hpp"
 #include "daemon/service/event_loop.hpp"
 
 namespace dssm::daemon {
-
-// Looks names up without keeping the loop waiting: one thread, asked one name at a time. Destroyed,
-// it forgets what was asked. One per dssmd.
-class Resolver {
- public:
-  explicit Resolver(const EventLoop& loop);
-  Resolver(const Resolver&) = delete;
-  Resolver& operator=(const Resolver&) = delete;
-  ~Resolver();
-
-  using Then = std::function<void(Result<std::vector<wire::SocketAddress>>)>;
-  // Calls `then` from the loop, later; not after the returned ticket is gone.
-  using Ticket = std::shared_ptr<void>;
-  Ticket resolve(const wire::Address& address, Then then);
-
- private:
-  struct State;
-  std::unique_ptr<State> state_;
-};
 
 class Dialer final : private FrameLink::User {
  public:
@@ -54,7 +34,7 @@ class Dialer final : private FrameLink::User {
     virtual void on_batch_end() {}
     virtual void on_output_empty() {}
     // The connection broke, or an attempt failed; the dialer goes on trying by itself. Called for
-    // each failed attempt too.
+    // each failed round of attempts too. Whoever refused us did so in words, which are in `why`.
     virtual void on_down(const Error& why) = 0;
 
    protected:
@@ -76,8 +56,11 @@ class Dialer final : private FrameLink::User {
 
   // Tries at once instead of waiting for the pause to end (the other side just showed up).
   void hurry();
-  // Closes the connection, if there is one, and begins anew: on_down() follows from the loop.
+  // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
+  // the next attempt after the pause that is due. While it pauses anyway: nothing.
   void restart(const Error& why);
+  // Where to go from the next attempt on.
+  void set_address(wire::Address address);
 
   FrameLink* link() noexcept;             // nullptr unless up
   std::string address() const;            // connected to, else as configured
