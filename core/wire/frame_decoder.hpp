@@ -73,9 +73,11 @@ class FrameDecoder {
   //          the decoder is not usable afterwards
   Result<void> commit(std::size_t bytes);
 
-  // From within on_sample_begin(): there is no place for this sample now. `out` is not used, the
-  // sample stays in the input buffer, and commit() returns. The next commit(), which may be one of 0
-  // bytes, goes on with on_sample_begin() for the same sample. Until then nothing is to be received.
+  // From within the sink: commit() shall return now, though more may be buffered. The next commit(),
+  // which may be one of 0 bytes, goes on. Until then nothing is to be received.
+  //   in on_sample_begin()  there is no place for this sample now: `out` is not used, the sample stays
+  //                         in the input buffer, and on_sample_begin() comes again for it
+  //   in the others         what was handed out is taken; commit() returns after it
   void hold() noexcept;
 
   // Whether a payload has begun that is not complete: the place that the sink gave is in use.
