@@ -12,28 +12,34 @@
 #include <cstddef>
 #include <deque>
 #include <memory>
-#include <optional>
 #include <vector>
 
 #include "core/wire/frame_decoder.hpp"
 #include "core/wire/transport.hpp"
 #include "daemon/service/event_loop.hpp"
+#include "daemon/streams/memory_budget.hpp"
 
 namespace dssm::daemon {
 
 class FrameLink final : private wire::FrameSink {
  public:
+  // Received in a row before others get their turn.
+  static constexpr int kReceivesPerTurn = 16;
+  static constexpr std::size_t kBytesPerTurn = 1U << 20;
+
   // Who works with the link. An error returned from a handler closes the link with last words.
-  // Handlers may send on the link and close it, but not destroy it.
+  // Handlers may send on the link, pause it and close it, but not destroy it.
   class User {
    public:
     virtual Result<void> on_frame(net::Frame& frame) = 0;
-    // As wire::FrameSink. Without set_payload_bytes() there are none.
+    // As wire::FrameSink. Without set_payload_bytes() there are none. When the link is paused
+    // within on_sample_begin(), `out` is not used, and it comes again for the same sample after
+    // resume().
     virtual Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) = 0;
     virtual Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) = 0;
     // All that had arrived is handed out: time to wake readers, to acknowledge.
     virtual void on_batch_end() {}
-    // Nothing waits to be sent any more: samples may follow.
+    // Nothing waits to be sent any more, or the socket takes bytes again: samples may follow.
     virtual void on_output_empty() {}
     // The link ended by itself or by an error; called once, last of all, from the loop and never
     // from within a call of the user's own. Destroy the link later, not here.
@@ -53,27 +59,37 @@ class FrameLink final : private wire::FrameSink {
   // Size of the samples that this link may receive; see FrameDecoder.
   void set_payload_bytes(std::size_t payload_bytes) noexcept;
 
+  // What waits to be sent by send() is charged to `budget`, which outlives the link; when it is
+  // used up, the link closes itself.
+  void set_budget(MemoryBudget& budget) noexcept { budget_ = &budget; }
+
   // Sends a frame, or queues what does not go at once. After the link closed: nothing happens.
   void send(const net::Frame& frame);
 
   // --- for SamplePump -------------------------------------------------------------------------
 
   // Whether nothing waits to be sent: only then send_now() may be used.
-  bool output_empty() const noexcept;
+  bool output_empty() const noexcept { return output_.empty(); }
   // Sends without queueing; 0 bytes when the socket is full or the link is closed. Whoever sent a
-  // part of a frame queues the rest at once.
+  // part of a frame queues the rest at once, or says so by set_mid_frame().
   std::size_t send_now(std::span<const iovec> parts, bool more);
   // Queues bytes that complete a frame that send_now() began; not counted against
-  // max_queued_bytes. on_output_empty() comes when they are gone.
-  void queue_rest(std::vector<std::byte> bytes);
+  // max_queued_bytes. `share` of the budget is given back, and on_output_empty() comes, when they
+  // are gone.
+  void queue_rest(std::vector<std::byte> bytes, MemoryShare share = {});
+  // While true, a frame is sent by several send_now() with other work between them: what send() is
+  // given waits behind it, and send_now() may be used although something waits.
+  void set_mid_frame(bool mid_frame);
   // Asks for on_output_empty() when the socket takes bytes again, after send_now() took none.
   void want_output();
 
   // --- the rest -------------------------------------------------------------------------------
 
-  // Stops receiving until resume(): what the peer sends waits in the kernel, and slows it down.
+  // Stops handing out and receiving until resume(): what the peer sends waits in the kernel, and
+  // slows it down. What the handler that calls this was given is taken (but see on_sample_begin()).
   void pause();
   void resume();
+  bool is_paused() const noexcept { return paused_; }
 
   // Closes with last words for the peer (a Failure with serial 0), as far as they go out at once.
   // on_closed() follows from the loop.
@@ -85,16 +101,44 @@ class FrameLink final : private wire::FrameSink {
   const wire::DecoderCounters& counters() const noexcept { return decoder_.counters(); }
 
  private:
+  struct Outgoing {
+    std::vector<std::byte> bytes;
+    std::size_t sent = 0;
+    bool counted = false;  // against max_queued_bytes_
+    MemoryShare share;
+  };
+
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   Result<void> on_frame(net::Frame& frame) override;
 
+  void on_readable();
+  void on_writable();
+  void go_on();
+  bool hand_out(std::size_t bytes);
+  void listen_again();
+  std::size_t transmit(std::span<const iovec> parts, bool more);
+  bool flush();
+  void enqueue(Outgoing outgoing);
+  void lose_output();
+  void close(const Error& why);
+
   std::unique_ptr<wire::Transport> transport_;
   User& user_;
   std::size_t max_queued_bytes_;
+  MemoryBudget* budget_ = nullptr;
   wire::FrameDecoder decoder_;
+  std::deque<Outgoing> output_;
+  std::size_t queued_bytes_ = 0;
   bool closed_ = false;
+  bool output_lost_ = false;  // the peer takes nothing more; what it said last is still to be read
+  bool mid_frame_ = false;
+  bool paused_ = false;
+  bool handing_out_ = false;  // the decoder is at work
+  bool held_ = false;         // it was told to stop, and may have more
+  Error why_;
   MonoTime last_heard_ = MonoClock::now();
+  EventSource readable_, writable_, next_turn_, ended_;
 };
 
 }  // namespace dssm::daemon

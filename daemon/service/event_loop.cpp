@@ -45,6 +45,10 @@ EventSource EventSource::writable(const EventLoop& loop, int fd, Callback callba
   return {loop, fd, EV_WRITE | EV_PERSIST, std::move(callback)};
 }
 
+EventSource EventSource::edge(const EventLoop& loop, int fd, Callback callback) {
+  return {loop, fd, EV_READ | EV_ET | EV_PERSIST, std::move(callback)};
+}
+
 EventSource EventSource::signal(const EventLoop& loop, int number, Callback callback) {
   return {loop, number, EV_SIGNAL | EV_PERSIST, std::move(callback)};
 }

@@ -7,6 +7,7 @@
 
 #include <cstdint>
 #include <dssm/result.hpp>
+#include <optional>
 #include <utility>
 
 namespace dssm::daemon {
@@ -57,6 +58,13 @@ class MemoryBudget {
                      " are left of max_memory = " + std::to_string(limit_) +
                      " bytes; keep less history, remove streams (dssmctl rm), or raise the key "
                      "max_memory"};
+  }
+
+  // The same for whoever has other words, or another way, when it is used up.
+  std::optional<MemoryShare> try_take(std::uint64_t bytes) noexcept {
+    if (bytes > limit_ - used_) return std::nullopt;
+    used_ += bytes;
+    return MemoryShare(*this, bytes);
   }
 
   std::uint64_t used() const noexcept { return used_; }

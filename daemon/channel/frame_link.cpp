@@ -1,0 +1,274 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/channel/frame_link.hpp"
+
+#include <algorithm>
+#include <array>
+#include <optional>
+#include <utility>
+
+#include "core/wire/frame.hpp"
+#include "core/wire/network_protocol.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+constexpr std::size_t kMaxParts = 16;  // of one send, as Transport takes them
+
+Error closed_by_handler() { return {Errc::closed, "the connection was closed meanwhile"}; }
+
+iovec part_of(std::span<const std::byte> bytes) noexcept {
+  return {const_cast<std::byte*>(bytes.data()), bytes.size()};
+}
+
+std::size_t total(std::span<const iovec> parts) noexcept {
+  std::size_t bytes = 0;
+  for (const iovec& part : parts) bytes += part.iov_len;
+  return bytes;
+}
+
+}  // namespace
+
+FrameLink::FrameLink(const EventLoop& loop, std::unique_ptr<wire::Transport> transport, User& user,
+                     std::size_t max_queued_bytes)
+    : transport_(std::move(transport)),
+      user_(user),
+      max_queued_bytes_(max_queued_bytes),
+      decoder_(*this, wire::kMaxNetworkFrameBytes),
+      readable_(EventSource::readable(loop, transport_->fd(), [this] { on_readable(); })),
+      writable_(EventSource::writable(loop, transport_->fd(), [this] { on_writable(); })),
+      next_turn_(EventSource::timer(loop, [this] { go_on(); })),
+      ended_(EventSource::timer(loop, [this] { user_.on_closed(why_); })) {
+  readable_.enable();
+}
+
+FrameLink::~FrameLink() = default;
+
+void FrameLink::set_payload_bytes(std::size_t payload_bytes) noexcept {
+  decoder_.set_payload_bytes(payload_bytes);
+}
+
+// --- receiving
+// ------------------------------------------------------------------------------------
+
+void FrameLink::on_readable() {
+  std::size_t received = 0;
+  Error end;
+  bool ended = false;
+  for (int receives = 0; receives < kReceivesPerTurn && received < kBytesPerTurn; ++receives) {
+    const std::span<const iovec> spaces = decoder_.spaces();
+    const std::size_t room = total(spaces);
+    const Result<wire::IoResult> got = transport_->receive(spaces);
+    if (got && got->status == wire::IoStatus::would_block) break;
+    if (!got || got->status == wire::IoStatus::end) {
+      ended = true;
+      end = !got ? got.error()
+                 : Error{Errc::daemon_away, decoder_.at_frame_end()
+                                                ? "the other side closed the connection"
+                                                : "the other side closed the connection in the "
+                                                  "middle of a frame"};
+      break;
+    }
+    last_heard_ = MonoClock::now();
+    received += got->bytes;
+    if (!hand_out(got->bytes)) return;
+    if (paused_ || held_ || got->bytes < room) break;
+  }
+  if (received > 0) user_.on_batch_end();
+  if (ended) close(end);
+}
+
+// Goes on with what was received before a pause.
+void FrameLink::go_on() {
+  if (closed_ || paused_ || !hand_out(0)) return;
+  user_.on_batch_end();
+  if (!closed_ && !paused_) listen_again();
+}
+
+// False when the link closed over it.
+bool FrameLink::hand_out(std::size_t bytes) {
+  held_ = false;
+  handing_out_ = true;
+  const Result<void> taken = decoder_.commit(bytes);
+  handing_out_ = false;
+  if (!taken) close_with(taken.error());
+  return !closed_;
+}
+
+void FrameLink::listen_again() {
+  if (held_) return next_turn_.enable_in(Duration::zero());
+  readable_.enable();
+}
+
+// A handler may have closed the link: the decoder is stopped, too.
+Result<void> FrameLink::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+  if (closed_) return closed_by_handler();
+  return user_.on_sample_begin(sample, out);
+}
+
+Result<void> FrameLink::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+  if (closed_) return closed_by_handler();
+  return user_.on_sample_end(sample, torn);
+}
+
+Result<void> FrameLink::on_frame(net::Frame& frame) {
+  if (closed_) return closed_by_handler();
+  return user_.on_frame(frame);
+}
+
+void FrameLink::pause() {
+  if (closed_ || paused_) return;
+  paused_ = true;
+  if (handing_out_) {
+    decoder_.hold();
+    held_ = true;
+  }
+  readable_.disable();
+  next_turn_.disable();
+  if (output_lost_) close(why_);
+}
+
+void FrameLink::resume() {
+  if (closed_ || !paused_) return;
+  paused_ = false;
+  listen_again();
+}
+
+// --- sending
+// --------------------------------------------------------------------------------------
+
+void FrameLink::send(const net::Frame& frame) {
+  if (closed_ || output_lost_) return;
+  const std::string encoded = wire::encode_frame(frame);
+  std::span<const std::byte> rest = std::as_bytes(std::span(encoded));
+  if (output_.empty() && !mid_frame_) {
+    const iovec part = part_of(rest);
+    rest = rest.subspan(transmit({&part, 1}, false));
+    if (rest.empty() || closed_ || output_lost_) return;
+  }
+  if (queued_bytes_ + rest.size() > max_queued_bytes_) {
+    return close_with(
+        {Errc::limit_exceeded, "the other side does not read: " + std::to_string(queued_bytes_) +
+                                   " bytes wait for it, and " + std::to_string(rest.size()) +
+                                   " more would be above the limit of " +
+                                   std::to_string(max_queued_bytes_)});
+  }
+  Outgoing outgoing{{rest.begin(), rest.end()}, 0, true, {}};
+  if (budget_) {
+    std::optional<MemoryShare> share = budget_->try_take(rest.size());
+    if (!share) {
+      return close_with(
+          {Errc::limit_exceeded,
+           "the other side does not read: no memory is left for " + std::to_string(rest.size()) +
+               " bytes more of max_peer_memory = " + std::to_string(budget_->limit()) +
+               " bytes; read faster, use fewer connections, or raise that key"});
+    }
+    outgoing.share = *std::move(share);
+  }
+  queued_bytes_ += rest.size();
+  enqueue(std::move(outgoing));
+}
+
+std::size_t FrameLink::send_now(std::span<const iovec> parts, bool more) {
+  if (closed_ || output_lost_ || (!output_.empty() && !mid_frame_)) return 0;
+  return transmit(parts, more);
+}
+
+void FrameLink::queue_rest(std::vector<std::byte> bytes, MemoryShare share) {
+  if (closed_ || output_lost_) return;
+  Outgoing outgoing{std::move(bytes), 0, false, std::move(share)};
+  if (!mid_frame_) return enqueue(std::move(outgoing));
+  // The frame that it completes went out piece by piece: before all that waits.
+  output_.push_front(std::move(outgoing));
+  writable_.enable();
+}
+
+void FrameLink::enqueue(Outgoing outgoing) {
+  output_.push_back(std::move(outgoing));
+  if (!mid_frame_) writable_.enable();
+}
+
+void FrameLink::set_mid_frame(bool mid_frame) {
+  mid_frame_ = mid_frame;
+  if (!mid_frame && !output_.empty()) want_output();
+}
+
+void FrameLink::want_output() {
+  if (!closed_ && !output_lost_) writable_.enable();
+}
+
+void FrameLink::on_writable() {
+  if (!mid_frame_ && !flush()) return;
+  writable_.disable();
+  user_.on_output_empty();
+}
+
+// Sends what waits. True when nothing is left.
+bool FrameLink::flush() {
+  while (!output_.empty()) {
+    std::array<iovec, kMaxParts> parts;
+    std::size_t count = 0, bytes = 0;
+    for (const Outgoing& next : output_) {
+      if (count == parts.size()) break;
+      parts[count] = part_of(std::span(next.bytes).subspan(next.sent));
+      bytes += parts[count++].iov_len;
+    }
+    std::size_t sent = transmit(std::span(parts).first(count), false);
+    if (closed_ || output_lost_) return false;
+    const bool all = sent == bytes;
+    while (!output_.empty()) {
+      Outgoing& next = output_.front();
+      const std::size_t step = std::min(sent, next.bytes.size() - next.sent);
+      next.sent += step;
+      sent -= step;
+      if (next.sent < next.bytes.size()) break;
+      if (next.counted) queued_bytes_ -= next.bytes.size();
+      output_.pop_front();
+    }
+    if (!all) return false;
+  }
+  return true;
+}
+
+std::size_t FrameLink::transmit(std::span<const iovec> parts, bool more) {
+  const Result<wire::IoResult> sent = transport_->send(parts, more);
+  if (sent && sent->status != wire::IoStatus::end) return sent->bytes;
+  why_ = sent ? Error{Errc::daemon_away, "the other side closed the connection"} : sent.error();
+  lose_output();
+  return 0;
+}
+
+// The peer may have said why before it closed: that waits to be received, so receiving goes on and
+// will find the end by itself.
+void FrameLink::lose_output() {
+  output_lost_ = true;
+  output_.clear();
+  queued_bytes_ = 0;
+  writable_.disable();
+  if (paused_) close(why_);
+}
+
+void FrameLink::close_with(const Error& why) {
+  if (closed_) return;
+  if (!output_lost_ && !mid_frame_ && flush()) {
+    net::Frame last_words;
+    wire::to_message(why, *last_words.mutable_failure());
+    const std::string encoded = wire::encode_frame(last_words);
+    const iovec part = part_of(std::as_bytes(std::span(encoded)));
+    transmit({&part, 1}, false);
+  }
+  close(why);
+}
+
+void FrameLink::close(const Error& why) {
+  if (closed_) return;
+  closed_ = true;
+  why_ = why;
+  readable_.disable();
+  writable_.disable();
+  next_turn_.disable();
+  output_.clear();
+  transport_.reset();
+  ended_.enable_in(Duration::zero());
+}
+
+}  // namespace dssm::daemon
