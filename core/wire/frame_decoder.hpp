@@ -7,8 +7,11 @@
 // result.
 //
 //   use     spaces() -> Transport::receive() -> commit() ; again
-//   trust   nothing that arrives is believed: lengths are checked against the limits before memory
-//           is taken for them
+//   trust   nothing that arrives is believed: lengths are checked against the limits, and memory
+//           grows with what has arrived, not with what was announced
+//   memory  a decoder that waits for the next frame owns no buffer: the input buffer belongs to the
+//           thread and is lent from spaces() to commit(). A hundred idle channels cost a hundred
+//           small objects, and a busy one always finds the buffer in the processor's cache.
 #pragma once
 
 #include <sys/uio.h>
@@ -18,9 +21,11 @@
 #include <cstdint>
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
+#include <memory>
 #include <span>
 #include <vector>
 
+#include "core/wire/sample_frame.hpp"
 #include "network.pb.h"
 
 namespace dssm::wire {
@@ -28,7 +33,8 @@ namespace dssm::wire {
 // A sample frame's fields before its payload.
 struct IncomingSample {
   std::uint64_t serial = 0;
-  SampleInfo info;  // clock_error >= 0; tid as it came: the receiver checks it
+  SampleInfo
+      info;  // tid >= 0, clock_error >= 0; else as it came: the receiver knows what it awaits
   std::size_t payload_bytes = 0;
 };
 
@@ -37,7 +43,7 @@ struct IncomingSample {
 class FrameSink {
  public:
   // A sample begins. `out` is set to where its payload_bytes are to go, or nullptr to throw them
-  // away. The place stays valid until on_sample_end() or the sink is told on_sample_cut().
+  // away. The place stays valid until on_sample_end(), or until the decoder is used no more.
   virtual Result<void> on_sample_begin(const IncomingSample& sample, std::byte*& out) = 0;
   // Its payload is complete. torn: the sender says that it is void.
   virtual Result<void> on_sample_end(const IncomingSample& sample, bool torn) = 0;
@@ -59,29 +65,33 @@ class FrameDecoder {
  public:
   // max_frame_bytes: of frames without a payload, before set_payload_bytes() also of all.
   FrameDecoder(FrameSink& sink, std::size_t max_frame_bytes);
+  FrameDecoder(const FrameDecoder&) = delete;
+  FrameDecoder& operator=(const FrameDecoder&) = delete;
+  ~FrameDecoder();
 
   // From now on samples have exactly so many bytes; a frame that says otherwise is an error.
   // 0 (at first): samples are refused.
   void set_payload_bytes(std::size_t payload_bytes) noexcept;
 
   // Where to receive: the rest of a payload that is under way (may be missing), then the input
-  // buffer. At least 4 KiB in all. Valid until the next call of any member.
+  // buffer. At least 4 KiB in all. Valid until the next call of any member, and until another
+  // decoder's spaces() in the same thread.
   std::span<const iovec> spaces();
 
-  // `bytes` were received into spaces(). Calls the sink for all that is complete now.
+  // `bytes` were received into spaces(), in the same thread. Calls the sink for all that is
+  // complete now.
   //   fails  protocol (no frame, too long, wrong payload size ...), and what the sink returned;
   //          the decoder is not usable afterwards
   Result<void> commit(std::size_t bytes);
 
-  // From within the sink: commit() shall return now, though more may be buffered. The next commit(),
-  // which may be one of 0 bytes, goes on. Until then nothing is to be received.
-  //   in on_sample_begin()  there is no place for this sample now: `out` is not used, the sample stays
-  //                         in the input buffer, and on_sample_begin() comes again for it
-  //   in the others         what was handed out is taken; commit() returns after it
-  void hold() noexcept;
+  // From within on_sample_begin(): there is no place for this sample now. `out` is not used, the
+  // sample stays in the input buffer, and commit() returns. The next commit(), which may be one of
+  // 0 bytes, goes on with on_sample_begin() for the same sample. Until then nothing is to be
+  // received.
+  void hold() noexcept { held_ = true; }
 
   // Whether a payload has begun that is not complete: the place that the sink gave is in use.
-  bool in_payload() const noexcept;
+  bool in_payload() const noexcept { return stage_ == Stage::payload && place_ != nullptr; }
 
   // Whether nothing is buffered: the last commit() ended at the end of a frame.
   bool at_frame_end() const noexcept;
@@ -89,11 +99,50 @@ class FrameDecoder {
   const DecoderCounters& counters() const noexcept { return counters_; }
 
  private:
-  // The implementer chooses the state.
+  using Bytes = std::span<const std::byte>;
+  struct InputBuffer;
+  static std::unique_ptr<InputBuffer>& thread_input();
+
+  // What the next byte belongs to.
+  enum class Stage : unsigned char {
+    head,     // a frame's length and, if it is a sample, all that comes before the payload
+    payload,  // payload_left_ bytes of a sample's payload
+    trailer,  // trailer_left_ bytes behind it
+    whole,    // whole_left_ bytes of a frame that is collected
+  };
+
+  // Each takes from the front of `input` what it can use now.
+  Result<void> decode(Bytes& input);
+  Result<void> take_head(Bytes& input);
+  Result<void> take_payload(Bytes& input);
+  Result<void> take_trailer(Bytes& input);
+  Result<void> take_whole(Bytes& input);
+
+  Result<void> begin_whole(Bytes& input, std::size_t length_bytes, std::size_t frame_bytes);
+  Result<void> end_sample(bool torn);
+  Result<void> parse_whole(Bytes message);
+  Result<void> hand_out_slowly(net::Frame& frame, std::size_t frame_bytes);
+  Result<void> check_payload_bytes(std::uint64_t payload_bytes) const;
+  std::size_t longest_frame_bytes() const noexcept;
+
   FrameSink& sink_;
   std::size_t max_frame_bytes_;
   std::size_t payload_bytes_ = 0;
   DecoderCounters counters_;
+  std::array<iovec, 2> spaces_{};
+
+  Stage stage_ = Stage::head;
+  bool held_ = false;  // on_sample_begin() refused the sample at the front of the input
+  std::size_t head_bytes_ = 0;
+  std::array<std::byte, kMaxSampleHeaderBytes> head_{};  // a head that is not complete
+  IncomingSample sample_;                                // the one under way
+  std::byte* place_ = nullptr;                           // where its next byte goes; null: nowhere
+  std::size_t payload_left_ = 0;
+  std::size_t trailer_bytes_ = 0, trailer_left_ = 0;
+  std::array<std::byte, kTornTrailerBytes> trailer_{};
+  std::vector<std::byte> whole_;
+  std::size_t whole_left_ = 0;
+  std::unique_ptr<InputBuffer> kept_input_;  // while a sample is held back
 };
 
 }  // namespace dssm::wire

@@ -17,6 +17,7 @@ namespace dssm::wire {
 
 inline constexpr std::uint32_t kNetworkProtocolVersion = 1;
 inline constexpr std::size_t kMaxNetworkFrameBytes = 17U << 20;  // without a payload
+inline constexpr std::size_t kMaxPlainBytes = 1U << 20;  // of a frame, without payload and property
 inline constexpr std::size_t kMaxFeatures = 32;
 inline constexpr std::size_t kMaxFeatureBytes = 63;
 inline constexpr std::string_view kFeatureTorn = "torn";  // network.proto, Frame.torn
@@ -53,7 +54,7 @@ Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string
 
 // This PC's id for a dssmd that calls its host `name`: from the machine id (machine-id(5)), which
 // is not told to others, and the name, so that several dssmd with different names on one machine
-// are different hosts. Without a machine id: random, and with it different after each start.
+// are different hosts. Without a machine id: random, and so different after each start.
 HostId host_id_for(std::string_view name);
 
 // Random and never 0.

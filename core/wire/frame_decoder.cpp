@@ -1,0 +1,384 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The decoder is a small state machine (Stage) over whatever arrives. Three ways lead through it:
+//
+//   many small samples   One receive brings thousands of frames into the input buffer. Each is read
+//                        by hand and its payload copied out: no allocation, no protobuf.
+//   one large sample     Its head comes into the input buffer. From then on spaces() gives the rest
+//                        of the payload's place first, and the kernel writes there.
+//   all the rest         A frame is collected, if it did not arrive at once, and parsed by
+//   protobuf.
+//
+// The input buffer belongs to the thread, not to the decoder, so nothing may stay in it: when a
+// commit() ends within a frame, a head is kept in head_ (a few bytes), payload and trailer are
+// where they belong already, other frames are in whole_. Only for a sample that the sink holds back
+// does the decoder take the buffer with it.
+#include "core/wire/frame_decoder.hpp"
+
+#include <algorithm>
+#include <cstring>
+
+#include "core/base/check.hpp"
+#include "core/wire/network_protocol.hpp"
+#include "core/wire/sample_head.hpp"
+#include "core/wire/sample_tags.hpp"
+#include "core/wire/varint.hpp"
+
+namespace dssm::wire {
+namespace {
+
+// About 2,000 small samples in one receive, and still in the processor's second cache.
+constexpr std::size_t kInputBytes = 256 << 10;
+
+// From this size on, all that fits into the input buffer beside a payload is the next one's head
+// and little more, so that all but that little is received in place. Below, one receive for several
+// samples and a copy that stays in the cache are cheaper.
+constexpr std::size_t kLargePayloadBytes = 32 << 10;
+constexpr std::size_t kSmallInputBytes = 4 << 10;
+
+// What a sample frame may have besides its payload.
+constexpr std::size_t kMaxSampleOverheadBytes = 1 << 10;
+
+Error bad(std::string why) { return Error{Errc::protocol, std::move(why)}; }
+
+std::string bytes_text(std::uint64_t bytes) { return std::to_string(bytes) + " bytes"; }
+
+Error too_long(std::uint64_t bytes, std::size_t limit) {
+  return bad("a frame of " + bytes_text(bytes) + " is longer than the " + std::to_string(limit) +
+             " that are taken");
+}
+
+bool is_bulk(std::uint64_t field) noexcept {
+  return field == net::Frame::kPayloadFieldNumber || field == net::Frame::kSetPropertyFieldNumber ||
+         field == net::Frame::kPropertyFieldNumber;
+}
+
+// How much of a frame is not the inside of a payload or a property. Such bytes may cost a hundred
+// times their size in memory when they are parsed (two bytes make an empty Stream in a list), and
+// two allocations each.
+std::size_t plain_bytes(std::span<const std::byte> message) noexcept {
+  const std::byte* at = message.data();
+  const std::byte* const end = at + message.size();
+  std::size_t bulk = 0;
+  while (at != end) {
+    std::uint64_t tag = 0, value = 0;
+    if (read_varint(at, end, kMaxLengthBytes, tag) != VarintStatus::ok) return message.size();
+    std::uint64_t content = 0;
+    switch (tag & 7) {
+      case 0:
+        if (read_varint(at, end, kMaxVarintBytes, value) != VarintStatus::ok) return message.size();
+        break;
+      case 1:
+        content = 8;
+        break;
+      case 2:
+        if (read_varint(at, end, kMaxLengthBytes, content) != VarintStatus::ok) {
+          return message.size();
+        }
+        if (is_bulk(tag >> 3)) bulk += content;
+        break;
+      case 5:
+        content = 4;
+        break;
+      default:
+        return message.size();  // groups: no message of ours has them
+    }
+    if (content > static_cast<std::uint64_t>(end - at)) return message.size();
+    at += content;
+  }
+  return message.size() - bulk;
+}
+
+Result<void> check_sample(std::int64_t tid, std::uint64_t clock_error_ns) {
+  if (tid < 0) return bad("a sample has the tid " + std::to_string(tid) + "; they start at 0");
+  if (clock_error_ns > static_cast<std::uint64_t>(INT64_MAX)) {
+    return bad("a sample has the clock error " + std::to_string(clock_error_ns) +
+               " ns; more than 2^63-1 is not possible");
+  }
+  return {};
+}
+
+IncomingSample incoming(std::uint64_t serial, std::int64_t tid, std::int64_t time_ns,
+                        std::uint64_t clock_error_ns, std::size_t payload_bytes) {
+  return {serial,
+          {tid, time_from_ns(time_ns), Duration(static_cast<std::int64_t>(clock_error_ns))},
+          payload_bytes};
+}
+
+}  // namespace
+
+struct FrameDecoder::InputBuffer {
+  const FrameDecoder* user;  // whose spaces() lent it out last
+  std::size_t begin, end;    // while a sample is held back: bytes[begin, end) are not decoded yet
+  std::array<std::byte, kInputBytes> bytes;
+};
+
+FrameDecoder::FrameDecoder(FrameSink& sink, std::size_t max_frame_bytes)
+    : sink_(sink), max_frame_bytes_(max_frame_bytes) {}
+
+FrameDecoder::~FrameDecoder() = default;
+
+void FrameDecoder::set_payload_bytes(std::size_t payload_bytes) noexcept {
+  payload_bytes_ = payload_bytes;
+}
+
+bool FrameDecoder::at_frame_end() const noexcept {
+  return stage_ == Stage::head && head_bytes_ == 0 && !kept_input_;
+}
+
+std::size_t FrameDecoder::longest_frame_bytes() const noexcept {
+  if (payload_bytes_ == 0) return max_frame_bytes_;
+  return std::max(max_frame_bytes_, payload_bytes_ + kMaxSampleOverheadBytes);
+}
+
+Result<void> FrameDecoder::check_payload_bytes(std::uint64_t payload_bytes) const {
+  if (payload_bytes_ == 0) return bad("a sample came where none is awaited");
+  if (payload_bytes == payload_bytes_) return {};
+  return bad("a sample of " + bytes_text(payload_bytes) + " came; the stream's samples have " +
+             std::to_string(payload_bytes_));
+}
+
+// --- the input buffer
+// -----------------------------------------------------------------------------
+
+// The thread's input buffer; null while a commit() works on it, so that a sink which drives another
+// connection from within a callback gets another one.
+std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
+  thread_local std::unique_ptr<InputBuffer> input;
+  return input;
+}
+
+std::span<const iovec> FrameDecoder::spaces() {
+  std::unique_ptr<InputBuffer>& input = thread_input();
+  if (!input) input = std::make_unique_for_overwrite<InputBuffer>();
+  input->user = this;
+  std::copy_n(head_.begin(), head_bytes_, input->bytes.begin());
+  const bool throws_away = stage_ == Stage::payload && !place_;
+  const bool receives_in_place =
+      payload_bytes_ >= kLargePayloadBytes && stage_ != Stage::whole && !throws_away;
+  const iovec rest{input->bytes.data() + head_bytes_,
+                   receives_in_place ? kSmallInputBytes : kInputBytes - head_bytes_};
+  if (!in_payload()) {
+    spaces_[0] = rest;
+    return std::span(spaces_).first(1);
+  }
+  spaces_ = {iovec{place_, payload_left_}, rest};
+  return spaces_;
+}
+
+Result<void> FrameDecoder::commit(std::size_t bytes) {
+  const bool resumes = kept_input_ != nullptr;
+  DSSM_CHECK(!resumes || bytes == 0);  // nothing is received while a sample is held back
+  held_ = false;
+  if (in_payload()) {
+    const std::size_t direct = std::min(bytes, payload_left_);
+    place_ += direct;
+    payload_left_ -= direct;
+    counters_.direct_payload_bytes += direct;
+    bytes -= direct;
+  }
+  std::unique_ptr<InputBuffer> buffer = std::move(resumes ? kept_input_ : thread_input());
+  Bytes input;
+  if (resumes) {
+    input = Bytes(buffer->bytes).subspan(buffer->begin, buffer->end - buffer->begin);
+  } else if (bytes > 0) {
+    DSSM_CHECK(buffer && buffer->user == this);  // commit() follows spaces(), in one thread
+    input = Bytes(buffer->bytes).first(head_bytes_ + bytes);
+    head_bytes_ = 0;
+  }
+  Result<void> result = decode(input);
+  if (held_) {
+    buffer->begin = static_cast<std::size_t>(input.data() - buffer->bytes.data());
+    buffer->end = buffer->begin + input.size();
+    kept_input_ = std::move(buffer);
+  } else {
+    thread_input() = std::move(buffer);
+  }
+  return result;
+}
+
+// --- decoding
+// -------------------------------------------------------------------------------------
+
+Result<void> FrameDecoder::decode(Bytes& input) {
+  // Without any input too: the last byte may have been received in place, and a frame that was
+  // collected may have been held back.
+  bool goes_on = !input.empty() || (stage_ == Stage::payload && payload_left_ == 0) ||
+                 (stage_ == Stage::whole && whole_left_ == 0);
+  while (goes_on) {
+    Result<void> taken;
+    switch (stage_) {
+      case Stage::head:
+        taken = take_head(input);
+        break;
+      case Stage::payload:
+        taken = take_payload(input);
+        break;
+      case Stage::trailer:
+        taken = take_trailer(input);
+        break;
+      case Stage::whole:
+        taken = take_whole(input);
+        break;
+    }
+    if (!taken) return taken;
+    goes_on = !input.empty() && !held_;
+  }
+  return {};
+}
+
+Result<void> FrameDecoder::take_head(Bytes& input) {
+  SampleHead head;
+  const HeadStatus status = read_sample_head_untrusted(input, head);
+  if (status == HeadStatus::no_frame) return bad("the input is no varint-delimited frame");
+  if (head.frame_bytes > longest_frame_bytes()) {
+    return too_long(head.frame_bytes, longest_frame_bytes());
+  }
+  if (status == HeadStatus::incomplete) {
+    head_bytes_ = input.size();
+    std::copy(input.begin(), input.end(), head_.begin());
+    input = {};
+    return {};
+  }
+  if (status == HeadStatus::other) {
+    return begin_whole(input, head.length_bytes, static_cast<std::size_t>(head.frame_bytes));
+  }
+  if (Result<void> checked = check_payload_bytes(head.payload_bytes); !checked) return checked;
+  if (Result<void> checked = check_sample(head.tid, head.clock_error_ns); !checked) return checked;
+  sample_ = incoming(head.serial, head.tid, head.time_ns, head.clock_error_ns, head.payload_bytes);
+  std::byte* place = nullptr;
+  Result<void> begun = sink_.on_sample_begin(sample_, place);
+  if (!begun || held_) return begun;
+  place_ = place;
+  payload_left_ = sample_.payload_bytes;
+  trailer_bytes_ = trailer_left_ = head.trailer_bytes;
+  stage_ = Stage::payload;
+  input = input.subspan(head.bytes);
+  return {};
+}
+
+Result<void> FrameDecoder::take_payload(Bytes& input) {
+  const std::size_t bytes = std::min(input.size(), payload_left_);
+  if (place_ && bytes > 0) {
+    std::memcpy(place_, input.data(), bytes);
+    place_ += bytes;
+    counters_.copied_payload_bytes += bytes;
+  }
+  payload_left_ -= bytes;
+  input = input.subspan(bytes);
+  if (payload_left_ > 0) return {};
+  if (trailer_bytes_ == 0) return end_sample(false);
+  stage_ = Stage::trailer;
+  return {};
+}
+
+// Behind the payload comes `torn`, or a field that is not known here and was not known to be there:
+// the head said only how long it is.
+Result<void> FrameDecoder::take_trailer(Bytes& input) {
+  const std::size_t bytes = std::min(input.size(), trailer_left_);
+  std::copy_n(input.begin(), bytes, trailer_.begin() + (trailer_bytes_ - trailer_left_));
+  trailer_left_ -= bytes;
+  input = input.subspan(bytes);
+  if (trailer_left_ > 0) return {};
+  const auto value = std::to_integer<unsigned>(trailer_.back());
+  if (trailer_[0] == kTornTag[0] && trailer_[1] == kTornTag[1] && value < 0x80) {
+    return end_sample(value != 0);
+  }
+  const std::byte* at = trailer_.data();
+  std::uint64_t tag = 0;
+  net::Frame trailer;
+  if (read_varint(at, trailer_.end(), kMaxLengthBytes, tag) != VarintStatus::ok ||
+      !trailer.ParseFromArray(trailer_.data(), static_cast<int>(trailer_.size()))) {
+    return bad("what follows a sample's payload is no field");
+  }
+  if (tag >> 3 <= net::Frame::kTornFieldNumber) {
+    return bad("field " + std::to_string(tag >> 3) +
+               " came behind a sample's payload; it has to come before it");
+  }
+  return end_sample(false);
+}
+
+Result<void> FrameDecoder::end_sample(bool torn) {
+  ++counters_.samples;
+  place_ = nullptr;
+  stage_ = Stage::head;
+  return sink_.on_sample_end(sample_, torn);
+}
+
+// --- frames that protobuf parses
+// --------------------------------------------------------------------
+
+Result<void> FrameDecoder::begin_whole(Bytes& input, std::size_t length_bytes,
+                                       std::size_t frame_bytes) {
+  const Bytes rest = input.subspan(length_bytes);
+  if (rest.size() >= frame_bytes) {
+    Result<void> parsed = parse_whole(rest.first(frame_bytes));
+    if (parsed && !held_) input = rest.subspan(frame_bytes);
+    return parsed;
+  }
+  whole_left_ = frame_bytes;
+  stage_ = Stage::whole;
+  input = rest;
+  return {};
+}
+
+Result<void> FrameDecoder::take_whole(Bytes& input) {
+  const std::size_t bytes = std::min(input.size(), whole_left_);
+  whole_.insert(whole_.end(), input.begin(), input.begin() + static_cast<std::ptrdiff_t>(bytes));
+  whole_left_ -= bytes;
+  input = input.subspan(bytes);
+  if (whole_left_ > 0) return {};
+  Result<void> parsed = parse_whole(whole_);
+  if (!parsed || held_) return parsed;
+  whole_ = {};
+  stage_ = Stage::head;
+  return {};
+}
+
+Result<void> FrameDecoder::parse_whole(Bytes message) {
+  if (message.size() > kMaxPlainBytes && plain_bytes(message) > kMaxPlainBytes) {
+    return bad("a frame of " + bytes_text(message.size()) + " has more than " +
+               std::to_string(kMaxPlainBytes) + " that are neither payload nor property");
+  }
+  net::Frame frame;
+  if (!frame.ParseFromArray(message.data(), static_cast<int>(message.size()))) {
+    return bad("a frame of " + bytes_text(message.size()) + " is no message of this protocol");
+  }
+  if (frame.has_sample() || !frame.payload().empty()) {
+    return hand_out_slowly(frame, message.size());
+  }
+  if (message.size() > max_frame_bytes_) return too_long(message.size(), max_frame_bytes_);
+  return sink_.on_frame(frame);
+}
+
+Result<void> FrameDecoder::hand_out_slowly(net::Frame& frame, std::size_t frame_bytes) {
+  const std::string& payload = frame.payload();
+  if (Result<void> checked = check_payload_bytes(payload.size()); !checked) return checked;
+  if (frame_bytes - payload.size() > kMaxSampleOverheadBytes) {
+    return bad("a sample's frame has " + bytes_text(frame_bytes - payload.size()) +
+               " besides the payload; at most " + std::to_string(kMaxSampleOverheadBytes) +
+               " are taken");
+  }
+  if (!frame.has_sample()) return bad("a payload came without its sample");
+  if (frame.body_case() != net::Frame::BODY_NOT_SET) {
+    return bad("a frame carries a sample and another message");
+  }
+  const net::Sample& stamps = frame.sample();
+  if (Result<void> checked = check_sample(stamps.tid(), stamps.clock_error_ns()); !checked) {
+    return checked;
+  }
+  sample_ = incoming(frame.serial(), stamps.tid(), stamps.time_ns(), stamps.clock_error_ns(),
+                     payload.size());
+  std::byte* place = nullptr;
+  Result<void> begun = sink_.on_sample_begin(sample_, place);
+  if (!begun || held_) return begun;
+  if (place) {
+    std::memcpy(place, payload.data(), payload.size());
+    counters_.copied_payload_bytes += payload.size();
+  }
+  ++counters_.samples;
+  ++counters_.slow_frames;
+  return sink_.on_sample_end(sample_, frame.torn());
+}
+
+}  // namespace dssm::wire

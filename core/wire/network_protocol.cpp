@@ -1,0 +1,163 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The greeting: what both ends say first, and what is believed of it. Words that a peer sends end
+// up in logs and tables, so they are short and hold no control characters.
+#include "core/wire/network_protocol.hpp"
+
+#include <fcntl.h>
+#include <sys/random.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cstring>
+
+#include "core/base/sha256.hpp"
+#include "core/base/unique_fd.hpp"
+
+namespace dssm::wire {
+namespace {
+
+// Sets what is hashed here apart from what other software hashes of the same machine id. Random,
+// made once; changing it changes the identity of every host.
+constexpr std::string_view kApplicationId = "677a14dda84aa85900164edec47f0e46";
+constexpr std::size_t kMachineIdBytes = 32;  // hexadecimal digits, machine-id(5)
+constexpr std::size_t kMaxHostBytes = 31;
+
+Error bad(const std::string& who, std::string_view why) {
+  return Error{Errc::protocol, who + " greets with " + std::string(why)};
+}
+
+bool is_host_name(std::string_view name) {
+  return !name.empty() && name.size() <= kMaxHostBytes &&
+         std::all_of(name.begin(), name.end(), [](char c) {
+           return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') ||
+                  c == '-';
+         });
+}
+
+bool is_printable(std::string_view text) {
+  return std::none_of(text.begin(), text.end(),
+                      [](unsigned char c) { return c < 0x20 || c == 0x7f; });
+}
+
+void fill_randomly(void* bytes, std::size_t size) {
+  // Up to 256 bytes come at once and never fail; early in the boot this waits for the kernel's
+  // pool.
+  while (::getrandom(bytes, size, 0) != static_cast<ssize_t>(size)) {
+  }
+}
+
+// 32 hexadecimal digits, or empty when this machine has no id (yet).
+std::string machine_id() {
+  const UniqueFd file(::open("/etc/machine-id", O_RDONLY | O_CLOEXEC));
+  std::string id(kMachineIdBytes, '\0');
+  if (!file || ::read(file.get(), id.data(), id.size()) != static_cast<ssize_t>(id.size())) {
+    return {};
+  }
+  const bool is_id = id.find_first_not_of("0123456789abcdef") == id.npos;
+  return is_id ? id : std::string();
+}
+
+// In place of a machine id, for as long as this process lives.
+std::string random_id() {
+  std::array<char, kMachineIdBytes> bytes{};
+  fill_randomly(bytes.data(), bytes.size());
+  return {bytes.begin(), bytes.end()};
+}
+
+}  // namespace
+
+bool Greeting::has_feature(std::string_view feature) const noexcept {
+  return std::find(features.begin(), features.end(), feature) != features.end();
+}
+
+std::string Greeting::str() const {
+  if (program == "dssmd") return "dssmd of host '" + host + "'";
+  return "'" + program + "' on host '" + host + "'";
+}
+
+void to_message(const Greeting& greeting, net::Hello& out) {
+  out.set_protocol_version(kNetworkProtocolVersion);
+  out.set_host(greeting.host);
+  out.set_host_id(greeting.host_id.data(), greeting.host_id.size());
+  out.set_life(greeting.life);
+  out.set_program(greeting.program);
+  out.set_version(greeting.version);
+  for (const std::string& feature : greeting.features) out.add_features(feature);
+  to_message(greeting.clock_bound, *out.mutable_clock());
+}
+
+Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string& who) {
+  const bool words_are_good =
+      message.program().size() <= kMaxProgramBytes && is_printable(message.program()) &&
+      message.version().size() <= kMaxProgramBytes && is_printable(message.version());
+  if (message.protocol_version() != kNetworkProtocolVersion) {
+    // A later version may use the other fields in another way: only what can be shown is shown.
+    const std::string software = words_are_good && !message.version().empty()
+                                     ? " (DSSM " + message.version() + ")"
+                                     : std::string();
+    return Error{Errc::protocol,
+                 who + " speaks version " + std::to_string(message.protocol_version()) +
+                     " of the network protocol" + software +
+                     ", this side (DSSM " DSSM_VERSION ") version " +
+                     std::to_string(kNetworkProtocolVersion) + "; install the same DSSM on both"};
+  }
+  Greeting greeting;
+  if (!is_host_name(message.host())) {
+    return bad(who, "a host name that is not 1 to 31 letters, digits and '-'");
+  }
+  if (message.host_id().size() != greeting.host_id.size()) {
+    return bad(who,
+               "a host id of " + std::to_string(message.host_id().size()) + " bytes; it takes 16");
+  }
+  if (!words_are_good) {
+    return bad(who,
+               "a program's name or version that is longer than 127 bytes or holds control "
+               "characters");
+  }
+  if (static_cast<std::size_t>(message.features_size()) > kMaxFeatures) {
+    return bad(who, "more than 32 features");
+  }
+  for (const std::string& feature : message.features()) {
+    if (feature.empty() || feature.size() > kMaxFeatureBytes || !is_printable(feature)) {
+      return bad(who, "a feature that is empty, longer than 63 bytes or holds control characters");
+    }
+    greeting.features.push_back(feature);
+  }
+  greeting.host = message.host();
+  std::memcpy(greeting.host_id.data(), message.host_id().data(), greeting.host_id.size());
+  greeting.life = message.life();
+  greeting.program = message.program();
+  greeting.version = message.version();
+  if (message.has_clock()) greeting.clock_bound = clock_bound_untrusted(message.clock());
+  return greeting;
+}
+
+HostId host_id_for(std::string_view name) {
+  static const std::string machine = [] {
+    std::string id = machine_id();
+    return id.empty() ? random_id() : id;
+  }();
+  // Both parts in front have a fixed length, so no two names give the same bytes. 128 random bits
+  // go in: nobody finds the machine id by trying.
+  const Sha256 digest = sha256(std::string(kApplicationId) + machine + std::string(name));
+  HostId id{};
+  std::copy_n(digest.begin(), id.size(), id.begin());
+  return id;
+}
+
+std::uint64_t random_number() {
+  std::uint64_t number = 0;
+  while (number == 0) fill_randomly(&number, sizeof number);
+  return number;
+}
+
+Duration clock_bound_untrusted(const net::ClockStatus& status) noexcept {
+  return status.bound_ns() < 0 ? kUnknownClockError : Duration(status.bound_ns());
+}
+
+void to_message(Duration clock_bound, net::ClockStatus& out) {
+  out.set_bound_ns(to_ns(clock_bound));
+}
+
+}  // namespace dssm::wire

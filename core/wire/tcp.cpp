@@ -1,0 +1,187 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// TCP as DSSM uses it. Two kinds of ends are told apart: a peer that closed or died (`end`, part of
+// normal work), and a network that does not carry (an error whose text says so).
+#include "core/wire/tcp.hpp"
+
+#include <netinet/in.h>
+#include <netinet/tcp.h>
+
+#include <algorithm>
+#include <cerrno>
+#include <cstring>
+#include <string>
+
+namespace dssm::wire {
+namespace {
+
+// A peer is given up when it left our probes or data unanswered for so long.
+constexpr int kProbeAfterSeconds = 1, kProbeEverySeconds = 1, kProbes = 2;
+constexpr unsigned kUnansweredMs = 3000;
+constexpr int kBacklog = 128;  // connections that wait for accept(); more get no answer yet
+constexpr std::size_t kMaxParts = 16;
+
+void set_option(int socket, int level, int option, int value) noexcept {
+  // The only failure is a socket that is none, and then everything else fails too.
+  static_cast<void>(::setsockopt(socket, level, option, &value, sizeof value));
+}
+
+Result<UniqueFd> tcp_socket(const SocketAddress& address) {
+  UniqueFd fd(::socket(address.storage.ss_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0));
+  if (!fd) return os_error("create a TCP socket for '" + address.str() + "'");
+  return fd;
+}
+
+// Why a connection does not work, in words that say what to look at; `what` is tried.
+Error network_error(const std::string& what, int errno_value) {
+  switch (errno_value) {
+    case ETIMEDOUT:
+      return Error{Errc::daemon_away, what + ": no answer from the other PC for " +
+                                          std::to_string(kUnansweredMs / 1000) +
+                                          " s; is it on, and is the network between us whole?"};
+    case EHOSTUNREACH:
+    case ENETUNREACH:
+    case EHOSTDOWN:
+    case ENETDOWN:
+      return Error{Errc::daemon_away, os_error(what, errno_value).message +
+                                          "; is the other PC on, and does this one have a way to "
+                                          "it (`ip route get`)?"};
+    default:
+      return os_error(what, errno_value);
+  }
+}
+
+Result<IoResult> io_result(ssize_t bytes, const char* what) {
+  if (bytes > 0) return IoResult{IoStatus::ok, static_cast<std::size_t>(bytes)};
+  if (bytes == 0) return IoResult{IoStatus::end, 0};
+  if (errno == EAGAIN) return IoResult{IoStatus::would_block, 0};
+  if (errno == EPIPE || errno == ECONNRESET) return IoResult{IoStatus::end, 0};
+  return network_error(what, errno);
+}
+
+class TcpTransport final : public Transport {
+ public:
+  explicit TcpTransport(UniqueFd socket) noexcept : socket_(std::move(socket)) {}
+
+  Result<IoResult> send(std::span<const iovec> parts, bool more) override {
+    const msghdr message = header(parts);
+    ssize_t bytes = 0;
+    do {
+      bytes =
+          ::sendmsg(socket_.get(), &message, MSG_NOSIGNAL | MSG_DONTWAIT | (more ? MSG_MORE : 0));
+    } while (bytes < 0 && errno == EINTR);
+    return io_result(bytes, "send to the other side");
+  }
+
+  Result<IoResult> receive(std::span<const iovec> spaces) override {
+    msghdr message = header(spaces);
+    ssize_t bytes = 0;
+    do {
+      bytes = ::recvmsg(socket_.get(), &message, MSG_DONTWAIT);
+    } while (bytes < 0 && errno == EINTR);
+    return io_result(bytes, "receive from the other side");
+  }
+
+  int fd() const noexcept override { return socket_.get(); }
+
+ private:
+  static msghdr header(std::span<const iovec> parts) noexcept {
+    msghdr message{};
+    message.msg_iov = const_cast<iovec*>(parts.data());  // the kernel only reads them
+    message.msg_iovlen = std::min(parts.size(), kMaxParts);
+    return message;
+  }
+
+  UniqueFd socket_;
+};
+
+using NameOf = int (*)(int, sockaddr*, socklen_t*);
+
+Result<SocketAddress> address_by(NameOf name_of, int socket, const char* what) {
+  SocketAddress address;
+  address.length = sizeof address.storage;
+  if (name_of(socket, reinterpret_cast<sockaddr*>(&address.storage), &address.length)) {
+    return os_error(what);
+  }
+  return address;
+}
+
+// With nobody listening at a port of this PC that the kernel also picks for outgoing connections,
+// a socket can be connected to itself.
+bool is_connected_to_itself(int socket) {
+  const Result<SocketAddress> local = local_address(socket), peer = peer_address(socket);
+  return local && peer && local->length == peer->length &&
+         std::memcmp(&local->storage, &peer->storage, local->length) == 0;
+}
+
+}  // namespace
+
+Result<UniqueFd> listen_tcp(const SocketAddress& address) {
+  const std::string what = "listen at '" + address.str() + "'";
+  Result<UniqueFd> fd = tcp_socket(address);
+  if (!fd) return std::move(fd).error().context(what);
+  set_option(fd->get(), SOL_SOCKET, SO_REUSEADDR, 1);
+  if (address.storage.ss_family == AF_INET6) set_option(fd->get(), IPPROTO_IPV6, IPV6_V6ONLY, 1);
+  if (::bind(fd->get(), address.get(), address.length) || ::listen(fd->get(), kBacklog)) {
+    if (errno == EADDRINUSE) {
+      return Error{Errc::conflict, what +
+                                       ": the port is taken by another process (`ss -ltnp` shows "
+                                       "it); end that one or choose another port"};
+    }
+    if (errno == EADDRNOTAVAIL) {
+      return Error{Errc::invalid_argument,
+                   what + ": this PC has no such address (`ip address` lists them)"};
+    }
+    return os_error(what);
+  }
+  return fd;
+}
+
+Result<SocketAddress> local_address(int socket) {
+  return address_by(&::getsockname, socket, "ask for a socket's own address");
+}
+
+Result<SocketAddress> peer_address(int socket) {
+  return address_by(&::getpeername, socket, "ask for the other side's address");
+}
+
+Result<UniqueFd> start_connect(const SocketAddress& address) {
+  Result<UniqueFd> fd = tcp_socket(address);
+  if (!fd) return fd;
+  set_channel_options(fd->get());
+  if (::connect(fd->get(), address.get(), address.length) && errno != EINPROGRESS &&
+      errno != EINTR) {
+    return network_error("connect to '" + address.str() + "'", errno);
+  }
+  return fd;
+}
+
+Result<void> finish_connect(int socket, const SocketAddress& address) {
+  const std::string what = "connect to '" + address.str() + "'";
+  int why = 0;
+  socklen_t length = sizeof why;
+  if (::getsockopt(socket, SOL_SOCKET, SO_ERROR, &why, &length)) return os_error(what);
+  if (why == 0 && is_connected_to_itself(socket)) why = ECONNREFUSED;
+  if (why == 0) return {};
+  if (why == ECONNREFUSED) {
+    return Error{Errc::no_daemon, os_error(what, why).message +
+                                      "; is dssmd running there, and does it listen on that "
+                                      "address?"};
+  }
+  return network_error(what, why);
+}
+
+void set_channel_options(int socket) noexcept {
+  set_option(socket, IPPROTO_TCP, TCP_NODELAY, 1);
+  set_option(socket, SOL_SOCKET, SO_KEEPALIVE, 1);
+  set_option(socket, IPPROTO_TCP, TCP_KEEPIDLE, kProbeAfterSeconds);
+  set_option(socket, IPPROTO_TCP, TCP_KEEPINTVL, kProbeEverySeconds);
+  set_option(socket, IPPROTO_TCP, TCP_KEEPCNT, kProbes);
+  set_option(socket, IPPROTO_TCP, TCP_USER_TIMEOUT, static_cast<int>(kUnansweredMs));
+}
+
+std::unique_ptr<Transport> make_tcp_transport(UniqueFd socket) {
+  return std::make_unique<TcpTransport>(std::move(socket));
+}
+
+}  // namespace dssm::wire
