@@ -36,10 +36,10 @@ LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOw
       logger_(logger),
       requests_(registry, opens, clock),
       recovering_(recovering) {
-  registry_.observe(this);
+  registry_.add_observer(*this);
 }
 
-LocalService::~LocalService() { registry_.observe(nullptr); }
+LocalService::~LocalService() { registry_.remove_observer(*this); }
 
 ClientNumber LocalService::connect(std::int32_t pid, std::uint32_t uid, ClientOutput& output) {
   const ClientNumber number = next_client_++;
@@ -213,7 +213,8 @@ void LocalService::on_stream_added(const Stream& stream) {
                 {.stream = stream.id().str(), .message_id = message_id::kStreamCreated});
 }
 
-void LocalService::on_stream_removed(const StreamId& id) {
+void LocalService::on_stream_removed(const Stream& stream) {
+  const StreamId& id = stream.id();
   local::StreamEvent event;
   event.set_removed(true);
   wire::to_message(id, *event.mutable_stream()->mutable_id());

@@ -90,7 +90,7 @@ class LocalService final : private StreamObserver {
   void release_held();
 
   void on_stream_added(const Stream& stream) override;
-  void on_stream_removed(const StreamId& id) override;
+  void on_stream_removed(const Stream& stream) override;
 
   Registry& registry_;
   OpenTable& opens_;

@@ -99,7 +99,7 @@ Result<void> Registry::remove(const StreamId& id) {
   }
   by_name_.erase(Key{stream->id().name, stream->id().id});
   in_order_.erase(std::find(in_order_.begin(), in_order_.end(), stream));
-  if (observer_) observer_->on_stream_removed(stream->id());
+  for (StreamObserver* observer : observers_) observer->on_stream_removed(*stream);
   return {};
 }
 
@@ -129,7 +129,7 @@ void Registry::add(std::shared_ptr<Stream> stream) {
                                       });
   in_order_.insert(place, stream);
   next_order_ = std::max(next_order_, stream->created_order() + 1);
-  if (observer_) observer_->on_stream_added(*stream);
+  for (StreamObserver* observer : observers_) observer->on_stream_added(*stream);
 }
 
 }  // namespace dssm::daemon

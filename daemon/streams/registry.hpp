@@ -24,7 +24,7 @@ namespace dssm::daemon {
 class StreamObserver {
  public:
   virtual void on_stream_added(const Stream& stream) = 0;
-  virtual void on_stream_removed(const StreamId& id) = 0;
+  virtual void on_stream_removed(const Stream& stream) = 0;
 
  protected:
   ~StreamObserver() = default;
@@ -43,8 +43,10 @@ class Registry {
   Registry(const Registry&) = delete;
   Registry& operator=(const Registry&) = delete;
 
-  // At most one; nullptr: none. It outlives the registry or takes itself off.
-  void observe(StreamObserver* observer) noexcept { observer_ = observer; }
+  // Told in the order in which they were added. Each outlives the registry or takes itself off;
+  // none does either while it is told.
+  void add_observer(StreamObserver& observer) { observers_.push_back(&observer); }
+  void remove_observer(StreamObserver& observer) { std::erase(observers_, &observer); }
 
   const std::string& host() const noexcept { return host_; }
   const MemoryBudget& budget() const noexcept { return budget_; }
@@ -96,7 +98,7 @@ class Registry {
   std::map<Key, std::shared_ptr<Stream>> by_name_;
   std::vector<std::shared_ptr<Stream>> in_order_;
   std::uint64_t next_order_ = 1;
-  StreamObserver* observer_ = nullptr;
+  std::vector<StreamObserver*> observers_;
 };
 
 }  // namespace dssm::daemon

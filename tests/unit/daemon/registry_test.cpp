@@ -429,19 +429,22 @@ TEST(Registry, FreesTheNameOfARemovedStreamAndLeavesItsHoldersAlone) {
   EXPECT_NE(next->info().incarnation, removed->info().incarnation);
 }
 
-TEST(Registry, TellsItsObserverWhatComesAndGoes) {
+TEST(Registry, TellsItsObserversWhatComesAndGoes) {
   struct Recorder final : StreamObserver {
     void on_stream_added(const Stream& stream) override { text += "+" + stream.id().name; }
-    void on_stream_removed(const StreamId& id) override { text += "-" + id.name; }
+    void on_stream_removed(const Stream& stream) override { text += "-" + stream.id().name; }
     std::string text;
-  } recorder;
+  } recorder, other;
   Registry registry("pc1", kLimits);
-  registry.observe(&recorder);
+  registry.add_observer(recorder);
+  registry.add_observer(other);
   create(registry, {"a", 0, ""});
   create(registry, {"a", 0, ""});
   create(registry, {"b", 0, ""});
+  registry.remove_observer(other);
   ASSERT_TRUE(registry.remove({"a", 0, ""}));
   EXPECT_EQ(recorder.text, "+a+b-a");
+  EXPECT_EQ(other.text, "+a+b");
 }
 
 }  // namespace
