@@ -15,9 +15,9 @@
 namespace dssm::wire {
 namespace {
 
-// A peer is given up when it left our probes or data unanswered for so long.
 constexpr int kProbeAfterSeconds = 1, kProbeEverySeconds = 1, kProbes = 2;
-constexpr unsigned kUnansweredMs = 3000;
+// A peer is given up when probes or data were left unanswered for so long (tcp.hpp says why two).
+constexpr int kUnansweredMs = 3000, kUntakenMs = 30'000;
 constexpr int kBacklog = 128;  // connections that wait for accept(); more get no answer yet
 constexpr std::size_t kMaxParts = 16;
 
@@ -30,6 +30,13 @@ Result<UniqueFd> tcp_socket(const SocketAddress& address) {
   UniqueFd fd(::socket(address.storage.ss_family, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0));
   if (!fd) return os_error("create a TCP socket for '" + address.str() + "'");
   return fd;
+}
+
+int user_timeout_ms(int socket) noexcept {
+  int value = 0;
+  socklen_t length = sizeof value;
+  ::getsockopt(socket, IPPROTO_TCP, TCP_USER_TIMEOUT, &value, &length);
+  return value;
 }
 
 // Why a connection does not work, in words that say what to look at; `what` is tried.
@@ -51,12 +58,12 @@ Error network_error(const std::string& what, int errno_value) {
   }
 }
 
-Result<IoResult> io_result(ssize_t bytes, const char* what) {
+Result<IoResult> io_result(ssize_t bytes, const char* what, int socket) {
   if (bytes > 0) return IoResult{IoStatus::ok, static_cast<std::size_t>(bytes)};
   if (bytes == 0) return IoResult{IoStatus::end, 0};
   if (errno == EAGAIN) return IoResult{IoStatus::would_block, 0};
   if (errno == EPIPE || errno == ECONNRESET) return IoResult{IoStatus::end, 0};
-  return network_error(what, errno);
+  return network_error(what, errno, socket);
 }
 
 class TcpTransport final : public Transport {
@@ -70,7 +77,7 @@ class TcpTransport final : public Transport {
       bytes =
           ::sendmsg(socket_.get(), &message, MSG_NOSIGNAL | MSG_DONTWAIT | (more ? MSG_MORE : 0));
     } while (bytes < 0 && errno == EINTR);
-    return io_result(bytes, "send to the other side");
+    return io_result(bytes, "send to the other side", socket_.get());
   }
 
   Result<IoResult> receive(std::span<const iovec> spaces) override {
@@ -79,7 +86,7 @@ class TcpTransport final : public Transport {
     do {
       bytes = ::recvmsg(socket_.get(), &message, MSG_DONTWAIT);
     } while (bytes < 0 && errno == EINTR);
-    return io_result(bytes, "receive from the other side");
+    return io_result(bytes, "receive from the other side", socket_.get());
   }
 
   int fd() const noexcept override { return socket_.get(); }
@@ -149,9 +156,10 @@ Result<UniqueFd> start_connect(const SocketAddress& address) {
   Result<UniqueFd> fd = tcp_socket(address);
   if (!fd) return fd;
   set_channel_options(fd->get());
+  set_option(fd->get(), IPPROTO_TCP, TCP_USER_TIMEOUT, kUnansweredMs);
   if (::connect(fd->get(), address.get(), address.length) && errno != EINPROGRESS &&
       errno != EINTR) {
-    return network_error("connect to '" + address.str() + "'", errno);
+    return network_error("connect to '" + address.str() + "'", errno, fd->get());
   }
   return fd;
 }
@@ -168,7 +176,7 @@ Result<void> finish_connect(int socket, const SocketAddress& address) {
                                       "; is dssmd running there, and does it listen on that "
                                       "address?"};
   }
-  return network_error(what, why);
+  return network_error(what, why, socket);
 }
 
 void set_channel_options(int socket) noexcept {
@@ -177,7 +185,7 @@ void set_channel_options(int socket) noexcept {
   set_option(socket, IPPROTO_TCP, TCP_KEEPIDLE, kProbeAfterSeconds);
   set_option(socket, IPPROTO_TCP, TCP_KEEPINTVL, kProbeEverySeconds);
   set_option(socket, IPPROTO_TCP, TCP_KEEPCNT, kProbes);
-  set_option(socket, IPPROTO_TCP, TCP_USER_TIMEOUT, static_cast<int>(kUnansweredMs));
+  set_option(socket, IPPROTO_TCP, TCP_USER_TIMEOUT, kUntakenMs);
 }
 
 std::unique_ptr<Transport> make_tcp_transport(UniqueFd socket) {

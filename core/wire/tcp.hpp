@@ -1,8 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // TCP sockets as DSSM uses them: non-blocking, close-on-exec, without Nagle's delay, and with a
-// kernel that notices within about 3 s that the other PC is gone (keep-alive probes and
-// TCP_USER_TIMEOUT), so that idle channels need no heartbeats of their own.
+// kernel that notices when the other PC is gone, so that idle channels need no heartbeats of their
+// own. How soon depends on the end:
+//
+//   the end that connected  3 s (keep-alive probes, and TCP_USER_TIMEOUT for what was sent): mirrors
+//                           and remote writers want to know, and begin anew.
+//   the end that accepted   30 s. Linux counts a receiver whose window stays closed like one that is
+//                           gone. A program that looks at its subscription every few seconds is not
+//                           to be cut off for it; one that takes nothing for 30 s is, and resumes
+//                           where it was when it looks again.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -24,14 +31,14 @@ Result<SocketAddress> local_address(int socket);
 Result<SocketAddress> peer_address(int socket);
 
 // Begins to connect; the socket becomes writable when it is done or failed, then ask
-// finish_connect().
+// finish_connect(). Sets the options of the end that connected.
 Result<UniqueFd> start_connect(const SocketAddress& address);
 
 // How connecting ended; the error says whom and why ("connect to '10.0.0.2:13776': Connection
 // refused; is dssmd running there, and does it listen on that address?").
 Result<void> finish_connect(int socket, const SocketAddress& address);
 
-// Sets the options named above on a connected or accepted socket.
+// Sets the options of the end that accepted.
 void set_channel_options(int socket) noexcept;
 
 // A transport over a connected socket; takes it over.
