@@ -16,5 +16,10 @@ inline constexpr std::string_view kStreamRemoved = "bdd6965dfe8a4d14a605fa127c65
 inline constexpr std::string_view kStreamAdopted = "a73f7306e3fa42bb87f7d49f265044f7";
 inline constexpr std::string_view kOfferRefused = "7a844fc7f25c4582beea94223502bb69";
 inline constexpr std::string_view kRecovering = "2e58a82ca63744cc956de7dd2a52e977";
+inline constexpr std::string_view kHostUp = "fe1593d94e4646a8809f1ca751e33ac1";
+inline constexpr std::string_view kHostDown = "7300d3a6bb28413296e1b5a92550935a";
+inline constexpr std::string_view kHostRefused = "6e6d9e31825e4606b3c25808b5202f09";
+inline constexpr std::string_view kMirror = "23d4f07a4eab2d215e6fbbb2388899a9";
+inline constexpr std::string_view kRemoteWriter = "94e358d29cf143f9fb5c0eaa7656d3f6";
 
 }  // namespace dssm::daemon::message_id
