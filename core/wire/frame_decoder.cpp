@@ -126,6 +126,13 @@ bool FrameDecoder::at_frame_end() const noexcept {
   return stage_ == Stage::head && head_bytes_ == 0 && !kept_input_;
 }
 
+void FrameDecoder::move_payload(std::byte* place) noexcept {
+  const std::size_t come = sample_.payload_bytes - payload_left_;
+  std::memcpy(place, place_ - come, come);
+  counters_.copied_payload_bytes += come;
+  place_ = place + come;
+}
+
 std::size_t FrameDecoder::longest_frame_bytes() const noexcept {
   if (payload_bytes_ == 0) return max_frame_bytes_;
   return std::max(max_frame_bytes_, payload_bytes_ + kMaxSampleOverheadBytes);

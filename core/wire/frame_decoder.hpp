@@ -93,6 +93,10 @@ class FrameDecoder {
   // Whether a payload has begun that is not complete: the place that the sink gave is in use.
   bool in_payload() const noexcept { return stage_ == Stage::payload && place_ != nullptr; }
 
+  // The sample under way, between on_sample_begin() and on_sample_end(), goes on at `place`: what
+  // has come of its payload is copied there, and its old place is free.
+  void move_payload(std::byte* place) noexcept;
+
   // Whether nothing is buffered: the last commit() ended at the end of a frame.
   bool at_frame_end() const noexcept;
 
