@@ -40,12 +40,13 @@ int user_timeout_ms(int socket) noexcept {
 }
 
 // Why a connection does not work, in words that say what to look at; `what` is tried.
-Error network_error(const std::string& what, int errno_value) {
+Error network_error(const std::string& what, int errno_value, int socket) {
   switch (errno_value) {
     case ETIMEDOUT:
       return Error{Errc::daemon_away, what + ": no answer from the other PC for " +
-                                          std::to_string(kUnansweredMs / 1000) +
-                                          " s; is it on, and is the network between us whole?"};
+                                          std::to_string(user_timeout_ms(socket) / 1000) +
+                                          " s; is it on, is the network between us whole, and "
+                                          "does the program there still read?"};
     case EHOSTUNREACH:
     case ENETUNREACH:
     case EHOSTDOWN:
