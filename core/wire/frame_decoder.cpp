@@ -109,7 +109,7 @@ IncomingSample incoming(std::uint64_t serial, std::int64_t tid, std::int64_t tim
 
 struct FrameDecoder::InputBuffer {
   const FrameDecoder* user;  // whose spaces() lent it out last
-  std::size_t begin, end;    // while a sample is held back: bytes[begin, end) are not decoded yet
+  std::size_t begin, end;    // in kept_input_: bytes[begin, end) are not decoded yet
   std::array<std::byte, kInputBytes> bytes;
 };
 
@@ -174,9 +174,8 @@ std::span<const iovec> FrameDecoder::spaces() {
 }
 
 Result<void> FrameDecoder::commit(std::size_t bytes) {
-  const bool resumes = kept_input_ != nullptr;
-  DSSM_CHECK(!resumes || bytes == 0);  // nothing is received while a sample is held back
-  held_ = false;
+  DSSM_CHECK(!held_ || bytes == 0);  // nothing is received while the sink holds back
+  held_ = refused_ = false;
   if (in_payload()) {
     const std::size_t direct = std::min(bytes, payload_left_);
     place_ += direct;
@@ -184,6 +183,7 @@ Result<void> FrameDecoder::commit(std::size_t bytes) {
     counters_.direct_payload_bytes += direct;
     bytes -= direct;
   }
+  const bool resumes = kept_input_ != nullptr;
   std::unique_ptr<InputBuffer> buffer = std::move(resumes ? kept_input_ : thread_input());
   Bytes input;
   if (resumes) {
@@ -194,7 +194,7 @@ Result<void> FrameDecoder::commit(std::size_t bytes) {
     head_bytes_ = 0;
   }
   Result<void> result = decode(input);
-  if (held_) {
+  if (held_ && !input.empty()) {
     buffer->begin = static_cast<std::size_t>(input.data() - buffer->bytes.data());
     buffer->end = buffer->begin + input.size();
     kept_input_ = std::move(buffer);
@@ -254,8 +254,8 @@ Result<void> FrameDecoder::take_head(Bytes& input) {
   if (Result<void> checked = check_sample(head.tid, head.clock_error_ns); !checked) return checked;
   sample_ = incoming(head.serial, head.tid, head.time_ns, head.clock_error_ns, head.payload_bytes);
   std::byte* place = nullptr;
-  Result<void> begun = sink_.on_sample_begin(sample_, place);
-  if (!begun || held_) return begun;
+  Result<void> begun = begin_sample(place);
+  if (!begun || refused_) return begun;
   place_ = place;
   payload_left_ = sample_.payload_bytes;
   trailer_bytes_ = trailer_left_ = head.trailer_bytes;
@@ -305,6 +305,12 @@ Result<void> FrameDecoder::take_trailer(Bytes& input) {
   return end_sample(false);
 }
 
+Result<void> FrameDecoder::begin_sample(std::byte*& place) {
+  Result<void> begun = sink_.on_sample_begin(sample_, place);
+  refused_ = held_;
+  return begun;
+}
+
 Result<void> FrameDecoder::end_sample(bool torn) {
   ++counters_.samples;
   place_ = nullptr;
@@ -320,7 +326,7 @@ Result<void> FrameDecoder::begin_whole(Bytes& input, std::size_t length_bytes,
   const Bytes rest = input.subspan(length_bytes);
   if (rest.size() >= frame_bytes) {
     Result<void> parsed = parse_whole(rest.first(frame_bytes));
-    if (parsed && !held_) input = rest.subspan(frame_bytes);
+    if (parsed && !refused_) input = rest.subspan(frame_bytes);
     return parsed;
   }
   whole_left_ = frame_bytes;
@@ -336,7 +342,7 @@ Result<void> FrameDecoder::take_whole(Bytes& input) {
   input = input.subspan(bytes);
   if (whole_left_ > 0) return {};
   Result<void> parsed = parse_whole(whole_);
-  if (!parsed || held_) return parsed;
+  if (!parsed || refused_) return parsed;
   whole_ = {};
   stage_ = Stage::head;
   return {};
@@ -377,8 +383,8 @@ Result<void> FrameDecoder::hand_out_slowly(net::Frame& frame, std::size_t frame_
   sample_ = incoming(frame.serial(), stamps.tid(), stamps.time_ns(), stamps.clock_error_ns(),
                      payload.size());
   std::byte* place = nullptr;
-  Result<void> begun = sink_.on_sample_begin(sample_, place);
-  if (!begun || held_) return begun;
+  Result<void> begun = begin_sample(place);
+  if (!begun || refused_) return begun;
   if (place) {
     std::memcpy(place, payload.data(), payload.size());
     counters_.copied_payload_bytes += payload.size();

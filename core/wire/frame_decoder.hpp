@@ -84,10 +84,12 @@ class FrameDecoder {
   //          the decoder is not usable afterwards
   Result<void> commit(std::size_t bytes);
 
-  // From within on_sample_begin(): there is no place for this sample now. `out` is not used, the
-  // sample stays in the input buffer, and commit() returns. The next commit(), which may be one of
-  // 0 bytes, goes on with on_sample_begin() for the same sample. Until then nothing is to be
-  // received.
+  // From within the sink: commit() shall return now, though more may be buffered. The next
+  // commit(), which may be one of 0 bytes, goes on. Until then nothing is to be received.
+  //   in on_sample_begin()  there is no place for this sample now: `out` is not used, the sample
+  //   stays
+  //                         in the input buffer, and on_sample_begin() comes again for it
+  //   in the others         what was handed out is taken; commit() returns after it
   void hold() noexcept { held_ = true; }
 
   // Whether a payload has begun that is not complete: the place that the sink gave is in use.
@@ -123,6 +125,7 @@ class FrameDecoder {
   Result<void> take_whole(Bytes& input);
 
   Result<void> begin_whole(Bytes& input, std::size_t length_bytes, std::size_t frame_bytes);
+  Result<void> begin_sample(std::byte*& place);
   Result<void> end_sample(bool torn);
   Result<void> parse_whole(Bytes message);
   Result<void> hand_out_slowly(net::Frame& frame, std::size_t frame_bytes);
@@ -136,7 +139,8 @@ class FrameDecoder {
   std::array<iovec, 2> spaces_{};
 
   Stage stage_ = Stage::head;
-  bool held_ = false;  // on_sample_begin() refused the sample at the front of the input
+  bool held_ = false;     // the sink wants commit() to return
+  bool refused_ = false;  // it did so in on_sample_begin(): the sample is still in the input
   std::size_t head_bytes_ = 0;
   std::array<std::byte, kMaxSampleHeaderBytes> head_{};  // a head that is not complete
   IncomingSample sample_;                                // the one under way
@@ -146,7 +150,7 @@ class FrameDecoder {
   std::array<std::byte, kTornTrailerBytes> trailer_{};
   std::vector<std::byte> whole_;
   std::size_t whole_left_ = 0;
-  std::unique_ptr<InputBuffer> kept_input_;  // while a sample is held back
+  std::unique_ptr<InputBuffer> kept_input_;  // what the sink did not want yet
 };
 
 }  // namespace dssm::wire
