@@ -19,6 +19,7 @@ void print_json(const MeterState& state, const Statistics& delays, Output& out) 
   json["new_samples"] = state.new_samples;
   json["seen_samples"] = state.seen;
   json["lost_samples"] = state.lost;
+  json["restarts"] = state.restarts;
   json["final"] = state.final;
   json["delay_mean_ns"] = known(delays.mean_ns);
   json["delay_min_ns"] = known(to_ns(delays.min));
@@ -45,7 +46,7 @@ Result<void> run_delay(const Options& options, Output& out) {
   meter.on_sample = [&](const SampleInfo& info, Time arrival) {
     delays.add(saturating_sub(arrival, info.time));
   };
-  meter.on_report = [&](const MeterState& state) {
+  meter.on_report = [&](const MeterState& state, Session&) {
     const auto print = options.json ? print_json : print_text;
     print(state, delays.statistics(), out);
   };

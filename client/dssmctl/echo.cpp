@@ -20,48 +20,85 @@ SampleForm form_of(const Options& options) {
   return options.csv ? SampleForm::csv : SampleForm::text;
 }
 
+// The fields to show of the reader's stream as it is now.
+Result<std::vector<Field>> wanted_fields(const RawReader& reader, const Options& options) {
+  Result<std::vector<Field>> fields =
+      select_fields(readable_fields_untrusted(reader.type()), options.fields);
+  if (!fields) return std::move(fields).error().context("show '" + reader.id().str() + "'");
+  return fields;
+}
+
 // Prints the samples after the reader's cursor, in order.
 class Echo {
  public:
-  Echo(RawReader& reader, SamplePrinter& printer, Output& out, std::uint64_t count)
+  Echo(RawReader& reader, SamplePrinter& printer, Output& out, const Options& options)
       : reader_(reader),
         printer_(printer),
         out_(out),
-        left_(count),
+        options_(options),
+        left_(options.count.value_or(
+            options.at || options.last ? 1 : std::numeric_limits<std::uint64_t>::max())),
         payload_(reader.payload_bytes()) {}
 
-  // Reads one sample with `read`, as the members of RawReader do, and prints it.
+  // Reads one sample with `read`, as the members of RawReader do, and prints it; goes on with the
+  // new ring of a stream that began anew. Never `restarted`, unless result() says why not to go on.
   template <class Read>
   ReadStatus print(Read read) {
     SampleInfo info;
-    const ReadStatus status = read(std::span<std::byte>(payload_), info);
+    ReadStatus status = ReadStatus::restarted;
+    while (status == ReadStatus::restarted && result_) {
+      status = read(std::span<std::byte>(payload_), info);
+      if (status == ReadStatus::restarted) begin_anew();
+    }
     if (status == ReadStatus::ok) {
-      printer_.sample(info, payload_, reader_.lost() - lost_);
+      printer_.sample(info, payload_, {reader_.lost() - lost_, reader_.restarts()});
       lost_ = reader_.lost();
       --left_;
     }
     return status;
   }
 
-  // Prints what is there up to sample `last`. Whether to go on.
-  bool print_until(Tid last) {
-    while (left_ > 0 && reader_.cursor() < last && !stop_requested()) {
+  // Prints what is there at this moment. Whether to go on.
+  bool print_new() {
+    const Tid last = reader_.newest();
+    const std::uint64_t restarts = reader_.restarts();
+    bool more = true;  // at least one look: only a read finds out that the stream began anew
+    while (more && go_on()) {
       const ReadStatus status =
           print([&](auto payload, auto& info) { return reader_.next(payload, info); });
-      if (status == ReadStatus::lapped) continue;
-      if (status != ReadStatus::ok) break;
-      if (!out_.flush_some()) return false;
+      if (status == ReadStatus::not_yet || !out_.flush_some()) break;
+      more = reader_.cursor() < last || reader_.restarts() != restarts;
     }
-    return out_.flush() && left_ > 0 && !stop_requested();
+    return out_.flush() && go_on();
   }
 
+  // Why the stream cannot be shown any longer.
+  const Result<void>& result() const { return result_; }
+
  private:
+  bool go_on() const { return left_ > 0 && result_ && !stop_requested(); }
+
+  void begin_anew() {
+    out_.flush();  // so that the lines come in order where both outputs go to one place
+    say_began_anew(reader_);
+    Result<std::vector<Field>> fields = wanted_fields(reader_, options_);
+    if (!fields) {
+      result_ = std::move(fields).error();
+    } else if (*fields != printer_.fields()) {
+      result_ = Error{Errc::type_mismatch, "go on with '" + reader_.id().str() +
+                                               "': it began anew with other fields; start again "
+                                               "to see them"};
+    }
+  }
+
   RawReader& reader_;
   SamplePrinter& printer_;
   Output& out_;
+  const Options& options_;
   std::uint64_t left_;
   std::uint64_t lost_ = 0;
   std::vector<std::byte> payload_;
+  Result<void> result_;
 };
 
 Error failed_read(const RawReader& reader, const std::string& what, ReadStatus status) {
@@ -105,12 +142,14 @@ Result<void> begin(const Options& options, bool awaited, RawReader& reader, Echo
     if (!time) return time.error();
     const ReadStatus status =
         echo.print([&](auto payload, auto& info) { return reader.at(*time, payload, info); });
+    if (!echo.result()) return echo.result();
     if (status != ReadStatus::ok) {
       return failed_read(reader, "the sample at " + seconds_text(to_ns(*time)), status);
     }
   } else if (options.last) {
     const ReadStatus status =
         echo.print([&](auto payload, auto& info) { return reader.latest(payload, info); });
+    if (!echo.result()) return echo.result();
     if (status != ReadStatus::ok) return failed_read(reader, "the newest sample", status);
   } else {
     reader.seek(awaited ? kNoTid : reader.newest());
@@ -121,35 +160,25 @@ Result<void> begin(const Options& options, bool awaited, RawReader& reader, Echo
 }  // namespace
 
 Result<void> run_echo(const Options& options, Output& out) {
-  catch_stop_signals();
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  Result<std::optional<OpenedStream>> opened = open_stream(*session, options);
-  if (!opened) return std::move(opened).error();
-  if (!*opened) return {};
-  RawReader& reader = (*opened)->reader;
-  Result<std::vector<Field>> fields =
-      select_fields(readable_fields_untrusted(reader.type()), options.fields);
-  if (!fields) return std::move(fields).error().context("show '" + reader.id().str() + "'");
+  return with_stream(options, [&](OpenedStream& opened) -> Result<void> {
+    RawReader& reader = opened.reader;
+    Result<std::vector<Field>> fields = wanted_fields(reader, options);
+    if (!fields) return std::move(fields).error();
+    SamplePrinter printer(out, form_of(options), options.full, reader.id(), std::move(*fields));
+    Echo echo(reader, printer, out, options);
+    printer.begin();
+    if (Result<void> begun = begin(options, opened.awaited, reader, echo); !begun) return begun;
+    if (!echo.print_new()) return echo.result();
 
-  const bool once = options.at || options.last;
-  const std::uint64_t count =
-      options.count.value_or(once ? 1 : std::numeric_limits<std::uint64_t>::max());
-  SamplePrinter printer(out, form_of(options), options.full, reader.id(), std::move(*fields));
-  Echo echo(reader, printer, out, count);
-  printer.begin();
-  if (Result<void> begun = begin(options, (*opened)->awaited, reader, echo); !begun) return begun;
-  if (!echo.print_until(reader.newest())) return {};
-
-  Result<Follower> follower = Follower::open(*session, reader, out);
-  if (!follower) return std::move(follower).error();
-  while (true) {
-    const Follower::Wake wake = follower->wait(kNever);
-    if (wake == Follower::Wake::stop) return {};
-    const bool go_on = echo.print_until(reader.newest());
-    if (!go_on) return {};
-    if (wake == Follower::Wake::removed) return removed_error(reader);
-  }
+    Result<Follower> follower = Follower::open(opened.session, reader, out);
+    if (!follower) return std::move(follower).error();
+    while (true) {
+      const Follower::Wake wake = follower->wait(kNever);
+      if (wake == Follower::Wake::stop) return {};
+      if (!echo.print_new()) return echo.result();
+      if (wake == Follower::Wake::ended) return end_of(reader);
+    }
+  });
 }
 
 }  // namespace dssm::ctl

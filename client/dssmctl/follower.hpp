@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Waiting on a stream that is being shown: for its next sample, the next report, Ctrl-C, the end of
-// whoever reads our output, and the stream's removal.
+// whoever reads our output, and the stream's end. A stream that begins anew, with a new ring, is
+// followed; one that was removed and is not there is at its end.
 //
 // It looks up every kLookUp because a signal that comes between the look at its mark and the sleep
 // on the ring would otherwise be noticed only with the next sample.
@@ -18,10 +19,10 @@ namespace dssm::ctl {
 class Follower {
  public:
   enum class Wake : unsigned char {
-    sample,  // there is something newer than the reader's cursor
+    sample,  // there is something newer than the reader's cursor, or the stream began anew
     deadline,
-    stop,     // by signal, or because nobody reads our output any more
-    removed,  // the stream was removed; samples written before may still be unread
+    stop,   // by signal, or because nobody reads our output any more
+    ended,  // nothing more will come; samples written before may still be unread
   };
 
   // `session`, `reader` and `out` outlive the follower.
@@ -39,13 +40,16 @@ class Follower {
   Session& session_;
   RawReader& reader_;
   Output& out_;
-  // Set by the session's thread when something happened to a stream of this name. Shared with the
-  // callback, which moves with the watch.
+  // Set by the session's thread when a stream of this name was removed. Shared with the callback,
+  // which moves with the watch.
   std::shared_ptr<std::atomic<bool>> suspicion_ = std::make_shared<std::atomic<bool>>(false);
   std::optional<Session::Watch> watch_;
 };
 
-// What to say when `reader`'s stream was removed.
-Error removed_error(const RawReader& reader);
+// Why nothing more comes to `reader`: its stream was removed, or began anew as something else.
+Error end_of(const RawReader& reader);
+
+// Says on standard error that `reader`'s stream began anew.
+void say_began_anew(const RawReader& reader);
 
 }  // namespace dssm::ctl

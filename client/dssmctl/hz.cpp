@@ -57,6 +57,7 @@ Json common_json(const MeterState& state, const Statistics& intervals) {
   json["new_samples"] = state.new_samples;
   json["seen_samples"] = state.seen;
   json["lost_samples"] = state.lost;
+  json["restarts"] = state.restarts;
   json["age_ns"] = state.seen > 0 ? Json(to_ns(state.age)) : Json();
   json["final"] = state.final;
   json["rate_hz"] = rate_hz(intervals) > 0 ? Json(rate_hz(intervals)) : Json();
@@ -101,7 +102,7 @@ Result<void> run_interval_meter(const Options& options, Output& out, Print print
   meter.from_history = true;
   meter.on_sample = [&](const SampleInfo& info, Time) { intervals.on_sample(info); };
   meter.on_gap = [&] { intervals.on_gap(); };
-  meter.on_report = [&](const MeterState& state) {
+  meter.on_report = [&](const MeterState& state, Session&) {
     print(state, intervals.statistics(), options.json, out);
   };
   return run_meter(options, out, meter);

@@ -4,6 +4,7 @@
 // dssmd, one write; it is run in loops and by the shell's completion, so it has to be quick.
 #include <algorithm>
 
+#include "client/dssmctl/names.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/stream_json.hpp"
 #include "client/dssmctl/table.hpp"

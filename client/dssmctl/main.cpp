@@ -53,12 +53,6 @@ Result<void> run(const Options& options, Output& out) {
   return Error{Errc::invalid_argument, "no such verb"};  // not reached: all verbs are listed above
 }
 
-void complain(std::string_view text) {
-  Output err(STDERR_FILENO);
-  err.add(text);
-  err.flush();
-}
-
 int report(const Error& error, const std::string& verb_name) {
   complain("dssmctl: " + verb_name + ": " + escaped_message(error.message) + "\n");
   return error.code == Errc::invalid_argument ? kWrongUsage : kFailure;

@@ -5,7 +5,6 @@
 
 #include "client/dssmctl/follower.hpp"
 #include "client/dssmctl/open_stream.hpp"
-#include "client/dssmctl/stop_signal.hpp"
 #include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
@@ -18,6 +17,18 @@ class StampReader {
       : reader_(reader), meter_(meter), state_(state) {}
 
   void read_new() {
+    read_ring();
+    while (began_anew()) {
+      say_began_anew(reader_);
+      state_.restarts = reader_.restarts();
+      if (meter_.on_gap) meter_.on_gap();
+      read_ring();
+    }
+    state_.age = saturating_sub(WallClock::now(), newest_time_);
+  }
+
+ private:
+  void read_ring() {
     const Time arrival = WallClock::now();
     const Tid newest = reader_.newest();
     Tid tid = reader_.cursor() + 1;
@@ -37,10 +48,18 @@ class StampReader {
       meter_.on_sample(info, arrival);
     }
     reader_.seek(tid - 1);
-    state_.age = saturating_sub(WallClock::now(), newest_time_);
   }
 
- private:
+  // Goes on with the stream's new ring, when there is one; stamps alone would never tell. No
+  // payload is read.
+  bool began_anew() {
+    const Tid cursor = reader_.cursor();
+    BorrowedSample next;
+    if (reader_.borrow(cursor + 1, next) == ReadStatus::restarted) return true;
+    reader_.seek(cursor);
+    return false;
+  }
+
   RawReader& reader_;
   const Meter& meter_;
   MeterState& state_;
@@ -57,47 +76,45 @@ Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t wind
 }  // namespace
 
 Result<void> run_meter(const Options& options, Output& out, const Meter& meter) {
-  catch_stop_signals();
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  Result<std::optional<OpenedStream>> opened = open_stream(*session, options);
-  if (!opened) return std::move(opened).error();
-  if (!*opened) return {};
-  RawReader& reader = (*opened)->reader;
-  Result<Follower> follower = Follower::open(*session, reader, out);
-  if (!follower) return std::move(follower).error();
+  return with_stream(options, [&](OpenedStream& opened) -> Result<void> {
+    RawReader& reader = opened.reader;
+    Result<Follower> follower = Follower::open(opened.session, reader, out);
+    if (!follower) return std::move(follower).error();
 
-  MeterState state;
-  state.stream = reader.id();
-  state.payload_bytes = reader.payload_bytes();
-  StampReader stamps(reader, meter, state);
-  reader.seek(std::max(kNoTid, start_before(reader, meter, options.window, (*opened)->awaited)));
-  if (meter.from_history) stamps.read_new();
+    MeterState state;
+    state.stream = reader.id();
+    state.payload_bytes = reader.payload_bytes();
+    StampReader stamps(reader, meter, state);
+    reader.seek(std::max(kNoTid, start_before(reader, meter, options.window, opened.awaited)));
+    if (meter.from_history) stamps.read_new();
 
-  std::uint64_t reports = 0;
-  MonoTime due = deadline_in(options.interval);
-  while (true) {
-    const bool early = meter.from_history && reports == 0 && state.seen >= 2;
-    if (early || MonoClock::now() >= due) {
-      meter.on_report(state);
-      state.new_samples = 0;
-      if (!out.flush() || ++reports == options.count) return {};
-      due = deadline_in(options.interval);
+    std::uint64_t reports = 0;
+    MonoTime due = deadline_in(options.interval);
+    while (true) {
+      const bool early = meter.from_history && reports == 0 && state.seen >= 2;
+      if (early || MonoClock::now() >= due) {
+        meter.on_report(state, opened.session);
+        state.new_samples = 0;
+        if (!out.flush() || ++reports == options.count) return {};
+        due = deadline_in(options.interval);
+      }
+      const Follower::Wake wake = follower->wait(due);
+      stamps.read_new();
+      if (wake == Follower::Wake::stop || wake == Follower::Wake::ended) {
+        state.final = true;
+        meter.on_report(state, opened.session);
+        if (wake == Follower::Wake::ended) return end_of(reader);
+        return {};
+      }
     }
-    const Follower::Wake wake = follower->wait(due);
-    stamps.read_new();
-    if (wake == Follower::Wake::stop || wake == Follower::Wake::removed) {
-      state.final = true;
-      meter.on_report(state);
-      if (wake == Follower::Wake::removed) return removed_error(reader);
-      return {};
-    }
-  }
+  });
 }
 
 std::string farewell(const MeterState& state) {
-  return "--- " + escaped(state.stream.str()) + ": " + std::to_string(state.seen) + " samples, " +
-         std::to_string(state.lost) + " lost ---\n";
+  std::string text = "--- " + escaped(state.stream.str()) + ": " + std::to_string(state.seen) +
+                     " samples, " + std::to_string(state.lost) + " lost";
+  if (state.restarts > 0) text += ", began anew " + std::to_string(state.restarts) + " times";
+  return text + " ---\n";
 }
 
 }  // namespace dssm::ctl

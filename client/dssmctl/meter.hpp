@@ -5,7 +5,7 @@
 #pragma once
 
 #include <cstdint>
-#include <dssm/sample.hpp>
+#include <dssm/session.hpp>
 #include <functional>
 #include <string>
 
@@ -21,6 +21,7 @@ struct MeterState {
   std::uint64_t seen = 0;         // samples since the start
   std::uint64_t new_samples = 0;  // since the last report
   std::uint64_t lost = 0;         // overwritten before their stamps were read, since the start
+  std::uint64_t restarts = 0;     // of the stream, since the start
   Duration age{};                 // of the newest sample seen; meaningless while seen is 0
   bool final = false;             // the last one, not after an interval
 };
@@ -31,11 +32,11 @@ struct Meter {
   bool from_history = false;
   std::function<void(const SampleInfo& info, Time arrival)> on_sample;
   std::function<void()> on_gap;  // the next sample does not follow the last one
-  std::function<void(const MeterState& state)> on_report;
+  std::function<void(const MeterState& state, Session& session)> on_report;
 };
 
-// Runs until `options.count` reports are made; or until Ctrl-C or the removal of the stream, with
-// one more report.
+// Runs until `options.count` reports are made; or until Ctrl-C or the end of the stream, with one
+// more report.
 Result<void> run_meter(const Options& options, Output& out, const Meter& meter);
 
 // "--- odom:0@pc1: 12 samples, 0 lost ---", before a final report for people.

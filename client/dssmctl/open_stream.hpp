@@ -5,9 +5,7 @@
 #pragma once
 
 #include <dssm/session.hpp>
-#include <string>
-#include <string_view>
-#include <vector>
+#include <functional>
 
 #include "client/dssmctl/options.hpp"
 
@@ -16,21 +14,18 @@ namespace dssm::ctl {
 Result<Session> connect(const Options& options);
 
 struct OpenedStream {
+  Session session;
   RawReader reader;
   bool awaited;  // it was not there at first: nothing of it was missed
 };
 
-// Opens `options.stream` for reading, waiting up to `options.wait` for it. Fails also with a text
-// that names similar streams; without a reader and without an error when told to stop.
-Result<std::optional<OpenedStream>> open_stream(Session& session, const Options& options);
+// For verbs that run until told otherwise: catches stop signals, connects, opens `options.stream`
+// for reading, waiting up to `options.wait` for it, and does `work` with it. Success without `work`
+// when told to stop before; a failure to open names similar streams.
+Result<void> with_stream(const Options& options,
+                         const std::function<Result<void>(OpenedStream&)>& work);
 
 // `error` with a hint at streams named like `wanted` when it says that there is no such stream.
 Error with_similar_names(Error error, Session& session, const StreamId& wanted);
-
-// Those of `names` that a person may have meant by `wanted`, best first, at most three.
-std::vector<std::string> similar_names(std::string_view wanted, std::vector<std::string> names);
-
-// A stream's shortest unambiguous name: without ":0".
-std::string short_name(const StreamId& id);
 
 }  // namespace dssm::ctl

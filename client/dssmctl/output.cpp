@@ -42,4 +42,10 @@ std::string Output::bold(std::string_view text) const {
   return colour_ ? "\x1b[1m" + std::string(text) + "\x1b[0m" : std::string(text);
 }
 
+void complain(std::string_view text) {
+  Output err(STDERR_FILENO);
+  err.add(text);
+  err.flush();
+}
+
 }  // namespace dssm::ctl

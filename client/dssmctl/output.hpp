@@ -47,4 +47,7 @@ class Output {
   Result<void> result_;
 };
 
+// Writes `text` to standard error, at once.
+void complain(std::string_view text);
+
 }  // namespace dssm::ctl

@@ -54,22 +54,23 @@ void SamplePrinter::begin() {
 }
 
 void SamplePrinter::sample(const SampleInfo& info, std::span<const std::byte> payload,
-                           std::uint64_t lost) {
+                           const Breaks& breaks) {
   switch (form_) {
     case SampleForm::text:
-      return text_sample(info, payload, lost);
+      return text_sample(info, payload, breaks);
     case SampleForm::json:
-      return json_sample(info, payload, lost);
+      return json_sample(info, payload, breaks);
     case SampleForm::csv:
       return csv_sample(info, payload);
   }
 }
 
 void SamplePrinter::text_sample(const SampleInfo& info, std::span<const std::byte> payload,
-                                std::uint64_t lost) {
+                                const Breaks& breaks) {
   std::string text;
-  if (lost > 0) {
-    text += "# " + std::to_string(lost) + " samples were overwritten before they could be shown\n";
+  if (breaks.lost > 0) {
+    text += "# " + std::to_string(breaks.lost) +
+            " samples were overwritten before they could be shown\n";
   }
   text += "tid: " + std::to_string(info.tid) + "\ntime: " + seconds_text(to_ns(info.time));
   text += "\nclock_error: ";
@@ -91,14 +92,15 @@ void SamplePrinter::text_sample(const SampleInfo& info, std::span<const std::byt
 }
 
 void SamplePrinter::json_sample(const SampleInfo& info, std::span<const std::byte> payload,
-                                std::uint64_t lost) {
+                                const Breaks& breaks) {
   Json json;
   json["stream"] = stream_.str();
   json["tid"] = info.tid;
   json["time_ns"] = to_ns(info.time);
   json["clock_error_ns"] =
       info.clock_error == kUnknownClockError ? Json() : Json(to_ns(info.clock_error));
-  json["lost"] = lost;
+  json["lost"] = breaks.lost;
+  json["restarts"] = breaks.restarts;
   if (fields_.empty()) {
     json["payload_bytes"] = payload.size();
     json["payload_hex"] = hex_text(payload);

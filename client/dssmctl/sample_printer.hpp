@@ -32,12 +32,20 @@ class SamplePrinter {
   // What stands before the first sample: CSV's header line.
   void begin();
 
-  // One sample; `lost` samples before it were overwritten unread.
-  void sample(const SampleInfo& info, std::span<const std::byte> payload, std::uint64_t lost);
+  const std::vector<Field>& fields() const { return fields_; }
+
+  // What came between a sample and those before it.
+  struct Breaks {
+    std::uint64_t lost = 0;      // samples right before it that were overwritten unread
+    std::uint64_t restarts = 0;  // how often the stream began anew since the start
+  };
+  void sample(const SampleInfo& info, std::span<const std::byte> payload, const Breaks& breaks);
 
  private:
-  void text_sample(const SampleInfo& info, std::span<const std::byte> payload, std::uint64_t lost);
-  void json_sample(const SampleInfo& info, std::span<const std::byte> payload, std::uint64_t lost);
+  void text_sample(const SampleInfo& info, std::span<const std::byte> payload,
+                   const Breaks& breaks);
+  void json_sample(const SampleInfo& info, std::span<const std::byte> payload,
+                   const Breaks& breaks);
   void csv_sample(const SampleInfo& info, std::span<const std::byte> payload);
   std::string cell(std::string_view text) const;
 

@@ -79,6 +79,7 @@ TEST_F(Echo, PrintsTheSameAsJson) {
   write(0, 3);
   EXPECT_EQ(json({"echo", "s", "--last"}), Json::parse(R"({
       "stream": "s:0@pc1", "tid": 3, "time_ns": 103000000000, "clock_error_ns": 3000, "lost": 0,
+      "restarts": 0,
       "fields": {"number": 3, "value": 1.5, "inner.a": -3, "inner.b": [1, 2], "row.a": [10, 20],
                  "row[0].b": [11, 12], "row[1].b": [21, 22], "text": "a,\"b\""}})"));
 }

@@ -17,7 +17,7 @@ std::string print(SampleForm form, std::vector<Field> fields, std::span<const st
   return printed([&](Output& out) {
     SamplePrinter printer(out, form, full, kStream, std::move(fields));
     printer.begin();
-    printer.sample(info, payload, lost);
+    printer.sample(info, payload, {lost, 3});
   });
 }
 
@@ -52,7 +52,7 @@ TEST(SamplePrinter, LeavesAnUnknownClockErrorEmptyInCsvAndNullInJson) {
             "tid,time_ns,clock_error_ns,payload_hex\n7,1500000000,,ab\n");
   EXPECT_EQ(print(SampleForm::json, {}, payload, info_of(), false, 2),
             "{\"stream\":\"s:1@pc1\",\"tid\":7,\"time_ns\":1500000000,\"clock_error_ns\":null,"
-            "\"lost\":2,\"payload_bytes\":1,\"payload_hex\":\"ab\"}\n");
+            "\"lost\":2,\"restarts\":3,\"payload_bytes\":1,\"payload_hex\":\"ab\"}\n");
 }
 
 TEST(SamplePrinter, ShortensLongPayloadsUnlessToldOtherwise) {

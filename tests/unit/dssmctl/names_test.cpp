@@ -1,12 +1,32 @@
 // SPDX-License-Identifier: Apache-2.0
-#include <gtest/gtest.h>
+#include "client/dssmctl/names.hpp"
 
-#include "client/dssmctl/open_stream.hpp"
+#include <gtest/gtest.h>
 
 namespace dssm::ctl {
 namespace {
 
 using Names = std::vector<std::string>;
+
+Names opening(const std::vector<StreamId>& ids) {
+  std::vector<StreamInfo> streams;
+  for (const StreamId& id : ids) streams.emplace_back().id = id;
+  return opening_names(streams, "pc1");
+}
+
+TEST(OpeningNames, AreShortWhereOneStreamHasTheName) {
+  EXPECT_EQ(opening({{"odom", 0, "pc1"}, {"lidar", 0, "pc2"}, {"lidar", 1, "pc3"}}),
+            (Names{"odom", "lidar", "lidar:1"}));
+}
+
+TEST(OpeningNames, AreShortForAnOwnStreamAndNameTheHostOfOthers) {
+  EXPECT_EQ(opening({{"odom", 0, "pc1"}, {"odom", 0, "pc2"}, {"odom", 0, "pc3"}}),
+            (Names{"odom", "odom@pc2", "odom@pc3"}));
+}
+
+TEST(OpeningNames, NameTheHostsWhenOnlyOthersHaveTheStream) {
+  EXPECT_EQ(opening({{"cam", 2, "pc2"}, {"cam", 2, "pc3"}}), (Names{"cam:2@pc2", "cam:2@pc3"}));
+}
 
 TEST(SimilarNames, FindsTypingErrorsBestFirst) {
   EXPECT_EQ(similar_names("lidr", {"odom", "lida", "lidar", "camera"}), (Names{"lida", "lidar"}));
@@ -20,6 +40,10 @@ TEST(SimilarNames, FindsPartsOfNames) {
 
 TEST(SimilarNames, FindsAnotherId) {
   EXPECT_EQ(similar_names("lidar:2", {"lidar:1", "imu"}), Names{"lidar:1"});
+}
+
+TEST(SimilarNames, NamesEachOnce) {
+  EXPECT_EQ(similar_names("lidr", {"lidar", "lidar"}), Names{"lidar"});
 }
 
 TEST(SimilarNames, NamesThreeAtMost) {
