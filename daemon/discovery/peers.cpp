@@ -204,6 +204,7 @@ std::vector<local::Host> Peers::hosts() const {
     if (link.address() != link.configured().str()) host.add_addresses(link.address());
     host.set_since_ns(to_ns(link.in_this_state_for()));
     host.set_round_trip_ns(to_ns(link.last_round_trip()));
+    host.set_least_round_trip_ns(to_ns(link.least_round_trip()));
     host.set_clock_bound_ns(to_ns(kUnknownClockError));
     host.set_insecure(link.crosses_network());
     if (link.them()) {

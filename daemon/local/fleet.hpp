@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // What the programs of this PC may ask of other hosts, as LocalService sees it. Answers come later,
-// by a function that is called once, from the loop, or at once from within the call.
+// by a function that is called once, from the loop, or at once from within the call; never after
+// the Fleet is gone. An id without a host means the only other host that has such a stream: own
+// streams are looked for first, by the caller.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -35,16 +37,15 @@ class Fleet {
   };
   virtual void observe(Observer* observer) = 0;  // nullptr: none
 
-  // Whether some other host owns `id`: `id` names another host, or it names none and a known host
-  // has it. Own streams are looked for first, by the caller.
-  virtual bool is_remote(const StreamId& id) const = 0;
+  // Whether the other host that `id` names is there and has such a stream.
+  virtual bool is_there(const StreamId& id) const = 0;
 
   // The mirror of a stream, filled with its history. Kept while its Stream is in the OpenTable, and
   // some seconds longer.
   virtual void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) = 0;
 
-  // A ring of this host that is published into the other host's stream. `plan`: create the stream
-  // there unless it exists; nullptr: it must exist. `id` names the host unless `plan` is nullptr.
+  // A ring of this host that is published into the other host's stream.
+  //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist
   virtual void open_writer(const StreamId& id, const CreatePlan* plan,
                            Then<OpenedRemoteWriter> then) = 0;
 
