@@ -1,0 +1,183 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A mirror answers as the owner's ring does: random reads by time and by tid of the same streams on
+// three hosts, while they are written and in pauses, give the same tids, times, clock errors and
+// bytes.
+#include <atomic>
+#include <cstring>
+#include <random>
+#include <thread>
+
+#include "tests/process/network/fleet.hpp"
+#include "tests/process/network/known_samples.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr int kHosts = 3;
+constexpr int kRounds = 10;
+constexpr int kReadsByTime = 1'000'000 / kSlowness;  // of all streams, each on all hosts
+
+// One stream, its writer on pc1, and a reader on each host; [0] is the owner's.
+struct Watched {
+  KnownStream known;
+  Tid history = 0;    // samples written before anybody reads
+  int per_round = 0;  // samples written in each round
+  RawWriter writer;
+  std::vector<RawReader> readers;
+  std::vector<std::byte> scratch = std::vector<std::byte>(known.payload_bytes);
+
+  void write_next() {
+    const SampleInfo info = known.info(writer.newest() + 1);
+    known.fill(scratch, 1, info.tid);
+    ASSERT_EQ(writer.write(scratch, info.time, info.clock_error), info.tid);
+  }
+};
+
+class Equality : public NetworkTest {
+ protected:
+  void watch(const KnownStream& known, Tid history, int per_round) {
+    streams.push_back({known,
+                       history,
+                       per_round,
+                       sessions[0].create_raw(known.id, known.type(), known.history()).value(),
+                       {}});
+    while (streams.back().writer.newest() + 1 < history) streams.back().write_next();
+  }
+
+  // Reads by `read(reader, payload, info)` on all hosts, and compares. Returns whether the read was
+  // good on all; while the stream is written, `too_old` and `not_yet` may come on one only.
+  template <class Read>
+  bool compare(Watched& stream, Read read, bool paused) {
+    SampleInfo infos[kHosts];
+    ReadStatus statuses[kHosts];
+    for (std::size_t host = 0; host < kHosts; ++host) {
+      payloads[host].resize(stream.known.payload_bytes);
+      statuses[host] = read(stream.readers[host], payloads[host], infos[host]);
+    }
+    for (std::size_t host = 1; host < kHosts; ++host) {
+      if (paused) {
+        EXPECT_EQ(status_name(statuses[host]), status_name(statuses[0]));
+      }
+      if (statuses[host] != ReadStatus::ok || statuses[0] != ReadStatus::ok) return false;
+      EXPECT_EQ(infos[host].tid, infos[0].tid);
+      EXPECT_EQ(infos[host].time, infos[0].time) << "of tid " << infos[0].tid;
+      EXPECT_EQ(infos[host].clock_error, infos[0].clock_error) << "of tid " << infos[0].tid;
+      EXPECT_TRUE(payloads[host] == payloads[0]) << "bytes of tid " << infos[0].tid;
+    }
+    return true;
+  }
+
+  // A random time in the middle of the samples [first, last], or a little outside of them.
+  Time random_time(const Watched& stream, Tid first, Tid last) {
+    const std::int64_t margin = 3 * to_ns(stream.known.cycle);
+    std::uniform_int_distribution<std::int64_t> times(to_ns(stream.known.info(first).time) - margin,
+                                                      to_ns(stream.known.info(last).time) + margin);
+    return time_from_ns(times(random));
+  }
+
+  // Waits until all mirrors have what the owner has.
+  void await_mirrors(Watched& stream) {
+    for (RawReader& reader : stream.readers) {
+      ASSERT_EQ(reader.wait_for_tid(stream.writer.newest(), kNever), WaitStatus::ready);
+      EXPECT_EQ(reader.newest(), stream.writer.newest());
+      EXPECT_EQ(reader.oldest(), stream.readers[0].oldest()) << "not the same window";
+    }
+  }
+
+  void compare_by_time_in_a_pause(Watched& stream, int reads) {
+    await_mirrors(stream);
+    for (int i = 0; i < reads && !HasFailure(); ++i) {
+      const Tid oldest = stream.readers[0].oldest();
+      // A third of them before anybody here began to read.
+      const Tid newest = i % 3 == 0 ? stream.history - 1 : stream.writer.newest();
+      const Time t = random_time(stream, std::min(oldest, newest), newest);
+      compare(
+          stream,
+          [&](RawReader& reader, auto& payload, SampleInfo& info) {
+            return reader.at(t, payload, info);
+          },
+          true);
+    }
+  }
+
+  // Until `done`: by tid, and, on streams whose times never run backwards, by time.
+  void compare_while_written(const std::atomic<bool>& done) {
+    while (!done && !HasFailure()) {
+      for (Watched& stream : streams) {
+        std::uniform_int_distribution<Tid> tids(stream.readers[0].oldest(),
+                                                stream.readers[kHosts - 1].newest());
+        const Tid tid = tids(random);
+        compared_while_written += compare(
+            stream,
+            [&](RawReader& reader, auto& payload, SampleInfo& info) {
+              return reader.tid(tid, payload, info);
+            },
+            false);
+        if (stream.known.jitter >= stream.known.cycle / 2) continue;
+        // Up to the newest one that all have, the answer can not change any more.
+        Tid newest = stream.readers[0].newest();
+        for (const RawReader& reader : stream.readers) newest = std::min(newest, reader.newest());
+        const Time t = std::min(random_time(stream, tid, newest), stream.known.info(newest).time);
+        compared_while_written += compare(
+            stream,
+            [&](RawReader& reader, auto& payload, SampleInfo& info) {
+              return reader.at(t, payload, info);
+            },
+            false);
+      }
+    }
+  }
+
+  const std::uint64_t seed = number_from_environment("DSSM_TEST_SEED", std::random_device{}());
+  std::mt19937_64 random{seed};
+  std::vector<Session> sessions;
+  std::vector<Watched> streams;
+  std::vector<std::byte> payloads[kHosts];
+  std::uint64_t compared_while_written = 0;
+};
+
+TEST_F(Equality, MirrorsAnswerEveryReadAsTheOwnerDoes) {
+  if (!make_fleet(kHosts)) return;
+  SCOPED_TRACE(testing::Message() << "DSSM_TEST_SEED=" << seed);
+  for (int host = 1; host <= kHosts; ++host) sessions.push_back(fleet->session(host));
+  watch({{"regular", 0, "pc1"}, 64, 1 << 15, 1ms, 0ms, 1}, 12'000, 500);
+  watch({{"irregular", 0, "pc1"}, 64, 1 << 13, 2ms, 30ms, 2}, 3'000, 250);
+  watch({{"large", 0, "pc1"}, 64 << 10, 512, 20ms, 5ms, 3}, 250, 25);
+  for (Watched& stream : streams) {
+    for (Session& session : sessions) {
+      stream.readers.push_back(session.await_raw_reader(stream.known.id, kNever).value());
+    }
+  }
+  for (int round = 0; round < kRounds && !HasFailure(); ++round) {
+    std::atomic<bool> done = false;
+    std::thread write([&] {
+      for (int tick = 0; tick < 500; ++tick) {
+        for (Watched& stream : streams) {
+          if (tick % (500 / stream.per_round) == 0) stream.write_next();
+        }
+        std::this_thread::sleep_for(1ms);  // the streams' rate, not a wait for anything
+      }
+      done = true;
+    });
+    compare_while_written(done);
+    write.join();
+    for (Watched& stream : streams) {
+      compare_by_time_in_a_pause(stream, kReadsByTime / 3 / kRounds + 1);
+    }
+  }
+  EXPECT_GT(compared_while_written, 0u);
+  for (Watched& stream : streams) {
+    EXPECT_EQ(stream.readers[0].oldest(), 0) << "the past from before the readers is all there";
+    // Now let the writer lap the ring, as fast as it can: what is left is the same everywhere.
+    for (std::uint64_t i = 0; i < 2 * stream.known.depth; ++i) stream.write_next();
+    stream.history = stream.writer.newest();
+    compare_by_time_in_a_pause(stream, 1000);
+    for (RawReader& reader : stream.readers) EXPECT_EQ(reader.restarts(), 0u);
+  }
+}
+
+}  // namespace
+}  // namespace dssm::test

@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "tests/process/network/follower.hpp"
+
+namespace dssm::test {
+
+Follower::Follower(const KnownStream& known, RawReader reader, std::optional<RawReader> owner)
+    : known_(known),
+      reader_(std::move(reader)),
+      owner_(std::move(owner)),
+      payload_(known.payload_bytes) {
+  reader_.seek(kNoTid);
+}
+
+void Follower::take(int most) {
+  SampleInfo info;
+  for (int i = 0; i < most; ++i) {
+    switch (reader_.next(payload_, info)) {
+      case ReadStatus::ok:
+        check(info);
+        break;
+      case ReadStatus::restarted:
+        if (owner_) fault("began anew, although its owner's ring was always there");
+        ++restarts_;
+        earlier_life_ = life_;
+        life_ = 0;
+        last_ = kNoTid;
+        break;
+      case ReadStatus::not_yet:
+      case ReadStatus::lapped:  // again and again; the next call goes on
+        return;
+      case ReadStatus::too_old:
+        fault("next() returned too_old");
+        return;
+    }
+  }
+}
+
+void Follower::check(const SampleInfo& info) {
+  if (life_ == 0) life_ = KnownStream::life(payload_);
+  if (life_ <= earlier_life_) fault("a new ring with samples of an old life");
+  if (const std::string wrong = known_.fault(payload_, info, life_); !wrong.empty()) fault(wrong);
+  if (info.tid <= last_) {
+    fault("tid " + std::to_string(info.tid) + " after " + std::to_string(last_));
+  }
+  const auto left_out = static_cast<std::uint64_t>(info.tid - last_ - 1);
+  const std::uint64_t counted = reader_.lost() - lost_;
+  if (left_out != counted) {
+    fault(std::to_string(left_out) + " samples before tid " + std::to_string(info.tid) +
+          " did not come, and " + std::to_string(counted) + " were counted");
+  }
+  // Asked after the loss: what is there now was there when it was called lost.
+  if (left_out > 0 && owner_ && owner_->oldest() < info.tid) {
+    fault("tids " + std::to_string(last_ + 1) + " to " + std::to_string(info.tid - 1) +
+          " were lost, and the owner's ring holds those from " + std::to_string(owner_->oldest()));
+  }
+  last_ = info.tid;
+  lost_ = reader_.lost();
+  ++taken_;
+}
+
+void Follower::fault(const std::string& what) {
+  constexpr int kEnough = 10;
+  if (++fault_count_ <= kEnough) faults_ += "'" + known_.id.str() + "': " + what + "\n";
+}
+
+}  // namespace dssm::test

@@ -1,0 +1,25 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The load of the long tests: fifteen streams of known samples, from 10 Hz to 1 kHz and from 64 B
+// to 1 MiB, and who writes them.
+#pragma once
+
+#include <atomic>
+#include <dssm/dssm.hpp>
+#include <vector>
+
+#include "tests/process/network/known_samples.hpp"
+
+namespace dssm::test {
+
+// The fifteen streams of `host`. They are written at `percent` of their full rates, which come to
+// 30 MB and 6000 samples a second; their rings take 120 MB. Some rings reach back for many seconds,
+// others for less than one.
+std::vector<KnownStream> load_of(int host, std::uint64_t percent);
+
+// Creates the streams and writes to each at its rate until `stop`. Streams that are there already
+// are gone on with, with the life that their samples have.
+void write_load(Session session, const std::vector<KnownStream>& streams, std::uint64_t life,
+                const std::atomic<bool>& stop);
+
+}  // namespace dssm::test

@@ -1,0 +1,253 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Thirty streams between three PCs while cables are cut and dssmds are killed at random: every
+// sample that the owner's ring still held when the link came back arrives once, in order, untorn;
+// what is lost is counted exactly.
+//
+//   $DSSM_SOAK_SECONDS  how long the trouble lasts; default 45, less under a sanitizer
+//   $DSSM_SOAK_PERCENT  of the streams' full rates; default 100, less under a sanitizer
+//   $DSSM_TEST_SEED     of the random trouble; default: another one each time, printed
+#include <fcntl.h>
+#include <unistd.h>
+
+#include <csignal>
+#include <cstdio>
+#include <random>
+#include <thread>
+
+#include "tests/process/network/fleet.hpp"
+#include "tests/process/network/follower.hpp"
+#include "tests/process/network/load.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr int kHosts = 3;
+constexpr int kOwners = 2;  // pc1 and pc2 own fifteen streams each; all hosts read those of others
+
+// For what must come by itself, however busy the machine is.
+constexpr Duration kPatience = 2min;
+
+class Soak : public NetworkTest {
+ protected:
+  void open_fleet() {
+    if (!make_fleet(kHosts)) return;
+    std::printf("DSSM_TEST_SEED=%llu DSSM_SOAK_SECONDS=%llu DSSM_SOAK_PERCENT=%llu\n",
+                static_cast<unsigned long long>(seed), static_cast<unsigned long long>(seconds),
+                static_cast<unsigned long long>(percent));
+    for (int host = 1; host <= kHosts; ++host) sessions.push_back(fleet->session(host));
+  }
+
+  // Followers of all streams of other hosts, on every host. `lasting_rings`: each also looks into
+  // the owner's ring, and by that keeps it alive.
+  void follow(bool lasting_rings) {
+    for (int host = 1; host <= kHosts; ++host) {
+      Session& session = sessions[static_cast<std::size_t>(host) - 1];
+      for (int owner = 1; owner <= kOwners; ++owner) {
+        if (owner == host) continue;
+        for (const KnownStream& known : load_of(owner, percent)) {
+          auto reader = session.await_raw_reader(known.id, deadline_in(kPatience));
+          ASSERT_TRUE(reader) << "on " << Network::name(host) << ": " << reader.error().message;
+          std::optional<RawReader> owners;
+          if (lasting_rings) {
+            Session& at_owner = sessions[static_cast<std::size_t>(owner) - 1];
+            owners = at_owner.open_raw_reader(known.id).value();
+          }
+          followers[host - 1].emplace_back(known, *std::move(reader), std::move(owners));
+        }
+      }
+    }
+  }
+
+  // Reads on behalf of one host until `finished` says of all its followers that they are done, or
+  // `give_up`.
+  template <class IsDone>
+  void read_on(std::vector<Follower>& mine, IsDone is_done) {
+    std::vector<RawReader*> readers;
+    for (Follower& follower : mine) readers.push_back(&follower.reader());
+    for (;;) {
+      (void)wait_any(readers, deadline_in(100ms));
+      bool all_done = finishing || give_up;
+      for (Follower& follower : mine) {
+        follower.take(64);
+        if (all_done && !give_up) all_done = is_done(follower);
+      }
+      if (all_done) return;
+    }
+  }
+
+  // Trouble of every kind, at random, for $DSSM_SOAK_SECONDS; in the end all is in order again.
+  // `also` is one more kind.
+  template <class Also>
+  void make_trouble(Also also) {
+    std::mt19937_64 random(seed);
+    std::vector<bool> cut(kHosts + 1, false);
+    const auto chance = [&](int percent_of_all) {
+      return static_cast<int>(random() % 100) < percent_of_all;
+    };
+    for (const MonoTime end = deadline_in(std::chrono::seconds(seconds));
+         MonoClock::now() < end && !HasFailure();) {
+      // How long a state of the world lasts; nothing is waited for.
+      std::this_thread::sleep_for(std::chrono::milliseconds(20 + random() % 600));
+      const int host = 1 + static_cast<int>(random() % kHosts);
+      const auto index = static_cast<std::size_t>(host);
+      if (chance(50)) {
+        if (!chance(cut[index] ? 60 : 40)) continue;
+        cut[index] = !cut[index];
+        cut[index] ? fleet->network().cut(host) : fleet->network().heal(host);
+        cuts += cut[index];
+      } else if (!fleet->runs(host)) {
+        if (chance(80)) fleet->start_dssmd(host);
+      } else if (chance(20)) {
+        fleet->kill_dssmd(host);
+        ++kills;
+      } else if (host <= kOwners && chance(20)) {
+        also(host, random());
+      }
+    }
+    for (int host = 1; host <= kHosts; ++host) {
+      fleet->network().heal(host);
+      fleet->start_dssmd(host);
+    }
+  }
+
+  // Waits for the threads that read, and says what they found.
+  void finish(std::vector<std::thread>& reading) {
+    finishing = true;
+    std::atomic<bool> ended = false;
+    std::thread watchdog([&] {
+      for (const MonoTime end = deadline_in(kPatience); !ended && !give_up;) {
+        if (MonoClock::now() > end) give_up = true;
+        std::this_thread::sleep_for(50ms);
+      }
+    });
+    for (std::thread& each : reading) each.join();
+    ended = true;
+    watchdog.join();
+    EXPECT_FALSE(give_up) << "not all followers came to an end";
+    std::uint64_t taken = 0, lost = 0, restarts = 0;
+    for (const auto& mine : followers) {
+      for (const Follower& follower : mine) {
+        EXPECT_EQ(follower.faults(), "");
+        taken += follower.taken(), lost += follower.lost(), restarts += follower.restarts();
+      }
+    }
+    std::printf("%d cuts, %d dssmds killed; %llu samples taken, %llu lost, %llu new rings\n", cuts,
+                kills, static_cast<unsigned long long>(taken),
+                static_cast<unsigned long long>(lost), static_cast<unsigned long long>(restarts));
+  }
+
+  // What a follower that did not come to its end can be told about.
+  std::string about(int host, Follower& follower) {
+    return "on " + Network::name(host) + " '" + follower.known().id.str() + "': cursor " +
+           std::to_string(follower.reader().cursor()) + ", mirror's newest " +
+           std::to_string(follower.reader().newest()) + ", life " +
+           std::to_string(follower.life()) + ", restarts " + std::to_string(follower.restarts());
+  }
+
+  const std::uint64_t seed = number_from_environment("DSSM_TEST_SEED", std::random_device{}());
+  const std::uint64_t seconds =
+      number_from_environment("DSSM_SOAK_SECONDS", kSlowness > 1 ? 20 : 45);
+  const std::uint64_t percent = number_from_environment("DSSM_SOAK_PERCENT", 100 / kSlowness);
+  std::vector<Session> sessions;
+  std::vector<Follower> followers[kHosts];
+  std::atomic<bool> finishing = false, give_up = false;
+  int cuts = 0, kills = 0;
+};
+
+TEST_F(Soak, LosesNothingThatTheOwnersRingStillHolds) {
+  open_fleet();
+  if (!fleet) return;
+  std::atomic<bool> stop = false;
+  std::vector<std::thread> writing, reading;
+  for (int owner = 1; owner <= kOwners; ++owner) {
+    writing.emplace_back([&, owner] {
+      write_load(sessions[static_cast<std::size_t>(owner) - 1], load_of(owner, percent), 1, stop);
+    });
+  }
+  follow(true);
+  for (auto& mine : followers) {
+    reading.emplace_back(
+        [&] { read_on(mine, [](const Follower& follower) { return follower.has_all(); }); });
+  }
+  make_trouble([](int, std::uint64_t) {});
+  stop = true;
+  for (std::thread& each : writing) each.join();
+  finish(reading);
+  for (int host = 1; host <= kHosts; ++host) {
+    for (Follower& follower : followers[host - 1]) {
+      EXPECT_TRUE(follower.has_all()) << about(host, follower);
+      EXPECT_EQ(follower.taken() + follower.lost(), static_cast<std::uint64_t>(follower.last()) + 1)
+          << about(host, follower);
+    }
+  }
+}
+
+// The programs that write are killed too: alone, and together with their dssmd, so that the rings
+// are gone and the streams begin anew.
+TEST_F(Soak, GoesOnWithNewRingsWhenOwnersLoseTheirs) {
+  open_fleet();
+  if (!fleet) return;
+  std::uint64_t lives[kOwners + 1] = {};
+  pid_t writers[kOwners + 1] = {};
+  const auto start_writer = [&](int owner) {
+    int began[2];
+    ASSERT_EQ(::pipe2(began, O_CLOEXEC), 0);
+    writers[owner] = start({built("tests/process/network/load-writer"), std::to_string(owner),
+                            std::to_string(percent), std::to_string(++lives[owner])},
+                           {fleet->dssmd(owner).environment()}, began[1]);
+    ::close(began[1]);
+    char byte = 0;
+    EXPECT_EQ(::read(began[0], &byte, 1), 1) << "it ended by itself";
+    ::close(began[0]);
+  };
+  const auto kill_writer = [&](int owner) {
+    ::kill(writers[owner], SIGKILL);
+    wait_for(writers[owner]);
+  };
+  for (int owner = 1; owner <= kOwners; ++owner) start_writer(owner);
+  follow(false);
+  std::vector<std::thread> reading;
+  std::uint64_t newest_life[kOwners + 1] = {};
+  std::atomic<bool> lives_known = false;
+  for (auto& mine : followers) {
+    reading.emplace_back([&] {
+      read_on(mine, [&](const Follower& follower) {
+        const int owner = follower.known().id.host == Network::name(1) ? 1 : 2;
+        return lives_known && follower.life() == newest_life[owner];
+      });
+    });
+  }
+  make_trouble([&](int owner, std::uint64_t random) {
+    kill_writer(owner);
+    if (random % 2 == 0) {
+      fleet->kill_dssmd(owner);
+      fleet->start_dssmd(owner);
+    }
+    start_writer(owner);
+  });
+  // Once more, so that there is a life that all must come to see.
+  for (int owner = 1; owner <= kOwners; ++owner) {
+    kill_writer(owner);
+    fleet->kill_dssmd(owner);
+    fleet->start_dssmd(owner);
+    start_writer(owner);
+    newest_life[owner] = lives[owner];
+  }
+  lives_known = true;
+  finish(reading);
+  for (int host = 1; host <= kHosts; ++host) {
+    for (Follower& follower : followers[host - 1]) {
+      const int owner = follower.known().id.host == Network::name(1) ? 1 : 2;
+      EXPECT_EQ(follower.life(), lives[owner]) << about(host, follower);
+      EXPECT_GT(follower.restarts(), 0u) << about(host, follower);
+      EXPECT_EQ(follower.reader().restarts(), follower.restarts());
+    }
+  }
+  for (int owner = 1; owner <= kOwners; ++owner) kill_writer(owner);
+}
+
+}  // namespace
+}  // namespace dssm::test

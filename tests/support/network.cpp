@@ -1,0 +1,129 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Namespaces are made by unshare(2) in a thread's own, held by descriptors, and furnished with
+// ip(8), which takes /proc/PID/fd/N for a namespace where people write a name.
+#include "tests/support/network.hpp"
+
+#include <fcntl.h>
+#include <sched.h>
+#include <unistd.h>
+
+#include <cerrno>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm::test {
+namespace {
+
+UniqueFd namespace_of_this_thread() {
+  return UniqueFd(::open("/proc/thread-self/ns/net", O_RDONLY | O_CLOEXEC));
+}
+
+void enter(int network_namespace) {
+  if (::setns(network_namespace, CLONE_NEWNET) == 0) return;
+  std::fprintf(stderr, "test harness: setns: %s\n", std::strerror(errno));
+  std::abort();  // to go on in the wrong network would test nothing
+}
+
+// A new namespace, empty but for a loopback interface that is down.
+Result<UniqueFd> make_namespace() {
+  const UniqueFd before = namespace_of_this_thread();
+  if (!before) return os_error("open /proc/thread-self/ns/net");
+  if (::unshare(CLONE_NEWNET) != 0) return os_error("make a network namespace");
+  UniqueFd made = namespace_of_this_thread();
+  enter(before.get());
+  if (!made) return os_error("open /proc/thread-self/ns/net");
+  return made;
+}
+
+// Does what the lines say, each one an `ip` command without the word ip.
+Result<void> try_ip(const std::string& lines) {
+  const Finished finished = run({"ip", "-batch", "-"}, {}, lines);
+  if (finished.exit_status == 0) return {};
+  return Error{Errc::system, "ip -batch: " + finished.err};
+}
+
+void ip(const std::string& lines) {
+  const Result<void> done = try_ip(lines);
+  if (done) return;
+  std::fprintf(stderr, "test harness: %s%s", lines.c_str(), done.error().message.c_str());
+  std::abort();
+}
+
+std::string path_of(const UniqueFd& fd) {
+  return "/proc/" + std::to_string(::getpid()) + "/fd/" + std::to_string(fd.get());
+}
+
+}  // namespace
+
+Inside::Inside(int network_namespace) : before_(namespace_of_this_thread()) {
+  enter(network_namespace);
+}
+
+Inside::~Inside() { enter(before_.get()); }
+
+std::string Network::name(int host) { return "pc" + std::to_string(host); }
+std::string Network::address(int host) { return "10.77.0." + std::to_string(host); }
+std::string Network::address6(int host) { return "fd77::" + std::to_string(host); }
+
+Result<std::unique_ptr<Network>> Network::open(int hosts) {
+  if (::geteuid() != 0) {
+    return Error{Errc::no_permission, "only root may make network namespaces"};
+  }
+  if (::access("/usr/sbin/ip", X_OK) != 0 && ::access("/sbin/ip", X_OK) != 0) {
+    return Error{Errc::not_found, "no ip(8) on this machine; install the package iproute2"};
+  }
+  std::unique_ptr<Network> network(new Network);
+  Result<UniqueFd> made = make_namespace();
+  if (!made) return std::move(made).error();
+  network->switch_ = *std::move(made);
+  const Inside inside(network->switch_.get());
+  // The only two kinds of interface that a kernel may not have. No snooping: it would swallow the
+  // first neighbour solicitations of IPv6.
+  const Result<void> usable = try_ip(
+      "link add switch type bridge mcast_snooping 0\n"
+      "link set switch up\n"
+      "link add probe type veth peer name probe-peer\n"
+      "link del probe\n");
+  if (!usable) return Error(usable.error()).context("this kernel has no bridge or no veth");
+  for (int host = 1; host <= hosts; ++host) {
+    made = make_namespace();
+    if (!made) return std::move(made).error();
+    ip("link add " + name(host) + " type veth peer name eth0 netns " + path_of(*made) + "\n" +
+       "link set " + name(host) + " master switch\n" +  //
+       "link set " + name(host) + " up\n");
+    network->hosts_.push_back(*std::move(made));
+    const Inside in_host = network->inside(host);
+    ip("link set lo up\n"
+       "link set eth0 up\n"
+       "address add " +
+       address(host) + "/24 dev eth0\n" +  //
+       // nodad: usable at once, also after the cable was out.
+       "address add " + address6(host) + "/64 dev eth0 nodad\n");
+  }
+  return network;
+}
+
+void Network::cut(int host) {
+  const Inside inside(switch_.get());
+  ip("link set " + name(host) + " down\n");
+}
+
+void Network::heal(int host) {
+  const Inside inside(switch_.get());
+  ip("link set " + name(host) + " up\n");
+}
+
+Result<void> Network::shape(int host, const std::string& how) {
+  const Inside inside(switch_.get());
+  // tc, like ip, reads words.
+  const Finished finished =
+      run({"tc", "-batch", "-"}, {}, "qdisc replace dev " + name(host) + " root " + how + "\n");
+  if (finished.exit_status == 0) return {};
+  return Error{Errc::system, "tc qdisc ... " + how + ": " + finished.err};
+}
+
+}  // namespace dssm::test
