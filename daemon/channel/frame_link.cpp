@@ -152,7 +152,7 @@ void FrameLink::send(const net::Frame& frame) {
                                    " more would be above the limit of " +
                                    std::to_string(max_queued_bytes_)});
   }
-  Outgoing outgoing{{rest.begin(), rest.end()}, 0, true, {}};
+  Outgoing outgoing{RawBytes::copy_of(rest), 0, true, {}};
   if (budget_) {
     std::optional<MemoryShare> share = budget_->try_take(rest.size());
     if (!share) {
@@ -173,7 +173,7 @@ std::size_t FrameLink::send_now(std::span<const iovec> parts, bool more) {
   return transmit(parts, more);
 }
 
-void FrameLink::queue_rest(std::vector<std::byte> bytes, MemoryShare share) {
+void FrameLink::queue_rest(RawBytes bytes, MemoryShare share) {
   if (closed_ || output_lost_) return;
   Outgoing outgoing{std::move(bytes), 0, false, std::move(share)};
   if (!mid_frame_) return enqueue(std::move(outgoing));
@@ -209,7 +209,7 @@ bool FrameLink::flush() {
     std::size_t count = 0, bytes = 0;
     for (const Outgoing& next : output_) {
       if (count == parts.size()) break;
-      parts[count] = part_of(std::span(next.bytes).subspan(next.sent));
+      parts[count] = part_of(std::as_const(next.bytes).span().subspan(next.sent));
       bytes += parts[count++].iov_len;
     }
     std::size_t sent = transmit(std::span(parts).first(count), false);

@@ -12,10 +12,11 @@
 #include <cstddef>
 #include <deque>
 #include <memory>
-#include <vector>
+#include <span>
 
 #include "core/wire/frame_decoder.hpp"
 #include "core/wire/transport.hpp"
+#include "daemon/channel/raw_bytes.hpp"
 #include "daemon/service/event_loop.hpp"
 #include "daemon/streams/memory_budget.hpp"
 
@@ -76,7 +77,7 @@ class FrameLink final : private wire::FrameSink {
   // Queues bytes that complete a frame that send_now() began; not counted against
   // max_queued_bytes. `share` of the budget is given back, and on_output_empty() comes, when they
   // are gone.
-  void queue_rest(std::vector<std::byte> bytes, MemoryShare share = {});
+  void queue_rest(RawBytes bytes, MemoryShare share = {});
   // While true, a frame is sent by several send_now() with other work between them: what send() is
   // given waits behind it, and send_now() may be used although something waits.
   void set_mid_frame(bool mid_frame);
@@ -102,7 +103,7 @@ class FrameLink final : private wire::FrameSink {
 
  private:
   struct Outgoing {
-    std::vector<std::byte> bytes;
+    RawBytes bytes;
     std::size_t sent = 0;
     bool counted = false;  // against max_queued_bytes_
     MemoryShare share;

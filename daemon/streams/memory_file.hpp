@@ -19,6 +19,10 @@ Result<void> check_own_memory_file(int fd, int seals, std::string_view what);
 // Whether both stand for the same file.
 bool same_file(int fd, int other_fd) noexcept;
 
+// Whether both are descriptors of the same open file, as duplicates are: eventfds all share one
+// inode. False also where the kernel does not tell (kcmp(2) may be filtered).
+bool same_open_file(int fd, int other_fd) noexcept;
+
 // A second descriptor of the same open file, close-on-exec.
 Result<UniqueFd> duplicate(int fd);
 

@@ -135,12 +135,14 @@ Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& b
   if (!bell) return std::move(bell).error();
   Result<UniqueFd> doorbell = create_doorbell();
   if (!doorbell) return std::move(doorbell).error();
+  std::vector<UniqueFd> doorbells;
+  doorbells.push_back(*std::move(doorbell));
   Result<MetaFile> meta = MetaFile::create(meta_of(plan, {}));
   if (!meta) return std::move(meta).error();
   auto mapping = ring::RingMapping::open_untrusted(ring->get(), ring::Access::read_only);
   if (!mapping) return std::move(mapping).error();
   return std::shared_ptr<Stream>(
-      new Stream(plan, Files{*std::move(ring), *std::move(bell), *std::move(doorbell)},
+      new Stream(plan, Files{*std::move(ring), *std::move(bell), std::move(doorbells)},
                  *std::move(meta), *std::move(mapping), *std::move(share)));
 }
 
@@ -170,7 +172,7 @@ Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, Memo
   Result<UniqueFd> ring = ring::reopen_read_write(files.ring.get());
   if (!ring) return std::move(ring).error();
   std::shared_ptr<Stream> stream(
-      new Stream(*std::move(plan), Files{*std::move(ring), std::move(files.bell), UniqueFd()},
+      new Stream(*std::move(plan), Files{*std::move(ring), std::move(files.bell), {}},
                  *std::move(meta), *std::move(mapping), *std::move(share)));
   stream->property_share_ = *std::move(property_share);
   stream->take_doorbell_untrusted(std::move(files.doorbell));
@@ -192,17 +194,17 @@ StreamInfo Stream::info() const {
 }
 
 Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role) {
-  if (role == Role::writer && !files_.doorbell) {
+  if (role == Role::writer && files_.doorbells.empty()) {
     Result<UniqueFd> made = create_doorbell();
     if (!made) return std::move(made).error();
-    files_.doorbell = *std::move(made);
+    add_doorbell(*std::move(made));
   }
   Result<UniqueFd> all[] = {
       role == Role::writer ? duplicate(files_.ring.get())
                            : ring::reopen_read_only(files_.ring.get()),
       duplicate(files_.bell.get()),
       ring::reopen_read_only(meta_.fd()),
-      role == Role::writer ? duplicate(files_.doorbell.get()) : UniqueFd(),
+      role == Role::writer ? duplicate(files_.doorbells.front().get()) : UniqueFd(),
   };
   std::vector<UniqueFd> descriptors;
   for (Result<UniqueFd>& one : all) {
@@ -223,14 +225,28 @@ Result<std::shared_ptr<ring::Bell>> Stream::map_bell() const {
 bool Stream::is_ring(int fd) const noexcept { return same_file(fd, files_.ring.get()); }
 
 void Stream::take_doorbell_untrusted(UniqueFd doorbell) {
-  if (!doorbell || files_.doorbell) return;
+  if (!doorbell || files_.doorbells.size() == kMaxDoorbells) return;
   char kind[64] = {};
   const std::string path = "/proc/self/fd/" + std::to_string(doorbell.get());
   if (::readlink(path.c_str(), kind, sizeof kind - 1) < 0) return;
   // A blocking one could stop whoever reads it.
   const int flags = ::fcntl(doorbell.get(), F_GETFL);
   if (std::string_view(kind) != "anon_inode:[eventfd]" || !(flags & O_NONBLOCK)) return;
-  files_.doorbell = std::move(doorbell);
+  for (const UniqueFd& known : files_.doorbells) {
+    if (same_open_file(known.get(), doorbell.get())) return;
+  }
+  add_doorbell(std::move(doorbell));
+}
+
+void Stream::add_doorbell(UniqueFd doorbell) {
+  files_.doorbells.push_back(std::move(doorbell));
+  if (doorbell_observer_) doorbell_observer_->on_doorbell_added(files_.doorbells.back().get());
+}
+
+void Stream::observe_doorbells(DoorbellObserver* observer) {
+  doorbell_observer_ = observer;
+  if (!observer) return;
+  for (const UniqueFd& doorbell : files_.doorbells) observer->on_doorbell_added(doorbell.get());
 }
 
 Result<void> Stream::mark_removed() {

@@ -34,6 +34,15 @@ struct OfferedFiles {
   UniqueFd doorbell;  // may be missing
 };
 
+// Told about the doorbells of a stream: eventfds that its writers write to while the bell says so.
+class DoorbellObserver {
+ public:
+  virtual void on_doorbell_added(int fd) = 0;  // the stream's; good as long as it
+
+ protected:
+  ~DoorbellObserver() = default;
+};
+
 // What dssmd uses a ring for.
 enum class Purpose : std::uint8_t {
   own,            // the stream is this host's
@@ -88,9 +97,14 @@ class Stream {
   // Whether `fd` is this stream's ring.
   bool is_ring(int fd) const noexcept;
 
-  // Takes the doorbell that a writer kept, when there is none yet; whatever is no such eventfd is
-  // dropped.
+  // Takes the doorbell that a writer kept over a restart of dssmd, beside those that there are
+  // already: another one may have been made for another writer meanwhile. Whatever is no such
+  // eventfd, and what would be more than kMaxDoorbells, is dropped.
   void take_doorbell_untrusted(UniqueFd doorbell);
+  static constexpr std::size_t kMaxDoorbells = 8;
+
+  // Tells of each doorbell, those that are there at once. At most one observer; nullptr: none.
+  void observe_doorbells(DoorbellObserver* observer);
 
   Result<std::string> property() const;
   Result<void> set_property(std::string_view property, MemoryBudget& budget);
@@ -101,7 +115,8 @@ class Stream {
 
  private:
   struct Files {
-    UniqueFd ring, bell, doorbell;
+    UniqueFd ring, bell;
+    std::vector<UniqueFd> doorbells;
   };
   Stream(Plan plan, Files files, MetaFile meta, std::shared_ptr<const ring::RingMapping> mapping,
          MemoryShare share)
@@ -110,6 +125,7 @@ class Stream {
         meta_(std::move(meta)),
         mapping_(std::move(mapping)),
         share_(std::move(share)) {}
+  void add_doorbell(UniqueFd doorbell);
 
   Plan plan_;
   Files files_;
@@ -117,6 +133,7 @@ class Stream {
   std::shared_ptr<const ring::RingMapping> mapping_;  // read-only
   MemoryShare share_, property_share_;                // of ring and type; of the property
   bool removed_ = false;
+  DoorbellObserver* doorbell_observer_ = nullptr;
 };
 
 }  // namespace dssm::daemon

@@ -1,0 +1,113 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Sends samples out of a ring over a link. The writer is never waited for and may overwrite a slot
+// at any moment, so each way of sending has to make sure that no receiver accepts such a sample:
+//
+//   small  payloads below kInPlaceBytes are copied, as many at a time as there are, into whole
+//          frames, each checked by its slot's sequence, then sent at once. One copy.
+//   large  ones go out straight from their slot by gathered sends. When all bytes are with the
+//          kernel, the sequence is checked, and the verdict follows as the frame's last field
+//          (network.proto, Frame.torn). What the socket does not take is copied aside at once, so
+//          that a slow connection does not make the sample void, and checked then. When the peer's
+//          memory is used up, it waits in the slot, at the risk of being overwritten there.
+//   large, for a peer without the feature "torn": copied as a whole, checked, then sent.
+//
+// Work is cut into slices of kSliceBytes, so that nobody waits long for one large sample.
+#pragma once
+
+#include <array>
+#include <cstddef>
+#include <cstdint>
+#include <dssm/sample.hpp>
+
+#include "core/ring/ring_reader.hpp"
+#include "core/wire/sample_frame.hpp"
+#include "daemon/channel/frame_link.hpp"
+#include "daemon/channel/raw_bytes.hpp"
+#include "daemon/streams/memory_budget.hpp"
+
+namespace dssm::daemon {
+
+enum class SendStatus : std::uint8_t {
+  sent,        // all of it is with the kernel or queued
+  torn,        // the same, but it was overwritten meanwhile, and the receiver knows
+  gone,        // the ring does not hold it; nothing was sent
+  blocked,     // the link has no room: on_output_empty() comes
+  unfinished,  // go on in the next turn
+  no_memory,   // a peer without "torn", and no memory left to copy the sample aside
+};
+
+// One per link; mapping and link outlive it. Use it only while the link's output is empty, or
+// busy().
+class SampleSender {
+ public:
+  // From this size on a second and a third send cost less than the copy they save. Measured: see
+  // docs/benchmarks.md "Sending in place".
+  static constexpr std::size_t kInPlaceBytes = 16U << 10;
+  static constexpr std::size_t kBatchBytes = 64U << 10;
+  static constexpr std::size_t kSliceBytes = 1U << 20;
+
+  struct Options {
+    bool may_tear = false;           // the receiver has the feature "torn"
+    MemoryBudget* budget = nullptr;  // charged for what is copied aside; outlives the sender
+  };
+
+  struct Counters {
+    std::uint64_t samples = 0;
+    std::uint64_t torn = 0;
+    std::uint64_t copied_payload_bytes = 0;    // in this process
+    std::uint64_t in_place_payload_bytes = 0;  // from the slot to the kernel
+  };
+
+  SampleSender(const ring::RingMapping& mapping, FrameLink& link, const Options& options);
+  SampleSender(const SampleSender&) = delete;
+  SampleSender& operator=(const SampleSender&) = delete;
+
+  bool sends_in_place() const noexcept { return payload_bytes_ >= kInPlaceBytes; }
+
+  // Sends sample `tid`; `serial` as in Frame. After `blocked` or `unfinished` with busy(): go_on().
+  SendStatus send(Tid tid, std::uint64_t serial);
+
+  // Small payloads only: sends samples from `first` to at most `last`. `next` is set behind the
+  // last one that is sent or queued; the status is about the sample `next`, when it is not `sent`.
+  SendStatus send_many(Tid first, Tid last, Tid& next);
+
+  // Whether a sample is begun and not complete; nothing else may be begun then.
+  bool busy() const noexcept { return busy_; }
+  SendStatus go_on();
+
+  // After a run of samples, before returning to the loop or sending another frame: sends what was
+  // kept back to go out with the next sample.
+  void end_run();
+
+  const Counters& counters() const noexcept { return counters_; }
+
+ private:
+  SendStatus begin_in_place(Tid tid, std::uint64_t serial);
+  SendStatus send_slice();
+  bool begin_copying();
+  SendStatus copy_slice();
+  SendStatus end_copying();
+  SendStatus end_sample(bool valid);
+  void keep_head(std::span<const std::byte> bytes) noexcept;
+
+  ring::RingReader reader_;
+  FrameLink& link_;
+  Options options_;
+  std::size_t payload_bytes_;
+  Counters counters_;
+
+  // Bytes that go before the payload: the verdict on the sample before, and the header.
+  std::array<std::byte, wire::kTornTrailerBytes + wire::kMaxSampleHeaderBytes> head_{};
+  std::size_t head_bytes_ = 0, head_sent_ = 0;
+
+  bool busy_ = false;
+  ring::RingReader::Place place_{};
+  std::size_t offset_ = 0;  // bytes of the payload that are sent or copied
+  bool copying_ = false;
+  RawBytes aside_;
+  std::size_t aside_bytes_ = 0;  // filled so far
+  MemoryShare share_;
+};
+
+}  // namespace dssm::daemon
