@@ -87,8 +87,7 @@ class FrameDecoder {
   // From within the sink: commit() shall return now, though more may be buffered. The next
   // commit(), which may be one of 0 bytes, goes on. Until then nothing is to be received.
   //   in on_sample_begin()  there is no place for this sample now: `out` is not used, the sample
-  //   stays
-  //                         in the input buffer, and on_sample_begin() comes again for it
+  //                         stays in the input buffer, and on_sample_begin() comes again for it
   //   in the others         what was handed out is taken; commit() returns after it
   void hold() noexcept { held_ = true; }
 

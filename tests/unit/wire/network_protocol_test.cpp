@@ -1,0 +1,142 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/wire/network_protocol.hpp"
+
+#include <gtest/gtest.h>
+
+#include <fstream>
+
+namespace dssm::wire {
+namespace {
+
+Greeting mapper() {
+  Greeting greeting;
+  greeting.host = "pc3";
+  greeting.host_id = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16};
+  greeting.life = 77;
+  greeting.program = "mapper";
+  greeting.version = "0.1.0";
+  greeting.features = {"torn", "other"};
+  greeting.clock_bound = std::chrono::microseconds(250);
+  return greeting;
+}
+
+net::Hello hello() {
+  net::Hello message;
+  to_message(mapper(), message);
+  return message;
+}
+
+// Checks that the greeting is refused with a text that holds `why`.
+void expect_refused(const net::Hello& message, const std::string& why) {
+  const auto greeting = greeting_untrusted(message, "the program at '10.0.0.3:4'");
+  ASSERT_FALSE(greeting) << why;
+  EXPECT_EQ(greeting.error().code, Errc::protocol);
+  EXPECT_NE(greeting.error().message.find("the program at '10.0.0.3:4'"), std::string::npos);
+  EXPECT_NE(greeting.error().message.find(why), std::string::npos) << greeting.error().message;
+}
+
+TEST(Greeting, CrossesTheWire) {
+  const auto back = greeting_untrusted(hello(), "x");
+  ASSERT_TRUE(back) << back.error().message;
+  EXPECT_EQ(back->host, "pc3");
+  EXPECT_EQ(back->host_id, mapper().host_id);
+  EXPECT_EQ(back->life, 77u);
+  EXPECT_EQ(back->program, "mapper");
+  EXPECT_EQ(back->version, "0.1.0");
+  EXPECT_EQ(back->features, mapper().features);
+  EXPECT_EQ(back->clock_bound, std::chrono::microseconds(250));
+  EXPECT_TRUE(back->has_feature(kFeatureTorn));
+  EXPECT_FALSE(back->has_feature("tor"));
+  EXPECT_EQ(back->str(), "'mapper' on host 'pc3'");
+  Greeting daemon = mapper();
+  daemon.program = "dssmd";
+  EXPECT_EQ(daemon.str(), "dssmd of host 'pc3'");
+}
+
+TEST(Greeting, NamesBothVersionsAndBothSidesWhenTheyDiffer) {
+  net::Hello message = hello();
+  message.set_protocol_version(9);
+  message.set_version("7.1.0");
+  message.clear_host_id();  // whatever else changed: the version is what counts
+  expect_refused(message, "speaks version 9 of the network protocol (DSSM 7.1.0)");
+  expect_refused(message, "version 1; install the same DSSM on both");
+  message.set_version("\n");
+  expect_refused(message, "speaks version 9 of the network protocol, this side");
+  expect_refused(net::Hello(), "speaks version 0");
+}
+
+TEST(Greeting, ChecksEveryValue) {
+  net::Hello message = hello();
+  for (const char* host : {"", "pc.3", "pc 3", "\xc3\xa4", "a-name-of-thirty-two-characters-x"}) {
+    message.set_host(host);
+    expect_refused(message, "a host name");
+  }
+  message = hello();
+  message.set_host_id("123456789012345");
+  expect_refused(message, "a host id of 15 bytes");
+  message = hello();
+  message.set_program(std::string(128, 'x'));
+  expect_refused(message, "127 bytes");
+  message.set_program("ma\npper");
+  expect_refused(message, "control characters");
+  message = hello();
+  message.set_version("\x1b[31m");
+  expect_refused(message, "control characters");
+  message = hello();
+  for (std::size_t i = 0; i < kMaxFeatures; ++i) message.add_features("x");
+  expect_refused(message, "more than 32 features");
+  for (const std::string& feature : {std::string(), std::string(64, 'x'), std::string("\t")}) {
+    message = hello();
+    message.add_features(feature);
+    expect_refused(message, "a feature");
+  }
+}
+
+TEST(Greeting, TakesValuesAtTheirLimits) {
+  net::Hello message = hello();
+  message.set_host(std::string(31, 'z'));
+  message.set_program(std::string(127, 'x'));
+  message.clear_features();
+  for (std::size_t i = 0; i < kMaxFeatures; ++i) message.add_features(std::string(63, 'x'));
+  EXPECT_TRUE(greeting_untrusted(message, "x"));
+}
+
+TEST(ClockBound, IsUnknownUnlessSaid) {
+  net::Hello message = hello();
+  message.clear_clock();
+  EXPECT_EQ(greeting_untrusted(message, "x")->clock_bound, kUnknownClockError);
+  message.mutable_clock()->set_bound_ns(-1);
+  EXPECT_EQ(greeting_untrusted(message, "x")->clock_bound, kUnknownClockError);
+  net::ClockStatus status;
+  for (const Duration bound : {Duration(0), Duration(1'500'000), kUnknownClockError}) {
+    to_message(bound, status);
+    EXPECT_EQ(clock_bound_untrusted(status), bound);
+  }
+}
+
+TEST(HostId, DiffersBetweenNamesAndStaysTheSame) {
+  EXPECT_EQ(host_id_for("pc1"), host_id_for("pc1"));
+  EXPECT_NE(host_id_for("pc1"), host_id_for("pc2"));
+  EXPECT_NE(host_id_for("pc1"), host_id_for(""));
+  EXPECT_NE(host_id_for("pc1"), HostId{});
+}
+
+TEST(HostId, DoesNotTellTheMachineId) {
+  std::string machine;
+  std::getline(std::ifstream("/etc/machine-id"), machine);
+  if (machine.size() != 32) GTEST_SKIP() << "this machine has no id";
+  HostId raw{};
+  for (std::size_t i = 0; i < raw.size(); ++i) {
+    raw[i] = static_cast<std::uint8_t>(std::stoul(machine.substr(2 * i, 2), nullptr, 16));
+  }
+  EXPECT_NE(host_id_for(""), raw);
+}
+
+TEST(RandomNumber, IsNeverTwiceTheSame) {
+  const std::uint64_t first = random_number();
+  EXPECT_NE(first, 0u);
+  EXPECT_NE(first, random_number());
+}
+
+}  // namespace
+}  // namespace dssm::wire
