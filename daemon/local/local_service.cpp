@@ -29,17 +29,24 @@ std::string last_words(const Error& error) {
 }
 
 LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
-                           Logger& logger, bool recovering)
+                           Logger& logger, bool recovering, Fleet* fleet)
     : registry_(registry),
       opens_(opens),
       clock_(clock),
       logger_(logger),
       requests_(registry, opens, clock),
+      fleet_(fleet),
       recovering_(recovering) {
   registry_.add_observer(*this);
+  if (!fleet_) return;
+  remote_.emplace(registry_.host(), *fleet_, opens_);
+  fleet_->observe(this);
 }
 
-LocalService::~LocalService() { registry_.remove_observer(*this); }
+LocalService::~LocalService() {
+  if (fleet_) fleet_->observe(nullptr);
+  registry_.remove_observer(*this);
+}
 
 ClientNumber LocalService::connect(std::int32_t pid, std::uint32_t uid, ClientOutput& output) {
   const ClientNumber number = next_client_++;
@@ -125,28 +132,77 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
                          DescriptorQueue& descriptors) {
   if (request.has_watch()) return watch(number, request.serial());
   if (request.has_list_clients()) return list_clients(clients_.at(number), request.serial());
+  const auto own_knows = [this](const StreamId& id) { return registry_.knows(id); };
+  if (remote_ && remote_->takes(request, own_knows)) {
+    return serve_remote(number, request, descriptors);
+  }
   const auto identity = clients_.at(number).identity;
   Result<Reply> reply = requests_.handle_untrusted(identity, request, descriptors);
-  // Events of this request may have cost this very client its connection.
-  const auto client = clients_.find(number);
-  if (client == clients_.end()) return;
-  if (reply && request.has_offer()) {
-    logger_.info(
-        "took stream '" +
-            StreamId{request.offer().id().name(), request.offer().id().id(), registry_.host()}
-                .str() +
-            "' back from a program",
-        {.peer = identity->str(), .message_id = message_id::kStreamAdopted});
+  if (request.has_offer()) log_offer(*identity, request.offer(), reply);
+  if (!reply || !remote_ || !request.has_list() || request.list().own_only()) {
+    return on_answer(number, request.serial(), std::move(reply));
   }
-  if (!reply && request.has_offer()) {
-    logger_.warning("refuse an offered stream: " + reply.error().message,
-                    {.peer = identity->str(), .message_id = message_id::kOfferRefused});
+  if (const RemoteRequests::Answer answer = await(number, request.serial())) {
+    remote_->complete_list(*std::move(reply), answer);
+  }
+}
+
+void LocalService::serve_remote(ClientNumber number, const local::Request& request,
+                                DescriptorQueue& descriptors) {
+  const auto identity = clients_.at(number).identity;
+  if (request.has_offer()) {  // answered at once
+    return remote_->handle_untrusted(identity, request, descriptors, [&](Result<Reply> reply) {
+      log_offer(*identity, request.offer(), reply);
+      on_answer(number, request.serial(), std::move(reply));
+    });
+  }
+  if (const RemoteRequests::Answer answer = await(number, request.serial())) {
+    remote_->handle_untrusted(identity, request, descriptors, answer);
+  }
+}
+
+// Where the answer of another host is to go; none when this client waits for too many already,
+// which it is told.
+RemoteRequests::Answer LocalService::await(ClientNumber number, std::uint64_t serial) {
+  Client& client = clients_.at(number);
+  if (client.awaited >= kMaxAwaited) {
+    send_failure(
+        client, serial,
+        {Errc::limit_exceeded, "other hosts have not answered " + std::to_string(kMaxAwaited) +
+                                   " requests of this program yet; wait for them"});
+    return {};
+  }
+  ++client.awaited;
+  return [this, number, serial](Result<Reply> reply) {
+    if (const auto asker = clients_.find(number); asker != clients_.end()) --asker->second.awaited;
+    on_answer(number, serial, std::move(reply));
+  };
+}
+
+void LocalService::on_answer(ClientNumber number, std::uint64_t serial, Result<Reply> reply) {
+  const auto client = clients_.find(number);
+  if (client == clients_.end()) {
+    // It left meanwhile: events of this very request may have cost it its connection.
+    opens_.remove_all(number);
+    return;
   }
   if (reply) {
-    send(client->second, request.serial(), *std::move(reply));
+    send(client->second, serial, *std::move(reply));
   } else {
-    send_failure(client->second, request.serial(), reply.error());
+    send_failure(client->second, serial, reply.error());
   }
+}
+
+void LocalService::log_offer(const ClientIdentity& client, const local::Offer& offer,
+                             const Result<Reply>& reply) {
+  if (!reply) {
+    return logger_.warning("refuse an offered stream: " + reply.error().message,
+                           {.peer = client.str(), .message_id = message_id::kOfferRefused});
+  }
+  StreamId id{offer.id().name(), offer.id().id(), offer.id().host()};
+  if (id.host.empty()) id.host = registry_.host();
+  logger_.info("took stream '" + id.str() + "' back from a program",
+               {.peer = client.str(), .message_id = message_id::kStreamAdopted});
 }
 
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
@@ -158,6 +214,15 @@ void LocalService::watch(ClientNumber number, std::uint64_t serial) {
     Reply event;
     requests_.describe(*stream, *event.response.mutable_stream_event()->mutable_stream());
     send(client->second, 0, std::move(event));
+  }
+  if (fleet_) {
+    for (const StreamInfo& stream : fleet_->known_streams()) {
+      const auto client = clients_.find(number);
+      if (client == clients_.end()) return;
+      Reply event;
+      wire::to_message(stream, *event.response.mutable_stream_event()->mutable_stream());
+      send(client->second, 0, std::move(event));
+    }
   }
   const auto client = clients_.find(number);
   if (client == clients_.end()) return;
@@ -211,6 +276,7 @@ void LocalService::on_stream_added(const Stream& stream) {
   broadcast(event);
   logger_.debug("stream '" + stream.id().str() + "' is there",
                 {.stream = stream.id().str(), .message_id = message_id::kStreamCreated});
+  tell_readers_of_gone(stream.id());
 }
 
 void LocalService::on_stream_removed(const Stream& stream) {
@@ -223,6 +289,47 @@ void LocalService::on_stream_removed(const Stream& stream) {
                 {.stream = id.str(), .message_id = message_id::kStreamRemoved});
 }
 
+void LocalService::on_remote_stream_added(const StreamInfo& stream) {
+  local::StreamEvent event;
+  wire::to_message(stream, *event.mutable_stream());
+  broadcast(event);
+  tell_readers_of_gone(stream.id);
+}
+
+void LocalService::on_remote_stream_removed(const StreamId& id) {
+  local::StreamEvent event;
+  event.set_removed(true);
+  wire::to_message(id, *event.mutable_stream()->mutable_id());
+  broadcast(event);
+}
+
+// --- rings with a successor
+// -----------------------------------------------------------------------
+
+void LocalService::on_ring_replaced(const Stream& stream) {
+  for (const OpenTable::Reading& reading : opens_.readers_of(stream)) {
+    // Sending may end connections, so each is looked for anew.
+    const auto client = clients_.find(reading.client);
+    if (client == clients_.end()) continue;
+    Reply event;
+    event.response.mutable_replaced()->set_handle(reading.number);
+    send(client->second, 0, std::move(event));
+  }
+}
+
+// A stream of that name is there: whoever reads one of the same name that will get no sample any
+// more goes on with it, if that is what an open by the name they used gives now.
+void LocalService::tell_readers_of_gone(const StreamId& successor) {
+  for (const auto& stream : opens_.open_streams(successor.name, successor.id)) {
+    if (is_gone(*stream)) on_ring_replaced(*stream);
+  }
+}
+
+bool LocalService::is_gone(const Stream& stream) const {
+  if (stream.id().host == registry_.host()) return stream.removed();
+  return !fleet_ || !fleet_->is_there(stream.id());
+}
+
 // --- recovery
 // -------------------------------------------------------------------------------------
 
@@ -233,6 +340,7 @@ bool LocalService::must_wait(const local::Request& request) const {
   if (!subject) return false;
   // A name that is no name is refused at once.
   const Result<StreamId> id = wire::stream_id_untrusted(*subject);
+  if (id && !id->host.empty() && id->host != registry_.host()) return false;  // nobody here has it
   return id && !registry_.knows(*id);
 }
 

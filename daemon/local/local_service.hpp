@@ -4,6 +4,13 @@
 // them, and tells those who watch. Connection and Server carry the bytes; tests and fuzzers put
 // frames in directly.
 //
+// Requests about streams of other hosts go to the Fleet, whose answers come when they come; the
+// client may be gone by then, and with it all interest.
+//
+// A ring can get a successor: a stream is created anew under the name of a removed one, its owner
+// comes back without its rings, or another host has it now. Whoever reads the old ring is told
+// (Replaced) and opens the stream anew.
+//
 // After a crash of the dssmd before this one, programs that still hold streams come back and offer
 // them. Until end_recovery() a request about a stream that nobody offered yet is held back, not
 // refused: otherwise a writer that starts anew could take the name of a ring that others still use.
@@ -13,11 +20,14 @@
 #include <dssm/result.hpp>
 #include <map>
 #include <memory>
+#include <optional>
 #include <span>
 #include <string>
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
+#include "daemon/local/fleet.hpp"
+#include "daemon/local/remote_requests.hpp"
 #include "daemon/local/stream_requests.hpp"
 #include "daemon/service/log.hpp"
 #include "daemon/streams/open_table.hpp"
@@ -39,11 +49,15 @@ class ClientOutput {
 // The answer to a peer that gets no further one: a failure that belongs to no request.
 std::string last_words(const Error& error);
 
-class LocalService final : private StreamObserver {
+class LocalService final : private StreamObserver, private Fleet::Observer {
  public:
+  // Requests of one client that wait for other hosts.
+  static constexpr std::size_t kMaxAwaited = 1024;
+
   // recovering: the dssmd before this one did not end properly.
+  // fleet: outlives this; nullptr: there are no other hosts.
   LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock, Logger& logger,
-               bool recovering);
+               bool recovering, Fleet* fleet = nullptr);
   LocalService(const LocalService&) = delete;
   LocalService& operator=(const LocalService&) = delete;
   ~LocalService();
@@ -69,6 +83,7 @@ class LocalService final : private StreamObserver {
     bool greeted = false;
     bool watching = false;
     std::size_t held_bytes = 0;
+    std::size_t awaited = 0;  // answers of other hosts
   };
   struct Held {
     ClientNumber client = 0;
@@ -79,6 +94,12 @@ class LocalService final : private StreamObserver {
   bool refuse(const Client& client, std::uint64_t serial, const Error& error);
   bool greet(Client& client, std::uint64_t serial, const local::Hello& hello);
   void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
+  void serve_remote(ClientNumber number, const local::Request& request,
+                    DescriptorQueue& descriptors);
+  RemoteRequests::Answer await(ClientNumber number, std::uint64_t serial);
+  void on_answer(ClientNumber number, std::uint64_t serial, Result<Reply> reply);
+  void log_offer(const ClientIdentity& client, const local::Offer& offer,
+                 const Result<Reply>& reply);
   void watch(ClientNumber number, std::uint64_t serial);
   void list_clients(const Client& client, std::uint64_t serial);
   void send(const Client& client, std::uint64_t serial, Reply reply);
@@ -91,12 +112,19 @@ class LocalService final : private StreamObserver {
 
   void on_stream_added(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
+  void on_remote_stream_added(const StreamInfo& stream) override;
+  void on_remote_stream_removed(const StreamId& id) override;
+  void on_ring_replaced(const Stream& stream) override;
+  void tell_readers_of_gone(const StreamId& successor);
+  bool is_gone(const Stream& stream) const;
 
   Registry& registry_;
   OpenTable& opens_;
   PlaybackClockOwner& clock_;
   Logger& logger_;
   StreamRequests requests_;
+  Fleet* fleet_;
+  std::optional<RemoteRequests> remote_;  // with a fleet
   bool recovering_;
   ClientNumber next_client_ = 1;
   std::map<ClientNumber, Client> clients_;

@@ -8,30 +8,6 @@
 #include "core/wire/local_protocol.hpp"
 
 namespace dssm::daemon {
-namespace {
-
-// Lists leave room for what frames them; fields of types go first when a list gets too long.
-constexpr std::size_t kMaxListBytes = wire::kMaxLocalFrameBytes - (1U << 20);
-
-Reply done() {
-  Reply reply;
-  reply.response.mutable_done();
-  return reply;
-}
-
-Error missing_descriptors(const std::string& wanted) {
-  return Error{Errc::protocol, "the request comes without its descriptors (" + wanted + ")"};
-}
-
-// The descriptors of the oldest message that brought any.
-std::vector<UniqueFd> take_descriptors(DescriptorQueue& queue) {
-  if (queue.empty()) return {};
-  std::vector<UniqueFd> taken = std::move(queue.front());
-  queue.pop_front();
-  return taken;
-}
-
-}  // namespace
 
 Result<Reply> StreamRequests::handle_untrusted(const Client& client, const local::Request& request,
                                                DescriptorQueue& descriptors) {
@@ -63,6 +39,8 @@ Result<Reply> StreamRequests::handle_untrusted(const Client& client, const local
     case local::Request::kHello:
     case local::Request::kWatch:
     case local::Request::kListClients:
+    case local::Request::kListHosts:
+    case local::Request::kPingHost:
     case local::Request::BODY_NOT_SET:
       break;
   }
@@ -106,13 +84,6 @@ Result<std::shared_ptr<Stream>> StreamRequests::find_untrusted(const proto::Stre
   return registry_.find(*checked);
 }
 
-void StreamRequests::note_open(const Client& client, const std::shared_ptr<Stream>& stream,
-                               Role role, std::uint32_t tag, local::Opened& opened) {
-  opened.set_handle(opens_.add({client, stream, role, tag}));
-  wire::to_message(stream->id(), *opened.mutable_id());
-  wire::to_message(stream->type(), *opened.mutable_type());
-}
-
 Result<Reply> StreamRequests::create(const Client& client, const local::Create& request) {
   const Result<StreamId> id = wire::stream_id_untrusted(request.id());
   if (!id) return id.error();
@@ -122,48 +93,34 @@ Result<Reply> StreamRequests::create(const Client& client, const local::Create& 
   const Result<Registry::Created> created =
       registry_.create(*id, *type, {request.depth(), Duration(request.cycle_ns())}, client->pid);
   if (!created) return created.error();
-  Result<std::vector<UniqueFd>> descriptors = created->stream->descriptors_for(Role::writer);
-  if (!descriptors) {
+  Result<Reply> reply = opened(opens_, client, created->stream, Role::writer, request.tag());
+  if (reply) {
+    reply->response.mutable_opened()->set_created(created->created);
+  } else if (created->created) {
     // Nobody would know of it, and nothing was written to it: as if it had never been.
-    if (created->created) static_cast<void>(registry_.remove(created->stream->id()));
-    return std::move(descriptors).error();
+    static_cast<void>(registry_.remove(created->stream->id()));
   }
-  Reply reply;
-  local::Opened& opened = *reply.response.mutable_opened();
-  note_open(client, created->stream, Role::writer, request.tag(), opened);
-  opened.set_created(created->created);
-  reply.descriptors = *std::move(descriptors);
   return reply;
 }
 
 Result<Reply> StreamRequests::open(const Client& client, const local::Open& request) {
   const Result<std::shared_ptr<Stream>> stream = find_untrusted(request.id());
   if (!stream) return stream.error();
-  if (Result<void> room = opens_.check_room(*client); !room) return std::move(room).error();
   const Role role = request.for_writing() ? Role::writer : Role::reader;
-  Result<std::vector<UniqueFd>> descriptors = (*stream)->descriptors_for(role);
-  if (!descriptors) return std::move(descriptors).error();
-  Reply reply;
-  note_open(client, *stream, role, request.tag(), *reply.response.mutable_opened());
-  reply.descriptors = *std::move(descriptors);
-  return reply;
+  return opened(opens_, client, *stream, role, request.tag());
 }
 
 Result<Reply> StreamRequests::offer(const Client& client, const local::Offer& request,
                                     DescriptorQueue& descriptors) {
-  std::vector<UniqueFd> offered = take_descriptors(descriptors);
-  if (offered.size() < 3) return missing_descriptors("ring, bell, meta");
+  const Role role = request.for_writing() ? Role::writer : Role::reader;
+  Result<OfferedFiles> files = offered_files(descriptors, role);
+  if (!files) return std::move(files).error();
   const Result<StreamId> id = wire::stream_id_untrusted(request.id());
   if (!id) return id.error();
   if (Result<void> room = opens_.check_room(*client); !room) return std::move(room).error();
-  const Role role = request.for_writing() ? Role::writer : Role::reader;
-  OfferedFiles files{std::move(offered[0]), std::move(offered[1]), std::move(offered[2]), {}};
-  if (offered.size() > 3 && role == Role::writer) files.doorbell = std::move(offered[3]);
-  const Result<std::shared_ptr<Stream>> stream = registry_.adopt_untrusted(*id, std::move(files));
+  const Result<std::shared_ptr<Stream>> stream = registry_.adopt_untrusted(*id, *std::move(files));
   if (!stream) return stream.error();
-  Reply reply;
-  note_open(client, *stream, role, request.tag(), *reply.response.mutable_opened());
-  return reply;
+  return noted_open(opens_, client, *stream, role, request.tag());
 }
 
 Result<Reply> StreamRequests::close(const Client& client, const local::Close& request) {
@@ -244,7 +201,9 @@ Result<Reply> StreamRequests::open_clock(const local::OpenClock& request,
                                          DescriptorQueue& descriptors) {
   if (request.offered()) {
     std::vector<UniqueFd> offered = take_descriptors(descriptors);
-    if (offered.empty()) return missing_descriptors("clock");
+    if (offered.empty()) {
+      return Error{Errc::protocol, "the request comes without its descriptor (clock)"};
+    }
     if (!clock_.has_one()) {
       Result<void> adopted = clock_.adopt_untrusted(std::move(offered[0]));
       if (!adopted) return std::move(adopted).error();

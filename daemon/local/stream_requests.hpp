@@ -1,32 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What clients may ask about streams, request by request: from the protocol's messages to Registry,
-// OpenTable and PlaybackClockOwner, and back. No sockets and no events here; LocalService decides
-// whose turn it is.
+// What clients may ask about this host's streams, request by request: from the protocol's messages
+// to Registry, OpenTable and PlaybackClockOwner, and back. No sockets and no events here;
+// LocalService decides whose turn it is.
 #pragma once
 
-#include <deque>
 #include <dssm/result.hpp>
 #include <memory>
-#include <vector>
 
-#include "core/base/unique_fd.hpp"
+#include "daemon/local/reply.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"
 #include "local.pb.h"
 
 namespace dssm::daemon {
-
-// An answer and the descriptors that go with it, in the order that local.proto says.
-struct Reply {
-  local::Response response;
-  std::vector<UniqueFd> descriptors;
-};
-
-// Descriptors that arrived, one element per message that brought some. A request that takes
-// descriptors takes the oldest element.
-using DescriptorQueue = std::deque<std::vector<UniqueFd>>;
 
 class StreamRequests {
  public:
@@ -61,8 +49,6 @@ class StreamRequests {
   Result<Reply> get_daemon();
 
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
-  void note_open(const Client& client, const std::shared_ptr<Stream>& stream, Role role,
-                 std::uint32_t tag, local::Opened& opened);
 
   Registry& registry_;
   OpenTable& opens_;

@@ -76,4 +76,25 @@ std::vector<StreamUser> OpenTable::users(const Stream& stream) const {
   return users;
 }
 
+std::vector<OpenTable::Reading> OpenTable::readers_of(const Stream& stream) const {
+  std::vector<Reading> readers;
+  const auto found = by_stream_.find(&stream);
+  if (found == by_stream_.end()) return readers;
+  for (const OpenNumber number : found->second.opens) {
+    const OpenEntry& entry = entries_.at(number);
+    if (entry.role == Role::reader) readers.push_back({entry.client->number, number});
+  }
+  return readers;
+}
+
+std::vector<std::shared_ptr<const Stream>> OpenTable::open_streams(const std::string& name,
+                                                                   std::int32_t id) const {
+  std::vector<std::shared_ptr<const Stream>> streams;
+  for (const auto& [stream, of_stream] : by_stream_) {
+    if (stream->id().name != name || stream->id().id != id) continue;
+    streams.push_back(entries_.at(*of_stream.opens.begin()).stream);
+  }
+  return streams;
+}
+
 }  // namespace dssm::daemon

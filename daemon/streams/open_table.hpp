@@ -66,6 +66,18 @@ class OpenTable {
   Counts counts(const Stream& stream) const;
   std::vector<StreamUser> users(const Stream& stream) const;  // in the order of opening
 
+  // Who reads `stream`, in the order of opening.
+  struct Reading {
+    ClientNumber client = 0;
+    OpenNumber number = 0;
+  };
+  std::vector<Reading> readers_of(const Stream& stream) const;
+
+  // The streams of that name and id that somebody has open, whosever they are: own ones, removed
+  // ones, mirrors. Looks at all open streams.
+  std::vector<std::shared_ptr<const Stream>> open_streams(const std::string& name,
+                                                          std::int32_t id) const;
+
   // In the order of opening.
   const std::map<OpenNumber, OpenEntry>& entries() const noexcept { return entries_; }
 

@@ -1,0 +1,53 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What clients may ask about streams of other hosts, and about the hosts: from the protocol's
+// messages to Fleet and OpenTable, and back. The counterpart of StreamRequests; answers may take as
+// long as the other host takes.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <functional>
+#include <memory>
+
+#include "daemon/local/fleet.hpp"
+#include "daemon/local/reply.hpp"
+
+namespace dssm::daemon {
+
+class RemoteRequests {
+ public:
+  RemoteRequests(const std::string& own_host, Fleet& fleet, OpenTable& opens)
+      : own_host_(own_host), fleet_(fleet), opens_(opens) {}
+
+  using Client = std::shared_ptr<const ClientIdentity>;
+  // Called once: later, or at once. Whoever opened a stream for a client that is gone by then
+  // forgets its opens.
+  using Answer = std::function<void(Result<Reply>)>;
+
+  // Whether `request` is for other hosts: it is about a stream of another host, or `own_knows` says
+  // that the stream it is about is none of this host's own, or it is about hosts.
+  bool takes(const local::Request& request,
+             const std::function<bool(const StreamId&)>& own_knows) const;
+
+  // Does what such a request asks for.
+  void handle_untrusted(const Client& client, const local::Request& request,
+                        DescriptorQueue& descriptors, Answer answer);
+
+  // Adds the other hosts' streams to the list of the own ones.
+  void complete_list(Reply own, Answer answer);
+
+ private:
+  void create(const Client& client, const StreamId& id, const local::Create& request,
+              Answer answer);
+  void open(const Client& client, const StreamId& id, const local::Open& request, Answer answer);
+  Result<Reply> offer(const Client& client, const StreamId& id, const local::Offer& request,
+                      DescriptorQueue& descriptors);
+  Reply list_hosts() const;
+  void ping(const std::string& host, Answer answer);
+
+  const std::string own_host_;
+  Fleet& fleet_;
+  OpenTable& opens_;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,49 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What an answer to a program is made of, and the answers that several requests share.
+#pragma once
+
+#include <deque>
+#include <memory>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "core/wire/local_protocol.hpp"
+#include "daemon/streams/open_table.hpp"
+#include "local.pb.h"
+
+namespace dssm::daemon {
+
+// An answer and the descriptors that go with it, in the order that local.proto says.
+struct Reply {
+  local::Response response;
+  std::vector<UniqueFd> descriptors;
+};
+
+// Descriptors that arrived, one element per message that brought some. A request that takes
+// descriptors takes the oldest element.
+using DescriptorQueue = std::deque<std::vector<UniqueFd>>;
+
+// Lists leave room for what frames them; fields of types go first when a list gets too long.
+inline constexpr std::size_t kMaxListBytes = wire::kMaxLocalFrameBytes - (1U << 20);
+
+// Success with nothing to tell.
+Reply done();
+
+// The descriptors of the oldest message that brought any.
+std::vector<UniqueFd> take_descriptors(DescriptorQueue& queue);
+
+// The memory files of an Offer, from its descriptors.
+//   fails  protocol: some are missing
+Result<OfferedFiles> offered_files(DescriptorQueue& queue, Role role);
+
+// Notes that `client` has `stream` open and tells it so, without descriptors.
+Reply noted_open(OpenTable& opens, const std::shared_ptr<const ClientIdentity>& client,
+                 const std::shared_ptr<Stream>& stream, Role role, std::uint32_t tag);
+
+// The same, with the descriptors that go with a Create or an Open.
+//   fails  limit_exceeded (opens), os errors; then nothing is noted
+Result<Reply> opened(OpenTable& opens, const std::shared_ptr<const ClientIdentity>& client,
+                     const std::shared_ptr<Stream>& stream, Role role, std::uint32_t tag);
+
+}  // namespace dssm::daemon
