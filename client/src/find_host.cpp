@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/src/find_host.hpp"
+
+#include <charconv>
+#include <cstdlib>
+#include <dssm/session.hpp>
+
+namespace dssm::detail {
+namespace {
+
+std::vector<wire::SocketAddress> ask_catalog(const wire::Address&) { return {}; }
+
+}  // namespace
+
+Result<std::uint16_t> default_port() {
+  const char* text = std::getenv("DSSM_PORT");  // NOLINT(concurrency-mt-unsafe): as getaddrinfo
+  if (!text || !*text) return wire::kDefaultPort;
+  const std::string_view digits(text);
+  std::uint16_t port = 0;
+  const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), port);
+  if (error != std::errc{} || end != digits.data() + digits.size() || port == 0) {
+    return Error{Errc::invalid_argument, "$DSSM_PORT is '" + std::string(digits) +
+                                             "', which is no port: set it to 1 to 65535"};
+  }
+  return port;
+}
+
+Result<wire::Address> parse_host(const std::string& text) {
+  auto port = default_port();
+  if (!port) return std::move(port).error();
+  return wire::Address::parse(text.empty() ? "127.0.0.1" : text, *port);
+}
+
+Result<std::vector<wire::SocketAddress>> find_host(const wire::Address& address) {
+  auto resolved = wire::resolve(address);
+  if (resolved) return resolved;
+  std::vector<wire::SocketAddress> known = ask_catalog(address);
+  if (!known.empty()) return known;
+  Error error = std::move(resolved).error();
+  error.message += "; nor does a dssmd of this PC know a host of that name";
+  return error;
+}
+
+}  // namespace dssm::detail

@@ -1,0 +1,227 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/src/network_link.hpp"
+
+#include <poll.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+
+#include "core/wire/frame.hpp"
+#include "core/wire/tcp.hpp"
+
+namespace dssm::detail {
+namespace {
+
+// For one address: longer than a lost first packet takes to be sent again (1 s).
+constexpr Duration kConnectTimeout = std::chrono::seconds(2);
+
+constexpr std::size_t kMaxHostBytes = 31;
+
+// This PC's name as a greeting wants it: letters, digits and '-'.
+std::string own_host() {
+  std::array<char, 256> text{};
+  ::gethostname(text.data(), text.size() - 1);
+  std::string name(text.data());
+  name.resize(std::min({name.find('.'), name.size(), kMaxHostBytes}));
+  for (char& c : name) {
+    if (!((c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9'))) c = '-';
+  }
+  return name.empty() ? "unnamed" : name;
+}
+
+void add(wire::DecoderCounters& sum, const wire::DecoderCounters& more) noexcept {
+  sum.samples += more.samples;
+  sum.copied_payload_bytes += more.copied_payload_bytes;
+  sum.direct_payload_bytes += more.direct_payload_bytes;
+  sum.slow_frames += more.slow_frames;
+}
+
+}  // namespace
+
+NetworkLink::NetworkLink(wire::FrameSink& user, std::string program)
+    : user_(user), program_(std::move(program)), life_(wire::random_number()) {}
+
+void NetworkLink::start(std::vector<wire::SocketAddress> addresses) {
+  close();
+  addresses_ = std::move(addresses);
+  next_address_ = 0;
+  phase_ = Phase::connecting;  // advance() does the rest
+  step_deadline_ = MonoClock::now();
+}
+
+void NetworkLink::close() {
+  if (decoder_) add(earlier_, decoder_->counters());
+  decoder_.reset();
+  transport_.reset();
+  connecting_.reset();
+  queued_.clear();
+  queued_from_ = 0;
+  phase_ = Phase::down;
+  step_deadline_ = kNever;
+}
+
+Error NetworkLink::down(Error why) {
+  close();
+  return why;
+}
+
+Error NetworkLink::lost() const {
+  return Error{Errc::daemon_away, "dssmd at '" + address_ + "' closed the connection"};
+}
+
+// --- connecting and greeting
+// -----------------------------------------------------------------------
+
+Result<void> NetworkLink::connect_next() {
+  Error last{Errc::no_daemon, "no address to connect to"};
+  while (next_address_ < addresses_.size()) {
+    const wire::SocketAddress& address = addresses_[next_address_++];
+    address_ = address.str();
+    auto socket = wire::start_connect(address);
+    if (socket) {
+      connecting_ = std::move(*socket);
+      step_deadline_ = deadline_in(kConnectTimeout);
+      return {};
+    }
+    last = std::move(socket).error();
+  }
+  return down(std::move(last));
+}
+
+Result<void> NetworkLink::greet() {
+  transport_ = wire::make_tcp_transport(std::move(connecting_));
+  wire::FrameSink& sink = *this;
+  decoder_ = std::make_unique<wire::FrameDecoder>(sink, wire::kMaxNetworkFrameBytes);
+  wire::Greeting self;
+  self.host = own_host();
+  self.host_id = wire::host_id_for(self.host);
+  self.life = life_;
+  self.program = program_;
+  self.version = DSSM_VERSION;
+  self.features = {std::string(wire::kFeatureTorn)};
+  net::Frame frame;
+  wire::to_message(self, *frame.mutable_hello());
+  phase_ = Phase::greeting;
+  step_deadline_ = deadline_in(wire::kHelloTimeout);
+  queue(frame);
+  return send_queued();
+}
+
+Result<void> NetworkLink::advance() {
+  if (phase_ == Phase::down) return {};
+  if (phase_ == Phase::up) return {};
+  if (phase_ == Phase::connecting) {
+    if (!connecting_) return connect_next();
+    pollfd ready{connecting_.get(), POLLOUT, 0};
+    if (::poll(&ready, 1, 0) > 0) {
+      Result<void> connected =
+          wire::finish_connect(connecting_.get(), addresses_[next_address_ - 1]);
+      if (connected) return greet();
+      connecting_.reset();
+      if (next_address_ < addresses_.size()) return connect_next();
+      return down(std::move(connected).error());
+    }
+    if (MonoClock::now() < step_deadline_) return {};
+    connecting_.reset();
+    if (next_address_ < addresses_.size()) return connect_next();
+    return down(Error{Errc::no_daemon,
+                      "connect to '" + address_ +
+                          "': no answer; is that PC on, and do both reach each other (`ping`)?"});
+  }
+  if (has_queued()) {
+    if (Result<void> sent = send_queued(); !sent) return sent;
+  }
+  if (MonoClock::now() < step_deadline_) return {};
+  return down(
+      Error{Errc::protocol, "what listens at '" + address_ + "' does not greet; is it a dssmd?"});
+}
+
+// --- frames
+// ----------------------------------------------------------------------------------------
+
+void NetworkLink::queue(const net::Frame& frame) {
+  if (!has_queued()) queued_.clear(), queued_from_ = 0;
+  queued_ += wire::encode_frame(frame);
+}
+
+Result<void> NetworkLink::send_queued() {
+  auto sent = send_some(std::as_bytes(std::span(queued_)).subspan(queued_from_));
+  if (!sent) return std::move(sent).error();
+  queued_from_ += *sent;
+  return {};
+}
+
+Result<std::size_t> NetworkLink::send_some(std::span<const std::byte> bytes) {
+  std::size_t sent = 0;
+  while (sent < bytes.size()) {
+    const iovec part{const_cast<std::byte*>(bytes.data()) + sent, bytes.size() - sent};
+    auto result = transport_->send({&part, 1}, false);
+    if (!result) return down(std::move(result).error());
+    // Gone: its last words may be there to read, and then the end.
+    if (result->status != wire::IoStatus::ok) break;
+    sent += result->bytes;
+  }
+  return sent;
+}
+
+Result<bool> NetworkLink::receive() {
+  if (!transport_) return false;
+  auto received = transport_->receive(decoder_->spaces());
+  if (!received) return down(std::move(received).error());
+  if (received->status == wire::IoStatus::would_block) return false;
+  if (received->status == wire::IoStatus::end) return down(lost());
+  if (Result<void> done = decoder_->commit(received->bytes); !done) {
+    return down(std::move(done).error());
+  }
+  return true;
+}
+
+Result<void> NetworkLink::resume() {
+  if (!decoder_) return {};
+  if (Result<void> done = decoder_->commit(0); !done) return down(std::move(done).error());
+  return {};
+}
+
+Result<void> NetworkLink::on_frame(net::Frame& frame) {
+  if (phase_ == Phase::up) return user_.on_frame(frame);
+  const std::string who = "dssmd at '" + address_ + "'";
+  if (frame.has_failure()) return wire::failure(frame.failure()).context(who + " refuses");
+  if (!frame.has_hello()) {
+    return Error{Errc::protocol, who + " does not begin with a greeting; is it a dssmd?"};
+  }
+  auto them = wire::greeting_untrusted(frame.hello(), who);
+  if (!them) return std::move(them).error();
+  them_ = std::move(*them);
+  phase_ = Phase::up;
+  step_deadline_ = kNever;
+  return {};
+}
+
+Result<void> NetworkLink::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+  return user_.on_sample_begin(sample, out);  // refused by the decoder before a size is set
+}
+
+Result<void> NetworkLink::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+  return user_.on_sample_end(sample, torn);
+}
+
+wire::DecoderCounters NetworkLink::counters() const noexcept {
+  wire::DecoderCounters sum = earlier_;
+  if (decoder_) add(sum, decoder_->counters());
+  return sum;
+}
+
+// --- waiting
+// ---------------------------------------------------------------------------------------
+
+int NetworkLink::fd() const noexcept { return transport_ ? transport_->fd() : connecting_.get(); }
+
+short NetworkLink::events(bool more_to_send) const noexcept {
+  if (phase_ == Phase::connecting) return POLLOUT;
+  return static_cast<short>(POLLIN | (has_queued() || more_to_send ? POLLOUT : 0));
+}
+
+MonoTime NetworkLink::next_step() const noexcept { return step_deadline_; }
+
+}  // namespace dssm::detail

@@ -1,0 +1,105 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A program's connection to the network port of a dssmd: connects, greets, sends frames, cuts what
+// arrives into frames. Knows nothing of what they mean. It never waits by itself: its user polls
+// fd() for events() until next_step(), and then calls advance() and receive().
+//
+// Any failure takes the link down and is returned; start() begins anew.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <memory>
+#include <span>
+#include <string>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "core/wire/address.hpp"
+#include "core/wire/frame_decoder.hpp"
+#include "core/wire/network_protocol.hpp"
+#include "core/wire/transport.hpp"
+
+namespace dssm::detail {
+
+// A resource with one owner; one thread.
+class NetworkLink final : private wire::FrameSink {
+ public:
+  // What arrives after the greeting goes to `user`, from within receive() and resume().
+  NetworkLink(wire::FrameSink& user, std::string program);
+  NetworkLink(const NetworkLink&) = delete;
+  NetworkLink& operator=(const NetworkLink&) = delete;
+
+  // Begins to connect to one of `addresses` (at least one), tried in turn. Takes an open link down
+  // first.
+  void start(std::vector<wire::SocketAddress> addresses);
+  void close();
+
+  bool is_down() const noexcept { return phase_ == Phase::down; }
+  bool is_up() const noexcept { return phase_ == Phase::up; }
+
+  // Takes the steps of connecting and greeting that can be taken now.
+  //   fails  when no address is left (the last one's error), or the greeting failed
+  Result<void> advance();
+
+  // --- once up --------------------------------------------------------------------------------
+
+  // Queues a frame, for send_queued().
+  void queue(const net::Frame& frame);
+  bool has_queued() const noexcept { return queued_from_ < queued_.size(); }
+  Result<void> send_queued();
+  // Sends bytes of the user's own; returns how many went. Nothing may be queued.
+  Result<std::size_t> send_some(std::span<const std::byte> bytes);
+
+  // Receives once. False: nothing was there. Not while a sample is held back.
+  //   fails  besides: what `user` returned
+  Result<bool> receive();
+  // Goes on with what was received, after the user held a sample back.
+  Result<void> resume();
+
+  void set_payload_bytes(std::size_t bytes) noexcept { decoder_->set_payload_bytes(bytes); }
+  wire::FrameDecoder& decoder() noexcept { return *decoder_; }
+
+  // Of this connection and all before it.
+  wire::DecoderCounters counters() const noexcept;
+
+  // --- waiting --------------------------------------------------------------------------------
+
+  int fd() const noexcept;  // -1 while down
+  short events(bool more_to_send) const noexcept;
+  MonoTime next_step() const noexcept;  // when advance() has to be called at the latest
+
+  // "10.0.0.2:13776"; where it is connected to, or tries to be; empty before the first start().
+  const std::string& address() const noexcept { return address_; }
+  const wire::Greeting& them() const noexcept { return them_; }  // once up
+
+ private:
+  enum class Phase : unsigned char { down, connecting, greeting, up };
+
+  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
+  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
+  Result<void> on_frame(net::Frame& frame) override;
+  Result<void> connect_next();
+  Result<void> greet();
+  Error down(Error why);
+  Error lost() const;
+
+  wire::FrameSink& user_;
+  const std::string program_;
+  const std::uint64_t life_;
+
+  Phase phase_ = Phase::down;
+  MonoTime step_deadline_ = kNever;
+  std::vector<wire::SocketAddress> addresses_;
+  std::size_t next_address_ = 0;
+  std::string address_;
+  UniqueFd connecting_;
+  std::unique_ptr<wire::Transport> transport_;
+  std::unique_ptr<wire::FrameDecoder> decoder_;
+  wire::DecoderCounters earlier_;
+  std::string queued_;
+  std::size_t queued_from_ = 0;
+  wire::Greeting them_;
+};
+
+}  // namespace dssm::detail

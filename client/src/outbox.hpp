@@ -1,0 +1,75 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Samples on their way to another host's stream: kept as whole frames, one behind the other, from
+// when they are posted until the owner says that they are written, so that a new connection can
+// send again what was lost with the old one. Samples are numbered 0, 1, 2 ... as they are posted.
+//
+//   first ........ send ........ next       numbers
+//     sent, not      waiting
+//     acknowledged   to be sent
+//
+// Bounded: when there is no room, the oldest goes. One that was never sent is dropped for certain;
+// one that was sent is probably written, and only a new connection will tell.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/sample.hpp>
+#include <span>
+#include <vector>
+
+namespace dssm::detail {
+
+// A value; one thread.
+class Outbox {
+ public:
+  // max_bytes: of all payloads; one sample is always kept, however large.
+  Outbox(std::size_t payload_bytes, std::uint64_t max_samples, std::uint64_t max_bytes);
+
+  // Keeps the sample, to be sent; returns its number.
+  std::int64_t push(std::span<const std::byte> payload, Time time, Duration clock_error);
+
+  // Bytes to be sent next, in one piece of whole frames (the first one may be begun); empty when
+  // there is nothing.
+  std::span<const std::byte> unsent() const noexcept;
+  // Of unsent(), only what completes a frame that was begun.
+  std::span<const std::byte> rest_of_frame() const noexcept;
+  // So many bytes from the start of unsent() or rest_of_frame() went.
+  void sent(std::size_t bytes) noexcept;
+
+  // All up to this number are written; `tid` is what the newest of them became.
+  //   fails  protocol (a number that was never posted)
+  Result<void> acknowledge(std::int64_t last, Tid tid);
+  // The connection is gone: nothing is to be sent before restart().
+  void on_down() noexcept;
+  // There is a new connection, and the owner has written all up to this number.
+  //   fails  as acknowledge()
+  Result<void> restart(std::int64_t last, Tid tid);
+
+  std::int64_t newest() const noexcept { return next_ - 1; }           // -1: nothing was posted
+  bool all_written() const noexcept { return written_ == next_ - 1; }  // or dropped
+  Tid written_tid() const noexcept { return written_tid_; }
+  std::uint64_t dropped() const noexcept { return dropped_; }
+
+ private:
+  std::byte* frame(std::int64_t number) noexcept;
+  const std::byte* frame(std::int64_t number) const noexcept;
+  void make_room();
+  void drop_oldest();
+  void leave_begun_frame();
+
+  std::size_t payload_bytes_, frame_bytes_;
+  std::int64_t max_count_, room_ = 0;  // frames
+  std::vector<std::byte> frames_;      // frame `number` at number % room_
+  std::vector<std::byte> begun_;       // rest of a frame that was begun and had to make room
+  std::int64_t first_ = 0, send_ = 0, next_ = 0;
+  std::size_t sent_of_send_ = 0;  // bytes of frame `send_` that went
+  // Sent by this connection, gone from here since, and perhaps not written: [from, to).
+  std::int64_t unsure_from_ = 0, unsure_to_ = 0;
+  std::int64_t written_ = -1;
+  Tid written_tid_ = kNoTid;
+  std::uint64_t dropped_ = 0;
+};
+
+}  // namespace dssm::detail

@@ -1,0 +1,262 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// PConnector's requests in the network protocol's words; the rest is Channel's.
+#include <poll.h>
+
+#include <algorithm>
+#include <dssm/pconnector.hpp>
+
+#include "client/src/channel.hpp"
+#include "client/src/find_host.hpp"
+#include "client/src/program_name.hpp"
+
+namespace dssm {
+namespace detail {
+
+struct PConnectorState {
+  explicit PConnectorState(std::unique_ptr<Channel> opened) : channel(std::move(opened)) {}
+  std::unique_ptr<Channel> channel;
+};
+
+namespace {
+
+// Nobody hears from outside what a connection that only lists says.
+class ListSink final : public wire::FrameSink {
+ public:
+  Result<void> on_sample_begin(const wire::IncomingSample&, std::byte*&) override {
+    return Error{Errc::protocol, "a sample came on a connection that carries none"};
+  }
+  Result<void> on_sample_end(const wire::IncomingSample&, bool) override { return {}; }
+  Result<void> on_frame(net::Frame& frame) override {
+    if (frame.has_failure()) return wire::failure(frame.failure());
+    if (!frame.has_stream_list()) return {};
+    streams.emplace();
+    for (const proto::Stream& stream : frame.stream_list().streams()) {
+      streams->push_back(wire::stream_info(stream));
+    }
+    return {};
+  }
+  std::optional<std::vector<StreamInfo>> streams;
+};
+
+Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
+                                             const PConnectorOptions& options) {
+  const MonoTime deadline = deadline_in(options.request_timeout);
+  auto addresses = find_host(host);
+  if (!addresses) return std::move(addresses).error();
+  ListSink sink;
+  NetworkLink link(sink, options.program.empty() ? default_program() : options.program);
+  link.start(std::move(*addresses));
+  for (bool asked = false; !sink.streams;) {
+    if (Result<void> done = link.advance(); !done) return std::move(done).error();
+    if (link.is_up() && !asked) {
+      asked = true;
+      net::Frame frame;
+      frame.set_serial(1);
+      frame.mutable_list();
+      link.queue(frame);
+    }
+    if (link.is_up() && link.has_queued()) {
+      if (Result<void> sent = link.send_queued(); !sent) return std::move(sent).error();
+    }
+    const MonoTime now = MonoClock::now();
+    if (now >= deadline) {
+      return Error{Errc::daemon_away, "dssmd at '" + link.address() + "' does not answer"};
+    }
+    const std::int64_t ns =
+        std::max<std::int64_t>(0, to_ns(std::min(deadline, link.next_step()) - now));
+    const timespec timeout{ns / 1'000'000'000, ns % 1'000'000'000};
+    pollfd ready{link.fd(), link.events(false), 0};
+    if (::ppoll(&ready, 1, &timeout, nullptr) <= 0) continue;
+    if (auto received = link.receive(); !received) return std::move(received).error();
+  }
+  return std::move(*sink.streams);
+}
+
+// "open 'lidar:0' at '10.0.0.2'"
+std::string attempt(const char* verb, const StreamId& id, const PConnectorOptions& options) {
+  std::string text = verb + (" '" + id.str() + "'");
+  if (!options.address.empty()) text += " at '" + options.address + "'";
+  return text;
+}
+
+}  // namespace
+}  // namespace detail
+
+PConnector::PConnector(std::unique_ptr<detail::PConnectorState> state) noexcept
+    : state_(std::move(state)) {}
+PConnector::PConnector(PConnector&&) noexcept = default;
+PConnector& PConnector::operator=(PConnector&&) noexcept = default;
+PConnector::~PConnector() = default;
+
+Result<PConnector> PConnector::open(const StreamId& id, PConnectorOptions options,
+                                    const TypeInfo* wanted) {
+  const std::string what = detail::attempt("open", id, options);
+  if (Result<void> checked = id.check(); !checked) return std::move(checked).error().context(what);
+  auto channel = detail::Channel::open({id}, std::move(options));
+  if (!channel) return std::move(channel).error().context(what);
+  if (wanted) {
+    if (Result<void> usable = (*channel)->stream().type.check_usable_as(*wanted); !usable) {
+      return std::move(usable).error().context(what);
+    }
+  }
+  return PConnector(std::make_unique<detail::PConnectorState>(std::move(*channel)));
+}
+
+Result<PConnector> PConnector::create(const StreamId& id, const TypeInfo& type,
+                                      const History& history, PConnectorOptions options) {
+  const std::string what = detail::attempt("create", id, options);
+  if (Result<void> checked = id.check(); !checked) return std::move(checked).error().context(what);
+  if (Result<void> checked = type.check(); !checked) {
+    return std::move(checked).error().context(what);
+  }
+  auto channel = detail::Channel::open({id, type, history}, std::move(options));
+  if (!channel) return std::move(channel).error().context(what);
+  return PConnector(std::make_unique<detail::PConnectorState>(std::move(*channel)));
+}
+
+Result<std::vector<StreamInfo>> PConnector::list(PConnectorOptions options) {
+  const std::string what = "list the streams of '" + options.address + "'";
+  auto host = detail::parse_host(options.address);
+  if (!host) return std::move(host).error().context(what);
+  auto streams = detail::list_streams(*host, options);
+  if (!streams) return std::move(streams).error().context(what);
+  return streams;
+}
+
+// --- reading
+// ---------------------------------------------------------------------------------------
+
+Result<ReadStatus> PConnector::latest(std::span<std::byte> payload, SampleInfo& info) {
+  net::Frame frame;
+  frame.mutable_read()->set_newest(true);
+  return state_->channel->read(std::move(frame), payload, info);
+}
+
+Result<ReadStatus> PConnector::tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) {
+  if (tid < 0) return ReadStatus::too_old;
+  net::Frame frame;
+  frame.mutable_read()->set_tid(tid);
+  return state_->channel->read(std::move(frame), payload, info);
+}
+
+Result<ReadStatus> PConnector::at(Time t, std::span<std::byte> payload, SampleInfo& info) {
+  net::Frame frame;
+  frame.mutable_read()->set_time_ns(to_ns(t));
+  return state_->channel->read(std::move(frame), payload, info);
+}
+
+Result<ReadStatus> PConnector::newer(Tid than, std::span<std::byte> payload, SampleInfo& info) {
+  net::Frame frame;
+  frame.mutable_read()->set_newer_than(than);
+  return state_->channel->read(std::move(frame), payload, info);
+}
+
+namespace {
+
+Result<net::Range> ask_range(detail::Channel& channel, std::optional<Time> t) {
+  net::Frame frame;
+  frame.mutable_get_range();
+  if (t) frame.mutable_get_range()->set_time_ns(to_ns(*t));
+  auto answer = channel.ask(std::move(frame));
+  if (!answer) {
+    return std::move(answer).error().context("look at '" + channel.stream().id.str() + "'");
+  }
+  return std::move(*answer->mutable_range());
+}
+
+}  // namespace
+
+Result<Tid> PConnector::newest() {
+  auto range = ask_range(*state_->channel, std::nullopt);
+  if (!range) return std::move(range).error();
+  return std::max(range->newest(), kNoTid);
+}
+
+Result<Tid> PConnector::oldest() {
+  auto range = ask_range(*state_->channel, std::nullopt);
+  if (!range) return std::move(range).error();
+  return std::max(range->oldest(), kNoTid);
+}
+
+Result<Tid> PConnector::find(Time t) {
+  auto range = ask_range(*state_->channel, t);
+  if (!range) return std::move(range).error();
+  return std::max(range->at_tid(), kNoTid);
+}
+
+// --- subscription
+// ----------------------------------------------------------------------------------
+
+Result<void> PConnector::subscribe(const Subscription& what) {
+  return state_->channel->subscribe(what);
+}
+
+Result<void> PConnector::unsubscribe() { return state_->channel->unsubscribe(); }
+
+Result<ReadStatus> PConnector::next(std::span<std::byte> payload, SampleInfo& info) {
+  return state_->channel->next(payload, info);
+}
+
+WaitStatus PConnector::wait(MonoTime deadline) { return state_->channel->wait(deadline); }
+std::uint64_t PConnector::lost() const noexcept { return state_->channel->lost(); }
+std::uint64_t PConnector::restarts() const noexcept { return state_->channel->restarts(); }
+int PConnector::fd() const noexcept { return state_->channel->fd(); }
+
+// --- writing
+// ---------------------------------------------------------------------------------------
+
+Result<Tid> PConnector::write(std::span<const std::byte> payload, Time time, Duration clock_error) {
+  if (Result<void> posted = post(payload, time, clock_error); !posted) {
+    return std::move(posted).error();
+  }
+  return flush(deadline_in(state_->channel->request_timeout()));
+}
+
+Result<void> PConnector::post(std::span<const std::byte> payload, Time time, Duration clock_error) {
+  return state_->channel->post(payload, time, clock_error);
+}
+
+Result<Tid> PConnector::flush(MonoTime deadline) { return state_->channel->flush(deadline); }
+std::uint64_t PConnector::dropped() const noexcept { return state_->channel->dropped(); }
+
+// --- about the stream
+// ------------------------------------------------------------------------------
+
+Result<std::vector<std::byte>> PConnector::property() {
+  net::Frame frame;
+  frame.mutable_get_property();
+  auto answer = state_->channel->ask(std::move(frame));
+  if (!answer) return std::move(answer).error().context("get the property of '" + id().str() + "'");
+  const std::string& property = answer->property().property();
+  const auto* bytes = reinterpret_cast<const std::byte*>(property.data());
+  return std::vector<std::byte>(bytes, bytes + property.size());
+}
+
+Result<void> PConnector::set_property(std::span<const std::byte> property) {
+  const std::string what = "set the property of '" + id().str() + "'";
+  if (property.size() > wire::kMaxPropertyBytes) {
+    return Error{Errc::limit_exceeded, what + ": it has " + std::to_string(property.size()) +
+                                           " bytes; at most " +
+                                           std::to_string(wire::kMaxPropertyBytes) + " are taken"};
+  }
+  net::Frame frame;
+  frame.mutable_set_property()->set_property(property.data(), property.size());
+  auto answer = state_->channel->ask(std::move(frame));
+  if (!answer) return std::move(answer).error().context(what);
+  return {};
+}
+
+const StreamId& PConnector::id() const noexcept { return state_->channel->stream().id; }
+const TypeInfo& PConnector::type() const noexcept { return state_->channel->stream().type; }
+std::uint64_t PConnector::payload_bytes() const noexcept { return type().payload_bytes; }
+std::uint64_t PConnector::depth() const noexcept { return state_->channel->stream().depth; }
+Duration PConnector::cycle() const noexcept { return state_->channel->stream().cycle; }
+std::uint64_t PConnector::incarnation() const noexcept {
+  return state_->channel->stream().incarnation;
+}
+bool PConnector::connected() const noexcept { return state_->channel->is_up(); }
+const std::string& PConnector::address() const noexcept { return state_->channel->address(); }
+PConnector::Counters PConnector::counters() const noexcept { return state_->channel->counters(); }
+
+}  // namespace dssm
