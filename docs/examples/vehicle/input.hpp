@@ -14,8 +14,12 @@
 
 namespace vehicle {
 
-// Opens `stream`, waiting until it is created. Fails as Session::open_reader() does, but for
-// not_found, which it waits out; nullopt when a signal asked to stop.
+// What localizer and mapper end with under --complete when they had to leave scans out.
+inline constexpr int kIncompleteStatus = 3;
+
+// Opens `stream`, on whichever host it is, waiting until it is created and its host answers. Fails
+// as Session::open_reader() does, but for not_found and daemon_away, which it waits out; nullopt
+// when a signal asked to stop.
 template <class T>
 dssm::Result<std::optional<dssm::Reader<T>>> open_when_there(dssm::Session& session,
                                                              const char* stream,
@@ -24,7 +28,10 @@ dssm::Result<std::optional<dssm::Reader<T>>> open_when_there(dssm::Session& sess
     dssm::Result<dssm::Reader<T>> reader =
         session.await_reader<T>(stream, dssm::deadline_in(kSlice));
     if (reader) return std::optional<dssm::Reader<T>>(std::move(*reader));
-    if (reader.error().code != dssm::Errc::not_found) return std::move(reader).error();
+    const dssm::Errc code = reader.error().code;
+    if (code != dssm::Errc::not_found && code != dssm::Errc::daemon_away) {
+      return std::move(reader).error();
+    }
     if (!told) progress.say("waiting for the stream '" + std::string(stream) + "'");
   }
   return std::optional<dssm::Reader<T>>();

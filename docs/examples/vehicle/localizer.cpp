@@ -27,11 +27,12 @@ int fail(const dssm::Error& error) {
 int main(int argc, char** argv) {
   CLI::App app("Reads the odometry at the time of each LIDAR scan and writes poses.");
   double deadline_s = 1;
-  bool late = false;
+  bool late = false, complete = false;
   app.add_option("--deadline", deadline_s, "seconds to wait for the odometry of a scan")
       ->check(CLI::Range(0.0, 3600.0))
       ->capture_default_str();
   app.add_flag("--late", late, "take the newest drive also when it is over already");
+  app.add_flag("--complete", complete, "end with status 3 when a scan got no pose");
   CLI11_PARSE(app, argc, argv);
   vehicle::stop_on_signals();
   vehicle::Progress progress("localizer");
@@ -80,5 +81,5 @@ int main(int argc, char** argv) {
   }
   poses->write({0, 0, 0, dssm::kNoTid}, info.time);  // the end mark passes on
   progress.say(summary());
-  return 0;
+  return complete && without_odometry + lidar.lost() > 0 ? vehicle::kIncompleteStatus : 0;
 }

@@ -15,6 +15,7 @@
 #include "occupancy_grid.hpp"
 #include "progress.hpp"
 #include "samples.hpp"
+#include "scan_at.hpp"
 #include "stop.hpp"
 
 namespace {
@@ -29,13 +30,17 @@ int fail(const dssm::Error& error) {
 int main(int argc, char** argv) {
   CLI::App app("Draws a map from poses and LIDAR scans.");
   std::string out = "map.png";
-  double patience_s = 10;
-  bool late = false;
+  double patience_s = 10, deadline_s = 1;
+  bool late = false, complete = false;
   app.add_option("--out", out, "the picture to write (PNG)")->capture_default_str();
   app.add_option("--patience", patience_s, "seconds without a pose after which the drive is over")
       ->check(CLI::Range(0.1, 86400.0))
       ->capture_default_str();
+  app.add_option("--deadline", deadline_s, "seconds to wait for the scan of a pose")
+      ->check(CLI::Range(0.0, 3600.0))
+      ->capture_default_str();
   app.add_flag("--late", late, "take the newest drive also when it is over already");
+  app.add_flag("--complete", complete, "end with status 3 when a pose or its scan was missed");
   CLI11_PARSE(app, argc, argv);
   vehicle::stop_on_signals();
   vehicle::Progress progress("mapper");
@@ -53,7 +58,7 @@ int main(int argc, char** argv) {
       vehicle::open_when_there<vehicle::Scan>(*session, vehicle::kScanStream, progress);
   if (!scan_reader) return fail(scan_reader.error());
   if (!*scan_reader) return 0;
-  dssm::Reader<vehicle::Scan>& lidar = **scan_reader;
+  vehicle::ScanAt scans(std::move(**scan_reader), dssm::Duration(std::llround(deadline_s * 1e9)));
 
   vehicle::OccupancyGrid grid;
   std::vector<vehicle::Pose2> way;
@@ -66,7 +71,7 @@ int main(int argc, char** argv) {
   };
   vehicle::Pose pose;
   vehicle::Scan scan;
-  dssm::SampleInfo pose_info, scan_info;
+  dssm::SampleInfo pose_info;
   dssm::MonoTime deadline = dssm::kNever;  // the first pose may take as long as it likes
   while (!vehicle::stop_requested()) {
     if (poses.next(pose, pose_info) != dssm::ReadStatus::ok) {
@@ -80,12 +85,11 @@ int main(int argc, char** argv) {
     }
     deadline = dssm::deadline_in(patience);
     if (pose.is_end()) break;
-    if (lidar.at(pose_info.time, scan, scan_info) == dssm::ReadStatus::ok &&
-        scan_info.tid == pose.scan_tid) {
+    if (scans.at(pose_info.time, pose.scan_tid, scan)) {
       const vehicle::Pose2 laser{pose.x_m, pose.y_m, pose.theta_rad};
       grid.add(laser, {scan.ranges(), scan.first_rad, scan.step_rad});
       way.push_back(laser);
-    } else {
+    } else if (!vehicle::stop_requested()) {
       ++without_scan;
     }
     progress.update(summary);
@@ -97,5 +101,5 @@ int main(int argc, char** argv) {
   }
   progress.say(summary() + "; " + std::to_string(grid.count(vehicle::OccupancyGrid::Cell::wall)) +
                " wall cells; the map is in '" + out + "'");
-  return 0;
+  return complete && without_scan + poses.lost() > 0 ? vehicle::kIncompleteStatus : 0;
 }

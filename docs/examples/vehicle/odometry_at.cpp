@@ -16,12 +16,22 @@ std::optional<Pose2> OdometryAt::between(dssm::Time t, const dssm::Neighbours& r
   dssm::SampleInfo info;
   if (reader_.tid(readings.before.tid, before, info) != dssm::ReadStatus::ok ||
       reader_.tid(readings.after.tid, after, info) != dssm::ReadStatus::ok) {
-    return std::nullopt;  // overwritten since the search: too old by now
+    return std::nullopt;  // overwritten since the search, or the stream began anew
   }
   return interpolate({before.x_m, before.y_m, before.theta_rad},
                      {after.x_m, after.y_m, after.theta_rad},
                      weight_of(dssm::to_ns(t), dssm::to_ns(readings.before.time),
                                dssm::to_ns(readings.after.time)));
+}
+
+bool OdometryAt::goes_on_with_new_ring() {
+  Odometry newest;
+  dssm::SampleInfo info;
+  (void)reader_.latest(newest, info);
+  if (reader_.restarts() == restarts_) return false;
+  restarts_ = reader_.restarts();
+  newest_at_start_ = dssm::kNoTid;
+  return true;
 }
 
 std::optional<Pose2> OdometryAt::at(dssm::Time t) {
@@ -30,7 +40,10 @@ std::optional<Pose2> OdometryAt::at(dssm::Time t) {
     const dssm::Tid newest = reader_.newest();  // before the search: what comes after it wakes us
     dssm::Neighbours readings;
     const dssm::ReadStatus status = reader_.neighbours(t, readings);
-    if (status == dssm::ReadStatus::ok) return between(t, readings);
+    if (status == dssm::ReadStatus::ok) {
+      if (const std::optional<Pose2> pose = between(t, readings)) return pose;
+    }
+    if (goes_on_with_new_ring() || status == dssm::ReadStatus::ok) continue;
     // Too old for good, unless all there is stems from an earlier drive with later stamps.
     if (status == dssm::ReadStatus::too_old && newest != newest_at_start_) return std::nullopt;
     const dssm::MonoTime now = dssm::MonoClock::now();

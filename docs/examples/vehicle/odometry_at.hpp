@@ -3,6 +3,7 @@
 // "What did the encoder say when this scan was taken?": the question that DSSM is for.
 #pragma once
 
+#include <cstdint>
 #include <dssm/reader.hpp>
 #include <optional>
 
@@ -25,10 +26,14 @@ class OdometryAt {
 
  private:
   std::optional<Pose2> between(dssm::Time t, const dssm::Neighbours& readings);
+  // True, once, when the stream began anew. neighbours() leaves the reader where it is, on the old
+  // ring; a read that moves the cursor goes on with the new one.
+  bool goes_on_with_new_ring();
 
   dssm::Reader<Odometry> reader_;
   dssm::Duration deadline_;
   dssm::Tid newest_at_start_;
+  std::uint64_t restarts_ = 0;  // of the reader, as far as noticed here
 };
 
 }  // namespace vehicle

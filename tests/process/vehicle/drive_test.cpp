@@ -1,17 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The whole drive: the four programs as processes on a dssmd of their own, replaying the first
-// minute of the recording without pauses. Rings are deep enough to hold all of it and stamps are
-// the recording's, so nothing here depends on how fast this machine is.
+// minute of the recording without pauses.
+#include "tests/process/vehicle/drive.hpp"
+
 #include <gtest/gtest.h>
 #include <png.h>
 #include <signal.h>
 
 #include <algorithm>
 #include <cmath>
-#include <cstdlib>
 #include <dssm/dssm.hpp>
-#include <fstream>
 #include <iterator>
 #include <random>
 #include <string>
@@ -21,65 +20,31 @@
 #include "docs/examples/vehicle/map_picture.hpp"
 #include "docs/examples/vehicle/occupancy_grid.hpp"
 #include "docs/examples/vehicle/resample.hpp"
-#include "tests/support/daemon_process.hpp"
 
 namespace vehicle {
 namespace {
 
 using dssm::test::DaemonProcess;
-using Command = std::vector<std::string>;
+using test::Command;
+using test::connect;
+using test::content;
+using test::localizer;
+using test::mapper;
+using test::program;
+using test::recording;
+using test::written;
 
 constexpr double kToS = 60;
 constexpr double kEncoderCycleS = 0.05;  // the encoder's default
 
-std::string recording() {
-  return std::string(std::getenv("DSSM_SOURCE_ROOT")) +
-         "/docs/examples/vehicle/data/freiburg-079.carmen.log.gz";
-}
-
-Command program(const std::string& name, const Command& arguments) {
-  Command command{dssm::test::built("docs/examples/vehicle/" + name)};
-  command.insert(command.end(), arguments.begin(), arguments.end());
-  return command;
-}
-
 Command source(const std::string& name, const Command& more = {"--speed", "0"}) {
-  Command arguments{"--log", recording(), "--to", std::to_string(kToS), "--life", "200"};
-  arguments.insert(arguments.end(), more.begin(), more.end());
-  return program(name, arguments);
+  return test::source(name, kToS, more);
 }
 
-Command localizer() { return program("localizer", {"--late", "--deadline", "600"}); }
-Command mapper(const std::string& out) {
-  return program("mapper", {"--late", "--patience", "600", "--out", out});
-}
-
-std::string content(const std::string& path) {
-  std::ifstream file(path, std::ios::binary);
-  return {std::istreambuf_iterator<char>(file), {}};
-}
-
-// Starts all, then waits for all; each must end with status 0.
 void run_all(const DaemonProcess& daemon, const std::vector<Command>& commands) {
-  std::vector<pid_t> pids;
-  for (const Command& command : commands) {
-    pids.push_back(dssm::test::start(command, {daemon.environment()}));
-  }
-  for (std::size_t i = 0; i < pids.size(); ++i) {
-    EXPECT_EQ(dssm::test::wait_for(pids[i]), 0) << commands[i][0];
-  }
-}
-
-dssm::Session connect(const DaemonProcess& daemon) {
-  dssm::SessionOptions options;
-  options.socket_path = daemon.socket_path();
-  return dssm::Session::connect(options).value();
-}
-
-// The number of samples written to `stream`.
-dssm::Tid written(const DaemonProcess& daemon, const std::string& stream) {
-  dssm::Session session = connect(daemon);
-  return session.info(dssm::StreamId{stream, 0, ""}).value().newest + 1;
+  std::vector<test::Placed> programs;
+  for (const Command& command : commands) programs.push_back({&daemon, command});
+  test::run_all(programs);
 }
 
 class VehicleDrive : public testing::Test {

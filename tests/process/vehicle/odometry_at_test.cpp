@@ -104,6 +104,20 @@ TEST_F(OdometryAtTest, GivesUpAtOnceWhenTheRingNoLongerHoldsTheTime) {
   EXPECT_FALSE(odometry.at(at_ms(1050)));  // would wait an hour otherwise
 }
 
+TEST_F(OdometryAtTest, GoesOnWhenTheStreamBeganAnew) {
+  encoder_.write({7, 7, 7}, at_ms(1000));
+  encoder_.write({8, 8, 8}, at_ms(1100));
+  OdometryAt odometry = this->odometry(std::chrono::hours(1));
+  ASSERT_TRUE(odometry.at(at_ms(1050)));
+  ASSERT_TRUE(session_.remove(dssm::StreamId{"odometry", 0, ""}));
+  encoder_ = session_.create<Odometry>("odometry", dssm::History{8, milliseconds(100)}).value();
+  encoder_.write({1, 0, 0}, at_ms(5000));
+  encoder_.write({2, 0, 0}, at_ms(5100));
+  const std::optional<Pose2> pose = odometry.at(at_ms(5050));
+  ASSERT_TRUE(pose);
+  EXPECT_DOUBLE_EQ(pose->x_m, 1.5);
+}
+
 TEST_F(OdometryAtTest, EndsWhenASignalAsksToStop) {
   OdometryAt odometry = this->odometry(std::chrono::hours(1));
   stop_signal = SIGINT;

@@ -1,0 +1,47 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What tests of the whole drive share: the vehicle's programs as command lines, replaying the
+// beginning of the recording with rings deep enough to hold all of it, so that nothing depends on
+// how fast this machine is.
+#pragma once
+
+#include <dssm/dssm.hpp>
+#include <string>
+#include <vector>
+
+#include "tests/support/daemon_process.hpp"
+
+namespace vehicle::test {
+
+using Command = std::vector<std::string>;
+
+// The file with the recording.
+std::string recording();
+
+// `name` with `arguments`.
+Command program(const std::string& name, const Command& arguments);
+
+// encoder or lidar: replays until second `to_s` of the recording.
+Command source(const std::string& name, double to_s, const Command& more = {"--speed", "0"});
+
+// They take what is there already, wait for what is not, and fail when they lost a sample.
+Command localizer();
+Command mapper(const std::string& out);
+
+// A program and the dssmd that it uses.
+struct Placed {
+  const dssm::test::DaemonProcess* host;
+  Command command;
+};
+
+// Starts all, then waits for all; each must end with status 0.
+void run_all(const std::vector<Placed>& programs);
+
+std::string content(const std::string& path);
+
+dssm::Session connect(const dssm::test::DaemonProcess& host);
+
+// The number of samples written to `stream`, which `host` owns.
+dssm::Tid written(const dssm::test::DaemonProcess& host, const std::string& stream);
+
+}  // namespace vehicle::test
