@@ -28,6 +28,35 @@ Result<void> without_answer(Result<detail::Answer> answer, const std::string& wh
   return {};
 }
 
+Result<std::vector<StreamInfo>> listed(detail::Client& client, bool own_only) {
+  local::Request request;
+  request.mutable_list()->set_own_only(own_only);
+  auto answer = client.call(std::move(request));
+  if (!answer) return std::move(answer).error().context("list the streams");
+  std::vector<StreamInfo> streams;
+  streams.reserve(static_cast<std::size_t>(answer->response.stream_list().streams_size()));
+  for (const proto::Stream& stream : answer->response.stream_list().streams()) {
+    streams.push_back(wire::stream_info(stream));
+  }
+  return streams;
+}
+
+HostInfo host_info(const local::Host& message) {
+  HostInfo host;
+  host.name = message.name();
+  host.addresses.assign(message.addresses().begin(), message.addresses().end());
+  host.version = message.version();
+  host.state = message.state();
+  host.since = Duration(message.since_ns());
+  host.round_trip = Duration(message.round_trip_ns());
+  host.least_round_trip = Duration(message.least_round_trip_ns());
+  host.streams = message.streams();
+  host.clock_bound = Duration(message.clock_bound_ns());
+  host.insecure = message.insecure();
+  host.error = message.error();
+  return host;
+}
+
 }  // namespace
 
 namespace detail {
@@ -151,18 +180,9 @@ Result<void> Session::remove(const StreamId& id) {
   return without_answer(client_->call(std::move(request)), quoted("remove", id));
 }
 
-Result<std::vector<StreamInfo>> Session::list() {
-  local::Request request;
-  request.mutable_list();
-  auto answer = client_->call(std::move(request));
-  if (!answer) return std::move(answer).error().context("list the streams");
-  std::vector<StreamInfo> streams;
-  streams.reserve(static_cast<std::size_t>(answer->response.stream_list().streams_size()));
-  for (const proto::Stream& stream : answer->response.stream_list().streams()) {
-    streams.push_back(wire::stream_info(stream));
-  }
-  return streams;
-}
+Result<std::vector<StreamInfo>> Session::list() { return listed(*client_, false); }
+
+Result<std::vector<StreamInfo>> Session::list_own() { return listed(*client_, true); }
 
 Result<StreamInfo> Session::info(const StreamId& id) {
   local::Request request;
@@ -198,6 +218,27 @@ Result<void> Session::set_property(const StreamId& id, std::span<const std::byte
 
 Result<std::vector<std::byte>> Session::property(const StreamId& id) {
   return detail::get_property(*client_, id);
+}
+
+Result<std::vector<HostInfo>> Session::hosts() {
+  local::Request request;
+  request.mutable_list_hosts();
+  auto answer = client_->call(std::move(request));
+  if (!answer) return std::move(answer).error().context("list the hosts");
+  std::vector<HostInfo> hosts;
+  for (const local::Host& host : answer->response.host_list().hosts()) {
+    hosts.push_back(host_info(host));
+  }
+  return hosts;
+}
+
+Result<RoundTrip> Session::ping(const std::string& host) {
+  local::Request request;
+  request.mutable_ping_host()->set_host(host);
+  auto answer = client_->call(std::move(request));
+  if (!answer) return std::move(answer).error().context("ping '" + host + "'");
+  const local::RoundTrip& round_trip = answer->response.round_trip();
+  return RoundTrip{Duration(round_trip.round_trip_ns()), round_trip.address()};
 }
 
 Result<PlaybackClock> Session::playback_clock() {

@@ -13,6 +13,12 @@ TypeInfo type_info(const proto::Type& message) {
   return type;
 }
 
+MirrorInfo mirror_info(const proto::Mirror& message) {
+  return {message.state(),          message.gap_samples(), message.reconnects(),
+          message.restarts(),       message.newest(),      message.received_samples(),
+          message.received_bytes(), message.error()};
+}
+
 }  // namespace
 
 void to_message(const StreamId& id, proto::StreamId& out) {
@@ -50,6 +56,7 @@ void to_message(const StreamInfo& info, proto::Stream& out) {
   out.set_rate_hz(info.rate_hz);
   out.set_writers(info.writers);
   out.set_readers(info.readers);
+  out.set_channels(info.channels);
   for (const StreamUser& user : info.users) {
     proto::User& message = *out.add_users();
     message.set_pid(user.pid);
@@ -57,6 +64,18 @@ void to_message(const StreamInfo& info, proto::Stream& out) {
     message.set_program(user.program);
     message.set_writer(user.role == Role::writer);
   }
+  if (info.mirror) to_message(*info.mirror, *out.mutable_mirror());
+}
+
+void to_message(const MirrorInfo& info, proto::Mirror& out) {
+  out.set_state(info.state);
+  out.set_gap_samples(info.gap_samples);
+  out.set_reconnects(info.reconnects);
+  out.set_restarts(info.restarts);
+  out.set_newest(info.newest);
+  out.set_received_samples(info.received_samples);
+  out.set_received_bytes(info.received_bytes);
+  out.set_error(info.error);
 }
 
 void to_message(const Error& error, proto::Failure& out) {
@@ -103,10 +122,12 @@ StreamInfo stream_info(const proto::Stream& message) {
   info.rate_hz = message.rate_hz();
   info.writers = message.writers();
   info.readers = message.readers();
+  info.channels = message.channels();
   for (const proto::User& user : message.users()) {
     info.users.push_back(
         {user.pid(), user.uid(), user.program(), user.writer() ? Role::writer : Role::reader});
   }
+  if (message.has_mirror()) info.mirror = mirror_info(message.mirror());
   return info;
 }
 

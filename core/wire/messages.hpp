@@ -18,6 +18,7 @@ inline constexpr std::size_t kMaxProgramBytes = 127;
 // Public types to messages.
 void to_message(const StreamId& id, proto::StreamId& out);
 void to_message(const TypeInfo& type, proto::Type& out);
+void to_message(const MirrorInfo& info, proto::Mirror& out);
 void to_message(const StreamInfo& info, proto::Stream& out);
 void to_message(const Error& error, proto::Failure& out);
 

@@ -62,6 +62,27 @@ struct DaemonInfo {
   std::uint64_t memory_limit_bytes = 0;  // for all rings
 };
 
+// A host of the fleet, as this PC's dssmd sees it: this PC itself, and each configured peer.
+struct HostInfo {
+  std::string name;                    // empty while it never answered
+  std::vector<std::string> addresses;  // as configured and as reached: "pc2:13776"
+  std::string version;                 // of its dssmd
+  std::string state;                   // "self", "up", "connecting", "down", "refused"
+  Duration since{};                    // how long it has been in this state
+  Duration round_trip{};               // of the last heartbeat, which comes once a second; 0: none
+  Duration least_round_trip{};         // of this connection's heartbeats; 0: none
+  std::uint32_t streams = 0;           // that it owns
+  Duration clock_bound = kUnknownClockError;
+  bool insecure = false;  // its traffic crosses the network in the clear
+  std::string error;      // why it is not up, or a warning that concerns it; empty: all is well
+};
+
+// A sign of life that was asked for.
+struct RoundTrip {
+  Duration round_trip{};  // from dssmd to dssmd and back
+  std::string address;    // where it was reached; empty: it is this PC
+};
+
 // What a watcher is told.
 struct StreamEvent {
   enum class Kind : std::uint8_t { added, removed };
@@ -82,6 +103,10 @@ class Session {
   ~Session();
 
   // --- streams --------------------------------------------------------------------------------
+
+  // A stream's name may say whose it is: "lidar@pc2". Without a host, this PC's own stream of that
+  // name is meant if there is one, else the only other host's that is known; a new one is created
+  // on this PC. Wherever a stream is, reading and writing it is the same.
 
   // Creates the stream and opens it for writing. When it exists with the same payload size, its
   // ring is kept, whatever history was asked for, and the writer continues its tids.
@@ -137,8 +162,13 @@ class Session {
   //   fails  not_found
   Result<void> remove(const StreamId& id);
 
-  // All streams, in the order of creation.
+  // All streams: first this PC's, then the other hosts' in the order of their names, each in the
+  // order of creation. A host that does not answer within half a second is listed with what is
+  // known of its streams; one that is down is left out.
   Result<std::vector<StreamInfo>> list();
+
+  // Those of this PC only, in the order of creation.
+  Result<std::vector<StreamInfo>> list_own();
 
   // One stream, with its users.
   //   fails  not_found
@@ -169,6 +199,16 @@ class Session {
   //   fails  not_found (no stream; for get also: none set), limit_exceeded
   Result<void> set_property(const StreamId& id, std::span<const std::byte> property);
   Result<std::vector<std::byte>> property(const StreamId& id);
+
+  // --- other hosts ----------------------------------------------------------------------------
+
+  // This PC first, then the configured peers, each with its state at this moment.
+  Result<std::vector<HostInfo>> hosts();
+
+  // Asks the dssmd of that host for a sign of life, over the connection that this PC's dssmd keeps.
+  //   fails  not_found (no host of that name is up), conflict (several are), daemon_away (it does
+  //          not answer)
+  Result<RoundTrip> ping(const std::string& host);
 
   // --- the rest -------------------------------------------------------------------------------
 

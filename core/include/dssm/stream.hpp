@@ -7,6 +7,7 @@
 #include <cstdint>
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -113,7 +114,20 @@ struct StreamUser {
   Role role = Role::reader;
 };
 
-// What is known about a stream at the moment of asking.
+// How this PC's copy of another host's stream is doing.
+struct MirrorInfo {
+  std::string state;              // for people: "live", "filling", "connecting", "owner away" ...
+  std::uint64_t gap_samples = 0;  // lost: the owner's ring no longer held them when asked for
+  std::uint64_t reconnects = 0;
+  std::uint64_t restarts = 0;  // times the owner's ring was replaced by a new one
+  Tid newest = kNoTid;         // newest sample that is here
+  std::uint64_t received_samples = 0;
+  std::uint64_t received_bytes = 0;  // of payloads
+  std::string error;                 // why it is not live; empty when it is
+};
+
+// What is known about a stream at the moment of asking. Of a stream of another host: what its owner
+// knows, pids and users included.
 struct StreamInfo {
   StreamId id;  // with its owner's host
   TypeInfo type;
@@ -129,7 +143,9 @@ struct StreamInfo {
   double rate_hz = 0;  // from the stamps of the newest samples; 0 when unknown
   std::uint32_t writers = 0;
   std::uint32_t readers = 0;
-  std::vector<StreamUser> users;  // filled by Session::info(), not by Session::list()
+  std::uint32_t channels = 0;        // connections from other hosts that carry it
+  std::vector<StreamUser> users;     // filled by Session::info(), not by Session::list()
+  std::optional<MirrorInfo> mirror;  // of another host's stream that is read here; by info() only
 };
 
 }  // namespace dssm
