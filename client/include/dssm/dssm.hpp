@@ -5,6 +5,7 @@
 
 #include <dssm/describe.hpp>
 #include <dssm/error.hpp>
+#include <dssm/pconnector.hpp>
 #include <dssm/playback_clock.hpp>
 #include <dssm/reader.hpp>
 #include <dssm/result.hpp>

@@ -8,11 +8,16 @@
 //   threads  one object belongs to one thread at a time. It has no thread of its own: it reads its
 //            connection inside the calls, so a subscription that is not asked for a long time stays
 //            in the owner's ring, and what the ring then no longer holds is a counted gap
-//   cost     a read is one request and its answer: one round trip. A subscribed sample is one
-//            receive, straight into the caller's memory for large payloads
+//   cost     a read is one request and its answer: one round trip. Subscribed samples are one
+//            receive each while they come one by one, and one for many when they come many at a
+//            time; each is copied once, or, when it is large, received where the caller wants it
 //   trouble  when the connection breaks, calls reconnect (at most request_timeout, then
-//            daemon_away), subscriptions resume at the tid they had, and posted samples are sent
-//            again from where the owner stopped: each is written once
+//            daemon_away; next(), post() and fd() never wait for it), subscriptions resume at the
+//            tid they had, and posted samples are sent again from where the owner stopped: each is
+//            written once
+//   anew     when the owner's ring was replaced by a new one, whose tids begin anew, the next read
+//            returns `restarted`, once; next() after all that came of the old ring
+//   fork     a child must open a PConnector of its own
 //   moved    a moved-from object may only be assigned to or destroyed
 #pragma once
 
@@ -37,12 +42,13 @@ struct PConnectorState;
 struct PConnectorOptions {
   // Where dssmd listens: "pc2", "10.0.0.2:13776", "[::1]:13776". Without a port $DSSM_PORT, else
   // 13776. Empty: the host in the stream's name, else "127.0.0.1". A name that the system's
-  // resolver does not know is looked for in the catalog of this PC's dssmd, when there is one.
+  // resolver does not know is looked for in the catalog of this PC's dssmd, when there is one. To
+  // look up a name may take seconds, whatever request_timeout says.
   std::string address = {};
   std::string program = {};  // shown on the other side; empty: this program's name
   Duration request_timeout = std::chrono::seconds(5);
-  // Samples that post() keeps while the connection is down, beyond which the oldest are dropped and
-  // counted.
+  // Samples that post() keeps until the owner says that they are written, beyond which the oldest
+  // are dropped and counted.
   std::uint64_t max_unsent_samples = 1024;
   std::uint64_t max_unsent_bytes = 64U << 20;
 };
@@ -82,9 +88,11 @@ class PConnector {
   ~PConnector();  // sends what was posted, at most for 1 s
 
   // --- reading: one round trip each -----------------------------------------------------------
-  // `payload` is exactly payload_bytes() long; it and `info` are set only when the result is ok.
+  // `payload` is exactly payload_bytes() long, and unspecified unless the result is ok; `info` is
+  // set only when it is.
   //   returns  as RawReader's functions of these names
-  //   fails    daemon_away, protocol
+  //   fails    daemon_away, protocol, invalid_argument (size), type_mismatch (the stream
+  //            was created anew with another type)
   Result<ReadStatus> latest(std::span<std::byte> payload, SampleInfo& info);
   Result<ReadStatus> tid(Tid tid, std::span<std::byte> payload, SampleInfo& info);
   Result<ReadStatus> at(Time t, std::span<std::byte> payload, SampleInfo& info);
@@ -104,32 +112,43 @@ class PConnector {
   Result<void> subscribe(const Subscription& what);
   Result<void> unsubscribe();  // opens the channel anew; samples under way are dropped
 
-  // Copies the next sample of the subscription, when it has come.
-  //   returns  ok | not_yet
-  //   fails    daemon_away (the connection is down and cannot be had back at the moment; call
-  //   again),
-  //            invalid_argument (no subscription)
+  // Takes the next sample of the subscription, when it has come. A large one that has begun to come
+  // is received to its end here, for at most 20 ms; then what has come is put aside.
+  //   payload  as above
+  //   returns  ok | not_yet | restarted
+  //   fails    daemon_away (the connection is down; call again, each call does what can be done at
+  //            once to have it back), not_found (the stream was removed; call again, it may come
+  //            back), invalid_argument (no subscription, size)
   Result<ReadStatus> next(std::span<std::byte> payload, SampleInfo& info);
 
-  // Waits until next() has something, or until the monotonic clock reaches `deadline`.
+  // Waits until next() has something, a failure included that waiting does not mend, or until the
+  // monotonic clock reaches `deadline`. `ready` may come when a large sample has only begun to
+  // come: after it next() may say not_yet. Without a subscription: timeout, at once.
   WaitStatus wait(MonoTime deadline);
 
-  // Samples that the owner's ring no longer held when their turn came.
+  // Samples that the owner's ring no longer held when their turn came, and those that came while
+  // this object was waiting for answers and that nobody took: more than 16 MiB of them are not
+  // kept.
   std::uint64_t lost() const noexcept;
   // How often the owner's ring was replaced by a new one, whose tids begin anew.
   std::uint64_t restarts() const noexcept;
 
-  // To be polled for reading before next(). May change after a reconnect: ask before each poll.
+  // To be polled for reading, after next() said not_yet or failed; then call next() again. It
+  // stands for the connection while there is one, and for the next attempt while there is none. Ask
+  // for it before each poll: asking tells it what to wait for.
   int fd() const noexcept;
 
   // --- writing --------------------------------------------------------------------------------
 
   // Writes one sample and waits for its tid in the owner's ring.
+  //   fails  daemon_away: not acknowledged in time. The sample is kept as if it had been posted,
+  //          and sent when the connection is back: do not write it again
   Result<Tid> write(std::span<const std::byte> payload, Time time = WallClock::now(),
                     Duration clock_error = kUnknownClockError);
 
-  // Writes one sample without waiting: it is sent, or, while the connection is down, kept and sent
-  // later, in order. For rate.
+  // Writes one sample without waiting: it is sent, or, while the connection is down or takes no
+  // more, kept and sent by a later call of any of these functions, in order. For rate. Who posts
+  // faster than the network carries calls flush() now and then, or samples are dropped.
   //   fails  invalid_argument (size)
   Result<void> post(std::span<const std::byte> payload, Time time = WallClock::now(),
                     Duration clock_error = kUnknownClockError);
@@ -138,7 +157,7 @@ class PConnector {
   //   returns  the tid of the last one; kNoTid when nothing was posted
   Result<Tid> flush(MonoTime deadline);
 
-  // Posted samples that were dropped because too many waited for the connection.
+  // Posted samples that were dropped because too many waited to be sent or acknowledged.
   std::uint64_t dropped() const noexcept;
 
   // --- about the stream -----------------------------------------------------------------------
@@ -155,8 +174,8 @@ class PConnector {
   bool connected() const noexcept;
   const std::string& address() const noexcept;  // connected to, or to be
 
-  // How payloads moved inside this process, for tests and benchmarks: copied once out of the input
-  // buffer, or received where the caller wants them.
+  // How payloads that came moved inside this process, for tests and benchmarks: by a copy, or
+  // received where the caller wants them.
   struct Counters {
     std::uint64_t samples = 0, copied_payload_bytes = 0, direct_payload_bytes = 0;
     std::uint64_t reconnects = 0;
