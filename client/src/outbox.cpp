@@ -13,6 +13,11 @@ namespace dssm::detail {
 namespace {
 
 constexpr std::int64_t kFirstRoom = 16;
+
+// Only an owner that takes samples and acknowledges none makes so many; the oldest are then taken
+// for written.
+constexpr std::size_t kMaxUnsure = 1024;
+
 using Header = std::array<std::byte, wire::kMaxSampleHeaderBytes>;
 
 std::size_t header_bytes(std::size_t payload_bytes) {
@@ -76,8 +81,9 @@ void Outbox::drop_oldest() {
     ++dropped_;
     ++send_;
   } else {
-    if (unsure_from_ == unsure_to_) unsure_from_ = first_;
-    unsure_to_ = first_ + 1;
+    if (unsure_.empty() || unsure_.back().to != first_) unsure_.push_back({first_, first_});
+    ++unsure_.back().to;
+    if (unsure_.size() > kMaxUnsure) unsure_.pop_front();
   }
   ++first_;
 }
@@ -119,6 +125,8 @@ Result<void> Outbox::acknowledge(std::int64_t last, Tid tid) {
   if (last >= send_) leave_begun_frame();
   send_ = std::max(send_, last + 1);
   first_ = std::max(first_, last + 1);
+  while (!unsure_.empty() && unsure_.front().to <= last + 1) unsure_.pop_front();
+  if (!unsure_.empty()) unsure_.front().from = std::max(unsure_.front().from, last + 1);
   return {};
 }
 
@@ -130,9 +138,9 @@ void Outbox::on_down() noexcept {
 
 Result<void> Outbox::restart(std::int64_t last, Tid tid) {
   if (Result<void> done = acknowledge(last, tid); !done) return done;
-  const std::int64_t lost_from = std::max(unsure_from_, last + 1);
-  if (unsure_to_ > lost_from) dropped_ += static_cast<std::uint64_t>(unsure_to_ - lost_from);
-  unsure_from_ = unsure_to_ = 0;
+  // What the owner has not written and is not here any more will never be sent.
+  for (const Range& lost : unsure_) dropped_ += static_cast<std::uint64_t>(lost.to - lost.from);
+  unsure_.clear();
   send_ = first_;
   return {};
 }

@@ -14,6 +14,7 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <deque>
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
 #include <span>
@@ -65,8 +66,10 @@ class Outbox {
   std::vector<std::byte> begun_;       // rest of a frame that was begun and had to make room
   std::int64_t first_ = 0, send_ = 0, next_ = 0;
   std::size_t sent_of_send_ = 0;  // bytes of frame `send_` that went
-  // Sent by this connection, gone from here since, and perhaps not written: [from, to).
-  std::int64_t unsure_from_ = 0, unsure_to_ = 0;
+  struct Range {
+    std::int64_t from, to;  // without `to`
+  };
+  std::deque<Range> unsure_;  // sent, gone from here since, and perhaps not written; rising
   std::int64_t written_ = -1;
   Tid written_tid_ = kNoTid;
   std::uint64_t dropped_ = 0;

@@ -1,0 +1,245 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/src/subscriber.hpp"
+
+#include <gtest/gtest.h>
+
+#include <array>
+#include <cstring>
+
+namespace dssm::detail {
+namespace {
+
+using Payload = std::array<std::byte, 8>;
+
+struct SubscriberTest : testing::Test {
+  Subscriber subscriber{8};
+  Payload target{};
+  SampleInfo info;
+
+  void begin(Subscription what = {}) {
+    subscriber.begin(what);
+    subscribed(what.start == Subscription::Start::tid ? what.tid : 0);
+  }
+  void subscribed(Tid first) {
+    net::Subscribed message;
+    message.set_first_tid(first);
+    ASSERT_TRUE(subscriber.on_subscribed(message));
+  }
+  void gap(Tid first, std::uint64_t count) {
+    net::Gap message;
+    message.set_first_tid(first);
+    message.set_count(count);
+    subscriber.on_gap(message);
+  }
+  // What became of it: true: it went somewhere.
+  bool arrive(Tid tid, bool torn = false) {
+    std::byte* out = nullptr;
+    const SampleInfo stamps{tid, time_from_ns(tid), Duration(1)};
+    const auto place = subscriber.on_sample_begin(stamps, out);
+    EXPECT_TRUE(place);
+    if (!*place) return false;
+    if (out) std::memcpy(out, &tid, sizeof tid);
+    subscriber.on_sample_end(stamps, torn);
+    return true;
+  }
+  void expect_kept(Tid tid) {
+    ASSERT_TRUE(subscriber.has_kept());
+    ASSERT_EQ(subscriber.take_kept(target, info), ReadStatus::ok);
+    EXPECT_EQ(info.tid, tid);
+    EXPECT_EQ(std::memcmp(target.data(), &tid, sizeof tid), 0);
+  }
+  net::Subscribe request(std::uint64_t incarnation = 77) {
+    net::Subscribe message;
+    subscriber.to_message(incarnation, message);
+    return message;
+  }
+};
+
+TEST_F(SubscriberTest, AsksForWhatTheUserAskedFor) {
+  subscriber.begin({});
+  EXPECT_TRUE(request().from_now());
+  subscriber.begin({.start = Subscription::Start::oldest, .max_rate_hz = 12.5});
+  EXPECT_TRUE(request().from_oldest());
+  EXPECT_EQ(request().max_rate_hz(), 12.5);
+  subscriber.begin({.start = Subscription::Start::tid, .tid = 9});
+  EXPECT_EQ(request().from_tid(), 9);
+  EXPECT_EQ(request().incarnation(), 77u);
+  subscriber.begin({.start = Subscription::Start::time, .time = time_from_ns(-5)});
+  EXPECT_EQ(request().from_time_ns(), -5);
+}
+
+TEST_F(SubscriberTest, ASampleThatNobodyWaitsForHasToWait) {
+  begin();
+  EXPECT_FALSE(arrive(0));
+  subscriber.set_target(target.data());
+  EXPECT_TRUE(arrive(0));
+  ASSERT_TRUE(subscriber.taken(info));
+  EXPECT_EQ(info.tid, 0);
+  EXPECT_FALSE(subscriber.taken(info));
+  EXPECT_FALSE(arrive(1)) << "the target is taken";
+}
+
+TEST_F(SubscriberTest, KeepsSamplesInOrderAndGivesThemBeforeNewOnes) {
+  begin();
+  subscriber.keep(true);
+  EXPECT_TRUE(arrive(0));
+  EXPECT_TRUE(arrive(1));
+  subscriber.keep(false);
+  subscriber.set_target(target.data());
+  EXPECT_FALSE(arrive(2));
+  expect_kept(0);
+  expect_kept(1);
+  EXPECT_TRUE(arrive(2));
+  EXPECT_TRUE(subscriber.taken(info));
+}
+
+TEST_F(SubscriberTest, ResumesAtTheSampleThatIsDueAndCountsWhatTheRingLost) {
+  begin({.start = Subscription::Start::tid, .tid = 10});
+  subscriber.keep(true);
+  arrive(10);
+  arrive(11);
+  subscriber.on_down();
+  EXPECT_EQ(request().from_tid(), 12);
+  EXPECT_EQ(request().incarnation(), 77u);
+  EXPECT_TRUE(arrive(5)) << "what came before the answer is not ours";
+  subscribed(15);
+  EXPECT_EQ(subscriber.lost(), 3u);
+  arrive(15);
+  expect_kept(10);
+  expect_kept(11);
+  expect_kept(15);
+  EXPECT_FALSE(subscriber.has_kept());
+}
+
+TEST_F(SubscriberTest, ResumesEvenWhenNothingHadCome) {
+  subscriber.begin({});
+  subscribed(40);
+  subscriber.on_down();
+  EXPECT_EQ(request().from_tid(), 40);
+}
+
+TEST_F(SubscriberTest, CountsEachLostSampleOnceByGapOrByTid) {
+  begin();
+  subscriber.keep(true);
+  arrive(0);
+  gap(1, 4);
+  EXPECT_EQ(subscriber.lost(), 4u);
+  arrive(5);
+  EXPECT_EQ(subscriber.lost(), 4u);
+  arrive(8);
+  EXPECT_EQ(subscriber.lost(), 6u) << "tids that never came are lost, whoever says so";
+  arrive(9, true);
+  EXPECT_EQ(subscriber.lost(), 6u);
+  gap(9, 1);
+  EXPECT_EQ(subscriber.lost(), 7u);
+  arrive(10);
+  EXPECT_EQ(subscriber.lost(), 7u);
+  gap(3, 2);  // of long ago
+  EXPECT_EQ(subscriber.lost(), 7u);
+  gap(INT64_MAX, UINT64_MAX);
+  subscriber.lost();
+}
+
+TEST_F(SubscriberTest, DoesNotCountWhatWasLeftOutForTheRate) {
+  begin({.max_rate_hz = 10});
+  subscriber.keep(true);
+  arrive(0);
+  arrive(50);
+  gap(60, 5);
+  EXPECT_EQ(subscriber.lost(), 5u);
+  subscriber.on_down();
+  subscribed(200);
+  EXPECT_EQ(subscriber.lost(), 5u);
+}
+
+TEST_F(SubscriberTest, ATornSampleIsNeverGivenOut) {
+  begin();
+  subscriber.set_target(target.data());
+  EXPECT_TRUE(arrive(0, true));
+  EXPECT_FALSE(subscriber.taken(info));
+  EXPECT_TRUE(arrive(1)) << "the target is still free";
+  EXPECT_TRUE(subscriber.taken(info));
+  EXPECT_EQ(subscriber.lost(), 1u);
+}
+
+TEST_F(SubscriberTest, TellsOfANewRingAfterTheOldOnesSamples) {
+  begin();
+  subscriber.keep(true);
+  arrive(0);
+  arrive(1);
+  subscriber.on_down();
+  subscriber.on_restart();
+  EXPECT_TRUE(request().from_oldest());
+  subscribed(0);
+  arrive(0);
+  expect_kept(0);
+  expect_kept(1);
+  EXPECT_EQ(subscriber.take_kept(target, info), ReadStatus::restarted);
+  expect_kept(0);
+  EXPECT_FALSE(subscriber.take_kept(target, info));
+  EXPECT_EQ(subscriber.lost(), 0u);
+}
+
+TEST_F(SubscriberTest, TellsOfANewRingAlsoWhenTheQueueOverflows) {
+  Subscriber small(16U << 20);  // one sample fills the queue
+  small.begin({});
+  net::Subscribed message;
+  ASSERT_TRUE(small.on_subscribed(message));
+  small.keep(true);
+  std::byte* out = nullptr;
+  ASSERT_TRUE(small.on_sample_begin({0, {}, {}}, out));
+  small.on_sample_end({0, {}, {}}, false);
+  small.on_down();
+  small.on_restart();
+  ASSERT_TRUE(small.on_subscribed(message));
+  ASSERT_TRUE(small.on_sample_begin({0, {}, {}}, out));
+  small.on_sample_end({0, {}, {}}, false);
+  EXPECT_EQ(small.lost(), 1u);
+  std::vector<std::byte> payload(16U << 20);
+  EXPECT_EQ(small.take_kept(payload, info), ReadStatus::restarted);
+  EXPECT_EQ(small.take_kept(payload, info), ReadStatus::ok);
+}
+
+TEST_F(SubscriberTest, RefusesTidsThatFallAndTheOneThatHasNoSuccessor) {
+  begin();
+  subscriber.keep(true);
+  arrive(7);
+  std::byte* out = nullptr;
+  EXPECT_EQ(subscriber.on_sample_begin({7, {}, {}}, out).error().code, Errc::protocol);
+  EXPECT_EQ(subscriber.on_sample_begin({INT64_MAX, {}, {}}, out).error().code, Errc::protocol);
+  net::Subscribed message;
+  message.set_first_tid(-1);
+  EXPECT_EQ(subscriber.on_subscribed(message).error().code, Errc::protocol);
+}
+
+TEST_F(SubscriberTest, PutsAsideTheSampleThatFillsTheTarget) {
+  begin();
+  subscriber.set_target(target.data());
+  std::byte* out = nullptr;
+  ASSERT_TRUE(subscriber.on_sample_begin({3, {}, {}}, out));
+  EXPECT_EQ(out, target.data());
+  EXPECT_TRUE(subscriber.is_filling_target());
+  out = subscriber.leave_target();
+  EXPECT_FALSE(subscriber.is_filling_target());
+  subscriber.set_target(nullptr);
+  const Tid tid = 3;
+  std::memcpy(out, &tid, sizeof tid);
+  subscriber.on_sample_end({3, {}, {}}, false);
+  expect_kept(3);
+}
+
+TEST_F(SubscriberTest, ANewSubscriptionForgetsTheOldOne) {
+  begin();
+  subscriber.keep(true);
+  arrive(0);
+  subscriber.begin({.start = Subscription::Start::oldest});
+  EXPECT_FALSE(subscriber.has_kept());
+  EXPECT_TRUE(arrive(1)) << "of the old one: thrown away";
+  EXPECT_FALSE(subscriber.has_kept());
+  subscribed(0);
+  arrive(0);
+  expect_kept(0);
+}
+
+}  // namespace
+}  // namespace dssm::detail
