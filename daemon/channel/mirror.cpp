@@ -51,56 +51,13 @@ Mirror::Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, Duration 
       room_(std::move(room)),
       lender_([this] { linger_timer_.enable_in(linger_); }),
       wait_timer_(EventSource::timer(parts.loop, [this] { on_wait_timer(); })),
-      retry_timer_(EventSource::timer(parts.loop, [this] { try_again(); })),
       linger_timer_(EventSource::timer(parts.loop, [this] { on_linger_timer(); })),
-      name_(id_.str()) {}
+      name_(id_.str()),
+      channel_(parts, name_, *this) {}
 
-// --- the owner
-// ------------------------------------------------------------------------------------
+// --- the connection --------------------------------------------------------------------------
 
-void Mirror::connect(const KnownHost& host) {
-  owner_ = host.greeting.host_id;
-  if (!dialer_) {
-    address_ = host.address;
-    dialer_.reset(new Dialer(parts_.loop, parts_.resolver, {address_, parts_.self}, *this));
-    return;
-  }
-  if (address_ != host.address) {
-    address_ = host.address;
-    dialer_->set_address(address_);
-    dialer_->restart({Errc::daemon_away, host.str() + " is reached at another address now"});
-  }
-  dialer_->hurry();
-}
-
-void Mirror::on_owner_down(const Error& why) {
-  if (dialer_) dialer_->restart(why);
-}
-
-void Mirror::on_stream_there() {
-  if (state_ == State::removed) try_again();
-}
-
-// Asks anew, on a new connection: this one belongs to a stream that is no more, or was refused.
-void Mirror::try_again() {
-  retry_timer_.disable();
-  if (!dialer_) return;
-  if (dialer_->link()) {
-    trying_again_ = true;
-    dialer_->restart({Errc::closed, "mirror '" + name_ + "' opens the stream anew"});
-  }
-  dialer_->hurry();
-}
-
-// --- the connection
-// -------------------------------------------------------------------------------
-
-void Mirror::on_up(FrameLink& link, const wire::Greeting& them) {
-  if (them.host_id != *owner_) {
-    return dialer_->restart({Errc::conflict, "at '" + address_.str() + "' answers " + them.str() +
-                                                 ", which is another PC than the owner of '" +
-                                                 name_ + "'"});
-  }
+void Mirror::on_up(FrameLink& link, const wire::Greeting&) {
   step_ = Step::opening;
   net::Frame frame;
   frame.set_serial(kOpen);
@@ -109,13 +66,20 @@ void Mirror::on_up(FrameLink& link, const wire::Greeting& them) {
 }
 
 void Mirror::on_down(const Error& why) {
-  step_ = Step::none;
-  if (ring_) ring_->wake();  // for what came with the end
-  if (std::exchange(trying_again_, false)) return;
+  on_anew();
   trouble_ = why;
   if (state_ == State::removed) return;
   state_ = ring_ ? State::owner_away : State::connecting;
   if (ring_) tell_trouble();
+}
+
+void Mirror::on_anew() {
+  step_ = Step::none;
+  if (ring_) ring_->wake();  // for what came with the end
+}
+
+void Mirror::on_stream_there() {
+  if (state_ == State::removed) channel_.try_again();
 }
 
 Result<void> Mirror::on_frame(net::Frame& frame) {
@@ -149,7 +113,7 @@ Result<void> Mirror::on_opened_untrusted(const net::Opened& opened) {
     on_refused(followed.error());
     return {};
   }
-  FrameLink& link = *dialer_->link();
+  FrameLink& link = *channel_.link();
   link.set_payload_bytes(theirs->type.payload_bytes);
   net::Frame frame;
   frame.set_serial(kSubscribe);
@@ -257,7 +221,7 @@ void Mirror::on_removed(const Error& why) {
     tell_trouble();
   }
   fail_waiting(why);
-  retry_timer_.enable_in(kRetryPause);
+  channel_.try_again_later();
 }
 
 void Mirror::on_refused(const Error& why) {
@@ -267,11 +231,10 @@ void Mirror::on_refused(const Error& why) {
   state_ = ring_ ? State::owner_away : State::connecting;
   if (ring_) tell_trouble();
   ring_ ? answer_waiting() : fail_waiting(why);
-  retry_timer_.enable_in(kRetryPause);
+  channel_.try_again_later();
 }
 
-// --- samples
-// --------------------------------------------------------------------------------------
+// --- samples ---------------------------------------------------------------------------------
 
 Result<void> Mirror::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
   if (step_ != Step::subscribed) return untimely("a sample");
@@ -292,8 +255,7 @@ void Mirror::on_batch_end() {
   if (ring_) ring_->wake();
 }
 
-// --- programs
-// -------------------------------------------------------------------------------------
+// --- programs --------------------------------------------------------------------------------
 
 std::shared_ptr<Stream> Mirror::lend() {
   done_ = false;
@@ -311,7 +273,7 @@ void Mirror::open(Then then) {
   const Duration longest = state_ == State::filling ? kFillTimeout : kOwnerTimeout;
   waiting_.push_back({std::move(then), deadline_in(longest)});
   arm_wait_timer();
-  if (state_ == State::removed) try_again();
+  if (state_ == State::removed) channel_.try_again();
 }
 
 Result<std::shared_ptr<Stream>> Mirror::adopt_untrusted(OfferedFiles files) {
@@ -397,7 +359,7 @@ void Mirror::on_wait_timer() {
 
 Error Mirror::away() const {
   return Error{Errc::daemon_away, "stream '" + name_ + "': host '" + id_.host +
-                                      "' does not answer at '" + address_.str() + "'" +
+                                      "' does not answer at '" + channel_.address().str() + "'" +
                                       (trouble_ ? ": " + trouble_->message : "") +
                                       "; look at `dssmctl hosts`, and try again"};
 }
@@ -415,8 +377,7 @@ void Mirror::on_linger_timer() {
   keeper_.on_mirror_done();
 }
 
-// --- the log
-// --------------------------------------------------------------------------------------
+// --- the log ---------------------------------------------------------------------------------
 
 LogFields Mirror::log_fields() const {
   return {.stream = name_, .peer = id_.host, .message_id = message_id::kMirror};

@@ -19,34 +19,21 @@
 #include <vector>
 
 #include "common.pb.h"
-#include "daemon/channel/dialer.hpp"
 #include "daemon/channel/lender.hpp"
 #include "daemon/channel/mirror_ring.hpp"
-#include "daemon/channel/resolver.hpp"
+#include "daemon/channel/owner_channel.hpp"
 #include "daemon/discovery/catalog.hpp"
 #include "daemon/service/event_loop.hpp"
 #include "daemon/service/log.hpp"
-#include "daemon/streams/registry.hpp"
 
 namespace dssm::daemon {
 
-// What all channels of this dssmd to other hosts have in common; all of it outlives them.
-struct ChannelParts {
-  const EventLoop& loop;
-  Resolver& resolver;
-  Registry& registry;  // for memory and room
-  Logger& logger;
-  wire::Greeting self;
-};
-
-class Mirror final : private Dialer::User {
+class Mirror final : private OwnerChannel::User {
  public:
   // How long a program that opens the mirror waits for the owner to answer, and then for the
   // history: what has come by then is there to read, the rest follows.
   static constexpr Duration kOwnerTimeout = std::chrono::seconds(2);
   static constexpr Duration kFillTimeout = std::chrono::seconds(1);
-  // Between two looks whether a removed stream, or one that was refused, can be had.
-  static constexpr Duration kRetryPause = std::chrono::seconds(2);
 
   class Keeper {
    public:
@@ -65,25 +52,19 @@ class Mirror final : private Dialer::User {
   Mirror& operator=(const Mirror&) = delete;
 
   const StreamId& id() const noexcept { return id_; }
-  // Whose stream it is, once connect() said so.
-  const std::optional<wire::HostId>& owner() const noexcept { return owner_; }
   // Whether there is a ring, or somebody who waits for one.
   bool has_use() const noexcept { return ring_ || !waiting_.empty(); }
   // Whether it may be destroyed.
   bool done() const noexcept { return done_; }
 
-  // --- what its keeper knows of the owner -----------------------------------------------------
-
-  // The owner answers there. Another host than before: it has taken over the name.
-  void connect(const KnownHost& host);
-  // The owner does not answer any more: the channel is dead too, even if TCP does not know it yet.
-  void on_owner_down(const Error& why);
+  // Where the keeper says what the catalog knows of the owner.
+  OwnerChannel& channel() noexcept { return channel_; }
   // The owner has such a stream, or a new ring of it.
   void on_stream_there();
 
   // --- for programs ---------------------------------------------------------------------------
 
-  // Borrows the ring, as MirrorKeeper::open(). After connect().
+  // Borrows the ring, as MirrorKeeper::open(). After channel().connect().
   void open(Then then);
   // Takes a ring that a program held while dssmd was away. Another offer of the same ring gives the
   // same stream.
@@ -103,13 +84,14 @@ class Mirror final : private Dialer::User {
     std::uint64_t gap_samples = 0, received_samples = 0, received_bytes = 0;
   };
 
-  // Dialer::User
+  // OwnerChannel::User
   void on_up(FrameLink& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   void on_batch_end() override;
   void on_down(const Error& why) override;
+  void on_anew() override;
 
   Result<void> on_opened_untrusted(const net::Opened& opened);
   Result<void> on_subscribed_untrusted(const net::Subscribed& subscribed);
@@ -119,7 +101,6 @@ class Mirror final : private Dialer::User {
   void on_refused(const Error& why);
   Result<void> follow_untrusted(const StreamInfo& theirs);
   void take_ring(std::unique_ptr<MirrorRing> ring);
-  void try_again();
 
   std::shared_ptr<Stream> lend();
   void answer_waiting();
@@ -139,12 +120,9 @@ class Mirror final : private Dialer::User {
   const StreamId id_;
   const Duration linger_;
   const RingRoom room_;
-  std::optional<wire::HostId> owner_;
-  wire::Address address_;
 
   State state_ = State::connecting;
   Step step_ = Step::none;
-  bool trying_again_ = false;     // the connection is about to end because we want it to
   std::optional<Error> trouble_;  // why it is not live
   bool told_ = false;             // the log knows of the present trouble
   std::unique_ptr<MirrorRing> ring_;
@@ -159,9 +137,9 @@ class Mirror final : private Dialer::User {
   Lender lender_;
   std::vector<Waiting> waiting_;
   MonoTime patience_ends_{};  // with the filling that is under way
-  EventSource wait_timer_, retry_timer_, linger_timer_;
-  const std::string name_;          // for the log
-  std::unique_ptr<Dialer> dialer_;  // last: ends first
+  EventSource wait_timer_, linger_timer_;
+  const std::string name_;  // for messages
+  OwnerChannel channel_;    // last: ends first
 };
 
 }  // namespace dssm::daemon

@@ -35,13 +35,14 @@ void Mirrors::open(const KnownHost& host, const StreamId& id, Then then) {
   const Result<Mirror*> found = mirror_or_new(full);
   if (!found) return then(found.error());
   Mirror& one = **found;
-  if (one.owner() && *one.owner() != host.greeting.host_id && catalog_.find(*one.owner())) {
+  if (one.channel().owner() && *one.channel().owner() != host.greeting.host_id &&
+      catalog_.find(*one.channel().owner())) {
     return then(Error{Errc::conflict, "stream '" + full.str() + "': two hosts are called '" +
                                           full.host +
                                           "', and the mirror here is that of the other one; give "
                                           "each its own name (key name) and restart its dssmd"});
   }
-  one.connect(host);
+  one.channel().connect(host);
   one.open(std::move(then));
 }
 
@@ -53,8 +54,8 @@ Result<std::shared_ptr<Stream>> Mirrors::adopt_untrusted(const StreamId& id, Off
   if (!stream) return stream;
   // Else it comes up later, or not at all.
   if (const Result<const KnownHost*> host = catalog_.find_host(id.host);
-      host && !(*found)->owner()) {
-    (*found)->connect(**host);
+      host && !(*found)->channel().owner()) {
+    (*found)->channel().connect(**host);
   }
   return stream;
 }
@@ -81,29 +82,28 @@ bool Mirrors::describe(const StreamId& id, proto::Mirror& out) const {
   return true;
 }
 
-// --- the catalog
-// ----------------------------------------------------------------------------------
+// --- the catalog -----------------------------------------------------------------------------
 
 void Mirrors::on_host_up(const KnownHost& host) {
   for (const auto& [key, one] : mirrors_) {
     if (one->id().host != host.greeting.host) continue;
-    if (!one->owner() || *one->owner() == host.greeting.host_id) one->connect(host);
+    if (!one->channel().owner() || *one->channel().owner() == host.greeting.host_id)
+      one->channel().connect(host);
   }
 }
 
 void Mirrors::on_host_down(const KnownHost& host, const Error& why) {
   for (const auto& [key, one] : mirrors_) {
-    if (one->owner() == host.greeting.host_id) one->on_owner_down(why);
+    if (one->channel().owner() == host.greeting.host_id) one->channel().on_owner_down(why);
   }
 }
 
 void Mirrors::on_remote_stream_added(const KnownHost& host, const StreamInfo& stream) {
   Mirror* one = mirror({stream.id.name, stream.id.id, host.greeting.host});
-  if (one && one->owner() == host.greeting.host_id) one->on_stream_there();
+  if (one && one->channel().owner() == host.greeting.host_id) one->on_stream_there();
 }
 
-// --- the mirrors
-// ----------------------------------------------------------------------------------
+// --- the mirrors -----------------------------------------------------------------------------
 
 void Mirrors::on_ring_replaced(const Stream& old) {
   if (observer_) observer_->on_ring_replaced(old);
