@@ -62,7 +62,7 @@ bool is_name(std::string_view host) {
 Result<std::uint16_t> parse_port(std::string_view text, std::string_view port, bool zero_allowed) {
   std::uint16_t number = 0;
   const auto [end, error] = std::from_chars(port.data(), port.data() + port.size(), number);
-  if (error != std::errc() || end != port.data() + port.size() || port.empty()) {
+  if (error != std::errc() || end != port.data() + port.size()) {
     return invalid(text, "'" + std::string(port) +
                              "' is no port; write HOST:PORT with a port from 1 to 65535");
   }

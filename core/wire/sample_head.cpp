@@ -34,6 +34,7 @@ bool read_stamps(const std::byte* at, const std::byte* end, SampleHead& head) no
 }  // namespace
 
 HeadStatus read_sample_head_untrusted(std::span<const std::byte> input, SampleHead& head) noexcept {
+  head = {};
   const std::byte* at = input.data();
   const std::byte* end = at + input.size();
   switch (read_varint(at, end, kMaxLengthBytes, head.frame_bytes)) {
@@ -57,7 +58,6 @@ HeadStatus read_sample_head_untrusted(std::span<const std::byte> input, SampleHe
   };
 
   if (at == end) return at_the_end;
-  head.serial = 0;
   if (*at == kSerialTag) {
     const VarintStatus status = read_varint(++at, end, kMaxVarintBytes, head.serial);
     if (status != VarintStatus::ok) return status_of(status);
@@ -70,8 +70,6 @@ HeadStatus read_sample_head_untrusted(std::span<const std::byte> input, SampleHe
     return HeadStatus::other;
   }
   if (static_cast<std::size_t>(end - at) <= sample_bytes) return at_the_end;
-  head.tid = head.time_ns = 0;
-  head.clock_error_ns = 0;
   if (!read_stamps(at, at + sample_bytes, head)) return HeadStatus::other;
   at += sample_bytes;
   if (*at != kPayloadTag) return HeadStatus::other;

@@ -433,12 +433,12 @@ TEST(FrameDecoder, SharesItsThreadWithOtherDecoders) {
 }
 
 TEST(FrameDecoder, LetsASinkDriveAnotherDecoder) {
-  const std::string stream = mixed_stream();
-  const std::vector<std::string> log = decode(stream, 20).log;
+  const std::string stream = mixed_stream(), other = published(5) + stream;
+  const std::vector<std::string> log = decode(stream, 20).log, other_log = decode(other, 20).log;
   Recorder recorder;
   FrameDecoder decoder(recorder, kMaxFrame);
   decoder.set_payload_bytes(20);
-  recorder.then = [&](const net::Frame&) { EXPECT_EQ(decode(stream, 20).log, log); };
+  recorder.then = [&](const net::Frame&) { EXPECT_EQ(decode(other, 20).log, other_log); };
   ASSERT_TRUE(feed(decoder, stream));
   EXPECT_EQ(recorder.log, log);
 }

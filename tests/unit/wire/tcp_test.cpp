@@ -107,6 +107,7 @@ TEST(Tcp, SurvivesSendingToAPeerThatIsGone) {
     sent = pair.server->send(part, false).value();
   } while (sent.status == IoStatus::ok);
   EXPECT_EQ(sent.status, IoStatus::end);
+  EXPECT_EQ(pair.server->send(part, false)->status, IoStatus::end);  // no SIGPIPE either
   EXPECT_EQ(pair.server->receive(part)->status, IoStatus::end);
 }
 
@@ -134,6 +135,17 @@ TEST(ListenTcp, TakesBothKindsOfAnyAddressSideBySide) {
   EXPECT_TRUE(ipv6) << ipv6.error().message;
   EXPECT_TRUE(::fcntl(ipv4.get(), F_GETFD) & FD_CLOEXEC);
   EXPECT_TRUE(::fcntl(ipv4.get(), F_GETFL) & O_NONBLOCK);
+}
+
+// The end that closes first leaves the port in TIME_WAIT for a minute.
+TEST(ListenTcp, TakesItsPortBackAtOnce) {
+  Pair pair = connect_pair();
+  const SocketAddress address = local_address(pair.server->fd()).value();
+  pair.server.reset();
+  await(pair.client->fd(), POLLIN);
+  pair.client.reset();
+  const auto again = listen_tcp(address);
+  EXPECT_TRUE(again) << again.error().message;
 }
 
 TEST(ListenTcp, SaysThatAPortIsTakenOrAnAddressNotHere) {
