@@ -5,14 +5,15 @@
 
 namespace dssm::test {
 
-Fleet::Fleet(std::unique_ptr<Network> network, const std::vector<std::string>& extra)
+Fleet::Fleet(std::unique_ptr<Network> network, const std::vector<std::string>& extra,
+             IpVersion version)
     : network_(std::move(network)) {
   for (int host = 1; host <= hosts(); ++host) {
-    std::vector<std::string> flags = {"--insecure", "--listen", Network::address(host) + ":13776"};
+    std::vector<std::string> flags = {"--insecure", "--listen", dssmd_address(host, version)};
     for (int peer = 1; peer <= hosts(); ++peer) {
       if (peer == host) continue;
       flags.push_back("--peer");
-      flags.push_back(Network::address(peer) + ":13776");
+      flags.push_back(dssmd_address(peer, version));
     }
     flags.insert(flags.end(), {"--log-level", "error"});
     flags.insert(flags.end(), extra.begin(), extra.end());
@@ -44,11 +45,23 @@ std::unique_ptr<Network> NetworkTest::make_network(int hosts) {
   return nullptr;
 }
 
-bool NetworkTest::make_fleet(int hosts, const std::vector<std::string>& extra) {
+bool NetworkTest::make_fleet(int hosts, const std::vector<std::string>& extra, IpVersion version) {
   std::unique_ptr<Network> network = make_network(hosts);
   if (!network) return false;
-  fleet = std::make_unique<Fleet>(std::move(network), extra);
+  fleet = std::make_unique<Fleet>(std::move(network), extra, version);
   return true;
+}
+
+std::string dssmd_address(int host, IpVersion version) {
+  return (version == IpVersion::v4 ? Network::address(host) : "[" + Network::address6(host) + "]") +
+         ":13776";
+}
+
+HostInfo host_info(Session& session, const std::string& name) {
+  for (HostInfo& host : session.hosts().value()) {
+    if (host.name == name) return host;
+  }
+  return {};
 }
 
 std::uint64_t number_from_environment(const char* name, std::uint64_t otherwise) {

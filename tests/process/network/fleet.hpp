@@ -9,6 +9,7 @@
 #include <dssm/dssm.hpp>
 #include <memory>
 #include <string>
+#include <thread>
 #include <vector>
 
 #include "tests/support/daemon_process.hpp"
@@ -16,10 +17,13 @@
 
 namespace dssm::test {
 
+enum class IpVersion : std::uint8_t { v4, v6 };
+
 class Fleet {
  public:
   // `extra` flags are given to every dssmd. Hosts are numbered from 1, as in Network.
-  explicit Fleet(std::unique_ptr<Network> network, const std::vector<std::string>& extra = {});
+  explicit Fleet(std::unique_ptr<Network> network, const std::vector<std::string>& extra = {},
+                 IpVersion version = IpVersion::v4);
 
   Network& network() { return *network_; }
   int hosts() const { return network_->hosts(); }
@@ -43,12 +47,33 @@ class Fleet {
 class NetworkTest : public testing::Test {
  protected:
   // In a test: `if (!make_fleet(3)) return;`
-  bool make_fleet(int hosts, const std::vector<std::string>& extra = {});
+  bool make_fleet(int hosts, const std::vector<std::string>& extra = {},
+                  IpVersion version = IpVersion::v4);
   // Skips the test, with the reason, when the network cannot be had.
   std::unique_ptr<Network> make_network(int hosts);
 
   std::unique_ptr<Fleet> fleet;
 };
+
+// Where the host's dssmd listens: "10.77.0.1:13776", "[fd77::1]:13776".
+std::string dssmd_address(int host, IpVersion version = IpVersion::v4);
+
+// Looks again and again until `done` is true, for what happens soon but cannot be waited for. Fails
+// the test, and returns false, when it did not happen in a minute.
+template <class Done>
+bool await(const char* what, Done done) {
+  for (const MonoTime end = deadline_in(std::chrono::minutes(1)); !done();) {
+    if (MonoClock::now() > end) {
+      ADD_FAILURE() << "did not happen in a minute: " << what;
+      return false;
+    }
+    std::this_thread::sleep_for(std::chrono::milliseconds(2));
+  }
+  return true;
+}
+
+// What `session`'s dssmd knows of the host; an empty state when it does not list it.
+HostInfo host_info(Session& session, const std::string& name);
 
 // $NAME as a number, or `otherwise`.
 std::uint64_t number_from_environment(const char* name, std::uint64_t otherwise);

@@ -82,4 +82,6 @@ void write_load(Session session, const std::vector<KnownStream>& streams, std::u
   }
 }
 
+KnownStream steady_stream() { return {{"steady", 0, "pc1"}, 256, 1 << 16, 1ms, 0ms, 1000}; }
+
 }  // namespace dssm::test

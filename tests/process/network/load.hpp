@@ -22,4 +22,8 @@ std::vector<KnownStream> load_of(int host, std::uint64_t percent);
 void write_load(Session session, const std::vector<KnownStream>& streams, std::uint64_t life,
                 const std::atomic<bool>& stop);
 
+// 1 kHz of 256 B, a stream of pc1 whose ring reaches back for a minute: nobody has to lose
+// anything.
+KnownStream steady_stream();
+
 }  // namespace dssm::test

@@ -1,0 +1,262 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What a fleet promises when cables are cut, names collide, versions differ: on PCs of the test's
+// own.
+#include <fcntl.h>
+#include <unistd.h>
+
+#include <thread>
+
+#include "tests/process/network/fleet.hpp"
+#include "tests/process/network/known_samples.hpp"
+#include "tests/process/network/raw_peer.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+
+class Hosts : public NetworkTest {
+ protected:
+  // Waits until the two see each other.
+  void await_up(Session& session, int host) {
+    await("the host is up", [&] { return host_info(session, Network::name(host)).state == "up"; });
+  }
+
+  static bool lists(Session& session, const std::string& stream) {
+    for (const StreamInfo& each : session.list().value()) {
+      if (each.id.name == stream) return true;
+    }
+    return false;
+  }
+
+  static KnownStream small(const std::string& name, std::uint64_t depth) {
+    return {{name, 0, "pc1"}, 64, depth, 1ms, 0ms, 1};
+  }
+
+  static RawWriter make(Session session, const KnownStream& known) {
+    return session.create_raw(known.id, known.type(), known.history()).value();
+  }
+
+  static void write_until(RawWriter& writer, const KnownStream& known, Tid last) {
+    std::vector<std::byte> payload(known.payload_bytes);
+    while (writer.newest() < last) {
+      const SampleInfo info = known.info(writer.newest() + 1);
+      known.fill(payload, 1, info.tid);
+      ASSERT_EQ(writer.write(payload, info.time, info.clock_error), info.tid);
+    }
+  }
+
+  // Takes all samples from `first` to `last`, each once.
+  static void expect_samples(RawReader& reader, const KnownStream& known, Tid first, Tid last) {
+    std::vector<std::byte> payload(known.payload_bytes);
+    SampleInfo info;
+    for (Tid tid = first; tid <= last; ++tid) {
+      ASSERT_EQ(reader.wait_for_tid(tid, kNever), WaitStatus::ready);
+      ASSERT_EQ(reader.next(payload, info), ReadStatus::ok);
+      ASSERT_EQ(info.tid, tid);
+      ASSERT_EQ(known.fault(payload, info, 1), "");
+    }
+  }
+};
+
+TEST_F(Hosts, ThatCannotBeReachedLeaveWithin3SecondsAndComeBack) {
+  if (!make_fleet(2)) return;
+  Session here = fleet->session(1);
+  const RawWriter writer =
+      fleet->session(2).create_raw({"there", 0, ""}, {"", 8, 1, {}}, {8, 1s}).value();
+  await_up(here, 2);
+  await("its stream is known", [&] { return lists(here, "there"); });
+  Duration noticed{};
+  for (int attempt = 0; attempt < 2; ++attempt) {
+    const MonoTime cut = MonoClock::now();
+    fleet->network().cut(2);
+    await("the dead host is noticed", [&] { return host_info(here, "pc2").state != "up"; });
+    noticed = MonoClock::now() - cut;
+    EXPECT_FALSE(lists(here, "there"));
+    EXPECT_NE(host_info(here, "pc2").error, "");
+    fleet->network().heal(2);
+    await_up(here, 2);
+    await("its stream is back", [&] { return lists(here, "there"); });
+    if (noticed < 3500ms) break;  // the machine may be busy: once more
+  }
+  // This is the promise itself: 3 s, and half a second for a busy machine to look.
+  EXPECT_LT(noticed, 3500ms);
+}
+
+TEST_F(Hosts, ThatDieAreNoticedAtOnceAndComeBack) {
+  if (!make_fleet(2)) return;
+  Session here = fleet->session(1);
+  await_up(here, 2);
+  fleet->kill_dssmd(2);
+  await("the dead dssmd is noticed", [&] { return host_info(here, "pc2").state != "up"; });
+  fleet->start_dssmd(2);
+  await_up(here, 2);
+}
+
+TEST_F(Hosts, MirrorsResumeAtTheirTidAfterACut) {
+  if (!make_fleet(2)) return;
+  Session owner = fleet->session(1), there = fleet->session(2);
+  const KnownStream known = small("kept", 4096);
+  RawWriter writer = make(owner, known);
+  write_until(writer, known, 99);
+  RawReader reader = there.await_raw_reader(known.id, kNever).value();
+  reader.seek(kNoTid);
+  expect_samples(reader, known, 0, 99);
+  for (Tid last = 1099; last < 4000; last += 1000) {
+    fleet->network().cut(1);
+    write_until(writer, known, last - 500);
+    await("the cut is noticed", [&] { return host_info(there, "pc1").state != "up"; });
+    write_until(writer, known, last);
+    fleet->network().heal(1);
+    expect_samples(reader, known, last - 999, last);
+  }
+  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.restarts(), 0u);
+  await_up(there, 1);
+  const StreamInfo info = there.info(known.id).value();
+  ASSERT_TRUE(info.mirror);
+  EXPECT_EQ(info.mirror->gap_samples, 0u);
+  EXPECT_GE(info.mirror->reconnects, 3u);
+  EXPECT_EQ(info.mirror->newest, writer.newest());
+  EXPECT_EQ(info.mirror->received_samples, 3100u) << "each came once";
+}
+
+// Shorter than anybody would notice: TCP itself sends again.
+TEST_F(Hosts, ShortCutsLoseNothing) {
+  if (!make_fleet(2)) return;
+  Session owner = fleet->session(1), there = fleet->session(2);
+  const KnownStream known = small("kept", 4096);
+  RawWriter writer = make(owner, known);
+  RawReader reader = there.await_raw_reader(known.id, kNever).value();
+  reader.seek(kNoTid);
+  for (int round = 0; round < 10; ++round) {
+    fleet->network().cut(1);
+    write_until(writer, known, 100 * round + 99);
+    fleet->network().heal(1);
+    expect_samples(reader, known, 100 * round, 100 * round + 99);
+  }
+  EXPECT_EQ(reader.lost(), 0u);
+}
+
+TEST_F(Hosts, GapsAfterACutAreCountedExactly) {
+  if (!make_fleet(2)) return;
+  Session owner = fleet->session(1), there = fleet->session(2);
+  const KnownStream known = small("short", 64);
+  RawWriter writer = make(owner, known);
+  write_until(writer, known, 9);
+  RawReader reader = there.await_raw_reader(known.id, kNever).value();
+  reader.seek(kNoTid);
+  expect_samples(reader, known, 0, 9);
+  fleet->network().cut(1);
+  await("the cut is noticed", [&] { return host_info(there, "pc1").state != "up"; });
+  write_until(writer, known, 999);
+  fleet->network().heal(1);
+  // 64 slots hold 63 samples: 937 to 999; 10 to 936 are lost.
+  ASSERT_EQ(reader.wait_for_tid(999, kNever), WaitStatus::ready);
+  expect_samples(reader, known, 937, 999);
+  EXPECT_EQ(reader.lost(), 927u);
+  EXPECT_EQ(there.info(known.id).value().mirror->gap_samples, 927u);
+}
+
+TEST_F(Hosts, StreamsOfOneNameAreToldApartByHost) {
+  if (!make_fleet(3)) return;
+  std::vector<RawWriter> writers;
+  for (int host = 1; host <= 2; ++host) {
+    writers.push_back(
+        fleet->session(host).create_raw({"twin", 0, ""}, {"", 8, 1, {}}, {8, 1s}).value());
+    const std::vector<std::byte> payload(8, static_cast<std::byte>(host));
+    ASSERT_EQ(writers.back().write(payload), 0);
+  }
+  Session third = fleet->session(3);
+  const auto read = [](Result<RawReader> reader) {
+    std::vector<std::byte> payload(8);
+    SampleInfo info;
+    if (!reader) return 100;
+    EXPECT_EQ(reader->latest(payload, info), ReadStatus::ok);
+    return static_cast<int>(payload[0]);
+  };
+  for (int host = 1; host <= 2; ++host) {
+    EXPECT_EQ(read(third.await_raw_reader({"twin", 0, Network::name(host)}, kNever)), host);
+    Session own = fleet->session(host);
+    EXPECT_EQ(read(own.open_raw_reader({"twin", 0, ""})), host) << "the own one comes first";
+  }
+  const auto either = third.open_raw_reader({"twin", 0, ""});
+  ASSERT_FALSE(either);
+  EXPECT_EQ(either.error().code, Errc::conflict);
+  EXPECT_NE(either.error().message.find("'pc1'"), std::string::npos) << either.error().message;
+  EXPECT_NE(either.error().message.find("'pc2'"), std::string::npos) << either.error().message;
+}
+
+TEST_F(Hosts, SpeakIpv6) {
+  if (!make_fleet(2, {}, IpVersion::v6)) return;
+  Session owner = fleet->session(1), there = fleet->session(2);
+  const KnownStream known = small("six", 64);
+  RawWriter writer = make(owner, known);
+  write_until(writer, known, 49);
+  RawReader reader = there.await_raw_reader(known.id, kNever).value();
+  reader.seek(kNoTid);
+  expect_samples(reader, known, 0, 49);
+  EXPECT_GT(there.ping("pc1").value().round_trip, 0ns);
+}
+
+TEST_F(Hosts, RefuseAPeerOfTheFutureInWords) {
+  if (!make_fleet(1)) return;
+  const Inside inside = fleet->network().inside(1);
+  RawPeer peer(Network::address(1));
+  peer.send(hello_frame(99));
+  const std::optional<net::Frame> last = peer.await_end();
+  ASSERT_TRUE(last && last->has_failure()) << "no last words";
+  EXPECT_EQ(last->failure().code(), "protocol");
+  EXPECT_NE(last->failure().message().find("99"), std::string::npos) << last->failure().message();
+  EXPECT_NE(last->failure().message().find("pc1"), std::string::npos) << last->failure().message();
+}
+
+TEST_F(Hosts, SayThatAPeerOfTheFutureWasRefused) {
+  std::unique_ptr<Network> network = make_network(2);
+  if (!network) return;
+  const UniqueFd listener = [&] {
+    const Inside inside = network->inside(2);
+    return listen_at(Network::address(2));
+  }();
+  const Inside inside = network->inside(1);
+  const DaemonProcess dssmd(
+      {"--insecure", "--listen", dssmd_address(1), "--peer", dssmd_address(2)});
+  RawPeer peer = accept_peer(listener);
+  ASSERT_TRUE(peer.receive()) << "its Hello";
+  peer.send(hello_frame(99));
+  Session session = Session::connect({.socket_path = dssmd.socket_path()}).value();
+  HostInfo refused;
+  await("the other host is refused", [&] {
+    for (HostInfo& host : session.hosts().value()) {
+      if (host.state == "refused") refused = host;
+    }
+    return refused.state == "refused";
+  });
+  EXPECT_NE(refused.error.find("99"), std::string::npos) << refused.error;
+  EXPECT_NE(refused.error.find(dssmd_address(2)), std::string::npos) << refused.error;
+}
+
+TEST_F(Hosts, OpenTheNetworkOnlyWhenToldThatItIsInsecure) {
+  std::unique_ptr<Network> network = make_network(1);
+  if (!network) return;
+  const Inside inside = network->inside(1);
+  const std::string folder = make_temp_dir();
+  for (const std::string flag : {"--listen", "--peer"}) {
+    const Finished finished =
+        run({built("daemon/dssmd"), "--runtime-dir", folder, flag, dssmd_address(1)});
+    EXPECT_EQ(finished.exit_status, 2) << finished.err;
+    EXPECT_NE(finished.err.find("insecure"), std::string::npos) << finished.err;
+    EXPECT_NE(finished.err.find(Network::address(1)), std::string::npos) << finished.err;
+  }
+  remove_tree(folder);
+  // Unasked, it listens where only this PC can reach it.
+  const DaemonProcess dssmd;
+  for (const std::string& address : dssmd.addresses()) {
+    EXPECT_TRUE(address.starts_with("127.") || address.starts_with("[::1]")) << address;
+  }
+  EXPECT_FALSE(RawPeer(Network::address(1)).is_open());
+}
+
+}  // namespace
+}  // namespace dssm::test

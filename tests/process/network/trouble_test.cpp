@@ -1,0 +1,314 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Programs and peers that misbehave, from another PC and on the same one, beside a stream that is
+// written and read as always: its readers lose nothing and get everything, dssmd's memory stays
+// within its limit, and a bad peer's connection ends. Counts are compared, never times.
+#include <fcntl.h>
+#include <unistd.h>
+
+#include <csignal>
+#include <fstream>
+#include <random>
+#include <sstream>
+#include <thread>
+
+#include "tests/process/network/fleet.hpp"
+#include "tests/process/network/follower.hpp"
+#include "tests/process/network/load.hpp"
+#include "tests/process/network/raw_peer.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr std::uint64_t kPeerMemoryBytes = 8 << 20;  // as configured below
+// What dssmd's own tables and malloc may add; its rings are no anonymous memory.
+constexpr std::uint64_t kOtherMemoryBytes = 8 << 20;
+
+// pc1 owns steady_stream(), which is written all the time and read on pc1 and on pc2. The trouble
+// comes from pc3 or from further programs.
+class Trouble : public NetworkTest {
+ protected:
+  void SetUp() override {
+    if (!make_fleet(3, {"--max-peer-memory", "8 MiB"})) return;
+    const std::vector<KnownStream> streams = {steady_stream()};
+    stop = false;
+    writing = std::thread([this, streams] { write_load(fleet->session(1), streams, 1, stop); });
+    for (int host = 1; host <= 2; ++host) {
+      Session session = fleet->session(host);
+      Session owner = fleet->session(1);
+      bystanders.push_back(std::make_unique<Bystander>(
+          Follower(steady_stream(), session.await_raw_reader(steady_stream().id, kNever).value(),
+                   owner.await_raw_reader(steady_stream().id, kNever).value())));
+    }
+    for (auto& bystander : bystanders) {
+      reading.emplace_back([this, &bystander = *bystander] {
+        do {
+          (void)bystander.follower.reader().wait(deadline_in(50ms));
+          bystander.follower.take(1000);
+          bystander.taken = bystander.follower.taken();
+        } while (!stop || !bystander.follower.has_all());
+      });
+    }
+    await_progress();
+    memory_before = anonymous_memory();
+  }
+
+  void TearDown() override {
+    if (!fleet) return;
+    stop = true;
+    writing.join();
+    for (std::thread& each : reading) each.join();
+    for (auto& bystander : bystanders) {
+      EXPECT_EQ(bystander->follower.faults(), "");
+      EXPECT_EQ(bystander->follower.lost(), 0u);
+      EXPECT_EQ(bystander->follower.restarts(), 0u);
+    }
+  }
+
+  // Waits until all bystanders have taken so many more samples than now.
+  void await_progress(std::uint64_t samples = 1000) {
+    for (auto& bystander : bystanders) {
+      const std::uint64_t enough = bystander->taken + samples;
+      while (bystander->taken < enough) std::this_thread::sleep_for(1ms);
+    }
+  }
+
+  // Of pc1's dssmd.
+  std::uint64_t anonymous_memory() {
+    std::ifstream status("/proc/" + std::to_string(fleet->dssmd(1).pid()) + "/status");
+    for (std::string word; status >> word;) {
+      std::uint64_t kib = 0;
+      if (word == "RssAnon:" && status >> kib) return kib << 10;
+    }
+    ADD_FAILURE() << "no RssAnon in /proc/PID/status";
+    return 0;
+  }
+
+  void expect_bounded_memory() {
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+    return;  // the sanitizer's own memory tells nothing
+#endif
+    EXPECT_LT(anonymous_memory(), memory_before + kPeerMemoryBytes + kOtherMemoryBytes);
+  }
+
+  RawPeer connect_from(int host) {
+    const Inside inside = fleet->network().inside(host);
+    return RawPeer(Network::address(1));
+  }
+
+  // A stream whose ring takes 64 MiB, much more than a peer may make dssmd hold.
+  RawWriter make_large() {
+    return fleet->session(1).create_raw({"large", 0, ""}, {"", 1 << 20, 1, {}}, {64, 10ms}).value();
+  }
+
+  struct Bystander {
+    explicit Bystander(Follower made) : follower(std::move(made)) {}
+    Follower follower;
+    std::atomic<std::uint64_t> taken = 0;
+  };
+  std::atomic<bool> stop = false;
+  std::thread writing;
+  std::vector<std::unique_ptr<Bystander>> bystanders;
+  std::vector<std::thread> reading;
+  std::uint64_t memory_before = 0;
+};
+
+TEST_F(Trouble, PeersThatSayNothingOrOneByteAreClosed) {
+  if (!fleet) return;
+  std::vector<RawPeer> silent;
+  for (int i = 0; i < 20; ++i) {
+    silent.push_back(connect_from(3));
+    ASSERT_TRUE(silent.back().is_open());
+    // The first byte of a Hello's length; the next one would come in a minute.
+    if (i % 2 == 0) silent.back().send_bytes("\x20");
+  }
+  await_progress();
+  for (RawPeer& peer : silent) peer.await_end();
+  await_progress();
+  expect_bounded_memory();
+}
+
+TEST_F(Trouble, PeersThatSendGarbageAreClosed) {
+  if (!fleet) return;
+  const std::uint64_t seed = number_from_environment("DSSM_TEST_SEED", std::random_device{}());
+  SCOPED_TRACE(testing::Message() << "DSSM_TEST_SEED=" << seed);
+  std::mt19937_64 random(seed);
+  for (int i = 0; i < 100; ++i) {
+    RawPeer peer = connect_from(3);
+    ASSERT_TRUE(peer.is_open());
+    // From the start; after a good Hello; in place of a request on an open channel.
+    if (i % 3 > 0) {
+      ASSERT_FALSE(peer.greet());
+    }
+    if (i % 3 > 1) {
+      peer.send(open_frame(1, "steady"));
+      ASSERT_TRUE(peer.receive());
+    }
+    std::string garbage(1 + random() % 100'000, '\0');
+    for (char& byte : garbage) byte = static_cast<char>(random());
+    peer.send_bytes(garbage);
+    // Random bytes may begin with the length of a frame that is not complete yet: 17 MiB of zeros
+    // are no frames in any case.
+    peer.send_bytes(std::string(32U << 20, '\0'));
+    peer.await_end();
+  }
+  await_progress();
+  expect_bounded_memory();
+}
+
+TEST_F(Trouble, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
+  if (!fleet) return;
+  RawWriter large = make_large();
+  std::vector<std::byte> payload(large.payload_bytes());
+  std::vector<RawPeer> lazy;
+  for (int i = 0; i < 20; ++i) {
+    lazy.push_back(connect_from(3));
+    ASSERT_FALSE(lazy.back().greet());
+    lazy.back().send(open_frame(1, i % 2 == 0 ? "large" : "steady"));
+    lazy.back().send(subscribe_from_oldest_frame(2));
+  }
+  for (int round = 0; round < 10; ++round) {
+    for (int i = 0; i < 32; ++i)
+      ASSERT_NE(large.write(payload), kNoTid);  // laps twice every 4 rounds
+    await_progress(200);
+    expect_bounded_memory();
+  }
+  // Whoever reads at last gets every sample or hears that it is lost.
+  for (std::size_t i = 0; i < lazy.size(); ++i) {
+    Tid next = 0;
+    std::uint64_t samples = 0;
+    const Tid enough = i % 2 == 0 ? large.newest() : 2000;
+    while (next <= enough) {
+      const std::optional<net::Frame> frame = lazy[i].receive();
+      ASSERT_TRUE(frame) << "the connection ended at tid " << next;
+      if (frame->has_gap()) {
+        ASSERT_EQ(frame->gap().first_tid(), next);
+        next += static_cast<Tid>(frame->gap().count());
+      } else if (frame->has_sample()) {
+        ASSERT_EQ(frame->sample().tid(), next);
+        ++next, ++samples;
+      }
+    }
+    EXPECT_GT(samples, 0u);
+  }
+}
+
+TEST_F(Trouble, PeersThatAskAndNeverReadAreClosed) {
+  if (!fleet) return;
+  RawWriter large = make_large();
+  ASSERT_NE(large.write(std::vector<std::byte>(large.payload_bytes())), kNoTid);
+  for (const bool whole_samples : {false, true}) {
+    RawPeer greedy = connect_from(3);
+    ASSERT_FALSE(greedy.greet());
+    net::Frame ask;
+    if (whole_samples) {
+      greedy.send(open_frame(1, "large"));
+      ask.mutable_read()->set_newest(true);
+    } else {
+      ask.mutable_list();
+    }
+    // As long as dssmd takes questions.
+    for (std::uint64_t serial = 2; greedy.is_open() && serial < 1'000'000; ++serial) {
+      ask.set_serial(serial);
+      greedy.send(ask);
+      if (serial % 1000 == 0) expect_bounded_memory();
+    }
+    EXPECT_FALSE(greedy.is_open()) << "a million questions and nobody minds";
+  }
+  await_progress();
+}
+
+TEST_F(Trouble, ConnectionsBeyondTheLimitAreRefusedInWords) {
+  if (!fleet) return;
+  std::vector<RawPeer> many;
+  for (int i = 0; i < 1000; ++i) many.push_back(connect_from(3));
+  int refused = 0, welcome = 0;
+  for (RawPeer& peer : many) {
+    const std::optional<net::Frame> instead = peer.greet();
+    if (!instead && peer.is_open()) {
+      ++welcome;
+      continue;
+    }
+    ++refused;
+    if (!instead) continue;  // its words were lost with the connection
+    EXPECT_NE(instead->failure().message().find("max_connections"), std::string::npos)
+        << instead->failure().message();
+  }
+  EXPECT_GT(welcome, 100);
+  EXPECT_GT(refused, 800);
+  await_progress();
+  expect_bounded_memory();
+  // Other hosts are served meanwhile, and this one again when it has let go.
+  EXPECT_FALSE(connect_from(2).greet());
+  many.clear();
+  while (connect_from(3).greet()) std::this_thread::sleep_for(1ms);
+}
+
+// Programs that are stopped in the middle and go on later.
+class Stopped {
+ public:
+  Stopped(const std::vector<std::string>& words, const std::string& environment) {
+    int in[2], out[2];
+    EXPECT_EQ(::pipe2(in, O_CLOEXEC), 0);
+    EXPECT_EQ(::pipe2(out, O_CLOEXEC), 0);
+    std::vector<std::string> argv = {built("tests/process/network/steady-reader")};
+    argv.insert(argv.end(), words.begin(), words.end());
+    // Its stdin is ours while it is started: there is no other way to hand it one.
+    const UniqueFd own_stdin(::fcntl(STDIN_FILENO, F_DUPFD_CLOEXEC, 3));
+    ::dup2(in[0], STDIN_FILENO);
+    pid_ = start(argv, {environment}, out[1]);
+    ::dup2(own_stdin.get(), STDIN_FILENO);
+    ::close(in[0]), ::close(out[1]);
+    stdin_.reset(in[1]);
+    stdout_.reset(out[0]);
+    char byte = 0;
+    EXPECT_EQ(::read(stdout_.get(), &byte, 1), 1) << "it ended by itself";
+    ::kill(pid_, SIGSTOP);
+  }
+
+  // Lets it go on and come to its end; what it says.
+  void finish(std::uint64_t& taken, std::uint64_t& lost) {
+    ::kill(pid_, SIGCONT);
+    stdin_.reset();
+    std::string text;
+    char buffer[4096];
+    for (ssize_t n; (n = ::read(stdout_.get(), buffer, sizeof buffer)) > 0;) {
+      text.append(buffer, static_cast<std::size_t>(n));
+    }
+    EXPECT_EQ(wait_for(pid_), 0) << text;
+    std::istringstream(text) >> taken >> lost;
+  }
+
+ private:
+  pid_t pid_ = -1;
+  UniqueFd stdin_, stdout_;
+};
+
+TEST_F(Trouble, StoppedReadersDisturbNobodyAndGoOnWhereTheyWere) {
+  if (!fleet) return;
+  std::vector<std::unique_ptr<Stopped>> stopped;
+  for (int host = 1; host <= 3; ++host) {
+    stopped.push_back(
+        std::make_unique<Stopped>(std::vector<std::string>{}, fleet->dssmd(host).environment()));
+  }
+  {
+    const Inside inside = fleet->network().inside(3);
+    stopped.push_back(std::make_unique<Stopped>(std::vector<std::string>{Network::address(1)},
+                                                "DSSM_SOCKET=/nowhere"));
+  }
+  for (int round = 0; round < 5; ++round) {
+    await_progress();
+    expect_bounded_memory();
+  }
+  for (auto& each : stopped) {
+    std::uint64_t taken = 0, lost = 0;
+    each->finish(taken, lost);
+    EXPECT_GT(taken, 5000u);
+    EXPECT_EQ(lost, 0u) << "the ring holds a minute";
+  }
+}
+
+}  // namespace
+}  // namespace dssm::test
