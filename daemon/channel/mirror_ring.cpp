@@ -6,6 +6,8 @@
 #include <string>
 #include <utility>
 
+#include "daemon/channel/sample_pump.hpp"
+
 namespace dssm::daemon {
 
 Result<std::unique_ptr<MirrorRing>> MirrorRing::open(std::shared_ptr<Stream> stream,
@@ -30,7 +32,7 @@ MirrorRing::MirrorRing(std::shared_ptr<Stream> stream,
       next_(writer_.newest() < 0 ? kNoTid : writer_.newest() + 1) {}
 
 Result<void> MirrorRing::on_subscribed_untrusted(Tid first) {
-  if (first < 0 || first > kMaxPeerTid) {
+  if (first < 0 || first > kLastTid) {
     return Error{Errc::protocol,
                  "the subscription is said to begin with sample " + std::to_string(first)};
   }
@@ -51,7 +53,7 @@ bool MirrorRing::would_spoil_window(Tid tid) const noexcept {
 
 Result<std::byte*> MirrorRing::begin_untrusted(const wire::IncomingSample& sample) {
   const Tid tid = sample.info.tid;
-  if (tid < next_ || tid > kMaxPeerTid) {
+  if (tid < next_ || tid > kLastTid) {
     return Error{Errc::protocol, "sample " + std::to_string(tid) + " came where sample " +
                                      std::to_string(next_) + " or a later one was due"};
   }
@@ -90,7 +92,7 @@ void MirrorRing::end(const wire::IncomingSample& sample, bool torn) {
 }
 
 Result<void> MirrorRing::on_gap_untrusted(Tid first, std::uint64_t count) {
-  if (first < 0 || first > kMaxPeerTid || count > static_cast<std::uint64_t>(kMaxPeerTid)) {
+  if (first < 0 || first > kLastTid || count > static_cast<std::uint64_t>(kLastTid - first)) {
     return Error{Errc::protocol, "a gap of " + std::to_string(count) + " samples at sample " +
                                      std::to_string(first)};
   }

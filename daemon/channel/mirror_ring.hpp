@@ -21,9 +21,6 @@
 
 namespace dssm::daemon {
 
-// Tids that a peer may name: far beyond what anybody writes, and no sum of two overflows.
-inline constexpr Tid kMaxPeerTid = Tid{1} << 61;
-
 class MirrorRing {
  public:
   // Goes on behind what `stream`, a mirror's ring, holds. The budget outlives it.

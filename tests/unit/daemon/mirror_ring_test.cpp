@@ -5,6 +5,7 @@
 
 #include <cstring>
 
+#include "daemon/channel/sample_pump.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 
 namespace dssm::daemon {
@@ -147,12 +148,12 @@ TEST_F(MirrorRingTest, ReceivesInPlaceWhenThereIsNoMemoryToSetAside) {
 
 TEST_F(MirrorRingTest, RefusesTidsThatDoNotRise) {
   EXPECT_FALSE(ring->on_subscribed_untrusted(-1));
-  EXPECT_FALSE(ring->on_subscribed_untrusted(kMaxPeerTid + 1));
+  EXPECT_FALSE(ring->on_subscribed_untrusted(kLastTid + 1));
   ASSERT_TRUE(ring->on_subscribed_untrusted(5));
   ASSERT_TRUE(take(5));
   EXPECT_EQ(take(5).error().code, Errc::protocol);
   EXPECT_EQ(take(4).error().code, Errc::protocol);
-  EXPECT_EQ(take(kMaxPeerTid + 1).error().code, Errc::protocol);
+  EXPECT_EQ(take(kLastTid + 1).error().code, Errc::protocol);
   EXPECT_EQ(ring->on_gap_untrusted(3, 2).error().code, Errc::protocol);
   EXPECT_EQ(ring->on_gap_untrusted(-1, 20).error().code, Errc::protocol);
   EXPECT_EQ(ring->on_gap_untrusted(0, ~std::uint64_t{0}).error().code, Errc::protocol);
