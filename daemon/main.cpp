@@ -7,6 +7,7 @@
 
 #include <cstdio>
 
+#include "daemon/channel/network_listener.hpp"
 #include "daemon/local/listener.hpp"
 #include "daemon/local/local_service.hpp"
 #include "daemon/local/server.hpp"
@@ -37,6 +38,8 @@ Result<void> run(const Config& config, Logger& logger) {
   const Result<Listener> listener =
       Listener::open(dir->socket_path(), config.socket_group, config.socket_mode);
   if (!listener) return listener.error();
+  const Result<NetworkListener> network = NetworkListener::open(config.listen, logger);
+  if (!network) return network.error();
   const bool recovering = listener->predecessor_died() && config.recovery_grace > Duration::zero();
 
   Registry registry(config.name,
@@ -56,9 +59,16 @@ Result<void> run(const Config& config, Logger& logger) {
   EventSource stops[] = {EventSource::signal(*loop, SIGTERM, [&] { loop->stop(); }),
                          EventSource::signal(*loop, SIGINT, [&] { loop->stop(); })};
   for (EventSource& stop : stops) stop.enable();
+  if (config.insecure) {
+    logger.warning(
+        "insecure = true: samples cross the network in the clear, and whoever reaches this host "
+        "can "
+        "read and write all its streams",
+        {.message_id = message_id::kInsecure});
+  }
 
   const std::string ready =
-      "ready, host '" + config.name + "', socket '" + dir->socket_path() + "'";
+      "ready, host '" + config.name + "', socket '" + dir->socket_path() + "', " + network->str();
   logger.notice(ready, {.message_id = message_id::kReady});
   notify_ready(ready);
   if (Result<void> ran = loop->run(); !ran) return ran;

@@ -8,6 +8,7 @@
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/service/message_ids.hpp"
+#include "daemon/streams/description.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -212,7 +213,7 @@ void LocalService::watch(ClientNumber number, std::uint64_t serial) {
     const auto client = clients_.find(number);
     if (client == clients_.end()) return;
     Reply event;
-    requests_.describe(*stream, *event.response.mutable_stream_event()->mutable_stream());
+    describe(*stream, opens_, *event.response.mutable_stream_event()->mutable_stream());
     send(client->second, 0, std::move(event));
   }
   if (fleet_) {
@@ -272,7 +273,7 @@ void LocalService::broadcast(const local::StreamEvent& event) {
 
 void LocalService::on_stream_added(const Stream& stream) {
   local::StreamEvent event;
-  requests_.describe(stream, *event.mutable_stream());
+  describe(stream, opens_, *event.mutable_stream());
   broadcast(event);
   logger_.debug("stream '" + stream.id().str() + "' is there",
                 {.stream = stream.id().str(), .message_id = message_id::kStreamCreated});

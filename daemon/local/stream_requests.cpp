@@ -6,6 +6,7 @@
 #include <utility>
 
 #include "core/wire/local_protocol.hpp"
+#include "daemon/streams/description.hpp"
 
 namespace dssm::daemon {
 
@@ -68,14 +69,6 @@ const proto::StreamId* StreamRequests::subject(const local::Request& request) no
     default:
       return nullptr;
   }
-}
-
-void StreamRequests::describe(const Stream& stream, proto::Stream& out) const {
-  StreamInfo info = stream.info();
-  const OpenTable::Counts counts = opens_.counts(stream);
-  info.writers = counts.writers;
-  info.readers = counts.readers;
-  wire::to_message(info, out);
 }
 
 Result<std::shared_ptr<Stream>> StreamRequests::find_untrusted(const proto::StreamId& id) const {
@@ -141,18 +134,7 @@ Result<Reply> StreamRequests::remove(const local::Remove& request) {
 
 Result<Reply> StreamRequests::list() {
   Reply reply;
-  proto::StreamList& list = *reply.response.mutable_stream_list();
-  std::size_t bytes = 0;
-  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
-    proto::Stream& entry = *list.add_streams();
-    describe(*stream, entry);
-    bytes += entry.ByteSizeLong();
-    if (bytes > kMaxListBytes) {
-      bytes -= entry.ByteSizeLong();
-      entry.mutable_type()->clear_fields();
-      bytes += entry.ByteSizeLong();
-    }
-  }
+  describe_all(registry_, opens_, kMaxListBytes, *reply.response.mutable_stream_list());
   return reply;
 }
 
@@ -160,15 +142,7 @@ Result<Reply> StreamRequests::info(const local::Info& request) {
   const Result<std::shared_ptr<Stream>> stream = find_untrusted(request.id());
   if (!stream) return stream.error();
   Reply reply;
-  proto::Stream& entry = *reply.response.mutable_stream_list()->add_streams();
-  describe(**stream, entry);
-  for (const StreamUser& user : opens_.users(**stream)) {
-    proto::User& message = *entry.add_users();
-    message.set_pid(user.pid);
-    message.set_uid(user.uid);
-    message.set_program(user.program);
-    message.set_writer(user.role == Role::writer);
-  }
+  describe_with_users(**stream, opens_, *reply.response.mutable_stream_list()->add_streams());
   return reply;
 }
 

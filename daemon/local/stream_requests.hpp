@@ -30,9 +30,6 @@ class StreamRequests {
   // The stream that `request` is about; nullptr for requests about none.
   static const proto::StreamId* subject(const local::Request& request) noexcept;
 
-  // What List and Info tell of a stream, without its users.
-  void describe(const Stream& stream, proto::Stream& out) const;
-
  private:
   Result<Reply> create(const Client& client, const local::Create& request);
   Result<Reply> open(const Client& client, const local::Open& request);

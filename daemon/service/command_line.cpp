@@ -2,20 +2,18 @@
 #include "daemon/service/command_line.hpp"
 
 #include <CLI/CLI.hpp>
-#include <algorithm>
 #include <map>
+#include <string>
+#include <vector>
 
 namespace dssm::daemon {
 namespace {
 
-std::string flag_of(std::string_view key) {
-  std::string flag = "--" + std::string(key);
-  std::replace(flag.begin(), flag.end(), '_', '-');
-  return flag;
-}
+// By key: what its flag was given, in order.
+using Flags = std::map<std::string_view, std::vector<std::string>>;
 
 // File first, flags over it; all mistakes of both, one per line.
-Result<void> collect(CommandLine& line, const std::map<std::string_view, std::string>& flags) {
+Result<void> collect(CommandLine& line, const Flags& flags) {
   std::string mistakes;
   const auto note = [&](const std::string& mistake) {
     mistakes.append(mistakes.empty() ? "" : "\n").append(mistake);
@@ -28,8 +26,11 @@ Result<void> collect(CommandLine& line, const std::map<std::string_view, std::st
   for (const ConfigKey& key : config_keys()) {
     const auto flag = flags.find(key.name);
     if (flag == flags.end()) continue;
-    if (Result<void> set = key.set(line.config, flag->second); !set) {
-      note(flag_of(key.name) + ": " + set.error().message);
+    if (key.clear) key.clear(line.config);
+    for (const std::string& text : flag->second) {
+      if (Result<void> set = key.set(line.config, text); !set) {
+        note(key.flag() + ": " + set.error().message);
+      }
     }
   }
   if (mistakes.empty()) {
@@ -39,27 +40,41 @@ Result<void> collect(CommandLine& line, const std::map<std::string_view, std::st
   return Error{Errc::invalid_argument, mistakes};
 }
 
+void add_flag(CLI::App& app, const ConfigKey& key, Flags& flags) {
+  const std::string help(key.help);
+  if (key.form == ValueForm::boolean) {
+    app.add_flag_function(
+        key.flag(),
+        [&flags, &key](std::int64_t count) { flags[key.name] = {count > 0 ? "true" : "false"}; },
+        help);
+    return;
+  }
+  CLI::Option* option = app.add_option_function<std::vector<std::string>>(
+      key.flag(),
+      [&flags, &key](const std::vector<std::string>& texts) { flags[key.name] = texts; }, help);
+  option->type_name(std::string(key.value));
+  // One value behind each flag; CLI11 takes all that follow otherwise.
+  option->allow_extra_args(false);
+  if (key.form != ValueForm::list) option->expected(1);
+}
+
 }  // namespace
 
 Result<CommandLine> parse_command_line(int argc, const char* const* argv) {
   CommandLine line;
-  std::map<std::string_view, std::string> flags;
+  Flags flags;
   bool check = false;
   // CLI11 reports by exceptions; they end here.
   try {
     CLI::App app("Owns the streams of this PC: rings in shared memory, found by name.", "dssmd");
     app.footer(
         "Each flag but --help, --version, --config and --check-config is also a key of the\n"
-        "configuration file, with '_' for '-'. See dssmd(8) and docs/configuration.md.");
+        "configuration file, with '_' for '-' (--peer is the key 'peers'). See dssmd(8) and\n"
+        "docs/configuration.md.");
     app.set_version_flag("--version", "dssmd " DSSM_VERSION);
     app.add_option("--config", line.config_path, "configuration file (TOML)")->type_name("FILE");
     app.add_flag("--check-config", check, "only check the configuration: print OK or the mistakes");
-    for (const ConfigKey& key : config_keys()) {
-      app.add_option_function<std::string>(
-             flag_of(key.name), [&flags, &key](const std::string& text) { flags[key.name] = text; },
-             std::string(key.help))
-          ->type_name(std::string(key.value));
-    }
+    for (const ConfigKey& key : config_keys()) add_flag(app, key, flags);
     try {
       app.parse(argc, argv);
     } catch (const CLI::CallForHelp&) {

@@ -22,6 +22,7 @@ namespace {
 constexpr std::size_t kMaxFileBytes = 1U << 20;
 constexpr std::uint64_t kMostMemoryBytes = 1ULL << 50;
 constexpr Duration kLongestGrace = std::chrono::seconds(60);
+constexpr Duration kLongestLinger = std::chrono::hours(1);
 
 // Puts a parsed value into its place.
 template <class T, class U>
@@ -43,6 +44,66 @@ Result<void> set_runtime_dir(Config& config, std::string_view text) {
   }
   config.runtime_dir = text;
   return {};
+}
+
+// An empty text adds nothing, so that the flag can ask for an empty list.
+Result<void> add_listen_address(Config& config, std::string_view text) {
+  if (text.empty()) return {};
+  Result<wire::Address> address = wire::Address::parse(text, wire::kDefaultPort, true);
+  if (!address) return std::move(address).error();
+  if (wire::resolve_number(*address).empty()) {
+    return Error{Errc::invalid_argument,
+                 quoted(text) +
+                     " is a name; write the number of an address of this PC, such as "
+                     "\"127.0.0.1:13776\", \"[::]:13776\" or \"0.0.0.0:13776\""};
+  }
+  config.listen->push_back(*std::move(address));
+  return {};
+}
+
+Result<void> add_peer(Config& config, std::string_view text) {
+  if (text.empty()) return {};
+  Result<wire::Address> address = wire::Address::parse(text);
+  if (!address) return std::move(address).error();
+  config.peers.push_back(*std::move(address));
+  return {};
+}
+
+Result<void> set_insecure(Config& config, std::string_view text) {
+  if (text != "true" && text != "false") {
+    return Error{Errc::invalid_argument, quoted(text) + " is neither true nor false"};
+  }
+  config.insecure = text == "true";
+  return {};
+}
+
+// A name may stand for any address, now or tomorrow; only "localhost" may not.
+bool stays_on_this_pc(const wire::Address& address) {
+  if (address.host == "localhost") return true;
+  const std::vector<wire::SocketAddress> numbers = wire::resolve_number(address);
+  return !numbers.empty() && numbers.front().is_loopback();
+}
+
+Result<void> check_secure(const Config& config) {
+  if (config.insecure) return {};
+  std::string addresses;
+  const auto note = [&](std::string_view what, const std::vector<wire::Address>& list) {
+    for (const wire::Address& address : list) {
+      if (stays_on_this_pc(address)) continue;
+      addresses.append(addresses.empty() ? "" : ", ")
+          .append(what)
+          .append(" ")
+          .append(quoted(address.str()));
+    }
+  };
+  if (config.listen) note("listen", *config.listen);
+  note("peer", config.peers);
+  if (addresses.empty()) return {};
+  return Error{Errc::invalid_argument,
+               addresses +
+                   ": other PCs are reached in the clear, and whoever reaches this one can read "
+                   "and write all its streams; set insecure = true (--insecure) if you own that "
+                   "network, or use loopback addresses only"};
 }
 
 constexpr ConfigKey kKeys[] = {
@@ -100,21 +161,67 @@ constexpr ConfigKey kKeys[] = {
      [](Config& c, std::string_view text) {
        return take(c.recovery_grace, parse_duration(text, Duration::zero(), kLongestGrace));
      }},
+    {"listen", "ADDR:PORT",
+     "where to listen for other hosts; may be repeated, '' for nowhere; default: 127.0.0.1:13776 "
+     "and [::1]:13776",
+     ValueForm::list, add_listen_address, [](Config& c) { c.listen.emplace(); }},
+    {"peers", "HOST:PORT", "another host's dssmd to share streams with; may be repeated",
+     ValueForm::list, add_peer, [](Config& c) { c.peers.clear(); }, "peer"},
+    {"insecure", "", "allow addresses of other PCs although nothing is encrypted",
+     ValueForm::boolean, set_insecure},
+    {"max_connections", "COUNT", "connections of other hosts at once; default: 256",
+     ValueForm::integer,
+     [](Config& c, std::string_view text) {
+       return take(c.max_connections, parse_count(text, 1, kMostConnections));
+     }},
+    {"max_connections_per_host", "COUNT", "connections from one address at once; default: 128",
+     ValueForm::integer,
+     [](Config& c, std::string_view text) {
+       return take(c.max_connections_per_host, parse_count(text, 1, kMostConnections));
+     }},
+    {"max_peer_memory", "BYTES",
+     "memory that the connections from one address may take of dssmd; default: 96 MiB",
+     ValueForm::integer_or_text,
+     [](Config& c, std::string_view text) {
+       return take(c.max_peer_memory_bytes, parse_bytes(text, 1 << 20, kMostMemoryBytes));
+     }},
+    {"mirror_linger", "TIME",
+     "how long the copy of another host's stream is kept after its last reader; default: 5 s",
+     ValueForm::text,
+     [](Config& c, std::string_view text) {
+       return take(c.mirror_linger, parse_duration(text, Duration::zero(), kLongestLinger));
+     }},
 };
 
 std::string place(const std::string& path, const toml::source_region& source) {
   return path + ":" + std::to_string(source.begin.line) + ": ";
 }
 
+const char* words_for(ValueForm form) noexcept {
+  switch (form) {
+    case ValueForm::text:
+      return "a text in quotes";
+    case ValueForm::integer:
+      return "a whole number";
+    case ValueForm::integer_or_text:
+      return "a whole number or a text in quotes";
+    case ValueForm::boolean:
+      return "true or false";
+    case ValueForm::list:
+      return "a list of texts in quotes";
+  }
+  return "";
+}
+
 // The value as the flag would have it, or why it has the wrong type.
 Result<std::string> text_of(const toml::node& node, ValueForm form) {
-  if (form != ValueForm::integer && node.is_string()) return node.as_string()->get();
-  if (form != ValueForm::text && node.is_integer()) {
-    return std::to_string(node.as_integer()->get());
+  const bool takes_text = form == ValueForm::text || form == ValueForm::integer_or_text;
+  const bool takes_integer = form == ValueForm::integer || form == ValueForm::integer_or_text;
+  if (takes_text && node.is_string()) return node.as_string()->get();
+  if (takes_integer && node.is_integer()) return std::to_string(node.as_integer()->get());
+  if (form == ValueForm::boolean && node.is_boolean()) {
+    return std::string(node.as_boolean()->get() ? "true" : "false");
   }
-  const char* wanted = form == ValueForm::text      ? "a text in quotes"
-                       : form == ValueForm::integer ? "a whole number"
-                                                    : "a whole number or a text in quotes";
   std::string type = "another type";
   if (node.is_string()) type = "a text";
   if (node.is_integer()) type = "a whole number";
@@ -122,7 +229,24 @@ Result<std::string> text_of(const toml::node& node, ValueForm form) {
   if (node.is_boolean()) type = "true or false";
   if (node.is_array()) type = "a list";
   if (node.is_table()) type = "a table";
-  return Error{Errc::invalid_argument, type + " stands where " + wanted + " belongs"};
+  return Error{Errc::invalid_argument, type + " stands where " + words_for(form) + " belongs"};
+}
+
+Result<void> set_list(Config& config, const ConfigKey& key, const toml::node& node) {
+  if (!node.is_array()) return text_of(node, ValueForm::list).error();
+  key.clear(config);
+  for (const toml::node& element : *node.as_array()) {
+    const Result<std::string> text = text_of(element, ValueForm::text);
+    if (!text) return text.error();
+    if (Result<void> set = key.set(config, *text); !set) return set;
+  }
+  return {};
+}
+
+Result<void> set_value(Config& config, const ConfigKey& key, const toml::node& node) {
+  if (key.form == ValueForm::list) return set_list(config, key, node);
+  const Result<std::string> text = text_of(node, key.form);
+  return text ? key.set(config, *text) : text.error();
 }
 
 std::string unknown_key(std::string_view name) {
@@ -161,6 +285,12 @@ std::uint64_t Config::half_of_the_machines_memory() noexcept {
 
 std::span<const ConfigKey> config_keys() noexcept { return kKeys; }
 
+std::string ConfigKey::flag() const {
+  std::string flag = "--" + std::string(flag_name.empty() ? name : flag_name);
+  std::replace(flag.begin(), flag.end(), '_', '-');
+  return flag;
+}
+
 Result<void> apply_text_untrusted(Config& config, std::string_view text, const std::string& path) {
   if (!is_utf8(text)) {
     return Error{Errc::invalid_argument, path + ": the file is no UTF-8 text"};
@@ -178,8 +308,7 @@ Result<void> apply_text_untrusted(Config& config, std::string_view text, const s
       mistake(unknown_key(name.str()));
       continue;
     }
-    const Result<std::string> value = text_of(node, key->form);
-    const Result<void> set = value ? key->set(config, *value) : value.error();
+    const Result<void> set = set_value(config, *key, node);
     if (!set) mistake("key " + quoted(key->name) + ": " + set.error().message);
   }
   if (mistakes.empty()) return {};
@@ -209,6 +338,7 @@ Result<void> apply_file(Config& config, const std::string& path) {
 }
 
 Result<void> finish(Config& config) {
+  if (Result<void> secure = check_secure(config); !secure) return secure;
   if (!config.name.empty()) return {};
   char name[256] = {};
   if (::gethostname(name, sizeof name - 1)) return os_error("ask for the machine's name");

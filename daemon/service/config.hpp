@@ -2,7 +2,8 @@
 //
 // dssmd's configuration: one table of keys that serves the file, the flags, the help text and the
 // checks alike. A key `max_streams` in the file is the flag --max-streams; both go through the same
-// words and the same range. docs/configuration.md explains each key to a person.
+// words and the same range. A key that is a list is a flag that may be repeated; where the flag is
+// given, it replaces the file's list. docs/configuration.md explains each key to a person.
 #pragma once
 
 #include <sys/types.h>
@@ -14,7 +15,9 @@
 #include <span>
 #include <string>
 #include <string_view>
+#include <vector>
 
+#include "core/wire/address.hpp"
 #include "daemon/service/log.hpp"
 
 namespace dssm::daemon {
@@ -24,6 +27,7 @@ namespace dssm::daemon {
 inline constexpr std::uint64_t kMostStreams = 32768;
 inline constexpr std::uint64_t kMostClients = 32768;
 inline constexpr std::uint64_t kMostOpens = 100'000;
+inline constexpr std::uint64_t kMostConnections = 32768;
 
 inline constexpr std::size_t kMaxHostBytes = 31;
 
@@ -41,19 +45,35 @@ struct Config {
   std::uint64_t max_property_bytes = 16ULL << 20;
   Duration recovery_grace = std::chrono::milliseconds(500);
 
+  // Other hosts. listen: none given: loopback as far as it is there; empty: no network.
+  std::optional<std::vector<wire::Address>> listen;
+  std::vector<wire::Address> peers;
+  bool insecure = false;
+  std::uint64_t max_connections = 256;
+  std::uint64_t max_connections_per_host = 128;
+  std::uint64_t max_peer_memory_bytes = 96ULL << 20;
+  Duration mirror_linger = std::chrono::seconds(5);
+
   static std::uint64_t half_of_the_machines_memory() noexcept;
 };
 
-// How a value is written in the file: in quotes, as a plain integer, or as either.
-enum class ValueForm : std::uint8_t { text, integer, integer_or_text };
+// How a value is written in the file: in quotes, as a plain integer, as either, as true or false
+// (its flag stands alone), or as a list of texts in quotes.
+enum class ValueForm : std::uint8_t { text, integer, integer_or_text, boolean, list };
 
 struct ConfigKey {
   std::string_view name;   // "max_streams"
   std::string_view value;  // what stands for the value in the help text: "COUNT"
   std::string_view help;
   ValueForm form;
-  // Takes over `text`; the failure says what is wrong with it, without naming the key.
+  // Takes over `text`, for lists one element; the failure says what is wrong with it, without
+  // naming the key.
   Result<void> (*set)(Config& config, std::string_view text);
+  // Lists only: makes it an empty one, before its elements are set.
+  void (*clear)(Config& config) = nullptr;
+  std::string_view flag_name = {};  // where the flag is not called as the key: "peer"
+
+  std::string flag() const;  // "--max-streams"
 };
 
 // In the order in which help text and documentation list them.

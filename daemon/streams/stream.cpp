@@ -189,6 +189,7 @@ StreamInfo Stream::info() const {
   info.property_bytes = property_share_.bytes();
   info.incarnation = mapping_->identity().incarnation;
   info.creator_pid = plan_.creator_pid;
+  info.channels = channels_;
   fill_figures(*mapping_, info);
   return info;
 }

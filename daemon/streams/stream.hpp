@@ -109,6 +109,11 @@ class Stream {
   Result<std::string> property() const;
   Result<void> set_property(std::string_view property, MemoryBudget& budget);
 
+  // How many connections from other hosts carry this stream now.
+  std::uint32_t channels() const noexcept { return channels_; }
+  void add_channel() noexcept { ++channels_; }
+  void remove_channel() noexcept { --channels_; }
+
   // So that no later offer brings it back.
   Result<void> mark_removed();
   bool removed() const noexcept { return removed_; }
@@ -133,6 +138,7 @@ class Stream {
   std::shared_ptr<const ring::RingMapping> mapping_;  // read-only
   MemoryShare share_, property_share_;                // of ring and type; of the property
   bool removed_ = false;
+  std::uint32_t channels_ = 0;
   DoorbellObserver* doorbell_observer_ = nullptr;
 };
 

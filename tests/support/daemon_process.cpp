@@ -11,6 +11,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cstdio>
 #include <cstdlib>
@@ -119,11 +120,38 @@ Finished run(const std::vector<std::string>& argv, const std::vector<std::string
   return result;
 }
 
+namespace {
+
+bool listens(const std::vector<std::string>& words) {
+  return std::any_of(words.begin(), words.end(), [](const std::string& word) {
+    return word == "--listen" || word.starts_with("--listen=") || word == "--config";
+  });
+}
+
+// From the status line "..., listening at A, B".
+std::vector<std::string> addresses_in(const std::string& text) {
+  constexpr std::string_view kMark = "listening at ";
+  std::vector<std::string> addresses;
+  std::size_t at = text.find(kMark);
+  if (at == text.npos) return addresses;
+  for (at += kMark.size();; at += 2) {
+    const std::size_t end = std::min(text.find_first_of(",\n", at), text.size());
+    addresses.push_back(text.substr(at, end - at));
+    at = end;
+    if (text.compare(at, 2, ", ") != 0) return addresses;
+  }
+}
+
+}  // namespace
+
 DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& host)
     : dir_(make_temp_dir()) {
   argv_ = {built("daemon/dssmd"), "--runtime-dir", dir_, "--name", host};
   argv_.insert(argv_.end(), extra.begin(), extra.end());
+  if (!listens(extra)) argv_.insert(argv_.end(), {"--listen", "127.0.0.1:0"});
   start();
+  // Whoever knows the address finds it there after a restart, too.
+  if (!listens(extra) && !addresses_.empty()) argv_.back() = addresses_.front();
 }
 
 void DaemonProcess::start() {
@@ -138,9 +166,10 @@ void DaemonProcess::start() {
   pid_ = test::start(argv_, {"NOTIFY_SOCKET=" + notify_path});
   for (;;) {  // a daemon that ends instead of answering is seen by its status
     pollfd fd{notify, POLLIN, 0};
-    char text[256] = {};
+    char text[4096] = {};
     if (::poll(&fd, 1, 100) > 0 && ::recv(notify, text, sizeof text - 1, 0) > 0 &&
         std::strstr(text, "READY=1")) {
+      addresses_ = addresses_in(text);
       break;
     }
     if (::waitpid(pid_, nullptr, WNOHANG) == pid_) {

@@ -35,7 +35,8 @@ int wait_for(pid_t pid);
 class DaemonProcess {
  public:
   // Starts `dssmd --runtime-dir DIR --name HOST extra...` and waits until it says that it is ready
-  // (sd_notify's READY=1). Ends the test program with a text when it does not come up.
+  // (sd_notify's READY=1). Ends the test program with a text when it does not come up. Unless
+  // `extra` says where to listen for other hosts, it is at any free port of 127.0.0.1.
   explicit DaemonProcess(std::vector<std::string> extra = {}, const std::string& host = "pc1");
   DaemonProcess(const DaemonProcess&) = delete;
   DaemonProcess& operator=(const DaemonProcess&) = delete;
@@ -46,6 +47,11 @@ class DaemonProcess {
   std::string environment() const { return "DSSM_SOCKET=" + socket_path(); }
   pid_t pid() const { return pid_; }
 
+  // Where it listens for other hosts, "127.0.0.1:40123"; the first one. After a restart it is there
+  // again.
+  std::string address() const { return addresses_.empty() ? "" : addresses_.front(); }
+  const std::vector<std::string>& addresses() const { return addresses_; }
+
   void kill_hard();  // SIGKILL, and waits for its end
   int stop();        // SIGTERM, and its exit status
   void start();      // again, in the same folder
@@ -53,6 +59,7 @@ class DaemonProcess {
  private:
   std::string dir_;
   std::vector<std::string> argv_;
+  std::vector<std::string> addresses_;
   pid_t pid_ = -1;
 };
 

@@ -70,14 +70,15 @@ TEST(Start, TellsThatItIsReadyWithHostAndSocket) {
   if (pid == 0) {
     ::dup2(ends[1], 2);
     const std::string program = built("daemon/dssmd");
-    ::execl(program.c_str(), "dssmd", "--runtime-dir", dir.c_str(), "--name", "pc9", nullptr);
+    ::execl(program.c_str(), "dssmd", "--runtime-dir", dir.c_str(), "--name", "pc9", "--listen", "",
+            nullptr);
     ::_exit(127);
   }
   ::close(ends[1]);
   std::string text;
   char c = 0;
   while (text.find('\n') == text.npos && ::read(ends[0], &c, 1) == 1) text += c;
-  EXPECT_EQ(text, "dssmd: ready, host 'pc9', socket '" + dir + "/dssmd.sock'\n");
+  EXPECT_EQ(text, "dssmd: ready, host 'pc9', socket '" + dir + "/dssmd.sock', no network\n");
   ::kill(pid, SIGTERM);
   EXPECT_EQ(wait_for(pid), 0);
   ::close(ends[0]);

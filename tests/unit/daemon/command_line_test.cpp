@@ -24,9 +24,7 @@ TEST(CommandLine, HasAFlagForEveryKey) {
   ASSERT_TRUE(help);
   EXPECT_EQ(help->action, CommandLine::Action::print);
   for (const ConfigKey& key : config_keys()) {
-    std::string flag = "--" + std::string(key.name);
-    std::replace(flag.begin(), flag.end(), '_', '-');
-    EXPECT_NE(help->text.find(flag + " "), std::string::npos) << flag;
+    EXPECT_NE(help->text.find(key.flag() + " "), std::string::npos) << key.flag();
   }
 }
 
@@ -45,6 +43,30 @@ TEST(CommandLine, LetsAFlagWinOverTheFile) {
   EXPECT_EQ(line->config.name, "from-flag");
   EXPECT_EQ(line->config.max_streams, 5u);
   EXPECT_EQ(line->action, CommandLine::Action::run);
+  test::remove_tree(dir);
+}
+
+TEST(CommandLine, TakesAListFromARepeatedFlagInPlaceOfTheFiles) {
+  const std::string dir = test::make_temp_dir(), path = dir + "/dssmd.conf";
+  std::ofstream(path) << "peers = [\"pc7\", \"pc8\"]\nlisten = [\"127.0.0.1:5\"]\n";
+  const Result<CommandLine> line = parse({"--config", path.c_str(), "--peer", "pc2", "--insecure",
+                                          "--peer", "pc3:77", "--listen", ""});
+  ASSERT_TRUE(line) << line.error().message;
+  const std::vector<wire::Address> peers = {{"pc2", 13776}, {"pc3", 77}};
+  EXPECT_EQ(line->config.peers, peers);
+  EXPECT_TRUE(line->config.insecure);
+  ASSERT_TRUE(line->config.listen);
+  EXPECT_TRUE(line->config.listen->empty());
+  test::remove_tree(dir);
+}
+
+TEST(CommandLine, LetsAFlagTakeBackWhatTheFileAllows) {
+  const std::string dir = test::make_temp_dir(), path = dir + "/dssmd.conf";
+  std::ofstream(path) << "insecure = true\n";
+  const Result<CommandLine> line = parse({"--config", path.c_str(), "--insecure=false"});
+  ASSERT_TRUE(line) << line.error().message;
+  EXPECT_FALSE(line->config.insecure);
+  EXPECT_FALSE(parse({"--config", path.c_str(), "--insecure=false", "--peer", "pc2"}));
   test::remove_tree(dir);
 }
 

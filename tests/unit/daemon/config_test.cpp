@@ -37,6 +37,13 @@ max_opens = 13
 max_opens_per_client = 14
 max_property = 15
 recovery_grace = "16 ms"
+listen = ["127.0.0.1:17", "[::]:18", "::1"]
+peers = ["pc2", "10.0.0.2:19"]
+insecure = true
+max_connections = 20
+max_connections_per_host = 21
+max_peer_memory = "22 MiB"
+mirror_linger = "23 s"
 )",
                                                     "dssmd.conf");
   ASSERT_TRUE(applied) << applied.error().message;
@@ -52,6 +59,15 @@ recovery_grace = "16 ms"
   EXPECT_EQ(config.max_opens_per_client, 14u);
   EXPECT_EQ(config.max_property_bytes, 15u);
   EXPECT_EQ(config.recovery_grace, std::chrono::milliseconds(16));
+  const std::vector<wire::Address> listen = {{"127.0.0.1", 17}, {"::", 18}, {"::1", 13776}};
+  EXPECT_EQ(config.listen, listen);
+  const std::vector<wire::Address> peers = {{"pc2", 13776}, {"10.0.0.2", 19}};
+  EXPECT_EQ(config.peers, peers);
+  EXPECT_TRUE(config.insecure);
+  EXPECT_EQ(config.max_connections, 20u);
+  EXPECT_EQ(config.max_connections_per_host, 21u);
+  EXPECT_EQ(config.max_peer_memory_bytes, 22u << 20);
+  EXPECT_EQ(config.mirror_linger, std::chrono::seconds(23));
 }
 
 TEST(Config, TakesAnEmptyFile) { EXPECT_EQ(mistakes_in(""), ""); }
@@ -73,6 +89,44 @@ TEST(Config, NamesLineAndKeyOfAWrongType) {
   EXPECT_NE(mistakes_in("[name]\nx = 1\n").find("a table stands"), std::string::npos);
   EXPECT_NE(mistakes_in("max_clients = 1.5\n").find("a number with a point"), std::string::npos);
   EXPECT_NE(mistakes_in("max_clients = true\n").find("true or false"), std::string::npos);
+}
+
+TEST(Config, NamesLineAndKeyOfWhatIsWrongInAList) {
+  EXPECT_EQ(mistakes_in("listen = \"127.0.0.1\"\n"),
+            "dssmd.conf:1: key 'listen': a text stands where a list of texts in quotes belongs");
+  EXPECT_EQ(mistakes_in("peers = [\"pc2\", 5]\n"),
+            "dssmd.conf:1: key 'peers': a whole number stands where a text in quotes belongs");
+  EXPECT_EQ(mistakes_in("insecure = \"yes\"\n"),
+            "dssmd.conf:1: key 'insecure': a text stands where true or false belongs");
+  EXPECT_NE(mistakes_in("peers = [\"pc2:99999\"]\n").find("'99999' is no port"), std::string::npos);
+  EXPECT_NE(mistakes_in("peers = [\"pc2:0\"]\n").find("port 0"), std::string::npos);
+  EXPECT_NE(mistakes_in("listen = [\"pc1\"]\n").find("'pc1' is a name"), std::string::npos);
+}
+
+TEST(Config, TellsNoNetworkFromNothingSaid) {
+  Config config;
+  EXPECT_FALSE(config.listen);
+  ASSERT_TRUE(apply_text_untrusted(config, "listen = []", "dssmd.conf"));
+  ASSERT_TRUE(config.listen);
+  EXPECT_TRUE(config.listen->empty());
+}
+
+TEST(Config, AsksForInsecureWhereAnAddressIsNotOnThisPc) {
+  const auto finished = [](const std::string& text) {
+    Config config;
+    config.name = "pc1";
+    const Result<void> applied = apply_text_untrusted(config, text, "dssmd.conf");
+    EXPECT_TRUE(applied) << applied.error().message;
+    const Result<void> done = finish(config);
+    return done ? std::string() : done.error().message;
+  };
+  EXPECT_EQ(finished("listen = [\"127.0.0.1\", \"127.9.9.9:5\", \"[::1]:0\"]"), "");
+  EXPECT_EQ(finished("peers = [\"localhost:5\", \"127.0.0.1\"]"), "");
+  const std::string refused = finished("listen = [\"0.0.0.0:5\"]\npeers = [\"pc2\"]");
+  EXPECT_NE(refused.find("listen '0.0.0.0:5', peer 'pc2:13776'"), std::string::npos) << refused;
+  EXPECT_NE(refused.find("insecure = true"), std::string::npos) << refused;
+  EXPECT_NE(finished("listen = [\"[::]:5\"]"), "");
+  EXPECT_EQ(finished("listen = [\"0.0.0.0:5\"]\npeers = [\"pc2\"]\ninsecure = true"), "");
 }
 
 TEST(Config, NamesLineKeyAndRangeOfAValueOutOfRange) {

@@ -1,0 +1,40 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The TCP sockets on which other hosts and remote programs reach this dssmd.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "core/wire/address.hpp"
+#include "daemon/service/log.hpp"
+
+namespace dssm::daemon {
+
+class NetworkListener {
+ public:
+  // Listens at the configured addresses, which are numbers; an empty list: nowhere. Nothing
+  // configured: at the default port of 127.0.0.1 and ::1, as far as this PC has them and no other
+  // dssmd took the port before; what is missing is logged as a warning.
+  //   fails  naming the configured address that cannot be had
+  static Result<NetworkListener> open(const std::optional<std::vector<wire::Address>>& configured,
+                                      Logger& logger);
+
+  const std::vector<UniqueFd>& sockets() const noexcept { return sockets_; }
+
+  // Where it listens, with the port that the system chose where 0 was asked for.
+  const std::vector<std::string>& addresses() const noexcept { return addresses_; }
+  std::string str() const;  // "listening at 127.0.0.1:13776, [::1]:13776", "no network"
+
+ private:
+  NetworkListener() = default;
+  Result<void> add(const wire::Address& address);
+
+  std::vector<UniqueFd> sockets_;
+  std::vector<std::string> addresses_;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,27 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What dssmd tells of the streams of this host: in the same words to its own programs and to other
+// hosts.
+#pragma once
+
+#include <cstddef>
+
+#include "common.pb.h"
+#include "daemon/streams/open_table.hpp"
+#include "daemon/streams/registry.hpp"
+
+namespace dssm::daemon {
+
+// The stream as it is at this moment, with how many programs and channels use it.
+void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out);
+
+// The same, with the programs of this host that use it.
+void describe_with_users(const Stream& stream, const OpenTable& opens, proto::Stream& out);
+
+// All streams in the order of creation. From `max_bytes` on their types' fields are left out: a
+// list has to fit into one frame, and there are few who want the fields of thousands of streams at
+// once.
+void describe_all(const Registry& registry, const OpenTable& opens, std::size_t max_bytes,
+                  proto::StreamList& out);
+
+}  // namespace dssm::daemon
