@@ -1,28 +1,45 @@
 # SPDX-License-Identifier: Apache-2.0
 #
-# bash completion for dssmctl(1): verbs, options, and the names of the streams that there are, as
-# `dssmctl ls --names` tells them. Works with and without the bash-completion package, whose helper
-# functions it does not need. A test compares the words below with `dssmctl --help`.
+# bash completion for dssmctl(1): verbs, options, and the names of the streams and hosts that there
+# are, as `dssmctl ls --names` and `dssmctl hosts --names` tell them. Works with and without the
+# bash-completion package, whose helper functions it does not need. A test compares the words below
+# with `dssmctl --help`.
 
-# The streams' names, one per line. $1: the words of the command line, for --socket.
-_dssmctl_streams() {
+# What dssmctl prints for the words given here. From the command line: --socket.
+_dssmctl_ask() {
   local socket=() i
   for ((i = 1; i + 1 < ${#words[@]}; ++i)); do
     [[ ${words[i]} == --socket ]] && socket=(--socket "${words[i + 1]}")
   done
-  "${words[0]}" "${socket[@]}" ls --names 2>/dev/null
+  "${words[0]}" "${socket[@]}" "$@" 2>/dev/null
+}
+
+# The names that open a stream, one per line; behind an @ that is typed already, all hosts.
+_dssmctl_streams() {
+  _dssmctl_ask ls --names
+  _dssmctl_at_hosts
+}
+
+_dssmctl_at_hosts() {
+  local host typed=${cur//\\/}
+  [[ $typed == *@* ]] || return 0
+  while IFS= read -r host; do
+    printf '%s\n' "${typed%%@*}@$host"
+  done < <(_dssmctl_ask hosts --names)
 }
 
 # Puts those lines of standard input into COMPREPLY that begin with what is being typed, quoted
-# for the shell. Bash has split the word at colons: what stands before the last one is not to be
-# replaced, so it is cut off.
+# for the shell, each once. Bash has split the word at colons and at signs: what stands before the
+# last one is not to be replaced, so it is cut off.
 _dssmctl_offer() {
-  local line typed=${cur//\\/} before=""
-  [[ $typed == *:* && $COMP_WORDBREAKS == *:* ]] && before=${typed%"${typed##*:}"}
+  local line typed=${cur//\\/} before="" breaks=""
+  [[ $COMP_WORDBREAKS == *:* ]] && breaks+=":"
+  [[ $COMP_WORDBREAKS == *@* ]] && breaks+="@"
+  [[ -n $breaks && $typed == *[$breaks]* ]] && before=${typed%"${typed##*[$breaks]}"}
   while IFS= read -r line; do
     [[ -n $line && $line == "$typed"* ]] || continue
     printf -v line %q "${line#"$before"}"
-    COMPREPLY+=("$line")
+    [[ " ${COMPREPLY[*]} " == *" $line "* ]] || COMPREPLY+=("$line")
   done
 }
 
@@ -33,11 +50,11 @@ _dssmctl_offer_files() {
 
 _dssmctl() {
   COMPREPLY=()
-  # Bash's own words, with those put together again that it split at colons.
+  # Bash's own words, with those put together again that it split at colons and at signs.
   local words=() cword=0 i word glue=0
   for ((i = 0; i <= COMP_CWORD; ++i)); do
     word=${COMP_WORDS[i]}
-    if [[ $word == :* && ${#words[@]} -gt 1 ]]; then
+    if [[ $word == [:@]* && ${#words[@]} -gt 1 ]]; then
       words[-1]+=$word
       glue=1
     elif ((glue)); then
@@ -54,8 +71,8 @@ _dssmctl() {
   local verb="" positional=0
   for ((i = 1; i < cword; ++i)); do
     case ${words[i]} in
-      --socket | --sort | --at | --count | -n | --field | --wait | --window | -w | --interval | -i | \
-        --size | --depth | --life | --cycle | --type | --align | --offset | --speed | --time)
+      --socket | --sort | --at | --count | -n | -c | --field | --wait | --window | -w | --interval | \
+        -i | --size | --depth | --life | --cycle | --type | --align | --offset | --speed | --time)
         ((++i))
         ;;
       -*) ;;
@@ -75,11 +92,11 @@ _dssmctl() {
       return
       ;;
     --sort)
-      mapfile -t COMPREPLY < <(compgen -W "created name id size depth cycle rate age writers \
+      mapfile -t COMPREPLY < <(compgen -W "created name id host size depth cycle rate age writers \
         readers type memory" -- "$cur")
       return
       ;;
-    --at | --count | -n | --field | --wait | --window | -w | --interval | -i | --size | --depth | \
+    --at | --count | -n | -c | --field | --wait | --window | -w | --interval | -i | --size | --depth | \
       --life | --cycle | --type | --align | --offset | --speed | --time)
       return # a value that only the person knows
       ;;
@@ -88,7 +105,9 @@ _dssmctl() {
   local common="--help --json --socket" options=""
   case $verb in
     "") options="--version" ;;
-    ls) options="--names --reverse --sort" ;;
+    ls) options="--names --own --reverse --sort" ;;
+    hosts) options="--names" ;;
+    ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
     hz | bw | delay) options="--count --interval --wait --window" ;;
     create) options="--align --cycle --depth --life --size --type" ;;
@@ -102,10 +121,12 @@ _dssmctl() {
   case $verb in
     "")
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw create delay echo hz info ls playback property rm" -- "$cur")
+        "bw create delay echo hosts hz info ls ping playback property rm" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;
+    ping) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_ask hosts --names) ;;
+    create) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_at_hosts) ;;
     rm) _dssmctl_offer < <(_dssmctl_streams) ;;
     info | echo | hz | bw | delay)
       ((positional == 0)) && _dssmctl_offer < <(_dssmctl_streams)

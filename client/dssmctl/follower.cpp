@@ -12,22 +12,27 @@ Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out
   Follower follower(session, reader, out);
   Result<Session::Watch> watch =
       session.watch([suspicion = follower.suspicion_, id = reader.id()](const StreamEvent& event) {
-        if (event.stream.id == id && event.kind == StreamEvent::Kind::removed) {
-          suspicion->store(true, std::memory_order_relaxed);
-        }
+        if (event.stream.id != id) return;
+        suspicion->store(event.kind == StreamEvent::Kind::removed, std::memory_order_relaxed);
       });
   if (!watch) return std::move(watch).error();
   follower.watch_ = std::move(*watch);
   return follower;
 }
 
-// After a restart of dssmd a stream may look removed for a moment, until those who hold it have
-// offered it back, and one that is created anew at once goes on: only the answer that there is none
-// counts.
+// A stream that is created anew at once goes on, and after a restart of dssmd one may look removed
+// until those who hold it have offered it back: only the answer that there is none counts. A stream
+// of another host is also "removed" while that host is away, and then goes on in its mirror.
 bool Follower::removed() {
-  if (!suspicion_->exchange(false, std::memory_order_relaxed)) return false;
+  if (!suspicion_->load(std::memory_order_relaxed) || !session_.connected()) return false;
   const Result<StreamInfo> now = session_.info(reader_.id());
-  return !now && now.error().code == Errc::not_found;
+  if (!now) return now.error().code == Errc::not_found;
+  if (!now->mirror || now->mirror->state != "removed") {
+    gone_since_.reset();
+    return false;
+  }
+  if (!gone_since_) gone_since_ = MonoClock::now();
+  return MonoClock::now() - *gone_since_ >= kMayComeBack;
 }
 
 Follower::Wake Follower::wait(MonoTime deadline) {

@@ -40,9 +40,14 @@ class Follower {
   Session& session_;
   RawReader& reader_;
   Output& out_;
-  // Set by the session's thread when a stream of this name was removed. Shared with the callback,
-  // which moves with the watch.
+  // A stream of another host that is not there any more may be back in a moment: its dssmd was
+  // restarted, and the programs that hold the stream are about to offer it.
+  static constexpr Duration kMayComeBack = std::chrono::seconds(2);
+
+  // Set by the session's thread: whether a stream of this name was removed, and none came since.
+  // Shared with the callback, which moves with the watch.
   std::shared_ptr<std::atomic<bool>> suspicion_ = std::make_shared<std::atomic<bool>>(false);
+  std::optional<MonoTime> gone_since_;
   std::optional<Session::Watch> watch_;
 };
 

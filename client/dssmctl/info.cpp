@@ -53,18 +53,34 @@ void print_users(const StreamInfo& stream, Output& out) {
   table.print(out);
 }
 
+// Of another host's stream: the copy that this PC keeps of it, while somebody reads it here.
+void print_mirror(const MirrorInfo& mirror, Output& out) {
+  add_line(
+      out, "mirror",
+      escaped(mirror.state) + (mirror.error.empty() ? "" : ": " + escaped_message(mirror.error)));
+  add_line(out, "received",
+           std::to_string(mirror.received_samples) + " samples, " +
+               bytes_text(mirror.received_bytes) + ", up to tid " + std::to_string(mirror.newest));
+  add_line(out, "missing", std::to_string(mirror.gap_samples) + " samples");
+  add_line(out, "reconnects", std::to_string(mirror.reconnects));
+  add_line(out, "restarts", std::to_string(mirror.restarts));
+}
+
 void print_stream(const StreamInfo& stream, Output& out) {
   out.add(out.bold(escaped(stream.id.str())) + "\n");
+  add_line(out, "owner", "host " + escaped(stream.id.host));
   add_line(out, "type", escaped(stream.type.str()));
   add_line(out, "depth", std::to_string(stream.depth) + " slots");
   add_line(out, "cycle", duration_text(stream.cycle));
   print_samples(stream, out);
   add_line(out, "writers", std::to_string(stream.writers));
   add_line(out, "readers", std::to_string(stream.readers));
+  add_line(out, "channels", std::to_string(stream.channels) + " to other hosts");
   add_line(out, "memory", bytes_text(stream.memory_bytes));
   add_line(out, "property", stream.property_bytes ? bytes_text(stream.property_bytes) : "none");
   add_line(out, "incarnation", std::to_string(stream.incarnation));
   add_line(out, "created by", "pid " + std::to_string(stream.creator_pid));
+  if (stream.mirror) print_mirror(*stream.mirror, out);
   print_fields(stream, out);
   print_users(stream, out);
 }
@@ -72,8 +88,13 @@ void print_stream(const StreamInfo& stream, Output& out) {
 Result<void> print_daemon(Session& session, const Options& options, Output& out) {
   const Result<DaemonInfo> daemon = session.daemon();
   if (!daemon) return daemon.error();
+  const Result<std::vector<HostInfo>> hosts = session.hosts();
+  if (!hosts) return hosts.error();
+  const std::vector<std::string> addresses =
+      hosts->empty() ? std::vector<std::string>() : hosts->front().addresses;
   if (options.json) {
     out.add(json_document({{"host", daemon->host},
+                           {"addresses", addresses},
                            {"version", daemon->version},
                            {"pid", daemon->pid},
                            {"streams", daemon->streams},
@@ -83,6 +104,7 @@ Result<void> print_daemon(Session& session, const Options& options, Output& out)
   }
   out.add(out.bold("dssmd " + escaped(daemon->version)) + "\n");
   add_line(out, "host", escaped(daemon->host));
+  add_line(out, "addresses", addresses.empty() ? "none" : list_text(addresses));
   add_line(out, "pid", std::to_string(daemon->pid));
   add_line(out, "streams", std::to_string(daemon->streams));
   add_line(out, "memory",

@@ -4,6 +4,7 @@
 // as null, everything outside ASCII as \u escapes. Bytes that are no UTF-8 become U+FFFD.
 #pragma once
 
+#include <dssm/time.hpp>
 #include <nlohmann/json.hpp>
 #include <string>
 
@@ -16,6 +17,11 @@ inline std::string json_text(const Json& json) {
 }
 
 inline std::string json_line(const Json& json) { return json_text(json) + "\n"; }
+
+// A bound on a clock's or stamp's error [ns]; null: unknown.
+inline Json bound_json(Duration bound) {
+  return bound == kUnknownClockError ? Json() : Json(to_ns(bound));
+}
 
 // A document of its own: indented, because people look at it too.
 inline std::string json_document(const Json& json) {

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl ls: all streams, in the order of their creation unless told otherwise. One question to
-// dssmd, one write; it is run in loops and by the shell's completion, so it has to be quick.
+// dssmctl ls: all streams of all hosts, own ones first, each host's in the order of their creation
+// unless told otherwise. One question to dssmd (two for names), one write; it is run in loops and
+// by the shell's completion, so it has to be quick.
 #include <algorithm>
 
 #include "client/dssmctl/names.hpp"
@@ -27,6 +28,7 @@ void sort_streams(std::vector<StreamInfo>& streams, const std::string& key) {
     return sort_by(streams, [](const auto& s) { return std::pair(s.id.name, s.id.id); });
   if (key == "id")
     return sort_by(streams, [](const auto& s) { return std::pair(s.id.id, s.id.name); });
+  if (key == "host") return sort_by(streams, [](const auto& s) { return s.id.host; });
   if (key == "size") return sort_by(streams, [](const auto& s) { return s.type.payload_bytes; });
   if (key == "depth") return sort_by(streams, [](const auto& s) { return s.depth; });
   if (key == "cycle") return sort_by(streams, [](const auto& s) { return s.cycle; });
@@ -49,6 +51,7 @@ std::vector<std::string> row(const StreamInfo& stream, Time now) {
   return {
       escaped(stream.id.name),
       std::to_string(stream.id.id),
+      escaped(stream.id.host),
       std::to_string(stream.type.payload_bytes),
       std::to_string(stream.depth),
       duration_text(stream.cycle),
@@ -73,10 +76,21 @@ void print_json(const std::vector<StreamInfo>& streams, Time now, Output& out) {
   out.add("\n]}\n");
 }
 
+// A program must get a name as it is; a terminal must not.
+Result<void> print_names(Session& session, const std::vector<StreamInfo>& streams, Output& out) {
+  const Result<DaemonInfo> daemon = session.daemon();
+  if (!daemon) return daemon.error();
+  for (const std::string& name : opening_names(streams, daemon->host)) {
+    out.add((out.terminal() ? escaped(name) : name) + "\n");
+  }
+  return {};
+}
+
 void print_table(const std::vector<StreamInfo>& streams, Time now, Output& out) {
   constexpr auto kRight = Table::Align::right;
   Table table({{"NAME"},
                {"ID", kRight},
+               {"HOST"},
                {"SIZE", kRight},
                {"DEPTH", kRight},
                {"CYCLE", kRight},
@@ -94,23 +108,14 @@ void print_table(const std::vector<StreamInfo>& streams, Time now, Output& out) 
 Result<void> run_ls(const Options& options, Output& out) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
-  Result<std::vector<StreamInfo>> streams = session->list();
+  Result<std::vector<StreamInfo>> streams = options.own ? session->list_own() : session->list();
   if (!streams) return std::move(streams).error();
   sort_streams(*streams, options.sort);
   if (options.reverse) std::reverse(streams->begin(), streams->end());
 
+  if (options.names) return print_names(*session, *streams, out);
   const Time now = WallClock::now();
-  if (options.json) {
-    print_json(*streams, now, out);
-  } else if (options.names) {
-    // A program must get the name as it is; a terminal must not.
-    for (const StreamInfo& stream : *streams) {
-      const std::string name = short_name(stream.id);
-      out.add((out.terminal() ? escaped(name) : name) + "\n");
-    }
-  } else {
-    print_table(*streams, now, out);
-  }
+  options.json ? print_json(*streams, now, out) : print_table(*streams, now, out);
   return {};
 }
 

@@ -25,6 +25,10 @@ Result<void> run(const Options& options, Output& out) {
   switch (options.verb) {
     case Verb::ls:
       return run_ls(options, out);
+    case Verb::hosts:
+      return run_hosts(options, out);
+    case Verb::ping:
+      return run_ping(options, out);
     case Verb::info:
       return run_info(options, out);
     case Verb::echo:

@@ -84,22 +84,35 @@ void add_wait(CLI::App* app, Options& options) {
 }
 
 void add_ls(CLI::App& app, Options& options) {
-  CLI::App* ls = app.add_subcommand("ls", "list all streams");
+  CLI::App* ls = app.add_subcommand("ls", "list the streams of all hosts");
+  ls->add_flag("--own", options.own, "only those of this host");
   ls->add_flag("--names", options.names, "only names, one per line, for programs");
   ls->add_option("--sort", options.sort,
-                 "created, name, id, size, depth, cycle, rate, age, writers, readers, type or "
-                 "memory (default: created)")
+                 "created, name, id, host, size, depth, cycle, rate, age, writers, readers, type "
+                 "or memory (default: created)")
       ->type_name("KEY")
       ->check(CLI::Validator(
           [](std::string& key) -> std::string {
-            for (const char* known : {"created", "name", "id", "size", "depth", "cycle", "rate",
-                                      "age", "writers", "readers", "type", "memory"}) {
+            for (const char* known : {"created", "name", "id", "host", "size", "depth", "cycle",
+                                      "rate", "age", "writers", "readers", "type", "memory"}) {
               if (key == known) return {};
             }
             return "'" + escaped(key) + "' is no key to sort by";
           },
           ""));
   ls->add_flag("-r,--reverse", options.reverse, "the other way round");
+}
+
+void add_hosts(CLI::App& app, Options& options) {
+  CLI::App* hosts = app.add_subcommand("hosts", "list the hosts, and how they are reached");
+  hosts->add_flag("--names", options.names, "only names, one per line, for programs");
+  CLI::App* ping = app.add_subcommand("ping", "ask another host's dssmd for a sign of life");
+  ping->add_option("HOST", options.host, "a name that `dssmctl hosts` shows")
+      ->required()
+      ->type_name("");
+  add_whole(ping, "-c,--count", "N", "end after N questions", options.count, 1);
+  add_seconds(ping, "-i,--interval", "time between two questions (default: 1)", options.interval,
+              Range::positive);
 }
 
 void add_echo(CLI::App& app, Options& options) {
@@ -142,7 +155,7 @@ void add_meter(CLI::App& app, const std::string& name, const std::string& descri
 
 void add_create(CLI::App& app, Options& options) {
   CLI::App* create = app.add_subcommand("create", "create a stream");
-  create->add_option("NAME", options.stream, "its name, as NAME or NAME:ID")
+  create->add_option("NAME", options.stream, "its name, as NAME, NAME:ID or NAME:ID@HOST")
       ->required()
       ->type_name("");
   add_whole(create, "--size", "BYTES", "bytes per sample", options.payload_bytes, 1,
@@ -207,6 +220,7 @@ void add_all(CLI::App& app, Options& options) {
       ->type_name("PATH");
   app.add_flag("--json", options.json, "output for programs");
   add_ls(app, options);
+  add_hosts(app, options);
   CLI::App* info = app.add_subcommand("info", "all about one stream, or about dssmd");
   info->add_option("STREAM", options.stream, kStreamHelp)->type_name("");
   add_echo(app, options);
@@ -249,6 +263,8 @@ std::string verb_name(const CLI::App& app) {
 std::optional<Verb> verb_of(std::string_view name) {
   static constexpr std::pair<std::string_view, Verb> kVerbs[] = {
       {"ls", Verb::ls},
+      {"hosts", Verb::hosts},
+      {"ping", Verb::ping},
       {"info", Verb::info},
       {"echo", Verb::echo},
       {"hz", Verb::hz},
@@ -283,7 +299,7 @@ CommandLine usage_error(const CLI::App& app, const std::string& complaint) {
 
 CommandLine parse_command_line(int argc, const char* const* argv) {
   Options options;
-  CLI::App app("Show and manage the streams of this PC's dssmd.", "dssmctl");
+  CLI::App app("Show and manage streams of sensor samples, on this PC and on others.", "dssmctl");
   add_all(app, options);
   if (argc < 2) return {std::nullopt, app.help(), false};
   try {

@@ -14,6 +14,8 @@ namespace dssm::ctl {
 
 enum class Verb : unsigned char {
   ls,
+  hosts,
+  ping,
   info,
   echo,
   hz,
@@ -44,11 +46,15 @@ struct Options {
   Duration wait{};                   // echo, hz, bw, delay: how long for the stream to appear
 
   // ls
-  bool names = false;
+  bool own = false;    // only this host's
+  bool names = false;  // also for hosts
   std::string sort = "created";
   bool reverse = false;
 
-  // echo; `count` also for hz, bw, delay (reports)
+  // ping
+  std::string host;
+
+  // echo; `count` also for hz, bw, delay (reports) and ping (questions)
   std::optional<std::uint64_t> count;
   std::optional<Duration> at;
   bool at_counts_back = false;  // from the newest sample; `at` is then 0 or less
@@ -57,7 +63,7 @@ struct Options {
   bool full = false;
   std::vector<std::string> fields;
 
-  // hz, bw, delay
+  // hz, bw, delay; `interval` also for ping
   std::uint64_t window = 10'000;
   Duration interval = std::chrono::seconds(1);
 

@@ -73,9 +73,7 @@ void SamplePrinter::text_sample(const SampleInfo& info, std::span<const std::byt
             " samples were overwritten before they could be shown\n";
   }
   text += "tid: " + std::to_string(info.tid) + "\ntime: " + seconds_text(to_ns(info.time));
-  text += "\nclock_error: ";
-  text += info.clock_error == kUnknownClockError ? "unknown" : duration_text(info.clock_error);
-  text += '\n';
+  text += "\nclock_error: " + bound_text(info.clock_error) + "\n";
   const std::size_t shown = full_ ? std::numeric_limits<std::size_t>::max() : kShownElements;
   for (const Field& field : fields_) {
     text += escaped(field.name) + ": " + field_text(payload, field, shown) + "\n";
@@ -97,8 +95,7 @@ void SamplePrinter::json_sample(const SampleInfo& info, std::span<const std::byt
   json["stream"] = stream_.str();
   json["tid"] = info.tid;
   json["time_ns"] = to_ns(info.time);
-  json["clock_error_ns"] =
-      info.clock_error == kUnknownClockError ? Json() : Json(to_ns(info.clock_error));
+  json["clock_error_ns"] = bound_json(info.clock_error);
   json["lost"] = breaks.lost;
   json["restarts"] = breaks.restarts;
   if (fields_.empty()) {

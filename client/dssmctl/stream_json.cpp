@@ -5,6 +5,21 @@
 
 namespace dssm::ctl {
 
+namespace {
+
+Json mirror_json(const MirrorInfo& mirror) {
+  return {{"state", mirror.state},
+          {"newest_tid", mirror.newest != kNoTid ? Json(mirror.newest) : Json()},
+          {"received_samples", mirror.received_samples},
+          {"received_bytes", mirror.received_bytes},
+          {"gap_samples", mirror.gap_samples},
+          {"reconnects", mirror.reconnects},
+          {"restarts", mirror.restarts},
+          {"error", mirror.error.empty() ? Json() : Json(mirror.error)}};
+}
+
+}  // namespace
+
 Json stream_json(const StreamInfo& stream, Time now) {
   const bool written = stream.newest != kNoTid;
   const auto when_written = [&](std::int64_t value) { return written ? Json(value) : Json(); };
@@ -24,6 +39,7 @@ Json stream_json(const StreamInfo& stream, Time now) {
   json["newest_time_ns"] = when_written(to_ns(stream.newest_time));
   json["writers"] = stream.writers;
   json["readers"] = stream.readers;
+  json["channels"] = stream.channels;
   json["memory_bytes"] = stream.memory_bytes;
   json["property_bytes"] = stream.property_bytes;
   json["incarnation"] = stream.incarnation;
@@ -48,6 +64,7 @@ void add_details(Json& json, const StreamInfo& stream) {
                      {"uid", user.uid},
                      {"program", user.program}});
   }
+  json["mirror"] = stream.mirror ? mirror_json(*stream.mirror) : Json();
 }
 
 std::string_view role_name(Role role) { return role == Role::writer ? "writer" : "reader"; }

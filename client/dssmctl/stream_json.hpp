@@ -11,7 +11,7 @@ namespace dssm::ctl {
 
 Json stream_json(const StreamInfo& stream, Time now);
 
-// What `info` adds: fields and users.
+// What `info` adds: fields, users, and how the mirror is doing.
 void add_details(Json& json, const StreamInfo& stream);
 
 std::string_view role_name(Role role);

@@ -95,6 +95,12 @@ std::string escaped_message(std::string_view message) {
   return out;
 }
 
+std::string list_text(const std::vector<std::string>& texts) {
+  std::string out;
+  for (const std::string& text : texts) out.append(out.empty() ? "" : ", ").append(escaped(text));
+  return out;
+}
+
 std::string duration_text(Duration d) {
   const std::int64_t ns = to_ns(d);
   if (ns < 0) {
@@ -110,6 +116,10 @@ std::string duration_text(Duration d) {
   if (s < 2 * 3600) return two_units(s / 60, 'm', s % 60, 's');
   if (s < 48 * 3600) return two_units(s / 3600, 'h', s / 60 % 60, 'm');
   return two_units(s / 86400, 'd', s / 3600 % 24, 'h');
+}
+
+std::string bound_text(Duration bound) {
+  return bound == kUnknownClockError ? "unknown" : duration_text(bound);
 }
 
 std::string seconds_text(std::int64_t ns) {

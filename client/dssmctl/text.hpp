@@ -12,6 +12,7 @@
 #include <span>
 #include <string>
 #include <string_view>
+#include <vector>
 
 namespace dssm::ctl {
 
@@ -22,8 +23,14 @@ std::string escaped(std::string_view bytes);
 // The same for a message that is to be one line; backslashes stay, it may have been escaped before.
 std::string escaped_message(std::string_view message);
 
+// `texts`, escaped, with commas between them: "a, b".
+std::string list_text(const std::vector<std::string>& texts);
+
 // A duration with three digits and its unit: "1.25 ms", "2h05m". For people only.
 std::string duration_text(Duration d);
+
+// A bound on a clock's or stamp's error, as duration_text(), or "unknown".
+std::string bound_text(Duration bound);
 
 // Nanoseconds as exact seconds: "-1.500000000".
 std::string seconds_text(std::int64_t ns);

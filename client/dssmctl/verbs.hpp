@@ -12,6 +12,8 @@
 namespace dssm::ctl {
 
 Result<void> run_ls(const Options& options, Output& out);
+Result<void> run_hosts(const Options& options, Output& out);
+Result<void> run_ping(const Options& options, Output& out);
 Result<void> run_info(const Options& options, Output& out);
 Result<void> run_echo(const Options& options, Output& out);
 Result<void> run_hz(const Options& options, Output& out);

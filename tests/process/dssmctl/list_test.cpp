@@ -24,7 +24,8 @@ using Info = CtlTest;
 using Strings = std::vector<std::string>;
 
 TEST_F(Ls, ShowsOnlyTheHeaderWithoutStreams) {
-  EXPECT_EQ(output({"ls"}), "NAME  ID  SIZE  DEPTH  CYCLE  RATE  AGE  WRITERS  READERS  TYPE\n");
+  EXPECT_EQ(output({"ls"}),
+            "NAME  ID  HOST  SIZE  DEPTH  CYCLE  RATE  AGE  WRITERS  READERS  TYPE\n");
   EXPECT_EQ(output({"ls", "--names"}), "");
   EXPECT_EQ(json({"ls"}), Json::parse(R"({"streams":[]})"));
 }
@@ -41,11 +42,12 @@ TEST_F(Ls, ShowsWhatIsKnownOfEachStreamInAlignedColumns) {
   const Strings row = words_of(lines[1]);
   ASSERT_GE(row.size(), 12U);
   EXPECT_EQ(Strings(row.begin(), row.begin() + 8),
-            (Strings{"pose", "3", "16", "8", "10.0", "ms", "50.0", "Hz"}));
+            (Strings{"pose", "3", "pc1", "16", "8", "10.0", "ms", "50.0"}));
   EXPECT_EQ(Strings(row.end() - 3, row.end()), (Strings{"1", "1", "Pose"}));
   const Strings other = words_of(lines[2]);
-  EXPECT_EQ(Strings(other.begin(), other.begin() + 10),
-            (Strings{"a_rather_long_name", "0", "100", "4", "10.0", "ms", "-", "-", "1", "0"}));
+  EXPECT_EQ(
+      Strings(other.begin(), other.begin() + 11),
+      (Strings{"a_rather_long_name", "0", "pc1", "100", "4", "10.0", "ms", "-", "-", "1", "0"}));
   // Numbers end where their column's title ends, texts begin where it begins.
   const std::size_t size_end = lines[0].find("SIZE") + 4;
   EXPECT_EQ(lines[1].substr(size_end - 2, 2), "16");

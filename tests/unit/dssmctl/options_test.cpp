@@ -65,6 +65,15 @@ TEST(CommandLine, ReadsTheSizesOfAStreamToCreate) {
   EXPECT_EQ(options.cycle, 25ms);
 }
 
+TEST(CommandLine, ReadsHowToPing) {
+  const Options options = options_of({"ping", "pc2", "-c", "3", "-i", "0.5"});
+  EXPECT_EQ(options.verb, Verb::ping);
+  EXPECT_EQ(options.host, "pc2");
+  EXPECT_EQ(options.count, 3U);
+  EXPECT_EQ(options.interval, 500ms);
+  EXPECT_EQ(options_of({"ping", "pc2"}).interval, 1s);
+}
+
 TEST(CommandLine, SaysWhatIsWrongAndWhereHelpIs) {
   const struct {
     std::vector<const char*> words;
@@ -93,6 +102,9 @@ TEST(CommandLine, RefusesWhatDoesNotFitTogether) {
       {"echo", "s", "--count", "0"},
       {"echo", "s", "--wait", "-1"},
       {"ls", "--names", "--json"},
+      {"hosts", "--names", "--json"},
+      {"ping"},
+      {"ping", "pc2", "--interval", "0"},
       {"hz", "s", "--window", "1"},
       {"hz", "s", "--interval", "0"},
       {"create", "s", "--size", "4"},

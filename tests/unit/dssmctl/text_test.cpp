@@ -40,6 +40,17 @@ TEST(Text, WritesDurationsWithThreeDigitsAndAUnit) {
   EXPECT_EQ(duration_text(Duration::min()), "-" + duration_text(Duration::max()));
 }
 
+TEST(Text, WritesBoundsThatNobodyKnows) {
+  EXPECT_EQ(bound_text(1500us), "1.50 ms");
+  EXPECT_EQ(bound_text(kUnknownClockError), "unknown");
+}
+
+TEST(Text, WritesListsEscaped) {
+  EXPECT_EQ(list_text({"pc2:13776", "10.0.0.2:13776"}), "pc2:13776, 10.0.0.2:13776");
+  EXPECT_EQ(list_text({"\x1b[2J"}), "\\x1b[2J");
+  EXPECT_EQ(list_text({}), "");
+}
+
 TEST(Text, WritesSecondsExactlyOverTheWholeRange) {
   EXPECT_EQ(seconds_text(0), "0.000000000");
   EXPECT_EQ(seconds_text(1'700'000'000'123'456'789), "1700000000.123456789");

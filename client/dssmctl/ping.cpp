@@ -1,0 +1,130 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmctl ping: asks the dssmd of another host for a sign of life, over the connection that this
+// PC's dssmd keeps to it, in the manner of ping(8). The time is from dssmd to dssmd: how long a
+// request of one to the other takes.
+#include <algorithm>
+#include <cmath>
+#include <thread>
+
+#include "client/dssmctl/json.hpp"
+#include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/statistics.hpp"
+#include "client/dssmctl/stop_signal.hpp"
+#include "client/dssmctl/text.hpp"
+#include "client/dssmctl/verbs.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+// For the summary: more answers than anybody waits for; then the newest ones.
+constexpr std::size_t kKeptAnswers = 1'000'000;
+
+// A signal between the look at its mark and the sleep is noticed so late.
+constexpr Duration kLookUp = std::chrono::milliseconds(100);
+
+class Ping {
+ public:
+  Ping(const Options& options, Output& out) : host_(options.host), json_(options.json), out_(out) {}
+
+  void on_answer(const RoundTrip& answer) {
+    ++asked_;
+    ++answered_;
+    times_.add(answer.round_trip);
+    const std::string address = answer.address.empty() ? "this PC" : answer.address;
+    if (json_) {
+      return out_.add(json_line({{"host", host_},
+                                 {"seq", asked_},
+                                 {"address", answer.address.empty() ? Json() : Json(address)},
+                                 {"round_trip_ns", to_ns(answer.round_trip)}}));
+    }
+    out_.add("answer from " + escaped(host_) + " (" + escaped(address) + "): seq=" +
+             std::to_string(asked_) + " time=" + duration_text(answer.round_trip) + "\n");
+  }
+
+  void on_silence(const Error& why) {
+    ++asked_;
+    if (json_) {
+      return out_.add(json_line(
+          {{"host", host_}, {"seq", asked_}, {"round_trip_ns", Json()}, {"error", why.message}}));
+    }
+    out_.add("no answer: seq=" + std::to_string(asked_) + ": " + escaped_message(why.message) +
+             "\n");
+  }
+
+  // The last words.
+  void summary() {
+    const Statistics times = times_.statistics();
+    if (json_) {
+      const auto known = [&](auto value) { return times.count > 0 ? Json(value) : Json(); };
+      return out_.add(json_line({{"host", host_},
+                                 {"asked", asked_},
+                                 {"answered", answered_},
+                                 {"round_trip_min_ns", known(to_ns(times.min))},
+                                 {"round_trip_mean_ns", known(times.mean_ns)},
+                                 {"round_trip_max_ns", known(to_ns(times.max))},
+                                 {"round_trip_std_dev_ns", known(times.std_dev_ns)}}));
+    }
+    out_.add("--- " + escaped(host_) + ": asked " + std::to_string(asked_) + " times, answered " +
+             std::to_string(answered_) + " ---\n");
+    if (times.count == 0) return;
+    const auto rounded = [](double ns) { return duration_text(Duration(std::llround(ns))); };
+    out_.add("round trip min/avg/max/mdev: " + duration_text(times.min) + " / " +
+             rounded(times.mean_ns) + " / " + duration_text(times.max) + " / " +
+             rounded(times.std_dev_ns) + "\n");
+  }
+
+  std::uint64_t asked() const { return asked_; }
+  std::uint64_t answered() const { return answered_; }
+
+ private:
+  const std::string& host_;
+  bool json_;
+  Output& out_;
+  std::uint64_t asked_ = 0, answered_ = 0;
+  Window times_{kKeptAnswers};
+};
+
+// Whether dssmd knows a host of that name, even if it does not answer.
+bool is_known(Session& session, const std::string& name) {
+  const Result<std::vector<HostInfo>> hosts = session.hosts();
+  return hosts && std::any_of(hosts->begin(), hosts->end(),
+                              [&](const HostInfo& host) { return host.name == name; });
+}
+
+// Sleeps until `due`. Whether to go on: false when told to stop or when nobody reads our output.
+bool wait_until(MonoTime due, Output& out) {
+  while (MonoClock::now() < due) {
+    if (stop_requested() || out.reader_gone()) return false;
+    const Duration rest = std::min(due - MonoClock::now(), kLookUp);
+    std::this_thread::sleep_for(rest);
+  }
+  return true;
+}
+
+}  // namespace
+
+Result<void> run_ping(const Options& options, Output& out) {
+  catch_stop_signals();
+  Result<Session> session = connect(options);
+  if (!session) return std::move(session).error();
+  Ping ping(options, out);
+  MonoTime due = MonoClock::now();
+  do {
+    const Result<RoundTrip> answer = session->ping(options.host);
+    if (answer) {
+      ping.on_answer(*answer);
+    } else if (ping.asked() == 0 && !is_known(*session, options.host)) {
+      return answer.error();
+    } else {
+      ping.on_silence(answer.error());
+    }
+    due = std::max(due + options.interval, MonoClock::now());
+  } while (out.flush() && ping.asked() != options.count && wait_until(due, out));
+  ping.summary();
+  if (ping.answered() > 0) return {};
+  return Error{Errc::daemon_away,
+               "host '" + options.host + "' did not answer; see `dssmctl hosts`"};
+}
+
+}  // namespace dssm::ctl
