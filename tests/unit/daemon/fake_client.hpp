@@ -1,0 +1,115 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A program of this PC as LocalService sees it, without a socket, and the requests that tests make.
+#pragma once
+
+#include <gtest/gtest.h>
+
+#include <cstring>
+#include <deque>
+#include <string>
+#include <vector>
+
+#include "core/wire/frame.hpp"
+#include "daemon/local/local_service.hpp"
+#include "tests/unit/daemon/daemon_fixtures.hpp"
+
+namespace dssm::daemon {
+
+class SilentLogger final : public Logger {
+ public:
+  void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
+};
+
+// A client without a socket: what it is sent, decoded.
+class FakeClient final : public ClientOutput {
+ public:
+  FakeClient(LocalService& service, std::int32_t pid)
+      : service_(service), number_(service.connect(pid, 1000, *this)) {}
+  ~FakeClient() { service_.disconnect(number_); }
+
+  void send(const std::string& frame, std::vector<UniqueFd> descriptors) override {
+    wire::FrameBuffer buffer(wire::kMaxLocalFrameBytes);
+    for (std::string_view rest = frame; !rest.empty();) {
+      const auto space = buffer.space();
+      const std::size_t part = std::min(space.size(), rest.size());
+      std::memcpy(space.data(), rest.data(), part);
+      buffer.commit(part);
+      rest.remove_prefix(part);
+    }
+    const auto message = buffer.next();
+    ASSERT_TRUE(message && *message);
+    local::Response response;
+    ASSERT_TRUE(response.ParseFromArray((*message)->data(), static_cast<int>((*message)->size())));
+    received.push_back(std::move(response));
+    received_descriptors.push_back(std::move(descriptors));
+  }
+
+  bool put(const local::Request& request) {
+    const std::string bytes = request.SerializeAsString();
+    return service_.on_frame_untrusted(number_, std::as_bytes(std::span(bytes)), offered);
+  }
+
+  // Sends `request` under a new serial and gives what came back first.
+  local::Response ask(local::Request request) {
+    request.set_serial(++serial_);
+    EXPECT_TRUE(put(request));
+    return next();
+  }
+
+  local::Response next() {
+    if (received.empty()) {
+      ADD_FAILURE() << "nothing was sent";
+      return {};
+    }
+    local::Response response = std::move(received.front());
+    received.pop_front();
+    last_descriptors = std::move(received_descriptors.front());
+    received_descriptors.pop_front();
+    return response;
+  }
+
+  FakeClient& greet() {
+    local::Request hello;
+    hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
+    hello.mutable_hello()->set_program("test");
+    EXPECT_TRUE(ask(hello).has_welcome());
+    return *this;
+  }
+
+  std::deque<local::Response> received;
+  std::deque<std::vector<UniqueFd>> received_descriptors;
+  std::vector<UniqueFd> last_descriptors;
+  DescriptorQueue offered;
+
+ private:
+  LocalService& service_;
+  ClientNumber number_;
+  std::uint64_t serial_ = 0;
+};
+
+inline local::Request create_request(const std::string& name) {
+  local::Request request;
+  local::Create& create = *request.mutable_create();
+  create.mutable_id()->set_name(name);
+  wire::to_message(odometry_type(), *create.mutable_type());
+  create.set_depth(16);
+  create.set_cycle_ns(10'000'000);
+  create.set_tag(7);
+  return request;
+}
+
+inline local::Request open_request(const std::string& name, bool for_writing = false) {
+  local::Request request;
+  request.mutable_open()->mutable_id()->set_name(name);
+  request.mutable_open()->set_for_writing(for_writing);
+  return request;
+}
+
+inline local::Request list_request() {
+  local::Request request;
+  request.mutable_list();
+  return request;
+}
+
+}  // namespace dssm::daemon
