@@ -5,16 +5,32 @@ namespace dssm::test {
 
 Follower::Follower(const KnownStream& known, RawReader reader, std::optional<RawReader> owner)
     : known_(known),
-      reader_(std::move(reader)),
+      source_(std::move(reader)),
       owner_(std::move(owner)),
       payload_(known.payload_bytes) {
-  reader_.seek(kNoTid);
+  this->reader().seek(kNoTid);
+}
+
+Follower::Follower(const KnownStream& known, PConnector connector, std::optional<RawReader> owner)
+    : known_(known),
+      source_(std::move(connector)),
+      owner_(std::move(owner)),
+      payload_(known.payload_bytes) {}
+
+std::uint64_t Follower::lost() const {
+  return std::visit([](const auto& source) { return source.lost(); }, source_);
+}
+
+ReadStatus Follower::next(SampleInfo& info) {
+  if (auto* reader = std::get_if<RawReader>(&source_)) return reader->next(payload_, info);
+  const Result<ReadStatus> status = connector().next(payload_, info);
+  return status ? *status : ReadStatus::not_yet;  // away: the next call tries again
 }
 
 void Follower::take(int most) {
   SampleInfo info;
   for (int i = 0; i < most; ++i) {
-    switch (reader_.next(payload_, info)) {
+    switch (next(info)) {
       case ReadStatus::ok:
         check(info);
         break;
@@ -37,14 +53,21 @@ void Follower::take(int most) {
 
 void Follower::check(const SampleInfo& info) {
   if (life_ == 0) life_ = KnownStream::life(payload_);
+  const bool is_reader = std::holds_alternative<RawReader>(source_);
+  if (last_ == kNoTid) {
+    // A reader counts from tid 0, a subscription from the oldest sample there was.
+    first_ = is_reader ? 0 : info.tid - static_cast<Tid>(lost() - lost_);
+    last_ = first_ - 1;
+  }
   if (life_ <= earlier_life_) fault("a new ring with samples of an old life");
   if (const std::string wrong = known_.fault(payload_, info, life_); !wrong.empty()) fault(wrong);
   if (info.tid <= last_) {
     fault("tid " + std::to_string(info.tid) + " after " + std::to_string(last_));
   }
   const auto left_out = static_cast<std::uint64_t>(info.tid - last_ - 1);
-  const std::uint64_t counted = reader_.lost() - lost_;
-  if (left_out != counted) {
+  const std::uint64_t counted = lost() - lost_;
+  // A subscription counts a gap when it hears of it, which may be before this sample's turn.
+  if (is_reader ? left_out != counted : left_out > counted) {
     fault(std::to_string(left_out) + " samples before tid " + std::to_string(info.tid) +
           " did not come, and " + std::to_string(counted) + " were counted");
   }
@@ -54,7 +77,7 @@ void Follower::check(const SampleInfo& info) {
           " were lost, and the owner's ring holds those from " + std::to_string(owner_->oldest()));
   }
   last_ = info.tid;
-  lost_ = reader_.lost();
+  lost_ += left_out;
   ++taken_;
 }
 

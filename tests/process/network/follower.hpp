@@ -1,13 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A reader that takes every sample of a stream of known samples and checks what it is given: each
-// sample once, in order, untorn; that gaps are counted exactly; and that nothing is called lost
-// which the owner's ring still holds.
+// A reader, or a PConnector's subscription, that takes every sample of a stream of known samples
+// and checks what it is given: each sample once, in order, untorn; that gaps are counted exactly;
+// and that nothing is called lost which the owner's ring still holds.
 #pragma once
 
 #include <dssm/dssm.hpp>
+#include <dssm/pconnector.hpp>
 #include <optional>
 #include <string>
+#include <variant>
 #include <vector>
 
 #include "tests/process/network/known_samples.hpp"
@@ -17,40 +19,45 @@ namespace dssm::test {
 // One thread, that of its reader.
 class Follower {
  public:
-  //   reader  begins with the oldest sample that is there
-  //   owner   another reader, of the owner's own ring, which lives as long as the stream; none: the
-  //           stream may begin anew, with a life of a higher number
+  //   reader     begins with the oldest sample that is there
+  //   connector  has subscribed from the oldest sample on
+  //   owner      a reader of the owner's own ring, which lives as long as the stream; none: the
+  //              stream may begin anew, with a life of a higher number
   Follower(const KnownStream& known, RawReader reader, std::optional<RawReader> owner);
+  Follower(const KnownStream& known, PConnector connector, std::optional<RawReader> owner);
 
   // Takes what is there, up to `most` samples.
   void take(int most);
 
-  RawReader& reader() { return reader_; }
+  RawReader& reader() { return std::get<RawReader>(source_); }
+  PConnector& connector() { return std::get<PConnector>(source_); }
   const KnownStream& known() const { return known_; }
   // The newest sample of the owner's ring has been taken.
-  bool has_all() const { return owner_ && reader_.cursor() == owner_->newest(); }
+  bool has_all() const { return owner_ && last_ == owner_->newest(); }
 
+  Tid first() const { return first_; }  // of the last ring: the first one that was there to be had
   Tid last() const { return last_; }
   std::uint64_t life() const { return life_; }
   std::uint64_t taken() const { return taken_; }
-  std::uint64_t lost() const { return reader_.lost(); }
+  std::uint64_t lost() const;
   std::uint64_t restarts() const { return restarts_; }
 
   // All that was wrong, a line each; empty: nothing.
   const std::string& faults() const { return faults_; }
 
  private:
+  ReadStatus next(SampleInfo& info);
   void check(const SampleInfo& info);
   void fault(const std::string& what);
 
   KnownStream known_;
-  RawReader reader_;
+  std::variant<RawReader, PConnector> source_;
   std::optional<RawReader> owner_;
   std::vector<std::byte> payload_;
   std::uint64_t life_ = 0;  // 0: of the next sample
   std::uint64_t earlier_life_ = 0;
-  Tid last_ = kNoTid;
-  std::uint64_t lost_ = 0;  // as the reader counted, up to `last_`
+  Tid first_ = 0, last_ = kNoTid;
+  std::uint64_t lost_ = 0;  // as the source counted, up to `last_`
   std::uint64_t taken_ = 0, restarts_ = 0;
   int fault_count_ = 0;
   std::string faults_;

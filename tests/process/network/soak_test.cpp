@@ -8,6 +8,7 @@
 //   $DSSM_SOAK_PERCENT  of the streams' full rates; default 100, less under a sanitizer
 //   $DSSM_TEST_SEED     of the random trouble; default: another one each time, printed
 #include <fcntl.h>
+#include <poll.h>
 #include <unistd.h>
 
 #include <csignal>
@@ -57,6 +58,35 @@ class Soak : public NetworkTest {
           }
           followers[host - 1].emplace_back(known, *std::move(reader), std::move(owners));
         }
+      }
+    }
+  }
+
+  // Followers by PConnector of all streams of pc1, from the last host, which the calling thread is
+  // inside of.
+  std::vector<Follower> follow_by_connectors() {
+    std::vector<Follower> connected;
+    for (const KnownStream& known : load_of(1, percent)) {
+      PConnector connector =
+          PConnector::open(known.id, {.address = Network::address(1), .request_timeout = kPatience})
+              .value();
+      connector.subscribe({.start = Subscription::Start::oldest}).value();
+      connected.emplace_back(known, std::move(connector),
+                             sessions[0].open_raw_reader(known.id).value());
+    }
+    return connected;
+  }
+
+  // Reads from subscriptions until all is there and the trouble is over, or `give_up`.
+  void read_on(std::vector<Follower>& connected) {
+    for (bool all_done = false; !all_done && !give_up;) {
+      std::vector<pollfd> fds;
+      for (Follower& follower : connected) fds.push_back({follower.connector().fd(), POLLIN, 0});
+      ::poll(fds.data(), fds.size(), 20);
+      all_done = finishing;
+      for (Follower& follower : connected) {
+        follower.take(64);
+        all_done = all_done && follower.has_all();
       }
     }
   }
@@ -139,12 +169,12 @@ class Soak : public NetworkTest {
                 static_cast<unsigned long long>(lost), static_cast<unsigned long long>(restarts));
   }
 
-  // What a follower that did not come to its end can be told about.
-  std::string about(int host, Follower& follower) {
-    return "on " + Network::name(host) + " '" + follower.known().id.str() + "': cursor " +
-           std::to_string(follower.reader().cursor()) + ", mirror's newest " +
-           std::to_string(follower.reader().newest()) + ", life " +
-           std::to_string(follower.life()) + ", restarts " + std::to_string(follower.restarts());
+  // How far a follower came, for messages.
+  static std::string about(const Follower& follower) {
+    return "'" + follower.known().id.str() + "': " + std::to_string(follower.taken()) + " taken, " +
+           std::to_string(follower.lost()) + " lost, from tid " + std::to_string(follower.first()) +
+           " to " + std::to_string(follower.last()) + ", life " + std::to_string(follower.life()) +
+           ", restarts " + std::to_string(follower.restarts());
   }
 
   const std::uint64_t seed = number_from_environment("DSSM_TEST_SEED", std::random_device{}());
@@ -152,7 +182,7 @@ class Soak : public NetworkTest {
       number_from_environment("DSSM_SOAK_SECONDS", kSlowness > 1 ? 20 : 45);
   const std::uint64_t percent = number_from_environment("DSSM_SOAK_PERCENT", 100 / kSlowness);
   std::vector<Session> sessions;
-  std::vector<Follower> followers[kHosts];
+  std::vector<Follower> followers[kHosts + 1];  // [kHosts]: by PConnector
   std::atomic<bool> finishing = false, give_up = false;
   int cuts = 0, kills = 0;
 };
@@ -168,19 +198,29 @@ TEST_F(Soak, LosesNothingThatTheOwnersRingStillHolds) {
     });
   }
   follow(true);
-  for (auto& mine : followers) {
-    reading.emplace_back(
-        [&] { read_on(mine, [](const Follower& follower) { return follower.has_all(); }); });
+  for (int host = 1; host <= kHosts; ++host) {
+    reading.emplace_back([&, &mine = followers[host - 1]] {
+      read_on(mine, [](const Follower& follower) { return follower.has_all(); });
+    });
   }
+  std::atomic<bool> connected = false;
+  reading.emplace_back([&] {
+    const Inside inside = fleet->network().inside(kHosts);
+    followers[kHosts] = follow_by_connectors();
+    connected = true;
+    read_on(followers[kHosts]);
+  });
+  while (!connected) std::this_thread::sleep_for(1ms);
   make_trouble([](int, std::uint64_t) {});
   stop = true;
   for (std::thread& each : writing) each.join();
   finish(reading);
-  for (int host = 1; host <= kHosts; ++host) {
-    for (Follower& follower : followers[host - 1]) {
-      EXPECT_TRUE(follower.has_all()) << about(host, follower);
-      EXPECT_EQ(follower.taken() + follower.lost(), static_cast<std::uint64_t>(follower.last()) + 1)
-          << about(host, follower);
+  for (const auto& mine : followers) {
+    for (const Follower& follower : mine) {
+      EXPECT_TRUE(follower.has_all()) << about(follower);
+      EXPECT_EQ(follower.taken() + follower.lost(),
+                static_cast<std::uint64_t>(follower.last() - follower.first()) + 1)
+          << about(follower);
     }
   }
 }
@@ -212,8 +252,8 @@ TEST_F(Soak, GoesOnWithNewRingsWhenOwnersLoseTheirs) {
   std::vector<std::thread> reading;
   std::uint64_t newest_life[kOwners + 1] = {};
   std::atomic<bool> lives_known = false;
-  for (auto& mine : followers) {
-    reading.emplace_back([&] {
+  for (int host = 1; host <= kHosts; ++host) {
+    reading.emplace_back([&, &mine = followers[host - 1]] {
       read_on(mine, [&](const Follower& follower) {
         const int owner = follower.known().id.host == Network::name(1) ? 1 : 2;
         return lives_known && follower.life() == newest_life[owner];
@@ -238,11 +278,11 @@ TEST_F(Soak, GoesOnWithNewRingsWhenOwnersLoseTheirs) {
   }
   lives_known = true;
   finish(reading);
-  for (int host = 1; host <= kHosts; ++host) {
-    for (Follower& follower : followers[host - 1]) {
+  for (auto& mine : followers) {
+    for (Follower& follower : mine) {
       const int owner = follower.known().id.host == Network::name(1) ? 1 : 2;
-      EXPECT_EQ(follower.life(), lives[owner]) << about(host, follower);
-      EXPECT_GT(follower.restarts(), 0u) << about(host, follower);
+      EXPECT_EQ(follower.life(), lives[owner]) << about(follower);
+      EXPECT_GT(follower.restarts(), 0u) << about(follower);
       EXPECT_EQ(follower.reader().restarts(), follower.restarts());
     }
   }
