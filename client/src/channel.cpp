@@ -18,9 +18,6 @@ using namespace std::chrono_literals;
 // Between attempts to set up a connection.
 constexpr Duration kFirstPause = 10ms;
 constexpr Duration kLongestPause = 1s;
-// A connection that lived so long was a good one: the next is tried without a pause.
-constexpr Duration kGoodLife = 1s;
-
 // How long next() stays with a large sample that has begun to arrive in the caller's memory, before
 // it puts aside what has come: 20 MB at 1 GB/s.
 constexpr Duration kStayWithSample = 20ms;
@@ -123,8 +120,8 @@ void Channel::set_up() {
 }
 
 void Channel::note_up() {
-  if (up_since_ != kNever || !is_up()) return;
-  up_since_ = MonoClock::now();
+  if (was_up_ || !is_up()) return;
+  was_up_ = true;
   ++connections_;
   set_up_deadline_ = kNever;
   why_down_.reset();
@@ -132,19 +129,18 @@ void Channel::note_up() {
 
 void Channel::forget_connection() {
   link_.close();
-  set_up_sent_ = opened_ = held_ = may_publish_ = false;
+  set_up_sent_ = opened_ = was_up_ = useful_ = held_ = may_publish_ = false;
   open_serial_ = subscribe_serial_ = publishing_serial_ = ask_serial_ = 0;
-  set_up_deadline_ = up_since_ = kNever;
+  set_up_deadline_ = kNever;
   if (subscriber_) subscriber_->on_down();
   if (outbox_) outbox_->on_down();
 }
 
 void Channel::went_down(Error why) {
-  const MonoTime now = MonoClock::now();
-  if (up_since_ == kNever) ++failed_attempts_;
-  const bool was_good = up_since_ != kNever && now - up_since_ > kGoodLife;
-  pause_ = was_good ? Duration(0) : std::clamp(2 * pause_, kFirstPause, kLongestPause);
-  retry_at_ = now + pause_;
+  if (!was_up_) ++failed_attempts_;
+  // A connection that brought something was a good one: the next is tried without a pause.
+  pause_ = useful_ ? Duration(0) : std::clamp(2 * pause_, kFirstPause, kLongestPause);
+  retry_at_ = MonoClock::now() + pause_;
   why_down_ = std::move(why);
   forget_connection();
 }
@@ -204,6 +200,7 @@ bool Channel::receive() {
   }
   auto received = link_.receive();
   if (!received) return went_down(std::move(received).error()), false;
+  if (*received && !set_up_sent_) advance(Patience::none);  // it may have been the greeting
   return *received;
 }
 
@@ -297,6 +294,7 @@ Result<void> Channel::on_event(const net::Frame& frame) {
   if (!subscriber_) return {};
   if (frame.has_gap()) subscriber_->on_gap(frame.gap());
   if (frame.has_published()) {
+    useful_ = true;
     return outbox_->acknowledge(frame.published().last(), frame.published().last_tid());
   }
   return {};
@@ -324,7 +322,7 @@ Result<void> Channel::on_frame(net::Frame& frame) {
   } else if (serial == ask_serial_) {
     answer_ = std::move(frame);
     ask_serial_ = 0;
-    answered_ = true;
+    answered_ = useful_ = true;
   }
   if (result) note_up();
   return result;
@@ -344,6 +342,7 @@ Result<void> Channel::on_sample_begin(const wire::IncomingSample& sample, std::b
 }
 
 Result<void> Channel::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+  useful_ = true;
   if (sample.serial == 0) return subscriber_->on_sample_end(sample.info, torn), Result<void>();
   if (sample.serial != ask_serial_ || !read_target_) return {};
   read_info_ = sample.info;
@@ -434,7 +433,7 @@ Result<void> Channel::subscribe(const Subscription& what_from) {
   subscriber_->keep(true);
   request_subscription();
   static_cast<void>(run(deadline, false, [&] { return is_up() || link_.is_down(); }));
-  if (!is_up()) {
+  if (!subscriber_->granted() && !subscription_refused_) {
     if (Result<void> up = get_up(deadline); !up) {
       subscriber_->end();
       return std::move(up).error().context(what("subscribe to"));
@@ -503,7 +502,7 @@ WaitStatus Channel::wait(MonoTime deadline) {
   subscriber_->keep(false);
   return run(deadline, true, [&] {
     return held_ || subscriber_->has_kept() ||
-           (why_down_ && up_since_ == kNever && !is_worth_waiting(why_down_->code));
+           (why_down_ && !was_up_ && !is_worth_waiting(why_down_->code));
   });
 }
 

@@ -111,8 +111,9 @@ class Channel final : private wire::FrameSink {
   NetworkLink link_;
   bool set_up_sent_ = false;  // on this connection
   bool opened_ = false;       // on this connection
+  bool was_up_ = false;       // this connection
+  bool useful_ = false;       // it brought something
   MonoTime set_up_deadline_ = kNever;
-  MonoTime up_since_ = kNever;
   MonoTime retry_at_ = MonoTime::min();
   Duration pause_{};
   std::optional<Error> why_down_;

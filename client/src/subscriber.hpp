@@ -27,6 +27,7 @@ class Subscriber {
   void begin(const Subscription& what);
   void end();
   bool active() const noexcept { return what_.has_value(); }
+  bool granted() const noexcept { return resumes_; }  // on_subscribed() came since begin()
 
   // The request that begins it, or after a cut goes on with it.
   void to_message(std::uint64_t incarnation, net::Subscribe& out) const;

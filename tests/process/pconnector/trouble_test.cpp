@@ -1,0 +1,802 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// PConnector against a fake dssmd: refusals, garbage, broken connections, samples that come in
+// pieces or at a bad moment. What a real dssmd does is in the other tests of this folder.
+#include <gtest/gtest.h>
+#include <poll.h>
+#include <signal.h>
+#include <sys/time.h>
+
+#include <dssm/pconnector.hpp>
+#include <future>
+
+#include "core/wire/sample_frame.hpp"
+#include "core/wire/tcp.hpp"
+#include "tests/process/pconnector/fake_daemon.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+
+// A sample of 8 bytes as the fake sends it: its tid, in digits.
+std::string text_of(std::int64_t tid) {
+  std::string text = std::to_string(tid);
+  return std::string(8 - text.size(), '0') + text;
+}
+
+struct Sample {
+  std::string bytes = std::string(8, '?');
+  SampleInfo info;
+  std::span<std::byte> span() { return std::as_writable_bytes(std::span(bytes)); }
+};
+
+Result<PConnector> open(const FakeDaemon& daemon, const TypeInfo* wanted = nullptr) {
+  return PConnector::open({"lidar", 0, {}}, {.address = daemon.address()}, wanted);
+}
+
+void expect_sample(PConnector& con, std::int64_t tid) {
+  Sample sample;
+  for (;;) {
+    const WaitStatus waited = con.wait(kNever);
+    ASSERT_EQ(waited, WaitStatus::ready);
+    const auto status = con.next(sample.span(), sample.info);
+    ASSERT_TRUE(status) << status.error().message;
+    if (*status == ReadStatus::not_yet) continue;
+    ASSERT_EQ(*status, ReadStatus::ok);
+    break;
+  }
+  EXPECT_EQ(sample.info.tid, tid);
+  EXPECT_EQ(sample.info.time, time_from_ns(tid * 10));
+  EXPECT_EQ(sample.info.clock_error, 7ns);
+  EXPECT_EQ(sample.bytes, text_of(tid));
+}
+
+void expect_words(const Error& error, Errc code, const std::vector<std::string>& words) {
+  EXPECT_EQ(errc_name(error.code), errc_name(code)) << error.message;
+  for (const std::string& word : words) {
+    EXPECT_NE(error.message.find(word), std::string::npos) << word << "\n" << error.message;
+  }
+}
+
+// --- opening -----------------------------------------------------------------------------------
+
+TEST(PConnectorOpen, SaysThatNobodyListens) {
+  // A port that was ours a moment ago.
+  std::string address;
+  {
+    const auto any = wire::Address::parse("127.0.0.1:0", wire::kDefaultPort, true).value();
+    const UniqueFd socket = wire::listen_tcp(wire::resolve_number(any).at(0)).value();
+    address = wire::local_address(socket.get())->str();
+  }
+  const auto con = PConnector::open({"lidar", 1, {}}, {.address = address});
+  ASSERT_FALSE(con);
+  expect_words(con.error(), Errc::no_daemon, {"lidar:1", address, "refused", "dssmd"});
+}
+
+TEST(PConnectorOpen, RefusesWhatIsNoAddressNameOrType) {
+  const auto port = PConnector::open({"lidar", 0, {}}, {.address = "127.0.0.1:99999"});
+  expect_words(port.error(), Errc::invalid_argument, {"99999"});
+  const auto name = PConnector::open({"li:dar", 0, {}}, {.address = "127.0.0.1"});
+  expect_words(name.error(), Errc::invalid_argument, {"li:dar"});
+  const auto type = PConnector::create({"lidar", 0, {}}, TypeInfo{}, {16, 1ms});
+  EXPECT_EQ(type.error().code, Errc::invalid_argument);
+}
+
+TEST(PConnectorOpen, TakesThePortFromTheEnvironment) {
+  const FakeDaemon daemon([](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
+  const std::string port = daemon.address().substr(daemon.address().find(':') + 1);
+  ::setenv("DSSM_PORT", port.c_str(), 1);
+  const auto con = PConnector::open({"lidar", 0, {}}, {.address = "127.0.0.1"});
+  ::setenv("DSSM_PORT", "many", 1);
+  const auto bad = PConnector::open({"lidar", 0, {}});
+  ::unsetenv("DSSM_PORT");
+  EXPECT_TRUE(con) << con.error().message;
+  expect_words(bad.error(), Errc::invalid_argument, {"DSSM_PORT", "many"});
+}
+
+TEST(PConnectorOpen, PassesOnWhyDssmdRefuses) {
+  const FakeDaemon daemon([](FakePeer& peer, int) {
+    peer.take();
+    net::Frame frame;
+    frame.mutable_failure()->set_code("limit_exceeded");
+    frame.mutable_failure()->set_message("256 connections are the limit");
+    peer.send(frame);
+  });
+  const auto con = open(daemon);
+  ASSERT_FALSE(con);
+  expect_words(con.error(), Errc::limit_exceeded,
+               {"lidar", daemon.address(), "256 connections are the limit"});
+}
+
+TEST(PConnectorOpen, SaysThatThereIsNoSuchStream) {
+  const FakeDaemon daemon([](FakePeer& peer, int) {
+    peer.greet();
+    net::Frame answer;
+    answer.set_serial(peer.take().value_or(net::Frame()).serial());
+    answer.mutable_failure()->set_code("not_found");
+    answer.mutable_failure()->set_message("no stream 'lidar:0' on host 'fake'");
+    peer.send(answer);
+    peer.wait_for_end();
+  });
+  const auto con = open(daemon);
+  ASSERT_FALSE(con);
+  expect_words(con.error(), Errc::not_found, {"no stream 'lidar:0' on host 'fake'"});
+}
+
+TEST(PConnectorOpen, NamesBothTypesWhenTheyDiffer) {
+  const FakeDaemon daemon(
+      [](FakePeer& peer, int) { peer.open(8, 1, "Scan"), peer.wait_for_end(); });
+  const TypeInfo size{"Scan", 16, 1, {}}, name{"Image", 8, 1, {}}, same{"Scan", 8, 1, {}};
+  expect_words(open(daemon, &size).error(), Errc::type_mismatch, {"8 bytes", "16 bytes"});
+  expect_words(open(daemon, &name).error(), Errc::type_mismatch, {"Scan", "Image"});
+  EXPECT_TRUE(open(daemon, &same));
+}
+
+TEST(PConnectorOpen, RefusesAnotherVersionInWords) {
+  const FakeDaemon daemon([](FakePeer& peer, int) {
+    peer.take();
+    net::Frame hello;
+    hello.mutable_hello()->set_protocol_version(9);
+    hello.mutable_hello()->set_host("future");
+    hello.mutable_hello()->set_version("7.7");
+    peer.send(hello);
+    peer.wait_for_end();
+  });
+  const auto con = open(daemon);
+  ASSERT_FALSE(con);
+  expect_words(con.error(), Errc::protocol, {daemon.address(), "version 9", "version 1", "7.7"});
+}
+
+TEST(PConnectorOpen, SaysThatGarbageIsNoDssmd) {
+  for (const std::string& bytes : std::vector<std::string>{
+           "HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain; charset=utf-8\r\n\r\n400 Bad "
+           "Request",
+           "SSH-2.0-OpenSSH_9.2p1 Debian-2+deb12u3\r\n" + std::string(100, 'k'),
+           std::string(100, '\xff'), std::string(3, '\0')}) {
+    const FakeDaemon daemon([&](FakePeer& peer, int) {
+      peer.send_bytes(bytes);
+      peer.wait_for_end();
+    });
+    const auto con =
+        PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 10s});
+    ASSERT_FALSE(con);
+    expect_words(con.error(), Errc::protocol, {"lidar", daemon.address()});
+  }
+}
+
+TEST(PConnectorOpen, SaysThatTheConnectionWasClosed) {
+  const FakeDaemon daemon([](FakePeer&, int) {});
+  const auto con = open(daemon);
+  ASSERT_FALSE(con);
+  expect_words(con.error(), Errc::daemon_away, {daemon.address(), "closed"});
+}
+
+TEST(PConnectorOpen, RefusesADescriptionThatCannotBe) {
+  const FakeDaemon daemon([](FakePeer& peer, int number) {
+    peer.open(number == 0 ? (65ULL << 20) : 0);
+    peer.wait_for_end();
+  });
+  for (int i = 0; i < 2; ++i) {
+    const auto con = open(daemon);
+    ASSERT_FALSE(con);
+    EXPECT_NE(con.error().message.find("description"), std::string::npos) << con.error().message;
+  }
+}
+
+TEST(PConnectorOpen, ASilentDssmdCostsTheRequestTimeout) {
+  const FakeDaemon daemon([](FakePeer& peer, int) { peer.wait_for_end(); });
+  const auto con =
+      PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 200ms});
+  ASSERT_FALSE(con);
+  expect_words(con.error(), Errc::daemon_away, {daemon.address(), "does not answer"});
+}
+
+// --- requests ----------------------------------------------------------------------------------
+
+// Answers the reads of one connection with sample 5, until something else comes.
+void answer_reads(FakePeer& peer) {
+  for (;;) {
+    const auto request = peer.take();
+    if (!request || !request->has_read()) return;
+    peer.send_sample(5, text_of(5), request->serial());
+  }
+}
+
+TEST(PConnectorRequest, IsAskedAgainOnANewConnection) {
+  std::atomic<int> asked = 0;
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    peer.open(8);
+    if (number < 2) {
+      if (peer.take()) ++asked;
+      return;  // hangs up instead of answering
+    }
+    answer_reads(peer);
+  });
+  auto con = open(daemon).value();
+  Sample sample;
+  ASSERT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
+  EXPECT_EQ(sample.info.tid, 5);
+  EXPECT_EQ(sample.bytes, text_of(5));
+  EXPECT_EQ(asked, 2);
+  EXPECT_EQ(con.counters().reconnects, 2u);
+}
+
+TEST(PConnectorRequest, FailsAtOnceWhenTheAnswerIsGarbageAndTheNextOneWorks) {
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    peer.open(8);
+    if (number == 0) {
+      peer.take();
+      peer.send_bytes(std::string(64, '\xff'));
+      return peer.wait_for_end();
+    }
+    answer_reads(peer);
+  });
+  auto con = open(daemon).value();
+  Sample sample;
+  const auto bad = con.latest(sample.span(), sample.info);
+  ASSERT_FALSE(bad);
+  expect_words(bad.error(), Errc::protocol, {"lidar"});
+  EXPECT_EQ(sample.info.tid, kNoTid);
+  EXPECT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
+}
+
+TEST(PConnectorRequest, RefusesSamplesOfAnotherSize) {
+  const FakeDaemon daemon([&](FakePeer& peer, int) {
+    peer.open(8);
+    const auto request = peer.take();
+    if (request) peer.send_sample(5, "123456789", request->serial());
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  Sample sample;
+  const auto bad = con.latest(sample.span(), sample.info);
+  ASSERT_FALSE(bad);
+  expect_words(bad.error(), Errc::protocol, {"9"});
+}
+
+TEST(PConnectorRequest, AsksAgainForATornSample) {
+  const FakeDaemon daemon([&](FakePeer& peer, int) {
+    peer.open(8);
+    auto request = peer.take();
+    if (request) peer.send_sample(4, text_of(4), request->serial(), true);
+    request = peer.take();
+    if (request) peer.send_sample(5, text_of(5), request->serial(), false);
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  Sample sample;
+  ASSERT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
+  EXPECT_EQ(sample.info.tid, 5);
+}
+
+TEST(PConnectorRequest, TellsDaemonAwayWhenItStaysAway) {
+  auto daemon = std::make_unique<FakeDaemon>([](FakePeer& peer, int) { peer.open(8); });
+  auto con =
+      PConnector::open({"lidar", 0, {}}, {.address = daemon->address(), .request_timeout = 300ms})
+          .value();
+  const std::string address = daemon->address();
+  daemon.reset();
+  Sample sample;
+  const auto away = con.latest(sample.span(), sample.info);
+  ASSERT_FALSE(away);
+  expect_words(away.error(), Errc::daemon_away, {"lidar", address});
+  EXPECT_FALSE(con.connected());
+}
+
+TEST(PConnectorRequest, TellsOnceThatTheStreamBeganAnew) {
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    peer.open(8, number == 0 ? 1 : 2);
+    if (number == 0) {
+      const auto request = peer.take();
+      if (request) peer.send_sample(5, text_of(5), request->serial());
+      return;
+    }
+    answer_reads(peer);
+  });
+  auto con = open(daemon).value();
+  Sample sample;
+  ASSERT_EQ(con.tid(5, sample.span(), sample.info).value(), ReadStatus::ok);
+  EXPECT_EQ(con.tid(5, sample.span(), sample.info).value(), ReadStatus::restarted);
+  EXPECT_EQ(con.restarts(), 1u);
+  EXPECT_EQ(con.incarnation(), 2u);
+  EXPECT_EQ(con.tid(5, sample.span(), sample.info).value(), ReadStatus::ok);
+}
+
+TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    peer.open(number == 0 ? 8 : 9, static_cast<std::uint64_t>(number) + 1);
+    if (number == 0) {
+      peer.take();
+      return;
+    }
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  Sample sample;
+  const auto bad = con.latest(sample.span(), sample.info);
+  ASSERT_FALSE(bad);
+  expect_words(bad.error(), Errc::type_mismatch, {"anew", "8 bytes", "9 bytes"});
+}
+
+TEST(PConnectorRequest, RefusesABufferOfAnotherSize) {
+  const FakeDaemon daemon([&](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
+  auto con = open(daemon).value();
+  std::array<std::byte, 7> small;
+  SampleInfo info;
+  EXPECT_EQ(con.latest(small, info).error().code, Errc::invalid_argument);
+  EXPECT_EQ(con.next(small, info).error().code, Errc::invalid_argument);
+  EXPECT_EQ(con.post(small).error().code, Errc::invalid_argument);
+  EXPECT_EQ(con.write(small).error().code, Errc::invalid_argument);
+}
+
+// --- subscriptions -----------------------------------------------------------------------------
+
+TEST(PConnectorSubscription, ComesInOrderHoweverTheBytesCome) {
+  for (const std::size_t piece : {1, 7, 50, 1000}) {
+    const FakeDaemon daemon([&](FakePeer& peer, int) {
+      peer.open(8);
+      peer.subscribe(0);
+      std::string bytes;
+      for (std::int64_t tid = 0; tid < 20; ++tid) {
+        std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
+        const std::size_t length = wire::encode_sample_header(
+            header, 0, {tid, time_from_ns(tid * 10), 7ns}, 8, wire::Trailer::none);
+        bytes.append(reinterpret_cast<const char*>(header.data()), length);
+        bytes += text_of(tid);
+      }
+      for (std::size_t at = 0; at < bytes.size(); at += piece) {
+        peer.send_bytes(bytes.substr(at, piece));
+      }
+      peer.wait_for_end();
+    });
+    auto con = open(daemon).value();
+    ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
+    for (std::int64_t tid = 0; tid < 20; ++tid) expect_sample(con, tid);
+    Sample sample;
+    EXPECT_EQ(con.next(sample.span(), sample.info).value(), ReadStatus::not_yet);
+    EXPECT_EQ(con.lost(), 0u);
+  }
+}
+
+TEST(PConnectorSubscription, NeedsOne) {
+  const FakeDaemon daemon([](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
+  auto con = open(daemon).value();
+  Sample sample;
+  const auto none = con.next(sample.span(), sample.info);
+  ASSERT_FALSE(none);
+  expect_words(none.error(), Errc::invalid_argument, {"subscribe"});
+  EXPECT_EQ(con.wait(kNever), WaitStatus::timeout);
+}
+
+TEST(PConnectorSubscription, KeepsWhatComesWhileARequestWaits) {
+  const FakeDaemon daemon([](FakePeer& peer, int) {
+    peer.open(8);
+    peer.subscribe(0);
+    for (std::int64_t tid = 0; tid < 3; ++tid) peer.send_sample(tid, text_of(tid));
+    const auto request = peer.take();
+    if (!request) return;
+    for (std::int64_t tid = 3; tid < 6; ++tid) peer.send_sample(tid, text_of(tid));
+    peer.send_sample(5, text_of(5), request->serial());
+    peer.send_sample(6, text_of(6));
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
+  expect_sample(con, 0);
+  Sample sample;
+  ASSERT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
+  EXPECT_EQ(sample.info.tid, 5);
+  for (std::int64_t tid = 1; tid < 7; ++tid) expect_sample(con, tid);
+}
+
+TEST(PConnectorSubscription, ResumesAtTheSampleThatIsDue) {
+  std::promise<net::Subscribe> resumed;
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    peer.open(8);
+    if (number == 0) {
+      peer.subscribe(3);
+      peer.send_sample(3, text_of(3));
+      peer.send_sample(4, text_of(4));
+      return;
+    }
+    resumed.set_value(peer.subscribe(7).subscribe());
+    peer.send_sample(7, text_of(7));
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({}));
+  expect_sample(con, 3);
+  expect_sample(con, 4);
+  expect_sample(con, 7);
+  const net::Subscribe request = resumed.get_future().get();
+  EXPECT_EQ(request.from_tid(), 5);
+  EXPECT_EQ(request.incarnation(), 1u);
+  EXPECT_EQ(con.lost(), 2u);
+  EXPECT_EQ(con.restarts(), 0u);
+}
+
+TEST(PConnectorSubscription, TellsOfANewRingBetweenItsSamplesAndThoseOfTheOld) {
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    peer.open(8, number == 0 ? 1 : 2);
+    peer.subscribe(number == 0 ? 8 : 0, number == 0 ? 1 : 2);
+    peer.send_sample(number == 0 ? 8 : 0, text_of(number == 0 ? 8 : 0));
+    if (number == 0) return;
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({}));
+  expect_sample(con, 8);
+  ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
+  Sample sample;
+  EXPECT_EQ(con.next(sample.span(), sample.info).value(), ReadStatus::restarted);
+  expect_sample(con, 0);
+  EXPECT_EQ(con.lost(), 0u);
+  EXPECT_EQ(con.restarts(), 1u);
+}
+
+TEST(PConnectorSubscription, TellsWhenTheConnectionIsDownWithoutWaiting) {
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    if (number == 0) {
+      peer.open(8);
+      peer.subscribe(0);
+      return;
+    }
+    peer.wait_for_end();  // silent from now on
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({}));
+  Sample sample;
+  for (;;) {
+    const auto status = con.next(sample.span(), sample.info);
+    if (!status) {
+      expect_words(status.error(), Errc::daemon_away, {"lidar"});
+      break;
+    }
+    ASSERT_EQ(*status, ReadStatus::not_yet);
+  }
+}
+
+TEST(PConnectorSubscription, SaysThatTheStreamWasRemovedAndGoesOnWhenItIsBack) {
+  std::atomic<bool> back = false;
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    if (number == 0) {
+      peer.open(8);
+      peer.subscribe(0);
+      net::Frame ended;
+      ended.mutable_ended()->set_removed(true);
+      peer.send(ended);
+    } else if (!back) {
+      peer.greet();
+      net::Frame answer;
+      answer.set_serial(peer.take().value_or(net::Frame()).serial());
+      answer.mutable_failure()->set_code("not_found");
+      peer.send(answer);
+    } else {
+      peer.open(8, 2);
+      peer.subscribe(0, 2);
+      peer.send_sample(0, text_of(0));
+    }
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({}));
+  Sample sample;
+  for (;;) {
+    const auto status = con.next(sample.span(), sample.info);
+    if (status) {
+      ASSERT_EQ(*status, ReadStatus::not_yet);
+      continue;
+    }
+    EXPECT_EQ(status.error().code, Errc::not_found) << status.error().message;
+    break;
+  }
+  back = true;
+  ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
+  EXPECT_EQ(con.next(sample.span(), sample.info).value(), ReadStatus::restarted);
+  expect_sample(con, 0);
+}
+
+TEST(PConnectorSubscription, PassesOnWhyItIsRefused) {
+  const FakeDaemon daemon([](FakePeer& peer, int) {
+    peer.open(8);
+    net::Frame answer;
+    answer.set_serial(peer.take().value_or(net::Frame()).serial());
+    answer.mutable_failure()->set_code("no_permission");
+    answer.mutable_failure()->set_message("not for you");
+    peer.send(answer);
+    answer_reads(peer);
+  });
+  auto con = open(daemon).value();
+  const auto refused = con.subscribe({});
+  ASSERT_FALSE(refused);
+  expect_words(refused.error(), Errc::no_permission, {"lidar", "not for you"});
+  Sample sample;
+  EXPECT_FALSE(con.next(sample.span(), sample.info));
+  EXPECT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok)
+      << "the connection is still good";
+}
+
+TEST(PConnectorSubscription, WaitEndsAtItsDeadlineAndAtASignal) {
+  const FakeDaemon daemon([](FakePeer& peer, int) {
+    peer.open(8);
+    peer.subscribe(0);
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({}));
+  EXPECT_EQ(con.wait(MonoClock::now() - 1s), WaitStatus::timeout);
+  const MonoTime deadline = deadline_in(20ms);
+  EXPECT_EQ(con.wait(deadline), WaitStatus::timeout);
+  EXPECT_GE(MonoClock::now(), deadline);
+  struct sigaction action {};
+  action.sa_handler = [](int) {};
+  ::sigaction(SIGALRM, &action, nullptr);
+  const itimerval timer{{0, 20'000}, {0, 20'000}};  // again and again: one may come too early
+  ::setitimer(ITIMER_REAL, &timer, nullptr);
+  EXPECT_EQ(con.wait(kNever), WaitStatus::interrupted);
+  const itimerval off{};
+  ::setitimer(ITIMER_REAL, &off, nullptr);
+}
+
+TEST(PConnectorSubscription, ItsDescriptorStandsForTheConnectionAndForTheNextAttempt) {
+  const FakeDaemon daemon([](FakePeer& peer, int number) {
+    if (number == 1) return;  // one attempt fails
+    peer.open(8);
+    peer.subscribe(number);
+    peer.send_sample(number, text_of(number));
+    if (number > 1) peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({}));
+  for (const std::int64_t tid : {0, 2}) {
+    for (;;) {
+      Sample sample;
+      const auto status = con.next(sample.span(), sample.info);
+      if (status && *status == ReadStatus::ok) {
+        EXPECT_EQ(sample.info.tid, tid);
+        break;
+      }
+      pollfd ready{con.fd(), POLLIN, 0};
+      ASSERT_EQ(::poll(&ready, 1, -1), 1);
+    }
+  }
+  EXPECT_EQ(con.lost(), 1u);
+}
+
+// --- large samples -----------------------------------------------------------------------------
+
+constexpr std::size_t kLargeBytes = 3 << 20;
+
+std::string large(char fill) { return std::string(kLargeBytes, fill); }
+
+TEST(PConnectorLargeSamples, ArePutAsideWhenTheRestDoesNotCome) {
+  std::promise<void> go_on;
+  const FakeDaemon daemon([&](FakePeer& peer, int) {
+    peer.open(kLargeBytes);
+    peer.subscribe(0);
+    net::Frame frame;
+    frame.mutable_sample()->set_tid(0);
+    frame.set_payload(large('a'));
+    const std::string bytes = wire::encode_frame(frame);
+    peer.send_bytes(bytes.substr(0, 2'000'000));
+    go_on.get_future().wait();
+    peer.send_bytes(bytes.substr(2'000'000));
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
+  ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
+  std::string first(kLargeBytes, '?'), second(kLargeBytes, '?');
+  SampleInfo info;
+  EXPECT_EQ(con.next(std::as_writable_bytes(std::span(first)), info).value(), ReadStatus::not_yet);
+  first.assign(kLargeBytes, '!');  // ours again
+  EXPECT_EQ(con.next(std::as_writable_bytes(std::span(first)), info).value(), ReadStatus::not_yet);
+  EXPECT_EQ(con.wait(deadline_in(10ms)), WaitStatus::timeout) << "what is put aside is not ready";
+  go_on.set_value();
+  ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
+  ASSERT_EQ(con.next(std::as_writable_bytes(std::span(second)), info).value(), ReadStatus::ok);
+  EXPECT_EQ(second, large('a'));
+  EXPECT_EQ(first, large('!'));
+  EXPECT_EQ(info.tid, 0);
+}
+
+TEST(PConnectorLargeSamples, AreReceivedWhereTheyAreWanted) {
+  const FakeDaemon daemon([&](FakePeer& peer, int) {
+    peer.open(kLargeBytes);
+    peer.subscribe(0);
+    for (std::int64_t tid = 0; tid < 20; ++tid) {
+      peer.send_sample(tid, large(static_cast<char>('a' + tid)));
+    }
+    const auto request = peer.take();
+    if (request) peer.send_sample(5, large('!'), request->serial());
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
+  std::string sample(kLargeBytes, '?');
+  const auto span = std::as_writable_bytes(std::span(sample));
+  SampleInfo info;
+  for (std::int64_t tid = 0; tid < 20;) {
+    ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
+    const ReadStatus status = con.next(span, info).value();
+    if (status == ReadStatus::not_yet) continue;
+    ASSERT_EQ(status, ReadStatus::ok);
+    ASSERT_EQ(info.tid, tid);
+    ASSERT_EQ(sample, large(static_cast<char>('a' + tid)));
+    ++tid;
+  }
+  ASSERT_EQ(con.latest(span, info).value(), ReadStatus::ok);
+  EXPECT_EQ(sample, large('!'));
+  const auto counters = con.counters();
+  EXPECT_EQ(counters.samples, 21u);
+  EXPECT_GT(counters.direct_payload_bytes, 21 * kLargeBytes * 9 / 10);
+  EXPECT_LE(counters.direct_payload_bytes + counters.copied_payload_bytes, 21 * kLargeBytes);
+}
+
+TEST(PConnectorLargeSamples, OneThatWasCutComesAnew) {
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    peer.open(kLargeBytes);
+    peer.subscribe(0);
+    net::Frame frame;
+    frame.mutable_sample()->set_tid(0);
+    frame.set_payload(large('a'));
+    const std::string bytes = wire::encode_frame(frame);
+    if (number < 3)
+      return peer.send_bytes(
+          bytes.substr(0, bytes.size() * (1 + static_cast<unsigned>(number)) / 4));
+    peer.send_bytes(bytes);
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
+  std::string sample(kLargeBytes, '?');
+  SampleInfo info;
+  for (;;) {
+    const auto status = con.next(std::as_writable_bytes(std::span(sample)), info);
+    if (status && *status == ReadStatus::ok) break;
+    ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
+  }
+  EXPECT_EQ(sample, large('a'));
+  EXPECT_EQ(con.lost(), 0u);
+  EXPECT_EQ(con.counters().reconnects, 3u);
+}
+
+// --- publishing --------------------------------------------------------------------------------
+
+// A publisher's other end: writes each sample once, over all connections.
+struct Owner {
+  std::int64_t last = -1;
+  std::vector<std::string> written;
+
+  void answer_start(FakePeer& peer, const net::Frame& frame) const {
+    net::Frame answer;
+    answer.set_serial(frame.serial());
+    answer.mutable_publishing()->set_last(last);
+    answer.mutable_publishing()->set_last_tid(static_cast<std::int64_t>(written.size()) - 1);
+    peer.send(answer);
+  }
+  void take(const net::Frame& frame) {
+    if (frame.sample().tid() <= last) return;
+    last = frame.sample().tid();
+    written.push_back(frame.payload());
+  }
+  void acknowledge(FakePeer& peer) const {
+    net::Frame event;
+    event.mutable_published()->set_last(last);
+    event.mutable_published()->set_last_tid(static_cast<std::int64_t>(written.size()) - 1);
+    peer.send(event);
+  }
+};
+
+std::span<const std::byte> bytes_of(const std::string& text) {
+  return std::as_bytes(std::span(text));
+}
+
+TEST(PConnectorPublishing, WritesEachSampleOnceOverBrokenConnections) {
+  Owner owner;  // of the fake's thread until the connector is gone
+  {
+    const FakeDaemon daemon([&](FakePeer& peer, int number) {
+      peer.open(8);
+      for (int frames = 0;; ++frames) {
+        const auto frame = peer.take();
+        if (!frame) return;
+        if (frame->has_start_publishing()) {
+          owner.answer_start(peer, *frame);
+          continue;
+        }
+        // Hangs up after some samples: before, and after it wrote the last one, and without having
+        // said so.
+        if (number < 20 && frames > number % 5) {
+          if (number % 2 == 0) owner.take(*frame);
+          return;
+        }
+        owner.take(*frame);
+        if (frames % 3 == 0 || number >= 20) owner.acknowledge(peer);
+      }
+    });
+    auto con = open(daemon).value();
+    for (std::int64_t i = 0; i < 500; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+    const auto flushed = con.flush(kNever);
+    ASSERT_TRUE(flushed) << flushed.error().message;
+    EXPECT_EQ(*flushed, 499);
+    const auto written = con.write(bytes_of(text_of(500)));
+    ASSERT_TRUE(written) << written.error().message;
+    EXPECT_EQ(*written, 500);
+    EXPECT_EQ(con.dropped(), 0u);
+    EXPECT_GE(con.counters().reconnects, 20u);
+  }
+  ASSERT_EQ(owner.written.size(), 501u);
+  for (std::int64_t i = 0; i <= 500; ++i) {
+    EXPECT_EQ(owner.written[static_cast<std::size_t>(i)], text_of(i));
+  }
+}
+
+TEST(PConnectorPublishing, KeepsTheNewestWhileDssmdIsAwayAndCountsTheOthers) {
+  Owner owner;
+  std::atomic<bool> back = false;
+  {
+    const FakeDaemon daemon([&](FakePeer& peer, int number) {
+      if (number > 0 && !back) return;
+      peer.open(8);
+      if (number == 0) return;
+      for (;;) {
+        const auto frame = peer.take();
+        if (!frame) return;
+        if (frame->has_start_publishing()) {
+          owner.answer_start(peer, *frame);
+        } else {
+          owner.take(*frame);
+          owner.acknowledge(peer);
+        }
+      }
+    });
+    auto con =
+        PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .max_unsent_samples = 10})
+            .value();
+    while (con.connected()) ASSERT_TRUE(con.post(bytes_of(text_of(0))));
+    const std::uint64_t before = con.dropped();
+    for (std::int64_t i = 1; i <= 30; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+    EXPECT_GE(con.dropped(), before + 20);
+    back = true;
+    ASSERT_TRUE(con.flush(kNever));
+  }
+  ASSERT_GE(owner.written.size(), 10u);
+  for (std::size_t i = 0; i < 10; ++i) {
+    EXPECT_EQ(owner.written[owner.written.size() - 10 + i],
+              text_of(static_cast<std::int64_t>(21 + i)));
+  }
+}
+
+TEST(PConnectorPublishing, AWriteThatIsNotAcknowledgedSaysSo) {
+  const FakeDaemon daemon([](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
+  auto con =
+      PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 100ms})
+          .value();
+  const auto written = con.write(bytes_of(text_of(0)));
+  ASSERT_FALSE(written);
+  expect_words(written.error(), Errc::daemon_away, {"lidar", "kept"});
+}
+
+TEST(PConnectorPublishing, TheDestructorSendsWhatWasPosted) {
+  Owner owner;
+  {
+    const FakeDaemon daemon([&](FakePeer& peer, int) {
+      peer.open(8);
+      while (const auto frame = peer.take()) {
+        if (frame->has_start_publishing()) {
+          owner.answer_start(peer, *frame);
+        } else {
+          owner.take(*frame);
+          owner.acknowledge(peer);
+        }
+      }
+    });
+    auto con = open(daemon).value();
+    for (std::int64_t i = 0; i < 1000; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+  }
+  EXPECT_EQ(owner.written.size(), 1000u);
+}
+
+}  // namespace
+}  // namespace dssm::test
