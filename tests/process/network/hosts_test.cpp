@@ -8,7 +8,8 @@
 #include <thread>
 
 #include "tests/process/network/fleet.hpp"
-#include "tests/process/network/known_samples.hpp"
+#include "tests/process/network/follower.hpp"
+#include "tests/process/network/load.hpp"
 #include "tests/process/network/raw_peer.hpp"
 
 namespace dssm::test {
@@ -157,6 +158,59 @@ TEST_F(Hosts, GapsAfterACutAreCountedExactly) {
   expect_samples(reader, known, 937, 999);
   EXPECT_EQ(reader.lost(), 927u);
   EXPECT_EQ(there.info(known.id).value().mirror->gap_samples, 927u);
+}
+
+// A link that carries a third of a stream: gaps are counted, and what else goes over the link does
+// not suffer.
+TEST_F(Hosts, BehindASlowLinkSkipForwardAndCountIt) {
+  if (!make_fleet(2)) return;
+  const Result<void> slow = fleet->network().shape(2, "tbf rate 20mbit burst 64kb latency 50ms");
+  if (!slow) GTEST_SKIP() << slow.error().message;
+  Session owner = fleet->session(1), there = fleet->session(2);
+  const KnownStream wide{{"wide", 0, "pc1"}, 64 << 10, 32, 10ms, 0ms, 1};
+  const KnownStream narrow{{"narrow", 0, "pc1"}, 64, 4096, 10ms, 0ms, 2};
+  std::atomic<bool> stop = false;
+  std::thread writing([&] { LoadWriter(owner, {wide, narrow}, 1).write_until(stop); });
+  std::vector<Follower> followers;
+  for (const KnownStream& known : {wide, narrow}) {
+    followers.emplace_back(known, there.await_raw_reader(known.id, kNever).value(),
+                           owner.await_raw_reader(known.id, kNever).value());
+  }
+  RawReader* const readers[] = {&followers[0].reader(), &followers[1].reader()};
+  const auto take_until = [&](auto enough) {
+    while (!enough()) {
+      (void)wait_any(readers, kNever);
+      for (Follower& follower : followers) follower.take(100);
+    }
+  };
+  take_until([&] { return followers[1].taken() >= 1000 && followers[0].lost() > 0; });
+  stop = true;
+  writing.join();
+  take_until([&] { return followers[0].has_all() && followers[1].has_all(); });
+  for (const Follower& follower : followers) {
+    EXPECT_EQ(follower.faults(), "");
+    EXPECT_EQ(follower.taken() + follower.lost(), static_cast<std::uint64_t>(follower.last()) + 1);
+  }
+  EXPECT_GT(followers[0].taken(), 100u);
+  EXPECT_EQ(followers[1].lost(), 0u);
+}
+
+TEST_F(Hosts, FarApartLoseNothing) {
+  if (!make_fleet(2)) return;
+  for (int host = 1; host <= 2; ++host) {
+    const Result<void> far = fleet->network().shape(host, "netem delay 50ms 10ms loss 1%");
+    if (!far) GTEST_SKIP() << far.error().message;
+  }
+  Session owner = fleet->session(1), there = fleet->session(2);
+  const KnownStream known = small("far", 4096);
+  RawWriter writer = make(owner, known);
+  RawReader reader = there.await_raw_reader(known.id, kNever).value();
+  reader.seek(kNoTid);
+  for (Tid last = 99; last < 3000; last += 100) {
+    write_until(writer, known, last);
+    expect_samples(reader, known, last - 99, last);
+  }
+  EXPECT_EQ(reader.lost(), 0u);
 }
 
 TEST_F(Hosts, StreamsOfOneNameAreToldApartByHost) {

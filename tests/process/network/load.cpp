@@ -23,28 +23,13 @@ constexpr Kind kKinds[] = {
     {20, 256 << 10, 64},  {10, 512 << 10, 32}, {10, 1 << 20, 16},
 };
 
-// A stream that is being written.
-struct Written {
-  const KnownStream& known;
-  RawWriter writer;
-  std::uint64_t life;
-  std::uint64_t written = 0;  // by this program
-
-  void write_next() {
-    const SampleInfo info = known.info(writer.newest() + 1);
-    Loan loan = writer.loan();
-    known.fill(loan.payload(), life, info.tid);
-    loan.publish(info.time, info.clock_error);
-    ++written;
-  }
-};
-
-// The life of the samples that the stream holds already; `otherwise` when there are none.
-std::uint64_t life_of(Session& session, const KnownStream& known, std::uint64_t otherwise) {
+// The life of the samples that the stream holds already.
+std::uint64_t life_of(Session& session, const KnownStream& known) {
   RawReader reader = session.open_raw_reader(known.id).value();
   std::vector<std::byte> payload(known.payload_bytes);
   SampleInfo info;
-  return reader.latest(payload, info) == ReadStatus::ok ? KnownStream::life(payload) : otherwise;
+  while (reader.latest(payload, info) != ReadStatus::ok) continue;  // nobody laps us for ever
+  return KnownStream::life(payload);
 }
 
 }  // namespace
@@ -64,22 +49,49 @@ std::vector<KnownStream> load_of(int host, std::uint64_t percent) {
   return streams;
 }
 
-void write_load(Session session, const std::vector<KnownStream>& streams, std::uint64_t life,
-                const std::atomic<bool>& stop) {
-  std::vector<Written> all;
+LoadWriter::LoadWriter(Session session, const std::vector<KnownStream>& streams,
+                       std::uint64_t life) {
   for (const KnownStream& known : streams) {
     RawWriter writer = session.create_raw(known.id, known.type(), known.history()).value();
-    all.push_back({known, std::move(writer), life_of(session, known, life)});
+    const bool begins = writer.newest() == kNoTid;
+    streams_.push_back({known, std::move(writer), begins ? life : life_of(session, known)});
   }
+}
+
+void LoadWriter::write_until(const std::atomic<bool>& stop) {
   const MonoTime begin = MonoClock::now();
   while (!stop) {
     const Duration gone = MonoClock::now() - begin;
-    for (Written& stream : all) {
+    for (Written& stream : streams_) {
       const auto due = static_cast<std::uint64_t>(gone / stream.known.cycle);
       while (stream.written < due) stream.write_next();
     }
     std::this_thread::sleep_for(1ms);  // the load's rate, not a wait for anything
   }
+}
+
+void LoadWriter::Written::write_next() {
+  const SampleInfo info = known.info(writer.newest() + 1);
+  Loan loan = writer.loan();
+  known.fill(loan.payload(), life, info.tid);
+  loan.publish(info.time, info.clock_error);
+  ++written;
+}
+
+std::vector<KnownStream> published_load(std::uint64_t percent) {
+  std::vector<KnownStream> streams;
+  for (const Kind& kind : {Kind{1000, 64, 1 << 18}, Kind{1000, 16, 1 << 18},
+                           Kind{200, 1024, 1 << 15}, Kind{50, 16 << 10, 1 << 12}}) {
+    const int number = static_cast<int>(streams.size());
+    const Duration cycle = Duration(1s) / kind.rate_hz * 100 / static_cast<std::int64_t>(percent);
+    streams.push_back({{"published", number, "pc1"},
+                       kind.payload_bytes,
+                       kind.depth,
+                       cycle,
+                       cycle,
+                       static_cast<std::uint64_t>(500 + number)});
+  }
+  return streams;
 }
 
 KnownStream steady_stream() { return {{"steady", 0, "pc1"}, 256, 1 << 16, 1ms, 0ms, 1000}; }

@@ -17,10 +17,33 @@ namespace dssm::test {
 // others for less than one.
 std::vector<KnownStream> load_of(int host, std::uint64_t percent);
 
-// Creates the streams and writes to each at its rate until `stop`. Streams that are there already
-// are gone on with, with the life that their samples have.
-void write_load(Session session, const std::vector<KnownStream>& streams, std::uint64_t life,
-                const std::atomic<bool>& stop);
+// Writes streams at their rates.
+class LoadWriter {
+ public:
+  // Creates the streams. Those that are there already are gone on with, with the life that their
+  // samples have.
+  LoadWriter(Session session, const std::vector<KnownStream>& streams, std::uint64_t life);
+
+  void write_until(const std::atomic<bool>& stop);
+
+  // Of the stream's number in the list.
+  Tid newest(std::size_t stream) const { return streams_[stream].writer.newest(); }
+
+ private:
+  struct Written {
+    KnownStream known;
+    RawWriter writer;
+    std::uint64_t life;
+    std::uint64_t written = 0;  // by this object
+
+    void write_next();
+  };
+  std::vector<Written> streams_;
+};
+
+// Four streams of pc1, to be written by another host. Their rings reach back for more than a
+// minute, which is longer than a link is ever cut.
+std::vector<KnownStream> published_load(std::uint64_t percent);
 
 // 1 kHz of 256 B, a stream of pc1 whose ring reaches back for a minute: nobody has to lose
 // anything.

@@ -16,5 +16,6 @@ int main(int, char** argv) {
       test::load_of(std::atoi(argv[1]), std::strtoull(argv[2], nullptr, 10));
   Session session = Session::connect({.request_timeout = std::chrono::minutes(2)}).value();
   if (::write(STDOUT_FILENO, "x", 1) != 1) return 1;
-  test::write_load(std::move(session), streams, std::strtoull(argv[3], nullptr, 10), stop);
+  test::LoadWriter(std::move(session), streams, std::strtoull(argv[3], nullptr, 10))
+      .write_until(stop);
 }

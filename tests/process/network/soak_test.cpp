@@ -39,6 +39,14 @@ class Soak : public NetworkTest {
                 static_cast<unsigned long long>(seed), static_cast<unsigned long long>(seconds),
                 static_cast<unsigned long long>(percent));
     for (int host = 1; host <= kHosts; ++host) sessions.push_back(fleet->session(host));
+    for (Session& session : sessions) {
+      for (int host = 1; host <= kHosts; ++host) {
+        await("every host sees every other", [&] {
+          const std::string state = host_info(session, Network::name(host)).state;
+          return state == "up" || state == "self";
+        });
+      }
+    }
   }
 
   // Followers of all streams of other hosts, on every host. `lasting_rings`: each also looks into
@@ -194,7 +202,8 @@ TEST_F(Soak, LosesNothingThatTheOwnersRingStillHolds) {
   std::vector<std::thread> writing, reading;
   for (int owner = 1; owner <= kOwners; ++owner) {
     writing.emplace_back([&, owner] {
-      write_load(sessions[static_cast<std::size_t>(owner) - 1], load_of(owner, percent), 1, stop);
+      LoadWriter(sessions[static_cast<std::size_t>(owner) - 1], load_of(owner, percent), 1)
+          .write_until(stop);
     });
   }
   follow(true);
@@ -222,6 +231,38 @@ TEST_F(Soak, LosesNothingThatTheOwnersRingStillHolds) {
                 static_cast<std::uint64_t>(follower.last() - follower.first()) + 1)
           << about(follower);
     }
+  }
+}
+
+// Streams of pc1 that are written on pc3: what the link cannot carry waits there, and each sample
+// is written once, so that its tid is the same on both.
+TEST_F(Soak, RemoteWritersCatchUpAndWriteEachSampleOnce) {
+  open_fleet();
+  if (!fleet) return;
+  const std::vector<KnownStream> streams = published_load(percent);
+  std::atomic<bool> stop = false;
+  LoadWriter writer(sessions[2], streams, 1);
+  std::thread writing([&] { writer.write_until(stop); });
+  for (const KnownStream& known : streams) {
+    const auto open = [&] {
+      return sessions[0].await_raw_reader(known.id, deadline_in(kPatience)).value();
+    };
+    followers[0].emplace_back(known, open(), open());
+  }
+  std::vector<std::thread> reading;
+  reading.emplace_back([&] {
+    read_on(followers[0], [&](const Follower& follower) {
+      return follower.last() == writer.newest(static_cast<std::size_t>(follower.known().id.id));
+    });
+  });
+  make_trouble([](int, std::uint64_t) {});
+  stop = true;
+  writing.join();
+  finish(reading);
+  for (const Follower& follower : followers[0]) {
+    EXPECT_EQ(follower.last(), writer.newest(static_cast<std::size_t>(follower.known().id.id)))
+        << about(follower);
+    EXPECT_EQ(follower.lost(), 0u) << about(follower);
   }
 }
 

@@ -32,9 +32,9 @@ class Trouble : public NetworkTest {
  protected:
   void SetUp() override {
     if (!make_fleet(3, {"--max-peer-memory", "8 MiB"})) return;
-    const std::vector<KnownStream> streams = {steady_stream()};
     stop = false;
-    writing = std::thread([this, streams] { write_load(fleet->session(1), streams, 1, stop); });
+    writing = std::thread(
+        [this] { LoadWriter(fleet->session(1), {steady_stream()}, 1).write_until(stop); });
     for (int host = 1; host <= 2; ++host) {
       Session session = fleet->session(host);
       Session owner = fleet->session(1);
