@@ -8,6 +8,7 @@
 #include <utility>
 
 #include "core/wire/messages.hpp"
+#include "daemon/channel/owner_stream.hpp"
 #include "daemon/service/message_ids.hpp"
 
 namespace dssm::daemon {
@@ -18,27 +19,6 @@ constexpr std::uint64_t kOpen = 1, kSubscribe = 2;
 
 // A link that is too slow for its stream has gaps all the time.
 constexpr Duration kGapLinePause = std::chrono::seconds(10);
-
-Error untimely(const char* what) {
-  return Error{Errc::protocol, std::string(what) + " came, which nobody asked for"};
-}
-
-// What the owner says about its stream.
-Result<StreamInfo> stream_untrusted(const net::Opened& opened, const StreamId& expected) {
-  const Result<StreamId> id = wire::stream_id_untrusted(opened.stream().id());
-  if (!id) return id.error();
-  if (*id != expected) {
-    return Error{Errc::protocol, "it opened '" + id->str() + "' instead"};
-  }
-  Result<TypeInfo> type = wire::type_untrusted(opened.stream().type());
-  if (!type) return std::move(type).error();
-  StreamInfo stream = wire::stream_info(opened.stream());
-  stream.type = *std::move(type);
-  if (stream.cycle <= Duration::zero() || stream.incarnation == 0) {
-    return Error{Errc::protocol, "its description of the stream has no cycle or no incarnation"};
-  }
-  return stream;
-}
 
 }  // namespace
 
@@ -107,7 +87,7 @@ Result<void> Mirror::on_frame(net::Frame& frame) {
 
 Result<void> Mirror::on_opened_untrusted(const net::Opened& opened) {
   if (step_ != Step::opening) return untimely("Opened");
-  const Result<StreamInfo> theirs = stream_untrusted(opened, id_);
+  const Result<StreamInfo> theirs = owner_stream_untrusted(opened, id_);
   if (!theirs) return theirs.error();
   if (Result<void> followed = follow_untrusted(*theirs); !followed) {
     on_refused(followed.error());

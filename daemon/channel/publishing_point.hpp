@@ -1,0 +1,59 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// With which sample a remote writer goes on after its connection broke, so that each is written
+// once. Mostly the owner knows. When its dssmd was restarted it has forgotten, and its ring may
+// hold more of our samples than it could still tell us. But we know of one sample of ours which of
+// theirs it became: those that follow it there are read and compared with our next ones, by their
+// stamps. Samples of other publishers in between are passed over.
+#pragma once
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/sample.hpp>
+#include <dssm/stream.hpp>
+#include <optional>
+
+#include "core/ring/ring_reader.hpp"
+#include "daemon/channel/outgoing_ring.hpp"
+#include "network.pb.h"
+
+namespace dssm::daemon {
+
+// Each function returns the request to send next; nothing: what is known is in the ring's next().
+class PublishingPoint {
+ public:
+  // So many samples are compared; beyond that the first ones may be written twice.
+  static constexpr Tid kMostCompared = 4096;
+  using Request = std::optional<net::Frame>;
+
+  // The ring outlives it.
+  explicit PublishingPoint(OutgoingRing& ring) : ring_(ring), reader_(ring.mapping()) {}
+
+  // The ring is new; it begins where the owner's is.
+  void begin(const StreamInfo& theirs) noexcept {
+    their_incarnation_ = theirs.incarnation;
+    known_tid_ = theirs.newest;
+  }
+
+  net::Frame start() const;  // StartPublishing
+  Result<Request> on_publishing_untrusted(const net::Publishing& publishing);
+  Result<Request> on_range_untrusted(const net::Range& range);
+  Result<Request> on_sample(const SampleInfo& theirs);
+  Result<Request> on_no_sample();
+
+  // While publishing: what the owner has written by now.
+  //   fails  protocol: that was not sent
+  Result<void> on_published_untrusted(const net::Published& published);
+
+ private:
+  Request compare_next();
+  Result<void> note_untrusted(Tid last, Tid tid);
+
+  OutgoingRing& ring_;
+  ring::RingReader reader_;
+  std::uint64_t their_incarnation_ = 0;  // 0: not known
+  Tid known_tid_ = kNoTid;  // in their ring: our sample next() - 1 is there or before it
+  Tid last_compared_ = kNoTid;
+};
+
+}  // namespace dssm::daemon
