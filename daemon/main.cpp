@@ -7,7 +7,13 @@
 
 #include <cstdio>
 
+#include "daemon/channel/mirrors.hpp"
 #include "daemon/channel/network_listener.hpp"
+#include "daemon/channel/remote_writers.hpp"
+#include "daemon/channel/resolver.hpp"
+#include "daemon/discovery/catalog.hpp"
+#include "daemon/discovery/fleet_service.hpp"
+#include "daemon/discovery/peers.hpp"
 #include "daemon/local/listener.hpp"
 #include "daemon/local/local_service.hpp"
 #include "daemon/local/server.hpp"
@@ -26,6 +32,18 @@ namespace dssm::daemon {
 namespace {
 
 constexpr int kFailed = 1, kUsage = 2;
+
+// What this dssmd says of itself to other hosts.
+wire::Greeting own_greeting(const std::string& name) {
+  wire::Greeting self;
+  self.host = name;
+  self.host_id = wire::host_id_for(name);
+  self.life = wire::random_number();
+  self.program = "dssmd";
+  self.version = DSSM_VERSION;
+  self.features = {std::string(wire::kFeatureTorn)};
+  return self;
+}
 
 Result<void> run(const Config& config, Logger& logger) {
   raise_descriptor_limit();
@@ -46,7 +64,18 @@ Result<void> run(const Config& config, Logger& logger) {
                     {config.max_streams, config.max_memory_bytes, config.max_property_bytes});
   OpenTable opens({config.max_opens, config.max_opens_per_client});
   PlaybackClockOwner clock;
-  LocalService service(registry, opens, clock, logger, recovering);
+
+  const wire::Greeting self = own_greeting(config.name);
+  Resolver resolver(*loop);
+  const ChannelParts parts{*loop, resolver, registry, logger, self};
+  Catalog catalog(config.name);
+  Mirrors mirrors(parts, catalog, config.mirror_linger);
+  RemoteWriters writers(parts, catalog);
+  Peers peers(*loop, resolver, config.peers, self, catalog, logger);
+  FleetService fleet(*loop, {self, network->addresses(), config.insecure}, registry, catalog, peers,
+                     mirrors, writers);
+
+  LocalService service(registry, opens, clock, logger, recovering, &fleet);
   const Server server(*loop, *listener, config.max_clients, service, logger);
 
   EventSource grace = EventSource::timer(*loop, [&] { service.end_recovery(); });
