@@ -382,6 +382,22 @@ TEST(Golden, GreetingIsUnderstood) {
   EXPECT_TRUE(greeting->has_feature(kFeatureTorn));
 }
 
+TEST(Golden, ExamplesInTheDocumentationAreTheFiles) {
+  std::set<std::string> files;
+  for (const auto& entry : std::filesystem::directory_iterator(folder())) {
+    if (entry.path().extension() == ".hex") files.insert(text_of(entry.path()));
+  }
+  const std::string text = text_of(source_root() / "docs/wire.md"), fence = "```\n";
+  int examples = 0;
+  for (std::size_t at = 0; (at = text.find(fence, at)) != text.npos; ++examples) {
+    const std::size_t begin = at + fence.size(), end = text.find(fence, begin);
+    ASSERT_NE(end, text.npos);
+    EXPECT_TRUE(files.count(text.substr(begin, end - begin))) << text.substr(begin, end - begin);
+    at = end + fence.size();
+  }
+  EXPECT_GE(examples, 10);
+}
+
 // Every file has a meaning above and in the README; every message that a frame can carry has a
 // file.
 TEST(Golden, FilesAndMeaningsAreComplete) {
