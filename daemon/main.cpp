@@ -7,6 +7,7 @@
 
 #include <cstdio>
 
+#include "daemon/channel/channel_server.hpp"
 #include "daemon/channel/mirrors.hpp"
 #include "daemon/channel/network_listener.hpp"
 #include "daemon/channel/remote_writers.hpp"
@@ -77,8 +78,15 @@ Result<void> run(const Config& config, Logger& logger) {
 
   LocalService service(registry, opens, clock, logger, recovering, &fleet);
   const Server server(*loop, *listener, config.max_clients, service, logger);
+  ChannelServer channels(
+      {*loop, registry, opens, logger}, self,
+      {config.max_connections, config.max_connections_per_host, config.max_peer_memory_bytes});
 
-  EventSource grace = EventSource::timer(*loop, [&] { service.end_recovery(); });
+  EventSource grace = EventSource::timer(*loop, [&] {
+    service.end_recovery();
+    channels.serve(*network);
+  });
+  if (!recovering) channels.serve(*network);
   if (recovering) {
     grace.enable_in(config.recovery_grace);
     logger.notice(
@@ -91,8 +99,7 @@ Result<void> run(const Config& config, Logger& logger) {
   if (config.insecure) {
     logger.warning(
         "insecure = true: samples cross the network in the clear, and whoever reaches this host "
-        "can "
-        "read and write all its streams",
+        "can read and write all its streams",
         {.message_id = message_id::kInsecure});
   }
 

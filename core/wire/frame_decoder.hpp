@@ -101,6 +101,9 @@ class FrameDecoder {
   // Whether nothing is buffered: the last commit() ended at the end of a frame.
   bool at_frame_end() const noexcept;
 
+  // Memory that the frame under way takes: not yet complete, and no sample in our order of fields.
+  std::size_t collected_bytes() const noexcept { return whole_.capacity(); }
+
   const DecoderCounters& counters() const noexcept { return counters_; }
 
  private:

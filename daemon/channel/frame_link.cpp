@@ -91,7 +91,23 @@ bool FrameLink::hand_out(std::size_t bytes) {
   const Result<void> taken = decoder_.commit(bytes);
   handing_out_ = false;
   if (!taken) close_with(taken.error());
-  return !closed_;
+  return !closed_ && charge_input();
+}
+
+bool FrameLink::charge_input() {
+  const std::size_t bytes = decoder_.collected_bytes();
+  if (!budget_ || bytes == input_share_.bytes()) return true;
+  input_share_ = {};
+  std::optional<MemoryShare> share = budget_->try_take(bytes);
+  if (share) {
+    input_share_ = *std::move(share);
+    return true;
+  }
+  close_with({Errc::limit_exceeded,
+              "no memory is left to receive a frame of more than " + std::to_string(bytes) +
+                  " bytes: max_peer_memory = " + std::to_string(budget_->limit()) +
+                  " bytes are used up; use fewer connections or raise that key"});
+  return false;
 }
 
 void FrameLink::listen_again() {
@@ -267,6 +283,7 @@ void FrameLink::close(const Error& why) {
   writable_.disable();
   next_turn_.disable();
   output_.clear();
+  input_share_ = {};
   transport_.reset();
   ended_.enable_in(Duration::zero());
 }

@@ -60,8 +60,8 @@ class FrameLink final : private wire::FrameSink {
   // Size of the samples that this link may receive; see FrameDecoder.
   void set_payload_bytes(std::size_t payload_bytes) noexcept;
 
-  // What waits to be sent by send() is charged to `budget`, which outlives the link; when it is
-  // used up, the link closes itself.
+  // What waits to be sent by send(), and a long frame that is being received, are charged to
+  // `budget`, which outlives the link; when it is used up, the link closes itself.
   void set_budget(MemoryBudget& budget) noexcept { budget_ = &budget; }
 
   // Sends a frame, or queues what does not go at once. After the link closed: nothing happens.
@@ -117,6 +117,7 @@ class FrameLink final : private wire::FrameSink {
   void on_writable();
   void go_on();
   bool hand_out(std::size_t bytes);
+  bool charge_input();
   void listen_again();
   std::size_t transmit(std::span<const iovec> parts, bool more);
   bool flush();
@@ -131,6 +132,7 @@ class FrameLink final : private wire::FrameSink {
   wire::FrameDecoder decoder_;
   std::deque<Outgoing> output_;
   std::size_t queued_bytes_ = 0;
+  MemoryShare input_share_;
   bool closed_ = false;
   bool output_lost_ = false;  // the peer takes nothing more; what it said last is still to be read
   bool mid_frame_ = false;

@@ -29,7 +29,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameLink& link, Sample
       next_(std::clamp<Tid>(plan.first, 0, kLastTid)),
       last_(kLastTid) {}
 
-Result<PumpWait> SamplePump::pump(MonoTime now) {
+Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
   std::size_t bytes = 0;
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
@@ -37,6 +37,8 @@ Result<PumpWait> SamplePump::pump(MonoTime now) {
     if (under_way_) {
       status = sender_.go_on();
       bytes += SampleSender::kSliceBytes;
+    } else if (only_under_way) {
+      break;
     } else {
       const Look seen = look(now);
       if (seen != Look::ready) sender_.end_run();

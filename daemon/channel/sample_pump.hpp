@@ -70,8 +70,9 @@ class SamplePump {
 
   // Sends what there is to be sent in one turn. The sender must not be busy with somebody else's
   // sample.
-  //   fails  limit_exceeded (the peer's memory is used up, and it does not know "torn")
-  Result<PumpWait> pump(MonoTime now);
+  //   only_under_way  begins no other sample: somebody else wants to send in between
+  //   fails           limit_exceeded (the peer's memory is used up, and it does not know "torn")
+  Result<PumpWait> pump(MonoTime now, bool only_under_way = false);
 
   // No sample after `last` is sent.
   void end_at(Tid last) noexcept { last_ = last; }

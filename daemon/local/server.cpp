@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/local/server.hpp"
 
-#include <fcntl.h>
 #include <sys/socket.h>
 
 #include <cerrno>
@@ -16,8 +15,6 @@ namespace {
 // Accepted in a row before those who are connected get their turn.
 constexpr int kAcceptsPerTurn = 16;
 
-UniqueFd make_spare() { return UniqueFd(::open("/dev/null", O_RDONLY | O_CLOEXEC)); }
-
 }  // namespace
 
 Server::Server(const EventLoop& loop, const Listener& listener, std::uint64_t max_clients,
@@ -27,7 +24,6 @@ Server::Server(const EventLoop& loop, const Listener& listener, std::uint64_t ma
       max_clients_(max_clients),
       service_(service),
       logger_(logger),
-      spare_(make_spare()),
       incoming_(EventSource::readable(loop, listener.fd(), [this] { on_connection(); })),
       sweep_(EventSource::timer(loop, [this] {
         for (const std::uint64_t number : std::exchange(ended_, {})) connections_.erase(number);
@@ -41,7 +37,11 @@ void Server::on_connection() {
     if (socket) {
       accept(std::move(socket));
     } else if (errno == EMFILE || errno == ENFILE) {
-      return make_room_to_refuse();
+      return spare_.accept_to_refuse(listener_.fd(), [this](UniqueFd last) {
+        turn_away(std::move(last), {Errc::limit_exceeded,
+                                    "dssmd has no descriptors left (ulimit -n, LimitNOFILE=); "
+                                    "raise that limit, or lower max_clients and max_streams"});
+      });
     } else if (errno == EINTR || errno == ECONNABORTED) {
       continue;
     } else {
@@ -78,19 +78,6 @@ void Server::turn_away(UniqueFd socket, const Error& error) {
   const std::string words = last_words(error);
   // As much as fits: the program is gone from here in any case.
   static_cast<void>(wire::send_some(socket.get(), std::as_bytes(std::span(words)), {}));
-}
-
-// Without descriptors a waiting program could not even be refused, and the loop would turn for
-// nothing.
-void Server::make_room_to_refuse() {
-  const Error error{Errc::limit_exceeded,
-                    "dssmd has no descriptors left (ulimit -n, LimitNOFILE=); raise that limit, or "
-                    "lower max_clients and max_streams"};
-  spare_.reset();
-  UniqueFd socket(::accept4(listener_.fd(), nullptr, nullptr, SOCK_CLOEXEC | SOCK_NONBLOCK));
-  if (socket) turn_away(std::move(socket), error);
-  socket.reset();
-  spare_ = make_spare();
 }
 
 }  // namespace dssm::daemon

@@ -14,6 +14,7 @@
 #include "daemon/local/local_service.hpp"
 #include "daemon/service/event_loop.hpp"
 #include "daemon/service/log.hpp"
+#include "daemon/service/spare_descriptor.hpp"
 
 namespace dssm::daemon {
 
@@ -29,14 +30,13 @@ class Server {
   void on_connection();
   void accept(UniqueFd socket);
   void turn_away(UniqueFd socket, const Error& error);
-  void make_room_to_refuse();
 
   const EventLoop& loop_;
   const Listener& listener_;
   std::uint64_t max_clients_;
   LocalService& service_;
   Logger& logger_;
-  UniqueFd spare_;  // given up for a moment to refuse a client when descriptors run out
+  SpareDescriptor spare_;
   std::uint64_t next_ = 0;
   std::map<std::uint64_t, std::unique_ptr<Connection>> connections_;
   std::vector<std::uint64_t> ended_;  // to be destroyed outside of their own callbacks

@@ -158,14 +158,8 @@ Result<Reply> StreamRequests::set_property(const local::SetProperty& request) {
 Result<Reply> StreamRequests::get_property(const local::GetProperty& request) {
   const Result<std::shared_ptr<Stream>> stream = find_untrusted(request.id());
   if (!stream) return stream.error();
-  Result<std::string> property = (*stream)->property();
-  if (!property) {
-    return std::move(property).error().context("stream '" + (*stream)->id().str() + "'");
-  }
-  if (property->empty()) {
-    return Error{Errc::not_found, "stream '" + (*stream)->id().str() +
-                                      "' has no property set; `dssmctl property set` sets one"};
-  }
+  Result<std::string> property = property_of(**stream);
+  if (!property) return std::move(property).error();
   Reply reply;
   reply.response.mutable_property()->set_property(*std::move(property));
   return reply;

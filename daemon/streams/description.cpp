@@ -38,4 +38,14 @@ void describe_all(const Registry& registry, const OpenTable& opens, std::size_t 
   }
 }
 
+Result<std::string> property_of(const Stream& stream) {
+  Result<std::string> property = stream.property();
+  if (!property) {
+    return std::move(property).error().context("stream '" + stream.id().str() + "'");
+  }
+  if (!property->empty()) return property;
+  return Error{Errc::not_found, "stream '" + stream.id().str() +
+                                    "' has no property set; `dssmctl property set` sets one"};
+}
+
 }  // namespace dssm::daemon

@@ -5,6 +5,8 @@
 #pragma once
 
 #include <cstddef>
+#include <dssm/result.hpp>
+#include <string>
 
 #include "common.pb.h"
 #include "daemon/streams/open_table.hpp"
@@ -23,5 +25,9 @@ void describe_with_users(const Stream& stream, const OpenTable& opens, proto::St
 // once.
 void describe_all(const Registry& registry, const OpenTable& opens, std::size_t max_bytes,
                   proto::StreamList& out);
+
+// The stream's property.
+//   fails  not_found (none is set), os errors
+Result<std::string> property_of(const Stream& stream);
 
 }  // namespace dssm::daemon

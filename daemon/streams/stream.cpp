@@ -7,6 +7,7 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <cerrno>
 
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_reader.hpp"
@@ -221,6 +222,18 @@ Result<std::shared_ptr<const ring::RingMapping>> Stream::map_for_writing() const
 
 Result<std::shared_ptr<ring::Bell>> Stream::map_bell() const {
   return ring::Bell::open_untrusted(files_.bell.get());
+}
+
+Result<void> Stream::reserve(std::uint64_t offset, std::uint64_t bytes) {
+  int failed = 0;
+  do {
+    failed =
+        ::posix_fallocate(files_.ring.get(), static_cast<off_t>(offset), static_cast<off_t>(bytes));
+  } while (failed == EINTR);
+  if (!failed) return {};
+  return os_error("reserve " + std::to_string(bytes) + " bytes of memory for the ring of '" +
+                      plan_.id.str() + "'",
+                  failed);
 }
 
 bool Stream::is_ring(int fd) const noexcept { return same_file(fd, files_.ring.get()); }

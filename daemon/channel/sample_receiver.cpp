@@ -1,0 +1,115 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/channel/sample_receiver.hpp"
+
+#include <algorithm>
+#include <optional>
+#include <utility>
+
+namespace dssm::daemon {
+
+Result<std::unique_ptr<SampleReceiver>> SampleReceiver::open(const EventLoop& loop, FrameLink& link,
+                                                             MemoryBudget& budget,
+                                                             ServedStream& stream,
+                                                             std::uint64_t publisher) {
+  const std::uint64_t payload_bytes = stream.stream().type().payload_bytes;
+  std::optional<MemoryShare> share = budget.try_take(payload_bytes);
+  if (!share) {
+    return Error{Errc::limit_exceeded,
+                 "publish into '" + stream.stream().id().str() + "': a sample of " +
+                     std::to_string(payload_bytes) +
+                     " bytes does not fit into what is left of max_peer_memory = " +
+                     std::to_string(budget.limit()) +
+                     " bytes for this address; close other connections or raise that key"};
+  }
+  Result<std::shared_ptr<OwnWriter>> writer = stream.writer();
+  if (!writer) return std::move(writer).error();
+  return std::unique_ptr<SampleReceiver>(
+      new SampleReceiver(loop, link, *std::move(share), stream, *std::move(writer), publisher));
+}
+
+SampleReceiver::SampleReceiver(const EventLoop& loop, FrameLink& link, MemoryShare share,
+                               ServedStream& stream, std::shared_ptr<OwnWriter> writer,
+                               std::uint64_t publisher)
+    : link_(link),
+      share_(std::move(share)),
+      stream_(stream),
+      writer_(std::move(writer)),
+      publisher_(publisher),
+      payload_(stream.stream().type().payload_bytes),
+      retry_timer_(EventSource::timer(loop, [this] { try_again(); })) {}
+
+Result<void> SampleReceiver::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+  // Also samples of a stream that was removed are dropped: nobody will find them.
+  dropping_ = sample.info.tid <= last().last || stream_.stream().removed();
+  out = dropping_ ? nullptr : payload_.data();
+  return {};
+}
+
+Result<void> SampleReceiver::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+  sample_ = sample;
+  if (!dropping_ && !torn) return write();
+  if (sample.serial != 0) {
+    answer(sample.serial);
+  } else {
+    unacknowledged_ = true;
+  }
+  return {};
+}
+
+Result<void> SampleReceiver::write() {
+  using Outcome = ring::RingWriter::Attempt::Outcome;
+  const ring::RingWriter::Attempt attempt = writer_->writer().try_write(
+      std::as_const(payload_).span(), sample_.info.time, sample_.info.clock_error);
+  switch (attempt.outcome) {
+    case Outcome::written:
+      break;
+    case Outcome::busy:
+      waiting_ = true;
+      link_.pause();
+      retry_timer_.enable_in(retry_);
+      retry_ = std::min(2 * retry_, kLongestRetry);
+      return {};
+    case Outcome::refused:
+      return Error{Errc::system,
+                   "write to '" + stream_.stream().id().str() +
+                       "': a program has damaged the lock of its ring; remove the stream (dssmctl "
+                       "rm) and create it anew"};
+  }
+  retry_ = kFirstRetry;
+  written_ = true;
+  stream_.publishers().written(publisher_, sample_.info.tid, attempt.tid);
+  if (sample_.serial != 0) {
+    answer(sample_.serial);
+  } else {
+    unacknowledged_ = true;
+  }
+  return {};
+}
+
+void SampleReceiver::try_again() {
+  waiting_ = false;
+  if (Result<void> written = write(); !written) return link_.close_with(written.error());
+  if (waiting_) return;
+  acknowledge();
+  link_.resume();
+}
+
+void SampleReceiver::answer(std::uint64_t serial) {
+  const PublisherTable::Entry entry = last();
+  net::Frame frame;
+  frame.set_serial(serial);
+  frame.mutable_published()->set_last(entry.last);
+  frame.mutable_published()->set_last_tid(entry.last_tid);
+  link_.send(frame);
+}
+
+void SampleReceiver::acknowledge() {
+  if (std::exchange(written_, false)) stream_.look();
+  // One acknowledgement stands for all before it: those that would wait for the socket are not
+  // sent.
+  if (!unacknowledged_ || !link_.output_empty()) return;
+  unacknowledged_ = false;
+  answer(0);
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,348 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/channel/stream_channel.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+
+#include "daemon/streams/description.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+// A reader that was lapped this often while it was answered is not keeping up.
+constexpr int kMaxReadAttempts = 100;
+
+// New samples that are followed at once before others get their turn.
+constexpr int kMaxLooks = 16;
+
+net::Frame answer_to(std::uint64_t serial) {
+  net::Frame frame;
+  frame.set_serial(serial);
+  return frame;
+}
+
+}  // namespace
+
+StreamChannel::StreamChannel(const Parts& parts, std::shared_ptr<ServedStream> served,
+                             bool may_tear)
+    : parts_(parts),
+      served_(std::move(served)),
+      reader_(stream().mapping()),
+      sender_(stream().mapping(), parts_.link, {may_tear, &parts_.budget}),
+      due_(EventSource::timer(parts_.loop, [this] { parts_.owner.work_now(); })) {
+  served_->stream().add_channel();
+  parts_.link.set_payload_bytes(stream().type().payload_bytes);
+}
+
+StreamChannel::~StreamChannel() {
+  if (feed_) feed_->forget(*this);
+  served_->stream().remove_channel();
+}
+
+Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
+  if (stream().removed()) {
+    return Error{Errc::not_found,
+                 "stream '" + stream().id().str() + "' was removed; create it anew"};
+  }
+  switch (request.body_case()) {
+    case net::Frame::kSubscribe:
+      return subscribe(request.serial(), request.subscribe());
+    case net::Frame::kRead:
+      reading_ = {request.serial(), request.read(), 0};
+      return go_on_reading();
+    case net::Frame::kGetRange:
+      return get_range(request.serial(), request.get_range());
+    case net::Frame::kStartPublishing:
+      return start_publishing(request.serial(), request.start_publishing());
+    case net::Frame::kSetProperty:
+      return set_property(request.serial(), request.set_property());
+    case net::Frame::kGetProperty:
+      return get_property(request.serial());
+    case net::Frame::kOpen:
+    case net::Frame::kCreate:
+      return Error{Errc::protocol, "this channel carries '" + stream().id().str() +
+                                       "' already; open another connection for another stream"};
+    default:
+      return Error{Errc::protocol,
+                   "a channel takes no such request; it is for control connections, or of a newer "
+                   "version than this dssmd (" DSSM_VERSION ")"};
+  }
+}
+
+Result<void> StreamChannel::work(MonoTime now, bool request_waits) {
+  if (reading_) {
+    if (Result<void> read = go_on_reading(); !read || reading_) return read;
+  }
+  if (receiver_) receiver_->acknowledge();
+  return go_on_pumping(now, request_waits);
+}
+
+// --- subscription
+// ---------------------------------------------------------------------------------
+
+Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe& request) {
+  if (!std::isfinite(request.max_rate_hz()) || request.max_rate_hz() < 0) {
+    return Error{Errc::invalid_argument,
+                 "subscribe to '" + stream().id().str() + "': max_rate_hz is " +
+                     std::to_string(request.max_rate_hz()) +
+                     "; give 0 for all samples, or how many per second at most"};
+  }
+  if (!feed_) {
+    Result<std::shared_ptr<StreamFeed>> feed = served_->feed();
+    if (!feed) return std::move(feed).error();
+    feed_ = *std::move(feed);
+  }
+  feed_->forget(*this);
+  due_.disable();
+  const Tid newest = newest_untrusted(reader_);
+  const Tid first = first_tid(request);
+  net::Frame frame = answer_to(serial);
+  net::Subscribed& subscribed = *frame.mutable_subscribed();
+  subscribed.set_incarnation(stream().incarnation());
+  subscribed.set_first_tid(first);
+  subscribed.set_newest(newest);
+  parts_.link.send(frame);
+  pump_.emplace(stream().mapping(), parts_.link, sender_, static_cast<SamplePump::Events&>(*this),
+                SamplePump::Plan{first, newest, request.max_rate_hz()});
+  parts_.owner.work_soon();
+  return {};
+}
+
+Tid StreamChannel::first_tid(const net::Subscribe& request) const {
+  const Tid next = newest_untrusted(reader_) + 1;
+  // Of an empty ring that is 0, and no sample is passed over.
+  const Tid oldest = next == 0 ? 0 : std::clamp<Tid>(reader_.oldest(), 0, next - 1);
+  switch (request.start_case()) {
+    case net::Subscribe::kFromTid: {
+      const bool other_ring =
+          request.incarnation() != 0 && request.incarnation() != stream().incarnation();
+      return other_ring ? oldest : std::clamp<Tid>(request.from_tid(), 0, kLastTid);
+    }
+    case net::Subscribe::kFromTimeNs: {
+      Tid tid = kNoTid;
+      const Time time = time_from_ns(request.from_time_ns());
+      return reader_.find(time, tid) == ReadStatus::ok ? std::clamp<Tid>(tid, oldest, next)
+                                                       : oldest;
+    }
+    case net::Subscribe::kFromOldest:
+      return oldest;
+    case net::Subscribe::kFromNow:
+    case net::Subscribe::START_NOT_SET:
+      break;
+  }
+  return next;
+}
+
+Result<void> StreamChannel::go_on_pumping(MonoTime now, bool request_waits) {
+  if (!pump_) return {};
+  feed_->forget(*this);
+  Result<PumpWait> wait = pump_->pump(now, request_waits);
+  for (int looks = 0; wait && *wait == PumpWait::news; ++looks) {
+    if (feed_->wait(*this, pump_->known())) return {};
+    // One came between the look and the arming of the doorbell.
+    wait = looks < kMaxLooks ? pump_->pump(now) : Result(PumpWait::turn);
+  }
+  if (!wait)
+    return std::move(wait).error().context("send samples of '" + stream().id().str() + "'");
+  switch (*wait) {
+    case PumpWait::news:
+      break;
+    case PumpWait::time:
+      due_.enable_in(pump_->due() - now);
+      break;
+    case PumpWait::turn:
+      parts_.owner.work_soon();
+      break;
+    case PumpWait::nothing:
+      pump_.reset();
+      break;
+    case PumpWait::room:
+      break;
+  }
+  return {};
+}
+
+void StreamChannel::on_news() { parts_.owner.work_now(); }
+
+void StreamChannel::on_gap(Tid first, std::uint64_t count) {
+  lost_ += count;
+  net::Frame frame;
+  frame.mutable_gap()->set_first_tid(first);
+  frame.mutable_gap()->set_count(count);
+  parts_.link.send(frame);
+}
+
+void StreamChannel::on_caught_up() {
+  net::Frame frame;
+  frame.mutable_caught_up();
+  parts_.link.send(frame);
+}
+
+void StreamChannel::on_removed() {
+  if (!pump_) return end();
+  pump_->end_at(newest_untrusted(reader_));
+  parts_.owner.work_soon();
+}
+
+void StreamChannel::on_end() { end(); }
+
+void StreamChannel::end() {
+  net::Frame frame;
+  frame.mutable_ended()->set_removed(true);
+  parts_.link.send(frame);
+}
+
+// --- reads
+// ----------------------------------------------------------------------------------------
+
+ReadStatus StreamChannel::find(const net::Read& request, Tid& tid) const {
+  const Tid newest = newest_untrusted(reader_);
+  switch (request.which_case()) {
+    case net::Read::kTid:
+      tid = request.tid();
+      if (tid > newest) return ReadStatus::not_yet;
+      return tid < 0 || tid < reader_.oldest() ? ReadStatus::too_old : ReadStatus::ok;
+    case net::Read::kTimeNs:
+      return reader_.find(time_from_ns(request.time_ns()), tid);
+    case net::Read::kNewerThan:
+      tid = newest;
+      return newest < 0 || newest <= request.newer_than() ? ReadStatus::not_yet : ReadStatus::ok;
+    case net::Read::kNewest:
+    case net::Read::WHICH_NOT_SET:
+      break;
+  }
+  tid = newest;
+  return newest < 0 ? ReadStatus::not_yet : ReadStatus::ok;
+}
+
+Result<void> StreamChannel::go_on_reading() {
+  const bool tid_counts = reading_->request.which_case() == net::Read::kTid;
+  for (;;) {
+    SendStatus status = SendStatus::gone;
+    if (sender_.busy()) {
+      status = sender_.go_on();
+    } else if (!parts_.link.output_empty()) {
+      return {};
+    } else {
+      Tid tid = kNoTid;
+      const ReadStatus found = find(reading_->request, tid);
+      if (found != ReadStatus::ok) return answer_no_sample(found), Result<void>();
+      if (++reading_->attempts > kMaxReadAttempts) {
+        return answer_no_sample(ReadStatus::lapped), Result<void>();
+      }
+      status = sender_.send(tid, reading_->serial);
+      // A tid that was found and is gone when it is looked at does not come back.
+      if (status == SendStatus::gone && tid_counts) {
+        return answer_no_sample(ReadStatus::too_old), Result<void>();
+      }
+    }
+    switch (status) {
+      case SendStatus::sent:
+        sender_.end_run();
+        reading_.reset();
+        return {};
+      case SendStatus::torn:  // void, and so no answer: another one follows
+      case SendStatus::gone:
+        break;
+      case SendStatus::blocked:
+        sender_.end_run();
+        return {};
+      case SendStatus::unfinished:
+        parts_.owner.work_soon();
+        return {};
+      case SendStatus::no_memory: {
+        Error error{Errc::limit_exceeded,
+                    "read from '" + stream().id().str() +
+                        "': no memory is left to copy a sample aside; use a client that has the "
+                        "feature 'torn', or raise the key max_peer_memory"};
+        reading_.reset();
+        return error;
+      }
+    }
+    sender_.end_run();
+  }
+}
+
+void StreamChannel::answer_no_sample(ReadStatus status) {
+  net::Frame frame = answer_to(reading_->serial);
+  frame.mutable_no_sample()->set_status(static_cast<std::uint32_t>(status));
+  reading_.reset();
+  parts_.link.send(frame);
+}
+
+Result<void> StreamChannel::get_range(std::uint64_t serial, const net::GetRange& request) {
+  net::Frame frame = answer_to(serial);
+  net::Range& range = *frame.mutable_range();
+  const Tid newest = newest_untrusted(reader_);
+  range.set_newest(newest);
+  range.set_oldest(newest < 0 ? kNoTid : std::clamp<Tid>(reader_.oldest(), 0, newest));
+  range.set_at_tid(kNoTid);
+  Tid tid = kNoTid;
+  if (request.has_time_ns() &&
+      reader_.find(time_from_ns(request.time_ns()), tid) == ReadStatus::ok) {
+    range.set_at_tid(tid);
+  }
+  parts_.link.send(frame);
+  return {};
+}
+
+// --- publishing
+// -----------------------------------------------------------------------------------
+
+Result<void> StreamChannel::start_publishing(std::uint64_t serial,
+                                             const net::StartPublishing& request) {
+  receiver_.reset();
+  Result<std::unique_ptr<SampleReceiver>> receiver =
+      SampleReceiver::open(parts_.loop, parts_.link, parts_.budget, *served_, request.publisher());
+  if (!receiver) return std::move(receiver).error();
+  receiver_ = *std::move(receiver);
+  const PublisherTable::Entry last = receiver_->last();
+  net::Frame frame = answer_to(serial);
+  net::Publishing& publishing = *frame.mutable_publishing();
+  publishing.set_last(last.last);
+  publishing.set_last_tid(last.last_tid);
+  publishing.set_incarnation(stream().incarnation());
+  parts_.link.send(frame);
+  return {};
+}
+
+Result<void> StreamChannel::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+  if (!receiver_) {
+    return Error{Errc::protocol,
+                 "stream '" + stream().id().str() + "': a sample came before StartPublishing"};
+  }
+  return receiver_->on_sample_begin(sample, out);
+}
+
+Result<void> StreamChannel::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+  return receiver_->on_sample_end(sample, torn);
+}
+
+void StreamChannel::on_batch_end() {
+  if (receiver_) receiver_->acknowledge();
+}
+
+// --- property
+// -------------------------------------------------------------------------------------
+
+Result<void> StreamChannel::set_property(std::uint64_t serial, const net::SetProperty& request) {
+  if (Result<void> set = parts_.registry.set_property(stream().id(), request.property()); !set) {
+    return set;
+  }
+  net::Frame frame = answer_to(serial);
+  frame.mutable_done();
+  parts_.link.send(frame);
+  return {};
+}
+
+Result<void> StreamChannel::get_property(std::uint64_t serial) {
+  Result<std::string> property = property_of(stream());
+  if (!property) return std::move(property).error();
+  net::Frame frame = answer_to(serial);
+  frame.mutable_property()->set_property(*std::move(property));
+  parts_.link.send(frame);
+  return {};
+}
+
+}  // namespace dssm::daemon
