@@ -45,16 +45,19 @@ Result<void> run_create(const Options& options, Output& out) {
   const bool there = session->info(*id).has_value();
   Result<RawWriter> writer = session->create_raw(*id, type, *history);
   if (!writer) return std::move(writer).error();
+  // Not the writer's own figures: for another host's stream those of a ring on the way there.
+  const Result<StreamInfo> stream = session->info(writer->id());
+  if (!stream) return stream.error();
   if (options.json) {
-    out.add(json_document({{"stream", writer->id().str()},
+    out.add(json_document({{"stream", stream->id.str()},
                            {"created", !there},
-                           {"payload_bytes", writer->payload_bytes()},
-                           {"depth", writer->depth()},
-                           {"cycle_ns", to_ns(writer->cycle())}}));
+                           {"payload_bytes", stream->type.payload_bytes},
+                           {"depth", stream->depth},
+                           {"cycle_ns", to_ns(stream->cycle)}}));
   } else {
-    out.add(escaped(writer->id().str()) +
+    out.add(escaped(stream->id.str()) +
             (there ? ": exists already, kept with " : ": created with ") +
-            std::to_string(writer->depth()) + " slots of " + bytes_text(writer->payload_bytes()) +
+            std::to_string(stream->depth) + " slots of " + bytes_text(stream->type.payload_bytes) +
             "\n");
   }
   return {};

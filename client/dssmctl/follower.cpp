@@ -21,18 +21,24 @@ Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out
 }
 
 // A stream that is created anew at once goes on, and after a restart of dssmd one may look removed
-// until those who hold it have offered it back: only the answer that there is none counts. A stream
-// of another host is also "removed" while that host is away, and then goes on in its mirror.
+// until those who hold it have offered it back: only answers that there is none count, and only if
+// that stays so. A stream of another host is also "removed" while that host is away, and then goes
+// on in its mirror.
 bool Follower::removed() {
-  if (!suspicion_->load(std::memory_order_relaxed) || !session_.connected()) return false;
-  const Result<StreamInfo> now = session_.info(reader_.id());
-  if (!now) return now.error().code == Errc::not_found;
-  if (!now->mirror || now->mirror->state != "removed") {
+  bool gone = false;
+  Duration patience = kLookUp;
+  if (suspicion_->load(std::memory_order_relaxed) && session_.connected()) {
+    const Result<StreamInfo> now = session_.info(reader_.id());
+    gone =
+        now ? now->mirror && now->mirror->state == "removed" : now.error().code == Errc::not_found;
+    if (now) patience = kMayComeBack;
+  }
+  if (!gone) {
     gone_since_.reset();
     return false;
   }
   if (!gone_since_) gone_since_ = MonoClock::now();
-  return MonoClock::now() - *gone_since_ >= kMayComeBack;
+  return MonoClock::now() - *gone_since_ >= patience;
 }
 
 Follower::Wake Follower::wait(MonoTime deadline) {

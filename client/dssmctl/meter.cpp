@@ -113,7 +113,7 @@ Result<void> run_meter(const Options& options, Output& out, const Meter& meter) 
 std::string farewell(const MeterState& state) {
   std::string text = "--- " + escaped(state.stream.str()) + ": " + std::to_string(state.seen) +
                      " samples, " + std::to_string(state.lost) + " lost";
-  if (state.restarts > 0) text += ", began anew " + std::to_string(state.restarts) + " times";
+  if (state.restarts > 0) text += ", began anew: " + std::to_string(state.restarts);
   return text + " ---\n";
 }
 

@@ -65,7 +65,7 @@ class Ping {
                                  {"round_trip_max_ns", known(to_ns(times.max))},
                                  {"round_trip_std_dev_ns", known(times.std_dev_ns)}}));
     }
-    out_.add("--- " + escaped(host_) + ": asked " + std::to_string(asked_) + " times, answered " +
+    out_.add("--- " + escaped(host_) + ": asked " + std::to_string(asked_) + ", answered " +
              std::to_string(answered_) + " ---\n");
     if (times.count == 0) return;
     const auto rounded = [](double ns) { return duration_text(Duration(std::llround(ns))); };

@@ -6,7 +6,7 @@
 #include <fstream>
 #include <set>
 
-#include "tests/process/dssmctl/ctl_test.hpp"
+#include "tests/process/dssmctl/fleet_test.hpp"
 #include "tests/process/dssmctl/help_words.hpp"
 
 namespace dssm::test {
@@ -14,26 +14,32 @@ namespace {
 
 using Strings = std::vector<std::string>;
 
-class Completion : public CtlTest {
+template <class Base>
+class CompletionOn : public Base {
  protected:
   // What bash would offer with the cursor at the end of `words`, split as bash splits them.
   Strings offered(Strings words) {
     const std::string script =
-        "source \"$1\"; shift; COMP_WORDS=(\"$@\"); COMP_CWORD=$(($# - 1)); _dssmctl \"$1\"; "
+        "source \"$1\"; shift; COMP_WORDBREAKS=$' \\t\\n@><=;|&(:'; COMP_WORDS=(\"$@\"); "
+        "COMP_CWORD=$(($# - 1)); _dssmctl \"$1\"; "
         "((${#COMPREPLY[@]})) && printf '%s\\n' \"${COMPREPLY[@]}\"; exit 0";
     Strings argv = {"bash",        "--norc", "-c",
                     script,        "bash",   source_root() + "/client/dssmctl/dssmctl.bash",
                     dssmctl_path()};
     argv.insert(argv.end(), words.begin(), words.end());
-    const Finished finished = run(argv, environment());
+    const Finished finished = run(argv, this->environment());
     EXPECT_EQ(finished.exit_status, 0);
     EXPECT_EQ(finished.err, "");
     Strings lines = lines_of(finished.out);
     std::sort(lines.begin(), lines.end());
     return lines;
   }
-  void create(const std::string& name) { output({"create", name, "--size", "4", "--depth", "4"}); }
+  void create(const std::string& name) {
+    this->output({"create", name, "--size", "4", "--depth", "4"});
+  }
 };
+using Completion = CompletionOn<CtlTest>;
+using CompletionInAFleet = CompletionOn<FleetTest>;
 
 TEST_F(Completion, OffersExactlyTheVerbsOfTheHelpText) {
   EXPECT_EQ(offered({""}), help_verbs({}));
@@ -75,6 +81,28 @@ TEST_F(Completion, CompletesBehindColonsAtWhichBashSplitsWords) {
   for (const char* name : {"lidar", "lidar:1", "lidar:12"}) create(name);
   EXPECT_EQ(offered({"echo", "lidar", ":"}), (Strings{"1", "12"}));
   EXPECT_EQ(offered({"echo", "lidar", ":", "12"}), Strings{"12"});
+}
+
+TEST_F(CompletionInAFleet, OffersTheNamesThatOpenOtherHostsStreams) {
+  for (const char* name : {"odom", "odom@pc2", "lidar@pc2", "lidar@pc3", "imu@pc3"}) create(name);
+  await_streams(4);
+  EXPECT_EQ(offered({"echo", ""}), (Strings{"imu", "lidar@pc2", "lidar@pc3", "odom", "odom@pc2"}));
+  EXPECT_EQ(offered({"echo", "lid"}), (Strings{"lidar@pc2", "lidar@pc3"}));
+}
+
+TEST_F(CompletionInAFleet, OffersHostsBehindAnAtSignAtWhichBashSplitsWords) {
+  create("imu:1@pc3");
+  await_streams(1);
+  EXPECT_EQ(offered({"echo", "imu", ":", "1", "@"}), (Strings{"pc1", "pc2", "pc3"}));
+  EXPECT_EQ(offered({"info", "imu", "@", "pc2"}), Strings{"pc2"});
+  EXPECT_EQ(offered({"create", "new", "@", "p"}), (Strings{"pc1", "pc2", "pc3"}));
+}
+
+TEST_F(CompletionInAFleet, OffersHostsToPing) {
+  EXPECT_EQ(offered({"ping", ""}), (Strings{"pc1", "pc2", "pc3"}));
+  EXPECT_EQ(offered({"ping", "-c", "1", "pc2"}), Strings{"pc2"});
+  EXPECT_EQ(offered({"ping", "-c", ""}), Strings{});
+  EXPECT_EQ(offered({"ping", "pc2", ""}), Strings{});
 }
 
 TEST_F(Completion, QuotesNamesForTheShell) {

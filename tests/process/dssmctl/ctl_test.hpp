@@ -58,8 +58,19 @@ class Running {
   std::string text_;
 };
 
+// This process's session with a dssmd.
+inline Session session_with(const DaemonProcess& daemon) {
+  return Session::connect({.socket_path = daemon.socket_path(),
+                           .program = "the test",
+                           .request_timeout = std::chrono::seconds(60)})
+      .value();
+}
+
 class CtlTest : public testing::Test {
  protected:
+  explicit CtlTest(std::vector<std::string> dssmd_words = {})
+      : daemon_(std::move(dssmd_words)), session_(session_with(daemon_)) {}
+
   Finished ctl(std::vector<std::string> words, const std::string& input = {});
 
   // What ctl() printed when it succeeds; otherwise the test fails.
@@ -71,10 +82,7 @@ class CtlTest : public testing::Test {
   std::vector<std::string> environment() const { return {daemon_.environment()}; }
 
   DaemonProcess daemon_;
-  Session session_ = Session::connect({.socket_path = daemon_.socket_path(),
-                                       .program = "the test",
-                                       .request_timeout = std::chrono::seconds(60)})
-                         .value();
+  Session session_;
 };
 
 std::vector<std::string> lines_of(const std::string& text);

@@ -88,6 +88,45 @@ TEST_F(Stop, MeasuresOnceMoreWhenTheStreamIsRemoved) {
   EXPECT_EQ(hz.status(), 1);
 }
 
+TEST_F(Stop, GoesOnWithAStreamThatIsCreatedAnew) {
+  writer_.write(1);
+  Running echo(argv({"echo", "s", "--json"}), environment());
+  Running hz(argv({"hz", "s", "--json", "--interval", "0.05"}), environment());
+  EXPECT_EQ(Json::parse(echo.line([&] { writer_.write(1); }))["restarts"], 0);
+  EXPECT_EQ(Json::parse(hz.line())["restarts"], 0);
+  ASSERT_TRUE(session_.remove(writer_.id()));
+  writer_ = session_.create<double>("s", depth_of(16)).value();
+  for (int i = 0; i < 3; ++i) writer_.write(i);
+
+  const auto await_news = [](Running& running) {
+    std::string line;
+    while ((line = running.line()).starts_with('{')) {
+    }
+    EXPECT_EQ(line, "dssmctl: 's:0@pc1': the stream began anew");
+  };
+  await_news(echo);
+  for (int tid = 0; tid < 3; ++tid) {
+    const Json sample = Json::parse(echo.line());
+    EXPECT_EQ(sample["tid"], tid);
+    EXPECT_EQ(sample["restarts"], 1);
+    EXPECT_EQ(sample["lost"], 0);
+  }
+  await_news(hz);
+  const Json report = Json::parse(hz.line());
+  EXPECT_EQ(report["restarts"], 1);
+  EXPECT_EQ(report["lost_samples"], 0);
+}
+
+TEST_F(Stop, FailsWhenTheStreamIsCreatedAnewAsSomethingElse) {
+  Running echo(argv({"echo", "s"}), environment());
+  echo.line([&] { writer_.write(1); });
+  ASSERT_TRUE(session_.remove(writer_.id()));
+  auto other = session_.create<float>("s", depth_of(16)).value();
+  const std::string rest = echo.rest();
+  EXPECT_NE(rest.find("go on with the new ring of 's:0@pc1'"), std::string::npos) << rest;
+  EXPECT_EQ(echo.status(), 1);
+}
+
 TEST_F(Stop, GoesOnWhileTheDaemonIsAwayAndAfterItsReturn) {
   Running echo(argv({"echo", "s", "--json"}), environment());
   std::int64_t tid = Json::parse(echo.line([&] { writer_.write(1); }))["tid"];

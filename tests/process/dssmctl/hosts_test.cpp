@@ -1,0 +1,159 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmctl hosts and ping.
+#include <signal.h>
+
+#include "tests/process/dssmctl/fleet_test.hpp"
+
+namespace dssm::test {
+namespace {
+
+using Hosts = FleetTest;
+using Ping = FleetTest;
+using Strings = std::vector<std::string>;
+
+bool contains(const std::string& text, const std::string& part) {
+  return text.find(part) != std::string::npos;
+}
+
+TEST_F(Hosts, ShowsThisHostFirstAndHowTheOthersAreReached) {
+  auto writer = on_pc2_.create<double>("lidar", depth_of(4)).value();
+  await_streams(1);
+  const Json hosts = json({"hosts"})["hosts"];
+  ASSERT_EQ(hosts.size(), 3U);
+  EXPECT_EQ(hosts[0]["host"], "pc1");
+  EXPECT_EQ(hosts[0]["state"], "self");
+  EXPECT_EQ(hosts[0]["addresses"], Json({daemon_.address()}));
+  EXPECT_TRUE(hosts[0]["round_trip_ns"].is_null());
+  EXPECT_EQ(hosts[1]["host"], "pc2");
+  EXPECT_EQ(hosts[1]["state"], "up");
+  EXPECT_EQ(hosts[1]["addresses"], Json({pc2_.address()}));
+  EXPECT_EQ(hosts[1]["streams"], 1);
+  EXPECT_EQ(hosts[1]["version"], hosts[0]["version"]);
+  EXPECT_GE(hosts[1]["state_for_ns"], 0);
+  EXPECT_EQ(hosts[1]["insecure"], false);  // loopback
+  EXPECT_TRUE(hosts[1]["clock_bound_ns"].is_null());
+  EXPECT_TRUE(hosts[1]["error"].is_null());
+
+  const Strings lines = lines_of(output({"hosts"}));
+  ASSERT_EQ(lines.size(), 4U);
+  EXPECT_EQ(words_of(lines[0]),
+            (Strings{"HOST", "STATE", "ADDRESS", "VERSION", "RTT", "STREAMS", "CLOCK", "NOTE"}));
+  EXPECT_EQ(words_of(lines[1]),
+            (Strings{"pc1", "self", daemon_.address(), DSSM_VERSION, "-", "0", "unknown"}));
+  EXPECT_TRUE(lines[2].starts_with("pc2   up     " + pc2_.address())) << lines[2];
+}
+
+TEST_F(Hosts, IsASuccessThatSaysWhyAHostIsDown) {
+  pc3_.kill_hard();
+  await_state("pc3", "down");
+  const std::string text = output({"hosts"});
+  EXPECT_TRUE(contains(lines_of(text)[3], "pc3   down")) << text;
+  const Json down = json({"hosts"})["hosts"][2];
+  EXPECT_EQ(down["state"], "down");
+  EXPECT_FALSE(down["error"].get<std::string>().empty());
+  EXPECT_TRUE(contains(text, down["error"].get<std::string>().substr(0, 20))) << text;
+  EXPECT_EQ(json({"ls"})["streams"].size(), 0U);
+}
+
+TEST_F(Hosts, GivesEachNameOnceToPrograms) {
+  EXPECT_EQ(output({"hosts", "--names"}), "pc1\npc2\npc3\n");
+  DaemonProcess alone({"--peer", pc2_.address(), "--peer", "127.0.0.1:9", "--peer",
+                       "localhost:" + pc2_.address().substr(pc2_.address().find(':') + 1)},
+                      "pc4");
+  Session session = session_with(alone);
+  while (session.hosts().value()[1].state != "up" || session.hosts().value()[3].name.empty()) {
+  }
+  EXPECT_EQ(output({"--socket", alone.socket_path(), "hosts", "--names"}), "pc4\npc2\n");
+  const Json hosts = json({"--socket", alone.socket_path(), "hosts"})["hosts"];
+  ASSERT_EQ(hosts.size(), 4U);
+  EXPECT_TRUE(hosts[2]["host"].is_null());
+  EXPECT_EQ(hosts[2]["addresses"][0], "127.0.0.1:9");
+  EXPECT_TRUE(contains(hosts[3]["error"].get<std::string>(), "same host as")) << hosts[3];
+}
+
+TEST_F(Ping, TellsEachAnswerAndTheirTimes) {
+  const Strings lines = lines_of(output({"ping", "pc2", "-c", "3", "-i", "0.01"}));
+  ASSERT_EQ(lines.size(), 5U);
+  for (std::size_t i = 0; i < 3; ++i) {
+    EXPECT_TRUE(lines[i].starts_with("answer from pc2 (" + pc2_.address() +
+                                     "): seq=" + std::to_string(i + 1) + " time="))
+        << lines[i];
+  }
+  EXPECT_EQ(lines[3], "--- pc2: asked 3, answered 3 ---");
+  EXPECT_TRUE(lines[4].starts_with("round trip min/avg/max/mdev: ")) << lines[4];
+}
+
+TEST_F(Ping, TellsProgramsTheSame) {
+  const Strings lines = lines_of(output({"ping", "pc2", "-c", "2", "-i", "0.01", "--json"}));
+  ASSERT_EQ(lines.size(), 3U);
+  const Json first = Json::parse(lines[0]), second = Json::parse(lines[1]);
+  const Json summary = Json::parse(lines[2]);
+  EXPECT_EQ(first["host"], "pc2");
+  EXPECT_EQ(first["seq"], 1);
+  EXPECT_EQ(first["address"], pc2_.address());
+  EXPECT_EQ(summary["asked"], 2);
+  EXPECT_EQ(summary["answered"], 2);
+  const auto least = std::min(first["round_trip_ns"].get<std::int64_t>(),
+                              second["round_trip_ns"].get<std::int64_t>());
+  EXPECT_GT(least, 0);
+  EXPECT_EQ(summary["round_trip_min_ns"], least);
+  EXPECT_GE(summary["round_trip_max_ns"].get<std::int64_t>(), least);
+  EXPECT_GE(summary["round_trip_mean_ns"].get<double>(), static_cast<double>(least));
+}
+
+TEST_F(Ping, EndsWithItsSummaryOnASignal) {
+  Running ping(argv({"ping", "pc2", "-i", "1000"}), environment());
+  EXPECT_TRUE(ping.line().starts_with("answer from pc2"));
+  ping.signal(SIGINT);
+  EXPECT_EQ(ping.line(), "--- pc2: asked 1, answered 1 ---");
+  ping.rest();
+  EXPECT_EQ(ping.status(), 0);
+}
+
+TEST_F(Ping, EndsQuietlyWhenItsReaderHasEnough) {
+  Running ping(argv({"ping", "pc2", "-i", "1000"}), environment());
+  ping.line();
+  ping.close_output();
+  EXPECT_EQ(ping.status(), 0);
+}
+
+TEST_F(Ping, FailsWhenNothingAnswered) {
+  pc3_.kill_hard();
+  await_state("pc3", "down");
+  const Finished finished = ctl({"ping", "pc3", "-c", "2", "-i", "0.01"});
+  EXPECT_EQ(finished.exit_status, 1);
+  const Strings lines = lines_of(finished.out);
+  ASSERT_EQ(lines.size(), 3U) << finished.out;
+  EXPECT_TRUE(lines[0].starts_with("no answer: seq=1: ")) << lines[0];
+  EXPECT_EQ(lines[2], "--- pc3: asked 2, answered 0 ---");
+  EXPECT_TRUE(contains(finished.err, "'pc3' did not answer")) << finished.err;
+}
+
+TEST_F(Ping, GoesOnWhileTheHostIsAwayAndAfterItsReturn) {
+  Running ping(argv({"ping", "pc3", "-i", "0.01"}), environment());
+  EXPECT_TRUE(ping.line().starts_with("answer from pc3"));
+  pc3_.kill_hard();
+  while (!ping.line().starts_with("no answer: ")) {
+  }
+  pc3_.start();
+  while (!ping.line().starts_with("answer from pc3")) {
+  }
+  ping.signal(SIGTERM);
+  ping.rest();
+  EXPECT_EQ(ping.status(), 0);
+}
+
+TEST_F(Ping, NamesTheHostsThereAreWhenOneIsUnknown) {
+  const Finished finished = ctl({"ping", "pc9"});
+  EXPECT_EQ(finished.exit_status, 1);
+  EXPECT_EQ(finished.out, "");
+  EXPECT_TRUE(contains(finished.err, "'pc9'") && contains(finished.err, "'pc2'")) << finished.err;
+}
+
+TEST_F(Ping, AnswersForThisHostAtOnce) {
+  EXPECT_TRUE(output({"ping", "pc1", "-c", "1"}).starts_with("answer from pc1 (this PC): seq=1"));
+}
+
+}  // namespace
+}  // namespace dssm::test

@@ -1,0 +1,264 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// All verbs on streams of other hosts.
+#include <signal.h>
+
+#include <fstream>
+
+#include "tests/process/dssmctl/fleet_test.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+using Remote = FleetTest;
+using Strings = std::vector<std::string>;
+
+constexpr std::int64_t kSecond = 1'000'000'000;
+
+bool contains(const std::string& text, const std::string& part) {
+  return text.find(part) != std::string::npos;
+}
+
+// Sample i has the time 100 + i seconds.
+void write(Writer<double>& writer, int first, int last) {
+  for (int i = first; i <= last; ++i) writer.write(i / 2.0, at_ns((100 + i) * kSecond));
+}
+
+TEST_F(Remote, LsShowsTheStreamsOfAllHostsOwnOnesFirst) {
+  auto zebra = session_.create<double>("zebra", depth_of(4)).value();
+  auto lidar = on_pc3_.create<double>("lidar", depth_of(8)).value();
+  auto odom = on_pc2_.create<double>("odom:1", depth_of(4)).value();
+  await_streams(2);
+  const Strings lines = lines_of(output({"ls"}));
+  ASSERT_EQ(lines.size(), 4U);
+  const auto first_words = [&](std::size_t line) {
+    const Strings words = words_of(lines[line]);
+    return Strings(words.begin(), words.begin() + 3);
+  };
+  EXPECT_EQ(first_words(0), (Strings{"NAME", "ID", "HOST"}));
+  EXPECT_EQ(first_words(1), (Strings{"zebra", "0", "pc1"}));
+  EXPECT_EQ(first_words(2), (Strings{"odom", "1", "pc2"}));
+  EXPECT_EQ(first_words(3), (Strings{"lidar", "0", "pc3"}));
+  EXPECT_EQ(output({"ls", "--names"}), "zebra\nodom:1\nlidar\n");
+  EXPECT_EQ(output({"ls", "--names", "--sort", "host", "-r"}), "lidar\nodom:1\nzebra\n");
+  EXPECT_EQ(output({"ls", "--names", "--own"}), "zebra\n");
+
+  const Json streams = json({"ls"})["streams"];
+  EXPECT_EQ(streams[2]["stream"], "lidar:0@pc3");
+  EXPECT_EQ(streams[2]["host"], "pc3");
+  EXPECT_EQ(streams[2]["depth"], 8);
+  EXPECT_EQ(streams[2]["channels"], 0);
+  EXPECT_EQ(json({"ls", "--own"})["streams"].size(), 1U);
+}
+
+TEST_F(Remote, NamesOpenTheRightStreamWhereSeveralHaveTheName) {
+  auto here = session_.create<double>("odom", depth_of(4)).value();
+  auto on_2 = on_pc2_.create<double>("odom", depth_of(4)).value();
+  auto lidar_2 = on_pc2_.create<double>("lidar", depth_of(4)).value();
+  auto lidar_3 = on_pc3_.create<double>("lidar", depth_of(4)).value();
+  await_streams(3);
+  const Strings names = lines_of(output({"ls", "--names"}));
+  EXPECT_EQ(names, (Strings{"odom", "odom@pc2", "lidar@pc2", "lidar@pc3"}));
+  const Json streams = json({"ls"})["streams"];
+  for (std::size_t i = 0; i < names.size(); ++i) {
+    EXPECT_EQ(json({"info", names[i]})["stream"], streams[i]["stream"]) << names[i];
+  }
+  const Finished ambiguous = ctl({"echo", "lidar", "--last"});
+  EXPECT_EQ(ambiguous.exit_status, 1);
+  EXPECT_TRUE(contains(ambiguous.err, "pc2") && contains(ambiguous.err, "pc3")) << ambiguous.err;
+}
+
+TEST_F(Remote, EchoShowsThePastAndTheNewestSample) {
+  auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
+  write(writer, 0, 9);
+  await_streams(1);
+  for (const char* name : {"s", "s@pc2", "s:0@pc2"}) {
+    const Json newest = json({"echo", name, "--last"});
+    EXPECT_EQ(newest["stream"], "s:0@pc2");
+    EXPECT_EQ(newest["tid"], 9);
+    EXPECT_EQ(newest["time_ns"], 109 * kSecond);
+    EXPECT_EQ(newest["fields"]["value"], 4.5);
+    EXPECT_EQ(json({"echo", name, "--at", "104.5"})["tid"], 4);
+  }
+}
+
+TEST_F(Remote, EchoShowsEachSampleOnceAsItComes) {
+  auto writer = on_pc2_.create<double>("s", depth_of(1000)).value();
+  await_streams(1);
+  Running echo(argv({"echo", "s", "--json"}), environment());
+  int next = 0;
+  const auto write_one = [&] { write(writer, next, next), ++next; };
+  const std::int64_t first = Json::parse(echo.line(write_one))["tid"];
+  for (std::int64_t tid = first + 1; tid < first + 20; ++tid) {
+    EXPECT_EQ(Json::parse(echo.line(write_one))["tid"], tid);
+  }
+  echo.signal(SIGINT);
+  echo.rest();
+  EXPECT_EQ(echo.status(), 0);
+}
+
+TEST_F(Remote, HzAndBwFollowFromTheOwnersStamps) {
+  auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
+  write(writer, 0, 9);
+  await_streams(1);
+  const Json hz = json({"hz", "s@pc2", "--count", "1"});
+  EXPECT_EQ(hz["stream"], "s:0@pc2");
+  EXPECT_EQ(hz["seen_samples"], 10);
+  EXPECT_DOUBLE_EQ(hz["rate_hz"].get<double>(), 1);
+  EXPECT_EQ(hz["restarts"], 0);
+  EXPECT_DOUBLE_EQ(json({"bw", "s@pc2", "--count", "1"})["bytes_per_second"].get<double>(), 8);
+}
+
+TEST_F(Remote, DelaySaysThatNobodyKnowsTheClocks) {
+  auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
+  await_streams(1);
+  Running delay(argv({"delay", "s@pc2", "--interval", "0.05"}), environment());
+  std::string line;
+  do {
+    line = delay.line([&] { writer.write(0, WallClock::now() - 10s); });
+  } while (!line.starts_with("average delay: 10."));
+  delay.line();
+  EXPECT_TRUE(delay.line().starts_with("\tclocks: unknown"));
+
+  Running as_json(argv({"delay", "s@pc2", "--interval", "0.05", "--json"}), environment());
+  Json report;
+  do {
+    report = Json::parse(as_json.line([&] { writer.write(0, WallClock::now() - 10s); }));
+  } while (report["samples"] == 0);
+  EXPECT_TRUE(report["delay_error_ns"].is_null());
+}
+
+TEST_F(Remote, InfoTellsOwnerChannelsAndHowTheMirrorIsDoing) {
+  auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
+  write(writer, 0, 9);
+  await_streams(1);
+  EXPECT_TRUE(json({"info", "s"})["mirror"].is_null());
+  EXPECT_FALSE(contains(output({"info", "s"}), "mirror:"));
+
+  auto reader = session_.open_reader<double>("s").value();
+  const Json info = json({"info", "s"});
+  EXPECT_EQ(info["host"], "pc2");
+  EXPECT_EQ(info["channels"], 1);
+  EXPECT_EQ(info["writers"], 1);
+  EXPECT_EQ(info["users"][0]["program"], "the test");
+  EXPECT_EQ(info["mirror"]["state"], "live");
+  EXPECT_EQ(info["mirror"]["newest_tid"], 9);
+  EXPECT_EQ(info["mirror"]["received_samples"], 10);
+  EXPECT_EQ(info["mirror"]["received_bytes"], 80);
+  EXPECT_EQ(info["mirror"]["gap_samples"], 0);
+  EXPECT_EQ(info["mirror"]["reconnects"], 0);
+  EXPECT_EQ(info["mirror"]["restarts"], 0);
+  EXPECT_TRUE(info["mirror"]["error"].is_null());
+  const std::string text = output({"info", "s"});
+  for (const char* part : {"s:0@pc2\n", "owner:        host pc2\n", "channels:     1 to other",
+                           "mirror:       live\n", "10 samples, 80 bytes, up to tid 9\n"}) {
+    EXPECT_TRUE(contains(text, part)) << part << " in\n" << text;
+  }
+
+  pc2_.kill_hard();
+  await_state("pc2", "down");
+  const Json alone = json({"info", "s@pc2"});
+  EXPECT_EQ(alone["mirror"]["state"], "owner away");
+  EXPECT_FALSE(alone["mirror"]["error"].get<std::string>().empty());
+}
+
+TEST_F(Remote, CreateAndRmWorkOnTheNamedHost) {
+  EXPECT_EQ(json({"create", "s:2@pc2", "--size", "24", "--depth", "10"}),
+            Json::parse(R"({"stream":"s:2@pc2","created":true,"payload_bytes":24,
+                            "depth":10,"cycle_ns":100000000})"));
+  EXPECT_EQ(on_pc2_.info({"s", 2, ""}).value().depth, 10U);
+  EXPECT_EQ(json({"create", "s:2@pc2", "--size", "24", "--depth", "99"})["created"], false);
+  EXPECT_EQ(json({"ls", "--own"})["streams"].size(), 0U);
+  await_streams(1);
+  EXPECT_EQ(json({"rm", "s:2@pc2"})["removed"][0], "s:2@pc2");
+  EXPECT_EQ(on_pc2_.list_own().value().size(), 0U);
+}
+
+TEST_F(Remote, PropertiesCrossBothWays) {
+  auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
+  await_streams(1);
+  EXPECT_EQ(ctl({"property", "set", "s@pc2"}, "calibrated").exit_status, 0);
+  EXPECT_EQ(output({"property", "get", "s@pc2"}), "calibrated");
+  EXPECT_EQ(on_pc2_.property({"s", 0, ""}).value().size(), 10U);
+}
+
+TEST_F(Remote, SimilarNamesAreFoundOnOtherHosts) {
+  auto writer = on_pc2_.create<double>("lidar", depth_of(16)).value();
+  await_streams(1);
+  EXPECT_TRUE(contains(ctl({"echo", "lidr"}).err, "is it 'lidar'?"));
+  EXPECT_TRUE(contains(ctl({"info", "lidar@pc3"}).err, "is it 'lidar@pc2'?"));
+}
+
+TEST_F(Remote, EchoAndHzEndWhenTheOwnerRemovesTheStream) {
+  auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
+  write(writer, 0, 1);
+  await_streams(1);
+  Running echo(argv({"echo", "s", "--csv"}), environment());
+  Running hz(argv({"hz", "s", "--interval", "1000"}), environment());
+  hz.line();
+  hz.line();
+  echo.line();
+  echo.line([&] { write(writer, 2, 2); });
+  ASSERT_TRUE(on_pc2_.remove(writer.id()));
+  EXPECT_TRUE(contains(echo.rest(), "'s:0@pc2': it was removed"));
+  EXPECT_EQ(echo.status(), 1);
+  EXPECT_TRUE(contains(hz.rest(), "'s:0@pc2': it was removed"));
+  EXPECT_EQ(hz.status(), 1);
+}
+
+// The owner's dssmd comes back and gets the ring from the program that holds it.
+TEST_F(Remote, EchoGoesOnWhileTheOwnerIsAwayAndAfterItsReturn) {
+  auto writer = on_pc2_.create<double>("s", depth_of(10'000)).value();
+  await_streams(1);
+  Running echo(argv({"echo", "s", "--json"}), environment());
+  const auto write_one = [&] { writer.write(1); };
+  std::int64_t tid = Json::parse(echo.line(write_one))["tid"];
+  pc2_.kill_hard();
+  await_state("pc2", "down");
+  const Tid written_meanwhile = writer.write(2);
+  pc2_.start();
+  while (tid < written_meanwhile + 10) {
+    const Json line = Json::parse(echo.line(write_one), nullptr, false);
+    ASSERT_TRUE(line.is_object());
+    ASSERT_EQ(line["tid"], tid + 1);
+    EXPECT_EQ(line["lost"], 0);
+    tid = line["tid"];
+  }
+}
+
+TEST_F(Remote, FollowersGoOnWithTheNewRingOfAStreamThatBeganAnew) {
+  auto writer = std::optional(on_pc2_.create<double>("s", depth_of(1000)).value());
+  write(*writer, 0, 9);
+  await_streams(1);
+  Running echo(argv({"echo", "s", "--json"}), environment());
+  Running hz(argv({"hz", "s", "--json", "--interval", "0.05"}), environment());
+  EXPECT_EQ(Json::parse(echo.line([&] { writer->write(1); }))["restarts"], 0);
+  EXPECT_EQ(Json::parse(hz.line())["restarts"], 0);
+  // Gone with all who held it, and created anew.
+  writer.reset();
+  ASSERT_TRUE(on_pc2_.remove({"s", 0, ""}));
+  writer = on_pc2_.create<double>("s", depth_of(1000)).value();
+  write(*writer, 0, 4);
+
+  const auto await_news = [](Running& running) {
+    std::string line;
+    while ((line = running.line()).starts_with('{')) {
+    }
+    EXPECT_EQ(line, "dssmctl: 's:0@pc2': the stream began anew");
+  };
+  await_news(echo);
+  for (int tid = 0; tid <= 4; ++tid) {
+    const Json sample = Json::parse(echo.line());
+    EXPECT_EQ(sample["tid"], tid);
+    EXPECT_EQ(sample["restarts"], 1);
+    EXPECT_EQ(sample["lost"], 0);
+  }
+  await_news(hz);
+  const Json report = Json::parse(hz.line());
+  EXPECT_EQ(report["restarts"], 1);
+  EXPECT_EQ(report["lost_samples"], 0);
+}
+
+}  // namespace
+}  // namespace dssm::test
