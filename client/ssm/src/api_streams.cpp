@@ -27,6 +27,14 @@ std::string quoted(const char* name, int id) {
   return std::string("'") + name + "' [" + std::to_string(id) + "]";
 }
 
+// "lidar@pc2" names a stream and its host; the limits of names are for what is before the '@'.
+std::size_t name_length(const char* name) { return std::strcspn(name, "@"); }
+
+dssm::StreamId stream_id(const char* name, int id) {
+  const std::size_t length = name_length(name);
+  return {std::string(name, length), id, name[length] ? name + length + 1 : ""};
+}
+
 std::string number(double value) {
   char text[32];
   std::snprintf(text, sizeof text, "%g", value);
@@ -40,10 +48,13 @@ double slots(double life, double cycle) { return SSM_BUFFER_MARGIN * (life / cyc
 // What is wrong with the arguments of createSSM; nothing when all is well.
 std::optional<std::string> wrong_arguments(const char* name, int id, double life, double cycle) {
   if (!name) return "create : the stream name is NULL";
-  const std::size_t length = std::strlen(name);
+  const std::size_t length = name_length(name);
   if (length == 0 || length >= SSM_SNAME_MAX) {
     return "create '" + std::string(name) + "' : a stream name has 1 to 31 bytes, not " +
            std::to_string(length);
+  }
+  if (name[length] && !name[length + 1]) {
+    return "create '" + std::string(name) + "' : there is no host's name behind the '@'";
   }
   const std::string what = "create " + quoted(name, id) + " : ";
   if (id < 0) return what + "a stream id is 0 or more";
@@ -74,11 +85,12 @@ dssm::Result<dssm::Session> connect_for_second_end() { return process().any_sess
 
 // For the calls that find streams by name: nothing when there can be none of that name.
 std::optional<dssm::StreamId> find_id(const char* name, int id) {
-  if (!name || std::strlen(name) >= SSM_SNAME_MAX || id < 0) return std::nullopt;
-  return dssm::StreamId{name, id, {}};
+  if (!name || name_length(name) >= SSM_SNAME_MAX || id < 0) return std::nullopt;
+  if (name[name_length(name)] && !name[name_length(name) + 1]) return std::nullopt;
+  return stream_id(name, id);
 }
 
-bool name_too_long(const char* name) { return !name || std::strlen(name) > SSM_SNAME_MAX; }
+bool name_too_long(const char* name) { return !name || name_length(name) > SSM_SNAME_MAX; }
 
 dssm::Result<dssm::StreamInfo> ask(const dssm::StreamId& id) {
   auto session = process().session();
@@ -105,7 +117,7 @@ SSM_sid createSSM(const char* stream_name, int stream_id, size_t stream_size, ss
   const std::string what = "create " + quoted(stream_name, stream_id) + " : ";
   dssm::Result<dssm::Session> session = process().session();
   if (!session) return report_error(what + session.error().message), nullptr;
-  const dssm::StreamId id{stream_name, stream_id, {}};
+  const dssm::StreamId id = ::stream_id(stream_name, stream_id);
   const dssm::History history{
       static_cast<std::uint64_t>(calcSSM_table(life, cycle)),
       std::max(dssm::Duration(1), dssm::Duration(dssm::ssm::ns_from_seconds(cycle)))};
@@ -144,14 +156,14 @@ int releaseSSM(SSM_sid* sid) { return closeSSM(sid); }
 
 int getSSM_num(void) {
   auto session = process().session();
-  auto streams = session ? session->list() : std::move(session).error();
+  auto streams = session ? session->list_own() : std::move(session).error();
   if (!streams) return remember_error(streams.error().message), -1;
   return static_cast<int>(streams->size());
 }
 
 int getSSM_name(int n, char* stream_name, int* stream_id, size_t* size) {
   auto session = process().session();
-  auto streams = session ? session->list() : std::move(session).error();
+  auto streams = session ? session->list_own() : std::move(session).error();
   if (!streams) return remember_error(streams.error().message), -1;
   if (n < 0 || static_cast<std::size_t>(n) >= streams->size()) return -1;
   const dssm::StreamInfo& stream = (*streams)[static_cast<std::size_t>(n)];

@@ -63,9 +63,9 @@ Stream::Stream(RawWriter writer, Connect connect)
       id_(writer.id()),
       data_bytes_(ssm::data_bytes(writer.type())),
       payload_bytes_(writer.payload_bytes()),
-      depth_(writer.depth()),
       incarnation_(writer.incarnation()),
-      cycle_(writer.cycle()),
+      depth_(writer.depth()),
+      cycle_ns_(to_ns(writer.cycle())),
       writer_(new RawWriter(std::move(writer))) {}
 
 Stream::Stream(RawReader reader, Connect connect)
@@ -73,9 +73,9 @@ Stream::Stream(RawReader reader, Connect connect)
       id_(reader.id()),
       data_bytes_(ssm::data_bytes(reader.type())),
       payload_bytes_(reader.payload_bytes()),
-      depth_(reader.depth()),
       incarnation_(reader.incarnation()),
-      cycle_(reader.cycle()),
+      depth_(reader.depth()),
+      cycle_ns_(to_ns(reader.cycle())),
       reader_(new RawReader(std::move(reader))) {}
 
 Stream::~Stream() {
@@ -108,15 +108,46 @@ RawWriter* Stream::writer() noexcept {
   return writer_.load(std::memory_order_relaxed);
 }
 
-Tid Stream::newest() const noexcept {
-  if (const RawReader* open = reader_.load(std::memory_order_acquire)) return open->newest();
-  return writer_.load(std::memory_order_acquire)->newest();
+// --- tids
+// ------------------------------------------------------------------------------------------
+
+void Stream::tell(Tid tid) noexcept {
+  if (tid > told_.load(std::memory_order_relaxed)) told_.store(tid, std::memory_order_relaxed);
 }
 
-Tid Stream::oldest() const noexcept {
+void Stream::on_restart(const RawReader& open) noexcept {
+  offset_.store(told_.load(std::memory_order_relaxed) + 1, std::memory_order_relaxed);
+  depth_.store(open.depth(), std::memory_order_relaxed);
+  cycle_ns_.store(to_ns(open.cycle()), std::memory_order_relaxed);
+}
+
+// Goes on with the new ring, if there is one.
+void Stream::follow_ring(RawReader& open) noexcept {
+  BorrowedSample nothing;
+  if (open.borrow(kNoTid, nothing) == ReadStatus::restarted) on_restart(open);
+}
+
+Tid Stream::newest() noexcept {
+  RawReader* const open = reader_.load(std::memory_order_acquire);
+  if (!open) return writer_.load(std::memory_order_acquire)->newest();
+  const std::lock_guard guard(read_lock_);
+  // A program that reads one sample after the other is not through with the old ring yet.
+  const Tid read = read_.load(std::memory_order_relaxed);
+  if (read == kNoTid || open->newest() + offset() <= read) follow_ring(*open);
+  const Tid newest = open->newest();
+  if (newest < 0) return offset() - 1;  // kNoTid, or the last one of the old ring
+  tell(newest + offset());
+  return newest + offset();
+}
+
+Tid Stream::oldest() noexcept {
   const Tid top = newest();
-  const Tid oldest = top - static_cast<Tid>(depth_) + 2;
-  return top < 0 ? kNoTid : oldest < 0 ? 0 : oldest;
+  if (top < 0) return kNoTid;
+  const RawReader* const open = reader_.load(std::memory_order_acquire);
+  if (!open) return std::max<Tid>(0, top - static_cast<Tid>(depth()) + 2);
+  const std::lock_guard guard(read_lock_);
+  const Tid oldest = open->oldest();
+  return oldest < 0 ? top : oldest + offset();  // a new ring, still empty: nothing before `top`
 }
 
 // --- reading
@@ -137,11 +168,22 @@ ReadStatus Stream::copy(Copy& out, Read read) noexcept {
   if (!open) return ReadStatus::not_yet;
   const std::lock_guard guard(read_lock_);
   for (int attempt = 0; attempt < kAttempts; ++attempt) {
-    if (const ReadStatus status = read(*open); status != ReadStatus::ok) return status;
+    ReadStatus status = read(*open);
+    if (status == ReadStatus::restarted) {
+      on_restart(*open);
+      continue;
+    }
+    if (status != ReadStatus::ok) return status;
     BorrowedSample place;  // the bytes behind the slot belong to nobody, so they are there to read
-    if (open->borrow(out.info.tid, place) != ReadStatus::ok) continue;
+    status = open->borrow(out.info.tid, place);
+    if (status == ReadStatus::restarted) on_restart(*open);
+    if (status != ReadStatus::ok) continue;
     std::memcpy(out.bytes_ + payload_bytes_, place.payload().data() + payload_bytes_, kGuardBytes);
-    if (place.still_valid()) return ReadStatus::ok;
+    if (!place.still_valid()) continue;
+    out.info.tid += offset();
+    tell(out.info.tid);
+    read_.store(out.info.tid, std::memory_order_relaxed);
+    return ReadStatus::ok;
   }
   return ReadStatus::lapped;
 }
@@ -151,7 +193,19 @@ ReadStatus Stream::latest(Copy& out) noexcept {
 }
 
 ReadStatus Stream::tid(Tid tid, Copy& out) noexcept {
-  return copy(out, [&](RawReader& open) { return open.tid(tid, out.payload(), out.info); });
+  return copy(out, [&](RawReader& open) {
+    const Tid wanted = tid - offset();
+    if (wanted < 0) return ReadStatus::too_old;
+    for (int attempt = 0; attempt < kAttempts; ++attempt) {
+      // Not by RawReader::tid(), which leaves the old ring at once.
+      open.seek(wanted - 1);
+      const ReadStatus status = open.next(out.payload(), out.info);
+      if (status != ReadStatus::ok || out.info.tid == wanted) return status;
+      if (wanted < open.oldest()) return ReadStatus::too_old;
+      // A signal handler that reads too moved the cursor in between.
+    }
+    return ReadStatus::lapped;
+  });
 }
 
 ReadStatus Stream::at(Time t, Copy& out) noexcept {
@@ -162,7 +216,10 @@ ReadStatus Stream::find(Time t, SampleInfo& info) noexcept {
   RawReader* const open = reader();
   if (!open) return ReadStatus::not_yet;
   const std::lock_guard guard(read_lock_);
-  return open->find(t, info);
+  follow_ring(*open);
+  const ReadStatus status = open->find(t, info);
+  if (status == ReadStatus::ok) tell(info.tid += offset());
+  return status;
 }
 
 WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
@@ -174,7 +231,14 @@ WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
   }
   // Without the lock, so that other threads may read meanwhile: a wait for a given tid uses nothing
   // of the reader that reading changes.
-  return open->wait_for_tid(tid, deadline);
+  const WaitStatus status = open->wait_for_tid(tid - offset(), deadline);
+  // A new ring ends the wait as well: let the caller look again, but not in a tight loop while the
+  // new ring cannot be had.
+  if (status == WaitStatus::ready && newest() < tid) {
+    const timespec pause{0, 1'000'000};
+    ::nanosleep(&pause, nullptr);
+  }
+  return status;
 }
 
 // --- writing

@@ -6,6 +6,12 @@
 // Reads go through a private copy: what a caller's buffer or callback gets is a whole sample, and a
 // read that fails has not touched the buffer.
 //
+// When the stream begins anew (removed and created, or its owner came back without its rings), the
+// reader goes on with the new ring, and old programs' loops go on with it: to them tids keep
+// rising, the first sample of the new ring following the last tid that they were told. All tids
+// here are such; `offset_` is what they are ahead of the ring's. What the old ring still held is
+// read first where samples are read by tid, one after the other.
+//
 //   threads  all functions may be called from any thread, and from a signal handler once the reader
 //            and the writer are open
 #pragma once
@@ -45,12 +51,12 @@ class Stream {
 
   const StreamId& id() const noexcept { return id_; }
   std::uint64_t data_bytes() const noexcept { return data_bytes_; }
-  std::uint64_t depth() const noexcept { return depth_; }
-  Duration cycle() const noexcept { return cycle_; }
+  std::uint64_t depth() const noexcept { return depth_.load(std::memory_order_relaxed); }
+  Duration cycle() const noexcept { return Duration(cycle_ns_.load(std::memory_order_relaxed)); }
 
-  // As in RawReader. One load.
-  Tid newest() const noexcept;
-  Tid oldest() const noexcept;
+  // As in RawReader. A lock that nobody holds for long, and a load.
+  Tid newest() noexcept;
+  Tid oldest() noexcept;
 
   // A copy of a sample and its stamps. The 64 bytes behind its payload are those behind the slot:
   // writing callbacks of real programs go a few bytes too far, and their reading ones as far.
@@ -94,11 +100,21 @@ class Stream {
   RawWriter* writer() noexcept;
   template <class Read>
   ReadStatus copy(Copy& out, Read read) noexcept;
+  void follow_ring(RawReader& open) noexcept;
+  void on_restart(const RawReader& open) noexcept;
+  void tell(Tid tid) noexcept;
+  Tid offset() const noexcept { return offset_.load(std::memory_order_relaxed); }
 
   const Connect connect_;
   const StreamId id_;
-  const std::uint64_t data_bytes_, payload_bytes_, depth_, incarnation_;
-  const Duration cycle_;
+  const std::uint64_t data_bytes_, payload_bytes_, incarnation_;
+  std::atomic<std::uint64_t> depth_;  // this and the next: of the ring that is read now
+  std::atomic<std::int64_t> cycle_ns_;
+
+  // Written under the read lock.
+  std::atomic<Tid> offset_{0};     // tids here are so far ahead of the ring's
+  std::atomic<Tid> told_{kNoTid};  // the greatest that the program was told
+  std::atomic<Tid> read_{kNoTid};  // the last that it read
 
   ReentrantLock read_lock_, write_lock_;
   std::atomic<RawReader*> reader_{nullptr};  // set once, under its lock; owned
