@@ -25,7 +25,7 @@ std::span<std::byte> FrameBuffer::space() {
   if (begin_ == end_) {
     begin_ = end_ = 0;
     if (buffer_.size() > kKeptBytes)
-      buffer_ = {};  // a rare large frame does not cost memory for ever
+      buffer_ = std::vector<std::byte>();  // a rare large frame does not cost memory for ever
   }
   if (buffer_.size() - end_ < kRoom) {
     if (begin_ > 0) {

@@ -343,7 +343,7 @@ Result<void> FrameDecoder::take_whole(Bytes& input) {
   if (whole_left_ > 0) return {};
   Result<void> parsed = parse_whole(whole_);
   if (!parsed || refused_) return parsed;
-  whole_ = {};
+  whole_ = std::vector<std::byte>();  // `= {}` would keep its memory
   stage_ = Stage::head;
   return {};
 }
