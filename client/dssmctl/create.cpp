@@ -42,7 +42,13 @@ Result<void> run_create(const Options& options, Output& out) {
 
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
-  const bool there = session->info(*id).has_value();
+  StreamId wanted = *id;
+  if (wanted.host.empty()) {  // created here, whatever other hosts have
+    const Result<DaemonInfo> daemon = session->daemon();
+    if (!daemon) return daemon.error();
+    wanted.host = daemon->host;
+  }
+  const bool there = session->info(wanted).has_value();
   Result<RawWriter> writer = session->create_raw(*id, type, *history);
   if (!writer) return std::move(writer).error();
   // Not the writer's own figures: for another host's stream those of a ring on the way there.

@@ -59,8 +59,10 @@ void print_mirror(const MirrorInfo& mirror, Output& out) {
       out, "mirror",
       escaped(mirror.state) + (mirror.error.empty() ? "" : ": " + escaped_message(mirror.error)));
   add_line(out, "received",
-           std::to_string(mirror.received_samples) + " samples, " +
-               bytes_text(mirror.received_bytes) + ", up to tid " + std::to_string(mirror.newest));
+           mirror.newest == kNoTid ? "nothing yet"
+                                   : std::to_string(mirror.received_samples) + " samples, " +
+                                         bytes_text(mirror.received_bytes) + ", up to tid " +
+                                         std::to_string(mirror.newest));
   add_line(out, "missing", std::to_string(mirror.gap_samples) + " samples");
   add_line(out, "reconnects", std::to_string(mirror.reconnects));
   add_line(out, "restarts", std::to_string(mirror.restarts));
@@ -79,7 +81,9 @@ void print_stream(const StreamInfo& stream, Output& out) {
   add_line(out, "memory", bytes_text(stream.memory_bytes));
   add_line(out, "property", stream.property_bytes ? bytes_text(stream.property_bytes) : "none");
   add_line(out, "incarnation", std::to_string(stream.incarnation));
-  add_line(out, "created by", "pid " + std::to_string(stream.creator_pid));
+  if (stream.creator_pid != 0) {  // of a mirror whose owner is away it is not known
+    add_line(out, "created by", "pid " + std::to_string(stream.creator_pid));
+  }
   if (stream.mirror) print_mirror(*stream.mirror, out);
   print_fields(stream, out);
   print_users(stream, out);

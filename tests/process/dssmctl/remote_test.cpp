@@ -175,6 +175,14 @@ TEST_F(Remote, CreateAndRmWorkOnTheNamedHost) {
   EXPECT_EQ(on_pc2_.list_own().value().size(), 0U);
 }
 
+TEST_F(Remote, CreateWithoutAHostMakesAnOwnStreamWhateverOthersHave) {
+  auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
+  await_streams(1);
+  EXPECT_EQ(json({"create", "s", "--size", "8", "--depth", "4"}),
+            Json::parse(R"({"stream":"s:0@pc1","created":true,"payload_bytes":8,
+                            "depth":4,"cycle_ns":100000000})"));
+}
+
 TEST_F(Remote, PropertiesCrossBothWays) {
   auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
   await_streams(1);
