@@ -1,0 +1,52 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// 100 streams read on another host, nobody writing: how often the two dssmd wake up, beside the
+// heartbeats of one control connection, which are all that may wake them.
+#include <dssm/dssm.hpp>
+#include <fstream>
+#include <string>
+
+#include "tests/bench/harness.hpp"
+#include "tests/bench/processes.hpp"
+#include "tests/support/daemon_process.hpp"
+
+using namespace dssm;
+using namespace dssm::bench;
+using namespace std::chrono_literals;
+
+namespace {
+
+// How often the process went to sleep: each wake-up ends with it.
+std::int64_t sleeps(pid_t pid) {
+  std::ifstream status("/proc/" + std::to_string(pid) + "/status");
+  for (std::string word; status >> word;) {
+    std::int64_t count = 0;
+    if (word == "voluntary_ctxt_switches:" && status >> count) return count;
+  }
+  fail("read /proc");
+}
+
+}  // namespace
+
+int main() {
+  constexpr int kStreams = 100, kSeconds = 10;
+  test::DaemonProcess owner({"--listen", "127.0.0.1:0"}, "pc1");
+  test::DaemonProcess other({"--listen", "127.0.0.1:0", "--peer", owner.address()}, "pc2");
+  Session session = Session::connect({.socket_path = owner.socket_path()}).value();
+  Session there = Session::connect({.socket_path = other.socket_path()}).value();
+  std::vector<RawWriter> writers;
+  std::vector<RawReader> readers;
+  for (int i = 0; i < kStreams; ++i) {
+    const StreamId id{"idle", i, "pc1"};
+    writers.push_back(session.create_raw(id, {"", 64, 1, {}}, History{100, 10ms}).value());
+    readers.push_back(there.await_raw_reader(id, deadline_in(10s)).value());
+  }
+  ::sleep(1);
+  const std::int64_t owner_before = sleeps(owner.pid()), other_before = sleeps(other.pid());
+  ::sleep(kSeconds);
+  const double owner_rate = static_cast<double>(sleeps(owner.pid()) - owner_before) / kSeconds;
+  const double other_rate = static_cast<double>(sleeps(other.pid()) - other_before) / kSeconds;
+  std::printf("100 remote streams, nobody writing       wake-ups a second  heartbeats\n");
+  std::printf("  owner: a Ping a second arrives         %17.1f  1\n", owner_rate);
+  std::printf("  mirrors: sends it, and gets the Pong   %17.1f  2\n", other_rate);
+}

@@ -1,0 +1,130 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// How much one channel carries: large samples beside raw TCP with writes of the same size, and how
+// many small ones; how often a payload is copied on the way. Both hosts are on this machine, joined
+// by loopback.
+//
+// The samples stand in the owner's ring before the clock starts, and the reader takes all of them
+// into one piece of memory: sending and receiving is all that is measured, on both sides. The raw
+// sender's memory is as large as the ring, so that neither side works out of the cache alone.
+#include <dssm/dssm.hpp>
+#include <dssm/pconnector.hpp>
+#include <string>
+
+#include "tests/bench/harness.hpp"
+#include "tests/bench/processes.hpp"
+#include "tests/support/daemon_process.hpp"
+
+using namespace dssm;
+using namespace dssm::bench;
+using namespace std::chrono_literals;
+
+namespace {
+
+constexpr int kRounds = 7;
+
+double raw_bytes_per_s(std::size_t bytes, std::size_t count) {
+  const auto [out, in] = tcp_pair();
+  const int sender = out;
+  std::vector<std::byte> all(bytes * count, std::byte{1});
+  const pid_t pid = in_child([&] {
+    std::byte go{};
+    receive_all(sender, &go, 1);
+    for (std::size_t i = 0; i < count; ++i) send_all(sender, all.data() + i * bytes, bytes);
+  });
+  std::vector<std::byte> one(bytes);
+  const std::int64_t start = now_ns();
+  send_all(in, one.data(), 1);
+  for (std::size_t i = 0; i < count; ++i) receive_all(in, one.data(), bytes);
+  const double took = static_cast<double>(now_ns() - start);
+  ::waitpid(pid, nullptr, 0);
+  ::close(in), ::close(out);
+  return static_cast<double>(bytes * count) * 1e9 / took;
+}
+
+// Takes `count` samples by a subscription; the time that took.
+double drain_ns(PConnector& connector, std::size_t bytes, std::size_t count) {
+  std::vector<std::byte> one(bytes);
+  SampleInfo info;
+  const std::int64_t start = now_ns();
+  connector.subscribe({.start = Subscription::Start::oldest}).value();
+  for (std::size_t i = 0; i < count;) {
+    if (connector.next(one, info).value() != ReadStatus::ok) {
+      static_cast<void>(connector.wait(kNever));
+    } else {
+      ++i;
+    }
+  }
+  const double took = static_cast<double>(now_ns() - start);
+  connector.unsubscribe().value();
+  return took;
+}
+
+std::vector<std::byte> fill(Session& session, const StreamId& id, std::size_t bytes,
+                            std::size_t count) {
+  RawWriter writer = session.create_raw(id, {"", bytes, 1, {}}, History{count + 1, 1ms}).value();
+  std::vector<std::byte> payload(bytes, std::byte{1});
+  for (std::size_t i = 0; i < count; ++i)
+    writer.write(payload, time_from_ns(static_cast<std::int64_t>(i)));
+  return payload;
+}
+
+void bench_large(const std::string& address, Session& session, std::size_t bytes,
+                 std::size_t count) {
+  const StreamId id{"large", static_cast<std::int32_t>(bytes), ""};
+  fill(session, id, bytes, count);
+  PConnector connector = PConnector::open(id, {.address = address}).value();
+  std::vector<double> raw, ours;
+  drain_ns(connector, bytes, count);
+  for (int i = 0; i < kRounds; ++i) {
+    raw.push_back(raw_bytes_per_s(bytes, count) / 1e6);
+    ours.push_back(static_cast<double>(bytes * count) * 1e3 / drain_ns(connector, bytes, count));
+  }
+  const Figures raw_figures = figures_of(raw), our_figures = figures_of(ours);
+  const std::string tail = ", " + std::to_string(bytes >> 10) + " KiB";
+  char rest[80];
+  std::snprintf(rest, sizeof rest, "%7.2f  >= 0.9", our_figures.median / raw_figures.median);
+  print_row("  raw TCP [MB/s]" + tail, raw_figures);
+  print_row("one channel [MB/s]" + tail, our_figures, rest);
+  const PConnector::Counters counters = connector.counters();
+  const double received = static_cast<double>(counters.samples * bytes);
+  std::printf("%-44s %9.3f\n", "  user-space copies of a payload, receiver",
+              static_cast<double>(counters.copied_payload_bytes) / received);
+  session.remove(id).value();
+}
+
+void bench_small(const std::string& address, Session& session, Session& other) {
+  constexpr std::size_t kCount = 1'000'000, kBytes = 64;
+  const StreamId id{"small", 0, "pc1"};
+  fill(session, id, kBytes, kCount);
+  std::vector<double> connector_rate, mirror_rate;
+  PConnector connector = PConnector::open(id, {.address = address}).value();
+  for (int i = 0; i < kRounds; ++i) {
+    connector_rate.push_back(static_cast<double>(kCount) * 1e9 /
+                             drain_ns(connector, kBytes, kCount));
+  }
+  print_row("PConnector, 64 B [samples/s]", figures_of(connector_rate), "         >= 1000000");
+  const std::int64_t start = now_ns();
+  RawReader reader = other.await_raw_reader(id, deadline_in(30s)).value();
+  const auto last = static_cast<Tid>(kCount) - 1;
+  while (reader.newest() != last) static_cast<void>(reader.wait_for_tid(last, kNever));
+  mirror_rate.push_back(static_cast<double>(kCount) * 1e9 / static_cast<double>(now_ns() - start));
+  if (reader.oldest() != 0) fail("samples are missing");
+  print_row("mirror from nothing, 64 B [samples/s]", figures_of(mirror_rate),
+            "         >= 1000000");
+  session.remove(id).value();
+}
+
+}  // namespace
+
+int main() {
+  test::DaemonProcess owner({"--listen", "127.0.0.1:0"}, "pc1");
+  test::DaemonProcess other({"--listen", "127.0.0.1:0", "--peer", owner.address()}, "pc2");
+  Session session = Session::connect({.socket_path = owner.socket_path()}).value();
+  Session there = Session::connect({.socket_path = other.socket_path()}).value();
+  std::printf("%-44s %9s %9s %9s %9s  %7s  %s\n", "more is better", "min", "median", "p99", "p99.9",
+              "ratio", "target");
+  bench_large(owner.address(), session, 64 << 10, 4096);
+  bench_large(owner.address(), session, 1 << 20, 256);
+  bench_small(owner.address(), session, there);
+}

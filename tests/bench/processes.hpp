@@ -1,0 +1,119 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What the benchmarks of chains of processes share: children, bare TCP, futexes, CPU time.
+#pragma once
+
+#include <linux/futex.h>
+#include <netinet/in.h>
+#include <netinet/tcp.h>
+#include <sys/mman.h>
+#include <sys/prctl.h>
+#include <sys/socket.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <atomic>
+#include <climits>
+#include <csignal>
+#include <cstdio>
+#include <cstdlib>
+#include <dssm/time.hpp>
+#include <new>
+#include <utility>
+
+namespace dssm::bench {
+
+// Ends the benchmark with a text: a figure that was measured halfway is none.
+[[noreturn]] inline void fail(const char* what) {
+  std::perror(what);
+  std::abort();
+}
+
+// Memory that children share with their parent; never given back.
+template <class T>
+T& shared() {
+  void* memory =
+      ::mmap(nullptr, sizeof(T), PROT_READ | PROT_WRITE, MAP_SHARED | MAP_ANONYMOUS, -1, 0);
+  if (memory == MAP_FAILED) fail("mmap");
+  return *new (memory) T;
+}
+
+// Runs `work` in a child that dies with this process; never returns there.
+template <class Work>
+pid_t in_child(Work work) {
+  const pid_t pid = ::fork();
+  if (pid < 0) fail("fork");
+  if (pid > 0) return pid;
+  ::prctl(PR_SET_PDEATHSIG, SIGKILL);
+  work();
+  ::_exit(0);
+}
+
+inline void end_child(pid_t pid) {
+  ::kill(pid, SIGKILL);
+  ::waitpid(pid, nullptr, 0);
+}
+
+inline void sleep_until(MonoTime time) {
+  const timespec until{to_ns(time.time_since_epoch()) / 1'000'000'000,
+                       to_ns(time.time_since_epoch()) % 1'000'000'000};
+  ::clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, nullptr);
+}
+
+inline void futex_wait(std::atomic<std::uint32_t>& word, std::uint32_t value) {
+  ::syscall(SYS_futex, &word, FUTEX_WAIT, value, nullptr, nullptr, 0);
+}
+inline void futex_wake(std::atomic<std::uint32_t>& word) {
+  ::syscall(SYS_futex, &word, FUTEX_WAKE, INT_MAX, nullptr, nullptr, 0);
+}
+
+// CPU time that all threads of a process took so far.
+inline std::int64_t cpu_ns(pid_t pid) {
+  clockid_t clock{};
+  timespec time{};
+  if (::clock_getcpuclockid(pid, &clock) || ::clock_gettime(clock, &time)) fail("CPU time");
+  return time.tv_sec * 1'000'000'000 + time.tv_nsec;
+}
+
+// Two ends of a TCP connection over loopback, without Nagle's delay.
+inline std::pair<int, int> tcp_pair() {
+  const int listener = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
+  sockaddr_in address{};
+  address.sin_family = AF_INET;
+  address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+  socklen_t length = sizeof address;
+  auto* name = reinterpret_cast<sockaddr*>(&address);
+  if (::bind(listener, name, length) || ::listen(listener, 1) ||
+      ::getsockname(listener, name, &length)) {
+    fail("listen");
+  }
+  const int one = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
+  if (::connect(one, name, length)) fail("connect");
+  const int other = ::accept4(listener, nullptr, nullptr, SOCK_CLOEXEC);
+  if (other < 0) fail("accept");
+  ::close(listener);
+  const int on = 1;
+  for (const int fd : {one, other}) ::setsockopt(fd, IPPROTO_TCP, TCP_NODELAY, &on, sizeof on);
+  return {one, other};
+}
+
+inline void send_all(int fd, const void* data, std::size_t bytes) {
+  const auto* at = static_cast<const char*>(data);
+  while (bytes > 0) {
+    const ssize_t sent = ::send(fd, at, bytes, MSG_NOSIGNAL);
+    if (sent <= 0) fail("send");
+    at += sent, bytes -= static_cast<std::size_t>(sent);
+  }
+}
+
+inline void receive_all(int fd, void* data, std::size_t bytes) {
+  auto* at = static_cast<char*>(data);
+  while (bytes > 0) {
+    const ssize_t got = ::recv(fd, at, bytes, 0);
+    if (got <= 0) fail("recv");
+    at += got, bytes -= static_cast<std::size_t>(got);
+  }
+}
+
+}  // namespace dssm::bench

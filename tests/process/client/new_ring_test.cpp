@@ -1,0 +1,171 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Readers of a stream that begins anew: told once, then on the new ring.
+#include <gtest/gtest.h>
+#include <poll.h>
+
+#include <dssm/dssm.hpp>
+#include <thread>
+
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm {
+namespace {
+
+using namespace std::chrono_literals;
+using test::DaemonProcess;
+
+const StreamId kId{"anew", 0, ""};
+
+Session connect(const DaemonProcess& daemon) {
+  return Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 60s}).value();
+}
+
+// Removes the stream and creates it again.
+Writer<double> create_anew(Session& session) {
+  session.remove(kId).value();
+  return session.create<double>("anew", History{16, 1ms}).value();
+}
+
+// Waits for the next outcome of next() that is not not_yet.
+ReadStatus next(Reader<double>& reader, double& value, SampleInfo& info) {
+  for (;;) {
+    const ReadStatus status = reader.next(value, info);
+    if (status != ReadStatus::not_yet) return status;
+    EXPECT_NE(reader.wait(kNever), WaitStatus::timeout);
+  }
+}
+
+TEST(NewRing, IsGoneOnWithAfterTheOldOneIsReadToItsEnd) {
+  const DaemonProcess daemon;
+  Session session = connect(daemon);
+  Writer<double> writer = session.create<double>("anew", History{16, 1ms}).value();
+  Reader<double> reader = session.open_reader<double>("anew").value();
+  reader.seek(kNoTid);
+  for (int i = 0; i < 3; ++i) writer.write(i);
+  const std::uint64_t old_ring = reader.incarnation();
+  Writer<double> again = create_anew(session);
+  for (int i = 0; i < 2; ++i) again.write(100 + i);
+  double value = 0;
+  SampleInfo info;
+  for (int i = 0; i < 3; ++i) {
+    ASSERT_EQ(next(reader, value, info), ReadStatus::ok);
+    EXPECT_EQ(info.tid, i);
+    EXPECT_EQ(value, i);
+  }
+  ASSERT_EQ(next(reader, value, info), ReadStatus::restarted);
+  EXPECT_EQ(value, 2) << "an outcome without a sample touches nothing";
+  EXPECT_EQ(reader.cursor(), kNoTid);
+  EXPECT_EQ(reader.restarts(), 1u);
+  EXPECT_NE(reader.incarnation(), old_ring);
+  EXPECT_EQ(reader.incarnation(), again.incarnation());
+  for (int i = 0; i < 2; ++i) {
+    ASSERT_EQ(next(reader, value, info), ReadStatus::ok);
+    EXPECT_EQ(info.tid, i);
+    EXPECT_EQ(value, 100 + i);
+  }
+  EXPECT_EQ(reader.next(value, info), ReadStatus::not_yet);
+  EXPECT_EQ(reader.lost(), 0u);
+}
+
+TEST(NewRing, WakesWhoSleepsOnTheOldOne) {
+  const DaemonProcess daemon;
+  Session session = connect(daemon);
+  Writer<double> writer = session.create<double>("anew", History{16, 1ms}).value();
+  Reader<double> reader = session.open_reader<double>("anew").value();
+  const int ready = reader.ready_fd().value();
+  std::thread sleeper([&] {
+    double value = 0;
+    SampleInfo info;
+    ASSERT_EQ(next(reader, value, info), ReadStatus::restarted);
+    ASSERT_EQ(next(reader, value, info), ReadStatus::ok);
+    EXPECT_EQ(value, 7);
+  });
+  Writer<double> again = create_anew(session);
+  again.write(7);
+  sleeper.join();
+  pollfd event{ready, POLLIN, 0};
+  ASSERT_EQ(::poll(&event, 1, -1), 1);
+  reader.clear_ready();
+  again.write(8);  // the descriptor speaks of the new ring
+  ASSERT_EQ(::poll(&event, 1, -1), 1);
+  double value = 0;
+  SampleInfo info;
+  ASSERT_EQ(reader.next(value, info), ReadStatus::ok);
+  EXPECT_EQ(value, 8);
+}
+
+TEST(NewRing, IsToldByReadsByTimeAtOnce) {
+  const DaemonProcess daemon;
+  Session session = connect(daemon);
+  Writer<double> writer = session.create<double>("anew", History{16, 1ms}).value();
+  writer.write(1, time_from_ns(1000));
+  Reader<double> reader = session.open_reader<double>("anew").value();
+  BorrowedSample borrowed;
+  ASSERT_EQ(reader.borrow(0, borrowed), ReadStatus::ok);
+  Writer<double> again = create_anew(session);
+  again.write(2, time_from_ns(2000));
+  double value = 0;
+  SampleInfo info;
+  while (reader.at(time_from_ns(1500), value, info) != ReadStatus::restarted) {
+    EXPECT_NE(reader.wait(kNever), WaitStatus::timeout);
+  }
+  EXPECT_EQ(Reader<double>::view(borrowed), 1) << "what was borrowed stays mapped";
+  EXPECT_EQ(reader.at(time_from_ns(1500), value, info), ReadStatus::too_old);
+  ASSERT_EQ(reader.at(time_from_ns(2500), value, info), ReadStatus::ok);
+  EXPECT_EQ(value, 2);
+}
+
+TEST(NewRing, OfAnotherTypeLeavesTheReaderOnTheOldOneAndSaysWhy) {
+  const DaemonProcess daemon;
+  Session session = connect(daemon);
+  Writer<double> writer = session.create<double>("anew", History{16, 1ms}).value();
+  writer.write(1);
+  Reader<double> reader = session.open_reader<double>("anew").value();
+  session.remove(kId).value();
+  RawWriter other = session.create_raw(kId, {"", 3, 1, {}}, History{16, 1ms}).value();
+  double value = 0;
+  SampleInfo info;
+  while (!reader.trouble()) {
+    ASSERT_EQ(reader.latest(value, info), ReadStatus::ok);
+    EXPECT_EQ(value, 1);
+  }
+  EXPECT_EQ(reader.trouble()->code, Errc::type_mismatch);
+  EXPECT_NE(reader.trouble()->message.find("anew:0"), std::string::npos);
+  EXPECT_EQ(reader.restarts(), 0u);
+}
+
+// A dssmd that died, and a writer that took the name before the reader's process was back: that
+// process holds a ring that nobody else knows.
+TEST(NewRing, IsFoundWhenTheNameWasTakenWhileDssmdWasAway) {
+  DaemonProcess daemon({"--recovery-grace", "0 ms"});
+  Session reading = connect(daemon);
+  std::uint64_t restarts = 0;
+  std::optional<Writer<double>> writer = reading.create<double>("anew", History{16, 1ms}).value();
+  Reader<double> reader = reading.open_reader<double>("anew").value();
+  double value = 0;
+  SampleInfo info;
+  // Whether the eager one comes first is a race; it is run until it did.
+  while (restarts == 0) {
+    writer.reset();
+    daemon.kill_hard();
+    daemon.start();
+    Session eager = connect(daemon);
+    writer = eager.create<double>("anew", History{16, 1ms}).value();
+    writer->write(5);
+    // A question that the reading session's keeper answers only when it is back and has offered.
+    ASSERT_TRUE(reading.daemon());
+    const bool took_the_name = writer->incarnation() != reader.incarnation();
+    if (!took_the_name) continue;
+    while (reader.latest(value, info) != ReadStatus::restarted) {
+      EXPECT_NE(reader.wait(kNever), WaitStatus::timeout);
+    }
+    restarts = reader.restarts();
+    ASSERT_EQ(reader.latest(value, info), ReadStatus::ok);
+    EXPECT_EQ(value, 5);
+    EXPECT_EQ(reader.incarnation(), writer->incarnation());
+  }
+}
+
+}  // namespace
+}  // namespace dssm
