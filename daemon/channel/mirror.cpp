@@ -292,11 +292,13 @@ void Mirror::describe(proto::Mirror& out) const {
 
 void Mirror::answer_waiting() {
   for (const Waiting& one : std::exchange(waiting_, {})) one.then(lend());
+  arm_wait_timer();
 }
 
 void Mirror::fail_waiting(const Error& why) {
   const std::vector<Waiting> all = std::exchange(waiting_, {});
   for (const Waiting& one : all) one.then(why);
+  arm_wait_timer();
   leave_if_alone(!all.empty());
 }
 

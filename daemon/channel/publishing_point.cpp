@@ -28,6 +28,7 @@ Result<PublishingPoint::Request> PublishingPoint::on_publishing_untrusted(
   const bool same_ring =
       std::exchange(their_incarnation_, publishing.incarnation()) == publishing.incarnation();
   if (!same_ring) known_tid_ = kNoTid;
+  const bool sent_before = std::exchange(started_, true);
   // It may know less than we do: when it has forgotten us, or has done so once before.
   if (publishing.last() >= ring_.next_untrusted() - 1 && publishing.last() >= 0) {
     if (Result<void> noted = note_untrusted(publishing.last(), publishing.last_tid()); !noted) {
@@ -35,7 +36,7 @@ Result<PublishingPoint::Request> PublishingPoint::on_publishing_untrusted(
     }
     return Request();
   }
-  if (!same_ring || ring_.all_published()) return Request();
+  if (!same_ring || !sent_before || ring_.all_published()) return Request();
   net::Frame frame;
   frame.set_serial(kSerial);
   frame.mutable_get_range();

@@ -54,6 +54,7 @@ class PublishingPoint {
   std::uint64_t their_incarnation_ = 0;  // 0: not known
   Tid known_tid_ = kNoTid;  // in their ring: our sample next() - 1 is there or before it
   Tid last_compared_ = kNoTid;
+  bool started_ = false;  // samples may have been sent
 };
 
 }  // namespace dssm::daemon

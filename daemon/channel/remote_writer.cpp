@@ -309,6 +309,7 @@ Result<std::shared_ptr<Stream>> RemoteWriter::adopt_untrusted(OfferedFiles files
 }
 
 void RemoteWriter::answer_waiting(bool created) {
+  wait_timer_.disable();
   for (const Waiting& one : std::exchange(waiting_, {})) {
     if (Result<void> usable = check_plan(one.plan ? &*one.plan : nullptr); !usable) {
       one.then(std::move(usable).error());
@@ -320,6 +321,7 @@ void RemoteWriter::answer_waiting(bool created) {
 }
 
 void RemoteWriter::fail_waiting(const Error& why) {
+  wait_timer_.disable();
   for (const Waiting& one : std::exchange(waiting_, {})) one.then(why);
   if (!ring_ && waiting_.empty()) end();
 }

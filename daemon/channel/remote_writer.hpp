@@ -55,6 +55,7 @@ class RemoteWriter final : private OwnerChannel::User,
   RemoteWriter(const ChannelParts& parts, Keeper& keeper, StreamId id, RingRoom room);
   RemoteWriter(const RemoteWriter&) = delete;
   RemoteWriter& operator=(const RemoteWriter&) = delete;
+  ~RemoteWriter() { stop_publishing(); }  // before its link goes
 
   // --- for ChannelTable -----------------------------------------------------------------------
   const StreamId& id() const noexcept { return id_; }

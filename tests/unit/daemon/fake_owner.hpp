@@ -107,10 +107,11 @@ class FakeOwner final : private FrameLink::User {
     frame.mutable_ended()->set_removed(true);
     send(frame);
   }
-  void sample(const SampleInfo& info, const std::vector<std::byte>& payload, bool torn = false) {
+  void sample(const SampleInfo& info, const std::vector<std::byte>& payload, bool torn = false,
+              std::uint64_t serial = 0) {
     std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
     const std::size_t bytes =
-        wire::encode_sample_header(header, 0, info, payload.size(), wire::Trailer::torn);
+        wire::encode_sample_header(header, serial, info, payload.size(), wire::Trailer::torn);
     const auto trailer = wire::torn_trailer(torn);
     std::vector<std::byte> all(header.begin(), header.begin() + static_cast<std::ptrdiff_t>(bytes));
     all.insert(all.end(), payload.begin(), payload.end());
@@ -125,8 +126,9 @@ class FakeOwner final : private FrameLink::User {
     SampleInfo info;
     std::vector<std::byte> payload;
     std::uint64_t serial = 0;
+    bool complete = false;
   };
-  std::vector<Published> published;
+  std::deque<Published> published;  // which keeps its elements where they are
 
  private:
   void accept_one() {
@@ -149,11 +151,13 @@ class FakeOwner final : private FrameLink::User {
     return {};
   }
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override {
-    published.push_back({sample.info, std::vector<std::byte>(sample.payload_bytes), sample.serial});
+    published.push_back(
+        {sample.info, std::vector<std::byte>(sample.payload_bytes), sample.serial, false});
     out = published.back().payload.data();
     return {};
   }
   Result<void> on_sample_end(const wire::IncomingSample&, bool torn) override {
+    published.back().complete = true;
     if (torn) published.pop_back();
     return {};
   }
