@@ -48,6 +48,7 @@ Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
       if (seen == Look::news) return PumpWait::news;
       if (seen == Look::time) return PumpWait::time;
       if (sender_.sends_in_place()) {
+        sent_up_to = next_ + 1;
         status = sender_.send(next_, 0);
         bytes += std::min(payload_bytes_, SampleSender::kSliceBytes);
       } else {
