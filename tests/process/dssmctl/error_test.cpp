@@ -8,6 +8,8 @@ namespace {
 
 const std::vector<std::vector<std::string>> kVerbsThatAsk = {
     {"ls"},
+    {"hosts"},
+    {"ping", "pc2"},
     {"info"},
     {"info", "s"},
     {"echo", "s"},
