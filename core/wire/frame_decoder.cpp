@@ -6,13 +6,12 @@
 //                        by hand and its payload copied out: no allocation, no protobuf.
 //   one large sample     Its head comes into the input buffer. From then on spaces() gives the rest
 //                        of the payload's place first, and the kernel writes there.
-//   all the rest         A frame is collected, if it did not arrive at once, and parsed by
-//   protobuf.
+//   all the rest         A frame is collected, unless it came at once, and parsed by protobuf.
 //
 // The input buffer belongs to the thread, not to the decoder, so nothing may stay in it: when a
 // commit() ends within a frame, a head is kept in head_ (a few bytes), payload and trailer are
-// where they belong already, other frames are in whole_. Only for a sample that the sink holds back
-// does the decoder take the buffer with it.
+// where they belong already, other frames are in whole_. Only while the sink holds back does the
+// decoder take the buffer with it.
 #include "core/wire/frame_decoder.hpp"
 
 #include <algorithm>
@@ -145,8 +144,7 @@ Result<void> FrameDecoder::check_payload_bytes(std::uint64_t payload_bytes) cons
              std::to_string(payload_bytes_));
 }
 
-// --- the input buffer
-// -----------------------------------------------------------------------------
+// --- the input buffer ----------------------------------------------------------------------------
 
 // The thread's input buffer; null while a commit() works on it, so that a sink which drives another
 // connection from within a callback gets another one.
@@ -204,8 +202,7 @@ Result<void> FrameDecoder::commit(std::size_t bytes) {
   return result;
 }
 
-// --- decoding
-// -------------------------------------------------------------------------------------
+// --- decoding ------------------------------------------------------------------------------------
 
 Result<void> FrameDecoder::decode(Bytes& input) {
   // Without any input too: the last byte may have been received in place, and a frame that was
@@ -318,8 +315,7 @@ Result<void> FrameDecoder::end_sample(bool torn) {
   return sink_.on_sample_end(sample_, torn);
 }
 
-// --- frames that protobuf parses
-// --------------------------------------------------------------------
+// --- frames that protobuf parses -----------------------------------------------------------------
 
 Result<void> FrameDecoder::begin_whole(Bytes& input, std::size_t length_bytes,
                                        std::size_t frame_bytes) {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Cuts what arrives over a network connection into frames. A sample's payload goes where the
-// receiver wants it: straight from the kernel for large ones (the space that space() gives is the
+// receiver wants it: straight from the kernel for large ones (the space that spaces() gives is the
 // slot itself), with one copy out of the input buffer for those that arrive many at a time. Frames
 // whose fields come in another order than ours are collected and parsed by protobuf: slower, same
 // result.

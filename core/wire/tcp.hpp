@@ -4,12 +4,12 @@
 // kernel that notices when the other PC is gone, so that idle channels need no heartbeats of their
 // own. How soon depends on the end:
 //
-//   the end that connected  3 s (keep-alive probes, and TCP_USER_TIMEOUT for what was sent): mirrors
-//                           and remote writers want to know, and begin anew.
-//   the end that accepted   30 s. Linux counts a receiver whose window stays closed like one that is
-//                           gone. A program that looks at its subscription every few seconds is not
-//                           to be cut off for it; one that takes nothing for 30 s is, and resumes
-//                           where it was when it looks again.
+//   the end that connected  3 s (keep-alive probes, and TCP_USER_TIMEOUT for what was sent):
+//                           mirrors and remote writers want to know, and begin anew.
+//   the end that accepted   30 s. Linux counts a receiver whose window stays closed like one that
+//                           is gone. A program that looks at its subscription every few seconds is
+//                           not to be cut off for it; one that takes nothing for 30 s is, and
+//                           resumes where it was when it looks again.
 #pragma once
 
 #include <dssm/result.hpp>

@@ -353,8 +353,7 @@ TEST(FrameDecoder, MovesAPayloadThatIsUnderWay) {
   }
 }
 
-// --- holding back
-// ---------------------------------------------------------------------------------
+// --- holding back --------------------------------------------------------------------------------
 
 TEST(FrameDecoder, GivesTheSameToASinkThatHoldsBackAtRandom) {
   const unsigned seed = std::random_device()();
@@ -412,8 +411,7 @@ TEST(FrameDecoder, KeepsItsInputWhileOtherDecodersWork) {
   EXPECT_EQ(recorder.log, decode(stream, 20).log);
 }
 
-// --- the input buffer is the thread's
-// ---------------------------------------------------------------
+// --- the input buffer is the thread's ------------------------------------------------------------
 
 TEST(FrameDecoder, SharesItsThreadWithOtherDecoders) {
   const std::string stream = mixed_stream();
@@ -454,8 +452,7 @@ TEST(FrameDecoder, GoesOnInAnotherThread) {
   EXPECT_EQ(recorder.log, decode(stream, 20).log);
 }
 
-// --- what is refused
-// ------------------------------------------------------------------------------
+// --- what is refused -----------------------------------------------------------------------------
 
 TEST(FrameDecoder, RefusesALengthBeyondTheLimitsBeforeTheFrameIsThere) {
   expect_refused("\xa1\x8d\x06", 0, "100001 bytes is longer than the 100000");   // kMaxFrame + 1
