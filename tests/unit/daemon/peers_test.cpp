@@ -260,6 +260,9 @@ TEST_F(PeersTest, KeepTwoHostsOfOneNameAndWarnAtBoth) {
   EXPECT_NE(host(0).error().find("is called 'pc2' too"), std::string::npos) << host(0).error();
   EXPECT_NE(host(1).error().find(one.owner.host().address.str()), std::string::npos)
       << host(1).error();
+  two.owner.cut();
+  wait([&] { return catalog.hosts().size() == 1; });
+  EXPECT_EQ(host(0).error(), "") << "there is only one now";
 }
 
 TEST_F(PeersTest, KnowThemselves) {
@@ -350,6 +353,25 @@ TEST_F(PeersTest, BoundTheRequestsThatWait) {
   link.ask(large, [&](const Result<net::Frame>& answer) { too_large = !answer; });
   EXPECT_TRUE(too_large);
   EXPECT_FALSE(catalog.hosts().empty()) << "the connection does not suffer";
+}
+
+TEST_F(PeersTest, MakeRoomForRequestsWithEachAnswer) {
+  start({&one});
+  wait_until_settled();
+  PeerLink& link = *peers->link_to(one.owner.host().greeting.host_id);
+  for (std::size_t i = 0; i < 4; ++i) {
+    net::Frame large;
+    large.mutable_set_property()->set_property(std::string(PeerLink::kMaxWaitingBytes / 3, 'x'));
+    std::optional<bool> done;
+    link.ask(large, [&](const Result<net::Frame>& answer) { done = answer.has_value(); });
+    wait([&] { return one.asked.size() > i || done; });
+    ASSERT_FALSE(done);
+    net::Frame answer = answer_to(one.asked[i]);
+    answer.mutable_done();
+    one.owner.send(answer);
+    wait([&] { return done.has_value(); });
+    EXPECT_TRUE(*done);
+  }
 }
 
 TEST_F(PeersTest, EndAConnectionThatAnswersWhatNobodyAsked) {

@@ -321,6 +321,10 @@ TEST_F(RemoteRequestsTest, TellsReadersWhenAnOwnStreamIsCreatedAnew) {
   EXPECT_TRUE(client->received.empty());
   writer.ask(create_request("odometry"));
   EXPECT_TRUE(client->received.empty()) << "it joined, nothing is new";
+  StreamInfo elsewhere = lidar_at("pc2");
+  elsewhere.id.name = "other";
+  fleet.observer->on_remote_stream_added(elsewhere);
+  EXPECT_TRUE(client->received.empty()) << "what is read is still there";
 }
 
 TEST_F(RemoteRequestsTest, TellsReadersOfAStreamThatMovedToAnotherHost) {
