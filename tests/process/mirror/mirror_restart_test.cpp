@@ -1,0 +1,194 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Mirrors in trouble: the owner's dssmd or the mirror's is killed, stopped or away, under load.
+// What the owner's ring still holds when the link is back arrives, once and in order; what it does
+// not hold is a gap of exactly that many samples.
+#include <csignal>
+
+#include "tests/process/mirror/two_hosts.hpp"
+
+namespace dssm::test {
+namespace {
+
+constexpr History kLong{1 << 16, 1ms};  // of which nobody has to lose anything
+
+TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonIsKilledUnderLoad) {
+  auto writer = here.create<Counted>("load", kLong).value();
+  auto reader = there.open_reader<Counted>("load").value();
+  Reading reading(reader);
+  std::int64_t written = 0;
+  {
+    Writing writing(writer);
+    for (int round = 0; round < 5; ++round) {
+      writing.more(100);
+      pc1.kill_hard();
+      writing.more(100);  // the writer goes on without a dssmd
+      pc1.start();
+      reading.await_taken(writing.written());
+    }
+    written = writing.stop();
+  }
+  reading.await_taken(written);
+  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.restarts(), 0u) << "the ring is the same";
+  EXPECT_EQ(mirror("load").gap_samples, 0u);
+  EXPECT_EQ(mirror("load").reconnects, 5u);
+}
+
+TEST_F(TwoHosts, LoseNothingWhenTheMirrorsDaemonIsKilledUnderLoad) {
+  auto writer = here.create<Counted>("load", kLong).value();
+  auto reader = there.open_reader<Counted>("load").value();
+  Session another = connect(pc2);
+  auto second = another.open_reader<Counted>("load").value();
+  Reading reading(reader), reading_too(second);
+  std::int64_t written = 0;
+  {
+    Writing writing(writer);
+    for (int round = 0; round < 5; ++round) {
+      writing.more(100);
+      pc2.kill_hard();
+      writing.more(100);
+      pc2.start();
+      reading.await_taken(writing.written());
+    }
+    written = writing.stop();
+  }
+  reading.await_taken(written);
+  reading_too.await_taken(written);
+  EXPECT_EQ(reader.lost() + second.lost(), 0u);
+  EXPECT_EQ(reader.restarts() + second.restarts(), 0u);
+  // One mirror serves them both, and new ones.
+  auto later = there.open_reader<Counted>("load").value();
+  EXPECT_EQ(later.incarnation(), writer.incarnation());
+  EXPECT_EQ(channels("load"), 1u);
+}
+
+TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonHangs) {
+  auto writer = here.create<Counted>("load", kLong).value();
+  auto reader = there.open_reader<Counted>("load").value();
+  Reading reading(reader);
+  Writing writing(writer);
+  reading.await_taken(100);
+  ::kill(pc1.pid(), SIGSTOP);
+  // For long enough that its silence counts as death.
+  await([&] { return mirror("load").state == "owner away"; });
+  EXPECT_NE(mirror("load").error, "");
+  const std::int64_t before = writing.written();
+  ::kill(pc1.pid(), SIGCONT);
+  reading.await_taken(before + 100);
+  await([&] { return mirror("load").state == "live"; });
+  EXPECT_EQ(mirror("load").error, "");
+  reading.await_taken(writing.stop());
+  EXPECT_EQ(reader.lost(), 0u);
+}
+
+TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsAway) {
+  auto writer = here.create<Counted>("kept", kLong).value();
+  for (int i = 0; i < 100; ++i) writer.write(counted(i));
+  auto reader = there.open_reader<Counted>("kept").value();
+  pc1.kill_hard();
+  await([&] { return mirror("kept").state == "owner away"; });
+  auto joined = there.open_reader<Counted>("kept@pc1");
+  ASSERT_TRUE(joined) << joined.error().message;
+  Counted sample{};
+  SampleInfo info;
+  for (Tid tid = 0; tid < 100; ++tid) {
+    ASSERT_EQ(joined->tid(tid, sample, info), ReadStatus::ok);
+    EXPECT_EQ(sample.number, tid);
+  }
+}
+
+TEST_F(TwoHosts, CountExactlyWhatTheOwnersRingLostMeanwhile) {
+  auto writer = here.create<Counted>("short", History{64, 1ms}).value();
+  auto reader = there.open_reader<Counted>("short").value();
+  reader.seek(kNoTid);
+  Counted sample{};
+  SampleInfo info;
+  for (int i = 0; i < 10; ++i) writer.write(counted(i));
+  for (int i = 0; i < 10; ++i) {
+    ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+    ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+  }
+  pc1.kill_hard();
+  await([&] { return mirror("short").state == "owner away"; });
+  for (int i = 10; i < 1000; ++i) writer.write(counted(i));
+  const Tid oldest = 1000 - 63;
+  pc1.start();
+  for (Tid tid = oldest; tid < 1000; ++tid) {
+    ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+    ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+    ASSERT_EQ(info.tid, tid);
+    EXPECT_EQ(sample.number, tid);
+  }
+  EXPECT_EQ(reader.lost(), static_cast<std::uint64_t>(oldest) - 10);
+  EXPECT_EQ(mirror("short").gap_samples, static_cast<std::uint64_t>(oldest) - 10);
+  EXPECT_EQ(reader.oldest(), oldest);
+}
+
+// Its rings died with it: nobody held them.
+TEST_F(TwoHosts, TellReadersThatTheOwnerCameBackWithoutItsRing) {
+  auto reader = [&] {
+    Session brief = connect(pc1);
+    auto writer = brief.create<Counted>("reborn", kLong).value();
+    for (int i = 0; i < 10; ++i) writer.write(counted(i));
+    auto opened = there.open_reader<Counted>("reborn").value();
+    EXPECT_EQ(opened.wait_for_tid(9, kNever), WaitStatus::ready);
+    pc1.kill_hard();
+    return opened;
+  }();
+  reader.seek(kNoTid);
+  pc1.start();
+  Session again = connect(pc1);
+  auto writer = again.create<Counted>("reborn", kLong).value();
+  writer.write(counted(100));
+  Counted sample{};
+  SampleInfo info;
+  for (int i = 0; i < 10; ++i) {
+    ASSERT_EQ(reader.next(sample, info), ReadStatus::ok) << "first what the old ring held";
+    EXPECT_EQ(sample.number, i);
+  }
+  ReadStatus status = ReadStatus::not_yet;
+  await([&] { return (status = reader.next(sample, info)) != ReadStatus::not_yet; });
+  EXPECT_EQ(status, ReadStatus::restarted);
+  ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+  ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 0);
+  EXPECT_EQ(sample.number, 100);
+  EXPECT_EQ(reader.incarnation(), writer.incarnation());
+  EXPECT_EQ(mirror("reborn").restarts, 1u);
+}
+
+// Both at once: whoever comes back first waits for the other.
+TEST_F(TwoHosts, FindEachOtherAgainWhenBothDaemonsAreKilled) {
+  auto writer = here.create<Counted>("load", kLong).value();
+  auto reader = there.open_reader<Counted>("load").value();
+  Reading reading(reader);
+  Writing writing(writer);
+  for (int round = 0; round < 2; ++round) {
+    writing.more(100);
+    pc1.kill_hard();
+    pc2.kill_hard();
+    writing.more(100);
+    (round == 0 ? pc1 : pc2).start();
+    writing.more(100);
+    (round == 0 ? pc2 : pc1).start();
+    reading.await_taken(writing.written());
+  }
+  reading.await_taken(writing.stop());
+  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.restarts(), 0u);
+}
+
+TEST_F(TwoHosts, SayThatAHostDoesNotAnswer) {
+  auto writer = here.create<Counted>("odometry", kLong).value();
+  await_list(there, {"odometry:0@pc1"});
+  ::kill(pc1.pid(), SIGSTOP);
+  const auto reader = there.open_reader<Counted>("odometry");
+  ::kill(pc1.pid(), SIGCONT);
+  ASSERT_FALSE(reader);
+  EXPECT_EQ(reader.error().code, Errc::daemon_away);
+  EXPECT_NE(reader.error().message.find("'pc1'"), std::string::npos) << reader.error().message;
+}
+
+}  // namespace
+}  // namespace dssm::test

@@ -1,0 +1,218 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Mirrors while all is well: they hold what the owner's ring holds, share one channel, come and go
+// with their readers, and carry samples of every size.
+#include <random>
+
+#include "tests/process/mirror/two_hosts.hpp"
+
+namespace dssm::test {
+namespace {
+
+TEST_F(TwoHosts, ReadTheHistoryFromBeforeTheReaderCame) {
+  auto writer = here.create<Counted>("odometry", History{1024, 1ms}).value();
+  for (int i = 0; i < 3000; ++i) writer.write(counted(i), time_from_ns(1000 * i), Duration(i));
+  auto reader = there.open_reader<Counted>("odometry").value();
+  EXPECT_EQ(reader.id(), (StreamId{"odometry", 0, "pc1"}));
+  EXPECT_EQ(reader.type(), type_of<Counted>()) << "with all its fields";
+  EXPECT_EQ(reader.depth(), 1024u);
+  EXPECT_EQ(reader.cycle(), 1ms);
+  EXPECT_EQ(reader.incarnation(), writer.incarnation());
+  EXPECT_EQ(reader.newest(), 2999);
+  EXPECT_EQ(reader.oldest(), here.open_reader<Counted>("odometry").value().oldest());
+  for (Tid tid = reader.oldest(); tid <= reader.newest(); ++tid) {
+    Counted sample{};
+    SampleInfo info;
+    ASSERT_EQ(reader.tid(tid, sample, info), ReadStatus::ok);
+    EXPECT_EQ(sample.number, tid);
+    EXPECT_TRUE(is_whole(sample));
+    EXPECT_EQ(to_ns(info.time), 1000 * tid);
+    EXPECT_EQ(to_ns(info.clock_error), tid);
+  }
+  EXPECT_EQ(mirror("odometry").state, "live");
+  EXPECT_EQ(mirror("odometry").gap_samples, 0u);
+}
+
+// Also where times run backwards, and while the stream is written.
+TEST_F(TwoHosts, AnswerReadsByTimeAsTheOwnerDoes) {
+  const auto seed = std::random_device()();
+  SCOPED_TRACE("seed " + std::to_string(seed));
+  std::mt19937_64 random(seed);
+  auto writer = here.create<Counted>("jumpy", History{500, 1ms}).value();
+  auto owned = here.open_reader<Counted>("jumpy").value();
+  auto mirrored = there.open_reader<Counted>("jumpy").value();
+  std::int64_t time = 1'000'000;
+  for (int i = 0; i < 5000; ++i) {
+    time += random() % 50 == 0 ? -static_cast<std::int64_t>(random() % 5000)
+                               : static_cast<std::int64_t>(random() % 20);
+    writer.write(counted(i), time_from_ns(time));
+    if (i % 100 != 99) continue;
+    ASSERT_EQ(mirrored.wait_for_tid(i, kNever), WaitStatus::ready);
+    for (int reads = 0; reads < 100; ++reads) {
+      const Time t = time_from_ns(time - 3000 + static_cast<std::int64_t>(random() % 4000));
+      Counted there_sample{}, here_sample{};
+      SampleInfo there_info, here_info;
+      const ReadStatus status = owned.at(t, here_sample, here_info);
+      ASSERT_EQ(mirrored.at(t, there_sample, there_info), status);
+      if (status != ReadStatus::ok) continue;
+      ASSERT_EQ(there_info.tid, here_info.tid);
+      ASSERT_EQ(there_info.time, here_info.time);
+      ASSERT_EQ(there_sample.number, here_sample.number);
+    }
+  }
+}
+
+TEST_F(TwoHosts, ShareOneChannelAmongAllReaders) {
+  auto writer = here.create<Counted>("lidar", History{64, 1ms}).value();
+  EXPECT_EQ(channels("lidar"), 0u);
+  auto first = there.open_reader<Counted>("lidar").value();
+  Session another = connect(pc2);
+  auto second = another.open_reader<Counted>("lidar@pc1").value();
+  auto third = there.open_reader<Counted>("lidar:0").value();
+  EXPECT_EQ(channels("lidar"), 1u);
+  writer.write(counted(0));
+  for (Reader<Counted>* reader : {&first, &second, &third}) {
+    EXPECT_EQ(reader->wait_for_tid(0, kNever), WaitStatus::ready);
+  }
+  EXPECT_EQ(channels("lidar"), 1u);
+}
+
+TEST_F(TwoHosts, ReadAnEmptyStreamFromItsFirstSampleOn) {
+  auto writer = here.create<Counted>("later", History{64, 1ms}).value();
+  auto reader = there.open_reader<Counted>("later").value();
+  EXPECT_EQ(reader.newest(), kNoTid);
+  EXPECT_EQ(mirror("later").state, "live");
+  writer.write(counted(0));
+  EXPECT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
+}
+
+class LingeringHosts : public TwoHosts {
+ protected:
+  LingeringHosts() : TwoHosts("100 ms") {}
+};
+
+TEST_F(LingeringHosts, CloseTheChannelAfterTheLastReaderLeft) {
+  auto writer = here.create<Counted>("imu", History{64, 1ms}).value();
+  const std::uint64_t memory = there.daemon().value().memory_bytes;
+  for (int round = 0; round < 3; ++round) {
+    {
+      auto reader = there.open_reader<Counted>("imu").value();
+      EXPECT_EQ(channels("imu"), 1u);
+      EXPECT_GT(there.daemon().value().memory_bytes, memory);
+    }
+    await([&] { return channels("imu") == 0; });
+    await([&] { return there.daemon().value().memory_bytes == memory; });
+  }
+}
+
+// A program that is killed has left as well.
+TEST_F(LingeringHosts, CloseTheChannelOfReadersThatDied) {
+  auto writer = here.create<Counted>("imu", History{64, 1ms}).value();
+  writer.write(counted(0));
+  const int nowhere = ::open("/dev/null", O_WRONLY | O_CLOEXEC);
+  const pid_t reader =
+      start({built("client/dssmctl/dssmctl"), "echo", "imu@pc1"}, {pc2.environment()}, nowhere);
+  ::close(nowhere);
+  await([&] { return channels("imu") == 1; });
+  ::kill(reader, SIGKILL);
+  wait_for(reader);
+  await([&] { return channels("imu") == 0; });
+}
+
+TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
+  std::optional<Writer<Counted>> writer = here.create<Counted>("anew", History{64, 1ms}).value();
+  for (int i = 0; i < 5; ++i) writer->write(counted(i));
+  auto reader = there.open_reader<Counted>("anew").value();
+  reader.seek(kNoTid);
+  ASSERT_TRUE(here.remove({"anew", 0, ""}));
+  await([&] { return mirror("anew").state == "removed"; });
+  const auto none = there.open_reader<Counted>("anew@pc1");
+  ASSERT_FALSE(none);
+  EXPECT_EQ(none.error().code, Errc::not_found);
+  Counted sample{};
+  SampleInfo info;
+  for (int i = 0; i < 5; ++i) {
+    ASSERT_EQ(reader.next(sample, info), ReadStatus::ok) << "what it had is still there";
+    EXPECT_EQ(sample.number, i);
+  }
+  EXPECT_EQ(reader.next(sample, info), ReadStatus::not_yet);
+  writer = here.create<Counted>("anew", History{64, 1ms}).value();
+  writer->write(counted(100));
+  ReadStatus status = ReadStatus::not_yet;
+  await([&] { return (status = reader.next(sample, info)) != ReadStatus::not_yet; });
+  EXPECT_EQ(status, ReadStatus::restarted);
+  ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+  ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 0);
+  EXPECT_EQ(sample.number, 100);
+  EXPECT_EQ(mirror("anew").restarts, 1u);
+}
+
+// --- sizes ---------------------------------------------------------------------------------------
+
+TEST_F(TwoHosts, CarrySamplesOf64MiB) {
+  constexpr std::size_t kBytes = kMaxPayloadBytes;
+  const TypeInfo type{"", kBytes, 1, {}};
+  auto writer = here.create_raw({"camera", 0, ""}, type, {3, 1s}).value();
+  auto reader = there.open_raw_reader({"camera", 0, "pc1"}).value();
+  std::vector<std::byte> payload(kBytes), got(kBytes);
+  for (std::uint64_t tid = 0; tid < 3; ++tid) {
+    for (std::size_t i = 0; i < kBytes; i += sizeof i) {
+      const std::uint64_t word = (i + tid) * 0x9e3779b97f4a7c15;
+      std::memcpy(&payload[i], &word, sizeof word);
+    }
+    ASSERT_EQ(writer.write(payload, time_from_ns(1)), static_cast<Tid>(tid));
+    ASSERT_EQ(reader.wait_for_tid(static_cast<Tid>(tid), kNever), WaitStatus::ready);
+    SampleInfo info;
+    ASSERT_EQ(reader.tid(static_cast<Tid>(tid), got, info), ReadStatus::ok);
+    ASSERT_TRUE(got == payload);
+  }
+  EXPECT_EQ(mirror("camera").gap_samples, 0u);
+}
+
+TEST_F(TwoHosts, CarrySamplesOfOneByteAtRate) {
+  constexpr Tid kSamples = 200'000;
+  auto writer = here.create_raw({"bumper", 0, ""}, {"", 1, 1, {}}, {kSamples + 2, 10us}).value();
+  auto reader = there.open_raw_reader({"bumper", 0, "pc1"}).value();
+  reader.seek(kNoTid);
+  for (Tid tid = 0; tid < kSamples; ++tid) {
+    const auto byte = static_cast<std::byte>(tid * 7);
+    writer.write({&byte, 1}, time_from_ns(tid));
+  }
+  for (Tid tid = 0; tid < kSamples; ++tid) {
+    std::byte byte{};
+    SampleInfo info;
+    ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+    ASSERT_EQ(reader.next({&byte, 1}, info), ReadStatus::ok);
+    ASSERT_EQ(info.tid, tid);
+    ASSERT_EQ(byte, static_cast<std::byte>(tid * 7));
+  }
+  EXPECT_EQ(mirror("bumper").gap_samples, 0u);
+  EXPECT_EQ(mirror("bumper").received_samples, static_cast<std::uint64_t>(kSamples));
+}
+
+// --- limits --------------------------------------------------------------------------------------
+
+TEST(TightHosts, SayWhichLimitAMirrorWouldBreak) {
+  DaemonProcess pc1({}, "pc1");
+  DaemonProcess pc2({"--peer", pc1.address(), "--max-memory", "1 MiB", "--max-streams", "2"},
+                    "pc2");
+  Session here = connect(pc1), there = connect(pc2);
+  await_state(there, pc1, "up");
+  auto big = here.create<Counted>("big", History{1 << 16, 1ms}).value();
+  auto small = here.create<Counted>("small", History{16, 1ms}).value();
+  auto more = here.create<Counted>("more", History{16, 1ms}).value();
+  const auto refused = there.open_reader<Counted>("big@pc1");
+  ASSERT_FALSE(refused);
+  EXPECT_EQ(refused.error().code, Errc::limit_exceeded);
+  EXPECT_NE(refused.error().message.find("max_memory"), std::string::npos)
+      << refused.error().message;
+  auto own = there.create<Counted>("own", History{16, 1ms}).value();
+  auto mirrored = there.open_reader<Counted>("small@pc1").value();
+  const auto third = there.open_reader<Counted>("more@pc1");
+  ASSERT_FALSE(third);
+  EXPECT_NE(third.error().message.find("max_streams"), std::string::npos) << third.error().message;
+}
+
+}  // namespace
+}  // namespace dssm::test

@@ -1,0 +1,163 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Writing into the stream of another host: each sample arrives once, in order, whatever happens to
+// the link and to either dssmd in between.
+#include <csignal>
+
+#include "tests/process/mirror/two_hosts.hpp"
+
+namespace dssm::test {
+namespace {
+
+constexpr History kLong{1 << 16, 1ms};
+
+// pc2 writes, pc1 owns and reads.
+using RemoteWriter = TwoHosts;
+
+TEST_F(RemoteWriter, CreatesTheStreamAndWritesWithTheOwnersTids) {
+  auto writer = there.create<Counted>("goal@pc1", kLong).value();
+  EXPECT_EQ(writer.id(), (StreamId{"goal", 0, "pc1"}));
+  auto reader = here.open_reader<Counted>("goal").value();
+  EXPECT_EQ(reader.type(), type_of<Counted>());
+  EXPECT_EQ(reader.depth(), kLong.depth);
+  EXPECT_EQ(reader.cycle(), kLong.cycle);
+  for (int i = 0; i < 10; ++i) {
+    EXPECT_EQ(writer.write(counted(i), time_from_ns(i), Duration(2 * i)), i);
+    ASSERT_EQ(reader.wait_for_tid(i, kNever), WaitStatus::ready);
+    Counted sample{};
+    SampleInfo info;
+    ASSERT_EQ(reader.tid(i, sample, info), ReadStatus::ok);
+    EXPECT_EQ(sample.number, i);
+    EXPECT_EQ(to_ns(info.time), i);
+    EXPECT_EQ(to_ns(info.clock_error), 2 * i);
+  }
+  EXPECT_EQ(names(there.list_own().value()), std::vector<std::string>{});
+}
+
+TEST_F(RemoteWriter, GoesOnWithTheTidsOfAStreamThatIsThere) {
+  auto first = here.create<Counted>("goal", kLong).value();
+  for (int i = 0; i < 7; ++i) first.write(counted(i));
+  auto writer = there.open_writer<Counted>("goal@pc1").value();
+  EXPECT_EQ(writer.write(counted(7)), 7);
+  auto joined = there.create<Counted>("goal@pc1", kLong).value();
+  EXPECT_EQ(joined.write(counted(8)), 8) << "all writers of a PC share one ring";
+  auto reader = here.open_reader<Counted>("goal").value();
+  ASSERT_EQ(reader.wait_for_tid(8, kNever), WaitStatus::ready);
+  EXPECT_EQ(channels("goal"), 1u);
+}
+
+TEST_F(RemoteWriter, IsReadOnItsOwnPcAsOnAnyOther) {
+  auto writer = there.create<Counted>("goal@pc1", kLong).value();
+  auto reader = there.open_reader<Counted>("goal@pc1").value();
+  writer.write(counted(0));
+  EXPECT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
+}
+
+TEST_F(RemoteWriter, IsRefusedInWords) {
+  auto other = here.create<double>("goal", kLong).value();
+  const auto mismatch = there.create<Counted>("goal@pc1", kLong);
+  ASSERT_FALSE(mismatch);
+  EXPECT_EQ(mismatch.error().code, Errc::type_mismatch);
+  const auto missing = there.open_writer<Counted>("missing@pc1");
+  ASSERT_FALSE(missing);
+  EXPECT_EQ(missing.error().code, Errc::not_found);
+  const auto nowhere = there.create<Counted>("goal@pc9", kLong);
+  ASSERT_FALSE(nowhere);
+  EXPECT_EQ(nowhere.error().code, Errc::not_found);
+  EXPECT_EQ(there.daemon().value().memory_bytes, 0u);
+}
+
+TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonWasKilled) {
+  auto writer = there.create<Counted>("goal@pc1", kLong).value();
+  auto reader = here.open_reader<Counted>("goal").value();  // keeps the ring
+  Reading reading(reader);
+  Writing writing(writer);
+  for (int round = 0; round < 5; ++round) {
+    writing.more(100);
+    pc1.kill_hard();
+    writing.more(100);
+    pc1.start();
+    reading.await_taken(writing.written());
+  }
+  reading.await_taken(writing.stop());
+  EXPECT_EQ(reader.newest(), writing.written() - 1) << "none twice";
+  EXPECT_EQ(reader.lost(), 0u);
+}
+
+TEST_F(RemoteWriter, CatchesUpWhenItsOwnDaemonWasKilled) {
+  auto writer = there.create<Counted>("goal@pc1", kLong).value();
+  auto reader = here.open_reader<Counted>("goal").value();
+  Reading reading(reader);
+  Writing writing(writer);
+  for (int round = 0; round < 5; ++round) {
+    writing.more(100);
+    pc2.kill_hard();
+    writing.more(100);
+    pc2.start();
+    reading.await_taken(writing.written());
+  }
+  reading.await_taken(writing.stop());
+  EXPECT_EQ(reader.newest(), writing.written() - 1);
+  EXPECT_EQ(reader.lost(), 0u);
+}
+
+TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonHangs) {
+  auto writer = there.create<Counted>("goal@pc1", kLong).value();
+  auto reader = here.open_reader<Counted>("goal").value();
+  Reading reading(reader);
+  Writing writing(writer);
+  reading.await_taken(100);
+  ::kill(pc1.pid(), SIGSTOP);
+  await_state(there, pc1, "down");
+  ::kill(pc1.pid(), SIGCONT);
+  reading.await_taken(writing.written() + 100);
+  reading.await_taken(writing.stop());
+  EXPECT_EQ(reader.newest(), writing.written() - 1);
+}
+
+TEST_F(RemoteWriter, CreatesTheStreamAgainWhenTheOwnerLostIt) {
+  auto writer = there.create<Counted>("goal@pc1", kLong).value();
+  writer.write(counted(0));
+  await([&] { return here.info({"goal", 0, ""}).value().newest == 0; });
+  pc1.kill_hard();
+  pc1.start();
+  writer.write(counted(1));
+  Reader<Counted> reader = here.await_reader<Counted>("goal").value();
+  ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+  Counted sample{};
+  SampleInfo info;
+  ASSERT_EQ(reader.latest(sample, info), ReadStatus::ok);
+  EXPECT_EQ(sample.number, 1);
+}
+
+TEST_F(RemoteWriter, PublishesTheRestAfterItsProgramHasGone) {
+  {
+    auto writer = there.create<Counted>("goal@pc1", kLong).value();
+    ::kill(pc1.pid(), SIGSTOP);
+    for (int i = 0; i < 1000; ++i) writer.write(counted(i));
+  }
+  ::kill(pc1.pid(), SIGCONT);
+  auto reader = here.open_reader<Counted>("goal").value();
+  Reading reading(reader);
+  reading.await_taken(1000);
+  await([&] { return there.daemon().value().memory_bytes == 0; });
+  EXPECT_EQ(reader.newest(), 999);
+}
+
+TEST_F(RemoteWriter, CarriesLargeSamples) {
+  constexpr std::size_t kBytes = 16U << 20;
+  auto writer = there.create_raw({"camera", 0, "pc1"}, {"", kBytes, 1, {}}, {3, 1s}).value();
+  auto reader = here.open_raw_reader({"camera", 0, ""}).value();
+  std::vector<std::byte> got(kBytes);
+  for (Tid tid = 0; tid < 4; ++tid) {
+    const std::vector<std::byte> payload(kBytes, static_cast<std::byte>(tid + 1));
+    ASSERT_EQ(writer.write(payload, time_from_ns(1)), tid);
+    ASSERT_EQ(reader.wait_for_tid(tid, kNever), WaitStatus::ready);
+    SampleInfo info;
+    ASSERT_EQ(reader.tid(tid, got, info), ReadStatus::ok);
+    ASSERT_TRUE(got == payload);
+  }
+}
+
+}  // namespace
+}  // namespace dssm::test
