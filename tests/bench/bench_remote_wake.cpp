@@ -60,7 +60,8 @@ std::int64_t cpu_of(const std::vector<pid_t>& processes) {
   for (;;) {
     std::uint64_t count = 0;
     if (::read(doorbell, &count, sizeof count) != sizeof count) fail("read eventfd");
-    send_all(socket, payload, bytes);
+    // One each: on a busy machine several rings may have become one.
+    for (; count > 0; --count) send_all(socket, payload, bytes);
   }
 }
 
