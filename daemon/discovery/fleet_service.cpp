@@ -76,6 +76,15 @@ Error FleetService::with_trouble(Error error) const {
   return error;
 }
 
+// The mirror of a stream whose owner is away: its history is still here. While the owner is there,
+// what it says about its stream counts.
+std::shared_ptr<Stream> FleetService::orphan(const StreamId& id) const {
+  std::shared_ptr<Stream> mirror = mirrors_.find(id);
+  if (!mirror) return nullptr;
+  const Result<const KnownHost*> owner = catalog_.find_host(mirror->id().host);
+  return !owner && owner.error().code == Errc::not_found ? std::move(mirror) : nullptr;
+}
+
 void FleetService::ask_owner(const StreamId& id, Fill fill, FromOwner then) {
   when_known(id, [this, id, fill = std::move(fill), then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
@@ -97,10 +106,7 @@ void FleetService::open_reader(const StreamId& id, Then<std::shared_ptr<Stream>>
   when_known(id, [this, id, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (owner) return mirrors_.open(**owner, owned_by(**owner, id), std::move(then));
-    // Its owner is away, and its history still here.
-    if (owner.error().code == Errc::not_found) {
-      if (std::shared_ptr<Stream> mirror = mirrors_.find(id)) return then(std::move(mirror));
-    }
+    if (std::shared_ptr<Stream> mirror = orphan(id)) return then(std::move(mirror));
     then(with_trouble(owner.error()));
   });
 }
@@ -124,12 +130,10 @@ Result<std::shared_ptr<Stream>> FleetService::adopt_untrusted(const StreamId& id
 // --- about one stream
 // -----------------------------------------------------------------------------
 
-Result<proto::Stream> FleetService::of_mirror(const StreamId& id) const {
-  const std::shared_ptr<Stream> mirror = mirrors_.find(id);
-  if (!mirror) return Error{Errc::not_found, "there is no mirror of '" + id.str() + "'"};
+proto::Stream FleetService::told_of_mirror(const Stream& mirror) const {
   proto::Stream stream;
-  wire::to_message(mirror->info(), stream);
-  mirrors_.describe(mirror->id(), *stream.mutable_mirror());
+  wire::to_message(mirror.info(), stream);
+  mirrors_.describe(mirror.id(), *stream.mutable_mirror());
   return stream;
 }
 
@@ -141,9 +145,9 @@ void FleetService::info(const StreamId& id, Then<proto::Stream> then) {
       },
       [this, id, then = std::move(then)](const std::string& owner, Result<net::Frame> answer) {
         if (!answer) {
-          // The owner is away; what its mirror knows is better than nothing.
-          Result<proto::Stream> mirrored = of_mirror(id);
-          return then(mirrored ? std::move(mirrored) : std::move(answer).error());
+          // What its mirror knows is better than nothing.
+          if (const auto mirror = orphan(id)) return then(told_of_mirror(*mirror));
+          return then(std::move(answer).error());
         }
         proto::StreamList& list = *answer->mutable_stream_list();
         if (list.streams_size() != 1) return then(unexpected(owner));

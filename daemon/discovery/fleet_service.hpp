@@ -76,7 +76,8 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
   void ask_owner(const StreamId& id, Fill fill, FromOwner then);
   void when_known(const StreamId& id, std::function<void()> go_on);
   Error with_trouble(Error error) const;
-  Result<proto::Stream> of_mirror(const StreamId& id) const;
+  std::shared_ptr<Stream> orphan(const StreamId& id) const;
+  proto::Stream told_of_mirror(const Stream& mirror) const;
   std::vector<const KnownHost*> hosts_by_name() const;
   void on_list_answer(Listing& listing, const wire::HostId& id, Result<net::Frame> answer);
   void finish(Listing& listing);

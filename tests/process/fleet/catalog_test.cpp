@@ -172,8 +172,9 @@ TEST_F(FleetCatalog, CarriesPropertiesInfoAndRemoval) {
   EXPECT_TRUE(on2.list().value().empty());
   await_list(on1, {});
   const auto gone = on1.info(there);
-  ASSERT_FALSE(gone);
+  ASSERT_FALSE(gone) << "not even while its mirror lingers";
   EXPECT_EQ(gone.error().code, Errc::not_found);
+  EXPECT_FALSE(on1.open_reader<double>("lidar"));
 }
 
 TEST_F(FleetCatalog, AnswersPingsOfHostsByName) {
@@ -204,6 +205,28 @@ TEST_F(FleetCatalog, LetsReadersFollowAStreamThatMoves) {
   three.write(3);
   await([&] { return reader.latest(sample, info) == ReadStatus::ok && sample == 3; });
   EXPECT_EQ(reader.restarts(), 1u);
+}
+
+// Its history is here, and goes on being here while its owner is away.
+TEST_F(FleetCatalog, KeepsTheMirrorOfAnOwnerThatIsAway) {
+  {
+    auto two = on2.create<double>("lidar", kHistory).value();
+    two.write(2);
+  }
+  Reader<double> reader = on1.await_reader<double>("lidar").value();
+  await([&] { return reader.newest() == 0; });
+  pc2.kill_hard();
+  await_state(on1, pc2, "down");
+  for (const std::string name : {"lidar", "lidar@pc2"}) {
+    const auto another = on1.open_reader<double>(name);
+    ASSERT_TRUE(another) << another.error().message;
+    EXPECT_EQ(another->newest(), 0);
+    const StreamInfo info = on1.info(StreamId::parse(name).value()).value();
+    ASSERT_TRUE(info.mirror);
+    EXPECT_NE(info.mirror->error, "");
+    EXPECT_EQ(info.newest, 0);
+  }
+  EXPECT_TRUE(on1.list().value().empty()) << "it is not to be had anew";
 }
 
 // Programs that start together with dssmd find what other hosts have.
