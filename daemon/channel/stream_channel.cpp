@@ -5,6 +5,7 @@
 #include <cmath>
 #include <utility>
 
+#include "core/wire/messages.hpp"
 #include "daemon/streams/description.hpp"
 
 namespace dssm::daemon {
@@ -50,7 +51,8 @@ Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
       return subscribe(request.serial(), request.subscribe());
     case net::Frame::kRead:
       reading_ = {request.serial(), request.read(), 0};
-      return go_on_reading();
+      go_on_reading();
+      return {};
     case net::Frame::kGetRange:
       return get_range(request.serial(), request.get_range());
     case net::Frame::kStartPublishing:
@@ -72,7 +74,8 @@ Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
 
 Result<void> StreamChannel::work(MonoTime now, bool request_waits) {
   if (reading_) {
-    if (Result<void> read = go_on_reading(); !read || reading_) return read;
+    go_on_reading();
+    if (reading_) return {};
   }
   if (receiver_) receiver_->acknowledge();
   return go_on_pumping(now, request_waits);
@@ -216,57 +219,58 @@ ReadStatus StreamChannel::find(const net::Read& request, Tid& tid) const {
   return newest < 0 ? ReadStatus::not_yet : ReadStatus::ok;
 }
 
-Result<void> StreamChannel::go_on_reading() {
-  const bool tid_counts = reading_->request.which_case() == net::Read::kTid;
-  for (;;) {
-    SendStatus status = SendStatus::gone;
-    if (sender_.busy()) {
-      status = sender_.go_on();
-    } else if (!parts_.link.output_empty()) {
-      return {};
-    } else {
-      Tid tid = kNoTid;
-      const ReadStatus found = find(reading_->request, tid);
-      if (found != ReadStatus::ok) return answer_no_sample(found), Result<void>();
-      if (++reading_->attempts > kMaxReadAttempts) {
-        return answer_no_sample(ReadStatus::lapped), Result<void>();
-      }
-      status = sender_.send(tid, reading_->serial);
-      // A tid that was found and is gone when it is looked at does not come back.
-      if (status == SendStatus::gone && tid_counts) {
-        return answer_no_sample(ReadStatus::too_old), Result<void>();
-      }
-    }
-    switch (status) {
-      case SendStatus::sent:
-        sender_.end_run();
-        reading_.reset();
-        return {};
-      case SendStatus::torn:  // void, and so no answer: another one follows
-      case SendStatus::gone:
-        break;
-      case SendStatus::blocked:
-        sender_.end_run();
-        return {};
-      case SendStatus::unfinished:
-        parts_.owner.work_soon();
-        return {};
-      case SendStatus::no_memory: {
-        Error error{Errc::limit_exceeded,
-                    "read from '" + stream().id().str() +
-                        "': no memory is left to copy a sample aside; use a client that has the "
-                        "feature 'torn', or raise the key max_peer_memory"};
-        reading_.reset();
-        return error;
-      }
-    }
-    sender_.end_run();
+void StreamChannel::go_on_reading() {
+  const SendStatus status = sender_.busy() ? sender_.go_on() : begin_reading();
+  if (!reading_) return;
+  switch (status) {
+    case SendStatus::sent:
+      sender_.end_run();
+      reading_.reset();
+      return;
+    case SendStatus::torn:  // void, and so no answer: another one follows
+    case SendStatus::gone:
+      sender_.end_run();
+      if (++reading_->attempts == kMaxReadAttempts) return answer_no_sample(ReadStatus::lapped);
+      return parts_.owner.work_soon();
+    case SendStatus::blocked:
+      return sender_.end_run();
+    case SendStatus::unfinished:
+      return parts_.owner.work_soon();
+    case SendStatus::no_memory:
+      return answer_failure({Errc::limit_exceeded,
+                             "read from '" + stream().id().str() +
+                                 "': no memory is left to copy a sample aside; use a client that "
+                                 "has the feature 'torn', or raise the key max_peer_memory"});
   }
+}
+
+// Looks for the sample that is asked for, and sends its beginning. Answers when there is none.
+SendStatus StreamChannel::begin_reading() {
+  if (!parts_.link.output_empty()) return SendStatus::blocked;
+  Tid tid = kNoTid;
+  const ReadStatus found = find(reading_->request, tid);
+  if (found != ReadStatus::ok) {
+    answer_no_sample(found);
+    return SendStatus::sent;
+  }
+  const SendStatus status = sender_.send(tid, reading_->serial);
+  // A tid that was found and is gone when it is looked at does not come back.
+  if (status == SendStatus::gone && reading_->request.which_case() == net::Read::kTid) {
+    answer_no_sample(ReadStatus::too_old);
+  }
+  return status;
 }
 
 void StreamChannel::answer_no_sample(ReadStatus status) {
   net::Frame frame = answer_to(reading_->serial);
   frame.mutable_no_sample()->set_status(static_cast<std::uint32_t>(status));
+  reading_.reset();
+  parts_.link.send(frame);
+}
+
+void StreamChannel::answer_failure(const Error& error) {
+  net::Frame frame = answer_to(reading_->serial);
+  wire::to_message(error, *frame.mutable_failure());
   reading_.reset();
   parts_.link.send(frame);
 }

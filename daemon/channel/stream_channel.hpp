@@ -85,9 +85,11 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
   Result<void> set_property(std::uint64_t serial, const net::SetProperty& request);
   Result<void> get_property(std::uint64_t serial);
 
-  Result<void> go_on_reading();
+  void go_on_reading();
+  SendStatus begin_reading();
   ReadStatus find(const net::Read& request, Tid& tid) const;
   void answer_no_sample(ReadStatus status);
+  void answer_failure(const Error& error);
   Result<void> go_on_pumping(MonoTime now, bool request_waits);
   void end();
 

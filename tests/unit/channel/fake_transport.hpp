@@ -26,8 +26,8 @@
 
 namespace dssm::daemon {
 
-// What a test and its transport share; the link owns the transport.
-struct FakePeer {
+// What a test and its transport share. The link owns the transport; both may go first.
+struct FakePeerState {
   static constexpr std::size_t kAll = std::numeric_limits<std::size_t>::max();
 
   std::vector<std::byte> sent;      // by the link
@@ -59,13 +59,28 @@ struct FakePeer {
   }
 };
 
+class FakePeer : public FakePeerState {
+ public:
+  FakePeer() = default;
+  FakePeer(const FakePeer&) = delete;
+  FakePeer& operator=(const FakePeer&) = delete;
+  ~FakePeer() { *alive_ = false; }
+
+ private:
+  friend class FakeTransport;
+  std::shared_ptr<bool> alive_ = std::make_shared<bool>(true);
+};
+
 class FakeTransport final : public wire::Transport {
  public:
-  explicit FakeTransport(FakePeer& peer) : peer_(peer) {}
-  ~FakeTransport() override { peer_.closed = true; }
+  explicit FakeTransport(FakePeer& peer)
+      : peer_(peer), alive_(peer.alive_), fd_(::dup(peer.readable.get())) {}
+  ~FakeTransport() override {
+    if (*alive_) peer_.closed = true;
+  }
 
   Result<wire::IoResult> send(std::span<const iovec> parts, bool more) override {
-    if (peer_.gone) return wire::IoResult{wire::IoStatus::end, 0};
+    if (!*alive_ || peer_.gone) return wire::IoResult{wire::IoStatus::end, 0};
     std::size_t left = std::min(peer_.room, peer_.most_at_once), sent = 0;
     for (const iovec& part : parts) {
       const std::size_t step = std::min(left, part.iov_len);
@@ -82,6 +97,7 @@ class FakeTransport final : public wire::Transport {
   }
 
   Result<wire::IoResult> receive(std::span<const iovec> spaces) override {
+    if (!*alive_) return wire::IoResult{wire::IoStatus::end, 0};
     if (peer_.input.empty()) {
       if (peer_.gone) return wire::IoResult{wire::IoStatus::end, 0};
       std::uint64_t count = 0;
@@ -100,10 +116,12 @@ class FakeTransport final : public wire::Transport {
     return wire::IoResult{wire::IoStatus::ok, taken};
   }
 
-  int fd() const noexcept override { return peer_.readable.get(); }
+  int fd() const noexcept override { return fd_.get(); }
 
  private:
   FakePeer& peer_;
+  std::shared_ptr<bool> alive_;
+  UniqueFd fd_;
 };
 
 // One frame as the peer sees it.
