@@ -29,11 +29,14 @@ namespace {
 // About 2,000 small samples in one receive, and still in the processor's second cache.
 constexpr std::size_t kInputBytes = 256 << 10;
 
-// From this size on, all that fits into the input buffer beside a payload is the next one's head
-// and little more, so that all but that little is received in place. Below, one receive for several
-// samples and a copy that stays in the cache are cheaper.
-constexpr std::size_t kLargePayloadBytes = 32 << 10;
-constexpr std::size_t kSmallInputBytes = 4 << 10;
+// From this size on a receive ends behind the payload under way, with little room for what follows:
+// the verdict on it and the next one's head. So all but that little is received in place. Below,
+// one receive for several samples and a copy that stays in the cache are cheaper. Measured over
+// loopback: the receiver's processor time is the same for both at 8 KiB; at 16 KiB receiving in
+// place takes 10 % less.
+constexpr std::size_t kLargePayloadBytes = 16 << 10;
+constexpr std::size_t kRoomBehindPayload = kTornTrailerBytes + kMaxSampleHeaderBytes;
+constexpr std::size_t kLeastSpace = 4 << 10;  // in all
 
 // What a sample frame may have besides its payload.
 constexpr std::size_t kMaxSampleOverheadBytes = 1 << 10;
@@ -161,8 +164,12 @@ std::span<const iovec> FrameDecoder::spaces() {
   const bool throws_away = stage_ == Stage::payload && !place_;
   const bool receives_in_place =
       payload_bytes_ >= kLargePayloadBytes && stage_ != Stage::whole && !throws_away;
-  const iovec rest{input->bytes.data() + head_bytes_,
-                   receives_in_place ? kSmallInputBytes : kInputBytes - head_bytes_};
+  std::size_t room = kInputBytes - head_bytes_;
+  if (receives_in_place) {
+    const std::size_t payload_room = in_payload() ? std::min(payload_left_, kLeastSpace) : 0;
+    room = std::max(kLeastSpace - payload_room, kRoomBehindPayload);
+  }
+  const iovec rest{input->bytes.data() + head_bytes_, room};
   if (!in_payload()) {
     spaces_[0] = rest;
     return std::span(spaces_).first(1);

@@ -179,7 +179,7 @@ TEST(FrameDecoder, GivesTheSameForRandomSplitsOfLargeSamples) {
   const unsigned seed = std::random_device()();
   SCOPED_TRACE("seed " + std::to_string(seed));
   std::mt19937 random(seed);
-  for (const std::size_t payload_bytes : {5'000u, 32'768u, 100'000u, 400'000u}) {
+  for (const std::size_t payload_bytes : {5'000u, 16'384u, 100'000u, 400'000u}) {
     std::string stream;
     for (std::int64_t tid = 0; tid < 12; ++tid) {
       const auto torn = static_cast<Torn>(random() % 3);
@@ -274,7 +274,7 @@ TEST(FrameDecoder, CopiesSmallPayloadsOnceAndLargeOnesHardly) {
   EXPECT_EQ(copied.counters.direct_payload_bytes, 0u);
   const Decoded direct = decode(large, 1 << 20);
   EXPECT_EQ(direct.counters.copied_payload_bytes + direct.counters.direct_payload_bytes, 20u << 20);
-  EXPECT_LT(direct.counters.copied_payload_bytes, (20u << 20) / 200);
+  EXPECT_LT(direct.counters.copied_payload_bytes, (20u << 20) / 1000);
   EXPECT_EQ(direct.counters.slow_frames, 0u);
 }
 
