@@ -106,14 +106,14 @@ std::optional<net::Frame> RawPeer::await_end() {
   return last;
 }
 
-std::optional<net::Frame> RawPeer::greet() {
-  send(hello_frame());
+std::optional<net::Frame> RawPeer::greet(const std::vector<std::string>& features) {
+  send(hello_frame(1, features));
   std::optional<net::Frame> answer = receive();
   if (answer && answer->has_hello()) return {};
   return answer;
 }
 
-net::Frame hello_frame(std::uint32_t protocol_version) {
+net::Frame hello_frame(std::uint32_t protocol_version, const std::vector<std::string>& features) {
   net::Frame frame;
   net::Hello& hello = *frame.mutable_hello();
   hello.set_protocol_version(protocol_version);
@@ -122,6 +122,7 @@ net::Frame hello_frame(std::uint32_t protocol_version) {
   hello.set_life(1);
   hello.set_program("raw peer");
   hello.set_version("0.0.0");
+  for (const std::string& feature : features) hello.add_features(feature);
   return frame;
 }
 

@@ -8,13 +8,14 @@
 #include <optional>
 #include <string>
 #include <string_view>
+#include <vector>
 
 #include "core/base/unique_fd.hpp"
 #include "network.pb.h"
 
 namespace dssm::test {
 
-inline constexpr int kPatienceSeconds = 60;
+inline constexpr int kPatienceSeconds = 180;
 inline constexpr int kPort = 13776;
 
 class RawPeer {
@@ -39,14 +40,15 @@ class RawPeer {
 
   // Says Hello as a program of a host "raw" does, and takes the answer's Hello. What came instead
   // of it, if anything, is returned.
-  std::optional<net::Frame> greet();
+  std::optional<net::Frame> greet(const std::vector<std::string>& features = {});
 
  private:
   UniqueFd socket_;
   std::string input_;  // what arrived and is not handed out yet
 };
 
-net::Frame hello_frame(std::uint32_t protocol_version = 1);
+net::Frame hello_frame(std::uint32_t protocol_version = 1,
+                       const std::vector<std::string>& features = {});
 net::Frame open_frame(std::uint64_t serial, const std::string& stream);
 net::Frame subscribe_from_oldest_frame(std::uint64_t serial);
 
