@@ -62,7 +62,7 @@ class Channel final : private wire::FrameSink {
   std::uint64_t dropped() const noexcept { return outbox_->dropped(); }
 
   const StreamInfo& stream() const noexcept { return stream_; }
-  bool is_up() const noexcept;
+  bool is_connected() const noexcept { return was_up_; }
   const std::string& address() const noexcept { return link_.address(); }
   Duration request_timeout() const noexcept { return options_.request_timeout; }
   PConnector::Counters counters() const noexcept;
@@ -71,6 +71,9 @@ class Channel final : private wire::FrameSink {
   Channel(Goal goal, PConnectorOptions options);
 
   enum class Patience : bool { none, some };  // some: may look names up
+
+  // Set up, and no answer about subscription or publishing is due.
+  bool is_up() const noexcept;
 
   void advance(Patience patience);
   Result<void> begin_connecting(Patience patience);

@@ -255,7 +255,7 @@ Duration PConnector::cycle() const noexcept { return state_->channel->stream().c
 std::uint64_t PConnector::incarnation() const noexcept {
   return state_->channel->stream().incarnation;
 }
-bool PConnector::connected() const noexcept { return state_->channel->is_up(); }
+bool PConnector::connected() const noexcept { return state_->channel->is_connected(); }
 const std::string& PConnector::address() const noexcept { return state_->channel->address(); }
 PConnector::Counters PConnector::counters() const noexcept { return state_->channel->counters(); }
 

@@ -1,85 +1,28 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // <ssm.h>, <libssm.h>: creating, opening and closing streams, what is known of them, properties.
-#include <poll.h>
-#include <signal.h>
-
 #include <algorithm>
 #include <atomic>
-#include <cerrno>
 #include <cstring>
 #include <dssm/session.hpp>
 #include <optional>
 
 #include "../include/libssm.h"
+#include "interruptible.hpp"
 #include "messages.hpp"
 #include "process.hpp"
+#include "stream_arguments.hpp"
 #include "tid_convert.hpp"
 #include "time_convert.hpp"
 
+using dssm::ssm::name_length;
 using dssm::ssm::process;
+using dssm::ssm::quoted;
 using dssm::ssm::remember_error;
 using dssm::ssm::report_error;
+using dssm::ssm::slots;
 
 namespace {
-
-std::string quoted(const char* name, int id) {
-  return std::string("'") + name + "' [" + std::to_string(id) + "]";
-}
-
-// "lidar@pc2" names a stream and its host; the limits of names are for what is before the '@'.
-std::size_t name_length(const char* name) { return std::strcspn(name, "@"); }
-
-dssm::StreamId stream_id(const char* name, int id) {
-  const std::size_t length = name_length(name);
-  return {std::string(name, length), id, name[length] ? name + length + 1 : ""};
-}
-
-std::string number(double value) {
-  char text[32];
-  std::snprintf(text, sizeof text, "%g", value);
-  return text;
-}
-
-// Before truncation. The quotient comes first, as in the old library: 1 s at 0.1 s gives 13, which
-// 1.2 * life / cycle would miss by a rounding.
-double slots(double life, double cycle) { return SSM_BUFFER_MARGIN * (life / cycle) + SSM_MARGIN; }
-
-// What is wrong with the arguments of createSSM; nothing when all is well.
-std::optional<std::string> wrong_arguments(const char* name, int id, double life, double cycle) {
-  if (!name) return "create : the stream name is NULL";
-  const std::size_t length = name_length(name);
-  if (length == 0 || length >= SSM_SNAME_MAX) {
-    return "create '" + std::string(name) + "' : a stream name has 1 to 31 bytes, not " +
-           std::to_string(length);
-  }
-  if (name[length] && !name[length + 1]) {
-    return "create '" + std::string(name) + "' : there is no host's name behind the '@'";
-  }
-  const std::string what = "create " + quoted(name, id) + " : ";
-  if (id < 0) return what + "a stream id is 0 or more";
-  if (!(life > 0)) return what + "life is " + number(life) + " s, must be more than 0";
-  if (!(cycle > 0)) return what + "cycle is " + number(cycle) + " s, must be more than 0";
-  if (life < cycle) {
-    return what + "life (" + number(life) + " s) is shorter than cycle (" + number(cycle) + " s)";
-  }
-  if (slots(life, cycle) > static_cast<double>(dssm::kMaxDepth)) {
-    return what + "life " + number(life) + " s at cycle " + number(cycle) +
-           " s needs more slots than a ring may have (" + std::to_string(dssm::kMaxDepth) +
-           "); ask for less life";
-  }
-  return std::nullopt;
-}
-
-// A ring has at least one byte; streams without data say so by their type's name.
-dssm::TypeInfo type_for(std::size_t bytes) {
-  dssm::TypeInfo type;
-  type.payload_bytes = bytes;
-  if (bytes > 0) return type;
-  type.name = dssm::ssm::kEmptyType;
-  type.payload_bytes = 1;
-  return type;
-}
 
 dssm::Result<dssm::Session> connect_for_second_end() { return process().any_session(); }
 
@@ -87,7 +30,7 @@ dssm::Result<dssm::Session> connect_for_second_end() { return process().any_sess
 std::optional<dssm::StreamId> find_id(const char* name, int id) {
   if (!name || name_length(name) >= SSM_SNAME_MAX || id < 0) return std::nullopt;
   if (name[name_length(name)] && !name[name_length(name) + 1]) return std::nullopt;
-  return stream_id(name, id);
+  return dssm::ssm::stream_id(name, id);
 }
 
 bool name_too_long(const char* name) { return !name || name_length(name) > SSM_SNAME_MAX; }
@@ -110,19 +53,17 @@ ssmTimeT calcSSM_life(int table_num, ssmTimeT cycle) {
 
 SSM_sid createSSM(const char* stream_name, int stream_id, size_t stream_size, ssmTimeT life,
                   ssmTimeT cycle) {
-  if (const auto wrong = wrong_arguments(stream_name, stream_id, life, cycle)) {
+  if (const auto wrong = dssm::ssm::wrong_arguments(stream_name, stream_id, life, cycle)) {
     report_error(*wrong);
     return nullptr;
   }
   const std::string what = "create " + quoted(stream_name, stream_id) + " : ";
   dssm::Result<dssm::Session> session = process().session();
   if (!session) return report_error(what + session.error().message), nullptr;
-  const dssm::StreamId id = ::stream_id(stream_name, stream_id);
-  const dssm::History history{
-      static_cast<std::uint64_t>(calcSSM_table(life, cycle)),
-      std::max(dssm::Duration(1), dssm::Duration(dssm::ssm::ns_from_seconds(cycle)))};
+  const dssm::StreamId id = dssm::ssm::stream_id(stream_name, stream_id);
   dssm::Result<dssm::RawWriter> writer =
-      session->create_raw(id, type_for(stream_size), history, dssm::ssm::kTagHidden);
+      session->create_raw(id, dssm::ssm::type_for(stream_size), dssm::ssm::history_of(life, cycle),
+                          dssm::ssm::kTagHidden);
   if (!writer) return report_error(what + writer.error().message), nullptr;
   if (dssm::ssm::data_bytes(writer->type()) != stream_size) {
     report_error(what + "the stream exists with " +
@@ -253,36 +194,21 @@ int dssm_ssm_wait_stream(const char* stream_name, int stream_id, double timeout)
   const dssm::MonoTime deadline =
       timeout > 0 ? dssm::deadline_in(dssm::Duration(dssm::ssm::ns_from_seconds(timeout)))
                   : dssm::kNever;
-  // Signals are let in only while sleeping, so that none is missed between two sleeps.
-  sigset_t all, before;
-  ::sigfillset(&all);
-  ::pthread_sigmask(SIG_SETMASK, &all, &before);
-  int result = 0;
+  constexpr dssm::Duration kLook = std::chrono::milliseconds(100);
+  dssm::ssm::Interruptible signals;
   for (;;) {
     const auto info = ask(*id);
-    if (info) {
-      result = 1;
-      break;
-    }
+    if (info) return 1;
     // Daemon away: it may come back. Anything else does not get better by waiting.
     if (info.error().code != dssm::Errc::not_found &&
         info.error().code != dssm::Errc::daemon_away) {
       remember_error(info.error().message);
-      result = -2;
-      break;
+      return -2;
     }
-    constexpr dssm::Duration kLook = std::chrono::milliseconds(100);
     const dssm::MonoTime now = dssm::MonoClock::now();
-    if (now >= deadline) break;
-    const std::int64_t span = dssm::to_ns(std::min(kLook, deadline - now));
-    const timespec sleep{span / dssm::ssm::kSecond, span % dssm::ssm::kSecond};
-    if (::ppoll(nullptr, 0, &sleep, &before) < 0 && errno == EINTR) {
-      result = -1;
-      break;
-    }
+    if (now >= deadline) return 0;
+    if (!signals.pause(std::min(kLook, deadline - now))) return -1;
   }
-  ::pthread_sigmask(SIG_SETMASK, &before, nullptr);
-  return result;
 }
 
 }  // extern "C"

@@ -23,6 +23,29 @@ Process the_process;
 
 thread_local int thread_id = 0;
 
+Result<Session> connect(const std::string& path) {
+  SessionOptions options;
+  options.socket_path = path;
+  return Session::connect(std::move(options));
+}
+
+// Where programs look for dssmd; `path` becomes the place where it was.
+Result<Session> connect_anywhere(std::string& path) {
+  Error failure;
+  for (const std::string& place : socket_paths()) {
+    Result<Session> session = connect(place);
+    if (session) {
+      path = place;
+      return session;
+    }
+    // The first path is the one to talk about, unless a dssmd refused us at a later one.
+    if (failure.message.empty() || session.error().code != Errc::no_daemon) {
+      failure = std::move(session).error();
+    }
+  }
+  return failure;
+}
+
 }  // namespace
 
 Process& process() noexcept { return the_process; }
@@ -125,28 +148,17 @@ Result<void> Process::start() {
     clock_.attach(std::move(*clock), generation_);
     return {};
   }
-  Error failure;
-  for (const std::string& path : socket_paths()) {
-    SessionOptions options;
-    options.socket_path = path;
-    Result<Session> session = Session::connect(std::move(options));
-    if (!session) {
-      // The first path is the one to talk about, unless a dssmd refused us at a later one.
-      if (failure.message.empty() || session.error().code != Errc::no_daemon) {
-        failure = std::move(session).error();
-      }
-      continue;
-    }
-    Result<PlaybackClock> clock = session->playback_clock();
-    if (!clock) return std::move(clock).error();
-    std::strncpy(socket_path_, path.c_str(), sizeof socket_path_ - 1);
-    registration_ = new Registration{std::move(*session), ends, nullptr};
-    clock_.attach(std::move(*clock), generation_);
-    was_registered_.store(true);
-    if (ends_.load() != ends) clock_.detach(), ::sem_post(&wake_);  // a handler ended it already
-    return {};
-  }
-  return failure;
+  std::string path;
+  Result<Session> session = connect_anywhere(path);
+  if (!session) return std::move(session).error();
+  Result<PlaybackClock> clock = session->playback_clock();
+  if (!clock) return std::move(clock).error();
+  std::strncpy(socket_path_, path.c_str(), sizeof socket_path_ - 1);
+  registration_ = new Registration{std::move(*session), ends, nullptr};
+  clock_.attach(std::move(*clock), generation_);
+  was_registered_.store(true);
+  if (ends_.load() != ends) clock_.detach(), ::sem_post(&wake_);  // a handler ended it already
+  return {};
 }
 
 bool Process::end() noexcept {
@@ -181,9 +193,9 @@ Result<Session> Process::session() {
 
 Result<Session> Process::any_session() {
   if (Result<Session> registered = session()) return registered;
-  SessionOptions options;
-  options.socket_path = socket_path_;
-  return Session::connect(std::move(options));
+  std::string path;
+  if (was_registered_.load()) return connect(socket_path_);
+  return connect_anywhere(path);
 }
 
 SSM_sid Process::add(std::unique_ptr<Stream> stream) {

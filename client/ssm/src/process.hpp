@@ -37,7 +37,8 @@ class Process {
   // The session; fails with `closed` before start() and after end(). Call it without the lock.
   Result<Session> session();
 
-  // The session, or a new one for the moment: for sids that outlive endSSM.
+  // The session, or a new one for the moment: for sids that outlive endSSM, and for what needs no
+  // initSSM.
   Result<Session> any_session();
 
   // A sid for the stream.

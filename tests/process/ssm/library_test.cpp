@@ -66,18 +66,46 @@ TEST(SsmHeaders, CompileWithoutWarningsInEveryDialectOfCpp) {
   }
 }
 
+TEST(SsmHeaders, OfTheRemoteInterfaceCompileWithoutWarningsFromCpp11On) {
+  const std::vector<std::string> headers = {
+      "dssm-def.hpp", "dssm-utility.hpp",     "dssm-proxy-client.hpp",
+      "dssm.hpp",     "ssm-proxy-client.hpp", "ssm-proxy-client-child.hpp",
+      "ssm.hpp"};
+  compile("c++", "c++11", "cpp", headers);
+  for (const char* dialect : {"c++14", "c++17", "c++20"}) {
+    compile("c++", dialect, "cpp", {"ssm-proxy-client-child.hpp"});  // which includes the others
+  }
+}
+
+// One has a folder in front, and what they declare has other names.
+TEST(SsmHeaders, LiveBesideDssmsOwn) {
+  const std::string folder = make_temp_dir();
+  std::ofstream(folder + "/program.cpp")
+      << "#include <dssm.hpp>\n#include <dssm/dssm.hpp>\n"
+         "DSSMApi<int> old_one; dssm::PConnectorOptions own_one; PConnector* old_base = &old_one;\n"
+         "int main() {}\n";
+  const Finished finished = run(
+      {"c++", "-std=c++20", "-fsyntax-only", "-I" + source("client/ssm/include"),
+       "-I" + source("client/include"), "-I" + source("core/include"), folder + "/program.cpp"});
+  EXPECT_EQ(finished.exit_status, 0) << finished.err;
+  remove_tree(folder);
+}
+
 TEST(SsmHeaders, TakeNoNamesThatProgramsUse) {
   const std::string folder = make_temp_dir();
   std::ofstream(folder + "/program.cpp")
       << "#include <libssm.h>\n#include <ssm.hpp>\n#include <ssmp.hpp>\n"
+         "#if __cplusplus >= 201103L\n#include <dssm.hpp>\n#endif\n"
          "static void ctrlC(int) {}\nbool gShutOff;\nvoid setSigInt() {}\n"
          "#ifdef PI\n#error PI\n#endif\nconst double PI = 3;\n"
          "struct node {}; struct edge {}; int get_unit(); int Time, Duration, Stream, Error;\n"
          "namespace dssm { int mine; }\n"
          "int main() { ctrlC(0); setSigInt(); node n; edge e; (void)n; (void)e; }\n";
-  const Finished finished = run({"c++", "-std=gnu++98", "-fsyntax-only",
-                                 "-I" + source("client/ssm/include"), folder + "/program.cpp"});
-  EXPECT_EQ(finished.exit_status, 0) << finished.err;
+  for (const char* dialect : {"-std=gnu++98", "-std=c++11"}) {
+    const Finished finished = run({"c++", dialect, "-fsyntax-only",
+                                   "-I" + source("client/ssm/include"), folder + "/program.cpp"});
+    EXPECT_EQ(finished.exit_status, 0) << finished.err;
+  }
   remove_tree(folder);
 }
 
@@ -99,7 +127,8 @@ TEST(SsmLibrary, ExportsTheDocumentedNamesAndNothingElse) {
   }
   EXPECT_EQ(exported, documented);
   std::string headers;
-  for (const char* header : {"ssm.h", "ssm-time.h", "libssm.h", "ssm.hpp"}) {
+  for (const char* header :
+       {"ssm.h", "ssm-time.h", "libssm.h", "ssm.hpp", "dssm-proxy-client.hpp"}) {
     std::ifstream file(source("client/ssm/include/") + header);
     headers.append(std::istreambuf_iterator<char>(file), {});
   }

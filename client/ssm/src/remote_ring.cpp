@@ -1,0 +1,119 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "remote_ring.hpp"
+
+#include <poll.h>
+#include <pthread.h>
+#include <signal.h>
+#include <sys/eventfd.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cstdio>
+#include <cstring>
+
+#include "messages.hpp"
+
+namespace dssm::ssm {
+namespace {
+
+// Programs of the oldest kind ask for "512" and mean samples, where it now means seconds: what is
+// kept must not take the machine's memory away.
+constexpr std::uint64_t kMaxRingBytes = 512U << 20;
+
+}  // namespace
+
+RemoteRing::RemoteRing(PConnector connector)
+    : connector_(std::move(connector)), stop_(::eventfd(0, EFD_CLOEXEC)), owner_pid_(::getpid()) {}
+
+Result<std::unique_ptr<RemoteRing>> RemoteRing::start(PConnector connector,
+                                                      const History& history) {
+  const std::string what = "keep samples of '" + connector.id().str() + "'";
+  const std::uint64_t bytes = connector.payload_bytes();
+  const std::uint64_t most = std::max(kMinDepth, kMaxRingBytes / bytes);
+  const std::uint64_t depth = std::min(history.depth, most);
+  if (depth < history.depth) {
+    report_error(what + " : " + std::to_string(depth - 1) + " instead of " +
+                 std::to_string(history.depth - 1) + ", which would take more than " +
+                 std::to_string(kMaxRingBytes >> 20) + " MiB; ask for less life");
+  }
+  auto geometry = ring::Geometry::of(bytes, depth);
+  if (!geometry) return std::move(geometry).error().context(what);
+  const ring::RingIdentity identity{connector.id(), 1, history.cycle,
+                                    connector.type().alignment_bytes};
+  auto memory = ring::create_ring(identity, *geometry);
+  if (!memory) return std::move(memory).error().context(what);
+  if (Result<void> done = ring::reserve(memory->get(), *geometry); !done) {
+    return std::move(done).error().context(what);
+  }
+  auto bell_memory = ring::create_bell();
+  if (!bell_memory) return std::move(bell_memory).error().context(what);
+  auto mapping = ring::RingMapping::open_untrusted(memory->get(), ring::Access::read_write);
+  if (!mapping) return std::move(mapping).error().context(what);
+  auto bell = ring::Bell::open_untrusted(bell_memory->get());
+  if (!bell) return std::move(bell).error().context(what);
+
+  std::unique_ptr<RemoteRing> made(new RemoteRing(std::move(connector)));
+  if (!made->stop_) return os_error(what);
+  made->mapping_ = std::move(*mapping);
+  made->bell_ = std::move(*bell);
+  sigset_t all, before;  // signal handlers are the program's: they run in its own threads
+  ::sigfillset(&all);
+  ::pthread_sigmask(SIG_SETMASK, &all, &before);
+  const int error = ::pthread_create(&made->thread_, nullptr, &run, made.get());
+  ::pthread_sigmask(SIG_SETMASK, &before, nullptr);
+  if (error) return os_error(what, error);
+  made->runs_ = true;
+  return made;
+}
+
+RemoteRing::~RemoteRing() {
+  if (!runs_ || ::getpid() != owner_pid_) return;
+  const std::uint64_t one = 1;
+  [[maybe_unused]] const ssize_t written = ::write(stop_.get(), &one, sizeof one);
+  ::pthread_join(thread_, nullptr);
+}
+
+void* RemoteRing::run(void* self) {
+  static_cast<RemoteRing*>(self)->fill();
+  return nullptr;
+}
+
+// Waits until there may be something to take. False: the thread shall end.
+bool RemoteRing::pause() {
+  pollfd ready[] = {{connector_.fd(), POLLIN, 0}, {stop_.get(), POLLIN, 0}};
+  while (::poll(ready, 2, -1) < 0) continue;
+  return ready[1].revents == 0;
+}
+
+void RemoteRing::fill() {
+  ring::MirrorWriter writer(*mapping_, *bell_);
+  const std::size_t bytes = mapping_->geometry().payload_bytes;
+  Tid offset = 0;  // the ring's tids are so far ahead of the stream's
+  Tid due = 0;     // the ring's tid of the next sample, if none is lost
+  bool complained = false;
+  for (;;) {
+    std::byte* const place = writer.begin(due);
+    SampleInfo info;
+    const auto status = connector_.next({place, bytes}, info);
+    if (!status && !complained) report_error(status.error().message + "; trying again");
+    complained = !status;
+    if (!status || *status == ReadStatus::not_yet) {
+      if (!pause()) return;
+      continue;
+    }
+    if (*status == ReadStatus::restarted) {
+      offset = writer.newest() + 1;
+      due = offset;
+      continue;
+    }
+    const Tid tid = info.tid + offset;
+    if (tid != due) {  // some are lost, or it is the first
+      std::byte* const right_place = writer.begin(tid);
+      if (right_place != place) std::memcpy(right_place, place, bytes);
+    }
+    writer.commit(info.time, info.clock_error);
+    due = tid + 1;
+  }
+}
+
+}  // namespace dssm::ssm

@@ -1,0 +1,472 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "remote_stream.hpp"
+
+#include <algorithm>
+#include <charconv>
+#include <cstdlib>
+#include <cstring>
+#include <mutex>
+
+#include "interruptible.hpp"
+#include "messages.hpp"
+#include "socket_path.hpp"
+#include "stream_arguments.hpp"
+#include "tid_convert.hpp"
+#include "time_convert.hpp"
+
+namespace dssm::ssm {
+namespace {
+
+using namespace std::chrono_literals;
+
+// How long one call tries: Ctrl-C is seen after it. More for samples that take long to come.
+constexpr Duration kCallTimeout = 2s;
+constexpr std::uint64_t kSlowestBytesPerSecond = 4'000'000;
+
+constexpr Duration kRetryPause = 200ms;
+
+// When connecting and opening give up: $DSSM_CONNECT_TIMEOUT [s] from now, else never.
+MonoTime give_up_at() {
+  const std::string text = environment("DSSM_CONNECT_TIMEOUT");
+  double seconds = 0;
+  const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), seconds);
+  if (text.empty() || error != std::errc{} || end != text.data() + text.size()) return kNever;
+  return deadline_in(Duration(std::max<std::int64_t>(0, ns_from_seconds(seconds))));
+}
+
+// Whether waiting may mend it: the other PC may start, the stream may be created.
+bool is_worth_waiting(Errc code) noexcept {
+  return code == Errc::no_daemon || code == Errc::daemon_away || code == Errc::not_found ||
+         code == Errc::system || code == Errc::limit_exceeded;
+}
+
+// Tries until it works, fails for good, is interrupted, or is given up. What is wrong is said once.
+template <class Try>
+auto retry(const std::string& what, Try attempt) -> decltype(attempt()) {
+  const MonoTime give_up = give_up_at();
+  Interruptible signals;
+  std::string said;
+  for (;;) {
+    auto result = attempt();
+    if (result || !is_worth_waiting(result.error().code)) return result;
+    if (MonoClock::now() >= give_up) return result;
+    if (result.error().message != said) {
+      said = result.error().message;
+      report_error(what + " : " + said + "; trying again");
+    }
+    if (!signals.pause(std::min(kRetryPause, give_up - MonoClock::now()))) {
+      return Error{Errc::closed, "interrupted by a signal"};
+    }
+  }
+}
+
+SSM_tid error_of(ReadStatus status, RemoteStream::Which which) noexcept {
+  if (status != ReadStatus::not_yet) return SSM_ERROR_PAST;
+  return which == RemoteStream::Which::tid || which == RemoteStream::Which::next
+             ? SSM_ERROR_FUTURE
+             : SSM_ERROR_NO_DATA;
+}
+
+}  // namespace
+
+// One call inside the object; false when this thread is inside already.
+class RemoteStream::Call {
+ public:
+  explicit Call(RemoteStream& stream) noexcept : stream_(stream) {
+    stream_.lock_.lock();
+    allowed_ = !stream_.inside_;
+    stream_.inside_ = true;
+  }
+  Call(const Call&) = delete;
+  Call& operator=(const Call&) = delete;
+  ~Call() {
+    if (allowed_) stream_.inside_ = false;
+    stream_.lock_.unlock();
+  }
+  explicit operator bool() const noexcept { return allowed_; }
+  // Whether besides there is an open stream to work with.
+  bool has_stream() const noexcept {
+    return allowed_ && stream_.open_.load() && stream_.connector_.has_value();
+  }
+
+ private:
+  RemoteStream& stream_;
+  bool allowed_ = false;
+};
+
+// --- connecting, creating, opening
+// -----------------------------------------------------------------
+
+PConnectorOptions RemoteStream::options(const std::string& address,
+                                        std::uint64_t payload_bytes) const {
+  PConnectorOptions options;
+  options.address = address;
+  options.request_timeout =
+      kCallTimeout + std::chrono::seconds(payload_bytes / kSlowestBytesPerSecond);
+  return options;
+}
+
+std::string RemoteStream::quoted_name() const {
+  return quoted(connector_->id().name, connector_->id().id);
+}
+
+void RemoteStream::complain(const Error& error) {
+  if (error.message == complaint_) return remember_error(error.message);
+  complaint_ = error.message;
+  report_error(error.message);
+}
+
+bool RemoteStream::connect(const std::string& address) {
+  const Call call(*this);
+  if (!call) return false;
+  const std::string what = "connect to '" + address + "'";
+  const auto listed = retry(what, [&] { return PConnector::list(options(address, 0)); });
+  if (!listed) report_error(what + " : " + listed.error().message);
+  return listed.has_value();
+}
+
+bool RemoteStream::take(Result<PConnector> opened, const std::string& what) {
+  ring_.reset();
+  connector_.reset();
+  if (!opened) {
+    report_error(what + " : " + opened.error().message);
+    return false;
+  }
+  connector_ = std::move(*opened);
+  sample_.resize(connector_->payload_bytes());
+  offset_ = 0;
+  told_ = kNoTid;
+  restarts_ = 0;
+  complaint_.clear();
+  open_.store(true);
+  return true;
+}
+
+bool RemoteStream::create(const std::string& address, const StreamId& id, const TypeInfo& type,
+                          const History& history) {
+  const Call call(*this);
+  if (!call) return false;
+  open_.store(false);
+  address_ = address;
+  return take(PConnector::create(id, type, history, options(address, type.payload_bytes)),
+              "create " + quoted(id.name, id.id));
+}
+
+bool RemoteStream::open(const std::string& address, const StreamId& id, std::size_t data_bytes) {
+  const Call call(*this);
+  if (!call) return false;
+  open_.store(false);
+  address_ = address;
+  const std::string what = "open " + quoted(id.name, id.id);
+  auto opened = retry(what, [&]() -> Result<PConnector> {
+    auto connector = PConnector::open(id, options(address, data_bytes));
+    if (connector && connector->payload_bytes() != data_bytes) {
+      return Error{Errc::type_mismatch,
+                   "the stream has " + std::to_string(connector->payload_bytes()) +
+                       " bytes per sample, this program's type " + std::to_string(data_bytes) +
+                       " : use the type that it was created with"};
+    }
+    return connector;
+  });
+  return take(std::move(opened), what);
+}
+
+// --- reading over the network
+// ----------------------------------------------------------------------
+
+// Tids go on behind the last one told when the stream began anew.
+void RemoteStream::follow_restart() {
+  if (connector_->restarts() == restarts_) return;
+  restarts_ = connector_->restarts();
+  offset_ = told_ + 1;
+}
+
+template <class Ask>
+ReadStatus RemoteStream::fetch_by(Ask ask, SampleInfo& info) {
+  for (;;) {
+    Result<ReadStatus> status = ask(*connector_);
+    follow_restart();
+    if (!status) {
+      complain(status.error());
+      return ReadStatus::not_yet;
+    }
+    complaint_.clear();
+    if (*status == ReadStatus::restarted) continue;
+    if (*status == ReadStatus::ok) {
+      info.tid += offset_;
+      told_ = std::max(told_, info.tid);
+    }
+    return *status;
+  }
+}
+
+ReadStatus RemoteStream::fetch(Tid tid, SampleInfo& info) {
+  return fetch_by([&](PConnector& from) { return from.tid(tid - offset_, sample_, info); }, info);
+}
+
+Tid RemoteStream::ask_newest() {
+  const auto newest = connector_->newest();
+  follow_restart();
+  if (!newest) return complain(newest.error()), kNoTid;
+  complaint_.clear();
+  const Tid tid = *newest + offset_;  // of a new ring that is empty: the last one of the old
+  told_ = std::max(told_, tid);
+  return tid;
+}
+
+Tid RemoteStream::ask_oldest() {
+  const auto oldest = connector_->oldest();
+  follow_restart();
+  if (!oldest) return complain(oldest.error()), kNoTid;
+  complaint_.clear();
+  return *oldest < 0 ? offset_ - 1 : *oldest + offset_;
+}
+
+// The 64-bit tid that a program means.
+Tid RemoteStream::ring_tid_of(SSM_tid tid) {
+  if (told_ < 0) told_ = ask_newest();
+  return ring_tid(tid, told_);
+}
+
+SSM_tid RemoteStream::hand_over(const SampleInfo& info, void* data, double* time) {
+  std::memcpy(data, sample_.data(), sample_.size());
+  if (time) *time = seconds_from_time(info.time);
+  return ssm_tid(info.tid);
+}
+
+SSM_tid RemoteStream::read(const Request& request, void* data, std::size_t bytes, double* time) {
+  const Call call(*this);
+  if (!call.has_stream()) return SSM_ERROR_NO_DATA;
+  if (bytes != sample_.size()) {
+    complain({Errc::type_mismatch, "read " + quoted_name() + " : its samples have " +
+                                       std::to_string(sample_.size()) +
+                                       " bytes, this program's type " + std::to_string(bytes)});
+    return SSM_ERROR_NO_DATA;
+  }
+  SampleInfo info;
+  ReadStatus status = ReadStatus::not_yet;
+  const auto newest = [&](PConnector& from) { return from.latest(sample_, info); };
+  switch (request.which) {
+    case Which::newest:
+      status = fetch_by(newest, info);
+      break;
+    case Which::tid:
+      status = fetch(ring_tid_of(request.tid), info);
+      break;
+    case Which::newer: {
+      const Tid than = request.tid < 0 ? kNoTid : ring_tid_of(request.tid);
+      status = fetch_by(
+          [&](PConnector& from) {
+            return from.newer(std::max(than - offset_, kNoTid), sample_, info);
+          },
+          info);
+      break;
+    }
+    case Which::next: {
+      if (request.tid < 0) {
+        status = fetch_by(newest, info);
+        break;
+      }
+      const Tid target = ring_tid_of(request.tid) + request.dt;
+      status = fetch(target, info);
+      // Again when a fast writer overtakes us between asking and reading.
+      for (int attempt = 0; attempt < 100 && status == ReadStatus::too_old; ++attempt) {
+        const Tid oldest = ask_oldest();
+        if (oldest <= target) break;
+        status = fetch(oldest, info);
+        if (status == ReadStatus::ok) {
+          report_error("readNext : skipping " + quoted_name() +
+                       " TID: " + std::to_string(ssm_tid(target)) + " -> " +
+                       std::to_string(ssm_tid(info.tid)));
+        }
+      }
+      break;
+    }
+    case Which::at:
+      status = request.time > 0
+                   ? fetch_by(
+                         [&](PConnector& from) {
+                           return from.at(time_from_seconds(request.time), sample_, info);
+                         },
+                         info)
+                   : fetch_by(newest, info);
+      break;
+  }
+  if (status != ReadStatus::ok) return error_of(status, request.which);
+  return hand_over(info, data, time);
+}
+
+SSM_tid RemoteStream::top() {
+  const Call call(*this);
+  return call.has_stream() ? ssm_tid(ask_newest()) : -1;
+}
+
+SSM_tid RemoteStream::bottom() {
+  const Call call(*this);
+  return call.has_stream() ? ssm_tid(ask_oldest()) : -1;
+}
+
+bool RemoteStream::is_newer(SSM_tid tid) {
+  const Call call(*this);
+  if (!call.has_stream()) return false;
+  const Tid newest = ask_newest();
+  return newest >= 0 && (tid < 0 || newest > ring_tid(tid, newest));
+}
+
+SSM_tid RemoteStream::tid_at(double time) {
+  const Call call(*this);
+  if (!call.has_stream()) return -1;
+  // Strictly before, as getTID() has it: at most one nanosecond less.
+  const Time t = time_from_seconds(time);
+  const auto found = connector_->find(t > Time::min() ? t - Duration(1) : t);
+  follow_restart();
+  if (!found) return complain(found.error()), SSM_ERROR_NO_DATA;
+  if (*found >= 0) {
+    told_ = std::max(told_, *found + offset_);
+    return ssm_tid(*found + offset_);
+  }
+  return ask_newest() < 0 ? SSM_ERROR_NO_DATA : SSM_ERROR_PAST;
+}
+
+// --- writing and properties
+// ------------------------------------------------------------------------
+
+bool RemoteStream::write(const void* data, std::size_t bytes, double time) {
+  const Call call(*this);
+  if (!call.has_stream()) return false;
+  const auto posted =
+      connector_->post({static_cast<const std::byte*>(data), bytes}, time_from_seconds(time));
+  if (!posted) return complain(posted.error()), false;
+  if (connector_->connected()) {
+    complaint_.clear();
+  } else {
+    complain({Errc::daemon_away, "write " + quoted_name() + " : '" + address_ +
+                                     "' is away; the newest samples are kept and sent later"});
+  }
+  return true;
+}
+
+bool RemoteStream::set_property(const void* data, std::size_t bytes) {
+  const Call call(*this);
+  if (!call.has_stream()) return false;
+  const auto set = connector_->set_property({static_cast<const std::byte*>(data), bytes});
+  if (!set) complain(set.error());
+  return set.has_value();
+}
+
+bool RemoteStream::get_property(void* data, std::size_t bytes) {
+  const Call call(*this);
+  if (!call.has_stream()) return false;
+  const auto property = connector_->property();
+  if (!property) {
+    if (property.error().code == Errc::not_found) {
+      remember_error(property.error().message);
+    } else {
+      complain(property.error());
+    }
+    return false;
+  }
+  if (property->size() != bytes) {
+    report_error("get the property of " + quoted_name() + " : it has " +
+                 std::to_string(property->size()) + " bytes, this program's type " +
+                 std::to_string(bytes) + "; use the type that it was set with");
+    return false;
+  }
+  std::memcpy(data, property->data(), bytes);
+  return true;
+}
+
+// --- buffered
+// --------------------------------------------------------------------------------------
+
+bool RemoteStream::buffer(double life, double cycle) {
+  const Call call(*this);
+  if (!call.has_stream()) return false;
+  ring_.reset();
+  const std::string what = "readyRingBuf " + quoted_name() + " : ";
+  History history{connector_->depth(), connector_->cycle()};
+  const double own_cycle = seconds_from_ns(to_ns(history.cycle));
+  if (life != 0 || cycle != 0) {
+    if (cycle == 0) cycle = own_cycle;
+    if (life == 0) life = static_cast<double>(history.depth - 1) * own_cycle / SSM_BUFFER_MARGIN;
+    const double wanted = slots(life, cycle);
+    if (!(life > 0 && cycle > 0 && life >= cycle && wanted <= static_cast<double>(kMaxDepth))) {
+      report_error(what + "a life of " + std::to_string(life) + " s at a cycle of " +
+                   std::to_string(cycle) +
+                   " s cannot be; both must be more than 0, life not less "
+                   "than cycle, and together not more than 2^24 samples");
+      return false;
+    }
+    history.depth = std::max(static_cast<std::uint64_t>(wanted), kMinDepth);
+    history.cycle = Duration(ns_from_seconds(cycle));
+  }
+  auto connector = PConnector::open(connector_->id(), options(address_, sample_.size()));
+  if (!connector) return report_error(what + connector.error().message), false;
+  // From the oldest: programs read by time, and what happened before they came is worth having.
+  if (auto done = connector->subscribe({.start = Subscription::Start::oldest}); !done) {
+    return report_error(what + done.error().message), false;
+  }
+  auto ring = RemoteRing::start(std::move(*connector), history);
+  if (!ring) return report_error(what + ring.error().message), false;
+  ring_ = std::move(*ring);
+  return true;
+}
+
+SSM_tid RemoteStream::top_buffered() {
+  const Call call(*this);
+  return call.has_stream() && ring_ ? ssm_tid(ring_->reader().newest()) : -1;
+}
+
+SSM_tid RemoteStream::read_buffered(const Request& request, void* data, std::size_t bytes,
+                                    double* time) {
+  const Call call(*this);
+  if (!call.has_stream() || !ring_ || bytes != sample_.size()) return SSM_ERROR_NO_DATA;
+  const ring::RingReader reader = ring_->reader();
+  const Tid newest = reader.newest();
+  SampleInfo info;
+  ReadStatus status = ReadStatus::not_yet;
+  switch (request.which) {
+    case Which::newest:
+      status = reader.read_newest(sample_, info);
+      break;
+    case Which::tid:
+      status = reader.read(ring_tid(request.tid, newest), sample_, info);
+      break;
+    case Which::newer:
+      if (request.tid < 0 || newest > ring_tid(request.tid, newest)) {
+        status = reader.read_newest(sample_, info);
+      }
+      break;
+    case Which::next: {
+      if (request.tid < 0) {
+        status = reader.read_newest(sample_, info);
+        break;
+      }
+      Tid target = ring_tid(request.tid, newest) + request.dt;
+      status = reader.read(target, sample_, info);
+      for (int attempt = 0; attempt < 100 && status == ReadStatus::too_old; ++attempt) {
+        const Tid oldest = reader.oldest();
+        if (oldest <= target) break;
+        target = oldest;
+        status = reader.read(target, sample_, info);
+      }
+      break;
+    }
+    case Which::at:
+      if (request.time > 0) {
+        for (int attempt = 0; attempt < 100; ++attempt) {
+          Tid found = kNoTid;
+          status = reader.find(time_from_seconds(request.time), found);
+          if (status == ReadStatus::ok) status = reader.read(found, sample_, info);
+          if (status != ReadStatus::too_old || found == kNoTid) break;
+        }
+      } else {
+        status = reader.read_newest(sample_, info);
+      }
+      break;
+  }
+  if (status != ReadStatus::ok) return error_of(status, request.which);
+  return hand_over(info, data, time);
+}
+
+}  // namespace dssm::ssm

@@ -1,0 +1,96 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What is behind a PConnector of the old interface: a dssm::PConnector, and the ring of its samples
+// once the program asked for one.
+//
+// Calls that fail say why on stderr, once until something works again. While other PC or network
+// are away, each call tries for about two seconds and fails then; the waits (connect, open) go on
+// until a signal handler runs, or $DSSM_CONNECT_TIMEOUT seconds have passed.
+//
+//   tids     as in stream.hpp: they keep rising when the stream begins anew
+//   threads  calls take turns; a call in a signal handler that interrupted another one of the same
+//            object in its own thread fails
+#pragma once
+
+#include <atomic>
+#include <dssm/pconnector.hpp>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "../include/libssm.h"
+#include "reentrant_lock.hpp"
+#include "remote_ring.hpp"
+
+namespace dssm::ssm {
+
+class RemoteStream {
+ public:
+  RemoteStream() = default;
+  RemoteStream(const RemoteStream&) = delete;
+  RemoteStream& operator=(const RemoteStream&) = delete;
+
+  bool connect(const std::string& address);
+  bool create(const std::string& address, const StreamId& id, const TypeInfo& type,
+              const History& history);
+  bool open(const std::string& address, const StreamId& id, std::size_t data_bytes);
+  bool is_open() const noexcept { return open_.load(); }
+  void close() noexcept { open_.store(false); }  // async-signal-safe: nothing is taken down yet
+
+  enum class Which { newest, tid, newer, next, at };
+  struct Request {
+    Which which;
+    SSM_tid tid;  // tid, newer, next
+    int dt;       // next
+    double time;  // at
+  };
+  // The tid that was read, or an SSM_ERROR_...
+  SSM_tid read(const Request& request, void* data, std::size_t bytes, double* time);
+  SSM_tid read_buffered(const Request& request, void* data, std::size_t bytes, double* time);
+
+  SSM_tid top();
+  SSM_tid top_buffered();
+  SSM_tid bottom();
+  SSM_tid tid_at(double time);
+  bool is_newer(SSM_tid tid);
+
+  bool write(const void* data, std::size_t bytes, double time);
+
+  bool set_property(const void* data, std::size_t bytes);
+  bool get_property(void* data, std::size_t bytes);
+
+  // Zeroes: what the stream itself has.
+  bool buffer(double life, double cycle);
+
+ private:
+  class Call;
+
+  PConnectorOptions options(const std::string& address, std::uint64_t payload_bytes) const;
+  bool take(Result<PConnector> opened, const std::string& what);
+  std::string quoted_name() const;
+  void complain(const Error& error);
+  void follow_restart();
+  Tid ring_tid_of(SSM_tid tid);
+
+  // In tids as programs are told them, of 64 bits.
+  ReadStatus fetch(Tid tid, SampleInfo& info);
+  template <class Ask>
+  ReadStatus fetch_by(Ask ask, SampleInfo& info);
+  SSM_tid hand_over(const SampleInfo& info, void* data, double* time);
+  Tid ask_newest();
+  Tid ask_oldest();
+
+  ReentrantLock lock_;
+  bool inside_ = false;
+  std::atomic<bool> open_{false};
+  std::optional<PConnector> connector_;
+  std::string address_;
+  std::vector<std::byte> sample_;  // read into, before it is the program's
+  Tid offset_ = 0, told_ = kNoTid;
+  std::uint64_t restarts_ = 0;  // of connector_, that offset_ knows of
+  std::string complaint_;       // made, and not mended since
+  std::unique_ptr<RemoteRing> ring_;
+};
+
+}  // namespace dssm::ssm

@@ -1,0 +1,141 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Signals and the remote interface: Ctrl-C ends its waits, and terminate() in a handler, at any
+// moment, ends all that follows without harm. Arguments: FOLDER ADDRESS.
+#include <signal.h>
+#include <sys/time.h>
+#include <sys/wait.h>
+
+#include "check.h"
+#include "dssm.hpp"
+
+namespace {
+
+struct Sample {
+  double a[32];
+};
+
+const char* address;
+volatile sig_atomic_t handled = 0;
+
+void on_signal(int number, void (*handler)(int)) {
+  struct sigaction action;
+  memset(&action, 0, sizeof(action));
+  action.sa_handler = handler;
+  action.sa_flags = SA_RESTART;
+  sigaction(number, &action, NULL);
+}
+
+void count(int) { handled = handled + 1; }
+
+// SIGALRM after `first` and then every `next` microseconds (0: once).
+void alarm_after(int first, int next) {
+  itimerval timer;
+  memset(&timer, 0, sizeof(timer));
+  timer.it_value.tv_usec = first;
+  timer.it_interval.tv_usec = next;
+  setitimer(ITIMER_REAL, &timer, NULL);
+}
+
+void signals_end_the_waits() {
+  on_signal(SIGALRM, count);
+  DSSMApi<Sample> nowhere("storm", 0, "127.0.0.1:1"), never("never", 0, address);
+  catch_stderr();
+  alarm_after(50000, 50000);
+  CHECK(!nowhere.initRemote());
+  CHECK(!never.open());
+  alarm_after(0, 0);
+  CHECK_TEXT(caught_stderr(), "interrupted");
+  CHECK(handled > 0);
+}
+
+DSSMApi<Sample>*source, *sink, *buffered;
+
+void terminate_all(int) {
+  source->terminate();
+  sink->release();
+  buffered->terminate();
+  handled = 1;
+}
+
+int storm_child(int kind, int ready_fd) {
+  alarm(60);  // a deadlock ends here, and is seen by the parent
+  source = new DSSMApi<Sample>("storm", 0, address);
+  sink = new DSSMApi<Sample>("storm", 1, address);
+  buffered = new DSSMApi<Sample>("storm", 0, address);
+  if (!source->open() || !source->createDataCon()) return 1;
+  if (!sink->create(1.0, 0.1) || !sink->createDataCon()) return 2;
+  if (!buffered->open(SSM_READ_BUFFER) || !buffered->createDataCon()) return 3;
+  buffered->readyRingBuf();
+  on_signal(SIGINT, terminate_all);
+  handled = 0;
+  if (write(ready_fd, "r", 1) != 1) return 4;
+  while (!handled) {
+    switch (kind) {
+      case 0:
+        source->readLast();
+        break;
+      case 1:
+        source->readTime(gettimeSSM() - 0.5);
+        break;
+      case 2:
+        sink->write();
+        break;
+      case 3:
+        buffered->readNextBuf();
+        break;
+      default:
+        buffered->readTimeBuf(gettimeSSM() - 0.5);
+        source->getTID_top();
+        break;
+    }
+  }
+  if (source->readNew() || sink->write() || buffered->readLastBuf() || source->isOpen()) return 5;
+  source->terminate();
+  delete source;
+  delete sink;
+  delete buffered;
+  return 0;
+}
+
+void storm(int rounds) {
+  DSSMApi<Sample> writer("storm", 0, address);
+  CHECK(writer.create(0.3, 0.1) && writer.createDataCon() && writer.write());
+  srandom(static_cast<unsigned>(getpid()));
+  printf("seed %d\n", getpid());
+  for (int round = 0; round < rounds; ++round) {
+    int ready[2];
+    if (pipe(ready) != 0) abort();
+    fflush(stdout);
+    const pid_t child = fork();
+    if (child == 0) _exit(storm_child(round % 5, ready[1]));
+    close(ready[1]);
+    char byte;
+    CHECK(read(ready[0], &byte, 1) == 1);
+    close(ready[0]);
+    for (int i = 0; i < 20; ++i) writer.write();
+    usleep(static_cast<useconds_t>(random() % 2000));
+    kill(child, SIGINT);
+    int status = 0;
+    waitpid(child, &status, 0);
+    if (status != 0) printf("round %d: wait status %x\n", round, status);
+    CHECK_EQUAL(status, 0);
+  }
+}
+
+void sigpipe_is_the_programs() {
+  struct sigaction action;
+  sigaction(SIGPIPE, NULL, &action);
+  CHECK(action.sa_handler == SIG_DFL);
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+  check_begin(argc, argv);
+  address = argv[2];
+  storm(50);
+  signals_end_the_waits();
+  sigpipe_is_the_programs();
+  return check_result();
+}

@@ -1,0 +1,234 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Runs the programs of programs/ that meet other PCs: those of the remote interface, and SSM
+// programs that open another PC's stream by its name.
+#include <fcntl.h>
+#include <gtest/gtest.h>
+#include <signal.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <dssm/dssm.hpp>
+#include <thread>
+
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+
+std::string program(const std::string& name) { return built("tests/process/ssm/" + name); }
+
+class SsmRemoteProgram : public testing::TestWithParam<std::string> {};
+
+TEST_P(SsmRemoteProgram, ChecksHold) {
+  const DaemonProcess daemon({"--log-level", "warning"});
+  const std::string folder = make_temp_dir();
+  const Finished finished =
+      run({program(GetParam()), folder, daemon.address()}, {daemon.environment()});
+  EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
+  remove_tree(folder);
+}
+
+class SsmRemoteProcesses : public testing::TestWithParam<std::string> {};
+
+TEST_P(SsmRemoteProcesses, ChecksHold) {
+#ifdef __SANITIZE_THREAD__
+  GTEST_SKIP() << "the thread sanitizer holds signals back and knows no threads in forked children";
+#endif
+  const DaemonProcess daemon({"--log-level", "warning"});
+  const std::string folder = make_temp_dir();
+  const Finished finished =
+      run({program(GetParam()), folder, daemon.address()}, {daemon.environment()});
+  EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
+  remove_tree(folder);
+}
+
+std::string test_name(const testing::TestParamInfo<std::string>& info) {
+  std::string name = info.param;
+  std::replace_if(
+      name.begin(), name.end(), [](unsigned char c) { return !std::isalnum(c); }, '_');
+  return name;
+}
+
+INSTANTIATE_TEST_SUITE_P(Cpp, SsmRemoteProgram,
+                         testing::Values("remote_api-c++11", "remote_api-c++14", "remote_api-c++17",
+                                         "remote_api-c++20", "remote_prototype-c++11",
+                                         "remote_prototype-c++20"),
+                         test_name);
+INSTANTIATE_TEST_SUITE_P(Cpp, SsmRemoteProcesses,
+                         testing::Values("remote_buffered-c++11", "remote_buffered-c++20",
+                                         "remote_signals-c++11"),
+                         test_name);
+
+// Two PCs, of which the first knows the second.
+struct SsmFleet : testing::Test {
+  DaemonProcess pc2{{"--log-level", "warning"}, "pc2"};
+  DaemonProcess pc1{{"--log-level", "warning", "--peer", pc2.address()}, "pc1"};
+
+  static void await_host(const DaemonProcess& daemon, const std::string& name) {
+    auto session = Session::connect({.socket_path = daemon.socket_path()}).value();
+    for (;;) {
+      const auto hosts = session.hosts().value();
+      if (std::any_of(hosts.begin(), hosts.end(), [&](const HostInfo& host) {
+            return host.name == name && host.state == "up";
+          })) {
+        return;
+      }
+      std::this_thread::yield();
+    }
+  }
+};
+
+struct Point {
+  std::int32_t number;
+  double x;
+};
+
+TEST_F(SsmFleet, AnSsmProgramReadsAndWritesStreamsOfAnotherPcByTheirNames) {
+  auto far = Session::connect({.socket_path = pc2.socket_path()}).value();
+  auto writer =
+      far.create_raw({"far", 3, {}}, {"", sizeof(Point), 1, {}}, History{100, 100ms}).value();
+  for (std::int32_t i = 0; i < 10; ++i) {
+    const Point point{i, 0.5 * i};
+    writer.write(std::as_bytes(std::span(&point, 1)), time_from_ns((1000LL + i) * 1'000'000'000));
+  }
+  const int property = 99;
+  ASSERT_TRUE(writer.set_property(std::as_bytes(std::span(&property, 1))));
+  await_host(pc1, "pc2");
+  const std::string folder = make_temp_dir();
+  const Finished finished =
+      run({program("remote_names-gnu++98"), folder, "pc2"}, {pc1.environment()});
+  EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
+  remove_tree(folder);
+  EXPECT_TRUE(far.info({"ours", 0, {}}));
+}
+
+TEST(SsmBroadcast, EachHostSeesWhatAllShow) {
+  // Both need the other's address: the second one's comes by starting it on the port it had.
+  auto second =
+      std::make_unique<DaemonProcess>(std::vector<std::string>{"--log-level", "warning"}, "pc2");
+  const DaemonProcess first({"--log-level", "warning", "--peer", second->address()}, "pc1");
+  const std::string at = second->address();
+  second.reset();
+  second = std::make_unique<DaemonProcess>(
+      std::vector<std::string>{"--log-level", "warning", "--listen", at, "--peer", first.address()},
+      "pc2");
+  const std::string folders[] = {make_temp_dir(), make_temp_dir()};
+  Finished one, two;
+  std::thread other([&] {
+    two = run({program("remote_broadcast-c++11"), folders[1], "22", "11"}, {second->environment()});
+  });
+  one = run({program("remote_broadcast-c++11"), folders[0], "11", "22"}, {first.environment()});
+  other.join();
+  EXPECT_EQ(one.exit_status, 0) << one.out << one.err;
+  EXPECT_EQ(two.exit_status, 0) << two.out << two.err;
+  for (const std::string& folder : folders) remove_tree(folder);
+}
+
+// A program whose standard input and output are the test's.
+class Talking {
+ public:
+  Talking(const std::vector<std::string>& argv, const std::string& environment) {
+    int in[2], out[2];
+    if (::pipe2(in, O_CLOEXEC) || ::pipe2(out, O_CLOEXEC)) std::abort();
+    // start() leaves stdin alone: the shell takes it from the pipe's path in /proc.
+    const std::string path = "/proc/" + std::to_string(::getpid()) + "/fd/" + std::to_string(in[0]);
+    std::string command = "exec";
+    for (const std::string& word : argv) command += " '" + word + "'";
+    pid_ = start({"sh", "-c", command + " <" + path}, {environment}, out[1]);
+    ::close(out[1]);
+    read_in_ = in[0];
+    to_ = in[1];
+    from_ = out[0];
+  }
+  Talking(const Talking&) = delete;
+  Talking& operator=(const Talking&) = delete;
+
+  void say(const std::string& line) const {
+    ASSERT_EQ(::write(to_, line.data(), line.size()), static_cast<ssize_t>(line.size()));
+  }
+  std::string line() const {
+    std::string text;
+    for (char c = 0; ::read(from_, &c, 1) == 1 && c != '\n';) text += c;
+    return text;
+  }
+  // Its exit status, and what else it said.
+  int end(std::string& rest) {
+    ::close(to_);
+    ::close(read_in_);
+    char buffer[4096];
+    for (ssize_t n; (n = ::read(from_, buffer, sizeof buffer)) > 0;) {
+      rest.append(buffer, static_cast<std::size_t>(n));
+    }
+    ::close(from_);
+    return wait_for(pid_);
+  }
+
+ private:
+  pid_t pid_ = -1;
+  int read_in_ = -1, to_ = -1, from_ = -1;
+};
+
+struct SsmNewRing : testing::Test {
+  DaemonProcess daemon{{"--log-level", "warning"}};
+  Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
+  std::string folder = make_temp_dir();
+  int number = 0;
+  RawWriter writer = make();
+
+  ~SsmNewRing() override { remove_tree(folder); }
+
+  RawWriter make() {
+    return session.create_raw({"anew", 0, {}}, {"", sizeof(int), 1, {}}, History{64, 1ms}).value();
+  }
+  void write(int count) {
+    for (int i = 0; i < count; ++i, ++number) {
+      writer.write(std::as_bytes(std::span(&number, 1)));
+    }
+  }
+  // Until the program has read all that was written.
+  void await(const Talking& program) {
+    const std::string last = std::to_string(number - 1);
+    program.say(last + "\n");
+    ASSERT_EQ(program.line(), last);
+  }
+  void replace_ring() {
+    ASSERT_TRUE(session.remove({"anew", 0, {}}));
+    writer = make();
+  }
+};
+
+TEST_F(SsmNewRing, LoopsOfOldProgramsGoOn) {
+  write(1);
+  Talking talking({program("cpp_anew-gnu++98"), folder}, daemon.environment());
+  for (int round = 0; round < 4; ++round) {
+    write(5);
+    await(talking);
+    replace_ring();
+  }
+  std::string rest;
+  EXPECT_EQ(talking.end(rest), 0) << rest;
+}
+
+TEST_F(SsmNewRing, RemoteLoopsOfOldProgramsGoOnOverRestartsOfDssmdToo) {
+  write(1);
+  Talking talking({program("remote_anew-c++11"), folder, daemon.address()}, daemon.environment());
+  for (int round = 0; round < 6; ++round) {
+    write(5);
+    await(talking);
+    if (round % 2 == 0) {
+      replace_ring();
+    } else {
+      daemon.kill_hard();
+      write(5);
+      daemon.start();
+    }
+  }
+  std::string rest;
+  EXPECT_EQ(talking.end(rest), 0) << rest;
+}
+
+}  // namespace
+}  // namespace dssm::test
