@@ -9,7 +9,10 @@
 namespace dssm::ctl {
 
 Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out) {
-  Follower follower(session, reader, out);
+  const Result<DaemonInfo> daemon = session.daemon();
+  if (!daemon) return daemon.error();
+  const bool own = reader.id().host == daemon->host;
+  Follower follower(session, reader, out, own ? kLookUp : kMayComeBack);
   Result<Session::Watch> watch =
       session.watch([suspicion = follower.suspicion_, id = reader.id()](const StreamEvent& event) {
         if (event.stream.id != id) return;
@@ -20,25 +23,22 @@ Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out
   return follower;
 }
 
-// A stream that is created anew at once goes on, and after a restart of dssmd one may look removed
-// until those who hold it have offered it back: only answers that there is none count, and only if
-// that stays so. A stream of another host is also "removed" while that host is away, and then goes
-// on in its mirror.
+// A stream that is created anew at once goes on, and after a restart of its dssmd one may look
+// removed until those who hold it have offered it back: only answers that there is none count, and
+// only if that stays so. While another host is away dssmd tells of its stream what the mirror
+// knows.
 bool Follower::removed() {
   bool gone = false;
-  Duration patience = kLookUp;
   if (suspicion_->load(std::memory_order_relaxed) && session_.connected()) {
     const Result<StreamInfo> now = session_.info(reader_.id());
-    gone =
-        now ? now->mirror && now->mirror->state == "removed" : now.error().code == Errc::not_found;
-    if (now) patience = kMayComeBack;
+    gone = !now && now.error().code == Errc::not_found;
   }
   if (!gone) {
     gone_since_.reset();
     return false;
   }
   if (!gone_since_) gone_since_ = MonoClock::now();
-  return MonoClock::now() - *gone_since_ >= patience;
+  return MonoClock::now() - *gone_since_ >= patience_;
 }
 
 Follower::Wake Follower::wait(MonoTime deadline) {

@@ -31,19 +31,19 @@ class Follower {
   Wake wait(MonoTime deadline);
 
  private:
-  Follower(Session& session, RawReader& reader, Output& out)
-      : session_(session), reader_(reader), out_(out) {}
+  Follower(Session& session, RawReader& reader, Output& out, Duration patience)
+      : session_(session), reader_(reader), out_(out), patience_(patience) {}
   bool removed();
 
   static constexpr Duration kLookUp = std::chrono::milliseconds(100);
+  // A stream of another host that is not there any more may be back in a moment: its dssmd was
+  // restarted, and the programs that hold the stream are about to offer it.
+  static constexpr Duration kMayComeBack = std::chrono::seconds(3);
 
   Session& session_;
   RawReader& reader_;
   Output& out_;
-  // A stream of another host that is not there any more may be back in a moment: its dssmd was
-  // restarted, and the programs that hold the stream are about to offer it.
-  static constexpr Duration kMayComeBack = std::chrono::seconds(2);
-
+  Duration patience_;  // so long the stream has to be gone to count as removed
   // Set by the session's thread: whether a stream of this name was removed, and none came since.
   // Shared with the callback, which moves with the watch.
   std::shared_ptr<std::atomic<bool>> suspicion_ = std::make_shared<std::atomic<bool>>(false);

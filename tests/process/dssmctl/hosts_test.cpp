@@ -47,29 +47,35 @@ TEST_F(Hosts, ShowsThisHostFirstAndHowTheOthersAreReached) {
 TEST_F(Hosts, IsASuccessThatSaysWhyAHostIsDown) {
   pc3_.kill_hard();
   await_state("pc3", "down");
-  const std::string text = output({"hosts"});
-  EXPECT_TRUE(contains(lines_of(text)[3], "pc3   down")) << text;
+  const std::string row = lines_of(output({"hosts"}))[3];
+  EXPECT_TRUE(row.starts_with("pc3   down")) << row;
   const Json down = json({"hosts"})["hosts"][2];
   EXPECT_EQ(down["state"], "down");
-  EXPECT_FALSE(down["error"].get<std::string>().empty());
-  EXPECT_TRUE(contains(text, down["error"].get<std::string>().substr(0, 20))) << text;
+  // The reason is another one from attempt to attempt, and always names who is meant.
+  const std::string who = "'" + pc3_.address() + "'";
+  EXPECT_TRUE(contains(row, who)) << row;
+  EXPECT_TRUE(contains(down["error"].get<std::string>(), who)) << down;
   EXPECT_EQ(json({"ls"})["streams"].size(), 0U);
 }
 
 TEST_F(Hosts, GivesEachNameOnceToPrograms) {
   EXPECT_EQ(output({"hosts", "--names"}), "pc1\npc2\npc3\n");
-  DaemonProcess alone({"--peer", pc2_.address(), "--peer", "127.0.0.1:9", "--peer",
-                       "localhost:" + pc2_.address().substr(pc2_.address().find(':') + 1)},
-                      "pc4");
-  Session session = session_with(alone);
-  while (session.hosts().value()[1].state != "up" || session.hosts().value()[3].name.empty()) {
+  const std::string nobody = pc3_.address();
+  pc3_.kill_hard();
+  const std::string other_address = "localhost" + pc2_.address().substr(pc2_.address().find(':'));
+  DaemonProcess pc4({"--peer", pc2_.address(), "--peer", nobody, "--peer", other_address}, "pc4");
+  Session session = session_with(pc4);
+  const auto state = [&](std::size_t i) { return session.hosts().value()[i].state; };
+  while (state(1) != "up" || state(2) != "down" || state(3) != "up") {
   }
-  EXPECT_EQ(output({"--socket", alone.socket_path(), "hosts", "--names"}), "pc4\npc2\n");
-  const Json hosts = json({"--socket", alone.socket_path(), "hosts"})["hosts"];
+  EXPECT_EQ(output({"--socket", pc4.socket_path(), "hosts", "--names"}), "pc4\npc2\n");
+  const Json hosts = json({"--socket", pc4.socket_path(), "hosts"})["hosts"];
   ASSERT_EQ(hosts.size(), 4U);
   EXPECT_TRUE(hosts[2]["host"].is_null());
-  EXPECT_EQ(hosts[2]["addresses"][0], "127.0.0.1:9");
-  EXPECT_TRUE(contains(hosts[3]["error"].get<std::string>(), "same host as")) << hosts[3];
+  EXPECT_EQ(hosts[2]["addresses"][0], nobody);
+  // Whichever came first is in use.
+  const Json& spare = hosts[1]["error"].is_null() ? hosts[3] : hosts[1];
+  EXPECT_TRUE(contains(spare["error"].get<std::string>(), "same host as")) << hosts;
 }
 
 TEST_F(Ping, TellsEachAnswerAndTheirTimes) {

@@ -215,9 +215,7 @@ TEST_F(Remote, EchoAndHzEndWhenTheOwnerRemovesTheStream) {
   EXPECT_EQ(hz.status(), 1);
 }
 
-// The owner's dssmd comes back and gets the ring from the program that holds it: after a crash
-// before it serves other hosts, after a proper stop perhaps later, so that for a moment the stream
-// is not there.
+// The owner's dssmd comes back and gets the ring from the program that holds it.
 TEST_F(Remote, EchoGoesOnWhileTheOwnerIsAwayAndAfterItsReturn) {
   auto writer = on_pc2_.create<double>("s", depth_of(10'000)).value();
   await_streams(1);
@@ -236,6 +234,42 @@ TEST_F(Remote, EchoGoesOnWhileTheOwnerIsAwayAndAfterItsReturn) {
       EXPECT_EQ(line["lost"], 0);
       tid = line["tid"];
     }
+  }
+}
+
+// The same, but that program takes its time: meanwhile there is no such stream.
+TEST_F(Remote, EchoGoesOnWhenTheStreamComesBackLaterThanItsOwner) {
+  const std::vector<std::byte> payload(4);
+  output({"--socket", pc2_.socket_path(), "create", "s", "--size", "4", "--depth", "100"});
+  Running holder(argv({"--socket", pc2_.socket_path(), "echo", "s"}), environment());
+  while (on_pc2_.info({"s", 0, ""}).value().readers != 1) {
+  }
+  await_streams(1);
+  Running echo(argv({"echo", "s", "--csv"}), environment());
+  echo.line();  // the header
+  // Two samples, one after the other: after the second one it follows for sure.
+  Tid tid = kNoTid;
+  for (int i = 0; i < 2; ++i) {
+    auto writer = on_pc2_.open_raw_writer({"s", 0, ""}).value();
+    tid = std::stoll(echo.line([&] { writer.write(payload); }));
+  }
+  pc2_.stop();
+  holder.stop();
+  pc2_.start();
+  while (session_.info({"s", 0, "pc2"})) {  // the mirror's, until pc2 says that there is none
+  }
+  // Nobody sees from outside that echo has noticed; it looks every 100 ms.
+  for (const MonoTime noticed = deadline_in(300ms); MonoClock::now() < noticed;) {
+    ASSERT_FALSE(session_.info({"s", 0, "pc2"}));
+  }
+  holder.signal(SIGCONT);
+  while (!on_pc2_.info({"s", 0, ""})) {
+  }
+  const Tid last = on_pc2_.open_raw_writer({"s", 0, ""}).value().write(payload);
+  while (tid < last) {
+    const std::string line = echo.line();
+    ASSERT_TRUE(line.starts_with(std::to_string(tid + 1) + ",")) << line;
+    ++tid;
   }
 }
 
