@@ -2,8 +2,9 @@
 //
 // Any bytes from a client that said hello: through the frame buffer, the decoding of requests, the
 // registry and its real memory files, down to the answers. A second client watches and holds a
-// stream, so that events and conflicts happen. An input's first two bytes choose whether dssmd is
-// recovering, which descriptors come along, and how its bytes are cut.
+// stream, so that events and conflicts happen. Another host answers when the input is over, or when
+// the client has left. An input's first two bytes choose whether dssmd is recovering, which
+// descriptors come along, and how its bytes are cut.
 #include <fcntl.h>
 
 #include <algorithm>
@@ -14,6 +15,7 @@
 #include "core/wire/local_protocol.hpp"
 #include "daemon/local/local_service.hpp"
 #include "daemon/service/process.hpp"
+#include "tests/fuzz/late_fleet.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -36,11 +38,12 @@ struct Daemon {
       : registry("pc1",
                  {.max_streams = 8, .max_memory_bytes = 1 << 20, .max_property_bytes = 4096}),
         opens({.max_opens = 16, .max_opens_per_client = 8}),
-        service(registry, opens, clock, logger, recovering) {}
+        service(registry, opens, clock, logger, recovering, &fleet) {}
   SilentLogger logger;
   Registry registry;
   OpenTable opens;
   PlaybackClockOwner clock;
+  LateFleet fleet;
   LocalService service;
 };
 
@@ -114,7 +117,9 @@ void run(std::span<const std::uint8_t> input) {
     }
   }
   daemon.service.end_recovery();
+  if (cut & 1) daemon.fleet.answer();
   daemon.service.disconnect(client);
+  daemon.fleet.answer();
   if (!daemon.opens.entries().empty()) std::abort();
 }
 

@@ -1,0 +1,105 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Another host for the fuzzer of the local protocol: it has every stream that it is asked for, and
+// answers when told to.
+#pragma once
+
+#include <functional>
+#include <utility>
+#include <vector>
+
+#include "daemon/local/fleet.hpp"
+#include "daemon/streams/registry.hpp"
+
+namespace dssm::daemon {
+
+class LateFleet final : public Fleet {
+ public:
+  // Gives all answers that are due.
+  void answer() {
+    for (const std::function<void()>& due : std::exchange(due_, {})) due();
+  }
+
+  void observe(Observer* observer) override { observer_ = observer; }
+  bool is_there(const StreamId& id) const override { return pc2_.knows(id); }
+
+  void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) override {
+    due_.push_back([this, id, then = std::move(then)] { then(ring(id)); });
+  }
+  void open_writer(const StreamId& id, const CreatePlan* plan,
+                   Then<OpenedRemoteWriter> then) override {
+    if (plan) replace(id);
+    due_.push_back([this, id, then = std::move(then)] {
+      const Result<std::shared_ptr<Stream>> stream = ring(id);
+      if (!stream) return then(stream.error());
+      then(OpenedRemoteWriter{*stream, false});
+    });
+  }
+  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role,
+                                                  OfferedFiles files) override {
+    return pc2_.adopt_untrusted(id, std::move(files));
+  }
+  void info(const StreamId& id, Then<proto::Stream> then) override {
+    due_.push_back([this, id, then = std::move(then)] {
+      const Result<std::shared_ptr<Stream>> stream = ring(id);
+      if (!stream) return then(stream.error());
+      proto::Stream message;
+      wire::to_message((*stream)->info(), message);
+      then(std::move(message));
+    });
+  }
+  void get_property(const StreamId&, Then<std::string> then) override {
+    due_.push_back([then = std::move(then)] { then(std::string("x")); });
+  }
+  void set_property(const StreamId&, std::string, Then<void> then) override {
+    due_.push_back([then = std::move(then)] { then({}); });
+  }
+  void remove(const StreamId& id, Then<void> then) override {
+    replace(id);
+    due_.push_back([then = std::move(then)] { then({}); });
+  }
+  void list(Then<std::vector<proto::Stream>> then) override {
+    due_.push_back([this, then = std::move(then)] {
+      std::vector<proto::Stream> streams;
+      for (const StreamInfo& stream : known_streams()) {
+        wire::to_message(stream, streams.emplace_back());
+      }
+      then(std::move(streams));
+    });
+  }
+  std::vector<StreamInfo> known_streams() const override {
+    std::vector<StreamInfo> streams;
+    for (const auto& stream : pc2_.streams()) streams.push_back(stream->info());
+    return streams;
+  }
+  std::vector<local::Host> hosts() const override { return std::vector<local::Host>(2); }
+  void ping(const std::string&, Then<local::RoundTrip> then) override {
+    due_.push_back([then = std::move(then)] { then(local::RoundTrip()); });
+  }
+
+ private:
+  // The ring of `id`, made when first asked for.
+  Result<std::shared_ptr<Stream>> ring(const StreamId& id) {
+    auto created =
+        pc2_.create({id.name, id.id, ""}, {"T", 8, 8, {}}, {4, std::chrono::milliseconds(1)}, 1);
+    if (!created) return std::move(created).error();
+    return created->stream;
+  }
+  // It goes, comes back with another ring, and its readers hear of it.
+  void replace(const StreamId& id) {
+    const StreamId there{id.name, id.id, "pc2"};
+    const Result<std::shared_ptr<Stream>> old = pc2_.find(there);
+    if (!old || !pc2_.remove(there)) return;
+    if (observer_) observer_->on_remote_stream_removed(there);
+    if (const auto anew = ring(id); anew && observer_) {
+      observer_->on_remote_stream_added((*anew)->info());
+    }
+    if (observer_) observer_->on_ring_replaced(**old);
+  }
+
+  Registry pc2_{"pc2", {.max_streams = 8, .max_memory_bytes = 1 << 20, .max_property_bytes = 16}};
+  Observer* observer_ = nullptr;
+  std::vector<std::function<void()>> due_;
+};
+
+}  // namespace dssm::daemon
