@@ -35,7 +35,7 @@ _dssmctl_offer() {
   local line typed=${cur//\\/} before="" breaks=""
   [[ $COMP_WORDBREAKS == *:* ]] && breaks+=":"
   [[ $COMP_WORDBREAKS == *@* ]] && breaks+="@"
-  [[ -n $breaks && $typed == *[$breaks]* ]] && before=${typed%"${typed##*[$breaks]}"}
+  [[ -n $breaks && $typed == *[$breaks]* ]] && before=${typed%"${typed##*["$breaks"]}"}
   while IFS= read -r line; do
     [[ -n $line && $line == "$typed"* ]] || continue
     printf -v line %q "${line#"$before"}"
@@ -71,8 +71,9 @@ _dssmctl() {
   local verb="" positional=0
   for ((i = 1; i < cword; ++i)); do
     case ${words[i]} in
-      --socket | --sort | --at | --count | -n | -c | --field | --wait | --window | -w | --interval | \
-        -i | --size | --depth | --life | --cycle | --type | --align | --offset | --speed | --time)
+      --socket | --sort | --at | --count | -n | -c | --field | --wait | --window | -w | \
+        --interval | -i | --size | --depth | --life | --cycle | --type | --align | --offset | \
+        --speed | --time)
         ((++i))
         ;;
       -*) ;;
@@ -96,8 +97,8 @@ _dssmctl() {
         readers type memory" -- "$cur")
       return
       ;;
-    --at | --count | -n | -c | --field | --wait | --window | -w | --interval | -i | --size | --depth | \
-      --life | --cycle | --type | --align | --offset | --speed | --time)
+    --at | --count | -n | -c | --field | --wait | --window | -w | --interval | -i | --size | \
+      --depth | --life | --cycle | --type | --align | --offset | --speed | --time)
       return # a value that only the person knows
       ;;
   esac

@@ -35,7 +35,7 @@ Json host_json(const HostInfo& host) {
 }
 
 std::string note(const HostInfo& host) {
-  std::string text = host.insecure ? "insecure: in the clear over the network" : "";
+  std::string text = host.insecure ? "insecure: nothing is encrypted" : "";
   if (!host.error.empty()) text += (text.empty() ? "" : "; ") + escaped_message(host.error);
   return text;
 }

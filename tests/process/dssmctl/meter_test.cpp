@@ -142,6 +142,7 @@ TEST_F(Meter, DelayIsTheAgeOfSamplesWhenTheyArrive) {
   EXPECT_GE(report["delay_mean_ns"].get<double>(), report["delay_min_ns"].get<double>());
   EXPECT_LE(report["delay_mean_ns"].get<double>(), report["delay_max_ns"].get<double>());
   EXPECT_EQ(report["new_samples"], report["seen_samples"]);
+  EXPECT_EQ(report["delay_error_ns"], 0);  // one clock
 }
 
 TEST_F(Meter, DelayIgnoresSamplesFromBeforeItsStart) {
