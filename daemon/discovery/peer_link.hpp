@@ -9,6 +9,7 @@
 #include <map>
 #include <optional>
 #include <string>
+#include <string_view>
 
 #include "core/wire/address.hpp"
 #include "core/wire/network_protocol.hpp"
