@@ -239,14 +239,17 @@ WaitStatus Channel::run(MonoTime deadline, bool interruptible, Done done) {
 Result<void> Channel::get_up(MonoTime deadline) {
   if (is_up()) return {};
   subscriber_->keep(true);
-  const std::uint64_t failed_before = failed_attempts_;
-  const auto hopeless = [&] {
-    return failed_attempts_ != failed_before && why_down_ && !is_worth_waiting(why_down_->code);
-  };
-  static_cast<void>(run(deadline, false, [&] { return is_up() || hopeless(); }));
+  const std::uint64_t before = failed_attempts_;
+  static_cast<void>(run(deadline, false, [&] { return is_up() || is_hopeless_since(before); }));
   if (is_up()) return {};
-  if (hopeless()) return *why_down_;
+  if (is_hopeless_since(before)) return *why_down_;
   return away("is away and did not come back in time");
+}
+
+// Whether an attempt to connect failed, after there had been `failed_before`, in a way that trying
+// again soon does not mend.
+bool Channel::is_hopeless_since(std::uint64_t failed_before) const noexcept {
+  return failed_attempts_ != failed_before && why_down_ && !is_worth_waiting(why_down_->code);
 }
 
 Error Channel::away(const std::string& how) const {
@@ -317,7 +320,10 @@ Result<void> Channel::on_frame(net::Frame& frame) {
   } else if (serial == publishing_serial_) {
     publishing_serial_ = 0;
     if (frame.has_failure()) return wire::failure(frame.failure()).context("publish");
-    result = outbox_->restart(frame.publishing().last(), frame.publishing().last_tid());
+    // One that was allowed to begin before has nothing to go back to.
+    if (!may_publish_) {
+      result = outbox_->restart(frame.publishing().last(), frame.publishing().last_tid());
+    }
     may_publish_ = true;
   } else if (serial == ask_serial_) {
     answer_ = std::move(frame);
@@ -500,10 +506,9 @@ bool Channel::await_more(MonoTime deadline) const noexcept {
 WaitStatus Channel::wait(MonoTime deadline) {
   if (!subscriber_->active()) return WaitStatus::timeout;
   subscriber_->keep(false);
-  return run(deadline, true, [&] {
-    return held_ || subscriber_->has_kept() ||
-           (why_down_ && !was_up_ && !is_worth_waiting(why_down_->code));
-  });
+  const std::uint64_t before = failed_attempts_;
+  return run(deadline, true,
+             [&] { return held_ || subscriber_->has_kept() || is_hopeless_since(before); });
 }
 
 int Channel::fd() noexcept {
@@ -547,7 +552,8 @@ Result<void> Channel::post(std::span<const std::byte> payload, Time time, Durati
   }
   outbox_->push(payload, time, clock_error);
   advance(Patience::none);
-  if (++posts_since_receive_ < kPostsPerReceive && !link_.is_down()) return {};
+  // What did not go tells that the other side is slow, or gone.
+  if (++posts_since_receive_ < kPostsPerReceive && !has_more_to_send()) return {};
   posts_since_receive_ = 0;
   subscriber_->keep(true);
   while (receive()) {
@@ -558,13 +564,11 @@ Result<void> Channel::post(std::span<const std::byte> payload, Time time, Durati
 Result<Tid> Channel::flush(MonoTime deadline) {
   if (outbox_->newest() < 0) return kNoTid;
   subscriber_->keep(true);
-  const std::uint64_t failed_before = failed_attempts_;
-  const auto hopeless = [&] {
-    return failed_attempts_ != failed_before && why_down_ && !is_worth_waiting(why_down_->code);
-  };
-  static_cast<void>(run(deadline, false, [&] { return outbox_->all_written() || hopeless(); }));
+  const std::uint64_t before = failed_attempts_;
+  static_cast<void>(
+      run(deadline, false, [&] { return outbox_->all_written() || is_hopeless_since(before); }));
   if (outbox_->all_written()) return outbox_->written_tid();
-  if (hopeless()) return Error(*why_down_).context(what("write"));
+  if (is_hopeless_since(before)) return Error(*why_down_).context(what("write"));
   return away("did not take all samples in time; they are kept and sent when it does")
       .context(what("write"));
 }

@@ -89,6 +89,7 @@ class Channel final : private wire::FrameSink {
   Result<void> get_up(MonoTime deadline);
   // Sends the request, again after each reconnect, until it is answered.
   Result<void> exchange(net::Frame& request);
+  bool is_hopeless_since(std::uint64_t failed_before) const noexcept;
   Error away(const std::string& how) const;
   std::string what(const char* verb) const;
   MonoTime next_step() const noexcept;

@@ -153,6 +153,7 @@ void Client::offer_streams(Handshake& link) {
     StreamId id;
     Role role;
     std::uint32_t tag;
+    bool any_host;
     std::shared_ptr<const SharedRing> ring;
   };
   std::vector<Held> all_held;
@@ -160,7 +161,8 @@ void Client::offer_streams(Handshake& link) {
     const std::lock_guard guard(mutex_);
     for (const auto& [key, stream] : open_streams_) {
       stream->handle = 0;
-      all_held.push_back({key, stream->id, stream->role, stream->tag, stream->ring});
+      all_held.push_back(
+          {key, stream->id, stream->role, stream->tag, stream->asked.host.empty(), stream->ring});
     }
   }
   for (const Held& held : all_held) {
@@ -168,6 +170,7 @@ void Client::offer_streams(Handshake& link) {
     wire::to_message(held.id, *request.mutable_offer()->mutable_id());
     request.mutable_offer()->set_for_writing(held.role == Role::writer);
     request.mutable_offer()->set_tag(held.tag);
+    request.mutable_offer()->set_any_host(held.any_host);
     const int fds[] = {held.ring->ring_fd.get(), held.ring->bell_fd.get(), held.ring->meta_fd.get(),
                        held.ring->doorbell_fd.get()};
     auto opened =
@@ -352,6 +355,7 @@ Result<void> Client::register_stream(OpenStream& stream, const Answer& answer) {
   wire::to_message(stream.id, *request.mutable_offer()->mutable_id());
   request.mutable_offer()->set_for_writing(stream.role == Role::writer);
   request.mutable_offer()->set_tag(stream.tag);
+  request.mutable_offer()->set_any_host(stream.asked.host.empty());
   const SharedRing& ring = *stream.ring;
   const int fds[] = {ring.ring_fd.get(), ring.bell_fd.get(), ring.meta_fd.get(),
                      ring.doorbell_fd.get()};

@@ -319,6 +319,30 @@ TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
   expect_words(bad.error(), Errc::type_mismatch, {"anew", "8 bytes", "9 bytes"});
 }
 
+TEST(PConnectorRequest, AWaitForAStreamThatCannotBeUsedAnyMoreIsNoLoop) {
+  std::atomic<int> connections = 0;
+  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    ++connections;
+    peer.open(number == 0 ? 8 : 9, static_cast<std::uint64_t>(number) + 1);
+    if (number == 0) {
+      peer.subscribe(0);
+      return;
+    }
+    peer.wait_for_end();
+  });
+  auto con = open(daemon).value();
+  ASSERT_TRUE(con.subscribe({}));
+  Sample sample;
+  for (int i = 0; i < 5; ++i) {
+    const int before = connections;
+    ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
+    EXPECT_GT(connections, before) << "each time after one more attempt";
+    const auto status = con.next(sample.span(), sample.info);
+    ASSERT_FALSE(status);
+    EXPECT_NE(status.error().message.find("anew"), std::string::npos) << status.error().message;
+  }
+}
+
 TEST(PConnectorRequest, RefusesABufferOfAnotherSize) {
   const FakeDaemon daemon([&](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
   auto con = open(daemon).value();
@@ -729,6 +753,61 @@ TEST(PConnectorPublishing, WritesEachSampleOnceOverBrokenConnections) {
   ASSERT_EQ(owner.written.size(), 501u);
   for (std::int64_t i = 0; i <= 500; ++i) {
     EXPECT_EQ(owner.written[static_cast<std::size_t>(i)], text_of(i));
+  }
+}
+
+TEST(PConnectorPublishing, SendsNothingTwiceOnOneConnection) {
+  std::vector<std::int64_t> numbers;  // of the fake's thread until the connector is gone
+  {
+    const FakeDaemon daemon([&](FakePeer& peer, int) {
+      peer.open(8);
+      std::optional<net::Frame> start;
+      while (const auto frame = peer.take()) {
+        if (frame->has_start_publishing()) {
+          start = frame;  // answered late
+          continue;
+        }
+        numbers.push_back(frame->sample().tid());
+        if (numbers.size() == 100) Owner().answer_start(peer, *start);
+        Owner owner;
+        owner.last = frame->sample().tid();
+        owner.acknowledge(peer);
+      }
+    });
+    auto con = open(daemon).value();
+    for (std::int64_t i = 0; i < 300; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+    ASSERT_TRUE(con.flush(kNever));
+    for (std::int64_t i = 300; i < 310; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+    ASSERT_TRUE(con.flush(kNever));
+  }
+  ASSERT_EQ(numbers.size(), 310u);
+  for (std::int64_t i = 0; i < 310; ++i) EXPECT_EQ(numbers[static_cast<std::size_t>(i)], i);
+}
+
+TEST(PConnectorPublishing, NoticesABrokenConnectionByTheNextPosts) {
+  Owner owner;
+  {
+    const FakeDaemon daemon([&](FakePeer& peer, int number) {
+      peer.open(8);
+      while (const auto frame = peer.take()) {
+        if (frame->has_start_publishing()) {
+          owner.answer_start(peer, *frame);
+          continue;
+        }
+        owner.take(*frame);
+        owner.acknowledge(peer);
+        if (number == 0) return;
+      }
+    });
+    auto con = open(daemon).value();
+    int posts = 0;
+    while (con.counters().reconnects == 0) {
+      ASSERT_TRUE(con.post(bytes_of(text_of(posts++))));
+      ::poll(nullptr, 0, 1);  // a writer of 1 kHz
+    }
+    EXPECT_LT(posts, 200);
+    ASSERT_TRUE(con.flush(kNever));
+    EXPECT_EQ(owner.written.size(), static_cast<std::size_t>(posts));
   }
 }
 
