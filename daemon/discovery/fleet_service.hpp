@@ -46,7 +46,9 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
   ~FleetService();
 
   void observe(Fleet::Observer* observer) override { observer_ = observer; }
-  bool is_there(const StreamId& id) const override { return catalog_.has(id); }
+  bool is_there(const StreamId& id) const override {
+    return id.host.empty() ? catalog_.find_owner(id).has_value() : catalog_.has(id);
+  }
   void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) override;
   void open_writer(const StreamId& id, const CreatePlan* plan,
                    Then<OpenedRemoteWriter> then) override;

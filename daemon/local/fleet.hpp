@@ -37,7 +37,8 @@ class Fleet {
   };
   virtual void observe(Observer* observer) = 0;  // nullptr: none
 
-  // Whether the other host that `id` names is there and has such a stream.
+  // Whether the other host that `id` names is there and has such a stream; without a host: whether
+  // exactly one other host has one.
   virtual bool is_there(const StreamId& id) const = 0;
 
   // The mirror of a stream, filled with its history. Kept while its Stream is in the OpenTable, and

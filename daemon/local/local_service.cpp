@@ -277,7 +277,7 @@ void LocalService::on_stream_added(const Stream& stream) {
   broadcast(event);
   logger_.debug("stream '" + stream.id().str() + "' is there",
                 {.stream = stream.id().str(), .message_id = message_id::kStreamCreated});
-  tell_readers_of_gone(stream.id());
+  look_for_successors(stream.id());
 }
 
 void LocalService::on_stream_removed(const Stream& stream) {
@@ -288,13 +288,14 @@ void LocalService::on_stream_removed(const Stream& stream) {
   broadcast(event);
   logger_.debug("stream '" + id.str() + "' is removed",
                 {.stream = id.str(), .message_id = message_id::kStreamRemoved});
+  look_for_successors(id);
 }
 
 void LocalService::on_remote_stream_added(const StreamInfo& stream) {
   local::StreamEvent event;
   wire::to_message(stream, *event.mutable_stream());
   broadcast(event);
-  tell_readers_of_gone(stream.id);
+  look_for_successors(stream.id);
 }
 
 void LocalService::on_remote_stream_removed(const StreamId& id) {
@@ -302,27 +303,35 @@ void LocalService::on_remote_stream_removed(const StreamId& id) {
   event.set_removed(true);
   wire::to_message(id, *event.mutable_stream()->mutable_id());
   broadcast(event);
+  look_for_successors(id);
 }
 
 // --- rings with a successor
 // -----------------------------------------------------------------------
 
-void LocalService::on_ring_replaced(const Stream& stream) {
-  for (const OpenTable::Reading& reading : opens_.readers_of(stream)) {
-    // Sending may end connections, so each is looked for anew.
-    const auto client = clients_.find(reading.client);
-    if (client == clients_.end()) continue;
-    Reply event;
-    event.response.mutable_replaced()->set_handle(reading.number);
-    send(client->second, 0, std::move(event));
-  }
+void LocalService::tell_replaced(const OpenTable::Reading& reading) {
+  const auto client = clients_.find(reading.client);
+  if (client == clients_.end()) return;  // sending to another one may have ended this one
+  Reply event;
+  event.response.mutable_replaced()->set_handle(reading.number);
+  send(client->second, 0, std::move(event));
 }
 
-// A stream of that name is there: whoever reads one of the same name that will get no sample any
-// more goes on with it, if that is what an open by the name they used gives now.
-void LocalService::tell_readers_of_gone(const StreamId& successor) {
-  for (const auto& stream : opens_.open_streams(successor.name, successor.id)) {
-    if (is_gone(*stream)) on_ring_replaced(*stream);
+void LocalService::on_ring_replaced(const Stream& stream) {
+  for (const OpenTable::Reading& reading : opens_.readers_of(stream)) tell_replaced(reading);
+}
+
+// Streams with the name in `id` came or went. Whoever reads one of that name that will get no
+// sample any more is told when the name they used stands for another one now.
+void LocalService::look_for_successors(const StreamId& id) {
+  const StreamId any{id.name, id.id, ""};
+  const bool here = registry_.knows(any), elsewhere = fleet_ && fleet_->is_there(any);
+  for (const auto& stream : opens_.open_streams(id.name, id.id)) {
+    if (!is_gone(*stream)) continue;
+    const bool own = stream->id().host == registry_.host();
+    for (const OpenTable::Reading& reading : opens_.readers_of(*stream)) {
+      if (reading.any_host ? here || elsewhere : own && here) tell_replaced(reading);
+    }
   }
 }
 

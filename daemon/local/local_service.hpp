@@ -9,7 +9,8 @@
 //
 // A ring can get a successor: a stream is created anew under the name of a removed one, its owner
 // comes back without its rings, or another host has it now. Whoever reads the old ring is told
-// (Replaced) and opens the stream anew.
+// (Replaced) and opens the stream anew, by the name used the first time: so the stream may move to
+// another host only for those who named none.
 //
 // After a crash of the dssmd before this one, programs that still hold streams come back and offer
 // them. Until end_recovery() a request about a stream that nobody offered yet is held back, not
@@ -115,7 +116,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void on_remote_stream_added(const StreamInfo& stream) override;
   void on_remote_stream_removed(const StreamId& id) override;
   void on_ring_replaced(const Stream& stream) override;
-  void tell_readers_of_gone(const StreamId& successor);
+  void tell_replaced(const OpenTable::Reading& reading);
+  void look_for_successors(const StreamId& id);
   bool is_gone(const Stream& stream) const;
 
   Registry& registry_;

@@ -72,38 +72,40 @@ void RemoteRequests::create(const Client& client, const StreamId& id, const loca
   if (!type) return answer(type.error());
   if (Result<void> room = opens_.check_room(*client); !room) return answer(std::move(room).error());
   const CreatePlan plan{*type, {request.depth(), Duration(request.cycle_ns())}};
-  fleet_.open_writer(id, &plan,
-                     [this, client, tag = request.tag(),
-                      answer = std::move(answer)](Result<OpenedRemoteWriter> writer) {
-                       if (!writer) return answer(std::move(writer).error());
-                       Result<Reply> reply =
-                           opened(opens_, client, writer->stream, Role::writer, tag);
-                       if (reply) {
-                         reply->response.mutable_opened()->set_created(writer->created);
-                       }
-                       answer(std::move(reply));
-                     });
+  fleet_.open_writer(
+      id, &plan,
+      [this, client, tag = request.tag(),
+       answer = std::move(answer)](Result<OpenedRemoteWriter> writer) {
+        if (!writer) return answer(std::move(writer).error());
+        Result<Reply> reply = opened(opens_, {client, writer->stream, Role::writer, tag, false});
+        if (reply) {
+          reply->response.mutable_opened()->set_created(writer->created);
+        }
+        answer(std::move(reply));
+      });
 }
 
 void RemoteRequests::open(const Client& client, const StreamId& id, const local::Open& request,
                           Answer answer) {
   if (Result<void> room = opens_.check_room(*client); !room) return answer(std::move(room).error());
   const std::uint32_t tag = request.tag();
+  const bool any_host = id.host.empty();
   if (request.for_writing()) {
     return fleet_.open_writer(
         id, nullptr,
-        [this, client, tag, answer = std::move(answer)](Result<OpenedRemoteWriter> writer) {
+        [this, client, tag, any_host,
+         answer = std::move(answer)](Result<OpenedRemoteWriter> writer) {
           if (!writer) return answer(std::move(writer).error());
-          answer(opened(opens_, client, writer->stream, Role::writer, tag));
+          answer(opened(opens_, {client, writer->stream, Role::writer, tag, any_host}));
         });
   }
-  fleet_.open_reader(
-      id, [this, client, tag, answer = std::move(answer)](Result<std::shared_ptr<Stream>> stream) {
-        if (!stream) return answer(std::move(stream).error());
-        Result<Reply> reply = opened(opens_, client, *stream, Role::reader, tag);
-        if (reply) reply->response.mutable_opened()->set_mirror(true);
-        answer(std::move(reply));
-      });
+  fleet_.open_reader(id, [this, client, tag, any_host,
+                          answer = std::move(answer)](Result<std::shared_ptr<Stream>> stream) {
+    if (!stream) return answer(std::move(stream).error());
+    Result<Reply> reply = opened(opens_, {client, *stream, Role::reader, tag, any_host});
+    if (reply) reply->response.mutable_opened()->set_mirror(true);
+    answer(std::move(reply));
+  });
 }
 
 Result<Reply> RemoteRequests::offer(const Client& client, const StreamId& id,
@@ -115,7 +117,7 @@ Result<Reply> RemoteRequests::offer(const Client& client, const StreamId& id,
   const Result<std::shared_ptr<Stream>> stream =
       fleet_.adopt_untrusted(id, role, *std::move(files));
   if (!stream) return stream.error();
-  return noted_open(opens_, client, *stream, role, request.tag());
+  return noted_open(opens_, {client, *stream, role, request.tag(), request.any_host()});
 }
 
 void RemoteRequests::complete_list(Reply own, Answer answer) {

@@ -28,22 +28,20 @@ Result<OfferedFiles> offered_files(DescriptorQueue& queue, Role role) {
   return files;
 }
 
-Reply noted_open(OpenTable& opens, const std::shared_ptr<const ClientIdentity>& client,
-                 const std::shared_ptr<Stream>& stream, Role role, std::uint32_t tag) {
+Reply noted_open(OpenTable& opens, const OpenEntry& entry) {
   Reply reply;
   local::Opened& message = *reply.response.mutable_opened();
-  message.set_handle(opens.add({client, stream, role, tag}));
-  wire::to_message(stream->id(), *message.mutable_id());
-  wire::to_message(stream->type(), *message.mutable_type());
+  message.set_handle(opens.add(entry));
+  wire::to_message(entry.stream->id(), *message.mutable_id());
+  wire::to_message(entry.stream->type(), *message.mutable_type());
   return reply;
 }
 
-Result<Reply> opened(OpenTable& opens, const std::shared_ptr<const ClientIdentity>& client,
-                     const std::shared_ptr<Stream>& stream, Role role, std::uint32_t tag) {
-  if (Result<void> room = opens.check_room(*client); !room) return std::move(room).error();
-  Result<std::vector<UniqueFd>> descriptors = stream->descriptors_for(role);
+Result<Reply> opened(OpenTable& opens, const OpenEntry& entry) {
+  if (Result<void> room = opens.check_room(*entry.client); !room) return std::move(room).error();
+  Result<std::vector<UniqueFd>> descriptors = entry.stream->descriptors_for(entry.role);
   if (!descriptors) return std::move(descriptors).error();
-  Reply reply = noted_open(opens, client, stream, role, tag);
+  Reply reply = noted_open(opens, entry);
   reply.descriptors = *std::move(descriptors);
   return reply;
 }

@@ -37,13 +37,11 @@ std::vector<UniqueFd> take_descriptors(DescriptorQueue& queue);
 //   fails  protocol: some are missing
 Result<OfferedFiles> offered_files(DescriptorQueue& queue, Role role);
 
-// Notes that `client` has `stream` open and tells it so, without descriptors.
-Reply noted_open(OpenTable& opens, const std::shared_ptr<const ClientIdentity>& client,
-                 const std::shared_ptr<Stream>& stream, Role role, std::uint32_t tag);
+// Notes that a client has a stream open and tells it so, without descriptors.
+Reply noted_open(OpenTable& opens, const OpenEntry& entry);
 
 // The same, with the descriptors that go with a Create or an Open.
 //   fails  limit_exceeded (opens), os errors; then nothing is noted
-Result<Reply> opened(OpenTable& opens, const std::shared_ptr<const ClientIdentity>& client,
-                     const std::shared_ptr<Stream>& stream, Role role, std::uint32_t tag);
+Result<Reply> opened(OpenTable& opens, const OpenEntry& entry);
 
 }  // namespace dssm::daemon

@@ -86,7 +86,8 @@ Result<Reply> StreamRequests::create(const Client& client, const local::Create& 
   const Result<Registry::Created> created =
       registry_.create(*id, *type, {request.depth(), Duration(request.cycle_ns())}, client->pid);
   if (!created) return created.error();
-  Result<Reply> reply = opened(opens_, client, created->stream, Role::writer, request.tag());
+  Result<Reply> reply =
+      opened(opens_, {client, created->stream, Role::writer, request.tag(), id->host.empty()});
   if (reply) {
     reply->response.mutable_opened()->set_created(created->created);
   } else if (created->created) {
@@ -100,7 +101,7 @@ Result<Reply> StreamRequests::open(const Client& client, const local::Open& requ
   const Result<std::shared_ptr<Stream>> stream = find_untrusted(request.id());
   if (!stream) return stream.error();
   const Role role = request.for_writing() ? Role::writer : Role::reader;
-  return opened(opens_, client, *stream, role, request.tag());
+  return opened(opens_, {client, *stream, role, request.tag(), request.id().host().empty()});
 }
 
 Result<Reply> StreamRequests::offer(const Client& client, const local::Offer& request,
@@ -113,7 +114,7 @@ Result<Reply> StreamRequests::offer(const Client& client, const local::Offer& re
   if (Result<void> room = opens_.check_room(*client); !room) return std::move(room).error();
   const Result<std::shared_ptr<Stream>> stream = registry_.adopt_untrusted(*id, *std::move(files));
   if (!stream) return stream.error();
-  return noted_open(opens_, client, *stream, role, request.tag());
+  return noted_open(opens_, {client, *stream, role, request.tag(), request.any_host()});
 }
 
 Result<Reply> StreamRequests::close(const Client& client, const local::Close& request) {

@@ -82,7 +82,9 @@ std::vector<OpenTable::Reading> OpenTable::readers_of(const Stream& stream) cons
   if (found == by_stream_.end()) return readers;
   for (const OpenNumber number : found->second.opens) {
     const OpenEntry& entry = entries_.at(number);
-    if (entry.role == Role::reader) readers.push_back({entry.client->number, number});
+    if (entry.role == Role::reader) {
+      readers.push_back({entry.client->number, number, entry.any_host});
+    }
   }
   return readers;
 }

@@ -40,6 +40,7 @@ struct OpenEntry {
   std::shared_ptr<Stream> stream;
   Role role = Role::reader;
   std::uint32_t tag = 0;
+  bool any_host = false;  // opened by a name without a host
 };
 
 class OpenTable {
@@ -70,6 +71,7 @@ class OpenTable {
   struct Reading {
     ClientNumber client = 0;
     OpenNumber number = 0;
+    bool any_host = false;
   };
   std::vector<Reading> readers_of(const Stream& stream) const;
 

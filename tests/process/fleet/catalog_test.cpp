@@ -196,15 +196,32 @@ TEST_F(FleetCatalog, LetsReadersFollowAStreamThatMoves) {
   auto two = on2.create<double>("lidar", kHistory).value();
   two.write(2);
   Reader<double> reader = on1.await_reader<double>("lidar").value();
+  Reader<double> particular = on1.open_reader<double>("lidar@pc2").value();
   double sample = 0;
   SampleInfo info;
-  await([&] { return reader.latest(sample, info) == ReadStatus::ok; });
+  const auto await_value = [&](double value) {
+    await([&] { return reader.latest(sample, info) == ReadStatus::ok && sample == value; });
+  };
+  await_value(2);
   ASSERT_TRUE(on2.remove({"lidar", 0, ""}));
   await_list(on1, {});
   auto three = on3.create<double>("lidar", kHistory).value();
   three.write(3);
-  await([&] { return reader.latest(sample, info) == ReadStatus::ok && sample == 3; });
-  EXPECT_EQ(reader.restarts(), 1u);
+  await_value(3);
+  // The next one is there before the old one goes.
+  auto two_again = on2.create<double>("lidar", kHistory).value();
+  two_again.write(22);
+  await_list(on1, {"lidar:0@pc2", "lidar:0@pc3"});
+  EXPECT_EQ(particular.restarts(), 0u);
+  await([&] { return particular.latest(sample, info) == ReadStatus::ok && sample == 22; });
+  pc3.kill_hard();
+  await_value(22);
+  auto one = on1.create<double>("lidar", kHistory).value();
+  one.write(1);
+  ASSERT_TRUE(on2.remove({"lidar", 0, ""}));
+  await_value(1);
+  EXPECT_EQ(reader.restarts(), 3u);
+  EXPECT_EQ(particular.restarts(), 1u) << "only when its own host had a new ring";
 }
 
 // Its history is here, and goes on being here while its owner is away.

@@ -328,22 +328,53 @@ TEST_F(RemoteRequestsTest, TellsReadersWhenAnOwnStreamIsCreatedAnew) {
 }
 
 TEST_F(RemoteRequestsTest, TellsReadersOfAStreamThatMovedToAnotherHost) {
+  FakeClient particular(*service, 6);
+  particular.greet();
+  const auto ring = fleet.ring("lidar");
   put(open_request("lidar"));
-  fleet.reader_then(fleet.ring("lidar"));
+  fleet.reader_then(ring);
   const std::uint64_t handle = client->next().opened().handle();
-  fleet.there = {"lidar:0@pc2"};
+  local::Request named = open_at("lidar", "pc2");
+  named.set_serial(50);
+  particular.put(named);
+  fleet.reader_then(ring);
+  EXPECT_TRUE(particular.next().has_opened());
+
+  fleet.there = {"lidar:0@pc2", "lidar:0"};
   fleet.observer->on_remote_stream_added(lidar_at("pc2"));
   EXPECT_TRUE(client->received.empty()) << "it is the one that is read";
+  fleet.there = {"lidar:0@pc2", "lidar:0@pc3"};
   fleet.observer->on_remote_stream_added(lidar_at("pc3"));
   EXPECT_TRUE(client->received.empty()) << "the one that is read is still there";
-  fleet.there.clear();
+  fleet.there = {"lidar:0@pc3", "lidar:0"};
   fleet.observer->on_remote_stream_removed({"lidar", 0, "pc2"});
-  EXPECT_TRUE(client->received.empty());
-  fleet.there = {"lidar:0@pc3"};
-  fleet.observer->on_remote_stream_added(lidar_at("pc3"));
+  EXPECT_EQ(client->next().replaced().handle(), handle) << "now the name means the other";
+  fleet.there.clear();
+  fleet.observer->on_remote_stream_removed({"lidar", 0, "pc3"});
+  EXPECT_TRUE(client->received.empty()) << "there is none";
+  fleet.there = {"lidar:0@pc4", "lidar:0"};
+  fleet.observer->on_remote_stream_added(lidar_at("pc4"));
   EXPECT_EQ(client->next().replaced().handle(), handle);
   fleet.there.clear();
   EXPECT_EQ(client->ask(create_request("lidar")).replaced().handle(), handle) << "and home again";
+  EXPECT_TRUE(particular.received.empty()) << "who names a host wants no other";
+}
+
+TEST_F(RemoteRequestsTest, TellsReadersOfAnOwnStreamThatMovedAway) {
+  client->ask(create_request("lidar"));
+  const std::uint64_t any = client->ask(open_request("lidar")).opened().handle();
+  const std::uint64_t own = client->ask(open_at("lidar", "pc1")).opened().handle();
+  fleet.there = {"lidar:0@pc2", "lidar:0"};
+  fleet.observer->on_remote_stream_added(lidar_at("pc2"));
+  EXPECT_TRUE(client->received.empty());
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("lidar");
+  EXPECT_EQ(client->ask(remove).replaced().handle(), any);
+  EXPECT_TRUE(client->next().has_done());
+  EXPECT_TRUE(client->received.empty());
+  fleet.there.clear();
+  EXPECT_EQ(client->ask(create_request("lidar")).replaced().handle(), any);
+  EXPECT_EQ(client->next().replaced().handle(), own);
 }
 
 // --- after a restart of dssmd
@@ -374,12 +405,14 @@ TEST_F(RecoveringRequestsTest, GiveBackWhatBelongsToAnotherHost) {
   local::Request offer;
   offer.mutable_offer()->mutable_id()->set_name("lidar");
   offer.mutable_offer()->mutable_id()->set_host("pc2");
+  offer.mutable_offer()->set_any_host(true);
   client->offered.push_back(std::move(kept));
   const local::Response answer = client->ask(offer);
   EXPECT_TRUE(answer.has_opened()) << answer.failure().message();
   EXPECT_TRUE(client->last_descriptors.empty());
   EXPECT_EQ(fleet.asked, Asked{"adopt reader lidar:0@pc2"});
-  EXPECT_EQ(opens.entries().size(), 1u);
+  ASSERT_EQ(opens.entries().size(), 1u);
+  EXPECT_TRUE(opens.entries().begin()->second.any_host) << "as it was opened";
   EXPECT_TRUE(registry.streams().empty()) << "it is none of ours";
   EXPECT_EQ(client->ask(offer).failure().code(), "protocol") << "without its descriptors";
 }
