@@ -123,6 +123,28 @@ TEST_F(Hosts, MirrorsResumeAtTheirTidAfterACut) {
   EXPECT_EQ(info.mirror->received_samples, 3100u) << "each came once";
 }
 
+TEST_F(Hosts, MirrorsResumeAtTheirTidAfterADssmdWasKilled) {
+  if (!make_fleet(2)) return;
+  Session owner = fleet->session(1), there = fleet->session(2);
+  const KnownStream known = small("kept", 4096);
+  RawWriter writer = make(owner, known);
+  write_until(writer, known, 99);
+  RawReader reader = there.await_raw_reader(known.id, kNever).value();
+  reader.seek(kNoTid);
+  expect_samples(reader, known, 0, 99);
+  Tid last = 99;
+  for (const std::vector<int>& killed : std::vector<std::vector<int>>{{1}, {2}, {1, 2}, {1}}) {
+    for (const int host : killed) fleet->kill_dssmd(host);
+    write_until(writer, known, last + 500);
+    for (const int host : killed) fleet->start_dssmd(host);
+    write_until(writer, known, last + 900);
+    expect_samples(reader, known, last + 1, last + 900);
+    last += 900;
+  }
+  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.restarts(), 0u);
+}
+
 // Shorter than anybody would notice: TCP itself sends again.
 TEST_F(Hosts, ShortCutsLoseNothing) {
   if (!make_fleet(2)) return;
