@@ -50,6 +50,7 @@ Result<void> run(const Config& config, Logger& logger) {
   raise_descriptor_limit();
   ignore_broken_pipes();
   silence_protobuf();
+  return_large_memory();
   const Result<RuntimeDir> dir = RuntimeDir::open(config.runtime_dir);
   if (!dir) return dir.error();
   Result<EventLoop> loop = EventLoop::open();

@@ -43,6 +43,12 @@ FrameLink::FrameLink(const EventLoop& loop, std::unique_ptr<wire::Transport> tra
 
 FrameLink::~FrameLink() = default;
 
+std::span<const std::byte> FrameLink::Outgoing::unsent() const noexcept {
+  const auto* text = std::get_if<std::string>(&bytes);
+  const auto all = text ? std::as_bytes(std::span(*text)) : std::get_if<RawBytes>(&bytes)->span();
+  return all.subspan(sent);
+}
+
 void FrameLink::set_payload_bytes(std::size_t payload_bytes) noexcept {
   decoder_.set_payload_bytes(payload_bytes);
 }
@@ -154,33 +160,32 @@ void FrameLink::resume() {
 
 void FrameLink::send(const net::Frame& frame) {
   if (closed_ || output_lost_) return;
-  const std::string encoded = wire::encode_frame(frame);
-  std::span<const std::byte> rest = std::as_bytes(std::span(encoded));
+  Outgoing outgoing{wire::encode_frame(frame), 0, true, {}};
+  const std::size_t bytes = outgoing.unsent().size();
   if (output_.empty() && !mid_frame_) {
-    const iovec part = part_of(rest);
-    rest = rest.subspan(transmit({&part, 1}, false));
-    if (rest.empty() || closed_ || output_lost_) return;
+    const iovec part = part_of(outgoing.unsent());
+    outgoing.sent = transmit({&part, 1}, false);
+    if (outgoing.sent == bytes || closed_ || output_lost_) return;
   }
-  if (queued_bytes_ + rest.size() > max_queued_bytes_) {
+  if (queued_bytes_ + bytes > max_queued_bytes_) {
     return close_with(
         {Errc::limit_exceeded, "the other side does not read: " + std::to_string(queued_bytes_) +
-                                   " bytes wait for it, and " + std::to_string(rest.size()) +
+                                   " bytes wait for it, and " + std::to_string(bytes) +
                                    " more would be above the limit of " +
                                    std::to_string(max_queued_bytes_)});
   }
-  Outgoing outgoing{RawBytes::copy_of(rest), 0, true, {}};
   if (budget_) {
-    std::optional<MemoryShare> share = budget_->try_take(rest.size());
+    std::optional<MemoryShare> share = budget_->try_take(bytes);
     if (!share) {
       return close_with(
           {Errc::limit_exceeded,
-           "the other side does not read: no memory is left for " + std::to_string(rest.size()) +
+           "the other side does not read: no memory is left for " + std::to_string(bytes) +
                " bytes more of max_peer_memory = " + std::to_string(budget_->limit()) +
                " bytes; read faster, use fewer connections, or raise that key"});
     }
     outgoing.share = *std::move(share);
   }
-  queued_bytes_ += rest.size();
+  queued_bytes_ += bytes;
   enqueue(std::move(outgoing));
 }
 
@@ -225,7 +230,7 @@ bool FrameLink::flush() {
     std::size_t count = 0, bytes = 0;
     for (const Outgoing& next : output_) {
       if (count == parts.size()) break;
-      parts[count] = part_of(std::as_const(next.bytes).span().subspan(next.sent));
+      parts[count] = part_of(next.unsent());
       bytes += parts[count++].iov_len;
     }
     std::size_t sent = transmit(std::span(parts).first(count), false);
@@ -233,11 +238,11 @@ bool FrameLink::flush() {
     const bool all = sent == bytes;
     while (!output_.empty()) {
       Outgoing& next = output_.front();
-      const std::size_t step = std::min(sent, next.bytes.size() - next.sent);
+      const std::size_t step = std::min(sent, next.unsent().size());
       next.sent += step;
       sent -= step;
-      if (next.sent < next.bytes.size()) break;
-      if (next.counted) queued_bytes_ -= next.bytes.size();
+      if (!next.unsent().empty()) break;
+      if (next.counted) queued_bytes_ -= next.sent;
       output_.pop_front();
     }
     if (!all) return false;

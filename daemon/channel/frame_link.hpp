@@ -13,6 +13,8 @@
 #include <deque>
 #include <memory>
 #include <span>
+#include <string>
+#include <variant>
 
 #include "core/wire/frame_decoder.hpp"
 #include "core/wire/transport.hpp"
@@ -103,10 +105,12 @@ class FrameLink final : private wire::FrameSink {
 
  private:
   struct Outgoing {
-    RawBytes bytes;
+    std::variant<std::string, RawBytes> bytes;  // a frame; a rest
     std::size_t sent = 0;
     bool counted = false;  // against max_queued_bytes_
     MemoryShare share;
+
+    std::span<const std::byte> unsent() const noexcept;
   };
 
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;

@@ -2,6 +2,7 @@
 #include "daemon/service/process.hpp"
 
 #include <google/protobuf/stubs/logging.h>
+#include <malloc.h>
 #include <signal.h>
 #include <sys/resource.h>
 
@@ -17,5 +18,12 @@ void raise_descriptor_limit() noexcept {
 void ignore_broken_pipes() noexcept { ::signal(SIGPIPE, SIG_IGN); }
 
 void silence_protobuf() noexcept { google::protobuf::SetLogHandler(nullptr); }
+
+// Pieces up to 4 MiB, which samples that wait for a slow network need often, are kept: page faults
+// cost as much as copying.
+void return_large_memory() noexcept {
+  ::mallopt(M_MMAP_THRESHOLD, 4 << 20);
+  ::mallopt(M_TRIM_THRESHOLD, 8 << 20);
+}
 
 }  // namespace dssm::daemon

@@ -16,4 +16,8 @@ void ignore_broken_pipes() noexcept;
 // waiting where nobody reads stderr. dssmd says itself what it refuses.
 void silence_protobuf() noexcept;
 
+// What is freed in large pieces goes back to the system at once: otherwise the C library learns
+// from a few answers of 16 MiB to keep such pieces, and what peers made dssmd use stays used.
+void return_large_memory() noexcept;
+
 }  // namespace dssm::daemon

@@ -1,0 +1,272 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Channels of a running dssmd over real sockets: every sample once, large ones, lapped readers,
+// publishing over connections that break.
+#include <gtest/gtest.h>
+#include <sys/socket.h>
+
+#include <map>
+#include <random>
+#include <thread>
+
+#include "core/ring/ring_reader.hpp"
+#include "tests/process/channel/raw_peer.hpp"
+
+namespace dssm::test {
+namespace {
+
+// Takes a subscription's frames: in order, whole, and every tid either there or in a gap.
+struct Judge {
+  Tid next = kNoTid;
+  std::uint64_t samples = 0, lost = 0, torn = 0;
+  bool caught_up = false;
+
+  void take(const Received& received) {
+    if (received.frame.has_caught_up()) caught_up = true;
+    if (received.frame.has_subscribed()) next = received.frame.subscribed().first_tid();
+    if (received.frame.has_gap()) {
+      EXPECT_EQ(received.frame.gap().first_tid(), next);
+      next += static_cast<Tid>(received.frame.gap().count());
+      lost += received.frame.gap().count();
+    }
+    if (!received.frame.has_sample()) return;
+    if (received.torn) {
+      ++torn;
+      return;
+    }
+    const Tid tid = received.frame.sample().tid();
+    EXPECT_EQ(tid, next);
+    EXPECT_EQ(received.frame.sample().time_ns(), 1'000'000 + tid * 1000);
+    EXPECT_TRUE(is_payload_of(tid, received.payload)) << "sample " << tid;
+    next = tid + 1;
+    ++samples;
+  }
+  // Until sample `last` was there or is lost.
+  void take_up_to(RawPeer& peer, Tid last) {
+    while (next <= last) {
+      const Received received = peer.receive();
+      ASSERT_FALSE(received.ended);
+      take(received);
+    }
+  }
+};
+
+class Channel : public testing::Test {
+ protected:
+  DaemonProcess daemon_{{"--log-level", "warning"}};
+  RawClient local_{daemon_.socket_path()};
+};
+
+TEST_F(Channel, BringsEverySampleOnceWhileTheWriterWrites) {
+  for (const std::size_t bytes : {64u, 20'000u}) {
+    const int count = bytes == 64 ? 100'000 : 3000;
+    LocalWriter writer(local_, "s" + std::to_string(bytes), bytes, bytes == 64 ? 131'072 : 4096);
+    writer.write(count / 10);
+    RawPeer peer(daemon_.address());
+    peer.open("s" + std::to_string(bytes));
+    peer.send([&] {
+      net::Frame frame = subscribe_from_oldest();
+      frame.set_serial(1000);
+      return frame;
+    }());
+    std::thread writing([&] { writer.write(count - count / 10); });
+    Judge judge;
+    judge.take_up_to(peer, count - 1);
+    writing.join();
+    EXPECT_EQ(judge.samples, static_cast<std::uint64_t>(count));
+    EXPECT_EQ(judge.lost, 0u);
+    EXPECT_TRUE(judge.caught_up);
+  }
+}
+
+// A writer that wraps around the ring all the time, and a reader that does not keep up.
+TEST_F(Channel, SkipsALappedReaderForwardAndCountsExactly) {
+  for (const bool torn : {true, false}) {
+    for (const std::size_t bytes : {100u, 50'000u, 3'000'000u}) {
+      const std::string name = "lap" + std::to_string(bytes) + (torn ? "t" : "");
+      LocalWriter writer(local_, name, bytes, 6);
+      RawPeer peer(daemon_.address(), true, torn);
+      peer.open(name);
+      Judge judge;
+      judge.take(peer.ask(subscribe_from_oldest()));
+      const int count = bytes > 1'000'000 ? 100 : 3000;
+      std::thread writing([&] { writer.write(count); });
+      judge.take_up_to(peer, count - 1);
+      writing.join();
+      EXPECT_EQ(judge.samples + judge.lost, static_cast<std::uint64_t>(count));
+      EXPECT_GT(judge.samples, 0u);
+      EXPECT_TRUE(torn || judge.torn == 0);
+    }
+  }
+}
+
+TEST_F(Channel, CarriesTheLargestAndTheSmallestSamples) {
+  for (const std::size_t bytes : {std::size_t{1}, std::size_t{64} << 20}) {
+    const std::string name = "size" + std::to_string(bytes);
+    RawPeer publisher(daemon_.address()), reader(daemon_.address());
+    EXPECT_TRUE(publisher.create(name, bytes, 3).created());
+    reader.open(name);
+    Judge judge;
+    judge.take(reader.ask(subscribe_from_oldest()));
+    net::Frame start;
+    start.mutable_start_publishing()->set_publisher(5);
+    const Received started = publisher.ask(start);
+    ASSERT_TRUE(started.frame.has_publishing()) << started.frame.failure().message();
+    std::vector<std::byte> payload(bytes);
+    for (Tid tid = 0; tid < 3; ++tid) {
+      fill_payload(tid, payload);
+      publisher.send_sample(tid, payload, time_from_ns(1'000'000 + tid * 1000),
+                            static_cast<std::uint64_t>(tid) + 100);
+      const Received published = publisher.receive();
+      EXPECT_EQ(published.frame.published().last_tid(), tid) << published.frame.failure().message();
+      judge.take_up_to(reader, tid);
+    }
+    EXPECT_EQ(judge.samples, 3u);
+    net::Frame read;
+    read.mutable_read()->set_tid(2);
+    const Received answer = reader.ask(read);
+    EXPECT_TRUE(is_payload_of(2, answer.payload));
+    EXPECT_EQ(answer.payload.size(), bytes);
+  }
+}
+
+TEST_F(Channel, WritesEachPublishedSampleOnceThoughConnectionsBreakAnywhere) {
+  const auto seed = std::random_device()();
+  SCOPED_TRACE("seed " + std::to_string(seed));
+  std::mt19937 random(seed);
+  constexpr std::int64_t kSamples = 5000;
+  RawPeer(daemon_.address()).create("once", 40, 8192);
+  std::vector<std::byte> payload(40);
+  int connections = 0;
+  for (std::int64_t acknowledged = -1; acknowledged < kSamples - 1; ++connections) {
+    RawPeer peer(daemon_.address());
+    peer.open("once");
+    net::Frame start;
+    start.mutable_start_publishing()->set_publisher(77);
+    const std::int64_t last = peer.ask(start).frame.publishing().last();
+    EXPECT_GE(last, acknowledged);
+    acknowledged = last;
+    // Some samples, the last of them cut off somewhere, and no waiting for what is acknowledged.
+    const std::int64_t end = std::min<std::int64_t>(kSamples, last + 1 + random() % 400);
+    for (std::int64_t number = last + 1; number < end; ++number) {
+      fill_payload(number, payload);
+      peer.send_sample(number, payload, time_from_ns(1'000'000 + number * 1000));
+    }
+    if (random() % 2) peer.send_bytes(std::string_view("\x49\x12\x1b\x09").substr(0, random() % 4));
+    if (random() % 2) ::shutdown(peer.fd(), SHUT_WR);
+  }
+  EXPECT_GT(connections, 10);
+  RawPeer reader(daemon_.address());
+  reader.open("once");
+  Judge judge;
+  judge.take(reader.ask(subscribe_from_oldest()));
+  while (!judge.caught_up) judge.take(reader.receive());  // bytes and times are checked by tid
+  EXPECT_EQ(judge.samples, static_cast<std::uint64_t>(kSamples));
+}
+
+TEST_F(Channel, WakesLocalReadersOfWhatIsPublished) {
+  RawPeer publisher(daemon_.address());
+  publisher.create("wake", 16, 8);
+  net::Frame start;
+  start.mutable_start_publishing()->set_publisher(1);
+  publisher.ask(start);
+  const Answer opened = local_.ask(open_request("wake"));
+  const auto mapping =
+      ring::RingMapping::open_untrusted(opened.descriptors.at(0).get(), ring::Access::read_only)
+          .value();
+  const auto bell = ring::Bell::open_untrusted(opened.descriptors.at(1).get()).value();
+  const ring::RingReader reader(*mapping);
+  const std::uint32_t announced = bell->announce();
+  ASSERT_EQ(reader.newest(), kNoTid);
+  publisher.send_sample(0, std::vector<std::byte>(16), {});
+  while (reader.newest() == kNoTid) {
+    ASSERT_NE(bell->sleep(announced, deadline_in(std::chrono::seconds(kPatienceSeconds))),
+              WaitStatus::timeout);
+  }
+}
+
+TEST_F(Channel, GoesOnWithTheRingThatAWriterKeptOverARestart) {
+  LocalWriter writer(local_, "kept", 64, 1024);
+  writer.write(10);
+  {
+    RawPeer peer(daemon_.address());
+    EXPECT_EQ(peer.open("kept").stream().newest(), 9);
+  }
+  daemon_.kill_hard();
+  writer.write(5);
+  daemon_.start();
+  // While programs give their streams back nobody else can take their names.
+  RawPeer early(daemon_.address(), false);
+  early.send(network_hello());
+  RawClient again(daemon_.socket_path());
+  EXPECT_EQ(again.ask(create_request("other")).response.has_opened(), true);
+  EXPECT_TRUE(early.receive().frame.has_hello());
+}
+
+// --- many kinds of peers
+// --------------------------------------------------------------------------
+
+TEST_F(Channel, TellsAllAboutTheStreamsOfItsHost) {
+  LocalWriter writer(local_, "a", 16, 32);
+  writer.write(3);
+  RawPeer control(daemon_.address()), channel(daemon_.address());
+  EXPECT_EQ(control.server().host(), "pc1");
+  EXPECT_EQ(control.server().program(), "dssmd");
+  EXPECT_EQ(control.server().host_id().size(), 16u);
+  EXPECT_NE(control.server().life(), 0u);
+  channel.open("a");
+  net::Frame info;
+  info.mutable_info()->mutable_id()->set_name("a");
+  const Received told = control.ask(info);
+  ASSERT_EQ(told.frame.stream_list().streams_size(), 1);
+  const proto::Stream& stream = told.frame.stream_list().streams(0);
+  EXPECT_EQ(stream.newest(), 2);
+  EXPECT_EQ(stream.writers(), 1u);
+  EXPECT_EQ(stream.channels(), 1u);
+  ASSERT_EQ(stream.users_size(), 1);
+  EXPECT_EQ(stream.users(0).pid(), ::getpid());
+  net::Frame watch;
+  watch.mutable_watch();
+  watch.set_serial(500);
+  control.send(watch);
+  EXPECT_EQ(control.receive().frame.stream_event().stream().id().name(), "a");
+  EXPECT_TRUE(control.receive().frame.has_done());
+  local_.ask(create_request("b"));
+  EXPECT_EQ(control.receive().frame.stream_event().stream().id().name(), "b");
+  net::Frame remove;
+  remove.mutable_remove()->mutable_id()->set_name("a");
+  EXPECT_TRUE(control.ask(remove).frame.has_done());
+  EXPECT_TRUE(channel.receive().frame.ended().removed());
+}
+
+TEST(ChannelAddresses, MayBeIPv6AndSeveral) {
+  if (::access("/proc/net/if_inet6", F_OK)) GTEST_SKIP() << "this kernel has no IPv6";
+  const DaemonProcess daemon({"--listen", "127.0.0.1:0", "--listen", "[::1]:0"});
+  ASSERT_EQ(daemon.addresses().size(), 2u);
+  EXPECT_TRUE(daemon.addresses()[1].starts_with("[::1]:")) << daemon.addresses()[1];
+  for (const std::string& address : daemon.addresses()) {
+    RawPeer peer(address);
+    EXPECT_TRUE(peer.ask(network_list()).frame.has_stream_list());
+  }
+}
+
+TEST(ChannelAddresses, ThatAreConfiguredMustBeFree) {
+  const DaemonProcess first;
+  const std::string dir = make_temp_dir();
+  const Finished second = run(
+      {built("daemon/dssmd"), "--runtime-dir", dir, "--name", "pc2", "--listen", first.address()});
+  EXPECT_EQ(second.exit_status, 1);
+  EXPECT_NE(second.err.find("'" + first.address() + "'"), std::string::npos) << second.err;
+  remove_tree(dir);
+}
+
+TEST(ChannelAddresses, BeyondThisPcTakeInsecure) {
+  const Finished refused = run({built("daemon/dssmd"), "--check-config", "--listen", "0.0.0.0:0"});
+  EXPECT_EQ(refused.exit_status, 2);
+  EXPECT_NE(refused.err.find("insecure = true"), std::string::npos) << refused.err;
+  const DaemonProcess open({"--listen", "0.0.0.0:0", "--insecure"});
+  EXPECT_TRUE(open.address().starts_with("0.0.0.0:")) << open.address();
+}
+
+}  // namespace
+}  // namespace dssm::test
