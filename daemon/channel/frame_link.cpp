@@ -167,21 +167,25 @@ void FrameLink::send(const net::Frame& frame) {
     outgoing.sent = transmit({&part, 1}, false);
     if (outgoing.sent == bytes || closed_ || output_lost_) return;
   }
+  // Last words cannot stand in the middle of a frame.
+  const auto refuse = [&](const Error& why) {
+    mid_frame_ = mid_frame_ || outgoing.sent > 0;
+    close_with(why);
+  };
   if (queued_bytes_ + bytes > max_queued_bytes_) {
-    return close_with(
-        {Errc::limit_exceeded, "the other side does not read: " + std::to_string(queued_bytes_) +
-                                   " bytes wait for it, and " + std::to_string(bytes) +
-                                   " more would be above the limit of " +
-                                   std::to_string(max_queued_bytes_)});
+    return refuse({Errc::limit_exceeded,
+                   "the other side does not read: " + std::to_string(queued_bytes_) +
+                       " bytes wait for it, and " + std::to_string(bytes) +
+                       " more would be above the limit of " + std::to_string(max_queued_bytes_)});
   }
   if (budget_) {
     std::optional<MemoryShare> share = budget_->try_take(bytes);
     if (!share) {
-      return close_with(
-          {Errc::limit_exceeded,
-           "the other side does not read: no memory is left for " + std::to_string(bytes) +
-               " bytes more of max_peer_memory = " + std::to_string(budget_->limit()) +
-               " bytes; read faster, use fewer connections, or raise that key"});
+      return refuse({Errc::limit_exceeded,
+                     "the other side does not read: no memory is left for " +
+                         std::to_string(bytes) +
+                         " bytes more of max_peer_memory = " + std::to_string(budget_->limit()) +
+                         " bytes; read faster, use fewer connections, or raise that key"});
     }
     outgoing.share = *std::move(share);
   }
