@@ -60,21 +60,24 @@ bool ReaderState::restart() noexcept {
         std::move(usable).error().context("go on with the new ring of '" + (*anew)->id.str() + "'");
     return false;
   }
-  if ((*anew)->ring->mapping->identity().incarnation ==
-      stream->ring->mapping->identity().incarnation) {
-    return false;  // asked too early: try again
-  }
+  if ((*anew)->ring == stream->ring) return false;  // asked too early: try again
+  // A mirror that was made anew, because dssmd lost the old one, has the same samples with the same
+  // tids: nobody needs to be told.
+  const bool same_samples = (*anew)->ring->mapping->identity().incarnation ==
+                            stream->ring->mapping->identity().incarnation;
   previous = stream->ring;
   {
     const std::lock_guard guard(stream_mutex);
     stream = *std::move(anew);
   }
   ring = ring::RingReader(*stream->ring->mapping);
-  cursor = kNoTid;  // next() goes on with the first sample of the new ring; a fresh reader stays so
   next_attempt_ns = 0;
-  ++restarts;
-  if (ready) client.notifiers().follow(*ready, {stream->ring, stream->superseded, kNoTid});
-  return true;
+  if (!same_samples) {
+    cursor = kNoTid;  // next() goes on with the first sample there; a fresh reader stays so
+    ++restarts;
+  }
+  if (ready) client.notifiers().follow(*ready, {stream->ring, stream->superseded, cursor});
+  return !same_samples;
 }
 
 std::shared_ptr<OpenStream> ReaderState::stream_now() const {

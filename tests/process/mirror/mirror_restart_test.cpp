@@ -4,6 +4,8 @@
 // What the owner's ring still holds when the link is back arrives, once and in order; what it does
 // not hold is a gap of exactly that many samples.
 #include <csignal>
+#include <cstdio>
+#include <cstdlib>
 
 #include "tests/process/mirror/two_hosts.hpp"
 
@@ -177,6 +179,40 @@ TEST_F(TwoHosts, FindEachOtherAgainWhenBothDaemonsAreKilled) {
   reading.await_taken(writing.stop());
   EXPECT_EQ(reader.lost(), 0u);
   EXPECT_EQ(reader.restarts(), 0u);
+}
+
+// Somebody opens the stream before the program that holds its mirror has offered that: there is a
+// new mirror then, and the program goes on with it, at the very sample it was.
+TEST_F(TwoHosts, GoOnWithAMirrorThatWasMadeMeanwhile) {
+  auto writer = here.create<Counted>("load", kLong).value();
+  int lines[2];
+  ASSERT_EQ(::pipe2(lines, O_CLOEXEC), 0);
+  const pid_t holder = start({built("client/dssmctl/dssmctl"), "echo", "--csv", "load@pc1"},
+                             {pc2.environment()}, lines[1]);
+  ::close(lines[1]);
+  std::FILE* out = ::fdopen(lines[0], "r");
+  char line[4096];
+  ASSERT_TRUE(std::fgets(line, sizeof line, out)) << "the names of the columns";
+  const auto expect_line = [&](std::int64_t tid) {
+    ASSERT_TRUE(std::fgets(line, sizeof line, out));
+    EXPECT_EQ(std::strtoll(line, nullptr, 10), tid) << line;
+  };
+  writer.write(counted(0));
+  expect_line(0);
+  ::kill(holder, SIGSTOP);
+  pc2.kill_hard();
+  pc2.start();
+  writer.write(counted(1));
+  await_state(there, pc1, "up");
+  auto eager = there.open_reader<Counted>("load@pc1").value();
+  ::kill(holder, SIGCONT);
+  expect_line(1);
+  writer.write(counted(2));
+  expect_line(2);
+  EXPECT_EQ(channels("load"), 1u);
+  ::kill(holder, SIGKILL);
+  wait_for(holder);
+  std::fclose(out);
 }
 
 TEST_F(TwoHosts, SayThatAHostDoesNotAnswer) {
