@@ -108,7 +108,7 @@ void FakeDaemon::serve(const std::function<void(FakePeer&, int)>& script) {
   for (int number = 0;; ++number) {
     pollfd ready{listener_.get(), POLLIN, 0};
     while (::poll(&ready, 1, -1) < 0) continue;
-    const UniqueFd socket(::accept4(listener_.get(), nullptr, nullptr, SOCK_CLOEXEC));
+    UniqueFd socket(::accept4(listener_.get(), nullptr, nullptr, SOCK_CLOEXEC));
     if (stop_ || !socket) return;
     wire::set_channel_options(socket.get());
     connected_ = socket.get();
@@ -117,6 +117,8 @@ void FakeDaemon::serve(const std::function<void(FakePeer&, int)>& script) {
       script(peer, number);
     }
     connected_ = -1;
+    socket.reset();
+    ++ended_;
   }
 }
 

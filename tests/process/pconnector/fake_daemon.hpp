@@ -52,6 +52,8 @@ class FakeDaemon {
   ~FakeDaemon();
 
   const std::string& address() const { return address_; }
+  // How many connections the script has ended.
+  int ended() const { return ended_; }
   // Hangs up on whoever is connected.
   void hang_up();
 
@@ -61,6 +63,7 @@ class FakeDaemon {
   UniqueFd listener_;
   std::string address_;
   std::atomic<int> connected_{-1};
+  std::atomic<int> ended_{0};
   std::atomic<bool> stop_{false};
   std::thread thread_;
 };
