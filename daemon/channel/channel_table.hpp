@@ -3,7 +3,8 @@
 // What this dssmd keeps for streams of other hosts, one per stream: mirrors in one table, remote
 // writers in another. Finds or makes the entry for a stream, tells each what the catalog knows of
 // its owner, and destroys those that are done. An entry is known by the name, id and host's name of
-// its stream, as programs write them.
+// its stream, as programs write them; where several rings of one stream may be in use, further ones
+// are numbered.
 #pragma once
 
 #include <functional>
@@ -62,7 +63,7 @@ class ChannelTable final : private CatalogObserver {
   //   fails  limit_exceeded, conflict
   Result<Kept*> find_or_make(const KnownHost& host, const StreamId& id) {
     const StreamId full{id.name, id.id, host.greeting.host};
-    const Result<Kept*> found = find_or_make(full);
+    const Result<Kept*> found = find_or_make(key_of(full));
     if (!found) return found;
     OwnerChannel& channel = (*found)->channel();
     if (channel.owner() && *channel.owner() != host.greeting.host_id &&
@@ -76,36 +77,44 @@ class ChannelTable final : private CatalogObserver {
     return found;
   }
 
-  // The entry for a ring that `take` brings: a stream whose owner may not be known yet.
+  // Gives a ring that a program kept to the entry that has it already, or to a new one: `take`
+  // does, and fails with conflict when the entry has another ring. The owner may not be known yet.
+  //   side_by_side  several rings of one stream may be in use; else only the first entry is asked
+  //   fails         as take; limit_exceeded
   Result<std::shared_ptr<Stream>> adopt(
-      const StreamId& id, const std::function<Result<std::shared_ptr<Stream>>(Kept&)>& take) {
-    const Result<Kept*> found = find_or_make(id);
-    if (!found) return found.error();
-    Kept& kept = **found;
-    Result<std::shared_ptr<Stream>> stream = take(kept);
-    if (!kept.has_use()) {
-      entries_.erase(key_of(id));
-    } else if (!kept.channel().owner()) {
-      // Else it comes up later.
-      if (const auto host = catalog_.find_host(id.host)) kept.channel().connect(**host);
+      const StreamId& id, bool side_by_side,
+      const std::function<Result<std::shared_ptr<Stream>>(Kept&)>& take) {
+    Key key = key_of(id);
+    for (;; ++std::get<3>(key)) {
+      const Result<Kept*> found = find_or_make(key);
+      if (!found) return found.error();
+      Kept& kept = **found;
+      Result<std::shared_ptr<Stream>> stream = take(kept);
+      if (side_by_side && !stream && stream.error().code == Errc::conflict) continue;
+      if (!kept.has_use()) {
+        entries_.erase(key);
+      } else if (!kept.channel().owner()) {
+        // Else it comes up later.
+        if (const auto host = catalog_.find_host(id.host)) kept.channel().connect(**host);
+      }
+      return stream;
     }
-    return stream;
   }
 
   // Destroys soon, outside of all callbacks, what is done.
   void sweep() { sweep_.enable_in(Duration::zero()); }
 
  private:
-  using Key = std::tuple<std::string, std::int32_t, std::string>;  // name, id, host's name
-  static Key key_of(const StreamId& id) { return {id.name, id.id, id.host}; }
+  // Name, id, host's name; 0, or the number of a further ring.
+  using Key = std::tuple<std::string, std::int32_t, std::string, std::uint64_t>;
+  static Key key_of(const StreamId& id) { return {id.name, id.id, id.host, 0}; }
 
-  Result<Kept*> find_or_make(const StreamId& id) {
-    if (const auto found = entries_.find(key_of(id)); found != entries_.end()) {
-      return found->second.get();
-    }
+  Result<Kept*> find_or_make(const Key& key) {
+    if (const auto found = entries_.find(key); found != entries_.end()) return found->second.get();
+    const StreamId id{std::get<0>(key), std::get<1>(key), std::get<2>(key)};
     Result<RingRoom> room = parts_.registry.take_room();
     if (!room) return std::move(room).error().context("stream '" + id.str() + "'");
-    return entries_.emplace(key_of(id), make_(id, *std::move(room))).first->second.get();
+    return entries_.emplace(key, make_(id, *std::move(room))).first->second.get();
   }
 
   void on_host_up(const KnownHost& host) override {
@@ -123,9 +132,12 @@ class ChannelTable final : private CatalogObserver {
     }
   }
   void on_remote_stream_added(const KnownHost& host, const StreamInfo& stream) override {
-    const auto found = entries_.find({stream.id.name, stream.id.id, host.greeting.host});
-    if (found == entries_.end()) return;
-    if (found->second->channel().owner() == host.greeting.host_id) found->second->on_stream_there();
+    const StreamId id{stream.id.name, stream.id.id, host.greeting.host};
+    for (auto next = entries_.lower_bound(key_of(id));
+         next != entries_.end() && next->second->id() == id; ++next) {
+      Kept& kept = *next->second;
+      if (kept.channel().owner() == host.greeting.host_id) kept.on_stream_there();
+    }
   }
 
   const ChannelParts& parts_;

@@ -19,7 +19,7 @@ void Mirrors::open(const KnownHost& host, const StreamId& id, Then then) {
 
 Result<std::shared_ptr<Stream>> Mirrors::adopt_untrusted(const StreamId& id, OfferedFiles files) {
   return table_.adopt(
-      id, [&files](Mirror& mirror) { return mirror.adopt_untrusted(std::move(files)); });
+      id, false, [&files](Mirror& mirror) { return mirror.adopt_untrusted(std::move(files)); });
 }
 
 std::shared_ptr<Stream> Mirrors::find(const StreamId& id) const {

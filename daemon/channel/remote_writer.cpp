@@ -283,7 +283,7 @@ Result<void> RemoteWriter::check_plan(const CreatePlan* plan) {
   return {};
 }
 
-Result<std::shared_ptr<Stream>> RemoteWriter::adopt_untrusted(OfferedFiles files) {
+Result<std::shared_ptr<Stream>> RemoteWriter::adopt_untrusted(OfferedFiles&& files) {
   if (ring_) {
     if (!ring_->stream()->is_ring(files.ring.get())) {
       return Error{Errc::conflict, "another ring is published into stream '" + name_ +

@@ -69,8 +69,8 @@ class RemoteWriter final : private OwnerChannel::User,
   // Borrows the ring, as RemoteWriterKeeper::open(). After channel().connect().
   void open(const CreatePlan* plan, Then then);
   // Takes a ring that a program held while dssmd was away. Another offer of the same ring gives the
-  // same stream.
-  Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles files);
+  // same stream; with another ring it fails with conflict, and `files` stay as they are.
+  Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles&& files);
 
  private:
   enum class Step { none, opening, starting, publishing };  // of the connection

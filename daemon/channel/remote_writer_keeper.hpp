@@ -33,8 +33,9 @@ class RemoteWriterKeeper {
                     Then then) = 0;
 
   // Goes on with such a ring that a program held while dssmd was away. `id` names the owner's host,
-  // which need not be in the catalog yet. Two offers of one ring are one remote writer.
-  //   fails  conflict (another ring is at it by now), protocol, no_permission, limit_exceeded
+  // which need not be in the catalog yet. Two offers of one ring are one remote writer; beside a
+  // ring that somebody opened since, it is a second one.
+  //   fails  protocol, no_permission, limit_exceeded
   virtual Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id,
                                                           OfferedFiles files) = 0;
 

@@ -20,8 +20,10 @@ void RemoteWriters::open(const KnownHost& host, const StreamId& id, const Create
 
 Result<std::shared_ptr<Stream>> RemoteWriters::adopt_untrusted(const StreamId& id,
                                                                OfferedFiles files) {
-  return table_.adopt(
-      id, [&files](RemoteWriter& writer) { return writer.adopt_untrusted(std::move(files)); });
+  // When somebody has opened the stream since, both rings are published, as two publishers'.
+  return table_.adopt(id, true, [&files](RemoteWriter& writer) {
+    return writer.adopt_untrusted(std::move(files));
+  });
 }
 
 }  // namespace dssm::daemon

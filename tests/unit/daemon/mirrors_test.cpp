@@ -206,9 +206,14 @@ TEST_F(MirrorsTest, ClosesWhenNobodyUsesItAnyMore) {
 TEST_F(MirrorsTest, StaysForAWhileAfterItsLastUser) {
   mirrors = std::make_unique<Mirrors>(parts, catalog, 50ms);
   opened(5).reset();
-  const MonoTime left = MonoClock::now();
   auto opened_again = open();
   ASSERT_TRUE(opened_again->has_value()) << "it is there still";
+  bool later = false;
+  EventSource timer = EventSource::timer(loop, [&] { later = true; });
+  timer.enable_in(100ms);
+  run_until(loop, [&] { return later; });
+  EXPECT_EQ(mirrors->size(), 1u) << "somebody uses it again";
+  const MonoTime left = MonoClock::now();
   opened_again.reset();
   run_until(loop, [&] { return mirrors->size() == 0; });
   EXPECT_GE(MonoClock::now() - left, 50ms);

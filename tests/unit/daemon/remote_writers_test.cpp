@@ -398,6 +398,29 @@ TEST_F(RemoteWritersTest, GoesOnWithARingThatAProgramKept) {
   until_published(4);
 }
 
+// Somebody opened the stream before the program came back: no sample of either may get lost.
+TEST_F(RemoteWritersTest, PublishesAKeptRingBesideOneThatWasOpenedSince) {
+  std::optional<Program> program;
+  {
+    const std::shared_ptr<Stream> stream = opened();
+    program.emplace(*stream);
+    writers.reset();
+  }
+  writers = std::make_unique<RemoteWriters>(parts, catalog);
+  const std::shared_ptr<Stream> since = opened();
+  const int before = owner->connections();
+  const auto kept = writers->adopt_untrusted(kId, program->offer());
+  ASSERT_TRUE(kept) << kept.error().message;
+  EXPECT_NE(kept->get(), since.get());
+  EXPECT_EQ(writers->adopt_untrusted(kId, program->offer()).value(), *kept);
+  EXPECT_EQ(writers->size(), 2u);
+  run_until(loop, [&] { return owner->connections() > before; });
+  EXPECT_EQ(serve(-1, -1), (*kept)->incarnation()) << "as a publisher of its own";
+  program->write(7);
+  until_published(7);
+  EXPECT_EQ(wait(open(&plan)).stream, since) << "the one that is opened stays the same";
+}
+
 TEST_F(RemoteWritersTest, RefusesRingsThatAreNoRemoteWriters) {
   const auto offer = [&](Purpose purpose, const StreamId& id) {
     auto stream =
