@@ -49,7 +49,7 @@ Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
       if (seen == Look::time) return PumpWait::time;
       if (sender_.sends_in_place()) {
         sent_up_to = next_ + 1;
-        status = sender_.send(next_, 0);
+        status = sender_.send(next_, 0, next_ < std::min(newest_untrusted(reader_), last_));
         bytes += std::min(payload_bytes_, SampleSender::kSliceBytes);
       } else {
         const Tid at_most = next_ + (kSamplesPerTurn - samples) - 1;

@@ -26,26 +26,40 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameLink& link,
       options_(options),
       payload_bytes_(mapping.geometry().payload_bytes) {}
 
-SendStatus SampleSender::send(Tid tid, std::uint64_t serial) {
+SendStatus SampleSender::send(Tid tid, std::uint64_t serial, bool more_follow) {
   DSSM_CHECK(!busy_);
-  if (sends_in_place()) return begin_in_place(tid, serial);
-  std::byte frame[wire::kMaxSampleHeaderBytes + kInPlaceBytes];
+  const bool is_small = payload_bytes_ < kInPlaceBytes;
+  const bool may_copy = payload_bytes_ <= kMostCopiedBytes;
+  const bool copy_pays = is_small || !more_follow || !options_.may_tear;
+  return may_copy && copy_pays ? send_copy(tid, serial) : begin_in_place(tid, serial);
+}
+
+SendStatus SampleSender::send_copy(Tid tid, std::uint64_t serial) {
+  std::byte staged[sizeof head_ + kMostCopiedBytes];
   SampleInfo info;
-  std::byte* payload = frame + wire::kMaxSampleHeaderBytes;
+  std::byte* payload = staged + sizeof head_;
   if (reader_.read(tid, {payload, payload_bytes_}, info) != ReadStatus::ok) return SendStatus::gone;
-  counters_.copied_payload_bytes += payload_bytes_;
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
   const std::size_t header_bytes =
       wire::encode_sample_header(header, serial, info, payload_bytes_, wire::Trailer::none);
-  std::byte* begin = std::copy_backward(header.begin(), header.begin() + header_bytes, payload);
-  const std::size_t bytes = header_bytes + payload_bytes_;
+  // Behind the verdict on the sample before, if it is still here.
+  const std::size_t kept_bytes = head_bytes_ - head_sent_;
+  keep_head(std::span(header).first(header_bytes));
+  const std::size_t bytes = kept_bytes + header_bytes + payload_bytes_;
+  std::byte* begin = payload - header_bytes - kept_bytes;
+  std::copy_n(head_.begin() + head_sent_, kept_bytes + header_bytes, begin);
+  head_bytes_ -= header_bytes;
   const iovec part = part_of(begin, bytes);
   const std::size_t sent = link_.send_now({&part, 1}, false);
-  if (sent == 0) {
+  if (sent <= kept_bytes) {
+    head_sent_ += sent;
     link_.want_output();
     return SendStatus::blocked;
   }
+  head_bytes_ = head_sent_ = 0;
+  // Charged with the connection: there is at most one such rest.
   if (sent < bytes) link_.queue_rest(RawBytes::copy_of({begin + sent, bytes - sent}));
+  counters_.copied_payload_bytes += payload_bytes_;
   ++counters_.samples;
   return SendStatus::sent;
 }

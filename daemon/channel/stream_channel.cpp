@@ -253,7 +253,7 @@ SendStatus StreamChannel::begin_reading() {
     answer_no_sample(found);
     return SendStatus::sent;
   }
-  const SendStatus status = sender_.send(tid, reading_->serial);
+  const SendStatus status = sender_.send(tid, reading_->serial, false);
   // A tid that was found and is gone when it is looked at does not come back.
   if (status == SendStatus::gone && reading_->request.which_case() == net::Read::kTid) {
     answer_no_sample(ReadStatus::too_old);

@@ -5,7 +5,7 @@
 #include <gtest/gtest.h>
 #include <sys/socket.h>
 
-#include <map>
+#include <atomic>
 #include <random>
 #include <thread>
 
@@ -97,6 +97,37 @@ TEST_F(Channel, SkipsALappedReaderForwardAndCountsExactly) {
       EXPECT_GT(judge.samples, 0u);
       EXPECT_TRUE(torn || judge.torn == 0);
     }
+  }
+}
+
+TEST_F(Channel, AnswersReadsWholeThoughTheWriterLapsThem) {
+  for (const bool torn : {true, false}) {
+    const std::string name = torn ? "readt" : "read";
+    LocalWriter writer(local_, name, 1'000'000, 4);
+    writer.write();
+    RawPeer peer(daemon_.address(), true, torn);
+    peer.open(name);
+    std::atomic<bool> done = false;
+    std::thread writing([&] {
+      while (!done) writer.write();
+    });
+    net::Frame read;
+    read.mutable_read()->set_newest(true);
+    Tid newest = kNoTid;
+    for (int i = 0; i < 300; ++i) {
+      const Received answer = peer.ask(read);
+      ASSERT_FALSE(answer.ended);
+      if (answer.frame.has_no_sample()) {
+        EXPECT_EQ(answer.frame.no_sample().status(), 3u) << "lapped again and again, at worst";
+        continue;
+      }
+      EXPECT_GE(answer.frame.sample().tid(), newest);
+      newest = answer.frame.sample().tid();
+      EXPECT_TRUE(is_payload_of(newest, answer.payload));
+    }
+    done = true;
+    writing.join();
+    EXPECT_GT(newest, 0);
   }
 }
 
