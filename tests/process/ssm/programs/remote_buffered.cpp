@@ -85,6 +85,28 @@ void reads_every_sample_in_order() {
   CHECK(con.readLast());
 }
 
+// The stream is older than its ring.
+void begins_with_the_oldest_held() {
+  DSSMApi<Point> old("old", 2, address), con("old", 2, address);
+  CHECK(old.create(1.0, 0.1) && old.createDataCon());  // 13 slots
+  for (int i = 0; i < 40; ++i) {
+    old.wdata->number = i;
+    memset(old.wdata->rest, i, sizeof(old.wdata->rest));
+    CHECK(old.write(1000.0 + i));
+  }
+  while (old.getTID_top() < 39) usleep(1000);
+  CHECK(con.open(SSM_READ_BUFFER) && con.createDataCon());
+  con.readyRingBuf(5, 0.1);
+  await_top(con, 39);
+  CHECK(!con.readBuf(27));
+  for (int i = 28; i < 40; ++i) {
+    CHECK(con.readBuf(i));
+    CHECK_EQUAL(con.data.number, i);
+    CHECK(whole(con.data));
+    CHECK_SAME(con.time, 1000.0 + i);
+  }
+}
+
 void skips_what_left_its_ring() {
   DSSMApi<Point> con("buffered", 2, address);
   CHECK(con.open(SSM_EXCLUSIVE));
@@ -164,6 +186,7 @@ int main(int argc, char** argv) {
   CHECK(source.initRemote() && source.create(1.0, 0.0001) && source.createDataCon());
   for (int i = 0; i < 10; ++i) write_one(i);
   reads_every_sample_in_order();
+  begins_with_the_oldest_held();
   skips_what_left_its_ring();
   refuses_what_cannot_be();
   ends_with_its_object();

@@ -67,6 +67,11 @@ int main(int argc, char** argv) {
   sid = createSSM((longest + "@" + host).c_str(), 0, sizeof(Point), 1, 0.1);
   CHECK(sid != 0);
   closeSSM(&sid);
+  sid = openSSM((longest + "@" + host).c_str(), 0, SSM_READ);
+  CHECK(sid != 0);
+  closeSSM(&sid);
+  CHECK_EQUAL(getSSM_info((longest + "@" + host).c_str(), 0, NULL, NULL, NULL, NULL),
+              sizeof(Point));
   catch_stderr();
   CHECK(createSSM((too_long + "@" + host).c_str(), 0, sizeof(Point), 1, 0.1) == 0);
   CHECK(createSSM("far@", 0, sizeof(Point), 1, 0.1) == 0);
