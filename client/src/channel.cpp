@@ -361,7 +361,8 @@ Result<void> Channel::on_sample_end(const wire::IncomingSample& sample, bool tor
 // --- requests
 // --------------------------------------------------------------------------------------
 
-Result<void> Channel::exchange(net::Frame& request) {
+template <class Queue>
+Result<void> Channel::exchange(Queue queue) {
   const MonoTime deadline = deadline_in(options_.request_timeout);
   for (;;) {
     if (Result<void> up = get_up(deadline); !up) return up;
@@ -369,8 +370,7 @@ Result<void> Channel::exchange(net::Frame& request) {
     answered_ = false;
     read_info_.reset();
     ask_serial_ = next_serial_++;
-    request.set_serial(ask_serial_);
-    link_.queue(request);
+    queue(ask_serial_);
     const WaitStatus status = run(deadline, false, [&] { return answered_ || ask_serial_ == 0; });
     if (answered_) return {};
     if (status == WaitStatus::timeout) {
@@ -385,12 +385,16 @@ Result<void> Channel::exchange(net::Frame& request) {
 
 Result<net::Frame> Channel::ask(net::Frame request) {
   read_target_ = nullptr;
-  if (Result<void> done = exchange(request); !done) return std::move(done).error();
+  const auto queue = [&](std::uint64_t serial) {
+    request.set_serial(serial);
+    link_.queue(request);
+  };
+  if (Result<void> done = exchange(queue); !done) return std::move(done).error();
   if (answer_.has_failure()) return wire::failure(answer_.failure());
   return std::move(answer_);
 }
 
-Result<ReadStatus> Channel::read(net::Frame request, std::span<std::byte> payload,
+Result<ReadStatus> Channel::read(const ReadRequest& request, std::span<std::byte> payload,
                                  SampleInfo& info) {
   if (payload.size() != stream_.type.payload_bytes) {
     return Error{Errc::invalid_argument, what("read") + ": its samples have " +
@@ -400,7 +404,10 @@ Result<ReadStatus> Channel::read(net::Frame request, std::span<std::byte> payloa
   for (;;) {
     if (std::exchange(restart_untold_, false)) return ReadStatus::restarted;
     read_target_ = payload.data();
-    Result<void> done = exchange(request);
+    Result<void> done = exchange([&](std::uint64_t serial) {
+      std::array<std::byte, kMaxReadRequestBytes> bytes;
+      link_.queue(std::span(bytes).first(encode_read_request(bytes, serial, request)));
+    });
     read_target_ = nullptr;
     if (!done) return std::move(done).error().context(what("read"));
     if (restart_untold_) continue;  // what was asked for was another ring's

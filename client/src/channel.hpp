@@ -18,6 +18,7 @@
 
 #include "client/src/network_link.hpp"
 #include "client/src/outbox.hpp"
+#include "client/src/read_request.hpp"
 #include "client/src/readiness.hpp"
 #include "client/src/subscriber.hpp"
 
@@ -45,7 +46,8 @@ class Channel final : private wire::FrameSink {
   //   fails  besides: daemon_away, protocol, and what opening the channel anew fails with
   Result<net::Frame> ask(net::Frame request);
   // The same for Read, whose answer is a sample or NoSample.
-  Result<ReadStatus> read(net::Frame request, std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> read(const ReadRequest& request, std::span<std::byte> payload,
+                          SampleInfo& info);
 
   // --- as PConnector ---------------------------------------------------------------------------
 
@@ -87,8 +89,9 @@ class Channel final : private wire::FrameSink {
   WaitStatus run(MonoTime deadline, bool interruptible, Done done);
   // Waits until the channel is up.
   Result<void> get_up(MonoTime deadline);
-  // Sends the request, again after each reconnect, until it is answered.
-  Result<void> exchange(net::Frame& request);
+  // Sends what queue(serial) queues, again after each reconnect, until it is answered.
+  template <class Queue>
+  Result<void> exchange(Queue queue);
   bool is_hopeless_since(std::uint64_t failed_before) const noexcept;
   Error away(const std::string& how) const;
   std::string what(const char* verb) const;

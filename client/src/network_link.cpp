@@ -141,8 +141,13 @@ Result<void> NetworkLink::advance() {
 // ----------------------------------------------------------------------------------------
 
 void NetworkLink::queue(const net::Frame& frame) {
+  const std::string encoded = wire::encode_frame(frame);
+  queue(std::as_bytes(std::span(encoded)));
+}
+
+void NetworkLink::queue(std::span<const std::byte> encoded) {
   if (!has_queued()) queued_.clear(), queued_from_ = 0;
-  queued_ += wire::encode_frame(frame);
+  queued_.append(reinterpret_cast<const char*>(encoded.data()), encoded.size());
 }
 
 Result<void> NetworkLink::send_queued() {

@@ -46,6 +46,7 @@ class NetworkLink final : private wire::FrameSink {
 
   // Queues a frame, for send_queued().
   void queue(const net::Frame& frame);
+  void queue(std::span<const std::byte> encoded);
   bool has_queued() const noexcept { return queued_from_ < queued_.size(); }
   Result<void> send_queued();
   // Sends bytes of the user's own; returns how many went. Nothing may be queued.

@@ -127,29 +127,22 @@ Result<std::vector<StreamInfo>> PConnector::list(PConnectorOptions options) {
 // --- reading
 // ---------------------------------------------------------------------------------------
 
+using Which = detail::ReadRequest::Which;
+
 Result<ReadStatus> PConnector::latest(std::span<std::byte> payload, SampleInfo& info) {
-  net::Frame frame;
-  frame.mutable_read()->set_newest(true);
-  return state_->channel->read(std::move(frame), payload, info);
+  return state_->channel->read({Which::newest}, payload, info);
 }
 
 Result<ReadStatus> PConnector::tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) {
-  if (tid < 0) return ReadStatus::too_old;
-  net::Frame frame;
-  frame.mutable_read()->set_tid(tid);
-  return state_->channel->read(std::move(frame), payload, info);
+  return state_->channel->read({Which::tid, tid}, payload, info);
 }
 
 Result<ReadStatus> PConnector::at(Time t, std::span<std::byte> payload, SampleInfo& info) {
-  net::Frame frame;
-  frame.mutable_read()->set_time_ns(to_ns(t));
-  return state_->channel->read(std::move(frame), payload, info);
+  return state_->channel->read({Which::time, to_ns(t)}, payload, info);
 }
 
 Result<ReadStatus> PConnector::newer(Tid than, std::span<std::byte> payload, SampleInfo& info) {
-  net::Frame frame;
-  frame.mutable_read()->set_newer_than(than);
-  return state_->channel->read(std::move(frame), payload, info);
+  return state_->channel->read({Which::newer_than, than}, payload, info);
 }
 
 namespace {
