@@ -125,7 +125,11 @@ TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
   auto reader = there.open_reader<Counted>("anew").value();
   reader.seek(kNoTid);
   ASSERT_TRUE(here.remove({"anew", 0, ""}));
-  await([&] { return mirror("anew").state == "removed"; });
+  // The owner is asked, and says so.
+  await([&] {
+    const auto info = there.info({"anew", 0, "pc1"});
+    return !info && info.error().code == Errc::not_found;
+  });
   const auto none = there.open_reader<Counted>("anew@pc1");
   ASSERT_FALSE(none);
   EXPECT_EQ(none.error().code, Errc::not_found);
