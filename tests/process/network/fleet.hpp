@@ -80,7 +80,7 @@ std::uint64_t number_from_environment(const char* name, std::uint64_t otherwise)
 
 // How much slower than usual things go here: what costs much is done so many times less.
 #if defined(__SANITIZE_THREAD__)
-inline constexpr int kSlowness = 10;
+inline constexpr int kSlowness = 20;
 #elif defined(__SANITIZE_ADDRESS__)
 inline constexpr int kSlowness = 4;
 #else

@@ -264,6 +264,40 @@ TEST_F(Hosts, StreamsOfOneNameAreToldApartByHost) {
   EXPECT_NE(either.error().message.find("'pc2'"), std::string::npos) << either.error().message;
 }
 
+// A PC dies, and another one takes its place with a stream of the same name.
+TEST_F(Hosts, FindAStreamThatMovedToAnotherHost) {
+  if (!make_fleet(3)) return;
+  KnownStream known = small("moving", 64);
+  RawWriter first = make(fleet->session(1), known);
+  write_until(first, known, 9);
+  Session third = fleet->session(3);
+  ASSERT_TRUE(third.await_raw_reader(known.id, kNever));  // so that it is known there
+  RawReader reader = third.open_raw_reader({"moving", 0, ""}).value();
+  reader.seek(kNoTid);
+  expect_samples(reader, known, 0, 9);
+  fleet->network().cut(1);
+  known.id.host = "pc2";
+  RawWriter second = make(fleet->session(2), known);
+  write_until(second, known, 29);
+  std::vector<std::byte> payload(known.payload_bytes);
+  SampleInfo info;
+  ReadStatus status = ReadStatus::not_yet;
+  while (status == ReadStatus::not_yet) {
+    (void)reader.wait(kNever);
+    status = reader.next(payload, info);
+  }
+  ASSERT_EQ(status, ReadStatus::restarted);
+  EXPECT_EQ(reader.id().host, "pc2");
+  expect_samples(reader, known, 0, 29);
+  // The first one comes back: whoever has moved stays.
+  fleet->network().heal(1);
+  await_up(third, 1);
+  write_until(first, known, 19);
+  write_until(second, known, 39);
+  expect_samples(reader, known, 30, 39);
+  EXPECT_EQ(reader.restarts(), 1u);
+}
+
 TEST_F(Hosts, SpeakIpv6) {
   if (!make_fleet(2, {}, IpVersion::v6)) return;
   Session owner = fleet->session(1), there = fleet->session(2);

@@ -29,7 +29,7 @@ constexpr int kHosts = 3;
 constexpr int kOwners = 2;  // pc1 and pc2 own fifteen streams each; all hosts read those of others
 
 // For what must come by itself, however busy the machine is.
-constexpr Duration kPatience = 1min;
+constexpr Duration kPatience = 3min;
 
 class Soak : public NetworkTest {
  protected:
