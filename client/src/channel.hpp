@@ -85,6 +85,7 @@ class Channel final : private wire::FrameSink {
   void forget_connection();
   Result<void> send_all();
   bool receive();
+  bool on_received(Result<bool> received);
   template <class Done>
   WaitStatus run(MonoTime deadline, bool interruptible, Done done);
   // Waits until the channel is up.

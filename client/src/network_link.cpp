@@ -172,7 +172,15 @@ Result<std::size_t> NetworkLink::send_some(std::span<const std::byte> bytes) {
 
 Result<bool> NetworkLink::receive() {
   if (!transport_) return false;
-  auto received = transport_->receive(decoder_->spaces());
+  return take(transport_->receive(decoder_->spaces()));
+}
+
+Result<bool> NetworkLink::receive_waiting() {
+  if (!transport_) return false;
+  return take(transport_->receive_waiting(decoder_->spaces()));
+}
+
+Result<bool> NetworkLink::take(Result<wire::IoResult> received) {
   if (!received) return down(std::move(received).error());
   if (received->status == wire::IoStatus::would_block) return false;
   if (received->status == wire::IoStatus::end) return down(lost());

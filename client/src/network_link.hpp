@@ -55,6 +55,8 @@ class NetworkLink final : private wire::FrameSink {
   // Receives once. False: nothing was there. Not while a sample is held back.
   //   fails  besides: what `user` returned
   Result<bool> receive();
+  // The same, waiting as Transport::receive_waiting() does.
+  Result<bool> receive_waiting();
   // Goes on with what was received, after the user held a sample back.
   Result<void> resume();
 
@@ -82,6 +84,7 @@ class NetworkLink final : private wire::FrameSink {
   Result<void> on_frame(net::Frame& frame) override;
   Result<void> connect_next();
   Result<void> greet();
+  Result<bool> take(Result<wire::IoResult> received);
   Error down(Error why);
   Error lost() const;
 

@@ -4,8 +4,10 @@
 // normal work), and a network that does not carry (an error whose text says so).
 #include "core/wire/tcp.hpp"
 
+#include <fcntl.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
+#include <sys/time.h>
 
 #include <algorithm>
 #include <cerrno>
@@ -90,9 +92,25 @@ class TcpTransport final : public Transport {
     return io_result(bytes, "receive from the other side", socket_.get());
   }
 
+  Result<IoResult> receive_waiting(std::span<const iovec> spaces) override {
+    if (!waits_) make_waitable();
+    msghdr message = header(spaces);
+    const ssize_t bytes = ::recvmsg(socket_.get(), &message, 0);
+    if (bytes < 0 && errno == EINTR) return IoResult{IoStatus::would_block, 0};
+    return io_result(bytes, "receive from the other side", socket_.get());
+  }
+
   int fd() const noexcept override { return socket_.get(); }
 
  private:
+  // All other calls say MSG_DONTWAIT, so the socket's own mode is free for this.
+  void make_waitable() noexcept {
+    waits_ = true;
+    constexpr timeval kWait{0, std::chrono::microseconds(kReceiveWait).count()};
+    static_cast<void>(::setsockopt(socket_.get(), SOL_SOCKET, SO_RCVTIMEO, &kWait, sizeof kWait));
+    static_cast<void>(::fcntl(socket_.get(), F_SETFL, 0));  // without O_NONBLOCK
+  }
+
   static msghdr header(std::span<const iovec> parts) noexcept {
     msghdr message{};
     message.msg_iov = const_cast<iovec*>(parts.data());  // the kernel only reads them
@@ -101,6 +119,7 @@ class TcpTransport final : public Transport {
   }
 
   UniqueFd socket_;
+  bool waits_ = false;  // receive_waiting() was prepared
 };
 
 using NameOf = int (*)(int, sockaddr*, socklen_t*);

@@ -4,8 +4,10 @@
 // of buffers in tests.
 #pragma once
 
+#include <poll.h>
 #include <sys/uio.h>
 
+#include <chrono>
 #include <dssm/result.hpp>
 #include <span>
 
@@ -13,8 +15,8 @@
 
 namespace dssm::wire {
 
-// One connection's bytes. A resource with one owner; one thread at a time. Never waits: the
-// descriptor is non-blocking, whoever wants to wait polls fd().
+// One connection's bytes. A resource with one owner; one thread at a time. Never waits, but where
+// it says so: whoever wants to wait polls fd().
 class Transport {
  public:
   Transport() = default;
@@ -30,6 +32,16 @@ class Transport {
   // Receives into `spaces`, in order.
   //   returns  ok with the number of bytes (0 < bytes) | would_block | end
   virtual Result<IoResult> receive(std::span<const iovec> spaces) = 0;
+
+  // The same, waiting for bytes: for kReceiveWait, or until a signal handler runs. For programs
+  // that have nothing else to do until an answer comes: one system call instead of two.
+  //   returns  would_block: nothing came
+  virtual Result<IoResult> receive_waiting(std::span<const iovec> spaces) {
+    pollfd ready{fd(), POLLIN, 0};
+    ::poll(&ready, 1, static_cast<int>(kReceiveWait.count()));
+    return receive(spaces);
+  }
+  static constexpr std::chrono::milliseconds kReceiveWait{50};
 
   // Readable or writable when receive() or send() may go on.
   virtual int fd() const noexcept = 0;

@@ -9,7 +9,7 @@
 //   address  "192.168.0.10", "192.168.0.10:13776", "[::1]:13776", "pc2"; without a port $DSSM_PORT,
 //            else 13776
 //   signals  release() and terminate() may be called from a signal handler at any moment; a read or
-//            write in a handler that interrupted one of the same object fails
+//            write over the network in a handler that interrupted another one fails
 #ifndef DSSM_DSSM_PROXY_CLIENT_HPP
 #define DSSM_DSSM_PROXY_CLIENT_HPP
 

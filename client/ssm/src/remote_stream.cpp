@@ -69,18 +69,25 @@ SSM_tid error_of(ReadStatus status, RemoteStream::Which which) noexcept {
 
 }  // namespace
 
-// One call inside the object; false when this thread is inside already.
+// One call inside the object; false when this thread is inside already. Over the network: inside
+// any such object, because they share what a thread receives into.
 class RemoteStream::Call {
  public:
-  explicit Call(RemoteStream& stream) noexcept : stream_(stream) {
+  enum class Way : bool { network, memory };
+
+  explicit Call(RemoteStream& stream, Way way = Way::network) noexcept
+      : stream_(stream), way_(way) {
     stream_.lock_.lock();
-    allowed_ = !stream_.inside_;
+    allowed_ = !stream_.inside_ && (way == Way::memory || !on_network);
+    if (!allowed_) return;
     stream_.inside_ = true;
+    if (way == Way::network) on_network = true;
   }
   Call(const Call&) = delete;
   Call& operator=(const Call&) = delete;
   ~Call() {
     if (allowed_) stream_.inside_ = false;
+    if (allowed_ && way_ == Way::network) on_network = false;
     stream_.lock_.unlock();
   }
   explicit operator bool() const noexcept { return allowed_; }
@@ -90,9 +97,12 @@ class RemoteStream::Call {
   }
 
  private:
+  static thread_local bool on_network;
   RemoteStream& stream_;
+  const Way way_;
   bool allowed_ = false;
 };
+thread_local bool RemoteStream::Call::on_network = false;
 
 // --- connecting, creating, opening
 // -----------------------------------------------------------------
@@ -413,13 +423,13 @@ bool RemoteStream::buffer(double life, double cycle) {
 }
 
 SSM_tid RemoteStream::top_buffered() {
-  const Call call(*this);
+  const Call call(*this, Call::Way::memory);
   return call.has_stream() && ring_ ? ssm_tid(ring_->reader().newest()) : -1;
 }
 
 SSM_tid RemoteStream::read_buffered(const Request& request, void* data, std::size_t bytes,
                                     double* time) {
-  const Call call(*this);
+  const Call call(*this, Call::Way::memory);
   if (!call.has_stream() || !ring_ || bytes != sample_.size()) return SSM_ERROR_NO_DATA;
   const ring::RingReader reader = ring_->reader();
   const Tid newest = reader.newest();

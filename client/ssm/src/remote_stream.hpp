@@ -8,8 +8,10 @@
 // until a signal handler runs, or $DSSM_CONNECT_TIMEOUT seconds have passed.
 //
 //   tids     as in stream.hpp: they keep rising when the stream begins anew
-//   threads  calls take turns; a call in a signal handler that interrupted another one of the same
-//            object in its own thread fails
+//   threads  calls take turns
+//   signals  close() at any moment; a call in a handler that interrupted another one, of this
+//   object
+//            or another in its own thread, fails (but reading what was collected)
 #pragma once
 
 #include <atomic>

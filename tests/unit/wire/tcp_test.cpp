@@ -11,6 +11,8 @@
 #include <sys/socket.h>
 
 #include <cstring>
+#include <dssm/time.hpp>
+#include <thread>
 
 namespace dssm::wire {
 namespace {
@@ -67,6 +69,27 @@ TEST_P(TcpTransport, CarriesPartsInTheirOrder) {
   EXPECT_EQ(received.status, IoStatus::ok);
   EXPECT_EQ(received.bytes, 12u);
   EXPECT_EQ(begin + rest.substr(0, 5), "first second");
+}
+
+TEST_P(TcpTransport, WaitsForBytesForAWhileAndThenNeverAgain) {
+  const Pair pair = connect_pair(GetParam());
+  std::string space(20, '?');
+  const iovec spaces[] = {part_of(space)};
+  const MonoTime begin = MonoClock::now();
+  EXPECT_EQ(pair.server->receive_waiting(spaces)->status, IoStatus::would_block);
+  // The kernel counts in ticks.
+  EXPECT_GE(MonoClock::now() - begin, Transport::kReceiveWait - std::chrono::milliseconds(10));
+  EXPECT_EQ(pair.server->receive(spaces)->status, IoStatus::would_block);
+  const std::string text = "bytes";
+  const iovec part[] = {part_of(text)};
+  std::thread sending([&] { EXPECT_EQ(pair.client->send(part, false)->bytes, 5u); });
+  IoResult received;
+  do {
+    received = pair.server->receive_waiting(spaces).value();
+  } while (received.status == IoStatus::would_block);
+  sending.join();
+  EXPECT_EQ(received.bytes, 5u);
+  EXPECT_EQ(space.substr(0, 5), "bytes");
 }
 
 INSTANTIATE_TEST_SUITE_P(BothKinds, TcpTransport, testing::Values("127.0.0.1:0", "[::1]:0"));

@@ -123,6 +123,34 @@ void storm(int rounds) {
   }
 }
 
+// Control loops that read and write from a timer's handler, in the midst of the main loop's.
+DSSMApi<Sample>*main_loops, *handlers;
+int handler_calls = 0, handler_reads = 0;
+
+void read_and_write(int) {
+  ++handler_calls;
+  if (handlers->readLast() && handlers->write()) ++handler_reads;
+  if (buffered->readLastBuf()) handled = handled + 1;
+}
+
+void calls_in_handlers_fail_or_work() {
+  DSSMApi<Sample> one("storm", 0, address), other("storm", 0, address), third("storm", 0, address);
+  main_loops = &one;
+  handlers = &other;
+  buffered = &third;
+  CHECK(one.open() && one.createDataCon() && other.open() && other.createDataCon());
+  CHECK(third.open() && third.createDataCon());
+  third.readyRingBuf();
+  while (!third.readNewBuf()) usleep(1000);
+  handled = 0;
+  on_signal(SIGALRM, read_and_write);
+  alarm_after(200, 200);
+  while (handler_calls < 500) CHECK(one.readLast());
+  alarm_after(0, 0);
+  CHECK(handled > 0);
+  CHECK(other.readLast() && one.write());
+}
+
 void sigpipe_is_the_programs() {
   struct sigaction action;
   sigaction(SIGPIPE, NULL, &action);
@@ -136,6 +164,7 @@ int main(int argc, char** argv) {
   address = argv[2];
   storm(50);
   signals_end_the_waits();
+  calls_in_handlers_fail_or_work();
   sigpipe_is_the_programs();
   return check_result();
 }
