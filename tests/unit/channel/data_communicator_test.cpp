@@ -173,6 +173,27 @@ TEST(DataCommunicator, ServesASlowAskerOneRequestAtATime) {
   }
 }
 
+TEST(DataCommunicator, KeepsOneLongAnswerForASlowAskerNotAllOfThem) {
+  ServerRig rig;
+  rig.create("a");
+  ASSERT_TRUE(rig.registry.set_property({"a", 0, ""}, std::string(1 << 20, 'p')));
+  FakePeer peer;
+  rig.connect(peer);
+  rig.open(peer, "a");
+  peer.room = 1000;
+  for (std::uint64_t serial = 1; serial <= 25; ++serial) {
+    net::Frame frame;
+    frame.set_serial(serial);
+    frame.mutable_get_property();
+    peer.put(frame);
+  }
+  rig.turns(100);
+  EXPECT_FALSE(peer.closed);
+  peer.room = FakePeer::kAll;
+  rig.turns(400);
+  EXPECT_EQ(rig.take(peer).size(), 25u);
+}
+
 TEST(DataCommunicator, LetsOthersHaveTheirTurnBetweenManyRequests) {
   ServerRig rig;
   rig.create("a");
@@ -360,6 +381,7 @@ TEST(StreamWatch, WaitsForAPeerThatReadsSlowlyAndKeepsTheOrder) {
   const std::size_t again = text.find("+s299 ");
   EXPECT_NE(again, text.npos);
   EXPECT_EQ(text.find("+s299 ", again + 1), text.npos) << "the removed one was not told of";
+  EXPECT_GT(again, text.find("+s298 ")) << "in the order of creation";
   EXPECT_LT(again, text.find("done "));
   EXPECT_EQ(std::count(text.begin(), text.end(), '+'), 300);
 }
