@@ -8,9 +8,9 @@
 #include <unistd.h>
 
 #include <algorithm>
-#include <cstdio>
-#include <cstring>
+#include <vector>
 
+#include "core/ring/sample_publisher.hpp"
 #include "messages.hpp"
 
 namespace dssm::ssm {
@@ -45,17 +45,12 @@ Result<std::unique_ptr<RemoteRing>> RemoteRing::start(PConnector connector,
   if (Result<void> done = ring::reserve(memory->get(), *geometry); !done) {
     return std::move(done).error().context(what);
   }
-  auto bell_memory = ring::create_bell();
-  if (!bell_memory) return std::move(bell_memory).error().context(what);
   auto mapping = ring::RingMapping::open_untrusted(memory->get(), ring::Access::read_write);
   if (!mapping) return std::move(mapping).error().context(what);
-  auto bell = ring::Bell::open_untrusted(bell_memory->get());
-  if (!bell) return std::move(bell).error().context(what);
 
   std::unique_ptr<RemoteRing> made(new RemoteRing(std::move(connector)));
   if (!made->stop_) return os_error(what);
   made->mapping_ = std::move(*mapping);
-  made->bell_ = std::move(*bell);
   sigset_t all, before;  // signal handlers are the program's: they run in its own threads
   ::sigfillset(&all);
   ::pthread_sigmask(SIG_SETMASK, &all, &before);
@@ -86,33 +81,27 @@ bool RemoteRing::pause() {
 }
 
 void RemoteRing::fill() {
-  ring::MirrorWriter writer(*mapping_, *bell_);
-  const std::size_t bytes = mapping_->geometry().payload_bytes;
+  // Samples are received beside the ring and then copied into it as its readers expect it; they are
+  // in the same process, and must not meet the decoder's plain stores.
+  const ring::SamplePublisher ring(*mapping_);
+  std::vector<std::byte> payload(mapping_->geometry().payload_bytes);
   Tid offset = 0;  // the ring's tids are so far ahead of the stream's
-  Tid due = 0;     // the ring's tid of the next sample, if none is lost
   bool complained = false;
   for (;;) {
-    std::byte* const place = writer.begin(due);
     SampleInfo info;
-    const auto status = connector_.next({place, bytes}, info);
+    const auto status = connector_.next(payload, info);
     if (!status && !complained) report_error(status.error().message + "; trying again");
     complained = !status;
     if (!status || *status == ReadStatus::not_yet) {
       if (!pause()) return;
-      continue;
+    } else if (*status == ReadStatus::restarted) {
+      offset = ring.newest() + 1;
+    } else {
+      const Tid tid = info.tid + offset;
+      ring.begin(tid);
+      ring.fill(tid, payload);
+      ring.publish(tid, info.time, info.clock_error);
     }
-    if (*status == ReadStatus::restarted) {
-      offset = writer.newest() + 1;
-      due = offset;
-      continue;
-    }
-    const Tid tid = info.tid + offset;
-    if (tid != due) {  // some are lost, or it is the first
-      std::byte* const right_place = writer.begin(tid);
-      if (right_place != place) std::memcpy(right_place, place, bytes);
-    }
-    writer.commit(info.time, info.clock_error);
-    due = tid + 1;
   }
 }
 

@@ -4,19 +4,18 @@
 // subscription and fills the ring, readers read it without the network. Every sample is in it, in
 // order, as long as the link keeps up; what was lost is missing, and is told as missing.
 //
-// The ring is a mirror as dssmd keeps them, with one difference: its tids go on rising when the
-// stream begins anew, so that old programs' loops go on.
+// The ring is a copy as dssmd keeps them, but its tids go on rising when the stream begins anew, so
+// that old programs' loops go on, and nobody sleeps on it, so it has no bell.
 #pragma once
 
+#include <pthread.h>
 #include <sys/types.h>
 
-#include <atomic>
 #include <dssm/pconnector.hpp>
 #include <memory>
-#include <string>
-#include <thread>
 
-#include "core/ring/mirror_writer.hpp"
+#include "core/base/unique_fd.hpp"
+#include "core/ring/ring_memory.hpp"
 #include "core/ring/ring_reader.hpp"
 
 namespace dssm::ssm {
@@ -42,7 +41,6 @@ class RemoteRing {
 
   PConnector connector_;  // the thread's
   std::shared_ptr<const ring::RingMapping> mapping_;
-  std::shared_ptr<ring::Bell> bell_;
   UniqueFd stop_;  // eventfd: readable when the thread shall end
   const pid_t owner_pid_;
   pthread_t thread_{};
