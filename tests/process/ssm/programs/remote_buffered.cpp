@@ -164,6 +164,9 @@ void a_child_reads_on() {
   const pid_t child = fork();
   if (child == 0) {
     const bool good = con.readLastBuf() && con.data.number == 2999;
+#ifdef __SANITIZE_ADDRESS__
+    _exit(good ? 0 : 1);  // what the parent's thread had would count as lost
+#endif
     exit(good ? 0 : 1);
   }
   int status = -1;
