@@ -50,7 +50,11 @@ static_assert(std::atomic<std::uint32_t>::is_always_lock_free);
 //   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
 //   520     8 run_start        tid    writer      before top; see "Search by time"
 //   528     8 first            tid    dssmd       before top; > 0 only in mirrors: see "Window"
-//   536  3560 reserved         -      -           zero
+//   536     8 owner_tid        tid    dssmd       only in remote writers' rings, as
+//   owner_incarnation:
+//                                                 see "Window"
+//   544     8 owner_incarnation -     dssmd       behind owner_tid
+//   552  3544 reserved         -      -           zero
 struct RingHeader {
   std::uint64_t magic;
   std::uint32_t layout_version;
@@ -76,13 +80,15 @@ struct RingHeader {
   std::atomic<std::int64_t> top;
   std::atomic<std::int64_t> run_start;
   std::atomic<std::int64_t> first;
-  std::byte reserved3[3560];
+  std::atomic<std::int64_t> owner_tid;
+  std::atomic<std::uint64_t> owner_incarnation;
+  std::byte reserved3[3544];
 };
 static_assert(sizeof(pthread_mutex_t) <= 64);
 static_assert(offsetof(RingHeader, incarnation) == 64 && offsetof(RingHeader, name) == 88);
 static_assert(offsetof(RingHeader, host) == 128 && offsetof(RingHeader, lock) == 320);
 static_assert(offsetof(RingHeader, top) == 512 && offsetof(RingHeader, run_start) == 520);
-static_assert(offsetof(RingHeader, first) == 528);
+static_assert(offsetof(RingHeader, first) == 528 && offsetof(RingHeader, owner_tid) == 536);
 static_assert(sizeof(RingHeader) == kPageBytes);
 
 //   off size field           unit  written by  order

@@ -27,6 +27,7 @@ Result<std::unique_ptr<OutgoingRing>> OutgoingRing::make(const StreamInfo& their
   header.top.store(theirs.newest, std::memory_order_relaxed);
   header.run_start.store(theirs.newest + 1, std::memory_order_relaxed);
   (*made)->set_next(theirs.newest + 1);
+  (*made)->set_owner(theirs.incarnation, theirs.newest);
   return made;
 }
 
@@ -47,6 +48,26 @@ Tid OutgoingRing::next_untrusted() const noexcept {
 
 void OutgoingRing::set_next(Tid next) noexcept {
   mapping_->header().first.store(next, std::memory_order_relaxed);
+}
+
+std::uint64_t OutgoingRing::owner_incarnation_untrusted() const noexcept {
+  return mapping_->header().owner_incarnation.load(std::memory_order_relaxed);
+}
+
+Tid OutgoingRing::owner_tid_untrusted() const noexcept {
+  return std::clamp(mapping_->header().owner_tid.load(std::memory_order_relaxed), kNoTid, kLastTid);
+}
+
+// A dssmd that dies in between leaves kNoTid behind, which does no harm.
+void OutgoingRing::set_owner(std::uint64_t incarnation, Tid tid) noexcept {
+  ring::RingHeader& header = mapping_->header();
+  header.owner_tid.store(kNoTid, std::memory_order_relaxed);
+  header.owner_incarnation.store(incarnation, std::memory_order_release);
+  header.owner_tid.store(tid, std::memory_order_release);
+}
+
+void OutgoingRing::set_owner_tid(Tid tid) noexcept {
+  mapping_->header().owner_tid.store(tid, std::memory_order_relaxed);
 }
 
 }  // namespace dssm::daemon

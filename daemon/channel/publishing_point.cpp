@@ -25,9 +25,8 @@ net::Frame PublishingPoint::start() const {
 
 Result<PublishingPoint::Request> PublishingPoint::on_publishing_untrusted(
     const net::Publishing& publishing) {
-  const bool same_ring =
-      std::exchange(their_incarnation_, publishing.incarnation()) == publishing.incarnation();
-  if (!same_ring) known_tid_ = kNoTid;
+  const bool same_ring = ring_.owner_incarnation_untrusted() == publishing.incarnation();
+  if (!same_ring) ring_.set_owner(publishing.incarnation(), kNoTid);
   const bool sent_before = std::exchange(started_, true);
   // It may know less than we do: when it has forgotten us, or has done so once before.
   if (publishing.last() >= ring_.next_untrusted() - 1 && publishing.last() >= 0) {
@@ -48,31 +47,33 @@ Result<PublishingPoint::Request> PublishingPoint::on_range_untrusted(const net::
     return Error{Errc::protocol,
                  "its newest sample is said to be " + std::to_string(range.newest())};
   }
-  last_compared_ = std::min(range.newest(), known_tid_ + kMostCompared);
+  compared_ = ring_.owner_tid_untrusted();
+  last_compared_ = std::min(range.newest(), compared_ + kMostCompared);
   return compare_next();
 }
 
 PublishingPoint::Request PublishingPoint::compare_next() {
-  if (known_tid_ >= last_compared_ || ring_.all_published()) return {};
+  if (compared_ >= last_compared_ || ring_.all_published()) return {};
   net::Frame frame;
   frame.set_serial(kSerial);
-  frame.mutable_read()->set_tid(known_tid_ + 1);
+  frame.mutable_read()->set_tid(compared_ + 1);
   return frame;
 }
 
 Result<PublishingPoint::Request> PublishingPoint::on_sample(const SampleInfo& theirs) {
-  if (theirs.tid != known_tid_ + 1) return untimely("a sample");
+  if (theirs.tid != compared_ + 1) return untimely("a sample");
   SampleInfo own;
   const Tid next = ring_.next_untrusted();
   if (reader_.stamp(next, own) == ReadStatus::ok && own.time == theirs.time &&
       own.clock_error == theirs.clock_error) {
     ring_.set_next(next + 1);
+    ring_.set_owner_tid(theirs.tid);
   }
   return on_no_sample();
 }
 
 Result<PublishingPoint::Request> PublishingPoint::on_no_sample() {
-  ++known_tid_;
+  ++compared_;
   return compare_next();
 }
 
@@ -90,7 +91,7 @@ Result<void> PublishingPoint::note_untrusted(Tid last, Tid tid) {
                                      " to " + std::to_string(newest)};
   }
   ring_.set_next(last + 1);
-  known_tid_ = tid;
+  ring_.set_owner_tid(tid);
   return {};
 }
 

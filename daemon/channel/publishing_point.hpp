@@ -3,8 +3,9 @@
 // With which sample a remote writer goes on after its connection broke, so that each is written
 // once. Mostly the owner knows. When its dssmd was restarted it has forgotten, and its ring may
 // hold more of our samples than it could still tell us. But we know of one sample of ours which of
-// theirs it became: those that follow it there are read and compared with our next ones, by their
-// stamps. Samples of other publishers in between are passed over.
+// theirs it became, and our ring knows it when we are restarted too: those that follow it there are
+// read and compared with our next ones, by their stamps. Samples of other publishers in between are
+// passed over.
 #pragma once
 
 #include <cstdint>
@@ -29,11 +30,8 @@ class PublishingPoint {
   // The ring outlives it.
   explicit PublishingPoint(OutgoingRing& ring) : ring_(ring), reader_(ring.mapping()) {}
 
-  // The ring is new; it begins where the owner's is.
-  void begin(const StreamInfo& theirs) noexcept {
-    their_incarnation_ = theirs.incarnation;
-    known_tid_ = theirs.newest;
-  }
+  // Nothing of the ring was sent yet; otherwise, of a ring that a program kept, it may have been.
+  void begin() noexcept { started_ = false; }
 
   net::Frame start() const;  // StartPublishing
   Result<Request> on_publishing_untrusted(const net::Publishing& publishing);
@@ -51,10 +49,8 @@ class PublishingPoint {
 
   OutgoingRing& ring_;
   ring::RingReader reader_;
-  std::uint64_t their_incarnation_ = 0;  // 0: not known
-  Tid known_tid_ = kNoTid;  // in their ring: our sample next() - 1 is there or before it
-  Tid last_compared_ = kNoTid;
-  bool started_ = false;  // samples may have been sent
+  Tid compared_ = kNoTid, last_compared_ = kNoTid;
+  bool started_ = true;  // samples may have been sent
 };
 
 }  // namespace dssm::daemon

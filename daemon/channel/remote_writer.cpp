@@ -132,7 +132,7 @@ Result<void> RemoteWriter::follow(const StreamInfo& theirs) {
   Result<std::unique_ptr<OutgoingRing>> ring = OutgoingRing::make(theirs, parts_.registry.budget());
   if (!ring) return std::move(ring).error().context("write to '" + name_ + "'");
   if (Result<void> taken = take_ring(*std::move(ring)); !taken) return taken;
-  point_->begin(theirs);
+  point_->begin();
   return {};
 }
 
