@@ -39,25 +39,39 @@ SampleReceiver::SampleReceiver(const EventLoop& loop, FrameLink& link, MemorySha
       retry_timer_(EventSource::timer(loop, [this] { try_again(); })) {}
 
 Result<void> SampleReceiver::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
-  // Also samples of a stream that was removed are dropped: nobody will find them.
-  dropping_ = sample.info.tid <= last().last || stream_.stream().removed();
+  dropping_ = is_done_with(sample);
   out = dropping_ ? nullptr : payload_.data();
   return {};
+}
+
+// Also samples of a stream that was removed are dropped: nobody will find them.
+bool SampleReceiver::is_done_with(const wire::IncomingSample& sample) {
+  return sample.info.tid <= last().last || stream_.stream().removed();
 }
 
 Result<void> SampleReceiver::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   sample_ = sample;
   if (!dropping_ && !torn) return write();
-  if (sample.serial != 0) {
-    answer(sample.serial);
+  note_done();
+  return {};
+}
+
+void SampleReceiver::note_done() {
+  if (sample_.serial != 0) {
+    answer(sample_.serial);
   } else {
     unacknowledged_ = true;
   }
-  return {};
 }
 
 Result<void> SampleReceiver::write() {
   using Outcome = ring::RingWriter::Attempt::Outcome;
+  // The publisher may have come back on another connection while this one was cut in the middle of
+  // the sample, and have sent it there, and more.
+  if (is_done_with(sample_)) {
+    note_done();
+    return {};
+  }
   const ring::RingWriter::Attempt attempt = writer_->writer().try_write(
       std::as_const(payload_).span(), sample_.info.time, sample_.info.clock_error);
   switch (attempt.outcome) {
@@ -78,11 +92,7 @@ Result<void> SampleReceiver::write() {
   retry_ = kFirstRetry;
   written_ = true;
   stream_.publishers().written(publisher_, sample_.info.tid, attempt.tid);
-  if (sample_.serial != 0) {
-    answer(sample_.serial);
-  } else {
-    unacknowledged_ = true;
-  }
+  note_done();
   return {};
 }
 

@@ -7,8 +7,7 @@
 #include <string>
 
 #include "tests/bench/harness.hpp"
-#include "tests/bench/processes.hpp"
-#include "tests/support/daemon_process.hpp"
+#include "tests/bench/hosts.hpp"
 
 using namespace dssm;
 using namespace dssm::bench;
@@ -30,10 +29,10 @@ std::int64_t sleeps(pid_t pid) {
 
 int main() {
   constexpr int kStreams = 100, kSeconds = 10;
-  test::DaemonProcess owner({"--listen", "127.0.0.1:0"}, "pc1");
-  test::DaemonProcess other({"--listen", "127.0.0.1:0", "--peer", owner.address()}, "pc2");
-  Session session = Session::connect({.socket_path = owner.socket_path()}).value();
-  Session there = Session::connect({.socket_path = other.socket_path()}).value();
+  const Hosts hosts;
+  const auto owner = hosts.start_owner(), other = hosts.start_other(*owner);
+  Session session = Session::connect({.socket_path = owner->socket_path()}).value();
+  Session there = Session::connect({.socket_path = other->socket_path()}).value();
   std::vector<RawWriter> writers;
   std::vector<RawReader> readers;
   for (int i = 0; i < kStreams; ++i) {
@@ -42,10 +41,10 @@ int main() {
     readers.push_back(there.await_raw_reader(id, deadline_in(10s)).value());
   }
   ::sleep(1);
-  const std::int64_t owner_before = sleeps(owner.pid()), other_before = sleeps(other.pid());
+  const std::int64_t owner_before = sleeps(owner->pid()), other_before = sleeps(other->pid());
   ::sleep(kSeconds);
-  const double owner_rate = static_cast<double>(sleeps(owner.pid()) - owner_before) / kSeconds;
-  const double other_rate = static_cast<double>(sleeps(other.pid()) - other_before) / kSeconds;
+  const double owner_rate = static_cast<double>(sleeps(owner->pid()) - owner_before) / kSeconds;
+  const double other_rate = static_cast<double>(sleeps(other->pid()) - other_before) / kSeconds;
   std::printf("100 remote streams, nobody writing       wake-ups a second  heartbeats\n");
   std::printf("  owner: a Ping a second arrives         %17.1f  1\n", owner_rate);
   std::printf("  mirrors: sends it, and gets the Pong   %17.1f  2\n", other_rate);

@@ -2,7 +2,8 @@
 //
 // Reading across hosts: a PConnector's question by time beside a bare TCP ping-pong of the same
 // sizes; a mirror by time beside the owner's ring; and what remote readers cost the writer, beside
-// one write to an eventfd. Both hosts are on this machine, joined by loopback.
+// one write to an eventfd.
+#include <sys/epoll.h>
 #include <sys/eventfd.h>
 
 #include <dssm/dssm.hpp>
@@ -11,8 +12,7 @@
 #include <string>
 
 #include "tests/bench/harness.hpp"
-#include "tests/bench/processes.hpp"
-#include "tests/support/daemon_process.hpp"
+#include "tests/bench/hosts.hpp"
 
 using namespace dssm;
 using namespace dssm::bench;
@@ -21,26 +21,32 @@ using namespace std::chrono_literals;
 namespace {
 
 constexpr std::size_t kQuestionBytes = 32;
+constexpr std::size_t kAnswers = 100, kStride = 37;
 
-void bench_questions(const std::string& address, Session& session, std::size_t bytes) {
+void bench_questions(const Hosts& hosts, const std::string& address, Session& session,
+                     std::size_t bytes) {
   const StreamId id{"ask", static_cast<std::int32_t>(bytes), ""};
-  RawWriter writer = session.create_raw(id, {"", bytes, 1, {}}, History{101, 1ms}).value();
+  RawWriter writer = session.create_raw(id, {"", bytes, 1, {}}, History{kAnswers + 1, 1ms}).value();
   std::vector<std::byte> payload(bytes);
-  for (std::int64_t i = 0; i < 100; ++i) writer.write(payload, time_from_ns(1'000'000 * i));
+  for (std::int64_t i = 0; i < std::int64_t{kAnswers}; ++i)
+    writer.write(payload, time_from_ns(1'000'000 * i));
 
-  const auto [client, server] = tcp_pair();
+  const auto [server, client] = hosts.tcp_pair();
   const int echo = server;
   const pid_t pid = in_child([&] {
-    std::vector<std::byte> question(kQuestionBytes), answer(bytes);
-    for (;;) {
+    // From as many places as the ring's, in the same order: that one answer stays in the cache
+    // would be no limit of the machine's.
+    std::vector<std::byte> question(kQuestionBytes), answers(kAnswers * bytes, std::byte{1});
+    for (std::size_t at = 0;; at = (at + kStride) % kAnswers) {
       receive_all(echo, question.data(), question.size());
-      send_all(echo, answer.data(), answer.size());
+      send_all(echo, answers.data() + at * bytes, bytes);
     }
   });
+  const auto in_other = hosts.inside(2);
   PConnector connector = PConnector::open(id, {.address = address}).value();
   std::vector<std::byte> question(kQuestionBytes), out(bytes);
   SampleInfo info;
-  std::int64_t at = 0;
+  std::size_t at = 0;
   const int socket = client;
   const Pair pair = measure(
       4000, 1,
@@ -49,8 +55,9 @@ void bench_questions(const std::string& address, Session& session, std::size_t b
         receive_all(socket, out.data(), out.size());
       },
       [&] {
-        at = (at + 37) % 100;
-        if (connector.at(time_from_ns(1'000'000 * at), out, info).value() != ReadStatus::ok) {
+        at = (at + kStride) % kAnswers;
+        if (connector.at(time_from_ns(1'000'000 * static_cast<std::int64_t>(at)), out, info)
+                .value() != ReadStatus::ok) {
           fail("read by time");
         }
       });
@@ -86,15 +93,19 @@ void bench_mirror(Session& owner, Session& other) {
 
 // What a write costs more while eight readers elsewhere are subscribed, in units of one write to an
 // eventfd that somebody waits for.
-void bench_writer(const test::DaemonProcess& daemon, Session& session) {
+void bench_writer(const Hosts& hosts, const std::string& address, Session& session) {
   constexpr int kReaders = 8, kWrites = 3000;
   RawWriter writer =
       session.create_raw({"cost", 0, ""}, {"", 64, 1, {}}, History{1000, 1ms}).value();
   const int bell = ::eventfd(0, EFD_CLOEXEC);
   const pid_t listener = in_child([&] {
-    for (std::uint64_t count = 0;;) {
-      if (::read(bell, &count, sizeof count) != sizeof count) fail("read eventfd");
+    const int epoll = ::epoll_create1(EPOLL_CLOEXEC);
+    epoll_event event{};
+    event.events = EPOLLIN | EPOLLET;
+    if (::epoll_ctl(epoll, EPOLL_CTL_ADD, bell, &event)) fail("epoll_ctl");
+    while (::epoll_wait(epoll, &event, 1, -1) >= 0) {
     }
+    fail("epoll_wait");
   });
   std::vector<std::byte> payload(64);
   const auto paced = [&](auto operation) {
@@ -115,10 +126,10 @@ void bench_writer(const test::DaemonProcess& daemon, Session& session) {
   });
   const Figures alone = paced(write);
   auto& ready = shared<std::atomic<int>>();
-  const std::string address = daemon.address();
   std::vector<pid_t> readers;
   for (int i = 0; i < kReaders; ++i) {
     readers.push_back(in_child([&] {
+      const auto in_other = hosts.inside(2);
       PConnector connector = PConnector::open({"cost", 0, ""}, {.address = address}).value();
       connector.subscribe({}).value();
       ready.fetch_add(1);
@@ -147,14 +158,15 @@ void bench_writer(const test::DaemonProcess& daemon, Session& session) {
 }  // namespace
 
 int main() {
-  test::DaemonProcess owner({"--listen", "127.0.0.1:0"}, "pc1");
-  test::DaemonProcess other({"--listen", "127.0.0.1:0", "--peer", owner.address()}, "pc2");
-  Session session = Session::connect({.socket_path = owner.socket_path()}).value();
-  Session there = Session::connect({.socket_path = other.socket_path()}).value();
-  print_head();
-  for (const std::size_t bytes : {64, 1024, 16 << 10, 64 << 10}) {
-    bench_questions(owner.address(), session, bytes);
-  }
-  bench_mirror(session, there);
-  bench_writer(owner, session);
+  on_hosts([](const Hosts& hosts) {
+    const auto owner = hosts.start_owner(), other = hosts.start_other(*owner);
+    Session session = Session::connect({.socket_path = owner->socket_path()}).value();
+    Session there = Session::connect({.socket_path = other->socket_path()}).value();
+    print_head();
+    for (const std::size_t bytes : {64, 1024, 16 << 10, 64 << 10}) {
+      bench_questions(hosts, owner->address(), session, bytes);
+    }
+    bench_mirror(session, there);
+    bench_writer(hosts, owner->address(), session);
+  });
 }

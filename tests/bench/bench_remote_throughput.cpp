@@ -1,19 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // How much one channel carries: large samples beside raw TCP with writes of the same size, and how
-// many small ones; how often a payload is copied on the way. Both hosts are on this machine, joined
-// by loopback.
+// many small ones; how often a payload is copied on the way.
 //
 // The samples stand in the owner's ring before the clock starts, and the reader takes all of them
 // into one piece of memory: sending and receiving is all that is measured, on both sides. The raw
 // sender's memory is as large as the ring, so that neither side works out of the cache alone.
+#include <fcntl.h>
+#include <sys/mman.h>
+
+#include <cinttypes>
 #include <dssm/dssm.hpp>
 #include <dssm/pconnector.hpp>
 #include <string>
 
 #include "tests/bench/harness.hpp"
-#include "tests/bench/processes.hpp"
-#include "tests/support/daemon_process.hpp"
+#include "tests/bench/hosts.hpp"
 
 using namespace dssm;
 using namespace dssm::bench;
@@ -23,8 +25,8 @@ namespace {
 
 constexpr int kRounds = 7;
 
-double raw_bytes_per_s(std::size_t bytes, std::size_t count) {
-  const auto [out, in] = tcp_pair();
+double raw_bytes_per_s(const Hosts& hosts, std::size_t bytes, std::size_t count) {
+  const auto [out, in] = hosts.tcp_pair();
   const int sender = out;
   std::vector<std::byte> all(bytes * count, std::byte{1});
   const pid_t pid = in_child([&] {
@@ -60,24 +62,30 @@ double drain_ns(PConnector& connector, std::size_t bytes, std::size_t count) {
   return took;
 }
 
-std::vector<std::byte> fill(Session& session, const StreamId& id, std::size_t bytes,
-                            std::size_t count) {
+RawWriter fill(Session& session, const StreamId& id, std::size_t bytes, std::size_t count) {
   RawWriter writer = session.create_raw(id, {"", bytes, 1, {}}, History{count + 1, 1ms}).value();
   std::vector<std::byte> payload(bytes, std::byte{1});
   for (std::size_t i = 0; i < count; ++i)
     writer.write(payload, time_from_ns(static_cast<std::int64_t>(i)));
-  return payload;
+  return writer;
 }
 
-void bench_large(const std::string& address, Session& session, std::size_t bytes,
-                 std::size_t count) {
+void print_receiver_copies(const PConnector::Counters& counters, std::size_t bytes) {
+  const double received = static_cast<double>(counters.samples * bytes);
+  std::printf("%-44s %9.3f\n", "  user-space copies of a payload, receiver",
+              static_cast<double>(counters.copied_payload_bytes) / received);
+}
+
+void bench_large(const Hosts& hosts, const std::string& address, Session& session,
+                 std::size_t bytes, std::size_t count) {
   const StreamId id{"large", static_cast<std::int32_t>(bytes), ""};
-  fill(session, id, bytes, count);
+  const RawWriter writer = fill(session, id, bytes, count);
+  const auto in_other = hosts.inside(2);
   PConnector connector = PConnector::open(id, {.address = address}).value();
   std::vector<double> raw, ours;
   drain_ns(connector, bytes, count);
   for (int i = 0; i < kRounds; ++i) {
-    raw.push_back(raw_bytes_per_s(bytes, count) / 1e6);
+    raw.push_back(raw_bytes_per_s(hosts, bytes, count) / 1e6);
     ours.push_back(static_cast<double>(bytes * count) * 1e3 / drain_ns(connector, bytes, count));
   }
   const Figures raw_figures = figures_of(raw), our_figures = figures_of(ours);
@@ -86,24 +94,23 @@ void bench_large(const std::string& address, Session& session, std::size_t bytes
   std::snprintf(rest, sizeof rest, "%7.2f  >= 0.9", our_figures.median / raw_figures.median);
   print_row("  raw TCP [MB/s]" + tail, raw_figures);
   print_row("one channel [MB/s]" + tail, our_figures, rest);
-  const PConnector::Counters counters = connector.counters();
-  const double received = static_cast<double>(counters.samples * bytes);
-  std::printf("%-44s %9.3f\n", "  user-space copies of a payload, receiver",
-              static_cast<double>(counters.copied_payload_bytes) / received);
+  print_receiver_copies(connector.counters(), bytes);
   session.remove(id).value();
 }
 
-void bench_small(const std::string& address, Session& session, Session& other) {
+void bench_small(const Hosts& hosts, const std::string& address, Session& session, Session& other) {
   constexpr std::size_t kCount = 1'000'000, kBytes = 64;
   const StreamId id{"small", 0, "pc1"};
-  fill(session, id, kBytes, kCount);
+  const RawWriter writer = fill(session, id, kBytes, kCount);
   std::vector<double> connector_rate, mirror_rate;
+  const auto in_other = hosts.inside(2);
   PConnector connector = PConnector::open(id, {.address = address}).value();
   for (int i = 0; i < kRounds; ++i) {
     connector_rate.push_back(static_cast<double>(kCount) * 1e9 /
                              drain_ns(connector, kBytes, kCount));
   }
   print_row("PConnector, 64 B [samples/s]", figures_of(connector_rate), "         >= 1000000");
+  print_receiver_copies(connector.counters(), kBytes);
   const std::int64_t start = now_ns();
   RawReader reader = other.await_raw_reader(id, deadline_in(30s)).value();
   const auto last = static_cast<Tid>(kCount) - 1;
@@ -115,16 +122,52 @@ void bench_small(const std::string& address, Session& session, Session& other) {
   session.remove(id).value();
 }
 
+// What the owner's dssmd says at the end of a channel about the payloads that it sent.
+void count_copies(const Hosts& hosts, std::size_t bytes, std::size_t count) {
+  const int log = ::memfd_create("log", MFD_CLOEXEC), screen = ::fcntl(2, F_DUPFD_CLOEXEC, 3);
+  if (log < 0 || screen < 0 || ::dup2(log, 2) < 0) fail("catch the log");
+  const auto owner = hosts.start_owner("debug");
+  ::dup2(screen, 2);
+  Session session = Session::connect({.socket_path = owner->socket_path()}).value();
+  const StreamId id{"copied", 0, ""};
+  const RawWriter writer = fill(session, id, bytes, count);
+  {
+    const auto in_other = hosts.inside(2);
+    PConnector connector = PConnector::open(id, {.address = owner->address()}).value();
+    drain_ns(connector, bytes, count);
+  }
+  for (std::string text(1 << 16, ' ');; ::usleep(1000)) {
+    const ssize_t length = ::pread(log, text.data(), text.size(), 0);
+    const std::string said = text.substr(0, static_cast<std::size_t>(std::max<ssize_t>(length, 0)));
+    const std::size_t at = said.find(" samples sent (");
+    if (at == std::string::npos) continue;
+    std::uint64_t copied = 0, in_place = 0;
+    if (std::sscanf(said.c_str() + at, " samples sent (%" SCNu64 " payload bytes copied, %" SCNu64,
+                    &copied, &in_place) != 2) {
+      fail("understand dssmd's log");
+    }
+    std::printf("%-44s %9.3f\n", "  user-space copies of a payload, sender",
+                static_cast<double>(copied) / static_cast<double>(copied + in_place));
+    break;
+  }
+  ::close(log), ::close(screen);
+}
+
 }  // namespace
 
 int main() {
-  test::DaemonProcess owner({"--listen", "127.0.0.1:0"}, "pc1");
-  test::DaemonProcess other({"--listen", "127.0.0.1:0", "--peer", owner.address()}, "pc2");
-  Session session = Session::connect({.socket_path = owner.socket_path()}).value();
-  Session there = Session::connect({.socket_path = other.socket_path()}).value();
-  std::printf("%-44s %9s %9s %9s %9s  %7s  %s\n", "more is better", "min", "median", "p99", "p99.9",
-              "ratio", "target");
-  bench_large(owner.address(), session, 64 << 10, 4096);
-  bench_large(owner.address(), session, 1 << 20, 256);
-  bench_small(owner.address(), session, there);
+  on_hosts([](const Hosts& hosts) {
+    const auto owner = hosts.start_owner(), other = hosts.start_other(*owner);
+    Session session = Session::connect({.socket_path = owner->socket_path()}).value();
+    Session there = Session::connect({.socket_path = other->socket_path()}).value();
+    std::printf("%-44s %9s %9s %9s %9s  %7s  %s\n", "more is better", "min", "median", "p99",
+                "p99.9", "ratio", "target");
+    for (const std::size_t bytes : {64 << 10, 1 << 20}) {
+      const std::size_t count = (256U << 20) / bytes;
+      bench_large(hosts, owner->address(), session, bytes, count);
+      count_copies(hosts, bytes, count);
+    }
+    bench_small(hosts, owner->address(), session, there);
+    count_copies(hosts, 64, 1'000'000);
+  });
 }

@@ -2,8 +2,7 @@
 //
 // From a writer on one host to a reader that sleeps on another, 1,000 times a second: how long it
 // takes, and how much CPU time of all processes together. Beside it, in turns, a chain of bare
-// processes with the same hops: eventfd wake, TCP one way, futex wake. Both hosts are on this
-// machine, joined by loopback.
+// processes with the same hops: eventfd wake, TCP one way, futex wake.
 #include <sys/eventfd.h>
 
 #include <cstring>
@@ -12,8 +11,7 @@
 #include <string>
 
 #include "tests/bench/harness.hpp"
-#include "tests/bench/processes.hpp"
-#include "tests/support/daemon_process.hpp"
+#include "tests/bench/hosts.hpp"
 
 using namespace dssm;
 using namespace dssm::bench;
@@ -146,12 +144,12 @@ void print(const std::string& raw_name, const std::string& our_name, Chain& raw,
               static_cast<double>(our_cpu_ns) / static_cast<double>(raw_cpu_ns), cpu_target);
 }
 
-void measure_wakes(std::size_t bytes) {
-  test::DaemonProcess owner({"--listen", "127.0.0.1:0"}, "pc1");
+void measure_wakes(const Hosts& hosts, std::size_t bytes) {
+  const auto owner = hosts.start_owner();
   auto& all = shared<Shared>();
   const int bells[] = {::eventfd(0, EFD_CLOEXEC), ::eventfd(0, EFD_CLOEXEC)};
-  const auto [mirror_out, mirror_in] = tcp_pair();
-  const auto [connector_out, connector_in] = tcp_pair();
+  const auto [mirror_out, mirror_in] = hosts.tcp_pair();
+  const auto [connector_out, connector_in] = hosts.tcp_pair();
   Chain& raw_mirror = all[Kind::raw_mirror];
   Chain& our_mirror = all[Kind::our_mirror];
   Chain& raw_connector = all[Kind::raw_connector];
@@ -164,7 +162,7 @@ void measure_wakes(std::size_t bytes) {
       in_child([&] { forward(bells[1], connector_out, raw_connector.here, bytes); }),
       in_child([&] { sleep_on_socket(connector_in, raw_connector, bytes); })};
 
-  Session session = Session::connect({.socket_path = owner.socket_path()}).value();
+  Session session = Session::connect({.socket_path = owner->socket_path()}).value();
   RawWriter writer =
       session.create_raw({"chain", 0, ""}, {"", bytes, 1, {}}, History{1000, 1ms}).value();
   std::vector<std::byte> payload(bytes);
@@ -183,25 +181,28 @@ void measure_wakes(std::size_t bytes) {
   std::int64_t cpu[kKinds] = {};
   const std::string tail = ", " + std::to_string(bytes) + " B";
   {
-    test::DaemonProcess mirror({"--listen", "127.0.0.1:0", "--peer", owner.address()}, "pc2");
-    const std::string socket = mirror.socket_path();
+    const auto mirror = hosts.start_other(*owner);
+    const std::string socket = mirror->socket_path();
     const pid_t reader = in_child([&] { read_mirror(socket, our_mirror); });
     wait_until_ready(our_mirror);
     for (int i = 0; i < kRounds; ++i) {
       cpu[0] += round(raw_mirror, raw_mirror_processes, [&] { send_raw(raw_mirror, bells[0]); });
-      cpu[1] += round(our_mirror, {owner.pid(), mirror.pid(), reader}, send_ours);
+      cpu[1] += round(our_mirror, {owner->pid(), mirror->pid(), reader}, send_ours);
     }
     end_child(reader);
     print("eventfd, TCP, futex" + tail, "writer to sleeping reader of a mirror" + tail, raw_mirror,
           our_mirror, cpu[0], cpu[1], bytes == 1024 ? "<= 1.3" : "");
   }
-  const std::string address = owner.address();
-  const pid_t reader = in_child([&] { read_connector(address, our_connector); });
+  const std::string address = owner->address();
+  const pid_t reader = in_child([&] {
+    const auto in_other = hosts.inside(2);
+    read_connector(address, our_connector);
+  });
   wait_until_ready(our_connector);
   for (int i = 0; i < kRounds; ++i) {
     cpu[2] +=
         round(raw_connector, raw_connector_processes, [&] { send_raw(raw_connector, bells[1]); });
-    cpu[3] += round(our_connector, {owner.pid(), reader}, send_ours);
+    cpu[3] += round(our_connector, {owner->pid(), reader}, send_ours);
   }
   end_child(reader);
   print("eventfd, TCP" + tail, "writer to sleeping PConnector" + tail, raw_connector, our_connector,
@@ -216,7 +217,9 @@ void measure_wakes(std::size_t bytes) {
 }  // namespace
 
 int main() {
-  print_head();
-  measure_wakes(64);
-  measure_wakes(1024);
+  on_hosts([](const Hosts& hosts) {
+    print_head();
+    measure_wakes(hosts, 64);
+    measure_wakes(hosts, 1024);
+  });
 }

@@ -3,6 +3,7 @@
 // What the benchmarks of chains of processes share: children, bare TCP, futexes, CPU time.
 #pragma once
 
+#include <arpa/inet.h>
 #include <linux/futex.h>
 #include <netinet/in.h>
 #include <netinet/tcp.h>
@@ -74,28 +75,6 @@ inline std::int64_t cpu_ns(pid_t pid) {
   timespec time{};
   if (::clock_getcpuclockid(pid, &clock) || ::clock_gettime(clock, &time)) fail("CPU time");
   return time.tv_sec * 1'000'000'000 + time.tv_nsec;
-}
-
-// Two ends of a TCP connection over loopback, without Nagle's delay.
-inline std::pair<int, int> tcp_pair() {
-  const int listener = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
-  sockaddr_in address{};
-  address.sin_family = AF_INET;
-  address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
-  socklen_t length = sizeof address;
-  auto* name = reinterpret_cast<sockaddr*>(&address);
-  if (::bind(listener, name, length) || ::listen(listener, 1) ||
-      ::getsockname(listener, name, &length)) {
-    fail("listen");
-  }
-  const int one = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
-  if (::connect(one, name, length)) fail("connect");
-  const int other = ::accept4(listener, nullptr, nullptr, SOCK_CLOEXEC);
-  if (other < 0) fail("accept");
-  ::close(listener);
-  const int on = 1;
-  for (const int fd : {one, other}) ::setsockopt(fd, IPPROTO_TCP, TCP_NODELAY, &on, sizeof on);
-  return {one, other};
 }
 
 inline void send_all(int fd, const void* data, std::size_t bytes) {

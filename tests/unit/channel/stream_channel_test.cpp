@@ -15,13 +15,14 @@ namespace {
 constexpr std::uint64_t kBytes = 24;
 
 std::vector<std::byte> sample_frame(std::int64_t number, std::uint64_t serial = 0,
-                                    std::byte fill = std::byte{9}) {
+                                    std::byte fill = std::byte{9},
+                                    std::uint64_t payload_bytes = kBytes) {
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
   const std::size_t bytes =
       wire::encode_sample_header(header, serial, {number, time_from_ns(5000 + number), Duration(4)},
-                                 kBytes, wire::Trailer::none);
+                                 payload_bytes, wire::Trailer::none);
   std::vector<std::byte> frame(header.begin(), header.begin() + bytes);
-  frame.resize(frame.size() + kBytes, fill);
+  frame.resize(frame.size() + payload_bytes, fill);
   return frame;
 }
 
@@ -343,6 +344,38 @@ TEST_F(StreamChannelTest, WritesEachSampleOnceOverReconnects) {
   EXPECT_EQ(stream->info().newest, 4);
   frame.mutable_start_publishing()->set_publisher(12);
   EXPECT_EQ(rig.ask(again, frame).publishing().last(), -1) << "another publisher";
+}
+
+// A connection was cut in the middle of a sample, and what was under way arrives after all, while
+// the publisher has gone on by another one.
+TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionComesBack) {
+  constexpr std::uint64_t kLarge = 100'000;  // received piece by piece
+  const std::shared_ptr<Stream> camera = rig.create("camera", kLarge);
+  FakePeer old, again;
+  net::Frame frame = request(70);
+  frame.mutable_start_publishing()->set_publisher(11);
+  for (FakePeer* one : {&old, &again}) {
+    rig.connect(*one);
+    rig.open(*one, "camera");
+    EXPECT_EQ(rig.ask(*one, frame).publishing().last(), -1);
+  }
+  const auto large = [](std::int64_t number) {
+    return sample_frame(number, 0, std::byte{9}, kLarge);
+  };
+  const std::vector<std::byte> first = large(0);
+  old.put({first.begin(), first.begin() + 50'000});
+  rig.turns();
+  for (const std::int64_t number : {0, 1, 2}) again.put(large(number));
+  rig.turns();
+  EXPECT_EQ(camera->info().newest, 2);
+  old.put({first.begin() + 50'000, first.end()});
+  old.put(large(1));
+  rig.turns();
+  EXPECT_EQ(camera->info().newest, 2);
+  EXPECT_EQ(words(rig.take(old, kLarge)), "published:2=2 published:2=2");
+  again.put(large(3));
+  rig.turns();
+  EXPECT_EQ(camera->info().newest, 3);
 }
 
 TEST_F(StreamChannelTest, AcknowledgesWhatWasWrittenBeforeWithoutWritingIt) {
