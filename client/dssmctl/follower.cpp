@@ -12,7 +12,7 @@ Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out
   const Result<DaemonInfo> daemon = session.daemon();
   if (!daemon) return daemon.error();
   const bool own = reader.id().host == daemon->host;
-  Follower follower(session, reader, out, own ? kLookUp : kMayComeBack);
+  Follower follower(session, reader, out, own ? kStopLookUp : kMayComeBack);
   Result<Session::Watch> watch =
       session.watch([suspicion = follower.suspicion_, id = reader.id()](const StreamEvent& event) {
         if (event.stream.id != id) return;
@@ -45,7 +45,7 @@ Follower::Wake Follower::wait(MonoTime deadline) {
   while (true) {
     if (stop_requested() || out_.reader_gone()) return Wake::stop;
     if (removed() || reader_.trouble()) return Wake::ended;
-    const MonoTime look_up = std::min(deadline, deadline_in(kLookUp));
+    const MonoTime look_up = std::min(deadline, deadline_in(kStopLookUp));
     if (reader_.wait(look_up) == WaitStatus::ready) return Wake::sample;
     if (MonoClock::now() >= deadline) return Wake::deadline;
   }

@@ -3,9 +3,6 @@
 // Waiting on a stream that is being shown: for its next sample, the next report, Ctrl-C, the end of
 // whoever reads our output, and the stream's end. A stream that begins anew, with a new ring, is
 // followed; one that was removed and is not there is at its end.
-//
-// It looks up every kLookUp because a signal that comes between the look at its mark and the sleep
-// on the ring would otherwise be noticed only with the next sample.
 #pragma once
 
 #include <atomic>
@@ -35,7 +32,6 @@ class Follower {
       : session_(session), reader_(reader), out_(out), patience_(patience) {}
   bool removed();
 
-  static constexpr Duration kLookUp = std::chrono::milliseconds(100);
   // A stream of another host that is not there any more may be back in a moment: its dssmd was
   // restarted, and the programs that hold the stream are about to offer it.
   static constexpr Duration kMayComeBack = std::chrono::seconds(3);

@@ -35,7 +35,9 @@ double rate_hz(const Statistics& intervals) {
   return intervals.count > 0 && intervals.mean_ns > 0 ? 1e9 / intervals.mean_ns : 0;
 }
 
-std::string rate_text(double rate) { return rate > 0 ? fixed_text(rate, 3) + " Hz" : "unknown"; }
+std::string precise_rate_text(double rate) {
+  return rate > 0 ? fixed_text(rate, 3) + " Hz" : "unknown";
+}
 
 // Whether there is something to measure; prints why not.
 bool measurable(const MeterState& state, const Statistics& intervals, Output& out) {
@@ -75,7 +77,7 @@ void print_hz(const MeterState& state, const Statistics& intervals, bool as_json
     return out.add(json_line(json));
   }
   if (!measurable(state, intervals, out)) return;
-  out.add("average rate: " + rate_text(rate_hz(intervals)) + "\n\tmin: " +
+  out.add("average rate: " + precise_rate_text(rate_hz(intervals)) + "\n\tmin: " +
           seconds_text(to_ns(intervals.min)) + " s max: " + seconds_text(to_ns(intervals.max)) +
           " s std dev: " + fixed_text(intervals.std_dev_ns / 1e9, 9) +
           " s window: " + std::to_string(intervals.count + 1) + "\n");
@@ -91,7 +93,7 @@ void print_bw(const MeterState& state, const Statistics& intervals, bool as_json
   }
   if (!measurable(state, intervals, out)) return;
   out.add("average: " + (rate > 0 ? byte_rate_text(bytes_per_second) : "unknown") +
-          "\n\tpayload: " + bytes_text(state.payload_bytes) + " rate: " + rate_text(rate) +
+          "\n\tpayload: " + bytes_text(state.payload_bytes) + " rate: " + precise_rate_text(rate) +
           " window: " + std::to_string(intervals.count + 1) + "\n");
 }
 

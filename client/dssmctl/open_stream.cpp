@@ -11,9 +11,6 @@
 namespace dssm::ctl {
 namespace {
 
-// libdssm waits for a stream without heeding signals: look up this often.
-constexpr Duration kLookUp = std::chrono::milliseconds(100);
-
 // Without a reader and without an error when told to stop.
 Result<std::optional<OpenedStream>> open_stream(const Options& options) {
   Result<Session> session = connect(options);
@@ -26,7 +23,7 @@ Result<std::optional<OpenedStream>> open_stream(const Options& options) {
   const MonoTime deadline = deadline_in(options.wait);
   while (reader.error().code == Errc::not_found && MonoClock::now() < deadline) {
     if (stop_requested()) return std::optional<OpenedStream>();
-    reader = session->await_raw_reader(*id, std::min(deadline, deadline_in(kLookUp)));
+    reader = session->await_raw_reader(*id, std::min(deadline, deadline_in(kStopLookUp)));
     if (reader) return std::optional(OpenedStream{*session, std::move(*reader), true});
   }
   Error error = with_similar_names(std::move(reader).error(), *session, *id);

@@ -20,9 +20,6 @@ namespace {
 // For the summary: more answers than anybody waits for; then the newest ones.
 constexpr std::size_t kKeptAnswers = 1'000'000;
 
-// A signal between the look at its mark and the sleep is noticed so late.
-constexpr Duration kLookUp = std::chrono::milliseconds(100);
-
 class Ping {
  public:
   Ping(const Options& options, Output& out) : host_(options.host), json_(options.json), out_(out) {}
@@ -96,7 +93,7 @@ bool is_known(Session& session, const std::string& name) {
 bool wait_until(MonoTime due, Output& out) {
   while (MonoClock::now() < due) {
     if (stop_requested() || out.reader_gone()) return false;
-    const Duration rest = std::min(due - MonoClock::now(), kLookUp);
+    const Duration rest = std::min(due - MonoClock::now(), kStopLookUp);
     std::this_thread::sleep_for(rest);
   }
   return true;

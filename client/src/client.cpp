@@ -22,8 +22,8 @@ constexpr timeval kSocketTimeout{.tv_sec = 2, .tv_usec = 0};
 
 // Between attempts to connect anew. Shorter than dssmd's recovery_grace (500 ms), during which a
 // restarted dssmd keeps names free for the rings that are offered back.
-constexpr Duration kFirstPause = 10ms;
-constexpr Duration kLongestPause = 200ms;
+constexpr Duration kFirstReconnectPause = 10ms;
+constexpr Duration kLongestReconnectPause = 200ms;
 
 // Of events about opens that are not noted yet: as many as threads may be opening at once.
 constexpr std::size_t kMaxReplacedEarly = 1024;
@@ -518,7 +518,7 @@ void Client::keep() {
     const Result<void> ended = read_connection(socket);
     stop_using();
     if (ended) return;  // told to stop
-    for (Duration time = kFirstPause;; time = std::min(2 * time, kLongestPause)) {
+    for (Duration time = kFirstReconnectPause;; time = std::min(2 * time, kLongestReconnectPause)) {
       auto anew = shake_hands();
       if (anew) {
         start_using(std::move(*anew));

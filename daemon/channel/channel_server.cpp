@@ -14,7 +14,7 @@ namespace dssm::daemon {
 namespace {
 
 // Accepted in a row before those who are connected get their turn.
-constexpr int kAcceptsPerTurn = 16;
+constexpr int kPeersPerTurn = 16;
 
 // How often heartbeats make us look at the streams whose doorbells did not ring: a writer may have
 // been killed between writing and ringing.
@@ -50,7 +50,7 @@ void ChannelServer::serve(const NetworkListener& listener) {
 }
 
 void ChannelServer::on_connection(int listener) {
-  for (int i = 0; i < kAcceptsPerTurn; ++i) {
+  for (int i = 0; i < kPeersPerTurn; ++i) {
     UniqueFd socket(::accept4(listener, nullptr, nullptr, SOCK_CLOEXEC | SOCK_NONBLOCK));
     if (socket) {
       accept(std::move(socket));

@@ -10,7 +10,7 @@ namespace dssm::daemon {
 namespace {
 
 // What receivers take of a frame, less what frames a list.
-constexpr std::size_t kMaxListBytes = wire::kMaxPlainBytes - (4U << 10);
+constexpr std::size_t kMaxPlainListBytes = wire::kMaxPlainBytes - (4U << 10);
 
 }  // namespace
 
@@ -60,8 +60,8 @@ Result<std::shared_ptr<Stream>> ControlRequests::find_untrusted(const proto::Str
 
 Result<void> ControlRequests::list(net::Frame& answer) const {
   proto::StreamList& list = *answer.mutable_stream_list();
-  describe_all(registry_, opens_, kMaxListBytes, list);
-  if (list.ByteSizeLong() <= kMaxListBytes) return {};
+  describe_all(registry_, opens_, kMaxPlainListBytes, list);
+  if (list.ByteSizeLong() <= kMaxPlainListBytes) return {};
   return Error{Errc::limit_exceeded,
                "the list of the " + std::to_string(registry_.streams().size()) +
                    " streams of host '" + registry_.host() +

@@ -8,7 +8,7 @@ namespace dssm::daemon {
 namespace {
 
 // A frame that we send is no larger than a property and its stream's name.
-constexpr std::size_t kMaxQueuedBytes = PeerLink::kMaxWaitingBytes + (2U << 20);
+constexpr std::size_t kMaxOutputBytes = PeerLink::kMaxWaitingBytes + (2U << 20);
 
 // Silence while bytes of ours still wait for the peer's kernel to take them: a large property on a
 // slow network keeps our heartbeats from going out. Whether the peer's PC is alive is then watched
@@ -44,7 +44,7 @@ PeerLink::PeerLink(const EventLoop& loop, Resolver& resolver, const wire::Addres
       clock_bound_(self.clock_bound),
       user_(user),
       heartbeat_(EventSource::timer(loop, [this] { beat(); })),
-      dialer_(loop, resolver, {peer, self, kMaxQueuedBytes}, *this) {}
+      dialer_(loop, resolver, {peer, self, kMaxOutputBytes}, *this) {}
 
 void PeerLink::enter(State state, std::optional<Error> why) {
   if (state != state_) since_ = MonoClock::now();

@@ -13,7 +13,7 @@ namespace dssm::daemon {
 namespace {
 
 // Accepted in a row before those who are connected get their turn.
-constexpr int kAcceptsPerTurn = 16;
+constexpr int kClientsPerTurn = 16;
 
 }  // namespace
 
@@ -32,7 +32,7 @@ Server::Server(const EventLoop& loop, const Listener& listener, std::uint64_t ma
 }
 
 void Server::on_connection() {
-  for (int i = 0; i < kAcceptsPerTurn; ++i) {
+  for (int i = 0; i < kClientsPerTurn; ++i) {
     UniqueFd socket(::accept4(listener_.fd(), nullptr, nullptr, SOCK_CLOEXEC | SOCK_NONBLOCK));
     if (socket) {
       accept(std::move(socket));

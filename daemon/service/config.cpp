@@ -34,7 +34,7 @@ Result<void> take(T& place, Result<U> value) {
 
 Result<void> set_runtime_dir(Config& config, std::string_view text) {
   const auto error = [&](const std::string& why) {
-    return Error{Errc::invalid_argument, quoted(text) + " " + why};
+    return Error{Errc::invalid_argument, in_quotes(text) + " " + why};
   };
   if (!text.starts_with('/')) return error("does not begin with '/'");
   if (text.find('\0') != text.npos) return error("holds a zero byte");
@@ -53,7 +53,7 @@ Result<void> add_listen_address(Config& config, std::string_view text) {
   if (!address) return std::move(address).error();
   if (wire::resolve_number(*address).empty()) {
     return Error{Errc::invalid_argument,
-                 quoted(text) +
+                 in_quotes(text) +
                      " is a name; write the number of an address of this PC, such as "
                      "\"127.0.0.1:13776\", \"[::]:13776\" or \"0.0.0.0:13776\""};
   }
@@ -71,7 +71,7 @@ Result<void> add_peer(Config& config, std::string_view text) {
 
 Result<void> set_insecure(Config& config, std::string_view text) {
   if (text != "true" && text != "false") {
-    return Error{Errc::invalid_argument, quoted(text) + " is neither true nor false"};
+    return Error{Errc::invalid_argument, in_quotes(text) + " is neither true nor false"};
   }
   config.insecure = text == "true";
   return {};
@@ -93,7 +93,7 @@ Result<void> check_secure(const Config& config) {
       addresses.append(addresses.empty() ? "" : ", ")
           .append(what)
           .append(" ")
-          .append(quoted(address.str()));
+          .append(in_quotes(address.str()));
     }
   };
   if (config.listen) note("listen", *config.listen);
@@ -309,7 +309,7 @@ Result<void> apply_text_untrusted(Config& config, std::string_view text, const s
       continue;
     }
     const Result<void> set = set_value(config, *key, node);
-    if (!set) mistake("key " + quoted(key->name) + ": " + set.error().message);
+    if (!set) mistake("key " + in_quotes(key->name) + ": " + set.error().message);
   }
   if (mistakes.empty()) return {};
   std::stable_sort(mistakes.begin(), mistakes.end(),

@@ -32,8 +32,8 @@ Result<Quantity> parse_quantity(std::string_view text) {
   Quantity quantity;
   const char* end = text.data() + text.size();
   const auto [rest, error] = std::from_chars(text.data(), end, quantity.number);
-  if (error == std::errc::result_out_of_range) return invalid(quoted(text) + " is too large");
-  if (error != std::errc()) return invalid(quoted(text) + " does not begin with a whole number");
+  if (error == std::errc::result_out_of_range) return invalid(in_quotes(text) + " is too large");
+  if (error != std::errc()) return invalid(in_quotes(text) + " does not begin with a whole number");
   quantity.unit = std::string_view(rest, static_cast<std::size_t>(end - rest));
   while (quantity.unit.starts_with(' ')) quantity.unit.remove_prefix(1);
   return quantity;
@@ -41,7 +41,7 @@ Result<Quantity> parse_quantity(std::string_view text) {
 
 Error out_of_range(std::string_view text, std::uint64_t least, std::uint64_t most,
                    std::string_view unit) {
-  return invalid(quoted(text) + " is outside of " + std::to_string(least) + " to " +
+  return invalid(in_quotes(text) + " is outside of " + std::to_string(least) + " to " +
                  std::to_string(most) + std::string(unit));
 }
 
@@ -50,7 +50,7 @@ Error out_of_range(std::string_view text, std::uint64_t least, std::uint64_t mos
 Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t least, std::uint64_t most) {
   const Result<Quantity> quantity = parse_quantity(text);
   if (!quantity) return quantity.error();
-  if (!quantity->unit.empty()) return invalid(quoted(text) + " is no whole number");
+  if (!quantity->unit.empty()) return invalid(in_quotes(text) + " is no whole number");
   if (quantity->number < least || quantity->number > most) {
     return out_of_range(text, least, most, "");
   }
@@ -62,7 +62,7 @@ Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, st
   if (!quantity) return quantity.error();
   std::uint64_t bytes = quantity->number;
   if (quantity->unit == "%") {
-    if (quantity->number > 100) return invalid(quoted(text) + " is more than the whole memory");
+    if (quantity->number > 100) return invalid(in_quotes(text) + " is more than the whole memory");
     bytes = memory_of_the_machine() / 100 * quantity->number;
   } else if (quantity->unit == "KiB") {
     bytes = product(bytes, 1ULL << 10);
@@ -73,7 +73,7 @@ Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, st
   } else if (quantity->unit == "TiB") {
     bytes = product(bytes, 1ULL << 40);
   } else if (!quantity->unit.empty()) {
-    return invalid(quoted(text) + " has an unknown unit; write bytes, KiB, MiB, GiB, TiB or %");
+    return invalid(in_quotes(text) + " has an unknown unit; write bytes, KiB, MiB, GiB, TiB or %");
   }
   if (bytes < least || bytes > most) return out_of_range(text, least, most, " bytes");
   return bytes;
@@ -88,7 +88,7 @@ Result<Duration> parse_duration(std::string_view text, Duration least, Duration 
   } else if (quantity->unit == "s") {
     ns = product(ns, 1'000'000'000);
   } else {
-    return invalid(quoted(text) + " needs a unit: 'ms' or 's'");
+    return invalid(in_quotes(text) + " needs a unit: 'ms' or 's'");
   }
   if (ns < static_cast<std::uint64_t>(to_ns(least)) ||
       ns > static_cast<std::uint64_t>(to_ns(most))) {
@@ -103,10 +103,10 @@ Result<mode_t> parse_mode(std::string_view text) {
   const char* end = text.data() + text.size();
   const auto [rest, error] = std::from_chars(text.data(), end, mode, 8);
   if (error != std::errc() || rest != end || mode > 0777) {
-    return invalid(quoted(text) + " are no permissions; write them in octal, e.g. \"0660\"");
+    return invalid(in_quotes(text) + " are no permissions; write them in octal, e.g. \"0660\"");
   }
   if (!(mode & 0200)) {
-    return invalid(quoted(text) +
+    return invalid(in_quotes(text) +
                    " would lock out even dssmd's own user; connecting takes write permission, "
                    "e.g. \"0660\"");
   }
@@ -124,10 +124,10 @@ Result<gid_t> parse_group(std::string_view name) {
       space.resize(space.size() * 2);
       continue;
     }
-    if (failed) return os_error("look for the group " + quoted(name), failed);
+    if (failed) return os_error("look for the group " + in_quotes(name), failed);
     if (!found) {
-      return invalid("there is no group " + quoted(name) + "; create it with `groupadd --system " +
-                     printable(name) + "`");
+      return invalid("there is no group " + in_quotes(name) +
+                     "; create it with `groupadd --system " + printable(name) + "`");
     }
     return found->gr_gid;
   }
@@ -139,19 +139,19 @@ Result<LogLevel> parse_log_level(std::string_view text) {
   if (text == "notice") return LogLevel::notice;
   if (text == "info") return LogLevel::info;
   if (text == "debug") return LogLevel::debug;
-  return invalid(quoted(text) + " is no level; write error, warning, notice, info or debug");
+  return invalid(in_quotes(text) + " is no level; write error, warning, notice, info or debug");
 }
 
 Result<void> check_host_name(std::string_view text) {
   if (text.empty() || text.size() > kMaxHostBytes) {
-    return invalid(quoted(text) + " is " + std::to_string(text.size()) +
+    return invalid(in_quotes(text) + " is " + std::to_string(text.size()) +
                    " bytes long; a host's name takes 1 to " + std::to_string(kMaxHostBytes));
   }
   for (const char c : text) {
     const bool good =
         (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '-';
     if (!good) {
-      return invalid(quoted(text) + " holds other characters than letters, digits and '-'");
+      return invalid(in_quotes(text) + " holds other characters than letters, digits and '-'");
     }
   }
   return {};

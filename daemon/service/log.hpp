@@ -60,6 +60,6 @@ bool under_systemd() noexcept;
 std::string printable(std::string_view text);
 
 // The same in single quotes, as messages show what they are about.
-std::string quoted(std::string_view text);
+std::string in_quotes(std::string_view text);
 
 }  // namespace dssm::daemon

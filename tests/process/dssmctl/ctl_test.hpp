@@ -19,6 +19,12 @@ namespace dssm::test {
 
 using Json = nlohmann::json;
 
+constexpr std::int64_t kSecond = 1'000'000'000;  // ns
+
+inline bool contains(const std::string& text, const std::string& part) {
+  return text.find(part) != std::string::npos;
+}
+
 inline std::string dssmctl_path() { return built("client/dssmctl/dssmctl"); }
 
 // Both outputs of a program in the background, mixed, read as they come. Ends it if it still runs.

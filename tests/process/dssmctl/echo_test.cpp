@@ -27,8 +27,6 @@ struct Sample {
 };
 DSSM_DESCRIBE(Sample, number, value, inner, row, text)
 
-constexpr std::int64_t kSecond = 1'000'000'000;
-
 class Echo : public CtlTest {
  protected:
   // Sample i has number i and the time 100 + i seconds.

@@ -12,10 +12,6 @@ using Hosts = FleetTest;
 using Ping = FleetTest;
 using Strings = std::vector<std::string>;
 
-bool contains(const std::string& text, const std::string& part) {
-  return text.find(part) != std::string::npos;
-}
-
 TEST_F(Hosts, ShowsThisHostFirstAndHowTheOthersAreReached) {
   auto writer = on_pc2_.create<double>("lidar", depth_of(4)).value();
   await_streams(1);

@@ -14,12 +14,6 @@ using namespace std::chrono_literals;
 using Remote = FleetTest;
 using Strings = std::vector<std::string>;
 
-constexpr std::int64_t kSecond = 1'000'000'000;
-
-bool contains(const std::string& text, const std::string& part) {
-  return text.find(part) != std::string::npos;
-}
-
 // Sample i has the time 100 + i seconds.
 void write(Writer<double>& writer, int first, int last) {
   for (int i = first; i <= last; ++i) writer.write(i / 2.0, at_ns((100 + i) * kSecond));

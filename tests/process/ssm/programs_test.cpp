@@ -10,6 +10,7 @@
 #include <cstdlib>
 #include <fstream>
 
+#include "tests/process/ssm/test_name.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::test {
@@ -35,13 +36,6 @@ TEST_P(SsmProcesses, ChecksHold) {
   GTEST_SKIP() << "the thread sanitizer holds signals back and knows no threads in forked children";
 #endif
   expect_checks_hold(GetParam());
-}
-
-std::string test_name(const testing::TestParamInfo<std::string>& info) {
-  std::string name = info.param;
-  std::replace_if(
-      name.begin(), name.end(), [](unsigned char c) { return !std::isalnum(c); }, '_');
-  return name;
 }
 
 INSTANTIATE_TEST_SUITE_P(C, SsmProgram,

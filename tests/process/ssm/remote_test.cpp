@@ -11,6 +11,7 @@
 #include <dssm/dssm.hpp>
 #include <thread>
 
+#include "tests/process/ssm/test_name.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::test {
@@ -43,13 +44,6 @@ TEST_P(SsmRemoteProcesses, ChecksHold) {
       run({program(GetParam()), folder, daemon.address()}, {daemon.environment()});
   EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
   remove_tree(folder);
-}
-
-std::string test_name(const testing::TestParamInfo<std::string>& info) {
-  std::string name = info.param;
-  std::replace_if(
-      name.begin(), name.end(), [](unsigned char c) { return !std::isalnum(c); }, '_');
-  return name;
 }
 
 INSTANTIATE_TEST_SUITE_P(Cpp, SsmRemoteProgram,

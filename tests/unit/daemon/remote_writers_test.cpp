@@ -14,7 +14,7 @@ namespace {
 
 using namespace std::chrono_literals;
 
-const StreamId kId{"odometry", 0, "pc2"};
+const StreamId kOdometry{"odometry", 0, "pc2"};
 
 class KeptLines final : public Logger {
  public:
@@ -64,7 +64,7 @@ class RemoteWritersTest : public testing::Test {
   StreamInfo theirs;
 
   RemoteWritersTest() {
-    theirs.id = kId;
+    theirs.id = kOdometry;
     theirs.type = odometry_type();
     theirs.depth = 16;
     theirs.cycle = 10ms;
@@ -75,7 +75,7 @@ class RemoteWritersTest : public testing::Test {
   using Answer = std::optional<Result<OpenedRemoteWriter>>;
   std::shared_ptr<Answer> open(const CreatePlan* with) {
     auto answer = std::make_shared<Answer>();
-    writers->open(owner->host(), kId, with, [answer](Result<OpenedRemoteWriter> result) {
+    writers->open(owner->host(), kOdometry, with, [answer](Result<OpenedRemoteWriter> result) {
       answer->emplace(std::move(result));
     });
     return answer;
@@ -166,7 +166,7 @@ TEST_F(RemoteWritersTest, CreatesTheStreamAtItsOwnerAndPublishes) {
   publishing(owner->take(), -1, -1);
   const OpenedRemoteWriter writer = wait(answer);
   EXPECT_FALSE(writer.created);
-  EXPECT_EQ(writer.stream->id(), kId);
+  EXPECT_EQ(writer.stream->id(), kOdometry);
   EXPECT_EQ(writer.stream->type(), odometry_type());
   EXPECT_EQ(writer.stream->purpose(), Purpose::remote_writer);
   Program program(*writer.stream);
@@ -239,7 +239,7 @@ TEST_F(RemoteWritersTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
   const KnownHost host = owner->host();
   owner.reset();
   std::optional<Error> error;
-  writers->open(host, kId, &plan,
+  writers->open(host, kOdometry, &plan,
                 [&](Result<OpenedRemoteWriter> result) { error = result.error(); });
   run_until(loop, [&] { return error.has_value(); });
   EXPECT_EQ(error->code, Errc::daemon_away);
@@ -392,9 +392,9 @@ TEST_F(RemoteWritersTest, GoesOnWithARingThatAProgramKept) {
   program->write(3);
   catalog.host_down(owner->host().greeting.host_id, {Errc::daemon_away, "not known yet"});
   writers = std::make_unique<RemoteWriters>(parts, catalog);
-  const auto stream = writers->adopt_untrusted(kId, program->offer());
+  const auto stream = writers->adopt_untrusted(kOdometry, program->offer());
   ASSERT_TRUE(stream) << stream.error().message;
-  const auto again = writers->adopt_untrusted(kId, program->offer());
+  const auto again = writers->adopt_untrusted(kOdometry, program->offer());
   ASSERT_TRUE(again) << again.error().message;
   EXPECT_EQ(stream->get(), again->get());
   catalog.host_up(owner->host().greeting, owner->host().address);
@@ -421,10 +421,10 @@ TEST_F(RemoteWritersTest, PublishesAKeptRingBesideOneThatWasOpenedSince) {
   writers = std::make_unique<RemoteWriters>(parts, catalog);
   const std::shared_ptr<Stream> since = opened();
   const int before = owner->connections();
-  const auto kept = writers->adopt_untrusted(kId, program->offer());
+  const auto kept = writers->adopt_untrusted(kOdometry, program->offer());
   ASSERT_TRUE(kept) << kept.error().message;
   EXPECT_NE(kept->get(), since.get());
-  EXPECT_EQ(writers->adopt_untrusted(kId, program->offer()).value(), *kept);
+  EXPECT_EQ(writers->adopt_untrusted(kOdometry, program->offer()).value(), *kept);
   EXPECT_EQ(writers->size(), 2u);
   run_until(loop, [&] { return owner->connections() > before; });
   program->write(7);
@@ -441,10 +441,11 @@ TEST_F(RemoteWritersTest, RefusesRingsThatAreNoRemoteWriters) {
             {.id = id, .type = odometry_type(), .depth = 16, .cycle = 1ms, .purpose = purpose},
             registry.budget())
             .value();
-    return writers->adopt_untrusted(kId, as_offer(stream->descriptors_for(Role::writer).value()));
+    return writers->adopt_untrusted(kOdometry,
+                                    as_offer(stream->descriptors_for(Role::writer).value()));
   };
-  EXPECT_EQ(offer(Purpose::mirror, kId).error().code, Errc::protocol);
-  EXPECT_EQ(offer(Purpose::own, kId).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::mirror, kOdometry).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::own, kOdometry).error().code, Errc::protocol);
   EXPECT_EQ(offer(Purpose::remote_writer, {"other", 0, "pc2"}).error().code, Errc::protocol);
   EXPECT_EQ(writers->size(), 0u);
 }
