@@ -74,11 +74,11 @@ void OpenStream::supersede() const noexcept {
 // -----------------------------------------------------------------------
 
 struct Client::Handshake {
-  explicit Handshake(int connected) : socket(connected) {}
+  explicit Handshake(UniqueFd connected) : socket(std::move(connected)) {}
 
-  int socket;
-  wire::FrameBuffer input{wire::kMaxLocalFrameBytes};
-  std::vector<UniqueFd> fds;
+  UniqueFd socket;
+  Input input;
+  std::vector<std::uint64_t> replaced;  // handles whose Replaced came between the answers
   std::uint64_t serial = 0;
 
   // One request and its answer, with nobody else on the socket.
@@ -87,7 +87,7 @@ struct Client::Handshake {
     const std::string frame = wire::encode_frame(request);
     auto rest = std::as_bytes(std::span(frame));
     while (!rest.empty()) {
-      auto sent = wire::send_some(socket, rest, request_fds);
+      auto sent = wire::send_some(socket.get(), rest, request_fds);
       if (!sent) return std::move(sent).error();
       if (sent->status == wire::IoStatus::end) break;  // its last words may be there to read
       if (sent->status != wire::IoStatus::ok) return silence();
@@ -95,7 +95,7 @@ struct Client::Handshake {
       request_fds = {};
     }
     for (;;) {
-      auto message = input.next();
+      auto message = input.frames.next();
       if (!message) return std::move(message).error();
       if (*message) {
         local::Response response;
@@ -105,14 +105,14 @@ struct Client::Handshake {
         if (response.has_failure() && (response.serial() == serial || response.serial() == 0)) {
           return wire::failure(response.failure());  // serial 0: dssmd's last words
         }
-        if (response.serial() != serial) continue;  // an event, or an answer to what was given up
-        return response;
+        if (response.serial() == serial) return response;
+        if (response.has_replaced()) replaced.push_back(response.replaced().handle());
+        continue;  // an event, or an answer to what was given up
       }
-      const auto space = input.space();
-      auto received = wire::recv_some(socket, space, fds);
+      auto received = wire::recv_some(socket.get(), input.frames.space(), input.fds);
       if (!received) return std::move(received).error();
       if (received->status != wire::IoStatus::ok) return silence();
-      input.commit(received->bytes);
+      input.frames.commit(received->bytes);
     }
   }
 
@@ -121,12 +121,12 @@ struct Client::Handshake {
   }
 };
 
-Result<UniqueFd> Client::shake_hands() {
+Result<Client::Handshake> Client::shake_hands() {
   auto connected = wire::connect_unix(options_.socket_path);
   if (!connected) return std::move(connected).error();
   ::setsockopt(connected->get(), SOL_SOCKET, SO_SNDTIMEO, &kSocketTimeout, sizeof kSocketTimeout);
   ::setsockopt(connected->get(), SOL_SOCKET, SO_RCVTIMEO, &kSocketTimeout, sizeof kSocketTimeout);
-  Handshake link(connected->get());
+  Handshake link(std::move(*connected));
   local::Request hello;
   hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
   hello.mutable_hello()->set_program(options_.program);
@@ -144,7 +144,7 @@ Result<UniqueFd> Client::shake_hands() {
   }
   offer_streams(link);
   offer_clock(link);
-  return std::move(*connected);
+  return link;
 }
 
 void Client::offer_streams(Handshake& link) {
@@ -216,9 +216,9 @@ void Client::offer_clock(Handshake& link) {
 Result<std::shared_ptr<Client>> Client::connect(SessionOptions options) {
   auto client = std::make_shared<Client>(completed(std::move(options)));
   if (!client->stop_fd_) return os_error("create an eventfd");
-  auto socket = client->shake_hands();
-  if (!socket) return std::move(socket).error();
-  client->start_using(std::move(*socket));
+  auto link = client->shake_hands();
+  if (!link) return std::move(link).error();
+  client->start_using(std::move(*link));
   client->keeper_ = quiet_thread([self = client.get()] { self->keep(); });
   return client;
 }
@@ -471,7 +471,9 @@ void Client::on_rewatched() {
 // --- the keeper
 // ------------------------------------------------------------------------------------
 
-void Client::start_using(UniqueFd socket) {
+void Client::start_using(Handshake link) {
+  input_ = std::move(link.input);
+  for (const std::uint64_t handle : link.replaced) on_replaced(handle);
   bool watching = false;
   {
     const std::lock_guard guard(watch_mutex_);
@@ -479,7 +481,7 @@ void Client::start_using(UniqueFd socket) {
     told_before_ = known_streams_;
   }
   const std::lock_guard guard(mutex_);
-  socket_ = std::move(socket);
+  socket_ = std::move(link.socket);
   ++connection_;
   if (watching) {
     local::Request request;
@@ -531,31 +533,29 @@ void Client::keep() {
 
 // Reads until the connection breaks (an error) or the client is being destroyed (success).
 Result<void> Client::read_connection(int socket) {
-  wire::FrameBuffer input(wire::kMaxLocalFrameBytes);
-  std::vector<UniqueFd> fds;
   for (;;) {
-    pollfd ready[] = {{socket, POLLIN, 0}, {stop_fd_.get(), POLLIN, 0}};
-    if (::poll(ready, 2, -1) < 0) continue;
-    if (ready[1].revents) return {};
-    auto received = wire::recv_some(socket, input.space(), fds);
-    if (!received) return std::move(received).error();
-    if (received->status == wire::IoStatus::end) return Handshake::silence();
-    input.commit(received->bytes);
     for (;;) {
-      auto message = input.next();
+      auto message = input_.frames.next();
       if (!message) return std::move(message).error();
       if (!*message) break;
       local::Response response;
       if (!response.ParseFromArray((*message)->data(), static_cast<int>((*message)->size()))) {
         return Error{Errc::protocol, "dssmd sent what is no message of the local protocol"};
       }
-      if (Result<void> done = dispatch(std::move(response), fds); !done) return done;
+      if (Result<void> done = dispatch(std::move(response)); !done) return done;
     }
+    pollfd ready[] = {{socket, POLLIN, 0}, {stop_fd_.get(), POLLIN, 0}};
+    if (::poll(ready, 2, -1) < 0) continue;
+    if (ready[1].revents) return {};
+    auto received = wire::recv_some(socket, input_.frames.space(), input_.fds);
+    if (!received) return std::move(received).error();
+    if (received->status == wire::IoStatus::end) return Handshake::silence();
+    input_.frames.commit(received->bytes);
   }
 }
 
-// Takes the descriptors that belong to this response from the front of `fds`.
-Result<void> Client::dispatch(local::Response response, std::vector<UniqueFd>& fds) {
+// Takes the descriptors that belong to this response from the front of those that came.
+Result<void> Client::dispatch(local::Response response) {
   if (response.serial() == 0) {
     if (response.has_stream_event()) on_stream_event(response.stream_event());
     if (response.has_replaced()) on_replaced(response.replaced().handle());
@@ -572,6 +572,7 @@ Result<void> Client::dispatch(local::Response response, std::vector<UniqueFd>& f
   const InFlight in_flight = entry->second;
   in_flight_.erase(entry);
   const std::size_t count = response.has_failure() ? 0 : in_flight.fds;
+  std::vector<UniqueFd>& fds = input_.fds;
   if (fds.size() < count) {
     return Error{Errc::protocol, "dssmd sent fewer descriptors than belong to its answer"};
   }

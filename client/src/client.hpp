@@ -101,19 +101,25 @@ class Client : public std::enable_shared_from_this<Client> {
     std::size_t fds = 0;       // that come with a success
   };
 
+  // What came by the connection and was not yet looked at.
+  struct Input {
+    wire::FrameBuffer frames{wire::kMaxLocalFrameBytes};
+    std::vector<UniqueFd> fds;
+  };
+
   // A connection while it is being set up, before other threads may use it.
   struct Handshake;
-  Result<UniqueFd> shake_hands();
+  Result<Handshake> shake_hands();
   void offer_streams(Handshake& link);
   void offer_clock(Handshake& link);
 
   void keep();  // the keeper thread
   Result<void> read_connection(int socket);
-  Result<void> dispatch(local::Response response, std::vector<UniqueFd>& fds);
+  Result<void> dispatch(local::Response response);
   void on_stream_event(const local::StreamEvent& message);
   void on_replaced(std::uint64_t handle);
   void on_rewatched();
-  void start_using(UniqueFd socket);
+  void start_using(Handshake link);
   void stop_using();
   bool pause(Duration time) const;  // false: the client is being destroyed
   Result<void> send_locked(const local::Request& request, std::span<const int> fds);
@@ -125,6 +131,8 @@ class Client : public std::enable_shared_from_this<Client> {
   NotifierPool notifiers_;
   RingCache rings_;
   UniqueFd stop_fd_;  // eventfd: readable when the keeper shall end
+
+  Input input_;  // the keeper's
 
   mutable std::mutex mutex_;         // guards all up to clock_fd_
   std::condition_variable changed_;  // an answer came, or the connection came or went

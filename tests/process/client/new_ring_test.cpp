@@ -7,6 +7,8 @@
 #include <dssm/dssm.hpp>
 #include <thread>
 
+#include "core/wire/frame.hpp"
+#include "tests/process/client/relay.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm {
@@ -133,6 +135,42 @@ TEST(NewRing, OfAnotherTypeLeavesTheReaderOnTheOldOneAndSaysWhy) {
   EXPECT_EQ(reader.trouble()->code, Errc::type_mismatch);
   EXPECT_NE(reader.trouble()->message.find("anew:0"), std::string::npos);
   EXPECT_EQ(reader.restarts(), 0u);
+}
+
+// While a program sets up its connection anew, dssmd may tell it already that a ring which it has
+// just taken back has a successor: a mirror whose owner began anew.
+TEST(NewRing, IsToldWhileTheConnectionIsSetUpAnew) {
+  const DaemonProcess daemon;
+  Session writing = connect(daemon);
+  test::Relay relay(daemon.socket_path());
+  Session session = Session::connect({.socket_path = relay.socket_path()}).value();
+  std::vector<Writer<double>> writers;
+  std::vector<Reader<double>> readers;
+  for (const char* name : {"first", "last"}) {
+    writers.push_back(writing.create<double>(name, History{16, 1ms}).value());
+    readers.push_back(session.open_reader<double>(name).value());
+  }
+  std::atomic<int> told = 0;
+  relay.set_behind([&told](const local::Response& response) {
+    if (!response.has_opened()) return std::string();
+    ++told;
+    local::Response event;
+    event.mutable_replaced()->set_handle(response.opened().handle());
+    return wire::encode_frame(event);
+  });
+  relay.cut();
+  while (told != 2) std::this_thread::yield();
+  relay.set_behind(nullptr);
+  // Each asks for its new ring, again and again: there is none yet.
+  double value = 0;
+  SampleInfo info;
+  for (Reader<double>& reader : readers) {
+    const int before = relay.opens();
+    for (const MonoTime end = deadline_in(30s); relay.opens() == before;) {
+      ASSERT_LT(MonoClock::now(), end) << reader.id().str() << " does not know";
+      EXPECT_EQ(reader.next(value, info), ReadStatus::not_yet);
+    }
+  }
 }
 
 // A dssmd that died, and a writer that took the name before the reader's process was back: that
