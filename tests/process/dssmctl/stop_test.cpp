@@ -89,6 +89,8 @@ TEST_F(Stop, MeasuresOnceMoreWhenTheStreamIsRemoved) {
 }
 
 TEST_F(Stop, GoesOnWithAStreamThatIsCreatedAnew) {
+  ASSERT_TRUE(session_.remove(writer_.id()));
+  writer_ = session_.create<double>("s", depth_of(1 << 20)).value();  // nobody is lapped
   writer_.write(1);
   Running echo(argv({"echo", "s", "--json"}), environment());
   Running hz(argv({"hz", "s", "--json", "--interval", "0.05"}), environment());
