@@ -21,12 +21,9 @@ namespace {
 constexpr std::size_t kPayloadBytes = 64;
 
 // A sanitizer multiplies instructions and the cost of a fork: it gets a sample of them.
-#if defined(DSSM_TSAN)
+#if defined(DSSM_TSAN) || defined(__SANITIZE_ADDRESS__)
 constexpr int kStride = 197;
 constexpr int kRounds = 50;
-#elif defined(__SANITIZE_ADDRESS__)
-constexpr int kStride = 41;
-constexpr int kRounds = 100;
 #else
 constexpr int kStride = 1;
 constexpr int kRounds = 2000;
