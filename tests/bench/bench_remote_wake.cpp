@@ -19,8 +19,8 @@ using namespace std::chrono_literals;
 
 namespace {
 
-constexpr int kSamples = 1500;  // of one round
-constexpr int kRounds = 4;
+constexpr int kSamples = 500;  // of one round
+constexpr int kRounds = 12;
 constexpr std::size_t kMaxPayloadBytes = 1024;
 
 enum class Kind { raw_mirror, our_mirror, raw_connector, our_connector, count };
