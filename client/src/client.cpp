@@ -105,7 +105,10 @@ struct Client::Handshake {
         if (response.has_failure() && (response.serial() == serial || response.serial() == 0)) {
           return wire::failure(response.failure());  // serial 0: dssmd's last words
         }
-        if (response.serial() == serial) return response;
+        if (response.serial() == serial) {
+          input.fds.clear();  // all that came are this answer's, which nobody needs again
+          return response;
+        }
         if (response.has_replaced()) replaced.push_back(response.replaced().handle());
         continue;  // an event, or an answer to what was given up
       }
