@@ -233,9 +233,9 @@ TEST_F(Trouble, PeersThatAskAndNeverReadAreStoppedAndThenClosed) {
 TEST_F(Trouble, ConnectionsBeyondTheLimitAreRefusedInWords) {
   if (!begin(96)) return;
   std::vector<RawPeer> many;
-  for (int i = 0; i < 1000; ++i) many.push_back(connect_from(3));
   int refused = 0, welcome = 0;
-  for (RawPeer& peer : many) {
+  for (int i = 0; i < 1000; ++i) {
+    RawPeer& peer = many.emplace_back(connect_from(3));
     const std::optional<net::Frame> instead = peer.greet();
     if (!instead && peer.is_open()) {
       ++welcome;
