@@ -8,6 +8,7 @@
 #include <random>
 #include <thread>
 
+#include "core/ring/copy.hpp"
 #include "tests/unit/ring/test_ring.hpp"
 
 namespace dssm::ring {
@@ -15,7 +16,7 @@ namespace {
 
 void put(MirrorWriter& mirror, Tid tid, std::int64_t time_ns, std::size_t bytes) {
   const std::vector<std::byte> payload = payload_for(tid, bytes);
-  std::copy(payload.begin(), payload.end(), mirror.begin(tid));
+  copy_in(mirror.begin(tid), payload.data(), payload.size());
   mirror.commit(time_from_ns(time_ns), Duration(tid % 100));
 }
 
