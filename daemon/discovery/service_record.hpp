@@ -21,9 +21,16 @@ inline constexpr std::string_view kServiceType = "_dssm._tcp";
 // The subtype that only hosts have, so that one browser finds hosts and not thousands of streams.
 // No stream can be called so.
 inline constexpr std::string_view kHostSubtype = "_host:._sub._dssm._tcp";
-inline constexpr std::size_t kMaxInstanceBytes = 63;  // one DNS label
+// One DNS label. Streams whose names do not fit are refused when they are created
+// (StreamId::check).
+inline constexpr std::size_t kMaxInstanceBytes = 63;
+static_assert(kMaxInstanceBytes == kMaxFullNameBytes);
 
-using TxtRecord = std::vector<std::pair<std::string, std::string>>;  // keys and values, in order
+// Of what others announce; ours stay far below (docs/discovery.md "Sizes").
+inline constexpr std::size_t kMaxTxtBytes = 1300;
+
+// Keys and values, in order; an empty value stands for a key alone, without '='. Values are bytes.
+using TxtRecord = std::vector<std::pair<std::string, std::string>>;
 
 // What is announced: a stream, or (without `stream`) the host itself.
 struct ServiceRecord {
@@ -45,16 +52,15 @@ struct ServiceRecord {
   std::optional<Stream> stream;
 
   std::string instance() const;  // "lidar:0@pc2", "pc2"
-  std::string subtype() const;   // "_lidar._sub._dssm._tcp"; kHostSubtype
+  std::string subtype() const;   // "_lidar._sub._dssm._tcp", escaped; kHostSubtype
   TxtRecord txt() const;
 
   friend bool operator==(const ServiceRecord&, const ServiceRecord&) = default;
 };
 
-// Whether a stream with that full id (with host) can be announced.
-//   fails  invalid_argument: its instance name does not fit into 63 bytes; says by how much, and
-//          what to shorten
-Result<void> check_instance_name(const StreamId& id);
+// Tells types apart that have one name; equal for equal types, on every host and in every version
+// (docs/discovery.md "Records").
+std::uint64_t type_hash(const TypeInfo& type);
 
 // What somebody else announces; only hosts' records are of use to us.
 //   fails  protocol: another txtvers, values that are missing, wrong or out of their limits
