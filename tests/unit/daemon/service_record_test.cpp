@@ -3,6 +3,7 @@
 // What is announced by mDNS, and what is believed of what others announce.
 #include "daemon/discovery/service_record.hpp"
 
+#include <avahi-common/domain.h>
 #include <gtest/gtest.h>
 
 #include <algorithm>
@@ -162,6 +163,27 @@ TEST(ServiceRecord, EscapesTheSubtypeAsAvahiDoes) {
   EXPECT_EQ(subtype_of("A-z_09"), "_A-z_09._sub._dssm._tcp");
 }
 
+TEST(ServiceRecord, GivesSubtypesThatAvahiTakes) {
+  for (int byte = 0x20; byte < 0x7f; ++byte) {
+    if (byte == ':' || byte == '@') continue;  // in no name
+    for (const std::size_t length : {1, 2, 31}) {
+      ServiceRecord record = stream_record();
+      record.stream->name = std::string(length, static_cast<char>(byte));
+      const std::string subtype = record.subtype();
+      ASSERT_TRUE(avahi_is_valid_service_subtype(subtype.c_str())) << subtype;
+      const char* type = avahi_get_type_from_subtype(subtype.c_str());
+      ASSERT_TRUE(type) << subtype;
+      EXPECT_EQ(type, kServiceType);
+      char label[AVAHI_LABEL_MAX];
+      const char* rest = subtype.c_str();
+      ASSERT_TRUE(avahi_unescape_label(&rest, label, sizeof label)) << subtype;
+      EXPECT_EQ(label, "_" + record.stream->name + (length == 1 ? ":" : ""));
+    }
+  }
+  EXPECT_TRUE(avahi_is_valid_service_subtype(std::string(kHostSubtype).c_str()));
+  EXPECT_TRUE(avahi_is_valid_service_name(longest_record().instance().c_str()));
+}
+
 // Avahi refuses "_x._sub._dssm._tcp": the whole service would not be announced.
 TEST(ServiceRecord, LengthensTheSubtypeOfANameOfOneByte) {
   ServiceRecord record = stream_record();
@@ -311,11 +333,12 @@ TEST(ServiceRecordUntrusted, RefusesAnOversizedRecord) {
 }
 
 TEST(ServiceRecordUntrusted, QuotesJunkWithoutPassingItOn) {
-  const std::string words =
-      refusal(with(stream_record().txt(), "host", "\x1b[31m\xff\n<3>forged line"));
-  EXPECT_EQ(words.find('\n'), std::string::npos);
-  EXPECT_EQ(words.find('\x1b'), std::string::npos);
-  EXPECT_EQ(words.find('\xff'), std::string::npos);
+  const std::string junk = "\x1b[31m\xff\n<3>forged";
+  for (const std::string key : {"txtvers", "host", "hid", "proto", "name", "id", "type", "ring"}) {
+    const std::string words = refusal(with(stream_record().txt(), key, junk));
+    EXPECT_NE(words, "") << key;
+    EXPECT_EQ(words.find_first_of("\n\x1b\xff"), std::string::npos) << words;
+  }
 }
 
 }  // namespace
