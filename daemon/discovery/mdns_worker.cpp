@@ -28,8 +28,14 @@ constexpr Duration kLongestConnectPause = std::chrono::seconds(2);
 constexpr Duration kOrdersSettle = std::chrono::milliseconds(50);
 constexpr Duration kReportSettle = std::chrono::milliseconds(20);
 
+// Beside Avahi's own, which are negative.
+constexpr int kErrorNoBus = 1;
+
 std::string why_waiting(int error) {
   switch (error) {
+    case kErrorNoBus:
+      return "the D-Bus system bus cannot be reached: install and start it, and the Avahi daemon "
+             "(apt install dbus avahi-daemon; systemctl start dbus avahi-daemon)";
     case AVAHI_ERR_NO_DAEMON:
     case AVAHI_ERR_DISCONNECTED:
       return "the Avahi daemon does not run: install and start it (apt install avahi-daemon; "
@@ -105,7 +111,8 @@ bool MdnsWorker::take_orders() {
 void MdnsWorker::connect() {
   int error = AVAHI_OK;
   client_ = avahi_client_new(poll_.api(), AVAHI_CLIENT_NO_FAIL, on_client, this, &error);
-  if (!client_) return wait_for_avahi(error);
+  // Without an Avahi daemon there is a client all the same: it is the bus that is missing.
+  if (!client_) return wait_for_avahi(error == AVAHI_ERR_NO_DAEMON ? kErrorNoBus : error);
   follow_.enable_in(Duration::zero());
 }
 
@@ -117,8 +124,11 @@ void MdnsWorker::disconnect() {
 }
 
 // Also called from within avahi_client_new().
-void MdnsWorker::on_client(AvahiClient*, AvahiClientState, void* self) {
-  static_cast<MdnsWorker*>(self)->follow_.enable_in(Duration::zero());
+void MdnsWorker::on_client(AvahiClient*, AvahiClientState state, void* self) {
+  auto& worker = *static_cast<MdnsWorker*>(self);
+  // It may have passed before anybody looks, and what was announced with the old name with it.
+  worker.renamed_ |= state == AVAHI_CLIENT_S_REGISTERING || state == AVAHI_CLIENT_S_COLLISION;
+  worker.follow_.enable_in(Duration::zero());
 }
 
 void MdnsWorker::on_avahi_failure(int error) {
@@ -155,11 +165,8 @@ void MdnsWorker::follow_state() {
         told_waiting_ = false;
       }
       browser_.start(client_);
-      if (state == AVAHI_CLIENT_S_RUNNING) {
-        publisher_.start(client_);
-      } else {
-        publisher_.pause();
-      }
+      if (std::exchange(renamed_, false)) publisher_.pause();
+      if (state == AVAHI_CLIENT_S_RUNNING) publisher_.start(client_);
       break;
     }
   }

@@ -57,6 +57,7 @@ class MdnsWorker final : private AvahiUser {
   MdnsState state_;
   std::string interface_trouble_;
   int failure_ = 0;            // of the client, to be dealt with outside its callbacks
+  bool renamed_ = false;       // this PC got another name since follow_state() looked
   bool told_waiting_ = false;  // the log knows
   Duration pause_;             // before the next attempt to connect
   std::unique_ptr<InterfaceWatch> interfaces_;

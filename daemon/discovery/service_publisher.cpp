@@ -27,9 +27,9 @@ using StringList = std::unique_ptr<AvahiStringList, FreeStringList>;
 
 StringList string_list(const TxtRecord& txt) {
   AvahiStringList* list = nullptr;
-  // Each one goes to the front.
-  for (auto pair = txt.rbegin(); pair != txt.rend(); ++pair) {
-    const auto& [key, value] = *pair;
+  // Each one goes to the front, and the Avahi daemon puts the last one first: on the network they
+  // are in our order, which matters for txtvers (RFC 6763 section 6.7).
+  for (const auto& [key, value] : txt) {
     list = value.empty() ? avahi_string_list_add(list, key.c_str())
                          : avahi_string_list_add_pair_arbitrary(
                                list, key.c_str(),
