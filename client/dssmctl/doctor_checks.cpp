@@ -352,10 +352,15 @@ void check_hosts(const Facts& facts, Findings& findings) {
   for (const HostInfo& host : facts.hosts) {
     const std::string name = "host " + name_of(host);
     if (host.state == "self") {
-      if (host.error.empty()) continue;
-      findings.push_back({name, Status::warn, host.error,
-                          "something that other hosts say of themselves does not fit",
-                          "journalctl -u dssmd -n 50  # tells when it began"});
+      // What is wrong with this host is mostly wrong with another one too, and told there.
+      const bool told =
+          std::any_of(facts.hosts.begin(), facts.hosts.end(), [&](const HostInfo& other) {
+            return other.state != "self" && other.error == host.error;
+          });
+      if (host.error.empty() || told) continue;
+      findings.push_back({name, Status::fail, host.error,
+                          "another host has this one's name, and is not let in for that",
+                          "dssmctl hosts  # shows where; see 'host names'"});
     } else if (host.state == "up") {
       findings.push_back(
           {name,
@@ -363,6 +368,10 @@ void check_hosts(const Facts& facts, Findings& findings) {
            "up at " + list_text(host.addresses) + (host.error.empty() ? "" : ": " + host.error),
            {},
            {}});
+    } else if (host.state == "refused") {
+      findings.push_back({name, Status::fail, "refused: " + host.error,
+                          "the two do not fit together: versions, names or limits",
+                          "dssmctl hosts  # says why; install the same version of DSSM on both"});
     } else if (!host.id.empty() && up.contains(host.id)) {
       findings.push_back({name,
                           Status::ok,
@@ -379,10 +388,6 @@ void check_hosts(const Facts& facts, Findings& findings) {
            "its keys listen and insecure do not let others in",
            "echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines in its " +
                std::string(kConfigFile) + ", then restart its dssmd"});
-    } else if (host.state == "refused") {
-      findings.push_back({name, Status::fail, "refused: " + host.error,
-                          "the two do not fit together: versions, names or limits",
-                          "dssmctl hosts  # says why; install the same version of DSSM on both"});
     } else {
       findings.push_back(host_down(host));
     }
@@ -392,7 +397,10 @@ void check_hosts(const Facts& facts, Findings& findings) {
 void check_host_names(const Facts& facts, Findings& findings) {
   std::map<std::string, std::set<std::string>> ids;  // by name
   for (const HostInfo& host : facts.hosts) {
-    if (!host.name.empty() && !host.id.empty()) ids[host.name].insert(host.id);
+    if (host.name.empty() || host.id.empty()) continue;
+    ids[host.name].insert(host.id);
+    // With this PC's machine id too it has this one's id: a copied PC, or a second dssmd here.
+    if (host.state == "refused" && host.name == facts.daemon.host) ids[host.name].insert("refused");
   }
   std::string doubled;
   for (const auto& [name, of_name] : ids) {

@@ -254,6 +254,16 @@ TEST(Doctor, FindsHostsOfOneName) {
   EXPECT_FINDING(facts, "host names", Status::fail, "name = ");
 }
 
+TEST(Doctor, FindsACopyOfThisHost) {
+  Facts facts = healthy();
+  facts.hosts[1] = host_at("pc1", "refused", "10.0.0.2:13776", "it has this host's name and id");
+  EXPECT_FINDING(facts, "host names", Status::fail, "name = ");
+  EXPECT_FINDING(facts, "host pc1", Status::fail, "dssmctl hosts");
+  facts.hosts[0].error = facts.hosts[1].error;
+  facts.hosts.pop_back();
+  EXPECT_FINDING(facts, "host pc1", Status::fail, "host names");
+}
+
 TEST(Doctor, FindsStreamsOfOneNameAndNamesOnlySome) {
   Facts facts = healthy();
   facts.streams.push_back(stream_of("lidar", "pc2"));
