@@ -192,15 +192,20 @@ TEST_F(FoundHostsTest, AreNotDialedASecondTimeWhenTheyAreConfiguredToo) {
 }
 
 TEST_F(FoundHostsTest, StopTryingWhenTheConfiguredConnectionComesUp) {
-  one->owner.call_itself("pc9");
+  one->owner.call_itself("pc8");
+  two->owner.call_itself("pc9");
   start({at(*one)});
   wait_until_up();
-  peers->on_host_found(host_at({nobody()}));
-  wait([&] { return peers->hosts().size() == 2 && host(1).state() == "down"; });
+  peers->on_host_found(host_at({at(*two)}));
+  wait([&] { return peers->hosts().size() == 2 && host(1).state() == "refused"; });
   one->owner.greet_as(pc2);
   one->owner.cut();
   wait([&] { return catalog.find(pc2.host_id) != nullptr; });
   look_around();
+  const int before = two->owner.connections();
+  peers->on_host_found(host_at({at(*two), nobody()}));  // which would be dialed at once
+  look_around();
+  EXPECT_EQ(two->owner.connections(), before);
   ASSERT_EQ(peers->hosts().size(), 1u);
   EXPECT_EQ(host().state(), "up");
   EXPECT_EQ(peers->trouble(), "");
