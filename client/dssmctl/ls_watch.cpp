@@ -6,8 +6,8 @@
 #include "client/dssmctl/ls_watch.hpp"
 
 #include <condition_variable>
-#include <map>
 #include <mutex>
+#include <set>
 
 #include "client/dssmctl/stop_signal.hpp"
 #include "client/dssmctl/stream_json.hpp"
@@ -39,8 +39,7 @@ class EventQueue {
   std::vector<StreamEvent> events_;
 };
 
-// Prints what differs from what was printed before: after a reconnect dssmd tells all that is
-// there anew.
+// Prints a line for each stream that comes or goes.
 class StreamLog {
  public:
   StreamLog(const Options& options, const StreamFilter& filter, Output& out)
@@ -49,15 +48,12 @@ class StreamLog {
   void on_event(const StreamEvent& event) {
     if (!filter_.takes(event.stream.id)) return;
     const std::string name = event.stream.id.str();
-    const auto known = shown_.find(name);
     if (event.kind == StreamEvent::Kind::removed) {
-      if (known == shown_.end()) return;
-      shown_.erase(known);
+      shown_.erase(name);
       return print_removed(event.stream.id);
     }
-    if (known != shown_.end() && known->second == event.stream.incarnation) return;
-    if (known != shown_.end()) print_removed(event.stream.id);
-    shown_[name] = event.stream.incarnation;
+    // One that was created anew while dssmd was away is told as added only.
+    if (!shown_.insert(name).second) print_removed(event.stream.id);
     print_added(event.stream);
   }
 
@@ -86,7 +82,7 @@ class StreamLog {
   bool json_;
   const StreamFilter& filter_;
   Output& out_;
-  std::map<std::string, std::uint64_t> shown_;  // full names and incarnations
+  std::set<std::string> shown_;  // full names
 };
 
 }  // namespace

@@ -130,6 +130,19 @@ TEST_F(LsWatch, TellsAfterARestartOfDssmdOnlyWhatHasChanged) {
   await_there({"kept:0@pc1", "last:0@pc1"});
 }
 
+TEST_F(LsWatch, TellsThatAStreamWasCreatedAnewWhileItDidNotLook) {
+  output({"create", "s", "--size", "4", "--depth", "4"});
+  Running watch(argv({"ls", "--watch"}), environment());
+  EXPECT_TRUE(watch.line().starts_with("+ s:0@pc1 4 bytes"));
+  watch.stop();
+  daemon_.kill_hard();
+  daemon_.start();
+  output({"create", "s", "--size", "8", "--depth", "4"});
+  watch.signal(SIGCONT);
+  EXPECT_EQ(watch.line(), "- s:0@pc1");
+  EXPECT_TRUE(watch.line().starts_with("+ s:0@pc1 8 bytes"));
+}
+
 TEST_F(LsWatch, EndsQuietlyWhenItsReaderHasEnough) {
   output({"create", "s", "--size", "4", "--depth", "4"});
   Running watch(argv({"ls", "--watch"}), environment());
