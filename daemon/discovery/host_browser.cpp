@@ -11,7 +11,6 @@
 
 #include <algorithm>
 #include <cstring>
-#include <set>
 #include <vector>
 
 namespace dssm::daemon {
@@ -19,6 +18,7 @@ namespace {
 
 // Until a resolver that could not be made is tried again.
 constexpr Duration kResolverPause = std::chrono::seconds(5);
+constexpr int kRefillPerTurn = 32;
 constexpr std::size_t kMaxTxtPairs = 64;
 
 // The pairs of a TXT record; fails when it is larger than any of ours.
@@ -84,6 +84,7 @@ HostBrowser::HostBrowser(const EventLoop& loop, const wire::HostId& self,
                          const InterfaceFilter& filter, AvahiUser& user)
     : self_(self), filter_(filter), user_(user) {
   retry_ = EventSource::timer(loop, [this] { resolve_again(); });
+  refill_ = EventSource::timer(loop, [this] { refill(); });
 }
 
 void HostBrowser::start(AvahiClient* client) {
@@ -99,8 +100,9 @@ void HostBrowser::forget() {
   client_ = nullptr;
   browser_ = nullptr;
   results_.clear();
-  left_out_ = 0;
+  waiting_.clear();
   retry_.disable();
+  refill_.disable();
 }
 
 FoundHosts HostBrowser::hosts() const {
@@ -151,7 +153,7 @@ std::uint32_t HostBrowser::hosts_heard() const {
 }
 
 std::string HostBrowser::trouble() const {
-  if (left_out_ == 0) return {};
+  if (waiting_.empty()) return {};
   return "more than " + std::to_string(kMaxResults) +
          " hosts, counted once per interface and protocol, announce themselves; the others are "
          "left out (name them as peers)";
@@ -181,24 +183,34 @@ void HostBrowser::on_new(Key key) {
   if (results_.contains(key)) return;
   const std::string interface = interface_name(key.interface);
   if (interface.empty() || !filter_.admits(interface)) return;
-  if (results_.size() >= kMaxResults && !make_room()) {
-    if (left_out_++ == 0) {
-      user_.log(LogLevel::warning, "mDNS: " + trouble());
-      user_.on_avahi_change();
+  if (waiting_.size() < kMaxWaiting) waiting_.insert(std::move(key));
+  refill_.enable_in(Duration::zero());
+}
+
+// Gives places to those that wait; a few at a time, because each costs D-Bus calls.
+void HostBrowser::refill() {
+  for (int n = 0; n < kRefillPerTurn && !waiting_.empty(); ++n) {
+    if (user_.stopping() || !client_) return;
+    if (results_.size() >= kMaxResults && !make_room()) {
+      if (!std::exchange(told_full_, true)) user_.log(LogLevel::warning, "mDNS: " + trouble());
+      return user_.on_avahi_change();
     }
-    return;
+    const auto next = waiting_.extract(waiting_.begin());
+    Result& result = results_[next.value()];
+    result.browser = this;
+    result.key = next.value();
+    resolve(result);
   }
-  Result& result = results_[key];
-  result.browser = this;
-  result.key = std::move(key);
-  resolve(result);
+  if (!waiting_.empty()) refill_.enable_in(Duration::zero());
 }
 
 void HostBrowser::on_removed(const Key& key) {
+  waiting_.erase(key);
   const auto at = results_.find(key);
   if (at == results_.end()) return;
   free_resolver(at->second);
   results_.erase(at);
+  if (!waiting_.empty()) refill_.enable_in(Duration::zero());
   user_.on_avahi_change();
 }
 
@@ -246,7 +258,9 @@ void HostBrowser::on_resolver(AvahiServiceResolver*, AvahiIfIndex, AvahiProtocol
   } else {
     of.browser->on_not_resolved(of);
   }
-  of.browser->user_.on_avahi_change();
+  HostBrowser& browser = *of.browser;
+  if (of.useless && !browser.waiting_.empty()) browser.refill_.enable_in(Duration::zero());
+  browser.user_.on_avahi_change();
 }
 
 void HostBrowser::on_resolved_untrusted(Result& result, const AvahiAddress* address,

@@ -4,7 +4,8 @@
 // was heard on several interfaces, by IPv4 and IPv6, into one host per id.
 //
 // A resolver stays as long as its result, because a changed TXT record or address is told only to
-// resolvers. So results are bounded; one that cannot be used gives way to a new one.
+// resolvers. So results are bounded: the ones beyond wait for the place of one that has gone or
+// turned out to be of no use, so that whoever announces rubbish cannot keep the good ones out.
 #pragma once
 
 #include <avahi-client/lookup.h>
@@ -13,6 +14,7 @@
 #include <cstdint>
 #include <map>
 #include <optional>
+#include <set>
 #include <string>
 
 #include "daemon/discovery/avahi_user.hpp"
@@ -25,6 +27,7 @@ namespace dssm::daemon {
 class HostBrowser {
  public:
   static constexpr std::size_t kMaxResults = 256;
+  static constexpr std::size_t kMaxWaiting = 4096;  // as many as Avahi remembers records
   static constexpr std::size_t kMaxAddresses = 16;  // of one host
 
   // All outlive it.
@@ -81,6 +84,7 @@ class HostBrowser {
   void resolve(Result& result);
   void free_resolver(Result& result);
   bool make_room();
+  void refill();
   void resolve_again();
 
   const wire::HostId self_;
@@ -89,8 +93,9 @@ class HostBrowser {
   AvahiClient* client_ = nullptr;
   AvahiServiceBrowser* browser_ = nullptr;
   std::map<Key, Result> results_;
-  std::uint64_t left_out_ = 0;  // results beyond kMaxResults
-  EventSource retry_;
+  std::set<Key> waiting_;  // beyond kMaxResults
+  bool told_full_ = false;
+  EventSource retry_, refill_;
 };
 
 }  // namespace dssm::daemon
