@@ -183,6 +183,19 @@ TEST_F(MdnsNeedsRoot, UsesOnlyTheInterfacesThatAreConfigured) {
   EXPECT_FALSE(avoiding.hosts().contains(2));
 }
 
+TEST_F(MdnsNeedsRoot, WithholdsWhatIsBeyondAvahisLimitsAndSaysSoOnce) {
+  if (!make({"pc1", "pc2"})) GTEST_SKIP() << why_;
+  Probe one(pc(1), 1, "pc1");
+  one.command("many 800");
+  EXPECT_TRUE(one.until_state({"announced=740 withheld=61", "objects-per-client-max"}));
+  Probe two(pc(2), 2, "pc2");  // the browser's resolvers have their place all the same
+  EXPECT_TRUE(one.until([&] { return has(one, 2, "pc2 open 10.77.0.2:7000"); }));
+  EXPECT_TRUE(two.until([&] { return has(two, 1, "pc1 open 10.77.0.1:7000"); }));
+  one.command("many 739");
+  EXPECT_TRUE(one.until_state({"announced=740 withheld=0"}));
+  EXPECT_EQ(one.count("log 4 mDNS: "), 1);
+}
+
 TEST_F(MdnsNeedsRoot, HostileRecordsHarmNobody) {
   if (!make({"pc1", "pc2", "pc3"})) GTEST_SKIP() << why_;
   const std::string type = "_host:._sub._dssm._tcp";
