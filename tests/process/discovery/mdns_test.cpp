@@ -158,7 +158,8 @@ TEST_F(MdnsNeedsRoot, AHungAvahiDaemonBlocksNeitherTheLoopNorTheEnd) {
   Probe one(pc(1), 1, "pc1");
   ASSERT_TRUE(one.until_state({"running announced=1"}));
   pc(1).pause_avahi();
-  one.command("announce lidar:0");  // its thread now waits for an answer by D-Bus
+  one.command("announce lidar:0");
+  ASSERT_TRUE(one.until_it_waits_for_an_answer());
   one.command("tick");
   const auto before = std::chrono::steady_clock::now();
   EXPECT_TRUE(one.until([&] { return one.count("tock") == 1; }));

@@ -4,12 +4,15 @@
 #include <fcntl.h>
 #include <poll.h>
 #include <signal.h>
+#include <sys/syscall.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
+#include <filesystem>
+#include <fstream>
 #include <sstream>
 #include <utility>
 
@@ -113,6 +116,20 @@ bool Probe::until_found(int id, const std::string& text) {
 
 bool Probe::until_lost(int id) {
   return until([&] { return !hosts_.contains(id); });
+}
+
+bool Probe::until_it_waits_for_an_answer() const {
+  const std::string tasks = "/proc/" + std::to_string(pid_) + "/task";
+  for (int tries = 0; tries < 3000; ++tries) {
+    std::error_code gone;
+    for (const auto& task : std::filesystem::directory_iterator(tasks, gone)) {
+      long number = -1;
+      std::ifstream(task.path() / "syscall") >> number;
+      if (number == SYS_poll || number == SYS_ppoll) return true;
+    }
+    ::usleep(10'000);
+  }
+  return false;
 }
 
 int Probe::count(const std::string& beginning) const {

@@ -41,6 +41,9 @@ class Probe {
   const std::map<int, std::string>& hosts() const { return hosts_; }  // "NAME open ADDRESS..."
   const std::string& state() const { return state_; }
   bool state_has(const std::string& word) const { return state_.find(word) != std::string::npos; }
+  // One of its threads waits in poll(2), as libdbus does for an answer; event loops do not.
+  //   returns  false: none within half a minute, or this kernel does not tell
+  bool until_it_waits_for_an_answer() const;
   int count(const std::string& beginning) const;  // lines that begin so
 
  private:
