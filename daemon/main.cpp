@@ -6,6 +6,7 @@
 #include <signal.h>
 
 #include <cstdio>
+#include <optional>
 
 #include "daemon/channel/channel_server.hpp"
 #include "daemon/channel/mirrors.hpp"
@@ -13,6 +14,7 @@
 #include "daemon/channel/remote_writers.hpp"
 #include "daemon/channel/resolver.hpp"
 #include "daemon/discovery/catalog.hpp"
+#include "daemon/discovery/discovery.hpp"
 #include "daemon/discovery/fleet_service.hpp"
 #include "daemon/discovery/peers.hpp"
 #include "daemon/local/listener.hpp"
@@ -83,11 +85,22 @@ Result<void> run(const Config& config, Logger& logger) {
       {*loop, registry, opens, logger}, self,
       {config.max_connections, config.max_connections_per_host, config.max_peer_memory_bytes});
 
+  std::optional<Discovery> discovery;
+  if (config.mdns) {
+    discovery.emplace(*loop,
+                      Discovery::Options{self, reach_of(network->addresses()), config.insecure,
+                                         config.interfaces, config.avoid_interfaces},
+                      registry, peers, fleet, logger);
+  }
+  const auto serve_others = [&] {
+    channels.serve(*network);
+    if (discovery) discovery->start_announcing();
+  };
   EventSource grace = EventSource::timer(*loop, [&] {
     service.end_recovery();
-    channels.serve(*network);
+    serve_others();
   });
-  if (!recovering) channels.serve(*network);
+  if (!recovering) serve_others();
   if (recovering) {
     grace.enable_in(config.recovery_grace);
     logger.notice(

@@ -16,14 +16,7 @@ namespace {
 void print_json(const MeterState& state, const Statistics& delays, const Clocks& clocks,
                 Output& out) {
   const auto known = [&](auto value) { return delays.count > 0 ? Json(value) : Json(); };
-  Json json;
-  json["stream"] = state.stream.str();
-  json["samples"] = delays.count;
-  json["new_samples"] = state.new_samples;
-  json["seen_samples"] = state.seen;
-  json["lost_samples"] = state.lost;
-  json["restarts"] = state.restarts;
-  json["final"] = state.final;
+  Json json = report_json(state, "samples", delays.count);
   json["delay_mean_ns"] = known(delays.mean_ns);
   json["delay_min_ns"] = known(to_ns(delays.min));
   json["delay_max_ns"] = known(to_ns(delays.max));

@@ -71,7 +71,7 @@ _dssmctl() {
   local verb="" positional=0
   for ((i = 1; i < cword; ++i)); do
     case ${words[i]} in
-      --socket | --sort | --at | --count | -n | -c | --field | --wait | --window | -w | \
+      --socket | --sort | --host | --at | --count | -n | -c | --field | --wait | --window | -w | \
         --interval | -i | --size | --depth | --life | --cycle | --type | --align | --offset | \
         --speed | --time)
         ((++i))
@@ -97,6 +97,10 @@ _dssmctl() {
         readers type memory" -- "$cur")
       return
       ;;
+    --host)
+      _dssmctl_offer < <(_dssmctl_ask hosts --names)
+      return
+      ;;
     --at | --count | -n | -c | --field | --wait | --window | -w | --interval | -i | --size | \
       --depth | --life | --cycle | --type | --align | --offset | --speed | --time)
       return # a value that only the person knows
@@ -106,7 +110,7 @@ _dssmctl() {
   local common="--help --json --socket" options=""
   case $verb in
     "") options="--version" ;;
-    ls) options="--names --own --reverse --sort" ;;
+    ls) options="--host --local --names --own --reverse --sort --watch" ;;
     hosts) options="--names" ;;
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
@@ -122,7 +126,7 @@ _dssmctl() {
   case $verb in
     "")
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw create delay echo hosts hz info ls ping playback property rm" -- "$cur")
+        "bw create delay doctor echo hosts hz info ls ping playback property rm" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;

@@ -52,16 +52,9 @@ bool measurable(const MeterState& state, const Statistics& intervals, Output& ou
 }
 
 Json common_json(const MeterState& state, const Statistics& intervals) {
-  Json json;
-  json["stream"] = state.stream.str();
+  Json json = report_json(state, "intervals", intervals.count);
   json["payload_bytes"] = state.payload_bytes;
-  json["intervals"] = intervals.count;
-  json["new_samples"] = state.new_samples;
-  json["seen_samples"] = state.seen;
-  json["lost_samples"] = state.lost;
-  json["restarts"] = state.restarts;
   json["age_ns"] = state.seen > 0 ? Json(to_ns(state.age)) : Json();
-  json["final"] = state.final;
   json["rate_hz"] = rate_hz(intervals) > 0 ? Json(rate_hz(intervals)) : Json();
   return json;
 }

@@ -1,10 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl ls: all streams of all hosts, own ones first, each host's in the order of their creation
-// unless told otherwise. One question to dssmd (two for names), one write; it is run in loops and
-// by the shell's completion, so it has to be quick.
+// unless told otherwise. One question to dssmd (two for names or hosts), one write; it is run in
+// loops and by the shell's completion, so it has to be quick.
 #include <algorithm>
+#include <set>
 
+#include "client/dssmctl/duplicates.hpp"
+#include "client/dssmctl/ls_watch.hpp"
 #include "client/dssmctl/names.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/stream_json.hpp"
@@ -47,9 +50,11 @@ void sort_streams(std::vector<StreamInfo>& streams, const std::string& key) {
 
 std::string rate_text(double rate_hz) { return rate_hz > 0 ? fixed_text(rate_hz, 1) + " Hz" : "-"; }
 
-std::vector<std::string> row(const StreamInfo& stream, Time now) {
+constexpr std::string_view kDuplicateMark = " *";
+
+std::vector<std::string> row(const StreamInfo& stream, bool duplicate, Time now) {
   return {
-      escaped(stream.id.name),
+      escaped(stream.id.name).append(duplicate ? kDuplicateMark : ""),
       std::to_string(stream.id.id),
       escaped(stream.id.host),
       std::to_string(stream.type.payload_bytes),
@@ -63,30 +68,33 @@ std::vector<std::string> row(const StreamInfo& stream, Time now) {
   };
 }
 
+// What to show, in order. The marks follow from all that there is, shown or not; without the other
+// hosts' streams nobody knows them.
+struct Listing {
+  std::vector<StreamInfo> streams;
+  std::optional<Duplicates> duplicates;
+
+  bool duplicate(const StreamInfo& stream) const {
+    return duplicates && duplicates->has(stream.id);
+  }
+};
+
 // One document, but a line per stream: with a thousand of them neither a tree of values in memory
 // nor indentation is worth its time.
-void print_json(const std::vector<StreamInfo>& streams, Time now, Output& out) {
+void print_json(const Listing& listing, Time now, Output& out) {
   out.add("{\"streams\":[");
   std::string_view separator = "\n";
-  for (const StreamInfo& stream : streams) {
+  for (const StreamInfo& stream : listing.streams) {
+    Json json = stream_json(stream, now);
+    json["duplicate"] = listing.duplicates ? Json(listing.duplicate(stream)) : Json();
     out.add(separator);
-    out.add(json_text(stream_json(stream, now)));
+    out.add(json_text(json));
     separator = ",\n";
   }
   out.add("\n]}\n");
 }
 
-// A program must get a name as it is; a terminal must not.
-Result<void> print_names(Session& session, const std::vector<StreamInfo>& streams, Output& out) {
-  const Result<DaemonInfo> daemon = session.daemon();
-  if (!daemon) return daemon.error();
-  for (const std::string& name : opening_names(streams, daemon->host)) {
-    out.add((out.terminal() ? escaped(name) : name) + "\n");
-  }
-  return {};
-}
-
-void print_table(const std::vector<StreamInfo>& streams, Time now, Output& out) {
+void print_table(const Listing& listing, Time now, Output& out) {
   constexpr auto kRight = Table::Align::right;
   Table table({{"NAME"},
                {"ID", kRight},
@@ -99,8 +107,64 @@ void print_table(const std::vector<StreamInfo>& streams, Time now, Output& out) 
                {"WRITERS", kRight},
                {"READERS", kRight},
                {"TYPE"}});
-  for (const StreamInfo& stream : streams) table.add_row(row(stream, now));
+  const StreamInfo* marked = nullptr;
+  for (const StreamInfo& stream : listing.streams) {
+    const bool duplicate = listing.duplicate(stream);
+    if (duplicate) marked = &stream;
+    table.add_row(row(stream, duplicate, now));
+  }
   table.print(out);
+  if (marked) {
+    out.add("* several hosts have a stream of this name and id: say which one, as in " +
+            escaped(marked->id.str()) + "\n");
+  }
+}
+
+// A program must get a name as it is; a terminal must not.
+Result<void> print_names(Session& session, const std::vector<StreamInfo>& all,
+                         const StreamFilter& filter, Output& out) {
+  const Result<DaemonInfo> daemon = session.daemon();
+  if (!daemon) return daemon.error();
+  const std::vector<std::string> names = opening_names(all, daemon->host);
+  for (std::size_t i = 0; i < all.size(); ++i) {
+    if (!filter.takes(all[i].id)) continue;
+    out.add((out.terminal() ? escaped(names[i]) : names[i]) + "\n");
+  }
+  return {};
+}
+
+// A name that is no host's would show nothing for ever.
+Result<void> check_hosts(Session& session, const std::vector<std::string>& wanted) {
+  if (wanted.empty()) return {};
+  const Result<std::vector<HostInfo>> hosts = session.hosts();
+  if (!hosts) return hosts.error();
+  std::set<std::string> known;
+  for (const HostInfo& host : *hosts) {
+    if (!host.name.empty()) known.insert(host.name);
+  }
+  for (const std::string& name : wanted) {
+    if (known.contains(name)) continue;
+    Error error{Errc::not_found, "look for host '" + name + "': no such host is known here; known"};
+    std::string_view separator = " are '";
+    for (const std::string& other : known) {
+      error.message.append(separator).append(other).append("'");
+      separator = ", '";
+    }
+    error.message += "; see `dssmctl hosts`";
+    return error;
+  }
+  return {};
+}
+
+// With --own the streams of this host, as with --host and its name.
+Result<StreamFilter> filter_of(Session& session, const Options& options) {
+  std::vector<std::string> hosts = options.hosts;
+  if (options.own) {
+    const Result<DaemonInfo> daemon = session.daemon();
+    if (!daemon) return daemon.error();
+    hosts = {daemon->host};
+  }
+  return StreamFilter(std::move(hosts), options.pattern);
 }
 
 }  // namespace
@@ -108,14 +172,24 @@ void print_table(const std::vector<StreamInfo>& streams, Time now, Output& out) 
 Result<void> run_ls(const Options& options, Output& out) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
+  if (Result<void> known = check_hosts(*session, options.hosts); !known) return known;
+  if (options.watch) {
+    const Result<StreamFilter> filter = filter_of(*session, options);
+    return filter ? watch_streams(*session, options, *filter, out) : filter.error();
+  }
   Result<std::vector<StreamInfo>> streams = options.own ? session->list_own() : session->list();
   if (!streams) return std::move(streams).error();
   sort_streams(*streams, options.sort);
   if (options.reverse) std::reverse(streams->begin(), streams->end());
 
-  if (options.names) return print_names(*session, *streams, out);
+  const StreamFilter filter(options.hosts, options.pattern);
+  if (options.names) return print_names(*session, *streams, filter, out);
+  Listing listing;
+  if (!options.own) listing.duplicates.emplace(*streams);
+  std::erase_if(*streams, [&](const StreamInfo& stream) { return !filter.takes(stream.id); });
+  listing.streams = std::move(*streams);
   const Time now = WallClock::now();
-  options.json ? print_json(*streams, now, out) : print_table(*streams, now, out);
+  options.json ? print_json(listing, now, out) : print_table(listing, now, out);
   return {};
 }
 

@@ -27,6 +27,8 @@ Result<void> run(const Options& options, Output& out) {
       return run_ls(options, out);
     case Verb::hosts:
       return run_hosts(options, out);
+    case Verb::doctor:
+      return run_doctor(options, out);
     case Verb::ping:
       return run_ping(options, out);
     case Verb::info:

@@ -110,6 +110,18 @@ Result<void> run_meter(const Options& options, Output& out, const Meter& meter) 
   });
 }
 
+Json report_json(const MeterState& state, const char* measured_key, std::uint64_t measured) {
+  Json json;
+  json["stream"] = state.stream.str();
+  json[measured_key] = measured;
+  json["new_samples"] = state.new_samples;
+  json["seen_samples"] = state.seen;
+  json["lost_samples"] = state.lost;
+  json["restarts"] = state.restarts;
+  json["final"] = state.final;
+  return json;
+}
+
 std::string farewell(const MeterState& state) {
   std::string text = "--- " + escaped(state.stream.str()) + ": " + std::to_string(state.seen) +
                      " samples, " + std::to_string(state.lost) + " lost";

@@ -9,6 +9,7 @@
 #include <functional>
 #include <string>
 
+#include "client/dssmctl/json.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
 
@@ -38,6 +39,10 @@ struct Meter {
 // Runs until `options.count` reports are made; or until Ctrl-C or the end of the stream, with one
 // more report.
 Result<void> run_meter(const Options& options, Output& out, const Meter& meter);
+
+// The keys with which every report as JSON begins. `measured` is the number of what was measured,
+// called `measured_key`: the samples of delays, the intervals of rates.
+Json report_json(const MeterState& state, const char* measured_key, std::uint64_t measured);
 
 // "--- odom:0@pc1: 12 samples, 0 lost ---", before a final report for people.
 std::string farewell(const MeterState& state);

@@ -85,7 +85,15 @@ void add_wait(CLI::App* app, Options& options) {
 
 void add_ls(CLI::App& app, Options& options) {
   CLI::App* ls = app.add_subcommand("ls", "list the streams of all hosts");
-  ls->add_flag("--own", options.own, "only those of this host");
+  ls->add_option("PATTERN", options.pattern,
+                 "only streams whose NAME or NAME:ID this shell pattern fits, as 'camera*'")
+      ->type_name("");
+  CLI::Option* own = ls->add_flag("--own,--local", options.own, "only those of this host");
+  ls->add_option("--host", options.hosts, "only those of this host; may be given several times")
+      ->type_name("HOST")
+      ->allow_extra_args(false)  // one value per --host, so that PATTERN may follow
+      ->excludes(own);
+  ls->add_flag("--watch", options.watch, "go on: a line for each stream that comes or goes");
   ls->add_flag("--names", options.names, "only names, one per line, for programs");
   ls->add_option("--sort", options.sort,
                  "created, name, id, host, size, depth, cycle, rate, age, writers, readers, type "
@@ -106,6 +114,7 @@ void add_ls(CLI::App& app, Options& options) {
 void add_hosts(CLI::App& app, Options& options) {
   CLI::App* hosts = app.add_subcommand("hosts", "list the hosts, and how they are reached");
   hosts->add_flag("--names", options.names, "only names, one per line, for programs");
+  app.add_subcommand("doctor", "look for what is wrong, and say what mends it");
   CLI::App* ping = app.add_subcommand("ping", "ask another host's dssmd for a sign of life");
   ping->add_option("HOST", options.host, "a name that `dssmctl hosts` shows")
       ->required()
@@ -241,6 +250,10 @@ std::string complaint_about(const Options& options) {
   }
   if (options.csv && options.json) return "--csv and --json: choose one";
   if (options.names && options.json) return "--names and --json: choose one";
+  if (options.names && options.watch) return "--names and --watch: choose one";
+  if (options.watch && (options.reverse || options.sort != Options().sort)) {
+    return "--watch shows changes in the order in which they come: leave --sort and --reverse away";
+  }
   return {};
 }
 
@@ -264,6 +277,7 @@ std::optional<Verb> verb_of(std::string_view name) {
   static constexpr std::pair<std::string_view, Verb> kVerbs[] = {
       {"ls", Verb::ls},
       {"hosts", Verb::hosts},
+      {"doctor", Verb::doctor},
       {"ping", Verb::ping},
       {"info", Verb::info},
       {"echo", Verb::echo},

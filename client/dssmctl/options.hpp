@@ -15,6 +15,7 @@ namespace dssm::ctl {
 enum class Verb : unsigned char {
   ls,
   hosts,
+  doctor,
   ping,
   info,
   echo,
@@ -46,7 +47,10 @@ struct Options {
   Duration wait{};                   // echo, hz, bw, delay: how long for the stream to appear
 
   // ls
-  bool own = false;    // only this host's
+  bool own = false;                // only this host's
+  std::vector<std::string> hosts;  // only theirs; empty: of all
+  std::string pattern;             // only streams whose names fit; empty: all
+  bool watch = false;
   bool names = false;  // also for hosts
   std::string sort = "created";
   bool reverse = false;

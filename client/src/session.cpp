@@ -41,6 +41,16 @@ Result<std::vector<StreamInfo>> listed(detail::Client& client, bool own_only) {
   return streams;
 }
 
+std::string hex(std::string_view bytes) {
+  constexpr char kDigits[] = "0123456789abcdef";
+  std::string digits;
+  for (const char c : bytes) {
+    const auto byte = static_cast<unsigned char>(c);
+    digits += {kDigits[byte >> 4], kDigits[byte & 15]};
+  }
+  return digits;
+}
+
 HostInfo host_info(const local::Host& message) {
   HostInfo host;
   host.name = message.name();
@@ -54,6 +64,8 @@ HostInfo host_info(const local::Host& message) {
   host.clock_bound = Duration(message.clock_bound_ns());
   host.insecure = message.insecure();
   host.error = message.error();
+  host.id = hex(message.host_id());
+  host.found_by.assign(message.found_by().begin(), message.found_by().end());
   return host;
 }
 
@@ -282,8 +294,16 @@ Result<DaemonInfo> Session::daemon() {
   auto answer = client_->call(std::move(request));
   if (!answer) return std::move(answer).error().context("ask dssmd about itself");
   const local::Daemon& daemon = answer->response.daemon();
-  return DaemonInfo{daemon.host(),    daemon.version(),      daemon.pid(),
-                    daemon.streams(), daemon.memory_bytes(), daemon.memory_limit_bytes()};
+  const local::Mdns& mdns = daemon.mdns();
+  return DaemonInfo{
+      daemon.host(),
+      daemon.version(),
+      daemon.pid(),
+      daemon.streams(),
+      daemon.memory_bytes(),
+      daemon.memory_limit_bytes(),
+      {mdns.phase().empty() ? "off" : mdns.phase(), mdns.trouble(), mdns.avahi_version(),
+       mdns.announced(), mdns.withheld(), mdns.own_host_seen(), mdns.hosts_heard()}};
 }
 
 bool Session::connected() const noexcept { return client_->connected(); }

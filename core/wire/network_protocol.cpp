@@ -87,20 +87,23 @@ void to_message(const Greeting& greeting, net::Hello& out) {
   to_message(greeting.clock_bound, *out.mutable_clock());
 }
 
+Error other_protocol_version(const std::string& who, std::uint32_t theirs,
+                             const std::string& software) {
+  return {Errc::protocol,
+          who + " speaks version " + std::to_string(theirs) + " of the network protocol" +
+              (software.empty() ? "" : " (DSSM " + software + ")") +
+              ", this side (DSSM " DSSM_VERSION ") version " +
+              std::to_string(kNetworkProtocolVersion) + "; install the same DSSM on both"};
+}
+
 Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string& who) {
   const bool words_are_good =
       message.program().size() <= kMaxProgramBytes && is_printable(message.program()) &&
       message.version().size() <= kMaxProgramBytes && is_printable(message.version());
   if (message.protocol_version() != kNetworkProtocolVersion) {
     // A later version may use the other fields in another way: only what can be shown is shown.
-    const std::string software = words_are_good && !message.version().empty()
-                                     ? " (DSSM " + message.version() + ")"
-                                     : std::string();
-    return Error{Errc::protocol,
-                 who + " speaks version " + std::to_string(message.protocol_version()) +
-                     " of the network protocol" + software +
-                     ", this side (DSSM " DSSM_VERSION ") version " +
-                     std::to_string(kNetworkProtocolVersion) + "; install the same DSSM on both"};
+    return other_protocol_version(who, message.protocol_version(),
+                                  words_are_good ? message.version() : std::string());
   }
   Greeting greeting;
   if (!is_host_name(message.host())) {

@@ -52,6 +52,11 @@ void to_message(const Greeting& greeting, net::Hello& out);
 //   who    for the message: "dssmd at '10.0.0.2:13776'", "the program at '10.0.0.3:40000'"
 Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string& who);
 
+// Why this side cannot talk to `who`, who speaks `theirs`.
+//   software  "0.3.0"; empty: not known
+Error other_protocol_version(const std::string& who, std::uint32_t theirs,
+                             const std::string& software = {});
+
 // This PC's id for a dssmd that calls its host `name`: from the machine id (machine-id(5)), which
 // is not told to others, and the name, so that several dssmd with different names on one machine
 // are different hosts. Without a machine id: random, and so different after each start.

@@ -36,6 +36,7 @@ struct Dialer::State {
   }
 
   void begin_round();
+  void begin_with(std::vector<wire::SocketAddress> found);
   void try_next_address();
   void on_connected();
   void on_timer();
@@ -61,6 +62,8 @@ struct Dialer::State {
   std::unique_ptr<FrameLink> link;  // until the next round: it must not end in its own callbacks
   std::optional<wire::Greeting> them;
   std::optional<Error> reason;  // why the link is about to close, when we know better than it does
+  bool given_up = false;        // by restart(), while it was up
+  std::string last_choice;      // of addresses; empty: any
   EventSource connected, timer;
 };
 
@@ -76,13 +79,27 @@ void Dialer::State::begin_round() {
   reason.reset();
   last.reset();
   step = Step::look_up;
-  looking_up =
-      resolver.resolve(options.address, [this](Result<std::vector<wire::SocketAddress>> found) {
-        if (!found) return fail(found.error());
-        addresses = *std::move(found);
-        current = 0;
-        try_next_address();
-      });
+  std::vector<wire::SocketAddress> numbers;
+  for (const wire::Address& address : options.addresses) {
+    const std::vector<wire::SocketAddress> found = wire::resolve_number(address);
+    numbers.insert(numbers.end(), found.begin(), found.end());
+  }
+  if (!numbers.empty()) return begin_with(std::move(numbers));
+  looking_up = resolver.resolve(options.addresses.front(),
+                                [this](Result<std::vector<wire::SocketAddress>> found) {
+                                  if (!found) return fail(found.error());
+                                  begin_with(*std::move(found));
+                                });
+}
+
+void Dialer::State::begin_with(std::vector<wire::SocketAddress> found) {
+  addresses = std::move(found);
+  const auto last_one = std::find_if(
+      addresses.begin(), addresses.end(),
+      [this](const wire::SocketAddress& address) { return address.str() == last_choice; });
+  if (last_one != addresses.end()) std::rotate(addresses.begin(), last_one + 1, addresses.end());
+  current = 0;
+  try_next_address();
 }
 
 // Tries addresses[current] and, while they fail at once, those behind it.
@@ -97,7 +114,8 @@ void Dialer::State::try_next_address() {
     socket = *std::move(started);
     connected = EventSource::writable(loop, socket.get(), [this] { on_connected(); });
     connected.enable();
-    return timer.enable_in(kConnectTimeout);
+    const auto share = options.round_time / static_cast<std::int64_t>(addresses.size());
+    return timer.enable_in(std::min(kConnectTimeout, share));
   }
   fail(*last);
 }
@@ -176,9 +194,11 @@ Result<void> Dialer::State::greet_untrusted(const net::Frame& frame) {
 void Dialer::State::fail(const Error& why) {
   // A server that greets and then refuses is not asked 20 times a second.
   if (step == Step::up && MonoClock::now() - up_since >= kLongestPause) pause = kFirstPause;
+  const bool of_no_use = std::exchange(given_up, false) || step == Step::greet;
+  last_choice = of_no_use ? addresses[current].str() : std::string();
   step = Step::pause;
   timer.enable_in(pause);
-  pause = std::min(2 * pause, kLongestPause);
+  pause = std::min(2 * pause, options.longest_pause);
   user.on_down(why);
 }
 
@@ -202,6 +222,7 @@ void Dialer::restart(const Error& why) {
     case State::Step::up:
       if (!state.link->is_open()) return;  // on_closed() is on its way
       state.reason = why;
+      state.given_up = true;
       return state.link->close_with(why);
     case State::Step::look_up:
     case State::Step::connect:
@@ -214,7 +235,9 @@ void Dialer::restart(const Error& why) {
   }
 }
 
-void Dialer::set_address(wire::Address address) { state_->options.address = std::move(address); }
+void Dialer::set_addresses(std::vector<wire::Address> addresses) {
+  state_->options.addresses = std::move(addresses);
+}
 
 FrameLink* Dialer::link() noexcept {
   return state_->step == State::Step::up ? state_->link.get() : nullptr;
@@ -223,7 +246,7 @@ FrameLink* Dialer::link() noexcept {
 std::string Dialer::address() const {
   const State& state = *state_;
   return state.link && state.step != State::Step::pause ? state.addresses[state.current].str()
-                                                        : state.options.address.str();
+                                                        : state.options.addresses.front().str();
 }
 
 bool Dialer::crosses_network() const noexcept {

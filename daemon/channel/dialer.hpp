@@ -3,10 +3,14 @@
 // Keeps one outgoing connection up: looks the address up, connects, greets, and when the connection
 // breaks does it all again, after a pause that grows from kFirstPause to kLongestPause and never
 // gives up. Used by PeerLink (control connections), mirrors and remote writers (channels).
+//
+// Of several addresses the first that connects is taken. When nobody greets there, or when
+// restart() gave the connection up, the next round begins with the one behind it.
 #pragma once
 
 #include <memory>
 #include <string>
+#include <vector>
 
 #include "core/wire/address.hpp"
 #include "core/wire/network_protocol.hpp"
@@ -42,9 +46,13 @@ class Dialer final : private FrameLink::User {
   };
 
   struct Options {
-    wire::Address address;  // looked up anew for each round of attempts
-    wire::Greeting self;    // what to say
+    // Best first, at least one: numbers, or one name, which is looked up anew for each round of
+    // attempts.
+    std::vector<wire::Address> addresses;
+    wire::Greeting self;  // what to say
     std::size_t max_queued_bytes = 1U << 20;
+    Duration longest_pause = kLongestPause;
+    Duration round_time = Duration::max();  // all addresses share it, none gets > kConnectTimeout
   };
 
   // Starts at once. resolver, loop and user outlive it. Destroying it, outside of its own
@@ -59,11 +67,11 @@ class Dialer final : private FrameLink::User {
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
   // the next attempt after the pause that is due. While it pauses anyway: nothing.
   void restart(const Error& why);
-  // Where to go from the next attempt on.
-  void set_address(wire::Address address);
+  // Where to go from the next round of attempts on; what is up stays as it is.
+  void set_addresses(std::vector<wire::Address> addresses);
 
   FrameLink* link() noexcept;             // nullptr unless up
-  std::string address() const;            // connected to, else as configured
+  std::string address() const;            // connected to, else the first
   bool crosses_network() const noexcept;  // connected to another address than loopback
 
  private:

@@ -15,12 +15,12 @@ void OwnerChannel::connect(const KnownHost& host) {
   owner_ = host.greeting.host_id;
   if (!dialer_) {
     address_ = host.address;
-    dialer_.reset(new Dialer(parts_.loop, parts_.resolver, {address_, parts_.self}, *this));
+    dialer_.reset(new Dialer(parts_.loop, parts_.resolver, {{address_}, parts_.self}, *this));
     return;
   }
   if (address_ != host.address) {
     address_ = host.address;
-    dialer_->set_address(address_);
+    dialer_->set_addresses({address_});
     dialer_->restart({Errc::daemon_away, host.str() + " is reached at another address now"});
   }
   dialer_->hurry();

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The catalog: which hosts there are, and which streams they own, as far as known here. Own streams
-// stand in the Registry; this holds the others'. It is fed by discovery (configured peers today,
-// mDNS in a later round) and asked by everybody who has to find a stream. One thread, no sockets.
+// stand in the Registry; this holds the others'. It is fed by discovery (Peers, configured or
+// found) and asked by everybody who has to find a stream. One thread, no sockets.
 //
 // A host is known by its id. Names may collide: then both hosts are kept, and whoever asks by that
 // name is told of both.

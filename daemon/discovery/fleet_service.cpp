@@ -28,6 +28,18 @@ Result<proto::Stream> stream_untrusted(const std::string& host, proto::Stream st
   return stream;
 }
 
+std::string_view phase_name(MdnsState::Phase phase) {
+  switch (phase) {
+    case MdnsState::Phase::off:
+      return "off";
+    case MdnsState::Phase::waiting:
+      return "waiting";
+    case MdnsState::Phase::running:
+      return "running";
+  }
+  return "off";
+}
+
 Error unexpected(const std::string& host) {
   return Error{Errc::protocol, "host '" + host + "' answered something else than it was asked"};
 }
@@ -294,6 +306,18 @@ std::vector<local::Host> FleetService::hosts() const {
   self.set_error(peers_.own_trouble());
   for (local::Host& host : peers_.hosts()) hosts.push_back(std::move(host));
   return hosts;
+}
+
+local::Mdns FleetService::mdns() const {
+  local::Mdns mdns;
+  mdns.set_phase(std::string(phase_name(mdns_.phase)));
+  mdns.set_trouble(printable(mdns_.trouble));
+  mdns.set_avahi_version(printable(mdns_.avahi_version));
+  mdns.set_announced(mdns_.announced);
+  mdns.set_withheld(mdns_.withheld);
+  mdns.set_own_host_seen(mdns_.own_host_seen);
+  mdns.set_hosts_heard(mdns_.hosts_heard);
+  return mdns;
 }
 
 void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {

@@ -19,6 +19,7 @@
 #include "daemon/channel/mirror_keeper.hpp"
 #include "daemon/channel/remote_writer_keeper.hpp"
 #include "daemon/discovery/catalog.hpp"
+#include "daemon/discovery/found_host.hpp"
 #include "daemon/discovery/peers.hpp"
 #include "daemon/local/fleet.hpp"
 #include "daemon/service/event_loop.hpp"
@@ -61,7 +62,11 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
   void list(Then<std::vector<proto::Stream>> then) override;
   std::vector<StreamInfo> known_streams() const override;
   std::vector<local::Host> hosts() const override;
+  local::Mdns mdns() const override;
   void ping(const std::string& host, Then<local::RoundTrip> then) override;
+
+  // What mdns() tells from now on; "off" before.
+  void set_mdns(MdnsState state) { mdns_ = std::move(state); }
 
  private:
   // A List of all hosts that is under way.
@@ -96,6 +101,7 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
   MirrorKeeper& mirrors_;
   RemoteWriterKeeper& writers_;
   Fleet::Observer* observer_ = nullptr;
+  MdnsState mdns_;
   std::vector<std::function<void()>> early_;       // wait for the peers to settle
   std::deque<std::shared_ptr<Listing>> listings_;  // in the order of their deadlines
   EventSource list_timer_;

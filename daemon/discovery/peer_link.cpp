@@ -38,13 +38,30 @@ std::string_view state_name(PeerLink::State state) noexcept {
   return "";
 }
 
-PeerLink::PeerLink(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
-                   const wire::Greeting& self, User& user)
-    : configured_(peer),
-      clock_bound_(self.clock_bound),
+PeerLink::PeerLink(const EventLoop& loop, Resolver& resolver, std::optional<wire::HostId> expected,
+                   Dialer::Options options, User& user)
+    : configured_(options.addresses.front()),
+      expected_(expected),
+      clock_bound_(options.self.clock_bound),
       user_(user),
       heartbeat_(EventSource::timer(loop, [this] { beat(); })),
-      dialer_(loop, resolver, {peer, self, kMaxOutputBytes}, *this) {}
+      dialer_(loop, resolver, std::move(options), *this) {}
+
+PeerLink::PeerLink(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
+                   const wire::Greeting& self, User& user)
+    : PeerLink(loop, resolver, std::nullopt, {{peer}, self, kMaxOutputBytes}, user) {}
+
+PeerLink::PeerLink(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
+                   const std::vector<wire::Address>& addresses, const wire::Greeting& self,
+                   User& user)
+    : PeerLink(loop, resolver, id, {addresses, self, kMaxOutputBytes, kFoundPause, kFoundRoundTime},
+               user) {}
+
+void PeerLink::set_addresses(const std::vector<wire::Address>& addresses) {
+  configured_ = addresses.front();
+  dialer_.set_addresses(addresses);
+  if (state_ != State::up) dialer_.hurry();
+}
 
 void PeerLink::enter(State state, std::optional<Error> why) {
   if (state != state_) since_ = MonoClock::now();
@@ -53,6 +70,10 @@ void PeerLink::enter(State state, std::optional<Error> why) {
 }
 
 void PeerLink::on_up(FrameLink&, const wire::Greeting& them) {
+  if (expected_ && them.host_id != *expected_) {
+    return dialer_.restart({Errc::conflict, "at '" + address() + "' answers " + them.str() +
+                                                ", which is another one than was found there"});
+  }
   them_ = them;
   enter(State::up, std::nullopt);
   user_.on_link_up(*this);

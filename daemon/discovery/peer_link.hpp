@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The control connection to one configured peer: keeps it up, carries requests and their answers,
-// listens to changes of the peer's streams, and measures that it is alive. What a peer means for
-// the catalog is decided by Peers.
+// The control connection to one configured peer, or to one host that was found: keeps it up,
+// carries requests and their answers, listens to changes of the peer's streams, and measures that
+// it is alive. What a peer means for the catalog is decided by Peers.
 #pragma once
 
 #include <functional>
@@ -10,6 +10,7 @@
 #include <optional>
 #include <string>
 #include <string_view>
+#include <vector>
 
 #include "core/wire/address.hpp"
 #include "core/wire/network_protocol.hpp"
@@ -23,6 +24,11 @@ class PeerLink final : private Dialer::User {
   // Requests of one peer that wait for their answers.
   static constexpr std::size_t kMaxWaiting = 4096;
   static constexpr std::size_t kMaxWaitingBytes = 40U << 20;  // two properties of the largest size
+
+  // A found host that answers again is back within kFoundRoundTime + kFoundPause, whichever of its
+  // addresses are dead; the design allows 3 s.
+  static constexpr Duration kFoundRoundTime = std::chrono::milliseconds(1500);
+  static constexpr Duration kFoundPause = std::chrono::seconds(1);
 
   enum class State : unsigned char {
     connecting,  // not decided yet
@@ -47,9 +53,13 @@ class PeerLink final : private Dialer::User {
     ~User() = default;
   };
 
-  // Starts at once; what is given outlives it.
+  // Starts at once; what is given outlives it. To a configured peer, whoever that is:
   PeerLink(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
            const wire::Greeting& self, User& user);
+  // To the host `id`, which is said to be at one of `addresses` (numbers, best first, at least
+  // one); any other that answers there is refused.
+  PeerLink(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
+           const std::vector<wire::Address>& addresses, const wire::Greeting& self, User& user);
   PeerLink(const PeerLink&) = delete;
   PeerLink& operator=(const PeerLink&) = delete;
 
@@ -70,6 +80,9 @@ class PeerLink final : private Dialer::User {
   // Gives the connection up and tries again later.
   void drop(const Error& why) { dialer_.restart(why); }
 
+  // Where to go from the next attempt on, which comes at once unless it is up.
+  void set_addresses(const std::vector<wire::Address>& addresses);
+
   // --- about the peer -------------------------------------------------------------------------
 
   State state() const noexcept { return state_; }
@@ -77,8 +90,9 @@ class PeerLink final : private Dialer::User {
   const std::optional<Error>& why() const noexcept { return why_; }  // it is not up
   // Who answers there; while it is not up, who did last.
   const std::optional<wire::Greeting>& them() const noexcept { return them_; }
+  // As configured; of a found host: its first address.
   const wire::Address& configured() const noexcept { return configured_; }
-  std::string address() const { return dialer_.address(); }  // connected to, else as configured
+  std::string address() const { return dialer_.address(); }  // connected to, else configured()
   bool crosses_network() const noexcept { return dialer_.crosses_network(); }
 
   // Of the heartbeats of this connection; zero: not known.
@@ -98,7 +112,11 @@ class PeerLink final : private Dialer::User {
   void on_pong(MonoTime asked, const Result<net::Frame>& answer);
   void enter(State state, std::optional<Error> why);
 
-  const wire::Address configured_;
+  PeerLink(const EventLoop& loop, Resolver& resolver, std::optional<wire::HostId> expected,
+           Dialer::Options options, User& user);
+
+  wire::Address configured_;
+  const std::optional<wire::HostId> expected_;
   const Duration clock_bound_;  // our own
   User& user_;
   State state_ = State::connecting;

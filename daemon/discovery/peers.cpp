@@ -13,25 +13,18 @@ std::string describe(const PeerLink& link) {
   return "host '" + link.them()->host + "' ('" + link.address() + "')";
 }
 
-// For a connection that stands by while `in_use` is used. A dssmd that was restarted is here for a
-// moment, until its predecessor's connection is found to be dead; if both live on, they are two.
-std::string same_host_warning(const PeerLink& in_use, const PeerLink& by) {
-  const std::string other = "'" + in_use.configured().str() + "', which is in use";
-  if (in_use.them()->life == by.them()->life) return "same host as " + other;
-  return "has name and machine id of " + other +
-         ", but is another dssmd; give each host its own name (key name), and copied PCs their own "
-         "/etc/machine-id";
-}
-
 }  // namespace
 
 Peers::Peers(const EventLoop& loop, Resolver& resolver, const std::vector<wire::Address>& peers,
              wire::Greeting self, Catalog& catalog, Logger& logger)
-    : self_(std::move(self)),
+    : loop_(loop),
+      resolver_(resolver),
+      self_(std::move(self)),
       catalog_(catalog),
       logger_(logger),
       settled_(peers.empty()),
-      settle_timer_(EventSource::timer(loop, [this] { settle(); })) {
+      settle_timer_(EventSource::timer(loop, [this] { settle(); })),
+      tend_soon_(EventSource::timer(loop, [this] { tend_found_hosts(); })) {
   if (!settled_) settle_timer_.enable_in(kSettleTime);
   PeerLink::User& user = *this;
   for (const wire::Address& peer : peers) {
@@ -46,6 +39,13 @@ Peers::Peer& Peers::peer_of(const PeerLink& link) {
                        [&](const Peer& peer) { return peer.link.get() == &link; });
 }
 
+Peers::Peer* Peers::found_host(const wire::HostId& id) {
+  const auto found = std::find_if(peers_.begin(), peers_.end(), [&](const Peer& peer) {
+    return peer.found && peer.found->host.id == id;
+  });
+  return found == peers_.end() ? nullptr : &*found;
+}
+
 const Peers::Peer* Peers::in_use(const wire::HostId& id) const {
   const auto found = std::find_if(peers_.begin(), peers_.end(), [&](const Peer& peer) {
     return peer.use == Use::in_use && peer.link->them()->host_id == id;
@@ -53,19 +53,160 @@ const Peers::Peer* Peers::in_use(const wire::HostId& id) const {
   return found == peers_.end() ? nullptr : &*found;
 }
 
+bool Peers::is_up_as_configured(const wire::HostId& id) const {
+  return std::any_of(peers_.begin(), peers_.end(), [&](const Peer& peer) {
+    return !peer.found && peer.use != Use::none && peer.link->them()->host_id == id;
+  });
+}
+
 PeerLink* Peers::link_to(const wire::HostId& id) {
   const Peer* peer = in_use(id);
   return peer ? peer->link.get() : nullptr;
 }
 
+// --- found hosts
+// ----------------------------------------------------------------------------------
+
+void Peers::expect_finder(bool insecure) {
+  insecure_ = insecure;
+  finder_is_searching_ = true;
+  settled_ = false;
+  settle_timer_.enable_in(kSettleTime);
+}
+
+void Peers::on_host_found(const FoundHost& host) {
+  if (host.id == self_.host_id) return;
+  Peer* known = found_host(host.id);
+  if (!known) {
+    const auto count = std::count_if(peers_.begin(), peers_.end(),
+                                     [](const Peer& peer) { return peer.found.has_value(); });
+    if (static_cast<std::size_t>(count) >= kMaxFoundHosts) {
+      if (std::exchange(told_too_many_, true)) return;
+      return logger_.warning("mDNS finds more than " + std::to_string(kMaxFoundHosts) +
+                                 " hosts; further ones, such as '" + host.name +
+                                 "', are not followed (name those that are needed as peers, and "
+                                 "look with `avahi-browse -r _dssm._tcp` for who announces them)",
+                             {.peer = host.name, .message_id = message_id::kHostRefused});
+    }
+    known = &peers_.emplace_back();
+    known->found.emplace();
+  }
+  known->found->listed = true;
+  known->found->host = host;
+  if (host.addresses.size() > kMaxAddressesOfHost) {
+    known->found->host.addresses.resize(kMaxAddressesOfHost);
+  }
+  tend_soon_.enable_in(Duration::zero());
+}
+
+void Peers::on_host_lost(const wire::HostId& id) {
+  Peer* known = found_host(id);
+  if (!known) return;
+  known->found->listed = false;
+  tend_soon_.enable_in(Duration::zero());
+}
+
+void Peers::on_mdns_state(const MdnsState& state) {
+  finder_is_searching_ = state.phase == MdnsState::Phase::running;
+  settle_if_decided();
+}
+
+Peers::Occupied Peers::occupied() const {
+  Occupied occupied;
+  for (const Peer& peer : peers_) {
+    if (peer.use != Use::none) occupied.emplace(peer.link->address(), &*peer.link->them());
+  }
+  return occupied;
+}
+
+// Decides where a connection to that host may go, and why to nowhere.
+void Peers::look_at(Found& found, const Occupied& occupied) const {
+  const FoundHost& host = found.host;
+  const std::string who = "host '" + host.name + "'";
+  found.usable.clear();
+  found.obstacle.reset();
+  if (host.protocol_version != wire::kNetworkProtocolVersion) {
+    found.obstacle = {
+        "refused", wire::other_protocol_version("dssmd of " + who, host.protocol_version).message};
+    return;
+  }
+  found.obstacle = {"down", who +
+                                " is announced without an address that can be reached from here; "
+                                "check the network interfaces of both"};
+  if (host.closed) {
+    found.obstacle = {"closed", who +
+                                    " listens on its own loopback only; to share its streams set "
+                                    "listen and insecure there, see docs/configuration.md"};
+  }
+  for (const wire::Address& address : host.addresses) {
+    const std::vector<wire::SocketAddress> numbers = wire::resolve_number(address);
+    if (numbers.empty()) continue;
+    if (!insecure_ && !numbers.front().is_loopback()) {
+      found.obstacle = {"closed", who +
+                                      " is on another PC, and this dssmd connects to others only "
+                                      "with insecure = true, see docs/configuration.md"};
+      continue;
+    }
+    const auto occupant = occupied.find(numbers.front().str());
+    if (occupant != occupied.end() && occupant->second->host_id != host.id) {
+      found.obstacle = {"refused", who + " is said to be at '" + address.str() + "', where host '" +
+                                       occupant->second->host + "' answers"};
+      continue;
+    }
+    found.usable.push_back(address);
+  }
+  if (!found.usable.empty()) found.obstacle.reset();
+}
+
+void Peers::tend_found_hosts() {
+  PeerLink::User& user = *this;
+  const Occupied now_occupied = occupied();
+  for (auto next = peers_.begin(); next != peers_.end();) {
+    const auto peer = next++;
+    if (!peer->found) continue;
+    Found& found = *peer->found;
+    const std::vector<wire::Address> before = found.usable;
+    look_at(found, now_occupied);
+    const bool is_needed = !is_up_as_configured(found.host.id);
+    const bool is_up = peer->use == Use::in_use || (peer->use != Use::none && is_needed);
+    if (!found.listed && !is_up) {
+      peers_.erase(peer);
+    } else if (!is_up && (!is_needed || found.obstacle)) {
+      peer->link.reset();
+      peer->use = Use::none;
+      peer->warning.clear();
+    } else if (!peer->link) {
+      peer->link =
+          std::make_unique<PeerLink>(loop_, resolver_, found.host.id, found.usable, self_, user);
+    } else if (!found.usable.empty() && found.usable != before) {
+      peer->link->set_addresses(found.usable);
+    }
+  }
+}
+
 // --- connections come and go
 // ----------------------------------------------------------------------
+
+// For a connection that stands by while another is used. A dssmd that was restarted is here for a
+// moment, until its predecessor's connection is found to be dead; if both live on, they are two.
+std::string Peers::same_host_warning(const Peer& in_use, const Peer& by) {
+  const bool is_same = in_use.link->them()->life == by.link->them()->life;
+  if (is_same && in_use.found) return {};  // to be found too is no mistake of the configuration
+  const std::string other =
+      "'" + (in_use.found ? in_use.link->address() : in_use.link->configured().str()) +
+      "', which is in use";
+  if (is_same) return "same host as " + other;
+  return "has name and machine id of " + other +
+         ", but is another dssmd; give each host its own name (key name), and copied PCs their own "
+         "/etc/machine-id";
+}
 
 void Peers::on_link_up(PeerLink& link) {
   Peer& peer = peer_of(link);
   const wire::Greeting& them = *link.them();
   peer.told_down = false;
   peer.warning.clear();
+  tend_soon_.enable_in(Duration::zero());
   if (them.host_id == self_.host_id) {
     // Left standing without a word: a connection that is closed would be dialed again and again.
     peer.use = them.life == self_.life ? Use::self : Use::not_usable;
@@ -79,7 +220,7 @@ void Peers::on_link_up(PeerLink& link) {
   }
   if (const Peer* other = in_use(them.host_id)) {
     peer.use = Use::standing_by;
-    peer.warning = same_host_warning(*other->link, link);
+    peer.warning = same_host_warning(*other, peer);
     link.keep_alive();
     return decide(peer);
   }
@@ -111,6 +252,7 @@ void Peers::on_link_down(PeerLink& link, const Error& why, bool attempt) {
   Peer& peer = peer_of(link);
   const Use was = std::exchange(peer.use, Use::none);
   peer.warning.clear();
+  tend_soon_.enable_in(Duration::zero());
   if (was == Use::in_use) {
     const wire::HostId id = link.them()->host_id;
     logger_.notice("host '" + link.them()->host + "' is down: " + why.message,
@@ -118,7 +260,9 @@ void Peers::on_link_down(PeerLink& link, const Error& why, bool attempt) {
     catalog_.host_down(id, why);
     take_over(id);
   } else if (attempt && !peer.told_down) {
-    logger_.notice("peer '" + link.configured().str() + "' is not there, trying on: " + why.message,
+    const std::string whom = peer.found ? "host '" + peer.found->host.name + "' (found by mDNS)"
+                                        : "peer '" + link.configured().str() + "'";
+    logger_.notice(whom + " is not there, trying on: " + why.message,
                    {.peer = link.configured().str(), .message_id = message_id::kHostDown});
   }
   peer.told_down = true;
@@ -134,7 +278,7 @@ void Peers::take_over(const wire::HostId& id) {
   use(*next);
   for (Peer& other : peers_) {
     if (other.use != Use::standing_by || other.link->them()->host_id != id) continue;
-    other.warning = same_host_warning(*next->link, *other.link);
+    other.warning = same_host_warning(*next, other);
   }
 }
 
@@ -168,79 +312,21 @@ void Peers::on_heartbeat(PeerLink& link) {
 
 void Peers::decide(Peer& peer) {
   peer.decided = true;
-  const auto decided = [](const Peer& each) { return each.decided; };
-  if (!settled_ && std::all_of(peers_.begin(), peers_.end(), decided)) settle();
+  settle_if_decided();
+}
+
+void Peers::settle_if_decided() {
+  const auto decided = [](const Peer& each) { return each.found || each.decided; };
+  if (settled_ || finder_is_searching_ || !std::all_of(peers_.begin(), peers_.end(), decided)) {
+    return;
+  }
+  settle();
 }
 
 void Peers::settle() {
   if (std::exchange(settled_, true)) return;
   settle_timer_.disable();
   if (on_settled_) std::exchange(on_settled_, {})();
-}
-
-// --- what to tell people
-// --------------------------------------------------------------------------
-
-std::string Peers::namesake_warning(const Peer& peer) const {
-  const wire::Greeting& them = *peer.link->them();
-  for (const Peer& other : peers_) {
-    if (other.use != Use::in_use || other.link->them()->host_id == them.host_id) continue;
-    if (other.link->them()->host != them.host) continue;
-    return "the host at '" + other.link->address() + "' is called '" + them.host +
-           "' too; give each its own name (key name)";
-  }
-  return {};
-}
-
-std::vector<local::Host> Peers::hosts() const {
-  std::vector<local::Host> hosts;
-  for (const Peer& peer : peers_) {
-    const PeerLink& link = *peer.link;
-    local::Host& host = hosts.emplace_back();
-    host.set_state(peer.use == Use::self         ? "self"
-                   : peer.use == Use::not_usable ? "refused"
-                                                 : std::string(state_name(link.state())));
-    host.add_addresses(link.configured().str());
-    if (link.address() != link.configured().str()) host.add_addresses(link.address());
-    host.set_since_ns(to_ns(link.in_this_state_for()));
-    host.set_round_trip_ns(to_ns(link.last_round_trip()));
-    host.set_least_round_trip_ns(to_ns(link.least_round_trip()));
-    host.set_clock_bound_ns(to_ns(kUnknownClockError));
-    host.set_insecure(link.crosses_network());
-    if (link.them()) {
-      host.set_name(link.them()->host);
-      host.set_host_id(link.them()->host_id.data(), link.them()->host_id.size());
-      host.set_version(link.them()->version);
-    }
-    if (link.why()) host.set_error(link.why()->message);
-    if (!peer.warning.empty()) host.set_error(peer.warning);
-    if (peer.use != Use::in_use) continue;
-    host.set_clock_bound_ns(to_ns(link.them()->clock_bound));
-    if (const KnownHost* known = catalog_.find(link.them()->host_id)) {
-      host.set_streams(static_cast<std::uint32_t>(known->streams.size()));
-    }
-    if (std::string warning = namesake_warning(peer); !warning.empty()) {
-      host.set_error(std::move(warning));
-    }
-  }
-  return hosts;
-}
-
-std::string Peers::trouble() const {
-  std::string text;
-  for (const Peer& peer : peers_) {
-    if (!peer.link->why()) continue;
-    text += (text.empty() ? "'" : ", '") + peer.link->configured().str() + "' (" +
-            peer.link->why()->message + ")";
-  }
-  return text;
-}
-
-std::string Peers::own_trouble() const {
-  for (const Peer& peer : peers_) {
-    if (peer.use == Use::not_usable) return peer.warning;
-  }
-  return {};
 }
 
 }  // namespace dssm::daemon

@@ -68,6 +68,7 @@ class Fleet {
   virtual std::vector<StreamInfo> known_streams() const = 0;
 
   virtual std::vector<local::Host> hosts() const = 0;  // this one first
+  virtual local::Mdns mdns() const = 0;                // how finding them by mDNS fares
   virtual void ping(const std::string& host, Then<local::RoundTrip> then) = 0;
 
  protected:

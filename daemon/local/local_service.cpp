@@ -140,6 +140,9 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
   const auto identity = clients_.at(number).identity;
   Result<Reply> reply = requests_.handle_untrusted(identity, request, descriptors);
   if (request.has_offer()) log_offer(*identity, request.offer(), reply);
+  if (request.has_get_daemon() && reply && remote_) {
+    remote_->complete_daemon(*reply->response.mutable_daemon());
+  }
   if (!reply || !remote_ || !request.has_list() || request.list().own_only()) {
     return on_answer(number, request.serial(), std::move(reply));
   }

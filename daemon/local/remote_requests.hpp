@@ -36,6 +36,9 @@ class RemoteRequests {
   // Adds the other hosts' streams to the list of the own ones.
   void complete_list(Reply own, Answer answer);
 
+  // Adds to what this dssmd tells of itself how it finds others.
+  void complete_daemon(local::Daemon& daemon) const { *daemon.mutable_mdns() = fleet_.mdns(); }
+
  private:
   void create(const Client& client, const StreamId& id, const local::Create& request,
               Answer answer);

@@ -210,6 +210,7 @@ Result<Reply> StreamRequests::get_daemon() {
   daemon.set_streams(registry_.streams().size());
   daemon.set_memory_bytes(registry_.budget().used());
   daemon.set_memory_limit_bytes(registry_.budget().limit());
+  daemon.mutable_mdns()->set_phase("off");  // unless there is a fleet that knows more
   return reply;
 }
 

@@ -69,11 +69,11 @@ Result<void> add_peer(Config& config, std::string_view text) {
   return {};
 }
 
-Result<void> set_insecure(Config& config, std::string_view text) {
-  if (text != "true" && text != "false") {
-    return Error{Errc::invalid_argument, in_quotes(text) + " is neither true nor false"};
-  }
-  config.insecure = text == "true";
+Result<void> add_interface(std::vector<std::string>& interfaces, std::string_view text) {
+  if (text.empty()) return {};
+  Result<std::string> interface = parse_interface(text);
+  if (!interface) return std::move(interface).error();
+  interfaces.push_back(*std::move(interface));
   return {};
 }
 
@@ -168,7 +168,25 @@ constexpr ConfigKey kKeys[] = {
     {"peers", "HOST:PORT", "another host's dssmd to share streams with; may be repeated",
      ValueForm::list, add_peer, [](Config& c) { c.peers.clear(); }, "peer"},
     {"insecure", "", "allow addresses of other PCs although nothing is encrypted",
-     ValueForm::boolean, set_insecure},
+     ValueForm::boolean,
+     [](Config& c, std::string_view text) { return take(c.insecure, parse_boolean(text)); }},
+    {"mdns", "",
+     "find other hosts, and announce this one and its streams, by mDNS; default: true "
+     "(--mdns=false: do not)",
+     ValueForm::boolean,
+     [](Config& c, std::string_view text) { return take(c.mdns, parse_boolean(text)); }},
+    {"interfaces", "NAME",
+     "network interface to use for mDNS, or a pattern such as 'eth*'; may be repeated; default: "
+     "all",
+     ValueForm::list,
+     [](Config& c, std::string_view text) { return add_interface(c.interfaces, text); },
+     [](Config& c) { c.interfaces.clear(); }, "interface"},
+    {"avoid_interfaces", "NAME",
+     "network interface not to use for mDNS, or a pattern; may be repeated, '' for none; default: "
+     "those of containers, virtual machines and tunnels",
+     ValueForm::list,
+     [](Config& c, std::string_view text) { return add_interface(c.avoid_interfaces, text); },
+     [](Config& c) { c.avoid_interfaces.clear(); }, "avoid-interface"},
     {"max_connections", "COUNT", "connections of other hosts at once; default: 256",
      ValueForm::integer,
      [](Config& c, std::string_view text) {
@@ -281,6 +299,11 @@ Result<toml::table> parse_toml(std::string_view text, const std::string& path) {
 std::uint64_t Config::half_of_the_machines_memory() noexcept {
   const std::uint64_t half = memory_of_the_machine() / 2;
   return half > 0 ? half : 1ULL << 30;
+}
+
+std::vector<std::string> Config::interfaces_between_programs() {
+  return {"docker*", "veth*", "br-*", "virbr*",     "lxc*", "lxdbr*",
+          "tun*",    "tap*",  "wg*",  "tailscale*", "zt*",  "vmnet*"};
 }
 
 std::span<const ConfigKey> config_keys() noexcept { return kKeys; }

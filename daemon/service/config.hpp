@@ -49,12 +49,20 @@ struct Config {
   std::optional<std::vector<wire::Address>> listen;
   std::vector<wire::Address> peers;
   bool insecure = false;
+  // Discovery by mDNS. Names of network interfaces, or patterns as in fnmatch(3): those in
+  // `interfaces`, all when that is empty, without those in `avoid_interfaces`.
+  bool mdns = true;
+  std::vector<std::string> interfaces;
+  std::vector<std::string> avoid_interfaces = interfaces_between_programs();
   std::uint64_t max_connections = 256;
   std::uint64_t max_connections_per_host = 128;
   std::uint64_t max_peer_memory_bytes = 96ULL << 20;
   Duration mirror_linger = std::chrono::seconds(5);
 
   static std::uint64_t half_of_the_machines_memory() noexcept;
+  // Those of containers, virtual machines and tunnels: what is found there is found again on the
+  // cable, or is no host of this vehicle.
+  static std::vector<std::string> interfaces_between_programs();
 };
 
 // How a value is written in the file: in quotes, as a plain integer, as either, as true or false

@@ -2,6 +2,7 @@
 #include "daemon/service/config_values.hpp"
 
 #include <grp.h>
+#include <net/if.h>
 #include <sys/types.h>
 #include <unistd.h>
 
@@ -13,6 +14,8 @@
 
 namespace dssm::daemon {
 namespace {
+
+constexpr std::size_t kMaxInterfacePatternBytes = 63;
 
 Error invalid(std::string why) { return Error{Errc::invalid_argument, std::move(why)}; }
 
@@ -131,6 +134,30 @@ Result<gid_t> parse_group(std::string_view name) {
     }
     return found->gr_gid;
   }
+}
+
+Result<bool> parse_boolean(std::string_view text) {
+  if (text == "true") return true;
+  if (text == "false") return false;
+  return invalid(in_quotes(text) + " is neither true nor false");
+}
+
+Result<std::string> parse_interface(std::string_view text) {
+  const bool is_pattern = text.find_first_of("*?[\\") != text.npos;
+  const std::size_t most = is_pattern ? kMaxInterfacePatternBytes : IFNAMSIZ - 1;
+  if (text.empty() || text.size() > most) {
+    return invalid(in_quotes(text) + " is " + std::to_string(text.size()) + " bytes long; " +
+                   (is_pattern ? "a pattern" : "the name of a network interface") + " takes 1 to " +
+                   std::to_string(most));
+  }
+  for (const char c : text) {
+    if (static_cast<unsigned char>(c) <= 0x20 || c == 0x7f || c == '/') {
+      return invalid(in_quotes(text) +
+                     " holds a blank, a control character or '/', which no network interface has "
+                     "in its name; `ip link` lists those of this PC");
+    }
+  }
+  return std::string(text);
 }
 
 Result<LogLevel> parse_log_level(std::string_view text) {

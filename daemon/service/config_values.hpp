@@ -30,6 +30,13 @@ Result<mode_t> parse_mode(std::string_view text);
 // The number of the group `name`, which must exist.
 Result<gid_t> parse_group(std::string_view name);
 
+// true, false
+Result<bool> parse_boolean(std::string_view text);
+
+// The name of a network interface, or a pattern for such names as in fnmatch(3): 1 to 63 bytes
+// without blanks and '/', at most 15 of them when it is no pattern.
+Result<std::string> parse_interface(std::string_view text);
+
 // error, warning, notice, info, debug
 Result<LogLevel> parse_log_level(std::string_view text);
 

@@ -147,6 +147,10 @@ std::vector<std::string> addresses_in(const std::string& text) {
 DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& host)
     : dir_(make_temp_dir()) {
   argv_ = {built("daemon/dssmd"), "--runtime-dir", dir_, "--name", host};
+  const bool says_mdns = std::any_of(extra.begin(), extra.end(), [](const std::string& word) {
+    return word.starts_with("--mdns");
+  });
+  if (!says_mdns) argv_.emplace_back("--mdns=false");
   argv_.insert(argv_.end(), extra.begin(), extra.end());
   if (!listens(extra)) argv_.insert(argv_.end(), {"--listen", "127.0.0.1:0"});
   start();

@@ -60,21 +60,37 @@ struct DaemonInfo {
   std::uint64_t streams = 0;
   std::uint64_t memory_bytes = 0;        // of all rings
   std::uint64_t memory_limit_bytes = 0;  // for all rings
+
+  // How it fares with finding other hosts by mDNS.
+  struct Mdns {
+    std::string phase;              // "off", "waiting" (for the Avahi daemon), "running"
+    std::string trouble;            // why it waits, or what goes wrong; empty: nothing
+    std::string avahi_version;      // "avahi 0.8"
+    std::uint32_t announced = 0;    // services: streams, and the host itself
+    std::uint32_t withheld = 0;     // services that could not be announced
+    bool own_host_seen = false;     // this host's own announcement is visible here
+    std::uint32_t hosts_heard = 0;  // other hosts heard of by multicast
+  };
+  Mdns mdns;
 };
 
-// A host of the fleet, as this PC's dssmd sees it: this PC itself, and each configured peer.
+// A host of the fleet, as this PC's dssmd sees it: this PC itself, each configured peer, and each
+// host that was found by mDNS.
 struct HostInfo {
   std::string name;                    // empty while it never answered
   std::vector<std::string> addresses;  // as configured and as reached: "pc2:13776"
   std::string version;                 // of its dssmd
-  std::string state;                   // "self", "up", "connecting", "down", "refused"
-  Duration since{};                    // how long it has been in this state
-  Duration round_trip{};               // of the last heartbeat, which comes once a second; 0: none
-  Duration least_round_trip{};         // of this connection's heartbeats; 0: none
-  std::uint32_t streams = 0;           // that it owns
+  std::string state;            // "self", "up", "connecting", "down", "refused", "closed" (it
+                                // was found by mDNS, but listens on its own loopback only)
+  Duration since{};             // how long it has been in this state
+  Duration round_trip{};        // of the last heartbeat, which comes once a second; 0: none
+  Duration least_round_trip{};  // of this connection's heartbeats; 0: none
+  std::uint32_t streams = 0;    // that it owns
   Duration clock_bound = kUnknownClockError;
   bool insecure = false;  // its traffic crosses the network in the clear
   std::string error;      // why it is not up, or a warning that concerns it; empty: all is well
+  std::string id;         // 32 hex digits, of the host whatever it is called; empty: not known
+  std::vector<std::string> found_by;  // "peer" (configured), "mdns"; empty: it is this PC
 };
 
 // A sign of life that was asked for.
@@ -202,7 +218,8 @@ class Session {
 
   // --- other hosts ----------------------------------------------------------------------------
 
-  // This PC first, then the configured peers, each with its state at this moment.
+  // This PC first, then the configured peers and those found by mDNS, each with its state at this
+  // moment.
   Result<std::vector<HostInfo>> hosts();
 
   // Asks the dssmd of that host for a sign of life, over the connection that this PC's dssmd keeps.

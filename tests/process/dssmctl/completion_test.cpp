@@ -103,6 +103,7 @@ TEST_F(CompletionInAFleet, OffersHostsToPing) {
   EXPECT_EQ(offered({"ping", "-c", "1", "pc2"}), Strings{"pc2"});
   EXPECT_EQ(offered({"ping", "-c", ""}), Strings{});
   EXPECT_EQ(offered({"ping", "pc2", ""}), Strings{});
+  EXPECT_EQ(offered({"ls", "--host", ""}), (Strings{"pc1", "pc2", "pc3"}));
 }
 
 TEST_F(Completion, QuotesNamesForTheShell) {

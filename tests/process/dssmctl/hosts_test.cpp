@@ -25,6 +25,9 @@ TEST_F(Hosts, ShowsThisHostFirstAndHowTheOthersAreReached) {
   EXPECT_EQ(hosts[1]["state"], "up");
   EXPECT_EQ(hosts[1]["addresses"], Json({pc2_.address()}));
   EXPECT_EQ(hosts[1]["streams"], 1);
+  EXPECT_EQ(hosts[1]["found_by"], host("pc2").found_by);
+  EXPECT_EQ(hosts[1]["id"].get<std::string>().size(), 32U);
+  EXPECT_NE(hosts[1]["id"], hosts[0]["id"]);
   EXPECT_EQ(hosts[1]["version"], hosts[0]["version"]);
   EXPECT_GE(hosts[1]["state_for_ns"], 0);
   EXPECT_EQ(hosts[1]["insecure"], false);  // loopback
@@ -33,10 +36,10 @@ TEST_F(Hosts, ShowsThisHostFirstAndHowTheOthersAreReached) {
 
   const Strings lines = lines_of(output({"hosts"}));
   ASSERT_EQ(lines.size(), 4U);
-  EXPECT_EQ(words_of(lines[0]),
-            (Strings{"HOST", "STATE", "ADDRESS", "VERSION", "RTT", "STREAMS", "CLOCK", "NOTE"}));
+  EXPECT_EQ(words_of(lines[0]), (Strings{"HOST", "STATE", "ADDRESS", "FOUND", "BY", "VERSION",
+                                         "RTT", "STREAMS", "CLOCK", "NOTE"}));
   EXPECT_EQ(words_of(lines[1]),
-            (Strings{"pc1", "self", daemon_.address(), DSSM_VERSION, "-", "0", "unknown"}));
+            (Strings{"pc1", "self", daemon_.address(), "-", DSSM_VERSION, "-", "0", "unknown"}));
   EXPECT_TRUE(lines[2].starts_with("pc2   up     " + pc2_.address())) << lines[2];
 }
 

@@ -60,6 +60,21 @@ TEST(CommandLine, TakesAListFromARepeatedFlagInPlaceOfTheFiles) {
   test::remove_tree(dir);
 }
 
+TEST(CommandLine, TurnsMdnsOffAndChoosesItsInterfaces) {
+  const Result<CommandLine> defaults = parse({});
+  ASSERT_TRUE(defaults) << defaults.error().message;
+  EXPECT_TRUE(defaults->config.mdns);
+  const Result<CommandLine> line = parse(
+      {"--mdns=false", "--interface", "eth0", "--interface", "wlan*", "--avoid-interface", ""});
+  ASSERT_TRUE(line) << line.error().message;
+  EXPECT_FALSE(line->config.mdns);
+  EXPECT_EQ(line->config.interfaces, (std::vector<std::string>{"eth0", "wlan*"}));
+  EXPECT_TRUE(line->config.avoid_interfaces.empty());
+  EXPECT_TRUE(parse({"--mdns"})->config.mdns);
+  EXPECT_FALSE(parse({"--mdns=no"})->config.mdns);
+  EXPECT_FALSE(parse({"--interface", "no name"}));
+}
+
 TEST(CommandLine, LetsAFlagTakeBackWhatTheFileAllows) {
   const std::string dir = test::make_temp_dir(), path = dir + "/dssmd.conf";
   std::ofstream(path) << "insecure = true\n";

@@ -3,8 +3,10 @@
 // The configuration file and its values: what is taken, and what is said about what is not.
 #include "daemon/service/config.hpp"
 
+#include <fnmatch.h>
 #include <gtest/gtest.h>
 
+#include <algorithm>
 #include <fstream>
 
 #include "daemon/service/config_values.hpp"
@@ -40,6 +42,9 @@ recovery_grace = "16 ms"
 listen = ["127.0.0.1:17", "[::]:18", "::1"]
 peers = ["pc2", "10.0.0.2:19"]
 insecure = true
+mdns = false
+interfaces = ["eth0", "wlan*"]
+avoid_interfaces = ["eth0.[0-9]*"]
 max_connections = 20
 max_connections_per_host = 21
 max_peer_memory = "22 MiB"
@@ -64,6 +69,9 @@ mirror_linger = "23 s"
   const std::vector<wire::Address> peers = {{"pc2", 13776}, {"10.0.0.2", 19}};
   EXPECT_EQ(config.peers, peers);
   EXPECT_TRUE(config.insecure);
+  EXPECT_FALSE(config.mdns);
+  EXPECT_EQ(config.interfaces, (std::vector<std::string>{"eth0", "wlan*"}));
+  EXPECT_EQ(config.avoid_interfaces, std::vector<std::string>{"eth0.[0-9]*"});
   EXPECT_EQ(config.max_connections, 20u);
   EXPECT_EQ(config.max_connections_per_host, 21u);
   EXPECT_EQ(config.max_peer_memory_bytes, 22u << 20);
@@ -109,6 +117,32 @@ TEST(Config, TellsNoNetworkFromNothingSaid) {
   ASSERT_TRUE(apply_text_untrusted(config, "listen = []", "dssmd.conf"));
   ASSERT_TRUE(config.listen);
   EXPECT_TRUE(config.listen->empty());
+}
+
+TEST(Config, UsesMdnsOnAllInterfacesButThoseOfContainersAndTunnels) {
+  const Config config;
+  EXPECT_TRUE(config.mdns);
+  EXPECT_TRUE(config.interfaces.empty());
+  const auto avoided = [&](const char* name) {
+    return std::any_of(
+        config.avoid_interfaces.begin(), config.avoid_interfaces.end(),
+        [&](const std::string& pattern) { return ::fnmatch(pattern.c_str(), name, 0) == 0; });
+  };
+  for (const char* name : {"docker0", "veth1a2b", "br-0c1d", "virbr0", "lxcbr0", "lxdbr0", "tun0",
+                           "tap0", "wg0", "tailscale0", "zt7nnig34", "vmnet8"}) {
+    EXPECT_TRUE(avoided(name)) << name;
+  }
+  for (const char* name : {"lo", "eth0", "enp3s0", "wlan0", "wlp2s0", "br0", "bond0", "can0"}) {
+    EXPECT_FALSE(avoided(name)) << name;
+  }
+}
+
+TEST(Config, PutsAListOfInterfacesInPlaceOfTheDefault) {
+  Config config;
+  ASSERT_TRUE(apply_text_untrusted(config, "avoid_interfaces = [\"can0\"]", "dssmd.conf"));
+  EXPECT_EQ(config.avoid_interfaces, std::vector<std::string>{"can0"});
+  ASSERT_TRUE(apply_text_untrusted(config, "avoid_interfaces = []", "dssmd.conf"));
+  EXPECT_TRUE(config.avoid_interfaces.empty());
 }
 
 TEST(Config, AsksForInsecureWhereAnAddressIsNotOnThisPc) {
@@ -243,6 +277,29 @@ TEST(ConfigValues, ReadDurationsOnlyWithTheirUnits) {
   EXPECT_FALSE(parse_duration("2", zero, minute));
   EXPECT_FALSE(parse_duration("2 h", zero, minute));
   EXPECT_FALSE(parse_duration("18446744073709551615 s", zero, minute));
+}
+
+TEST(ConfigValues, TakeNamesAndPatternsOfInterfaces) {
+  for (const std::string good :
+       {"eth0", "enp0s31f6", "eth*", "eth[0-3]", "wl?n0", "15-bytes-long--"}) {
+    const Result<std::string> taken = parse_interface(good);
+    ASSERT_TRUE(taken) << taken.error().message;
+    EXPECT_EQ(*taken, good);
+  }
+  EXPECT_TRUE(parse_interface("*" + std::string(62, 'x')));
+  EXPECT_FALSE(parse_interface("*" + std::string(63, 'x')));
+  EXPECT_FALSE(parse_interface("16-bytes-long---"));
+  EXPECT_FALSE(parse_interface(""));
+  EXPECT_FALSE(parse_interface("eth 0"));
+  EXPECT_FALSE(parse_interface("eth0\n"));
+  EXPECT_FALSE(parse_interface("eth/*"));
+}
+
+TEST(ConfigValues, TakeOnlyTrueAndFalse) {
+  EXPECT_TRUE(*parse_boolean("true"));
+  EXPECT_FALSE(*parse_boolean("false"));
+  EXPECT_FALSE(parse_boolean("yes"));
+  EXPECT_FALSE(parse_boolean(""));
 }
 
 TEST(ConfigValues, ReadModesInOctal) {

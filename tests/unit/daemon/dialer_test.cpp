@@ -4,6 +4,7 @@
 #include "daemon/channel/dialer.hpp"
 
 #include <gtest/gtest.h>
+#include <netinet/in.h>
 
 #include "core/wire/frame.hpp"
 #include "tests/unit/daemon/fake_owner.hpp"
@@ -62,7 +63,16 @@ class DialerTest : public testing::Test, protected Dialer::User {
   bool up = false;
 
   void dial(const wire::Address& address) {
-    dialer = std::make_unique<Dialer>(loop, resolver, Dialer::Options{address, greeting_of("pc1")},
+    dialer =
+        std::make_unique<Dialer>(loop, resolver, Dialer::Options{{address}, greeting_of("pc1")},
+                                 static_cast<Dialer::User&>(*this));
+  }
+  void dial_in_turn(const std::vector<wire::SocketAddress>& at, Dialer::Options options = {}) {
+    for (const wire::SocketAddress& address : at) {
+      options.addresses.push_back(wire::Address::parse(address.str()).value());
+    }
+    options.self = greeting_of("pc1");
+    dialer = std::make_unique<Dialer>(loop, resolver, std::move(options),
                                       static_cast<Dialer::User&>(*this));
   }
   void dial(const wire::SocketAddress& address) {
@@ -124,6 +134,51 @@ TEST_F(DialerTest, TriesTheAddressesOfANameInTurn) {
   EXPECT_TRUE(downs.empty()) << "one round of attempts, and it was good";
 }
 
+TEST_F(DialerTest, TriesTheAddressesThatItIsGivenInTurn) {
+  FakeOwner owner(loop);
+  const wire::SocketAddress good = wire::resolve_number(owner.host().address).at(0);
+  dial_in_turn({closed_port(loop), closed_port(loop), good});
+  wait([this] { return up; });
+  EXPECT_EQ(dialer->address(), good.str());
+  EXPECT_TRUE(downs.empty());
+}
+
+TEST_F(DialerTest, BeginsBehindAnAddressThatIsOfNoUse) {
+  RawServer talker(loop, "220 smtp ready\r\n", false);
+  FakeOwner owner(loop);
+  const wire::SocketAddress good = wire::resolve_number(owner.host().address).at(0);
+  dial_in_turn({talker.address(), closed_port(loop), good});
+  wait([this] { return up; });
+  EXPECT_EQ(downs.size(), 1u);
+  EXPECT_EQ(talker.connections(), 1);
+  dialer->restart({Errc::daemon_away, "silent"});
+  wait([&] { return talker.connections() == 2; });  // the one behind the last one
+  wait([&] { return up && downs.size() >= 3; });
+}
+
+TEST_F(DialerTest, LetsItsAddressesShareTheTimeOfARound) {
+  // A full queue of connections: the kernel leaves further ones without any answer.
+  const UniqueFd full(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
+  sockaddr_in any{};
+  any.sin_family = AF_INET;
+  any.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+  ASSERT_EQ(::bind(full.get(), reinterpret_cast<const sockaddr*>(&any), sizeof any), 0);
+  ASSERT_EQ(::listen(full.get(), 0), 0);
+  const wire::SocketAddress dead = wire::local_address(full.get()).value();
+  const UniqueFd filler(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
+  ASSERT_EQ(::connect(filler.get(), dead.get(), dead.length), 0);
+  FakeOwner owner(loop);
+  Dialer::Options options;
+  options.round_time = std::chrono::milliseconds(40);
+  dial_in_turn({dead, dead, dead, wire::resolve_number(owner.host().address).at(0)}, options);
+  bool timed_out = false;
+  EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
+  timer.enable_in(Dialer::kConnectTimeout);  // what one address would take else
+  wait([&] { return up || timed_out; });
+  EXPECT_TRUE(up);
+  EXPECT_TRUE(downs.empty());
+}
+
 TEST_F(DialerTest, SaysWhyNoAddressOfANameWorked) {
   answers = {closed_port(loop), closed_port(loop)};
   dial({"pc2", 1});
@@ -159,7 +214,7 @@ TEST_F(DialerTest, FindsAServerThatStartsLater) {
   dial(port);
   wait([this] { return downs.size() >= 2; });
   FakeOwner owner(loop);
-  dialer->set_address(owner.host().address);
+  dialer->set_addresses({owner.host().address});
   dialer->hurry();
   wait([this] { return up; });
 }

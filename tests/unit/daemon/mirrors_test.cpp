@@ -270,6 +270,27 @@ TEST_F(MirrorsTest, FollowsTheOwnerToANewAddress) {
   until_newest(*stream, 6);
 }
 
+// The control connection went over to another network interface; the channel's may seem to work.
+TEST_F(MirrorsTest, LosesNothingWhenTheSameOwnerIsReachedAtAnotherAddress) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  const wire::Greeting greeting = owner->host().greeting;
+  const std::unique_ptr<FakeOwner> before = std::move(owner);
+  owner = std::make_unique<FakeOwner>(loop);
+  owner->greet_as(greeting);
+  catalog.host_down(greeting.host_id, {Errc::daemon_away, "no sign of life"});
+  catalog.host_up(greeting, owner->host().address);
+  const net::Frame subscribe = serve(6);
+  EXPECT_EQ(subscribe.subscribe().from_tid(), 6);
+  EXPECT_EQ(subscribe.subscribe().incarnation(), 7u);
+  samples(6, 8);
+  owner->caught_up();
+  until_newest(*stream, 8);
+  until_state("live");
+  EXPECT_EQ(stream->info().oldest, 0);
+  EXPECT_EQ(state().gap_samples(), 0u);
+  EXPECT_EQ(before->connections(), 1);
+}
+
 TEST_F(MirrorsTest, BeginsANewRingWhenTheOwnerLostIts) {
   const std::shared_ptr<Stream> old = opened(5);
   owner->cut();

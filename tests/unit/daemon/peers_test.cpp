@@ -7,72 +7,10 @@
 #include <gtest/gtest.h>
 
 #include "tests/unit/daemon/daemon_fixtures.hpp"
-#include "tests/unit/daemon/fake_owner.hpp"
+#include "tests/unit/daemon/fake_peer.hpp"
 
 namespace dssm::daemon {
 namespace {
-
-class KeptLog final : public Logger {
- public:
-  void write(LogLevel level, std::string_view text, const LogFields&) noexcept override {
-    if (level <= LogLevel::notice) lines.emplace_back(text);
-  }
-  bool says(const std::string& text) const {
-    return std::any_of(lines.begin(), lines.end(), [&](const std::string& line) {
-      return line.find(text) != std::string::npos;
-    });
-  }
-  std::vector<std::string> lines;
-};
-
-net::Frame answer_to(const net::Frame& request) {
-  net::Frame answer;
-  answer.set_serial(request.serial());
-  return answer;
-}
-
-// A peer that answers heartbeats and Watch by itself.
-class FakePeer {
- public:
-  explicit FakePeer(const EventLoop& loop, const std::string& name = "pc2") : owner(loop, name) {}
-
-  // Answers what came; to be called while waiting for something.
-  void serve() {
-    while (owner.asked()) {
-      const net::Frame request = owner.take();
-      net::Frame answer = answer_to(request);
-      if (request.has_ping()) {
-        ++pings;
-        if (silent) continue;
-        answer.mutable_pong()->mutable_clock()->set_bound_ns(1000);
-      } else if (request.has_watch()) {
-        ++watches;
-        for (const std::string& stream : streams) tell(stream, false);
-        answer.mutable_done();
-      } else {
-        asked.push_back(request);
-        continue;
-      }
-      owner.send(answer);
-    }
-  }
-  void tell(const std::string& name, bool removed, const std::string& as_host = "") {
-    net::Frame frame;
-    net::StreamEvent& event = *frame.mutable_stream_event();
-    event.set_removed(removed);
-    event.mutable_stream()->mutable_id()->set_name(name);
-    event.mutable_stream()->mutable_id()->set_host(as_host);
-    wire::to_message(odometry_type(), *event.mutable_stream()->mutable_type());
-    event.mutable_stream()->set_incarnation(1);
-    owner.send(frame);
-  }
-
-  FakeOwner owner;
-  std::vector<std::string> streams;
-  std::vector<net::Frame> asked;
-  bool silent = false;
-  int pings = 0, watches = 0;
-};
 
 class PeersTest : public testing::Test {
  protected:

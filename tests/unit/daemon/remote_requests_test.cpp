@@ -72,6 +72,12 @@ class FakeFleet final : public Fleet {
     hosts[1].set_name("pc2");
     return hosts;
   }
+  local::Mdns mdns() const override {
+    local::Mdns mdns;
+    mdns.set_phase("running");
+    mdns.set_hosts_heard(7);
+    return mdns;
+  }
   void ping(const std::string& host, Then<local::RoundTrip> then) override {
     asked.push_back("ping " + host);
     local::RoundTrip round_trip;
@@ -254,6 +260,15 @@ TEST_F(RemoteRequestsTest, TellsAboutHosts) {
   ping.mutable_ping_host()->set_host("pc1");
   EXPECT_TRUE(client->ask(ping).has_round_trip());
   EXPECT_EQ(fleet.asked, Asked{"ping pc2"});
+}
+
+TEST_F(RemoteRequestsTest, TellsHowOtherHostsAreFound) {
+  local::Request request;
+  request.mutable_get_daemon();
+  const local::Daemon daemon = client->ask(request).daemon();
+  EXPECT_EQ(daemon.host(), "pc1");
+  EXPECT_EQ(daemon.mdns().phase(), "running");
+  EXPECT_EQ(daemon.mdns().hosts_heard(), 7u);
 }
 
 TEST_F(RemoteRequestsTest, BoundsWhatOneClientWaitsFor) {

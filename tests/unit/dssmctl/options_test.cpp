@@ -65,6 +65,17 @@ TEST(CommandLine, ReadsTheSizesOfAStreamToCreate) {
   EXPECT_EQ(options.cycle, 25ms);
 }
 
+TEST(CommandLine, ReadsWhichStreamsToList) {
+  const Options some = options_of({"ls", "--host", "pc2", "--host", "pc3", "camera*", "--watch"});
+  EXPECT_EQ(some.hosts, (std::vector<std::string>{"pc2", "pc3"}));
+  EXPECT_EQ(some.pattern, "camera*");
+  EXPECT_TRUE(some.watch);
+  EXPECT_FALSE(some.own);
+  EXPECT_TRUE(options_of({"ls", "--own"}).own);
+  EXPECT_TRUE(options_of({"ls", "--local"}).own);
+  EXPECT_EQ(options_of({"doctor", "--json"}).verb, Verb::doctor);
+}
+
 TEST(CommandLine, ReadsHowToPing) {
   const Options options = options_of({"ping", "pc2", "-c", "3", "-i", "0.5"});
   EXPECT_EQ(options.verb, Verb::ping);
@@ -82,7 +93,7 @@ TEST(CommandLine, SaysWhatIsWrongAndWhereHelpIs) {
       {{"lss"}, "dssmctl: there is no verb 'lss'; see 'dssmctl --help'\n"},
       {{"--wrong"}, "dssmctl: there is no option '--wrong'; see 'dssmctl --help'\n"},
       {{"ls", "--wrong"}, "dssmctl: ls: there is no option '--wrong'; see 'dssmctl ls --help'\n"},
-      {{"ls", "odom"}, "dssmctl: ls: 'odom' is one word too many; see 'dssmctl ls --help'\n"},
+      {{"ls", "o*", "odom"}, "dssmctl: ls: 'odom' is one word too many; see 'dssmctl ls --help'\n"},
       {{"echo"}, "dssmctl: echo: STREAM is required; see 'dssmctl echo --help'\n"},
       {{"property", "del"},
        "dssmctl: property: there is no verb 'del'; see 'dssmctl property --help'\n"},
@@ -102,6 +113,12 @@ TEST(CommandLine, RefusesWhatDoesNotFitTogether) {
       {"echo", "s", "--count", "0"},
       {"echo", "s", "--wait", "-1"},
       {"ls", "--names", "--json"},
+      {"ls", "--names", "--watch"},
+      {"ls", "--watch", "--sort", "name"},
+      {"ls", "--watch", "--reverse"},
+      {"ls", "--local", "--host", "pc2"},
+      {"ls", "--host"},
+      {"doctor", "pc2"},
       {"hosts", "--names", "--json"},
       {"ping"},
       {"ping", "pc2", "--interval", "0"},

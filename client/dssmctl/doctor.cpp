@@ -1,0 +1,56 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmctl doctor: looks at all that usually goes wrong, and says for each what it found, why it is
+// so, and what mends it. It changes nothing itself.
+#include <algorithm>
+
+#include "client/dssmctl/doctor_checks.hpp"
+#include "client/dssmctl/json.hpp"
+#include "client/dssmctl/text.hpp"
+#include "client/dssmctl/verbs.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+void print_json(const std::vector<Finding>& findings, bool ok, Output& out) {
+  const auto status_name = [](Finding::Status status) {
+    return status == Finding::Status::ok ? "ok" : status == Finding::Status::warn ? "warn" : "fail";
+  };
+  const auto or_null = [](const std::string& text) { return text.empty() ? Json() : Json(text); };
+  Json checks = Json::array();
+  for (const Finding& finding : findings) {
+    checks.push_back({{"name", finding.name},
+                      {"status", status_name(finding.status)},
+                      {"text", finding.text},
+                      {"cause", or_null(finding.cause)},
+                      {"command", or_null(finding.command)}});
+  }
+  out.add(json_document({{"checks", std::move(checks)}, {"ok", ok}}));
+}
+
+void print_text(const std::vector<Finding>& findings, Output& out) {
+  for (const Finding& finding : findings) {
+    const std::string mark = finding.status == Finding::Status::ok     ? "OK    "
+                             : finding.status == Finding::Status::warn ? out.bold("WARN") + "  "
+                                                                       : out.bold("FAIL") + "  ";
+    out.add(mark + escaped(finding.name) + ": " + escaped_message(finding.text) + "\n");
+    if (finding.status == Finding::Status::ok) continue;
+    out.add("      likely: " + escaped_message(finding.cause) + "\n");
+    out.add("      try:    " + escaped_message(finding.command) + "\n");
+  }
+}
+
+}  // namespace
+
+Result<void> run_doctor(const Options& options, Output& out) {
+  const std::vector<Finding> findings = findings_of(collect_facts(options));
+  const auto failed = std::count_if(findings.begin(), findings.end(), [](const Finding& finding) {
+    return finding.status == Finding::Status::fail;
+  });
+  options.json ? print_json(findings, failed == 0, out) : print_text(findings, out);
+  if (failed == 0) return {};
+  return Error{Errc::system, std::to_string(failed) + " of " + std::to_string(findings.size()) +
+                                 " checks failed; do what stands behind them, then run it again"};
+}
+
+}  // namespace dssm::ctl

@@ -1,0 +1,74 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What `dssmctl doctor` looks at: collected here, judged in doctor_checks.hpp.
+#pragma once
+
+#include <cstdint>
+#include <dssm/session.hpp>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "client/dssmctl/options.hpp"
+
+namespace dssm::ctl {
+
+// The socket of dssmd, as the file system shows it.
+struct SocketFacts {
+  enum class Kind : std::uint8_t { missing, socket, something_else, hidden };
+  std::string path;
+  bool chosen = false;            // by --socket or $DSSM_SOCKET
+  Kind kind = Kind::missing;      // hidden: this user may not look there
+  std::string group;              // that may connect; empty: not known
+  bool user_in_group = false;     // by the system's list of groups
+  bool process_in_group = false;  // as of its login
+};
+
+// Numbers of the machine; 0: not known.
+struct MemoryFacts {
+  std::uint64_t total_bytes = 0, available_bytes = 0;
+};
+
+struct DescriptorFacts {
+  std::uint64_t soft_limit = 0;  // of dssmd; 0: not known
+};
+
+struct DiskFacts {
+  std::string path;
+  std::uint64_t total_bytes = 0, free_bytes = 0;  // free for programs of ordinary users
+};
+
+// The clock of this PC, by what chronyc tells.
+struct ClockFacts {
+  enum class State : std::uint8_t { no_chrony, no_answer, unsynchronized, synchronized };
+  State state = State::no_chrony;
+  std::string detail;  // what chronyc said; the source when synchronized
+};
+
+struct Facts {
+  std::string user;     // who runs dssmctl
+  std::string service;  // of dssmd, as `systemctl is-active` says; empty: not known
+  std::string version;  // of dssmctl and its library
+  SocketFacts socket;
+  std::optional<Error> failed;  // why dssmd does not answer; then there is nothing of these three:
+  DaemonInfo daemon;
+  std::vector<HostInfo> hosts;      // this one first
+  std::vector<StreamInfo> streams;  // of all hosts
+  MemoryFacts memory;
+  DescriptorFacts descriptors;
+  bool avahi_installed = false;
+  bool avahi_running = false;
+  ClockFacts clock;
+  std::vector<DiskFacts> disks;
+};
+
+// Asks dssmd, the kernel, systemctl and chronyc; takes some seconds when one of them hangs.
+Facts collect_facts(const Options& options);
+
+// What `chronyc -c tracking` printed, taken apart.
+ClockFacts clock_facts_untrusted(int exit_status, const std::string& output);
+
+// The soft limit of open files in the text of /proc/PID/limits; 0: it is not there.
+std::uint64_t soft_limit_untrusted(const std::string& limits);
+
+}  // namespace dssm::ctl

@@ -1,0 +1,88 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/discovery/discovery.hpp"
+
+#include <algorithm>
+#include <utility>
+
+namespace dssm::daemon {
+
+Reach reach_of(const std::vector<std::string>& addresses) {
+  Reach reach;
+  for (const std::string& text : addresses) {
+    const Result<wire::Address> address = wire::Address::parse(text);
+    if (!address) continue;
+    const std::vector<wire::SocketAddress> numbers = wire::resolve_number(*address);
+    const bool loopback =
+        std::all_of(numbers.begin(), numbers.end(),
+                    [](const wire::SocketAddress& number) { return number.is_loopback(); });
+    if (reach.port == 0 || (reach.closed && !loopback)) reach = {address->port, loopback};
+  }
+  return reach;
+}
+
+Discovery::Discovery(const EventLoop& loop, Options options, Registry& registry, Peers& peers,
+                     FleetService& fleet, Logger& logger)
+    : options_(std::move(options)),
+      registry_(registry),
+      peers_(peers),
+      fleet_(fleet),
+      announce_timer_(EventSource::timer(loop, [this] { announce(); })),
+      mdns_(loop,
+            {options_.self.host_id, options_.reach.port, options_.interfaces,
+             options_.avoid_interfaces},
+            static_cast<HostFinderUser&>(*this), logger) {
+  peers_.expect_finder(options_.insecure);
+  fleet_.set_mdns(mdns_.state());
+  registry_.add_observer(*this);
+}
+
+Discovery::~Discovery() { registry_.remove_observer(*this); }
+
+void Discovery::start_announcing() {
+  announcing_ = options_.reach.port != 0;
+  announce();
+}
+
+// --- found
+// ----------------------------------------------------------------------------------------
+
+void Discovery::on_host_found(const FoundHost& host) { peers_.on_host_found(host); }
+
+void Discovery::on_host_lost(const wire::HostId& id) { peers_.on_host_lost(id); }
+
+void Discovery::on_mdns_state(const MdnsState& state) {
+  peers_.on_mdns_state(state);
+  fleet_.set_mdns(state);
+}
+
+// --- announced
+// ------------------------------------------------------------------------------------
+
+void Discovery::on_stream_added(const Stream&) { announce_timer_.enable_in(Duration::zero()); }
+
+void Discovery::on_stream_removed(const Stream&) { announce_timer_.enable_in(Duration::zero()); }
+
+// The host first: by it others find all the rest. A host that others cannot reach keeps the names
+// of its streams to itself.
+void Discovery::announce() {
+  if (!announcing_) return;
+  std::vector<ServiceRecord> records;
+  ServiceRecord& host = records.emplace_back();
+  host.host_id = options_.self.host_id;
+  host.host = options_.self.host;
+  host.protocol_version = wire::kNetworkProtocolVersion;
+  host.closed = options_.reach.closed;
+  if (!host.closed) {
+    records.reserve(1 + registry_.streams().size());
+    for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
+      const StreamInfo info = stream->info();
+      ServiceRecord record = records.front();
+      record.stream = {info.id.name, info.id.id,     info.type.payload_bytes, info.depth,
+                       info.cycle,   info.type.name, type_hash(info.type),    info.incarnation};
+      records.push_back(std::move(record));
+    }
+  }
+  mdns_.announce(std::move(records));
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Discovery by mDNS as a part of dssmd: announces this host and the streams that it owns as they
+// come and go, passes on which hosts are found, and how mDNS fares.
+#pragma once
+
+#include <cstdint>
+#include <string>
+#include <vector>
+
+#include "daemon/discovery/fleet_service.hpp"
+#include "daemon/discovery/mdns.hpp"
+#include "daemon/discovery/peers.hpp"
+#include "daemon/service/event_loop.hpp"
+#include "daemon/service/log.hpp"
+#include "daemon/streams/registry.hpp"
+
+namespace dssm::daemon {
+
+// Where others come, out of the addresses that a dssmd listens at.
+struct Reach {
+  std::uint16_t port = 0;  // 0: it listens nowhere
+  bool closed = true;      // at loopback only
+
+  friend bool operator==(const Reach&, const Reach&) = default;
+};
+Reach reach_of(const std::vector<std::string>& addresses);
+
+class Discovery final : private HostFinderUser, private StreamObserver {
+ public:
+  struct Options {
+    wire::Greeting self;
+    Reach reach;
+    bool insecure = false;  // found hosts may be reached over the network
+    std::vector<std::string> interfaces, avoid_interfaces;
+  };
+
+  // Finds from now on; announces from the first start_announcing() on. What is given by reference
+  // outlives it. To be made before the loop runs.
+  Discovery(const EventLoop& loop, Options options, Registry& registry, Peers& peers,
+            FleetService& fleet, Logger& logger);
+  Discovery(const Discovery&) = delete;
+  Discovery& operator=(const Discovery&) = delete;
+  ~Discovery();
+
+  // This host serves others by now.
+  void start_announcing();
+
+ private:
+  void on_host_found(const FoundHost& host) override;
+  void on_host_lost(const wire::HostId& id) override;
+  void on_mdns_state(const MdnsState& state) override;
+  void on_stream_added(const Stream& stream) override;
+  void on_stream_removed(const Stream& stream) override;
+  void announce();
+
+  const Options options_;
+  Registry& registry_;
+  Peers& peers_;
+  FleetService& fleet_;
+  bool announcing_ = false;
+  EventSource announce_timer_;  // after a change: when the loop is done with what caused it
+  Mdns mdns_;                   // last: it calls the others
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,57 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Any TXT record of somebody else's service: taken, or refused with a message. What is taken keeps
+// to the limits, and announced anew it is the same. The input is a record as it crosses the
+// network: strings, each with a byte in front that tells its length.
+#include <algorithm>
+#include <cstdlib>
+
+#include "core/base/utf8.hpp"
+#include "daemon/discovery/service_record.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+void require(bool holds) {
+  if (!holds) std::abort();
+}
+
+TxtRecord txt_from(std::string_view bytes) {
+  TxtRecord txt;
+  while (!bytes.empty()) {
+    const std::size_t length = static_cast<unsigned char>(bytes.front());
+    bytes.remove_prefix(1);
+    const std::string_view string = bytes.substr(0, length);
+    bytes.remove_prefix(string.size());
+    const std::size_t equals = std::min(string.find('='), string.size());
+    txt.emplace_back(string.substr(0, equals), string.substr(std::min(equals + 1, string.size())));
+  }
+  return txt;
+}
+
+void run(std::string_view bytes) {
+  const Result<ServiceRecord> record = service_record_untrusted(txt_from(bytes));
+  if (!record) {
+    require(record.error().code == Errc::protocol && is_utf8(record.error().message));
+    return;
+  }
+  require(record->instance().size() <= kMaxInstanceBytes);
+  // A byte takes four characters at most ("\195"), of a label of at most 32 bytes.
+  require(record->subtype().size() <= 4 * 32 + std::string_view("._sub._dssm._tcp").size());
+  std::size_t txt_bytes = 0;
+  for (const auto& [key, value] : record->txt()) {
+    require(key.size() + 1 + value.size() <= 255);
+    txt_bytes += 2 + key.size() + value.size();
+  }
+  require(txt_bytes <= 400);
+  const Result<ServiceRecord> again = service_record_untrusted(record->txt());
+  require(again && *again == *record);
+}
+
+}  // namespace
+}  // namespace dssm::daemon
+
+extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
+  dssm::daemon::run({reinterpret_cast<const char*>(data), size});
+  return 0;
+}

@@ -1,0 +1,281 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/dssmctl/doctor_checks.hpp"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+
+namespace dssm::ctl {
+namespace {
+
+using Status = Finding::Status;
+
+constexpr std::uint64_t kGiB = 1ULL << 30;
+
+HostInfo host_at(std::string name, std::string state, std::string address, std::string error = {}) {
+  HostInfo host;
+  host.id = "id of " + name;
+  host.name = std::move(name);
+  host.state = std::move(state);
+  if (!address.empty()) host.addresses = {std::move(address)};
+  host.version = "1.2";
+  host.error = std::move(error);
+  return host;
+}
+
+StreamInfo stream_of(std::string name, std::string host) {
+  StreamInfo stream;
+  stream.id = {std::move(name), 0, std::move(host)};
+  return stream;
+}
+
+// pc1, where dssmctl runs, and pc2: all is well.
+Facts healthy() {
+  Facts facts;
+  facts.user = "anna";
+  facts.version = "1.2";
+  facts.socket = {.path = "/run/dssm/dssmd.sock",
+                  .chosen = false,
+                  .kind = SocketFacts::Kind::socket,
+                  .group = "dssm",
+                  .user_in_group = true,
+                  .process_in_group = true};
+  facts.daemon.host = "pc1";
+  facts.daemon.version = "1.2";
+  facts.daemon.pid = 42;
+  facts.daemon.streams = 3;
+  facts.daemon.memory_bytes = kGiB;
+  facts.daemon.memory_limit_bytes = 4 * kGiB;
+  facts.daemon.mdns.phase = "running";
+  facts.daemon.mdns.avahi_version = "avahi 0.8";
+  facts.daemon.mdns.announced = 4;
+  facts.daemon.mdns.own_host_seen = true;
+  facts.daemon.mdns.hosts_heard = 1;
+  facts.hosts = {host_at("pc1", "self", "10.0.0.1:13776"), host_at("pc2", "up", "10.0.0.2:13776")};
+  facts.streams = {stream_of("lidar", "pc1"), stream_of("odom", "pc2")};
+  facts.memory = {8 * kGiB, 6 * kGiB};
+  facts.descriptors.soft_limit = 1024;
+  facts.avahi_installed = facts.avahi_running = true;
+  facts.clock = {ClockFacts::State::synchronized, "pc2"};
+  facts.disks = {{"/", 100 * kGiB, 50 * kGiB}, {"/run", kGiB, kGiB}};
+  return facts;
+}
+
+Facts unreachable(Errc code) {
+  Facts facts = healthy();
+  facts.failed = Error{code, "connect to '/run/dssm/dssmd.sock': it did not work"};
+  return facts;
+}
+
+// The finding of that name; all findings say what to do unless they are ok.
+Finding finding_of(const Facts& facts, const std::string& name) {
+  Finding wanted{"none", Status::ok, {}, {}, {}};
+  for (const Finding& finding : findings_of(facts)) {
+    EXPECT_FALSE(finding.text.empty()) << finding.name;
+    EXPECT_EQ(finding.status == Status::ok, finding.cause.empty()) << finding.name;
+    EXPECT_EQ(finding.status == Status::ok, finding.command.empty()) << finding.name;
+    if (finding.name == name) wanted = finding;
+  }
+  EXPECT_EQ(wanted.name, name);
+  return wanted;
+}
+
+#define EXPECT_FINDING(facts, finding_name, wanted_status, part_of_command)                 \
+  do {                                                                                      \
+    const Finding finding = finding_of(facts, finding_name);                                \
+    EXPECT_EQ(finding.status, wanted_status) << finding.text;                               \
+    EXPECT_NE(finding.command.find(part_of_command), std::string::npos) << finding.command; \
+  } while (false)
+
+TEST(Doctor, FindsNothingWhereAllIsWell) {
+  const std::vector<Finding> findings = findings_of(healthy());
+  EXPECT_GE(findings.size(), 10U);
+  for (const Finding& finding : findings) {
+    EXPECT_EQ(finding.status, Status::ok) << finding.name << ": " << finding.text;
+  }
+}
+
+TEST(Doctor, TellsWhyDssmdIsNotThere) {
+  Facts facts = unreachable(Errc::no_daemon);
+  EXPECT_FINDING(facts, "daemon", Status::fail, "systemctl enable --now dssmd");
+  facts.service = "failed";
+  EXPECT_FINDING(facts, "daemon", Status::fail, "journalctl -u dssmd");
+  facts.service = "active";
+  EXPECT_FINDING(facts, "daemon", Status::fail, "runtime_dir");
+  facts.socket.chosen = true;
+  EXPECT_FINDING(facts, "daemon", Status::fail, "unset DSSM_SOCKET");
+  facts.socket.kind = SocketFacts::Kind::something_else;
+  EXPECT_FINDING(facts, "daemon", Status::fail, "ls -l /run/dssm/dssmd.sock");
+  EXPECT_FINDING(unreachable(Errc::protocol), "daemon", Status::fail, "systemctl restart dssmd");
+  EXPECT_FINDING(unreachable(Errc::daemon_away), "daemon", Status::fail, "journalctl -u dssmd");
+  EXPECT_FINDING(unreachable(Errc::invalid_argument), "daemon", Status::fail, "DSSM_SOCKET");
+}
+
+TEST(Doctor, TellsWhatPermissionIsMissing) {
+  Facts facts = unreachable(Errc::no_permission);
+  EXPECT_FINDING(facts, "daemon", Status::fail, "socket_mode");
+  facts.socket.process_in_group = false;
+  EXPECT_FINDING(facts, "daemon", Status::fail, "newgrp dssm");
+  facts.socket.user_in_group = false;
+  EXPECT_FINDING(facts, "daemon", Status::fail, "usermod -aG dssm anna");
+  facts.socket.group.clear();
+  EXPECT_FINDING(facts, "daemon", Status::fail, "usermod -aG dssm anna");
+  facts.socket.group = "robots";
+  EXPECT_FINDING(facts, "daemon", Status::fail, "usermod -aG robots anna");
+}
+
+TEST(Doctor, SaysNothingOfWhatOnlyDssmdKnowsWhileItIsAway) {
+  for (const Finding& finding : findings_of(unreachable(Errc::no_daemon))) {
+    EXPECT_TRUE(finding.name == "daemon" || finding.name == "clock" ||
+                finding.name.starts_with("disk "))
+        << finding.name;
+  }
+}
+
+TEST(Doctor, ComparesVersions) {
+  Facts facts = healthy();
+  facts.hosts[1].version = "1.1";
+  EXPECT_FINDING(facts, "version", Status::warn, "same version");
+  facts.daemon.version = "1.1";
+  EXPECT_FINDING(facts, "version", Status::warn, "restart dssmd");
+}
+
+TEST(Doctor, WarnsBeforeMemoryRunsOut) {
+  Facts facts = healthy();
+  facts.daemon.memory_bytes = 4 * kGiB - kGiB / 4;
+  EXPECT_FINDING(facts, "memory", Status::warn, "max_memory");
+  facts.daemon.memory_bytes = 5 * kGiB;  // more than allowed, since a configuration changed
+  EXPECT_FINDING(facts, "memory", Status::warn, "max_memory");
+  facts = healthy();
+  facts.memory.available_bytes = kGiB / 8;
+  EXPECT_FINDING(facts, "memory", Status::warn, "ps -eo");
+}
+
+TEST(Doctor, WarnsBeforeDescriptorsRunOut) {
+  Facts facts = healthy();
+  facts.daemon.streams = 160;
+  EXPECT_FINDING(facts, "descriptors", Status::warn, "LimitNOFILE");
+  facts.descriptors.soft_limit = 0;  // not known
+  for (const Finding& finding : findings_of(facts)) EXPECT_NE(finding.name, "descriptors");
+}
+
+TEST(Doctor, WarnsOfFullDisks) {
+  Facts facts = healthy();
+  facts.disks[0].free_bytes = 4 * kGiB;  // of 100
+  EXPECT_FINDING(facts, "disk /", Status::warn, "vacuum");
+  facts.disks[1].free_bytes = 99ULL << 20;  // of 1 GiB
+  EXPECT_FINDING(facts, "disk /run", Status::warn, "du ");
+}
+
+TEST(Doctor, LooksAtTheClock) {
+  Facts facts = healthy();
+  facts.clock = {ClockFacts::State::no_chrony, ""};
+  EXPECT_FINDING(facts, "clock", Status::warn, "apt install chrony");
+  facts.clock = {ClockFacts::State::no_answer, "506 Cannot talk to daemon"};
+  EXPECT_FINDING(facts, "clock", Status::warn, "systemctl enable --now chrony");
+  facts.clock = {ClockFacts::State::unsynchronized, "Not synchronised"};
+  EXPECT_FINDING(facts, "clock", Status::warn, "chronyc sources");
+}
+
+TEST(Doctor, WarnsOfLoopbackOnlyWhereThereAreOtherPcs) {
+  Facts facts = healthy();
+  facts.hosts[0].addresses = {"127.0.0.1:13776", "[::1]:13776"};
+  EXPECT_FINDING(facts, "listening", Status::warn, "listen = ");
+  facts.hosts[0].addresses.clear();
+  EXPECT_FINDING(facts, "listening", Status::warn, "insecure = true");
+  facts.hosts[1].addresses = {"127.0.0.1:20000"};  // a second dssmd of this PC
+  EXPECT_FINDING(facts, "listening", Status::ok, "");
+  facts.hosts.pop_back();
+  EXPECT_FINDING(facts, "listening", Status::ok, "");
+}
+
+TEST(Doctor, TellsWhatAvahiLacks) {
+  Facts facts = healthy();
+  facts.daemon.mdns.phase = "waiting";
+  EXPECT_FINDING(facts, "mdns", Status::warn, "dbus");
+  facts.avahi_running = false;
+  EXPECT_FINDING(facts, "mdns", Status::warn, "systemctl start avahi-daemon");
+  facts.avahi_installed = false;
+  EXPECT_FINDING(facts, "mdns", Status::warn, "apt install avahi-daemon");
+  facts.daemon.mdns.phase = "off";
+  EXPECT_FINDING(facts, "mdns", Status::ok, "");
+}
+
+TEST(Doctor, TellsWhatMdnsLacks) {
+  Facts facts = healthy();
+  facts.daemon.mdns.hosts_heard = 0;
+  EXPECT_FINDING(facts, "mdns", Status::warn, "5353");
+  facts.hosts[1].state = "down";  // then nobody knows whether it could be heard
+  EXPECT_FINDING(facts, "mdns", Status::ok, "");
+  facts.daemon.mdns.trouble = "a name was taken";
+  EXPECT_FINDING(facts, "mdns", Status::warn, "journalctl -u avahi-daemon");
+  facts.daemon.mdns.own_host_seen = false;
+  EXPECT_FINDING(facts, "mdns", Status::warn, "avahi-browse");
+  facts.daemon.mdns.withheld = 7;
+  EXPECT_FINDING(facts, "mdns", Status::warn, "objects-per");
+}
+
+TEST(Doctor, TellsOfEachHostWhyItIsNotUp) {
+  Facts facts = healthy();
+  facts.hosts[1] = host_at("pc2", "down", "10.0.0.2:13776",
+                           "connect to '10.0.0.2:13776': Connection refused; is dssmd running?");
+  EXPECT_FINDING(facts, "host pc2", Status::fail, "systemctl status dssmd");
+  facts.hosts[1].error = "connect to '10.0.0.2:13776': no answer; is that PC on?";
+  EXPECT_FINDING(facts, "host pc2", Status::fail, "ping 10.0.0.2 ");
+  facts.hosts[1] = host_at("", "down", "[fe80::2%eth0]:13776", "no answer");
+  EXPECT_FINDING(facts, "host [fe80::2%eth0]:13776", Status::fail, "ping fe80::2%eth0 ");
+  facts.hosts[1].addresses = {"pc9:13776"};
+  facts.hosts[1].error = "look up 'pc9': Name or service not known";
+  EXPECT_FINDING(facts, "host pc9:13776", Status::fail, "getent hosts pc9 ");
+  facts.hosts[1] = host_at("pc2", "refused", "10.0.0.2:13776", "it speaks version 9");
+  EXPECT_FINDING(facts, "host pc2", Status::fail, "same version");
+  facts.hosts[1] = host_at("pc2", "connecting", "10.0.0.2:13776");
+  EXPECT_FINDING(facts, "host pc2", Status::warn, "dssmctl hosts");
+  facts.hosts[1] = host_at("pc2", "closed", "");
+  EXPECT_FINDING(facts, "host pc2", Status::warn, "listen = ");
+}
+
+TEST(Doctor, ForgivesAnAddressThatDoesNotWorkWhileAnotherOfThatHostDoes) {
+  Facts facts = healthy();
+  facts.hosts.push_back(host_at("pc2", "down", "192.168.0.2:13776", "no answer"));
+  EXPECT_FINDING(facts, "host pc2", Status::ok, "");
+  EXPECT_FINDING(facts, "host names", Status::ok, "");
+  facts.hosts[1].state = "down";
+  EXPECT_FINDING(facts, "host pc2", Status::fail, "ping");
+}
+
+TEST(Doctor, FindsHostsOfOneName) {
+  Facts facts = healthy();
+  facts.hosts.push_back(host_at("pc2", "up", "10.0.0.3:13776"));
+  facts.hosts.back().id = "another one";
+  EXPECT_FINDING(facts, "host names", Status::fail, "name = ");
+  facts = healthy();
+  facts.hosts[1].name = "pc1";
+  EXPECT_FINDING(facts, "host names", Status::fail, "name = ");
+}
+
+TEST(Doctor, FindsACopyOfThisHost) {
+  Facts facts = healthy();
+  facts.hosts[1] = host_at("pc1", "refused", "10.0.0.2:13776", "it has this host's name and id");
+  EXPECT_FINDING(facts, "host names", Status::fail, "name = ");
+  EXPECT_FINDING(facts, "host pc1", Status::fail, "dssmctl hosts");
+  facts.hosts[0].error = facts.hosts[1].error;
+  facts.hosts.pop_back();
+  EXPECT_FINDING(facts, "host pc1", Status::fail, "host names");
+}
+
+TEST(Doctor, FindsStreamsOfOneNameAndNamesOnlySome) {
+  Facts facts = healthy();
+  facts.streams.push_back(stream_of("lidar", "pc2"));
+  EXPECT_FINDING(facts, "stream names", Status::warn, "lidar:0@pc1");
+  EXPECT_EQ(finding_of(facts, "stream names").text, "several hosts have 'lidar:0' of pc1, pc2");
+  for (int i = 0; i < 100; ++i) {
+    for (const char* host : {"pc1", "pc2"}) {
+      facts.streams.push_back(stream_of("x" + std::to_string(i), host));
+    }
+  }
+  EXPECT_TRUE(finding_of(facts, "stream names").text.ends_with(" and 96 more"));
+}
+
+}  // namespace
+}  // namespace dssm::ctl

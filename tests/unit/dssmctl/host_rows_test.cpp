@@ -1,0 +1,45 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/dssmctl/host_rows.hpp"
+
+#include <gtest/gtest.h>
+
+namespace dssm::ctl {
+namespace {
+
+HostInfo closed_host() {
+  HostInfo host;
+  host.name = "pc2";
+  host.state = "closed";
+  host.id = "00ff";
+  host.found_by = {"peer", "mdns"};
+  return host;
+}
+
+TEST(HostRow, HasACellForEachColumnAndSaysByWhatTheHostWasFound) {
+  const std::vector<std::string> row = host_row(closed_host());
+  ASSERT_EQ(row.size(), host_columns().size());
+  EXPECT_EQ(host_columns()[3].title, "FOUND BY");
+  EXPECT_EQ(std::vector<std::string>(row.begin(), row.begin() + 4),
+            (std::vector<std::string>{"pc2", "closed", "-", "peer, mdns"}));
+}
+
+TEST(HostRow, EscapesWhatOthersSay) {
+  HostInfo host = closed_host();
+  host.found_by = {"m\x1b[dns"};
+  host.error = "a\nb";
+  for (const std::string& cell : host_row(host)) {
+    EXPECT_EQ(cell.find_first_of("\x1b\n"), std::string::npos) << cell;
+  }
+}
+
+TEST(HostJson, TellsProgramsTheSame) {
+  const Json json = host_json(closed_host());
+  EXPECT_EQ(json["host"], "pc2");
+  EXPECT_EQ(json["id"], "00ff");
+  EXPECT_EQ(json["state"], "closed");
+  EXPECT_EQ(json["found_by"], Json({"peer", "mdns"}));
+  EXPECT_TRUE(json["version"].is_null());
+}
+
+}  // namespace
+}  // namespace dssm::ctl
