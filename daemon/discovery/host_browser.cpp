@@ -243,6 +243,21 @@ void HostBrowser::resolve_again() {
   }
 }
 
+// Two hosts cannot be at one address and port. When two PCs had one name until Avahi gave one of
+// them another, a resolver keeps the address that it heard first, also after that has become the
+// other one's: both are asked for anew.
+void HostBrowser::check_contest(Result& result) {
+  for (auto& [key, other] : results_) {
+    if (!other.heard || other.heard->record.host_id == result.heard->record.host_id) continue;
+    if (other.heard->address != result.heard->address || other.heard->port != result.heard->port) {
+      continue;
+    }
+    free_resolver(result);
+    free_resolver(other);
+    retry_.enable_in(kResolverPause);
+  }
+}
+
 void HostBrowser::free_resolver(Result& result) {
   if (result.resolver) avahi_service_resolver_free(std::exchange(result.resolver, nullptr));
 }
@@ -285,6 +300,7 @@ void HostBrowser::on_resolved_untrusted(Result& result, const AvahiAddress* addr
   result.heard = Heard{*std::move(record), usable->text, usable->rank, port, local};
   result.useless = false;
   result.told_bad = false;
+  check_contest(result);
 }
 
 // Nobody answers for it (any more). A resolver that timed out goes on listening.

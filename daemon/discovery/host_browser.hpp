@@ -82,6 +82,7 @@ class HostBrowser {
                              AvahiStringList* txt, bool local);
   void on_not_resolved(Result& result);
   void resolve(Result& result);
+  void check_contest(Result& result);
   void free_resolver(Result& result);
   bool make_room();
   void refill();

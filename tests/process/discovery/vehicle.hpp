@@ -1,66 +1,25 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A vehicle of the test's own with nothing configured: PCs with D-Bus, Avahi, and a dssmd that
-// listens on the network and finds the others by mDNS alone.
+// What the tests of whole vehicles share.
 #pragma once
 
 #include <gtest/gtest.h>
 
-#include <cstdlib>
-#include <dssm/dssm.hpp>
-#include <memory>
 #include <string>
 #include <thread>
-#include <vector>
 
-#include "tests/support/avahi_host.hpp"
-#include "tests/support/daemon_process.hpp"
-#include "tests/support/network.hpp"
+#include "tests/support/mdns_vehicle.hpp"
 
 namespace dssm::test {
 
-class Vehicle : public testing::Test {
+class Vehicle : public testing::Test, protected MdnsVehicle {
  protected:
-  // PCs 1 to `pcs` with a dssmd each, called "pc1" ... there.
-  //   returns  false: the test is to be skipped, and has been told so
+  // PCs with a dssmd each.
+  //   returns  false: the test is to be skipped, because of why_
   bool make(int pcs) {
-    Result<std::unique_ptr<Network>> network = Network::open(pcs);
-    if (!network) return why_ = network.error().message, false;
-    network_ = *std::move(network);
-    for (int pc = 1; pc <= pcs; ++pc) {
-      Result<std::unique_ptr<AvahiHost>> host = AvahiHost::open(*network_, pc, Network::name(pc));
-      if (!host) return why_ = host.error().message, false;
-      avahi_.push_back(*std::move(host));
-      avahi(pc).start_dbus();
-      avahi(pc).start_avahi();
-    }
-    for (int pc = 1; pc <= pcs; ++pc) {
-      dssmds_.push_back(make_dssmd(pc, Network::name(pc)));
-      sessions_.push_back(session_of(dssmd(pc)));
-    }
+    if (Result<void> opened = open(pcs); !opened) return why_ = opened.error().message, false;
+    for (int pc = 1; pc <= pcs; ++pc) add_dssmd();
     return true;
-  }
-
-  AvahiHost& avahi(int pc) { return *avahi_.at(static_cast<std::size_t>(pc) - 1); }
-  DaemonProcess& dssmd(int pc) { return *dssmds_.at(static_cast<std::size_t>(pc) - 1); }
-  Session& session(int pc) { return sessions_.at(static_cast<std::size_t>(pc) - 1); }
-
-  // One more dssmd on a PC, called `name`.
-  std::unique_ptr<DaemonProcess> make_dssmd(int pc, const std::string& name,
-                                            std::vector<std::string> flags = {}) {
-    const OnPc on_pc(avahi(pc));
-    if (flags.empty()) flags = {"--listen", Network::address(pc) + ":0", "--insecure"};
-    flags.insert(flags.end(), {"--mdns=true", "--log-level", "notice"});
-    return std::make_unique<DaemonProcess>(flags, name);
-  }
-  static Session session_of(const DaemonProcess& daemon) {
-    return Session::connect(
-               {.socket_path = daemon.socket_path(), .request_timeout = std::chrono::minutes(1)})
-        .value();
-  }
-  void start_dssmd(int pc) {
-    const OnPc on_pc(avahi(pc));
-    dssmd(pc).start();
   }
 
   // Looks again and again until `done`, for a minute; how long it took.
@@ -77,57 +36,17 @@ class Vehicle : public testing::Test {
     return MonoClock::now() - begin;
   }
 
-  static std::vector<HostInfo> hosts(Session& on, const std::string& name) {
-    std::vector<HostInfo> found;
-    for (HostInfo& host : on.hosts().value()) {
-      if (host.name == name) found.push_back(std::move(host));
-    }
-    return found;
-  }
-  static bool is_up(Session& on, const std::string& name) {
-    const std::vector<HostInfo> found = hosts(on, name);
-    return found.size() == 1 && found[0].state == "up";
-  }
-  static bool lists(Session& on, const StreamId& id) {
-    for (const StreamInfo& stream : on.list().value()) {
-      if (stream.id == id) return true;
-    }
-    return false;
-  }
   void await_all_up() {
-    for (std::size_t here = 1; here <= sessions_.size(); ++here) {
-      for (std::size_t there = 1; there <= sessions_.size(); ++there) {
+    for (int here = 1; here <= dssmds(); ++here) {
+      for (int there = 1; there <= dssmds(); ++there) {
         if (here == there) continue;
-        const std::string name = Network::name(static_cast<int>(there));
-        await(name + " is found", [&] { return is_up(session(static_cast<int>(here)), name); });
+        const std::string name = Network::name(there);
+        await(name + " is found", [&] { return is_up(session(here), name); });
       }
     }
   }
 
   std::string why_;
-  std::unique_ptr<Network> network_;
-  std::vector<std::unique_ptr<AvahiHost>> avahi_;
-  std::vector<std::unique_ptr<DaemonProcess>> dssmds_;
-  std::vector<Session> sessions_;
-
- private:
-  // While it lives, what is started belongs to that PC and speaks to its bus.
-  class OnPc {
-   public:
-    explicit OnPc(AvahiHost& host) : inside_(host.inside()) {
-      const std::string setting = host.environment();
-      const std::size_t end = setting.find('=');
-      name_ = setting.substr(0, end);
-      ::setenv(name_.c_str(), setting.substr(end + 1).c_str(), 1);
-    }
-    OnPc(const OnPc&) = delete;
-    OnPc& operator=(const OnPc&) = delete;
-    ~OnPc() { ::unsetenv(name_.c_str()); }
-
-   private:
-    Inside inside_;
-    std::string name_;
-  };
 };
 
 }  // namespace dssm::test

@@ -45,11 +45,11 @@ TEST_F(Vehicle, LosesAHostThatFallsSilentAndFindsItAgain) {
   writer.write(1);
   Reader<double> reader = session(1).await_reader<double>("kept", deadline_in(1min)).value();
   await("the stream is listed", [&] { return lists(session(1), id); });
-  network_->cut(2);
+  network().cut(2);
   EXPECT_LT(await("the dead host is noticed", [&] { return !is_up(session(1), "pc2"); }), kSoon);
   EXPECT_FALSE(lists(session(1), id));
   writer.write(2);
-  network_->heal(2);
+  network().heal(2);
   EXPECT_LT(await("it is back", [&] { return is_up(session(1), "pc2"); }), kSoon);
   await("its stream is back", [&] { return lists(session(1), id); });
   // The reader goes on by itself.

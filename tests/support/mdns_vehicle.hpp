@@ -1,0 +1,112 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A vehicle of the test's own with nothing configured: PCs with D-Bus, Avahi, and a dssmd that
+// listens on the network and finds the others by mDNS alone.
+#pragma once
+
+#include <cstdlib>
+#include <dssm/dssm.hpp>
+#include <memory>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "tests/support/avahi_host.hpp"
+#include "tests/support/daemon_process.hpp"
+#include "tests/support/network.hpp"
+
+namespace dssm::test {
+
+class MdnsVehicle {
+ public:
+  // PCs 1 to `pcs`, without a dssmd.
+  //   fails  when this machine cannot do it, with the reason: skip the test with it
+  Result<void> open(int pcs) {
+    Result<std::unique_ptr<Network>> network = Network::open(pcs);
+    if (!network) return std::move(network).error();
+    network_ = *std::move(network);
+    for (int pc = 1; pc <= pcs; ++pc) {
+      Result<std::unique_ptr<AvahiHost>> host = AvahiHost::open(*network_, pc, Network::name(pc));
+      if (!host) return std::move(host).error();
+      avahi_.push_back(*std::move(host));
+      avahi(pc).start_dbus();
+      avahi(pc).start_avahi();
+    }
+    return {};
+  }
+  // A dssmd on the next PC, called "pc1" ...
+  void add_dssmd() {
+    const int pc = static_cast<int>(dssmds_.size()) + 1;
+    dssmds_.push_back(make_dssmd(pc, Network::name(pc)));
+    sessions_.push_back(session_of(dssmd(pc)));
+  }
+
+  Network& network() { return *network_; }
+  int dssmds() const { return static_cast<int>(dssmds_.size()); }
+
+  AvahiHost& avahi(int pc) { return *avahi_.at(static_cast<std::size_t>(pc) - 1); }
+  DaemonProcess& dssmd(int pc) { return *dssmds_.at(static_cast<std::size_t>(pc) - 1); }
+  Session& session(int pc) { return sessions_.at(static_cast<std::size_t>(pc) - 1); }
+
+  // One more dssmd on a PC, called `name`.
+  std::unique_ptr<DaemonProcess> make_dssmd(int pc, const std::string& name,
+                                            std::vector<std::string> flags = {}) {
+    const OnPc on_pc(avahi(pc));
+    if (flags.empty()) flags = {"--listen", Network::address(pc) + ":0", "--insecure"};
+    flags.insert(flags.end(), {"--mdns=true", "--log-level", "notice"});
+    return std::make_unique<DaemonProcess>(flags, name);
+  }
+  static Session session_of(const DaemonProcess& daemon) {
+    return Session::connect(
+               {.socket_path = daemon.socket_path(), .request_timeout = std::chrono::minutes(1)})
+        .value();
+  }
+  void start_dssmd(int pc) {
+    const OnPc on_pc(avahi(pc));
+    dssmd(pc).start();
+  }
+
+  static std::vector<HostInfo> hosts(Session& on, const std::string& name) {
+    std::vector<HostInfo> found;
+    for (HostInfo& host : on.hosts().value()) {
+      if (host.name == name) found.push_back(std::move(host));
+    }
+    return found;
+  }
+  static bool is_up(Session& on, const std::string& name) {
+    const std::vector<HostInfo> found = hosts(on, name);
+    return found.size() == 1 && found[0].state == "up";
+  }
+  static bool lists(Session& on, const StreamId& id) {
+    for (const StreamInfo& stream : on.list().value()) {
+      if (stream.id == id) return true;
+    }
+    return false;
+  }
+
+ private:
+  // While it lives, what is started belongs to that PC and speaks to its bus.
+  class OnPc {
+   public:
+    explicit OnPc(AvahiHost& host) : inside_(host.inside()) {
+      const std::string setting = host.environment();
+      const std::size_t end = setting.find('=');
+      name_ = setting.substr(0, end);
+      ::setenv(name_.c_str(), setting.substr(end + 1).c_str(), 1);
+    }
+    OnPc(const OnPc&) = delete;
+    OnPc& operator=(const OnPc&) = delete;
+    ~OnPc() { ::unsetenv(name_.c_str()); }
+
+   private:
+    Inside inside_;
+    std::string name_;
+  };
+
+  std::unique_ptr<Network> network_;
+  std::vector<std::unique_ptr<AvahiHost>> avahi_;
+  std::vector<std::unique_ptr<DaemonProcess>> dssmds_;
+  std::vector<Session> sessions_;
+};
+
+}  // namespace dssm::test
