@@ -226,6 +226,7 @@ TEST_F(PConnectorServing, TakesEverySampleOfAFastWriter) {
 TEST_F(PConnectorServing, ThinsAtTheSource) {
   auto writer = make({1024, 1ms});
   auto con = open();
+  const MonoTime begin = MonoClock::now();  // before anything can be sent
   ASSERT_TRUE(con.subscribe({.max_rate_hz = 50}));
   std::atomic<bool> stop = false;
   std::thread writing([&] {
@@ -236,7 +237,6 @@ TEST_F(PConnectorServing, ThinsAtTheSource) {
   });
   Sample sample;
   SampleInfo info;
-  const MonoTime begin = MonoClock::now();
   for (int i = 0; i < 10; ++i) {
     ASSERT_EQ(await_next(con, sample, info), ReadStatus::ok);
     EXPECT_EQ(sample.number, info.tid);
