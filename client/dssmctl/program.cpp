@@ -16,6 +16,8 @@
 namespace dssm::ctl {
 namespace {
 
+constexpr int kNotExecuted = 127;  // posix_spawn(3)
+
 // Starts it with both outputs at `out_fd`; -1 when there is no such program.
 pid_t spawn(std::vector<std::string>& argv, int out_fd) {
   std::vector<char*> words;
@@ -78,7 +80,8 @@ std::optional<ProgramEnd> run_program(std::vector<std::string> argv, Duration ti
     if (WIFEXITED(status)) end.exit_status = WEXITSTATUS(status);
   }
   ::close(ends[0]);
-  if (pid <= 0) return std::nullopt;
+  // POSIX lets a spawn that cannot execute the program succeed, and end with that status.
+  if (pid <= 0 || end.exit_status == kNotExecuted) return std::nullopt;
   return end;
 }
 
