@@ -50,10 +50,10 @@ static_assert(std::atomic<std::uint32_t>::is_always_lock_free);
 //   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
 //   520     8 run_start        tid    writer      before top; see "Search by time"
 //   528     8 first            tid    dssmd       before top; > 0 only in mirrors: see "Window"
-//   536     8 owner_tid        tid    dssmd       only in remote writers' rings, as
-//   owner_incarnation:
+//   536     8 owner_tid        tid    dssmd       in remote writers' rings only: which sample of
+//                                                 the owner's ring the last published one became;
 //                                                 see "Window"
-//   544     8 owner_incarnation -     dssmd       behind owner_tid
+//   544     8 owner_incarnation -     dssmd       of that ring of the owner
 //   552  3544 reserved         -      -           zero
 struct RingHeader {
   std::uint64_t magic;

@@ -5,6 +5,12 @@
 #include <utility>
 
 namespace dssm::daemon {
+namespace {
+
+// After a change: each list describes all streams anew, and a thousand may be created in a row.
+constexpr Duration kAnnouncePause = std::chrono::milliseconds(50);
+
+}  // namespace
 
 Reach reach_of(const std::vector<std::string>& addresses) {
   Reach reach;
@@ -58,13 +64,18 @@ void Discovery::on_mdns_state(const MdnsState& state) {
 // --- announced
 // ------------------------------------------------------------------------------------
 
-void Discovery::on_stream_added(const Stream&) { announce_timer_.enable_in(Duration::zero()); }
+void Discovery::on_stream_added(const Stream&) { announce_soon(); }
 
-void Discovery::on_stream_removed(const Stream&) { announce_timer_.enable_in(Duration::zero()); }
+void Discovery::on_stream_removed(const Stream&) { announce_soon(); }
+
+void Discovery::announce_soon() {
+  if (!std::exchange(announce_is_due_, true)) announce_timer_.enable_in(kAnnouncePause);
+}
 
 // The host first: by it others find all the rest. A host that others cannot reach keeps the names
 // of its streams to itself.
 void Discovery::announce() {
+  announce_is_due_ = false;
   if (!announcing_) return;
   std::vector<ServiceRecord> records;
   ServiceRecord& host = records.emplace_back();

@@ -52,6 +52,7 @@ class Discovery final : private HostFinderUser, private StreamObserver {
   void on_mdns_state(const MdnsState& state) override;
   void on_stream_added(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
+  void announce_soon();
   void announce();
 
   const Options options_;
@@ -59,8 +60,9 @@ class Discovery final : private HostFinderUser, private StreamObserver {
   Peers& peers_;
   FleetService& fleet_;
   bool announcing_ = false;
-  EventSource announce_timer_;  // after a change: when the loop is done with what caused it
-  Mdns mdns_;                   // last: it calls the others
+  bool announce_is_due_ = false;
+  EventSource announce_timer_;
+  Mdns mdns_;  // last: it calls the others
 };
 
 }  // namespace dssm::daemon
