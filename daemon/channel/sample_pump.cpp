@@ -52,7 +52,8 @@ Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
         status = sender_.send(next_, 0, next_ < std::min(newest_untrusted(reader_), last_));
         bytes += std::min(payload_bytes_, SampleSender::kSliceBytes);
       } else {
-        const Tid at_most = next_ + (kSamplesPerTurn - samples) - 1;
+        // The writer goes on meanwhile: a thinned stream's newest may be older already.
+        const Tid at_most = next_ + (thins() ? 1 : kSamplesPerTurn - samples) - 1;
         status = sender_.send_many(next_, std::min({newest_untrusted(reader_), last_, at_most}),
                                    sent_up_to);
         bytes += static_cast<std::size_t>(sent_up_to - next_) * payload_bytes_;

@@ -100,6 +100,7 @@ class PumpRig final : private FrameLink::User, private SamplePump::Events {
   std::map<Tid, Tid> gaps;
   bool thinned = false;
   int caught_up = 0, ends = 0;
+  int written_when_caught_up = 0;  // by a writer that does not wait for the pump
 
  private:
   Result<void> on_frame(net::Frame&) override { return {}; }
@@ -112,7 +113,10 @@ class PumpRig final : private FrameLink::User, private SamplePump::Events {
     frame.mutable_gap()->set_count(count);
     link.send(frame);
   }
-  void on_caught_up() override { ++caught_up; }
+  void on_caught_up() override {
+    ++caught_up;
+    write(written_when_caught_up);
+  }
   void on_end() override { ++ends; }
 };
 
@@ -502,6 +506,16 @@ TEST(SamplePump, SendsTheNewestAtEachTimeWhenItThins) {
   for (std::size_t i = 1; i < got.size(); ++i) EXPECT_EQ(got[i], 9 + static_cast<Tid>(i) * 10);
   EXPECT_EQ(rig.pump->lost(), 0u) << "what is left out is no loss";
   EXPECT_TRUE(rig.gaps.empty());
+}
+
+TEST(SamplePump, SendsOneSampleAtATimeThoughTheWriterGoesOnMeanwhile) {
+  PumpRig rig(kSmall, 64);
+  rig.thinned = true;
+  rig.write(10);
+  rig.written_when_caught_up = 5;
+  rig.start({0, kNoTid, 100});
+  EXPECT_EQ(rig.run(kStart), PumpWait::time);
+  EXPECT_EQ(rig.accepted(), tids(9, 9));
 }
 
 TEST(SamplePump, SendsEachSampleOfAStreamThatIsSlowerThanTheHighestRate) {
