@@ -31,6 +31,8 @@ class Mdns {
     // empty, without those in `avoid_interfaces`.
     std::vector<std::string> interfaces;
     std::vector<std::string> avoid_interfaces;
+    // Between the announcements of two new streams, after the first few.
+    Duration stream_pause = std::chrono::microseconds(62'500);
   };
 
   // Starts at once. loop, user and logger outlive it; the user is told from the loop.

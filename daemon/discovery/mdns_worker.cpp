@@ -57,7 +57,7 @@ MdnsWorker::MdnsWorker(EventLoop& loop, const Mdns::Options& options, MdnsMailbo
       mailbox_(mailbox),
       filter_(options.interfaces, options.avoid_interfaces),
       poll_(loop),
-      publisher_(loop, options.port, *this),
+      publisher_(loop, options.port, options.stream_pause, *this),
       browser_(loop, options.self, filter_, *this),
       pause_(kFirstConnectPause) {
   state_.phase = MdnsState::Phase::waiting;

@@ -15,6 +15,8 @@ namespace dssm::daemon {
 namespace {
 
 constexpr int kServicesPerTurn = 16;
+// Before the pauses begin. Few PCs have more.
+constexpr int kStreamsAtOnce = 32;
 // After so many collisions in a row somebody claims every name that is tried.
 constexpr int kMaxRenames = 20;
 // Until what was refused is tried again.
@@ -58,8 +60,9 @@ bool is_avahi_connection_error(int error) noexcept {
   }
 }
 
-ServicePublisher::ServicePublisher(const EventLoop& loop, std::uint16_t port, AvahiUser& user)
-    : user_(user), port_(port) {
+ServicePublisher::ServicePublisher(const EventLoop& loop, std::uint16_t port, Duration stream_pause,
+                                   AvahiUser& user)
+    : user_(user), port_(port), pace_(kStreamsAtOnce, stream_pause) {
   worker_ = EventSource::timer(loop, [this] { work(); });
   retry_ = EventSource::timer(loop, [this] { queue_withheld(); });
 }
@@ -190,12 +193,46 @@ void ServicePublisher::work() {
     queue_.pop_front();
     const auto at = services_.find(instance);
     if (at == services_.end()) continue;
+    if (is_new_stream(at->second)) {
+      const MonoTime now = MonoClock::now();
+      if (const Duration pause = pace_.wait(now); pause > Duration::zero()) {
+        // All others wait, too; what must not wait stands before it, see want().
+        queue_.push_front(instance);
+        worker_.enable_in(pause);
+        return user_.on_avahi_change();
+      }
+      if (!host_is_settled()) {
+        at->second.queued = false;  // queue_new_streams() comes back to it
+        continue;
+      }
+      pace_.take(now);
+    }
     at->second.queued = false;
     if (!bring(at->second)) return user_.on_avahi_failure(avahi_client_errno(client_));
     if (!at->second.wanted) services_.erase(at);
   }
   if (!queue_.empty()) worker_.enable_in(Duration::zero());
   user_.on_avahi_change();
+}
+
+bool ServicePublisher::is_new_stream(const Service& service) const {
+  return client_ && running_ && service.wanted && service.record.stream &&
+         service.state == State::idle;
+}
+
+// Announced, or it cannot be.
+bool ServicePublisher::host_is_settled() const {
+  return std::none_of(services_.begin(), services_.end(), [](const auto& entry) {
+    const Service& service = entry.second;
+    return service.wanted && !service.record.stream &&
+           (service.state == State::idle || service.state == State::registering);
+  });
+}
+
+void ServicePublisher::queue_new_streams() {
+  for (auto& [instance, service] : services_) {
+    if (is_new_stream(service)) queue(service);
+  }
 }
 
 // Does what there is to do for one service.
@@ -306,6 +343,7 @@ void ServicePublisher::withhold(Service& service, int error) {
     told_withheld_ = true;
     user_.log(LogLevel::warning, "mDNS: " + trouble());
   }
+  if (!service.record.stream) queue_new_streams();
 }
 
 void ServicePublisher::on_group(AvahiEntryGroup*, AvahiEntryGroupState state, void* service) {
@@ -320,6 +358,7 @@ void ServicePublisher::on_group(Service& service, AvahiEntryGroupState state) {
     case AVAHI_ENTRY_GROUP_ESTABLISHED:
       service.state = State::established;
       service.renamed = 0;
+      if (!service.record.stream) queue_new_streams();
       break;
     case AVAHI_ENTRY_GROUP_COLLISION:
       // Another PC has that name: "pc2 #2". Who we are stands in the TXT record.

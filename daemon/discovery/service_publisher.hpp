@@ -3,10 +3,14 @@
 // Brings what Avahi announces to what is wanted: one entry group per service, so that one changes,
 // collides or fails without the others.
 //
+// The host comes first; streams are announced when that is done, and a few at a time: all Avahi
+// daemons of the network work on each one, and those that hear of a thousand at once are late to
+// tell of the hosts (docs/discovery.md "Many streams").
+//
 // Avahi's stock limits, as its daemon counts them: 1024 objects per client, entry groups and
 // resolvers together; 32 entries per entry group, of which a service takes one and each subtype
 // another, on each interface that is named. What is beyond is withheld, streams in the order of
-// their names; the host itself comes first.
+// their names.
 #pragma once
 
 #include <avahi-client/publish.h>
@@ -18,6 +22,7 @@
 #include <vector>
 
 #include "daemon/discovery/avahi_user.hpp"
+#include "daemon/discovery/pace.hpp"
 #include "daemon/discovery/service_record.hpp"
 #include "daemon/service/event_loop.hpp"
 
@@ -30,8 +35,9 @@ class ServicePublisher {
   // Two entries each: half of what a group may hold.
   static constexpr std::size_t kMaxInterfaces = 8;
 
-  // loop and user outlive it.
-  ServicePublisher(const EventLoop& loop, std::uint16_t port, AvahiUser& user);
+  // stream_pause: as in Mdns::Options. loop and user outlive it.
+  ServicePublisher(const EventLoop& loop, std::uint16_t port, Duration stream_pause,
+                   AvahiUser& user);
   ServicePublisher(const ServicePublisher&) = delete;
   ServicePublisher& operator=(const ServicePublisher&) = delete;
 
@@ -69,6 +75,9 @@ class ServicePublisher {
   void queue_all();
   void queue_withheld();
   void work();
+  bool is_new_stream(const Service& service) const;
+  bool host_is_settled() const;
+  void queue_new_streams();
   bool bring(Service& service);
   int add(Service& service);
   bool update(Service& service);
@@ -84,6 +93,7 @@ class ServicePublisher {
   std::deque<std::string> queue_;  // instances to look at
   std::size_t groups_ = 0;
   bool told_withheld_ = false;
+  Pace pace_;
   EventSource worker_, retry_;
 };
 

@@ -34,6 +34,7 @@ class AvahiHost {
   void kill_avahi();   // SIGKILL: says no good-bye
   void pause_avahi();  // SIGSTOP; kill_avahi() ends that, too
 
+  pid_t avahi_pid() const noexcept { return avahi_; }  // -1: does not run
   // For programs of this PC: "DBUS_SYSTEM_BUS_ADDRESS=...".
   std::string environment() const;
   Inside inside() const { return network_.inside(host_); }

@@ -4,6 +4,7 @@
 // process.
 //
 //   mdns-probe COMMANDS ID NAME PORT [open|closed] [use=PATTERN]... [avoid=PATTERN]...
+//              [pause=MILLISECONDS]
 //
 // ID is one byte, of which the host id is made. Reads commands from descriptor COMMANDS, one a
 // line, and ends with it:
@@ -91,6 +92,9 @@ int main(int argc, char** argv) {
     const std::string_view word = argv[i];
     if (word == "closed") self.closed = true;
     if (word.starts_with("use=")) options.interfaces.emplace_back(word.substr(4));
+    if (word.starts_with("pause=")) {
+      options.stream_pause = std::chrono::milliseconds(std::atoi(word.substr(6).data()));
+    }
     if (word.starts_with("avoid=")) options.avoid_interfaces.emplace_back(word.substr(6));
   }
   Result<EventLoop> loop = EventLoop::open();

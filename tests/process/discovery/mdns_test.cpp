@@ -101,6 +101,26 @@ TEST_F(MdnsNeedsRoot, FindsBothOfTwoHostsWithOneName) {
   EXPECT_TRUE(two.until_state({"announced=1 withheld=0 own=1 heard=2"}));
 }
 
+TEST_F(MdnsNeedsRoot, AnnouncesEachStreamOfTwoHostsWithOneNameThatMeetLater) {
+  if (!make({"pc1", "pc2", "pc3"})) GTEST_SKIP() << why_;
+  network_->cut(2);
+  Probe one(pc(1), 1, "twin");
+  Probe two(pc(2), 2, "twin");
+  one.command("announce lidar:0");
+  two.command("announce lidar:0");
+  ASSERT_TRUE(one.until_state({"announced=2"}));
+  ASSERT_TRUE(two.until_state({"announced=2"}));
+  network_->heal(2);
+  EXPECT_TRUE(one.until_state({"announced=2 withheld=0 own=1 heard=1"}));
+  EXPECT_TRUE(two.until_state({"announced=2 withheld=0 own=1 heard=1"}));
+  const std::string first = raw_ask(pc(3), "resolve", "lidar:0@twin", "_lidar._sub._dssm._tcp");
+  const std::string second = raw_ask(pc(3), "resolve", "lidar:0@twin #2", "_lidar._sub._dssm._tcp");
+  const std::string hids[] = {"txt hid=01010101", "txt hid=02020202"};
+  const bool in_order = first.find(hids[0]) != first.npos;
+  EXPECT_NE(first.find(hids[in_order ? 0 : 1]), first.npos) << first;
+  EXPECT_NE(second.find(hids[in_order ? 1 : 0]), second.npos) << second;
+}
+
 TEST_F(MdnsNeedsRoot, FindsASecondHostOfTheSamePcByLoopback) {
   if (!make({"pc1", "pc2"})) GTEST_SKIP() << why_;
   Probe one(pc(1), 1, "pc1");
@@ -186,7 +206,7 @@ TEST_F(MdnsNeedsRoot, UsesOnlyTheInterfacesThatAreConfigured) {
 
 TEST_F(MdnsNeedsRoot, WithholdsWhatIsBeyondAvahisLimitsAndSaysSoOnce) {
   if (!make({"pc1", "pc2"})) GTEST_SKIP() << why_;
-  Probe one(pc(1), 1, "pc1");
+  Probe one(pc(1), 1, "pc1", {"pause=0"});
   one.command("many 800");
   EXPECT_TRUE(one.until_state({"announced=740 withheld=61", "objects-per-client-max"}));
   Probe two(pc(2), 2, "pc2");  // the browser's resolvers have their place all the same
