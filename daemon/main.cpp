@@ -5,9 +5,13 @@
 // dssmd is there, 2 when flags or configuration are wrong.
 #include <signal.h>
 
+#include <algorithm>
 #include <cstdio>
+#include <memory>
 #include <optional>
+#include <utility>
 
+#include "core/wire/tcp.hpp"
 #include "daemon/channel/channel_server.hpp"
 #include "daemon/channel/mirrors.hpp"
 #include "daemon/channel/network_listener.hpp"
@@ -22,11 +26,16 @@
 #include "daemon/local/server.hpp"
 #include "daemon/service/command_line.hpp"
 #include "daemon/service/event_loop.hpp"
+#include "daemon/service/inherited.hpp"
+#include "daemon/service/journal_logger.hpp"
 #include "daemon/service/log.hpp"
 #include "daemon/service/message_ids.hpp"
-#include "daemon/service/notify.hpp"
 #include "daemon/service/process.hpp"
+#include "daemon/service/reloader.hpp"
 #include "daemon/service/runtime_dir.hpp"
+#include "daemon/service/service_manager.hpp"
+#include "daemon/service/status_line.hpp"
+#include "daemon/streams/descriptor_store.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"
@@ -48,7 +57,71 @@ wire::Greeting own_greeting(const std::string& name) {
   return self;
 }
 
-Result<void> run(const Config& config, Logger& logger) {
+// The limits of the configuration, as the parts take them.
+Registry::Limits stream_limits(const Config& config) {
+  return {config.max_streams, config.max_memory_bytes, config.max_property_bytes};
+}
+OpenTable::Limits open_limits(const Config& config) {
+  return {config.max_opens, config.max_opens_per_client};
+}
+PeerTable::Limits peer_limits(const Config& config) {
+  return {config.max_connections, config.max_connections_per_host, config.max_peer_memory_bytes};
+}
+
+// The line in `systemctl status`; no clock is watched yet.
+std::string status_text(const Registry& registry, const Peers& peers,
+                        const NetworkListener& network) {
+  std::size_t up = 0, known = 0;
+  for (const local::Host& host : peers.hosts()) {
+    if (host.state() == "self") continue;
+    ++known;
+    if (host.state() == "up") ++up;
+  }
+  return "host '" + registry.host() + "', " + std::to_string(registry.streams().size()) +
+         " streams, " + std::to_string(up) + " of " + std::to_string(known) +
+         " other hosts up, clock unknown, " + network.str();
+}
+
+// Touches the status line when streams come and go.
+class StreamCount final : private StreamObserver {
+ public:
+  StreamCount(Registry& registry, StatusLine& line) : registry_(registry), line_(line) {
+    registry_.add_observer(*this);
+  }
+  ~StreamCount() { registry_.remove_observer(*this); }
+
+ private:
+  void on_stream_added(const Stream&) override { line_.touch(); }
+  void on_stream_removed(const Stream&) override { line_.touch(); }
+  Registry& registry_;
+  StatusLine& line_;
+};
+
+// Sockets that were handed over for other places than the configuration names.
+void close_unused(const Inherited& inherited, ServiceManager& manager, Logger& logger) {
+  const auto warn = [&](const std::string& where, const std::string& mend) {
+    logger.warning("the service manager hands over a socket at " + where +
+                       ", which the configuration does not name, closing it; " + mend,
+                   {.message_id = message_id::kSocketUnused});
+  };
+  for (const NamedDescriptor& one : inherited.local) {
+    warn("another path (" + one.name + ")",
+         "make ListenStream= of its socket unit the key runtime_dir and /dssmd.sock");
+  }
+  for (const NamedDescriptor& one : inherited.network) {
+    const Result<wire::SocketAddress> address = wire::local_address(one.fd.get());
+    const std::string where = address ? "'" + address->str() + "'" : "no address";
+    if (NetworkListener::is_kept_name(one.name)) {  // the configuration named it before
+      manager.forget(one.name);
+      logger.info("stop listening at " + where);
+    } else {
+      warn(where, "add it to the key listen, or take it out of the socket unit");
+    }
+  }
+}
+
+// read_again: reads the configuration file anew; none: there is no file.
+Result<void> run(const Config& config, const Reloader::Read& read_again, LeveledLogger& logger) {
   raise_descriptor_limit();
   ignore_broken_pipes();
   silence_protobuf();
@@ -57,17 +130,29 @@ Result<void> run(const Config& config, Logger& logger) {
   if (!dir) return dir.error();
   Result<EventLoop> loop = EventLoop::open();
   if (!loop) return std::move(loop).error();
+  ServiceManager manager(*loop, ServiceManager::notify_socket());
+  Inherited inherited = Inherited::sort(take_handed_over());
   const Result<Listener> listener =
-      Listener::open(dir->socket_path(), config.socket_group, config.socket_mode);
+      Listener::open(dir->socket_path(), config.socket_group, config.socket_mode,
+                     inherited.take_local(dir->socket_path()));
   if (!listener) return listener.error();
-  const Result<NetworkListener> network = NetworkListener::open(config.listen, logger);
+  const Result<NetworkListener> network =
+      NetworkListener::open(config.listen, inherited.network, logger);
   if (!network) return network.error();
-  const bool recovering = listener->predecessor_died() && config.recovery_grace > Duration::zero();
+  close_unused(inherited, manager, logger);
+  network->keep_in(manager);
+  inherited.local.clear();
+  inherited.network.clear();
 
-  Registry registry(config.name,
-                    {config.max_streams, config.max_memory_bytes, config.max_property_bytes});
-  OpenTable opens({config.max_opens, config.max_opens_per_client});
+  Registry registry(config.name, stream_limits(config));
+  OpenTable opens(open_limits(config));
   PlaybackClockOwner clock;
+  DescriptorStore store(registry, clock, manager, logger);
+  const bool some_may_be_missing = store.restore_untrusted(std::move(inherited.others));
+  // Nothing tells whether there was a dssmd before this one when its socket was handed over.
+  const bool recovering = some_may_be_missing &&
+                          (listener->predecessor_died() || listener->inherited()) &&
+                          config.recovery_grace > Duration::zero();
 
   const wire::Greeting self = own_greeting(config.name);
   Resolver resolver(*loop);
@@ -80,10 +165,8 @@ Result<void> run(const Config& config, Logger& logger) {
                      mirrors, writers);
 
   LocalService service(registry, opens, clock, logger, recovering, &fleet);
-  const Server server(*loop, *listener, config.max_clients, service, logger);
-  ChannelServer channels(
-      {*loop, registry, opens, logger}, self,
-      {config.max_connections, config.max_connections_per_host, config.max_peer_memory_bytes});
+  Server server(*loop, *listener, config.max_clients, service, logger);
+  ChannelServer channels({*loop, registry, opens, logger}, self, peer_limits(config));
 
   std::optional<Discovery> discovery;
   if (config.mdns) {
@@ -103,13 +186,37 @@ Result<void> run(const Config& config, Logger& logger) {
   if (!recovering) serve_others();
   if (recovering) {
     grace.enable_in(config.recovery_grace);
-    logger.notice(
-        "the dssmd before this one did not end properly; programs give their streams back",
-        {.message_id = message_id::kRecovering});
+    logger.notice(listener->predecessor_died()
+                      ? "the dssmd before this one did not end properly; programs give their "
+                        "streams back"
+                      : "started without streams; programs that hold some give them back",
+                  {.message_id = message_id::kRecovering});
   }
   EventSource stops[] = {EventSource::signal(*loop, SIGTERM, [&] { loop->stop(); }),
                          EventSource::signal(*loop, SIGINT, [&] { loop->stop(); })};
   for (EventSource& stop : stops) stop.enable();
+
+  StatusLine status(*loop, manager, [&] { return status_text(registry, peers, *network); });
+  const StreamCount count(registry, status);
+  peers.on_change([&] { status.touch(); });
+  Reloader reloader(
+      config, read_again,
+      [&](const Config& changed) {
+        logger.set_level(changed.log_level);
+        registry.set_limits(stream_limits(changed));
+        opens.set_limits(open_limits(changed));
+        server.set_max_clients(changed.max_clients);
+        channels.set_limits(peer_limits(changed));
+        mirrors.set_linger(changed.mirror_linger);
+        peers.set_configured(changed.peers);
+      },
+      logger);
+  EventSource reload = EventSource::signal(*loop, SIGHUP, [&] {
+    manager.reloading();
+    reloader.reload();
+    manager.ready(status.now());
+  });
+  if (read_again) reload.enable();
   if (config.insecure) {
     logger.warning(
         "insecure = true: samples cross the network in the clear, and whoever reaches this host "
@@ -120,17 +227,32 @@ Result<void> run(const Config& config, Logger& logger) {
   const std::string ready =
       "ready, host '" + config.name + "', socket '" + dir->socket_path() + "', " + network->str();
   logger.notice(ready, {.message_id = message_id::kReady});
-  notify_ready(ready);
+  manager.ready(status.now());
+  const Watchdog watchdog(*loop, manager);
   if (Result<void> ran = loop->run(); !ran) return ran;
-  notify_stopping();
+  manager.stopping();
+  peers.on_change({});
   logger.notice("stopping", {.message_id = message_id::kStopping});
   return {};
 }
 
-void print_lines(const std::string& lines) {
-  for (std::size_t begin = 0; begin <= lines.size();) {
-    const std::size_t end = std::min(lines.find('\n', begin), lines.size());
-    std::fprintf(stderr, "dssmd: %s\n", lines.substr(begin, end - begin).c_str());
+std::unique_ptr<LeveledLogger> open_log(LogLevel level) {
+  if (stderr_is_journal()) return std::make_unique<JournalLogger>(level);
+  return std::make_unique<StderrLogger>(level, false);
+}
+
+// What is wrong with flags and configuration, a line each.
+void tell_mistakes(const std::string& mistakes) {
+  std::optional<JournalLogger> journal;
+  if (stderr_is_journal()) journal.emplace(LogLevel::error);
+  for (std::size_t begin = 0; begin <= mistakes.size();) {
+    const std::size_t end = std::min(mistakes.find('\n', begin), mistakes.size());
+    const std::string line = mistakes.substr(begin, end - begin);
+    if (journal) {
+      journal->error(line, {.message_id = message_id::kFailed});
+    } else {
+      std::fprintf(stderr, "dssmd: %s\n", line.c_str());
+    }
     begin = end + 1;
   }
 }
@@ -138,7 +260,7 @@ void print_lines(const std::string& lines) {
 int main(int argc, char** argv) {
   const Result<CommandLine> line = parse_command_line(argc, argv);
   if (!line) {
-    print_lines(line.error().message);
+    tell_mistakes(line.error().message);
     return kUsage;
   }
   if (line->action == CommandLine::Action::print) {
@@ -149,9 +271,17 @@ int main(int argc, char** argv) {
     std::puts("OK");
     return 0;
   }
-  StderrLogger logger(line->config.log_level, under_systemd());
-  if (Result<void> ran = run(line->config, logger); !ran) {
-    logger.error(ran.error().message);
+  const std::unique_ptr<LeveledLogger> logger = open_log(line->config.log_level);
+  Reloader::Read read_again;
+  if (!line->config_path.empty()) {
+    read_again = [argc, argv]() -> Result<Config> {
+      Result<CommandLine> again = parse_command_line(argc, argv);
+      if (!again) return std::move(again).error();
+      return std::move(again->config);
+    };
+  }
+  if (Result<void> ran = run(line->config, read_again, *logger); !ran) {
+    logger->error(ran.error().message, {.message_id = message_id::kFailed});
     return kFailed;
   }
   return 0;

@@ -169,7 +169,31 @@ Result<SocketAddress> local_address(int socket) {
 }
 
 Result<SocketAddress> peer_address(int socket) {
-  return address_by(&::getpeername, socket, "ask for the other side's address");
+  Result<SocketAddress> peer =
+      address_by(&::getpeername, socket, "ask for the other side's address");
+  if (!peer || peer->storage.ss_family != AF_INET6) return peer;
+  sockaddr_in6 six{};
+  std::memcpy(&six, &peer->storage, sizeof six);
+  if (!IN6_IS_ADDR_V4MAPPED(&six.sin6_addr)) return peer;
+  sockaddr_in four{};
+  four.sin_family = AF_INET;
+  four.sin_port = six.sin6_port;
+  std::memcpy(&four.sin_addr, six.sin6_addr.s6_addr + 12, sizeof four.sin_addr);
+  peer->storage = {};
+  std::memcpy(&peer->storage, &four, sizeof four);
+  peer->length = sizeof four;
+  return peer;
+}
+
+bool takes_ipv4_too(int socket) noexcept {
+  const Result<SocketAddress> address = local_address(socket);
+  if (!address || address->storage.ss_family != AF_INET6) return false;
+  sockaddr_in6 six{};
+  std::memcpy(&six, &address->storage, sizeof six);
+  int only_6 = 1;
+  socklen_t length = sizeof only_6;
+  return IN6_IS_ADDR_UNSPECIFIED(&six.sin6_addr) &&
+         ::getsockopt(socket, IPPROTO_IPV6, IPV6_V6ONLY, &only_6, &length) == 0 && !only_6;
 }
 
 Result<UniqueFd> start_connect(const SocketAddress& address) {

@@ -28,7 +28,11 @@ Result<UniqueFd> listen_tcp(const SocketAddress& address);
 
 // The address that a socket is bound to (after listening on port 0), or connected to.
 Result<SocketAddress> local_address(int socket);
-Result<SocketAddress> peer_address(int socket);
+Result<SocketAddress> peer_address(int socket);  // IPv4 as such, also over a socket of IPv6
+
+// Whether connections over IPv4 arrive at this listening socket of "::", too, as at one that
+// systemd made with its defaults.
+bool takes_ipv4_too(int socket) noexcept;
 
 // Begins to connect; the socket becomes writable when it is done or failed, then ask
 // finish_connect(). Sets the options of the end that connected.

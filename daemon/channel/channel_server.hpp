@@ -46,6 +46,8 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ke
   Result<void> adopt(std::unique_ptr<wire::Transport> transport,
                      const wire::SocketAddress& address);
 
+  void set_limits(const PeerTable::Limits& limits) { peers_.set_limits(limits); }
+
   std::size_t connections() const noexcept { return communicators_.size(); }
 
  private:

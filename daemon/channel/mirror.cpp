@@ -22,7 +22,7 @@ constexpr Duration kGapLinePause = std::chrono::seconds(10);
 
 }  // namespace
 
-Mirror::Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, Duration linger,
+Mirror::Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, const Duration& linger,
                RingRoom room)
     : parts_(parts),
       keeper_(keeper),

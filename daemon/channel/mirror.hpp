@@ -46,8 +46,9 @@ class Mirror final : private OwnerChannel::User {
   };
   using Then = std::function<void(Result<std::shared_ptr<Stream>>)>;
 
-  // id: with its owner's host. parts and keeper outlive it.
-  Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, Duration linger, RingRoom room);
+  // id: with its owner's host. parts, keeper and linger outlive it.
+  Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, const Duration& linger,
+         RingRoom room);
   Mirror(const Mirror&) = delete;
   Mirror& operator=(const Mirror&) = delete;
 
@@ -118,7 +119,7 @@ class Mirror final : private OwnerChannel::User {
   const ChannelParts& parts_;
   Keeper& keeper_;
   const StreamId id_;
-  const Duration linger_;
+  const Duration& linger_;  // its keeper's, which may change
   const RingRoom room_;
 
   State state_ = State::connecting;

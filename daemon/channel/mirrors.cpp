@@ -6,9 +6,9 @@
 namespace dssm::daemon {
 
 Mirrors::Mirrors(const ChannelParts& parts, Catalog& catalog, Duration linger)
-    : table_(parts, catalog, [this, &parts, linger](StreamId id, RingRoom room) {
+    : linger_(linger), table_(parts, catalog, [this, &parts](StreamId id, RingRoom room) {
         Mirror::Keeper& keeper = *this;
-        return std::make_unique<Mirror>(parts, keeper, std::move(id), linger, std::move(room));
+        return std::make_unique<Mirror>(parts, keeper, std::move(id), linger_, std::move(room));
       }) {}
 
 void Mirrors::open(const KnownHost& host, const StreamId& id, Then then) {

@@ -16,6 +16,8 @@ class Mirrors final : public MirrorKeeper, private Mirror::Keeper {
   Mirrors(const Mirrors&) = delete;
   Mirrors& operator=(const Mirrors&) = delete;
 
+  void set_linger(Duration linger) { linger_ = linger; }  // from the next time a reader leaves
+
   std::size_t size() const noexcept { return table_.size(); }
 
   void observe(MirrorKeeper::Observer* observer) override { observer_ = observer; }
@@ -29,6 +31,7 @@ class Mirrors final : public MirrorKeeper, private Mirror::Keeper {
   void on_mirror_done() override { table_.sweep(); }
 
   MirrorKeeper::Observer* observer_ = nullptr;
+  Duration linger_;
   ChannelTable<Mirror> table_;
 };
 

@@ -1,19 +1,35 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/channel/network_listener.hpp"
 
+#include <algorithm>
+#include <set>
 #include <utility>
 
 #include "core/wire/tcp.hpp"
 
 namespace dssm::daemon {
+namespace {
+
+// Whether connections to `wanted` arrive at `socket`.
+bool listens_at(int socket, const wire::SocketAddress& wanted) {
+  const Result<wire::SocketAddress> bound = wire::local_address(socket);
+  if (!bound) return false;
+  if (bound->str() == wanted.str()) return true;
+  // A socket of IPv6 may take IPv4 along.
+  return wire::takes_ipv4_too(socket) &&
+         wanted.str() == "0.0.0.0" + bound->str().substr(bound->str().rfind(':'));
+}
+
+}  // namespace
 
 Result<NetworkListener> NetworkListener::open(
-    const std::optional<std::vector<wire::Address>>& configured, Logger& logger) {
+    const std::optional<std::vector<wire::Address>>& configured, Inherited& inherited,
+    Logger& logger) {
   NetworkListener listener;
   const std::vector<wire::Address> defaults = {{"127.0.0.1", wire::kDefaultPort},
                                                {"::1", wire::kDefaultPort}};
   for (const wire::Address& address : configured.value_or(defaults)) {
-    Result<void> added = listener.add(address);
+    Result<void> added = listener.add(address, inherited);
     if (added) continue;
     if (configured) return std::move(added).error();
     logger.warning(added.error().message +
@@ -22,16 +38,44 @@ Result<NetworkListener> NetworkListener::open(
   return listener;
 }
 
-Result<void> NetworkListener::add(const wire::Address& address) {
+Result<void> NetworkListener::add(const wire::Address& address, Inherited& inherited) {
   for (const wire::SocketAddress& number : wire::resolve_number(address)) {
+    const bool is_covered = std::any_of(sockets_.begin(), sockets_.end(), [&](const UniqueFd& fd) {
+      return listens_at(fd.get(), number);
+    });
+    if (is_covered) continue;
+    const auto found =
+        std::find_if(inherited.begin(), inherited.end(),
+                     [&](const NamedDescriptor& one) { return listens_at(one.fd.get(), number); });
+    if (found != inherited.end()) {
+      addresses_.push_back(wire::local_address(found->fd.get())->str());
+      names_.push_back(std::move(found->name));
+      sockets_.push_back(std::move(found->fd));
+      inherited.erase(found);
+      continue;
+    }
     Result<UniqueFd> socket = wire::listen_tcp(number);
     if (!socket) return std::move(socket).error();
     const Result<wire::SocketAddress> bound = wire::local_address(socket->get());
     if (!bound) return bound.error();
     addresses_.push_back(bound->str());
+    names_.emplace_back();
     sockets_.push_back(*std::move(socket));
   }
   return {};
+}
+
+void NetworkListener::keep_in(ServiceManager& manager) const {
+  std::set<std::string> used(names_.begin(), names_.end());
+  int number = 0;
+  for (std::size_t i = 0; i < sockets_.size(); ++i) {
+    if (!names_[i].empty()) continue;
+    std::string name;
+    do {
+      name = "=" + std::to_string(number++);
+    } while (!used.insert(name).second);
+    manager.keep(name, {sockets_[i].get()});
+  }
 }
 
 std::string NetworkListener::str() const {

@@ -11,17 +11,28 @@
 #include "core/base/unique_fd.hpp"
 #include "core/wire/address.hpp"
 #include "daemon/service/log.hpp"
+#include "daemon/service/service_manager.hpp"
 
 namespace dssm::daemon {
 
 class NetworkListener {
  public:
+  // Sockets that listen already: kept over a restart, or the service manager's.
+  using Inherited = std::vector<NamedDescriptor>;
+
   // Listens at the configured addresses, which are numbers; an empty list: nowhere. Nothing
   // configured: at the default port of 127.0.0.1 and ::1, as far as this PC has them and no other
   // dssmd took the port before; what is missing is logged as a warning.
-  //   fails  naming the configured address that cannot be had
+  //   inherited  those that are bound to a wanted address are used, and taken out of the list
+  //   fails      naming the configured address that cannot be had
   static Result<NetworkListener> open(const std::optional<std::vector<wire::Address>>& configured,
-                                      Logger& logger);
+                                      Inherited& inherited, Logger& logger);
+
+  // Has the service manager keep the sockets, so that whoever connects while dssmd is restarted
+  // waits and is not refused. Those that it handed over are its own anyhow.
+  void keep_in(ServiceManager& manager) const;
+  // Whether a name that came with a socket is one that keep_in() gave.
+  static bool is_kept_name(const std::string& name) { return name.starts_with('='); }
 
   const std::vector<UniqueFd>& sockets() const noexcept { return sockets_; }
 
@@ -31,9 +42,10 @@ class NetworkListener {
 
  private:
   NetworkListener() = default;
-  Result<void> add(const wire::Address& address);
+  Result<void> add(const wire::Address& address, Inherited& inherited);
 
   std::vector<UniqueFd> sockets_;
+  std::vector<std::string> names_;  // of each socket, as it was handed over; empty: made here
   std::vector<std::string> addresses_;
 };
 

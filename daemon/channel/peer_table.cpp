@@ -31,6 +31,13 @@ PeerPlace::~PeerPlace() {
   if (table_) table_->leave(*account_);
 }
 
+void PeerTable::set_limits(const Limits& limits) {
+  limits_ = limits;
+  for (const auto& [address, account] : accounts_) {
+    account->budget.set_limit(limits.max_peer_memory_bytes);
+  }
+}
+
 Result<PeerPlace> PeerTable::admit(const wire::SocketAddress& address) {
   if (connections_ >= limits_.max_connections) {
     return Error{Errc::limit_exceeded,

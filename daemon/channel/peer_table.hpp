@@ -60,6 +60,9 @@ class PeerTable {
   PeerTable(const PeerTable&) = delete;
   PeerTable& operator=(const PeerTable&) = delete;
 
+  // For who comes, the accounts of those who are there included.
+  void set_limits(const Limits& limits);
+
   // A place for one more connection from `address`.
   //   fails  limit_exceeded, naming the key
   Result<PeerPlace> admit(const wire::SocketAddress& address);

@@ -24,7 +24,7 @@ Peers::Peers(const EventLoop& loop, Resolver& resolver, const std::vector<wire::
       logger_(logger),
       settled_(peers.empty()),
       settle_timer_(EventSource::timer(loop, [this] { settle(); })),
-      tend_soon_(EventSource::timer(loop, [this] { tend_found_hosts(); })) {
+      tend_soon_(EventSource::timer(loop, [this] { tend(); })) {
   if (!settled_) settle_timer_.enable_in(kSettleTime);
   PeerLink::User& user = *this;
   for (const wire::Address& peer : peers) {
@@ -158,30 +158,65 @@ void Peers::look_at(Found& found, const Occupied& occupied) const {
   if (!found.usable.empty()) found.obstacle.reset();
 }
 
-void Peers::tend_found_hosts() {
-  PeerLink::User& user = *this;
+void Peers::tend() {
   const Occupied now_occupied = occupied();
   for (auto next = peers_.begin(); next != peers_.end();) {
     const auto peer = next++;
-    if (!peer->found) continue;
-    Found& found = *peer->found;
-    const std::vector<wire::Address> before = found.usable;
-    look_at(found, now_occupied);
-    const bool is_needed = !is_up_as_configured(found.host.id);
-    const bool is_up = peer->use == Use::in_use || (peer->use != Use::none && is_needed);
-    if (!found.listed && !is_up) {
+    if (peer->found) {
+      tend_found_host(peer, now_occupied);
+    } else if (peer->leaving && peer->use == Use::none) {
       peers_.erase(peer);
-    } else if (!is_up && (!is_needed || found.obstacle)) {
-      peer->link.reset();
-      peer->use = Use::none;
-      peer->warning.clear();
-    } else if (!peer->link) {
-      peer->link =
-          std::make_unique<PeerLink>(loop_, resolver_, found.host.id, found.usable, self_, user);
-    } else if (!found.usable.empty() && found.usable != before) {
-      peer->link->set_addresses(found.usable);
     }
   }
+  settle_if_decided();
+  if (on_change_) on_change_();
+}
+
+// May erase `peer`.
+void Peers::tend_found_host(std::list<Peer>::iterator peer, const Occupied& now_occupied) {
+  PeerLink::User& user = *this;
+  Found& found = *peer->found;
+  const std::vector<wire::Address> before = found.usable;
+  look_at(found, now_occupied);
+  const bool is_needed = !is_up_as_configured(found.host.id);
+  const bool is_up = peer->use == Use::in_use || (peer->use != Use::none && is_needed);
+  if (!found.listed && !is_up) {
+    peers_.erase(peer);
+  } else if (!is_up && (!is_needed || found.obstacle)) {
+    peer->link.reset();
+    peer->use = Use::none;
+    peer->warning.clear();
+  } else if (!peer->link) {
+    peer->link =
+        std::make_unique<PeerLink>(loop_, resolver_, found.host.id, found.usable, self_, user);
+  } else if (!found.usable.empty() && found.usable != before) {
+    peer->link->set_addresses(found.usable);
+  }
+}
+
+// --- configured peers change
+// ----------------------------------------------------------------------
+
+void Peers::set_configured(const std::vector<wire::Address>& peers) {
+  PeerLink::User& user = *this;
+  std::vector<wire::Address> known;
+  for (Peer& peer : peers_) {
+    if (peer.found || peer.leaving) continue;
+    const wire::Address& address = peer.link->configured();
+    known.push_back(address);
+    if (std::find(peers.begin(), peers.end(), address) != peers.end()) continue;
+    peer.leaving = true;
+    // When that is through, tend() takes it away; what waits for its answers is told.
+    peer.link->drop({Errc::daemon_away, "it is not among the peers any more (key peers)"});
+  }
+  const auto first_found = std::find_if(peers_.begin(), peers_.end(),
+                                        [](const Peer& peer) { return peer.found.has_value(); });
+  for (const wire::Address& address : peers) {
+    if (std::find(known.begin(), known.end(), address) != known.end()) continue;
+    peers_.emplace(first_found)->link =
+        std::make_unique<PeerLink>(loop_, resolver_, address, self_, user);
+  }
+  tend_soon_.enable_in(Duration::zero());
 }
 
 // --- connections come and go

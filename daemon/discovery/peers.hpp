@@ -60,6 +60,13 @@ class Peers final : public HostFinderUser, private PeerLink::User {
   Peers& operator=(const Peers&) = delete;
   ~Peers();
 
+  // Takes these configured peers in place of those before: new ones are dialed, those that are not
+  // among them any more are dropped. To be called from the loop.
+  void set_configured(const std::vector<wire::Address>& peers);
+
+  // Called from the loop after changes, several of them together; {}: nobody.
+  void on_change(std::function<void()> then) { on_change_ = std::move(then); }
+
   // There is a finder, which will call the functions below. To be called before the loop runs.
   //   insecure  found hosts may be reached over the network, in the clear; else only those on this
   //             PC's loopback
@@ -108,6 +115,7 @@ class Peers final : public HostFinderUser, private PeerLink::User {
     Use use = Use::none;
     bool decided = false;    // its first word came
     bool told_down = false;  // the log says that it is not up
+    bool leaving = false;    // is not configured any more
     std::string warning;     // concerns this peer while it is up
   };
   // Addresses, written as numbers, and who answers there at this moment.
@@ -125,7 +133,8 @@ class Peers final : public HostFinderUser, private PeerLink::User {
   bool is_up_as_configured(const wire::HostId& id) const;
   void use(Peer& peer);
   void take_over(const wire::HostId& id);
-  void tend_found_hosts();
+  void tend();
+  void tend_found_host(std::list<Peer>::iterator peer, const Occupied& now_occupied);
   void look_at(Found& found, const Occupied& occupied) const;
   Occupied occupied() const;
   void decide(Peer& peer);
@@ -148,9 +157,10 @@ class Peers final : public HostFinderUser, private PeerLink::User {
   bool told_too_many_ = false;
   bool finder_is_searching_ = false;
   bool settled_ = false;
-  std::function<void()> on_settled_;
+  std::function<void()> on_settled_, on_change_;
   EventSource settle_timer_;
-  // Connections to found hosts begin and end only here, never within a call of another one's.
+  // Connections end, and those to found hosts begin, only here: never within a call of another
+  // one's.
   EventSource tend_soon_;
 };
 

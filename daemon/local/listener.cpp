@@ -29,7 +29,8 @@ Result<bool> remove_stale(const std::string& path) {
 
 }  // namespace
 
-Result<Listener> Listener::open(const std::string& path, std::optional<gid_t> group, mode_t mode) {
+Result<Listener> Listener::open(const std::string& path, std::optional<gid_t> group, mode_t mode,
+                                UniqueFd inherited) {
   const std::string what = "listen at '" + path + "'";
   sockaddr_un address{};
   address.sun_family = AF_UNIX;
@@ -40,6 +41,12 @@ Result<Listener> Listener::open(const std::string& path, std::optional<gid_t> gr
                      "choose a shorter folder with --runtime-dir"};
   }
   std::memcpy(address.sun_path, path.data(), path.size());
+  if (inherited) {
+    Listener listener(path, std::move(inherited));
+    listener.inherited_ = true;
+    if (Result<void> allowed = listener.allow(group, mode); !allowed) return allowed.error();
+    return listener;
+  }
   const Result<bool> stale = remove_stale(path);
   if (!stale) return stale.error();
   UniqueFd fd(::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0));
@@ -47,19 +54,32 @@ Result<Listener> Listener::open(const std::string& path, std::optional<gid_t> gr
   if (::bind(fd.get(), reinterpret_cast<const sockaddr*>(&address), sizeof address)) {
     return os_error(what);
   }
-  Listener listener(path, std::move(fd), *stale);
-  if (group && ::chown(path.c_str(), static_cast<uid_t>(-1), *group)) {
-    Error error = os_error(what + ": give it to group " + std::to_string(*group));
-    error.message += "; dssmd's user has to be a member of socket_group";
-    return error;
-  }
-  if (::chmod(path.c_str(), mode)) return os_error(what + ": set its permissions");
+  Listener listener(path, std::move(fd));
+  listener.predecessor_died_ = *stale;
+  if (Result<void> allowed = listener.allow(group, mode); !allowed) return allowed.error();
   if (::listen(listener.fd(), SOMAXCONN)) return os_error(what);
   return listener;
 }
 
+Result<void> Listener::allow(std::optional<gid_t> group, mode_t mode) const {
+  const std::string what = "listen at '" + path_ + "'";
+  struct stat file {};
+  if (::stat(path_.c_str(), &file)) return os_error(what);
+  if (group && *group != file.st_gid && ::chown(path_.c_str(), static_cast<uid_t>(-1), *group)) {
+    Error error = os_error(what + ": give it to group " + std::to_string(*group));
+    error.message +=
+        "; dssmd's user has to own the socket (SocketUser=) and be a member of "
+        "socket_group";
+    return error;
+  }
+  if (mode != (file.st_mode & 07777) && ::chmod(path_.c_str(), mode)) {
+    return os_error(what + ": set its permissions (key socket_mode)");
+  }
+  return {};
+}
+
 Listener::~Listener() {
-  if (fd_) ::unlink(path_.c_str());
+  if (fd_ && !inherited_) ::unlink(path_.c_str());
 }
 
 }  // namespace dssm::daemon

@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The Unix socket that programs of this PC connect to. Whoever holds one also holds the lock on its
-// folder (RuntimeDir), so a socket file that is there already belongs to a dssmd that died.
+// folder (RuntimeDir), so a socket file that is there already belongs to a dssmd that died, or is
+// that of a socket which the service manager listens at and handed over. Such a one is used as it
+// is and left behind: programs that connect while no dssmd runs wait there.
 #pragma once
 
 #include <sys/types.h>
@@ -17,24 +19,29 @@ namespace dssm::daemon {
 class Listener {
  public:
   // Listens at `path` with that group (none: leave it) and mode; nobody can connect before both are
-  // set.
-  static Result<Listener> open(const std::string& path, std::optional<gid_t> group, mode_t mode);
+  // set. inherited: the socket that was handed over for `path`; none: makes one.
+  static Result<Listener> open(const std::string& path, std::optional<gid_t> group, mode_t mode,
+                               UniqueFd inherited = {});
 
   Listener(Listener&&) = default;
   Listener& operator=(Listener&&) = delete;
-  ~Listener();  // removes the socket file
+  ~Listener();  // removes the socket file, unless it was inherited
 
   int fd() const noexcept { return fd_.get(); }
 
   // A socket file was there: the dssmd before this one did not end properly.
   bool predecessor_died() const noexcept { return predecessor_died_; }
 
+  // It was handed over. Then nothing tells whether there was a dssmd before.
+  bool inherited() const noexcept { return inherited_; }
+
  private:
-  Listener(std::string path, UniqueFd fd, bool predecessor_died)
-      : path_(std::move(path)), fd_(std::move(fd)), predecessor_died_(predecessor_died) {}
+  Listener(std::string path, UniqueFd fd) : path_(std::move(path)), fd_(std::move(fd)) {}
+  Result<void> allow(std::optional<gid_t> group, mode_t mode) const;
   std::string path_;
   UniqueFd fd_;
-  bool predecessor_died_;
+  bool predecessor_died_ = false;
+  bool inherited_ = false;
 };
 
 }  // namespace dssm::daemon

@@ -26,6 +26,8 @@ class Server {
   Server(const Server&) = delete;
   Server& operator=(const Server&) = delete;
 
+  void set_max_clients(std::uint64_t max_clients) { max_clients_ = max_clients; }  // for who comes
+
  private:
   void on_connection();
   void accept(UniqueFd socket);

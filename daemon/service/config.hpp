@@ -74,6 +74,11 @@ struct ConfigKey {
   std::string_view value;  // what stands for the value in the help text: "COUNT"
   std::string_view help;
   ValueForm form;
+  // A new value in the file counts from a reload (SIGHUP) on, or not before the next start.
+  struct Change {
+    bool at_once;
+    bool (*is_same)(const Config& one, const Config& other);
+  } change;
   // Takes over `text`, for lists one element; the failure says what is wrong with it, without
   // naming the key.
   Result<void> (*set)(Config& config, std::string_view text);

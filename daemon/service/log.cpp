@@ -2,10 +2,12 @@
 #include "daemon/service/log.hpp"
 
 #include <poll.h>
+#include <sys/stat.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <cstdlib>
+#include <string>
 
 namespace dssm::daemon {
 namespace {
@@ -34,7 +36,7 @@ bool takes_a_line() noexcept {
 }  // namespace
 
 void StderrLogger::write(LogLevel level, std::string_view text, const LogFields& fields) noexcept {
-  if (level > level_) return;
+  if (leaves_out(level)) return;
   constexpr std::size_t kMaxLineBytes = 4096;  // PIPE_BUF: such a line is written as a whole
   if (!takes_a_line()) {
     ++left_out_;
@@ -56,8 +58,12 @@ void StderrLogger::write(LogLevel level, std::string_view text, const LogFields&
   [[maybe_unused]] const ssize_t written = ::write(STDERR_FILENO, line.data(), line.size());
 }
 
-bool under_systemd() noexcept {
-  return std::getenv("JOURNAL_STREAM") != nullptr;  // NOLINT(concurrency-mt-unsafe): one thread
+// Compared, because programs that a service starts inherit the variable, but not always stderr.
+bool stderr_is_journal() noexcept {
+  const char* stream = std::getenv("JOURNAL_STREAM");  // NOLINT(concurrency-mt-unsafe): one thread
+  struct stat file {};
+  if (!stream || ::fstat(STDERR_FILENO, &file)) return false;
+  return stream == std::to_string(file.st_dev) + ":" + std::to_string(file.st_ino);
 }
 
 std::string printable(std::string_view text) {

@@ -35,25 +35,37 @@ class Logger {
   void debug(std::string_view text, const LogFields& f = {}) { write(LogLevel::debug, text, f); }
 };
 
+// A logger that leaves out what is less important than its level, which may change at any time.
+class LeveledLogger : public Logger {
+ public:
+  explicit LeveledLogger(LogLevel level) : level_(level) {}
+  void set_level(LogLevel level) noexcept { level_ = level; }
+
+ protected:
+  bool leaves_out(LogLevel level) const noexcept { return level > level_; }
+
+ private:
+  LogLevel level_;
+};
+
 // One line per entry to stderr: "dssmd: warning: text", or "<4>text" where systemd collects stderr
 // and cuts such prefixes off itself. Never waits: a line that stderr does not take at once is left
 // out and counted, and the next line says how many are missing.
-class StderrLogger final : public Logger {
+class StderrLogger final : public LeveledLogger {
  public:
-  // journal_prefix: write "<4>" and the like; see under_systemd().
+  // journal_prefix: write "<4>" and the like; see stderr_is_journal().
   StderrLogger(LogLevel level, bool journal_prefix)
-      : level_(level), journal_prefix_(journal_prefix) {}
+      : LeveledLogger(level), journal_prefix_(journal_prefix) {}
 
   void write(LogLevel level, std::string_view text, const LogFields& fields) noexcept override;
 
  private:
-  LogLevel level_;
   bool journal_prefix_;
   std::uint64_t left_out_ = 0;
 };
 
-// Whether systemd connected this process's stderr to the journal ($JOURNAL_STREAM is set).
-bool under_systemd() noexcept;
+// Whether this process's stderr goes to the journal ($JOURNAL_STREAM names it).
+bool stderr_is_journal() noexcept;
 
 // `text` with control characters replaced by '?', so that what a client calls itself cannot forge
 // log lines.

@@ -26,4 +26,13 @@ inline constexpr std::string_view kHostRefused = "6e6d9e31825e4606b3c25808b5202f
 inline constexpr std::string_view kMirror = "23d4f07a4eab2d215e6fbbb2388899a9";
 inline constexpr std::string_view kRemoteWriter = "94e358d29cf143f9fb5c0eaa7656d3f6";
 
+inline constexpr std::string_view kRestored = "6652b011a31745f696e5b209f05c7cfc";
+inline constexpr std::string_view kStoredDropped = "fd7f54bc686049b2bcf77b75781c951a";
+inline constexpr std::string_view kStoreFull = "ea5df5dd2c364bba8caad1373754687b";
+inline constexpr std::string_view kSocketUnused = "86f14245a8b3478da87275019235f7e3";
+inline constexpr std::string_view kReloaded = "2c576e97c0d846c8befd084654c3f471";
+inline constexpr std::string_view kReloadFailed = "c167d78902794b3994971ec3e0b22184";
+inline constexpr std::string_view kRestartNeeded = "3b6dcdea709c45e2bbf57a286fb0fec0";
+inline constexpr std::string_view kFailed = "27e5b81c407a4d239b44a249741694ea";
+
 }  // namespace dssm::daemon::message_id

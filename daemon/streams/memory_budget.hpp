@@ -48,13 +48,13 @@ class MemoryBudget {
 
   // Fails with limit_exceeded, naming the key and what is left.
   Result<MemoryShare> take(std::uint64_t bytes) {
-    if (bytes <= limit_ - used_) {
+    if (bytes <= left()) {
       used_ += bytes;
       return MemoryShare(*this, bytes);
     }
     return Error{Errc::limit_exceeded,
                  std::to_string(bytes) + " bytes of memory are needed and " +
-                     std::to_string(limit_ - used_) +
+                     std::to_string(left()) +
                      " are left of max_memory = " + std::to_string(limit_) +
                      " bytes; keep less history, remove streams (dssmctl rm), or raise the key "
                      "max_memory"};
@@ -62,7 +62,7 @@ class MemoryBudget {
 
   // The same for whoever has other words, or another way, when it is used up.
   std::optional<MemoryShare> try_take(std::uint64_t bytes) noexcept {
-    if (bytes > limit_ - used_) return std::nullopt;
+    if (bytes > left()) return std::nullopt;
     used_ += bytes;
     return MemoryShare(*this, bytes);
   }
@@ -70,8 +70,12 @@ class MemoryBudget {
   std::uint64_t used() const noexcept { return used_; }
   std::uint64_t limit() const noexcept { return limit_; }
 
+  // Nothing is taken back: below what is used, nothing more is given.
+  void set_limit(std::uint64_t limit_bytes) noexcept { limit_ = limit_bytes; }
+
  private:
   friend class MemoryShare;
+  std::uint64_t left() const noexcept { return limit_ > used_ ? limit_ - used_ : 0; }
   std::uint64_t limit_;
   std::uint64_t used_ = 0;
 };

@@ -16,6 +16,11 @@ namespace dssm::daemon {
 //   fails  protocol (no sealed memory file), no_permission (somebody else's)
 Result<void> check_own_memory_file(int fd, int seals, std::string_view what);
 
+// What dssmd uses a descriptor for that it made itself; told by its name alone, so that who takes
+// it still has to check it.
+enum class DescriptorKind : unsigned char { other, ring, bell, meta, doorbell, playback_clock };
+DescriptorKind kind_of_untrusted(int fd);
+
 // Whether both stand for the same file.
 bool same_file(int fd, int other_fd) noexcept;
 

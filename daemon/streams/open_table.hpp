@@ -55,6 +55,8 @@ class OpenTable {
 
   explicit OpenTable(const Limits& limits) : limits_(limits) {}
 
+  void set_limits(const Limits& limits) { limits_ = limits; }  // for what comes
+
   // Whether `client` may open one more. Fails with limit_exceeded, naming the key.
   Result<void> check_room(const ClientIdentity& client) const;
 

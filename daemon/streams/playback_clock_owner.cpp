@@ -20,7 +20,7 @@ Result<void> PlaybackClockOwner::adopt_untrusted(UniqueFd offered) {
   if (auto record = clock::PlaybackRecord::open_untrusted(offered.get()); !record) {
     return std::move(record).error();
   }
-  clock_ = std::move(offered);
+  take(std::move(offered));
   return {};
 }
 
@@ -28,9 +28,14 @@ Result<UniqueFd> PlaybackClockOwner::get() {
   if (!clock_) {
     Result<UniqueFd> made = clock::create_playback_clock();
     if (!made) return std::move(made).error();
-    clock_ = *std::move(made);
+    take(*std::move(made));
   }
   return duplicate(clock_.get());
+}
+
+void PlaybackClockOwner::take(UniqueFd clock) {
+  clock_ = std::move(clock);
+  if (on_new_clock_) on_new_clock_(clock_.get());
 }
 
 }  // namespace dssm::daemon

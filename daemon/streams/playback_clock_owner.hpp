@@ -6,6 +6,7 @@
 #pragma once
 
 #include <dssm/result.hpp>
+#include <functional>
 
 #include "core/base/unique_fd.hpp"
 
@@ -23,8 +24,14 @@ class PlaybackClockOwner {
   // A descriptor (read and write) for a client; its own.
   Result<UniqueFd> get();
 
+  // Called with each clock from now on that was not there before; {}: nobody.
+  void on_new_clock(std::function<void(int fd)> then) { on_new_clock_ = std::move(then); }
+
  private:
+  void take(UniqueFd clock);
+
   UniqueFd clock_;
+  std::function<void(int)> on_new_clock_;
 };
 
 }  // namespace dssm::daemon

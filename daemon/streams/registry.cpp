@@ -83,10 +83,28 @@ Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, Of
     return Error{Errc::protocol,
                  context + ": the offered ring is that of '" + (*stream)->id().str() + "'"};
   }
-  if ((*stream)->purpose() != Purpose::own) {
-    return Error{Errc::protocol, context + ": the offered ring is a copy for another host"};
+  return add_adopted(*std::move(stream));
+}
+
+Result<std::shared_ptr<Stream>> Registry::adopt_stored_untrusted(OfferedFiles files) {
+  if (Result<void> room = check_room(); !room) return std::move(room).error();
+  Result<std::shared_ptr<Stream>> stream = Stream::adopt_untrusted(std::move(files), budget_);
+  if (!stream) return stream;
+  const StreamId& id = (*stream)->id();
+  // With not_found, own_id() would say that the stream was removed.
+  if (Result<StreamId> own = own_id(id); !own) return Error{Errc::conflict, own.error().message};
+  if (by_name_.contains(Key{id.name, id.id})) {
+    return Error{Errc::conflict, "stream '" + id.str() + "': another ring has that name"};
   }
-  add(*stream);
+  return add_adopted(*std::move(stream));
+}
+
+Result<std::shared_ptr<Stream>> Registry::add_adopted(std::shared_ptr<Stream> stream) {
+  if (stream->purpose() != Purpose::own) {
+    return Error{Errc::protocol, "stream '" + stream->id().str() +
+                                     "': the offered ring is a copy for another host"};
+  }
+  add(stream);
   return stream;
 }
 

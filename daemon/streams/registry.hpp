@@ -43,6 +43,12 @@ class Registry {
   Registry(const Registry&) = delete;
   Registry& operator=(const Registry&) = delete;
 
+  // For what comes; what is there stays.
+  void set_limits(const Limits& limits) {
+    limits_ = limits;
+    budget_.set_limit(limits.max_memory_bytes);
+  }
+
   // Told in the order in which they were added. Each outlives the registry or takes itself off;
   // none does either while it is told.
   void add_observer(StreamObserver& observer) { observers_.push_back(&observer); }
@@ -73,10 +79,14 @@ class Registry {
   Result<Created> create(const StreamId& id, const TypeInfo& type, const History& history,
                          std::int32_t creator_pid);
 
-  // Takes back a stream that a client (or, later, systemd) kept while no dssmd ran; gives the
+  // Takes back a stream that a client kept while no dssmd ran; gives the
   // registered one when it is the very same ring.
   //   fails  conflict (another ring has that name), protocol, no_permission, limit_exceeded
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, OfferedFiles files);
+
+  // The same of a stream that the service manager kept: which one, its files say.
+  //   fails  also not_found (the stream was removed)
+  Result<std::shared_ptr<Stream>> adopt_stored_untrusted(OfferedFiles files);
 
   // The name is free at once; whoever has the stream open keeps it.
   //   fails  not_found
@@ -89,6 +99,7 @@ class Registry {
   using Key = std::pair<std::string, std::int32_t>;
   Result<StreamId> own_id(StreamId id) const;
   Result<void> check_room() const;
+  Result<std::shared_ptr<Stream>> add_adopted(std::shared_ptr<Stream> stream);
   void add(std::shared_ptr<Stream> stream);
 
   std::string host_;

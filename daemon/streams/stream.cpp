@@ -216,6 +216,12 @@ Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role) {
   return descriptors;
 }
 
+std::vector<int> Stream::descriptors_to_keep() const {
+  std::vector<int> fds = {files_.ring.get(), files_.bell.get(), meta_.fd()};
+  for (const UniqueFd& doorbell : files_.doorbells) fds.push_back(doorbell.get());
+  return fds;
+}
+
 Result<std::shared_ptr<const ring::RingMapping>> Stream::map_for_writing() const {
   return ring::RingMapping::open_untrusted(files_.ring.get(), ring::Access::read_write);
 }
@@ -240,12 +246,10 @@ bool Stream::is_ring(int fd) const noexcept { return same_file(fd, files_.ring.g
 
 void Stream::take_doorbell_untrusted(UniqueFd doorbell) {
   if (!doorbell || files_.doorbells.size() == kMaxDoorbells) return;
-  char kind[64] = {};
-  const std::string path = "/proc/self/fd/" + std::to_string(doorbell.get());
-  if (::readlink(path.c_str(), kind, sizeof kind - 1) < 0) return;
   // A blocking one could stop whoever reads it.
   const int flags = ::fcntl(doorbell.get(), F_GETFL);
-  if (std::string_view(kind) != "anon_inode:[eventfd]" || !(flags & O_NONBLOCK)) return;
+  if (kind_of_untrusted(doorbell.get()) != DescriptorKind::doorbell || !(flags & O_NONBLOCK))
+    return;
   for (const UniqueFd& known : files_.doorbells) {
     if (same_open_file(known.get(), doorbell.get())) return;
   }

@@ -68,8 +68,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
   static Result<std::shared_ptr<Stream>> create(const Plan& plan, MemoryBudget& budget);
 
   // Brings a stream back from its memory files, after checking owner, seals, geometry, and that
-  // ring and meta file tell the same story. Serves clients' offers, and is made for systemd's
-  // descriptor store.
+  // ring and meta file tell the same story. Serves clients' offers and DescriptorStore.
   static Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles files, MemoryBudget& budget);
 
   Stream(const Stream&) = delete;
@@ -89,6 +88,9 @@ class Stream : public std::enable_shared_from_this<Stream> {
   // missing doorbell is made.
   Result<std::vector<UniqueFd>> descriptors_for(Role role);
 
+  // All that brings this stream back, at most kMostKept; the stream's own.
+  std::vector<int> descriptors_to_keep() const;
+
   // The ring for dssmd itself: to look at, to write to (mirrors), and its bell.
   const ring::RingMapping& mapping() const noexcept { return *mapping_; }
   Result<std::shared_ptr<const ring::RingMapping>> map_for_writing() const;
@@ -107,6 +109,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
   // eventfd, and what would be more than kMaxDoorbells, is dropped.
   void take_doorbell_untrusted(UniqueFd doorbell);
   static constexpr std::size_t kMaxDoorbells = 8;
+  static constexpr std::size_t kMostKept = 3 + kMaxDoorbells;
 
   // Tells of each doorbell, those that are there at once. At most one observer; nullptr: none.
   void observe_doorbells(DoorbellObserver* observer);

@@ -1,0 +1,40 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// SIGHUP: reads the configuration anew. With a mistake in it everything stays as it was, and all
+// mistakes are logged; else what can change while dssmd runs changes at once, and the keys that
+// take a restart are named.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <functional>
+
+#include "daemon/service/config.hpp"
+#include "daemon/service/log.hpp"
+
+namespace dssm::daemon {
+
+class Reloader {
+ public:
+  using Read = std::function<Result<Config>()>;
+  using Apply = std::function<void(const Config&)>;
+
+  // config: what dssmd runs with. apply: takes over the keys that may change at once. logger:
+  // outlives it.
+  Reloader(const Config& config, Read read, Apply apply, Logger& logger)
+      : started_with_(config),
+        applied_(config),
+        read_(std::move(read)),
+        apply_(std::move(apply)),
+        logger_(logger) {}
+
+  void reload();
+
+ private:
+  const Config started_with_;
+  Config applied_;
+  Read read_;
+  Apply apply_;
+  Logger& logger_;
+};
+
+}  // namespace dssm::daemon

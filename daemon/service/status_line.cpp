@@ -1,0 +1,28 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/service/status_line.hpp"
+
+#include <utility>
+
+namespace dssm::daemon {
+
+StatusLine::StatusLine(const EventLoop& loop, ServiceManager& manager,
+                       std::function<std::string()> text)
+    : manager_(manager),
+      text_(std::move(text)),
+      timer_(EventSource::timer(loop, [this] { update(); })) {}
+
+std::string StatusLine::now() { return told_ = text_(); }
+
+void StatusLine::touch() {
+  if (manager_.is_there() && !std::exchange(due_, true)) timer_.enable_in(kPause);
+}
+
+void StatusLine::update() {
+  due_ = false;
+  std::string text = text_();
+  if (text == told_) return;
+  told_ = std::move(text);
+  manager_.status(told_);
+}
+
+}  // namespace dssm::daemon
