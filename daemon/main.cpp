@@ -148,7 +148,8 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
   OpenTable opens(open_limits(config));
   PlaybackClockOwner clock;
   DescriptorStore store(registry, clock, manager, logger);
-  const bool some_may_be_missing = store.restore_untrusted(std::move(inherited.others));
+  const bool some_may_be_missing =
+      store.restore_untrusted(std::move(inherited.others), network->has_kept());
   // Nothing tells whether there was a dssmd before this one when its socket was handed over.
   const bool recovering = some_may_be_missing &&
                           (listener->predecessor_died() || listener->inherited()) &&

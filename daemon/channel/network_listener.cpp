@@ -78,6 +78,10 @@ void NetworkListener::keep_in(ServiceManager& manager) const {
   }
 }
 
+bool NetworkListener::has_kept() const {
+  return std::any_of(names_.begin(), names_.end(), is_kept_name);
+}
+
 std::string NetworkListener::str() const {
   if (addresses_.empty()) return "no network";
   std::string text = "listening at ";

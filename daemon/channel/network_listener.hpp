@@ -31,6 +31,7 @@ class NetworkListener {
   // Has the service manager keep the sockets, so that whoever connects while dssmd is restarted
   // waits and is not refused. Those that it handed over are its own anyhow.
   void keep_in(ServiceManager& manager) const;
+  bool has_kept() const;  // one of the sockets was kept by it
   // Whether a name that came with a socket is one that keep_in() gave.
   static bool is_kept_name(const std::string& name) { return name.starts_with('='); }
 

@@ -349,6 +349,8 @@ bool LocalService::is_gone(const Stream& stream) const {
 bool LocalService::must_wait(const local::Request& request) const {
   if (!recovering_ || request.has_offer()) return false;
   if (request.has_open_clock()) return !request.open_clock().offered() && !clock_.has_one();
+  // Whoever watches would be told that streams are gone which are about to come back.
+  if (request.has_watch()) return true;
   const proto::StreamId* subject = StreamRequests::subject(request);
   if (!subject) return false;
   // A name that is no name is refused at once.

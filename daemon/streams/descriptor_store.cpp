@@ -21,18 +21,24 @@ static_assert(kDigits.size() == 64 && kNames > DescriptorStore::kMaxDescriptors)
 }  // namespace
 
 DescriptorStore::DescriptorStore(Registry& registry, PlaybackClockOwner& clock,
-                                 ServiceManager& manager, Logger& logger)
-    : registry_(registry), clock_(clock), manager_(manager), logger_(logger) {}
+                                 ServiceManager& manager, Logger& logger,
+                                 std::size_t max_descriptors)
+    : registry_(registry),
+      clock_(clock),
+      manager_(manager),
+      logger_(logger),
+      max_descriptors_(max_descriptors) {}
 
 DescriptorStore::~DescriptorStore() {
   clock_.on_new_clock({});
   registry_.remove_observer(*this);
 }
 
-bool DescriptorStore::restore_untrusted(std::vector<NamedDescriptor> kept) {
+bool DescriptorStore::restore_untrusted(std::vector<NamedDescriptor> kept, bool store_is_there) {
   std::map<std::string, std::vector<UniqueFd>> groups;
   for (NamedDescriptor& one : kept) groups[one.name].push_back(std::move(one.fd));
-  bool all_is_here = !groups.empty() && kept.size() + Stream::kMostKept <= kMaxDescriptors;
+  bool all_is_here =
+      (store_is_there || !groups.empty()) && kept.size() + Stream::kMostKept <= max_descriptors_;
   for (auto& [name, fds] : groups) {
     switch (take_back(name, std::move(fds))) {
       case Taken::good:
@@ -119,11 +125,11 @@ void DescriptorStore::keep_clock(int fd) {
 void DescriptorStore::on_stream_added(const Stream& stream) {
   if (!manager_.is_there()) return;
   const std::vector<int> fds = stream.descriptors_to_keep();
-  if (descriptors_ + fds.size() > kMaxDescriptors) {
+  if (descriptors_ + fds.size() > max_descriptors_) {
     if (std::exchange(told_full_, true)) return;
     return logger_.warning(
         "stream '" + stream.id().str() + "' and further ones are not kept while dssmd restarts: " +
-            std::to_string(kMaxDescriptors) +
+            std::to_string(max_descriptors_) +
             " descriptors are in the service manager's store already; the programs that hold "
             "these streams give them back, remove (dssmctl rm) those that nobody needs",
         {.stream = stream.id().str(), .message_id = message_id::kStoreFull});

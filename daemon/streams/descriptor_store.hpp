@@ -35,16 +35,19 @@ class DescriptorStore final : private StreamObserver {
 
   // All outlive it.
   DescriptorStore(Registry& registry, PlaybackClockOwner& clock, ServiceManager& manager,
-                  Logger& logger);
+                  Logger& logger, std::size_t max_descriptors = kMaxDescriptors);
   DescriptorStore(const DescriptorStore&) = delete;
   DescriptorStore& operator=(const DescriptorStore&) = delete;
   ~DescriptorStore();
 
   // Takes back what was kept, checked as what programs offer. What is not in order is dropped with
   // a warning. To be called once, before anything is created.
-  //   returns  whether streams may be missing that an earlier dssmd had: nothing was kept, or some
-  //            of it was dropped, or the store was full
-  bool restore_untrusted(std::vector<NamedDescriptor> kept);
+  //   store_is_there  something else came from the store: had there been streams, they would have,
+  //                   too
+  //   returns         whether streams may be missing that an earlier dssmd had: nothing was kept,
+  //   or
+  //                   some of it was dropped, or the store was full
+  bool restore_untrusted(std::vector<NamedDescriptor> kept, bool store_is_there);
 
   std::size_t descriptors() const noexcept { return descriptors_; }
 
@@ -66,6 +69,7 @@ class DescriptorStore final : private StreamObserver {
   PlaybackClockOwner& clock_;
   ServiceManager& manager_;
   Logger& logger_;
+  const std::size_t max_descriptors_;
   bool told_full_ = false;
   std::size_t descriptors_ = 0;
   std::uint32_t next_ = 0;

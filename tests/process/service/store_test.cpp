@@ -1,0 +1,152 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What is in the service manager's descriptor store, and what dssmd makes of a store that is not in
+// order.
+#include <fcntl.h>
+#include <gtest/gtest.h>
+#include <sys/eventfd.h>
+#include <sys/mman.h>
+
+#include <csignal>
+#include <dssm/dssm.hpp>
+
+#include "tests/support/service_manager.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr History kShort{16, 1ms};
+constexpr std::size_t kPerStream = 4;  // ring, bell, meta, doorbell
+
+ServiceManager::Options without_network() { return {.arguments = {"--listen", ""}}; }
+
+Session connect_to(const ServiceManager& manager) {
+  return Session::connect({.socket_path = manager.socket_path(), .request_timeout = 60s}).value();
+}
+
+std::vector<std::string> stream_names(Session& session) {
+  std::vector<std::string> names;
+  for (const StreamInfo& stream : session.list().value()) names.push_back(stream.id.name);
+  return names;
+}
+
+UniqueFd fake_ring() {
+  return UniqueFd(::memfd_create("dssm-ring:a:0@pc1", MFD_CLOEXEC | MFD_ALLOW_SEALING));
+}
+
+TEST(DescriptorStore, HoldsFourDescriptorsOfAStreamUntilItIsRemoved) {
+  ServiceManager manager(without_network());
+  Session session = connect_to(manager);
+  for (const char* name : {"a", "b", "c"}) session.create<int>(name, kShort).value();
+  EXPECT_EQ(manager.stored_descriptors(), 3 * kPerStream);
+  EXPECT_EQ(manager.stored().size(), 3u) << "a name for each stream";
+  ASSERT_TRUE(session.remove({"b", 0, ""}));
+  EXPECT_EQ(manager.stored_descriptors(), 2 * kPerStream);
+  manager.restart();
+  EXPECT_EQ(stream_names(session), (std::vector<std::string>{"a", "c"}));
+  // A new life gives out names that the old one did not.
+  session.create<int>("d", kShort).value();
+  EXPECT_EQ(manager.stored_descriptors(), 3 * kPerStream);
+  EXPECT_EQ(manager.stored().size(), 3u);
+  for (const char* name : {"a", "c", "d"}) ASSERT_TRUE(session.remove({name, 0, ""}));
+  EXPECT_EQ(manager.stored_descriptors(), 0u);
+  manager.restart();
+  EXPECT_EQ(stream_names(session), std::vector<std::string>());
+}
+
+TEST(DescriptorStore, HoldsTheListeningSocketOnceOverManyRestarts) {
+  ServiceManager manager;
+  const std::string address = manager.address();
+  EXPECT_EQ(manager.stored(), (std::map<std::string, std::size_t>{{"=0", 1}}));
+  for (int round = 0; round < 3; ++round) {
+    manager.restart();
+    EXPECT_EQ(manager.address(), address);
+    EXPECT_EQ(manager.stored_descriptors(), 1u);
+    EXPECT_EQ(manager.doubled(), 0);
+  }
+}
+
+TEST(DescriptorStore, HoldsThePlaybackClock) {
+  ServiceManager manager(without_network());
+  ASSERT_TRUE(connect_to(manager).playback_clock());
+  EXPECT_EQ(manager.stored_descriptors(), 1u);
+  manager.restart();
+  ASSERT_TRUE(connect_to(manager).playback_clock());
+  EXPECT_EQ(manager.stored_descriptors(), 1u);
+}
+
+TEST(DescriptorStore, DropsWhatIsNotInOrderAndKeepsTheRest) {
+  ServiceManager manager(without_network());
+  Session session = connect_to(manager);
+  auto writer = session.create<int>("good", kShort).value();
+  manager.kill_hard();
+  manager.put_into_store("null", UniqueFd(::open("/dev/null", O_RDWR | O_CLOEXEC)));
+  manager.put_into_store("lone", fake_ring());
+  manager.put_into_store("bell", UniqueFd(::eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK)));
+  for (const char* kind : {"dssm-ring:x:0@pc1", "dssm-bell", "dssm-meta"}) {
+    manager.put_into_store("empty",
+                           UniqueFd(::memfd_create(kind, MFD_CLOEXEC | MFD_ALLOW_SEALING)));
+  }
+  manager.put_into_store("clock", UniqueFd(::memfd_create("dssm-playback-clock", MFD_CLOEXEC)));
+  manager.start();
+  EXPECT_EQ(stream_names(session), std::vector<std::string>{"good"});
+  EXPECT_EQ(session.info({"good", 0, ""}).value().incarnation, writer.incarnation());
+  EXPECT_EQ(manager.stored_descriptors(), kPerStream) << "what was dropped is out of the store";
+}
+
+// A stream whose entry is broken comes back from the program that holds it.
+TEST(DescriptorStore, LetsProgramsGiveBackWhatTheStoreLost) {
+  ServiceManager manager({.arguments = {"--listen", ""}, .store_max = kPerStream + 2});
+  Session session = connect_to(manager);
+  auto first = session.create<int>("first", kShort).value();
+  auto second = session.create<int>("second", kShort).value();
+  EXPECT_EQ(manager.stored_descriptors(), kPerStream + 2) << "the second one is there by half";
+  manager.kill_hard();
+  manager.start();
+  // Held back until the program that holds it is here, although another one is quicker.
+  Session eager = connect_to(manager);
+  EXPECT_EQ(eager.create<int>("second", kShort).value().incarnation(), second.incarnation());
+  EXPECT_EQ(eager.create<int>("first", kShort).value().incarnation(), first.incarnation());
+}
+
+TEST(DescriptorStore, DoesNotBringARemovedStreamBack) {
+  ServiceManager manager(without_network());
+  Session session = connect_to(manager);
+  session.create<int>("gone", kShort).value();
+  ASSERT_TRUE(session.remove({"gone", 0, ""}));
+  manager.kill_hard();
+  manager.start();
+  EXPECT_EQ(stream_names(session), std::vector<std::string>());
+}
+
+TEST(DescriptorStore, RefusesStreamsOfAnotherHostName) {
+  ServiceManager manager(without_network());
+  { connect_to(manager).create<int>("s", kShort).value(); }
+  manager.kill_hard();
+  manager.rename_host("pc9");
+  manager.start();
+  Session session = connect_to(manager);
+  EXPECT_EQ(stream_names(session), std::vector<std::string>());
+  EXPECT_EQ(manager.stored_descriptors(), 0u);
+}
+
+// systemd starts no program with an environment variable above 128 KiB, and all names are in one.
+TEST(DescriptorStore, StartsAgainWithAsManyStreamsAsTheDefaultAllows) {
+  ServiceManager manager(without_network());
+  constexpr std::size_t kStreams = 4096;
+  {
+    Session session = connect_to(manager);
+    for (std::size_t i = 0; i < kStreams; ++i) {
+      ASSERT_TRUE(session.create<int>("many:" + std::to_string(i), kShort));
+    }
+  }
+  EXPECT_EQ(manager.stored_descriptors(), kStreams * kPerStream);
+  manager.kill_hard();
+  manager.start();
+  EXPECT_EQ(connect_to(manager).list().value().size(), kStreams);
+}
+
+}  // namespace
+}  // namespace dssm::test
