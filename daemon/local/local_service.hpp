@@ -13,8 +13,9 @@
 // another host only for those who named none.
 //
 // After a crash of the dssmd before this one, programs that still hold streams come back and offer
-// them. Until end_recovery() a request about a stream that nobody offered yet is held back, not
-// refused: otherwise a writer that starts anew could take the name of a ring that others still use.
+// them. Until end_recovery() a Watch, and a request about a stream that nobody offered yet, is held
+// back, not refused: otherwise a writer that starts anew could take the name of a ring that others
+// still use.
 #pragma once
 
 #include <cstddef>

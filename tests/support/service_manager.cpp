@@ -44,12 +44,14 @@ UniqueFd bind_unix(const std::string& path, int type) {
 }
 
 bool is_same_open_file(int one, int other) {
-  struct stat first {
-  }, second{};
-  ::fstat(one, &first), ::fstat(other, &second);
-  if (first.st_ino != second.st_ino) return false;  // the quick way for most
   const pid_t self = ::getpid();
   return ::syscall(SYS_kcmp, self, self, KCMP_FILE, one, other) == 0;
+}
+
+ino_t inode_of(int fd) {
+  struct stat file {};
+  if (::fstat(fd, &file)) fail("fstat");
+  return file.st_ino;
 }
 
 // The value of `key` in a message "KEY=value\nOTHER=..."; empty: it is not there.
@@ -220,7 +222,8 @@ std::size_t ServiceManager::stored_descriptors() {
 
 void ServiceManager::put_into_store(const std::string& name, UniqueFd fd) {
   const std::lock_guard guard(mutex_);
-  store_.push_back({name, std::move(fd)});
+  const ino_t inode = inode_of(fd.get());
+  store_.push_back({name, std::move(fd), inode});
 }
 
 int ServiceManager::doubled() {
@@ -268,12 +271,13 @@ void ServiceManager::take(const std::string& text, std::vector<UniqueFd> fds) {
     std::erase_if(store_, [&](const Stored& one) { return one.name == name; });
   } else if (value_of(text, "FDSTORE") == "1") {
     for (UniqueFd& fd : fds) {
+      const ino_t inode = inode_of(fd.get());
       const bool is_there = std::any_of(store_.begin(), store_.end(), [&](const Stored& one) {
-        return is_same_open_file(one.fd.get(), fd.get());
+        return one.inode == inode && is_same_open_file(one.fd.get(), fd.get());
       });
       if (is_there) ++doubled_;
       if (is_there || store_.size() >= options_.store_max) continue;
-      store_.push_back({name, std::move(fd)});
+      store_.push_back({name, std::move(fd), inode});
     }
   }
   if (const std::string status = value_of(text, "STATUS"); !status.empty()) status_ = status;

@@ -82,6 +82,7 @@ class ServiceManager {
   struct Stored {
     std::string name;
     UniqueFd fd;
+    ino_t inode = 0;  // the quick way to see that two are not the same
   };
 
   int end(int number);

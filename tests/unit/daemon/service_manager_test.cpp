@@ -1,0 +1,128 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Messages to systemd and to its journal: what they hold, and that nobody waits for them.
+#include "daemon/service/service_manager.hpp"
+
+#include <gtest/gtest.h>
+#include <sys/socket.h>
+#include <sys/un.h>
+
+#include <cstring>
+
+#include "daemon/service/journal_logger.hpp"
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+// A datagram socket that takes what is sent to it when it is asked.
+class Inbox {
+ public:
+  Inbox() {
+    sockaddr_un address{};
+    address.sun_family = AF_UNIX;
+    std::strncpy(address.sun_path, path().c_str(), sizeof address.sun_path - 1);
+    EXPECT_EQ(::bind(fd_.get(), reinterpret_cast<sockaddr*>(&address), sizeof address), 0);
+  }
+  Inbox(const Inbox&) = delete;
+  Inbox& operator=(const Inbox&) = delete;
+  ~Inbox() { test::remove_tree(dir_); }
+
+  std::string path() const { return dir_ + "/socket"; }
+  std::string next() {  // empty: nothing is there
+    char text[8192];
+    const ssize_t bytes = ::recv(fd_.get(), text, sizeof text, MSG_DONTWAIT);
+    return bytes > 0 ? std::string(text, static_cast<std::size_t>(bytes)) : "";
+  }
+
+ private:
+  std::string dir_ = test::make_temp_dir();
+  UniqueFd fd_{::socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0)};
+};
+
+class ServiceManagerTest : public testing::Test {
+ protected:
+  // Until the manager takes nothing more.
+  int fill() {
+    int sent = 0;
+    for (; manager.waiting() == 0 && sent < 100'000; ++sent) manager.status(std::to_string(sent));
+    return sent;
+  }
+  EventLoop loop = EventLoop::open().value();
+  Inbox inbox;
+  ServiceManager manager{loop, inbox.path()};
+};
+
+TEST_F(ServiceManagerTest, SendsWhatSystemdUnderstands) {
+  manager.ready("all\nis well");
+  EXPECT_EQ(inbox.next(), "READY=1\nSTATUS=all?is well");
+  manager.reloading();
+  EXPECT_TRUE(inbox.next().starts_with("RELOADING=1\nMONOTONIC_USEC="));
+  manager.keep("abc", {0});
+  EXPECT_EQ(inbox.next(), "FDSTORE=1\nFDPOLL=0\nFDNAME=abc");
+  manager.forget("abc");
+  EXPECT_EQ(inbox.next(), "FDSTOREREMOVE=1\nFDNAME=abc");
+  manager.alive();
+  EXPECT_EQ(inbox.next(), "WATCHDOG=1");
+}
+
+TEST_F(ServiceManagerTest, SendsLaterAndInOrderWhatIsNotTakenAtOnce) {
+  const int before = fill();
+  ASSERT_EQ(manager.waiting(), 1u);
+  manager.status("later");
+  manager.alive();  // worthless later
+  EXPECT_EQ(manager.waiting(), 2u);
+  EventSource look = EventSource::timer(loop, [&] {
+    if (manager.waiting() == 0) return loop.stop();
+    look.enable_in(std::chrono::milliseconds(1));
+  });
+  for (int i = 0; i < before - 1; ++i) EXPECT_EQ(inbox.next(), "STATUS=" + std::to_string(i));
+  look.enable_in(Duration::zero());
+  ASSERT_TRUE(loop.run());
+  EXPECT_EQ(inbox.next(), "STATUS=" + std::to_string(before - 1));
+  EXPECT_EQ(inbox.next(), "STATUS=later");
+  EXPECT_EQ(inbox.next(), "");
+}
+
+TEST_F(ServiceManagerTest, DoesNotKeepWhatIsForgottenBeforeItWasSent) {
+  fill();
+  manager.keep("abc", {0});
+  EXPECT_EQ(manager.waiting(), 2u);
+  manager.forget("abc");
+  EXPECT_EQ(manager.waiting(), 1u);
+}
+
+TEST(NoServiceManager, IsNotMissed) {
+  EventLoop loop = EventLoop::open().value();
+  for (const std::string path : {"", "nonsense", "/nowhere/notify"}) {
+    ServiceManager manager(loop, path);
+    manager.ready("up");
+    manager.keep("abc", {0});
+    EXPECT_EQ(manager.waiting(), 0u);
+  }
+}
+
+TEST(JournalLogger, WritesFieldsThatCanBeSearched) {
+  Inbox inbox;
+  JournalLogger logger(LogLevel::info, inbox.path());
+  logger.warning("hot\nPRIORITY=0", {.stream = "s:0@pc1", .peer = "'x'", .message_id = "0123"});
+  EXPECT_EQ(inbox.next(),
+            "MESSAGE=hot?PRIORITY=0\nPRIORITY=4\nSYSLOG_IDENTIFIER=dssmd\nMESSAGE_ID=0123\n"
+            "DSSM_STREAM=s:0@pc1\nDSSM_PEER='x'\n");
+  logger.debug("quiet");
+  EXPECT_EQ(inbox.next(), "");
+  logger.set_level(LogLevel::debug);
+  logger.debug("loud");
+  EXPECT_EQ(inbox.next(), "MESSAGE=loud\nPRIORITY=7\nSYSLOG_IDENTIFIER=dssmd\n");
+}
+
+TEST(JournalLogger, DoesNotWaitForAJournalThatHangs) {
+  Inbox inbox;  // nobody takes anything
+  JournalLogger logger(LogLevel::info, inbox.path());
+  testing::internal::CaptureStderr();
+  for (int i = 0; i < 10'000; ++i) logger.info("line");
+  EXPECT_NE(testing::internal::GetCapturedStderr().find("<6>line\n"), std::string::npos);
+}
+
+}  // namespace
+}  // namespace dssm::daemon
