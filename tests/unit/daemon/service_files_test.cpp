@@ -44,7 +44,7 @@ TEST(Catalog, HasASubjectAndATextInEachEntry) {
   const std::size_t entries = all_matches(catalog, "\n(-- )").size();
   EXPECT_EQ(all_matches(catalog,
                         "\n(-- [0-9a-f]{32}\nSubject: [^\n]+\nDefined-By: DSSM\n"
-                        "Documentation: [^\n]+\n\n[A-Z])")
+                        "Documentation: [^\n]+\n\n[A-Za-z])")
                 .size(),
             entries);
 }
