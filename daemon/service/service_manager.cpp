@@ -23,9 +23,9 @@ namespace {
 
 constexpr std::size_t kMostDescriptorsPerMessage = 253;  // the kernel's SCM_MAX_FD
 
-// Until what the manager did not take is tried again. Not told by the socket: too many descriptors
-// under way are no matter of room in it.
-constexpr Duration kPause = std::chrono::milliseconds(2);
+// Until what the manager did not take is tried again when the socket does not tell: too many
+// descriptors under way are no matter of room in it.
+constexpr Duration kPause = std::chrono::milliseconds(10);
 
 }  // namespace
 
@@ -48,7 +48,8 @@ std::string ServiceManager::notify_socket() {
 }
 
 ServiceManager::ServiceManager(const EventLoop& loop, std::string notify_socket)
-    : path_(std::move(notify_socket)),
+    : loop_(loop),
+      path_(std::move(notify_socket)),
       try_again_(EventSource::timer(loop, [this] { send_waiting(); })) {
   const bool is_address = (path_.starts_with('/') || path_.starts_with('@')) && path_.size() > 1 &&
                           path_.size() < sizeof(sockaddr_un::sun_path);
@@ -106,8 +107,12 @@ ServiceManager::Sent ServiceManager::send_now(const Message& message) {
   for (int attempt = 0; attempt < 2; ++attempt) {
     if (!socket_ && !connect()) return Sent::nobody_there;
     const Sent sent = try_send(message);
-    if (sent == Sent::not_now) try_again_.enable_in(kPause);
+    if (sent == Sent::not_now) {
+      writable_.enable();
+      try_again_.enable_in(kPause);
+    }
     if (sent != Sent::nobody_there) return sent;
+    writable_ = EventSource();
     socket_.reset();
   }
   return Sent::nobody_there;
@@ -125,6 +130,10 @@ bool ServiceManager::connect() {
     return false;
   }
   socket_ = std::move(socket);
+  writable_ = EventSource::writable(loop_, socket_.get(), [this] {
+    writable_.disable();
+    try_again_.enable_in(Duration::zero());
+  });
   return true;
 }
 

@@ -4,8 +4,9 @@
 // over a restart (FileDescriptorStoreMax=), and hands over sockets and what it kept. Where there is
 // none ($NOTIFY_SOCKET, $LISTEN_FDS) nothing of this does anything.
 //
-// Nothing here waits: what the manager does not take at once goes out in order when it does.
-// Watchdog signs are the exception, they are worthless later.
+// Nothing here waits: what the manager does not take at once goes out in order when it does. A
+// dssmd that is killed before that did not say it: streams of that moment come back from their
+// programs. Watchdog signs are the exception, they are worthless later.
 #pragma once
 
 #include <cstddef>
@@ -74,9 +75,11 @@ class ServiceManager {
   bool connect();
   void send_waiting();
 
+  const EventLoop& loop_;
   std::string path_;
   UniqueFd socket_;
   std::deque<Message> waiting_;
+  EventSource writable_;  // of the socket; only hurries try_again_, which may replace it
   EventSource try_again_;
 };
 

@@ -226,6 +226,10 @@ void ServiceManager::put_into_store(const std::string& name, UniqueFd fd) {
   store_.push_back({name, std::move(fd), inode});
 }
 
+void ServiceManager::await_stored(std::size_t descriptors) {
+  await([&](const Messages&) { return store_.size() == descriptors; });
+}
+
 int ServiceManager::doubled() {
   const std::lock_guard guard(mutex_);
   drain();

@@ -73,6 +73,7 @@ class ServiceManager {
   // In the store now: by name, how many descriptors. All that dssmd sent before this call counts.
   std::map<std::string, std::size_t> stored();
   std::size_t stored_descriptors();
+  void await_stored(std::size_t descriptors);  // many at once take their time
   // Puts something there that dssmd never sent.
   void put_into_store(const std::string& name, UniqueFd fd);
   // How often descriptors came that were there already.

@@ -149,7 +149,7 @@ TEST(DescriptorStore, BringsThousandsOfStreamsBack) {
       ASSERT_TRUE(session.create<int>("many:" + std::to_string(i), kShort));
     }
   }
-  EXPECT_EQ(manager.stored_descriptors(), streams * kPerStream);
+  manager.await_stored(streams * kPerStream);
   manager.kill_hard();
   manager.start();
   EXPECT_EQ(connect_to(manager).list().value().size(), streams);
