@@ -36,6 +36,7 @@ struct Dialer::State {
   }
 
   void begin_round();
+  void begin_anew();
   void begin_with(std::vector<wire::SocketAddress> found);
   void try_next_address();
   void on_connected();
@@ -66,6 +67,15 @@ struct Dialer::State {
   std::string last_choice;      // of addresses; empty: any
   EventSource connected, timer;
 };
+
+// Leaves an attempt to connect for a round of its own. From the timer: it may be in the attempt's
+// own callback that somebody has learned of better addresses.
+void Dialer::State::begin_anew() {
+  connected.disable();
+  socket.reset();
+  step = Step::pause;
+  timer.enable_in(Duration::zero());
+}
 
 // Who is at the other end, as far as known.
 std::string Dialer::State::who() const {
@@ -236,7 +246,10 @@ void Dialer::restart(const Error& why) {
 }
 
 void Dialer::set_addresses(std::vector<wire::Address> addresses) {
-  state_->options.addresses = std::move(addresses);
+  State& state = *state_;
+  if (addresses == state.options.addresses) return;
+  state.options.addresses = std::move(addresses);
+  if (state.step == State::Step::connect) state.begin_anew();
 }
 
 FrameLink* Dialer::link() noexcept {

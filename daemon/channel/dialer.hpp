@@ -67,7 +67,8 @@ class Dialer final : private FrameLink::User {
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
   // the next attempt after the pause that is due. While it pauses anyway: nothing.
   void restart(const Error& why);
-  // Where to go from the next round of attempts on; what is up stays as it is.
+  // Where to go from the next round of attempts on. That begins at once when one is just waiting
+  // for somebody to answer; what is up stays as it is.
   void set_addresses(std::vector<wire::Address> addresses);
 
   FrameLink* link() noexcept;             // nullptr unless up

@@ -44,6 +44,24 @@ class RawServer {
   EventSource accepting_;
 };
 
+// A full queue of connections: the kernel leaves further ones without any answer.
+class SilentServer {
+ public:
+  SilentServer() {
+    sockaddr_in any{};
+    any.sin_family = AF_INET;
+    any.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    EXPECT_EQ(::bind(full_.get(), reinterpret_cast<const sockaddr*>(&any), sizeof any), 0);
+    EXPECT_EQ(::listen(full_.get(), 0), 0);
+    EXPECT_EQ(::connect(filler_.get(), address().get(), address().length), 0);
+  }
+  wire::SocketAddress address() const { return wire::local_address(full_.get()).value(); }
+
+ private:
+  UniqueFd full_{::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0)};
+  UniqueFd filler_{::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0)};
+};
+
 // A port that nobody listens at: taken and given back.
 wire::SocketAddress closed_port(const EventLoop& loop) {
   return RawServer(loop, "", false).address();
@@ -157,16 +175,8 @@ TEST_F(DialerTest, BeginsBehindAnAddressThatIsOfNoUse) {
 }
 
 TEST_F(DialerTest, LetsItsAddressesShareTheTimeOfARound) {
-  // A full queue of connections: the kernel leaves further ones without any answer.
-  const UniqueFd full(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
-  sockaddr_in any{};
-  any.sin_family = AF_INET;
-  any.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
-  ASSERT_EQ(::bind(full.get(), reinterpret_cast<const sockaddr*>(&any), sizeof any), 0);
-  ASSERT_EQ(::listen(full.get(), 0), 0);
-  const wire::SocketAddress dead = wire::local_address(full.get()).value();
-  const UniqueFd filler(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
-  ASSERT_EQ(::connect(filler.get(), dead.get(), dead.length), 0);
+  const SilentServer silent;
+  const wire::SocketAddress dead = silent.address();
   FakeOwner owner(loop);
   Dialer::Options options;
   options.round_time = std::chrono::milliseconds(40);
@@ -177,6 +187,23 @@ TEST_F(DialerTest, LetsItsAddressesShareTheTimeOfARound) {
   wait([&] { return up || timed_out; });
   EXPECT_TRUE(up);
   EXPECT_TRUE(downs.empty());
+}
+
+TEST_F(DialerTest, LeavesAnAddressThatDoesNotAnswerForNewOnesAtOnce) {
+  const SilentServer silent;
+  FakeOwner owner(loop);
+  dial_in_turn({silent.address()});
+  event_base_loop(loop.base(), EVLOOP_ONCE);  // it begins to connect
+  bool timed_out = false;
+  EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
+  timer.enable_in(Dialer::kConnectTimeout);  // what it would wait else
+  dialer->set_addresses({owner.host().address});
+  wait([&] { return up || timed_out; });
+  EXPECT_TRUE(up);
+  EXPECT_TRUE(downs.empty());
+  dialer->set_addresses({wire::Address::parse(silent.address().str()).value()});
+  event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
+  EXPECT_TRUE(up) << "what is up stays";
 }
 
 TEST_F(DialerTest, SaysWhyNoAddressOfANameWorked) {
