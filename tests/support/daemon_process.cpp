@@ -158,6 +158,10 @@ DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& 
   if (!listens(extra) && !addresses_.empty()) argv_.back() = addresses_.front();
 }
 
+void DaemonProcess::call(const std::string& host) {
+  *(std::find(argv_.begin(), argv_.end(), "--name") + 1) = host;
+}
+
 void DaemonProcess::start() {
   const std::string notify_path = dir_ + "/notify";
   const int notify = ::socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0);

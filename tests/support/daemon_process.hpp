@@ -53,9 +53,10 @@ class DaemonProcess {
   std::string address() const { return addresses_.empty() ? "" : addresses_.front(); }
   const std::vector<std::string>& addresses() const { return addresses_; }
 
-  void kill_hard();  // SIGKILL, and waits for its end
-  int stop();        // SIGTERM, and its exit status
-  void start();      // again, in the same folder
+  void kill_hard();                    // SIGKILL, and waits for its end
+  int stop();                          // SIGTERM, and its exit status
+  void start();                        // again, in the same folder
+  void call(const std::string& host);  // so from the next start() on
 
  private:
   std::string dir_;

@@ -4,6 +4,7 @@
 // listens on the network and finds the others by mDNS alone.
 #pragma once
 
+#include <algorithm>
 #include <cstdlib>
 #include <dssm/dssm.hpp>
 #include <memory>
@@ -22,22 +23,36 @@ class MdnsVehicle {
   // PCs 1 to `pcs`, without a dssmd.
   //   fails  when this machine cannot do it, with the reason: skip the test with it
   Result<void> open(int pcs) {
+    const Result<void> made = open_without_avahi(pcs);
+    for (int pc = 1; made && pc <= pcs; ++pc) start_avahi(pc);
+    return made;
+  }
+  // The same, but nothing runs there: first the network is to be made another one.
+  Result<void> open_without_avahi(int pcs) {
     Result<std::unique_ptr<Network>> network = Network::open(pcs);
     if (!network) return std::move(network).error();
     network_ = *std::move(network);
     for (int pc = 1; pc <= pcs; ++pc) {
-      Result<std::unique_ptr<AvahiHost>> host = AvahiHost::open(*network_, pc, Network::name(pc));
-      if (!host) return std::move(host).error();
-      avahi_.push_back(*std::move(host));
-      avahi(pc).start_dbus();
-      avahi(pc).start_avahi();
+      if (Result<void> made = name_pc(pc, Network::name(pc)); !made) return made;
     }
     return {};
   }
-  // A dssmd on the next PC, called "pc1" ...
-  void add_dssmd() {
+  // Calls a PC otherwise in mDNS, as long as its Avahi does not run.
+  Result<void> name_pc(int pc, const std::string& name) {
+    Result<std::unique_ptr<AvahiHost>> host = AvahiHost::open(*network_, pc, name);
+    if (!host) return std::move(host).error();
+    avahi_.resize(std::max(avahi_.size(), static_cast<std::size_t>(pc)));
+    avahi_[static_cast<std::size_t>(pc) - 1] = *std::move(host);
+    return {};
+  }
+  void start_avahi(int pc) {
+    avahi(pc).start_dbus();
+    avahi(pc).start_avahi();
+  }
+  // A dssmd on the next PC, called "pc1" ... unless `name` says otherwise.
+  void add_dssmd(const std::vector<std::string>& flags = {}, const std::string& name = {}) {
     const int pc = static_cast<int>(dssmds_.size()) + 1;
-    dssmds_.push_back(make_dssmd(pc, Network::name(pc)));
+    dssmds_.push_back(make_dssmd(pc, name.empty() ? Network::name(pc) : name, flags));
     sessions_.push_back(session_of(dssmd(pc)));
   }
 

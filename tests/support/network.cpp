@@ -92,19 +92,58 @@ Result<std::unique_ptr<Network>> Network::open(int hosts) {
   for (int host = 1; host <= hosts; ++host) {
     made = make_namespace();
     if (!made) return std::move(made).error();
-    ip("link add " + name(host) + " type veth peer name eth0 netns " + path_of(*made) + "\n" +
-       "link set " + name(host) + " master switch\n" +  //
-       "link set " + name(host) + " up\n");
     network->hosts_.push_back(*std::move(made));
-    const Inside in_host = network->inside(host);
-    ip("link set lo up\n"
-       "link set eth0 up\n"
-       "address add " +
-       address(host) + "/24 dev eth0\n" +  //
-       // nodad: usable at once, also after the cable was out.
-       "address add " + address6(host) + "/64 dev eth0 nodad\n");
+    network->configure(host, "link set lo up\n");
+    network->connect(host, name(host), "eth0");
+    network->configure(
+        host, "address add " + address(host) +
+                  "/24 dev eth0\n" +  //
+                                      // nodad: usable at once, also after the cable was out.
+                  "address add " + address6(host) + "/64 dev eth0 nodad\n");
   }
   return network;
+}
+
+// `port` is the cable's end in the switch.
+void Network::connect(int host, const std::string& port, const std::string& interface) {
+  {
+    const Inside inside(switch_.get());
+    ip("link add " + port + " type veth peer name " + interface + " netns " +
+       path_of(hosts_.at(static_cast<std::size_t>(host) - 1)) + "\n" +  //
+       "link set " + port + " master switch\n" +                        //
+       "link set " + port + " up\n");
+  }
+  configure(host, "link set " + interface + " up\n");
+}
+
+void Network::add_cable(int host, const std::string& interface) {
+  connect(host, name(host) + "-" + interface, interface);
+}
+
+void Network::configure(int host, const std::string& lines) const {
+  const Inside in_host = inside(host);
+  ip(lines);
+}
+
+Result<void> Network::swallow(int host) {
+  if (::access("/usr/sbin/nft", X_OK) != 0) {
+    return Error{Errc::not_found, "no nft(8) on this machine; install the package nftables"};
+  }
+  const Inside in_host = inside(host);
+  const Finished finished =
+      run({"/usr/sbin/nft", "-f", "-"}, {},
+          "table inet swallow { chain input { type filter hook input priority 0; "
+          "iif != lo meta l4proto tcp drop; }; }\n");
+  if (finished.exit_status == 0) return {};
+  return Error{Errc::system, "nft -f: " + finished.err};
+}
+
+void Network::stop_swallowing(int host) {
+  const Inside in_host = inside(host);
+  const Finished finished = run({"/usr/sbin/nft", "delete", "table", "inet", "swallow"});
+  if (finished.exit_status == 0) return;
+  std::fprintf(stderr, "test harness: nft delete: %s", finished.err.c_str());
+  std::abort();
 }
 
 void Network::cut(int host) {

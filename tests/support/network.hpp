@@ -53,6 +53,18 @@ class Network {
     return Inside(hosts_.at(static_cast<std::size_t>(host) - 1).get());
   }
 
+  // One more cable from the host to the switch, at its interface `interface`, which is up and has
+  // only the addresses that the kernel itself gives it.
+  void add_cable(int host, const std::string& interface);
+  // Configures the host as `lines` say, each one an ip(8) command without the word ip:
+  // "link del eth0\n".
+  void configure(int host, const std::string& lines) const;
+  // Lets the host take no TCP from others, and answer nothing to who tries, as behind a firewall
+  // that drops; multicast still goes through.
+  //   fails  when this machine has no nft(8) that works: skip the test with the reason
+  Result<void> swallow(int host);
+  void stop_swallowing(int host);
+
   // Takes the host's cable out of the switch; puts it back. Whichever is so already stays so.
   void cut(int host);
   void heal(int host);
@@ -64,6 +76,7 @@ class Network {
 
  private:
   Network() = default;
+  void connect(int host, const std::string& port, const std::string& interface);
   UniqueFd switch_;
   std::vector<UniqueFd> hosts_;
 };

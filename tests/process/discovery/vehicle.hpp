@@ -5,24 +5,37 @@
 
 #include <gtest/gtest.h>
 
+#include <cstdio>
 #include <string>
 #include <thread>
+#include <vector>
 
 #include "tests/support/mdns_vehicle.hpp"
 
 namespace dssm::test {
 
+// The promise is 3 s; the rest is for a machine that is busy with other tests.
+#if defined(__SANITIZE_THREAD__) || defined(__SANITIZE_ADDRESS__)
+inline constexpr Duration kSoon = std::chrono::minutes(1);
+#else
+inline constexpr Duration kSoon = std::chrono::seconds(6);
+#endif
+
 class Vehicle : public testing::Test, protected MdnsVehicle {
  protected:
   // PCs with a dssmd each.
   //   returns  false: the test is to be skipped, because of why_
-  bool make(int pcs) {
-    if (Result<void> opened = open(pcs); !opened) return why_ = opened.error().message, false;
-    for (int pc = 1; pc <= pcs; ++pc) add_dssmd();
+  bool make(int pcs, const std::vector<std::string>& flags = {}) {
+    if (!possible(open(pcs))) return false;
+    for (int pc = 1; pc <= pcs; ++pc) add_dssmd(flags);
     return true;
   }
+  bool possible(const Result<void>& done) {
+    if (!done) why_ = done.error().message;
+    return done.has_value();
+  }
 
-  // Looks again and again until `done`, for a minute; how long it took.
+  // Looks again and again until `done`, for a minute; how long it took, which is printed too.
   template <class Done>
   Duration await(const std::string& what, Done done) {
     const MonoTime begin = MonoClock::now();
@@ -33,7 +46,12 @@ class Vehicle : public testing::Test, protected MdnsVehicle {
       }
       std::this_thread::sleep_for(std::chrono::milliseconds(5));
     }
-    return MonoClock::now() - begin;
+    const Duration took = MonoClock::now() - begin;
+    std::printf(
+        "%6lld ms until %s\n",
+        static_cast<long long>(std::chrono::duration_cast<std::chrono::milliseconds>(took).count()),
+        what.c_str());
+    return took;
   }
 
   void await_all_up() {
