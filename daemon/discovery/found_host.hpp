@@ -13,10 +13,10 @@
 
 namespace dssm::daemon {
 
-// A dssmd that was found. A value.
+// A dssmd that was found: never this very one, as far as mDNS can tell. A value.
 struct FoundHost {
-  wire::HostId id{};
-  std::string name;  // "pc2"; two hosts may have the same one
+  wire::HostId id{};  // this host's own: of a PC that was copied from this one, or the like
+  std::string name;   // "pc2"; two hosts may have the same one
   std::uint32_t protocol_version = 0;
   bool closed = false;  // it listens on its own loopback only: not to be reached
   // Where it may be reached, best first; numbers only, link-local ones with their interface

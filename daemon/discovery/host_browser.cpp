@@ -80,9 +80,9 @@ std::optional<RankedAddress> address_untrusted(const AvahiAddress& address,
 
 }  // namespace
 
-HostBrowser::HostBrowser(const EventLoop& loop, const wire::HostId& self,
+HostBrowser::HostBrowser(const EventLoop& loop, const wire::HostId& self, std::uint16_t port,
                          const InterfaceFilter& filter, AvahiUser& user)
-    : self_(self), filter_(filter), user_(user) {
+    : self_(self), port_(port), filter_(filter), user_(user) {
   retry_ = EventSource::timer(loop, [this] { resolve_again(); });
   refill_ = EventSource::timer(loop, [this] { refill(); });
 }
@@ -105,6 +105,11 @@ void HostBrowser::forget() {
   refill_.disable();
 }
 
+// What this PC announces with our id and our port is ours. Our id alone has a copy of this PC, too.
+bool HostBrowser::is_own(const Heard& heard) const {
+  return heard.local && heard.record.host_id == self_ && heard.port == port_;
+}
+
 FoundHosts HostBrowser::hosts() const {
   struct Merged {
     const Heard* best = nullptr;  // names and describes the host
@@ -112,7 +117,7 @@ FoundHosts HostBrowser::hosts() const {
   };
   std::map<wire::HostId, Merged> merged;
   for (const auto& [key, result] : results_) {
-    if (!result.heard || result.heard->record.host_id == self_) continue;
+    if (!result.heard || is_own(*result.heard)) continue;
     Merged& host = merged[result.heard->record.host_id];
     host.all.push_back(&*result.heard);
     // What this PC's own Avahi says cannot be somebody else's claim.
@@ -138,14 +143,14 @@ FoundHosts HostBrowser::hosts() const {
 
 bool HostBrowser::own_host_seen() const {
   return std::any_of(results_.begin(), results_.end(), [this](const auto& entry) {
-    return entry.second.heard && entry.second.heard->record.host_id == self_;
+    return entry.second.heard && is_own(*entry.second.heard);
   });
 }
 
 std::uint32_t HostBrowser::hosts_heard() const {
   std::set<wire::HostId> heard, local;
   for (const auto& [key, result] : results_) {
-    if (!result.heard || result.heard->record.host_id == self_) continue;
+    if (!result.heard || is_own(*result.heard)) continue;
     (result.heard->local ? local : heard).insert(result.heard->record.host_id);
   }
   return static_cast<std::uint32_t>(std::count_if(
@@ -243,12 +248,15 @@ void HostBrowser::resolve_again() {
   }
 }
 
-// Two hosts cannot be at one address and port. When two PCs had one name until Avahi gave one of
-// them another, a resolver keeps the address that it heard first, also after that has become the
-// other one's: both are asked for anew.
+// Two hosts cannot be at one address and port, nor another with our id at ours. When two PCs had
+// one name until Avahi gave one of them another, a resolver keeps the address that it heard first,
+// also after that has become the other one's: both are asked for anew.
 void HostBrowser::check_contest(Result& result) {
   for (auto& [key, other] : results_) {
-    if (!other.heard || other.heard->record.host_id == result.heard->record.host_id) continue;
+    if (!other.heard || (other.heard->record.host_id == result.heard->record.host_id &&
+                         is_own(*other.heard) == is_own(*result.heard))) {
+      continue;
+    }
     if (other.heard->address != result.heard->address || other.heard->port != result.heard->port) {
       continue;
     }

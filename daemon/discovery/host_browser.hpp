@@ -31,17 +31,18 @@ class HostBrowser {
   static constexpr std::size_t kMaxAddresses = 16;  // of one host
 
   // All outlive it.
-  HostBrowser(const EventLoop& loop, const wire::HostId& self, const InterfaceFilter& filter,
-              AvahiUser& user);
+  //   self, port  of this host's own service
+  HostBrowser(const EventLoop& loop, const wire::HostId& self, std::uint16_t port,
+              const InterfaceFilter& filter, AvahiUser& user);
   HostBrowser(const HostBrowser&) = delete;
   HostBrowser& operator=(const HostBrowser&) = delete;
 
   void start(AvahiClient* client);  // already started: nothing
   void forget();                    // the client is gone or about to be freed, with all of ours
 
-  FoundHosts hosts() const;           // without this one
+  FoundHosts hosts() const;           // without this very one
   bool own_host_seen() const;         // this host's own service
-  std::uint32_t hosts_heard() const;  // others' that are not of this PC
+  std::uint32_t hosts_heard() const;  // others that are not of this PC
   std::string trouble() const;        // empty: none
 
  private:
@@ -82,6 +83,7 @@ class HostBrowser {
                              AvahiStringList* txt, bool local);
   void on_not_resolved(Result& result);
   void resolve(Result& result);
+  bool is_own(const Heard& heard) const;
   void check_contest(Result& result);
   void free_resolver(Result& result);
   bool make_room();
@@ -89,6 +91,7 @@ class HostBrowser {
   void resolve_again();
 
   const wire::HostId self_;
+  const std::uint16_t port_;
   const InterfaceFilter& filter_;
   AvahiUser& user_;
   AvahiClient* client_ = nullptr;

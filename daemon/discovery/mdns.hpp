@@ -25,8 +25,8 @@ namespace dssm::daemon {
 class Mdns {
  public:
   struct Options {
-    wire::HostId self;   // not to be found
-    std::uint16_t port;  // announced with every service
+    wire::HostId self;
+    std::uint16_t port;  // announced with every service; with `self` it is how we know ourselves
     // Names or patterns (fnmatch(3)) of network interfaces: those in `interfaces`, all when that is
     // empty, without those in `avoid_interfaces`.
     std::vector<std::string> interfaces;

@@ -58,7 +58,7 @@ MdnsWorker::MdnsWorker(EventLoop& loop, const Mdns::Options& options, MdnsMailbo
       filter_(options.interfaces, options.avoid_interfaces),
       poll_(loop),
       publisher_(loop, options.port, options.stream_pause, *this),
-      browser_(loop, options.self, filter_, *this),
+      browser_(loop, options.self, options.port, filter_, *this),
       pause_(kFirstConnectPause) {
   state_.phase = MdnsState::Phase::waiting;
   orders_ = EventSource::readable(loop, mailbox.orders_fd(), [this] { on_orders(); });

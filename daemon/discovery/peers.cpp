@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <utility>
 
+#include "daemon/discovery/service_record.hpp"
 #include "daemon/service/message_ids.hpp"
 
 namespace dssm::daemon {
@@ -55,7 +56,8 @@ const Peers::Peer* Peers::in_use(const wire::HostId& id) const {
 
 bool Peers::is_up_as_configured(const wire::HostId& id) const {
   return std::any_of(peers_.begin(), peers_.end(), [&](const Peer& peer) {
-    return !peer.found && peer.use != Use::none && peer.link->them()->host_id == id;
+    return !peer.found && peer.use != Use::none && peer.use != Use::self &&
+           peer.link->them()->host_id == id;
   });
 }
 
@@ -75,7 +77,6 @@ void Peers::expect_finder(bool insecure) {
 }
 
 void Peers::on_host_found(const FoundHost& host) {
-  if (host.id == self_.host_id) return;
   Peer* known = found_host(host.id);
   if (!known) {
     const auto count = std::count_if(peers_.begin(), peers_.end(),
@@ -156,6 +157,11 @@ void Peers::look_at(Found& found, const Occupied& occupied) const {
     found.usable.push_back(address);
   }
   if (!found.usable.empty()) found.obstacle.reset();
+  if (found.obstacle && host.id == self_.host_id) {
+    found.obstacle->error =
+        "another dssmd is announced with this host's name '" + self_.host +
+        "' and machine id, but cannot be asked who it is: " + found.obstacle->error;
+  }
 }
 
 void Peers::tend() {
@@ -233,7 +239,7 @@ std::string Peers::same_host_warning(const Peer& in_use, const Peer& by) {
   if (is_same) return "same host as " + other;
   return "has name and machine id of " + other +
          ", but is another dssmd; give each host its own name (key name), and copied PCs their own "
-         "/etc/machine-id";
+         "machine id (rm /etc/machine-id && systemd-machine-id-setup)";
 }
 
 void Peers::on_link_up(PeerLink& link) {
@@ -242,17 +248,7 @@ void Peers::on_link_up(PeerLink& link) {
   peer.told_down = false;
   peer.warning.clear();
   tend_soon_.enable_in(Duration::zero());
-  if (them.host_id == self_.host_id) {
-    // Left standing without a word: a connection that is closed would be dialed again and again.
-    peer.use = them.life == self_.life ? Use::self : Use::not_usable;
-    if (peer.use == Use::not_usable) {
-      peer.warning = "the dssmd at '" + link.address() + "' has this host's name '" + self_.host +
-                     "' and machine id; give each host its own name (key name), and copied PCs "
-                     "their own /etc/machine-id";
-      logger_.warning(peer.warning, {.message_id = message_id::kHostRefused});
-    }
-    return decide(peer);
-  }
+  if (them.host_id == self_.host_id) return on_own_id(peer);
   if (const Peer* other = in_use(them.host_id)) {
     peer.use = Use::standing_by;
     peer.warning = same_host_warning(*other, peer);
@@ -260,6 +256,30 @@ void Peers::on_link_up(PeerLink& link) {
     return decide(peer);
   }
   use(peer);
+}
+
+// This very dssmd or one that cannot be told from it. Its connection is left standing without a
+// word: one that is closed would be dialed again and again. Only that to our own echo ends, because
+// the next address may be that of another PC.
+void Peers::on_own_id(Peer& peer) {
+  PeerLink& link = *peer.link;
+  const wire::Greeting& them = *link.them();
+  const bool is_self = them.life == self_.life;
+  if (is_self && peer.found) {
+    return link.drop({Errc::conflict, "at '" + link.address() + "' answers this very dssmd"});
+  }
+  peer.use = is_self ? Use::self : Use::not_usable;
+  if (peer.use == Use::not_usable) {
+    peer.warning = "the dssmd at '" + link.address() + "' has this host's name '" + self_.host +
+                   "' and machine id (host id " + hex_of(self_.host_id) +
+                   "), so neither sees the other's streams; give one of them another name (key "
+                   "name), and a copied PC its own machine id (rm /etc/machine-id && "
+                   "systemd-machine-id-setup)";
+    if (std::exchange(told_twin_, them.life) != them.life) {
+      logger_.warning(peer.warning, {.message_id = message_id::kHostRefused});
+    }
+  }
+  decide(peer);
 }
 
 // The first connection to that host: its life is the host's.

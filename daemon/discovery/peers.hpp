@@ -20,7 +20,8 @@
 //   this very dssmd
 //     Is left alone.
 //   another PC with this one's id (a cloned disk, and the same name)
-//     Is left alone, with a warning.
+//     Is left alone, with a warning. Found ones too are asked who they are: what mDNS tells of our
+//     own id may be an echo of our own announcement, which is passed over without a word.
 //   two hosts of one name
 //     Both are kept; `@name` is then a conflict; a warning.
 //   a host with our own name
@@ -131,6 +132,7 @@ class Peers final : public HostFinderUser, private PeerLink::User {
   Peer* found_host(const wire::HostId& id);
   const Peer* in_use(const wire::HostId& id) const;
   bool is_up_as_configured(const wire::HostId& id) const;
+  void on_own_id(Peer& peer);
   void use(Peer& peer);
   void take_over(const wire::HostId& id);
   void tend();
@@ -143,6 +145,7 @@ class Peers final : public HostFinderUser, private PeerLink::User {
 
   static std::string same_host_warning(const Peer& in_use, const Peer& by);
   std::string namesake_warning(const Peer& peer) const;
+  bool is_shown(const Peer& peer) const;
   bool is_shown_by_configured(const Peer& found) const;
   bool shows_use(const Peer& peer) const;
   local::Host shown(const Peer& peer) const;
@@ -155,6 +158,7 @@ class Peers final : public HostFinderUser, private PeerLink::User {
   std::list<Peer> peers_;  // the configured ones first
   bool insecure_ = false;
   bool told_too_many_ = false;
+  std::uint64_t told_twin_ = 0;  // the life of the one with our id of which the log knows
   bool finder_is_searching_ = false;
   bool settled_ = false;
   std::function<void()> on_settled_, on_change_;

@@ -25,6 +25,15 @@ std::string Peers::namesake_warning(const Peer& peer) const {
   return {};
 }
 
+// Whether it has an entry of its own. What mDNS tells of our own id has one as soon as it is known
+// to be another's.
+bool Peers::is_shown(const Peer& peer) const {
+  if (!peer.found) return true;
+  const bool is_own = peer.found->host.id == self_.host_id;
+  const bool is_known = peer.use == Use::not_usable || peer.found->obstacle.has_value();
+  return is_own ? is_known : !is_shown_by_configured(peer);
+}
+
 // Whether the entry of a configured peer tells of that found host too.
 bool Peers::is_shown_by_configured(const Peer& found) const {
   return std::any_of(peers_.begin(), peers_.end(), [&](const Peer& peer) {
@@ -99,10 +108,10 @@ local::Host Peers::shown(const Peer& peer) const {
 std::vector<local::Host> Peers::hosts() const {
   std::vector<local::Host> hosts;
   for (const Peer& peer : peers_) {
-    if (peer.found && is_shown_by_configured(peer)) continue;
+    if (!is_shown(peer)) continue;
     local::Host& host = hosts.emplace_back(shown(peer));
     host.add_found_by(peer.found ? "mdns" : "peer");
-    if (peer.found || !peer.link->them()) continue;
+    if (peer.found || peer.use == Use::self || !peer.link->them()) continue;
     const bool is_found = std::any_of(peers_.begin(), peers_.end(), [&](const Peer& other) {
       return other.found && other.found->listed &&
              other.found->host.id == peer.link->them()->host_id;
@@ -123,7 +132,7 @@ std::string Peers::trouble() const {
       if (peer.link->why()) add(peer.link->configured().str(), peer.link->why()->message);
       continue;
     }
-    if (is_shown_by_configured(peer)) continue;
+    if (!is_shown(peer)) continue;
     const local::Host host = shown(peer);
     if (peer.use != Use::none || host.error().empty()) continue;
     if (++found_ones <= kMaxTroublesTold) add(host.name(), host.error());

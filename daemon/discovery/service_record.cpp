@@ -194,7 +194,7 @@ std::string ServiceRecord::subtype() const {
 TxtRecord ServiceRecord::txt() const {
   TxtRecord txt = {{"txtvers", std::string(kTxtVersion)},
                    {"host", host},
-                   {"hid", hex_of(host_id.data(), host_id.size())},
+                   {"hid", hex_of(host_id)},
                    {"proto", std::to_string(protocol_version)}};
   if (closed) txt.emplace_back("closed", "");
   if (!stream) return txt;
@@ -208,6 +208,8 @@ TxtRecord ServiceRecord::txt() const {
   txt.emplace_back("ring", hex_of(stream->incarnation));
   return txt;
 }
+
+std::string hex_of(const wire::HostId& id) { return hex_of(id.data(), id.size()); }
 
 std::uint64_t type_hash(const TypeInfo& type) {
   // Names by their lengths, since they may hold any character.

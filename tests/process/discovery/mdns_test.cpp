@@ -121,6 +121,23 @@ TEST_F(MdnsNeedsRoot, AnnouncesEachStreamOfTwoHostsWithOneNameThatMeetLater) {
   EXPECT_NE(second.find(hids[in_order ? 1 : 0]), second.npos) << second;
 }
 
+TEST_F(MdnsNeedsRoot, FindsAnotherPcWithThisOnesNameAndIdButNotItself) {
+  if (!make({"pc1", "pc1", "pc3"})) GTEST_SKIP() << why_;
+  Probe one(pc(1), 1, "pc1");
+  Probe copy(pc(2), 1, "pc1");
+  Probe three(pc(3), 3, "pc3");
+  const auto only_at = [](const Probe& probe, const std::string& there, const std::string& here) {
+    return has(probe, 1, "pc1 open " + there + ":7000") && !has(probe, 1, here);
+  };
+  EXPECT_TRUE(one.until([&] { return only_at(one, "10.77.0.2", "10.77.0.1"); }));
+  EXPECT_TRUE(copy.until([&] { return only_at(copy, "10.77.0.1", "10.77.0.2"); }));
+  EXPECT_TRUE(one.until_state({"own=1 heard=2"}));
+  EXPECT_FALSE(three.hosts().contains(3));
+  copy.finish();
+  EXPECT_TRUE(one.until_lost(1));
+  EXPECT_TRUE(one.until_state({"own=1 heard=1"}));
+}
+
 TEST_F(MdnsNeedsRoot, FindsASecondHostOfTheSamePcByLoopback) {
   if (!make({"pc1", "pc2"})) GTEST_SKIP() << why_;
   Probe one(pc(1), 1, "pc1");

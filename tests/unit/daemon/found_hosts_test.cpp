@@ -5,6 +5,7 @@
 #include <gtest/gtest.h>
 
 #include "daemon/discovery/peers.hpp"
+#include "daemon/discovery/service_record.hpp"
 #include "tests/unit/daemon/fake_peer.hpp"
 
 namespace dssm::daemon {
@@ -307,9 +308,75 @@ TEST_F(FoundHostsTest, AreNeverThisVeryHost) {
   start();
   one->owner.greet_as(self);
   peers->on_host_found(host_at({at(*one)}, "pc1"));
+  wait([&] { return one->owner.connections() == 1; });
   look_around();
-  EXPECT_TRUE(peers->hosts().empty());
-  EXPECT_EQ(one->owner.connections(), 0);
+  EXPECT_TRUE(peers->hosts().empty()) << "an echo of our own announcement";
+  EXPECT_EQ(peers->own_trouble(), "");
+  EXPECT_EQ(peers->trouble(), "");
+  EXPECT_TRUE(log.lines.empty());
+}
+
+TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
+  wire::Greeting copy = self;
+  ++copy.life;
+  two->owner.greet_as(copy);
+  one->owner.greet_as(self);
+  start();
+  // With the copy's address came one of our own.
+  peers->on_host_found(host_at({at(*one), at(*two)}, "pc1"));
+  wait([&] { return !peers->own_trouble().empty(); });
+  const std::string warning = peers->own_trouble();
+  for (const std::string& part : {at(*two).str(), hex_of(self.host_id),
+                                  std::string("rm /etc/machine-id"), std::string("(key name)")}) {
+    EXPECT_NE(warning.find(part), std::string::npos) << part << " is missing in " << warning;
+  }
+  ASSERT_EQ(peers->hosts().size(), 1u);
+  EXPECT_EQ(host().state(), "refused");
+  EXPECT_EQ(host().error(), warning);
+  EXPECT_EQ(host().addresses(0), at(*two).str());
+  EXPECT_TRUE(catalog.hosts().empty());
+  EXPECT_TRUE(two->owner.connected()) << "it is not asked again and again";
+  two->owner.cut();
+  wait([&] { return peers->own_trouble().empty(); });
+  wait([&] { return !peers->own_trouble().empty(); });
+  EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
+                          [](const std::string& line) {
+                            return line.find("this host's name") != std::string::npos;
+                          }),
+            1);
+  // It was given another name.
+  peers->on_host_lost(self.host_id);
+  two->owner.greet_as(pc2);
+  two->owner.cut();
+  peers->on_host_found(host_at({at(*two)}));
+  wait_until_up();
+  EXPECT_EQ(peers->hosts().size(), 1u);
+  EXPECT_EQ(peers->own_trouble(), "");
+}
+
+TEST_F(FoundHostsTest, AreAskedThoughThisHostIsAmongItsOwnPeers) {
+  wire::Greeting copy = self;
+  ++copy.life;
+  one->owner.greet_as(self);
+  two->owner.greet_as(copy);
+  start({at(*one)});
+  wait([&] { return host().state() == "self"; });
+  peers->on_host_found(host_at({at(*two)}, "pc1"));
+  wait([&] { return !peers->own_trouble().empty(); });
+  ASSERT_EQ(peers->hosts().size(), 2u);
+  EXPECT_EQ(host(0).state(), "self");
+  EXPECT_EQ(found_by(0), std::vector<std::string>{"peer"});
+  EXPECT_EQ(host(1).state(), "refused");
+}
+
+TEST_F(FoundHostsTest, AreSaidToHaveOurIdAlsoWhenTheyMayNotBeAsked) {
+  start({}, false);
+  peers->on_host_found(host_at({{"192.0.2.7", 13776}}, "pc1"));
+  look_around();
+  ASSERT_EQ(peers->hosts().size(), 1u);
+  EXPECT_EQ(host().state(), "closed");
+  EXPECT_NE(host().error().find("with this host's name 'pc1' and machine id"), std::string::npos)
+      << host().error();
 }
 
 TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheyAreClosed) {
