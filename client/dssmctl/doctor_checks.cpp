@@ -32,6 +32,18 @@ bool contains_text(const std::string& text, std::string_view part) {
   return text.find(part) != std::string::npos;
 }
 
+// Starts one of Debian's own services, in a container too.
+std::string start_command(const Facts& facts, const std::string& service) {
+  return facts.systemd ? "sudo systemctl enable --now " + service
+                       : "sudo service " + service + " start";
+}
+
+// Gives a host another name; `where` says which.
+std::string rename_command(const std::string& where) {
+  return "echo 'name = \"pc2\"'  # another one on " + where + ", as a line in " +
+         std::string(kConfigFile) + "; then: sudo systemctl restart dssmd";
+}
+
 // --- dssmd
 // ------------------------------------------------------------------------------------------------
 
@@ -71,7 +83,8 @@ Finding no_daemon(const Facts& facts) {
     finding.command = "grep runtime_dir " + std::string(kConfigFile) + "  # then set $DSSM_SOCKET";
   } else {
     finding.cause = "dssmd is not running";
-    finding.command = "sudo systemctl enable --now dssmd";
+    finding.command = facts.systemd ? "sudo systemctl enable --now dssmd"
+                                    : "dssmd  # in a terminal of its own: no systemd runs here";
   }
   return finding;
 }
@@ -207,7 +220,7 @@ void check_clock(const Facts& facts, Findings& findings) {
                                  "sudo apt install chrony"});
     case ClockFacts::State::no_answer:
       return findings.push_back({"clock", Status::warn, "chronyd does not answer" + said,
-                                 "chronyd is not running", "sudo systemctl enable --now chrony"});
+                                 "chronyd is not running", start_command(facts, "chrony")});
     case ClockFacts::State::unsynchronized:
       return findings.push_back(
           {"clock", Status::warn, "chronyd does not follow any other clock" + said,
@@ -278,7 +291,7 @@ Finding mdns_waiting(const Facts& facts) {
     finding.command = "sudo apt install avahi-daemon";
   } else if (!facts.avahi_running) {
     finding.cause = "avahi-daemon is not running; only configured peers are found";
-    finding.command = "sudo systemctl start avahi-daemon";
+    finding.command = start_command(facts, "avahi-daemon");
   } else {
     finding.cause = "avahi-daemon runs, but dssmd does not reach it over D-Bus";
     finding.command = "systemctl status dbus avahi-daemon  # then restart what failed";
@@ -333,6 +346,9 @@ Finding host_down(const HostInfo& host) {
   if (contains_text(host.error, "refused")) {
     finding.cause = "no dssmd runs there, or it listens at another address or port";
     finding.command = "systemctl status dssmd  # there; and look at its key listen";
+  } else if (contains_text(host.error, "does not greet")) {
+    finding.cause = "the dssmd there hangs, or another program has its port";
+    finding.command = "ss -ltnp  # there; then: systemctl restart dssmd";
   } else if (contains_text(host.error, "look up") || contains_text(host.error, "resolve") ||
              contains_text(host.error, "not known")) {
     finding.cause = "its name is not known here";
@@ -368,6 +384,16 @@ void check_hosts(const Facts& facts, Findings& findings) {
            "up at " + list_text(host.addresses) + (host.error.empty() ? "" : ": " + host.error),
            {},
            {}});
+    } else if (host.state == "refused" && host.name == facts.daemon.host) {
+      const bool copied = host.id == facts.hosts.front().id;
+      findings.push_back(
+          {name, Status::fail, "refused: " + host.error,
+           copied ? "one PC's disk was copied to the other, or two dssmd of this PC have one name"
+                  : "both hosts have the same name",
+           rename_command("one of them") +
+               (copied ? "; on a copied PC also: sudo rm /etc/machine-id && sudo "
+                         "systemd-machine-id-setup"
+                       : "")});
     } else if (host.state == "refused") {
       findings.push_back({name, Status::fail, "refused: " + host.error,
                           "the two do not fit together: versions, names or limits",
@@ -383,11 +409,15 @@ void check_hosts(const Facts& facts, Findings& findings) {
       findings.push_back({name, Status::warn, "being connected to",
                           "dssmd or the network has just come up", "dssmctl hosts"});
     } else if (host.state == "closed") {
+      // Either end may keep the other out.
+      const bool by_us = contains_text(host.error, "this dssmd connects");
       findings.push_back(
-          {name, Status::warn, "found by mDNS, but it listens on its own loopback only",
-           "its keys listen and insecure do not let others in",
-           "echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines in its " +
-               std::string(kConfigFile) + ", then restart its dssmd"});
+          {name, Status::warn, "found by mDNS, but not connected to: " + host.error,
+           by_us ? "the key insecure of this PC does not let its dssmd go to others"
+                 : "its keys listen and insecure do not let others in",
+           "echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines in " +
+               std::string(by_us ? "" : "its ") + kConfigFile + ", then restart " +
+               (by_us ? "this" : "its") + " dssmd"});
     } else {
       findings.push_back(host_down(host));
     }
@@ -411,8 +441,7 @@ void check_host_names(const Facts& facts, Findings& findings) {
   }
   findings.push_back({"host names", Status::fail, "several hosts are called " + doubled,
                       "PCs were installed from one image, or two dssmd run on one PC",
-                      "echo 'name = \"pc2\"'  # another one on each, as a line in " +
-                          std::string(kConfigFile) + "; then: sudo systemctl restart dssmd"});
+                      rename_command("each")});
 }
 
 void check_stream_names(const Facts& facts, Findings& findings) {

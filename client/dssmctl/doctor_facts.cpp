@@ -187,6 +187,7 @@ Facts collect_facts(const Options& options) {
   Facts facts;
   facts.user = user_name();
   facts.version = DSSM_VERSION;
+  facts.systemd = exists("/run/systemd/system");
   facts.socket = socket_facts(options, facts.user);
   ask_dssmd(options, facts);
   if (facts.failed && !facts.socket.chosen) facts.service = service_state();

@@ -47,6 +47,7 @@ struct ClockFacts {
 
 struct Facts {
   std::string user;     // who runs dssmctl
+  bool systemd = true;  // this PC was started by it, so that systemctl works
   std::string service;  // of dssmd, as `systemctl is-active` says; empty: not known
   std::string version;  // of dssmctl and its library
   SocketFacts socket;

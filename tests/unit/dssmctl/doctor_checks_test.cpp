@@ -194,7 +194,7 @@ TEST(Doctor, TellsWhatAvahiLacks) {
   facts.daemon.mdns.phase = "waiting";
   EXPECT_FINDING(facts, "mdns", Status::warn, "dbus");
   facts.avahi_running = false;
-  EXPECT_FINDING(facts, "mdns", Status::warn, "systemctl start avahi-daemon");
+  EXPECT_FINDING(facts, "mdns", Status::warn, "systemctl enable --now avahi-daemon");
   facts.avahi_installed = false;
   EXPECT_FINDING(facts, "mdns", Status::warn, "apt install avahi-daemon");
   facts.daemon.mdns.phase = "off";
@@ -232,7 +232,25 @@ TEST(Doctor, TellsOfEachHostWhyItIsNotUp) {
   facts.hosts[1] = host_at("pc2", "connecting", "10.0.0.2:13776");
   EXPECT_FINDING(facts, "host pc2", Status::warn, "dssmctl hosts");
   facts.hosts[1] = host_at("pc2", "closed", "");
-  EXPECT_FINDING(facts, "host pc2", Status::warn, "listen = ");
+  facts.hosts[1].error = "host 'pc2' listens on its own loopback only";
+  EXPECT_FINDING(facts, "host pc2", Status::warn, "in its /etc/dssm/dssmd.conf");
+  facts.hosts[1].error = "host 'pc2' is on another PC, and this dssmd connects to others only with";
+  EXPECT_FINDING(facts, "host pc2", Status::warn, "in /etc/dssm/dssmd.conf, then restart this");
+  facts.hosts[1] = host_at("pc2", "down", "10.0.0.2:13776", "it does not greet; is it a dssmd?");
+  EXPECT_FINDING(facts, "host pc2", Status::fail, "ss -ltnp");
+}
+
+TEST(Doctor, NamesCommandsThatWorkWithoutSystemd) {
+  Facts facts = unreachable(Errc::no_daemon);
+  facts.systemd = false;
+  EXPECT_FINDING(facts, "daemon", Status::fail, "dssmd  # in a terminal");
+  facts = healthy();
+  facts.systemd = false;
+  facts.clock.state = ClockFacts::State::no_answer;
+  EXPECT_FINDING(facts, "clock", Status::warn, "sudo service chrony start");
+  facts.daemon.mdns.phase = "waiting";
+  facts.avahi_running = false;
+  EXPECT_FINDING(facts, "mdns", Status::warn, "sudo service avahi-daemon start");
 }
 
 TEST(Doctor, ForgivesAnAddressThatDoesNotWorkWhileAnotherOfThatHostDoes) {
@@ -258,7 +276,10 @@ TEST(Doctor, FindsACopyOfThisHost) {
   Facts facts = healthy();
   facts.hosts[1] = host_at("pc1", "refused", "10.0.0.2:13776", "it has this host's name and id");
   EXPECT_FINDING(facts, "host names", Status::fail, "name = ");
-  EXPECT_FINDING(facts, "host pc1", Status::fail, "dssmctl hosts");
+  EXPECT_FINDING(facts, "host pc1", Status::fail, "rm /etc/machine-id");
+  facts.hosts[1].id += "9";  // the name alone
+  EXPECT_EQ(finding_of(facts, "host pc1").command.find("machine-id"), std::string::npos);
+  EXPECT_FINDING(facts, "host pc1", Status::fail, "name = ");
   facts.hosts[0].error = facts.hosts[1].error;
   facts.hosts.pop_back();
   EXPECT_FINDING(facts, "host pc1", Status::fail, "host names");
