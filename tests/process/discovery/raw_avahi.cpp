@@ -10,6 +10,9 @@
 //                                                ends
 //   raw-avahi record DOMAIN_NAME TXT             waits for the TXT record of this PC's own, prints
 //                                                its strings in the order of the wire; ends
+//   raw-avahi rename NAME                        lets the Avahi daemon call this PC so; ends when
+//   it
+//                                                has announced that
 #include <avahi-client/client.h>
 #include <avahi-client/lookup.h>
 #include <avahi-client/publish.h>
@@ -25,9 +28,14 @@ namespace {
 
 AvahiSimplePoll* simple_poll = nullptr;
 const char* wanted = nullptr;
-int missing = 0;  // groups that are not established
+const char* wanted_name = nullptr;  // of this PC
+int missing = 0;                    // groups that are not established
 
-void on_client(AvahiClient*, AvahiClientState, void*) {}
+void on_client(AvahiClient* client, AvahiClientState state, void*) {
+  if (state != AVAHI_CLIENT_S_RUNNING || !wanted_name) return;
+  const char* const name = avahi_client_get_host_name(client);
+  if (name && std::strcmp(name, wanted_name) == 0) avahi_simple_poll_quit(simple_poll);
+}
 
 void on_group(AvahiEntryGroup*, AvahiEntryGroupState state, void*) {
   if (state != AVAHI_ENTRY_GROUP_ESTABLISHED || --missing > 0) return;
@@ -86,7 +94,7 @@ void on_record(AvahiRecordBrowser*, AvahiIfIndex, AvahiProtocol, AvahiBrowserEve
 }  // namespace
 
 int main(int argc, char** argv) {
-  const std::string command = argc > 3 ? argv[1] : "";
+  const std::string command = argc > 2 ? argv[1] : "";
   simple_poll = avahi_simple_poll_new();
   int error = 0;
   AvahiClient* const client = avahi_client_new(avahi_simple_poll_get(simple_poll),
@@ -96,22 +104,25 @@ int main(int argc, char** argv) {
     return 1;
   }
   bool good = false;
-  if (command == "publish") {
+  if (command == "publish" && argc > 4) {
     AvahiStringList* txt = nullptr;
     for (int i = argc - 1; i > 4; --i) txt = avahi_string_list_add(txt, argv[i]);
     missing = 1;
     good = publish(client, argv[2], argv[3], std::atoi(argv[4]), txt);
     avahi_string_list_free(txt);
-  } else if (command == "flood") {
+  } else if (command == "flood" && argc > 3) {
     missing = std::atoi(argv[2]);
     good = true;
     for (int i = missing; i > 0 && good; --i) {
       good = publish(client, "flood " + std::to_string(i), argv[3], 9, nullptr);
     }
-  } else if (command == "resolve") {
+  } else if (command == "resolve" && argc > 3) {
     wanted = argv[2];
     good = avahi_service_browser_new(client, AVAHI_IF_UNSPEC, AVAHI_PROTO_UNSPEC, argv[3], nullptr,
                                      AvahiLookupFlags{}, on_browser, nullptr);
+  } else if (command == "rename") {
+    wanted_name = argv[2];
+    good = avahi_client_set_host_name(client, wanted_name) == 0;
   } else if (command == "record") {
     wanted = argv[2];
     good = avahi_record_browser_new(client, AVAHI_IF_UNSPEC, AVAHI_PROTO_UNSPEC, argv[2],
