@@ -25,9 +25,8 @@ MAX_AGE_S = 14 * 24 * 3600.0  # then updates of Debian are taken
 DOWNLOAD = ('set -e; mkdir "$1/debs"; cp $DEBS "$1/debs"; chroot "$1" apt-get clean; '
             'chroot "$1" sh -c "apt-get install --yes --no-install-recommends --download-only '
             '/debs/*.deb"; rm -r "$1/debs"')
-# What apt-get says when it has no network.
-NO_NETWORK = re.compile("Could not resolve|Could not connect|Unable to connect|Failed to fetch|"
-                        "Temporary failure|unreachable")
+# What mmdebstrap and apt-get say when there is no network: of the lists, and of the packages.
+NO_NETWORK = re.compile("apt-get update .*failed|Failed to fetch|Unable to fetch")
 
 
 class Unavailable(Exception):
