@@ -1,0 +1,72 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The cable between the guests: a bridge with a tap for each, and ways to cut it.
+
+Everything here is in the network namespace that the harness itself runs in (run), so names and
+addresses are the same in every run and nothing has to be removed.
+"""
+
+from collections.abc import Iterable
+
+from lab.command import run
+
+BRIDGE = "lab"
+HOST_ADDRESS = "10.99.0.254"
+
+
+def guest_name(number: int) -> str:
+    """The name of guest `number`, counted from 1."""
+    return f"pc{number}"
+
+
+def guest_address(number: int) -> str:
+    """The address of guest `number`."""
+    return f"10.99.0.{number}"
+
+
+def tap(number: int) -> str:
+    """The host's end of the cable of guest `number`."""
+    return f"tap{number}"
+
+
+class Network:
+    """A switch with a port for each of `guests` PCs and one for this machine."""
+
+    def __init__(self, guests: int) -> None:
+        self._ip("link", "set", "lo", "up")
+        # Snooping would keep mDNS from guests that the bridge has not yet seen ask for it.
+        self._ip("link", "add", BRIDGE, "type", "bridge", "mcast_snooping", "0", "forward_delay", "0")
+        self._ip("address", "add", f"{HOST_ADDRESS}/24", "dev", BRIDGE)
+        self._ip("link", "set", BRIDGE, "up")
+        for number in range(1, guests + 1):
+            self._ip("tuntap", "add", tap(number), "mode", "tap")
+            self._ip("link", "set", tap(number), "master", BRIDGE, "up")
+        self._nft("add table bridge lab; add set bridge lab left { type ifname; };"
+                  " add set bridge lab right { type ifname; };"
+                  " add chain bridge lab forward { type filter hook forward priority 0; };"
+                  " add rule bridge lab forward iifname @left oifname @right drop;"
+                  " add rule bridge lab forward iifname @right oifname @left drop")
+
+    def unplug(self, number: int) -> None:
+        """Pulls the cable of a guest; this machine does not reach it either."""
+        self._ip("link", "set", tap(number), "down")
+
+    def plug(self, number: int) -> None:
+        """Puts the cable of a guest back."""
+        self._ip("link", "set", tap(number), "up")
+
+    def part(self, left: Iterable[int], right: Iterable[int]) -> None:
+        """Lets nothing through between two groups of guests; ssh from this machine stays."""
+        for name, members in (("left", left), ("right", right)):
+            self._nft(f"add element bridge lab {name} {{ {', '.join(map(tap, members))} }}")
+
+    def join(self) -> None:
+        """Ends what part() began."""
+        self._nft("flush set bridge lab left; flush set bridge lab right")
+
+    @staticmethod
+    def _ip(*arguments: str) -> None:
+        run("ip", *arguments, what="set up the lab's network")
+
+    @staticmethod
+    def _nft(rules: str) -> None:
+        run("nft", rules, what="filter between the guests")

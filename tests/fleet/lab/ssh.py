@@ -1,0 +1,74 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Running commands on a guest, over one shared connection: a login costs a guest far more."""
+
+import pathlib
+import shlex
+import subprocess
+
+from lab.image import Image
+
+
+class GuestError(AssertionError):
+    """A command on a guest ended otherwise than expected; the text holds guest, command, output."""
+
+
+class Ssh:
+    """root's connection to one guest. Threads may share it."""
+
+    def __init__(self, name: str, address: str, image: Image, folder: pathlib.Path) -> None:
+        self.name = name
+        self.address = address
+        # ServerAlive: a connection to a guest that lost its power ends by itself.
+        self.options = [
+            "-F", "none", "-i", str(image.ssh_key), "-o", f"UserKnownHostsFile={image.known_hosts}",
+            "-o", "BatchMode=yes", "-o", "ConnectTimeout=2", "-o", "LogLevel=ERROR",
+            "-o", "ControlMaster=auto", "-o", "ControlPersist=yes",
+            "-o", f"ControlPath={folder}/ssh-{name}", "-o", "ServerAliveInterval=5",
+            "-o", "ServerAliveCountMax=12",
+        ]
+
+    def words(self, command: str) -> list[str]:
+        """The command line here that runs `command`, for a shell, there."""
+        return ["ssh", *self.options, f"root@{self.address}", command]
+
+    def attempt(self, command: str, *, stdin: bytes = b"", timeout: float = 120
+                ) -> subprocess.CompletedProcess[bytes]:
+        """Runs `command`; whether it succeeded is the caller's to judge."""
+        try:
+            return subprocess.run(self.words(command), input=stdin, capture_output=True,
+                                  timeout=timeout, check=False)
+        except subprocess.TimeoutExpired as error:
+            output = (error.stdout or b"") + (error.stderr or b"")
+            raise GuestError(f"{self.name}: '{command}' did not end within {timeout:.0f} s; it said:\n"
+                             f"{output.decode(errors='replace')[-4000:]}") from error
+
+    def run(self, command: str, *, stdin: bytes = b"", timeout: float = 120) -> str:
+        """Runs `command` and returns its stdout; anything but status 0 is an error."""
+        return self.read(command, stdin=stdin, timeout=timeout).decode(errors="replace")
+
+    def read(self, command: str, *, stdin: bytes = b"", timeout: float = 120) -> bytes:
+        """As run(), with stdout as it is."""
+        done = self.attempt(command, stdin=stdin, timeout=timeout)
+        if done.returncode:
+            output = (done.stdout + done.stderr).decode(errors="replace")
+            raise GuestError(f"{self.name}: '{command}' ended with {done.returncode}:\n{output[-4000:]}")
+        return done.stdout
+
+    def start(self, command: str) -> subprocess.Popen[str]:
+        """Starts `command` and returns at once; its stdin ends when the caller closes it."""
+        return subprocess.Popen(self.words(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                                stderr=subprocess.PIPE, text=True)
+
+    def put(self, files: list[pathlib.Path], folder: str) -> None:
+        """Copies files and folders, names and modes kept, into `folder` there."""
+        where = shlex.quote(folder)
+        pack = ["tar", "--create", "--owner=0", "--group=0"]
+        for file in files:
+            pack += ["-C", str(file.parent), file.name]
+        packed = subprocess.run(pack, stdout=subprocess.PIPE, check=True).stdout
+        self.run(f"mkdir -p {where} && tar -xf - -C {where}", stdin=packed)
+
+    def close(self) -> None:
+        """Ends the shared connection, as must be after the guest's end; the next command opens one."""
+        subprocess.run(["ssh", *self.options, "-O", "exit", f"root@{self.address}"],
+                       capture_output=True, check=False)
