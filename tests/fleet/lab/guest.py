@@ -24,14 +24,15 @@ BOOT_SECONDS = 180
 class Guest:
     """Guest `number`; its files are in `folder`, which is in memory and goes with the lab."""
 
-    def __init__(self, number: int, image: Image, preload: pathlib.Path, folder: pathlib.Path) -> None:
+    def __init__(self, number: int, image: Image, preload: pathlib.Path, folder: pathlib.Path,
+                 ssh_config: pathlib.Path) -> None:
         self.number = number
         self.name = guest_name(number)
         self.address = guest_address(number)
         self.folder = folder / self.name
         self.folder.mkdir()
         self.console = self.folder / "console"
-        self.ssh = Ssh(self.name, self.address, image, folder)
+        self.ssh = Ssh(self.name, ssh_config)
         self._disk = f"{self.folder}/disk,{image.disk}"
         self._preload = preload
         self._process: subprocess.Popen[bytes] | None = None

@@ -31,7 +31,7 @@ PACKAGES = (
     " python3 python3-apt"
     # What the project's packages and the example depend on.
     " libstdc++6 libevent-core-2.1-7 libprotobuf-lite32 libsystemd0 libavahi-client3"
-    " libavahi-common3 zlib1g libpng16-16 adduser init-system-helpers"
+    " libavahi-common3 libtomlplusplus3 zlib1g libpng16-16 adduser init-system-helpers"
 ).split()
 
 # Nobody reads them in a guest, and they are most of what dpkg would have to write.

@@ -8,28 +8,46 @@ import subprocess
 from lab.image import Image
 
 
+# ServerAlive: a connection to a guest that lost its power ends by itself.
+CONFIG = """\
+Host *
+  User root
+  IdentityFile {key}
+  UserKnownHostsFile {known_hosts}
+  BatchMode yes
+  ConnectTimeout 2
+  LogLevel ERROR
+  ControlMaster auto
+  ControlPersist yes
+  ControlPath {folder}/ssh-%n
+  ServerAliveInterval 5
+  ServerAliveCountMax 12
+"""
+
+
+def write_config(folder: pathlib.Path, image: Image, addresses: dict[str, str]) -> pathlib.Path:
+    """A configuration file by which ssh, and whoever uses it, knows the guests by name."""
+    config = folder / "ssh_config"
+    hosts = "".join(f"Host {name}\n  HostName {address}\n" for name, address in addresses.items())
+    config.write_text(hosts + CONFIG.format(key=image.ssh_key, known_hosts=image.known_hosts,
+                                            folder=folder))
+    return config
+
+
 class GuestError(AssertionError):
     """A command on a guest ended otherwise than expected; the text holds guest, command, output."""
 
 
 class Ssh:
-    """root's connection to one guest. Threads may share it."""
+    """root's connection to one guest, by its name in the file `config`. Threads may share it."""
 
-    def __init__(self, name: str, address: str, image: Image, folder: pathlib.Path) -> None:
+    def __init__(self, name: str, config: pathlib.Path) -> None:
         self.name = name
-        self.address = address
-        # ServerAlive: a connection to a guest that lost its power ends by itself.
-        self.options = [
-            "-F", "none", "-i", str(image.ssh_key), "-o", f"UserKnownHostsFile={image.known_hosts}",
-            "-o", "BatchMode=yes", "-o", "ConnectTimeout=2", "-o", "LogLevel=ERROR",
-            "-o", "ControlMaster=auto", "-o", "ControlPersist=yes",
-            "-o", f"ControlPath={folder}/ssh-{name}", "-o", "ServerAliveInterval=5",
-            "-o", "ServerAliveCountMax=12",
-        ]
+        self._ssh = ["ssh", "-F", str(config)]
 
     def words(self, command: str) -> list[str]:
         """The command line here that runs `command`, for a shell, there."""
-        return ["ssh", *self.options, f"root@{self.address}", command]
+        return [*self._ssh, self.name, command]
 
     def attempt(self, command: str, *, stdin: bytes = b"", timeout: float = 120
                 ) -> subprocess.CompletedProcess[bytes]:
@@ -70,5 +88,4 @@ class Ssh:
 
     def close(self) -> None:
         """Ends the shared connection, as must be after the guest's end; the next command opens one."""
-        subprocess.run(["ssh", *self.options, "-O", "exit", f"root@{self.address}"],
-                       capture_output=True, check=False)
+        subprocess.run([*self._ssh, "-O", "exit", self.name], capture_output=True, check=False)

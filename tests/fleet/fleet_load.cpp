@@ -1,0 +1,131 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The load of the fleet's scenarios: writes or reads streams whose every sample can be checked.
+//
+//   fleet-load write RATE_HZ STREAM@HOST...   creates them and writes each at this rate
+//   fleet-load read RATE_HZ STREAM@HOST...    reads each from its oldest sample on
+//
+// Says "ready" on stdout when each stream has moved, ends when its stdin does, readers once they
+// have all that was written until then. The last line is JSON:
+//
+//   write  {"written": {STREAM: COUNT}}
+//   read   {"faults": TEXT, "streams": {STREAM: {"taken": N, "lost": N, "restarts": N}}}
+//
+// A fault is a sample that was torn, came twice, out of order or not at all without being counted.
+// Exit status: 0; 1 with the reason on stderr.
+#include <poll.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cstdio>
+#include <cstdlib>
+#include <ctime>
+#include <dssm/dssm.hpp>
+#include <functional>
+#include <nlohmann/json.hpp>
+#include <thread>
+
+#include "tests/process/network/follower.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr std::uint64_t kPayloadBytes = 256;
+constexpr std::uint64_t kHistorySeconds = 20;
+
+KnownStream known_stream(const std::string& name, std::uint64_t rate_hz) {
+  KnownStream known;
+  known.id = StreamId::parse(name).value();
+  known.payload_bytes = kPayloadBytes;
+  known.depth = kHistorySeconds * rate_hz;
+  known.cycle = Duration(1s) / static_cast<std::int64_t>(rate_hz);
+  known.number = std::hash<std::string>()(known.id.str());
+  return known;
+}
+
+bool stdin_ended() {
+  pollfd in{STDIN_FILENO, POLLIN, 0};
+  return ::poll(&in, 1, 0) > 0;
+}
+
+void say(const std::string& line) {
+  std::printf("%s\n", line.c_str());
+  std::fflush(stdout);
+}
+
+void write(const std::vector<KnownStream>& streams) {
+  Session session = Session::connect().value();
+  std::vector<RawWriter> writers;
+  for (const KnownStream& known : streams) {
+    writers.push_back(session.create_raw(known.id, known.type(), known.history()).value());
+  }
+  // Greater with each writer of a stream, so that a reader can tell whose samples it gets.
+  const auto life = static_cast<std::uint64_t>(std::time(nullptr));
+  std::vector<std::byte> payload(kPayloadBytes);
+  MonoTime due = MonoClock::now();
+  for (Tid tid = 0; !stdin_ended(); ++tid, due += streams[0].cycle) {
+    std::this_thread::sleep_until(due);
+    for (std::size_t i = 0; i < streams.size(); ++i) {
+      streams[i].fill(payload, life, tid);
+      const SampleInfo info = streams[i].info(tid);
+      if (writers[i].write(payload, info.time, info.clock_error) != tid) {
+        std::fprintf(stderr, "'%s' was not new\n", streams[i].id.str().c_str());
+        std::exit(1);
+      }
+    }
+    if (tid == 0) say("ready");
+  }
+  nlohmann::json written;
+  for (const RawWriter& writer : writers) written[writer.id().str()] = writer.newest() + 1;
+  say(nlohmann::json{{"written", written}}.dump());
+}
+
+void read(const std::vector<KnownStream>& streams) {
+  Session session = Session::connect({.request_timeout = 60s}).value();
+  std::vector<Follower> followers;
+  for (const KnownStream& known : streams) {
+    followers.emplace_back(known, session.await_raw_reader(known.id, kNever).value(), std::nullopt);
+  }
+  std::vector<RawReader*> readers;
+  for (Follower& follower : followers) readers.push_back(&follower.reader());
+  const auto take = [&] {
+    (void)wait_any(readers, deadline_in(100ms));
+    for (Follower& follower : followers) follower.take(1000);
+  };
+  const auto all = [&](auto condition) {
+    return std::all_of(followers.begin(), followers.end(), condition);
+  };
+  while (!all([](const Follower& follower) { return follower.taken() > 0; })) take();
+  say("ready");
+  while (!stdin_ended()) take();
+  for (Follower& follower : followers) {
+    const Tid newest = session.info(follower.known().id).value().newest;
+    while (follower.last() < newest) take();
+  }
+  nlohmann::json found;
+  std::string text;
+  for (const Follower& follower : followers) {
+    text += follower.faults();
+    found[follower.known().id.str()] = {
+        {"taken", follower.taken()}, {"lost", follower.lost()}, {"restarts", follower.restarts()}};
+  }
+  say(nlohmann::json{{"faults", text}, {"streams", found}}.dump());
+}
+
+}  // namespace
+}  // namespace dssm::test
+
+int main(int argc, char** argv) {
+  using namespace dssm::test;
+  const std::string mode = argc > 3 ? argv[1] : "";
+  if (mode != "write" && mode != "read") {
+    std::fprintf(stderr, "usage: fleet-load write|read RATE_HZ STREAM@HOST...\n");
+    return 1;
+  }
+  const std::uint64_t rate_hz = std::strtoull(argv[2], nullptr, 10);
+  std::vector<KnownStream> streams;
+  for (int i = 3; i < argc; ++i) streams.push_back(known_stream(argv[i], rate_hz));
+  mode == "write" ? write(streams) : read(streams);
+}

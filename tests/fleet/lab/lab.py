@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+"""The lab that a scenario is given: guests, their network, and what is done to all of them."""
+
+import concurrent.futures
+import json
+import os
+import pathlib
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import Any, TypeVar
+
+from lab.guest import Guest
+from lab.image import Image
+from lab.network import Network, guest_address, guest_name
+from lab.packages import Artifacts, Deployment
+from lab.ssh import write_config
+from lab.timing import Timing
+
+T = TypeVar("T")
+GUESTS = 3
+PATIENCE_SECONDS = 60  # for what must come by itself, however busy this machine is
+
+
+class Lab:
+    """Three PCs on one switch, pc1 to pc3, off at first. Its folder is in memory."""
+
+    def __init__(self, image: Image, artifacts: Artifacts, timing: Timing, folder: pathlib.Path
+                 ) -> None:
+        self.network = Network(GUESTS)
+        numbers = range(1, GUESTS + 1)
+        self.ssh_config = write_config(folder, image, {guest_name(number): guest_address(number)
+                                                       for number in numbers})
+        self.guests = [Guest(number, image, artifacts.preload, folder, self.ssh_config)
+                       for number in numbers]
+        self.deployment = Deployment(artifacts)
+        self.timing = timing
+        self.all_cores = os.sched_getaffinity(0)
+        # Runs side by side spread over the cores.
+        self._core = sorted(self.all_cores)[folder.stat().st_ino % len(self.all_cores)]
+
+    def __getitem__(self, name: str) -> Guest:
+        """The guest of that name."""
+        return next(guest for guest in self.guests if guest.name == name)
+
+    def on_all(self, action: Callable[[Guest], T]) -> list[T]:
+        """Does something with all guests at once; the results in their order."""
+        with concurrent.futures.ThreadPoolExecutor(len(self.guests)) as pool:
+            return list(pool.map(action, self.guests))
+
+    @contextmanager
+    def spread(self) -> Iterator[None]:
+        """Gives the guests all cores for heavy work. Otherwise they share one: User Mode Linux
+        switches between host processes at each system call, which is cheapest on one core."""
+        try:
+            for guest in self.guests:
+                guest.pin(self.all_cores)
+            yield
+        finally:
+            for guest in self.guests:
+                guest.pin({self._core})
+
+    def boot(self) -> None:
+        """Switches all guests on and waits until they are up."""
+        for guest in self.guests:
+            guest.power_on(self.all_cores)
+        with self.spread():
+            self.on_all(Guest.await_running)
+
+    def shut_down(self) -> None:
+        """Takes all guests' power away."""
+        for guest in self.guests:
+            guest.power_off()
+
+    def reset(self) -> None:
+        """Boots all guests anew, with all cables plugged, after a scenario failed."""
+        self.shut_down()
+        self.network.join()
+        for guest in self.guests:
+            self.network.plug(guest.number)
+        self.boot()
+
+    def streams(self, guest: Guest) -> dict[str, dict[str, Any]]:
+        """What `dssmctl ls` shows there, by full name."""
+        listed = json.loads(guest.ssh.run("dssmctl ls --json"))["streams"]
+        return {stream["stream"]: stream for stream in listed}
+
+    def await_streams(self, *names: str, on: list[Guest] | None = None) -> float:
+        """Waits until each guest lists exactly these streams; returns how long that took [s]."""
+        started = time.monotonic()
+        for guest in on or self.guests:
+            await_that(f"{guest.name} lists exactly {', '.join(sorted(names)) or 'nothing'}",
+                       lambda guest=guest: (set(found := self.streams(guest)) == set(names),
+                                            sorted(found)))
+        return time.monotonic() - started
+
+
+def await_that(what: str, look: Callable[[], tuple[bool, object]],
+               seconds: float = PATIENCE_SECONDS) -> None:
+    """Looks again and again until `look` says True; its second result is for the failure's text."""
+    deadline = time.monotonic() + seconds
+    while True:
+        true, seen = look()
+        if true:
+            return
+        if time.monotonic() > deadline:
+            raise AssertionError(f"not within {seconds:.0f} s: {what}; the last look showed: {seen}")
+        time.sleep(0.05)

@@ -1,0 +1,33 @@
+# SPDX-License-Identifier: Apache-2.0
+"""Restart and kill -9 of dssmd under 3 writers at 1 kHz cost no sample, here or elsewhere
+
+Each sample is read once, in order and untorn by readers on the writers' PC and on both others; the
+readers' rings stay the same.
+"""
+
+from lab.dssmd import await_news, kill_dssmd
+from lab.lab import Lab
+from lab.load import Load, expect_complete
+
+STREAMS = [f"load{number}:0@pc1" for number in (1, 2, 3)]
+
+
+def run(lab: Lab) -> None:
+    """Restarts and kills the writers' dssmd, then those of the readers."""
+    pc1, pc2, pc3 = lab.guests
+    writers = [Load(pc1, "write", [stream]).await_ready() for stream in STREAMS]
+    readers = {guest.name: Load(guest, "read", STREAMS).await_ready() for guest in lab.guests}
+    pc1.ssh.run("systemctl restart dssmd")
+    await_news(STREAMS, pc2, pc3)
+    kill_dssmd(pc1)
+    await_news(STREAMS, pc2, pc3)
+    pc2.ssh.run("systemctl restart dssmd")
+    kill_dssmd(pc3)
+    await_news(STREAMS, pc2, pc3)
+    written = {"written": {stream: count for writer in writers
+                           for stream, count in writer.finish()["written"].items()}}
+    for name, reader in readers.items():
+        expect_complete(written, reader.finish(), f"reader on {name}")
+    for stream in STREAMS:
+        pc1.ssh.run(f"dssmctl rm {stream}")
+    lab.await_streams()
