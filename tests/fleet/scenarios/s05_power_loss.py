@@ -9,6 +9,7 @@ import time
 
 from lab.lab import Lab
 from lab.load import Load
+from lab.timing import PART
 
 STREAM = "powered:0@pc1"
 # What the design promises, and what a busy machine may add to the looking.
@@ -26,7 +27,7 @@ def run(lab: Lab) -> None:
     pc1.power_off()
     lab.await_streams(on=[pc2, pc3])
     gone = time.monotonic() - lost
-    with lab.timing.step("  of that: boot pc1"), lab.spread():
+    with lab.timing.step(PART + "boot pc1"), lab.spread():
         pc1.power_on(lab.all_cores)
         pc1.await_running()
     writer = Load(pc1, "write", [STREAM]).await_ready()
