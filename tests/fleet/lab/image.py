@@ -128,7 +128,7 @@ def _build(folder: pathlib.Path) -> None:
         _install_modules(tree)
         _configure(tree)
         _make_keys(tree, folder)
-        run("mke2fs", "-q", "-t", "ext4", "-L", "root", "-O", "^has_journal", "-d", tree,
+        run("mke2fs", "-q", "-t", "ext4", "-L", "root", "-d", tree,
             folder / "root.ext4", SIZE, what="make the guests' disk")
     folder.chmod(0o755)
 

@@ -71,8 +71,9 @@ class Deployment:
         guest.ssh.run(f"cat > /tmp/dssmd.conf <<'END'\n{CONFIGURATION}END\n"
                       "mkdir -p /etc/dssm && cp /tmp/dssmd.conf /etc/dssm/dssmd.conf &&"
                       " DEBIAN_FRONTEND=noninteractive dpkg --force-confold --force-unsafe-io"
-                      " --install /tmp/packages/*.deb && systemctl is-active dssmd.service")
+                      " --install /tmp/packages/*.deb && systemctl is-active dssmd.service && sync")
 
     def install_programs(self, guest: Guest) -> None:
         """Copies what only the test needs: its load, the example's programs, the recording."""
         guest.ssh.put([*self._artifacts.programs, RECORDING], PROGRAMS_FOLDER)
+        guest.ssh.run("sync")  # a PC that loses its power keeps no more than that
