@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Writes a sample through the installed dssmd and reads it back; exits with 0 when it is the same.
-#include <dssm/dssm.hpp>
-
 #include <cstdio>
+#include <dssm/dssm.hpp>
 
 struct Climate {
   double temperature_c;
