@@ -105,15 +105,14 @@ ServiceManager::Sent ServiceManager::send_now(const Message& message) {
   if (path_.empty()) return Sent::nobody_there;
   // A manager that was started anew has another socket at the same place.
   for (int attempt = 0; attempt < 2; ++attempt) {
-    if (!socket_ && !connect()) return Sent::nobody_there;
+    if (!connected_ && !connect()) return Sent::nobody_there;
     const Sent sent = try_send(message);
     if (sent == Sent::not_now) {
       writable_.enable();
       try_again_.enable_in(kPause);
     }
     if (sent != Sent::nobody_there) return sent;
-    writable_ = EventSource();
-    socket_.reset();
+    connected_ = false;
   }
   return Sent::nobody_there;
 }
@@ -125,16 +124,16 @@ bool ServiceManager::connect() {
   if (path_.starts_with('@')) address.sun_path[0] = '\0';
   const auto length = static_cast<socklen_t>(offsetof(sockaddr_un, sun_path) + path_.size() +
                                              (path_.starts_with('@') ? 0 : 1));
-  UniqueFd socket(::socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0));
-  if (!socket || ::connect(socket.get(), reinterpret_cast<const sockaddr*>(&address), length)) {
-    return false;
+  if (!socket_) {
+    socket_.reset(::socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0));
+    if (!socket_) return false;
+    writable_ = EventSource::writable(loop_, socket_.get(), [this] {
+      writable_.disable();
+      try_again_.enable_in(Duration::zero());
+    });
   }
-  socket_ = std::move(socket);
-  writable_ = EventSource::writable(loop_, socket_.get(), [this] {
-    writable_.disable();
-    try_again_.enable_in(Duration::zero());
-  });
-  return true;
+  connected_ = !::connect(socket_.get(), reinterpret_cast<const sockaddr*>(&address), length);
+  return connected_;
 }
 
 ServiceManager::Sent ServiceManager::try_send(const Message& message) const {

@@ -78,8 +78,9 @@ class ServiceManager {
   const EventLoop& loop_;
   std::string path_;
   UniqueFd socket_;
+  bool connected_ = false;
   std::deque<Message> waiting_;
-  EventSource writable_;  // of the socket; only hurries try_again_, which may replace it
+  EventSource writable_;  // of the socket; only hurries try_again_
   EventSource try_again_;
 };
 
