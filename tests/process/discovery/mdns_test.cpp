@@ -8,6 +8,7 @@
 #include <string>
 #include <vector>
 
+#include "tests/process/discovery/mdns_flood.hpp"
 #include "tests/process/discovery/probe.hpp"
 #include "tests/support/avahi_host.hpp"
 #include "tests/support/network.hpp"
@@ -266,6 +267,29 @@ TEST_F(MdnsNeedsRoot, HostileRecordsHarmNobody) {
   EXPECT_TRUE(one.until_state({"heard=2"}));
   one.command("tick");
   EXPECT_TRUE(one.until([&] { return one.count("tock") == 1; }));
+}
+
+// More than an Avahi daemon remembers (4096 records), and each of them well-formed.
+TEST_F(MdnsNeedsRoot, OutlivesTenThousandForgedHosts) {
+  if (!make({"pc1", "pc2", "pc3"})) GTEST_SKIP() << why_;
+  Probe one(pc(1), 1, "pc1");
+  Probe three(pc(3), 3, "pc3");
+  ASSERT_TRUE(one.until([&] { return has(one, 3, "pc3 open 10.77.0.3:7000"); }));
+  {
+    const Inside inside = network_->inside(2);
+    MdnsFlood(Network::address(2)).announce_hosts(10'000, 10);
+  }
+  // Their host ids begin with a zero, of which the probe shows no more.
+  EXPECT_TRUE(one.until([&] { return one.count("found 0 flood") > 200; })) << "they arrive";
+  one.command("tick");
+  EXPECT_TRUE(one.until([&] { return one.count("tock") == 1; }));
+  EXPECT_TRUE(has(one, 3, "pc3 open")) << "who was there stays";
+  // When Avahi has forgotten them, all is as before, and who comes is found.
+  EXPECT_TRUE(one.until_state({"heard=1 "}));
+  EXPECT_TRUE(has(one, 3, "pc3 open"));
+  EXPECT_LE(one.most_heard(), 257) << "so many are followed, and no more";
+  Probe two(pc(2), 2, "pc2");
+  EXPECT_TRUE(one.until([&] { return has(one, 2, "pc2 open 10.77.0.2:7000"); }));
 }
 
 }  // namespace

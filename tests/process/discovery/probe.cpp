@@ -132,6 +132,16 @@ bool Probe::until_it_waits_for_an_answer() const {
   return false;
 }
 
+int Probe::most_heard() const {
+  constexpr std::string_view kKey = " heard=";
+  int most = 0;
+  for (const std::string& line : lines_) {
+    const std::size_t at = line.find(kKey);
+    if (at != line.npos) most = std::max(most, std::atoi(line.c_str() + at + kKey.size()));
+  }
+  return most;
+}
+
 int Probe::count(const std::string& beginning) const {
   return static_cast<int>(std::count_if(lines_.begin(), lines_.end(), [&](const std::string& line) {
     return line.starts_with(beginning);

@@ -45,6 +45,7 @@ class Probe {
   //   returns  false: none within half a minute, or this kernel does not tell
   bool until_it_waits_for_an_answer() const;
   int count(const std::string& beginning) const;  // lines that begin so
+  int most_heard() const;  // the greatest number of hosts that it has heard of at a time
 
  private:
   bool read_line(int timeout_ms);
