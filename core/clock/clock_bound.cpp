@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/clock/clock_bound.hpp"
+
+#include <algorithm>
+#include <limits>
+
+namespace dssm::clock {
+namespace {
+
+constexpr Duration kNone = Duration::zero();
+
+Duration magnitude(Duration offset) noexcept {
+  return offset == Duration::min() ? kUnknownClockError : std::max(offset, -offset);
+}
+
+Duration half(Duration d) noexcept { return d / 2 + d % 2; }
+
+// own - reference where that is known and positive; all of `own` without a usable reference.
+Duration beyond(Duration own, Duration reference) noexcept {
+  if (own == kUnknownClockError) return own;
+  return own - std::clamp(reference, kNone, std::max(own, kNone));
+}
+
+}  // namespace
+
+Duration sum(Duration a, Duration b) noexcept {
+  return a > kUnknownClockError - b ? kUnknownClockError : a + b;
+}
+
+Duration bound_to_root(Duration offset, const RootDistance& own) noexcept {
+  return bound_to_reference(offset, own, {});
+}
+
+Duration bound_to_reference(Duration offset, const RootDistance& own,
+                            const RootDistance& reference) noexcept {
+  const Duration delay = beyond(own.delay, reference.delay);
+  return sum(sum(magnitude(offset), beyond(own.dispersion, reference.dispersion)),
+             delay == kUnknownClockError ? delay : half(delay));
+}
+
+Duration growth(Duration age, PartsPerBillion drift) noexcept {
+  if (age <= kNone) return kNone;
+  constexpr std::int64_t kBillion = 1'000'000'000, kMost = std::numeric_limits<std::int64_t>::max();
+  // Whole seconds and the rest apart, so that neither product overflows for an honest age.
+  const std::int64_t seconds = age.count() / kBillion, rest = age.count() % kBillion;
+  if (drift > kMost / kBillion || (drift > 0 && seconds > (kMost - 2 * drift) / drift)) {
+    return kUnknownClockError;
+  }
+  return Duration(seconds * drift + (rest * drift + kBillion - 1) / kBillion);
+}
+
+Duration bound_between(Duration one, std::string_view one_boot_id, Duration other,
+                       std::string_view other_boot_id) noexcept {
+  if (!one_boot_id.empty() && one_boot_id == other_boot_id) return kNone;
+  return sum(one, other);
+}
+
+}  // namespace dssm::clock

@@ -1,0 +1,345 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/clock/clock_estimator.hpp"
+
+#include <gtest/gtest.h>
+
+namespace dssm::clock {
+namespace {
+
+using namespace std::chrono_literals;
+using Verdict = ClockEstimator::Verdict;
+
+constexpr std::uint32_t kPc1 = 0x0a000001;
+constexpr PartsPerBillion kAgeing = 56'250;  // 50 ppm of a slewed second
+
+// An estimator whose clock and chronyd the test moves by hand.
+struct Rig {
+  ClockEstimator estimator{ClockEstimator::Settings{}};
+  Instant now{MonoTime(1000s), Time(2'000'000s), {}};
+  Tracking tracking = synchronized();
+
+  static Tracking synchronized() {
+    Tracking t;
+    t.reference_id = kPc1;
+    t.stratum = 11;
+    t.leap = 0;
+    t.update_interval = 1s;
+    t.offset = 10us;
+    t.root = {20us, 60us};
+    return t;
+  }
+
+  Rig() { estimator.look(now); }
+
+  void pass(Duration time) {
+    now.mono += time;
+    now.wall += time;
+    estimator.look(now);
+  }
+  void step(Duration by) {
+    now.wall += by;
+    EXPECT_EQ(estimator.look(now), by);
+  }
+  // chronyd answers at once, and learned something `age` ago.
+  Verdict hear(Duration age = 0s) {
+    tracking.updated = now.wall - tracking.offset - age;
+    return estimator.take_untrusted(tracking, now.mono, now);
+  }
+  // chronyd has learned nothing since.
+  Verdict hear_the_same() { return estimator.take_untrusted(tracking, now.mono, now); }
+  ClockState state() const { return estimator.at(now.mono); }
+};
+
+// What is expected of a clock without a bound.
+void expect_void(const ClockState& state, ClockTrouble why) {
+  EXPECT_EQ(state.status, ClockStatus::out_of_bounds);
+  EXPECT_EQ(state.trouble, why);
+  EXPECT_EQ(state.bound, kUnknownClockError);
+  EXPECT_EQ(state.basis, ClockBasis::nothing);
+}
+
+TEST(ClockEstimator, KnowsNothingBeforeChronydAnswers) {
+  Rig rig;
+  EXPECT_EQ(rig.state(), ClockState());
+  rig.estimator.on_no_chronyd();
+  rig.pass(1h);
+  EXPECT_EQ(rig.state(), ClockState());
+}
+
+TEST(ClockEstimator, StatesTheDistanceFromTheRoot) {
+  Rig rig;
+  EXPECT_EQ(rig.hear(), Verdict::taken);
+  const ClockState state = rig.state();
+  EXPECT_EQ(state.status, ClockStatus::synchronized);
+  EXPECT_EQ(state.trouble, ClockTrouble::none);
+  EXPECT_EQ(state.basis, ClockBasis::root);
+  EXPECT_EQ(state.bound, 60us);
+  EXPECT_EQ(state.ageing, kAgeing);
+  EXPECT_EQ(state.reference_id, kPc1);
+  EXPECT_EQ(state.stratum, 11);
+  EXPECT_EQ(state.offset, 10us);
+  EXPECT_EQ(state.read, rig.now.mono);
+}
+
+TEST(ClockEstimator, AgesFromTheTimeWhenChronydLearnedSomething) {
+  Rig rig;
+  rig.hear(2s);
+  EXPECT_EQ(rig.state().bound, 60us + growth(2s, kAgeing));
+  rig.pass(1s);
+  EXPECT_EQ(rig.state().bound, 60us + growth(3s, kAgeing));
+}
+
+TEST(ClockEstimator, AgesFromTheQuestionWhenTheAnswerTookTime) {
+  Rig rig;
+  const MonoTime asked = rig.now.mono;
+  rig.pass(500ms);
+  rig.tracking.updated = rig.now.wall - rig.tracking.offset;
+  rig.estimator.take_untrusted(rig.tracking, asked, rig.now);
+  EXPECT_EQ(rig.state().bound, 60us + growth(500ms, kAgeing));
+}
+
+TEST(ClockEstimator, AddsWhatItCannotTellFromAStep) {
+  Rig rig;
+  rig.hear();
+  rig.now.wall += 600ns;
+  rig.now.width = 300ns;
+  EXPECT_FALSE(rig.estimator.look(rig.now));
+  EXPECT_EQ(rig.state().bound, 60us + 900ns);
+}
+
+TEST(ClockEstimator, NoticesManySmallSteps) {
+  Rig rig;
+  rig.hear();
+  rig.now.wall += 700ns;
+  EXPECT_FALSE(rig.estimator.look(rig.now));
+  rig.now.wall += 700ns;
+  EXPECT_EQ(rig.estimator.look(rig.now), 1400ns);
+}
+
+TEST(ClockEstimator, FallsIntoHoldoverWhenChronydLearnsNothing) {
+  Rig rig;
+  rig.hear();
+  rig.pass(5s);
+  rig.hear(5s);
+  EXPECT_EQ(rig.state().status, ClockStatus::synchronized);
+  rig.pass(1s);
+  rig.hear(6s);
+  EXPECT_EQ(rig.state().status, ClockStatus::holdover);
+  EXPECT_EQ(rig.state().bound, 60us + growth(6s, kAgeing));
+  for (int age = 7; age < 30; ++age) {
+    rig.pass(1s);
+    rig.hear(std::chrono::seconds(age));
+  }
+  EXPECT_EQ(rig.state().status, ClockStatus::out_of_bounds);
+  EXPECT_EQ(rig.state().trouble, ClockTrouble::too_far);
+  EXPECT_EQ(rig.state().bound, 60us + growth(29s, kAgeing)) << "still true";
+}
+
+TEST(ClockEstimator, HasNoBoundWhenChronydIsSilent) {
+  Rig rig;
+  rig.hear();
+  rig.pass(ClockEstimator::kSilentAfter);
+  EXPECT_EQ(rig.state().status, ClockStatus::synchronized);
+  rig.pass(1ns);
+  expect_void(rig.state(), ClockTrouble::silent);
+  rig.hear();
+  EXPECT_EQ(rig.state().status, ClockStatus::synchronized);
+}
+
+TEST(ClockEstimator, HasNoBoundAtOnceWhenThereIsNoChronyd) {
+  Rig rig;
+  rig.hear();
+  rig.estimator.on_no_chronyd();
+  expect_void(rig.state(), ClockTrouble::no_chronyd);
+  rig.pass(1h);
+  expect_void(rig.state(), ClockTrouble::no_chronyd);
+}
+
+TEST(ClockEstimator, HasNoBoundWhenChronydIsUnsynchronized) {
+  Rig rig;
+  rig.hear();
+  rig.tracking = Tracking();
+  rig.tracking.root = {1s, 1s};
+  EXPECT_EQ(rig.estimator.take_untrusted(rig.tracking, rig.now.mono, rig.now),
+            Verdict::unsynchronized);
+  expect_void(rig.state(), ClockTrouble::unsynchronized);
+}
+
+TEST(ClockEstimator, TakesAnnouncedLeapSecondsForNormal) {
+  for (const std::uint16_t leap : {std::uint16_t{1}, std::uint16_t{2}}) {
+    Rig rig;
+    rig.tracking.leap = leap;
+    EXPECT_EQ(rig.hear(), Verdict::taken);
+  }
+}
+
+TEST(ClockEstimator, HasNoBoundAfterAStepUntilChronydMeasuredAnew) {
+  for (const Duration by : {Duration(200ms), Duration(-200ms), Duration(1h), Duration(-1h)}) {
+    Rig rig;
+    rig.hear();
+    rig.step(by);
+    expect_void(rig.state(), ClockTrouble::stepped);
+    for (int i = 0; i < 10; ++i) {
+      rig.pass(1s);
+      EXPECT_EQ(rig.hear_the_same(), Verdict::stepped) << "chronyd did not notice";
+      expect_void(rig.state(), ClockTrouble::stepped);
+    }
+    for (int i = 1; i < ClockEstimator::kUpdatesAfterStep; ++i) {
+      rig.pass(1s);
+      EXPECT_EQ(rig.hear(), Verdict::stepped);
+      EXPECT_EQ(rig.hear_the_same(), Verdict::stepped) << "the same measurement counts once";
+    }
+    rig.pass(1s);
+    EXPECT_EQ(rig.hear(), Verdict::taken);
+    EXPECT_EQ(rig.state().bound, 60us);
+  }
+}
+
+TEST(ClockEstimator, CountsAnewWhenTheClockIsSteppedAgain) {
+  Rig rig;
+  rig.hear();
+  rig.step(200ms);
+  rig.pass(1s);
+  rig.hear();
+  rig.pass(1s);
+  rig.hear();
+  rig.step(-200ms);
+  rig.pass(1s);
+  EXPECT_EQ(rig.hear(), Verdict::stepped);
+}
+
+TEST(ClockEstimator, TakesALocalReferenceForRight) {
+  Rig rig;
+  rig.tracking.reference_id = kLocalReferenceId;
+  rig.tracking.offset = 0s;
+  rig.tracking.root = {};
+  EXPECT_EQ(rig.hear(1s), Verdict::taken);
+  rig.pass(3s);
+  EXPECT_EQ(rig.state().status, ClockStatus::synchronized);
+  EXPECT_EQ(rig.state().basis, ClockBasis::own);
+  EXPECT_EQ(rig.state().bound, 0ns);
+  EXPECT_EQ(rig.state().ageing, 0);
+}
+
+TEST(ClockEstimator, KnowsThatALocalReferenceIsStillBeingSlewed) {
+  Rig rig;
+  rig.tracking.reference_id = kLocalReferenceId;
+  rig.tracking.offset = -40us;
+  rig.hear();
+  EXPECT_EQ(rig.state().bound, 40us);
+}
+
+TEST(ClockEstimator, HoldsOutWhenItHearsNoMoreFromTheReferencePc) {
+  Rig rig;
+  rig.hear();
+  rig.estimator.on_reference(ReferenceReport{kPc1, {}}, rig.now.mono);
+  rig.pass(8s);
+  rig.tracking.reference_id = kLocalReferenceId;
+  rig.tracking.root = {};
+  rig.hear();
+  EXPECT_EQ(rig.state().status, ClockStatus::holdover);
+  EXPECT_EQ(rig.state().bound, 60us + growth(8s, kAgeing));
+}
+
+TEST(ClockEstimator, IsNotRightByDefinitionWhenAnotherPcIs) {
+  Rig rig;
+  rig.tracking.reference_id = kLocalReferenceId;
+  rig.hear();
+  rig.estimator.on_reference(ReferenceReport{kPc1, {}}, rig.now.mono);
+  rig.pass(1s);
+  EXPECT_EQ(rig.hear(), Verdict::unsynchronized);
+  expect_void(rig.state(), ClockTrouble::unsynchronized);
+}
+
+// Reports of the reference PC, and of chronyd's, one a second.
+void hear_with_reference(Rig& rig, const ReferenceReport& report, int seconds) {
+  for (int i = 0; i < seconds; ++i) {
+    rig.pass(1s);
+    rig.estimator.on_reference(report, rig.now.mono);
+    rig.hear();
+  }
+}
+
+TEST(ClockEstimator, StatesTheDistanceFromTheReferencePcOnceThatIsKnownLongEnough) {
+  Rig rig;
+  rig.tracking.root = {520us, 1060us};
+  hear_with_reference(rig, {kPc1, {500us, 1000us}}, 256);
+  EXPECT_EQ(rig.state().basis, ClockBasis::root);
+  EXPECT_EQ(rig.state().bound, 10us + 520us + 530us);
+  hear_with_reference(rig, {kPc1, {500us, 1000us}}, 1);
+  EXPECT_EQ(rig.state().basis, ClockBasis::reference);
+  EXPECT_EQ(rig.state().bound, 10us + 20us + 30us);
+  rig.estimator.on_reference({}, rig.now.mono);
+  EXPECT_EQ(rig.state().basis, ClockBasis::root);
+}
+
+// What chronyd says here may go back to a measurement 256 intervals ago.
+TEST(ClockEstimator, GoesByTheLeastThatTheReferencePcSaidInTheTimeThatCounts) {
+  Rig rig;
+  rig.tracking.root = {520us, 1060us};
+  hear_with_reference(rig, {kPc1, {500us, 1000us}}, 300);
+  hear_with_reference(rig, {kPc1, {900us, 5000us}}, 200);
+  EXPECT_EQ(rig.state().bound, 60us);
+  hear_with_reference(rig, {kPc1, {400us, 5000us}}, 1);
+  EXPECT_EQ(rig.state().bound, 160us);
+  hear_with_reference(rig, {kPc1, {500us, 1000us}}, 256);
+  EXPECT_EQ(rig.state().bound, 160us);
+  hear_with_reference(rig, {kPc1, {500us, 1000us}}, 512);
+  EXPECT_EQ(rig.state().bound, 60us);
+}
+
+TEST(ClockEstimator, StatesTheDistanceFromTheRootWhenItFollowsSomebodyElse) {
+  Rig rig;
+  rig.tracking.root = {520us, 1060us};
+  hear_with_reference(rig, {kPc1, {500us, 1000us}}, 300);
+  rig.tracking.reference_id = 0x0a000002;
+  rig.hear();
+  EXPECT_EQ(rig.state().basis, ClockBasis::root);
+  EXPECT_EQ(rig.state().bound, 1060us);
+}
+
+TEST(ClockEstimator, TakesNonsenseForNoAnswer) {
+  const auto refused = [](auto spoil) {
+    Rig rig;
+    rig.hear();
+    rig.pass(1s);
+    rig.tracking.updated = rig.now.wall - rig.tracking.offset;
+    spoil(rig.tracking);
+    EXPECT_EQ(rig.estimator.take_untrusted(rig.tracking, rig.now.mono, rig.now), Verdict::nonsense);
+    EXPECT_EQ(rig.state().bound, 60us + growth(1s, kAgeing)) << "the last reading still counts";
+    rig.pass(3s);
+    expect_void(rig.state(), ClockTrouble::silent);
+  };
+  refused([](Tracking& t) { t.root.dispersion = -1ns; });
+  refused([](Tracking& t) { t.root.delay = -1ns; });
+  refused([](Tracking& t) { t.root.delay = Duration::max(); });
+  refused([](Tracking& t) { t.root.dispersion = Duration::max(); });
+  refused([](Tracking& t) { t.offset = Duration::min(); });
+  refused([](Tracking& t) { t.offset = Duration::max(); });
+  refused([](Tracking& t) { t.update_interval = -1s; });
+  refused([](Tracking& t) { t.leap = 4; });
+  refused([](Tracking& t) { t.updated = Time::min(); });
+  refused([](Tracking& t) { t.updated = Time::max(); });
+  refused([](Tracking& t) { t.updated += 2s; });
+}
+
+TEST(ClockEstimator, TakesNewSettingsAtOnce) {
+  Rig rig;
+  rig.hear();
+  rig.pass(1s);
+  rig.estimator.set({50us, 1'000'000});
+  EXPECT_EQ(rig.state().status, ClockStatus::out_of_bounds);
+  EXPECT_EQ(rig.state().bound, 60us + growth(1s, 1'125'000));
+}
+
+TEST(ClockInstant, IsReadFromBothClocks) {
+  const MonoTime mono = MonoClock::now();
+  const Time wall = WallClock::now();
+  const Instant now = Instant::now();
+  EXPECT_GE(now.mono, mono);
+  EXPECT_GE(now.wall, wall);
+  EXPECT_LE(now.mono + now.width, MonoClock::now());
+}
+
+}  // namespace
+}  // namespace dssm::clock
