@@ -18,12 +18,10 @@ using Traits = SimulatedPc::Traits;
 constexpr ClockEstimator::Settings kFiftyPpm{Duration(1500us), 50'000};
 constexpr int kRuns = 20;
 
-// The seeds of this run; DSSM_TEST_SEED repeats an earlier one.
+// The same in each run, so that what fails here fails again; DSSM_TEST_SEED tries others.
 std::uint32_t first_seed() {
   const char* text = std::getenv("DSSM_TEST_SEED");
-  static const std::uint32_t seed =
-      text ? static_cast<std::uint32_t>(std::strtoul(text, nullptr, 10)) : std::random_device{}();
-  return seed;
+  return text ? static_cast<std::uint32_t>(std::strtoul(text, nullptr, 10)) : 1;
 }
 
 // Runs `kRuns` PCs for `time` each: all stated bounds hold, and most of the time there is one.
