@@ -44,8 +44,8 @@ class Guest:
         command = [
             "unshare", "--pid", "--fork", "--kill-child=SIGKILL", "--mount-proc",
             "env", f"LD_PRELOAD={self._preload}", str(KERNEL),
-            f"mem={MEMORY}", f"ubd0={self._disk},{self._image.disk}", "root=/dev/ubda", "rw", "rootfstype=ext4",
-            "con=null", "con0=null,fd:1", f"umid={self.name}", f"uml_dir={self.folder}",
+            f"mem={MEMORY}", f"ubd0={self._disk},{self._image.disk}", "root=/dev/ubda", "rw",
+            "rootfstype=ext4", "con=null", "con0=null,fd:1", f"umid={self.name}", f"uml_dir={self.folder}",
             f"vec0:transport=tap,ifname={tap(self.number)},depth=128,gro=1",
             f"lab_address={self.address}", f"systemd.hostname={self.name}",
             f"systemd.machine_id={machine_id}", "quiet", "systemd.show_status=no",
