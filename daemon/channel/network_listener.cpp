@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/channel/network_listener.hpp"
 
+#include <sys/socket.h>
+
 #include <algorithm>
 #include <set>
 #include <utility>
@@ -20,6 +22,24 @@ bool listens_at(int socket, const wire::SocketAddress& wanted) {
          wanted.str() == "0.0.0.0" + bound->str().substr(bound->str().rfind(':'));
 }
 
+// Of the sockets that were kept, ends those at addresses that are not wanted any more: one at
+// 127.0.0.1 would be in the way of one at 0.0.0.0. Closing them is not enough, because the service
+// manager still has them.
+void end_unwanted(const NetworkListener::Inherited& inherited,
+                  const std::vector<wire::Address>& wanted) {
+  for (const NamedDescriptor& one : inherited) {
+    if (!NetworkListener::is_kept_name(one.name)) continue;
+    const bool is_wanted =
+        std::any_of(wanted.begin(), wanted.end(), [&](const wire::Address& address) {
+          const auto numbers = wire::resolve_number(address);
+          return std::any_of(
+              numbers.begin(), numbers.end(),
+              [&](const wire::SocketAddress& number) { return listens_at(one.fd.get(), number); });
+        });
+    if (!is_wanted) ::shutdown(one.fd.get(), SHUT_RDWR);
+  }
+}
+
 }  // namespace
 
 Result<NetworkListener> NetworkListener::open(
@@ -28,7 +48,9 @@ Result<NetworkListener> NetworkListener::open(
   NetworkListener listener;
   const std::vector<wire::Address> defaults = {{"127.0.0.1", wire::kDefaultPort},
                                                {"::1", wire::kDefaultPort}};
-  for (const wire::Address& address : configured.value_or(defaults)) {
+  const std::vector<wire::Address>& wanted = configured ? *configured : defaults;
+  end_unwanted(inherited, wanted);
+  for (const wire::Address& address : wanted) {
     Result<void> added = listener.add(address, inherited);
     if (added) continue;
     if (configured) return std::move(added).error();

@@ -23,7 +23,9 @@ class NetworkListener {
   // Listens at the configured addresses, which are numbers; an empty list: nowhere. Nothing
   // configured: at the default port of 127.0.0.1 and ::1, as far as this PC has them and no other
   // dssmd took the port before; what is missing is logged as a warning.
-  //   inherited  those that are bound to a wanted address are used, and taken out of the list
+  //   inherited  those that are bound to a wanted address are used, and taken out of the list; of
+  //   the
+  //              others, those that keep_in() had kept listen no more
   //   fails      naming the configured address that cannot be had
   static Result<NetworkListener> open(const std::optional<std::vector<wire::Address>>& configured,
                                       Inherited& inherited, Logger& logger);

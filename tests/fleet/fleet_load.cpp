@@ -5,8 +5,9 @@
 //   fleet-load write RATE_HZ STREAM@HOST...   creates them and writes each at this rate
 //   fleet-load read RATE_HZ STREAM@HOST...    reads each from its oldest sample on
 //
-// Says "ready" on stdout when each stream has moved, ends when its stdin does, readers once they
-// have all that was written until then. The last line is JSON:
+// Says "ready" on stdout when each stream has moved, and for each byte on stdin how many samples
+// have moved by then. Ends when stdin does, readers once they have all that was written until then.
+// The last line is JSON:
 //
 //   write  {"written": {STREAM: COUNT}}
 //   read   {"faults": TEXT, "streams": {STREAM: {"taken": N, "lost": N, "restarts": N}}}
@@ -23,6 +24,7 @@
 #include <dssm/dssm.hpp>
 #include <functional>
 #include <nlohmann/json.hpp>
+#include <numeric>
 #include <thread>
 
 #include "tests/process/network/follower.hpp"
@@ -45,14 +47,19 @@ KnownStream known_stream(const std::string& name, std::uint64_t rate_hz) {
   return known;
 }
 
-bool stdin_ended() {
-  pollfd in{STDIN_FILENO, POLLIN, 0};
-  return ::poll(&in, 1, 0) > 0;
-}
-
 void say(const std::string& line) {
   std::printf("%s\n", line.c_str());
   std::fflush(stdout);
+}
+
+// Answers a question on stdin, if there is one, with what `moved` says; whether stdin has ended.
+bool stdin_ended(const std::function<std::uint64_t()>& moved) {
+  pollfd in{STDIN_FILENO, POLLIN, 0};
+  if (::poll(&in, 1, 0) <= 0) return false;
+  char question = 0;
+  if (::read(STDIN_FILENO, &question, 1) != 1) return true;
+  say(std::to_string(moved()));
+  return false;
 }
 
 void write(const std::vector<KnownStream>& streams) {
@@ -65,7 +72,9 @@ void write(const std::vector<KnownStream>& streams) {
   const auto life = static_cast<std::uint64_t>(std::time(nullptr));
   std::vector<std::byte> payload(kPayloadBytes);
   MonoTime due = MonoClock::now();
-  for (Tid tid = 0; !stdin_ended(); ++tid, due += streams[0].cycle) {
+  Tid tid = 0;
+  const auto moved = [&] { return static_cast<std::uint64_t>(tid) * streams.size(); };
+  for (; !stdin_ended(moved); ++tid, due += streams[0].cycle) {
     std::this_thread::sleep_until(due);
     for (std::size_t i = 0; i < streams.size(); ++i) {
       streams[i].fill(payload, life, tid);
@@ -97,9 +106,14 @@ void read(const std::vector<KnownStream>& streams) {
   const auto all = [&](auto condition) {
     return std::all_of(followers.begin(), followers.end(), condition);
   };
+  const auto moved = [&] {
+    return std::accumulate(
+        followers.begin(), followers.end(), std::uint64_t{0},
+        [](std::uint64_t sum, const Follower& follower) { return sum + follower.taken(); });
+  };
   while (!all([](const Follower& follower) { return follower.taken() > 0; })) take();
   say("ready");
-  while (!stdin_ended()) take();
+  while (!stdin_ended(moved)) take();
   for (Follower& follower : followers) {
     const Tid newest = session.info(follower.known().id).value().newest;
     while (follower.last() < newest) take();

@@ -7,6 +7,9 @@
 // AMX, and says EFAULT; the guest's init dies at its first instruction ("ptrace set fp regs failed,
 // errno = 14"). Preloaded (LD_PRELOAD), this gives such a request its full size. What is added is
 // zero and belongs to registers that no guest can enable, so that nothing is lost.
+//
+// Where the state is not larger than UML's buffer, it does nothing: the request goes on as it came,
+// and Linux cuts one that is too long down to the whole state by itself.
 #include <dlfcn.h>
 #include <elf.h>
 #include <stdarg.h>

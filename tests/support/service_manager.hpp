@@ -58,6 +58,9 @@ class ServiceManager {
   void restart();    // systemctl restart: SIGTERM and a start, the store is kept
   void forget_more_sockets() { options_.more_sockets.clear(); }
   void rename_host(const std::string& host) { options_.host = host; }  // from the next start on
+  void set_arguments(const std::vector<std::string>& arguments) {      // likewise
+    options_.arguments = arguments;
+  }
   // kill(2); for SIGHUP, SIGSTOP ...
   void signal(int number) const;
 

@@ -10,9 +10,16 @@ class CommandError(Exception):
     """A program ended badly; the text holds the command and its output."""
 
 
-def run(*command: str | pathlib.Path, what: str, timeout: float = 600) -> str:
-    """Runs `command` and returns its stdout. `what` names the aim, for the failure's text."""
-    words = [str(word) for word in command]
+# Namespaces in which all processes end with the first one.
+CONTAINED = ("unshare", "--pid", "--mount", "--fork", "--kill-child=SIGKILL", "--mount-proc")
+
+
+def run(*command: str | pathlib.Path, what: str, timeout: float = 600, contained: bool = False) -> str:
+    """Runs `command` and returns its stdout. `what` names the aim, for the failure's text.
+
+    `contained`: when this ends early, so does all that the command has started.
+    """
+    words = [*(CONTAINED if contained else ()), *map(str, command)]
     try:
         done = subprocess.run(words, stdin=subprocess.DEVNULL, capture_output=True, text=True,
                               timeout=timeout, check=False)

@@ -33,7 +33,8 @@ class Guest:
         self.folder.mkdir()
         self.console = self.folder / "console"
         self.ssh = Ssh(self.name, ssh_config)
-        self._disk = f"{self.folder}/disk,{image.disk}"
+        self._image = image
+        self._disk = self.folder / "disk"  # what differs from the image
         self._preload = preload
         self._process: subprocess.Popen[bytes] | None = None
 
@@ -43,8 +44,8 @@ class Guest:
         command = [
             "unshare", "--pid", "--fork", "--kill-child=SIGKILL", "--mount-proc",
             "env", f"LD_PRELOAD={self._preload}", str(KERNEL),
-            f"mem={MEMORY}", f"ubd0={self._disk}", "root=/dev/ubda", "rw", "rootfstype=ext4",
-            "con=null", "con0=null,fd:1", f"umid={self.name}", f"uml_dir={self.folder}",
+            f"mem={MEMORY}", f"ubd0={self._disk},{self._image.disk}", "root=/dev/ubda", "rw",
+            "rootfstype=ext4", "con=null", "con0=null,fd:1", f"umid={self.name}", f"uml_dir={self.folder}",
             f"vec0:transport=tap,ifname={tap(self.number)},depth=128,gro=1",
             f"lab_address={self.address}", f"systemd.hostname={self.name}",
             f"systemd.machine_id={machine_id}", "quiet", "systemd.show_status=no",
@@ -70,6 +71,10 @@ class Guest:
         self._process.wait()
         self._process = None
         self.ssh.close()
+
+    def wipe(self) -> None:
+        """Makes a PC that is off a bare one again."""
+        self._disk.unlink(missing_ok=True)
 
     def reboot(self, cores: set[int]) -> None:
         """Shuts the PC down properly and switches it on again; await_running() as after power_on()."""

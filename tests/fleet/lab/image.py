@@ -11,17 +11,20 @@ import fcntl
 import hashlib
 import os
 import pathlib
+import re
 import shutil
 import tempfile
+import time
 from collections.abc import Iterator
 
-from lab.command import run
+from lab.command import CommandError, run
 
 KERNEL = pathlib.Path("/usr/bin/linux.uml")
 MODULES = pathlib.Path("/usr/lib/uml/modules")
 KEYRING = pathlib.Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 FILES = pathlib.Path(__file__).parent.parent / "image"
 SIZE = "1200M"
+UNUSED_SECONDS = 3 * 24 * 3600  # of other versions; a run of one may be going on
 
 PACKAGES = (
     # The PC: a system, its services, and the tools that scenarios use there.
@@ -36,6 +39,9 @@ PACKAGES = (
 
 # Nobody reads them in a guest, and they are most of what dpkg would have to write.
 EXCLUDED = ("man", "doc", "doc-base", "info", "locale", "lintian", "bug", "zoneinfo", "i18n")
+
+# What mmdebstrap and apt-get say when there is no network: of the lists, and of the packages.
+NO_NETWORK = re.compile("apt-get update .*failed|Failed to fetch|Unable to fetch")
 
 # What a PC in a test does not need and what makes it boot slowly: consoles, timers, hardware that
 # a guest has none of, and generators that look for it.
@@ -73,10 +79,14 @@ def cache_folder() -> pathlib.Path:
     return pathlib.Path(base) / "dssm" / "fleet"
 
 
+class NoNetwork(Exception):
+    """There is no image, and none can be made without a network."""
+
+
 def ensure_image() -> Image:
     """The image for this version of the harness; builds it when it is not there yet.
 
-    Runs side by side wait for the one that builds. Images of older versions go.
+    Runs side by side wait for the one that builds. Images that nobody has used for long go.
     """
     cache = cache_folder()
     cache.mkdir(parents=True, exist_ok=True)
@@ -86,9 +96,10 @@ def ensure_image() -> Image:
             with _scratch(cache) as scratch:
                 _build(scratch)
                 scratch.rename(folder)
-            for other in cache.iterdir():
-                if other.is_dir() and other != folder:
-                    shutil.rmtree(other)
+        os.utime(folder)
+        for other in cache.iterdir():
+            if other.is_dir() and time.time() - other.stat().st_mtime > UNUSED_SECONDS:
+                shutil.rmtree(other)
     return Image(folder)
 
 
@@ -135,10 +146,16 @@ def _build(folder: pathlib.Path) -> None:
 
 def _bootstrap(tree: pathlib.Path) -> None:
     options = [f"--dpkgopt=path-exclude=/usr/share/{name}/*" for name in EXCLUDED]
-    run("mmdebstrap", "--mode=root", "--variant=minbase", "--format=directory", "--quiet",
-        f"--keyring={KEYRING}", '--aptopt=Acquire::Languages "none"', '--aptopt=Acquire::Retries "3"',
-        "--dpkgopt=force-unsafe-io", *options, "--include=" + ",".join(PACKAGES), "bookworm", tree,
-        what="make a Debian for the guests (needs the network)")
+    try:
+        run("mmdebstrap", "--mode=root", "--variant=minbase", "--format=directory", "--quiet",
+            f"--keyring={KEYRING}", '--aptopt=Acquire::Languages "none"',
+            '--aptopt=Acquire::Retries "3"', "--dpkgopt=force-unsafe-io", *options,
+            "--include=" + ",".join(PACKAGES), "bookworm", tree,
+            what="make a Debian for the guests", contained=True)
+    except CommandError as error:
+        if NO_NETWORK.search(str(error)):
+            raise NoNetwork(str(error)) from error
+        raise
 
 
 def _install_modules(tree: pathlib.Path) -> None:

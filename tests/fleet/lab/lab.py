@@ -13,7 +13,8 @@ from typing import Any, TypeVar
 from lab.guest import Guest
 from lab.image import Image
 from lab.network import Network, guest_address, guest_name
-from lab.packages import Artifacts, Deployment
+from lab.packages import PROGRAMS_FOLDER, RECORDING, Artifacts
+from lab.playbooks import Playbooks, Played
 from lab.ssh import write_config
 from lab.timing import Timing
 
@@ -33,8 +34,10 @@ class Lab:
                                                        for number in numbers})
         self.guests = [Guest(number, image, artifacts.preload, folder, self.ssh_config)
                        for number in numbers]
-        self.deployment = Deployment(artifacts)
+        self.artifacts = artifacts
+        self.playbooks = Playbooks(folder, self.ssh_config, self.guests)
         self.timing = timing
+        self.folder = folder
         self.all_cores = os.sched_getaffinity(0)
         # Runs side by side spread over the cores.
         self._core = sorted(self.all_cores)[folder.stat().st_ino % len(self.all_cores)]
@@ -72,13 +75,40 @@ class Lab:
         for guest in self.guests:
             guest.power_off()
 
+    def install_programs(self) -> None:
+        """Copies what only the tests need: their load, the example's programs, the recording."""
+        def install(guest: Guest) -> None:
+            guest.ssh.put([*self.artifacts.programs, RECORDING], PROGRAMS_FOLDER)
+            guest.ssh.run("sync")  # a PC that loses its power keeps no more than that
+
+        self.on_all(install)
+
+    def deploy(self) -> Played:
+        """Makes the PCs a vehicle, or sees that they are one."""
+        with self.spread():
+            played = self.playbooks.play("site.yml", self.artifacts.packages)
+            self.on_all(lambda guest: guest.ssh.run("sync"))
+            return played
+
     def reset(self) -> None:
-        """Boots all guests anew, with all cables plugged, after a scenario failed."""
+        """From whatever a failed scenario has left to newly deployed PCs with fresh disks."""
+        for guest in self.guests:
+            guest.ssh.abandon()
         self.shut_down()
         self.network.join()
         for guest in self.guests:
             self.network.plug(guest.number)
+            guest.wipe()
         self.boot()
+        self.install_programs()
+        self.deploy()
+
+    def check_tidy(self) -> None:
+        """Fails when a scenario that passed has left something to the next one."""
+        left = {guest.name: running for guest in self.guests if (running := guest.ssh.abandon())}
+        assert not left, f"the scenario has left programs running: {left}"
+        self.await_streams()
+        self.on_all(Guest.await_running)
 
     def streams(self, guest: Guest) -> dict[str, dict[str, Any]]:
         """What `dssmctl ls` shows there, by full name."""

@@ -6,6 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from lab.guest import Guest
+from lab.lab import await_that
 from lab.packages import PROGRAMS_FOLDER
 from lab.ssh import GuestError
 
@@ -24,11 +25,21 @@ class Load:
 
     def await_ready(self) -> "Load":
         """Waits until samples move in each of its streams."""
-        assert self._process.stdout
-        if self._process.stdout.readline() != "ready\n":
-            self.finish()
-            raise self._error("ended before it began")
+        self._line()
         return self
+
+    def moved(self) -> int:
+        """How many samples it has written or read until now."""
+        assert self._process.stdin
+        self._process.stdin.write("?")
+        self._process.stdin.flush()
+        return int(self._line())
+
+    def await_more(self, samples: int) -> None:
+        """Waits until it has written or read so many samples more than now."""
+        wanted = self.moved() + samples
+        await_that(f"{self._guest.name}: '{self._command}' comes to {wanted} samples",
+                   lambda: ((moved := self.moved()) >= wanted, moved))
 
     def finish(self) -> dict[str, Any]:
         """Lets it come to its end, a reader when it has all, and returns what it found."""
@@ -38,10 +49,13 @@ class Load:
         result: dict[str, Any] = json.loads(out.splitlines()[-1])
         return result
 
-    def abandon(self) -> None:
-        """Ends the connection to it, and it by that."""
-        self._process.kill()
-        self._process.communicate()
+    def _line(self) -> str:
+        assert self._process.stdout
+        line = self._process.stdout.readline()
+        if not line:
+            self.finish()
+            raise self._error("ended by itself")
+        return line
 
     def _error(self, what: str) -> GuestError:
         return GuestError(f"{self._guest.name}: '{self._command}' {what}")

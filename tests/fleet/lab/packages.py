@@ -1,34 +1,29 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is tested, made on this machine, and how it gets onto bare guests."""
+"""What is tested, made on this machine."""
 
 import dataclasses
-import os
 import pathlib
+import shutil
+from collections.abc import Mapping
 
 from lab.command import run
-from lab.guest import Guest
 
 ROOT = pathlib.Path(__file__).parents[3]
 EXAMPLE = "docs/examples/vehicle"
 RECORDING = ROOT / EXAMPLE / "data/freiburg-079.carmen.log.gz"
 
-# The project's packages that a PC of a vehicle has.
+# The project's packages that the role installs.
 INSTALLED = ("libdssm1", "dssmd", "dssm-tools")
 
 # Where the test's own programs are on a guest.
 PROGRAMS_FOLDER = "/opt/fleet"
-
-CONFIGURATION = """\
-listen = ["0.0.0.0:13776"]
-insecure = true
-"""
 
 
 @dataclasses.dataclass
 class Artifacts:
     """All that was built for the guests."""
 
-    packages: list[pathlib.Path]  # .deb files
+    packages: pathlib.Path  # a folder of .deb files, each package once
     programs: list[pathlib.Path]  # the test's own, and the example's
     preload: pathlib.Path  # for the guests' kernels; see uml_xstate.c
 
@@ -37,43 +32,50 @@ def build(folder: pathlib.Path, packages: pathlib.Path | None) -> Artifacts:
     """Builds in `folder`, which meson knows or will; `packages`: a folder with packages that are built."""
     if not (folder / "build.ninja").exists():
         run("meson", "setup", folder, ROOT, "-Dunity=on", "-Dunity_size=16", "-Dbenchmarks=false",
-            what="configure the build")
+            what="configure the build", contained=True)
     targets = ["tests/fleet/fleet-load", "tests/fleet/uml-xstate.so",
                *(f"{EXAMPLE}/{name}" for name in ("encoder", "lidar", "localizer", "mapper"))]
-    run("ninja", "-C", folder, *targets, what="build the fleet's programs", timeout=3600)
+    run("ninja", "-C", folder, *targets, what="build the fleet's programs", timeout=3600, contained=True)
     if packages is None:
         packages = folder / "packages"
-        run(ROOT / "scripts/build-packages", packages, what="build the Debian packages", timeout=3600)
+        shutil.rmtree(packages, ignore_errors=True)  # the role wants no other version beside it
+        run(ROOT / "scripts/build-packages", packages, what="build the Debian packages", timeout=3600,
+            contained=True)
+    for name in INSTALLED:
+        package_file(packages, name)
     files = [folder / target for target in targets]
-    return Artifacts([newest(packages, name) for name in INSTALLED],
-                     [file for file in files if file.suffix != ".so"],
+    return Artifacts(packages, [file for file in files if file.suffix != ".so"],
                      next(file for file in files if file.suffix == ".so"))
 
 
-def newest(folder: pathlib.Path, package: str) -> pathlib.Path:
-    """The package's file in `folder`; the newest where there are several versions."""
-    files = sorted(folder.glob(f"{package}_*_amd64.deb"), key=os.path.getmtime)
-    if not files:
-        raise FileNotFoundError(f"no '{package}_*_amd64.deb' in '{folder}'; scripts/build-packages "
-                                "makes them")
-    return files[-1]
+def package_file(folder: pathlib.Path, package: str) -> pathlib.Path:
+    """The package's file in `folder`."""
+    files = list(folder.glob(f"{package}_*_amd64.deb"))
+    if len(files) != 1:
+        raise FileNotFoundError(f"'{folder}' holds {len(files)} files '{package}_*_amd64.deb' where one is "
+                                "needed; scripts/build-packages makes them in an empty folder")
+    return files[0]
 
 
-class Deployment:
-    """Makes a bare PC one of the vehicle: packages, configuration, a running dssmd."""
+def repack(packages: pathlib.Path, folder: pathlib.Path, suffix: str,
+           added: Mapping[str, str] | None = None) -> pathlib.Path:
+    """Packs the packages anew into `folder`, as a version that is higher by `suffix`.
 
-    def __init__(self, artifacts: Artifacts) -> None:
-        self._artifacts = artifacts
-
-    def deploy(self, guest: Guest) -> None:
-        """Installs and starts everything on one PC, which may be new or have it already."""
-        guest.ssh.put(self._artifacts.packages, "/tmp/packages")
-        guest.ssh.run(f"cat > /tmp/dssmd.conf <<'END'\n{CONFIGURATION}END\n"
-                      "mkdir -p /etc/dssm && cp /tmp/dssmd.conf /etc/dssm/dssmd.conf &&"
-                      " DEBIAN_FRONTEND=noninteractive dpkg --force-confold --force-unsafe-io"
-                      " --install /tmp/packages/*.deb && systemctl is-active dssmd.service && sync")
-
-    def install_programs(self, guest: Guest) -> None:
-        """Copies what only the test needs: its load, the example's programs, the recording."""
-        guest.ssh.put([*self._artifacts.programs, RECORDING], PROGRAMS_FOLDER)
-        guest.ssh.run("sync")  # a PC that loses its power keeps no more than that
+    `added`: files, by their paths on the PC, that dssmd is to have beside its own.
+    """
+    folder.mkdir()
+    for name in INSTALLED:
+        package = package_file(packages, name)
+        version = run("dpkg-deb", "--field", package, "Version", what="read a package").strip()
+        unpacked = folder / "unpacked"
+        run("dpkg-deb", "--raw-extract", package, unpacked, what="unpack a package")
+        control = unpacked / "DEBIAN/control"
+        control.write_text(control.read_text().replace(version, version + suffix))
+        for path, text in (added or {}).items() if name == "dssmd" else ():
+            file = unpacked / path.lstrip("/")
+            file.parent.mkdir(parents=True, exist_ok=True)
+            file.write_text(text)
+        run("dpkg-deb", "--root-owner-group", "-Znone", "--build", unpacked,
+            folder / f"{name}_{version}{suffix}_amd64.deb", what="pack a package")
+        shutil.rmtree(unpacked)
+    return folder

@@ -19,7 +19,7 @@ Host *
   LogLevel ERROR
   ControlMaster auto
   ControlPersist yes
-  ControlPath {folder}/ssh-%n
+  ControlPath {folder}/ssh-%h
   ServerAliveInterval 5
   ServerAliveCountMax 12
 """
@@ -44,6 +44,7 @@ class Ssh:
     def __init__(self, name: str, config: pathlib.Path) -> None:
         self.name = name
         self._ssh = ["ssh", "-F", str(config)]
+        self._started: list[tuple[str, subprocess.Popen[str]]] = []
 
     def words(self, command: str) -> list[str]:
         """The command line here that runs `command`, for a shell, there."""
@@ -74,8 +75,19 @@ class Ssh:
 
     def start(self, command: str) -> subprocess.Popen[str]:
         """Starts `command` and returns at once; its stdin ends when the caller closes it."""
-        return subprocess.Popen(self.words(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
-                                stderr=subprocess.PIPE, text=True)
+        process = subprocess.Popen(self.words(command), stdin=subprocess.PIPE, stdout=subprocess.PIPE,
+                                   stderr=subprocess.PIPE, text=True)
+        self._started.append((command, process))
+        return process
+
+    def abandon(self) -> list[str]:
+        """Ends the connections to what start() began and is still running, and returns what that is."""
+        running = [(command, process) for command, process in self._started if process.poll() is None]
+        for _, process in running:
+            process.kill()
+            process.communicate()
+        self._started.clear()
+        return [command for command, _ in running]
 
     def put(self, files: list[pathlib.Path], folder: str) -> None:
         """Copies files and folders, names and modes kept, into `folder` there."""

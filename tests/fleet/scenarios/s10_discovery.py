@@ -46,8 +46,7 @@ def second_dssmd(lab: Lab, guest: Guest) -> None:
 
 def one_name(lab: Lab, first: Guest, second: Guest) -> None:
     """Two PCs of one name are two hosts, and each says that there is another one of its name."""
-    second.ssh.run(f"systemctl stop dssmd && hostname {first.name} && systemctl restart avahi-daemon"
-                   " && systemctl start dssmd")
+    call(second, first.name)
     pc1 = lab["pc1"]
 
     def look() -> tuple[bool, object]:
@@ -56,6 +55,12 @@ def one_name(lab: Lab, first: Guest, second: Guest) -> None:
         return len({host["id"] for host in same}) == 2, hosts
 
     await_that(f"{pc1.name} lists two hosts of the name {first.name}", look)
-    second.ssh.run(f"systemctl stop dssmd && hostname {second.name} && systemctl restart avahi-daemon"
-                   " && systemctl start dssmd")
+    call(second, second.name)
     lab.await_streams()
+
+
+def call(guest: Guest, name: str) -> None:
+    """Gives a PC another name, to the machine as well as to dssmd."""
+    configure = f"""sed -i 's/^name = .*/name = "{name}"/' /etc/dssm/dssmd.conf"""
+    guest.ssh.run(f"systemctl stop dssmd && hostname {name} && {configure} &&"
+                  " systemctl restart avahi-daemon && systemctl start dssmd")

@@ -156,6 +156,18 @@ TEST(Sockets, ClosesOneThatTheConfigurationDoesNotName) {
   EXPECT_EQ(errno, ECONNREFUSED);
 }
 
+// The service manager still holds the one at 127.0.0.1, which is in the way of 0.0.0.0.
+TEST(Sockets, ChangesTheAddressAndKeepsThePort) {
+  ServiceManager manager;
+  const std::string before = manager.address();
+  const std::string port = before.substr(before.rfind(':'));
+  for (const std::string& address : {"0.0.0.0" + port, before}) {
+    manager.set_arguments({"--listen", address, "--insecure"});
+    manager.restart();
+    EXPECT_EQ(manager.address(), address);
+  }
+}
+
 TEST(Sockets, GivesTheInheritedSocketTheConfiguredPermissions) {
   ServiceManager manager({.arguments = {"--listen", "", "--socket-mode", "0600"}});
   struct stat file {};
