@@ -35,6 +35,7 @@ def run(lab: Lab) -> None:
     back = time.monotonic() - answered
     print(f"  | gone {gone:.1f} s after the power, back {back:.1f} s after its stream; promised:"
           f" {PROMISED_SECONDS} s", flush=True)
+    reader.await_more(100)  # it has found the new ring
     written = writer.finish()["written"][STREAM]
     found = reader.finish()
     assert not found["faults"], found["faults"]
