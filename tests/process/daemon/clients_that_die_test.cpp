@@ -104,7 +104,7 @@ TEST(OpensAndCloses, TenThousandOfThemLeakNothing) {
     ASSERT_TRUE(client.ask(close).response.has_done());
   }
   EXPECT_EQ(client.ask(list_opens_request()).response.open_list().opens_size(), 1);
-  EXPECT_EQ(open_descriptors(daemon.pid()), descriptors);
+  EXPECT_LE(open_descriptors(daemon.pid()), descriptors);
 }
 
 }  // namespace
