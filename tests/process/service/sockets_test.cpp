@@ -57,6 +57,18 @@ bool exists(const std::string& path) {
   return ::lstat(path.c_str(), &file) == 0;
 }
 
+// Until `pc2` has a connection to pc1.
+void await_pc1(const DaemonProcess& pc2) {
+  auto session =
+      Session::connect({.socket_path = pc2.socket_path(), .request_timeout = 60s}).value();
+  for (;;) {
+    for (const HostInfo& host : session.hosts().value()) {
+      if (host.name == "pc1" && host.state == "up") return;
+    }
+    std::this_thread::yield();
+  }
+}
+
 TEST(Sockets, LetProgramsWaitWhileNoDaemonRuns) {
   ServiceManager manager;
   ASSERT_EQ(manager.stop(), 0);
@@ -104,15 +116,7 @@ TEST(Sockets, TakesTheTcpSocketOfASocketUnit) {
   EXPECT_EQ(manager.address(), address);
   EXPECT_EQ(manager.stored_descriptors(), 0u) << "the socket unit has it already";
   DaemonProcess pc2({"--peer", address}, "pc2");
-  auto session =
-      Session::connect({.socket_path = pc2.socket_path(), .request_timeout = 60s}).value();
-  for (;;) {
-    bool up = false;
-    for (const HostInfo& host : session.hosts().value())
-      up |= host.name == "pc1" && host.state == "up";
-    if (up) break;
-    std::this_thread::yield();
-  }
+  await_pc1(pc2);
 }
 
 // ListenStream=13776 alone makes a socket of IPv6 that takes IPv4 along.
@@ -125,15 +129,7 @@ TEST(Sockets, TakesOneSocketForBothKindsOfAddresses) {
   EXPECT_EQ(manager.address(), "[::]:" + port);
   for (const std::string host : {"127.0.0.1", "[::1]"}) {
     DaemonProcess pc2({"--peer", host + ":" + port}, "pc2");
-    auto session =
-        Session::connect({.socket_path = pc2.socket_path(), .request_timeout = 60s}).value();
-    for (;;) {
-      bool up = false;
-      for (const HostInfo& one : session.hosts().value())
-        up |= one.name == "pc1" && one.state == "up";
-      if (up) break;
-      std::this_thread::yield();
-    }
+    await_pc1(pc2);
   }
 }
 
