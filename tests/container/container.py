@@ -1,0 +1,164 @@
+# SPDX-License-Identifier: Apache-2.0
+"""A PC as a container: a real systemd 252 with its own file system, network and processes.
+
+It shares kernel and clock with this machine, so chronyd runs there without setting the clock. For
+mount, pid and network namespaces of the test's own: what is left ends with them.
+"""
+
+import contextlib
+import os
+import pathlib
+import re
+import shutil
+import socket
+import subprocess
+import sys
+from collections.abc import Iterator
+
+HERE = pathlib.Path(__file__).resolve().parent
+sys.path.insert(0, str(HERE.parent / "packages"))
+
+from tree import Unavailable, mount_overlay  # noqa: E402
+
+# To begin with; the bare PC of a vehicle.
+PACKAGES = "systemd,dbus,python3,sudo,nftables"
+# What the role and the packages may want to install.
+CACHED = "avahi-daemon chrony python3-apt"
+PATIENCE_S = 60.0  # for what takes a second
+
+ADDRESSES = ("10.77.0.{}/24", "10.78.0.{}/24", "fd77::{}/64", "fd78::{}/64")
+
+
+class Cgroups:
+    """Control groups of the container's own, one in each hierarchy that systemd uses.
+
+    Without them it would take those of this process, which others may use as well.
+    """
+
+    def __init__(self) -> None:
+        self.folders = []
+        for line in pathlib.Path("/proc/self/cgroup").read_text().splitlines():
+            _, controllers, group = line.split(":", 2)
+            for root in self._roots(controllers):
+                folder = root / group.lstrip("/") / f"dssm-container-{os.getpid()}"
+                folder.mkdir()
+                self.folders.append(folder)
+
+    @staticmethod
+    def _roots(controllers: str) -> Iterator[pathlib.Path]:
+        """Where the hierarchy of these controllers is mounted, if systemd needs it."""
+        kind = {"": "cgroup2", "name=systemd": "cgroup"}.get(controllers)
+        for line in pathlib.Path("/proc/self/mounts").read_text().splitlines():
+            _, mount_point, found, options, *_ = line.split(" ")
+            if found == kind and (kind == "cgroup2" or controllers in options.split(",")):
+                yield pathlib.Path(mount_point)
+                return
+
+    def enter(self) -> None:
+        """Moves this process there."""
+        for folder in self.folders:
+            (folder / "cgroup.procs").write_text(str(os.getpid()))
+
+    def remove(self) -> None:
+        """When no process is in them any more."""
+        for folder in self.folders:
+            for below, _, _ in os.walk(folder, topdown=False):
+                os.rmdir(below)
+
+
+class Container:
+    """A PC at 10.77.0.2, 10.78.0.2, fd77::2 and fd78::2. This process is at the .1 of each."""
+
+    def __init__(self, bare: pathlib.Path, scratch: pathlib.Path, name: str) -> None:
+        """Lays its file system over the bare tree. Unavailable where that cannot be."""
+        scratch.mkdir()
+        self.name = name
+        self._scratch = scratch
+        self.root = mount_overlay(bare, scratch)
+        self._leader = 0
+        self._left = contextlib.ExitStack()
+        self._left.callback(subprocess.run, ["umount", self.root], check=True)
+        self._left.callback(self.power_off)
+        self.at_end = self._left.callback  # takes what is to be called when this is left
+
+    def __enter__(self) -> "Container":
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._left.close()
+
+    def boot(self) -> None:
+        """Returns when systemd has started all it is to start. Unavailable when it cannot run here."""
+        self._cgroups = Cgroups()
+        with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
+            ready.bind(str(self._scratch / "ready"))
+            ready.settimeout(PATIENCE_S)
+            log = (self._scratch / "log").open("w")
+            self._nspawn = subprocess.Popen(
+                ["systemd-nspawn", "--quiet", "--register=no", "--keep-unit", "--notify-ready=yes",
+                 "--network-veth", f"--directory={self.root}", f"--machine={self.name}",
+                 "--console=pipe", "--resolv-conf=off", "--boot"],
+                env=os.environ | {"NOTIFY_SOCKET": str(self._scratch / "ready")},
+                stdin=subprocess.DEVNULL, stdout=log, stderr=log, preexec_fn=self._cgroups.enter)
+            said = ""
+            try:
+                while "READY=1" not in said:
+                    said += ready.recv(4096).decode() + "\n"
+            except TimeoutError:
+                self.power_off()
+                text = (self._scratch / "log").read_text()
+                raise Unavailable(f"systemd does not start in a container here: {text}") from None
+        (self._scratch / "ready").unlink()
+        self._leader = int(re.search(r"^X_NSPAWN_LEADER_PID=([0-9]+)$", said, re.MULTILINE)[1])
+        device = f"ve-{self.name}"
+        for number, ip in ((1, ["ip"]), (2, ["nsenter", f"--target={self._leader}", "--net", "ip"])):
+            for address in ADDRESSES:
+                # nodad: else it could not be used for the first second or two.
+                subprocess.run([*ip, "address", "add", address.format(number), "dev",
+                                device if number == 1 else "host0",
+                                *(["nodad"] if ":" in address else [])], check=True)
+            subprocess.run([*ip, "link", "set", device if number == 1 else "host0", "up"], check=True)
+
+    def power_off(self) -> None:
+        """Ends it, if it runs."""
+        if not self._leader:
+            return
+        self._nspawn.terminate()  # which it takes as a wish to shut the container down
+        try:
+            self._nspawn.wait(PATIENCE_S)
+        finally:
+            self._nspawn.kill()
+            self._nspawn.wait()
+            self._leader = 0
+        self._cgroups.remove()
+
+    @property
+    def environment(self) -> dict[str, str]:
+        """What `enter` and programs in the container need."""
+        return {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin", "LC_ALL": "C.UTF-8",
+                "DEBIAN_FRONTEND": "noninteractive", "DSSM_CONTAINER": str(self._leader)}
+
+    def attempt(self, *words: str) -> subprocess.CompletedProcess[str]:
+        """Runs a program in the container; what it said is in stdout."""
+        return subprocess.run(["nsenter", f"--target={self._leader}", "--all", *words],
+                              env=self.environment, stdin=subprocess.DEVNULL,
+                              stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
+
+    def run(self, *words: str) -> str:
+        """Runs a program in the container and returns what it says; a failure is an AssertionError."""
+        done = self.attempt(*words)
+        assert done.returncode == 0, f"{' '.join(words)}: {done.returncode}\n{done.stdout[-4000:]}"
+        return done.stdout.strip()
+
+    def path(self, name: str) -> pathlib.Path:
+        """A file of the running container, also of what it has mounted, such as /run."""
+        return pathlib.Path(f"/proc/{self._leader}/root") / name.lstrip("/")
+
+    def install(self, debs: list[pathlib.Path]) -> None:
+        """Installs packages whose dependencies are in the apt cache, by apt-get."""
+        folder = self.root / "debs"
+        folder.mkdir()
+        for deb in debs:
+            shutil.copy(deb, folder)
+        self.run("apt-get", "install", "--yes", "--no-install-recommends",
+                 *(f"/debs/{deb.name}" for deb in debs))

@@ -1,0 +1,175 @@
+# SPDX-License-Identifier: Apache-2.0
+"""dssmd.service and dssmd.socket under a real systemd."""
+
+import pathlib
+import socket
+import threading
+import time
+from collections.abc import Callable
+
+from container import PATIENCE_S, Container
+
+SOCKET = "/run/dssm/dssmd.sock"
+CONFIGURATION = "/etc/dssm/dssmd.conf"
+
+
+class Visitors:
+    """Connect to dssmd's socket again and again, one after the other, inside the `with` block."""
+
+    def __init__(self, container: Container) -> None:
+        self._path = str(container.path(SOCKET))
+        self._thread = threading.Thread(target=self._come)
+        self._end = False
+        self.served = 0
+        self.refused: list[OSError] = []
+
+    def __enter__(self) -> "Visitors":
+        self._thread.start()
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self._end = True
+        self._thread.join()
+
+    def _come(self) -> None:
+        while not self._end:
+            with socket.socket(socket.AF_UNIX) as visitor:
+                try:
+                    visitor.connect(self._path)
+                    self.served += 1
+                except OSError as error:
+                    self.refused.append(error)
+
+    def wait_for_refused(self) -> None:
+        """Until a thousand more were refused."""
+        enough = len(self.refused) + 1000
+        wait_until(lambda: len(self.refused) >= enough, "nobody refuses visitors")
+
+
+def wait_until(condition: Callable[[], bool], otherwise: str) -> None:
+    """Until it holds; if that does not come, fails with `otherwise`."""
+    end = time.monotonic() + PATIENCE_S
+    while not condition():
+        assert time.monotonic() < end, otherwise
+        time.sleep(0.02)
+
+
+class ServiceTests:
+    """The tests, in the order in which they have to run."""
+
+    def __init__(self, container: Container, debs: list[pathlib.Path]) -> None:
+        self.container = container
+        self.debs = debs
+
+    def tests(self) -> list[tuple[str, Callable[[], None]]]:
+        """Names and functions."""
+        return [
+            ("installing dssmd starts it, with its socket", self.install),
+            ("who connects never meets a closed socket over crashes", self.crash),
+            ("who connects never meets a closed socket over restarts", self.restart),
+            ("who connects never meets a closed socket when dssmd hangs", self.hang),
+            ("whoever connects, a stopped dssmd stays stopped, without its socket", self.stop),
+            ("a dssmd that was stopped right after its crash stays stopped", self.stop_after_crash),
+            ("a mistake in the configuration ends service and socket", self.mistake),
+            ("after a boot dssmd runs, and its socket was there first", self.boot),
+            ("removing dssmd leaves neither service nor socket", self.remove),
+        ]
+
+    def show(self, unit: str, name: str) -> str:
+        """A property of a unit."""
+        return self.container.run("systemctl", "show", "--property", name, "--value", unit)
+
+    def states(self) -> tuple[str, str]:
+        """Of service and socket."""
+        return self.show("dssmd.service", "ActiveState"), self.show("dssmd.socket", "ActiveState")
+
+    def kill(self, signal: str) -> None:
+        """Sends dssmd a signal."""
+        self.container.run("systemctl", "kill", "--kill-who=main", f"--signal={signal}", "dssmd")
+
+    def end_and_await_next(self, signal: str) -> None:
+        """Returns when systemd has started the next dssmd."""
+        old = self.show("dssmd.service", "MainPID")
+        self.kill(signal)
+        wait_until(lambda: self.show("dssmd.service", "MainPID") not in ("0", old)
+                   and self.states() == ("active", "active"), f"no dssmd after SIG{signal}")
+
+    def install(self) -> None:
+        """Test."""
+        self.container.install(self.debs)
+        assert self.states() == ("active", "active"), self.states()
+
+    def crash(self) -> None:
+        """Test. Seven in a row, because units that start five times in 10 s may be given up."""
+        with Visitors(self.container) as visitors:
+            for signal in ("KILL", "ABRT", "TERM", "KILL", "KILL", "KILL", "KILL"):
+                self.end_and_await_next(signal)
+        assert visitors.served and not visitors.refused, visitors.refused[:3]
+
+    def restart(self) -> None:
+        """Test."""
+        with Visitors(self.container) as visitors:
+            for _ in range(3):
+                self.container.run("systemctl", "restart", "dssmd")
+            self.container.run("systemctl", "daemon-reexec")
+        assert visitors.served and not visitors.refused, visitors.refused[:3]
+
+    def hang(self) -> None:
+        """Test. The watchdog takes 10 s to notice; half a second is enough here."""
+        drop_in = self.container.path("/run/systemd/system/dssmd.service.d/watchdog.conf")
+        drop_in.parent.mkdir(parents=True)
+        drop_in.write_text("[Service]\nWatchdogSec=500ms\n")
+        self.container.run("systemctl", "daemon-reload")
+        self.container.run("systemctl", "restart", "dssmd")
+        with Visitors(self.container) as visitors:
+            self.end_and_await_next("STOP")
+        # Those for whom there was no more room in the queue of a socket that nobody serves wait, too.
+        assert visitors.served and not visitors.refused, visitors.refused[:3]
+        drop_in.unlink()
+        self.container.run("systemctl", "daemon-reload")
+
+    def stop(self) -> None:
+        """Test."""
+        for _ in range(3):
+            with Visitors(self.container) as visitors:
+                self.container.run("systemctl", "stop", "dssmd")
+                visitors.wait_for_refused()
+                assert self.states() == ("inactive", "inactive"), self.states()
+            self.container.run("systemctl", "start", "dssmd")
+            assert self.states() == ("active", "active"), self.states()
+
+    def stop_after_crash(self) -> None:
+        """Test."""
+        with Visitors(self.container) as visitors:
+            self.kill("KILL")
+            self.container.run("systemctl", "stop", "dssmd")
+            visitors.wait_for_refused()
+            assert "active" not in self.states(), self.states()
+        self.container.run("systemctl", "start", "dssmd")
+
+    def mistake(self) -> None:
+        """Test."""
+        file = self.container.path(CONFIGURATION)
+        right = file.read_text()
+        file.write_text("no_such_key = 1\n")
+        with Visitors(self.container) as visitors:
+            assert self.container.attempt("systemctl", "restart", "dssmd").returncode != 0
+            visitors.wait_for_refused()
+            assert self.states() == ("failed", "inactive"), self.states()
+        file.write_text(right)
+        self.container.run("systemctl", "start", "dssmd")
+        assert self.states() == ("active", "active"), self.states()
+
+    def boot(self) -> None:
+        """Test."""
+        self.container.power_off()
+        self.container.boot()
+        assert self.states() == ("active", "active"), self.states()
+        began = {unit: int(self.show(unit, "ActiveEnterTimestampMonotonic"))
+                 for unit in ("dssmd.socket", "sockets.target", "dssmd.service")}
+        assert sorted(began, key=began.__getitem__) == list(began), began
+
+    def remove(self) -> None:
+        """Test."""
+        self.container.run("apt-get", "purge", "--yes", "dssmd")
+        wait_until(lambda: self.states() == ("inactive", "inactive"), f"they are {self.states()}")
