@@ -45,8 +45,6 @@ table inet filter {
 # Of somebody else, and in the way of whoever loads all rules anew.
 FOREIGN_TABLE = "add table inet docker"
 
-NTP_QUESTION = bytes([0x23]) + bytes(47)  # version 4, client
-
 
 def pc_of(address: str) -> str:
     """The container's address in the network of one of ours."""

@@ -238,6 +238,57 @@ TEST_F(PeersTest, DoNotShowTheStreamsOfAHostWithTheirOwnName) {
   EXPECT_EQ(peers->own_trouble(), host(0).error());
 }
 
+// --- configured peers change
+// ----------------------------------------------------------------------
+
+TEST_F(PeersTest, DialWhoIsConfiguredAnewAndKeepWhoStays) {
+  start({&one});
+  wait([&] { return one.watches == 1; });
+  two.owner.greet_as(greeting_of("pc3"));
+  peers->set_configured({two.owner.host().address, one.owner.host().address});
+  wait([&] { return catalog.hosts().size() == 2; });
+  EXPECT_EQ(one.watches, 1) << "its connection is the one of before";
+  EXPECT_EQ(host(0).name(), "pc2");
+  EXPECT_EQ(host(1).name(), "pc3");
+}
+
+TEST_F(PeersTest, DropWhoIsNotConfiguredAnyMoreAndTellWhoeverWaits) {
+  one.streams = {"lidar"};
+  start({&one});
+  wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
+  std::string got;
+  net::Frame request;
+  request.mutable_get_property()->mutable_id()->set_name("lidar");
+  peers->link_to(one.owner.host().greeting.host_id)->ask(request, [&](Result<net::Frame> answer) {
+    got = answer.error().message;
+  });
+  peers->set_configured({});
+  wait([&] { return peers->hosts().empty(); });
+  EXPECT_TRUE(catalog.hosts().empty());
+  EXPECT_EQ(peers->link_to(one.owner.host().greeting.host_id), nullptr);
+  EXPECT_NE(got.find("not among the peers any more"), std::string::npos) << got;
+}
+
+TEST_F(PeersTest, DropWhoWasNeverThere) {
+  const wire::Address nobody = FakeOwner(loop).host().address;
+  peers = std::make_unique<Peers>(loop, resolver, std::vector{nobody}, self, catalog, log);
+  wait_until_settled();
+  peers->set_configured({});
+  wait([&] { return peers->hosts().empty(); });
+  EXPECT_EQ(peers->trouble(), "");
+}
+
+TEST_F(PeersTest, DialAgainWhoComesBackIntoTheConfiguration) {
+  const std::vector<wire::Address> configured = {one.owner.host().address};
+  start({&one});
+  wait([&] { return one.watches == 1; });
+  peers->set_configured({});
+  peers->set_configured(configured);  // before the first is through
+  wait([&] { return one.watches == 2 && peers->hosts().size() == 1; });
+  EXPECT_EQ(host(0).state(), "up");
+  EXPECT_EQ(catalog.hosts().size(), 1u);
+}
+
 // --- requests
 // -------------------------------------------------------------------------------------
 

@@ -4,41 +4,12 @@
 #include "daemon/service/service_manager.hpp"
 
 #include <gtest/gtest.h>
-#include <sys/socket.h>
-#include <sys/un.h>
-
-#include <cstring>
 
 #include "daemon/service/journal_logger.hpp"
-#include "tests/support/daemon_process.hpp"
+#include "tests/support/inbox.hpp"
 
 namespace dssm::daemon {
 namespace {
-
-// A datagram socket that takes what is sent to it when it is asked.
-class Inbox {
- public:
-  Inbox() {
-    sockaddr_un address{};
-    address.sun_family = AF_UNIX;
-    std::strncpy(address.sun_path, path().c_str(), sizeof address.sun_path - 1);
-    EXPECT_EQ(::bind(fd_.get(), reinterpret_cast<sockaddr*>(&address), sizeof address), 0);
-  }
-  Inbox(const Inbox&) = delete;
-  Inbox& operator=(const Inbox&) = delete;
-  ~Inbox() { test::remove_tree(dir_); }
-
-  std::string path() const { return dir_ + "/socket"; }
-  std::string next() {  // empty: nothing is there
-    char text[8192];
-    const ssize_t bytes = ::recv(fd_.get(), text, sizeof text, MSG_DONTWAIT);
-    return bytes > 0 ? std::string(text, static_cast<std::size_t>(bytes)) : "";
-  }
-
- private:
-  std::string dir_ = test::make_temp_dir();
-  UniqueFd fd_{::socket(AF_UNIX, SOCK_DGRAM | SOCK_CLOEXEC, 0)};
-};
 
 class ServiceManagerTest : public testing::Test {
  protected:
@@ -49,7 +20,7 @@ class ServiceManagerTest : public testing::Test {
     return sent;
   }
   EventLoop loop = EventLoop::open().value();
-  Inbox inbox;
+  test::Inbox inbox;
   ServiceManager manager{loop, inbox.path()};
 };
 
@@ -103,7 +74,7 @@ TEST(NoServiceManager, IsNotMissed) {
 }
 
 TEST(JournalLogger, WritesFieldsThatCanBeSearched) {
-  Inbox inbox;
+  test::Inbox inbox;
   JournalLogger logger(LogLevel::info, inbox.path());
   logger.warning("hot\nPRIORITY=0", {.stream = "s:0@pc1", .peer = "'x'", .message_id = "0123"});
   EXPECT_EQ(inbox.next(),
@@ -117,7 +88,7 @@ TEST(JournalLogger, WritesFieldsThatCanBeSearched) {
 }
 
 TEST(JournalLogger, DoesNotWaitForAJournalThatHangs) {
-  Inbox inbox;  // nobody takes anything
+  test::Inbox inbox;  // nobody takes anything
   JournalLogger logger(LogLevel::info, inbox.path());
   testing::internal::CaptureStderr();
   for (int i = 0; i < 10'000; ++i) logger.info("line");
