@@ -28,8 +28,8 @@ class InheritedTest : public testing::Test {
     }
     return fd;
   }
-  UniqueFd local(const std::string& name) {
-    UniqueFd fd(::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0));
+  UniqueFd local(const std::string& name, int type = SOCK_STREAM) {
+    UniqueFd fd(::socket(AF_UNIX, type | SOCK_CLOEXEC, 0));
     sockaddr_un address{};
     address.sun_family = AF_UNIX;
     std::strncpy(address.sun_path, (dir + name).c_str(), sizeof address.sun_path - 1);
@@ -54,6 +54,7 @@ TEST_F(InheritedTest, TellsListeningSocketsByWhatTheyAre) {
 TEST_F(InheritedTest, LeavesAllElseToOthers) {
   EXPECT_EQ(sort_one(UniqueFd(::memfd_create("ring", MFD_CLOEXEC))).others.size(), 1u);
   EXPECT_EQ(sort_one(network(AF_INET, SOCK_DGRAM)).others.size(), 1u);
+  EXPECT_EQ(sort_one(local("/packets", SOCK_SEQPACKET)).others.size(), 1u);
   UniqueFd does_not_listen(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
   EXPECT_EQ(sort_one(std::move(does_not_listen)).others.size(), 1u);
 }

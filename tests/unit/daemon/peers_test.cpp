@@ -248,6 +248,7 @@ TEST_F(PeersTest, DialWhoIsConfiguredAnewAndKeepWhoStays) {
   peers->set_configured({two.owner.host().address, one.owner.host().address});
   wait([&] { return catalog.hosts().size() == 2; });
   EXPECT_EQ(one.watches, 1) << "its connection is the one of before";
+  EXPECT_EQ(peers->hosts().size(), 2u);
   EXPECT_EQ(host(0).name(), "pc2");
   EXPECT_EQ(host(1).name(), "pc3");
 }
