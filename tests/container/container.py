@@ -36,12 +36,16 @@ class Cgroups:
     """
 
     def __init__(self) -> None:
-        self.folders = []
+        """Makes them. Unavailable where this process may not."""
+        self.folders: list[pathlib.Path] = []
         for line in pathlib.Path("/proc/self/cgroup").read_text().splitlines():
             _, controllers, group = line.split(":", 2)
             for root in self._roots(controllers):
                 folder = root / group.lstrip("/") / f"dssm-container-{os.getpid()}"
-                folder.mkdir()
+                try:
+                    folder.mkdir()
+                except OSError as error:
+                    raise Unavailable(f"no control groups can be made here: {error}") from error
                 self.folders.append(folder)
 
     @staticmethod
@@ -76,6 +80,7 @@ class Container:
         self._scratch = scratch
         self.root = mount_overlay(bare, scratch)
         self._leader = 0
+        self._nspawn: subprocess.Popen[bytes] | None = None
         self._left = contextlib.ExitStack()
         self._left.callback(subprocess.run, ["umount", self.root], check=True)
         self._left.callback(self.power_off)
@@ -121,15 +126,15 @@ class Container:
 
     def power_off(self) -> None:
         """Ends it, if it runs."""
-        if not self._leader:
+        if not self._nspawn:
             return
-        self._nspawn.terminate()  # which it takes as a wish to shut the container down
+        nspawn, self._nspawn = self._nspawn, None
+        nspawn.terminate()  # which it takes as a wish to shut the container down
         try:
-            self._nspawn.wait(PATIENCE_S)
+            nspawn.wait(PATIENCE_S)
         finally:
-            self._nspawn.kill()
-            self._nspawn.wait()
-            self._leader = 0
+            nspawn.kill()
+            nspawn.wait()
         self._cgroups.remove()
 
     @property
