@@ -35,6 +35,7 @@ def run(lab: Lab) -> None:
                            for stream, count in writer.finish()["written"].items()}}
     for name, reader in readers.items():
         expect_complete(written, reader.finish(), f"reader on {name}")
+    lab.await_streams(*STREAMS, ALONE)
     for guest in (pc1, pc2):
         found = Load(guest, "read", [ALONE]).await_ready().finish()
         expect_complete(alone, found, f"reader on {guest.name}")
