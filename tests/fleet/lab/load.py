@@ -2,15 +2,18 @@
 """Writers and readers on guests whose every sample is checked (fleet_load.cpp)."""
 
 import json
+import select
+import subprocess
 from collections.abc import Iterable
 from typing import Any
 
 from lab.guest import Guest
-from lab.lab import await_that
+from lab.lab import PATIENCE_SECONDS, await_that
 from lab.packages import PROGRAMS_FOLDER
 from lab.ssh import GuestError
 
 RATE_HZ = 1000
+FINISH_SECONDS = 120
 
 
 class Load:
@@ -43,7 +46,10 @@ class Load:
 
     def finish(self) -> dict[str, Any]:
         """Lets it come to its end, a reader when it has all, and returns what it found."""
-        out, err = self._process.communicate(timeout=120)
+        try:
+            out, err = self._process.communicate(timeout=FINISH_SECONDS)
+        except subprocess.TimeoutExpired as error:
+            raise self._error(f"did not come to its end within {FINISH_SECONDS} s") from error
         if self._process.returncode:
             raise self._error(f"ended with {self._process.returncode}:\n{out}{err}")
         result: dict[str, Any] = json.loads(out.splitlines()[-1])
@@ -51,6 +57,9 @@ class Load:
 
     def _line(self) -> str:
         assert self._process.stdout
+        # Each question has one line for an answer, so that none waits in the buffer already.
+        if not select.select([self._process.stdout], [], [], PATIENCE_SECONDS)[0]:
+            raise self._error(f"said nothing within {PATIENCE_SECONDS} s")
         line = self._process.stdout.readline()
         if not line:
             self.finish()

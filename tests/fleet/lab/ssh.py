@@ -1,6 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Running commands on a guest, over one shared connection: a login costs a guest far more."""
 
+import contextlib
 import pathlib
 import shlex
 import subprocess
@@ -85,7 +86,12 @@ class Ssh:
         running = [(command, process) for command, process in self._started if process.poll() is None]
         for _, process in running:
             process.kill()
-            process.communicate()
+            process.wait()
+            # Not until their end: the shared connection has them open as long as the command runs there.
+            for pipe in (process.stdin, process.stdout, process.stderr):
+                with contextlib.suppress(BrokenPipeError):  # of what was not yet sent
+                    if pipe:
+                        pipe.close()
         self._started.clear()
         return [command for command, _ in running]
 

@@ -2,7 +2,8 @@
 """Restart and kill -9 of dssmd under 3 writers at 1 kHz cost no sample, here or elsewhere
 
 Each sample is read once, in order and untorn by readers on the writers' PC and on both others; the
-readers' rings stay the same. Local readers do not notice: while dssmd stands still they go on.
+readers' rings stay the same. Local readers do not notice: while dssmd stands still they go on. A stream
+that nobody has open, and so nobody could offer back, is there with all its samples, too.
 """
 
 from lab.dssmd import await_news, await_restarted, kill_dssmd, main_pid
@@ -10,11 +11,13 @@ from lab.lab import Lab
 from lab.load import RATE_HZ, Load, expect_complete
 
 STREAMS = [f"load{number}:0@pc1" for number in (1, 2, 3)]
+ALONE = "alone:0@pc1"
 
 
 def run(lab: Lab) -> None:
     """Restarts and kills the writers' dssmd, then those of the readers."""
     pc1, pc2, pc3 = lab.guests
+    alone = Load(pc1, "write", [ALONE]).await_ready().finish()
     writers = [Load(pc1, "write", [stream]).await_ready() for stream in STREAMS]
     readers = {guest.name: Load(guest, "read", STREAMS).await_ready() for guest in lab.guests}
     pc1.ssh.run("systemctl restart dssmd")
@@ -32,6 +35,10 @@ def run(lab: Lab) -> None:
                            for stream, count in writer.finish()["written"].items()}}
     for name, reader in readers.items():
         expect_complete(written, reader.finish(), f"reader on {name}")
-    for stream in STREAMS:
+    lab.await_streams(*STREAMS, ALONE)
+    for guest in (pc1, pc2):
+        found = Load(guest, "read", [ALONE]).await_ready().finish()
+        expect_complete(alone, found, f"reader on {guest.name}")
+    for stream in (*STREAMS, ALONE):
         pc1.ssh.run(f"dssmctl rm {stream}")
     lab.await_streams()
