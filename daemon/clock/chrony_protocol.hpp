@@ -4,9 +4,9 @@
 // for "tracking". No I/O. Layouts after candm.h of chrony 4.3; all numbers are big-endian.
 //
 // Why not `chronyc -c tracking`, which asks the same question: once a second it would start a
-// process, which the sandbox of dssmd.service need not allow then; its output comes through a pipe
-// and is rounded to the nearest nanosecond, not upwards; and a chronyd that is not there is told
-// from one that is slow only by time. Here that is one datagram each way, and ECONNREFUSED.
+// process, which a sandbox had better not allow; its output comes through a pipe, to be parsed, and
+// rounded to the nearest nanosecond instead of upwards; and it takes seconds to find that there is
+// no chronyd. Here it is one datagram each way, and ECONNREFUSED at once.
 //
 // Anybody may ask for tracking from this PC (`cmdallow` concerns others), without a key.
 #pragma once
@@ -41,8 +41,8 @@ struct TrackingReply {
   std::optional<SourceAddress> source;  // nothing: it follows nobody, or a clock of this PC
 };
 
-// A request is padded to the length of its reply, or chronyd does not answer: nobody shall make it
-// send more than was sent.
+// The length of a reply, and of a request, too, or chronyd refuses it: nobody shall make it send
+// more than was sent.
 inline constexpr std::size_t kTrackingBytes = 104;
 
 std::array<std::byte, kTrackingBytes> tracking_request(std::uint32_t sequence);
@@ -51,8 +51,8 @@ std::array<std::byte, kTrackingBytes> tracking_request(std::uint32_t sequence);
 bool answers_untrusted(std::span<const std::byte> datagram, std::uint32_t sequence);
 
 // Reads a datagram that does.
-//   fails  protocol (no reply of this version, of another length, of another kind), denied,
-//          and otherwise daemon_away (chronyd says that it cannot), with what to do
+//   fails  protocol (another version, length or kind of reply), no_permission and system (chronyd
+//          says that it will not or cannot), with what to do
 Result<TrackingReply> tracking_untrusted(std::span<const std::byte> datagram);
 
 // A number of chronyd's in seconds: 2^(exponent - 25) * coefficient, of 7 and 25 bits, both signed.

@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Asks chronyd once a second how the clock is. Each question goes out of a socket of its own, with a
-// random number: an answer that comes late, or to somebody else, finds nobody; nothing is carried
+// Asks chronyd once a second how the clock is. Each question goes out of a socket of its own, with
+// a random number: an answer that comes late, or to somebody else, finds nobody; nothing is carried
 // over from one question to the next, so a chronyd that comes, goes, or hangs needs no handling.
 // Never blocks, and does bounded work in each second whatever is sent to it.
 #pragma once
 
-#include <array>
 #include <cstddef>
 #include <cstdint>
 #include <functional>
 #include <optional>
+#include <span>
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/address.hpp"
@@ -41,7 +41,8 @@ class ChronydClient {
     ~User() = default;
   };
 
-  // Asks at once when the loop runs, and then every kPeriod. What is given by reference outlives it.
+  // Asks at once when the loop runs, and then every kPeriod. What is given by reference outlives
+  // it.
   ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, User& user, Now now);
   ChronydClient(const ChronydClient&) = delete;
   ChronydClient& operator=(const ChronydClient&) = delete;
@@ -50,15 +51,15 @@ class ChronydClient {
   struct Question {
     std::uint32_t sequence = 0;
     MonoTime asked;
-    int datagrams = 0;         // that came for it
-    std::optional<Error> why;  // it has not been answered so far
+    int datagrams = 0;         // that came to its socket
+    std::optional<Error> why;  // none of them was an answer
   };
 
   void on_timer();
-  void ask();
-  Result<UniqueFd> send(std::uint32_t sequence);
+  Result<void> ask();
   void on_readable();
-  void close(int errno_value);
+  bool take_untrusted(std::span<const std::byte> datagram);
+  void finish();
 
   const EventLoop& loop_;
   const wire::SocketAddress chronyd_;
