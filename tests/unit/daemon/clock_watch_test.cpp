@@ -20,7 +20,8 @@ using clock::ClockTrouble;
 class LinesLogger final : public Logger {
  public:
   void write(LogLevel level, std::string_view text, const LogFields& fields) noexcept override {
-    EXPECT_EQ(fields.message_id.size(), 32u) << text;
+    // Only that a descriptor is missing is no event of the clock.
+    EXPECT_EQ(fields.message_id.empty(), text.starts_with("watch the wall clock")) << text;
     lines.push_back((level == LogLevel::warning ? "warning: " : "") + std::string(text));
   }
   std::vector<std::string> lines;
@@ -196,7 +197,7 @@ TEST_F(ClockWatchTest, TellsThatChronydLearnsNothing) {
 }
 
 TEST_F(ClockWatchTest, VoidsTheBoundOfAClockThatWasSet) {
-  for (const Duration step : {Duration(1h), Duration(-1h), Duration(200ms)}) {
+  for (const Duration step : {Duration(1h), Duration(-200ms)}) {
     until_status(ClockStatus::synchronized);
     now.wall += step;
     EXPECT_EQ(watch->state().trouble, ClockTrouble::stepped);
@@ -212,10 +213,9 @@ TEST_F(ClockWatchTest, VoidsTheBoundOfAClockThatWasSet) {
     EXPECT_EQ(watch->state().status, ClockStatus::synchronized);
   }
   EXPECT_EQ(told("warning: this PC's clock was set forward by 3600.000 s; it is out of bounds"), 1);
-  EXPECT_EQ(told("warning: this PC's clock was set back by 3600.000 s; it is out of bounds"), 1);
-  EXPECT_EQ(told("warning: this PC's clock was set forward by 200.000 ms; it is out of bounds"), 1);
-  EXPECT_EQ(told("is within"), 4);
-  EXPECT_EQ(logger.lines.size(), 7u);
+  EXPECT_EQ(told("warning: this PC's clock was set back by 200.000 ms; it is out of bounds"), 1);
+  EXPECT_EQ(told("is within"), 3);
+  EXPECT_EQ(logger.lines.size(), 5u);
 }
 
 TEST_F(ClockWatchTest, DoesNotFillTheLogWithSteps) {
