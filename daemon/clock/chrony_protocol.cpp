@@ -12,7 +12,7 @@
 namespace dssm::daemon {
 namespace {
 
-constexpr std::uint8_t kVersion = 6, kRequest = 1, kReply = 2;
+constexpr std::uint8_t kCommandVersion = 6, kRequest = 1, kReply = 2;
 constexpr std::uint16_t kTrackingCommand = 33, kTrackingReport = 5;
 
 // The head of a request: version, type, 2 reserved bytes, command, number of the attempt, sequence.
@@ -56,7 +56,7 @@ std::int32_t with_sign(std::uint32_t number, int bits) noexcept {
   return static_cast<std::int32_t>(number << (32 - bits)) >> (32 - bits);
 }
 
-Error refused(std::uint16_t status) {
+Error refusal_of(std::uint16_t status) {
   const std::string what = "it refuses to tell: ";
   switch (status) {
     case 2:   // STT_UNAUTH
@@ -126,7 +126,7 @@ std::string SourceAddress::str() const {
 
 std::array<std::byte, kTrackingBytes> tracking_request(std::uint32_t sequence) {
   std::array<std::byte, kTrackingBytes> request{};
-  put(request, 0, kVersion);
+  put(request, 0, kCommandVersion);
   put(request, 1, kRequest);
   put(request, kRequestCommand, kTrackingCommand);
   put(request, kRequestSequence, sequence);
@@ -142,8 +142,8 @@ Result<TrackingReply> tracking_untrusted(std::span<const std::byte> datagram) {
   if (datagram.size() < kHead) {
     return not_understood("bytes:", static_cast<int>(datagram.size()), kTrackingBytes);
   }
-  if (byte_at(datagram, 0) != kVersion) {
-    return not_understood("version", byte_at(datagram, 0), kVersion);
+  if (byte_at(datagram, 0) != kCommandVersion) {
+    return not_understood("version", byte_at(datagram, 0), kCommandVersion);
   }
   if (byte_at(datagram, 1) != kReply) {
     return not_understood("a message of type", byte_at(datagram, 1), kReply);
@@ -151,7 +151,7 @@ Result<TrackingReply> tracking_untrusted(std::span<const std::byte> datagram) {
   if (short_at(datagram, kCommand) != kTrackingCommand) {
     return not_understood("a reply to command", short_at(datagram, kCommand), kTrackingCommand);
   }
-  if (const std::uint16_t status = short_at(datagram, kStatus)) return refused(status);
+  if (const std::uint16_t status = short_at(datagram, kStatus)) return refusal_of(status);
   if (short_at(datagram, kReport) != kTrackingReport) {
     return not_understood("a report of kind", short_at(datagram, kReport), kTrackingReport);
   }

@@ -216,6 +216,7 @@ TEST_F(ClockWatchTest, VoidsTheBoundOfAClockThatWasSet) {
   EXPECT_EQ(told("warning: this PC's clock was set back by 200.000 ms; it is out of bounds"), 1);
   EXPECT_EQ(told("is within"), 3);
   EXPECT_EQ(logger.lines.size(), 5u);
+  EXPECT_EQ(told("left out"), 0);
 }
 
 TEST_F(ClockWatchTest, DoesNotFillTheLogWithSteps) {
