@@ -58,6 +58,7 @@ std::optional<Duration> ClockEstimator::look(const Instant& now) noexcept {
   // The base stays: one that moved along would let many small steps pass.
   unseen_ = size + blur;
   if (size <= kLeastStep + blur) return {};
+  if (!stepped_) before_step_ = base_;
   unseen_ = now.width;
   base_ = now;
   stepped_ = true;

@@ -118,6 +118,14 @@ class ClockEstimator {
   void set(const Settings& settings) noexcept { settings_ = settings; }
   const Settings& settings() const noexcept { return settings_; }
 
+  // Takes over from an estimator of the same boot, whose base() this was: a step between then and
+  // now counts as one that was seen. Before the first look().
+  void resume(const Instant& base) noexcept { base_ = base; }
+  // An instant since which the clock has not been set; as long as chronyd has not measured anew
+  // after a step, one before it, so that whoever resumes from it sees the step, too. nullopt:
+  // look() has not looked yet.
+  const std::optional<Instant>& base() const noexcept { return stepped_ ? before_step_ : base_; }
+
   // Compares the clocks; the first thing to do at each instant.
   //   returns  how far the wall clock was set since the last time, if it was: no bound holds any
   //            more until chronyd has measured anew
@@ -160,7 +168,8 @@ class ClockEstimator {
   bool is_overdue(MonoTime now) const noexcept;
 
   Settings settings_;
-  std::optional<Instant> base_;  // since the last step
+  std::optional<Instant> base_;         // since the last step
+  std::optional<Instant> before_step_;  // of the first step that chronyd has not measured yet
   std::optional<Reading> reading_;
   std::optional<Reference> reference_;
   Duration unseen_{};     // how far the clock may have been set without a step

@@ -35,4 +35,9 @@ inline constexpr std::string_view kReloadFailed = "c167d78902794b3994971ec3e0b22
 inline constexpr std::string_view kRestartNeeded = "3b6dcdea709c45e2bbf57a286fb0fec0";
 inline constexpr std::string_view kFailed = "27e5b81c407a4d239b44a249741694ea";
 
+inline constexpr std::string_view kClockStepped = "5d6eb3fceee243358e4818b0fde7d466";
+inline constexpr std::string_view kChronydAway = "4c74591c07464db9acb5c74a1f430715";
+inline constexpr std::string_view kClockOutOfBounds = "55d27db9b00947b3be6b238caa5c8e5e";
+inline constexpr std::string_view kClockInBounds = "4a6b6d5b038d4fc99bf6da04034435c4";
+
 }  // namespace dssm::daemon::message_id

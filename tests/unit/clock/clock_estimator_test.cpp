@@ -332,6 +332,45 @@ TEST(ClockEstimator, TakesNewSettingsAtOnce) {
   EXPECT_EQ(rig.state().bound, 60us + growth(1s, 1'125'000));
 }
 
+TEST(ClockEstimator, SeesStepsFromBeforeItWasMade) {
+  Rig rig;
+  EXPECT_EQ(rig.estimator.base()->mono, rig.now.mono);
+  for (const Duration step : {0s, 5s, -5s}) {
+    ClockEstimator next{ClockEstimator::Settings{}};
+    EXPECT_EQ(next.base(), std::nullopt);
+    next.resume(*rig.estimator.base());
+    Rig later = rig;
+    later.now.mono += 10s;
+    later.now.wall += 10s + step;
+    EXPECT_EQ(next.look(later.now), step == 0s ? std::nullopt : std::optional<Duration>(step));
+    EXPECT_EQ(next.at(later.now.mono).status, ClockStatus::unknown);
+    later.estimator = next;
+    EXPECT_EQ(later.hear(), step == 0s ? Verdict::taken : Verdict::stepped);
+  }
+}
+
+TEST(ClockEstimator, HandsAStepOnUntilItIsMeasured) {
+  Rig rig;
+  rig.hear();
+  rig.step(5s);
+  rig.pass(1s);
+  rig.hear();
+  rig.step(1s);
+  const auto seen_by_next = [&] {
+    ClockEstimator next{ClockEstimator::Settings{}};
+    next.resume(*rig.estimator.base());
+    return next.look(rig.now);
+  };
+  EXPECT_EQ(seen_by_next(), Duration(6s));
+  for (int i = 0; i < ClockEstimator::kUpdatesAfterStep; ++i) {
+    EXPECT_EQ(seen_by_next(), Duration(6s));
+    rig.pass(1s);
+    rig.hear();
+  }
+  EXPECT_EQ(rig.state().status, ClockStatus::synchronized);
+  EXPECT_EQ(seen_by_next(), std::nullopt);
+}
+
 TEST(ClockInstant, IsReadFromBothClocks) {
   const MonoTime mono = MonoClock::now();
   const Time wall = WallClock::now();

@@ -1,0 +1,100 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/clock/chronyd_client.hpp"
+
+#include <sys/socket.h>
+
+#include <array>
+#include <cerrno>
+#include <string>
+#include <utility>
+
+#include "core/wire/network_protocol.hpp"
+
+namespace dssm::daemon {
+
+ChronydClient::ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, User& user,
+                             Now now)
+    : loop_(loop),
+      chronyd_(chronyd),
+      user_(user),
+      now_(std::move(now)),
+      timer_(EventSource::timer(loop, [this] { on_timer(); })) {
+  timer_.enable_in(Duration::zero());
+}
+
+void ChronydClient::on_timer() {
+  timer_.enable_in(kPeriod);
+  if (question_) {
+    const Question unanswered = *std::exchange(question_, {});
+    user_.on_no_answer(unanswered.why.value_or(
+        Error{Errc::daemon_away, "it does not answer; does `chronyc tracking` work?"}));
+  }
+  if (Result<void> asked = ask(); !asked) user_.on_no_answer(asked.error());
+}
+
+Result<void> ChronydClient::ask() {
+  const std::string what = "ask chronyd at '" + chronyd_.str() + "'";
+  readable_ = {};  // before its descriptor is closed
+  socket_.reset(::socket(chronyd_.storage.ss_family, SOCK_DGRAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0));
+  if (!socket_ || ::connect(socket_.get(), chronyd_.get(), chronyd_.length)) return os_error(what);
+  Question question;
+  question.sequence = static_cast<std::uint32_t>(wire::random_number());
+  const auto request = tracking_request(question.sequence);
+  question.asked = now_().mono;
+  if (::send(socket_.get(), request.data(), request.size(), MSG_NOSIGNAL) < 0) {
+    return os_error(what);
+  }
+  question_ = std::move(question);
+  readable_ = EventSource::readable(loop_, socket_.get(), [this] { on_readable(); });
+  readable_.enable();
+  return {};
+}
+
+// Nothing more is expected at this socket.
+void ChronydClient::finish() {
+  readable_.disable();
+  socket_.reset();
+}
+
+void ChronydClient::on_readable() {
+  while (socket_) {
+    std::array<std::byte, 2 * kTrackingBytes> buffer;  // what is longer is no answer
+    const ssize_t size = ::recv(socket_.get(), buffer.data(), buffer.size(), 0);
+    if (size < 0) {
+      if (errno == EAGAIN) return;
+      if (errno == EINTR) continue;
+      const int errno_value = errno;
+      finish();
+      if (errno_value == ECONNREFUSED) {
+        question_.reset();
+        return user_.on_no_chronyd();
+      }
+      question_->why = os_error("receive from '" + chronyd_.str() + "'", errno_value);
+      return;
+    }
+    if (take_untrusted({buffer.data(), static_cast<std::size_t>(size)})) return;
+    if (++question_->datagrams == kMostDatagrams) finish();
+  }
+}
+
+// Whether that was the answer.
+bool ChronydClient::take_untrusted(std::span<const std::byte> datagram) {
+  if (!answers_untrusted(datagram, question_->sequence)) {
+    question_->why = Error{Errc::protocol,
+                           "what comes from there answers no question of ours; is "
+                           "it chronyd that listens there (`ss -lunp`)?"};
+    return false;
+  }
+  const clock::Instant answered = now_();
+  Result<TrackingReply> reply = tracking_untrusted(datagram);
+  if (!reply) {
+    question_->why = std::move(reply).error();
+    return false;
+  }
+  finish();
+  const MonoTime asked = std::exchange(question_, {})->asked;
+  user_.on_answer(*reply, asked, answered);
+  return true;
+}
+
+}  // namespace dssm::daemon

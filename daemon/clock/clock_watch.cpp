@@ -1,0 +1,239 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/clock/clock_watch.hpp"
+
+#include <algorithm>
+#include <array>
+#include <cstdio>
+#include <utility>
+
+#include "daemon/service/message_ids.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+using clock::ClockBasis;
+using clock::ClockStatus;
+using clock::ClockTrouble;
+using clock::Instant;
+
+// "1.234 ms", "12.345 s"; without the sign.
+std::string length_text(Duration d) {
+  const double seconds = std::chrono::abs(std::chrono::duration<double>(d)).count();
+  std::array<char, 48> text{};
+  std::snprintf(text.data(), text.size(), seconds < 1 ? "%.3f ms" : "%.3f s",
+                seconds < 1 ? seconds * 1000 : seconds);
+  return text.data();
+}
+
+std::string left_out_text(int count, const char* what) {
+  return count ? " (" + std::to_string(count) + " " + what + " before this were left out)" : "";
+}
+
+}  // namespace
+
+ClockWatch::ClockWatch(const EventLoop& loop, const Options& options, Observer& observer,
+                       Logger& logger)
+    : where_("chronyd at '" + options.chronyd.str() + "'"),
+      observer_(observer),
+      logger_(logger),
+      now_(options.now),
+      estimator_(options.settings),
+      client_(loop, options.chronyd, *this, options.now) {
+  Result<std::unique_ptr<StepWatch>> watch = StepWatch::open(loop, [this] { on_set(); });
+  if (watch) {
+    step_watch_ = *std::move(watch);
+  } else {
+    logger_.warning(watch.error().message +
+                    "; steps of this PC's clock are noticed within a second, not at once");
+  }
+}
+
+Instant ClockWatch::base() {
+  look(now_());
+  return *estimator_.base();
+}
+
+clock::ClockState ClockWatch::state() {
+  const Instant now = now_();
+  look(now);
+  return estimator_.at(now.mono);
+}
+
+std::optional<SourceAddress> ClockWatch::source() const noexcept {
+  return last_ ? last_->source : std::nullopt;
+}
+
+Duration ClockWatch::update_interval() const noexcept {
+  return last_ ? last_->tracking.update_interval : Duration::zero();
+}
+
+void ClockWatch::on_reference(const std::optional<clock::ReferenceReport>& report) noexcept {
+  estimator_.on_reference(report, now_().mono);
+}
+
+void ClockWatch::on_answer(const TrackingReply& reply, MonoTime asked, const Instant& answered) {
+  look(answered);
+  if (estimator_.take_untrusted(reply.tracking, asked, answered) ==
+      clock::ClockEstimator::Verdict::nonsense) {
+    return on_no_answer(
+        {Errc::protocol, "what it says cannot be; does `chronyc tracking` say so?"});
+  }
+  last_ = reply;
+  absent_ = false;
+  waiting_since_.reset();
+  changed(answered);
+}
+
+void ClockWatch::on_no_chronyd() {
+  const Instant now = now_();
+  look(now);
+  estimator_.on_no_chronyd();
+  last_.reset();
+  absent_ = true;
+  waiting_since_.reset();
+  changed(now);
+}
+
+void ClockWatch::on_no_answer(const Error& why) {
+  const Instant now = now_();
+  look(now);
+  if (!waiting_since_) waiting_since_ = now.mono;
+  why_ = why.message;
+  changed(now);
+}
+
+void ClockWatch::on_set() {
+  const Instant now = now_();
+  look(now);
+  changed(now);
+}
+
+void ClockWatch::look(const Instant& now) {
+  const std::optional<Duration> step = estimator_.look(now);
+  if (!step) return;
+  if (steps_.pace.wait(now.mono) > Duration::zero()) {
+    ++steps_.left_out;
+    return;
+  }
+  steps_.pace.take(now.mono);
+  logger_.warning(
+      "this PC's clock was set " + std::string(*step > Duration::zero() ? "forward" : "back") +
+          " by " + length_text(*step) + left_out_text(std::exchange(steps_.left_out, 0), "steps") +
+          "; it is out of bounds until chronyd has measured it " +
+          std::to_string(clock::ClockEstimator::kUpdatesAfterStep) + " times anew",
+      {.message_id = message_id::kClockStepped});
+}
+
+// Something may have: tells the log if so, and the observer in any case.
+void ClockWatch::changed(const Instant& now) {
+  const clock::ClockState state = estimator_.at(now.mono);
+  const Condition is = condition(state, now.mono);
+  if (is != std::exchange(seen_, is)) ++changes_.left_out;
+  // One that comes and goes while nothing may be said is counted; one that stays is told later.
+  if (is != told_ && changes_.pace.wait(now.mono) == Duration::zero()) tell(is, state, now.mono);
+  observer_.on_clock();
+}
+
+ClockWatch::Condition ClockWatch::condition(const clock::ClockState& state,
+                                            MonoTime now) const noexcept {
+  if (absent_ || state.status == ClockStatus::unknown) {
+    // A chronyd that is just starting may take a while to answer.
+    const bool too_long =
+        waiting_since_ && now - *waiting_since_ > clock::ClockEstimator::kSilentAfter;
+    return too_long ? Condition::silent : absent_ ? Condition::absent : Condition::unknown;
+  }
+  if (state.status == ClockStatus::holdover) return Condition::holdover;
+  if (state.status == ClockStatus::synchronized) return Condition::good;
+  switch (state.trouble) {
+    case ClockTrouble::unsynchronized:
+      return Condition::unsynchronized;
+    case ClockTrouble::stepped:
+      return Condition::stepped;
+    case ClockTrouble::too_far:
+      return Condition::too_far;
+    case ClockTrouble::no_chronyd:
+    case ClockTrouble::silent:
+    case ClockTrouble::none:
+      break;
+  }
+  return Condition::silent;
+}
+
+void ClockWatch::tell(Condition condition, const clock::ClockState& state, MonoTime now) {
+  const bool was_away = told_ == Condition::absent || told_ == Condition::silent;
+  const bool is_step = condition == Condition::stepped && !was_away;  // look() has told that
+  told_ = condition;
+  if (is_step || condition == Condition::unknown) {
+    --changes_.left_out;
+    return;
+  }
+  changes_.pace.take(now);
+  const std::string others = left_out_text(std::exchange(changes_.left_out, 0) - 1, "changes");
+  const std::string back = was_away ? where_ + " answers again" + others + "; " : "";
+  const std::string after = was_away ? "" : others;
+  switch (condition) {
+    case Condition::absent:
+      return logger_.warning("there is no " + where_ + after +
+                                 ": this PC's clock has no bound; is it running (`systemctl status "
+                                 "chrony`), and does chrony.conf leave its `cmdport` at that?",
+                             {.message_id = message_id::kChronydAway});
+    case Condition::silent:
+      return logger_.warning(where_ + " does not tell how this PC's clock is" + after +
+                                 "; the clock has no bound: " + why_,
+                             {.message_id = message_id::kChronydAway});
+    case Condition::unsynchronized:
+      return logger_.warning(back + "chronyd does not know the time" + after +
+                                 ", so this PC's clock has no bound; does it reach its sources "
+                                 "(`chronyc sources`)?",
+                             {.message_id = message_id::kClockOutOfBounds});
+    case Condition::stepped:
+      return logger_.warning(
+          back + "this PC's clock was set, and chronyd has yet to measure it anew" + after,
+          {.message_id = message_id::kClockOutOfBounds});
+    case Condition::too_far:
+      return logger_.warning(back + too_far(state, now) + after,
+                             {.message_id = message_id::kClockOutOfBounds});
+    case Condition::holdover:
+    case Condition::good:
+      return logger_.notice(back + in_bounds(condition, state, now) + after,
+                            {.message_id = message_id::kClockInBounds});
+    case Condition::unknown:
+      return;
+  }
+}
+
+std::string ClockWatch::in_bounds(Condition condition, const clock::ClockState& state,
+                                  MonoTime now) const {
+  const char* const from = state.basis == ClockBasis::own ? "the time that it gives to others"
+                           : state.basis == ClockBasis::reference ? "the reference PC's"
+                                                                  : "the right time";
+  std::string text = "this PC's clock is within " + length_text(state.bound) + " of " + from +
+                     " (limit " + length_text(estimator_.settings().limit) + ")";
+  if (condition == Condition::holdover) {
+    text += ", but chronyd has learned nothing for " + length_text(now - state.updated) +
+            ": that grows by " + length_text(Duration(state.ageing)) +
+            " each second; does it reach its sources (`chronyc sources`)?";
+  }
+  return text;
+}
+
+std::string ClockWatch::too_far(const clock::ClockState& state, MonoTime now) const {
+  const Duration off = std::chrono::abs(state.offset);
+  const Duration aged = clock::growth(now - state.updated, state.ageing);
+  const Duration way = state.bound - off - aged;
+  std::string text = "this PC's clock may be wrong by " + length_text(state.bound) +
+                     ", more than its limit of " + length_text(estimator_.settings().limit);
+  if (off >= std::max(aged, way)) {
+    return text + ": it is off by " + length_text(off) +
+           ", which chronyd is slewing away; wait, or step it (`chronyc makestep`)";
+  }
+  if (aged >= way) {
+    return text + ": chronyd has learned nothing for " + length_text(now - state.updated) +
+           "; does it reach its sources (`chronyc sources`)?";
+  }
+  return text +
+         ": so far is the source that chronyd follows from its root, or the network "
+         "delays its packets (`chronyc ntpdata`); is there a nearer one?";
+}
+
+}  // namespace dssm::daemon

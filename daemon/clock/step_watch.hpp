@@ -1,0 +1,33 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Tells at once when somebody sets the wall clock (timerfd_create(2), TFD_TIMER_CANCEL_ON_SET), and
+// also when the PC wakes from sleep. Not how far; slewing is none.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <functional>
+#include <memory>
+
+#include "core/base/unique_fd.hpp"
+#include "daemon/service/event_loop.hpp"
+
+namespace dssm::daemon {
+
+class StepWatch {
+ public:
+  // Calls on_set from the loop, which outlives it; several sets may lead to one call.
+  static Result<std::unique_ptr<StepWatch>> open(const EventLoop& loop,
+                                                 std::function<void()> on_set);
+  StepWatch(const StepWatch&) = delete;
+  StepWatch& operator=(const StepWatch&) = delete;
+
+ private:
+  StepWatch(const EventLoop& loop, UniqueFd timer, std::function<void()> on_set);
+  void on_readable();
+
+  UniqueFd timer_;
+  std::function<void()> on_set_;
+  EventSource readable_;
+};
+
+}  // namespace dssm::daemon
