@@ -1,10 +1,25 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// The names of all that can go wrong, and of what clocks can be.
+#include <array>
 #include <cerrno>
+#include <cstddef>
+#include <dssm/clock_status.hpp>
 #include <dssm/error.hpp>
 #include <dssm/sample.hpp>
 #include <system_error>
 
 namespace dssm {
+namespace {
+
+// Values may come from another process or PC.
+template <class Enum, std::size_t n>
+std::string_view name_in(const std::array<std::string_view, n>& names, Enum value) noexcept {
+  const auto index = static_cast<std::size_t>(value);
+  return index < n ? names[index] : "?";
+}
+
+}  // namespace
 
 std::string_view errc_name(Errc code) noexcept {
   switch (code) {
@@ -30,6 +45,8 @@ std::string_view errc_name(Errc code) noexcept {
       return "protocol";
     case Errc::conflict:
       return "conflict";
+    case Errc::clock_out_of_bounds:
+      return "clock_out_of_bounds";
     case Errc::closed:
       return "closed";
     case Errc::system:
@@ -50,6 +67,8 @@ std::string_view status_name(ReadStatus status) noexcept {
       return "lapped";
     case ReadStatus::restarted:
       return "restarted";
+    case ReadStatus::clock_out_of_bounds:
+      return "clock_out_of_bounds";
   }
   return "lapped";
 }
@@ -61,6 +80,28 @@ Error os_error(std::string_view what, int errno_value) {
   if (errno_value == EACCES || errno_value == EPERM) code = Errc::no_permission;
   if (errno_value == ENOMEM || errno_value == ENOSPC) code = Errc::no_memory;
   return Error{code, std::string(what) + ": " + std::generic_category().message(errno_value)};
+}
+
+std::string_view name_of(ClockStatus status) noexcept {
+  static constexpr std::array<std::string_view, 4> kNames = {"unknown", "synchronized", "holdover",
+                                                             "out of bounds"};
+  return name_in(kNames, status);
+}
+
+std::string_view name_of(ClockTrouble trouble) noexcept {
+  static constexpr std::array<std::string_view, 6> kNames = {
+      "none", "no chronyd", "chronyd is silent", "not synchronised", "stepped", "too far"};
+  return name_in(kNames, trouble);
+}
+
+std::string_view name_of(ClockBasis basis) noexcept {
+  static constexpr std::array<std::string_view, 4> kNames = {"nothing", "root", "reference", "own"};
+  return name_in(kNames, basis);
+}
+
+std::string_view name_of(ClockPolicy policy) noexcept {
+  static constexpr std::array<std::string_view, 3> kNames = {"enforce", "mark", "off"};
+  return name_in(kNames, policy);
 }
 
 }  // namespace dssm

@@ -49,10 +49,4 @@ Duration growth(Duration age, PartsPerBillion drift) noexcept {
   return Duration(seconds * drift + (rest * drift + kBillion - 1) / kBillion);
 }
 
-Duration bound_between(Duration one, std::string_view one_boot_id, Duration other,
-                       std::string_view other_boot_id) noexcept {
-  if (!one_boot_id.empty() && one_boot_id == other_boot_id) return kNone;
-  return sum(one, other);
-}
-
 }  // namespace dssm::clock

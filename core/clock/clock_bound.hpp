@@ -11,7 +11,6 @@
 
 #include <cstdint>
 #include <dssm/time.hpp>
-#include <string_view>
 
 namespace dssm::clock {
 
@@ -40,11 +39,5 @@ Duration bound_to_reference(Duration offset, const RootDistance& own,
 
 // What `drift` adds in `age`. An age below 0 adds nothing: the reading is as good as new.
 Duration growth(Duration age, PartsPerBillion drift) noexcept;
-
-// The distance between two clocks that each state a bound. Two PCs with one kernel (network
-// namespaces, containers) have one clock, which is no distance from itself whatever its bound is.
-//   boot ids  /proc/sys/kernel/random/boot_id of each; empty: not known, and nobody's
-Duration bound_between(Duration one, std::string_view one_boot_id, Duration other,
-                       std::string_view other_boot_id) noexcept;
 
 }  // namespace dssm::clock

@@ -180,21 +180,23 @@ ClockState ClockEstimator::at(MonoTime now) const noexcept {
   state.offset = tracking.offset;
   state.updated = reading_->updated;
   state.root = tracking.root;
+  state.own_bound = sum(bound_to_root(tracking.offset, {}), unseen_);
   if (tracking.reference_id == kLocalReferenceId) {
     state.basis = ClockBasis::own;
-    state.bound = bound_to_root(tracking.offset, {});
+    state.bound = state.root_bound = state.own_bound;
   } else {
     const bool relative = follows_reference() && reference_->whole;
     state.basis = relative ? ClockBasis::reference : ClockBasis::root;
     state.ageing = slewed(settings_.max_drift);
-    state.bound = bound_to_reference(
-        tracking.offset, tracking.root,
-        relative ? least(reference_->before, reference_->lately) : RootDistance{});
     // From when chronyd last learned something, not from when we asked: in between it goes by its
     // own estimate of the drift, which is no bound.
-    state.bound = sum(state.bound, growth(now - reading_->updated, state.ageing));
+    const Duration aged = sum(growth(now - reading_->updated, state.ageing), unseen_);
+    state.root_bound = sum(bound_to_root(tracking.offset, tracking.root), aged);
+    state.bound = relative ? sum(bound_to_reference(tracking.offset, tracking.root,
+                                                    least(reference_->before, reference_->lately)),
+                                 aged)
+                           : state.root_bound;
   }
-  state.bound = sum(state.bound, unseen_);
   if (state.bound > settings_.limit) {
     state.trouble = ClockTrouble::too_far;
   } else {

@@ -8,6 +8,7 @@
 #pragma once
 
 #include <cstdint>
+#include <dssm/clock_status.hpp>
 #include <dssm/time.hpp>
 #include <optional>
 
@@ -50,31 +51,6 @@ struct ReferenceReport {
   RootDistance root;
 };
 
-enum class ClockStatus : std::uint8_t {
-  unknown,        // chronyd has not been heard of yet
-  synchronized,   // the bound is within the limit
-  holdover,       // so far, but chronyd has not heard from its sources for some time
-  out_of_bounds,  // beyond the limit, or there is no bound: see ClockTrouble
-};
-
-// Why a clock is out of bounds.
-enum class ClockTrouble : std::uint8_t {
-  none,
-  no_chronyd,      // it was there, and nothing listens any more
-  silent,          // it does not answer
-  unsynchronized,  // it answers that it does not know the time
-  stepped,         // the clock was set; chronyd has not measured it anew
-  too_far,         // the bound is beyond the limit
-};
-
-// What the bound is a distance from.
-enum class ClockBasis : std::uint8_t {
-  nothing,    // there is no bound
-  root,       // UTC, or whatever the root of the clocks has
-  reference,  // the clock of the fleet's reference PC
-  own,        // this PC is the reference: right by definition
-};
-
 // The clock at one instant.
 struct ClockState {
   ClockStatus status = ClockStatus::unknown;
@@ -83,7 +59,9 @@ struct ClockState {
   std::uint16_t stratum = 0;
   std::uint32_t reference_id = 0;  // this and the following: of the last reading; 0 without one
   Duration bound = kUnknownClockError;
-  PartsPerBillion ageing = 0;  // what the bound grows by in a second from here on
+  Duration root_bound = kUnknownClockError;  // from the root, whatever the basis
+  Duration own_bound = kUnknownClockError;   // from the time that chronyd here keeps
+  PartsPerBillion ageing = 0;                // what the bound grows by in a second from here on
   Duration offset{};
   MonoTime read;     // when chronyd was asked
   MonoTime updated;  // when it last learned something

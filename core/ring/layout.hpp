@@ -15,6 +15,8 @@
 #include <cstddef>
 #include <cstdint>
 
+#include "core/ring/clock_gate.hpp"
+
 namespace dssm::ring {
 
 inline constexpr std::uint64_t kMagic = 0x474e49524d535344;  // "DSSMRING"
@@ -54,7 +56,9 @@ static_assert(std::atomic<std::uint32_t>::is_always_lock_free);
 //                                                 the owner's ring the last published one became;
 //                                                 see "Window"
 //   544     8 owner_incarnation -     dssmd       of that ring of the owner
-//   552  3544 reserved         -      -           zero
+//   552    24 reserved         -      -           zero
+//   576    56 clock            -      dssmd       in mirrors only: see clock_gate.hpp
+//   632  3464 reserved         -      -           zero
 struct RingHeader {
   std::uint64_t magic;
   std::uint32_t layout_version;
@@ -82,20 +86,23 @@ struct RingHeader {
   std::atomic<std::int64_t> first;
   std::atomic<std::int64_t> owner_tid;
   std::atomic<std::uint64_t> owner_incarnation;
-  std::byte reserved3[3544];
+  std::byte reserved3[24];
+  ClockGate clock;
+  std::byte reserved4[3464];
 };
 static_assert(sizeof(pthread_mutex_t) <= 64);
 static_assert(offsetof(RingHeader, incarnation) == 64 && offsetof(RingHeader, name) == 88);
 static_assert(offsetof(RingHeader, host) == 128 && offsetof(RingHeader, lock) == 320);
 static_assert(offsetof(RingHeader, top) == 512 && offsetof(RingHeader, run_start) == 520);
 static_assert(offsetof(RingHeader, first) == 528 && offsetof(RingHeader, owner_tid) == 536);
+static_assert(offsetof(RingHeader, clock) == 576);
 static_assert(sizeof(RingHeader) == kPageBytes);
 
 //   off size field           unit  written by  order
 //     0    8 sequence        -     writer      2*tid+1 while being filled, 2*tid+2 when published
 //     8    8 tid             -     writer      inside the sequence bracket, as all below
 //    16    8 time_ns         ns    writer      signed, since 1970, CLOCK_REALTIME of the writer
-//    24    8 clock_error_ns  ns    writer      >= 0; 2^63-1: unknown
+//    24    8 clock_error_ns  ns    writer      >= 0; 2^63-1: unknown; 2^63-2: of another clock
 //    32    8 run_start       tid   writer      first sample of the run this one belongs to
 //    40    8 run_parent      tid   writer      run_start's sample only: newest earlier sample with
 //    an

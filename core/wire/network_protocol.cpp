@@ -40,6 +40,12 @@ bool is_printable(std::string_view text) {
                       [](unsigned char c) { return c < 0x20 || c == 0x7f; });
 }
 
+// Nobody knows how long it was under way, but a connection that takes longer is dead.
+std::shared_ptr<const ClockReport> news(const proto::ClockStatus& clock) {
+  return std::make_shared<const ClockReport>(
+      clock_report_untrusted(clock, MonoClock::now() - kSilenceIsDeath));
+}
+
 void fill_randomly(void* bytes, std::size_t size) {
   // Up to 256 bytes come at once and never fail; early in the boot this waits for the kernel's
   // pool.
@@ -84,7 +90,7 @@ void to_message(const Greeting& greeting, net::Hello& out) {
   out.set_program(greeting.program);
   out.set_version(greeting.version);
   for (const std::string& feature : greeting.features) out.add_features(feature);
-  to_message(greeting.clock_bound, *out.mutable_clock());
+  if (greeting.clock) tell_clock(greeting, *out.mutable_clock());
 }
 
 Error other_protocol_version(const std::string& who, std::uint32_t theirs,
@@ -132,7 +138,9 @@ Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string
   greeting.life = message.life();
   greeting.program = message.program();
   greeting.version = message.version();
-  if (message.has_clock()) greeting.clock_bound = clock_bound_untrusted(message.clock());
+  if (message.has_clock()) {
+    greeting.clock = news(message.clock());
+  }
   return greeting;
 }
 
@@ -155,12 +163,16 @@ std::uint64_t random_number() {
   return number;
 }
 
-Duration clock_bound_untrusted(const net::ClockStatus& status) noexcept {
-  return status.bound_ns() < 0 ? kUnknownClockError : Duration(status.bound_ns());
+void tell_clock(const Greeting& self, proto::ClockStatus& out) {
+  if (self.clock) to_message(self.clock->at(MonoClock::now()), out);
 }
 
-void to_message(Duration clock_bound, net::ClockStatus& out) {
-  out.set_bound_ns(to_ns(clock_bound));
+std::shared_ptr<const ClockReport> clock_news_untrusted(const net::Pong& pong) {
+  return news(pong.clock());
+}
+
+Duration clock_bound_of(const Greeting& greeting) noexcept {
+  return greeting.clock ? greeting.clock->at(MonoClock::now()).standing.bound : kUnknownClockError;
 }
 
 }  // namespace dssm::wire

@@ -7,9 +7,11 @@
 #include <cstdint>
 #include <dssm/result.hpp>
 #include <dssm/time.hpp>
+#include <memory>
 #include <string>
 #include <vector>
 
+#include "core/wire/clock_report.hpp"
 #include "core/wire/messages.hpp"
 #include "network.pb.h"
 
@@ -20,7 +22,8 @@ inline constexpr std::size_t kMaxNetworkFrameBytes = 17U << 20;  // without a pa
 inline constexpr std::size_t kMaxPlainBytes = 1U << 20;  // of a frame, without payload and property
 inline constexpr std::size_t kMaxFeatures = 32;
 inline constexpr std::size_t kMaxFeatureBytes = 63;
-inline constexpr std::string_view kFeatureTorn = "torn";  // network.proto, Frame.torn
+inline constexpr std::string_view kFeatureTorn = "torn";    // network.proto, Frame.torn
+inline constexpr std::string_view kFeatureClock = "clock";  // network.proto, Pong as an event
 
 // Heartbeats of control connections, and when their silence means death (design: within 3 s).
 inline constexpr Duration kHeartbeat = std::chrono::seconds(1);
@@ -38,7 +41,9 @@ struct Greeting {
   std::string program;     // "dssmd", "mapper"
   std::string version;
   std::vector<std::string> features;
-  Duration clock_bound = kUnknownClockError;
+  // What it says of its clock; nullptr: nothing. Our own is kept up to date by who watches the
+  // clock, and all copies of our greeting share it.
+  std::shared_ptr<const ClockReport> clock;
 
   bool has_feature(std::string_view feature) const noexcept;
   std::string str() const;  // "'mapper' on host 'pc3'", "dssmd of host 'pc2'"
@@ -65,8 +70,13 @@ HostId host_id_for(std::string_view name);
 // Random and never 0.
 std::uint64_t random_number();
 
-// The clock bound for the wire and back.
-Duration clock_bound_untrusted(const net::ClockStatus& status) noexcept;
-void to_message(Duration clock_bound, net::ClockStatus& out);
+// What we say of our own clock at this moment; nothing when nothing is known.
+void tell_clock(const Greeting& self, proto::ClockStatus& out);
+
+// What a Pong that nobody asked for says of its sender's clock.
+std::shared_ptr<const ClockReport> clock_news_untrusted(const net::Pong& pong);
+
+// How far the host behind the greeting says that its clock may be off: its bound, aged until now.
+Duration clock_bound_of(const Greeting& greeting) noexcept;
 
 }  // namespace dssm::wire

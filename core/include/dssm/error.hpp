@@ -12,19 +12,20 @@
 namespace dssm {
 
 enum class Errc {
-  invalid_argument,  // the caller's words are wrong: a name, a size, a duration, a configuration
-  not_found,         // no such stream, or no property
-  already_exists,    // there is a stream of that name already, and it is not the same
-  type_mismatch,     // the stream has another payload size, alignment or type
-  limit_exceeded,    // a configured limit of dssmd, or one of the format
-  no_memory,         // the machine has no memory for it
-  no_permission,     // the operating system or dssmd refuses this user
-  no_daemon,         // nothing listens at the socket
-  daemon_away,       // dssmd was there and is gone; this process keeps trying
-  protocol,          // the other side speaks another version, or garbage
-  conflict,          // two things claim one name, e.g. a second dssmd in one folder
-  closed,            // the object was closed by this process
-  system,            // the operating system failed; the message has its words
+  invalid_argument,     // the caller's words are wrong: a name, a size, a duration, a configuration
+  not_found,            // no such stream, or no property
+  already_exists,       // there is a stream of that name already, and it is not the same
+  type_mismatch,        // the stream has another payload size, alignment or type
+  limit_exceeded,       // a configured limit of dssmd, or one of the format
+  no_memory,            // the machine has no memory for it
+  no_permission,        // the operating system or dssmd refuses this user
+  no_daemon,            // nothing listens at the socket
+  daemon_away,          // dssmd was there and is gone; this process keeps trying
+  protocol,             // the other side speaks another version, or garbage
+  conflict,             // two things claim one name, e.g. a second dssmd in one folder
+  clock_out_of_bounds,  // two hosts' clocks may be further apart than is allowed
+  closed,               // the object was closed by this process
+  system,               // the operating system failed; the message has its words
 };
 
 // The code's name as written in docs/errors.md, e.g. "not_found". Static storage.

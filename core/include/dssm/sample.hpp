@@ -30,6 +30,8 @@ enum class [[nodiscard]] ReadStatus : std::uint8_t{
     lapped,     // the writer overtook this reader again and again; nothing torn was returned
     restarted,  // the stream began anew, with a new ring and new tids: the reader is on it now,
                 // call again
+    clock_out_of_bounds,  // reads by time: the clocks of this PC and the stream's host may be
+                          // further apart than is allowed (key clock_limit)
 };
 
 // Outcomes of a wait.

@@ -46,6 +46,13 @@ using MonoTime = MonoClock::time_point;
 // The bound on a stamp's error when nothing is known about the clock that made it.
 inline constexpr Duration kUnknownClockError = Duration::max();
 
+// Instead of a bound: the stamp is none of its PC's clock, but of a recording, or of a device with
+// a clock of its own. How good this PC's clock is says nothing about it.
+inline constexpr Duration kForeignClockError = Duration::max() - Duration(1);
+
+// For writers: the stamp is one of this PC's clock, whose bound dssmd knows.
+inline constexpr Duration kOwnClockError = Duration(-1);
+
 // A deadline that never comes.
 inline constexpr MonoTime kNever = MonoTime::max();
 

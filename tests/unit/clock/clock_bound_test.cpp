@@ -55,13 +55,5 @@ TEST(ClockBound, GrowsBeyondAllBoundsRatherThanOverflow) {
   EXPECT_LT(growth(Duration::max(), 999'999'998), kUnknownClockError);
 }
 
-TEST(ClockBound, IsZeroBetweenPcsThatShareAKernel) {
-  EXPECT_EQ(bound_between(1ms, "a", 2ms, "b"), 3ms);
-  EXPECT_EQ(bound_between(1ms, "a", 2ms, "a"), 0ns);
-  EXPECT_EQ(bound_between(kUnknownClockError, "a", kUnknownClockError, "a"), 0ns);
-  EXPECT_EQ(bound_between(1ms, "", 2ms, ""), 3ms) << "not known whether they share one";
-  EXPECT_EQ(bound_between(kUnknownClockError, "a", 2ms, "b"), kUnknownClockError);
-}
-
 }  // namespace
 }  // namespace dssm::clock

@@ -76,8 +76,8 @@ const std::map<std::string, Fill>& messages() {
          greeting.program = "dssmd";
          greeting.version = "0.1.0";
          greeting.features = {std::string(kFeatureTorn)};
-         greeting.clock_bound = std::chrono::microseconds(250);
          to_message(greeting, *frame.mutable_hello());
+         frame.mutable_hello()->mutable_clock()->set_bound_ns(250'000);
        }},
       {"failure",
        [](net::Frame& frame) {
@@ -265,12 +265,12 @@ const std::map<std::string, Fill>& messages() {
       {"ping",
        [](net::Frame& frame) {
          frame.set_serial(9);
-         to_message(kUnknownClockError, *frame.mutable_ping()->mutable_clock());
+         frame.mutable_ping()->mutable_clock()->set_bound_ns(to_ns(kUnknownClockError));
        }},
       {"pong",
        [](net::Frame& frame) {
          frame.set_serial(9);
-         to_message(std::chrono::microseconds(250), *frame.mutable_pong()->mutable_clock());
+         frame.mutable_pong()->mutable_clock()->set_bound_ns(250'000);
        }},
       {"stream_list",
        [](net::Frame& frame) {

@@ -16,7 +16,11 @@ Greeting mapper() {
   greeting.program = "mapper";
   greeting.version = "0.1.0";
   greeting.features = {"torn", "other"};
-  greeting.clock_bound = std::chrono::microseconds(250);
+  auto clock = std::make_shared<ClockReport>();
+  clock->standing.anchor = greeting.host_id;
+  clock->standing.bound = std::chrono::microseconds(250);
+  clock->heard = MonoClock::now();
+  greeting.clock = clock;
   return greeting;
 }
 
@@ -44,7 +48,7 @@ TEST(Greeting, CrossesTheWire) {
   EXPECT_EQ(back->program, "mapper");
   EXPECT_EQ(back->version, "0.1.0");
   EXPECT_EQ(back->features, mapper().features);
-  EXPECT_EQ(back->clock_bound, std::chrono::microseconds(250));
+  EXPECT_EQ(clock_bound_of(*back), std::chrono::microseconds(250)) << "it does not age";
   EXPECT_TRUE(back->has_feature(kFeatureTorn));
   EXPECT_FALSE(back->has_feature("tor"));
   EXPECT_EQ(back->str(), "'mapper' on host 'pc3'");
@@ -101,17 +105,13 @@ TEST(Greeting, TakesValuesAtTheirLimits) {
   EXPECT_TRUE(greeting_untrusted(message, "x"));
 }
 
-TEST(ClockBound, IsUnknownUnlessSaid) {
+TEST(Greeting, SaysNothingOfTheClockUnlessItIsKnown) {
   net::Hello message = hello();
   message.clear_clock();
-  EXPECT_EQ(greeting_untrusted(message, "x")->clock_bound, kUnknownClockError);
+  EXPECT_EQ(clock_bound_of(*greeting_untrusted(message, "x")), kUnknownClockError);
+  message = hello();
   message.mutable_clock()->set_bound_ns(-1);
-  EXPECT_EQ(greeting_untrusted(message, "x")->clock_bound, kUnknownClockError);
-  net::ClockStatus status;
-  for (const Duration bound : {Duration(0), Duration(1'500'000), kUnknownClockError}) {
-    to_message(bound, status);
-    EXPECT_EQ(clock_bound_untrusted(status), bound);
-  }
+  EXPECT_EQ(clock_bound_of(*greeting_untrusted(message, "x")), kUnknownClockError);
 }
 
 TEST(HostId, DiffersBetweenNamesAndStaysTheSame) {
