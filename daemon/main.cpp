@@ -17,6 +17,7 @@
 #include "daemon/channel/network_listener.hpp"
 #include "daemon/channel/remote_writers.hpp"
 #include "daemon/channel/resolver.hpp"
+#include "daemon/clock/fleet_clock.hpp"
 #include "daemon/discovery/catalog.hpp"
 #include "daemon/discovery/discovery.hpp"
 #include "daemon/discovery/fleet_service.hpp"
@@ -53,7 +54,7 @@ wire::Greeting own_greeting(const std::string& name) {
   self.life = wire::random_number();
   self.program = "dssmd";
   self.version = DSSM_VERSION;
-  self.features = {std::string(wire::kFeatureTorn)};
+  self.features = {std::string(wire::kFeatureTorn), std::string(wire::kFeatureClock)};
   return self;
 }
 
@@ -68,8 +69,8 @@ PeerTable::Limits peer_limits(const Config& config) {
   return {config.max_connections, config.max_connections_per_host, config.max_peer_memory_bytes};
 }
 
-// The line in `systemctl status`; no clock is watched yet.
-std::string status_text(const Registry& registry, const Peers& peers,
+// The line in `systemctl status`.
+std::string status_text(const Registry& registry, const Peers& peers, const FleetClock& clock,
                         const NetworkListener& network) {
   std::size_t up = 0, known = 0;
   for (const local::Host& host : peers.hosts()) {
@@ -78,8 +79,14 @@ std::string status_text(const Registry& registry, const Peers& peers,
     if (host.state() == "up") ++up;
   }
   return "host '" + registry.host() + "', " + std::to_string(registry.streams().size()) +
-         " streams, " + std::to_string(up) + " of " + std::to_string(known) +
-         " other hosts up, clock unknown, " + network.str();
+         " streams, " + std::to_string(up) + " of " + std::to_string(known) + " other hosts up, " +
+         clock.str() + ", " + network.str();
+}
+
+FleetClock::Options clock_options(const Config& config) {
+  return {{wire::resolve_number(config.chronyd).front(),
+           {config.clocks.general.limit, config.max_drift}},
+          config.clocks};
 }
 
 // Touches the status line when streams come and go.
@@ -155,19 +162,25 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
                           (listener->predecessor_died() || listener->inherited()) &&
                           config.recovery_grace > Duration::zero();
 
-  const wire::Greeting self = own_greeting(config.name);
-  Resolver resolver(*loop);
-  const ChannelParts parts{*loop, resolver, registry, logger, self};
+  wire::Greeting self = own_greeting(config.name);
+  const auto own_clock = std::make_shared<wire::ClockReport>();
+  self.clock = own_clock;
   Catalog catalog(config.name);
+  Result<clock::ClockPageWriter> page = clock::ClockPageWriter::open(dir->clock_page_path());
+  if (!page) return std::move(page).error();
+  FleetClock fleet_clock(*loop, clock_options(config), *std::move(page), own_clock, self.host_id,
+                         catalog, logger);
+  Resolver resolver(*loop);
+  const ChannelParts parts{*loop, resolver, registry, logger, self, &fleet_clock};
   Mirrors mirrors(parts, catalog, config.mirror_linger);
   RemoteWriters writers(parts, catalog);
   Peers peers(*loop, resolver, config.peers, self, catalog, logger);
-  FleetService fleet(*loop, {self, network->addresses(), config.insecure}, registry, catalog, peers,
-                     mirrors, writers);
+  FleetService fleet(*loop, {self, network->addresses(), config.insecure, &fleet_clock}, registry,
+                     catalog, peers, mirrors, writers);
 
   LocalService service(registry, opens, clock, logger, recovering, &fleet);
   Server server(*loop, *listener, config.max_clients, service, logger);
-  ChannelServer channels({*loop, registry, opens, logger}, self, peer_limits(config));
+  ChannelServer channels({*loop, registry, opens, logger, &fleet_clock}, self, peer_limits(config));
 
   std::optional<Discovery> discovery;
   if (config.mdns) {
@@ -197,9 +210,15 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
                          EventSource::signal(*loop, SIGINT, [&] { loop->stop(); })};
   for (EventSource& stop : stops) stop.enable();
 
-  StatusLine status(*loop, manager, [&] { return status_text(registry, peers, *network); });
+  StatusLine status(*loop, manager,
+                    [&] { return status_text(registry, peers, fleet_clock, *network); });
   const StreamCount count(registry, status);
   peers.on_change([&] { status.touch(); });
+  fleet_clock.on_news([&] {
+    channels.tell_clock();
+    status.touch();
+  });
+  fleet_clock.on_change([&] { mirrors.on_clock(); });
   Reloader reloader(
       config, read_again,
       [&](const Config& changed) {
@@ -210,6 +229,7 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
         channels.set_limits(peer_limits(changed));
         mirrors.set_linger(changed.mirror_linger);
         peers.set_configured(changed.peers);
+        fleet_clock.set(changed.clocks, changed.max_drift);
       },
       logger);
   EventSource reload = EventSource::signal(*loop, SIGHUP, [&] {
@@ -233,6 +253,8 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
   if (Result<void> ran = loop->run(); !ran) return ran;
   manager.stopping();
   peers.on_change({});
+  fleet_clock.on_news({});
+  fleet_clock.on_change({});
   logger.notice("stopping", {.message_id = message_id::kStopping});
   return {};
 }

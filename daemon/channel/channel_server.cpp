@@ -95,10 +95,14 @@ void ChannelServer::keep(PeerPlace place, std::unique_ptr<wire::Transport> trans
                          const wire::SocketAddress& address) {
   auto communicator = std::make_unique<DataCommunicator>(
       DataCommunicator::Parts{parts_.loop, parts_.registry, parts_.opens, streams_, self_, logger_,
-                              *this},
+                              *this, parts_.clock},
       std::move(place), std::move(transport), address.str());
   DataCommunicator* key = communicator.get();
   communicators_.emplace(key, std::move(communicator));
+}
+
+void ChannelServer::tell_clock() {
+  for (const auto& [key, communicator] : communicators_) communicator->tell_clock();
 }
 
 void ChannelServer::turn_away(UniqueFd socket, const wire::SocketAddress* address,

@@ -30,6 +30,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ke
     Registry& registry;
     const OpenTable& opens;
     Logger& logger;
+    ClockRules* clock = nullptr;  // nobody watches the clock
   };
 
   // self: how this dssmd greets. All in `parts` outlive it.
@@ -45,6 +46,9 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ke
   // For tests and fuzzers: a connection that is there already.
   Result<void> adopt(std::unique_ptr<wire::Transport> transport,
                      const wire::SocketAddress& address);
+
+  // There is news of this host's clock.
+  void tell_clock();
 
   void set_limits(const PeerTable::Limits& limits) { peers_.set_limits(limits); }
 

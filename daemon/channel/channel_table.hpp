@@ -101,6 +101,11 @@ class ChannelTable final : private CatalogObserver {
     }
   }
 
+  template <class Work>
+  void for_each(const Work& work) const {
+    for (const auto& [key, kept] : entries_) work(*kept);
+  }
+
   // Destroys soon, outside of all callbacks, what is done.
   void sweep() { sweep_.enable_in(Duration::zero()); }
 

@@ -96,7 +96,7 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
     is_control_ = true;
     net::Frame pong;
     pong.set_serial(request.serial());
-    wire::to_message(parts_.self.clock_bound, *pong.mutable_pong()->mutable_clock());
+    wire::tell_clock(parts_.self, *pong.mutable_pong()->mutable_clock());
     link_.send(pong);
     parts_.keeper.on_heartbeat();
     return {};
@@ -129,6 +129,13 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
   return {};
 }
 
+void DataCommunicator::tell_clock() {
+  if (!is_control_ || !link_.is_open() || !them_->has_feature(wire::kFeatureClock)) return;
+  net::Frame frame;
+  wire::tell_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
+  link_.send(frame);
+}
+
 void DataCommunicator::send_failure(std::uint64_t serial, const Error& error) {
   net::Frame frame;
   frame.set_serial(serial);
@@ -157,8 +164,13 @@ Result<void> DataCommunicator::open(const net::Frame& request) {
   if (!id) return id.error();
   Result<std::shared_ptr<Stream>> stream = parts_.registry.find(*id);
   if (!stream) return std::move(stream).error();
+  if (Result<void> known = check_clock((*stream)->id()); !known) return known;
   opening_ = {request.serial(), *std::move(stream), false, std::nullopt};
   return go_on_opening();
+}
+
+Result<void> DataCommunicator::check_clock(const StreamId& id) const {
+  return parts_.clock ? parts_.clock->check_serving(id, *them_) : Result<void>();
 }
 
 Result<void> DataCommunicator::create(const net::Frame& request) {
@@ -167,6 +179,7 @@ Result<void> DataCommunicator::create(const net::Frame& request) {
   if (!id) return id.error();
   const Result<TypeInfo> type = wire::type_untrusted(create.type());
   if (!type) return type.error();
+  if (Result<void> known = check_clock(*id); !known) return known;
   // No program of this host is the creator.
   Result<Registry::Created> created =
       parts_.registry.create(*id, *type, {create.depth(), Duration(create.cycle_ns())}, 0);
@@ -196,7 +209,8 @@ Result<void> DataCommunicator::go_on_opening() {
   }
   const Opening opening = *std::exchange(opening_, std::nullopt);
   channel_ = std::make_unique<StreamChannel>(
-      StreamChannel::Parts{parts_.loop, parts_.registry, link_, place_.budget(), *this},
+      StreamChannel::Parts{parts_.loop, parts_.registry, link_, place_.budget(), *this, parts_.self,
+                           them_->has_feature(wire::kFeatureClock) ? parts_.clock : nullptr},
       parts_.streams.get(opening.stream), them_->has_feature(wire::kFeatureTorn));
   net::Frame answer;
   answer.set_serial(opening.serial);

@@ -58,6 +58,7 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
     const wire::Greeting& self;
     Logger& logger;
     Keeper& keeper;
+    ClockRules* clock;  // nullptr: nobody watches the clock
   };
 
   // peer_address: for the log, "10.0.0.3:40000". All in `parts` outlive it.
@@ -69,6 +70,9 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
 
   void on_stream_added(const Stream& stream);
   void on_stream_removed(const Stream& stream);
+
+  // There is news of this host's clock: tells control connections that want to know.
+  void tell_clock();
 
   // Tells the peer why, as far as that goes at once.
   void close_with(const Error& why) { link_.close_with(why); }
@@ -98,6 +102,7 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
   Result<void> serve_control(const net::Frame& request);
   Result<void> open(const net::Frame& request);
   Result<void> create(const net::Frame& request);
+  Result<void> check_clock(const StreamId& id) const;
   Result<void> go_on_opening();
   void send_failure(std::uint64_t serial, const Error& error);
   void watch_silence();

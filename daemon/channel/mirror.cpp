@@ -29,6 +29,7 @@ Mirror::Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, const Dur
       id_(std::move(id)),
       linger_(linger),
       room_(std::move(room)),
+      clock_(parts.clock, id_),
       lender_([this] { linger_timer_.enable_in(linger_); }),
       wait_timer_(EventSource::timer(parts.loop, [this] { on_wait_timer(); })),
       linger_timer_(EventSource::timer(parts.loop, [this] { on_linger_timer(); })),
@@ -37,7 +38,8 @@ Mirror::Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, const Dur
 
 // --- the connection --------------------------------------------------------------------------
 
-void Mirror::on_up(FrameLink& link, const wire::Greeting&) {
+void Mirror::on_up(FrameLink& link, const wire::Greeting& them) {
+  on_owner_clock(them.clock);
   step_ = Step::opening;
   net::Frame frame;
   frame.set_serial(kOpen);
@@ -74,6 +76,9 @@ Result<void> Mirror::on_frame(net::Frame& frame) {
       return {};
     case net::Frame::kGap:
       return on_gap_untrusted(frame.gap());
+    case net::Frame::kPong:
+      on_owner_clock(wire::clock_news_untrusted(frame.pong()));
+      return {};
     case net::Frame::kEnded:
       on_removed({Errc::not_found, "stream '" + name_ + "' was removed on its host"});
       return {};
@@ -149,7 +154,18 @@ void Mirror::take_ring(std::unique_ptr<MirrorRing> ring) {
     parts_.logger.notice("stream '" + name_ + "' has a new ring on its host: it was created anew",
                          log_fields());
   }
+  if (ring_) clock_.on_new_ring();
   ring_ = std::move(ring);
+  judge();
+}
+
+void Mirror::on_owner_clock(MirrorClock::Report report) {
+  clock_.on_owner(std::move(report), ring_ ? ring_->newest() : kNoTid);
+  judge();
+}
+
+void Mirror::judge() {
+  if (ring_) ring_->set_clock(clock_.verdict());
 }
 
 Result<void> Mirror::on_subscribed_untrusted(const net::Subscribed& subscribed) {
@@ -242,13 +258,21 @@ std::shared_ptr<Stream> Mirror::lend() {
   return lender_.lend(ring_->stream());
 }
 
+void Mirror::lend_to(const Then& then) {
+  if (Result<void> good = clock_.check_opening(); !good) return then(std::move(good).error());
+  then(lend());
+}
+
 std::shared_ptr<Stream> Mirror::borrow() { return ring_ ? lend() : nullptr; }
 
 void Mirror::open(Then then) {
   // While the owner is away its history is still here.
   const bool ready = state_ == State::live || state_ == State::owner_away ||
                      (state_ == State::connecting && ring_);
-  if (ready) return then(lend());
+  if (ready) {
+    lend_to(then);
+    return leave_if_alone(true);
+  }
   done_ = false;
   const Duration longest = state_ == State::filling ? kFillTimeout : kOwnerTimeout;
   waiting_.push_back({std::move(then), deadline_in(longest)});
@@ -288,11 +312,14 @@ void Mirror::describe(proto::Mirror& out) const {
   out.set_received_samples(before_.received_samples + (ring_ ? ring_->received_samples() : 0));
   out.set_received_bytes(before_.received_bytes + (ring_ ? ring_->received_bytes() : 0));
   if (state_ != State::live && trouble_) out.set_error(trouble_->message);
+  out.set_clock(clock_.trouble());
 }
 
 void Mirror::answer_waiting() {
-  for (const Waiting& one : std::exchange(waiting_, {})) one.then(lend());
+  const std::vector<Waiting> all = std::exchange(waiting_, {});
+  for (const Waiting& one : all) lend_to(one.then);
   arm_wait_timer();
+  leave_if_alone(!all.empty());
 }
 
 void Mirror::fail_waiting(const Error& why) {
@@ -330,7 +357,7 @@ void Mirror::on_wait_timer() {
   waiting_.erase(waiting_.begin(), later);
   for (const Waiting& one : overdue) {
     if (ring_ && state_ != State::removed) {
-      one.then(lend());
+      lend_to(one.then);
     } else {
       one.then(away());
     }

@@ -20,6 +20,7 @@
 
 #include "common.pb.h"
 #include "daemon/channel/lender.hpp"
+#include "daemon/channel/mirror_clock.hpp"
 #include "daemon/channel/mirror_ring.hpp"
 #include "daemon/channel/owner_channel.hpp"
 #include "daemon/discovery/catalog.hpp"
@@ -62,6 +63,9 @@ class Mirror final : private OwnerChannel::User {
   OwnerChannel& channel() noexcept { return channel_; }
   // The owner has such a stream, or a new ring of it.
   void on_stream_there();
+  // What the owner says of its clock; this PC's clock was read anew.
+  void on_owner_clock(MirrorClock::Report report);
+  void on_clock() { judge(); }
 
   // --- for programs ---------------------------------------------------------------------------
 
@@ -103,7 +107,9 @@ class Mirror final : private OwnerChannel::User {
   Result<void> follow_untrusted(const StreamInfo& theirs);
   void take_ring(std::unique_ptr<MirrorRing> ring);
 
+  void judge();
   std::shared_ptr<Stream> lend();
+  void lend_to(const Then& then);
   void answer_waiting();
   void fail_waiting(const Error& why);
   void leave_if_alone(bool somebody_left);
@@ -122,6 +128,7 @@ class Mirror final : private OwnerChannel::User {
   const Duration& linger_;  // its keeper's, which may change
   const RingRoom room_;
 
+  MirrorClock clock_;
   State state_ = State::connecting;
   Step step_ = Step::none;
   std::optional<Error> trouble_;  // why it is not live

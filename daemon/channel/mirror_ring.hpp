@@ -44,6 +44,10 @@ class MirrorRing {
   // The owner's ring no longer has these.
   //   fails  protocol: they were here already
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
+  // What this PC's readers may make of the samples' times.
+  void set_clock(const ring::ClockVerdict& verdict) noexcept {
+    ring::store(mapping_->header().clock, verdict);
+  }
   // Wakes readers, when anything came since the last time.
   void wake() noexcept;
 

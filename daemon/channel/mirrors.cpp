@@ -6,10 +6,28 @@
 namespace dssm::daemon {
 
 Mirrors::Mirrors(const ChannelParts& parts, Catalog& catalog, Duration linger)
-    : linger_(linger), table_(parts, catalog, [this, &parts](StreamId id, RingRoom room) {
+    : catalog_(catalog),
+      linger_(linger),
+      table_(parts, catalog, [this, &parts](StreamId id, RingRoom room) {
         Mirror::Keeper& keeper = *this;
         return std::make_unique<Mirror>(parts, keeper, std::move(id), linger_, std::move(room));
-      }) {}
+      }) {
+  catalog_.add_observer(*this);
+}
+
+Mirrors::~Mirrors() { catalog_.remove_observer(*this); }
+
+void Mirrors::on_clock() {
+  table_.for_each([](Mirror& mirror) { mirror.on_clock(); });
+}
+
+void Mirrors::on_host_clock(const KnownHost& host) {
+  table_.for_each([&](Mirror& mirror) {
+    if (mirror.channel().owner() == host.greeting.host_id) {
+      mirror.on_owner_clock(host.greeting.clock);
+    }
+  });
+}
 
 void Mirrors::open(const KnownHost& host, const StreamId& id, Then then) {
   const Result<Mirror*> mirror = table_.find_or_make(host, id);

@@ -9,12 +9,16 @@
 
 namespace dssm::daemon {
 
-class Mirrors final : public MirrorKeeper, private Mirror::Keeper {
+class Mirrors final : public MirrorKeeper, private Mirror::Keeper, private CatalogObserver {
  public:
   // linger: how long a mirror stays after its last user left. parts and catalog outlive it.
   Mirrors(const ChannelParts& parts, Catalog& catalog, Duration linger);
   Mirrors(const Mirrors&) = delete;
   Mirrors& operator=(const Mirrors&) = delete;
+  ~Mirrors();
+
+  // This PC's clock was read anew.
+  void on_clock();
 
   void set_linger(Duration linger) { linger_ = linger; }  // from the next time a reader leaves
 
@@ -27,9 +31,11 @@ class Mirrors final : public MirrorKeeper, private Mirror::Keeper {
   bool describe(const StreamId& id, proto::Mirror& out) const override;
 
  private:
+  void on_host_clock(const KnownHost& host) override;
   void on_ring_replaced(const Stream& old) override;
   void on_mirror_done() override { table_.sweep(); }
 
+  Catalog& catalog_;
   MirrorKeeper::Observer* observer_ = nullptr;
   Duration linger_;
   ChannelTable<Mirror> table_;

@@ -10,6 +10,7 @@
 #include <optional>
 #include <string>
 
+#include "daemon/channel/clock_rules.hpp"
 #include "daemon/channel/dialer.hpp"
 #include "daemon/channel/resolver.hpp"
 #include "daemon/discovery/catalog.hpp"
@@ -26,6 +27,7 @@ struct ChannelParts {
   Registry& registry;  // for memory and room
   Logger& logger;
   wire::Greeting self;
+  const ClockRules* clock = nullptr;  // nobody watches the clock
 };
 
 class OwnerChannel final : private Dialer::User {

@@ -47,15 +47,17 @@ Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
       if (!link_.output_empty()) return PumpWait::room;
       if (seen == Look::news) return PumpWait::news;
       if (seen == Look::time) return PumpWait::time;
+      const Tid newest = std::min(newest_untrusted(reader_), last_);
+      events_.before_samples();
+      if (!link_.output_empty()) return PumpWait::room;
       if (sender_.sends_in_place()) {
         sent_up_to = next_ + 1;
-        status = sender_.send(next_, 0, next_ < std::min(newest_untrusted(reader_), last_));
+        status = sender_.send(next_, 0, next_ < newest);
         bytes += std::min(payload_bytes_, SampleSender::kSliceBytes);
       } else {
         // The writer goes on meanwhile: a thinned stream's newest may be older already.
         const Tid at_most = next_ + (thins() ? 1 : kSamplesPerTurn - samples) - 1;
-        status = sender_.send_many(next_, std::min({newest_untrusted(reader_), last_, at_most}),
-                                   sent_up_to);
+        status = sender_.send_many(next_, std::min(newest, at_most), sent_up_to);
         bytes += static_cast<std::size_t>(sent_up_to - next_) * payload_bytes_;
       }
     }

@@ -45,6 +45,8 @@ class SamplePump {
    public:
     // Samples [first, first + count) are lost. Frames may be sent on the link.
     virtual void on_gap(Tid first, std::uint64_t count) = 0;
+    // What was written until now may be sent next. Frames may be sent on the link.
+    virtual void before_samples() {}
     // All samples up to Plan::caught_up_at were sent or lost.
     virtual void on_caught_up() {}
     // After end_at(): all samples up to that one were sent or lost.

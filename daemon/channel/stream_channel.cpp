@@ -168,6 +168,19 @@ Result<void> StreamChannel::go_on_pumping(MonoTime now, bool request_waits) {
 
 void StreamChannel::on_news() { parts_.owner.work_now(); }
 
+// The clock may have been set, and samples been written after that: what they say of their time
+// must not be believed.
+void StreamChannel::before_samples() {
+  if (!parts_.clock) return;
+  const std::uint64_t news = parts_.clock->news();
+  if (clock_news_ == news) return;
+  clock_news_ = news;
+  sender_.end_run();
+  net::Frame frame;
+  wire::tell_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
+  parts_.link.send(frame);
+}
+
 void StreamChannel::on_gap(Tid first, std::uint64_t count) {
   lost_ += count;
   net::Frame frame;

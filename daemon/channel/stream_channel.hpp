@@ -9,6 +9,7 @@
 #include <optional>
 
 #include "core/ring/ring_reader.hpp"
+#include "daemon/channel/clock_rules.hpp"
 #include "daemon/channel/frame_link.hpp"
 #include "daemon/channel/sample_pump.hpp"
 #include "daemon/channel/sample_receiver.hpp"
@@ -37,6 +38,8 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
     FrameLink& link;
     MemoryBudget& budget;  // of the peer
     Owner& owner;
+    const wire::Greeting& self;
+    ClockRules* clock;  // nullptr: the client does not want to know
   };
 
   // may_tear: the client has the feature "torn". All in `parts` outlive it.
@@ -93,6 +96,7 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
   Result<void> go_on_pumping(MonoTime now, bool request_waits);
   void end();
 
+  void before_samples() override;
   void on_gap(Tid first, std::uint64_t count) override;
   void on_caught_up() override;
   void on_end() override;
@@ -107,7 +111,8 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
   std::unique_ptr<SampleReceiver> receiver_;
   std::optional<Reading> reading_;
   std::uint64_t lost_ = 0;
-  EventSource due_;  // for subscriptions with a highest rate
+  std::optional<std::uint64_t> clock_news_;  // that the client was told
+  EventSource due_;                          // for subscriptions with a highest rate
 };
 
 }  // namespace dssm::daemon

@@ -11,9 +11,6 @@
 namespace dssm::daemon {
 namespace {
 
-using clock::ClockBasis;
-using clock::ClockStatus;
-using clock::ClockTrouble;
 using clock::Instant;
 
 // "1.234 ms", "12.345 s"; without the sign.

@@ -40,7 +40,7 @@ StepWatch::StepWatch(const EventLoop& loop, UniqueFd timer, std::function<void()
 void StepWatch::on_readable() {
   std::uint64_t expired = 0;
   // Fails with ECANCELED when the clock was set, which is what we are here for.
-  static_cast<void>(::read(timer_.get(), &expired, sizeof expired));
+  [[maybe_unused]] const ssize_t got = ::read(timer_.get(), &expired, sizeof expired);
   // Armed before anybody looks at the clock, so that no step falls in between.
   arm(timer_.get());
   on_set_();

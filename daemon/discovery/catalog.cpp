@@ -89,10 +89,11 @@ void Catalog::stream_removed(const wire::HostId& id, const StreamId& stream) {
       [&](CatalogObserver& observer) { observer.on_remote_stream_removed(host, gone.mapped()); });
 }
 
-void Catalog::set_clock_bound(const wire::HostId& id, Duration bound) {
-  if (const auto found = hosts_.find(id); found != hosts_.end()) {
-    found->second.greeting.clock_bound = bound;
-  }
+void Catalog::set_clock(const wire::HostId& id, std::shared_ptr<const wire::ClockReport> clock) {
+  const auto found = hosts_.find(id);
+  if (found == hosts_.end()) return;
+  found->second.greeting.clock = std::move(clock);
+  notify([&](CatalogObserver& observer) { observer.on_host_clock(found->second); });
 }
 
 const KnownHost* Catalog::find(const wire::HostId& id) const {

@@ -12,6 +12,7 @@
 #include <dssm/result.hpp>
 #include <dssm/stream.hpp>
 #include <map>
+#include <memory>
 #include <string>
 #include <utility>
 #include <vector>
@@ -28,7 +29,7 @@ inline constexpr std::size_t kMaxBytesPerHost = 32U << 20;
 
 // A host that answers at this moment.
 struct KnownHost {
-  wire::Greeting greeting;  // name, id, life, version, clock bound
+  wire::Greeting greeting;  // name, id, life, version, clock
   wire::Address address;    // where it was reached: channels go there too
   std::map<std::pair<std::string, std::int32_t>, StreamInfo> streams;  // by name and id
   std::size_t stream_bytes = 0;                                        // what `streams` takes
@@ -41,6 +42,7 @@ class CatalogObserver {
  public:
   virtual void on_host_up(const KnownHost&) {}
   virtual void on_host_down(const KnownHost&, const Error&) {}  // after its streams are removed
+  virtual void on_host_clock(const KnownHost&) {}               // it said what its clock is like
   virtual void on_remote_stream_added(const KnownHost&, const StreamInfo&) {}  // or a new ring
   virtual void on_remote_stream_removed(const KnownHost&, const StreamInfo&) {}
 
@@ -72,7 +74,7 @@ class Catalog {
   Result<void> stream_added(const wire::HostId& id, StreamInfo stream);
   void stream_removed(const wire::HostId& id, const StreamId& stream);
   // What the host says about its clock by now.
-  void set_clock_bound(const wire::HostId& id, Duration bound);
+  void set_clock(const wire::HostId& id, std::shared_ptr<const wire::ClockReport> clock);
 
   // --- asked ----------------------------------------------------------------------------------
 

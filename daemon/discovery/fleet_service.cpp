@@ -301,11 +301,30 @@ std::vector<local::Host> FleetService::hosts() const {
   self.set_version(self_.greeting.version);
   self.set_state("self");
   self.set_streams(static_cast<std::uint32_t>(registry_.streams().size()));
-  self.set_clock_bound_ns(to_ns(self_.greeting.clock_bound));
+  self.set_clock_bound_ns(to_ns(wire::clock_bound_of(self_.greeting)));
+  wire::tell_clock(self_.greeting, *self.mutable_clock());
   self.set_insecure(self_.insecure);
   self.set_error(peers_.own_trouble());
-  for (local::Host& host : peers_.hosts()) hosts.push_back(std::move(host));
+  self.set_clock_distance_ns(0);
+  for (local::Host& host : peers_.hosts()) {
+    host.set_clock_distance_ns(to_ns(clock_distance_to(host)));
+    hosts.push_back(std::move(host));
+  }
   return hosts;
+}
+
+Duration FleetService::clock_distance_to(const local::Host& host) const {
+  wire::HostId id{};
+  if (!self_.clock || host.host_id().size() != id.size()) return kUnknownClockError;
+  std::copy(host.host_id().begin(), host.host_id().end(), id.begin());
+  const KnownHost* known = catalog_.find(id);
+  if (!known || !known->greeting.clock) return kUnknownClockError;
+  return self_.clock->distance_to(*known->greeting.clock);
+}
+
+Result<UniqueFd> FleetService::clock_page() const {
+  if (self_.clock) return self_.clock->page_for_reading();
+  return Error{Errc::not_found, "this dssmd does not watch the clock"};
 }
 
 local::Mdns FleetService::mdns() const {
@@ -326,7 +345,7 @@ void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {
     if (!known) return then(with_trouble(known.error()));
     PeerLink& link = *peers_.link_to((*known)->greeting.host_id);
     net::Frame request;
-    wire::to_message(self_.greeting.clock_bound, *request.mutable_ping()->mutable_clock());
+    wire::tell_clock(self_.greeting, *request.mutable_ping()->mutable_clock());
     link.ask(std::move(request), [address = link.address(), sent = MonoClock::now(),
                                   then = std::move(then)](Result<net::Frame> answer) {
       if (!answer) return then(std::move(answer).error());

@@ -16,6 +16,7 @@
 #include <string>
 #include <vector>
 
+#include "daemon/channel/clock_rules.hpp"
 #include "daemon/channel/mirror_keeper.hpp"
 #include "daemon/channel/remote_writer_keeper.hpp"
 #include "daemon/discovery/catalog.hpp"
@@ -37,6 +38,7 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
     wire::Greeting greeting;
     std::vector<std::string> addresses;  // that it listens at
     bool insecure = false;               // at one of them other PCs may come in the clear
+    const ClockRules* clock = nullptr;   // nobody watches the clock
   };
 
   // What is given by reference outlives it.
@@ -63,6 +65,7 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
   std::vector<StreamInfo> known_streams() const override;
   std::vector<local::Host> hosts() const override;
   local::Mdns mdns() const override;
+  Result<UniqueFd> clock_page() const override;
   void ping(const std::string& host, Then<local::RoundTrip> then) override;
 
   // What mdns() tells from now on; "off" before.
@@ -93,6 +96,8 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
   void on_remote_stream_added(const KnownHost& host, const StreamInfo& stream) override;
   void on_remote_stream_removed(const KnownHost& host, const StreamInfo& stream) override;
   void on_ring_replaced(const Stream& stream) override;
+
+  Duration clock_distance_to(const local::Host& host) const;
 
   const Self self_;
   const Registry& registry_;

@@ -42,7 +42,7 @@ PeerLink::PeerLink(const EventLoop& loop, Resolver& resolver, std::optional<wire
                    Dialer::Options options, User& user)
     : configured_(options.addresses.front()),
       expected_(expected),
-      clock_bound_(options.self.clock_bound),
+      self_(options.self),
       user_(user),
       heartbeat_(EventSource::timer(loop, [this] { beat(); })),
       dialer_(loop, resolver, std::move(options), *this) {}
@@ -127,6 +127,7 @@ Result<void> PeerLink::on_frame(net::Frame& frame) {
   if (frame.has_stream_event() && watching_) {
     return user_.on_stream_event_untrusted(*this, frame.stream_event());
   }
+  if (frame.has_pong()) take_clock(wire::clock_news_untrusted(frame.pong()));
   return {};  // an event of a later version
 }
 
@@ -159,9 +160,14 @@ void PeerLink::beat() {
              " ms"});
   }
   net::Frame request;
-  wire::to_message(clock_bound_, *request.mutable_ping()->mutable_clock());
+  wire::tell_clock(self_, *request.mutable_ping()->mutable_clock());
   ask(std::move(request), [this, now](const Result<net::Frame>& answer) { on_pong(now, answer); });
   heartbeat_.enable_in(std::min(wire::kHeartbeat, allowed - silence));
+}
+
+void PeerLink::take_clock(std::shared_ptr<const wire::ClockReport> clock) {
+  them_->clock = std::move(clock);
+  user_.on_heartbeat(*this);
 }
 
 void PeerLink::on_pong(MonoTime asked, const Result<net::Frame>& answer) {
@@ -171,8 +177,8 @@ void PeerLink::on_pong(MonoTime asked, const Result<net::Frame>& answer) {
                           ? last_round_trip_
                           : std::min(least_round_trip_, last_round_trip_);
   if (!answer->pong().has_clock()) return;
-  them_->clock_bound = wire::clock_bound_untrusted(answer->pong().clock());
-  user_.on_heartbeat(*this);
+  take_clock(std::make_shared<const wire::ClockReport>(
+      wire::clock_report_untrusted(answer->pong().clock(), asked)));
 }
 
 }  // namespace dssm::daemon

@@ -109,6 +109,7 @@ class PeerLink final : private Dialer::User {
   Result<void> on_frame(net::Frame& frame) override;
   void on_down(const Error& why) override;
   void beat();
+  void take_clock(std::shared_ptr<const wire::ClockReport> clock);
   void on_pong(MonoTime asked, const Result<net::Frame>& answer);
   void enter(State state, std::optional<Error> why);
 
@@ -117,7 +118,7 @@ class PeerLink final : private Dialer::User {
 
   wire::Address configured_;
   const std::optional<wire::HostId> expected_;
-  const Duration clock_bound_;  // our own
+  const wire::Greeting self_;
   User& user_;
   State state_ = State::connecting;
   MonoTime since_ = MonoClock::now();

@@ -359,7 +359,7 @@ void Peers::on_watched(PeerLink& link) { decide(peer_of(link)); }
 
 void Peers::on_heartbeat(PeerLink& link) {
   if (peer_of(link).use != Use::in_use) return;
-  catalog_.set_clock_bound(link.them()->host_id, link.them()->clock_bound);
+  catalog_.set_clock(link.them()->host_id, link.them()->clock);
 }
 
 // --- the first words

@@ -12,6 +12,12 @@ namespace {
 // Of found hosts, in the error message of one request.
 constexpr std::size_t kMaxTroublesTold = 8;
 
+// Adds what it says of its clock, aged until now.
+void tell_clock_of(const wire::Greeting& them, local::Host& host) {
+  host.set_clock_bound_ns(to_ns(wire::clock_bound_of(them)));
+  wire::tell_clock(them, *host.mutable_clock());
+}
+
 }  // namespace
 
 std::string Peers::namesake_warning(const Peer& peer) const {
@@ -95,7 +101,7 @@ local::Host Peers::shown(const Peer& peer) const {
   if (link.why()) host.set_error(link.why()->message);
   if (!peer.warning.empty()) host.set_error(peer.warning);
   if (!shows_use(peer)) return host;
-  host.set_clock_bound_ns(to_ns(link.them()->clock_bound));
+  tell_clock_of(*link.them(), host);
   if (const KnownHost* known = catalog_.find(link.them()->host_id)) {
     host.set_streams(static_cast<std::uint32_t>(known->streams.size()));
   }

@@ -69,6 +69,8 @@ class Fleet {
 
   virtual std::vector<local::Host> hosts() const = 0;  // this one first
   virtual local::Mdns mdns() const = 0;                // how finding them by mDNS fares
+  // The page that says how good this PC's clock is; not_found: nobody watches it.
+  virtual Result<UniqueFd> clock_page() const = 0;
   virtual void ping(const std::string& host, Then<local::RoundTrip> then) = 0;
 
  protected:

@@ -20,7 +20,9 @@ Fleet::Then<void> answer_done(RemoteRequests::Answer answer) {
 
 bool RemoteRequests::takes(const local::Request& request,
                            const std::function<bool(const StreamId&)>& own_knows) const {
-  if (request.has_list_hosts() || request.has_ping_host()) return true;
+  if (request.has_list_hosts() || request.has_ping_host() || request.has_open_clock_page()) {
+    return true;
+  }
   const proto::StreamId* subject = StreamRequests::subject(request);
   if (!subject) return false;
   const Result<StreamId> id = wire::stream_id_untrusted(*subject);
@@ -33,6 +35,7 @@ bool RemoteRequests::takes(const local::Request& request,
 void RemoteRequests::handle_untrusted(const Client& client, const local::Request& request,
                                       DescriptorQueue& descriptors, Answer answer) {
   if (request.has_list_hosts()) return answer(list_hosts());
+  if (request.has_open_clock_page()) return answer(open_clock_page());
   if (request.has_ping_host()) return ping(request.ping_host().host(), std::move(answer));
   const StreamId id = *wire::stream_id_untrusted(*StreamRequests::subject(request));
   switch (request.body_case()) {
@@ -149,6 +152,15 @@ Reply RemoteRequests::list_hosts() const {
   Reply reply;
   local::HostList& list = *reply.response.mutable_host_list();
   for (local::Host& host : fleet_.hosts()) *list.add_hosts() = std::move(host);
+  return reply;
+}
+
+Result<Reply> RemoteRequests::open_clock_page() const {
+  Result<UniqueFd> page = fleet_.clock_page();
+  if (!page) return std::move(page).error();
+  Reply reply;
+  reply.response.mutable_clock_page();
+  reply.descriptors.push_back(*std::move(page));
   return reply;
 }
 

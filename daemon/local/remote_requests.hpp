@@ -46,6 +46,7 @@ class RemoteRequests {
   Result<Reply> offer(const Client& client, const StreamId& id, const local::Offer& request,
                       DescriptorQueue& descriptors);
   Reply list_hosts() const;
+  Result<Reply> open_clock_page() const;
   void ping(const std::string& host, Answer answer);
 
   const std::string own_host_;

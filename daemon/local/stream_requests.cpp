@@ -37,6 +37,7 @@ Result<Reply> StreamRequests::handle_untrusted(const Client& client, const local
       return list_opens();
     case local::Request::kGetDaemon:
       return get_daemon();
+    case local::Request::kOpenClockPage:
     case local::Request::kHello:
     case local::Request::kWatch:
     case local::Request::kListClients:

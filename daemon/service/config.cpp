@@ -23,6 +23,7 @@ constexpr std::size_t kMaxFileBytes = 1U << 20;
 constexpr std::uint64_t kMostMemoryBytes = 1ULL << 50;
 constexpr Duration kLongestGrace = std::chrono::seconds(60);
 constexpr Duration kLongestLinger = std::chrono::hours(1);
+constexpr std::uint16_t kChronydPort = 323;
 
 // Puts a parsed value into its place.
 template <class T, class U>
@@ -66,6 +67,17 @@ Result<void> add_peer(Config& config, std::string_view text) {
   Result<wire::Address> address = wire::Address::parse(text);
   if (!address) return std::move(address).error();
   config.peers.push_back(*std::move(address));
+  return {};
+}
+
+Result<void> set_chronyd(Config& config, std::string_view text) {
+  Result<wire::Address> address = wire::Address::parse(text, kChronydPort);
+  if (!address) return std::move(address).error();
+  if (wire::resolve_number(*address).empty()) {
+    return Error{Errc::invalid_argument,
+                 in_quotes(text) + " is a name; write a number such as \"127.0.0.1:323\""};
+  }
+  config.chronyd = *std::move(address);
   return {};
 }
 
@@ -225,6 +237,37 @@ constexpr ConfigKey kKeys[] = {
      [](Config& c, std::string_view text) {
        return take(c.mirror_linger, parse_duration(text, Duration::zero(), kLongestLinger));
      }},
+    {"clock_policy", "POLICY",
+     "what to do with streams of hosts whose clocks may be too far from this one's: enforce (not "
+     "open them, and answer reads by time with an error), mark (tell who asks) or off; default: "
+     "enforce",
+     ValueForm::text, at_once<&Config::clocks>,
+     [](Config& c, std::string_view text) {
+       return take(c.clocks.general.policy, parse_clock_policy(text));
+     }},
+    {"clock_limit", "TIME", "how far two hosts' clocks may be apart; default: 1500 us",
+     ValueForm::text, at_once<&Config::clocks>,
+     [](Config& c, std::string_view text) {
+       return take(c.clocks.general.limit, parse_clock_limit(text));
+     }},
+    {"clock_streams", "STREAM=POLICY",
+     "another policy, and limit, for some streams, e.g. 'gps=off' or 'camera*=mark 5 ms'; may be "
+     "repeated, the first that matches counts",
+     ValueForm::list, at_once<&Config::clocks>,
+     [](Config& c, std::string_view text) -> Result<void> {
+       if (text.empty()) return {};
+       Result<clock::ClockPolicies::Exception> exception = parse_clock_exception(text);
+       if (!exception) return std::move(exception).error();
+       c.clocks.exceptions.push_back(*std::move(exception));
+       return {};
+     },
+     [](Config& c) { c.clocks.exceptions.clear(); }, "clock-stream"},
+    {"max_drift", "PPM", "how fast this PC's clock runs away at worst; default: 50 ppm",
+     ValueForm::text, at_once<&Config::max_drift>,
+     [](Config& c, std::string_view text) { return take(c.max_drift, parse_drift(text)); }},
+    {"chronyd", "ADDR:PORT",
+     "where this PC's chronyd takes questions (cmdport); default: 127.0.0.1:323", ValueForm::text,
+     at_restart<&Config::chronyd>, set_chronyd},
 };
 
 std::string place(const std::string& path, const toml::source_region& source) {

@@ -17,6 +17,8 @@
 #include <string_view>
 #include <vector>
 
+#include "core/clock/clock_bound.hpp"
+#include "core/clock/clock_policies.hpp"
 #include "core/wire/address.hpp"
 #include "daemon/service/log.hpp"
 
@@ -58,6 +60,11 @@ struct Config {
   std::uint64_t max_connections_per_host = 128;
   std::uint64_t max_peer_memory_bytes = 96ULL << 20;
   Duration mirror_linger = std::chrono::seconds(5);
+
+  // Clocks.
+  clock::ClockPolicies clocks;
+  clock::PartsPerBillion max_drift = 50'000;
+  wire::Address chronyd{"127.0.0.1", 323};  // where it takes questions
 
   static std::uint64_t half_of_the_machines_memory() noexcept;
   // Those of containers, virtual machines and tunnels: what is found there is found again on the

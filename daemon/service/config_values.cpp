@@ -17,6 +17,11 @@ namespace {
 
 constexpr std::size_t kMaxInterfacePatternBytes = 63;
 
+constexpr Duration kLeastClockLimit = std::chrono::microseconds(10);
+constexpr Duration kMostClockLimit = std::chrono::seconds(10);
+constexpr std::size_t kMaxStreamPatternBytes = 63;
+constexpr std::uint64_t kMostDriftPpm = 1000;
+
 Error invalid(std::string why) { return Error{Errc::invalid_argument, std::move(why)}; }
 
 // a * b, or the greatest number there is: out of every range.
@@ -86,19 +91,73 @@ Result<Duration> parse_duration(std::string_view text, Duration least, Duration 
   const Result<Quantity> quantity = parse_quantity(text);
   if (!quantity) return quantity.error();
   std::uint64_t ns = quantity->number;
-  if (quantity->unit == "ms") {
+  if (quantity->unit == "us") {
+    ns = product(ns, 1'000);
+  } else if (quantity->unit == "ms") {
     ns = product(ns, 1'000'000);
   } else if (quantity->unit == "s") {
     ns = product(ns, 1'000'000'000);
   } else {
-    return invalid(in_quotes(text) + " needs a unit: 'ms' or 's'");
+    return invalid(in_quotes(text) + " needs a unit: 'us', 'ms' or 's'");
   }
   if (ns < static_cast<std::uint64_t>(to_ns(least)) ||
       ns > static_cast<std::uint64_t>(to_ns(most))) {
-    return out_of_range(text, static_cast<std::uint64_t>(to_ns(least)) / 1'000'000,
-                        static_cast<std::uint64_t>(to_ns(most)) / 1'000'000, " ms");
+    const bool fine = least % std::chrono::milliseconds(1) != Duration::zero();
+    const std::int64_t unit = fine ? 1'000 : 1'000'000;
+    return out_of_range(text, static_cast<std::uint64_t>(to_ns(least) / unit),
+                        static_cast<std::uint64_t>(to_ns(most) / unit), fine ? " us" : " ms");
   }
   return Duration(static_cast<std::int64_t>(ns));
+}
+
+Result<ClockPolicy> parse_clock_policy(std::string_view text) {
+  for (const ClockPolicy policy : {ClockPolicy::enforce, ClockPolicy::mark, ClockPolicy::off}) {
+    if (text == name_of(policy)) return policy;
+  }
+  return Error{Errc::invalid_argument,
+               in_quotes(text) + " is no policy; it is \"enforce\", \"mark\" or \"off\""};
+}
+
+Result<Duration> parse_clock_limit(std::string_view text) {
+  return parse_duration(text, kLeastClockLimit, kMostClockLimit);
+}
+
+Result<clock::ClockPolicies::Exception> parse_clock_exception(std::string_view text) {
+  const auto wrong = [&](const std::string& why) {
+    return Error{Errc::invalid_argument,
+                 in_quotes(text) + " " + why +
+                     "; write \"STREAM=POLICY\" or \"STREAM=POLICY LIMIT\", such as \"gps=off\" or "
+                     "\"camera*=mark 5 ms\""};
+  };
+  const std::size_t equals = text.rfind('=');
+  if (equals == text.npos) return wrong("has no '='");
+  clock::ClockPolicies::Exception exception;
+  exception.pattern = text.substr(0, equals);
+  if (exception.pattern.empty()) return wrong("names no stream");
+  if (exception.pattern.size() > kMaxStreamPatternBytes) {
+    return wrong("names a stream too long to be one");
+  }
+  if (exception.pattern.find('\0') != std::string::npos) return wrong("holds a zero byte");
+  const std::string_view demand = text.substr(equals + 1);
+  const std::size_t blank = std::min(demand.find(' '), demand.size());
+  const Result<ClockPolicy> policy = parse_clock_policy(demand.substr(0, blank));
+  if (!policy) return wrong("has a policy that is none: " + policy.error().message);
+  exception.policy = *policy;
+  if (blank == demand.size()) return exception;
+  const Result<Duration> limit = parse_clock_limit(demand.substr(blank + 1));
+  if (!limit) return wrong("has a limit that is none: " + limit.error().message);
+  exception.limit = *limit;
+  return exception;
+}
+
+Result<clock::PartsPerBillion> parse_drift(std::string_view text) {
+  const Result<Quantity> quantity = parse_quantity(text);
+  if (!quantity) return quantity.error();
+  if (quantity->unit != "ppm") return invalid(in_quotes(text) + " needs the unit 'ppm'");
+  if (quantity->number < 1 || quantity->number > kMostDriftPpm) {
+    return out_of_range(text, 1, kMostDriftPpm, " ppm");
+  }
+  return static_cast<clock::PartsPerBillion>(quantity->number) * 1000;
 }
 
 Result<mode_t> parse_mode(std::string_view text) {

@@ -11,6 +11,8 @@
 #include <dssm/time.hpp>
 #include <string_view>
 
+#include "core/clock/clock_bound.hpp"
+#include "core/clock/clock_policies.hpp"
 #include "daemon/service/log.hpp"
 
 namespace dssm::daemon {
@@ -21,8 +23,20 @@ Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t least, st
 // Bytes: "1048576", "512 KiB", "64 MiB", "2 GiB", "1 TiB", or "50%" of the machine's memory.
 Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, std::uint64_t most);
 
-// "0 ms", "500 ms", "2 s"; the unit must be there.
+// "0 ms", "1500 us", "500 ms", "2 s"; the unit must be there.
 Result<Duration> parse_duration(std::string_view text, Duration least, Duration most);
+
+// "enforce", "mark", "off".
+Result<ClockPolicy> parse_clock_policy(std::string_view text);
+
+// How far two clocks may be apart: 10 us to 10 s.
+Result<Duration> parse_clock_limit(std::string_view text);
+
+// "STREAM=POLICY", or "STREAM=POLICY LIMIT": "gps=off", "camera*=mark 5 ms".
+Result<clock::ClockPolicies::Exception> parse_clock_exception(std::string_view text);
+
+// How far a clock runs away: "50 ppm"; 1 to 1000. In billionths.
+Result<clock::PartsPerBillion> parse_drift(std::string_view text);
 
 // File permissions in octal, "0660"; only the nine ordinary bits, and the owner's write bit is set.
 Result<mode_t> parse_mode(std::string_view text);

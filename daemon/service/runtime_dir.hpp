@@ -20,6 +20,7 @@ class RuntimeDir {
 
   const std::string& path() const noexcept { return path_; }
   std::string socket_path() const { return path_ + "/dssmd.sock"; }
+  std::string clock_page_path() const { return path_ + "/clock"; }
 
  private:
   RuntimeDir(std::string path, UniqueFd lock) : path_(std::move(path)), lock_(std::move(lock)) {}

@@ -349,8 +349,8 @@ TEST_F(StreamChannelTest, WritesEachSampleOnceOverReconnects) {
 // A connection was cut in the middle of a sample, and what was under way arrives after all, while
 // the publisher has gone on by another one.
 TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionComesBack) {
-  constexpr std::uint64_t kLarge = 100'000;  // received piece by piece
-  const std::shared_ptr<Stream> camera = rig.create("camera", kLarge);
+  constexpr std::uint64_t kInPieces = 100'000;  // received piece by piece
+  const std::shared_ptr<Stream> camera = rig.create("camera", kInPieces);
   FakePeer old, again;
   net::Frame frame = request(70);
   frame.mutable_start_publishing()->set_publisher(11);
@@ -360,7 +360,7 @@ TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionComesBack) {
     EXPECT_EQ(rig.ask(*one, frame).publishing().last(), -1);
   }
   const auto large = [](std::int64_t number) {
-    return sample_frame(number, 0, std::byte{9}, kLarge);
+    return sample_frame(number, 0, std::byte{9}, kInPieces);
   };
   const std::vector<std::byte> first = large(0);
   old.put({first.begin(), first.begin() + 50'000});
@@ -372,7 +372,7 @@ TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionComesBack) {
   old.put(large(1));
   rig.turns();
   EXPECT_EQ(camera->info().newest, 2);
-  EXPECT_EQ(words(rig.take(old, kLarge)), "published:2=2 published:2=2");
+  EXPECT_EQ(words(rig.take(old, kInPieces)), "published:2=2 published:2=2");
   again.put(large(3));
   rig.turns();
   EXPECT_EQ(camera->info().newest, 3);

@@ -13,9 +13,6 @@ namespace dssm::daemon {
 namespace {
 
 using namespace std::chrono_literals;
-using clock::ClockBasis;
-using clock::ClockStatus;
-using clock::ClockTrouble;
 
 class LinesLogger final : public Logger {
  public:

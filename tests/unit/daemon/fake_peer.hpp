@@ -47,6 +47,7 @@ class FakePeer {
         ++pings;
         if (silent) continue;
         answer.mutable_pong()->mutable_clock()->set_bound_ns(1000);
+        answer.mutable_pong()->mutable_clock()->set_anchor(std::string(16, 'r'));
       } else if (request.has_watch()) {
         ++watches;
         for (const std::string& stream : streams) tell(stream, false);

@@ -80,7 +80,7 @@ TEST_F(PeersTest, MeasureTheRoundTripAndHearOfTheClock) {
   EXPECT_GT(shown.least_round_trip_ns(), 0);
   EXPECT_LE(shown.least_round_trip_ns(), shown.round_trip_ns());
   EXPECT_EQ(shown.clock_bound_ns(), 1000);
-  EXPECT_EQ(catalog.hosts().begin()->second.greeting.clock_bound, Duration(1000));
+  EXPECT_EQ(catalog.hosts().begin()->second.greeting.clock->standing.bound, Duration(1000));
 }
 
 TEST_F(PeersTest, TakeAHostOutWhenItsConnectionBreaks) {

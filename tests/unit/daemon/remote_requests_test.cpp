@@ -78,6 +78,7 @@ class FakeFleet final : public Fleet {
     mdns.set_hosts_heard(7);
     return mdns;
   }
+  Result<UniqueFd> clock_page() const override { return Error{Errc::not_found, "no page here"}; }
   void ping(const std::string& host, Then<local::RoundTrip> then) override {
     asked.push_back("ping " + host);
     local::RoundTrip round_trip;

@@ -1,0 +1,109 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// This PC's clock among those of the fleet: from what the watch says of it, and what the other
+// hosts say of theirs, follows where it stands; that is told to the programs of this PC (the shared
+// page), to the other hosts (the report in our greeting), and to all who ask what another host's
+// samples are worth here (ClockRules). docs/clocks.md "Between two PCs".
+#pragma once
+
+#include <deque>
+#include <functional>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "core/clock/clock_page.hpp"
+#include "core/clock/clock_policies.hpp"
+#include "core/wire/clock_report.hpp"
+#include "daemon/channel/clock_rules.hpp"
+#include "daemon/clock/clock_watch.hpp"
+#include "daemon/discovery/catalog.hpp"
+#include "daemon/service/event_loop.hpp"
+
+namespace dssm::daemon {
+
+class FleetClock final : public ClockRules, private ClockWatch::Observer, private CatalogObserver {
+ public:
+  // The host that this one follows may be away for so long before those who follow this one take
+  // it for their reference.
+  static constexpr Duration kPatience = std::chrono::seconds(5);
+  // How far back the shared page tells bounds.
+  static constexpr Duration kReach = std::chrono::seconds(10);
+
+  struct Options {
+    ClockWatch::Options watch;
+    clock::ClockPolicies policies;
+  };
+
+  // self: with a report of its own, which is kept up to date from now on. What is given by
+  // reference outlives it.
+  FleetClock(const EventLoop& loop, const Options& options, clock::ClockPageWriter page,
+             std::shared_ptr<wire::ClockReport> own, wire::HostId self, Catalog& catalog,
+             Logger& logger);
+  FleetClock(const FleetClock&) = delete;
+  FleetClock& operator=(const FleetClock&) = delete;
+  ~FleetClock();
+
+  // Called from the loop when verdicts may have changed, at least once a second; and before it when
+  // there is news for other hosts.
+  void on_change(std::function<void()> then) { on_change_ = std::move(then); }
+  void on_news(std::function<void()> then) { on_news_ = std::move(then); }
+
+  void set(const clock::ClockPolicies& policies, clock::PartsPerBillion max_drift);
+
+  const wire::ClockReport& own() const noexcept { return *own_; }
+  // "clock synchronized within 120 us of 'pc1'", for people.
+  std::string str() const;
+
+  // ClockRules
+  std::uint64_t news() override;
+  Result<void> check_serving(const StreamId& id, const wire::Greeting& them) const override;
+  ring::ClockVerdict judge(const StreamId& id, const wire::ClockReport* owner) const override;
+  Error why_not(const StreamId& id, const wire::ClockReport* owner) const override;
+  Duration distance_to(const wire::ClockReport& other) const override;
+  Result<UniqueFd> page_for_reading() const override { return page_.for_reading(); }
+
+ private:
+  // The host whose address chronyd names.
+  struct Source {
+    wire::HostId id{};
+    std::string name;
+    std::shared_ptr<const wire::ClockReport> report;  // what it said last
+    std::optional<MonoTime> away_since;
+  };
+  struct Stated {
+    Time wall;
+    Duration bound;
+  };
+
+  void on_clock() override;
+  void on_host_clock(const KnownHost& host) override;
+  void on_host_down(const KnownHost& host, const Error& why) override;
+
+  void refresh();
+  void find_source(MonoTime now);
+  const KnownHost* host_at(const SourceAddress& address) const;
+  bool is_followed() const;
+  void look_up_addresses(MonoTime now);
+  void stand(const clock::ClockState& state, MonoTime now);
+  void choose_anchor(const clock::ClockState& state, MonoTime now);
+  void judge_own(const clock::ClockState& state);
+  void publish(const clock::ClockState& state, const clock::Instant& now);
+
+  Catalog& catalog_;
+  clock::ClockPageWriter page_;
+  const std::shared_ptr<wire::ClockReport> own_;
+  const wire::HostId self_;
+  clock::ClockPolicies policies_;
+  std::optional<SourceAddress> source_address_;
+  std::optional<Source> source_;
+  MonoTime addresses_read_{};
+  std::deque<Stated> stated_;  // within kReach; all of them bounds
+  bool was_in_bounds_ = false;
+  std::uint64_t news_ = 0;
+  std::function<void()> on_change_, on_news_;
+  ClockWatch watch_;  // last: it calls the others
+};
+
+}  // namespace dssm::daemon
