@@ -57,11 +57,16 @@ local::Request open_request(const StreamId& id, bool for_writing, std::uint32_t 
 std::size_t fds_with_answer(const local::Request& request) {
   if (request.has_create()) return 4;
   if (request.has_open()) return request.open().for_writing() ? 4 : 3;
-  if (request.has_open_clock()) return 1;
+  if (request.has_open_clock() || request.has_open_clock_page()) return 1;
   return 0;
 }
 
 }  // namespace
+
+Client::ClockPlace& latest_clock_page() noexcept {
+  static Client::ClockPlace place = nullptr;
+  return place;
+}
 
 OpenStream::~OpenStream() { client->close(*this); }
 
@@ -81,8 +86,10 @@ struct Client::Handshake {
   std::vector<std::uint64_t> replaced;  // handles whose Replaced came between the answers
   std::uint64_t serial = 0;
 
-  // One request and its answer, with nobody else on the socket.
+  // One request and its answer, with nobody else on the socket. What descriptors came with it is in
+  // input.fds until the next one.
   Result<local::Response> exchange(local::Request request, std::span<const int> request_fds = {}) {
+    input.fds.clear();
     request.set_serial(++serial);
     const std::string frame = wire::encode_frame(request);
     auto rest = std::as_bytes(std::span(frame));
@@ -106,7 +113,6 @@ struct Client::Handshake {
           return wire::failure(response.failure());  // serial 0: dssmd's last words
         }
         if (response.serial() == serial) {
-          input.fds.clear();  // all that came are this answer's, which nobody needs again
           return response;
         }
         if (response.has_replaced()) replaced.push_back(response.replaced().handle());
@@ -145,8 +151,10 @@ Result<Client::Handshake> Client::shake_hands() {
                                      std::to_string(wire::kLocalProtocolVersion) +
                                      "; install the same version of DSSM everywhere on this PC"};
   }
+  open_clock_page(link);
   offer_streams(link);
   offer_clock(link);
+  link.input.fds.clear();
   return link;
 }
 
@@ -202,6 +210,20 @@ void Client::offer_streams(Handshake& link) {
       [[maybe_unused]] auto done = link.exchange(std::move(request_close));
     }
   }
+}
+
+// Without one, or with one of another version, nothing is known of the clock, which is no reason
+// not to go on.
+void Client::open_clock_page(Handshake& link) {
+  local::Request request;
+  request.mutable_open_clock_page();
+  const auto answer = link.exchange(std::move(request));
+  if (!answer || link.input.fds.empty()) return;
+  const Result<const clock::ClockPage*> page =
+      clock::map_clock_page_untrusted(link.input.fds.front().get());
+  if (!page) return;
+  clock_page_.store(*page, std::memory_order_release);
+  latest_clock_page().store(*page, std::memory_order_release);
 }
 
 void Client::offer_clock(Handshake& link) {

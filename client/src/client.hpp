@@ -17,6 +17,7 @@
 
 #include "client/src/notifier.hpp"
 #include "client/src/shared_ring.hpp"
+#include "core/clock/clock_page.hpp"
 #include "core/clock/playback_record.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
@@ -85,6 +86,10 @@ class Client : public std::enable_shared_from_this<Client> {
   Result<std::uint64_t> add_watch(OnEvent on_event);
   void remove_watch(std::uint64_t key);  // waits for a running callback
 
+  // Where the page is found that says how good this PC's clock is; nullptr in it: there is none.
+  using ClockPlace = std::atomic<const clock::ClockPage*>;
+  const ClockPlace& clock_page() const noexcept { return clock_page_; }
+
   bool connected() const;
   NotifierPool& notifiers() { return notifiers_; }
 
@@ -112,6 +117,7 @@ class Client : public std::enable_shared_from_this<Client> {
   Result<Handshake> shake_hands();
   void offer_streams(Handshake& link);
   void offer_clock(Handshake& link);
+  void open_clock_page(Handshake& link);
 
   void keep();  // the keeper thread
   Result<void> read_connection(int socket);
@@ -133,6 +139,7 @@ class Client : public std::enable_shared_from_this<Client> {
   UniqueFd stop_fd_;  // eventfd: readable when the keeper shall end
 
   Input input_;  // the keeper's
+  ClockPlace clock_page_ = nullptr;
 
   mutable std::mutex mutex_;         // guards all up to clock_fd_
   std::condition_variable changed_;  // an answer came, or the connection came or went
@@ -156,5 +163,8 @@ class Client : public std::enable_shared_from_this<Client> {
 
   std::thread keeper_;
 };
+
+// The page that a session of this process got last.
+Client::ClockPlace& latest_clock_page() noexcept;
 
 }  // namespace dssm::detail

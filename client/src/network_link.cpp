@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <array>
 
+#include "core/clock/clock_page.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/tcp.hpp"
 
@@ -100,6 +101,10 @@ Result<void> NetworkLink::greet() {
   self.program = program_;
   self.version = DSSM_VERSION;
   self.features = {std::string(wire::kFeatureTorn)};
+  // Nobody here watches the clock, but the host may have the same one.
+  const auto clock = std::make_shared<wire::ClockReport>();
+  clock->standing.boot_id = clock::boot_id();
+  self.clock = clock;
   net::Frame frame;
   wire::to_message(self, *frame.mutable_hello());
   phase_ = Phase::greeting;

@@ -9,6 +9,7 @@
 #include "client/src/channel.hpp"
 #include "client/src/find_host.hpp"
 #include "client/src/program_name.hpp"
+#include "client/src/states.hpp"
 
 namespace dssm {
 namespace detail {
@@ -207,7 +208,10 @@ Result<Tid> PConnector::write(std::span<const std::byte> payload, Time time, Dur
 }
 
 Result<void> PConnector::post(std::span<const std::byte> payload, Time time, Duration clock_error) {
-  return state_->channel->post(payload, time, clock_error);
+  return state_->channel->post(payload, time,
+                               clock_error == kOwnClockError
+                                   ? detail::error_by(detail::latest_clock_page(), time)
+                                   : clock_error);
 }
 
 Result<Tid> PConnector::flush(MonoTime deadline) { return state_->channel->flush(deadline); }

@@ -36,6 +36,28 @@ Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
   return distance(t, after.time) < distance(before.time, t) ? after.tid : before.tid;
 }
 
+// Precise to some milliseconds, for a fifth of the price; verdicts hold for seconds.
+MonoTime coarse_now() noexcept {
+  timespec now{};
+  ::clock_gettime(CLOCK_MONOTONIC_COARSE, &now);
+  return MonoTime(std::chrono::seconds(now.tv_sec) + Duration(now.tv_nsec));
+}
+
+// Whether the time of that sample must not be used.
+bool is_refused(const ring::RingReader& ring, const SampleInfo& info) noexcept {
+  return ring.clock_rule() == ring::ClockRule::enforce && !ring.clock().is_good(info, coarse_now());
+}
+
+// The same by tid; for a read by time, before the sample is copied.
+//   returns  ok | too_old | not_yet | clock_out_of_bounds
+ReadStatus check_clock(const ring::RingReader& ring, Tid tid) noexcept {
+  if (ring.clock_rule() != ring::ClockRule::enforce) return ReadStatus::ok;
+  SampleInfo info;
+  const ReadStatus status = ring.stamp(tid, info);
+  if (status != ReadStatus::ok) return status;
+  return is_refused(ring, info) ? ReadStatus::clock_out_of_bounds : ReadStatus::ok;
+}
+
 }  // namespace
 
 bool BorrowedSample::still_valid() const noexcept {
@@ -147,6 +169,8 @@ ReadStatus RawReader::at(Time t, std::span<std::byte> payload, SampleInfo& info)
     Tid found = kNoTid;
     const ReadStatus status = state_->ring.find(t, found);
     if (status != ReadStatus::ok) return status;
+    const ReadStatus checked = check_clock(state_->ring, found);
+    if (checked == ReadStatus::clock_out_of_bounds) return checked;
     if (state_->ring.read(found, payload, info) == ReadStatus::ok) {
       state_->took(found);
       return ReadStatus::ok;
@@ -164,6 +188,8 @@ ReadStatus RawReader::at_or_after(Time t, std::span<std::byte> payload, SampleIn
         to_ns(t) == INT64_MIN ? ReadStatus::too_old : state_->ring.find(t - Duration(1), before);
     if (found == ReadStatus::not_yet || found == ReadStatus::lapped) return found;
     const Tid wanted = found == ReadStatus::too_old ? state_->ring.oldest() : before + 1;
+    const ReadStatus checked = check_clock(state_->ring, wanted);
+    if (checked == ReadStatus::clock_out_of_bounds) return checked;
     const ReadStatus status = tid(wanted, payload, info);
     if (status != ReadStatus::too_old) return status;
   }
@@ -184,6 +210,8 @@ ReadStatus RawReader::nearest(Time t, std::span<std::byte> payload, SampleInfo& 
       if (state_->ring.stamp(before, left) != ReadStatus::ok) continue;
       if (state_->ring.stamp(before + 1, right) == ReadStatus::ok) wanted = closer(t, left, right);
     }
+    const ReadStatus checked = check_clock(state_->ring, wanted);
+    if (checked == ReadStatus::clock_out_of_bounds) return checked;
     const ReadStatus status = tid(wanted, payload, info);
     if (status != ReadStatus::too_old) return status;
   }
@@ -202,10 +230,54 @@ ReadStatus RawReader::neighbours(Time t, Neighbours& out) const noexcept {
     if (state_->ring.stamp(before, seen.before) != ReadStatus::ok) continue;
     // A sample that ran backwards may have come between: then it is the newest with time <= t.
     if (seen.after.time <= t) continue;
+    if (is_refused(state_->ring, seen.before) || is_refused(state_->ring, seen.after)) {
+      return ReadStatus::clock_out_of_bounds;
+    }
     out = seen;
     return ReadStatus::ok;
   }
   return ReadStatus::lapped;
+}
+
+Duration RawReader::clock_error(const SampleInfo& info) const noexcept {
+  return state_->ring.clock().distance(info, coarse_now());
+}
+
+bool RawReader::clock_in_bounds(const SampleInfo& info) const noexcept {
+  return state_->ring.clock().is_good(info, coarse_now());
+}
+
+JointRead at(Time t, std::span<JointSample> samples, Duration max_error) noexcept {
+  for (const JointSample& sample : samples) {
+    detail::ReaderState& state = *sample.reader->state_;
+    if (state.restart_due() && state.restart()) {
+      return {ReadStatus::restarted, static_cast<std::size_t>(&sample - samples.data()),
+              kUnknownClockError};
+    }
+  }
+  JointRead read;
+  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+    read = {ReadStatus::ok, 0, Duration::zero()};
+    for (std::size_t i = 0; i < samples.size(); ++i) {
+      const RawReader& reader = *samples[i].reader;
+      const ReadStatus status = reader.find(t, samples[i].info);
+      if (status != ReadStatus::ok) return {status, i, kUnknownClockError};
+      const Duration error = reader.clock_error(samples[i].info);
+      if (error > read.error) read = {ReadStatus::ok, i, error};
+    }
+    if (read.error > max_error) read.status = ReadStatus::clock_out_of_bounds;
+    for (std::size_t i = 0; i < samples.size() && read.status == ReadStatus::ok; ++i) {
+      JointSample& sample = samples[i];
+      DSSM_CHECK(sample.payload.size() == sample.reader->payload_bytes());
+      const ring::RingReader& ring = sample.reader->state_->ring;
+      if (ring.read(sample.info.tid, sample.payload, sample.info) == ReadStatus::ok) continue;
+      read = {ReadStatus::lapped, i, kUnknownClockError};
+    }
+    if (read.status != ReadStatus::lapped) break;
+  }
+  if (read.status != ReadStatus::ok) return read;
+  for (const JointSample& sample : samples) sample.reader->state_->took(sample.info.tid);
+  return read;
 }
 
 Tid RawReader::newest() const noexcept { return state_->ring.newest(); }
@@ -220,7 +292,11 @@ ReadStatus RawReader::find(Time t, SampleInfo& info) const noexcept {
     Tid found = kNoTid;
     const ReadStatus status = state_->ring.find(t, found);
     if (status != ReadStatus::ok) return status;
-    if (state_->ring.stamp(found, info) == ReadStatus::ok) return ReadStatus::ok;
+    SampleInfo seen;
+    if (state_->ring.stamp(found, seen) != ReadStatus::ok) continue;
+    if (is_refused(state_->ring, seen)) return ReadStatus::clock_out_of_bounds;
+    info = seen;
+    return ReadStatus::ok;
   }
   return ReadStatus::lapped;
 }

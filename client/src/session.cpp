@@ -1,10 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Session's functions as requests to dssmd.
+#include <algorithm>
 #include <dssm/session.hpp>
 
 #include "client/src/client.hpp"
 #include "client/src/states.hpp"
+#include "core/wire/clock_report.hpp"
 
 namespace dssm {
 namespace {
@@ -51,6 +53,14 @@ std::string hex(std::string_view bytes) {
   return digits;
 }
 
+// Between two looks whether a clock is good by now.
+constexpr Duration kClockLookUp = std::chrono::milliseconds(500);
+
+// Whether a stream that cannot be opened because of this may be had later.
+bool is_worth_waiting_for(const Error& why) {
+  return why.code == Errc::not_found || why.code == Errc::clock_out_of_bounds;
+}
+
 HostInfo host_info(const local::Host& message) {
   HostInfo host;
   host.name = message.name();
@@ -65,6 +75,19 @@ HostInfo host_info(const local::Host& message) {
   host.insecure = message.insecure();
   host.error = message.error();
   host.id = hex(message.host_id());
+  if (message.has_clock()) {
+    const auto report = wire::clock_report_untrusted(message.clock(), MonoClock::now());
+    host.clock = {report.status,
+                  report.trouble,
+                  report.basis,
+                  report.offset,
+                  report.reference,
+                  report.stratum,
+                  report.update_interval,
+                  report.age,
+                  report.standing.root_bound,
+                  Duration(message.clock_distance_ns())};
+  }
   host.found_by.assign(message.found_by().begin(), message.found_by().end());
   return host;
 }
@@ -173,14 +196,18 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
   if (!watching) return std::move(watching).error().context(quoted("wait for", id));
   for (std::uint64_t seen = 0;;) {
     auto reader = open_raw_reader(id, wanted);
-    if (reader || reader.error().code != Errc::not_found) return reader;
+    if (reader || !is_worth_waiting_for(reader.error())) return reader;
+    // That a clock is good again is no event of a stream.
+    const bool is_clock = reader.error().code == Errc::clock_out_of_bounds;
+    const MonoTime next = is_clock ? std::min(deadline, deadline_in(kClockLookUp)) : deadline;
     std::unique_lock lock(mutex);
-    // steady_clock is CLOCK_MONOTONIC too, with the same origin.
-    const std::chrono::steady_clock::time_point until(deadline.time_since_epoch());
-    if (deadline == kNever) {
+    if (next == kNever) {
       came.wait(lock, [&] { return times > seen; });
-    } else if (!came.wait_until(lock, until, [&] { return times > seen; })) {
-      return std::move(reader).error();
+    } else {
+      // steady_clock is CLOCK_MONOTONIC too, with the same origin.
+      const std::chrono::steady_clock::time_point until(next.time_since_epoch());
+      const bool news = came.wait_until(lock, until, [&] { return times > seen; });
+      if (!news && next == deadline) return std::move(reader).error();
     }
     seen = times;
   }

@@ -18,6 +18,21 @@ namespace dssm::detail {
 // How long a reader waits before it tries again to open the ring that superseded its own.
 inline constexpr Duration kRestartPause = std::chrono::milliseconds(200);
 
+// A time that is further from now than this is none of this PC's clock.
+inline constexpr Duration kLongestDelay = std::chrono::seconds(10);
+
+// How far this PC's clock may have been off at `time`, by the page at `place`; kForeignClockError
+// for a time that is none of it.
+inline Duration error_by(const Client::ClockPlace& place, Time time) noexcept {
+  const clock::ClockPage* page = place.load(std::memory_order_acquire);
+  const std::optional<Duration> error = page ? clock::error_at(*page, time) : std::nullopt;
+  if (error) return *error;
+  // Only now, because it costs more than all the rest.
+  const Time now = WallClock::now();
+  return time < now - kLongestDelay || time > now + kLongestDelay ? kForeignClockError
+                                                                  : kUnknownClockError;
+}
+
 struct ReaderState {
   explicit ReaderState(std::shared_ptr<OpenStream> opened)
       : stream(std::move(opened)), ring(*stream->ring->mapping) {}
@@ -54,10 +69,17 @@ struct ReaderState {
 struct WriterState {
   explicit WriterState(std::shared_ptr<OpenStream> opened)
       : stream(std::move(opened)),
+        clock(stream->client->clock_page()),
         ring(*stream->ring->mapping, *stream->ring->bell, stream->ring->doorbell_fd.get()),
         payload_bytes(stream->ring->mapping->geometry().payload_bytes) {}
 
+  // What a sample is stamped with that a writer says this about.
+  Duration stamp(Time time, Duration clock_error) const noexcept {
+    return clock_error == kOwnClockError ? error_by(clock, time) : clock_error;
+  }
+
   std::shared_ptr<OpenStream> stream;
+  const Client::ClockPlace& clock;
   ring::RingWriter ring;
   std::uint64_t payload_bytes;
 };

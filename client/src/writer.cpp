@@ -12,7 +12,7 @@ Loan::Loan(detail::WriterState* state) noexcept : state_(state) {
 Tid Loan::publish(Time time, Duration clock_error) noexcept {
   if (payload_.empty()) return kNoTid;
   payload_ = {};
-  return state_->ring.commit(time, clock_error);
+  return state_->ring.commit(time, state_->stamp(time, clock_error));
 }
 
 void Loan::abandon() noexcept {
@@ -29,7 +29,7 @@ RawWriter::~RawWriter() = default;
 
 Tid RawWriter::write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept {
   if (payload.size() != state_->payload_bytes) return kNoTid;
-  return state_->ring.write(payload, time, clock_error);
+  return state_->ring.write(payload, time, state_->stamp(time, clock_error));
 }
 
 Loan RawWriter::loan() noexcept { return Loan(state_.get()); }

@@ -3,6 +3,7 @@
 // All of DSSM's C++ API.
 #pragma once
 
+#include <dssm/clock.hpp>
 #include <dssm/describe.hpp>
 #include <dssm/error.hpp>
 #include <dssm/pconnector.hpp>

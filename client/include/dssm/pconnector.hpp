@@ -145,14 +145,14 @@ class PConnector {
   //   fails  daemon_away: not acknowledged in time. The sample is kept as if it had been posted,
   //          and sent when the connection is back: do not write it again
   Result<Tid> write(std::span<const std::byte> payload, Time time = WallClock::now(),
-                    Duration clock_error = kUnknownClockError);
+                    Duration clock_error = kOwnClockError);
 
   // Writes one sample without waiting: it is sent, or, while the connection is down or takes no
   // more, kept and sent by a later call of any of these functions, in order. For rate. Who posts
   // faster than the network carries calls flush() now and then, or samples are dropped.
   //   fails  invalid_argument (size)
   Result<void> post(std::span<const std::byte> payload, Time time = WallClock::now(),
-                    Duration clock_error = kUnknownClockError);
+                    Duration clock_error = kOwnClockError);
 
   // Waits until all that was posted is in the owner's ring, at most until `deadline`.
   //   returns  the tid of the last one; kNoTid when nothing was posted

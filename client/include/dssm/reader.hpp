@@ -60,6 +60,10 @@ struct Neighbours {
   SampleInfo after;   // the sample written right after `before`; its time is > t
 };
 
+class RawReader;
+struct JointSample;
+struct JointRead;
+
 class RawReader {
  public:
   RawReader(RawReader&&) noexcept;
@@ -87,6 +91,9 @@ class RawReader {
   ReadStatus previous(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   // --- reading by time ------------------------------------------------------------------------
+  // All of these, find() too, return clock_out_of_bounds for a sample of another host that may be
+  // further from this PC's clock than is allowed (keys clock_policy and clock_limit of dssmd).
+  // Reading by tid is never refused: clock_in_bounds() tells such samples.
   // Exact for every sequence of times, also one that runs backwards (docs/ring-layout.md "Search by
   // time"). "The newest sample" is the one with the greatest tid.
   //   cost     O(1) on a regular stream, else O(log depth)
@@ -108,6 +115,13 @@ class RawReader {
   // The stamps of the two neighbours of `t`; read their payloads with tid(). Leaves the cursor.
   //   returns  ok | not_yet (no sample after `t` yet, or nothing written) | too_old | lapped
   ReadStatus neighbours(Time t, Neighbours& out) const noexcept;
+
+  // How far info.time may be from this PC's clock: its clock_error and what is known of both clocks
+  // at this moment. 0 for a stream of this PC, or of another host with the same kernel, which has
+  // the same clock; kUnknownClockError: unknown. `info` is of this reader's stream.
+  Duration clock_error(const SampleInfo& info) const noexcept;
+  // Whether that is allowed; always, where the stream's policy is `off`.
+  bool clock_in_bounds(const SampleInfo& info) const noexcept;
 
   // --- stamps and places without payloads -----------------------------------------------------
 
@@ -177,10 +191,32 @@ class RawReader {
 
  private:
   friend class Session;
+  friend JointRead at(Time t, std::span<JointSample> samples, Duration max_error) noexcept;
   friend WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
   explicit RawReader(std::unique_ptr<detail::ReaderState> state) noexcept;
   std::unique_ptr<detail::ReaderState> state_;
 };
+
+// One of several samples that are read together.
+struct JointSample {
+  RawReader* reader = nullptr;
+  std::span<std::byte> payload;  // exactly reader->payload_bytes() long
+  SampleInfo info{};
+};
+
+struct JointRead {
+  ReadStatus status = ReadStatus::ok;
+  std::size_t which = 0;  // of the samples: why it is not ok; if it is, the one that is worst known
+  Duration error = kUnknownClockError;  // >= 0: how far the time of any of them may be from this
+                                        // PC's clock; also when that is the reason
+};
+
+// What at(t) gives of several streams: all of them or none.
+//   max_error  >= 0: no sample's time may be further from this PC's clock
+//   returns    as at(); clock_out_of_bounds also when max_error is not kept. Unless ok,
+//              payloads and infos are unspecified, and the cursors are where they were
+JointRead at(Time t, std::span<JointSample> samples,
+             Duration max_error = kUnknownClockError) noexcept;
 
 // Waits until one of `readers` has a sample newer than its cursor, or until `deadline`. At most
 // kMaxWaitAny readers; all must be valid. Returns `ready` also at once when one has already.
@@ -212,6 +248,9 @@ class Reader : public RawReader {
   ReadStatus nearest(Time t, T& out, SampleInfo& info) noexcept {
     return RawReader::nearest(t, bytes(out), info);
   }
+
+  // For at() of several streams: this one's sample, to be put into `out`.
+  JointSample joint(T& out) noexcept { return {this, bytes(out), {}}; }
 
   // The borrowed payload as a T. Check still_valid() after the last use of what was read.
   static const T& view(const BorrowedSample& sample) noexcept {

@@ -13,6 +13,7 @@
 //   errors   besides those named at each function: daemon_away (no answer in time), protocol
 #pragma once
 
+#include <dssm/clock_status.hpp>
 #include <dssm/playback_clock.hpp>
 #include <dssm/reader.hpp>
 #include <dssm/stream.hpp>
@@ -74,6 +75,20 @@ struct DaemonInfo {
   Mdns mdns;
 };
 
+// What a host says of its clock (docs/clocks.md), aged until now.
+struct ClockInfo {
+  ClockStatus status = ClockStatus::unknown;
+  ClockTrouble trouble = ClockTrouble::none;
+  ClockBasis basis = ClockBasis::nothing;
+  Duration offset{};      // its clock minus what its chronyd takes for the right time
+  std::string reference;  // whom it follows: a host's name or an address; empty: nobody
+  std::uint16_t stratum = 0;
+  Duration update_interval{};                // between two measurements of its chronyd
+  Duration age{};                            // of the last one
+  Duration root_bound = kUnknownClockError;  // from UTC
+  Duration distance = kUnknownClockError;    // greatest distance from this PC's clock
+};
+
 // A host of the fleet, as this PC's dssmd sees it: this PC itself, each configured peer, and each
 // host that was found by mDNS.
 struct HostInfo {
@@ -86,10 +101,11 @@ struct HostInfo {
   Duration round_trip{};        // of the last heartbeat, which comes once a second; 0: none
   Duration least_round_trip{};  // of this connection's heartbeats; 0: none
   std::uint32_t streams = 0;    // that it owns
-  Duration clock_bound = kUnknownClockError;
-  bool insecure = false;  // its traffic crosses the network in the clear
-  std::string error;      // why it is not up, or a warning that concerns it; empty: all is well
-  std::string id;         // 32 hex digits, of the host whatever it is called; empty: not known
+  Duration clock_bound = kUnknownClockError;  // of its samples' stamps, against the reference PC
+  std::optional<ClockInfo> clock;             // nothing: it says nothing of it
+  bool insecure = false;                      // its traffic crosses the network in the clear
+  std::string error;  // why it is not up, or a warning that concerns it; empty: all is well
+  std::string id;     // 32 hex digits, of the host whatever it is called; empty: not known
   std::vector<std::string> found_by;  // "peer" (configured), "mdns"; empty: it is this PC
 };
 
@@ -133,14 +149,15 @@ class Session {
 
   // Opens an existing stream. With `wanted`, fails with type_mismatch unless
   // TypeInfo::check_usable_as(wanted).
-  //   fails  not_found, type_mismatch
+  //   fails  not_found, type_mismatch, clock_out_of_bounds (for reading on another host)
   Result<RawWriter> open_raw_writer(const StreamId& id, const TypeInfo* wanted = nullptr,
                                     std::uint32_t tag = 0);
   Result<RawReader> open_raw_reader(const StreamId& id, const TypeInfo* wanted = nullptr,
                                     std::uint32_t tag = 0);
 
-  // Opens a stream for reading, waiting for it to be created until `deadline`.
-  //   fails  as open_raw_reader(); not_found when the deadline passed
+  // Opens a stream for reading, waiting until `deadline` for it to be created, and for the clocks
+  // of its host and of this PC to be good enough.
+  //   fails  as open_raw_reader(); not_found, clock_out_of_bounds when the deadline passed
   Result<RawReader> await_raw_reader(const StreamId& id, MonoTime deadline,
                                      const TypeInfo* wanted = nullptr);
 

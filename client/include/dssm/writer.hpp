@@ -44,7 +44,7 @@ class Loan {
   std::span<std::byte> payload() const noexcept { return payload_; }
 
   // Makes the sample visible, stamped with `time`, and gives its tid. kNoTid without a loan.
-  Tid publish(Time time, Duration clock_error = kUnknownClockError) noexcept;
+  Tid publish(Time time, Duration clock_error = kOwnClockError) noexcept;
 
   // Gives the slot back; nobody sees what was written into it.
   void abandon() noexcept;
@@ -65,10 +65,13 @@ class RawWriter {
   // Writes one sample.
   //   payload      exactly payload_bytes() long
   //   time         when it was measured; stored as given, also when it runs backwards
-  //   clock_error  >= 0: bound on the error of `time`
+  //   clock_error  >= 0: bound on the error of `time`. kOwnClockError: what dssmd knows of this
+  //   PC's
+  //                clock at `time`, which was some seconds ago at most. A time that is more than
+  //                10 s from now is none of this clock, but a recording's: kForeignClockError
   //   returns      its tid; kNoTid when the length is wrong or this thread holds a loan
   Tid write(std::span<const std::byte> payload, Time time = WallClock::now(),
-            Duration clock_error = kUnknownClockError) noexcept;
+            Duration clock_error = kOwnClockError) noexcept;
 
   // Lends the next slot for filling in place. Waits for other writers of this stream.
   Loan loan() noexcept;
@@ -99,7 +102,7 @@ class Writer : public RawWriter {
   explicit Writer(RawWriter raw) noexcept : RawWriter(std::move(raw)) {}
 
   Tid write(const T& sample, Time time = WallClock::now(),
-            Duration clock_error = kUnknownClockError) noexcept {
+            Duration clock_error = kOwnClockError) noexcept {
     return RawWriter::write(std::as_bytes(std::span<const T, 1>(&sample, 1)), time, clock_error);
   }
 

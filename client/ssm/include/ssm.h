@@ -57,6 +57,10 @@ SSM_tid getTID_top(SSM_sid sid);
 SSM_tid getTID_bottom(SSM_sid sid);
 int waitTID(SSM_sid sid, SSM_tid tid);
 
+/* Not in SSM: how far the time of sample tid may be from this PC's clock [s]; 0 for a stream of this
+ * PC, negative when it is not known or the sample is not held. */
+double getClockErrorSSM(SSM_sid sid, SSM_tid tid);
+
 SSM_tid readSSM(SSM_sid sid, void* data, ssmTimeT* ytime, SSM_tid tid) DSSM_SSM_MUST_USE;
 SSM_tid readSSM_time(SSM_sid sid, void* data, ssmTimeT ytime, ssmTimeT* ret_time) DSSM_SSM_MUST_USE;
 SSM_tid readSSMP(SSM_sid sid, void* adata, ssmTimeT* ytime, SSM_tid tid,

@@ -26,6 +26,12 @@ using ReadCallback = void (*)(const void* ssmp, void* data, void* user_data);
 using WriteCallback = void (*)(void* ssmp, const void* data, void* user_data);
 
 SSM_tid error_of(ReadStatus status) noexcept {
+  if (status == ReadStatus::clock_out_of_bounds) {
+    remember_error(
+        "read by time : the clocks of this PC and the stream's are not known to be close "
+        "enough (dssmctl clock)");
+    return SSM_ERROR_NO_DATA;
+  }
   return status == ReadStatus::not_yet ? SSM_ERROR_NO_DATA : SSM_ERROR_PAST;
 }
 
@@ -53,7 +59,8 @@ SSM_tid read_tid(Stream& stream, Stream::Copy& copy, SSM_tid tid) {
       return SSM_ERROR_FUTURE;
     case ReadStatus::too_old:
     case ReadStatus::lapped:
-    case ReadStatus::restarted:  // Stream goes on by itself
+    case ReadStatus::restarted:            // Stream goes on by itself
+    case ReadStatus::clock_out_of_bounds:  // not of reads by tid
       break;
   }
   return SSM_ERROR_PAST;
@@ -94,6 +101,13 @@ SSM_tid getTID(SSM_sid sid, ssmTimeT ytime) {
   const ReadStatus status =
       use->find(time > dssm::Time::min() ? time - dssm::Duration(1) : time, info);
   return status == ReadStatus::ok ? ssm_tid(info.tid) : error_of(status);
+}
+
+double getClockErrorSSM(SSM_sid sid, SSM_tid tid) {
+  const SidUse use(sid);
+  if (!use) return -1;
+  const dssm::Duration error = use->clock_error(ring_tid(tid, use->newest()));
+  return error == dssm::kUnknownClockError ? -1 : std::chrono::duration<double>(error).count();
 }
 
 int waitTID(SSM_sid sid, SSM_tid tid) {

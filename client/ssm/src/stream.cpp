@@ -222,6 +222,16 @@ ReadStatus Stream::find(Time t, SampleInfo& info) noexcept {
   return status;
 }
 
+Duration Stream::clock_error(Tid tid) noexcept {
+  RawReader* const open = reader();
+  if (!open) return kUnknownClockError;
+  const std::lock_guard guard(read_lock_);
+  follow_ring(*open);
+  SampleInfo info;
+  return open->stamp(tid - offset(), info) == ReadStatus::ok ? open->clock_error(info)
+                                                             : kUnknownClockError;
+}
+
 WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
   RawReader* const open = reader();
   if (!open) {  // nothing to sleep on; the caller looks again

@@ -80,6 +80,8 @@ class Stream {
   ReadStatus tid(Tid tid, Copy& out) noexcept;
   ReadStatus at(Time t, Copy& out) noexcept;
   ReadStatus find(Time t, SampleInfo& info) noexcept;
+  // RawReader::clock_error() of sample `tid`; kUnknownClockError also when it is not held.
+  Duration clock_error(Tid tid) noexcept;
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
 
   // Writes one sample; kNoTid when the writer cannot be opened or this thread is writing to the
