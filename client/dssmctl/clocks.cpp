@@ -6,7 +6,7 @@
 namespace dssm::ctl {
 
 void Clocks::add(const SampleInfo& info) {
-  const bool known = info.clock_error != kUnknownClockError;
+  const bool known = info.clock_error < kForeignClockError;
   some_unknown_ |= !known;
   if (known) known_errors_.add(info.clock_error);
 }

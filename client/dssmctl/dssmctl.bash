@@ -72,7 +72,7 @@ _dssmctl() {
   for ((i = 1; i < cword; ++i)); do
     case ${words[i]} in
       --socket | --sort | --host | --at | --count | -n | -c | --field | --wait | --window | -w | \
-        --interval | -i | --size | --depth | --life | --cycle | --type | --align | --offset | \
+        --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
         --speed | --time)
         ((++i))
         ;;
@@ -112,6 +112,7 @@ _dssmctl() {
     "") options="--version" ;;
     ls) options="--host --local --names --own --reverse --sort --watch" ;;
     hosts) options="--names" ;;
+    clock) options="--table --wait --watch" ;;
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
     hz | bw | delay) options="--count --interval --wait --window" ;;
@@ -126,7 +127,7 @@ _dssmctl() {
   case $verb in
     "")
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw create delay doctor echo hosts hz info ls ping playback property rm" -- "$cur")
+        "bw clock create delay doctor echo hosts hz info ls ping playback property rm" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;

@@ -20,7 +20,7 @@ inline std::string json_line(const Json& json) { return json_text(json) + "\n"; 
 
 // A bound on a clock's or stamp's error [ns]; null: unknown.
 inline Json bound_json(Duration bound) {
-  return bound == kUnknownClockError ? Json() : Json(to_ns(bound));
+  return bound >= kForeignClockError ? Json() : Json(to_ns(bound));
 }
 
 // A document of its own: indented, because people look at it too.

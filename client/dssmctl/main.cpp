@@ -27,6 +27,8 @@ Result<void> run(const Options& options, Output& out) {
       return run_ls(options, out);
     case Verb::hosts:
       return run_hosts(options, out);
+    case Verb::clock:
+      return run_clock(options, out);
     case Verb::doctor:
       return run_doctor(options, out);
     case Verb::ping:

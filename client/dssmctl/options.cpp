@@ -114,6 +114,17 @@ void add_ls(CLI::App& app, Options& options) {
 void add_hosts(CLI::App& app, Options& options) {
   CLI::App* hosts = app.add_subcommand("hosts", "list the hosts, and how they are reached");
   hosts->add_flag("--names", options.names, "only names, one per line, for programs");
+  CLI::App* clock = app.add_subcommand("clock", "how good the hosts' clocks are");
+  CLI::Option* watch = clock->add_flag("--watch", options.watch, "go on: anew each second");
+  CLI::Option* table = add_whole(clock, "--table", "N",
+                                 "average, maximum, minimum and standard deviation of N readings, "
+                                 "one a second",
+                                 options.table, 1, kMaxWindow);
+  add_seconds(clock, "--wait", "until this host's clock is good, for so long at most",
+              options.clock_wait, Range::not_negative)
+      ->excludes(watch)
+      ->excludes(table);
+  table->excludes(watch);
   app.add_subcommand("doctor", "look for what is wrong, and say what mends it");
   CLI::App* ping = app.add_subcommand("ping", "ask another host's dssmd for a sign of life");
   ping->add_option("HOST", options.host, "a name that `dssmctl hosts` shows")
@@ -277,6 +288,7 @@ std::optional<Verb> verb_of(std::string_view name) {
   static constexpr std::pair<std::string_view, Verb> kVerbs[] = {
       {"ls", Verb::ls},
       {"hosts", Verb::hosts},
+      {"clock", Verb::clock},
       {"doctor", Verb::doctor},
       {"ping", Verb::ping},
       {"info", Verb::info},

@@ -15,6 +15,7 @@ namespace dssm::ctl {
 enum class Verb : unsigned char {
   ls,
   hosts,
+  clock,
   doctor,
   ping,
   info,
@@ -50,10 +51,14 @@ struct Options {
   bool own = false;                // only this host's
   std::vector<std::string> hosts;  // only theirs; empty: of all
   std::string pattern;             // only streams whose names fit; empty: all
-  bool watch = false;
-  bool names = false;  // also for hosts
+  bool watch = false;              // also for clock
+  bool names = false;              // also for hosts
   std::string sort = "created";
   bool reverse = false;
+
+  // clock
+  std::optional<std::uint64_t> table;  // readings
+  std::optional<Duration> clock_wait;
 
   // ping
   std::string host;

@@ -110,7 +110,7 @@ void SamplePrinter::json_sample(const SampleInfo& info, std::span<const std::byt
 
 void SamplePrinter::csv_sample(const SampleInfo& info, std::span<const std::byte> payload) {
   std::string line = std::to_string(info.tid) + "," + std::to_string(to_ns(info.time)) + ",";
-  if (info.clock_error != kUnknownClockError) line += std::to_string(to_ns(info.clock_error));
+  if (info.clock_error < kForeignClockError) line += std::to_string(to_ns(info.clock_error));
   for (const Field& field : fields_) {
     const std::uint64_t cells = is_text(field) ? 1 : field.count;
     for (std::uint64_t i = 0; i < cells; ++i) {

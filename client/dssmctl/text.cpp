@@ -119,6 +119,7 @@ std::string duration_text(Duration d) {
 }
 
 std::string bound_text(Duration bound) {
+  if (bound == kForeignClockError) return "of another clock";
   return bound == kUnknownClockError ? "unknown" : duration_text(bound);
 }
 

@@ -13,6 +13,7 @@ namespace dssm::ctl {
 
 Result<void> run_ls(const Options& options, Output& out);
 Result<void> run_hosts(const Options& options, Output& out);
+Result<void> run_clock(const Options& options, Output& out);
 Result<void> run_doctor(const Options& options, Output& out);
 Result<void> run_ping(const Options& options, Output& out);
 Result<void> run_info(const Options& options, Output& out);

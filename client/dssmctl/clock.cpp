@@ -1,0 +1,234 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmctl clock: how good the fleet's clocks are, a row per host; as it changes (--watch), as a
+// table of statistics (--table), or as something to wait for (--wait).
+#include <dssm/clock.hpp>
+#include <map>
+#include <thread>
+
+#include "client/dssmctl/json.hpp"
+#include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/statistics.hpp"
+#include "client/dssmctl/stop_signal.hpp"
+#include "client/dssmctl/table.hpp"
+#include "client/dssmctl/text.hpp"
+#include "client/dssmctl/verbs.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+constexpr Duration kReadingPeriod = std::chrono::seconds(1);  // as often as hosts tell
+constexpr auto kRight = Table::Align::right;
+
+bool is_there(const HostInfo& host) { return host.state == "self" || host.state == "up"; }
+
+bool is_good(const ClockInfo& clock) {
+  return clock.status == ClockStatus::synchronized || clock.status == ClockStatus::holdover;
+}
+
+std::string or_dash(std::string text) { return text.empty() ? "-" : text; }
+
+// "1.25 ms", "-87 us"
+std::string offset_text(Duration offset) {
+  return offset < Duration::zero() ? "-" + duration_text(-offset) : duration_text(offset);
+}
+
+std::string status_text(const ClockInfo& clock) {
+  const std::string status(name_of(clock.status));
+  return clock.trouble == ClockTrouble::none ? status
+                                             : status + ": " + std::string(name_of(clock.trouble));
+}
+
+std::string reference_text(const ClockInfo& clock) {
+  if (clock.basis == ClockBasis::own) return "itself";
+  return or_dash(escaped(clock.reference));
+}
+
+// A host that says nothing has dashes.
+std::vector<std::string> clock_row(const HostInfo& host) {
+  if (!host.clock) return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-"};
+  const ClockInfo& clock = *host.clock;
+  const bool is_read = clock.status != ClockStatus::unknown && clock.age > Duration::zero();
+  return {escaped(host.name),
+          status_text(clock),
+          bound_text(host.clock_bound),
+          bound_text(clock.distance),
+          is_read ? offset_text(clock.offset) : "-",
+          reference_text(clock),
+          clock.update_interval > Duration::zero() ? duration_text(clock.update_interval) : "-",
+          is_read ? duration_text(clock.age) : "-"};
+}
+
+Json clock_json(const HostInfo& host) {
+  Json json;
+  json["host"] = host.name;
+  json["state"] = host.state;
+  const ClockInfo clock = host.clock.value_or(ClockInfo());
+  json["status"] = name_of(clock.status);
+  json["trouble"] = clock.trouble == ClockTrouble::none ? Json() : Json(name_of(clock.trouble));
+  json["basis"] = name_of(clock.basis);
+  json["bound_ns"] = bound_json(host.clock_bound);
+  json["distance_ns"] = bound_json(clock.distance);
+  json["root_bound_ns"] = bound_json(clock.root_bound);
+  json["offset_ns"] = to_ns(clock.offset);
+  json["reference"] = clock.reference.empty() ? Json() : Json(clock.reference);
+  json["stratum"] = clock.stratum;
+  json["poll_ns"] = to_ns(clock.update_interval);
+  json["age_ns"] = to_ns(clock.age);
+  return json;
+}
+
+void print_clocks(const std::vector<HostInfo>& hosts, bool json, Output& out) {
+  if (json) {
+    Json all = Json::array();
+    for (const HostInfo& host : hosts) {
+      if (is_there(host)) all.push_back(clock_json(host));
+    }
+    return out.add(json_line({{"clocks", std::move(all)}}));
+  }
+  Table table({{"HOST"},
+               {"STATUS"},
+               {"BOUND", kRight},
+               {"FROM HERE", kRight},
+               {"OFFSET", kRight},
+               {"REFERENCE"},
+               {"POLL", kRight},
+               {"AGE", kRight}});
+  for (const HostInfo& host : hosts) {
+    if (is_there(host)) table.add_row(clock_row(host));
+  }
+  table.print(out);
+}
+
+// False when told to stop before.
+bool wait_a_period(MonoTime until) {
+  while (MonoClock::now() < until) {
+    if (stop_requested()) return false;
+    std::this_thread::sleep_for(std::min(until - MonoClock::now(), kStopLookUp));
+  }
+  return !stop_requested();
+}
+
+Result<void> watch_clocks(Session& session, const Options& options, Output& out) {
+  catch_stop_signals();
+  for (MonoTime next = MonoClock::now();; next += kReadingPeriod) {
+    const Result<std::vector<HostInfo>> hosts = session.hosts();
+    if (!hosts) return hosts.error();
+    print_clocks(*hosts, options.json, out);
+    if (!options.json) out.add("\n");
+    if (!out.flush() || out.reader_gone() || !wait_a_period(next + kReadingPeriod)) return {};
+  }
+}
+
+// What was read of one host.
+struct Readings {
+  explicit Readings(std::size_t count) : offsets(count), bounds(count) {}
+  Window offsets, bounds;  // of the offset only its size
+  std::size_t unknown = 0;
+};
+
+Json statistics_json(const Statistics& statistics) {
+  return {{"readings", statistics.count},
+          {"average_ns", statistics.mean_ns},
+          {"max_ns", to_ns(statistics.max)},
+          {"min_ns", to_ns(statistics.min)},
+          {"std_dev_ns", statistics.std_dev_ns}};
+}
+
+void print_table(const std::map<std::string, Readings>& all, bool json, Output& out) {
+  if (json) {
+    Json hosts = Json::array();
+    for (const auto& [name, readings] : all) {
+      hosts.push_back({{"host", name},
+                       {"offset", statistics_json(readings.offsets.statistics())},
+                       {"bound", statistics_json(readings.bounds.statistics())},
+                       {"unknown", readings.unknown}});
+    }
+    return out.add(json_document({{"clocks", std::move(hosts)}}));
+  }
+  const auto ns_text = [](double ns) { return duration_text(Duration(std::llround(ns))); };
+  Table table({{"HOST"},
+               {"OF"},
+               {"READINGS", kRight},
+               {"AVERAGE", kRight},
+               {"MAX", kRight},
+               {"MIN", kRight},
+               {"STD DEV", kRight}});
+  for (const auto& [name, readings] : all) {
+    for (const auto& [what, window] :
+         {std::pair("offset", &readings.offsets), std::pair("bound", &readings.bounds)}) {
+      const Statistics found = window->statistics();
+      table.add_row({escaped(name), what, std::to_string(found.count), ns_text(found.mean_ns),
+                     duration_text(found.max), duration_text(found.min),
+                     ns_text(found.std_dev_ns)});
+    }
+  }
+  table.print(out);
+  for (const auto& [name, readings] : all) {
+    if (readings.unknown == 0) continue;
+    out.add("at " + std::to_string(readings.unknown) + " readings the clock of '" + escaped(name) +
+            "' was not known\n");
+  }
+}
+
+Result<void> tabulate_clocks(Session& session, const Options& options, Output& out) {
+  catch_stop_signals();
+  const std::uint64_t count = *options.table;
+  std::map<std::string, Readings> all;
+  MonoTime next = MonoClock::now();
+  for (std::uint64_t i = 0; i < count; ++i, next += kReadingPeriod) {
+    if (!wait_a_period(next)) break;
+    const Result<std::vector<HostInfo>> hosts = session.hosts();
+    if (!hosts) return hosts.error();
+    for (const HostInfo& host : *hosts) {
+      if (!is_there(host)) continue;
+      Readings& readings = all.try_emplace(host.name, count).first->second;
+      if (!host.clock || host.clock_bound == kUnknownClockError) {
+        ++readings.unknown;
+        continue;
+      }
+      readings.offsets.add(std::max(host.clock->offset, -host.clock->offset));
+      readings.bounds.add(host.clock_bound);
+    }
+  }
+  print_table(all, options.json, out);
+  return {};
+}
+
+// Until this host's clock is good enough; says so, or why it is not.
+Result<void> await_clock(Session& session, const Options& options, Output& out) {
+  catch_stop_signals();
+  const MonoTime deadline = deadline_in(*options.clock_wait);
+  for (;;) {
+    const Result<std::vector<HostInfo>> hosts = session.hosts();
+    if (!hosts) return hosts.error();
+    const HostInfo& self = hosts->front();
+    if (self.clock && is_good(*self.clock)) {
+      print_clocks({self}, options.json, out);
+      return {};
+    }
+    const MonoTime now = MonoClock::now();
+    if (now >= deadline || !wait_a_period(std::min(deadline, now + kStopLookUp))) {
+      return Error{Errc::clock_out_of_bounds,
+                   "the clock of this host is " +
+                       (self.clock ? status_text(*self.clock) : "not watched") +
+                       "; look at `chronyc tracking` and `systemctl status chrony`"};
+    }
+  }
+}
+
+}  // namespace
+
+Result<void> run_clock(const Options& options, Output& out) {
+  Result<Session> session = connect(options);
+  if (!session) return std::move(session).error();
+  if (options.clock_wait) return await_clock(*session, options, out);
+  if (options.table) return tabulate_clocks(*session, options, out);
+  if (options.watch) return watch_clocks(*session, options, out);
+  const Result<std::vector<HostInfo>> hosts = session->hosts();
+  if (!hosts) return hosts.error();
+  print_clocks(*hosts, options.json, out);
+  return {};
+}
+
+}  // namespace dssm::ctl
