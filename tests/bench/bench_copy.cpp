@@ -2,9 +2,12 @@
 //
 // Writing and reading samples of several sizes through the public API, beside clock_gettime for
 // small ones and memcpy of the same size between the same buffers for large ones.
+#include <cstdlib>
 #include <cstring>
 #include <dssm/dssm.hpp>
+#include <filesystem>
 
+#include "core/clock/clock_page.hpp"
 #include "tests/bench/harness.hpp"
 #include "tests/support/daemon_process.hpp"
 
@@ -38,15 +41,51 @@ void small(Session& session) {
   std::byte payload[64] = {};
   SampleInfo info;
   std::int64_t time = 0;
-  const auto write = [&] { stream.writer.write(payload, time_from_ns(++time)); };
+  const auto write = [&] { stream.writer.write(payload, time_from_ns(++time), 1us); };
   for (int i = 0; i < 2000; ++i) write();
-  print_pair("clock_gettime", "write 64 B, given time", measure(2000, 1000, raw_clock, write),
+  print_pair("clock_gettime", "write 64 B, given stamp", measure(2000, 1000, raw_clock, write),
              "<= 1.8");
   const auto read = [&] {
     if (stream.reader.latest(payload, info) != ReadStatus::ok) std::abort();
     keep(payload);
   };
   print_pair("clock_gettime", "read newest 64 B", measure(2000, 1000, raw_clock, read), "<= 1.2");
+}
+
+// What it costs to let libdssm state the clock's error: writing with and without, and the look at
+// the page alone, which has a bound here, as where there is a chronyd.
+void stamped(Session& session) {
+  Stream stream = make_stream(session, "stamped", 64, 1000);
+  std::byte payload[64] = {};
+  Time now;
+  int writes = 0;
+  // A clock read in each write would hide what is measured.
+  const auto recently = [&] {
+    if (writes++ % 1000 == 0) now = WallClock::now();
+    return now;
+  };
+  const auto given = [&] { stream.writer.write(payload, recently(), 1us); };
+  const auto own = [&] { stream.writer.write(payload, recently()); };
+  print_pair("write 64 B, given stamp", "write 64 B, own clock's error",
+             measure(2000, 1000, given, own), "at most 5 ns more");
+
+  char folder[] = "/tmp/dssm-bench-XXXXXX";
+  if (!::mkdtemp(folder)) std::abort();
+  {
+    clock::ClockPageWriter page =
+        clock::ClockPageWriter::open(std::string(folder) + "/clock").value();
+    clock::ClockRecord record;
+    record.wall = Time(50s);
+    record.state.bound = 100us;
+    record.state.ageing = 56'250;
+    page.store(record);
+    Time t = record.wall;
+    const auto nothing = [&] { keep(t += 1ns); };
+    const auto look = [&] { keep(clock::error_at(page.page(), t += 1ns)); };
+    print_pair("nothing", "look at the clock page", measure(2000, 1000, nothing, look),
+               "at most 5 ns more");
+  }
+  std::filesystem::remove_all(folder);
 }
 
 // memcpy goes between the same buffers: the caller's and the ring's own slots, in the order of
@@ -122,6 +161,7 @@ int main() {
   Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
   print_head();
   small(session);
+  stamped(session);
   large(session, 64 << 10, 32, 4000);
   large(session, 1 << 20, 16, 1000);
 }

@@ -7,6 +7,7 @@
 #include <cstring>
 #include <fstream>
 
+#include "core/clock/clock_page.hpp"
 #include "core/wire/address.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/sample_frame.hpp"
@@ -151,6 +152,7 @@ net::Frame network_hello(std::uint32_t version, bool torn) {
   net::Frame frame;
   wire::to_message(greeting, *frame.mutable_hello());
   frame.mutable_hello()->set_protocol_version(version);
+  frame.mutable_hello()->mutable_clock()->set_boot_id(clock::boot_id());  // its clock is the host's
   return frame;
 }
 

@@ -25,6 +25,8 @@ UNKNOWN_CLOCK_ERROR = 2**63 - 1
 NOT_YET, TOO_OLD = 1, 2
 START = 1_700_000_000_000_000_000  # ns, time of sample 0
 CYCLE = 25_000_000  # ns
+with open("/proc/sys/kernel/random/boot_id", "rb") as boot_id_file:
+    BOOT_ID = boot_id_file.read().strip()
 
 
 def compile_messages(proto_folder):
@@ -67,6 +69,7 @@ class Connection:
             program="stock_protobuf.py",
             version="0",
             features=features,
+            clock={"boot_id": BOOT_ID},  # this program and dssmd have one clock
         )
         self.send(net.Frame(hello=self.hello))
         self.answer = self.receive()

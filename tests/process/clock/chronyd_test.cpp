@@ -26,9 +26,6 @@ namespace dssm::daemon {
 namespace {
 
 using namespace std::chrono_literals;
-using clock::ClockBasis;
-using clock::ClockStatus;
-using clock::ClockTrouble;
 
 std::string program(const std::string& name) {
   for (const char* folder : {"/usr/sbin/", "/usr/bin/"}) {

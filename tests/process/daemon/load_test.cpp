@@ -60,12 +60,13 @@ TEST(Load, CostsLittleMemoryAndNoTimeWithAHundredIdleStreams) {
     return proc_number(daemon.pid(), "status", "voluntary_ctxt_switches");
   };
   client.ask(list_request());
-  // Once it has told the service manager how many streams there are.
+  // Once it has told the service manager how many streams there are. It asks chronyd each second,
+  // which takes a wake-up for the question and one for what comes of it.
   EXPECT_TRUE(eventually([&] {
     const std::uint64_t before = switches();
     ::poll(nullptr, 0, 1500);  // the span that is looked at, not a wait for something
-    return switches() == before;
-  })) << "an idle dssmd wakes up";
+    return switches() <= before + 4;
+  })) << "an idle dssmd wakes up for something else than the clock";
 #if !defined(__SANITIZE_ADDRESS__) && !defined(__SANITIZE_THREAD__)
   const std::uint64_t private_kib = proc_number(daemon.pid(), "smaps_rollup", "Private_Dirty") +
                                     proc_number(daemon.pid(), "smaps_rollup", "Private_Clean");

@@ -42,7 +42,8 @@ void Follower::take(int most) {
         last_ = kNoTid;
         break;
       case ReadStatus::not_yet:
-      case ReadStatus::lapped:  // again and again; the next call goes on
+      case ReadStatus::clock_out_of_bounds:  // not of reads by tid
+      case ReadStatus::lapped:               // again and again; the next call goes on
         return;
       case ReadStatus::too_old:
         fault("next() returned too_old");

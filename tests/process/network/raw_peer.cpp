@@ -8,6 +8,8 @@
 #include <netinet/in.h>
 #include <sys/socket.h>
 
+#include <fstream>
+
 namespace dssm::test {
 namespace {
 
@@ -122,6 +124,9 @@ net::Frame hello_frame(std::uint32_t protocol_version, const std::vector<std::st
   hello.set_life(1);
   hello.set_program("raw peer");
   hello.set_version("0.0.0");
+  // Its clock is the host's.
+  std::getline(std::ifstream("/proc/sys/kernel/random/boot_id"),
+               *hello.mutable_clock()->mutable_boot_id());
   for (const std::string& feature : features) hello.add_features(feature);
   return frame;
 }
