@@ -115,6 +115,11 @@ Error failed_read(const RawReader& reader, const std::string& what, ReadStatus s
       return {Errc::system, tried +
                                 "the writer overwrites samples faster than they can be read; "
                                 "give the stream more depth"};
+    case ReadStatus::clock_out_of_bounds:
+      return {Errc::clock_out_of_bounds,
+              tried +
+                  "the clocks of its host and of this PC may be too far apart; look at `dssmctl "
+                  "clock`"};
     default:
       return {Errc::not_found, tried + "nothing was written to it yet"};
   }

@@ -63,6 +63,7 @@ void print_mirror(const MirrorInfo& mirror, Output& out) {
                                    : std::to_string(mirror.received_samples) + " samples, " +
                                          bytes_text(mirror.received_bytes) + ", up to tid " +
                                          std::to_string(mirror.newest));
+  if (!mirror.clock.empty()) add_line(out, "clock", escaped_message(mirror.clock));
   add_line(out, "missing", std::to_string(mirror.gap_samples) + " samples");
   add_line(out, "reconnects", std::to_string(mirror.reconnects));
   add_line(out, "restarts", std::to_string(mirror.restarts));

@@ -15,6 +15,7 @@ Json mirror_json(const MirrorInfo& mirror) {
           {"gap_samples", mirror.gap_samples},
           {"reconnects", mirror.reconnects},
           {"restarts", mirror.restarts},
+          {"clock", mirror.clock.empty() ? Json() : Json(mirror.clock)},
           {"error", mirror.error.empty() ? Json() : Json(mirror.error)}};
 }
 

@@ -16,7 +16,7 @@ TypeInfo type_info(const proto::Type& message) {
 MirrorInfo mirror_info(const proto::Mirror& message) {
   return {message.state(),          message.gap_samples(), message.reconnects(),
           message.restarts(),       message.newest(),      message.received_samples(),
-          message.received_bytes(), message.error()};
+          message.received_bytes(), message.error(),       message.clock()};
 }
 
 }  // namespace

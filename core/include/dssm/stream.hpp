@@ -124,6 +124,7 @@ struct MirrorInfo {
   std::uint64_t received_samples = 0;
   std::uint64_t received_bytes = 0;  // of payloads
   std::string error;                 // why it is not live; empty when it is
+  std::string clock;  // why the times of its samples are not good; empty when they are
 };
 
 // What is known about a stream at the moment of asking. Of a stream of another host: what its owner
