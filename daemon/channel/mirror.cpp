@@ -165,7 +165,7 @@ void Mirror::on_owner_clock(MirrorClock::Report report) {
 }
 
 void Mirror::judge() {
-  if (ring_) ring_->set_clock(clock_.verdict());
+  if (ring_ && clock_.is_heard()) ring_->set_clock(clock_.verdict());
 }
 
 Result<void> Mirror::on_subscribed_untrusted(const net::Subscribed& subscribed) {

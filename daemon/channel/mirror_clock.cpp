@@ -14,6 +14,7 @@ bool is_known(const MirrorClock::Report& report) noexcept {
 }  // namespace
 
 void MirrorClock::on_owner(Report report, Tid newest) noexcept {
+  heard_ = true;
   const Report before = std::exchange(report_, std::move(report));
   if (!is_known(report_)) {
     // Open from the first sample on that we do not have yet.
@@ -41,6 +42,7 @@ ring::ClockVerdict MirrorClock::verdict() const {
 }
 
 Result<void> MirrorClock::check_opening() const {
+  if (!heard_) return {};
   const ring::ClockVerdict now = verdict();
   if (now.rule != ring::ClockRule::enforce || now.allowed >= Duration::zero()) return {};
   return rules_->why_not(id_, report_.get());

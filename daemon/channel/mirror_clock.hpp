@@ -27,8 +27,12 @@ class MirrorClock {
   // The mirror goes on with another ring, whose samples all come from now on.
   void on_new_ring() noexcept;
 
+  // Whether the owner was heard of. Until then the verdict of the dssmd before this one stands, as
+  // long as it holds: the readers of a mirror shall not notice that dssmd is restarted.
+  bool is_heard() const noexcept { return heard_; }
+
   ring::ClockVerdict verdict() const;
-  // Whether the stream may be opened.
+  // Whether the stream may be opened; always, until the owner was heard of.
   //   fails  clock_out_of_bounds
   Result<void> check_opening() const;
   // Why its times are not good; empty: they are.
@@ -40,6 +44,7 @@ class MirrorClock {
   const ClockRules* rules_;
   const StreamId& id_;
   Report report_;
+  bool heard_ = false;
   Tid doubtful_first_ = 0, doubtful_last_ = kNoTid;
 };
 

@@ -65,6 +65,14 @@ TEST_F(MirrorClockTest, AStreamIsOpenedWhenSomethingIsAllowed) {
   EXPECT_EQ(clock.trouble(), "not 'lidar:0@pc2'");
 }
 
+TEST_F(MirrorClockTest, AStreamIsOpenedUntilItsOwnerWasHeardOf) {
+  EXPECT_FALSE(clock.is_heard());
+  EXPECT_TRUE(clock.check_opening());
+  clock.on_owner(nullptr, kNoTid);  // a dssmd that says nothing of its clock
+  EXPECT_TRUE(clock.is_heard());
+  EXPECT_FALSE(clock.check_opening());
+}
+
 TEST_F(MirrorClockTest, MarkedStreamsAreOpenedAndTold) {
   rules.rule = ring::ClockRule::mark;
   clock.on_owner(report(2ms), kNoTid);
