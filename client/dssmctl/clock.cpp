@@ -18,7 +18,6 @@ namespace dssm::ctl {
 namespace {
 
 constexpr Duration kReadingPeriod = std::chrono::seconds(1);  // as often as hosts tell
-constexpr auto kRight = Table::Align::right;
 
 bool is_there(const HostInfo& host) { return host.state == "self" || host.state == "up"; }
 
@@ -88,12 +87,12 @@ void print_clocks(const std::vector<HostInfo>& hosts, bool json, Output& out) {
   }
   Table table({{"HOST"},
                {"STATUS"},
-               {"BOUND", kRight},
-               {"FROM HERE", kRight},
-               {"OFFSET", kRight},
+               {"BOUND", Table::Align::right},
+               {"FROM HERE", Table::Align::right},
+               {"OFFSET", Table::Align::right},
                {"REFERENCE"},
-               {"POLL", kRight},
-               {"AGE", kRight}});
+               {"POLL", Table::Align::right},
+               {"AGE", Table::Align::right}});
   for (const HostInfo& host : hosts) {
     if (is_there(host)) table.add_row(clock_row(host));
   }
@@ -149,11 +148,11 @@ void print_table(const std::map<std::string, Readings>& all, bool json, Output& 
   const auto ns_text = [](double ns) { return duration_text(Duration(std::llround(ns))); };
   Table table({{"HOST"},
                {"OF"},
-               {"READINGS", kRight},
-               {"AVERAGE", kRight},
-               {"MAX", kRight},
-               {"MIN", kRight},
-               {"STD DEV", kRight}});
+               {"READINGS", Table::Align::right},
+               {"AVERAGE", Table::Align::right},
+               {"MAX", Table::Align::right},
+               {"MIN", Table::Align::right},
+               {"STD DEV", Table::Align::right}});
   for (const auto& [name, readings] : all) {
     for (const auto& [what, window] :
          {std::pair("offset", &readings.offsets), std::pair("bound", &readings.bounds)}) {
