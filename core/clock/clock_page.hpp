@@ -81,9 +81,8 @@ struct ClockRecord {
 inline constexpr Duration kLongestUse = std::chrono::milliseconds(3500);
 
 // How far this PC's clock may have been from its reference at `t`, a time by this clock.
-//   returns  kUnknownClockError: not known then; nothing: the page does not reach `t`, which is
-//   none
-//            of this clock, or lies too far back, or dssmd is gone
+//   returns  kUnknownClockError: not known then. Nothing: the page does not reach `t`: that is no
+//            time of this clock, or lies too far back, or dssmd is gone
 //   threads  any; async-signal-safe; no system call
 std::optional<Duration> error_at(const ClockPage& page, Time t) noexcept;
 

@@ -9,8 +9,6 @@
 #include <cstring>
 #include <utility>
 
-#include "core/base/utf8.hpp"
-
 namespace dssm::daemon {
 namespace {
 
