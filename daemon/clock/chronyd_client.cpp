@@ -47,6 +47,7 @@ Result<void> ChronydClient::ask() {
   question_ = std::move(question);
   readable_ = EventSource::readable(loop_, socket_.get(), [this] { on_readable(); });
   readable_.enable();
+  on_readable();  // that nothing listens on this PC is known at once
   return {};
 }
 

@@ -37,7 +37,8 @@ class DaemonProcess {
   // Starts `dssmd --runtime-dir DIR --name HOST extra...` and waits until it says that it is ready
   // (sd_notify's READY=1). Ends the test program with a text when it does not come up. Unless
   // `extra` says where to listen for other hosts, it is at any free port of 127.0.0.1; and unless
-  // it says something of mDNS, there is none: nobody else on this network shall see a test.
+  // it says something of mDNS, there is none: nobody else on this network shall see a test. For
+  // the same reason it finds no chronyd.
   explicit DaemonProcess(std::vector<std::string> extra = {}, const std::string& host = "pc1");
   DaemonProcess(const DaemonProcess&) = delete;
   DaemonProcess& operator=(const DaemonProcess&) = delete;
