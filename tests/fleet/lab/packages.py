@@ -33,7 +33,7 @@ def build(folder: pathlib.Path, packages: pathlib.Path | None) -> Artifacts:
     if not (folder / "build.ninja").exists():
         run("meson", "setup", folder, ROOT, "-Dunity=on", "-Dunity_size=16", "-Dbenchmarks=false",
             what="configure the build", contained=True)
-    targets = ["tests/fleet/fleet-load", "tests/fleet/uml-xstate.so",
+    targets = ["tests/fleet/fleet-clock", "tests/fleet/fleet-load", "tests/fleet/uml-xstate.so",
                *(f"{EXAMPLE}/{name}" for name in ("encoder", "lidar", "localizer", "mapper"))]
     run("ninja", "-C", folder, *targets, what="build the fleet's programs", timeout=3600, contained=True)
     if packages is None:

@@ -1,0 +1,228 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What a PC's clock shows and what DSSM states about it, for somebody outside who knows the truth
+// (lab/truth.py).
+//
+//   fleet-clock PORT HOST...
+//
+// Writes the stream "truth" a hundred times a second, each sample holding both clocks, stamped as
+// any program's samples are, and reads that of each other HOST. Answers each datagram "NUMBER STEP"
+// at UDP PORT with JSON, see answer(); a STEP other than 0 sets the wall clock forward by so many
+// nanoseconds first, or backward when it is negative.
+//
+// Says "ready" on stdout once it writes. Ends when stdin does. Exit status: 0; 1 with the reason on
+// stderr.
+#include <arpa/inet.h>
+#include <poll.h>
+#include <sys/socket.h>
+#include <sys/timex.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <array>
+#include <atomic>
+#include <cerrno>
+#include <cstdio>
+#include <cstdlib>
+#include <cstring>
+#include <deque>
+#include <dssm/clock.hpp>
+#include <dssm/dssm.hpp>
+#include <memory>
+#include <nlohmann/json.hpp>
+#include <optional>
+#include <string>
+#include <thread>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+
+namespace dssm::test {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr Duration kPeriod = 10ms;
+constexpr Duration kHistory = 10s;
+
+struct BothClocks {
+  std::int64_t wall_ns = 0, mono_ns = 0;
+  std::int64_t within_ns = 0;  // between looking at the monotonic clock before and after the other
+  std::int64_t life = 0;       // of the program
+};
+
+BothClocks look_at_clocks() {
+  static const std::int64_t life = to_ns(WallClock::now());
+  const MonoTime before = MonoClock::now();
+  const Time wall = WallClock::now();
+  const Duration within = MonoClock::now() - before;
+  return {to_ns(wall), (before + within / 2).time_since_epoch().count(), within.count(), life};
+}
+
+[[noreturn]] void fail(const std::string& what) {
+  std::fprintf(stderr, "%s\n", what.c_str());
+  std::exit(1);
+}
+
+// The stream of another host, once it can be had.
+class Other {
+ public:
+  Other(Session session, std::string host)
+      : host_(std::move(host)), opening_([this, session = std::move(session)]() mutable {
+          // Refused again and again until both clocks are good.
+          reader_.emplace(session.await_reader<BothClocks>("truth@" + host_).value());
+          open_.store(true, std::memory_order_release);
+        }) {
+    opening_.detach();  // until the process ends
+  }
+
+  const std::string& host() const { return host_; }
+  Reader<BothClocks>* reader() {
+    return open_.load(std::memory_order_acquire) ? &*reader_ : nullptr;
+  }
+
+ private:
+  const std::string host_;
+  std::optional<Reader<BothClocks>> reader_;
+  std::atomic<bool> open_ = false;
+  std::thread opening_;
+};
+
+// -1: nothing is known.
+std::int64_t known_ns(Duration error) { return error == kUnknownClockError ? -1 : error.count(); }
+
+void put(nlohmann::json& to, const BothClocks& clocks) {
+  to["mono"] = clocks.mono_ns;
+  to["within"] = clocks.within_ns;
+  to["life"] = clocks.life;
+}
+
+// A sample, and what DSSM says of its time on this PC.
+nlohmann::json statement(const Reader<BothClocks>& reader, ReadStatus status,
+                         const BothClocks& sample, const SampleInfo& info) {
+  nlohmann::json said{{"status", status_name(status)}};
+  if (status != ReadStatus::ok) return said;
+  said["time"] = to_ns(info.time);
+  put(said, sample);
+  said["error"] = known_ns(reader.clock_error(info));
+  said["good"] = reader.clock_in_bounds(info);
+  return said;
+}
+
+// The read that is refused when a clock may be too far off, and the one that never is.
+nlohmann::json statements(Reader<BothClocks>& reader) {
+  BothClocks sample;
+  SampleInfo info;
+  ReadStatus status = reader.at(WallClock::now(), sample, info);
+  nlohmann::json by_time = statement(reader, status, sample, info);
+  status = reader.latest(sample, info);
+  return {{"by_time", by_time}, {"newest", statement(reader, status, sample, info)}};
+}
+
+// All others' samples of one time.
+nlohmann::json joint_statement(const std::vector<Reader<BothClocks>*>& readers) {
+  std::vector<BothClocks> samples(readers.size());
+  std::vector<JointSample> joint;
+  for (std::size_t i = 0; i < readers.size(); ++i) joint.push_back(readers[i]->joint(samples[i]));
+  const JointRead read = at(WallClock::now(), joint, 1ms);
+  nlohmann::json said{{"status", status_name(read.status)}, {"error", known_ns(read.error)}};
+  for (std::size_t i = 0; read.status == ReadStatus::ok && i < readers.size(); ++i) {
+    nlohmann::json& of_one = said["samples"][readers[i]->id().host];
+    of_one["time"] = to_ns(joint[i].info.time);
+    put(of_one, samples[i]);
+  }
+  return said;
+}
+
+// {"number", "wall", "mono", "within", "life": this PC's clocks when the question had come,
+//  "mono_end": when this is sent, "own": {"status", "error"},
+//  "others": {HOST: {"by_time": SAMPLE, "newest": SAMPLE}},
+//  "joint": {"status", "error", "samples": {HOST: SAMPLE}}}
+// SAMPLE: {"status", "time", "mono", "within", "life", "error", "good"}, clocks being its writer's.
+// Times and errors in ns, an error of -1 being unknown. "joint" only when all others are there.
+std::string answer(std::int64_t number, const BothClocks& came, std::deque<Other>& others) {
+  const clock::Reading own = clock::now();
+  nlohmann::json said{{"number", number},
+                      {"wall", came.wall_ns},
+                      {"own", {{"status", name_of(own.status)}, {"error", known_ns(own.error)}}},
+                      {"others", nlohmann::json::object()}};
+  put(said, came);
+  std::vector<Reader<BothClocks>*> readers;
+  for (Other& other : others) {
+    if (Reader<BothClocks>* reader = other.reader()) {
+      said["others"][other.host()] = statements(*reader);
+      readers.push_back(reader);
+    }
+  }
+  if (!readers.empty() && readers.size() == others.size()) said["joint"] = joint_statement(readers);
+  said["mono_end"] = MonoClock::now().time_since_epoch().count();
+  return said.dump();
+}
+
+void step(std::int64_t ns) {
+  timex change{};
+  change.modes = ADJ_SETOFFSET | ADJ_NANO;
+  const std::int64_t second = 1'000'000'000;
+  change.time.tv_sec = ns / second - (ns % second < 0 ? 1 : 0);
+  change.time.tv_usec = (ns % second + second) % second;  // nanoseconds, by ADJ_NANO
+  if (::adjtimex(&change) < 0) fail(std::string("cannot set the clock: ") + std::strerror(errno));
+}
+
+void answer_datagrams(int socket, std::deque<Other>& others) {
+  for (;;) {
+    std::array<char, 64> request{};
+    sockaddr_in from{};
+    socklen_t length = sizeof from;
+    const ssize_t size = ::recvfrom(socket, request.data(), request.size() - 1, MSG_DONTWAIT,
+                                    reinterpret_cast<sockaddr*>(&from), &length);
+    if (size < 0) return;
+    std::int64_t number = 0, ns = 0;
+    if (std::sscanf(request.data(), "%ld %ld", &number, &ns) != 2) continue;
+    if (ns) step(ns);
+    const std::string said = answer(number, look_at_clocks(), others);
+    ::sendto(socket, said.data(), said.size(), 0, reinterpret_cast<const sockaddr*>(&from), length);
+  }
+}
+
+int run(std::uint16_t port, const std::vector<std::string>& hosts) {
+  const UniqueFd socket(::socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0));
+  sockaddr_in address{};
+  address.sin_family = AF_INET;
+  address.sin_port = htons(port);
+  if (::bind(socket.get(), reinterpret_cast<const sockaddr*>(&address), sizeof address)) {
+    fail("cannot listen at UDP port " + std::to_string(port) + ": " + std::strerror(errno));
+  }
+  Session session = Session::connect().value();
+  Writer<BothClocks> writer = session.create<BothClocks>("truth", kHistory, kPeriod).value();
+  std::deque<Other> others;
+  for (const std::string& host : hosts) others.emplace_back(session, host);
+
+  std::printf("ready\n");
+  std::fflush(stdout);
+  MonoTime due = MonoClock::now();
+  for (;;) {
+    std::array<pollfd, 2> ready{{{socket.get(), POLLIN, 0}, {STDIN_FILENO, POLLIN, 0}}};
+    const Duration left = std::max(due - MonoClock::now(), Duration::zero());
+    const timespec timeout{0, static_cast<long>(left.count())};
+    ::ppoll(ready.data(), ready.size(), &timeout, nullptr);
+    if (ready[1].revents) return 0;
+    if (ready[0].revents) answer_datagrams(socket.get(), others);
+    if (MonoClock::now() < due) continue;
+    const BothClocks sample = look_at_clocks();
+    writer.write(sample, time_from_ns(sample.wall_ns));
+    due = std::max(due + kPeriod, MonoClock::now());  // what was missed is not made up for
+  }
+}
+
+}  // namespace
+}  // namespace dssm::test
+
+int main(int argc, char** argv) {
+  if (argc < 3) {
+    std::fprintf(stderr, "usage: fleet-clock PORT HOST...\n");
+    return 1;
+  }
+  const auto port = static_cast<std::uint16_t>(std::strtoul(argv[1], nullptr, 10));
+  const int status = dssm::test::run(port, {argv + 2, argv + argc});
+  std::_Exit(status);  // the threads that still wait for another host go with the process
+}
