@@ -29,7 +29,7 @@ RawWriter::~RawWriter() = default;
 
 Tid RawWriter::write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept {
   if (payload.size() != state_->payload_bytes) return kNoTid;
-  return state_->ring.write(payload, time, state_->stamp(time, clock_error));
+  return state_->ring.write_with(payload, time, [&] { return state_->stamp(time, clock_error); });
 }
 
 Loan RawWriter::loan() noexcept { return Loan(state_.get()); }

@@ -25,6 +25,14 @@ class RingWriter {
   // holds the lock already (a loan).
   Tid write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
 
+  // The same with a bound that has yet to be looked up: `clock_error()` is called once, with the
+  // lock held, so that the processor waits for its loads while it copies the payload. Before the
+  // lock, whose atomic operation waits for all that came before, it would cost what it takes.
+  template <class LookUp>
+  Tid write_with(std::span<const std::byte> payload, Time time, LookUp clock_error) noexcept {
+    return lock() ? write_locked(payload, time, clock_error()) : kNoTid;
+  }
+
   // The same without waiting for another writer: for dssmd, whose loop must not wait for a program.
   struct Attempt {
     enum class Outcome : unsigned char {

@@ -62,6 +62,7 @@ FleetClock::FleetClock(const EventLoop& loop, const Options& options, clock::Clo
       own_(std::move(own)),
       self_(self),
       policies_(options.policies),
+      log_(logger),
       watch_(loop, options.watch, *this, logger) {
   own_->standing.boot_id = clock::boot_id();
   own_->standing.anchor = self_;
@@ -89,6 +90,7 @@ void FleetClock::on_host_clock(const KnownHost& host) {
 }
 
 void FleetClock::on_host_down(const KnownHost& host, const Error&) {
+  log_.forget(host.greeting.host_id);
   if (source_ && host.greeting.host_id == source_->id) refresh();
 }
 
@@ -110,6 +112,7 @@ void FleetClock::refresh() {
   stand(state, now);
   judge_own(state);
   publish(state, instant);
+  tell_of_others(now);
   was_in_bounds_ |= is_good(own_->status);
   if (is_news(before, *own_)) {
     ++news_;
@@ -264,6 +267,16 @@ void FleetClock::publish(const clock::ClockState& state, const clock::Instant& n
   page_.store(record);
 }
 
+// While this clock is not good, nobody's is here; the log says that of this clock.
+void FleetClock::tell_of_others(MonoTime now) {
+  if (policies_.general.policy == ClockPolicy::off || !is_good(own_->status)) return;
+  for (const auto& [id, host] : catalog_.hosts()) {
+    if (id == self_) continue;
+    log_.look(id, host.greeting.host,
+              trouble_with(host.greeting.clock.get(), policies_.general.limit), now);
+  }
+}
+
 std::string FleetClock::str() const {
   std::string text = "clock " + std::string(name_of(own_->status));
   if (own_->status == ClockStatus::unknown) return text;
@@ -327,21 +340,27 @@ ring::ClockVerdict FleetClock::judge(const StreamId& id, const wire::ClockReport
   return verdict;
 }
 
-Error FleetClock::why_not(const StreamId& id, const wire::ClockReport* owner) const {
-  std::string why = "nothing is known of its host's clock";
-  if (own_->standing.bound == kUnknownClockError) {
-    why = "the " + str() + " on this PC";
-  } else if (owner && owner->standing.bound == kUnknownClockError) {
-    why = "the clock of its host is " + std::string(name_of(owner->status)) + " (" +
-          std::string(name_of(owner->trouble)) + ")";
-  } else if (owner) {
-    const Duration distance = distance_to(*owner);
-    why = distance == kUnknownClockError
-              ? "the clocks of its host and of this PC follow different references"
-              : "the clocks of its host and of this PC may be " + in_microseconds(distance) +
-                    " apart, and " + in_microseconds(policies_.demand_for(id).limit) +
-                    " are allowed (key clock_limit)";
+// Why the times of that host's samples are not good here; empty: they are.
+std::string FleetClock::trouble_with(const wire::ClockReport* owner, Duration limit) const {
+  if (!owner) return "nothing is known of its host's clock";
+  if (clock::share_clock(own_->standing, owner->standing)) return {};
+  if (own_->standing.bound == kUnknownClockError) return "the " + str() + " on this PC";
+  if (owner->standing.bound == kUnknownClockError) {
+    return "the clock of its host is " + std::string(name_of(owner->status)) + " (" +
+           std::string(name_of(owner->trouble)) + ")";
   }
+  const Duration distance = distance_to(*owner);
+  if (distance == kUnknownClockError) {
+    return "the clocks of its host and of this PC follow different references";
+  }
+  if (distance <= limit) return {};
+  return "the clocks of its host and of this PC may be " + in_microseconds(distance) +
+         " apart, and " + in_microseconds(limit) + " are allowed (key clock_limit)";
+}
+
+Error FleetClock::why_not(const StreamId& id, const wire::ClockReport* owner) const {
+  const std::string trouble = trouble_with(owner, policies_.demand_for(id).limit);
+  const std::string why = trouble.empty() ? "its host's clock was not known just now" : trouble;
   return Error{Errc::clock_out_of_bounds,
                "stream '" + id.str() + "': " + why +
                    "; look at `dssmctl clock` and at `chronyc tracking` on both, or set the key "

@@ -18,6 +18,7 @@
 #include "core/wire/clock_report.hpp"
 #include "daemon/channel/clock_rules.hpp"
 #include "daemon/clock/clock_watch.hpp"
+#include "daemon/clock/host_clock_log.hpp"
 #include "daemon/discovery/catalog.hpp"
 #include "daemon/service/event_loop.hpp"
 
@@ -90,6 +91,8 @@ class FleetClock final : public ClockRules, private ClockWatch::Observer, privat
   void choose_anchor(const clock::ClockState& state, MonoTime now);
   void judge_own(const clock::ClockState& state);
   void publish(const clock::ClockState& state, const clock::Instant& now);
+  void tell_of_others(MonoTime now);
+  std::string trouble_with(const wire::ClockReport* owner, Duration limit) const;
 
   Catalog& catalog_;
   clock::ClockPageWriter page_;
@@ -103,6 +106,7 @@ class FleetClock final : public ClockRules, private ClockWatch::Observer, privat
   bool was_in_bounds_ = false;
   std::uint64_t news_ = 0;
   std::function<void()> on_change_, on_news_;
+  HostClockLog log_;
   ClockWatch watch_;  // last: it calls the others
 };
 

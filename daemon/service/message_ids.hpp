@@ -39,5 +39,7 @@ inline constexpr std::string_view kClockStepped = "5d6eb3fceee243358e4818b0fde7d
 inline constexpr std::string_view kChronydAway = "4c74591c07464db9acb5c74a1f430715";
 inline constexpr std::string_view kClockOutOfBounds = "55d27db9b00947b3be6b238caa5c8e5e";
 inline constexpr std::string_view kClockInBounds = "4a6b6d5b038d4fc99bf6da04034435c4";
+inline constexpr std::string_view kHostClockOutOfBounds = "f9499dfd06ca40afa1f6fa6c5b19d9dc";
+inline constexpr std::string_view kHostClockInBounds = "54bb5043dc954f85843dd6b355e528d0";
 
 }  // namespace dssm::daemon::message_id

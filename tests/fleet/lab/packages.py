@@ -28,14 +28,16 @@ class Artifacts:
     preload: pathlib.Path  # for the guests' kernels; see uml_xstate.c
 
 
-def build(folder: pathlib.Path, packages: pathlib.Path | None) -> Artifacts:
-    """Builds in `folder`, which meson knows or will; `packages`: a folder with packages that are built."""
-    if not (folder / "build.ninja").exists():
-        run("meson", "setup", folder, ROOT, "-Dunity=on", "-Dunity_size=16", "-Dbenchmarks=false",
-            what="configure the build", contained=True)
+def build(folder: pathlib.Path, programs: pathlib.Path | None, packages: pathlib.Path | None) -> Artifacts:
+    """Builds in `folder`, which meson knows or will; `programs` and `packages`: folders where these are built."""
     targets = ["tests/fleet/fleet-clock", "tests/fleet/fleet-load", "tests/fleet/uml-xstate.so",
                *(f"{EXAMPLE}/{name}" for name in ("encoder", "lidar", "localizer", "mapper"))]
-    run("ninja", "-C", folder, *targets, what="build the fleet's programs", timeout=3600, contained=True)
+    if programs is None:
+        programs = folder
+        if not (folder / "build.ninja").exists():
+            run("meson", "setup", folder, ROOT, "-Dunity=on", "-Dunity_size=16", "-Dbenchmarks=false",
+                what="configure the build", contained=True)
+        run("ninja", "-C", folder, *targets, what="build the fleet's programs", timeout=3600, contained=True)
     if packages is None:
         packages = folder / "packages"
         shutil.rmtree(packages, ignore_errors=True)  # the role wants no other version beside it
@@ -43,7 +45,7 @@ def build(folder: pathlib.Path, packages: pathlib.Path | None) -> Artifacts:
             contained=True)
     for name in INSTALLED:
         package_file(packages, name)
-    files = [folder / target for target in targets]
+    files = [programs / target for target in targets]
     return Artifacts(packages, [file for file in files if file.suffix != ".so"],
                      next(file for file in files if file.suffix == ".so"))
 

@@ -1,0 +1,31 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/clock/host_clock_log.hpp"
+
+#include "daemon/service/message_ids.hpp"
+
+namespace dssm::daemon {
+
+void HostClockLog::look(const wire::HostId& id, const std::string& name, const std::string& trouble,
+                        MonoTime now) {
+  Seen& seen = hosts_[id];
+  const bool is_good = trouble.empty();
+  if (is_good) {
+    seen.bad_since.reset();
+    seen.was_good = true;
+  } else if (!seen.bad_since) {
+    seen.bad_since = now;
+  }
+  const bool is_due = seen.was_good || (seen.bad_since && now - *seen.bad_since >= kPatience);
+  // What comes and goes while nothing may be said is left out; what stays is told later.
+  if (is_good != seen.told || !is_due || seen.pace.wait(now) > Duration::zero()) return;
+  seen.pace.take(now);
+  seen.told = !is_good;
+  if (is_good) {
+    return logger_.notice("the times of " + in_quotes(name) + "'s samples are good here again",
+                          {.message_id = message_id::kHostClockInBounds});
+  }
+  logger_.warning("the times of " + in_quotes(name) + "'s samples are not good here: " + trouble,
+                  {.message_id = message_id::kHostClockOutOfBounds});
+}
+
+}  // namespace dssm::daemon
