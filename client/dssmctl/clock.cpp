@@ -2,6 +2,8 @@
 //
 // dssmctl clock: how good the fleet's clocks are, a row per host; as it changes (--watch), as a
 // table of statistics (--table), or as something to wait for (--wait).
+#include <algorithm>
+#include <cmath>
 #include <dssm/clock.hpp>
 #include <map>
 #include <thread>

@@ -424,6 +424,29 @@ void check_hosts(const Facts& facts, Findings& findings) {
   }
 }
 
+// What the fleet's clocks are worth to each other; a PC that is alone has nobody to differ from.
+void check_fleet_clocks(const Facts& facts, Findings& findings) {
+  for (const HostInfo& host : facts.hosts) {
+    if (host.state != "up" || !is_other_pc(host) || !host.clock) continue;
+    const ClockInfo& clock = *host.clock;
+    Finding finding{"clock of " + name_of(host),
+                    Status::ok,
+                    "at most " + bound_text(clock.distance) + " from this one's",
+                    {},
+                    {}};
+    if (clock.distance == kUnknownClockError) {
+      finding.status = Status::warn;
+      finding.text = "it is not known how far it is from this one's (" +
+                     std::string(dssm::name_of(clock.status)) + " there)";
+      finding.cause =
+          "one of both is not synchronized, or they follow different references; reads of its "
+          "samples by time are refused, unless clock_policy says otherwise";
+      finding.command = "dssmctl clock  # then `chronyc sources` where it is not 'synchronized'";
+    }
+    findings.push_back(std::move(finding));
+  }
+}
+
 void check_host_names(const Facts& facts, Findings& findings) {
   std::map<std::string, std::set<std::string>> ids;  // by name
   for (const HostInfo& host : facts.hosts) {
@@ -487,6 +510,7 @@ std::vector<Finding> findings_of(const Facts& facts) {
   check_listening(facts, findings);
   check_mdns(facts, findings);
   check_hosts(facts, findings);
+  check_fleet_clocks(facts, findings);
   check_host_names(facts, findings);
   check_stream_names(facts, findings);
   return findings;

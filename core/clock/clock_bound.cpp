@@ -23,10 +23,6 @@ Duration beyond(Duration own, Duration reference) noexcept {
 
 }  // namespace
 
-Duration sum(Duration a, Duration b) noexcept {
-  return a > kUnknownClockError - b ? kUnknownClockError : a + b;
-}
-
 Duration bound_to_root(Duration offset, const RootDistance& own) noexcept {
   return bound_to_reference(offset, own, {});
 }

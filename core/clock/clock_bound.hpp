@@ -12,6 +12,8 @@
 #include <cstdint>
 #include <dssm/time.hpp>
 
+#include "core/base/bound_sum.hpp"
+
 namespace dssm::clock {
 
 // How far a clock runs away, in billionths (ns per second): 50 ppm are 50,000.
@@ -25,8 +27,7 @@ struct RootDistance {
   friend bool operator==(const RootDistance& a, const RootDistance& b) = default;
 };
 
-// a + b, both >= 0.
-Duration sum(Duration a, Duration b) noexcept;
+using dssm::sum;
 
 // Distance from the time that the clock's root has (UTC): |offset| + dispersion + delay / 2.
 Duration bound_to_root(Duration offset, const RootDistance& own) noexcept;

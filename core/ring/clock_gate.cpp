@@ -3,14 +3,12 @@
 
 #include <algorithm>
 
+#include "core/base/bound_sum.hpp"
+
 namespace dssm::ring {
 namespace {
 
 constexpr int kTries = 1000;
-
-Duration sum(Duration a, Duration b) noexcept {
-  return a > kUnknownClockError - b ? kUnknownClockError : a + b;
-}
 
 }  // namespace
 

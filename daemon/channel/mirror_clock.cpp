@@ -17,8 +17,9 @@ void MirrorClock::on_owner(Report report, Tid newest) noexcept {
   heard_ = true;
   const Report before = std::exchange(report_, std::move(report));
   if (!is_known(report_)) {
-    // Open from the first sample on that we do not have yet.
-    if (!is_in_doubt()) doubtful_first_ = newest + 1;
+    // From the first sample on that we do not have yet; what was in doubt before stays so, with all
+    // in between.
+    if (doubtful_first_ > doubtful_last_) doubtful_first_ = newest + 1;
     doubtful_last_ = INT64_MAX;
   } else if (is_in_doubt()) {
     doubtful_last_ = newest;

@@ -13,17 +13,18 @@
 namespace dssm::daemon {
 
 ChronydClient::ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, User& user,
-                             Now now)
+                             Now now, Duration period)
     : loop_(loop),
       chronyd_(chronyd),
       user_(user),
       now_(std::move(now)),
+      period_(period),
       timer_(EventSource::timer(loop, [this] { on_timer(); })) {
   timer_.enable_in(Duration::zero());
 }
 
 void ChronydClient::on_timer() {
-  timer_.enable_in(kPeriod);
+  timer_.enable_in(period_);
   if (question_) {
     const Question unanswered = *std::exchange(question_, {});
     user_.on_no_answer(unanswered.why.value_or(

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Asks chronyd once a second how the clock is. Each question goes out of a socket of its own, with
-// a random number: an answer that comes late, or to somebody else, finds nobody; nothing is carried
-// over from one question to the next, so a chronyd that comes, goes, or hangs needs no handling.
-// Never blocks, and does bounded work in each second whatever is sent to it.
+// Asks chronyd again and again how the clock is. Each question goes out of a socket of its own,
+// with a random number: an answer that comes late, or to somebody else, finds nobody; nothing is
+// carried over from one question to the next, so a chronyd that comes, goes, or hangs needs no
+// handling. Never blocks, and does bounded work in each period whatever is sent to it.
 #pragma once
 
 #include <cstddef>
@@ -34,16 +34,17 @@ class ChronydClient {
                            const clock::Instant& answered) = 0;
     // Nothing listens there; told after each question.
     virtual void on_no_chronyd() = 0;
-    // A second has passed without an answer that can be read.
+    // A period has passed without an answer that can be read.
     virtual void on_no_answer(const Error& why) = 0;
 
    protected:
     ~User() = default;
   };
 
-  // Asks at once when the loop runs, and then every kPeriod. What is given by reference outlives
+  // Asks at once when the loop runs, and then once a period. What is given by reference outlives
   // it.
-  ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, User& user, Now now);
+  ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, User& user, Now now,
+                Duration period = kPeriod);
   ChronydClient(const ChronydClient&) = delete;
   ChronydClient& operator=(const ChronydClient&) = delete;
 
@@ -65,6 +66,7 @@ class ChronydClient {
   const wire::SocketAddress chronyd_;
   User& user_;
   const Now now_;
+  const Duration period_;
   std::optional<Question> question_;  // until it is answered or refused
   UniqueFd socket_;
   EventSource readable_, timer_;

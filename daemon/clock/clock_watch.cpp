@@ -35,7 +35,7 @@ ClockWatch::ClockWatch(const EventLoop& loop, const Options& options, Observer& 
       logger_(logger),
       now_(options.now),
       estimator_(options.settings),
-      client_(loop, options.chronyd, *this, options.now) {
+      client_(loop, options.chronyd, *this, options.now, options.period) {
   Result<std::unique_ptr<StepWatch>> watch = StepWatch::open(loop, [this] { on_set(); });
   if (watch) {
     step_watch_ = *std::move(watch);

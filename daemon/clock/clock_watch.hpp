@@ -24,7 +24,9 @@ class ClockWatch final : private ChronydClient::User {
   struct Options {
     wire::SocketAddress chronyd;
     clock::ClockEstimator::Settings settings;
-    ChronydClient::Now now = clock::Instant::now;  // tests put their own in its place
+    // Tests put their own in their places.
+    ChronydClient::Now now = clock::Instant::now;
+    Duration period = ChronydClient::kPeriod;
   };
 
   class Observer {

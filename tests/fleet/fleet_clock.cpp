@@ -5,7 +5,7 @@
 //
 //   fleet-clock PORT HOST...
 //
-// Writes the stream "truth" a hundred times a second, each sample holding both clocks, stamped as
+// Writes the stream "truth" a hundred times a second, each sample holding its clocks, stamped as
 // any program's samples are, and reads that of each other HOST. Answers each datagram "NUMBER STEP"
 // at UDP PORT with JSON, see answer(); a STEP other than 0 sets the wall clock forward by so many
 // nanoseconds first, or backward when it is negative.
@@ -45,18 +45,26 @@ using namespace std::chrono_literals;
 constexpr Duration kPeriod = 10ms;
 constexpr Duration kHistory = 10s;
 
-struct BothClocks {
+struct Clocks {
   std::int64_t wall_ns = 0, mono_ns = 0;
-  std::int64_t within_ns = 0;  // between looking at the monotonic clock before and after the other
+  std::int64_t raw_ns = 0;     // CLOCK_MONOTONIC_RAW: nobody slews or sets it
+  std::int64_t within_ns = 0;  // between looking at that before and after the others
   std::int64_t life = 0;       // of the program
 };
 
-BothClocks look_at_clocks() {
+std::int64_t raw_now_ns() {
+  timespec now{};
+  ::clock_gettime(CLOCK_MONOTONIC_RAW, &now);
+  return std::int64_t{now.tv_sec} * 1'000'000'000 + now.tv_nsec;
+}
+
+Clocks look_at_clocks() {
   static const std::int64_t life = to_ns(WallClock::now());
-  const MonoTime before = MonoClock::now();
-  const Time wall = WallClock::now();
-  const Duration within = MonoClock::now() - before;
-  return {to_ns(wall), (before + within / 2).time_since_epoch().count(), within.count(), life};
+  const std::int64_t before = raw_now_ns();
+  const std::int64_t wall = to_ns(WallClock::now());
+  const std::int64_t mono = MonoClock::now().time_since_epoch().count();
+  const std::int64_t within = raw_now_ns() - before;
+  return {wall, mono, before + within / 2, within, life};
 }
 
 [[noreturn]] void fail(const std::string& what) {
@@ -70,20 +78,18 @@ class Other {
   Other(Session session, std::string host)
       : host_(std::move(host)), opening_([this, session = std::move(session)]() mutable {
           // Refused again and again until both clocks are good.
-          reader_.emplace(session.await_reader<BothClocks>("truth@" + host_).value());
+          reader_.emplace(session.await_reader<Clocks>("truth@" + host_).value());
           open_.store(true, std::memory_order_release);
         }) {
     opening_.detach();  // until the process ends
   }
 
   const std::string& host() const { return host_; }
-  Reader<BothClocks>* reader() {
-    return open_.load(std::memory_order_acquire) ? &*reader_ : nullptr;
-  }
+  Reader<Clocks>* reader() { return open_.load(std::memory_order_acquire) ? &*reader_ : nullptr; }
 
  private:
   const std::string host_;
-  std::optional<Reader<BothClocks>> reader_;
+  std::optional<Reader<Clocks>> reader_;
   std::atomic<bool> open_ = false;
   std::thread opening_;
 };
@@ -91,15 +97,15 @@ class Other {
 // -1: nothing is known.
 std::int64_t known_ns(Duration error) { return error == kUnknownClockError ? -1 : error.count(); }
 
-void put(nlohmann::json& to, const BothClocks& clocks) {
-  to["mono"] = clocks.mono_ns;
+void put(nlohmann::json& to, const Clocks& clocks) {
+  to["raw"] = clocks.raw_ns;
   to["within"] = clocks.within_ns;
   to["life"] = clocks.life;
 }
 
 // A sample, and what DSSM says of its time on this PC.
-nlohmann::json statement(const Reader<BothClocks>& reader, ReadStatus status,
-                         const BothClocks& sample, const SampleInfo& info) {
+nlohmann::json statement(const Reader<Clocks>& reader, ReadStatus status, const Clocks& sample,
+                         const SampleInfo& info) {
   nlohmann::json said{{"status", status_name(status)}};
   if (status != ReadStatus::ok) return said;
   said["time"] = to_ns(info.time);
@@ -110,8 +116,8 @@ nlohmann::json statement(const Reader<BothClocks>& reader, ReadStatus status,
 }
 
 // The read that is refused when a clock may be too far off, and the one that never is.
-nlohmann::json statements(Reader<BothClocks>& reader) {
-  BothClocks sample;
+nlohmann::json statements(Reader<Clocks>& reader) {
+  Clocks sample;
   SampleInfo info;
   ReadStatus status = reader.at(WallClock::now(), sample, info);
   nlohmann::json by_time = statement(reader, status, sample, info);
@@ -120,8 +126,8 @@ nlohmann::json statements(Reader<BothClocks>& reader) {
 }
 
 // All others' samples of one time.
-nlohmann::json joint_statement(const std::vector<Reader<BothClocks>*>& readers) {
-  std::vector<BothClocks> samples(readers.size());
+nlohmann::json joint_statement(const std::vector<Reader<Clocks>*>& readers) {
+  std::vector<Clocks> samples(readers.size());
   std::vector<JointSample> joint;
   for (std::size_t i = 0; i < readers.size(); ++i) joint.push_back(readers[i]->joint(samples[i]));
   const JointRead read = at(WallClock::now(), joint, 1ms);
@@ -134,28 +140,30 @@ nlohmann::json joint_statement(const std::vector<Reader<BothClocks>*>& readers) 
   return said;
 }
 
-// {"number", "wall", "mono", "within", "life": this PC's clocks when the question had come,
-//  "mono_end": when this is sent, "own": {"status", "error"},
+// {"number", "wall", "mono", "raw", "within", "life": this PC's clocks when the question had come,
+//  "raw_end": when this is sent, "own": {"status", "error"},
 //  "others": {HOST: {"by_time": SAMPLE, "newest": SAMPLE}},
 //  "joint": {"status", "error", "samples": {HOST: SAMPLE}}}
-// SAMPLE: {"status", "time", "mono", "within", "life", "error", "good"}, clocks being its writer's.
-// Times and errors in ns, an error of -1 being unknown. "joint" only when all others are there.
-std::string answer(std::int64_t number, const BothClocks& came, std::deque<Other>& others) {
+// SAMPLE: {"status", "time", "raw", "within", "life", "error", "good"}, clocks being its
+// writer's. Times and errors in ns, an error of -1 being unknown. "joint" only when all others are
+// there.
+std::string answer(std::int64_t number, const Clocks& came, std::deque<Other>& others) {
   const clock::Reading own = clock::now();
   nlohmann::json said{{"number", number},
                       {"wall", came.wall_ns},
+                      {"mono", came.mono_ns},
                       {"own", {{"status", name_of(own.status)}, {"error", known_ns(own.error)}}},
                       {"others", nlohmann::json::object()}};
   put(said, came);
-  std::vector<Reader<BothClocks>*> readers;
+  std::vector<Reader<Clocks>*> readers;
   for (Other& other : others) {
-    if (Reader<BothClocks>* reader = other.reader()) {
+    if (Reader<Clocks>* reader = other.reader()) {
       said["others"][other.host()] = statements(*reader);
       readers.push_back(reader);
     }
   }
   if (!readers.empty() && readers.size() == others.size()) said["joint"] = joint_statement(readers);
-  said["mono_end"] = MonoClock::now().time_since_epoch().count();
+  said["raw_end"] = raw_now_ns();
   return said.dump();
 }
 
@@ -193,7 +201,7 @@ int run(std::uint16_t port, const std::vector<std::string>& hosts) {
     fail("cannot listen at UDP port " + std::to_string(port) + ": " + std::strerror(errno));
   }
   Session session = Session::connect().value();
-  Writer<BothClocks> writer = session.create<BothClocks>("truth", kHistory, kPeriod).value();
+  Writer<Clocks> writer = session.create<Clocks>("truth", kHistory, kPeriod).value();
   std::deque<Other> others;
   for (const std::string& host : hosts) others.emplace_back(session, host);
 
@@ -208,7 +216,7 @@ int run(std::uint16_t port, const std::vector<std::string>& hosts) {
     if (ready[1].revents) return 0;
     if (ready[0].revents) answer_datagrams(socket.get(), others);
     if (MonoClock::now() < due) continue;
-    const BothClocks sample = look_at_clocks();
+    const Clocks sample = look_at_clocks();
     writer.write(sample, time_from_ns(sample.wall_ns));
     due = std::max(due + kPeriod, MonoClock::now());  // what was missed is not made up for
   }

@@ -1,17 +1,21 @@
 # SPDX-License-Identifier: Apache-2.0
 """The clocks of the guests as they are, measured from outside, and what DSSM states about them.
 
-Asks each guest's fleet-clock (fleet_clock.cpp) some 30 times a second. An answer holds both clocks of
-the guest, and statements about the samples of the others; each sample holds both clocks of its
-writer. This machine's monotonic clock is what all are compared with: a question that left at t1 and
-whose answer was there at t2 was answered in between, so what is computed of a clock has a width, half
-a round trip, and a statement is called false only when it is for all values within.
+Asks each guest's fleet-clock (fleet_clock.cpp) some 30 times a second. An answer holds the clocks of
+the guest and statements about the samples of the others; each sample holds the clocks of its writer.
+
+What all are compared with is this machine's monotonic clock, which is what a User Mode Linux kernel
+counts its CLOCK_MONOTONIC_RAW by: the two differ by what they differed by when it booted. A question
+that left at t1 and was answered at t2 was looked at in between; all of them together bound that
+difference. So what is computed of a clock has a width, and a statement is called false only when it
+is for all values within.
 """
 
 import bisect
 import dataclasses
 import itertools
 import json
+import math
 import select
 import socket
 import statistics
@@ -30,25 +34,32 @@ PERIOD_SECONDS = 0.03
 MOST_ASKED = 300  # questions whose answers may still come
 LIMIT_NS = 1_500_000  # dssmd's default clock_limit
 STEADY_SECONDS = 1.5  # without one statement that is not good: recovered
+RECOVERY_SECONDS = 180
 SECOND_NS = 10**9
 
 
 @dataclasses.dataclass
 class Look:
-    """A guest's clocks at the moment `at` of this machine's clock, all in ns."""
+    """A guest's clocks, all in ns, and what was said with them."""
 
-    at: float
-    width: float  # half of what `at` may be off
+    came: int  # when that was here
     wall: int
     mono: int
+    raw: int
+    within: int
     said: dict[str, Any]
+
+    def status_of(self, owner: str) -> str:
+        """How a read by time of another guest's samples ended; "closed": they cannot be had yet."""
+        status: str = self.said["others"].get(owner, {"by_time": {"status": "closed"}})["by_time"]["status"]
+        return status
 
 
 @dataclasses.dataclass
 class Checked:
     """A statement about a sample of `owner` made on the PC `reader`, beside the truth. In ns."""
 
-    at: float
+    came: int
     reader: str
     owner: str
     good: bool
@@ -62,32 +73,33 @@ class Checked:
 
 
 class Life:
-    """What was seen of one run of fleet-clock: within it the monotonic clock goes on."""
+    """What was seen of one run of fleet-clock."""
 
     def __init__(self) -> None:
         self.looks: list[Look] = []
+        self._ahead_least, self._ahead_most = -math.inf, math.inf
 
-    def at_mono(self, mono: int) -> tuple[float, float] | None:
-        """This machine's time when the guest's monotonic clock showed `mono`, and its width."""
-        index = bisect.bisect_right(self.looks, mono, key=lambda look: look.mono)
-        return self._between(index, lambda a, b: (mono - a.mono) / (b.mono - a.mono),
-                             lambda a, b, part: a.at + part * (b.at - a.at))
+    def note(self, look: Look, left: int) -> None:
+        """Adds the answer to a question that left here at `left`."""
+        self._ahead_least = max(self._ahead_least, left - look.raw - look.within)
+        self._ahead_most = min(self._ahead_most, look.came - look.said["raw_end"])
+        if not self.looks or self.looks[-1].raw < look.raw:
+            self.looks.append(look)
 
-    def mono_at(self, at: float) -> tuple[float, float] | None:
-        """The guest's monotonic clock at a time of this machine, and its width."""
-        index = bisect.bisect_right(self.looks, at, key=lambda look: look.at)
-        return self._between(index, lambda a, b: (at - a.at) / (b.at - a.at),
-                             lambda a, b, part: a.mono + part * (b.mono - a.mono))
+    def ahead(self) -> tuple[float, float]:
+        """This machine's monotonic clock minus the guest's raw one, and its width."""
+        assert self._ahead_least <= self._ahead_most, "the guest does not count time as this machine does"
+        return ((self._ahead_least + self._ahead_most) / 2, (self._ahead_most - self._ahead_least) / 2)
 
-    def _between(self, index: int, part_of: Any, value_of: Any) -> tuple[float, float] | None:
-        if not 0 < index < len(self.looks):
+    def wall_at(self, raw: float, look: Look) -> tuple[float, float] | None:
+        """What the wall clock that `look` shows would have shown when the raw one showed `raw`, and its
+        width: what the PC slewed in between."""
+        index = bisect.bisect_right(self.looks, raw, key=lambda each: each.raw) - 1
+        if index < 0:
             return None
-        before, after = self.looks[index - 1], self.looks[index]
-        # While chronyd slews, the guest's second is not this machine's, and where that began within
-        # the interval is not known.
-        bend = abs((after.mono - before.mono) - (after.at - before.at))
-        part = part_of(before, after)
-        return value_of(before, after, part), max(before.width, after.width) + bend
+        before = self.looks[index]
+        slewed = abs((look.mono - before.mono) - (look.raw - before.raw))
+        return look.wall - (look.raw - raw), look.within + slewed
 
 
 class Watched:
@@ -96,16 +108,16 @@ class Watched:
     def __init__(self, guest: Guest) -> None:
         self.guest = guest
         self.lives: dict[int, Life] = {}
-        self.steps: list[float] = []  # when its clock was set from here
+        self.steps: list[int] = []  # when its clock was set from here
 
     @property
-    def looks(self) -> list[Look]:
-        """Those of the last life."""
-        return next(reversed(self.lives.values())).looks if self.lives else []
+    def last(self) -> Life:
+        """The one that goes on."""
+        return next(reversed(self.lives.values())) if self.lives else Life()
 
 
 class Truth:
-    """Watches from `with watching()` on; what it saw is judged after that."""
+    """Watches within `with watching()`; what it saw is judged after that."""
 
     def __init__(self, guests: Iterable[Guest]) -> None:
         self.watched = {guest.name: Watched(guest) for guest in guests}
@@ -141,7 +153,7 @@ class Truth:
             for guest in guests:
                 guest.ssh.abandon()
 
-    def step(self, guest: Guest, ns: int) -> float:
+    def step(self, guest: Guest, ns: int) -> int:
         """Sets a guest's clock forward by `ns`; returns when that was."""
         steps = self.watched[guest.name].steps
         before = len(steps)
@@ -149,38 +161,47 @@ class Truth:
         await_that(f"{guest.name}'s clock is set", lambda: (len(steps) > before, len(steps)))
         return steps[-1]
 
-    def now(self) -> float:
-        """A moment, for since= below."""
-        return float(time.monotonic_ns())
-
-    def await_good(self, *names: str) -> float:
-        """Waits until these guests have called each other's samples good for a while, and returns when that
-        began."""
-        begin = self.now()
+    def await_good(self, *names: str) -> int:
+        """Waits until these guests, or all, have called each other's samples good for a while, and returns
+        when that began."""
+        begin = time.monotonic_ns()
         wanted = names or tuple(self.watched)
 
         def look() -> tuple[bool, object]:
             bad, since = self._last_not_good(wanted, begin)
-            return self.now() - since > STEADY_SECONDS * SECOND_NS, bad
+            return time.monotonic_ns() - since > STEADY_SECONDS * SECOND_NS, bad
 
-        await_that(f"{', '.join(wanted)} call each other's clocks good", look, 180)
+        await_that(f"{', '.join(wanted)} call each other's clocks good", look, RECOVERY_SECONDS)
         return self._last_not_good(wanted, begin)[1]
 
-    def _last_not_good(self, names: Iterable[str], begin: float) -> tuple[str, float]:
+    def await_refused(self, owner: str, since: int) -> float:
+        """Waits until a read of a guest's samples is refused elsewhere for its time; after how many seconds
+        since `since` that was for the first time."""
+        def refused() -> list[int]:
+            return [look.came for name, watched in self.watched.items() if name != owner
+                    for look in reversed(watched.last.looks) if look.came > since
+                    and look.status_of(owner) == "clock_out_of_bounds"]
+
+        await_that(f"reads of {owner}'s samples by time are refused", lambda: (bool(refused()), None))
+        return (min(refused()) - since) / SECOND_NS
+
+    def share_good(self, reader: str, owner: str, since: int) -> float:
+        """The share of the reads of `owner`'s samples that were good, of those since then."""
+        said = [look.status_of(owner) for look in self.watched[reader].last.looks if look.came > since]
+        return said.count("ok") / max(len(said), 1)
+
+    def _last_not_good(self, names: Iterable[str], begin: int) -> tuple[str, int]:
         last = ("nothing", begin)
         for name in names:
-            looks = self.watched[name].looks
-            if not looks or looks[-1].at < self.now() - SECOND_NS:
-                return f"{name} does not answer", self.now()
-            for other in names:
-                if other == name:
-                    continue
-                for look in reversed(looks):
-                    if look.at < last[1]:
+            looks = self.watched[name].last.looks
+            if not looks or looks[-1].came < time.monotonic_ns() - SECOND_NS:
+                return f"{name} does not answer", time.monotonic_ns()
+            for owner in names:
+                for look in reversed(looks) if owner != name else ():
+                    if look.came < last[1]:
                         break
-                    said = look.said["others"].get(other, {"by_time": {"status": "not open"}})["by_time"]
-                    if said["status"] != "ok":
-                        last = (f"{name} reads {other}: {said['status']}", look.at)
+                    if look.status_of(owner) != "ok":
+                        last = (f"{name} reads {owner}: {look.status_of(owner)}", look.came)
                         break
         return last
 
@@ -217,23 +238,19 @@ class Truth:
             return
         name, left, stepped = asked
         watched = self.watched[name]
-        spent = said["mono_end"] - said["mono"]
-        width = max(0, came - left - spent) / 2 + said["within"] / 2
-        look = Look(left + width, width, said["wall"], said["mono"], said)
+        look = Look(came, said["wall"], said["mono"], said["raw"], said["within"], said)
         if stepped:
-            watched.steps.append(look.at)
-        looks = watched.lives.setdefault(said["life"], Life()).looks
-        if not looks or (looks[-1].at < look.at and looks[-1].mono < look.mono):
-            looks.append(look)
+            watched.steps.append(came)
+        watched.lives.setdefault(said["life"], Life()).note(look, left)
 
     # --- what was seen ---
 
-    def checked(self, kind: str, since: float = 0) -> Iterator[Checked]:
-        """All statements of a kind ("by_time", "newest", "joint") beside the truth."""
+    def checked(self, kind: str) -> Iterator[Checked]:
+        """All statements of a kind (KINDS) beside the truth."""
         for name, watched in self.watched.items():
             for life in watched.lives.values():
                 for look in life.looks:
-                    for owner, said in statements(look, kind) if look.at >= since else ():
+                    for owner, said in statements(look, kind):
                         checked = self._check(name, life, look, owner, said)
                         if checked:
                             yield checked
@@ -241,28 +258,32 @@ class Truth:
     def _check(self, reader: str, life: Life, look: Look, owner: str, said: dict[str, Any]
                ) -> Checked | None:
         writer = self.watched[owner].lives.get(said["life"])
-        written = writer and writer.at_mono(said["mono"])
-        then = written and life.mono_at(written[0])
-        if not written or not then:
-            return None  # before the first look, or after the last
-        wall_then = look.wall - (look.mono - then[0])
-        width = written[1] + then[1] + said["within"]
-        return Checked(look.at, reader, owner, said["good"], said["error"],
-                       said["time"] - wall_then, width)
+        if writer is None:
+            return None  # it died before it was seen
+        writer_ahead, writer_width = writer.ahead()
+        ahead, width = life.ahead()
+        wall = life.wall_at(said["raw"] + writer_ahead - ahead, look)
+        if wall is None:
+            return None  # written before the first look
+        return Checked(look.came, reader, owner, said["good"], said["error"], said["time"] - wall[0],
+                       width + writer_width + wall[1] + said["within"])
 
-    def true_offsets(self, name: str, reference: str, since: float = 0) -> list[tuple[float, float]]:
+    def true_offsets(self, name: str, reference: str, since: int) -> list[tuple[float, float]]:
         """How far a guest's clock was ahead of another's, and the width, at each look of its [ns]."""
         found = []
-        looks = self.watched[reference].looks
-        for look in self.watched[name].looks:
-            index = bisect.bisect_right(looks, look.at, key=lambda each: each.at)
-            if look.at < since or not 0 < index < len(looks):
-                continue
-            near = looks[index - 1]
-            found.append((look.wall - near.wall - (look.at - near.at), look.width + near.width))
+        own, other = self.watched[name].last, self.watched[reference].last
+        (own_ahead, own_width), (other_ahead, other_width) = own.ahead(), other.ahead()
+        for look in own.looks:
+            raw = look.raw + own_ahead - other_ahead
+            index = bisect.bisect_right(other.looks, raw, key=lambda each: each.raw) - 1
+            if look.came > since and index >= 0:
+                near = other.looks[index]
+                found.append((look.wall - (near.wall + raw - near.raw),
+                              own_width + other_width + look.within + near.within))
         return found
 
 
+# Reads by time; of the newest sample by number; and of all others' samples together.
 KINDS = ("by_time", "newest", "joint")
 # A program that asks for the time just after its own PC's clock was set has it before dssmd has
 # noticed: docs/clocks.md "What is not covered".
@@ -275,26 +296,27 @@ def expect_true(truth: Truth) -> None:
     stated = [each for each in everything if each.stated >= 0]
     good = [each for each in everything if each.good]
     assert good, "nothing was called good"
-    print(f"  | {len(everything)} statements, {len(stated)} with a bound, {len(good)} good; medians: bound"
-          f" {_median_us(each.stated for each in stated)} us, true {_median_us(abs(each.true) for each in stated)}"
-          f" us, known within {_median_us(each.width for each in stated)} us; the worst used"
-          f" {max((abs(each.true) - each.width) / max(each.stated, 1) for each in stated):.2f} of its bound", flush=True)
-    assert statistics.median(each.width for each in good) < LIMIT_NS / 3, "the truth is not known well enough"
+    print(f"  | {len(everything)} statements, {len(stated)} with a bound, {len(good)} good; of those with a bound, in"
+          f" us: stated {spread(each.stated for each in stated)}; true {spread(abs(each.true) for each in stated)};"
+          f" known within {spread(each.width for each in stated)}", flush=True)
+    known = statistics.median(each.width for each in good)
+    assert known < LIMIT_NS / 3, f"the truth is known within {known / 1e3:.0f} us only"
     wrong = [each for each in stated if each.is_false(each.stated)]
     wrong += [each for each in good if not 0 <= each.stated <= LIMIT_NS or each.is_false(LIMIT_NS)]
-    late = [(each.at - step) / 1e6 for each in wrong
-            for step in truth.watched[each.reader].steps if 0 <= each.at - step < NOTICE_NS]
-    if late:
-        print(f"  | on a PC whose own clock was set, {len(late)} statements were wrong until dssmd knew, the last"
-              f" {max(late):.1f} ms after that", flush=True)
-    wrong = [each for each in wrong if not any(
-        0 <= each.at - step < NOTICE_NS for step in truth.watched[each.reader].steps)]
+    unnoticed = [(each.came - step) / 1e6 for each in wrong for step in truth.watched[each.reader].steps
+                 if 0 <= each.came - step < NOTICE_NS]
+    if unnoticed:
+        print(f"  | on the PC whose clock was set, {len(unnoticed)} statements were wrong before its dssmd knew, the"
+              f" last one {max(unnoticed):.1f} ms after that", flush=True)
+    wrong = [each for each in wrong if not any(0 <= each.came - step < NOTICE_NS
+                                               for step in truth.watched[each.reader].steps)]
     assert not wrong, f"{len(wrong)} of {len(everything)} statements are false, the first ones: {wrong[:5]}"
 
 
-def _median_us(values: Iterable[float]) -> str:
-    found = list(values)
-    return f"{statistics.median(found) / 1e3:.0f}" if found else "-"
+def spread(values_ns: Iterable[float]) -> str:
+    """Median and greatest, in us."""
+    values = sorted(values_ns)
+    return f"median {statistics.median(values) / 1e3:.0f}, max {values[-1] / 1e3:.0f}"
 
 
 def statements(look: Look, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
@@ -309,18 +331,9 @@ def statements(look: Look, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
             yield owner, said[kind]
 
 
-def refused_since(truth: Truth, owner: str, since: float) -> float:
-    """After how many seconds the first reading of a PC's samples elsewhere was refused."""
-    refusals = [look.at for name, watched in truth.watched.items() if name != owner
-                for look in watched.looks if look.at > since
-                and look.said["others"].get(owner, {"by_time": {"status": ""}})["by_time"]["status"]
-                == "clock_out_of_bounds"]
-    assert refusals, f"no reading of {owner}'s samples was refused"
-    return (min(refusals) - since) / SECOND_NS
-
-
-def summary(offsets: Iterable[float]) -> str:
+def summary(offsets: Iterable[tuple[float, float]]) -> str:
     """A row of the paper's Table I: average, maximum, minimum and standard deviation of the size."""
-    sizes = [abs(offset) / 1e3 for offset in offsets]
-    return (f"average {statistics.fmean(sizes):.1f} us, max {max(sizes):.1f}, min {min(sizes):.1f},"
-            f" sd {statistics.pstdev(sizes):.1f}, n {len(sizes)}")
+    pairs = list(offsets)
+    sizes = [abs(offset) / 1e3 for offset, _ in pairs]
+    return (f"average {statistics.fmean(sizes):.1f} us, max {max(sizes):.1f}, min {min(sizes):.1f}, std dev"
+            f" {statistics.pstdev(sizes):.1f}, of {len(sizes)}, known within {max(width for _, width in pairs) / 1e3:.1f}")

@@ -2,11 +2,13 @@
 """A PC that loses its power leaves the lists, returns by itself, and readers follow
 
 How long both take is measured and said, beside what is promised; a busy machine proves nothing about
-that. Readers elsewhere go on with the PC's new streams and are told that these began anew.
+that, so what is proved is that the heartbeat's silence made it leave, and nothing slower. Readers elsewhere go on with the PC's new streams and are told that these began anew.
 """
 
 import time
 
+from lab.dssmd import HOST_DOWN, journal_after, journal_end
+from lab.guest import Guest
 from lab.lab import Lab
 from lab.load import Load
 from lab.timing import PART
@@ -22,10 +24,13 @@ def run(lab: Lab) -> None:
     Load(pc1, "write", [STREAM]).await_ready()
     reader = Load(pc2, "read", [STREAM]).await_ready()
     lab.await_streams(STREAM)
+    ends = {guest: journal_end(guest) for guest in (pc2, pc3)}
     lost = time.monotonic()
     pc1.power_off()
     lab.await_streams(on=[pc2, pc3])
     gone = time.monotonic() - lost
+    for guest, end in ends.items():
+        expect_silence(guest, end)
     with lab.timing.step(PART + "boot pc1"), lab.spread():
         pc1.power_on(lab.all_cores)
         pc1.await_running()
@@ -43,3 +48,9 @@ def run(lab: Lab) -> None:
     assert written > 0
     pc1.ssh.run(f"dssmctl rm {STREAM}")
     lab.await_streams()
+
+
+def expect_silence(guest: Guest, end: str) -> None:
+    """dssmd there says that pc1 left because nothing was heard of it."""
+    said = journal_after(guest, end, HOST_DOWN)
+    assert any("host 'pc1' is down: no sign of life" in line for line in said), f"{guest.name}: {said}"

@@ -6,8 +6,11 @@ After a step or a cut nothing is delivered as good that is beyond the limit, and
 itself; how long that takes is measured.
 """
 
+import time
+
+from lab.clocks import await_reference
 from lab.lab import Lab
-from lab.truth import SECOND_NS, Truth, expect_true, refused_since, summary
+from lab.truth import SECOND_NS, Truth, expect_true, summary
 
 STEP_NS = SECOND_NS // 5
 READINGS = 10
@@ -20,25 +23,27 @@ def run(lab: Lab) -> None:
         begin = truth.await_good()
         print(pc3.ssh.run(f"dssmctl clock --table {READINGS}"), end="", flush=True)
         for guest in (pc2, pc3):
-            offsets = truth.true_offsets(guest.name, "pc1", begin)
-            print(f"  | {guest.name} - pc1, seen from outside: {summary(each[0] for each in offsets)}; within"
-                  f" {summary(each[1] for each in offsets)}", flush=True)
+            print(f"  | {guest.name} - pc1 by the truth: {summary(truth.true_offsets(guest.name, 'pc1', begin))} us",
+                  flush=True)
         stepped = truth.step(pc2, STEP_NS)
         good = truth.await_good()
-        print(f"  | after a step of 200 ms: refused after {refused_since(truth, 'pc2', stepped):.3f} s, good again"
-              f" after {(good - stepped) / SECOND_NS:.1f} s", flush=True)
-        cut = truth.now()
+        print(f"  | a step of 200 ms: refused after {truth.await_refused('pc2', stepped):.3f} s, good again after"
+              f" {(good - stepped) / SECOND_NS:.1f} s", flush=True)
+        cut = time.monotonic_ns()
         lab.network.part([1], [2, 3])
-        good = truth.await_good("pc2", "pc3")
-        lab.await_streams("truth:0@pc2", "truth:0@pc3", on=[pc2, pc3])
-        print(f"  | without the reference: its samples refused after {refused_since(truth, 'pc1', cut):.1f} s, the"
-              f" others good without a break {(truth.now() - good) / SECOND_NS:.1f} s"
-              f" of {(truth.now() - cut) / SECOND_NS:.1f} s", flush=True)
-        joined = truth.now()
+        refused = truth.await_refused("pc1", cut)
+        await_reference(pc3, "pc2")
+        truth.await_good("pc2", "pc3")
+        print(f"  | without the reference: its samples refused after {refused:.1f} s; the successor followed after"
+              f" {(time.monotonic_ns() - cut) / SECOND_NS:.1f} s; of the reads between the others"
+              f" {100 * truth.share_good('pc2', 'pc3', cut):.1f} and {100 * truth.share_good('pc3', 'pc2', cut):.1f}"
+              " % good", flush=True)
+        joined = time.monotonic_ns()
         lab.network.join()
         good = truth.await_good()
         print(f"  | the reference back: good again after {(good - joined) / SECOND_NS:.1f} s", flush=True)
+        await_reference(pc3, "pc1")
+        truth.await_good()
     expect_true(truth)
-    for guest in lab.guests:
-        guest.ssh.run("dssmctl rm truth")
+    lab.on_all(lambda guest: guest.ssh.run("dssmctl rm truth"))
     lab.await_streams()

@@ -5,21 +5,20 @@ Under load: every sample arrives once and in order, no PC takes another one for 
 leaves a list. Only times are refused, until the clocks are good again.
 """
 
-from lab.guest import Guest
+from lab.dssmd import HOST_DOWN, journal_after, journal_end
 from lab.lab import Lab
 from lab.load import Load, expect_complete
-from lab.truth import SECOND_NS, Truth, expect_true, refused_since
+from lab.truth import SECOND_NS, Truth, expect_true
 
 HOUR_NS = 3600 * SECOND_NS
 STREAMS = ["hour:0@pc1", "hour:0@pc2", "hour:0@pc3"]
-HOST_DOWN = "7300d3a6bb28413296e1b5a92550935a"  # systemd/dssmd.catalog
 MORE = 3000  # samples, three seconds of a heartbeat that gives up after as many
 
 
 def run(lab: Lab) -> None:
     """Sets pc3's clock an hour forward, two back, and one forward."""
     pc3 = lab["pc3"]
-    downs = lab.on_all(hosts_down)
+    ends = lab.on_all(journal_end)
     with Truth(lab.guests).watching() as truth:
         truth.await_good()
         writers = [Load(guest, "write", [stream]).await_ready()
@@ -30,7 +29,7 @@ def run(lab: Lab) -> None:
             for load in (*writers, *readers.values()):
                 load.await_more(MORE)
             print(f"  | pc3's clock set by {hours} h: refused elsewhere after"
-                  f" {refused_since(truth, 'pc3', stepped):.3f} s", flush=True)
+                  f" {truth.await_refused('pc3', stepped):.3f} s", flush=True)
         good = truth.await_good()
         print(f"  | good again {(good - stepped) / SECOND_NS:.1f} s after it was set right", flush=True)
         written = {"written": {stream: count for writer in writers
@@ -38,15 +37,10 @@ def run(lab: Lab) -> None:
         for name, reader in readers.items():
             expect_complete(written, reader.finish(), f"reader on {name}")
     expect_true(truth)
-    assert lab.on_all(hosts_down) == downs, "a PC was taken for gone"
+    for guest, end in zip(lab.guests, ends):
+        assert not (said := journal_after(guest, end, HOST_DOWN)), f"{guest.name} took a PC for gone: {said}"
     for stream in STREAMS:
         lab["pc1"].ssh.run(f"dssmctl rm {stream}")
-    for guest in lab.guests:
-        guest.ssh.run("dssmctl rm truth")
+    lab.on_all(lambda guest: guest.ssh.run("dssmctl rm truth"))
     lab.await_streams()
 
-
-def hosts_down(guest: Guest) -> int:
-    """How often dssmd there has found another PC gone since it booted."""
-    said = guest.ssh.run(f"journalctl --boot --output=json MESSAGE_ID={HOST_DOWN}")
-    return len(said.splitlines())

@@ -53,7 +53,7 @@ class ClockWatchTest : public testing::Test, protected ClockWatch::Observer {
   void on_clock() override { ++looks; }
 
   void restart() {
-    const ClockWatch::Options options{chronyd.address(), {}, [this] { return now; }};
+    const ClockWatch::Options options{chronyd.address(), {}, [this] { return now; }, 50ms};
     ClockWatch::Observer& observer = *this;
     watch = std::make_unique<ClockWatch>(loop, options, observer, logger);
   }

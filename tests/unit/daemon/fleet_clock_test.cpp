@@ -58,8 +58,9 @@ class FleetClockTest : public testing::Test {
   // Starts, and waits until chronyd has answered.
   FleetClock& start() {
     Result<clock::ClockPageWriter> page = clock::ClockPageWriter::open(folder_ + "/clock");
-    fleet.emplace(loop, FleetClock::Options{{chronyd.address(), {}}, policies}, *std::move(page),
-                  own, kSelf, catalog, logger);
+    fleet.emplace(loop,
+                  FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
+                  *std::move(page), own, kSelf, catalog, logger);
     fleet->on_news([this] { ++news; });
     wait([this] { return own->status != ClockStatus::unknown; });
     return *fleet;
@@ -172,8 +173,9 @@ TEST_F(FleetClockTest, AHostWithThisKernelHasThisClock) {
   Result<clock::ClockPageWriter> page =
       clock::ClockPageWriter::open(std::filesystem::temp_directory_path() / "dssm-same-clock");
   std::filesystem::remove(std::filesystem::temp_directory_path() / "dssm-same-clock");
-  fleet.emplace(loop, FleetClock::Options{{chronyd.address(), {}}, policies}, *std::move(page), own,
-                kSelf, catalog, logger);
+  fleet.emplace(loop,
+                FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
+                *std::move(page), own, kSelf, catalog, logger);
   wire::ClockReport same;
   same.standing.boot_id = clock::boot_id();
   EXPECT_EQ(fleet->judge(lidar, &same).rule, ring::ClockRule::same_clock);

@@ -95,6 +95,18 @@ TEST_F(MirrorClockTest, SamplesThatComeWhileTheOwnersClockIsUnknownStayDoubtful)
   EXPECT_FALSE(is_doubtful(21));
 }
 
+TEST_F(MirrorClockTest, WhatWasDoubtfulOnceStaysSoWhenTheClockIsSetAgain) {
+  clock.on_owner(report(1us), 9);
+  for (const Tid newest : {10, 20}) {
+    clock.on_owner(report(kUnknownClockError), newest);
+    clock.on_owner(report(1us), newest + 5);
+  }
+  EXPECT_FALSE(is_doubtful(10));
+  EXPECT_TRUE(is_doubtful(11));
+  EXPECT_TRUE(is_doubtful(25));
+  EXPECT_FALSE(is_doubtful(26));
+}
+
 TEST_F(MirrorClockTest, WhatWasStampedAgainstAnotherReferenceIsDoubtful) {
   clock.on_owner(report(1us, 1), 9);
   clock.on_owner(report(1us, 2), 12);

@@ -262,6 +262,18 @@ TEST(Doctor, ForgivesAnAddressThatDoesNotWorkWhileAnotherOfThatHostDoes) {
   EXPECT_FINDING(facts, "host pc2", Status::fail, "ping");
 }
 
+TEST(Doctor, SaysHowFarClocksAreApartAndWarnsWhenNobodyKnows) {
+  Facts facts = healthy();
+  facts.hosts[1].clock = ClockInfo();
+  facts.hosts[1].clock->distance = std::chrono::microseconds(250);
+  EXPECT_FINDING(facts, "clock of pc2", Status::ok, "");
+  EXPECT_EQ(finding_of(facts, "clock of pc2").text, "at most 250 us from this one's");
+  facts.hosts[1].clock->status = ClockStatus::out_of_bounds;
+  facts.hosts[1].clock->distance = kUnknownClockError;
+  EXPECT_FINDING(facts, "clock of pc2", Status::warn, "dssmctl clock");
+  EXPECT_NE(finding_of(facts, "clock of pc2").text.find("out of bounds there"), std::string::npos);
+}
+
 TEST(Doctor, FindsHostsOfOneName) {
   Facts facts = healthy();
   facts.hosts.push_back(host_at("pc2", "up", "10.0.0.3:13776"));

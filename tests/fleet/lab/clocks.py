@@ -1,0 +1,24 @@
+# SPDX-License-Identifier: Apache-2.0
+"""What the PCs say of their clocks."""
+
+import json
+from typing import Any
+
+from lab.guest import Guest
+from lab.lab import await_that
+
+
+def clock_of(guest: Guest) -> dict[str, Any]:
+    """What `dssmctl clock` says of that PC, there."""
+    clocks = json.loads(guest.ssh.run("dssmctl clock --json"))["clocks"]
+    own: dict[str, Any] = next(clock for clock in clocks if clock["host"] == guest.name)
+    return own
+
+
+def await_reference(guest: Guest, reference: str) -> None:
+    """Waits until chronyd there follows another PC."""
+    def look() -> tuple[bool, object]:
+        clock = clock_of(guest)
+        return clock["reference"] == reference and clock["status"] == "synchronized", clock
+
+    await_that(f"{guest.name} follows {reference}", look)
