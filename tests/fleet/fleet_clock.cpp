@@ -58,13 +58,22 @@ std::int64_t raw_now_ns() {
   return std::int64_t{now.tv_sec} * 1'000'000'000 + now.tv_nsec;
 }
 
+// A PC that does something else in between says little; so this one is asked again then.
+constexpr std::int64_t kQuickEnoughNs = 20'000;
+constexpr int kMostLooks = 5;
+
 Clocks look_at_clocks() {
   static const std::int64_t life = to_ns(WallClock::now());
-  const std::int64_t before = raw_now_ns();
-  const std::int64_t wall = to_ns(WallClock::now());
-  const std::int64_t mono = MonoClock::now().time_since_epoch().count();
-  const std::int64_t within = raw_now_ns() - before;
-  return {wall, mono, before + within / 2, within, life};
+  Clocks best;
+  for (int i = 0; i < kMostLooks; ++i) {
+    const std::int64_t before = raw_now_ns();
+    const std::int64_t wall = to_ns(WallClock::now());
+    const std::int64_t mono = MonoClock::now().time_since_epoch().count();
+    const std::int64_t within = raw_now_ns() - before;
+    if (i == 0 || within < best.within_ns) best = {wall, mono, before + within / 2, within, life};
+    if (within < kQuickEnoughNs) break;
+  }
+  return best;
 }
 
 [[noreturn]] void fail(const std::string& what) {

@@ -13,8 +13,7 @@ from lab.guest import Guest
 from lab.packages import ROOT
 
 FOLDER = ROOT / "ansible"
-# One reference and no successor, or the start of the reference would wait 12.5 s for that.
-VARIABLES = {"dssm_subnets": ["10.99.0.0/24"], "dssm_insecure": True, "dssm_chrony_servers": ["pc1"]}
+VARIABLES = {"dssm_subnets": ["10.99.0.0/24"], "dssm_insecure": True}
 
 
 @dataclasses.dataclass
