@@ -218,7 +218,10 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
     channels.tell_clock();
     status.touch();
   });
-  fleet_clock.on_change([&] { mirrors.on_clock(); });
+  fleet_clock.on_change([&] {
+    mirrors.on_clock();
+    channels.on_clock();
+  });
   Reloader reloader(
       config, read_again,
       [&](const Config& changed) {

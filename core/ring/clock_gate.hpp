@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What this PC's dssmd thinks of the times in a mirror: how far they may be from this PC's clock,
-// and which of them are good. It stands in the mirror's header, where readers look at it with each
-// read by time; docs/clocks.md "Judging another host's samples".
+// What this PC's dssmd thinks of the times in a mirror, or in an own stream that other hosts write
+// to: how far they may be from this PC's clock, and which of them are good. It stands in the ring's
+// header, where readers look at it with each read by time; docs/clocks.md "Judging another host's
+// samples".
 //
 // dssmd is the only writer, and writes anew about once a second.
 #pragma once
@@ -15,7 +16,7 @@
 namespace dssm::ring {
 
 enum class ClockRule : std::uint32_t {
-  none = 0,        // nobody judges: a stream of this PC
+  none = 0,        // nobody judges: a stream that only this PC writes to
   same_clock = 1,  // another host, but this PC's kernel: no distance, and all is good
   off = 2,         // all is good
   mark = 3,        // what is not good is delivered and can be told from the rest
@@ -59,6 +60,11 @@ struct ClockGate {
   std::atomic<std::int64_t> doubtful_first, doubtful_last;
 };
 static_assert(sizeof(ClockGate) == 56);
+
+// Whether there ever was a verdict.
+inline bool is_judged(const ClockGate& gate) noexcept {
+  return gate.sequence.load(std::memory_order_relaxed) != 0;
+}
 
 void store(ClockGate& gate, const ClockVerdict& verdict) noexcept;
 

@@ -105,6 +105,16 @@ void ChannelServer::tell_clock() {
   for (const auto& [key, communicator] : communicators_) communicator->tell_clock();
 }
 
+// Also streams that only the dssmd before this one had served.
+void ChannelServer::on_clock() {
+  if (!parts_.clock) return;
+  for (const std::shared_ptr<Stream>& stream : parts_.registry.streams()) {
+    if (!ring::is_judged(stream->mapping().header().clock)) continue;
+    Result<void> judged = streams_.get(stream)->judge(parts_.clock->judge_own(stream->id()));
+    if (!judged) logger_.warning(judged.error().context("judge the times of a stream").message);
+  }
+}
+
 void ChannelServer::turn_away(UniqueFd socket, const wire::SocketAddress* address,
                               const Error& error) {
   logger_.warning("refuse a connection" +

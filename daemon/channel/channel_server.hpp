@@ -49,6 +49,8 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ke
 
   // There is news of this host's clock.
   void tell_clock();
+  // Verdicts on clocks may have changed; at least once a second.
+  void on_clock();
 
   void set_limits(const PeerTable::Limits& limits) { peers_.set_limits(limits); }
 

@@ -29,7 +29,11 @@ class ClockRules {
   // (nullptr: nothing). No sample is doubtful.
   virtual ring::ClockVerdict judge(const StreamId& id, const wire::ClockReport* owner) const = 0;
 
-  // Why that is not good enough to open the stream; for the log and for programs.
+  // What the times in the own stream `id` are worth here when other hosts write to it, whose
+  // samples carry bounds against what this clock follows.
+  virtual ring::ClockVerdict judge_own(const StreamId& id) const = 0;
+
+  // Why another host's stream is not good enough to be opened; for the log and for programs.
   virtual Error why_not(const StreamId& id, const wire::ClockReport* owner) const = 0;
 
   // How far that host's clock may be from this one's.

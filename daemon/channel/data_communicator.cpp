@@ -210,7 +210,7 @@ Result<void> DataCommunicator::go_on_opening() {
   const Opening opening = *std::exchange(opening_, std::nullopt);
   channel_ = std::make_unique<StreamChannel>(
       StreamChannel::Parts{parts_.loop, parts_.registry, link_, place_.budget(), *this, parts_.self,
-                           them_->has_feature(wire::kFeatureClock) ? parts_.clock : nullptr},
+                           *them_, parts_.clock},
       parts_.streams.get(opening.stream), them_->has_feature(wire::kFeatureTorn));
   net::Frame answer;
   answer.set_serial(opening.serial);

@@ -37,6 +37,16 @@ Result<std::shared_ptr<OwnWriter>> ServedStream::writer() {
   return shared(writer_, [this] { return OwnWriter::open(*stream_); });
 }
 
+Result<void> ServedStream::judge(const ring::ClockVerdict& verdict) {
+  if (!judging_) {
+    Result<std::shared_ptr<OwnWriter>> writer = this->writer();
+    if (!writer) return std::move(writer).error();
+    judging_ = *std::move(writer);
+  }
+  ring::store(judging_->clock_gate(), verdict);
+  return {};
+}
+
 void ServedStream::look() {
   if (const std::shared_ptr<StreamFeed> feed = feed_.lock()) feed->look();
 }

@@ -9,6 +9,7 @@
 #include <memory>
 
 #include "core/ring/bell.hpp"
+#include "core/ring/clock_gate.hpp"
 #include "core/ring/ring_writer.hpp"
 #include "daemon/channel/publisher_table.hpp"
 #include "daemon/channel/stream_feed.hpp"
@@ -26,6 +27,7 @@ class OwnWriter {
 
   // Without doorbell: who writes by it calls the feed.
   ring::RingWriter& writer() noexcept { return writer_; }
+  ring::ClockGate& clock_gate() noexcept { return mapping_->header().clock; }
 
  private:
   OwnWriter(std::shared_ptr<const ring::RingMapping> mapping, std::shared_ptr<ring::Bell> bell);
@@ -48,6 +50,10 @@ class ServedStream {
   Result<std::shared_ptr<StreamFeed>> feed();
   Result<std::shared_ptr<OwnWriter>> writer();
 
+  // Says in the ring what its times are worth here; once that was said, it has to be said again and
+  // again (ClockVerdict::kHolds), also by the next dssmd. Fails with os errors.
+  Result<void> judge(const ring::ClockVerdict& verdict);
+
   // dssmd wrote to the ring, or a writer may have died before it could ring.
   void look();
 
@@ -57,6 +63,7 @@ class ServedStream {
   PublisherTable publishers_;
   std::weak_ptr<StreamFeed> feed_;
   std::weak_ptr<OwnWriter> writer_;
+  std::shared_ptr<OwnWriter> judging_;  // once its times are judged
 };
 
 // By stream. An entry is made by the first channel and stays until the stream is removed.

@@ -171,7 +171,7 @@ void StreamChannel::on_news() { parts_.owner.work_now(); }
 // The clock may have been set, and samples been written after that: what they say of their time
 // must not be believed.
 void StreamChannel::before_samples() {
-  if (!parts_.clock) return;
+  if (!parts_.clock || !parts_.them.has_feature(wire::kFeatureClock)) return;
   const std::uint64_t news = parts_.clock->news();
   if (clock_news_ == news) return;
   clock_news_ = news;
@@ -314,6 +314,7 @@ Result<void> StreamChannel::start_publishing(std::uint64_t serial,
       SampleReceiver::open(parts_.loop, parts_.link, parts_.budget, *served_, request.publisher());
   if (!receiver) return std::move(receiver).error();
   receiver_ = *std::move(receiver);
+  if (Result<void> judged = judge_writer(); !judged) return judged;
   const PublisherTable::Entry last = receiver_->last();
   net::Frame frame = answer_to(serial);
   net::Publishing& publishing = *frame.mutable_publishing();
@@ -342,6 +343,16 @@ void StreamChannel::on_batch_end() {
 
 // --- property
 // -------------------------------------------------------------------------------------
+
+// From the first writer on with another clock than this PC's, readers here look at what the times
+// of the stream are worth.
+Result<void> StreamChannel::judge_writer() {
+  if (!parts_.clock) return {};
+  const StreamId& id = stream().id();
+  const bool is_this_clock =
+      parts_.clock->judge(id, parts_.them.clock.get()).rule == ring::ClockRule::same_clock;
+  return is_this_clock ? Result<void>() : served_->judge(parts_.clock->judge_own(id));
+}
 
 Result<void> StreamChannel::set_property(std::uint64_t serial, const net::SetProperty& request) {
   if (Result<void> set = parts_.registry.set_property(stream().id(), request.property()); !set) {

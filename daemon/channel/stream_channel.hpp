@@ -39,7 +39,8 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
     MemoryBudget& budget;  // of the peer
     Owner& owner;
     const wire::Greeting& self;
-    ClockRules* clock;  // nullptr: the client does not want to know
+    const wire::Greeting& them;
+    ClockRules* clock;  // nullptr: nobody watches it
   };
 
   // may_tear: the client has the feature "torn". All in `parts` outlive it.
@@ -85,6 +86,7 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
   Tid first_tid(const net::Subscribe& request) const;
   Result<void> get_range(std::uint64_t serial, const net::GetRange& request);
   Result<void> start_publishing(std::uint64_t serial, const net::StartPublishing& request);
+  Result<void> judge_writer();
   Result<void> set_property(std::uint64_t serial, const net::SetProperty& request);
   Result<void> get_property(std::uint64_t serial);
 

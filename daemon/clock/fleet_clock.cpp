@@ -52,6 +52,16 @@ bool is_news(const wire::ClockReport& before, const wire::ClockReport& after) {
          before.standing.anchor != after.standing.anchor;
 }
 
+ring::ClockVerdict nothing_is_good(const clock::ClockDemand& demand) {
+  ring::ClockVerdict verdict;
+  verdict.rule = demand.policy == ClockPolicy::off    ? ring::ClockRule::off
+                 : demand.policy == ClockPolicy::mark ? ring::ClockRule::mark
+                                                      : ring::ClockRule::enforce;
+  verdict.allowed = Duration(-1);
+  verdict.judged = MonoClock::now();
+  return verdict;
+}
+
 }  // namespace
 
 FleetClock::FleetClock(const EventLoop& loop, const Options& options, clock::ClockPageWriter page,
@@ -320,17 +330,12 @@ Result<void> FleetClock::check_serving(const StreamId& id, const wire::Greeting&
 }
 
 ring::ClockVerdict FleetClock::judge(const StreamId& id, const wire::ClockReport* owner) const {
-  ring::ClockVerdict verdict;
-  verdict.judged = MonoClock::now();
+  const clock::ClockDemand demand = policies_.demand_for(id);
+  ring::ClockVerdict verdict = nothing_is_good(demand);
   if (owner && clock::share_clock(own_->standing, owner->standing)) {
     verdict.rule = ring::ClockRule::same_clock;
     return verdict;
   }
-  const clock::ClockDemand demand = policies_.demand_for(id);
-  verdict.rule = demand.policy == ClockPolicy::off    ? ring::ClockRule::off
-                 : demand.policy == ClockPolicy::mark ? ring::ClockRule::mark
-                                                      : ring::ClockRule::enforce;
-  verdict.allowed = Duration(-1);
   if (!owner || owner->standing.bound == kUnknownClockError) return verdict;
   const clock::ClockStanding own = own_->at(verdict.judged).standing;
   const clock::ClockStanding theirs = owner->at(verdict.judged).standing;
@@ -356,6 +361,17 @@ std::string FleetClock::trouble_with(const wire::ClockReport* owner, Duration li
   if (distance <= limit) return {};
   return "the clocks of its host and of this PC may be " + in_microseconds(distance) +
          " apart, and " + in_microseconds(limit) + " are allowed (key clock_limit)";
+}
+
+ring::ClockVerdict FleetClock::judge_own(const StreamId& id) const {
+  const clock::ClockDemand demand = policies_.demand_for(id);
+  ring::ClockVerdict verdict = nothing_is_good(demand);
+  const clock::ClockStanding own = own_->at(verdict.judged).standing;
+  if (own.bound == kUnknownClockError) return verdict;
+  verdict.added = own.bound;
+  verdict.ageing_ppb = static_cast<std::uint32_t>(own.ageing);
+  if (verdict.added <= demand.limit) verdict.allowed = demand.limit - verdict.added;
+  return verdict;
 }
 
 Error FleetClock::why_not(const StreamId& id, const wire::ClockReport* owner) const {

@@ -61,6 +61,7 @@ class FleetClock final : public ClockRules, private ClockWatch::Observer, privat
   std::uint64_t news() override;
   Result<void> check_serving(const StreamId& id, const wire::Greeting& them) const override;
   ring::ClockVerdict judge(const StreamId& id, const wire::ClockReport* owner) const override;
+  ring::ClockVerdict judge_own(const StreamId& id) const override;
   Error why_not(const StreamId& id, const wire::ClockReport* owner) const override;
   Duration distance_to(const wire::ClockReport& other) const override;
   Result<UniqueFd> page_for_reading() const override { return page_.for_reading(); }

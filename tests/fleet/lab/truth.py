@@ -33,7 +33,7 @@ PORT = 7123
 PERIOD_SECONDS = 0.03
 CALIBRATION = 300  # questions to each guest, one after the other, before all others
 MOST_ASKED = 300  # questions whose answers may still come
-QUICK_NS = 50_000  # a look at a guest's clocks that took longer is no measurement
+QUICK_NS = 150_000  # a look at a guest's clocks that took longer is no measurement
 LIMIT_NS = 1_500_000  # dssmd's default clock_limit
 STEADY_SECONDS = 1.5  # without one statement that is not good: recovered
 RECOVERY_SECONDS = 180
@@ -288,7 +288,8 @@ class Truth:
             index = bisect.bisect_right(other.looks, raw, key=lambda each: each.raw) - 1
             near = other.looks[max(index, 0)]
             if look.came > since and index >= 0 and max(look.within, near.within) < QUICK_NS:
-                found.append((look.wall - (near.wall + raw - near.raw), own_width + other_width))
+                found.append((look.wall - (near.wall + raw - near.raw),
+                              own_width + other_width + (look.within + near.within) / 2))
         return found
 
 

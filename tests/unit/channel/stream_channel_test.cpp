@@ -8,6 +8,7 @@
 
 #include "core/wire/sample_frame.hpp"
 #include "tests/unit/channel/server_rig.hpp"
+#include "tests/unit/daemon/fake_clock_rules.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -479,6 +480,46 @@ TEST_F(StreamChannelTest, KeepsThePropertyForEverybody) {
   set.mutable_set_property()->set_property("");
   EXPECT_TRUE(rig.ask(control, set).has_done());
   EXPECT_EQ(rig.ask(control, get).failure().code(), "not_found");
+}
+
+// --- clocks
+// ---------------------------------------------------------------------------------------
+
+class WriterOfAnotherClock : public testing::Test {
+ protected:
+  void start_publishing() {
+    rig.connect(peer);
+    rig.open(peer, "far");
+    net::Frame frame;
+    frame.set_serial(70);
+    frame.mutable_start_publishing()->set_publisher(11);
+    EXPECT_TRUE(rig.ask(peer, frame).has_publishing());
+  }
+  ring::ClockVerdict verdict() const { return ring::load(stream->mapping().header().clock); }
+
+  FakeClockRules rules;
+  ServerRig rig{{16, 8, 32U << 20}, &rules};
+  FakePeer peer;
+  std::shared_ptr<Stream> stream = rig.create("far");
+};
+
+TEST_F(WriterOfAnotherClock, HasTheStreamsTimesJudgedFromThenOn) {
+  rules.own_bound = std::chrono::microseconds(100);
+  rig.server.on_clock();
+  EXPECT_EQ(verdict().rule, ring::ClockRule::none) << "nobody else writes to it yet";
+  start_publishing();
+  EXPECT_EQ(verdict().rule, ring::ClockRule::enforce);
+  EXPECT_EQ(verdict().added, rules.own_bound);
+  rules.own_bound = std::chrono::microseconds(300);
+  rig.server.on_clock();
+  EXPECT_EQ(verdict().added, rules.own_bound);
+}
+
+TEST_F(WriterOfAnotherClock, IsNoneWhenItsKernelIsThisOne) {
+  rules.rule = ring::ClockRule::same_clock;
+  start_publishing();
+  rig.server.on_clock();
+  EXPECT_EQ(verdict().rule, ring::ClockRule::none);
 }
 
 }  // namespace

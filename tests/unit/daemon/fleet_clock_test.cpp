@@ -121,6 +121,20 @@ TEST_F(FleetClockTest, OnePcThatFollowsNobodyIsItsOwnReference) {
   EXPECT_EQ(news, 1) << "others have to know";
 }
 
+TEST_F(FleetClockTest, OwnStreamsThatOthersWriteToAreAsFarOffAsThisClock) {
+  EXPECT_FALSE(FleetClockTest::start().judge_own(lidar).added == kUnknownClockError);
+  const ring::ClockVerdict known = fleet->judge_own(lidar);
+  EXPECT_EQ(known.rule, ring::ClockRule::enforce);
+  EXPECT_GE(known.added, own->standing.bound);
+  EXPECT_EQ(known.allowed, policies.general.limit - known.added);
+  tracking.leap = clock::Tracking::kUnsynchronized;
+  wait([this] { return own->standing.bound == kUnknownClockError; });
+  EXPECT_LT(fleet->judge_own(lidar).allowed, 0ns);
+  policies.general.policy = ClockPolicy::off;
+  fleet->set(policies, 50'000);
+  EXPECT_EQ(fleet->judge_own(lidar).rule, ring::ClockRule::off);
+}
+
 TEST_F(FleetClockTest, OnlyUtcIsLeftWithoutAHostToFollow) {
   start();
   EXPECT_EQ(own->basis, ClockBasis::root);

@@ -3,30 +3,12 @@
 
 #include <gtest/gtest.h>
 
+#include "tests/unit/daemon/fake_clock_rules.hpp"
+
 namespace dssm::daemon {
 namespace {
 
 using namespace std::chrono_literals;
-
-// Allows what is left of 1 ms, and knows no distance but what the owner says.
-class FakeRules final : public ClockRules {
- public:
-  std::uint64_t news() override { return 0; }
-  Result<void> check_serving(const StreamId&, const wire::Greeting&) const override { return {}; }
-  ring::ClockVerdict judge(const StreamId&, const wire::ClockReport* owner) const override {
-    ring::ClockVerdict verdict;
-    verdict.rule = rule;
-    verdict.allowed = owner ? 1ms - owner->standing.bound : Duration(-1);
-    return verdict;
-  }
-  Error why_not(const StreamId& id, const wire::ClockReport*) const override {
-    return {Errc::clock_out_of_bounds, "not '" + id.str() + "'"};
-  }
-  Duration distance_to(const wire::ClockReport&) const override { return {}; }
-  Result<UniqueFd> page_for_reading() const override { return Error{}; }
-
-  ring::ClockRule rule = ring::ClockRule::enforce;
-};
 
 MirrorClock::Report report(Duration bound, std::uint8_t anchor = 1) {
   auto made = std::make_shared<wire::ClockReport>();
@@ -43,7 +25,7 @@ class MirrorClockTest : public testing::Test {
   }
 
   const StreamId id{"lidar", 0, "pc2"};
-  FakeRules rules;
+  FakeClockRules rules;
   MirrorClock clock{&rules, id};
 };
 
