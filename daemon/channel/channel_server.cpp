@@ -111,7 +111,7 @@ void ChannelServer::on_clock() {
   for (const std::shared_ptr<Stream>& stream : parts_.registry.streams()) {
     if (!ring::is_judged(stream->mapping().header().clock)) continue;
     Result<void> judged = streams_.get(stream)->judge(parts_.clock->judge_own(stream->id()));
-    if (!judged) logger_.warning(judged.error().context("judge the times of a stream").message);
+    if (!judged) logger_.warning("judge the times of a stream: " + judged.error().message);
   }
 }
 
