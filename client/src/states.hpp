@@ -10,6 +10,7 @@
 #include <optional>
 
 #include "client/src/client.hpp"
+#include "core/clock/error_cache.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "core/ring/ring_writer.hpp"
 
@@ -74,12 +75,16 @@ struct WriterState {
         payload_bytes(stream->ring->mapping->geometry().payload_bytes) {}
 
   // What a sample is stamped with that a writer says this about.
-  Duration stamp(Time time, Duration clock_error) const noexcept {
-    return clock_error == kOwnClockError ? error_by(clock, time) : clock_error;
+  Duration stamp(Time time, Duration clock_error) noexcept {
+    if (clock_error != kOwnClockError) return clock_error;
+    Duration error{};
+    const bool found = own_error.find(clock.load(std::memory_order_acquire), time, error);
+    return found ? error : error_by(clock, time);
   }
 
   std::shared_ptr<OpenStream> stream;
   const Client::ClockPlace& clock;
+  clock::ErrorCache own_error;
   ring::RingWriter ring;
   std::uint64_t payload_bytes;
 };

@@ -25,7 +25,7 @@ template <class Work>
 auto with_record(const ClockPage& page, const Work& work) {
   for (;;) {
     const std::uint64_t generation = page.generation.load(std::memory_order_acquire);
-    const auto result = work(page.records[generation % 2]);
+    const auto result = work(page.records[generation % 2], generation);
     if (page.generation.load(std::memory_order_relaxed) == generation) return result;
   }
 }
@@ -78,28 +78,33 @@ std::string boot_id() {
   return id;
 }
 
-std::optional<Duration> error_at(const ClockPage& page, Time t) noexcept {
-  struct Seen {
-    std::int64_t wall, bound, ageing, earlier_from, earlier_bound;
-  };
-  const Seen seen = with_record(page, [](const ClockPage::Record& record) noexcept {
-    return Seen{get(record.wall_ns), get(record.bound_ns), get(record.ageing_ppb),
-                get(record.earlier_from_ns), get(record.earlier_bound_ns)};
+StatedBound stated_bound(const ClockPage& page) noexcept {
+  return with_record(page, [](const ClockPage::Record& record, std::uint64_t generation) noexcept {
+    return StatedBound{generation,
+                       get(record.wall_ns),
+                       get(record.bound_ns),
+                       get(record.ageing_ppb),
+                       get(record.earlier_from_ns),
+                       get(record.earlier_bound_ns)};
   });
+}
+
+std::optional<Duration> error_at(const ClockPage& page, Time t) noexcept {
+  const StatedBound seen = stated_bound(page);
   const std::int64_t time = to_ns(t);
-  if (time < seen.wall) {
-    if (time < seen.earlier_from) return std::nullopt;
-    return Duration(seen.earlier_bound);
+  if (time < seen.wall_ns) {
+    if (time < seen.earlier_from_ns) return std::nullopt;
+    return Duration(seen.earlier_bound_ns);
   }
   // Unsigned: the two may be further apart than 2^63 ns.
   const std::uint64_t age =
-      static_cast<std::uint64_t>(time) - static_cast<std::uint64_t>(seen.wall);
+      static_cast<std::uint64_t>(time) - static_cast<std::uint64_t>(seen.wall_ns);
   if (age > static_cast<std::uint64_t>(to_ns(kLongestUse))) return std::nullopt;
-  if (seen.bound == INT64_MAX) return kUnknownClockError;
+  if (seen.bound_ns == INT64_MAX) return kUnknownClockError;
   // At most 3.5e9 * 10^6 here, so it does not overflow; the division rounds up.
   const std::uint64_t growth =
-      (age * static_cast<std::uint64_t>(seen.ageing) + 999'999'999) / 1'000'000'000;
-  return sum(Duration(seen.bound), Duration(static_cast<std::int64_t>(growth)));
+      (age * static_cast<std::uint64_t>(seen.ageing_ppb) + 999'999'999) / 1'000'000'000;
+  return sum(Duration(seen.bound_ns), Duration(static_cast<std::int64_t>(growth)));
 }
 
 ClockStatus status_of(const ClockPage& page) noexcept {
@@ -107,7 +112,7 @@ ClockStatus status_of(const ClockPage& page) noexcept {
     std::int64_t mono;
     std::uint32_t status;
   };
-  const Seen seen = with_record(page, [](const ClockPage::Record& record) noexcept {
+  const Seen seen = with_record(page, [](const ClockPage::Record& record, std::uint64_t) noexcept {
     return Seen{get(record.mono_ns), get(record.status)};
   });
   const Duration age = MonoClock::now() - MonoTime(Duration(seen.mono));
@@ -115,7 +120,7 @@ ClockStatus status_of(const ClockPage& page) noexcept {
 }
 
 ClockRecord load(const ClockPage& page) {
-  return with_record(page, [](const ClockPage::Record& record) {
+  return with_record(page, [](const ClockPage::Record& record, std::uint64_t) {
     ClockRecord out;
     out.wall = time_from_ns(get(record.wall_ns));
     out.mono = MonoTime(Duration(get(record.mono_ns)));

@@ -86,6 +86,14 @@ inline constexpr Duration kLongestUse = std::chrono::milliseconds(3500);
 //   threads  any; async-signal-safe; no system call
 std::optional<Duration> error_at(const ClockPage& page, Time t) noexcept;
 
+// What error_at() answers from.
+struct StatedBound {
+  std::uint64_t generation = 0;  // of the page
+  std::int64_t wall_ns = 0, bound_ns = 0, ageing_ppb = 0;
+  std::int64_t earlier_from_ns = 0, earlier_bound_ns = 0;  // as in ClockPage::Record
+};
+StatedBound stated_bound(const ClockPage& page) noexcept;
+
 // What dssmd says of the clock; `unknown` when it has said nothing for kLongestUse. As error_at().
 ClockStatus status_of(const ClockPage& page) noexcept;
 

@@ -53,7 +53,10 @@ Instant ClockWatch::base() {
 clock::ClockState ClockWatch::state() {
   const Instant now = now_();
   look(now);
-  return estimator_.at(now.mono);
+  clock::ClockState state = estimator_.at(now.mono);
+  // Whoever asks why wants to know that it was never there.
+  if (state.status == ClockStatus::unknown && absent_) state.trouble = ClockTrouble::no_chronyd;
+  return state;
 }
 
 std::optional<SourceAddress> ClockWatch::source() const noexcept {

@@ -289,7 +289,6 @@ void FleetClock::tell_of_others(MonoTime now) {
 
 std::string FleetClock::str() const {
   std::string text = "clock " + std::string(name_of(own_->status));
-  if (own_->status == ClockStatus::unknown) return text;
   if (own_->trouble != ClockTrouble::none) text += ": " + std::string(name_of(own_->trouble));
   if (own_->standing.bound == kUnknownClockError) return text;
   text += " within " + in_microseconds(own_->standing.bound);

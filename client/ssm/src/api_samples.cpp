@@ -106,7 +106,8 @@ SSM_tid getTID(SSM_sid sid, ssmTimeT ytime) {
 double getClockErrorSSM(SSM_sid sid, SSM_tid tid) {
   const SidUse use(sid);
   if (!use) return -1;
-  const dssm::Duration error = use->clock_error(ring_tid(tid, use->newest()));
+  const dssm::Tid newest = use->newest();
+  const dssm::Duration error = use->clock_error(tid < 0 ? newest : ring_tid(tid, newest));
   return error == dssm::kUnknownClockError ? -1 : std::chrono::duration<double>(error).count();
 }
 

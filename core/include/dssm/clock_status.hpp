@@ -19,7 +19,7 @@ enum class ClockStatus : std::uint8_t {
 // Why a clock is out of bounds.
 enum class ClockTrouble : std::uint8_t {
   none,
-  no_chronyd,      // it was there, and nothing listens any more
+  no_chronyd,      // nothing listens where it should
   silent,          // it does not answer
   unsynchronized,  // it answers that it does not know the time
   stepped,         // the clock was set; chronyd has not measured it anew

@@ -6,6 +6,7 @@
 #include <sys/resource.h>
 #include <sys/wait.h>
 
+#include <array>
 #include <atomic>
 #include <csignal>
 #include <dssm/dssm.hpp>
@@ -98,6 +99,35 @@ TEST_F(Api, ReadsByTidByTimeAndInOrder) {
   EXPECT_EQ(around.after.tid, 6);
   EXPECT_EQ(reader.neighbours(time_of(10), around), ReadStatus::not_yet);
   EXPECT_EQ(reader.neighbours(time_of(0) - 1ns, around), ReadStatus::too_old);
+}
+
+TEST_F(Api, ReadsSeveralStreamsAtOneTimeOrNone) {
+  auto odometry = make();
+  auto rough = make("rough");
+  make("empty");
+  for (Tid tid = 0; tid < 4; ++tid) write(odometry, tid);
+  for (Tid tid = 0; tid < 2; ++tid) write(rough, tid);
+  auto reader = session.open_reader<Odometry>("odometry").value();
+  auto rough_reader = session.open_reader<Odometry>("rough").value();
+  auto empty_reader = session.open_reader<Odometry>("empty").value();
+  Odometry out{}, rough_out{}, empty_out{};
+  std::array samples{reader.joint(out), rough_reader.joint(rough_out)};
+  JointRead read = at(time_of(2), samples, 0ns);
+  EXPECT_EQ(read.status, ReadStatus::ok);
+  EXPECT_EQ(read.error, 0ns) << "both are of this PC's clock";
+  EXPECT_EQ(samples[0].info.tid, 2);
+  EXPECT_EQ(out.x, sample(2).x);
+  EXPECT_EQ(samples[1].info.tid, 1);
+  EXPECT_EQ(rough_out.x, sample(1).x);
+  EXPECT_EQ(reader.cursor(), 2);
+  EXPECT_EQ(rough_reader.cursor(), 1);
+
+  EXPECT_EQ(at(time_of(0) - 1ns, samples).status, ReadStatus::too_old);
+  std::array three{reader.joint(out), rough_reader.joint(rough_out), empty_reader.joint(empty_out)};
+  read = at(time_of(3), three);
+  EXPECT_EQ(read.status, ReadStatus::not_yet);
+  EXPECT_EQ(read.which, 2U);
+  EXPECT_EQ(reader.cursor(), 2) << "all or none";
 }
 
 TEST_F(Api, CountsWhatAReaderLostWhenItWasLapped) {

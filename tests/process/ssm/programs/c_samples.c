@@ -33,6 +33,7 @@ static void zero_sid(void) {
   CHECK_EQUAL(getTID_top(sid), SSM_ERROR_NO_DATA);
   CHECK_EQUAL(getTID_bottom(sid), SSM_ERROR_NO_DATA);
   CHECK_EQUAL(waitTID(sid, 0), -1);
+  CHECK(getClockErrorSSM(sid, 0) < 0);
   CHECK_EQUAL(readSSM(sid, &s, &time, -1), SSM_ERROR_NO_DATA);
   CHECK_EQUAL(readSSM_time(sid, &s, 1.0, &time), SSM_ERROR_NO_DATA);
   CHECK_EQUAL(readSSMP(sid, &s, &time, -1, NULL, NULL), SSM_ERROR_NO_DATA);
@@ -101,6 +102,9 @@ static void readable_window(void) {
   CHECK_SAME(time, 7);
   CHECK_EQUAL(readSSM(sid, &s, NULL, -5), 19); /* any negative number: the newest */
   CHECK_EQUAL(s.n, 19);
+  CHECK_SAME(getClockErrorSSM(sid, 19), 0); /* of this PC's clock */
+  CHECK_SAME(getClockErrorSSM(sid, -1), 0);
+  CHECK(getClockErrorSSM(sid, 7) < 0);
   releaseSSM(&sid);
 
   sid = createSSM("window2", 0, sizeof(Sample), 0.1, 0.1); /* two slots: only the newest */
