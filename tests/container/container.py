@@ -13,6 +13,7 @@ import shutil
 import socket
 import subprocess
 import sys
+import tempfile
 from collections.abc import Iterator
 
 HERE = pathlib.Path(__file__).resolve().parent
@@ -41,12 +42,12 @@ class Cgroups:
         for line in pathlib.Path("/proc/self/cgroup").read_text().splitlines():
             _, controllers, group = line.split(":", 2)
             for root in self._roots(controllers):
-                folder = root / group.lstrip("/") / f"dssm-container-{os.getpid()}"
+                # Not by this process's number, which is 1 in each run: one that was killed leaves its own.
                 try:
-                    folder.mkdir()
+                    folder = tempfile.mkdtemp(prefix="dssm-container-", dir=root / group.lstrip("/"))
                 except OSError as error:
                     raise Unavailable(f"no control groups can be made here: {error}") from error
-                self.folders.append(folder)
+                self.folders.append(pathlib.Path(folder))
 
     @staticmethod
     def _roots(controllers: str) -> Iterator[pathlib.Path]:
