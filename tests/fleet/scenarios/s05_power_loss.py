@@ -9,7 +9,7 @@ import time
 
 from lab.dssmd import HOST_DOWN, journal_after, journal_end
 from lab.guest import Guest
-from lab.lab import Lab
+from lab.lab import Lab, await_that
 from lab.load import Load
 from lab.timing import PART
 
@@ -52,5 +52,10 @@ def run(lab: Lab) -> None:
 
 def expect_silence(guest: Guest, end: str) -> None:
     """dssmd there says that pc1 left because nothing was heard of it."""
-    said = journal_after(guest, end, HOST_DOWN)
-    assert any("host 'pc1' is down: no sign of life" in line for line in said), f"{guest.name}: {said}"
+    def look() -> tuple[bool, object]:  # journald may be a little behind
+        said = journal_after(guest, end, HOST_DOWN)
+        return any("host 'pc1' is down: " in line for line in said), said
+
+    await_that(f"{guest.name} says why pc1 is down", look)
+    _, said = look()
+    assert "no sign of life" in str(said), f"{guest.name}: {said}"
