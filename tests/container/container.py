@@ -9,11 +9,11 @@ import contextlib
 import os
 import pathlib
 import re
+import secrets
 import shutil
 import socket
 import subprocess
 import sys
-import tempfile
 from collections.abc import Iterator
 
 HERE = pathlib.Path(__file__).resolve().parent
@@ -39,15 +39,18 @@ class Cgroups:
     def __init__(self) -> None:
         """Makes them. Unavailable where this process may not."""
         self.folders: list[pathlib.Path] = []
+        # Not this process's number, which is 1 in each run: one that was killed leaves its groups. And one
+        # name for all hierarchies, or systemd-nspawn makes what it misses.
+        name = f"dssm-container-{secrets.token_hex(4)}"
         for line in pathlib.Path("/proc/self/cgroup").read_text().splitlines():
             _, controllers, group = line.split(":", 2)
             for root in self._roots(controllers):
-                # Not by this process's number, which is 1 in each run: one that was killed leaves its own.
+                folder = root / group.lstrip("/") / name
                 try:
-                    folder = tempfile.mkdtemp(prefix="dssm-container-", dir=root / group.lstrip("/"))
+                    folder.mkdir()
                 except OSError as error:
                     raise Unavailable(f"no control groups can be made here: {error}") from error
-                self.folders.append(pathlib.Path(folder))
+                self.folders.append(folder)
 
     @staticmethod
     def _roots(controllers: str) -> Iterator[pathlib.Path]:
