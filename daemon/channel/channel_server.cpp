@@ -149,6 +149,7 @@ void ChannelServer::on_stream_removed(const Stream& stream) {
 }
 
 void ChannelServer::on_heartbeat() {
+  if (parts_.clock) parts_.clock->on_heartbeat();
   const MonoTime now = MonoClock::now();
   if (now - looked_ < kLookPeriod) return;
   looked_ = now;

@@ -21,6 +21,10 @@ class ClockRules {
   // another sample.
   virtual std::uint64_t news() = 0;
 
+  // A heartbeat of another host has come, about each second: dssmd is awake, and may as well ask
+  // chronyd now as wake up for that later.
+  virtual void on_heartbeat() = 0;
+
   // Whether samples of the own stream `id` may be carried to and from whoever greeted so.
   //   fails  clock_out_of_bounds
   virtual Result<void> check_serving(const StreamId& id, const wire::Greeting& them) const = 0;

@@ -92,8 +92,8 @@ void DataCommunicator::serve(const net::Frame& request) {
 
 Result<void> DataCommunicator::dispatch(const net::Frame& request) {
   if (request.has_ping()) {
-    if (!is_control_) silence_.enable_in(wire::kSilenceIsDeath);
     is_control_ = true;
+    silence_.enable_in(wire::kSilenceIsDeath);
     net::Frame pong;
     pong.set_serial(request.serial());
     wire::tell_clock(parts_.self, *pong.mutable_pong()->mutable_clock());

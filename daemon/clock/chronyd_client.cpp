@@ -19,12 +19,22 @@ ChronydClient::ChronydClient(const EventLoop& loop, const wire::SocketAddress& c
       user_(user),
       now_(std::move(now)),
       period_(period),
-      timer_(EventSource::timer(loop, [this] { on_timer(); })) {
+      slack_(period / 4),
+      timer_(EventSource::timer(loop, [this] { next_question(); })) {
   timer_.enable_in(Duration::zero());
 }
 
-void ChronydClient::on_timer() {
-  timer_.enable_in(period_);
+void ChronydClient::take_occasion() {
+  occasion_ = MonoClock::now();
+  if (occasion_ - asked_ >= period_ - slack_) next_question();
+}
+
+void ChronydClient::next_question() {
+  asked_ = MonoClock::now();
+  // Behind the next occasion, if there is to be one. One that comes too early for a question comes
+  // later in the period each time, until it is in time.
+  const bool occasions_come = asked_ - occasion_ < period_ + slack_;
+  timer_.enable_in(occasions_come ? period_ + slack_ : period_);
   if (question_) {
     const Question unanswered = *std::exchange(question_, {});
     user_.on_no_answer(unanswered.why.value_or(

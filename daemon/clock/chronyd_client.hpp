@@ -41,12 +41,16 @@ class ChronydClient {
     ~User() = default;
   };
 
-  // Asks at once when the loop runs, and then once a period. What is given by reference outlives
-  // it.
+  // Asks at once when the loop runs, and then about once a period. What is given by reference
+  // outlives it.
   ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, User& user, Now now,
                 Duration period = kPeriod);
   ChronydClient(const ChronydClient&) = delete;
   ChronydClient& operator=(const ChronydClient&) = delete;
+
+  // The process is awake anyway: asks now when a question is about due. Where such occasions come
+  // once a period, the timer does not wake it.
+  void take_occasion();
 
  private:
   struct Question {
@@ -56,7 +60,7 @@ class ChronydClient {
     std::optional<Error> why;  // none of them was an answer
   };
 
-  void on_timer();
+  void next_question();
   Result<void> ask();
   void on_readable();
   bool take_untrusted(std::span<const std::byte> datagram);
@@ -66,7 +70,8 @@ class ChronydClient {
   const wire::SocketAddress chronyd_;
   User& user_;
   const Now now_;
-  const Duration period_;
+  const Duration period_, slack_;
+  MonoTime asked_{}, occasion_{};     // the last ones
   std::optional<Question> question_;  // until it is answered or refused
   UniqueFd socket_;
   EventSource readable_, timer_;

@@ -31,7 +31,7 @@ class ClockWatch final : private ChronydClient::User {
 
   class Observer {
    public:
-    // Look at state() again: after each answer of chronyd, each second without one, and at once
+    // Look at state() again: after each answer of chronyd, each period without one, and at once
     // after a step, or when chronyd is found to be gone.
     virtual void on_clock() = 0;
 
@@ -52,6 +52,9 @@ class ClockWatch final : private ChronydClient::User {
   clock::Instant base();
 
   clock::ClockState state();  // at this moment
+
+  // dssmd is awake anyway: chronyd is asked now when that is about due.
+  void take_occasion() { client_.take_occasion(); }
 
   // Of chronyd's last answer, while there is a chronyd: whom it follows, and how often it measures.
   std::optional<SourceAddress> source() const noexcept;

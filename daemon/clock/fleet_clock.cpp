@@ -97,6 +97,7 @@ void FleetClock::on_clock() { refresh(); }
 void FleetClock::on_host_clock(const KnownHost& host) {
   // The others are heard often enough by the tick of our own watch.
   if (source_ && host.greeting.host_id == source_->id) refresh();
+  on_heartbeat();
 }
 
 void FleetClock::on_host_down(const KnownHost& host, const Error&) {

@@ -9,12 +9,14 @@
 
 #include "core/wire/frame.hpp"
 #include "tests/process/client/relay.hpp"
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm {
 namespace {
 
 using namespace std::chrono_literals;
+using test::await;
 using test::DaemonProcess;
 
 const StreamId kId{"anew", 0, ""};
@@ -159,7 +161,7 @@ TEST(NewRing, IsToldWhileTheConnectionIsSetUpAnew) {
     return wire::encode_frame(event);
   });
   relay.cut();
-  while (told != 2) std::this_thread::yield();
+  await([&] { return told == 2; });
   relay.set_behind(nullptr);
   // Each asks for its new ring, again and again: there is none yet.
   double value = 0;

@@ -11,12 +11,14 @@
 #include <dssm/dssm.hpp>
 #include <thread>
 
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm {
 namespace {
 
 using namespace std::chrono_literals;
+using test::await;
 using test::DaemonProcess;
 
 struct Counted {
@@ -66,14 +68,14 @@ TEST(Restart, LosesNoSampleWhenTheDaemonIsKilledUnderLoad) {
   for (int round = 0; round < 5; ++round) {
     const std::int64_t before = written.load();
     daemon.kill_hard();
-    while (written.load() < before + 100) std::this_thread::yield();  // it goes on without
+    await([&] { return written.load() >= before + 100; });  // it goes on without
     daemon.start();
     // Both sessions are back with what they hold, under the same ring.
     const StreamInfo info = [&] {
       for (;;) {
         auto seen = reading.info({"load", 0, ""});
         if (seen && seen->writers == 1 && seen->readers == 1) return *seen;
-        std::this_thread::yield();
+        std::this_thread::sleep_for(test::kLookPause);
       }
     }();
     EXPECT_EQ(info.incarnation, incarnation);
@@ -206,7 +208,7 @@ TEST(Restart, DaemonKeepsNothingOfClientsThatWereKilled) {
     ::close(started[0]);
   }
   // Its sockets are closed by the kernel before its death is reported; dssmd has them on its loop.
-  while (session.clients().value().size() != 1) std::this_thread::yield();
+  await([&] { return session.clients().value().size() == 1; });
   EXPECT_EQ(session.opens().value().size(), 0u);
   for (const StreamInfo& stream : session.list().value()) {
     auto writer = session.open_raw_writer(stream.id);

@@ -8,12 +8,14 @@
 #include <dssm/stream.hpp>
 #include <span>
 #include <string>
+#include <thread>
 #include <utility>
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::test {
@@ -74,6 +76,7 @@ bool eventually(Done done) {
   const MonoTime deadline = deadline_in(std::chrono::seconds(kPatienceSeconds));
   while (!done()) {
     if (MonoClock::now() > deadline) return false;
+    std::this_thread::sleep_for(kLookPause);
   }
   return true;
 }

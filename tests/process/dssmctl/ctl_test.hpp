@@ -13,6 +13,7 @@
 #include <string_view>
 #include <vector>
 
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::test {

@@ -175,8 +175,7 @@ TEST_F(Echo, AwaitsAStreamAndShowsItFromItsFirstSample) {
   for (int attempt = 0; attempt < 20 && !from_the_first; ++attempt) {
     const std::string name = "late" + std::to_string(attempt);
     Running echo(argv({"echo", name, "--wait", "60", "--count", "3", "--csv"}), environment());
-    while (session_.clients().value().size() < 2) {
-    }
+    await([&] { return session_.clients().value().size() == 2; });
     for (int i = 0; i < 50; ++i) ASSERT_TRUE(session_.list());  // leaves it some time
     auto late = session_.create<double>(name, depth_of(16)).value();
     for (int i = 0; i < 3; ++i) late.write(i, at_ns(i));

@@ -30,14 +30,12 @@ class FleetTest : protected OtherHosts, public CtlTest {
     return {};
   }
   void await_state(const std::string& name, const std::string& state) {
-    while (host(name).state != state) {
-    }
+    await([&] { return host(name).state == state; });
   }
 
   // Until pc1 knows as many streams of other hosts.
   void await_streams(std::uint32_t streams) {
-    while (host("pc2").streams + host("pc3").streams != streams) {
-    }
+    await([&] { return host("pc2").streams + host("pc3").streams == streams; });
   }
 };
 

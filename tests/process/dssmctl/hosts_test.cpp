@@ -65,8 +65,7 @@ TEST_F(Hosts, GivesEachNameOnceToPrograms) {
   DaemonProcess pc4({"--peer", pc2_.address(), "--peer", nobody, "--peer", other_address}, "pc4");
   Session session = session_with(pc4);
   const auto state = [&](std::size_t i) { return session.hosts().value()[i].state; };
-  while (state(1) != "up" || state(2) != "down" || state(3) != "up") {
-  }
+  await([&] { return state(1) == "up" && state(2) == "down" && state(3) == "up"; });
   EXPECT_EQ(output({"--socket", pc4.socket_path(), "hosts", "--names"}), "pc4\npc2\n");
   const Json hosts = json({"--socket", pc4.socket_path(), "hosts"})["hosts"];
   ASSERT_EQ(hosts.size(), 4U);

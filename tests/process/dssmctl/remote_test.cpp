@@ -236,8 +236,7 @@ TEST_F(Remote, EchoGoesOnWhenTheStreamComesBackLaterThanItsOwner) {
   const std::vector<std::byte> payload(4);
   output({"--socket", pc2_.socket_path(), "create", "s", "--size", "4", "--depth", "100"});
   Running holder(argv({"--socket", pc2_.socket_path(), "echo", "s"}), environment());
-  while (on_pc2_.info({"s", 0, ""}).value().readers != 1) {
-  }
+  await([&] { return on_pc2_.info({"s", 0, ""}).value().readers == 1; });
   await_streams(1);
   Running echo(argv({"echo", "s", "--csv"}), environment());
   echo.line();  // the header
@@ -250,15 +249,14 @@ TEST_F(Remote, EchoGoesOnWhenTheStreamComesBackLaterThanItsOwner) {
   pc2_.stop();
   holder.stop();
   pc2_.start();
-  while (session_.info({"s", 0, "pc2"})) {  // the mirror's, until pc2 says that there is none
-  }
+  // The mirror's, until pc2 says that there is none.
+  await([&] { return !session_.info({"s", 0, "pc2"}); });
   // Nobody sees from outside that echo has noticed; it looks every 100 ms.
   for (const MonoTime noticed = deadline_in(300ms); MonoClock::now() < noticed;) {
     ASSERT_FALSE(session_.info({"s", 0, "pc2"}));
   }
   holder.signal(SIGCONT);
-  while (!on_pc2_.info({"s", 0, ""})) {
-  }
+  await([&] { return on_pc2_.info({"s", 0, ""}).has_value(); });
   const Tid last = on_pc2_.open_raw_writer({"s", 0, ""}).value().write(payload);
   while (tid < last) {
     const std::string line = echo.line();

@@ -15,8 +15,7 @@ struct Stop : CtlTest {
 
   // Waits until `readers` processes read the stream, dssmctl among them.
   void await_readers(std::uint32_t readers) {
-    while (session_.info(writer_.id()).value().readers != readers) {
-    }
+    await([&] { return session_.info(writer_.id()).value().readers == readers; });
   }
 };
 
@@ -36,8 +35,7 @@ TEST_F(Stop, EndsWithSuccessOnASignalWhileNothingIsWritten) {
 TEST_F(Stop, EndsWithSuccessOnASignalWhileAwaitingAStream) {
   Running running(argv({"echo", "never", "--wait", "1000"}), environment());
   // Nobody sees from outside that it waits; connected is as near as it gets.
-  while (session_.clients().value().size() < 2) {
-  }
+  await([&] { return session_.clients().value().size() == 2; });
   running.signal(SIGINT);
   EXPECT_EQ(running.rest(), "");
   EXPECT_EQ(running.status(), 0);
@@ -144,8 +142,7 @@ TEST_F(Stop, GoesOnWhileTheDaemonIsAwayAndAfterItsReturn) {
   daemon_.kill_hard();
   follow();
   daemon_.start();
-  while (session_.info(writer_.id()).value().readers != 1) {
-  }
+  await_readers(1);
   follow();
   ASSERT_TRUE(session_.remove(writer_.id()));
   EXPECT_NE(echo.rest().find("it was removed"), std::string::npos);

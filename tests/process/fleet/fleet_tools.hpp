@@ -3,11 +3,12 @@
 // What the tests of a fleet on loopback share.
 #pragma once
 
+#include <algorithm>
 #include <dssm/dssm.hpp>
 #include <string>
-#include <thread>
 #include <vector>
 
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::test {
@@ -18,18 +19,20 @@ inline Session connect(const DaemonProcess& daemon) {
       .value();
 }
 
-// Looks again and again; the test runner's time limit is the watchdog.
-template <class Condition>
-void await(Condition condition) {
-  while (!condition()) std::this_thread::yield();
-}
-
 // What `session`'s dssmd says about the peer at `address`.
 inline HostInfo peer_at(Session& session, const std::string& address) {
   for (HostInfo& host : session.hosts().value()) {
     if (host.state != "self" && host.addresses.at(0) == address) return std::move(host);
   }
   return {};
+}
+
+inline void await_up(Session& session, const std::string& host) {
+  await([&] {
+    const std::vector<HostInfo> hosts = session.hosts().value();
+    return std::any_of(hosts.begin(), hosts.end(),
+                       [&](const HostInfo& one) { return one.name == host && one.state == "up"; });
+  });
 }
 
 inline void await_state(Session& session, const DaemonProcess& peer, const std::string& state) {

@@ -9,6 +9,7 @@
 #include <random>
 #include <thread>
 
+#include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::test {
@@ -383,11 +384,7 @@ TEST_F(PConnectorServing, FindsAHostInTheCatalogOfTheLocalDssmd) {
   const DaemonProcess local({"--log-level", "warning", "--peer", daemon.address()}, "pc1");
   ::setenv("DSSM_SOCKET", local.socket_path().c_str(), 1);
   auto here = Session::connect().value();
-  for (;;) {
-    const auto hosts = here.hosts().value();
-    if (hosts.size() == 2 && hosts[1].name == "pc2") break;
-    std::this_thread::yield();
-  }
+  await_up(here, "pc2");
   const auto con = PConnector::open({"lidar", 0, {}}, {.address = "pc2"});
   const auto by_name = PConnector::open({"lidar", 0, "pc2"});
   const auto none = PConnector::open({"lidar", 0, {}}, {.address = "pc7"});

@@ -14,6 +14,7 @@
 #include "core/wire/sample_frame.hpp"
 #include "core/wire/tcp.hpp"
 #include "tests/process/pconnector/fake_daemon.hpp"
+#include "tests/support/await.hpp"
 
 namespace dssm::test {
 namespace {
@@ -812,7 +813,7 @@ TEST(PConnectorPublishing, NoticesABrokenConnectionByTheNextPosts) {
     auto con = open(daemon).value();
     int posts = 0;
     ASSERT_TRUE(con.post(bytes_of(text_of(posts++))));
-    while (daemon.ended() == 0) std::this_thread::yield();
+    await([&] { return daemon.ended() != 0; });
     // The first one tells the kernel, the second one us.
     for (int i = 0; i < 3 && con.counters().reconnects == 0 && con.connected(); ++i) {
       ASSERT_TRUE(con.post(bytes_of(text_of(posts++))));

@@ -9,6 +9,7 @@
 #include <dssm/dssm.hpp>
 #include <fstream>
 
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/service_manager.hpp"
 
@@ -127,14 +128,13 @@ TEST(Reload, DialsNewPeersAndDropsOldOnes) {
   ServiceManager manager({.arguments = {"--config", file.path()}});
   Session session = connect_to(manager.socket_path());
   const auto await_hosts = [&](const std::vector<std::string>& names) {
-    for (;;) {
+    await([&] {
       std::vector<std::string> up;
       for (const HostInfo& host : session.hosts().value()) {
         if (host.state == "up") up.push_back(host.name);
       }
-      if (up == names && session.hosts().value().size() == names.size() + 1) return;
-      std::this_thread::yield();
-    }
+      return up == names && session.hosts().value().size() == names.size() + 1;
+    });
   };
   await_hosts({"pc2"});
   file.write(head + "[\"" + pc2.address() + "\", \"" + pc3.address() + "\"]\n");

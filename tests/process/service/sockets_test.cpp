@@ -15,6 +15,7 @@
 #include <dssm/dssm.hpp>
 #include <future>
 
+#include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/service_manager.hpp"
 
@@ -61,12 +62,7 @@ bool exists(const std::string& path) {
 void await_pc1(const DaemonProcess& pc2) {
   auto session =
       Session::connect({.socket_path = pc2.socket_path(), .request_timeout = 60s}).value();
-  for (;;) {
-    for (const HostInfo& host : session.hosts().value()) {
-      if (host.name == "pc1" && host.state == "up") return;
-    }
-    std::this_thread::yield();
-  }
+  await_up(session, "pc1");
 }
 
 TEST(Sockets, LetProgramsWaitWhileNoDaemonRuns) {

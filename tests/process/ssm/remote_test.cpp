@@ -7,10 +7,10 @@
 #include <signal.h>
 #include <unistd.h>
 
-#include <algorithm>
 #include <dssm/dssm.hpp>
 #include <thread>
 
+#include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/process/ssm/test_name.hpp"
 #include "tests/support/daemon_process.hpp"
 
@@ -63,15 +63,7 @@ struct SsmFleet : testing::Test {
 
   static void await_host(const DaemonProcess& daemon, const std::string& name) {
     auto session = Session::connect({.socket_path = daemon.socket_path()}).value();
-    for (;;) {
-      const auto hosts = session.hosts().value();
-      if (std::any_of(hosts.begin(), hosts.end(), [&](const HostInfo& host) {
-            return host.name == name && host.state == "up";
-          })) {
-        return;
-      }
-      std::this_thread::yield();
-    }
+    await_up(session, name);
   }
 };
 

@@ -76,6 +76,48 @@ TEST_F(ChronydClientTest, AsksAgainAndAgainWithOtherNumbers) {
   }
 }
 
+TEST_F(ChronydClientTest, AsksWhenTheProcessIsAwakeAnyway) {
+  then = [this](const Question& question) { reply(question); };
+  start();
+  until([&] { return answers.size() == 1; });
+  struct Occasion {
+    MonoTime begin, end;
+  };
+  std::vector<Occasion> occasions;
+  EventSource heartbeat = EventSource::timer(loop, [&] {
+    const MonoTime begin = MonoClock::now();
+    for (int i = 0; i < 10; ++i) client->take_occasion();
+    occasions.push_back({begin, MonoClock::now()});
+    heartbeat.enable_in(kPeriod);
+  });
+  heartbeat.enable_in(kPeriod * 9 / 10);
+  until([&] { return answers.size() == 6; });
+  ASSERT_EQ(occasions.size(), 5u) << "each was one to ask at, once";
+  for (std::size_t i = 0; i < occasions.size(); ++i) {
+    EXPECT_GE(answers[i + 1].asked, occasions[i].begin);
+    EXPECT_LE(answers[i + 1].asked, occasions[i].end);
+  }
+  heartbeat.disable();
+  until([&] { return answers.size() == 7; });  // by itself again
+}
+
+// A heartbeat between two questions is none to ask at; some later one is.
+TEST_F(ChronydClientTest, FallsInWithHeartbeats) {
+  then = [this](const Question& question) { reply(question); };
+  MonoTime beat;
+  EventSource heartbeat = EventSource::timer(loop, [&] {
+    beat = MonoClock::now();
+    client->take_occasion();
+    heartbeat.enable_in(kPeriod);
+  });
+  start();
+  heartbeat.enable_in(kPeriod / 2);
+  until([&] {
+    return !answers.empty() && answers.back().asked >= beat && beat > MonoTime{} &&
+           answers.back().asked - beat < kPeriod / 20;
+  });
+}
+
 TEST_F(ChronydClientTest, KnowsAtOnceThatNobodyListens) {
   chronyd.stop();
   const MonoTime begin = MonoClock::now();

@@ -10,6 +10,7 @@ namespace dssm::daemon {
 class FakeClockRules final : public ClockRules {
  public:
   std::uint64_t news() override { return 0; }
+  void on_heartbeat() override {}
   Result<void> check_serving(const StreamId&, const wire::Greeting&) const override { return {}; }
   ring::ClockVerdict judge(const StreamId&, const wire::ClockReport* owner) const override {
     ring::ClockVerdict verdict;
