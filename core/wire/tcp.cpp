@@ -74,11 +74,12 @@ class TcpTransport final : public Transport {
   explicit TcpTransport(UniqueFd socket) noexcept : socket_(std::move(socket)) {}
 
   Result<IoResult> send(std::span<const iovec> parts, bool more) override {
+    const int flags = MSG_NOSIGNAL | MSG_DONTWAIT | (more ? MSG_MORE : 0);
     const msghdr message = header(parts);
     ssize_t bytes = 0;
-    do {
-      bytes =
-          ::sendmsg(socket_.get(), &message, MSG_NOSIGNAL | MSG_DONTWAIT | (more ? MSG_MORE : 0));
+    do {  // the kernel has less to look at when there is but one part
+      bytes = parts.size() == 1 ? ::send(socket_.get(), parts[0].iov_base, parts[0].iov_len, flags)
+                                : ::sendmsg(socket_.get(), &message, flags);
     } while (bytes < 0 && errno == EINTR);
     return io_result(bytes, "send to the other side", socket_.get());
   }
@@ -87,7 +88,9 @@ class TcpTransport final : public Transport {
     msghdr message = header(spaces);
     ssize_t bytes = 0;
     do {
-      bytes = ::recvmsg(socket_.get(), &message, MSG_DONTWAIT);
+      bytes = spaces.size() == 1
+                  ? ::recv(socket_.get(), spaces[0].iov_base, spaces[0].iov_len, MSG_DONTWAIT)
+                  : ::recvmsg(socket_.get(), &message, MSG_DONTWAIT);
     } while (bytes < 0 && errno == EINTR);
     return io_result(bytes, "receive from the other side", socket_.get());
   }

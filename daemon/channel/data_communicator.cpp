@@ -227,13 +227,16 @@ Result<void> DataCommunicator::go_on_opening() {
 // --- turns
 // ----------------------------------------------------------------------------------------
 
-void DataCommunicator::work_soon() { next_turn_.enable_in(Duration::zero()); }
+void DataCommunicator::work_soon() {
+  turn_is_due_ = true;
+  next_turn_.enable_in(Duration::zero());
+}
 
 void DataCommunicator::on_output_empty() { work_now(); }
 
 void DataCommunicator::work_now() {
   if (!link_.is_open()) return;
-  next_turn_.disable();
+  if (std::exchange(turn_is_due_, false)) next_turn_.disable();
   served_ = 0;
   if (opening_) {
     const std::uint64_t serial = opening_->serial;

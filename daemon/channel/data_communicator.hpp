@@ -122,6 +122,7 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
   std::unique_ptr<StreamWatch> watch_;
   std::optional<Opening> opening_;
   std::unique_ptr<StreamChannel> channel_;
+  bool turn_is_due_ = false;
   EventSource next_turn_, greeting_is_late_, silence_;
 };
 

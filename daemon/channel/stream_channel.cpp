@@ -29,6 +29,7 @@ StreamChannel::StreamChannel(const Parts& parts, std::shared_ptr<ServedStream> s
                              bool may_tear)
     : parts_(parts),
       served_(std::move(served)),
+      tells_clock_(parts.clock && parts.them.has_feature(wire::kFeatureClock)),
       reader_(stream().mapping()),
       sender_(stream().mapping(), parts_.link, {may_tear, &parts_.budget}),
       due_(EventSource::timer(parts_.loop, [this] { parts_.owner.work_now(); })) {
@@ -171,7 +172,7 @@ void StreamChannel::on_news() { parts_.owner.work_now(); }
 // The clock may have been set, and samples been written after that: what they say of their time
 // must not be believed.
 void StreamChannel::before_samples() {
-  if (!parts_.clock || !parts_.them.has_feature(wire::kFeatureClock)) return;
+  if (!tells_clock_) return;
   const std::uint64_t news = parts_.clock->news();
   if (clock_news_ == news) return;
   clock_news_ = news;

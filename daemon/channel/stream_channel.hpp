@@ -106,6 +106,7 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
 
   Parts parts_;
   std::shared_ptr<ServedStream> served_;
+  const bool tells_clock_;  // to who is there
   ring::RingReader reader_;
   SampleSender sender_;
   std::shared_ptr<StreamFeed> feed_;  // while there is a subscription

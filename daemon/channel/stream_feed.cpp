@@ -63,7 +63,7 @@ void StreamFeed::look() {
   while (std::exchange(look_again_, false) && !waiting_.empty()) {
     // Disarmed, so that the writer does not ring for what is sent in this round anyway.
     arm(false);
-    told_ = std::exchange(waiting_, {});
+    std::swap(told_, waiting_);  // neither gives its memory back
     for (std::size_t i = 0; i < told_.size(); ++i) {
       const Waiting waiting = std::exchange(told_[i], {nullptr, kNoTid});
       if (!waiting.listener) continue;

@@ -34,6 +34,7 @@ ClockWatch::ClockWatch(const EventLoop& loop, const Options& options, Observer& 
       observer_(observer),
       logger_(logger),
       now_(options.now),
+      tick_(options.tick),
       estimator_(options.settings),
       client_(loop, options.chronyd, *this, options.now, options.period) {
   Result<std::unique_ptr<StepWatch>> watch = StepWatch::open(loop, [this] { on_set(); });
@@ -57,6 +58,16 @@ clock::ClockState ClockWatch::state() {
   // Whoever asks why wants to know that it was never there.
   if (state.status == ClockStatus::unknown && absent_) state.trouble = ClockTrouble::no_chronyd;
   return state;
+}
+
+bool ClockWatch::may_differ() {
+  const std::optional<clock::Tick> tick = tick_();
+  if (tick && seen_tick_ && tick->difference == seen_tick_->difference &&
+      tick->mono - seen_tick_->mono < kMostDelay) {
+    return false;
+  }
+  seen_tick_ = tick;
+  return true;
 }
 
 std::optional<SourceAddress> ClockWatch::source() const noexcept {

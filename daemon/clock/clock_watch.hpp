@@ -10,6 +10,7 @@
 #include <string>
 
 #include "core/clock/clock_estimator.hpp"
+#include "core/clock/clock_tick.hpp"
 #include "core/wire/address.hpp"
 #include "daemon/clock/chronyd_client.hpp"
 #include "daemon/clock/step_watch.hpp"
@@ -27,6 +28,7 @@ class ClockWatch final : private ChronydClient::User {
     // Tests put their own in their places.
     ChronydClient::Now now = clock::Instant::now;
     Duration period = ChronydClient::kPeriod;
+    std::function<std::optional<clock::Tick>()> tick = clock::Tick::last;
   };
 
   class Observer {
@@ -52,6 +54,11 @@ class ClockWatch final : private ChronydClient::User {
   clock::Instant base();
 
   clock::ClockState state();  // at this moment
+
+  // Whether state() may tell something else than when this was asked last. Costs much less, and
+  // misses no step; what comes with time alone (chronyd is silent) may be kMostDelay old.
+  bool may_differ();
+  static constexpr Duration kMostDelay = std::chrono::milliseconds(50);
 
   // dssmd is awake anyway: chronyd is asked now when that is about due.
   void take_occasion() { client_.take_occasion(); }
@@ -99,7 +106,9 @@ class ClockWatch final : private ChronydClient::User {
   Observer& observer_;
   Logger& logger_;
   const ChronydClient::Now now_;
+  const std::function<std::optional<clock::Tick>()> tick_;
   clock::ClockEstimator estimator_;
+  std::optional<clock::Tick> seen_tick_;   // before may_differ() was true last
   std::optional<TrackingReply> last_;      // while there is a chronyd
   bool absent_ = false;                    // nothing listens there
   std::optional<MonoTime> waiting_since_;  // no answer since then

@@ -15,9 +15,25 @@ void on_event(evutil_socket_t, short, void* callback) noexcept {
 }  // namespace
 
 Result<EventLoop> EventLoop::open() {
-  event_base* base = event_base_new();
-  if (!base) return os_error("create the event loop");
-  return EventLoop(base);
+  Result<std::unique_ptr<TimerQueue>> timers = TimerQueue::open();
+  if (!timers) return std::move(timers).error().context("create the event loop");
+  EventLoop loop(*std::move(timers));
+  if (!loop.base_) return os_error("create the event loop");
+  loop.watch_timers();
+  return loop;
+}
+
+EventLoop::EventLoop(std::unique_ptr<TimerQueue> timers)
+    : base_(event_base_new()), timers_(std::move(timers)) {}
+
+void EventLoop::watch_timers() {
+  timer_is_due_.reset(event_new(
+      base(), timers_->fd(), EV_READ | EV_ET | EV_PERSIST,
+      [](evutil_socket_t, short, void* timers) noexcept {
+        static_cast<TimerQueue*>(timers)->run_due();
+      },
+      timers_.get()));
+  DSSM_CHECK(timer_is_due_ && event_add(timer_is_due_.get(), nullptr) == 0);
 }
 
 Result<void> EventLoop::run() {
@@ -30,6 +46,7 @@ Result<void> EventLoop::run() {
 void EventLoop::stop() noexcept { event_base_loopbreak(base_.get()); }
 
 void EventLoop::Free::operator()(event_base* base) const noexcept { event_base_free(base); }
+void EventLoop::Free::operator()(event* source) const noexcept { event_free(source); }
 
 EventSource::EventSource(const EventLoop& loop, int fd, short what, Callback callback)
     : callback_(std::make_unique<Callback>(std::move(callback))),
@@ -54,19 +71,26 @@ EventSource EventSource::signal(const EventLoop& loop, int number, Callback call
 }
 
 EventSource EventSource::timer(const EventLoop& loop, Callback callback) {
-  return {loop, -1, 0, std::move(callback)};
+  EventSource timer(loop, -1, 0, std::move(callback));
+  timer.timer_ = std::make_unique<TimerQueue::Timer>(loop.timers(), *timer.callback_);
+  return timer;
 }
 
 void EventSource::enable() noexcept { DSSM_CHECK(event_add(event_.get(), nullptr) == 0); }
 
 void EventSource::enable_in(Duration delay) noexcept {
-  const auto microseconds = std::chrono::duration_cast<std::chrono::microseconds>(delay).count();
-  const timeval wait{microseconds / 1'000'000, microseconds % 1'000'000};
-  DSSM_CHECK(event_add(event_.get(), &wait) == 0);
+  if (delay > Duration::zero()) {
+    event_del(event_.get());
+    return timer_->start(deadline_in(delay));
+  }
+  timer_->stop();
+  constexpr timeval kAtOnce{};
+  DSSM_CHECK(event_add(event_.get(), &kAtOnce) == 0);
 }
 
 void EventSource::disable() noexcept {
   if (event_) event_del(event_.get());
+  if (timer_) timer_->stop();
 }
 
 void EventSource::Free::operator()(event* source) const noexcept { event_free(source); }

@@ -10,6 +10,8 @@
 #include <functional>
 #include <memory>
 
+#include "daemon/service/timer_queue.hpp"
+
 struct event_base;
 struct event;
 
@@ -25,13 +27,18 @@ class EventLoop {
   void stop() noexcept;
 
   event_base* base() const noexcept { return base_.get(); }
+  TimerQueue& timers() const noexcept { return *timers_; }
 
  private:
   struct Free {
     void operator()(event_base* base) const noexcept;
+    void operator()(event* source) const noexcept;
   };
-  explicit EventLoop(event_base* base) : base_(base) {}
+  explicit EventLoop(std::unique_ptr<TimerQueue> timers);
+  void watch_timers();
   std::unique_ptr<event_base, Free> base_;
+  std::unique_ptr<TimerQueue> timers_;
+  std::unique_ptr<event, Free> timer_is_due_;
 };
 
 // Calls back when something happens; idle until enable(). The callback may disable its own source
@@ -47,6 +54,7 @@ class EventSource {
   // eventfd), whether or not anybody reads it. `fd` must have no other source in this loop.
   static EventSource edge(const EventLoop& loop, int fd, Callback callback);
   static EventSource signal(const EventLoop& loop, int number, Callback callback);
+  // Without a delay it calls back in the loop's next turn, when other events had theirs.
   static EventSource timer(const EventLoop& loop, Callback callback);
 
   void enable() noexcept;
@@ -59,7 +67,8 @@ class EventSource {
   };
   EventSource(const EventLoop& loop, int fd, short what, Callback callback);
   std::unique_ptr<Callback> callback_;  // on the heap: libevent keeps its address
-  std::unique_ptr<event, Free> event_;
+  std::unique_ptr<event, Free> event_;  // of a timer: for the next turn
+  std::unique_ptr<TimerQueue::Timer> timer_;
 };
 
 }  // namespace dssm::daemon

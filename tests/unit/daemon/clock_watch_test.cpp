@@ -29,6 +29,7 @@ class ClockWatchTest : public testing::Test, protected ClockWatch::Observer {
   EventLoop loop = EventLoop::open().value();
   LinesLogger logger;
   clock::Instant now{MonoTime(1000s), Time(1'795'000'000s), {}};
+  std::optional<clock::Tick> tick;  // nullopt: nothing is known of it
   clock::Tracking tracking;
   Duration age{};  // of its last measurement
   bool mute = false;
@@ -53,7 +54,8 @@ class ClockWatchTest : public testing::Test, protected ClockWatch::Observer {
   void on_clock() override { ++looks; }
 
   void restart() {
-    const ClockWatch::Options options{chronyd.address(), {}, [this] { return now; }, 50ms};
+    const ClockWatch::Options options{
+        chronyd.address(), {}, [this] { return now; }, 50ms, [this] { return tick; }};
     ClockWatch::Observer& observer = *this;
     watch = std::make_unique<ClockWatch>(loop, options, observer, logger);
   }
@@ -289,6 +291,22 @@ TEST_F(ClockWatchTest, TakesOtherLimits) {
   watch->set({.limit = 50us});
   EXPECT_EQ(watch->state().trouble, ClockTrouble::too_far);
   until_told("more than its limit of 0.050 ms");
+}
+
+TEST_F(ClockWatchTest, SaysCheaplyThatNothingHasChanged) {
+  EXPECT_TRUE(watch->may_differ());
+  EXPECT_TRUE(watch->may_differ()) << "a tick came in between: nothing is known";
+  tick = clock::Tick{now.mono, now.wall - time_from_ns(0) - now.mono.time_since_epoch()};
+  EXPECT_TRUE(watch->may_differ());
+  EXPECT_FALSE(watch->may_differ());
+  tick->mono += ClockWatch::kMostDelay - 1ns;
+  EXPECT_FALSE(watch->may_differ());
+  tick->mono += 1ns;
+  EXPECT_TRUE(watch->may_differ()) << "what time alone changes";
+  EXPECT_FALSE(watch->may_differ());
+  tick->difference += 1ns;
+  EXPECT_TRUE(watch->may_differ()) << "the clock was set";
+  EXPECT_FALSE(watch->may_differ());
 }
 
 TEST_F(ClockWatchTest, LivesWithoutDescriptors) {

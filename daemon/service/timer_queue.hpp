@@ -1,0 +1,67 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The timers of one event loop, behind one timerfd. libevent's own timers become a timeout of
+// epoll_wait(): the kernel sets a timer up before each sleep and takes it down after it, although
+// the first one due stays the same for thousands of samples. Here the kernel hears of a timer
+// only when another one is the first.
+//
+//   threads  one
+#pragma once
+
+#include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <functional>
+#include <map>
+#include <memory>
+
+#include "core/base/unique_fd.hpp"
+
+namespace dssm::daemon {
+
+class TimerQueue {
+ public:
+  class Timer;
+
+  //   fails  os errors: no descriptor left
+  static Result<std::unique_ptr<TimerQueue>> open();
+
+  // Gets readable when a timer is due. To be watched edge-triggered, and never read.
+  int fd() const noexcept { return fd_.get(); }
+  // Then calls back those that are due, in the order of their times.
+  void run_due();
+
+ private:
+  using Waiting = std::multimap<MonoTime, Timer*>;  // of one time: in the order of their starts
+
+  explicit TimerQueue(UniqueFd fd) noexcept : fd_(std::move(fd)) {}
+  void arm() noexcept;
+
+  UniqueFd fd_;
+  Waiting waiting_;
+  MonoTime armed_ = kNever;  // what the kernel was told last
+  bool running_ = false;
+};
+
+// Calls back once at the time that it is started for, unless it is stopped or started anew before.
+// The callback may do both. The queue outlives it.
+class TimerQueue::Timer {
+ public:
+  // callback outlives the timer.
+  Timer(TimerQueue& queue, const std::function<void()>& callback);
+  Timer(const Timer&) = delete;
+  Timer& operator=(const Timer&) = delete;
+  ~Timer();
+
+  void start(MonoTime when) noexcept;
+  void stop() noexcept;
+
+ private:
+  friend class TimerQueue;
+
+  TimerQueue& queue_;
+  const std::function<void()>& callback_;
+  Waiting::node_type node_;    // while it is idle: starting allocates nothing
+  Waiting::iterator place_{};  // while it waits
+};
+
+}  // namespace dssm::daemon
