@@ -54,11 +54,12 @@ std::string hex(std::string_view bytes) {
 }
 
 // Between two looks whether a clock is good by now.
-constexpr Duration kClockLookUp = std::chrono::milliseconds(500);
+constexpr Duration kLookAgain = std::chrono::milliseconds(500);
 
 // Whether a stream that cannot be opened because of this may be had later.
 bool is_worth_waiting_for(const Error& why) {
-  return why.code == Errc::not_found || why.code == Errc::clock_out_of_bounds;
+  return why.code == Errc::not_found || why.code == Errc::clock_out_of_bounds ||
+         why.code == Errc::daemon_away;
 }
 
 HostInfo host_info(const local::Host& message) {
@@ -197,9 +198,9 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
   for (std::uint64_t seen = 0;;) {
     auto reader = open_raw_reader(id, wanted);
     if (reader || !is_worth_waiting_for(reader.error())) return reader;
-    // That a clock is good again is no event of a stream.
-    const bool is_clock = reader.error().code == Errc::clock_out_of_bounds;
-    const MonoTime next = is_clock ? std::min(deadline, deadline_in(kClockLookUp)) : deadline;
+    // That a clock is good again, or that a host answers again, is no event of a stream.
+    const bool is_told = reader.error().code == Errc::not_found;
+    const MonoTime next = is_told ? deadline : std::min(deadline, deadline_in(kLookAgain));
     std::unique_lock lock(mutex);
     if (next == kNever) {
       came.wait(lock, [&] { return times > seen; });

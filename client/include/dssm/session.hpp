@@ -155,9 +155,10 @@ class Session {
   Result<RawReader> open_raw_reader(const StreamId& id, const TypeInfo* wanted = nullptr,
                                     std::uint32_t tag = 0);
 
-  // Opens a stream for reading, waiting until `deadline` for it to be created, and for the clocks
-  // of its host and of this PC to be good enough.
-  //   fails  as open_raw_reader(); not_found, clock_out_of_bounds when the deadline passed
+  // Opens a stream for reading, waiting until `deadline` for it to be created, for its host to
+  // answer, and for the clocks of that and of this PC to be good enough.
+  //   fails  as open_raw_reader(); not_found, daemon_away, clock_out_of_bounds when the deadline
+  //          passed
   Result<RawReader> await_raw_reader(const StreamId& id, MonoTime deadline,
                                      const TypeInfo* wanted = nullptr);
 

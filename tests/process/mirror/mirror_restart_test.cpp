@@ -6,6 +6,7 @@
 #include <csignal>
 #include <cstdio>
 #include <cstdlib>
+#include <future>
 
 #include "tests/process/mirror/two_hosts.hpp"
 
@@ -16,7 +17,7 @@ constexpr History kLong{1 << 16, 1ms};  // of which nobody has to lose anything
 
 TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonIsKilledUnderLoad) {
   auto writer = here.create<Counted>("load", kLong).value();
-  auto reader = there.open_reader<Counted>("load").value();
+  auto reader = open_filled<Counted>(there, "load");
   Reading reading(reader);
   std::int64_t written = 0;
   {
@@ -39,9 +40,9 @@ TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonIsKilledUnderLoad) {
 
 TEST_F(TwoHosts, LoseNothingWhenTheMirrorsDaemonIsKilledUnderLoad) {
   auto writer = here.create<Counted>("load", kLong).value();
-  auto reader = there.open_reader<Counted>("load").value();
+  auto reader = open_filled<Counted>(there, "load");
   Session another = connect(pc2);
-  auto second = another.open_reader<Counted>("load").value();
+  auto second = open_filled<Counted>(another, "load");
   Reading reading(reader), reading_too(second);
   std::int64_t written = 0;
   {
@@ -60,14 +61,14 @@ TEST_F(TwoHosts, LoseNothingWhenTheMirrorsDaemonIsKilledUnderLoad) {
   EXPECT_EQ(reader.lost() + second.lost(), 0u);
   EXPECT_EQ(reader.restarts() + second.restarts(), 0u);
   // One mirror serves them both, and new ones.
-  auto later = there.open_reader<Counted>("load").value();
+  auto later = open_filled<Counted>(there, "load");
   EXPECT_EQ(later.incarnation(), writer.incarnation());
   EXPECT_EQ(channels("load"), 1u);
 }
 
 TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonHangs) {
   auto writer = here.create<Counted>("load", kLong).value();
-  auto reader = there.open_reader<Counted>("load").value();
+  auto reader = open_filled<Counted>(there, "load");
   Reading reading(reader);
   Writing writing(writer);
   reading.await_taken(100);
@@ -87,7 +88,7 @@ TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonHangs) {
 TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsAway) {
   auto writer = here.create<Counted>("kept", kLong).value();
   for (int i = 0; i < 100; ++i) writer.write(counted(i));
-  auto reader = there.open_reader<Counted>("kept").value();
+  auto reader = open_filled<Counted>(there, "kept");
   pc1.kill_hard();
   await([&] { return mirror("kept").state == "owner away"; });
   auto joined = there.open_reader<Counted>("kept@pc1");
@@ -102,7 +103,7 @@ TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsAway) {
 
 TEST_F(TwoHosts, CountExactlyWhatTheOwnersRingLostMeanwhile) {
   auto writer = here.create<Counted>("short", History{64, 1ms}).value();
-  auto reader = there.open_reader<Counted>("short").value();
+  auto reader = open_filled<Counted>(there, "short");
   reader.seek(kNoTid);
   Counted sample{};
   SampleInfo info;
@@ -133,7 +134,7 @@ TEST_F(TwoHosts, TellReadersThatTheOwnerCameBackWithoutItsRing) {
     Session brief = connect(pc1);
     auto writer = brief.create<Counted>("reborn", kLong).value();
     for (int i = 0; i < 10; ++i) writer.write(counted(i));
-    auto opened = there.open_reader<Counted>("reborn").value();
+    auto opened = open_filled<Counted>(there, "reborn");
     EXPECT_EQ(opened.wait_for_tid(9, kNever), WaitStatus::ready);
     pc1.kill_hard();
     return opened;
@@ -163,7 +164,7 @@ TEST_F(TwoHosts, TellReadersThatTheOwnerCameBackWithoutItsRing) {
 // Both at once: whoever comes back first waits for the other.
 TEST_F(TwoHosts, FindEachOtherAgainWhenBothDaemonsAreKilled) {
   auto writer = here.create<Counted>("load", kLong).value();
-  auto reader = there.open_reader<Counted>("load").value();
+  auto reader = open_filled<Counted>(there, "load");
   Reading reading(reader);
   Writing writing(writer);
   for (int round = 0; round < 2; ++round) {
@@ -204,7 +205,7 @@ TEST_F(TwoHosts, GoOnWithAMirrorThatWasMadeMeanwhile) {
   pc2.start();
   writer.write(counted(1));
   await_state(there, pc1, "up");
-  auto eager = there.open_reader<Counted>("load@pc1").value();
+  auto eager = open_filled<Counted>(there, "load@pc1");
   ::kill(holder, SIGCONT);
   expect_line(1);
   writer.write(counted(2));
@@ -213,6 +214,20 @@ TEST_F(TwoHosts, GoOnWithAMirrorThatWasMadeMeanwhile) {
   ::kill(holder, SIGKILL);
   wait_for(holder);
   std::fclose(out);
+}
+
+TEST_F(TwoHosts, WaitForAHostThatDoesNotAnswer) {
+  auto writer = here.create<Counted>("odometry", kLong).value();
+  await_list(there, {"odometry:0@pc1"});
+  ::kill(pc1.pid(), SIGSTOP);
+  auto opened = std::async(std::launch::async, [this] {
+    return there.await_reader<Counted>("odometry@pc1", deadline_in(60s));
+  });
+  Session another = connect(pc2);  // the other one's questions wait for each other
+  await([&] { return peer_at(another, pc1.address()).state == "down"; });
+  ::kill(pc1.pid(), SIGCONT);
+  const auto reader = opened.get();
+  EXPECT_TRUE(reader) << reader.error().message;
 }
 
 TEST_F(TwoHosts, SayThatAHostDoesNotAnswer) {
