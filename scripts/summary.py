@@ -3,16 +3,24 @@
 """Counts what the test runs of ./check did.
 
 Takes build folders. Reads what meson wrote there: testlog.json, a line for each test program, and
-testlog.junit.xml, an entry for each test in them. Names every test that failed or was skipped, and
-closes with one line "N passed, N failed" (", N skipped" when there were any). A program that ended
-badly without naming a failed test, a crash say, counts as one. Exits with 1 when a test failed or
-when there was none.
+testlog.junit.xml, an entry for each test in them. Names every test that failed, with what it said,
+or was skipped, and closes with one line "N passed, N failed" (", N skipped" when there were any). A
+program that ended badly without naming a failed test, a crash say, counts as one. Exits with 1 when
+a test failed or when there was none.
 """
 
 import json
 import pathlib
 import sys
+import textwrap
 import xml.etree.ElementTree as ElementTree
+
+MOST_LINES = 12
+
+
+def first_lines(text: str | None) -> str:
+    """What a test says of its failure, as far as it is worth repeating far from its log."""
+    return "\n".join((text or "").strip().splitlines()[:MOST_LINES])
 
 
 def count(folder: pathlib.Path) -> tuple[int, int, int]:
@@ -20,9 +28,12 @@ def count(folder: pathlib.Path) -> tuple[int, int, int]:
     passed = failed = skipped = 0
     for case in ElementTree.parse(folder / "testlog.junit.xml").getroot().iter("testcase"):
         name = f"{folder.parent.name}: {case.get('classname')}.{case.get('name')}"
-        if case.find("failure") is not None or case.find("error") is not None:
+        troubles = case.findall("failure") + case.findall("error")
+        if troubles:
             failed += 1
             print(f"FAILED  {name}")
+            for trouble in troubles:
+                print(textwrap.indent(first_lines(trouble.get("message") or trouble.text), " " * 8))
         elif case.find("skipped") is not None or case.get("result") in ("skipped", "suppressed"):
             skipped += 1
             print(f"SKIPPED {name}")

@@ -5,7 +5,9 @@
 
 #include <algorithm>
 #include <dssm/dssm.hpp>
+#include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "tests/support/await.hpp"
@@ -37,6 +39,27 @@ inline void await_up(Session& session, const std::string& host) {
 
 inline void await_state(Session& session, const DaemonProcess& peer, const std::string& state) {
   await([&] { return peer_at(session, peer.address()).state == state; });
+}
+
+// A reader of a stream of another host, once its mirror is filled: on a busy machine opening gives
+// up waiting for the other dssmd or for the history, or the other one is taken for dead.
+template <class T>
+Reader<T> open_filled(Session& session, const std::string& stream) {
+  std::optional<Reader<T>> reader;
+  await([&] {
+    Result<Reader<T>> opened = session.open_reader<T>(stream);
+    if (opened) {
+      reader = *std::move(opened);
+    } else if (opened.error().code != Errc::daemon_away && opened.error().code != Errc::not_found) {
+      opened.value();  // throws, with the reason
+    }
+    return reader.has_value();
+  });
+  await([&] {
+    const Result<StreamInfo> info = session.info(reader->id());
+    return info && info->mirror && info->mirror->state == "live";
+  });
+  return *std::move(reader);
 }
 
 // All streams that `session` lists, as "lidar:0@pc2".

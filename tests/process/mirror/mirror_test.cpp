@@ -12,7 +12,7 @@ namespace {
 TEST_F(TwoHosts, ReadTheHistoryFromBeforeTheReaderCame) {
   auto writer = here.create<Counted>("odometry", History{1024, 1ms}).value();
   for (int i = 0; i < 3000; ++i) writer.write(counted(i), time_from_ns(1000 * i), Duration(i));
-  auto reader = there.open_reader<Counted>("odometry").value();
+  auto reader = open_filled<Counted>(there, "odometry");
   EXPECT_EQ(reader.id(), (StreamId{"odometry", 0, "pc1"}));
   EXPECT_EQ(reader.type(), type_of<Counted>()) << "with all its fields";
   EXPECT_EQ(reader.depth(), 1024u);
@@ -40,7 +40,7 @@ TEST_F(TwoHosts, AnswerReadsByTimeAsTheOwnerDoes) {
   std::mt19937_64 random(seed);
   auto writer = here.create<Counted>("jumpy", History{500, 1ms}).value();
   auto owned = here.open_reader<Counted>("jumpy").value();
-  auto mirrored = there.open_reader<Counted>("jumpy").value();
+  auto mirrored = open_filled<Counted>(there, "jumpy");
   std::int64_t time = 1'000'000;
   for (int i = 0; i < 5000; ++i) {
     time += random() % 50 == 0 ? -static_cast<std::int64_t>(random() % 5000)
@@ -65,10 +65,10 @@ TEST_F(TwoHosts, AnswerReadsByTimeAsTheOwnerDoes) {
 TEST_F(TwoHosts, ShareOneChannelAmongAllReaders) {
   auto writer = here.create<Counted>("lidar", History{64, 1ms}).value();
   EXPECT_EQ(channels("lidar"), 0u);
-  auto first = there.open_reader<Counted>("lidar").value();
+  auto first = open_filled<Counted>(there, "lidar");
   Session another = connect(pc2);
-  auto second = another.open_reader<Counted>("lidar@pc1").value();
-  auto third = there.open_reader<Counted>("lidar:0").value();
+  auto second = open_filled<Counted>(another, "lidar@pc1");
+  auto third = open_filled<Counted>(there, "lidar:0");
   EXPECT_EQ(channels("lidar"), 1u);
   writer.write(counted(0));
   for (Reader<Counted>* reader : {&first, &second, &third}) {
@@ -79,7 +79,7 @@ TEST_F(TwoHosts, ShareOneChannelAmongAllReaders) {
 
 TEST_F(TwoHosts, ReadAnEmptyStreamFromItsFirstSampleOn) {
   auto writer = here.create<Counted>("later", History{64, 1ms}).value();
-  auto reader = there.open_reader<Counted>("later").value();
+  auto reader = open_filled<Counted>(there, "later");
   EXPECT_EQ(reader.newest(), kNoTid);
   EXPECT_EQ(mirror("later").state, "live");
   writer.write(counted(0));
@@ -96,7 +96,7 @@ TEST_F(LingeringHosts, CloseTheChannelAfterTheLastReaderLeft) {
   const std::uint64_t memory = there.daemon().value().memory_bytes;
   for (int round = 0; round < 3; ++round) {
     {
-      auto reader = there.open_reader<Counted>("imu").value();
+      auto reader = open_filled<Counted>(there, "imu");
       EXPECT_EQ(channels("imu"), 1u);
       EXPECT_GT(there.daemon().value().memory_bytes, memory);
     }
@@ -122,7 +122,7 @@ TEST_F(LingeringHosts, CloseTheChannelOfReadersThatDied) {
 TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
   std::optional<Writer<Counted>> writer = here.create<Counted>("anew", History{64, 1ms}).value();
   for (int i = 0; i < 5; ++i) writer->write(counted(i));
-  auto reader = there.open_reader<Counted>("anew").value();
+  auto reader = open_filled<Counted>(there, "anew");
   reader.seek(kNoTid);
   ASSERT_TRUE(here.remove({"anew", 0, ""}));
   // The owner is asked, and says so.
@@ -212,7 +212,7 @@ TEST(TightHosts, SayWhichLimitAMirrorWouldBreak) {
   EXPECT_NE(refused.error().message.find("max_memory"), std::string::npos)
       << refused.error().message;
   auto own = there.create<Counted>("own", History{16, 1ms}).value();
-  auto mirrored = there.open_reader<Counted>("small@pc1").value();
+  auto mirrored = open_filled<Counted>(there, "small@pc1");
   const auto third = there.open_reader<Counted>("more@pc1");
   ASSERT_FALSE(third);
   EXPECT_NE(third.error().message.find("max_streams"), std::string::npos) << third.error().message;
