@@ -12,6 +12,11 @@ namespace dssm::ctl {
 namespace {
 
 // Without a reader and without an error when told to stop.
+// What --wait waits for.
+bool may_come(const Error& why) {
+  return why.code == Errc::not_found || why.code == Errc::daemon_away;
+}
+
 Result<std::optional<OpenedStream>> open_stream(const Options& options) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
@@ -21,7 +26,7 @@ Result<std::optional<OpenedStream>> open_stream(const Options& options) {
   if (reader) return std::optional(OpenedStream{*session, std::move(*reader), false});
 
   const MonoTime deadline = deadline_in(options.wait);
-  while (reader.error().code == Errc::not_found && MonoClock::now() < deadline) {
+  while (may_come(reader.error()) && MonoClock::now() < deadline) {
     if (stop_requested()) return std::optional<OpenedStream>();
     reader = session->await_raw_reader(*id, std::min(deadline, deadline_in(kStopLookUp)));
     if (reader) return std::optional(OpenedStream{*session, std::move(*reader), true});

@@ -79,8 +79,8 @@ void add_stream(CLI::App* app, Options& options) {
 }
 
 void add_wait(CLI::App* app, Options& options) {
-  add_seconds(app, "--wait", "wait so long for the stream to appear", options.wait,
-              Range::not_negative);
+  add_seconds(app, "--wait", "wait so long for the stream to appear, or its host to answer",
+              options.wait, Range::not_negative);
 }
 
 void add_ls(CLI::App& app, Options& options) {

@@ -231,6 +231,20 @@ TEST_F(Remote, EchoGoesOnWhileTheOwnerIsAwayAndAfterItsReturn) {
   }
 }
 
+TEST_F(Remote, EchoAwaitsAHostThatDoesNotAnswer) {
+  auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
+  writer.write(1);
+  await_streams(1);
+  ::kill(pc2_.pid(), SIGSTOP);
+  Running echo(argv({"echo", "s@pc2", "--wait", "60", "--count", "1", "--csv"}), environment());
+  await_state("pc2", "down");
+  ::kill(pc2_.pid(), SIGCONT);
+  echo.line();  // the header
+  EXPECT_TRUE(echo.line().starts_with("0,"));
+  echo.rest();
+  EXPECT_EQ(echo.status(), 0);
+}
+
 // The same, but that program takes its time: meanwhile there is no such stream.
 TEST_F(Remote, EchoGoesOnWhenTheStreamComesBackLaterThanItsOwner) {
   const std::vector<std::byte> payload(4);
