@@ -62,6 +62,8 @@ class Running {
   pid_t pid_ = -1;
   int fd_ = -1;
   bool ended_ = false;
+  int ending_ = 0;  // the signal that it was sent last to end it
+  MonoTime signal_again_;
   std::string text_;
 };
 
