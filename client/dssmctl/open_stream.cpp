@@ -11,12 +11,12 @@
 namespace dssm::ctl {
 namespace {
 
-// Without a reader and without an error when told to stop.
 // What --wait waits for.
 bool may_come(const Error& why) {
   return why.code == Errc::not_found || why.code == Errc::daemon_away;
 }
 
+// Without a reader and without an error when told to stop.
 Result<std::optional<OpenedStream>> open_stream(const Options& options) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();

@@ -38,9 +38,8 @@ Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
 
 // Precise to some milliseconds, for a fifth of the price; verdicts hold for seconds.
 MonoTime coarse_now() noexcept {
-  timespec now{};
-  ::clock_gettime(CLOCK_MONOTONIC_COARSE, &now);
-  return MonoTime(std::chrono::seconds(now.tv_sec) + Duration(now.tv_nsec));
+  using Coarse = detail::PosixClock<CLOCK_MONOTONIC_COARSE, true>;
+  return MonoTime(Coarse::now().time_since_epoch());
 }
 
 // Whether the time of that sample must not be used.

@@ -53,7 +53,7 @@ std::string hex(std::string_view bytes) {
   return digits;
 }
 
-// Between two looks whether a clock is good by now.
+// Between two tries for what is no event of a stream.
 constexpr Duration kLookAgain = std::chrono::milliseconds(500);
 
 // Whether a stream that cannot be opened because of this may be had later.

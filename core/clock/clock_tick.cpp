@@ -1,23 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/clock/clock_tick.hpp"
 
-#include <time.h>
-
 namespace dssm::clock {
-namespace {
-
-Duration read(clockid_t clock) noexcept {
-  timespec time{};
-  ::clock_gettime(clock, &time);  // cannot fail for a clock that exists
-  return std::chrono::seconds(time.tv_sec) + std::chrono::nanoseconds(time.tv_nsec);
-}
-
-}  // namespace
 
 std::optional<Tick> Tick::last() noexcept {
-  const Duration before = read(CLOCK_MONOTONIC_COARSE);
-  const Duration wall = read(CLOCK_REALTIME_COARSE);
-  if (read(CLOCK_MONOTONIC_COARSE) != before) return std::nullopt;
+  using Mono = detail::PosixClock<CLOCK_MONOTONIC_COARSE, true>;
+  using Wall = detail::PosixClock<CLOCK_REALTIME_COARSE, false>;
+  const Duration before = Mono::now().time_since_epoch();
+  const Duration wall = Wall::now().time_since_epoch();
+  if (Mono::now().time_since_epoch() != before) return std::nullopt;
   return Tick{MonoTime(before), wall - before};
 }
 
