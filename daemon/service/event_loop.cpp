@@ -46,7 +46,7 @@ Result<void> EventLoop::run() {
 void EventLoop::stop() noexcept { event_base_loopbreak(base_.get()); }
 
 void EventLoop::Free::operator()(event_base* base) const noexcept { event_base_free(base); }
-void EventLoop::Free::operator()(event* source) const noexcept { event_free(source); }
+void FreeEvent::operator()(event* source) const noexcept { event_free(source); }
 
 EventSource::EventSource(const EventLoop& loop, int fd, short what, Callback callback)
     : callback_(std::make_unique<Callback>(std::move(callback))),
@@ -92,7 +92,5 @@ void EventSource::disable() noexcept {
   if (event_) event_del(event_.get());
   if (timer_) timer_->stop();
 }
-
-void EventSource::Free::operator()(event* source) const noexcept { event_free(source); }
 
 }  // namespace dssm::daemon

@@ -17,6 +17,10 @@ struct event;
 
 namespace dssm::daemon {
 
+struct FreeEvent {
+  void operator()(event* source) const noexcept;
+};
+
 class EventLoop {
  public:
   static Result<EventLoop> open();
@@ -32,13 +36,12 @@ class EventLoop {
  private:
   struct Free {
     void operator()(event_base* base) const noexcept;
-    void operator()(event* source) const noexcept;
   };
   explicit EventLoop(std::unique_ptr<TimerQueue> timers);
   void watch_timers();
   std::unique_ptr<event_base, Free> base_;
   std::unique_ptr<TimerQueue> timers_;
-  std::unique_ptr<event, Free> timer_is_due_;
+  std::unique_ptr<event, FreeEvent> timer_is_due_;
 };
 
 // Calls back when something happens; idle until enable(). The callback may disable its own source
@@ -62,12 +65,9 @@ class EventSource {
   void disable() noexcept;
 
  private:
-  struct Free {
-    void operator()(event* source) const noexcept;
-  };
   EventSource(const EventLoop& loop, int fd, short what, Callback callback);
-  std::unique_ptr<Callback> callback_;  // on the heap: libevent keeps its address
-  std::unique_ptr<event, Free> event_;  // of a timer: for the next turn
+  std::unique_ptr<Callback> callback_;       // on the heap: libevent keeps its address
+  std::unique_ptr<event, FreeEvent> event_;  // of a timer: for the next turn
   std::unique_ptr<TimerQueue::Timer> timer_;
 };
 
