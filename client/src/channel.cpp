@@ -86,7 +86,7 @@ Channel::~Channel() {
 // --- the connection
 // --------------------------------------------------------------------------------
 
-bool Channel::is_up() const noexcept {
+[[gnu::hot]] bool Channel::is_up() const noexcept {
   return link_.is_up() && opened_ && subscribe_serial_ == 0 && publishing_serial_ == 0;
 }
 
@@ -145,7 +145,7 @@ void Channel::went_down(Error why) {
   forget_connection();
 }
 
-void Channel::advance(Patience patience) {
+[[gnu::hot]] void Channel::advance(Patience patience) {
   if (link_.is_down()) {
     if (MonoClock::now() < retry_at_) return;
     if (Result<void> begun = begin_connecting(patience); !begun) {
@@ -193,7 +193,7 @@ bool Channel::has_more_to_send() const noexcept {
 }
 
 // Takes what has come, once. False: nothing has, or the connection broke.
-bool Channel::receive() {
+[[gnu::hot]] bool Channel::receive() {
   if (std::exchange(held_, false)) {
     if (Result<void> done = link_.resume(); !done) return went_down(std::move(done).error()), false;
     return true;
@@ -201,7 +201,22 @@ bool Channel::receive() {
   return on_received(link_.receive());
 }
 
-bool Channel::on_received(Result<bool> received) {
+// Whether there is nothing to do but to wait for what comes: then receive_waiting() saves a system
+// call.
+[[gnu::hot]] bool Channel::may_wait_in_receive() const noexcept {
+  return is_up() && !held_ && !link_.has_queued() && !has_more_to_send();
+}
+
+// Takes what comes within Transport::kReceiveWait. After may_wait_in_receive().
+//   returns  ok | would_block | interrupted | end: the connection broke
+[[gnu::hot]] wire::IoStatus Channel::receive_waiting() {
+  const Result<wire::IoStatus> received = link_.receive_waiting();
+  if (received) return *received;
+  went_down(received.error());
+  return wire::IoStatus::end;
+}
+
+[[gnu::hot]] bool Channel::on_received(Result<bool> received) {
   if (!received) return went_down(std::move(received).error()), false;
   if (*received && !set_up_sent_) advance(Patience::none);  // it may have been the greeting
   return *received;
@@ -337,7 +352,8 @@ Result<void> Channel::on_frame(net::Frame& frame) {
   return result;
 }
 
-Result<void> Channel::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+[[gnu::hot]] Result<void> Channel::on_sample_begin(const wire::IncomingSample& sample,
+                                                   std::byte*& out) {
   if (sample.serial != 0) {
     out = sample.serial == ask_serial_ ? read_target_ : nullptr;
     return {};
@@ -350,7 +366,7 @@ Result<void> Channel::on_sample_begin(const wire::IncomingSample& sample, std::b
   return {};
 }
 
-Result<void> Channel::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+[[gnu::hot]] Result<void> Channel::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   useful_ = true;
   if (sample.serial == 0) return subscriber_->on_sample_end(sample.info, torn), Result<void>();
   if (sample.serial != ask_serial_ || !read_target_) return {};
@@ -376,10 +392,9 @@ Result<void> Channel::exchange(Queue queue) {
     queue(ask_serial_);
     const auto done = [&] { return answered_ || ask_serial_ == 0; };
     advance(Patience::none);
-    // The answer comes within a round trip, nearly always: to wait for it without poll() saves a
-    // twentieth of that.
-    while (!done() && !held_ && !link_.has_queued() && !has_more_to_send() &&
-           on_received(link_.receive_waiting()) && MonoClock::now() < deadline) {
+    // The answer comes within a round trip, nearly always.
+    while (!done() && may_wait_in_receive() && receive_waiting() == wire::IoStatus::ok &&
+           MonoClock::now() < deadline) {
     }
     const WaitStatus status = run(deadline, false, done);
     if (answered_) return {};
@@ -474,7 +489,7 @@ Result<void> Channel::unsubscribe() {
   return get_up(deadline_in(options_.request_timeout));
 }
 
-Result<ReadStatus> Channel::next(std::span<std::byte> payload, SampleInfo& info) {
+[[gnu::hot]] Result<ReadStatus> Channel::next(std::span<std::byte> payload, SampleInfo& info) {
   if (payload.size() != stream_.type.payload_bytes) {
     return Error{Errc::invalid_argument, what("read") + ": its samples have " +
                                              std::to_string(stream_.type.payload_bytes) +
@@ -493,7 +508,7 @@ Result<ReadStatus> Channel::next(std::span<std::byte> payload, SampleInfo& info)
   return result;
 }
 
-Result<ReadStatus> Channel::take_next(std::span<std::byte> payload, SampleInfo& info) {
+[[gnu::hot]] Result<ReadStatus> Channel::take_next(std::span<std::byte> payload, SampleInfo& info) {
   if (!held_) advance(Patience::none);
   MonoTime stay_until = kNever;
   for (;;) {
@@ -520,12 +535,18 @@ bool Channel::await_more(MonoTime deadline) const noexcept {
   return ::ppoll(&ready, 1, &timeout, nullptr) > 0;
 }
 
-WaitStatus Channel::wait(MonoTime deadline) {
+[[gnu::hot]] WaitStatus Channel::wait(MonoTime deadline) {
   if (!subscriber_->active()) return WaitStatus::timeout;
   subscriber_->keep(false);
   const std::uint64_t before = failed_attempts_;
-  return run(deadline, true,
-             [&] { return held_ || subscriber_->has_kept() || is_hopeless_since(before); });
+  const auto done = [&] { return held_ || subscriber_->has_kept() || is_hopeless_since(before); };
+  // Mostly the next sample comes soon. After that time poll(), which does not wake up for nothing.
+  if (!done() && may_wait_in_receive() &&
+      (deadline == kNever || deadline - MonoClock::now() >= wire::Transport::kReceiveWait)) {
+    const wire::IoStatus status = receive_waiting();
+    if (status == wire::IoStatus::interrupted) return WaitStatus::interrupted;
+  }
+  return run(deadline, true, done);
 }
 
 int Channel::fd() noexcept {

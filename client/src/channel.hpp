@@ -85,6 +85,8 @@ class Channel final : private wire::FrameSink {
   void forget_connection();
   Result<void> send_all();
   bool receive();
+  bool may_wait_in_receive() const noexcept;
+  wire::IoStatus receive_waiting();
   bool on_received(Result<bool> received);
   template <class Done>
   WaitStatus run(MonoTime deadline, bool interruptible, Done done);

@@ -113,7 +113,7 @@ Result<void> NetworkLink::greet() {
   return send_queued();
 }
 
-Result<void> NetworkLink::advance() {
+[[gnu::hot]] Result<void> NetworkLink::advance() {
   if (phase_ == Phase::down) return {};
   if (phase_ == Phase::up) return {};
   if (phase_ == Phase::connecting) {
@@ -175,17 +175,21 @@ Result<std::size_t> NetworkLink::send_some(std::span<const std::byte> bytes) {
   return sent;
 }
 
-Result<bool> NetworkLink::receive() {
+[[gnu::hot]] Result<bool> NetworkLink::receive() {
   if (!transport_) return false;
   return take(transport_->receive(decoder_->spaces()));
 }
 
-Result<bool> NetworkLink::receive_waiting() {
-  if (!transport_) return false;
-  return take(transport_->receive_waiting(decoder_->spaces()));
+[[gnu::hot]] Result<wire::IoStatus> NetworkLink::receive_waiting() {
+  if (!transport_) return wire::IoStatus::would_block;
+  Result<wire::IoResult> received = transport_->receive_waiting(decoder_->spaces());
+  if (received && received->status == wire::IoStatus::interrupted) return received->status;
+  const Result<bool> taken = take(std::move(received));
+  if (!taken) return taken.error();
+  return *taken ? wire::IoStatus::ok : wire::IoStatus::would_block;
 }
 
-Result<bool> NetworkLink::take(Result<wire::IoResult> received) {
+[[gnu::hot]] Result<bool> NetworkLink::take(Result<wire::IoResult> received) {
   if (!received) return down(std::move(received).error());
   if (received->status == wire::IoStatus::would_block) return false;
   if (received->status == wire::IoStatus::end) return down(lost());
@@ -216,11 +220,13 @@ Result<void> NetworkLink::on_frame(net::Frame& frame) {
   return {};
 }
 
-Result<void> NetworkLink::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+[[gnu::hot]] Result<void> NetworkLink::on_sample_begin(const wire::IncomingSample& sample,
+                                                       std::byte*& out) {
   return user_.on_sample_begin(sample, out);  // refused by the decoder before a size is set
 }
 
-Result<void> NetworkLink::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+[[gnu::hot]] Result<void> NetworkLink::on_sample_end(const wire::IncomingSample& sample,
+                                                     bool torn) {
   return user_.on_sample_end(sample, torn);
 }
 

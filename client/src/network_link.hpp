@@ -56,7 +56,8 @@ class NetworkLink final : private wire::FrameSink {
   //   fails  besides: what `user` returned
   Result<bool> receive();
   // The same, waiting as Transport::receive_waiting() does.
-  Result<bool> receive_waiting();
+  //   returns  ok | would_block (nothing came) | interrupted
+  Result<wire::IoStatus> receive_waiting();
   // Goes on with what was received, after the user held a sample back.
   Result<void> resume();
 

@@ -8,6 +8,7 @@
 #include "client/src/client.hpp"
 #include "client/src/states.hpp"
 #include "core/base/check.hpp"
+#include "core/clock/coarse_now.hpp"
 
 namespace dssm {
 namespace {
@@ -36,11 +37,8 @@ Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
   return distance(t, after.time) < distance(before.time, t) ? after.tid : before.tid;
 }
 
-// Precise to some milliseconds, for a fifth of the price; verdicts hold for seconds.
-MonoTime coarse_now() noexcept {
-  using Coarse = detail::PosixClock<CLOCK_MONOTONIC_COARSE, true>;
-  return MonoTime(Coarse::now().time_since_epoch());
-}
+// Verdicts hold for seconds, so a coarse clock does.
+using clock::coarse_now;
 
 // Whether the time of that sample must not be used.
 bool is_refused(const ring::RingReader& ring, const SampleInfo& info) noexcept {
@@ -119,7 +117,7 @@ RawReader::RawReader(RawReader&&) noexcept = default;
 RawReader& RawReader::operator=(RawReader&&) noexcept = default;
 RawReader::~RawReader() = default;
 
-ReadStatus RawReader::latest(std::span<std::byte> payload, SampleInfo& info) noexcept {
+[[gnu::hot]] ReadStatus RawReader::latest(std::span<std::byte> payload, SampleInfo& info) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read_newest(payload, info);
@@ -135,7 +133,7 @@ ReadStatus RawReader::tid(Tid tid, std::span<std::byte> payload, SampleInfo& inf
   return status;
 }
 
-ReadStatus RawReader::next(std::span<std::byte> payload, SampleInfo& info) noexcept {
+[[gnu::hot]] ReadStatus RawReader::next(std::span<std::byte> payload, SampleInfo& info) noexcept {
   if (state_->fresh) return latest(payload, info);
   DSSM_CHECK(payload.size() == payload_bytes());
   Tid wanted = state_->cursor + 1;
@@ -319,11 +317,11 @@ ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
   return ReadStatus::ok;
 }
 
-WaitStatus RawReader::wait(MonoTime deadline) noexcept {
+[[gnu::hot]] WaitStatus RawReader::wait(MonoTime deadline) noexcept {
   return wait_for_tid(state_->cursor + 1, deadline);
 }
 
-WaitStatus RawReader::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
+[[gnu::hot]] WaitStatus RawReader::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
   const std::shared_ptr<detail::OpenStream> stream = state_->stream_now();
   const ring::RingReader ring(*stream->ring->mapping);
   return wait_until(*stream->ring->bell, deadline,

@@ -91,7 +91,7 @@ void Subscriber::on_down() noexcept {
   arriving_ = Arriving::nothing;
 }
 
-Result<bool> Subscriber::on_sample_begin(const SampleInfo& info, std::byte*& out) {
+[[gnu::hot]] Result<bool> Subscriber::on_sample_begin(const SampleInfo& info, std::byte*& out) {
   if (!live_) {
     arriving_ = Arriving::nowhere;
     out = nullptr;
@@ -112,7 +112,7 @@ Result<bool> Subscriber::on_sample_begin(const SampleInfo& info, std::byte*& out
   return true;
 }
 
-void Subscriber::on_sample_end(const SampleInfo& info, bool torn) noexcept {
+[[gnu::hot]] void Subscriber::on_sample_end(const SampleInfo& info, bool torn) noexcept {
   const Arriving arrived = std::exchange(arriving_, Arriving::nothing);
   if (torn || arrived == Arriving::nowhere) return;
   if (!is_thinned()) lost_ += static_cast<std::uint64_t>(info.tid - due_);
@@ -122,7 +122,7 @@ void Subscriber::on_sample_end(const SampleInfo& info, bool torn) noexcept {
   target_ = nullptr;
 }
 
-bool Subscriber::taken(SampleInfo& info) noexcept {
+[[gnu::hot]] bool Subscriber::taken(SampleInfo& info) noexcept {
   if (!taken_) return false;
   info = *taken_;
   taken_.reset();
@@ -134,8 +134,8 @@ std::byte* Subscriber::leave_target() {
   return queue_.place();
 }
 
-std::optional<ReadStatus> Subscriber::take_kept(std::span<std::byte> payload,
-                                                SampleInfo& info) noexcept {
+[[gnu::hot]] std::optional<ReadStatus> Subscriber::take_kept(std::span<std::byte> payload,
+                                                             SampleInfo& info) noexcept {
   if (must_tell_restart()) {
     restart_at_.reset();
     return ReadStatus::restarted;

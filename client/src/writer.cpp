@@ -27,7 +27,8 @@ RawWriter::RawWriter(RawWriter&&) noexcept = default;
 RawWriter& RawWriter::operator=(RawWriter&&) noexcept = default;
 RawWriter::~RawWriter() = default;
 
-Tid RawWriter::write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept {
+[[gnu::hot]] Tid RawWriter::write(std::span<const std::byte> payload, Time time,
+                                  Duration clock_error) noexcept {
   if (payload.size() != state_->payload_bytes) return kNoTid;
   return state_->ring.write_with(payload, time, [&] { return state_->stamp(time, clock_error); });
 }

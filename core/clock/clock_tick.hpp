@@ -7,7 +7,6 @@
 #pragma once
 
 #include <dssm/time.hpp>
-#include <optional>
 
 namespace dssm::clock {
 
@@ -15,8 +14,8 @@ struct Tick {
   MonoTime mono;
   Duration difference{};  // of the wall clock from the monotonic one
 
-  // nullopt: a tick came while we looked. Thread-safe.
-  static std::optional<Tick> last() noexcept;
+  // When a tick comes while we look, the difference is that tick too large. Thread-safe.
+  static Tick last() noexcept;
 };
 
 }  // namespace dssm::clock

@@ -34,6 +34,8 @@ timespec to_timespec(MonoTime time) noexcept {
   return {ns / 1'000'000'000, ns % 1'000'000'000};
 }
 
+constexpr timespec kMaxSleepTime{kMaxSleep / std::chrono::seconds(1), 0};
+
 // When to look up although nobody rang.
 MonoTime look_up(MonoTime deadline) noexcept { return std::min(deadline, deadline_in(kMaxSleep)); }
 
@@ -73,7 +75,7 @@ Bell::~Bell() {
   if (page_) ::munmap(page_, sizeof(BellPage));
 }
 
-void Bell::ring_slowly() noexcept {
+[[gnu::hot]] void Bell::ring_slowly() noexcept {
   // The addition clears bit 0 and moves the count; between the load in ring() and here another
   // writer may have done so, then it also woke all.
   std::uint32_t word = page_->word.load(std::memory_order_relaxed);
@@ -85,7 +87,12 @@ void Bell::ring_slowly() noexcept {
   }
 }
 
-WaitStatus Bell::sleep(std::uint32_t announced, MonoTime deadline) noexcept {
+[[gnu::hot]] WaitStatus Bell::sleep(std::uint32_t announced, MonoTime deadline) noexcept {
+  if (deadline == kNever) {  // kMaxSleep from now on, without asking when that is
+    const long result =
+        ::syscall(SYS_futex, &page_->word, FUTEX_WAIT, announced, &kMaxSleepTime, nullptr, 0);
+    return outcome(result, errno, deadline);
+  }
   const timespec until = to_timespec(look_up(deadline));
   const long result = ::syscall(SYS_futex, &page_->word, FUTEX_WAIT_BITSET, announced, &until,
                                 nullptr, FUTEX_BITSET_MATCH_ANY);

@@ -38,6 +38,10 @@ class Bell {
 
   // --- writers, after publishing --------------------------------------------------------------
 
+  // Before: a sleeper or dssmd wrote to the line that ring() looks at, so it has to come from
+  // another processor, and may do so while the payload is copied.
+  void expect_ring() const noexcept { __builtin_prefetch(page_); }
+
   // Wakes all sleepers; without any, one load of a line that nobody writes.
   void ring() noexcept {
     if (page_->word.load(std::memory_order_seq_cst) & kSleeper) ring_slowly();

@@ -43,8 +43,8 @@ bool RingReader::still_valid(const std::atomic<std::uint64_t>& sequence,
   return sequence.load(std::memory_order_relaxed) == expected;
 }
 
-ReadStatus RingReader::read(Tid tid, std::span<std::byte> payload,
-                            SampleInfo& info) const noexcept {
+[[gnu::hot]] ReadStatus RingReader::read(Tid tid, std::span<std::byte> payload,
+                                         SampleInfo& info) const noexcept {
   const Tid top = newest();
   if (tid > top) return ReadStatus::not_yet;
   if (tid < 0 || tid < slots_.oldest_for(top)) return ReadStatus::too_old;
@@ -59,7 +59,8 @@ ReadStatus RingReader::read(Tid tid, std::span<std::byte> payload,
   return ReadStatus::ok;
 }
 
-ReadStatus RingReader::read_newest(std::span<std::byte> payload, SampleInfo& info) const noexcept {
+[[gnu::hot]] ReadStatus RingReader::read_newest(std::span<std::byte> payload,
+                                                SampleInfo& info) const noexcept {
   for (int attempt = 0; attempt < kMaxRetries; ++attempt) {
     const Tid top = newest();
     if (top < 0) return ReadStatus::not_yet;

@@ -34,18 +34,18 @@ struct HeldRings {
 RingWriter::RingWriter(const RingMapping& mapping, Bell& bell, int doorbell) noexcept
     : publisher_(mapping), bell_(&bell), doorbell_(doorbell) {}
 
-bool RingWriter::lock() noexcept {
+[[gnu::hot]] bool RingWriter::lock() noexcept {
   RingHeader& header = publisher_.header();
   if (held_rings.count != 0 && held_rings.holds(&header)) return false;
   return take(lock_robust(header.lock));
 }
 
-bool RingWriter::take(LockResult result) noexcept {
+[[gnu::hot]] bool RingWriter::take(LockResult result) noexcept {
   if (result == LockResult::recovered) publisher_.recover();
   return result == LockResult::locked || result == LockResult::recovered;
 }
 
-void RingWriter::unlock() noexcept { pthread_mutex_unlock(&publisher_.header().lock); }
+[[gnu::hot]] void RingWriter::unlock() noexcept { pthread_mutex_unlock(&publisher_.header().lock); }
 
 std::byte* RingWriter::begin() noexcept {
   if (held_rings.count == held_rings.rings.size() || !lock()) return nullptr;
@@ -70,8 +70,8 @@ Tid RingWriter::commit(Time time, Duration clock_error) noexcept {
   return tid;
 }
 
-Tid RingWriter::write(std::span<const std::byte> payload, Time time,
-                      Duration clock_error) noexcept {
+[[gnu::hot]] Tid RingWriter::write(std::span<const std::byte> payload, Time time,
+                                   Duration clock_error) noexcept {
   if (!lock()) return kNoTid;
   return write_locked(payload, time, clock_error);
 }
@@ -85,8 +85,9 @@ RingWriter::Attempt RingWriter::try_write(std::span<const std::byte> payload, Ti
   return {Attempt::Outcome::written, write_locked(payload, time, clock_error)};
 }
 
-Tid RingWriter::write_locked(std::span<const std::byte> payload, Time time,
-                             Duration clock_error) noexcept {
+[[gnu::hot]] Tid RingWriter::write_locked(std::span<const std::byte> payload, Time time,
+                                          Duration clock_error) noexcept {
+  bell_->expect_ring();
   const Tid tid = newest() + 1;
   publisher_.begin(tid);
   publisher_.fill(tid, payload);
@@ -98,7 +99,7 @@ Tid RingWriter::write_locked(std::span<const std::byte> payload, Time time,
 
 // What follows a sample, outside of the lock: waking who sleeps, and getting ready for the next
 // one.
-void RingWriter::follow_up(Tid tid) noexcept {
+[[gnu::hot]] void RingWriter::follow_up(Tid tid) noexcept {
   bell_->ring();
   if (doorbell_ >= 0 && bell_->doorbell_armed()) {
     const std::uint64_t one = 1;

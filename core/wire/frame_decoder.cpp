@@ -91,7 +91,7 @@ std::size_t plain_bytes(std::span<const std::byte> message) noexcept {
   return message.size() - bulk;
 }
 
-Result<void> check_sample(std::int64_t tid, std::uint64_t clock_error_ns) {
+[[gnu::hot]] Result<void> check_sample(std::int64_t tid, std::uint64_t clock_error_ns) {
   if (tid < 0) return bad("a sample has the tid " + std::to_string(tid) + "; they start at 0");
   if (clock_error_ns > static_cast<std::uint64_t>(INT64_MAX)) {
     return bad("a sample has the clock error " + std::to_string(clock_error_ns) +
@@ -140,7 +140,7 @@ std::size_t FrameDecoder::longest_frame_bytes() const noexcept {
   return std::max(max_frame_bytes_, payload_bytes_ + kMaxSampleOverheadBytes);
 }
 
-Result<void> FrameDecoder::check_payload_bytes(std::uint64_t payload_bytes) const {
+[[gnu::hot]] Result<void> FrameDecoder::check_payload_bytes(std::uint64_t payload_bytes) const {
   if (payload_bytes_ == 0) return bad("a sample came where none is awaited");
   if (payload_bytes == payload_bytes_) return {};
   return bad("a sample of " + bytes_text(payload_bytes) + " came; the stream's samples have " +
@@ -156,7 +156,7 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
   return input;
 }
 
-std::span<const iovec> FrameDecoder::spaces() {
+[[gnu::hot]] std::span<const iovec> FrameDecoder::spaces() {
   std::unique_ptr<InputBuffer>& input = thread_input();
   if (!input) input = std::make_unique_for_overwrite<InputBuffer>();
   input->user = this;
@@ -178,7 +178,7 @@ std::span<const iovec> FrameDecoder::spaces() {
   return spaces_;
 }
 
-Result<void> FrameDecoder::commit(std::size_t bytes) {
+[[gnu::hot]] Result<void> FrameDecoder::commit(std::size_t bytes) {
   DSSM_CHECK(!held_ || bytes == 0);  // nothing is received while the sink holds back
   held_ = refused_ = false;
   if (in_payload()) {
@@ -211,7 +211,7 @@ Result<void> FrameDecoder::commit(std::size_t bytes) {
 
 // --- decoding ------------------------------------------------------------------------------------
 
-Result<void> FrameDecoder::decode(Bytes& input) {
+[[gnu::hot]] Result<void> FrameDecoder::decode(Bytes& input) {
   // Without any input too: the last byte may have been received in place, and a frame that was
   // collected may have been held back.
   bool goes_on = !input.empty() || (stage_ == Stage::payload && payload_left_ == 0) ||
@@ -238,7 +238,7 @@ Result<void> FrameDecoder::decode(Bytes& input) {
   return {};
 }
 
-Result<void> FrameDecoder::take_head(Bytes& input) {
+[[gnu::hot]] Result<void> FrameDecoder::take_head(Bytes& input) {
   SampleHead head;
   const HeadStatus status = read_sample_head_untrusted(input, head);
   if (status == HeadStatus::no_frame) return bad("the input is no varint-delimited frame");
@@ -268,7 +268,7 @@ Result<void> FrameDecoder::take_head(Bytes& input) {
   return {};
 }
 
-Result<void> FrameDecoder::take_payload(Bytes& input) {
+[[gnu::hot]] Result<void> FrameDecoder::take_payload(Bytes& input) {
   const std::size_t bytes = std::min(input.size(), payload_left_);
   if (place_ && bytes > 0) {
     std::memcpy(place_, input.data(), bytes);
@@ -309,13 +309,13 @@ Result<void> FrameDecoder::take_trailer(Bytes& input) {
   return end_sample(false);
 }
 
-Result<void> FrameDecoder::begin_sample(std::byte*& place) {
+[[gnu::hot]] Result<void> FrameDecoder::begin_sample(std::byte*& place) {
   Result<void> begun = sink_.on_sample_begin(sample_, place);
   refused_ = held_;
   return begun;
 }
 
-Result<void> FrameDecoder::end_sample(bool torn) {
+[[gnu::hot]] Result<void> FrameDecoder::end_sample(bool torn) {
   ++counters_.samples;
   place_ = nullptr;
   stage_ = Stage::head;

@@ -9,7 +9,8 @@ namespace dssm::wire {
 enum class IoStatus : unsigned char {
   ok,
   would_block,
-  end,  // the other side closed the connection or is gone
+  interrupted,  // a signal handler ran meanwhile; only of what waits
+  end,          // the other side closed the connection or is gone
 };
 
 struct IoResult {

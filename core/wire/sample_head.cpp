@@ -33,7 +33,8 @@ bool read_stamps(const std::byte* at, const std::byte* end, SampleHead& head) no
 
 }  // namespace
 
-HeadStatus read_sample_head_untrusted(std::span<const std::byte> input, SampleHead& head) noexcept {
+[[gnu::hot]] HeadStatus read_sample_head_untrusted(std::span<const std::byte> input,
+                                                   SampleHead& head) noexcept {
   head = {};
   const std::byte* at = input.data();
   const std::byte* end = at + input.size();

@@ -61,7 +61,7 @@ Error network_error(const std::string& what, int errno_value, int socket) {
   }
 }
 
-Result<IoResult> io_result(ssize_t bytes, const char* what, int socket) {
+[[gnu::hot]] Result<IoResult> io_result(ssize_t bytes, const char* what, int socket) {
   if (bytes > 0) return IoResult{IoStatus::ok, static_cast<std::size_t>(bytes)};
   if (bytes == 0) return IoResult{IoStatus::end, 0};
   if (errno == EAGAIN) return IoResult{IoStatus::would_block, 0};
@@ -73,7 +73,7 @@ class TcpTransport final : public Transport {
  public:
   explicit TcpTransport(UniqueFd socket) noexcept : socket_(std::move(socket)) {}
 
-  Result<IoResult> send(std::span<const iovec> parts, bool more) override {
+  [[gnu::hot]] Result<IoResult> send(std::span<const iovec> parts, bool more) override {
     const int flags = MSG_NOSIGNAL | MSG_DONTWAIT | (more ? MSG_MORE : 0);
     const msghdr message = header(parts);
     ssize_t bytes = 0;
@@ -84,7 +84,7 @@ class TcpTransport final : public Transport {
     return io_result(bytes, "send to the other side", socket_.get());
   }
 
-  Result<IoResult> receive(std::span<const iovec> spaces) override {
+  [[gnu::hot]] Result<IoResult> receive(std::span<const iovec> spaces) override {
     msghdr message = header(spaces);
     ssize_t bytes = 0;
     do {
@@ -99,7 +99,7 @@ class TcpTransport final : public Transport {
     if (!waits_) make_waitable();
     msghdr message = header(spaces);
     const ssize_t bytes = ::recvmsg(socket_.get(), &message, 0);
-    if (bytes < 0 && errno == EINTR) return IoResult{IoStatus::would_block, 0};
+    if (bytes < 0 && errno == EINTR) return IoResult{IoStatus::interrupted, 0};
     return io_result(bytes, "receive from the other side", socket_.get());
   }
 

@@ -35,7 +35,7 @@ class Transport {
 
   // The same, waiting for bytes: for kReceiveWait, or until a signal handler runs. For programs
   // that have nothing else to do until an answer comes: one system call instead of two.
-  //   returns  would_block: nothing came
+  //   returns  besides: would_block (nothing came) | interrupted
   virtual Result<IoResult> receive_waiting(std::span<const iovec> spaces) {
     pollfd ready{fd(), POLLIN, 0};
     ::poll(&ready, 1, static_cast<int>(kReceiveWait.count()));

@@ -143,19 +143,6 @@ void DataCommunicator::send_failure(std::uint64_t serial, const Error& error) {
   link_.send(frame);
 }
 
-Result<void> DataCommunicator::on_sample_begin(const wire::IncomingSample& sample,
-                                               std::byte*& out) {
-  return channel_->on_sample_begin(sample, out);
-}
-
-Result<void> DataCommunicator::on_sample_end(const wire::IncomingSample& sample, bool torn) {
-  return channel_->on_sample_end(sample, torn);
-}
-
-void DataCommunicator::on_batch_end() {
-  if (channel_) channel_->on_batch_end();
-}
-
 // --- opening
 // --------------------------------------------------------------------------------------
 
@@ -234,7 +221,7 @@ void DataCommunicator::work_soon() {
 
 void DataCommunicator::on_output_empty() { work_now(); }
 
-void DataCommunicator::work_now() {
+[[gnu::hot]] void DataCommunicator::work_now() {
   if (!link_.is_open()) return;
   if (std::exchange(turn_is_due_, false)) next_turn_.disable();
   served_ = 0;
@@ -248,7 +235,7 @@ void DataCommunicator::work_now() {
     link_.resume();
   }
   if (channel_) {
-    const Result<void> worked = channel_->work(MonoClock::now(), waiting_.has_value());
+    const Result<void> worked = channel_->work(waiting_.has_value());
     if (!worked) return link_.close_with(worked.error());
   }
   if (watch_ && watch_->work()) work_soon();

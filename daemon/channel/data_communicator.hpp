@@ -87,9 +87,6 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
   };
 
   Result<void> on_frame(net::Frame& frame) override;
-  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
-  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
-  void on_batch_end() override;
   void on_output_empty() override;
   void on_closed(const Error& why) override;
   void work_now() override;

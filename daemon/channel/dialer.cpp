@@ -269,18 +269,6 @@ bool Dialer::crosses_network() const noexcept {
 
 Result<void> Dialer::on_frame(net::Frame& frame) { return state_->on_frame(frame); }
 
-Result<void> Dialer::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
-  return state_->user.on_sample_begin(sample, out);
-}
-
-Result<void> Dialer::on_sample_end(const wire::IncomingSample& sample, bool torn) {
-  return state_->user.on_sample_end(sample, torn);
-}
-
-void Dialer::on_batch_end() {
-  if (state_->step == State::Step::up) state_->user.on_batch_end();
-}
-
 void Dialer::on_output_empty() {
   if (state_->step == State::Step::up) state_->user.on_output_empty();
 }

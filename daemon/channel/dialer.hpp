@@ -31,11 +31,6 @@ class Dialer final : private FrameLink::User {
     // Both greetings are exchanged: ask away. `link` is the dialer's and good until on_down().
     virtual void on_up(FrameLink& link, const wire::Greeting& them) = 0;
     virtual Result<void> on_frame(net::Frame& frame) = 0;
-    virtual Result<void> on_sample_begin(const wire::IncomingSample&, std::byte*&) {
-      return Error{Errc::protocol, "a sample came on a connection that carries none"};
-    }
-    virtual Result<void> on_sample_end(const wire::IncomingSample&, bool) { return {}; }
-    virtual void on_batch_end() {}
     virtual void on_output_empty() {}
     // The connection broke, or an attempt failed; the dialer goes on trying by itself. Called for
     // each failed round of attempts too. Whoever refused us did so in words, which are in `why`.
@@ -79,9 +74,6 @@ class Dialer final : private FrameLink::User {
   struct State;
   std::unique_ptr<State> state_;
   Result<void> on_frame(net::Frame& frame) override;
-  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
-  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
-  void on_batch_end() override;
   void on_output_empty() override;
   void on_closed(const Error& why) override;
 };

@@ -6,6 +6,7 @@
 #include <optional>
 #include <utility>
 
+#include "core/clock/coarse_now.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/network_protocol.hpp"
 
@@ -49,14 +50,15 @@ std::span<const std::byte> FrameLink::Outgoing::unsent() const noexcept {
   return all.subspan(sent);
 }
 
-void FrameLink::set_payload_bytes(std::size_t payload_bytes) noexcept {
+void FrameLink::take_samples(std::size_t payload_bytes, SampleSink& sink) noexcept {
+  samples_ = &sink;
   decoder_.set_payload_bytes(payload_bytes);
 }
 
 // --- receiving
 // ------------------------------------------------------------------------------------
 
-void FrameLink::on_readable() {
+[[gnu::hot]] void FrameLink::on_readable() {
   std::size_t received = 0;
   Error end;
   bool ended = false;
@@ -74,24 +76,24 @@ void FrameLink::on_readable() {
                                                   "middle of a frame"};
       break;
     }
-    last_heard_ = MonoClock::now();
+    last_heard_ = clock::coarse_now();
     received += got->bytes;
     if (!hand_out(got->bytes)) return;
     if (paused_ || held_ || got->bytes < room) break;
   }
-  if (received > 0) user_.on_batch_end();
+  if (received > 0 && samples_) samples_->on_batch_end();
   if (ended) close(end);
 }
 
 // Goes on with what was received before a pause.
 void FrameLink::go_on() {
   if (closed_ || paused_ || !hand_out(0)) return;
-  user_.on_batch_end();
+  if (samples_) samples_->on_batch_end();
   if (!closed_ && !paused_) listen_again();
 }
 
 // False when the link closed over it.
-bool FrameLink::hand_out(std::size_t bytes) {
+[[gnu::hot]] bool FrameLink::hand_out(std::size_t bytes) {
   held_ = false;
   handing_out_ = true;
   const Result<void> taken = decoder_.commit(bytes);
@@ -100,7 +102,7 @@ bool FrameLink::hand_out(std::size_t bytes) {
   return !closed_ && charge_input();
 }
 
-bool FrameLink::charge_input() {
+[[gnu::hot]] bool FrameLink::charge_input() {
   const std::size_t bytes = decoder_.collected_bytes();
   if (!budget_ || bytes == input_share_.bytes()) return true;
   input_share_ = {};
@@ -122,14 +124,15 @@ void FrameLink::listen_again() {
 }
 
 // A handler may have closed the link: the decoder is stopped, too.
-Result<void> FrameLink::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+[[gnu::hot]] Result<void> FrameLink::on_sample_begin(const wire::IncomingSample& sample,
+                                                     std::byte*& out) {
   if (closed_) return closed_by_handler();
-  return user_.on_sample_begin(sample, out);
+  return samples_->on_sample_begin(sample, out);
 }
 
-Result<void> FrameLink::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+[[gnu::hot]] Result<void> FrameLink::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   if (closed_) return closed_by_handler();
-  return user_.on_sample_end(sample, torn);
+  return samples_->on_sample_end(sample, torn);
 }
 
 Result<void> FrameLink::on_frame(net::Frame& frame) {
@@ -193,7 +196,7 @@ void FrameLink::send(const net::Frame& frame) {
   enqueue(std::move(outgoing));
 }
 
-std::size_t FrameLink::send_now(std::span<const iovec> parts, bool more) {
+[[gnu::hot]] std::size_t FrameLink::send_now(std::span<const iovec> parts, bool more) {
   if (closed_ || output_lost_ || (!output_.empty() && !mid_frame_)) return 0;
   return transmit(parts, more);
 }
@@ -254,7 +257,7 @@ bool FrameLink::flush() {
   return true;
 }
 
-std::size_t FrameLink::transmit(std::span<const iovec> parts, bool more) {
+[[gnu::hot]] std::size_t FrameLink::transmit(std::span<const iovec> parts, bool more) {
   const Result<wire::IoResult> sent = transport_->send(parts, more);
   if (sent && sent->status != wire::IoStatus::end) return sent->bytes;
   why_ = sent ? Error{Errc::daemon_away, "the other side closed the connection"} : sent.error();

@@ -35,13 +35,6 @@ class FrameLink final : private wire::FrameSink {
   class User {
    public:
     virtual Result<void> on_frame(net::Frame& frame) = 0;
-    // As wire::FrameSink. Without set_payload_bytes() there are none. When the link is paused
-    // within on_sample_begin(), `out` is not used, and it comes again for the same sample after
-    // resume().
-    virtual Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) = 0;
-    virtual Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) = 0;
-    // All that had arrived is handed out: time to wake readers, to acknowledge.
-    virtual void on_batch_end() {}
     // Nothing waits to be sent any more, or the socket takes bytes again: samples may follow.
     virtual void on_output_empty() {}
     // The link ended by itself or by an error; called once, last of all, from the loop and never
@@ -52,6 +45,21 @@ class FrameLink final : private wire::FrameSink {
     ~User() = default;
   };
 
+  // Who takes samples: not by way of the user, because each step on a sample's way costs. The same
+  // rules as for the user's handlers.
+  class SampleSink {
+   public:
+    // As wire::FrameSink. When the link is paused within on_sample_begin(), `out` is not used, and
+    // it comes again for the same sample after resume().
+    virtual Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) = 0;
+    virtual Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) = 0;
+    // All that had arrived is handed out: time to wake readers, to acknowledge.
+    virtual void on_batch_end() {}
+
+   protected:
+    ~SampleSink() = default;
+  };
+
   // user and loop outlive the link.
   FrameLink(const EventLoop& loop, std::unique_ptr<wire::Transport> transport, User& user,
             std::size_t max_queued_bytes);
@@ -59,8 +67,9 @@ class FrameLink final : private wire::FrameSink {
   FrameLink& operator=(const FrameLink&) = delete;
   ~FrameLink();
 
-  // Size of the samples that this link may receive; see FrameDecoder.
-  void set_payload_bytes(std::size_t payload_bytes) noexcept;
+  // From now on samples of this size are received, and `sink`, which outlives the link, gets them.
+  // Until then one that comes is an error of the peer.
+  void take_samples(std::size_t payload_bytes, SampleSink& sink) noexcept;
 
   // What waits to be sent by send(), and a long frame that is being received, are charged to
   // `budget`, which outlives the link; when it is used up, the link closes itself.
@@ -99,7 +108,7 @@ class FrameLink final : private wire::FrameSink {
   void close_with(const Error& why);
   bool is_open() const noexcept { return !closed_; }
 
-  // For heartbeats: when something arrived last.
+  // For heartbeats: when something arrived last, to some milliseconds.
   MonoTime last_heard() const noexcept { return last_heard_; }
   const wire::DecoderCounters& counters() const noexcept { return decoder_.counters(); }
 
@@ -131,6 +140,7 @@ class FrameLink final : private wire::FrameSink {
 
   std::unique_ptr<wire::Transport> transport_;
   User& user_;
+  SampleSink* samples_ = nullptr;
   std::size_t max_queued_bytes_;
   MemoryBudget* budget_ = nullptr;
   wire::FrameDecoder decoder_;

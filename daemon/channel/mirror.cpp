@@ -99,7 +99,7 @@ Result<void> Mirror::on_opened_untrusted(const net::Opened& opened) {
     return {};
   }
   FrameLink& link = *channel_.link();
-  link.set_payload_bytes(theirs->type.payload_bytes);
+  link.take_samples(theirs->type.payload_bytes, *this);
   net::Frame frame;
   frame.set_serial(kSubscribe);
   net::Subscribe& subscribe = *frame.mutable_subscribe();
@@ -232,7 +232,8 @@ void Mirror::on_refused(const Error& why) {
 
 // --- samples ---------------------------------------------------------------------------------
 
-Result<void> Mirror::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+[[gnu::hot]] Result<void> Mirror::on_sample_begin(const wire::IncomingSample& sample,
+                                                  std::byte*& out) {
   if (step_ != Step::subscribed) return untimely("a sample");
   const Result<std::byte*> place = ring_->begin_untrusted(sample);
   if (!place) return place.error();
@@ -240,14 +241,14 @@ Result<void> Mirror::on_sample_begin(const wire::IncomingSample& sample, std::by
   return {};
 }
 
-Result<void> Mirror::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+[[gnu::hot]] Result<void> Mirror::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   const std::uint64_t before = ring_->gap_samples();
   ring_->end(sample, torn);
   if (ring_->gap_samples() != before) tell_gaps(ring_->gap_samples() - before);
   return {};
 }
 
-void Mirror::on_batch_end() {
+[[gnu::hot]] void Mirror::on_batch_end() {
   if (ring_) ring_->wake();
 }
 

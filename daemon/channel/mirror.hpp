@@ -29,7 +29,7 @@
 
 namespace dssm::daemon {
 
-class Mirror final : private OwnerChannel::User {
+class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
  public:
   // How long a program that opens the mirror waits for the owner to answer, and then for the
   // history: what has come by then is there to read, the rest follows.
@@ -92,11 +92,12 @@ class Mirror final : private OwnerChannel::User {
   // OwnerChannel::User
   void on_up(FrameLink& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
+  void on_down(const Error& why) override;
+  void on_anew() override;
+  // FrameLink::SampleSink
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   void on_batch_end() override;
-  void on_down(const Error& why) override;
-  void on_anew() override;
 
   Result<void> on_opened_untrusted(const net::Opened& opened);
   Result<void> on_subscribed_untrusted(const net::Subscribed& subscribed);

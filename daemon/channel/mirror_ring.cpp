@@ -41,24 +41,25 @@ Result<void> MirrorRing::on_subscribed_untrusted(Tid first) {
   return {};
 }
 
-// Behind a gap the slot of sample `tid` may be one that readers still read, and the payload may
+// Behind a gap, the slot of sample `tid` may be one that readers still read, and the payload may
 // take long to arrive.
 bool MirrorRing::would_spoil_window(Tid tid) const noexcept {
   const Tid newest = writer_.newest();
-  if (newest < 0 || tid == newest + 1) return false;
+  if (newest < 0) return false;
   const Tid depth = static_cast<Tid>(stream_->mapping().geometry().depth);
   const Tid same_slot = newest - (depth - (tid - newest) % depth) % depth;
   return same_slot >= reader_.oldest();
 }
 
-Result<std::byte*> MirrorRing::begin_untrusted(const wire::IncomingSample& sample) {
+[[gnu::hot]] Result<std::byte*> MirrorRing::begin_untrusted(const wire::IncomingSample& sample) {
   const Tid tid = sample.info.tid;
   if (tid < next_ || tid > kLastTid) {
     return Error{Errc::protocol, "sample " + std::to_string(tid) + " came where sample " +
                                      std::to_string(next_) + " or a later one was due"};
   }
-  drop_aside();  // of one that was cut off
-  if (would_spoil_window(tid)) take_aside(sample.payload_bytes);
+  if (aside_) drop_aside();  // of one that was cut off
+  const bool behind_gap = tid != writer_.newest() + 1;
+  if (behind_gap && would_spoil_window(tid)) take_aside(sample.payload_bytes);
   return aside_ ? aside_.get() : writer_.begin(tid);
 }
 
@@ -76,7 +77,7 @@ void MirrorRing::drop_aside() noexcept {
   aside_share_ = MemoryShare();
 }
 
-void MirrorRing::end(const wire::IncomingSample& sample, bool torn) {
+[[gnu::hot]] void MirrorRing::end(const wire::IncomingSample& sample, bool torn) {
   if (!torn) {
     const Tid tid = sample.info.tid;
     if (aside_) std::memcpy(writer_.begin(tid), aside_.get(), sample.payload_bytes);
@@ -88,7 +89,7 @@ void MirrorRing::end(const wire::IncomingSample& sample, bool torn) {
     received_bytes_ += sample.payload_bytes;
   }
   // A torn one is missing from here on: what comes next counts it, by its own tid.
-  drop_aside();
+  if (aside_) drop_aside();
 }
 
 Result<void> MirrorRing::on_gap_untrusted(Tid first, std::uint64_t count) {
@@ -107,7 +108,7 @@ Result<void> MirrorRing::on_gap_untrusted(Tid first, std::uint64_t count) {
   return {};
 }
 
-void MirrorRing::wake() noexcept {
+[[gnu::hot]] void MirrorRing::wake() noexcept {
   if (std::exchange(news_, false)) writer_.wake();
 }
 

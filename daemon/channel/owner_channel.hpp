@@ -67,13 +67,6 @@ class OwnerChannel final : private Dialer::User {
  private:
   void on_up(FrameLink& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override { return user_.on_frame(frame); }
-  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override {
-    return user_.on_sample_begin(sample, out);
-  }
-  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override {
-    return user_.on_sample_end(sample, torn);
-  }
-  void on_batch_end() override { user_.on_batch_end(); }
   void on_output_empty() override { user_.on_output_empty(); }
   void on_down(const Error& why) override;
 

@@ -115,7 +115,7 @@ Result<void> RemoteWriter::on_opened_untrusted(const net::Opened& opened) {
   removed_ = false;
   answer_waiting(opened.created());
   step_ = Step::starting;
-  channel_.link()->set_payload_bytes(theirs->type.payload_bytes);
+  channel_.link()->take_samples(theirs->type.payload_bytes, *this);
   channel_.link()->send(point_->start());
   return {};
 }
@@ -220,7 +220,7 @@ void RemoteWriter::start_publishing() {
 
 void RemoteWriter::publish() {
   if (!pump_) return;
-  const Result<PumpWait> wait = pump_->pump(MonoClock::now());
+  const Result<PumpWait> wait = pump_->pump({});
   if (!wait) return channel_.link()->close_with(wait.error());
   if (*wait == PumpWait::turn || (*wait == PumpWait::news && !feed_->wait(*this, pump_->known()))) {
     turn_timer_.enable_in(Duration::zero());

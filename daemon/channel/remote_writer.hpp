@@ -34,6 +34,7 @@
 namespace dssm::daemon {
 
 class RemoteWriter final : private OwnerChannel::User,
+                           private FrameLink::SampleSink,
                            private StreamFeed::Listener,
                            private SamplePump::Events {
  public:
@@ -83,11 +84,12 @@ class RemoteWriter final : private OwnerChannel::User,
   // OwnerChannel::User
   void on_up(FrameLink& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
-  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
-  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   void on_output_empty() override { publish(); }
   void on_down(const Error& why) override;
   void on_anew() override;
+  // FrameLink::SampleSink
+  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
+  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   // StreamFeed::Listener, SamplePump::Events
   void on_news() override { publish(); }
   void on_gap(Tid first, std::uint64_t count) override;

@@ -13,7 +13,7 @@ Duration period_of(double rate_hz) {
 
 }  // namespace
 
-Tid newest_untrusted(const ring::RingReader& reader) noexcept {
+[[gnu::hot]] Tid newest_untrusted(const ring::RingReader& reader) noexcept {
   const Tid newest = reader.newest();
   return newest <= kLastTid ? newest : kNoTid;
 }
@@ -29,7 +29,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameLink& link, Sample
       next_(std::clamp<Tid>(plan.first, 0, kLastTid)),
       last_(kLastTid) {}
 
-Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
+[[gnu::hot]] Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
   std::size_t bytes = 0;
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
@@ -93,7 +93,7 @@ Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
 }
 
 // Finds out whether, and from where, to go on.
-SamplePump::Look SamplePump::look(MonoTime now) {
+[[gnu::hot]] SamplePump::Look SamplePump::look(MonoTime now) {
   const Tid newest = newest_untrusted(reader_);
   if (!thins() && next_ <= newest) {
     const Tid oldest = reader_.oldest();

@@ -70,6 +70,9 @@ class SamplePump {
   SamplePump(const SamplePump&) = delete;
   SamplePump& operator=(const SamplePump&) = delete;
 
+  // Whether it leaves samples out, to keep to a rate: only then pump() looks at its `now`.
+  bool thins() const noexcept { return plan_.max_rate_hz > 0; }
+
   // Sends what there is to be sent in one turn. The sender must not be busy with somebody else's
   // sample.
   //   only_under_way  begins no other sample: somebody else wants to send in between
@@ -89,8 +92,6 @@ class SamplePump {
   Look look(MonoTime now);
   void lose_up_to(Tid next);
   void after_sample(MonoTime now);
-
-  bool thins() const noexcept { return plan_.max_rate_hz > 0; }
 
   ring::RingReader reader_;
   std::size_t payload_bytes_;

@@ -26,7 +26,7 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameLink& link,
       options_(options),
       payload_bytes_(mapping.geometry().payload_bytes) {}
 
-SendStatus SampleSender::send(Tid tid, std::uint64_t serial, bool more_follow) {
+[[gnu::hot]] SendStatus SampleSender::send(Tid tid, std::uint64_t serial, bool more_follow) {
   DSSM_CHECK(!busy_);
   const bool is_small = payload_bytes_ < kInPlaceBytes;
   const bool may_copy = payload_bytes_ <= kMostCopiedBytes;
@@ -34,7 +34,7 @@ SendStatus SampleSender::send(Tid tid, std::uint64_t serial, bool more_follow) {
   return may_copy && copy_pays ? send_copy(tid, serial) : begin_in_place(tid, serial);
 }
 
-SendStatus SampleSender::send_copy(Tid tid, std::uint64_t serial) {
+[[gnu::hot]] SendStatus SampleSender::send_copy(Tid tid, std::uint64_t serial) {
   std::byte staged[sizeof head_ + kMostCopiedBytes];
   SampleInfo info;
   std::byte* payload = staged + sizeof head_;
@@ -67,7 +67,7 @@ SendStatus SampleSender::send_copy(Tid tid, std::uint64_t serial) {
 // --- small payloads, many at a time
 // ---------------------------------------------------------------
 
-SendStatus SampleSender::send_many(Tid first, Tid last, Tid& next) {
+[[gnu::hot]] SendStatus SampleSender::send_many(Tid first, Tid last, Tid& next) {
   next = first;
   std::byte staged[kBatchBytes];
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
@@ -238,7 +238,7 @@ SendStatus SampleSender::end_sample(bool valid) {
   return valid ? SendStatus::sent : SendStatus::torn;
 }
 
-void SampleSender::end_run() {
+[[gnu::hot]] void SampleSender::end_run() {
   if (busy_ || head_bytes_ == 0) return;
   const std::size_t bytes = head_bytes_ - head_sent_;
   const iovec part = part_of(head_.data() + head_sent_, bytes);

@@ -34,7 +34,7 @@ StreamChannel::StreamChannel(const Parts& parts, std::shared_ptr<ServedStream> s
       sender_(stream().mapping(), parts_.link, {may_tear, &parts_.budget}),
       due_(EventSource::timer(parts_.loop, [this] { parts_.owner.work_now(); })) {
   served_->stream().add_channel();
-  parts_.link.set_payload_bytes(stream().type().payload_bytes);
+  parts_.link.take_samples(stream().type().payload_bytes, *this);
 }
 
 StreamChannel::~StreamChannel() {
@@ -73,13 +73,13 @@ Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
   }
 }
 
-Result<void> StreamChannel::work(MonoTime now, bool request_waits) {
+[[gnu::hot]] Result<void> StreamChannel::work(bool request_waits) {
   if (reading_) {
     go_on_reading();
     if (reading_) return {};
   }
   if (receiver_) receiver_->acknowledge();
-  return go_on_pumping(now, request_waits);
+  return go_on_pumping(request_waits);
 }
 
 // --- subscription
@@ -138,8 +138,9 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   return next;
 }
 
-Result<void> StreamChannel::go_on_pumping(MonoTime now, bool request_waits) {
+[[gnu::hot]] Result<void> StreamChannel::go_on_pumping(bool request_waits) {
   if (!pump_) return {};
+  const MonoTime now = pump_->thins() ? MonoClock::now() : MonoTime{};
   feed_->forget(*this);
   Result<PumpWait> wait = pump_->pump(now, request_waits);
   for (int looks = 0; wait && *wait == PumpWait::news; ++looks) {
@@ -167,11 +168,11 @@ Result<void> StreamChannel::go_on_pumping(MonoTime now, bool request_waits) {
   return {};
 }
 
-void StreamChannel::on_news() { parts_.owner.work_now(); }
+[[gnu::hot]] void StreamChannel::on_news() { parts_.owner.work_now(); }
 
 // The clock may have been set, and samples been written after that: what they say of their time
 // must not be believed.
-void StreamChannel::before_samples() {
+[[gnu::hot]] void StreamChannel::before_samples() {
   if (!tells_clock_) return;
   const std::uint64_t news = parts_.clock->news();
   if (clock_news_ == news) return;

@@ -21,7 +21,9 @@
 
 namespace dssm::daemon {
 
-class StreamChannel final : private SamplePump::Events, private StreamFeed::Listener {
+class StreamChannel final : private SamplePump::Events,
+                            private StreamFeed::Listener,
+                            private FrameLink::SampleSink {
  public:
   // Calls work(): at once, or in the next turn of the loop.
   class Owner {
@@ -62,11 +64,7 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
 
   // Goes on with what can go on, for one turn.
   //   request_waits  no sample of the subscription is begun, so that busy() ends
-  Result<void> work(MonoTime now, bool request_waits);
-
-  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out);
-  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn);
-  void on_batch_end();
+  Result<void> work(bool request_waits);
 
   // The stream lost its name: what it holds is still sent, then the client is told.
   void on_removed();
@@ -95,7 +93,7 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
   ReadStatus find(const net::Read& request, Tid& tid) const;
   void answer_no_sample(ReadStatus status);
   void answer_failure(const Error& error);
-  Result<void> go_on_pumping(MonoTime now, bool request_waits);
+  Result<void> go_on_pumping(bool request_waits);
   void end();
 
   void before_samples() override;
@@ -103,6 +101,10 @@ class StreamChannel final : private SamplePump::Events, private StreamFeed::List
   void on_caught_up() override;
   void on_end() override;
   void on_news() override;
+
+  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
+  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
+  void on_batch_end() override;
 
   Parts parts_;
   std::shared_ptr<ServedStream> served_;

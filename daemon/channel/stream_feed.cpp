@@ -31,13 +31,13 @@ void StreamFeed::on_doorbell_added(int fd) {
   doorbells_.back().enable();
 }
 
-void StreamFeed::arm(bool armed) noexcept {
+[[gnu::hot]] void StreamFeed::arm(bool armed) noexcept {
   if (armed == armed_) return;
   armed_ = armed;
   bell_->arm_doorbell(armed);
 }
 
-bool StreamFeed::wait(Listener& listener, Tid known) {
+[[gnu::hot]] bool StreamFeed::wait(Listener& listener, Tid known) {
   std::erase_if(waiting_, [&](const Waiting& waiting) { return waiting.listener == &listener; });
   arm(true);
   if (newest_untrusted(reader_) > known) {
@@ -48,7 +48,7 @@ bool StreamFeed::wait(Listener& listener, Tid known) {
   return true;
 }
 
-void StreamFeed::forget(Listener& listener) noexcept {
+[[gnu::hot]] void StreamFeed::forget(Listener& listener) noexcept {
   std::erase_if(waiting_, [&](const Waiting& waiting) { return waiting.listener == &listener; });
   for (Waiting& waiting : told_) {
     if (waiting.listener == &listener) waiting.listener = nullptr;
@@ -56,7 +56,7 @@ void StreamFeed::forget(Listener& listener) noexcept {
   if (waiting_.empty()) arm(false);
 }
 
-void StreamFeed::look() {
+[[gnu::hot]] void StreamFeed::look() {
   look_again_ = true;
   if (looking_) return;  // a listener wrote to the stream
   looking_ = true;

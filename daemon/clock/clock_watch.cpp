@@ -60,10 +60,10 @@ clock::ClockState ClockWatch::state() {
   return state;
 }
 
-bool ClockWatch::may_differ() {
-  const std::optional<clock::Tick> tick = tick_();
-  if (tick && seen_tick_ && tick->difference == seen_tick_->difference &&
-      tick->mono - seen_tick_->mono < kMostDelay) {
+[[gnu::hot]] bool ClockWatch::may_differ() {
+  const clock::Tick tick = tick_();
+  if (seen_tick_ && tick.difference == seen_tick_->difference &&
+      tick.mono - seen_tick_->mono < kMostDelay) {
     return false;
   }
   seen_tick_ = tick;

@@ -28,7 +28,7 @@ class ClockWatch final : private ChronydClient::User {
     // Tests put their own in their places.
     ChronydClient::Now now = clock::Instant::now;
     Duration period = ChronydClient::kPeriod;
-    std::function<std::optional<clock::Tick>()> tick = clock::Tick::last;
+    std::function<clock::Tick()> tick = clock::Tick::last;
   };
 
   class Observer {
@@ -106,7 +106,7 @@ class ClockWatch final : private ChronydClient::User {
   Observer& observer_;
   Logger& logger_;
   const ChronydClient::Now now_;
-  const std::function<std::optional<clock::Tick>()> tick_;
+  const std::function<clock::Tick()> tick_;
   clock::ClockEstimator estimator_;
   std::optional<clock::Tick> seen_tick_;   // before may_differ() was true last
   std::optional<TrackingReply> last_;      // while there is a chronyd

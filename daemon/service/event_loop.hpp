@@ -41,7 +41,7 @@ class EventLoop {
   void watch_timers();
   std::unique_ptr<event_base, Free> base_;
   std::unique_ptr<TimerQueue> timers_;
-  std::unique_ptr<event, FreeEvent> timer_is_due_;
+  std::unique_ptr<event, FreeEvent> run_timers_, timer_is_due_;
 };
 
 // Calls back when something happens; idle until enable(). The callback may disable its own source
@@ -57,7 +57,8 @@ class EventSource {
   // eventfd), whether or not anybody reads it. `fd` must have no other source in this loop.
   static EventSource edge(const EventLoop& loop, int fd, Callback callback);
   static EventSource signal(const EventLoop& loop, int number, Callback callback);
-  // Without a delay it calls back in the loop's next turn, when other events had theirs.
+  // Without a delay it calls back in the loop's next turn, when other events had theirs; with one,
+  // when it is over and all that had arrived by then is handed out.
   static EventSource timer(const EventLoop& loop, Callback callback);
 
   void enable() noexcept;

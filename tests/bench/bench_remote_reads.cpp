@@ -95,9 +95,10 @@ void bench_mirror(Session& owner, Session& other) {
 // eventfd behind which a bare process does the same: sends 64 B to eight others.
 void bench_writer(const Hosts& hosts, const std::string& address, const std::string& socket_path,
                   Session& session) {
-  constexpr int kReaders = 8, kWrites = 3000;
-  RawWriter writer =
-      session.create_raw({"cost", 0, ""}, {"", 64, 1, {}}, History{1000, 1ms}).value();
+  constexpr int kReaders = 8, kRounds = 60, kWrites = 100;
+  const TypeInfo type{"", 64, 1, {}};
+  RawWriter near = session.create_raw({"near", 0, ""}, type, History{1000, 1ms}).value();
+  RawWriter far = session.create_raw({"far", 0, ""}, type, History{1000, 1ms}).value();
   const int bell = ::eventfd(0, EFD_CLOEXEC);
   std::vector<pid_t> bare;
   std::vector<int> sockets;
@@ -120,43 +121,26 @@ void bench_writer(const Hosts& hosts, const std::string& address, const std::str
     }
     fail("epoll_wait");
   }));
-  std::vector<std::byte> payload(64);
-  const auto paced = [&](auto operation) {
-    std::vector<double> ns;
-    MonoTime next = MonoClock::now();
-    for (int i = 0; i < kWrites; ++i) {
-      sleep_until(next += 500us);
-      const std::int64_t start = now_ns();
-      operation();
-      ns.push_back(static_cast<double>(now_ns() - start));
-    }
-    return figures_of(std::move(ns));
-  };
-  const auto write = [&] { writer.write(payload, WallClock::now()); };
-  const Figures doorbell = paced([&] {
-    const std::uint64_t one = 1;
-    if (::write(bell, &one, sizeof one) != sizeof one) fail("write eventfd");
-  });
-  const Figures alone = paced(write);
+  const std::vector<std::byte> payload(64);
+  near.write(payload, WallClock::now());
+  auto& ready = shared<std::atomic<int>>();
   // A reader that never sleeps in the ring costs the writer no call, but its caches: as dssmd does.
   const pid_t local = in_child([&] {
     RawReader reader = Session::connect({.socket_path = socket_path})
                            .value()
-                           .open_raw_reader({"cost", 0, ""})
+                           .open_raw_reader({"near", 0, ""})
                            .value();
+    ready.fetch_add(1);
     std::vector<std::byte> out(64);
     for (SampleInfo info;; ::usleep(100)) {
       if (reader.latest(out, info) != ReadStatus::ok) fail("read");
     }
   });
-  const Figures with_local = paced(write);
-  end_child(local);
-  auto& ready = shared<std::atomic<int>>();
   std::vector<pid_t> readers;
   for (int i = 0; i < kReaders; ++i) {
     readers.push_back(in_child([&] {
       const auto in_other = hosts.inside(2);
-      PConnector connector = PConnector::open({"cost", 0, ""}, {.address = address}).value();
+      PConnector connector = PConnector::open({"far", 0, ""}, {.address = address}).value();
       connector.subscribe({}).value();
       ready.fetch_add(1);
       std::vector<std::byte> out(64);
@@ -168,14 +152,41 @@ void bench_writer(const Hosts& hosts, const std::string& address, const std::str
       }
     }));
   }
-  while (ready.load() != kReaders) ::usleep(1000);
-  const Figures with = paced(write);
+  while (ready.load() != kReaders + 1) ::usleep(1000);
+  ::kill(local, SIGSTOP);
+  const auto ring = [&] {
+    const std::uint64_t one = 1;
+    if (::write(bell, &one, sizeof one) != sizeof one) fail("write eventfd");
+  };
+  const auto paced = [&](std::vector<double>& ns, auto operation, auto untimed) {
+    MonoTime next = MonoClock::now();
+    for (int i = 0; i < kWrites; ++i) {
+      sleep_until(next += 500us);
+      const std::int64_t start = now_ns();
+      operation();
+      ns.push_back(static_cast<double>(now_ns() - start));
+      untimed();
+    }
+  };
+  std::vector<double> bare_ns, near_ns, far_ns;
+  for (int round = 0; round < kRounds; ++round) {
+    paced(bare_ns, ring, [] {});
+    ::kill(local, SIGCONT);
+    // Eight processes run between two writes in all three: they cool the writer's caches.
+    paced(
+        near_ns, [&] { near.write(payload, WallClock::now()); }, ring);
+    ::kill(local, SIGSTOP);
+    paced(
+        far_ns, [&] { far.write(payload, WallClock::now()); }, [] {});
+  }
+  end_child(local);
   for (const pid_t pid : readers) end_child(pid);
   for (const pid_t pid : bare) end_child(pid);
   for (const int socket : sockets) ::close(socket);
   ::close(bell);
+  const Figures doorbell = figures_of(bare_ns), with_local = figures_of(near_ns),
+                with = figures_of(far_ns);
   print_row("  write an eventfd, 64 B sent to 8 processes", doorbell);
-  print_row("  write 64 B, no reader", alone);
   print_row("  write 64 B, a local reader looks at it", with_local);
   char rest[80];
   std::snprintf(rest, sizeof rest, "%7.2f  <= 1 more",

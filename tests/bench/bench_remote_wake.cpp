@@ -19,8 +19,9 @@ using namespace std::chrono_literals;
 
 namespace {
 
-constexpr int kSamples = 500;  // of one round
-constexpr int kRounds = 12;
+constexpr int kSamples =
+    100;  // of one round: many, since the scheduler places processes anew in each
+constexpr int kRounds = 60;
 constexpr std::size_t kMaxPayloadBytes = 1024;
 
 enum class Kind { raw_mirror, our_mirror, raw_connector, our_connector, count };

@@ -7,6 +7,7 @@
 #pragma once
 
 #include <dssm/error.hpp>
+#include <optional>
 #include <stdexcept>
 #include <utility>
 #include <variant>
@@ -70,21 +71,19 @@ class [[nodiscard]] Result<void> {
   using value_type = void;
 
   Result() = default;
-  Result(Error error)
-      : error_(std::move(error)), failed_(true) {}  // NOLINT: implicit by intent, `return error;`
+  Result(Error error) : error_(std::move(error)) {}  // NOLINT: implicit by intent, `return error;`
 
-  bool has_value() const noexcept { return !failed_; }
-  explicit operator bool() const noexcept { return !failed_; }
-  Error& error() & noexcept { return error_; }
-  const Error& error() const& noexcept { return error_; }
-  Error&& error() && noexcept { return std::move(error_); }
+  bool has_value() const noexcept { return !error_; }
+  explicit operator bool() const noexcept { return !error_; }
+  Error& error() & noexcept { return *error_; }
+  const Error& error() const& noexcept { return *error_; }
+  Error&& error() && noexcept { return *std::move(error_); }
   void value() const {
-    if (failed_) throw BadResult(error_);
+    if (error_) throw BadResult(*error_);
   }
 
  private:
-  Error error_;
-  bool failed_ = false;
+  std::optional<Error> error_;
 };
 
 }  // namespace dssm

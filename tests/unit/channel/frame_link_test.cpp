@@ -37,9 +37,14 @@ iovec part(const std::vector<std::byte>& bytes, std::size_t from, std::size_t to
   return {const_cast<std::byte*>(bytes.data()) + from, to - from};
 }
 
-class FrameLinkTest : public testing::Test, protected FrameLink::User {
+class FrameLinkTest : public testing::Test,
+                      protected FrameLink::User,
+                      protected FrameLink::SampleSink {
  protected:
   static constexpr std::size_t kMaxQueued = 10'000;
+  static constexpr std::size_t kPayloadBytes = 100;
+
+  FrameLinkTest() { link->take_samples(kPayloadBytes, *this); }
 
   Result<void> on_frame(net::Frame& frame) override {
     got.push_back(frame.serial());
@@ -238,15 +243,29 @@ TEST_F(FrameLinkTest, HandsNothingOutWhilePaused) {
   EXPECT_EQ(got, (Serials{1, 2, 3, 4}));
 }
 
-TEST_F(FrameLinkTest, BeginsASampleAgainThatCameInAPause) {
-  link->set_payload_bytes(100);
+std::vector<std::byte> sample_frame(Tid tid, std::size_t payload_bytes, std::byte content) {
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
   const std::size_t header_bytes =
-      wire::encode_sample_header(header, 0, {7, {}, {}}, 100, wire::Trailer::none);
+      wire::encode_sample_header(header, 0, {tid, {}, {}}, payload_bytes, wire::Trailer::none);
   std::vector<std::byte> frame(header.begin(), header.begin() + header_bytes);
-  frame.resize(frame.size() + 100, std::byte{5});
+  frame.resize(frame.size() + payload_bytes, content);
+  return frame;
+}
+
+TEST_F(FrameLinkTest, RefusesASampleThatNobodyTakes) {
+  FakePeer other;
+  FrameLink one(loop, std::make_unique<FakeTransport>(other), *this, kMaxQueued);
+  other.put(sample_frame(7, kPayloadBytes, std::byte{5}));
+  run_turns(loop, 3);
+  EXPECT_TRUE(begun.empty());
+  ASSERT_TRUE(why);
+  EXPECT_EQ(why->code, Errc::protocol);
+  EXPECT_NE(why->message.find("none is awaited"), std::string::npos) << why->message;
+}
+
+TEST_F(FrameLinkTest, BeginsASampleAgainThatCameInAPause) {
   hold_sample = true;
-  peer.put(frame);
+  peer.put(sample_frame(7, kPayloadBytes, std::byte{5}));
   run_turns(loop, 3);
   EXPECT_EQ(begun, std::vector<Tid>{7});
   EXPECT_TRUE(ended.empty());
@@ -255,7 +274,7 @@ TEST_F(FrameLinkTest, BeginsASampleAgainThatCameInAPause) {
   run_turns(loop, 3);
   EXPECT_EQ(begun, (std::vector<Tid>{7, 7}));
   EXPECT_EQ(ended, std::vector<Tid>{7});
-  EXPECT_EQ(payload, std::vector<std::byte>(100, std::byte{5}));
+  EXPECT_EQ(payload, std::vector<std::byte>(kPayloadBytes, std::byte{5}));
 }
 
 TEST_F(FrameLinkTest, TellsThePeerWhyItCloses) {

@@ -104,8 +104,6 @@ class PumpRig final : private FrameLink::User, private SamplePump::Events {
 
  private:
   Result<void> on_frame(net::Frame&) override { return {}; }
-  Result<void> on_sample_begin(const wire::IncomingSample&, std::byte*&) override { return {}; }
-  Result<void> on_sample_end(const wire::IncomingSample&, bool) override { return {}; }
   void on_closed(const Error& why) override { ADD_FAILURE() << why.message; }
   void on_gap(Tid first, std::uint64_t count) override {
     net::Frame frame;

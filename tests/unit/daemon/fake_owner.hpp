@@ -43,7 +43,7 @@ inline wire::Greeting greeting_of(const std::string& host) {
   return greeting;
 }
 
-class FakeOwner final : private FrameLink::User {
+class FakeOwner final : private FrameLink::User, private FrameLink::SampleSink {
  public:
   explicit FakeOwner(const EventLoop& loop, const std::string& host = "pc2")
       : loop_(loop), greeting_(greeting_of(host)) {
@@ -121,7 +121,7 @@ class FakeOwner final : private FrameLink::User {
   void cut() { link_.reset(); }
 
   // The samples that were published here, as they came.
-  void take_samples(std::size_t payload_bytes) { link_->set_payload_bytes(payload_bytes); }
+  void take_samples(std::size_t payload_bytes) { link_->take_samples(payload_bytes, *this); }
   struct Published {
     SampleInfo info;
     std::vector<std::byte> payload;

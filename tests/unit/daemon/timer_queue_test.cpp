@@ -3,6 +3,8 @@
 
 #include <gtest/gtest.h>
 #include <poll.h>
+#include <sys/eventfd.h>
+#include <unistd.h>
 
 #include <memory>
 #include <optional>
@@ -137,6 +139,23 @@ TEST_F(TimerQueueTest, KeepsThousandsInOrder) {
   }
   EXPECT_TRUE(std::is_sorted(times.begin(), times.end()));
   EXPECT_FALSE(is_readable(0));
+}
+
+// After a stall both are due: whoever judges a silence has to hear first what has been said.
+TEST(EventLoopTimers, ComeBehindWhatHasArrived) {
+  EventLoop loop = EventLoop::open().value();
+  const UniqueFd arrival(::eventfd(0, EFD_CLOEXEC));
+  std::string order;
+  EventSource timer = EventSource::timer(loop, [&] { order += 't', loop.stop(); });
+  EventSource arrived = EventSource::edge(loop, arrival.get(), [&] { order += 'a'; });
+  arrived.enable();
+  timer.enable_in(1ms);
+  pollfd due{loop.timers().fd(), POLLIN, 0};
+  ASSERT_EQ(::poll(&due, 1, 20'000), 1);
+  const std::uint64_t one = 1;
+  ASSERT_EQ(::write(arrival.get(), &one, sizeof one), ssize_t{sizeof one});
+  ASSERT_TRUE(loop.run());
+  EXPECT_EQ(order, "at");
 }
 
 // With and without a delay, in libevent's loop.

@@ -215,6 +215,16 @@ TEST(Bell, SleepEndsAtTheDeadline) {
   EXPECT_EQ(status, WaitStatus::timeout);
 }
 
+// A writer may have died between publishing and ringing.
+TEST(Bell, SleepersLookUpThoughNobodyRings) {
+  const TestRing ring(8, 4);
+  for (const MonoTime deadline : {kNever, deadline_in(std::chrono::hours(1))}) {
+    const MonoTime begin = MonoClock::now();
+    EXPECT_EQ(ring.bell->sleep(ring.bell->announce(), deadline), WaitStatus::ready);
+    EXPECT_GE(MonoClock::now() - begin, kMaxSleep);
+  }
+}
+
 TEST(Bell, SleepReturnsWhenItRangSinceTheAnnouncement) {
   const TestRing ring(8, 4);
   const std::uint32_t announced = ring.bell->announce();

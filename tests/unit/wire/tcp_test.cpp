@@ -8,8 +8,10 @@
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <poll.h>
+#include <signal.h>
 #include <sys/socket.h>
 
+#include <atomic>
 #include <cstring>
 #include <dssm/time.hpp>
 #include <thread>
@@ -90,6 +92,25 @@ TEST_P(TcpTransport, WaitsForBytesForAWhileAndThenNeverAgain) {
   sending.join();
   EXPECT_EQ(received.bytes, 5u);
   EXPECT_EQ(space.substr(0, 5), "bytes");
+}
+
+TEST_P(TcpTransport, TellsOfASignalThatEndsItsWait) {
+  const Pair pair = connect_pair(GetParam());
+  struct sigaction action {
+  }, before{};
+  action.sa_handler = [](int) {};
+  ::sigaction(SIGUSR1, &action, &before);
+  const pthread_t self = ::pthread_self();
+  std::atomic<bool> done = false;
+  std::thread killer([&] {
+    while (!done) ::pthread_kill(self, SIGUSR1), std::this_thread::yield();
+  });
+  std::string space(20, '?');
+  const iovec spaces[] = {part_of(space)};
+  EXPECT_EQ(pair.server->receive_waiting(spaces)->status, IoStatus::interrupted);
+  done = true;
+  killer.join();
+  ::sigaction(SIGUSR1, &before, nullptr);
 }
 
 INSTANTIATE_TEST_SUITE_P(BothKinds, TcpTransport, testing::Values("127.0.0.1:0", "[::1]:0"));
