@@ -57,12 +57,16 @@ void Mirror::on_down(const Error& why) {
 
 void Mirror::on_anew() {
   step_ = Step::none;
+  ending_ = false;
   if (ring_) ring_->wake();  // for what came with the end
 }
 
 void Mirror::on_stream_there() {
+  ending_ = false;
   if (state_ == State::removed) channel_.try_again();
 }
+
+void Mirror::on_stream_gone() { ending_ = state_ == State::live; }
 
 Result<void> Mirror::on_frame(net::Frame& frame) {
   switch (frame.body_case()) {
@@ -210,6 +214,7 @@ Result<void> Mirror::on_gap_untrusted(const net::Gap& gap) {
 // name is found by the catalog or by asking.
 void Mirror::on_removed(const Error& why) {
   step_ = Step::none;
+  ending_ = false;
   state_ = State::removed;
   trouble_ = why;
   if (ring_) {
@@ -268,7 +273,7 @@ std::shared_ptr<Stream> Mirror::borrow() { return ring_ ? lend() : nullptr; }
 
 void Mirror::open(Then then) {
   // While the owner is away its history is still here.
-  const bool ready = state_ == State::live || state_ == State::owner_away ||
+  const bool ready = (state_ == State::live && !ending_) || state_ == State::owner_away ||
                      (state_ == State::connecting && ring_);
   if (ready) {
     lend_to(then);

@@ -63,6 +63,8 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
   OwnerChannel& channel() noexcept { return channel_; }
   // The owner has such a stream, or a new ring of it.
   void on_stream_there();
+  // The owner has removed it. The channel tells so, too, behind the last samples.
+  void on_stream_gone();
   // What the owner says of its clock; this PC's clock was read anew.
   void on_owner_clock(MirrorClock::Report report);
   void on_clock() { judge(); }
@@ -132,6 +134,7 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
   MirrorClock clock_;
   State state_ = State::connecting;
   Step step_ = Step::none;
+  bool ending_ = false;           // the stream was removed; the channel is still to tell so
   std::optional<Error> trouble_;  // why it is not live
   bool told_ = false;             // the log knows of the present trouble
   std::unique_ptr<MirrorRing> ring_;

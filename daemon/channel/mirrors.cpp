@@ -29,6 +29,14 @@ void Mirrors::on_host_clock(const KnownHost& host) {
   });
 }
 
+// So that a program that was told of the removal does not get the stream's old ring afterwards.
+void Mirrors::on_remote_stream_removed(const KnownHost& host, const StreamInfo& stream) {
+  const wire::HostId& owner = host.greeting.host_id;
+  if (!catalog_.find(owner)) return;  // it is the host that is gone, and its streams may be there
+  Mirror* mirror = table_.find({stream.id.name, stream.id.id, host.greeting.host});
+  if (mirror && mirror->channel().owner() == owner) mirror->on_stream_gone();
+}
+
 void Mirrors::open(const KnownHost& host, const StreamId& id, Then then) {
   const Result<Mirror*> mirror = table_.find_or_make(host, id);
   if (!mirror) return then(mirror.error());

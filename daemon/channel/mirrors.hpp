@@ -32,6 +32,7 @@ class Mirrors final : public MirrorKeeper, private Mirror::Keeper, private Catal
 
  private:
   void on_host_clock(const KnownHost& host) override;
+  void on_remote_stream_removed(const KnownHost& host, const StreamInfo& stream) override;
   void on_ring_replaced(const Stream& old) override;
   void on_mirror_done() override { table_.sweep(); }
 

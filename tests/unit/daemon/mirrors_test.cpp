@@ -328,6 +328,32 @@ TEST_F(MirrorsTest, KeepsTheRingOfARemovedStreamAndTriesAgain) {
   EXPECT_EQ(replaced.size(), 1u);
 }
 
+// The catalog's connection may be quicker than the channel.
+TEST_F(MirrorsTest, LendsNoRingOfAStreamThatTheCatalogKnowsToBeRemoved) {
+  const wire::HostId host_id = owner->host().greeting.host_id;
+  const std::shared_ptr<Stream> stream = opened(5);
+  catalog.stream_added(host_id, theirs).value();
+  catalog.stream_removed(host_id, kId);
+  const auto answer = open();
+  EXPECT_FALSE(answer->has_value());
+  samples(6, 6);
+  owner->removed();
+  run_until(loop, [&] { return answer->has_value(); });
+  EXPECT_EQ((*answer)->error().code, Errc::not_found);
+  EXPECT_EQ(newest(*stream), 6) << "its readers get the last samples";
+}
+
+TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  const KnownHost host = owner->host();
+  catalog.stream_added(host.greeting.host_id, theirs).value();
+  catalog.host_down(host.greeting.host_id, {Errc::daemon_away, "it is silent"});
+  catalog.host_up(host.greeting, host.address);
+  const auto answer = open();
+  ASSERT_TRUE(answer->has_value());
+  EXPECT_EQ((*answer)->value(), stream);
+}
+
 TEST_F(MirrorsTest, AsksAgainForARemovedStreamWhenSomebodyOpensIt) {
   const std::shared_ptr<Stream> stream = opened(5);
   owner->removed();
