@@ -198,7 +198,7 @@ bool Channel::has_more_to_send() const noexcept {
     if (Result<void> done = link_.resume(); !done) return went_down(std::move(done).error()), false;
     return true;
   }
-  return on_received(link_.receive());
+  return on_received(link_.receive()) == wire::IoStatus::ok;
 }
 
 // Whether there is nothing to do but to wait for what comes: then receive_waiting() saves a system
@@ -210,15 +210,13 @@ bool Channel::has_more_to_send() const noexcept {
 // Takes what comes within Transport::kReceiveWait. After may_wait_in_receive().
 //   returns  ok | would_block | interrupted | end: the connection broke
 [[gnu::hot]] wire::IoStatus Channel::receive_waiting() {
-  const Result<wire::IoStatus> received = link_.receive_waiting();
-  if (received) return *received;
-  went_down(received.error());
-  return wire::IoStatus::end;
+  return on_received(link_.receive_waiting());
 }
 
-[[gnu::hot]] bool Channel::on_received(Result<bool> received) {
-  if (!received) return went_down(std::move(received).error()), false;
-  if (*received && !set_up_sent_) advance(Patience::none);  // it may have been the greeting
+[[gnu::hot]] wire::IoStatus Channel::on_received(const Result<wire::IoStatus>& received) {
+  if (!received) return went_down(received.error()), wire::IoStatus::end;
+  // It may have been the greeting.
+  if (*received == wire::IoStatus::ok && !set_up_sent_) advance(Patience::none);
   return *received;
 }
 

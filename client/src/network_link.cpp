@@ -175,28 +175,24 @@ Result<std::size_t> NetworkLink::send_some(std::span<const std::byte> bytes) {
   return sent;
 }
 
-[[gnu::hot]] Result<bool> NetworkLink::receive() {
-  if (!transport_) return false;
+[[gnu::hot]] Result<wire::IoStatus> NetworkLink::receive() {
+  if (!transport_) return wire::IoStatus::would_block;
   return take(transport_->receive(decoder_->spaces()));
 }
 
 [[gnu::hot]] Result<wire::IoStatus> NetworkLink::receive_waiting() {
   if (!transport_) return wire::IoStatus::would_block;
-  Result<wire::IoResult> received = transport_->receive_waiting(decoder_->spaces());
-  if (received && received->status == wire::IoStatus::interrupted) return received->status;
-  const Result<bool> taken = take(std::move(received));
-  if (!taken) return taken.error();
-  return *taken ? wire::IoStatus::ok : wire::IoStatus::would_block;
+  return take(transport_->receive_waiting(decoder_->spaces()));
 }
 
-[[gnu::hot]] Result<bool> NetworkLink::take(Result<wire::IoResult> received) {
-  if (!received) return down(std::move(received).error());
-  if (received->status == wire::IoStatus::would_block) return false;
+[[gnu::hot]] Result<wire::IoStatus> NetworkLink::take(const Result<wire::IoResult>& received) {
+  if (!received) return down(received.error());
   if (received->status == wire::IoStatus::end) return down(lost());
+  if (received->status != wire::IoStatus::ok) return received->status;
   if (Result<void> done = decoder_->commit(received->bytes); !done) {
     return down(std::move(done).error());
   }
-  return true;
+  return wire::IoStatus::ok;
 }
 
 Result<void> NetworkLink::resume() {

@@ -52,11 +52,12 @@ class NetworkLink final : private wire::FrameSink {
   // Sends bytes of the user's own; returns how many went. Nothing may be queued.
   Result<std::size_t> send_some(std::span<const std::byte> bytes);
 
-  // Receives once. False: nothing was there. Not while a sample is held back.
-  //   fails  besides: what `user` returned
-  Result<bool> receive();
+  // Receives once. Not while a sample is held back.
+  //   returns  ok | would_block (nothing was there)
+  //   fails    besides: what `user` returned
+  Result<wire::IoStatus> receive();
   // The same, waiting as Transport::receive_waiting() does.
-  //   returns  ok | would_block (nothing came) | interrupted
+  //   returns  besides: interrupted
   Result<wire::IoStatus> receive_waiting();
   // Goes on with what was received, after the user held a sample back.
   Result<void> resume();
@@ -85,7 +86,7 @@ class NetworkLink final : private wire::FrameSink {
   Result<void> on_frame(net::Frame& frame) override;
   Result<void> connect_next();
   Result<void> greet();
-  Result<bool> take(Result<wire::IoResult> received);
+  Result<wire::IoStatus> take(const Result<wire::IoResult>& received);
   Error down(Error why);
   Error lost() const;
 

@@ -85,8 +85,10 @@ void bench_mirror(Session& owner, Session& other) {
     const auto t = static_cast<std::int64_t>(random() % (kDepth - 2)) + kDepth + 1;
     if (reader.at(time_from_ns(1'000'000 * t), payload, info) != ReadStatus::ok) fail("at");
   };
+  // Each page of the two rings costs its first reader a fault.
+  for (int i = 0; i < 20 * kDepth; ++i) read(here), read(there);
   const Pair pair = measure(
-      2000, 200, [&] { read(here); }, [&] { read(there); });
+      20'000, 200, [&] { read(here); }, [&] { read(there); });
   print_pair("owner's ring by time", "mirror by time", pair, "");
   std::printf("%-44s %47.2f  %s\n", "  ratio of the p99", pair.ours.p99 / pair.raw.p99, "<= 1.2");
 }

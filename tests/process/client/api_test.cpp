@@ -7,8 +7,6 @@
 #include <sys/wait.h>
 
 #include <array>
-#include <atomic>
-#include <csignal>
 #include <dssm/dssm.hpp>
 #include <filesystem>
 #include <mutex>
@@ -16,6 +14,7 @@
 #include <thread>
 
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/signals.hpp"
 
 namespace dssm {
 namespace {
@@ -279,21 +278,10 @@ TEST_F(Api, WaitsForSamplesWithADeadline) {
 }
 
 TEST_F(Api, ReportsASignalThatInterruptsAWait) {
-  struct sigaction action {
-  }, before{};
-  action.sa_handler = [](int) {};
-  ::sigaction(SIGUSR1, &action, &before);
   auto writer = make();
   auto reader = session.open_reader<Odometry>("odometry").value();
-  const pthread_t self = ::pthread_self();
-  std::atomic<bool> done = false;
-  std::thread killer([&] {
-    while (!done) ::pthread_kill(self, SIGUSR1), std::this_thread::yield();
-  });
+  const test::Signals signals;
   EXPECT_EQ(reader.wait(kNever), WaitStatus::interrupted);
-  done = true;
-  killer.join();
-  ::sigaction(SIGUSR1, &before, nullptr);
 }
 
 TEST_F(Api, OffersADescriptorToEventLoops) {

@@ -8,13 +8,13 @@
 #include <netinet/in.h>
 #include <netinet/tcp.h>
 #include <poll.h>
-#include <signal.h>
 #include <sys/socket.h>
 
-#include <atomic>
 #include <cstring>
 #include <dssm/time.hpp>
 #include <thread>
+
+#include "tests/support/signals.hpp"
 
 namespace dssm::wire {
 namespace {
@@ -96,21 +96,10 @@ TEST_P(TcpTransport, WaitsForBytesForAWhileAndThenNeverAgain) {
 
 TEST_P(TcpTransport, TellsOfASignalThatEndsItsWait) {
   const Pair pair = connect_pair(GetParam());
-  struct sigaction action {
-  }, before{};
-  action.sa_handler = [](int) {};
-  ::sigaction(SIGUSR1, &action, &before);
-  const pthread_t self = ::pthread_self();
-  std::atomic<bool> done = false;
-  std::thread killer([&] {
-    while (!done) ::pthread_kill(self, SIGUSR1), std::this_thread::yield();
-  });
   std::string space(20, '?');
   const iovec spaces[] = {part_of(space)};
+  const test::Signals signals;
   EXPECT_EQ(pair.server->receive_waiting(spaces)->status, IoStatus::interrupted);
-  done = true;
-  killer.join();
-  ::sigaction(SIGUSR1, &before, nullptr);
 }
 
 INSTANTIATE_TEST_SUITE_P(BothKinds, TcpTransport, testing::Values("127.0.0.1:0", "[::1]:0"));
