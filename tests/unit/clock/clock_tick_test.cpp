@@ -13,7 +13,12 @@ using namespace std::chrono_literals;
 // No tick came while we looked: twice in a row it would have been another one.
 Tick last_whole() {
   Tick tick = Tick::last();
-  for (Tick next; (next = Tick::last()).difference != tick.difference;) tick = next;
+  for (int looks = 0; looks < 1000; ++looks) {
+    const Tick next = Tick::last();
+    if (next.difference == tick.difference) return tick;
+    tick = next;
+  }
+  ADD_FAILURE() << "no two looks in a row saw the same tick";
   return tick;
 }
 
