@@ -166,7 +166,7 @@ Result<std::size_t> NetworkLink::send_some(std::span<const std::byte> bytes) {
   std::size_t sent = 0;
   while (sent < bytes.size()) {
     const iovec part{const_cast<std::byte*>(bytes.data()) + sent, bytes.size() - sent};
-    auto result = transport_->send({&part, 1}, false);
+    auto result = transport_->send({&part, 1});
     if (!result) return down(std::move(result).error());
     // Gone: its last words may be there to read, and then the end.
     if (result->status != wire::IoStatus::ok) break;

@@ -73,8 +73,8 @@ class TcpTransport final : public Transport {
  public:
   explicit TcpTransport(UniqueFd socket) noexcept : socket_(std::move(socket)) {}
 
-  [[gnu::hot]] Result<IoResult> send(std::span<const iovec> parts, bool more) override {
-    const int flags = MSG_NOSIGNAL | MSG_DONTWAIT | (more ? MSG_MORE : 0);
+  [[gnu::hot]] Result<IoResult> send(std::span<const iovec> parts) override {
+    const int flags = MSG_NOSIGNAL | MSG_DONTWAIT;
     const msghdr message = header(parts);
     ssize_t bytes = 0;
     do {  // the kernel has less to look at when there is but one part

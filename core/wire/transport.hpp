@@ -25,9 +25,8 @@ class Transport {
   virtual ~Transport() = default;
 
   // Sends as much of `parts` (at most 16), in order, as goes without waiting.
-  //   more  further bytes follow at once: the last packet may wait for them (MSG_MORE)
   //   returns  ok with the number of bytes (0 < bytes) | would_block | end (the peer is gone)
-  virtual Result<IoResult> send(std::span<const iovec> parts, bool more) = 0;
+  virtual Result<IoResult> send(std::span<const iovec> parts) = 0;
 
   // Receives into `spaces`, in order.
   //   returns  ok with the number of bytes (0 < bytes) | would_block | end

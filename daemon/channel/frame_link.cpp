@@ -167,7 +167,7 @@ void FrameLink::send(const net::Frame& frame) {
   const std::size_t bytes = outgoing.unsent().size();
   if (output_.empty() && !mid_frame_) {
     const iovec part = part_of(outgoing.unsent());
-    outgoing.sent = transmit({&part, 1}, false);
+    outgoing.sent = transmit({&part, 1});
     if (outgoing.sent == bytes || closed_ || output_lost_) return;
   }
   // Last words cannot stand in the middle of a frame.
@@ -196,9 +196,9 @@ void FrameLink::send(const net::Frame& frame) {
   enqueue(std::move(outgoing));
 }
 
-[[gnu::hot]] std::size_t FrameLink::send_now(std::span<const iovec> parts, bool more) {
+[[gnu::hot]] std::size_t FrameLink::send_now(std::span<const iovec> parts) {
   if (closed_ || output_lost_ || (!output_.empty() && !mid_frame_)) return 0;
-  return transmit(parts, more);
+  return transmit(parts);
 }
 
 void FrameLink::queue_rest(RawBytes bytes, MemoryShare share) {
@@ -240,7 +240,7 @@ bool FrameLink::flush() {
       parts[count] = part_of(next.unsent());
       bytes += parts[count++].iov_len;
     }
-    std::size_t sent = transmit(std::span(parts).first(count), false);
+    std::size_t sent = transmit(std::span(parts).first(count));
     if (closed_ || output_lost_) return false;
     const bool all = sent == bytes;
     while (!output_.empty()) {
@@ -257,8 +257,8 @@ bool FrameLink::flush() {
   return true;
 }
 
-[[gnu::hot]] std::size_t FrameLink::transmit(std::span<const iovec> parts, bool more) {
-  const Result<wire::IoResult> sent = transport_->send(parts, more);
+[[gnu::hot]] std::size_t FrameLink::transmit(std::span<const iovec> parts) {
+  const Result<wire::IoResult> sent = transport_->send(parts);
   if (sent && sent->status != wire::IoStatus::end) return sent->bytes;
   why_ = sent ? Error{Errc::daemon_away, "the other side closed the connection"} : sent.error();
   lose_output();
@@ -282,7 +282,7 @@ void FrameLink::close_with(const Error& why) {
     wire::to_message(why, *last_words.mutable_failure());
     const std::string encoded = wire::encode_frame(last_words);
     const iovec part = part_of(std::as_bytes(std::span(encoded)));
-    transmit({&part, 1}, false);
+    transmit({&part, 1});
   }
   close(why);
 }

@@ -84,7 +84,7 @@ class FrameLink final : private wire::FrameSink {
   bool output_empty() const noexcept { return output_.empty(); }
   // Sends without queueing; 0 bytes when the socket is full or the link is closed. Whoever sent a
   // part of a frame queues the rest at once, or says so by set_mid_frame().
-  std::size_t send_now(std::span<const iovec> parts, bool more);
+  std::size_t send_now(std::span<const iovec> parts);
   // Queues bytes that complete a frame that send_now() began; not counted against
   // max_queued_bytes. `share` of the budget is given back, and on_output_empty() comes, when they
   // are gone.
@@ -132,7 +132,7 @@ class FrameLink final : private wire::FrameSink {
   bool hand_out(std::size_t bytes);
   bool charge_input();
   void listen_again();
-  std::size_t transmit(std::span<const iovec> parts, bool more);
+  std::size_t transmit(std::span<const iovec> parts);
   bool flush();
   void enqueue(Outgoing outgoing);
   void lose_output();

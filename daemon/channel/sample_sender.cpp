@@ -50,7 +50,7 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameLink& link,
   std::copy_n(head_.begin() + head_sent_, kept_bytes + header_bytes, begin);
   head_bytes_ -= header_bytes;
   const iovec part = part_of(begin, bytes);
-  const std::size_t sent = link_.send_now({&part, 1}, false);
+  const std::size_t sent = link_.send_now({&part, 1});
   if (sent <= kept_bytes) {
     head_sent_ += sent;
     link_.want_output();
@@ -87,7 +87,7 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameLink& link,
   }
   if (bytes == 0) return SendStatus::gone;
   const iovec part = part_of(staged, bytes);
-  const std::size_t sent = link_.send_now({&part, 1}, false);
+  const std::size_t sent = link_.send_now({&part, 1});
   counters_.copied_payload_bytes += static_cast<std::uint64_t>(next - first) * payload_bytes_;
   if (sent == 0) {
     link_.want_output();
@@ -161,7 +161,7 @@ SendStatus SampleSender::send_slice() {
   const std::size_t head = head_bytes_ - head_sent_;
   const iovec parts[] = {part_of(head_.data() + head_sent_, head),
                          part_of(place_.payload + offset_, slice)};
-  const std::size_t sent = link_.send_now(parts, true);
+  const std::size_t sent = link_.send_now(parts);
   head_sent_ += std::min(sent, head);
   const std::size_t of_payload = sent - std::min(sent, head);
   offset_ += of_payload;
@@ -242,7 +242,7 @@ SendStatus SampleSender::end_sample(bool valid) {
   if (busy_ || head_bytes_ == 0) return;
   const std::size_t bytes = head_bytes_ - head_sent_;
   const iovec part = part_of(head_.data() + head_sent_, bytes);
-  const std::size_t sent = bytes > 0 ? link_.send_now({&part, 1}, false) : 0;
+  const std::size_t sent = bytes > 0 ? link_.send_now({&part, 1}) : 0;
   if (sent < bytes) {
     link_.queue_rest(RawBytes::copy_of(std::span(head_).subspan(head_sent_ + sent, bytes - sent)));
   }

@@ -12,6 +12,8 @@
 //             once, so that a slow connection does not make the sample void, and checked then. When
 //             the peer's memory is used up, it waits in the slot, at the risk of being overwritten
 //             there. For a peer without the feature "torn": copied as a whole, checked, then sent.
+//             Without MSG_MORE, which made the kernel send up to twice as slowly
+//             (docs/benchmarks.md).
 //
 // Where the one begins to pay and the other ends was measured on loopback, as processor time of the
 // sending thread per sample (2 cores, busy): in runs from a ring larger than the cache, copied and

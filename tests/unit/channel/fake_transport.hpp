@@ -34,7 +34,7 @@ struct FakePeerState {
   std::size_t room = kAll;          // how many bytes it may still send before the socket is full
   std::size_t most_at_once = kAll;  // of one send
   std::function<void()> after_send;
-  std::vector<bool> more;  // of each send that took something
+  std::size_t sends = 0;  // that took something
   std::deque<std::vector<std::byte>> input;
   bool closed = false;  // by the link
   bool gone = false;    // the peer is: what was put in is still received
@@ -79,7 +79,7 @@ class FakeTransport final : public wire::Transport {
     if (*alive_) peer_.closed = true;
   }
 
-  Result<wire::IoResult> send(std::span<const iovec> parts, bool more) override {
+  Result<wire::IoResult> send(std::span<const iovec> parts) override {
     if (!*alive_ || peer_.gone) return wire::IoResult{wire::IoStatus::end, 0};
     std::size_t left = std::min(peer_.room, peer_.most_at_once), sent = 0;
     for (const iovec& part : parts) {
@@ -91,7 +91,7 @@ class FakeTransport final : public wire::Transport {
     }
     if (sent == 0) return wire::IoResult{wire::IoStatus::would_block, 0};
     if (peer_.room != FakePeer::kAll) peer_.room -= sent;
-    peer_.more.push_back(more);
+    ++peer_.sends;
     if (peer_.after_send) peer_.after_send();
     return wire::IoResult{wire::IoStatus::ok, sent};
   }

@@ -137,17 +137,17 @@ TEST_F(FrameLinkTest, PutsNoFrameIntoTheMiddleOfAnother) {
     peer.sent.clear();
     link->set_mid_frame(true);
     iovec first = part(frame, 0, 100);
-    ASSERT_EQ(link->send_now({&first, 1}, true), 100u);
+    ASSERT_EQ(link->send_now({&first, 1}), 100u);
     link->send(ping(2));
     run_turns(loop, 3);
     EXPECT_EQ(peer.sent.size(), 100u) << "it waits";
     iovec second = part(frame, 100, 200);
-    ASSERT_EQ(link->send_now({&second, 1}, true), 100u) << "goes on before what waits";
+    ASSERT_EQ(link->send_now({&second, 1}), 100u) << "goes on before what waits";
     if (queues_rest) {
       link->queue_rest(RawBytes::copy_of(std::span(frame).subspan(200)));
     } else {
       iovec third = part(frame, 200, frame.size());
-      ASSERT_EQ(link->send_now({&third, 1}, false), frame.size() - 200);
+      ASSERT_EQ(link->send_now({&third, 1}), frame.size() - 200);
     }
     link->set_mid_frame(false);
     run_turns(loop, 3);
@@ -323,7 +323,7 @@ TEST_F(FrameLinkTest, DoesNothingAfterItClosed) {
   link->want_output();
   link->queue_rest(RawBytes(10));
   iovec nothing{};
-  EXPECT_EQ(link->send_now({&nothing, 1}, false), 0u);
+  EXPECT_EQ(link->send_now({&nothing, 1}), 0u);
   link->close_with({Errc::closed, "again"});
   run_turns(loop, 3);
   EXPECT_TRUE(peer.sent.empty());

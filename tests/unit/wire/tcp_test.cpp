@@ -63,7 +63,7 @@ TEST_P(TcpTransport, CarriesPartsInTheirOrder) {
   const Pair pair = connect_pair(GetParam());
   const std::string first = "first ", second = "second";
   const iovec parts[] = {part_of(first), part_of(second)};
-  EXPECT_EQ(pair.client->send(parts, false)->bytes, 12u);
+  EXPECT_EQ(pair.client->send(parts)->bytes, 12u);
   std::string begin(7, '?'), rest(20, '?');
   const iovec spaces[] = {part_of(begin), part_of(rest)};
   await(pair.server->fd(), POLLIN);
@@ -84,7 +84,7 @@ TEST_P(TcpTransport, WaitsForBytesForAWhileAndThenNeverAgain) {
   EXPECT_EQ(pair.server->receive(spaces)->status, IoStatus::would_block);
   const std::string text = "bytes";
   const iovec part[] = {part_of(text)};
-  std::thread sending([&] { EXPECT_EQ(pair.client->send(part, false)->bytes, 5u); });
+  std::thread sending([&] { EXPECT_EQ(pair.client->send(part)->bytes, 5u); });
   IoResult received;
   do {
     received = pair.server->receive_waiting(spaces).value();
@@ -110,7 +110,7 @@ TEST(Tcp, NeverWaits) {
   const iovec part[] = {part_of(bytes)};
   EXPECT_EQ(pair.server->receive(part)->status, IoStatus::would_block);
   for (;;) {  // until the kernel takes no more
-    const IoResult sent = pair.client->send(part, false).value();
+    const IoResult sent = pair.client->send(part).value();
     if (sent.status == IoStatus::would_block) break;
     ASSERT_EQ(sent.status, IoStatus::ok);
     EXPECT_GT(sent.bytes, 0u);
@@ -121,7 +121,7 @@ TEST(Tcp, SaysWhenThePeerClosed) {
   Pair pair = connect_pair();
   std::string bytes(10, 'x');
   const iovec part[] = {part_of(bytes)};
-  EXPECT_EQ(pair.client->send(part, false)->status, IoStatus::ok);
+  EXPECT_EQ(pair.client->send(part)->status, IoStatus::ok);
   pair.client.reset();
   await(pair.server->fd(), POLLIN);
   EXPECT_EQ(pair.server->receive(part)->bytes, 10u);
@@ -132,15 +132,15 @@ TEST(Tcp, SurvivesSendingToAPeerThatIsGone) {
   Pair pair = connect_pair();
   std::string bytes(10, 'x');
   const iovec part[] = {part_of(bytes)};
-  EXPECT_EQ(pair.server->send(part, false)->status, IoStatus::ok);
+  EXPECT_EQ(pair.server->send(part)->status, IoStatus::ok);
   pair.client.reset();  // with bytes that it did not read: the kernel answers with a reset
   await(pair.server->fd(), POLLIN);
   IoResult sent;
   do {
-    sent = pair.server->send(part, false).value();
+    sent = pair.server->send(part).value();
   } while (sent.status == IoStatus::ok);
   EXPECT_EQ(sent.status, IoStatus::end);
-  EXPECT_EQ(pair.server->send(part, false)->status, IoStatus::end);  // no SIGPIPE either
+  EXPECT_EQ(pair.server->send(part)->status, IoStatus::end);  // no SIGPIPE either
   EXPECT_EQ(pair.server->receive(part)->status, IoStatus::end);
 }
 
