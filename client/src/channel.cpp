@@ -19,7 +19,7 @@ using namespace std::chrono_literals;
 constexpr Duration kFirstPause = 10ms;
 constexpr Duration kLongestPause = 1s;
 // How long next() stays with a large sample that has begun to arrive in the caller's memory, before
-// it puts aside what has come: 20 MB at 1 GB/s.
+// it puts aside what has come: 20 MB at 1 GB/s. When nothing more comes, Transport::kReceiveWait.
 constexpr Duration kStayWithSample = 20ms;
 
 // post() looks for acknowledgements once in so many calls.
@@ -508,29 +508,19 @@ Result<void> Channel::unsubscribe() {
 
 [[gnu::hot]] Result<ReadStatus> Channel::take_next(std::span<std::byte> payload, SampleInfo& info) {
   if (!held_) advance(Patience::none);
-  MonoTime stay_until = kNever;
-  for (;;) {
-    const bool received = receive();
+  for (MonoTime stay_until = kNever;;) {
+    // The rest is on its way: to wait for it here saves a copy of all of it.
+    const bool waits = subscriber_->is_filling_target() && may_wait_in_receive();
+    if (waits && stay_until == kNever) stay_until = deadline_in(kStayWithSample);
+    const bool received = waits ? receive_waiting() == wire::IoStatus::ok : receive();
     if (subscriber_->taken(info)) return ReadStatus::ok;
     if (auto kept = subscriber_->take_kept(payload, info)) return *kept;
-    if (received) continue;
-    if (!subscriber_->is_filling_target()) break;
-    // The rest is on its way: to wait for it here saves a copy of all of it.
-    if (stay_until == kNever) stay_until = deadline_in(kStayWithSample);
-    if (!await_more(stay_until)) break;
+    if (!received || (waits && MonoClock::now() >= stay_until)) break;
   }
   if (is_up()) return ReadStatus::not_yet;
   Error error = why_down_ ? *why_down_ : Error{Errc::daemon_away, "the connection is being set up"};
   if (error.code != Errc::not_found) error.code = Errc::daemon_away;
   return std::move(error).context(what("read"));
-}
-
-// Whether something arrives before the deadline, and before a signal.
-bool Channel::await_more(MonoTime deadline) const noexcept {
-  pollfd ready{link_.fd(), POLLIN, 0};
-  const std::int64_t ns = std::max<std::int64_t>(0, to_ns(deadline - MonoClock::now()));
-  const timespec timeout{ns / 1'000'000'000, ns % 1'000'000'000};
-  return ::ppoll(&ready, 1, &timeout, nullptr) > 0;
 }
 
 [[gnu::hot]] WaitStatus Channel::wait(MonoTime deadline) {

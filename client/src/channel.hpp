@@ -104,7 +104,6 @@ class Channel final : private wire::FrameSink {
   void start_publishing();
   bool has_more_to_send() const noexcept;
   Result<ReadStatus> take_next(std::span<std::byte> payload, SampleInfo& info);
-  bool await_more(MonoTime deadline) const noexcept;
 
   Result<void> on_frame(net::Frame& frame) override;
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
