@@ -19,8 +19,10 @@ using namespace std::chrono_literals;
 constexpr Duration kFirstPause = 10ms;
 constexpr Duration kLongestPause = 1s;
 // How long next() stays with a large sample that has begun to arrive in the caller's memory, before
-// it puts aside what has come: 20 MB at 1 GB/s. When nothing more comes, Transport::kReceiveWait.
-constexpr Duration kStayWithSample = 20ms;
+// it puts aside what has come: 10 MB at 1 GB/s. The last wait within that time may end
+// Transport::kReceiveWait after it, which makes the 20 ms that pconnector.hpp tells.
+constexpr Duration kStayWithSample = 10ms;
+static_assert(kStayWithSample + wire::Transport::kReceiveWait <= 20ms);
 
 // post() looks for acknowledgements once in so many calls.
 constexpr unsigned kPostsPerReceive = 32;

@@ -40,7 +40,7 @@ class Transport {
     ::poll(&ready, 1, static_cast<int>(kReceiveWait.count()));
     return receive(spaces);
   }
-  static constexpr std::chrono::milliseconds kReceiveWait{20};
+  static constexpr std::chrono::milliseconds kReceiveWait{10};
 
   // Readable or writable when receive() or send() may go on.
   virtual int fd() const noexcept = 0;
