@@ -66,7 +66,10 @@ void Mirror::on_stream_there() {
   if (state_ == State::removed) channel_.try_again();
 }
 
-void Mirror::on_stream_gone() { ending_ = state_ == State::live; }
+// The channel may be ahead, and the mirror live with the next ring.
+void Mirror::on_stream_gone(std::uint64_t incarnation) {
+  ending_ = state_ == State::live && ring_->stream()->incarnation() == incarnation;
+}
 
 Result<void> Mirror::on_frame(net::Frame& frame) {
   switch (frame.body_case()) {

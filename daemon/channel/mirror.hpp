@@ -63,8 +63,9 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
   OwnerChannel& channel() noexcept { return channel_; }
   // The owner has such a stream, or a new ring of it.
   void on_stream_there();
-  // The owner has removed it. The channel tells so, too, behind the last samples.
-  void on_stream_gone();
+  // The owner has removed the ring of that incarnation. The channel tells so, too, behind the last
+  // samples.
+  void on_stream_gone(std::uint64_t incarnation);
   // What the owner says of its clock; this PC's clock was read anew.
   void on_owner_clock(MirrorClock::Report report);
   void on_clock() { judge(); }

@@ -34,7 +34,7 @@ void Mirrors::on_remote_stream_removed(const KnownHost& host, const StreamInfo& 
   const wire::HostId& owner = host.greeting.host_id;
   if (!catalog_.find(owner)) return;  // it is the host that is gone, and its streams may be there
   Mirror* mirror = table_.find({stream.id.name, stream.id.id, host.greeting.host});
-  if (mirror && mirror->channel().owner() == owner) mirror->on_stream_gone();
+  if (mirror && mirror->channel().owner() == owner) mirror->on_stream_gone(stream.incarnation);
 }
 
 void Mirrors::open(const KnownHost& host, const StreamId& id, Then then) {

@@ -343,6 +343,18 @@ TEST_F(MirrorsTest, LendsNoRingOfAStreamThatTheCatalogKnowsToBeRemoved) {
   EXPECT_EQ(newest(*stream), 6) << "its readers get the last samples";
 }
 
+TEST_F(MirrorsTest, LendsItsRingWhenTheCatalogHearsLateOfTheLastOnesRemoval) {
+  const wire::HostId host_id = owner->host().greeting.host_id;
+  const std::shared_ptr<Stream> stream = opened(5);
+  StreamInfo last = theirs;
+  last.incarnation = theirs.incarnation - 1;
+  catalog.stream_added(host_id, last).value();
+  catalog.stream_removed(host_id, kId);
+  const auto answer = open();
+  ASSERT_TRUE(answer->has_value());
+  EXPECT_EQ((*answer)->value(), stream);
+}
+
 TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
   const std::shared_ptr<Stream> stream = opened(5);
   const KnownHost host = owner->host();
