@@ -129,6 +129,7 @@ void close_unused(const Inherited& inherited, ServiceManager& manager, Logger& l
 
 // read_again: reads the configuration file anew; none: there is no file.
 Result<void> run(const Config& config, const Reloader::Read& read_again, LeveledLogger& logger) {
+  HeldRequests requests;
   raise_descriptor_limit();
   ignore_broken_pipes();
   silence_protobuf();
@@ -241,6 +242,7 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
     manager.ready(status.now());
   });
   if (read_again) reload.enable();
+  requests.deliver();
   if (config.insecure) {
     logger.warning(
         "insecure = true: samples cross the network in the clear, and whoever reaches this host "

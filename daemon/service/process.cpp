@@ -3,7 +3,6 @@
 
 #include <google/protobuf/stubs/logging.h>
 #include <malloc.h>
-#include <signal.h>
 #include <sys/resource.h>
 
 namespace dssm::daemon {
@@ -25,5 +24,14 @@ void return_large_memory() noexcept {
   ::mallopt(M_MMAP_THRESHOLD, 4 << 20);
   ::mallopt(M_TRIM_THRESHOLD, 8 << 20);
 }
+
+HeldRequests::HeldRequests() noexcept {
+  sigset_t requests;
+  ::sigemptyset(&requests);
+  for (const int number : {SIGINT, SIGTERM, SIGHUP}) ::sigaddset(&requests, number);
+  ::pthread_sigmask(SIG_BLOCK, &requests, &before_);
+}
+
+void HeldRequests::deliver() noexcept { ::pthread_sigmask(SIG_SETMASK, &before_, nullptr); }
 
 }  // namespace dssm::daemon

@@ -170,8 +170,21 @@ int open_notify_socket(std::string& name) {
   ::_exit(kCannotStart);
 }
 
-// Until dssmd ends: tells when it is ready and passes on requests to stop. Its wait status.
-int attend(pid_t dssmd, int signals_fd, int notify_fd, const Options& options) {
+struct End {
+  int wait_status;
+  bool asked_to_stop;
+
+  // Before it can take a request to stop, a signal just ends it.
+  bool as_asked() const {
+    return (WIFEXITED(wait_status) && WEXITSTATUS(wait_status) == 0) ||
+           (asked_to_stop && WIFSIGNALED(wait_status) &&
+            (WTERMSIG(wait_status) == SIGTERM || WTERMSIG(wait_status) == SIGINT));
+  }
+};
+
+// Until dssmd ends: tells when it is ready and passes on requests to stop.
+End attend(pid_t dssmd, int signals_fd, int notify_fd, const Options& options) {
+  bool asked_to_stop = false;
   for (;;) {
     pollfd ready[] = {{signals_fd, POLLIN, 0}, {notify_fd, POLLIN, 0}};
     if (::poll(ready, 2, -1) < 0) continue;
@@ -189,10 +202,11 @@ int attend(pid_t dssmd, int signals_fd, int notify_fd, const Options& options) {
     if (signal.ssi_signo != SIGCHLD) {
       if (!options.quiet) std::printf("\nprogram stop [%u]\n", signal.ssi_signo);
       ::kill(dssmd, SIGTERM);
+      asked_to_stop = true;
       continue;
     }
     int status = 0;
-    if (::waitpid(dssmd, &status, WNOHANG) == dssmd) return status;
+    if (::waitpid(dssmd, &status, WNOHANG) == dssmd) return {status, asked_to_stop};
   }
 }
 
@@ -231,8 +245,9 @@ int main(int argc, char** argv) {
   }
   if (dssmd == 0) become_dssmd(options, *folder, notify_name, self, before);
 
-  const int status = attend(dssmd, signals_fd, notify_fd, options);
-  if (!WIFEXITED(status) || WEXITSTATUS(status) != 0) {
+  const End end = attend(dssmd, signals_fd, notify_fd, options);
+  if (!end.as_asked()) {
+    const int status = end.wait_status;
     std::fprintf(stderr, "ERROR : dssmd ended with %s %d; its own words are above\n",
                  WIFEXITED(status) ? "status" : "signal",
                  WIFEXITED(status) ? WEXITSTATUS(status) : WTERMSIG(status));

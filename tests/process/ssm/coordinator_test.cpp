@@ -8,6 +8,7 @@
 #include <unistd.h>
 
 #include <cstdlib>
+#include <filesystem>
 #include <fstream>
 #include <sstream>
 
@@ -24,8 +25,9 @@ const std::string& coordinator() {
 // A running coordinator in a folder of its own.
 class Coordinator {
  public:
-  explicit Coordinator(std::vector<std::string> options = {}) {
-    std::vector<std::string> command = {coordinator()};
+  explicit Coordinator(std::vector<std::string> options = {},
+                       const std::string& program = coordinator()) {
+    std::vector<std::string> command = {program};
     command.insert(command.end(), options.begin(), options.end());
     int out[2];
     if (::pipe2(out, O_CLOEXEC)) std::abort();
@@ -131,6 +133,20 @@ TEST(SsmCoordinator, SaysThatOneIsRunningAlready) {
   EXPECT_NE(second.err.find(running.folder), std::string::npos) << second.err;
   EXPECT_EQ(running.signal_and_wait(SIGINT), 0);
   EXPECT_EQ(running.read_until("anything"), "");
+}
+
+// A dssmd that has not come to its own handlers yet ends by the signal.
+TEST(SsmCoordinator, EndsWellWhenItIsStoppedBeforeItsDssmdIsReady) {
+  const std::string programs = make_temp_dir();
+  std::filesystem::copy(coordinator(), programs);
+  std::ofstream(programs + "/dssmd") << "#!/bin/sh\necho started\nexec sleep 1000\n";
+  std::filesystem::permissions(programs + "/dssmd", std::filesystem::perms::owner_all);
+  for (const int signal : {SIGINT, SIGTERM, SIGHUP}) {
+    Coordinator running({}, programs + "/ssm-coordinator");
+    ASSERT_NE(running.read_until("started").find("started"), std::string::npos);
+    EXPECT_EQ(running.signal_and_wait(signal), 0);
+  }
+  remove_tree(programs);
 }
 
 TEST(SsmCoordinator, IsFoundByItsName) {
