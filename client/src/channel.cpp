@@ -62,7 +62,8 @@ Channel::Channel(Goal goal, PConnectorOptions options)
     : goal_(std::move(goal)),
       options_(std::move(options)),
       owner_pid_(::getpid()),
-      link_(*this, options_.program.empty() ? default_program() : options_.program),
+      link_(*this, options_.program.empty() ? default_program() : options_.program,
+            options_.request_timeout),
       publisher_(wire::random_number()) {}
 
 Result<std::unique_ptr<Channel>> Channel::open(Goal goal, PConnectorOptions options) {
@@ -77,7 +78,7 @@ Result<std::unique_ptr<Channel>> Channel::open(Goal goal, PConnectorOptions opti
   static_cast<void>(channel->run(deadline_in(channel->options_.request_timeout), false, tried));
   if (channel->is_up()) return channel;
   if (channel->why_down_) return *channel->why_down_;
-  return Error{Errc::daemon_away, "dssmd at '" + channel->host_->str() + "' does not answer"};
+  return channel->link_.silence();
 }
 
 Channel::~Channel() {
@@ -159,8 +160,8 @@ void Channel::went_down(Error why) {
     if (!link_.is_up()) return;
   }
   if (!set_up_sent_) set_up();
-  if (set_up_deadline_ != kNever && MonoClock::now() >= set_up_deadline_) {
-    return went_down(Error{Errc::daemon_away, "dssmd at '" + address() + "' does not answer"});
+  if (set_up_deadline_ != kNever && MonoClock::now() >= set_up_deadline_ && !link_.has_arrived()) {
+    return went_down(link_.silence());
   }
   if (Result<void> sent = send_all(); !sent) went_down(std::move(sent).error());
 }

@@ -40,8 +40,11 @@ void add(wire::DecoderCounters& sum, const wire::DecoderCounters& more) noexcept
 
 }  // namespace
 
-NetworkLink::NetworkLink(wire::FrameSink& user, std::string program)
-    : user_(user), program_(std::move(program)), life_(wire::random_number()) {}
+NetworkLink::NetworkLink(wire::FrameSink& user, std::string program, Duration patience)
+    : user_(user),
+      program_(std::move(program)),
+      patience_(std::max(patience, wire::kHelloTimeout)),
+      life_(wire::random_number()) {}
 
 void NetworkLink::start(std::vector<wire::SocketAddress> addresses) {
   close();
@@ -108,7 +111,7 @@ Result<void> NetworkLink::greet() {
   net::Frame frame;
   wire::to_message(self, *frame.mutable_hello());
   phase_ = Phase::greeting;
-  step_deadline_ = deadline_in(wire::kHelloTimeout);
+  step_deadline_ = deadline_in(patience_);
   queue(frame);
   return send_queued();
 }
@@ -130,16 +133,34 @@ Result<void> NetworkLink::greet() {
     if (MonoClock::now() < step_deadline_) return {};
     connecting_.reset();
     if (next_address_ < addresses_.size()) return connect_next();
-    return down(Error{Errc::no_daemon,
-                      "connect to '" + address_ +
-                          "': no answer; is that PC on, and do both reach each other (`ping`)?"});
+    return down(silence());
   }
   if (has_queued()) {
     if (Result<void> sent = send_queued(); !sent) return sent;
   }
-  if (MonoClock::now() < step_deadline_) return {};
-  return down(
-      Error{Errc::protocol, "what listens at '" + address_ + "' does not greet; is it a dssmd?"});
+  if (MonoClock::now() < step_deadline_ || has_arrived()) return {};
+  return down(silence());
+}
+
+Error NetworkLink::silence() const {
+  switch (phase_) {
+    case Phase::connecting:
+      return {Errc::no_daemon,
+              "connect to '" + address_ +
+                  "': no answer; is that PC on, and do both reach each other (`ping`)?"};
+    case Phase::greeting:
+      return {Errc::daemon_away,
+              "what listens at '" + address_ + "' does not greet; is it a dssmd?"};
+    case Phase::down:
+    case Phase::up:
+      break;
+  }
+  return {Errc::daemon_away, "dssmd at '" + address_ + "' does not answer"};
+}
+
+bool NetworkLink::has_arrived() const noexcept {
+  pollfd ready{fd(), POLLIN, 0};
+  return ::poll(&ready, 1, 0) > 0;
 }
 
 // --- frames

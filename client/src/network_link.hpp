@@ -25,8 +25,9 @@ namespace dssm::detail {
 // A resource with one owner; one thread.
 class NetworkLink final : private wire::FrameSink {
  public:
-  // What arrives after the greeting goes to `user`, from within receive() and resume().
-  NetworkLink(wire::FrameSink& user, std::string program);
+  // What arrives after the greeting goes to `user`, from within receive() and resume(). A dssmd
+  // that is very busy may greet late: it is given `patience`, kHelloTimeout at least.
+  NetworkLink(wire::FrameSink& user, std::string program, Duration patience);
   NetworkLink(const NetworkLink&) = delete;
   NetworkLink& operator=(const NetworkLink&) = delete;
 
@@ -41,6 +42,8 @@ class NetworkLink final : private wire::FrameSink {
   // Takes the steps of connecting and greeting that can be taken now.
   //   fails  when no address is left (the last one's error), or the greeting failed
   Result<void> advance();
+  // What it has waited for in vain, for who gives up waiting.
+  Error silence() const;
 
   // --- once up --------------------------------------------------------------------------------
 
@@ -68,6 +71,10 @@ class NetworkLink final : private wire::FrameSink {
   // Of this connection and all before it.
   wire::DecoderCounters counters() const noexcept;
 
+  // Whether there is something to receive. Asked before a silence is judged: after a stall of this
+  // program, what it waits for may have been there for long.
+  bool has_arrived() const noexcept;
+
   // --- waiting --------------------------------------------------------------------------------
 
   int fd() const noexcept;  // -1 while down
@@ -92,6 +99,7 @@ class NetworkLink final : private wire::FrameSink {
 
   wire::FrameSink& user_;
   const std::string program_;
+  const Duration patience_;
   const std::uint64_t life_;
 
   Phase phase_ = Phase::down;

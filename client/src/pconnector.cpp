@@ -46,7 +46,8 @@ Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
   auto addresses = find_host(host);
   if (!addresses) return std::move(addresses).error();
   ListSink sink;
-  NetworkLink link(sink, options.program.empty() ? default_program() : options.program);
+  NetworkLink link(sink, options.program.empty() ? default_program() : options.program,
+                   options.request_timeout);
   link.start(std::move(*addresses));
   for (bool asked = false; !sink.streams;) {
     if (Result<void> done = link.advance(); !done) return std::move(done).error();
@@ -61,15 +62,15 @@ Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
       if (Result<void> sent = link.send_queued(); !sent) return std::move(sent).error();
     }
     const MonoTime now = MonoClock::now();
-    if (now >= deadline) {
-      return Error{Errc::daemon_away, "dssmd at '" + link.address() + "' does not answer"};
-    }
     const std::int64_t ns =
         std::max<std::int64_t>(0, to_ns(std::min(deadline, link.next_step()) - now));
     const timespec timeout{ns / 1'000'000'000, ns % 1'000'000'000};
     pollfd ready{link.fd(), link.events(false), 0};
-    if (::ppoll(&ready, 1, &timeout, nullptr) <= 0) continue;
-    if (auto received = link.receive(); !received) return std::move(received).error();
+    if (::ppoll(&ready, 1, &timeout, nullptr) > 0) {
+      if (auto received = link.receive(); !received) return std::move(received).error();
+    }
+    // After what has arrived was looked at: this program may have been stalled.
+    if (now >= deadline && !sink.streams) return link.silence();
   }
   return std::move(*sink.streams);
 }

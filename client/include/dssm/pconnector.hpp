@@ -47,6 +47,7 @@ struct PConnectorOptions {
   // look up a name may take seconds, whatever request_timeout says.
   std::string address = {};
   std::string program = {};  // shown on the other side; empty: this program's name
+  // How long a call waits for dssmd, to greet and to answer.
   Duration request_timeout = std::chrono::seconds(5);
   // Samples that post() keeps until the owner says that they are written, beyond which the oldest
   // are dropped and counted.
@@ -72,8 +73,8 @@ class PConnector {
  public:
   // Connects and opens an existing stream. With `wanted`, fails with type_mismatch unless
   // TypeInfo::check_usable_as(wanted).
-  //   fails  no_daemon (nobody listens there), not_found, type_mismatch, protocol, daemon_away,
-  //          invalid_argument (address)
+  //   fails  no_daemon (nobody listens or answers there), not_found, type_mismatch, protocol,
+  //          daemon_away, invalid_argument (address)
   static Result<PConnector> open(const StreamId& id, PConnectorOptions options = {},
                                  const TypeInfo* wanted = nullptr);
   // The same, creating the stream there when it does not exist.

@@ -11,6 +11,7 @@
 #include <future>
 #include <thread>
 
+#include "core/wire/network_protocol.hpp"
 #include "core/wire/sample_frame.hpp"
 #include "core/wire/tcp.hpp"
 #include "tests/process/pconnector/fake_daemon.hpp"
@@ -27,7 +28,7 @@ std::string text_of(std::int64_t tid) {
   return std::string(8 - text.size(), '0') + text;
 }
 
-struct Sample {
+struct TakenSample {
   std::string bytes = std::string(8, '?');
   SampleInfo info;
   std::span<std::byte> span() { return std::as_writable_bytes(std::span(bytes)); }
@@ -38,7 +39,7 @@ Result<PConnector> open(const FakeDaemon& daemon, const TypeInfo* wanted = nullp
 }
 
 void expect_sample(PConnector& con, std::int64_t tid) {
-  Sample sample;
+  TakenSample sample;
   for (;;) {
     const WaitStatus waited = con.wait(kNever);
     ASSERT_EQ(waited, WaitStatus::ready);
@@ -191,7 +192,18 @@ TEST(PConnectorOpen, ASilentDssmdCostsTheRequestTimeout) {
   const auto con =
       PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 200ms});
   ASSERT_FALSE(con);
-  expect_words(con.error(), Errc::daemon_away, {daemon.address(), "does not answer"});
+  expect_words(con.error(), Errc::daemon_away, {daemon.address(), "does not greet"});
+}
+
+TEST(PConnectorOpen, GivesABusyDssmdTheRequestTimeoutToGreet) {
+  const FakeDaemon daemon([](FakePeer& peer, int) {
+    std::this_thread::sleep_for(wire::kHelloTimeout + 100ms);
+    peer.open(8);
+    peer.wait_for_end();
+  });
+  const auto con =
+      PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 60s});
+  EXPECT_TRUE(con) << con.error().message;
 }
 
 // --- requests ----------------------------------------------------------------------------------
@@ -216,7 +228,7 @@ TEST(PConnectorRequest, IsAskedAgainOnANewConnection) {
     answer_reads(peer);
   });
   auto con = open(daemon).value();
-  Sample sample;
+  TakenSample sample;
   ASSERT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
   EXPECT_EQ(sample.info.tid, 5);
   EXPECT_EQ(sample.bytes, text_of(5));
@@ -235,7 +247,7 @@ TEST(PConnectorRequest, FailsAtOnceWhenTheAnswerIsGarbageAndTheNextOneWorks) {
     answer_reads(peer);
   });
   auto con = open(daemon).value();
-  Sample sample;
+  TakenSample sample;
   const auto bad = con.latest(sample.span(), sample.info);
   ASSERT_FALSE(bad);
   expect_words(bad.error(), Errc::protocol, {"lidar"});
@@ -251,7 +263,7 @@ TEST(PConnectorRequest, RefusesSamplesOfAnotherSize) {
     peer.wait_for_end();
   });
   auto con = open(daemon).value();
-  Sample sample;
+  TakenSample sample;
   const auto bad = con.latest(sample.span(), sample.info);
   ASSERT_FALSE(bad);
   expect_words(bad.error(), Errc::protocol, {"9"});
@@ -267,7 +279,7 @@ TEST(PConnectorRequest, AsksAgainForATornSample) {
     peer.wait_for_end();
   });
   auto con = open(daemon).value();
-  Sample sample;
+  TakenSample sample;
   ASSERT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
   EXPECT_EQ(sample.info.tid, 5);
 }
@@ -279,7 +291,7 @@ TEST(PConnectorRequest, TellsDaemonAwayWhenItStaysAway) {
           .value();
   const std::string address = daemon->address();
   daemon.reset();
-  Sample sample;
+  TakenSample sample;
   const auto away = con.latest(sample.span(), sample.info);
   ASSERT_FALSE(away);
   expect_words(away.error(), Errc::daemon_away, {"lidar", address});
@@ -297,7 +309,7 @@ TEST(PConnectorRequest, TellsOnceThatTheStreamBeganAnew) {
     answer_reads(peer);
   });
   auto con = open(daemon).value();
-  Sample sample;
+  TakenSample sample;
   ASSERT_EQ(con.tid(5, sample.span(), sample.info).value(), ReadStatus::ok);
   EXPECT_EQ(con.tid(5, sample.span(), sample.info).value(), ReadStatus::restarted);
   EXPECT_EQ(con.restarts(), 1u);
@@ -315,7 +327,7 @@ TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
     peer.wait_for_end();
   });
   auto con = open(daemon).value();
-  Sample sample;
+  TakenSample sample;
   const auto bad = con.latest(sample.span(), sample.info);
   ASSERT_FALSE(bad);
   expect_words(bad.error(), Errc::type_mismatch, {"anew", "8 bytes", "9 bytes"});
@@ -334,7 +346,7 @@ TEST(PConnectorRequest, AWaitForAStreamThatCannotBeUsedAnyMoreIsNoLoop) {
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
-  Sample sample;
+  TakenSample sample;
   for (int i = 0; i < 5; ++i) {
     const int before = connections;
     ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
@@ -379,7 +391,7 @@ TEST(PConnectorSubscription, ComesInOrderHoweverTheBytesCome) {
     auto con = open(daemon).value();
     ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
     for (std::int64_t tid = 0; tid < 20; ++tid) expect_sample(con, tid);
-    Sample sample;
+    TakenSample sample;
     EXPECT_EQ(con.next(sample.span(), sample.info).value(), ReadStatus::not_yet);
     EXPECT_EQ(con.lost(), 0u);
   }
@@ -388,7 +400,7 @@ TEST(PConnectorSubscription, ComesInOrderHoweverTheBytesCome) {
 TEST(PConnectorSubscription, NeedsOne) {
   const FakeDaemon daemon([](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
   auto con = open(daemon).value();
-  Sample sample;
+  TakenSample sample;
   const auto none = con.next(sample.span(), sample.info);
   ASSERT_FALSE(none);
   expect_words(none.error(), Errc::invalid_argument, {"subscribe"});
@@ -410,7 +422,7 @@ TEST(PConnectorSubscription, KeepsWhatComesWhileARequestWaits) {
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
   expect_sample(con, 0);
-  Sample sample;
+  TakenSample sample;
   ASSERT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
   EXPECT_EQ(sample.info.tid, 5);
   for (std::int64_t tid = 1; tid < 7; ++tid) expect_sample(con, tid);
@@ -454,7 +466,7 @@ TEST(PConnectorSubscription, TellsOfANewRingBetweenItsSamplesAndThoseOfTheOld) {
   ASSERT_TRUE(con.subscribe({}));
   expect_sample(con, 8);
   ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
-  Sample sample;
+  TakenSample sample;
   EXPECT_EQ(con.next(sample.span(), sample.info).value(), ReadStatus::restarted);
   expect_sample(con, 0);
   EXPECT_EQ(con.lost(), 0u);
@@ -472,7 +484,7 @@ TEST(PConnectorSubscription, TellsWhenTheConnectionIsDownWithoutWaiting) {
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
-  Sample sample;
+  TakenSample sample;
   for (;;) {
     const auto status = con.next(sample.span(), sample.info);
     if (!status) {
@@ -507,7 +519,7 @@ TEST(PConnectorSubscription, SaysThatTheStreamWasRemovedAndGoesOnWhenItIsBack) {
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
-  Sample sample;
+  TakenSample sample;
   for (;;) {
     const auto status = con.next(sample.span(), sample.info);
     if (status) {
@@ -537,7 +549,7 @@ TEST(PConnectorSubscription, PassesOnWhyItIsRefused) {
   const auto refused = con.subscribe({});
   ASSERT_FALSE(refused);
   expect_words(refused.error(), Errc::no_permission, {"lidar", "not for you"});
-  Sample sample;
+  TakenSample sample;
   EXPECT_FALSE(con.next(sample.span(), sample.info));
   EXPECT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok)
       << "the connection is still good";
@@ -583,7 +595,7 @@ TEST(PConnectorSubscription, ItsDescriptorStandsForTheConnectionAndForTheNextAtt
   ASSERT_TRUE(con.subscribe({}));
   for (const std::int64_t tid : {0, 2}) {
     for (;;) {
-      Sample sample;
+      TakenSample sample;
       const auto status = con.next(sample.span(), sample.info);
       if (status && *status == ReadStatus::ok) {
         EXPECT_EQ(sample.info.tid, tid);
@@ -602,11 +614,14 @@ constexpr std::size_t kLargeBytes = 3 << 20;
 
 std::string large(char fill) { return std::string(kLargeBytes, fill); }
 
+// What comes while the client still waits to hear that it is subscribed has no place of the
+// caller's to go to.
 TEST(PConnectorLargeSamples, ArePutAsideWhenTheRestDoesNotCome) {
-  std::promise<void> go_on;
+  std::promise<void> subscribed, go_on;
   const FakeDaemon daemon([&](FakePeer& peer, int) {
     peer.open(kLargeBytes);
     peer.subscribe(0);
+    subscribed.get_future().wait();
     net::Frame frame;
     frame.mutable_sample()->set_tid(0);
     frame.set_payload(large('a'));
@@ -618,6 +633,7 @@ TEST(PConnectorLargeSamples, ArePutAsideWhenTheRestDoesNotCome) {
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
+  subscribed.set_value();
   ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
   std::string first(kLargeBytes, '?'), second(kLargeBytes, '?');
   SampleInfo info;
@@ -634,9 +650,11 @@ TEST(PConnectorLargeSamples, ArePutAsideWhenTheRestDoesNotCome) {
 }
 
 TEST(PConnectorLargeSamples, AreReceivedWhereTheyAreWanted) {
+  std::promise<void> subscribed;
   const FakeDaemon daemon([&](FakePeer& peer, int) {
     peer.open(kLargeBytes);
     peer.subscribe(0);
+    subscribed.get_future().wait();
     for (std::int64_t tid = 0; tid < 20; ++tid) {
       peer.send_sample(tid, large(static_cast<char>('a' + tid)));
     }
@@ -646,13 +664,18 @@ TEST(PConnectorLargeSamples, AreReceivedWhereTheyAreWanted) {
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
+  subscribed.set_value();
   std::string sample(kLargeBytes, '?');
   const auto span = std::as_writable_bytes(std::span(sample));
   SampleInfo info;
+  std::uint64_t stalls = 0;  // of a busy machine: what had come is put aside
   for (std::int64_t tid = 0; tid < 20;) {
     ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
     const ReadStatus status = con.next(span, info).value();
-    if (status == ReadStatus::not_yet) continue;
+    if (status == ReadStatus::not_yet) {
+      ++stalls;
+      continue;
+    }
     ASSERT_EQ(status, ReadStatus::ok);
     ASSERT_EQ(info.tid, tid);
     ASSERT_EQ(sample, large(static_cast<char>('a' + tid)));
@@ -662,8 +685,9 @@ TEST(PConnectorLargeSamples, AreReceivedWhereTheyAreWanted) {
   EXPECT_EQ(sample, large('!'));
   const auto counters = con.counters();
   EXPECT_EQ(counters.samples, 21u);
-  EXPECT_GT(counters.direct_payload_bytes, 21 * kLargeBytes * 9 / 10);
-  EXPECT_LE(counters.direct_payload_bytes + counters.copied_payload_bytes, 21 * kLargeBytes);
+  EXPECT_GT(counters.direct_payload_bytes + stalls * kLargeBytes, 21 * kLargeBytes * 9 / 10);
+  EXPECT_LE(counters.direct_payload_bytes + counters.copied_payload_bytes,
+            (21 + 2 * stalls) * kLargeBytes);
 }
 
 TEST(PConnectorLargeSamples, OneThatWasCutComesAnew) {
