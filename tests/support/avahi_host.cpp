@@ -3,11 +3,14 @@
 
 #include <fcntl.h>
 #include <signal.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cstdio>
 #include <cstdlib>
 #include <fstream>
+#include <sstream>
 #include <utility>
 
 #include "tests/support/daemon_process.hpp"
@@ -77,6 +80,26 @@ AvahiHost::~AvahiHost() {
 
 std::string AvahiHost::environment() const {
   return "DBUS_SYSTEM_BUS_ADDRESS=unix:path=" + dir_ + "/bus";
+}
+
+std::string AvahiHost::account() const {
+  std::string text = "avahi-daemon ";
+  siginfo_t end{};
+  if (avahi_ <= 0) {
+    text += "does not run";
+  } else if (::waitid(P_PID, static_cast<id_t>(avahi_), &end, WEXITED | WNOHANG | WNOWAIT) == 0 &&
+             end.si_pid == avahi_) {
+    text += (end.si_code == CLD_EXITED ? "has ended with status " : "was ended by signal ") +
+            std::to_string(end.si_status);
+  } else {
+    text += "runs";
+  }
+  std::ifstream log(dir_ + "/avahi.log");
+  std::stringstream words;
+  words << log.rdbuf();
+  constexpr std::size_t kEnough = 4096;
+  const std::string said = words.str();
+  return text + "; it said:\n" + said.substr(said.size() - std::min(said.size(), kEnough));
 }
 
 void AvahiHost::start_dbus() {

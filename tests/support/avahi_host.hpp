@@ -35,6 +35,8 @@ class AvahiHost {
   void pause_avahi();  // SIGSTOP; kill_avahi() ends that, too
 
   pid_t avahi_pid() const noexcept { return avahi_; }  // -1: does not run
+  // How the Avahi daemon is, and its last words: for a test that fails.
+  std::string account() const;
   // For programs of this PC: "DBUS_SYSTEM_BUS_ADDRESS=...".
   std::string environment() const;
   Inside inside() const { return network_.inside(host_); }

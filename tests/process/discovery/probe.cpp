@@ -26,7 +26,8 @@ constexpr auto kFarTooLong = std::chrono::seconds(60);
 
 }  // namespace
 
-Probe::Probe(const AvahiHost& pc, int id, const std::string& name, std::vector<std::string> extra) {
+Probe::Probe(const AvahiHost& pc, int id, const std::string& name, std::vector<std::string> extra)
+    : pc_(pc) {
   int in[2], out[2];
   if (::pipe2(in, O_CLOEXEC) != 0 || ::pipe2(out, O_CLOEXEC) != 0) std::abort();
   commands_.reset(in[1]);
@@ -98,6 +99,7 @@ bool Probe::until(const std::function<bool()>& so) {
     if (left.count() > 0 && read_line(static_cast<int>(left.count()))) continue;
     std::fprintf(stderr, "what it printed:\n");
     for (const std::string& line : lines_) std::fprintf(stderr, "  %s\n", line.c_str());
+    std::fprintf(stderr, "%s\n", pc_.account().c_str());
     return false;
   }
   return true;

@@ -18,7 +18,8 @@ namespace dssm::test {
 class Probe {
  public:
   // A host `name` whose id is made of the byte `id`.
-  Probe(const AvahiHost& pc, int id, const std::string& name, std::vector<std::string> extra = {});
+  Probe(const AvahiHost& pc, int id, const std::string& name,
+        std::vector<std::string> extra = {});  // `pc` has to outlive it
   Probe(const Probe&) = delete;
   Probe& operator=(const Probe&) = delete;
   ~Probe();
@@ -31,7 +32,7 @@ class Probe {
 
   // Reads what it prints until that is so.
   //   returns  false: not within a time that is far beyond all that may be expected; says what it
-  //            has printed
+  //            has printed, and how the Avahi daemon is
   bool until(const std::function<bool()>& so);
   // The newest state contains all of these words.
   bool until_state(const std::vector<std::string>& words);
@@ -50,6 +51,7 @@ class Probe {
  private:
   bool read_line(int timeout_ms);
 
+  const AvahiHost& pc_;
   UniqueFd commands_, output_;
   pid_t pid_ = -1;
   std::string input_;
