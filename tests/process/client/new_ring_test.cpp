@@ -11,6 +11,7 @@
 #include "tests/process/client/relay.hpp"
 #include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm {
 namespace {
@@ -20,10 +21,6 @@ using test::await;
 using test::DaemonProcess;
 
 const StreamId kId{"anew", 0, ""};
-
-Session connect(const DaemonProcess& daemon) {
-  return Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 60s}).value();
-}
 
 // Removes the stream and creates it again.
 Writer<double> create_anew(Session& session) {

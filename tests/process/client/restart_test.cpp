@@ -13,6 +13,7 @@
 
 #include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm {
 namespace {
@@ -31,10 +32,6 @@ Counted counted(std::int64_t number) {
   Counted sample{number, {}};
   for (auto& word : sample.again) word = number;
   return sample;
-}
-
-Session connect(const DaemonProcess& daemon) {
-  return Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 60s}).value();
 }
 
 TEST(Restart, LosesNoSampleWhenTheDaemonIsKilledUnderLoad) {

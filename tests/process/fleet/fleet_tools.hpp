@@ -12,14 +12,9 @@
 
 #include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm::test {
-
-inline Session connect(const DaemonProcess& daemon) {
-  return Session::connect(
-             {.socket_path = daemon.socket_path(), .request_timeout = std::chrono::seconds(60)})
-      .value();
-}
 
 // What `session`'s dssmd says about the peer at `address`.
 inline HostInfo peer_at(Session& session, const std::string& address) {

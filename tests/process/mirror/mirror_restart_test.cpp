@@ -13,8 +13,6 @@
 namespace dssm::test {
 namespace {
 
-constexpr History kLong{1 << 16, 1ms};  // of which nobody has to lose anything
-
 TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonIsKilledUnderLoad) {
   auto writer = here.create<Counted>("load", kLong).value();
   auto reader = open_filled<Counted>(there, "load");

@@ -9,8 +9,6 @@
 namespace dssm::test {
 namespace {
 
-constexpr History kLong{1 << 16, 1ms};
-
 // pc2 writes, pc1 owns and reads.
 using RemoteWriter = TwoHosts;
 

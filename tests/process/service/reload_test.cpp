@@ -12,17 +12,12 @@
 #include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/service_manager.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm::test {
 namespace {
 
 using namespace std::chrono_literals;
-
-constexpr History kShort{16, 1ms};
-
-Session connect_to(const std::string& socket_path) {
-  return Session::connect({.socket_path = socket_path, .request_timeout = 60s}).value();
-}
 
 // A configuration file that can be changed.
 class ConfigurationFile {

@@ -12,6 +12,7 @@
 
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/service_manager.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm::test {
 namespace {
@@ -30,10 +31,6 @@ Numbered numbered(std::int64_t number) {
   Numbered sample{number, {}};
   for (auto& word : sample.again) word = number;
   return sample;
-}
-
-Session connect_to(const std::string& socket_path) {
-  return Session::connect({.socket_path = socket_path, .request_timeout = 60s}).value();
 }
 
 std::string stream_name(int number) { return "load" + std::to_string(number); }

@@ -18,13 +18,12 @@
 #include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/service_manager.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm::test {
 namespace {
 
 using namespace std::chrono_literals;
-
-constexpr History kShort{16, 1ms};
 
 // A listening socket of 127.0.0.1, or of [::], which takes IPv4 along as systemd's do.
 struct ListeningSocket {
@@ -60,8 +59,7 @@ bool exists(const std::string& path) {
 
 // Until `pc2` has a connection to pc1.
 void await_pc1(const DaemonProcess& pc2) {
-  auto session =
-      Session::connect({.socket_path = pc2.socket_path(), .request_timeout = 60s}).value();
+  Session session = connect(pc2);
   await_up(session, "pc1");
 }
 
@@ -70,8 +68,7 @@ TEST(Sockets, LetProgramsWaitWhileNoDaemonRuns) {
   ASSERT_EQ(manager.stop(), 0);
   EXPECT_TRUE(exists(manager.socket_path())) << "it is not dssmd's to take away";
   auto created = std::async(std::launch::async, [&] {
-    auto session =
-        Session::connect({.socket_path = manager.socket_path(), .request_timeout = 60s}).value();
+    Session session = connect_to(manager.socket_path());
     return session.create<int>("early", kShort).has_value();
   });
   // It is in the queue of the socket by now, or will be: both have to work.
@@ -83,8 +80,7 @@ TEST(Sockets, LetProgramsWaitWhileNoDaemonRuns) {
 
 TEST(Sockets, LetOtherHostsWaitWhileDaemonIsStartedAnew) {
   ServiceManager manager;
-  auto session =
-      Session::connect({.socket_path = manager.socket_path(), .request_timeout = 60s}).value();
+  Session session = connect_to(manager.socket_path());
   auto writer = session.create<int>("s", kShort).value();
   const std::string address = manager.address();
   const auto port = static_cast<std::uint16_t>(std::stoi(address.substr(address.rfind(':') + 1)));

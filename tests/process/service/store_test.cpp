@@ -13,20 +13,16 @@
 #include <dssm/dssm.hpp>
 
 #include "tests/support/service_manager.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm::test {
 namespace {
 
 using namespace std::chrono_literals;
 
-constexpr History kShort{16, 1ms};
 constexpr std::size_t kPerStream = 4;  // ring, bell, meta, doorbell
 
 ServiceManager::Options without_network() { return {.arguments = {"--listen", ""}}; }
-
-Session connect_to(const ServiceManager& manager) {
-  return Session::connect({.socket_path = manager.socket_path(), .request_timeout = 60s}).value();
-}
 
 std::vector<std::string> stream_names(Session& session) {
   std::vector<std::string> names;
@@ -40,7 +36,7 @@ UniqueFd fake_ring() {
 
 TEST(DescriptorStore, HoldsFourDescriptorsOfAStreamUntilItIsRemoved) {
   ServiceManager manager(without_network());
-  Session session = connect_to(manager);
+  Session session = connect_to(manager.socket_path());
   for (const char* name : {"a", "b", "c"}) session.create<int>(name, kShort).value();
   EXPECT_EQ(manager.stored_descriptors(), 3 * kPerStream);
   EXPECT_EQ(manager.stored().size(), 3u) << "a name for each stream";
@@ -72,16 +68,16 @@ TEST(DescriptorStore, HoldsTheListeningSocketOnceOverManyRestarts) {
 
 TEST(DescriptorStore, HoldsThePlaybackClock) {
   ServiceManager manager(without_network());
-  ASSERT_TRUE(connect_to(manager).playback_clock());
+  ASSERT_TRUE(connect_to(manager.socket_path()).playback_clock());
   EXPECT_EQ(manager.stored_descriptors(), 1u);
   manager.restart();
-  ASSERT_TRUE(connect_to(manager).playback_clock());
+  ASSERT_TRUE(connect_to(manager.socket_path()).playback_clock());
   EXPECT_EQ(manager.stored_descriptors(), 1u);
 }
 
 TEST(DescriptorStore, DropsWhatIsNotInOrderAndKeepsTheRest) {
   ServiceManager manager(without_network());
-  Session session = connect_to(manager);
+  Session session = connect_to(manager.socket_path());
   auto writer = session.create<int>("good", kShort).value();
   manager.kill_hard();
   manager.put_into_store("null", UniqueFd(::open("/dev/null", O_RDWR | O_CLOEXEC)));
@@ -101,21 +97,21 @@ TEST(DescriptorStore, DropsWhatIsNotInOrderAndKeepsTheRest) {
 // A stream whose entry is broken comes back from the program that holds it.
 TEST(DescriptorStore, LetsProgramsGiveBackWhatTheStoreLost) {
   ServiceManager manager({.arguments = {"--listen", ""}, .store_max = kPerStream + 2});
-  Session session = connect_to(manager);
+  Session session = connect_to(manager.socket_path());
   auto first = session.create<int>("first", kShort).value();
   auto second = session.create<int>("second", kShort).value();
   EXPECT_EQ(manager.stored_descriptors(), kPerStream + 2) << "the second one is there by half";
   manager.kill_hard();
   manager.start();
   // Held back until the program that holds it is here, although another one is quicker.
-  Session eager = connect_to(manager);
+  Session eager = connect_to(manager.socket_path());
   EXPECT_EQ(eager.create<int>("second", kShort).value().incarnation(), second.incarnation());
   EXPECT_EQ(eager.create<int>("first", kShort).value().incarnation(), first.incarnation());
 }
 
 TEST(DescriptorStore, DoesNotBringARemovedStreamBack) {
   ServiceManager manager(without_network());
-  Session session = connect_to(manager);
+  Session session = connect_to(manager.socket_path());
   session.create<int>("gone", kShort).value();
   ASSERT_TRUE(session.remove({"gone", 0, ""}));
   manager.kill_hard();
@@ -125,11 +121,11 @@ TEST(DescriptorStore, DoesNotBringARemovedStreamBack) {
 
 TEST(DescriptorStore, RefusesStreamsOfAnotherHostName) {
   ServiceManager manager(without_network());
-  { connect_to(manager).create<int>("s", kShort).value(); }
+  { connect_to(manager.socket_path()).create<int>("s", kShort).value(); }
   manager.kill_hard();
   manager.rename_host("pc9");
   manager.start();
-  Session session = connect_to(manager);
+  Session session = connect_to(manager.socket_path());
   EXPECT_EQ(stream_names(session), std::vector<std::string>());
   EXPECT_EQ(manager.stored_descriptors(), 0u);
 }
@@ -144,7 +140,7 @@ TEST(DescriptorStore, BringsThousandsOfStreamsBack) {
   const std::size_t streams = std::min<std::size_t>(4096, limit.rlim_max / (2 * kPerStream + 2));
   ServiceManager manager(without_network());
   {
-    Session session = connect_to(manager);
+    Session session = connect_to(manager.socket_path());
     for (std::size_t i = 0; i < streams; ++i) {
       ASSERT_TRUE(session.create<int>("many:" + std::to_string(i), kShort));
     }
@@ -152,7 +148,7 @@ TEST(DescriptorStore, BringsThousandsOfStreamsBack) {
   manager.await_stored(streams * kPerStream);
   manager.kill_hard();
   manager.start();
-  EXPECT_EQ(connect_to(manager).list().value().size(), streams);
+  EXPECT_EQ(connect_to(manager.socket_path()).list().value().size(), streams);
 }
 
 }  // namespace

@@ -1,0 +1,26 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Streams of, and sessions with, a test's own dssmd, patient enough for a busy machine.
+#pragma once
+
+#include <chrono>
+#include <dssm/dssm.hpp>
+#include <string>
+
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm::test {
+
+// Of a stream that only has to be there.
+inline constexpr History kShort{16, std::chrono::milliseconds(1)};
+// Of one whose readers shall lose nothing, however busy the machine is.
+inline constexpr History kLong{1 << 16, std::chrono::milliseconds(1)};
+
+inline Session connect_to(const std::string& socket_path) {
+  return Session::connect({.socket_path = socket_path, .request_timeout = std::chrono::seconds(60)})
+      .value();
+}
+
+inline Session connect(const DaemonProcess& daemon) { return connect_to(daemon.socket_path()); }
+
+}  // namespace dssm::test
