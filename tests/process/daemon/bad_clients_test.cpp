@@ -256,8 +256,9 @@ TEST(Limits, OnDescriptorsRefuseProgramsWithoutASpinningDssmd) {
   // A dssmd with few descriptors, through the shell that sets its limit.
   const std::string dir = make_temp_dir();
   const pid_t pid = start({"/bin/sh", "-c",
-                           "ulimit -n 24; exec " + built("daemon/dssmd") + " --name pc1 " +
-                               "--log-level error --runtime-dir " + dir});
+                           "ulimit -n 24; exec " + built("daemon/dssmd") +
+                               " --name pc1 --listen '' --mdns=false --chronyd 127.0.0.1:1" +
+                               " --log-level error --runtime-dir " + dir});
   const std::string path = dir + "/dssmd.sock";
   ASSERT_TRUE(eventually([&] { return wire::connect_unix(path).has_value(); }));
   {

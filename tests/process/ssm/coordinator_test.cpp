@@ -8,6 +8,7 @@
 #include <unistd.h>
 
 #include <cstdlib>
+#include <dssm/session.hpp>
 #include <filesystem>
 #include <fstream>
 #include <sstream>
@@ -126,7 +127,7 @@ TEST(SsmCoordinator, PrintsTheOldBannerAndServesUntilSigintOrSigterm) {
 
 TEST(SsmCoordinator, SaysThatOneIsRunningAlready) {
   Coordinator running({"-q"});
-  while (::access((running.folder + "/dssmd.sock").c_str(), F_OK) != 0) ::poll(nullptr, 0, 1);
+  while (!Session::connect({.socket_path = running.folder + "/dssmd.sock"})) ::poll(nullptr, 0, 1);
   const Finished second = run({coordinator()}, {running.environment()});
   EXPECT_NE(second.err.find("is running already"), std::string::npos) << second.err;
   EXPECT_EQ(second.exit_status, 255);
