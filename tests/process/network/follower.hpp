@@ -57,6 +57,7 @@ class Follower {
   std::uint64_t life_ = 0;  // 0: of the next sample
   std::uint64_t earlier_life_ = 0;
   Tid first_ = 0, last_ = kNoTid;
+  Tid first_taken_ = kNoTid;
   std::uint64_t lost_ = 0;  // as the source counted, up to `last_`
   std::uint64_t taken_ = 0, restarts_ = 0;
   int fault_count_ = 0;
