@@ -11,6 +11,7 @@
 
 #include "core/ring/ring_reader.hpp"
 #include "tests/process/channel/raw_peer.hpp"
+#include "tests/support/largest_payload.hpp"
 
 namespace dssm::test {
 namespace {
@@ -132,7 +133,7 @@ TEST_F(Channel, AnswersReadsWholeThoughTheWriterLapsThem) {
 }
 
 TEST_F(Channel, CarriesTheLargestAndTheSmallestSamples) {
-  for (const std::size_t bytes : {std::size_t{1}, std::size_t{64} << 20}) {
+  for (const std::size_t bytes : {std::size_t{1}, kLargestPayloadBytes}) {
     const std::string name = "size" + std::to_string(bytes);
     RawPeer publisher(daemon_.address()), reader(daemon_.address());
     EXPECT_TRUE(publisher.create(name, bytes, 3).created());

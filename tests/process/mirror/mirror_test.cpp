@@ -5,6 +5,7 @@
 #include <random>
 
 #include "tests/process/mirror/two_hosts.hpp"
+#include "tests/support/largest_payload.hpp"
 
 namespace dssm::test {
 namespace {
@@ -154,8 +155,8 @@ TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
 
 // --- sizes ---------------------------------------------------------------------------------------
 
-TEST_F(TwoHosts, CarrySamplesOf64MiB) {
-  constexpr std::size_t kBytes = kMaxPayloadBytes;
+TEST_F(TwoHosts, CarryTheLargestSamples) {
+  constexpr std::size_t kBytes = kLargestPayloadBytes;
   const TypeInfo type{"", kBytes, 1, {}};
   auto writer = here.create_raw({"camera", 0, ""}, type, {3, 1s}).value();
   auto reader = there.open_raw_reader({"camera", 0, "pc1"}).value();

@@ -11,6 +11,7 @@
 
 #include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/largest_payload.hpp"
 
 namespace dssm::test {
 namespace {
@@ -396,8 +397,8 @@ TEST_F(PConnectorServing, FindsAHostInTheCatalogOfTheLocalDssmd) {
   EXPECT_NE(none.error().message.find("pc7"), std::string::npos) << none.error().message;
 }
 
-TEST_F(PConnectorServing, CarriesSamplesOfOneByteAndOf64MiB) {
-  for (const std::uint64_t bytes : {std::uint64_t{1}, kMaxPayloadBytes}) {
+TEST_F(PConnectorServing, CarriesTheSmallestAndTheLargestSamples) {
+  for (const std::size_t bytes : {std::size_t{1}, kLargestPayloadBytes}) {
     const StreamId id{"s" + std::to_string(bytes), 0, {}};
     PConnectorOptions patient = options();
     patient.request_timeout = 60s;

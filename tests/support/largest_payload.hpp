@@ -1,0 +1,20 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// How large the largest samples of tests are: as large as samples may be, but not where each of
+// their bytes costs a hundred.
+#pragma once
+
+#include <cstddef>
+#include <dssm/stream.hpp>
+
+namespace dssm::test {
+
+#if defined(__SANITIZE_THREAD__)
+// It remembers every word that is copied as one: a test with 64 MiB took 7 GiB of memory, and three
+// of them side by side all that a machine had.
+inline constexpr std::size_t kLargestPayloadBytes = 8 << 20;
+#else
+inline constexpr std::size_t kLargestPayloadBytes = kMaxPayloadBytes;
+#endif
+
+}  // namespace dssm::test
