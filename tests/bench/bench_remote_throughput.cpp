@@ -10,6 +10,7 @@
 #include <sys/mman.h>
 
 #include <cinttypes>
+#include <cstring>
 #include <dssm/dssm.hpp>
 #include <dssm/pconnector.hpp>
 #include <string>
@@ -25,23 +26,57 @@ namespace {
 
 constexpr int kRounds = 7;
 
-double raw_bytes_per_s(const Hosts& hosts, std::size_t bytes, std::size_t count) {
+// Memory like a ring's, in pages of the same size.
+class SharedMemory {
+ public:
+  explicit SharedMemory(std::size_t size) : bytes_(size) {
+    const int fd = ::memfd_create("raw", MFD_CLOEXEC);
+    if (fd < 0 || ::ftruncate(fd, static_cast<off_t>(size)) != 0) fail("make shared memory");
+    void* const place = ::mmap(nullptr, size, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
+    if (place == MAP_FAILED) fail("map shared memory");
+    ::close(fd);
+    data_ = static_cast<std::byte*>(place);
+    std::memset(data_, 1, size);
+  }
+  SharedMemory(const SharedMemory&) = delete;
+  SharedMemory& operator=(const SharedMemory&) = delete;
+  ~SharedMemory() { ::munmap(data_, bytes_); }
+
+  const std::byte* data() const { return data_; }
+  std::size_t bytes() const { return bytes_; }
+
+  // So that a process that has just got it has no page faults later.
+  void touch() const {
+    for (std::size_t at = 0; at < bytes_; at += 4096) {
+      static_cast<void>(*static_cast<const volatile std::byte*>(data_ + at));
+    }
+  }
+
+ private:
+  std::byte* data_;
+  std::size_t bytes_;
+};
+
+double raw_bytes_per_s(const Hosts& hosts, const SharedMemory& all, std::size_t bytes) {
   const auto [out, in] = hosts.tcp_pair();
   const int sender = out;
-  std::vector<std::byte> all(bytes * count, std::byte{1});
   const pid_t pid = in_child([&] {
+    all.touch();
     std::byte go{};
+    send_all(sender, &go, 1);
     receive_all(sender, &go, 1);
-    for (std::size_t i = 0; i < count; ++i) send_all(sender, all.data() + i * bytes, bytes);
+    for (std::size_t at = 0; at < all.bytes(); at += bytes)
+      send_all(sender, all.data() + at, bytes);
   });
   std::vector<std::byte> one(bytes);
+  receive_all(in, one.data(), 1);
   const std::int64_t start = now_ns();
   send_all(in, one.data(), 1);
-  for (std::size_t i = 0; i < count; ++i) receive_all(in, one.data(), bytes);
+  for (std::size_t at = 0; at < all.bytes(); at += bytes) receive_all(in, one.data(), bytes);
   const double took = static_cast<double>(now_ns() - start);
   ::waitpid(pid, nullptr, 0);
   ::close(in), ::close(out);
-  return static_cast<double>(bytes * count) * 1e9 / took;
+  return static_cast<double>(all.bytes()) * 1e9 / took;
 }
 
 // Takes `count` samples by a subscription; the time that took.
@@ -83,9 +118,10 @@ void bench_large(const Hosts& hosts, const std::string& address, Session& sessio
   const auto in_other = hosts.inside(2);
   PConnector connector = PConnector::open(id, {.address = address}).value();
   std::vector<double> raw, ours;
+  const SharedMemory all(bytes * count);
   drain_ns(connector, bytes, count);
   for (int i = 0; i < kRounds; ++i) {
-    raw.push_back(raw_bytes_per_s(hosts, bytes, count) / 1e6);
+    raw.push_back(raw_bytes_per_s(hosts, all, bytes) / 1e6);
     ours.push_back(static_cast<double>(bytes * count) * 1e3 / drain_ns(connector, bytes, count));
   }
   const Figures raw_figures = figures_of(raw), our_figures = figures_of(ours);
