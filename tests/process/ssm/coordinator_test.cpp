@@ -13,6 +13,7 @@
 #include <fstream>
 #include <sstream>
 
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::test {
@@ -127,7 +128,9 @@ TEST(SsmCoordinator, PrintsTheOldBannerAndServesUntilSigintOrSigterm) {
 
 TEST(SsmCoordinator, SaysThatOneIsRunningAlready) {
   Coordinator running({"-q"});
-  while (!Session::connect({.socket_path = running.folder + "/dssmd.sock"})) ::poll(nullptr, 0, 1);
+  await([&] {
+    return Session::connect({.socket_path = running.folder + "/dssmd.sock"}).has_value();
+  });
   const Finished second = run({coordinator()}, {running.environment()});
   EXPECT_NE(second.err.find("is running already"), std::string::npos) << second.err;
   EXPECT_EQ(second.exit_status, 255);
