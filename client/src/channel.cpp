@@ -216,6 +216,11 @@ bool Channel::has_more_to_send() const noexcept {
   return on_received(link_.receive_waiting());
 }
 
+// The same, for what follows at once if it follows at all: the rest of a sample, the next one.
+[[gnu::hot]] wire::IoStatus Channel::receive_watching() {
+  return on_received(link_.receive_watching());
+}
+
 [[gnu::hot]] wire::IoStatus Channel::on_received(const Result<wire::IoStatus>& received) {
   if (!received) return went_down(received.error()), wire::IoStatus::end;
   // It may have been the greeting.
@@ -515,7 +520,7 @@ Result<void> Channel::unsubscribe() {
     // The rest is on its way: to wait for it here saves a copy of all of it.
     const bool waits = subscriber_->is_filling_target() && may_wait_in_receive();
     if (waits && stay_until == kNever) stay_until = deadline_in(kStayWithSample);
-    const bool received = waits ? receive_waiting() == wire::IoStatus::ok : receive();
+    const bool received = waits ? receive_watching() == wire::IoStatus::ok : receive();
     if (subscriber_->taken(info)) return ReadStatus::ok;
     if (auto kept = subscriber_->take_kept(payload, info)) return *kept;
     if (!received || (waits && MonoClock::now() >= stay_until)) break;
@@ -534,7 +539,7 @@ Result<void> Channel::unsubscribe() {
   // Mostly the next sample comes soon. After that time poll(), which does not wake up for nothing.
   if (!done() && may_wait_in_receive() &&
       (deadline == kNever || deadline - MonoClock::now() >= wire::Transport::kReceiveWait)) {
-    const wire::IoStatus status = receive_waiting();
+    const wire::IoStatus status = receive_watching();
     if (status == wire::IoStatus::interrupted) return WaitStatus::interrupted;
   }
   return run(deadline, true, done);

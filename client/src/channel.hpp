@@ -87,6 +87,7 @@ class Channel final : private wire::FrameSink {
   bool receive();
   bool may_wait_in_receive() const noexcept;
   wire::IoStatus receive_waiting();
+  wire::IoStatus receive_watching();
   wire::IoStatus on_received(const Result<wire::IoStatus>& received);
   template <class Done>
   WaitStatus run(MonoTime deadline, bool interruptible, Done done);

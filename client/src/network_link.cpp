@@ -206,10 +206,16 @@ Result<std::size_t> NetworkLink::send_some(std::span<const std::byte> bytes) {
   return take(transport_->receive_waiting(decoder_->spaces()));
 }
 
+[[gnu::hot]] Result<wire::IoStatus> NetworkLink::receive_watching() {
+  if (!transport_) return wire::IoStatus::would_block;
+  return take(vigil_.receive(*transport_, decoder_->spaces()));
+}
+
 [[gnu::hot]] Result<wire::IoStatus> NetworkLink::take(const Result<wire::IoResult>& received) {
   if (!received) return down(received.error());
   if (received->status == wire::IoStatus::end) return down(lost());
   if (received->status != wire::IoStatus::ok) return received->status;
+  vigil_.on_received(received->bytes);
   if (Result<void> done = decoder_->commit(received->bytes); !done) {
     return down(std::move(done).error());
   }

@@ -14,6 +14,7 @@
 #include <string>
 #include <vector>
 
+#include "client/src/vigil.hpp"
 #include "core/base/unique_fd.hpp"
 #include "core/wire/address.hpp"
 #include "core/wire/frame_decoder.hpp"
@@ -62,6 +63,9 @@ class NetworkLink final : private wire::FrameSink {
   // The same, waiting as Transport::receive_waiting() does.
   //   returns  besides: interrupted
   Result<wire::IoStatus> receive_waiting();
+  // The same, after staying awake for a moment where that pays (vigil.hpp). A signal within that
+  // moment does not interrupt.
+  Result<wire::IoStatus> receive_watching();
   // Goes on with what was received, after the user held a sample back.
   Result<void> resume();
 
@@ -111,6 +115,7 @@ class NetworkLink final : private wire::FrameSink {
   std::unique_ptr<wire::Transport> transport_;
   std::unique_ptr<wire::FrameDecoder> decoder_;
   wire::DecoderCounters earlier_;
+  Vigil vigil_;
   std::string queued_;
   std::size_t queued_from_ = 0;
   wire::Greeting them_;

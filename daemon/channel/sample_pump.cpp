@@ -80,7 +80,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameLink& link, Sample
         sender_.end_run();
         return PumpWait::room;
       case SendStatus::unfinished:
-        return PumpWait::turn;
+        break;
       case SendStatus::no_memory:
         return Error{Errc::limit_exceeded,
                      "no memory is left to copy a sample of " + std::to_string(payload_bytes_) +

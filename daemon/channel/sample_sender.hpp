@@ -21,7 +21,10 @@
 // sample, still in the cache, takes 3.4 and 3.6 us at 16 KiB, 9.0 and 11 us at 64 KiB, 28 and 18 us
 // at 256 KiB: alone it pays for the verdict's own packet.
 //
-// Work is cut into slices of kSliceBytes, so that nobody waits long for one large sample.
+// Work is cut into slices of kSliceBytes, so that nobody waits long for one large sample. And one
+// send is no larger: while it lasts the kernel keeps what the peer acknowledges aside and frees no
+// memory of this connection, so that of a longer one every byte goes into memory that no cache
+// holds. Sends of 256 KiB were up to twice as fast as such of 1 MiB (docs/benchmarks.md).
 #pragma once
 
 #include <array>
@@ -42,7 +45,7 @@ enum class SendStatus : std::uint8_t {
   torn,        // the same, but it was overwritten meanwhile, and the receiver knows
   gone,        // the ring does not hold it; nothing was sent
   blocked,     // the link has no room: on_output_empty() comes
-  unfinished,  // go on in the next turn
+  unfinished,  // go on, in the next turn if this one was long enough
   no_memory,   // a peer without "torn", and no memory left to copy the sample aside
 };
 
@@ -53,7 +56,7 @@ class SampleSender {
   static constexpr std::size_t kInPlaceBytes = 16U << 10;     // from here on in place, in a run
   static constexpr std::size_t kMostCopiedBytes = 64U << 10;  // up to here copied, when it is alone
   static constexpr std::size_t kBatchBytes = 64U << 10;
-  static constexpr std::size_t kSliceBytes = 1U << 20;
+  static constexpr std::size_t kSliceBytes = 256U << 10;
 
   struct Options {
     bool may_tear = false;           // the receiver has the feature "torn"

@@ -399,26 +399,29 @@ TEST(SamplePump, FailsWhenItMayNeitherTearNorCopy) {
 }
 
 TEST(SamplePump, CutsALongSampleIntoTurns) {
-  constexpr std::size_t kLong = 5 * SampleSender::kSliceBytes + 17;
+  constexpr std::size_t kLong = 5 * SamplePump::kBytesPerTurn + 17;
   for (const bool may_tear : {true, false}) {
     PumpRig rig(kLong, 4, may_tear);
     rig.write(2);
     rig.start({0, 1, 0});
     EXPECT_EQ(rig.run(), PumpWait::turn);
-    EXPECT_LE(rig.peer.sent.size(), SampleSender::kSliceBytes + 100);
+    EXPECT_LE(rig.peer.sent.size(), SamplePump::kBytesPerTurn + 100);
+    if (may_tear) {
+      EXPECT_EQ(rig.peer.sends, SamplePump::kBytesPerTurn / SampleSender::kSliceBytes);
+    }
     EXPECT_EQ(rig.run_on(), PumpWait::news);
     EXPECT_EQ(rig.accepted(), tids(0, 1));
   }
 }
 
 TEST(SamplePump, LooksAgainAfterALongSampleIsCopiedAside) {
-  constexpr std::size_t kLong = 3 * SampleSender::kSliceBytes;
+  constexpr std::size_t kLong = 3 * SamplePump::kBytesPerTurn;
   for (const bool may_tear : {true, false}) {
     PumpRig rig(kLong, 4, may_tear);
     rig.write(1);
     rig.start({0, 0, 0});
     rig.peer.room = 100;
-    EXPECT_EQ(rig.run(), PumpWait::turn) << "one slice is copied";
+    EXPECT_EQ(rig.run(), PumpWait::turn) << "a part is copied";
     rig.write(8);
     rig.peer.room = FakePeer::kAll;
     EXPECT_EQ(rig.run_on(), PumpWait::news);
