@@ -125,7 +125,9 @@ class PConnector {
 
   // Waits until next() has something, a failure included that waiting does not mend, or until the
   // monotonic clock reaches `deadline`. `ready` may come when a large sample has only begun to
-  // come: after it next() may say not_yet. Without a subscription: timeout, at once.
+  // come: after it next() may say not_yet. Without a subscription: timeout, at once. While data
+  // come fast it looks for them without sleeping, for 30 us at a time: always at 2 GB/s, for 5 % of
+  // the time at most at 100 MB/s.
   WaitStatus wait(MonoTime deadline);
 
   // Samples that the owner's ring no longer held when their turn came, and those that came while
