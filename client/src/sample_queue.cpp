@@ -16,18 +16,16 @@ SampleQueue::SampleQueue(std::size_t payload_bytes, std::size_t max_bytes)
       max_count_(std::max<std::size_t>(1, max_bytes / payload_bytes)) {}
 
 std::byte* SampleQueue::place() {
-  if (count_ == infos_.size()) {
-    if (count_ < max_count_) {
-      grow();
-    } else {
-      remove_oldest();
-      ++dropped_;
-    }
-  }
+  if (count_ == infos_.size()) grow();
   return payloads_.data() + index(count_) * payload_bytes_;
 }
 
-void SampleQueue::push(const SampleInfo& info) noexcept { infos_[index(count_++)] = info; }
+void SampleQueue::push(const SampleInfo& info) noexcept {
+  infos_[index(count_++)] = info;
+  if (count_ <= max_count_) return;
+  remove_oldest();
+  ++dropped_;
+}
 
 void SampleQueue::pop(std::span<std::byte> payload, SampleInfo& info) noexcept {
   std::memcpy(payload.data(), payloads_.data() + first_ * payload_bytes_, payload_bytes_);
@@ -47,7 +45,8 @@ void SampleQueue::clear() noexcept {
 }
 
 void SampleQueue::grow() {
-  const std::size_t room = std::min(max_count_, std::max(kFirstCount, 2 * infos_.size()));
+  const std::size_t most = max_count_ + 1;  // one is arriving
+  const std::size_t room = std::min(most, std::max(kFirstCount, 2 * infos_.size()));
   std::vector<std::byte> payloads(room * payload_bytes_);
   std::vector<SampleInfo> infos(room);
   for (std::size_t n = 0; n < count_; ++n) {

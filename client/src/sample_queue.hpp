@@ -2,7 +2,8 @@
 //
 // Samples of a subscription that came while their reader was busy with something else: a circular
 // buffer of equal entries in one piece of memory, which grows as it fills and is then used again
-// and again. Bounded: beyond its limit the oldest samples go.
+// and again. Bounded: beyond its limit the oldest samples go, each when its successor is complete
+// and not before: what has begun to come may be cut off, or void.
 #pragma once
 
 #include <cstddef>
@@ -15,16 +16,16 @@ namespace dssm::detail {
 // A value; one thread.
 class SampleQueue {
  public:
-  // max_bytes: of all payloads; one sample is always kept, however large.
+  // max_bytes: of all payloads but the one that is arriving; one sample is always kept, however
+  // large.
   SampleQueue(std::size_t payload_bytes, std::size_t max_bytes);
 
   bool empty() const noexcept { return count_ == 0; }
   std::size_t size() const noexcept { return count_; }
 
   // Where the next sample's payload goes, until it is pushed or given up by another call of this.
-  // May drop the oldest sample: then dropped() rises.
   std::byte* place();
-  // The payload at place() is complete.
+  // The payload at place() is complete. May drop the oldest sample: then dropped() rises.
   void push(const SampleInfo& info) noexcept;
 
   // Takes the oldest sample; not when empty.

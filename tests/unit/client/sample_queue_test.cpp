@@ -64,6 +64,15 @@ TEST(SampleQueue, DropsAndCountsTheOldestBeyondItsLimit) {
   for (Tid tid = 15; tid < 25; ++tid) expect_pop(queue, tid);
 }
 
+TEST(SampleQueue, KeepsAllWhenOneThatArrivesIsGivenUp) {
+  SampleQueue queue(8, 10 * 8);
+  for (Tid tid = 0; tid < 10; ++tid) push(queue, tid);
+  std::memcpy(queue.place(), payload_of(77).data(), 8);
+  std::memcpy(queue.place(), payload_of(78).data(), 8);
+  EXPECT_EQ(queue.dropped(), 0u);
+  for (Tid tid = 0; tid < 10; ++tid) expect_pop(queue, tid);
+}
+
 TEST(SampleQueue, KeepsOneSampleThatIsLargerThanItsLimit) {
   SampleQueue queue(8, 1);
   push(queue, 1);
