@@ -5,6 +5,8 @@
 // request of one to the other takes.
 #include <algorithm>
 #include <cmath>
+#include <future>
+#include <optional>
 #include <thread>
 
 #include "client/dssmctl/json.hpp"
@@ -38,6 +40,9 @@ class Ping {
     out_.add("answer from " + escaped(host_) + " (" + escaped(address) + "): seq=" +
              std::to_string(asked_) + " time=" + duration_text(answer.round_trip) + "\n");
   }
+
+  // Told to stop before the answer came.
+  void on_stop() { ++asked_; }
 
   void on_silence(const Error& why) {
     ++asked_;
@@ -89,10 +94,25 @@ bool is_known(Session& session, const std::string& name) {
                               [&](const HostInfo& host) { return host.name == name; });
 }
 
+bool must_stop(Output& out) { return stop_requested() || out.reader_gone(); }
+
+// Asks in a thread of its own, because the answer of a host that is silent takes seconds, and
+// nobody who wants to stop waits for it: then none.
+std::optional<Result<RoundTrip>> ask(const Session& session, const std::string& host, Output& out) {
+  std::packaged_task<Result<RoundTrip>()> question(
+      [asked = session, host]() mutable { return asked.ping(host); });
+  std::future<Result<RoundTrip>> answer = question.get_future();
+  std::thread(std::move(question)).detach();
+  while (answer.wait_for(kStopLookUp) != std::future_status::ready) {
+    if (must_stop(out)) return std::nullopt;
+  }
+  return answer.get();
+}
+
 // Sleeps until `due`. Whether to go on: false when told to stop or when nobody reads our output.
 bool wait_until(MonoTime due, Output& out) {
   while (MonoClock::now() < due) {
-    if (stop_requested() || out.reader_gone()) return false;
+    if (must_stop(out)) return false;
     const Duration rest = std::min(due - MonoClock::now(), kStopLookUp);
     std::this_thread::sleep_for(rest);
   }
@@ -108,13 +128,17 @@ Result<void> run_ping(const Options& options, Output& out) {
   Ping ping(options, out);
   MonoTime due = MonoClock::now();
   do {
-    const Result<RoundTrip> answer = session->ping(options.host);
-    if (answer) {
-      ping.on_answer(*answer);
+    const std::optional<Result<RoundTrip>> answer = ask(*session, options.host, out);
+    if (!answer) {
+      ping.on_stop();
+      break;
+    }
+    if (*answer) {
+      ping.on_answer(**answer);
     } else if (ping.asked() == 0 && !is_known(*session, options.host)) {
-      return answer.error();
+      return answer->error();
     } else {
-      ping.on_silence(answer.error());
+      ping.on_silence(answer->error());
     }
     due = std::max(due + options.interval, MonoClock::now());
   } while (out.flush() && ping.asked() != options.count && wait_until(due, out));

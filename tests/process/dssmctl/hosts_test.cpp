@@ -115,6 +115,17 @@ TEST_F(Ping, EndsWithItsSummaryOnASignal) {
   EXPECT_EQ(ping.status(), 0);
 }
 
+TEST_F(Ping, EndsWithoutWaitingForAnAnswer) {
+  ::kill(pc2_.pid(), SIGSTOP);
+  Running ping(argv({"ping", "pc2"}), environment());
+  await([&] { return session_.clients().value().size() == 2; });
+  ping.signal(SIGINT);
+  EXPECT_EQ(ping.line(), "--- pc2: asked 1, answered 0 ---");
+  ping.rest();
+  EXPECT_EQ(ping.status(), 1);
+  ::kill(pc2_.pid(), SIGCONT);
+}
+
 TEST_F(Ping, EndsQuietlyWhenItsReaderHasEnough) {
   Running ping(argv({"ping", "pc2", "-i", "1000"}), environment());
   ping.line();
