@@ -13,7 +13,6 @@
 #include <sys/mman.h>
 
 #include <algorithm>
-#include <cerrno>
 #include <cinttypes>
 #include <cstring>
 #include <dssm/dssm.hpp>
@@ -62,18 +61,8 @@ class SharedMemory {
 
 struct RawWay {
   std::size_t write_bytes;
-  bool sleeps;  // the receiver does, whenever there is nothing
+  int receive_flags;  // as receive_all()
 };
-
-// Receives as receive_all(), without ever sleeping.
-void receive_awake(int fd, std::byte* at, std::size_t bytes) {
-  while (bytes > 0) {
-    const ssize_t got = ::recv(fd, at, bytes, MSG_DONTWAIT);
-    if (got < 0 && errno == EAGAIN) continue;
-    if (got <= 0) fail("recv");
-    at += got, bytes -= static_cast<std::size_t>(got);
-  }
-}
 
 double raw_bytes_per_s(const Hosts& hosts, const SharedMemory& all, std::size_t bytes,
                        const RawWay& way) {
@@ -92,7 +81,7 @@ double raw_bytes_per_s(const Hosts& hosts, const SharedMemory& all, std::size_t 
   const std::int64_t start = now_ns();
   send_all(in, one.data(), 1);
   for (std::size_t at = 0; at < all.bytes(); at += bytes) {
-    way.sleeps ? receive_all(in, one.data(), bytes) : receive_awake(in, one.data(), bytes);
+    receive_all(in, one.data(), bytes, way.receive_flags);
   }
   const double took = static_cast<double>(now_ns() - start);
   ::waitpid(pid, nullptr, 0);
@@ -138,7 +127,7 @@ void bench_large(const Hosts& hosts, const std::string& address, Session& sessio
   const RawWriter writer = fill(session, id, bytes, count);
   const auto in_other = hosts.inside(2);
   PConnector connector = PConnector::open(id, {.address = address}).value();
-  const RawWay plain{bytes, true}, fastest{std::min<std::size_t>(bytes, 256 << 10), false};
+  const RawWay plain{bytes, 0}, fastest{std::min<std::size_t>(bytes, 256 << 10), MSG_DONTWAIT};
   std::vector<double> raw, awake, ours;
   const SharedMemory all(bytes * count);
   drain_ns(connector, bytes, count);

@@ -15,6 +15,7 @@
 #include <unistd.h>
 
 #include <atomic>
+#include <cerrno>
 #include <climits>
 #include <csignal>
 #include <cstdio>
@@ -86,10 +87,12 @@ inline void send_all(int fd, const void* data, std::size_t bytes) {
   }
 }
 
-inline void receive_all(int fd, void* data, std::size_t bytes) {
+// flags: of recv(2). With MSG_DONTWAIT it looks again and again and never sleeps.
+inline void receive_all(int fd, void* data, std::size_t bytes, int flags = 0) {
   auto* at = static_cast<char*>(data);
   while (bytes > 0) {
-    const ssize_t got = ::recv(fd, at, bytes, 0);
+    const ssize_t got = ::recv(fd, at, bytes, flags);
+    if (got < 0 && errno == EAGAIN) continue;
     if (got <= 0) fail("recv");
     at += got, bytes -= static_cast<std::size_t>(got);
   }
