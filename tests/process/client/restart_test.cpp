@@ -9,6 +9,7 @@
 #include <atomic>
 #include <csignal>
 #include <dssm/dssm.hpp>
+#include <optional>
 #include <thread>
 
 #include "tests/support/await.hpp"
@@ -176,11 +177,17 @@ TEST(Restart, TellsWatchersWhatIsGone) {
 
 TEST(Restart, FailsRequestsInWordsWhileTheDaemonIsAway) {
   DaemonProcess daemon;
-  Session session =
-      Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 50ms}).value();
+  Session session = connect(daemon);
   Writer<Counted> writer = session.create<Counted>("s", History{16, 1ms}).value();
+  std::optional<Session> impatient;
+  await([&] {  // a busy dssmd may be late with its greeting
+    auto connected =
+        Session::connect({.socket_path = daemon.socket_path(), .request_timeout = 50ms});
+    if (connected) impatient = std::move(*connected);
+    return impatient.has_value();
+  });
   daemon.kill_hard();
-  const auto list = session.list();
+  const auto list = impatient->list();
   ASSERT_FALSE(list);
   EXPECT_EQ(list.error().code, Errc::daemon_away);
   EXPECT_NE(list.error().message.find("list the streams"), std::string::npos);
