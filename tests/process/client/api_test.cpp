@@ -14,6 +14,7 @@
 #include <thread>
 
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/session.hpp"
 #include "tests/support/signals.hpp"
 
 namespace dssm {
@@ -33,7 +34,7 @@ struct Turned {  // same size, other type
 
 struct Api : testing::Test {
   DaemonProcess daemon;
-  Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
+  Session session = test::connect(daemon);
 
   Writer<Odometry> make(std::string_view name = "odometry", History history = {64, 10ms}) {
     return session.create<Odometry>(name, history).value();
@@ -389,7 +390,7 @@ TEST_F(Api, AwaitsAStreamThatComesLater) {
 }
 
 TEST_F(Api, SharesOnePlaybackClock) {
-  Session other = Session::connect({.socket_path = daemon.socket_path()}).value();
+  Session other = test::connect(daemon);
   PlaybackClock clock = session.playback_clock().value(), seen = other.playback_clock().value();
   EXPECT_EQ(seen.setting().speed, 1);
   clock.set_paused(true);
@@ -443,7 +444,7 @@ TEST_F(Api, Serves1000StreamsAnd1000Clients) {
   std::vector<Session> sessions;
   std::vector<Reader<double>> readers;
   for (int i = 0; i < 1000; ++i) {
-    sessions.push_back(Session::connect({.socket_path = daemon.socket_path()}).value());
+    sessions.push_back(test::connect(daemon));
     readers.push_back(sessions.back().open_reader<double>("s" + std::to_string(i)).value());
   }
   for (int i = 0; i < 1000; ++i) {

@@ -142,7 +142,7 @@ TEST(NewRing, IsToldWhileTheConnectionIsSetUpAnew) {
   const DaemonProcess daemon;
   Session writing = connect(daemon);
   test::Relay relay(daemon.socket_path());
-  Session session = Session::connect({.socket_path = relay.socket_path()}).value();
+  Session session = test::connect_to(relay.socket_path());
   std::vector<Writer<double>> writers;
   std::vector<Reader<double>> readers;
   for (const char* name : {"first", "last"}) {

@@ -12,7 +12,7 @@ int main(int, char** argv) {
   using namespace std::chrono_literals;
   using Sample = std::array<std::int64_t, 16>;
   const int enough = std::atoi(argv[1]);
-  dssm::Session session = dssm::Session::connect().value();
+  dssm::Session session = dssm::Session::connect({.request_timeout = 60s}).value();
   for (int i = 0;; ++i) {
     const std::string name = "victim:" + std::to_string(i % 3);
     auto writer = session.create<Sample>(name, dssm::History{16, 1ms}).value();

@@ -11,6 +11,7 @@
 #include "tests/process/network/follower.hpp"
 #include "tests/process/network/load.hpp"
 #include "tests/process/network/raw_peer.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm::test {
 namespace {
@@ -335,7 +336,7 @@ TEST_F(Hosts, SayThatAPeerOfTheFutureWasRefused) {
   RawPeer peer = accept_peer(listener);
   ASSERT_TRUE(peer.receive()) << "its Hello";
   peer.send(hello_frame(99));
-  Session session = Session::connect({.socket_path = dssmd.socket_path()}).value();
+  Session session = connect_to(dssmd.socket_path());
   HostInfo refused;
   await("the other host is refused", [&] {
     for (HostInfo& host : session.hosts().value()) {

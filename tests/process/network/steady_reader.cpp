@@ -38,7 +38,7 @@ void say_begun() {
 
 Outcome read_mirror() {
   const KnownStream known = steady_stream();
-  Session session = Session::connect().value();
+  Session session = Session::connect({.request_timeout = std::chrono::minutes(2)}).value();
   Follower follower(known, session.await_raw_reader(known.id, kNever).value(), {});
   while (follower.taken() == 0) {
     (void)follower.reader().wait(kNever);
@@ -59,7 +59,9 @@ Outcome read_mirror() {
 
 Outcome read_by_connector(const std::string& address) {
   const KnownStream known = steady_stream();
-  PConnector connector = PConnector::open(known.id, {.address = address}).value();
+  PConnector connector =
+      PConnector::open(known.id, {.address = address, .request_timeout = std::chrono::minutes(2)})
+          .value();
   connector.subscribe({.start = Subscription::Start::oldest}).value();
   std::vector<std::byte> payload(known.payload_bytes);
   SampleInfo info;

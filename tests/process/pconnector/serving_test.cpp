@@ -12,6 +12,7 @@
 #include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/largest_payload.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm::test {
 namespace {
@@ -46,9 +47,11 @@ std::span<const std::byte> bytes_of(const T& value) {
 
 struct PConnectorServing : testing::Test {
   DaemonProcess daemon{{"--log-level", "warning"}, "pc2"};
-  Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
+  Session session = connect(daemon);
 
-  PConnectorOptions options() const { return {.address = daemon.address(), .program = "test"}; }
+  PConnectorOptions options() const {
+    return {.address = daemon.address(), .program = "test", .request_timeout = 60s};
+  }
   PConnector open(const std::string& name = "lidar") const {
     const TypeInfo type = type_of<Sample>();
     auto con = PConnector::open(StreamId::parse(name).value(), options(), &type);
@@ -384,7 +387,7 @@ TEST_F(PConnectorServing, FindsAHostInTheCatalogOfTheLocalDssmd) {
   make();
   const DaemonProcess local({"--log-level", "warning", "--peer", daemon.address()}, "pc1");
   ::setenv("DSSM_SOCKET", local.socket_path().c_str(), 1);
-  auto here = Session::connect().value();
+  auto here = connect(local);
   await_up(here, "pc2");
   const auto con = PConnector::open({"lidar", 0, {}}, {.address = "pc2"});
   const auto by_name = PConnector::open({"lidar", 0, "pc2"});
@@ -400,10 +403,8 @@ TEST_F(PConnectorServing, FindsAHostInTheCatalogOfTheLocalDssmd) {
 TEST_F(PConnectorServing, CarriesTheSmallestAndTheLargestSamples) {
   for (const std::size_t bytes : {std::size_t{1}, kLargestPayloadBytes}) {
     const StreamId id{"s" + std::to_string(bytes), 0, {}};
-    PConnectorOptions patient = options();
-    patient.request_timeout = 60s;
-    auto writer = PConnector::create(id, {"", bytes, 1, {}}, {4, 1s}, patient).value();
-    auto reader = PConnector::open(id, patient).value();
+    auto writer = PConnector::create(id, {"", bytes, 1, {}}, {4, 1s}, options()).value();
+    auto reader = PConnector::open(id, options()).value();
     ASSERT_TRUE(reader.subscribe({}));
     std::vector<std::byte> sent(bytes), received(bytes);
     std::mt19937_64 random(bytes);

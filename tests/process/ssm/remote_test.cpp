@@ -13,6 +13,7 @@
 #include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/process/ssm/test_name.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/session.hpp"
 
 namespace dssm::test {
 namespace {
@@ -62,7 +63,7 @@ struct SsmFleet : testing::Test {
   DaemonProcess pc1{{"--log-level", "warning", "--peer", pc2.address()}, "pc1"};
 
   static void await_host(const DaemonProcess& daemon, const std::string& name) {
-    auto session = Session::connect({.socket_path = daemon.socket_path()}).value();
+    auto session = connect(daemon);
     await_up(session, name);
   }
 };
@@ -73,7 +74,7 @@ struct Point {
 };
 
 TEST_F(SsmFleet, AnSsmProgramReadsAndWritesStreamsOfAnotherPcByTheirNames) {
-  auto far = Session::connect({.socket_path = pc2.socket_path()}).value();
+  auto far = connect(pc2);
   auto writer =
       far.create_raw({"far", 3, {}}, {"", sizeof(Point), 1, {}}, History{100, 100ms}).value();
   for (std::int32_t i = 0; i < 10; ++i) {
@@ -159,7 +160,7 @@ class Talking {
 
 struct SsmNewRing : testing::Test {
   DaemonProcess daemon{{"--log-level", "warning"}};
-  Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
+  Session session = connect(daemon);
   std::string folder = make_temp_dir();
   int number = 0;
   RawWriter writer = make();

@@ -49,12 +49,6 @@ std::string content(const std::string& path) {
   return {std::istreambuf_iterator<char>(file), {}};
 }
 
-dssm::Session connect(const dssm::test::DaemonProcess& host) {
-  dssm::SessionOptions options;
-  options.socket_path = host.socket_path();
-  return dssm::Session::connect(options).value();
-}
-
 dssm::Tid written(const dssm::test::DaemonProcess& host, const std::string& stream) {
   dssm::Session session = connect(host);
   return session.info(dssm::StreamId{stream, 0, ""}).value().newest + 1;

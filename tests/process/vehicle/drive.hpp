@@ -9,7 +9,7 @@
 #include <string>
 #include <vector>
 
-#include "tests/support/daemon_process.hpp"
+#include "tests/support/session.hpp"
 
 namespace vehicle::test {
 
@@ -39,7 +39,7 @@ void run_all(const std::vector<Placed>& programs);
 
 std::string content(const std::string& path);
 
-dssm::Session connect(const dssm::test::DaemonProcess& host);
+using dssm::test::connect;
 
 // The number of samples written to `stream`, which `host` owns.
 dssm::Tid written(const dssm::test::DaemonProcess& host, const std::string& stream);

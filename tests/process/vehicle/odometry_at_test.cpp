@@ -11,6 +11,7 @@
 
 #include "docs/examples/vehicle/stop.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/session.hpp"
 
 namespace vehicle {
 namespace {
@@ -20,17 +21,12 @@ using std::chrono::milliseconds;
 class OdometryAtTest : public testing::Test {
  protected:
   dssm::test::DaemonProcess daemon_;
-  dssm::Session session_ = connect(daemon_.socket_path());
+  dssm::Session session_ = dssm::test::connect(daemon_);
   dssm::Writer<Odometry> encoder_ =
       session_.create<Odometry>("odometry", dssm::History{8, milliseconds(100)}).value();
 
   OdometryAt odometry(dssm::Duration deadline = std::chrono::minutes(1)) {
     return OdometryAt(session_.open_reader<Odometry>("odometry").value(), deadline);
-  }
-  static dssm::Session connect(const std::string& socket_path) {
-    dssm::SessionOptions options;
-    options.socket_path = socket_path;
-    return dssm::Session::connect(options).value();
   }
   static dssm::Time at_ms(std::int64_t ms) { return dssm::Time(milliseconds(ms)); }
 };
