@@ -29,6 +29,7 @@ using namespace std::chrono_literals;
 namespace {
 
 constexpr int kRounds = 7;
+constexpr std::uint64_t kPostedDepth = 32;
 
 // Memory like a ring's, in pages of the same size.
 class SharedMemory {
@@ -107,6 +108,18 @@ double drain_ns(PConnector& connector, std::size_t bytes, std::size_t count) {
   return took;
 }
 
+// Posts `count` samples and waits until they are written; the time that took.
+double post_ns(PConnector& connector, const std::vector<std::byte>& one, std::size_t count) {
+  const std::int64_t start = now_ns();
+  for (std::size_t i = 0; i < count; ++i) {
+    connector.post(one, time_from_ns(static_cast<std::int64_t>(i))).value();
+  }
+  const Tid last = connector.flush(deadline_in(60s)).value();
+  const double took = static_cast<double>(now_ns() - start);
+  if (last % static_cast<Tid>(count) != static_cast<Tid>(count) - 1) fail("post all samples");
+  return took;
+}
+
 RawWriter fill(Session& session, const StreamId& id, std::size_t bytes, std::size_t count) {
   RawWriter writer = session.create_raw(id, {"", bytes, 1, {}}, History{count + 1, 1ms}).value();
   std::vector<std::byte> payload(bytes, std::byte{1});
@@ -128,16 +141,24 @@ void bench_large(const Hosts& hosts, const std::string& address, Session& sessio
   const auto in_other = hosts.inside(2);
   PConnector connector = PConnector::open(id, {.address = address}).value();
   const RawWay plain{bytes, 0}, fastest{std::min<std::size_t>(bytes, 256 << 10), MSG_DONTWAIT};
-  std::vector<double> raw, awake, ours;
+  PConnector poster =
+      PConnector::create(
+          {"posted", id.id, ""}, {"", bytes, 1, {}}, History{kPostedDepth, 1ms},
+          {.address = address, .max_unsent_samples = count, .max_unsent_bytes = bytes * count})
+          .value();
+  const std::vector<std::byte> posted(bytes, std::byte{1});
+  std::vector<double> raw, awake, ours, posts;
   const SharedMemory all(bytes * count);
   drain_ns(connector, bytes, count);
+  post_ns(poster, posted, count);
   for (int i = 0; i < kRounds; ++i) {
     raw.push_back(raw_bytes_per_s(hosts, all, bytes, plain) / 1e6);
     awake.push_back(raw_bytes_per_s(hosts, all, bytes, fastest) / 1e6);
     ours.push_back(static_cast<double>(bytes * count) * 1e3 / drain_ns(connector, bytes, count));
+    posts.push_back(static_cast<double>(bytes * count) * 1e3 / post_ns(poster, posted, count));
   }
   const Figures raw_figures = figures_of(raw), awake_figures = figures_of(awake),
-                our_figures = figures_of(ours);
+                our_figures = figures_of(ours), posted_figures = figures_of(posts);
   const std::string tail = ", " + std::to_string(bytes >> 10) + " KiB";
   char rest[80];
   std::snprintf(rest, sizeof rest, "%7.2f  >= 0.9", our_figures.median / raw_figures.median);
@@ -147,6 +168,8 @@ void bench_large(const Hosts& hosts, const std::string& address, Session& sessio
   std::printf("%-44s %47.2f\n", "  one channel beside that",
               our_figures.median / awake_figures.median);
   print_receiver_copies(connector.counters(), bytes);
+  print_row("PConnector::post [MB/s]" + tail, posted_figures);
+  std::printf("%-44s %47.2f\n", "  beside raw TCP", posted_figures.median / raw_figures.median);
   session.remove(id).value();
 }
 
