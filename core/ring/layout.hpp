@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The ring's layout in memory: the ABI between all processes that map one. docs/ring-layout.md
-// explains it byte by byte; tests/unit/ring/layout_test.cpp compares that document with this file.
+// explains it byte by byte; tests/unit/ring/ring_memory_test.cpp has its numbers by hand.
 // Little endian. An incompatible change raises kLayoutVersion.
 //
 //   offset 0       RingHeader, one page; its first part is written once, before anybody maps it
@@ -30,6 +30,23 @@ inline constexpr std::size_t kGuardBytes = 64;
 static_assert(std::atomic<std::int64_t>::is_always_lock_free);
 static_assert(std::atomic<std::uint32_t>::is_always_lock_free);
 
+// More publishers of one stream at a time than anybody has, and few enough to search one by one.
+inline constexpr std::size_t kMaxPublishers = 64;
+
+//   off size field              unit  written by  order
+//     0    8 publisher          -     dssmd       who; before tid_end
+//     8    8 tid_end            tid   dssmd       behind its last sample's tid; 0: this note is
+//     free
+//    16    8 number_end         -     dssmd       behind its last sample's number
+//    24    8 earlier_tid_end    tid   dssmd       the same of the sample before that; 0: none. They
+//    32    8 earlier_number_end -     dssmd       count while tid_end is beyond top + 1
+struct PublisherNote {
+  std::atomic<std::uint64_t> publisher;
+  std::atomic<std::uint64_t> tid_end, number_end;
+  std::atomic<std::uint64_t> earlier_tid_end, earlier_number_end;
+};
+static_assert(sizeof(PublisherNote) == 40);
+
 //   off  size field            unit   written by  order
 //     0     8 magic            -      dssmd       before the first hand-out, as all up to 320
 //     8     4 layout_version   -      dssmd
@@ -51,14 +68,12 @@ static_assert(std::atomic<std::uint32_t>::is_always_lock_free);
 //   384    64 reserved         -      -           zero: keeps the lock's line from top's neighbour
 //   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
 //   520     8 run_start        tid    writer      before top; see "Search by time"
-//   528     8 first            tid    dssmd       before top; > 0 only in mirrors: see "Window"
-//   536     8 owner_tid        tid    dssmd       in remote writers' rings only: which sample of
-//                                                 the owner's ring the last published one became;
-//                                                 see "Window"
-//   544     8 owner_incarnation -     dssmd       of that ring of the owner
-//   552    24 reserved         -      -           zero
-//   576    56 clock            -      dssmd       in mirrors only: see clock_gate.hpp
-//   632  3464 reserved         -      -           zero
+//   528     8 first            tid    dssmd       before top; see "Window"
+//   536    40 reserved         -      -           zero
+//   576    56 clock            -      dssmd       see clock_gate.hpp
+//   632     8 reserved         -      -           zero
+//   640  2560 publishers       -      dssmd       before top: see publisher_notes.hpp
+//  3200   896 reserved         -      -           zero
 struct RingHeader {
   std::uint64_t magic;
   std::uint32_t layout_version;
@@ -84,18 +99,18 @@ struct RingHeader {
   std::atomic<std::int64_t> top;
   std::atomic<std::int64_t> run_start;
   std::atomic<std::int64_t> first;
-  std::atomic<std::int64_t> owner_tid;
-  std::atomic<std::uint64_t> owner_incarnation;
-  std::byte reserved3[24];
+  std::byte reserved3[40];
   ClockGate clock;
-  std::byte reserved4[3464];
+  std::byte reserved4[8];
+  PublisherNote publishers[kMaxPublishers];
+  std::byte reserved5[896];
 };
 static_assert(sizeof(pthread_mutex_t) <= 64);
 static_assert(offsetof(RingHeader, incarnation) == 64 && offsetof(RingHeader, name) == 88);
 static_assert(offsetof(RingHeader, host) == 128 && offsetof(RingHeader, lock) == 320);
 static_assert(offsetof(RingHeader, top) == 512 && offsetof(RingHeader, run_start) == 520);
-static_assert(offsetof(RingHeader, first) == 528 && offsetof(RingHeader, owner_tid) == 536);
-static_assert(offsetof(RingHeader, clock) == 576);
+static_assert(offsetof(RingHeader, first) == 528 && offsetof(RingHeader, clock) == 576);
+static_assert(offsetof(RingHeader, publishers) == 640);
 static_assert(sizeof(RingHeader) == kPageBytes);
 
 //   off size field           unit  written by  order

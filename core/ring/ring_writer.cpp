@@ -76,12 +76,14 @@ Tid RingWriter::commit(Time time, Duration clock_error) noexcept {
   return write_locked(payload, time, clock_error);
 }
 
-RingWriter::Attempt RingWriter::try_write(std::span<const std::byte> payload, Time time,
-                                          Duration clock_error) noexcept {
+RingWriter::Attempt RingWriter::try_publish(const PublishedSample& sample,
+                                            std::span<const std::byte> payload, Time time,
+                                            Duration clock_error) noexcept {
   RingHeader& header = publisher_.header();
   const LockResult result = try_lock_robust(header.lock);
   if (result == LockResult::busy) return {Attempt::Outcome::busy, kNoTid};
   if (!take(result)) return {Attempt::Outcome::refused, kNoTid};
+  PublisherNotes(header).note(sample, newest() + 1);
   return {Attempt::Outcome::written, write_locked(payload, time, clock_error)};
 }
 

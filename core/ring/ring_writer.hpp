@@ -9,6 +9,7 @@
 #include <span>
 
 #include "core/ring/bell.hpp"
+#include "core/ring/publisher_notes.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "core/ring/robust_lock.hpp"
 #include "core/ring/sample_publisher.hpp"
@@ -33,7 +34,8 @@ class RingWriter {
     return lock() ? write_locked(payload, time, clock_error()) : kNoTid;
   }
 
-  // The same without waiting for another writer: for dssmd, whose loop must not wait for a program.
+  // Writes one sample for somebody on another PC and notes how far that one is by it
+  // (PublisherNotes). Does not wait for another writer: dssmd's loop must not wait for a program.
   struct Attempt {
     enum class Outcome : unsigned char {
       written,
@@ -42,7 +44,8 @@ class RingWriter {
     } outcome;
     Tid tid;
   };
-  Attempt try_write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
+  Attempt try_publish(const PublishedSample& sample, std::span<const std::byte> payload, Time time,
+                      Duration clock_error) noexcept;
 
   // In place: begin() takes the lock and gives the next slot's payload (nullptr when this thread
   // holds it already); then exactly one of commit() and cancel(), in the same thread.

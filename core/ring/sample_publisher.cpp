@@ -2,6 +2,7 @@
 #include "core/ring/sample_publisher.hpp"
 
 #include "core/ring/copy.hpp"
+#include "core/ring/publisher_notes.hpp"
 #include "core/ring/time_search.hpp"
 
 namespace dssm::ring {
@@ -66,7 +67,8 @@ SamplePublisher::SamplePublisher(const RingMapping& mapping) noexcept
   header_->top.store(tid, std::memory_order_seq_cst);
 }
 
-// The dead writer may have begun a run, or crossed a gap, with the sample that it did not finish.
+// The dead writer may have begun a run, crossed a gap, or noted its publisher with the sample that
+// it did not finish.
 // Its slot needs no repair: it is outside of the window, and the next sample of that tid fills it
 // anew.
 void SamplePublisher::recover() const noexcept {
@@ -76,6 +78,7 @@ void SamplePublisher::recover() const noexcept {
   if (header_->first.load(std::memory_order_relaxed) > top) {
     header_->first.store(top < 0 ? 0 : top, std::memory_order_release);
   }
+  PublisherNotes(*header_).recover();
 }
 
 [[gnu::hot]] void SamplePublisher::expect_next(Tid tid) const noexcept {

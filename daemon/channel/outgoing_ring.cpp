@@ -2,6 +2,7 @@
 #include "daemon/channel/outgoing_ring.hpp"
 
 #include <algorithm>
+#include <string>
 #include <utility>
 
 #include "daemon/channel/sample_pump.hpp"
@@ -26,8 +27,7 @@ Result<std::unique_ptr<OutgoingRing>> OutgoingRing::make(const StreamInfo& their
   ring::RingHeader& header = (*made)->mapping_->header();
   header.top.store(theirs.newest, std::memory_order_relaxed);
   header.run_start.store(theirs.newest + 1, std::memory_order_relaxed);
-  (*made)->set_next(theirs.newest + 1);
-  (*made)->set_owner(theirs.incarnation, theirs.newest);
+  header.first.store(theirs.newest + 1, std::memory_order_relaxed);
   return made;
 }
 
@@ -46,28 +46,15 @@ Tid OutgoingRing::next_untrusted() const noexcept {
   return std::clamp<Tid>(next, 0, newest_untrusted() + 1);
 }
 
-void OutgoingRing::set_next(Tid next) noexcept {
-  mapping_->header().first.store(next, std::memory_order_relaxed);
-}
-
-std::uint64_t OutgoingRing::owner_incarnation_untrusted() const noexcept {
-  return mapping_->header().owner_incarnation.load(std::memory_order_relaxed);
-}
-
-Tid OutgoingRing::owner_tid_untrusted() const noexcept {
-  return std::clamp(mapping_->header().owner_tid.load(std::memory_order_relaxed), kNoTid, kLastTid);
-}
-
-// A dssmd that dies in between leaves kNoTid behind, which does no harm.
-void OutgoingRing::set_owner(std::uint64_t incarnation, Tid tid) noexcept {
-  ring::RingHeader& header = mapping_->header();
-  header.owner_tid.store(kNoTid, std::memory_order_relaxed);
-  header.owner_incarnation.store(incarnation, std::memory_order_release);
-  header.owner_tid.store(tid, std::memory_order_release);
-}
-
-void OutgoingRing::set_owner_tid(Tid tid) noexcept {
-  mapping_->header().owner_tid.store(tid, std::memory_order_relaxed);
+Result<void> OutgoingRing::note_published_untrusted(Tid last) {
+  const Tid next = next_untrusted(), newest = newest_untrusted();
+  if (last < next - 1 || last > newest) {
+    return Error{Errc::protocol, "it says that our sample " + std::to_string(last) +
+                                     " is written, and ours to be published are " +
+                                     std::to_string(next) + " to " + std::to_string(newest)};
+  }
+  mapping_->header().first.store(last + 1, std::memory_order_relaxed);
+  return {};
 }
 
 }  // namespace dssm::daemon

@@ -2,9 +2,8 @@
 //
 // The local ring of a remote writer. Programs write to it as to any ring; dssmd publishes what they
 // wrote into the owner's stream. Nobody reads it, so dssmd uses the header's `first` for the sample
-// that is to be published next, and beside it which sample of the owner's ring the last one became:
-// the ring alone, offered back after a crash of dssmd, says where to go on and, by its incarnation,
-// as which publisher.
+// that is to be published next: the ring alone, offered back after a crash of dssmd, says where to
+// go on and, by its incarnation, as which publisher.
 //
 // The ring begins where the owner's stream is at that moment. So the tid that write() returns is
 // the one that the sample gets in the owner's ring, as long as nobody else writes to that stream
@@ -45,16 +44,11 @@ class OutgoingRing {
   // behind the newest one.
   Tid next_untrusted() const noexcept;
   Tid newest_untrusted() const noexcept;
-  // Samples before `next` are in the owner's ring, or lost.
-  void set_next(Tid next) noexcept;
   bool all_published() const noexcept { return next_untrusted() > newest_untrusted(); }
 
-  // In the owner's ring of that incarnation, sample next() - 1 is this one, or one before it, or it
-  // was lost. kNoTid: nothing is known.
-  std::uint64_t owner_incarnation_untrusted() const noexcept;
-  Tid owner_tid_untrusted() const noexcept;
-  void set_owner(std::uint64_t incarnation, Tid tid) noexcept;
-  void set_owner_tid(Tid tid) noexcept;
+  // Samples up to `last` are in the owner's ring, or lost.
+  //   fails  protocol: that was not sent, or was known
+  Result<void> note_published_untrusted(Tid last);
 
  private:
   OutgoingRing(std::shared_ptr<Stream> stream, std::shared_ptr<const ring::RingMapping> mapping)

@@ -14,7 +14,7 @@
 namespace dssm::daemon {
 namespace {
 
-constexpr std::uint64_t kOpenSerial = 1;
+constexpr std::uint64_t kOpenSerial = 1, kStartSerial = 2;
 
 // A link that is too slow for its writer loses samples all the time.
 constexpr Duration kLossLinePause = std::chrono::seconds(10);
@@ -86,9 +86,7 @@ Result<void> RemoteWriter::on_frame(net::Frame& frame) {
     case net::Frame::kOpened:
       return on_opened_untrusted(frame.opened());
     case net::Frame::kPublishing:
-    case net::Frame::kRange:
-    case net::Frame::kNoSample:
-      return on_start_untrusted(frame);
+      return on_publishing_untrusted(frame.publishing());
     case net::Frame::kPublished:
       return on_published_untrusted(frame.published());
     case net::Frame::kEnded:
@@ -115,8 +113,10 @@ Result<void> RemoteWriter::on_opened_untrusted(const net::Opened& opened) {
   removed_ = false;
   answer_waiting(opened.created());
   step_ = Step::starting;
-  channel_.link()->take_samples(theirs->type.payload_bytes, *this);
-  channel_.link()->send(point_->start());
+  net::Frame start;
+  start.set_serial(kStartSerial);
+  start.mutable_start_publishing()->set_publisher(ring_->publisher());
+  channel_.link()->send(start);
   return {};
 }
 
@@ -131,9 +131,7 @@ Result<void> RemoteWriter::follow(const StreamInfo& theirs) {
   }
   Result<std::unique_ptr<OutgoingRing>> ring = OutgoingRing::make(theirs, parts_.registry.budget());
   if (!ring) return std::move(ring).error().context("write to '" + name_ + "'");
-  if (Result<void> taken = take_ring(*std::move(ring)); !taken) return taken;
-  point_->begin();
-  return {};
+  return take_ring(*std::move(ring));
 }
 
 Result<void> RemoteWriter::take_ring(std::unique_ptr<OutgoingRing> ring) {
@@ -141,7 +139,6 @@ Result<void> RemoteWriter::take_ring(std::unique_ptr<OutgoingRing> ring) {
   if (!feed) return std::move(feed).error().context("write to '" + name_ + "'");
   feed_ = *std::move(feed);
   ring_ = std::move(ring);
-  point_.emplace(*ring_);
   return {};
 }
 
@@ -167,36 +164,15 @@ void RemoteWriter::on_refused(const Error& why) {
 
 // --- publishing ----------------------------------------------------------------------------------
 
-Result<void> RemoteWriter::on_start_untrusted(const net::Frame& frame) {
-  if (step_ != Step::starting) return untimely("an answer");
-  switch (frame.body_case()) {
-    case net::Frame::kPublishing:
-      return go_on(point_->on_publishing_untrusted(frame.publishing()));
-    case net::Frame::kRange:
-      return go_on(point_->on_range_untrusted(frame.range()));
-    default:
-      return go_on(point_->on_no_sample());
+Result<void> RemoteWriter::on_publishing_untrusted(const net::Publishing& publishing) {
+  if (step_ != Step::starting) return untimely("Publishing");
+  // Less than we know of: its ring is another one, or 64 others published since. We go on.
+  if (publishing.last() >= ring_->next_untrusted()) {
+    if (Result<void> noted = ring_->note_published_untrusted(publishing.last()); !noted) {
+      return noted;
+    }
   }
-}
-
-// Only what PublishingPoint asks for; it looks at the stamps.
-Result<void> RemoteWriter::on_sample_begin(const wire::IncomingSample&, std::byte*& out) {
-  if (step_ != Step::starting) return untimely("a sample");
-  out = nullptr;
-  return {};
-}
-
-Result<void> RemoteWriter::on_sample_end(const wire::IncomingSample& sample, bool torn) {
-  return go_on(torn ? point_->on_no_sample() : point_->on_sample(sample.info));
-}
-
-Result<void> RemoteWriter::go_on(const Result<PublishingPoint::Request>& next) {
-  if (!next) return next.error();
-  if (*next) {
-    channel_.link()->send(**next);
-  } else {
-    start_publishing();
-  }
+  start_publishing();
   return {};
 }
 
@@ -236,7 +212,7 @@ void RemoteWriter::stop_publishing() noexcept {
 
 Result<void> RemoteWriter::on_published_untrusted(const net::Published& published) {
   if (step_ != Step::publishing) return untimely("Published");
-  if (Result<void> noted = point_->on_published_untrusted(published); !noted) return noted;
+  if (Result<void> noted = ring_->note_published_untrusted(published.last()); !noted) return noted;
   if (!lender_.any_lent()) drain_timer_.enable_in(Duration::zero());
   return {};
 }

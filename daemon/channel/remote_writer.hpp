@@ -6,8 +6,8 @@
 //   ring     programs write to it without waiting for anybody; what the link does not carry at the
 //            moment stays there, and what it no longer holds when its turn comes is counted and
 //            told in the log
-//   once     samples are numbered by their local tids, so that the owner can say, after a cut,
-//            where it stopped (PublishingPoint has the case where it has forgotten)
+//   once     samples are numbered by their local tids, and the owner notes in its ring how far we
+//            are by it, so that it can say, after a cut, where to go on
 //   end      when the programs have closed it and everything is published, at most kDrainTimeout
 //            later
 //   removed  a stream that somebody removes at its owner stays removed until somebody creates it
@@ -25,7 +25,6 @@
 #include "daemon/channel/lender.hpp"
 #include "daemon/channel/outgoing_ring.hpp"
 #include "daemon/channel/owner_channel.hpp"
-#include "daemon/channel/publishing_point.hpp"
 #include "daemon/channel/remote_writer_keeper.hpp"
 #include "daemon/channel/sample_pump.hpp"
 #include "daemon/channel/sample_sender.hpp"
@@ -34,7 +33,6 @@
 namespace dssm::daemon {
 
 class RemoteWriter final : private OwnerChannel::User,
-                           private FrameLink::SampleSink,
                            private StreamFeed::Listener,
                            private SamplePump::Events {
  public:
@@ -87,9 +85,6 @@ class RemoteWriter final : private OwnerChannel::User,
   void on_output_empty() override { publish(); }
   void on_down(const Error& why) override;
   void on_anew() override;
-  // FrameLink::SampleSink
-  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
-  Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   // StreamFeed::Listener, SamplePump::Events
   void on_news() override { publish(); }
   void on_gap(Tid first, std::uint64_t count) override;
@@ -98,8 +93,7 @@ class RemoteWriter final : private OwnerChannel::User,
   Result<void> on_opened_untrusted(const net::Opened& opened);
   Result<void> follow(const StreamInfo& theirs);
   Result<void> take_ring(std::unique_ptr<OutgoingRing> ring);
-  Result<void> on_start_untrusted(const net::Frame& frame);
-  Result<void> go_on(const Result<PublishingPoint::Request>& next);
+  Result<void> on_publishing_untrusted(const net::Publishing& publishing);
   Result<void> on_published_untrusted(const net::Published& published);
   void start_publishing();
   void publish();
@@ -134,7 +128,6 @@ class RemoteWriter final : private OwnerChannel::User,
 
   std::unique_ptr<OutgoingRing> ring_;
   std::shared_ptr<StreamFeed> feed_;
-  std::optional<PublishingPoint> point_;
   bool may_tear_ = false;  // the owner has the feature "torn"
   std::optional<SampleSender> sender_;
   std::optional<SamplePump> pump_;

@@ -46,7 +46,7 @@ Result<void> SampleReceiver::on_sample_begin(const wire::IncomingSample& sample,
 
 // Also samples of a stream that was removed are dropped: nobody will find them.
 bool SampleReceiver::is_done_with(const wire::IncomingSample& sample) {
-  return sample.info.tid <= last().last || stream_.stream().removed();
+  return sample.info.tid <= last().number || stream_.stream().removed();
 }
 
 Result<void> SampleReceiver::on_sample_end(const wire::IncomingSample& sample, bool torn) {
@@ -72,8 +72,9 @@ Result<void> SampleReceiver::write() {
     note_done();
     return {};
   }
-  const ring::RingWriter::Attempt attempt = writer_->writer().try_write(
-      std::as_const(payload_).span(), sample_.info.time, sample_.info.clock_error);
+  const ring::RingWriter::Attempt attempt =
+      writer_->writer().try_publish({publisher_, sample_.info.tid}, std::as_const(payload_).span(),
+                                    sample_.info.time, sample_.info.clock_error);
   switch (attempt.outcome) {
     case Outcome::written:
       break;
@@ -91,7 +92,6 @@ Result<void> SampleReceiver::write() {
   }
   retry_ = kFirstRetry;
   written_ = true;
-  stream_.publishers().written(publisher_, sample_.info.tid, attempt.tid);
   note_done();
   return {};
 }
@@ -105,11 +105,11 @@ void SampleReceiver::try_again() {
 }
 
 void SampleReceiver::answer(std::uint64_t serial) {
-  const PublisherTable::Entry entry = last();
+  const ring::PublisherNotes::Last written = last();
   net::Frame frame;
   frame.set_serial(serial);
-  frame.mutable_published()->set_last(entry.last);
-  frame.mutable_published()->set_last_tid(entry.last_tid);
+  frame.mutable_published()->set_last(written.number);
+  frame.mutable_published()->set_last_tid(written.tid);
   link_.send(frame);
 }
 

@@ -35,7 +35,9 @@ class SampleReceiver {
   SampleReceiver& operator=(const SampleReceiver&) = delete;
 
   // Where the publisher stopped.
-  PublisherTable::Entry last() { return stream_.publishers().get(publisher_); }
+  ring::PublisherNotes::Last last() const noexcept {
+    return writer_->publishers().last_untrusted(publisher_);
+  }
 
   // As FrameLink::User.
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out);

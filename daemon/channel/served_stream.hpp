@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What all channels of one stream share: the feed that tells of new samples, the way to write, and
-// where its publishers stopped. The first two are there only while somebody uses them.
+// What all channels of one stream share: the feed that tells of new samples, and the way to write.
+// They are there only while somebody uses them.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -10,8 +10,8 @@
 
 #include "core/ring/bell.hpp"
 #include "core/ring/clock_gate.hpp"
+#include "core/ring/publisher_notes.hpp"
 #include "core/ring/ring_writer.hpp"
-#include "daemon/channel/publisher_table.hpp"
 #include "daemon/channel/stream_feed.hpp"
 #include "daemon/service/event_loop.hpp"
 #include "daemon/streams/stream.hpp"
@@ -27,6 +27,7 @@ class OwnWriter {
 
   // Without doorbell: who writes by it calls the feed.
   ring::RingWriter& writer() noexcept { return writer_; }
+  ring::PublisherNotes publishers() noexcept { return ring::PublisherNotes(mapping_->header()); }
   ring::ClockGate& clock_gate() noexcept { return mapping_->header().clock; }
 
  private:
@@ -44,7 +45,6 @@ class ServedStream {
   ServedStream& operator=(const ServedStream&) = delete;
 
   Stream& stream() const noexcept { return *stream_; }
-  PublisherTable& publishers() noexcept { return publishers_; }
 
   // Fail with os errors (descriptors or address space run out).
   Result<std::shared_ptr<StreamFeed>> feed();
@@ -60,7 +60,6 @@ class ServedStream {
  private:
   const EventLoop& loop_;
   std::shared_ptr<Stream> stream_;
-  PublisherTable publishers_;
   std::weak_ptr<StreamFeed> feed_;
   std::weak_ptr<OwnWriter> writer_;
   std::shared_ptr<OwnWriter> judging_;  // once its times are judged

@@ -317,11 +317,11 @@ Result<void> StreamChannel::start_publishing(std::uint64_t serial,
   if (!receiver) return std::move(receiver).error();
   receiver_ = *std::move(receiver);
   if (Result<void> judged = judge_writer(); !judged) return judged;
-  const PublisherTable::Entry last = receiver_->last();
+  const ring::PublisherNotes::Last last = receiver_->last();
   net::Frame frame = answer_to(serial);
   net::Publishing& publishing = *frame.mutable_publishing();
-  publishing.set_last(last.last);
-  publishing.set_last_tid(last.last_tid);
+  publishing.set_last(last.number);
+  publishing.set_last_tid(last.tid);
   publishing.set_incarnation(stream().incarnation());
   parts_.link.send(frame);
   return {};

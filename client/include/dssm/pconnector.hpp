@@ -14,8 +14,7 @@
 //   trouble  when the connection breaks, calls reconnect (at most request_timeout, then
 //            daemon_away; next(), post() and fd() never wait for it), subscriptions resume at the
 //            tid they had, and posted samples are sent again from where the owner stopped: each is
-//            written once (only a dssmd that is killed after writing and before saying so makes
-//            the last ones come twice)
+//            written once, also when the owner's dssmd is killed
 //   anew     when the owner's ring was replaced by a new one, whose tids begin anew, the next read
 //            returns `restarted`, once; next() after all that came of the old ring
 //   fork     a child must open a PConnector of its own

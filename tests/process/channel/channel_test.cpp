@@ -196,6 +196,32 @@ TEST_F(Channel, WritesEachPublishedSampleOnceThoughConnectionsBreakAnywhere) {
   EXPECT_EQ(judge.samples, static_cast<std::uint64_t>(kSamples));
 }
 
+// Killed before it said so: the next dssmd gets the ring back, and knows it from there.
+TEST_F(Channel, SaysAfterARestartWhatWasWrittenBefore) {
+  constexpr std::int64_t kSamples = 10'000;
+  LocalWriter program(local_, "once", 40, 16);  // keeps the ring
+  net::Frame start;
+  start.mutable_start_publishing()->set_publisher(77);
+  std::int64_t last = -1;
+  for (int life = 0; life < 3; ++life) {
+    RawClient local(daemon_.socket_path());
+    if (life > 0) program.offer(local);
+    RawPeer peer(daemon_.address());
+    peer.open("once");
+    const net::Publishing publishing = peer.ask(start).frame.publishing();
+    EXPECT_EQ(publishing.last(), last);
+    EXPECT_EQ(publishing.last_tid(), last);
+    const std::int64_t end = last + 1 + kSamples;
+    for (std::int64_t number = last + 1; number < end; ++number) {
+      peer.send_sample(number, std::vector<std::byte>(40), time_from_ns(number));
+    }
+    last = end - 1;
+    ASSERT_TRUE(eventually([&] { return program.newest() == last; }));
+    daemon_.kill_hard();
+    daemon_.start();
+  }
+}
+
 TEST_F(Channel, WakesLocalReadersOfWhatIsPublished) {
   RawPeer publisher(daemon_.address());
   publisher.create("wake", 16, 8);

@@ -170,7 +170,7 @@ net::Frame subscribe_from_oldest() {
 
 LocalWriter::LocalWriter(RawClient& client, const std::string& name, std::uint64_t payload_bytes,
                          std::uint64_t depth)
-    : payload_(payload_bytes) {
+    : name_(name), payload_(payload_bytes) {
   local::Request request = create_request(name, depth);
   request.mutable_create()->mutable_type()->clear_name();
   request.mutable_create()->mutable_type()->set_payload_bytes(payload_bytes);
@@ -180,6 +180,11 @@ LocalWriter::LocalWriter(RawClient& client, const std::string& name, std::uint64
   mapping_ =
       ring::RingMapping::open_untrusted(descriptors_.at(0).get(), ring::Access::read_write).value();
   bell_ = ring::Bell::open_untrusted(descriptors_.at(1).get()).value();
+}
+
+void LocalWriter::offer(RawClient& client) const {
+  const Answer answer = client.ask(offer_request(name_, true), numbers(descriptors_));
+  EXPECT_TRUE(answer.response.has_opened()) << answer.response.failure().message();
 }
 
 Tid LocalWriter::write() {

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
+#include "core/ring/ring_reader.hpp"
 #include "core/ring/ring_writer.hpp"
 #include "core/wire/frame_decoder.hpp"
 #include "core/wire/network_protocol.hpp"
@@ -82,8 +83,12 @@ class LocalWriter {
     for (int i = 0; i < count; ++i) write();
   }
   std::size_t payload_bytes() const { return payload_.size(); }
+  Tid newest() const { return ring::RingReader(*mapping_).newest(); }
+  // Gives the stream back to a dssmd that was restarted; `client` stays open as long as this.
+  void offer(RawClient& client) const;
 
  private:
+  std::string name_;
   std::vector<UniqueFd> descriptors_;
   std::shared_ptr<const ring::RingMapping> mapping_;
   std::shared_ptr<ring::Bell> bell_;

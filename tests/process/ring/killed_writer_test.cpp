@@ -55,21 +55,34 @@ struct Deaths {
   int rings_checked = 0;
 };
 
-Deaths die_at_every_instruction(TimeOf time_of) {
+constexpr std::uint64_t kPublisher = 77;
+enum class Publishes { no, known, unknown };  // as dssmd, for a publisher that wrote before or not
+
+Deaths die_at_every_instruction(TimeOf time_of, Publishes publishes = Publishes::no,
+                                int stride = kStride) {
   const TestRing ring(kPayloadBytes, 5);
   const RingReader reader = ring.reader();
+  const PublisherNotes notes(ring.mapping->header());
   RingWriter survivor = ring.writer();
+  if (publishes == Publishes::known) {
+    survivor.try_publish({kPublisher, 7}, payload_for(0, kPayloadBytes), {}, {});
+  }
   Deaths deaths;
   bool finished = false;
-  for (int steps = 0; !finished; steps += kStride) {
+  for (int steps = 0; !finished; steps += stride) {
     const Tid next = reader.newest() + 1;
+    const std::int64_t number = notes.last_untrusted(kPublisher).number + 1;
     const auto payload = payload_for(next, kPayloadBytes);
     const pid_t child = ::fork();
     if (child == 0) {
       RingWriter writer = ring.writer();
       ::ptrace(PTRACE_TRACEME, 0, nullptr, nullptr);
       ::raise(SIGSTOP);
-      writer.write(payload, time_from_ns(time_of(next)), Duration(0));
+      if (publishes != Publishes::no) {
+        writer.try_publish({kPublisher, number}, payload, time_from_ns(time_of(next)), Duration(0));
+      } else {
+        writer.write(payload, time_from_ns(time_of(next)), Duration(0));
+      }
       ::_exit(0);
     }
     int status = 0;
@@ -87,10 +100,18 @@ Deaths die_at_every_instruction(TimeOf time_of) {
     // The next writer gets the lock at once and continues the tids.
     const Tid expected = reader.newest() + 1;
     EXPECT_TRUE(expected == next || expected == next + 1);
+    // It is known whose sample that was exactly when it is there.
+    const auto expect_noted = [&] {
+      if (publishes == Publishes::no) return;
+      EXPECT_EQ(notes.last_untrusted(kPublisher).number, expected == next ? number - 1 : number);
+      EXPECT_LT(notes.last_untrusted(kPublisher).tid, expected);
+    };
+    expect_noted();
     EXPECT_EQ(survivor.write(payload_for(expected, kPayloadBytes), time_from_ns(time_of(expected)),
                              Duration(0)),
               expected);
     expect_whole(reader);
+    expect_noted();
     if (testing::Test::HasFailure()) {
       std::printf("after %d instructions\n", steps);
       return deaths;
@@ -115,6 +136,18 @@ TEST(KilledWriter, LeavesARingInOrderAtEveryInstructionOfAStepBackwards) {
               deaths.instructions);
   EXPECT_GT(deaths.rings_checked, 5);
   EXPECT_GT(deaths.instructions, 100);
+}
+
+TEST(KilledWriter, KnowsAtEveryInstructionWhetherWhatItPublishesIsWritten) {
+  const Deaths known = die_at_every_instruction(forwards, Publishes::known);
+  // To find that out takes many more instructions, which change nothing.
+  const Deaths unknown = die_at_every_instruction(forwards, Publishes::unknown, 5 * kStride);
+  for (const Deaths& deaths : {known, unknown}) {
+    std::printf("killed at %d places of %d instructions\n", deaths.rings_checked,
+                deaths.instructions);
+    EXPECT_GT(deaths.instructions, 100);
+  }
+  EXPECT_GT(known.rings_checked, 5);
 }
 
 TEST(KilledWriter, LeavesARingInOrderAtThousandsOfRandomMoments) {

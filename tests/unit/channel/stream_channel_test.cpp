@@ -347,6 +347,33 @@ TEST_F(StreamChannelTest, WritesEachSampleOnceOverReconnects) {
   EXPECT_EQ(rig.ask(again, frame).publishing().last(), -1) << "another publisher";
 }
 
+// The ring outlives dssmd, and what stands in it about publishers does.
+TEST_F(StreamChannelTest, KnowsPublishersOfARingThatIsOfferedBack) {
+  start_publishing(11);
+  for (const std::int64_t number : {0, 3, 4}) peer.put(sample_frame(number));
+  rig.turns();
+  take();
+  ServerRig next;
+  const std::shared_ptr<Stream> same =
+      next.registry
+          .adopt_untrusted({"odometry", 0, ""},
+                           as_offer(stream->descriptors_for(Role::writer).value()))
+          .value();
+  FakePeer again;
+  next.connect(again);
+  next.open(again, "odometry");
+  net::Frame frame = request(70);
+  frame.mutable_start_publishing()->set_publisher(11);
+  const net::Frame answer = next.ask(again, frame);
+  EXPECT_EQ(answer.publishing().last(), 4);
+  EXPECT_EQ(answer.publishing().last_tid(), 2);
+  again.put(sample_frame(4));
+  again.put(sample_frame(5));
+  next.turns();
+  EXPECT_EQ(words(next.take(again, kBytes)), "published:4=2 published:5=3");
+  EXPECT_EQ(same->info().newest, 3);
+}
+
 // A connection was cut in the middle of a sample, and what was under way arrives after all, while
 // the publisher has gone on by another one.
 TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionComesBack) {

@@ -1,35 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What dssmd remembers about peers: where publishers stopped, and how much it logs about them.
+// What dssmd remembers about peers: what they take, and how much it logs about them.
 #include <gtest/gtest.h>
 
-#include "daemon/channel/publisher_table.hpp"
 #include "daemon/service/calm_logger.hpp"
 #include "tests/unit/channel/server_rig.hpp"
 
 namespace dssm::daemon {
 namespace {
-
-TEST(PublisherTable, KnowsWhereEachStopped) {
-  PublisherTable table;
-  EXPECT_EQ(table.get(5).last, -1);
-  EXPECT_EQ(table.get(5).last_tid, kNoTid);
-  table.written(5, 10, 100);
-  table.written(6, 2, 101);
-  EXPECT_EQ(table.get(5).last, 10);
-  EXPECT_EQ(table.get(5).last_tid, 100);
-  EXPECT_EQ(table.get(6).last, 2);
-}
-
-TEST(PublisherTable, ForgetsTheOneThatWroteLongestAgo) {
-  PublisherTable table;
-  for (std::uint64_t i = 0; i < PublisherTable::kMaxPublishers; ++i) table.written(i, 7, 7);
-  table.written(0, 8, 8);
-  table.written(1000, 1, 9);
-  EXPECT_EQ(table.get(0).last, 8);
-  EXPECT_EQ(table.get(1).last, -1) << "the oldest made room";
-  EXPECT_EQ(table.get(1000).last, 1);
-}
 
 TEST(CalmLogger, PassesSoManyLinesOnAndCountsTheOthers) {
   RecordingLogger to;

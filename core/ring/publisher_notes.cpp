@@ -1,0 +1,81 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// All stores are releases, and loads acquires: a process that is killed has done all that is before
+// some instruction and nothing behind it, so the order in the program is what counts.
+#include "core/ring/publisher_notes.hpp"
+
+#include <algorithm>
+#include <iterator>
+
+namespace dssm::ring {
+namespace {
+
+bool is_of(const PublisherNote& note, std::uint64_t publisher) noexcept {
+  return note.publisher.load(std::memory_order_acquire) == publisher &&
+         note.tid_end.load(std::memory_order_acquire) != 0;
+}
+
+}  // namespace
+
+// Behind the newest sample's tid.
+std::uint64_t PublisherNotes::end() const noexcept {
+  return static_cast<std::uint64_t>(header_->top.load(std::memory_order_acquire)) + 1;
+}
+
+[[gnu::hot]] PublisherNotes::Last PublisherNotes::last_untrusted(
+    std::uint64_t publisher) const noexcept {
+  const PublisherNote* const found =
+      std::find_if(std::begin(header_->publishers), std::end(header_->publishers),
+                   [publisher](const PublisherNote& note) { return is_of(note, publisher); });
+  if (found == std::end(header_->publishers)) return {};
+  const std::uint64_t end = this->end();
+  std::uint64_t tid_end = found->tid_end.load(std::memory_order_acquire);
+  std::uint64_t number_end = found->number_end.load(std::memory_order_acquire);
+  if (tid_end > end) {
+    tid_end = found->earlier_tid_end.load(std::memory_order_acquire);
+    number_end = found->earlier_number_end.load(std::memory_order_acquire);
+  }
+  const Last last{static_cast<std::int64_t>(number_end - 1), static_cast<Tid>(tid_end - 1)};
+  return tid_end == 0 || tid_end > end || last.number < 0 ? Last{} : last;
+}
+
+// The note of `publisher`, or one that is made its own.
+[[gnu::hot]] PublisherNote& PublisherNotes::place_for(std::uint64_t publisher) const noexcept {
+  PublisherNote* oldest = std::begin(header_->publishers);
+  for (PublisherNote& note : header_->publishers) {
+    if (is_of(note, publisher)) return note;
+    if (note.tid_end.load(std::memory_order_acquire) <
+        oldest->tid_end.load(std::memory_order_acquire)) {
+      oldest = &note;
+    }
+  }
+  // From here on it is nobody's, until there is a tid again.
+  oldest->tid_end.store(0, std::memory_order_release);
+  oldest->publisher.store(publisher, std::memory_order_release);
+  return *oldest;
+}
+
+[[gnu::hot]] void PublisherNotes::note(const PublishedSample& sample, Tid tid) const noexcept {
+  PublisherNote& note = place_for(sample.publisher);
+  note.earlier_number_end.store(note.number_end.load(std::memory_order_relaxed),
+                                std::memory_order_release);
+  note.earlier_tid_end.store(note.tid_end.load(std::memory_order_relaxed),
+                             std::memory_order_release);
+  // From here on it is the note of a sample that is not there yet.
+  note.tid_end.store(static_cast<std::uint64_t>(tid) + 1, std::memory_order_release);
+  note.number_end.store(static_cast<std::uint64_t>(sample.number) + 1, std::memory_order_release);
+}
+
+void PublisherNotes::recover() const noexcept {
+  const std::uint64_t end = this->end();
+  for (PublisherNote& note : header_->publishers) {
+    if (note.tid_end.load(std::memory_order_acquire) <= end) continue;
+    // The tid last: whoever is killed in between leaves the note as it was.
+    note.number_end.store(note.earlier_number_end.load(std::memory_order_acquire),
+                          std::memory_order_release);
+    note.tid_end.store(note.earlier_tid_end.load(std::memory_order_acquire),
+                       std::memory_order_release);
+  }
+}
+
+}  // namespace dssm::ring
