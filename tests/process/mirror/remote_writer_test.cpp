@@ -82,6 +82,27 @@ TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonWasKilled) {
   EXPECT_EQ(reader.lost(), 0u);
 }
 
+// Much more is under way, and written, than was acknowledged.
+TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonIsKilledInTheMidstOfABacklog) {
+  constexpr std::int64_t kBacklog = 15'000;
+  auto writer = there.create<Counted>("goal@pc1", kLong).value();
+  auto reader = here.open_reader<Counted>("goal").value();
+  Reading reading(reader);
+  std::int64_t written = 0;
+  for (int round = 0; round < 5; ++round) {
+    ::kill(pc1.pid(), SIGSTOP);
+    for (std::int64_t i = 0; i < kBacklog; ++i) writer.write(counted(written++));
+    const Tid before = reader.newest();
+    ::kill(pc1.pid(), SIGCONT);
+    await([&] { return reader.newest() > before + 1000 * (round + 1); });
+    pc1.kill_hard();
+    pc1.start();
+    reading.await_taken(written);
+  }
+  EXPECT_EQ(reader.newest(), written - 1) << "none twice";
+  EXPECT_EQ(reader.lost(), 0u);
+}
+
 TEST_F(RemoteWriter, CatchesUpWhenItsOwnDaemonWasKilled) {
   auto writer = there.create<Counted>("goal@pc1", kLong).value();
   auto reader = here.open_reader<Counted>("goal").value();
