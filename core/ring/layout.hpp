@@ -30,16 +30,18 @@ inline constexpr std::size_t kGuardBytes = 64;
 static_assert(std::atomic<std::int64_t>::is_always_lock_free);
 static_assert(std::atomic<std::uint32_t>::is_always_lock_free);
 
-// More publishers of one stream at a time than anybody has, and few enough to search one by one.
+// Few enough to search one by one, and more than write to one stream at a time. A PConnector is one
+// for as long as it lives; the one that wrote longest ago makes room.
 inline constexpr std::size_t kMaxPublishers = 64;
 
 //   off size field              unit  written by  order
-//     0    8 publisher          -     dssmd       who; before tid_end
-//     8    8 tid_end            tid   dssmd       behind its last sample's tid; 0: this note is
-//     free
+//     0    8 publisher          -     dssmd       before tid_end
+//     8    8 tid_end            tid   dssmd       behind its last sample's tid; 0: free
 //    16    8 number_end         -     dssmd       behind its last sample's number
-//    24    8 earlier_tid_end    tid   dssmd       the same of the sample before that; 0: none. They
-//    32    8 earlier_number_end -     dssmd       count while tid_end is beyond top + 1
+//    24    8 earlier_tid_end    tid   dssmd       the same of its sample before; 0: none. They
+//    count 32    8 earlier_number_end -     dssmd       while tid_end is beyond top + 1; who gets a
+//    dead
+//                                                 writer's lock puts them back
 struct PublisherNote {
   std::atomic<std::uint64_t> publisher;
   std::atomic<std::uint64_t> tid_end, number_end;

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// All stores are releases, and loads acquires: a process that is killed has done all that is before
-// some instruction and nothing behind it, so the order in the program is what counts.
+// A process that is killed has done all that is before some instruction and nothing behind it, so
+// the order in the program is what counts. The stores are releases so that the compiler keeps it,
+// and so that who reads without the lock while another process takes a note back sees it, too.
 #include "core/ring/publisher_notes.hpp"
 
 #include <algorithm>
@@ -19,7 +20,8 @@ bool is_of(const PublisherNote& note, std::uint64_t publisher) noexcept {
 
 // Behind the newest sample's tid.
 std::uint64_t PublisherNotes::end() const noexcept {
-  return static_cast<std::uint64_t>(header_->top.load(std::memory_order_acquire)) + 1;
+  const Tid top = header_->top.load(std::memory_order_acquire);
+  return top < 0 ? 0 : static_cast<std::uint64_t>(top) + 1;
 }
 
 [[gnu::hot]] PublisherNotes::Last PublisherNotes::last_untrusted(
@@ -28,6 +30,8 @@ std::uint64_t PublisherNotes::end() const noexcept {
       std::find_if(std::begin(header_->publishers), std::end(header_->publishers),
                    [publisher](const PublisherNote& note) { return is_of(note, publisher); });
   if (found == std::end(header_->publishers)) return {};
+  // The end first: a program may take the note back meanwhile and write a sample of its own under
+  // that tid.
   const std::uint64_t end = this->end();
   std::uint64_t tid_end = found->tid_end.load(std::memory_order_acquire);
   std::uint64_t number_end = found->number_end.load(std::memory_order_acquire);

@@ -10,7 +10,6 @@
 // lock puts that back. docs/ring-layout.md "Publishers".
 #pragma once
 
-#include <cstddef>
 #include <cstdint>
 #include <dssm/sample.hpp>
 
@@ -24,7 +23,7 @@ struct PublishedSample {
   std::int64_t number = -1;  // -1: none
 };
 
-// A value; the ring outlives it.
+// A value; the ring, mapped for writing by who notes and recovers, outlives it.
 class PublisherNotes {
  public:
   explicit PublisherNotes(RingHeader& header) noexcept : header_(&header) {}

@@ -67,10 +67,9 @@ SamplePublisher::SamplePublisher(const RingMapping& mapping) noexcept
   header_->top.store(tid, std::memory_order_seq_cst);
 }
 
-// The dead writer may have begun a run, crossed a gap, or noted its publisher with the sample that
-// it did not finish.
-// Its slot needs no repair: it is outside of the window, and the next sample of that tid fills it
-// anew.
+// With the sample that it did not finish the dead writer may have begun a run, crossed a gap, or
+// noted its publisher. Its slot needs no repair: it is outside of the window, and the next sample
+// of that tid fills it anew.
 void SamplePublisher::recover() const noexcept {
   const Tid top = header_->top.load(std::memory_order_relaxed);
   const Tid run_start = top < 0 ? 0 : slots_.slot(top).run_start.load(std::memory_order_relaxed);

@@ -31,7 +31,7 @@ class SamplePublisher {
   // mirrors only) leaves a gap, and what was before it is not readable any more.
   void publish(Tid tid, Time time, Duration clock_error) const noexcept;
 
-  // Sets right what a writer left that died inside publish().
+  // Sets right what a writer left that died before its sample was there.
   void recover() const noexcept;
 
   // Takes the line of the sample after `tid` away from the readers of the last lap, so that the

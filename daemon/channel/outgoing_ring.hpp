@@ -46,8 +46,9 @@ class OutgoingRing {
   Tid newest_untrusted() const noexcept;
   bool all_published() const noexcept { return next_untrusted() > newest_untrusted(); }
 
-  // Samples up to `last` are in the owner's ring, or lost.
-  //   fails  protocol: that was not sent, or was known
+  // Samples up to `last` are in the owner's ring, or lost. An owner may know of less than we do:
+  // its ring is another one by now, or 64 others published into it since.
+  //   fails  protocol: that was not sent
   Result<void> note_published_untrusted(Tid last);
 
  private:

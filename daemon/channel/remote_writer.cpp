@@ -166,12 +166,7 @@ void RemoteWriter::on_refused(const Error& why) {
 
 Result<void> RemoteWriter::on_publishing_untrusted(const net::Publishing& publishing) {
   if (step_ != Step::starting) return untimely("Publishing");
-  // Less than we know of: its ring is another one, or 64 others published since. We go on.
-  if (publishing.last() >= ring_->next_untrusted()) {
-    if (Result<void> noted = ring_->note_published_untrusted(publishing.last()); !noted) {
-      return noted;
-    }
-  }
+  if (Result<void> noted = note_published_untrusted(publishing.last()); !noted) return noted;
   start_publishing();
   return {};
 }
@@ -212,7 +207,11 @@ void RemoteWriter::stop_publishing() noexcept {
 
 Result<void> RemoteWriter::on_published_untrusted(const net::Published& published) {
   if (step_ != Step::publishing) return untimely("Published");
-  if (Result<void> noted = ring_->note_published_untrusted(published.last()); !noted) return noted;
+  return note_published_untrusted(published.last());
+}
+
+Result<void> RemoteWriter::note_published_untrusted(Tid last) {
+  if (Result<void> noted = ring_->note_published_untrusted(last); !noted) return noted;
   if (!lender_.any_lent()) drain_timer_.enable_in(Duration::zero());
   return {};
 }

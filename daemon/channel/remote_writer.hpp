@@ -95,6 +95,7 @@ class RemoteWriter final : private OwnerChannel::User,
   Result<void> take_ring(std::unique_ptr<OutgoingRing> ring);
   Result<void> on_publishing_untrusted(const net::Publishing& publishing);
   Result<void> on_published_untrusted(const net::Published& published);
+  Result<void> note_published_untrusted(Tid last);
   void start_publishing();
   void publish();
   void stop_publishing() noexcept;

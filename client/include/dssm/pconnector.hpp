@@ -14,7 +14,8 @@
 //   trouble  when the connection breaks, calls reconnect (at most request_timeout, then
 //            daemon_away; next(), post() and fd() never wait for it), subscriptions resume at the
 //            tid they had, and posted samples are sent again from where the owner stopped: each is
-//            written once, also when the owner's dssmd is killed
+//            written once, also when the owner's dssmd is killed (but what was under way when a
+//            connection broke comes twice if 64 others wrote to the stream since)
 //   anew     when the owner's ring was replaced by a new one, whose tids begin anew, the next read
 //            returns `restarted`, once; next() after all that came of the old ring
 //   fork     a child must open a PConnector of its own

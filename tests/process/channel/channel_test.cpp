@@ -196,7 +196,7 @@ TEST_F(Channel, WritesEachPublishedSampleOnceThoughConnectionsBreakAnywhere) {
   EXPECT_EQ(judge.samples, static_cast<std::uint64_t>(kSamples));
 }
 
-// Killed before it said so: the next dssmd gets the ring back, and knows it from there.
+// Whatever was acknowledged: the next dssmd gets the ring back, and knows it from there.
 TEST_F(Channel, SaysAfterARestartWhatWasWrittenBefore) {
   constexpr std::int64_t kSamples = 10'000;
   LocalWriter program(local_, "once", 40, 16);  // keeps the ring

@@ -84,7 +84,8 @@ class LocalWriter {
   }
   std::size_t payload_bytes() const { return payload_.size(); }
   Tid newest() const { return ring::RingReader(*mapping_).newest(); }
-  // Gives the stream back to a dssmd that was restarted; `client` stays open as long as this.
+  // Gives the stream back to a dssmd that was restarted. It is this program's while `client` is
+  // connected.
   void offer(RawClient& client) const;
 
  private:

@@ -22,10 +22,14 @@ constexpr std::size_t kPayloadBytes = 64;
 
 // A sanitizer multiplies instructions and the cost of a fork: it gets a sample of them.
 #if defined(DSSM_TSAN) || defined(__SANITIZE_ADDRESS__)
+constexpr bool kSanitized = true;
 constexpr int kStride = 197;
+constexpr int kPublishingStride = 991;
 constexpr int kRounds = 50;
 #else
+constexpr bool kSanitized = false;
 constexpr int kStride = 1;
+constexpr int kPublishingStride = 1;
 constexpr int kRounds = 2000;
 #endif
 
@@ -56,20 +60,19 @@ struct Deaths {
 };
 
 constexpr std::uint64_t kPublisher = 77;
-enum class Publishes { no, known, unknown };  // as dssmd, for a publisher that wrote before or not
 
-Deaths die_at_every_instruction(TimeOf time_of, Publishes publishes = Publishes::no,
-                                int stride = kStride) {
+// publishes: as dssmd for kPublisher, which has written before.
+Deaths die_at_every_instruction(TimeOf time_of, bool publishes = false) {
   const TestRing ring(kPayloadBytes, 5);
   const RingReader reader = ring.reader();
   const PublisherNotes notes(ring.mapping->header());
   RingWriter survivor = ring.writer();
-  if (publishes == Publishes::known) {
+  if (publishes) {
     survivor.try_publish({kPublisher, 7}, payload_for(0, kPayloadBytes), {}, {});
   }
   Deaths deaths;
   bool finished = false;
-  for (int steps = 0; !finished; steps += stride) {
+  for (int steps = 0; !finished; steps += publishes ? kPublishingStride : kStride) {
     const Tid next = reader.newest() + 1;
     const std::int64_t number = notes.last_untrusted(kPublisher).number + 1;
     const auto payload = payload_for(next, kPayloadBytes);
@@ -78,7 +81,7 @@ Deaths die_at_every_instruction(TimeOf time_of, Publishes publishes = Publishes:
       RingWriter writer = ring.writer();
       ::ptrace(PTRACE_TRACEME, 0, nullptr, nullptr);
       ::raise(SIGSTOP);
-      if (publishes != Publishes::no) {
+      if (publishes) {
         writer.try_publish({kPublisher, number}, payload, time_from_ns(time_of(next)), Duration(0));
       } else {
         writer.write(payload, time_from_ns(time_of(next)), Duration(0));
@@ -102,7 +105,7 @@ Deaths die_at_every_instruction(TimeOf time_of, Publishes publishes = Publishes:
     EXPECT_TRUE(expected == next || expected == next + 1);
     // It is known whose sample that was exactly when it is there.
     const auto expect_noted = [&] {
-      if (publishes == Publishes::no) return;
+      if (!publishes) return;
       EXPECT_EQ(notes.last_untrusted(kPublisher).number, expected == next ? number - 1 : number);
       EXPECT_LT(notes.last_untrusted(kPublisher).tid, expected);
     };
@@ -139,15 +142,111 @@ TEST(KilledWriter, LeavesARingInOrderAtEveryInstructionOfAStepBackwards) {
 }
 
 TEST(KilledWriter, KnowsAtEveryInstructionWhetherWhatItPublishesIsWritten) {
-  const Deaths known = die_at_every_instruction(forwards, Publishes::known);
-  // To find that out takes many more instructions, which change nothing.
-  const Deaths unknown = die_at_every_instruction(forwards, Publishes::unknown, 5 * kStride);
-  for (const Deaths& deaths : {known, unknown}) {
-    std::printf("killed at %d places of %d instructions\n", deaths.rings_checked,
-                deaths.instructions);
-    EXPECT_GT(deaths.instructions, 100);
+  const Deaths deaths = die_at_every_instruction(forwards, true);
+  std::printf("killed at %d places of %d instructions\n", deaths.rings_checked,
+              deaths.instructions);
+  EXPECT_GT(deaths.rings_checked, 5);
+  EXPECT_GT(deaths.instructions, 100);
+}
+
+// What a writer changes in a ring's header, step by step.
+struct HeaderState {
+  explicit HeaderState(const RingHeader& header) : top(header.top.load()) {
+    std::memcpy(notes, header.publishers, sizeof notes);
   }
-  EXPECT_GT(known.rings_checked, 5);
+  bool operator==(const HeaderState& other) const {
+    return top == other.top && std::memcmp(notes, other.notes, sizeof notes) == 0;
+  }
+  Tid top;
+  std::byte notes[sizeof(RingHeader::publishers)];
+};
+
+// Runs `act` in a child and kills it right after its `changes`-th change to the header, which is as
+// good as at each instruction until the next one. Returns whether it came to its end before.
+template <class Act>
+bool finishes_before(int changes, const RingHeader& header, Act act) {
+  const pid_t child = ::fork();
+  if (child == 0) {
+    ::ptrace(PTRACE_TRACEME, 0, nullptr, nullptr);
+    ::raise(SIGSTOP);
+    act();
+    ::_exit(0);
+  }
+  int status = 0;
+  ::waitpid(child, &status, 0);
+  for (HeaderState before(header); WIFSTOPPED(status) && changes > 0;) {
+    ::ptrace(PTRACE_SINGLESTEP, child, nullptr, nullptr);
+    ::waitpid(child, &status, 0);
+    const HeaderState now(header);
+    if (!(now == before)) --changes;
+    before = now;
+  }
+  if (WIFEXITED(status)) return true;
+  ::kill(child, SIGKILL);
+  ::waitpid(child, &status, 0);
+  return false;
+}
+
+class KilledDaemon : public testing::Test {
+ protected:
+  void SetUp() override {
+    if (kSanitized) {
+      GTEST_SKIP() << "each instruction is looked at, and a sanitizer multiplies them; a plain "
+                      "build runs this";
+    }
+  }
+  void write() { survivor.write(payload, {}, Duration(0)); }
+  void publish(std::uint64_t publisher, std::int64_t number) {
+    RingWriter writer = ring.writer();
+    writer.try_publish({publisher, number}, payload, {}, Duration(0));
+  }
+  std::int64_t last(std::uint64_t publisher) const {
+    return notes.last_untrusted(publisher).number;
+  }
+
+  const TestRing ring{kPayloadBytes, 5};
+  const RingHeader& header = ring.mapping->header();
+  const PublisherNotes notes{ring.mapping->header()};
+  RingWriter survivor = ring.writer();
+  const std::vector<std::byte> payload = payload_for(0, kPayloadBytes);
+};
+
+TEST_F(KilledDaemon, DoesNotTakeForANewPublishersWhatAForgottenOneWrote) {
+  for (std::uint64_t i = 0; i < kMaxPublishers; ++i) publish(i, 1000);
+  int changes = 0;
+  for (bool finished = false; !finished;) {
+    const std::uint64_t fresh = 1'000'000 + static_cast<std::uint64_t>(++changes);
+    const Tid before = ring.reader().newest();
+    finished = finishes_before(changes, header, [&] { publish(fresh, 5); });
+    const std::int64_t expected = ring.reader().newest() > before ? 5 : -1;
+    EXPECT_EQ(last(fresh), expected) << "after " << changes << " changes";
+    write();
+    EXPECT_EQ(last(fresh), expected) << "after " << changes << " changes";
+    publish(2'000'000 + static_cast<std::uint64_t>(changes), 1000);  // no note stays free
+  }
+  EXPECT_GT(changes, 5);
+}
+
+// And the one who recovers what a dssmd has left dies as well.
+TEST_F(KilledDaemon, IsRecoveredByWritersThatDieToo) {
+  publish(kPublisher, 7);
+  int changes = 0;
+  for (bool finished = false; !finished;) {
+    const pid_t daemon = ::fork();
+    if (daemon == 0) {
+      RingWriter writer = ring.writer();
+      writer.begin();
+      notes.note({kPublisher, 8}, writer.newest() + 1);
+      ::_exit(0);  // with the lock
+    }
+    int status = 0;
+    ::waitpid(daemon, &status, 0);
+    finished = finishes_before(++changes, header, [&] { write(); });
+    EXPECT_EQ(last(kPublisher), 7) << "after " << changes << " changes";
+    write();
+    EXPECT_EQ(last(kPublisher), 7) << "after " << changes << " changes";
+  }
+  EXPECT_GT(changes, 3);
 }
 
 TEST(KilledWriter, LeavesARingInOrderAtThousandsOfRandomMoments) {

@@ -107,11 +107,10 @@ class FakeOwner final : private FrameLink::User, private FrameLink::SampleSink {
     frame.mutable_ended()->set_removed(true);
     send(frame);
   }
-  void sample(const SampleInfo& info, const std::vector<std::byte>& payload, bool torn = false,
-              std::uint64_t serial = 0) {
+  void sample(const SampleInfo& info, const std::vector<std::byte>& payload, bool torn = false) {
     std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
     const std::size_t bytes =
-        wire::encode_sample_header(header, serial, info, payload.size(), wire::Trailer::torn);
+        wire::encode_sample_header(header, 0, info, payload.size(), wire::Trailer::torn);
     const auto trailer = wire::torn_trailer(torn);
     std::vector<std::byte> all(header.begin(), header.begin() + static_cast<std::ptrdiff_t>(bytes));
     all.insert(all.end(), payload.begin(), payload.end());
