@@ -119,10 +119,12 @@ class Equality : public NetworkTest {
             },
             false);
         if (stream.known.jitter >= stream.known.cycle / 2) continue;
-        // Up to the newest one that all have, the answer can not change any more.
+        // Up to the newest one that all have, the answer can not change any more. Any of the
+        // mirrors may be behind, also behind `tid`.
         Tid newest = stream.readers[0].newest();
         for (const RawReader& reader : stream.readers) newest = std::min(newest, reader.newest());
-        const Time t = std::min(random_time(stream, tid, newest), stream.known.info(newest).time);
+        const Time t = std::min(random_time(stream, std::min(tid, newest), newest),
+                                stream.known.info(newest).time);
         compared_while_written += compare(
             stream,
             [&](RawReader& reader, auto& payload, SampleInfo& info) {
@@ -152,6 +154,7 @@ TEST_F(Equality, MirrorsAnswerEveryReadAsTheOwnerDoes) {
     for (Session& session : sessions) {
       stream.readers.push_back(session.await_raw_reader(stream.known.id, kNever).value());
     }
+    await_mirrors(stream);  // opening one does not wait for long for what is in it
   }
   for (int round = 0; round < kRounds && !HasFailure(); ++round) {
     std::atomic<bool> done = false;
