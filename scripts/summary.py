@@ -23,6 +23,15 @@ def first_lines(text: str | None) -> str:
     return "\n".join((text or "").strip().splitlines()[:MOST_LINES])
 
 
+def last_words(case: ElementTree.Element) -> str:
+    """What a program printed that ended without naming a failed test: how it began and ended."""
+    printed = case.findtext("system-err") or case.findtext("system-out") or ""
+    lines = printed.strip().splitlines()
+    if len(lines) > 2 * MOST_LINES:
+        lines[MOST_LINES:-MOST_LINES] = ["..."]
+    return "\n".join(lines)
+
+
 def count(folder: pathlib.Path) -> tuple[int, int, int]:
     """Passed, failed and skipped tests of one build folder; prints the latter two."""
     passed = failed = skipped = 0
@@ -33,7 +42,9 @@ def count(folder: pathlib.Path) -> tuple[int, int, int]:
             failed += 1
             print(f"FAILED  {name}")
             for trouble in troubles:
-                print(textwrap.indent(first_lines(trouble.get("message") or trouble.text), " " * 8))
+                said = first_lines(trouble.get("message") or trouble.text) or last_words(case)
+                if said:
+                    print(textwrap.indent(said, " " * 8))
         elif case.find("skipped") is not None or case.get("result") in ("skipped", "suppressed"):
             skipped += 1
             print(f"SKIPPED {name}")
