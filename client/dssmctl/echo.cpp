@@ -169,14 +169,15 @@ Result<void> run_echo(const Options& options, Output& out) {
     RawReader& reader = opened.reader;
     Result<std::vector<Field>> fields = wanted_fields(reader, options);
     if (!fields) return std::move(fields).error();
+    // Before the first sample is shown: who sees one counts on getting the next ones, too, whatever
+    // becomes of dssmd.
+    Result<Follower> follower = Follower::open(opened.session, reader, out);
+    if (!follower) return std::move(follower).error();
     SamplePrinter printer(out, form_of(options), options.full, reader.id(), std::move(*fields));
     Echo echo(reader, printer, out, options);
     printer.begin();
     if (Result<void> begun = begin(options, opened.awaited, reader, echo); !begun) return begun;
     if (!echo.print_new()) return echo.result();
-
-    Result<Follower> follower = Follower::open(opened.session, reader, out);
-    if (!follower) return std::move(follower).error();
     while (true) {
       const Follower::Wake wake = follower->wait(kNever);
       if (wake == Follower::Wake::stop) return {};

@@ -11,7 +11,7 @@ namespace {
 const char* const kEndlessVerbs[] = {"echo", "hz", "bw", "delay"};
 
 struct Stop : CtlTest {
-  Writer<double> writer_ = session_.create<double>("s", depth_of(16)).value();
+  Writer<double> writer_ = session_.create<double>("s", depth_of(1 << 14)).value();
 
   // Waits until `readers` processes read the stream, dssmctl among them.
   void await_readers(std::uint32_t readers) {
@@ -140,10 +140,10 @@ TEST_F(Stop, GoesOnWhileTheDaemonIsAwayAndAfterItsReturn) {
     }
   };
   daemon_.kill_hard();
-  follow();
+  ASSERT_NO_FATAL_FAILURE(follow());
   daemon_.start();
   await_readers(1);
-  follow();
+  ASSERT_NO_FATAL_FAILURE(follow());
   ASSERT_TRUE(session_.remove(writer_.id()));
   EXPECT_NE(echo.rest().find("it was removed"), std::string::npos);
   EXPECT_EQ(echo.status(), 1);
