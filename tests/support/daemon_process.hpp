@@ -32,6 +32,10 @@ pid_t start(const std::vector<std::string>& argv, const std::vector<std::string>
             int out_fd = -1);
 int wait_for(pid_t pid);
 
+// For a dssmd that is killed while others wait to create its streams anew: holders that offer their
+// rings get more than dssmd's own 500 ms for it, which is little where many tests run at once.
+inline const std::vector<std::string> kPatientRecovery = {"--recovery-grace", "3 s"};
+
 class DaemonProcess {
  public:
   // Starts `dssmd --runtime-dir DIR --name HOST extra...` and waits until it says that it is ready

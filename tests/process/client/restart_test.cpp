@@ -111,7 +111,7 @@ TEST(Restart, BringsBackAStreamThatOnlyReadersHold) {
 
 // The name is kept free for the ring that a living process is about to offer back.
 TEST(Restart, DoesNotLetAnEagerWriterReplaceAHeldRing) {
-  DaemonProcess daemon;
+  DaemonProcess daemon(test::kPatientRecovery);
   Session holding = connect(daemon);
   Writer<Counted> writer = holding.create<Counted>("held", History{16, 1ms}).value();
   for (int round = 0; round < 5; ++round) {

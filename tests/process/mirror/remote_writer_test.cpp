@@ -10,7 +10,9 @@ namespace dssm::test {
 namespace {
 
 // pc2 writes, pc1 owns and reads.
-using RemoteWriter = TwoHosts;
+struct RemoteWriter : TwoHosts {
+  RemoteWriter() : TwoHosts("5 s", kPatientRecovery) {}
+};
 
 TEST_F(RemoteWriter, CreatesTheStreamAndWritesWithTheOwnersTids) {
   auto writer = there.create<Counted>("goal@pc1", kLong).value();

@@ -34,7 +34,7 @@ constexpr Duration kPatience = 3min;
 class Soak : public NetworkTest {
  protected:
   void open_fleet() {
-    if (!make_fleet(kHosts)) return;
+    if (!make_fleet(kHosts, kPatientRecovery)) return;
     std::printf("DSSM_TEST_SEED=%llu DSSM_SOAK_SECONDS=%llu DSSM_SOAK_PERCENT=%llu\n",
                 static_cast<unsigned long long>(seed), static_cast<unsigned long long>(seconds),
                 static_cast<unsigned long long>(percent));

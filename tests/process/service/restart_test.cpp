@@ -152,7 +152,7 @@ class ServiceUnderLoad : public testing::Test {
     EXPECT_EQ(events.load(), told) << "who watches on this PC does not notice";
   }
 
-  ServiceManager pc1;
+  ServiceManager pc1{{.arguments = kPatientRecovery}};
   DaemonProcess pc2{{"--peer", pc1.address()}, "pc2"};
 };
 
