@@ -5,6 +5,8 @@
 // virtual machine's host that has better things to do; a test that counts on time shows it here.
 // Ends with the command's exit status; 2: wrong arguments; 77: this machine does not allow it.
 //
+// starve.py, beside it, keeps some of the processes from them and lets the others go on.
+//
 // Above 950 ms there is little to gain: unless told otherwise, the kernel leaves the last 50 ms of
 // each second to those that are no real-time programs (sched(7)).
 #include <sched.h>
