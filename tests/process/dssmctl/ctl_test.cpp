@@ -79,6 +79,11 @@ std::string Running::rest() {
   return std::exchange(text_, {});
 }
 
+void Running::await_output() {
+  pollfd fd{fd_, POLLIN, 0};
+  ASSERT_EQ(::poll(&fd, 1, -1), 1);
+}
+
 void Running::close_output() {
   if (fd_ >= 0) ::close(std::exchange(fd_, -1));
 }

@@ -51,6 +51,10 @@ class Running {
   std::string line();
   std::string rest();  // all that comes until its end
 
+  // Until there is output to read, and reads none of it: a program that prints more than a pipe
+  // holds (64 KiB) stands still in the midst of that.
+  void await_output();
+
   void close_output();  // our end of the pipe
   void signal(int number);
   void stop();   // SIGSTOP, and waits until it stands still

@@ -3,6 +3,8 @@
 // How the verbs that run without end come to one.
 #include <signal.h>
 
+#include <array>
+
 #include "tests/process/dssmctl/ctl_test.hpp"
 
 namespace dssm::test {
@@ -147,6 +149,24 @@ TEST_F(Stop, GoesOnWhileTheDaemonIsAwayAndAfterItsReturn) {
   ASSERT_TRUE(session_.remove(writer_.id()));
   EXPECT_NE(echo.rest().find("it was removed"), std::string::npos);
   EXPECT_EQ(echo.status(), 1);
+}
+
+// From its first sample on echo has all that it needs to go on without dssmd.
+TEST_F(Stop, GoesOnWhenTheDaemonGoesAwayWhileTheFirstSampleIsShown) {
+  using Large = std::array<double, 1 << 14>;
+  Writer<Large> writer = session_.create<Large>("large", depth_of(4)).value();
+  writer.write(Large{});
+  Running echo(argv({"echo", "large", "--last", "-n", "2", "--full", "--json"}), environment());
+  echo.await_output();
+  daemon_.kill_hard();
+  for (int tid = 0; tid < 2; ++tid) {
+    const Json line = Json::parse(echo.line(), nullptr, false);
+    ASSERT_TRUE(line.is_object()) << line;
+    EXPECT_EQ(line["tid"], tid);
+    writer.write(Large{});
+  }
+  EXPECT_EQ(echo.rest(), "");
+  EXPECT_EQ(echo.status(), 0);
 }
 
 }  // namespace
