@@ -12,25 +12,25 @@
 #include <utility>
 
 #include "core/wire/tcp.hpp"
-#include "daemon/channel/channel_server.hpp"
-#include "daemon/channel/mirrors.hpp"
-#include "daemon/channel/network_listener.hpp"
-#include "daemon/channel/remote_writers.hpp"
-#include "daemon/channel/resolver.hpp"
+#include "daemon/base/event_loop.hpp"
+#include "daemon/base/journal_logger.hpp"
+#include "daemon/base/log.hpp"
+#include "daemon/base/message_ids.hpp"
 #include "daemon/clock/fleet_clock.hpp"
-#include "daemon/discovery/catalog.hpp"
-#include "daemon/discovery/discovery.hpp"
-#include "daemon/discovery/fleet_service.hpp"
-#include "daemon/discovery/peers.hpp"
+#include "daemon/fleet/catalog.hpp"
+#include "daemon/fleet/mdns/discovery.hpp"
+#include "daemon/fleet/peers.hpp"
+#include "daemon/link/network_listener.hpp"
+#include "daemon/link/resolver.hpp"
+#include "daemon/local/fleet_service.hpp"
 #include "daemon/local/listener.hpp"
 #include "daemon/local/local_service.hpp"
 #include "daemon/local/server.hpp"
+#include "daemon/remote/mirrors.hpp"
+#include "daemon/remote/remote_writers.hpp"
+#include "daemon/serve/channel_server.hpp"
 #include "daemon/service/command_line.hpp"
-#include "daemon/service/event_loop.hpp"
 #include "daemon/service/inherited.hpp"
-#include "daemon/service/journal_logger.hpp"
-#include "daemon/service/log.hpp"
-#include "daemon/service/message_ids.hpp"
 #include "daemon/service/process.hpp"
 #include "daemon/service/reloader.hpp"
 #include "daemon/service/runtime_dir.hpp"
@@ -188,7 +188,7 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
     discovery.emplace(*loop,
                       Discovery::Options{self, reach_of(network->addresses()), config.insecure,
                                          config.interfaces, config.avoid_interfaces},
-                      registry, peers, fleet, logger);
+                      registry, peers, logger);
   }
   const auto serve_others = [&] {
     channels.serve(*network);

@@ -45,7 +45,6 @@ std::string rename_command(const std::string& where) {
 }
 
 // --- dssmd
-// ------------------------------------------------------------------------------------------------
 
 Finding no_permission(const Facts& facts) {
   const SocketFacts& socket = facts.socket;
@@ -146,7 +145,6 @@ void check_version(const Facts& facts, Findings& findings) {
 }
 
 // --- this PC
-// ------------------------------------------------------------------------------------------------
 
 void check_memory(const Facts& facts, Findings& findings) {
   const DaemonInfo& daemon = facts.daemon;
@@ -233,7 +231,6 @@ void check_clock(const Facts& facts, Findings& findings) {
 }
 
 // --- the others
-// ------------------------------------------------------------------------------------------------
 
 // Of an address as dssmd writes it: "127.0.0.1:13776", "[::1]:13776", "localhost:13776".
 bool on_loopback(const std::string& address) {

@@ -87,7 +87,6 @@ Channel::~Channel() {
 }
 
 // --- the connection
-// --------------------------------------------------------------------------------
 
 [[gnu::hot]] bool Channel::is_up() const noexcept {
   return link_.is_up() && opened_ && subscribe_serial_ == 0 && publishing_serial_ == 0;
@@ -285,7 +284,6 @@ Error Channel::away(const std::string& how) const {
 std::string Channel::what(const char* verb) const { return verb + (" '" + stream_.id.str() + "'"); }
 
 // --- what arrives
-// ----------------------------------------------------------------------------------
 
 Result<void> Channel::on_opened(const net::Frame& frame) {
   open_serial_ = 0;
@@ -384,7 +382,6 @@ Result<void> Channel::on_frame(net::Frame& frame) {
 }
 
 // --- requests
-// --------------------------------------------------------------------------------------
 
 template <class Queue>
 Result<void> Channel::exchange(Queue queue) {
@@ -457,7 +454,6 @@ Result<ReadStatus> Channel::read(const ReadRequest& request, std::span<std::byte
 }
 
 // --- the subscription
-// ------------------------------------------------------------------------------
 
 void Channel::request_subscription() {
   net::Frame frame;
@@ -558,7 +554,6 @@ int Channel::fd() noexcept {
 }
 
 // --- publishing
-// ------------------------------------------------------------------------------------
 
 void Channel::start_publishing() {
   net::Frame frame;

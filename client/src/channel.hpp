@@ -40,7 +40,7 @@ class Channel final : private wire::FrameSink {
   Channel& operator=(const Channel&) = delete;
   ~Channel();
 
-  // --- requests, which wait for their answer ---------------------------------------------------
+  // --- requests, which wait for their answer
 
   // The answer to `request`; a Failure comes as its error.
   //   fails  besides: daemon_away, protocol, and what opening the channel anew fails with
@@ -49,7 +49,7 @@ class Channel final : private wire::FrameSink {
   Result<ReadStatus> read(const ReadRequest& request, std::span<std::byte> payload,
                           SampleInfo& info);
 
-  // --- as PConnector ---------------------------------------------------------------------------
+  // --- as PConnector
 
   Result<void> subscribe(const Subscription& what);
   Result<void> unsubscribe();

@@ -76,7 +76,6 @@ void OpenStream::supersede() const noexcept {
 }
 
 // --- setting up a connection
-// -----------------------------------------------------------------------
 
 struct Client::Handshake {
   explicit Handshake(UniqueFd connected) : socket(std::move(connected)) {}
@@ -263,7 +262,6 @@ Client::~Client() {
 }
 
 // --- requests
-// --------------------------------------------------------------------------------------
 
 bool Client::connected() const {
   const std::lock_guard guard(mutex_);
@@ -423,7 +421,6 @@ Result<std::shared_ptr<clock::PlaybackRecord>> Client::playback_clock() {
 }
 
 // --- watches
-// ---------------------------------------------------------------------------------------
 
 Result<std::uint64_t> Client::add_watch(OnEvent on_event) {
   bool first = false;
@@ -494,7 +491,6 @@ void Client::on_rewatched() {
 }
 
 // --- the keeper
-// ------------------------------------------------------------------------------------
 
 void Client::start_using(Handshake link) {
   input_ = std::move(link.input);

@@ -75,7 +75,6 @@ Error NetworkLink::lost() const {
 }
 
 // --- connecting and greeting
-// -----------------------------------------------------------------------
 
 Result<void> NetworkLink::connect_next() {
   Error last{Errc::no_daemon, "no address to connect to"};
@@ -164,7 +163,6 @@ bool NetworkLink::has_arrived() const noexcept {
 }
 
 // --- frames
-// ----------------------------------------------------------------------------------------
 
 void NetworkLink::queue(const net::Frame& frame) {
   const std::string encoded = wire::encode_frame(frame);
@@ -260,7 +258,6 @@ wire::DecoderCounters NetworkLink::counters() const noexcept {
 }
 
 // --- waiting
-// ---------------------------------------------------------------------------------------
 
 int NetworkLink::fd() const noexcept { return transport_ ? transport_->fd() : connecting_.get(); }
 

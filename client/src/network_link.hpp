@@ -46,7 +46,7 @@ class NetworkLink final : private wire::FrameSink {
   // What it has waited for in vain, for who gives up waiting.
   Error silence() const;
 
-  // --- once up --------------------------------------------------------------------------------
+  // --- once up
 
   // Queues a frame, for send_queued().
   void queue(const net::Frame& frame);
@@ -79,7 +79,7 @@ class NetworkLink final : private wire::FrameSink {
   // program, what it waits for may have been there for long.
   bool has_arrived() const noexcept;
 
-  // --- waiting --------------------------------------------------------------------------------
+  // --- waiting
 
   int fd() const noexcept;  // -1 while down
   short events(bool more_to_send) const noexcept;

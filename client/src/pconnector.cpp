@@ -127,7 +127,6 @@ Result<std::vector<StreamInfo>> PConnector::list(PConnectorOptions options) {
 }
 
 // --- reading
-// ---------------------------------------------------------------------------------------
 
 using Which = detail::ReadRequest::Which;
 
@@ -181,7 +180,6 @@ Result<Tid> PConnector::find(Time t) {
 }
 
 // --- subscription
-// ----------------------------------------------------------------------------------
 
 Result<void> PConnector::subscribe(const Subscription& what) {
   return state_->channel->subscribe(what);
@@ -199,7 +197,6 @@ std::uint64_t PConnector::restarts() const noexcept { return state_->channel->re
 int PConnector::fd() const noexcept { return state_->channel->fd(); }
 
 // --- writing
-// ---------------------------------------------------------------------------------------
 
 Result<Tid> PConnector::write(std::span<const std::byte> payload, Time time, Duration clock_error) {
   if (Result<void> posted = post(payload, time, clock_error); !posted) {
@@ -219,7 +216,6 @@ Result<Tid> PConnector::flush(MonoTime deadline) { return state_->channel->flush
 std::uint64_t PConnector::dropped() const noexcept { return state_->channel->dropped(); }
 
 // --- about the stream
-// ------------------------------------------------------------------------------
 
 Result<std::vector<std::byte>> PConnector::property() {
   net::Frame frame;

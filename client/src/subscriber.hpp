@@ -32,7 +32,7 @@ class Subscriber {
   // The request that begins it, or after a cut goes on with it.
   void to_message(std::uint64_t incarnation, net::Subscribe& out) const;
 
-  // --- what the connection brings -------------------------------------------------------------
+  // --- what the connection brings
 
   // From here on samples are this subscription's.
   Result<void> on_subscribed(const net::Subscribed& message);
@@ -46,7 +46,7 @@ class Subscriber {
   Result<bool> on_sample_begin(const SampleInfo& info, std::byte*& out);
   void on_sample_end(const SampleInfo& info, bool torn) noexcept;
 
-  // --- what the user gets ---------------------------------------------------------------------
+  // --- what the user gets
 
   // Whether samples that nobody waits for are kept in the queue.
   void keep(bool keep) noexcept { keep_ = keep; }

@@ -36,7 +36,7 @@ class Bell {
   Bell& operator=(const Bell&) = delete;
   ~Bell();
 
-  // --- writers, after publishing --------------------------------------------------------------
+  // --- writers, after publishing
 
   // Before: a sleeper or dssmd wrote to the line that ring() looks at, so it has to come from
   // another processor, and may do so while the payload is copied.
@@ -52,12 +52,12 @@ class Bell {
     return page_->doorbell_armed.load(std::memory_order_seq_cst) != 0;
   }
 
-  // --- dssmd ----------------------------------------------------------------------------------
+  // --- dssmd
   void arm_doorbell(bool armed) noexcept {
     page_->doorbell_armed.store(armed ? 1 : 0, std::memory_order_seq_cst);
   }
 
-  // --- sleepers -------------------------------------------------------------------------------
+  // --- sleepers
 
   // Announces a sleeper; returns the value to hand to sleep(). Look at the ring between the two.
   std::uint32_t announce() noexcept {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The ring's layout in memory: the ABI between all processes that map one. docs/ring-layout.md
-// explains it byte by byte; tests/unit/ring/ring_memory_test.cpp has its numbers by hand.
+// explains it byte by byte; tests/unit/core/ring/ring_memory_test.cpp has its numbers by hand.
 // Little endian. An incompatible change raises kLayoutVersion.
 //
 //   offset 0       RingHeader, one page; its first part is written once, before anybody maps it

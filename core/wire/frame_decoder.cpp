@@ -147,7 +147,7 @@ std::size_t FrameDecoder::longest_frame_bytes() const noexcept {
              std::to_string(payload_bytes_));
 }
 
-// --- the input buffer ----------------------------------------------------------------------------
+// --- the input buffer
 
 // The thread's input buffer; null while a commit() works on it, so that a sink which drives another
 // connection from within a callback gets another one.
@@ -209,7 +209,7 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
   return result;
 }
 
-// --- decoding ------------------------------------------------------------------------------------
+// --- decoding
 
 [[gnu::hot]] Result<void> FrameDecoder::decode(Bytes& input) {
   // Without any input too: the last byte may have been received in place, and a frame that was
@@ -322,7 +322,7 @@ Result<void> FrameDecoder::take_trailer(Bytes& input) {
   return sink_.on_sample_end(sample_, torn);
 }
 
-// --- frames that protobuf parses -----------------------------------------------------------------
+// --- frames that protobuf parses
 
 Result<void> FrameDecoder::begin_whole(Bytes& input, std::size_t length_bytes,
                                        std::size_t frame_bytes) {

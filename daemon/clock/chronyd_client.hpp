@@ -14,8 +14,8 @@
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/address.hpp"
+#include "daemon/base/event_loop.hpp"
 #include "daemon/clock/chrony_protocol.hpp"
-#include "daemon/service/event_loop.hpp"
 
 namespace dssm::daemon {
 

@@ -6,7 +6,7 @@
 #include <cstdio>
 #include <utility>
 
-#include "daemon/service/message_ids.hpp"
+#include "daemon/base/message_ids.hpp"
 
 namespace dssm::daemon {
 namespace {

@@ -12,11 +12,11 @@
 #include "core/clock/clock_estimator.hpp"
 #include "core/clock/clock_tick.hpp"
 #include "core/wire/address.hpp"
+#include "daemon/base/event_loop.hpp"
+#include "daemon/base/log.hpp"
+#include "daemon/base/pace.hpp"
 #include "daemon/clock/chronyd_client.hpp"
 #include "daemon/clock/step_watch.hpp"
-#include "daemon/discovery/pace.hpp"
-#include "daemon/service/event_loop.hpp"
-#include "daemon/service/log.hpp"
 
 namespace dssm::daemon {
 

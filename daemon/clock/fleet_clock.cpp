@@ -112,7 +112,7 @@ void FleetClock::on_host_down(const KnownHost& host, const Error&) {
   return news_;
 }
 
-// --- where this clock stands -----------------------------------------------------------------
+// --- where this clock stands
 
 void FleetClock::refresh() {
   const clock::Instant instant = clock::Instant::now();
@@ -310,7 +310,7 @@ std::string FleetClock::str() const {
   return text;
 }
 
-// --- what others' samples are worth here -----------------------------------------------------
+// --- what others' samples are worth here
 
 Duration FleetClock::distance_to(const wire::ClockReport& other) const {
   const MonoTime now = MonoClock::now();

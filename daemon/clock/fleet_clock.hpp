@@ -16,11 +16,11 @@
 #include "core/clock/clock_page.hpp"
 #include "core/clock/clock_policies.hpp"
 #include "core/wire/clock_report.hpp"
-#include "daemon/channel/clock_rules.hpp"
+#include "daemon/base/event_loop.hpp"
 #include "daemon/clock/clock_watch.hpp"
 #include "daemon/clock/host_clock_log.hpp"
-#include "daemon/discovery/catalog.hpp"
-#include "daemon/service/event_loop.hpp"
+#include "daemon/fleet/catalog.hpp"
+#include "daemon/fleet/clock_rules.hpp"
 
 namespace dssm::daemon {
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/clock/host_clock_log.hpp"
 
-#include "daemon/service/message_ids.hpp"
+#include "daemon/base/message_ids.hpp"
 
 namespace dssm::daemon {
 

@@ -10,8 +10,8 @@
 #include <string>
 
 #include "core/wire/network_protocol.hpp"
-#include "daemon/discovery/pace.hpp"
-#include "daemon/service/log.hpp"
+#include "daemon/base/log.hpp"
+#include "daemon/base/pace.hpp"
 
 namespace dssm::daemon {
 

@@ -9,7 +9,7 @@
 #include <memory>
 
 #include "core/base/unique_fd.hpp"
-#include "daemon/service/event_loop.hpp"
+#include "daemon/base/event_loop.hpp"
 
 namespace dssm::daemon {
 

@@ -5,7 +5,7 @@
 
 #include "core/wire/fd_socket.hpp"
 #include "core/wire/local_protocol.hpp"
-#include "daemon/service/message_ids.hpp"
+#include "daemon/base/message_ids.hpp"
 
 namespace dssm::daemon {
 

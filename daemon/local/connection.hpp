@@ -14,9 +14,9 @@
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/frame.hpp"
+#include "daemon/base/event_loop.hpp"
+#include "daemon/base/log.hpp"
 #include "daemon/local/local_service.hpp"
-#include "daemon/service/event_loop.hpp"
-#include "daemon/service/log.hpp"
 
 namespace dssm::daemon {
 

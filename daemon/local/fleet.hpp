@@ -13,7 +13,7 @@
 #include <string>
 #include <vector>
 
-#include "daemon/channel/remote_writer_keeper.hpp"
+#include "daemon/remote/remote_writer_keeper.hpp"
 #include "daemon/streams/stream.hpp"
 #include "local.pb.h"
 

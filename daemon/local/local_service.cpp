@@ -7,7 +7,7 @@
 #include "core/base/utf8.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
-#include "daemon/service/message_ids.hpp"
+#include "daemon/base/message_ids.hpp"
 #include "daemon/streams/description.hpp"
 
 namespace dssm::daemon {
@@ -310,7 +310,6 @@ void LocalService::on_remote_stream_removed(const StreamId& id) {
 }
 
 // --- rings with a successor
-// -----------------------------------------------------------------------
 
 void LocalService::tell_replaced(const OpenTable::Reading& reading) {
   const auto client = clients_.find(reading.client);
@@ -344,7 +343,6 @@ bool LocalService::is_gone(const Stream& stream) const {
 }
 
 // --- recovery
-// -------------------------------------------------------------------------------------
 
 bool LocalService::must_wait(const local::Request& request) const {
   if (!recovering_ || request.has_offer()) return false;

@@ -28,10 +28,10 @@
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
+#include "daemon/base/log.hpp"
 #include "daemon/local/fleet.hpp"
 #include "daemon/local/remote_requests.hpp"
 #include "daemon/local/stream_requests.hpp"
-#include "daemon/service/log.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"

@@ -7,7 +7,7 @@
 #include <utility>
 
 #include "core/wire/fd_socket.hpp"
-#include "daemon/service/message_ids.hpp"
+#include "daemon/base/message_ids.hpp"
 
 namespace dssm::daemon {
 namespace {

@@ -9,12 +9,12 @@
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
+#include "daemon/base/event_loop.hpp"
+#include "daemon/base/log.hpp"
+#include "daemon/base/spare_descriptor.hpp"
 #include "daemon/local/connection.hpp"
 #include "daemon/local/listener.hpp"
 #include "daemon/local/local_service.hpp"
-#include "daemon/service/event_loop.hpp"
-#include "daemon/service/log.hpp"
-#include "daemon/service/spare_descriptor.hpp"
 
 namespace dssm::daemon {
 

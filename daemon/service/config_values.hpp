@@ -13,7 +13,7 @@
 
 #include "core/clock/clock_bound.hpp"
 #include "core/clock/clock_policies.hpp"
-#include "daemon/service/log.hpp"
+#include "daemon/base/log.hpp"
 
 namespace dssm::daemon {
 

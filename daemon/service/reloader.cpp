@@ -5,7 +5,7 @@
 #include <string>
 #include <string_view>
 
-#include "daemon/service/message_ids.hpp"
+#include "daemon/base/message_ids.hpp"
 
 namespace dssm::daemon {
 namespace {

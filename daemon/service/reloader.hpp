@@ -8,8 +8,8 @@
 #include <dssm/result.hpp>
 #include <functional>
 
+#include "daemon/base/log.hpp"
 #include "daemon/service/config.hpp"
-#include "daemon/service/log.hpp"
 
 namespace dssm::daemon {
 

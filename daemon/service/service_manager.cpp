@@ -16,7 +16,7 @@
 #include <utility>
 
 #include "core/base/check.hpp"
-#include "daemon/service/log.hpp"
+#include "daemon/base/log.hpp"
 
 namespace dssm::daemon {
 namespace {

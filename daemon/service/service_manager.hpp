@@ -19,7 +19,7 @@
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
-#include "daemon/service/event_loop.hpp"
+#include "daemon/base/event_loop.hpp"
 
 namespace dssm::daemon {
 

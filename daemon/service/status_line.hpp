@@ -8,7 +8,7 @@
 #include <functional>
 #include <string>
 
-#include "daemon/service/event_loop.hpp"
+#include "daemon/base/event_loop.hpp"
 #include "daemon/service/service_manager.hpp"
 
 namespace dssm::daemon {

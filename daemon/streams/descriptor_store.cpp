@@ -6,7 +6,7 @@
 #include <string_view>
 #include <utility>
 
-#include "daemon/service/message_ids.hpp"
+#include "daemon/base/message_ids.hpp"
 #include "daemon/streams/memory_file.hpp"
 
 namespace dssm::daemon {

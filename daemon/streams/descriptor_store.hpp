@@ -20,7 +20,7 @@
 #include <string>
 #include <vector>
 
-#include "daemon/service/log.hpp"
+#include "daemon/base/log.hpp"
 #include "daemon/service/service_manager.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"

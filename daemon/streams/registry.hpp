@@ -14,7 +14,7 @@
 #include <utility>
 #include <vector>
 
-#include "daemon/streams/memory_budget.hpp"
+#include "daemon/base/memory_budget.hpp"
 #include "daemon/streams/ring_room.hpp"
 #include "daemon/streams/stream.hpp"
 

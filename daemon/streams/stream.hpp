@@ -20,7 +20,7 @@
 #include "core/base/unique_fd.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_memory.hpp"
-#include "daemon/streams/memory_budget.hpp"
+#include "daemon/base/memory_budget.hpp"
 #include "daemon/streams/meta_file.hpp"
 
 namespace dssm::daemon {

@@ -16,7 +16,7 @@
 
 #include "core/ring/ring_writer.hpp"
 #include "core/wire/frame.hpp"
-#include "daemon/channel/channel_server.hpp"
+#include "daemon/serve/channel_server.hpp"
 #include "daemon/service/process.hpp"
 
 namespace dssm::daemon {

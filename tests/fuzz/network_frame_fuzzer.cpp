@@ -11,7 +11,7 @@
 
 #include "core/wire/network_protocol.hpp"
 #include "core/wire/varint.hpp"
-#include "tests/unit/wire/recorder.hpp"
+#include "tests/unit/core/wire/recorder.hpp"
 
 namespace dssm::wire {
 namespace {

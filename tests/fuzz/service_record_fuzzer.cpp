@@ -7,7 +7,7 @@
 #include <cstdlib>
 
 #include "core/base/utf8.hpp"
-#include "daemon/discovery/service_record.hpp"
+#include "daemon/fleet/service_record.hpp"
 
 namespace dssm::daemon {
 namespace {

@@ -95,11 +95,9 @@ Result<std::unique_ptr<Network>> Network::open(int hosts) {
     network->hosts_.push_back(*std::move(made));
     network->configure(host, "link set lo up\n");
     network->connect(host, name(host), "eth0");
-    network->configure(
-        host, "address add " + address(host) +
-                  "/24 dev eth0\n" +  //
-                                      // nodad: usable at once, also after the cable was out.
-                  "address add " + address6(host) + "/64 dev eth0 nodad\n");
+    network->configure(host, "address add " + address(host) + "/24 dev eth0\n" +  //
+                                 // nodad: usable at once, also after the cable was out.
+                                 "address add " + address6(host) + "/64 dev eth0 nodad\n");
   }
   return network;
 }

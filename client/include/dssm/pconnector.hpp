@@ -89,7 +89,7 @@ class PConnector {
   PConnector& operator=(PConnector&&) noexcept;
   ~PConnector();  // sends what was posted, at most for 1 s
 
-  // --- reading: one round trip each -----------------------------------------------------------
+  // --- reading: one round trip each
   // `payload` is exactly payload_bytes() long, and unspecified unless the result is ok; `info` is
   // set only when it is.
   //   returns  as RawReader's functions of these names
@@ -107,7 +107,7 @@ class PConnector {
   // Tid of the newest sample with time <= t; kNoTid when there is none.
   Result<Tid> find(Time t);
 
-  // --- subscription ---------------------------------------------------------------------------
+  // --- subscription
 
   // Samples come by themselves from now on, to be taken by next(). A second call replaces the
   // first subscription.
@@ -142,7 +142,7 @@ class PConnector {
   // for it before each poll: asking tells it what to wait for.
   int fd() const noexcept;
 
-  // --- writing --------------------------------------------------------------------------------
+  // --- writing
 
   // Writes one sample and waits for its tid in the owner's ring.
   //   fails  daemon_away: not acknowledged in time. The sample is kept as if it had been posted,
@@ -164,7 +164,7 @@ class PConnector {
   // Posted samples that were dropped because too many waited to be sent or acknowledged.
   std::uint64_t dropped() const noexcept;
 
-  // --- about the stream -----------------------------------------------------------------------
+  // --- about the stream
 
   Result<std::vector<std::byte>> property();
   Result<void> set_property(std::span<const std::byte> property);

@@ -70,7 +70,7 @@ class RawReader {
   RawReader& operator=(RawReader&&) noexcept;
   ~RawReader();
 
-  // --- reading by tid -------------------------------------------------------------------------
+  // --- reading by tid
 
   // Copies the newest sample. `payload` is exactly payload_bytes() long in all calls below.
   //   returns  ok | not_yet (nothing written) | lapped
@@ -90,7 +90,7 @@ class RawReader {
   //   returns  ok | not_yet (nothing was read before) | too_old
   ReadStatus previous(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
-  // --- reading by time ------------------------------------------------------------------------
+  // --- reading by time
   // All of these, find() too, return clock_out_of_bounds for a sample of another host that may be
   // further from this PC's clock than is allowed (keys clock_policy and clock_limit of dssmd).
   // Reading by tid is never refused: clock_in_bounds() tells such samples.
@@ -123,7 +123,7 @@ class RawReader {
   // Whether that is allowed; always, where the stream's policy is `off`.
   bool clock_in_bounds(const SampleInfo& info) const noexcept;
 
-  // --- stamps and places without payloads -----------------------------------------------------
+  // --- stamps and places without payloads
 
   // Tid of the newest sample, kNoTid while nothing is written; of the oldest readable one.
   Tid newest() const noexcept;
@@ -154,13 +154,13 @@ class RawReader {
   // all is well.
   std::optional<Error> trouble() const;
 
-  // --- in place -------------------------------------------------------------------------------
+  // --- in place
 
   // Looks at sample `tid` in place.
   //   returns  as tid(); sets the cursor
   ReadStatus borrow(Tid tid, BorrowedSample& out) noexcept;
 
-  // --- waiting --------------------------------------------------------------------------------
+  // --- waiting
 
   // Waits until there is a sample newer than the cursor, or the stream began anew, or the monotonic
   // clock reaches `deadline` (kNever: no limit; a deadline in the past: just look).
@@ -176,7 +176,7 @@ class RawReader {
   Result<int> ready_fd() noexcept;
   void clear_ready() noexcept;
 
-  // --- about the stream -----------------------------------------------------------------------
+  // --- about the stream
 
   // References stay good until a read returns `restarted`.
   const StreamId& id() const noexcept;    // with its owner's host

@@ -134,7 +134,7 @@ class Session {
   Session& operator=(Session&&) noexcept;
   ~Session();
 
-  // --- streams --------------------------------------------------------------------------------
+  // --- streams
 
   // A stream's name may say whose it is: "lidar@pc2". Without a host, this PC's own stream of that
   // name is meant if there is one, else the only other host's that is known; a new one is created
@@ -226,7 +226,7 @@ class Session {
   };
   Result<Watch> watch(std::function<void(const StreamEvent&)> on_event);
 
-  // --- properties -----------------------------------------------------------------------------
+  // --- properties
 
   // A small constant block attached to a stream. No open is needed. At most 16 MiB, or what dssmd
   // is configured to take.
@@ -234,7 +234,7 @@ class Session {
   Result<void> set_property(const StreamId& id, std::span<const std::byte> property);
   Result<std::vector<std::byte>> property(const StreamId& id);
 
-  // --- other hosts ----------------------------------------------------------------------------
+  // --- other hosts
 
   // This PC first, then the configured peers and those found by mDNS, each with its state at this
   // moment.
@@ -245,7 +245,7 @@ class Session {
   //          not answer)
   Result<RoundTrip> ping(const std::string& host);
 
-  // --- the rest -------------------------------------------------------------------------------
+  // --- the rest
 
   Result<PlaybackClock> playback_clock();
   Result<std::vector<ClientInfo>> clients();

@@ -165,7 +165,6 @@ int get_propertySSM(const char* stream_name, int stream_id, void* data) {
 }
 
 // --- between ssm.hpp and this library
-// --------------------------------------------------------------
 
 size_t dssm_ssm_data_size(SSM_sid sid) {
   const dssm::ssm::SidUse use(sid);

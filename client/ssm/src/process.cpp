@@ -64,7 +64,6 @@ bool Process::registered_locked() const noexcept {
 }
 
 // --- the reaper
-// ------------------------------------------------------------------------------------
 
 void* Process::run_reaper(void* self) {
   auto& process = *static_cast<Process*>(self);
@@ -131,7 +130,6 @@ void Process::after_fork_in_child() {
 }
 
 // --- registration
-// ----------------------------------------------------------------------------------
 
 Result<void> Process::start() {
   const std::lock_guard guard(mutex_);

@@ -105,7 +105,6 @@ class RemoteStream::Call {
 thread_local bool RemoteStream::Call::on_network = false;
 
 // --- connecting, creating, opening
-// -----------------------------------------------------------------
 
 PConnectorOptions RemoteStream::options(const std::string& address,
                                         std::uint64_t payload_bytes) const {
@@ -182,7 +181,6 @@ bool RemoteStream::open(const std::string& address, const StreamId& id, std::siz
 }
 
 // --- reading over the network
-// ----------------------------------------------------------------------
 
 // Tids go on behind the last one told when the stream began anew.
 void RemoteStream::follow_restart() {
@@ -339,7 +337,6 @@ SSM_tid RemoteStream::tid_at(double time) {
 }
 
 // --- writing and properties
-// ------------------------------------------------------------------------
 
 bool RemoteStream::write(const void* data, std::size_t bytes, double time) {
   const Call call(*this);
@@ -387,7 +384,6 @@ bool RemoteStream::get_property(void* data, std::size_t bytes) {
 }
 
 // --- buffered
-// --------------------------------------------------------------------------------------
 
 bool RemoteStream::buffer(double life, double cycle) {
   const Call call(*this);

@@ -109,7 +109,6 @@ RawWriter* Stream::writer() noexcept {
 }
 
 // --- tids
-// ------------------------------------------------------------------------------------------
 
 void Stream::tell(Tid tid) noexcept {
   if (tid > told_.load(std::memory_order_relaxed)) told_.store(tid, std::memory_order_relaxed);
@@ -151,7 +150,6 @@ Tid Stream::oldest() noexcept {
 }
 
 // --- reading
-// ---------------------------------------------------------------------------------------
 
 Stream::Copy::Copy(Stream& stream)
     : stream_(stream), bytes_(stream.spare_.exchange(nullptr, std::memory_order_acquire)) {
@@ -252,7 +250,6 @@ WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
 }
 
 // --- writing
-// ---------------------------------------------------------------------------------------
 
 Tid Stream::write(const void* data, Time time) noexcept {
   RawWriter* const open = writer();

@@ -262,7 +262,6 @@ TEST_F(Channel, GoesOnWithTheRingThatAWriterKeptOverARestart) {
 }
 
 // --- many kinds of peers
-// --------------------------------------------------------------------------
 
 TEST_F(Channel, TellsAllAboutTheStreamsOfItsHost) {
   LocalWriter writer(local_, "a", 16, 32);

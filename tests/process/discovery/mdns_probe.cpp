@@ -28,7 +28,7 @@
 #include <string>
 #include <string_view>
 
-#include "daemon/discovery/mdns.hpp"
+#include "daemon/fleet/mdns/mdns.hpp"
 
 namespace {
 

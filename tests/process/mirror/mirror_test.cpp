@@ -153,7 +153,7 @@ TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
   EXPECT_EQ(mirror("anew").restarts, 1u);
 }
 
-// --- sizes ---------------------------------------------------------------------------------------
+// --- sizes
 
 TEST_F(TwoHosts, CarryTheLargestSamples) {
   constexpr std::size_t kBytes = kLargestPayloadBytes;
@@ -196,7 +196,7 @@ TEST_F(TwoHosts, CarrySamplesOfOneByteAtRate) {
   EXPECT_EQ(mirror("bumper").received_samples, static_cast<std::uint64_t>(kSamples));
 }
 
-// --- limits --------------------------------------------------------------------------------------
+// --- limits
 
 TEST(TightHosts, SayWhichLimitAMirrorWouldBreak) {
   DaemonProcess pc1({}, "pc1");

@@ -76,7 +76,7 @@ void expect_words(const Error& error, Errc code, const std::vector<std::string>&
   }
 }
 
-// --- opening -----------------------------------------------------------------------------------
+// --- opening
 
 TEST(PConnectorOpen, SaysThatNobodyListens) {
   // A port that was ours a moment ago.
@@ -220,7 +220,7 @@ TEST(PConnectorOpen, GivesABusyDssmdTheRequestTimeoutToGreet) {
   EXPECT_TRUE(con) << con.error().message;
 }
 
-// --- requests ----------------------------------------------------------------------------------
+// --- requests
 
 // Answers the reads of one connection with sample 5, until something else comes.
 void answer_reads(FakePeer& peer) {
@@ -380,7 +380,7 @@ TEST(PConnectorRequest, RefusesABufferOfAnotherSize) {
   EXPECT_EQ(con.write(small).error().code, Errc::invalid_argument);
 }
 
-// --- subscriptions -----------------------------------------------------------------------------
+// --- subscriptions
 
 TEST(PConnectorSubscription, ComesInOrderHoweverTheBytesCome) {
   for (const std::size_t piece : {1, 7, 50, 1000}) {
@@ -620,7 +620,7 @@ TEST(PConnectorSubscription, ItsDescriptorStandsForTheConnectionAndForTheNextAtt
   EXPECT_EQ(con.lost(), 1u);
 }
 
-// --- large samples -----------------------------------------------------------------------------
+// --- large samples
 
 constexpr std::size_t kLargeBytes = 3 << 20;
 
@@ -730,7 +730,7 @@ TEST(PConnectorLargeSamples, OneThatWasCutComesAnew) {
   EXPECT_EQ(con.counters().reconnects, 3u);
 }
 
-// --- publishing --------------------------------------------------------------------------------
+// --- publishing
 
 // A publisher's other end: writes each sample once, over all connections.
 struct Owner {

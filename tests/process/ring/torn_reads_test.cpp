@@ -13,7 +13,7 @@
 #include <cstdlib>
 
 #include "core/ring/copy.hpp"
-#include "tests/unit/ring/test_ring.hpp"
+#include "tests/unit/core/ring/test_ring.hpp"
 
 namespace dssm::ring {
 namespace {

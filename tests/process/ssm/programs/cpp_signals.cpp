@@ -37,7 +37,6 @@ void alarm_after(int first, int next) {
 }
 
 // --- the storm: one child per round, ended by SIGINT at a random moment
-// ---------------------------
 
 SSMApi<Sample> source("storm", 0), sink("storm", 1), opened("storm", 0);
 SSMApiBase* const all[] = {&source, &sink, &opened};
@@ -162,7 +161,6 @@ void storm(int rounds, unsigned seed) {
 }
 
 // --- waits and signals
-// -----------------------------------------------------------------------------
 
 SSMApi<Sample> own("own", 0);
 int handler_reads = 0, handler_writes = 0;

@@ -1,0 +1,117 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/base/event_loop.hpp"
+
+#include <event2/event.h>
+
+#include "core/base/check.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+[[gnu::hot]] void on_event(evutil_socket_t, short, void* callback) noexcept {
+  (*static_cast<EventSource::Callback*>(callback))();
+}
+
+constexpr timeval kAtOnce{};
+
+// Without a lock, because there is one thread; without a look at the clock in each turn, because
+// libevent keeps none of our times (TimerQueue does).
+event_base* new_base() noexcept {
+  event_config* const config = event_config_new();
+  if (!config) return nullptr;
+  event_config_set_flag(config, EVENT_BASE_FLAG_NOLOCK | EVENT_BASE_FLAG_NO_CACHE_TIME);
+  event_base* const base = event_base_new_with_config(config);
+  event_config_free(config);
+  return base;
+}
+
+}  // namespace
+
+Result<EventLoop> EventLoop::open() {
+  Result<std::unique_ptr<TimerQueue>> timers = TimerQueue::open();
+  if (!timers) return std::move(timers).error().context("create the event loop");
+  EventLoop loop(*std::move(timers));
+  if (!loop.base_) return os_error("create the event loop");
+  loop.watch_timers();
+  return loop;
+}
+
+EventLoop::EventLoop(std::unique_ptr<TimerQueue> timers)
+    : base_(new_base()), timers_(std::move(timers)) {}
+
+// Due timers run in the next turn, when what has arrived is handed out: after a stall, who judges a
+// silence must not do so while the other side's words wait to be read.
+void EventLoop::watch_timers() {
+  run_timers_.reset(event_new(
+      base(), -1, 0,
+      [](evutil_socket_t, short, void* timers) noexcept {
+        static_cast<TimerQueue*>(timers)->run_due();
+      },
+      timers_.get()));
+  DSSM_CHECK(run_timers_);
+  timer_is_due_.reset(event_new(
+      base(), timers_->fd(), EV_READ | EV_ET | EV_PERSIST,
+      [](evutil_socket_t, short, void* run_timers) noexcept {
+        DSSM_CHECK(event_add(static_cast<event*>(run_timers), &kAtOnce) == 0);
+      },
+      run_timers_.get()));
+  DSSM_CHECK(timer_is_due_ && event_add(timer_is_due_.get(), nullptr) == 0);
+}
+
+Result<void> EventLoop::run() {
+  if (event_base_loop(base_.get(), EVLOOP_NO_EXIT_ON_EMPTY) < 0) {
+    return os_error("run the event loop");
+  }
+  return {};
+}
+
+void EventLoop::stop() noexcept { event_base_loopbreak(base_.get()); }
+
+void EventLoop::Free::operator()(event_base* base) const noexcept { event_base_free(base); }
+void FreeEvent::operator()(event* source) const noexcept { event_free(source); }
+
+EventSource::EventSource(const EventLoop& loop, int fd, short what, Callback callback)
+    : callback_(std::make_unique<Callback>(std::move(callback))),
+      event_(event_new(loop.base(), fd, what, on_event, callback_.get())) {
+  DSSM_CHECK(event_);  // fails only without memory for a few dozen bytes
+}
+
+EventSource EventSource::readable(const EventLoop& loop, int fd, Callback callback) {
+  return {loop, fd, EV_READ | EV_PERSIST, std::move(callback)};
+}
+
+EventSource EventSource::writable(const EventLoop& loop, int fd, Callback callback) {
+  return {loop, fd, EV_WRITE | EV_PERSIST, std::move(callback)};
+}
+
+EventSource EventSource::edge(const EventLoop& loop, int fd, Callback callback) {
+  return {loop, fd, EV_READ | EV_ET | EV_PERSIST, std::move(callback)};
+}
+
+EventSource EventSource::signal(const EventLoop& loop, int number, Callback callback) {
+  return {loop, number, EV_SIGNAL | EV_PERSIST, std::move(callback)};
+}
+
+EventSource EventSource::timer(const EventLoop& loop, Callback callback) {
+  EventSource timer(loop, -1, 0, std::move(callback));
+  timer.timer_ = std::make_unique<TimerQueue::Timer>(loop.timers(), *timer.callback_);
+  return timer;
+}
+
+void EventSource::enable() noexcept { DSSM_CHECK(event_add(event_.get(), nullptr) == 0); }
+
+void EventSource::enable_in(Duration delay) noexcept {
+  if (delay > Duration::zero()) {
+    event_del(event_.get());
+    return timer_->start(deadline_in(delay));
+  }
+  timer_->stop();
+  DSSM_CHECK(event_add(event_.get(), &kAtOnce) == 0);
+}
+
+void EventSource::disable() noexcept {
+  if (event_) event_del(event_.get());
+  if (timer_) timer_->stop();
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,77 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What dssmd tells its operator. The rest of the daemon knows only Logger; where the words go is
+// decided in main(). A function either logs or returns a failure, so lines appear where dssmd gives
+// something up.
+#pragma once
+
+#include <cstdint>
+#include <string>
+#include <string_view>
+
+namespace dssm::daemon {
+
+// Numbers as in syslog(3); each level includes the ones before it.
+enum class LogLevel : std::uint8_t { error = 3, warning = 4, notice = 5, info = 6, debug = 7 };
+
+// What an entry is about, for logs that can be searched by field. Empty: not about any.
+struct LogFields {
+  std::string_view stream = {};      // "lidar:0@pc1"
+  std::string_view peer = {};        // "'mapper' (pid 12, uid 1000)"
+  std::string_view message_id = {};  // one of daemon/base/message_ids.hpp
+};
+
+class Logger {
+ public:
+  virtual ~Logger() = default;
+  virtual void write(LogLevel level, std::string_view text, const LogFields& fields) noexcept = 0;
+
+  void error(std::string_view text, const LogFields& f = {}) { write(LogLevel::error, text, f); }
+  void warning(std::string_view text, const LogFields& f = {}) {
+    write(LogLevel::warning, text, f);
+  }
+  void notice(std::string_view text, const LogFields& f = {}) { write(LogLevel::notice, text, f); }
+  void info(std::string_view text, const LogFields& f = {}) { write(LogLevel::info, text, f); }
+  void debug(std::string_view text, const LogFields& f = {}) { write(LogLevel::debug, text, f); }
+};
+
+// A logger that leaves out what is less important than its level, which may change at any time.
+class LeveledLogger : public Logger {
+ public:
+  explicit LeveledLogger(LogLevel level) : level_(level) {}
+  void set_level(LogLevel level) noexcept { level_ = level; }
+
+ protected:
+  bool leaves_out(LogLevel level) const noexcept { return level > level_; }
+
+ private:
+  LogLevel level_;
+};
+
+// One line per entry to stderr: "dssmd: warning: text", or "<4>text" where systemd collects stderr
+// and cuts such prefixes off itself. Never waits: a line that stderr does not take at once is left
+// out and counted, and the next line says how many are missing.
+class StderrLogger final : public LeveledLogger {
+ public:
+  // journal_prefix: write "<4>" and the like; see stderr_is_journal().
+  StderrLogger(LogLevel level, bool journal_prefix)
+      : LeveledLogger(level), journal_prefix_(journal_prefix) {}
+
+  void write(LogLevel level, std::string_view text, const LogFields& fields) noexcept override;
+
+ private:
+  bool journal_prefix_;
+  std::uint64_t left_out_ = 0;
+};
+
+// Whether this process's stderr goes to the journal ($JOURNAL_STREAM names it).
+bool stderr_is_journal() noexcept;
+
+// `text` with control characters replaced by '?', so that what a client calls itself cannot forge
+// log lines.
+std::string printable(std::string_view text);
+
+// The same in single quotes, as messages show what they are about.
+std::string in_quotes(std::string_view text);
+
+}  // namespace dssm::daemon

@@ -1,0 +1,109 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The catalog: which hosts there are, and which streams they own, as far as known here. Own streams
+// stand in the Registry; this holds the others'. It is fed by discovery (Peers, configured or
+// found) and asked by everybody who has to find a stream. One thread, no sockets.
+//
+// A host is known by its id. Names may collide: then both hosts are kept, and whoever asks by that
+// name is told of both.
+#pragma once
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/stream.hpp>
+#include <map>
+#include <memory>
+#include <string>
+#include <utility>
+#include <vector>
+
+#include "core/wire/address.hpp"
+#include "core/wire/network_protocol.hpp"
+
+namespace dssm::daemon {
+
+// What one host may have us remember. An honest one has at most max_streams <= 32768 streams, which
+// take some 300 bytes each, and 50 for each field of their types.
+inline constexpr std::size_t kMaxStreamsPerHost = 32768;
+inline constexpr std::size_t kMaxBytesPerHost = 32U << 20;
+
+// A host that answers at this moment.
+struct KnownHost {
+  wire::Greeting greeting;  // name, id, life, version, clock
+  wire::Address address;    // where it was reached: channels go there too
+  std::map<std::pair<std::string, std::int32_t>, StreamInfo> streams;  // by name and id
+  std::size_t stream_bytes = 0;                                        // what `streams` takes
+
+  std::string str() const;  // "host 'pc2' ('10.0.0.2:13776')"
+};
+
+// Told about changes, after they are in the catalog. Handlers must not change the catalog.
+class CatalogObserver {
+ public:
+  virtual void on_host_up(const KnownHost&) {}
+  virtual void on_host_down(const KnownHost&, const Error&) {}  // after its streams are removed
+  virtual void on_host_clock(const KnownHost&) {}               // it said what its clock is like
+  virtual void on_remote_stream_added(const KnownHost&, const StreamInfo&) {}  // or a new ring
+  virtual void on_remote_stream_removed(const KnownHost&, const StreamInfo&) {}
+
+ protected:
+  ~CatalogObserver() = default;
+};
+
+class Catalog {
+ public:
+  explicit Catalog(std::string own_host) : own_host_(std::move(own_host)) {}
+  Catalog(const Catalog&) = delete;
+  Catalog& operator=(const Catalog&) = delete;
+
+  const std::string& own_host() const noexcept { return own_host_; }
+
+  void add_observer(CatalogObserver& observer);
+  void remove_observer(CatalogObserver& observer);  // also from within a handler
+
+  // --- fed by discovery
+
+  // The host answers. When it is known already by another address, the first one stays; a host that
+  // comes with another `life` has restarted: it is told as down first, with all its streams.
+  void host_up(const wire::Greeting& greeting, const wire::Address& address);
+  // It does not answer any more: its streams leave the catalog.
+  void host_down(const wire::HostId& id, const Error& why);
+  // A stream is there, or has a new ring. Its id names the owner's host. Descriptions of fields are
+  // left out when a host has too many of them.
+  //   fails  limit_exceeded (this host has too many streams), not_found (no such host)
+  Result<void> stream_added(const wire::HostId& id, StreamInfo stream);
+  void stream_removed(const wire::HostId& id, const StreamId& stream);
+  // What the host says about its clock by now.
+  void set_clock(const wire::HostId& id, std::shared_ptr<const wire::ClockReport> clock);
+
+  // --- asked
+
+  const std::map<wire::HostId, KnownHost>& hosts() const noexcept { return hosts_; }
+
+  // The host with that id; nullptr: it is not there.
+  const KnownHost* find(const wire::HostId& id) const;
+
+  // The host of that name.
+  //   fails  not_found (naming those that are known), conflict (two hosts of that name)
+  Result<const KnownHost*> find_host(const std::string& name) const;
+
+  // The host that owns `id`, when it is none of this host's own: the host in `id`, which is the one
+  // to say whether it has such a stream; or, without one, the only host that has it.
+  //   fails  not_found (what is known, what to do), conflict (naming all that have it)
+  Result<const KnownHost*> find_owner(const StreamId& id) const;
+
+  // Whether that very host, known by name, has such a stream at this moment.
+  bool has(const StreamId& id) const;
+
+ private:
+  using Key = std::pair<std::string, std::int32_t>;
+  template <class Tell>
+  void notify(const Tell& tell);
+  std::string host_names() const;  // "'pc2', 'pc3'"
+
+  std::string own_host_;
+  std::map<wire::HostId, KnownHost> hosts_;
+  std::vector<CatalogObserver*> observers_;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,50 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Which network interfaces to use, by the patterns of the configuration.
+#pragma once
+
+#include <functional>
+#include <map>
+#include <string>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "daemon/base/event_loop.hpp"
+
+namespace dssm::daemon {
+
+class InterfaceFilter {
+ public:
+  // Names or patterns (fnmatch(3)): those in `use`, all when that is empty, without those in
+  // `avoid`.
+  InterfaceFilter(std::vector<std::string> use, std::vector<std::string> avoid)
+      : use_(std::move(use)), avoid_(std::move(avoid)) {}
+
+  bool admits(const std::string& name) const;
+  // Whether only some are named, so that one has to know which there are.
+  bool selects() const noexcept { return !use_.empty(); }
+  std::string selection() const;  // "'eth*', 'wlan0'"
+
+  // Those that there are now, by index.
+  std::map<int, std::string> existing() const;
+
+ private:
+  std::vector<std::string> use_, avoid_;
+};
+
+// The name of the interface with that index; empty: it is gone.
+std::string interface_name(int index);
+
+// Calls back when interfaces may have come, gone or been renamed.
+class InterfaceWatch {
+ public:
+  InterfaceWatch(const EventLoop& loop, std::function<void()> on_change);
+  InterfaceWatch(const InterfaceWatch&) = delete;
+  InterfaceWatch& operator=(const InterfaceWatch&) = delete;
+
+ private:
+  UniqueFd netlink_;
+  EventSource source_;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,67 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The thread that talks to Avahi: keeps a client connected, lets it announce and browse, and
+// reports to the mailbox. Any call in here may take as long as D-Bus is patient (25 s).
+#pragma once
+
+#include <avahi-client/client.h>
+
+#include <memory>
+#include <string>
+
+#include "daemon/fleet/mdns/avahi_poll.hpp"
+#include "daemon/fleet/mdns/avahi_user.hpp"
+#include "daemon/fleet/mdns/host_browser.hpp"
+#include "daemon/fleet/mdns/interface_filter.hpp"
+#include "daemon/fleet/mdns/mdns.hpp"
+#include "daemon/fleet/mdns/mdns_mailbox.hpp"
+#include "daemon/fleet/mdns/service_publisher.hpp"
+
+namespace dssm::daemon {
+
+class MdnsWorker final : private AvahiUser {
+ public:
+  // loop and mailbox outlive it; loop is its own.
+  MdnsWorker(EventLoop& loop, const Mdns::Options& options, MdnsMailbox& mailbox);
+  MdnsWorker(const MdnsWorker&) = delete;
+  MdnsWorker& operator=(const MdnsWorker&) = delete;
+  ~MdnsWorker();  // withdraws all
+
+  void run();  // until the mailbox says stop
+
+ private:
+  void on_avahi_change() override;
+  void on_avahi_failure(int error) override;
+  void log(LogLevel level, std::string text) override;
+  bool stopping() const noexcept override;
+
+  static void on_client(AvahiClient* client, AvahiClientState state, void* self);
+  void on_orders();
+  void on_settled();
+  bool take_orders();
+  void connect();
+  void disconnect();
+  void follow_state();
+  void wait_for_avahi(int error);
+  void begin_anew();
+  void choose_interfaces();
+  void report();
+
+  EventLoop& loop_;
+  MdnsMailbox& mailbox_;
+  const InterfaceFilter filter_;
+  LoopAvahiPoll poll_;
+  ServicePublisher publisher_;
+  HostBrowser browser_;
+  AvahiClient* client_ = nullptr;
+  MdnsState state_;
+  std::string interface_trouble_;
+  int failure_ = 0;            // of the client, to be dealt with outside its callbacks
+  bool renamed_ = false;       // this PC got another name since follow_state() looked
+  bool told_waiting_ = false;  // the log knows
+  Duration pause_;             // before the next attempt to connect
+  std::unique_ptr<InterfaceWatch> interfaces_;
+  EventSource orders_, settle_, connect_, follow_, report_;
+};
+
+}  // namespace dssm::daemon

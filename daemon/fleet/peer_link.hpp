@@ -1,0 +1,139 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The control connection to one configured peer, or to one host that was found: keeps it up,
+// carries requests and their answers, listens to changes of the peer's streams, and measures that
+// it is alive. What a peer means for the catalog is decided by Peers.
+#pragma once
+
+#include <functional>
+#include <map>
+#include <optional>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "core/wire/address.hpp"
+#include "core/wire/network_protocol.hpp"
+#include "daemon/base/event_loop.hpp"
+#include "daemon/link/dialer.hpp"
+
+namespace dssm::daemon {
+
+class PeerLink final : private Dialer::User {
+ public:
+  // Requests of one peer that wait for their answers.
+  static constexpr std::size_t kMaxWaiting = 4096;
+  static constexpr std::size_t kMaxWaitingBytes = 40U << 20;  // two properties of the largest size
+
+  // A found host that answers again is back within kFoundRoundTime + kFoundPause, whichever of its
+  // addresses are dead; the design allows 3 s.
+  static constexpr Duration kFoundRoundTime = std::chrono::milliseconds(1500);
+  static constexpr Duration kFoundPause = std::chrono::seconds(1);
+
+  enum class State : unsigned char {
+    connecting,  // not decided yet
+    up,
+    down,     // it cannot be reached
+    refused,  // it answers, but we do not fit together
+  };
+
+  // Told from the loop; must not destroy the link.
+  class User {
+   public:
+    virtual void on_link_up(PeerLink& link) = 0;
+    // It was up, or, `attempt`: it could not be brought up.
+    virtual void on_link_down(PeerLink& link, const Error& why, bool attempt) = 0;
+    // After watch(): a change of the peer's streams. Fails when that is nonsense.
+    virtual Result<void> on_stream_event_untrusted(PeerLink& link,
+                                                   const net::StreamEvent& event) = 0;
+    virtual void on_watched(PeerLink& link) = 0;    // all that was there has been told
+    virtual void on_heartbeat(PeerLink& link) = 0;  // them() has news of the peer's clock
+
+   protected:
+    ~User() = default;
+  };
+
+  // Starts at once; what is given outlives it. To a configured peer, whoever that is:
+  PeerLink(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
+           const wire::Greeting& self, User& user);
+  // To the host `id`, which is said to be at one of `addresses` (numbers, best first, at least
+  // one); any other that answers there is refused.
+  PeerLink(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
+           const std::vector<wire::Address>& addresses, const wire::Greeting& self, User& user);
+  PeerLink(const PeerLink&) = delete;
+  PeerLink& operator=(const PeerLink&) = delete;
+
+  // --- to be called while it is up
+
+  // Sends a request (its serial is set here). `then` gets the answer, or why there is none: the
+  // peer's own words, limit_exceeded (too much is waiting), daemon_away (not up, or the connection
+  // broke). Called once, from the loop, or at once when nothing was sent.
+  using Then = std::function<void(Result<net::Frame>)>;
+  void ask(net::Frame request, Then then);
+
+  // From now on on_stream_event_untrusted().
+  void watch();
+
+  // Heartbeats, and death after kSilenceIsDeath without any sign of life.
+  void keep_alive();
+
+  // Gives the connection up and tries again later.
+  void drop(const Error& why) { dialer_.restart(why); }
+
+  // Where to go from the next attempt on, which comes at once unless it is up.
+  void set_addresses(const std::vector<wire::Address>& addresses);
+
+  // --- about the peer
+
+  State state() const noexcept { return state_; }
+  Duration in_this_state_for() const noexcept { return MonoClock::now() - since_; }
+  const std::optional<Error>& why() const noexcept { return why_; }  // it is not up
+  // Who answers there; while it is not up, who did last.
+  const std::optional<wire::Greeting>& them() const noexcept { return them_; }
+  // As configured; of a found host: its first address.
+  const wire::Address& configured() const noexcept { return configured_; }
+  std::string address() const { return dialer_.address(); }  // connected to, else configured()
+  bool crosses_network() const noexcept { return dialer_.crosses_network(); }
+
+  // Of the heartbeats of this connection; zero: not known.
+  Duration last_round_trip() const noexcept { return last_round_trip_; }
+  Duration least_round_trip() const noexcept { return least_round_trip_; }
+
+ private:
+  struct Waiting {
+    Then then;
+    std::size_t bytes = 0;
+  };
+
+  void on_up(FrameLink& link, const wire::Greeting& them) override;
+  Result<void> on_frame(net::Frame& frame) override;
+  void on_down(const Error& why) override;
+  void beat();
+  void take_clock(std::shared_ptr<const wire::ClockReport> clock);
+  void on_pong(MonoTime asked, const Result<net::Frame>& answer);
+  void enter(State state, std::optional<Error> why);
+
+  PeerLink(const EventLoop& loop, Resolver& resolver, std::optional<wire::HostId> expected,
+           Dialer::Options options, User& user);
+
+  wire::Address configured_;
+  const std::optional<wire::HostId> expected_;
+  const wire::Greeting self_;
+  User& user_;
+  State state_ = State::connecting;
+  MonoTime since_ = MonoClock::now();
+  std::optional<Error> why_;
+  std::optional<wire::Greeting> them_;
+  Duration last_round_trip_{}, least_round_trip_{};
+  bool watching_ = false;
+  std::uint64_t next_serial_ = 1;
+  std::map<std::uint64_t, Waiting> waiting_;
+  std::size_t waiting_bytes_ = 0;
+  EventSource heartbeat_;
+  Dialer dialer_;  // last: it calls the others
+};
+
+// "connecting", "up" ...; static storage.
+std::string_view state_name(PeerLink::State state) noexcept;
+
+}  // namespace dssm::daemon

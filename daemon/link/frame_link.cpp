@@ -1,0 +1,301 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/link/frame_link.hpp"
+
+#include <algorithm>
+#include <array>
+#include <optional>
+#include <utility>
+
+#include "core/clock/coarse_now.hpp"
+#include "core/wire/frame.hpp"
+#include "core/wire/network_protocol.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+constexpr std::size_t kMaxParts = 16;  // of one send, as Transport takes them
+
+Error closed_by_handler() { return {Errc::closed, "the connection was closed meanwhile"}; }
+
+iovec part_of(std::span<const std::byte> bytes) noexcept {
+  return {const_cast<std::byte*>(bytes.data()), bytes.size()};
+}
+
+std::size_t total(std::span<const iovec> parts) noexcept {
+  std::size_t bytes = 0;
+  for (const iovec& part : parts) bytes += part.iov_len;
+  return bytes;
+}
+
+}  // namespace
+
+FrameLink::FrameLink(const EventLoop& loop, std::unique_ptr<wire::Transport> transport, User& user,
+                     std::size_t max_queued_bytes)
+    : transport_(std::move(transport)),
+      user_(user),
+      max_queued_bytes_(max_queued_bytes),
+      decoder_(*this, wire::kMaxNetworkFrameBytes),
+      readable_(EventSource::readable(loop, transport_->fd(), [this] { on_readable(); })),
+      writable_(EventSource::writable(loop, transport_->fd(), [this] { on_writable(); })),
+      next_turn_(EventSource::timer(loop, [this] { go_on(); })),
+      ended_(EventSource::timer(loop, [this] { user_.on_closed(why_); })) {
+  readable_.enable();
+}
+
+FrameLink::~FrameLink() = default;
+
+std::span<const std::byte> FrameLink::Outgoing::unsent() const noexcept {
+  const auto* text = std::get_if<std::string>(&bytes);
+  const auto all = text ? std::as_bytes(std::span(*text)) : std::get_if<RawBytes>(&bytes)->span();
+  return all.subspan(sent);
+}
+
+void FrameLink::take_samples(std::size_t payload_bytes, SampleSink& sink) noexcept {
+  samples_ = &sink;
+  decoder_.set_payload_bytes(payload_bytes);
+}
+
+// --- receiving
+
+[[gnu::hot]] void FrameLink::on_readable() {
+  std::size_t received = 0;
+  Error end;
+  bool ended = false;
+  for (int receives = 0; receives < kReceivesPerTurn && received < kBytesPerTurn; ++receives) {
+    const std::span<const iovec> spaces = decoder_.spaces();
+    const std::size_t room = total(spaces);
+    const Result<wire::IoResult> got = transport_->receive(spaces);
+    if (got && got->status == wire::IoStatus::would_block) break;
+    if (!got || got->status == wire::IoStatus::end) {
+      ended = true;
+      end = !got ? got.error()
+                 : Error{Errc::daemon_away, decoder_.at_frame_end()
+                                                ? "the other side closed the connection"
+                                                : "the other side closed the connection in the "
+                                                  "middle of a frame"};
+      break;
+    }
+    last_heard_ = clock::coarse_now();
+    received += got->bytes;
+    if (!hand_out(got->bytes)) return;
+    if (paused_ || held_ || got->bytes < room) break;
+  }
+  if (received > 0 && samples_) samples_->on_batch_end();
+  if (ended) close(end);
+}
+
+// Goes on with what was received before a pause.
+void FrameLink::go_on() {
+  if (closed_ || paused_ || !hand_out(0)) return;
+  if (samples_) samples_->on_batch_end();
+  if (!closed_ && !paused_) listen_again();
+}
+
+// False when the link closed over it.
+[[gnu::hot]] bool FrameLink::hand_out(std::size_t bytes) {
+  held_ = false;
+  handing_out_ = true;
+  const Result<void> taken = decoder_.commit(bytes);
+  handing_out_ = false;
+  if (!taken) close_with(taken.error());
+  return !closed_ && charge_input();
+}
+
+[[gnu::hot]] bool FrameLink::charge_input() {
+  const std::size_t bytes = decoder_.collected_bytes();
+  if (!budget_ || bytes == input_share_.bytes()) return true;
+  input_share_ = {};
+  std::optional<MemoryShare> share = budget_->try_take(bytes);
+  if (share) {
+    input_share_ = *std::move(share);
+    return true;
+  }
+  close_with({Errc::limit_exceeded,
+              "no memory is left to receive a frame of more than " + std::to_string(bytes) +
+                  " bytes: max_peer_memory = " + std::to_string(budget_->limit()) +
+                  " bytes are used up; use fewer connections or raise that key"});
+  return false;
+}
+
+void FrameLink::listen_again() {
+  if (held_) return next_turn_.enable_in(Duration::zero());
+  readable_.enable();
+}
+
+// A handler may have closed the link: the decoder is stopped, too.
+[[gnu::hot]] Result<void> FrameLink::on_sample_begin(const wire::IncomingSample& sample,
+                                                     std::byte*& out) {
+  if (closed_) return closed_by_handler();
+  return samples_->on_sample_begin(sample, out);
+}
+
+[[gnu::hot]] Result<void> FrameLink::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+  if (closed_) return closed_by_handler();
+  return samples_->on_sample_end(sample, torn);
+}
+
+Result<void> FrameLink::on_frame(net::Frame& frame) {
+  if (closed_) return closed_by_handler();
+  return user_.on_frame(frame);
+}
+
+void FrameLink::pause() {
+  if (closed_ || paused_) return;
+  paused_ = true;
+  if (handing_out_) {
+    decoder_.hold();
+    held_ = true;
+  }
+  readable_.disable();
+  next_turn_.disable();
+  if (output_lost_) close(why_);
+}
+
+void FrameLink::resume() {
+  if (closed_ || !paused_) return;
+  paused_ = false;
+  listen_again();
+}
+
+// --- sending
+
+void FrameLink::send(const net::Frame& frame) {
+  if (closed_ || output_lost_) return;
+  Outgoing outgoing{wire::encode_frame(frame), 0, true, {}};
+  const std::size_t bytes = outgoing.unsent().size();
+  if (output_.empty() && !mid_frame_) {
+    const iovec part = part_of(outgoing.unsent());
+    outgoing.sent = transmit({&part, 1});
+    if (outgoing.sent == bytes || closed_ || output_lost_) return;
+  }
+  // Last words cannot stand in the middle of a frame.
+  const auto refuse = [&](const Error& why) {
+    mid_frame_ = mid_frame_ || outgoing.sent > 0;
+    close_with(why);
+  };
+  if (queued_bytes_ + bytes > max_queued_bytes_) {
+    return refuse({Errc::limit_exceeded,
+                   "the other side does not read: " + std::to_string(queued_bytes_) +
+                       " bytes wait for it, and " + std::to_string(bytes) +
+                       " more would be above the limit of " + std::to_string(max_queued_bytes_)});
+  }
+  if (budget_) {
+    std::optional<MemoryShare> share = budget_->try_take(bytes);
+    if (!share) {
+      return refuse({Errc::limit_exceeded,
+                     "the other side does not read: no memory is left for " +
+                         std::to_string(bytes) +
+                         " bytes more of max_peer_memory = " + std::to_string(budget_->limit()) +
+                         " bytes; read faster, use fewer connections, or raise that key"});
+    }
+    outgoing.share = *std::move(share);
+  }
+  queued_bytes_ += bytes;
+  enqueue(std::move(outgoing));
+}
+
+[[gnu::hot]] std::size_t FrameLink::send_now(std::span<const iovec> parts) {
+  if (closed_ || output_lost_ || (!output_.empty() && !mid_frame_)) return 0;
+  return transmit(parts);
+}
+
+void FrameLink::queue_rest(RawBytes bytes, MemoryShare share) {
+  if (closed_ || output_lost_) return;
+  Outgoing outgoing{std::move(bytes), 0, false, std::move(share)};
+  if (!mid_frame_) return enqueue(std::move(outgoing));
+  // The frame that it completes went out piece by piece: before all that waits.
+  output_.push_front(std::move(outgoing));
+  writable_.enable();
+}
+
+void FrameLink::enqueue(Outgoing outgoing) {
+  output_.push_back(std::move(outgoing));
+  if (!mid_frame_) writable_.enable();
+}
+
+void FrameLink::set_mid_frame(bool mid_frame) {
+  mid_frame_ = mid_frame;
+  if (!mid_frame && !output_.empty()) want_output();
+}
+
+void FrameLink::want_output() {
+  if (!closed_ && !output_lost_) writable_.enable();
+}
+
+void FrameLink::on_writable() {
+  if (!mid_frame_ && !flush()) return;
+  writable_.disable();
+  user_.on_output_empty();
+}
+
+// Sends what waits. True when nothing is left.
+bool FrameLink::flush() {
+  while (!output_.empty()) {
+    std::array<iovec, kMaxParts> parts;
+    std::size_t count = 0, bytes = 0;
+    for (const Outgoing& next : output_) {
+      if (count == parts.size()) break;
+      parts[count] = part_of(next.unsent());
+      bytes += parts[count++].iov_len;
+    }
+    std::size_t sent = transmit(std::span(parts).first(count));
+    if (closed_ || output_lost_) return false;
+    const bool all = sent == bytes;
+    while (!output_.empty()) {
+      Outgoing& next = output_.front();
+      const std::size_t step = std::min(sent, next.unsent().size());
+      next.sent += step;
+      sent -= step;
+      if (!next.unsent().empty()) break;
+      if (next.counted) queued_bytes_ -= next.sent;
+      output_.pop_front();
+    }
+    if (!all) return false;
+  }
+  return true;
+}
+
+[[gnu::hot]] std::size_t FrameLink::transmit(std::span<const iovec> parts) {
+  const Result<wire::IoResult> sent = transport_->send(parts);
+  if (sent && sent->status != wire::IoStatus::end) return sent->bytes;
+  why_ = sent ? Error{Errc::daemon_away, "the other side closed the connection"} : sent.error();
+  lose_output();
+  return 0;
+}
+
+// The peer may have said why before it closed: that waits to be received, so receiving goes on and
+// will find the end by itself.
+void FrameLink::lose_output() {
+  output_lost_ = true;
+  output_.clear();
+  queued_bytes_ = 0;
+  writable_.disable();
+  if (paused_) close(why_);
+}
+
+void FrameLink::close_with(const Error& why) {
+  if (closed_) return;
+  if (!output_lost_ && !mid_frame_ && flush()) {
+    net::Frame last_words;
+    wire::to_message(why, *last_words.mutable_failure());
+    const std::string encoded = wire::encode_frame(last_words);
+    const iovec part = part_of(std::as_bytes(std::span(encoded)));
+    transmit({&part, 1});
+  }
+  close(why);
+}
+
+void FrameLink::close(const Error& why) {
+  if (closed_) return;
+  closed_ = true;
+  why_ = why;
+  readable_.disable();
+  writable_.disable();
+  next_turn_.disable();
+  output_.clear();
+  input_share_ = {};
+  transport_.reset();
+  ended_.enable_in(Duration::zero());
+}
+
+}  // namespace dssm::daemon

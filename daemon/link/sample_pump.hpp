@@ -1,0 +1,110 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Sends a ring's samples over a link from a given one on: each once, in the order of their tids, as
+// fast as the link takes them, until it has caught up; then waits to be called again. What the ring
+// no longer holds when its turn comes is told as a gap. Knows neither subscriptions nor doorbells:
+// DataCommunicator and RemoteWriter use it at the two ends of a channel.
+//
+// Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/sample.hpp>
+
+#include "core/ring/ring_reader.hpp"
+#include "daemon/link/frame_link.hpp"
+#include "daemon/link/sample_sender.hpp"
+
+namespace dssm::daemon {
+
+// Tids beyond this one are no samples: somebody with write access has written nonsense into the
+// ring. Far enough from the greatest number to add to them.
+inline constexpr Tid kLastTid = Tid{1} << 62;
+
+// The newest sample, as those see it who send samples to other hosts; kNoTid: none.
+Tid newest_untrusted(const ring::RingReader& reader) noexcept;
+
+// What has to happen before pump() has something to do.
+enum class PumpWait : std::uint8_t {
+  news,     // a sample newer than known()
+  room,     // on_output_empty() of the link
+  turn,     // others had theirs
+  time,     // due() comes
+  nothing,  // it has ended
+};
+
+// The mapping, link, sender and events outlive it. pump() may call events and send on the link.
+class SamplePump {
+ public:
+  static constexpr int kSamplesPerTurn = 1024;
+  static constexpr std::size_t kBytesPerTurn = 1U << 20;
+
+  class Events {
+   public:
+    // Samples [first, first + count) are lost. Frames may be sent on the link.
+    virtual void on_gap(Tid first, std::uint64_t count) = 0;
+    // What was written until now may be sent next. Frames may be sent on the link.
+    virtual void before_samples() {}
+    // All samples up to Plan::caught_up_at were sent or lost.
+    virtual void on_caught_up() {}
+    // After end_at(): all samples up to that one were sent or lost.
+    virtual void on_end() {}
+
+   protected:
+    ~Events() = default;
+  };
+
+  struct Plan {
+    Tid first = 0;  // >= 0; may lie before what the ring holds (a gap), or in the future
+    Tid caught_up_at = kNoTid;
+    // > 0: at most so many samples per second: the newest one at each time. What is left out is no
+    // gap. Above 1000 the loop's timers, which count milliseconds, make it less when samples come
+    // faster than that.
+    double max_rate_hz = 0;
+  };
+
+  SamplePump(const ring::RingMapping& mapping, FrameLink& link, SampleSender& sender,
+             Events& events, const Plan& plan);
+  SamplePump(const SamplePump&) = delete;
+  SamplePump& operator=(const SamplePump&) = delete;
+
+  // Whether it leaves samples out, to keep to a rate: only then pump() looks at its `now`.
+  bool thins() const noexcept { return plan_.max_rate_hz > 0; }
+
+  // Sends what there is to be sent in one turn. The sender must not be busy with somebody else's
+  // sample.
+  //   only_under_way  begins no other sample: somebody else wants to send in between
+  //   fails           limit_exceeded (the peer's memory is used up, and it does not know "torn")
+  Result<PumpWait> pump(MonoTime now, bool only_under_way = false);
+
+  // No sample after `last` is sent.
+  void end_at(Tid last) noexcept { last_ = last; }
+
+  // The newest sample that was looked at: only a newer one is news.
+  Tid known() const noexcept { return next_ - 1; }
+  MonoTime due() const noexcept { return due_; }
+  std::uint64_t lost() const noexcept { return lost_; }
+
+ private:
+  enum class Look : std::uint8_t { ready, news, time, end };
+  Look look(MonoTime now);
+  void lose_up_to(Tid next);
+  void after_sample(MonoTime now);
+
+  ring::RingReader reader_;
+  std::size_t payload_bytes_;
+  FrameLink& link_;
+  SampleSender& sender_;
+  Events& events_;
+  Plan plan_;
+  Tid next_;
+  Tid last_;
+  bool under_way_ = false;  // the sender is busy with sample next_
+  bool caught_up_ = false;
+  MonoTime due_{};
+  std::uint64_t lost_ = 0;
+};
+
+}  // namespace dssm::daemon

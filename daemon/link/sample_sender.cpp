@@ -1,0 +1,250 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/link/sample_sender.hpp"
+
+#include <algorithm>
+#include <optional>
+#include <utility>
+
+#include "core/base/check.hpp"
+#include "core/ring/copy.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+using ring::RingReader;
+
+iovec part_of(const std::byte* bytes, std::size_t size) noexcept {
+  return {const_cast<std::byte*>(bytes), size};  // the kernel only reads them
+}
+
+}  // namespace
+
+SampleSender::SampleSender(const ring::RingMapping& mapping, FrameLink& link,
+                           const Options& options)
+    : reader_(mapping),
+      link_(link),
+      options_(options),
+      payload_bytes_(mapping.geometry().payload_bytes) {}
+
+[[gnu::hot]] SendStatus SampleSender::send(Tid tid, std::uint64_t serial, bool more_follow) {
+  DSSM_CHECK(!busy_);
+  const bool is_small = payload_bytes_ < kInPlaceBytes;
+  const bool may_copy = payload_bytes_ <= kMostCopiedBytes;
+  const bool copy_pays = is_small || !more_follow || !options_.may_tear;
+  return may_copy && copy_pays ? send_copy(tid, serial) : begin_in_place(tid, serial);
+}
+
+[[gnu::hot]] SendStatus SampleSender::send_copy(Tid tid, std::uint64_t serial) {
+  std::byte staged[sizeof head_ + kMostCopiedBytes];
+  SampleInfo info;
+  std::byte* payload = staged + sizeof head_;
+  if (reader_.read(tid, {payload, payload_bytes_}, info) != ReadStatus::ok) return SendStatus::gone;
+  std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
+  const std::size_t header_bytes =
+      wire::encode_sample_header(header, serial, info, payload_bytes_, wire::Trailer::none);
+  // Behind the verdict on the sample before, if it is still here.
+  const std::size_t kept_bytes = head_bytes_ - head_sent_;
+  keep_head(std::span(header).first(header_bytes));
+  const std::size_t bytes = kept_bytes + header_bytes + payload_bytes_;
+  std::byte* begin = payload - header_bytes - kept_bytes;
+  std::copy_n(head_.begin() + head_sent_, kept_bytes + header_bytes, begin);
+  head_bytes_ -= header_bytes;
+  const iovec part = part_of(begin, bytes);
+  const std::size_t sent = link_.send_now({&part, 1});
+  if (sent <= kept_bytes) {
+    head_sent_ += sent;
+    link_.want_output();
+    return SendStatus::blocked;
+  }
+  head_bytes_ = head_sent_ = 0;
+  // Charged with the connection: there is at most one such rest.
+  if (sent < bytes) link_.queue_rest(RawBytes::copy_of({begin + sent, bytes - sent}));
+  counters_.copied_payload_bytes += payload_bytes_;
+  ++counters_.samples;
+  return SendStatus::sent;
+}
+
+// --- small payloads, many at a time
+
+[[gnu::hot]] SendStatus SampleSender::send_many(Tid first, Tid last, Tid& next) {
+  next = first;
+  std::byte staged[kBatchBytes];
+  std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
+  // Headers of one stream have one length (sample_frame.cpp), so frames have as well.
+  const std::size_t header_bytes =
+      wire::encode_sample_header(header, 0, {}, payload_bytes_, wire::Trailer::none);
+  const std::size_t frame_bytes = header_bytes + payload_bytes_;
+  const auto room = static_cast<Tid>(kBatchBytes / frame_bytes);
+  const Tid end = last - first < room ? last + 1 : first + room;
+  std::size_t bytes = 0;
+  for (; next < end; ++next, bytes += frame_bytes) {
+    SampleInfo info;
+    std::byte* payload = staged + bytes + header_bytes;
+    if (reader_.read(next, {payload, payload_bytes_}, info) != ReadStatus::ok) break;
+    wire::encode_sample_header(header, 0, info, payload_bytes_, wire::Trailer::none);
+    std::copy_n(header.begin(), header_bytes, staged + bytes);
+  }
+  if (bytes == 0) return SendStatus::gone;
+  const iovec part = part_of(staged, bytes);
+  const std::size_t sent = link_.send_now({&part, 1});
+  counters_.copied_payload_bytes += static_cast<std::uint64_t>(next - first) * payload_bytes_;
+  if (sent == 0) {
+    link_.want_output();
+    next = first;
+    return SendStatus::blocked;
+  }
+  if (sent < bytes) {
+    std::optional<MemoryShare> share;
+    if (options_.budget) share = options_.budget->try_take(bytes - sent);
+    if (options_.budget && !share) {
+      // Only what completes the frame that is begun; the others are still in the ring.
+      const std::size_t frames = (sent + frame_bytes - 1) / frame_bytes;
+      bytes = frames * frame_bytes;
+      next = first + static_cast<Tid>(frames);
+    }
+    if (sent < bytes) {
+      link_.queue_rest(RawBytes::copy_of({staged + sent, bytes - sent}),
+                       share ? *std::move(share) : MemoryShare());
+    }
+  }
+  counters_.samples += static_cast<std::uint64_t>(next - first);
+  return SendStatus::sent;
+}
+
+// --- large payloads
+
+void SampleSender::keep_head(std::span<const std::byte> bytes) noexcept {
+  std::copy(bytes.begin(), bytes.end(), head_.begin() + head_bytes_);
+  head_bytes_ += bytes.size();
+}
+
+SendStatus SampleSender::begin_in_place(Tid tid, std::uint64_t serial) {
+  SampleInfo info;
+  if (reader_.locate(tid, place_, info) != ReadStatus::ok) return SendStatus::gone;
+  std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
+  const std::size_t header_bytes =
+      wire::encode_sample_header(header, serial, info, payload_bytes_,
+                                 options_.may_tear ? wire::Trailer::torn : wire::Trailer::none);
+  const std::size_t kept_bytes = head_bytes_;
+  keep_head(std::span(header).first(header_bytes));
+  offset_ = 0;
+  busy_ = true;
+  if (!options_.may_tear) {
+    if (!begin_copying()) {
+      busy_ = false;
+      head_bytes_ = kept_bytes;
+      return SendStatus::no_memory;
+    }
+    return copy_slice();
+  }
+  link_.set_mid_frame(true);
+  const SendStatus status = send_slice();
+  if (busy_ && head_sent_ <= kept_bytes && !copying_) {
+    // Nothing of this sample went: it is not begun.
+    busy_ = false;
+    head_bytes_ = kept_bytes;
+    link_.set_mid_frame(false);
+    return SendStatus::blocked;
+  }
+  return status;
+}
+
+SendStatus SampleSender::go_on() {
+  DSSM_CHECK(busy_);
+  return copying_ ? copy_slice() : send_slice();
+}
+
+SendStatus SampleSender::send_slice() {
+  const std::size_t slice = std::min(payload_bytes_ - offset_, kSliceBytes);
+  const std::size_t head = head_bytes_ - head_sent_;
+  const iovec parts[] = {part_of(head_.data() + head_sent_, head),
+                         part_of(place_.payload + offset_, slice)};
+  const std::size_t sent = link_.send_now(parts);
+  head_sent_ += std::min(sent, head);
+  const std::size_t of_payload = sent - std::min(sent, head);
+  offset_ += of_payload;
+  counters_.in_place_payload_bytes += of_payload;
+  if (sent == head + slice) {
+    if (offset_ < payload_bytes_) return SendStatus::unfinished;
+    head_bytes_ = head_sent_ = 0;
+    return end_sample(RingReader::still_valid(*place_.sequence, place_.expected));
+  }
+  // The socket is full. Nothing is copied aside of a sample that is not begun, nor of one that is
+  // void already.
+  const bool begun = head_sent_ > 0;
+  if (begun && RingReader::still_valid(*place_.sequence, place_.expected) && begin_copying()) {
+    return copy_slice();
+  }
+  link_.want_output();
+  return SendStatus::blocked;
+}
+
+// False when there is no memory for it.
+bool SampleSender::begin_copying() {
+  const std::size_t head = head_bytes_ - head_sent_;
+  const std::size_t bytes =
+      head + (payload_bytes_ - offset_) + (options_.may_tear ? wire::kTornTrailerBytes : 0);
+  if (options_.budget) {
+    std::optional<MemoryShare> share = options_.budget->try_take(bytes);
+    if (!share) return false;
+    share_ = *std::move(share);
+  }
+  aside_ = RawBytes(bytes);
+  std::copy_n(head_.begin() + head_sent_, head, aside_.data());
+  aside_bytes_ = head;
+  head_bytes_ = head_sent_ = 0;
+  copying_ = true;
+  return true;
+}
+
+SendStatus SampleSender::copy_slice() {
+  const std::size_t slice = std::min(payload_bytes_ - offset_, kSliceBytes);
+  ring::copy_out(aside_.data() + aside_bytes_, place_.payload + offset_, slice);
+  aside_bytes_ += slice;
+  offset_ += slice;
+  counters_.copied_payload_bytes += slice;
+  return offset_ < payload_bytes_ ? SendStatus::unfinished : end_copying();
+}
+
+SendStatus SampleSender::end_copying() {
+  const bool valid = RingReader::still_valid(*place_.sequence, place_.expected);
+  copying_ = false;
+  if (!options_.may_tear && !valid) {
+    busy_ = false;
+    aside_ = {};
+    share_ = {};
+    return SendStatus::gone;
+  }
+  if (options_.may_tear) {
+    const auto verdict = wire::torn_trailer(!valid);
+    std::copy(verdict.begin(), verdict.end(), aside_.data() + aside_bytes_);
+  }
+  link_.queue_rest(std::exchange(aside_, {}), std::exchange(share_, {}));
+  const SendStatus status = end_sample(valid);
+  head_bytes_ = 0;  // the verdict is queued already
+  return status;
+}
+
+SendStatus SampleSender::end_sample(bool valid) {
+  if (options_.may_tear) {
+    keep_head(wire::torn_trailer(!valid));
+    link_.set_mid_frame(false);
+  }
+  busy_ = false;
+  ++counters_.samples;
+  if (!valid) ++counters_.torn;
+  return valid ? SendStatus::sent : SendStatus::torn;
+}
+
+[[gnu::hot]] void SampleSender::end_run() {
+  if (busy_ || head_bytes_ == 0) return;
+  const std::size_t bytes = head_bytes_ - head_sent_;
+  const iovec part = part_of(head_.data() + head_sent_, bytes);
+  const std::size_t sent = bytes > 0 ? link_.send_now({&part, 1}) : 0;
+  if (sent < bytes) {
+    link_.queue_rest(RawBytes::copy_of(std::span(head_).subspan(head_sent_ + sent, bytes - sent)));
+  }
+  head_bytes_ = head_sent_ = 0;
+}
+
+}  // namespace dssm::daemon

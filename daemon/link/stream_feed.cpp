@@ -1,0 +1,79 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/link/stream_feed.hpp"
+
+#include <algorithm>
+#include <utility>
+
+#include "daemon/link/sample_pump.hpp"
+
+namespace dssm::daemon {
+
+Result<std::shared_ptr<StreamFeed>> StreamFeed::open(const EventLoop& loop,
+                                                     std::shared_ptr<Stream> stream) {
+  Result<std::shared_ptr<ring::Bell>> bell = stream->map_bell();
+  if (!bell) return std::move(bell).error().context("stream '" + stream->id().str() + "'");
+  return std::shared_ptr<StreamFeed>(new StreamFeed(loop, std::move(stream), *std::move(bell)));
+}
+
+StreamFeed::StreamFeed(const EventLoop& loop, std::shared_ptr<Stream> stream,
+                       std::shared_ptr<ring::Bell> bell)
+    : loop_(loop), stream_(std::move(stream)), bell_(std::move(bell)), reader_(stream_->mapping()) {
+  stream_->observe_doorbells(this);
+}
+
+StreamFeed::~StreamFeed() {
+  stream_->observe_doorbells(nullptr);
+  arm(false);
+}
+
+void StreamFeed::on_doorbell_added(int fd) {
+  doorbells_.push_back(EventSource::edge(loop_, fd, [this] { look(); }));
+  doorbells_.back().enable();
+}
+
+[[gnu::hot]] void StreamFeed::arm(bool armed) noexcept {
+  if (armed == armed_) return;
+  armed_ = armed;
+  bell_->arm_doorbell(armed);
+}
+
+[[gnu::hot]] bool StreamFeed::wait(Listener& listener, Tid known) {
+  std::erase_if(waiting_, [&](const Waiting& waiting) { return waiting.listener == &listener; });
+  arm(true);
+  if (newest_untrusted(reader_) > known) {
+    if (waiting_.empty()) arm(false);
+    return false;
+  }
+  waiting_.push_back({&listener, known});
+  return true;
+}
+
+[[gnu::hot]] void StreamFeed::forget(Listener& listener) noexcept {
+  std::erase_if(waiting_, [&](const Waiting& waiting) { return waiting.listener == &listener; });
+  for (Waiting& waiting : told_) {
+    if (waiting.listener == &listener) waiting.listener = nullptr;
+  }
+  if (waiting_.empty()) arm(false);
+}
+
+[[gnu::hot]] void StreamFeed::look() {
+  look_again_ = true;
+  if (looking_) return;  // a listener wrote to the stream
+  looking_ = true;
+  while (std::exchange(look_again_, false) && !waiting_.empty()) {
+    // Disarmed, so that the writer does not ring for what is sent in this round anyway.
+    arm(false);
+    std::swap(told_, waiting_);  // neither gives its memory back
+    for (std::size_t i = 0; i < told_.size(); ++i) {
+      const Waiting waiting = std::exchange(told_[i], {nullptr, kNoTid});
+      if (!waiting.listener) continue;
+      // Whoever is told will wait again: only for the others it is worth arming.
+      const bool news = newest_untrusted(reader_) > waiting.known;
+      if (news || !wait(*waiting.listener, waiting.known)) waiting.listener->on_news();
+    }
+    told_.clear();
+  }
+  looking_ = false;
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,371 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/local/fleet_service.hpp"
+
+#include <algorithm>
+#include <utility>
+
+#include "daemon/base/log.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+StreamId owned_by(const KnownHost& host, const StreamId& id) {
+  return {id.name, id.id, host.greeting.host};
+}
+
+// Takes over what `host` tells about one of its streams: every value is in order afterwards.
+Result<proto::Stream> stream_untrusted(const std::string& host, proto::Stream stream) {
+  stream.mutable_id()->set_host(host);  // nobody speaks for another host
+  const Result<StreamId> id = wire::stream_id_untrusted(stream.id());
+  if (!id) return id.error();
+  if (const Result<TypeInfo> type = wire::type_untrusted(stream.type()); !type) {
+    return type.error();
+  }
+  for (proto::User& user : *stream.mutable_users()) {
+    user.set_program(printable(user.program().substr(0, wire::kMaxProgramBytes)));
+  }
+  stream.clear_mirror();  // that one is ours to tell
+  return stream;
+}
+
+std::string_view phase_name(MdnsState::Phase phase) {
+  switch (phase) {
+    case MdnsState::Phase::off:
+      return "off";
+    case MdnsState::Phase::waiting:
+      return "waiting";
+    case MdnsState::Phase::running:
+      return "running";
+  }
+  return "off";
+}
+
+Error unexpected(const std::string& host) {
+  return Error{Errc::protocol, "host '" + host + "' answered something else than it was asked"};
+}
+
+}  // namespace
+
+FleetService::FleetService(const EventLoop& loop, Self self, const Registry& registry,
+                           Catalog& catalog, Peers& peers, MirrorKeeper& mirrors,
+                           RemoteWriterKeeper& writers)
+    : self_(std::move(self)),
+      registry_(registry),
+      catalog_(catalog),
+      peers_(peers),
+      mirrors_(mirrors),
+      writers_(writers),
+      list_timer_(EventSource::timer(loop, [this] { on_list_timeout(); })) {
+  catalog_.add_observer(*this);
+  mirrors_.observe(this);
+  peers_.on_settled([this] {
+    for (const std::function<void()>& go_on : std::exchange(early_, {})) go_on();
+  });
+}
+
+FleetService::~FleetService() {
+  peers_.on_settled({});
+  mirrors_.observe(nullptr);
+  catalog_.remove_observer(*this);
+}
+
+// --- finding owners
+
+// Goes on when the owner of `id` can be told, or when it is clear that it cannot.
+void FleetService::when_known(const StreamId& id, std::function<void()> go_on) {
+  const bool known = !id.host.empty() && catalog_.find_host(id.host);
+  if (known || peers_.settled() || early_.size() >= kMaxEarlyRequests) return go_on();
+  early_.push_back(std::move(go_on));
+}
+
+// What is not found may be at a peer that is away.
+Error FleetService::with_trouble(Error error) const {
+  if (error.code != Errc::not_found) return error;
+  if (const std::string trouble = peers_.trouble(); !trouble.empty()) {
+    error.message += "; not answering at the moment: " + trouble;
+  }
+  return error;
+}
+
+// The mirror of a stream whose owner is away: its history is still here. While the owner is there,
+// what it says about its stream counts.
+std::shared_ptr<Stream> FleetService::orphan(const StreamId& id) const {
+  std::shared_ptr<Stream> mirror = mirrors_.find(id);
+  if (!mirror) return nullptr;
+  const Result<const KnownHost*> owner = catalog_.find_host(mirror->id().host);
+  return !owner && owner.error().code == Errc::not_found ? std::move(mirror) : nullptr;
+}
+
+void FleetService::ask_owner(const StreamId& id, Fill fill, FromOwner then) {
+  when_known(id, [this, id, fill = std::move(fill), then = std::move(then)]() mutable {
+    const Result<const KnownHost*> owner = catalog_.find_owner(id);
+    if (!owner) return then({}, with_trouble(owner.error()));
+    const wire::Greeting& host = (*owner)->greeting;
+    net::Frame request;
+    proto::StreamId message;
+    wire::to_message(owned_by(**owner, id), message);
+    fill(request, message);
+    // In the catalog is who has a connection in use.
+    peers_.link_to(host.host_id)
+        ->ask(std::move(request), [name = host.host, then](Result<net::Frame> answer) {
+          then(name, std::move(answer));
+        });
+  });
+}
+
+void FleetService::open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) {
+  when_known(id, [this, id, then = std::move(then)]() mutable {
+    const Result<const KnownHost*> owner = catalog_.find_owner(id);
+    if (owner) return mirrors_.open(**owner, owned_by(**owner, id), std::move(then));
+    if (std::shared_ptr<Stream> mirror = orphan(id)) return then(std::move(mirror));
+    then(with_trouble(owner.error()));
+  });
+}
+
+void FleetService::open_writer(const StreamId& id, const CreatePlan* plan,
+                               Then<OpenedRemoteWriter> then) {
+  const std::optional<CreatePlan> kept = plan ? std::optional(*plan) : std::nullopt;
+  when_known(id, [this, id, kept, then = std::move(then)]() mutable {
+    const Result<const KnownHost*> owner = catalog_.find_owner(id);
+    if (!owner) return then(with_trouble(owner.error()));
+    writers_.open(**owner, owned_by(**owner, id), kept ? &*kept : nullptr, std::move(then));
+  });
+}
+
+Result<std::shared_ptr<Stream>> FleetService::adopt_untrusted(const StreamId& id, Role role,
+                                                              OfferedFiles files) {
+  return role == Role::writer ? writers_.adopt_untrusted(id, std::move(files))
+                              : mirrors_.adopt_untrusted(id, std::move(files));
+}
+
+// --- about one stream
+
+proto::Stream FleetService::told_of_mirror(const Stream& mirror) const {
+  proto::Stream stream;
+  wire::to_message(mirror.info(), stream);
+  mirrors_.describe(mirror.id(), *stream.mutable_mirror());
+  return stream;
+}
+
+void FleetService::info(const StreamId& id, Then<proto::Stream> then) {
+  ask_owner(
+      id,
+      [](net::Frame& request, const proto::StreamId& of) {
+        *request.mutable_info()->mutable_id() = of;
+      },
+      [this, id, then = std::move(then)](const std::string& owner, Result<net::Frame> answer) {
+        if (!answer) {
+          // What its mirror knows is better than nothing.
+          if (const auto mirror = orphan(id)) return then(told_of_mirror(*mirror));
+          return then(std::move(answer).error());
+        }
+        proto::StreamList& list = *answer->mutable_stream_list();
+        if (list.streams_size() != 1) return then(unexpected(owner));
+        Result<proto::Stream> stream = stream_untrusted(owner, std::move(*list.mutable_streams(0)));
+        if (!stream) return then(std::move(stream));
+        proto::Mirror mirror;
+        if (mirrors_.describe({id.name, id.id, owner}, mirror)) {
+          *stream->mutable_mirror() = std::move(mirror);
+        }
+        then(std::move(stream));
+      });
+}
+
+void FleetService::get_property(const StreamId& id, Then<std::string> then) {
+  ask_owner(
+      id,
+      [](net::Frame& request, const proto::StreamId& of) {
+        *request.mutable_get_property()->mutable_id() = of;
+      },
+      [then = std::move(then)](const std::string&, Result<net::Frame> answer) {
+        if (!answer) return then(std::move(answer).error());
+        then(std::move(*answer->mutable_property()->mutable_property()));
+      });
+}
+
+void FleetService::set_property(const StreamId& id, std::string property, Then<void> then) {
+  ask_owner(
+      id,
+      [property = std::move(property)](net::Frame& request, const proto::StreamId& of) mutable {
+        *request.mutable_set_property()->mutable_id() = of;
+        request.mutable_set_property()->set_property(std::move(property));
+      },
+      [then = std::move(then)](const std::string&, Result<net::Frame> answer) {
+        if (!answer) return then(std::move(answer).error());
+        then({});
+      });
+}
+
+void FleetService::remove(const StreamId& id, Then<void> then) {
+  ask_owner(
+      id,
+      [](net::Frame& request, const proto::StreamId& of) {
+        *request.mutable_remove()->mutable_id() = of;
+      },
+      [then = std::move(then)](const std::string&, Result<net::Frame> answer) {
+        if (!answer) return then(std::move(answer).error());
+        then({});
+      });
+}
+
+// --- lists
+
+std::vector<const KnownHost*> FleetService::hosts_by_name() const {
+  std::vector<const KnownHost*> hosts;
+  for (const auto& [id, host] : catalog_.hosts()) hosts.push_back(&host);
+  std::stable_sort(hosts.begin(), hosts.end(), [](const KnownHost* one, const KnownHost* other) {
+    return one->greeting.host < other->greeting.host;
+  });
+  return hosts;
+}
+
+std::vector<StreamInfo> FleetService::known_streams() const {
+  std::vector<StreamInfo> streams;
+  for (const KnownHost* host : hosts_by_name()) {
+    for (const auto& [key, stream] : host->streams) streams.push_back(stream);
+  }
+  return streams;
+}
+
+void FleetService::list(Then<std::vector<proto::Stream>> then) {
+  const auto listing = std::make_shared<Listing>();
+  listing->then = std::move(then);
+  listing->deadline = deadline_in(kFreshTimeout);
+  listing->unanswered = catalog_.hosts().size() + 1;  // this function is one of them until its end
+  for (const auto& [id, host] : catalog_.hosts()) {
+    net::Frame request;
+    request.mutable_list();
+    peers_.link_to(id)->ask(std::move(request),
+                            [this, listing, host_id = id](Result<net::Frame> answer) {
+                              on_list_answer(*listing, host_id, std::move(answer));
+                            });
+  }
+  if (--listing->unanswered == 0) return finish(*listing);
+  listings_.push_back(listing);
+  if (listings_.size() == 1) list_timer_.enable_in(kFreshTimeout);
+}
+
+void FleetService::on_list_answer(Listing& listing, const wire::HostId& id,
+                                  Result<net::Frame> answer) {
+  const KnownHost* host = catalog_.find(id);
+  if (answer && host && !listing.done) {
+    std::vector<proto::Stream>& streams = listing.answers[id];
+    for (proto::Stream& message : *answer->mutable_stream_list()->mutable_streams()) {
+      Result<proto::Stream> stream = stream_untrusted(host->greeting.host, std::move(message));
+      if (stream) streams.push_back(*std::move(stream));
+    }
+  }
+  if (--listing.unanswered == 0) finish(listing);
+}
+
+// Answers with what came, and with what the catalog knows of those that said nothing.
+void FleetService::finish(Listing& listing) {
+  if (std::exchange(listing.done, true)) return;
+  const auto then = std::exchange(listing.then, {});
+  auto answers = std::exchange(listing.answers, {});
+  std::vector<proto::Stream> streams;
+  for (const KnownHost* host : hosts_by_name()) {
+    if (const auto answer = answers.find(host->greeting.host_id); answer != answers.end()) {
+      std::move(answer->second.begin(), answer->second.end(), std::back_inserter(streams));
+      continue;
+    }
+    for (const auto& [key, stream] : host->streams)
+      wire::to_message(stream, streams.emplace_back());
+  }
+  then(std::move(streams));
+}
+
+void FleetService::on_list_timeout() {
+  while (!listings_.empty()) {
+    const std::shared_ptr<Listing> first = listings_.front();
+    if (!first->done && first->deadline > MonoClock::now()) {
+      return list_timer_.enable_in(first->deadline - MonoClock::now());
+    }
+    listings_.pop_front();
+    finish(*first);
+  }
+}
+
+// --- hosts
+
+std::vector<local::Host> FleetService::hosts() const {
+  std::vector<local::Host> hosts(1);
+  local::Host& self = hosts.front();
+  self.set_name(self_.greeting.host);
+  self.set_host_id(self_.greeting.host_id.data(), self_.greeting.host_id.size());
+  for (const std::string& address : self_.addresses) self.add_addresses(address);
+  self.set_version(self_.greeting.version);
+  self.set_state("self");
+  self.set_streams(static_cast<std::uint32_t>(registry_.streams().size()));
+  self.set_clock_bound_ns(to_ns(wire::clock_bound_of(self_.greeting)));
+  wire::tell_clock(self_.greeting, *self.mutable_clock());
+  self.set_insecure(self_.insecure);
+  self.set_error(peers_.own_trouble());
+  self.set_clock_distance_ns(0);
+  for (local::Host& host : peers_.hosts()) {
+    host.set_clock_distance_ns(to_ns(clock_distance_to(host)));
+    hosts.push_back(std::move(host));
+  }
+  return hosts;
+}
+
+Duration FleetService::clock_distance_to(const local::Host& host) const {
+  wire::HostId id{};
+  if (!self_.clock || host.host_id().size() != id.size()) return kUnknownClockError;
+  std::copy(host.host_id().begin(), host.host_id().end(), id.begin());
+  const KnownHost* known = catalog_.find(id);
+  if (!known || !known->greeting.clock) return kUnknownClockError;
+  return self_.clock->distance_to(*known->greeting.clock);
+}
+
+Result<UniqueFd> FleetService::clock_page() const {
+  if (self_.clock) return self_.clock->page_for_reading();
+  return Error{Errc::not_found, "this dssmd does not watch the clock"};
+}
+
+local::Mdns FleetService::mdns() const {
+  const MdnsState& state = peers_.mdns();
+  local::Mdns mdns;
+  mdns.set_phase(std::string(phase_name(state.phase)));
+  mdns.set_trouble(printable(state.trouble));
+  mdns.set_avahi_version(printable(state.avahi_version));
+  mdns.set_announced(state.announced);
+  mdns.set_withheld(state.withheld);
+  mdns.set_own_host_seen(state.own_host_seen);
+  mdns.set_hosts_heard(state.hosts_heard);
+  return mdns;
+}
+
+void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {
+  when_known({"", 0, host}, [this, host, then = std::move(then)]() mutable {
+    const Result<const KnownHost*> known = catalog_.find_host(host);
+    if (!known) return then(with_trouble(known.error()));
+    PeerLink& link = *peers_.link_to((*known)->greeting.host_id);
+    net::Frame request;
+    wire::tell_clock(self_.greeting, *request.mutable_ping()->mutable_clock());
+    link.ask(std::move(request), [address = link.address(), sent = MonoClock::now(),
+                                  then = std::move(then)](Result<net::Frame> answer) {
+      if (!answer) return then(std::move(answer).error());
+      local::RoundTrip round_trip;
+      round_trip.set_round_trip_ns(to_ns(MonoClock::now() - sent));
+      round_trip.set_address(address);
+      then(std::move(round_trip));
+    });
+  });
+}
+
+// --- news
+
+void FleetService::on_remote_stream_added(const KnownHost&, const StreamInfo& stream) {
+  if (observer_) observer_->on_remote_stream_added(stream);
+}
+
+void FleetService::on_remote_stream_removed(const KnownHost&, const StreamInfo& stream) {
+  if (observer_) observer_->on_remote_stream_removed(stream.id);
+}
+
+void FleetService::on_ring_replaced(const Stream& stream) {
+  if (observer_) observer_->on_ring_replaced(stream);
+}
+
+}  // namespace dssm::daemon

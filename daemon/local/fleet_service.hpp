@@ -1,0 +1,111 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Fleet for a dssmd with a network: finds owners in the catalog, asks them over their control
+// connections, has mirrors and remote writers opened by their keepers, and passes on what changes.
+//
+// Right after its start dssmd knows no other host yet. A request that would fail for that reason
+// waits until each peer has been heard of or tried once (Peers::kSettleTime at most): programs that
+// start together with dssmd find remote streams as they find local ones.
+#pragma once
+
+#include <deque>
+#include <functional>
+#include <map>
+#include <memory>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "daemon/base/event_loop.hpp"
+#include "daemon/fleet/catalog.hpp"
+#include "daemon/fleet/clock_rules.hpp"
+#include "daemon/fleet/found_host.hpp"
+#include "daemon/fleet/peers.hpp"
+#include "daemon/local/fleet.hpp"
+#include "daemon/remote/mirror_keeper.hpp"
+#include "daemon/remote/remote_writer_keeper.hpp"
+#include "daemon/streams/registry.hpp"
+
+namespace dssm::daemon {
+
+class FleetService final : public Fleet, private CatalogObserver, private MirrorKeeper::Observer {
+ public:
+  // Requests that wait for the first words of the peers; more fail at once.
+  static constexpr std::size_t kMaxEarlyRequests = 4096;
+
+  // What the list of hosts tells about this one.
+  struct Self {
+    wire::Greeting greeting;
+    std::vector<std::string> addresses;  // that it listens at
+    bool insecure = false;               // at one of them other PCs may come in the clear
+    const ClockRules* clock = nullptr;   // nobody watches the clock
+  };
+
+  // What is given by reference outlives it.
+  FleetService(const EventLoop& loop, Self self, const Registry& registry, Catalog& catalog,
+               Peers& peers, MirrorKeeper& mirrors, RemoteWriterKeeper& writers);
+  FleetService(const FleetService&) = delete;
+  FleetService& operator=(const FleetService&) = delete;
+  ~FleetService();
+
+  void observe(Fleet::Observer* observer) override { observer_ = observer; }
+  bool is_there(const StreamId& id) const override {
+    return id.host.empty() ? catalog_.find_owner(id).has_value() : catalog_.has(id);
+  }
+  void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) override;
+  void open_writer(const StreamId& id, const CreatePlan* plan,
+                   Then<OpenedRemoteWriter> then) override;
+  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
+                                                  OfferedFiles files) override;
+  void info(const StreamId& id, Then<proto::Stream> then) override;
+  void get_property(const StreamId& id, Then<std::string> then) override;
+  void set_property(const StreamId& id, std::string property, Then<void> then) override;
+  void remove(const StreamId& id, Then<void> then) override;
+  void list(Then<std::vector<proto::Stream>> then) override;
+  std::vector<StreamInfo> known_streams() const override;
+  std::vector<local::Host> hosts() const override;
+  local::Mdns mdns() const override;
+  Result<UniqueFd> clock_page() const override;
+  void ping(const std::string& host, Then<local::RoundTrip> then) override;
+
+ private:
+  // A List of all hosts that is under way.
+  struct Listing {
+    Then<std::vector<proto::Stream>> then;
+    MonoTime deadline;
+    std::map<wire::HostId, std::vector<proto::Stream>> answers;
+    std::size_t unanswered = 0;
+    bool done = false;
+  };
+
+  using Fill = std::function<void(net::Frame&, const proto::StreamId&)>;
+  using FromOwner = std::function<void(const std::string& owner, Result<net::Frame>)>;
+  void ask_owner(const StreamId& id, Fill fill, FromOwner then);
+  void when_known(const StreamId& id, std::function<void()> go_on);
+  Error with_trouble(Error error) const;
+  std::shared_ptr<Stream> orphan(const StreamId& id) const;
+  proto::Stream told_of_mirror(const Stream& mirror) const;
+  std::vector<const KnownHost*> hosts_by_name() const;
+  void on_list_answer(Listing& listing, const wire::HostId& id, Result<net::Frame> answer);
+  void finish(Listing& listing);
+  void on_list_timeout();
+
+  void on_remote_stream_added(const KnownHost& host, const StreamInfo& stream) override;
+  void on_remote_stream_removed(const KnownHost& host, const StreamInfo& stream) override;
+  void on_ring_replaced(const Stream& stream) override;
+
+  Duration clock_distance_to(const local::Host& host) const;
+
+  const Self self_;
+  const Registry& registry_;
+  Catalog& catalog_;
+  Peers& peers_;
+  MirrorKeeper& mirrors_;
+  RemoteWriterKeeper& writers_;
+  Fleet::Observer* observer_ = nullptr;
+  std::vector<std::function<void()>> early_;       // wait for the peers to settle
+  std::deque<std::shared_ptr<Listing>> listings_;  // in the order of their deadlines
+  EventSource list_timer_;
+};
+
+}  // namespace dssm::daemon

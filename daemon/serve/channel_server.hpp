@@ -1,0 +1,85 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Accepts connections of other hosts and remote programs, within the limits, and keeps them.
+#pragma once
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <map>
+#include <memory>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "core/wire/network_protocol.hpp"
+#include "daemon/base/calm_logger.hpp"
+#include "daemon/base/event_loop.hpp"
+#include "daemon/base/spare_descriptor.hpp"
+#include "daemon/link/network_listener.hpp"
+#include "daemon/serve/data_communicator.hpp"
+#include "daemon/serve/peer_table.hpp"
+#include "daemon/serve/served_stream.hpp"
+#include "daemon/streams/open_table.hpp"
+#include "daemon/streams/registry.hpp"
+
+namespace dssm::daemon {
+
+class ChannelServer final : private StreamObserver, private DataCommunicator::Keeper {
+ public:
+  struct Parts {
+    const EventLoop& loop;
+    Registry& registry;
+    const OpenTable& opens;
+    Logger& logger;
+    ClockRules* clock = nullptr;  // nobody watches the clock
+  };
+
+  // self: how this dssmd greets. All in `parts` outlive it.
+  ChannelServer(const Parts& parts, wire::Greeting self, const PeerTable::Limits& limits);
+  ChannelServer(const ChannelServer&) = delete;
+  ChannelServer& operator=(const ChannelServer&) = delete;
+  ~ChannelServer();  // tells those who are connected
+
+  // Accepts from now on. Until then whoever connects waits: while the programs of this PC give
+  // streams back after a crash, nobody else may take their names. `listener` outlives the server.
+  void serve(const NetworkListener& listener);
+
+  // For tests and fuzzers: a connection that is there already.
+  Result<void> adopt(std::unique_ptr<wire::Transport> transport,
+                     const wire::SocketAddress& address);
+
+  // There is news of this host's clock.
+  void tell_clock();
+  // Verdicts on clocks may have changed; at least once a second.
+  void on_clock();
+
+  void set_limits(const PeerTable::Limits& limits) { peers_.set_limits(limits); }
+
+  std::size_t connections() const noexcept { return communicators_.size(); }
+
+ private:
+  void on_connection(int listener);
+  void accept(UniqueFd socket);
+  void keep(PeerPlace place, std::unique_ptr<wire::Transport> transport,
+            const wire::SocketAddress& address);
+  void turn_away(UniqueFd socket, const wire::SocketAddress* address, const Error& error);
+  void sweep();
+
+  void on_stream_added(const Stream& stream) override;
+  void on_stream_removed(const Stream& stream) override;
+  void on_ended(DataCommunicator& communicator) override;
+  void on_heartbeat() override;
+
+  Parts parts_;
+  CalmLogger logger_;
+  wire::Greeting self_;
+  PeerTable peers_;
+  ServedStreams streams_;
+  SpareDescriptor spare_;
+  MonoTime looked_{};  // at all streams
+  std::map<DataCommunicator*, std::unique_ptr<DataCommunicator>> communicators_;
+  std::vector<DataCommunicator*> ended_;  // to be destroyed outside of their own callbacks
+  std::vector<EventSource> incoming_;
+  EventSource sweep_;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,316 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/serve/data_communicator.hpp"
+
+#include <utility>
+
+#include "daemon/base/message_ids.hpp"
+#include "daemon/streams/description.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+bool opens_a_stream(const net::Frame& request) noexcept {
+  return request.body_case() == net::Frame::kOpen || request.body_case() == net::Frame::kCreate;
+}
+
+}  // namespace
+
+DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
+                                   std::unique_ptr<wire::Transport> transport,
+                                   std::string peer_address)
+    : parts_(parts),
+      place_(std::move(place)),
+      peer_address_(std::move(peer_address)),
+      link_(parts.loop, std::move(transport), *this, kMaxQueuedBytes),
+      control_(parts.registry, parts.opens),
+      next_turn_(EventSource::timer(parts.loop, [this] { work_now(); })),
+      greeting_is_late_(EventSource::timer(
+          parts.loop,
+          [this] {
+            link_.close_with({Errc::protocol, peer() + " connected and said no Hello for 3 s"});
+          })),
+      silence_(EventSource::timer(parts.loop, [this] { watch_silence(); })) {
+  link_.set_budget(place_.budget());
+  greeting_is_late_.enable_in(wire::kHelloTimeout);
+}
+
+DataCommunicator::~DataCommunicator() = default;
+
+std::string DataCommunicator::peer() const {
+  return (them_ ? them_->str() : "somebody") + " at '" + peer_address_ + "'";
+}
+
+// --- frames
+
+Result<void> DataCommunicator::on_frame(net::Frame& frame) {
+  if (!them_) return greet(frame);
+  if (frame.serial() == 0) {
+    if (!frame.has_failure()) {
+      return Error{Errc::protocol, "a request has no serial; it takes one above 0"};
+    }
+    their_words_ = wire::failure(frame.failure());
+    return {};
+  }
+  if (served_ < kRequestsPerTurn && can_serve()) {
+    serve(frame);
+    return {};
+  }
+  waiting_ = std::move(frame);
+  link_.pause();
+  // Otherwise whatever is in the way ends with work_now().
+  if (can_serve()) work_soon();
+  return {};
+}
+
+Result<void> DataCommunicator::greet(const net::Frame& frame) {
+  if (!frame.has_hello()) {
+    return Error{Errc::protocol, "the first frame on a connection has to be Hello"};
+  }
+  Result<wire::Greeting> them =
+      wire::greeting_untrusted(frame.hello(), "the program at '" + peer_address_ + "'");
+  if (!them) {
+    // So that both ends have both names: they see it in the words that they get.
+    return std::move(them).error().context("dssmd of host '" + parts_.self.host + "' refuses");
+  }
+  them_ = *std::move(them);
+  greeting_is_late_.disable();
+  net::Frame hello;
+  wire::to_message(parts_.self, *hello.mutable_hello());
+  link_.send(hello);
+  return {};
+}
+
+bool DataCommunicator::can_serve() const noexcept {
+  return link_.is_open() && link_.output_empty() && !opening_ && !(channel_ && channel_->busy());
+}
+
+void DataCommunicator::serve(const net::Frame& request) {
+  ++served_;
+  if (Result<void> done = dispatch(request); !done) send_failure(request.serial(), done.error());
+}
+
+Result<void> DataCommunicator::dispatch(const net::Frame& request) {
+  if (request.has_ping()) {
+    is_control_ = true;
+    silence_.enable_in(wire::kSilenceIsDeath);
+    net::Frame pong;
+    pong.set_serial(request.serial());
+    wire::tell_clock(parts_.self, *pong.mutable_pong()->mutable_clock());
+    link_.send(pong);
+    parts_.keeper.on_heartbeat();
+    return {};
+  }
+  if (!channel_ && ControlRequests::is_control(request)) return serve_control(request);
+  if (!channel_ && opens_a_stream(request)) {
+    if (is_control_) {
+      return Error{Errc::protocol, "this is a control connection; open another one for the stream"};
+    }
+    return request.has_open() ? open(request) : create(request);
+  }
+  if (channel_) return channel_->serve_untrusted(request);
+  return Error{Errc::protocol,
+               "dssmd of host '" + parts_.self.host +
+                   "' (" DSSM_VERSION
+                   ") takes no such request on a connection without an open stream"};
+}
+
+Result<void> DataCommunicator::serve_control(const net::Frame& request) {
+  is_control_ = true;
+  if (request.has_watch()) {
+    watch_ = std::make_unique<StreamWatch>(parts_.registry, parts_.opens, link_, request.serial());
+    work_soon();
+    return {};
+  }
+  net::Frame answer;
+  answer.set_serial(request.serial());
+  if (Result<void> done = control_.serve_untrusted(request, answer); !done) return done;
+  link_.send(answer);
+  return {};
+}
+
+void DataCommunicator::tell_clock() {
+  if (!is_control_ || !link_.is_open() || !them_->has_feature(wire::kFeatureClock)) return;
+  net::Frame frame;
+  wire::tell_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
+  link_.send(frame);
+}
+
+void DataCommunicator::send_failure(std::uint64_t serial, const Error& error) {
+  net::Frame frame;
+  frame.set_serial(serial);
+  wire::to_message(error, *frame.mutable_failure());
+  link_.send(frame);
+}
+
+// --- opening
+
+Result<void> DataCommunicator::open(const net::Frame& request) {
+  const Result<StreamId> id = wire::stream_id_untrusted(request.open().id());
+  if (!id) return id.error();
+  Result<std::shared_ptr<Stream>> stream = parts_.registry.find(*id);
+  if (!stream) return std::move(stream).error();
+  if (Result<void> known = check_clock((*stream)->id()); !known) return known;
+  opening_ = {request.serial(), *std::move(stream), false, std::nullopt};
+  return go_on_opening();
+}
+
+Result<void> DataCommunicator::check_clock(const StreamId& id) const {
+  return parts_.clock ? parts_.clock->check_serving(id, *them_) : Result<void>();
+}
+
+Result<void> DataCommunicator::create(const net::Frame& request) {
+  const net::Create& create = request.create();
+  const Result<StreamId> id = wire::stream_id_untrusted(create.id());
+  if (!id) return id.error();
+  const Result<TypeInfo> type = wire::type_untrusted(create.type());
+  if (!type) return type.error();
+  if (Result<void> known = check_clock(*id); !known) return known;
+  // No program of this host is the creator.
+  Result<Registry::Created> created =
+      parts_.registry.create(*id, *type, {create.depth(), Duration(create.cycle_ns())}, 0);
+  if (!created) return std::move(created).error();
+  opening_ = {request.serial(), created->stream, created->created, std::nullopt};
+  if (created->created) opening_->reservation.emplace(created->stream);
+  return go_on_opening();
+}
+
+Result<void> DataCommunicator::go_on_opening() {
+  if (opening_->stream->removed()) {
+    const std::string id = opening_->stream->id().str();
+    opening_.reset();
+    return Error{Errc::not_found, "stream '" + id + "' was removed meanwhile; create it anew"};
+  }
+  if (opening_->reservation) {
+    const Result<bool> reserved = opening_->reservation->go_on();
+    if (!reserved) {
+      static_cast<void>(parts_.registry.remove(opening_->stream->id()));
+      opening_.reset();
+      return reserved.error();
+    }
+    if (!*reserved) {
+      work_soon();
+      return {};
+    }
+  }
+  const Opening opening = *std::exchange(opening_, std::nullopt);
+  channel_ = std::make_unique<StreamChannel>(
+      StreamChannel::Parts{parts_.loop, parts_.registry, link_, place_.budget(), *this, parts_.self,
+                           *them_, parts_.clock},
+      parts_.streams.get(opening.stream), them_->has_feature(wire::kFeatureTorn));
+  net::Frame answer;
+  answer.set_serial(opening.serial);
+  describe(*opening.stream, parts_.opens, *answer.mutable_opened()->mutable_stream());
+  answer.mutable_opened()->set_created(opening.created);
+  link_.send(answer);
+  const std::string id = opening.stream->id().str();
+  parts_.logger.info(
+      "channel of '" + id + "' opened by " + peer(),
+      {.stream = id, .peer = peer_address_, .message_id = message_id::kChannelOpened});
+  return {};
+}
+
+// --- turns
+
+void DataCommunicator::work_soon() {
+  turn_is_due_ = true;
+  next_turn_.enable_in(Duration::zero());
+}
+
+void DataCommunicator::on_output_empty() { work_now(); }
+
+[[gnu::hot]] void DataCommunicator::work_now() {
+  if (!link_.is_open()) return;
+  if (std::exchange(turn_is_due_, false)) next_turn_.disable();
+  served_ = 0;
+  if (opening_) {
+    const std::uint64_t serial = opening_->serial;
+    if (Result<void> opened = go_on_opening(); !opened) send_failure(serial, opened.error());
+  }
+  if (waiting_ && can_serve()) {
+    const net::Frame request = *std::exchange(waiting_, std::nullopt);
+    serve(request);
+    link_.resume();
+  }
+  if (channel_) {
+    const Result<void> worked = channel_->work(waiting_.has_value());
+    if (!worked) return link_.close_with(worked.error());
+  }
+  if (watch_ && watch_->work()) work_soon();
+  if (waiting_ && can_serve()) work_soon();
+}
+
+void DataCommunicator::watch_silence() {
+  const Duration silent = MonoClock::now() - link_.last_heard();
+  // While the link is paused it is us who do not listen.
+  if (silent < wire::kSilenceIsDeath || link_.is_paused()) {
+    const Duration rest = wire::kSilenceIsDeath - silent;
+    return silence_.enable_in(link_.is_paused() ? wire::kSilenceIsDeath : rest);
+  }
+  link_.close_with({Errc::daemon_away, "nothing came from " + peer() + " for " +
+                                           std::to_string(silent / std::chrono::milliseconds(1)) +
+                                           " ms"});
+}
+
+// --- what happens to streams
+
+void DataCommunicator::on_stream_added(const Stream& stream) {
+  if (watch_) watch_->on_stream_added(stream);
+}
+
+void DataCommunicator::on_stream_removed(const Stream& stream) {
+  if (watch_) watch_->on_stream_removed(stream);
+  if (channel_ && &channel_->stream() == &stream) channel_->on_removed();
+}
+
+// --- the end
+
+void DataCommunicator::on_closed(const Error& why) {
+  next_turn_.disable();
+  greeting_is_late_.disable();
+  silence_.disable();
+  // A ring whose memory is not all there yet, and that nobody else has found, is as if it had never
+  // been.
+  if (opening_ && opening_->created && opening_->stream->channels() == 0 &&
+      !opening_->stream->removed()) {
+    const OpenTable::Counts counts = parts_.opens.counts(*opening_->stream);
+    if (counts.writers + counts.readers == 0) {
+      static_cast<void>(parts_.registry.remove(opening_->stream->id()));
+    }
+  }
+  log_end(why);
+  channel_.reset();
+  watch_.reset();
+  parts_.keeper.on_ended(*this);
+}
+
+void DataCommunicator::log_end(const Error& why) {
+  const std::string reason = their_words_.message.empty() ? why.message : their_words_.message;
+  if (why.code != Errc::daemon_away) {
+    parts_.logger.warning("closed the connection of " + peer() + ": " + why.message,
+                          {.peer = peer_address_, .message_id = message_id::kPeerRefused});
+  }
+  if (!channel_) {
+    if (is_control_) {
+      parts_.logger.info("control connection of " + peer() + " ended: " + reason,
+                         {.peer = peer_address_});
+    }
+    return;
+  }
+  const std::string id = channel_->stream().id().str();
+  parts_.logger.info(
+      "channel of '" + id + "' of " + peer() + " ended: " + reason,
+      {.stream = id, .peer = peer_address_, .message_id = message_id::kChannelClosed});
+  const SampleSender::Counters& sent = channel_->counters();
+  const wire::DecoderCounters& received = link_.counters();
+  parts_.logger.debug(
+      "channel of '" + id + "': " + std::to_string(sent.samples) + " samples sent (" +
+          std::to_string(sent.copied_payload_bytes) + " payload bytes copied, " +
+          std::to_string(sent.in_place_payload_bytes) + " sent in place, " +
+          std::to_string(sent.torn) + " samples torn, " + std::to_string(channel_->lost()) +
+          " lost), " + std::to_string(received.samples) + " received (" +
+          std::to_string(received.copied_payload_bytes) + " payload bytes copied, " +
+          std::to_string(received.direct_payload_bytes) + " received in place)",
+      {.stream = id, .peer = peer_address_});
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,73 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/serve/peer_table.hpp"
+
+#include <optional>
+#include <utility>
+
+namespace dssm::daemon {
+namespace {
+
+// The address alone: ports differ from connection to connection.
+std::string without_port(const wire::SocketAddress& address) {
+  std::string text = address.str();
+  return text.substr(0, text.rfind(':'));
+}
+
+}  // namespace
+
+PeerPlace::PeerPlace(PeerTable& table, PeerAccount& account, MemoryShare share)
+    : table_(&table), account_(&account), share_(std::move(share)) {
+  ++table_->connections_;
+  ++account_->connections;
+}
+
+PeerPlace::PeerPlace(PeerPlace&& other) noexcept
+    : table_(std::exchange(other.table_, nullptr)),
+      account_(other.account_),
+      share_(std::move(other.share_)) {}
+
+PeerPlace::~PeerPlace() {
+  share_ = {};  // before its budget goes
+  if (table_) table_->leave(*account_);
+}
+
+void PeerTable::set_limits(const Limits& limits) {
+  limits_ = limits;
+  for (const auto& [address, account] : accounts_) {
+    account->budget.set_limit(limits.max_peer_memory_bytes);
+  }
+}
+
+Result<PeerPlace> PeerTable::admit(const wire::SocketAddress& address) {
+  if (connections_ >= limits_.max_connections) {
+    return Error{Errc::limit_exceeded,
+                 "there are max_connections = " + std::to_string(limits_.max_connections) +
+                     " connections from other hosts already; close some or raise the key "
+                     "max_connections"};
+  }
+  const std::string name = without_port(address);
+  const auto found = accounts_.find(name);
+  if (found != accounts_.end() && found->second->connections >= limits_.max_connections_per_host) {
+    return Error{Errc::limit_exceeded,
+                 "there are max_connections_per_host = " +
+                     std::to_string(limits_.max_connections_per_host) + " connections from '" +
+                     name + "' already; close some or raise the key max_connections_per_host"};
+  }
+  std::unique_ptr<PeerAccount>& account = accounts_[name];
+  if (!account) account = std::make_unique<PeerAccount>(name, limits_.max_peer_memory_bytes);
+  std::optional<MemoryShare> share = account->budget.try_take(kConnectionBytes);
+  if (share) return PeerPlace(*this, *account, *std::move(share));
+  Error error{Errc::limit_exceeded, "the connections from '" + name +
+                                        "' have used up max_peer_memory = " +
+                                        std::to_string(limits_.max_peer_memory_bytes) +
+                                        " bytes; close some or raise the key max_peer_memory"};
+  if (account->connections == 0) accounts_.erase(name);
+  return error;
+}
+
+void PeerTable::leave(PeerAccount& account) {
+  --connections_;
+  if (--account.connections == 0) accounts_.erase(std::string(account.address));
+}
+
+}  // namespace dssm::daemon

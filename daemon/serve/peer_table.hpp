@@ -1,0 +1,80 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Who is connected over the network, by address, and what they cost. Everything that a peer can
+// make grow (frames that wait for it, samples that are received from it, ...) is charged to the
+// account of its address, so that one bad peer cannot use up what the others need.
+#pragma once
+
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <map>
+#include <memory>
+#include <string>
+
+#include "core/wire/address.hpp"
+#include "daemon/base/memory_budget.hpp"
+
+namespace dssm::daemon {
+
+// One address, while there are connections from it.
+struct PeerAccount {
+  PeerAccount(std::string its_address, std::uint64_t memory_bytes)
+      : address(std::move(its_address)), budget(memory_bytes) {}
+  std::string address;  // "10.0.0.2", without port
+  MemoryBudget budget;
+  std::uint64_t connections = 0;
+};
+
+class PeerTable;
+
+// One connection's place; given back by the destructor. The table outlives it.
+class PeerPlace {
+ public:
+  PeerPlace(PeerPlace&& other) noexcept;
+  PeerPlace& operator=(PeerPlace&&) = delete;
+  ~PeerPlace();
+
+  MemoryBudget& budget() const noexcept { return account_->budget; }
+
+ private:
+  friend class PeerTable;
+  PeerPlace(PeerTable& table, PeerAccount& account, MemoryShare share);
+  PeerTable* table_;
+  PeerAccount* account_;
+  MemoryShare share_;
+};
+
+class PeerTable {
+ public:
+  // Charged for each connection, whatever it does: its objects, and the input that the decoder
+  // keeps while the connection is paused.
+  static constexpr std::uint64_t kConnectionBytes = 320U << 10;
+
+  struct Limits {
+    std::uint64_t max_connections = 0;
+    std::uint64_t max_connections_per_host = 0;
+    std::uint64_t max_peer_memory_bytes = 0;
+  };
+
+  explicit PeerTable(const Limits& limits) : limits_(limits) {}
+  PeerTable(const PeerTable&) = delete;
+  PeerTable& operator=(const PeerTable&) = delete;
+
+  // For who comes, the accounts of those who are there included.
+  void set_limits(const Limits& limits);
+
+  // A place for one more connection from `address`.
+  //   fails  limit_exceeded, naming the key
+  Result<PeerPlace> admit(const wire::SocketAddress& address);
+
+  std::uint64_t connections() const noexcept { return connections_; }
+
+ private:
+  friend class PeerPlace;
+  void leave(PeerAccount& account);
+  Limits limits_;
+  std::uint64_t connections_ = 0;
+  std::map<std::string, std::unique_ptr<PeerAccount>> accounts_;
+};
+
+}  // namespace dssm::daemon

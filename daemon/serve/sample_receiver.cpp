@@ -1,0 +1,125 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/serve/sample_receiver.hpp"
+
+#include <algorithm>
+#include <optional>
+#include <utility>
+
+namespace dssm::daemon {
+
+Result<std::unique_ptr<SampleReceiver>> SampleReceiver::open(const EventLoop& loop, FrameLink& link,
+                                                             MemoryBudget& budget,
+                                                             ServedStream& stream,
+                                                             std::uint64_t publisher) {
+  const std::uint64_t payload_bytes = stream.stream().type().payload_bytes;
+  std::optional<MemoryShare> share = budget.try_take(payload_bytes);
+  if (!share) {
+    return Error{Errc::limit_exceeded,
+                 "publish into '" + stream.stream().id().str() + "': a sample of " +
+                     std::to_string(payload_bytes) +
+                     " bytes does not fit into what is left of max_peer_memory = " +
+                     std::to_string(budget.limit()) +
+                     " bytes for this address; close other connections or raise that key"};
+  }
+  Result<std::shared_ptr<OwnWriter>> writer = stream.writer();
+  if (!writer) return std::move(writer).error();
+  return std::unique_ptr<SampleReceiver>(
+      new SampleReceiver(loop, link, *std::move(share), stream, *std::move(writer), publisher));
+}
+
+SampleReceiver::SampleReceiver(const EventLoop& loop, FrameLink& link, MemoryShare share,
+                               ServedStream& stream, std::shared_ptr<OwnWriter> writer,
+                               std::uint64_t publisher)
+    : link_(link),
+      share_(std::move(share)),
+      stream_(stream),
+      writer_(std::move(writer)),
+      publisher_(publisher),
+      payload_(stream.stream().type().payload_bytes),
+      retry_timer_(EventSource::timer(loop, [this] { try_again(); })) {}
+
+Result<void> SampleReceiver::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+  dropping_ = is_done_with(sample);
+  out = dropping_ ? nullptr : payload_.data();
+  return {};
+}
+
+// Also samples of a stream that was removed are dropped: nobody will find them.
+bool SampleReceiver::is_done_with(const wire::IncomingSample& sample) {
+  return sample.info.tid <= last().number || stream_.stream().removed();
+}
+
+Result<void> SampleReceiver::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+  sample_ = sample;
+  if (!dropping_ && !torn) return write();
+  note_done();
+  return {};
+}
+
+void SampleReceiver::note_done() {
+  if (sample_.serial != 0) {
+    answer(sample_.serial);
+  } else {
+    unacknowledged_ = true;
+  }
+}
+
+Result<void> SampleReceiver::write() {
+  using Outcome = ring::RingWriter::Attempt::Outcome;
+  // The publisher may have come back on another connection while this one was cut in the middle of
+  // the sample, and have sent it there, and more.
+  if (is_done_with(sample_)) {
+    note_done();
+    return {};
+  }
+  const ring::RingWriter::Attempt attempt =
+      writer_->writer().try_publish({publisher_, sample_.info.tid}, std::as_const(payload_).span(),
+                                    sample_.info.time, sample_.info.clock_error);
+  switch (attempt.outcome) {
+    case Outcome::written:
+      break;
+    case Outcome::busy:
+      waiting_ = true;
+      link_.pause();
+      retry_timer_.enable_in(retry_);
+      retry_ = std::min(2 * retry_, kLongestRetry);
+      return {};
+    case Outcome::refused:
+      return Error{Errc::system,
+                   "write to '" + stream_.stream().id().str() +
+                       "': a program has damaged the lock of its ring; remove the stream (dssmctl "
+                       "rm) and create it anew"};
+  }
+  retry_ = kFirstRetry;
+  written_ = true;
+  note_done();
+  return {};
+}
+
+void SampleReceiver::try_again() {
+  waiting_ = false;
+  if (Result<void> written = write(); !written) return link_.close_with(written.error());
+  if (waiting_) return;
+  acknowledge();
+  link_.resume();
+}
+
+void SampleReceiver::answer(std::uint64_t serial) {
+  const ring::PublisherNotes::Last written = last();
+  net::Frame frame;
+  frame.set_serial(serial);
+  frame.mutable_published()->set_last(written.number);
+  frame.mutable_published()->set_last_tid(written.tid);
+  link_.send(frame);
+}
+
+void SampleReceiver::acknowledge() {
+  if (std::exchange(written_, false)) stream_.look();
+  // One acknowledgement stands for all before it: those that would wait for the socket are not
+  // sent.
+  if (!unacknowledged_ || !link_.output_empty()) return;
+  unacknowledged_ = false;
+  answer(0);
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,64 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/serve/served_stream.hpp"
+
+#include <utility>
+
+namespace dssm::daemon {
+namespace {
+
+// What `pointer` still points to, or what `open` makes.
+template <class T, class Open>
+Result<std::shared_ptr<T>> shared(std::weak_ptr<T>& pointer, Open open) {
+  if (std::shared_ptr<T> there = pointer.lock()) return there;
+  Result<std::shared_ptr<T>> opened = open();
+  if (opened) pointer = *opened;
+  return opened;
+}
+
+}  // namespace
+
+Result<std::shared_ptr<OwnWriter>> OwnWriter::open(const Stream& stream) {
+  Result<std::shared_ptr<const ring::RingMapping>> mapping = stream.map_for_writing();
+  if (!mapping) return std::move(mapping).error();
+  Result<std::shared_ptr<ring::Bell>> bell = stream.map_bell();
+  if (!bell) return std::move(bell).error();
+  return std::shared_ptr<OwnWriter>(new OwnWriter(*std::move(mapping), *std::move(bell)));
+}
+
+OwnWriter::OwnWriter(std::shared_ptr<const ring::RingMapping> mapping,
+                     std::shared_ptr<ring::Bell> bell)
+    : mapping_(std::move(mapping)), bell_(std::move(bell)), writer_(*mapping_, *bell_, -1) {}
+
+Result<std::shared_ptr<StreamFeed>> ServedStream::feed() {
+  return shared(feed_, [this] { return StreamFeed::open(loop_, stream_); });
+}
+
+Result<std::shared_ptr<OwnWriter>> ServedStream::writer() {
+  return shared(writer_, [this] { return OwnWriter::open(*stream_); });
+}
+
+Result<void> ServedStream::judge(const ring::ClockVerdict& verdict) {
+  if (!judging_) {
+    Result<std::shared_ptr<OwnWriter>> writer = this->writer();
+    if (!writer) return std::move(writer).error();
+    judging_ = *std::move(writer);
+  }
+  ring::store(judging_->clock_gate(), verdict);
+  return {};
+}
+
+void ServedStream::look() {
+  if (const std::shared_ptr<StreamFeed> feed = feed_.lock()) feed->look();
+}
+
+std::shared_ptr<ServedStream> ServedStreams::get(std::shared_ptr<Stream> stream) {
+  std::shared_ptr<ServedStream>& served = streams_[stream.get()];
+  if (!served) served = std::make_shared<ServedStream>(loop_, std::move(stream));
+  return served;
+}
+
+void ServedStreams::look_at_all() {
+  for (const auto& [key, served] : streams_) served->look();
+}
+
+}  // namespace dssm::daemon

@@ -1,0 +1,374 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/serve/stream_channel.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <utility>
+
+#include "core/wire/messages.hpp"
+#include "daemon/streams/description.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+// A reader that was lapped this often while it was answered is not keeping up.
+constexpr int kMaxReadAttempts = 100;
+
+// New samples that are followed at once before others get their turn.
+constexpr int kMaxLooks = 16;
+
+net::Frame answer_to(std::uint64_t serial) {
+  net::Frame frame;
+  frame.set_serial(serial);
+  return frame;
+}
+
+}  // namespace
+
+StreamChannel::StreamChannel(const Parts& parts, std::shared_ptr<ServedStream> served,
+                             bool may_tear)
+    : parts_(parts),
+      served_(std::move(served)),
+      tells_clock_(parts.clock && parts.them.has_feature(wire::kFeatureClock)),
+      reader_(stream().mapping()),
+      sender_(stream().mapping(), parts_.link, {may_tear, &parts_.budget}),
+      due_(EventSource::timer(parts_.loop, [this] { parts_.owner.work_now(); })) {
+  served_->stream().add_channel();
+  parts_.link.take_samples(stream().type().payload_bytes, *this);
+}
+
+StreamChannel::~StreamChannel() {
+  if (feed_) feed_->forget(*this);
+  served_->stream().remove_channel();
+}
+
+Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
+  if (stream().removed()) {
+    return Error{Errc::not_found,
+                 "stream '" + stream().id().str() + "' was removed; create it anew"};
+  }
+  switch (request.body_case()) {
+    case net::Frame::kSubscribe:
+      return subscribe(request.serial(), request.subscribe());
+    case net::Frame::kRead:
+      reading_ = {request.serial(), request.read(), 0};
+      go_on_reading();
+      return {};
+    case net::Frame::kGetRange:
+      return get_range(request.serial(), request.get_range());
+    case net::Frame::kStartPublishing:
+      return start_publishing(request.serial(), request.start_publishing());
+    case net::Frame::kSetProperty:
+      return set_property(request.serial(), request.set_property());
+    case net::Frame::kGetProperty:
+      return get_property(request.serial());
+    case net::Frame::kOpen:
+    case net::Frame::kCreate:
+      return Error{Errc::protocol, "this channel carries '" + stream().id().str() +
+                                       "' already; open another connection for another stream"};
+    default:
+      return Error{Errc::protocol,
+                   "a channel takes no such request; it is for control connections, or of a newer "
+                   "version than this dssmd (" DSSM_VERSION ")"};
+  }
+}
+
+[[gnu::hot]] Result<void> StreamChannel::work(bool request_waits) {
+  if (reading_) {
+    go_on_reading();
+    if (reading_) return {};
+  }
+  if (receiver_) receiver_->acknowledge();
+  return go_on_pumping(request_waits);
+}
+
+// --- subscription
+
+Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe& request) {
+  if (!std::isfinite(request.max_rate_hz()) || request.max_rate_hz() < 0) {
+    return Error{Errc::invalid_argument,
+                 "subscribe to '" + stream().id().str() + "': max_rate_hz is " +
+                     std::to_string(request.max_rate_hz()) +
+                     "; give 0 for all samples, or how many per second at most"};
+  }
+  if (!feed_) {
+    Result<std::shared_ptr<StreamFeed>> feed = served_->feed();
+    if (!feed) return std::move(feed).error();
+    feed_ = *std::move(feed);
+  }
+  feed_->forget(*this);
+  due_.disable();
+  const Tid newest = newest_untrusted(reader_);
+  const Tid first = first_tid(request);
+  net::Frame frame = answer_to(serial);
+  net::Subscribed& subscribed = *frame.mutable_subscribed();
+  subscribed.set_incarnation(stream().incarnation());
+  subscribed.set_first_tid(first);
+  subscribed.set_newest(newest);
+  parts_.link.send(frame);
+  pump_.emplace(stream().mapping(), parts_.link, sender_, static_cast<SamplePump::Events&>(*this),
+                SamplePump::Plan{first, newest, request.max_rate_hz()});
+  parts_.owner.work_soon();
+  return {};
+}
+
+Tid StreamChannel::first_tid(const net::Subscribe& request) const {
+  const Tid next = newest_untrusted(reader_) + 1;
+  // Of an empty ring that is 0, and no sample is passed over.
+  const Tid oldest = next == 0 ? 0 : std::clamp<Tid>(reader_.oldest(), 0, next - 1);
+  switch (request.start_case()) {
+    case net::Subscribe::kFromTid: {
+      const bool other_ring =
+          request.incarnation() != 0 && request.incarnation() != stream().incarnation();
+      return other_ring ? oldest : std::clamp<Tid>(request.from_tid(), 0, kLastTid);
+    }
+    case net::Subscribe::kFromTimeNs: {
+      Tid tid = kNoTid;
+      const Time time = time_from_ns(request.from_time_ns());
+      return reader_.find(time, tid) == ReadStatus::ok ? std::clamp<Tid>(tid, oldest, next)
+                                                       : oldest;
+    }
+    case net::Subscribe::kFromOldest:
+      return oldest;
+    case net::Subscribe::kFromNow:
+    case net::Subscribe::START_NOT_SET:
+      break;
+  }
+  return next;
+}
+
+[[gnu::hot]] Result<void> StreamChannel::go_on_pumping(bool request_waits) {
+  if (!pump_) return {};
+  const MonoTime now = pump_->thins() ? MonoClock::now() : MonoTime{};
+  feed_->forget(*this);
+  Result<PumpWait> wait = pump_->pump(now, request_waits);
+  for (int looks = 0; wait && *wait == PumpWait::news; ++looks) {
+    if (feed_->wait(*this, pump_->known())) return {};
+    // One came between the look and the arming of the doorbell.
+    wait = looks < kMaxLooks ? pump_->pump(now) : Result(PumpWait::turn);
+  }
+  if (!wait)
+    return std::move(wait).error().context("send samples of '" + stream().id().str() + "'");
+  switch (*wait) {
+    case PumpWait::news:
+      break;
+    case PumpWait::time:
+      due_.enable_in(pump_->due() - now);
+      break;
+    case PumpWait::turn:
+      parts_.owner.work_soon();
+      break;
+    case PumpWait::nothing:
+      pump_.reset();
+      break;
+    case PumpWait::room:
+      break;
+  }
+  return {};
+}
+
+[[gnu::hot]] void StreamChannel::on_news() { parts_.owner.work_now(); }
+
+// The clock may have been set, and samples been written after that: what they say of their time
+// must not be believed.
+[[gnu::hot]] void StreamChannel::before_samples() {
+  if (!tells_clock_) return;
+  const std::uint64_t news = parts_.clock->news();
+  if (clock_news_ == news) return;
+  clock_news_ = news;
+  sender_.end_run();
+  net::Frame frame;
+  wire::tell_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
+  parts_.link.send(frame);
+}
+
+void StreamChannel::on_gap(Tid first, std::uint64_t count) {
+  lost_ += count;
+  net::Frame frame;
+  frame.mutable_gap()->set_first_tid(first);
+  frame.mutable_gap()->set_count(count);
+  parts_.link.send(frame);
+}
+
+void StreamChannel::on_caught_up() {
+  net::Frame frame;
+  frame.mutable_caught_up();
+  parts_.link.send(frame);
+}
+
+void StreamChannel::on_removed() {
+  if (!pump_) return end();
+  pump_->end_at(newest_untrusted(reader_));
+  parts_.owner.work_soon();
+}
+
+void StreamChannel::on_end() { end(); }
+
+void StreamChannel::end() {
+  net::Frame frame;
+  frame.mutable_ended()->set_removed(true);
+  parts_.link.send(frame);
+}
+
+// --- reads
+
+ReadStatus StreamChannel::find(const net::Read& request, Tid& tid) const {
+  const Tid newest = newest_untrusted(reader_);
+  switch (request.which_case()) {
+    case net::Read::kTid:
+      tid = request.tid();
+      if (tid > newest) return ReadStatus::not_yet;
+      return tid < 0 || tid < reader_.oldest() ? ReadStatus::too_old : ReadStatus::ok;
+    case net::Read::kTimeNs:
+      return reader_.find(time_from_ns(request.time_ns()), tid);
+    case net::Read::kNewerThan:
+      tid = newest;
+      return newest < 0 || newest <= request.newer_than() ? ReadStatus::not_yet : ReadStatus::ok;
+    case net::Read::kNewest:
+    case net::Read::WHICH_NOT_SET:
+      break;
+  }
+  tid = newest;
+  return newest < 0 ? ReadStatus::not_yet : ReadStatus::ok;
+}
+
+void StreamChannel::go_on_reading() {
+  const SendStatus status = sender_.busy() ? sender_.go_on() : begin_reading();
+  if (!reading_) return;
+  switch (status) {
+    case SendStatus::sent:
+      sender_.end_run();
+      reading_.reset();
+      return;
+    case SendStatus::torn:  // void, and so no answer: another one follows
+    case SendStatus::gone:
+      sender_.end_run();
+      if (++reading_->attempts == kMaxReadAttempts) return answer_no_sample(ReadStatus::lapped);
+      return parts_.owner.work_soon();
+    case SendStatus::blocked:
+      return sender_.end_run();
+    case SendStatus::unfinished:
+      return parts_.owner.work_soon();
+    case SendStatus::no_memory:
+      return answer_failure({Errc::limit_exceeded,
+                             "read from '" + stream().id().str() +
+                                 "': no memory is left to copy a sample aside; use a client that "
+                                 "has the feature 'torn', or raise the key max_peer_memory"});
+  }
+}
+
+// Looks for the sample that is asked for, and sends its beginning. Answers when there is none.
+SendStatus StreamChannel::begin_reading() {
+  if (!parts_.link.output_empty()) return SendStatus::blocked;
+  Tid tid = kNoTid;
+  const ReadStatus found = find(reading_->request, tid);
+  if (found != ReadStatus::ok) {
+    answer_no_sample(found);
+    return SendStatus::sent;
+  }
+  const SendStatus status = sender_.send(tid, reading_->serial, false);
+  // A tid that was found and is gone when it is looked at does not come back.
+  if (status == SendStatus::gone && reading_->request.which_case() == net::Read::kTid) {
+    answer_no_sample(ReadStatus::too_old);
+  }
+  return status;
+}
+
+void StreamChannel::answer_no_sample(ReadStatus status) {
+  net::Frame frame = answer_to(reading_->serial);
+  frame.mutable_no_sample()->set_status(static_cast<std::uint32_t>(status));
+  reading_.reset();
+  parts_.link.send(frame);
+}
+
+void StreamChannel::answer_failure(const Error& error) {
+  net::Frame frame = answer_to(reading_->serial);
+  wire::to_message(error, *frame.mutable_failure());
+  reading_.reset();
+  parts_.link.send(frame);
+}
+
+Result<void> StreamChannel::get_range(std::uint64_t serial, const net::GetRange& request) {
+  net::Frame frame = answer_to(serial);
+  net::Range& range = *frame.mutable_range();
+  const Tid newest = newest_untrusted(reader_);
+  range.set_newest(newest);
+  range.set_oldest(newest < 0 ? kNoTid : std::clamp<Tid>(reader_.oldest(), 0, newest));
+  range.set_at_tid(kNoTid);
+  Tid tid = kNoTid;
+  if (request.has_time_ns() &&
+      reader_.find(time_from_ns(request.time_ns()), tid) == ReadStatus::ok) {
+    range.set_at_tid(tid);
+  }
+  parts_.link.send(frame);
+  return {};
+}
+
+// --- publishing
+
+Result<void> StreamChannel::start_publishing(std::uint64_t serial,
+                                             const net::StartPublishing& request) {
+  receiver_.reset();
+  Result<std::unique_ptr<SampleReceiver>> receiver =
+      SampleReceiver::open(parts_.loop, parts_.link, parts_.budget, *served_, request.publisher());
+  if (!receiver) return std::move(receiver).error();
+  receiver_ = *std::move(receiver);
+  if (Result<void> judged = judge_writer(); !judged) return judged;
+  const ring::PublisherNotes::Last last = receiver_->last();
+  net::Frame frame = answer_to(serial);
+  net::Publishing& publishing = *frame.mutable_publishing();
+  publishing.set_last(last.number);
+  publishing.set_last_tid(last.tid);
+  publishing.set_incarnation(stream().incarnation());
+  parts_.link.send(frame);
+  return {};
+}
+
+Result<void> StreamChannel::on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) {
+  if (!receiver_) {
+    return Error{Errc::protocol,
+                 "stream '" + stream().id().str() + "': a sample came before StartPublishing"};
+  }
+  return receiver_->on_sample_begin(sample, out);
+}
+
+Result<void> StreamChannel::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+  return receiver_->on_sample_end(sample, torn);
+}
+
+void StreamChannel::on_batch_end() {
+  if (receiver_) receiver_->acknowledge();
+}
+
+// --- property
+
+// From the first writer on with another clock than this PC's, readers here look at what the times
+// of the stream are worth.
+Result<void> StreamChannel::judge_writer() {
+  if (!parts_.clock) return {};
+  const StreamId& id = stream().id();
+  const bool is_this_clock =
+      parts_.clock->judge(id, parts_.them.clock.get()).rule == ring::ClockRule::same_clock;
+  return is_this_clock ? Result<void>() : served_->judge(parts_.clock->judge_own(id));
+}
+
+Result<void> StreamChannel::set_property(std::uint64_t serial, const net::SetProperty& request) {
+  if (Result<void> set = parts_.registry.set_property(stream().id(), request.property()); !set) {
+    return set;
+  }
+  net::Frame frame = answer_to(serial);
+  frame.mutable_done();
+  parts_.link.send(frame);
+  return {};
+}
+
+Result<void> StreamChannel::get_property(std::uint64_t serial) {
+  Result<std::string> property = property_of(stream());
+  if (!property) return std::move(property).error();
+  net::Frame frame = answer_to(serial);
+  frame.mutable_property()->set_property(*std::move(property));
+  parts_.link.send(frame);
+  return {};
+}
+
+}  // namespace dssm::daemon

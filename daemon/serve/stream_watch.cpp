@@ -1,0 +1,56 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/serve/stream_watch.hpp"
+
+#include "core/wire/messages.hpp"
+#include "daemon/streams/description.hpp"
+
+namespace dssm::daemon {
+
+StreamWatch::StreamWatch(const Registry& registry, const OpenTable& opens, FrameLink& link,
+                         std::uint64_t serial)
+    : opens_(opens),
+      link_(link),
+      serial_(serial),
+      untold_(registry.streams().begin(), registry.streams().end()) {}
+
+bool StreamWatch::work() {
+  for (int told = 0; !untold_.empty() && link_.output_empty(); ++told) {
+    if (told == kStreamsPerTurn) return true;
+    const std::shared_ptr<const Stream> stream = untold_.front().lock();
+    untold_.pop_front();
+    if (stream && !stream->removed()) tell(*stream);
+  }
+  if (!untold_.empty() || serial_ == 0) return false;
+  net::Frame done;
+  done.set_serial(serial_);
+  done.mutable_done();
+  serial_ = 0;
+  link_.send(done);
+  return false;
+}
+
+void StreamWatch::tell(const Stream& stream) {
+  net::Frame frame;
+  describe(stream, opens_, *frame.mutable_stream_event()->mutable_stream());
+  link_.send(frame);
+}
+
+void StreamWatch::on_stream_added(const Stream& stream) {
+  if (untold_.empty()) {
+    tell(stream);
+  } else {
+    untold_.push_back(stream.weak_from_this());
+  }
+}
+
+// Also of one that was not told yet: whoever does not know it has nothing to forget.
+void StreamWatch::on_stream_removed(const Stream& stream) {
+  net::Frame frame;
+  net::StreamEvent& event = *frame.mutable_stream_event();
+  event.set_removed(true);
+  wire::to_message(stream.id(), *event.mutable_stream()->mutable_id());
+  event.mutable_stream()->set_incarnation(stream.incarnation());
+  link_.send(frame);
+}
+
+}  // namespace dssm::daemon

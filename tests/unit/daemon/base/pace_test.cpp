@@ -1,0 +1,38 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/base/pace.hpp"
+
+#include <gtest/gtest.h>
+
+namespace dssm::daemon {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr MonoTime kBegin{1000s};
+
+// How many may go at that moment.
+int take_all(Pace& pace, MonoTime now) {
+  int count = 0;
+  for (; pace.wait(now) == Duration::zero(); ++count) pace.take(now);
+  return count;
+}
+
+TEST(Pace, LetsSoManyGoAtOnceAndThenOnePerPeriod) {
+  Pace pace(4, 100ms);
+  EXPECT_EQ(take_all(pace, kBegin), 4);
+  EXPECT_EQ(pace.wait(kBegin), 100ms);
+  EXPECT_EQ(pace.wait(kBegin + 30ms), 70ms);
+  EXPECT_EQ(take_all(pace, kBegin + 99ms), 0);
+  EXPECT_EQ(take_all(pace, kBegin + 100ms), 1);
+  EXPECT_EQ(take_all(pace, kBegin + 300ms), 2);
+}
+
+TEST(Pace, HasAllOfThemAgainAfterARestAndNotMore) {
+  Pace pace(4, 100ms);
+  EXPECT_EQ(take_all(pace, kBegin), 4);
+  EXPECT_EQ(take_all(pace, kBegin + 399ms), 3);
+  EXPECT_EQ(take_all(pace, kBegin + 10s), 4);
+}
+
+}  // namespace
+}  // namespace dssm::daemon

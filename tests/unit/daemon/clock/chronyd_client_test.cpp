@@ -1,0 +1,226 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/clock/chronyd_client.hpp"
+
+#include <event2/event.h>
+
+#include <set>
+
+#include "tests/unit/daemon/clock/fake_chronyd.hpp"
+#include "tests/unit/daemon/remote/fake_owner.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr Duration kPeriod = 200ms;
+
+class ChronydClientTest : public testing::Test, protected ChronydClient::User {
+ protected:
+  using Question = FakeChronyd::Question;
+  struct Answer {
+    TrackingReply reply;
+    MonoTime asked;
+    clock::Instant answered;
+  };
+
+  EventLoop loop = EventLoop::open().value();
+  // What happens with each question; every test says so.
+  std::function<void(const Question&)> then;
+  std::vector<Question> questions;
+  FakeChronyd chronyd{loop, [this](const Question& question) {
+                        questions.push_back(question);
+                        then(question);
+                      }};
+  std::vector<Answer> answers;
+  std::vector<std::string> unanswered;
+  int absent = 0;
+  std::unique_ptr<ChronydClient> client;
+
+  void on_answer(const TrackingReply& reply, MonoTime asked,
+                 const clock::Instant& answered) override {
+    answers.push_back({reply, asked, answered});
+  }
+  void on_no_chronyd() override { ++absent; }
+  void on_no_answer(const Error& why) override { unanswered.push_back(why.message); }
+
+  void start() { start(chronyd.address()); }
+  void start(const wire::SocketAddress& address) {
+    ChronydClient::User& user = *this;
+    client = std::make_unique<ChronydClient>(loop, address, user, clock::Instant::now, kPeriod);
+  }
+  void reply(const Question& question) { chronyd.answer(question, real_reply()); }
+  void until(const std::function<bool()>& done) { run_until(loop, done); }
+};
+
+TEST_F(ChronydClientTest, AsksAgainAndAgainWithOtherNumbers) {
+  then = [this](const Question& question) { reply(question); };
+  const MonoTime begin = MonoClock::now();
+  start();
+  until([&] { return answers.size() == 3; });
+  EXPECT_GE(MonoClock::now() - begin, 2 * kPeriod - 10ms);
+  std::set<std::uint32_t> numbers;
+  for (const Question& question : questions) {
+    EXPECT_EQ(question.bytes.size(), kTrackingBytes);
+    numbers.insert(question.sequence());
+  }
+  EXPECT_EQ(numbers.size(), 3u);
+  EXPECT_TRUE(unanswered.empty());
+  EXPECT_EQ(absent, 0);
+  MonoTime last = begin;
+  for (const Answer& answer : answers) {
+    EXPECT_EQ(answer.reply.tracking.reference_id, 0x7f000001u);
+    EXPECT_GE(answer.asked, last);
+    EXPECT_GE(answer.answered.mono, answer.asked);
+    last = answer.answered.mono;
+  }
+}
+
+TEST_F(ChronydClientTest, AsksWhenTheProcessIsAwakeAnyway) {
+  then = [this](const Question& question) { reply(question); };
+  start();
+  until([&] { return answers.size() == 1; });
+  struct Occasion {
+    MonoTime begin, end;
+  };
+  std::vector<Occasion> occasions;
+  EventSource heartbeat = EventSource::timer(loop, [&] {
+    const MonoTime begin = MonoClock::now();
+    for (int i = 0; i < 10; ++i) client->take_occasion();
+    occasions.push_back({begin, MonoClock::now()});
+    heartbeat.enable_in(kPeriod);
+  });
+  heartbeat.enable_in(kPeriod * 9 / 10);
+  until([&] { return answers.size() == 6; });
+  ASSERT_EQ(occasions.size(), 5u) << "each was one to ask at, once";
+  for (std::size_t i = 0; i < occasions.size(); ++i) {
+    EXPECT_GE(answers[i + 1].asked, occasions[i].begin);
+    EXPECT_LE(answers[i + 1].asked, occasions[i].end);
+  }
+  heartbeat.disable();
+  until([&] { return answers.size() == 7; });  // by itself again
+}
+
+// A heartbeat between two questions is none to ask at; from some later one on each is.
+TEST_F(ChronydClientTest, FallsInWithHeartbeats) {
+  then = [this](const Question& question) { reply(question); };
+  MonoTime begin, end;  // of the last heartbeat
+  EventSource heartbeat = EventSource::timer(loop, [&] {
+    begin = MonoClock::now();
+    client->take_occasion();
+    end = MonoClock::now();
+    heartbeat.enable_in(kPeriod);
+  });
+  start();
+  heartbeat.enable_in(kPeriod / 2);
+  std::size_t seen = 0;
+  int in_turn = 0;
+  until([&] {
+    for (; seen < answers.size(); ++seen) {
+      const MonoTime asked = answers[seen].asked;
+      in_turn = asked >= begin && asked <= end ? in_turn + 1 : 0;
+    }
+    return in_turn == 4;
+  });
+}
+
+TEST_F(ChronydClientTest, KnowsAtOnceThatNobodyListens) {
+  chronyd.stop();
+  const MonoTime begin = MonoClock::now();
+  start();
+  until([&] { return absent == 1; });
+  EXPECT_LT(MonoClock::now() - begin, kPeriod) << "with the first question";
+  until([&] { return absent == 2; });
+  then = [this](const Question& question) { reply(question); };
+  chronyd.start();
+  until([&] { return answers.size() == 1; });
+  chronyd.stop();
+  const int before = absent;
+  until([&] { return absent > before; });
+  EXPECT_TRUE(unanswered.empty());
+}
+
+TEST_F(ChronydClientTest, DoesNotWaitForOneThatIsSilent) {
+  then = [](const Question&) {};
+  start();
+  until([&] { return unanswered.size() == 2; });
+  EXPECT_NE(unanswered[0].find("does not answer"), std::string::npos) << unanswered[0];
+  then = [this](const Question& question) { reply(question); };
+  until([&] { return answers.size() == 1; });
+  EXPECT_EQ(absent, 0);
+}
+
+TEST_F(ChronydClientTest, LeavesLateAnswersAlone) {
+  then = [this](const Question&) {
+    if (questions.size() == 1) return;
+    // The first one's comes with the second question, to where either came from.
+    reply(questions[0]);
+    Datagram late = real_reply();
+    put_number(late, kReplySequence, questions[0].sequence());
+    chronyd.send(questions.back(), late);
+  };
+  start();
+  until([&] { return unanswered.size() == 2; });
+  EXPECT_TRUE(answers.empty());
+  EXPECT_NE(unanswered[1].find("no question of ours"), std::string::npos) << unanswered[1];
+}
+
+TEST_F(ChronydClientTest, FindsTheAnswerBehindGarbage) {
+  then = [this](const Question& question) {
+    chronyd.send(question, {});
+    chronyd.send(question, Datagram(3, std::byte{0xff}));
+    chronyd.send(question, Datagram(2000, std::byte{6}));
+    Datagram other = real_reply();
+    put_number(other, kReplySequence, question.sequence() + 1);
+    chronyd.send(question, other);
+    Datagram damaged = real_reply();
+    damaged.pop_back();
+    chronyd.answer(question, damaged);
+    reply(question);
+    reply(question);
+  };
+  start();
+  until([&] { return answers.size() == 2; });
+  EXPECT_EQ(questions.size(), 2u) << "one answer for each question";
+  EXPECT_TRUE(unanswered.empty());
+}
+
+TEST_F(ChronydClientTest, LooksAtSoManyDatagramsOnly) {
+  then = [this](const Question& question) {
+    for (int i = 0; i < ChronydClient::kMostDatagrams; ++i) chronyd.send(question, {});
+    reply(question);
+  };
+  start();
+  until([&] { return unanswered.size() == 1; });
+  EXPECT_TRUE(answers.empty());
+  // And it is as good as new then.
+  then = [this](const Question& question) {
+    for (int i = 1; i < ChronydClient::kMostDatagrams; ++i) chronyd.send(question, {});
+    reply(question);
+  };
+  until([&] { return answers.size() == 1; });
+}
+
+TEST_F(ChronydClientTest, TellsWhyItWasRefused) {
+  then = [this](const Question& question) {
+    Datagram refusal = real_reply();
+    refusal.resize(28);
+    put_number(refusal, kReplyStatus, std::uint16_t{6});
+    chronyd.answer(question, refusal);
+  };
+  start();
+  until([&] { return unanswered.size() == 1; });
+  EXPECT_NE(unanswered[0].find("not enabled"), std::string::npos) << unanswered[0];
+}
+
+TEST_F(ChronydClientTest, TriesAgainWhereThereIsNoWay) {
+  // Linux lets no socket send to everybody that has not asked for it.
+  const auto nowhere = wire::Address::parse("255.255.255.255:323").value();
+  start(wire::resolve_number(nowhere).at(0));
+  until([&] { return unanswered.size() == 2; });
+  EXPECT_NE(unanswered[0].find("ask chronyd"), std::string::npos) << unanswered[0];
+  EXPECT_TRUE(answers.empty());
+}
+
+}  // namespace
+}  // namespace dssm::daemon

@@ -1,0 +1,243 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// This PC's clock among others, which the test puts into the catalog, with a chronyd that says what
+// the test wants.
+#include "daemon/clock/fleet_clock.hpp"
+
+#include <filesystem>
+
+#include "tests/unit/daemon/clock/fake_chronyd.hpp"
+#include "tests/unit/daemon/remote/fake_owner.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr wire::HostId kSelf{1}, kReference{2}, kOther{3};
+constexpr std::uint32_t kReferenceAddress = 0x0a000001;  // 10.0.0.1
+constexpr wire::IpBytes kReferenceBytes{0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, 10, 0, 0, 1};
+
+struct NoLogger final : Logger {
+  void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
+};
+
+// A host whose clock is `bound` from its own chronyd's time, and follows nobody.
+wire::Greeting host(wire::HostId id, const std::string& name, Duration bound) {
+  auto report = std::make_shared<wire::ClockReport>();
+  report->standing.boot_id = name + "'s boot";
+  report->standing.chain = {{id, bound}};
+  report->standing.anchor = id;
+  report->standing.bound = bound;
+  report->status = ClockStatus::synchronized;
+  report->heard = MonoClock::now();
+  wire::Greeting greeting;
+  greeting.host = name;
+  greeting.host_id = id;
+  greeting.life = 1;
+  greeting.program = "dssmd";
+  greeting.clock = report;
+  return greeting;
+}
+
+class FleetClockTest : public testing::Test {
+ protected:
+  FleetClockTest() {
+    char folder[] = "/tmp/dssm-fleet-clock-XXXXXX";
+    EXPECT_TRUE(::mkdtemp(folder));
+    folder_ = folder;
+    tracking.reference_id = kReferenceAddress;
+    tracking.stratum = 11;
+    tracking.leap = 0;
+    tracking.update_interval = 1s;
+    tracking.offset = 10us;
+    tracking.root = {20us, 60us};
+  }
+  ~FleetClockTest() override { std::filesystem::remove_all(folder_); }
+
+  // Starts, and waits until chronyd has answered.
+  FleetClock& start() {
+    Result<clock::ClockPageWriter> page = clock::ClockPageWriter::open(folder_ + "/clock");
+    fleet.emplace(loop,
+                  FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
+                  *std::move(page), own, kSelf, catalog, logger);
+    fleet->on_news([this] { ++news; });
+    wait([this] { return own->status != ClockStatus::unknown; });
+    return *fleet;
+  }
+  template <class Done>
+  void wait(Done done) {
+    const MonoTime deadline = deadline_in(20s);
+    while (!done() && MonoClock::now() < deadline) {
+      EventSource tick = EventSource::timer(loop, [this] { loop.stop(); });
+      tick.enable_in(10ms);
+      ASSERT_TRUE(loop.run());
+    }
+    EXPECT_TRUE(done());
+  }
+  void follow_nobody() {
+    tracking.reference_id = clock::kLocalReferenceId;
+    tracking.root = {};
+    tracking.offset = 0us;
+  }
+  void add_reference() {
+    wire::Greeting reference = host(kReference, "pc1", 5us);
+    auto report = std::make_shared<wire::ClockReport>(*reference.clock);
+    report->addresses = {kReferenceBytes};
+    reference.clock = report;
+    catalog.host_up(reference, {"10.0.0.1", 13776});
+  }
+  ring::ClockVerdict judged(const wire::Greeting& owner) const {
+    return fleet->judge(lidar, owner.clock.get());
+  }
+
+  const StreamId lidar{"lidar", 0, "pc3"};
+  EventLoop loop = EventLoop::open().value();
+  NoLogger logger;
+  clock::Tracking tracking;
+  FakeChronyd chronyd{loop, [this](const FakeChronyd::Question& question) {
+                        tracking.updated = WallClock::now() - tracking.offset - 10ms;
+                        chronyd.answer(question, reply_of(tracking));
+                      }};
+  Catalog catalog{"self"};
+  clock::ClockPolicies policies;
+  std::shared_ptr<wire::ClockReport> own = std::make_shared<wire::ClockReport>();
+  std::optional<FleetClock> fleet;
+  int news = 0;
+
+ private:
+  std::string folder_;
+};
+
+TEST_F(FleetClockTest, OnePcThatFollowsNobodyIsItsOwnReference) {
+  follow_nobody();
+  start();
+  EXPECT_EQ(own->status, ClockStatus::synchronized);
+  EXPECT_EQ(own->basis, ClockBasis::own);
+  EXPECT_EQ(own->standing.anchor, kSelf);
+  EXPECT_EQ(own->standing.chain.size(), 1U);
+  EXPECT_LT(own->standing.bound, 50us);
+  EXPECT_FALSE(own->standing.root_is_utc);
+  EXPECT_EQ(news, 1) << "others have to know";
+}
+
+TEST_F(FleetClockTest, OwnStreamsThatOthersWriteToAreAsFarOffAsThisClock) {
+  EXPECT_FALSE(FleetClockTest::start().judge_own(lidar).added == kUnknownClockError);
+  const ring::ClockVerdict known = fleet->judge_own(lidar);
+  EXPECT_EQ(known.rule, ring::ClockRule::enforce);
+  EXPECT_GE(known.added, own->standing.bound);
+  EXPECT_EQ(known.allowed, policies.general.limit - known.added);
+  tracking.leap = clock::Tracking::kUnsynchronized;
+  wait([this] { return own->standing.bound == kUnknownClockError; });
+  EXPECT_LT(fleet->judge_own(lidar).allowed, 0ns);
+  policies.general.policy = ClockPolicy::off;
+  fleet->set(policies, 50'000);
+  EXPECT_EQ(fleet->judge_own(lidar).rule, ring::ClockRule::off);
+}
+
+TEST_F(FleetClockTest, OnlyUtcIsLeftWithoutAHostToFollow) {
+  start();
+  EXPECT_EQ(own->basis, ClockBasis::root);
+  EXPECT_TRUE(own->standing.bound_is_root);
+  EXPECT_TRUE(own->standing.root_is_utc);
+  EXPECT_GE(own->standing.bound, 60us);
+  EXPECT_LT(own->standing.bound, 200us);
+  EXPECT_EQ(own->reference, "10.0.0.1");
+}
+
+TEST_F(FleetClockTest, TheHostAtTheAddressThatChronydFollowsIsTheReference) {
+  add_reference();
+  start();
+  EXPECT_EQ(own->basis, ClockBasis::reference);
+  EXPECT_EQ(own->reference, "pc1");
+  EXPECT_EQ(own->standing.anchor, kReference);
+  ASSERT_EQ(own->standing.chain.size(), 2U);
+  EXPECT_EQ(own->standing.chain[1].clock, kReference);
+  EXPECT_EQ(own->standing.chain[1].bound, own->standing.bound);
+}
+
+TEST_F(FleetClockTest, ASampleMayBeAsWrongAsIsLeftOfTheLimit) {
+  add_reference();
+  start();
+  const ring::ClockVerdict verdict = judged(host(kReference, "pc1", 5us));
+  EXPECT_EQ(verdict.rule, ring::ClockRule::enforce);
+  EXPECT_EQ(verdict.allowed, 1500us - verdict.added);
+  EXPECT_GE(verdict.added, own->standing.bound);
+  EXPECT_LT(verdict.added, own->standing.bound + 200us);
+}
+
+TEST_F(FleetClockTest, NothingIsGoodOfAHostThatFollowsSomebodyElse) {
+  add_reference();
+  start();
+  EXPECT_LT(judged(host(kOther, "pc3", 5us)).allowed, 0us);
+  const Error why = fleet->why_not(lidar, host(kOther, "pc3", 5us).clock.get());
+  EXPECT_EQ(why.code, Errc::clock_out_of_bounds);
+  EXPECT_NE(why.message.find("follow different references"), std::string::npos) << why.message;
+}
+
+TEST_F(FleetClockTest, NothingIsGoodOfAHostWhoseClockIsUnknown) {
+  add_reference();
+  start();
+  EXPECT_LT(judged(host(kReference, "pc1", kUnknownClockError)).allowed, 0us);
+  EXPECT_LT(fleet->judge(lidar, nullptr).allowed, 0us);
+}
+
+TEST_F(FleetClockTest, AHostWithThisKernelHasThisClock) {
+  chronyd.stop();
+  Result<clock::ClockPageWriter> page =
+      clock::ClockPageWriter::open(std::filesystem::temp_directory_path() / "dssm-same-clock");
+  std::filesystem::remove(std::filesystem::temp_directory_path() / "dssm-same-clock");
+  fleet.emplace(loop,
+                FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
+                *std::move(page), own, kSelf, catalog, logger);
+  wire::ClockReport same;
+  same.standing.boot_id = clock::boot_id();
+  EXPECT_EQ(fleet->judge(lidar, &same).rule, ring::ClockRule::same_clock);
+  EXPECT_EQ(fleet->distance_to(same), 0us);
+}
+
+TEST_F(FleetClockTest, PoliciesDecide) {
+  policies.general.policy = ClockPolicy::mark;
+  policies.exceptions = {{"lidar", ClockPolicy::off, 0us}, {"cam*", ClockPolicy::enforce, 5ms}};
+  add_reference();
+  start();
+  const wire::Greeting owner = host(kReference, "pc1", 5us);
+  EXPECT_EQ(judged(owner).rule, ring::ClockRule::off);
+  EXPECT_EQ(fleet->judge({"odometry", 0, "pc1"}, owner.clock.get()).rule, ring::ClockRule::mark);
+  const ring::ClockVerdict camera = fleet->judge({"camera", 1, "pc1"}, owner.clock.get());
+  EXPECT_EQ(camera.rule, ring::ClockRule::enforce);
+  EXPECT_EQ(camera.allowed, 5ms - camera.added);
+}
+
+TEST_F(FleetClockTest, ServesOthersFromWhenTheClockWasFirstKnown) {
+  tracking.leap = clock::Tracking::kUnsynchronized;
+  start();
+  const wire::Greeting peer = host(kOther, "pc3", 5us);
+  const Result<void> refused = fleet->check_serving(lidar, peer);
+  ASSERT_FALSE(refused);
+  EXPECT_EQ(refused.error().code, Errc::clock_out_of_bounds);
+  EXPECT_NE(refused.error().message.find("not synchronised"), std::string::npos)
+      << refused.error().message;
+  tracking.leap = 0;
+  wait([this] { return own->status == ClockStatus::synchronized; });
+  EXPECT_TRUE(fleet->check_serving(lidar, peer));
+  wire::Greeting program = peer;
+  program.clock = nullptr;
+  EXPECT_TRUE(fleet->check_serving(lidar, program));
+  tracking.leap = clock::Tracking::kUnsynchronized;
+  wait([this] { return own->status == ClockStatus::out_of_bounds; });
+  EXPECT_TRUE(fleet->check_serving(lidar, peer)) << "a dssmd judges for itself";
+  EXPECT_FALSE(fleet->check_serving(lidar, program)) << "who watches no clock cannot";
+}
+
+TEST_F(FleetClockTest, ProgramsOfThisPcFindTheBoundOnThePage) {
+  follow_nobody();
+  start();
+  const UniqueFd file = fleet->page_for_reading().value();
+  const clock::ClockPage& page = **clock::map_clock_page_untrusted(file.get());
+  EXPECT_EQ(clock::status_of(page), ClockStatus::synchronized);
+  EXPECT_LT(clock::error_at(page, WallClock::now()).value(), 1ms);
+}
+
+}  // namespace
+}  // namespace dssm::daemon

@@ -1,0 +1,80 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The dssmd of another host for tests of control connections, and a log to look into.
+#pragma once
+
+#include <algorithm>
+#include <string>
+#include <string_view>
+#include <vector>
+
+#include "daemon/base/log.hpp"
+#include "tests/unit/daemon/daemon_fixtures.hpp"
+#include "tests/unit/daemon/remote/fake_owner.hpp"
+
+namespace dssm::daemon {
+
+class KeptLog final : public Logger {
+ public:
+  void write(LogLevel level, std::string_view text, const LogFields&) noexcept override {
+    if (level <= LogLevel::notice) lines.emplace_back(text);
+  }
+  bool says(const std::string& text) const {
+    return std::any_of(lines.begin(), lines.end(), [&](const std::string& line) {
+      return line.find(text) != std::string::npos;
+    });
+  }
+  std::vector<std::string> lines;
+};
+
+inline net::Frame answer_to(const net::Frame& request) {
+  net::Frame answer;
+  answer.set_serial(request.serial());
+  return answer;
+}
+
+// A peer that answers heartbeats and Watch by itself.
+class FakePeer {
+ public:
+  explicit FakePeer(const EventLoop& loop, const std::string& name = "pc2") : owner(loop, name) {}
+
+  // Answers what came; to be called while waiting for something.
+  void serve() {
+    while (owner.asked()) {
+      const net::Frame request = owner.take();
+      net::Frame answer = answer_to(request);
+      if (request.has_ping()) {
+        ++pings;
+        if (silent) continue;
+        answer.mutable_pong()->mutable_clock()->set_bound_ns(1000);
+        answer.mutable_pong()->mutable_clock()->set_anchor(std::string(16, 'r'));
+      } else if (request.has_watch()) {
+        ++watches;
+        for (const std::string& stream : streams) tell(stream, false);
+        answer.mutable_done();
+      } else {
+        asked.push_back(request);
+        continue;
+      }
+      owner.send(answer);
+    }
+  }
+  void tell(const std::string& name, bool removed, const std::string& as_host = "") {
+    net::Frame frame;
+    net::StreamEvent& event = *frame.mutable_stream_event();
+    event.set_removed(removed);
+    event.mutable_stream()->mutable_id()->set_name(name);
+    event.mutable_stream()->mutable_id()->set_host(as_host);
+    wire::to_message(odometry_type(), *event.mutable_stream()->mutable_type());
+    event.mutable_stream()->set_incarnation(1);
+    owner.send(frame);
+  }
+
+  FakeOwner owner;
+  std::vector<std::string> streams;
+  std::vector<net::Frame> asked;
+  bool silent = false;
+  int pings = 0, watches = 0;
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,533 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What the hosts that mDNS finds become: dialed, kept, changed to another of their addresses, and
+// forgotten, whatever is announced.
+#include <gtest/gtest.h>
+
+#include "daemon/fleet/peers.hpp"
+#include "daemon/fleet/service_record.hpp"
+#include "tests/unit/daemon/fleet/fake_peer.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+MdnsState mdns_in(MdnsState::Phase phase) {
+  MdnsState state;
+  state.phase = phase;
+  return state;
+}
+
+class FoundHostsTest : public testing::Test {
+ protected:
+  EventLoop loop = EventLoop::open().value();
+  Resolver resolver{loop};
+  Catalog catalog{"pc1"};
+  KeptLog log;
+  const wire::Greeting self = greeting_of("pc1");
+  const wire::Greeting pc2 = greeting_of("pc2");
+  std::unique_ptr<FakePeer> one = std::make_unique<FakePeer>(loop);
+  std::unique_ptr<FakePeer> two = std::make_unique<FakePeer>(loop);
+  std::unique_ptr<Peers> peers;
+
+  // Both are addresses of one host, unless a test says otherwise.
+  FoundHostsTest() {
+    one->owner.greet_as(pc2);
+    two->owner.greet_as(pc2);
+  }
+  void start(const std::vector<wire::Address>& configured = {}, bool insecure = true) {
+    peers = std::make_unique<Peers>(loop, resolver, configured, self, catalog, log);
+    peers->expect_finder(insecure);
+  }
+  static wire::Address at(FakePeer& peer) { return peer.owner.host().address; }
+  wire::Address nobody() { return FakeOwner(loop).host().address; }
+  static FoundHost host_at(const std::vector<wire::Address>& addresses,
+                           const std::string& name = "pc2") {
+    FoundHost host;
+    host.id = wire::host_id_for(name);
+    host.name = name;
+    host.protocol_version = wire::kNetworkProtocolVersion;
+    host.addresses = addresses;
+    return host;
+  }
+  void serve() {
+    if (one) one->serve();
+    if (two) two->serve();
+  }
+  void wait(const std::function<bool()>& done) {
+    run_until(loop, [&] {
+      serve();
+      return done();
+    });
+  }
+  void wait_until_up() {
+    wait([this] { return !catalog.hosts().empty(); });
+  }
+  void wait_until_down() {
+    wait([this] { return catalog.hosts().empty(); });
+  }
+  // All that can happen without waiting for a timer.
+  void look_around() {
+    for (int i = 0; i < 300; ++i) {
+      event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
+      serve();
+    }
+  }
+  local::Host host(std::size_t index = 0) const { return peers->hosts().at(index); }
+  std::vector<std::string> found_by(std::size_t index = 0) const {
+    const local::Host shown = host(index);
+    return {shown.found_by().begin(), shown.found_by().end()};
+  }
+  wire::Address address_in_catalog() const { return catalog.hosts().at(pc2.host_id).address; }
+};
+
+TEST_F(FoundHostsTest, GoIntoTheCatalogWithTheirStreams) {
+  one->streams = {"lidar", "imu"};
+  start();
+  peers->on_host_found(host_at({at(*one)}));
+  EXPECT_EQ(host().state(), "connecting");
+  wait([&] { return catalog.has({"lidar", 0, "pc2"}) && catalog.has({"imu", 0, "pc2"}); });
+  ASSERT_EQ(peers->hosts().size(), 1u);
+  EXPECT_EQ(host().name(), "pc2");
+  EXPECT_EQ(host().host_id(), std::string(pc2.host_id.begin(), pc2.host_id.end()));
+  EXPECT_EQ(host().state(), "up");
+  EXPECT_EQ(host().streams(), 2u);
+  EXPECT_EQ(host().error(), "");
+  EXPECT_EQ(host().addresses_size(), 1);
+  EXPECT_EQ(found_by(), std::vector<std::string>{"mdns"});
+  EXPECT_EQ(peers->trouble(), "");
+  EXPECT_TRUE(peers->link_to(pc2.host_id));
+}
+
+TEST_F(FoundHostsTest, AreDialedAtTheirAddressesInTurn) {
+  start();
+  peers->on_host_found(host_at({nobody(), nobody(), at(*one), at(*two)}));
+  wait_until_up();
+  EXPECT_EQ(address_in_catalog(), at(*one));
+  look_around();
+  EXPECT_EQ(two->owner.connections(), 0) << "one connection is enough";
+  ASSERT_EQ(host().addresses_size(), 4);
+  EXPECT_EQ(host().addresses(0), at(*one).str()) << "the one that is used";
+}
+
+TEST_F(FoundHostsTest, ComeBackAtTheirBestAddressAfterARestart) {
+  start();
+  peers->on_host_found(host_at({at(*one), at(*two)}));
+  wait_until_up();
+  one->owner.cut();
+  wait_until_down();
+  wait_until_up();
+  EXPECT_EQ(address_in_catalog(), at(*one));
+  EXPECT_EQ(two->owner.connections(), 0);
+}
+
+TEST_F(FoundHostsTest, AreReachedAtAnotherAddressWhenTheFirstIsGone) {
+  one->streams = two->streams = {"lidar"};
+  start();
+  peers->on_host_found(host_at({at(*one), at(*two)}));
+  wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
+  one.reset();
+  wait_until_down();
+  wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
+  EXPECT_EQ(address_in_catalog(), at(*two)) << "which is where channels go";
+}
+
+TEST_F(FoundHostsTest, AreReachedAtAnotherAddressWhenTheFirstFallsSilent) {
+  one->silent = true;  // and takes connections all the same
+  start();
+  peers->on_host_found(host_at({at(*one), at(*two)}));
+  wait_until_up();
+  EXPECT_EQ(address_in_catalog(), at(*one));
+  wait_until_down();
+  wait_until_up();
+  EXPECT_EQ(address_in_catalog(), at(*two));
+  EXPECT_EQ(one->owner.connections(), 1);
+}
+
+TEST_F(FoundHostsTest, KeepAConnectionThatWorksWhenTheAddressesChange) {
+  start();
+  peers->on_host_found(host_at({at(*one)}));
+  wait_until_up();
+  peers->on_host_found(host_at({at(*two)}));
+  look_around();
+  EXPECT_EQ(address_in_catalog(), at(*one));
+  EXPECT_TRUE(one->owner.connected());
+  one->owner.cut();  // it would take a new connection
+  wait_until_down();
+  wait_until_up();
+  EXPECT_EQ(address_in_catalog(), at(*two));
+  EXPECT_EQ(one->owner.connections(), 1);
+}
+
+TEST_F(FoundHostsTest, AreDialedAtOnceWhenTheyHaveNewAddresses) {
+  start();
+  peers->on_host_found(host_at({nobody()}));
+  wait([&] { return host().state() == "down" && host().since_ns() > 1'600'000'000; });
+  EXPECT_NE(host().error().find("refused"), std::string::npos) << host().error();
+  EXPECT_NE(peers->trouble().find("'pc2' (connect to"), std::string::npos) << peers->trouble();
+  EXPECT_TRUE(log.says("host 'pc2' (found by mDNS) is not there"));
+  bool waited = false;  // for most of a pause
+  EventSource timer = EventSource::timer(loop, [&] { waited = true; });
+  timer.enable_in(PeerLink::kFoundPause * 9 / 10);
+  peers->on_host_found(host_at({at(*one)}));
+  wait([&] { return waited || host().state() == "up"; });
+  EXPECT_EQ(host().state(), "up");
+}
+
+TEST_F(FoundHostsTest, AreNotDialedASecondTimeWhenTheyAreConfiguredToo) {
+  one->streams = two->streams = {"lidar"};
+  start({at(*one)});
+  wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
+  peers->on_host_found(host_at({at(*two)}));
+  look_around();
+  EXPECT_EQ(two->owner.connections(), 0);
+  ASSERT_EQ(peers->hosts().size(), 1u);
+  EXPECT_EQ(found_by(), (std::vector<std::string>{"peer", "mdns"}));
+  EXPECT_EQ(host().error(), "");
+  one.reset();
+  wait([&] { return two->watches == 1 && catalog.has({"lidar", 0, "pc2"}); });
+  ASSERT_EQ(peers->hosts().size(), 2u);
+  EXPECT_EQ(host(0).state(), "down");
+  EXPECT_EQ(host(1).state(), "up");
+  EXPECT_EQ(host(1).streams(), 1u);
+  EXPECT_EQ(found_by(1), std::vector<std::string>{"mdns"});
+}
+
+TEST_F(FoundHostsTest, StopTryingWhenTheConfiguredConnectionComesUp) {
+  one->owner.call_itself("pc8");
+  two->owner.call_itself("pc9");
+  start({at(*one)});
+  wait_until_up();
+  peers->on_host_found(host_at({at(*two)}));
+  wait([&] { return peers->hosts().size() == 2 && host(1).state() == "refused"; });
+  one->owner.greet_as(pc2);
+  one->owner.cut();
+  wait([&] { return catalog.find(pc2.host_id) != nullptr; });
+  look_around();
+  const int before = two->owner.connections();
+  peers->on_host_found(host_at({at(*two), nobody()}));  // which would be dialed at once
+  look_around();
+  EXPECT_EQ(two->owner.connections(), before);
+  ASSERT_EQ(peers->hosts().size(), 1u);
+  EXPECT_EQ(host().state(), "up");
+  EXPECT_EQ(peers->trouble(), "");
+}
+
+TEST_F(FoundHostsTest, StayInUseWhenTheConfiguredConnectionComesLater) {
+  one->owner.call_itself("pc9");
+  one->streams = two->streams = {"lidar"};
+  start({at(*one)});
+  wait_until_up();
+  peers->on_host_found(host_at({at(*two)}));
+  wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
+  EXPECT_EQ(peers->hosts().size(), 2u);
+  one->owner.greet_as(pc2);
+  one->owner.cut();
+  wait([&] { return peers->hosts().size() == 1 && host().state() == "up"; });
+  EXPECT_EQ(host().error(), "");
+  EXPECT_EQ(host().streams(), 1u) << "it speaks for both";
+  EXPECT_EQ(found_by(), (std::vector<std::string>{"peer", "mdns"}));
+  look_around();
+  EXPECT_EQ(address_in_catalog(), at(*two));
+  EXPECT_TRUE(two->owner.connected());
+  two.reset();
+  wait([&] { return !catalog.hosts().empty() && address_in_catalog() == at(*one); });
+  wait([&] { return one->watches == 2; });  // as pc9, and now
+}
+
+TEST_F(FoundHostsTest, StayWhileTheirConnectionIsUpWhenMdnsLosesThem) {
+  start();
+  peers->on_host_found(host_at({at(*one)}));
+  wait_until_up();
+  peers->on_host_lost(pc2.host_id);
+  look_around();
+  EXPECT_EQ(host().state(), "up");
+  one->owner.cut();
+  wait([&] { return peers->hosts().empty(); });
+  EXPECT_TRUE(catalog.hosts().empty());
+  look_around();
+  EXPECT_EQ(one->owner.connections(), 1) << "forgotten";
+}
+
+TEST_F(FoundHostsTest, StayWhenMdnsFindsThemAgain) {
+  start();
+  peers->on_host_found(host_at({at(*one)}));
+  wait_until_up();
+  peers->on_host_lost(pc2.host_id);
+  look_around();
+  peers->on_host_found(host_at({at(*one)}));
+  one->owner.cut();
+  wait_until_down();
+  wait_until_up();
+  EXPECT_EQ(one->owner.connections(), 2);
+}
+
+TEST_F(FoundHostsTest, GoAtOnceWhenMdnsLosesThemWhileTheyAreDown) {
+  start();
+  peers->on_host_found(host_at({nobody()}));
+  wait([&] { return host().state() == "down"; });
+  peers->on_host_lost(pc2.host_id);
+  peers->on_host_lost(wire::host_id_for("pc3"));
+  look_around();
+  EXPECT_TRUE(peers->hosts().empty());
+  EXPECT_EQ(peers->trouble(), "");
+}
+
+TEST_F(FoundHostsTest, AreNotTakenForAnotherThatAnswersAtTheirAddress) {
+  one->owner.call_itself("pc3");
+  start();
+  peers->on_host_found(host_at({at(*one)}));
+  wait([&] { return host().state() == "refused"; });
+  EXPECT_NE(host().error().find("answers dssmd of host 'pc3'"), std::string::npos)
+      << host().error();
+  EXPECT_EQ(host().name(), "pc2");
+  EXPECT_TRUE(catalog.hosts().empty());
+  peers->on_host_found(host_at({at(*one), at(*two)}));
+  wait_until_up();
+  EXPECT_EQ(address_in_catalog(), at(*two)) << "the next address is tried too";
+}
+
+TEST_F(FoundHostsTest, AreNotLookedForWhereAnotherHostIsUp) {
+  start();
+  peers->on_host_found(host_at({at(*one)}));
+  wait_until_up();
+  peers->on_host_found(host_at({at(*one)}, "pc3"));
+  look_around();
+  ASSERT_EQ(peers->hosts().size(), 2u);
+  EXPECT_EQ(host(1).state(), "refused");
+  EXPECT_NE(host(1).error().find("where host 'pc2' answers"), std::string::npos) << host(1).error();
+  EXPECT_EQ(one->owner.connections(), 1) << "it is not disturbed";
+  EXPECT_EQ(host(0).state(), "up");
+  one->owner.call_itself("pc3");
+  one->owner.cut();
+  wait([&] { return catalog.find(wire::host_id_for("pc3")) != nullptr; });
+  look_around();
+  EXPECT_EQ(host(0).state(), "refused") << "now it is the other way round";
+}
+
+TEST_F(FoundHostsTest, AreNeverThisVeryHost) {
+  start();
+  one->owner.greet_as(self);
+  peers->on_host_found(host_at({at(*one)}, "pc1"));
+  wait([&] { return one->owner.connections() == 1; });
+  look_around();
+  EXPECT_TRUE(peers->hosts().empty()) << "an echo of our own announcement";
+  EXPECT_EQ(peers->own_trouble(), "");
+  EXPECT_EQ(peers->trouble(), "");
+  EXPECT_TRUE(log.lines.empty());
+}
+
+TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
+  wire::Greeting copy = self;
+  ++copy.life;
+  two->owner.greet_as(copy);
+  one->owner.greet_as(self);
+  start();
+  // With the copy's address came one of our own.
+  peers->on_host_found(host_at({at(*one), at(*two)}, "pc1"));
+  wait([&] { return !peers->own_trouble().empty(); });
+  const std::string warning = peers->own_trouble();
+  for (const std::string& part : {at(*two).str(), hex_of(self.host_id),
+                                  std::string("rm /etc/machine-id"), std::string("(key name)")}) {
+    EXPECT_NE(warning.find(part), std::string::npos) << part << " is missing in " << warning;
+  }
+  ASSERT_EQ(peers->hosts().size(), 1u);
+  EXPECT_EQ(host().state(), "refused");
+  EXPECT_EQ(host().error(), warning);
+  EXPECT_EQ(host().addresses(0), at(*two).str());
+  EXPECT_TRUE(catalog.hosts().empty());
+  EXPECT_TRUE(two->owner.connected()) << "it is not asked again and again";
+  two->owner.cut();
+  wait([&] { return peers->own_trouble().empty(); });
+  wait([&] { return !peers->own_trouble().empty(); });
+  EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
+                          [](const std::string& line) {
+                            return line.find("this host's name") != std::string::npos;
+                          }),
+            1);
+  // It was given another name.
+  peers->on_host_lost(self.host_id);
+  two->owner.greet_as(pc2);
+  two->owner.cut();
+  peers->on_host_found(host_at({at(*two)}));
+  wait_until_up();
+  EXPECT_EQ(peers->hosts().size(), 1u);
+  EXPECT_EQ(peers->own_trouble(), "");
+}
+
+TEST_F(FoundHostsTest, AreAskedThoughThisHostIsAmongItsOwnPeers) {
+  wire::Greeting copy = self;
+  ++copy.life;
+  one->owner.greet_as(self);
+  two->owner.greet_as(copy);
+  start({at(*one)});
+  wait([&] { return host().state() == "self"; });
+  peers->on_host_found(host_at({at(*two)}, "pc1"));
+  wait([&] { return !peers->own_trouble().empty(); });
+  ASSERT_EQ(peers->hosts().size(), 2u);
+  EXPECT_EQ(host(0).state(), "self");
+  EXPECT_EQ(found_by(0), std::vector<std::string>{"peer"});
+  EXPECT_EQ(host(1).state(), "refused");
+}
+
+TEST_F(FoundHostsTest, AreSaidToHaveOurIdAlsoWhenTheyMayNotBeAsked) {
+  start({}, false);
+  peers->on_host_found(host_at({{"192.0.2.7", 13776}}, "pc1"));
+  look_around();
+  ASSERT_EQ(peers->hosts().size(), 1u);
+  EXPECT_EQ(host().state(), "closed");
+  EXPECT_NE(host().error().find("with this host's name 'pc1' and machine id"), std::string::npos)
+      << host().error();
+}
+
+TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheyAreClosed) {
+  FoundHost closed = host_at({});
+  closed.closed = true;
+  start();
+  peers->on_host_found(closed);
+  look_around();
+  EXPECT_EQ(host().state(), "closed");
+  EXPECT_NE(host().error().find("set listen and insecure there"), std::string::npos);
+  EXPECT_NE(peers->trouble().find("'pc2' (host 'pc2' listens"), std::string::npos)
+      << peers->trouble();
+  closed.addresses = {at(*one)};  // another dssmd of this PC
+  peers->on_host_found(closed);
+  wait_until_up();
+  EXPECT_EQ(host().state(), "up");
+}
+
+TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheySpeakAnotherVersion) {
+  FoundHost other = host_at({at(*one)});
+  other.protocol_version = 77;
+  start();
+  peers->on_host_found(other);
+  look_around();
+  EXPECT_EQ(host().state(), "refused");
+  net::Hello hello;
+  wire::to_message(pc2, hello);
+  hello.set_protocol_version(77);
+  hello.clear_version();
+  EXPECT_EQ(host().error(), wire::greeting_untrusted(hello, "dssmd of host 'pc2'").error().message);
+  EXPECT_EQ(one->owner.connections(), 0);
+  peers->on_host_found(host_at({at(*one)}));  // it was updated
+  wait_until_up();
+}
+
+TEST_F(FoundHostsTest, AreNotReachedInTheClearUnlessThatIsAllowed) {
+  start({}, false);
+  peers->on_host_found(host_at({{"192.0.2.7", 13776}}, "pc3"));
+  peers->on_host_found(host_at({{"192.0.2.8", 13776}, at(*one)}));
+  wait_until_up();
+  EXPECT_EQ(address_in_catalog(), at(*one)) << "a dssmd of this PC";
+  EXPECT_EQ(host(0).state(), "closed");
+  EXPECT_NE(host(0).error().find("only with insecure = true"), std::string::npos);
+}
+
+TEST_F(FoundHostsTest, AreBoundedInNumberAndAddresses) {
+  start({}, false);
+  for (int i = 0; i < 1000; ++i) {
+    peers->on_host_found(host_at(std::vector<wire::Address>(100, {"192.0.2.7", 13776}),
+                                 "pc" + std::to_string(1000 + i)));
+  }
+  look_around();
+  ASSERT_EQ(peers->hosts().size(), Peers::kMaxFoundHosts);
+  EXPECT_EQ(static_cast<std::size_t>(host().addresses_size()), Peers::kMaxAddressesOfHost);
+  EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
+                          [](const std::string& line) {
+                            return line.find("more than 256 hosts") != std::string::npos;
+                          }),
+            1);
+  EXPECT_LT(peers->trouble().size(), 4000u);
+  EXPECT_NE(peers->trouble().find("and 248 more"), std::string::npos) << peers->trouble();
+  peers->on_host_lost(wire::host_id_for("pc1000"));
+  look_around();
+  peers->on_host_found(host_at({at(*one)}));
+  wait_until_up();  // there was room again
+}
+
+TEST_F(FoundHostsTest, AreReachedThoughOneOfTheirAddressesNeverGreets) {
+  const UniqueFd mute =
+      wire::listen_tcp(wire::resolve_number({"127.0.0.1", 0}).at(0)).value();  // only connects
+  const wire::SocketAddress bound = wire::local_address(mute.get()).value();
+  const wire::Address never{"127.0.0.1", wire::Address::parse(bound.str()).value().port};
+  start();
+  peers->on_host_found(host_at({never}, "pc3"));
+  peers->on_host_found(host_at({never, at(*one)}));
+  wait([&] { return host(0).state() == "down"; });
+  EXPECT_NE(host(0).error().find("does not greet"), std::string::npos) << host(0).error();
+  wait_until_up();
+  EXPECT_EQ(address_in_catalog(), at(*one));
+}
+
+TEST_F(FoundHostsTest, MayBeSeveralAtOneIpNumber) {
+  const wire::Greeting pc3 = greeting_of("pc3");
+  two->owner.greet_as(pc3);
+  start();
+  peers->on_host_found(host_at({at(*one)}));
+  peers->on_host_found(host_at({at(*two)}, "pc3"));
+  wait([&] { return catalog.hosts().size() == 2; });
+  EXPECT_EQ(host(0).state(), "up");
+  EXPECT_EQ(host(1).state(), "up");
+  EXPECT_EQ(catalog.hosts().at(pc3.host_id).address, at(*two));
+}
+
+TEST_F(FoundHostsTest, MayHaveOneName) {
+  wire::Greeting namesake = pc2;
+  ++namesake.host_id[0];
+  two->owner.greet_as(namesake);
+  FoundHost second = host_at({at(*two)});
+  second.id = namesake.host_id;
+  start();
+  peers->on_host_found(host_at({at(*one)}));
+  peers->on_host_found(second);
+  wait([&] { return catalog.hosts().size() == 2; });
+  EXPECT_NE(host(0).error().find("is called 'pc2' too"), std::string::npos) << host(0).error();
+  EXPECT_NE(host(1).error().find(at(*one).str()), std::string::npos) << host(1).error();
+}
+
+TEST_F(FoundHostsTest, AreWarnedOfWhenTheyHaveOurName) {
+  wire::Greeting namesake = self;
+  ++namesake.host_id[0];
+  one->owner.greet_as(namesake);
+  FoundHost found = host_at({at(*one)}, "pc1");
+  found.id = namesake.host_id;
+  start();
+  peers->on_host_found(found);
+  wait([&] { return !peers->own_trouble().empty(); });
+  EXPECT_EQ(host().state(), "refused");
+  EXPECT_EQ(host().error(), peers->own_trouble());
+  EXPECT_TRUE(catalog.hosts().empty());
+  look_around();
+  EXPECT_EQ(one->owner.connections(), 1);
+}
+
+// --- the first words
+
+TEST_F(FoundHostsTest, AreWaitedForWhileMdnsWorks) {
+  const MonoTime begin = MonoClock::now();
+  start({at(*one)});
+  EXPECT_FALSE(peers->settled());
+  bool told = false;
+  peers->on_settled([&] { told = true; });
+  peers->on_mdns_state(mdns_in(MdnsState::Phase::running));
+  wait([&] { return told; });
+  // The loop's clock is as coarse as the kernel's ticks.
+  EXPECT_GE(MonoClock::now() - begin, Peers::kSettleTime - std::chrono::milliseconds(20));
+}
+
+TEST_F(FoundHostsTest, AreNotWaitedForWithoutAvahi) {
+  start();
+  EXPECT_FALSE(peers->settled()) << "not before the finder said so";
+  peers->on_mdns_state(mdns_in(MdnsState::Phase::waiting));
+  EXPECT_TRUE(peers->settled());
+}
+
+TEST_F(FoundHostsTest, LetPeersBeWaitedForWithoutAvahi) {
+  start({at(*one)});
+  peers->on_mdns_state(mdns_in(MdnsState::Phase::waiting));
+  EXPECT_FALSE(peers->settled());
+  wait([&] { return peers->settled(); });
+  EXPECT_EQ(one->watches, 1);
+}
+
+}  // namespace
+}  // namespace dssm::daemon

@@ -1,0 +1,377 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What configured peers become in the catalog: hosts that come and go, fall silent, answer at two
+// addresses, share a name, or are this very dssmd.
+#include "daemon/fleet/peers.hpp"
+
+#include <gtest/gtest.h>
+
+#include "tests/unit/daemon/daemon_fixtures.hpp"
+#include "tests/unit/daemon/fleet/fake_peer.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+class PeersTest : public testing::Test {
+ protected:
+  EventLoop loop = EventLoop::open().value();
+  Resolver resolver{loop};
+  Catalog catalog{"pc1"};
+  KeptLog log;
+  wire::Greeting self = greeting_of("pc1");
+  FakePeer one{loop}, two{loop};
+  std::unique_ptr<Peers> peers;
+
+  void start(const std::vector<FakePeer*>& configured) {
+    std::vector<wire::Address> addresses;
+    for (FakePeer* peer : configured) addresses.push_back(peer->owner.host().address);
+    peers = std::make_unique<Peers>(loop, resolver, addresses, self, catalog, log);
+  }
+  void wait(const std::function<bool()>& done) {
+    run_until(loop, [&] {
+      one.serve(), two.serve();
+      return done();
+    });
+  }
+  void wait_until_settled() {
+    wait([this] { return peers->settled(); });
+  }
+  local::Host host(std::size_t index) const { return peers->hosts().at(index); }
+};
+
+TEST_F(PeersTest, AreSettledAtOnceWithoutAny) {
+  start({});
+  EXPECT_TRUE(peers->settled());
+  EXPECT_TRUE(peers->hosts().empty());
+}
+
+TEST_F(PeersTest, PutAHostAndItsStreamsIntoTheCatalog) {
+  one.streams = {"lidar", "imu"};
+  start({&one});
+  bool told = false;
+  peers->on_settled([&] { told = true; });
+  EXPECT_FALSE(peers->settled());
+  wait([&] { return told; });
+  EXPECT_TRUE(peers->settled());
+  ASSERT_EQ(catalog.hosts().size(), 1u);
+  const KnownHost& known = catalog.hosts().begin()->second;
+  EXPECT_EQ(known.greeting.host, "pc2");
+  EXPECT_EQ(known.address, one.owner.host().address);
+  EXPECT_EQ(known.streams.size(), 2u);
+  EXPECT_EQ(known.streams.at({"lidar", 0}).id.str(), "lidar:0@pc2");
+  one.tell("lidar", true);
+  one.tell("gps", false);
+  wait([&] { return known.streams.contains({"gps", 0}); });
+  EXPECT_EQ(known.streams.size(), 2u);
+  const local::Host shown = host(0);
+  EXPECT_EQ(shown.name(), "pc2");
+  EXPECT_EQ(shown.state(), "up");
+  EXPECT_EQ(shown.streams(), 2u);
+  EXPECT_EQ(shown.error(), "");
+  EXPECT_FALSE(shown.insecure());
+  EXPECT_TRUE(log.says("host 'pc2'"));
+}
+
+TEST_F(PeersTest, MeasureTheRoundTripAndHearOfTheClock) {
+  start({&one});
+  wait([&] { return one.pings >= 3; });
+  const local::Host shown = host(0);
+  EXPECT_GT(shown.round_trip_ns(), 0);
+  EXPECT_GT(shown.least_round_trip_ns(), 0);
+  EXPECT_LE(shown.least_round_trip_ns(), shown.round_trip_ns());
+  EXPECT_EQ(shown.clock_bound_ns(), 1000);
+  EXPECT_EQ(catalog.hosts().begin()->second.greeting.clock->standing.bound, Duration(1000));
+}
+
+TEST_F(PeersTest, TakeAHostOutWhenItsConnectionBreaks) {
+  one.streams = {"lidar"};
+  start({&one});
+  wait_until_settled();
+  one.owner.cut();
+  wait([&] { return catalog.hosts().empty(); });
+  EXPECT_TRUE(log.says("host 'pc2' is down"));
+  wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
+  EXPECT_EQ(one.watches, 2);
+  EXPECT_EQ(host(0).state(), "up");
+}
+
+TEST_F(PeersTest, TakeAHostOutWhenItFallsSilent) {
+  start({&one});
+  wait([&] { return one.pings >= 1; });
+  one.silent = true;
+  const MonoTime begin = MonoClock::now();
+  wait([&] { return catalog.hosts().empty(); });
+  EXPECT_GE(MonoClock::now() - begin, wire::kSilenceIsDeath - wire::kHeartbeat);
+  EXPECT_EQ(host(0).state(), "down");
+  EXPECT_NE(host(0).error().find("no sign of life from host 'pc2'"), std::string::npos)
+      << host(0).error();
+  one.silent = false;
+  wait([&] { return !catalog.hosts().empty(); });
+}
+
+TEST_F(PeersTest, LeaveAPeerAloneThatTalksNonsenseAboutItsStreams) {
+  start({&one});
+  wait_until_settled();
+  one.tell("a:b", false);
+  wait([&] { return catalog.hosts().empty(); });
+  EXPECT_EQ(host(0).state(), "refused");
+  EXPECT_NE(host(0).error().find("a stream event"), std::string::npos) << host(0).error();
+}
+
+TEST_F(PeersTest, LetNobodySpeakForAnotherHost) {
+  start({&one});
+  wait_until_settled();
+  one.tell("lidar", false, "pc3");
+  wait([&] { return !catalog.hosts().begin()->second.streams.empty(); });
+  EXPECT_TRUE(catalog.has({"lidar", 0, "pc2"}));
+}
+
+TEST_F(PeersTest, SettleWhenAPeerIsNotThereAndSayWhy) {
+  const wire::Address nobody = FakeOwner(loop).host().address;
+  peers = std::make_unique<Peers>(loop, resolver, std::vector{nobody}, self, catalog, log);
+  wait_until_settled();
+  EXPECT_EQ(host(0).state(), "down");
+  EXPECT_EQ(host(0).name(), "");
+  EXPECT_NE(host(0).error().find("refused"), std::string::npos) << host(0).error();
+  EXPECT_NE(peers->trouble().find(nobody.str()), std::string::npos);
+  wait([&] { return host(0).since_ns() > 300'000'000; });  // several attempts
+  EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
+                          [](const std::string& line) {
+                            return line.find("is not there") != std::string::npos;
+                          }),
+            1)
+      << "once, not at each attempt";
+}
+
+TEST_F(PeersTest, SettleAfterAWhileWhenAPeerSaysNothing) {
+  UniqueFd listening =
+      wire::listen_tcp(
+          wire::resolve_number(wire::Address::parse("127.0.0.1:0", 0, true).value()).at(0))
+          .value();  // connects, and says nothing
+  const auto address =
+      wire::Address::parse(wire::local_address(listening.get()).value().str()).value();
+  peers = std::make_unique<Peers>(loop, resolver, std::vector{address}, self, catalog, log);
+  wait_until_settled();
+  EXPECT_EQ(host(0).state(), "connecting");
+}
+
+TEST_F(PeersTest, UseOneOfTwoAddressesAndTakeTheOtherWhenItFails) {
+  two.owner.greet_as(one.owner.host().greeting);
+  one.streams = two.streams = {"lidar"};
+  start({&one, &two});
+  wait([&] { return one.watches + two.watches > 0 && peers->settled(); });
+  ASSERT_EQ(one.watches + two.watches, 1) << "only one is used";
+  FakePeer& used = one.watches ? one : two;
+  FakePeer& spare = one.watches ? two : one;
+  const std::size_t spare_index = one.watches ? 1 : 0;
+  EXPECT_EQ(host(spare_index).state(), "up");
+  EXPECT_NE(host(spare_index).error().find("same host as '" + used.owner.host().address.str()),
+            std::string::npos)
+      << host(spare_index).error();
+  EXPECT_EQ(catalog.hosts().size(), 1u);
+  wait([&] { return spare.pings >= 1; });
+  used.owner.cut();
+  wait([&] { return spare.watches == 1; });
+  EXPECT_EQ(catalog.hosts().begin()->second.address, spare.owner.host().address);
+  wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
+  EXPECT_EQ(host(spare_index).error(), "");
+}
+
+TEST_F(PeersTest, WarnOfTwoPcsWithOneIdAndUseTheFirst) {
+  wire::Greeting clone = one.owner.host().greeting;
+  ++clone.life;
+  two.owner.greet_as(clone);
+  start({&one, &two});
+  wait([&] { return one.watches + two.watches > 0 && peers->settled(); });
+  ASSERT_EQ(one.watches + two.watches, 1);
+  const local::Host spare = host(one.watches ? 1 : 0);
+  EXPECT_NE(spare.error().find("but is another dssmd"), std::string::npos) << spare.error();
+}
+
+TEST_F(PeersTest, KeepTwoHostsOfOneNameAndWarnAtBoth) {
+  wire::Greeting namesake = greeting_of("pc2");
+  namesake.host_id[0] = static_cast<std::uint8_t>(namesake.host_id[0] + 1);
+  two.owner.greet_as(namesake);
+  start({&one, &two});
+  wait_until_settled();
+  EXPECT_EQ(catalog.hosts().size(), 2u);
+  EXPECT_NE(host(0).error().find("is called 'pc2' too"), std::string::npos) << host(0).error();
+  EXPECT_NE(host(1).error().find(one.owner.host().address.str()), std::string::npos)
+      << host(1).error();
+  two.owner.cut();
+  wait([&] { return catalog.hosts().size() == 1; });
+  EXPECT_EQ(host(0).error(), "") << "there is only one now";
+}
+
+TEST_F(PeersTest, KnowThemselves) {
+  one.owner.greet_as(self);
+  start({&one});
+  wait_until_settled();
+  EXPECT_EQ(host(0).state(), "self");
+  EXPECT_EQ(host(0).error(), "");
+  EXPECT_TRUE(catalog.hosts().empty());
+  EXPECT_EQ(one.owner.connections(), 1) << "left standing, not dialed again and again";
+  EXPECT_EQ(peers->own_trouble(), "");
+}
+
+TEST_F(PeersTest, RefuseAnotherPcWithTheirOwnId) {
+  wire::Greeting clone = self;
+  ++clone.life;
+  one.owner.greet_as(clone);
+  start({&one});
+  wait_until_settled();
+  EXPECT_EQ(host(0).state(), "refused");
+  EXPECT_NE(host(0).error().find("machine id"), std::string::npos) << host(0).error();
+  EXPECT_EQ(peers->own_trouble(), host(0).error());
+  EXPECT_TRUE(catalog.hosts().empty());
+}
+
+TEST_F(PeersTest, DoNotShowTheStreamsOfAHostWithTheirOwnName) {
+  wire::Greeting namesake = greeting_of("pc1");
+  namesake.host_id[0] = static_cast<std::uint8_t>(namesake.host_id[0] + 1);
+  one.owner.greet_as(namesake);
+  start({&one});
+  wait_until_settled();
+  EXPECT_TRUE(catalog.hosts().empty());
+  EXPECT_EQ(one.watches, 0);
+  EXPECT_NE(host(0).error().find("as this one is"), std::string::npos) << host(0).error();
+  EXPECT_EQ(peers->own_trouble(), host(0).error());
+}
+
+// --- configured peers change
+
+TEST_F(PeersTest, DialWhoIsConfiguredAnewAndKeepWhoStays) {
+  start({&one});
+  wait([&] { return one.watches == 1; });
+  two.owner.greet_as(greeting_of("pc3"));
+  peers->set_configured({two.owner.host().address, one.owner.host().address});
+  wait([&] { return catalog.hosts().size() == 2; });
+  EXPECT_EQ(one.watches, 1) << "its connection is the one of before";
+  EXPECT_EQ(peers->hosts().size(), 2u);
+  EXPECT_EQ(host(0).name(), "pc2");
+  EXPECT_EQ(host(1).name(), "pc3");
+}
+
+TEST_F(PeersTest, DropWhoIsNotConfiguredAnyMoreAndTellWhoeverWaits) {
+  one.streams = {"lidar"};
+  start({&one});
+  wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
+  std::string got;
+  net::Frame request;
+  request.mutable_get_property()->mutable_id()->set_name("lidar");
+  peers->link_to(one.owner.host().greeting.host_id)->ask(request, [&](Result<net::Frame> answer) {
+    got = answer.error().message;
+  });
+  peers->set_configured({});
+  wait([&] { return peers->hosts().empty(); });
+  EXPECT_TRUE(catalog.hosts().empty());
+  EXPECT_EQ(peers->link_to(one.owner.host().greeting.host_id), nullptr);
+  EXPECT_NE(got.find("not among the peers any more"), std::string::npos) << got;
+}
+
+TEST_F(PeersTest, DropWhoWasNeverThere) {
+  const wire::Address nobody = FakeOwner(loop).host().address;
+  peers = std::make_unique<Peers>(loop, resolver, std::vector{nobody}, self, catalog, log);
+  wait_until_settled();
+  peers->set_configured({});
+  wait([&] { return peers->hosts().empty(); });
+  EXPECT_EQ(peers->trouble(), "");
+}
+
+TEST_F(PeersTest, DialAgainWhoComesBackIntoTheConfiguration) {
+  const std::vector<wire::Address> configured = {one.owner.host().address};
+  start({&one});
+  wait([&] { return one.watches == 1; });
+  peers->set_configured({});
+  peers->set_configured(configured);  // before the first is through
+  wait([&] { return one.watches == 2 && peers->hosts().size() == 1; });
+  EXPECT_EQ(host(0).state(), "up");
+  EXPECT_EQ(catalog.hosts().size(), 1u);
+}
+
+// --- requests
+
+TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {
+  start({&one});
+  wait_until_settled();
+  PeerLink* link = peers->link_to(one.owner.host().greeting.host_id);
+  ASSERT_TRUE(link);
+  std::vector<std::string> got;
+  const auto ask = [&](const std::string& name) {
+    net::Frame request;
+    request.mutable_get_property()->mutable_id()->set_name(name);
+    link->ask(request, [&got, name](Result<net::Frame> answer) {
+      got.push_back(name + ": " +
+                    (answer ? answer->property().property() : answer.error().message));
+    });
+  };
+  ask("a");
+  ask("b");
+  wait([&] { return one.asked.size() == 2; });
+  net::Frame second = answer_to(one.asked[1]);
+  second.mutable_property()->set_property("B");
+  one.owner.send(second);
+  one.owner.fail(one.asked[0], Errc::not_found, "no such stream");
+  wait([&] { return got.size() == 2; });
+  EXPECT_EQ(got, (std::vector<std::string>{"b: B", "a: no such stream"}));
+  ask("c");
+  wait([&] { return one.asked.size() == 3; });
+  one.owner.cut();
+  wait([&] { return got.size() == 3; });
+  EXPECT_EQ(got[2].find("c: host 'pc2' went away before it answered"), 0u) << got[2];
+  EXPECT_EQ(peers->link_to(one.owner.host().greeting.host_id), nullptr);
+}
+
+TEST_F(PeersTest, BoundTheRequestsThatWait) {
+  start({&one});
+  wait_until_settled();
+  PeerLink& link = *peers->link_to(one.owner.host().greeting.host_id);
+  std::size_t refused = 0;
+  for (std::size_t i = 0; i < PeerLink::kMaxWaiting + 10; ++i) {
+    net::Frame request;
+    request.mutable_list();
+    link.ask(request, [&](const Result<net::Frame>& answer) {
+      if (!answer && answer.error().code == Errc::limit_exceeded) ++refused;
+    });
+  }
+  EXPECT_GE(refused, 10u);
+  net::Frame large;
+  large.mutable_set_property()->set_property(std::string(PeerLink::kMaxWaitingBytes + 1, 'x'));
+  bool too_large = false;
+  link.ask(large, [&](const Result<net::Frame>& answer) { too_large = !answer; });
+  EXPECT_TRUE(too_large);
+  EXPECT_FALSE(catalog.hosts().empty()) << "the connection does not suffer";
+}
+
+TEST_F(PeersTest, MakeRoomForRequestsWithEachAnswer) {
+  start({&one});
+  wait_until_settled();
+  PeerLink& link = *peers->link_to(one.owner.host().greeting.host_id);
+  for (std::size_t i = 0; i < 4; ++i) {
+    net::Frame large;
+    large.mutable_set_property()->set_property(std::string(PeerLink::kMaxWaitingBytes / 3, 'x'));
+    std::optional<bool> done;
+    link.ask(large, [&](const Result<net::Frame>& answer) { done = answer.has_value(); });
+    wait([&] { return one.asked.size() > i || done; });
+    ASSERT_FALSE(done);
+    net::Frame answer = answer_to(one.asked[i]);
+    answer.mutable_done();
+    one.owner.send(answer);
+    wait([&] { return done.has_value(); });
+    EXPECT_TRUE(*done);
+  }
+}
+
+TEST_F(PeersTest, EndAConnectionThatAnswersWhatNobodyAsked) {
+  start({&one});
+  wait_until_settled();
+  net::Frame answer;
+  answer.set_serial(999);
+  answer.mutable_done();
+  one.owner.send(answer);
+  wait([&] { return catalog.hosts().empty(); });
+  EXPECT_NE(host(0).error().find("what nobody asked"), std::string::npos) << host(0).error();
+}
+
+}  // namespace
+}  // namespace dssm::daemon

@@ -1,0 +1,387 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Keeping a connection up: against a server that greets, and against those that do not.
+#include "daemon/link/dialer.hpp"
+
+#include <gtest/gtest.h>
+#include <netinet/in.h>
+
+#include "core/wire/frame.hpp"
+#include "tests/unit/daemon/remote/fake_owner.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+// A server that says the same to everybody who connects, and nothing else.
+class RawServer {
+ public:
+  RawServer(const EventLoop& loop, std::string words, bool hangs_up)
+      : words_(std::move(words)), hangs_up_(hangs_up) {
+    const wire::Address any = wire::Address::parse("127.0.0.1:0", 0, true).value();
+    listening_ = wire::listen_tcp(wire::resolve_number(any).at(0)).value();
+    accepting_ = EventSource::readable(loop, listening_.get(), [this] { on_connection(); });
+    accepting_.enable();
+  }
+
+  wire::SocketAddress address() const { return wire::local_address(listening_.get()).value(); }
+  int connections() const { return connections_; }
+
+ private:
+  void on_connection() {
+    ++connections_;
+    UniqueFd socket(::accept4(listening_.get(), nullptr, nullptr, SOCK_CLOEXEC));
+    EXPECT_EQ(::send(socket.get(), words_.data(), words_.size(), MSG_NOSIGNAL),
+              static_cast<ssize_t>(words_.size()));
+    if (hangs_up_) ::shutdown(socket.get(), SHUT_WR);
+    sockets_.push_back(std::move(socket));
+  }
+
+  const std::string words_;
+  const bool hangs_up_;
+  int connections_ = 0;
+  UniqueFd listening_;
+  std::vector<UniqueFd> sockets_;
+  EventSource accepting_;
+};
+
+// A full queue of connections: the kernel leaves further ones without any answer.
+class SilentServer {
+ public:
+  SilentServer() {
+    sockaddr_in any{};
+    any.sin_family = AF_INET;
+    any.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+    EXPECT_EQ(::bind(full_.get(), reinterpret_cast<const sockaddr*>(&any), sizeof any), 0);
+    EXPECT_EQ(::listen(full_.get(), 0), 0);
+    EXPECT_EQ(::connect(filler_.get(), address().get(), address().length), 0);
+  }
+  wire::SocketAddress address() const { return wire::local_address(full_.get()).value(); }
+
+ private:
+  UniqueFd full_{::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0)};
+  UniqueFd filler_{::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0)};
+};
+
+// A port that nobody listens at: taken and given back.
+wire::SocketAddress closed_port(const EventLoop& loop) {
+  return RawServer(loop, "", false).address();
+}
+
+class DialerTest : public testing::Test, protected Dialer::User {
+ protected:
+  EventLoop loop = EventLoop::open().value();
+  std::vector<wire::SocketAddress> answers;  // of the resolver, for names
+  Resolver resolver{loop, [this](const wire::Address&) -> Result<std::vector<wire::SocketAddress>> {
+                      return answers;
+                    }};
+  std::unique_ptr<Dialer> dialer;
+  std::optional<wire::Greeting> them;
+  std::vector<Error> downs;
+  std::vector<net::Frame> frames;
+  bool up = false;
+
+  void dial(const wire::Address& address) {
+    dialer =
+        std::make_unique<Dialer>(loop, resolver, Dialer::Options{{address}, greeting_of("pc1")},
+                                 static_cast<Dialer::User&>(*this));
+  }
+  void dial_in_turn(const std::vector<wire::SocketAddress>& at, Dialer::Options options = {}) {
+    for (const wire::SocketAddress& address : at) {
+      options.addresses.push_back(wire::Address::parse(address.str()).value());
+    }
+    options.self = greeting_of("pc1");
+    dialer = std::make_unique<Dialer>(loop, resolver, std::move(options),
+                                      static_cast<Dialer::User&>(*this));
+  }
+  void dial(const wire::SocketAddress& address) {
+    dial(wire::Address::parse(address.str()).value());
+  }
+  void wait(const std::function<bool()>& done) { run_until(loop, done); }
+  const Error& wait_for_down() {
+    wait([this] { return !downs.empty(); });
+    return downs.front();
+  }
+
+  void on_up(FrameLink& link, const wire::Greeting& greeting) override {
+    EXPECT_EQ(&link, dialer->link());
+    EXPECT_FALSE(up);
+    up = true;
+    them = greeting;
+  }
+  Result<void> on_frame(net::Frame& frame) override {
+    frames.push_back(std::move(frame));
+    return {};
+  }
+  void on_down(const Error& why) override {
+    EXPECT_EQ(dialer->link(), nullptr);
+    up = false;
+    downs.push_back(why);
+  }
+};
+
+TEST_F(DialerTest, GreetsAndHandsOverTheLink) {
+  FakeOwner owner(loop);
+  dial(owner.host().address);
+  EXPECT_EQ(dialer->link(), nullptr);
+  EXPECT_EQ(dialer->address(), owner.host().address.str());
+  wait([this] { return up; });
+  EXPECT_EQ(them->host, "pc2");
+  EXPECT_EQ(them->host_id, owner.host().greeting.host_id);
+  EXPECT_FALSE(dialer->crosses_network());
+  net::Frame ping;
+  ping.set_serial(5);
+  ping.mutable_ping();
+  dialer->link()->send(ping);
+  EXPECT_EQ(owner.take().serial(), 5u);
+  net::Frame pong;
+  pong.set_serial(5);
+  pong.mutable_pong();
+  owner.send(pong);
+  wait([this] { return !frames.empty(); });
+  EXPECT_TRUE(frames.front().has_pong());
+  EXPECT_TRUE(downs.empty());
+}
+
+TEST_F(DialerTest, TriesTheAddressesOfANameInTurn) {
+  FakeOwner owner(loop);
+  const wire::SocketAddress good = wire::resolve_number(owner.host().address).at(0);
+  answers = {closed_port(loop), closed_port(loop), good};
+  dial({"pc2", 1});
+  wait([this] { return up; });
+  EXPECT_EQ(dialer->address(), good.str());
+  EXPECT_TRUE(downs.empty()) << "one round of attempts, and it was good";
+}
+
+TEST_F(DialerTest, TriesTheAddressesThatItIsGivenInTurn) {
+  FakeOwner owner(loop);
+  const wire::SocketAddress good = wire::resolve_number(owner.host().address).at(0);
+  dial_in_turn({closed_port(loop), closed_port(loop), good});
+  wait([this] { return up; });
+  EXPECT_EQ(dialer->address(), good.str());
+  EXPECT_TRUE(downs.empty());
+}
+
+TEST_F(DialerTest, BeginsBehindAnAddressThatIsOfNoUse) {
+  RawServer talker(loop, "220 smtp ready\r\n", false);
+  FakeOwner owner(loop);
+  const wire::SocketAddress good = wire::resolve_number(owner.host().address).at(0);
+  dial_in_turn({talker.address(), closed_port(loop), good});
+  wait([this] { return up; });
+  EXPECT_EQ(downs.size(), 1u);
+  EXPECT_EQ(talker.connections(), 1);
+  dialer->restart({Errc::daemon_away, "silent"});
+  wait([&] { return talker.connections() == 2; });  // the one behind the last one
+  wait([&] { return up && downs.size() >= 3; });
+}
+
+TEST_F(DialerTest, LetsItsAddressesShareTheTimeOfARound) {
+  const SilentServer silent;
+  const wire::SocketAddress dead = silent.address();
+  FakeOwner owner(loop);
+  Dialer::Options options;
+  options.round_time = std::chrono::milliseconds(40);
+  dial_in_turn({dead, dead, dead, wire::resolve_number(owner.host().address).at(0)}, options);
+  bool timed_out = false;
+  EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
+  timer.enable_in(Dialer::kConnectTimeout);  // what one address would take else
+  wait([&] { return up || timed_out; });
+  EXPECT_TRUE(up);
+  EXPECT_TRUE(downs.empty());
+}
+
+TEST_F(DialerTest, LeavesAnAddressThatDoesNotAnswerForNewOnesAtOnce) {
+  const SilentServer silent;
+  FakeOwner owner(loop);
+  dial_in_turn({silent.address()});
+  event_base_loop(loop.base(), EVLOOP_ONCE);  // it begins to connect
+  bool timed_out = false;
+  EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
+  timer.enable_in(Dialer::kConnectTimeout);  // what it would wait else
+  dialer->set_addresses({owner.host().address});
+  wait([&] { return up || timed_out; });
+  EXPECT_TRUE(up);
+  EXPECT_TRUE(downs.empty());
+  dialer->set_addresses({wire::Address::parse(silent.address().str()).value()});
+  event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
+  EXPECT_TRUE(up) << "what is up stays";
+}
+
+TEST_F(DialerTest, SaysWhyNoAddressOfANameWorked) {
+  answers = {closed_port(loop), closed_port(loop)};
+  dial({"pc2", 1});
+  const Error& why = wait_for_down();
+  EXPECT_NE(why.message.find(answers[1].str()), std::string::npos) << why.message;
+  EXPECT_NE(why.message.find("refused"), std::string::npos) << why.message;
+}
+
+TEST_F(DialerTest, SaysWhyANameCouldNotBeLookedUpAndTriesAgain) {
+  dial({"pc2", 1});  // no address
+  EXPECT_EQ(wait_for_down().code, Errc::not_found);
+  FakeOwner owner(loop);
+  wait([this] { return downs.size() == 2; });
+  answers = {wire::resolve_number(owner.host().address).at(0)};
+  wait([this] { return up; });
+}
+
+TEST_F(DialerTest, ComesBackWhenTheConnectionBroke) {
+  FakeOwner owner(loop);
+  dial(owner.host().address);
+  for (int round = 0; round < 3; ++round) {
+    wait([this] { return up; });
+    owner.cut();
+    wait([this] { return !up; });
+  }
+  EXPECT_EQ(downs.size(), 3u);
+  EXPECT_NE(downs.front().message.find("dssmd of host 'pc2'"), std::string::npos)
+      << downs.front().message;
+}
+
+TEST_F(DialerTest, FindsAServerThatStartsLater) {
+  const wire::SocketAddress port = closed_port(loop);
+  dial(port);
+  wait([this] { return downs.size() >= 2; });
+  FakeOwner owner(loop);
+  dialer->set_addresses({owner.host().address});
+  dialer->hurry();
+  wait([this] { return up; });
+}
+
+TEST_F(DialerTest, QuotesWhoeverRefusesIt) {
+  net::Frame failure;
+  wire::to_message(Error{Errc::limit_exceeded, "too many connections"}, *failure.mutable_failure());
+  RawServer server(loop, wire::encode_frame(failure), true);
+  dial(server.address());
+  const Error& why = wait_for_down();
+  EXPECT_EQ(why.code, Errc::limit_exceeded);
+  EXPECT_EQ(why.message,
+            "refused by dssmd at '" + server.address().str() + "': too many connections");
+}
+
+TEST_F(DialerTest, QuotesTheLastWordsOfAServerThatWasUp) {
+  FakeOwner owner(loop);
+  dial(owner.host().address);
+  wait([this] { return up; });
+  net::Frame failure;
+  wire::to_message(Error{Errc::no_permission, "no more"}, *failure.mutable_failure());
+  owner.send(failure);
+  const Error& why = wait_for_down();
+  EXPECT_EQ(why.code, Errc::no_permission);
+  EXPECT_EQ(why.message.find("refused by dssmd of host 'pc2'"), 0u) << why.message;
+  EXPECT_NE(why.message.find("no more"), std::string::npos);
+}
+
+TEST_F(DialerTest, RefusesAServerOfAnotherVersionInWords) {
+  net::Frame hello;
+  wire::to_message(greeting_of("pc9"), *hello.mutable_hello());
+  hello.mutable_hello()->set_protocol_version(77);
+  RawServer server(loop, wire::encode_frame(hello), false);
+  dial(server.address());
+  const Error& why = wait_for_down();
+  EXPECT_EQ(why.code, Errc::protocol);
+  EXPECT_NE(why.message.find("77"), std::string::npos) << why.message;
+  EXPECT_NE(why.message.find(server.address().str()), std::string::npos) << why.message;
+}
+
+TEST_F(DialerTest, GivesUpWhoSaysSomethingElseThanHello) {
+  net::Frame frame;
+  frame.mutable_done();
+  RawServer server(loop, wire::encode_frame(frame), false);
+  dial(server.address());
+  EXPECT_EQ(wait_for_down().code, Errc::protocol);
+}
+
+TEST_F(DialerTest, GivesUpWhoSendsGarbage) {
+  RawServer server(loop, "SSH-2.0-OpenSSH_9.2\r\n" + std::string(100, '\xff'), false);
+  dial(server.address());
+  EXPECT_EQ(wait_for_down().code, Errc::protocol);
+}
+
+TEST_F(DialerTest, GivesUpWhoHangsUpWithoutAWord) {
+  RawServer server(loop, "", true);
+  dial(server.address());
+  const Error& why = wait_for_down();
+  EXPECT_NE(why.message.find(server.address().str()), std::string::npos) << why.message;
+}
+
+TEST_F(DialerTest, GivesUpWhoDoesNotGreetInTime) {
+  RawServer server(loop, "", false);
+  dial(server.address());
+  const Error& why = wait_for_down();
+  EXPECT_EQ(why.code, Errc::daemon_away);
+  EXPECT_NE(why.message.find("does not greet"), std::string::npos) << why.message;
+}
+
+TEST_F(DialerTest, GivesUpWhoGreetsTwice) {
+  FakeOwner owner(loop);
+  dial(owner.host().address);
+  wait([this] { return up; });
+  net::Frame hello;
+  wire::to_message(greeting_of("pc2"), *hello.mutable_hello());
+  owner.send(hello);
+  EXPECT_EQ(wait_for_down().code, Errc::protocol);
+}
+
+TEST_F(DialerTest, RestartsWhatIsUpForTheReasonThatIsGiven) {
+  FakeOwner owner(loop);
+  dial(owner.host().address);
+  wait([this] { return up; });
+  dialer->restart({Errc::daemon_away, "silent"});
+  EXPECT_TRUE(downs.empty()) << "from the loop";
+  EXPECT_EQ(wait_for_down().message, "silent");
+  wait([this] { return up; });
+  EXPECT_EQ(downs.size(), 1u);
+}
+
+TEST_F(DialerTest, RestartsAnAttemptThatIsUnderWay) {
+  FakeOwner owner(loop);
+  dial({"pc2", 1});
+  answers = {wire::resolve_number(owner.host().address).at(0)};
+  event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);  // it looks the name up
+  dialer->restart({Errc::daemon_away, "moved"});
+  EXPECT_EQ(wait_for_down().message, "moved");
+  dialer->restart({Errc::daemon_away, "not told: it pauses"});
+  wait([this] { return up; });
+  EXPECT_EQ(downs.size(), 1u);
+}
+
+TEST_F(DialerTest, PausesLongerAfterEachFailureAndNotWhenHurried) {
+  RawServer server(loop, "", true);
+  dial(server.address());
+  const MonoTime begin = MonoClock::now();
+  wait([this] { return downs.size() == 5; });
+  const Duration pauses = Dialer::kFirstPause * (1 + 2 + 4 + 8);
+  EXPECT_GE(MonoClock::now() - begin, pauses);
+  const int before = server.connections();
+  const auto look_around = [&] {
+    for (int i = 0; i < 1000; ++i) event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
+  };
+  look_around();
+  EXPECT_EQ(server.connections(), before) << "it pauses";
+  dialer->hurry();
+  look_around();
+  EXPECT_EQ(server.connections(), before + 1);
+}
+
+TEST_F(DialerTest, RefusesSamplesOnAConnectionThatCarriesNone) {
+  FakeOwner owner(loop);
+  dial(owner.host().address);
+  wait([this] { return up; });
+  owner.sample({0, Time(), Duration()}, std::vector<std::byte>(8));
+  EXPECT_EQ(wait_for_down().code, Errc::protocol);
+}
+
+TEST_F(DialerTest, MayBeDestroyedAtAnyStep) {
+  FakeOwner owner(loop);
+  const wire::Address address = owner.host().address;
+  for (int rounds = 0; rounds < 12; ++rounds) {
+    dial(address);
+    for (int i = 0; i < rounds; ++i) event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
+    up = false;
+    dialer.reset();
+  }
+  dial(address);
+  wait([this] { return up; });
+}
+
+}  // namespace
+}  // namespace dssm::daemon

@@ -1,0 +1,342 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A link over a transport of the test's own: order and bounds of what is sent, pauses, and how it
+// ends.
+#include "daemon/link/frame_link.hpp"
+
+#include <optional>
+
+#include "core/wire/network_protocol.hpp"
+#include "core/wire/sample_frame.hpp"
+#include "tests/unit/daemon/link/fake_transport.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+net::Frame property(std::uint64_t serial, std::size_t bytes) {
+  net::Frame frame;
+  frame.set_serial(serial);
+  frame.mutable_property()->set_property(std::string(bytes, 'p'));
+  return frame;
+}
+
+net::Frame ping(std::uint64_t serial) {
+  net::Frame frame;
+  frame.set_serial(serial);
+  frame.mutable_ping();
+  return frame;
+}
+
+std::vector<std::byte> bytes_of(const net::Frame& frame) {
+  const std::string text = wire::encode_frame(frame);
+  const auto bytes = std::as_bytes(std::span(text));
+  return {bytes.begin(), bytes.end()};
+}
+
+iovec part(const std::vector<std::byte>& bytes, std::size_t from, std::size_t to) {
+  return {const_cast<std::byte*>(bytes.data()) + from, to - from};
+}
+
+class FrameLinkTest : public testing::Test,
+                      protected FrameLink::User,
+                      protected FrameLink::SampleSink {
+ protected:
+  static constexpr std::size_t kMaxQueued = 10'000;
+  static constexpr std::size_t kPayloadBytes = 100;
+
+  FrameLinkTest() { link->take_samples(kPayloadBytes, *this); }
+
+  Result<void> on_frame(net::Frame& frame) override {
+    got.push_back(frame.serial());
+    return handler ? handler(frame) : Result<void>();
+  }
+  Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override {
+    begun.push_back(sample.info.tid);
+    if (hold_sample) {
+      link->pause();
+      return {};
+    }
+    payload.assign(sample.payload_bytes, std::byte{0});
+    out = payload.data();
+    return {};
+  }
+  Result<void> on_sample_end(const wire::IncomingSample& sample, bool) override {
+    ended.push_back(sample.info.tid);
+    return {};
+  }
+  void on_batch_end() override { ++batches; }
+  void on_output_empty() override { ++empties; }
+  void on_closed(const Error& error) override {
+    EXPECT_FALSE(why) << "told twice";
+    why = error;
+  }
+
+  std::vector<std::uint64_t> serials_sent() {
+    std::vector<std::uint64_t> serials;
+    for (const SentItem& item : decode(peer.sent)) serials.push_back(item.frame.serial());
+    return serials;
+  }
+
+  EventLoop loop = *EventLoop::open();
+  FakePeer peer;
+  std::function<Result<void>(net::Frame&)> handler;
+  std::vector<std::uint64_t> got;
+  std::vector<Tid> begun, ended;
+  std::vector<std::byte> payload;
+  bool hold_sample = false;
+  int batches = 0, empties = 0;
+  std::optional<Error> why;
+  std::optional<FrameLink> link{std::in_place, loop, std::make_unique<FakeTransport>(peer),
+                                static_cast<FrameLink::User&>(*this), kMaxQueued};
+};
+
+using Serials = std::vector<std::uint64_t>;
+
+TEST_F(FrameLinkTest, SendsAtOnceWhatThePeerTakes) {
+  link->send(ping(1));
+  EXPECT_EQ(serials_sent(), Serials{1}) << "without a turn of the loop";
+  EXPECT_TRUE(link->output_empty());
+}
+
+TEST_F(FrameLinkTest, KeepsTheOrderWhereverThePeerStops) {
+  const std::size_t all = bytes_of(property(1, 50)).size() + bytes_of(ping(2)).size() +
+                          bytes_of(property(3, 200)).size();
+  for (std::size_t room = 0; room <= all; ++room) {
+    FakePeer other;
+    other.room = room;
+    FrameLink one(loop, std::make_unique<FakeTransport>(other), *this, kMaxQueued);
+    one.send(property(1, 50));
+    one.send(ping(2));
+    one.send(property(3, 200));
+    EXPECT_EQ(one.output_empty(), room == all);
+    other.room = FakePeer::kAll;
+    other.most_at_once = 7;
+    run_turns(loop, 100);
+    EXPECT_TRUE(one.output_empty());
+    Serials serials;
+    for (const SentItem& item : decode(other.sent)) serials.push_back(item.frame.serial());
+    EXPECT_EQ(serials, (Serials{1, 2, 3})) << "room for " << room;
+  }
+}
+
+TEST_F(FrameLinkTest, TellsWhenNothingWaitsAnyMore) {
+  peer.room = 3;
+  link->send(ping(1));
+  EXPECT_EQ(empties, 0);
+  peer.room = FakePeer::kAll;
+  run_turns(loop, 3);
+  EXPECT_EQ(empties, 1);
+  link->want_output();
+  run_turns(loop, 3);
+  EXPECT_EQ(empties, 2) << "asked for without anything waiting";
+}
+
+TEST_F(FrameLinkTest, PutsNoFrameIntoTheMiddleOfAnother) {
+  const std::vector<std::byte> frame = bytes_of(property(1, 300));
+  for (const bool queues_rest : {true, false}) {
+    peer.sent.clear();
+    link->set_mid_frame(true);
+    iovec first = part(frame, 0, 100);
+    ASSERT_EQ(link->send_now({&first, 1}), 100u);
+    link->send(ping(2));
+    run_turns(loop, 3);
+    EXPECT_EQ(peer.sent.size(), 100u) << "it waits";
+    iovec second = part(frame, 100, 200);
+    ASSERT_EQ(link->send_now({&second, 1}), 100u) << "goes on before what waits";
+    if (queues_rest) {
+      link->queue_rest(RawBytes::copy_of(std::span(frame).subspan(200)));
+    } else {
+      iovec third = part(frame, 200, frame.size());
+      ASSERT_EQ(link->send_now({&third, 1}), frame.size() - 200);
+    }
+    link->set_mid_frame(false);
+    run_turns(loop, 3);
+    EXPECT_EQ(serials_sent(), (Serials{1, 2}));
+    EXPECT_TRUE(link->output_empty());
+  }
+}
+
+TEST_F(FrameLinkTest, ClosesOnWhoAsksAndDoesNotRead) {
+  peer.room = 0;
+  int sent = 0;
+  for (; link->is_open() && sent < 100; ++sent) link->send(property(1, 1000));
+  EXPECT_EQ(sent, 10) << "10,000 bytes may wait, frames have a few bytes more than 1,000";
+  EXPECT_TRUE(peer.closed);
+  EXPECT_FALSE(why) << "not from within a call of ours";
+  run_turns(loop, 2);
+  ASSERT_TRUE(why);
+  EXPECT_EQ(why->code, Errc::limit_exceeded);
+}
+
+TEST_F(FrameLinkTest, ChargesWhatWaitsToTheBudgetAndGivesItBack) {
+  MemoryBudget budget(5000);
+  link->set_budget(budget);
+  peer.room = 0;
+  link->send(property(1, 3000));
+  EXPECT_GE(budget.used(), 3000u);
+  peer.room = FakePeer::kAll;
+  run_turns(loop, 2);
+  EXPECT_EQ(budget.used(), 0u);
+  peer.room = 0;
+  link->send(property(2, 3000));
+  link->send(property(3, 3000));
+  EXPECT_FALSE(link->is_open()) << "the budget is smaller than what may wait otherwise";
+  EXPECT_EQ(budget.used(), 0u);
+  run_turns(loop, 2);
+  ASSERT_TRUE(why);
+  EXPECT_NE(why->message.find("max_peer_memory"), std::string::npos) << why->message;
+}
+
+TEST_F(FrameLinkTest, ChargesALongFrameWhileItIsReceived) {
+  MemoryBudget budget(1 << 20);
+  link->set_budget(budget);
+  const std::vector<std::byte> frame = bytes_of(property(1, 700'000));
+  const auto part_end = frame.begin() + 400'000;
+  peer.put({frame.begin(), part_end});
+  run_turns(loop, 5);
+  EXPECT_GE(budget.used(), 300'000u);
+  peer.put({part_end, frame.end()});
+  run_turns(loop, 5);
+  EXPECT_EQ(got, Serials{1});
+  EXPECT_EQ(budget.used(), 0u);
+
+  const std::vector<std::byte> longer = bytes_of(property(2, 3'000'000));
+  peer.put(longer);
+  run_turns(loop, 20);
+  EXPECT_FALSE(link->is_open());
+  EXPECT_EQ(budget.used(), 0u);
+}
+
+TEST_F(FrameLinkTest, LetsOthersHaveTheirTurn) {
+  std::vector<std::byte> many;
+  for (std::uint64_t serial = 1; serial <= 30'000; ++serial) {
+    const std::vector<std::byte> one = bytes_of(property(serial, 100));
+    many.insert(many.end(), one.begin(), one.end());
+  }
+  ASSERT_GT(many.size(), 2 * FrameLink::kBytesPerTurn);
+  peer.put(many);
+  run_turns(loop, 1);
+  EXPECT_GT(got.size(), 0u);
+  EXPECT_LT(got.size(), 20'000u) << "all of it in one turn";
+  EXPECT_EQ(batches, 1);
+  run_turns(loop, 50);
+  EXPECT_EQ(got.size(), 30'000u);
+}
+
+TEST_F(FrameLinkTest, HandsNothingOutWhilePaused) {
+  handler = [&](net::Frame& frame) -> Result<void> {
+    if (frame.serial() == 2) link->pause();
+    return {};
+  };
+  std::vector<std::byte> three;
+  for (const std::uint64_t serial : {1, 2, 3}) {
+    const std::vector<std::byte> one = bytes_of(ping(serial));
+    three.insert(three.end(), one.begin(), one.end());
+  }
+  peer.put(three);
+  peer.put(ping(4));
+  run_turns(loop, 5);
+  EXPECT_EQ(got, (Serials{1, 2})) << "though 3 was received together with 2";
+  EXPECT_EQ(batches, 1);
+  link->resume();
+  run_turns(loop, 5);
+  EXPECT_EQ(got, (Serials{1, 2, 3, 4}));
+}
+
+std::vector<std::byte> sample_frame(Tid tid, std::size_t payload_bytes, std::byte content) {
+  std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
+  const std::size_t header_bytes =
+      wire::encode_sample_header(header, 0, {tid, {}, {}}, payload_bytes, wire::Trailer::none);
+  std::vector<std::byte> frame(header.begin(), header.begin() + header_bytes);
+  frame.resize(frame.size() + payload_bytes, content);
+  return frame;
+}
+
+TEST_F(FrameLinkTest, RefusesASampleThatNobodyTakes) {
+  FakePeer other;
+  FrameLink one(loop, std::make_unique<FakeTransport>(other), *this, kMaxQueued);
+  other.put(sample_frame(7, kPayloadBytes, std::byte{5}));
+  run_turns(loop, 3);
+  EXPECT_TRUE(begun.empty());
+  ASSERT_TRUE(why);
+  EXPECT_EQ(why->code, Errc::protocol);
+  EXPECT_NE(why->message.find("none is awaited"), std::string::npos) << why->message;
+}
+
+TEST_F(FrameLinkTest, BeginsASampleAgainThatCameInAPause) {
+  hold_sample = true;
+  peer.put(sample_frame(7, kPayloadBytes, std::byte{5}));
+  run_turns(loop, 3);
+  EXPECT_EQ(begun, std::vector<Tid>{7});
+  EXPECT_TRUE(ended.empty());
+  hold_sample = false;
+  link->resume();
+  run_turns(loop, 3);
+  EXPECT_EQ(begun, (std::vector<Tid>{7, 7}));
+  EXPECT_EQ(ended, std::vector<Tid>{7});
+  EXPECT_EQ(payload, std::vector<std::byte>(kPayloadBytes, std::byte{5}));
+}
+
+TEST_F(FrameLinkTest, TellsThePeerWhyItCloses) {
+  handler = [](net::Frame&) -> Result<void> { return Error{Errc::protocol, "not like this"}; };
+  std::vector<std::byte> two = bytes_of(ping(1));
+  const std::vector<std::byte> second = bytes_of(ping(2));
+  two.insert(two.end(), second.begin(), second.end());
+  peer.put(two);
+  run_turns(loop, 3);
+  EXPECT_EQ(got, Serials{1}) << "nothing is handed out after an error";
+  EXPECT_TRUE(peer.closed);
+  const std::vector<SentItem> items = decode(peer.sent);
+  ASSERT_EQ(items.size(), 1u);
+  EXPECT_EQ(items[0].frame.serial(), 0u);
+  EXPECT_EQ(items[0].frame.failure().message(), "not like this");
+  ASSERT_TRUE(why);
+  EXPECT_EQ(why->message, "not like this");
+}
+
+TEST_F(FrameLinkTest, ReadsThePeersLastWordsWhenItTakesNothingMore) {
+  peer.put(ping(9));
+  peer.gone = true;
+  link->send(ping(1));
+  EXPECT_TRUE(link->is_open()) << "what the peer said is still to be read";
+  run_turns(loop, 3);
+  EXPECT_EQ(got, Serials{9});
+  ASSERT_TRUE(why);
+  EXPECT_EQ(why->code, Errc::daemon_away);
+}
+
+TEST_F(FrameLinkTest, EndsWithThePeerAlsoInTheMiddleOfAFrame) {
+  const std::vector<std::byte> frame = bytes_of(property(1, 100));
+  peer.put({frame.begin(), frame.begin() + 50});
+  peer.vanish();
+  run_turns(loop, 3);
+  ASSERT_TRUE(why);
+  EXPECT_NE(why->message.find("middle of a frame"), std::string::npos) << why->message;
+}
+
+TEST_F(FrameLinkTest, DoesNothingAfterItClosed) {
+  link->close_with({Errc::closed, "enough"});
+  peer.sent.clear();
+  link->send(ping(1));
+  link->pause();
+  link->resume();
+  link->want_output();
+  link->queue_rest(RawBytes(10));
+  iovec nothing{};
+  EXPECT_EQ(link->send_now({&nothing, 1}), 0u);
+  link->close_with({Errc::closed, "again"});
+  run_turns(loop, 3);
+  EXPECT_TRUE(peer.sent.empty());
+  ASSERT_TRUE(why);
+  EXPECT_EQ(why->message, "enough");
+}
+
+TEST_F(FrameLinkTest, MayBeDestroyedBeforeItsEndIsTold) {
+  link->close_with({Errc::closed, "enough"});
+  link.reset();
+  run_turns(loop, 3);
+  EXPECT_FALSE(why);
+}
+
+}  // namespace
+}  // namespace dssm::daemon

@@ -1,0 +1,534 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Samples from a ring to a peer: each once and in order, gaps counted exactly, none that was
+// overwritten while it was sent, wherever the socket stops.
+#include "daemon/link/sample_pump.hpp"
+
+#include <map>
+#include <random>
+
+#include "tests/unit/core/ring/test_ring.hpp"
+#include "tests/unit/daemon/link/fake_transport.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+constexpr std::size_t kSmall = 40;
+constexpr std::size_t kMiddle = SampleSender::kInPlaceBytes;
+constexpr std::size_t kLarge = SampleSender::kMostCopiedBytes + 1;
+constexpr MonoTime kStart{std::chrono::seconds(1000)};
+
+Time time_of(Tid tid) { return time_from_ns(1'000'000 + tid * 1000); }
+
+// A ring, a link, and what goes from one to the other.
+class PumpRig final : private FrameLink::User, private SamplePump::Events {
+ public:
+  PumpRig(std::size_t payload_bytes, std::uint64_t depth, bool may_tear = true,
+          std::uint64_t budget_bytes = 1U << 30)
+      : ring(payload_bytes, depth),
+        payload_bytes_(payload_bytes),
+        budget(budget_bytes),
+        link(loop, std::make_unique<FakeTransport>(peer), *this, 1U << 20),
+        sender(*ring.mapping, link, {may_tear, &budget}) {}
+
+  void start(const SamplePump::Plan& plan) {
+    pump.emplace(*ring.mapping, link, sender, static_cast<SamplePump::Events&>(*this), plan);
+  }
+
+  Tid write() {
+    const Tid tid = ring.reader().newest() + 1;
+    return ring.writer().write(ring::payload_for(tid, payload_bytes_), time_of(tid), Duration(5));
+  }
+  void write(int count) {
+    for (int i = 0; i < count; ++i) write();
+  }
+
+  PumpWait run(MonoTime now = kStart) {
+    const Result<PumpWait> wait = pump->pump(now);
+    EXPECT_TRUE(wait) << wait.error().message;
+    return wait ? *wait : PumpWait::nothing;
+  }
+  // With as many turns of the loop as it takes. The rest of what is queued goes out, too.
+  PumpWait run_on(MonoTime now = kStart) {
+    PumpWait wait = run(now);
+    for (int i = 0; i < 100'000 && (wait == PumpWait::room || wait == PumpWait::turn); ++i) {
+      run_turns(loop);
+      wait = run(now);
+    }
+    for (int i = 0; i < 100 && !link.output_empty(); ++i) run_turns(loop);
+    return wait;
+  }
+
+  // What the peer accepts: each sample checked against what was written, in rising order, and
+  // every tid between the first and the last either there or in a gap.
+  std::vector<Tid> accepted() {
+    std::vector<Tid> tids;
+    Tid next = kNoTid;
+    gaps.clear();
+    for (const SentItem& item : decode(peer.sent, payload_bytes_)) {
+      if (item.frame.has_gap()) {
+        const Tid first = item.frame.gap().first_tid();
+        const auto count = static_cast<Tid>(item.frame.gap().count());
+        EXPECT_TRUE(next == kNoTid || first == next) << "a gap begins elsewhere";
+        gaps[first] = count;
+        next = first + count;
+      }
+      if (!item.frame.has_sample() || item.torn) continue;
+      const Tid tid = item.frame.sample().tid();
+      EXPECT_EQ(item.frame.sample().time_ns(), to_ns(time_of(tid)));
+      EXPECT_EQ(item.payload, ring::payload_for(tid, payload_bytes_)) << "sample " << tid;
+      EXPECT_TRUE(next == kNoTid || thinned || tid == next) << tid << ", not " << next;
+      next = tid + 1;
+      tids.push_back(tid);
+    }
+    return tids;
+  }
+  std::size_t torn_seen() {
+    std::size_t torn = 0;
+    for (const SentItem& item : decode(peer.sent, payload_bytes_)) torn += item.torn;
+    return torn;
+  }
+
+  EventLoop loop = *EventLoop::open();
+  FakePeer peer;
+  ring::TestRing ring;
+  std::size_t payload_bytes_;
+  MemoryBudget budget;
+  FrameLink link;
+  SampleSender sender;
+  std::optional<SamplePump> pump;
+  std::map<Tid, Tid> gaps;
+  bool thinned = false;
+  int caught_up = 0, ends = 0;
+  int written_when_caught_up = 0;  // by a writer that does not wait for the pump
+
+ private:
+  Result<void> on_frame(net::Frame&) override { return {}; }
+  void on_closed(const Error& why) override { ADD_FAILURE() << why.message; }
+  void on_gap(Tid first, std::uint64_t count) override {
+    net::Frame frame;
+    frame.mutable_gap()->set_first_tid(first);
+    frame.mutable_gap()->set_count(count);
+    link.send(frame);
+  }
+  void on_caught_up() override {
+    ++caught_up;
+    write(written_when_caught_up);
+  }
+  void on_end() override { ++ends; }
+};
+
+std::vector<Tid> tids(Tid first, Tid last) {
+  std::vector<Tid> list;
+  for (Tid tid = first; tid <= last; ++tid) list.push_back(tid);
+  return list;
+}
+
+class SamplePumpOfEachKind : public testing::TestWithParam<std::size_t> {};
+INSTANTIATE_TEST_SUITE_P(, SamplePumpOfEachKind, testing::Values(kSmall, kMiddle, kLarge),
+                         [](const testing::TestParamInfo<std::size_t>& size) {
+                           return size.param == kSmall    ? std::string("Small")
+                                  : size.param == kMiddle ? std::string("Middle")
+                                                          : std::string("Large");
+                         });
+
+TEST_P(SamplePumpOfEachKind, SendsAllThatIsThereAndWaitsForNews) {
+  PumpRig rig(GetParam(), 16);
+  rig.write(10);
+  rig.start({0, 9, 0});
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.pump->known(), 9);
+  EXPECT_EQ(rig.accepted(), tids(0, 9));
+  EXPECT_EQ(rig.caught_up, 1);
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  rig.write(2);
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.accepted(), tids(0, 11));
+  EXPECT_EQ(rig.caught_up, 1);
+  EXPECT_EQ(rig.pump->lost(), 0u);
+}
+
+TEST_P(SamplePumpOfEachKind, HasCaughtUpWithAnEmptyStreamAtOnce) {
+  PumpRig rig(GetParam(), 16);
+  rig.start({0, kNoTid, 0});
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.caught_up, 1);
+  rig.write();
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.accepted(), tids(0, 0));
+}
+
+TEST_P(SamplePumpOfEachKind, TellsExactlyWhatTheRingNoLongerHolds) {
+  PumpRig rig(GetParam(), 8);
+  rig.write(30);  // 23 to 29 are held
+  rig.start({5, 29, 0});
+  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.accepted(), tids(23, 29));
+  EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{5, 18}}));
+  EXPECT_EQ(rig.pump->lost(), 18u);
+  rig.write(20);
+  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.gaps.size(), 1u);
+  EXPECT_EQ(rig.accepted().back(), 49);
+  EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{5, 18}, {30, 13}}));
+  EXPECT_EQ(rig.pump->lost(), 31u);
+}
+
+TEST_P(SamplePumpOfEachKind, WaitsForASampleOfTheFuture) {
+  PumpRig rig(GetParam(), 16);
+  rig.write(3);
+  rig.start({5, 2, 0});
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  rig.write(2);
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_TRUE(rig.accepted().empty());
+  rig.write(2);
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.accepted(), tids(5, 6));
+}
+
+TEST_P(SamplePumpOfEachKind, EndsAfterTheLastOneWhereverThatIs) {
+  PumpRig rig(GetParam(), 8);
+  rig.write(10);
+  rig.start({5, 9, 0});
+  rig.pump->end_at(8);
+  EXPECT_EQ(rig.run_on(), PumpWait::nothing);
+  EXPECT_EQ(rig.accepted(), tids(5, 8));
+  EXPECT_EQ(rig.ends, 1);
+
+  PumpRig lapped(GetParam(), 8);
+  lapped.write(10);
+  lapped.start({5, 9, 0});
+  lapped.pump->end_at(6);
+  lapped.write(20);
+  EXPECT_EQ(lapped.run_on(), PumpWait::nothing);
+  EXPECT_TRUE(lapped.accepted().empty());
+  EXPECT_EQ(lapped.gaps, (std::map<Tid, Tid>{{5, 2}})) << "not beyond the last one";
+}
+
+TEST_P(SamplePumpOfEachKind, DoesALimitedAmountInOneTurn) {
+  PumpRig rig(GetParam(), 8192);
+  const int count = GetParam() == kSmall ? 3000 : 200;
+  rig.write(count);
+  rig.start({0, count - 1, 0});
+  EXPECT_EQ(rig.run(), PumpWait::turn);
+  const std::size_t first_turn = rig.accepted().size();
+  EXPECT_LE(first_turn, static_cast<std::size_t>(SamplePump::kSamplesPerTurn));
+  EXPECT_LE(first_turn * GetParam(), SamplePump::kBytesPerTurn + kLarge);
+  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.accepted(), tids(0, count - 1));
+}
+
+// Whoever has the ring writable can put anything there.
+TEST_P(SamplePumpOfEachKind, TakesNonsenseInTheRingForNothing) {
+  PumpRig rig(GetParam(), 8);
+  rig.write(3);
+  rig.start({0, 2, 0});
+  rig.ring.mapping->header().top.store(INT64_MAX);
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  rig.ring.mapping->header().top.store(-5);
+  EXPECT_EQ(rig.run(), PumpWait::news);
+  rig.ring.mapping->header().top.store(kLastTid);
+  rig.run();  // whatever it says: no fault, and an end
+  rig.ring.mapping->header().first.store(INT64_MAX);
+  rig.run();
+}
+
+// The socket stops once, after each possible number of bytes.
+TEST_P(SamplePumpOfEachKind, SendsWholeSamplesWhereverTheSocketStops) {
+  const std::size_t payload_bytes = GetParam();
+  for (const bool may_tear : {true, false}) {
+    for (const std::uint64_t budget : {std::uint64_t{1} << 30, std::uint64_t{10}}) {
+      if (!may_tear && budget == 10 && payload_bytes == kLarge) continue;  // cannot be sent at all
+      std::size_t total = 0;
+      {
+        PumpRig rig(payload_bytes, 8, may_tear);
+        rig.write(3);
+        rig.start({0, 2, 0});
+        rig.run_on();
+        total = rig.peer.sent.size();
+      }
+      for (std::size_t room = 0; room <= total; ++room) {
+        // All around the borders of frames, headers and verdicts; samples of the rest.
+        const std::size_t in_frame = room % (total / 3);
+        if (in_frame > 45 && in_frame < total / 3 - 5 && room % (total / 16) != 0) continue;
+        PumpRig rig(payload_bytes, 8, may_tear, budget);
+        rig.write(3);
+        rig.start({0, 2, 0});
+        rig.peer.room = room;
+        rig.run();
+        rig.peer.room = FakePeer::kAll;
+        EXPECT_EQ(rig.run_on(), PumpWait::news);
+        ASSERT_EQ(rig.accepted(), tids(0, 2)) << "room for " << room << " of " << total;
+        EXPECT_EQ(rig.torn_seen(), 0u);
+        EXPECT_EQ(rig.budget.used(), 0u);
+      }
+    }
+  }
+}
+
+TEST_P(SamplePumpOfEachKind, SendsAllWhenTheSocketTakesLittleAtATime) {
+  const auto seed = std::random_device()();
+  SCOPED_TRACE("seed " + std::to_string(seed));
+  std::mt19937 random(seed);
+  const int rounds = GetParam() == kSmall ? 20 : 8;
+  for (int round = 0; round < rounds; ++round) {
+    PumpRig rig(GetParam(), 64, round % 2 == 0, round % 4 < 2 ? 1U << 30 : GetParam() + 200);
+    rig.write(40);
+    rig.start({0, 39, 0});
+    rig.peer.room = 0;
+    rig.peer.most_at_once = 1 + random() % (GetParam() * 2);
+    PumpWait wait = rig.run();
+    while (wait != PumpWait::news) {
+      rig.peer.room = random() % 3 == 0 ? 0 : random() % (GetParam() * 3);
+      run_turns(rig.loop);
+      wait = rig.run();
+    }
+    rig.peer.room = FakePeer::kAll;
+    rig.run_on();
+    EXPECT_EQ(rig.accepted(), tids(0, 39));
+    EXPECT_EQ(rig.torn_seen(), 0u);
+  }
+}
+
+// A writer that is faster than the peer, and writes between any two sends.
+TEST_P(SamplePumpOfEachKind, LosesNothingWithoutSayingSoWhenItIsLapped) {
+  const auto seed = std::random_device()();
+  SCOPED_TRACE("seed " + std::to_string(seed));
+  std::mt19937 random(seed);
+  const int rounds = GetParam() == kSmall ? 30 : 6;
+  for (int round = 0; round < rounds; ++round) {
+    PumpRig rig(GetParam(), 4 + random() % 8, round % 3 != 0,
+                round % 2 == 0 ? 1U << 30 : GetParam() + 200);
+    rig.write(2);
+    rig.start({0, 1, 0});
+    rig.peer.most_at_once = 1 + random() % (2 * GetParam());
+    rig.peer.after_send = [&] {
+      if (random() % 2) rig.write(static_cast<int>(random() % 5));
+    };
+    for (int turn = 0; turn < (GetParam() == kLarge ? 60 : 200); ++turn) {
+      rig.peer.room = random() % 3 == 0 ? 0 : random() % (2 * GetParam());
+      run_turns(rig.loop);
+      rig.run();
+    }
+    rig.peer.after_send = nullptr;
+    rig.peer.room = FakePeer::kAll;
+    EXPECT_EQ(rig.run_on(), PumpWait::news);
+    const std::vector<Tid> got = rig.accepted();  // checks bytes, order and gaps
+    ASSERT_FALSE(got.empty());
+    EXPECT_EQ(got.back(), rig.ring.reader().newest());
+    std::uint64_t lost = 0;
+    for (const auto& [first, count] : rig.gaps) lost += static_cast<std::uint64_t>(count);
+    EXPECT_EQ(lost, rig.pump->lost());
+    EXPECT_EQ(got.size() + lost, static_cast<std::uint64_t>(rig.ring.reader().newest()) + 1);
+    EXPECT_EQ(rig.torn_seen(), rig.sender.counters().torn);
+    EXPECT_EQ(rig.budget.used(), 0u);
+  }
+}
+
+// --- large payloads
+
+// Overwrites the slot of the sample that is being sent, once.
+void overwrite_in(PumpRig& rig) {
+  rig.peer.after_send = [&rig] {
+    rig.peer.after_send = nullptr;
+    rig.write(8);
+  };
+}
+
+TEST(SamplePump, MarksALargeSampleThatIsOverwrittenWhileItIsSent) {
+  PumpRig rig(kLarge, 4);
+  rig.write(1);
+  rig.start({0, 0, 0});
+  overwrite_in(rig);
+  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.torn_seen(), 1u);
+  EXPECT_EQ(rig.accepted(), tids(6, 8));
+  EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{0, 6}})) << "the void sample counts as lost";
+}
+
+TEST(SamplePump, KeepsWhatItCopiedAsideWhenTheSlotIsOverwrittenLater) {
+  PumpRig rig(kLarge, 4);
+  rig.write(1);
+  rig.start({0, 0, 0});
+  rig.peer.room = 100;  // header and some of the payload: the rest is copied at once
+  EXPECT_EQ(rig.run(), PumpWait::room);
+  EXPECT_GT(rig.budget.used(), kLarge - 100);
+  rig.write(8);
+  rig.peer.room = FakePeer::kAll;
+  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.torn_seen(), 0u);
+  EXPECT_EQ(rig.accepted().front(), 0);
+  EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{1, 5}}));
+}
+
+TEST(SamplePump, RisksTheSlotWhenThePeersMemoryIsUsedUp) {
+  PumpRig rig(kLarge, 4, true, 1000);
+  rig.write(1);
+  rig.start({0, 0, 0});
+  rig.peer.room = 100;
+  EXPECT_EQ(rig.run(), PumpWait::room);
+  EXPECT_TRUE(rig.sender.busy());
+  EXPECT_EQ(rig.budget.used(), 0u);
+  rig.write(8);
+  rig.peer.room = FakePeer::kAll;
+  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.torn_seen(), 1u);
+  EXPECT_EQ(rig.accepted(), tids(6, 8));
+}
+
+TEST(SamplePump, NeverSendsAVoidSampleToAPeerThatDoesNotKnowThem) {
+  PumpRig rig(kLarge, 4, false);
+  rig.write(1);
+  rig.start({0, 0, 0});
+  overwrite_in(rig);
+  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.torn_seen(), 0u);
+  EXPECT_EQ(rig.accepted().back(), 8);
+}
+
+TEST(SamplePump, FailsWhenItMayNeitherTearNorCopy) {
+  PumpRig rig(kLarge, 4, false, 1000);
+  rig.write(1);
+  rig.start({0, 0, 0});
+  const Result<PumpWait> wait = rig.pump->pump(kStart);
+  ASSERT_FALSE(wait);
+  EXPECT_EQ(wait.error().code, Errc::limit_exceeded);
+  EXPECT_NE(wait.error().message.find("max_peer_memory"), std::string::npos);
+}
+
+TEST(SamplePump, CutsALongSampleIntoTurns) {
+  constexpr std::size_t kLong = 5 * SamplePump::kBytesPerTurn + 17;
+  for (const bool may_tear : {true, false}) {
+    PumpRig rig(kLong, 4, may_tear);
+    rig.write(2);
+    rig.start({0, 1, 0});
+    EXPECT_EQ(rig.run(), PumpWait::turn);
+    EXPECT_LE(rig.peer.sent.size(), SamplePump::kBytesPerTurn + 100);
+    if (may_tear) {
+      EXPECT_EQ(rig.peer.sends, SamplePump::kBytesPerTurn / SampleSender::kSliceBytes);
+    }
+    EXPECT_EQ(rig.run_on(), PumpWait::news);
+    EXPECT_EQ(rig.accepted(), tids(0, 1));
+  }
+}
+
+TEST(SamplePump, LooksAgainAfterALongSampleIsCopiedAside) {
+  constexpr std::size_t kLong = 3 * SamplePump::kBytesPerTurn;
+  for (const bool may_tear : {true, false}) {
+    PumpRig rig(kLong, 4, may_tear);
+    rig.write(1);
+    rig.start({0, 0, 0});
+    rig.peer.room = 100;
+    EXPECT_EQ(rig.run(), PumpWait::turn) << "a part is copied";
+    rig.write(8);
+    rig.peer.room = FakePeer::kAll;
+    EXPECT_EQ(rig.run_on(), PumpWait::news);
+    EXPECT_EQ(rig.torn_seen(), may_tear ? 1u : 0u);
+    EXPECT_EQ(rig.accepted(), tids(6, 8));
+    EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{0, 6}}));
+  }
+}
+
+TEST(SamplePump, CopiesNothingWhenTheSocketTakesAllOfALargeSample) {
+  PumpRig large(kLarge, 8), small(kSmall, 8);
+  for (PumpRig* rig : {&large, &small}) {
+    rig->write(5);
+    rig->start({0, 4, 0});
+    rig->run_on();
+    EXPECT_EQ(rig->sender.counters().samples, 5u);
+  }
+  EXPECT_EQ(large.sender.counters().copied_payload_bytes, 0u);
+  EXPECT_EQ(large.sender.counters().in_place_payload_bytes, 5 * kLarge);
+  EXPECT_EQ(small.sender.counters().copied_payload_bytes, 5 * kSmall);
+  EXPECT_EQ(small.peer.sends, 1u) << "all small samples in one send";
+  EXPECT_EQ(large.peer.sends, 6u) << "one send each, and one for the last verdict";
+}
+
+TEST(SamplePump, CopiesOneThatIsNotLargeAndComesAlone) {
+  PumpRig rig(kMiddle, 8);
+  rig.start({0, kNoTid, 0});
+  for (int i = 0; i < 3; ++i) {
+    rig.write();
+    EXPECT_EQ(rig.run(), PumpWait::news);
+  }
+  EXPECT_EQ(rig.sender.counters().copied_payload_bytes, 3 * kMiddle);
+  EXPECT_EQ(rig.peer.sends, 3u) << "one send each";
+  rig.write(3);
+  rig.run_on();
+  EXPECT_EQ(rig.sender.counters().in_place_payload_bytes, 2 * kMiddle);
+  EXPECT_EQ(rig.peer.sends, 6u) << "the last of a run brings the verdict on the one before";
+  EXPECT_EQ(rig.accepted(), tids(0, 5));
+}
+
+TEST(SamplePump, StopsAfterTheSampleUnderWayWhenSomebodyElseWantsToSend) {
+  PumpRig rig(kLarge, 8, true, 1000);
+  rig.write(3);
+  rig.start({0, 2, 0});
+  rig.peer.room = 500;
+  EXPECT_EQ(rig.run(), PumpWait::room);
+  EXPECT_TRUE(rig.sender.busy());
+  rig.peer.room = FakePeer::kAll;
+  const Result<PumpWait> wait = rig.pump->pump(kStart, true);
+  ASSERT_TRUE(wait);
+  EXPECT_EQ(*wait, PumpWait::turn);
+  EXPECT_FALSE(rig.sender.busy());
+  EXPECT_EQ(rig.accepted(), tids(0, 0)) << "whole, with its verdict";
+}
+
+// --- thinning
+
+TEST(SamplePump, SendsTheNewestAtEachTimeWhenItThins) {
+  PumpRig rig(kSmall, 64);
+  rig.thinned = true;
+  rig.write(10);
+  rig.start({0, 9, 100});
+  EXPECT_EQ(rig.run(kStart), PumpWait::news);
+  EXPECT_EQ(rig.accepted(), tids(9, 9));
+  EXPECT_EQ(rig.caught_up, 1);
+  const auto at = [](int ms) { return kStart + std::chrono::milliseconds(ms); };
+  for (int ms = 1; ms <= 100; ++ms) {  // a sample per millisecond
+    rig.write();
+    EXPECT_EQ(rig.run(at(ms)) == PumpWait::time, rig.pump->due() > at(ms) && ms % 10 != 0);
+  }
+  const std::vector<Tid> got = rig.accepted();
+  EXPECT_EQ(got.size(), 11u) << "one at once, then 10 in 100 ms";
+  for (std::size_t i = 1; i < got.size(); ++i) EXPECT_EQ(got[i], 9 + static_cast<Tid>(i) * 10);
+  EXPECT_EQ(rig.pump->lost(), 0u) << "what is left out is no loss";
+  EXPECT_TRUE(rig.gaps.empty());
+}
+
+TEST(SamplePump, SendsOneSampleAtATimeThoughTheWriterGoesOnMeanwhile) {
+  PumpRig rig(kSmall, 64);
+  rig.thinned = true;
+  rig.write(10);
+  rig.written_when_caught_up = 5;
+  rig.start({0, kNoTid, 100});
+  EXPECT_EQ(rig.run(kStart), PumpWait::time);
+  EXPECT_EQ(rig.accepted(), tids(9, 9));
+}
+
+TEST(SamplePump, SendsEachSampleOfAStreamThatIsSlowerThanTheHighestRate) {
+  PumpRig rig(kSmall, 64);
+  rig.start({0, kNoTid, 100});
+  for (int ms = 0; ms < 500; ms += 50) {
+    rig.write();
+    EXPECT_EQ(rig.run(kStart + std::chrono::milliseconds(ms)), PumpWait::news);
+  }
+  EXPECT_EQ(rig.accepted(), tids(0, 9));
+}
+
+TEST(SamplePump, TellsNoGapWhenAThinnedStreamLapsIt) {
+  PumpRig rig(kLarge, 4);
+  rig.thinned = true;
+  rig.write(20);
+  rig.start({0, 19, 1});
+  overwrite_in(rig);
+  EXPECT_EQ(rig.run_on(kStart), PumpWait::news);
+  EXPECT_EQ(rig.torn_seen(), 1u);
+  EXPECT_EQ(rig.accepted().back(), 27);
+  EXPECT_TRUE(rig.gaps.empty());
+}
+
+}  // namespace
+}  // namespace dssm::daemon

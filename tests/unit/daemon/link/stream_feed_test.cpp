@@ -1,0 +1,203 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// How dssmd hears of new samples: every one of them once somebody waits, and nothing when nobody
+// does.
+#include "daemon/link/stream_feed.hpp"
+
+#include <gtest/gtest.h>
+#include <poll.h>
+#include <unistd.h>
+
+#include "core/ring/ring_writer.hpp"
+#include "tests/unit/daemon/daemon_fixtures.hpp"
+#include "tests/unit/daemon/link/fake_transport.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+class StreamFeedTest : public testing::Test, protected StreamFeed::Listener {
+ protected:
+  // A program that writes.
+  struct Program {
+    explicit Program(OfferedFiles its_files) : files(std::move(its_files)) {
+      mapping =
+          ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_write).value();
+      bell = ring::Bell::open_untrusted(files.bell.get()).value();
+    }
+    Tid write() {
+      const std::vector<std::byte> payload(24);
+      return ring::RingWriter(*mapping, *bell, files.doorbell.get())
+          .write(payload, {}, kUnknownClockError);
+    }
+    // How often the doorbell was rung since this was asked last.
+    std::uint64_t rings() const {
+      std::uint64_t count = 0;
+      return ::read(files.doorbell.get(), &count, sizeof count) == sizeof count ? count : 0;
+    }
+    OfferedFiles files;
+    std::shared_ptr<const ring::RingMapping> mapping;
+    std::shared_ptr<ring::Bell> bell;
+  };
+
+  Program writer() { return Program(as_offer(stream->descriptors_for(Role::writer).value())); }
+
+  void on_news() override {
+    ++news;
+    if (on_told) on_told();
+  }
+
+  EventLoop loop = *EventLoop::open();
+  Registry registry{"pc1", kLimits};
+  std::shared_ptr<Stream> stream =
+      registry.create({"odometry", 0, ""}, odometry_type(), kHistory, 1)->stream;
+  std::shared_ptr<StreamFeed> feed = StreamFeed::open(loop, stream).value();
+  int news = 0;
+  std::function<void()> on_told;
+};
+
+TEST_F(StreamFeedTest, TellsOnceOfASampleThatIsNewer) {
+  Program program = writer();
+  ASSERT_TRUE(feed->wait(*this, kNoTid));
+  run_turns(loop, 3);
+  EXPECT_EQ(news, 0);
+  program.write();
+  run_turns(loop, 3);
+  EXPECT_EQ(news, 1);
+  program.write();
+  run_turns(loop, 3);
+  EXPECT_EQ(news, 1) << "it does not wait any more";
+}
+
+TEST_F(StreamFeedTest, SaysAtOnceThatThereIsNewsAlready) {
+  Program program = writer();
+  program.write();
+  EXPECT_FALSE(feed->wait(*this, kNoTid));
+  EXPECT_FALSE(program.bell->doorbell_armed());
+  EXPECT_TRUE(feed->wait(*this, 0));
+}
+
+TEST_F(StreamFeedTest, LetsWritersRingOnlyWhileSomebodyWaits) {
+  Program program = writer();
+  EXPECT_FALSE(program.bell->doorbell_armed());
+  program.write();
+  EXPECT_EQ(program.rings(), 0u);
+  ASSERT_TRUE(feed->wait(*this, 0));
+  program.write();
+  run_turns(loop, 3);
+  EXPECT_EQ(program.rings(), 1u);
+  EXPECT_EQ(news, 1);
+  for (int i = 0; i < 100; ++i) program.write();
+  EXPECT_EQ(program.rings(), 0u) << "whoever was told is at work, and needs no ring";
+}
+
+TEST_F(StreamFeedTest, ArmsAgainForOneWhoWaitsForALaterSample) {
+  Program program = writer();
+  ASSERT_TRUE(feed->wait(*this, 2));  // wants sample 3
+  for (int i = 0; i < 3; ++i) {
+    program.write();
+    run_turns(loop, 3);
+  }
+  EXPECT_EQ(news, 0);
+  program.write();
+  run_turns(loop, 3);
+  EXPECT_EQ(news, 1);
+}
+
+TEST_F(StreamFeedTest, MissesNoSampleThatIsWrittenWhileItTells) {
+  Program program = writer();
+  Tid known = kNoTid;
+  on_told = [&] {
+    program.write();  // after the bell was looked at
+    known = ring::RingReader(stream->mapping()).newest();
+    EXPECT_TRUE(feed->wait(*this, known));
+  };
+  ASSERT_TRUE(feed->wait(*this, known));
+  program.write();
+  run_turns(loop, 3);
+  EXPECT_EQ(news, 1);
+  program.write();
+  run_turns(loop, 3);
+  EXPECT_EQ(news, 2);
+  EXPECT_EQ(known, 3);
+}
+
+TEST_F(StreamFeedTest, HearsEveryDoorbellOfItsStream) {
+  Program first = writer();
+  // A writer that kept a doorbell of its own over a restart.
+  UniqueFd kept(::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC));
+  Program second = writer();
+  second.files.doorbell = copy_of(kept);
+  stream->take_doorbell_untrusted(std::move(kept));
+  for (Program* program : {&first, &second, &first, &second}) {
+    const int before = news;
+    ASSERT_TRUE(feed->wait(*this, ring::RingReader(stream->mapping()).newest()));
+    program->write();
+    run_turns(loop, 3);
+    EXPECT_EQ(news, before + 1);
+  }
+}
+
+TEST_F(StreamFeedTest, ForgetsWhoAsksForItAlsoWhileItTells) {
+  struct Other final : StreamFeed::Listener {
+    void on_news() override { ++told; }
+    int told = 0;
+  } other;
+  Program program = writer();
+  ASSERT_TRUE(feed->wait(*this, kNoTid));
+  ASSERT_TRUE(feed->wait(other, kNoTid));
+  on_told = [&] { feed->forget(other); };
+  program.write();
+  run_turns(loop, 3);
+  EXPECT_EQ(news, 1);
+  EXPECT_EQ(other.told, 0);
+  ASSERT_TRUE(feed->wait(other, 0));
+  feed->forget(other);
+  EXPECT_FALSE(program.bell->doorbell_armed());
+}
+
+TEST_F(StreamFeedTest, LooksByItselfWhenAskedTo) {
+  Program program = writer();
+  ASSERT_TRUE(feed->wait(*this, kNoTid));
+  feed->look();
+  EXPECT_EQ(news, 0);
+  // A writer that was killed before it could ring.
+  UniqueFd doorbell = std::move(program.files.doorbell);
+  program.write();
+  run_turns(loop, 3);
+  EXPECT_EQ(news, 0);
+  feed->look();
+  EXPECT_EQ(news, 1);
+}
+
+TEST_F(StreamFeedTest, DisarmsWhenItGoes) {
+  Program program = writer();
+  ASSERT_TRUE(feed->wait(*this, kNoTid));
+  EXPECT_TRUE(program.bell->doorbell_armed());
+  feed.reset();
+  EXPECT_FALSE(program.bell->doorbell_armed());
+}
+
+TEST(Doorbells, AreKeptApartAndLimited) {
+  Registry registry("pc1", kLimits);
+  const auto stream = registry.create({"odometry", 0, ""}, odometry_type(), kHistory, 1)->stream;
+  struct Counter final : DoorbellObserver {
+    void on_doorbell_added(int) override { ++count; }
+    std::size_t count = 0;
+  } counter;
+  stream->observe_doorbells(&counter);
+  EXPECT_EQ(counter.count, 1u) << "the one that it was made with";
+  const auto eventfd = [] { return UniqueFd(::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC)); };
+  const OfferedFiles own = as_offer(stream->descriptors_for(Role::writer).value());
+  stream->take_doorbell_untrusted(copy_of(own.doorbell));
+  EXPECT_EQ(counter.count, 1u) << "the same one again";
+  const UniqueFd other = eventfd();
+  stream->take_doorbell_untrusted(copy_of(other));
+  stream->take_doorbell_untrusted(copy_of(other));
+  EXPECT_EQ(counter.count, 2u);
+  for (int i = 0; i < 20; ++i) stream->take_doorbell_untrusted(eventfd());
+  EXPECT_EQ(counter.count, Stream::kMaxDoorbells);
+  stream->observe_doorbells(nullptr);
+}
+
+}  // namespace
+}  // namespace dssm::daemon

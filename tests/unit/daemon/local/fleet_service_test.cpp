@@ -1,0 +1,92 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What FleetService tells programs of this host and of mDNS. What it does with streams of other
+// hosts is tested with real ones (tests/process/mirror, tests/process/fleet).
+#include "daemon/local/fleet_service.hpp"
+
+#include <gtest/gtest.h>
+
+#include "daemon/remote/mirrors.hpp"
+#include "daemon/remote/remote_writers.hpp"
+#include "tests/unit/daemon/daemon_fixtures.hpp"
+#include "tests/unit/daemon/fleet/fake_peer.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+class FleetServiceTest : public testing::Test {
+ protected:
+  EventLoop loop = EventLoop::open().value();
+  Resolver resolver{loop};
+  Registry registry{"pc1", kLimits};
+  KeptLog log;
+  const wire::Greeting self = greeting_of("pc1");
+  const ChannelParts parts{loop, resolver, registry, log, self};
+  Catalog catalog{"pc1"};
+  Mirrors mirrors{parts, catalog, Duration::zero()};
+  RemoteWriters writers{parts, catalog};
+  FakePeer peer{loop, "pc1"};
+  Peers peers{loop, resolver, {peer.owner.host().address}, self, catalog, log};
+  FleetService fleet{loop,   {self, {"10.0.0.1:13776"}, true}, registry, catalog, peers, mirrors,
+                     writers};
+};
+
+TEST_F(FleetServiceTest, TellsThatMdnsIsOffUntilItHearsOtherwise) {
+  const local::Mdns told = fleet.mdns();
+  EXPECT_EQ(told.phase(), "off");
+  EXPECT_EQ(told.trouble(), "");
+  EXPECT_EQ(told.announced(), 0u);
+  EXPECT_FALSE(told.own_host_seen());
+}
+
+TEST_F(FleetServiceTest, TellsTheNewestStateOfMdns) {
+  MdnsState state;
+  state.phase = MdnsState::Phase::waiting;
+  state.trouble = "no Avahi";
+  peers.on_mdns_state(state);
+  EXPECT_EQ(fleet.mdns().phase(), "waiting");
+  EXPECT_EQ(fleet.mdns().trouble(), "no Avahi");
+  state.phase = MdnsState::Phase::running;
+  state.trouble.clear();
+  state.avahi_version = "avahi 0.8";
+  state.announced = 3;
+  state.withheld = 2;
+  state.own_host_seen = true;
+  state.hosts_heard = 5;
+  peers.on_mdns_state(state);
+  const local::Mdns told = fleet.mdns();
+  EXPECT_EQ(told.phase(), "running");
+  EXPECT_EQ(told.trouble(), "");
+  EXPECT_EQ(told.avahi_version(), "avahi 0.8");
+  EXPECT_EQ(told.announced(), 3u);
+  EXPECT_EQ(told.withheld(), 2u);
+  EXPECT_TRUE(told.own_host_seen());
+  EXPECT_EQ(told.hosts_heard(), 5u);
+}
+
+TEST_F(FleetServiceTest, TellsWordsOfOthersInPrintableCharactersOnly) {
+  MdnsState state;
+  state.trouble = "more than \x1b[31m";
+  state.avahi_version = "avahi\n0.8";
+  peers.on_mdns_state(state);
+  EXPECT_EQ(fleet.mdns().trouble().find('\x1b'), std::string::npos) << fleet.mdns().trouble();
+  EXPECT_EQ(fleet.mdns().avahi_version().find('\n'), std::string::npos);
+}
+
+TEST_F(FleetServiceTest, TellsOfThisHostFirstAndWhatIsWrongWithIt) {
+  wire::Greeting copy = self;
+  ++copy.life;
+  peer.owner.greet_as(copy);
+  EXPECT_EQ(fleet.hosts().at(0).error(), "");
+  run_until(loop, [&] { return fleet.hosts().at(1).state() == "refused"; });
+  const local::Host told = fleet.hosts().at(0);
+  EXPECT_EQ(told.name(), "pc1");
+  EXPECT_EQ(told.state(), "self");
+  EXPECT_EQ(told.addresses(0), "10.0.0.1:13776");
+  EXPECT_TRUE(told.insecure());
+  EXPECT_NE(told.error(), "");
+  EXPECT_EQ(told.error(), fleet.hosts().at(1).error());
+}
+
+}  // namespace
+}  // namespace dssm::daemon

@@ -1,0 +1,436 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The local protocol without a socket: what each request answers, who hears of events, what happens
+// to a client that breaks the rules, and what waits while dssmd recovers.
+#include "daemon/local/local_service.hpp"
+
+#include <gtest/gtest.h>
+
+#include "tests/unit/daemon/local/fake_client.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+struct Daemon {
+  explicit Daemon(bool recovering = false, const OpenTable::Limits& limits = {1000, 100})
+      : opens(limits), service(registry, opens, clock, logger, recovering) {}
+  SilentLogger logger;
+  Registry registry{"pc1", kLimits};
+  OpenTable opens;
+  PlaybackClockOwner clock;
+  LocalService service;
+};
+
+// --- the rules
+
+TEST(LocalService, WelcomesAProgramThatSpeaksItsVersion) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  local::Request hello;
+  hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
+  const local::Response response = client.ask(hello);
+  EXPECT_EQ(response.serial(), 1u);
+  EXPECT_EQ(response.welcome().host(), "pc1");
+  EXPECT_EQ(response.welcome().daemon_version(), DSSM_VERSION);
+}
+
+TEST(LocalService, RefusesAVersionFromTheFutureAndNamesBoth) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  local::Request hello;
+  hello.set_serial(9);
+  hello.mutable_hello()->set_protocol_version(77);
+  EXPECT_FALSE(client.put(hello)) << "the connection must end";
+  const local::Response response = client.next();
+  EXPECT_EQ(response.serial(), 9u);
+  EXPECT_EQ(response.failure().code(), "protocol");
+  EXPECT_NE(response.failure().message().find("version 77"), std::string::npos);
+  EXPECT_NE(response.failure().message().find("version 1 "), std::string::npos);
+}
+
+TEST(LocalService, EndsAConnectionThatDoesNotBeginWithHello) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  local::Request list = list_request();
+  list.set_serial(1);
+  EXPECT_FALSE(client.put(list));
+  EXPECT_EQ(client.next().failure().code(), "protocol");
+}
+
+TEST(LocalService, EndsAConnectionThatSendsGarbageOrNoSerial) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  EXPECT_FALSE(client.put(list_request())) << "serial 0";
+  EXPECT_EQ(client.next().failure().code(), "protocol");
+  const std::string garbage(100, '\xff');
+  FakeClient other(daemon.service, 6);
+  DescriptorQueue none;
+  EXPECT_FALSE(daemon.service.on_frame_untrusted(2, std::as_bytes(std::span(garbage)), none));
+  EXPECT_EQ(other.next().serial(), 0u) << "last words belong to no request";
+}
+
+TEST(LocalService, AnswersARequestItDoesNotKnowAndGoesOn) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  local::Request unknown;  // a later version's request arrives as one without a body
+  EXPECT_EQ(client.ask(unknown).failure().code(), "protocol");
+  EXPECT_TRUE(client.ask(list_request()).has_stream_list());
+}
+
+TEST(LocalService, CutsTheProgramsNameToWhatPeopleCanRead) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  local::Request hello;
+  hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
+  hello.mutable_hello()->set_program(std::string(126, 'x') + "\xc3\xa4\n" + std::string(500, 'y'));
+  EXPECT_TRUE(client.ask(hello).has_welcome());
+  local::Request list;
+  list.mutable_list_clients();
+  EXPECT_EQ(client.ask(list).client_list().clients(0).program(), std::string(126, 'x'));
+}
+
+// --- requests
+
+TEST(LocalService, CreatesOpensListsAndClosesStreams) {
+  Daemon daemon;
+  FakeClient writer(daemon.service, 5), reader(daemon.service, 6);
+  writer.greet(), reader.greet();
+  const local::Response created = writer.ask(create_request("odometry"));
+  EXPECT_TRUE(created.opened().created());
+  EXPECT_EQ(created.opened().id().host(), "pc1");
+  EXPECT_EQ(writer.last_descriptors.size(), 4u);
+  EXPECT_FALSE(writer.ask(create_request("odometry")).opened().created());
+  const local::Response opened = reader.ask(open_request("odometry"));
+  EXPECT_EQ(reader.last_descriptors.size(), 3u);
+  EXPECT_EQ(opened.opened().type().name(), "Odometry");
+
+  const local::Response list = reader.ask(list_request());
+  ASSERT_EQ(list.stream_list().streams_size(), 1);
+  EXPECT_EQ(list.stream_list().streams(0).writers(), 2u);
+  EXPECT_EQ(list.stream_list().streams(0).readers(), 1u);
+  EXPECT_EQ(list.stream_list().streams(0).users_size(), 0);
+
+  local::Request info;
+  info.mutable_info()->mutable_id()->set_name("odometry");
+  const local::Response told = reader.ask(info);
+  ASSERT_EQ(told.stream_list().streams_size(), 1);
+  ASSERT_EQ(told.stream_list().streams(0).users_size(), 3);
+  EXPECT_EQ(told.stream_list().streams(0).users(2).pid(), 6);
+  EXPECT_FALSE(told.stream_list().streams(0).users(2).writer());
+
+  local::Request opens;
+  opens.mutable_list_opens();
+  const local::Response entries = reader.ask(opens);
+  ASSERT_EQ(entries.open_list().opens_size(), 3);
+  EXPECT_EQ(entries.open_list().opens(0).tag(), 7u);
+  EXPECT_TRUE(entries.open_list().opens(0).for_writing());
+  EXPECT_EQ(entries.open_list().opens(2).creator_pid(), 5);
+  EXPECT_EQ(entries.open_list().opens(2).opener_pid(), 6);
+
+  local::Request close;
+  close.mutable_close()->set_handle(opened.opened().handle());
+  EXPECT_TRUE(reader.ask(close).has_done());
+  EXPECT_EQ(reader.ask(close).failure().code(), "not_found");
+  EXPECT_EQ(reader.ask(list_request()).stream_list().streams(0).readers(), 0u);
+}
+
+TEST(LocalService, TellsWhatIsWrongWithAStreamThatCannotBeCreatedOrOpened) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  EXPECT_EQ(client.ask(open_request("nowhere")).failure().code(), "not_found");
+  EXPECT_EQ(client.ask(create_request("a:b")).failure().code(), "invalid_argument");
+  EXPECT_EQ(client.ask(create_request(std::string(32, 'x'))).failure().code(), "invalid_argument");
+  local::Request request = create_request("x");
+  request.mutable_create()->set_cycle_ns(0);
+  EXPECT_EQ(client.ask(request).failure().code(), "invalid_argument");
+  request = create_request("x");
+  request.mutable_create()->set_depth(1);
+  EXPECT_TRUE(client.ask(request).has_failure());
+  request = create_request("x");
+  request.mutable_create()->mutable_type()->set_payload_bytes(0);
+  EXPECT_EQ(client.ask(request).failure().code(), "invalid_argument");
+  request = create_request("x");
+  request.mutable_create()->set_depth(1 << 22);
+  EXPECT_EQ(client.ask(request).failure().code(), "limit_exceeded");
+  EXPECT_TRUE(daemon.registry.streams().empty());
+}
+
+TEST(LocalService, ForgetsTheOpensOfAClientThatLeavesAndKeepsItsStreams) {
+  Daemon daemon;
+  FakeClient watcher(daemon.service, 5);
+  watcher.greet();
+  {
+    FakeClient client(daemon.service, 6);
+    client.greet();
+    client.ask(create_request("odometry"));
+  }
+  const local::Response list = watcher.ask(list_request());
+  ASSERT_EQ(list.stream_list().streams_size(), 1);
+  EXPECT_EQ(list.stream_list().streams(0).writers(), 0u);
+  EXPECT_EQ(daemon.service.clients(), 1u);
+}
+
+TEST(LocalService, RefusesMoreOpensThanTheLimitBeforeItCreatesAnything) {
+  Daemon daemon(false, {.max_opens = 10, .max_opens_per_client = 1});
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  client.ask(create_request("a"));
+  const local::Response refused = client.ask(create_request("b"));
+  EXPECT_EQ(refused.failure().code(), "limit_exceeded");
+  EXPECT_NE(refused.failure().message().find("max_opens_per_client = 1"), std::string::npos);
+  EXPECT_EQ(daemon.registry.streams().size(), 1u);
+}
+
+TEST(LocalService, KeepsAndGivesProperties) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  client.ask(create_request("odometry"));
+  local::Request set, get;
+  set.mutable_set_property()->mutable_id()->set_name("odometry");
+  set.mutable_set_property()->set_property(std::string("a\0b", 3));
+  get.mutable_get_property()->mutable_id()->set_name("odometry");
+  EXPECT_EQ(client.ask(get).property().property(), "");
+  EXPECT_TRUE(client.ask(set).has_done());
+  EXPECT_EQ(client.ask(get).property().property(), std::string("a\0b", 3));
+}
+
+TEST(LocalService, TellsWatchersWhatIsThereAndWhatChanges) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5), watcher(daemon.service, 6);
+  client.greet(), watcher.greet();
+  client.ask(create_request("a"));
+  local::Request watch;
+  watch.mutable_watch();
+  const local::Response there = watcher.ask(watch);
+  EXPECT_EQ(there.serial(), 0u);
+  EXPECT_EQ(there.stream_event().stream().id().name(), "a");
+  EXPECT_TRUE(watcher.next().has_done()) << "the answer comes when all has been told";
+  client.ask(create_request("b"));
+  const local::Response added = watcher.next();
+  EXPECT_EQ(added.serial(), 0u);
+  EXPECT_FALSE(added.stream_event().removed());
+  EXPECT_EQ(added.stream_event().stream().id().name(), "b");
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("a");
+  client.ask(remove);
+  const local::Response removed = watcher.next();
+  EXPECT_TRUE(removed.stream_event().removed());
+  EXPECT_EQ(removed.stream_event().stream().id().name(), "a");
+  EXPECT_TRUE(watcher.received.empty());
+  EXPECT_TRUE(client.received.empty()) << "who does not watch hears nothing";
+}
+
+TEST(LocalService, ListsProgramsInTheOrderTheyCame) {
+  Daemon daemon;
+  FakeClient one(daemon.service, 11), two(daemon.service, 12), silent(daemon.service, 13);
+  two.greet(), one.greet();
+  local::Request list;
+  list.mutable_list_clients();
+  const local::Response response = one.ask(list);
+  ASSERT_EQ(response.client_list().clients_size(), 2) << "only those who said hello";
+  EXPECT_EQ(response.client_list().clients(0).pid(), 11);
+  EXPECT_EQ(response.client_list().clients(1).pid(), 12);
+  EXPECT_EQ(response.client_list().clients(1).uid(), 1000u);
+}
+
+TEST(LocalService, LeavesOutFieldsWhenAListGetsTooLongForAFrame) {
+  Daemon daemon(false, {.max_opens = 1000, .max_opens_per_client = 1000});
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  constexpr int kStreams = 300;  // with 60 KB of field names each: 18 MB
+  for (int i = 0; i < kStreams; ++i) {
+    local::Request request = create_request("s");
+    request.mutable_create()->mutable_id()->set_id(i);
+    request.mutable_create()->mutable_type()->mutable_fields(0)->set_name(std::string(60'000, 'f'));
+    const local::Response created = client.ask(request);
+    ASSERT_TRUE(created.has_opened()) << created.failure().message();
+  }
+  const local::Response list = client.ask(list_request());  // fails on a frame that is too long
+  ASSERT_EQ(list.stream_list().streams_size(), kStreams);
+  EXPECT_EQ(list.stream_list().streams(0).type().fields_size(), 2);
+  EXPECT_EQ(list.stream_list().streams(kStreams - 1).type().fields_size(), 0);
+  EXPECT_EQ(list.stream_list().streams(kStreams - 1).type().name(), "Odometry");
+}
+
+TEST(LocalService, HandsOutOneAndTheSamePlaybackClock) {
+  Daemon daemon;
+  FakeClient one(daemon.service, 5), two(daemon.service, 6);
+  one.greet(), two.greet();
+  local::Request request;
+  request.mutable_open_clock();
+  EXPECT_TRUE(one.ask(request).has_clock());
+  EXPECT_TRUE(two.ask(request).has_clock());
+  ASSERT_EQ(one.last_descriptors.size(), 1u);
+  ASSERT_EQ(two.last_descriptors.size(), 1u);
+  EXPECT_TRUE(same_file(one.last_descriptors[0].get(), two.last_descriptors[0].get()));
+}
+
+TEST(LocalService, TakesBackAPlaybackClockOnlyBeforeItHandedOneOut) {
+  UniqueFd kept;
+  {
+    Daemon before;
+    kept = *before.clock.get();
+  }
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  local::Request offer;
+  offer.mutable_open_clock()->set_offered(true);
+  EXPECT_EQ(client.ask(offer).failure().code(), "protocol") << "it comes without its descriptor";
+  client.offered.emplace_back().push_back(UniqueFd(::open("/dev/null", O_RDWR | O_CLOEXEC)));
+  EXPECT_EQ(client.ask(offer).failure().code(), "protocol");
+  client.offered.emplace_back().push_back(copy_of(kept));
+  EXPECT_TRUE(client.ask(offer).has_clock());
+  EXPECT_TRUE(same_file(client.last_descriptors[0].get(), kept.get()));
+
+  Daemon in_use;
+  FakeClient other(in_use.service, 6);
+  other.greet();
+  local::Request plain;
+  plain.mutable_open_clock();
+  EXPECT_TRUE(other.ask(plain).has_clock());
+  other.offered.emplace_back().push_back(copy_of(kept));
+  EXPECT_TRUE(other.ask(offer).has_clock());
+  EXPECT_FALSE(same_file(other.last_descriptors[0].get(), kept.get()));
+}
+
+TEST(LocalService, TellsAboutItself) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  client.ask(create_request("odometry"));
+  local::Request request;
+  request.mutable_get_daemon();
+  const local::Response response = client.ask(request);
+  EXPECT_EQ(response.daemon().host(), "pc1");
+  EXPECT_EQ(response.daemon().streams(), 1u);
+  EXPECT_EQ(response.daemon().memory_limit_bytes(), kLimits.max_memory_bytes);
+  EXPECT_GT(response.daemon().memory_bytes(), 16u * 24);
+  EXPECT_EQ(response.daemon().mdns().phase(), "off");  // without a network
+}
+
+// --- recovery
+
+// A client's answer to a Create by an earlier dssmd: what it can offer now.
+std::vector<UniqueFd> descriptors_from_before(const std::string& name) {
+  Daemon before;
+  FakeClient client(before.service, 5);
+  client.greet();
+  EXPECT_TRUE(client.ask(create_request(name)).has_opened());
+  return std::move(client.last_descriptors);
+}
+
+local::Request offer_request(const std::string& name) {
+  local::Request request;
+  request.mutable_offer()->mutable_id()->set_name(name);
+  request.mutable_offer()->set_for_writing(true);
+  return request;
+}
+
+TEST(LocalService, HoldsBackWhoWantsAStreamThatMayStillBeOffered) {
+  std::vector<UniqueFd> kept = descriptors_from_before("odometry");
+  const UniqueFd ring = copy_of(kept[0]);
+  Daemon daemon(true);
+  FakeClient fresh(daemon.service, 6), old(daemon.service, 5);
+  fresh.greet(), old.greet();
+  local::Request create = create_request("odometry");
+  create.set_serial(50);
+  ASSERT_TRUE(fresh.put(create));
+  EXPECT_TRUE(fresh.received.empty()) << "neither done nor refused";
+  EXPECT_TRUE(fresh.ask(list_request()).has_stream_list()) << "all else goes on";
+
+  old.offered.push_back(std::move(kept));
+  const local::Response offered = old.ask(offer_request("odometry"));
+  EXPECT_TRUE(offered.has_opened()) << offered.failure().message();
+  EXPECT_TRUE(old.last_descriptors.empty());
+  const local::Response joined = fresh.next();
+  EXPECT_EQ(joined.serial(), 50u);
+  EXPECT_FALSE(joined.opened().created());
+  EXPECT_TRUE(same_file(fresh.last_descriptors.at(0).get(), ring.get())) << "the old ring";
+}
+
+TEST(LocalService, AnswersHeldRequestsWhenRecoveryEnds) {
+  Daemon daemon(true);
+  FakeClient client(daemon.service, 6);
+  client.greet();
+  local::Request create = create_request("odometry"), open = open_request("lidar");
+  create.set_serial(50), open.set_serial(51);
+  ASSERT_TRUE(client.put(create) && client.put(open));
+  EXPECT_TRUE(client.received.empty());
+  daemon.service.end_recovery();
+  EXPECT_TRUE(client.next().opened().created());
+  const local::Response refused = client.next();
+  EXPECT_EQ(refused.serial(), 51u);
+  EXPECT_EQ(refused.failure().code(), "not_found");
+  EXPECT_TRUE(client.ask(create_request("next")).has_opened()) << "at once from now on";
+}
+
+TEST(LocalService, RefusesAtOnceWhatNoOfferCouldMend) {
+  Daemon daemon(true);
+  FakeClient client(daemon.service, 6);
+  client.greet();
+  EXPECT_EQ(client.ask(create_request("a:b")).failure().code(), "invalid_argument");
+}
+
+TEST(LocalService, ForgetsWhatAClientWaitedForWhenItLeaves) {
+  Daemon daemon(true);
+  {
+    FakeClient client(daemon.service, 6);
+    client.greet();
+    local::Request create = create_request("odometry");
+    create.set_serial(50);
+    ASSERT_TRUE(client.put(create));
+  }
+  daemon.service.end_recovery();
+  EXPECT_TRUE(daemon.registry.streams().empty());
+}
+
+TEST(LocalService, BoundsWhatOneClientHasWaiting) {
+  Daemon daemon(true);
+  FakeClient client(daemon.service, 6);
+  client.greet();
+  local::Request create = create_request("odometry");
+  create.mutable_create()->mutable_type()->mutable_fields(0)->set_name(std::string(200'000, 'f'));
+  for (std::uint64_t serial = 50; serial < 60 && client.received.empty(); ++serial) {
+    create.set_serial(serial);
+    ASSERT_TRUE(client.put(create));
+  }
+  EXPECT_EQ(client.next().failure().code(), "limit_exceeded");
+}
+
+TEST(LocalService, HoldsBackWhoWantsAPlaybackClockThatMayStillBeOffered) {
+  UniqueFd kept;
+  {
+    Daemon before;
+    kept = *before.clock.get();
+  }
+  Daemon daemon(true);
+  FakeClient fresh(daemon.service, 6), old(daemon.service, 5);
+  fresh.greet(), old.greet();
+  local::Request plain, offer;
+  plain.set_serial(50);
+  plain.mutable_open_clock();
+  offer.mutable_open_clock()->set_offered(true);
+  ASSERT_TRUE(fresh.put(plain));
+  EXPECT_TRUE(fresh.received.empty());
+  old.offered.emplace_back().push_back(copy_of(kept));
+  EXPECT_TRUE(old.ask(offer).has_clock());
+  EXPECT_TRUE(fresh.next().has_clock());
+  EXPECT_TRUE(same_file(fresh.last_descriptors.at(0).get(), kept.get()));
+}
+
+TEST(LocalService, RefusesAnOfferWithoutItsDescriptors) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 6);
+  client.greet();
+  EXPECT_EQ(client.ask(offer_request("odometry")).failure().code(), "protocol");
+  client.offered.emplace_back().push_back(UniqueFd(::open("/dev/null", O_RDWR | O_CLOEXEC)));
+  EXPECT_EQ(client.ask(offer_request("odometry")).failure().code(), "protocol");
+}
+
+}  // namespace
+}  // namespace dssm::daemon

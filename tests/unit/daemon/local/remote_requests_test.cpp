@@ -1,0 +1,435 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What programs ask about other hosts, with a fleet that answers when the test says: which requests
+// go there, what comes back, who is told of changes, and what happens to those who do not wait.
+#include "daemon/local/remote_requests.hpp"
+
+#include <gtest/gtest.h>
+
+#include <set>
+
+#include "tests/unit/daemon/local/fake_client.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+StreamInfo lidar_at(const std::string& host) {
+  StreamInfo info;
+  info.id = {"lidar", 0, host};
+  info.type = odometry_type();
+  info.incarnation = 5;
+  return info;
+}
+
+// Keeps what it is asked. Its rings are made by a registry that calls itself by the owner's name.
+class FakeFleet final : public Fleet {
+ public:
+  void observe(Observer* who) override { observer = who; }
+  bool is_there(const StreamId& id) const override { return there.contains(id.str()); }
+  void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) override {
+    asked.push_back("open_reader " + id.str());
+    reader_then = std::move(then);
+  }
+  void open_writer(const StreamId& id, const CreatePlan* plan,
+                   Then<OpenedRemoteWriter> then) override {
+    asked.push_back("open_writer " + id.str() +
+                    (plan ? " depth " + std::to_string(plan->history.depth) : ""));
+    writer_then = std::move(then);
+  }
+  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
+                                                  OfferedFiles files) override {
+    asked.push_back(std::string("adopt ") + (role == Role::writer ? "writer " : "reader ") +
+                    id.str());
+    return owner.adopt_untrusted(id, std::move(files));
+  }
+  void info(const StreamId& id, Then<proto::Stream> then) override {
+    asked.push_back("info " + id.str());
+    proto::Stream stream;
+    wire::to_message(lidar_at("pc2"), stream);
+    stream.mutable_mirror()->set_state("live");
+    then(stream);
+  }
+  void get_property(const StreamId& id, Then<std::string> then) override {
+    asked.push_back("get_property " + id.str());
+    then(std::string("calibration"));
+  }
+  void set_property(const StreamId& id, std::string property, Then<void> then) override {
+    asked.push_back("set_property " + id.str() + " " + property);
+    then({});
+  }
+  void remove(const StreamId& id, Then<void> then) override {
+    asked.push_back("remove " + id.str());
+    then(Error{Errc::not_found, "no such stream there"});
+  }
+  void list(Then<std::vector<proto::Stream>> then) override {
+    asked.push_back("list");
+    list_then.push_back(std::move(then));
+  }
+  std::vector<StreamInfo> known_streams() const override { return known; }
+  std::vector<local::Host> hosts() const override {
+    std::vector<local::Host> hosts(2);
+    hosts[0].set_name("pc1");
+    hosts[1].set_name("pc2");
+    return hosts;
+  }
+  local::Mdns mdns() const override {
+    local::Mdns mdns;
+    mdns.set_phase("running");
+    mdns.set_hosts_heard(7);
+    return mdns;
+  }
+  Result<UniqueFd> clock_page() const override { return Error{Errc::not_found, "no page here"}; }
+  void ping(const std::string& host, Then<local::RoundTrip> then) override {
+    asked.push_back("ping " + host);
+    local::RoundTrip round_trip;
+    round_trip.set_round_trip_ns(42);
+    then(round_trip);
+  }
+
+  std::shared_ptr<Stream> ring(const std::string& name) {
+    return owner.create({name, 0, ""}, odometry_type(), kHistory, 1).value().stream;
+  }
+
+  Registry owner{"pc2", kLimits};
+  Observer* observer = nullptr;
+  std::vector<std::string> asked;
+  Then<std::shared_ptr<Stream>> reader_then;
+  Then<OpenedRemoteWriter> writer_then;
+  std::vector<Then<std::vector<proto::Stream>>> list_then;
+  std::vector<StreamInfo> known;
+  std::set<std::string> there;
+};
+
+using Asked = std::vector<std::string>;
+
+class RemoteRequestsTest : public testing::Test {
+ protected:
+  SilentLogger logger;
+  Registry registry{"pc1", kLimits};
+  OpenTable opens{{.max_opens = 2000, .max_opens_per_client = 2000}};
+  PlaybackClockOwner clock;
+  FakeFleet fleet;
+  std::unique_ptr<LocalService> service;
+  std::unique_ptr<FakeClient> client;
+
+  explicit RemoteRequestsTest(bool recovering = false)
+      : service(std::make_unique<LocalService>(registry, opens, clock, logger, recovering, &fleet)),
+        client(std::make_unique<FakeClient>(*service, 5)) {
+    client->greet();
+  }
+
+  // Puts a request that is answered later.
+  void put(local::Request request, std::uint64_t serial = 77) {
+    request.set_serial(serial);
+    ASSERT_TRUE(client->put(request));
+  }
+};
+
+local::Request open_at(const std::string& name, const std::string& host, bool for_writing = false) {
+  local::Request request = open_request(name, for_writing);
+  request.mutable_open()->mutable_id()->set_host(host);
+  return request;
+}
+
+TEST_F(RemoteRequestsTest, OpensAMirrorWhenItIsThere) {
+  put(open_at("lidar", "pc2"));
+  EXPECT_EQ(fleet.asked, Asked{"open_reader lidar:0@pc2"});
+  EXPECT_TRUE(client->received.empty());
+  const auto ring = fleet.ring("lidar");
+  fleet.reader_then(ring);
+  const local::Response answer = client->next();
+  EXPECT_EQ(answer.serial(), 77u);
+  EXPECT_TRUE(answer.opened().mirror());
+  EXPECT_EQ(answer.opened().id().host(), "pc2");
+  EXPECT_EQ(client->last_descriptors.size(), 3u);
+  EXPECT_EQ(opens.counts(*ring).readers, 1u) << "so that its keeper knows of it";
+  local::Request close;
+  close.mutable_close()->set_handle(answer.opened().handle());
+  EXPECT_TRUE(client->ask(close).has_done());
+  EXPECT_EQ(opens.counts(*ring).readers, 0u);
+}
+
+TEST_F(RemoteRequestsTest, PrefersAnOwnStreamAndAsksForWhatIsNone) {
+  client->ask(create_request("lidar"));
+  EXPECT_TRUE(client->ask(open_request("lidar")).has_opened());
+  EXPECT_FALSE(client->ask(open_at("lidar", "pc1")).opened().mirror());
+  EXPECT_TRUE(fleet.asked.empty());
+  put(open_request("imu"));
+  EXPECT_EQ(fleet.asked, Asked{"open_reader imu:0"});
+  fleet.reader_then(Error{Errc::conflict, "pc2 and pc3 have it"});
+  EXPECT_EQ(client->next().failure().code(), "conflict");
+}
+
+TEST_F(RemoteRequestsTest, NeverLooksElsewhereForAStreamNamedAsItsOwn) {
+  EXPECT_EQ(client->ask(open_at("imu", "pc1")).failure().code(), "not_found");
+  EXPECT_TRUE(fleet.asked.empty());
+}
+
+TEST_F(RemoteRequestsTest, CreatesHereUnlessToldOtherwise) {
+  fleet.known = {lidar_at("pc2")};
+  EXPECT_EQ(client->ask(create_request("lidar")).opened().id().host(), "pc1");
+  EXPECT_TRUE(fleet.asked.empty());
+  local::Request create = create_request("lidar");
+  create.mutable_create()->mutable_id()->set_host("pc2");
+  put(create);
+  EXPECT_EQ(fleet.asked, Asked{"open_writer lidar:0@pc2 depth 16"});
+  fleet.writer_then(OpenedRemoteWriter{fleet.ring("lidar"), true});
+  const local::Response answer = client->next();
+  EXPECT_TRUE(answer.opened().created());
+  EXPECT_FALSE(answer.opened().mirror());
+  EXPECT_EQ(answer.opened().id().host(), "pc2");
+  EXPECT_EQ(client->last_descriptors.size(), 4u);
+}
+
+TEST_F(RemoteRequestsTest, OpensForWritingWhatMustExist) {
+  put(open_at("lidar", "pc2", true));
+  EXPECT_EQ(fleet.asked, Asked{"open_writer lidar:0@pc2"});
+  fleet.writer_then(OpenedRemoteWriter{fleet.ring("lidar"), false});
+  EXPECT_FALSE(client->next().opened().created());
+  EXPECT_EQ(client->last_descriptors.size(), 4u);
+}
+
+TEST_F(RemoteRequestsTest, ForgetsWhatAClientOpenedThatLeft) {
+  put(open_at("lidar", "pc2"));
+  client.reset();
+  const auto ring = fleet.ring("lidar");
+  fleet.reader_then(ring);
+  EXPECT_EQ(opens.counts(*ring).readers, 0u);
+  EXPECT_TRUE(opens.entries().empty());
+}
+
+TEST_F(RemoteRequestsTest, PassesOnTheRest) {
+  local::Request info, get, set, remove;
+  info.mutable_info()->mutable_id()->set_name("lidar");
+  const local::Response told = client->ask(info);
+  ASSERT_EQ(told.stream_list().streams_size(), 1);
+  EXPECT_EQ(told.stream_list().streams(0).mirror().state(), "live");
+  get.mutable_get_property()->mutable_id()->set_name("lidar");
+  EXPECT_EQ(client->ask(get).property().property(), "calibration");
+  set.mutable_set_property()->mutable_id()->set_name("lidar");
+  set.mutable_set_property()->mutable_id()->set_host("pc2");
+  set.mutable_set_property()->set_property("new");
+  EXPECT_TRUE(client->ask(set).has_done());
+  remove.mutable_remove()->mutable_id()->set_name("lidar");
+  EXPECT_EQ(client->ask(remove).failure().message(), "no such stream there");
+  EXPECT_EQ(fleet.asked, (Asked{"info lidar:0", "get_property lidar:0",
+                                "set_property lidar:0@pc2 new", "remove lidar:0"}));
+}
+
+TEST_F(RemoteRequestsTest, ListsOwnStreamsFirst) {
+  client->ask(create_request("odometry"));
+  put(list_request());
+  EXPECT_TRUE(client->received.empty());
+  std::vector<proto::Stream> others(1);
+  wire::to_message(lidar_at("pc2"), others[0]);
+  fleet.list_then.at(0)(others);
+  const local::Response list = client->next();
+  ASSERT_EQ(list.stream_list().streams_size(), 2);
+  EXPECT_EQ(list.stream_list().streams(0).id().host(), "pc1");
+  EXPECT_EQ(list.stream_list().streams(1).id().host(), "pc2");
+  local::Request own = list_request();
+  own.mutable_list()->set_own_only(true);
+  EXPECT_EQ(client->ask(own).stream_list().streams_size(), 1);
+  EXPECT_EQ(fleet.asked, Asked{"list"});
+}
+
+TEST_F(RemoteRequestsTest, LeavesOutFieldsOrSaysSoWhenTheListGetsTooLong) {
+  put(list_request(), 80);
+  put(list_request(), 81);
+  proto::Stream stream;
+  wire::to_message(lidar_at("pc2"), stream);
+  stream.mutable_type()->mutable_fields(0)->set_name(std::string(60'000, 'f'));
+  fleet.list_then.at(0)(std::vector<proto::Stream>(300, stream));
+  const local::Response list = client->next();
+  ASSERT_EQ(list.stream_list().streams_size(), 300);
+  EXPECT_EQ(list.stream_list().streams(0).type().fields_size(), 2);
+  EXPECT_EQ(list.stream_list().streams(299).type().fields_size(), 0);
+  stream.mutable_type()->clear_fields();
+  stream.mutable_type()->set_name(std::string(127, 't'));
+  fleet.list_then.at(1)(std::vector<proto::Stream>(150'000, stream));
+  EXPECT_EQ(client->next().failure().code(), "limit_exceeded");
+}
+
+TEST_F(RemoteRequestsTest, TellsAboutHosts) {
+  local::Request hosts, ping;
+  hosts.mutable_list_hosts();
+  const local::Response list = client->ask(hosts);
+  ASSERT_EQ(list.host_list().hosts_size(), 2);
+  EXPECT_EQ(list.host_list().hosts(0).name(), "pc1");
+  ping.mutable_ping_host()->set_host("pc2");
+  EXPECT_EQ(client->ask(ping).round_trip().round_trip_ns(), 42);
+  ping.mutable_ping_host()->set_host("pc1");
+  EXPECT_TRUE(client->ask(ping).has_round_trip());
+  EXPECT_EQ(fleet.asked, Asked{"ping pc2"});
+}
+
+TEST_F(RemoteRequestsTest, TellsHowOtherHostsAreFound) {
+  local::Request request;
+  request.mutable_get_daemon();
+  const local::Daemon daemon = client->ask(request).daemon();
+  EXPECT_EQ(daemon.host(), "pc1");
+  EXPECT_EQ(daemon.mdns().phase(), "running");
+  EXPECT_EQ(daemon.mdns().hosts_heard(), 7u);
+}
+
+TEST_F(RemoteRequestsTest, BoundsWhatOneClientWaitsFor) {
+  for (std::size_t i = 0; i < LocalService::kMaxAwaited; ++i) put(list_request(), 1000 + i);
+  EXPECT_TRUE(client->received.empty());
+  put(list_request(), 50);
+  const local::Response refused = client->next();
+  EXPECT_EQ(refused.serial(), 50u);
+  EXPECT_EQ(refused.failure().code(), "limit_exceeded");
+  fleet.list_then.at(0)(std::vector<proto::Stream>());
+  EXPECT_EQ(client->next().serial(), 1000u);
+  put(list_request(), 51);
+  EXPECT_TRUE(client->received.empty()) << "there is room again";
+}
+
+// --- changes
+
+TEST_F(RemoteRequestsTest, TellsWatchersOfAllHosts) {
+  client->ask(create_request("odometry"));
+  fleet.known = {lidar_at("pc2")};
+  local::Request watch;
+  watch.mutable_watch();
+  EXPECT_EQ(client->ask(watch).stream_event().stream().id().name(), "odometry");
+  EXPECT_EQ(client->next().stream_event().stream().id().host(), "pc2");
+  EXPECT_TRUE(client->next().has_done());
+  fleet.observer->on_remote_stream_added(lidar_at("pc3"));
+  const local::Response added = client->next();
+  EXPECT_FALSE(added.stream_event().removed());
+  EXPECT_EQ(added.stream_event().stream().id().host(), "pc3");
+  EXPECT_EQ(added.stream_event().stream().incarnation(), 5u);
+  fleet.observer->on_remote_stream_removed({"lidar", 0, "pc3"});
+  const local::Response removed = client->next();
+  EXPECT_TRUE(removed.stream_event().removed());
+  EXPECT_EQ(removed.stream_event().stream().id().host(), "pc3");
+}
+
+TEST_F(RemoteRequestsTest, TellsReadersOfAReplacedMirror) {
+  put(open_at("lidar", "pc2"));
+  const auto ring = fleet.ring("lidar");
+  fleet.reader_then(ring);
+  const std::uint64_t handle = client->next().opened().handle();
+  put(open_at("lidar", "pc2", true));
+  fleet.writer_then(OpenedRemoteWriter{ring, false});
+  client->next();
+  fleet.observer->on_ring_replaced(*ring);
+  const local::Response event = client->next();
+  EXPECT_EQ(event.serial(), 0u);
+  EXPECT_EQ(event.replaced().handle(), handle);
+  EXPECT_TRUE(client->received.empty()) << "writers are not concerned";
+}
+
+TEST_F(RemoteRequestsTest, TellsReadersWhenAnOwnStreamIsCreatedAnew) {
+  client->ask(create_request("odometry"));
+  client->ask(create_request("other"));
+  const std::uint64_t handle = client->ask(open_request("odometry")).opened().handle();
+  client->ask(open_request("other"));
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("odometry");
+  EXPECT_TRUE(client->ask(remove).has_done());
+  EXPECT_TRUE(client->received.empty()) << "there is no successor yet";
+  FakeClient writer(*service, 6);
+  writer.greet().ask(create_request("odometry"));
+  EXPECT_EQ(client->next().replaced().handle(), handle);
+  EXPECT_TRUE(client->received.empty());
+  writer.ask(create_request("odometry"));
+  EXPECT_TRUE(client->received.empty()) << "it joined, nothing is new";
+  StreamInfo elsewhere = lidar_at("pc2");
+  elsewhere.id.name = "other";
+  fleet.observer->on_remote_stream_added(elsewhere);
+  EXPECT_TRUE(client->received.empty()) << "what is read is still there";
+}
+
+TEST_F(RemoteRequestsTest, TellsReadersOfAStreamThatMovedToAnotherHost) {
+  FakeClient particular(*service, 6);
+  particular.greet();
+  const auto ring = fleet.ring("lidar");
+  put(open_request("lidar"));
+  fleet.reader_then(ring);
+  const std::uint64_t handle = client->next().opened().handle();
+  local::Request named = open_at("lidar", "pc2");
+  named.set_serial(50);
+  particular.put(named);
+  fleet.reader_then(ring);
+  EXPECT_TRUE(particular.next().has_opened());
+
+  fleet.there = {"lidar:0@pc2", "lidar:0"};
+  fleet.observer->on_remote_stream_added(lidar_at("pc2"));
+  EXPECT_TRUE(client->received.empty()) << "it is the one that is read";
+  fleet.there = {"lidar:0@pc2", "lidar:0@pc3"};
+  fleet.observer->on_remote_stream_added(lidar_at("pc3"));
+  EXPECT_TRUE(client->received.empty()) << "the one that is read is still there";
+  fleet.there = {"lidar:0@pc3", "lidar:0"};
+  fleet.observer->on_remote_stream_removed({"lidar", 0, "pc2"});
+  EXPECT_EQ(client->next().replaced().handle(), handle) << "now the name means the other";
+  fleet.there.clear();
+  fleet.observer->on_remote_stream_removed({"lidar", 0, "pc3"});
+  EXPECT_TRUE(client->received.empty()) << "there is none";
+  fleet.there = {"lidar:0@pc4", "lidar:0"};
+  fleet.observer->on_remote_stream_added(lidar_at("pc4"));
+  EXPECT_EQ(client->next().replaced().handle(), handle);
+  fleet.there.clear();
+  EXPECT_EQ(client->ask(create_request("lidar")).replaced().handle(), handle) << "and home again";
+  EXPECT_TRUE(particular.received.empty()) << "who names a host wants no other";
+}
+
+TEST_F(RemoteRequestsTest, TellsReadersOfAnOwnStreamThatMovedAway) {
+  client->ask(create_request("lidar"));
+  const std::uint64_t any = client->ask(open_request("lidar")).opened().handle();
+  const std::uint64_t own = client->ask(open_at("lidar", "pc1")).opened().handle();
+  fleet.there = {"lidar:0@pc2", "lidar:0"};
+  fleet.observer->on_remote_stream_added(lidar_at("pc2"));
+  EXPECT_TRUE(client->received.empty());
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("lidar");
+  EXPECT_EQ(client->ask(remove).replaced().handle(), any);
+  EXPECT_TRUE(client->next().has_done());
+  EXPECT_TRUE(client->received.empty());
+  fleet.there.clear();
+  EXPECT_EQ(client->ask(create_request("lidar")).replaced().handle(), any);
+  EXPECT_EQ(client->next().replaced().handle(), own);
+}
+
+// --- after a restart of dssmd
+
+class RecoveringRequestsTest : public RemoteRequestsTest {
+ protected:
+  RecoveringRequestsTest() : RemoteRequestsTest(true) {}
+};
+
+TEST_F(RecoveringRequestsTest, DoNotWaitWhenTheyNameAnotherHost) {
+  put(open_at("lidar", "pc2"), 80);
+  put(open_request("lidar"), 81);
+  EXPECT_EQ(fleet.asked, Asked{"open_reader lidar:0@pc2"}) << "the other may be ours";
+  service->end_recovery();
+  EXPECT_EQ(fleet.asked, (Asked{"open_reader lidar:0@pc2", "open_reader lidar:0"}));
+}
+
+TEST_F(RecoveringRequestsTest, GiveBackWhatBelongsToAnotherHost) {
+  std::vector<UniqueFd> kept;
+  {
+    Registry before("pc2", kLimits);
+    kept = before.create({"lidar", 0, ""}, odometry_type(), kHistory, 1)
+               .value()
+               .stream->descriptors_for(Role::reader)
+               .value();
+  }
+  local::Request offer;
+  offer.mutable_offer()->mutable_id()->set_name("lidar");
+  offer.mutable_offer()->mutable_id()->set_host("pc2");
+  offer.mutable_offer()->set_any_host(true);
+  client->offered.push_back(std::move(kept));
+  const local::Response answer = client->ask(offer);
+  EXPECT_TRUE(answer.has_opened()) << answer.failure().message();
+  EXPECT_TRUE(client->last_descriptors.empty());
+  EXPECT_EQ(fleet.asked, Asked{"adopt reader lidar:0@pc2"});
+  ASSERT_EQ(opens.entries().size(), 1u);
+  EXPECT_TRUE(opens.entries().begin()->second.any_host) << "as it was opened";
+  EXPECT_TRUE(registry.streams().empty()) << "it is none of ours";
+  EXPECT_EQ(client->ask(offer).failure().code(), "protocol") << "without its descriptors";
+}
+
+}  // namespace
+}  // namespace dssm::daemon

@@ -1,0 +1,484 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Mirrors against an owner that does what the test says.
+#include "daemon/remote/mirrors.hpp"
+
+#include <gtest/gtest.h>
+
+#include "tests/unit/daemon/daemon_fixtures.hpp"
+#include "tests/unit/daemon/remote/fake_owner.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+using namespace std::chrono_literals;
+
+class SilentLogger final : public Logger {
+ public:
+  void write(LogLevel level, std::string_view text, const LogFields&) noexcept override {
+    if (level <= LogLevel::warning) warnings += std::string(text) + "\n";
+  }
+  std::string warnings;
+};
+
+const StreamId kId{"odometry", 0, "pc2"};
+
+class MirrorsTest : public testing::Test, protected MirrorKeeper::Observer {
+ protected:
+  EventLoop loop = EventLoop::open().value();
+  Resolver resolver{loop};
+  Registry registry{"pc1", kLimits};
+  SilentLogger logger;
+  Catalog catalog{"pc1"};
+  ChannelParts parts{loop, resolver, registry, logger, greeting_of("pc1")};
+  std::unique_ptr<Mirrors> mirrors = std::make_unique<Mirrors>(parts, catalog, 0ms);
+  std::unique_ptr<FakeOwner> owner = std::make_unique<FakeOwner>(loop);
+  StreamInfo theirs;
+  std::vector<const Stream*> replaced;
+
+  MirrorsTest() {
+    mirrors->observe(this);
+    theirs.id = kId;
+    theirs.type = odometry_type();
+    theirs.depth = 16;
+    theirs.cycle = 10ms;
+    theirs.incarnation = 7;
+    catalog.host_up(owner->host().greeting, owner->host().address);
+  }
+  void on_ring_replaced(const Stream& stream) override { replaced.push_back(&stream); }
+
+  using Answer = std::optional<Result<std::shared_ptr<Stream>>>;
+  std::shared_ptr<Answer> open() {
+    auto answer = std::make_shared<Answer>();
+    mirrors->open(owner->host(), kId, [answer](Result<std::shared_ptr<Stream>> result) {
+      answer->emplace(std::move(result));
+    });
+    return answer;
+  }
+  std::shared_ptr<Stream> wait(const std::shared_ptr<Answer>& answer) {
+    run_until(loop, [&] { return answer->has_value(); });
+    return (*answer)->value();
+  }
+  // Answers Open and Subscribe; returns the latter.
+  net::Frame serve(Tid first) {
+    const net::Frame open = owner->take();
+    EXPECT_TRUE(open.has_open());
+    EXPECT_EQ(open.open().id().name(), kId.name);
+    owner->say(theirs, open);
+    net::Frame subscribe = owner->take();
+    EXPECT_TRUE(subscribe.has_subscribe());
+    owner->subscribed(subscribe, theirs.incarnation, first);
+    return subscribe;
+  }
+  void samples(Tid first, Tid last) {
+    for (Tid tid = first; tid <= last; ++tid) {
+      owner->sample({tid, time_from_ns(tid), Duration(1)},
+                    std::vector<std::byte>(24, static_cast<std::byte>(tid)));
+    }
+  }
+  // A mirror that is up to date, with samples 0 ... newest.
+  std::shared_ptr<Stream> opened(Tid newest) {
+    const auto answer = open();
+    serve(0);
+    samples(0, newest);
+    owner->caught_up();
+    return wait(answer);
+  }
+  proto::Mirror state() {
+    proto::Mirror state;
+    EXPECT_TRUE(mirrors->describe(kId, state));
+    return state;
+  }
+  void until_state(const std::string& word) {
+    run_until(loop, [&] { return state().state() == word; });
+  }
+  static Tid newest(const Stream& stream) { return ring::RingReader(stream.mapping()).newest(); }
+  void until_newest(const Stream& stream, Tid tid) {
+    run_until(loop, [&] { return newest(stream) >= tid; });
+    EXPECT_EQ(newest(stream), tid);
+  }
+};
+
+TEST_F(MirrorsTest, FillsARingWithTheOwnersHistoryBeforeItAnswers) {
+  const auto answer = open();
+  const net::Frame subscribe = serve(100);
+  EXPECT_TRUE(subscribe.subscribe().from_oldest());
+  samples(100, 110);
+  run_until(loop, [&] { return mirrors->find(kId) && newest(*mirrors->find(kId)) == 110; });
+  EXPECT_FALSE(answer->has_value()) << "more may follow";
+  EXPECT_EQ(state().state(), "filling");
+  owner->caught_up();
+  const std::shared_ptr<Stream> stream = wait(answer);
+  EXPECT_EQ(stream->id(), kId);
+  EXPECT_EQ(stream->type(), odometry_type());
+  EXPECT_EQ(stream->incarnation(), 7u);
+  EXPECT_EQ(stream->purpose(), Purpose::mirror);
+  EXPECT_EQ(stream->info().depth, 16u);
+  EXPECT_EQ(stream->info().cycle, 10ms);
+  EXPECT_EQ(stream->info().oldest, 100);
+  EXPECT_EQ(state().state(), "live");
+  EXPECT_EQ(state().received_samples(), 11u);
+  EXPECT_EQ(state().received_bytes(), 11u * 24);
+  EXPECT_EQ(state().newest(), 110);
+}
+
+TEST_F(MirrorsTest, SharesOneChannelAmongAllReaders) {
+  const auto first = open(), second = open();
+  serve(0);
+  owner->caught_up();
+  EXPECT_EQ(wait(first), wait(second));
+  const auto third = open();
+  ASSERT_TRUE(third->has_value()) << "it is there";
+  EXPECT_EQ(owner->connections(), 1);
+  EXPECT_EQ(mirrors->size(), 1u);
+}
+
+TEST_F(MirrorsTest, AnswersWithWhatCameWhenTheHistoryTakesLong) {
+  const auto answer = open();
+  serve(0);
+  samples(0, 3);
+  EXPECT_EQ(newest(*wait(answer)), 3);
+  EXPECT_EQ(state().state(), "filling");
+}
+
+TEST_F(MirrorsTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
+  const wire::Address nobody = owner->host().address;
+  const KnownHost host = owner->host();
+  owner.reset();  // nobody listens there any more
+  std::optional<Error> error;
+  mirrors->open(host, kId, [&](Result<std::shared_ptr<Stream>> result) { error = result.error(); });
+  run_until(loop, [&] { return error.has_value(); });
+  EXPECT_EQ(error->code, Errc::daemon_away);
+  EXPECT_NE(error->message.find("odometry:0@pc2"), std::string::npos) << error->message;
+  EXPECT_NE(error->message.find(nobody.str()), std::string::npos) << error->message;
+  EXPECT_NE(error->message.find("refused"), std::string::npos) << error->message;
+  run_until(loop, [&] { return mirrors->size() == 0; });
+}
+
+TEST_F(MirrorsTest, HandsOnWhatTheOwnerRefuses) {
+  const auto answer = open();
+  owner->fail(owner->take(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
+  run_until(loop, [&] { return answer->has_value(); });
+  EXPECT_EQ((*answer)->error().code, Errc::not_found);
+  run_until(loop, [&] { return mirrors->size() == 0; });
+  EXPECT_EQ(registry.budget().used(), 0u);
+}
+
+TEST_F(MirrorsTest, RefusesWhatDoesNotFitIntoItsMemory) {
+  theirs.depth = kMaxDepth;
+  const auto answer = open();
+  owner->say(theirs, owner->take());
+  run_until(loop, [&] { return answer->has_value(); });
+  EXPECT_EQ((*answer)->error().code, Errc::limit_exceeded);
+  EXPECT_NE((*answer)->error().message.find("max_memory"), std::string::npos);
+}
+
+TEST_F(MirrorsTest, CountsTowardsTheStreamsOfThisHost) {
+  Registry small("pc1", {.max_streams = 1, .max_memory_bytes = 1 << 20, .max_property_bytes = 1});
+  const ChannelParts small_parts{loop, resolver, small, logger, greeting_of("pc1")};
+  Mirrors few(small_parts, catalog, 0ms);
+  {
+    std::optional<Errc> code;
+    few.open(owner->host(), kId, [&](auto result) {
+      code = result ? std::nullopt : std::optional(result.error().code);
+    });
+    EXPECT_EQ(small.create({"own", 0, ""}, odometry_type(), kHistory, 1).error().code,
+              Errc::limit_exceeded);
+    few.open(owner->host(), {"other", 0, "pc2"}, [&](auto result) { code = result.error().code; });
+    EXPECT_EQ(code, Errc::limit_exceeded);
+    owner->fail(owner->take(), Errc::not_found, "none");
+    run_until(loop, [&] { return few.size() == 0; });
+  }
+  EXPECT_TRUE(small.create({"own", 0, ""}, odometry_type(), kHistory, 1));
+}
+
+TEST_F(MirrorsTest, ClosesWhenNobodyUsesItAnyMore) {
+  std::shared_ptr<Stream> stream = opened(5);
+  std::shared_ptr<Stream> second = mirrors->find(kId);
+  stream.reset();
+  event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
+  EXPECT_TRUE(owner->connected()) << "one uses it still";
+  second.reset();
+  run_until(loop, [&] { return mirrors->size() == 0 && !owner->connected(); });
+  EXPECT_EQ(registry.budget().used(), 0u);
+}
+
+TEST_F(MirrorsTest, StaysForAWhileAfterItsLastUser) {
+  mirrors = std::make_unique<Mirrors>(parts, catalog, 50ms);
+  opened(5).reset();
+  auto opened_again = open();
+  ASSERT_TRUE(opened_again->has_value()) << "it is there still";
+  bool later = false;
+  EventSource timer = EventSource::timer(loop, [&] { later = true; });
+  timer.enable_in(100ms);
+  run_until(loop, [&] { return later; });
+  EXPECT_EQ(mirrors->size(), 1u) << "somebody uses it again";
+  const MonoTime left = MonoClock::now();
+  opened_again.reset();
+  run_until(loop, [&] { return mirrors->size() == 0; });
+  EXPECT_GE(MonoClock::now() - left, 50ms);
+  EXPECT_EQ(owner->connections(), 1);
+}
+
+TEST_F(MirrorsTest, ResumesBehindWhatItHas) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  owner->cut();
+  const net::Frame subscribe = serve(6);
+  EXPECT_EQ(subscribe.subscribe().from_tid(), 6);
+  EXPECT_EQ(subscribe.subscribe().incarnation(), 7u);
+  samples(6, 8);
+  owner->caught_up();
+  until_newest(*stream, 8);
+  until_state("live");
+  EXPECT_EQ(state().reconnects(), 1u);
+  EXPECT_EQ(state().gap_samples(), 0u);
+  EXPECT_EQ(state().error(), "");
+}
+
+TEST_F(MirrorsTest, CountsWhatTheOwnerNoLongerHas) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  owner->cut();
+  serve(6);
+  owner->gap(6, 14);
+  samples(20, 22);
+  owner->sample({23, {}, {}}, std::vector<std::byte>(24), true);
+  samples(24, 24);
+  until_newest(*stream, 24);
+  EXPECT_EQ(state().gap_samples(), 15u);
+  EXPECT_NE(logger.warnings.find("14 samples"), std::string::npos) << logger.warnings;
+  EXPECT_EQ(stream->info().oldest, 24);
+}
+
+TEST_F(MirrorsTest, KeepsTheRingWhileTheOwnerIsAway) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  catalog.host_down(owner->host().greeting.host_id, {Errc::daemon_away, "no sign of life"});
+  until_state("owner away");
+  EXPECT_NE(state().error().find("no sign of life"), std::string::npos) << state().error();
+  const auto answer = open();
+  ASSERT_TRUE(answer->has_value()) << "the history is here";
+  EXPECT_EQ(newest(*(*answer)->value()), 5);
+}
+
+TEST_F(MirrorsTest, FollowsTheOwnerToANewAddress) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  const wire::Greeting greeting = owner->host().greeting;
+  catalog.host_down(greeting.host_id, {Errc::daemon_away, "gone"});
+  owner = std::make_unique<FakeOwner>(loop);  // another port
+  catalog.host_up(owner->host().greeting, owner->host().address);
+  serve(6);
+  samples(6, 6);
+  until_newest(*stream, 6);
+}
+
+// The control connection went over to another network interface; the channel's may seem to work.
+TEST_F(MirrorsTest, LosesNothingWhenTheSameOwnerIsReachedAtAnotherAddress) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  const wire::Greeting greeting = owner->host().greeting;
+  const std::unique_ptr<FakeOwner> before = std::move(owner);
+  owner = std::make_unique<FakeOwner>(loop);
+  owner->greet_as(greeting);
+  catalog.host_down(greeting.host_id, {Errc::daemon_away, "no sign of life"});
+  catalog.host_up(greeting, owner->host().address);
+  const net::Frame subscribe = serve(6);
+  EXPECT_EQ(subscribe.subscribe().from_tid(), 6);
+  EXPECT_EQ(subscribe.subscribe().incarnation(), 7u);
+  samples(6, 8);
+  owner->caught_up();
+  until_newest(*stream, 8);
+  until_state("live");
+  EXPECT_EQ(stream->info().oldest, 0);
+  EXPECT_EQ(state().gap_samples(), 0u);
+  EXPECT_EQ(before->connections(), 1);
+}
+
+TEST_F(MirrorsTest, BeginsANewRingWhenTheOwnerLostIts) {
+  const std::shared_ptr<Stream> old = opened(5);
+  owner->cut();
+  theirs.incarnation = 8;
+  const net::Frame subscribe = serve(0);
+  EXPECT_TRUE(subscribe.subscribe().from_oldest());
+  samples(0, 1);
+  run_until(loop, [&] { return mirrors->find(kId) != old; });
+  EXPECT_TRUE(replaced.empty()) << "not before there is something to read";
+  owner->caught_up();
+  run_until(loop, [&] { return !replaced.empty(); });
+  EXPECT_EQ(replaced, std::vector<const Stream*>{old.get()});
+  EXPECT_EQ(newest(*old), 5) << "who holds it keeps it";
+  const auto answer = open();
+  ASSERT_TRUE(answer->has_value());
+  EXPECT_EQ((*answer)->value()->incarnation(), 8u);
+  EXPECT_EQ(newest(*(*answer)->value()), 1);
+  EXPECT_EQ(state().restarts(), 1u);
+  EXPECT_EQ(state().received_samples(), 8u) << "of both rings";
+}
+
+TEST_F(MirrorsTest, KeepsTheRingOfARemovedStreamAndTriesAgain) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  catalog.stream_added(owner->host().greeting.host_id, theirs).value();
+  owner->removed();
+  until_state("removed");
+  EXPECT_NE(state().error(), "");
+  catalog.stream_removed(owner->host().greeting.host_id, kId);
+  theirs.incarnation = 8;
+  catalog.stream_added(owner->host().greeting.host_id, theirs).value();
+  run_until(loop, [&] { return owner->connections() == 2; });
+  serve(0);
+  owner->caught_up();
+  until_state("live");
+  EXPECT_EQ(replaced.size(), 1u);
+}
+
+// The catalog's connection may be quicker than the channel.
+TEST_F(MirrorsTest, LendsNoRingOfAStreamThatTheCatalogKnowsToBeRemoved) {
+  const wire::HostId host_id = owner->host().greeting.host_id;
+  const std::shared_ptr<Stream> stream = opened(5);
+  catalog.stream_added(host_id, theirs).value();
+  catalog.stream_removed(host_id, kId);
+  const auto answer = open();
+  EXPECT_FALSE(answer->has_value());
+  samples(6, 6);
+  owner->removed();
+  run_until(loop, [&] { return answer->has_value(); });
+  EXPECT_EQ((*answer)->error().code, Errc::not_found);
+  EXPECT_EQ(newest(*stream), 6) << "its readers get the last samples";
+}
+
+TEST_F(MirrorsTest, LendsItsRingWhenTheCatalogHearsLateOfTheLastOnesRemoval) {
+  const wire::HostId host_id = owner->host().greeting.host_id;
+  const std::shared_ptr<Stream> stream = opened(5);
+  StreamInfo last = theirs;
+  last.incarnation = theirs.incarnation - 1;
+  catalog.stream_added(host_id, last).value();
+  catalog.stream_removed(host_id, kId);
+  const auto answer = open();
+  ASSERT_TRUE(answer->has_value());
+  EXPECT_EQ((*answer)->value(), stream);
+}
+
+TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  const KnownHost host = owner->host();
+  catalog.stream_added(host.greeting.host_id, theirs).value();
+  catalog.host_down(host.greeting.host_id, {Errc::daemon_away, "it is silent"});
+  catalog.host_up(host.greeting, host.address);
+  const auto answer = open();
+  ASSERT_TRUE(answer->has_value());
+  EXPECT_EQ((*answer)->value(), stream);
+}
+
+TEST_F(MirrorsTest, AsksAgainForARemovedStreamWhenSomebodyOpensIt) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  owner->removed();
+  until_state("removed");
+  const auto answer = open();
+  EXPECT_FALSE(answer->has_value());
+  run_until(loop, [&] { return owner->connections() == 2; });
+  owner->fail(owner->take(), Errc::not_found, "there is no such stream");
+  run_until(loop, [&] { return answer->has_value(); });
+  EXPECT_EQ((*answer)->error().code, Errc::not_found);
+  EXPECT_EQ(mirrors->size(), 1u) << "its reader stays";
+  // Nobody has to tell: it looks by itself as well.
+  run_until(loop, [&] { return owner->connections() == 3; });
+  serve(6);
+  owner->caught_up();
+  until_state("live");
+}
+
+TEST_F(MirrorsTest, GoesOnWithARingThatAProgramKept) {
+  std::vector<UniqueFd> kept;
+  {
+    const std::shared_ptr<Stream> stream = opened(5);
+    kept = stream->descriptors_for(Role::reader).value();
+  }
+  mirrors = std::make_unique<Mirrors>(parts, catalog, 0ms);
+  catalog.host_down(owner->host().greeting.host_id, {Errc::daemon_away, "not known yet"});
+  std::vector<UniqueFd> again;
+  for (const UniqueFd& fd : kept) again.push_back(copy_of(fd));
+  auto stream = mirrors->adopt_untrusted(kId, as_offer(std::move(again)));
+  ASSERT_TRUE(stream) << stream.error().message;
+  EXPECT_EQ(state().state(), "connecting");
+  EXPECT_EQ(state().newest(), 5);
+  // The second program that holds it.
+  auto second = mirrors->adopt_untrusted(kId, as_offer(std::move(kept)));
+  ASSERT_TRUE(second) << second.error().message;
+  EXPECT_EQ(second->get(), stream->get());
+  catalog.host_up(owner->host().greeting, owner->host().address);
+  const net::Frame subscribe = serve(6);
+  EXPECT_EQ(subscribe.subscribe().from_tid(), 6);
+  samples(6, 6);
+  until_newest(**stream, 6);
+}
+
+TEST_F(MirrorsTest, RefusesRingsThatAreNoMirrors) {
+  const auto offer = [&](Purpose purpose, const StreamId& id) {
+    auto stream =
+        Stream::create(
+            {.id = id, .type = odometry_type(), .depth = 16, .cycle = 1ms, .purpose = purpose},
+            registry.budget())
+            .value();
+    return mirrors->adopt_untrusted(kId, as_offer(stream->descriptors_for(Role::reader).value()));
+  };
+  // Programs can write to these: dssmd must not build on what stands there.
+  EXPECT_EQ(offer(Purpose::remote_writer, kId).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::own, kId).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::mirror, {"other", 0, "pc2"}).error().code, Errc::protocol);
+  EXPECT_EQ(mirrors->size(), 0u);
+  EXPECT_EQ(registry.budget().used(), 0u);
+}
+
+TEST_F(MirrorsTest, RefusesAnOfferedRingWhenTheMirrorHasAnother) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  auto other = Stream::create({.id = kId,
+                               .type = odometry_type(),
+                               .depth = 16,
+                               .cycle = 1ms,
+                               .purpose = Purpose::mirror,
+                               .incarnation = 7},
+                              registry.budget())
+                   .value();
+  EXPECT_EQ(mirrors->adopt_untrusted(kId, as_offer(other->descriptors_for(Role::reader).value()))
+                .error()
+                .code,
+            Errc::conflict);
+  EXPECT_EQ(mirrors->size(), 1u);
+}
+
+TEST_F(MirrorsTest, DoesNotReadFromAnotherPcAtTheOwnersAddress) {
+  owner->call_itself("pc3");
+  const auto answer = open();
+  run_until(loop, [&] { return answer->has_value(); });
+  EXPECT_EQ((*answer)->error().code, Errc::daemon_away);
+  EXPECT_NE((*answer)->error().message.find("pc3"), std::string::npos)
+      << (*answer)->error().message;
+  EXPECT_FALSE(owner->asked() && owner->take().has_open());
+}
+
+// Each costs the connection, and nothing else: the mirror tries again.
+TEST_F(MirrorsTest, ClosesTheChannelOfAnOwnerThatBreaksTheProtocol) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  int connections = 1;
+  const auto expect_closed = [&](const std::function<void()>& offence) {
+    offence();
+    run_until(loop, [&] { return owner->connections() > connections; });
+    ++connections;
+    serve(6);
+    owner->caught_up();
+    until_state("live");
+    EXPECT_EQ(newest(*stream), 5);
+  };
+  expect_closed([&] { samples(5, 5); });                     // a tid twice
+  expect_closed([&] { owner->gap(0, 3); });                  // what is here
+  expect_closed([&] { owner->say(theirs, net::Frame()); });  // unasked
+  expect_closed([&] { owner->sample({6, {}, {}}, std::vector<std::byte>(25)); });
+}
+
+TEST_F(MirrorsTest, IgnoresWhatALaterVersionMaySay) {
+  const std::shared_ptr<Stream> stream = opened(5);
+  owner->send(net::Frame());
+  samples(6, 6);
+  until_newest(*stream, 6);
+  EXPECT_EQ(owner->connections(), 1);
+}
+
+}  // namespace
+}  // namespace dssm::daemon

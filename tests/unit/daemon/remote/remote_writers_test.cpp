@@ -1,0 +1,480 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Remote writers against an owner that does what the test says.
+#include "daemon/remote/remote_writers.hpp"
+
+#include <gtest/gtest.h>
+
+#include "core/ring/ring_writer.hpp"
+#include "tests/unit/daemon/daemon_fixtures.hpp"
+#include "tests/unit/daemon/remote/fake_owner.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+using namespace std::chrono_literals;
+
+const StreamId kOdometry{"odometry", 0, "pc2"};
+
+class KeptLines final : public Logger {
+ public:
+  void write(LogLevel level, std::string_view text, const LogFields&) noexcept override {
+    if (level <= LogLevel::warning) warnings += std::string(text) + "\n";
+  }
+  std::string warnings;
+};
+
+// A program that has the ring open for writing.
+class Program {
+ public:
+  explicit Program(Stream& stream) : fds_(stream.descriptors_for(Role::writer).value()) {
+    mapping_ = ring::RingMapping::open_untrusted(fds_[0].get(), ring::Access::read_write).value();
+    bell_ = ring::Bell::open_untrusted(fds_[1].get()).value();
+  }
+  // Sample i has the time i and bytes of i. Returns its tid.
+  Tid write(int i) {
+    ring::RingWriter writer(*mapping_, *bell_, fds_[3].get());
+    return writer.write(std::vector<std::byte>(24, static_cast<std::byte>(i)), time_from_ns(i),
+                        Duration(1));
+  }
+  OfferedFiles offer() const {
+    std::vector<UniqueFd> copies;
+    for (const UniqueFd& fd : fds_) copies.push_back(copy_of(fd));
+    return as_offer(std::move(copies));
+  }
+
+ private:
+  std::vector<UniqueFd> fds_;
+  std::shared_ptr<const ring::RingMapping> mapping_;
+  std::shared_ptr<ring::Bell> bell_;
+};
+
+class RemoteWritersTest : public testing::Test {
+ protected:
+  EventLoop loop = EventLoop::open().value();
+  Resolver resolver{loop};
+  Registry registry{"pc1", kLimits};
+  KeptLines logger;
+  Catalog catalog{"pc1"};
+  wire::Greeting self = greeting_of("pc1");
+  ChannelParts parts{loop, resolver, registry, logger, self};
+  std::unique_ptr<RemoteWriters> writers = std::make_unique<RemoteWriters>(parts, catalog);
+  std::unique_ptr<FakeOwner> owner = std::make_unique<FakeOwner>(loop);
+  CreatePlan plan{odometry_type(), kHistory};
+  StreamInfo theirs;
+
+  RemoteWritersTest() {
+    theirs.id = kOdometry;
+    theirs.type = odometry_type();
+    theirs.depth = 16;
+    theirs.cycle = 10ms;
+    theirs.incarnation = 7;
+    catalog.host_up(owner->host().greeting, owner->host().address);
+  }
+
+  using Answer = std::optional<Result<OpenedRemoteWriter>>;
+  std::shared_ptr<Answer> open(const CreatePlan* with) {
+    auto answer = std::make_shared<Answer>();
+    writers->open(owner->host(), kOdometry, with, [answer](Result<OpenedRemoteWriter> result) {
+      answer->emplace(std::move(result));
+    });
+    return answer;
+  }
+  OpenedRemoteWriter wait(const std::shared_ptr<Answer>& answer) {
+    run_until(loop, [&] { return answer->has_value(); });
+    return (*answer)->value();
+  }
+  Error wait_error(const std::shared_ptr<Answer>& answer) {
+    run_until(loop, [&] { return answer->has_value(); });
+    return (*answer)->error();
+  }
+  // Answers Open or Create, and StartPublishing. Returns the publisher's number.
+  std::uint64_t serve(Tid last, bool created = false) {
+    net::Frame opened;
+    opened.set_serial(owner->take().serial());
+    wire::to_message(theirs, *opened.mutable_opened()->mutable_stream());
+    opened.mutable_opened()->set_created(created);
+    owner->send(opened);
+    const net::Frame start = owner->take();
+    EXPECT_TRUE(start.has_start_publishing());
+    publishing(start, last);
+    return start.start_publishing().publisher();
+  }
+  void publishing(const net::Frame& start, Tid last) {
+    owner->take_samples(24);
+    net::Frame answer;
+    answer.set_serial(start.serial());
+    answer.mutable_publishing()->set_last(last);
+    owner->send(answer);
+  }
+  void acknowledge(Tid last) {
+    net::Frame frame;
+    frame.mutable_published()->set_last(last);
+    owner->send(frame);
+  }
+  std::shared_ptr<Stream> opened() {
+    const auto answer = open(&plan);
+    serve(-1, true);
+    return wait(answer).stream;
+  }
+  // Sample i is the one that Program::write(i) wrote.
+  void until_published(int i) {
+    run_until(loop, [&] {
+      return !owner->published.empty() && owner->published.back().info.time == time_from_ns(i) &&
+             owner->published.back().complete;
+    });
+  }
+  std::vector<int> times() {
+    std::vector<int> times;
+    for (const FakeOwner::Published& one : owner->published) {
+      times.push_back(static_cast<int>(to_ns(one.info.time)));
+      EXPECT_EQ(one.payload, std::vector<std::byte>(24, static_cast<std::byte>(times.back())));
+    }
+    return times;
+  }
+};
+
+TEST_F(RemoteWritersTest, CreatesTheStreamAtItsOwnerAndPublishes) {
+  const auto answer = open(&plan);
+  const net::Frame create = owner->take();
+  ASSERT_TRUE(create.has_create());
+  EXPECT_EQ(create.create().id().name(), "odometry");
+  EXPECT_EQ(create.create().depth(), kHistory.depth);
+  EXPECT_EQ(create.create().cycle_ns(), to_ns(kHistory.cycle));
+  EXPECT_EQ(create.create().type().name(), "Odometry");
+  owner->say(theirs, create);
+  publishing(owner->take(), -1);
+  const OpenedRemoteWriter writer = wait(answer);
+  EXPECT_FALSE(writer.created);
+  EXPECT_EQ(writer.stream->id(), kOdometry);
+  EXPECT_EQ(writer.stream->type(), odometry_type());
+  EXPECT_EQ(writer.stream->purpose(), Purpose::remote_writer);
+  Program program(*writer.stream);
+  for (int i = 0; i < 5; ++i) EXPECT_EQ(program.write(i), i);
+  until_published(4);
+  EXPECT_EQ(times(), (std::vector<int>{0, 1, 2, 3, 4}));
+  for (int i = 0; i < 5; ++i) {
+    EXPECT_EQ(owner->published[static_cast<std::size_t>(i)].info.tid, i);
+    EXPECT_EQ(owner->published[static_cast<std::size_t>(i)].info.clock_error, Duration(1));
+    EXPECT_EQ(owner->published[static_cast<std::size_t>(i)].serial, 0u);
+  }
+}
+
+TEST_F(RemoteWritersTest, TellsWhoCreatedTheStream) {
+  const auto first = open(&plan), second = open(&plan);
+  serve(-1, true);
+  EXPECT_TRUE(wait(first).created);
+  EXPECT_FALSE(wait(second).created);
+  EXPECT_EQ(wait(first).stream, wait(second).stream);
+  EXPECT_EQ(owner->connections(), 1);
+}
+
+// Then write() returns the tid that the sample gets over there.
+TEST_F(RemoteWritersTest, GoesOnWithTheTidsOfTheOwnersRing) {
+  theirs.newest = 99;
+  Program program(*opened());
+  EXPECT_EQ(program.write(0), 100);
+  EXPECT_EQ(program.write(1), 101);
+  until_published(1);
+  EXPECT_EQ(owner->published.front().info.tid, 100);
+  EXPECT_EQ(times(), (std::vector<int>{0, 1}));
+}
+
+TEST_F(RemoteWritersTest, OpensAnExistingStreamWithoutCreatingIt) {
+  const auto answer = open(nullptr);
+  const net::Frame request = owner->take();
+  EXPECT_TRUE(request.has_open());
+  owner->fail(request, Errc::not_found, "there is no stream 'odometry:0@pc2'");
+  EXPECT_EQ(wait_error(answer).code, Errc::not_found);
+  run_until(loop, [&] { return writers->size() == 0; });
+  EXPECT_EQ(registry.budget().used(), 0u);
+}
+
+// One is refused, the other not.
+TEST_F(RemoteWritersTest, AsksForEachWhoWaitsWhatItWants) {
+  const auto opening = open(nullptr), creating = open(&plan);
+  owner->fail(owner->take(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
+  EXPECT_EQ(wait_error(opening).code, Errc::not_found);
+  EXPECT_FALSE(creating->has_value());
+  serve(-1, true);
+  EXPECT_TRUE(wait(creating).created);
+}
+
+TEST_F(RemoteWritersTest, HandsOnThatTheTypeDiffers) {
+  const auto answer = open(&plan);
+  owner->fail(owner->take(), Errc::type_mismatch, "it has 8 bytes");
+  EXPECT_EQ(wait_error(answer).code, Errc::type_mismatch);
+}
+
+TEST_F(RemoteWritersTest, ChecksTheTypeOfThoseWhoJoin) {
+  const std::shared_ptr<Stream> stream = opened();
+  const CreatePlan other{{"Other", 24, 8, {}}, kHistory};
+  const auto answer = open(&other);
+  ASSERT_TRUE(answer->has_value());
+  EXPECT_EQ((*answer)->error().code, Errc::type_mismatch);
+  EXPECT_TRUE(open(&plan)->has_value());
+}
+
+TEST_F(RemoteWritersTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
+  const KnownHost host = owner->host();
+  owner.reset();
+  std::optional<Error> error;
+  writers->open(host, kOdometry, &plan,
+                [&](Result<OpenedRemoteWriter> result) { error = result.error(); });
+  run_until(loop, [&] { return error.has_value(); });
+  EXPECT_EQ(error->code, Errc::daemon_away);
+  EXPECT_NE(error->message.find("odometry:0@pc2"), std::string::npos) << error->message;
+  run_until(loop, [&] { return writers->size() == 0; });
+}
+
+TEST_F(RemoteWritersTest, CatchesUpFromWhereTheOwnerStopped) {
+  const std::shared_ptr<Stream> stream = opened();
+  Program program(*stream);
+  for (int i = 0; i < 3; ++i) program.write(i);
+  until_published(2);
+  acknowledge(0);
+  owner->published.clear();
+  owner->cut();
+  for (int i = 3; i < 6; ++i) EXPECT_EQ(program.write(i), i) << "it goes on without the link";
+  EXPECT_EQ(serve(1), stream->incarnation()) << "the same publisher";
+  until_published(5);
+  EXPECT_EQ(times(), (std::vector<int>{2, 3, 4, 5})) << "1 was written though not acknowledged";
+}
+
+// Its ring is another one, or 64 others have published since. Also while it is connected: when the
+// first sample comes torn, for example, it has none to acknowledge.
+TEST_F(RemoteWritersTest, GoesOnBehindWhatItKnowsWhenTheOwnerHasForgottenIt) {
+  const std::shared_ptr<Stream> stream = opened();
+  const auto expect_known = [&](Tid last) {
+    run_until(loop, [&] { return stream->mapping().header().first.load() == last + 1; });
+  };
+  Program program(*stream);
+  for (int i = 0; i < 4; ++i) program.write(i);
+  until_published(3);
+  acknowledge(1);
+  expect_known(1);
+  owner->published.clear();
+  owner->cut();
+  serve(kNoTid);
+  until_published(3);
+  acknowledge(kNoTid);
+  acknowledge(2);
+  expect_known(2);
+  owner->cut();
+  serve(0);
+  acknowledge(1);
+  program.write(4);
+  until_published(4);
+  EXPECT_EQ(times(), (std::vector<int>{2, 3, 3, 4}));
+  EXPECT_EQ(owner->connections(), 3);
+}
+
+TEST_F(RemoteWritersTest, GoesOnInANewRingOfTheOwner) {
+  Program program(*opened());
+  for (int i = 0; i < 3; ++i) program.write(i);
+  until_published(2);
+  acknowledge(1);
+  owner->published.clear();
+  owner->cut();
+  theirs.incarnation = 8;  // came back without its ring
+  EXPECT_TRUE(owner->take().has_create()) << "so it is created again";
+}
+
+TEST_F(RemoteWritersTest, PublishesIntoANewRingWhatWasNotPublished) {
+  const std::shared_ptr<Stream> stream = opened();
+  Program program(*stream);
+  for (int i = 0; i < 3; ++i) program.write(i);
+  until_published(2);
+  acknowledge(1);
+  run_until(loop, [&] { return stream->mapping().header().first.load() == 2; });
+  owner->published.clear();
+  owner->cut();
+  theirs.incarnation = 8;
+  serve(-1, true);
+  until_published(2);
+  EXPECT_EQ(times(), (std::vector<int>{2}));
+}
+
+TEST_F(RemoteWritersTest, CountsWhatItsRingNoLongerHolds) {
+  const std::shared_ptr<Stream> stream = opened();
+  Program program(*stream);
+  program.write(0);
+  until_published(0);
+  owner->cut();
+  owner->published.clear();
+  const Tid depth = static_cast<Tid>(stream->info().depth);
+  EXPECT_EQ(depth, static_cast<Tid>(OutgoingRing::kMinSlots));
+  for (int i = 1; i <= depth + 9; ++i) program.write(i);
+  serve(0);
+  until_published(static_cast<int>(depth) + 9);
+  EXPECT_EQ(owner->published.front().info.tid, 11);
+  EXPECT_EQ(owner->published.size(), static_cast<std::size_t>(depth - 1));
+  EXPECT_NE(logger.warnings.find("lacks 10 samples"), std::string::npos) << logger.warnings;
+}
+
+TEST_F(RemoteWritersTest, EndsWhenItsProgramsHaveGoneAndAllIsPublished) {
+  std::shared_ptr<Stream> stream = opened();
+  std::optional<Program> program(std::in_place, *stream);
+  program->write(0);
+  program.reset();
+  stream.reset();
+  until_published(0);
+  event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
+  EXPECT_EQ(writers->size(), 1u) << "not known to be written";
+  acknowledge(0);
+  run_until(loop, [&] { return writers->size() == 0 && !owner->connected(); });
+  EXPECT_EQ(registry.budget().used(), 0u);
+  EXPECT_EQ(logger.warnings, "");
+}
+
+TEST_F(RemoteWritersTest, EndsAtOnceWhenNothingIsLeftToPublish) {
+  opened().reset();
+  run_until(loop, [&] { return writers->size() == 0; });
+}
+
+TEST_F(RemoteWritersTest, IsJoinedWhileItDrains) {
+  std::shared_ptr<Stream> stream = opened();
+  Program program(*stream);
+  program.write(0);
+  until_published(0);
+  stream.reset();
+  stream = wait(open(&plan)).stream;
+  acknowledge(0);
+  program.write(1);
+  until_published(1);
+  EXPECT_EQ(owner->connections(), 1);
+}
+
+TEST_F(RemoteWritersTest, LeavesARemovedStreamAloneUntilItIsCreatedAgain) {
+  const std::shared_ptr<Stream> stream = opened();
+  Program program(*stream);
+  owner->removed();
+  run_until(loop, [&] { return owner->connections() == 2; });  // it looks by itself
+  const net::Frame look = owner->take();
+  EXPECT_TRUE(look.has_open()) << "but does not create it";
+  owner->fail(look, Errc::not_found, "there is no stream");
+  program.write(0);
+  const auto answer = open(&plan);  // somebody does
+  run_until(loop, [&] { return owner->connections() == 3; });
+  theirs.incarnation = 8;
+  serve(-1, true);
+  EXPECT_TRUE(wait(answer).created);
+  until_published(0);
+  EXPECT_EQ(times(), (std::vector<int>{0}));
+}
+
+TEST_F(RemoteWritersTest, GoesOnWithARingThatAProgramKept) {
+  std::optional<Program> program;
+  std::uint64_t publisher = 0;
+  {
+    const std::shared_ptr<Stream> stream = opened();
+    program.emplace(*stream);
+    publisher = stream->incarnation();
+    for (int i = 0; i < 3; ++i) program->write(i);
+    until_published(2);
+    acknowledge(1);
+    run_until(loop, [&] { return stream->mapping().header().first.load() == 2; });
+    owner->published.clear();
+    writers.reset();  // dies
+  }
+  program->write(3);
+  catalog.host_down(owner->host().greeting.host_id, {Errc::daemon_away, "not known yet"});
+  writers = std::make_unique<RemoteWriters>(parts, catalog);
+  const auto stream = writers->adopt_untrusted(kOdometry, program->offer());
+  ASSERT_TRUE(stream) << stream.error().message;
+  const auto again = writers->adopt_untrusted(kOdometry, program->offer());
+  ASSERT_TRUE(again) << again.error().message;
+  EXPECT_EQ(stream->get(), again->get());
+  catalog.host_up(owner->host().greeting, owner->host().address);
+  // Sample 2 was written, and the word of it was lost with both.
+  EXPECT_EQ(serve(2), publisher);
+  until_published(3);
+  EXPECT_EQ(times(), (std::vector<int>{3}));
+  program->write(4);  // with the doorbell that it kept
+  until_published(4);
+}
+
+// Somebody opened the stream before the program came back: no sample of either may get lost.
+TEST_F(RemoteWritersTest, PublishesAKeptRingBesideOneThatWasOpenedSince) {
+  std::optional<Program> program;
+  {
+    const std::shared_ptr<Stream> stream = opened();
+    program.emplace(*stream);
+    writers.reset();
+  }
+  writers = std::make_unique<RemoteWriters>(parts, catalog);
+  const std::shared_ptr<Stream> since = opened();
+  const int before = owner->connections();
+  const auto kept = writers->adopt_untrusted(kOdometry, program->offer());
+  ASSERT_TRUE(kept) << kept.error().message;
+  EXPECT_NE(kept->get(), since.get());
+  EXPECT_EQ(writers->adopt_untrusted(kOdometry, program->offer()).value(), *kept);
+  EXPECT_EQ(writers->size(), 2u);
+  run_until(loop, [&] { return owner->connections() > before; });
+  program->write(7);
+  EXPECT_EQ(serve(-1), (*kept)->incarnation()) << "as a publisher of its own";
+  until_published(7);
+  EXPECT_EQ(wait(open(&plan)).stream, since) << "the one that is opened stays the same";
+}
+
+TEST_F(RemoteWritersTest, RefusesRingsThatAreNoRemoteWriters) {
+  const auto offer = [&](Purpose purpose, const StreamId& id) {
+    auto stream =
+        Stream::create(
+            {.id = id, .type = odometry_type(), .depth = 16, .cycle = 1ms, .purpose = purpose},
+            registry.budget())
+            .value();
+    return writers->adopt_untrusted(kOdometry,
+                                    as_offer(stream->descriptors_for(Role::writer).value()));
+  };
+  EXPECT_EQ(offer(Purpose::mirror, kOdometry).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::own, kOdometry).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::remote_writer, {"other", 0, "pc2"}).error().code, Errc::protocol);
+  EXPECT_EQ(writers->size(), 0u);
+}
+
+// Each costs the connection, and nothing else.
+TEST_F(RemoteWritersTest, ClosesTheChannelOfAnOwnerThatBreaksTheProtocol) {
+  const std::shared_ptr<Stream> stream = opened();
+  Program program(*stream);
+  program.write(0);
+  until_published(0);
+  int connections = 1;
+  const auto expect_closed = [&](const std::function<void()>& offence) {
+    offence();
+    run_until(loop, [&] { return owner->connections() > connections; });
+    ++connections;
+    serve(0);
+  };
+  expect_closed([&] { acknowledge(5); });                                          // never sent
+  expect_closed([&] { acknowledge(INT64_MAX); });                                  // nor that
+  expect_closed([&] { owner->sample({0, {}, {}}, std::vector<std::byte>(24)); });  // unasked
+  program.write(1);
+  until_published(1);
+}
+
+TEST_F(RemoteWritersTest, DoesNotBelieveNonsenseInARingThatProgramsWriteTo) {
+  const std::shared_ptr<Stream> stream = opened();
+  Program program(*stream);
+  program.write(0);
+  until_published(0);
+  const auto mapping = stream->map_for_writing().value();
+  for (const Tid nonsense : {Tid{INT64_MAX}, Tid{INT64_MIN}, kLastTid + 1}) {
+    mapping->header().first.store(nonsense);
+    owner->cut();
+    serve(0);
+  }
+  mapping->header().first.store(1);
+  mapping->header().top.store(INT64_MAX);
+  owner->cut();
+  const int before = owner->connections();
+  run_until(loop, [&] { return owner->connections() > before; });
+  mapping->header().top.store(0);
+  owner->cut();
+  serve(0);
+  program.write(1);
+  until_published(1);
+}
+
+}  // namespace
+}  // namespace dssm::daemon

@@ -1,0 +1,548 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What a channel does for one stream: reads, subscriptions, publishing, property, and the stream's
+// end.
+#include "daemon/serve/stream_channel.hpp"
+
+#include <thread>
+
+#include "core/wire/sample_frame.hpp"
+#include "tests/unit/daemon/remote/fake_clock_rules.hpp"
+#include "tests/unit/daemon/serve/server_rig.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+constexpr std::uint64_t kBytes = 24;
+
+std::vector<std::byte> sample_frame(std::int64_t number, std::uint64_t serial = 0,
+                                    std::byte fill = std::byte{9},
+                                    std::uint64_t payload_bytes = kBytes) {
+  std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
+  const std::size_t bytes =
+      wire::encode_sample_header(header, serial, {number, time_from_ns(5000 + number), Duration(4)},
+                                 payload_bytes, wire::Trailer::none);
+  std::vector<std::byte> frame(header.begin(), header.begin() + bytes);
+  frame.resize(frame.size() + payload_bytes, fill);
+  return frame;
+}
+
+class StreamChannelTest : public testing::Test {
+ protected:
+  void SetUp() override {
+    stream = rig.create("odometry", kBytes, 8);
+    rig.connect(peer);
+    rig.open(peer, "odometry");
+  }
+
+  net::Frame request(std::uint64_t serial) {
+    net::Frame frame;
+    frame.set_serial(serial);
+    return frame;
+  }
+  std::vector<SentItem> take() { return rig.take(peer, kBytes); }
+  std::vector<SentItem> ask(const net::Frame& frame) {
+    peer.put(frame);
+    rig.turns();
+    return take();
+  }
+
+  // The tid that a Read brings, or minus its status.
+  Tid read(const net::Read& what) {
+    net::Frame frame = request(50);
+    *frame.mutable_read() = what;
+    const std::vector<SentItem> items = ask(frame);
+    EXPECT_EQ(items.size(), 1u);
+    if (items.empty()) return -100;
+    EXPECT_EQ(items[0].frame.serial(), 50u);
+    if (items[0].frame.has_no_sample()) {
+      return -static_cast<Tid>(items[0].frame.no_sample().status());
+    }
+    const Tid tid = items[0].frame.sample().tid();
+    EXPECT_EQ(items[0].payload, ServerRig::payload_for(tid, kBytes));
+    return tid;
+  }
+  Tid read_tid(Tid tid) {
+    net::Read what;
+    what.set_tid(tid);
+    return read(what);
+  }
+  Tid read_time(std::int64_t ns) {
+    net::Read what;
+    what.set_time_ns(ns);
+    return read(what);
+  }
+
+  // "subscribed:0 1 2 caught_up gap:3+4 ended", and the like.
+  static std::string words(const std::vector<SentItem>& items) {
+    std::string text;
+    for (const SentItem& item : items) {
+      text += text.empty() ? "" : " ";
+      if (item.frame.has_subscribed()) {
+        text += "subscribed:" + std::to_string(item.frame.subscribed().first_tid());
+      } else if (item.frame.has_gap()) {
+        text += "gap:" + std::to_string(item.frame.gap().first_tid()) + "+" +
+                std::to_string(item.frame.gap().count());
+      } else if (item.frame.has_caught_up()) {
+        text += "caught_up";
+      } else if (item.frame.has_ended()) {
+        text += item.frame.ended().removed() ? "removed" : "ended";
+      } else if (item.frame.has_sample()) {
+        text += std::to_string(item.frame.sample().tid());
+      } else if (item.frame.has_published()) {
+        text += "published:" + std::to_string(item.frame.published().last()) + "=" +
+                std::to_string(item.frame.published().last_tid());
+      } else if (item.frame.has_failure()) {
+        text += "failure:" + item.frame.failure().code();
+      } else {
+        text += "?";
+      }
+    }
+    return text;
+  }
+  std::string subscribe(const std::function<void(net::Subscribe&)>& how) {
+    net::Frame frame = request(60);
+    how(*frame.mutable_subscribe());
+    return words(ask(frame));
+  }
+
+  net::Publishing start_publishing(std::uint64_t publisher) {
+    net::Frame frame = request(70);
+    frame.mutable_start_publishing()->set_publisher(publisher);
+    const std::vector<SentItem> items = ask(frame);
+    EXPECT_EQ(items.size(), 1u);
+    if (items.empty()) return {};
+    EXPECT_TRUE(items[0].frame.has_publishing()) << items[0].frame.failure().message();
+    return items[0].frame.publishing();
+  }
+
+  ServerRig rig;
+  FakePeer peer;
+  std::shared_ptr<Stream> stream;
+};
+
+// --- reads
+
+TEST_F(StreamChannelTest, ReadsByTidTimeAndNewest) {
+  constexpr Tid kNotYet = -1, kTooOld = -2;
+  net::Read newest, newer;
+  newest.set_newest(true);
+  EXPECT_EQ(read(newest), kNotYet);
+  EXPECT_EQ(read_tid(0), kNotYet);
+  EXPECT_EQ(read_time(1'000'000), kNotYet);
+  rig.write(*stream, 20);  // 13 to 19 are held; times 1000 + 10 * tid
+  EXPECT_EQ(read(newest), 19);
+  EXPECT_EQ(read_tid(13), 13);
+  EXPECT_EQ(read_tid(12), kTooOld);
+  EXPECT_EQ(read_tid(20), kNotYet);
+  EXPECT_EQ(read_tid(-3), kTooOld);
+  EXPECT_EQ(read_time(1155), 15);
+  EXPECT_EQ(read_time(999'999), 19);
+  EXPECT_EQ(read_time(1129), kTooOld);
+  newer.set_newer_than(18);
+  EXPECT_EQ(read(newer), 19);
+  newer.set_newer_than(19);
+  EXPECT_EQ(read(newer), kNotYet);
+}
+
+TEST_F(StreamChannelTest, TellsItsRange) {
+  net::Frame frame = request(1);
+  frame.mutable_get_range()->set_time_ns(1155);
+  net::Range range = ask(frame).at(0).frame.range();
+  EXPECT_EQ(range.oldest(), -1);
+  EXPECT_EQ(range.newest(), -1);
+  EXPECT_EQ(range.at_tid(), -1);
+  rig.write(*stream, 20);
+  range = ask(frame).at(0).frame.range();
+  EXPECT_EQ(range.oldest(), 13);
+  EXPECT_EQ(range.newest(), 19);
+  EXPECT_EQ(range.at_tid(), 15);
+  frame.mutable_get_range()->clear_time_ns();
+  EXPECT_EQ(ask(frame).at(0).frame.range().at_tid(), -1);
+}
+
+// --- subscriptions
+
+TEST_F(StreamChannelTest, BeginsASubscriptionWhereItIsAskedTo) {
+  rig.write(*stream, 20);
+  EXPECT_EQ(subscribe([](auto& s) { s.set_from_oldest(true); }),
+            "subscribed:13 13 14 15 16 17 18 19 caught_up");
+  EXPECT_EQ(subscribe([](auto& s) { s.set_from_now(true); }), "subscribed:20 caught_up");
+  EXPECT_EQ(subscribe([](auto&) {}), "subscribed:20 caught_up");
+  EXPECT_EQ(subscribe([](auto& s) { s.set_from_tid(17); }), "subscribed:17 17 18 19 caught_up");
+  EXPECT_EQ(subscribe([](auto& s) { s.set_from_tid(10); }),
+            "subscribed:10 gap:10+3 13 14 15 16 17 18 19 caught_up");
+  EXPECT_EQ(subscribe([](auto& s) { s.set_from_time_ns(1175); }),
+            "subscribed:17 17 18 19 caught_up");
+  EXPECT_EQ(subscribe([](auto& s) { s.set_from_time_ns(5); }),
+            "subscribed:13 13 14 15 16 17 18 19 caught_up");
+  rig.write(*stream);
+  rig.turns();
+  EXPECT_EQ(words(take()), "20") << "the last subscription alone";
+}
+
+TEST_F(StreamChannelTest, BeginsAnewWhenTheTidIsAnotherRings) {
+  rig.write(*stream, 3);
+  EXPECT_EQ(subscribe([&](auto& s) {
+              s.set_from_tid(2);
+              s.set_incarnation(stream->incarnation());
+            }),
+            "subscribed:2 2 caught_up");
+  EXPECT_EQ(subscribe([&](auto& s) {
+              s.set_from_tid(2);
+              s.set_incarnation(stream->incarnation() + 1);
+            }),
+            "subscribed:0 0 1 2 caught_up");
+}
+
+TEST_F(StreamChannelTest, SendsWhatIsWrittenFromThenOn) {
+  EXPECT_EQ(subscribe([](auto& s) { s.set_from_now(true); }), "subscribed:0 caught_up");
+  for (int i = 0; i < 3; ++i) {
+    rig.write(*stream);
+    rig.turns();
+    EXPECT_EQ(words(take()), std::to_string(i));
+  }
+}
+
+TEST_F(StreamChannelTest, ServesReadsInTheMidstOfASubscription) {
+  subscribe([](auto& s) { s.set_from_now(true); });
+  peer.room = 30;
+  rig.write(*stream, 5);
+  rig.turns();
+  peer.put(sample_read(99, 4));
+  rig.turns();
+  peer.room = FakePeer::kAll;
+  rig.turns(20);
+  std::string subscribed;
+  int answers = 0;
+  for (const SentItem& item : take()) {
+    if (item.frame.serial() == 99) {
+      ++answers;
+      EXPECT_EQ(item.payload, ServerRig::payload_for(4, kBytes));
+    } else {
+      subscribed += std::to_string(item.frame.sample().tid());
+    }
+  }
+  EXPECT_EQ(answers, 1);
+  EXPECT_EQ(subscribed, "01234");
+}
+
+TEST_F(StreamChannelTest, ThinsAtTheSource) {
+  rig.write(*stream, 5);
+  EXPECT_EQ(subscribe([](auto& s) {
+              s.set_from_oldest(true);
+              s.set_max_rate_hz(50);
+            }),
+            "subscribed:0 4 caught_up");
+  // A sample each millisecond; 20 ms must pass between two that are sent.
+  const MonoTime begin = MonoClock::now();
+  std::vector<Tid> got;
+  ASSERT_TRUE(run_until(rig.loop, [&] {
+    rig.write(*stream);
+    for (const SentItem& item : take()) {
+      EXPECT_TRUE(item.frame.has_sample()) << "a gap for what was left out";
+      got.push_back(item.frame.sample().tid());
+    }
+    return got.size() == 5;
+  }));
+  EXPECT_GE(MonoClock::now() - begin, std::chrono::milliseconds(20 * 4));
+  EXPECT_TRUE(std::is_sorted(got.begin(), got.end()));
+}
+
+TEST_F(StreamChannelTest, RefusesARateThatIsNone) {
+  for (const double rate :
+       {-1.0, std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::infinity()}) {
+    EXPECT_EQ(subscribe([rate](auto& s) { s.set_max_rate_hz(rate); }), "failure:invalid_argument");
+  }
+}
+
+TEST_F(StreamChannelTest, SendsTheRestThenTellsThatTheStreamWasRemoved) {
+  EXPECT_EQ(subscribe([](auto& s) { s.set_from_now(true); }), "subscribed:0 caught_up");
+  peer.room = 0;
+  rig.write(*stream, 4);
+  rig.turns();
+  ASSERT_TRUE(rig.registry.remove({"odometry", 0, ""}));
+  rig.turns();
+  peer.room = FakePeer::kAll;
+  rig.turns(20);
+  EXPECT_EQ(words(take()), "0 1 2 3 removed");
+  EXPECT_EQ(words(ask(sample_read(1, 0))), "failure:not_found");
+  rig.write(*stream);
+  rig.turns();
+  EXPECT_EQ(words(take()), "") << "nothing follows";
+}
+
+TEST_F(StreamChannelTest, TellsOfTheRemovalAlsoWhoDidNotSubscribe) {
+  ASSERT_TRUE(rig.registry.remove({"odometry", 0, ""}));
+  rig.turns();
+  EXPECT_EQ(words(take()), "removed");
+}
+
+TEST_F(StreamChannelTest, DoesNotDisturbTheWriterWhileNobodySubscribes) {
+  const auto bell = stream->map_bell().value();
+  EXPECT_FALSE(bell->doorbell_armed());
+  subscribe([](auto& s) { s.set_from_now(true); });
+  EXPECT_TRUE(bell->doorbell_armed());
+  peer.vanish();
+  rig.turns();
+  EXPECT_FALSE(bell->doorbell_armed());
+}
+
+// --- publishing
+
+TEST_F(StreamChannelTest, WritesWhatIsPublishedAndAcknowledgesEachBatchOnce) {
+  const net::Publishing publishing = start_publishing(11);
+  EXPECT_EQ(publishing.last(), -1);
+  EXPECT_EQ(publishing.incarnation(), stream->incarnation());
+  std::vector<std::byte> batch;
+  for (const std::int64_t number : {0, 1, 2}) {
+    const std::vector<std::byte> one = sample_frame(number);
+    batch.insert(batch.end(), one.begin(), one.end());
+  }
+  peer.put(batch);
+  rig.turns();
+  EXPECT_EQ(words(take()), "published:2=2");
+  const ring::RingReader reader(stream->mapping());
+  std::vector<std::byte> payload(kBytes);
+  SampleInfo info;
+  ASSERT_EQ(reader.read(1, payload, info), ReadStatus::ok);
+  EXPECT_EQ(payload, std::vector<std::byte>(kBytes, std::byte{9}));
+  EXPECT_EQ(to_ns(info.time), 5001);
+  EXPECT_EQ(info.clock_error, Duration(4));
+  peer.put(sample_frame(3, 77));
+  rig.turns();
+  const std::vector<SentItem> items = take();
+  EXPECT_EQ(words(items), "published:3=3");
+  EXPECT_EQ(items[0].frame.serial(), 77u);
+}
+
+TEST_F(StreamChannelTest, WritesEachSampleOnceOverReconnects) {
+  start_publishing(11);
+  peer.put(sample_frame(0));
+  peer.put(sample_frame(1));
+  rig.turns();
+  take();
+  peer.vanish();
+  rig.turns();
+  rig.write(*stream);  // somebody else writes meanwhile
+
+  FakePeer again;
+  rig.connect(again);
+  rig.open(again, "odometry");
+  net::Frame frame = request(70);
+  frame.mutable_start_publishing()->set_publisher(11);
+  const net::Frame answer = rig.ask(again, frame);
+  EXPECT_EQ(answer.publishing().last(), 1);
+  EXPECT_EQ(answer.publishing().last_tid(), 1);
+  again.put(sample_frame(1));  // sent again, although it was written
+  again.put(sample_frame(2));
+  again.put(sample_frame(5));  // the client dropped some
+  rig.turns();
+  EXPECT_EQ(words(rig.take(again, kBytes)), "published:1=1 published:2=3 published:5=4");
+  EXPECT_EQ(stream->info().newest, 4);
+  frame.mutable_start_publishing()->set_publisher(12);
+  EXPECT_EQ(rig.ask(again, frame).publishing().last(), -1) << "another publisher";
+}
+
+// The ring outlives dssmd, and what stands in it about publishers does.
+TEST_F(StreamChannelTest, KnowsPublishersOfARingThatIsOfferedBack) {
+  start_publishing(11);
+  for (const std::int64_t number : {0, 3, 4}) peer.put(sample_frame(number));
+  rig.turns();
+  take();
+  ServerRig next;
+  const std::shared_ptr<Stream> same =
+      next.registry
+          .adopt_untrusted({"odometry", 0, ""},
+                           as_offer(stream->descriptors_for(Role::writer).value()))
+          .value();
+  FakePeer again;
+  next.connect(again);
+  next.open(again, "odometry");
+  net::Frame frame = request(70);
+  frame.mutable_start_publishing()->set_publisher(11);
+  const net::Frame answer = next.ask(again, frame);
+  EXPECT_EQ(answer.publishing().last(), 4);
+  EXPECT_EQ(answer.publishing().last_tid(), 2);
+  again.put(sample_frame(4));
+  again.put(sample_frame(5));
+  next.turns();
+  EXPECT_EQ(words(next.take(again, kBytes)), "published:4=2 published:5=3");
+  EXPECT_EQ(same->info().newest, 3);
+}
+
+// A connection was cut in the middle of a sample, and what was under way arrives after all, while
+// the publisher has gone on by another one.
+TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionComesBack) {
+  constexpr std::uint64_t kInPieces = 100'000;  // received piece by piece
+  const std::shared_ptr<Stream> camera = rig.create("camera", kInPieces);
+  FakePeer old, again;
+  net::Frame frame = request(70);
+  frame.mutable_start_publishing()->set_publisher(11);
+  for (FakePeer* one : {&old, &again}) {
+    rig.connect(*one);
+    rig.open(*one, "camera");
+    EXPECT_EQ(rig.ask(*one, frame).publishing().last(), -1);
+  }
+  const auto large = [](std::int64_t number) {
+    return sample_frame(number, 0, std::byte{9}, kInPieces);
+  };
+  const std::vector<std::byte> first = large(0);
+  old.put({first.begin(), first.begin() + 50'000});
+  rig.turns();
+  for (const std::int64_t number : {0, 1, 2}) again.put(large(number));
+  rig.turns();
+  EXPECT_EQ(camera->info().newest, 2);
+  old.put({first.begin() + 50'000, first.end()});
+  old.put(large(1));
+  rig.turns();
+  EXPECT_EQ(camera->info().newest, 2);
+  EXPECT_EQ(words(rig.take(old, kInPieces)), "published:2=2 published:2=2");
+  again.put(large(3));
+  rig.turns();
+  EXPECT_EQ(camera->info().newest, 3);
+}
+
+TEST_F(StreamChannelTest, AcknowledgesWhatWasWrittenBeforeWithoutWritingIt) {
+  start_publishing(11);
+  peer.put(sample_frame(4));
+  rig.turns();
+  take();
+  peer.put(sample_frame(4, 88));
+  rig.turns();
+  const std::vector<SentItem> items = take();
+  EXPECT_EQ(words(items), "published:4=0");
+  EXPECT_EQ(items[0].frame.serial(), 88u);
+  EXPECT_EQ(stream->info().newest, 0);
+}
+
+TEST_F(StreamChannelTest, BringsPublishedSamplesToOtherChannels) {
+  FakePeer reader;
+  rig.connect(reader);
+  rig.open(reader, "odometry");
+  net::Frame frame = request(60);
+  frame.mutable_subscribe()->set_from_now(true);
+  reader.put(frame);
+  rig.turns();
+  rig.take(reader, kBytes);
+  start_publishing(11);
+  peer.put(sample_frame(0));
+  rig.turns();
+  EXPECT_EQ(words(rig.take(reader, kBytes)), "0");
+}
+
+TEST_F(StreamChannelTest, RefusesSamplesOfWhoDidNotSayThatItPublishes) {
+  peer.put(sample_frame(0));
+  rig.turns();
+  EXPECT_TRUE(peer.closed);
+  EXPECT_NE(take().back().frame.failure().message().find("StartPublishing"), std::string::npos);
+}
+
+TEST_F(StreamChannelTest, DoesNotWaitForAProgramThatHoldsTheLock) {
+  start_publishing(11);
+  // A program in the middle of filling a slot, in a thread of its own, as locks are threads'.
+  const auto mapping = stream->map_for_writing().value();
+  const auto bell = stream->map_bell().value();
+  std::atomic<int> step = 0;
+  std::thread program([&] {
+    ring::RingWriter writer(*mapping, *bell, -1);
+    EXPECT_TRUE(writer.begin());
+    step = 1;
+    step.notify_all();
+    step.wait(1);
+    writer.cancel();
+    step = 3;
+    step.notify_all();
+  });
+  step.wait(0);
+  for (const std::int64_t number : {0, 1, 2}) peer.put(sample_frame(number));
+  rig.turns(20);
+  EXPECT_EQ(words(take()), "");
+  FakePeer other;
+  rig.connect(other);  // the loop goes on
+  step = 2;
+  step.notify_all();
+  step.wait(2);
+  program.join();
+  std::vector<SentItem> items;
+  ASSERT_TRUE(run_until(rig.loop, [&] {
+    for (SentItem& item : take()) items.push_back(std::move(item));
+    return stream->info().newest == 2 && !items.empty() &&
+           items.back().frame.published().last() == 2;
+  }));
+}
+
+TEST_F(StreamChannelTest, HoldsNoMoreForAPublisherThanItsHostMay) {
+  ServerRig small({16, 8, 1U << 20});
+  small.create("camera", 900 << 10, 4);
+  FakePeer camera;
+  small.connect(camera);
+  small.open(camera, "camera");
+  net::Frame frame = request(1);
+  frame.mutable_start_publishing()->set_publisher(3);
+  const net::Frame refused = small.ask(camera, frame);
+  EXPECT_EQ(refused.failure().code(), "limit_exceeded");
+  EXPECT_NE(refused.failure().message().find("max_peer_memory"), std::string::npos);
+  EXPECT_NE(refused.failure().message().find("'camera:0@pc1'"), std::string::npos);
+}
+
+// --- property
+
+TEST_F(StreamChannelTest, KeepsThePropertyForEverybody) {
+  net::Frame get = request(1), set = request(2);
+  get.mutable_get_property();
+  set.mutable_set_property()->set_property("calibration");
+  EXPECT_EQ(words(ask(get)), "failure:not_found");
+  EXPECT_TRUE(ask(set).at(0).frame.has_done());
+  EXPECT_EQ(ask(get).at(0).frame.property().property(), "calibration");
+  FakePeer control;
+  rig.connect(control);
+  get.mutable_get_property()->mutable_id()->set_name("odometry");
+  EXPECT_EQ(rig.ask(control, get).property().property(), "calibration");
+  set.mutable_set_property()->mutable_id()->set_name("odometry");
+  set.mutable_set_property()->set_property("");
+  EXPECT_TRUE(rig.ask(control, set).has_done());
+  EXPECT_EQ(rig.ask(control, get).failure().code(), "not_found");
+}
+
+// --- clocks
+
+class WriterOfAnotherClock : public testing::Test {
+ protected:
+  void start_publishing() {
+    rig.connect(peer);
+    rig.open(peer, "far");
+    net::Frame frame;
+    frame.set_serial(70);
+    frame.mutable_start_publishing()->set_publisher(11);
+    EXPECT_TRUE(rig.ask(peer, frame).has_publishing());
+  }
+  ring::ClockVerdict verdict() const { return ring::load(stream->mapping().header().clock); }
+
+  FakeClockRules rules;
+  ServerRig rig{{16, 8, 32U << 20}, &rules};
+  FakePeer peer;
+  std::shared_ptr<Stream> stream = rig.create("far");
+};
+
+TEST_F(WriterOfAnotherClock, HasTheStreamsTimesJudgedFromThenOn) {
+  rules.own_bound = std::chrono::microseconds(100);
+  rig.server.on_clock();
+  EXPECT_EQ(verdict().rule, ring::ClockRule::none) << "nobody else writes to it yet";
+  start_publishing();
+  EXPECT_EQ(verdict().rule, ring::ClockRule::enforce);
+  EXPECT_EQ(verdict().added, rules.own_bound);
+  rules.own_bound = std::chrono::microseconds(300);
+  rig.server.on_clock();
+  EXPECT_EQ(verdict().added, rules.own_bound);
+}
+
+TEST_F(WriterOfAnotherClock, IsNoneWhenItsKernelIsThisOne) {
+  rules.rule = ring::ClockRule::same_clock;
+  start_publishing();
+  rig.server.on_clock();
+  EXPECT_EQ(verdict().rule, ring::ClockRule::none);
+}
+
+}  // namespace
+}  // namespace dssm::daemon

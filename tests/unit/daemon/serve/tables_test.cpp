@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What dssmd remembers about peers: what they take, and how much it logs about them.
+#include <gtest/gtest.h>
+
+#include "daemon/base/calm_logger.hpp"
+#include "tests/unit/daemon/serve/server_rig.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+TEST(CalmLogger, PassesSoManyLinesOnAndCountsTheOthers) {
+  RecordingLogger to;
+  MonoTime now{std::chrono::seconds(100)};
+  CalmLogger logger(to, [&] { return now; });
+  for (int i = 0; i < 2 * CalmLogger::kLinesPerPeriod; ++i) logger.warning("again");
+  EXPECT_EQ(to.warnings.size(), static_cast<std::size_t>(CalmLogger::kLinesPerPeriod));
+  logger.info("of another level");
+  EXPECT_TRUE(to.has("of another level"));
+  now += CalmLogger::kPeriod;
+  logger.warning("later");
+  EXPECT_EQ(to.warnings.back(), "later (" + std::to_string(CalmLogger::kLinesPerPeriod) +
+                                    " lines about other hosts before this one were left out)");
+  logger.warning("and on");
+  EXPECT_EQ(to.warnings.back(), "and on");
+}
+
+TEST(PeerTable, GivesEverythingBack) {
+  PeerTable table({10, 10, 1U << 20});
+  {
+    const PeerPlace first = *table.admit(address_of(2));
+    const PeerPlace second = *table.admit(address_of(2));
+    EXPECT_EQ(table.connections(), 2u);
+    EXPECT_EQ(&first.budget(), &second.budget()) << "one address, one account";
+    EXPECT_EQ(first.budget().used(), 2 * PeerTable::kConnectionBytes);
+    const PeerPlace other = *table.admit(address_of(3));
+    EXPECT_NE(&first.budget(), &other.budget());
+  }
+  EXPECT_EQ(table.connections(), 0u);
+  EXPECT_EQ(table.admit(address_of(2))->budget().used(), PeerTable::kConnectionBytes);
+}
+
+}  // namespace
+}  // namespace dssm::daemon

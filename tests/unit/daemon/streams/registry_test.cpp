@@ -1,0 +1,445 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Streams by name: creating, joining, limits, figures, properties, and taking streams back after a
+// restart, which here is a second Registry.
+#include "daemon/streams/registry.hpp"
+
+#include <fcntl.h>
+#include <gtest/gtest.h>
+#include <sys/eventfd.h>
+#include <sys/mman.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <optional>
+
+#include "core/ring/bell.hpp"
+#include "core/ring/ring_writer.hpp"
+#include "tests/unit/daemon/daemon_fixtures.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+const StreamId kOdometry{"odometry", 0, ""};
+
+std::shared_ptr<Stream> create(Registry& registry, const StreamId& id = kOdometry) {
+  Result<Registry::Created> created = registry.create(id, odometry_type(), kHistory, 42);
+  EXPECT_TRUE(created) << created.error().message;
+  return created ? created->stream : nullptr;
+}
+
+OfferedFiles kept_by(Role role, Stream& stream) {
+  Result<std::vector<UniqueFd>> descriptors = stream.descriptors_for(role);
+  EXPECT_TRUE(descriptors) << descriptors.error().message;
+  return as_offer(*std::move(descriptors));
+}
+
+Errc code_of(const Result<std::shared_ptr<Stream>>& result) {
+  return result ? Errc::closed : result.error().code;
+}
+
+// --- creating
+
+TEST(Registry, CreatesAStreamOnceAndJoinsItAfterwards) {
+  Registry registry("pc1", kLimits);
+  const Result<Registry::Created> first = registry.create(kOdometry, odometry_type(), kHistory, 42);
+  ASSERT_TRUE(first) << first.error().message;
+  EXPECT_TRUE(first->created);
+  EXPECT_EQ(first->stream->id().str(), "odometry:0@pc1");
+  const Result<Registry::Created> second =
+      registry.create(kOdometry, odometry_type(), kHistory, 43);
+  ASSERT_TRUE(second);
+  EXPECT_FALSE(second->created);
+  EXPECT_EQ(second->stream, first->stream);
+  EXPECT_EQ(second->stream->creator_pid(), 42);
+  EXPECT_EQ(registry.streams().size(), 1u);
+}
+
+TEST(Registry, RefusesToJoinWithAnotherSizeOrType) {
+  Registry registry("pc1", kLimits);
+  create(registry);
+  TypeInfo larger = odometry_type();
+  larger.payload_bytes = 32;
+  TypeInfo renamed = odometry_type();
+  renamed.name = "Pose";
+  TypeInfo nameless{"", 24, 8, {}};
+  EXPECT_EQ(registry.create(kOdometry, larger, kHistory, 1).error().code, Errc::type_mismatch);
+  const Result<Registry::Created> other = registry.create(kOdometry, renamed, kHistory, 1);
+  EXPECT_EQ(other.error().code, Errc::type_mismatch);
+  EXPECT_NE(other.error().message.find("'Odometry'"), std::string::npos);
+  EXPECT_NE(other.error().message.find("'Pose'"), std::string::npos);
+  EXPECT_TRUE(registry.create(kOdometry, nameless, kHistory, 1));
+}
+
+TEST(Registry, TellsStreamsApartByNameAndId) {
+  Registry registry("pc1", kLimits);
+  const auto zero = create(registry, {"lidar", 0, ""});
+  const auto one = create(registry, {"lidar", 1, "pc1"});
+  EXPECT_NE(zero, one);
+  EXPECT_EQ(*registry.find({"lidar", 1, ""}), one);
+  EXPECT_EQ(*registry.find({"lidar", 0, "pc1"}), zero);
+  EXPECT_FALSE(registry.find({"lidar", 2, ""}));
+}
+
+TEST(Registry, AnswersOnlyForItsOwnHost) {
+  Registry registry("pc1", kLimits);
+  create(registry);
+  const auto elsewhere = registry.find({"odometry", 0, "pc2"});
+  ASSERT_FALSE(elsewhere);
+  EXPECT_EQ(elsewhere.error().code, Errc::not_found);
+  EXPECT_NE(elsewhere.error().message.find("'pc2'"), std::string::npos);
+  EXPECT_FALSE(registry.create({"x", 0, "pc2"}, odometry_type(), kHistory, 1));
+}
+
+TEST(Registry, RefusesANameThatIsTooLongWithTheHost) {
+  const std::string host(31, 'h');
+  Registry registry(host, kLimits);
+  EXPECT_TRUE(registry.create({std::string(29, 'n'), 0, ""}, odometry_type(), kHistory, 1))
+      << "29 + 2 + 1 + 31 = 63 bytes";
+  const auto created = registry.create({std::string(30, 'n'), 0, ""}, odometry_type(), kHistory, 1);
+  ASSERT_FALSE(created);
+  EXPECT_NE(created.error().message.find("at most 63"), std::string::npos);
+}
+
+TEST(Registry, RefusesDepthsAndCyclesThatCannotBe) {
+  Registry registry("pc1", kLimits);
+  const auto code = [&](const History& history) {
+    return registry.create(kOdometry, odometry_type(), history, 1).error().code;
+  };
+  EXPECT_EQ(code({16, Duration::zero()}), Errc::invalid_argument);
+  EXPECT_EQ(code({16, Duration(-1)}), Errc::invalid_argument);
+  EXPECT_NE(code({0, Duration(1)}), Errc::closed);
+  EXPECT_NE(code({1, Duration(1)}), Errc::closed);
+  EXPECT_NE(code({kMaxDepth + 1, Duration(1)}), Errc::closed);
+  EXPECT_TRUE(registry.streams().empty());
+}
+
+TEST(Registry, RefusesATypeWhoseDescriptionIsTooLong) {
+  Registry registry("pc1", kLimits);
+  TypeInfo type = odometry_type();
+  type.fields[0].name = std::string(kMaxTypeBytes, 'x');
+  const auto created = registry.create(kOdometry, type, kHistory, 1);
+  ASSERT_FALSE(created);
+  EXPECT_EQ(created.error().code, Errc::limit_exceeded);
+}
+
+// --- limits
+
+TEST(Registry, NamesTheLimitOnStreams) {
+  Registry registry("pc1", {.max_streams = 2, .max_memory_bytes = 1 << 30});
+  create(registry, {"a", 0, ""});
+  create(registry, {"b", 0, ""});
+  const auto third = registry.create({"c", 0, ""}, odometry_type(), kHistory, 1);
+  ASSERT_FALSE(third);
+  EXPECT_EQ(third.error().code, Errc::limit_exceeded);
+  EXPECT_NE(third.error().message.find("max_streams = 2"), std::string::npos);
+  EXPECT_TRUE(registry.create({"b", 0, ""}, odometry_type(), kHistory, 1))
+      << "joining needs no room";
+}
+
+TEST(Registry, NamesTheLimitOnMemoryAndGivesMemoryBack) {
+  Registry registry("pc1", {.max_streams = 10, .max_memory_bytes = 1 << 20});
+  const TypeInfo large{"", 600 << 10, 1, {}};
+  const auto refused = registry.create(kOdometry, large, {2, Duration(1)}, 1);
+  ASSERT_FALSE(refused);
+  EXPECT_EQ(refused.error().code, Errc::limit_exceeded);
+  EXPECT_NE(refused.error().message.find("max_memory = 1048576"), std::string::npos);
+  EXPECT_EQ(registry.budget().used(), 0u);
+
+  const TypeInfo medium{"", 200 << 10, 1, {}};
+  std::shared_ptr<Stream> held = registry.create(kOdometry, medium, {3, Duration(1)}, 1)->stream;
+  ASSERT_TRUE(registry.remove(kOdometry));
+  EXPECT_FALSE(registry.create(kOdometry, medium, {3, Duration(1)}, 1))
+      << "a removed ring that somebody holds still takes its memory";
+  held.reset();
+  EXPECT_EQ(registry.budget().used(), 0u);
+  EXPECT_TRUE(registry.create(kOdometry, medium, {3, Duration(1)}, 1));
+}
+
+TEST(Registry, LeavesNoDescriptorBehind) {
+  const auto count = [] {
+    int open = 0;
+    for (int fd = 0; fd < 256; ++fd) open += ::fcntl(fd, F_GETFD) >= 0;
+    return open;
+  };
+  Registry registry("pc1", kLimits);
+  const int before = count();
+  const auto stream = create(registry);
+  EXPECT_EQ(count(), before + 4) << "ring, bell, meta, doorbell";
+  ASSERT_TRUE(stream->descriptors_for(Role::writer));
+  ASSERT_TRUE(stream->descriptors_for(Role::reader));
+  EXPECT_EQ(count(), before + 4);
+  static_cast<void>(registry.create({"too large", 0, ""}, {"", 64 << 20, 1, {}}, kHistory, 1));
+  EXPECT_EQ(count(), before + 4);
+}
+
+// --- what is handed out
+
+TEST(Stream, HandsOutARingThatReadersCannotMapWritable) {
+  Registry registry("pc1", kLimits);
+  const auto stream = create(registry);
+  const OfferedFiles for_reader = kept_by(Role::reader, *stream);
+  EXPECT_FALSE(for_reader.doorbell) << "the doorbell is for writers";
+  EXPECT_EQ(::mmap(nullptr, 4096, PROT_READ | PROT_WRITE, MAP_SHARED, for_reader.ring.get(), 0),
+            MAP_FAILED);
+  EXPECT_EQ(::mmap(nullptr, 4096, PROT_READ | PROT_WRITE, MAP_SHARED, for_reader.meta.get(), 0),
+            MAP_FAILED);
+  const OfferedFiles for_writer = kept_by(Role::writer, *stream);
+  EXPECT_TRUE(for_writer.doorbell);
+  EXPECT_TRUE(ring::RingMapping::open_untrusted(for_writer.ring.get(), ring::Access::read_write));
+  EXPECT_TRUE(ring::Bell::open_untrusted(for_reader.bell.get()));
+}
+
+TEST(Stream, TellsNewestOldestAndRateFromTheRing) {
+  Registry registry("pc1", kLimits);
+  const auto stream = create(registry);
+  EXPECT_EQ(stream->info().newest, kNoTid);
+  EXPECT_EQ(stream->info().rate_hz, 0);
+  const OfferedFiles files = kept_by(Role::writer, *stream);
+  const auto mapping =
+      ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_write);
+  const auto bell = ring::Bell::open_untrusted(files.bell.get());
+  ring::RingWriter writer(**mapping, **bell, -1);
+  const std::vector<std::byte> payload(24);
+  for (int i = 0; i < 40; ++i) {
+    writer.write(payload, time_from_ns(1'000'000'000LL + i * 20'000'000LL), Duration::zero());
+  }
+  const StreamInfo info = stream->info();
+  EXPECT_EQ(info.newest, 39);
+  EXPECT_EQ(info.oldest, 39 - 16 + 2);
+  EXPECT_EQ(to_ns(info.newest_time), 1'000'000'000LL + 39 * 20'000'000LL);
+  EXPECT_NEAR(info.rate_hz, 50, 1e-6);
+  EXPECT_EQ(info.depth, 16u);
+  EXPECT_EQ(info.cycle, std::chrono::milliseconds(10));
+  EXPECT_EQ(info.creator_pid, 42);
+}
+
+TEST(Stream, SurvivesNonsenseInARingItDoesNotTrust) {
+  Registry registry("pc1", kLimits);
+  const auto stream = create(registry);
+  const OfferedFiles files = kept_by(Role::writer, *stream);
+  const auto mapping =
+      ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_write);
+  for (const std::int64_t top : {INT64_MAX, INT64_MIN, INT64_C(-2), INT64_C(1) << 62}) {
+    (*mapping)->header().top.store(top);
+    const StreamInfo info = stream->info();
+    EXPECT_GE(info.newest, kNoTid);
+    EXPECT_LE(info.oldest, info.newest);
+    EXPECT_EQ(info.rate_hz, 0);
+  }
+}
+
+// --- property
+
+TEST(Registry, KeepsThePropertyOfAStreamAndChargesItsMemory) {
+  Registry registry("pc1", kLimits);
+  const auto stream = create(registry);
+  const std::uint64_t before = registry.budget().used();
+  ASSERT_TRUE(registry.set_property(kOdometry, "mounted upside down"));
+  EXPECT_EQ(*stream->property(), "mounted upside down");
+  EXPECT_EQ(stream->info().property_bytes, 19u);
+  EXPECT_EQ(registry.budget().used(), before + 19);
+  ASSERT_TRUE(registry.set_property(kOdometry, ""));
+  EXPECT_EQ(*stream->property(), "");
+  EXPECT_EQ(registry.budget().used(), before);
+  const Result<void> refused = registry.set_property(kOdometry, std::string((1 << 20) + 1, 'x'));
+  ASSERT_FALSE(refused);
+  EXPECT_NE(refused.error().message.find("max_property = 1048576"), std::string::npos);
+  EXPECT_EQ(registry.set_property({"other", 0, ""}, "x").error().code, Errc::not_found);
+}
+
+// --- taking streams back
+
+class Adoption : public testing::Test {
+ protected:
+  // What a client holds after its dssmd died.
+  OfferedFiles held(Role role, const StreamId& id = kOdometry) {
+    Registry before("pc1", kLimits);
+    const auto stream = create(before, id);
+    EXPECT_TRUE(before.set_property(id, "kept"));
+    return kept_by(role, *stream);
+  }
+  Errc verdict_on(OfferedFiles files) {
+    return code_of(registry_.adopt_untrusted(kOdometry, std::move(files)));
+  }
+  static UniqueFd memory_file(int seals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL) {
+    UniqueFd fd(::memfd_create("forged", MFD_CLOEXEC | MFD_ALLOW_SEALING));
+    EXPECT_EQ(::ftruncate(fd.get(), 65536), 0);
+    EXPECT_EQ(::fcntl(fd.get(), F_ADD_SEALS, seals), 0);
+    return fd;
+  }
+  Registry registry_{"pc1", kLimits};
+};
+
+TEST_F(Adoption, BringsAStreamBackWithAllThatWasKnownOfIt) {
+  const auto stream = registry_.adopt_untrusted(kOdometry, held(Role::reader));
+  ASSERT_TRUE(stream) << stream.error().message;
+  EXPECT_EQ((*stream)->type(), odometry_type());
+  EXPECT_EQ((*stream)->creator_pid(), 42);
+  EXPECT_EQ((*stream)->info().depth, 16u);
+  EXPECT_EQ(*(*stream)->property(), "kept");
+  EXPECT_EQ(*registry_.find(kOdometry), *stream);
+  // From a reader's read-only descriptors a writer gets what it needs, doorbell included.
+  const OfferedFiles for_writer = kept_by(Role::writer, **stream);
+  EXPECT_TRUE(for_writer.doorbell);
+  EXPECT_TRUE(ring::RingMapping::open_untrusted(for_writer.ring.get(), ring::Access::read_write));
+  EXPECT_TRUE(registry_.set_property(kOdometry, "newer"));
+}
+
+TEST_F(Adoption, OnlyNotesTheSecondOfferOfTheSameRing) {
+  OfferedFiles one = held(Role::reader), two;
+  two.ring = copy_of(one.ring), two.bell = copy_of(one.bell), two.meta = copy_of(one.meta);
+  const auto first = registry_.adopt_untrusted(kOdometry, std::move(one));
+  const auto second = registry_.adopt_untrusted(kOdometry, std::move(two));
+  ASSERT_TRUE(first && second);
+  EXPECT_EQ(*first, *second);
+  EXPECT_EQ(registry_.streams().size(), 1u);
+}
+
+TEST_F(Adoption, RefusesAnotherRingOfATakenName) {
+  create(registry_);
+  EXPECT_EQ(verdict_on(held(Role::writer)), Errc::conflict);
+}
+
+TEST_F(Adoption, TakesTheDoorbellThatAWriterKeptButNothingElseForOne) {
+  OfferedFiles files = held(Role::writer);
+  const std::uint64_t rung = 5;
+  ASSERT_EQ(::write(files.doorbell.get(), &rung, sizeof rung), ssize_t{sizeof rung});
+  const auto stream = registry_.adopt_untrusted(kOdometry, std::move(files));
+  ASSERT_TRUE(stream);
+  std::uint64_t read = 0;
+  const OfferedFiles again = kept_by(Role::writer, **stream);
+  ASSERT_EQ(::read(again.doorbell.get(), &read, sizeof read), ssize_t{sizeof read});
+  EXPECT_EQ(read, 5u) << "the same eventfd as before";
+
+  OfferedFiles wrong = held(Role::writer, {"other", 0, ""});
+  wrong.doorbell.reset(::eventfd(0, EFD_CLOEXEC));  // blocking: it could stop its reader
+  const auto other = registry_.adopt_untrusted({"other", 0, ""}, std::move(wrong));
+  ASSERT_TRUE(other);
+  const OfferedFiles fresh = kept_by(Role::writer, **other);
+  EXPECT_TRUE(::fcntl(fresh.doorbell.get(), F_GETFL) & O_NONBLOCK);
+}
+
+TEST_F(Adoption, KeepsTheOrderOfCreation) {
+  std::vector<OfferedFiles> kept;
+  const std::vector<StreamId> ids = {{"a", 0, ""}, {"b", 0, ""}, {"c", 0, ""}};
+  {
+    Registry before("pc1", kLimits);
+    for (const StreamId& id : ids) kept.push_back(kept_by(Role::reader, *create(before, id)));
+  }
+  for (const std::size_t i : {2, 0, 1}) {
+    ASSERT_TRUE(registry_.adopt_untrusted(ids[i], std::move(kept[i])));
+  }
+  create(registry_, {"d", 0, ""});
+  std::string order;
+  for (const auto& stream : registry_.streams()) order += stream->id().name;
+  EXPECT_EQ(order, "abcd");
+}
+
+TEST_F(Adoption, HoldsToTheLimits) {
+  Registry full("pc1", {.max_streams = 1, .max_memory_bytes = 1 << 30});
+  create(full, {"first", 0, ""});
+  EXPECT_EQ(code_of(full.adopt_untrusted(kOdometry, held(Role::reader))), Errc::limit_exceeded);
+  Registry small("pc1", {.max_streams = 9, .max_memory_bytes = 4096});
+  EXPECT_EQ(code_of(small.adopt_untrusted(kOdometry, held(Role::reader))), Errc::limit_exceeded);
+  EXPECT_EQ(small.budget().used(), 0u);
+}
+
+TEST_F(Adoption, DoesNotBringBackWhatWasRemoved) {
+  OfferedFiles files;
+  {
+    Registry before("pc1", kLimits);
+    files = kept_by(Role::writer, *create(before));
+    ASSERT_TRUE(before.remove(kOdometry));
+  }
+  EXPECT_EQ(verdict_on(std::move(files)), Errc::not_found);
+}
+
+TEST_F(Adoption, RefusesFilesOfAnotherUser) {
+  if (::geteuid() != 0) GTEST_SKIP() << "only root can make a file of another user";
+  for (UniqueFd OfferedFiles::*file :
+       {&OfferedFiles::ring, &OfferedFiles::bell, &OfferedFiles::meta}) {
+    OfferedFiles files = held(Role::writer);
+    ASSERT_EQ(::fchown((files.*file).get(), 65534, 65534), 0);
+    EXPECT_EQ(verdict_on(std::move(files)), Errc::no_permission);
+  }
+}
+
+TEST_F(Adoption, RefusesFilesThatAreNotSealedOrNoMemoryFiles) {
+  for (UniqueFd OfferedFiles::*file :
+       {&OfferedFiles::ring, &OfferedFiles::bell, &OfferedFiles::meta}) {
+    OfferedFiles files = held(Role::writer);
+    files.*file = memory_file(0);
+    EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+    files = held(Role::writer);
+    (files.*file).reset(::open("/dev/null", O_RDWR | O_CLOEXEC));
+    EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+    files = held(Role::writer);
+    files.*file = memory_file();  // sealed, but empty
+    EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+  }
+}
+
+TEST_F(Adoption, RefusesARingOfAnotherGeometryThanItsMetaFileSays) {
+  OfferedFiles files = held(Role::writer);
+  Registry before("pc1", kLimits);
+  TypeInfo larger = odometry_type();
+  larger.payload_bytes = 32;
+  const auto stream = before.create(kOdometry, larger, kHistory, 1)->stream;
+  files.ring = std::move(kept_by(Role::writer, *stream).ring);
+  EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+}
+
+TEST_F(Adoption, RefusesARingUnderAnotherName) {
+  EXPECT_EQ(verdict_on(held(Role::writer, {"lidar", 0, ""})), Errc::protocol);
+  EXPECT_EQ(verdict_on(held(Role::writer, {"odometry", 1, ""})), Errc::protocol);
+  EXPECT_TRUE(registry_.streams().empty());
+}
+
+TEST_F(Adoption, RefusesAStreamOfAnotherHost) {
+  Registry other("pc2", kLimits);
+  EXPECT_EQ(code_of(other.adopt_untrusted(kOdometry, held(Role::reader))), Errc::protocol);
+}
+
+TEST_F(Adoption, RefusesARingWhoseHeaderWasRewritten) {
+  OfferedFiles files = held(Role::writer);
+  const auto mapping =
+      ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_write);
+  (*mapping)->header().depth = 1 << 20;
+  EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+}
+
+// --- removing and watching
+
+TEST(Registry, FreesTheNameOfARemovedStreamAndLeavesItsHoldersAlone) {
+  Registry registry("pc1", kLimits);
+  const auto removed = create(registry);
+  ASSERT_TRUE(registry.remove(kOdometry));
+  EXPECT_FALSE(registry.find(kOdometry));
+  EXPECT_TRUE(removed->removed());
+  EXPECT_EQ(registry.remove(kOdometry).error().code, Errc::not_found);
+  const auto next = create(registry);
+  EXPECT_NE(next, removed);
+  EXPECT_NE(next->info().incarnation, removed->info().incarnation);
+}
+
+TEST(Registry, TellsItsObserversWhatComesAndGoes) {
+  struct Recorder final : StreamObserver {
+    void on_stream_added(const Stream& stream) override { text += "+" + stream.id().name; }
+    void on_stream_removed(const Stream& stream) override { text += "-" + stream.id().name; }
+    std::string text;
+  } recorder, other;
+  Registry registry("pc1", kLimits);
+  registry.add_observer(recorder);
+  registry.add_observer(other);
+  create(registry, {"a", 0, ""});
+  create(registry, {"a", 0, ""});
+  create(registry, {"b", 0, ""});
+  registry.remove_observer(other);
+  ASSERT_TRUE(registry.remove({"a", 0, ""}));
+  EXPECT_EQ(recorder.text, "+a+b-a");
+  EXPECT_EQ(other.text, "+a+b");
+}
+
+}  // namespace
+}  // namespace dssm::daemon
