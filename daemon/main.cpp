@@ -216,7 +216,7 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
   const StreamCount count(registry, status);
   peers.on_change([&] { status.touch(); });
   fleet_clock.on_news([&] {
-    channels.tell_clock();
+    channels.send_clock();
     status.touch();
   });
   fleet_clock.on_change([&] {
@@ -270,7 +270,7 @@ std::unique_ptr<LeveledLogger> open_log(LogLevel level) {
 }
 
 // What is wrong with flags and configuration, a line each.
-void tell_mistakes(const std::string& mistakes) {
+void print_errors(const std::string& mistakes) {
   std::optional<JournalLogger> journal;
   if (stderr_is_journal()) journal.emplace(LogLevel::error);
   for (std::size_t begin = 0; begin <= mistakes.size();) {
@@ -288,7 +288,7 @@ void tell_mistakes(const std::string& mistakes) {
 int main(int argc, char** argv) {
   const Result<CommandLine> line = parse_command_line(argc, argv);
   if (!line) {
-    tell_mistakes(line.error().message);
+    print_errors(line.error().message);
     return kUsage;
   }
   if (line->action == CommandLine::Action::print) {

@@ -23,7 +23,7 @@ def first_lines(text: str | None) -> str:
     return "\n".join((text or "").strip().splitlines()[:MOST_LINES])
 
 
-def last_words(case: ElementTree.Element) -> str:
+def final_failure(case: ElementTree.Element) -> str:
     """What a program printed that ended without naming a failed test: how it began and ended."""
     printed = case.findtext("system-err") or case.findtext("system-out") or ""
     lines = printed.strip().splitlines()
@@ -42,7 +42,7 @@ def count(folder: pathlib.Path) -> tuple[int, int, int]:
             failed += 1
             print(f"FAILED  {name}")
             for trouble in troubles:
-                said = first_lines(trouble.get("message") or trouble.text) or last_words(case)
+                said = first_lines(trouble.get("message") or trouble.text) or final_failure(case)
                 if said:
                     print(textwrap.indent(said, " " * 8))
         elif case.find("skipped") is not None or case.get("result") in ("skipped", "suppressed"):

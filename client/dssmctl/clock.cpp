@@ -36,8 +36,8 @@ std::string offset_text(Duration offset) {
 
 std::string status_text(const ClockInfo& clock) {
   const std::string status(name_of(clock.status));
-  return clock.trouble == ClockTrouble::none ? status
-                                             : status + ": " + std::string(name_of(clock.trouble));
+  return clock.trouble == ClockReason::none ? status
+                                            : status + ": " + std::string(name_of(clock.trouble));
 }
 
 std::string reference_text(const ClockInfo& clock) {
@@ -66,7 +66,7 @@ Json clock_json(const HostInfo& host) {
   json["state"] = host.state;
   const ClockInfo clock = host.clock.value_or(ClockInfo());
   json["status"] = name_of(clock.status);
-  json["trouble"] = clock.trouble == ClockTrouble::none ? Json() : Json(name_of(clock.trouble));
+  json["trouble"] = clock.trouble == ClockReason::none ? Json() : Json(name_of(clock.trouble));
   json["basis"] = name_of(clock.basis);
   json["bound_ns"] = bound_json(host.clock_bound);
   json["distance_ns"] = bound_json(clock.distance);

@@ -48,7 +48,7 @@ class Echo {
     ReadStatus status = ReadStatus::restarted;
     while (status == ReadStatus::restarted && result_) {
       status = read(std::span<std::byte>(payload_), info);
-      if (status == ReadStatus::restarted) begin_anew();
+      if (status == ReadStatus::restarted) reopen();
     }
     if (status == ReadStatus::ok) {
       printer_.sample(info, payload_, {reader_.lost() - lost_, reader_.restarts()});
@@ -78,7 +78,7 @@ class Echo {
  private:
   bool go_on() const { return left_ > 0 && result_ && !stop_requested(); }
 
-  void begin_anew() {
+  void reopen() {
     out_.flush();  // so that the lines come in order where both outputs go to one place
     say_began_anew(reader_);
     Result<std::vector<Field>> fields = wanted_fields(reader_, options_);

@@ -13,7 +13,7 @@ namespace {
 
 // What --wait waits for.
 bool may_come(const Error& why) {
-  return why.code == Errc::not_found || why.code == Errc::daemon_away;
+  return why.code == Errc::not_found || why.code == Errc::unavailable;
 }
 
 // Without a reader and without an error when told to stop.

@@ -144,7 +144,7 @@ Result<void> run_ping(const Options& options, Output& out) {
   } while (out.flush() && ping.asked() != options.count && wait_until(due, out));
   ping.summary();
   if (ping.answered() > 0) return {};
-  return Error{Errc::daemon_away,
+  return Error{Errc::unavailable,
                "host '" + options.host + "' did not answer; see `dssmctl hosts`"};
 }
 

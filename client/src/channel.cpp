@@ -27,7 +27,7 @@ static_assert(kStayWithSample + wire::Transport::kReceiveWait <= 20ms);
 // post() looks for acknowledgements once in so many calls.
 constexpr unsigned kPostsPerReceive = 32;
 
-constexpr Duration kLastWords = 1s;  // ~Channel sends what was posted for so long
+constexpr Duration kCloseTimeout = 1s;  // ~Channel sends what was posted for so long
 
 // Whether what went wrong may go right when it is tried again soon.
 bool is_worth_waiting(Errc code) noexcept {
@@ -83,7 +83,7 @@ Result<std::unique_ptr<Channel>> Channel::open(Goal goal, PConnectorOptions opti
 
 Channel::~Channel() {
   if (::getpid() != owner_pid_) return;
-  if (outbox_ && !outbox_->all_written()) static_cast<void>(flush(deadline_in(kLastWords)));
+  if (outbox_ && !outbox_->all_written()) static_cast<void>(flush(deadline_in(kCloseTimeout)));
 }
 
 // --- the connection
@@ -278,7 +278,7 @@ bool Channel::is_hopeless_since(std::uint64_t failed_before) const noexcept {
 Error Channel::away(const std::string& how) const {
   std::string message = "dssmd at '" + address() + "' " + how;
   if (why_down_) message += " (" + why_down_->message + ")";
-  return Error{Errc::daemon_away, message};
+  return Error{Errc::unavailable, message};
 }
 
 std::string Channel::what(const char* verb) const { return verb + (" '" + stream_.id.str() + "'"); }
@@ -522,8 +522,8 @@ Result<void> Channel::unsubscribe() {
     if (!received || (waits && MonoClock::now() >= stay_until)) break;
   }
   if (is_up()) return ReadStatus::not_yet;
-  Error error = why_down_ ? *why_down_ : Error{Errc::daemon_away, "the connection is being set up"};
-  if (error.code != Errc::not_found) error.code = Errc::daemon_away;
+  Error error = why_down_ ? *why_down_ : Error{Errc::unavailable, "the connection is being set up"};
+  if (error.code != Errc::not_found) error.code = Errc::unavailable;
   return std::move(error).context(what("read"));
 }
 

@@ -16,7 +16,7 @@
 #include <optional>
 #include <string>
 
-#include "client/src/network_link.hpp"
+#include "client/src/network_connection.hpp"
 #include "client/src/outbox.hpp"
 #include "client/src/read_request.hpp"
 #include "client/src/readiness.hpp"
@@ -25,7 +25,7 @@
 namespace dssm::detail {
 
 // A resource with one owner; one thread at a time.
-class Channel final : private wire::FrameSink {
+class Channel final : private wire::FrameDelegate {
  public:
   // Which stream, and what it is created as where it shall be created.
   struct Goal {
@@ -43,7 +43,7 @@ class Channel final : private wire::FrameSink {
   // --- requests, which wait for their answer
 
   // The answer to `request`; a Failure comes as its error.
-  //   fails  besides: daemon_away, protocol, and what opening the channel anew fails with
+  //   fails  besides: unavailable, protocol, and what opening the channel anew fails with
   Result<net::Frame> ask(net::Frame request);
   // The same for Read, whose answer is a sample or NoSample.
   Result<ReadStatus> read(const ReadRequest& request, std::span<std::byte> payload,
@@ -118,7 +118,7 @@ class Channel final : private wire::FrameSink {
   std::optional<wire::Address> host_;
   std::vector<wire::SocketAddress> addresses_;  // of the host, when looked up last
 
-  NetworkLink link_;
+  NetworkConnection link_;
   bool set_up_sent_ = false;  // on this connection
   bool opened_ = false;       // on this connection
   bool was_up_ = false;       // this connection

@@ -125,7 +125,7 @@ struct Client::Handshake {
   }
 
   static Error silence() {
-    return Error{Errc::daemon_away, "dssmd closed the connection or does not answer"};
+    return Error{Errc::unavailable, "dssmd closed the connection or does not answer"};
   }
 };
 
@@ -287,7 +287,7 @@ Result<Answer> Client::call(local::Request request, std::span<const int> fds) {
   const std::chrono::steady_clock::time_point deadline(
       deadline_in(options_.request_timeout).time_since_epoch());
   const auto too_late = [&](const char* why) {
-    return Error{Errc::daemon_away, "dssmd at '" + options_.socket_path + "' " + why +
+    return Error{Errc::unavailable, "dssmd at '" + options_.socket_path + "' " + why +
                                         "; look at `systemctl status dssmd`, then try again"};
   };
   std::unique_lock lock(mutex_);

@@ -22,7 +22,7 @@ struct PConnectorState {
 namespace {
 
 // Nobody hears from outside what a connection that only lists says.
-class ListSink final : public wire::FrameSink {
+class ListSink final : public wire::FrameDelegate {
  public:
   Result<void> on_sample_begin(const wire::IncomingSample&, std::byte*&) override {
     return Error{Errc::protocol, "a sample came on a connection that carries none"};
@@ -46,8 +46,8 @@ Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
   auto addresses = find_host(host);
   if (!addresses) return std::move(addresses).error();
   ListSink sink;
-  NetworkLink link(sink, options.program.empty() ? default_program() : options.program,
-                   options.request_timeout);
+  NetworkConnection link(sink, options.program.empty() ? default_program() : options.program,
+                         options.request_timeout);
   link.start(std::move(*addresses));
   for (bool asked = false; !sink.streams;) {
     if (Result<void> done = link.advance(); !done) return std::move(done).error();

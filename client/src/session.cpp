@@ -59,7 +59,7 @@ constexpr Duration kLookAgain = std::chrono::milliseconds(500);
 // Whether a stream that cannot be opened because of this may be had later.
 bool is_worth_waiting_for(const Error& why) {
   return why.code == Errc::not_found || why.code == Errc::clock_out_of_bounds ||
-         why.code == Errc::daemon_away;
+         why.code == Errc::unavailable;
 }
 
 HostInfo host_info(const local::Host& message) {

@@ -39,8 +39,8 @@ std::string_view errc_name(Errc code) noexcept {
       return "no_permission";
     case Errc::no_daemon:
       return "no_daemon";
-    case Errc::daemon_away:
-      return "daemon_away";
+    case Errc::unavailable:
+      return "unavailable";
     case Errc::protocol:
       return "protocol";
     case Errc::conflict:
@@ -88,7 +88,7 @@ std::string_view name_of(ClockStatus status) noexcept {
   return name_in(kNames, status);
 }
 
-std::string_view name_of(ClockTrouble trouble) noexcept {
+std::string_view name_of(ClockReason trouble) noexcept {
   static constexpr std::array<std::string_view, 6> kNames = {
       "none", "no chronyd", "chronyd is silent", "not synchronised", "stepped", "too far"};
   return name_in(kNames, trouble);

@@ -63,7 +63,7 @@ std::optional<Duration> ClockEstimator::look(const Instant& now) noexcept {
   base_ = now;
   stepped_ = true;
   updates_ = 0;
-  if (heard_ever_) forget(ClockTrouble::stepped);
+  if (heard_ever_) forget(ClockReason::stepped);
   return step;
 }
 
@@ -87,13 +87,13 @@ ClockEstimator::Verdict ClockEstimator::take_untrusted(const Tracking& tracking,
   heard_ = asked;
   const bool local = tracking.reference_id == kLocalReferenceId;
   if (tracking.leap == Tracking::kUnsynchronized) {
-    forget(ClockTrouble::unsynchronized);
+    forget(ClockReason::unsynchronized);
     return Verdict::unsynchronized;
   }
   if (local && reference_) {
     // Another PC is the reference, only ours does not hear it: what we knew grows old.
     if (!reading_ || reading_->tracking.reference_id == kLocalReferenceId) {
-      forget(ClockTrouble::unsynchronized);
+      forget(ClockReason::unsynchronized);
       return Verdict::unsynchronized;
     }
     return Verdict::taken;
@@ -108,21 +108,21 @@ ClockEstimator::Verdict ClockEstimator::take_untrusted(const Tracking& tracking,
   if (stepped_) {
     if (is_new) ++updates_;
     if (updates_ < kUpdatesAfterStep) {
-      forget(ClockTrouble::stepped);
+      forget(ClockReason::stepped);
       return Verdict::stepped;
     }
     stepped_ = false;
   }
   reading_ = {tracking, asked, updated};
-  why_ = ClockTrouble::none;
+  why_ = ClockReason::none;
   return Verdict::taken;
 }
 
 void ClockEstimator::on_no_chronyd() noexcept {
-  if (heard_ever_) forget(ClockTrouble::no_chronyd);
+  if (heard_ever_) forget(ClockReason::no_chronyd);
 }
 
-void ClockEstimator::forget(ClockTrouble why) noexcept {
+void ClockEstimator::forget(ClockReason why) noexcept {
   reading_.reset();
   why_ = why;
 }
@@ -170,7 +170,7 @@ ClockState ClockEstimator::at(MonoTime now) const noexcept {
   state.read = heard_;
   state.trouble = why_;
   if (now - heard_ > kSilentAfter) {
-    if (why_ != ClockTrouble::no_chronyd) state.trouble = ClockTrouble::silent;
+    if (why_ != ClockReason::no_chronyd) state.trouble = ClockReason::silent;
     return state;
   }
   if (!reading_) return state;
@@ -198,7 +198,7 @@ ClockState ClockEstimator::at(MonoTime now) const noexcept {
                            : state.root_bound;
   }
   if (state.bound > settings_.limit) {
-    state.trouble = ClockTrouble::too_far;
+    state.trouble = ClockReason::too_far;
   } else {
     state.status = state.basis != ClockBasis::own && is_overdue(now) ? ClockStatus::holdover
                                                                      : ClockStatus::synchronized;

@@ -54,7 +54,7 @@ struct ReferenceReport {
 // The clock at one instant.
 struct ClockState {
   ClockStatus status = ClockStatus::unknown;
-  ClockTrouble trouble = ClockTrouble::none;
+  ClockReason trouble = ClockReason::none;
   ClockBasis basis = ClockBasis::nothing;
   std::uint16_t stratum = 0;
   std::uint32_t reference_id = 0;  // this and the following: of the last reading; 0 without one
@@ -140,7 +140,7 @@ class ClockEstimator {
   };
 
   bool is_nonsense(const Tracking& tracking, const Instant& answered) const noexcept;
-  void forget(ClockTrouble why) noexcept;
+  void forget(ClockReason why) noexcept;
   Duration memory() const noexcept;
   bool follows_reference() const noexcept;
   bool is_overdue(MonoTime now) const noexcept;
@@ -155,7 +155,7 @@ class ClockEstimator {
   Time last_update_;      // chronyd's last measurement, by its own time
   int updates_ = 0;       // after the step
   MonoTime heard_;
-  ClockTrouble why_ = ClockTrouble::none;  // without a reading
+  ClockReason why_ = ClockReason::none;  // without a reading
   bool heard_ever_ = false;
 };
 

@@ -125,7 +125,7 @@ ClockRecord load(const ClockPage& page) {
     out.wall = time_from_ns(get(record.wall_ns));
     out.mono = MonoTime(Duration(get(record.mono_ns)));
     out.state.status = static_cast<ClockStatus>(get(record.status));
-    out.state.trouble = static_cast<ClockTrouble>(get(record.trouble));
+    out.state.trouble = static_cast<ClockReason>(get(record.trouble));
     out.state.basis = static_cast<ClockBasis>(get(record.basis));
     out.state.stratum = static_cast<std::uint16_t>(get(record.stratum));
     out.state.reference_id = get(record.reference_id);

@@ -42,12 +42,12 @@ inline constexpr std::size_t kMaxPublishers = 64;
 //    count 32    8 earlier_number_end -     dssmd       while tid_end is beyond top + 1; who gets a
 //    dead
 //                                                 writer's lock puts them back
-struct PublisherNote {
+struct PublisherCursor {
   std::atomic<std::uint64_t> publisher;
   std::atomic<std::uint64_t> tid_end, number_end;
   std::atomic<std::uint64_t> earlier_tid_end, earlier_number_end;
 };
-static_assert(sizeof(PublisherNote) == 40);
+static_assert(sizeof(PublisherCursor) == 40);
 
 //   off  size field            unit   written by  order
 //     0     8 magic            -      dssmd       before the first hand-out, as all up to 320
@@ -74,7 +74,7 @@ static_assert(sizeof(PublisherNote) == 40);
 //   536    40 reserved         -      -           zero
 //   576    56 clock            -      dssmd       see clock_gate.hpp
 //   632     8 reserved         -      -           zero
-//   640  2560 publishers       -      dssmd       before top: see publisher_notes.hpp
+//   640  2560 publishers       -      dssmd       before top: see publisher_cursors.hpp
 //  3200   896 reserved         -      -           zero
 struct RingHeader {
   std::uint64_t magic;
@@ -104,7 +104,7 @@ struct RingHeader {
   std::byte reserved3[40];
   ClockGate clock;
   std::byte reserved4[8];
-  PublisherNote publishers[kMaxPublishers];
+  PublisherCursor publishers[kMaxPublishers];
   std::byte reserved5[896];
 };
 static_assert(sizeof(pthread_mutex_t) <= 64);

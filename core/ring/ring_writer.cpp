@@ -83,7 +83,7 @@ RingWriter::Attempt RingWriter::try_publish(const PublishedSample& sample,
   const LockResult result = try_lock_robust(header.lock);
   if (result == LockResult::busy) return {Attempt::Outcome::busy, kNoTid};
   if (!take(result)) return {Attempt::Outcome::refused, kNoTid};
-  PublisherNotes(header).note(sample, newest() + 1);
+  PublisherCursors(header).note(sample, newest() + 1);
   return {Attempt::Outcome::written, write_locked(payload, time, clock_error)};
 }
 

@@ -9,7 +9,7 @@
 #include <span>
 
 #include "core/ring/bell.hpp"
-#include "core/ring/publisher_notes.hpp"
+#include "core/ring/publisher_cursors.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "core/ring/robust_lock.hpp"
 #include "core/ring/sample_publisher.hpp"
@@ -35,7 +35,7 @@ class RingWriter {
   }
 
   // Writes one sample for somebody on another PC and notes how far that one is by it
-  // (PublisherNotes). Does not wait for another writer: dssmd's loop must not wait for a program.
+  // (PublisherCursors). Does not wait for another writer: dssmd's loop must not wait for a program.
   struct Attempt {
     enum class Outcome : unsigned char {
       written,

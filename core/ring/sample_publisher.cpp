@@ -2,7 +2,7 @@
 #include "core/ring/sample_publisher.hpp"
 
 #include "core/ring/copy.hpp"
-#include "core/ring/publisher_notes.hpp"
+#include "core/ring/publisher_cursors.hpp"
 #include "core/ring/time_search.hpp"
 
 namespace dssm::ring {
@@ -77,7 +77,7 @@ void SamplePublisher::recover() const noexcept {
   if (header_->first.load(std::memory_order_relaxed) > top) {
     header_->first.store(top < 0 ? 0 : top, std::memory_order_release);
   }
-  PublisherNotes(*header_).recover();
+  PublisherCursors(*header_).recover();
 }
 
 [[gnu::hot]] void SamplePublisher::expect_next(Tid tid) const noexcept {

@@ -27,13 +27,13 @@ Enum enum_untrusted(std::uint32_t value, Enum last, Enum otherwise) noexcept {
   return value <= static_cast<std::uint32_t>(last) ? static_cast<Enum>(value) : otherwise;
 }
 
-void take_standing_untrusted(const proto::ClockStatus& message, clock::ClockStanding& out) {
+void take_standing_untrusted(const proto::ClockStatus& message, clock::SyncChain& out) {
   if (message.boot_id().size() <= kMaxBootIdBytes) out.boot_id = message.boot_id();
   if (message.ageing_ppb() < 0 || message.ageing_ppb() > kMostAgeing) return;
   out.ageing = message.ageing_ppb();
   out.root_bound = error_untrusted(message.root_bound_ns());
   out.root_is_utc = message.root_is_utc();
-  if (static_cast<std::size_t>(message.chain_size()) > clock::ClockStanding::kMostLinks) return;
+  if (static_cast<std::size_t>(message.chain_size()) > clock::SyncChain::kMostLinks) return;
   for (const proto::ClockLink& link : message.chain()) {
     clock::ClockId id{};
     if (!take_16_untrusted(link.host_id(), id)) continue;
@@ -55,7 +55,7 @@ ClockReport ClockReport::at(MonoTime now) const {
 }
 
 void to_message(const ClockReport& report, proto::ClockStatus& out) {
-  const clock::ClockStanding& standing = report.standing;
+  const clock::SyncChain& standing = report.standing;
   out.set_bound_ns(to_ns(standing.bound));
   out.set_boot_id(standing.boot_id);
   for (const clock::ClockLink& link : standing.chain) {
@@ -89,7 +89,7 @@ ClockReport clock_report_untrusted(const proto::ClockStatus& message, MonoTime h
   take_standing_untrusted(message, report.standing);
   report.status =
       enum_untrusted(message.status(), ClockStatus::out_of_bounds, ClockStatus::unknown);
-  report.trouble = enum_untrusted(message.trouble(), ClockTrouble::too_far, ClockTrouble::none);
+  report.trouble = enum_untrusted(message.trouble(), ClockReason::too_far, ClockReason::none);
   report.basis = enum_untrusted(message.basis(), ClockBasis::own, ClockBasis::nothing);
   report.offset = Duration(message.offset_ns());
   report.update_interval = Duration(std::max<std::int64_t>(message.update_interval_ns(), 0));

@@ -11,7 +11,7 @@
 #include <vector>
 
 #include "common.pb.h"
-#include "core/clock/clock_standing.hpp"
+#include "core/clock/sync_chain.hpp"
 
 namespace dssm::wire {
 
@@ -21,11 +21,11 @@ using IpBytes = std::array<std::uint8_t, 16>;
 struct ClockReport {
   static constexpr std::size_t kMostAddresses = 32;
 
-  clock::ClockStanding standing;
+  clock::SyncChain standing;
 
   // For people.
   ClockStatus status = ClockStatus::unknown;
-  ClockTrouble trouble = ClockTrouble::none;
+  ClockReason trouble = ClockReason::none;
   ClockBasis basis = ClockBasis::nothing;
   Duration offset{};
   Duration update_interval{};

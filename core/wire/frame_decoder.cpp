@@ -115,7 +115,7 @@ struct FrameDecoder::InputBuffer {
   std::array<std::byte, kInputBytes> bytes;
 };
 
-FrameDecoder::FrameDecoder(FrameSink& sink, std::size_t max_frame_bytes)
+FrameDecoder::FrameDecoder(FrameDelegate& sink, std::size_t max_frame_bytes)
     : sink_(sink), max_frame_bytes_(max_frame_bytes) {}
 
 FrameDecoder::~FrameDecoder() = default;

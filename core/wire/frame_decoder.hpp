@@ -40,7 +40,7 @@ struct IncomingSample {
 
 // What the decoder hands out; called from commit(). An error ends the decoding: the connection is
 // to be closed.
-class FrameSink {
+class FrameDelegate {
  public:
   // A sample begins. `out` is set to where its payload_bytes are to go, or nullptr to throw them
   // away. The place stays valid until on_sample_end(), or until the decoder is used no more.
@@ -51,7 +51,7 @@ class FrameSink {
   virtual Result<void> on_frame(net::Frame& frame) = 0;
 
  protected:
-  ~FrameSink() = default;
+  ~FrameDelegate() = default;
 };
 
 struct DecoderCounters {
@@ -64,7 +64,7 @@ struct DecoderCounters {
 class FrameDecoder {
  public:
   // max_frame_bytes: of frames without a payload, before set_payload_bytes() also of all.
-  FrameDecoder(FrameSink& sink, std::size_t max_frame_bytes);
+  FrameDecoder(FrameDelegate& sink, std::size_t max_frame_bytes);
   FrameDecoder(const FrameDecoder&) = delete;
   FrameDecoder& operator=(const FrameDecoder&) = delete;
   ~FrameDecoder();
@@ -134,7 +134,7 @@ class FrameDecoder {
   Result<void> check_payload_bytes(std::uint64_t payload_bytes) const;
   std::size_t longest_frame_bytes() const noexcept;
 
-  FrameSink& sink_;
+  FrameDelegate& sink_;
   std::size_t max_frame_bytes_;
   std::size_t payload_bytes_ = 0;
   DecoderCounters counters_;

@@ -134,7 +134,7 @@ StreamInfo stream_info(const proto::Stream& message) {
 Error failure(const proto::Failure& message) {
   constexpr Errc kCodes[] = {Errc::invalid_argument,   Errc::not_found,      Errc::already_exists,
                              Errc::type_mismatch,      Errc::limit_exceeded, Errc::no_memory,
-                             Errc::no_permission,      Errc::no_daemon,      Errc::daemon_away,
+                             Errc::no_permission,      Errc::no_daemon,      Errc::unavailable,
                              Errc::protocol,           Errc::conflict,       Errc::closed,
                              Errc::clock_out_of_bounds};
   Errc code = Errc::system;

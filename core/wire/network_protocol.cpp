@@ -43,7 +43,7 @@ bool is_printable(std::string_view text) {
 // Nobody knows how long it was under way, but a connection that takes longer is dead.
 std::shared_ptr<const ClockReport> news(const proto::ClockStatus& clock) {
   return std::make_shared<const ClockReport>(
-      clock_report_untrusted(clock, MonoClock::now() - kSilenceIsDeath));
+      clock_report_untrusted(clock, MonoClock::now() - kPeerTimeout));
 }
 
 void fill_randomly(void* bytes, std::size_t size) {
@@ -90,7 +90,7 @@ void to_message(const Greeting& greeting, net::Hello& out) {
   out.set_program(greeting.program);
   out.set_version(greeting.version);
   for (const std::string& feature : greeting.features) out.add_features(feature);
-  if (greeting.clock) tell_clock(greeting, *out.mutable_clock());
+  if (greeting.clock) send_clock(greeting, *out.mutable_clock());
 }
 
 Error other_protocol_version(const std::string& who, std::uint32_t theirs,
@@ -163,11 +163,11 @@ std::uint64_t random_number() {
   return number;
 }
 
-void tell_clock(const Greeting& self, proto::ClockStatus& out) {
+void send_clock(const Greeting& self, proto::ClockStatus& out) {
   if (self.clock) to_message(self.clock->at(MonoClock::now()), out);
 }
 
-std::shared_ptr<const ClockReport> clock_news_untrusted(const net::Pong& pong) {
+std::shared_ptr<const ClockReport> clock_report_untrusted(const net::Pong& pong) {
   return news(pong.clock());
 }
 

@@ -27,7 +27,7 @@ inline constexpr std::string_view kFeatureClock = "clock";  // network.proto, Po
 
 // Heartbeats of control connections, and when their silence means death (design: within 3 s).
 inline constexpr Duration kHeartbeat = std::chrono::seconds(1);
-inline constexpr Duration kSilenceIsDeath = std::chrono::milliseconds(2800);
+inline constexpr Duration kPeerTimeout = std::chrono::milliseconds(2800);
 // For the first Hello of a connection to be complete.
 inline constexpr Duration kHelloTimeout = std::chrono::seconds(3);
 
@@ -71,10 +71,10 @@ HostId host_id_for(std::string_view name);
 std::uint64_t random_number();
 
 // What we say of our own clock at this moment; nothing when nothing is known.
-void tell_clock(const Greeting& self, proto::ClockStatus& out);
+void send_clock(const Greeting& self, proto::ClockStatus& out);
 
 // What a Pong that nobody asked for says of its sender's clock.
-std::shared_ptr<const ClockReport> clock_news_untrusted(const net::Pong& pong);
+std::shared_ptr<const ClockReport> clock_report_untrusted(const net::Pong& pong);
 
 // How far the host behind the greeting says that its clock may be off: its bound, aged until now.
 Duration clock_bound_of(const Greeting& greeting) noexcept;

@@ -45,7 +45,7 @@ int user_timeout_ms(int socket) noexcept {
 Error network_error(const std::string& what, int errno_value, int socket) {
   switch (errno_value) {
     case ETIMEDOUT:
-      return Error{Errc::daemon_away, what + ": no answer from the other PC for " +
+      return Error{Errc::unavailable, what + ": no answer from the other PC for " +
                                           std::to_string(user_timeout_ms(socket) / 1000) +
                                           " s; is it on, is the network between us whole, and "
                                           "does the program there still read?"};
@@ -53,7 +53,7 @@ Error network_error(const std::string& what, int errno_value, int socket) {
     case ENETUNREACH:
     case EHOSTDOWN:
     case ENETDOWN:
-      return Error{Errc::daemon_away, os_error(what, errno_value).message +
+      return Error{Errc::unavailable, os_error(what, errno_value).message +
                                           "; is the other PC on, and does this one have a way to "
                                           "it (`ip route get`)?"};
     default:

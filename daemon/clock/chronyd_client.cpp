@@ -12,11 +12,11 @@
 
 namespace dssm::daemon {
 
-ChronydClient::ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, User& user,
-                             Now now, Duration period)
+ChronydClient::ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd,
+                             Observer& observer, Now now, Duration period)
     : loop_(loop),
       chronyd_(chronyd),
-      user_(user),
+      observer_(observer),
       now_(std::move(now)),
       period_(period),
       slack_(period / 4),
@@ -24,7 +24,7 @@ ChronydClient::ChronydClient(const EventLoop& loop, const wire::SocketAddress& c
   timer_.enable_in(Duration::zero());
 }
 
-void ChronydClient::take_occasion() {
+void ChronydClient::poll_if_due() {
   occasion_ = MonoClock::now();
   if (occasion_ - asked_ >= period_ - slack_) next_question();
 }
@@ -37,10 +37,10 @@ void ChronydClient::next_question() {
   timer_.enable_in(occasions_come ? period_ + slack_ : period_);
   if (question_) {
     const Question unanswered = *std::exchange(question_, {});
-    user_.on_no_answer(unanswered.why.value_or(
-        Error{Errc::daemon_away, "it does not answer; does `chronyc tracking` work?"}));
+    observer_.on_no_answer(unanswered.why.value_or(
+        Error{Errc::unavailable, "it does not answer; does `chronyc tracking` work?"}));
   }
-  if (Result<void> asked = ask(); !asked) user_.on_no_answer(asked.error());
+  if (Result<void> asked = ask(); !asked) observer_.on_no_answer(asked.error());
 }
 
 Result<void> ChronydClient::ask() {
@@ -79,7 +79,7 @@ void ChronydClient::on_readable() {
       finish();
       if (errno_value == ECONNREFUSED) {
         question_.reset();
-        return user_.on_no_chronyd();
+        return observer_.on_no_chronyd();
       }
       question_->why = os_error("receive from '" + chronyd_.str() + "'", errno_value);
       return;
@@ -105,7 +105,7 @@ bool ChronydClient::take_untrusted(std::span<const std::byte> datagram) {
   }
   finish();
   const MonoTime asked = std::exchange(question_, {})->asked;
-  user_.on_answer(*reply, asked, answered);
+  observer_.on_answer(*reply, asked, answered);
   return true;
 }
 

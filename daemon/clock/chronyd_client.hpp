@@ -27,7 +27,7 @@ class ChronydClient {
 
   using Now = std::function<clock::Instant()>;
 
-  class User {
+  class Observer {
    public:
     // An answer, to a question sent at `asked`. What it says is not checked.
     virtual void on_answer(const TrackingReply& reply, MonoTime asked,
@@ -38,19 +38,19 @@ class ChronydClient {
     virtual void on_no_answer(const Error& why) = 0;
 
    protected:
-    ~User() = default;
+    ~Observer() = default;
   };
 
   // Asks at once when the loop runs, and then about once a period. What is given by reference
   // outlives it.
-  ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, User& user, Now now,
-                Duration period = kPeriod);
+  ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, Observer& observer,
+                Now now, Duration period = kPeriod);
   ChronydClient(const ChronydClient&) = delete;
   ChronydClient& operator=(const ChronydClient&) = delete;
 
   // The process is awake anyway: asks now when a question is about due. Where such occasions come
   // once a period, the timer does not wake it.
-  void take_occasion();
+  void poll_if_due();
 
  private:
   struct Question {
@@ -68,7 +68,7 @@ class ChronydClient {
 
   const EventLoop& loop_;
   const wire::SocketAddress chronyd_;
-  User& user_;
+  Observer& observer_;
   const Now now_;
   const Duration period_, slack_;
   MonoTime asked_{}, occasion_{};     // the last ones

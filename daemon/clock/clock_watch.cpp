@@ -56,7 +56,7 @@ clock::ClockState ClockWatch::state() {
   look(now);
   clock::ClockState state = estimator_.at(now.mono);
   // Whoever asks why wants to know that it was never there.
-  if (state.status == ClockStatus::unknown && absent_) state.trouble = ClockTrouble::no_chronyd;
+  if (state.status == ClockStatus::unknown && absent_) state.trouble = ClockReason::no_chronyd;
   return state;
 }
 
@@ -156,15 +156,15 @@ ClockWatch::Condition ClockWatch::condition(const clock::ClockState& state,
   if (state.status == ClockStatus::holdover) return Condition::holdover;
   if (state.status == ClockStatus::synchronized) return Condition::good;
   switch (state.trouble) {
-    case ClockTrouble::unsynchronized:
+    case ClockReason::unsynchronized:
       return Condition::unsynchronized;
-    case ClockTrouble::stepped:
+    case ClockReason::stepped:
       return Condition::stepped;
-    case ClockTrouble::too_far:
+    case ClockReason::too_far:
       return Condition::too_far;
-    case ClockTrouble::no_chronyd:
-    case ClockTrouble::silent:
-    case ClockTrouble::none:
+    case ClockReason::no_chronyd:
+    case ClockReason::silent:
+    case ClockReason::none:
       break;
   }
   return Condition::silent;

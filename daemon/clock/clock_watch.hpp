@@ -14,13 +14,13 @@
 #include "core/wire/address.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
-#include "daemon/base/pace.hpp"
+#include "daemon/base/rate_limiter.hpp"
 #include "daemon/clock/chronyd_client.hpp"
 #include "daemon/clock/step_watch.hpp"
 
 namespace dssm::daemon {
 
-class ClockWatch final : private ChronydClient::User {
+class ClockWatch final : private ChronydClient::Observer {
  public:
   struct Options {
     wire::SocketAddress chronyd;
@@ -61,7 +61,7 @@ class ClockWatch final : private ChronydClient::User {
   static constexpr Duration kMostDelay = std::chrono::milliseconds(50);
 
   // dssmd is awake anyway: chronyd is asked now when that is about due.
-  void take_occasion() { client_.take_occasion(); }
+  void poll_if_due() { client_.poll_if_due(); }
 
   // Of chronyd's last answer, while there is a chronyd: whom it follows, and how often it measures.
   std::optional<SourceAddress> source() const noexcept;
@@ -85,7 +85,7 @@ class ClockWatch final : private ChronydClient::User {
   // So that a clock that is set every second, or goes in and out of bounds, does not fill the log.
   struct Calm {
     static constexpr int kAtOnce = 4;
-    Pace pace{kAtOnce, std::chrono::minutes(1)};
+    RateLimiter pace{kAtOnce, std::chrono::minutes(1)};
     int left_out = 0;
   };
 

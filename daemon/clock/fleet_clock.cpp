@@ -176,7 +176,7 @@ void FleetClock::look_up_addresses(MonoTime now) {
 }
 
 void FleetClock::stand(const clock::ClockState& state, MonoTime now) {
-  clock::ClockStanding& own = own_->standing;
+  clock::SyncChain& own = own_->standing;
   own_->heard = now;
   own.chain.clear();
   own.ageing = state.ageing;
@@ -185,12 +185,12 @@ void FleetClock::stand(const clock::ClockState& state, MonoTime now) {
   if (state.bound != kUnknownClockError) {
     own.chain.push_back({self_, state.own_bound});
     if (source_) {
-      const clock::ClockStanding theirs = source_->report->at(now).standing;
+      const clock::SyncChain theirs = source_->report->at(now).standing;
       own.root_is_utc = theirs.root_is_utc;
       own.chain.push_back({source_->id, state.bound});
       for (std::size_t i = 1; i < theirs.chain.size(); ++i) {
         const clock::ClockLink& link = theirs.chain[i];
-        if (own.chain.size() == clock::ClockStanding::kMostLinks) break;
+        if (own.chain.size() == clock::SyncChain::kMostLinks) break;
         if (own.distance_from(link.clock) != kUnknownClockError) break;  // a loop
         own.chain.push_back({link.clock, clock::sum(state.bound, link.bound)});
       }
@@ -201,7 +201,7 @@ void FleetClock::stand(const clock::ClockState& state, MonoTime now) {
 
 // What our samples are stamped against: the first host of the chain, as long as it is there.
 void FleetClock::choose_anchor(const clock::ClockState& state, MonoTime now) {
-  clock::ClockStanding& own = own_->standing;
+  clock::SyncChain& own = own_->standing;
   own.bound_is_root = false;
   own.anchor = self_;
   own.bound = state.own_bound;
@@ -233,10 +233,10 @@ void FleetClock::judge_own(const clock::ClockState& state) {
     const bool is_within = own_->standing.bound <= policies_.general.limit;
     if (is_within && state.status == ClockStatus::out_of_bounds) {
       own_->status = ClockStatus::synchronized;
-      own_->trouble = ClockTrouble::none;
+      own_->trouble = ClockReason::none;
     } else if (!is_within) {
       own_->status = ClockStatus::out_of_bounds;
-      own_->trouble = ClockTrouble::too_far;
+      own_->trouble = ClockReason::too_far;
     }
   }
   own_->offset = state.offset;
@@ -291,7 +291,7 @@ void FleetClock::tell_of_others(MonoTime now) {
 
 std::string FleetClock::str() const {
   std::string text = "clock " + std::string(name_of(own_->status));
-  if (own_->trouble != ClockTrouble::none) text += ": " + std::string(name_of(own_->trouble));
+  if (own_->trouble != ClockReason::none) text += ": " + std::string(name_of(own_->trouble));
   if (own_->standing.bound == kUnknownClockError) return text;
   text += " within " + in_microseconds(own_->standing.bound);
   switch (own_->basis) {
@@ -338,8 +338,8 @@ ring::ClockVerdict FleetClock::judge(const StreamId& id, const wire::ClockReport
     return verdict;
   }
   if (!owner || owner->standing.bound == kUnknownClockError) return verdict;
-  const clock::ClockStanding own = own_->at(verdict.judged).standing;
-  const clock::ClockStanding theirs = owner->at(verdict.judged).standing;
+  const clock::SyncChain own = own_->at(verdict.judged).standing;
+  const clock::SyncChain theirs = owner->at(verdict.judged).standing;
   verdict.added = clock::distance_from_anchor(theirs, own);
   verdict.ageing_ppb = static_cast<std::uint32_t>(own.ageing + theirs.ageing);
   if (verdict.added <= demand.limit) verdict.allowed = demand.limit - verdict.added;
@@ -367,7 +367,7 @@ std::string FleetClock::trouble_with(const wire::ClockReport* owner, Duration li
 ring::ClockVerdict FleetClock::judge_own(const StreamId& id) const {
   const clock::ClockDemand demand = policies_.demand_for(id);
   ring::ClockVerdict verdict = nothing_is_good(demand);
-  const clock::ClockStanding own = own_->at(verdict.judged).standing;
+  const clock::SyncChain own = own_->at(verdict.judged).standing;
   if (own.bound == kUnknownClockError) return verdict;
   verdict.added = own.bound;
   verdict.ageing_ppb = static_cast<std::uint32_t>(own.ageing);

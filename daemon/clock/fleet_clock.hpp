@@ -59,7 +59,7 @@ class FleetClock final : public ClockRules, private ClockWatch::Observer, privat
 
   // ClockRules
   std::uint64_t news() override;
-  void on_heartbeat() override { watch_.take_occasion(); }
+  void on_heartbeat() override { watch_.poll_if_due(); }
   Result<void> check_serving(const StreamId& id, const wire::Greeting& them) const override;
   ring::ClockVerdict judge(const StreamId& id, const wire::ClockReport* owner) const override;
   ring::ClockVerdict judge_own(const StreamId& id) const override;

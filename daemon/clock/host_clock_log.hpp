@@ -11,7 +11,7 @@
 
 #include "core/wire/network_protocol.hpp"
 #include "daemon/base/log.hpp"
-#include "daemon/base/pace.hpp"
+#include "daemon/base/rate_limiter.hpp"
 
 namespace dssm::daemon {
 
@@ -34,7 +34,7 @@ class HostClockLog {
     bool was_good = false;
     bool told = false;                  // that it is not good
     std::optional<MonoTime> bad_since;  // nothing: it is good
-    Pace pace{4, std::chrono::minutes(1)};
+    RateLimiter pace{4, std::chrono::minutes(1)};
   };
 
   Logger& logger_;

@@ -37,7 +37,7 @@ void Catalog::notify(const Tell& tell) {
 void Catalog::host_up(const wire::Greeting& greeting, const wire::Address& address) {
   if (const KnownHost* known = find(greeting.host_id)) {
     if (known->greeting.life == greeting.life) return;
-    host_down(greeting.host_id, {Errc::daemon_away, "its dssmd was restarted"});
+    host_down(greeting.host_id, {Errc::unavailable, "its dssmd was restarted"});
   }
   const KnownHost& host =
       hosts_.emplace(greeting.host_id, KnownHost{greeting, address, {}, 0}).first->second;

@@ -45,14 +45,14 @@ struct MdnsState {
 };
 
 // Told in the thread of the event loop that the finder was given.
-class HostFinderUser {
+class HostFinderObserver {
  public:
   virtual void on_host_found(const FoundHost& host) = 0;  // or something of it has changed
   virtual void on_host_lost(const wire::HostId& id) = 0;  // mDNS does not know it any more
   virtual void on_mdns_state(const MdnsState&) {}
 
  protected:
-  ~HostFinderUser() = default;
+  ~HostFinderObserver() = default;
 };
 
 }  // namespace dssm::daemon

@@ -10,7 +10,7 @@
 namespace dssm::daemon {
 namespace {
 
-std::string describe(const PeerLink& link) {
+std::string describe(const PeerConnection& link) {
   return "host '" + link.them()->host + "' ('" + link.address() + "')";
 }
 
@@ -27,15 +27,16 @@ Peers::Peers(const EventLoop& loop, Resolver& resolver, const std::vector<wire::
       settle_timer_(EventSource::timer(loop, [this] { settle(); })),
       tend_soon_(EventSource::timer(loop, [this] { tend(); })) {
   if (!settled_) settle_timer_.enable_in(kSettleTime);
-  PeerLink::User& user = *this;
+  PeerConnection::Observer& observer = *this;
   for (const wire::Address& peer : peers) {
-    peers_.emplace_back().link = std::make_unique<PeerLink>(loop, resolver, peer, self_, user);
+    peers_.emplace_back().link =
+        std::make_unique<PeerConnection>(loop, resolver, peer, self_, observer);
   }
 }
 
 Peers::~Peers() = default;
 
-Peers::Peer& Peers::peer_of(const PeerLink& link) {
+Peers::Peer& Peers::peer_of(const PeerConnection& link) {
   return *std::find_if(peers_.begin(), peers_.end(),
                        [&](const Peer& peer) { return peer.link.get() == &link; });
 }
@@ -61,7 +62,7 @@ bool Peers::is_up_as_configured(const wire::HostId& id) const {
   });
 }
 
-PeerLink* Peers::link_to(const wire::HostId& id) {
+PeerConnection* Peers::link_to(const wire::HostId& id) {
   const Peer* peer = in_use(id);
   return peer ? peer->link.get() : nullptr;
 }
@@ -181,7 +182,7 @@ void Peers::tend() {
 
 // May erase `peer`.
 void Peers::tend_found_host(std::list<Peer>::iterator peer, const Occupied& now_occupied) {
-  PeerLink::User& user = *this;
+  PeerConnection::Observer& observer = *this;
   Found& found = *peer->found;
   const std::vector<wire::Address> before = found.usable;
   look_at(found, now_occupied);
@@ -194,8 +195,8 @@ void Peers::tend_found_host(std::list<Peer>::iterator peer, const Occupied& now_
     peer->use = Use::none;
     peer->warning.clear();
   } else if (!peer->link) {
-    peer->link =
-        std::make_unique<PeerLink>(loop_, resolver_, found.host.id, found.usable, self_, user);
+    peer->link = std::make_unique<PeerConnection>(loop_, resolver_, found.host.id, found.usable,
+                                                  self_, observer);
   } else if (!found.usable.empty() && found.usable != before) {
     peer->link->set_addresses(found.usable);
   }
@@ -204,7 +205,7 @@ void Peers::tend_found_host(std::list<Peer>::iterator peer, const Occupied& now_
 // --- configured peers change
 
 void Peers::set_configured(const std::vector<wire::Address>& peers) {
-  PeerLink::User& user = *this;
+  PeerConnection::Observer& observer = *this;
   std::vector<wire::Address> known;
   for (Peer& peer : peers_) {
     if (peer.found || peer.leaving) continue;
@@ -213,14 +214,14 @@ void Peers::set_configured(const std::vector<wire::Address>& peers) {
     if (std::find(peers.begin(), peers.end(), address) != peers.end()) continue;
     peer.leaving = true;
     // When that is through, tend() takes it away; what waits for its answers is told.
-    peer.link->drop({Errc::daemon_away, "it is not among the peers any more (key peers)"});
+    peer.link->drop({Errc::unavailable, "it is not among the peers any more (key peers)"});
   }
   const auto first_found = std::find_if(peers_.begin(), peers_.end(),
                                         [](const Peer& peer) { return peer.found.has_value(); });
   for (const wire::Address& address : peers) {
     if (std::find(known.begin(), known.end(), address) != known.end()) continue;
     peers_.emplace(first_found)->link =
-        std::make_unique<PeerLink>(loop_, resolver_, address, self_, user);
+        std::make_unique<PeerConnection>(loop_, resolver_, address, self_, observer);
   }
   tend_soon_.enable_in(Duration::zero());
 }
@@ -241,7 +242,7 @@ std::string Peers::same_host_warning(const Peer& in_use, const Peer& by) {
          "machine id (rm /etc/machine-id && systemd-machine-id-setup)";
 }
 
-void Peers::on_link_up(PeerLink& link) {
+void Peers::on_link_up(PeerConnection& link) {
   Peer& peer = peer_of(link);
   const wire::Greeting& them = *link.them();
   peer.told_down = false;
@@ -261,7 +262,7 @@ void Peers::on_link_up(PeerLink& link) {
 // word: one that is closed would be dialed again and again. Only that to our own echo ends, because
 // the next address may be that of another PC.
 void Peers::on_own_id(Peer& peer) {
-  PeerLink& link = *peer.link;
+  PeerConnection& link = *peer.link;
   const wire::Greeting& them = *link.them();
   const bool is_self = them.life == self_.life;
   if (is_self && peer.found) {
@@ -283,7 +284,7 @@ void Peers::on_own_id(Peer& peer) {
 
 // The first connection to that host: its life is the host's.
 void Peers::use(Peer& peer) {
-  PeerLink& link = *peer.link;
+  PeerConnection& link = *peer.link;
   const wire::Greeting& them = *link.them();
   peer.use = Use::in_use;
   peer.warning.clear();
@@ -302,7 +303,7 @@ void Peers::use(Peer& peer) {
   link.watch();
 }
 
-void Peers::on_link_down(PeerLink& link, const Error& why, bool attempt) {
+void Peers::on_link_down(PeerConnection& link, const Error& why, bool attempt) {
   Peer& peer = peer_of(link);
   const Use was = std::exchange(peer.use, Use::none);
   peer.warning.clear();
@@ -336,7 +337,7 @@ void Peers::take_over(const wire::HostId& id) {
   }
 }
 
-Result<void> Peers::on_stream_event_untrusted(PeerLink& link, const net::StreamEvent& event) {
+Result<void> Peers::on_stream_event_untrusted(PeerConnection& link, const net::StreamEvent& event) {
   const wire::Greeting& them = *link.them();
   proto::StreamId named = event.stream().id();
   named.set_host(them.host);  // nobody speaks for another host
@@ -354,9 +355,9 @@ Result<void> Peers::on_stream_event_untrusted(PeerLink& link, const net::StreamE
   return catalog_.stream_added(them.host_id, std::move(stream));
 }
 
-void Peers::on_watched(PeerLink& link) { decide(peer_of(link)); }
+void Peers::on_watched(PeerConnection& link) { decide(peer_of(link)); }
 
-void Peers::on_heartbeat(PeerLink& link) {
+void Peers::on_heartbeat(PeerConnection& link) {
   if (peer_of(link).use != Use::in_use) return;
   catalog_.set_clock(link.them()->host_id, link.them()->clock);
 }

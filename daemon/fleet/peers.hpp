@@ -36,17 +36,17 @@
 #include <string>
 #include <vector>
 
-#include "daemon/base/calm_logger.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/base/rate_limited_logger.hpp"
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/fleet/found_host.hpp"
-#include "daemon/fleet/peer_link.hpp"
+#include "daemon/fleet/peer_connection.hpp"
 #include "local.pb.h"
 
 namespace dssm::daemon {
 
-class Peers final : public HostFinderUser, private PeerLink::User {
+class Peers final : public HostFinderObserver, private PeerConnection::Observer {
  public:
   // So long after the start nobody waits any more for peers that were not heard of.
   static constexpr Duration kSettleTime = std::chrono::seconds(1);
@@ -79,7 +79,7 @@ class Peers final : public HostFinderUser, private PeerLink::User {
   const MdnsState& mdns() const noexcept { return mdns_; }
 
   // The connection to a host that is up; nullptr: there is none.
-  PeerLink* link_to(const wire::HostId& id);
+  PeerConnection* link_to(const wire::HostId& id);
 
   // Whether kSettleTime passed, or the first word of each configured peer came, good or bad, and
   // there is no finder that might still find others: mDNS has no end, so when it works the time is
@@ -95,7 +95,7 @@ class Peers final : public HostFinderUser, private PeerLink::User {
   // refused)"; empty: all peers are up.
   std::string trouble() const;
   // A warning that concerns this host itself; empty: none.
-  std::string own_trouble() const;
+  std::string own_warning() const;
 
  private:
   // What a connection that is up is good for.
@@ -113,8 +113,8 @@ class Peers final : public HostFinderUser, private PeerLink::User {
     std::optional<Obstacle> obstacle;
   };
   struct Peer {
-    std::optional<Found> found;      // else it is configured
-    std::unique_ptr<PeerLink> link;  // nullptr: a found host that is not dialed
+    std::optional<Found> found;            // else it is configured
+    std::unique_ptr<PeerConnection> link;  // nullptr: a found host that is not dialed
     Use use = Use::none;
     bool decided = false;    // its first word came
     bool told_down = false;  // the log says that it is not up
@@ -124,13 +124,14 @@ class Peers final : public HostFinderUser, private PeerLink::User {
   // Addresses, written as numbers, and who answers there at this moment.
   using Occupied = std::map<std::string, const wire::Greeting*>;
 
-  void on_link_up(PeerLink& link) override;
-  void on_link_down(PeerLink& link, const Error& why, bool attempt) override;
-  Result<void> on_stream_event_untrusted(PeerLink& link, const net::StreamEvent& event) override;
-  void on_watched(PeerLink& link) override;
-  void on_heartbeat(PeerLink& link) override;
+  void on_link_up(PeerConnection& link) override;
+  void on_link_down(PeerConnection& link, const Error& why, bool attempt) override;
+  Result<void> on_stream_event_untrusted(PeerConnection& link,
+                                         const net::StreamEvent& event) override;
+  void on_watched(PeerConnection& link) override;
+  void on_heartbeat(PeerConnection& link) override;
 
-  Peer& peer_of(const PeerLink& link);
+  Peer& peer_of(const PeerConnection& link);
   Peer* found_host(const wire::HostId& id);
   const Peer* in_use(const wire::HostId& id) const;
   bool is_up_as_configured(const wire::HostId& id) const;
@@ -156,8 +157,8 @@ class Peers final : public HostFinderUser, private PeerLink::User {
   Resolver& resolver_;
   const wire::Greeting self_;
   Catalog& catalog_;
-  CalmLogger logger_;      // found hosts come and go as whoever announces them likes
-  std::list<Peer> peers_;  // the configured ones first
+  RateLimitedLogger logger_;  // found hosts come and go as whoever announces them likes
+  std::list<Peer> peers_;     // the configured ones first
   bool insecure_ = false;
   bool told_too_many_ = false;
   std::uint64_t told_twin_ = 0;  // the life of the one with our id of which the log knows

@@ -13,9 +13,9 @@ namespace {
 constexpr std::size_t kMaxTroublesTold = 8;
 
 // Adds what it says of its clock, aged until now.
-void tell_clock_of(const wire::Greeting& them, local::Host& host) {
+void send_clock_of(const wire::Greeting& them, local::Host& host) {
   host.set_clock_bound_ns(to_ns(wire::clock_bound_of(them)));
-  wire::tell_clock(them, *host.mutable_clock());
+  wire::send_clock(them, *host.mutable_clock());
 }
 
 }  // namespace
@@ -81,7 +81,7 @@ local::Host Peers::shown(const Peer& peer) const {
     }
     if (!peer.link) return host;
   }
-  const PeerLink& link = *peer.link;
+  const PeerConnection& link = *peer.link;
   host.set_state(peer.use == Use::self         ? "self"
                  : peer.use == Use::not_usable ? "refused"
                                                : std::string(state_name(link.state())));
@@ -101,7 +101,7 @@ local::Host Peers::shown(const Peer& peer) const {
   if (link.why()) host.set_error(link.why()->message);
   if (!peer.warning.empty()) host.set_error(peer.warning);
   if (!shows_use(peer)) return host;
-  tell_clock_of(*link.them(), host);
+  send_clock_of(*link.them(), host);
   if (const KnownHost* known = catalog_.find(link.them()->host_id)) {
     host.set_streams(static_cast<std::uint32_t>(known->streams.size()));
   }
@@ -150,7 +150,7 @@ std::string Peers::trouble() const {
   return text;
 }
 
-std::string Peers::own_trouble() const {
+std::string Peers::own_warning() const {
   for (const Peer& peer : peers_) {
     if (peer.use == Use::not_usable) return peer.warning;
   }

@@ -24,19 +24,19 @@ struct Dialer::State {
     pause,    // until the timer
   };
 
-  State(const EventLoop& event_loop, Resolver& with, Options given, User& for_user,
-        FrameLink::User& of_link)
+  State(const EventLoop& event_loop, Resolver& with, Options given, Observer& for_user,
+        FrameConnection::Observer& of_link)
       : loop(event_loop),
         resolver(with),
         options(std::move(given)),
-        user(for_user),
+        observer(for_user),
         link_user(of_link),
         timer(EventSource::timer(loop, [this] { on_timer(); })) {
     timer.enable_in(Duration::zero());
   }
 
   void begin_round();
-  void begin_anew();
+  void reopen();
   void begin_with(std::vector<wire::SocketAddress> found);
   void try_next_address();
   void on_connected();
@@ -49,18 +49,19 @@ struct Dialer::State {
   const EventLoop& loop;
   Resolver& resolver;
   Options options;
-  User& user;
-  FrameLink::User& link_user;
+  Observer& observer;
+  FrameConnection::Observer& link_user;
 
   Step step = Step::pause;
   Duration pause = kFirstPause;  // the next one
   MonoTime up_since{};
   Resolver::Ticket looking_up;
   std::vector<wire::SocketAddress> addresses;
-  std::size_t current = 0;          // of `addresses`: the one that is tried or connected to
-  std::optional<Error> last;        // why the address before it did not work
-  UniqueFd socket;                  // while it connects
-  std::unique_ptr<FrameLink> link;  // until the next round: it must not end in its own callbacks
+  std::size_t current = 0;    // of `addresses`: the one that is tried or connected to
+  std::optional<Error> last;  // why the address before it did not work
+  UniqueFd socket;            // while it connects
+  std::unique_ptr<FrameConnection>
+      link;  // until the next round: it must not end in its own callbacks
   std::optional<wire::Greeting> them;
   std::optional<Error> reason;  // why the link is about to close, when we know better than it does
   bool given_up = false;        // by restart(), while it was up
@@ -70,7 +71,7 @@ struct Dialer::State {
 
 // Leaves an attempt to connect for a round of its own. From the timer: it may be in the attempt's
 // own callback that somebody has learned of better addresses.
-void Dialer::State::begin_anew() {
+void Dialer::State::reopen() {
   connected.disable();
   socket.reset();
   step = Step::pause;
@@ -141,8 +142,8 @@ void Dialer::State::on_connected() {
   wire::set_channel_options(socket.get());
   step = Step::greet;
   timer.enable_in(wire::kHelloTimeout);
-  link = std::make_unique<FrameLink>(loop, wire::make_tcp_transport(std::move(socket)), link_user,
-                                     options.max_queued_bytes);
+  link = std::make_unique<FrameConnection>(loop, wire::make_tcp_transport(std::move(socket)),
+                                           link_user, options.max_queued_bytes);
   net::Frame hello;
   wire::to_message(options.self, *hello.mutable_hello());
   link->send(hello);
@@ -159,13 +160,13 @@ void Dialer::State::on_timer() {
         connected.disable();
         socket.reset();
         last =
-            Error{Errc::daemon_away, "connect to '" + addresses[current].str() +
+            Error{Errc::unavailable, "connect to '" + addresses[current].str() +
                                          "': no answer; is that PC on, and is there a way to it?"};
       }
       ++current;
       return try_next_address();
     case Step::greet:
-      reason = Error{Errc::daemon_away, who() + " does not greet; is it a dssmd?"};
+      reason = Error{Errc::unavailable, who() + " does not greet; is it a dssmd?"};
       return link->close_with(*reason);
     case Step::look_up:
     case Step::up:
@@ -180,7 +181,7 @@ Result<void> Dialer::State::on_frame(net::Frame& frame) {
   }
   if (step == Step::greet) return greet_untrusted(frame);
   if (frame.has_hello()) return Error{Errc::protocol, "it greets twice"};
-  return user.on_frame(frame);
+  return observer.on_frame(frame);
 }
 
 Result<void> Dialer::State::greet_untrusted(const net::Frame& frame) {
@@ -197,7 +198,7 @@ Result<void> Dialer::State::greet_untrusted(const net::Frame& frame) {
   timer.disable();
   step = Step::up;
   up_since = MonoClock::now();
-  user.on_up(*link, *them);
+  observer.on_up(*link, *them);
   return {};
 }
 
@@ -209,15 +210,15 @@ void Dialer::State::fail(const Error& why) {
   step = Step::pause;
   timer.enable_in(pause);
   pause = std::min(2 * pause, options.longest_pause);
-  user.on_down(why);
+  observer.on_down(why);
 }
 
-Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, User& user)
-    : state_(new State(loop, resolver, std::move(options), user, *this)) {}
+Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, Observer& observer)
+    : state_(new State(loop, resolver, std::move(options), observer, *this)) {}
 
 Dialer::~Dialer() = default;
 
-void Dialer::hurry() {
+void Dialer::retry_now() {
   state_->pause = kFirstPause;
   if (state_->step == State::Step::pause) state_->timer.enable_in(Duration::zero());
 }
@@ -249,10 +250,10 @@ void Dialer::set_addresses(std::vector<wire::Address> addresses) {
   State& state = *state_;
   if (addresses == state.options.addresses) return;
   state.options.addresses = std::move(addresses);
-  if (state.step == State::Step::connect) state.begin_anew();
+  if (state.step == State::Step::connect) state.reopen();
 }
 
-FrameLink* Dialer::link() noexcept {
+FrameConnection* Dialer::link() noexcept {
   return state_->step == State::Step::up ? state_->link.get() : nullptr;
 }
 
@@ -270,7 +271,7 @@ bool Dialer::crosses_network() const noexcept {
 Result<void> Dialer::on_frame(net::Frame& frame) { return state_->on_frame(frame); }
 
 void Dialer::on_output_empty() {
-  if (state_->step == State::Step::up) state_->user.on_output_empty();
+  if (state_->step == State::Step::up) state_->observer.on_output_empty();
 }
 
 void Dialer::on_closed(const Error& why) {

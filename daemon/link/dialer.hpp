@@ -2,7 +2,7 @@
 //
 // Keeps one outgoing connection up: looks the address up, connects, greets, and when the connection
 // breaks does it all again, after a pause that grows from kFirstPause to kLongestPause and never
-// gives up. Used by PeerLink (control connections), mirrors and remote writers (channels).
+// gives up. Used by PeerConnection (control connections), mirrors and remote writers (channels).
 //
 // Of several addresses the first that connects is taken. When nobody greets there, or when
 // restart() gave the connection up, the next round begins with the one behind it.
@@ -15,21 +15,21 @@
 #include "core/wire/address.hpp"
 #include "core/wire/network_protocol.hpp"
 #include "daemon/base/event_loop.hpp"
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 #include "daemon/link/resolver.hpp"
 
 namespace dssm::daemon {
 
-class Dialer final : private FrameLink::User {
+class Dialer final : private FrameConnection::Observer {
  public:
   static constexpr Duration kFirstPause = std::chrono::milliseconds(50);
   static constexpr Duration kLongestPause = std::chrono::seconds(2);
   static constexpr Duration kConnectTimeout = std::chrono::seconds(2);  // of one address
 
-  class User {
+  class Observer {
    public:
     // Both greetings are exchanged: ask away. `link` is the dialer's and good until on_down().
-    virtual void on_up(FrameLink& link, const wire::Greeting& them) = 0;
+    virtual void on_up(FrameConnection& link, const wire::Greeting& them) = 0;
     virtual Result<void> on_frame(net::Frame& frame) = 0;
     virtual void on_output_empty() {}
     // The connection broke, or an attempt failed; the dialer goes on trying by itself. Called for
@@ -37,7 +37,7 @@ class Dialer final : private FrameLink::User {
     virtual void on_down(const Error& why) = 0;
 
    protected:
-    ~User() = default;
+    ~Observer() = default;
   };
 
   struct Options {
@@ -50,15 +50,15 @@ class Dialer final : private FrameLink::User {
     Duration round_time = Duration::max();  // all addresses share it, none gets > kConnectTimeout
   };
 
-  // Starts at once. resolver, loop and user outlive it. Destroying it, outside of its own
+  // Starts at once. resolver, loop and observer outlive it. Destroying it, outside of its own
   // callbacks, closes the connection.
-  Dialer(const EventLoop& loop, Resolver& resolver, Options options, User& user);
+  Dialer(const EventLoop& loop, Resolver& resolver, Options options, Observer& observer);
   Dialer(const Dialer&) = delete;
   Dialer& operator=(const Dialer&) = delete;
   ~Dialer();
 
   // Tries at once instead of waiting for the pause to end (the other side just showed up).
-  void hurry();
+  void retry_now();
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
   // the next attempt after the pause that is due. While it pauses anyway: nothing.
   void restart(const Error& why);
@@ -66,7 +66,7 @@ class Dialer final : private FrameLink::User {
   // for somebody to answer; what is up stays as it is.
   void set_addresses(std::vector<wire::Address> addresses);
 
-  FrameLink* link() noexcept;             // nullptr unless up
+  FrameConnection* link() noexcept;       // nullptr unless up
   std::string address() const;            // connected to, else the first
   bool crosses_network() const noexcept;  // connected to another address than loopback
 

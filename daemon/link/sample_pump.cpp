@@ -18,13 +18,13 @@ Duration period_of(double rate_hz) {
   return newest <= kLastTid ? newest : kNoTid;
 }
 
-SamplePump::SamplePump(const ring::RingMapping& mapping, FrameLink& link, SampleSender& sender,
-                       Events& events, const Plan& plan)
+SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& link,
+                       SampleSender& sender, Observer& observer, const Plan& plan)
     : reader_(mapping),
       payload_bytes_(mapping.geometry().payload_bytes),
       link_(link),
       sender_(sender),
-      events_(events),
+      observer_(observer),
       plan_(plan),
       next_(std::clamp<Tid>(plan.first, 0, kLastTid)),
       last_(kLastTid) {}
@@ -48,7 +48,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameLink& link, Sample
       if (seen == Look::news) return PumpWait::news;
       if (seen == Look::time) return PumpWait::time;
       const Tid newest = std::min(newest_untrusted(reader_), last_);
-      events_.before_samples();
+      observer_.before_samples();
       if (!link_.output_empty()) return PumpWait::room;
       if (sender_.sends_in_place()) {
         sent_up_to = next_ + 1;
@@ -102,11 +102,11 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameLink& link, Sample
   if (!caught_up_ && next_ > plan_.caught_up_at) {
     caught_up_ = true;
     sender_.end_run();
-    events_.on_caught_up();
+    observer_.on_caught_up();
   }
   if (next_ > last_) {
     sender_.end_run();
-    events_.on_end();
+    observer_.on_end();
     return Look::end;
   }
   if (next_ > newest) return Look::news;
@@ -120,7 +120,7 @@ void SamplePump::lose_up_to(Tid next) {
   const auto count = static_cast<std::uint64_t>(next - next_);
   lost_ += count;
   sender_.end_run();
-  events_.on_gap(next_, count);
+  observer_.on_gap(next_, count);
   next_ = next;
 }
 

@@ -14,7 +14,7 @@
 #include <dssm/sample.hpp>
 
 #include "core/ring/ring_reader.hpp"
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 #include "daemon/link/sample_sender.hpp"
 
 namespace dssm::daemon {
@@ -41,7 +41,7 @@ class SamplePump {
   static constexpr int kSamplesPerTurn = 1024;
   static constexpr std::size_t kBytesPerTurn = 1U << 20;
 
-  class Events {
+  class Observer {
    public:
     // Samples [first, first + count) are lost. Frames may be sent on the link.
     virtual void on_gap(Tid first, std::uint64_t count) = 0;
@@ -53,7 +53,7 @@ class SamplePump {
     virtual void on_end() {}
 
    protected:
-    ~Events() = default;
+    ~Observer() = default;
   };
 
   struct Plan {
@@ -65,8 +65,8 @@ class SamplePump {
     double max_rate_hz = 0;
   };
 
-  SamplePump(const ring::RingMapping& mapping, FrameLink& link, SampleSender& sender,
-             Events& events, const Plan& plan);
+  SamplePump(const ring::RingMapping& mapping, FrameConnection& link, SampleSender& sender,
+             Observer& observer, const Plan& plan);
   SamplePump(const SamplePump&) = delete;
   SamplePump& operator=(const SamplePump&) = delete;
 
@@ -95,9 +95,9 @@ class SamplePump {
 
   ring::RingReader reader_;
   std::size_t payload_bytes_;
-  FrameLink& link_;
+  FrameConnection& link_;
   SampleSender& sender_;
-  Events& events_;
+  Observer& observer_;
   Plan plan_;
   Tid next_;
   Tid last_;

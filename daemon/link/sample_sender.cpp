@@ -19,7 +19,7 @@ iovec part_of(const std::byte* bytes, std::size_t size) noexcept {
 
 }  // namespace
 
-SampleSender::SampleSender(const ring::RingMapping& mapping, FrameLink& link,
+SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& link,
                            const Options& options)
     : reader_(mapping),
       link_(link),

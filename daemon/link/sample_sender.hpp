@@ -35,7 +35,7 @@
 #include "core/ring/ring_reader.hpp"
 #include "core/wire/sample_frame.hpp"
 #include "daemon/base/memory_budget.hpp"
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 #include "daemon/link/raw_bytes.hpp"
 
 namespace dssm::daemon {
@@ -70,7 +70,7 @@ class SampleSender {
     std::uint64_t in_place_payload_bytes = 0;  // from the slot to the kernel
   };
 
-  SampleSender(const ring::RingMapping& mapping, FrameLink& link, const Options& options);
+  SampleSender(const ring::RingMapping& mapping, FrameConnection& link, const Options& options);
   SampleSender(const SampleSender&) = delete;
   SampleSender& operator=(const SampleSender&) = delete;
 
@@ -105,7 +105,7 @@ class SampleSender {
   void keep_head(std::span<const std::byte> bytes) noexcept;
 
   ring::RingReader reader_;
-  FrameLink& link_;
+  FrameConnection& link_;
   Options options_;
   std::size_t payload_bytes_;
   Counters counters_;

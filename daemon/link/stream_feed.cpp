@@ -37,28 +37,28 @@ void StreamFeed::on_doorbell_added(int fd) {
   bell_->arm_doorbell(armed);
 }
 
-[[gnu::hot]] bool StreamFeed::wait(Listener& listener, Tid known) {
-  std::erase_if(waiting_, [&](const Waiting& waiting) { return waiting.listener == &listener; });
+[[gnu::hot]] bool StreamFeed::wait(Observer& observer, Tid known) {
+  std::erase_if(waiting_, [&](const Waiting& waiting) { return waiting.observer == &observer; });
   arm(true);
   if (newest_untrusted(reader_) > known) {
     if (waiting_.empty()) arm(false);
     return false;
   }
-  waiting_.push_back({&listener, known});
+  waiting_.push_back({&observer, known});
   return true;
 }
 
-[[gnu::hot]] void StreamFeed::forget(Listener& listener) noexcept {
-  std::erase_if(waiting_, [&](const Waiting& waiting) { return waiting.listener == &listener; });
+[[gnu::hot]] void StreamFeed::forget(Observer& observer) noexcept {
+  std::erase_if(waiting_, [&](const Waiting& waiting) { return waiting.observer == &observer; });
   for (Waiting& waiting : told_) {
-    if (waiting.listener == &listener) waiting.listener = nullptr;
+    if (waiting.observer == &observer) waiting.observer = nullptr;
   }
   if (waiting_.empty()) arm(false);
 }
 
 [[gnu::hot]] void StreamFeed::look() {
   look_again_ = true;
-  if (looking_) return;  // a listener wrote to the stream
+  if (looking_) return;  // a observer wrote to the stream
   looking_ = true;
   while (std::exchange(look_again_, false) && !waiting_.empty()) {
     // Disarmed, so that the writer does not ring for what is sent in this round anyway.
@@ -66,10 +66,10 @@ void StreamFeed::on_doorbell_added(int fd) {
     std::swap(told_, waiting_);  // neither gives its memory back
     for (std::size_t i = 0; i < told_.size(); ++i) {
       const Waiting waiting = std::exchange(told_[i], {nullptr, kNoTid});
-      if (!waiting.listener) continue;
+      if (!waiting.observer) continue;
       // Whoever is told will wait again: only for the others it is worth arming.
       const bool news = newest_untrusted(reader_) > waiting.known;
-      if (news || !wait(*waiting.listener, waiting.known)) waiting.listener->on_news();
+      if (news || !wait(*waiting.observer, waiting.known)) waiting.observer->on_news();
     }
     told_.clear();
   }

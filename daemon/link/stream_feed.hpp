@@ -23,14 +23,14 @@ namespace dssm::daemon {
 
 class StreamFeed final : private DoorbellObserver {
  public:
-  class Listener {
+  class Observer {
    public:
     // There is a sample newer than the one known; called once per wait(), from the loop. May call
     // wait() and forget().
     virtual void on_news() = 0;
 
    protected:
-    ~Listener() = default;
+    ~Observer() = default;
   };
 
   // At most one feed per stream at a time. loop outlives it.
@@ -40,11 +40,11 @@ class StreamFeed final : private DoorbellObserver {
   StreamFeed& operator=(const StreamFeed&) = delete;
   ~StreamFeed();
 
-  // Waits for a sample newer than `known`, instead of what this listener waited for before. False
+  // Waits for a sample newer than `known`, instead of what this observer waited for before. False
   // when there is one already: then nothing follows.
-  bool wait(Listener& listener, Tid known);
+  bool wait(Observer& observer, Tid known);
   // Nothing follows any more.
-  void forget(Listener& listener) noexcept;
+  void forget(Observer& observer) noexcept;
 
   // A sample was written, or may have been: by dssmd itself, or by a writer that died before it
   // could ring.
@@ -52,7 +52,7 @@ class StreamFeed final : private DoorbellObserver {
 
  private:
   struct Waiting {
-    Listener* listener;
+    Observer* observer;
     Tid known;
   };
 

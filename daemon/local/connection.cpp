@@ -121,7 +121,7 @@ void Connection::on_writable() {
 void Connection::end_with(const Error& error) {
   logger_.warning("close a connection: " + error.message,
                   {.message_id = message_id::kClientRefused});
-  send(last_words(error), {});
+  send(final_failure(error), {});
   close();
 }
 

@@ -298,9 +298,9 @@ std::vector<local::Host> FleetService::hosts() const {
   self.set_state("self");
   self.set_streams(static_cast<std::uint32_t>(registry_.streams().size()));
   self.set_clock_bound_ns(to_ns(wire::clock_bound_of(self_.greeting)));
-  wire::tell_clock(self_.greeting, *self.mutable_clock());
+  wire::send_clock(self_.greeting, *self.mutable_clock());
   self.set_insecure(self_.insecure);
-  self.set_error(peers_.own_trouble());
+  self.set_error(peers_.own_warning());
   self.set_clock_distance_ns(0);
   for (local::Host& host : peers_.hosts()) {
     host.set_clock_distance_ns(to_ns(clock_distance_to(host)));
@@ -340,9 +340,9 @@ void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {
   when_known({"", 0, host}, [this, host, then = std::move(then)]() mutable {
     const Result<const KnownHost*> known = catalog_.find_host(host);
     if (!known) return then(with_trouble(known.error()));
-    PeerLink& link = *peers_.link_to((*known)->greeting.host_id);
+    PeerConnection& link = *peers_.link_to((*known)->greeting.host_id);
     net::Frame request;
-    wire::tell_clock(self_.greeting, *request.mutable_ping()->mutable_clock());
+    wire::send_clock(self_.greeting, *request.mutable_ping()->mutable_clock());
     link.ask(std::move(request), [address = link.address(), sent = MonoClock::now(),
                                   then = std::move(then)](Result<net::Frame> answer) {
       if (!answer) return then(std::move(answer).error());

@@ -25,7 +25,7 @@ local::Response failure_response(std::uint64_t serial, const Error& error) {
 
 }  // namespace
 
-std::string last_words(const Error& error) {
+std::string final_failure(const Error& error) {
   return wire::encode_frame(failure_response(0, error));
 }
 
@@ -311,7 +311,7 @@ void LocalService::on_remote_stream_removed(const StreamId& id) {
 
 // --- rings with a successor
 
-void LocalService::tell_replaced(const OpenTable::Reading& reading) {
+void LocalService::notify_replaced(const OpenTable::Reading& reading) {
   const auto client = clients_.find(reading.client);
   if (client == clients_.end()) return;  // sending to another one may have ended this one
   Reply event;
@@ -320,7 +320,7 @@ void LocalService::tell_replaced(const OpenTable::Reading& reading) {
 }
 
 void LocalService::on_ring_replaced(const Stream& stream) {
-  for (const OpenTable::Reading& reading : opens_.readers_of(stream)) tell_replaced(reading);
+  for (const OpenTable::Reading& reading : opens_.readers_of(stream)) notify_replaced(reading);
 }
 
 // Streams with the name in `id` came or went. Whoever reads one of that name that will get no
@@ -332,7 +332,7 @@ void LocalService::look_for_successors(const StreamId& id) {
     if (!is_gone(*stream)) continue;
     const bool own = stream->id().host == registry_.host();
     for (const OpenTable::Reading& reading : opens_.readers_of(*stream)) {
-      if (reading.any_host ? here || elsewhere : own && here) tell_replaced(reading);
+      if (reading.any_host ? here || elsewhere : own && here) notify_replaced(reading);
     }
   }
 }

@@ -49,7 +49,7 @@ class ClientOutput {
 };
 
 // The answer to a peer that gets no further one: a failure that belongs to no request.
-std::string last_words(const Error& error);
+std::string final_failure(const Error& error);
 
 class LocalService final : private StreamObserver, private Fleet::Observer {
  public:
@@ -117,7 +117,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void on_remote_stream_added(const StreamInfo& stream) override;
   void on_remote_stream_removed(const StreamId& id) override;
   void on_ring_replaced(const Stream& stream) override;
-  void tell_replaced(const OpenTable::Reading& reading);
+  void notify_replaced(const OpenTable::Reading& reading);
   void look_for_successors(const StreamId& id);
   bool is_gone(const Stream& stream) const;
 

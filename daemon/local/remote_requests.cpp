@@ -73,7 +73,8 @@ void RemoteRequests::create(const Client& client, const StreamId& id, const loca
                             Answer answer) {
   const Result<TypeInfo> type = wire::type_untrusted(request.type());
   if (!type) return answer(type.error());
-  if (Result<void> room = opens_.check_room(*client); !room) return answer(std::move(room).error());
+  if (Result<void> room = opens_.check_quota(*client); !room)
+    return answer(std::move(room).error());
   const CreatePlan plan{*type, {request.depth(), Duration(request.cycle_ns())}};
   fleet_.open_writer(
       id, &plan,
@@ -90,7 +91,8 @@ void RemoteRequests::create(const Client& client, const StreamId& id, const loca
 
 void RemoteRequests::open(const Client& client, const StreamId& id, const local::Open& request,
                           Answer answer) {
-  if (Result<void> room = opens_.check_room(*client); !room) return answer(std::move(room).error());
+  if (Result<void> room = opens_.check_quota(*client); !room)
+    return answer(std::move(room).error());
   const std::uint32_t tag = request.tag();
   const bool any_host = id.host.empty();
   if (request.for_writing()) {
@@ -116,7 +118,7 @@ Result<Reply> RemoteRequests::offer(const Client& client, const StreamId& id,
   const Role role = request.for_writing() ? Role::writer : Role::reader;
   Result<OfferedFiles> files = offered_files(descriptors, role);
   if (!files) return std::move(files).error();
-  if (Result<void> room = opens_.check_room(*client); !room) return std::move(room).error();
+  if (Result<void> room = opens_.check_quota(*client); !room) return std::move(room).error();
   const Result<std::shared_ptr<Stream>> stream =
       fleet_.adopt_untrusted(id, role, *std::move(files));
   if (!stream) return stream.error();

@@ -38,7 +38,7 @@ Reply noted_open(OpenTable& opens, const OpenEntry& entry) {
 }
 
 Result<Reply> opened(OpenTable& opens, const OpenEntry& entry) {
-  if (Result<void> room = opens.check_room(*entry.client); !room) return std::move(room).error();
+  if (Result<void> room = opens.check_quota(*entry.client); !room) return std::move(room).error();
   Result<std::vector<UniqueFd>> descriptors = entry.stream->descriptors_for(entry.role);
   if (!descriptors) return std::move(descriptors).error();
   Reply reply = noted_open(opens, entry);

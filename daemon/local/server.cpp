@@ -75,7 +75,7 @@ void Server::accept(UniqueFd socket) {
 
 void Server::turn_away(UniqueFd socket, const Error& error) {
   logger_.warning("refuse a program: " + error.message, {.message_id = message_id::kClientRefused});
-  const std::string words = last_words(error);
+  const std::string words = final_failure(error);
   // As much as fits: the program is gone from here in any case.
   static_cast<void>(wire::send_some(socket.get(), std::as_bytes(std::span(words)), {}));
 }

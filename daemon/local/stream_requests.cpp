@@ -83,7 +83,7 @@ Result<Reply> StreamRequests::create(const Client& client, const local::Create& 
   if (!id) return id.error();
   const Result<TypeInfo> type = wire::type_untrusted(request.type());
   if (!type) return type.error();
-  if (Result<void> room = opens_.check_room(*client); !room) return std::move(room).error();
+  if (Result<void> room = opens_.check_quota(*client); !room) return std::move(room).error();
   const Result<Registry::Created> created =
       registry_.create(*id, *type, {request.depth(), Duration(request.cycle_ns())}, client->pid);
   if (!created) return created.error();
@@ -112,7 +112,7 @@ Result<Reply> StreamRequests::offer(const Client& client, const local::Offer& re
   if (!files) return std::move(files).error();
   const Result<StreamId> id = wire::stream_id_untrusted(request.id());
   if (!id) return id.error();
-  if (Result<void> room = opens_.check_room(*client); !room) return std::move(room).error();
+  if (Result<void> room = opens_.check_quota(*client); !room) return std::move(room).error();
   const Result<std::shared_ptr<Stream>> stream = registry_.adopt_untrusted(*id, *std::move(files));
   if (!stream) return stream.error();
   return noted_open(opens_, {client, *stream, role, request.tag(), request.any_host()});

@@ -14,20 +14,20 @@
 #include <tuple>
 #include <utility>
 
-#include "daemon/remote/owner_channel.hpp"
+#include "daemon/remote/owner_connection.hpp"
 
 namespace dssm::daemon {
 
 // Kept has
 //   id()               with its owner's host
-//   channel()          its OwnerChannel
+//   channel()          its OwnerConnection
 //   on_stream_there()  the owner has such a stream, or a new ring of it
 //   has_use()          whether there is a ring, or somebody who waits for one
 //   done()             whether it may be destroyed
 template <class Kept>
 class ChannelTable final : private CatalogObserver {
  public:
-  using Make = std::function<std::unique_ptr<Kept>(StreamId id, RingRoom room)>;
+  using Make = std::function<std::unique_ptr<Kept>(StreamId id, RingQuota room)>;
 
   // parts and catalog outlive it.
   ChannelTable(const ChannelParts& parts, Catalog& catalog, Make make)
@@ -65,7 +65,7 @@ class ChannelTable final : private CatalogObserver {
     const StreamId full{id.name, id.id, host.greeting.host};
     const Result<Kept*> found = find_or_make(key_of(full));
     if (!found) return found;
-    OwnerChannel& channel = (*found)->channel();
+    OwnerConnection& channel = (*found)->channel();
     if (channel.owner() && *channel.owner() != host.greeting.host_id &&
         catalog_.find(*channel.owner())) {
       return Error{Errc::conflict, "stream '" + full.str() + "': two hosts are called '" +
@@ -117,14 +117,14 @@ class ChannelTable final : private CatalogObserver {
   Result<Kept*> find_or_make(const Key& key) {
     if (const auto found = entries_.find(key); found != entries_.end()) return found->second.get();
     const StreamId id{std::get<0>(key), std::get<1>(key), std::get<2>(key)};
-    Result<RingRoom> room = parts_.registry.take_room();
+    Result<RingQuota> room = parts_.registry.acquire_quota();
     if (!room) return std::move(room).error().context("stream '" + id.str() + "'");
     return entries_.emplace(key, make_(id, *std::move(room))).first->second.get();
   }
 
   void on_host_up(const KnownHost& host) override {
     for (const auto& [key, kept] : entries_) {
-      OwnerChannel& channel = kept->channel();
+      OwnerConnection& channel = kept->channel();
       if (kept->id().host == host.greeting.host &&
           (!channel.owner() || *channel.owner() == host.greeting.host_id)) {
         channel.connect(host);

@@ -23,7 +23,7 @@ constexpr Duration kGapLinePause = std::chrono::seconds(10);
 }  // namespace
 
 Mirror::Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, const Duration& linger,
-               RingRoom room)
+               RingQuota room)
     : parts_(parts),
       keeper_(keeper),
       id_(std::move(id)),
@@ -38,7 +38,7 @@ Mirror::Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, const Dur
 
 // --- the connection
 
-void Mirror::on_up(FrameLink& link, const wire::Greeting& them) {
+void Mirror::on_up(FrameConnection& link, const wire::Greeting& them) {
   on_owner_clock(them.clock);
   step_ = Step::opening;
   net::Frame frame;
@@ -48,14 +48,14 @@ void Mirror::on_up(FrameLink& link, const wire::Greeting& them) {
 }
 
 void Mirror::on_down(const Error& why) {
-  on_anew();
+  on_reopen();
   trouble_ = why;
   if (state_ == State::removed) return;
-  state_ = ring_ ? State::owner_away : State::connecting;
-  if (ring_) tell_trouble();
+  state_ = ring_ ? State::owner_unavailable : State::connecting;
+  if (ring_) log_error();
 }
 
-void Mirror::on_anew() {
+void Mirror::on_reopen() {
   step_ = Step::none;
   ending_ = false;
   if (ring_) ring_->wake();  // for what came with the end
@@ -78,13 +78,13 @@ Result<void> Mirror::on_frame(net::Frame& frame) {
     case net::Frame::kSubscribed:
       return on_subscribed_untrusted(frame.subscribed());
     case net::Frame::kCaughtUp:
-      if (step_ != Step::subscribed) return untimely("CaughtUp");
+      if (step_ != Step::subscribed) return unexpected_frame("CaughtUp");
       on_caught_up();
       return {};
     case net::Frame::kGap:
       return on_gap_untrusted(frame.gap());
     case net::Frame::kPong:
-      on_owner_clock(wire::clock_news_untrusted(frame.pong()));
+      on_owner_clock(wire::clock_report_untrusted(frame.pong()));
       return {};
     case net::Frame::kEnded:
       on_removed({Errc::not_found, "stream '" + name_ + "' was removed on its host"});
@@ -98,14 +98,14 @@ Result<void> Mirror::on_frame(net::Frame& frame) {
 }
 
 Result<void> Mirror::on_opened_untrusted(const net::Opened& opened) {
-  if (step_ != Step::opening) return untimely("Opened");
+  if (step_ != Step::opening) return unexpected_frame("Opened");
   const Result<StreamInfo> theirs = owner_stream_untrusted(opened, id_);
   if (!theirs) return theirs.error();
   if (Result<void> followed = follow_untrusted(*theirs); !followed) {
     on_refused(followed.error());
     return {};
   }
-  FrameLink& link = *channel_.link();
+  FrameConnection& link = *channel_.link();
   link.take_samples(theirs->type.payload_bytes, *this);
   net::Frame frame;
   frame.set_serial(kSubscribe);
@@ -176,9 +176,9 @@ void Mirror::judge() {
 }
 
 Result<void> Mirror::on_subscribed_untrusted(const net::Subscribed& subscribed) {
-  if (step_ != Step::subscribing) return untimely("Subscribed");
+  if (step_ != Step::subscribing) return unexpected_frame("Subscribed");
   if (subscribed.incarnation() != ring_->stream()->incarnation()) {
-    return Error{Errc::daemon_away, "stream '" + name_ + "' was created anew just now"};
+    return Error{Errc::unavailable, "stream '" + name_ + "' was created anew just now"};
   }
   if (Result<void> begun = ring_->on_subscribed_untrusted(subscribed.first_tid()); !begun) {
     return begun;
@@ -199,17 +199,17 @@ void Mirror::on_caught_up() {
   } else {
     parts_.logger.debug("mirror '" + name_ + "' is filled, up to " + until, log_fields());
   }
-  tell_replaced();
+  notify_replaced();
   answer_waiting();
 }
 
 Result<void> Mirror::on_gap_untrusted(const net::Gap& gap) {
-  if (step_ != Step::subscribed) return untimely("Gap");
+  if (step_ != Step::subscribed) return unexpected_frame("Gap");
   const std::uint64_t before = ring_->gap_samples();
   if (Result<void> noted = ring_->on_gap_untrusted(gap.first_tid(), gap.count()); !noted) {
     return noted;
   }
-  tell_gaps(ring_->gap_samples() - before);
+  log_gaps(ring_->gap_samples() - before);
   return {};
 }
 
@@ -222,7 +222,7 @@ void Mirror::on_removed(const Error& why) {
   trouble_ = why;
   if (ring_) {
     ring_->wake();
-    tell_trouble();
+    log_error();
   }
   fail_waiting(why);
   channel_.try_again_later();
@@ -232,8 +232,8 @@ void Mirror::on_refused(const Error& why) {
   if (why.code == Errc::not_found) return on_removed(why);
   step_ = Step::none;
   trouble_ = why;
-  state_ = ring_ ? State::owner_away : State::connecting;
-  if (ring_) tell_trouble();
+  state_ = ring_ ? State::owner_unavailable : State::connecting;
+  if (ring_) log_error();
   ring_ ? answer_waiting() : fail_waiting(why);
   channel_.try_again_later();
 }
@@ -242,7 +242,7 @@ void Mirror::on_refused(const Error& why) {
 
 [[gnu::hot]] Result<void> Mirror::on_sample_begin(const wire::IncomingSample& sample,
                                                   std::byte*& out) {
-  if (step_ != Step::subscribed) return untimely("a sample");
+  if (step_ != Step::subscribed) return unexpected_frame("a sample");
   const Result<std::byte*> place = ring_->begin_untrusted(sample);
   if (!place) return place.error();
   out = *place;
@@ -252,7 +252,7 @@ void Mirror::on_refused(const Error& why) {
 [[gnu::hot]] Result<void> Mirror::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   const std::uint64_t before = ring_->gap_samples();
   ring_->end(sample, torn);
-  if (ring_->gap_samples() != before) tell_gaps(ring_->gap_samples() - before);
+  if (ring_->gap_samples() != before) log_gaps(ring_->gap_samples() - before);
   return {};
 }
 
@@ -276,7 +276,7 @@ std::shared_ptr<Stream> Mirror::borrow() { return ring_ ? lend() : nullptr; }
 
 void Mirror::open(Then then) {
   // While the owner is away its history is still here.
-  const bool ready = (state_ == State::live && !ending_) || state_ == State::owner_away ||
+  const bool ready = (state_ == State::live && !ending_) || state_ == State::owner_unavailable ||
                      (state_ == State::connecting && ring_);
   if (ready) {
     lend_to(then);
@@ -359,7 +359,7 @@ void Mirror::arm_wait_timer() {
 // What has come by now has to do; those who came later may wait longer.
 void Mirror::on_wait_timer() {
   const MonoTime now = MonoClock::now();
-  if (now >= patience_ends_) tell_replaced();
+  if (now >= patience_ends_) notify_replaced();
   const auto later = std::stable_partition(
       waiting_.begin(), waiting_.end(), [now](const Waiting& one) { return one.deadline <= now; });
   const std::vector<Waiting> overdue(waiting_.begin(), later);
@@ -376,14 +376,14 @@ void Mirror::on_wait_timer() {
 }
 
 Error Mirror::away() const {
-  return Error{Errc::daemon_away, "stream '" + name_ + "': host '" + id_.host +
+  return Error{Errc::unavailable, "stream '" + name_ + "': host '" + id_.host +
                                       "' does not answer at '" + channel_.address().str() + "'" +
                                       (trouble_ ? ": " + trouble_->message : "") +
                                       "; look at `dssmctl hosts`, and try again"};
 }
 
 // Only once there is something to read in the new ring: until then the old one is the better.
-void Mirror::tell_replaced() {
+void Mirror::notify_replaced() {
   for (const std::shared_ptr<Stream>& old : std::exchange(replaced_, {})) {
     keeper_.on_ring_replaced(*old);
   }
@@ -402,14 +402,14 @@ LogFields Mirror::log_fields() const {
 }
 
 // Once, not at each attempt.
-void Mirror::tell_trouble() {
+void Mirror::log_error() {
   if (std::exchange(told_, true)) return;
   parts_.logger.notice(
       "mirror '" + name_ + "' stays as it is: " + trouble_->message + "; trying again",
       log_fields());
 }
 
-void Mirror::tell_gaps(std::uint64_t samples) {
+void Mirror::log_gaps(std::uint64_t samples) {
   untold_gap_samples_ += samples;
   const MonoTime now = MonoClock::now();
   if (now < next_gap_line_) return;

@@ -25,11 +25,11 @@
 #include "daemon/remote/lender.hpp"
 #include "daemon/remote/mirror_clock.hpp"
 #include "daemon/remote/mirror_ring.hpp"
-#include "daemon/remote/owner_channel.hpp"
+#include "daemon/remote/owner_connection.hpp"
 
 namespace dssm::daemon {
 
-class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
+class Mirror final : private OwnerConnection::Observer, private FrameConnection::SampleDelegate {
  public:
   // How long a program that opens the mirror waits for the owner to answer, and then for the
   // history: what has come by then is there to read, the rest follows.
@@ -49,7 +49,7 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
 
   // id: with its owner's host. parts, keeper and linger outlive it.
   Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, const Duration& linger,
-         RingRoom room);
+         RingQuota room);
   Mirror(const Mirror&) = delete;
   Mirror& operator=(const Mirror&) = delete;
 
@@ -60,7 +60,7 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
   bool done() const noexcept { return done_; }
 
   // Where the keeper says what the catalog knows of the owner.
-  OwnerChannel& channel() noexcept { return channel_; }
+  OwnerConnection& channel() noexcept { return channel_; }
   // The owner has such a stream, or a new ring of it.
   void on_stream_there();
   // The owner has removed the ring of that incarnation. The channel tells so, too, behind the last
@@ -82,7 +82,7 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
   void describe(proto::Mirror& out) const;
 
  private:
-  enum class State { connecting, filling, live, owner_away, removed };
+  enum class State { connecting, filling, live, owner_unavailable, removed };
   enum class Step { none, opening, subscribing, subscribed };  // of the connection
   struct Waiting {
     Then then;
@@ -92,12 +92,12 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
     std::uint64_t gap_samples = 0, received_samples = 0, received_bytes = 0;
   };
 
-  // OwnerChannel::User
-  void on_up(FrameLink& link, const wire::Greeting& them) override;
+  // OwnerConnection::Observer
+  void on_up(FrameConnection& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
   void on_down(const Error& why) override;
-  void on_anew() override;
-  // FrameLink::SampleSink
+  void on_reopen() override;
+  // FrameConnection::SampleDelegate
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   void on_batch_end() override;
@@ -119,10 +119,10 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
   void leave_if_alone(bool somebody_left);
   void arm_wait_timer();
   void on_wait_timer();
-  void tell_replaced();
+  void notify_replaced();
   void on_linger_timer();
-  void tell_trouble();
-  void tell_gaps(std::uint64_t samples);
+  void log_error();
+  void log_gaps(std::uint64_t samples);
   Error away() const;
   LogFields log_fields() const;
 
@@ -130,7 +130,7 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
   Keeper& keeper_;
   const StreamId id_;
   const Duration& linger_;  // its keeper's, which may change
-  const RingRoom room_;
+  const RingQuota room_;
 
   MirrorClock clock_;
   State state_ = State::connecting;
@@ -151,8 +151,8 @@ class Mirror final : private OwnerChannel::User, private FrameLink::SampleSink {
   std::vector<Waiting> waiting_;
   MonoTime patience_ends_{};  // with the filling that is under way
   EventSource wait_timer_, linger_timer_;
-  const std::string name_;  // for messages
-  OwnerChannel channel_;    // last: ends first
+  const std::string name_;   // for messages
+  OwnerConnection channel_;  // last: ends first
 };
 
 }  // namespace dssm::daemon

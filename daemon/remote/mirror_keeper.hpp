@@ -32,7 +32,7 @@ class MirrorKeeper {
   // The mirror of `id`, a stream of `host`: the one that is there, or a new one, filled with the
   // owner's history. `host` is good during the call only. The stream's id names the owner's host.
   // It is kept while the OpenTable has it, and mirror_linger longer.
-  //   fails  not_found (the owner has no such stream any more), daemon_away (the owner does not
+  //   fails  not_found (the owner has no such stream any more), unavailable (the owner does not
   //          answer), limit_exceeded
   virtual void open(const KnownHost& host, const StreamId& id, Then then) = 0;
 

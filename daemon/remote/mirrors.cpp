@@ -8,7 +8,7 @@ namespace dssm::daemon {
 Mirrors::Mirrors(const ChannelParts& parts, Catalog& catalog, Duration linger)
     : catalog_(catalog),
       linger_(linger),
-      table_(parts, catalog, [this, &parts](StreamId id, RingRoom room) {
+      table_(parts, catalog, [this, &parts](StreamId id, RingQuota room) {
         Mirror::Keeper& keeper = *this;
         return std::make_unique<Mirror>(parts, keeper, std::move(id), linger_, std::move(room));
       }) {

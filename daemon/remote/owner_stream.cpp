@@ -28,7 +28,7 @@ Result<StreamInfo> owner_stream_untrusted(const net::Opened& opened, const Strea
   return stream;
 }
 
-Error untimely(const char* what) {
+Error unexpected_frame(const char* what) {
   return {Errc::protocol, std::string(what) + " came, which nobody asked for"};
 }
 

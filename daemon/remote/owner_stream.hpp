@@ -16,6 +16,6 @@ namespace dssm::daemon {
 Result<StreamInfo> owner_stream_untrusted(const net::Opened& opened, const StreamId& expected);
 
 // `what` came out of turn.
-Error untimely(const char* what);
+Error unexpected_frame(const char* what);
 
 }  // namespace dssm::daemon

@@ -21,7 +21,7 @@ constexpr Duration kLossLinePause = std::chrono::seconds(10);
 
 }  // namespace
 
-RemoteWriter::RemoteWriter(const ChannelParts& parts, Keeper& keeper, StreamId id, RingRoom room)
+RemoteWriter::RemoteWriter(const ChannelParts& parts, Keeper& keeper, StreamId id, RingQuota room)
     : parts_(parts),
       keeper_(keeper),
       id_(std::move(id)),
@@ -38,7 +38,7 @@ RemoteWriter::RemoteWriter(const ChannelParts& parts, Keeper& keeper, StreamId i
 
 // --- the connection
 
-void RemoteWriter::on_up(FrameLink&, const wire::Greeting& them) {
+void RemoteWriter::on_up(FrameConnection&, const wire::Greeting& them) {
   may_tear_ = them.has_feature(wire::kFeatureTorn);
   ask();
 }
@@ -67,12 +67,12 @@ void RemoteWriter::ask() {
 }
 
 void RemoteWriter::on_down(const Error& why) {
-  on_anew();
+  on_reopen();
   trouble_ = why;
-  if (ring_ && !removed_) tell_trouble(why);
+  if (ring_ && !removed_) log_error(why);
 }
 
-void RemoteWriter::on_anew() {
+void RemoteWriter::on_reopen() {
   stop_publishing();
   step_ = Step::none;
 }
@@ -102,7 +102,7 @@ Result<void> RemoteWriter::on_frame(net::Frame& frame) {
 }
 
 Result<void> RemoteWriter::on_opened_untrusted(const net::Opened& opened) {
-  if (step_ != Step::opening) return untimely("Opened");
+  if (step_ != Step::opening) return unexpected_frame("Opened");
   const Result<StreamInfo> theirs = owner_stream_untrusted(opened, id_);
   if (!theirs) return theirs.error();
   if (Result<void> followed = follow(*theirs); !followed) {
@@ -145,7 +145,7 @@ Result<void> RemoteWriter::take_ring(std::unique_ptr<OutgoingRing> ring) {
 // The stream is not to be had, or not as it was.
 void RemoteWriter::on_refused(const Error& why) {
   const bool opening = step_ == Step::opening;
-  on_anew();
+  on_reopen();
   if (opening && !waiting_.empty()) {
     // What one program wants may be refused, and what the next one wants not.
     const Waiting first = std::move(waiting_.front());
@@ -158,14 +158,14 @@ void RemoteWriter::on_refused(const Error& why) {
   }
   trouble_ = why;
   if (why.code == Errc::not_found && !creates_) removed_ = true;
-  if (ring_) tell_trouble(why);
+  if (ring_) log_error(why);
   channel_.try_again_later();
 }
 
 // --- publishing
 
 Result<void> RemoteWriter::on_publishing_untrusted(const net::Publishing& publishing) {
-  if (step_ != Step::starting) return untimely("Publishing");
+  if (step_ != Step::starting) return unexpected_frame("Publishing");
   if (Result<void> noted = note_published_untrusted(publishing.last()); !noted) return noted;
   start_publishing();
   return {};
@@ -179,10 +179,10 @@ void RemoteWriter::start_publishing() {
                              std::to_string(ring_->next_untrusted()) + " on",
                          log_fields());
   }
-  FrameLink& link = *channel_.link();
+  FrameConnection& link = *channel_.link();
   sender_.emplace(ring_->mapping(), link,
                   SampleSender::Options{may_tear_, &parts_.registry.budget()});
-  SamplePump::Events& events = *this;
+  SamplePump::Observer& events = *this;
   pump_.emplace(ring_->mapping(), link, *sender_, events,
                 SamplePump::Plan{.first = ring_->next_untrusted()});
   // From the loop: this may be the middle of what the link hands out.
@@ -206,7 +206,7 @@ void RemoteWriter::stop_publishing() noexcept {
 }
 
 Result<void> RemoteWriter::on_published_untrusted(const net::Published& published) {
-  if (step_ != Step::publishing) return untimely("Published");
+  if (step_ != Step::publishing) return unexpected_frame("Published");
   return note_published_untrusted(published.last());
 }
 
@@ -312,7 +312,7 @@ void RemoteWriter::on_wait_timer() {
                                   [now](const Waiting& one) { return one.deadline > now; });
   const std::vector<Waiting> overdue(waiting_.begin(), later);
   waiting_.erase(waiting_.begin(), later);
-  const Error why{Errc::daemon_away, "write to '" + name_ + "': host '" + id_.host +
+  const Error why{Errc::unavailable, "write to '" + name_ + "': host '" + id_.host +
                                          "' does not answer at '" + channel_.address().str() + "'" +
                                          (trouble_ ? ": " + trouble_->message : "") +
                                          "; look at `dssmctl hosts`, and try again"};
@@ -351,7 +351,7 @@ LogFields RemoteWriter::log_fields() const {
 }
 
 // Once, not at each attempt.
-void RemoteWriter::tell_trouble(const Error& why) {
+void RemoteWriter::log_error(const Error& why) {
   if (std::exchange(told_, true)) return;
   parts_.logger.notice(
       "samples for stream '" + name_ + "' stay here: " + why.message + "; trying again",

@@ -27,14 +27,14 @@
 #include "daemon/link/stream_feed.hpp"
 #include "daemon/remote/lender.hpp"
 #include "daemon/remote/outgoing_ring.hpp"
-#include "daemon/remote/owner_channel.hpp"
+#include "daemon/remote/owner_connection.hpp"
 #include "daemon/remote/remote_writer_keeper.hpp"
 
 namespace dssm::daemon {
 
-class RemoteWriter final : private OwnerChannel::User,
-                           private StreamFeed::Listener,
-                           private SamplePump::Events {
+class RemoteWriter final : private OwnerConnection::Observer,
+                           private StreamFeed::Observer,
+                           private SamplePump::Observer {
  public:
   // How long a program that opens it waits for the owner to answer.
   static constexpr Duration kOwnerTimeout = std::chrono::seconds(2);
@@ -51,14 +51,14 @@ class RemoteWriter final : private OwnerChannel::User,
   using Then = RemoteWriterKeeper::Then;
 
   // id: with its owner's host. parts and keeper outlive it.
-  RemoteWriter(const ChannelParts& parts, Keeper& keeper, StreamId id, RingRoom room);
+  RemoteWriter(const ChannelParts& parts, Keeper& keeper, StreamId id, RingQuota room);
   RemoteWriter(const RemoteWriter&) = delete;
   RemoteWriter& operator=(const RemoteWriter&) = delete;
   ~RemoteWriter() { stop_publishing(); }  // before its link goes
 
   // --- for ChannelTable
   const StreamId& id() const noexcept { return id_; }
-  OwnerChannel& channel() noexcept { return channel_; }
+  OwnerConnection& channel() noexcept { return channel_; }
   void on_stream_there();
   bool has_use() const noexcept { return ring_ || !waiting_.empty(); }
   bool done() const noexcept { return done_; }
@@ -79,13 +79,13 @@ class RemoteWriter final : private OwnerChannel::User,
     MonoTime deadline;
   };
 
-  // OwnerChannel::User
-  void on_up(FrameLink& link, const wire::Greeting& them) override;
+  // OwnerConnection::Observer
+  void on_up(FrameConnection& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
   void on_output_empty() override { publish(); }
   void on_down(const Error& why) override;
-  void on_anew() override;
-  // StreamFeed::Listener, SamplePump::Events
+  void on_reopen() override;
+  // StreamFeed::Observer, SamplePump::Observer
   void on_news() override { publish(); }
   void on_gap(Tid first, std::uint64_t count) override;
 
@@ -109,13 +109,13 @@ class RemoteWriter final : private OwnerChannel::User,
   void on_wait_timer();
   void on_drain_timer();
   void end();
-  void tell_trouble(const Error& why);
+  void log_error(const Error& why);
   LogFields log_fields() const;
 
   const ChannelParts& parts_;
   Keeper& keeper_;
   const StreamId id_;
-  const RingRoom room_;
+  const RingQuota room_;
   const std::string name_;  // for messages
 
   Step step_ = Step::none;
@@ -138,7 +138,7 @@ class RemoteWriter final : private OwnerChannel::User,
   std::vector<Waiting> waiting_;
   MonoTime drain_ends_{};
   EventSource wait_timer_, drain_timer_, turn_timer_;
-  OwnerChannel channel_;  // last: ends first
+  OwnerConnection channel_;  // last: ends first
 };
 
 }  // namespace dssm::daemon

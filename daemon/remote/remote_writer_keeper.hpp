@@ -28,7 +28,7 @@ class RemoteWriterKeeper {
   // A ring here whose samples go to `id`, a stream of `host`: the one that is there, or a new one
   // after the owner agreed. `host` is good during the call only.
   //   plan   create the stream there unless it exists; nullptr: it must exist. Used during the call
-  //   fails  not_found, type_mismatch, daemon_away (the owner does not answer), limit_exceeded
+  //   fails  not_found, type_mismatch, unavailable (the owner does not answer), limit_exceeded
   virtual void open(const KnownHost& host, const StreamId& id, const CreatePlan* plan,
                     Then then) = 0;
 

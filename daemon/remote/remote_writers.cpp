@@ -6,7 +6,7 @@
 namespace dssm::daemon {
 
 RemoteWriters::RemoteWriters(const ChannelParts& parts, Catalog& catalog)
-    : table_(parts, catalog, [this, &parts](StreamId id, RingRoom room) {
+    : table_(parts, catalog, [this, &parts](StreamId id, RingQuota room) {
         RemoteWriter::Keeper& keeper = *this;
         return std::make_unique<RemoteWriter>(parts, keeper, std::move(id), std::move(room));
       }) {}

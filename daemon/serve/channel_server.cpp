@@ -37,7 +37,7 @@ ChannelServer::~ChannelServer() {
   parts_.registry.remove_observer(*this);
   for (const auto& [key, communicator] : communicators_) {
     communicator->close_with(
-        {Errc::daemon_away, "dssmd of host '" + self_.host + "' is being stopped"});
+        {Errc::unavailable, "dssmd of host '" + self_.host + "' is being stopped"});
   }
 }
 
@@ -101,8 +101,8 @@ void ChannelServer::keep(PeerPlace place, std::unique_ptr<wire::Transport> trans
   communicators_.emplace(key, std::move(communicator));
 }
 
-void ChannelServer::tell_clock() {
-  for (const auto& [key, communicator] : communicators_) communicator->tell_clock();
+void ChannelServer::send_clock() {
+  for (const auto& [key, communicator] : communicators_) communicator->send_clock();
 }
 
 // Also streams that only the dssmd before this one had served.
@@ -121,9 +121,9 @@ void ChannelServer::turn_away(UniqueFd socket, const wire::SocketAddress* addres
                       (address ? " from '" + address->str() + "'" : std::string()) + ": " +
                       error.message,
                   {.message_id = message_id::kPeerRefused});
-  net::Frame last_words;
-  wire::to_message(error, *last_words.mutable_failure());
-  const std::string words = wire::encode_frame(last_words);
+  net::Frame final_failure;
+  wire::to_message(error, *final_failure.mutable_failure());
+  const std::string words = wire::encode_frame(final_failure);
   // As much as fits: the peer is gone from here in any case.
   static_cast<void>(::send(socket.get(), words.data(), words.size(), MSG_NOSIGNAL | MSG_DONTWAIT));
 }

@@ -11,8 +11,8 @@
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/network_protocol.hpp"
-#include "daemon/base/calm_logger.hpp"
 #include "daemon/base/event_loop.hpp"
+#include "daemon/base/rate_limited_logger.hpp"
 #include "daemon/base/spare_descriptor.hpp"
 #include "daemon/link/network_listener.hpp"
 #include "daemon/serve/data_communicator.hpp"
@@ -23,7 +23,7 @@
 
 namespace dssm::daemon {
 
-class ChannelServer final : private StreamObserver, private DataCommunicator::Keeper {
+class ChannelServer final : private StreamObserver, private DataCommunicator::Observer {
  public:
   struct Parts {
     const EventLoop& loop;
@@ -48,7 +48,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ke
                      const wire::SocketAddress& address);
 
   // There is news of this host's clock.
-  void tell_clock();
+  void send_clock();
   // Verdicts on clocks may have changed; at least once a second.
   void on_clock();
 
@@ -70,7 +70,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ke
   void on_heartbeat() override;
 
   Parts parts_;
-  CalmLogger logger_;
+  RateLimitedLogger logger_;
   wire::Greeting self_;
   PeerTable peers_;
   ServedStreams streams_;

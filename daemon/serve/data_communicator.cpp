@@ -92,12 +92,12 @@ void DataCommunicator::serve(const net::Frame& request) {
 Result<void> DataCommunicator::dispatch(const net::Frame& request) {
   if (request.has_ping()) {
     is_control_ = true;
-    silence_.enable_in(wire::kSilenceIsDeath);
+    silence_.enable_in(wire::kPeerTimeout);
     net::Frame pong;
     pong.set_serial(request.serial());
-    wire::tell_clock(parts_.self, *pong.mutable_pong()->mutable_clock());
+    wire::send_clock(parts_.self, *pong.mutable_pong()->mutable_clock());
     link_.send(pong);
-    parts_.keeper.on_heartbeat();
+    parts_.observer.on_heartbeat();
     return {};
   }
   if (!channel_ && ControlRequests::is_control(request)) return serve_control(request);
@@ -128,10 +128,10 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
   return {};
 }
 
-void DataCommunicator::tell_clock() {
+void DataCommunicator::send_clock() {
   if (!is_control_ || !link_.is_open() || !them_->has_feature(wire::kFeatureClock)) return;
   net::Frame frame;
-  wire::tell_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
+  wire::send_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
   link_.send(frame);
 }
 
@@ -242,11 +242,11 @@ void DataCommunicator::on_output_empty() { work_now(); }
 void DataCommunicator::watch_silence() {
   const Duration silent = MonoClock::now() - link_.last_heard();
   // While the link is paused it is us who do not listen.
-  if (silent < wire::kSilenceIsDeath || link_.is_paused()) {
-    const Duration rest = wire::kSilenceIsDeath - silent;
-    return silence_.enable_in(link_.is_paused() ? wire::kSilenceIsDeath : rest);
+  if (silent < wire::kPeerTimeout || link_.is_paused()) {
+    const Duration rest = wire::kPeerTimeout - silent;
+    return silence_.enable_in(link_.is_paused() ? wire::kPeerTimeout : rest);
   }
-  link_.close_with({Errc::daemon_away, "nothing came from " + peer() + " for " +
+  link_.close_with({Errc::unavailable, "nothing came from " + peer() + " for " +
                                            std::to_string(silent / std::chrono::milliseconds(1)) +
                                            " ms"});
 }
@@ -280,12 +280,12 @@ void DataCommunicator::on_closed(const Error& why) {
   log_end(why);
   channel_.reset();
   watch_.reset();
-  parts_.keeper.on_ended(*this);
+  parts_.observer.on_ended(*this);
 }
 
 void DataCommunicator::log_end(const Error& why) {
   const std::string reason = their_words_.message.empty() ? why.message : their_words_.message;
-  if (why.code != Errc::daemon_away) {
+  if (why.code != Errc::unavailable) {
     parts_.logger.warning("closed the connection of " + peer() + ": " + why.message,
                           {.peer = peer_address_, .message_id = message_id::kPeerRefused});
   }

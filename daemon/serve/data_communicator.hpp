@@ -18,7 +18,7 @@
 #include "core/wire/transport.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 #include "daemon/serve/control_requests.hpp"
 #include "daemon/serve/peer_table.hpp"
 #include "daemon/serve/ring_reservation.hpp"
@@ -30,7 +30,7 @@
 
 namespace dssm::daemon {
 
-class DataCommunicator final : private FrameLink::User, private StreamChannel::Owner {
+class DataCommunicator final : private FrameConnection::Observer, private StreamChannel::Observer {
  public:
   // Requests of one connection served in a row before others get their turn.
   static constexpr int kRequestsPerTurn = 16;
@@ -38,7 +38,7 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
   static constexpr std::size_t kMaxQueuedBytes = wire::kMaxNetworkFrameBytes + (1U << 20);
 
   // Who keeps the connection.
-  class Keeper {
+  class Observer {
    public:
     // It ended; to be destroyed later, not from within this call.
     virtual void on_ended(DataCommunicator& communicator) = 0;
@@ -46,7 +46,7 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
     virtual void on_heartbeat() {}
 
    protected:
-    ~Keeper() = default;
+    ~Observer() = default;
   };
 
   // What all connections share.
@@ -57,7 +57,7 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
     ServedStreams& streams;
     const wire::Greeting& self;
     Logger& logger;
-    Keeper& keeper;
+    Observer& observer;
     ClockRules* clock;  // nullptr: nobody watches the clock
   };
 
@@ -72,7 +72,7 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
   void on_stream_removed(const Stream& stream);
 
   // There is news of this host's clock: tells control connections that want to know.
-  void tell_clock();
+  void send_clock();
 
   // Tells the peer why, as far as that goes at once.
   void close_with(const Error& why) { link_.close_with(why); }
@@ -109,7 +109,7 @@ class DataCommunicator final : private FrameLink::User, private StreamChannel::O
   Parts parts_;
   PeerPlace place_;
   std::string peer_address_;
-  FrameLink link_;
+  FrameConnection link_;
   std::optional<wire::Greeting> them_;  // once they said Hello
   Error their_words_;                   // why they are about to close; empty: did not say
   std::optional<net::Frame> waiting_;   // a request whose turn has not come; the link is paused

@@ -7,7 +7,8 @@
 
 namespace dssm::daemon {
 
-Result<std::unique_ptr<SampleReceiver>> SampleReceiver::open(const EventLoop& loop, FrameLink& link,
+Result<std::unique_ptr<SampleReceiver>> SampleReceiver::open(const EventLoop& loop,
+                                                             FrameConnection& link,
                                                              MemoryBudget& budget,
                                                              ServedStream& stream,
                                                              std::uint64_t publisher) {
@@ -27,7 +28,7 @@ Result<std::unique_ptr<SampleReceiver>> SampleReceiver::open(const EventLoop& lo
       new SampleReceiver(loop, link, *std::move(share), stream, *std::move(writer), publisher));
 }
 
-SampleReceiver::SampleReceiver(const EventLoop& loop, FrameLink& link, MemoryShare share,
+SampleReceiver::SampleReceiver(const EventLoop& loop, FrameConnection& link, MemoryShare share,
                                ServedStream& stream, std::shared_ptr<OwnWriter> writer,
                                std::uint64_t publisher)
     : link_(link),
@@ -105,7 +106,7 @@ void SampleReceiver::try_again() {
 }
 
 void SampleReceiver::answer(std::uint64_t serial) {
-  const ring::PublisherNotes::Last written = last();
+  const ring::PublisherCursors::Last written = last();
   net::Frame frame;
   frame.set_serial(serial);
   frame.mutable_published()->set_last(written.number);

@@ -14,7 +14,7 @@
 
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/memory_budget.hpp"
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 #include "daemon/link/raw_bytes.hpp"
 #include "daemon/serve/served_stream.hpp"
 
@@ -28,18 +28,18 @@ class SampleReceiver {
 
   // Begins to publish for `publisher`. All outlive it.
   //   fails  limit_exceeded (no memory of `budget` is left for one payload), os errors
-  static Result<std::unique_ptr<SampleReceiver>> open(const EventLoop& loop, FrameLink& link,
+  static Result<std::unique_ptr<SampleReceiver>> open(const EventLoop& loop, FrameConnection& link,
                                                       MemoryBudget& budget, ServedStream& stream,
                                                       std::uint64_t publisher);
   SampleReceiver(const SampleReceiver&) = delete;
   SampleReceiver& operator=(const SampleReceiver&) = delete;
 
   // Where the publisher stopped.
-  ring::PublisherNotes::Last last() const noexcept {
+  ring::PublisherCursors::Last last() const noexcept {
     return writer_->publishers().last_untrusted(publisher_);
   }
 
-  // As FrameLink::User.
+  // As FrameConnection::Observer.
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out);
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn);
 
@@ -50,15 +50,15 @@ class SampleReceiver {
   bool busy() const noexcept { return waiting_; }
 
  private:
-  SampleReceiver(const EventLoop& loop, FrameLink& link, MemoryShare share, ServedStream& stream,
-                 std::shared_ptr<OwnWriter> writer, std::uint64_t publisher);
+  SampleReceiver(const EventLoop& loop, FrameConnection& link, MemoryShare share,
+                 ServedStream& stream, std::shared_ptr<OwnWriter> writer, std::uint64_t publisher);
   bool is_done_with(const wire::IncomingSample& sample);
   void note_done();
   Result<void> write();
   void try_again();
   void answer(std::uint64_t serial);
 
-  FrameLink& link_;
+  FrameConnection& link_;
   MemoryShare share_;
   ServedStream& stream_;
   std::shared_ptr<OwnWriter> writer_;

@@ -10,7 +10,7 @@
 
 #include "core/ring/bell.hpp"
 #include "core/ring/clock_gate.hpp"
-#include "core/ring/publisher_notes.hpp"
+#include "core/ring/publisher_cursors.hpp"
 #include "core/ring/ring_writer.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/link/stream_feed.hpp"
@@ -27,7 +27,9 @@ class OwnWriter {
 
   // Without doorbell: who writes by it calls the feed.
   ring::RingWriter& writer() noexcept { return writer_; }
-  ring::PublisherNotes publishers() noexcept { return ring::PublisherNotes(mapping_->header()); }
+  ring::PublisherCursors publishers() noexcept {
+    return ring::PublisherCursors(mapping_->header());
+  }
   ring::ClockGate& clock_gate() noexcept { return mapping_->header().clock; }
 
  private:

@@ -32,7 +32,7 @@ StreamChannel::StreamChannel(const Parts& parts, std::shared_ptr<ServedStream> s
       tells_clock_(parts.clock && parts.them.has_feature(wire::kFeatureClock)),
       reader_(stream().mapping()),
       sender_(stream().mapping(), parts_.link, {may_tear, &parts_.budget}),
-      due_(EventSource::timer(parts_.loop, [this] { parts_.owner.work_now(); })) {
+      due_(EventSource::timer(parts_.loop, [this] { parts_.observer.work_now(); })) {
   served_->stream().add_channel();
   parts_.link.take_samples(stream().type().payload_bytes, *this);
 }
@@ -106,9 +106,9 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
   subscribed.set_first_tid(first);
   subscribed.set_newest(newest);
   parts_.link.send(frame);
-  pump_.emplace(stream().mapping(), parts_.link, sender_, static_cast<SamplePump::Events&>(*this),
+  pump_.emplace(stream().mapping(), parts_.link, sender_, static_cast<SamplePump::Observer&>(*this),
                 SamplePump::Plan{first, newest, request.max_rate_hz()});
-  parts_.owner.work_soon();
+  parts_.observer.work_soon();
   return {};
 }
 
@@ -156,7 +156,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
       due_.enable_in(pump_->due() - now);
       break;
     case PumpWait::turn:
-      parts_.owner.work_soon();
+      parts_.observer.work_soon();
       break;
     case PumpWait::nothing:
       pump_.reset();
@@ -167,7 +167,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   return {};
 }
 
-[[gnu::hot]] void StreamChannel::on_news() { parts_.owner.work_now(); }
+[[gnu::hot]] void StreamChannel::on_news() { parts_.observer.work_now(); }
 
 // The clock may have been set, and samples been written after that: what they say of their time
 // must not be believed.
@@ -178,7 +178,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   clock_news_ = news;
   sender_.end_run();
   net::Frame frame;
-  wire::tell_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
+  wire::send_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
   parts_.link.send(frame);
 }
 
@@ -199,7 +199,7 @@ void StreamChannel::on_caught_up() {
 void StreamChannel::on_removed() {
   if (!pump_) return end();
   pump_->end_at(newest_untrusted(reader_));
-  parts_.owner.work_soon();
+  parts_.observer.work_soon();
 }
 
 void StreamChannel::on_end() { end(); }
@@ -244,11 +244,11 @@ void StreamChannel::go_on_reading() {
     case SendStatus::gone:
       sender_.end_run();
       if (++reading_->attempts == kMaxReadAttempts) return answer_no_sample(ReadStatus::lapped);
-      return parts_.owner.work_soon();
+      return parts_.observer.work_soon();
     case SendStatus::blocked:
       return sender_.end_run();
     case SendStatus::unfinished:
-      return parts_.owner.work_soon();
+      return parts_.observer.work_soon();
     case SendStatus::no_memory:
       return answer_failure({Errc::limit_exceeded,
                              "read from '" + stream().id().str() +
@@ -314,7 +314,7 @@ Result<void> StreamChannel::start_publishing(std::uint64_t serial,
   if (!receiver) return std::move(receiver).error();
   receiver_ = *std::move(receiver);
   if (Result<void> judged = judge_writer(); !judged) return judged;
-  const ring::PublisherNotes::Last last = receiver_->last();
+  const ring::PublisherCursors::Last last = receiver_->last();
   net::Frame frame = answer_to(serial);
   net::Publishing& publishing = *frame.mutable_publishing();
   publishing.set_last(last.number);

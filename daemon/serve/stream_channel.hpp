@@ -12,7 +12,7 @@
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/memory_budget.hpp"
 #include "daemon/fleet/clock_rules.hpp"
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 #include "daemon/link/sample_pump.hpp"
 #include "daemon/link/sample_sender.hpp"
 #include "daemon/serve/sample_receiver.hpp"
@@ -21,25 +21,25 @@
 
 namespace dssm::daemon {
 
-class StreamChannel final : private SamplePump::Events,
-                            private StreamFeed::Listener,
-                            private FrameLink::SampleSink {
+class StreamChannel final : private SamplePump::Observer,
+                            private StreamFeed::Observer,
+                            private FrameConnection::SampleDelegate {
  public:
   // Calls work(): at once, or in the next turn of the loop.
-  class Owner {
+  class Observer {
    public:
     virtual void work_now() = 0;
     virtual void work_soon() = 0;
 
    protected:
-    ~Owner() = default;
+    ~Observer() = default;
   };
   struct Parts {
     const EventLoop& loop;
     Registry& registry;
-    FrameLink& link;
+    FrameConnection& link;
     MemoryBudget& budget;  // of the peer
-    Owner& owner;
+    Observer& observer;
     const wire::Greeting& self;
     const wire::Greeting& them;
     ClockRules* clock;  // nullptr: nobody watches it

@@ -6,7 +6,7 @@
 
 namespace dssm::daemon {
 
-StreamWatch::StreamWatch(const Registry& registry, const OpenTable& opens, FrameLink& link,
+StreamWatch::StreamWatch(const Registry& registry, const OpenTable& opens, FrameConnection& link,
                          std::uint64_t serial)
     : opens_(opens),
       link_(link),

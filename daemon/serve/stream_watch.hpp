@@ -9,7 +9,7 @@
 #include <deque>
 #include <memory>
 
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
 
@@ -21,7 +21,7 @@ class StreamWatch {
   static constexpr int kStreamsPerTurn = 64;
 
   // All outlive it.
-  StreamWatch(const Registry& registry, const OpenTable& opens, FrameLink& link,
+  StreamWatch(const Registry& registry, const OpenTable& opens, FrameConnection& link,
               std::uint64_t serial);
 
   // Goes on telling while the link takes it. True when others should have their turn and work()
@@ -35,7 +35,7 @@ class StreamWatch {
   void tell(const Stream& stream);
 
   const OpenTable& opens_;
-  FrameLink& link_;
+  FrameConnection& link_;
   std::uint64_t serial_;  // of Watch; 0: answered
   std::deque<std::weak_ptr<const Stream>> untold_;
 };

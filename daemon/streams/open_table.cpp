@@ -7,7 +7,7 @@ std::string ClientIdentity::str() const {
   return "'" + program + "' (pid " + std::to_string(pid) + ", uid " + std::to_string(uid) + ")";
 }
 
-Result<void> OpenTable::check_room(const ClientIdentity& client) const {
+Result<void> OpenTable::check_quota(const ClientIdentity& client) const {
   if (entries_.size() >= limits_.max_opens) {
     return Error{Errc::limit_exceeded,
                  "all programs together have max_opens = " + std::to_string(limits_.max_opens) +

@@ -58,7 +58,7 @@ class OpenTable {
   void set_limits(const Limits& limits) { limits_ = limits; }  // for what comes
 
   // Whether `client` may open one more. Fails with limit_exceeded, naming the key.
-  Result<void> check_room(const ClientIdentity& client) const;
+  Result<void> check_quota(const ClientIdentity& client) const;
 
   OpenNumber add(OpenEntry entry);
 

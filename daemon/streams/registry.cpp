@@ -26,7 +26,7 @@ Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
                                     "'; create it first (`dssmctl ls` lists those that are there)"};
 }
 
-Result<void> Registry::check_room() const {
+Result<void> Registry::check_quota() const {
   if (by_name_.size() + rooms_ < limits_.max_streams) return {};
   return Error{Errc::limit_exceeded,
                "there are max_streams = " + std::to_string(limits_.max_streams) +
@@ -34,9 +34,9 @@ Result<void> Registry::check_room() const {
                    "remove some (dssmctl rm) or raise the key max_streams"};
 }
 
-Result<RingRoom> Registry::take_room() {
-  if (Result<void> room = check_room(); !room) return std::move(room).error();
-  return RingRoom(rooms_);
+Result<RingQuota> Registry::acquire_quota() {
+  if (Result<void> room = check_quota(); !room) return std::move(room).error();
+  return RingQuota(rooms_);
 }
 
 Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& type,
@@ -55,7 +55,7 @@ Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& t
                                              std::to_string(to_ns(history.cycle)) +
                                              " ns; give the expected time between two samples"};
   }
-  if (Result<void> room = check_room(); !room) return std::move(room).error().context(context);
+  if (Result<void> room = check_quota(); !room) return std::move(room).error().context(context);
   Result<std::shared_ptr<Stream>> stream =
       Stream::create({*own, type, history.depth, history.cycle, creator_pid, next_order_}, budget_);
   if (!stream) return std::move(stream).error().context(context);
@@ -76,7 +76,7 @@ Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, Of
                                      ": another ring has that name by now; close this one and open "
                                      "the stream anew"};
   }
-  if (Result<void> room = check_room(); !room) return std::move(room).error().context(context);
+  if (Result<void> room = check_quota(); !room) return std::move(room).error().context(context);
   Result<std::shared_ptr<Stream>> stream = Stream::adopt_untrusted(std::move(files), budget_);
   if (!stream) return std::move(stream).error().context(context);
   if ((*stream)->id() != *own) {
@@ -87,7 +87,7 @@ Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, Of
 }
 
 Result<std::shared_ptr<Stream>> Registry::adopt_stored_untrusted(OfferedFiles files) {
-  if (Result<void> room = check_room(); !room) return std::move(room).error();
+  if (Result<void> room = check_quota(); !room) return std::move(room).error();
   Result<std::shared_ptr<Stream>> stream = Stream::adopt_untrusted(std::move(files), budget_);
   if (!stream) return stream;
   const StreamId& id = (*stream)->id();

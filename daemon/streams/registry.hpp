@@ -15,7 +15,7 @@
 #include <vector>
 
 #include "daemon/base/memory_budget.hpp"
-#include "daemon/streams/ring_room.hpp"
+#include "daemon/streams/ring_quota.hpp"
 #include "daemon/streams/stream.hpp"
 
 namespace dssm::daemon {
@@ -60,7 +60,7 @@ class Registry {
   // For rings that stand elsewhere (mirrors, remote writers) but count like those here. The
   // registry outlives what it gives.
   MemoryBudget& budget() noexcept { return budget_; }
-  Result<RingRoom> take_room();  // fails with limit_exceeded, naming the key
+  Result<RingQuota> acquire_quota();  // fails with limit_exceeded, naming the key
 
   // In the order of creation.
   const std::vector<std::shared_ptr<Stream>>& streams() const noexcept { return in_order_; }
@@ -98,14 +98,14 @@ class Registry {
  private:
   using Key = std::pair<std::string, std::int32_t>;
   Result<StreamId> own_id(StreamId id) const;
-  Result<void> check_room() const;
+  Result<void> check_quota() const;
   Result<std::shared_ptr<Stream>> add_adopted(std::shared_ptr<Stream> stream);
   void add(std::shared_ptr<Stream> stream);
 
   std::string host_;
   Limits limits_;
   MemoryBudget budget_;      // before the streams, which hold shares of it
-  std::uint64_t rooms_ = 0;  // taken by take_room()
+  std::uint64_t rooms_ = 0;  // taken by acquire_quota()
   std::map<Key, std::shared_ptr<Stream>> by_name_;
   std::vector<std::shared_ptr<Stream>> in_order_;
   std::uint64_t next_order_ = 1;

@@ -12,7 +12,7 @@
 //            receive each while they come one by one, and one for many when they come many at a
 //            time; each is copied once, or, when it is large, received where the caller wants it
 //   trouble  when the connection breaks, calls reconnect (at most request_timeout, then
-//            daemon_away; next(), post() and fd() never wait for it), subscriptions resume at the
+//            unavailable; next(), post() and fd() never wait for it), subscriptions resume at the
 //            tid they had, and posted samples are sent again from where the owner stopped: each is
 //            written once, also when the owner's dssmd is killed (but what was under way when a
 //            connection broke comes twice if 64 others wrote to the stream since)
@@ -74,7 +74,7 @@ class PConnector {
   // Connects and opens an existing stream. With `wanted`, fails with type_mismatch unless
   // TypeInfo::check_usable_as(wanted).
   //   fails  no_daemon (nobody listens or answers there), not_found, type_mismatch, protocol,
-  //          daemon_away, invalid_argument (address)
+  //          unavailable, invalid_argument (address)
   static Result<PConnector> open(const StreamId& id, PConnectorOptions options = {},
                                  const TypeInfo* wanted = nullptr);
   // The same, creating the stream there when it does not exist.
@@ -93,7 +93,7 @@ class PConnector {
   // `payload` is exactly payload_bytes() long, and unspecified unless the result is ok; `info` is
   // set only when it is.
   //   returns  as RawReader's functions of these names
-  //   fails    daemon_away, protocol, invalid_argument (size), type_mismatch (the stream
+  //   fails    unavailable, protocol, invalid_argument (size), type_mismatch (the stream
   //            was created anew with another type)
   Result<ReadStatus> latest(std::span<std::byte> payload, SampleInfo& info);
   Result<ReadStatus> tid(Tid tid, std::span<std::byte> payload, SampleInfo& info);
@@ -118,7 +118,7 @@ class PConnector {
   // is received to its end here, for at most 20 ms; then what has come is put aside.
   //   payload  as above
   //   returns  ok | not_yet | restarted
-  //   fails    daemon_away (the connection is down; call again, each call does what can be done at
+  //   fails    unavailable (the connection is down; call again, each call does what can be done at
   //            once to have it back), not_found (the stream was removed; call again, it may come
   //            back), invalid_argument (no subscription, size)
   Result<ReadStatus> next(std::span<std::byte> payload, SampleInfo& info);
@@ -145,7 +145,7 @@ class PConnector {
   // --- writing
 
   // Writes one sample and waits for its tid in the owner's ring.
-  //   fails  daemon_away: not acknowledged in time. The sample is kept as if it had been posted,
+  //   fails  unavailable: not acknowledged in time. The sample is kept as if it had been posted,
   //          and sent when the connection is back: do not write it again
   Result<Tid> write(std::span<const std::byte> payload, Time time = WallClock::now(),
                     Duration clock_error = kOwnClockError);

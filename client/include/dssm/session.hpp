@@ -10,7 +10,7 @@
 //   threads  all functions may be called from any thread. A session runs one thread of its own,
 //            with all signals blocked.
 //   fork     a child must connect a session of its own; using the parent's there is undefined
-//   errors   besides those named at each function: daemon_away (no answer in time), protocol
+//   errors   besides those named at each function: unavailable (no answer in time), protocol
 #pragma once
 
 #include <dssm/clock_status.hpp>
@@ -78,7 +78,7 @@ struct DaemonInfo {
 // What a host says of its clock (docs/clocks.md), aged until now.
 struct ClockInfo {
   ClockStatus status = ClockStatus::unknown;
-  ClockTrouble trouble = ClockTrouble::none;
+  ClockReason trouble = ClockReason::none;
   ClockBasis basis = ClockBasis::nothing;
   Duration offset{};      // its clock minus what its chronyd takes for the right time
   std::string reference;  // whom it follows: a host's name or an address; empty: nobody
@@ -157,7 +157,7 @@ class Session {
 
   // Opens a stream for reading, waiting until `deadline` for it to be created, for its host to
   // answer, and for the clocks of that and of this PC to be good enough.
-  //   fails  as open_raw_reader(); not_found, daemon_away, clock_out_of_bounds when the deadline
+  //   fails  as open_raw_reader(); not_found, unavailable, clock_out_of_bounds when the deadline
   //          passed
   Result<RawReader> await_raw_reader(const StreamId& id, MonoTime deadline,
                                      const TypeInfo* wanted = nullptr);
@@ -241,7 +241,7 @@ class Session {
   Result<std::vector<HostInfo>> hosts();
 
   // Asks the dssmd of that host for a sign of life, over the connection that this PC's dssmd keeps.
-  //   fails  not_found (no host of that name is up), conflict (several are), daemon_away (it does
+  //   fails  not_found (no host of that name is up), conflict (several are), unavailable (it does
   //          not answer)
   Result<RoundTrip> ping(const std::string& host);
 

@@ -200,7 +200,7 @@ int dssm_ssm_wait_stream(const char* stream_name, int stream_id, double timeout)
     if (info) return 1;
     // Daemon away: it may come back. Anything else does not get better by waiting.
     if (info.error().code != dssm::Errc::not_found &&
-        info.error().code != dssm::Errc::daemon_away) {
+        info.error().code != dssm::Errc::unavailable) {
       remember_error(info.error().message);
       return -2;
     }

@@ -138,7 +138,7 @@ Result<void> Process::start() {
   reap_locked();
   if (registered_locked()) {
     if (!registration_->session.connected()) {
-      return Error{Errc::daemon_away, "dssmd is gone; this program goes on when it is back"};
+      return Error{Errc::unavailable, "dssmd is gone; this program goes on when it is back"};
     }
     if (clock_.attached()) return {};
     Result<PlaybackClock> clock = registration_->session.playback_clock();

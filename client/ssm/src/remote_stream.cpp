@@ -36,7 +36,7 @@ MonoTime give_up_at() {
 
 // Whether waiting may mend it: the other PC may start, the stream may be created.
 bool is_worth_waiting(Errc code) noexcept {
-  return code == Errc::no_daemon || code == Errc::daemon_away || code == Errc::not_found ||
+  return code == Errc::no_daemon || code == Errc::unavailable || code == Errc::not_found ||
          code == Errc::system || code == Errc::limit_exceeded;
 }
 
@@ -347,7 +347,7 @@ bool RemoteStream::write(const void* data, std::size_t bytes, double time) {
   if (connector_->connected()) {
     complaint_.clear();
   } else {
-    complain({Errc::daemon_away, "write " + quoted_name() + " : '" + address_ +
+    complain({Errc::unavailable, "write " + quoted_name() + " : '" + address_ +
                                      "' is away; the newest samples are kept and sent later"});
   }
   return true;

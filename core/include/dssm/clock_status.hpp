@@ -13,11 +13,11 @@ enum class ClockStatus : std::uint8_t {
   unknown,        // chronyd has not been heard of yet
   synchronized,   // the bound is within the limit
   holdover,       // so far, but chronyd has not heard from its sources for some time
-  out_of_bounds,  // beyond the limit, or there is no bound: see ClockTrouble
+  out_of_bounds,  // beyond the limit, or there is no bound: see ClockReason
 };
 
 // Why a clock is out of bounds.
-enum class ClockTrouble : std::uint8_t {
+enum class ClockReason : std::uint8_t {
   none,
   no_chronyd,      // nothing listens where it should
   silent,          // it does not answer
@@ -43,7 +43,7 @@ enum class ClockPolicy : std::uint8_t {
 
 // "synchronized", "out of bounds", "no chronyd", "reference", "enforce" ...; static storage.
 std::string_view name_of(ClockStatus status) noexcept;
-std::string_view name_of(ClockTrouble trouble) noexcept;
+std::string_view name_of(ClockReason trouble) noexcept;
 std::string_view name_of(ClockBasis basis) noexcept;
 std::string_view name_of(ClockPolicy policy) noexcept;
 

@@ -20,7 +20,7 @@ enum class Errc {
   no_memory,            // the machine has no memory for it
   no_permission,        // the operating system or dssmd refuses this user
   no_daemon,            // nothing listens at the socket
-  daemon_away,          // dssmd was there and is gone; this process keeps trying
+  unavailable,          // dssmd was there and is gone; this process keeps trying
   protocol,             // the other side speaks another version, or garbage
   conflict,             // two things claim one name, e.g. a second dssmd in one folder
   clock_out_of_bounds,  // two hosts' clocks may be further apart than is allowed

@@ -81,8 +81,8 @@ std::optional<RankedAddress> address_untrusted(const AvahiAddress& address,
 }  // namespace
 
 HostBrowser::HostBrowser(const EventLoop& loop, const wire::HostId& self, std::uint16_t port,
-                         const InterfaceFilter& filter, AvahiUser& user)
-    : self_(self), port_(port), filter_(filter), user_(user) {
+                         const InterfaceFilter& filter, AvahiObserver& observer)
+    : self_(self), port_(port), filter_(filter), observer_(observer) {
   retry_ = EventSource::timer(loop, [this] { resolve_again(); });
   refill_ = EventSource::timer(loop, [this] { refill(); });
 }
@@ -93,7 +93,7 @@ void HostBrowser::start(AvahiClient* client) {
   const std::string type(kHostSubtype);
   browser_ = avahi_service_browser_new(client, AVAHI_IF_UNSPEC, AVAHI_PROTO_UNSPEC, type.c_str(),
                                        nullptr, AvahiLookupFlags{}, on_browser, this);
-  if (!browser_) user_.on_avahi_failure(avahi_client_errno(client));
+  if (!browser_) observer_.on_avahi_failure(avahi_client_errno(client));
 }
 
 void HostBrowser::forget() {
@@ -176,7 +176,7 @@ void HostBrowser::on_browser(AvahiServiceBrowser*, AvahiIfIndex interface, Avahi
       browser.on_removed(Key{interface, protocol, name, domain});
       break;
     case AVAHI_BROWSER_FAILURE:
-      browser.user_.on_avahi_failure(avahi_client_errno(browser.client_));
+      browser.observer_.on_avahi_failure(avahi_client_errno(browser.client_));
       break;
     case AVAHI_BROWSER_CACHE_EXHAUSTED:
     case AVAHI_BROWSER_ALL_FOR_NOW:
@@ -195,10 +195,10 @@ void HostBrowser::on_new(Key key) {
 // Gives places to those that wait; a few at a time, because each costs D-Bus calls.
 void HostBrowser::refill() {
   for (int n = 0; n < kRefillPerTurn && !waiting_.empty(); ++n) {
-    if (user_.stopping() || !client_) return;
+    if (observer_.stopping() || !client_) return;
     if (results_.size() >= kMaxResults && !make_room()) {
-      if (!std::exchange(told_full_, true)) user_.log(LogLevel::warning, "mDNS: " + trouble());
-      return user_.on_avahi_change();
+      if (!std::exchange(told_full_, true)) observer_.log(LogLevel::warning, "mDNS: " + trouble());
+      return observer_.on_avahi_change();
     }
     const auto next = waiting_.extract(waiting_.begin());
     Result& result = results_[next.value()];
@@ -216,7 +216,7 @@ void HostBrowser::on_removed(const Key& key) {
   free_resolver(at->second);
   results_.erase(at);
   if (!waiting_.empty()) refill_.enable_in(Duration::zero());
-  user_.on_avahi_change();
+  observer_.on_avahi_change();
 }
 
 bool HostBrowser::make_room() {
@@ -238,13 +238,13 @@ void HostBrowser::resolve(Result& result) {
   if (result.resolver) return;
   const int error = avahi_client_errno(client_);
   result.useless = true;
-  if (is_avahi_connection_error(error)) return user_.on_avahi_failure(error);
+  if (is_avahi_connection_error(error)) return observer_.on_avahi_failure(error);
   retry_.enable_in(kResolverPause);
 }
 
 void HostBrowser::resolve_again() {
   for (auto& [key, result] : results_) {
-    if (!result.resolver && client_ && !user_.stopping()) resolve(result);
+    if (!result.resolver && client_ && !observer_.stopping()) resolve(result);
   }
 }
 
@@ -283,7 +283,7 @@ void HostBrowser::on_resolver(AvahiServiceResolver*, AvahiIfIndex, AvahiProtocol
   }
   HostBrowser& browser = *of.browser;
   if (of.useless && !browser.waiting_.empty()) browser.refill_.enable_in(Duration::zero());
-  browser.user_.on_avahi_change();
+  browser.observer_.on_avahi_change();
 }
 
 void HostBrowser::on_resolved_untrusted(Result& result, const AvahiAddress* address,
@@ -293,9 +293,9 @@ void HostBrowser::on_resolved_untrusted(Result& result, const AvahiAddress* addr
   const std::string interface = interface_name(result.key.interface);
   const auto bad = [&](const std::string& why) {
     if (std::exchange(result.told_bad, true)) return;
-    user_.log(LogLevel::warning, "mDNS: " + in_quotes(result.key.instance) + " on interface " +
-                                     in_quotes(interface) + " calls itself a DSSM host, but " +
-                                     why + ", skipping");
+    observer_.log(LogLevel::warning, "mDNS: " + in_quotes(result.key.instance) + " on interface " +
+                                         in_quotes(interface) + " calls itself a DSSM host, but " +
+                                         why + ", skipping");
   };
   const dssm::Result<TxtRecord> pairs = txt_untrusted(txt);
   if (!pairs) return bad(pairs.error().message);

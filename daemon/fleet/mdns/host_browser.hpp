@@ -18,7 +18,7 @@
 #include <string>
 
 #include "daemon/base/event_loop.hpp"
-#include "daemon/fleet/mdns/avahi_user.hpp"
+#include "daemon/fleet/mdns/avahi_observer.hpp"
 #include "daemon/fleet/mdns/interface_filter.hpp"
 #include "daemon/fleet/mdns/mdns_mailbox.hpp"
 
@@ -33,7 +33,7 @@ class HostBrowser {
   // All outlive it.
   //   self, port  of this host's own service
   HostBrowser(const EventLoop& loop, const wire::HostId& self, std::uint16_t port,
-              const InterfaceFilter& filter, AvahiUser& user);
+              const InterfaceFilter& filter, AvahiObserver& observer);
   HostBrowser(const HostBrowser&) = delete;
   HostBrowser& operator=(const HostBrowser&) = delete;
 
@@ -93,7 +93,7 @@ class HostBrowser {
   const wire::HostId self_;
   const std::uint16_t port_;
   const InterfaceFilter& filter_;
-  AvahiUser& user_;
+  AvahiObserver& observer_;
   AvahiClient* client_ = nullptr;
   AvahiServiceBrowser* browser_ = nullptr;
   std::map<Key, Result> results_;

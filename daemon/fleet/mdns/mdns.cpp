@@ -8,7 +8,7 @@
 #include <thread>
 #include <utility>
 
-#include "daemon/base/calm_logger.hpp"
+#include "daemon/base/rate_limited_logger.hpp"
 #include "daemon/fleet/mdns/mdns_mailbox.hpp"
 #include "daemon/fleet/mdns/mdns_worker.hpp"
 
@@ -21,13 +21,13 @@ constexpr Duration kPatienceAtEnd = std::chrono::milliseconds(900);
 }  // namespace
 
 struct Mdns::Impl {
-  Impl(HostFinderUser& user_, Logger& logger) : user(user_), calm(logger) {}
+  Impl(HostFinderObserver& observer_, Logger& logger) : observer(observer_), calm(logger) {}
 
   Result<void> start(const EventLoop& main_loop, const Options& options);
   void on_news();
 
-  HostFinderUser& user;
-  CalmLogger calm;  // others decide how often there is something to say
+  HostFinderObserver& observer;
+  RateLimitedLogger calm;  // others decide how often there is something to say
   MdnsState state;
   FoundHosts told;
   std::shared_ptr<MdnsMailbox> mailbox;
@@ -35,8 +35,8 @@ struct Mdns::Impl {
   EventSource news;
 };
 
-Mdns::Mdns(const EventLoop& loop, Options options, HostFinderUser& user, Logger& logger)
-    : impl_(std::make_unique<Impl>(user, logger)) {
+Mdns::Mdns(const EventLoop& loop, Options options, HostFinderObserver& observer, Logger& logger)
+    : impl_(std::make_unique<Impl>(observer, logger)) {
   impl_->state.phase = MdnsState::Phase::waiting;
   if (const Result<void> started = impl_->start(loop, options); !started) {
     impl_->state.trouble = started.error().message;
@@ -92,16 +92,16 @@ void Mdns::Impl::on_news() {
   if (fresh.hosts) {
     const FoundHosts before = std::exchange(told, *std::move(fresh.hosts));
     for (const auto& [id, host] : before) {
-      if (!told.contains(id)) user.on_host_lost(id);
+      if (!told.contains(id)) observer.on_host_lost(id);
     }
     for (const auto& [id, host] : told) {
       const auto known = before.find(id);
-      if (known == before.end() || known->second != host) user.on_host_found(host);
+      if (known == before.end() || known->second != host) observer.on_host_found(host);
     }
   }
   if (fresh.state && *fresh.state != state) {
     state = *std::move(fresh.state);
-    user.on_mdns_state(state);
+    observer.on_mdns_state(state);
   }
 }
 

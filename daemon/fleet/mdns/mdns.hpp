@@ -35,8 +35,8 @@ class Mdns {
     Duration stream_pause = std::chrono::microseconds(62'500);
   };
 
-  // Starts at once. loop, user and logger outlive it; the user is told from the loop.
-  Mdns(const EventLoop& loop, Options options, HostFinderUser& user, Logger& logger);
+  // Starts at once. loop, observer and logger outlive it; the observer is told from the loop.
+  Mdns(const EventLoop& loop, Options options, HostFinderObserver& observer, Logger& logger);
   Mdns(const Mdns&) = delete;
   Mdns& operator=(const Mdns&) = delete;
   ~Mdns();  // withdraws what is announced; a hung Avahi daemon delays it by a second at most

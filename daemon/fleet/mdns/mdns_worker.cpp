@@ -6,7 +6,7 @@
 //                   daemon the client waits for it (AVAHI_CLIENT_NO_FAIL)
 //   follow_state()  announces and browses as soon as the daemon is there; pauses announcing while
 //                   it looks for another name for this PC
-//   begin_anew()    frees the client with all that it made when the daemon or D-Bus has gone, and
+//   reopen()    frees the client with all that it made when the daemon or D-Bus has gone, and
 //                   connects again
 //
 // Avahi's callbacks only take notes: what they lead to is done by timers without delay, so that
@@ -138,12 +138,12 @@ void MdnsWorker::on_avahi_failure(int error) {
 
 void MdnsWorker::follow_state() {
   if (!client_) return;
-  if (failure_ != AVAHI_OK) return begin_anew();
+  if (failure_ != AVAHI_OK) return reopen();
   const AvahiClientState state = avahi_client_get_state(client_);
   switch (state) {
     case AVAHI_CLIENT_FAILURE:
       failure_ = avahi_client_errno(client_);
-      return begin_anew();
+      return reopen();
     case AVAHI_CLIENT_CONNECTING:
       state_.phase = MdnsState::Phase::waiting;
       state_.trouble = why_waiting(AVAHI_ERR_NO_DAEMON);
@@ -155,7 +155,7 @@ void MdnsWorker::follow_state() {
         const char* const version = avahi_client_get_version_string(client_);
         if (!version) {
           failure_ = avahi_client_errno(client_);
-          return begin_anew();
+          return reopen();
         }
         state_.avahi_version = printable(std::string_view(version).substr(0, 64));
         state_.phase = MdnsState::Phase::running;
@@ -173,7 +173,7 @@ void MdnsWorker::follow_state() {
   report();
 }
 
-void MdnsWorker::begin_anew() {
+void MdnsWorker::reopen() {
   const int error = failure_;
   disconnect();
   wait_for_avahi(error);

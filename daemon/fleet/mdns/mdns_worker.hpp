@@ -9,8 +9,8 @@
 #include <memory>
 #include <string>
 
+#include "daemon/fleet/mdns/avahi_observer.hpp"
 #include "daemon/fleet/mdns/avahi_poll.hpp"
-#include "daemon/fleet/mdns/avahi_user.hpp"
 #include "daemon/fleet/mdns/host_browser.hpp"
 #include "daemon/fleet/mdns/interface_filter.hpp"
 #include "daemon/fleet/mdns/mdns.hpp"
@@ -19,7 +19,7 @@
 
 namespace dssm::daemon {
 
-class MdnsWorker final : private AvahiUser {
+class MdnsWorker final : private AvahiObserver {
  public:
   // loop and mailbox outlive it; loop is its own.
   MdnsWorker(EventLoop& loop, const Mdns::Options& options, MdnsMailbox& mailbox);
@@ -43,7 +43,7 @@ class MdnsWorker final : private AvahiUser {
   void disconnect();
   void follow_state();
   void wait_for_avahi(int error);
-  void begin_anew();
+  void reopen();
   void choose_interfaces();
   void report();
 

@@ -61,8 +61,8 @@ bool is_avahi_connection_error(int error) noexcept {
 }
 
 ServicePublisher::ServicePublisher(const EventLoop& loop, std::uint16_t port, Duration stream_pause,
-                                   AvahiUser& user)
-    : user_(user), port_(port), pace_(kStreamsAtOnce, stream_pause) {
+                                   AvahiObserver& observer)
+    : observer_(observer), port_(port), pace_(kStreamsAtOnce, stream_pause) {
   worker_ = EventSource::timer(loop, [this] { work(); });
   retry_ = EventSource::timer(loop, [this] { queue_withheld(); });
 }
@@ -188,7 +188,7 @@ void ServicePublisher::queue_withheld() {
 
 void ServicePublisher::work() {
   for (int n = 0; n < kServicesPerTurn && !queue_.empty(); ++n) {
-    if (user_.stopping()) return;
+    if (observer_.stopping()) return;
     const std::string instance = std::move(queue_.front());
     queue_.pop_front();
     const auto at = services_.find(instance);
@@ -199,7 +199,7 @@ void ServicePublisher::work() {
         // All others wait, too; what must not wait stands before it, see want().
         queue_.push_front(instance);
         worker_.enable_in(pause);
-        return user_.on_avahi_change();
+        return observer_.on_avahi_change();
       }
       if (!host_is_settled()) {
         at->second.queued = false;  // queue_new_streams() comes back to it
@@ -208,11 +208,11 @@ void ServicePublisher::work() {
       pace_.take(now);
     }
     at->second.queued = false;
-    if (!bring(at->second)) return user_.on_avahi_failure(avahi_client_errno(client_));
+    if (!bring(at->second)) return observer_.on_avahi_failure(avahi_client_errno(client_));
     if (!at->second.wanted) services_.erase(at);
   }
   if (!queue_.empty()) worker_.enable_in(Duration::zero());
-  user_.on_avahi_change();
+  observer_.on_avahi_change();
 }
 
 bool ServicePublisher::is_new_stream(const Service& service) const {
@@ -341,7 +341,7 @@ void ServicePublisher::withhold(Service& service, int error) {
   if (error != AVAHI_OK) retry_.enable_in(kWithheldPause);
   if (!told_withheld_ && !is_avahi_connection_error(error)) {
     told_withheld_ = true;
-    user_.log(LogLevel::warning, "mDNS: " + trouble());
+    observer_.log(LogLevel::warning, "mDNS: " + trouble());
   }
   if (!service.record.stream) queue_new_streams();
 }
@@ -376,7 +376,7 @@ void ServicePublisher::on_group(Service& service, AvahiEntryGroupState state) {
     case AVAHI_ENTRY_GROUP_UNCOMMITED:
       break;
   }
-  user_.on_avahi_change();
+  observer_.on_avahi_change();
 }
 
 }  // namespace dssm::daemon

@@ -22,8 +22,8 @@
 #include <vector>
 
 #include "daemon/base/event_loop.hpp"
-#include "daemon/base/pace.hpp"
-#include "daemon/fleet/mdns/avahi_user.hpp"
+#include "daemon/base/rate_limiter.hpp"
+#include "daemon/fleet/mdns/avahi_observer.hpp"
 #include "daemon/fleet/service_record.hpp"
 
 namespace dssm::daemon {
@@ -35,9 +35,9 @@ class ServicePublisher {
   // Two entries each: half of what a group may hold.
   static constexpr std::size_t kMaxInterfaces = 8;
 
-  // stream_pause: as in Mdns::Options. loop and user outlive it.
+  // stream_pause: as in Mdns::Options. loop and observer outlive it.
   ServicePublisher(const EventLoop& loop, std::uint16_t port, Duration stream_pause,
-                   AvahiUser& user);
+                   AvahiObserver& observer);
   ServicePublisher(const ServicePublisher&) = delete;
   ServicePublisher& operator=(const ServicePublisher&) = delete;
 
@@ -84,7 +84,7 @@ class ServicePublisher {
   void withhold(Service& service, int error);
   bool rename(Service& service);
 
-  AvahiUser& user_;
+  AvahiObserver& observer_;
   const std::uint16_t port_;
   AvahiClient* client_ = nullptr;
   bool running_ = false;
@@ -93,7 +93,7 @@ class ServicePublisher {
   std::deque<std::string> queue_;  // instances to look at
   std::size_t groups_ = 0;
   bool told_withheld_ = false;
-  Pace pace_;
+  RateLimiter pace_;
   EventSource worker_, retry_;
 };
 

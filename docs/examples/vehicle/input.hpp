@@ -18,7 +18,7 @@ namespace vehicle {
 inline constexpr int kIncompleteStatus = 3;
 
 // Opens `stream`, on whichever host it is, waiting until it is created and its host answers. Fails
-// as Session::open_reader() does, but for not_found and daemon_away, which it waits out; nullopt
+// as Session::open_reader() does, but for not_found and unavailable, which it waits out; nullopt
 // when a signal asked to stop.
 template <class T>
 dssm::Result<std::optional<dssm::Reader<T>>> open_when_there(dssm::Session& session,
@@ -29,7 +29,7 @@ dssm::Result<std::optional<dssm::Reader<T>>> open_when_there(dssm::Session& sess
         session.await_reader<T>(stream, dssm::deadline_in(kSlice));
     if (reader) return std::optional<dssm::Reader<T>>(std::move(*reader));
     const dssm::Errc code = reader.error().code;
-    if (code != dssm::Errc::not_found && code != dssm::Errc::daemon_away) {
+    if (code != dssm::Errc::not_found && code != dssm::Errc::unavailable) {
       return std::move(reader).error();
     }
     if (!told) progress.say("waiting for the stream '" + std::string(stream) + "'");

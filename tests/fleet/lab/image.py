@@ -33,7 +33,7 @@ PACKAGES = (
     # Ansible's end on the PC.
     " python3 python3-apt"
     # What the project's packages and the example depend on.
-    " libstdc++6 libevent-core-2.1-7 libprotobuf-lite32 libsystemd0 libavahi-client3"
+    " libstdc++6 libevent-core-2.1-7 libfmt9 libprotobuf-lite32 libsystemd0 libavahi-client3"
     " libavahi-common3 libtomlplusplus3 zlib1g libpng16-16 adduser init-system-helpers"
 ).split()
 

@@ -48,13 +48,13 @@ TEST_F(BadPeer, ThatSendsGarbageIsToldSo) {
   RawPeer http(daemon_.address(), false);
   http.send_bytes(
       "GET / HTTP/1.1\r\nHost: pc1\r\nUser-Agent: a browser that lost its way home\r\n\r\n");
-  EXPECT_NE(http.last_words(), "");
+  EXPECT_NE(http.final_failure(), "");
   RawPeer endless(daemon_.address(), false);
   endless.send_bytes(std::string(64, '\xff'));
-  EXPECT_NE(endless.last_words(), "");
+  EXPECT_NE(endless.final_failure(), "");
   RawPeer long_frame(daemon_.address());
   long_frame.send_bytes(std::string("\xff\xff\xff\xff\x0f", 5));  // 2^32 - 1 bytes
-  EXPECT_NE(long_frame.last_words().find("4294967295 bytes"), std::string::npos);
+  EXPECT_NE(long_frame.final_failure().find("4294967295 bytes"), std::string::npos);
 }
 
 TEST_F(BadPeer, ThatSendsRandomBytesCostsOnlyItself) {
@@ -115,7 +115,7 @@ TEST_F(BadPeer, ThatChangesBytesOfGoodFramesCostsOnlyItself) {
 TEST_F(BadPeer, ThatComesFromTheFutureIsToldBothVersionsAndHosts) {
   RawPeer peer(daemon_.address(), false);
   peer.send(network_hello(1000));
-  const std::string words = peer.last_words();
+  const std::string words = peer.final_failure();
   EXPECT_NE(words.find("version 1000"), std::string::npos) << words;
   EXPECT_NE(words.find("version 1;"), std::string::npos) << words;
   EXPECT_NE(words.find("'pc1'"), std::string::npos) << words;
@@ -124,8 +124,8 @@ TEST_F(BadPeer, ThatComesFromTheFutureIsToldBothVersionsAndHosts) {
 TEST_F(BadPeer, ThatNeverFinishesItsHelloIsClosed) {
   RawPeer silent(daemon_.address(), false), slow(daemon_.address(), false);
   slow.send_bytes("\x20");
-  EXPECT_NE(silent.last_words().find("no Hello"), std::string::npos);
-  EXPECT_NE(slow.last_words().find("no Hello"), std::string::npos);
+  EXPECT_NE(silent.final_failure().find("no Hello"), std::string::npos);
+  EXPECT_NE(slow.final_failure().find("no Hello"), std::string::npos);
 }
 
 TEST_F(BadPeer, ThatStopsInTheMiddleOfAFrameIsNotMissed) {
@@ -149,14 +149,14 @@ TEST_F(BadPeer, ThatPublishesWithoutSayingSoOrInAnotherSizeIsRefused) {
     RawPeer peer(daemon_.address());
     peer.create("p", 16, 8);
     peer.send_sample(0, std::vector<std::byte>(16), {});
-    EXPECT_NE(peer.last_words().find("StartPublishing"), std::string::npos);
+    EXPECT_NE(peer.final_failure().find("StartPublishing"), std::string::npos);
     RawPeer other(daemon_.address());
     other.open("p");
     net::Frame start;
     start.mutable_start_publishing()->set_publisher(1);
     other.ask(start);
     other.send_sample(0, std::vector<std::byte>(17), {});
-    EXPECT_NE(other.last_words().find("17 bytes"), std::string::npos);
+    EXPECT_NE(other.final_failure().find("17 bytes"), std::string::npos);
   }
   net::Frame remove;
   remove.mutable_remove()->mutable_id()->set_name("p");
@@ -224,7 +224,7 @@ TEST(BadPeers, AreCounted) {
   const DaemonProcess daemon({"--max-connections", "3", "--max-connections-per-host", "2"});
   RawPeer one(daemon.address()), two(daemon.address());
   RawPeer three(daemon.address(), false);
-  const std::string words = three.last_words();
+  const std::string words = three.final_failure();
   EXPECT_NE(words.find("max_connections_per_host = 2"), std::string::npos) << words;
   EXPECT_NE(words.find("'pc1'"), std::string::npos) << words;
   one.close();
@@ -265,7 +265,7 @@ TEST(BadPeers, ThatComeAndGoDoNotFillTheLog) {
   for (int i = 0; i < 2000; ++i) {
     RawPeer peer(address, false);
     peer.send_bytes(std::string(16, '\xff'));
-    peer.last_words();
+    peer.final_failure();
   }
   ::kill(pid, SIGTERM);
   EXPECT_EQ(wait_for(pid), 0);

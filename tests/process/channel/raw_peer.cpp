@@ -84,7 +84,7 @@ Received RawPeer::ask(net::Frame request) {
   }
 }
 
-std::string RawPeer::last_words() {
+std::string RawPeer::final_failure() {
   std::string words;
   for (;;) {
     const Received next = receive();

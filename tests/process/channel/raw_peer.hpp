@@ -28,7 +28,7 @@ struct Received {
   bool ended = false;  // the connection ended instead
 };
 
-class RawPeer final : private wire::FrameSink {
+class RawPeer final : private wire::FrameDelegate {
  public:
   // Connects to "127.0.0.1:1234"; without `greet` it says nothing.
   explicit RawPeer(const std::string& address, bool greet = true, bool torn = true);
@@ -45,7 +45,7 @@ class RawPeer final : private wire::FrameSink {
   Received ask(net::Frame request);
 
   // Reads to the end; returns the message of the last words.
-  std::string last_words();
+  std::string final_failure();
 
   // Opens or creates a stream for this channel.
   net::Opened open(const std::string& name);

@@ -23,7 +23,7 @@ using test::DaemonProcess;
 const StreamId kId{"anew", 0, ""};
 
 // Removes the stream and creates it again.
-Writer<double> create_anew(Session& session) {
+Writer<double> recreate(Session& session) {
   session.remove(kId).value();
   return session.create<double>("anew", History{16, 1ms}).value();
 }
@@ -45,7 +45,7 @@ TEST(NewRing, IsGoneOnWithAfterTheOldOneIsReadToItsEnd) {
   reader.seek(kNoTid);
   for (int i = 0; i < 3; ++i) writer.write(i);
   const std::uint64_t old_ring = reader.incarnation();
-  Writer<double> again = create_anew(session);
+  Writer<double> again = recreate(session);
   for (int i = 0; i < 2; ++i) again.write(100 + i);
   double value = 0;
   SampleInfo info;
@@ -82,7 +82,7 @@ TEST(NewRing, WakesWhoSleepsOnTheOldOne) {
     ASSERT_EQ(next(reader, value, info), ReadStatus::ok);
     EXPECT_EQ(value, 7);
   });
-  Writer<double> again = create_anew(session);
+  Writer<double> again = recreate(session);
   again.write(7);
   sleeper.join();
   pollfd event{ready, POLLIN, 0};
@@ -104,7 +104,7 @@ TEST(NewRing, IsToldByReadsByTimeAtOnce) {
   Reader<double> reader = session.open_reader<double>("anew").value();
   BorrowedSample borrowed;
   ASSERT_EQ(reader.borrow(0, borrowed), ReadStatus::ok);
-  Writer<double> again = create_anew(session);
+  Writer<double> again = recreate(session);
   again.write(2, time_from_ns(2000));
   double value = 0;
   SampleInfo info;

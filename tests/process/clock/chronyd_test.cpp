@@ -148,7 +148,7 @@ class ChronydTest : public testing::Test, protected ClockWatch::Observer {
 };
 
 // One question, answered.
-class OneAnswer final : private ChronydClient::User {
+class OneAnswer final : private ChronydClient::Observer {
  public:
   OneAnswer(const EventLoop& loop, const Chronyd& chronyd)
       : client_(loop, chronyd.address(), *this, clock::Instant::now) {
@@ -224,7 +224,7 @@ TEST_F(ChronydTest, TakesTheLocalModeForRightByDefinition) {
             std::string::npos);
   until([&] { return watch->state().offset != Duration::zero(); });
   EXPECT_EQ(watch->state().offset, 250'000'015ns) << "ahead, and a unit of chronyd's format more";
-  EXPECT_EQ(watch->state().trouble, ClockTrouble::too_far);
+  EXPECT_EQ(watch->state().trouble, ClockReason::too_far);
   EXPECT_EQ(watch->state().bound, 250'000'015ns);
 }
 
@@ -237,7 +237,7 @@ TEST_F(ChronydTest, KnowsWithOneQuestionThatItIsGoneAndRecovers) {
     looks = 0;
     until([&] { return looks == 1; });
     EXPECT_EQ(watch->state().status, ClockStatus::out_of_bounds);
-    EXPECT_EQ(watch->state().trouble, ClockTrouble::no_chronyd);
+    EXPECT_EQ(watch->state().trouble, ClockReason::no_chronyd);
     EXPECT_EQ(watch->state().bound, kUnknownClockError);
     chronyd.start();
     until([&] { return watch->state().status == ClockStatus::synchronized; });
@@ -250,7 +250,7 @@ TEST_F(ChronydTest, IsSilentWhileItIsStopped) {
   until([&] { return watch->state().status == ClockStatus::synchronized; });
   chronyd.signal(SIGSTOP);
   until([&] { return watch->state().status != ClockStatus::synchronized; });
-  EXPECT_EQ(watch->state().trouble, ClockTrouble::silent);
+  EXPECT_EQ(watch->state().trouble, ClockReason::silent);
   chronyd.signal(SIGCONT);
   until([&] { return watch->state().status == ClockStatus::synchronized; });
 }

@@ -26,7 +26,7 @@ class BadClient : public testing::Test {
   }
 
   // Reads until the end; gives the last failure.
-  static std::string last_words(RawClient& client) {
+  static std::string final_failure(RawClient& client) {
     std::string words;
     for (;;) {
       const Answer answer = client.receive();
@@ -46,10 +46,10 @@ class BadClient : public testing::Test {
 TEST_F(BadClient, ThatSendsGarbageIsToldSo) {
   RawClient http(daemon_.socket_path(), false);
   http.send_bytes("\x05HELLO");
-  EXPECT_NE(last_words(http).find("no request of DSSM's local protocol"), std::string::npos);
+  EXPECT_NE(final_failure(http).find("no request of DSSM's local protocol"), std::string::npos);
   RawClient endless(daemon_.socket_path(), false);
   endless.send_bytes(std::string(64, '\xff'));
-  EXPECT_NE(last_words(endless).find("no varint-delimited frame"), std::string::npos);
+  EXPECT_NE(final_failure(endless).find("no varint-delimited frame"), std::string::npos);
 }
 
 TEST_F(BadClient, ThatSendsRandomBytesCostsOnlyItself) {
@@ -72,7 +72,7 @@ TEST_F(BadClient, ThatComesFromTheFutureIsToldBothVersions) {
   local::Request hello;
   hello.mutable_hello()->set_protocol_version(1000);
   client.send(hello);
-  const std::string words = last_words(client);
+  const std::string words = final_failure(client);
   EXPECT_NE(words.find("version 1000"), std::string::npos) << words;
   EXPECT_NE(words.find("version 1 "), std::string::npos) << words;
 }
@@ -80,13 +80,13 @@ TEST_F(BadClient, ThatComesFromTheFutureIsToldBothVersions) {
 TEST_F(BadClient, ThatAnnouncesAnEndlessFrameIsRefusedBeforeItSendsOne) {
   RawClient client(daemon_.socket_path());
   client.send_bytes(std::string("\xff\xff\xff\xff\x0f", 5));  // 2^32 - 1 bytes
-  EXPECT_NE(last_words(client).find("4294967295 bytes"), std::string::npos);
+  EXPECT_NE(final_failure(client).find("4294967295 bytes"), std::string::npos);
 }
 
 TEST_F(BadClient, ThatAsksBeforeHelloIsToldTheOrder) {
   RawClient client(daemon_.socket_path(), false);
   client.send(list_request());
-  EXPECT_NE(last_words(client).find("Hello"), std::string::npos);
+  EXPECT_NE(final_failure(client).find("Hello"), std::string::npos);
 }
 
 TEST_F(BadClient, ThatAsksForSomethingUnknownIsAnsweredAndServedOn) {
@@ -115,7 +115,7 @@ TEST_F(BadClient, ThatSendsTooManyDescriptorsAtOnceIsRefused) {
   header->cmsg_len = CMSG_LEN(flood.size() * sizeof(int));
   std::memcpy(CMSG_DATA(header), flood.data(), flood.size() * sizeof(int));
   ASSERT_EQ(::sendmsg(client.fd(), &message, MSG_NOSIGNAL), 1);
-  EXPECT_NE(last_words(client).find("descriptors"), std::string::npos);
+  EXPECT_NE(final_failure(client).find("descriptors"), std::string::npos);
   ::close(null);
 }
 
@@ -124,7 +124,7 @@ TEST_F(BadClient, ThatKeepsSendingDescriptorsNobodyAskedForIsRefused) {
   const int null = ::open("/dev/null", O_RDWR | O_CLOEXEC);
   const std::vector<int> some(16, null);
   for (int i = 0; i < 5; ++i) client.send(list_request(), some);
-  EXPECT_NE(last_words(client).find("descriptors"), std::string::npos);
+  EXPECT_NE(final_failure(client).find("descriptors"), std::string::npos);
   ::close(null);
 }
 

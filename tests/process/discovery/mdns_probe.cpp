@@ -35,7 +35,7 @@ namespace {
 using namespace dssm;
 using namespace dssm::daemon;
 
-class Printer final : public HostFinderUser, public Logger {
+class Printer final : public HostFinderObserver, public Logger {
  public:
   void on_host_found(const FoundHost& host) override {
     std::printf("found %d %s %s", host.id[0], host.name.c_str(), host.closed ? "closed" : "open");

@@ -193,7 +193,7 @@ TEST_F(FleetCatalog, AnswersPingsOfHostsByName) {
   ::kill(pc2.pid(), SIGSTOP);
   const auto hanging = on1.ping("pc2");
   ASSERT_FALSE(hanging);
-  EXPECT_EQ(hanging.error().code, Errc::daemon_away) << hanging.error().message;
+  EXPECT_EQ(hanging.error().code, Errc::unavailable) << hanging.error().message;
   ::kill(pc2.pid(), SIGCONT);
 }
 

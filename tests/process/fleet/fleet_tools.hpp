@@ -45,7 +45,7 @@ Reader<T> open_filled(Session& session, const std::string& stream) {
     Result<Reader<T>> opened = session.open_reader<T>(stream);
     if (opened) {
       reader = *std::move(opened);
-    } else if (opened.error().code != Errc::daemon_away && opened.error().code != Errc::not_found) {
+    } else if (opened.error().code != Errc::unavailable && opened.error().code != Errc::not_found) {
       opened.value();  // throws, with the reason
     }
     return reader.has_value();

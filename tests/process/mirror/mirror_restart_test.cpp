@@ -235,7 +235,7 @@ TEST_F(TwoHosts, SayThatAHostDoesNotAnswer) {
   const auto reader = there.open_reader<Counted>("odometry");
   ::kill(pc1.pid(), SIGCONT);
   ASSERT_FALSE(reader);
-  EXPECT_EQ(reader.error().code, Errc::daemon_away);
+  EXPECT_EQ(reader.error().code, Errc::unavailable);
   EXPECT_NE(reader.error().message.find("'pc1'"), std::string::npos) << reader.error().message;
 }
 

@@ -186,7 +186,7 @@ TEST(PConnectorOpen, SaysThatTheConnectionWasClosed) {
   const FakeDaemon daemon([](FakePeer&, int) {});
   const auto con = open(daemon);
   ASSERT_FALSE(con);
-  expect_words(con.error(), Errc::daemon_away, {daemon.address(), "closed"});
+  expect_words(con.error(), Errc::unavailable, {daemon.address(), "closed"});
 }
 
 TEST(PConnectorOpen, RefusesADescriptionThatCannotBe) {
@@ -206,7 +206,7 @@ TEST(PConnectorOpen, ASilentDssmdCostsTheRequestTimeout) {
   const auto con =
       PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 200ms});
   ASSERT_FALSE(con);
-  expect_words(con.error(), Errc::daemon_away, {daemon.address(), "does not greet"});
+  expect_words(con.error(), Errc::unavailable, {daemon.address(), "does not greet"});
 }
 
 TEST(PConnectorOpen, GivesABusyDssmdTheRequestTimeoutToGreet) {
@@ -306,7 +306,7 @@ TEST(PConnectorRequest, TellsDaemonAwayWhenItStaysAway) {
   TakenSample sample;
   const auto away = con.latest(sample.span(), sample.info);
   ASSERT_FALSE(away);
-  expect_words(away.error(), Errc::daemon_away, {"lidar", address});
+  expect_words(away.error(), Errc::unavailable, {"lidar", address});
   EXPECT_FALSE(con.connected());
 }
 
@@ -500,7 +500,7 @@ TEST(PConnectorSubscription, TellsWhenTheConnectionIsDownWithoutWaiting) {
   for (;;) {
     const auto status = con.next(sample.span(), sample.info);
     if (!status) {
-      expect_words(status.error(), Errc::daemon_away, {"lidar"});
+      expect_words(status.error(), Errc::unavailable, {"lidar"});
       break;
     }
     ASSERT_EQ(*status, ReadStatus::not_yet);
@@ -907,7 +907,7 @@ TEST(PConnectorPublishing, AWriteThatIsNotAcknowledgedSaysSo) {
   auto con = open_impatient(daemon, 100ms);
   const auto written = con.write(bytes_of(text_of(0)));
   ASSERT_FALSE(written);
-  expect_words(written.error(), Errc::daemon_away, {"lidar", "kept"});
+  expect_words(written.error(), Errc::unavailable, {"lidar", "kept"});
 }
 
 TEST(PConnectorPublishing, TheDestructorSendsWhatWasPosted) {

@@ -65,7 +65,7 @@ constexpr std::uint64_t kPublisher = 77;
 Deaths die_at_every_instruction(TimeOf time_of, bool publishes = false) {
   const TestRing ring(kPayloadBytes, 5);
   const RingReader reader = ring.reader();
-  const PublisherNotes notes(ring.mapping->header());
+  const PublisherCursors notes(ring.mapping->header());
   RingWriter survivor = ring.writer();
   if (publishes) {
     survivor.try_publish({kPublisher, 7}, payload_for(0, kPayloadBytes), {}, {});
@@ -206,7 +206,7 @@ class KilledDaemon : public testing::Test {
 
   const TestRing ring{kPayloadBytes, 5};
   const RingHeader& header = ring.mapping->header();
-  const PublisherNotes notes{ring.mapping->header()};
+  const PublisherCursors notes{ring.mapping->header()};
   RingWriter survivor = ring.writer();
   const std::vector<std::byte> payload = payload_for(0, kPayloadBytes);
 };

@@ -107,7 +107,7 @@ TEST(Doctor, TellsWhyDssmdIsNotThere) {
   facts.socket.kind = SocketFacts::Kind::something_else;
   EXPECT_FINDING(facts, "daemon", Status::fail, "ls -l /run/dssm/dssmd.sock");
   EXPECT_FINDING(unreachable(Errc::protocol), "daemon", Status::fail, "systemctl restart dssmd");
-  EXPECT_FINDING(unreachable(Errc::daemon_away), "daemon", Status::fail, "journalctl -u dssmd");
+  EXPECT_FINDING(unreachable(Errc::unavailable), "daemon", Status::fail, "journalctl -u dssmd");
   EXPECT_FINDING(unreachable(Errc::invalid_argument), "daemon", Status::fail, "DSSM_SOCKET");
 }
 

@@ -51,7 +51,7 @@ struct Rig {
 };
 
 // What is expected of a clock without a bound.
-void expect_void(const ClockState& state, ClockTrouble why) {
+void expect_void(const ClockState& state, ClockReason why) {
   EXPECT_EQ(state.status, ClockStatus::out_of_bounds);
   EXPECT_EQ(state.trouble, why);
   EXPECT_EQ(state.bound, kUnknownClockError);
@@ -71,7 +71,7 @@ TEST(ClockEstimator, StatesTheDistanceFromTheRoot) {
   EXPECT_EQ(rig.hear(), Verdict::taken);
   const ClockState state = rig.state();
   EXPECT_EQ(state.status, ClockStatus::synchronized);
-  EXPECT_EQ(state.trouble, ClockTrouble::none);
+  EXPECT_EQ(state.trouble, ClockReason::none);
   EXPECT_EQ(state.basis, ClockBasis::root);
   EXPECT_EQ(state.bound, 60us);
   EXPECT_EQ(state.ageing, kAgeing);
@@ -131,7 +131,7 @@ TEST(ClockEstimator, FallsIntoHoldoverWhenChronydLearnsNothing) {
     rig.hear(std::chrono::seconds(age));
   }
   EXPECT_EQ(rig.state().status, ClockStatus::out_of_bounds);
-  EXPECT_EQ(rig.state().trouble, ClockTrouble::too_far);
+  EXPECT_EQ(rig.state().trouble, ClockReason::too_far);
   EXPECT_EQ(rig.state().bound, 60us + growth(29s, kAgeing)) << "still true";
 }
 
@@ -141,7 +141,7 @@ TEST(ClockEstimator, HasNoBoundWhenChronydIsSilent) {
   rig.pass(ClockEstimator::kSilentAfter);
   EXPECT_EQ(rig.state().status, ClockStatus::synchronized);
   rig.pass(1ns);
-  expect_void(rig.state(), ClockTrouble::silent);
+  expect_void(rig.state(), ClockReason::silent);
   rig.hear();
   EXPECT_EQ(rig.state().status, ClockStatus::synchronized);
 }
@@ -150,9 +150,9 @@ TEST(ClockEstimator, HasNoBoundAtOnceWhenThereIsNoChronyd) {
   Rig rig;
   rig.hear();
   rig.estimator.on_no_chronyd();
-  expect_void(rig.state(), ClockTrouble::no_chronyd);
+  expect_void(rig.state(), ClockReason::no_chronyd);
   rig.pass(1h);
-  expect_void(rig.state(), ClockTrouble::no_chronyd);
+  expect_void(rig.state(), ClockReason::no_chronyd);
 }
 
 TEST(ClockEstimator, HasNoBoundWhenChronydIsUnsynchronized) {
@@ -162,7 +162,7 @@ TEST(ClockEstimator, HasNoBoundWhenChronydIsUnsynchronized) {
   rig.tracking.root = {1s, 1s};
   EXPECT_EQ(rig.estimator.take_untrusted(rig.tracking, rig.now.mono, rig.now),
             Verdict::unsynchronized);
-  expect_void(rig.state(), ClockTrouble::unsynchronized);
+  expect_void(rig.state(), ClockReason::unsynchronized);
 }
 
 TEST(ClockEstimator, TakesAnnouncedLeapSecondsForNormal) {
@@ -178,11 +178,11 @@ TEST(ClockEstimator, HasNoBoundAfterAStepUntilChronydMeasuredAnew) {
     Rig rig;
     rig.hear();
     rig.step(by);
-    expect_void(rig.state(), ClockTrouble::stepped);
+    expect_void(rig.state(), ClockReason::stepped);
     for (int i = 0; i < 10; ++i) {
       rig.pass(1s);
       EXPECT_EQ(rig.hear_the_same(), Verdict::stepped) << "chronyd did not notice";
-      expect_void(rig.state(), ClockTrouble::stepped);
+      expect_void(rig.state(), ClockReason::stepped);
     }
     for (int i = 1; i < ClockEstimator::kUpdatesAfterStep; ++i) {
       rig.pass(1s);
@@ -248,7 +248,7 @@ TEST(ClockEstimator, IsNotRightByDefinitionWhenAnotherPcIs) {
   rig.estimator.on_reference(ReferenceReport{kPc1, {}}, rig.now.mono);
   rig.pass(1s);
   EXPECT_EQ(rig.hear(), Verdict::unsynchronized);
-  expect_void(rig.state(), ClockTrouble::unsynchronized);
+  expect_void(rig.state(), ClockReason::unsynchronized);
 }
 
 // Reports of the reference PC, and of chronyd's, one a second.
@@ -308,7 +308,7 @@ TEST(ClockEstimator, TakesNonsenseForNoAnswer) {
     EXPECT_EQ(rig.estimator.take_untrusted(rig.tracking, rig.now.mono, rig.now), Verdict::nonsense);
     EXPECT_EQ(rig.state().bound, 60us + growth(1s, kAgeing)) << "the last reading still counts";
     rig.pass(3s);
-    expect_void(rig.state(), ClockTrouble::silent);
+    expect_void(rig.state(), ClockReason::silent);
   };
   refused([](Tracking& t) { t.root.dispersion = -1ns; });
   refused([](Tracking& t) { t.root.delay = -1ns; });

@@ -121,7 +121,7 @@ TEST(SimulatedClock, HasNoBoundFromTheStepOn) {
     ASSERT_NE(pc.state().bound, kUnknownClockError);
     pc.step(by);
     EXPECT_EQ(pc.state().bound, kUnknownClockError);
-    EXPECT_EQ(pc.state().trouble, ClockTrouble::stepped);
+    EXPECT_EQ(pc.state().trouble, ClockReason::stepped);
     pc.run(10s);
     EXPECT_NE(pc.state().bound, kUnknownClockError);
     EXPECT_EQ(pc.tally().not_covered, 0);

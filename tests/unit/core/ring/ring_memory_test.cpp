@@ -38,11 +38,11 @@ TEST(Layout, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(RingHeader, clock), 576u);
   EXPECT_EQ(offsetof(RingHeader, publishers), 640u);
   EXPECT_EQ(sizeof(RingHeader::publishers), 64u * 40);
-  EXPECT_EQ(offsetof(PublisherNote, publisher), 0u);
-  EXPECT_EQ(offsetof(PublisherNote, tid_end), 8u);
-  EXPECT_EQ(offsetof(PublisherNote, number_end), 16u);
-  EXPECT_EQ(offsetof(PublisherNote, earlier_tid_end), 24u);
-  EXPECT_EQ(offsetof(PublisherNote, earlier_number_end), 32u);
+  EXPECT_EQ(offsetof(PublisherCursor, publisher), 0u);
+  EXPECT_EQ(offsetof(PublisherCursor, tid_end), 8u);
+  EXPECT_EQ(offsetof(PublisherCursor, number_end), 16u);
+  EXPECT_EQ(offsetof(PublisherCursor, earlier_tid_end), 24u);
+  EXPECT_EQ(offsetof(PublisherCursor, earlier_number_end), 32u);
   EXPECT_EQ(sizeof(SlotHeader), 64u);
   EXPECT_EQ(offsetof(SlotHeader, sequence), 0u);
   EXPECT_EQ(offsetof(SlotHeader, tid), 8u);

@@ -85,7 +85,7 @@ const std::map<std::string, Fill>& messages() {
          to_message(Error{Errc::not_found, "no stream 'lidar:0' on host 'pc2'"},
                     *frame.mutable_failure());
        }},
-      {"last_words",
+      {"final_failure",
        [](net::Frame& frame) {
          to_message(Error{Errc::limit_exceeded, "too many connections"}, *frame.mutable_failure());
        }},

@@ -16,7 +16,7 @@
 
 namespace dssm::wire {
 
-class Recorder : public FrameSink {
+class Recorder : public FrameDelegate {
  public:
   virtual ~Recorder() = default;
 

@@ -15,7 +15,7 @@ using namespace std::chrono_literals;
 
 constexpr Duration kPeriod = 200ms;
 
-class ChronydClientTest : public testing::Test, protected ChronydClient::User {
+class ChronydClientTest : public testing::Test, protected ChronydClient::Observer {
  protected:
   using Question = FakeChronyd::Question;
   struct Answer {
@@ -46,8 +46,8 @@ class ChronydClientTest : public testing::Test, protected ChronydClient::User {
 
   void start() { start(chronyd.address()); }
   void start(const wire::SocketAddress& address) {
-    ChronydClient::User& user = *this;
-    client = std::make_unique<ChronydClient>(loop, address, user, clock::Instant::now, kPeriod);
+    ChronydClient::Observer& observer = *this;
+    client = std::make_unique<ChronydClient>(loop, address, observer, clock::Instant::now, kPeriod);
   }
   void reply(const Question& question) { chronyd.answer(question, real_reply()); }
   void until(const std::function<bool()>& done) { run_until(loop, done); }
@@ -86,7 +86,7 @@ TEST_F(ChronydClientTest, AsksWhenTheProcessIsAwakeAnyway) {
   std::vector<Occasion> occasions;
   EventSource heartbeat = EventSource::timer(loop, [&] {
     const MonoTime begin = MonoClock::now();
-    for (int i = 0; i < 10; ++i) client->take_occasion();
+    for (int i = 0; i < 10; ++i) client->poll_if_due();
     occasions.push_back({begin, MonoClock::now()});
     heartbeat.enable_in(kPeriod);
   });
@@ -107,7 +107,7 @@ TEST_F(ChronydClientTest, FallsInWithHeartbeats) {
   MonoTime begin, end;  // of the last heartbeat
   EventSource heartbeat = EventSource::timer(loop, [&] {
     begin = MonoClock::now();
-    client->take_occasion();
+    client->poll_if_due();
     end = MonoClock::now();
     heartbeat.enable_in(kPeriod);
   });

@@ -113,7 +113,7 @@ TEST_F(ClockWatchTest, TellsThatChronydIsNotThereGoesAndComesBack) {
   until_looks(1);
   EXPECT_EQ(told("there is no chronyd"), 2);
   EXPECT_EQ(watch->state().status, ClockStatus::out_of_bounds);
-  EXPECT_EQ(watch->state().trouble, ClockTrouble::no_chronyd);
+  EXPECT_EQ(watch->state().trouble, ClockReason::no_chronyd);
   EXPECT_EQ(watch->source(), std::nullopt);
   chronyd.start();
   until_status(ClockStatus::synchronized);
@@ -125,7 +125,7 @@ TEST_F(ClockWatchTest, TellsThatChronydIsSilent) {
   until_looks(1);
   mute = true;
   pass(4s);
-  EXPECT_EQ(watch->state().trouble, ClockTrouble::silent) << "nobody waits for a callback";
+  EXPECT_EQ(watch->state().trouble, ClockReason::silent) << "nobody waits for a callback";
   until_told("warning: chronyd at");
   EXPECT_EQ(
       told("does not tell how this PC's clock is; the clock has no bound: it does not answer"), 1);
@@ -167,7 +167,7 @@ TEST_F(ClockWatchTest, TakesNonsenseForNoAnswer) {
 TEST_F(ClockWatchTest, TellsThatChronydDoesNotKnowTheTime) {
   tracking.leap = clock::Tracking::kUnsynchronized;
   until_told("warning: chronyd does not know the time, so");
-  EXPECT_EQ(watch->state().trouble, ClockTrouble::unsynchronized);
+  EXPECT_EQ(watch->state().trouble, ClockReason::unsynchronized);
   tracking.leap = 0;
   until_told("this PC's clock is within");
 }
@@ -175,7 +175,7 @@ TEST_F(ClockWatchTest, TellsThatChronydDoesNotKnowTheTime) {
 TEST_F(ClockWatchTest, TellsWhyTheClockIsTooFarAway) {
   tracking.offset = -2ms;
   until_told("more than its limit of 1.500 ms: it is off by 2.000 ms");
-  EXPECT_EQ(watch->state().trouble, ClockTrouble::too_far);
+  EXPECT_EQ(watch->state().trouble, ClockReason::too_far);
   tracking.offset = 1us;
   until_told("is within");
   tracking.root.delay = 4ms;
@@ -199,13 +199,13 @@ TEST_F(ClockWatchTest, VoidsTheBoundOfAClockThatWasSet) {
   for (const Duration step : {Duration(1h), Duration(-200ms)}) {
     until_status(ClockStatus::synchronized);
     now.wall += step;
-    EXPECT_EQ(watch->state().trouble, ClockTrouble::stepped);
+    EXPECT_EQ(watch->state().trouble, ClockReason::stepped);
     EXPECT_EQ(watch->state().bound, kUnknownClockError);
     // chronyd measures once for each question.
     for (int i = 1; i < clock::ClockEstimator::kUpdatesAfterStep; ++i) {
       pass(1s);
       until_looks(1);
-      EXPECT_EQ(watch->state().trouble, ClockTrouble::stepped) << i;
+      EXPECT_EQ(watch->state().trouble, ClockReason::stepped) << i;
     }
     pass(1s);
     until_looks(1);
@@ -266,7 +266,7 @@ TEST_F(ClockWatchTest, SeesWhatHappenedWhileNoDssmdRan) {
   restart();
   watch->resume(base);
   until_looks(1);
-  EXPECT_EQ(watch->state().trouble, ClockTrouble::stepped);
+  EXPECT_EQ(watch->state().trouble, ClockReason::stepped);
   EXPECT_EQ(told("was set back by 5.000 ms"), 1);
 }
 
@@ -289,7 +289,7 @@ TEST_F(ClockWatchTest, MeasuresAgainstTheReferencePc) {
 TEST_F(ClockWatchTest, TakesOtherLimits) {
   until_looks(1);
   watch->set({.limit = 50us});
-  EXPECT_EQ(watch->state().trouble, ClockTrouble::too_far);
+  EXPECT_EQ(watch->state().trouble, ClockReason::too_far);
   until_told("more than its limit of 0.050 ms");
 }
 

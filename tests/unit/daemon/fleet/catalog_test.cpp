@@ -62,8 +62,8 @@ TEST(Catalog, TellsWhatComesAndGoesInOrder) {
   catalog.stream_removed(id_of(2), {"imu", 0, "pc2"});
   catalog.stream_removed(id_of(2), {"imu", 0, "pc2"});
   EXPECT_EQ(recorder.take(), Told{"-imu:0@pc2"});
-  catalog.host_down(id_of(2), {Errc::daemon_away, "cut"});
-  catalog.host_down(id_of(2), {Errc::daemon_away, "cut"});
+  catalog.host_down(id_of(2), {Errc::unavailable, "cut"});
+  catalog.host_down(id_of(2), {Errc::unavailable, "cut"});
   EXPECT_EQ(recorder.take(), (Told{"-lidar:0@pc2", "down pc2: cut"}));
   EXPECT_TRUE(catalog.hosts().empty());
   catalog.remove_observer(recorder);
@@ -140,7 +140,7 @@ TEST(Catalog, NamesAllOwnersOfAStreamThatSeveralHave) {
             "several hosts have a stream 'lidar:0': host 'pc2' ('10.0.0.2:13776') and host 'pc3' "
             "('10.0.0.3:13776'); say which one: 'lidar:0@pc2'");
   EXPECT_EQ((*catalog.find_owner({"lidar", 0, "pc3"}))->greeting.host_id, id_of(2));
-  catalog.host_down(id_of(2), {Errc::daemon_away, "cut"});
+  catalog.host_down(id_of(2), {Errc::unavailable, "cut"});
   EXPECT_EQ((*catalog.find_owner({"lidar", 0, ""}))->greeting.host, "pc2");
 }
 

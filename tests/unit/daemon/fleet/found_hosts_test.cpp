@@ -167,7 +167,7 @@ TEST_F(FoundHostsTest, AreDialedAtOnceWhenTheyHaveNewAddresses) {
   EXPECT_TRUE(log.says("host 'pc2' (found by mDNS) is not there"));
   bool waited = false;  // for most of a pause
   EventSource timer = EventSource::timer(loop, [&] { waited = true; });
-  timer.enable_in(PeerLink::kFoundPause * 9 / 10);
+  timer.enable_in(PeerConnection::kFoundPause * 9 / 10);
   peers->on_host_found(host_at({at(*one)}));
   wait([&] { return waited || host().state() == "up"; });
   EXPECT_EQ(host().state(), "up");
@@ -311,7 +311,7 @@ TEST_F(FoundHostsTest, AreNeverThisVeryHost) {
   wait([&] { return one->owner.connections() == 1; });
   look_around();
   EXPECT_TRUE(peers->hosts().empty()) << "an echo of our own announcement";
-  EXPECT_EQ(peers->own_trouble(), "");
+  EXPECT_EQ(peers->own_warning(), "");
   EXPECT_EQ(peers->trouble(), "");
   EXPECT_TRUE(log.lines.empty());
 }
@@ -324,8 +324,8 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   start();
   // With the copy's address came one of our own.
   peers->on_host_found(host_at({at(*one), at(*two)}, "pc1"));
-  wait([&] { return !peers->own_trouble().empty(); });
-  const std::string warning = peers->own_trouble();
+  wait([&] { return !peers->own_warning().empty(); });
+  const std::string warning = peers->own_warning();
   for (const std::string& part : {at(*two).str(), hex_of(self.host_id),
                                   std::string("rm /etc/machine-id"), std::string("(key name)")}) {
     EXPECT_NE(warning.find(part), std::string::npos) << part << " is missing in " << warning;
@@ -337,8 +337,8 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   EXPECT_TRUE(catalog.hosts().empty());
   EXPECT_TRUE(two->owner.connected()) << "it is not asked again and again";
   two->owner.cut();
-  wait([&] { return peers->own_trouble().empty(); });
-  wait([&] { return !peers->own_trouble().empty(); });
+  wait([&] { return peers->own_warning().empty(); });
+  wait([&] { return !peers->own_warning().empty(); });
   EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
                           [](const std::string& line) {
                             return line.find("this host's name") != std::string::npos;
@@ -351,7 +351,7 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   peers->on_host_found(host_at({at(*two)}));
   wait_until_up();
   EXPECT_EQ(peers->hosts().size(), 1u);
-  EXPECT_EQ(peers->own_trouble(), "");
+  EXPECT_EQ(peers->own_warning(), "");
 }
 
 TEST_F(FoundHostsTest, AreAskedThoughThisHostIsAmongItsOwnPeers) {
@@ -362,7 +362,7 @@ TEST_F(FoundHostsTest, AreAskedThoughThisHostIsAmongItsOwnPeers) {
   start({at(*one)});
   wait([&] { return host().state() == "self"; });
   peers->on_host_found(host_at({at(*two)}, "pc1"));
-  wait([&] { return !peers->own_trouble().empty(); });
+  wait([&] { return !peers->own_warning().empty(); });
   ASSERT_EQ(peers->hosts().size(), 2u);
   EXPECT_EQ(host(0).state(), "self");
   EXPECT_EQ(found_by(0), std::vector<std::string>{"peer"});
@@ -492,9 +492,9 @@ TEST_F(FoundHostsTest, AreWarnedOfWhenTheyHaveOurName) {
   found.id = namesake.host_id;
   start();
   peers->on_host_found(found);
-  wait([&] { return !peers->own_trouble().empty(); });
+  wait([&] { return !peers->own_warning().empty(); });
   EXPECT_EQ(host().state(), "refused");
-  EXPECT_EQ(host().error(), peers->own_trouble());
+  EXPECT_EQ(host().error(), peers->own_warning());
   EXPECT_TRUE(catalog.hosts().empty());
   look_around();
   EXPECT_EQ(one->owner.connections(), 1);

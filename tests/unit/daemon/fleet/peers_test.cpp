@@ -101,7 +101,7 @@ TEST_F(PeersTest, TakeAHostOutWhenItFallsSilent) {
   one.silent = true;
   const MonoTime begin = MonoClock::now();
   wait([&] { return catalog.hosts().empty(); });
-  EXPECT_GE(MonoClock::now() - begin, wire::kSilenceIsDeath - wire::kHeartbeat);
+  EXPECT_GE(MonoClock::now() - begin, wire::kPeerTimeout - wire::kHeartbeat);
   EXPECT_EQ(host(0).state(), "down");
   EXPECT_NE(host(0).error().find("no sign of life from host 'pc2'"), std::string::npos)
       << host(0).error();
@@ -211,7 +211,7 @@ TEST_F(PeersTest, KnowThemselves) {
   EXPECT_EQ(host(0).error(), "");
   EXPECT_TRUE(catalog.hosts().empty());
   EXPECT_EQ(one.owner.connections(), 1) << "left standing, not dialed again and again";
-  EXPECT_EQ(peers->own_trouble(), "");
+  EXPECT_EQ(peers->own_warning(), "");
 }
 
 TEST_F(PeersTest, RefuseAnotherPcWithTheirOwnId) {
@@ -222,7 +222,7 @@ TEST_F(PeersTest, RefuseAnotherPcWithTheirOwnId) {
   wait_until_settled();
   EXPECT_EQ(host(0).state(), "refused");
   EXPECT_NE(host(0).error().find("machine id"), std::string::npos) << host(0).error();
-  EXPECT_EQ(peers->own_trouble(), host(0).error());
+  EXPECT_EQ(peers->own_warning(), host(0).error());
   EXPECT_TRUE(catalog.hosts().empty());
 }
 
@@ -235,7 +235,7 @@ TEST_F(PeersTest, DoNotShowTheStreamsOfAHostWithTheirOwnName) {
   EXPECT_TRUE(catalog.hosts().empty());
   EXPECT_EQ(one.watches, 0);
   EXPECT_NE(host(0).error().find("as this one is"), std::string::npos) << host(0).error();
-  EXPECT_EQ(peers->own_trouble(), host(0).error());
+  EXPECT_EQ(peers->own_warning(), host(0).error());
 }
 
 // --- configured peers change
@@ -294,7 +294,7 @@ TEST_F(PeersTest, DialAgainWhoComesBackIntoTheConfiguration) {
 TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {
   start({&one});
   wait_until_settled();
-  PeerLink* link = peers->link_to(one.owner.host().greeting.host_id);
+  PeerConnection* link = peers->link_to(one.owner.host().greeting.host_id);
   ASSERT_TRUE(link);
   std::vector<std::string> got;
   const auto ask = [&](const std::string& name) {
@@ -325,9 +325,9 @@ TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {
 TEST_F(PeersTest, BoundTheRequestsThatWait) {
   start({&one});
   wait_until_settled();
-  PeerLink& link = *peers->link_to(one.owner.host().greeting.host_id);
+  PeerConnection& link = *peers->link_to(one.owner.host().greeting.host_id);
   std::size_t refused = 0;
-  for (std::size_t i = 0; i < PeerLink::kMaxWaiting + 10; ++i) {
+  for (std::size_t i = 0; i < PeerConnection::kMaxWaiting + 10; ++i) {
     net::Frame request;
     request.mutable_list();
     link.ask(request, [&](const Result<net::Frame>& answer) {
@@ -336,7 +336,8 @@ TEST_F(PeersTest, BoundTheRequestsThatWait) {
   }
   EXPECT_GE(refused, 10u);
   net::Frame large;
-  large.mutable_set_property()->set_property(std::string(PeerLink::kMaxWaitingBytes + 1, 'x'));
+  large.mutable_set_property()->set_property(
+      std::string(PeerConnection::kMaxWaitingBytes + 1, 'x'));
   bool too_large = false;
   link.ask(large, [&](const Result<net::Frame>& answer) { too_large = !answer; });
   EXPECT_TRUE(too_large);
@@ -346,10 +347,11 @@ TEST_F(PeersTest, BoundTheRequestsThatWait) {
 TEST_F(PeersTest, MakeRoomForRequestsWithEachAnswer) {
   start({&one});
   wait_until_settled();
-  PeerLink& link = *peers->link_to(one.owner.host().greeting.host_id);
+  PeerConnection& link = *peers->link_to(one.owner.host().greeting.host_id);
   for (std::size_t i = 0; i < 4; ++i) {
     net::Frame large;
-    large.mutable_set_property()->set_property(std::string(PeerLink::kMaxWaitingBytes / 3, 'x'));
+    large.mutable_set_property()->set_property(
+        std::string(PeerConnection::kMaxWaitingBytes / 3, 'x'));
     std::optional<bool> done;
     link.ask(large, [&](const Result<net::Frame>& answer) { done = answer.has_value(); });
     wait([&] { return one.asked.size() > i || done; });

@@ -67,7 +67,7 @@ wire::SocketAddress closed_port(const EventLoop& loop) {
   return RawServer(loop, "", false).address();
 }
 
-class DialerTest : public testing::Test, protected Dialer::User {
+class DialerTest : public testing::Test, protected Dialer::Observer {
  protected:
   EventLoop loop = EventLoop::open().value();
   std::vector<wire::SocketAddress> answers;  // of the resolver, for names
@@ -83,7 +83,7 @@ class DialerTest : public testing::Test, protected Dialer::User {
   void dial(const wire::Address& address) {
     dialer =
         std::make_unique<Dialer>(loop, resolver, Dialer::Options{{address}, greeting_of("pc1")},
-                                 static_cast<Dialer::User&>(*this));
+                                 static_cast<Dialer::Observer&>(*this));
   }
   void dial_in_turn(const std::vector<wire::SocketAddress>& at, Dialer::Options options = {}) {
     for (const wire::SocketAddress& address : at) {
@@ -91,7 +91,7 @@ class DialerTest : public testing::Test, protected Dialer::User {
     }
     options.self = greeting_of("pc1");
     dialer = std::make_unique<Dialer>(loop, resolver, std::move(options),
-                                      static_cast<Dialer::User&>(*this));
+                                      static_cast<Dialer::Observer&>(*this));
   }
   void dial(const wire::SocketAddress& address) {
     dial(wire::Address::parse(address.str()).value());
@@ -102,7 +102,7 @@ class DialerTest : public testing::Test, protected Dialer::User {
     return downs.front();
   }
 
-  void on_up(FrameLink& link, const wire::Greeting& greeting) override {
+  void on_up(FrameConnection& link, const wire::Greeting& greeting) override {
     EXPECT_EQ(&link, dialer->link());
     EXPECT_FALSE(up);
     up = true;
@@ -169,7 +169,7 @@ TEST_F(DialerTest, BeginsBehindAnAddressThatIsOfNoUse) {
   wait([this] { return up; });
   EXPECT_EQ(downs.size(), 1u);
   EXPECT_EQ(talker.connections(), 1);
-  dialer->restart({Errc::daemon_away, "silent"});
+  dialer->restart({Errc::unavailable, "silent"});
   wait([&] { return talker.connections() == 2; });  // the one behind the last one
   wait([&] { return up && downs.size() >= 3; });
 }
@@ -242,7 +242,7 @@ TEST_F(DialerTest, FindsAServerThatStartsLater) {
   wait([this] { return downs.size() >= 2; });
   FakeOwner owner(loop);
   dialer->set_addresses({owner.host().address});
-  dialer->hurry();
+  dialer->retry_now();
   wait([this] { return up; });
 }
 
@@ -307,7 +307,7 @@ TEST_F(DialerTest, GivesUpWhoDoesNotGreetInTime) {
   RawServer server(loop, "", false);
   dial(server.address());
   const Error& why = wait_for_down();
-  EXPECT_EQ(why.code, Errc::daemon_away);
+  EXPECT_EQ(why.code, Errc::unavailable);
   EXPECT_NE(why.message.find("does not greet"), std::string::npos) << why.message;
 }
 
@@ -325,7 +325,7 @@ TEST_F(DialerTest, RestartsWhatIsUpForTheReasonThatIsGiven) {
   FakeOwner owner(loop);
   dial(owner.host().address);
   wait([this] { return up; });
-  dialer->restart({Errc::daemon_away, "silent"});
+  dialer->restart({Errc::unavailable, "silent"});
   EXPECT_TRUE(downs.empty()) << "from the loop";
   EXPECT_EQ(wait_for_down().message, "silent");
   wait([this] { return up; });
@@ -337,9 +337,9 @@ TEST_F(DialerTest, RestartsAnAttemptThatIsUnderWay) {
   dial({"pc2", 1});
   answers = {wire::resolve_number(owner.host().address).at(0)};
   event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);  // it looks the name up
-  dialer->restart({Errc::daemon_away, "moved"});
+  dialer->restart({Errc::unavailable, "moved"});
   EXPECT_EQ(wait_for_down().message, "moved");
-  dialer->restart({Errc::daemon_away, "not told: it pauses"});
+  dialer->restart({Errc::unavailable, "not told: it pauses"});
   wait([this] { return up; });
   EXPECT_EQ(downs.size(), 1u);
 }
@@ -357,7 +357,7 @@ TEST_F(DialerTest, PausesLongerAfterEachFailureAndNotWhenHurried) {
   };
   look_around();
   EXPECT_EQ(server.connections(), before) << "it pauses";
-  dialer->hurry();
+  dialer->retry_now();
   look_around();
   EXPECT_EQ(server.connections(), before + 1);
 }

@@ -134,7 +134,7 @@ struct SentItem {
 // Cuts what was sent into frames; a rest that is no whole frame is a failure of the test.
 inline std::vector<SentItem> decode(const std::vector<std::byte>& bytes,
                                     std::size_t payload_bytes = 0) {
-  struct Sink final : wire::FrameSink {
+  struct Sink final : wire::FrameDelegate {
     Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override {
       SentItem item;
       item.frame.set_serial(sample.serial);

@@ -21,7 +21,7 @@ constexpr MonoTime kStart{std::chrono::seconds(1000)};
 Time time_of(Tid tid) { return time_from_ns(1'000'000 + tid * 1000); }
 
 // A ring, a link, and what goes from one to the other.
-class PumpRig final : private FrameLink::User, private SamplePump::Events {
+class PumpRig final : private FrameConnection::Observer, private SamplePump::Observer {
  public:
   PumpRig(std::size_t payload_bytes, std::uint64_t depth, bool may_tear = true,
           std::uint64_t budget_bytes = 1U << 30)
@@ -32,7 +32,7 @@ class PumpRig final : private FrameLink::User, private SamplePump::Events {
         sender(*ring.mapping, link, {may_tear, &budget}) {}
 
   void start(const SamplePump::Plan& plan) {
-    pump.emplace(*ring.mapping, link, sender, static_cast<SamplePump::Events&>(*this), plan);
+    pump.emplace(*ring.mapping, link, sender, static_cast<SamplePump::Observer&>(*this), plan);
   }
 
   Tid write() {
@@ -94,7 +94,7 @@ class PumpRig final : private FrameLink::User, private SamplePump::Events {
   ring::TestRing ring;
   std::size_t payload_bytes_;
   MemoryBudget budget;
-  FrameLink link;
+  FrameConnection link;
   SampleSender sender;
   std::optional<SamplePump> pump;
   std::map<Tid, Tid> gaps;

@@ -15,7 +15,7 @@
 namespace dssm::daemon {
 namespace {
 
-class StreamFeedTest : public testing::Test, protected StreamFeed::Listener {
+class StreamFeedTest : public testing::Test, protected StreamFeed::Observer {
  protected:
   // A program that writes.
   struct Program {
@@ -43,7 +43,7 @@ class StreamFeedTest : public testing::Test, protected StreamFeed::Listener {
 
   void on_news() override {
     ++news;
-    if (on_told) on_told();
+    if (on_notified) on_notified();
   }
 
   EventLoop loop = *EventLoop::open();
@@ -52,7 +52,7 @@ class StreamFeedTest : public testing::Test, protected StreamFeed::Listener {
       registry.create({"odometry", 0, ""}, odometry_type(), kHistory, 1)->stream;
   std::shared_ptr<StreamFeed> feed = StreamFeed::open(loop, stream).value();
   int news = 0;
-  std::function<void()> on_told;
+  std::function<void()> on_notified;
 };
 
 TEST_F(StreamFeedTest, TellsOnceOfASampleThatIsNewer) {
@@ -106,7 +106,7 @@ TEST_F(StreamFeedTest, ArmsAgainForOneWhoWaitsForALaterSample) {
 TEST_F(StreamFeedTest, MissesNoSampleThatIsWrittenWhileItTells) {
   Program program = writer();
   Tid known = kNoTid;
-  on_told = [&] {
+  on_notified = [&] {
     program.write();  // after the bell was looked at
     known = ring::RingReader(stream->mapping()).newest();
     EXPECT_TRUE(feed->wait(*this, known));
@@ -138,14 +138,14 @@ TEST_F(StreamFeedTest, HearsEveryDoorbellOfItsStream) {
 }
 
 TEST_F(StreamFeedTest, ForgetsWhoAsksForItAlsoWhileItTells) {
-  struct Other final : StreamFeed::Listener {
+  struct Other final : StreamFeed::Observer {
     void on_news() override { ++told; }
     int told = 0;
   } other;
   Program program = writer();
   ASSERT_TRUE(feed->wait(*this, kNoTid));
   ASSERT_TRUE(feed->wait(other, kNoTid));
-  on_told = [&] { feed->forget(other); };
+  on_notified = [&] { feed->forget(other); };
   program.write();
   run_turns(loop, 3);
   EXPECT_EQ(news, 1);

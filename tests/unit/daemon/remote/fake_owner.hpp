@@ -22,7 +22,7 @@
 #include "core/wire/tcp.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/fleet/catalog.hpp"
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 #include "daemon/link/raw_bytes.hpp"
 
 namespace dssm::daemon {
@@ -43,7 +43,7 @@ inline wire::Greeting greeting_of(const std::string& host) {
   return greeting;
 }
 
-class FakeOwner final : private FrameLink::User, private FrameLink::SampleSink {
+class FakeOwner final : private FrameConnection::Observer, private FrameConnection::SampleDelegate {
  public:
   explicit FakeOwner(const EventLoop& loop, const std::string& host = "pc2")
       : loop_(loop), greeting_(greeting_of(host)) {
@@ -136,7 +136,8 @@ class FakeOwner final : private FrameLink::User, private FrameLink::SampleSink {
     got_.clear();
     ended_ = false;
     greeted_ = false;
-    link_.reset(new FrameLink(loop_, wire::make_tcp_transport(std::move(socket)), *this, 1U << 20));
+    link_.reset(
+        new FrameConnection(loop_, wire::make_tcp_transport(std::move(socket)), *this, 1U << 20));
     ++connections_;
   }
   Result<void> on_frame(net::Frame& frame) override {
@@ -167,7 +168,7 @@ class FakeOwner final : private FrameLink::User, private FrameLink::SampleSink {
   KnownHost host_;
   UniqueFd listening_;
   EventSource accepting_;
-  std::unique_ptr<FrameLink> link_;
+  std::unique_ptr<FrameConnection> link_;
   bool greeted_ = false, ended_ = false;
   int connections_ = 0;
   std::deque<net::Frame> got_;

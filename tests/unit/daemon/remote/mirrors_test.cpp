@@ -148,7 +148,7 @@ TEST_F(MirrorsTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
   std::optional<Error> error;
   mirrors->open(host, kId, [&](Result<std::shared_ptr<Stream>> result) { error = result.error(); });
   run_until(loop, [&] { return error.has_value(); });
-  EXPECT_EQ(error->code, Errc::daemon_away);
+  EXPECT_EQ(error->code, Errc::unavailable);
   EXPECT_NE(error->message.find("odometry:0@pc2"), std::string::npos) << error->message;
   EXPECT_NE(error->message.find(nobody.str()), std::string::npos) << error->message;
   EXPECT_NE(error->message.find("refused"), std::string::npos) << error->message;
@@ -251,7 +251,7 @@ TEST_F(MirrorsTest, CountsWhatTheOwnerNoLongerHas) {
 
 TEST_F(MirrorsTest, KeepsTheRingWhileTheOwnerIsAway) {
   const std::shared_ptr<Stream> stream = opened(5);
-  catalog.host_down(owner->host().greeting.host_id, {Errc::daemon_away, "no sign of life"});
+  catalog.host_down(owner->host().greeting.host_id, {Errc::unavailable, "no sign of life"});
   until_state("owner away");
   EXPECT_NE(state().error().find("no sign of life"), std::string::npos) << state().error();
   const auto answer = open();
@@ -262,7 +262,7 @@ TEST_F(MirrorsTest, KeepsTheRingWhileTheOwnerIsAway) {
 TEST_F(MirrorsTest, FollowsTheOwnerToANewAddress) {
   const std::shared_ptr<Stream> stream = opened(5);
   const wire::Greeting greeting = owner->host().greeting;
-  catalog.host_down(greeting.host_id, {Errc::daemon_away, "gone"});
+  catalog.host_down(greeting.host_id, {Errc::unavailable, "gone"});
   owner = std::make_unique<FakeOwner>(loop);  // another port
   catalog.host_up(owner->host().greeting, owner->host().address);
   serve(6);
@@ -277,7 +277,7 @@ TEST_F(MirrorsTest, LosesNothingWhenTheSameOwnerIsReachedAtAnotherAddress) {
   const std::unique_ptr<FakeOwner> before = std::move(owner);
   owner = std::make_unique<FakeOwner>(loop);
   owner->greet_as(greeting);
-  catalog.host_down(greeting.host_id, {Errc::daemon_away, "no sign of life"});
+  catalog.host_down(greeting.host_id, {Errc::unavailable, "no sign of life"});
   catalog.host_up(greeting, owner->host().address);
   const net::Frame subscribe = serve(6);
   EXPECT_EQ(subscribe.subscribe().from_tid(), 6);
@@ -359,7 +359,7 @@ TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
   const std::shared_ptr<Stream> stream = opened(5);
   const KnownHost host = owner->host();
   catalog.stream_added(host.greeting.host_id, theirs).value();
-  catalog.host_down(host.greeting.host_id, {Errc::daemon_away, "it is silent"});
+  catalog.host_down(host.greeting.host_id, {Errc::unavailable, "it is silent"});
   catalog.host_up(host.greeting, host.address);
   const auto answer = open();
   ASSERT_TRUE(answer->has_value());
@@ -391,7 +391,7 @@ TEST_F(MirrorsTest, GoesOnWithARingThatAProgramKept) {
     kept = stream->descriptors_for(Role::reader).value();
   }
   mirrors = std::make_unique<Mirrors>(parts, catalog, 0ms);
-  catalog.host_down(owner->host().greeting.host_id, {Errc::daemon_away, "not known yet"});
+  catalog.host_down(owner->host().greeting.host_id, {Errc::unavailable, "not known yet"});
   std::vector<UniqueFd> again;
   for (const UniqueFd& fd : kept) again.push_back(copy_of(fd));
   auto stream = mirrors->adopt_untrusted(kId, as_offer(std::move(again)));
@@ -447,7 +447,7 @@ TEST_F(MirrorsTest, DoesNotReadFromAnotherPcAtTheOwnersAddress) {
   owner->call_itself("pc3");
   const auto answer = open();
   run_until(loop, [&] { return answer->has_value(); });
-  EXPECT_EQ((*answer)->error().code, Errc::daemon_away);
+  EXPECT_EQ((*answer)->error().code, Errc::unavailable);
   EXPECT_NE((*answer)->error().message.find("pc3"), std::string::npos)
       << (*answer)->error().message;
   EXPECT_FALSE(owner->asked() && owner->take().has_open());

@@ -222,7 +222,7 @@ TEST_F(RemoteWritersTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
   writers->open(host, kOdometry, &plan,
                 [&](Result<OpenedRemoteWriter> result) { error = result.error(); });
   run_until(loop, [&] { return error.has_value(); });
-  EXPECT_EQ(error->code, Errc::daemon_away);
+  EXPECT_EQ(error->code, Errc::unavailable);
   EXPECT_NE(error->message.find("odometry:0@pc2"), std::string::npos) << error->message;
   run_until(loop, [&] { return writers->size() == 0; });
 }
@@ -378,7 +378,7 @@ TEST_F(RemoteWritersTest, GoesOnWithARingThatAProgramKept) {
     writers.reset();  // dies
   }
   program->write(3);
-  catalog.host_down(owner->host().greeting.host_id, {Errc::daemon_away, "not known yet"});
+  catalog.host_down(owner->host().greeting.host_id, {Errc::unavailable, "not known yet"});
   writers = std::make_unique<RemoteWriters>(parts, catalog);
   const auto stream = writers->adopt_untrusted(kOdometry, program->offer());
   ASSERT_TRUE(stream) << stream.error().message;

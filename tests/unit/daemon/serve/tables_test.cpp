@@ -3,23 +3,23 @@
 // What dssmd remembers about peers: what they take, and how much it logs about them.
 #include <gtest/gtest.h>
 
-#include "daemon/base/calm_logger.hpp"
+#include "daemon/base/rate_limited_logger.hpp"
 #include "tests/unit/daemon/serve/server_rig.hpp"
 
 namespace dssm::daemon {
 namespace {
 
-TEST(CalmLogger, PassesSoManyLinesOnAndCountsTheOthers) {
+TEST(RateLimitedLogger, PassesSoManyLinesOnAndCountsTheOthers) {
   RecordingLogger to;
   MonoTime now{std::chrono::seconds(100)};
-  CalmLogger logger(to, [&] { return now; });
-  for (int i = 0; i < 2 * CalmLogger::kLinesPerPeriod; ++i) logger.warning("again");
-  EXPECT_EQ(to.warnings.size(), static_cast<std::size_t>(CalmLogger::kLinesPerPeriod));
+  RateLimitedLogger logger(to, [&] { return now; });
+  for (int i = 0; i < 2 * RateLimitedLogger::kLinesPerPeriod; ++i) logger.warning("again");
+  EXPECT_EQ(to.warnings.size(), static_cast<std::size_t>(RateLimitedLogger::kLinesPerPeriod));
   logger.info("of another level");
   EXPECT_TRUE(to.has("of another level"));
-  now += CalmLogger::kPeriod;
+  now += RateLimitedLogger::kPeriod;
   logger.warning("later");
-  EXPECT_EQ(to.warnings.back(), "later (" + std::to_string(CalmLogger::kLinesPerPeriod) +
+  EXPECT_EQ(to.warnings.back(), "later (" + std::to_string(RateLimitedLogger::kLinesPerPeriod) +
                                     " lines about other hosts before this one were left out)");
   logger.warning("and on");
   EXPECT_EQ(to.warnings.back(), "and on");

@@ -56,11 +56,12 @@ TEST_F(OpenTableTest, NamesTheLimitThatIsReached) {
   const auto a = stream("a");
   table_.add({client(1), a, Role::reader, 0});
   table_.add({client(1), a, Role::reader, 0});
-  EXPECT_NE(table_.check_room(*client(1)).error().message.find("max_opens_per_client = 2"),
+  EXPECT_NE(table_.check_quota(*client(1)).error().message.find("max_opens_per_client = 2"),
             std::string::npos);
-  EXPECT_TRUE(table_.check_room(*client(2)));
+  EXPECT_TRUE(table_.check_quota(*client(2)));
   table_.add({client(2), a, Role::reader, 0});
-  EXPECT_NE(table_.check_room(*client(2)).error().message.find("max_opens = 3"), std::string::npos);
+  EXPECT_NE(table_.check_quota(*client(2)).error().message.find("max_opens = 3"),
+            std::string::npos);
 }
 
 }  // namespace

@@ -14,13 +14,13 @@
 
 namespace dssm::daemon {
 
-class CalmLogger final : public Logger {
+class RateLimitedLogger final : public Logger {
  public:
   static constexpr int kLinesPerPeriod = 50;
   static constexpr Duration kPeriod = std::chrono::seconds(10);
 
   // to: outlives it. now: the clock; tests put their own in its place.
-  explicit CalmLogger(Logger& to, std::function<MonoTime()> now = MonoClock::now)
+  explicit RateLimitedLogger(Logger& to, std::function<MonoTime()> now = MonoClock::now)
       : to_(to), now_(std::move(now)) {}
 
   void write(LogLevel level, std::string_view text, const LogFields& fields) noexcept override;

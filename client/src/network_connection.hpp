@@ -14,7 +14,7 @@
 #include <string>
 #include <vector>
 
-#include "client/src/vigil.hpp"
+#include "client/src/spin_budget.hpp"
 #include "core/base/unique_fd.hpp"
 #include "core/wire/address.hpp"
 #include "core/wire/frame_decoder.hpp"
@@ -24,13 +24,13 @@
 namespace dssm::detail {
 
 // A resource with one owner; one thread.
-class NetworkLink final : private wire::FrameSink {
+class NetworkConnection final : private wire::FrameDelegate {
  public:
   // What arrives after the greeting goes to `user`, from within receive() and resume(). A dssmd
   // that is very busy may greet late: it is given `patience`, kHelloTimeout at least.
-  NetworkLink(wire::FrameSink& user, std::string program, Duration patience);
-  NetworkLink(const NetworkLink&) = delete;
-  NetworkLink& operator=(const NetworkLink&) = delete;
+  NetworkConnection(wire::FrameDelegate& user, std::string program, Duration patience);
+  NetworkConnection(const NetworkConnection&) = delete;
+  NetworkConnection& operator=(const NetworkConnection&) = delete;
 
   // Begins to connect to one of `addresses` (at least one), tried in turn. Takes an open link down
   // first.
@@ -63,7 +63,7 @@ class NetworkLink final : private wire::FrameSink {
   // The same, waiting as Transport::receive_waiting() does.
   //   returns  besides: interrupted
   Result<wire::IoStatus> receive_waiting();
-  // The same, after staying awake for a moment where that pays (vigil.hpp). A signal within that
+  // The same, after staying awake for a moment where that pays (spin_budget.hpp). A signal within that
   // moment does not interrupt.
   Result<wire::IoStatus> receive_watching();
   // Goes on with what was received, after the user held a sample back.
@@ -101,7 +101,7 @@ class NetworkLink final : private wire::FrameSink {
   Error down(Error why);
   Error lost() const;
 
-  wire::FrameSink& user_;
+  wire::FrameDelegate& user_;
   const std::string program_;
   const Duration patience_;
   const std::uint64_t life_;
@@ -115,7 +115,7 @@ class NetworkLink final : private wire::FrameSink {
   std::unique_ptr<wire::Transport> transport_;
   std::unique_ptr<wire::FrameDecoder> decoder_;
   wire::DecoderCounters earlier_;
-  Vigil vigil_;
+  SpinBudget spin_budget_;
   std::string queued_;
   std::size_t queued_from_ = 0;
   wire::Greeting them_;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 
 #include <algorithm>
 #include <array>
@@ -29,35 +29,35 @@ std::size_t total(std::span<const iovec> parts) noexcept {
 
 }  // namespace
 
-FrameLink::FrameLink(const EventLoop& loop, std::unique_ptr<wire::Transport> transport, User& user,
-                     std::size_t max_queued_bytes)
+FrameConnection::FrameConnection(const EventLoop& loop, std::unique_ptr<wire::Transport> transport,
+                                 Observer& observer, std::size_t max_queued_bytes)
     : transport_(std::move(transport)),
-      user_(user),
+      observer_(observer),
       max_queued_bytes_(max_queued_bytes),
       decoder_(*this, wire::kMaxNetworkFrameBytes),
       readable_(EventSource::readable(loop, transport_->fd(), [this] { on_readable(); })),
       writable_(EventSource::writable(loop, transport_->fd(), [this] { on_writable(); })),
       next_turn_(EventSource::timer(loop, [this] { go_on(); })),
-      ended_(EventSource::timer(loop, [this] { user_.on_closed(why_); })) {
+      ended_(EventSource::timer(loop, [this] { observer_.on_closed(why_); })) {
   readable_.enable();
 }
 
-FrameLink::~FrameLink() = default;
+FrameConnection::~FrameConnection() = default;
 
-std::span<const std::byte> FrameLink::Outgoing::unsent() const noexcept {
+std::span<const std::byte> FrameConnection::Outgoing::unsent() const noexcept {
   const auto* text = std::get_if<std::string>(&bytes);
   const auto all = text ? std::as_bytes(std::span(*text)) : std::get_if<RawBytes>(&bytes)->span();
   return all.subspan(sent);
 }
 
-void FrameLink::take_samples(std::size_t payload_bytes, SampleSink& sink) noexcept {
+void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& sink) noexcept {
   samples_ = &sink;
   decoder_.set_payload_bytes(payload_bytes);
 }
 
 // --- receiving
 
-[[gnu::hot]] void FrameLink::on_readable() {
+[[gnu::hot]] void FrameConnection::on_readable() {
   std::size_t received = 0;
   Error end;
   bool ended = false;
@@ -69,7 +69,7 @@ void FrameLink::take_samples(std::size_t payload_bytes, SampleSink& sink) noexce
     if (!got || got->status == wire::IoStatus::end) {
       ended = true;
       end = !got ? got.error()
-                 : Error{Errc::daemon_away, decoder_.at_frame_end()
+                 : Error{Errc::unavailable, decoder_.at_frame_end()
                                                 ? "the other side closed the connection"
                                                 : "the other side closed the connection in the "
                                                   "middle of a frame"};
@@ -85,14 +85,14 @@ void FrameLink::take_samples(std::size_t payload_bytes, SampleSink& sink) noexce
 }
 
 // Goes on with what was received before a pause.
-void FrameLink::go_on() {
+void FrameConnection::go_on() {
   if (closed_ || paused_ || !hand_out(0)) return;
   if (samples_) samples_->on_batch_end();
   if (!closed_ && !paused_) listen_again();
 }
 
 // False when the link closed over it.
-[[gnu::hot]] bool FrameLink::hand_out(std::size_t bytes) {
+[[gnu::hot]] bool FrameConnection::hand_out(std::size_t bytes) {
   held_ = false;
   handing_out_ = true;
   const Result<void> taken = decoder_.commit(bytes);
@@ -101,7 +101,7 @@ void FrameLink::go_on() {
   return !closed_ && charge_input();
 }
 
-[[gnu::hot]] bool FrameLink::charge_input() {
+[[gnu::hot]] bool FrameConnection::charge_input() {
   const std::size_t bytes = decoder_.collected_bytes();
   if (!budget_ || bytes == input_share_.bytes()) return true;
   input_share_ = {};
@@ -117,29 +117,30 @@ void FrameLink::go_on() {
   return false;
 }
 
-void FrameLink::listen_again() {
+void FrameConnection::listen_again() {
   if (held_) return next_turn_.enable_in(Duration::zero());
   readable_.enable();
 }
 
 // A handler may have closed the link: the decoder is stopped, too.
-[[gnu::hot]] Result<void> FrameLink::on_sample_begin(const wire::IncomingSample& sample,
-                                                     std::byte*& out) {
+[[gnu::hot]] Result<void> FrameConnection::on_sample_begin(const wire::IncomingSample& sample,
+                                                           std::byte*& out) {
   if (closed_) return closed_by_handler();
   return samples_->on_sample_begin(sample, out);
 }
 
-[[gnu::hot]] Result<void> FrameLink::on_sample_end(const wire::IncomingSample& sample, bool torn) {
+[[gnu::hot]] Result<void> FrameConnection::on_sample_end(const wire::IncomingSample& sample,
+                                                         bool torn) {
   if (closed_) return closed_by_handler();
   return samples_->on_sample_end(sample, torn);
 }
 
-Result<void> FrameLink::on_frame(net::Frame& frame) {
+Result<void> FrameConnection::on_frame(net::Frame& frame) {
   if (closed_) return closed_by_handler();
-  return user_.on_frame(frame);
+  return observer_.on_frame(frame);
 }
 
-void FrameLink::pause() {
+void FrameConnection::pause() {
   if (closed_ || paused_) return;
   paused_ = true;
   if (handing_out_) {
@@ -151,7 +152,7 @@ void FrameLink::pause() {
   if (output_lost_) close(why_);
 }
 
-void FrameLink::resume() {
+void FrameConnection::resume() {
   if (closed_ || !paused_) return;
   paused_ = false;
   listen_again();
@@ -159,7 +160,7 @@ void FrameLink::resume() {
 
 // --- sending
 
-void FrameLink::send(const net::Frame& frame) {
+void FrameConnection::send(const net::Frame& frame) {
   if (closed_ || output_lost_) return;
   Outgoing outgoing{wire::encode_frame(frame), 0, true, {}};
   const std::size_t bytes = outgoing.unsent().size();
@@ -194,12 +195,12 @@ void FrameLink::send(const net::Frame& frame) {
   enqueue(std::move(outgoing));
 }
 
-[[gnu::hot]] std::size_t FrameLink::send_now(std::span<const iovec> parts) {
+[[gnu::hot]] std::size_t FrameConnection::send_now(std::span<const iovec> parts) {
   if (closed_ || output_lost_ || (!output_.empty() && !mid_frame_)) return 0;
   return transmit(parts);
 }
 
-void FrameLink::queue_rest(RawBytes bytes, MemoryShare share) {
+void FrameConnection::queue_rest(RawBytes bytes, MemoryShare share) {
   if (closed_ || output_lost_) return;
   Outgoing outgoing{std::move(bytes), 0, false, std::move(share)};
   if (!mid_frame_) return enqueue(std::move(outgoing));
@@ -208,28 +209,28 @@ void FrameLink::queue_rest(RawBytes bytes, MemoryShare share) {
   writable_.enable();
 }
 
-void FrameLink::enqueue(Outgoing outgoing) {
+void FrameConnection::enqueue(Outgoing outgoing) {
   output_.push_back(std::move(outgoing));
   if (!mid_frame_) writable_.enable();
 }
 
-void FrameLink::set_mid_frame(bool mid_frame) {
+void FrameConnection::set_mid_frame(bool mid_frame) {
   mid_frame_ = mid_frame;
   if (!mid_frame && !output_.empty()) want_output();
 }
 
-void FrameLink::want_output() {
+void FrameConnection::want_output() {
   if (!closed_ && !output_lost_) writable_.enable();
 }
 
-void FrameLink::on_writable() {
+void FrameConnection::on_writable() {
   if (!mid_frame_ && !flush()) return;
   writable_.disable();
-  user_.on_output_empty();
+  observer_.on_output_empty();
 }
 
 // Sends what waits. True when nothing is left.
-bool FrameLink::flush() {
+bool FrameConnection::flush() {
   while (!output_.empty()) {
     std::array<iovec, kMaxParts> parts;
     std::size_t count = 0, bytes = 0;
@@ -255,17 +256,17 @@ bool FrameLink::flush() {
   return true;
 }
 
-[[gnu::hot]] std::size_t FrameLink::transmit(std::span<const iovec> parts) {
+[[gnu::hot]] std::size_t FrameConnection::transmit(std::span<const iovec> parts) {
   const Result<wire::IoResult> sent = transport_->send(parts);
   if (sent && sent->status != wire::IoStatus::end) return sent->bytes;
-  why_ = sent ? Error{Errc::daemon_away, "the other side closed the connection"} : sent.error();
+  why_ = sent ? Error{Errc::unavailable, "the other side closed the connection"} : sent.error();
   lose_output();
   return 0;
 }
 
 // The peer may have said why before it closed: that waits to be received, so receiving goes on and
 // will find the end by itself.
-void FrameLink::lose_output() {
+void FrameConnection::lose_output() {
   output_lost_ = true;
   output_.clear();
   queued_bytes_ = 0;
@@ -273,19 +274,19 @@ void FrameLink::lose_output() {
   if (paused_) close(why_);
 }
 
-void FrameLink::close_with(const Error& why) {
+void FrameConnection::close_with(const Error& why) {
   if (closed_) return;
   if (!output_lost_ && !mid_frame_ && flush()) {
-    net::Frame last_words;
-    wire::to_message(why, *last_words.mutable_failure());
-    const std::string encoded = wire::encode_frame(last_words);
+    net::Frame final_failure;
+    wire::to_message(why, *final_failure.mutable_failure());
+    const std::string encoded = wire::encode_frame(final_failure);
     const iovec part = part_of(std::as_bytes(std::span(encoded)));
     transmit({&part, 1});
   }
   close(why);
 }
 
-void FrameLink::close(const Error& why) {
+void FrameConnection::close(const Error& why) {
   if (closed_) return;
   closed_ = true;
   why_ = why;

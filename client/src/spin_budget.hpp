@@ -3,7 +3,7 @@
 // Lets a receiver that has taken all there was stay awake for what comes next, where that pays.
 //
 // To sleep costs the sender: it has to wake the receiver for each piece of a large sample, which
-// can take it longer than to send that piece. To stay awake costs this PC a processor. So a vigil
+// can take it longer than to send that piece. To stay awake costs this PC a processor. So a spin_budget
 // has to be earned by what was received, and is short:
 //
 //   each byte earns half a nanosecond   all of the time at 2 GB/s, 6 % of it at 1 Gbit/s, 0.05 % at
@@ -22,7 +22,7 @@
 namespace dssm::detail {
 
 // A value; one thread.
-class Vigil {
+class SpinBudget {
  public:
   // 60 KiB at 2 GB/s: enough for the next packet of a sender that is at it, and too little to be
   // missed by anybody else.
@@ -32,7 +32,7 @@ class Vigil {
   // Bytes came, by whatever way.
   void on_received(std::size_t bytes) noexcept;
 
-  // As Transport::receive_waiting(), after a vigil if one is earned. A signal during the vigil does
+  // As Transport::receive_waiting(), after a spin_budget if one is earned. A signal during the spin_budget does
   // not interrupt. What it brings is to be told by on_received().
   Result<wire::IoResult> receive(wire::Transport& transport, std::span<const iovec> spaces);
 

@@ -19,7 +19,7 @@
 
 namespace dssm::daemon {
 
-class PeerLink final : private Dialer::User {
+class PeerConnection final : private Dialer::Observer {
  public:
   // Requests of one peer that wait for their answers.
   static constexpr std::size_t kMaxWaiting = 4096;
@@ -38,35 +38,36 @@ class PeerLink final : private Dialer::User {
   };
 
   // Told from the loop; must not destroy the link.
-  class User {
+  class Observer {
    public:
-    virtual void on_link_up(PeerLink& link) = 0;
+    virtual void on_link_up(PeerConnection& link) = 0;
     // It was up, or, `attempt`: it could not be brought up.
-    virtual void on_link_down(PeerLink& link, const Error& why, bool attempt) = 0;
+    virtual void on_link_down(PeerConnection& link, const Error& why, bool attempt) = 0;
     // After watch(): a change of the peer's streams. Fails when that is nonsense.
-    virtual Result<void> on_stream_event_untrusted(PeerLink& link,
+    virtual Result<void> on_stream_event_untrusted(PeerConnection& link,
                                                    const net::StreamEvent& event) = 0;
-    virtual void on_watched(PeerLink& link) = 0;    // all that was there has been told
-    virtual void on_heartbeat(PeerLink& link) = 0;  // them() has news of the peer's clock
+    virtual void on_watched(PeerConnection& link) = 0;    // all that was there has been told
+    virtual void on_heartbeat(PeerConnection& link) = 0;  // them() has news of the peer's clock
 
    protected:
-    ~User() = default;
+    ~Observer() = default;
   };
 
   // Starts at once; what is given outlives it. To a configured peer, whoever that is:
-  PeerLink(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
-           const wire::Greeting& self, User& user);
+  PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
+                 const wire::Greeting& self, Observer& observer);
   // To the host `id`, which is said to be at one of `addresses` (numbers, best first, at least
   // one); any other that answers there is refused.
-  PeerLink(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
-           const std::vector<wire::Address>& addresses, const wire::Greeting& self, User& user);
-  PeerLink(const PeerLink&) = delete;
-  PeerLink& operator=(const PeerLink&) = delete;
+  PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
+                 const std::vector<wire::Address>& addresses, const wire::Greeting& self,
+                 Observer& observer);
+  PeerConnection(const PeerConnection&) = delete;
+  PeerConnection& operator=(const PeerConnection&) = delete;
 
   // --- to be called while it is up
 
   // Sends a request (its serial is set here). `then` gets the answer, or why there is none: the
-  // peer's own words, limit_exceeded (too much is waiting), daemon_away (not up, or the connection
+  // peer's own words, limit_exceeded (too much is waiting), unavailable (not up, or the connection
   // broke). Called once, from the loop, or at once when nothing was sent.
   using Then = std::function<void(Result<net::Frame>)>;
   void ask(net::Frame request, Then then);
@@ -74,7 +75,7 @@ class PeerLink final : private Dialer::User {
   // From now on on_stream_event_untrusted().
   void watch();
 
-  // Heartbeats, and death after kSilenceIsDeath without any sign of life.
+  // Heartbeats, and death after kPeerTimeout without any sign of life.
   void keep_alive();
 
   // Gives the connection up and tries again later.
@@ -105,7 +106,7 @@ class PeerLink final : private Dialer::User {
     std::size_t bytes = 0;
   };
 
-  void on_up(FrameLink& link, const wire::Greeting& them) override;
+  void on_up(FrameConnection& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
   void on_down(const Error& why) override;
   void beat();
@@ -113,13 +114,13 @@ class PeerLink final : private Dialer::User {
   void on_pong(MonoTime asked, const Result<net::Frame>& answer);
   void enter(State state, std::optional<Error> why);
 
-  PeerLink(const EventLoop& loop, Resolver& resolver, std::optional<wire::HostId> expected,
-           Dialer::Options options, User& user);
+  PeerConnection(const EventLoop& loop, Resolver& resolver, std::optional<wire::HostId> expected,
+                 Dialer::Options options, Observer& observer);
 
   wire::Address configured_;
   const std::optional<wire::HostId> expected_;
   const wire::Greeting self_;
-  User& user_;
+  Observer& observer_;
   State state_ = State::connecting;
   MonoTime since_ = MonoClock::now();
   std::optional<Error> why_;
@@ -134,6 +135,6 @@ class PeerLink final : private Dialer::User {
 };
 
 // "connecting", "up" ...; static storage.
-std::string_view state_name(PeerLink::State state) noexcept;
+std::string_view state_name(PeerConnection::State state) noexcept;
 
 }  // namespace dssm::daemon

@@ -30,29 +30,29 @@ struct ChannelParts {
   const ClockRules* clock = nullptr;  // nobody watches the clock
 };
 
-class OwnerChannel final : private Dialer::User {
+class OwnerConnection final : private Dialer::Observer {
  public:
   // Between two looks whether a stream that was removed or refused can be had.
   static constexpr Duration kRetryPause = std::chrono::seconds(2);
 
-  class User : public Dialer::User {
+  class Observer : public Dialer::Observer {
    public:
     // Instead of on_down(), when the connection ends because of try_again().
-    virtual void on_anew() = 0;
+    virtual void on_reopen() = 0;
 
    protected:
-    ~User() = default;
+    ~Observer() = default;
   };
 
   // stream: its name, for messages. All outlive it.
-  OwnerChannel(const ChannelParts& parts, std::string stream, User& user);
-  OwnerChannel(const OwnerChannel&) = delete;
-  OwnerChannel& operator=(const OwnerChannel&) = delete;
+  OwnerConnection(const ChannelParts& parts, std::string stream, Observer& observer);
+  OwnerConnection(const OwnerConnection&) = delete;
+  OwnerConnection& operator=(const OwnerConnection&) = delete;
 
   // Whose stream it is, once connect() said so.
   const std::optional<wire::HostId>& owner() const noexcept { return owner_; }
   const wire::Address& address() const noexcept { return address_; }
-  FrameLink* link() noexcept { return dialer_ ? dialer_->link() : nullptr; }
+  FrameConnection* link() noexcept { return dialer_ ? dialer_->link() : nullptr; }
 
   // The owner answers there. Another host than before: it has taken over the name.
   void connect(const KnownHost& host);
@@ -65,14 +65,14 @@ class OwnerChannel final : private Dialer::User {
   void try_again_later() { retry_timer_.enable_in(kRetryPause); }
 
  private:
-  void on_up(FrameLink& link, const wire::Greeting& them) override;
-  Result<void> on_frame(net::Frame& frame) override { return user_.on_frame(frame); }
-  void on_output_empty() override { user_.on_output_empty(); }
+  void on_up(FrameConnection& link, const wire::Greeting& them) override;
+  Result<void> on_frame(net::Frame& frame) override { return observer_.on_frame(frame); }
+  void on_output_empty() override { observer_.on_output_empty(); }
   void on_down(const Error& why) override;
 
   const ChannelParts& parts_;
   const std::string stream_;
-  User& user_;
+  Observer& observer_;
   std::optional<wire::HostId> owner_;
   wire::Address address_;
   bool anew_ = false;  // the connection is about to end because we want it to

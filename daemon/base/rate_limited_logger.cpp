@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "daemon/base/calm_logger.hpp"
+#include "daemon/base/rate_limited_logger.hpp"
 
 #include <string>
 #include <utility>
 
 namespace dssm::daemon {
 
-void CalmLogger::write(LogLevel level, std::string_view text, const LogFields& fields) noexcept {
+void RateLimitedLogger::write(LogLevel level, std::string_view text,
+                              const LogFields& fields) noexcept {
   Counter& counter = counters_[static_cast<std::size_t>(level)];
   if (counter.passed == kLinesPerPeriod) {
     const MonoTime now = now_();

@@ -2,7 +2,7 @@
 //
 // A link over a transport of the test's own: order and bounds of what is sent, pauses, and how it
 // ends.
-#include "daemon/link/frame_link.hpp"
+#include "daemon/link/frame_connection.hpp"
 
 #include <optional>
 
@@ -37,14 +37,14 @@ iovec part(const std::vector<std::byte>& bytes, std::size_t from, std::size_t to
   return {const_cast<std::byte*>(bytes.data()) + from, to - from};
 }
 
-class FrameLinkTest : public testing::Test,
-                      protected FrameLink::User,
-                      protected FrameLink::SampleSink {
+class FrameConnectionTest : public testing::Test,
+                            protected FrameConnection::Observer,
+                            protected FrameConnection::SampleDelegate {
  protected:
   static constexpr std::size_t kMaxQueued = 10'000;
   static constexpr std::size_t kPayloadBytes = 100;
 
-  FrameLinkTest() { link->take_samples(kPayloadBytes, *this); }
+  FrameConnectionTest() { link->take_samples(kPayloadBytes, *this); }
 
   Result<void> on_frame(net::Frame& frame) override {
     got.push_back(frame.serial());
@@ -86,25 +86,25 @@ class FrameLinkTest : public testing::Test,
   bool hold_sample = false;
   int batches = 0, empties = 0;
   std::optional<Error> why;
-  std::optional<FrameLink> link{std::in_place, loop, std::make_unique<FakeTransport>(peer),
-                                static_cast<FrameLink::User&>(*this), kMaxQueued};
+  std::optional<FrameConnection> link{std::in_place, loop, std::make_unique<FakeTransport>(peer),
+                                      static_cast<FrameConnection::Observer&>(*this), kMaxQueued};
 };
 
 using Serials = std::vector<std::uint64_t>;
 
-TEST_F(FrameLinkTest, SendsAtOnceWhatThePeerTakes) {
+TEST_F(FrameConnectionTest, SendsAtOnceWhatThePeerTakes) {
   link->send(ping(1));
   EXPECT_EQ(serials_sent(), Serials{1}) << "without a turn of the loop";
   EXPECT_TRUE(link->output_empty());
 }
 
-TEST_F(FrameLinkTest, KeepsTheOrderWhereverThePeerStops) {
+TEST_F(FrameConnectionTest, KeepsTheOrderWhereverThePeerStops) {
   const std::size_t all = bytes_of(property(1, 50)).size() + bytes_of(ping(2)).size() +
                           bytes_of(property(3, 200)).size();
   for (std::size_t room = 0; room <= all; ++room) {
     FakePeer other;
     other.room = room;
-    FrameLink one(loop, std::make_unique<FakeTransport>(other), *this, kMaxQueued);
+    FrameConnection one(loop, std::make_unique<FakeTransport>(other), *this, kMaxQueued);
     one.send(property(1, 50));
     one.send(ping(2));
     one.send(property(3, 200));
@@ -119,7 +119,7 @@ TEST_F(FrameLinkTest, KeepsTheOrderWhereverThePeerStops) {
   }
 }
 
-TEST_F(FrameLinkTest, TellsWhenNothingWaitsAnyMore) {
+TEST_F(FrameConnectionTest, TellsWhenNothingWaitsAnyMore) {
   peer.room = 3;
   link->send(ping(1));
   EXPECT_EQ(empties, 0);
@@ -131,7 +131,7 @@ TEST_F(FrameLinkTest, TellsWhenNothingWaitsAnyMore) {
   EXPECT_EQ(empties, 2) << "asked for without anything waiting";
 }
 
-TEST_F(FrameLinkTest, PutsNoFrameIntoTheMiddleOfAnother) {
+TEST_F(FrameConnectionTest, PutsNoFrameIntoTheMiddleOfAnother) {
   const std::vector<std::byte> frame = bytes_of(property(1, 300));
   for (const bool queues_rest : {true, false}) {
     peer.sent.clear();
@@ -156,7 +156,7 @@ TEST_F(FrameLinkTest, PutsNoFrameIntoTheMiddleOfAnother) {
   }
 }
 
-TEST_F(FrameLinkTest, ClosesOnWhoAsksAndDoesNotRead) {
+TEST_F(FrameConnectionTest, ClosesOnWhoAsksAndDoesNotRead) {
   peer.room = 0;
   int sent = 0;
   for (; link->is_open() && sent < 100; ++sent) link->send(property(1, 1000));
@@ -168,7 +168,7 @@ TEST_F(FrameLinkTest, ClosesOnWhoAsksAndDoesNotRead) {
   EXPECT_EQ(why->code, Errc::limit_exceeded);
 }
 
-TEST_F(FrameLinkTest, ChargesWhatWaitsToTheBudgetAndGivesItBack) {
+TEST_F(FrameConnectionTest, ChargesWhatWaitsToTheBudgetAndGivesItBack) {
   MemoryBudget budget(5000);
   link->set_budget(budget);
   peer.room = 0;
@@ -187,7 +187,7 @@ TEST_F(FrameLinkTest, ChargesWhatWaitsToTheBudgetAndGivesItBack) {
   EXPECT_NE(why->message.find("max_peer_memory"), std::string::npos) << why->message;
 }
 
-TEST_F(FrameLinkTest, ChargesALongFrameWhileItIsReceived) {
+TEST_F(FrameConnectionTest, ChargesALongFrameWhileItIsReceived) {
   MemoryBudget budget(1 << 20);
   link->set_budget(budget);
   const std::vector<std::byte> frame = bytes_of(property(1, 700'000));
@@ -207,13 +207,13 @@ TEST_F(FrameLinkTest, ChargesALongFrameWhileItIsReceived) {
   EXPECT_EQ(budget.used(), 0u);
 }
 
-TEST_F(FrameLinkTest, LetsOthersHaveTheirTurn) {
+TEST_F(FrameConnectionTest, LetsOthersHaveTheirTurn) {
   std::vector<std::byte> many;
   for (std::uint64_t serial = 1; serial <= 30'000; ++serial) {
     const std::vector<std::byte> one = bytes_of(property(serial, 100));
     many.insert(many.end(), one.begin(), one.end());
   }
-  ASSERT_GT(many.size(), 2 * FrameLink::kBytesPerTurn);
+  ASSERT_GT(many.size(), 2 * FrameConnection::kBytesPerTurn);
   peer.put(many);
   run_turns(loop, 1);
   EXPECT_GT(got.size(), 0u);
@@ -223,7 +223,7 @@ TEST_F(FrameLinkTest, LetsOthersHaveTheirTurn) {
   EXPECT_EQ(got.size(), 30'000u);
 }
 
-TEST_F(FrameLinkTest, HandsNothingOutWhilePaused) {
+TEST_F(FrameConnectionTest, HandsNothingOutWhilePaused) {
   handler = [&](net::Frame& frame) -> Result<void> {
     if (frame.serial() == 2) link->pause();
     return {};
@@ -252,9 +252,9 @@ std::vector<std::byte> sample_frame(Tid tid, std::size_t payload_bytes, std::byt
   return frame;
 }
 
-TEST_F(FrameLinkTest, RefusesASampleThatNobodyTakes) {
+TEST_F(FrameConnectionTest, RefusesASampleThatNobodyTakes) {
   FakePeer other;
-  FrameLink one(loop, std::make_unique<FakeTransport>(other), *this, kMaxQueued);
+  FrameConnection one(loop, std::make_unique<FakeTransport>(other), *this, kMaxQueued);
   other.put(sample_frame(7, kPayloadBytes, std::byte{5}));
   run_turns(loop, 3);
   EXPECT_TRUE(begun.empty());
@@ -263,7 +263,7 @@ TEST_F(FrameLinkTest, RefusesASampleThatNobodyTakes) {
   EXPECT_NE(why->message.find("none is awaited"), std::string::npos) << why->message;
 }
 
-TEST_F(FrameLinkTest, BeginsASampleAgainThatCameInAPause) {
+TEST_F(FrameConnectionTest, BeginsASampleAgainThatCameInAPause) {
   hold_sample = true;
   peer.put(sample_frame(7, kPayloadBytes, std::byte{5}));
   run_turns(loop, 3);
@@ -277,7 +277,7 @@ TEST_F(FrameLinkTest, BeginsASampleAgainThatCameInAPause) {
   EXPECT_EQ(payload, std::vector<std::byte>(kPayloadBytes, std::byte{5}));
 }
 
-TEST_F(FrameLinkTest, TellsThePeerWhyItCloses) {
+TEST_F(FrameConnectionTest, TellsThePeerWhyItCloses) {
   handler = [](net::Frame&) -> Result<void> { return Error{Errc::protocol, "not like this"}; };
   std::vector<std::byte> two = bytes_of(ping(1));
   const std::vector<std::byte> second = bytes_of(ping(2));
@@ -294,7 +294,7 @@ TEST_F(FrameLinkTest, TellsThePeerWhyItCloses) {
   EXPECT_EQ(why->message, "not like this");
 }
 
-TEST_F(FrameLinkTest, ReadsThePeersLastWordsWhenItTakesNothingMore) {
+TEST_F(FrameConnectionTest, ReadsThePeersLastWordsWhenItTakesNothingMore) {
   peer.put(ping(9));
   peer.gone = true;
   link->send(ping(1));
@@ -302,10 +302,10 @@ TEST_F(FrameLinkTest, ReadsThePeersLastWordsWhenItTakesNothingMore) {
   run_turns(loop, 3);
   EXPECT_EQ(got, Serials{9});
   ASSERT_TRUE(why);
-  EXPECT_EQ(why->code, Errc::daemon_away);
+  EXPECT_EQ(why->code, Errc::unavailable);
 }
 
-TEST_F(FrameLinkTest, EndsWithThePeerAlsoInTheMiddleOfAFrame) {
+TEST_F(FrameConnectionTest, EndsWithThePeerAlsoInTheMiddleOfAFrame) {
   const std::vector<std::byte> frame = bytes_of(property(1, 100));
   peer.put({frame.begin(), frame.begin() + 50});
   peer.vanish();
@@ -314,7 +314,7 @@ TEST_F(FrameLinkTest, EndsWithThePeerAlsoInTheMiddleOfAFrame) {
   EXPECT_NE(why->message.find("middle of a frame"), std::string::npos) << why->message;
 }
 
-TEST_F(FrameLinkTest, DoesNothingAfterItClosed) {
+TEST_F(FrameConnectionTest, DoesNothingAfterItClosed) {
   link->close_with({Errc::closed, "enough"});
   peer.sent.clear();
   link->send(ping(1));
@@ -331,7 +331,7 @@ TEST_F(FrameLinkTest, DoesNothingAfterItClosed) {
   EXPECT_EQ(why->message, "enough");
 }
 
-TEST_F(FrameLinkTest, MayBeDestroyedBeforeItsEndIsTold) {
+TEST_F(FrameConnectionTest, MayBeDestroyedBeforeItsEndIsTold) {
   link->close_with({Errc::closed, "enough"});
   link.reset();
   run_turns(loop, 3);

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "client/src/network_link.hpp"
+#include "client/src/network_connection.hpp"
 
 #include <poll.h>
 #include <unistd.h>
@@ -40,13 +40,14 @@ void add(wire::DecoderCounters& sum, const wire::DecoderCounters& more) noexcept
 
 }  // namespace
 
-NetworkLink::NetworkLink(wire::FrameSink& user, std::string program, Duration patience)
+NetworkConnection::NetworkConnection(wire::FrameDelegate& user, std::string program,
+                                     Duration patience)
     : user_(user),
       program_(std::move(program)),
       patience_(std::max(patience, wire::kHelloTimeout)),
       life_(wire::random_number()) {}
 
-void NetworkLink::start(std::vector<wire::SocketAddress> addresses) {
+void NetworkConnection::start(std::vector<wire::SocketAddress> addresses) {
   close();
   addresses_ = std::move(addresses);
   next_address_ = 0;
@@ -54,7 +55,7 @@ void NetworkLink::start(std::vector<wire::SocketAddress> addresses) {
   step_deadline_ = MonoClock::now();
 }
 
-void NetworkLink::close() {
+void NetworkConnection::close() {
   if (decoder_) add(earlier_, decoder_->counters());
   decoder_.reset();
   transport_.reset();
@@ -65,18 +66,18 @@ void NetworkLink::close() {
   step_deadline_ = kNever;
 }
 
-Error NetworkLink::down(Error why) {
+Error NetworkConnection::down(Error why) {
   close();
   return why;
 }
 
-Error NetworkLink::lost() const {
-  return Error{Errc::daemon_away, "dssmd at '" + address_ + "' closed the connection"};
+Error NetworkConnection::lost() const {
+  return Error{Errc::unavailable, "dssmd at '" + address_ + "' closed the connection"};
 }
 
 // --- connecting and greeting
 
-Result<void> NetworkLink::connect_next() {
+Result<void> NetworkConnection::connect_next() {
   Error last{Errc::no_daemon, "no address to connect to"};
   while (next_address_ < addresses_.size()) {
     const wire::SocketAddress& address = addresses_[next_address_++];
@@ -92,9 +93,9 @@ Result<void> NetworkLink::connect_next() {
   return down(std::move(last));
 }
 
-Result<void> NetworkLink::greet() {
+Result<void> NetworkConnection::greet() {
   transport_ = wire::make_tcp_transport(std::move(connecting_));
-  wire::FrameSink& sink = *this;
+  wire::FrameDelegate& sink = *this;
   decoder_ = std::make_unique<wire::FrameDecoder>(sink, wire::kMaxNetworkFrameBytes);
   wire::Greeting self;
   self.host = own_host();
@@ -115,7 +116,7 @@ Result<void> NetworkLink::greet() {
   return send_queued();
 }
 
-[[gnu::hot]] Result<void> NetworkLink::advance() {
+[[gnu::hot]] Result<void> NetworkConnection::advance() {
   if (phase_ == Phase::down) return {};
   if (phase_ == Phase::up) return {};
   if (phase_ == Phase::connecting) {
@@ -141,47 +142,47 @@ Result<void> NetworkLink::greet() {
   return down(silence());
 }
 
-Error NetworkLink::silence() const {
+Error NetworkConnection::silence() const {
   switch (phase_) {
     case Phase::connecting:
       return {Errc::no_daemon,
               "connect to '" + address_ +
                   "': no answer; is that PC on, and do both reach each other (`ping`)?"};
     case Phase::greeting:
-      return {Errc::daemon_away,
+      return {Errc::unavailable,
               "what listens at '" + address_ + "' does not greet; is it a dssmd?"};
     case Phase::down:
     case Phase::up:
       break;
   }
-  return {Errc::daemon_away, "dssmd at '" + address_ + "' does not answer"};
+  return {Errc::unavailable, "dssmd at '" + address_ + "' does not answer"};
 }
 
-bool NetworkLink::has_arrived() const noexcept {
+bool NetworkConnection::has_arrived() const noexcept {
   pollfd ready{fd(), POLLIN, 0};
   return ::poll(&ready, 1, 0) > 0;
 }
 
 // --- frames
 
-void NetworkLink::queue(const net::Frame& frame) {
+void NetworkConnection::queue(const net::Frame& frame) {
   const std::string encoded = wire::encode_frame(frame);
   queue(std::as_bytes(std::span(encoded)));
 }
 
-void NetworkLink::queue(std::span<const std::byte> encoded) {
+void NetworkConnection::queue(std::span<const std::byte> encoded) {
   if (!has_queued()) queued_.clear(), queued_from_ = 0;
   queued_.append(reinterpret_cast<const char*>(encoded.data()), encoded.size());
 }
 
-Result<void> NetworkLink::send_queued() {
+Result<void> NetworkConnection::send_queued() {
   auto sent = send_some(std::as_bytes(std::span(queued_)).subspan(queued_from_));
   if (!sent) return std::move(sent).error();
   queued_from_ += *sent;
   return {};
 }
 
-Result<std::size_t> NetworkLink::send_some(std::span<const std::byte> bytes) {
+Result<std::size_t> NetworkConnection::send_some(std::span<const std::byte> bytes) {
   std::size_t sent = 0;
   while (sent < bytes.size()) {
     const iovec part{const_cast<std::byte*>(bytes.data()) + sent, bytes.size() - sent};
@@ -194,39 +195,40 @@ Result<std::size_t> NetworkLink::send_some(std::span<const std::byte> bytes) {
   return sent;
 }
 
-[[gnu::hot]] Result<wire::IoStatus> NetworkLink::receive() {
+[[gnu::hot]] Result<wire::IoStatus> NetworkConnection::receive() {
   if (!transport_) return wire::IoStatus::would_block;
   return take(transport_->receive(decoder_->spaces()));
 }
 
-[[gnu::hot]] Result<wire::IoStatus> NetworkLink::receive_waiting() {
+[[gnu::hot]] Result<wire::IoStatus> NetworkConnection::receive_waiting() {
   if (!transport_) return wire::IoStatus::would_block;
   return take(transport_->receive_waiting(decoder_->spaces()));
 }
 
-[[gnu::hot]] Result<wire::IoStatus> NetworkLink::receive_watching() {
+[[gnu::hot]] Result<wire::IoStatus> NetworkConnection::receive_watching() {
   if (!transport_) return wire::IoStatus::would_block;
-  return take(vigil_.receive(*transport_, decoder_->spaces()));
+  return take(spin_budget_.receive(*transport_, decoder_->spaces()));
 }
 
-[[gnu::hot]] Result<wire::IoStatus> NetworkLink::take(const Result<wire::IoResult>& received) {
+[[gnu::hot]] Result<wire::IoStatus> NetworkConnection::take(
+    const Result<wire::IoResult>& received) {
   if (!received) return down(received.error());
   if (received->status == wire::IoStatus::end) return down(lost());
   if (received->status != wire::IoStatus::ok) return received->status;
-  vigil_.on_received(received->bytes);
+  spin_budget_.on_received(received->bytes);
   if (Result<void> done = decoder_->commit(received->bytes); !done) {
     return down(std::move(done).error());
   }
   return wire::IoStatus::ok;
 }
 
-Result<void> NetworkLink::resume() {
+Result<void> NetworkConnection::resume() {
   if (!decoder_) return {};
   if (Result<void> done = decoder_->commit(0); !done) return down(std::move(done).error());
   return {};
 }
 
-Result<void> NetworkLink::on_frame(net::Frame& frame) {
+Result<void> NetworkConnection::on_frame(net::Frame& frame) {
   if (phase_ == Phase::up) return user_.on_frame(frame);
   const std::string who = "dssmd at '" + address_ + "'";
   if (frame.has_failure()) return wire::failure(frame.failure()).context(who + " refuses");
@@ -241,17 +243,17 @@ Result<void> NetworkLink::on_frame(net::Frame& frame) {
   return {};
 }
 
-[[gnu::hot]] Result<void> NetworkLink::on_sample_begin(const wire::IncomingSample& sample,
-                                                       std::byte*& out) {
+[[gnu::hot]] Result<void> NetworkConnection::on_sample_begin(const wire::IncomingSample& sample,
+                                                             std::byte*& out) {
   return user_.on_sample_begin(sample, out);  // refused by the decoder before a size is set
 }
 
-[[gnu::hot]] Result<void> NetworkLink::on_sample_end(const wire::IncomingSample& sample,
-                                                     bool torn) {
+[[gnu::hot]] Result<void> NetworkConnection::on_sample_end(const wire::IncomingSample& sample,
+                                                           bool torn) {
   return user_.on_sample_end(sample, torn);
 }
 
-wire::DecoderCounters NetworkLink::counters() const noexcept {
+wire::DecoderCounters NetworkConnection::counters() const noexcept {
   wire::DecoderCounters sum = earlier_;
   if (decoder_) add(sum, decoder_->counters());
   return sum;
@@ -259,13 +261,15 @@ wire::DecoderCounters NetworkLink::counters() const noexcept {
 
 // --- waiting
 
-int NetworkLink::fd() const noexcept { return transport_ ? transport_->fd() : connecting_.get(); }
+int NetworkConnection::fd() const noexcept {
+  return transport_ ? transport_->fd() : connecting_.get();
+}
 
-short NetworkLink::events(bool more_to_send) const noexcept {
+short NetworkConnection::events(bool more_to_send) const noexcept {
   if (phase_ == Phase::connecting) return POLLOUT;
   return static_cast<short>(POLLIN | (has_queued() || more_to_send ? POLLOUT : 0));
 }
 
-MonoTime NetworkLink::next_step() const noexcept { return step_deadline_; }
+MonoTime NetworkConnection::next_step() const noexcept { return step_deadline_; }
 
 }  // namespace dssm::detail

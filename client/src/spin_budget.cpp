@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "client/src/vigil.hpp"
+#include "client/src/spin_budget.hpp"
 
 #include <algorithm>
 #include <cstdint>
@@ -11,13 +11,13 @@ constexpr std::size_t kBytesPerNs = 2;
 
 }  // namespace
 
-[[gnu::hot]] void Vigil::on_received(std::size_t bytes) noexcept {
+[[gnu::hot]] void SpinBudget::on_received(std::size_t bytes) noexcept {
   const Duration earned(static_cast<std::int64_t>(bytes / kBytesPerNs));
   credit_ = std::min(credit_ + earned, kDearest * kLongest);
 }
 
-[[gnu::hot]] Result<wire::IoResult> Vigil::receive(wire::Transport& transport,
-                                                   std::span<const iovec> spaces) {
+[[gnu::hot]] Result<wire::IoResult> SpinBudget::receive(wire::Transport& transport,
+                                                        std::span<const iovec> spaces) {
   if (!is_earned()) return transport.receive_waiting(spaces);
   const MonoTime begin = MonoClock::now();
   for (;;) {
@@ -30,7 +30,7 @@ constexpr std::size_t kBytesPerNs = 2;
   }
 }
 
-void Vigil::on_held(Duration length, bool in_vain) noexcept {
+void SpinBudget::on_held(Duration length, bool in_vain) noexcept {
   credit_ = in_vain ? Duration(0) : std::max(Duration(0), credit_ - length);
   price_ = in_vain ? std::min(2 * price_, kDearest * kLongest) : kLongest;
 }

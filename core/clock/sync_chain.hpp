@@ -25,7 +25,7 @@ struct ClockLink {
   friend bool operator==(const ClockLink& a, const ClockLink& b) = default;
 };
 
-struct ClockStanding {
+struct SyncChain {
   // A chain that is longer than this has a loop.
   static constexpr std::size_t kMostLinks = 8;
 
@@ -39,24 +39,24 @@ struct ClockStanding {
   bool root_is_utc = false;                  // false: the root is a PC that follows nobody
   PartsPerBillion ageing = 0;                // of all bounds here
 
-  friend bool operator==(const ClockStanding& a, const ClockStanding& b) = default;
+  friend bool operator==(const SyncChain& a, const SyncChain& b) = default;
 
   // As it is `age` later, when nothing more was heard.
-  ClockStanding aged(Duration age) const;
+  SyncChain aged(Duration age) const;
   // kUnknownClockError: it is not in the chain.
   Duration distance_from(const ClockId& clock) const noexcept;
 };
 
 // Whether both have the same kernel, and so the same clock.
-bool share_clock(const ClockStanding& one, const ClockStanding& other) noexcept;
+bool share_clock(const SyncChain& one, const SyncChain& other) noexcept;
 
 // How far two clocks may be apart at this moment: 0 for one kernel, else the shortest way by a
 // clock that both follow, or by UTC. kUnknownClockError: there is no such way.
-Duration distance(const ClockStanding& one, const ClockStanding& other) noexcept;
+Duration distance(const SyncChain& one, const SyncChain& other) noexcept;
 
 // How far the time of a sample by `writer`'s clock may be from `reader`'s clock, beyond what the
 // sample itself is stamped with (a bound against `writer.anchor`). kUnknownClockError: there is no
 // way. Not for clocks that share one: those have no distance, whatever is stamped.
-Duration distance_from_anchor(const ClockStanding& writer, const ClockStanding& reader) noexcept;
+Duration distance_from_anchor(const SyncChain& writer, const SyncChain& reader) noexcept;
 
 }  // namespace dssm::clock

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "core/clock/clock_standing.hpp"
+#include "core/clock/sync_chain.hpp"
 
 #include <algorithm>
 
 namespace dssm::clock {
 
-ClockStanding ClockStanding::aged(Duration age) const {
-  ClockStanding later = *this;
+SyncChain SyncChain::aged(Duration age) const {
+  SyncChain later = *this;
   const Duration more = growth(age, ageing);
   for (ClockLink& link : later.chain) link.bound = sum(link.bound, more);
   later.bound = sum(later.bound, more);
@@ -14,17 +14,17 @@ ClockStanding ClockStanding::aged(Duration age) const {
   return later;
 }
 
-Duration ClockStanding::distance_from(const ClockId& clock) const noexcept {
+Duration SyncChain::distance_from(const ClockId& clock) const noexcept {
   const auto link = std::find_if(chain.begin(), chain.end(),
                                  [&](const ClockLink& one) { return one.clock == clock; });
   return link == chain.end() ? kUnknownClockError : link->bound;
 }
 
-bool share_clock(const ClockStanding& one, const ClockStanding& other) noexcept {
+bool share_clock(const SyncChain& one, const SyncChain& other) noexcept {
   return !one.boot_id.empty() && one.boot_id == other.boot_id;
 }
 
-Duration distance(const ClockStanding& one, const ClockStanding& other) noexcept {
+Duration distance(const SyncChain& one, const SyncChain& other) noexcept {
   if (share_clock(one, other)) return {};
   Duration shortest = one.root_is_utc && other.root_is_utc ? sum(one.root_bound, other.root_bound)
                                                            : kUnknownClockError;
@@ -34,7 +34,7 @@ Duration distance(const ClockStanding& one, const ClockStanding& other) noexcept
   return shortest;
 }
 
-Duration distance_from_anchor(const ClockStanding& writer, const ClockStanding& reader) noexcept {
+Duration distance_from_anchor(const SyncChain& writer, const SyncChain& reader) noexcept {
   // By the anchor itself nothing is added to what the reader knows of it.
   const Duration directly = reader.distance_from(writer.anchor);
   // By any other way: from the anchor to the writer's clock, and from there to the reader's.

@@ -9,16 +9,16 @@
 
 namespace dssm::daemon {
 
-class RingRoom {
+class RingQuota {
  public:
-  RingRoom() = default;
-  explicit RingRoom(std::uint64_t& taken) noexcept : taken_(&taken) { ++taken; }  // outlives it
-  RingRoom(RingRoom&& other) noexcept : taken_(std::exchange(other.taken_, nullptr)) {}
-  RingRoom& operator=(RingRoom&& other) noexcept {
+  RingQuota() = default;
+  explicit RingQuota(std::uint64_t& taken) noexcept : taken_(&taken) { ++taken; }  // outlives it
+  RingQuota(RingQuota&& other) noexcept : taken_(std::exchange(other.taken_, nullptr)) {}
+  RingQuota& operator=(RingQuota&& other) noexcept {
     std::swap(taken_, other.taken_);
     return *this;
   }
-  ~RingRoom() {
+  ~RingQuota() {
     if (taken_) --*taken_;
   }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "client/src/network_link.hpp"
+#include "client/src/network_connection.hpp"
 
 #include <gtest/gtest.h>
 #include <poll.h>
@@ -15,15 +15,15 @@ namespace {
 
 using namespace std::chrono_literals;
 
-class NoUser final : public wire::FrameSink {
+class NoUser final : public wire::FrameDelegate {
   Result<void> on_sample_begin(const wire::IncomingSample&, std::byte*&) override { return {}; }
   Result<void> on_sample_end(const wire::IncomingSample&, bool) override { return {}; }
   Result<void> on_frame(net::Frame&) override { return {}; }
 };
 
 // A link that has said who it is to a dssmd that has not answered yet.
-struct NetworkLinkTest : testing::Test {
-  NetworkLinkTest() {
+struct NetworkConnectionTest : testing::Test {
+  NetworkConnectionTest() {
     const wire::Address any = wire::Address::parse("127.0.0.1:0", 0, true).value();
     listener = wire::listen_tcp(wire::resolve_number(any).at(0)).value();
     link.start({wire::local_address(listener.get()).value()});
@@ -48,11 +48,11 @@ struct NetworkLinkTest : testing::Test {
   }
 
   NoUser user;
-  NetworkLink link{user, "test", 0s};
+  NetworkConnection link{user, "test", 0s};
   UniqueFd listener, connection;
 };
 
-TEST_F(NetworkLinkTest, TakesAGreetingThatCameWhileThisProgramWasStalled) {
+TEST_F(NetworkConnectionTest, TakesAGreetingThatCameWhileThisProgramWasStalled) {
   greet();
   std::this_thread::sleep_until(link.next_step());
   ASSERT_TRUE(link.advance());
@@ -60,11 +60,11 @@ TEST_F(NetworkLinkTest, TakesAGreetingThatCameWhileThisProgramWasStalled) {
   EXPECT_TRUE(link.is_up());
 }
 
-TEST_F(NetworkLinkTest, GivesUpOneThatDoesNotGreet) {
+TEST_F(NetworkConnectionTest, GivesUpOneThatDoesNotGreet) {
   std::this_thread::sleep_until(link.next_step());
   const Result<void> advanced = link.advance();
   ASSERT_FALSE(advanced);
-  EXPECT_EQ(advanced.error().code, Errc::daemon_away);
+  EXPECT_EQ(advanced.error().code, Errc::unavailable);
   EXPECT_NE(advanced.error().message.find(link.address() + "' does not greet"), std::string::npos)
       << advanced.error().message;
   EXPECT_TRUE(link.is_down());

@@ -8,9 +8,9 @@ namespace dssm::daemon {
 
 // So many at once, then one per period; what is not used comes back at the same rate. (The generic
 // cell rate algorithm, ITU-T I.371: one time stands for the whole state.)
-class Pace {
+class RateLimiter {
  public:
-  Pace(int at_once, Duration period) : period_(period), ahead_((at_once - 1) * period) {}
+  RateLimiter(int at_once, Duration period) : period_(period), ahead_((at_once - 1) * period) {}
 
   // How long to wait before the next one; zero: not at all.
   Duration wait(MonoTime now) const { return std::max(Duration::zero(), due_ - ahead_ - now); }

@@ -24,7 +24,7 @@
 
 namespace dssm::daemon {
 
-class FrameLink final : private wire::FrameSink {
+class FrameConnection final : private wire::FrameDelegate {
  public:
   // Received in a row before others get their turn.
   static constexpr int kReceivesPerTurn = 16;
@@ -32,24 +32,24 @@ class FrameLink final : private wire::FrameSink {
 
   // Who works with the link. An error returned from a handler closes the link with last words.
   // Handlers may send on the link, pause it and close it, but not destroy it.
-  class User {
+  class Observer {
    public:
     virtual Result<void> on_frame(net::Frame& frame) = 0;
     // Nothing waits to be sent any more, or the socket takes bytes again: samples may follow.
     virtual void on_output_empty() {}
     // The link ended by itself or by an error; called once, last of all, from the loop and never
-    // from within a call of the user's own. Destroy the link later, not here.
+    // from within a call of the observer's own. Destroy the link later, not here.
     virtual void on_closed(const Error& why) = 0;
 
    protected:
-    ~User() = default;
+    ~Observer() = default;
   };
 
-  // Who takes samples: not by way of the user, because each step on a sample's way costs. The same
-  // rules as for the user's handlers.
-  class SampleSink {
+  // Who takes samples: not by way of the observer, because each step on a sample's way costs. The same
+  // rules as for the observer's handlers.
+  class SampleDelegate {
    public:
-    // As wire::FrameSink. When the link is paused within on_sample_begin(), `out` is not used, and
+    // As wire::FrameDelegate. When the link is paused within on_sample_begin(), `out` is not used, and
     // it comes again for the same sample after resume().
     virtual Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) = 0;
     virtual Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) = 0;
@@ -57,19 +57,19 @@ class FrameLink final : private wire::FrameSink {
     virtual void on_batch_end() {}
 
    protected:
-    ~SampleSink() = default;
+    ~SampleDelegate() = default;
   };
 
-  // user and loop outlive the link.
-  FrameLink(const EventLoop& loop, std::unique_ptr<wire::Transport> transport, User& user,
-            std::size_t max_queued_bytes);
-  FrameLink(const FrameLink&) = delete;
-  FrameLink& operator=(const FrameLink&) = delete;
-  ~FrameLink();
+  // observer and loop outlive the link.
+  FrameConnection(const EventLoop& loop, std::unique_ptr<wire::Transport> transport,
+                  Observer& observer, std::size_t max_queued_bytes);
+  FrameConnection(const FrameConnection&) = delete;
+  FrameConnection& operator=(const FrameConnection&) = delete;
+  ~FrameConnection();
 
   // From now on samples of this size are received, and `sink`, which outlives the link, gets them.
   // Until then one that comes is an error of the peer.
-  void take_samples(std::size_t payload_bytes, SampleSink& sink) noexcept;
+  void take_samples(std::size_t payload_bytes, SampleDelegate& sink) noexcept;
 
   // What waits to be sent by send(), and a long frame that is being received, are charged to
   // `budget`, which outlives the link; when it is used up, the link closes itself.
@@ -139,8 +139,8 @@ class FrameLink final : private wire::FrameSink {
   void close(const Error& why);
 
   std::unique_ptr<wire::Transport> transport_;
-  User& user_;
-  SampleSink* samples_ = nullptr;
+  Observer& observer_;
+  SampleDelegate* samples_ = nullptr;
   std::size_t max_queued_bytes_;
   MemoryBudget* budget_ = nullptr;
   wire::FrameDecoder decoder_;

@@ -3,7 +3,7 @@
 // A process that is killed has done all that is before some instruction and nothing behind it, so
 // the order in the program is what counts. The stores are releases so that the compiler keeps it,
 // and so that who reads without the lock while another process takes a note back sees it, too.
-#include "core/ring/publisher_notes.hpp"
+#include "core/ring/publisher_cursors.hpp"
 
 #include <algorithm>
 #include <iterator>
@@ -11,7 +11,7 @@
 namespace dssm::ring {
 namespace {
 
-bool is_of(const PublisherNote& note, std::uint64_t publisher) noexcept {
+bool is_of(const PublisherCursor& note, std::uint64_t publisher) noexcept {
   return note.publisher.load(std::memory_order_acquire) == publisher &&
          note.tid_end.load(std::memory_order_acquire) != 0;
 }
@@ -19,16 +19,16 @@ bool is_of(const PublisherNote& note, std::uint64_t publisher) noexcept {
 }  // namespace
 
 // Behind the newest sample's tid.
-std::uint64_t PublisherNotes::end() const noexcept {
+std::uint64_t PublisherCursors::end() const noexcept {
   const Tid top = header_->top.load(std::memory_order_acquire);
   return top < 0 ? 0 : static_cast<std::uint64_t>(top) + 1;
 }
 
-[[gnu::hot]] PublisherNotes::Last PublisherNotes::last_untrusted(
+[[gnu::hot]] PublisherCursors::Last PublisherCursors::last_untrusted(
     std::uint64_t publisher) const noexcept {
-  const PublisherNote* const found =
+  const PublisherCursor* const found =
       std::find_if(std::begin(header_->publishers), std::end(header_->publishers),
-                   [publisher](const PublisherNote& note) { return is_of(note, publisher); });
+                   [publisher](const PublisherCursor& note) { return is_of(note, publisher); });
   if (found == std::end(header_->publishers)) return {};
   // The end first: a program may take the note back meanwhile and write a sample of its own under
   // that tid.
@@ -44,9 +44,9 @@ std::uint64_t PublisherNotes::end() const noexcept {
 }
 
 // The note of `publisher`, or one that is made its own.
-[[gnu::hot]] PublisherNote& PublisherNotes::place_for(std::uint64_t publisher) const noexcept {
-  PublisherNote* oldest = std::begin(header_->publishers);
-  for (PublisherNote& note : header_->publishers) {
+[[gnu::hot]] PublisherCursor& PublisherCursors::place_for(std::uint64_t publisher) const noexcept {
+  PublisherCursor* oldest = std::begin(header_->publishers);
+  for (PublisherCursor& note : header_->publishers) {
     if (is_of(note, publisher)) return note;
     if (note.tid_end.load(std::memory_order_acquire) <
         oldest->tid_end.load(std::memory_order_acquire)) {
@@ -59,8 +59,8 @@ std::uint64_t PublisherNotes::end() const noexcept {
   return *oldest;
 }
 
-[[gnu::hot]] void PublisherNotes::note(const PublishedSample& sample, Tid tid) const noexcept {
-  PublisherNote& note = place_for(sample.publisher);
+[[gnu::hot]] void PublisherCursors::note(const PublishedSample& sample, Tid tid) const noexcept {
+  PublisherCursor& note = place_for(sample.publisher);
   note.earlier_number_end.store(note.number_end.load(std::memory_order_relaxed),
                                 std::memory_order_release);
   note.earlier_tid_end.store(note.tid_end.load(std::memory_order_relaxed),
@@ -70,9 +70,9 @@ std::uint64_t PublisherNotes::end() const noexcept {
   note.number_end.store(static_cast<std::uint64_t>(sample.number) + 1, std::memory_order_release);
 }
 
-void PublisherNotes::recover() const noexcept {
+void PublisherCursors::recover() const noexcept {
   const std::uint64_t end = this->end();
-  for (PublisherNote& note : header_->publishers) {
+  for (PublisherCursor& note : header_->publishers) {
     if (note.tid_end.load(std::memory_order_acquire) <= end) continue;
     // The tid last: whoever is killed in between leaves the note as it was.
     note.number_end.store(note.earlier_number_end.load(std::memory_order_acquire),

@@ -9,7 +9,7 @@
 
 namespace dssm::daemon {
 
-class AvahiUser {
+class AvahiObserver {
  public:
   // Something that is asked for has changed.
   virtual void on_avahi_change() = 0;
@@ -20,7 +20,7 @@ class AvahiUser {
   virtual bool stopping() const noexcept = 0;
 
  protected:
-  ~AvahiUser() = default;
+  ~AvahiObserver() = default;
 };
 
 // Whether that error of a call concerns the connection to Avahi and not what was asked.

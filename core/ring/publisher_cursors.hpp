@@ -24,9 +24,9 @@ struct PublishedSample {
 };
 
 // A value; the ring, mapped for writing by who notes and recovers, outlives it.
-class PublisherNotes {
+class PublisherCursors {
  public:
-  explicit PublisherNotes(RingHeader& header) noexcept : header_(&header) {}
+  explicit PublisherCursors(RingHeader& header) noexcept : header_(&header) {}
 
   struct Last {
     std::int64_t number = -1;  // -1: nothing of that publisher is known to be written
@@ -44,7 +44,7 @@ class PublisherNotes {
   void recover() const noexcept;
 
  private:
-  PublisherNote& place_for(std::uint64_t publisher) const noexcept;
+  PublisherCursor& place_for(std::uint64_t publisher) const noexcept;
   std::uint64_t end() const noexcept;
 
   RingHeader* header_;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "core/ring/publisher_notes.hpp"
+#include "core/ring/publisher_cursors.hpp"
 
 #include <limits>
 
@@ -22,7 +22,7 @@ class PublisherNotesTest : public testing::Test {
   Tid tid(std::uint64_t publisher) { return notes.last_untrusted(publisher).tid; }
 
   const TestRing ring{8, 4};
-  const PublisherNotes notes{ring.mapping->header()};
+  const PublisherCursors notes{ring.mapping->header()};
 };
 
 TEST_F(PublisherNotesTest, KnowWhereEachStopped) {
@@ -45,7 +45,7 @@ TEST_F(PublisherNotesTest, KnowWhereEachStopped) {
 TEST_F(PublisherNotesTest, LiveInTheRing) {
   publish(5, 10);
   const auto other = RingMapping::open_untrusted(ring.fd.get(), Access::read_only).value();
-  EXPECT_EQ(PublisherNotes(other->header()).last_untrusted(5).number, 10);
+  EXPECT_EQ(PublisherCursors(other->header()).last_untrusted(5).number, 10);
 }
 
 TEST_F(PublisherNotesTest, ForgetTheOneThatWroteLongestAgo) {
@@ -95,7 +95,7 @@ TEST_F(PublisherNotesTest, DoNotGiveANewPublisherWhatAForgottenOneWrote) {
 
 TEST_F(PublisherNotesTest, NonsenseOfAProgramIsNoNote) {
   publish(5, 10);
-  PublisherNote& note = ring.mapping->header().publishers[0];
+  PublisherCursor& note = ring.mapping->header().publishers[0];
   constexpr std::uint64_t kAll = ~std::uint64_t{0};
   for (const std::uint64_t nonsense : {std::uint64_t{3}, kAll >> 1, kAll}) {
     note.tid_end.store(nonsense);

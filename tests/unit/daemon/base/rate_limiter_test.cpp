@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "daemon/base/pace.hpp"
+#include "daemon/base/rate_limiter.hpp"
 
 #include <gtest/gtest.h>
 
@@ -11,14 +11,14 @@ using namespace std::chrono_literals;
 constexpr MonoTime kBegin{1000s};
 
 // How many may go at that moment.
-int take_all(Pace& pace, MonoTime now) {
+int take_all(RateLimiter& pace, MonoTime now) {
   int count = 0;
   for (; pace.wait(now) == Duration::zero(); ++count) pace.take(now);
   return count;
 }
 
-TEST(Pace, LetsSoManyGoAtOnceAndThenOnePerPeriod) {
-  Pace pace(4, 100ms);
+TEST(RateLimiter, LetsSoManyGoAtOnceAndThenOnePerPeriod) {
+  RateLimiter pace(4, 100ms);
   EXPECT_EQ(take_all(pace, kBegin), 4);
   EXPECT_EQ(pace.wait(kBegin), 100ms);
   EXPECT_EQ(pace.wait(kBegin + 30ms), 70ms);
@@ -27,8 +27,8 @@ TEST(Pace, LetsSoManyGoAtOnceAndThenOnePerPeriod) {
   EXPECT_EQ(take_all(pace, kBegin + 300ms), 2);
 }
 
-TEST(Pace, HasAllOfThemAgainAfterARestAndNotMore) {
-  Pace pace(4, 100ms);
+TEST(RateLimiter, HasAllOfThemAgainAfterARestAndNotMore) {
+  RateLimiter pace(4, 100ms);
   EXPECT_EQ(take_all(pace, kBegin), 4);
   EXPECT_EQ(take_all(pace, kBegin + 399ms), 3);
   EXPECT_EQ(take_all(pace, kBegin + 10s), 4);
