@@ -1,8 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmd: owns the streams of this PC. This file only wires the parts; what each does stands in its
-// header. Exit status: 0 after SIGTERM or SIGINT, 1 when the system does not let it run or another
-// dssmd is there, 2 when flags or configuration are wrong.
+// dssmd: owns the streams of this PC. This file only connects the parts; the header of each says
+// what it does. From the inside out:
+//
+//   Sockets     the runtime folder, the Unix socket, the TCP sockets
+//   OwnStreams  registry, open table, playback clock, descriptor store
+//   OtherHosts  clock, catalog, peers, mirrors, remote writers
+//   Dssmd       all of them, and the two servers: for programs (Server), for hosts (ChannelServer)
+//
+// Exit status: 0 after SIGTERM or SIGINT, 1 when the system does not let it run or another dssmd
+// runs already, 2 when flags or configuration are wrong.
+#include <fmt/format.h>
 #include <signal.h>
 
 #include <algorithm>
@@ -10,7 +18,9 @@
 #include <memory>
 #include <optional>
 #include <utility>
+#include <vector>
 
+#include "core/base/try.hpp"
 #include "core/wire/tcp.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/journal_logger.hpp"
@@ -46,8 +56,9 @@ namespace {
 
 constexpr int kFailed = 1, kUsage = 2;
 
-// What this dssmd says of itself to other hosts.
-wire::Greeting own_greeting(const std::string& name) {
+// How this dssmd greets other hosts.
+wire::Greeting own_greeting(const std::string& name,
+                            std::shared_ptr<const wire::ClockReport> clock) {
   wire::Greeting self;
   self.host = name;
   self.host_id = wire::host_id_for(name);
@@ -55,10 +66,11 @@ wire::Greeting own_greeting(const std::string& name) {
   self.program = "dssmd";
   self.version = DSSM_VERSION;
   self.features = {std::string(wire::kFeatureTorn), std::string(wire::kFeatureClock)};
+  self.clock = std::move(clock);
   return self;
 }
 
-// The limits of the configuration, as the parts take them.
+// The limits of the configuration, for each part.
 Registry::Limits stream_limits(const Config& config) {
   return {config.max_streams, config.max_memory_bytes, config.max_property_bytes};
 }
@@ -78,9 +90,8 @@ std::string status_text(const Registry& registry, const Peers& peers, const Flee
     ++known;
     if (host.state() == "up") ++up;
   }
-  return "host '" + registry.host() + "', " + std::to_string(registry.streams().size()) +
-         " streams, " + std::to_string(up) + " of " + std::to_string(known) + " other hosts up, " +
-         clock.str() + ", " + network.str();
+  return fmt::format("host '{}', {} streams, {} of {} other hosts up, {}, {}", registry.host(),
+                     registry.streams().size(), up, known, clock.str(), network.str());
 }
 
 FleetClock::Options clock_options(const Config& config) {
@@ -89,7 +100,7 @@ FleetClock::Options clock_options(const Config& config) {
           config.clocks};
 }
 
-// Touches the status line when streams come and go.
+// Refreshes the status line when a stream is added or removed.
 class StreamCount final : private StreamObserver {
  public:
   StreamCount(Registry& registry, StatusLine& line) : registry_(registry), line_(line) {
@@ -104,11 +115,11 @@ class StreamCount final : private StreamObserver {
   StatusLine& line_;
 };
 
-// Sockets that were handed over for other places than the configuration names.
+// Closes and logs inherited sockets at addresses that the configuration does not name.
 void close_unused(const Inherited& inherited, ServiceManager& manager, Logger& logger) {
-  const auto warn = [&](const std::string& where, const std::string& mend) {
+  const auto warn = [&](const std::string& where, const std::string& fix) {
     logger.warning("the service manager hands over a socket at " + where +
-                       ", which the configuration does not name, closing it; " + mend,
+                       ", which the configuration does not name, closing it; " + fix,
                    {.message_id = message_id::kSocketUnused});
   };
   for (const NamedDescriptor& one : inherited.local) {
@@ -127,141 +138,237 @@ void close_unused(const Inherited& inherited, ServiceManager& manager, Logger& l
   }
 }
 
-// read_again: reads the configuration file anew; none: there is no file.
+// The folder and the sockets of this dssmd.
+struct Sockets {
+  RuntimeDir dir;
+  Listener listener;
+  NetworkListener network;
+
+  // Takes from `inherited` the sockets that the configuration names, and closes the others.
+  static Result<Sockets> open(const Config& config, Inherited& inherited, ServiceManager& manager,
+                              Logger& logger) {
+    RuntimeDir dir = DSSM_TRY(RuntimeDir::open(config.runtime_dir));
+    Listener listener =
+        DSSM_TRY(Listener::open(dir.socket_path(), config.socket_group, config.socket_mode,
+                                inherited.take_local(dir.socket_path())));
+    NetworkListener network =
+        DSSM_TRY(NetworkListener::open(config.listen, inherited.network, logger));
+    close_unused(inherited, manager, logger);
+    network.keep_in(manager);
+    inherited.local.clear();
+    inherited.network.clear();
+    return Sockets{std::move(dir), std::move(listener), std::move(network)};
+  }
+};
+
+// The streams of this host.
+struct OwnStreams {
+  OwnStreams(const Config& config, ServiceManager& manager, Logger& logger)
+      : registry(config.name, stream_limits(config)),
+        opens(open_limits(config)),
+        store(registry, playback_clock, manager, logger) {}
+
+  Registry registry;
+  OpenTable opens;
+  PlaybackClockOwner playback_clock;
+  DescriptorStore store;
+};
+
+// This host's clock, the other hosts, and the copies of their streams.
+struct OtherHosts {
+  OtherHosts(const Config& config, const EventLoop& loop, const NetworkListener& network,
+             clock::ClockPageWriter page, Registry& registry, Logger& logger)
+      : own_clock(std::make_shared<wire::ClockReport>()),
+        self(own_greeting(config.name, own_clock)),
+        catalog(config.name),
+        clock(loop, clock_options(config), std::move(page), own_clock, self.host_id, catalog,
+              logger),
+        resolver(loop),
+        parts{loop, resolver, registry, logger, self, &clock},
+        mirrors(parts, catalog, config.mirror_linger),
+        writers(parts, catalog),
+        peers(loop, resolver, config.peers, self, catalog, logger),
+        service(loop, {self, network.addresses(), config.insecure, &clock}, registry, catalog,
+                peers, mirrors, writers) {}
+
+  std::shared_ptr<wire::ClockReport> own_clock;
+  wire::Greeting self;
+  Catalog catalog;
+  FleetClock clock;
+  Resolver resolver;
+  ChannelParts parts;
+  Mirrors mirrors;
+  RemoteWriters writers;
+  Peers peers;
+  FleetService service;
+};
+
+// All parts of a running dssmd. Each is constructed after those that it uses.
+class Dssmd {
+ public:
+  // What is given by reference outlives it.
+  //   stored  descriptors that the service manager kept over a restart
+  Dssmd(const Config& config, EventLoop& loop, ServiceManager& manager, const Sockets& sockets,
+        clock::ClockPageWriter page, std::vector<NamedDescriptor> stored, LeveledLogger& logger)
+      : config_(config),
+        loop_(loop),
+        manager_(manager),
+        sockets_(sockets),
+        logger_(logger),
+        streams_(config, manager, logger),
+        recovering_(restore(std::move(stored))),
+        hosts_(config, loop, sockets.network, std::move(page), streams_.registry, logger),
+        local_(streams_.registry, streams_.opens, streams_.playback_clock, logger, recovering_,
+               &hosts_.service),
+        server_(loop, sockets.listener, config.max_clients, local_, logger),
+        channels_({loop, streams_.registry, streams_.opens, logger, &hosts_.clock}, hosts_.self,
+                  peer_limits(config)),
+        status_(loop, manager,
+                [this] {
+                  return status_text(streams_.registry, hosts_.peers, hosts_.clock,
+                                     sockets_.network);
+                }),
+        count_(streams_.registry, status_) {
+    if (config.mdns) {
+      discovery_.emplace(
+          loop,
+          Discovery::Options{hosts_.self, reach_of(sockets.network.addresses()), config.insecure,
+                             config.interfaces, config.avoid_interfaces},
+          streams_.registry, hosts_.peers, logger);
+    }
+    hosts_.peers.on_change([this] { status_.touch(); });
+    hosts_.clock.on_news([this] {
+      channels_.send_clock();
+      status_.touch();
+    });
+    hosts_.clock.on_change([this] {
+      hosts_.mirrors.on_clock();
+      channels_.on_clock();
+    });
+  }
+  Dssmd(const Dssmd&) = delete;
+  Dssmd& operator=(const Dssmd&) = delete;
+  ~Dssmd() {
+    hosts_.peers.on_change({});
+    hosts_.clock.on_news({});
+    hosts_.clock.on_change({});
+  }
+
+  // Serves until SIGTERM or SIGINT.
+  //   read_again  reads the configuration file again, after SIGHUP; none: there is no file
+  //   signals     blocked until now
+  Result<void> run(const Reloader::Read& read_again, BlockedSignals& signals) {
+    EventSource grace = EventSource::timer(loop_, [this] {
+      local_.end_recovery();
+      serve_network();
+    });
+    if (recovering_) {
+      grace.enable_in(config_.recovery_grace);
+      log_recovery();
+    } else {
+      serve_network();
+    }
+    EventSource stops[] = {EventSource::signal(loop_, SIGTERM, [this] { loop_.stop(); }),
+                           EventSource::signal(loop_, SIGINT, [this] { loop_.stop(); })};
+    for (EventSource& stop : stops) stop.enable();
+    Reloader reloader(
+        config_, read_again, [this](const Config& changed) { apply(changed); }, logger_);
+    EventSource reload = EventSource::signal(loop_, SIGHUP, [&] {
+      manager_.reloading();
+      reloader.reload();
+      manager_.ready(status_.now());
+    });
+    if (read_again) reload.enable();
+    signals.deliver();
+    log_ready();
+    manager_.ready(status_.now());
+    const Watchdog watchdog(loop_, manager_);
+    DSSM_TRY(loop_.run());
+    manager_.stopping();
+    logger_.notice("stopping", {.message_id = message_id::kStopping});
+    return {};
+  }
+
+ private:
+  // Brings back the streams that the service manager kept. True when programs may still hold
+  // others, which they need time to offer.
+  bool restore(std::vector<NamedDescriptor> stored) {
+    const bool some_may_be_missing =
+        streams_.store.restore_untrusted(std::move(stored), sockets_.network.has_kept());
+    // With an inherited socket it is unknown whether a dssmd ran before this one.
+    return some_may_be_missing &&
+           (sockets_.listener.predecessor_died() || sockets_.listener.inherited()) &&
+           config_.recovery_grace > Duration::zero();
+  }
+
+  void serve_network() {
+    channels_.serve(sockets_.network);
+    if (discovery_) discovery_->start_announcing();
+  }
+
+  // The keys that may change while dssmd runs.
+  void apply(const Config& changed) {
+    logger_.set_level(changed.log_level);
+    streams_.registry.set_limits(stream_limits(changed));
+    streams_.opens.set_limits(open_limits(changed));
+    server_.set_max_clients(changed.max_clients);
+    channels_.set_limits(peer_limits(changed));
+    hosts_.mirrors.set_linger(changed.mirror_linger);
+    hosts_.peers.set_configured(changed.peers);
+    hosts_.clock.set(changed.clocks, changed.max_drift);
+  }
+
+  void log_recovery() {
+    logger_.notice(sockets_.listener.predecessor_died()
+                       ? "the dssmd before this one did not end properly; programs give their "
+                         "streams back"
+                       : "started without streams; programs that hold some give them back",
+                   {.message_id = message_id::kRecovering});
+  }
+
+  void log_ready() {
+    if (config_.insecure) {
+      logger_.warning(
+          "insecure = true: samples cross the network unencrypted, and any host that reaches this "
+          "one can read and write all its streams",
+          {.message_id = message_id::kInsecure});
+    }
+    logger_.notice(fmt::format("ready, host '{}', socket '{}', {}", config_.name,
+                               sockets_.dir.socket_path(), sockets_.network.str()),
+                   {.message_id = message_id::kReady});
+  }
+
+  const Config& config_;
+  EventLoop& loop_;
+  ServiceManager& manager_;
+  const Sockets& sockets_;
+  LeveledLogger& logger_;
+  OwnStreams streams_;
+  const bool recovering_;
+  OtherHosts hosts_;
+  LocalService local_;
+  Server server_;
+  ChannelServer channels_;
+  StatusLine status_;
+  const StreamCount count_;
+  std::optional<Discovery> discovery_;
+};
+
+// read_again: reads the configuration file again; none: there is no file.
 Result<void> run(const Config& config, const Reloader::Read& read_again, LeveledLogger& logger) {
-  HeldRequests requests;
+  BlockedSignals signals;
   raise_descriptor_limit();
   ignore_broken_pipes();
   silence_protobuf();
   return_large_memory();
-  const Result<RuntimeDir> dir = RuntimeDir::open(config.runtime_dir);
-  if (!dir) return dir.error();
-  Result<EventLoop> loop = EventLoop::open();
-  if (!loop) return std::move(loop).error();
-  ServiceManager manager(*loop, ServiceManager::notify_socket());
+  EventLoop loop = DSSM_TRY(EventLoop::open());
+  ServiceManager manager(loop, ServiceManager::notify_socket());
   Inherited inherited = Inherited::sort(take_handed_over());
-  const Result<Listener> listener =
-      Listener::open(dir->socket_path(), config.socket_group, config.socket_mode,
-                     inherited.take_local(dir->socket_path()));
-  if (!listener) return listener.error();
-  const Result<NetworkListener> network =
-      NetworkListener::open(config.listen, inherited.network, logger);
-  if (!network) return network.error();
-  close_unused(inherited, manager, logger);
-  network->keep_in(manager);
-  inherited.local.clear();
-  inherited.network.clear();
-
-  Registry registry(config.name, stream_limits(config));
-  OpenTable opens(open_limits(config));
-  PlaybackClockOwner clock;
-  DescriptorStore store(registry, clock, manager, logger);
-  const bool some_may_be_missing =
-      store.restore_untrusted(std::move(inherited.others), network->has_kept());
-  // Nothing tells whether there was a dssmd before this one when its socket was handed over.
-  const bool recovering = some_may_be_missing &&
-                          (listener->predecessor_died() || listener->inherited()) &&
-                          config.recovery_grace > Duration::zero();
-
-  wire::Greeting self = own_greeting(config.name);
-  const auto own_clock = std::make_shared<wire::ClockReport>();
-  self.clock = own_clock;
-  Catalog catalog(config.name);
-  Result<clock::ClockPageWriter> page = clock::ClockPageWriter::open(dir->clock_page_path());
-  if (!page) return std::move(page).error();
-  FleetClock fleet_clock(*loop, clock_options(config), *std::move(page), own_clock, self.host_id,
-                         catalog, logger);
-  Resolver resolver(*loop);
-  const ChannelParts parts{*loop, resolver, registry, logger, self, &fleet_clock};
-  Mirrors mirrors(parts, catalog, config.mirror_linger);
-  RemoteWriters writers(parts, catalog);
-  Peers peers(*loop, resolver, config.peers, self, catalog, logger);
-  FleetService fleet(*loop, {self, network->addresses(), config.insecure, &fleet_clock}, registry,
-                     catalog, peers, mirrors, writers);
-
-  LocalService service(registry, opens, clock, logger, recovering, &fleet);
-  Server server(*loop, *listener, config.max_clients, service, logger);
-  ChannelServer channels({*loop, registry, opens, logger, &fleet_clock}, self, peer_limits(config));
-
-  std::optional<Discovery> discovery;
-  if (config.mdns) {
-    discovery.emplace(*loop,
-                      Discovery::Options{self, reach_of(network->addresses()), config.insecure,
-                                         config.interfaces, config.avoid_interfaces},
-                      registry, peers, logger);
-  }
-  const auto serve_others = [&] {
-    channels.serve(*network);
-    if (discovery) discovery->start_announcing();
-  };
-  EventSource grace = EventSource::timer(*loop, [&] {
-    service.end_recovery();
-    serve_others();
-  });
-  if (!recovering) serve_others();
-  if (recovering) {
-    grace.enable_in(config.recovery_grace);
-    logger.notice(listener->predecessor_died()
-                      ? "the dssmd before this one did not end properly; programs give their "
-                        "streams back"
-                      : "started without streams; programs that hold some give them back",
-                  {.message_id = message_id::kRecovering});
-  }
-  EventSource stops[] = {EventSource::signal(*loop, SIGTERM, [&] { loop->stop(); }),
-                         EventSource::signal(*loop, SIGINT, [&] { loop->stop(); })};
-  for (EventSource& stop : stops) stop.enable();
-
-  StatusLine status(*loop, manager,
-                    [&] { return status_text(registry, peers, fleet_clock, *network); });
-  const StreamCount count(registry, status);
-  peers.on_change([&] { status.touch(); });
-  fleet_clock.on_news([&] {
-    channels.send_clock();
-    status.touch();
-  });
-  fleet_clock.on_change([&] {
-    mirrors.on_clock();
-    channels.on_clock();
-  });
-  Reloader reloader(
-      config, read_again,
-      [&](const Config& changed) {
-        logger.set_level(changed.log_level);
-        registry.set_limits(stream_limits(changed));
-        opens.set_limits(open_limits(changed));
-        server.set_max_clients(changed.max_clients);
-        channels.set_limits(peer_limits(changed));
-        mirrors.set_linger(changed.mirror_linger);
-        peers.set_configured(changed.peers);
-        fleet_clock.set(changed.clocks, changed.max_drift);
-      },
-      logger);
-  EventSource reload = EventSource::signal(*loop, SIGHUP, [&] {
-    manager.reloading();
-    reloader.reload();
-    manager.ready(status.now());
-  });
-  if (read_again) reload.enable();
-  requests.deliver();
-  if (config.insecure) {
-    logger.warning(
-        "insecure = true: samples cross the network in the clear, and whoever reaches this host "
-        "can read and write all its streams",
-        {.message_id = message_id::kInsecure});
-  }
-
-  const std::string ready =
-      "ready, host '" + config.name + "', socket '" + dir->socket_path() + "', " + network->str();
-  logger.notice(ready, {.message_id = message_id::kReady});
-  manager.ready(status.now());
-  const Watchdog watchdog(*loop, manager);
-  if (Result<void> ran = loop->run(); !ran) return ran;
-  manager.stopping();
-  peers.on_change({});
-  fleet_clock.on_news({});
-  fleet_clock.on_change({});
-  logger.notice("stopping", {.message_id = message_id::kStopping});
-  return {};
+  const Sockets sockets = DSSM_TRY(Sockets::open(config, inherited, manager, logger));
+  clock::ClockPageWriter page =
+      DSSM_TRY(clock::ClockPageWriter::open(sockets.dir.clock_page_path()));
+  Dssmd dssmd(config, loop, manager, sockets, std::move(page), std::move(inherited.others), logger);
+  return dssmd.run(read_again, signals);
 }
 
 std::unique_ptr<LeveledLogger> open_log(LogLevel level) {
@@ -269,7 +376,7 @@ std::unique_ptr<LeveledLogger> open_log(LogLevel level) {
   return std::make_unique<StderrLogger>(level, false);
 }
 
-// What is wrong with flags and configuration, a line each.
+// Prints the mistakes in flags and configuration, one a line.
 void print_errors(const std::string& mistakes) {
   std::optional<JournalLogger> journal;
   if (stderr_is_journal()) journal.emplace(LogLevel::error);
@@ -303,9 +410,7 @@ int main(int argc, char** argv) {
   Reloader::Read read_again;
   if (!line->config_path.empty()) {
     read_again = [argc, argv]() -> Result<Config> {
-      Result<CommandLine> again = parse_command_line(argc, argv);
-      if (!again) return std::move(again).error();
-      return std::move(again->config);
+      return DSSM_TRY(parse_command_line(argc, argv)).config;
     };
   }
   if (Result<void> ran = run(line->config, read_again, *logger); !ran) {

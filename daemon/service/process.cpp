@@ -25,13 +25,13 @@ void return_large_memory() noexcept {
   ::mallopt(M_TRIM_THRESHOLD, 8 << 20);
 }
 
-HeldRequests::HeldRequests() noexcept {
+BlockedSignals::BlockedSignals() noexcept {
   sigset_t requests;
   ::sigemptyset(&requests);
   for (const int number : {SIGINT, SIGTERM, SIGHUP}) ::sigaddset(&requests, number);
   ::pthread_sigmask(SIG_BLOCK, &requests, &before_);
 }
 
-void HeldRequests::deliver() noexcept { ::pthread_sigmask(SIG_SETMASK, &before_, nullptr); }
+void BlockedSignals::deliver() noexcept { ::pthread_sigmask(SIG_SETMASK, &before_, nullptr); }
 
 }  // namespace dssm::daemon

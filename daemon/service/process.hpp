@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What dssmd asks of the operating system for itself.
+// Settings of the dssmd process: descriptor limit, signals, memory.
 #pragma once
 
 #include <signal.h>
@@ -11,28 +11,28 @@ namespace dssm::daemon {
 // four, each client one.
 void raise_descriptor_limit() noexcept;
 
-// A program that vanished while it was written to is an error code, not the end.
+// Writing to a closed connection returns an error instead of ending dssmd (SIGPIPE).
 void ignore_broken_pipes() noexcept;
 
-// libprotobuf writes a line to stderr for each malformed string that a client sends: unbounded, and
-// waiting where nobody reads stderr. dssmd says itself what it refuses.
+// Keeps libprotobuf from writing a line to stderr for each malformed string that a client sends: that
+// has no limit, and it blocks when stderr is a full pipe. dssmd logs what it refuses.
 void silence_protobuf() noexcept;
 
-// What is freed in large pieces goes back to the system at once: otherwise the C library learns
-// from a few answers of 16 MiB to keep such pieces, and what peers made dssmd use stays used.
+// Returns large freed blocks to the system at once. Otherwise the C library raises its threshold
+// after a few responses of 16 MiB and keeps such blocks, so peers could make dssmd's memory grow.
 void return_large_memory() noexcept;
 
-// Keeps requests to stop or to read the configuration anew (SIGINT, SIGTERM, SIGHUP) for later,
-// while dssmd starts: whoever sees its socket may send one, and dssmd ends as it always does. For
-// one thread, before there are others; those that it starts meanwhile never take one.
-class HeldRequests {
+// Blocks SIGINT, SIGTERM and SIGHUP while dssmd starts, so that one which is sent as soon as the
+// socket exists still ends or reloads dssmd in the usual way. To be used by the first thread, before
+// it starts others; threads started meanwhile never receive these signals.
+class BlockedSignals {
  public:
-  HeldRequests() noexcept;
-  HeldRequests(const HeldRequests&) = delete;
-  HeldRequests& operator=(const HeldRequests&) = delete;
-  ~HeldRequests() { deliver(); }
+  BlockedSignals() noexcept;
+  BlockedSignals(const BlockedSignals&) = delete;
+  BlockedSignals& operator=(const BlockedSignals&) = delete;
+  ~BlockedSignals() { deliver(); }
 
-  // What has come, and what comes from now on. A second call does nothing.
+  // Delivers those that arrived, and all from now on. A second call does nothing.
   void deliver() noexcept;
 
  private:

@@ -353,7 +353,7 @@ TEST(LocalService, HoldsBackWhoWantsAStreamThatMayStillBeOffered) {
   EXPECT_TRUE(same_file(fresh.last_descriptors.at(0).get(), ring.get())) << "the old ring";
 }
 
-TEST(LocalService, AnswersHeldRequestsWhenRecoveryEnds) {
+TEST(LocalService, AnswersBlockedSignalsWhenRecoveryEnds) {
   Daemon daemon(true);
   FakeClient client(daemon.service, 6);
   client.greet();
