@@ -13,7 +13,7 @@
 #include <string>
 #include <vector>
 
-#include "daemon/remote/remote_writer_keeper.hpp"
+#include "daemon/streams/create_plan.hpp"
 #include "daemon/streams/stream.hpp"
 #include "local.pb.h"
 
@@ -47,8 +47,7 @@ class Fleet {
 
   // A ring of this host that is published into the other host's stream.
   //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist
-  virtual void open_writer(const StreamId& id, const CreatePlan* plan,
-                           Then<OpenedRemoteWriter> then) = 0;
+  virtual void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) = 0;
 
   // A mirror's or remote writer's ring that a program held while dssmd was away, to be gone on
   // with.

@@ -122,8 +122,7 @@ void FleetService::open_reader(const StreamId& id, Then<std::shared_ptr<Stream>>
   });
 }
 
-void FleetService::open_writer(const StreamId& id, const CreatePlan* plan,
-                               Then<OpenedRemoteWriter> then) {
+void FleetService::open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) {
   const std::optional<CreatePlan> kept = plan ? std::optional(*plan) : std::nullopt;
   when_known(id, [this, id, kept, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);

@@ -53,8 +53,7 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
     return id.host.empty() ? catalog_.find_owner(id).has_value() : catalog_.has(id);
   }
   void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) override;
-  void open_writer(const StreamId& id, const CreatePlan* plan,
-                   Then<OpenedRemoteWriter> then) override;
+  void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) override;
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
                                                   OfferedFiles files) override;
   void info(const StreamId& id, Then<proto::Stream> then) override;

@@ -78,8 +78,7 @@ void RemoteRequests::create(const Client& client, const StreamId& id, const loca
   const CreatePlan plan{*type, {request.depth(), Duration(request.cycle_ns())}};
   fleet_.open_writer(
       id, &plan,
-      [this, client, tag = request.tag(),
-       answer = std::move(answer)](Result<OpenedRemoteWriter> writer) {
+      [this, client, tag = request.tag(), answer = std::move(answer)](Result<OpenedRing> writer) {
         if (!writer) return answer(std::move(writer).error());
         Result<Reply> reply = opened(opens_, {client, writer->stream, Role::writer, tag, false});
         if (reply) {
@@ -98,8 +97,7 @@ void RemoteRequests::open(const Client& client, const StreamId& id, const local:
   if (request.for_writing()) {
     return fleet_.open_writer(
         id, nullptr,
-        [this, client, tag, any_host,
-         answer = std::move(answer)](Result<OpenedRemoteWriter> writer) {
+        [this, client, tag, any_host, answer = std::move(answer)](Result<OpenedRing> writer) {
           if (!writer) return answer(std::move(writer).error());
           answer(opened(opens_, {client, writer->stream, Role::writer, tag, any_host}));
         });

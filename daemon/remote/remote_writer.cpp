@@ -232,7 +232,7 @@ void RemoteWriter::on_gap(Tid, std::uint64_t count) {
 
 // --- programs
 
-OpenedRemoteWriter RemoteWriter::lend(bool created) {
+OpenedRing RemoteWriter::lend(bool created) {
   done_ = false;
   return {lender_.lend(ring_->stream()), created};
 }

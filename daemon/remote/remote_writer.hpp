@@ -101,7 +101,7 @@ class RemoteWriter final : private OwnerConnection::Observer,
   void stop_publishing() noexcept;
   void on_refused(const Error& why);
 
-  OpenedRemoteWriter lend(bool created);
+  OpenedRing lend(bool created);
   Result<void> check_plan(const CreatePlan* plan);
   void answer_waiting(bool created);
   void fail_waiting(const Error& why);

@@ -14,16 +14,10 @@
 
 namespace dssm::daemon {
 
-// A remote writer that a program may write to now.
-struct OpenedRemoteWriter {
-  std::shared_ptr<Stream> stream;  // the local ring; its id names the owner's host
-  bool created = false;            // the owner's stream was created by this very open
-};
-
 class RemoteWriterKeeper {
  public:
   // Called once, from the loop, or at once from within open(); never after the keeper is gone.
-  using Then = std::function<void(Result<OpenedRemoteWriter>)>;
+  using Then = std::function<void(Result<OpenedRing>)>;
 
   // A ring here whose samples go to `id`, a stream of `host`: the one that is there, or a new one
   // after the owner agreed. `host` is good during the call only.

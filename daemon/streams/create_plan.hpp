@@ -1,7 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// What a program asks for when it opens a stream of another host, and what it gets.
 #pragma once
 
 #include <dssm/stream.hpp>
+#include <memory>
 
 namespace dssm::daemon {
 
@@ -9,6 +12,14 @@ namespace dssm::daemon {
 struct CreatePlan {
   TypeInfo type;
   History history;
+};
+
+class Stream;
+
+// A ring of this host, a mirror's or a remote writer's, that a program may use now.
+struct OpenedRing {
+  std::shared_ptr<Stream> stream;  // its id names the owner's host
+  bool created = false;            // this open created the owner's stream
 };
 
 }  // namespace dssm::daemon

@@ -26,13 +26,12 @@ class LateFleet final : public Fleet {
   void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) override {
     due_.push_back([this, id, then = std::move(then)] { then(ring(id)); });
   }
-  void open_writer(const StreamId& id, const CreatePlan* plan,
-                   Then<OpenedRemoteWriter> then) override {
+  void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) override {
     if (plan) replace(id);
     due_.push_back([this, id, then = std::move(then)] {
       const Result<std::shared_ptr<Stream>> stream = ring(id);
       if (!stream) return then(stream.error());
-      then(OpenedRemoteWriter{*stream, false});
+      then(OpenedRing{*stream, false});
     });
   }
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role,

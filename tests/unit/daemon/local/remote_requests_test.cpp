@@ -30,8 +30,7 @@ class FakeFleet final : public Fleet {
     asked.push_back("open_reader " + id.str());
     reader_then = std::move(then);
   }
-  void open_writer(const StreamId& id, const CreatePlan* plan,
-                   Then<OpenedRemoteWriter> then) override {
+  void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) override {
     asked.push_back("open_writer " + id.str() +
                     (plan ? " depth " + std::to_string(plan->history.depth) : ""));
     writer_then = std::move(then);
@@ -94,7 +93,7 @@ class FakeFleet final : public Fleet {
   Observer* observer = nullptr;
   std::vector<std::string> asked;
   Then<std::shared_ptr<Stream>> reader_then;
-  Then<OpenedRemoteWriter> writer_then;
+  Then<OpenedRing> writer_then;
   std::vector<Then<std::vector<proto::Stream>>> list_then;
   std::vector<StreamInfo> known;
   std::set<std::string> there;
@@ -173,7 +172,7 @@ TEST_F(RemoteRequestsTest, CreatesHereUnlessToldOtherwise) {
   create.mutable_create()->mutable_id()->set_host("pc2");
   put(create);
   EXPECT_EQ(fleet.asked, Asked{"open_writer lidar:0@pc2 depth 16"});
-  fleet.writer_then(OpenedRemoteWriter{fleet.ring("lidar"), true});
+  fleet.writer_then(OpenedRing{fleet.ring("lidar"), true});
   const local::Response answer = client->next();
   EXPECT_TRUE(answer.opened().created());
   EXPECT_FALSE(answer.opened().mirror());
@@ -184,7 +183,7 @@ TEST_F(RemoteRequestsTest, CreatesHereUnlessToldOtherwise) {
 TEST_F(RemoteRequestsTest, OpensForWritingWhatMustExist) {
   put(open_at("lidar", "pc2", true));
   EXPECT_EQ(fleet.asked, Asked{"open_writer lidar:0@pc2"});
-  fleet.writer_then(OpenedRemoteWriter{fleet.ring("lidar"), false});
+  fleet.writer_then(OpenedRing{fleet.ring("lidar"), false});
   EXPECT_FALSE(client->next().opened().created());
   EXPECT_EQ(client->last_descriptors.size(), 4u);
 }
@@ -312,7 +311,7 @@ TEST_F(RemoteRequestsTest, TellsReadersOfAReplacedMirror) {
   fleet.reader_then(ring);
   const std::uint64_t handle = client->next().opened().handle();
   put(open_at("lidar", "pc2", true));
-  fleet.writer_then(OpenedRemoteWriter{ring, false});
+  fleet.writer_then(OpenedRing{ring, false});
   client->next();
   fleet.observer->on_ring_replaced(*ring);
   const local::Response event = client->next();

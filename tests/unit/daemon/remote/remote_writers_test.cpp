@@ -72,15 +72,14 @@ class RemoteWritersTest : public testing::Test {
     catalog.host_up(owner->host().greeting, owner->host().address);
   }
 
-  using Answer = std::optional<Result<OpenedRemoteWriter>>;
+  using Answer = std::optional<Result<OpenedRing>>;
   std::shared_ptr<Answer> open(const CreatePlan* with) {
     auto answer = std::make_shared<Answer>();
-    writers->open(owner->host(), kOdometry, with, [answer](Result<OpenedRemoteWriter> result) {
-      answer->emplace(std::move(result));
-    });
+    writers->open(owner->host(), kOdometry, with,
+                  [answer](Result<OpenedRing> result) { answer->emplace(std::move(result)); });
     return answer;
   }
-  OpenedRemoteWriter wait(const std::shared_ptr<Answer>& answer) {
+  OpenedRing wait(const std::shared_ptr<Answer>& answer) {
     run_until(loop, [&] { return answer->has_value(); });
     return (*answer)->value();
   }
@@ -144,7 +143,7 @@ TEST_F(RemoteWritersTest, CreatesTheStreamAtItsOwnerAndPublishes) {
   EXPECT_EQ(create.create().type().name(), "Odometry");
   owner->say(theirs, create);
   publishing(owner->take(), -1);
-  const OpenedRemoteWriter writer = wait(answer);
+  const OpenedRing writer = wait(answer);
   EXPECT_FALSE(writer.created);
   EXPECT_EQ(writer.stream->id(), kOdometry);
   EXPECT_EQ(writer.stream->type(), odometry_type());
@@ -219,8 +218,7 @@ TEST_F(RemoteWritersTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
   const KnownHost host = owner->host();
   owner.reset();
   std::optional<Error> error;
-  writers->open(host, kOdometry, &plan,
-                [&](Result<OpenedRemoteWriter> result) { error = result.error(); });
+  writers->open(host, kOdometry, &plan, [&](Result<OpenedRing> result) { error = result.error(); });
   run_until(loop, [&] { return error.has_value(); });
   EXPECT_EQ(error->code, Errc::unavailable);
   EXPECT_NE(error->message.find("odometry:0@pc2"), std::string::npos) << error->message;
