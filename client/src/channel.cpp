@@ -9,6 +9,7 @@
 
 #include "client/src/find_host.hpp"
 #include "client/src/program_name.hpp"
+#include "core/base/timespec.hpp"
 
 namespace dssm::detail {
 namespace {
@@ -242,11 +243,7 @@ WaitStatus Channel::run(MonoTime deadline, bool interruptible, Done done) {
       continue;
     }
     const MonoTime until = std::min(deadline, next_step());
-    timespec timeout{};
-    if (until != kNever) {
-      const std::int64_t ns = std::max<std::int64_t>(0, to_ns(until - MonoClock::now()));
-      timeout = {ns / 1'000'000'000, ns % 1'000'000'000};
-    }
+    const timespec timeout = timespec_of(until - MonoClock::now());
     pollfd ready{link_.fd(), link_.events(has_more_to_send()), 0};
     const int count = ::ppoll(&ready, 1, until == kNever ? nullptr : &timeout, nullptr);
     if (count > 0) {

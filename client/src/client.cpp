@@ -8,8 +8,10 @@
 
 #include <cstdlib>
 
-#include "client/src/quiet_thread.hpp"
-#include "core/base/utf8.hpp"
+#include "client/src/program_name.hpp"
+#include "core/base/quiet_thread.hpp"
+#include "core/base/timespec.hpp"
+#include "core/base/try.hpp"
 #include "core/wire/fd_socket.hpp"
 
 namespace dssm::detail {
@@ -32,12 +34,6 @@ std::string default_socket_path() {
   const char* path =
       std::getenv("DSSM_SOCKET");  // NOLINT(concurrency-mt-unsafe): read once, at connect
   return path && *path ? path : wire::kDefaultSocketPath;
-}
-
-std::string default_program() {
-  std::string name = program_invocation_short_name;
-  name.resize(std::min(name.size(), wire::kMaxProgramBytes));
-  return is_utf8(name) ? name : "?";
 }
 
 SessionOptions completed(SessionOptions options) {
@@ -243,7 +239,8 @@ Result<std::shared_ptr<Client>> Client::connect(SessionOptions options) {
   auto link = client->shake_hands();
   if (!link) return std::move(link).error();
   client->start_using(std::move(*link));
-  client->keeper_ = quiet_thread([self = client.get()] { self->keep(); });
+  client->keeper_ =
+      DSSM_TRY(quiet_thread("the connection to dssmd", [self = client.get()] { self->keep(); }));
   return client;
 }
 
@@ -527,7 +524,7 @@ void Client::stop_using() {
 
 bool Client::pause(Duration time) const {
   pollfd stop{stop_fd_.get(), POLLIN, 0};
-  const timespec timeout{to_ns(time) / 1'000'000'000, to_ns(time) % 1'000'000'000};
+  const timespec timeout = timespec_of(time);
   return ::ppoll(&stop, 1, &timeout, nullptr) <= 0;
 }
 

@@ -7,6 +7,7 @@
 #include <algorithm>
 #include <array>
 
+#include "core/base/text.hpp"
 #include "core/clock/clock_page.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/tcp.hpp"
@@ -17,8 +18,6 @@ namespace {
 // For one address: longer than a lost first packet takes to be sent again (1 s).
 constexpr Duration kConnectTimeout = std::chrono::seconds(2);
 
-constexpr std::size_t kMaxHostBytes = 31;
-
 // This PC's name as a greeting wants it: letters, digits and '-'.
 std::string own_host() {
   std::array<char, 256> text{};
@@ -26,7 +25,7 @@ std::string own_host() {
   std::string name(text.data());
   name.resize(std::min({name.find('.'), name.size(), kMaxHostBytes}));
   for (char& c : name) {
-    if (!((c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9'))) c = '-';
+    if (!is_letter_or_digit(c)) c = '-';
   }
   return name.empty() ? "unnamed" : name;
 }

@@ -4,7 +4,8 @@
 #include <sys/eventfd.h>
 #include <unistd.h>
 
-#include "client/src/quiet_thread.hpp"
+#include "core/base/quiet_thread.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::detail {
 
@@ -43,7 +44,8 @@ Result<std::unique_ptr<Notifier>> Notifier::start() {
   if (!bell) return std::move(bell).error();
   std::unique_ptr<Notifier> notifier(new Notifier);
   notifier->control_ = std::move(*bell);
-  notifier->thread_ = quiet_thread([self = notifier.get()] { self->run(); });
+  notifier->thread_ =
+      DSSM_TRY(quiet_thread("pollable descriptors", [self = notifier.get()] { self->run(); }));
   return notifier;
 }
 

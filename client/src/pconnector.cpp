@@ -10,6 +10,7 @@
 #include "client/src/find_host.hpp"
 #include "client/src/program_name.hpp"
 #include "client/src/states.hpp"
+#include "core/base/timespec.hpp"
 
 namespace dssm {
 namespace detail {
@@ -62,9 +63,7 @@ Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
       if (Result<void> sent = link.send_queued(); !sent) return std::move(sent).error();
     }
     const MonoTime now = MonoClock::now();
-    const std::int64_t ns =
-        std::max<std::int64_t>(0, to_ns(std::min(deadline, link.next_step()) - now));
-    const timespec timeout{ns / 1'000'000'000, ns % 1'000'000'000};
+    const timespec timeout = timespec_of(std::min(deadline, link.next_step()) - now);
     pollfd ready{link.fd(), link.events(false), 0};
     if (::ppoll(&ready, 1, &timeout, nullptr) > 0) {
       if (auto received = link.receive(); !received) return std::move(received).error();

@@ -6,6 +6,8 @@
 
 #include <algorithm>
 
+#include "core/base/timespec.hpp"
+
 namespace dssm::detail {
 
 Result<Readiness> Readiness::make() {
@@ -35,8 +37,7 @@ void Readiness::follow(int socket, short events, MonoTime at) noexcept {
   }
   itimerspec timer{};  // all 0: off
   if (at != kNever) {
-    const std::int64_t ns = std::max<std::int64_t>(1, to_ns(at.time_since_epoch()));
-    timer.it_value = {ns / 1'000'000'000, ns % 1'000'000'000};
+    timer.it_value = timespec_of(std::max(at, MonoTime(Duration(1))));
   }
   ::timerfd_settime(timer_.get(), TFD_TIMER_ABSTIME, &timer, nullptr);
 }

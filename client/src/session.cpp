@@ -6,6 +6,7 @@
 
 #include "client/src/client.hpp"
 #include "client/src/states.hpp"
+#include "core/base/text.hpp"
 #include "core/wire/clock_report.hpp"
 
 namespace dssm {
@@ -41,16 +42,6 @@ Result<std::vector<StreamInfo>> listed(detail::Client& client, bool own_only) {
     streams.push_back(wire::stream_info(stream));
   }
   return streams;
-}
-
-std::string hex(std::string_view bytes) {
-  constexpr char kDigits[] = "0123456789abcdef";
-  std::string digits;
-  for (const char c : bytes) {
-    const auto byte = static_cast<unsigned char>(c);
-    digits += {kDigits[byte >> 4], kDigits[byte & 15]};
-  }
-  return digits;
 }
 
 // Between two tries for what is no event of a stream.

@@ -5,17 +5,12 @@
 #include <charconv>
 #include <dssm/stream.hpp>
 
-#include "core/base/utf8.hpp"
+#include "core/base/text.hpp"
 
 namespace dssm {
 namespace {
 
 Error invalid(std::string message) { return Error{Errc::invalid_argument, std::move(message)}; }
-
-bool is_control(char c) noexcept {
-  const auto byte = static_cast<unsigned char>(c);
-  return byte < 0x20 || byte == 0x7f;
-}
 
 }  // namespace
 

@@ -13,6 +13,8 @@
 #include <cerrno>
 #include <climits>
 
+#include "core/base/timespec.hpp"
+
 namespace dssm::ring {
 namespace {
 
@@ -29,12 +31,7 @@ struct WaitVector {
 constexpr long kFutexWaitvNumber = 449;  // on every architecture
 constexpr std::uint32_t kFutex32 = 2;    // FUTEX_32; shared, as FUTEX_PRIVATE_FLAG is not set
 
-timespec to_timespec(MonoTime time) noexcept {
-  const std::int64_t ns = std::max<std::int64_t>(to_ns(time.time_since_epoch()), 0);
-  return {ns / 1'000'000'000, ns % 1'000'000'000};
-}
-
-constexpr timespec kMaxSleepTime{kMaxSleep / std::chrono::seconds(1), 0};
+constexpr timespec kMaxSleepTime = timespec_of(kMaxSleep);
 
 // When to look up although nobody rang.
 MonoTime look_up(MonoTime deadline) noexcept { return std::min(deadline, deadline_in(kMaxSleep)); }
@@ -93,7 +90,7 @@ Bell::~Bell() {
         ::syscall(SYS_futex, &page_->word, FUTEX_WAIT, announced, &kMaxSleepTime, nullptr, 0);
     return outcome(result, errno, deadline);
   }
-  const timespec until = to_timespec(look_up(deadline));
+  const timespec until = timespec_of(look_up(deadline));
   const long result = ::syscall(SYS_futex, &page_->word, FUTEX_WAIT_BITSET, announced, &until,
                                 nullptr, FUTEX_BITSET_MATCH_ANY);
   return outcome(result, errno, deadline);
@@ -107,11 +104,11 @@ WaitStatus Bell::sleep_any(std::span<Bell* const> bells, std::span<const std::ui
     vectors[i] = {announced[i], reinterpret_cast<std::uintptr_t>(&bells[i]->page_->word), kFutex32,
                   0};
   }
-  timespec until = to_timespec(look_up(deadline));
+  timespec until = timespec_of(look_up(deadline));
   const long result =
       ::syscall(kFutexWaitvNumber, vectors.data(), count, 0, &until, CLOCK_MONOTONIC);
   if (result >= 0 || errno != ENOSYS) return outcome(result, errno, deadline);
-  until = to_timespec(std::min(deadline, deadline_in(std::chrono::milliseconds(1))));
+  until = timespec_of(std::min(deadline, deadline_in(std::chrono::milliseconds(1))));
   const int error = ::clock_nanosleep(CLOCK_MONOTONIC, TIMER_ABSTIME, &until, nullptr);
   if (error == EINTR) return WaitStatus::interrupted;
   return MonoClock::now() >= deadline ? WaitStatus::timeout : WaitStatus::ready;

@@ -94,9 +94,9 @@ ClockReport clock_report_untrusted(const proto::ClockStatus& message, MonoTime h
   report.offset = Duration(message.offset_ns());
   report.update_interval = Duration(std::max<std::int64_t>(message.update_interval_ns(), 0));
   report.age = Duration(std::max<std::int64_t>(message.age_ns(), 0));
-  const auto is_printable = [](unsigned char c) { return c >= 0x20 && c < 0x7f; };
+  const auto is_shown = [](char c) { return c >= 0x20 && c < 0x7f; };
   if (message.reference().size() <= kMaxReferenceBytes &&
-      std::all_of(message.reference().begin(), message.reference().end(), is_printable)) {
+      std::all_of(message.reference().begin(), message.reference().end(), is_shown)) {
     report.reference = message.reference();
   }
   report.stratum = static_cast<std::uint16_t>(std::min(message.stratum(), 16U));

@@ -12,6 +12,7 @@
 #include <cstring>
 
 #include "core/base/sha256.hpp"
+#include "core/base/text.hpp"
 #include "core/base/unique_fd.hpp"
 
 namespace dssm::wire {
@@ -21,23 +22,9 @@ namespace {
 // made once; changing it changes the identity of every host.
 constexpr std::string_view kApplicationId = "677a14dda84aa85900164edec47f0e46";
 constexpr std::size_t kMachineIdBytes = 32;  // hexadecimal digits, machine-id(5)
-constexpr std::size_t kMaxHostBytes = 31;
 
 Error bad(const std::string& who, std::string_view why) {
   return Error{Errc::protocol, who + " greets with " + std::string(why)};
-}
-
-bool is_host_name(std::string_view name) {
-  return !name.empty() && name.size() <= kMaxHostBytes &&
-         std::all_of(name.begin(), name.end(), [](char c) {
-           return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') ||
-                  c == '-';
-         });
-}
-
-bool is_printable(std::string_view text) {
-  return std::none_of(text.begin(), text.end(),
-                      [](unsigned char c) { return c < 0x20 || c == 0x7f; });
 }
 
 // Nobody knows how long it was under way, but a connection that takes longer is dead.
@@ -104,15 +91,15 @@ Error other_protocol_version(const std::string& who, std::uint32_t theirs,
 
 Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string& who) {
   const bool words_are_good =
-      message.program().size() <= kMaxProgramBytes && is_printable(message.program()) &&
-      message.version().size() <= kMaxProgramBytes && is_printable(message.version());
+      message.program().size() <= kMaxProgramBytes && !has_control(message.program()) &&
+      message.version().size() <= kMaxProgramBytes && !has_control(message.version());
   if (message.protocol_version() != kNetworkProtocolVersion) {
     // A later version may use the other fields in another way: only what can be shown is shown.
     return other_protocol_version(who, message.protocol_version(),
                                   words_are_good ? message.version() : std::string());
   }
   Greeting greeting;
-  if (!is_host_name(message.host())) {
+  if (!check_host_name(message.host())) {
     return bad(who, "a host name that is not 1 to 31 letters, digits and '-'");
   }
   if (message.host_id().size() != greeting.host_id.size()) {
@@ -128,7 +115,7 @@ Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string
     return bad(who, "more than 32 features");
   }
   for (const std::string& feature : message.features()) {
-    if (feature.empty() || feature.size() > kMaxFeatureBytes || !is_printable(feature)) {
+    if (feature.empty() || feature.size() > kMaxFeatureBytes || has_control(feature)) {
       return bad(who, "a feature that is empty, longer than 63 bytes or holds control characters");
     }
     greeting.features.push_back(feature);

@@ -7,6 +7,8 @@
 #include <cstring>
 #include <utility>
 
+#include "core/base/text.hpp"
+
 namespace dssm::daemon {
 namespace {
 

@@ -9,6 +9,8 @@
 #include <cstdlib>
 #include <string>
 
+#include "core/base/text.hpp"
+
 namespace dssm::daemon {
 namespace {
 
@@ -64,19 +66,6 @@ bool stderr_is_journal() noexcept {
   struct stat file {};
   if (!stream || ::fstat(STDERR_FILENO, &file)) return false;
   return stream == std::to_string(file.st_dev) + ":" + std::to_string(file.st_ino);
-}
-
-std::string printable(std::string_view text) {
-  std::string out(text);
-  for (char& c : out) {
-    if (static_cast<unsigned char>(c) < 0x20 || c == 0x7f) c = '?';
-  }
-  return out;
-}
-
-std::string in_quotes(std::string_view text) {
-  std::string out = "'";
-  return out.append(printable(text)).append("'");
 }
 
 }  // namespace dssm::daemon

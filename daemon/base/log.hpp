@@ -67,11 +67,4 @@ class StderrLogger final : public LeveledLogger {
 // Whether this process's stderr goes to the journal ($JOURNAL_STREAM names it).
 bool stderr_is_journal() noexcept;
 
-// `text` with control characters replaced by '?', so that what a client calls itself cannot forge
-// log lines.
-std::string printable(std::string_view text);
-
-// The same in single quotes, as messages show what they are about.
-std::string in_quotes(std::string_view text);
-
 }  // namespace dssm::daemon

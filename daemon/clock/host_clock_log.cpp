@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/clock/host_clock_log.hpp"
 
+#include "core/base/text.hpp"
 #include "daemon/base/message_ids.hpp"
 
 namespace dssm::daemon {

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <utility>
 
+#include "core/base/text.hpp"
 #include "daemon/base/message_ids.hpp"
 #include "daemon/fleet/service_record.hpp"
 
@@ -271,7 +272,7 @@ void Peers::on_own_id(Peer& peer) {
   peer.use = is_self ? Use::self : Use::not_usable;
   if (peer.use == Use::not_usable) {
     peer.warning = "the dssmd at '" + link.address() + "' has this host's name '" + self_.host +
-                   "' and machine id (host id " + hex_of(self_.host_id) +
+                   "' and machine id (host id " + hex(self_.host_id) +
                    "), so neither sees the other's streams; give one of them another name (key "
                    "name), and a copied PC its own machine id (rm /etc/machine-id && "
                    "systemd-machine-id-setup)";

@@ -10,7 +10,7 @@
 #include <limits>
 
 #include "core/base/sha256.hpp"
-#include "core/base/utf8.hpp"
+#include "core/base/text.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/service/config_values.hpp"
 
@@ -22,28 +22,6 @@ constexpr std::size_t kHexDigits = 16;  // of 64 bits
 
 // The longest value of ours: with its key and '=' it fits into one string of a TXT record.
 static_assert(std::string_view("type=").size() + kMaxTypeNameBytes <= 255);
-
-std::string hex_of(const std::uint8_t* bytes, std::size_t count) {
-  constexpr std::string_view digits = "0123456789abcdef";
-  std::string text;
-  for (std::size_t i = 0; i < count; ++i) {
-    text += digits[bytes[i] >> 4];
-    text += digits[bytes[i] & 15];
-  }
-  return text;
-}
-
-std::string hex_of(std::uint64_t value) {
-  std::uint8_t bytes[8];
-  for (std::size_t i = 0; i < sizeof bytes; ++i) {
-    bytes[i] = static_cast<std::uint8_t>(value >> (56 - 8 * i));
-  }
-  return hex_of(bytes, sizeof bytes);
-}
-
-bool is_letter_or_digit(char c) {
-  return (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9');
-}
 
 // A label as Avahi wants it inside the text of a domain name; equal to what avahi_escape_label()
 // makes of it.
@@ -194,7 +172,7 @@ std::string ServiceRecord::subtype() const {
 TxtRecord ServiceRecord::txt() const {
   TxtRecord txt = {{"txtvers", std::string(kTxtVersion)},
                    {"host", host},
-                   {"hid", hex_of(host_id)},
+                   {"hid", hex(host_id)},
                    {"proto", std::to_string(protocol_version)}};
   if (closed) txt.emplace_back("closed", "");
   if (!stream) return txt;
@@ -204,12 +182,10 @@ TxtRecord ServiceRecord::txt() const {
   txt.emplace_back("depth", std::to_string(stream->depth));
   txt.emplace_back("cycle", std::to_string(to_ns(stream->cycle)));
   if (!stream->type.empty()) txt.emplace_back("type", stream->type);
-  txt.emplace_back("hash", hex_of(stream->type_hash));
-  txt.emplace_back("ring", hex_of(stream->incarnation));
+  txt.emplace_back("hash", hex(stream->type_hash));
+  txt.emplace_back("ring", hex(stream->incarnation));
   return txt;
 }
-
-std::string hex_of(const wire::HostId& id) { return hex_of(id.data(), id.size()); }
 
 std::uint64_t type_hash(const TypeInfo& type) {
   // Names by their lengths, since they may hold any character.

@@ -58,9 +58,6 @@ struct ServiceRecord {
   friend bool operator==(const ServiceRecord&, const ServiceRecord&) = default;
 };
 
-// A host id as `hid` and `dssmctl hosts --json` have it.
-std::string hex_of(const wire::HostId& id);
-
 // Tells types apart that have one name; equal for equal types, on every host and in every version
 // (docs/discovery.md "Records").
 std::uint64_t type_hash(const TypeInfo& type);

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/link/resolver.hpp"
 
-#include <signal.h>
 #include <sys/eventfd.h>
 #include <unistd.h>
 
@@ -14,6 +13,7 @@
 #include <utility>
 
 #include "core/base/check.hpp"
+#include "core/base/quiet_thread.hpp"
 #include "core/base/unique_fd.hpp"
 
 namespace dssm::daemon {
@@ -77,14 +77,14 @@ Resolver::Ticket Resolver::resolve(const wire::Address& address, Then then) {
     shared_->answer(address, number);
     return question;
   }
-  if (!std::exchange(started_, true)) {
-    // Signals are the loop's: a thread inherits the mask it is started under.
-    sigset_t all, before;
-    ::sigfillset(&all);
-    ::pthread_sigmask(SIG_SETMASK, &all, &before);
-    // Detached, because nobody could wait for it without waiting for getaddrinfo().
-    std::thread([shared = shared_] { work(shared); }).detach();
-    ::pthread_sigmask(SIG_SETMASK, &before, nullptr);
+  if (!started_) {
+    Result<std::thread> thread = quiet_thread("the resolver", [shared = shared_] { work(shared); });
+    if (!thread) {
+      shared_->answer(address, std::move(thread).error());
+      return question;
+    }
+    thread->detach();  // to join it would mean to wait for getaddrinfo()
+    started_ = true;
   }
   shared_->asked_or_ended.notify_one();
   return question;

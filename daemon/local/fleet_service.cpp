@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <utility>
 
+#include "core/base/text.hpp"
 #include "daemon/base/log.hpp"
 
 namespace dssm::daemon {

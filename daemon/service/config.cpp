@@ -11,8 +11,8 @@
 #include <map>
 #include <vector>
 
+#include "core/base/text.hpp"
 #include "core/base/unique_fd.hpp"
-#include "core/base/utf8.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/service/config_values.hpp"
 

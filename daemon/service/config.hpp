@@ -31,8 +31,6 @@ inline constexpr std::uint64_t kMostClients = 32768;
 inline constexpr std::uint64_t kMostOpens = 100'000;
 inline constexpr std::uint64_t kMostConnections = 32768;
 
-inline constexpr std::size_t kMaxHostBytes = 31;
-
 struct Config {
   std::string name;  // of this host; empty until finish() puts the machine's name there
   std::string runtime_dir = "/run/dssm";

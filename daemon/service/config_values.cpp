@@ -10,6 +10,7 @@
 #include <string>
 #include <vector>
 
+#include "core/base/text.hpp"
 #include "daemon/service/config.hpp"
 
 namespace dssm::daemon {
@@ -226,21 +227,6 @@ Result<LogLevel> parse_log_level(std::string_view text) {
   if (text == "info") return LogLevel::info;
   if (text == "debug") return LogLevel::debug;
   return invalid(in_quotes(text) + " is no level; write error, warning, notice, info or debug");
-}
-
-Result<void> check_host_name(std::string_view text) {
-  if (text.empty() || text.size() > kMaxHostBytes) {
-    return invalid(in_quotes(text) + " is " + std::to_string(text.size()) +
-                   " bytes long; a host's name takes 1 to " + std::to_string(kMaxHostBytes));
-  }
-  for (const char c : text) {
-    const bool good =
-        (c >= 'a' && c <= 'z') || (c >= 'A' && c <= 'Z') || (c >= '0' && c <= '9') || c == '-';
-    if (!good) {
-      return invalid(in_quotes(text) + " holds other characters than letters, digits and '-'");
-    }
-  }
-  return {};
 }
 
 std::uint64_t memory_of_the_machine() noexcept {

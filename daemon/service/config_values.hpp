@@ -54,9 +54,6 @@ Result<std::string> parse_interface(std::string_view text);
 // error, warning, notice, info, debug
 Result<LogLevel> parse_log_level(std::string_view text);
 
-// 1 to 31 bytes of letters, digits and '-': what stands behind '@' in a stream's name.
-Result<void> check_host_name(std::string_view text);
-
 // 0 when the system does not say.
 std::uint64_t memory_of_the_machine() noexcept;
 

@@ -16,6 +16,7 @@
 #include <utility>
 
 #include "core/base/check.hpp"
+#include "core/base/text.hpp"
 #include "daemon/base/log.hpp"
 
 namespace dssm::daemon {

@@ -6,7 +6,7 @@
 #include <algorithm>
 #include <cstdlib>
 
-#include "core/base/utf8.hpp"
+#include "core/base/text.hpp"
 #include "daemon/fleet/service_record.hpp"
 
 namespace dssm::daemon {

@@ -1,38 +1,28 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Waiting as old programs know it: until it works, or until the person presses Ctrl-C.
+// Waiting in a loop until something succeeds or the person presses Ctrl-C.
 #pragma once
 
 #include <poll.h>
-#include <signal.h>
 
-#include <algorithm>
 #include <cerrno>
-#include <dssm/time.hpp>
+
+#include "core/base/quiet_thread.hpp"
+#include "core/base/timespec.hpp"
 
 namespace dssm::ssm {
 
-// Signals are let in only in pause(), so that none is missed between two looks.
+// Blocks signals except in pause(), so that none is missed between two checks.
 class Interruptible {
  public:
-  Interruptible() noexcept {
-    sigset_t all;
-    ::sigfillset(&all);
-    ::pthread_sigmask(SIG_SETMASK, &all, &before_);
-  }
-  Interruptible(const Interruptible&) = delete;
-  Interruptible& operator=(const Interruptible&) = delete;
-  ~Interruptible() { ::pthread_sigmask(SIG_SETMASK, &before_, nullptr); }
-
   // Sleeps for `time`. False: a signal handler ran.
   bool pause(Duration time) noexcept {
-    const std::int64_t ns = std::max<std::int64_t>(0, to_ns(time));
-    const timespec sleep{ns / 1'000'000'000, ns % 1'000'000'000};
-    return !(::ppoll(nullptr, 0, &sleep, &before_) < 0 && errno == EINTR);
+    const timespec sleep = timespec_of(time);
+    return !(::ppoll(nullptr, 0, &sleep, &block_.before()) < 0 && errno == EINTR);
   }
 
  private:
-  sigset_t before_{};
+  SignalBlock block_;
 };
 
 }  // namespace dssm::ssm

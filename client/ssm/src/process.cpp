@@ -12,6 +12,7 @@
 #include <cstring>
 #include <new>
 
+#include "core/base/quiet_thread.hpp"
 #include "socket_path.hpp"
 
 namespace dssm::ssm {
@@ -100,12 +101,9 @@ Result<void> Process::prepare_locked() {
     handlers_ = true;
   }
   if (!reaper_) {
-    sigset_t all, before;  // signal handlers are the program's: they run in its own threads
-    ::sigfillset(&all);
-    ::pthread_sigmask(SIG_SETMASK, &all, &before);
+    const SignalBlock block;
     pthread_t thread;
     const int error = ::pthread_create(&thread, nullptr, &run_reaper, this);
-    ::pthread_sigmask(SIG_SETMASK, &before, nullptr);
     if (error) return os_error("start libssm's thread", error);
     ::pthread_detach(thread);
     reaper_ = true;

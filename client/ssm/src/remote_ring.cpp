@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <vector>
 
+#include "core/base/quiet_thread.hpp"
 #include "core/ring/sample_publisher.hpp"
 #include "messages.hpp"
 
@@ -51,11 +52,8 @@ Result<std::unique_ptr<RemoteRing>> RemoteRing::start(PConnector connector,
   std::unique_ptr<RemoteRing> made(new RemoteRing(std::move(connector)));
   if (!made->stop_) return os_error(what);
   made->mapping_ = std::move(*mapping);
-  sigset_t all, before;  // signal handlers are the program's: they run in its own threads
-  ::sigfillset(&all);
-  ::pthread_sigmask(SIG_SETMASK, &all, &before);
+  const SignalBlock block;
   const int error = ::pthread_create(&made->thread_, nullptr, &run, made.get());
-  ::pthread_sigmask(SIG_SETMASK, &before, nullptr);
   if (error) return os_error(what, error);
   made->runs_ = true;
   return made;

@@ -9,6 +9,7 @@
 #include <mutex>
 #include <new>
 
+#include "core/base/timespec.hpp"
 #include "messages.hpp"
 
 namespace dssm::ssm {
@@ -233,8 +234,7 @@ Duration Stream::clock_error(Tid tid) noexcept {
 WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
   RawReader* const open = reader();
   if (!open) {  // nothing to sleep on; the caller looks again
-    const Duration rest = std::max(Duration(0), deadline - MonoClock::now());
-    const timespec sleep{to_ns(rest) / 1'000'000'000, to_ns(rest) % 1'000'000'000};
+    const timespec sleep = timespec_of(deadline - MonoClock::now());
     return ::nanosleep(&sleep, nullptr) == 0 ? WaitStatus::timeout : WaitStatus::interrupted;
   }
   // Without the lock, so that other threads may read meanwhile: a wait for a given tid uses nothing

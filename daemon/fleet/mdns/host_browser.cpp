@@ -13,6 +13,8 @@
 #include <cstring>
 #include <vector>
 
+#include "core/base/text.hpp"
+
 namespace dssm::daemon {
 namespace {
 

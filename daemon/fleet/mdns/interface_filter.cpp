@@ -10,6 +10,7 @@
 #include <algorithm>
 #include <cerrno>
 
+#include "core/base/text.hpp"
 #include "daemon/base/log.hpp"
 
 namespace dssm::daemon {

@@ -8,6 +8,8 @@
 #include <thread>
 #include <utility>
 
+#include "core/base/quiet_thread.hpp"
+#include "core/base/try.hpp"
 #include "daemon/base/rate_limited_logger.hpp"
 #include "daemon/fleet/mdns/mdns_mailbox.hpp"
 #include "daemon/fleet/mdns/mdns_worker.hpp"
@@ -53,19 +55,15 @@ Result<void> Mdns::Impl::start(const EventLoop& main_loop, const Options& option
   mailbox = *std::move(made);
   news = EventSource::readable(main_loop, mailbox->news_fd(), [this] { on_news(); });
   news.enable();
-  // Signals are for dssmd's loop.
-  sigset_t all, before;
-  ::sigfillset(&all);
-  ::pthread_sigmask(SIG_SETMASK, &all, &before);
   // The thread has nothing of ours but the mailbox, which it owns as well: see ~Mdns().
-  thread = std::thread([box = mailbox, loop = *std::move(opened), options]() mutable {
-    {
-      MdnsWorker worker(loop, options, *box);
-      worker.run();
-    }
-    box->done();
-  });
-  ::pthread_sigmask(SIG_SETMASK, &before, nullptr);
+  thread =
+      DSSM_TRY(quiet_thread("mDNS", [box = mailbox, loop = *std::move(opened), options]() mutable {
+        {
+          MdnsWorker worker(loop, options, *box);
+          worker.run();
+        }
+        box->done();
+      }));
   return {};
 }
 

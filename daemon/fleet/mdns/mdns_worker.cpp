@@ -19,6 +19,8 @@
 #include <algorithm>
 #include <utility>
 
+#include "core/base/text.hpp"
+
 namespace dssm::daemon {
 namespace {
 

@@ -5,17 +5,10 @@
 
 #include <string>
 
+#include "core/base/text.hpp"
+
 namespace dssm {
 namespace {
-
-std::string hex(const Sha256& digest) {
-  std::string text;
-  for (const std::uint8_t byte : digest) {
-    text += "0123456789abcdef"[byte >> 4];
-    text += "0123456789abcdef"[byte & 15];
-  }
-  return text;
-}
 
 // The examples of FIPS 180-4's companion document: no, one and two blocks; and a long one.
 TEST(Sha256, IsTheStandards) {

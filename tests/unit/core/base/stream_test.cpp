@@ -4,7 +4,7 @@
 #include <dssm/describe.hpp>
 #include <dssm/stream.hpp>
 
-#include "core/base/utf8.hpp"
+#include "core/base/text.hpp"
 
 namespace dssm {
 

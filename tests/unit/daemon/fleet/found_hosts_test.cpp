@@ -4,6 +4,7 @@
 // forgotten, whatever is announced.
 #include <gtest/gtest.h>
 
+#include "core/base/text.hpp"
 #include "daemon/fleet/peers.hpp"
 #include "daemon/fleet/service_record.hpp"
 #include "tests/unit/daemon/fleet/fake_peer.hpp"
@@ -326,7 +327,7 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   peers->on_host_found(host_at({at(*one), at(*two)}, "pc1"));
   wait([&] { return !peers->own_warning().empty(); });
   const std::string warning = peers->own_warning();
-  for (const std::string& part : {at(*two).str(), hex_of(self.host_id),
+  for (const std::string& part : {at(*two).str(), hex(self.host_id),
                                   std::string("rm /etc/machine-id"), std::string("(key name)")}) {
     EXPECT_NE(warning.find(part), std::string::npos) << part << " is missing in " << warning;
   }

@@ -8,7 +8,7 @@
 
 #include <algorithm>
 
-#include "core/base/utf8.hpp"
+#include "core/base/text.hpp"
 
 namespace dssm::daemon {
 namespace {

@@ -240,17 +240,6 @@ TEST(Config, GivesTheMachinesNameUpToTheFirstDotWhenNoneIsSet) {
   }
 }
 
-TEST(ConfigValues, TakeOnlyHostNamesThatFitIntoStreamNames) {
-  EXPECT_TRUE(check_host_name("pc1"));
-  EXPECT_TRUE(check_host_name("A-9"));
-  EXPECT_TRUE(check_host_name(std::string(31, 'x')));
-  EXPECT_FALSE(check_host_name(""));
-  EXPECT_FALSE(check_host_name(std::string(32, 'x')));
-  EXPECT_FALSE(check_host_name("pc1.local"));
-  EXPECT_FALSE(check_host_name("pc 1"));
-  EXPECT_FALSE(check_host_name("pc@1"));
-}
-
 TEST(ConfigValues, ReadBytesWithTheirUnits) {
   const auto bytes = [](std::string_view text) {
     const Result<std::uint64_t> parsed = parse_bytes(text, 0, 1ULL << 50);
