@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The parser goes through the text twice: first each line for itself (numbers, counts), then all
-// timestamps together, because whether a stamp is wrong shows only beside its neighbours. In the
-// recording that comes with this example about twenty ODOM lines near the end claim to be from the
-// first seconds; sorted in where they claim to belong, they would turn the robot round for an
-// instant and smear the map.
+// The parser has two passes: the first parses each line (numbers, counts), the second checks all
+// timestamps together, because a wrong stamp can be recognized only by comparing it with its
+// neighbours. In the example's recording, about twenty ODOM lines near the end have stamps of the
+// first seconds. Sorted by these stamps, they would turn the robot for a moment and blur the map.
 #include "carmen_log.hpp"
 
 #include <zlib.h>
@@ -20,13 +19,13 @@
 namespace vehicle {
 namespace {
 
-// A stamp is believed when it lies within kBelievable of the median of the stamps around it:
-// kAround lines to each side. The loggers wrote up to a second out of order; pauses are no problem,
-// because on each side of one the stamp itself is the median.
+// A stamp is accepted when it is within kBelievableS of the median of the surrounding stamps, kAround
+// lines on each side. The logger wrote lines up to a second out of order. Pauses are not a problem: on
+// each side of a pause the stamp is near the median.
 constexpr double kBelievableS = 5;
 constexpr std::size_t kAround = 5;
 
-// The blank-separated words of one line, taken from the front.
+// Reads the blank-separated words of one line.
 class Words {
  public:
   explicit Words(std::string_view line) : rest_(line) {}
@@ -96,14 +95,14 @@ std::optional<ScanReading> parse_scan(Words& words) {
   return scan;
 }
 
-// A reading with the place of its line among all stamped lines of the file.
+// A reading with the index of its line among all stamped lines of the file.
 template <class Reading>
 struct Placed {
   std::size_t place;
   Reading reading;
 };
 
-// For each stamp, in file order, whether the stamps around it bear it out.
+// For each stamp, in file order, whether it agrees with the stamps around it.
 std::vector<bool> believable(const std::vector<double>& stamps) {
   std::vector<bool> result(stamps.size());
   for (std::size_t i = 0; i < stamps.size(); ++i) {
@@ -118,7 +117,7 @@ std::vector<bool> believable(const std::vector<double>& stamps) {
   return result;
 }
 
-// The believable ones of `placed` in order of time; those of equal time stay in file order.
+// The readings to keep, in order of time; those of equal time stay in file order.
 template <class Reading>
 std::vector<Reading> in_order(std::vector<Placed<Reading>>& placed, const std::vector<bool>& keep,
                               Skipped& skipped) {
@@ -189,7 +188,7 @@ std::string CarmenLog::summary() const {
 dssm::Result<CarmenLog> read_carmen_log(const std::string& path) {
   const std::string what = "read the recording '" + path + "'";
   errno = 0;
-  gzFile file = ::gzopen(path.c_str(), "rbe");  // reads plain text as it is
+  gzFile file = ::gzopen(path.c_str(), "rbe");  // also reads uncompressed text
   if (!file) {
     const int problem = errno;  // 0: zlib itself had no memory
     dssm::Error error = dssm::os_error(what, problem == 0 ? ENOMEM : problem);

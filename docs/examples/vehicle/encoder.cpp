@@ -2,14 +2,12 @@
 //
 // encoder: the vehicle's wheel encoders, replayed from a recording into the stream "odometry".
 //
-// This is a program of the old kind: it knows nothing of DSSM and uses <ssm.hpp> alone, as the
-// sensor handlers of existing vehicles do. Compiled against libssm it shares its samples through
-// DSSM all the same.
+// This is an SSM program: it uses only <ssm.hpp>, as the sensor handlers of existing vehicles do.
+// Linked with libssm, it shares its samples through DSSM.
 //
-// A real encoder reports at a steady rate of its own and not when the LIDAR happens to take a scan.
-// The recording has about five readings a second, each with the very stamp of a scan; so the
-// encoder reads the recorded motion every --cycle seconds, between readings in proportion to time.
-// `--cycle 0` replays the readings as they were recorded.
+// A real encoder has a constant rate that does not depend on the LIDAR. But the recording has about
+// five readings a second, each with exactly the stamp of a scan. So this program interpolates the
+// recorded motion every --cycle seconds. `--cycle 0` replays the readings as they were recorded.
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cmath>
@@ -27,7 +25,7 @@
 
 namespace {
 
-// Median distance of the recording's readings, for the ring's size when they are replayed as is.
+// Median interval of the recording's readings; sizes the ring with --cycle 0.
 constexpr double kRecordedCycleS = 0.2;
 
 int fail(const std::string& message) {
@@ -56,7 +54,7 @@ int main(int argc, char** argv) {
   const std::vector<vehicle::OdometryReading> readings =
       cycle_s > 0 ? vehicle::resample(log->odometry, cycle_s) : log->odometry;
   const vehicle::Span part = vehicle::span_around(readings, options.from_s, options.to_s);
-  progress.say(log->summary());
+  progress.print(log->summary());
 
   if (!initSSM()) return fail("cannot reach dssmd (see above); start it, then try again");
   SSMApi<Odometry> odometry("odometry", 0);
@@ -84,7 +82,7 @@ int main(int argc, char** argv) {
              std::to_string(written) + " samples";
     });
   }
-  progress.say(std::to_string(written) + " samples written");
+  progress.print(std::to_string(written) + " samples written");
   odometry.release();
   endSSM();
   return 0;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// How the vehicle's readers come to their streams: in any order of starting, stoppable at any
-// moment, and at the right place in streams that may still hold an earlier drive.
+// Opens the streams of the vehicle's readers. Programs may start in any order and be stopped at any
+// time, and readers begin at the right sample in streams that still hold an earlier drive.
 #pragma once
 
 #include <dssm/reader.hpp>
@@ -14,17 +14,17 @@
 
 namespace vehicle {
 
-// What localizer and mapper end with under --complete when they had to leave scans out.
+// Exit status of localizer and mapper with --complete after they had to skip scans.
 inline constexpr int kIncompleteStatus = 3;
 
-// Opens `stream`, on whichever host it is, waiting until it is created and its host answers. Fails
-// as Session::open_reader() does, but for not_found and unavailable, which it waits out; nullopt
-// when a signal asked to stop.
+// Opens `stream` on any host; waits until the stream is created and its host is available. Fails as
+// Session::open_reader() does, except for not_found and unavailable, on which it retries. nullopt
+// after a signal to stop.
 template <class T>
 dssm::Result<std::optional<dssm::Reader<T>>> open_when_there(dssm::Session& session,
                                                              const char* stream,
                                                              Progress& progress) {
-  for (bool told = false; !stop_requested(); told = true) {
+  for (bool reported = false; !stop_requested(); reported = true) {
     dssm::Result<dssm::Reader<T>> reader =
         session.await_reader<T>(stream, dssm::deadline_in(kSlice));
     if (reader) return std::optional<dssm::Reader<T>>(std::move(*reader));
@@ -32,15 +32,14 @@ dssm::Result<std::optional<dssm::Reader<T>>> open_when_there(dssm::Session& sess
     if (code != dssm::Errc::not_found && code != dssm::Errc::unavailable) {
       return std::move(reader).error();
     }
-    if (!told) progress.say("waiting for the stream '" + std::string(stream) + "'");
+    if (!reported) progress.print("waiting for the stream '" + std::string(stream) + "'");
   }
   return std::optional<dssm::Reader<T>>();
 }
 
-// Puts the cursor in front of the first sample of the newest drive. Streams outlive the programs
-// that write them, so a ring may begin with the rest of an earlier drive; the end marks tell. A
-// drive that is over already counts as an earlier one, too, and the reader then waits for the
-// next; `late` says that this is the drive to read.
+// Moves the cursor before the first sample of the newest drive. Streams exist longer than the
+// programs that write them, so a ring may begin with samples of an earlier drive; end marks separate
+// drives. If the newest drive is over, the reader waits for the next one, unless `late` is set.
 template <class T>
 void seek_to_drive(dssm::Reader<T>& reader, bool late) {
   T sample;

@@ -2,9 +2,9 @@
 //
 // lidar: the vehicle's laser scanner, replayed from a recording into the stream "lidar".
 //
-// Written against <dssm/...>. Each scan is filled in right where it will be read: loan() lends the
-// ring's next slot, publish() makes it visible; nothing is copied. When the recording is over, or
-// the program is told to stop, an end mark follows (samples.hpp).
+// Uses <dssm/...>. Each scan is filled in place, without a copy: loan() returns the ring's next slot,
+// and publish() makes it visible to readers. At the end of the recording, or after a signal to stop,
+// the program writes an end mark (samples.hpp).
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cmath>
@@ -20,7 +20,7 @@
 
 namespace {
 
-// Mean distance of the recording's scans.
+// Mean interval of the recording's scans.
 constexpr double kCycleS = 0.22;
 
 int fail(const dssm::Error& error) {
@@ -28,8 +28,8 @@ int fail(const dssm::Error& error) {
   return 1;
 }
 
-// Lasers of this kind see half a circle: from 90 degrees to the right to 90 degrees to the left,
-// the last beam included when their number is odd (181, 361) and left out when it is even.
+// Angle between beams. Lasers of this kind scan a half circle, from 90 degrees to the right to 90
+// degrees to the left; the last beam is at the left end only if their number is odd (181, 361).
 float step_rad(std::size_t beams) {
   return static_cast<float>(M_PI / static_cast<double>(beams % 2 == 0 ? beams : beams - 1));
 }
@@ -37,7 +37,7 @@ float step_rad(std::size_t beams) {
 // Fills the ring's next slot and publishes it. A null `reading` gives the end mark.
 void publish(dssm::Writer<vehicle::Scan>& writer, const vehicle::ScanReading* reading,
              dssm::Time time) {
-  dssm::Loan loan = writer.loan();  // never refused: this is the only loan of the only thread
+  dssm::Loan loan = writer.loan();  // cannot fail: there is no other loan
   vehicle::Scan& scan = dssm::Writer<vehicle::Scan>::view(loan);
   scan = {};
   if (reading) {
@@ -63,7 +63,7 @@ int main(int argc, char** argv) {
   if (!replay) return fail(replay.error());
   const dssm::Result<vehicle::CarmenLog> log = vehicle::read_carmen_log(options.log);
   if (!log) return fail(log.error());
-  progress.say(log->summary());
+  progress.print(log->summary());
 
   dssm::Result<dssm::Session> session = dssm::Session::connect();
   if (!session) return fail(session.error());
@@ -87,8 +87,8 @@ int main(int argc, char** argv) {
              std::to_string(written) + " scans";
     });
   }
-  // Later than the last scan, so that who asks for that scan's time does not get the mark.
+  // Later than the last scan, so that a read at that scan's time does not return the mark.
   publish(*writer, nullptr, newest + std::chrono::milliseconds(1));
-  progress.say(std::to_string(written) + " scans written");
+  progress.print(std::to_string(written) + " scans written");
   return 0;
 }

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// localizer: says where the vehicle was when each scan was taken. It follows the stream "lidar",
+// localizer: computes the vehicle's pose at the time of each scan. It follows the stream "lidar",
 // reads the stream "odometry" at the time of each scan, and writes the stream "pose", stamped with
 // the scan's time.
 #include <CLI/CLI.hpp>
@@ -31,7 +31,7 @@ int main(int argc, char** argv) {
   app.add_option("--deadline", deadline_s, "seconds to wait for the odometry of a scan")
       ->check(CLI::Range(0.0, 3600.0))
       ->capture_default_str();
-  app.add_flag("--late", late, "take the newest drive also when it is over already");
+  app.add_flag("--late", late, "read the newest drive even if it is over");
   app.add_flag("--complete", complete, "end with status 3 when a scan got no pose");
   CLI11_PARSE(app, argc, argv);
   vehicle::stop_on_signals();
@@ -44,7 +44,7 @@ int main(int argc, char** argv) {
   if (!*scans) return 0;
   dssm::Reader<vehicle::Scan>& lidar = **scans;
   vehicle::seek_to_drive(lidar, late);
-  // As many poses as the lidar keeps scans: a pose is of use as long as its scan is there.
+  // As many poses as the lidar keeps scans: a pose is useful while its scan exists.
   auto poses = session->create<vehicle::Pose>(vehicle::kPoseStream,
                                               dssm::History{lidar.depth(), lidar.cycle()});
   if (!poses) return fail(poses.error());
@@ -79,7 +79,7 @@ int main(int argc, char** argv) {
     }
     progress.update(summary);
   }
-  poses->write({0, 0, 0, dssm::kNoTid}, info.time);  // the end mark passes on
-  progress.say(summary());
+  poses->write({0, 0, 0, dssm::kNoTid}, info.time);  // the end mark
+  progress.print(summary());
   return complete && without_odometry + lidar.lost() > 0 ? vehicle::kIncompleteStatus : 0;
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Drawing by hand, pixel by pixel: a graphics library would add its own version to what the bytes
-// depend on. libpng writes the file.
+// Draws pixel by pixel: with a graphics library, the bytes would also depend on its version. libpng
+// writes the file.
 #include "map_picture.hpp"
 
 #include <png.h>
@@ -28,7 +28,7 @@ constexpr int kPixels = 2;        // per cell
 constexpr int kMarginCells = 20;  // 1 m
 constexpr double kBarM = 5;
 
-// The part of the grid that is shown, and where its cells lie in the picture.
+// Maps the shown part of the grid to pixels, and draws.
 class Canvas {
  public:
   explicit Canvas(OccupancyGrid::Box box) : box_(box) {
@@ -49,7 +49,7 @@ class Canvas {
     fill(x, y, kPixels, kPixels, colour);
   }
 
-  // A square of `size` pixels around a place on the floor.
+  // A square of `size` pixels around a point on the floor.
   void dot(double x_m, double y_m, int size, Colour colour) {
     fill(x_of(x_m) - size / 2, y_of(y_m) - size / 2, size, size, colour);
   }

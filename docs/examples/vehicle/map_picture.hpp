@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The map as a picture: walls dark, free floor white, unknown ground grey, the vehicle's way blue
-// from a green square to a red one, and a bar 5 m long in the lower left corner. One cell is two
-// pixels wide; y points up. The same grid and way give the same file, byte for byte.
+// The map as a picture: walls are dark, free floor is white, unknown floor is grey. The vehicle's path
+// is blue, from a green square to a red one. The bar in the lower left corner is 5 m long. One cell is
+// two pixels wide; y points up. The same grid and path give the same file, byte for byte.
 #pragma once
 
 #include <cstdint>
@@ -14,16 +14,16 @@
 
 namespace vehicle {
 
-// Rows from the top, three bytes (red, green, blue) a pixel.
+// Rows from top to bottom, three bytes (red, green, blue) per pixel.
 struct Picture {
   int width = 0, height = 0;
   std::vector<std::uint8_t> rgb;
 };
 
-// Shows the known part of `grid` and a margin. An empty grid gives a small grey picture.
+// Draws the known part of `grid` with a margin. An empty grid gives a small grey picture.
 Picture draw_map(const OccupancyGrid& grid, const std::vector<Pose2>& way);
 
-// Writes a PNG file, whole or not at all: a viewer that has it open never sees half a picture.
+// Writes a PNG file and replaces an old one in one step: a viewer never sees half a picture.
 dssm::Result<void> write_png(const Picture& picture, const std::string& path);
 
 }  // namespace vehicle

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// mapper: draws the walls that the LIDAR saw and the way that the vehicle took. It follows the
-// stream "pose", fetches from "lidar" the scan of each pose's time, and writes a picture when the
-// drive is over: at the end mark, when nothing has come for a while, or when told to stop.
+// mapper: draws the walls that the LIDAR saw and the path of the vehicle. It follows the stream
+// "pose", reads the scan of each pose from "lidar" by time, and writes a picture at the end of the
+// drive: at the end mark, after some seconds without a pose, or after a signal to stop.
 #include <CLI/CLI.hpp>
 #include <cmath>
 #include <cstdio>
@@ -30,21 +30,21 @@ int fail(const dssm::Error& error) {
 int main(int argc, char** argv) {
   CLI::App app("Draws a map from poses and LIDAR scans.");
   std::string out = "map.png";
-  double patience_s = 10, deadline_s = 1;
+  double timeout_s = 10, deadline_s = 1;
   bool late = false, complete = false;
   app.add_option("--out", out, "the picture to write (PNG)")->capture_default_str();
-  app.add_option("--patience", patience_s, "seconds without a pose after which the drive is over")
+  app.add_option("--timeout", timeout_s, "seconds without a pose after which the drive is over")
       ->check(CLI::Range(0.1, 86400.0))
       ->capture_default_str();
   app.add_option("--deadline", deadline_s, "seconds to wait for the scan of a pose")
       ->check(CLI::Range(0.0, 3600.0))
       ->capture_default_str();
-  app.add_flag("--late", late, "take the newest drive also when it is over already");
+  app.add_flag("--late", late, "read the newest drive even if it is over");
   app.add_flag("--complete", complete, "end with status 3 when a pose or its scan was missed");
   CLI11_PARSE(app, argc, argv);
   vehicle::stop_on_signals();
   vehicle::Progress progress("mapper");
-  const dssm::Duration patience(std::llround(patience_s * 1e9));
+  const dssm::Duration timeout(std::llround(timeout_s * 1e9));
 
   dssm::Result<dssm::Session> session = dssm::Session::connect();
   if (!session) return fail(session.error());
@@ -72,18 +72,18 @@ int main(int argc, char** argv) {
   vehicle::Pose pose;
   vehicle::Scan scan;
   dssm::SampleInfo pose_info;
-  dssm::MonoTime deadline = dssm::kNever;  // the first pose may take as long as it likes
+  dssm::MonoTime deadline = dssm::kNever;  // no timeout before the first pose
   while (!vehicle::stop_requested()) {
     if (poses.next(pose, pose_info) != dssm::ReadStatus::ok) {
       if (dssm::MonoClock::now() >= deadline) {
-        progress.say("no pose for " + std::to_string(std::lround(patience_s)) +
-                     " s and no end mark: the map shows what came until then");
+        progress.print("no pose for " + std::to_string(std::lround(timeout_s)) +
+                       " s and no end mark: the map shows the poses until then");
         break;
       }
       (void)poses.wait(dssm::deadline_in(vehicle::kSlice));
       continue;
     }
-    deadline = dssm::deadline_in(patience);
+    deadline = dssm::deadline_in(timeout);
     if (pose.is_end()) break;
     if (scans.at(pose_info.time, pose.scan_tid, scan)) {
       const vehicle::Pose2 laser{pose.x_m, pose.y_m, pose.theta_rad};
@@ -99,7 +99,7 @@ int main(int argc, char** argv) {
       !written) {
     return fail(written.error());
   }
-  progress.say(summary() + "; " + std::to_string(grid.count(vehicle::OccupancyGrid::Cell::wall)) +
-               " wall cells; the map is in '" + out + "'");
+  progress.print(summary() + "; " + std::to_string(grid.count(vehicle::OccupancyGrid::Cell::wall)) +
+                 " wall cells; the map is in '" + out + "'");
   return complete && without_scan + poses.lost() > 0 ? vehicle::kIncompleteStatus : 0;
 }

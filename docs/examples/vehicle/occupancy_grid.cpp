@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Beams are walked cell by cell with Bresenham's line. The figures below were found by looking at
-// the pictures; a wall weighs more than a free cell because a beam that grazes a wall passes
-// through the cells in front of it many times and ends in it once.
+// Bresenham's line algorithm visits the cells of each beam. The constants below were tuned by
+// inspecting the pictures. A wall weighs more than free floor, because beams pass the cells in front
+// of a wall many times for each beam that ends in it.
 #include "occupancy_grid.hpp"
 
 #include <algorithm>
@@ -12,13 +12,13 @@
 namespace vehicle {
 namespace {
 
-constexpr double kMinRangeM = 0.2;  // nearer: the robot itself, or the laser's window
+constexpr double kMinRangeM = 0.2;  // nearer: the robot, or the laser's window
 constexpr double kMaxWallM = 10;    // a degree of error in the pose is 17 cm there
-constexpr double kMaxRangeM = 40;   // the LIDAR reports 81.91 when nothing came back
+constexpr double kMaxRangeM = 40;   // the LIDAR reports 81.91 without a reflection
 constexpr int kWallEvidence = 3;
 constexpr int kFreeEvidence = -1;
-constexpr std::int16_t kMostEvidence = 60;  // so that a door that opened can still become free
-constexpr std::int16_t kLeastEvidence = -30;
+constexpr std::int16_t kMaxEvidence = 60;  // so that a door that opens can still become free
+constexpr std::int16_t kMinEvidence = -30;
 
 }  // namespace
 
@@ -32,7 +32,7 @@ void OccupancyGrid::add_evidence(int column, int row, int evidence) {
   if (column < 0 || column >= kSide || row < 0 || row >= kSide) return;
   std::int16_t& cell =
       evidence_[static_cast<std::size_t>(row) * kSide + static_cast<std::size_t>(column)];
-  cell = static_cast<std::int16_t>(std::clamp<int>(cell + evidence, kLeastEvidence, kMostEvidence));
+  cell = static_cast<std::int16_t>(std::clamp<int>(cell + evidence, kMinEvidence, kMaxEvidence));
 }
 
 void OccupancyGrid::add(const Pose2& laser, const Beams& beams) {

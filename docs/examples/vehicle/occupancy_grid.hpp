@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // An occupancy grid: the floor in square cells, each with the evidence that it is a wall or free.
-// A beam speaks for free floor along its way and for a wall where it ended.
+// A beam is evidence for free floor along its way and for a wall at its end.
 //
-// All evidence is counted in integers and added up in the order of the scans, so the same scans and
-// poses give the same grid, bit for bit, on every PC.
+// Evidence is added in integers and in the order of the scans, so the same scans and poses give the
+// same grid, bit for bit, on every PC.
 #pragma once
 
 #include <cstddef>
@@ -33,20 +33,20 @@ class OccupancyGrid {
 
   OccupancyGrid();
 
-  // Adds a scan taken by a laser at `laser`. Beams that met nothing within kMaxRangeM say only
-  // where the floor is free; what lies outside the grid is left out.
+  // Adds a scan taken by a laser at `laser`. A beam longer than kMaxRangeM is ignored, one longer than
+  // kMaxWallM is evidence only for free floor. Evidence outside the grid is ignored.
   void add(const Pose2& laser, const Beams& beams);
 
   // A cell by column (x) and row (y), both 0 to kSide - 1.
   Cell at(int column, int row) const;
 
-  // The column of `x_m`, or the row of `y_m`; may lie outside the grid.
+  // The column of `x_m`, or the row of `y_m`; may be outside the grid.
   static int index_of(double m);
 
-  // How many cells are walls.
+  // The number of cells of this kind.
   std::size_t count(Cell kind) const;
 
-  // Columns and rows that hold anything known: first and last, inclusive. Empty grid: last < first.
+  // First and last column and row with known cells, inclusive. Empty grid: last < first.
   struct Box {
     int first_column = kSide, last_column = -1, first_row = kSide, last_row = -1;
   };

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What the encoder writes to the stream "odometry". A plain struct, as SSM programs have them: the
-// encoder writes it through <ssm.hpp>, the localizer reads it through <dssm/...>.
+// The payload of the stream "odometry". A plain struct, as usual in SSM programs: the encoder writes
+// it through <ssm.hpp>, the localizer reads it through <dssm/...>.
 #pragma once
 
 struct Odometry {
-  double x_m, y_m;   // in the recording's frame: where the drive began
+  double x_m, y_m;   // in the recording's frame, whose origin is the start of the drive
   double theta_rad;  // counter-clockwise from x
 };

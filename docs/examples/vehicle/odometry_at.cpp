@@ -16,7 +16,7 @@ std::optional<Pose2> OdometryAt::between(dssm::Time t, const dssm::Neighbours& r
   dssm::SampleInfo info;
   if (reader_.tid(readings.before.tid, before, info) != dssm::ReadStatus::ok ||
       reader_.tid(readings.after.tid, after, info) != dssm::ReadStatus::ok) {
-    return std::nullopt;  // overwritten since the search, or the stream began anew
+    return std::nullopt;  // overwritten since the search, or the stream restarted
   }
   return interpolate({before.x_m, before.y_m, before.theta_rad},
                      {after.x_m, after.y_m, after.theta_rad},
@@ -24,7 +24,7 @@ std::optional<Pose2> OdometryAt::between(dssm::Time t, const dssm::Neighbours& r
                                dssm::to_ns(readings.after.time)));
 }
 
-bool OdometryAt::goes_on_with_new_ring() {
+bool OdometryAt::follow_restart() {
   Odometry newest;
   dssm::SampleInfo info;
   (void)reader_.latest(newest, info);
@@ -37,14 +37,14 @@ bool OdometryAt::goes_on_with_new_ring() {
 std::optional<Pose2> OdometryAt::at(dssm::Time t) {
   const dssm::MonoTime deadline = dssm::deadline_in(deadline_);
   while (!stop_requested()) {
-    const dssm::Tid newest = reader_.newest();  // before the search: what comes after it wakes us
+    const dssm::Tid newest = reader_.newest();  // before the search: wait_for_tid() misses nothing
     dssm::Neighbours readings;
     const dssm::ReadStatus status = reader_.neighbours(t, readings);
     if (status == dssm::ReadStatus::ok) {
       if (const std::optional<Pose2> pose = between(t, readings)) return pose;
     }
-    if (goes_on_with_new_ring() || status == dssm::ReadStatus::ok) continue;
-    // Too old for good, unless all there is stems from an earlier drive with later stamps.
+    if (follow_restart() || status == dssm::ReadStatus::ok) continue;
+    // Final, unless the ring holds only samples of an earlier drive with later stamps.
     if (status == dssm::ReadStatus::too_old && newest != newest_at_start_) return std::nullopt;
     const dssm::MonoTime now = dssm::MonoClock::now();
     if (now >= deadline) return std::nullopt;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One line on stderr that says how far a program is: updated in place on a terminal, otherwise a
-// plain line now and then, fit for a log file.
+// Shows a program's progress on stderr: on a terminal in one line that is updated in place, otherwise
+// in separate lines, for a log file.
 #pragma once
 
 #include <unistd.h>
@@ -15,12 +15,11 @@ namespace vehicle {
 
 class Progress {
  public:
-  // `program` stands before each line.
+  // Each line begins with `program`.
   explicit Progress(const char* program)
       : program_(program), on_terminal_(::isatty(STDERR_FILENO) == 1) {}
 
-  // Shows what text() returns, unless the last time was only just now; cheap enough to call for
-  // each sample.
+  // Shows the result of text() at most a few times per second; cheap enough to call for each sample.
   template <class Text>
   void update(Text text) {
     const dssm::MonoTime now = dssm::MonoClock::now();
@@ -30,8 +29,8 @@ class Progress {
     line_open_ = on_terminal_;
   }
 
-  // Prints a line that stays.
-  void say(const std::string& text) {
+  // Prints a line that update() does not overwrite.
+  void print(const std::string& text) {
     std::fprintf(stderr, "%s%s: %s\n", line_open_ ? "\r\033[K" : "", program_, text.c_str());
     line_open_ = false;
   }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The start is agreed on the wall clock, which all processes share, and turned once into a moment
-// of the monotonic clock: a step of the wall clock during the drive does not disturb it.
+// The start is a time of the wall clock, which all processes share. It is converted once to the
+// monotonic clock, so a step of the wall clock during the drive does not disturb the replay.
 #include "replay.hpp"
 
 #include <CLI/CLI.hpp>
@@ -23,7 +23,7 @@ dssm::Duration nanoseconds(double seconds) {
 
 void ReplayOptions::add_to(CLI::App& app) {
   app.add_option("--log", log, "the recording: a CARMEN log, plain or .gz")->required();
-  app.add_option("--speed", speed, "how many times faster than real; 0: without any pause")
+  app.add_option("--speed", speed, "how many times faster than real time; 0: without pauses")
       ->check(CLI::Range(0.0, 10000.0))
       ->capture_default_str();
   app.add_option("--from", from_s, "first second of the log to play")->capture_default_str();
@@ -35,7 +35,7 @@ void ReplayOptions::add_to(CLI::App& app) {
                  "wall-clock time of the start in seconds since 1970, the same for encoder and "
                  "lidar: $(($(date +%s) + 2)) (default: at once)");
   app.add_option("--stamps", stamps,
-                 "recording: the log's own, the same in every run; now: when it is replayed "
+                 "recording: the log's times, the same in every run; now: the time of the replay "
                  "(default: now with --start-at, otherwise recording)")
       ->check(CLI::IsMember({"recording", "now"}));
 }
@@ -45,13 +45,13 @@ dssm::Result<Replay> Replay::from(const ReplayOptions& options) {
       options.stamps.empty() ? options.start_at_s.has_value() : options.stamps == "now";
   if (stamps_now && !options.start_at_s) {
     return dssm::Error{dssm::Errc::invalid_argument,
-                       "--stamps now: encoder and lidar must agree when the drive begins; add "
+                       "--stamps now: encoder and lidar need the same start; add "
                        "'--start-at $(($(date +%s) + 2))', with one value for both"};
   }
   if (!(options.from_s < options.to_s)) {
     return dssm::Error{dssm::Errc::invalid_argument, "--from " + std::to_string(options.from_s) +
                                                          " --to " + std::to_string(options.to_s) +
-                                                         ": nothing lies between; --to must be "
+                                                         ": an empty part; --to must be "
                                                          "later than --from"};
   }
   Replay replay;
@@ -64,7 +64,7 @@ dssm::Result<Replay> Replay::from(const ReplayOptions& options) {
   if (stamps_now) {
     replay.first_stamp_ = start;
     replay.stamp_zero_s_ = options.from_s;
-    // Without pauses there is no real pace to show: the stamps run as at speed 1.
+    // A replay without pauses has no speed; the stamps advance as at speed 1.
     replay.stamp_speed_ = options.speed > 0 ? options.speed : 1;
   }
   return replay;

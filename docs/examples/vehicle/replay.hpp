@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// When to write what: the pace of a replay and the stamps it gives. The encoder and the lidar are
-// processes of their own that never talk to each other; they play together because both are told
-// the same moment to start at and the same speed.
+// The times of a replay: when each sample is written, and its stamp. The encoder and the lidar are
+// separate processes that do not communicate; they are synchronized because both get the same start
+// time and speed.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -19,7 +19,7 @@ namespace vehicle {
 
 struct ReplayOptions {
   std::string log;
-  double speed = 1;   // log seconds per second; 0: without any pause
+  double speed = 1;   // log seconds per second; 0: without pauses
   double from_s = 0;  // seconds of the log, both included
   double to_s = std::numeric_limits<double>::infinity();
   double life_s = 60;                // history to keep, in seconds of the log
@@ -37,10 +37,10 @@ class Replay {
   // Sleeps until the log's second `log_s` is due; false when a signal asks to stop.
   bool wait_until(double log_s) const;
 
-  // The stamp of what the log says happened at `log_s`.
+  // The stamp of a sample at the log's second `log_s`.
   dssm::Time stamp(double log_s) const;
 
-  // So many seconds of the log, as a difference of two stamps [s].
+  // The difference of the stamps [s] of two samples that are `log_s` seconds apart in the log.
   double in_stamps(double log_s) const { return log_s / stamp_speed_; }
 
  private:

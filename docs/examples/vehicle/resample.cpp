@@ -9,7 +9,7 @@ namespace vehicle {
 std::vector<OdometryReading> resample(const std::vector<OdometryReading>& readings,
                                       double cycle_s) {
   std::vector<OdometryReading> result;
-  std::size_t i = 0;  // readings[i] is the newest one at or before the moment looked at
+  std::size_t i = 0;  // readings[i] is the newest one at or before time_s
   for (double n = readings.empty() ? 0 : std::ceil(readings.front().time_s / cycle_s);
        !readings.empty() && n * cycle_s <= readings.back().time_s; n += 1) {
     const double time_s = n * cycle_s;

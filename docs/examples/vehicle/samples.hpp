@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What the other streams carry. Each DSSM_DESCRIBE line lets `dssmctl echo` show fields by name.
+// The payloads of the other streams. DSSM_DESCRIBE lets `dssmctl echo` show fields by name.
 #pragma once
 
 #include <algorithm>
@@ -18,8 +18,8 @@ inline constexpr char kOdometryStream[] = "odometry";
 inline constexpr char kScanStream[] = "lidar";
 inline constexpr char kPoseStream[] = "pose";
 
-// Stream "lidar". Its time is the moment of the scan. A scan without beams is no scan but the end
-// mark: the lidar has stopped, and whoever reads along may stop as well.
+// Stream "lidar". A sample's time is that of the scan. A sample without beams is the end mark: the
+// lidar has stopped, and readers may stop, too.
 struct Scan {
   std::int32_t beams;  // how many of range_m are used
   float first_rad;     // direction of range_m[0] from straight ahead, counter-clockwise
@@ -28,7 +28,7 @@ struct Scan {
 
   bool is_end() const { return beams == 0; }
 
-  // The ranges that are used; whatever a writer put into `beams`, never more than there are.
+  // The used part of range_m; stays within range_m for any value of `beams`.
   std::span<const float> ranges() const {
     return std::span<const float>(range_m).first(
         std::min(static_cast<std::size_t>(std::max(beams, 0)), kMaxBeams));
@@ -36,7 +36,7 @@ struct Scan {
 };
 DSSM_DESCRIBE(Scan, beams, first_rad, step_rad, range_m)
 
-// Stream "pose": where the laser was. Its time is that of the scan it belongs to.
+// Stream "pose": the laser's pose. A sample's time is that of its scan.
 struct Pose {
   double x_m, y_m, theta_rad;
   std::int64_t scan_tid;  // kNoTid: the end mark

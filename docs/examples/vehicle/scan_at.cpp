@@ -15,7 +15,7 @@ bool ScanAt::at(dssm::Time t, dssm::Tid tid, Scan& out) {
   const dssm::MonoTime deadline = dssm::deadline_in(deadline_);
   dssm::SampleInfo info;
   while (!stop_requested()) {
-    const bool written = reader_.newest() >= tid;  // before the read: else it may come in between
+    const bool written = reader_.newest() >= tid;  // before the read, so that at() misses no scan
     const dssm::ReadStatus status = reader_.at(t, out, info);
     if (status == dssm::ReadStatus::restarted) continue;
     if (status == dssm::ReadStatus::ok && info.tid == tid) return true;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The scan that a pose belongs to. On another PC than the lidar's, the two streams come by
-// connections of their own, and a pose may be there before its scan.
+// Reads the scan of a pose. On another PC than the lidar's, the two streams have separate connections,
+// and a pose may arrive before its scan.
 #pragma once
 
 #include <dssm/reader.hpp>
@@ -12,12 +12,11 @@ namespace vehicle {
 
 class ScanAt {
  public:
-  // `deadline` is how long at() waits for a scan at most.
+  // `deadline` is the longest time that at() waits for a scan.
   ScanAt(dssm::Reader<Scan> reader, dssm::Duration deadline);
 
-  // Copies the scan that was taken at `t`, which is number `tid`. When it is not there yet, waits
-  // for it. False when it does not come in time, when the ring no longer holds it, or when a signal
-  // asks to stop.
+  // Copies scan `tid`, whose time is `t`, and waits for it if necessary. False after the deadline,
+  // when the ring no longer holds the scan, or after a signal to stop.
   bool at(dssm::Time t, dssm::Tid tid, Scan& out);
 
  private:

@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Ctrl-C and SIGTERM as a question that a loop asks: "was I told to stop?". Whoever waits, waits in
-// slices of kSlice at most, so that the answer is never later than that even if the signal came
-// just before the wait.
+// Turns Ctrl-C and SIGTERM into stop_requested(), which loops check. A wait must not take longer than
+// kSlice, because a signal just before the wait does not interrupt it.
 #pragma once
 
 #include <chrono>

@@ -31,7 +31,7 @@ Command localizer() { return program("localizer", {"--late", "--complete", "--de
 
 Command mapper(const std::string& out) {
   return program("mapper",
-                 {"--late", "--complete", "--deadline", "600", "--patience", "600", "--out", out});
+                 {"--late", "--complete", "--deadline", "600", "--timeout", "600", "--out", out});
 }
 
 void run_all(const std::vector<Placed>& programs) {
