@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A logger that cannot be made to fill the log: what peers do can be repeated as often as they
-// like. Of each level it passes kLinesPerPeriod lines on in a period, counts the others, and says
-// how many they were with the first line of a later one.
+// A logger that peers cannot use to fill the log. Of each level it passes at most kLinesPerPeriod
+// lines on at once and in each period on average; the next line gives the number of lines that were
+// left out.
 #pragma once
 
-#include <array>
-#include <cstdint>
 #include <dssm/time.hpp>
 #include <functional>
+#include <vector>
 
 #include "daemon/base/log.hpp"
+#include "daemon/base/rate_limiter.hpp"
 
 namespace dssm::daemon {
 
@@ -19,21 +19,18 @@ class RateLimitedLogger final : public Logger {
   static constexpr int kLinesPerPeriod = 50;
   static constexpr Duration kPeriod = std::chrono::seconds(10);
 
-  // to: outlives it. now: the clock; tests put their own in its place.
+  // `to` outlives this object. `now` is the clock; tests pass their own.
   explicit RateLimitedLogger(Logger& to, std::function<MonoTime()> now = MonoClock::now)
       : to_(to), now_(std::move(now)) {}
 
   void write(LogLevel level, std::string_view text, const LogFields& fields) noexcept override;
 
  private:
-  struct Counter {
-    MonoTime period_begin{};
-    int passed = kLinesPerPeriod;  // so that the first line begins a period
-    std::uint64_t left_out = 0;
-  };
   Logger& to_;
   std::function<MonoTime()> now_;
-  std::array<Counter, static_cast<std::size_t>(LogLevel::debug) + 1> counters_{};
+  std::vector<RateLimiter> limiters_{// by level
+                                     static_cast<std::size_t>(LogLevel::debug) + 1,
+                                     RateLimiter(kLinesPerPeriod, kPeriod / kLinesPerPeriod)};
 };
 
 }  // namespace dssm::daemon

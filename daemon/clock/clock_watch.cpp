@@ -22,7 +22,7 @@ std::string length_text(Duration d) {
   return text.data();
 }
 
-std::string left_out_text(int count, const char* what) {
+std::string left_out_text(std::uint64_t count, const char* what) {
   return count ? " (" + std::to_string(count) + " " + what + " before this were left out)" : "";
 }
 
@@ -122,26 +122,23 @@ void ClockWatch::on_set() {
 void ClockWatch::look(const Instant& now) {
   const std::optional<Duration> step = estimator_.look(now);
   if (!step) return;
-  if (steps_.pace.wait(now.mono) > Duration::zero()) {
-    ++steps_.left_out;
-    return;
-  }
-  steps_.pace.take(now.mono);
-  logger_.warning(
-      "this PC's clock was set " + std::string(*step > Duration::zero() ? "forward" : "back") +
-          " by " + length_text(*step) + left_out_text(std::exchange(steps_.left_out, 0), "steps") +
-          "; it is out of bounds until chronyd has measured it " +
-          std::to_string(clock::ClockEstimator::kUpdatesAfterStep) + " times anew",
-      {.message_id = message_id::kClockStepped});
+  const auto steps = step_lines_.admit(now.mono);
+  if (!steps) return;
+  logger_.warning("this PC's clock was set " +
+                      std::string(*step > Duration::zero() ? "forward" : "back") + " by " +
+                      length_text(*step) + left_out_text(*steps - 1, "steps") +
+                      "; it is out of bounds until chronyd has measured it " +
+                      std::to_string(clock::ClockEstimator::kUpdatesAfterStep) + " times anew",
+                  {.message_id = message_id::kClockStepped});
 }
 
 // Something may have: tells the log if so, and the observer in any case.
 void ClockWatch::changed(const Instant& now) {
   const clock::ClockState state = estimator_.at(now.mono);
   const Condition is = condition(state, now.mono);
-  if (is != std::exchange(seen_, is)) ++changes_.left_out;
+  if (is != std::exchange(seen_, is)) ++unlogged_changes_;
   // One that comes and goes while nothing may be said is counted; one that stays is told later.
-  if (is != told_ && changes_.pace.wait(now.mono) == Duration::zero()) tell(is, state, now.mono);
+  if (is != told_ && change_lines_.wait(now.mono) == Duration::zero()) tell(is, state, now.mono);
   observer_.on_clock();
 }
 
@@ -175,11 +172,11 @@ void ClockWatch::tell(Condition condition, const clock::ClockState& state, MonoT
   const bool is_step = condition == Condition::stepped && !was_away;  // look() has told that
   told_ = condition;
   if (is_step || condition == Condition::unknown) {
-    --changes_.left_out;
+    --unlogged_changes_;
     return;
   }
-  changes_.pace.take(now);
-  const std::string others = left_out_text(std::exchange(changes_.left_out, 0) - 1, "changes");
+  change_lines_.take(now);
+  const std::string others = left_out_text(std::exchange(unlogged_changes_, 0) - 1, "changes");
   const std::string back = was_away ? where_ + " answers again" + others + "; " : "";
   const std::string after = was_away ? "" : others;
   switch (condition) {

@@ -82,12 +82,6 @@ class ClockWatch final : private ChronydClient::Observer {
     holdover,
     good,
   };
-  // So that a clock that is set every second, or goes in and out of bounds, does not fill the log.
-  struct Calm {
-    static constexpr int kAtOnce = 4;
-    RateLimiter pace{kAtOnce, std::chrono::minutes(1)};
-    int left_out = 0;
-  };
 
   void on_answer(const TrackingReply& reply, MonoTime asked,
                  const clock::Instant& answered) override;
@@ -114,7 +108,9 @@ class ClockWatch final : private ChronydClient::Observer {
   std::optional<MonoTime> waiting_since_;  // no answer since then
   std::string why_;                        // there is none
   Condition seen_ = Condition::unknown, told_ = Condition::unknown;
-  Calm changes_, steps_;
+  // So that a clock that is set every second, or goes in and out of bounds, does not fill the log.
+  RateLimiter change_lines_{4, std::chrono::minutes(1)}, step_lines_{4, std::chrono::minutes(1)};
+  std::uint64_t unlogged_changes_ = 0;
   std::unique_ptr<StepWatch> step_watch_;  // null: no descriptor was left for it
   ChronydClient client_;                   // last: it calls the others
 };

@@ -18,7 +18,6 @@ namespace {
 constexpr std::uint64_t kOpen = 1, kSubscribe = 2;
 
 // A link that is too slow for its stream has gaps all the time.
-constexpr Duration kGapLinePause = std::chrono::seconds(10);
 
 }  // namespace
 
@@ -410,12 +409,10 @@ void Mirror::log_error() {
 }
 
 void Mirror::log_gaps(std::uint64_t samples) {
-  untold_gap_samples_ += samples;
-  const MonoTime now = MonoClock::now();
-  if (now < next_gap_line_) return;
-  next_gap_line_ = now + kGapLinePause;
+  const auto unlogged = gap_lines_.admit(MonoClock::now(), samples);
+  if (!unlogged) return;
   parts_.logger.warning(
-      "mirror '" + name_ + "' lacks " + std::to_string(std::exchange(untold_gap_samples_, 0)) +
+      "mirror '" + name_ + "' lacks " + std::to_string(*unlogged) +
           " samples, which its owner's ring no longer held when their turn came; keep more history "
           "there, or write less than the link carries",
       log_fields());

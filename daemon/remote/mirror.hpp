@@ -21,6 +21,7 @@
 #include "common.pb.h"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/base/rate_limiter.hpp"
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/remote/lender.hpp"
 #include "daemon/remote/mirror_clock.hpp"
@@ -143,8 +144,7 @@ class Mirror final : private OwnerConnection::Observer, private FrameConnection:
   bool subscribed_before_ = false;
   std::uint64_t reconnects_ = 0, restarts_ = 0;
   Totals before_;  // of the rings that were replaced
-  std::uint64_t untold_gap_samples_ = 0;
-  MonoTime next_gap_line_{};
+  RateLimiter gap_lines_{1, std::chrono::seconds(10)};
 
   bool done_ = false;
   Lender lender_;

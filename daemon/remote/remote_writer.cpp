@@ -17,7 +17,6 @@ namespace {
 constexpr std::uint64_t kOpenSerial = 1, kStartSerial = 2;
 
 // A link that is too slow for its writer loses samples all the time.
-constexpr Duration kLossLinePause = std::chrono::seconds(10);
 
 }  // namespace
 
@@ -218,13 +217,11 @@ Result<void> RemoteWriter::note_published_untrusted(Tid last) {
 
 void RemoteWriter::on_gap(Tid, std::uint64_t count) {
   lost_samples_ += count;
-  untold_lost_samples_ += count;
-  const MonoTime now = MonoClock::now();
-  if (now < next_loss_line_) return;
-  next_loss_line_ = now + kLossLinePause;
+  const auto unlogged = loss_lines_.admit(MonoClock::now(), count);
+  if (!unlogged) return;
   parts_.logger.warning(
-      "stream '" + name_ + "' lacks " + std::to_string(std::exchange(untold_lost_samples_, 0)) +
-          " samples written here, " + std::to_string(lost_samples_) +
+      "stream '" + name_ + "' lacks " + std::to_string(*unlogged) + " samples written here, " +
+          std::to_string(lost_samples_) +
           " in all: the local ring no longer held them when their turn came; keep more history, "
           "or write less than the link carries",
       log_fields());

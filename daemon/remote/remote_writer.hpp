@@ -22,6 +22,7 @@
 #include <string>
 #include <vector>
 
+#include "daemon/base/rate_limiter.hpp"
 #include "daemon/link/sample_pump.hpp"
 #include "daemon/link/sample_sender.hpp"
 #include "daemon/link/stream_feed.hpp"
@@ -124,8 +125,8 @@ class RemoteWriter final : private OwnerConnection::Observer,
   History history_;       // of the owner's ring
   std::optional<Error> trouble_;
   bool told_ = false;  // the log knows of it
-  std::uint64_t lost_samples_ = 0, untold_lost_samples_ = 0;
-  MonoTime next_loss_line_{};
+  std::uint64_t lost_samples_ = 0;
+  RateLimiter loss_lines_{1, std::chrono::seconds(10)};
 
   std::unique_ptr<OutgoingRing> ring_;
   std::shared_ptr<StreamFeed> feed_;

@@ -34,5 +34,14 @@ TEST(RateLimiter, HasAllOfThemAgainAfterARestAndNotMore) {
   EXPECT_EQ(take_all(pace, kBegin + 10s), 4);
 }
 
+TEST(RateLimiter, SumsUpWhatIsLeftOut) {
+  RateLimiter lines(1, 10s);
+  EXPECT_EQ(lines.admit(kBegin, 5), 5u);
+  EXPECT_EQ(lines.admit(kBegin + 1s, 7), std::nullopt);
+  EXPECT_EQ(lines.admit(kBegin + 9s, 2), std::nullopt);
+  EXPECT_EQ(lines.admit(kBegin + 10s, 1), 10u);
+  EXPECT_EQ(lines.admit(kBegin + 20s), 1u);
+}
+
 }  // namespace
 }  // namespace dssm::daemon
