@@ -1,34 +1,37 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""Counts what the test runs of ./check did.
+"""Counts the results of the tests of ./check.
 
-Takes build folders. Reads what meson wrote there: testlog.json, a line for each test program, and
-testlog.junit.xml, an entry for each test in them. Names every test that failed, with what it said,
-or was skipped, and closes with one line "N passed, N failed" (", N skipped" when there were any). A
-program that ended badly without naming a failed test, a crash say, counts as one. Exits with 1 when
-a test failed or when there was none.
+    scripts/summary.py [--steps PASSED FAILED] FOLDER...
+
+Reads what meson wrote in these build folders: testlog.json, a line for each test program, and
+testlog.junit.xml, an entry for each test in them. Names every test that failed, with its output, or
+was skipped, and closes with one line "N passed, N failed" (", N skipped" when there were any). A
+program that failed without naming a failed test, for example in a crash, counts as one. --steps adds
+steps that are not tests. Exits with 1 when something failed or when there was nothing to count.
 """
 
+import argparse
 import json
 import pathlib
 import sys
 import textwrap
 import xml.etree.ElementTree as ElementTree
 
-MOST_LINES = 12
+MAX_LINES = 12
 
 
 def first_lines(text: str | None) -> str:
-    """What a test says of its failure, as far as it is worth repeating far from its log."""
-    return "\n".join((text or "").strip().splitlines()[:MOST_LINES])
+    """The beginning of a test's failure message."""
+    return "\n".join((text or "").strip().splitlines()[:MAX_LINES])
 
 
 def final_failure(case: ElementTree.Element) -> str:
-    """What a program printed that ended without naming a failed test: how it began and ended."""
+    """Beginning and end of the output of a program that failed without naming a failed test."""
     printed = case.findtext("system-err") or case.findtext("system-out") or ""
     lines = printed.strip().splitlines()
-    if len(lines) > 2 * MOST_LINES:
-        lines[MOST_LINES:-MOST_LINES] = ["..."]
+    if len(lines) > 2 * MAX_LINES:
+        lines[MAX_LINES:-MAX_LINES] = ["..."]
     return "\n".join(lines)
 
 
@@ -37,14 +40,14 @@ def count(folder: pathlib.Path) -> tuple[int, int, int]:
     passed = failed = skipped = 0
     for case in ElementTree.parse(folder / "testlog.junit.xml").getroot().iter("testcase"):
         name = f"{folder.parent.name}: {case.get('classname')}.{case.get('name')}"
-        troubles = case.findall("failure") + case.findall("error")
-        if troubles:
+        failures = case.findall("failure") + case.findall("error")
+        if failures:
             failed += 1
             print(f"FAILED  {name}")
-            for trouble in troubles:
-                said = first_lines(trouble.get("message") or trouble.text) or final_failure(case)
-                if said:
-                    print(textwrap.indent(said, " " * 8))
+            for failure in failures:
+                text = first_lines(failure.get("message") or failure.text) or final_failure(case)
+                if text:
+                    print(textwrap.indent(text, " " * 8))
         elif case.find("skipped") is not None or case.get("result") in ("skipped", "suppressed"):
             skipped += 1
             print(f"SKIPPED {name}")
@@ -57,12 +60,16 @@ def count(folder: pathlib.Path) -> tuple[int, int, int]:
     return passed, max(failed, len(bad)), skipped
 
 
-def main(folders: list[str]) -> int:
-    counts = [count(pathlib.Path(folder) / "meson-logs") for folder in folders]
+def main() -> int:
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--steps", nargs=2, type=int, default=(0, 0), metavar=("PASSED", "FAILED"))
+    parser.add_argument("folder", nargs="*", type=pathlib.Path)
+    options = parser.parse_args()
+    counts = [(*options.steps, 0), *(count(folder / "meson-logs") for folder in options.folder)]
     passed, failed, skipped = (sum(column) for column in zip(*counts))
     print(f"{passed} passed, {failed} failed" + (f", {skipped} skipped" if skipped else ""))
     return 1 if failed or not passed else 0
 
 
 if __name__ == "__main__":
-    sys.exit(main(sys.argv[1:]))
+    sys.exit(main())

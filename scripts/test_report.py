@@ -2,8 +2,8 @@
 """Results of a test program that meson does not run, in the files that meson would write.
 
 scripts/summary.py counts what is in FOLDER/meson-logs: testlog.junit.xml has an entry for each test,
-testlog.json a line for the whole program. Both are written anew after each test, so a program that
-is killed leaves what it did until then, and counts as failed (INTERRUPT).
+testlog.json a line for the whole program. Both are written again after each test, so a program that
+is killed leaves its results so far, and counts as failed (INTERRUPT).
 
     with Report("packages", folder) as report:
         if report.run("the packages are built", build):
@@ -40,7 +40,7 @@ class Report:
         self._passed = self._failed = 0
 
     def run(self, name: str, test: Callable[[], object]) -> bool:
-        """Runs a test, says how it went, and returns whether it passed.
+        """Runs a test, prints its result, and returns whether it passed.
 
         A test fails by any exception but Skip, an AssertionError say.
         """
@@ -50,7 +50,7 @@ class Report:
         except Skip as reason:
             self._note(name, started, "skipped", str(reason))
             return False
-        except Exception:  # whatever goes wrong is this test's failure, and the others still run
+        except Exception:  # any exception fails this test only; the others still run
             self._note(name, started, "failure", traceback.format_exc())
             return False
         self._note(name, started)
@@ -73,7 +73,7 @@ class Report:
                  trace: types.TracebackType | None) -> None:
         if error is not None:
             text = "".join(traceback.format_exception(kind, error, trace))
-            self._note("the program comes to its end", time.monotonic(), "failure", text)
+            self._note("the program ends normally", time.monotonic(), "failure", text)
         if self._failed:
             self._write("FAIL")
         else:

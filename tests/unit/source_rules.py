@@ -1,11 +1,16 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
 #
-# Checks that includes never turn back: that each file includes only files of its own folder and of
-# folders before it in ORDER, and that no files include each other in a circle. Prints each include
-# that breaks this, and fails.
+# Checks rules about the sources that no other tool checks. Prints each breach, and fails if there is
+# one.
 #
-#   include_order.py SOURCE_ROOT
+#   source_rules.py SOURCE_ROOT
+#
+# * Includes never turn back: each file includes only files of its own folder and of folders before
+#   it in ORDER, and no files include each other in a circle.
+# * A file with more than MAX_WITHOUT_ESSAY lines opens with a comment that says what it does; for
+#   x.cpp the comment may be in x.hpp.
+# * A ruler is one line: "// --- words".
 import os
 import re
 import sys
@@ -39,6 +44,9 @@ ONLY = {
     "client/dssmctl": ["core/include", "client/include"],
 }
 INCLUDE_ROOTS = ["", "core/include", "client/include", "client/ssm/include"]
+MAX_WITHOUT_ESSAY = 200
+# A comment that is the second half of a ruler: only dashes, or words before dashes.
+SPLIT_RULER = re.compile(r"^\s*//(?! ---? ?\w).*---+$")
 INCLUDE = re.compile(r'^\s*#\s*include\s+["<]([^">]+)[">]', re.MULTILINE)
 
 
@@ -48,8 +56,8 @@ def folder_of(path):
     return max(names, key=len) if names else None
 
 
-def sources(root):
-    for top in ("core", "client", "daemon"):
+def sources(root, tops):
+    for top in tops:
         for folder, _, files in os.walk(os.path.join(root, top)):
             for name in files:
                 if name.endswith((".hpp", ".cpp", ".h")):
@@ -90,13 +98,35 @@ def circle(graph):
     return None
 
 
-def main(root):
+def has_essay(root, path):
+    """Whether the file, or x.hpp for x.cpp, has a comment after its line with the licence."""
+    for name in (path, path.removesuffix(".cpp") + ".hpp"):
+        full = os.path.join(root, name)
+        if os.path.isfile(full):
+            with open(full, encoding="utf-8") as file:
+                if re.match(r"// SPDX.*\n//\n// \S", file.read()):
+                    return True
+    return False
+
+
+def comment_errors(root):
+    for path in sorted(sources(root, ("core", "client", "daemon", "docs", "tests"))):
+        with open(os.path.join(root, path), encoding="utf-8") as file:
+            lines = file.read().splitlines()
+        for number, line in enumerate(lines, 1):
+            if SPLIT_RULER.match(line):
+                yield f"{path}:{number}: a ruler is one line: // --- words"
+        if len(lines) > MAX_WITHOUT_ESSAY and not has_essay(root, path):
+            yield f"{path}: {len(lines)} lines, and no comment at the top says what they do"
+
+
+def include_errors(root):
     rank = {name: number for number, names in enumerate(ORDER) for name in names}
-    errors, graph = [], {}
-    for path in sorted(sources(root)):
+    graph = {}
+    for path in sorted(sources(root, ("core", "client", "daemon"))):
         own = folder_of(path)
         if own is None:
-            errors.append(f"{path}: its folder is not in ORDER of {sys.argv[0]}; add it there")
+            yield f"{path}: its folder is not in ORDER of {sys.argv[0]}; add it there"
             continue
         with open(os.path.join(root, path), encoding="utf-8") as file:
             graph[path] = list(included(root, path, file.read()))
@@ -108,12 +138,16 @@ def main(root):
             if own.startswith("daemon") and other.startswith("client"):
                 allowed = False
             if not allowed:
-                errors.append(f"{path} includes {other_path}: {own} must not include {other}")
+                yield f"{path} includes {other_path}: {own} must not include {other}"
     loop = circle(graph)
     if loop:
-        errors.append("files include each other: " + " -> ".join(loop))
+        yield "files include each other: " + " -> ".join(loop)
     if not graph:
-        errors.append(f"{root} has no sources")
+        yield f"{root} has no sources"
+
+
+def main(root):
+    errors = [*include_errors(root), *comment_errors(root)]
     for error in errors:
         print(error)
     return 1 if errors else 0
@@ -121,5 +155,5 @@ def main(root):
 
 if __name__ == "__main__":
     if len(sys.argv) != 2:
-        sys.exit("usage: include_order.py SOURCE_ROOT")
+        sys.exit("usage: source_rules.py SOURCE_ROOT")
     sys.exit(main(sys.argv[1]))
