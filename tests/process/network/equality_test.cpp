@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A mirror answers as the owner's ring does: random reads by time and by tid of the same streams on
-// three hosts, while they are written and in pauses, give the same tids, times, clock errors and
+// A mirror gives the same answers as the owner's ring: random reads by time and by tid of the same
+// streams on three hosts, during writes and in pauses, give the same tids, times, clock errors and
 // bytes.
 #include <atomic>
 #include <cstring>
@@ -23,7 +23,7 @@ constexpr int kReadsByTime = 1'000'000 / kSlowness;  // of all streams, each on 
 // One stream, its writer on pc1, and a reader on each host; [0] is the owner's.
 struct Watched {
   KnownStream known;
-  Tid history = 0;    // samples written before anybody reads
+  Tid history = 0;    // samples written before the first read
   int per_round = 0;  // samples written in each round
   int percent_of_reads = 0;
   RawWriter writer;
@@ -49,8 +49,8 @@ class Equality : public NetworkTest {
     while (streams.back().writer.newest() + 1 < history) streams.back().write_next();
   }
 
-  // Reads by `read(reader, payload, info)` on all hosts, and compares. Returns whether the read was
-  // good on all; while the stream is written, `too_old` and `not_yet` may come on one only.
+  // Reads by `read(reader, payload, info)` on all hosts, and compares. True if all reads were ok; while
+  // the stream is written, `too_old` and `not_yet` may occur on one host only.
   template <class Read>
   bool compare(Watched& stream, Read read, bool paused) {
     SampleInfo infos[kHosts];
@@ -72,7 +72,7 @@ class Equality : public NetworkTest {
     return true;
   }
 
-  // A random time in the middle of the samples [first, last], or a little outside of them.
+  // A random time between the samples `first` and `last`, or shortly outside.
   Time random_time(const Watched& stream, Tid first, Tid last) {
     const std::int64_t margin = 3 * to_ns(stream.known.cycle);
     std::uniform_int_distribution<std::int64_t> times(to_ns(stream.known.info(first).time) - margin,
@@ -80,7 +80,7 @@ class Equality : public NetworkTest {
     return time_from_ns(times(random));
   }
 
-  // Waits until all mirrors have what the owner has.
+  // Waits until all mirrors have the owner's newest sample.
   void await_mirrors(Watched& stream) {
     for (RawReader& reader : stream.readers) {
       ASSERT_EQ(reader.wait_for_tid(stream.writer.newest(), kNever), WaitStatus::ready);
@@ -93,7 +93,7 @@ class Equality : public NetworkTest {
     await_mirrors(stream);
     for (int i = 0; i < reads && !HasFailure(); ++i) {
       const Tid oldest = stream.readers[0].oldest();
-      // A third of them before anybody here began to read.
+      // A third of the reads are of samples from before the first read.
       const Tid newest = i % 3 == 0 ? stream.history - 1 : stream.writer.newest();
       const Time t = random_time(stream, std::min(oldest, newest), newest);
       compare(
@@ -105,7 +105,7 @@ class Equality : public NetworkTest {
     }
   }
 
-  // Until `done`: by tid, and, on streams whose times never run backwards, by time.
+  // Until `done`: reads by tid, and by time on streams whose times never decrease.
   void compare_while_written(const std::atomic<bool>& done) {
     while (!done && !HasFailure()) {
       for (Watched& stream : streams) {
@@ -119,8 +119,8 @@ class Equality : public NetworkTest {
             },
             false);
         if (stream.known.jitter >= stream.known.cycle / 2) continue;
-        // Up to the newest one that all have, the answer can not change any more. Any of the
-        // mirrors may be behind, also behind `tid`.
+        // Up to the newest sample that all hosts have, the answer is final. Any mirror may be older,
+        // also than `tid`.
         Tid newest = stream.readers[0].newest();
         for (const RawReader& reader : stream.readers) newest = std::min(newest, reader.newest());
         const Time t = std::min(random_time(stream, std::min(tid, newest), newest),
@@ -154,7 +154,7 @@ TEST_F(Equality, MirrorsAnswerEveryReadAsTheOwnerDoes) {
     for (Session& session : sessions) {
       stream.readers.push_back(session.await_raw_reader(stream.known.id, kNever).value());
     }
-    await_mirrors(stream);  // opening one does not wait for long for what is in it
+    await_mirrors(stream);  // opening returns before the history has arrived
   }
   for (int round = 0; round < kRounds && !HasFailure(); ++round) {
     std::atomic<bool> done = false;
@@ -175,8 +175,8 @@ TEST_F(Equality, MirrorsAnswerEveryReadAsTheOwnerDoes) {
   }
   EXPECT_GT(compared_while_written, 0u);
   for (Watched& stream : streams) {
-    EXPECT_EQ(stream.readers[0].oldest(), 0) << "the past from before the readers is all there";
-    // Now let the writer lap the ring, as fast as it can: what is left is the same everywhere.
+    EXPECT_EQ(stream.readers[0].oldest(), 0) << "the samples from before the readers are missing";
+    // The writer laps the ring at full speed; afterwards the same samples remain on all hosts.
     for (std::uint64_t i = 0; i < 2 * stream.known.depth; ++i) stream.write_next();
     stream.history = stream.writer.newest();
     compare_by_time_in_a_pause(stream, 1000);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A fleet of the test's own: PCs with a dssmd each, which listens on its PC's address and has all
-// the others for peers.
+// A fleet for one test: PCs with one dssmd each, which listens at its PC's address and has all the
+// others as peers.
 #pragma once
 
 #include <gtest/gtest.h>
@@ -21,7 +21,7 @@ enum class IpVersion : std::uint8_t { v4, v6 };
 
 class Fleet {
  public:
-  // `extra` flags are given to every dssmd. Hosts are numbered from 1, as in Network.
+  // Every dssmd gets the `extra` flags. Hosts are numbered from 1, as in Network.
   explicit Fleet(std::unique_ptr<Network> network, const std::vector<std::string>& extra = {},
                  IpVersion version = IpVersion::v4);
 
@@ -29,13 +29,13 @@ class Fleet {
   int hosts() const { return network_->hosts(); }
 
   DaemonProcess& dssmd(int host) { return *dssmds_.at(static_cast<std::size_t>(host) - 1); }
-  // Kills it, unless that was done already; starts it again in its place.
+  // Kill it unless it is dead; start it unless it runs.
   void kill_dssmd(int host);
   void start_dssmd(int host);
   bool runs(int host) { return dssmd(host).pid() > 0; }
 
-  // A connection of this process to the host's dssmd. A program sees the network only through
-  // dssmd, so it does not matter that this one is in no host.
+  // A connection of this process to the host's dssmd. Programs use the network only through dssmd, so
+  // this process need not be in the host's namespace.
   Session session(int host);
 
  private:
@@ -43,28 +43,28 @@ class Fleet {
   std::vector<std::unique_ptr<DaemonProcess>> dssmds_;
 };
 
-// Tests that need PCs; skipped, with the reason, where there can be none.
+// Tests that need PCs; skipped, with the reason, where these cannot be created.
 class NetworkTest : public testing::Test {
  protected:
   // In a test: `if (!make_fleet(3)) return;`
   bool make_fleet(int hosts, const std::vector<std::string>& extra = {},
                   IpVersion version = IpVersion::v4);
-  // Skips the test, with the reason, when the network cannot be had.
+  // Skips the test, with the reason, if the network cannot be created.
   std::unique_ptr<Network> make_network(int hosts);
 
   std::unique_ptr<Fleet> fleet;
 };
 
-// Where the host's dssmd listens: "10.77.0.1:13776", "[fd77::1]:13776".
+// The address at which the host's dssmd listens: "10.77.0.1:13776", "[fd77::1]:13776".
 std::string dssmd_address(int host, IpVersion version = IpVersion::v4);
 
-// Looks again and again until `done` is true, for what happens soon but cannot be waited for. Fails
-// the test, and returns false, when it did not happen in a minute.
+// Polls until `done` is true, for events without a notification. Fails the test, and returns false,
+// after a minute.
 template <class Done>
 bool await(const char* what, Done done) {
   for (const MonoTime end = deadline_in(std::chrono::minutes(1)); !done();) {
     if (MonoClock::now() > end) {
-      ADD_FAILURE() << "did not happen in a minute: " << what;
+      ADD_FAILURE() << "did not happen within a minute: " << what;
       return false;
     }
     std::this_thread::sleep_for(std::chrono::milliseconds(2));
@@ -72,13 +72,13 @@ bool await(const char* what, Done done) {
   return true;
 }
 
-// What `session`'s dssmd knows of the host; an empty state when it does not list it.
+// What `session`'s dssmd knows of the host; the state is empty if dssmd does not list it.
 HostInfo host_info(Session& session, const std::string& name);
 
 // $NAME as a number, or `otherwise`.
 std::uint64_t number_from_environment(const char* name, std::uint64_t otherwise);
 
-// How much slower than usual things go here: what costs much is done so many times less.
+// By how much sanitizers slow programs down; tests divide expensive work by it.
 #if defined(__SANITIZE_THREAD__)
 inline constexpr int kSlowness = 20;
 #elif defined(__SANITIZE_ADDRESS__)

@@ -26,7 +26,7 @@ std::uint64_t Follower::lost() const {
 ReadStatus Follower::next(SampleInfo& info) {
   if (auto* reader = std::get_if<RawReader>(&source_)) return reader->next(payload_, info);
   const Result<ReadStatus> status = connector().next(payload_, info);
-  return status ? *status : ReadStatus::not_yet;  // away: the next call tries again
+  return status ? *status : ReadStatus::not_yet;  // unavailable: the next call tries again
 }
 
 void Follower::take(int most) {
@@ -37,7 +37,7 @@ void Follower::take(int most) {
         check(info);
         break;
       case ReadStatus::restarted:
-        if (owner_) fault("began anew, although its owner's ring was always there");
+        if (owner_) fault("restarted, although its owner's ring always existed");
         ++restarts_;
         earlier_life_ = life_;
         life_ = 0;
@@ -45,7 +45,7 @@ void Follower::take(int most) {
         break;
       case ReadStatus::not_yet:
       case ReadStatus::clock_out_of_bounds:  // not of reads by tid
-      case ReadStatus::lapped:               // again and again; the next call goes on
+      case ReadStatus::lapped:               // repeatedly; the next call continues
         return;
       case ReadStatus::too_old:
         fault("next() returned too_old");
@@ -58,20 +58,20 @@ void Follower::check(const SampleInfo& info) {
   if (life_ == 0) life_ = KnownStream::life(payload_);
   const bool is_reader = std::holds_alternative<RawReader>(source_);
   if (last_ == kNoTid) {
-    // A reader counts from tid 0, a subscription from the oldest sample there was.
+    // A reader counts losses from tid 0, a subscription from the oldest sample at its start.
     first_ = is_reader ? 0 : info.tid - static_cast<Tid>(lost() - lost_);
     last_ = first_ - 1;
     first_taken_ = info.tid;
   }
-  if (life_ <= earlier_life_) fault("a new ring with samples of an old life");
+  if (life_ <= earlier_life_) fault("a new ring with samples of an earlier life");
   if (const std::string wrong = known_.fault(payload_, info, life_); !wrong.empty()) fault(wrong);
   if (info.tid <= last_) {
     fault("tid " + std::to_string(info.tid) + " after " + std::to_string(last_));
   }
   const auto left_out = static_cast<std::uint64_t>(info.tid - last_ - 1);
   std::uint64_t counted = lost() - lost_;
-  // A subscription counts a gap when it hears of it, which may be before this sample's turn; and
-  // what was counted at the first one's turn may be of a gap behind that.
+  // A subscription counts a gap when it is notified of it, which may be before this sample is taken.
+  // Losses that were counted when the first sample was taken may belong to a gap after that sample.
   if (!is_reader && left_out > counted) {
     const auto behind_first =
         std::min(left_out - counted, static_cast<std::uint64_t>(first_taken_ - first_));
@@ -81,9 +81,9 @@ void Follower::check(const SampleInfo& info) {
   }
   if (is_reader ? left_out != counted : left_out > counted) {
     fault(std::to_string(left_out) + " samples before tid " + std::to_string(info.tid) +
-          " did not come, and " + std::to_string(counted) + " were counted");
+          " are missing, and " + std::to_string(counted) + " were counted");
   }
-  // Asked after the loss: what is there now was there when it was called lost.
+  // Queried after the loss: the samples of the ring now were in it when they were counted as lost.
   if (left_out > 0 && owner_ && owner_->oldest() < info.tid) {
     fault("tids " + std::to_string(last_ + 1) + " to " + std::to_string(info.tid - 1) +
           " were lost, and the owner's ring holds those from " + std::to_string(owner_->oldest()));

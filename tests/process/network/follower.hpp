@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A reader, or a PConnector's subscription, that takes every sample of a stream of known samples
-// and checks what it is given: each sample once, in order, untorn; that gaps are counted exactly;
-// and that nothing is called lost which the owner's ring still holds.
+// A reader, or a PConnector's subscription, that reads every sample of a stream of known samples and
+// checks them: each sample once, in order, untorn; gaps counted exactly; no sample counted as lost
+// that the owner's ring still holds.
 #pragma once
 
 #include <dssm/dssm.hpp>
@@ -19,14 +19,14 @@ namespace dssm::test {
 // One thread, that of its reader.
 class Follower {
  public:
-  //   reader     begins with the oldest sample that is there
+  //   reader     begins with the oldest sample of its ring
   //   connector  has subscribed from the oldest sample on
-  //   owner      a reader of the owner's own ring, which lives as long as the stream; none: the
-  //              stream may begin anew, with a life of a higher number
+  //   owner      a reader of the owner's ring, which exists as long as the stream; without it, the
+  //              stream may restart, with a greater life
   Follower(const KnownStream& known, RawReader reader, std::optional<RawReader> owner);
   Follower(const KnownStream& known, PConnector connector, std::optional<RawReader> owner);
 
-  // Takes what is there, up to `most` samples.
+  // Takes the available samples, at most `most`.
   void take(int most);
 
   RawReader& reader() { return std::get<RawReader>(source_); }
@@ -35,14 +35,14 @@ class Follower {
   // The newest sample of the owner's ring has been taken.
   bool has_all() const { return owner_ && last_ == owner_->newest(); }
 
-  Tid first() const { return first_; }  // of the last ring: the first one that was there to be had
+  Tid first() const { return first_; }  // the first available one of the last ring
   Tid last() const { return last_; }
   std::uint64_t life() const { return life_; }
   std::uint64_t taken() const { return taken_; }
   std::uint64_t lost() const;
   std::uint64_t restarts() const { return restarts_; }
 
-  // All that was wrong, a line each; empty: nothing.
+  // All errors, one per line; empty if there are none.
   const std::string& faults() const { return faults_; }
 
  private:

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What a fleet promises when cables are cut, names collide, versions differ: on PCs of the test's
-// own.
+// The promises of a fleet when cables are cut, names are equal and versions differ, tested on PCs as
+// network namespaces.
 #include <fcntl.h>
 #include <unistd.h>
 
@@ -20,7 +20,7 @@ using namespace std::chrono_literals;
 
 class Hosts : public NetworkTest {
  protected:
-  // Waits until the two see each other.
+  // Waits until `session`'s dssmd is connected to `host`.
   void await_up(Session& session, int host) {
     await("the host is up", [&] { return host_info(session, Network::name(host)).state == "up"; });
   }
@@ -62,7 +62,7 @@ class Hosts : public NetworkTest {
   }
 };
 
-TEST_F(Hosts, ThatCannotBeReachedLeaveWithin3SecondsAndComeBack) {
+TEST_F(Hosts, ThatAreUnreachableAreDownWithin3SecondsAndUpAgain) {
   if (!make_fleet(2)) return;
   Session here = fleet->session(1);
   const RawWriter writer =
@@ -79,14 +79,14 @@ TEST_F(Hosts, ThatCannotBeReachedLeaveWithin3SecondsAndComeBack) {
     EXPECT_NE(host_info(here, "pc2").error, "");
     fleet->network().heal(2);
     await_up(here, 2);
-    await("its stream is back", [&] { return lists(here, "there"); });
-    if (noticed < 3500ms) break;  // the machine may be busy: once more
+    await("its stream is listed again", [&] { return lists(here, "there"); });
+    if (noticed < 3500ms) break;  // the machine may be busy: try again
   }
-  // This is the promise itself: 3 s, and half a second for a busy machine to look.
+  // The promise is 3 s; half a second more for a busy machine to notice.
   EXPECT_LT(noticed, 3500ms);
 }
 
-TEST_F(Hosts, ThatDieAreNoticedAtOnceAndComeBack) {
+TEST_F(Hosts, ThatDieAreDownAtOnceAndUpAgain) {
   if (!make_fleet(2)) return;
   Session here = fleet->session(1);
   await_up(here, 2);
@@ -121,7 +121,7 @@ TEST_F(Hosts, MirrorsResumeAtTheirTidAfterACut) {
   EXPECT_EQ(info.mirror->gap_samples, 0u);
   EXPECT_GE(info.mirror->reconnects, 3u);
   EXPECT_EQ(info.mirror->newest, writer.newest());
-  EXPECT_EQ(info.mirror->received_samples, 3100u) << "each came once";
+  EXPECT_EQ(info.mirror->received_samples, 3100u) << "not each came once";
 }
 
 TEST_F(Hosts, MirrorsResumeAtTheirTidAfterADssmdWasKilled) {
@@ -146,7 +146,7 @@ TEST_F(Hosts, MirrorsResumeAtTheirTidAfterADssmdWasKilled) {
   EXPECT_EQ(reader.restarts(), 0u);
 }
 
-// Shorter than anybody would notice: TCP itself sends again.
+// Shorter than the peer timeout: TCP sends again.
 TEST_F(Hosts, ShortCutsLoseNothing) {
   if (!make_fleet(2)) return;
   Session owner = fleet->session(1), there = fleet->session(2);
@@ -183,9 +183,8 @@ TEST_F(Hosts, GapsAfterACutAreCountedExactly) {
   EXPECT_EQ(there.info(known.id).value().mirror->gap_samples, 927u);
 }
 
-// A link that carries a third of a stream: gaps are counted, and what else goes over the link does
-// not suffer.
-TEST_F(Hosts, BehindASlowLinkSkipForwardAndCountIt) {
+// A network that carries a third of a stream: gaps are counted, and other streams do not suffer.
+TEST_F(Hosts, WithASlowNetworkSkipSamplesAndCountThem) {
   if (!make_fleet(2)) return;
   const Result<void> slow = fleet->network().shape(2, "tbf rate 20mbit burst 64kb latency 50ms");
   if (!slow) GTEST_SKIP() << slow.error().message;
@@ -218,7 +217,7 @@ TEST_F(Hosts, BehindASlowLinkSkipForwardAndCountIt) {
   EXPECT_EQ(followers[1].lost(), 0u);
 }
 
-TEST_F(Hosts, FarApartLoseNothing) {
+TEST_F(Hosts, WithALongDelayLoseNothing) {
   if (!make_fleet(2)) return;
   for (int host = 1; host <= 2; ++host) {
     const Result<void> far = fleet->network().shape(host, "netem delay 50ms 10ms loss 1%");
@@ -236,7 +235,7 @@ TEST_F(Hosts, FarApartLoseNothing) {
   EXPECT_EQ(reader.lost(), 0u);
 }
 
-TEST_F(Hosts, StreamsOfOneNameAreToldApartByHost) {
+TEST_F(Hosts, StreamsOfOneNameDifferByHost) {
   if (!make_fleet(3)) return;
   std::vector<RawWriter> writers;
   for (int host = 1; host <= 2; ++host) {
@@ -256,7 +255,7 @@ TEST_F(Hosts, StreamsOfOneNameAreToldApartByHost) {
   for (int host = 1; host <= 2; ++host) {
     EXPECT_EQ(read(third.await_raw_reader({"twin", 0, Network::name(host)}, kNever)), host);
     Session own = fleet->session(host);
-    EXPECT_EQ(read(own.open_raw_reader({"twin", 0, ""})), host) << "the own one comes first";
+    EXPECT_EQ(read(own.open_raw_reader({"twin", 0, ""})), host) << "the own stream has priority";
   }
   const auto either = third.open_raw_reader({"twin", 0, ""});
   ASSERT_FALSE(either);
@@ -265,14 +264,14 @@ TEST_F(Hosts, StreamsOfOneNameAreToldApartByHost) {
   EXPECT_NE(either.error().message.find("'pc2'"), std::string::npos) << either.error().message;
 }
 
-// A PC dies, and another one takes its place with a stream of the same name.
+// A PC dies, and another one creates a stream of the same name.
 TEST_F(Hosts, FindAStreamThatMovedToAnotherHost) {
   if (!make_fleet(3)) return;
   KnownStream known = small("moving", 64);
   RawWriter first = make(fleet->session(1), known);
   write_until(first, known, 9);
   Session third = fleet->session(3);
-  ASSERT_TRUE(third.await_raw_reader(known.id, kNever));  // so that it is known there
+  ASSERT_TRUE(third.await_raw_reader(known.id, kNever));  // until it is known there
   RawReader reader = third.open_raw_reader({"moving", 0, ""}).value();
   reader.seek(kNoTid);
   expect_samples(reader, known, 0, 9);
@@ -290,7 +289,7 @@ TEST_F(Hosts, FindAStreamThatMovedToAnotherHost) {
   ASSERT_EQ(status, ReadStatus::restarted);
   EXPECT_EQ(reader.id().host, "pc2");
   expect_samples(reader, known, 0, 29);
-  // The first one comes back: whoever has moved stays.
+  // The first host is up again: the reader stays with the second one.
   fleet->network().heal(1);
   await_up(third, 1);
   write_until(first, known, 19);
@@ -299,7 +298,7 @@ TEST_F(Hosts, FindAStreamThatMovedToAnotherHost) {
   EXPECT_EQ(reader.restarts(), 1u);
 }
 
-TEST_F(Hosts, SpeakIpv6) {
+TEST_F(Hosts, UseIpv6) {
   if (!make_fleet(2, {}, IpVersion::v6)) return;
   Session owner = fleet->session(1), there = fleet->session(2);
   const KnownStream known = small("six", 64);
@@ -311,19 +310,19 @@ TEST_F(Hosts, SpeakIpv6) {
   EXPECT_GT(there.ping("pc1").value().round_trip, 0ns);
 }
 
-TEST_F(Hosts, RefuseAPeerOfTheFutureInWords) {
+TEST_F(Hosts, RefuseAPeerOfALaterVersionWithAnError) {
   if (!make_fleet(1)) return;
   const Inside inside = fleet->network().inside(1);
   RawPeer peer(Network::address(1));
   peer.send(hello_frame(99));
   const std::optional<net::Frame> last = peer.await_end();
-  ASSERT_TRUE(last && last->has_failure()) << "no last words";
+  ASSERT_TRUE(last && last->has_failure()) << "no final failure";
   EXPECT_EQ(last->failure().code(), "protocol");
   EXPECT_NE(last->failure().message().find("99"), std::string::npos) << last->failure().message();
   EXPECT_NE(last->failure().message().find("pc1"), std::string::npos) << last->failure().message();
 }
 
-TEST_F(Hosts, SayThatAPeerOfTheFutureWasRefused) {
+TEST_F(Hosts, ReportThatAPeerOfALaterVersionWasRefused) {
   std::unique_ptr<Network> network = make_network(2);
   if (!network) return;
   const UniqueFd listener = [&] {
@@ -348,7 +347,7 @@ TEST_F(Hosts, SayThatAPeerOfTheFutureWasRefused) {
   EXPECT_NE(refused.error.find(dssmd_address(2)), std::string::npos) << refused.error;
 }
 
-TEST_F(Hosts, OpenTheNetworkOnlyWhenToldThatItIsInsecure) {
+TEST_F(Hosts, ListenForOtherPcsOnlyWithInsecure) {
   std::unique_ptr<Network> network = make_network(1);
   if (!network) return;
   const Inside inside = network->inside(1);
@@ -361,7 +360,7 @@ TEST_F(Hosts, OpenTheNetworkOnlyWhenToldThatItIsInsecure) {
     EXPECT_NE(finished.err.find(Network::address(1)), std::string::npos) << finished.err;
   }
   remove_tree(folder);
-  // Unasked, it listens where only this PC can reach it.
+  // By default, it listens where only this PC can connect.
   const DaemonProcess dssmd({"--config", "/dev/null"});
   EXPECT_EQ(dssmd.addresses(), (std::vector<std::string>{"127.0.0.1:13776", "[::1]:13776"}));
   EXPECT_FALSE(RawPeer(Network::address(1)).is_open());

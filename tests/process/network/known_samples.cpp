@@ -8,7 +8,7 @@ namespace {
 
 constexpr std::int64_t kFirstTimeNs = 1'000'000'000'000;
 
-// A number that looks random and follows from `number` (splitmix64).
+// A pseudo-random number computed from `number` (splitmix64).
 constexpr std::uint64_t mix(std::uint64_t number) {
   number += 0x9e3779b97f4a7c15;
   number = (number ^ (number >> 30)) * 0xbf58476d1ce4e5b9;

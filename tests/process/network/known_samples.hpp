@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Samples that can be checked by whoever reads them: time, clock error and every word of the
-// payload follow from the stream, the life of its writer, and the tid.
+// Samples that every reader can check: time, clock error and every word of the payload are computed
+// from the stream, the life of its writer, and the tid.
 #pragma once
 
 #include <dssm/sample.hpp>
@@ -17,9 +17,10 @@ struct KnownStream {
   StreamId id;                      // with the owner's host
   std::uint64_t payload_bytes = 0;  // a multiple of 8, at least 16
   std::uint64_t depth = 0;
-  Duration cycle{};   // between two samples, but for the jitter
-  Duration jitter{};  // times differ by at most so much from the regular ones; above the cycle they
-                      // run backwards now and then
+  Duration cycle{};  // between two samples, without jitter
+  Duration
+      jitter{};  // greatest difference from the regular times; above the cycle, times sometimes
+                 // decrease
   std::uint64_t number = 0;  // differs between the streams of a test
 
   TypeInfo type() const { return {"", payload_bytes, 8, {}}; }
@@ -27,13 +28,13 @@ struct KnownStream {
 
   // The stamps of sample `tid`.
   SampleInfo info(Tid tid) const;
-  // Its payload: word 0 is `life`, a number that differs between two writers of one stream of which
-  // the second begins anew; the other words follow from stream, life and tid, and all differ.
+  // Its payload: word 0 is `life`, a number that increases when a writer recreates the stream. The
+  // other words are computed from stream, life and tid, and all differ.
   void fill(std::span<std::byte> payload, std::uint64_t life, Tid tid) const;
 
   static std::uint64_t life(std::span<const std::byte> payload);
 
-  // What is wrong with a sample that was read; empty when nothing is.
+  // The error of a sample that was read; empty if it is correct.
   std::string fault(std::span<const std::byte> payload, const SampleInfo& info,
                     std::uint64_t life) const;
 };

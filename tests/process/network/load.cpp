@@ -23,12 +23,12 @@ constexpr Kind kKinds[] = {
     {20, 256 << 10, 64},  {10, 512 << 10, 32}, {10, 1 << 20, 16},
 };
 
-// The life of the samples that the stream holds already.
+// The life of the samples that the stream holds.
 std::uint64_t life_of(Session& session, const KnownStream& known) {
   RawReader reader = session.open_raw_reader(known.id).value();
   std::vector<std::byte> payload(known.payload_bytes);
   SampleInfo info;
-  while (reader.latest(payload, info) != ReadStatus::ok) continue;  // nobody laps us for ever
+  while (reader.latest(payload, info) != ReadStatus::ok) continue;  // not lapped forever
   return KnownStream::life(payload);
 }
 

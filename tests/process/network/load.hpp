@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The load of the long tests: fifteen streams of known samples, from 10 Hz to 1 kHz and from 64 B
-// to 1 MiB, and who writes them.
+// to 1 MiB, and their writer.
 #pragma once
 
 #include <atomic>
@@ -13,20 +13,19 @@
 namespace dssm::test {
 
 // The fifteen streams of `host`. They are written at `percent` of their full rates, which come to
-// 30 MB and 6000 samples a second; their rings take 120 MB. Some rings reach back for many seconds,
-// others for less than one.
+// 30 MB and 6000 samples a second; their rings take 120 MB. Some rings hold many seconds, others less
+// than one.
 std::vector<KnownStream> load_of(int host, std::uint64_t percent);
 
 // Writes streams at their rates.
 class LoadWriter {
  public:
-  // Creates the streams. Those that are there already are gone on with, with the life that their
-  // samples have.
+  // Creates the streams. Existing streams are continued, with the life of their samples.
   LoadWriter(Session session, const std::vector<KnownStream>& streams, std::uint64_t life);
 
   void write_until(const std::atomic<bool>& stop);
 
-  // Of the stream's number in the list.
+  // `stream` is an index into the list.
   Tid newest(std::size_t stream) const { return streams_[stream].writer.newest(); }
 
  private:
@@ -41,12 +40,11 @@ class LoadWriter {
   std::vector<Written> streams_;
 };
 
-// Four streams of pc1, to be written by another host. Their rings reach back for more than a
-// minute, which is longer than a link is ever cut.
+// Four streams of pc1 that another host writes. Their rings hold more than a minute, which is longer
+// than any cut of a cable.
 std::vector<KnownStream> published_load(std::uint64_t percent);
 
-// 1 kHz of 256 B, a stream of pc1 whose ring reaches back for a minute: nobody has to lose
-// anything.
+// A stream of pc1, 256 B at 1 kHz. Its ring holds a minute, so that readers lose nothing.
 KnownStream steady_stream();
 
 }  // namespace dssm::test

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // A program that writes the load of a host until it is killed: load_writer HOST PERCENT LIFE.
-// Prints one byte when it begins.
+// Prints one byte when it starts to write.
 #include <unistd.h>
 
 #include <cstdlib>

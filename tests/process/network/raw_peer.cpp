@@ -28,13 +28,13 @@ sockaddr_in socket_address(const std::string& address, int port) {
 
 UniqueFd tcp_socket() { return UniqueFd(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0)); }
 
-// The frame that `input` begins with, if it is complete, and its end.
+// The first frame of `input`, if it is complete, and its end.
 std::optional<net::Frame> first_frame(const std::string& input, std::size_t& end) {
   const auto* bytes = reinterpret_cast<const std::uint8_t*>(input.data());
   CodedInputStream in(bytes, static_cast<int>(input.size()));
   std::uint32_t length = 0;
   if (!in.ReadVarint32(&length)) {
-    EXPECT_LT(input.size(), kMaxLengthBytes) << "no length of a frame";
+    EXPECT_LT(input.size(), kMaxLengthBytes) << "an invalid length of a frame";
     return {};
   }
   const auto begin = static_cast<std::size_t>(in.CurrentPosition());
@@ -67,7 +67,7 @@ void RawPeer::send(const net::Frame& frame) {
     CodedOutputStream out(&stream);
     out.WriteVarint32(static_cast<std::uint32_t>(frame.ByteSizeLong()));
     frame.SerializeToCodedStream(&out);
-  }  // `bytes` is complete when both are gone
+  }  // `bytes` is complete after both are destroyed
   send_bytes(bytes);
 }
 
@@ -75,7 +75,7 @@ void RawPeer::send_bytes(std::string_view bytes) {
   while (!bytes.empty() && is_open()) {
     const ssize_t n = ::send(socket_.get(), bytes.data(), bytes.size(), MSG_NOSIGNAL);
     if (n < 0) {
-      EXPECT_NE(errno, EAGAIN) << "dssmd takes nothing and does not close the connection either";
+      EXPECT_NE(errno, EAGAIN) << "dssmd neither receives nor closes the connection";
       socket_.reset();
     } else {
       bytes.remove_prefix(static_cast<std::size_t>(n));
@@ -93,7 +93,7 @@ std::optional<net::Frame> RawPeer::receive() {
     if (!is_open()) return {};
     char buffer[65536];
     const ssize_t n = ::recv(socket_.get(), buffer, sizeof buffer, 0);
-    EXPECT_FALSE(n < 0 && errno == EAGAIN) << "dssmd says nothing and does not close either";
+    EXPECT_FALSE(n < 0 && errno == EAGAIN) << "dssmd neither sends nor closes the connection";
     if (n > 0) {
       input_.append(buffer, static_cast<std::size_t>(n));
     } else {
@@ -124,7 +124,7 @@ net::Frame hello_frame(std::uint32_t protocol_version, const std::vector<std::st
   hello.set_life(1);
   hello.set_program("raw peer");
   hello.set_version("0.0.0");
-  // Its clock is the host's.
+  // Its clock is this PC's.
   std::getline(std::ifstream("/proc/sys/kernel/random/boot_id"),
                *hello.mutable_clock()->mutable_boot_id());
   for (const std::string& feature : features) hello.add_features(feature);

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Thirty streams between three PCs while cables are cut and dssmds are killed at random: every
-// sample that the owner's ring still held when the link came back arrives once, in order, untorn;
-// what is lost is counted exactly.
+// sample that the owner's ring still holds at the reconnection arrives once, in order, untorn;
+// lost samples are counted exactly.
 //
-//   $DSSM_SOAK_SECONDS  how long the trouble lasts; default 45, less under a sanitizer
+//   $DSSM_SOAK_SECONDS  duration of the failures; default 45, less under a sanitizer
 //   $DSSM_SOAK_PERCENT  of the streams' full rates; default 100, less under a sanitizer
-//   $DSSM_TEST_SEED     of the random trouble; default: another one each time, printed
+//   $DSSM_TEST_SEED     of the random failures; default: another one each time, printed
 #include <fcntl.h>
 #include <poll.h>
 #include <unistd.h>
@@ -28,8 +28,8 @@ using namespace std::chrono_literals;
 constexpr int kHosts = 3;
 constexpr int kOwners = 2;  // pc1 and pc2 own fifteen streams each; all hosts read those of others
 
-// For what must come by itself, however busy the machine is.
-constexpr Duration kPatience = 3min;
+// For events that must happen even on a busy machine.
+constexpr Duration kTimeout = 3min;
 
 class Soak : public NetworkTest {
  protected:
@@ -49,15 +49,15 @@ class Soak : public NetworkTest {
     }
   }
 
-  // Followers of all streams of other hosts, on every host. `lasting_rings`: each also looks into
-  // the owner's ring, and by that keeps it alive.
+  // Followers of all streams of other hosts, on every host. With `lasting_rings` each also opens the
+  // owner's ring, which keeps it in use.
   void follow(bool lasting_rings) {
     for (int host = 1; host <= kHosts; ++host) {
       Session& session = sessions[static_cast<std::size_t>(host) - 1];
       for (int owner = 1; owner <= kOwners; ++owner) {
         if (owner == host) continue;
         for (const KnownStream& known : load_of(owner, percent)) {
-          auto reader = session.await_raw_reader(known.id, deadline_in(kPatience));
+          auto reader = session.await_raw_reader(known.id, deadline_in(kTimeout));
           ASSERT_TRUE(reader) << "on " << Network::name(host) << ": " << reader.error().message;
           std::optional<RawReader> owners;
           if (lasting_rings) {
@@ -70,13 +70,13 @@ class Soak : public NetworkTest {
     }
   }
 
-  // Followers by PConnector of all streams of pc1, from the last host, which the calling thread is
-  // inside of.
+  // Followers by PConnector of all streams of pc1, on the last host, in whose namespace the calling
+  // thread runs.
   std::vector<Follower> follow_by_connectors() {
     std::vector<Follower> connected;
     for (const KnownStream& known : load_of(1, percent)) {
       PConnector connector =
-          PConnector::open(known.id, {.address = Network::address(1), .request_timeout = kPatience})
+          PConnector::open(known.id, {.address = Network::address(1), .request_timeout = kTimeout})
               .value();
       connector.subscribe({.start = Subscription::Start::oldest}).value();
       connected.emplace_back(known, std::move(connector),
@@ -85,7 +85,7 @@ class Soak : public NetworkTest {
     return connected;
   }
 
-  // Reads from subscriptions until all is there and the trouble is over, or `give_up`.
+  // Reads from subscriptions until the failures are over and all samples are taken, or `give_up`.
   void read_on(std::vector<Follower>& connected) {
     for (bool all_done = false; !all_done && !give_up;) {
       std::vector<pollfd> fds;
@@ -99,8 +99,7 @@ class Soak : public NetworkTest {
     }
   }
 
-  // Reads on behalf of one host until `finished` says of all its followers that they are done, or
-  // `give_up`.
+  // Reads for one host until `is_done` is true for all its followers, or `give_up`.
   template <class IsDone>
   void read_on(std::vector<Follower>& mine, IsDone is_done) {
     std::vector<RawReader*> readers;
@@ -116,10 +115,10 @@ class Soak : public NetworkTest {
     }
   }
 
-  // Trouble of every kind, at random, for $DSSM_SOAK_SECONDS; in the end all is in order again.
-  // `also` is one more kind.
+  // Causes random failures for $DSSM_SOAK_SECONDS, and repairs all in the end. `also` is a further
+  // kind of failure.
   template <class Also>
-  void make_trouble(Also also) {
+  void cause_failures(Also also) {
     std::mt19937_64 random(seed);
     std::vector<bool> cut(kHosts + 1, false);
     const auto chance = [&](int percent_of_all) {
@@ -127,7 +126,7 @@ class Soak : public NetworkTest {
     };
     for (const MonoTime end = deadline_in(std::chrono::seconds(seconds));
          MonoClock::now() < end && !HasFailure();) {
-      // How long a state of the world lasts; nothing is waited for.
+      // The duration of each state, not a wait for anything.
       std::this_thread::sleep_for(std::chrono::milliseconds(20 + random() % 600));
       const int host = 1 + static_cast<int>(random() % kHosts);
       const auto index = static_cast<std::size_t>(host);
@@ -151,12 +150,12 @@ class Soak : public NetworkTest {
     }
   }
 
-  // Waits for the threads that read, and says what they found.
+  // Waits for the threads that read, and checks their results.
   void finish(std::vector<std::thread>& reading) {
     finishing = true;
     std::atomic<bool> ended = false;
     std::thread watchdog([&] {
-      for (const MonoTime end = deadline_in(kPatience); !ended && !give_up;) {
+      for (const MonoTime end = deadline_in(kTimeout); !ended && !give_up;) {
         if (MonoClock::now() > end) give_up = true;
         std::this_thread::sleep_for(50ms);
       }
@@ -164,7 +163,7 @@ class Soak : public NetworkTest {
     for (std::thread& each : reading) each.join();
     ended = true;
     watchdog.join();
-    EXPECT_FALSE(give_up) << "not all followers came to an end";
+    EXPECT_FALSE(give_up) << "not all followers finished";
     std::uint64_t taken = 0, lost = 0, restarts = 0;
     for (const auto& mine : followers) {
       for (const Follower& follower : mine) {
@@ -177,7 +176,7 @@ class Soak : public NetworkTest {
                 static_cast<unsigned long long>(lost), static_cast<unsigned long long>(restarts));
   }
 
-  // How far a follower on `host` came, and what its dssmd says about it, for messages.
+  // The state of a follower on `host`, and of its mirror, for messages.
   std::string about(int host, const Follower& follower) {
     std::string text = "on " + Network::name(host) + " '" + follower.known().id.str() +
                        "': " + std::to_string(follower.taken()) + " taken, " +
@@ -228,7 +227,7 @@ TEST_F(Soak, LosesNothingThatTheOwnersRingStillHolds) {
     read_on(followers[kHosts]);
   });
   while (!connected) std::this_thread::sleep_for(1ms);
-  make_trouble([](int, std::uint64_t) {});
+  cause_failures([](int, std::uint64_t) {});
   stop = true;
   for (std::thread& each : writing) each.join();
   finish(reading);
@@ -243,8 +242,8 @@ TEST_F(Soak, LosesNothingThatTheOwnersRingStillHolds) {
   }
 }
 
-// Streams of pc1 that are written on pc3: what the link cannot carry waits there, and each sample
-// is written once, so that its tid is the same on both.
+// Streams of pc1 that are written on pc3: samples wait there while there is no connection, and each
+// sample is written once, so that its tid is the same on both.
 TEST_F(Soak, RemoteWritersCatchUpAndWriteEachSampleOnce) {
   open_fleet();
   if (!fleet) return;
@@ -254,7 +253,7 @@ TEST_F(Soak, RemoteWritersCatchUpAndWriteEachSampleOnce) {
   std::thread writing([&] { writer.write_until(stop); });
   for (const KnownStream& known : streams) {
     const auto open = [&] {
-      return sessions[0].await_raw_reader(known.id, deadline_in(kPatience)).value();
+      return sessions[0].await_raw_reader(known.id, deadline_in(kTimeout)).value();
     };
     followers[0].emplace_back(known, open(), open());
   }
@@ -264,7 +263,7 @@ TEST_F(Soak, RemoteWritersCatchUpAndWriteEachSampleOnce) {
       return follower.last() == writer.newest(static_cast<std::size_t>(follower.known().id.id));
     });
   });
-  make_trouble([](int, std::uint64_t) {});
+  cause_failures([](int, std::uint64_t) {});
   stop = true;
   writing.join();
   finish(reading);
@@ -275,9 +274,9 @@ TEST_F(Soak, RemoteWritersCatchUpAndWriteEachSampleOnce) {
   }
 }
 
-// The programs that write are killed too: alone, and together with their dssmd, so that the rings
-// are gone and the streams begin anew.
-TEST_F(Soak, GoesOnWithNewRingsWhenOwnersLoseTheirs) {
+// Writing programs are killed too: alone, and together with their dssmd, so that the rings are lost
+// and the streams restart.
+TEST_F(Soak, ContinuesWithNewRingsWhenOwnersLoseTheirs) {
   open_fleet();
   if (!fleet) return;
   std::uint64_t lives[kOwners + 1] = {};
@@ -290,7 +289,7 @@ TEST_F(Soak, GoesOnWithNewRingsWhenOwnersLoseTheirs) {
                            {fleet->dssmd(owner).environment()}, began[1]);
     ::close(began[1]);
     char byte = 0;
-    EXPECT_EQ(::read(began[0], &byte, 1), 1) << "it ended by itself";
+    EXPECT_EQ(::read(began[0], &byte, 1), 1) << "it ended early";
     ::close(began[0]);
   };
   const auto kill_writer = [&](int owner) {
@@ -310,7 +309,7 @@ TEST_F(Soak, GoesOnWithNewRingsWhenOwnersLoseTheirs) {
       });
     });
   }
-  make_trouble([&](int owner, std::uint64_t random) {
+  cause_failures([&](int owner, std::uint64_t random) {
     kill_writer(owner);
     if (random % 2 == 0) {
       fleet->kill_dssmd(owner);
@@ -318,7 +317,7 @@ TEST_F(Soak, GoesOnWithNewRingsWhenOwnersLoseTheirs) {
     }
     start_writer(owner);
   });
-  // Once more, so that there is a life that all must come to see.
+  // Again, so that there is a last life that all followers must reach.
   for (int owner = 1; owner <= kOwners; ++owner) {
     kill_writer(owner);
     fleet->kill_dssmd(owner);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// SSM programs of programs/, which know nothing of other PCs: the writer runs on one, the reader on
+// The SSM programs in programs/, which do not name PCs: the writer runs on one PC, the reader on
 // another.
 #include <fcntl.h>
 #include <unistd.h>
@@ -14,7 +14,7 @@ namespace {
 
 class SsmPrograms : public NetworkTest {};
 
-TEST_F(SsmPrograms, ReadAStreamOfAnotherPcUnedited) {
+TEST_F(SsmPrograms, ReadAStreamOfAnotherPcUnchanged) {
   if (!make_fleet(2)) return;
   const std::string folder = make_temp_dir();
   int out[2];

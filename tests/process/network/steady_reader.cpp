@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A program that reads all of steady_stream() from the oldest sample on, until its stdin ends; to
-// be stopped and continued. Begins with one byte on stdout when it has read something, ends with a
-// line "TAKEN LOST" about tids 0 to the newest one at that time, or with what was wrong (exit
-// status 1).
+// A program that reads all of steady_stream() from the oldest sample on, until its stdin ends; tests
+// stop and continue it. It writes one byte to stdout after the first sample, and at the end a line
+// "TAKEN LOST" about tids 0 to the newest one, or the errors (exit status 1).
 //
 //   steady_reader          through the local dssmd
 //   steady_reader ADDRESS  with a PConnector to the owner's dssmd
@@ -32,7 +31,7 @@ bool stdin_ended() {
   return ::poll(&in, 1, 0) > 0;
 }
 
-void say_begun() {
+void report_begin() {
   if (::write(STDOUT_FILENO, "x", 1) != 1) std::exit(1);
 }
 
@@ -44,7 +43,7 @@ Outcome read_mirror() {
     (void)follower.reader().wait(kNever);
     follower.take(1);
   }
-  say_begun();
+  report_begin();
   while (!stdin_ended()) {
     (void)follower.reader().wait(deadline_in(50ms));
     follower.take(1000);
@@ -71,7 +70,7 @@ Outcome read_by_connector(const std::string& address) {
     (void)connector.wait(deadline);
     for (;;) {
       const Result<ReadStatus> status = connector.next(payload, info);
-      if (!status || *status != ReadStatus::ok) return;  // away: the next call tries again
+      if (!status || *status != ReadStatus::ok) return;  // unavailable: the next call tries again
       if (info.tid <= last) outcome.faults += "tid " + std::to_string(info.tid) + " again\n";
       last = info.tid;
       outcome.faults += known.fault(payload, info, 1);
@@ -79,7 +78,7 @@ Outcome read_by_connector(const std::string& address) {
     }
   };
   while (outcome.taken == 0) take(kNever);
-  say_begun();
+  report_begin();
   while (!stdin_ended()) take(deadline_in(50ms));
   const Tid newest = connector.newest().value();
   while (last < newest) take(kNever);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What dssmd tells the service manager: the watchdog's signs, the status line, reloads.
+// dssmd's notifications to the service manager: watchdog, status line, reloads.
 #include <gtest/gtest.h>
 
 #include <algorithm>
@@ -33,38 +33,38 @@ class ConfigurationFile {
   std::string dir_ = make_temp_dir();
 };
 
-// How often dssmd said that a reload began, and that it is ready.
+// The number of messages that begin with `begin`.
 std::size_t count(const ServiceManager::Messages& messages, const std::string& begin) {
   return static_cast<std::size_t>(
       std::count_if(messages.begin(), messages.end(),
                     [&](const std::string& message) { return message.starts_with(begin); }));
 }
 
-// Asks for a reload and waits for its end.
+// Requests a reload and waits for its end.
 void reload(ServiceManager& manager) {
   const std::size_t before = count(manager.messages(), "READY=1");
   manager.signal(SIGHUP);
   manager.await([&](const auto& messages) { return count(messages, "READY=1") > before; });
 }
 
-TEST(WatchdogSigns, ComeWhileTheLoopTurnsAndNotWhileItHangs) {
+TEST(WatchdogMessages, AreSentWhileTheLoopRunsAndNotWhileItHangs) {
   ServiceManager manager({.arguments = {"--listen", ""}, .watchdog_us = 200'000});
   EXPECT_TRUE(manager.says_within("WATCHDOG=1", 60s));
   EXPECT_TRUE(manager.says_within("WATCHDOG=1", 60s));
   manager.signal(SIGSTOP);
-  // What it said before it stopped is looked at first. Three intervals: systemd would have acted.
+  // Skips messages from before the stop. Three intervals: systemd would have restarted dssmd.
   EXPECT_FALSE(manager.says_within("WATCHDOG=1", 600ms));
   manager.signal(SIGCONT);
   EXPECT_TRUE(manager.says_within("WATCHDOG=1", 60s));
 }
 
-TEST(WatchdogSigns, AreNotSentWhenNobodyAsks) {
+TEST(WatchdogMessages, AreNotSentWithoutAWatchdog) {
   ServiceManager manager({.arguments = {"--listen", ""}});
   connect_to(manager.socket_path()).list().value();
   EXPECT_EQ(count(manager.messages(), "WATCHDOG=1"), 0u);
 }
 
-TEST(StatusLine, TellsStreamsHostsAndClock) {
+TEST(StatusLine, ShowsStreamsHostsAndClock) {
   DaemonProcess pc2({}, "pc2");
   ServiceManager manager({.arguments = {"--peer", pc2.address(), "--listen", "127.0.0.1:0"}});
   manager.await_status("1 of 1 other hosts up, clock unknown");
@@ -84,10 +84,10 @@ TEST(StatusLine, IsNotRepeatedForEachOfManyChanges) {
     ASSERT_TRUE(session.create<int>("s" + std::to_string(i), kShort));
   }
   manager.await_status(" 100 streams");
-  EXPECT_LE(count(manager.messages(), "STATUS="), 50u) << "a line a change would be 100";
+  EXPECT_LE(count(manager.messages(), "STATUS="), 50u) << "one line per change would be 100";
 }
 
-TEST(Reload, TakesOverWhatCanChangeAtOnce) {
+TEST(Reload, AppliesKeysThatCanChangeAtOnce) {
   const ConfigurationFile file("listen = []\nmax_streams = 1\n");
   ServiceManager manager({.arguments = {"--config", file.path()}});
   Session session = connect_to(manager.socket_path());
@@ -103,7 +103,7 @@ TEST(Reload, TakesOverWhatCanChangeAtOnce) {
         return message.starts_with("RELOADING=1\nMONOTONIC_USEC=");
       });
   ASSERT_NE(reloading, messages.end());
-  EXPECT_EQ(count({reloading, messages.end()}, "READY=1"), 1u) << "it is ready after, once";
+  EXPECT_EQ(count({reloading, messages.end()}, "READY=1"), 1u) << "it is not ready once after that";
 }
 
 TEST(Reload, KeepsTheOldConfigurationWhenTheNewOneHasMistakes) {
@@ -116,7 +116,7 @@ TEST(Reload, KeepsTheOldConfigurationWhenTheNewOneHasMistakes) {
   EXPECT_EQ(session.create<int>("b", kShort).error().code, Errc::limit_exceeded);
 }
 
-TEST(Reload, DialsNewPeersAndDropsOldOnes) {
+TEST(Reload, ConnectsToNewPeersAndDropsOldOnes) {
   DaemonProcess pc2({}, "pc2"), pc3({}, "pc3");
   const std::string head = "listen = []\nmdns = false\npeers = ";
   const ConfigurationFile file(head + "[\"" + pc2.address() + "\"]\n");

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmd as a service, killed, restarted, and stopped and started under load: three writers at 1
-// kHz, a reader of each on this PC and one on another. Not one sample is lost, torn or delivered
-// twice, and the readers on this PC are told nothing.
+// kHz, a reader of each on this PC and one on another. No sample is lost, torn or delivered
+// twice, and readers on this PC get no event.
 #include <gtest/gtest.h>
 
 #include <atomic>
@@ -23,7 +23,7 @@ constexpr int kStreams = 3;
 
 struct Numbered {
   std::int64_t number;
-  std::int64_t again[15];  // the same, to show tearing
+  std::int64_t again[15];  // the same number, to detect tearing
 };
 DSSM_DESCRIBE(Numbered, number, again)
 
@@ -35,7 +35,7 @@ Numbered numbered(std::int64_t number) {
 
 std::string stream_name(int number) { return "load" + std::to_string(number); }
 
-// Writes one stream at 1 kHz, from a session of its own as a sensor handler does.
+// Writes one stream at 1 kHz, with its own session, like a sensor handler.
 class Handler {
  public:
   Handler(const std::string& socket_path, int number)
@@ -67,7 +67,7 @@ class Handler {
   std::thread thread_;
 };
 
-// Takes every sample of a stream, from the first one on, and checks each.
+// Reads every sample of a stream, from the first one on, and checks it.
 class Taker {
  public:
   Taker(const std::string& socket_path, const std::string& name)
@@ -113,7 +113,7 @@ class Taker {
 
 class ServiceUnderLoad : public testing::Test {
  protected:
-  // `end_and_start` five times under load.
+  // Calls `end_and_start` five times under load.
   void run(const std::function<void()>& end_and_start) {
     std::vector<std::unique_ptr<Handler>> handlers;
     std::vector<std::unique_ptr<Taker>> local, remote;
@@ -126,11 +126,10 @@ class ServiceUnderLoad : public testing::Test {
     std::atomic<int> events = 0;
     const auto watch = watching.watch([&](const StreamEvent&) { ++events; });
     ASSERT_TRUE(watch);
-    const int told = events.load();
-    ASSERT_EQ(told, kStreams);
+    ASSERT_EQ(events.load(), kStreams);
     for (int round = 0; round < 5; ++round) {
       end_and_start();
-      // Everybody is back, and samples cross the network again.
+      // All are connected again, and samples cross the network.
       for (int i = 0; i < kStreams; ++i) {
         const auto s = static_cast<std::size_t>(i);
         remote[s]->await_taken(handlers[s]->written() + 50);
@@ -148,8 +147,8 @@ class ServiceUnderLoad : public testing::Test {
       EXPECT_EQ(local[s]->lost(), 0u);
       EXPECT_EQ(remote[s]->lost(), 0u);
     }
-    ASSERT_TRUE(watching.list());  // it is back and has been told what there was to tell
-    EXPECT_EQ(events.load(), told) << "who watches on this PC does not notice";
+    ASSERT_TRUE(watching.list());  // it has reconnected and received all events
+    EXPECT_EQ(events.load(), kStreams) << "a watching program on this PC noticed the restart";
   }
 
   ServiceManager pc1{{.arguments = kPatientRecovery}};
@@ -165,10 +164,10 @@ TEST_F(ServiceUnderLoad, LosesNothingWhenItIsKilled) {
 
 TEST_F(ServiceUnderLoad, LosesNothingWhenItIsRestarted) {
   run([this] { pc1.restart(); });
-  EXPECT_EQ(pc1.doubled(), 0) << "what is in the store is not sent again";
+  EXPECT_EQ(pc1.doubled(), 0) << "dssmd sent again what is in the store";
 }
 
-// systemd 252 drops the store then: the programs' own descriptors bring all back.
+// systemd 252 then empties the store: the programs give all streams back.
 TEST_F(ServiceUnderLoad, LosesNothingWhenItIsStoppedAndStarted) {
   run([this] {
     EXPECT_EQ(pc1.stop(), 0);
@@ -208,7 +207,7 @@ TEST(Service, KeepsStreamsWhoseProgramsHaveAllEnded) {
   }
 }
 
-// A property that is set anew is in the same memory file, which the store has already.
+// A property that is set again is in the same memory file, which the store has already.
 TEST(Service, KeepsThePropertyThatWasSetAfterARestart) {
   ServiceManager manager({.arguments = {"--listen", ""}});
   connect_to(manager.socket_path()).create<Numbered>("s", History{16, 1ms}).value();
@@ -222,8 +221,8 @@ TEST(Service, KeepsThePropertyThatWasSetAfterARestart) {
             std::vector<std::byte>(3, std::byte{9}));
 }
 
-// Nobody waits for recovery_grace where the store tells all: a name that is not known is free.
-TEST(Service, DoesNotWaitForOffersWhenTheStoreTellsAll) {
+// With a complete store there is no wait for recovery_grace: an unknown name is free.
+TEST(Service, DoesNotWaitForOffersWithACompleteStore) {
   ServiceManager manager({.arguments = {"--recovery-grace", "60 s"}});
   manager.restart();
   Session session =

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Sockets that are handed over: programs and hosts that connect while no dssmd runs wait.
+// Sockets that systemd passes to dssmd: programs and hosts that connect while no dssmd runs wait.
 #include <arpa/inet.h>
 #include <gtest/gtest.h>
 #include <netinet/in.h>
@@ -25,7 +25,7 @@ namespace {
 
 using namespace std::chrono_literals;
 
-// A listening socket of 127.0.0.1, or of [::], which takes IPv4 along as systemd's do.
+// A listening socket of 127.0.0.1, or of [::], which also accepts IPv4, like systemd's.
 struct ListeningSocket {
   UniqueFd fd;
   int port = 0;
@@ -57,7 +57,7 @@ bool exists(const std::string& path) {
   return ::lstat(path.c_str(), &file) == 0;
 }
 
-// Until `pc2` has a connection to pc1.
+// Waits until `pc2` is connected to pc1.
 void await_pc1(const DaemonProcess& pc2) {
   Session session = connect(pc2);
   await_up(session, "pc1");
@@ -66,26 +66,26 @@ void await_pc1(const DaemonProcess& pc2) {
 TEST(Sockets, LetProgramsWaitWhileNoDaemonRuns) {
   ServiceManager manager;
   ASSERT_EQ(manager.stop(), 0);
-  EXPECT_TRUE(exists(manager.socket_path())) << "it is not dssmd's to take away";
+  EXPECT_TRUE(exists(manager.socket_path())) << "dssmd removed a socket that it does not own";
   auto created = std::async(std::launch::async, [&] {
     Session session = connect_to(manager.socket_path());
     return session.create<int>("early", kShort).has_value();
   });
-  // It is in the queue of the socket by now, or will be: both have to work.
+  // Its connection is in the queue of the socket now or later; both must work.
   manager.start();
   EXPECT_TRUE(created.get());
   manager.kill_hard();
   EXPECT_TRUE(exists(manager.socket_path()));
 }
 
-TEST(Sockets, LetOtherHostsWaitWhileDaemonIsStartedAnew) {
+TEST(Sockets, LetOtherHostsWaitWhileDaemonRestarts) {
   ServiceManager manager;
   Session session = connect_to(manager.socket_path());
   auto writer = session.create<int>("s", kShort).value();
   const std::string address = manager.address();
   const auto port = static_cast<std::uint16_t>(std::stoi(address.substr(address.rfind(':') + 1)));
   manager.kill_hard();
-  // Nobody else listens there, and nobody accepts: the kernel completes the connection.
+  // The kernel completes the connection while no program accepts it.
   UniqueFd early(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
   sockaddr_in to{};
   to.sin_family = AF_INET;
@@ -93,7 +93,7 @@ TEST(Sockets, LetOtherHostsWaitWhileDaemonIsStartedAnew) {
   to.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
   ASSERT_EQ(::connect(early.get(), reinterpret_cast<sockaddr*>(&to), sizeof to), 0);
   manager.start();
-  // Whoever has nothing to say is let go in peace; with a socket made anew it would be a reset.
+  // A client that sends nothing is closed without an error; a new socket would cause a reset.
   ASSERT_EQ(::shutdown(early.get(), SHUT_WR), 0);
   char bytes[4096];
   ssize_t got = 0;
@@ -101,7 +101,7 @@ TEST(Sockets, LetOtherHostsWaitWhileDaemonIsStartedAnew) {
   EXPECT_EQ(got, 0) << std::strerror(errno);
 }
 
-TEST(Sockets, TakesTheTcpSocketOfASocketUnit) {
+TEST(Sockets, UsesTheTcpSocketOfASocketUnit) {
   const ListeningSocket socket = listen_here();
   const std::string address = "127.0.0.1:" + std::to_string(socket.port);
   ServiceManager manager({.arguments = {"--listen", address}, .more_sockets = {socket.fd.get()}});
@@ -111,8 +111,8 @@ TEST(Sockets, TakesTheTcpSocketOfASocketUnit) {
   await_pc1(pc2);
 }
 
-// ListenStream=13776 alone makes a socket of IPv6 that takes IPv4 along.
-TEST(Sockets, TakesOneSocketForBothKindsOfAddresses) {
+// ListenStream=13776 creates an IPv6 socket that also accepts IPv4.
+TEST(Sockets, UsesOneSocketForBothKindsOfAddresses) {
   const ListeningSocket socket = listen_here(AF_INET6);
   const std::string port = std::to_string(socket.port);
   ServiceManager manager(
@@ -125,14 +125,14 @@ TEST(Sockets, TakesOneSocketForBothKindsOfAddresses) {
   }
 }
 
-TEST(Sockets, ClosesOneThatTheConfigurationDoesNotName) {
+TEST(Sockets, ClosesSocketsThatTheConfigurationDoesNotName) {
   const ListeningSocket wanted = listen_here();
   const std::string address = "127.0.0.1:" + std::to_string(wanted.port);
   ListeningSocket other = listen_here();
   ServiceManager manager(
       {.arguments = {"--listen", address}, .more_sockets = {wanted.fd.get(), other.fd.get()}});
   manager.await_status("listening at " + address);
-  // Both sides of a connection in the queue of `other` are ours alone, as dssmd closed its own.
+  // Closes the last descriptors of `other`; dssmd has closed its own.
   manager.forget_more_sockets();
   other.fd.reset();
   UniqueFd client(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
@@ -144,7 +144,7 @@ TEST(Sockets, ClosesOneThatTheConfigurationDoesNotName) {
   EXPECT_EQ(errno, ECONNREFUSED);
 }
 
-// The service manager still holds the one at 127.0.0.1, which is in the way of 0.0.0.0.
+// The service manager still holds the socket at 127.0.0.1, which conflicts with 0.0.0.0.
 TEST(Sockets, ChangesTheAddressAndKeepsThePort) {
   ServiceManager manager;
   const std::string before = manager.address();
@@ -163,8 +163,7 @@ TEST(Sockets, GivesTheInheritedSocketTheConfiguredPermissions) {
   EXPECT_EQ(file.st_mode & 07777, 0600u);
 }
 
-// As before there was a service manager.
-TEST(Sockets, MakesAndRemovesItsOwnWithoutASocketUnit) {
+TEST(Sockets, CreatesAndRemovesItsOwnWithoutASocketUnit) {
   ServiceManager manager({.arguments = {"--listen", ""}, .socket = false});
   EXPECT_TRUE(exists(manager.socket_path()));
   EXPECT_EQ(manager.stop(), 0);

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What is in the service manager's descriptor store, and what dssmd makes of a store that is not in
-// order.
+// The contents of the service manager's descriptor store, and how dssmd handles an invalid store.
 #include <fcntl.h>
 #include <gtest/gtest.h>
 #include <sys/eventfd.h>
@@ -39,12 +38,12 @@ TEST(DescriptorStore, HoldsFourDescriptorsOfAStreamUntilItIsRemoved) {
   Session session = connect_to(manager.socket_path());
   for (const char* name : {"a", "b", "c"}) session.create<int>(name, kShort).value();
   EXPECT_EQ(manager.stored_descriptors(), 3 * kPerStream);
-  EXPECT_EQ(manager.stored().size(), 3u) << "a name for each stream";
+  EXPECT_EQ(manager.stored().size(), 3u) << "not one name per stream";
   ASSERT_TRUE(session.remove({"b", 0, ""}));
   EXPECT_EQ(manager.stored_descriptors(), 2 * kPerStream);
   manager.restart();
   EXPECT_EQ(stream_names(session), (std::vector<std::string>{"a", "c"}));
-  // A new life gives out names that the old one did not.
+  // After a restart dssmd uses new names.
   session.create<int>("d", kShort).value();
   EXPECT_EQ(manager.stored_descriptors(), 3 * kPerStream);
   EXPECT_EQ(manager.stored().size(), 3u);
@@ -75,7 +74,7 @@ TEST(DescriptorStore, HoldsThePlaybackClock) {
   EXPECT_EQ(manager.stored_descriptors(), 1u);
 }
 
-TEST(DescriptorStore, DropsWhatIsNotInOrderAndKeepsTheRest) {
+TEST(DescriptorStore, DropsInvalidDescriptorsAndKeepsTheRest) {
   ServiceManager manager(without_network());
   Session session = connect_to(manager.socket_path());
   auto writer = session.create<int>("good", kShort).value();
@@ -91,25 +90,26 @@ TEST(DescriptorStore, DropsWhatIsNotInOrderAndKeepsTheRest) {
   manager.start();
   EXPECT_EQ(stream_names(session), std::vector<std::string>{"good"});
   EXPECT_EQ(session.info({"good", 0, ""}).value().incarnation, writer.incarnation());
-  EXPECT_EQ(manager.stored_descriptors(), kPerStream) << "what was dropped is out of the store";
+  EXPECT_EQ(manager.stored_descriptors(), kPerStream)
+      << "dropped descriptors are still in the store";
 }
 
-// A stream whose entry is broken comes back from the program that holds it.
-TEST(DescriptorStore, LetsProgramsGiveBackWhatTheStoreLost) {
+// A program gives back its stream whose entry in the store is incomplete.
+TEST(DescriptorStore, LetsProgramsGiveBackStreamsThatTheStoreLost) {
   ServiceManager manager({.arguments = {"--listen", ""}, .store_max = kPerStream + 2});
   Session session = connect_to(manager.socket_path());
   auto first = session.create<int>("first", kShort).value();
   auto second = session.create<int>("second", kShort).value();
-  EXPECT_EQ(manager.stored_descriptors(), kPerStream + 2) << "the second one is there by half";
+  EXPECT_EQ(manager.stored_descriptors(), kPerStream + 2) << "the second stream is not half stored";
   manager.kill_hard();
   manager.start();
-  // Held back until the program that holds it is here, although another one is quicker.
+  // Waits for the program that has the stream open, although another one asks earlier.
   Session eager = connect_to(manager.socket_path());
   EXPECT_EQ(eager.create<int>("second", kShort).value().incarnation(), second.incarnation());
   EXPECT_EQ(eager.create<int>("first", kShort).value().incarnation(), first.incarnation());
 }
 
-TEST(DescriptorStore, DoesNotBringARemovedStreamBack) {
+TEST(DescriptorStore, DoesNotRecoverARemovedStream) {
   ServiceManager manager(without_network());
   Session session = connect_to(manager.socket_path());
   session.create<int>("gone", kShort).value();
@@ -130,13 +130,13 @@ TEST(DescriptorStore, RefusesStreamsOfAnotherHostName) {
   EXPECT_EQ(manager.stored_descriptors(), 0u);
 }
 
-// As many as this machine's limit of descriptors allows, and as the default of max_streams does.
-TEST(DescriptorStore, BringsThousandsOfStreamsBack) {
+// As many as this machine's limit of descriptors and the default of max_streams allow.
+TEST(DescriptorStore, RecoversThousandsOfStreams) {
   rlimit limit{};
   ASSERT_EQ(::getrlimit(RLIMIT_NOFILE, &limit), 0);
   limit.rlim_cur = limit.rlim_max;
   ASSERT_EQ(::setrlimit(RLIMIT_NOFILE, &limit), 0);
-  // The stand-in has them twice for a moment, when it hands them over.
+  // The fake service manager has them twice while it passes them.
   const std::size_t streams = std::min<std::size_t>(4096, limit.rlim_max / (2 * kPerStream + 2));
   ServiceManager manager(without_network());
   {

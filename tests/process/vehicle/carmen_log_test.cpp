@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The parser on lines as they should be, on lines as they really are, and on the whole recording.
+// Tests the parser with valid lines, with invalid lines, and with the whole recording.
 #include "docs/examples/vehicle/carmen_log.hpp"
 
 #include <gtest/gtest.h>
@@ -52,7 +52,7 @@ TEST(CarmenLog, ReadsEveryFieldThatTheVehicleUses) {
   EXPECT_EQ(log.skipped.bad, 0u);
 }
 
-TEST(CarmenLog, SkipsWhatIsNeitherOdometryNorScanWithoutCallingItBad) {
+TEST(CarmenLog, SkipsOtherLinesWithoutCountingThemAsBad) {
   const CarmenLog log = parse_carmen_log(
       "# message formats defined: PARAM SYNC ODOM FLASER RLASER\n#\n\nPARAM robot_use_laser on 1 m "
       "1\n"
@@ -62,7 +62,7 @@ TEST(CarmenLog, SkipsWhatIsNeitherOdometryNorScanWithoutCallingItBad) {
   EXPECT_EQ(log.skipped.bad, 0u);
 }
 
-TEST(CarmenLog, LeavesOutOdometryWithoutTimestamp) {
+TEST(CarmenLog, SkipsOdometryWithoutTimestamp) {
   const CarmenLog log = parse_carmen_log(odom("1", 10) + odom("0", 20) + odom("1.2", 30));
   ASSERT_EQ(log.odometry.size(), 2u);
   EXPECT_EQ(log.odometry[1].pose.x_m, 30);
@@ -70,7 +70,7 @@ TEST(CarmenLog, LeavesOutOdometryWithoutTimestamp) {
   EXPECT_EQ(log.skipped.misstamped, 0u);
 }
 
-TEST(CarmenLog, PutsSlightlyUnorderedLinesInOrder) {
+TEST(CarmenLog, SortsSlightlyUnorderedLines) {
   const CarmenLog log =
       parse_carmen_log(odom("-0.3") + odom("0.2") + flaser("0.9") + odom("0.6") + odom("0.4"));
   EXPECT_EQ(times(log.odometry), (std::vector<double>{-0.3, 0.2, 0.4, 0.6}));
@@ -85,7 +85,7 @@ TEST(CarmenLog, KeepsFileOrderAmongEqualTimes) {
   }
 }
 
-TEST(CarmenLog, LeavesOutStampsFarFromThoseAroundThem) {
+TEST(CarmenLog, SkipsStampsFarFromTheSurroundingOnes) {
   std::string text;
   for (int i = 0; i < 20; ++i) text += flaser(std::to_string(1000 + i * 0.2));
   text += odom("8.97771e-67") + flaser("1004") + odom("-0.95") + flaser("1004.2") + odom("9e12") +
@@ -105,12 +105,12 @@ TEST(CarmenLog, KeepsBothSidesOfAPause) {
   EXPECT_EQ(log.skipped.misstamped, 0u);
 }
 
-TEST(CarmenLog, CountsEachLineItCannotReadAndNamesTheFirst) {
+TEST(CarmenLog, CountsUnreadableLinesAndReportsTheFirst) {
   const std::string bad[] = {
       "ODOM 1 2 3 0 0 0",                // torn
-      "ODOM 1 2 three 0 0 0 5 pippo 5",  // no number
-      "ODOM 1 nan 3 0 0 0 5 pippo 5",    // none that can be computed with
-      "ODOM 1 1e999 3 0 0 0 5 pippo 5",  // none that fits
+      "ODOM 1 2 three 0 0 0 5 pippo 5",  // not a number
+      "ODOM 1 nan 3 0 0 0 5 pippo 5",    // not finite
+      "ODOM 1 1e999 3 0 0 0 5 pippo 5",  // does not fit into a double
       "FLASER 3 1 2 4 5 6",              // fewer ranges than announced
       "FLASER 0 4 5 6 7 8 9 1 pippo 1",  // no beams
       "FLASER -1 4 5 6 7 8 9 1 pippo 1",
@@ -173,7 +173,7 @@ TEST(CarmenLog, ReadsPlainTextLikeCompressed) {
   dssm::test::remove_tree(dir);
 }
 
-TEST(CarmenLog, RefusesAMissingFileByName) {
+TEST(CarmenLog, FailsWithTheNameOfAMissingFile) {
   const dssm::Result<CarmenLog> log = read_carmen_log("/nowhere/drive.log");
   ASSERT_FALSE(log);
   EXPECT_EQ(log.error().code, dssm::Errc::not_found);
@@ -197,7 +197,7 @@ TEST(CarmenLog, RefusesATruncatedArchiveAndAFileWithoutUsableLines) {
   dssm::test::remove_tree(dir);
 }
 
-TEST(Scan, NeverUsesMoreRangesThanThereAreWhateverTheWriterClaims) {
+TEST(Scan, LimitsItsRangesForAnyNumberOfBeams) {
   Scan scan{};
   scan.beams = 3;
   EXPECT_EQ(scan.ranges().size(), 3u);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What tests of the whole drive share: the vehicle's programs as command lines, replaying the
-// beginning of the recording with rings deep enough to hold all of it, so that nothing depends on
-// how fast this machine is.
+// Shared by tests of the whole drive: the command lines of the vehicle's programs. They replay the
+// beginning of the recording, with rings that hold all of it, so results do not depend on the speed of
+// this machine.
 #pragma once
 
 #include <dssm/dssm.hpp>
@@ -24,7 +24,7 @@ Command program(const std::string& name, const Command& arguments);
 // encoder or lidar: replays until second `to_s` of the recording.
 Command source(const std::string& name, double to_s, const Command& more = {"--speed", "0"});
 
-// They take what is there already, wait for what is not, and fail when they lost a sample.
+// Both read existing samples, wait for missing ones, and fail if a sample was lost.
 Command localizer();
 Command mapper(const std::string& out);
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The whole drive: the four programs as processes on a dssmd of their own, replaying the first
-// minute of the recording without pauses.
+// The whole drive: the four programs, with a dssmd of their own, replay the first minute of the
+// recording without pauses.
 #include "tests/process/vehicle/drive.hpp"
 
 #include <gtest/gtest.h>
@@ -63,7 +63,7 @@ class VehicleDrive : public testing::Test {
   }
 };
 
-TEST_F(VehicleDrive, GivesEachScanItsPoseAndTheSameMapInWhateverOrderTheProgramsStart) {
+TEST_F(VehicleDrive, GivesEachScanAPoseAndTheSameMapInAnyStartOrder) {
   const unsigned seed = std::random_device()();
   SCOPED_TRACE("seed " + std::to_string(seed));
   std::mt19937 random(seed);
@@ -90,8 +90,8 @@ TEST_F(VehicleDrive, GivesTheSameMapWhenTheReadersStartAfterTheDrive) {
   run_all(daemon, {mapper(map_)});
   EXPECT_EQ(written(daemon, "pose"), std::ssize(scans()) + 1);
 
-  // What went through the streams is what was in the recording: computed here without any stream,
-  // the map is the same, byte for byte.
+  // The streams carry exactly the recording: computed here without streams, the map is the same, byte
+  // for byte.
   const std::vector<OdometryReading> odometry = resample(log_.odometry, kEncoderCycleS);
   OccupancyGrid grid;
   std::vector<Pose2> way;
@@ -111,7 +111,7 @@ TEST_F(VehicleDrive, GivesTheSameMapWhenTheReadersStartAfterTheDrive) {
   EXPECT_EQ(content(map_), content(dir_ + "/expected.png"));
 }
 
-TEST_F(VehicleDrive, DrawsAPictureWithWallsFloorAndWay) {
+TEST_F(VehicleDrive, DrawsAPictureWithWallsFloorAndPath) {
   const DaemonProcess daemon;
   run_all(daemon, {source("encoder"), source("lidar"), localizer(), mapper(map_)});
   png_image image{};
@@ -127,7 +127,7 @@ TEST_F(VehicleDrive, DrawsAPictureWithWallsFloorAndWay) {
     white += colour == 0xffffff;
     blue += colour == 0x266edc;
   }
-  // Four pixels a cell of 25 cm2. In its first minute the vehicle sees about 30 m of corridor: some
+  // Four pixels per cell of 25 cm2. In its first minute the vehicle sees about 30 m of corridor: some
   // 100 m of wall, a cell or two thick, around 50 to 150 m2 of floor.
   EXPECT_GT(dark, 4 * 1500u);
   EXPECT_LT(dark, 4 * 15000u);
@@ -164,7 +164,7 @@ TEST_F(VehicleDrive, SkipsADriveThatIsOverAndMapsTheNextOne) {
   const dssm::Tid first_drive = written(daemon, "lidar");
   const pid_t localizing =
       dssm::test::start(program("localizer", {"--deadline", "600"}), {daemon.environment()});
-  // The localizer creates its stream once it has found its place in the scans.
+  // The localizer creates its stream after it has moved to its first scan.
   dssm::Session session = connect(daemon);
   (void)session.await_raw_reader(dssm::StreamId{"pose", 0, ""}, dssm::kNever).value();
   run_all(daemon, {source("encoder"), source("lidar")});
@@ -173,7 +173,7 @@ TEST_F(VehicleDrive, SkipsADriveThatIsOverAndMapsTheNextOne) {
   EXPECT_EQ(written(daemon, "pose"), first_drive);
 }
 
-TEST_F(VehicleDrive, SaysSoWhenThereIsNoDaemon) {
+TEST_F(VehicleDrive, FailsWithAMessageWithoutADaemon) {
   for (const Command& command : {source("encoder"), source("lidar"), localizer(), mapper(map_)}) {
     const dssm::test::Finished finished =
         dssm::test::run(command, {"DSSM_SOCKET=" + dir_ + "/nobody.sock"});
@@ -182,10 +182,10 @@ TEST_F(VehicleDrive, SaysSoWhenThereIsNoDaemon) {
   }
 }
 
-TEST_F(VehicleDrive, RefusesWhatCannotBeReplayed) {
+TEST_F(VehicleDrive, RefusesInvalidOptions) {
   const struct {
     Command arguments;
-    std::string complaint;
+    std::string expected;
   } cases[] = {
       {{"--log", "/nowhere.log"}, "'/nowhere.log'"},
       {{"--log", recording(), "--from", "9", "--to", "3"}, "--to must be later"},
@@ -197,7 +197,7 @@ TEST_F(VehicleDrive, RefusesWhatCannotBeReplayed) {
       const dssm::test::Finished finished =
           dssm::test::run(program(name, one.arguments), {daemon.environment()});
       EXPECT_EQ(finished.exit_status, 1) << name;
-      EXPECT_NE(finished.err.find(one.complaint), std::string::npos) << name << finished.err;
+      EXPECT_NE(finished.err.find(one.expected), std::string::npos) << name << finished.err;
     }
   }
 }

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 #
-# Prints the code block of a Markdown text that follows the line "<!-- file: NAME -->"; NAME comes
-# with -v name=NAME. Fails when there is none.
+# Prints the code block after the line "<!-- file: NAME -->" of a Markdown text, with NAME from
+# -v name=NAME. Fails when there is none.
 $0 == "<!-- file: " name " -->" { found = 1; next }
 found == 1 && /^```/ { found = 2; next }
 found == 2 && /^```/ { found = 3 }

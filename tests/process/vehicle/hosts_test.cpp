@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The vehicle on several hosts: the programs are the same and are told nothing of where streams
-// live, so the map must be the same, byte for byte. The hosts are dssmd processes that know each
-// other by loopback addresses only.
+// The vehicle on several hosts: programs and options are the same as on one, so the map must be the
+// same, byte for byte. The hosts are dssmd processes that connect by loopback addresses.
 #include <gtest/gtest.h>
 #include <unistd.h>
 
@@ -26,15 +25,15 @@ constexpr double kToS = 200;
 
 test::Command source(const std::string& name) { return test::source(name, kToS); }
 
-// Loopback addresses of this process alone, so that a port can be known before anybody listens.
+// Loopback addresses that only this process uses, so that ports are known before dssmd listens.
 std::string own_address(int host) {
   const int pid = ::getpid();
   return "127." + std::to_string(100 + host) + "." + std::to_string(pid / 256 % 256) + "." +
          std::to_string(pid % 256) + ":13776";
 }
 
-// A dssmd called pcHOST that knows `hosts` of them, itself among them as in vehicle.conf. It keeps
-// its copies of streams when nobody reads them any more, so that a test can ask about them.
+// A dssmd called pcHOST with `hosts` peers, one of which is itself, as in vehicle.conf. It keeps its
+// mirrors after the last reader, so that a test can inspect them.
 std::unique_ptr<DaemonProcess> start_host(int host, int hosts) {
   std::vector<std::string> flags{"--listen", own_address(host), "--mirror-linger", "1000 s"};
   for (int peer = 1; peer <= hosts; ++peer) {
@@ -43,7 +42,7 @@ std::unique_ptr<DaemonProcess> start_host(int host, int hosts) {
   return std::make_unique<DaemonProcess>(flags, "pc" + std::to_string(host));
 }
 
-// The copies of `stream` that `host` keeps lost nothing of it.
+// The mirror of `stream` on `host` has no gap.
 void expect_no_gap(const DaemonProcess& host, const std::string& stream) {
   dssm::Session session = test::connect(host);
   const dssm::StreamInfo info = session.info(dssm::StreamId{stream, 0, ""}).value();
@@ -59,7 +58,7 @@ class VehicleHosts : public testing::Test {
 
   std::string map_path(const std::string& name) const { return dir_ + "/" + name + ".png"; }
 
-  // The map from one PC; readers start when all is written.
+  // The map of a single host; readers start after all samples are written.
   const std::string& map_of_one_host() const {
     static const std::string map = [&] {
       const DaemonProcess pc({"--listen", "127.0.0.1:0"});
@@ -78,7 +77,7 @@ class VehicleHosts : public testing::Test {
   }
 };
 
-TEST_F(VehicleHosts, DrawTheSameMapAsOneInWhateverOrderTheProgramsStart) {
+TEST_F(VehicleHosts, DrawTheSameMapAsOneHostInAnyStartOrder) {
   const std::string expected = map_of_one_host();
   ASSERT_FALSE(expected.empty());
   const unsigned seed = std::random_device()();
@@ -105,7 +104,7 @@ TEST_F(VehicleHosts, DrawTheSameMapAsOneInWhateverOrderTheProgramsStart) {
   }
 }
 
-TEST_F(VehicleHosts, DrawTheSameMapWhenAllWasWrittenBeforeAnybodyRead) {
+TEST_F(VehicleHosts, DrawTheSameMapWhenReadersStartAfterTheDrive) {
   const std::string expected = map_of_one_host();
   const DaemonProcess pc1({"--listen", "127.0.0.1:0"}, "pc1");
   test::run_all({{&pc1, source("encoder")}, {&pc1, source("lidar")}});
@@ -117,13 +116,13 @@ TEST_F(VehicleHosts, DrawTheSameMapWhenAllWasWrittenBeforeAnybodyRead) {
   EXPECT_EQ(test::content(map_path("map")), expected);
 }
 
-TEST_F(VehicleHosts, WaitForAHostThatComesLate) {
+TEST_F(VehicleHosts, WaitForAHostThatStartsLate) {
   const std::string expected = map_of_one_host();
   const auto pc2 = start_host(2, 3), pc3 = start_host(3, 3);
   const pid_t localizing = dssm::test::start(test::localizer(), {pc2->environment()});
   const pid_t mapping = dssm::test::start(test::mapper(map_path("map")), {pc3->environment()});
   test::run_all({{pc2.get(), source("lidar")}});
-  // The localizer creates its stream when it has the lidar's; what it lacks then is the odometry.
+  // The localizer creates its stream when it has opened the lidar's; then it waits for the odometry.
   dssm::Session session = test::connect(*pc3);
   (void)session.await_raw_reader(dssm::StreamId{"pose", 0, ""}, dssm::kNever).value();
   const auto pc1 = start_host(1, 3);
@@ -133,7 +132,7 @@ TEST_F(VehicleHosts, WaitForAHostThatComesLate) {
   EXPECT_EQ(test::content(map_path("map")), expected);
 }
 
-TEST_F(VehicleHosts, DrawTheSameMapWhenEachDssmdIsKilledOnTheWay) {
+TEST_F(VehicleHosts, DrawTheSameMapWhenEachDssmdIsKilledDuringTheDrive) {
   const std::string expected = map_of_one_host();
   const auto pc1 = start_host(1, 3), pc2 = start_host(2, 3), pc3 = start_host(3, 3);
   std::vector<pid_t> programs{
@@ -155,7 +154,7 @@ TEST_F(VehicleHosts, DrawTheSameMapWhenEachDssmdIsKilledOnTheWay) {
   EXPECT_EQ(test::content(map_path("map")), expected);
 }
 
-TEST_F(VehicleHosts, HaveAConfigurationThatDssmdTakes) {
+TEST_F(VehicleHosts, HaveAValidConfiguration) {
   const std::string path =
       std::string(std::getenv("DSSM_SOURCE_ROOT")) + "/docs/examples/vehicle/vehicle.conf";
   const dssm::test::Finished checked =
@@ -163,11 +162,11 @@ TEST_F(VehicleHosts, HaveAConfigurationThatDssmdTakes) {
   EXPECT_EQ(checked.exit_status, 0) << checked.err;
 }
 
-TEST_F(VehicleHosts, SayWhatWasLost) {
+TEST_F(VehicleHosts, ReportLostSamples) {
   constexpr int kIncomplete = 3;
   const DaemonProcess pc1({"--listen", "127.0.0.1:0"}, "pc1");
   const DaemonProcess pc2({"--listen", "127.0.0.1:0", "--peer", pc1.address()}, "pc2");
-  // A ring that holds the last seconds only, read when all is over.
+  // The ring holds only the last seconds when the readers start.
   test::run_all(
       {{&pc1, source("encoder")},
        {&pc1, test::program("lidar", {"--log", test::recording(), "--to", std::to_string(kToS),
@@ -175,7 +174,7 @@ TEST_F(VehicleHosts, SayWhatWasLost) {
   const dssm::test::Finished localized = dssm::test::run(test::localizer(), {pc2.environment()});
   EXPECT_EQ(localized.exit_status, kIncomplete);
   EXPECT_NE(localized.err.find("scans missed"), std::string::npos) << localized.err;
-  // The poses are there, but not their scans any more.
+  // The poses still exist, but their scans do not.
   test::connect(pc1).remove(dssm::StreamId{"lidar", 0, ""}).value();
   test::run_all({{&pc1, test::source("lidar", 1)}});
   const dssm::test::Finished mapped = dssm::test::run(

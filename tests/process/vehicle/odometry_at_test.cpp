@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Reading the odometry at the time of a scan, through a real stream.
+// Tests reading the odometry at the time of a scan, with a real stream.
 #include "docs/examples/vehicle/odometry_at.hpp"
 
 #include <gtest/gtest.h>
@@ -38,11 +38,11 @@ TEST_F(OdometryAtTest, InterpolatesBetweenTheReadingsAroundTheTime) {
   ASSERT_TRUE(pose);
   EXPECT_DOUBLE_EQ(pose->x_m, 1.25);
   EXPECT_DOUBLE_EQ(pose->y_m, 11);
-  // 2 * pi - 6.2 = 0.0832 radians lie between the two, over pi; a quarter of it is 0.0208.
+  // The shorter way, over pi, is 2 * pi - 6.2 = 0.0832 radians; a quarter of it is 0.0208.
   EXPECT_NEAR(pose->theta_rad, 3.12080, 5e-6);
 }
 
-TEST_F(OdometryAtTest, GivesAReadingOfTheVeryTimeUnchanged) {
+TEST_F(OdometryAtTest, ReturnsAReadingOfTheExactTimeUnchanged) {
   encoder_.write({1, 10, 0.5}, at_ms(1000));
   encoder_.write({2, 14, 0.7}, at_ms(1100));
   encoder_.write({3, 18, 0.9}, at_ms(1200));
@@ -63,7 +63,7 @@ TEST_F(OdometryAtTest, WaitsForTheLaterReading) {
   EXPECT_DOUBLE_EQ(pose->x_m, 1.5);
 }
 
-TEST_F(OdometryAtTest, WaitsForAnEncoderThatHasNotBegun) {
+TEST_F(OdometryAtTest, WaitsForTheFirstReadings) {
   OdometryAt odometry = this->odometry();
   std::thread late([&] {
     encoder_.write({1, 0, 0}, at_ms(1000));
@@ -75,7 +75,7 @@ TEST_F(OdometryAtTest, WaitsForAnEncoderThatHasNotBegun) {
   EXPECT_DOUBLE_EQ(pose->x_m, 1.5);
 }
 
-TEST_F(OdometryAtTest, WaitsOutWhatAnEarlierDriveLeft) {
+TEST_F(OdometryAtTest, IgnoresReadingsOfAnEarlierDrive) {
   encoder_.write({7, 7, 7}, at_ms(400'000));
   encoder_.write({8, 8, 8}, at_ms(400'100));
   OdometryAt odometry = this->odometry();
@@ -89,18 +89,18 @@ TEST_F(OdometryAtTest, WaitsOutWhatAnEarlierDriveLeft) {
   EXPECT_DOUBLE_EQ(pose->x_m, 1.5);
 }
 
-TEST_F(OdometryAtTest, GivesUpWhenTheLaterReadingDoesNotCome) {
+TEST_F(OdometryAtTest, FailsAtTheDeadlineWithoutALaterReading) {
   encoder_.write({1, 0, 0}, at_ms(1000));
   EXPECT_FALSE(odometry(milliseconds(1)).at(at_ms(1050)));
 }
 
-TEST_F(OdometryAtTest, GivesUpAtOnceWhenTheRingNoLongerHoldsTheTime) {
+TEST_F(OdometryAtTest, FailsAtOnceWhenTheRingNoLongerHoldsTheTime) {
   OdometryAt odometry = this->odometry(std::chrono::hours(1));
   for (int i = 0; i < 20; ++i) encoder_.write({0, 0, 0}, at_ms(1000 + 100 * i));
   EXPECT_FALSE(odometry.at(at_ms(1050)));  // would wait an hour otherwise
 }
 
-TEST_F(OdometryAtTest, GoesOnWhenTheStreamBeganAnew) {
+TEST_F(OdometryAtTest, ContinuesWhenTheStreamIsRecreated) {
   encoder_.write({7, 7, 7}, at_ms(1000));
   encoder_.write({8, 8, 8}, at_ms(1100));
   OdometryAt odometry = this->odometry(std::chrono::hours(1));
@@ -114,7 +114,7 @@ TEST_F(OdometryAtTest, GoesOnWhenTheStreamBeganAnew) {
   EXPECT_DOUBLE_EQ(pose->x_m, 1.5);
 }
 
-TEST_F(OdometryAtTest, EndsWhenASignalAsksToStop) {
+TEST_F(OdometryAtTest, EndsAfterASignalToStop) {
   OdometryAt odometry = this->odometry(std::chrono::hours(1));
   stop_signal = SIGINT;
   EXPECT_FALSE(odometry.at(at_ms(1050)));

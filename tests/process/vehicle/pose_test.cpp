@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Interpolation against values worked out by hand.
+// Compares interpolation with values computed by hand.
 #include "docs/examples/vehicle/pose.hpp"
 
 #include <gtest/gtest.h>
@@ -14,7 +14,7 @@ namespace {
 
 constexpr double kDegree = M_PI / 180;
 
-TEST(Interpolate, MovesInProportion) {
+TEST(Interpolate, InterpolatesLinearly) {
   const Pose2 a{1, -2, 0.1}, b{3, 2, 0.5};
   const Pose2 quarter = interpolate(a, b, 0.25);
   EXPECT_DOUBLE_EQ(quarter.x_m, 1.5);
@@ -22,7 +22,7 @@ TEST(Interpolate, MovesInProportion) {
   EXPECT_DOUBLE_EQ(quarter.theta_rad, 0.2);
 }
 
-TEST(Interpolate, GivesTheEndsAtTheEnds) {
+TEST(Interpolate, ReturnsTheEndsAtTheEnds) {
   const Pose2 a{1, -2, 0.1}, b{3, 2, 0.5};
   EXPECT_EQ(interpolate(a, b, 0).x_m, 1);
   EXPECT_EQ(interpolate(a, b, 0).theta_rad, 0.1);
@@ -41,22 +41,22 @@ TEST(Interpolate, TurnsTheShorterWay) {
   EXPECT_NEAR(interpolate({0, 0, 0}, {0, 0, 90 * kDegree}, 0.5).theta_rad, 45 * kDegree, 1e-12);
 }
 
-TEST(Interpolate, TakesAnglesThatWereCountedOn) {
+TEST(Interpolate, AcceptsAnglesAboveAFullTurn) {
   // 10 and 730 degrees are the same as 10 and 10.
   EXPECT_NEAR(interpolate({0, 0, 10 * kDegree}, {0, 0, 730 * kDegree}, 0.5).theta_rad, 10 * kDegree,
               1e-12);
 }
 
-TEST(WeightOf, MeasuresTheWayInNanosecondsWithoutRounding) {
+TEST(WeightOf, IsExactToTheNanosecond) {
   constexpr std::int64_t kToday = 1'700'000'000'000'000'000;  // as a double: to 256 ns only
   EXPECT_EQ(weight_of(kToday, kToday, kToday + 4), 0);
   EXPECT_EQ(weight_of(kToday + 1, kToday, kToday + 4), 0.25);
   EXPECT_EQ(weight_of(kToday + 3, kToday, kToday + 4), 0.75);
 }
 
-TEST(WeightOf, IsZeroBetweenReadingsOfOneMoment) { EXPECT_EQ(weight_of(5, 5, 5), 0); }
+TEST(WeightOf, IsZeroForEqualTimes) { EXPECT_EQ(weight_of(5, 5, 5), 0); }
 
-TEST(Resample, ReadsTheMotionAtWholeMultiplesOfTheCycle) {
+TEST(Resample, InterpolatesAtWholeMultiplesOfTheCycle) {
   const std::vector<OdometryReading> recorded{
       {0.1, {0, 0, 0}}, {0.5, {4, 8, 0.4}}, {0.75, {4, 8, 0.4}}};
   const std::vector<OdometryReading> steady = resample(recorded, 0.25);
@@ -69,13 +69,13 @@ TEST(Resample, ReadsTheMotionAtWholeMultiplesOfTheCycle) {
   EXPECT_DOUBLE_EQ(steady[2].time_s, 0.75);
 }
 
-TEST(Resample, SurvivesEmptyAndSingleRecordings) {
+TEST(Resample, AcceptsEmptyAndSingleRecordings) {
   EXPECT_TRUE(resample({}, 0.1).empty());
   EXPECT_EQ(resample({{0.5, {1, 2, 3}}}, 0.25).size(), 1u);
   EXPECT_TRUE(resample({{0.3, {1, 2, 3}}}, 0.25).empty());  // no multiple of 0.25 in it
 }
 
-TEST(SpanAround, TakesOneReadingMoreAtEachSide) {
+TEST(SpanAround, IncludesOneMoreReadingOnEachSide) {
   const std::vector<OdometryReading> readings{{1, {}}, {2, {}}, {3, {}}, {4, {}}, {5, {}}};
   const Span inside = span_around(readings, 2.5, 3.5);  // 3, and 2 and 4 around it
   EXPECT_EQ(inside.begin, 1u);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Finding the scan of a pose, through a real stream.
+// Tests finding the scan of a pose, with a real stream.
 #include "docs/examples/vehicle/scan_at.hpp"
 
 #include <gtest/gtest.h>
@@ -28,7 +28,7 @@ class ScanAtTest : public testing::Test {
   ScanAt scans(dssm::Duration deadline = std::chrono::minutes(1)) {
     return ScanAt(session_.open_reader<Scan>(kScanStream).value(), deadline);
   }
-  // A scan told from others by its number of beams.
+  // Each scan has another number of beams.
   void write(std::int32_t beams, std::int64_t at_ms) {
     Scan scan{};
     scan.beams = beams;
@@ -37,13 +37,13 @@ class ScanAtTest : public testing::Test {
   static dssm::Time at_ms(std::int64_t ms) { return dssm::Time(milliseconds(ms)); }
 };
 
-TEST_F(ScanAtTest, GivesTheScanOfTheTime) {
+TEST_F(ScanAtTest, ReturnsTheScanOfTheTime) {
   for (int i = 0; i < 5; ++i) write(10 + i, 1000 + 100 * i);
   ASSERT_TRUE(scans().at(at_ms(1200), 2, scan_));
   EXPECT_EQ(scan_.beams, 12);
 }
 
-TEST_F(ScanAtTest, WaitsForAScanThatComesAfterItsPose) {
+TEST_F(ScanAtTest, WaitsForAScanThatArrivesAfterItsPose) {
   write(10, 1000);
   ScanAt scans = this->scans();
   std::thread late([&] { write(11, 1100); });
@@ -62,17 +62,17 @@ TEST_F(ScanAtTest, WaitsForTheFirstScan) {
   EXPECT_EQ(scan_.beams, 10);
 }
 
-TEST_F(ScanAtTest, GivesUpWhenTheScanDoesNotCome) {
+TEST_F(ScanAtTest, FailsAtTheDeadlineWithoutTheScan) {
   write(10, 1000);
   EXPECT_FALSE(scans(milliseconds(1)).at(at_ms(1100), 1, scan_));
 }
 
-TEST_F(ScanAtTest, GivesUpAtOnceWhenTheRingNoLongerHoldsTheScan) {
+TEST_F(ScanAtTest, FailsAtOnceWhenTheRingNoLongerHoldsTheScan) {
   for (int i = 0; i < 20; ++i) write(10, 1000 + 100 * i);
   EXPECT_FALSE(scans(std::chrono::hours(1)).at(at_ms(1100), 1, scan_));
 }
 
-TEST_F(ScanAtTest, DoesNotTakeTheScanOfAnotherDriveForThePosesOwn) {
+TEST_F(ScanAtTest, DoesNotReturnAScanOfAnotherDrive) {
   for (int drive = 0; drive < 2; ++drive) {
     for (int i = 0; i < 3; ++i) write(10 * (drive + 1) + i, 1000 + 100 * i);
   }
@@ -82,7 +82,7 @@ TEST_F(ScanAtTest, DoesNotTakeTheScanOfAnotherDriveForThePosesOwn) {
   EXPECT_EQ(scan_.beams, 21);
 }
 
-TEST_F(ScanAtTest, GoesOnWhenTheStreamBeganAnew) {
+TEST_F(ScanAtTest, ContinuesWhenTheStreamIsRecreated) {
   for (int i = 0; i < 5; ++i) write(10 + i, 1000 + 100 * i);
   ScanAt scans = this->scans(std::chrono::hours(1));
   ASSERT_TRUE(scans.at(at_ms(1400), 4, scan_));
@@ -93,7 +93,7 @@ TEST_F(ScanAtTest, GoesOnWhenTheStreamBeganAnew) {
   EXPECT_EQ(scan_.beams, 26);
 }
 
-TEST_F(ScanAtTest, EndsWhenASignalAsksToStop) {
+TEST_F(ScanAtTest, EndsAfterASignalToStop) {
   ScanAt scans = this->scans(std::chrono::hours(1));
   stop_signal = SIGINT;
   EXPECT_FALSE(scans.at(at_ms(1000), 0, scan_));

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The programs of docs/tutorial.md, built from its very text, talk to each other.
+// The programs of docs/tutorial.md, extracted from its text, exchange samples.
 #include <fcntl.h>
 #include <gtest/gtest.h>
 #include <signal.h>
@@ -24,8 +24,8 @@ std::string program(const std::string& name) {
   return dssm::test::built("tests/process/vehicle/tutorial_" + name);
 }
 
-// A program whose output the test reads line by line. It writes to a terminal of its own: into a
-// pipe it would write only when a buffer is full.
+// A program whose output the test reads line by line. It writes to a terminal, because it would write
+// to a pipe only when a buffer is full.
 class Reading {
  public:
   Reading(const std::string& name, const dssm::test::DaemonProcess& daemon) {
@@ -49,8 +49,8 @@ class Reading {
     dssm::test::wait_for(pid);
   }
 
-  // Appends what it prints, until there are kEnough lines or it ends. Gives how long it had been
-  // silent then.
+  // Appends the lines that it prints, until there are kEnough or it ends. Returns the time since the
+  // last line.
   std::chrono::steady_clock::duration take(std::vector<std::string>& lines) {
     char line[256];
     auto last = std::chrono::steady_clock::now();
@@ -66,19 +66,19 @@ class Reading {
   std::FILE* output_;
 };
 
-// Starts both, the reader first, each with its dssmd, and gives the first lines that the reader
-// prints; fewer when it ends early.
+// Starts both, the reader first, each with its dssmd, and returns the first lines that the reader
+// prints; fewer if it ends early.
 std::vector<std::string> lines_read(const std::string& reader,
                                     const dssm::test::DaemonProcess& readers_daemon,
                                     const std::string& writer,
                                     const dssm::test::DaemonProcess& writers_daemon) {
-  // An SSM reader ends when nothing has come for a second, which a busy machine may be the reason
-  // for: then it is started again.
-  constexpr auto kPatienceOfReadNext = std::chrono::milliseconds(900);
+  // An SSM reader ends after a second without a sample, which may also happen on a busy machine; then
+  // it is started again.
+  constexpr auto kReadNextTimeout = std::chrono::milliseconds(900);
   std::vector<std::string> lines;
   auto reading = std::make_unique<Reading>(reader, readers_daemon);
   const pid_t writing = dssm::test::start({program(writer)}, {writers_daemon.environment()});
-  while (reading->take(lines) > kPatienceOfReadNext && lines.size() < kEnough) {
+  while (reading->take(lines) > kReadNextTimeout && lines.size() < kEnough) {
     reading = std::make_unique<Reading>(reader, readers_daemon);
   }
   reading.reset();
@@ -94,12 +94,12 @@ void expect_climate(const std::vector<std::string>& lines) {
   for (const std::string& line : lines) EXPECT_TRUE(std::regex_match(line, expected)) << line;
 }
 
-TEST_P(Tutorial, ProgramsShareTheStreamWhicheverApiTheyUse) {
+TEST_P(Tutorial, ProgramsShareTheStreamWithEachApi) {
   const dssm::test::DaemonProcess daemon;
   expect_climate(lines_read(GetParam().first, daemon, GetParam().second, daemon));
 }
 
-TEST_P(Tutorial, ProgramsShareTheStreamFromTwoHosts) {
+TEST_P(Tutorial, ProgramsShareTheStreamBetweenTwoHosts) {
   const dssm::test::DaemonProcess pc1;
   const dssm::test::DaemonProcess pc2({"--peer", pc1.address()}, "pc2");
   expect_climate(lines_read(GetParam().first, pc2, GetParam().second, pc1));

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A program that reads odometry by time, in order and newest first, as they were written for SSM.
-// It names a stream and no PC.
+// A typical SSM program that reads odometry by time, in order, and newest first. It names the stream,
+// but no PC.
 #include <ssm.hpp>
 
 #include "odometry.h"
@@ -9,7 +9,7 @@
 
 static double time_of(int number) { return ODOMETRY_START + number * ODOMETRY_CYCLE; }
 
-// What was read last is sample `number`, untorn.
+// The last read returned sample `number`, untorn.
 static void check_sample(const SSMApi<Odometry, OdometryProperty>& odometry, int number) {
   CHECK_EQUAL(odometry.timeId, number);
   CHECK_EQUAL(odometry.data.number, number);
@@ -19,7 +19,7 @@ static void check_sample(const SSMApi<Odometry, OdometryProperty>& odometry, int
   CHECK(odometry.time > time_of(number) - 0.001 && odometry.time < time_of(number) + 0.001);
 }
 
-// Waits for the next sample, however long: readNext() does so for a second.
+// Waits for the next sample without a limit; readNext() waits for a second.
 static void next(SSMApi<Odometry, OdometryProperty>& odometry) {
   double before = gettimeSSM_real();
   while (!odometry.readNext()) {
@@ -39,7 +39,7 @@ int main(int argc, char** argv) {
   CHECK_SAME(odometry.property.wheel_radius, 0.125);
   CHECK(strcmp(odometry.property.maker, "T-frog") == 0);
 
-  // The past, from before this program was started.
+  // Samples from before this program was started.
   for (int number = 0; number < 1000; ++number) {
     CHECK(odometry.readTime(time_of(number) + 0.5 * ODOMETRY_CYCLE));
     check_sample(odometry, number);
@@ -50,7 +50,7 @@ int main(int argc, char** argv) {
   CHECK(odometry.readBack(3));
   check_sample(odometry, 4);
 
-  // The news, one by one.
+  // New samples, one by one.
   odometry.setBlocking(true);
   CHECK(odometry.readLast());
   const int first = odometry.timeId;

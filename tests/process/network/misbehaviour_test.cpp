@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Programs and peers that misbehave, from another PC and on the same one, beside a stream that is
-// written and read as always: its readers lose nothing and get everything, dssmd's memory stays
-// within its limit, and a bad peer's connection ends. Counts are compared, never times.
+// Programs and peers that misbehave, on another PC and on the owner's, while other programs write and
+// read a stream: its readers lose nothing, dssmd's memory stays within its limit, and a bad peer's
+// connection ends. The tests compare counts, never times.
 #include <fcntl.h>
 #include <unistd.h>
 
@@ -22,12 +22,12 @@ namespace {
 
 using namespace std::chrono_literals;
 
-// What dssmd's own tables and malloc may add; its rings are no anonymous memory.
+// What dssmd's tables and malloc may add; its rings are not anonymous memory.
 constexpr std::uint64_t kOtherMemoryBytes = 8 << 20;
 
-// pc1 owns steady_stream(), which is written all the time and read on pc1 and on pc2. The trouble
-// comes from pc3 or from further programs.
-class Trouble : public NetworkTest {
+// pc1 owns steady_stream(), which is written continuously and read on pc1 and on pc2. The misbehaving
+// peers are on pc3, or further programs.
+class Misbehaviour : public NetworkTest {
  protected:
   // In a test: `if (!begin(8)) return;`
   bool begin(std::uint64_t max_peer_memory_mib) {
@@ -69,7 +69,7 @@ class Trouble : public NetworkTest {
     }
   }
 
-  // Waits until all bystanders have taken so many more samples than now.
+  // Waits until all bystanders have taken this many more samples.
   void await_progress(std::uint64_t samples = 1000) {
     for (auto& bystander : bystanders) {
       const std::uint64_t enough = bystander->taken + samples;
@@ -77,7 +77,7 @@ class Trouble : public NetworkTest {
     }
   }
 
-  // Of pc1's dssmd.
+  // Anonymous memory of pc1's dssmd.
   std::uint64_t anonymous_memory() {
     std::ifstream status("/proc/" + std::to_string(fleet->dssmd(1).pid()) + "/status");
     for (std::string word; status >> word;) {
@@ -90,7 +90,7 @@ class Trouble : public NetworkTest {
 
   void expect_bounded_memory() {
 #if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-    return;  // the sanitizer's own memory tells nothing
+    return;  // includes the sanitizer's own memory
 #endif
     EXPECT_LT(anonymous_memory(), memory_before + max_peer_memory + kOtherMemoryBytes);
   }
@@ -100,7 +100,7 @@ class Trouble : public NetworkTest {
     return RawPeer(Network::address(1));
   }
 
-  // A stream whose ring takes 64 MiB, much more than a peer may make dssmd hold.
+  // A stream whose ring takes 64 MiB, much more than max_peer_memory.
   RawWriter make_large() {
     return fleet->session(1).create_raw({"large", 0, ""}, {"", 1 << 20, 1, {}}, {64, 10ms}).value();
   }
@@ -117,13 +117,13 @@ class Trouble : public NetworkTest {
   std::uint64_t max_peer_memory = 0, memory_before = 0;
 };
 
-TEST_F(Trouble, PeersThatSayNothingOrOneByteAreClosed) {
+TEST_F(Misbehaviour, PeersThatSendNothingOrOneByteAreClosed) {
   if (!begin(8)) return;
   std::vector<RawPeer> silent;
   for (int i = 0; i < 20; ++i) {
     silent.push_back(connect_from(3));
     ASSERT_TRUE(silent.back().is_open());
-    // The first byte of a Hello's length; the next one would come in a minute.
+    // The first byte of a Hello's length; the next one never follows.
     if (i % 2 == 0) silent.back().send_bytes("\x20");
   }
   await_progress();
@@ -132,7 +132,7 @@ TEST_F(Trouble, PeersThatSayNothingOrOneByteAreClosed) {
   expect_bounded_memory();
 }
 
-TEST_F(Trouble, PeersThatSendGarbageAreClosed) {
+TEST_F(Misbehaviour, PeersThatSendGarbageAreClosed) {
   if (!begin(8)) return;
   const std::uint64_t seed = number_from_environment("DSSM_TEST_SEED", std::random_device{}());
   SCOPED_TRACE(testing::Message() << "DSSM_TEST_SEED=" << seed);
@@ -140,7 +140,7 @@ TEST_F(Trouble, PeersThatSendGarbageAreClosed) {
   for (int i = 0; i < 100; ++i) {
     RawPeer peer = connect_from(3);
     ASSERT_TRUE(peer.is_open());
-    // From the start; after a good Hello; in place of a request on an open channel.
+    // At the start; after a valid Hello; instead of a request on an open channel.
     if (i % 3 > 0) {
       ASSERT_FALSE(peer.greet());
     }
@@ -151,8 +151,8 @@ TEST_F(Trouble, PeersThatSendGarbageAreClosed) {
     std::string garbage(1 + random() % 100'000, '\0');
     for (char& byte : garbage) byte = static_cast<char>(random());
     peer.send_bytes(garbage);
-    // Random bytes may begin with the length of a frame that is not complete yet: 17 MiB of zeros
-    // are no frames in any case.
+    // Random bytes may begin with the length of an incomplete frame of up to 17 MiB; more zeros are
+    // invalid in any case.
     peer.send_bytes(std::string(32U << 20, '\0'));
     peer.await_end();
   }
@@ -160,7 +160,7 @@ TEST_F(Trouble, PeersThatSendGarbageAreClosed) {
   expect_bounded_memory();
 }
 
-TEST_F(Trouble, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
+TEST_F(Misbehaviour, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
   if (!begin(8)) return;
   RawWriter large = make_large();
   std::vector<std::byte> payload(large.payload_bytes());
@@ -172,14 +172,14 @@ TEST_F(Trouble, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
     lazy.back().send(open_frame(1, i % 2 == 0 ? "large" : "steady"));
     lazy.back().send(subscribe_from_oldest_frame(2));
   }
-  // Well within the 30 s after which the kernel ends connections that take nothing, unless this
-  // machine is stalled.
+  // This takes much less than the 30 s after which the kernel ends connections that receive nothing,
+  // unless this machine is stalled.
   for (int round = 0; round < (kSlowness > 1 ? 1 : 10); ++round) {
     for (int i = 0; i < 32; ++i) ASSERT_NE(large.write(payload), kNoTid);
     await_progress(200);
     expect_bounded_memory();
   }
-  // Whoever reads at last gets every sample or hears that it is lost.
+  // A peer that reads at last gets every sample, or a gap that counts it.
   std::size_t served = 0;
   for (std::size_t i = 0; i < lazy.size(); ++i) {
     Tid next = 0;
@@ -201,12 +201,12 @@ TEST_F(Trouble, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
     EXPECT_GT(samples, 0u);
     ++served;
   }
-  if (served == 0) GTEST_SKIP() << "this machine took 30 s to begin to read";
+  if (served == 0) GTEST_SKIP() << "this machine took 30 s before it read";
 }
 
-// They are stopped by not being listened to; after a minute without taking anything, the kernel
-// ends their connections.
-TEST_F(Trouble, PeersThatAskAndNeverReadAreStoppedAndThenClosed) {
+// dssmd stops reading from them; after a minute in which they receive nothing, the kernel ends their
+// connections.
+TEST_F(Misbehaviour, PeersThatRequestAndNeverReadAreStoppedAndThenClosed) {
   if (!begin(8)) return;
   RawWriter large = make_large();
   ASSERT_NE(large.write(std::vector<std::byte>(large.payload_bytes())), kNoTid);
@@ -227,7 +227,7 @@ TEST_F(Trouble, PeersThatAskAndNeverReadAreStoppedAndThenClosed) {
         ask.set_serial(serial);
         peer.send(ask);
       }
-      EXPECT_FALSE(peer.is_open()) << "ten million questions and nobody minds";
+      EXPECT_FALSE(peer.is_open()) << "ten million requests without a limit";
       ++closed;
     });
   }
@@ -238,33 +238,33 @@ TEST_F(Trouble, PeersThatAskAndNeverReadAreStoppedAndThenClosed) {
   for (std::thread& each : greedy) each.join();
 }
 
-TEST_F(Trouble, ConnectionsBeyondTheLimitAreRefusedInWords) {
+TEST_F(Misbehaviour, ConnectionsBeyondTheLimitAreRefusedWithAnError) {
   if (!begin(96)) return;
   std::vector<RawPeer> many;
-  int refused = 0, welcome = 0;
+  int refused = 0, accepted = 0;
   for (int i = 0; i < 1000; ++i) {
     RawPeer& peer = many.emplace_back(connect_from(3));
     const std::optional<net::Frame> instead = peer.greet();
     if (!instead && peer.is_open()) {
-      ++welcome;
+      ++accepted;
       continue;
     }
     ++refused;
-    if (!instead) continue;  // its words were lost with the connection
+    if (!instead) continue;  // its error was lost with the connection
     EXPECT_NE(instead->failure().message().find("max_connections"), std::string::npos)
         << instead->failure().message();
   }
-  EXPECT_GT(welcome, 100);
+  EXPECT_GT(accepted, 100);
   EXPECT_GT(refused, 800);
   await_progress();
   expect_bounded_memory();
-  // Other hosts are served meanwhile, and this one again when it has let go.
+  // Other hosts are served meanwhile, and this one again after it closed its connections.
   EXPECT_FALSE(connect_from(2).greet());
   many.clear();
   while (connect_from(3).greet()) std::this_thread::sleep_for(1ms);
 }
 
-// Programs that are stopped in the middle and go on later.
+// A program that is stopped while it reads, and continued later.
 class Stopped {
  public:
   Stopped(const std::vector<std::string>& words, const std::string& environment) {
@@ -273,7 +273,7 @@ class Stopped {
     EXPECT_EQ(::pipe2(out, O_CLOEXEC), 0);
     std::vector<std::string> argv = {built("tests/process/network/steady-reader")};
     argv.insert(argv.end(), words.begin(), words.end());
-    // Its stdin is ours while it is started: there is no other way to hand it one.
+    // start() has no parameter for stdin, so the program inherits ours.
     const UniqueFd own_stdin(::fcntl(STDIN_FILENO, F_DUPFD_CLOEXEC, 3));
     ::dup2(in[0], STDIN_FILENO);
     pid_ = start(argv, {environment}, out[1]);
@@ -282,11 +282,11 @@ class Stopped {
     stdin_.reset(in[1]);
     stdout_.reset(out[0]);
     char byte = 0;
-    EXPECT_EQ(::read(stdout_.get(), &byte, 1), 1) << "it ended by itself";
+    EXPECT_EQ(::read(stdout_.get(), &byte, 1), 1) << "it ended early";
     ::kill(pid_, SIGSTOP);
   }
 
-  // Lets it go on and come to its end; what it says.
+  // Continues it until its end; returns its output.
   void finish(std::uint64_t& taken, std::uint64_t& lost) {
     ::kill(pid_, SIGCONT);
     stdin_.reset();
@@ -304,7 +304,7 @@ class Stopped {
   UniqueFd stdin_, stdout_;
 };
 
-TEST_F(Trouble, StoppedReadersDisturbNobodyAndGoOnWhereTheyWere) {
+TEST_F(Misbehaviour, StoppedReadersDisturbNoOthersAndContinueWhereTheyStopped) {
   if (!begin(8)) return;
   std::vector<std::unique_ptr<Stopped>> stopped;
   for (int host = 1; host <= 3; ++host) {
