@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What a PC's clock shows and what DSSM states about it, for somebody outside who knows the truth
-// (lab/truth.py).
+// Reports a PC's clock and DSSM's statements about clocks to lab/truth.py, which compares them with the
+// true values.
 //
 //   fleet-clock PORT HOST...
 //
-// Writes the stream "truth" a hundred times a second, each sample holding its clocks, stamped as
-// any program's samples are, and reads that of each other HOST. Answers each datagram "NUMBER STEP"
-// at UDP PORT with JSON, see answer(); a STEP other than 0 sets the wall clock forward by so many
-// nanoseconds first, or backward when it is negative.
+// Writes the stream "truth" a hundred times a second, with this PC's clocks as payload, stamped like
+// the samples of any program, and reads that stream of each other HOST. Answers each datagram "NUMBER
+// STEP" at UDP PORT with JSON, see answer(). A STEP other than 0 first sets the wall clock forward by
+// so many nanoseconds, or backward if negative.
 //
-// Says "ready" on stdout once it writes. Ends when stdin does. Exit status: 0; 1 with the reason on
-// stderr.
+// Prints "ready" on stdout before it writes. Ends when stdin ends. Exit status: 0; 1 with the reason
+// on stderr.
 #include <arpa/inet.h>
 #include <poll.h>
 #include <sys/socket.h>
@@ -47,9 +47,9 @@ constexpr Duration kHistory = 10s;
 
 struct Clocks {
   std::int64_t wall_ns = 0, mono_ns = 0;
-  std::int64_t raw_ns = 0;     // CLOCK_MONOTONIC_RAW: nobody slews or sets it
-  std::int64_t within_ns = 0;  // between looking at that before and after the others
-  std::int64_t life = 0;       // of the program
+  std::int64_t raw_ns = 0;     // CLOCK_MONOTONIC_RAW: never slewed or set
+  std::int64_t within_ns = 0;  // between reading raw before and after the others
+  std::int64_t instance = 0;   // differs between runs of this program
 };
 
 std::int64_t raw_now_ns() {
@@ -58,19 +58,20 @@ std::int64_t raw_now_ns() {
   return std::int64_t{now.tv_sec} * 1'000'000'000 + now.tv_nsec;
 }
 
-// A PC that does something else in between says little; so this one is asked again then.
+// An interrupted reading is inaccurate, so it is repeated.
 constexpr std::int64_t kQuickEnoughNs = 40'000;
-constexpr int kMostLooks = 5;
+constexpr int kMaxReadings = 5;
 
-Clocks look_at_clocks() {
-  static const std::int64_t life = to_ns(WallClock::now());
+Clocks read_clocks() {
+  static const std::int64_t instance = to_ns(WallClock::now());
   Clocks best;
-  for (int i = 0; i < kMostLooks; ++i) {
+  for (int i = 0; i < kMaxReadings; ++i) {
     const std::int64_t before = raw_now_ns();
     const std::int64_t wall = to_ns(WallClock::now());
     const std::int64_t mono = MonoClock::now().time_since_epoch().count();
     const std::int64_t within = raw_now_ns() - before;
-    if (i == 0 || within < best.within_ns) best = {wall, mono, before + within / 2, within, life};
+    if (i == 0 || within < best.within_ns)
+      best = {wall, mono, before + within / 2, within, instance};
     if (within < kQuickEnoughNs) break;
   }
   return best;
@@ -81,12 +82,12 @@ Clocks look_at_clocks() {
   std::exit(1);
 }
 
-// The stream of another host, once it can be had.
+// The stream of another host, opened as soon as possible.
 class Other {
  public:
   Other(Session session, std::string host)
       : host_(std::move(host)), opening_([this, session = std::move(session)]() mutable {
-          // Refused again and again until both clocks are good.
+          // Refused until both clocks are within bounds.
           reader_.emplace(session.await_reader<Clocks>("truth@" + host_).value());
           open_.store(true, std::memory_order_release);
         }) {
@@ -103,28 +104,28 @@ class Other {
   std::thread opening_;
 };
 
-// -1: nothing is known.
+// -1: unknown.
 std::int64_t known_ns(Duration error) { return error == kUnknownClockError ? -1 : error.count(); }
 
 void put(nlohmann::json& to, const Clocks& clocks) {
   to["raw"] = clocks.raw_ns;
   to["within"] = clocks.within_ns;
-  to["life"] = clocks.life;
+  to["instance"] = clocks.instance;
 }
 
-// A sample, and what DSSM says of its time on this PC.
+// A sample, and DSSM's statement about its time on this PC.
 nlohmann::json statement(const Reader<Clocks>& reader, ReadStatus status, const Clocks& sample,
                          const SampleInfo& info) {
-  nlohmann::json said{{"status", status_name(status)}};
-  if (status != ReadStatus::ok) return said;
-  said["time"] = to_ns(info.time);
-  put(said, sample);
-  said["error"] = known_ns(reader.clock_error(info));
-  said["good"] = reader.clock_in_bounds(info);
-  return said;
+  nlohmann::json out{{"status", status_name(status)}};
+  if (status != ReadStatus::ok) return out;
+  out["time"] = to_ns(info.time);
+  put(out, sample);
+  out["error"] = known_ns(reader.clock_error(info));
+  out["good"] = reader.clock_in_bounds(info);
+  return out;
 }
 
-// The read that is refused when a clock may be too far off, and the one that never is.
+// A read that is refused if clocks may differ too much, and one that is never refused.
 nlohmann::json statements(Reader<Clocks>& reader) {
   Clocks sample;
   SampleInfo info;
@@ -134,46 +135,46 @@ nlohmann::json statements(Reader<Clocks>& reader) {
   return {{"by_time", by_time}, {"newest", statement(reader, status, sample, info)}};
 }
 
-// All others' samples of one time.
+// The samples of all others at one time.
 nlohmann::json joint_statement(const std::vector<Reader<Clocks>*>& readers) {
   std::vector<Clocks> samples(readers.size());
   std::vector<JointSample> joint;
   for (std::size_t i = 0; i < readers.size(); ++i) joint.push_back(readers[i]->joint(samples[i]));
   const JointRead read = at(WallClock::now(), joint, 1ms);
-  nlohmann::json said{{"status", status_name(read.status)}, {"error", known_ns(read.error)}};
+  nlohmann::json out{{"status", status_name(read.status)}, {"error", known_ns(read.error)}};
   for (std::size_t i = 0; read.status == ReadStatus::ok && i < readers.size(); ++i) {
-    nlohmann::json& of_one = said["samples"][readers[i]->id().host];
+    nlohmann::json& of_one = out["samples"][readers[i]->id().host];
     of_one["time"] = to_ns(joint[i].info.time);
     put(of_one, samples[i]);
   }
-  return said;
+  return out;
 }
 
-// {"number", "wall", "mono", "raw", "within", "life": this PC's clocks when the question had come,
-//  "raw_end": when this is sent, "own": {"status", "error"},
+// {"number", "wall", "mono", "raw", "within", "instance": this PC's clocks after the request arrived,
+//  "raw_end": raw clock when this is sent, "own": {"status", "error"},
 //  "others": {HOST: {"by_time": SAMPLE, "newest": SAMPLE}},
 //  "joint": {"status", "error", "samples": {HOST: SAMPLE}}}
-// SAMPLE: {"status", "time", "raw", "within", "life", "error", "good"}, clocks being its
-// writer's. Times and errors in ns, an error of -1 being unknown. "joint" only when all others are
-// there.
+// SAMPLE: {"status", "time", "raw", "within", "instance", "error", "good"}; the clocks are its
+// writer's. Times and errors are in ns; an error of -1 is unknown. "joint" exists only when the
+// streams of all others are open.
 std::string answer(std::int64_t number, const Clocks& came, std::deque<Other>& others) {
   const clock::Reading own = clock::now();
-  nlohmann::json said{{"number", number},
-                      {"wall", came.wall_ns},
-                      {"mono", came.mono_ns},
-                      {"own", {{"status", name_of(own.status)}, {"error", known_ns(own.error)}}},
-                      {"others", nlohmann::json::object()}};
-  put(said, came);
+  nlohmann::json out{{"number", number},
+                     {"wall", came.wall_ns},
+                     {"mono", came.mono_ns},
+                     {"own", {{"status", name_of(own.status)}, {"error", known_ns(own.error)}}},
+                     {"others", nlohmann::json::object()}};
+  put(out, came);
   std::vector<Reader<Clocks>*> readers;
   for (Other& other : others) {
     if (Reader<Clocks>* reader = other.reader()) {
-      said["others"][other.host()] = statements(*reader);
+      out["others"][other.host()] = statements(*reader);
       readers.push_back(reader);
     }
   }
-  if (!readers.empty() && readers.size() == others.size()) said["joint"] = joint_statement(readers);
-  said["raw_end"] = raw_now_ns();
-  return said.dump();
+  if (!readers.empty() && readers.size() == others.size()) out["joint"] = joint_statement(readers);
+  out["raw_end"] = raw_now_ns();
+  return out.dump();
 }
 
 void step(std::int64_t ns) {
@@ -196,8 +197,8 @@ void answer_datagrams(int socket, std::deque<Other>& others) {
     std::int64_t number = 0, ns = 0;
     if (std::sscanf(request.data(), "%ld %ld", &number, &ns) != 2) continue;
     if (ns) step(ns);
-    const std::string said = answer(number, look_at_clocks(), others);
-    ::sendto(socket, said.data(), said.size(), 0, reinterpret_cast<const sockaddr*>(&from), length);
+    const std::string out = answer(number, read_clocks(), others);
+    ::sendto(socket, out.data(), out.size(), 0, reinterpret_cast<const sockaddr*>(&from), length);
   }
 }
 
@@ -225,9 +226,9 @@ int run(std::uint16_t port, const std::vector<std::string>& hosts) {
     if (ready[1].revents) return 0;
     if (ready[0].revents) answer_datagrams(socket.get(), others);
     if (MonoClock::now() < due) continue;
-    const Clocks sample = look_at_clocks();
+    const Clocks sample = read_clocks();
     writer.write(sample, time_from_ns(sample.wall_ns));
-    due = std::max(due + kPeriod, MonoClock::now());  // what was missed is not made up for
+    due = std::max(due + kPeriod, MonoClock::now());  // missed samples are not written later
   }
 }
 
@@ -241,5 +242,5 @@ int main(int argc, char** argv) {
   }
   const auto port = static_cast<std::uint16_t>(std::strtoul(argv[1], nullptr, 10));
   const int status = dssm::test::run(port, {argv + 2, argv + argc});
-  std::_Exit(status);  // the threads that still wait for another host go with the process
+  std::_Exit(status);  // also ends threads that still wait for another host
 }

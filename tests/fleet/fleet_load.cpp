@@ -1,18 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The load of the fleet's scenarios: writes or reads streams whose every sample can be checked.
+// The load of the fleet's scenarios: writes or reads streams, and checks every sample.
 //
 //   fleet-load write RATE_HZ STREAM@HOST...   creates them and writes each at this rate
 //   fleet-load read RATE_HZ STREAM@HOST...    reads each from its oldest sample on
 //
-// Says "ready" on stdout when each stream has moved, and for each byte on stdin how many samples
-// have moved by then. Ends when stdin does, readers once they have all that was written until then.
-// The last line is JSON:
+// Prints "ready" on stdout after the first sample of each stream, and for each byte on stdin the number
+// of samples written or read so far. Ends when stdin ends; readers first read all samples written until
+// then. The last line is JSON:
 //
 //   write  {"written": {STREAM: COUNT}}
 //   read   {"faults": TEXT, "streams": {STREAM: {"taken": N, "lost": N, "restarts": N}}}
 //
-// A fault is a sample that was torn, came twice, out of order or not at all without being counted.
+// A fault is a sample that was torn, read twice, out of order, or lost without being counted.
 // Exit status: 0; 1 with the reason on stderr.
 #include <poll.h>
 #include <unistd.h>
@@ -47,18 +47,18 @@ KnownStream known_stream(const std::string& name, std::uint64_t rate_hz) {
   return known;
 }
 
-void say(const std::string& line) {
+void print(const std::string& line) {
   std::printf("%s\n", line.c_str());
   std::fflush(stdout);
 }
 
-// Answers a question on stdin, if there is one, with what `moved` says; whether stdin has ended.
+// Answers a request on stdin, if there is one, with moved(). Returns whether stdin has ended.
 bool stdin_ended(const std::function<std::uint64_t()>& moved) {
   pollfd in{STDIN_FILENO, POLLIN, 0};
   if (::poll(&in, 1, 0) <= 0) return false;
-  char question = 0;
-  if (::read(STDIN_FILENO, &question, 1) != 1) return true;
-  say(std::to_string(moved()));
+  char request = 0;
+  if (::read(STDIN_FILENO, &request, 1) != 1) return true;
+  print(std::to_string(moved()));
   return false;
 }
 
@@ -68,7 +68,7 @@ void write(const std::vector<KnownStream>& streams) {
   for (const KnownStream& known : streams) {
     writers.push_back(session.create_raw(known.id, known.type(), known.history()).value());
   }
-  // Greater with each writer of a stream, so that a reader can tell whose samples it gets.
+  // Greater with each writer of a stream, so that readers can distinguish their samples.
   const auto life = static_cast<std::uint64_t>(std::time(nullptr));
   std::vector<std::byte> payload(kPayloadBytes);
   MonoTime due = MonoClock::now();
@@ -80,15 +80,15 @@ void write(const std::vector<KnownStream>& streams) {
       streams[i].fill(payload, life, tid);
       const SampleInfo info = streams[i].info(tid);
       if (writers[i].write(payload, info.time, info.clock_error) != tid) {
-        std::fprintf(stderr, "'%s' was not new\n", streams[i].id.str().c_str());
+        std::fprintf(stderr, "'%s' existed already\n", streams[i].id.str().c_str());
         std::exit(1);
       }
     }
-    if (tid == 0) say("ready");
+    if (tid == 0) print("ready");
   }
   nlohmann::json written;
   for (const RawWriter& writer : writers) written[writer.id().str()] = writer.newest() + 1;
-  say(nlohmann::json{{"written", written}}.dump());
+  print(nlohmann::json{{"written", written}}.dump());
 }
 
 void read(const std::vector<KnownStream>& streams) {
@@ -112,7 +112,7 @@ void read(const std::vector<KnownStream>& streams) {
         [](std::uint64_t sum, const Follower& follower) { return sum + follower.taken(); });
   };
   while (!all([](const Follower& follower) { return follower.taken() > 0; })) take();
-  say("ready");
+  print("ready");
   while (!stdin_ended(moved)) take();
   for (Follower& follower : followers) {
     const Tid newest = session.info(follower.known().id).value().newest;
@@ -125,7 +125,7 @@ void read(const std::vector<KnownStream>& streams) {
     found[follower.known().id.str()] = {
         {"taken", follower.taken()}, {"lost", follower.lost()}, {"restarts", follower.restarts()}};
   }
-  say(nlohmann::json{{"faults", text}, {"streams", found}}.dump());
+  print(nlohmann::json{{"faults", text}, {"streams", found}}.dump());
 }
 
 }  // namespace

@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Lets Linux 6.1's User Mode Linux run on processors whose register state is larger than it knows.
+// Lets Linux 6.1's User Mode Linux run on processors whose register state is larger than its buffer.
 //
-// It sets the vector registers of a guest's process by ptrace(PTRACE_SETREGSET, NT_X86_XSTATE) from
-// a buffer of a fixed size. Linux takes nothing but the whole state, which is larger where there is
-// AMX, and says EFAULT; the guest's init dies at its first instruction ("ptrace set fp regs failed,
-// errno = 14"). Preloaded (LD_PRELOAD), this gives such a request its full size. What is added is
-// zero and belongs to registers that no guest can enable, so that nothing is lost.
+// User Mode Linux sets the vector registers of a guest's process by ptrace(PTRACE_SETREGSET,
+// NT_X86_XSTATE) from a buffer of a fixed size. Linux accepts only the whole state, which is larger
+// with AMX, and returns EFAULT otherwise; the guest's init dies at its first instruction ("ptrace set fp
+// regs failed, errno = 14"). Preloaded (LD_PRELOAD), this library extends such a request to the full
+// size. The added bytes are zero and belong to registers that no guest can enable, so nothing is lost.
 //
-// Where the state is not larger than UML's buffer, it does nothing: the request goes on as it came,
-// and Linux cuts one that is too long down to the whole state by itself.
+// If the state is not larger than UML's buffer, the request is passed on unchanged; Linux itself
+// truncates one that is too long.
 #include <dlfcn.h>
 #include <elf.h>
 #include <stdarg.h>
@@ -17,7 +17,7 @@
 #include <sys/ptrace.h>
 #include <sys/uio.h>
 
-enum { kMostBytes = 64 * 1024 };
+enum { kMaxBytes = 64 * 1024 };
 
 static long (*real_ptrace)(int request, ...);
 
@@ -25,8 +25,8 @@ __attribute__((constructor)) static void find_real_ptrace(void) {
   *(void**)&real_ptrace = dlsym(RTLD_NEXT, "ptrace");
 }
 
-// UML runs its kernel in one thread and its stacks are small, hence static.
-static _Alignas(64) unsigned char whole[kMostBytes];
+// Static, because UML's stacks are small; it runs its kernel in one thread.
+static _Alignas(64) unsigned char whole[kMaxBytes];
 static size_t whole_bytes;  // of this machine's register state; 0: not known yet
 
 static long set_registers(void* pid, const struct iovec* given) {

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What the PCs say of their clocks."""
+"""The clocks of the PCs, as DSSM reports them."""
 
 import json
 from typing import Any
@@ -9,16 +9,16 @@ from lab.lab import await_that
 
 
 def clock_of(guest: Guest) -> dict[str, Any]:
-    """What `dssmctl clock` says of that PC, there."""
+    """The entry of that PC in the output of `dssmctl clock` there."""
     clocks = json.loads(guest.ssh.run("dssmctl clock --json"))["clocks"]
     own: dict[str, Any] = next(clock for clock in clocks if clock["host"] == guest.name)
     return own
 
 
 def await_reference(guest: Guest, reference: str) -> None:
-    """Waits until chronyd there follows another PC."""
-    def look() -> tuple[bool, object]:
+    """Waits until chronyd there follows the PC `reference`."""
+    def check() -> tuple[bool, object]:
         clock = clock_of(guest)
         return clock["reference"] == reference and clock["status"] == "synchronized", clock
 
-    await_that(f"{guest.name} follows {reference}", look)
+    await_that(f"{guest.name} follows {reference}", check)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Running programs of this machine, with failures that say what was tried and what it said."""
+"""Runs programs of this machine; errors name the aim, the command and its output."""
 
 import pathlib
 import shlex
@@ -7,7 +7,7 @@ import subprocess
 
 
 class CommandError(Exception):
-    """A program ended badly; the text holds the command and its output."""
+    """A program failed; the text contains the command and its output."""
 
 
 # Namespaces in which all processes end with the first one.
@@ -15,9 +15,9 @@ CONTAINED = ("unshare", "--pid", "--mount", "--fork", "--kill-child=SIGKILL", "-
 
 
 def run(*command: str | pathlib.Path, what: str, timeout: float = 600, contained: bool = False) -> str:
-    """Runs `command` and returns its stdout. `what` names the aim, for the failure's text.
+    """Runs `command` and returns its stdout. `what` is the aim, for the error's text.
 
-    `contained`: when this ends early, so does all that the command has started.
+    `contained`: if this program ends early, so do all processes of the command.
     """
     words = [*(CONTAINED if contained else ()), *map(str, command)]
     try:

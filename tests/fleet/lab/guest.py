@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One PC: a User Mode Linux process with its own kernel, clock, disk and systemd.
 
-All host processes of a guest live in a pid namespace of its own. Killing that namespace's first
-process kills them all at once, which is what losing its power is to a PC.
+All host processes of a guest are in its own pid namespace. Killing the first process of that
+namespace kills all of them at once, like a power loss.
 """
 
 import hashlib
@@ -19,11 +19,11 @@ from lab.ssh import GuestError, Ssh
 
 MEMORY = "384M"
 BOOT_SECONDS = 180
-BANNER_SECONDS = 20  # for sshd to say its name, however busy this machine is
+BANNER_SECONDS = 20  # for the first bytes of sshd, even on a busy machine
 
 
 class Guest:
-    """Guest `number`; its files are in `folder`, which is in memory and goes with the lab."""
+    """Guest `number`; its files are in `folder`, which is in memory and removed with the lab."""
 
     def __init__(self, number: int, image: Image, preload: pathlib.Path, folder: pathlib.Path,
                  ssh_config: pathlib.Path) -> None:
@@ -35,12 +35,12 @@ class Guest:
         self.console = self.folder / "console"
         self.ssh = Ssh(self.name, ssh_config)
         self._image = image
-        self._disk = self.folder / "disk"  # what differs from the image
+        self._disk = self.folder / "disk"  # the differences to the image
         self._preload = preload
         self._process: subprocess.Popen[bytes] | None = None
 
     def power_on(self, cores: set[int]) -> None:
-        """Starts the PC, on `cores` of this machine; await_running() waits until it is there."""
+        """Starts the PC, on `cores` of this machine; await_running() waits for its boot."""
         machine_id = hashlib.md5(self.name.encode(), usedforsecurity=False).hexdigest()
         command = [
             "unshare", "--pid", "--fork", "--kill-child=SIGKILL", "--mount-proc",
@@ -60,7 +60,7 @@ class Guest:
                 env={**os.environ, "TMPDIR": str(self.folder), "HOME": str(self.folder)})
 
     def power_off(self) -> None:
-        """Takes the power away; the disk stays."""
+        """Cuts the power; the disk stays."""
         if self._process is None:
             return
         init = self._init()
@@ -74,12 +74,12 @@ class Guest:
         self.ssh.close()
 
     def wipe(self) -> None:
-        """Makes a PC that is off a bare one again."""
+        """Makes a switched-off PC bare again."""
         self._disk.unlink(missing_ok=True)
 
     def reboot(self, cores: set[int]) -> None:
-        """Shuts the PC down properly and switches it on again; await_running() as after power_on()."""
-        # UML's own reboot keeps its end of the cable open and then finds that in use.
+        """Shuts the PC down and switches it on; call await_running() afterwards."""
+        # A reboot by UML fails: it keeps its end of the cable open and then finds it in use.
         self.ssh.attempt("systemctl poweroff")
         assert self._process
         try:
@@ -92,7 +92,7 @@ class Guest:
         self.power_on(cores)
 
     def await_running(self, seconds: float = BOOT_SECONDS) -> None:
-        """Waits until systemd there has started everything."""
+        """Waits until its systemd has started all units."""
         deadline = time.monotonic() + seconds
         while not self.answers():
             self._check_alive()
@@ -106,19 +106,18 @@ class Guest:
                              f"{state.stderr.decode().strip()}\n{failed.decode()}")
 
     def answers(self) -> bool:
-        """Whether its sshd does."""
+        """Whether its sshd answers."""
         try:
             with socket.create_connection((self.address, 22), timeout=0.3) as connection:
-                # It is up. Each new question would give a busy PC more to do, and it would not get
-                # round to any.
+                # It is up. Further attempts would only add to the load of a busy PC.
                 connection.settimeout(BANNER_SECONDS)
                 return connection.recv(4) == b"SSH-"
         except OSError:
-            time.sleep(0.05)  # a refusal comes at once
+            time.sleep(0.05)  # a refusal returns at once
             return False
 
     def pin(self, cores: set[int]) -> None:
-        """Lets the PC run on these cores of this machine only."""
+        """Restricts the PC to these cores of this machine."""
         for pid in self._pids():
             for task in _numbers(f"/proc/{pid}/task"):
                 try:
@@ -127,15 +126,15 @@ class Guest:
                     pass
 
     def freeze(self) -> None:
-        """Stops the PC in the middle of what it does; its connections stay open."""
+        """Stops all processes of the PC; its connections stay open."""
         self._signal(signal.SIGSTOP)
 
     def thaw(self) -> None:
-        """Lets a frozen PC go on."""
+        """Continues a frozen PC."""
         self._signal(signal.SIGCONT)
 
     def console_tail(self) -> str:
-        """The last of what its kernel said."""
+        """The end of its kernel's output."""
         return self.console.read_bytes()[-3000:].decode(errors="replace")
 
     def _signal(self, number: int) -> None:
@@ -150,7 +149,7 @@ class Guest:
             raise GuestError(f"{self.name}: its kernel ended; its console says:\n{self.console_tail()}")
 
     def _init(self) -> int | None:
-        """The first process of the guest's pid namespace, as numbered here."""
+        """The pid, in our namespace, of the first process of the guest's pid namespace."""
         if self._process is None:
             return None
         pid = self._process.pid

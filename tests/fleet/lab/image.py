@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
 """The disk image that all guests boot from: a small Debian, made once and cached.
 
-Guests reach nothing beyond the lab, so everything that a scenario or the project's packages need is
-in the image; the project itself is not, because bare guests are what deployment starts from. The
-image is never written to: each guest has a copy-on-write file of its own (guest.py).
+Guests have no network beyond the lab, so the image contains everything that scenarios and the
+project's packages need. It does not contain the project, because deployment starts from bare guests.
+The image is never modified: each guest has its own copy-on-write file (guest.py).
 """
 
 import contextlib
@@ -24,7 +24,7 @@ MODULES = pathlib.Path("/usr/lib/uml/modules")
 KEYRING = pathlib.Path("/usr/share/keyrings/debian-archive-keyring.gpg")
 FILES = pathlib.Path(__file__).parent.parent / "image"
 SIZE = "1200M"
-UNUSED_SECONDS = 3 * 24 * 3600  # of other versions; a run of one may be going on
+UNUSED_SECONDS = 3 * 24 * 3600  # then other versions are deleted; a run may still use one
 
 PACKAGES = (
     # The PC: a system, its services, and the tools that scenarios use there.
@@ -37,14 +37,14 @@ PACKAGES = (
     " libavahi-common3 libtomlplusplus3 zlib1g libpng16-16 adduser init-system-helpers"
 ).split()
 
-# Nobody reads them in a guest, and they are most of what dpkg would have to write.
+# Not needed in a guest, and most of what dpkg would write.
 EXCLUDED = ("man", "doc", "doc-base", "info", "locale", "lintian", "bug", "zoneinfo", "i18n")
 
-# What mmdebstrap and apt-get say when there is no network: of the lists, and of the packages.
+# Output of mmdebstrap and apt-get without a network: for package lists, and for packages.
 NO_NETWORK = re.compile("apt-get update .*failed|Failed to fetch|Unable to fetch")
 
-# What a PC in a test does not need and what makes it boot slowly: consoles, timers, hardware that
-# a guest has none of, and generators that look for it.
+# Not needed in a test, and slow to boot: consoles, timers, hardware that a guest does not have, and
+# generators that search for it.
 MASKED_UNITS = (
     "getty.target getty@tty1.service console-getty.service serial-getty@.service"
     " apt-daily.timer apt-daily-upgrade.timer dpkg-db-backup.timer fstrim.timer"
@@ -65,7 +65,7 @@ GENERATORS_KEPT = {"systemd-fstab-generator", "systemd-debug-generator"}
 
 
 class Image:
-    """A built image and what belongs to it: the key for ssh and the hosts' keys."""
+    """A built image, with the key for ssh and the hosts' keys."""
 
     def __init__(self, folder: pathlib.Path) -> None:
         self.disk = folder / "root.ext4"
@@ -74,19 +74,19 @@ class Image:
 
 
 def cache_folder() -> pathlib.Path:
-    """Where images are kept between runs."""
+    """The folder that keeps images between runs."""
     base = os.environ.get("XDG_CACHE_HOME") or pathlib.Path.home() / ".cache"
     return pathlib.Path(base) / "dssm" / "fleet"
 
 
 class NoNetwork(Exception):
-    """There is no image, and none can be made without a network."""
+    """No image exists, and none can be made without a network."""
 
 
 def ensure_image() -> Image:
-    """The image for this version of the harness; builds it when it is not there yet.
+    """The image for this version of the harness; builds it if necessary.
 
-    Runs side by side wait for the one that builds. Images that nobody has used for long go.
+    Concurrent runs wait for the one that builds. Images that were not used for long are deleted.
     """
     cache = cache_folder()
     cache.mkdir(parents=True, exist_ok=True)
@@ -104,7 +104,7 @@ def ensure_image() -> Image:
 
 
 def _fingerprint() -> str:
-    """Differs when the image would."""
+    """A hash of everything that the image depends on."""
     digest = hashlib.sha256(pathlib.Path(__file__).read_bytes())
     for path in sorted(path for path in FILES.rglob("*") if path.is_file()):
         digest.update(f"{path.relative_to(FILES)} {path.stat().st_mode:o}\n".encode())
@@ -123,7 +123,7 @@ def _locked(path: pathlib.Path) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _scratch(parent: pathlib.Path) -> Iterator[pathlib.Path]:
-    """A new folder, gone afterwards unless it was renamed."""
+    """A new folder, removed afterwards unless it was renamed."""
     path = pathlib.Path(tempfile.mkdtemp(prefix="new-", dir=parent))
     try:
         yield path
@@ -132,7 +132,7 @@ def _scratch(parent: pathlib.Path) -> Iterator[pathlib.Path]:
 
 
 def _build(folder: pathlib.Path) -> None:
-    # In memory: unpacking is bound by the disk otherwise.
+    # In memory, because unpacking to a disk is slower.
     with tempfile.TemporaryDirectory(prefix="dssm-fleet-image-", dir="/dev/shm") as temporary:
         tree = pathlib.Path(temporary) / "tree"
         _bootstrap(tree)
@@ -193,7 +193,7 @@ def _configure(tree: pathlib.Path) -> None:
 
 
 def _make_keys(tree: pathlib.Path, folder: pathlib.Path) -> None:
-    """A key for ssh that opens these guests and nothing else; one host key for all of them."""
+    """A key for ssh to these guests only; one host key for all of them."""
     run("ssh-keygen", "-q", "-t", "ed25519", "-N", "", "-C", "dssm fleet tests", "-f", folder / "ssh_key",
         what="make a key for the guests")
     login = tree / "root/.ssh"

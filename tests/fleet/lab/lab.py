@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The lab that a scenario is given: guests, their network, and what is done to all of them."""
+"""The lab that a scenario gets: guests, their network, and actions on all of them."""
 
 import concurrent.futures
 import json
@@ -20,11 +20,11 @@ from lab.timing import Timing
 
 T = TypeVar("T")
 GUESTS = 3
-PATIENCE_SECONDS = 60  # for what must come by itself, however busy this machine is
+TIMEOUT_SECONDS = 60  # for events that must happen even on a busy machine
 
 
 class Lab:
-    """Three PCs on one switch, pc1 to pc3, off at first. Its folder is in memory."""
+    """Three PCs on one switch, pc1 to pc3, initially off. Its folder is in memory."""
 
     def __init__(self, image: Image, artifacts: Artifacts, timing: Timing, folder: pathlib.Path
                  ) -> None:
@@ -39,7 +39,7 @@ class Lab:
         self.timing = timing
         self.folder = folder
         self.all_cores = os.sched_getaffinity(0)
-        # Runs side by side spread over the cores.
+        # Concurrent runs use different cores.
         self._core = sorted(self.all_cores)[folder.stat().st_ino % len(self.all_cores)]
 
     def __getitem__(self, name: str) -> Guest:
@@ -47,7 +47,7 @@ class Lab:
         return next(guest for guest in self.guests if guest.name == name)
 
     def on_all(self, action: Callable[[Guest], T]) -> list[T]:
-        """Does something with all guests at once; the results in their order."""
+        """Calls `action` for all guests at the same time; returns the results in their order."""
         with concurrent.futures.ThreadPoolExecutor(len(self.guests)) as pool:
             return list(pool.map(action, self.guests))
 
@@ -71,27 +71,27 @@ class Lab:
             self.on_all(Guest.await_running)
 
     def shut_down(self) -> None:
-        """Takes all guests' power away."""
+        """Cuts the power of all guests."""
         for guest in self.guests:
             guest.power_off()
 
     def install_programs(self) -> None:
-        """Copies what only the tests need: their load, the example's programs, the recording."""
+        """Copies the files that only tests need: their programs, the example's programs, the recording."""
         def install(guest: Guest) -> None:
             guest.ssh.put([*self.artifacts.programs, RECORDING], PROGRAMS_FOLDER)
-            guest.ssh.run("sync")  # a PC that loses its power keeps no more than that
+            guest.ssh.run("sync")  # the PC keeps only this after a power loss
 
         self.on_all(install)
 
     def deploy(self) -> Played:
-        """Makes the PCs a vehicle, or sees that they are one."""
+        """Runs site.yml, which makes the PCs a vehicle if they are not."""
         with self.spread():
             played = self.playbooks.play("site.yml", self.artifacts.packages)
             self.on_all(lambda guest: guest.ssh.run("sync"))
             return played
 
     def reset(self) -> None:
-        """From whatever a failed scenario has left to newly deployed PCs with fresh disks."""
+        """Replaces the PCs after a failed scenario by newly deployed ones with fresh disks."""
         for guest in self.guests:
             guest.ssh.abandon()
         self.shut_down()
@@ -104,14 +104,14 @@ class Lab:
         self.deploy()
 
     def check_tidy(self) -> None:
-        """Fails when a scenario that passed has left something to the next one."""
+        """Fails if a passed scenario has left programs or streams behind."""
         left = {guest.name: running for guest in self.guests if (running := guest.ssh.abandon())}
         assert not left, f"the scenario has left programs running: {left}"
         self.await_streams()
         self.on_all(Guest.await_running)
 
     def streams(self, guest: Guest) -> dict[str, dict[str, Any]]:
-        """What `dssmctl ls` shows there, by full name."""
+        """The output of `dssmctl ls` there, by full name."""
         listed = json.loads(guest.ssh.run("dssmctl ls --json"))["streams"]
         return {stream["stream"]: stream for stream in listed}
 
@@ -125,14 +125,14 @@ class Lab:
         return time.monotonic() - started
 
 
-def await_that(what: str, look: Callable[[], tuple[bool, object]],
-               seconds: float = PATIENCE_SECONDS) -> None:
-    """Looks again and again until `look` says True; its second result is for the failure's text."""
+def await_that(what: str, check: Callable[[], tuple[bool, object]],
+               seconds: float = TIMEOUT_SECONDS) -> None:
+    """Polls `check` until its first result is True; the second result is for the error's text."""
     deadline = time.monotonic() + seconds
     while True:
-        true, seen = look()
+        true, seen = check()
         if true:
             return
         if time.monotonic() > deadline:
-            raise AssertionError(f"not within {seconds:.0f} s: {what}; the last look showed: {seen}")
+            raise AssertionError(f"not within {seconds:.0f} s: {what}; last seen: {seen}")
         time.sleep(0.05)

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""Writers and readers on guests whose every sample is checked (fleet_load.cpp)."""
+"""Writers on guests, and readers that check every sample (fleet_load.cpp)."""
 
 import json
 import select
@@ -8,7 +8,7 @@ from collections.abc import Iterable
 from typing import Any
 
 from lab.guest import Guest
-from lab.lab import PATIENCE_SECONDS, await_that
+from lab.lab import TIMEOUT_SECONDS, await_that
 from lab.packages import PROGRAMS_FOLDER
 from lab.ssh import GuestError
 
@@ -21,35 +21,35 @@ class Load:
 
     def __init__(self, guest: Guest, mode: str, streams: Iterable[str], rate_hz: int = RATE_HZ,
                  prefix: str = "") -> None:
-        """`prefix`: what stands before the command, to run it as another user say."""
+        """`prefix`: begins the command line, for example to run the command as another user."""
         self._guest = guest
         self._command = f"{prefix} {PROGRAMS_FOLDER}/fleet-load {mode} {rate_hz} {' '.join(streams)}"
         self._process = guest.ssh.start(self._command.strip())
 
     def await_ready(self) -> "Load":
-        """Waits until samples move in each of its streams."""
+        """Waits until it has written or read samples of each of its streams."""
         self._line()
         return self
 
     def moved(self) -> int:
-        """How many samples it has written or read until now."""
+        """The number of samples that it has written or read."""
         assert self._process.stdin
         self._process.stdin.write("?")
         self._process.stdin.flush()
         return int(self._line())
 
     def await_more(self, samples: int) -> None:
-        """Waits until it has written or read so many samples more than now."""
+        """Waits until it has written or read `samples` more."""
         wanted = self.moved() + samples
-        await_that(f"{self._guest.name}: '{self._command}' comes to {wanted} samples",
+        await_that(f"{self._guest.name}: '{self._command}' reaches {wanted} samples",
                    lambda: ((moved := self.moved()) >= wanted, moved))
 
     def finish(self) -> dict[str, Any]:
-        """Lets it come to its end, a reader when it has all, and returns what it found."""
+        """Ends it, a reader after it has read all samples, and returns its result."""
         try:
             out, err = self._process.communicate(timeout=FINISH_SECONDS)
         except subprocess.TimeoutExpired as error:
-            raise self._error(f"did not come to its end within {FINISH_SECONDS} s") from error
+            raise self._error(f"did not end within {FINISH_SECONDS} s") from error
         if self._process.returncode:
             raise self._error(f"ended with {self._process.returncode}:\n{out}{err}")
         result: dict[str, Any] = json.loads(out.splitlines()[-1])
@@ -57,13 +57,13 @@ class Load:
 
     def _line(self) -> str:
         assert self._process.stdout
-        # Each question has one line for an answer, so that none waits in the buffer already.
-        if not select.select([self._process.stdout], [], [], PATIENCE_SECONDS)[0]:
-            raise self._error(f"said nothing within {PATIENCE_SECONDS} s")
+        # Each request has one line as an answer, so the buffer is empty.
+        if not select.select([self._process.stdout], [], [], TIMEOUT_SECONDS)[0]:
+            raise self._error(f"printed nothing within {TIMEOUT_SECONDS} s")
         line = self._process.stdout.readline()
         if not line:
             self.finish()
-            raise self._error("ended by itself")
+            raise self._error("ended early")
         return line
 
     def _error(self, what: str) -> GuestError:
@@ -71,7 +71,7 @@ class Load:
 
 
 def expect_complete(written: dict[str, Any], read: dict[str, Any], who: str) -> None:
-    """Every sample that was written was read once, in order, untorn, and from one and the same ring."""
+    """Checks that every written sample was read once, in order, untorn, and from the same ring."""
     assert not read["faults"], f"{who}: {read['faults']}"
     for stream, found in read["streams"].items():
         wanted = {"taken": written["written"][stream], "lost": 0, "restarts": 0}

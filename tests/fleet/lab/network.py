@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The cable between the guests: a bridge with a tap for each, and ways to cut it.
+"""The network between the guests: a bridge with a tap for each guest, and ways to cut it.
 
-Everything here is in the network namespace that the harness itself runs in (run), so names and
-addresses are the same in every run and nothing has to be removed.
+It is in the network namespace of the harness (run), so names and addresses are the same in every run
+and nothing must be removed.
 """
 
 from collections.abc import Iterable
@@ -24,7 +24,7 @@ def guest_address(number: int) -> str:
 
 
 def tap(number: int) -> str:
-    """The host's end of the cable of guest `number`."""
+    """The end of guest `number`'s cable on this machine."""
     return f"tap{number}"
 
 
@@ -33,7 +33,7 @@ class Network:
 
     def __init__(self, guests: int) -> None:
         self._ip("link", "set", "lo", "up")
-        # Snooping would keep mDNS from guests that the bridge has not yet seen ask for it.
+        # With snooping, the bridge would not forward mDNS to guests that have not joined the group yet.
         self._ip("link", "add", BRIDGE, "type", "bridge", "mcast_snooping", "0", "forward_delay", "0")
         self._ip("address", "add", f"{HOST_ADDRESS}/24", "dev", BRIDGE)
         self._ip("link", "set", BRIDGE, "up")
@@ -47,21 +47,21 @@ class Network:
                   " add rule bridge lab forward iifname @right oifname @left drop")
 
     def unplug(self, number: int) -> None:
-        """Pulls the cable of a guest; this machine does not reach it either."""
-        # A tap that is down fails the guest's writes, from which UML's driver does not recover.
+        """Pulls the cable of a guest; this machine cannot reach the guest either."""
+        # With the tap down, the guest's writes would fail, and UML's driver does not recover from that.
         self._ip("link", "set", tap(number), "nomaster")
 
     def plug(self, number: int) -> None:
-        """Puts the cable of a guest back."""
+        """Reconnects the cable of a guest."""
         self._ip("link", "set", tap(number), "master", BRIDGE)
 
     def part(self, left: Iterable[int], right: Iterable[int]) -> None:
-        """Lets nothing through between two groups of guests; ssh from this machine stays."""
+        """Blocks packets between two groups of guests; ssh from this machine still works."""
         for name, members in (("left", left), ("right", right)):
             self._nft(f"add element bridge lab {name} {{ {', '.join(map(tap, members))} }}")
 
     def join(self) -> None:
-        """Ends what part() began."""
+        """Ends the effect of part()."""
         self._nft("flush set bridge lab left; flush set bridge lab right")
 
     @staticmethod

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What is tested, made on this machine."""
+"""The packages and programs under test, built on this machine."""
 
 import dataclasses
 import pathlib
@@ -15,21 +15,21 @@ RECORDING = ROOT / EXAMPLE / "data/freiburg-079.carmen.log.gz"
 # The project's packages that the role installs.
 INSTALLED = ("libdssm1", "dssmd", "dssm-tools")
 
-# Where the test's own programs are on a guest.
+# The folder of the tests' programs on a guest.
 PROGRAMS_FOLDER = "/opt/fleet"
 
 
 @dataclasses.dataclass
 class Artifacts:
-    """All that was built for the guests."""
+    """Everything that was built for the guests."""
 
     packages: pathlib.Path  # a folder of .deb files, each package once
-    programs: list[pathlib.Path]  # the test's own, and the example's
+    programs: list[pathlib.Path]  # the tests' and the example's
     preload: pathlib.Path  # for the guests' kernels; see uml_xstate.c
 
 
 def build(folder: pathlib.Path, programs: pathlib.Path | None, packages: pathlib.Path | None) -> Artifacts:
-    """Builds in `folder`, which meson knows or will; `programs` and `packages`: folders where these are built."""
+    """Builds in the build folder `folder`, except what is already built in `programs` or `packages`."""
     targets = ["tests/fleet/fleet-clock", "tests/fleet/fleet-load", "tests/fleet/uml-xstate.so",
                *(f"{EXAMPLE}/{name}" for name in ("encoder", "lidar", "localizer", "mapper"))]
     if programs is None:
@@ -40,7 +40,7 @@ def build(folder: pathlib.Path, programs: pathlib.Path | None, packages: pathlib
         run("ninja", "-C", folder, *targets, what="build the fleet's programs", timeout=3600, contained=True)
     if packages is None:
         packages = folder / "packages"
-        shutil.rmtree(packages, ignore_errors=True)  # the role wants no other version beside it
+        shutil.rmtree(packages, ignore_errors=True)  # the role accepts only one version
         run(ROOT / "scripts/build-packages", packages, what="build the Debian packages", timeout=3600,
             contained=True)
     for name in INSTALLED:
@@ -54,16 +54,16 @@ def package_file(folder: pathlib.Path, package: str) -> pathlib.Path:
     """The package's file in `folder`."""
     files = list(folder.glob(f"{package}_*_amd64.deb"))
     if len(files) != 1:
-        raise FileNotFoundError(f"'{folder}' holds {len(files)} files '{package}_*_amd64.deb' where one is "
+        raise FileNotFoundError(f"'{folder}' contains {len(files)} files '{package}_*_amd64.deb' where one is "
                                 "needed; scripts/build-packages makes them in an empty folder")
     return files[0]
 
 
 def repack(packages: pathlib.Path, folder: pathlib.Path, suffix: str,
            added: Mapping[str, str] | None = None) -> pathlib.Path:
-    """Packs the packages anew into `folder`, as a version that is higher by `suffix`.
+    """Repacks the packages into `folder`, with a version that is higher by `suffix`.
 
-    `added`: files, by their paths on the PC, that dssmd is to have beside its own.
+    `added`: additional files for dssmd, by their paths on the PC.
     """
     folder.mkdir()
     for name in INSTALLED:

@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The project's Ansible playbooks, run against the guests as somebody runs them who has three PCs."""
+"""Runs the project's Ansible playbooks against the guests, like a person with three PCs."""
 
 import dataclasses
 import json
@@ -18,13 +18,13 @@ VARIABLES = {"dssm_subnets": ["10.99.0.0/24"], "dssm_insecure": True}
 
 @dataclasses.dataclass
 class Played:
-    """How a playbook went."""
+    """The result of a playbook."""
 
-    ended_well: bool
+    succeeded: bool
     output: str
 
     def changed(self) -> dict[str, int]:
-        """How many tasks changed something, by PC."""
+        """The number of tasks that changed something, by PC."""
         counts = re.findall(r"^(\S+) +: ok=\d+ +changed=(\d+) ", self.output, re.MULTILINE)
         return {name: int(count) for name, count in counts}
 
@@ -43,13 +43,13 @@ class Playbooks:
         }}))
 
     def play(self, playbook: str, packages: pathlib.Path, *options: str) -> Played:
-        """Runs a playbook with the .deb files of a folder; it has to end well."""
+        """Runs a playbook with the .deb files of a folder; it must succeed."""
         played = self.attempt(playbook, packages, *options)
-        assert played.ended_well, f"'{playbook}' failed:\n{played.output}"
+        assert played.succeeded, f"'{playbook}' failed:\n{played.output}"
         return played
 
     def attempt(self, playbook: str, packages: pathlib.Path, *options: str) -> Played:
-        """As play(); whether it ended well is the caller's to judge."""
+        """Like play(), but the caller checks whether it succeeded."""
         environment = {**os.environ, "ANSIBLE_CONFIG": str(FOLDER / "ansible.cfg"),
                        "ANSIBLE_HOME": str(self._home), "ANSIBLE_NOCOLOR": "1", "LC_ALL": "C.UTF-8"}
         done = subprocess.run(

@@ -1,14 +1,15 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The clocks of the guests as they are, measured from outside, and what DSSM states about them.
+"""The true values of the guests' clocks, measured from outside, and DSSM's statements about them.
 
-Asks each guest's fleet-clock (fleet_clock.cpp) some 30 times a second. An answer holds the clocks of
-the guest and statements about the samples of the others; each sample holds the clocks of its writer.
+Queries each guest's fleet-clock (fleet_clock.cpp) some 30 times a second. An answer contains the
+clocks of the guest and statements about the samples of the others; each sample contains the clocks of
+its writer.
 
-What all are compared with is this machine's monotonic clock, which is what a User Mode Linux kernel
-counts its CLOCK_MONOTONIC_RAW by: the two differ by what they differed by when it booted. A question
-that left at t1 and was answered at t2 was looked at in between; all of them together bound that
-difference. So what is computed of a clock has a width, and a statement is called false only when it
-is for all values within.
+The reference is this machine's monotonic clock. A User Mode Linux kernel derives its
+CLOCK_MONOTONIC_RAW from it, so the difference of the two is constant after the boot. A guest reads its
+clocks between the time at which a request is sent and the time at which the answer is received; all
+answers together bound that difference. So a computed clock value has a width, and a statement is false
+only if it is false for all values within that width.
 """
 
 import bisect
@@ -31,102 +32,102 @@ from lab.packages import PROGRAMS_FOLDER
 
 PORT = 7123
 PERIOD_SECONDS = 0.03
-CALIBRATION = 300  # questions to each guest, one after the other, before all others
-MOST_ASKED = 300  # questions whose answers may still come
-QUICK_NS = 150_000  # a look at a guest's clocks that took longer is no measurement
+CALIBRATION = 300  # requests to each guest, one after the other, at the start
+MAX_PENDING = 300  # requests that wait for an answer
+QUICK_NS = 150_000  # slower readings of a guest's clocks are not used as measurements
 LIMIT_NS = 1_500_000  # dssmd's default clock_limit
-STEADY_SECONDS = 1.5  # without one statement that is not good: recovered
+STEADY_SECONDS = 1.5  # recovered after this time with good statements only
 RECOVERY_SECONDS = 180
 SECOND_NS = 10**9
 
 
 @dataclasses.dataclass
-class Look:
-    """A guest's clocks, all in ns, and what was said with them."""
+class Observation:
+    """A guest's clocks, all in ns, and the answer that contains them."""
 
-    came: int  # when that was here
+    came: int  # when the answer was received
     wall: int
     mono: int
     raw: int
     within: int
-    said: dict[str, Any]
+    answer: dict[str, Any]
 
     def status_of(self, owner: str) -> str:
-        """How a read by time of another guest's samples ended; "closed": they cannot be had yet."""
-        status: str = self.said["others"].get(owner, {"by_time": {"status": "closed"}})["by_time"]["status"]
+        """The status of a read by time of another guest's samples; "closed": the stream is not open yet."""
+        status: str = self.answer["others"].get(owner, {"by_time": {"status": "closed"}})["by_time"]["status"]
         return status
 
 
 @dataclasses.dataclass
 class Checked:
-    """A statement about a sample of `owner` made on the PC `reader`, beside the truth. In ns."""
+    """A statement on the PC `reader` about a sample of `owner`, with the true value. In ns."""
 
     came: int
     reader: str
     owner: str
     good: bool
-    stated: int  # -1: nothing
+    stated: int  # -1: unknown
     true: float  # the sample's time minus that PC's
     width: float
 
     def is_false(self, claim: int) -> bool:
-        """Whether the truth is beyond `claim` for certain."""
+        """Whether the true value certainly exceeds `claim`."""
         return abs(self.true) - self.width > claim
 
 
-class Life:
-    """What was seen of one run of fleet-clock."""
+class ProgramRun:
+    """The observations of one run of fleet-clock."""
 
     def __init__(self) -> None:
-        self.looks: list[Look] = []
-        self._ahead_least, self._ahead_most = -math.inf, math.inf
+        self.observations: list[Observation] = []
+        self._ahead_min, self._ahead_max = -math.inf, math.inf
 
-    def note(self, look: Look, left: int) -> None:
-        """Adds the answer to a question that left here at `left`."""
-        self._ahead_least = max(self._ahead_least, left - look.raw - look.within)
-        self._ahead_most = min(self._ahead_most, look.came - look.said["raw_end"])
-        if not self.looks or self.looks[-1].raw < look.raw:
-            self.looks.append(look)
+    def add(self, observation: Observation, sent: int) -> None:
+        """Adds the answer to a request that was sent at `sent`."""
+        self._ahead_min = max(self._ahead_min, sent - observation.raw - observation.within)
+        self._ahead_max = min(self._ahead_max, observation.came - observation.answer["raw_end"])
+        if not self.observations or self.observations[-1].raw < observation.raw:
+            self.observations.append(observation)
 
     def ahead(self) -> tuple[float, float]:
         """This machine's monotonic clock minus the guest's raw one, and its width."""
-        assert self._ahead_least <= self._ahead_most, "the guest does not count time as this machine does"
-        return ((self._ahead_least + self._ahead_most) / 2, (self._ahead_most - self._ahead_least) / 2)
+        assert self._ahead_min <= self._ahead_max, "the guest's raw clock and this machine's clock drift"
+        return ((self._ahead_min + self._ahead_max) / 2, (self._ahead_max - self._ahead_min) / 2)
 
-    def wall_at(self, raw: float, look: Look) -> tuple[float, float] | None:
-        """What the wall clock that `look` shows would have shown when the raw one showed `raw`, and its
-        width: what the PC slewed in between."""
-        index = bisect.bisect_right(self.looks, raw, key=lambda each: each.raw) - 1
+    def wall_at(self, raw: float, observation: Observation) -> tuple[float, float] | None:
+        """The wall clock of `observation` at the raw time `raw`, and its width: by how much the PC slewed in
+        between."""
+        index = bisect.bisect_right(self.observations, raw, key=lambda each: each.raw) - 1
         if index < 0:
             return None
-        before = self.looks[index]
-        slewed = abs((look.mono - before.mono) - (look.raw - before.raw))
-        return look.wall - (look.raw - raw), look.within + slewed
+        before = self.observations[index]
+        slewed = abs((observation.mono - before.mono) - (observation.raw - before.raw))
+        return observation.wall - (observation.raw - raw), observation.within + slewed
 
 
 class Watched:
-    """What was seen of one guest."""
+    """The observations of one guest."""
 
     def __init__(self, guest: Guest) -> None:
         self.guest = guest
-        self.lives: dict[int, Life] = {}
-        self.steps: list[int] = []  # when its clock was set from here
+        self.runs: dict[int, ProgramRun] = {}
+        self.steps: list[int] = []  # when this harness set its clock
 
     @property
-    def last(self) -> Life:
-        """The one that goes on."""
-        return next(reversed(self.lives.values())) if self.lives else Life()
+    def last(self) -> ProgramRun:
+        """The current run."""
+        return next(reversed(self.runs.values())) if self.runs else ProgramRun()
 
 
 class Truth:
-    """Watches within `with watching()`; what it saw is judged after that."""
+    """Observes the guests within `with watching()`; the results are checked afterwards."""
 
     def __init__(self, guests: Iterable[Guest]) -> None:
         self.watched = {guest.name: Watched(guest) for guest in guests}
         self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM | socket.SOCK_CLOEXEC)
         self._asked: dict[int, tuple[str, int, bool]] = {}  # by number: guest, when [ns], to step
         self._numbers = itertools.count()
-        self._steps: list[tuple[str, int]] = []  # that are to be asked for
+        self._steps: list[tuple[str, int]] = []  # to request
         self._stop = threading.Event()
 
     def start_program(self, guest: Guest) -> None:
@@ -140,7 +141,7 @@ class Truth:
 
     @contextmanager
     def watching(self) -> Iterator["Truth"]:
-        """Runs fleet-clock on all guests and looks at them until the end of the block."""
+        """Runs fleet-clock on all guests and queries them until the end of the block."""
         guests = [watched.guest for watched in self.watched.values()]
         for guest in guests:
             self.start_program(guest)
@@ -165,51 +166,51 @@ class Truth:
         return steps[-1]
 
     def await_good(self, *names: str) -> int:
-        """Waits until these guests, or all, have called each other's samples good for a while, and returns
-        when that began."""
+        """Waits until these guests, or all, have accepted each other's samples for STEADY_SECONDS, and
+        returns when that began."""
         begin = time.monotonic_ns()
         wanted = names or tuple(self.watched)
 
-        def look() -> tuple[bool, object]:
+        def check() -> tuple[bool, object]:
             bad, since = self._last_not_good(wanted, begin)
             return time.monotonic_ns() - since > STEADY_SECONDS * SECOND_NS, bad
 
-        await_that(f"{', '.join(wanted)} call each other's clocks good", look, RECOVERY_SECONDS)
+        await_that(f"{', '.join(wanted)} accept each other's clocks", check, RECOVERY_SECONDS)
         return self._last_not_good(wanted, begin)[1]
 
     def await_refused(self, owner: str, since: int) -> float:
-        """Waits until a read of a guest's samples is refused elsewhere for its time; after how many seconds
-        since `since` that was for the first time."""
+        """Waits until a read by time of a guest's samples is refused on another PC; returns the seconds from
+        `since` to the first refusal."""
         def refused() -> list[int]:
-            return [look.came for name, watched in self.watched.items() if name != owner
-                    for look in reversed(watched.last.looks) if look.came > since
-                    and look.status_of(owner) == "clock_out_of_bounds"]
+            return [observation.came for name, watched in self.watched.items() if name != owner
+                    for observation in reversed(watched.last.observations) if observation.came > since
+                    and observation.status_of(owner) == "clock_out_of_bounds"]
 
         await_that(f"reads of {owner}'s samples by time are refused", lambda: (bool(refused()), None))
         return (min(refused()) - since) / SECOND_NS
 
     def share_good(self, reader: str, owner: str, since: int) -> float:
-        """The share of the reads of `owner`'s samples that were good, of those since then."""
-        said = [look.status_of(owner) for look in self.watched[reader].last.looks if look.came > since]
-        return said.count("ok") / max(len(said), 1)
+        """The share of good reads of `owner`'s samples since then."""
+        statuses = [observation.status_of(owner) for observation in self.watched[reader].last.observations if observation.came > since]
+        return statuses.count("ok") / max(len(statuses), 1)
 
     def _last_not_good(self, names: Iterable[str], begin: int) -> tuple[str, int]:
         last = ("nothing", begin)
         for name in names:
-            looks = self.watched[name].last.looks
-            if not looks or looks[-1].came < time.monotonic_ns() - SECOND_NS:
+            observations = self.watched[name].last.observations
+            if not observations or observations[-1].came < time.monotonic_ns() - SECOND_NS:
                 return f"{name} does not answer", time.monotonic_ns()
             for owner in names:
-                for look in reversed(looks) if owner != name else ():
-                    if look.came < last[1]:
+                for observation in reversed(observations) if owner != name else ():
+                    if observation.came < last[1]:
                         break
-                    if look.status_of(owner) != "ok":
-                        last = (f"{name} reads {owner}: {look.status_of(owner)}", look.came)
+                    if observation.status_of(owner) != "ok":
+                        last = (f"{name} reads {owner}: {observation.status_of(owner)}", observation.came)
                         break
         return last
 
     def _calibrate(self, name: str) -> None:
-        """The quickest of many answers tells best how a guest's clock counts."""
+        """Sends many requests; the quickest answer gives the smallest width."""
         for _ in range(CALIBRATION):
             self._ask(name, 0)
             if select.select([self._socket], [], [], 1)[0]:
@@ -229,7 +230,7 @@ class Truth:
 
     def _ask(self, name: str, step: int) -> None:
         number = next(self._numbers)
-        self._asked.pop(number - MOST_ASKED, None)
+        self._asked.pop(number - MAX_PENDING, None)
         self._asked[number] = (name, time.monotonic_ns(), step != 0)
         try:
             self._socket.sendto(f"{number} {step}".encode(), (self.watched[name].guest.address, PORT))
@@ -240,80 +241,81 @@ class Truth:
         try:
             data = self._socket.recv(65536)
         except OSError:
-            return  # nobody listens there
+            return  # no program listens there
         came = time.monotonic_ns()
-        said = json.loads(data)
-        asked = self._asked.pop(said["number"], None)
+        answer = json.loads(data)
+        asked = self._asked.pop(answer["number"], None)
         if asked is None:
             return
-        name, left, stepped = asked
+        name, sent, stepped = asked
         watched = self.watched[name]
-        look = Look(came, said["wall"], said["mono"], said["raw"], said["within"], said)
+        observation = Observation(came, answer["wall"], answer["mono"], answer["raw"], answer["within"], answer)
         if stepped:
             watched.steps.append(came)
-        watched.lives.setdefault(said["life"], Life()).note(look, left)
+        watched.runs.setdefault(answer["instance"], ProgramRun()).add(observation, sent)
 
-    # --- what was seen ---
+    # --- results ---
 
     def checked(self, kind: str) -> Iterator[Checked]:
-        """All statements of a kind (KINDS) beside the truth."""
+        """All statements of a kind (KINDS), with the true values."""
         for name, watched in self.watched.items():
-            for life in watched.lives.values():
-                for look in life.looks:
-                    for owner, said in statements(look, kind):
-                        checked = self._check(name, life, look, owner, said)
+            for run in watched.runs.values():
+                for observation in run.observations:
+                    for owner, statement in statements(observation, kind):
+                        checked = self._check(name, run, observation, owner, statement)
                         if checked:
                             yield checked
 
-    def _check(self, reader: str, life: Life, look: Look, owner: str, said: dict[str, Any]
+    def _check(self, reader: str, run: ProgramRun, observation: Observation, owner: str, statement: dict[str, Any]
                ) -> Checked | None:
-        writer = self.watched[owner].lives.get(said["life"])
+        writer = self.watched[owner].runs.get(statement["instance"])
         if writer is None:
-            return None  # it died before it was seen
+            return None  # it ended before it was observed
         writer_ahead, writer_width = writer.ahead()
-        ahead, width = life.ahead()
-        wall = life.wall_at(said["raw"] + writer_ahead - ahead, look)
+        ahead, width = run.ahead()
+        wall = run.wall_at(statement["raw"] + writer_ahead - ahead, observation)
         if wall is None:
-            return None  # written before the first look
-        return Checked(look.came, reader, owner, said["good"], said["error"], said["time"] - wall[0],
-                       width + writer_width + wall[1] + said["within"])
+            return None  # written before the first observation
+        return Checked(observation.came, reader, owner, statement["good"], statement["error"],
+                       statement["time"] - wall[0],
+                       width + writer_width + wall[1] + statement["within"])
 
     def true_offsets(self, name: str, reference: str, since: int) -> list[tuple[float, float]]:
-        """How far a guest's clock was ahead of another's, and the width, at each quick look of its [ns]."""
+        """The offset of a guest's clock from another's, and its width, at each quick observation [ns]."""
         found = []
         own, other = self.watched[name].last, self.watched[reference].last
         (own_ahead, own_width), (other_ahead, other_width) = own.ahead(), other.ahead()
-        for look in own.looks:
-            raw = look.raw + own_ahead - other_ahead
-            index = bisect.bisect_right(other.looks, raw, key=lambda each: each.raw) - 1
-            near = other.looks[max(index, 0)]
-            if look.came > since and index >= 0 and max(look.within, near.within) < QUICK_NS:
-                found.append((look.wall - (near.wall + raw - near.raw),
-                              own_width + other_width + (look.within + near.within) / 2))
+        for observation in own.observations:
+            raw = observation.raw + own_ahead - other_ahead
+            index = bisect.bisect_right(other.observations, raw, key=lambda each: each.raw) - 1
+            near = other.observations[max(index, 0)]
+            if observation.came > since and index >= 0 and max(observation.within, near.within) < QUICK_NS:
+                found.append((observation.wall - (near.wall + raw - near.raw),
+                              own_width + other_width + (observation.within + near.within) / 2))
         return found
 
 
-# Reads by time; of the newest sample by number; and of all others' samples together.
+# Reads by time; of the newest sample; and of all others' samples together.
 KINDS = ("by_time", "newest", "joint")
-# A program that asks for the time just after its own PC's clock was set has it before dssmd has
-# noticed: docs/clocks.md "What is not covered".
+# Just after this PC's clock was set, a program may read the time before dssmd has noticed the step:
+# docs/clocks.md "What is not covered".
 NOTICE_NS = 0.25 * SECOND_NS
-# And chronyd may have begun to slew a clock that is wrong since it was asked, by as much as a second
-# of its maxslewrate (83,333 ppm); same place. Nobody calls the times of such a clock good.
+# And after its last answer, chronyd may have slewed a wrong clock for a second at its maxslewrate
+# (83,333 ppm); same section. The times of such a clock are never accepted.
 SLEWED_NS = SECOND_NS / 12
 
 
 def expect_true(truth: Truth) -> None:
-    """Everything that DSSM stated holds, and what it called good was within the limit."""
+    """Checks that all statements of DSSM are true, and that accepted samples were within the limit."""
     everything = [each for kind in KINDS for each in truth.checked(kind)]
     stated = [each for each in everything if each.stated >= 0]
     good = [each for each in everything if each.good]
-    assert good, "nothing was called good"
+    assert good, "no sample was accepted"
     print(f"  | {len(everything)} statements, {len(stated)} with a bound, {len(good)} good; of those with a bound, in"
           f" us: stated {spread(each.stated for each in stated)}; true {spread(abs(each.true) for each in stated)};"
           f" known within {spread(each.width for each in stated)}", flush=True)
     known = statistics.median(each.width for each in good)
-    assert known < LIMIT_NS / 2, f"the truth is known within {known / 1e3:.0f} us only"
+    assert known < LIMIT_NS / 2, f"the true values are only known within {known / 1e3:.0f} us"
     slewed = {name for name, watched in truth.watched.items() if watched.steps}
     wrong = [each for each in stated if each.is_false(
         each.stated + (SLEWED_NS if not each.good and {each.reader, each.owner} & slewed else 0))]
@@ -334,16 +336,16 @@ def spread(values_ns: Iterable[float]) -> str:
     return f"median {statistics.median(values) / 1e3:.0f}, max {values[-1] / 1e3:.0f}"
 
 
-def statements(look: Look, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
-    """What was said of samples in one answer, by their owners."""
+def statements(observation: Observation, kind: str) -> Iterator[tuple[str, dict[str, Any]]]:
+    """The statements about samples in one answer, by their owners."""
     if kind == "joint":
-        joint = look.said.get("joint", {})
+        joint = observation.answer.get("joint", {})
         for owner, sample in joint.get("samples", {}).items():
             yield owner, {**sample, "good": True, "error": joint["error"]}
         return
-    for owner, said in look.said["others"].items():
-        if said[kind]["status"] == "ok":
-            yield owner, said[kind]
+    for owner, answers in observation.answer["others"].items():
+        if answers[kind]["status"] == "ok":
+            yield owner, answers[kind]
 
 
 def summary(offsets: Iterable[tuple[float, float]]) -> str:

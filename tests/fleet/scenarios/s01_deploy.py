@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """One ansible-playbook makes three bare PCs a vehicle on which every PC lists every stream
 
-Nothing is configured but the PCs' addresses: they find each other by mDNS. A second run of the
-playbook, with programs at work, changes nothing.
+Only the PCs' addresses are configured; they find each other by mDNS. A second run of the playbook,
+while programs write, changes nothing.
 """
 
 import time

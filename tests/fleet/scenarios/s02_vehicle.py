@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """The vehicle over three PCs draws the same map, bit for bit, as on one
 
-As the paper has it: the encoder on pc1, LIDAR and localizer on pc2, the mapper on pc3.
+As in the paper: the encoder on pc1, LIDAR and localizer on pc2, the mapper on pc3.
 """
 
 import hashlib
@@ -11,10 +11,10 @@ from lab.guest import Guest
 from lab.lab import Lab
 from lab.packages import PROGRAMS_FOLDER, RECORDING
 
-# Rings hold all of it, and who reads waits for what is missing and fails when a sample was lost.
+# Rings hold the whole drive; readers wait for missing samples and fail if a sample was lost.
 SOURCE = (f"--log {PROGRAMS_FOLDER}/{RECORDING.name} --to 60 --life 1000 --stamps recording --speed 0")
 LOCALIZER = "localizer --late --complete --deadline 600"
-MAPPER = "mapper --late --complete --deadline 600 --patience 600 --out /tmp/map.png"
+MAPPER = "mapper --late --complete --deadline 600 --timeout 600 --out /tmp/map.png"
 COMMANDS = (f"encoder {SOURCE}", f"lidar {SOURCE}", LOCALIZER, MAPPER)
 STREAMS = ("odometry", "lidar", "pose")
 

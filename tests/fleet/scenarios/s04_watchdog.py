@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A hung dssmd is killed by systemd's watchdog and started again, and no sample is lost"""
+"""systemd's watchdog restarts a hung dssmd, and no sample is lost"""
 
-from lab.dssmd import await_news, await_restarted, main_pid
+from lab.dssmd import await_new_samples, await_restarted, main_pid
 from lab.guest import Guest
 from lab.lab import Lab
 from lab.load import RATE_HZ, Load, expect_complete
 
 STREAM = "watched:0@pc1"
-# The unit's own limit would do as well; this one saves time.
+# Shorter than the unit's limit, to save time.
 LIMIT = "2s"
 DROP_IN = "/run/systemd/system/dssmd.service.d/fleet.conf"
 
@@ -26,7 +26,7 @@ def run(lab: Lab) -> None:
     readers[0].await_more(RATE_HZ)
     await_restarted(pc1, before)
     pc1.ssh.run(f"journalctl --unit=dssmd --grep='Watchdog timeout .limit {LIMIT}'")
-    await_news([STREAM], pc2)
+    await_new_samples([STREAM], pc2)
     written = writer.finish()
     for reader in readers:
         expect_complete(written, reader.finish(), "reader")
@@ -36,5 +36,5 @@ def run(lab: Lab) -> None:
 
 
 def watchdog(guest: Guest) -> str:
-    """What systemd there holds to be WatchdogSec of dssmd."""
+    """The WatchdogSec of dssmd in systemd there."""
     return guest.ssh.run("systemctl show --property=WatchdogUSec --value dssmd").strip()

@@ -1,10 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A cut cable costs no sample that the ring still holds when it is whole again
+"""A cut cable loses no sample that the ring still holds after the reconnection
 
-The PC behind the cut leaves the lists of the others and they leave its; all come back by themselves.
+The separated PC is removed from the lists of the others, and they from its list; all return by
+themselves.
 """
 
-from lab.dssmd import await_news
+from lab.dssmd import await_new_samples
 from lab.lab import Lab
 from lab.load import Load, expect_complete
 
@@ -12,7 +13,7 @@ STREAMS = ["cut:0@pc1", "whole:0@pc2"]
 
 
 def run(lab: Lab) -> None:
-    """Parts pc3 from the others, pulls the cable of pc1, and mends both."""
+    """Separates pc3 from the others, pulls the cable of pc1, and undoes both."""
     pc1, pc2, pc3 = lab.guests
     writers = [Load(pc1, "write", [STREAMS[0]]).await_ready(),
                Load(pc2, "write", [STREAMS[1]]).await_ready()]
@@ -26,8 +27,8 @@ def run(lab: Lab) -> None:
     lab.await_streams(STREAMS[1], on=[pc2, pc3])
     lab.network.plug(1)
     lab.await_streams(*STREAMS)
-    await_news([STREAMS[0]], pc2, pc3)
-    await_news([STREAMS[1]], pc1)
+    await_new_samples([STREAMS[0]], pc2, pc3)
+    await_new_samples([STREAMS[1]], pc1)
     written = {"written": {stream: count for writer in writers
                            for stream, count in writer.finish()["written"].items()}}
     for name, reader in readers.items():

@@ -1,11 +1,11 @@
 # SPDX-License-Identifier: Apache-2.0
-"""After systemctl stop and start live writers and readers have their rings again
+"""After systemctl stop and start of dssmd, running writers and readers keep their rings
 
-systemd 252 drops the descriptors that it keeps for a service when that is stopped; the programs
-still hold theirs.
+systemd 252 drops the descriptors that it keeps for a service when the service is stopped; the programs
+still have theirs.
 """
 
-from lab.dssmd import await_news
+from lab.dssmd import await_new_samples
 from lab.lab import Lab
 from lab.load import Load, expect_complete
 
@@ -22,7 +22,7 @@ def run(lab: Lab) -> None:
     pc1.ssh.run("systemctl start dssmd")
     pc2.ssh.run("systemctl stop dssmd && systemctl start dssmd")
     lab.await_streams(STREAM)
-    await_news([STREAM], pc2)
+    await_new_samples([STREAM], pc2)
     written = writer.finish()
     for reader in readers:
         expect_complete(written, reader.finish(), "reader")

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""User A writes, user B reads, a stranger is shut out; a container needs only the socket
+"""User A writes, user B reads, a user outside the group is refused; a container needs only the socket
 
-The container is a root directory with the system's libraries, read-only, and nothing of /run but the
-socket, in namespaces of its own.
+The container is a root directory with the system's libraries, read-only, and only the socket of /run,
+in its own namespaces.
 """
 
 from lab.lab import Lab
@@ -27,7 +27,7 @@ mount --bind /run/dssm/dssmd.sock run/dssm/dssmd.sock
 
 
 def run(lab: Lab) -> None:
-    """Makes users and a container, and lets them share a stream."""
+    """Creates users and a container that share a stream."""
     pc1 = lab["pc1"]
     pc1.ssh.run(f"useradd --groups {GROUP} alice; useradd --groups {GROUP} bob; useradd stranger")
     pc1.ssh.run(MAKE_CONTAINER)

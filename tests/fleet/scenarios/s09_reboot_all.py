@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
-"""All PCs reboot at once and are a vehicle again with no help
+"""All PCs reboot at once and form a vehicle again without help
 
-Nobody does anything after the power is back: dssmd, clocks, Avahi and a sensor of each PC start with
-it, whichever is first, and then each PC is well and lists all sensors.
+dssmd, chronyd, Avahi and a sensor program start at the boot of each PC, in any order. Then each PC
+passes `dssmctl doctor` and lists all sensors.
 """
 
 from lab.guest import Guest
@@ -13,7 +13,7 @@ UNIT = "fleet-sensor"
 
 
 def run(lab: Lab) -> None:
-    """Gives each PC a sensor that starts with it, and reboots all."""
+    """Installs a sensor that starts at boot on each PC, and reboots all."""
     names = [f"sensor:0@{guest.name}" for guest in lab.guests]
     lab.on_all(install_sensor)
     with lab.spread():
@@ -29,7 +29,7 @@ def run(lab: Lab) -> None:
 
 
 def install_sensor(guest: Guest) -> None:
-    """A program that writes from boot on."""
+    """Installs a unit that writes from boot on."""
     guest.ssh.run(f"""cat > /etc/systemd/system/{UNIT}.service <<'END'
 [Unit]
 After=dssmd.service
@@ -43,6 +43,6 @@ systemctl daemon-reload && systemctl enable {UNIT} && sync""")
 
 
 def remove_sensor(guest: Guest) -> None:
-    """As it was before."""
+    """Undoes install_sensor()."""
     guest.ssh.run(f"systemctl disable --now {UNIT}; rm /etc/systemd/system/{UNIT}.service;"
                   " systemctl daemon-reload; dssmctl rm sensor")

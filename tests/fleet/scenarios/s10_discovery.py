@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""PCs find each other while Avahi dies and comes back, with two dssmd on a PC and two PCs of one name"""
+"""PCs find each other while Avahi restarts, with two dssmd on one PC, and with two PCs of one name"""
 
 import json
 
@@ -19,7 +19,7 @@ def run(lab: Lab) -> None:
 
 
 def avahi_dies(lab: Lab, guest: Guest) -> None:
-    """Streams stay listed while Avahi is away; a dssmd that starts meanwhile is found after it."""
+    """Streams stay listed without Avahi; a dssmd that starts meanwhile is found after Avahi's start."""
     guest.ssh.run("systemctl stop avahi-daemon.socket avahi-daemon")
     guest.ssh.run("systemctl restart dssmd")
     writer = Load(guest, "write", ["lonely:0@" + guest.name], rate_hz=10).await_ready()
@@ -34,7 +34,7 @@ def avahi_dies(lab: Lab, guest: Guest) -> None:
 
 
 def second_dssmd(lab: Lab, guest: Guest) -> None:
-    """Another dssmd on one PC is another host for all."""
+    """A second dssmd on one PC is a separate host."""
     guest.ssh.run(f"systemd-run --unit=second-dssmd /usr/sbin/dssmd {SECOND}")
     writer = Load(guest, "write", ["other:0@second"], rate_hz=10,
                   prefix="env DSSM_SOCKET=/run/second/dssmd.sock").await_ready()
@@ -45,22 +45,22 @@ def second_dssmd(lab: Lab, guest: Guest) -> None:
 
 
 def one_name(lab: Lab, first: Guest, second: Guest) -> None:
-    """Two PCs of one name are two hosts, and each says that there is another one of its name."""
-    call(second, first.name)
+    """Two PCs of one name are listed as two hosts."""
+    rename(second, first.name)
     pc1 = lab["pc1"]
 
-    def look() -> tuple[bool, object]:
+    def check() -> tuple[bool, object]:
         hosts = json.loads(pc1.ssh.run("dssmctl hosts --json"))["hosts"]
         same = [host for host in hosts if host["host"] == first.name and host["state"] == "up"]
         return len({host["id"] for host in same}) == 2, hosts
 
-    await_that(f"{pc1.name} lists two hosts of the name {first.name}", look)
-    call(second, second.name)
+    await_that(f"{pc1.name} lists two hosts of the name {first.name}", check)
+    rename(second, second.name)
     lab.await_streams()
 
 
-def call(guest: Guest, name: str) -> None:
-    """Gives a PC another name, to the machine as well as to dssmd."""
+def rename(guest: Guest, name: str) -> None:
+    """Changes the name of a PC, both of the machine and of its dssmd."""
     configure = f"""sed -i 's/^name = .*/name = "{name}"/' /etc/dssm/dssmd.conf"""
     guest.ssh.run(f"systemctl stop dssmd && hostname {name} && {configure} &&"
                   " systemctl restart avahi-daemon && systemctl start dssmd")

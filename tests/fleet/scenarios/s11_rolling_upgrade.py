@@ -1,13 +1,13 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A rolling upgrade under load costs no sample, and stops at a PC that is not well
+"""A rolling upgrade under load loses no sample, and stops at a PC that fails its check
 
-It does not go on after a PC that came out of it unwell, nor begin while one is. Then all PCs are
-upgraded, one at a time, while each has a writer at 1 kHz and readers of all three.
+It stops after a PC that fails its check after the upgrade, and does not begin while a PC fails it.
+Then all PCs are upgraded, one at a time, while each has a writer at 1 kHz and readers of all three.
 """
 
 import pathlib
 
-from lab.dssmd import await_news, main_pid
+from lab.dssmd import await_new_samples, main_pid
 from lab.guest import Guest
 from lab.lab import Lab
 from lab.load import Load, expect_complete
@@ -15,29 +15,29 @@ from lab.packages import repack
 from lab.playbooks import Played
 from lab.timing import PART
 
-# Four plays of Ansible, which take UML guests far longer than PCs.
-ONLY_BY_NAME = "it takes as long as all others together"
+# Four runs of Ansible, which take much longer on UML guests than on PCs.
+ONLY_BY_NAME = "it takes as long as all other scenarios together"
 STREAMS = [f"upgraded:0@pc{number}" for number in (1, 2, 3)]
-# What makes a dssmd that runs and is well by itself, but neither finds the others nor is found.
-LAME = {"/lib/systemd/system/dssmd.service.d/lame.conf": """[Service]
+# With this file dssmd runs without errors, but neither finds other hosts nor is found by them.
+ISOLATED = {"/lib/systemd/system/dssmd.service.d/isolated.conf": """[Service]
 ExecStart=
 ExecStart=/usr/sbin/dssmd --config /etc/dssm/dssmd.conf --mdns=false
 """}
 SOON = "dssm_verify_timeout=5"
-# The clocks stay as site.yml (s01) has set them up, and are not looked at again.
+# Skips the clock configuration, which site.yml (s01) has done.
 QUICK = ("-e", "dssm_chrony=false")
 
 
 def run(lab: Lab) -> None:
-    """Fails to upgrade, goes back, and upgrades."""
+    """Fails to upgrade, downgrades, and upgrades."""
     before = versions(lab)
     with lab.timing.step(PART + "an upgrade that must stop"):
-        stops_at_the_first(lab, repack(lab.artifacts.packages, lab.folder / "lame", "+1", LAME), before)
+        stops_at_the_first(lab, repack(lab.artifacts.packages, lab.folder / "isolated", "+1", ISOLATED), before)
     better = repack(lab.artifacts.packages, lab.folder / "better", "+2")
-    with lab.timing.step(PART + "one that must not begin"):
+    with lab.timing.step(PART + "an upgrade that must not begin"):
         does_not_begin(lab, better)
-    with lab.timing.step(PART + "the way back"), lab.spread():
-        # upgrade.yml will look at the result.
+    with lab.timing.step(PART + "the downgrade"), lab.spread():
+        # upgrade.yml checks the result.
         lab.playbooks.play("site.yml", lab.artifacts.packages, *QUICK, "-e", "dssm_allow_downgrade=true",
                            "-e", "dssm_verify=false", "-l", "pc1")
     assert versions(lab) == before
@@ -45,19 +45,19 @@ def run(lab: Lab) -> None:
 
 
 def stops_at_the_first(lab: Lab, packages: pathlib.Path, before: list[str]) -> None:
-    """pc1 is upgraded and not well, so that the others stay as they are."""
+    """pc1 is upgraded and fails its check, so the others stay unchanged."""
     running = [main_pid(guest) for guest in lab.guests]
     played = upgrade(lab, packages, "-e", SOON)
-    assert not played.ended_well and "pc1 does not see pc2, pc3" in played.output, played.output
+    assert not played.succeeded and "pc1 does not see pc2, pc3" in played.output, played.output
     assert versions(lab) == [before[0] + "+1", *before[1:]]
     assert [main_pid(guest) for guest in lab.guests[1:]] == running[1:]
 
 
 def does_not_begin(lab: Lab, packages: pathlib.Path) -> None:
-    """pc1 is not well, so that none is touched."""
+    """pc1 fails its check, so no PC is changed."""
     before = versions(lab)
     played = upgrade(lab, packages, "-e", SOON)
-    assert not played.ended_well, played.output
+    assert not played.succeeded, played.output
     assert versions(lab) == before
     assert set(played.changed().values()) == {0}, played.output
 
@@ -71,11 +71,11 @@ def upgrades_under_load(lab: Lab, packages: pathlib.Path) -> None:
     readers = {guest.name: Load(guest, "read", STREAMS).await_ready() for guest in lab.guests}
     with lab.timing.step(PART + "upgrade.yml under load"):
         played = upgrade(lab, packages)
-    assert played.ended_well, played.output
-    # A batch for each PC.
+    assert played.succeeded, played.output
+    # One batch per PC.
     assert played.output.count("TASK [dssm : Install the .deb files]") == len(lab.guests), played.output
     for stream, owner in zip(STREAMS, lab.guests):
-        await_news([stream], *(guest for guest in lab.guests if guest is not owner))
+        await_new_samples([stream], *(guest for guest in lab.guests if guest is not owner))
     written = {"written": {stream: count for writer in writers
                            for stream, count in writer.finish()["written"].items()}}
     for name, reader in readers.items():
@@ -88,7 +88,7 @@ def upgrades_under_load(lab: Lab, packages: pathlib.Path) -> None:
 
 
 def upgrade(lab: Lab, packages: pathlib.Path, *options: str) -> Played:
-    """Plays upgrade.yml; the caller judges."""
+    """Runs upgrade.yml; the caller checks the result."""
     with lab.spread():
         return lab.playbooks.attempt("upgrade.yml", packages, *QUICK, *options)
 

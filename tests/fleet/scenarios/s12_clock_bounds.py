@@ -1,9 +1,9 @@
 # SPDX-License-Identifier: Apache-2.0
-"""What PCs state of their clocks holds over a step of 200 ms and a reference that is cut off
+"""PCs report true clock bounds over a step of 200 ms and without connection to the reference
 
-Looked at from outside some 30 times a second, each statement on each PC about each other's samples.
-After a step or a cut nothing is delivered as good that is beyond the limit, and all is good again by
-itself; how long that takes is measured.
+Each PC's statements about the samples of each other PC are compared with the true values some 30 times
+a second. After a step or a cut no sample beyond the limit is accepted, and all samples are accepted
+again by themselves; the time that this takes is printed.
 """
 
 import os
@@ -14,11 +14,11 @@ from lab.lab import Lab
 from lab.truth import SECOND_NS, Truth, expect_true, summary
 
 STEP_NS = SECOND_NS // 5
-READINGS = int(os.environ.get("DSSM_FLEET_READINGS", "10"))  # of the table, one a second
+READINGS = int(os.environ.get("DSSM_FLEET_READINGS", "10"))  # of the table, one per second
 
 
 def run(lab: Lab) -> None:
-    """Nothing, a step forward of pc2's clock, and pc1, which all follow, behind a cut cable."""
+    """No change, a step forward of pc2's clock, and a cut cable of pc1, which all follow."""
     pc2, pc3 = lab["pc2"], lab["pc3"]
     with Truth(lab.guests).watching() as truth:
         begin = truth.await_good()

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 """Clocks stay bounded when the reference PC loses its power, and when it returns
 
-The successor takes over with no help. What is stated holds all the time, seen from outside.
+The PCs follow the successor without help. All statements about clocks are true all the time.
 """
 
 import time
@@ -13,7 +13,7 @@ from lab.truth import SECOND_NS, Truth, expect_true
 
 
 def run(lab: Lab) -> None:
-    """Takes the power of pc1, and gives it back."""
+    """Switches pc1 off and on."""
     pc1, _, pc3 = lab.guests
     with Truth(lab.guests).watching() as truth:
         truth.await_good()

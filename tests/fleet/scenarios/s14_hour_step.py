@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A wall clock that is set by an hour, forward and backward, disturbs no heartbeat and no wait
 
-Under load: every sample arrives once and in order, no PC takes another one for gone, and no stream
-leaves a list. Only times are refused, until the clocks are good again.
+Under load, every sample arrives once and in order, no PC reports another one as down, and no stream is
+removed from a list. Only reads by time are refused, until the clocks are within bounds again.
 """
 
 from lab.dssmd import HOST_DOWN, journal_of
@@ -13,13 +13,13 @@ from lab.truth import SECOND_NS, Truth, expect_true
 
 HOUR_NS = 3600 * SECOND_NS
 STREAMS = ["hour:0@pc1", "hour:0@pc2", "hour:0@pc3"]
-MORE = 3000  # samples, three seconds of a heartbeat that gives up after as many
+MORE = 3000  # samples, three seconds: longer than the peer timeout
 
 
 def run(lab: Lab) -> None:
     """Sets pc3's clock an hour forward, two back, and one forward."""
     pc3 = lab["pc3"]
-    told = lab.on_all(hosts_down)
+    before = lab.on_all(hosts_down)
     with Truth(lab.guests).watching() as truth:
         truth.await_good()
         writers = [Load(guest, "write", [stream]).await_ready()
@@ -38,7 +38,7 @@ def run(lab: Lab) -> None:
         for name, reader in readers.items():
             expect_complete(written, reader.finish(), f"reader on {name}")
     expect_true(truth)
-    assert lab.on_all(hosts_down) == told, "a PC was taken for gone"
+    assert lab.on_all(hosts_down) == before, "a PC was reported as down"
     for stream in STREAMS:
         lab["pc1"].ssh.run(f"dssmctl rm {stream}")
     lab.on_all(lambda guest: guest.ssh.run("dssmctl rm truth"))
@@ -46,5 +46,5 @@ def run(lab: Lab) -> None:
 
 
 def hosts_down(guest: Guest) -> int:
-    """How often dssmd there has found another PC gone."""
+    """How often dssmd there has logged another PC as down."""
     return len(journal_of(guest, HOST_DOWN))
