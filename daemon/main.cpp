@@ -221,8 +221,9 @@ class Dssmd {
         local_(streams_.registry, streams_.opens, streams_.playback_clock, logger, recovering_,
                &hosts_.service),
         server_(loop, sockets.listener, config.max_clients, local_, logger),
-        channels_({loop, streams_.registry, streams_.opens, logger, &hosts_.clock}, hosts_.self,
-                  peer_limits(config)),
+        channels_({loop, streams_.registry, streams_.opens, logger, &hosts_.clock,
+                   [this] { hosts_.clock.poll_if_due(); }},
+                  hosts_.self, peer_limits(config)),
         status_(loop, manager,
                 [this] {
                   return status_text(streams_.registry, hosts_.peers, hosts_.clock,
@@ -237,7 +238,7 @@ class Dssmd {
           streams_.registry, hosts_.peers, logger);
     }
     hosts_.peers.on_change([this] { status_.touch(); });
-    hosts_.clock.on_news([this] {
+    hosts_.clock.on_new_generation([this] {
       channels_.send_clock();
       status_.touch();
     });
@@ -250,7 +251,7 @@ class Dssmd {
   Dssmd& operator=(const Dssmd&) = delete;
   ~Dssmd() {
     hosts_.peers.on_change({});
-    hosts_.clock.on_news({});
+    hosts_.clock.on_new_generation({});
     hosts_.clock.on_change({});
   }
 

@@ -23,7 +23,7 @@ PlaybackClock::PlaybackClock(std::shared_ptr<detail::PlaybackClockState> state) 
 
 PlaybackClock::Setting PlaybackClock::setting() const noexcept {
   const clock::PlaybackSetting now = state_->record->load();
-  return {now.offset_s, now.speed, now.paused, now.paused_at_s};
+  return {now.offset_s, now.speed, now.paused != 0, now.paused_at_s};
 }
 
 double PlaybackClock::now_s() const noexcept { return state_->record->load().at(real_now_s()); }

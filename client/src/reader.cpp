@@ -37,22 +37,26 @@ Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
   return distance(t, after.time) < distance(before.time, t) ? after.tid : before.tid;
 }
 
-// Verdicts hold for seconds, so a coarse clock does.
+// Assessments are valid for seconds, so a coarse clock is precise enough.
 using clock::coarse_now;
 
-// Whether the time of that sample must not be used.
+// Whether reads by time must not deliver that sample.
+bool is_refused(const ring::ClockAssessment& clock, const SampleInfo& info) noexcept {
+  return clock.policy == ClockPolicy::enforce && !clock.is_good(info, coarse_now());
+}
 bool is_refused(const ring::RingReader& ring, const SampleInfo& info) noexcept {
-  return ring.clock_rule() == ring::ClockRule::enforce && !ring.clock().is_good(info, coarse_now());
+  return is_refused(ring.clock(), info);
 }
 
 // The same by tid; for a read by time, before the sample is copied.
 //   returns  ok | too_old | not_yet | clock_out_of_bounds
 ReadStatus check_clock(const ring::RingReader& ring, Tid tid) noexcept {
-  if (ring.clock_rule() != ring::ClockRule::enforce) return ReadStatus::ok;
+  const ring::ClockAssessment clock = ring.clock();
+  if (clock.policy != ClockPolicy::enforce) return ReadStatus::ok;
   SampleInfo info;
   const ReadStatus status = ring.stamp(tid, info);
   if (status != ReadStatus::ok) return status;
-  return is_refused(ring, info) ? ReadStatus::clock_out_of_bounds : ReadStatus::ok;
+  return is_refused(clock, info) ? ReadStatus::clock_out_of_bounds : ReadStatus::ok;
 }
 
 }  // namespace

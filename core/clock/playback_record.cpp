@@ -2,11 +2,10 @@
 #include "core/clock/playback_record.hpp"
 
 #include <fcntl.h>
+#include <fmt/core.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
 #include <unistd.h>
-
-#include <bit>
 
 #include "core/ring/robust_lock.hpp"
 
@@ -14,17 +13,6 @@ namespace dssm::clock {
 namespace {
 
 constexpr int kSeals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL;
-
-void store_record(PlaybackPage::Record& record, const PlaybackSetting& setting) noexcept {
-  // Release: a reader that sees any of these sees the generation that was current before them, and
-  // tries again; pairs with the acquire loads in load().
-  record.offset_bits.store(std::bit_cast<std::uint64_t>(setting.offset_s),
-                           std::memory_order_release);
-  record.speed_bits.store(std::bit_cast<std::uint64_t>(setting.speed), std::memory_order_release);
-  record.paused.store(setting.paused ? 1 : 0, std::memory_order_release);
-  record.paused_at_bits.store(std::bit_cast<std::uint64_t>(setting.paused_at_s),
-                              std::memory_order_release);
-}
 
 }  // namespace
 
@@ -39,7 +27,7 @@ Result<UniqueFd> create_playback_clock() {
       ::mmap(nullptr, sizeof(PlaybackPage), PROT_READ | PROT_WRITE, MAP_SHARED, fd.get(), 0);
   if (memory == MAP_FAILED) return os_error("map the playback clock");
   auto& page = *static_cast<PlaybackPage*>(memory);
-  store_record(page.records[0], PlaybackSetting{});
+  page.setting.store({});
   ring::init_robust_lock(page.lock);
   page.layout_version = PlaybackPage::kLayoutVersion;
   page.magic = PlaybackPage::kMagic;
@@ -52,7 +40,8 @@ Result<std::shared_ptr<PlaybackRecord>> PlaybackRecord::open_untrusted(int fd) {
   const int seals = ::fcntl(fd, F_GET_SEALS);
   if (seals < 0 || (seals & kSeals) != kSeals || ::fstat(fd, &file) ||
       file.st_size != sizeof(PlaybackPage)) {
-    return Error{Errc::protocol, "this is no playback clock: no sealed memory file of one page"};
+    return Error{Errc::protocol,
+                 "this is not a playback clock: not a sealed memory file of one page"};
   }
   void* memory = ::mmap(nullptr, sizeof(PlaybackPage), PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
   if (memory == MAP_FAILED) return os_error("map the playback clock");
@@ -60,7 +49,8 @@ Result<std::shared_ptr<PlaybackRecord>> PlaybackRecord::open_untrusted(int fd) {
   record->page_ = static_cast<PlaybackPage*>(memory);
   if (record->page_->magic != PlaybackPage::kMagic ||
       record->page_->layout_version != PlaybackPage::kLayoutVersion) {
-    return Error{Errc::protocol, "this is no playback clock of layout version 1"};
+    return Error{Errc::protocol, fmt::format("this is not a playback clock of layout version {}",
+                                             PlaybackPage::kLayoutVersion)};
   }
   return record;
 }
@@ -70,30 +60,13 @@ PlaybackRecord::~PlaybackRecord() {
 }
 
 PlaybackSetting PlaybackRecord::load() const noexcept {
-  for (;;) {
-    const std::uint64_t generation = page_->generation.load(std::memory_order_acquire);
-    const PlaybackPage::Record& record = page_->records[generation % 2];
-    PlaybackSetting setting;
-    setting.offset_s = std::bit_cast<double>(record.offset_bits.load(std::memory_order_acquire));
-    setting.speed = std::bit_cast<double>(record.speed_bits.load(std::memory_order_acquire));
-    setting.paused = record.paused.load(std::memory_order_acquire) != 0;
-    setting.paused_at_s =
-        std::bit_cast<double>(record.paused_at_bits.load(std::memory_order_acquire));
-    // This record is written again only after the generation moved on, so an unchanged one means
-    // that all four belong together. Only two whole updates during four loads lead to another
-    // round.
-    if (page_->generation.load(std::memory_order_relaxed) == generation) return setting;
-  }
-}
-
-void PlaybackRecord::store(const PlaybackSetting& setting) noexcept {
-  const std::uint64_t next = page_->generation.load(std::memory_order_relaxed) + 1;
-  store_record(page_->records[next % 2], setting);
-  page_->generation.store(next, std::memory_order_release);
+  PlaybackSetting setting;
+  page_->setting.load(setting);
+  return setting;
 }
 
 bool PlaybackRecord::lock() noexcept {
-  // Whatever its last holder left, `generation` still names a whole record: nothing to repair.
+  // A holder that died left a complete setting: nothing to repair.
   return ring::lock_robust(page_->lock) != ring::LockResult::refused;
 }
 

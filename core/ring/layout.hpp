@@ -15,12 +15,13 @@
 #include <cstddef>
 #include <cstdint>
 
-#include "core/ring/clock_gate.hpp"
+#include "core/base/shared_snapshot.hpp"
+#include "core/ring/clock_assessment.hpp"
 
 namespace dssm::ring {
 
 inline constexpr std::uint64_t kMagic = 0x474e49524d535344;  // "DSSMRING"
-inline constexpr std::uint32_t kLayoutVersion = 2;
+inline constexpr std::uint32_t kLayoutVersion = 3;
 inline constexpr std::size_t kPageBytes = 4096;
 inline constexpr std::size_t kLineBytes = 64;
 
@@ -71,11 +72,10 @@ static_assert(sizeof(PublisherCursor) == 40);
 //   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
 //   520     8 run_start        tid    writer      before top; see "Search by time"
 //   528     8 first            tid    dssmd       before top; see "Window"
-//   536    40 reserved         -      -           zero
-//   576    56 clock            -      dssmd       see clock_gate.hpp
-//   632     8 reserved         -      -           zero
+//   536   104 reserved         -      -           zero
 //   640  2560 publishers       -      dssmd       before top: see publisher_cursors.hpp
-//  3200   896 reserved         -      -           zero
+//  3200   104 clock            -      dssmd       see clock_assessment.hpp, shared_snapshot.hpp
+//  3304   792 reserved         -      -           zero
 struct RingHeader {
   std::uint64_t magic;
   std::uint32_t layout_version;
@@ -101,18 +101,17 @@ struct RingHeader {
   std::atomic<std::int64_t> top;
   std::atomic<std::int64_t> run_start;
   std::atomic<std::int64_t> first;
-  std::byte reserved3[40];
-  ClockGate clock;
-  std::byte reserved4[8];
+  std::byte reserved3[104];
   PublisherCursor publishers[kMaxPublishers];
-  std::byte reserved5[896];
+  SharedSnapshot<ClockAssessment> clock;
+  std::byte reserved4[792];
 };
 static_assert(sizeof(pthread_mutex_t) <= 64);
 static_assert(offsetof(RingHeader, incarnation) == 64 && offsetof(RingHeader, name) == 88);
 static_assert(offsetof(RingHeader, host) == 128 && offsetof(RingHeader, lock) == 320);
 static_assert(offsetof(RingHeader, top) == 512 && offsetof(RingHeader, run_start) == 520);
-static_assert(offsetof(RingHeader, first) == 528 && offsetof(RingHeader, clock) == 576);
-static_assert(offsetof(RingHeader, publishers) == 640);
+static_assert(offsetof(RingHeader, first) == 528);
+static_assert(offsetof(RingHeader, publishers) == 640 && offsetof(RingHeader, clock) == 3200);
 static_assert(sizeof(RingHeader) == kPageBytes);
 
 //   off size field           unit  written by  order

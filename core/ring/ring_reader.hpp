@@ -38,12 +38,14 @@ class RingReader {
   //   returns  ok | not_yet | too_old
   ReadStatus stamp(Tid tid, SampleInfo& info) const noexcept;
 
-  // By which rule it judges them; a load.
-  ClockRule clock_rule() const noexcept {
-    return static_cast<ClockRule>(header_->clock.rule.load(std::memory_order_acquire));
+  // What this PC's dssmd states about the times in this ring. One load where it states nothing:
+  // where only this PC writes. What a hostile writer keeps changing counts as an unknown clock.
+  ClockAssessment clock() const noexcept {
+    if (!header_->clock.is_set()) return {};
+    ClockAssessment assessment = ClockAssessment::unknown_clock(ClockPolicy::enforce);
+    header_->clock.load(assessment);
+    return assessment;
   }
-  // What this PC's dssmd thinks of the times in this ring.
-  ClockVerdict clock() const noexcept { return load(header_->clock); }
 
   // Tid of the newest sample with time <= `t`; kNoTid with too_old when all lie after it.
   //   returns  ok | not_yet (empty) | too_old | lapped

@@ -44,22 +44,12 @@ bool is_good(ClockStatus status) noexcept {
 }
 
 // Whether other hosts have to know of the change before they get another sample.
-bool is_news(const wire::ClockReport& before, const wire::ClockReport& after) {
+bool is_new_generation(const wire::ClockReport& before, const wire::ClockReport& after) {
   const auto is_known = [](const wire::ClockReport& report) {
     return report.standing.bound != kUnknownClockError;
   };
   return before.status != after.status || is_known(before) != is_known(after) ||
          before.standing.anchor != after.standing.anchor;
-}
-
-ring::ClockVerdict nothing_is_good(const clock::ClockDemand& demand) {
-  ring::ClockVerdict verdict;
-  verdict.rule = demand.policy == ClockPolicy::off    ? ring::ClockRule::off
-                 : demand.policy == ClockPolicy::mark ? ring::ClockRule::mark
-                                                      : ring::ClockRule::enforce;
-  verdict.allowed = Duration(-1);
-  verdict.judged = MonoClock::now();
-  return verdict;
 }
 
 }  // namespace
@@ -97,7 +87,7 @@ void FleetClock::on_clock() { refresh(); }
 void FleetClock::on_host_clock(const KnownHost& host) {
   // The others are heard often enough by the tick of our own watch.
   if (source_ && host.greeting.host_id == source_->id) refresh();
-  on_heartbeat();
+  poll_if_due();
 }
 
 void FleetClock::on_host_down(const KnownHost& host, const Error&) {
@@ -105,11 +95,11 @@ void FleetClock::on_host_down(const KnownHost& host, const Error&) {
   if (source_ && host.greeting.host_id == source_->id) refresh();
 }
 
-[[gnu::hot]] std::uint64_t FleetClock::news() {
-  if (!watch_.may_differ()) return news_;
+[[gnu::hot]] std::uint64_t FleetClock::clock_generation() {
+  if (!watch_.may_differ()) return generation_;
   const bool is_known = watch_.state().bound != kUnknownClockError;
   if (is_known != (own_->standing.bound != kUnknownClockError)) refresh();
-  return news_;
+  return generation_;
 }
 
 // --- where this clock stands
@@ -121,14 +111,14 @@ void FleetClock::refresh() {
   const clock::ClockState state = watch_.state();
   const wire::ClockReport before = *own_;
   look_up_addresses(now);
-  stand(state, now);
-  judge_own(state);
+  update_chain(state, now);
+  update_status(state);
   publish(state, instant);
-  tell_of_others(now);
+  log_others(now);
   was_in_bounds_ |= is_good(own_->status);
-  if (is_news(before, *own_)) {
-    ++news_;
-    if (on_news_) on_news_();
+  if (is_new_generation(before, *own_)) {
+    ++generation_;
+    if (on_new_generation_) on_new_generation_();
   }
   if (on_change_) on_change_();
 }
@@ -175,7 +165,7 @@ void FleetClock::look_up_addresses(MonoTime now) {
   own_->addresses = own_addresses();
 }
 
-void FleetClock::stand(const clock::ClockState& state, MonoTime now) {
+void FleetClock::update_chain(const clock::ClockState& state, MonoTime now) {
   clock::SyncChain& own = own_->standing;
   own_->heard = now;
   own.chain.clear();
@@ -226,7 +216,7 @@ void FleetClock::choose_anchor(const clock::ClockState& state, MonoTime now) {
 }
 
 // The watch judges the distance from the source; what counts is the one from the anchor.
-void FleetClock::judge_own(const clock::ClockState& state) {
+void FleetClock::update_status(const clock::ClockState& state) {
   own_->status = state.status;
   own_->trouble = state.trouble;
   if (state.bound != kUnknownClockError) {
@@ -280,12 +270,12 @@ void FleetClock::publish(const clock::ClockState& state, const clock::Instant& n
 }
 
 // While this clock is not good, nobody's is here; the log says that of this clock.
-void FleetClock::tell_of_others(MonoTime now) {
+void FleetClock::log_others(MonoTime now) {
   if (policies_.general.policy == ClockPolicy::off || !is_good(own_->status)) return;
   for (const auto& [id, host] : catalog_.hosts()) {
     if (id == self_) continue;
     log_.look(id, host.greeting.host,
-              trouble_with(host.greeting.clock.get(), policies_.general.limit), now);
+              reason_against(host.greeting.clock.get(), policies_.general.limit), now);
   }
 }
 
@@ -330,24 +320,38 @@ Result<void> FleetClock::check_serving(const StreamId& id, const wire::Greeting&
                    "its key clock_policy to \"mark\" or \"off\""};
 }
 
-ring::ClockVerdict FleetClock::judge(const StreamId& id, const wire::ClockReport* owner) const {
-  const clock::ClockDemand demand = policies_.demand_for(id);
-  ring::ClockVerdict verdict = nothing_is_good(demand);
-  if (owner && clock::share_clock(own_->standing, owner->standing)) {
-    verdict.rule = ring::ClockRule::same_clock;
-    return verdict;
+ring::ClockAssessment FleetClock::assess_mirror(const StreamId& id,
+                                                const wire::ClockReport* owner) const {
+  if (owner && clock::share_clock(own_->standing, owner->standing)) return {};
+  const MonoTime now = MonoClock::now();
+  if (!owner || owner->standing.bound == kUnknownClockError) {
+    return assessment(id, now, kUnknownClockError, 0);
   }
-  if (!owner || owner->standing.bound == kUnknownClockError) return verdict;
-  const clock::SyncChain own = own_->at(verdict.judged).standing;
-  const clock::SyncChain theirs = owner->at(verdict.judged).standing;
-  verdict.added = clock::distance_from_anchor(theirs, own);
-  verdict.ageing_ppb = static_cast<std::uint32_t>(own.ageing + theirs.ageing);
-  if (verdict.added <= demand.limit) verdict.allowed = demand.limit - verdict.added;
-  return verdict;
+  const clock::SyncChain own = own_->at(now).standing, theirs = owner->at(now).standing;
+  return assessment(id, now, clock::distance_from_anchor(theirs, own), own.ageing + theirs.ageing);
+}
+
+ring::ClockAssessment FleetClock::assess_own(const StreamId& id) const {
+  const MonoTime now = MonoClock::now();
+  const clock::SyncChain own = own_->at(now).standing;
+  return assessment(id, now, own.bound, own.ageing);
+}
+
+// Of samples whose times may be `added` further from this clock than their clock errors say.
+ring::ClockAssessment FleetClock::assessment(const StreamId& id, MonoTime now, Duration added,
+                                             clock::PartsPerBillion ageing) const {
+  const clock::ClockDemand demand = policies_.demand_for(id);
+  ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(demand.policy);
+  assessment.assessed = now;
+  if (added == kUnknownClockError) return assessment;
+  assessment.added = added;
+  assessment.ageing_ppb = static_cast<std::uint32_t>(ageing);
+  if (added <= demand.limit) assessment.limit = demand.limit - added;
+  return assessment;
 }
 
 // Why the times of that host's samples are not good here; empty: they are.
-std::string FleetClock::trouble_with(const wire::ClockReport* owner, Duration limit) const {
+std::string FleetClock::reason_against(const wire::ClockReport* owner, Duration limit) const {
   if (!owner) return "nothing is known of its host's clock";
   if (clock::share_clock(own_->standing, owner->standing)) return {};
   if (own_->standing.bound == kUnknownClockError) return "the " + str() + " on this PC";
@@ -364,19 +368,8 @@ std::string FleetClock::trouble_with(const wire::ClockReport* owner, Duration li
          " apart, and " + in_microseconds(limit) + " are allowed (key clock_limit)";
 }
 
-ring::ClockVerdict FleetClock::judge_own(const StreamId& id) const {
-  const clock::ClockDemand demand = policies_.demand_for(id);
-  ring::ClockVerdict verdict = nothing_is_good(demand);
-  const clock::SyncChain own = own_->at(verdict.judged).standing;
-  if (own.bound == kUnknownClockError) return verdict;
-  verdict.added = own.bound;
-  verdict.ageing_ppb = static_cast<std::uint32_t>(own.ageing);
-  if (verdict.added <= demand.limit) verdict.allowed = demand.limit - verdict.added;
-  return verdict;
-}
-
-Error FleetClock::why_not(const StreamId& id, const wire::ClockReport* owner) const {
-  const std::string trouble = trouble_with(owner, policies_.demand_for(id).limit);
+Error FleetClock::refusal(const StreamId& id, const wire::ClockReport* owner) const {
+  const std::string trouble = reason_against(owner, policies_.demand_for(id).limit);
   const std::string why = trouble.empty() ? "its host's clock was not known just now" : trouble;
   return Error{Errc::clock_out_of_bounds,
                "stream '" + id.str() + "': " + why +

@@ -20,11 +20,13 @@
 #include "daemon/clock/clock_watch.hpp"
 #include "daemon/clock/host_clock_log.hpp"
 #include "daemon/fleet/catalog.hpp"
-#include "daemon/fleet/clock_rules.hpp"
+#include "daemon/fleet/clock_assessor.hpp"
 
 namespace dssm::daemon {
 
-class FleetClock final : public ClockRules, private ClockWatch::Observer, private CatalogObserver {
+class FleetClock final : public ClockAssessor,
+                         private ClockWatch::Observer,
+                         private CatalogObserver {
  public:
   // The host that this one follows may be away for so long before those who follow this one take
   // it for their reference.
@@ -46,10 +48,10 @@ class FleetClock final : public ClockRules, private ClockWatch::Observer, privat
   FleetClock& operator=(const FleetClock&) = delete;
   ~FleetClock();
 
-  // Called from the loop when verdicts may have changed, at least once a second; and before it when
-  // there is news for other hosts.
+  // Called from the loop when assessments may have changed, at least once a second; and before that
+  // when the clock has a new generation.
   void on_change(std::function<void()> then) { on_change_ = std::move(then); }
-  void on_news(std::function<void()> then) { on_news_ = std::move(then); }
+  void on_new_generation(std::function<void()> then) { on_new_generation_ = std::move(then); }
 
   void set(const clock::ClockPolicies& policies, clock::PartsPerBillion max_drift);
 
@@ -57,15 +59,20 @@ class FleetClock final : public ClockRules, private ClockWatch::Observer, privat
   // "clock synchronized within 120 us of 'pc1'", for people.
   std::string str() const;
 
-  // ClockRules
-  std::uint64_t news() override;
-  void on_heartbeat() override { watch_.poll_if_due(); }
+  // dssmd is awake: a question to chronyd that is about due is sent now, which saves a wake-up.
+  void poll_if_due() { watch_.poll_if_due(); }
+  // How far that host's clock may be from this one's.
+  Duration distance_to(const wire::ClockReport& other) const;
+  // The shared page for this PC's programs, for reading (core/clock/clock_page.hpp).
+  Result<UniqueFd> page_for_reading() const { return page_.for_reading(); }
+
+  // ClockAssessor
+  std::uint64_t clock_generation() override;
   Result<void> check_serving(const StreamId& id, const wire::Greeting& them) const override;
-  ring::ClockVerdict judge(const StreamId& id, const wire::ClockReport* owner) const override;
-  ring::ClockVerdict judge_own(const StreamId& id) const override;
-  Error why_not(const StreamId& id, const wire::ClockReport* owner) const override;
-  Duration distance_to(const wire::ClockReport& other) const override;
-  Result<UniqueFd> page_for_reading() const override { return page_.for_reading(); }
+  ring::ClockAssessment assess_mirror(const StreamId& id,
+                                      const wire::ClockReport* owner) const override;
+  ring::ClockAssessment assess_own(const StreamId& id) const override;
+  Error refusal(const StreamId& id, const wire::ClockReport* owner) const override;
 
  private:
   // The host whose address chronyd names.
@@ -89,12 +96,14 @@ class FleetClock final : public ClockRules, private ClockWatch::Observer, privat
   const KnownHost* host_at(const SourceAddress& address) const;
   bool is_followed() const;
   void look_up_addresses(MonoTime now);
-  void stand(const clock::ClockState& state, MonoTime now);
+  void update_chain(const clock::ClockState& state, MonoTime now);
   void choose_anchor(const clock::ClockState& state, MonoTime now);
-  void judge_own(const clock::ClockState& state);
+  void update_status(const clock::ClockState& state);
   void publish(const clock::ClockState& state, const clock::Instant& now);
-  void tell_of_others(MonoTime now);
-  std::string trouble_with(const wire::ClockReport* owner, Duration limit) const;
+  void log_others(MonoTime now);
+  ring::ClockAssessment assessment(const StreamId& id, MonoTime now, Duration added,
+                                   clock::PartsPerBillion ageing) const;
+  std::string reason_against(const wire::ClockReport* owner, Duration limit) const;
 
   Catalog& catalog_;
   clock::ClockPageWriter page_;
@@ -106,8 +115,8 @@ class FleetClock final : public ClockRules, private ClockWatch::Observer, privat
   MonoTime addresses_read_{};
   std::deque<Stated> stated_;  // within kReach; all of them bounds
   bool was_in_bounds_ = false;
-  std::uint64_t news_ = 0;
-  std::function<void()> on_change_, on_news_;
+  std::uint64_t generation_ = 0;
+  std::function<void()> on_change_, on_new_generation_;
   HostClockLog log_;
   ClockWatch watch_;  // last: it calls the others
 };

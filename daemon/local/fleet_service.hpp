@@ -17,8 +17,8 @@
 #include <vector>
 
 #include "daemon/base/event_loop.hpp"
+#include "daemon/clock/fleet_clock.hpp"
 #include "daemon/fleet/catalog.hpp"
-#include "daemon/fleet/clock_rules.hpp"
 #include "daemon/fleet/found_host.hpp"
 #include "daemon/fleet/peers.hpp"
 #include "daemon/local/fleet.hpp"
@@ -38,7 +38,7 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
     wire::Greeting greeting;
     std::vector<std::string> addresses;  // that it listens at
     bool insecure = false;               // at one of them other PCs may come in the clear
-    const ClockRules* clock = nullptr;   // nobody watches the clock
+    const FleetClock* clock = nullptr;   // nullptr: the clock is not watched
   };
 
   // What is given by reference outlives it.

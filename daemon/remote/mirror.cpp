@@ -162,16 +162,16 @@ void Mirror::take_ring(std::unique_ptr<MirrorRing> ring) {
   }
   if (ring_) clock_.on_new_ring();
   ring_ = std::move(ring);
-  judge();
+  assess();
 }
 
 void Mirror::on_owner_clock(MirrorClock::Report report) {
   clock_.on_owner(std::move(report), ring_ ? ring_->newest() : kNoTid);
-  judge();
+  assess();
 }
 
-void Mirror::judge() {
-  if (ring_ && clock_.is_heard()) ring_->set_clock(clock_.verdict());
+void Mirror::assess() {
+  if (ring_ && clock_.has_report()) ring_->set_clock(clock_.assessment());
 }
 
 Result<void> Mirror::on_subscribed_untrusted(const net::Subscribed& subscribed) {
@@ -320,7 +320,7 @@ void Mirror::describe(proto::Mirror& out) const {
   out.set_received_samples(before_.received_samples + (ring_ ? ring_->received_samples() : 0));
   out.set_received_bytes(before_.received_bytes + (ring_ ? ring_->received_bytes() : 0));
   if (state_ != State::live && trouble_) out.set_error(trouble_->message);
-  out.set_clock(clock_.trouble());
+  out.set_clock(clock_.reason());
 }
 
 void Mirror::answer_waiting() {

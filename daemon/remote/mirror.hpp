@@ -67,9 +67,9 @@ class Mirror final : private OwnerConnection::Observer, private FrameConnection:
   // The owner has removed the ring of that incarnation. The channel tells so, too, behind the last
   // samples.
   void on_stream_gone(std::uint64_t incarnation);
-  // What the owner says of its clock; this PC's clock was read anew.
+  // The owner reported its clock; this PC's clock was read again.
   void on_owner_clock(MirrorClock::Report report);
-  void on_clock() { judge(); }
+  void on_clock() { assess(); }
 
   // --- for programs
 
@@ -112,7 +112,7 @@ class Mirror final : private OwnerConnection::Observer, private FrameConnection:
   Result<void> follow_untrusted(const StreamInfo& theirs);
   void take_ring(std::unique_ptr<MirrorRing> ring);
 
-  void judge();
+  void assess();
   std::shared_ptr<Stream> lend();
   void lend_to(const Then& then);
   void answer_waiting();

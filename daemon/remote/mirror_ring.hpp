@@ -45,8 +45,8 @@ class MirrorRing {
   //   fails  protocol: they were here already
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
   // What this PC's readers may make of the samples' times.
-  void set_clock(const ring::ClockVerdict& verdict) noexcept {
-    ring::store(mapping_->header().clock, verdict);
+  void set_clock(const ring::ClockAssessment& assessment) noexcept {
+    mapping_->header().clock.store(assessment);
   }
   // Wakes readers, when anything came since the last time.
   void wake() noexcept;

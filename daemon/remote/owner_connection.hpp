@@ -13,7 +13,7 @@
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/fleet/catalog.hpp"
-#include "daemon/fleet/clock_rules.hpp"
+#include "daemon/fleet/clock_assessor.hpp"
 #include "daemon/link/dialer.hpp"
 #include "daemon/link/resolver.hpp"
 #include "daemon/streams/registry.hpp"
@@ -27,7 +27,7 @@ struct ChannelParts {
   Registry& registry;  // for memory and room
   Logger& logger;
   wire::Greeting self;
-  const ClockRules* clock = nullptr;  // nobody watches the clock
+  const ClockAssessor* clock = nullptr;  // nullptr: the clock is not watched
 };
 
 class OwnerConnection final : private Dialer::Observer {

@@ -109,9 +109,9 @@ void ChannelServer::send_clock() {
 void ChannelServer::on_clock() {
   if (!parts_.clock) return;
   for (const std::shared_ptr<Stream>& stream : parts_.registry.streams()) {
-    if (!ring::is_judged(stream->mapping().header().clock)) continue;
-    Result<void> judged = streams_.get(stream)->judge(parts_.clock->judge_own(stream->id()));
-    if (!judged) logger_.warning("judge the times of a stream: " + judged.error().message);
+    if (!stream->mapping().header().clock.is_set()) continue;
+    Result<void> assessed = streams_.get(stream)->assess(parts_.clock->assess_own(stream->id()));
+    if (!assessed) logger_.warning("assess the times of a stream: " + assessed.error().message);
   }
 }
 
@@ -149,7 +149,7 @@ void ChannelServer::on_stream_removed(const Stream& stream) {
 }
 
 void ChannelServer::on_heartbeat() {
-  if (parts_.clock) parts_.clock->on_heartbeat();
+  if (parts_.on_heartbeat) parts_.on_heartbeat();
   const MonoTime now = MonoClock::now();
   if (now - looked_ < kLookPeriod) return;
   looked_ = now;

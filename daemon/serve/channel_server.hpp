@@ -30,7 +30,8 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     Registry& registry;
     const OpenTable& opens;
     Logger& logger;
-    ClockRules* clock = nullptr;  // nobody watches the clock
+    ClockAssessor* clock = nullptr;           // nullptr: the clock is not watched
+    std::function<void()> on_heartbeat = {};  // of another host, about once a second; may be empty
   };
 
   // self: how this dssmd greets. All in `parts` outlive it.
@@ -47,9 +48,9 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   Result<void> adopt(std::unique_ptr<wire::Transport> transport,
                      const wire::SocketAddress& address);
 
-  // There is news of this host's clock.
+  // This host's clock has a new generation: notifies the hosts that are connected.
   void send_clock();
-  // Verdicts on clocks may have changed; at least once a second.
+  // Assessments of clocks may have changed; at least once a second.
   void on_clock();
 
   void set_limits(const PeerTable::Limits& limits) { peers_.set_limits(limits); }

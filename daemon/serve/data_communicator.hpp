@@ -58,7 +58,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     const wire::Greeting& self;
     Logger& logger;
     Observer& observer;
-    ClockRules* clock;  // nullptr: nobody watches the clock
+    ClockAssessor* clock;  // nullptr: the clock is not watched
   };
 
   // peer_address: for the log, "10.0.0.3:40000". All in `parts` outlive it.
@@ -71,7 +71,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   void on_stream_added(const Stream& stream);
   void on_stream_removed(const Stream& stream);
 
-  // There is news of this host's clock: tells control connections that want to know.
+  // This host's clock has a new generation: notifies control connections with the feature.
   void send_clock();
 
   // Tells the peer why, as far as that goes at once.

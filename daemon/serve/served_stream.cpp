@@ -37,13 +37,13 @@ Result<std::shared_ptr<OwnWriter>> ServedStream::writer() {
   return shared(writer_, [this] { return OwnWriter::open(*stream_); });
 }
 
-Result<void> ServedStream::judge(const ring::ClockVerdict& verdict) {
-  if (!judging_) {
+Result<void> ServedStream::assess(const ring::ClockAssessment& assessment) {
+  if (!assessed_) {
     Result<std::shared_ptr<OwnWriter>> writer = this->writer();
     if (!writer) return std::move(writer).error();
-    judging_ = *std::move(writer);
+    assessed_ = *std::move(writer);
   }
-  ring::store(judging_->clock_gate(), verdict);
+  assessed_->set_clock(assessment);
   return {};
 }
 

@@ -9,7 +9,7 @@
 #include <memory>
 
 #include "core/ring/bell.hpp"
-#include "core/ring/clock_gate.hpp"
+#include "core/ring/clock_assessment.hpp"
 #include "core/ring/publisher_cursors.hpp"
 #include "core/ring/ring_writer.hpp"
 #include "daemon/base/event_loop.hpp"
@@ -30,7 +30,9 @@ class OwnWriter {
   ring::PublisherCursors publishers() noexcept {
     return ring::PublisherCursors(mapping_->header());
   }
-  ring::ClockGate& clock_gate() noexcept { return mapping_->header().clock; }
+  void set_clock(const ring::ClockAssessment& assessment) noexcept {
+    mapping_->header().clock.store(assessment);
+  }
 
  private:
   OwnWriter(std::shared_ptr<const ring::RingMapping> mapping, std::shared_ptr<ring::Bell> bell);
@@ -52,9 +54,9 @@ class ServedStream {
   Result<std::shared_ptr<StreamFeed>> feed();
   Result<std::shared_ptr<OwnWriter>> writer();
 
-  // Says in the ring what its times are worth here; once that was said, it has to be said again and
-  // again (ClockVerdict::kHolds), also by the next dssmd. Fails with os errors.
-  Result<void> judge(const ring::ClockVerdict& verdict);
+  // States in the ring what its times are worth here. From then on it has to be stated again within
+  // ClockAssessment::kValidFor, also by the next dssmd. Fails with os errors.
+  Result<void> assess(const ring::ClockAssessment& assessment);
 
   // dssmd wrote to the ring, or a writer may have died before it could ring.
   void look();
@@ -64,7 +66,7 @@ class ServedStream {
   std::shared_ptr<Stream> stream_;
   std::weak_ptr<StreamFeed> feed_;
   std::weak_ptr<OwnWriter> writer_;
-  std::shared_ptr<OwnWriter> judging_;  // once its times are judged
+  std::shared_ptr<OwnWriter> assessed_;  // once its times are assessed
 };
 
 // By stream. An entry is made by the first channel and stays until the stream is removed.

@@ -29,7 +29,7 @@ StreamChannel::StreamChannel(const Parts& parts, std::shared_ptr<ServedStream> s
                              bool may_tear)
     : parts_(parts),
       served_(std::move(served)),
-      tells_clock_(parts.clock && parts.them.has_feature(wire::kFeatureClock)),
+      sends_clock_(parts.clock && parts.them.has_feature(wire::kFeatureClock)),
       reader_(stream().mapping()),
       sender_(stream().mapping(), parts_.link, {may_tear, &parts_.budget}),
       due_(EventSource::timer(parts_.loop, [this] { parts_.observer.work_now(); })) {
@@ -169,13 +169,13 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
 
 [[gnu::hot]] void StreamChannel::on_news() { parts_.observer.work_now(); }
 
-// The clock may have been set, and samples been written after that: what they say of their time
-// must not be believed.
+// The clock may have been set before these samples were written: the client has to know before it
+// gets them.
 [[gnu::hot]] void StreamChannel::before_samples() {
-  if (!tells_clock_) return;
-  const std::uint64_t news = parts_.clock->news();
-  if (clock_news_ == news) return;
-  clock_news_ = news;
+  if (!sends_clock_) return;
+  const std::uint64_t generation = parts_.clock->clock_generation();
+  if (clock_generation_ == generation) return;
+  clock_generation_ = generation;
   sender_.end_run();
   net::Frame frame;
   wire::send_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
@@ -313,7 +313,7 @@ Result<void> StreamChannel::start_publishing(std::uint64_t serial,
       SampleReceiver::open(parts_.loop, parts_.link, parts_.budget, *served_, request.publisher());
   if (!receiver) return std::move(receiver).error();
   receiver_ = *std::move(receiver);
-  if (Result<void> judged = judge_writer(); !judged) return judged;
+  if (Result<void> assessed = assess_writer(); !assessed) return assessed;
   const ring::PublisherCursors::Last last = receiver_->last();
   net::Frame frame = answer_to(serial);
   net::Publishing& publishing = *frame.mutable_publishing();
@@ -342,14 +342,13 @@ void StreamChannel::on_batch_end() {
 
 // --- property
 
-// From the first writer on with another clock than this PC's, readers here look at what the times
-// of the stream are worth.
-Result<void> StreamChannel::judge_writer() {
+// From the first writer with another clock than this PC's on, the ring states what its times are
+// worth.
+Result<void> StreamChannel::assess_writer() {
   if (!parts_.clock) return {};
   const StreamId& id = stream().id();
-  const bool is_this_clock =
-      parts_.clock->judge(id, parts_.them.clock.get()).rule == ring::ClockRule::same_clock;
-  return is_this_clock ? Result<void>() : served_->judge(parts_.clock->judge_own(id));
+  if (parts_.clock->assess_mirror(id, parts_.them.clock.get()).same_clock) return {};
+  return served_->assess(parts_.clock->assess_own(id));
 }
 
 Result<void> StreamChannel::set_property(std::uint64_t serial, const net::SetProperty& request) {

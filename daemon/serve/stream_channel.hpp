@@ -11,7 +11,7 @@
 #include "core/ring/ring_reader.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/memory_budget.hpp"
-#include "daemon/fleet/clock_rules.hpp"
+#include "daemon/fleet/clock_assessor.hpp"
 #include "daemon/link/frame_connection.hpp"
 #include "daemon/link/sample_pump.hpp"
 #include "daemon/link/sample_sender.hpp"
@@ -42,7 +42,7 @@ class StreamChannel final : private SamplePump::Observer,
     Observer& observer;
     const wire::Greeting& self;
     const wire::Greeting& them;
-    ClockRules* clock;  // nullptr: nobody watches it
+    ClockAssessor* clock;  // nullptr: the clock is not watched
   };
 
   // may_tear: the client has the feature "torn". All in `parts` outlive it.
@@ -84,7 +84,7 @@ class StreamChannel final : private SamplePump::Observer,
   Tid first_tid(const net::Subscribe& request) const;
   Result<void> get_range(std::uint64_t serial, const net::GetRange& request);
   Result<void> start_publishing(std::uint64_t serial, const net::StartPublishing& request);
-  Result<void> judge_writer();
+  Result<void> assess_writer();
   Result<void> set_property(std::uint64_t serial, const net::SetProperty& request);
   Result<void> get_property(std::uint64_t serial);
 
@@ -108,7 +108,7 @@ class StreamChannel final : private SamplePump::Observer,
 
   Parts parts_;
   std::shared_ptr<ServedStream> served_;
-  const bool tells_clock_;  // to who is there
+  const bool sends_clock_;  // the client has the feature "clock"
   ring::RingReader reader_;
   SampleSender sender_;
   std::shared_ptr<StreamFeed> feed_;  // while there is a subscription
@@ -116,8 +116,8 @@ class StreamChannel final : private SamplePump::Observer,
   std::unique_ptr<SampleReceiver> receiver_;
   std::optional<Reading> reading_;
   std::uint64_t lost_ = 0;
-  std::optional<std::uint64_t> clock_news_;  // that the client was told
-  EventSource due_;                          // for subscriptions with a highest rate
+  std::optional<std::uint64_t> clock_generation_;  // last sent
+  EventSource due_;                                // for subscriptions with a highest rate
 };
 
 }  // namespace dssm::daemon

@@ -37,8 +37,8 @@ enum class ClockBasis : std::uint8_t {
 // What happens to samples of a clock that is not known well enough.
 enum class ClockPolicy : std::uint8_t {
   enforce,  // streams are not opened, reads by time return clock_out_of_bounds
-  mark,     // all is delivered; whoever asks is told
-  off,      // nobody looks
+  mark,     // all samples are delivered; clock_in_bounds() says which are good
+  off,      // all samples are delivered and count as good
 };
 
 // "synchronized", "out of bounds", "no chronyd", "reference", "enforce" ...; static storage.

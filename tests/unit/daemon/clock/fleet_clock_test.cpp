@@ -61,7 +61,7 @@ class FleetClockTest : public testing::Test {
     fleet.emplace(loop,
                   FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
                   *std::move(page), own, kSelf, catalog, logger);
-    fleet->on_news([this] { ++news; });
+    fleet->on_new_generation([this] { ++news; });
     wait([this] { return own->status != ClockStatus::unknown; });
     return *fleet;
   }
@@ -87,8 +87,8 @@ class FleetClockTest : public testing::Test {
     reference.clock = report;
     catalog.host_up(reference, {"10.0.0.1", 13776});
   }
-  ring::ClockVerdict judged(const wire::Greeting& owner) const {
-    return fleet->judge(lidar, owner.clock.get());
+  ring::ClockAssessment assessed(const wire::Greeting& owner) const {
+    return fleet->assess_mirror(lidar, owner.clock.get());
   }
 
   const StreamId lidar{"lidar", 0, "pc3"};
@@ -122,17 +122,17 @@ TEST_F(FleetClockTest, OnePcThatFollowsNobodyIsItsOwnReference) {
 }
 
 TEST_F(FleetClockTest, OwnStreamsThatOthersWriteToAreAsFarOffAsThisClock) {
-  EXPECT_FALSE(FleetClockTest::start().judge_own(lidar).added == kUnknownClockError);
-  const ring::ClockVerdict known = fleet->judge_own(lidar);
-  EXPECT_EQ(known.rule, ring::ClockRule::enforce);
+  EXPECT_FALSE(FleetClockTest::start().assess_own(lidar).added == kUnknownClockError);
+  const ring::ClockAssessment known = fleet->assess_own(lidar);
+  EXPECT_EQ(known.policy, ClockPolicy::enforce);
   EXPECT_GE(known.added, own->standing.bound);
-  EXPECT_EQ(known.allowed, policies.general.limit - known.added);
+  EXPECT_EQ(known.limit, policies.general.limit - known.added);
   tracking.leap = clock::Tracking::kUnsynchronized;
   wait([this] { return own->standing.bound == kUnknownClockError; });
-  EXPECT_LT(fleet->judge_own(lidar).allowed, 0ns);
+  EXPECT_LT(fleet->assess_own(lidar).limit, 0ns);
   policies.general.policy = ClockPolicy::off;
   fleet->set(policies, 50'000);
-  EXPECT_EQ(fleet->judge_own(lidar).rule, ring::ClockRule::off);
+  EXPECT_EQ(fleet->assess_own(lidar).policy, ClockPolicy::off);
 }
 
 TEST_F(FleetClockTest, OnlyUtcIsLeftWithoutAHostToFollow) {
@@ -159,18 +159,18 @@ TEST_F(FleetClockTest, TheHostAtTheAddressThatChronydFollowsIsTheReference) {
 TEST_F(FleetClockTest, ASampleMayBeAsWrongAsIsLeftOfTheLimit) {
   add_reference();
   start();
-  const ring::ClockVerdict verdict = judged(host(kReference, "pc1", 5us));
-  EXPECT_EQ(verdict.rule, ring::ClockRule::enforce);
-  EXPECT_EQ(verdict.allowed, 1500us - verdict.added);
-  EXPECT_GE(verdict.added, own->standing.bound);
-  EXPECT_LT(verdict.added, own->standing.bound + 200us);
+  const ring::ClockAssessment found = assessed(host(kReference, "pc1", 5us));
+  EXPECT_EQ(found.policy, ClockPolicy::enforce);
+  EXPECT_EQ(found.limit, 1500us - found.added);
+  EXPECT_GE(found.added, own->standing.bound);
+  EXPECT_LT(found.added, own->standing.bound + 200us);
 }
 
 TEST_F(FleetClockTest, NothingIsGoodOfAHostThatFollowsSomebodyElse) {
   add_reference();
   start();
-  EXPECT_LT(judged(host(kOther, "pc3", 5us)).allowed, 0us);
-  const Error why = fleet->why_not(lidar, host(kOther, "pc3", 5us).clock.get());
+  EXPECT_LT(assessed(host(kOther, "pc3", 5us)).limit, 0us);
+  const Error why = fleet->refusal(lidar, host(kOther, "pc3", 5us).clock.get());
   EXPECT_EQ(why.code, Errc::clock_out_of_bounds);
   EXPECT_NE(why.message.find("follow different references"), std::string::npos) << why.message;
 }
@@ -178,8 +178,8 @@ TEST_F(FleetClockTest, NothingIsGoodOfAHostThatFollowsSomebodyElse) {
 TEST_F(FleetClockTest, NothingIsGoodOfAHostWhoseClockIsUnknown) {
   add_reference();
   start();
-  EXPECT_LT(judged(host(kReference, "pc1", kUnknownClockError)).allowed, 0us);
-  EXPECT_LT(fleet->judge(lidar, nullptr).allowed, 0us);
+  EXPECT_LT(assessed(host(kReference, "pc1", kUnknownClockError)).limit, 0us);
+  EXPECT_LT(fleet->assess_mirror(lidar, nullptr).limit, 0us);
 }
 
 TEST_F(FleetClockTest, AHostWithThisKernelHasThisClock) {
@@ -192,7 +192,7 @@ TEST_F(FleetClockTest, AHostWithThisKernelHasThisClock) {
                 *std::move(page), own, kSelf, catalog, logger);
   wire::ClockReport same;
   same.standing.boot_id = clock::boot_id();
-  EXPECT_EQ(fleet->judge(lidar, &same).rule, ring::ClockRule::same_clock);
+  EXPECT_TRUE(fleet->assess_mirror(lidar, &same).same_clock);
   EXPECT_EQ(fleet->distance_to(same), 0us);
 }
 
@@ -202,11 +202,13 @@ TEST_F(FleetClockTest, PoliciesDecide) {
   add_reference();
   start();
   const wire::Greeting owner = host(kReference, "pc1", 5us);
-  EXPECT_EQ(judged(owner).rule, ring::ClockRule::off);
-  EXPECT_EQ(fleet->judge({"odometry", 0, "pc1"}, owner.clock.get()).rule, ring::ClockRule::mark);
-  const ring::ClockVerdict camera = fleet->judge({"camera", 1, "pc1"}, owner.clock.get());
-  EXPECT_EQ(camera.rule, ring::ClockRule::enforce);
-  EXPECT_EQ(camera.allowed, 5ms - camera.added);
+  EXPECT_EQ(assessed(owner).policy, ClockPolicy::off);
+  EXPECT_EQ(fleet->assess_mirror({"odometry", 0, "pc1"}, owner.clock.get()).policy,
+            ClockPolicy::mark);
+  const ring::ClockAssessment camera =
+      fleet->assess_mirror({"camera", 1, "pc1"}, owner.clock.get());
+  EXPECT_EQ(camera.policy, ClockPolicy::enforce);
+  EXPECT_EQ(camera.limit, 5ms - camera.added);
 }
 
 TEST_F(FleetClockTest, ServesOthersFromWhenTheClockWasFirstKnown) {

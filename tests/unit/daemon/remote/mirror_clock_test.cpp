@@ -3,7 +3,7 @@
 
 #include <gtest/gtest.h>
 
-#include "tests/unit/daemon/remote/fake_clock_rules.hpp"
+#include "tests/unit/daemon/remote/fake_clock_assessor.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -19,95 +19,95 @@ MirrorClock::Report report(Duration bound, std::uint8_t anchor = 1) {
 
 class MirrorClockTest : public testing::Test {
  protected:
-  bool is_doubtful(Tid tid) const {
-    const ring::ClockVerdict verdict = clock.verdict();
-    return tid >= verdict.doubtful_first && tid <= verdict.doubtful_last;
+  bool is_suspect(Tid tid) const {
+    const ring::ClockAssessment now = clock.assessment();
+    return tid >= now.suspect_first && tid <= now.suspect_last;
   }
 
   const StreamId id{"lidar", 0, "pc2"};
-  FakeClockRules rules;
-  MirrorClock clock{&rules, id};
+  FakeClockAssessor assessor;
+  MirrorClock clock{&assessor, id};
 };
 
-TEST_F(MirrorClockTest, WithoutRulesNobodyJudges) {
+TEST_F(MirrorClockTest, WithoutAnAssessorAllTimesAreGood) {
   const MirrorClock free(nullptr, id);
-  EXPECT_EQ(free.verdict().rule, ring::ClockRule::none);
+  EXPECT_TRUE(free.assessment().same_clock);
   EXPECT_TRUE(free.check_opening());
-  EXPECT_EQ(free.trouble(), "");
+  EXPECT_EQ(free.reason(), "");
 }
 
 TEST_F(MirrorClockTest, AStreamIsOpenedWhenSomethingIsAllowed) {
   clock.on_owner(report(1ms), kNoTid);
   EXPECT_TRUE(clock.check_opening());
-  EXPECT_EQ(clock.trouble(), "");
+  EXPECT_EQ(clock.reason(), "");
   clock.on_owner(report(1ms + 1ns), kNoTid);
   const Result<void> refused = clock.check_opening();
   ASSERT_FALSE(refused);
   EXPECT_EQ(refused.error().code, Errc::clock_out_of_bounds);
-  EXPECT_EQ(clock.trouble(), "not 'lidar:0@pc2'");
+  EXPECT_EQ(clock.reason(), "not 'lidar:0@pc2'");
 }
 
-TEST_F(MirrorClockTest, AStreamIsOpenedUntilItsOwnerWasHeardOf) {
-  EXPECT_FALSE(clock.is_heard());
+TEST_F(MirrorClockTest, AStreamIsOpenedUntilItsOwnerReports) {
+  EXPECT_FALSE(clock.has_report());
   EXPECT_TRUE(clock.check_opening());
-  clock.on_owner(nullptr, kNoTid);  // a dssmd that says nothing of its clock
-  EXPECT_TRUE(clock.is_heard());
+  clock.on_owner(nullptr, kNoTid);  // a dssmd that reports nothing of its clock
+  EXPECT_TRUE(clock.has_report());
   EXPECT_FALSE(clock.check_opening());
 }
 
-TEST_F(MirrorClockTest, MarkedStreamsAreOpenedAndTold) {
-  rules.rule = ring::ClockRule::mark;
+TEST_F(MirrorClockTest, MarkedStreamsAreOpenedAndHaveAReason) {
+  assessor.policy = ClockPolicy::mark;
   clock.on_owner(report(2ms), kNoTid);
   EXPECT_TRUE(clock.check_opening());
-  EXPECT_EQ(clock.trouble(), "not 'lidar:0@pc2'");
+  EXPECT_EQ(clock.reason(), "not 'lidar:0@pc2'");
 }
 
-TEST_F(MirrorClockTest, SamplesThatComeWhileTheOwnersClockIsUnknownStayDoubtful) {
+TEST_F(MirrorClockTest, SamplesThatComeWhileTheOwnersClockIsUnknownStaySuspect) {
   clock.on_owner(report(1us), 9);
-  EXPECT_FALSE(is_doubtful(9));
+  EXPECT_FALSE(is_suspect(9));
   clock.on_owner(report(kUnknownClockError), 9);  // it was set
-  EXPECT_FALSE(is_doubtful(9));
-  EXPECT_TRUE(is_doubtful(10));
+  EXPECT_FALSE(is_suspect(9));
+  EXPECT_TRUE(is_suspect(10));
   clock.on_owner(report(kUnknownClockError), 15);
-  EXPECT_TRUE(is_doubtful(10)) << "from the first one on";
+  EXPECT_TRUE(is_suspect(10)) << "from the first one on";
   clock.on_owner(report(1us), 20);
-  EXPECT_FALSE(is_doubtful(9));
-  EXPECT_TRUE(is_doubtful(10));
-  EXPECT_TRUE(is_doubtful(20));
-  EXPECT_FALSE(is_doubtful(21));
+  EXPECT_FALSE(is_suspect(9));
+  EXPECT_TRUE(is_suspect(10));
+  EXPECT_TRUE(is_suspect(20));
+  EXPECT_FALSE(is_suspect(21));
 }
 
-TEST_F(MirrorClockTest, WhatWasDoubtfulOnceStaysSoWhenTheClockIsSetAgain) {
+TEST_F(MirrorClockTest, WhatWasSuspectOnceStaysSoWhenTheClockIsSetAgain) {
   clock.on_owner(report(1us), 9);
   for (const Tid newest : {10, 20}) {
     clock.on_owner(report(kUnknownClockError), newest);
     clock.on_owner(report(1us), newest + 5);
   }
-  EXPECT_FALSE(is_doubtful(10));
-  EXPECT_TRUE(is_doubtful(11));
-  EXPECT_TRUE(is_doubtful(25));
-  EXPECT_FALSE(is_doubtful(26));
+  EXPECT_FALSE(is_suspect(10));
+  EXPECT_TRUE(is_suspect(11));
+  EXPECT_TRUE(is_suspect(25));
+  EXPECT_FALSE(is_suspect(26));
 }
 
-TEST_F(MirrorClockTest, WhatWasStampedAgainstAnotherReferenceIsDoubtful) {
+TEST_F(MirrorClockTest, WhatWasStampedAgainstAnotherReferenceIsSuspect) {
   clock.on_owner(report(1us, 1), 9);
   clock.on_owner(report(1us, 2), 12);
-  EXPECT_TRUE(is_doubtful(0));
-  EXPECT_TRUE(is_doubtful(12));
-  EXPECT_FALSE(is_doubtful(13));
+  EXPECT_TRUE(is_suspect(0));
+  EXPECT_TRUE(is_suspect(12));
+  EXPECT_FALSE(is_suspect(13));
 }
 
-TEST_F(MirrorClockTest, ANewRingHasNoDoubtfulSamples) {
+TEST_F(MirrorClockTest, ANewRingHasNoSuspectSamples) {
   clock.on_owner(report(1us, 1), 9);
   clock.on_owner(report(1us, 2), 12);
   clock.on_new_ring();
-  EXPECT_FALSE(is_doubtful(0));
+  EXPECT_FALSE(is_suspect(0));
 }
 
-TEST_F(MirrorClockTest, ANewRingOfAnUnknownClockIsAllDoubtful) {
+TEST_F(MirrorClockTest, ANewRingOfAnUnknownClockIsAllSuspect) {
   clock.on_owner(report(kUnknownClockError), 9);
   clock.on_new_ring();
-  EXPECT_TRUE(is_doubtful(0));
+  EXPECT_TRUE(is_suspect(0));
 }
 
 }  // namespace

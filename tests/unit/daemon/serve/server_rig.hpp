@@ -66,7 +66,7 @@ inline net::Frame sample_read(std::uint64_t serial, Tid tid) {
 class ServerRig {
  public:
   explicit ServerRig(const PeerTable::Limits& limits = {16, 8, 32U << 20},
-                     ClockRules* clock = nullptr)
+                     ClockAssessor* clock = nullptr)
       : server({loop, registry, opens, logger, clock}, greeting_of("dssmd", "pc1"), limits) {}
 
   // Connects; without `greet` it says nothing. The peer outlives the rig's use of it.

@@ -7,7 +7,7 @@
 #include <thread>
 
 #include "core/wire/sample_frame.hpp"
-#include "tests/unit/daemon/remote/fake_clock_rules.hpp"
+#include "tests/unit/daemon/remote/fake_clock_assessor.hpp"
 #include "tests/unit/daemon/serve/server_rig.hpp"
 
 namespace dssm::daemon {
@@ -517,31 +517,32 @@ class WriterOfAnotherClock : public testing::Test {
     frame.mutable_start_publishing()->set_publisher(11);
     EXPECT_TRUE(rig.ask(peer, frame).has_publishing());
   }
-  ring::ClockVerdict verdict() const { return ring::load(stream->mapping().header().clock); }
+  ring::ClockAssessment stated() const { return ring::RingReader(stream->mapping()).clock(); }
 
-  FakeClockRules rules;
-  ServerRig rig{{16, 8, 32U << 20}, &rules};
+  FakeClockAssessor assessor;
+  ServerRig rig{{16, 8, 32U << 20}, &assessor};
   FakePeer peer;
   std::shared_ptr<Stream> stream = rig.create("far");
 };
 
-TEST_F(WriterOfAnotherClock, HasTheStreamsTimesJudgedFromThenOn) {
-  rules.own_bound = std::chrono::microseconds(100);
+TEST_F(WriterOfAnotherClock, HasTheStreamsTimesAssessedFromThenOn) {
+  assessor.own_bound = std::chrono::microseconds(100);
   rig.server.on_clock();
-  EXPECT_EQ(verdict().rule, ring::ClockRule::none) << "nobody else writes to it yet";
+  EXPECT_TRUE(stated().same_clock) << "only this PC writes to it yet";
   start_publishing();
-  EXPECT_EQ(verdict().rule, ring::ClockRule::enforce);
-  EXPECT_EQ(verdict().added, rules.own_bound);
-  rules.own_bound = std::chrono::microseconds(300);
+  EXPECT_FALSE(stated().same_clock);
+  EXPECT_EQ(stated().policy, ClockPolicy::enforce);
+  EXPECT_EQ(stated().added, assessor.own_bound);
+  assessor.own_bound = std::chrono::microseconds(300);
   rig.server.on_clock();
-  EXPECT_EQ(verdict().added, rules.own_bound);
+  EXPECT_EQ(stated().added, assessor.own_bound);
 }
 
 TEST_F(WriterOfAnotherClock, IsNoneWhenItsKernelIsThisOne) {
-  rules.rule = ring::ClockRule::same_clock;
+  assessor.same_clock = true;
   start_publishing();
   rig.server.on_clock();
-  EXPECT_EQ(verdict().rule, ring::ClockRule::none);
+  EXPECT_FALSE(stream->mapping().header().clock.is_set());
 }
 
 }  // namespace

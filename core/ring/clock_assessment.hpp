@@ -1,0 +1,58 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What this PC's dssmd states about the times in a mirror, or in an own stream that other hosts
+// write to: how far they may be from this PC's clock, and which of them reads by time may deliver.
+// It is in the ring's header, where readers find it with each read by time. dssmd stores it again
+// about once a second. docs/clocks.md "Assessing another host's samples".
+//
+// In a ring that only this PC writes to nothing is stored; it is read as a ClockAssessment().
+#pragma once
+
+#include <cstdint>
+#include <dssm/clock_status.hpp>
+#include <dssm/sample.hpp>
+#include <dssm/time.hpp>
+
+namespace dssm::ring {
+
+//   off size field          unit  (docs/ring-layout.md "Clock")
+//     0    1 policy         -     dssm::ClockPolicy; without effect where same_clock is not 0
+//     1    1 same_clock     -     not 0: stamped by this PC's own clock
+//     2    2 reserved       -     zero
+//     4    4 ageing_ppb     ns/s  what `added` grows by
+//     8    8 added          ns    to a sample's clock error: its distance from this PC's clock
+//    16    8 limit          ns    clock error up to which a sample is good; below 0: none is
+//    24    8 assessed       ns    CLOCK_MONOTONIC, when this was stated
+//    32   16 suspect_first, suspect_last  tids of the samples whose times cannot be trusted,
+//                                 because the writer's clock was being set
+struct ClockAssessment {
+  ClockPolicy policy = ClockPolicy::off;
+  std::uint8_t same_clock = 1;
+  std::uint16_t reserved = 0;
+  std::uint32_t ageing_ppb = 0;
+  Duration added{};
+  Duration limit = kUnknownClockError;
+  MonoTime assessed{};
+  Tid suspect_first = 0;
+  Tid suspect_last = kNoTid;
+
+  // An older assessment counts as unknown: dssmd states one a second, and restarts in less.
+  static constexpr Duration kValidFor = std::chrono::seconds(3);
+
+  // Another clock, of which nothing is known: no sample is good, unless `policy` is off.
+  static ClockAssessment unknown_clock(ClockPolicy policy) noexcept;
+
+  // How far the sample's time may be from this PC's clock.
+  Duration distance(const SampleInfo& info, MonoTime now) const noexcept;
+  // Whether it is good. A time of a foreign clock is, unless this PC's own clock was being set at
+  // that time: then it is not known which clock it was.
+  bool is_good(const SampleInfo& info, MonoTime now) const noexcept;
+
+ private:
+  bool is_suspect(const SampleInfo& info) const noexcept;
+  bool is_trusted(const SampleInfo& info, MonoTime now) const noexcept;
+  Duration grown_by(MonoTime now) const noexcept;
+};
+static_assert(sizeof(ClockAssessment) == 48);
+
+}  // namespace dssm::ring

@@ -1,0 +1,37 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Has a limit of 1 ms, and knows no distance but the bound that is stated.
+#pragma once
+
+#include "daemon/fleet/clock_assessor.hpp"
+
+namespace dssm::daemon {
+
+class FakeClockAssessor final : public ClockAssessor {
+ public:
+  std::uint64_t clock_generation() override { return 0; }
+  Result<void> check_serving(const StreamId&, const wire::Greeting&) const override { return {}; }
+  ring::ClockAssessment assess_mirror(const StreamId&,
+                                      const wire::ClockReport* owner) const override {
+    if (same_clock) return {};
+    ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(policy);
+    if (owner) assessment.limit = std::chrono::milliseconds(1) - owner->standing.bound;
+    return assessment;
+  }
+  ring::ClockAssessment assess_own(const StreamId&) const override {
+    ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(policy);
+    assessment.added = own_bound;
+    assessment.limit = std::chrono::milliseconds(1) - own_bound;
+    assessment.assessed = MonoClock::now();
+    return assessment;
+  }
+  Error refusal(const StreamId& id, const wire::ClockReport*) const override {
+    return {Errc::clock_out_of_bounds, "not '" + id.str() + "'"};
+  }
+
+  ClockPolicy policy = ClockPolicy::enforce;
+  bool same_clock = false;
+  Duration own_bound{};
+};
+
+}  // namespace dssm::daemon
