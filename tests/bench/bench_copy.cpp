@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Writing and reading samples of several sizes through the public API, beside clock_gettime for
-// small ones and memcpy of the same size between the same buffers for large ones.
+// Writing and reading samples of several sizes with the public API, compared with clock_gettime for
+// small ones, and with memcpy of the same size between the same buffers for large ones.
 #include <cstdlib>
 #include <cstring>
 #include <dssm/dssm.hpp>
@@ -52,14 +52,14 @@ void small(Session& session) {
   print_pair("clock_gettime", "read newest 64 B", measure(2000, 1000, raw_clock, read), "<= 1.2");
 }
 
-// What it costs to let libdssm state the clock's error: writing with and without, and the look at
-// the page alone, which has a bound here, as where there is a chronyd.
+// The cost of the clock error that libdssm adds: writing with and without it, and reading the clock
+// page, which contains a bound here, as with a chronyd.
 void stamped(Session& session) {
   Stream stream = make_stream(session, "stamped", 64, 1000);
   std::byte payload[64] = {};
   Time now;
   int writes = 0;
-  // A clock read in each write would hide what is measured.
+  // Reading the clock in each write would hide the difference.
   const auto recently = [&] {
     if (writes++ % 1000 == 0) now = WallClock::now();
     return now;
@@ -87,14 +87,14 @@ void stamped(Session& session) {
       if (!cache.find(&page.page(), t += 1ns, error)) std::abort();
       keep(error);
     };
-    print_pair("nothing", "look at the clock page", measure(2000, 1000, nothing, look),
+    print_pair("nothing", "read the clock page", measure(2000, 1000, nothing, look),
                "at most 5 ns more");
   }
   std::filesystem::remove_all(folder);
 }
 
-// memcpy goes between the same buffers: the caller's and the ring's own slots, in the order of
-// writing and half a lap apart, so that neither warms the caches for the other.
+// memcpy uses the same buffers: the caller's and the ring's slots, in the order of writing and half a
+// lap apart, so that neither fills the caches for the other.
 void large(Session& session, std::uint64_t bytes, std::uint64_t depth, int batches) {
   const std::string size = std::to_string(bytes / 1024) + " KiB";
   Stream stream = make_stream(session, ("large" + std::to_string(bytes)).c_str(), bytes, depth);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Eight hosts with 128 streams each, with nothing configured and Avahi's stock limits: how long
-// after the last start every host knows every stream, and what it costs to keep it so.
+// Eight hosts with 128 streams each, without configuration and with Avahi's default limits: the time
+// from the last start until every host knows every stream, and the cost afterwards.
 #include <cinttypes>
 #include <dssm/dssm.hpp>
 #include <fstream>
@@ -19,8 +19,8 @@ namespace {
 
 constexpr int kHosts = 8, kStreamsPerHost = 128, kSeconds = 30;
 
-// The first number behind `word` in a file of /proc.
-std::int64_t number_behind(const std::string& path, const std::string& word) {
+// The first number after `word` in a file of /proc.
+std::int64_t number_after(const std::string& path, const std::string& word) {
   std::ifstream file(path);
   for (std::string next; file >> next;) {
     std::int64_t number = 0;
@@ -29,7 +29,7 @@ std::int64_t number_behind(const std::string& path, const std::string& word) {
   fail(path.c_str());
 }
 
-// Packets that went out to multicast addresses: IPv4's second line of IpExt has the values.
+// Packets sent to multicast addresses; for IPv4, the second line of IpExt has the values.
 std::int64_t multicast_packets(test::MdnsVehicle& vehicle, int pc) {
   const test::Inside inside = vehicle.avahi(pc).inside();
   std::ifstream file("/proc/thread-self/net/netstat");
@@ -49,7 +49,7 @@ std::int64_t multicast_packets(test::MdnsVehicle& vehicle, int pc) {
     for (std::size_t i = 0; i < names.size() && i < words.size(); ++i) {
       if (names[i] == "OutMcastPkts") {
         return std::stoll(words[i]) +
-               number_behind("/proc/thread-self/net/snmp6", "Ip6OutMcastPkts");
+               number_after("/proc/thread-self/net/snmp6", "Ip6OutMcastPkts");
       }
     }
   }
@@ -115,7 +115,7 @@ int main() {
     const pid_t pid = vehicle.dssmd(pc).pid();
     cpu += cpu_ns(pid);
     most_kib =
-        std::max(most_kib, number_behind("/proc/" + std::to_string(pid) + "/status", "VmRSS:"));
+        std::max(most_kib, number_after("/proc/" + std::to_string(pid) + "/status", "VmRSS:"));
   }
   std::printf("  multicast packets a second, of one host        %6.2f\n",
               static_cast<double>(packets) / kHosts / kSeconds);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// From one process to another: waking a sleeper 1,000 times a second, beside a bare futex; and
-// handing a sample to a reader that spins, beside a bare cache line.
+// From one process to another: waking a sleeping reader 1,000 times a second, compared with a bare
+// futex; and passing a sample to a spinning reader, compared with a bare cache line.
 #include <linux/futex.h>
 #include <sched.h>
 #include <sys/mman.h>
@@ -40,7 +40,8 @@ void pin(int cpu) {
   cpu_set_t set;
   CPU_ZERO(&set);
   CPU_SET(static_cast<unsigned>(cpu), &set);
-  ::sched_setaffinity(0, sizeof set, &set);  // without it, or with one core only, just noisier
+  ::sched_setaffinity(0, sizeof set,
+                      &set);  // without affinity, or with one core, results are only noisier
 }
 
 long futex(std::atomic<std::uint32_t>& word, int operation, std::uint32_t value) {
@@ -52,7 +53,7 @@ struct Ball {
   std::byte rest[56];
 };
 
-// The child: sleeps for the raw futex and for the stream by turns, then plays the ball back.
+// The child: waits for the raw futex and for the stream in turns, then returns the ball.
 [[noreturn]] void child(Shared& shared, const std::string& socket) {
   ::prctl(PR_SET_PDEATHSIG, SIGKILL);
   pin(1);
@@ -105,7 +106,7 @@ int main() {
   Ball ball{};
   SampleInfo info;
   MonoTime next = MonoClock::now() + 100ms;
-  for (int i = 0; i < kWakes; ++i) {  // 500 us apart: each kind comes 1,000 times a second
+  for (int i = 0; i < kWakes; ++i) {  // 500 us apart: each kind occurs 1,000 times a second
     sleep_until(next += 500us);
     shared->sent_ns = now_ns();
     shared->word.fetch_add(1);

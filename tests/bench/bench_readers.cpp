@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What readers cost a writer: alone, with 1 and with 32 reading processes, and with one of them
-// stopped in the middle by SIGSTOP. Readers read the newest sample 1,000 times a second each, on
-// the other core. The raw limit is the writer alone, measured in the same run right before and
-// after.
+// The cost of readers for a writer: alone, with 1 and with 32 reading processes, and with one of them
+// stopped by SIGSTOP. Each reader reads the newest sample 1,000 times a second, on the other core. The
+// raw limit is the writer alone, measured in the same run right before and after.
 #include <sched.h>
 #include <sys/prctl.h>
 #include <sys/wait.h>
@@ -46,7 +45,7 @@ pid_t start_reader(const std::string& socket) {
   }
 }
 
-// Until dssmd counts `wanted` readers.
+// Waits until dssmd counts `wanted` readers.
 void await_readers(Session& session, std::uint32_t wanted) {
   while (session.info(StreamId{"busy", 0, ""}).value().readers != wanted) ::usleep(1000);
 }

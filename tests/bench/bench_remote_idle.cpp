@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// 100 streams read on another host, nobody writing: how often the two dssmd wake up, beside the
-// heartbeats of one control connection, which are all that may wake them.
+// 100 streams that are read on another host and not written: how often the two dssmd wake up, compared
+// with the heartbeats of one control connection, which are the only allowed reason.
 #include <dssm/dssm.hpp>
 #include <fstream>
 #include <string>
@@ -15,7 +15,7 @@ using namespace std::chrono_literals;
 
 namespace {
 
-// How often the process went to sleep: each wake-up ends with it.
+// How often the process went to sleep, which is the number of its wake-ups.
 std::int64_t sleeps(pid_t pid) {
   std::ifstream status("/proc/" + std::to_string(pid) + "/status");
   for (std::string word; status >> word;) {

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Reading across hosts: a PConnector's question by time beside a bare TCP ping-pong of the same
-// sizes; a mirror by time beside the owner's ring; and what remote readers cost the writer, beside
-// one write to an eventfd.
+// Reading across hosts: a PConnector's read by time compared with a bare TCP ping-pong of the same
+// sizes; reading a mirror by time compared with the owner's ring; and the cost of remote readers for
+// the writer, compared with one write to an eventfd.
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
 
@@ -34,8 +34,8 @@ void bench_questions(const Hosts& hosts, const std::string& address, Session& se
   const auto [server, client] = hosts.tcp_pair();
   const int echo = server;
   const pid_t pid = in_child([&] {
-    // From as many places as the ring's, in the same order: that one answer stays in the cache
-    // would be no limit of the machine's.
+    // From as many buffers as the ring has slots, in the same order: with a single buffer, the raw
+    // limit would profit from the cache.
     std::vector<std::byte> question(kQuestionBytes), answers(kAnswers * bytes, std::byte{1});
     for (std::size_t at = 0;; at = (at + kStride) % kAnswers) {
       receive_all(echo, question.data(), question.size());
@@ -85,7 +85,7 @@ void bench_mirror(Session& owner, Session& other) {
     const auto t = static_cast<std::int64_t>(random() % (kDepth - 2)) + kDepth + 1;
     if (reader.at(time_from_ns(1'000'000 * t), payload, info) != ReadStatus::ok) fail("at");
   };
-  // Each page of the two rings costs its first reader a fault.
+  // The first access to each page of the two rings causes a page fault.
   for (int i = 0; i < 20 * kDepth; ++i) read(here), read(there);
   const Pair pair = measure(
       20'000, 200, [&] { read(here); }, [&] { read(there); });
@@ -93,8 +93,8 @@ void bench_mirror(Session& owner, Session& other) {
   std::printf("%-44s %47.2f  %s\n", "  ratio of the p99", pair.ours.p99 / pair.raw.p99, "<= 1.2");
 }
 
-// What a write costs more while eight readers elsewhere are subscribed, in units of one write to an
-// eventfd behind which a bare process does the same: sends 64 B to eight others.
+// The additional cost of a write with eight remote subscribers, in units of one write to an eventfd
+// that makes a bare process send 64 B to eight others.
 void bench_writer(const Hosts& hosts, const std::string& address, const std::string& socket_path,
                   Session& session) {
   constexpr int kReaders = 8, kRounds = 60, kWrites = 100;
@@ -126,7 +126,7 @@ void bench_writer(const Hosts& hosts, const std::string& address, const std::str
   const std::vector<std::byte> payload(64);
   near.write(payload, WallClock::now());
   auto& ready = shared<std::atomic<int>>();
-  // A reader that never sleeps in the ring costs the writer no call, but its caches: as dssmd does.
+  // A reader that never waits costs the writer no system call, only cache misses, like dssmd.
   const pid_t local = in_child([&] {
     RawReader reader = Session::connect({.socket_path = socket_path})
                            .value()
@@ -174,7 +174,7 @@ void bench_writer(const Hosts& hosts, const std::string& address, const std::str
   for (int round = 0; round < kRounds; ++round) {
     paced(bare_ns, ring, [] {});
     ::kill(local, SIGCONT);
-    // Eight processes run between two writes in all three: they cool the writer's caches.
+    // In all three cases eight processes run between two writes and use the writer's caches.
     paced(
         near_ns, [&] { near.write(payload, WallClock::now()); }, ring);
     ::kill(local, SIGSTOP);
@@ -189,7 +189,7 @@ void bench_writer(const Hosts& hosts, const std::string& address, const std::str
   const Figures doorbell = figures_of(bare_ns), with_local = figures_of(near_ns),
                 with = figures_of(far_ns);
   print_row("  write an eventfd, 64 B sent to 8 processes", doorbell);
-  print_row("  write 64 B, a local reader looks at it", with_local);
+  print_row("  write 64 B, a local reader polls", with_local);
   char rest[80];
   std::snprintf(rest, sizeof rest, "%7.2f  <= 1 more",
                 (with.median - with_local.median) / doorbell.median);

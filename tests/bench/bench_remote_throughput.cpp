@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// How much one channel carries: large samples beside raw TCP with writes of the same size, and how
-// many small ones; how often a payload is copied on the way.
+// The throughput of one channel: large samples compared with raw TCP with writes of the same size, and
+// the rate of small samples; and how often a payload is copied on the way.
 //
-// The samples stand in the owner's ring before the clock starts, and the reader takes all of them
-// into one piece of memory: sending and receiving is all that is measured, on both sides. The raw
-// sender's memory is as large as the ring, so that neither side works out of the cache alone.
+// The samples are in the owner's ring before the clock starts, and the reader reads all of them into
+// one buffer, so only sending and receiving is measured. The raw sender's memory is as large as the
+// ring, so that neither side works only in the cache.
 //
-// Raw TCP is measured twice: as one would write it, which is what the target is about, and as fast
-// as bare processes can be made.
+// Raw TCP is measured twice: in a straightforward way, to which the target refers, and as fast as bare
+// processes can be made.
 #include <fcntl.h>
 #include <sys/mman.h>
 
@@ -31,7 +31,7 @@ namespace {
 constexpr int kRounds = 7;
 constexpr std::uint64_t kPostedDepth = 32;
 
-// Memory like a ring's, in pages of the same size.
+// Memory with pages of the same size as a ring's.
 class SharedMemory {
  public:
   explicit SharedMemory(std::size_t size) : bytes_(size) {
@@ -48,7 +48,7 @@ class SharedMemory {
   const std::byte* data() const { return data_; }
   std::size_t bytes() const { return bytes_; }
 
-  // So that a process that has just got it has no page faults later.
+  // So that a new process has no page faults later.
   void touch() const {
     for (std::size_t at = 0; at < bytes_; at += 4096) {
       static_cast<void>(*static_cast<const volatile std::byte*>(data_ + at));
@@ -62,7 +62,7 @@ class SharedMemory {
 
 struct RawWay {
   std::size_t write_bytes;
-  int receive_flags;  // as receive_all()
+  int receive_flags;  // of receive_all()
 };
 
 double raw_bytes_per_s(const Hosts& hosts, const SharedMemory& all, std::size_t bytes,
@@ -90,7 +90,7 @@ double raw_bytes_per_s(const Hosts& hosts, const SharedMemory& all, std::size_t 
   return static_cast<double>(all.bytes()) * 1e9 / took;
 }
 
-// Takes `count` samples by a subscription; the time that took.
+// Reads `count` samples by a subscription; returns the duration.
 double drain_ns(PConnector& connector, std::size_t bytes, std::size_t count) {
   std::vector<std::byte> one(bytes);
   SampleInfo info;
@@ -108,7 +108,7 @@ double drain_ns(PConnector& connector, std::size_t bytes, std::size_t count) {
   return took;
 }
 
-// Posts `count` samples and waits until they are written; the time that took.
+// Posts `count` samples and waits until they are written; returns the duration.
 double post_ns(PConnector& connector, const std::vector<std::byte>& one, std::size_t count) {
   const std::int64_t start = now_ns();
   for (std::size_t i = 0; i < count; ++i) {
@@ -197,17 +197,18 @@ void bench_small(const Hosts& hosts, const std::string& address, Session& sessio
   session.remove(id).value();
 }
 
-// It decides on how much of the time a sender may send, and so on all that is measured here.
+// Congestion control decides when a sender may send, and so affects all figures here.
 void print_congestion_control(const Hosts& hosts) {
   char name[16]{};
   socklen_t length = sizeof name;
   const auto [out, in] = hosts.tcp_pair();
-  if (::getsockopt(out, IPPROTO_TCP, TCP_CONGESTION, name, &length)) fail("look at TCP");
+  if (::getsockopt(out, IPPROTO_TCP, TCP_CONGESTION, name, &length))
+    fail("read the congestion control");
   ::close(out), ::close(in);
   std::printf("TCP's congestion control is '%s'\n", name);
 }
 
-// What the owner's dssmd says at the end of a channel about the payloads that it sent.
+// Parses what the owner's dssmd logs at the end of a channel about sent payloads.
 void count_copies(const Hosts& hosts, std::size_t bytes, std::size_t count) {
   const int log = ::memfd_create("log", MFD_CLOEXEC), screen = ::fcntl(2, F_DUPFD_CLOEXEC, 3);
   if (log < 0 || screen < 0 || ::dup2(log, 2) < 0) fail("catch the log");
@@ -229,7 +230,7 @@ void count_copies(const Hosts& hosts, std::size_t bytes, std::size_t count) {
     std::uint64_t copied = 0, in_place = 0;
     if (std::sscanf(said.c_str() + at, " samples sent (%" SCNu64 " payload bytes copied, %" SCNu64,
                     &copied, &in_place) != 2) {
-      fail("understand dssmd's log");
+      fail("parse dssmd's log");
     }
     std::printf("%-44s %9.3f\n", "  user-space copies of a payload, sender",
                 static_cast<double>(copied) / static_cast<double>(copied + in_place));

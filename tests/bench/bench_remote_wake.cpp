@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// From a writer on one host to a reader that sleeps on another, 1,000 times a second: how long it
-// takes, and how much CPU time of all processes together. Beside it, in turns, a chain of bare
-// processes with the same hops: eventfd wake, TCP one way, futex wake.
+// From a writer on one host to a sleeping reader on another, 1,000 times a second: the latency, and the
+// CPU time of all processes together. It alternates with a chain of bare processes with the same hops:
+// eventfd wake, TCP one way, futex wake.
 #include <sys/eventfd.h>
 
 #include <cstring>
@@ -20,19 +20,19 @@ using namespace std::chrono_literals;
 namespace {
 
 constexpr int kSamples =
-    100;  // of one round: many, since the scheduler places processes anew in each
+    100;  // of one round; many rounds, since the scheduler places processes differently in each
 constexpr int kRounds = 60;
 constexpr std::size_t kMaxPayloadBytes = 1024;
 
 enum class Kind { raw_mirror, our_mirror, raw_connector, our_connector, count };
 constexpr auto kKinds = static_cast<std::size_t>(Kind::count);
 
-// What one kind of chain shares.
+// Shared memory of one chain.
 struct alignas(64) Chain {
   alignas(64) std::atomic<std::uint32_t> word{0};  // raw: the futex of the last hop
   alignas(64) std::atomic<std::uint32_t> arrived{0};
-  alignas(64) std::byte here[kMaxPayloadBytes];   // raw: stands for the owner's ring
-  alignas(64) std::byte there[kMaxPayloadBytes];  // raw: stands for the mirror
+  alignas(64) std::byte here[kMaxPayloadBytes];   // raw: in place of the owner's ring
+  alignas(64) std::byte there[kMaxPayloadBytes];  // raw: in place of the mirror
   double took_ns[kSamples * kRounds];
 
   // In the last process of the chain.
@@ -59,7 +59,7 @@ std::int64_t cpu_of(const std::vector<pid_t>& processes) {
   for (;;) {
     std::uint64_t count = 0;
     if (::read(doorbell, &count, sizeof count) != sizeof count) fail("read eventfd");
-    // One each: on a busy machine several rings may have become one.
+    // One each: on a busy machine one read may return several writes.
     for (; count > 0; --count) send_all(socket, payload, bytes);
   }
 }
@@ -117,7 +117,7 @@ void wait_until_ready(Chain& chain) {
   while (chain.word.load() == 0) ::usleep(1000);
 }
 
-// One round: a sample each millisecond by `send`. The CPU time that it took all `processes`.
+// One round: a sample per millisecond by `send`. Returns the CPU time of all `processes`.
 template <class Send>
 std::int64_t round(Chain& chain, const std::vector<pid_t>& processes, Send send) {
   const std::uint32_t until = chain.arrived.load() + kSamples;
@@ -131,9 +131,8 @@ std::int64_t round(Chain& chain, const std::vector<pid_t>& processes, Send send)
   return cpu_of(processes) - cpu_before;
 }
 
-// The ratio of p99s of a tenth of the rounds; of these ratios the middle one. A disturbance from
-// outside slows some 50 samples in a row, which is the p99 of whichever side it came upon: here it
-// decides one tenth.
+// The median of ten ratios of p99s, each of a tenth of the rounds. An external disturbance slows some
+// 50 successive samples, which is the whole p99 of the affected side; here it affects only one tenth.
 double middle_p99_ratio(const Chain& raw, const Chain& ours) {
   constexpr int kParts = 10;
   constexpr int kOfPart = kSamples * kRounds / kParts;

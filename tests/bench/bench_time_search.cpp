@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Reading by time at random times, over depths and shapes of streams. The raw limit is what no
-// search can avoid, with its cache misses, in the same memory: somebody tells the tid, its entry of
-// the time index is looked at, and with that the sample is copied out of its slot.
+// Reading at random times, for several depths and shapes of streams. The raw limit is what every search
+// must do, with its cache misses, in the same memory: for a known tid, read its entry in the time index,
+// and then copy the sample from its slot.
 #include <dssm/dssm.hpp>
 #include <filesystem>
 #include <random>
@@ -19,7 +19,7 @@ namespace {
 
 constexpr int kQuestions = 1 << 16;
 
-// The stream's ring, mapped once more, for the raw limit.
+// The stream's ring, mapped a second time, for the raw limit.
 std::shared_ptr<const ring::RingMapping> ring_of(Session& session, const StreamId& id) {
   const std::string wanted = "dssm-ring:" + session.info(id).value().id.str();
   for (const auto& entry : std::filesystem::directory_iterator("/proc/self/fd")) {
@@ -48,7 +48,7 @@ void shape(Session& session, const std::string& name, std::uint64_t depth, Durat
     time = next_time(time, random);
     writer.write(payload, time_from_ns(time));
   }
-  // Questions all over the window, and the places of their answers.
+  // Times all over the window, and the slots of their samples.
   std::vector<Time> questions;
   std::vector<Tid> places;
   SampleInfo oldest, newest, found;
@@ -63,7 +63,7 @@ void shape(Session& session, const std::string& name, std::uint64_t depth, Durat
         static_cast<Tid>(random() % static_cast<std::uint64_t>(newest.tid - oldest.tid + 1));
     if (reader.stamp(tid, any) != ReadStatus::ok) std::abort();
     const Time t = any.time + Duration(static_cast<std::int64_t>(random() % 500));
-    if (reader.find(t, found) != ReadStatus::ok) continue;  // before all that is left
+    if (reader.find(t, found) != ReadStatus::ok) continue;  // older than the oldest sample
     questions.push_back(t);
     places.push_back(found.tid);
   }
@@ -72,7 +72,7 @@ void shape(Session& session, const std::string& name, std::uint64_t depth, Durat
   const auto touch = [&] {
     const Tid told = places[raw_at++ % kQuestions];
     const std::int64_t time_ns = slots.time_ns(told).load(std::memory_order_relaxed);
-    // The tid depends on the time, as it does for who searches; the difference is always 0.
+    // The tid depends on the time, as in a search; the difference is always 0.
     const Tid tid = told + (time_ns < 0 ? 1 : 0);
     if (raw_reader.read(tid, payload, info) != ReadStatus::ok) std::abort();
     keep(payload);
@@ -84,7 +84,7 @@ void shape(Session& session, const std::string& name, std::uint64_t depth, Durat
   char label[80];
   std::snprintf(label, sizeof label, "at(t), %s, depth %llu", name.c_str(),
                 static_cast<unsigned long long>(depth));
-  print_pair("the same sample, told its tid", label, measure(batches, 1000, touch, read), target);
+  print_pair("the same sample, tid known", label, measure(batches, 1000, touch, read), target);
 }
 
 }  // namespace

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What the benchmarks share: timing in batches, percentiles, and the line that shows ours beside
-// the machine's raw limit.
+// Shared by the benchmarks: timing in batches, percentiles, and the line that shows our figure with the
+// machine's raw limit.
 //
-// Ours and the raw limit are measured in turns, batch by batch, so that a noisy neighbour or a
-// change of the clock rate meets both. A figure is the time of one operation: a batch's time
-// divided by its operations for what takes nanoseconds, a single operation's for what takes longer.
+// Our operation and the raw limit alternate, batch by batch, so that other load or a change of the
+// clock rate affects both. A figure is the time of one operation: for operations that take
+// nanoseconds, a batch's time divided by their number; for longer ones, the time of each.
 #pragma once
 
 #include <algorithm>
@@ -32,13 +32,13 @@ inline Figures figures_of(std::vector<double> ns) {
 
 inline std::int64_t now_ns() { return to_ns(MonoClock::now().time_since_epoch()); }
 
-// Keeps the compiler from dropping what was computed.
+// Keeps the compiler from removing the computation of `value`.
 template <class T>
 inline void keep(const T& value) {
   asm volatile("" : : "r"(&value) : "memory");
 }
 
-// Runs `operation` `count` times; the time of one, in ns.
+// Runs `operation` `count` times; returns the time of one, in ns.
 template <class Operation>
 double time_batch(int count, Operation& operation) {
   const std::int64_t start = now_ns();
@@ -50,7 +50,7 @@ struct Pair {
   Figures raw, ours;
 };
 
-// Both operations in turns, `batches` times.
+// Alternates both operations, `batches` times.
 template <class Raw, class Ours>
 Pair measure(int batches, int count, Raw raw, Ours ours) {
   std::vector<double> raw_ns, ours_ns;
@@ -73,7 +73,7 @@ inline void print_row(const std::string& name, const Figures& f, const std::stri
   std::fflush(stdout);
 }
 
-// Two rows: the raw limit, and ours with its ratio of medians beside the target.
+// Prints two rows: the raw limit, and ours with the ratio of medians and the target.
 inline void print_pair(const std::string& raw_name, const std::string& our_name, const Pair& pair,
                        const std::string& target) {
   print_row("  " + raw_name, pair.raw);

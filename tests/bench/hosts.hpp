@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The two hosts of a benchmark: "pc1" owns the streams, "pc2" reads them. Both are this machine,
-// joined by loopback, or network namespaces joined by a cable each to a switch.
+// The two hosts of a benchmark: "pc1" owns the streams, "pc2" reads them. They are either this machine,
+// connected by loopback, or network namespaces, connected by cables to a switch.
 #pragma once
 
 #include <memory>
@@ -22,7 +22,7 @@ class Hosts {
 
   const char* name() const { return network_ ? "namespaces" : "loopback"; }
 
-  // While it lives, this thread is in that host.
+  // While it exists, this thread is in that host.
   std::unique_ptr<test::Inside> inside(int host) const {
     if (!network_) return nullptr;
     return std::unique_ptr<test::Inside>(new test::Inside(network_->inside(host)));
@@ -35,7 +35,7 @@ class Hosts {
     return start(2, {"--log-level", "warning", "--peer", owner.address()});
   }
 
-  // Two ends of a TCP connection without Nagle's delay: in the owner's host, and in the other.
+  // The ends of a TCP connection without Nagle's delay: on the owner's host, and on the other.
   std::pair<int, int> tcp_pair() const {
     const auto in_owner = inside(1);
     const int listener = ::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0);
@@ -75,7 +75,7 @@ class Hosts {
   std::unique_ptr<test::Network> network_;
 };
 
-// On each kind of hosts that this machine can have.
+// Runs on each kind of hosts that this machine supports.
 template <class Benchmark>
 void on_hosts(Benchmark benchmark) {
   std::printf("--- two hosts on loopback\n");

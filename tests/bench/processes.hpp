@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What the benchmarks of chains of processes share: children, bare TCP, futexes, CPU time.
+// Shared by benchmarks with chains of processes: children, bare TCP, futexes, CPU time.
 #pragma once
 
 #include <arpa/inet.h>
@@ -26,13 +26,13 @@
 
 namespace dssm::bench {
 
-// Ends the benchmark with a text: a figure that was measured halfway is none.
+// Ends the benchmark with a message: partial figures are useless.
 [[noreturn]] inline void fail(const char* what) {
   std::perror(what);
   std::abort();
 }
 
-// Memory that children share with their parent; never given back.
+// Memory that children share with their parent; never unmapped.
 template <class T>
 T& shared() {
   void* memory =
@@ -41,7 +41,7 @@ T& shared() {
   return *new (memory) T;
 }
 
-// Runs `work` in a child that dies with this process; never returns there.
+// Runs `work` in a child that ends with this process; does not return in the child.
 template <class Work>
 pid_t in_child(Work work) {
   const pid_t pid = ::fork();
@@ -70,7 +70,7 @@ inline void futex_wake(std::atomic<std::uint32_t>& word) {
   ::syscall(SYS_futex, &word, FUTEX_WAKE, INT_MAX, nullptr, nullptr, 0);
 }
 
-// CPU time that all threads of a process took so far.
+// CPU time used by all threads of a process so far.
 inline std::int64_t cpu_ns(pid_t pid) {
   clockid_t clock{};
   timespec time{};
@@ -87,7 +87,7 @@ inline void send_all(int fd, const void* data, std::size_t bytes) {
   }
 }
 
-// flags: of recv(2). With MSG_DONTWAIT it looks again and again and never sleeps.
+// flags: of recv(2). With MSG_DONTWAIT it polls without sleeping.
 inline void receive_all(int fd, void* data, std::size_t bytes, int flags = 0) {
   auto* at = static_cast<char*>(data);
   while (bytes > 0) {

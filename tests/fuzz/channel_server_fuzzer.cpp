@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Any bytes from a peer on the network that said hello: through the decoder and the requests down
-// to the registry, its rings and the answers, turn by turn of a real loop. A second peer watches
-// and subscribes, and a program writes, so that events, gaps and full sockets happen. An input's
-// first three bytes choose whether the peer knows "torn", how its bytes are cut, and how much it
-// reads.
+// Arbitrary bytes from a network peer after its Hello: through decoder and requests to the registry, its
+// rings and the answers, in a real event loop. A second peer watches and subscribes, and a program
+// writes, so that events, gaps and full sockets occur. An input's first three bytes choose whether the
+// peer has the feature "torn", how its bytes are split, and how much it reads.
 #include <event2/event.h>
 #include <netinet/in.h>
 #include <sys/eventfd.h>
@@ -27,7 +26,7 @@ class SilentLogger final : public Logger {
   void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
 };
 
-// What a transport of this file brings and takes.
+// The input and output of a transport in this file.
 struct Peer {
   std::string input;
   std::size_t cut = 1;  // bytes of one receive
@@ -93,7 +92,7 @@ wire::SocketAddress nowhere() {
   return address;
 }
 
-// Runs what is due.
+// Runs due events.
 void turn(const EventLoop& loop) { event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK); }
 
 void run(std::span<const std::uint8_t> input) {
@@ -142,7 +141,7 @@ void run(std::span<const std::uint8_t> input) {
     fuzzed.room = 1U << 20;
     turn(*loop);
   }
-  // It is gone from here, and the other one is not.
+  // This connection is closed, and the other one is not.
   if (!fuzzed.closed || watcher.closed) std::abort();
 }
 

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Any text as a configuration file: taken, or refused with a message.
+// Arbitrary text as a configuration file: accepted, or refused with a message.
 #include <cstdlib>
 
 #include "daemon/service/config.hpp"

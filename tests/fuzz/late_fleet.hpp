@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Another host for the fuzzer of the local protocol: it has every stream that it is asked for, and
-// answers when told to.
+// Another host for the fuzzer of the local protocol: it has every requested stream, and answers only
+// when answer() is called.
 #pragma once
 
 #include <functional>
@@ -15,7 +15,7 @@ namespace dssm::daemon {
 
 class LateFleet final : public Fleet {
  public:
-  // Gives all answers that are due.
+  // Sends all pending answers.
   void answer() {
     for (const std::function<void()>& due : std::exchange(due_, {})) due();
   }
@@ -78,14 +78,14 @@ class LateFleet final : public Fleet {
   }
 
  private:
-  // The ring of `id`, made when first asked for.
+  // The ring of `id`, created at the first request.
   Result<std::shared_ptr<Stream>> ring(const StreamId& id) {
     auto created =
         pc2_.create({id.name, id.id, ""}, {"T", 8, 8, {}}, {4, std::chrono::milliseconds(1)}, 1);
     if (!created) return std::move(created).error();
     return created->stream;
   }
-  // It goes, comes back with another ring, and its readers hear of it.
+  // Removes the stream, recreates it with another ring, and notifies its readers.
   void replace(const StreamId& id) {
     const StreamId there{id.name, id.id, "pc2"};
     const Result<std::shared_ptr<Stream>> old = pc2_.find(there);

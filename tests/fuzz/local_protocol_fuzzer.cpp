@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Any bytes from a client that said hello: through the frame buffer, the decoding of requests, the
-// registry and its real memory files, down to the answers. A second client watches and holds a
-// stream, so that events and conflicts happen. Another host answers when the input is over, or when
-// the client has left. An input's first two bytes choose whether dssmd is recovering, which
-// descriptors come along, and how its bytes are cut.
+// Arbitrary bytes from a local client after its Hello: through the frame buffer, the decoding of
+// requests, the registry and its real memory files to the answers. A second client watches and has a
+// stream open, so that events and conflicts occur. Another host answers after the input, or after the
+// client has disconnected. An input's first two bytes choose whether dssmd is recovering, which
+// descriptors the client sends, and how its bytes are split.
 #include <fcntl.h>
 
 #include <algorithm>
@@ -25,7 +25,7 @@ class SilentLogger final : public Logger {
   void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
 };
 
-// Takes whatever is sent, and insists that it is a frame that clients accept.
+// Receives all output, and checks that it consists of frames that clients accept.
 class Sink final : public ClientOutput {
  public:
   void send(const std::string& frame, std::vector<UniqueFd>) override {
@@ -73,7 +73,7 @@ const std::vector<UniqueFd>& kept_descriptors() {
   return kept;
 }
 
-// Up to four of them, or other files, as `choice` says.
+// Up to four of them, or other files, depending on `choice`.
 std::vector<UniqueFd> descriptors(unsigned choice) {
   std::vector<UniqueFd> result;
   for (unsigned i = 0; i < choice % 5; ++i) {

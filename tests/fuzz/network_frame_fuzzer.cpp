@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Any bytes from a peer, through the decoder of the network protocol. What it hands out must not
-// depend on the pieces in which the bytes arrive or on a sink that holds back, and must be what
-// protobuf alone makes of them. An input's first two bytes choose the payload size, how the bytes
-// are cut, and when the sink holds back.
+// Arbitrary bytes from a peer, through the decoder of the network protocol. Its output must not depend
+// on how the bytes are split or on a sink that pauses it, and must equal protobuf's output. An input's
+// first two bytes choose the payload size, how the bytes are split, and when the sink pauses.
 #include <google/protobuf/stubs/logging.h>
 
 #include <cstdlib>
@@ -24,7 +23,7 @@ struct Outcome {
   bool refused = false;
 };
 
-// hold_every: the sink holds back at every so many-th callback; 0: never.
+// hold_every: the sink pauses at every hold_every-th callback; 0: never.
 Outcome decode(std::string_view bytes, std::size_t payload_bytes, std::size_t at_most,
                unsigned hold_every) {
   Recorder recorder;
@@ -39,7 +38,7 @@ Outcome decode(std::string_view bytes, std::size_t payload_bytes, std::size_t at
   return {recorder.log, !fed};
 }
 
-// The entry of Recorder's log for one frame, by protobuf alone; nullopt: no message.
+// The entry of Recorder's log for one frame, decoded by protobuf; nullopt: not a message.
 std::optional<std::string> entry_of(const std::byte* bytes, std::size_t size) {
   net::Frame frame;
   if (!frame.ParseFromArray(bytes, static_cast<int>(size))) return std::nullopt;
@@ -73,7 +72,7 @@ void run(std::string_view input) {
   input.remove_prefix(2);
 
   const Outcome whole = decode(input, payload_bytes, SIZE_MAX, 0);
-  const unsigned every = choice / 4 % 8;  // who holds back always never gets anywhere
+  const unsigned every = choice / 4 % 8;  // a sink that always pauses makes no progress
   const Outcome in_pieces = decode(input, payload_bytes, cut, every == 1 ? 0 : every);
   if (whole.log != in_pieces.log || whole.refused != in_pieces.refused) std::abort();
 
@@ -87,7 +86,7 @@ void run(std::string_view input) {
 }  // namespace dssm::wire
 
 extern "C" int LLVMFuzzerInitialize(int*, char***) {
-  google::protobuf::SetLogHandler(nullptr);  // it prints each message that it refuses
+  google::protobuf::SetLogHandler(nullptr);  // it would print each refused message
   return 0;
 }
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Any TXT record of somebody else's service: taken, or refused with a message. What is taken keeps
-// to the limits, and announced anew it is the same. The input is a record as it crosses the
-// network: strings, each with a byte in front that tells its length.
+// Arbitrary TXT records of a service: accepted, or refused with a message. An accepted record is within
+// the limits, and encoding it again gives the same record. The input is a record in network format:
+// strings, each after a byte with its length.
 #include <algorithm>
 #include <cstdlib>
 
@@ -36,7 +36,7 @@ void run(std::string_view bytes) {
     return;
   }
   require(record->instance().size() <= kMaxInstanceBytes);
-  // A byte takes four characters at most ("\195"), of a label of at most 32 bytes.
+  // A byte takes at most four characters ("\195"), and a label has at most 32 bytes.
   require(record->subtype().size() <= 4 * 32 + std::string_view("._sub._dssm._tcp").size());
   std::size_t txt_bytes = 0;
   for (const auto& [key, value] : record->txt()) {

@@ -43,7 +43,7 @@ Result<std::unique_ptr<AvahiHost>> AvahiHost::open(const Network& network, int h
     }
   }
   std::unique_ptr<AvahiHost> made(new AvahiHost(network, host, make_temp_dir()));
-  // A bus like the system's, on which everybody may do everything.
+  // A bus like the system's, without restrictions.
   std::ofstream(made->dir_ + "/dbus.conf")
       << "<!DOCTYPE busconfig PUBLIC \"-//freedesktop//DTD D-Bus Bus Configuration 1.0//EN\"\n"
          " \"http://www.freedesktop.org/standards/dbus/1.0/busconfig.dtd\">\n"
@@ -99,7 +99,7 @@ std::string AvahiHost::account() const {
   words << log.rdbuf();
   constexpr std::size_t kEnough = 4096;
   const std::string said = words.str();
-  return text + "; it said:\n" + said.substr(said.size() - std::min(said.size(), kEnough));
+  return text + "; its log:\n" + said.substr(said.size() - std::min(said.size(), kEnough));
 }
 
 void AvahiHost::start_dbus() {
@@ -111,7 +111,7 @@ void AvahiHost::start_dbus() {
                  "--print-address=1"},
                 {}, address[1]);
   ::close(address[1]);
-  // It prints its address when it listens there.
+  // It prints its address after it has started to listen.
   char byte;
   if (::read(address[0], &byte, 1) != 1) {
     std::fprintf(stderr, "test harness: dbus-daemon does not start\n");

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A D-Bus daemon and an Avahi daemon of a test PC's own (tests/support/network.hpp), with Avahi's
-// stock limits. Nothing of them is visible outside: their files are in a folder of the test's, and
-// /run/avahi-daemon, which Avahi insists on, is in a mount namespace that ends with it. A test that
-// is killed takes both along.
+// A D-Bus daemon and an Avahi daemon for one test PC (tests/support/network.hpp), with Avahi's default
+// limits. They are invisible outside: their files are in a temporary folder, and /run/avahi-daemon,
+// which Avahi requires, is in a mount namespace that ends with Avahi. Both end with the test, also when
+// it is killed.
 //
-//   needs   root, dbus-daemon, avahi-daemon, unshare (util-linux); open() says what is missing
+//   needs   root, dbus-daemon, avahi-daemon, unshare (util-linux); open() reports what is missing
 #pragma once
 
 #include <sys/types.h>
@@ -20,7 +20,7 @@ namespace dssm::test {
 
 class AvahiHost {
  public:
-  // Starts nothing yet. `name` is that of the PC in mDNS: "pc1" is found as pc1.local.
+  // Starts nothing yet. `name` is the PC's name in mDNS: "pc1" is found as pc1.local.
   //   fails  when this machine cannot do it, with the reason: skip the test with it
   static Result<std::unique_ptr<AvahiHost>> open(const Network& network, int host,
                                                  const std::string& name);
@@ -28,14 +28,14 @@ class AvahiHost {
   AvahiHost& operator=(const AvahiHost&) = delete;
   ~AvahiHost();
 
-  void start_dbus();   // until it takes connections
-  void start_avahi();  // until it runs; it may not have reached D-Bus yet
+  void start_dbus();   // until it accepts connections
+  void start_avahi();  // until it runs; it may not be connected to D-Bus yet
   void kill_dbus();    // SIGKILL
-  void kill_avahi();   // SIGKILL: says no good-bye
+  void kill_avahi();   // SIGKILL: sends no goodbye
   void pause_avahi();  // SIGSTOP; kill_avahi() ends that, too
 
-  pid_t avahi_pid() const noexcept { return avahi_; }  // -1: does not run
-  // How the Avahi daemon is, and its last words: for a test that fails.
+  pid_t avahi_pid() const noexcept { return avahi_; }  // -1: not running
+  // The state of the Avahi daemon and the end of its log, for messages of failed tests.
   std::string account() const;
   // For programs of this PC: "DBUS_SYSTEM_BUS_ADDRESS=...".
   std::string environment() const;

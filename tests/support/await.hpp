@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Waiting for what gives no sign that could be waited for, such as the state of another process.
+// Polling for conditions without a notification, such as the state of another process.
 #pragma once
 
 #include <chrono>
@@ -8,11 +8,11 @@
 
 namespace dssm::test {
 
-// Between two looks: who looks without a pause takes the processor from what it waits for, on a
-// machine where many tests run at once.
+// The pause between two polls. Polling without a pause would take the processor from the process that
+// is waited for, on a machine where many tests run at once.
 inline constexpr auto kLookPause = std::chrono::milliseconds(1);
 
-// Looks again and again; the test runner's time limit is the watchdog.
+// Polls until `condition` is true; the test runner's time limit is the watchdog.
 template <class Condition>
 void await(Condition condition) {
   while (!condition()) std::this_thread::sleep_for(kLookPause);

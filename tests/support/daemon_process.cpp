@@ -28,7 +28,7 @@ namespace {
   std::abort();
 }
 
-// fork + exec; every descriptor but stdin, stdout and stderr is close-on-exec by our convention.
+// fork + exec; by convention, all descriptors except stdin, stdout and stderr are close-on-exec.
 pid_t spawn(const std::vector<std::string>& argv, const std::vector<std::string>& environment,
             int in_fd, int out_fd, int err_fd) {
   std::vector<char*> args;
@@ -43,7 +43,7 @@ pid_t spawn(const std::vector<std::string>& argv, const std::vector<std::string>
   const pid_t pid = ::fork();
   if (pid < 0) fail("fork");
   if (pid == 0) {
-    // A test that is killed takes what it started along.
+    // If the test is killed, so are the programs that it started.
     ::prctl(PR_SET_PDEATHSIG, SIGKILL);
     if (::getppid() != parent) ::_exit(127);
     if (in_fd >= 0) ::dup2(in_fd, 0);
@@ -147,16 +147,16 @@ std::vector<std::string> addresses_in(const std::string& text) {
 DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& host)
     : dir_(make_temp_dir()) {
   argv_ = {built("daemon/dssmd"), "--runtime-dir", dir_, "--name", host};
-  // Nobody's port: whether this machine runs chronyd is none of a test's business.
+  // An unused port: tests must not depend on a chronyd of this machine.
   argv_.insert(argv_.end(), {"--chronyd", "127.0.0.1:1"});
-  const bool says_mdns = std::any_of(extra.begin(), extra.end(), [](const std::string& word) {
+  const bool sets_mdns = std::any_of(extra.begin(), extra.end(), [](const std::string& word) {
     return word.starts_with("--mdns");
   });
-  if (!says_mdns) argv_.emplace_back("--mdns=false");
+  if (!sets_mdns) argv_.emplace_back("--mdns=false");
   argv_.insert(argv_.end(), extra.begin(), extra.end());
   if (!listens(extra)) argv_.insert(argv_.end(), {"--listen", "127.0.0.1:0"});
   start();
-  // Whoever knows the address finds it there after a restart, too.
+  // The same address after a restart.
   if (!listens(extra) && !addresses_.empty()) argv_.back() = addresses_.front();
 }
 
@@ -174,7 +174,7 @@ void DaemonProcess::start() {
   if (::bind(notify, reinterpret_cast<sockaddr*>(&address), sizeof address))
     fail("bind notify socket");
   pid_ = test::start(argv_, {"NOTIFY_SOCKET=" + notify_path});
-  for (;;) {  // a daemon that ends instead of answering is seen by its status
+  for (;;) {  // a daemon that ends early is detected by its status
     pollfd fd{notify, POLLIN, 0};
     char text[4096] = {};
     if (::poll(&fd, 1, 100) > 0 && ::recv(notify, text, sizeof text - 1, 0) > 0 &&
@@ -183,7 +183,7 @@ void DaemonProcess::start() {
       break;
     }
     if (::waitpid(pid_, nullptr, WNOHANG) == pid_) {
-      std::fprintf(stderr, "test harness: dssmd ended instead of getting ready\n");
+      std::fprintf(stderr, "test harness: dssmd ended before it was ready\n");
       std::abort();
     }
   }

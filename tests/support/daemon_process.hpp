@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A dssmd of the test's own: private runtime folder, private socket, ended by its pid.
+// A dssmd for one test, with its own runtime folder and socket; ended by its pid.
 #pragma once
 
 #include <sys/types.h>
@@ -10,11 +10,11 @@
 
 namespace dssm::test {
 
-// The path of something built here, e.g. built("daemon/dssmd"); from $DSSM_BUILD_ROOT, which meson
+// The path of a built file, e.g. built("daemon/dssmd"); from $DSSM_BUILD_ROOT, which meson
 // sets for every test.
 std::string built(const std::string& path);
 
-// A new empty folder below /tmp (short enough for socket paths); remove_tree() takes it away.
+// A new empty folder below /tmp (short enough for socket paths); remove_tree() removes it.
 std::string make_temp_dir();
 void remove_tree(const std::string& path);
 
@@ -26,23 +26,22 @@ struct Finished {
 Finished run(const std::vector<std::string>& argv, const std::vector<std::string>& environment = {},
              const std::string& input = {});
 
-// Starts a program in the background, its output going to this test's stderr unless `out_fd` >= 0
-// names where its stdout goes; wait_for() takes its status, as a shell shows it.
+// Starts a program in the background. Its output goes to this test's stderr, or its stdout to `out_fd`
+// if >= 0; wait_for() returns its status, as a shell shows it.
 pid_t start(const std::vector<std::string>& argv, const std::vector<std::string>& environment = {},
             int out_fd = -1);
 int wait_for(pid_t pid);
 
-// For a dssmd that is killed while others wait to create its streams anew: holders that offer their
-// rings get more than dssmd's own 500 ms for it, which is little where many tests run at once.
+// For a dssmd that is killed while programs wait to recreate its streams: on a machine where many tests
+// run at once, programs need more than the default of 500 ms to offer their rings.
 inline const std::vector<std::string> kPatientRecovery = {"--recovery-grace", "3 s"};
 
 class DaemonProcess {
  public:
-  // Starts `dssmd --runtime-dir DIR --name HOST extra...` and waits until it says that it is ready
-  // (sd_notify's READY=1). Ends the test program with a text when it does not come up. Unless
-  // `extra` says where to listen for other hosts, it is at any free port of 127.0.0.1; and unless
-  // it says something of mDNS, there is none: nobody else on this network shall see a test. For
-  // the same reason it finds no chronyd.
+  // Starts `dssmd --runtime-dir DIR --name HOST extra...` and waits until it is ready (sd_notify's
+  // READY=1). Ends the test program with a message if dssmd does not start. Unless `extra` sets
+  // them, dssmd listens for other hosts at a free port of 127.0.0.1, does not use mDNS, so that the
+  // network does not see the test, and finds no chronyd.
   explicit DaemonProcess(std::vector<std::string> extra = {}, const std::string& host = "pc1");
   DaemonProcess(const DaemonProcess&) = delete;
   DaemonProcess& operator=(const DaemonProcess&) = delete;
@@ -53,15 +52,15 @@ class DaemonProcess {
   std::string environment() const { return "DSSM_SOCKET=" + socket_path(); }
   pid_t pid() const { return pid_; }
 
-  // Where it listens for other hosts, "127.0.0.1:40123"; the first one. After a restart it is there
-  // again.
+  // The first address at which it listens for other hosts, "127.0.0.1:40123"; the same after a
+  // restart.
   std::string address() const { return addresses_.empty() ? "" : addresses_.front(); }
   const std::vector<std::string>& addresses() const { return addresses_; }
 
   void kill_hard();                    // SIGKILL, and waits for its end
   int stop();                          // SIGTERM, and its exit status
   void start();                        // again, in the same folder
-  void call(const std::string& host);  // so from the next start() on
+  void call(const std::string& host);  // its name from the next start() on
 
  private:
   std::string dir_;

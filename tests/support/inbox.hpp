@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Where dssmd tells the service manager something, in place of systemd's socket.
+// Receives dssmd's notifications to the service manager, in place of systemd's socket.
 #pragma once
 
 #include <gtest/gtest.h>
@@ -15,7 +15,7 @@
 
 namespace dssm::test {
 
-// A datagram socket that takes what is sent to it when it is asked.
+// A datagram socket; next() returns the received messages one by one.
 class Inbox {
  public:
   Inbox() {
@@ -29,7 +29,7 @@ class Inbox {
   ~Inbox() { remove_tree(dir_); }
 
   std::string path() const { return dir_ + "/socket"; }
-  std::string next() {  // empty: nothing is there
+  std::string next() {  // empty: no message
     char text[8192];
     const ssize_t bytes = ::recv(fd_.get(), text, sizeof text, MSG_DONTWAIT);
     return bytes > 0 ? std::string(text, static_cast<std::size_t>(bytes)) : "";

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// How large the largest samples of tests are: as large as samples may be, but not where each of
-// their bytes costs a hundred.
+// The size of the largest samples in tests: the maximum, except under sanitizers that need a hundred
+// bytes for each of theirs.
 #pragma once
 
 #include <cstddef>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A vehicle of the test's own with nothing configured: PCs with D-Bus, Avahi, and a dssmd that
-// listens on the network and finds the others by mDNS alone.
+// A vehicle without configuration for one test: PCs with D-Bus, Avahi, and a dssmd that listens on the
+// network and finds the others only by mDNS.
 #pragma once
 
 #include <algorithm>
@@ -27,7 +27,7 @@ class MdnsVehicle {
     for (int pc = 1; made && pc <= pcs; ++pc) start_avahi(pc);
     return made;
   }
-  // The same, but nothing runs there: first the network is to be made another one.
+  // The same, but without starting anything, so that the test can change the network first.
   Result<void> open_without_avahi(int pcs) {
     Result<std::unique_ptr<Network>> network = Network::open(pcs);
     if (!network) return std::move(network).error();
@@ -37,7 +37,7 @@ class MdnsVehicle {
     }
     return {};
   }
-  // Calls a PC otherwise in mDNS, as long as its Avahi does not run.
+  // Changes the name of a PC in mDNS; its Avahi must not run.
   Result<void> name_pc(int pc, const std::string& name) {
     Result<std::unique_ptr<AvahiHost>> host = AvahiHost::open(*network_, pc, name);
     if (!host) return std::move(host).error();
@@ -49,7 +49,7 @@ class MdnsVehicle {
     avahi(pc).start_dbus();
     avahi(pc).start_avahi();
   }
-  // A dssmd on the next PC, called "pc1" ... unless `name` says otherwise.
+  // Starts a dssmd on the next PC; its name is "pc1" ... or `name`.
   void add_dssmd(const std::vector<std::string>& flags = {}, const std::string& name = {}) {
     const int pc = static_cast<int>(dssmds_.size()) + 1;
     dssmds_.push_back(make_dssmd(pc, name.empty() ? Network::name(pc) : name, flags));
@@ -63,7 +63,7 @@ class MdnsVehicle {
   DaemonProcess& dssmd(int pc) { return *dssmds_.at(static_cast<std::size_t>(pc) - 1); }
   Session& session(int pc) { return sessions_.at(static_cast<std::size_t>(pc) - 1); }
 
-  // One more dssmd on a PC, called `name`.
+  // Starts one more dssmd, with this name, on a PC.
   std::unique_ptr<DaemonProcess> make_dssmd(int pc, const std::string& name,
                                             std::vector<std::string> flags = {}) {
     const OnPc on_pc(avahi(pc));
@@ -100,7 +100,7 @@ class MdnsVehicle {
   }
 
  private:
-  // While it lives, what is started belongs to that PC and speaks to its bus.
+  // While it exists, started programs belong to that PC and use its bus.
   class OnPc {
    public:
     explicit OnPc(AvahiHost& host) : inside_(host.inside()) {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Namespaces are made by unshare(2) in a thread's own, held by descriptors, and furnished with
-// ip(8), which takes /proc/PID/fd/N for a namespace where people write a name.
+// Namespaces are created with unshare(2), held by descriptors, and configured with ip(8), which accepts
+// /proc/PID/fd/N as the name of a namespace.
 #include "tests/support/network.hpp"
 
 #include <fcntl.h>
@@ -25,10 +25,10 @@ UniqueFd namespace_of_this_thread() {
 void enter(int network_namespace) {
   if (::setns(network_namespace, CLONE_NEWNET) == 0) return;
   std::fprintf(stderr, "test harness: setns: %s\n", std::strerror(errno));
-  std::abort();  // to go on in the wrong network would test nothing
+  std::abort();  // continuing in the wrong network would test nothing
 }
 
-// A new namespace, empty but for a loopback interface that is down.
+// A new namespace; it has only a loopback interface, which is down.
 Result<UniqueFd> make_namespace() {
   const UniqueFd before = namespace_of_this_thread();
   if (!before) return os_error("open /proc/thread-self/ns/net");
@@ -39,7 +39,7 @@ Result<UniqueFd> make_namespace() {
   return made;
 }
 
-// Does what the lines say, each one an `ip` command without the word ip.
+// Runs lines of `ip` commands, without the word ip.
 Result<void> try_ip(const std::string& lines) {
   const Finished finished = run({"ip", "-batch", "-"}, {}, lines);
   if (finished.exit_status == 0) return {};
@@ -81,8 +81,8 @@ Result<std::unique_ptr<Network>> Network::open(int hosts) {
   if (!made) return std::move(made).error();
   network->switch_ = *std::move(made);
   const Inside inside(network->switch_.get());
-  // The only two kinds of interface that a kernel may not have. No snooping: it would swallow the
-  // first neighbour solicitations of IPv6.
+  // A kernel may lack these two kinds of interface. Snooping would drop the first neighbour
+  // solicitations of IPv6.
   const Result<void> usable = try_ip(
       "link add switch type bridge mcast_snooping 0\n"
       "link set switch up\n"
@@ -96,13 +96,13 @@ Result<std::unique_ptr<Network>> Network::open(int hosts) {
     network->configure(host, "link set lo up\n");
     network->connect(host, name(host), "eth0");
     network->configure(host, "address add " + address(host) + "/24 dev eth0\n" +  //
-                                 // nodad: usable at once, also after the cable was out.
+                                 // nodad: usable at once, also after a reconnection.
                                  "address add " + address6(host) + "/64 dev eth0 nodad\n");
   }
   return network;
 }
 
-// `port` is the cable's end in the switch.
+// `port` is the end of the cable at the switch.
 void Network::connect(int host, const std::string& port, const std::string& interface) {
   {
     const Inside inside(switch_.get());
@@ -156,7 +156,7 @@ void Network::heal(int host) {
 
 Result<void> Network::shape(int host, const std::string& how) {
   const Inside inside(switch_.get());
-  // tc, like ip, reads words.
+  // tc reads commands like ip.
   const Finished finished =
       run({"tc", "-batch", "-"}, {}, "qdisc replace dev " + name(host) + " root " + how + "\n");
   if (finished.exit_status == 0) return {};

@@ -1,15 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// PCs of the test's own: network namespaces, joined by one cable each to a switch (a bridge in a
-// namespace of its own). Cables can be cut, healed and slowed down.
+// PCs for one test: network namespaces, each connected by a cable to a switch (a bridge in a separate
+// namespace). Cables can be cut, healed and slowed down.
 //
-//   PC k is called "pck" and has the addresses 10.77.0.k and fd77::k, whatever else runs on this
-//   machine: the namespaces have no names and no connection to the outside, so tests run side by
-//   side. They live as long as this object's descriptors and the programs in them: a test that is
-//   killed leaves nothing behind.
+//   PC k is called "pck" and has the addresses 10.77.0.k and fd77::k. The namespaces have no names and
+//   no connection to the outside, so several tests can run at the same time. They exist as long as
+//   this object's descriptors and the programs in them, so a killed test leaves nothing behind.
 //
 //   shared  everything but the network: files, Unix sockets, processes, memory
-//   needs   root, iproute2, and a kernel with veth and bridge; open() says what is missing
+//   needs   root, iproute2, and a kernel with veth and bridge; open() reports what is missing
 #pragma once
 
 #include <sys/types.h>
@@ -23,14 +22,14 @@
 
 namespace dssm::test {
 
-// While it lives, the thread that made it is inside a namespace: sockets that it makes and
-// programs that it starts belong there, also afterwards.
+// While it exists, the thread that created it is inside a namespace. Sockets that the thread creates
+// and programs that it starts stay there, also afterwards.
 class Inside {
  public:
   explicit Inside(int network_namespace);
   Inside(const Inside&) = delete;
   Inside& operator=(const Inside&) = delete;
-  ~Inside();  // back to where the thread was
+  ~Inside();  // returns the thread to its previous namespace
 
  private:
   UniqueFd before_;
@@ -38,7 +37,7 @@ class Inside {
 
 class Network {
  public:
-  // A switch and PCs "pc1" to "pc<hosts>", all cables in place. At most 9 hosts.
+  // A switch and PCs "pc1" to "pc<hosts>", all connected. At most 9 hosts.
   //   fails  when this machine cannot do it, with the reason: skip the test with it
   static Result<std::unique_ptr<Network>> open(int hosts);
 
@@ -53,25 +52,24 @@ class Network {
     return Inside(hosts_.at(static_cast<std::size_t>(host) - 1).get());
   }
 
-  // One more cable from the host to the switch, at its interface `interface`, which is up and has
-  // only the addresses that the kernel itself gives it.
+  // Adds a cable from the host to the switch, at its interface `interface`, which is up and has only
+  // the addresses that the kernel assigns.
   void add_cable(int host, const std::string& interface);
-  // Configures the host as `lines` say, each one an ip(8) command without the word ip:
+  // Configures the host by lines of ip(8) commands, without the word ip:
   // "link del eth0\n".
   void configure(int host, const std::string& lines) const;
-  // Lets the host take no TCP from others, and answer nothing to who tries, as behind a firewall
-  // that drops; multicast still goes through.
+  // Drops TCP from other hosts without an answer, like a firewall; multicast still passes.
   //   fails  when this machine has no nft(8) that works: skip the test with the reason
   Result<void> swallow(int host);
   void stop_swallowing(int host);
 
-  // Takes the host's cable out of the switch; puts it back. Whichever is so already stays so.
+  // Disconnect and reconnect the host's cable at the switch; no effect if already done.
   void cut(int host);
   void heal(int host);
 
-  // Lets the switch send to the host only as tc-netem(8) or tc-tbf(8) says: "netem delay 20ms",
+  // Shapes what the switch sends to the host, as in tc-netem(8) or tc-tbf(8): "netem delay 20ms",
   // "tbf rate 20mbit burst 64kb latency 100ms".
-  //   fails  when this kernel has no such thing: skip the test with the reason
+  //   fails  when this kernel does not support it: skip the test with the reason
   Result<void> shape(int host, const std::string& how);
 
  private:

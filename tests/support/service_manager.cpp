@@ -54,7 +54,7 @@ ino_t inode_of(int fd) {
   return file.st_ino;
 }
 
-// The value of `key` in a message "KEY=value\nOTHER=..."; empty: it is not there.
+// The value of `key` in a message "KEY=value\nOTHER=..."; empty if missing.
 std::string value_of(const std::string& message, const std::string& key) {
   const std::string lines = "\n" + message + "\n";
   const std::size_t at = lines.find("\n" + key + "=");
@@ -132,7 +132,7 @@ void ServiceManager::start() {
   const pid_t parent = ::getpid();
   pid_ = ::fork();
   if (pid_ < 0) fail("fork");
-  if (pid_ == 0) {  // other threads are gone: no memory is taken from here on
+  if (pid_ == 0) {  // no other threads here, so no memory may be allocated from now on
     ::prctl(PR_SET_PDEATHSIG, SIGKILL);
     if (::getppid() != parent) ::_exit(127);
     for (int& fd : fds) fd = ::fcntl(fd, F_DUPFD_CLOEXEC, end_of_handed_over);  // out of the way
@@ -153,7 +153,7 @@ int ServiceManager::end(int number) {
   ::kill(pid_, number);
   const int status = wait_for(std::exchange(pid_, -1));
   const std::lock_guard guard(mutex_);
-  drain();  // as systemd, which looks at messages before it looks at who died
+  drain();  // like systemd, which handles messages before it handles dead processes
   return status;
 }
 

@@ -1,15 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A small stand-in for systemd: starts dssmd as dssmd.service does, hands its Unix socket over,
-// takes its messages ($NOTIFY_SOCKET), and keeps descriptors over restarts. Of systemd 252 it
-// repeats what matters here:
+// A fake systemd: starts dssmd like dssmd.service, passes its Unix socket, receives its messages
+// ($NOTIFY_SOCKET), and keeps descriptors over restarts. It imitates these parts of systemd 252:
 //
-//   the store  takes what is not in it yet (the same open file counts once) up to a maximum, gives
-//              everything back at each start, and is dropped at stop()
-//   hand-over  $LISTEN_FDS, $LISTEN_FDNAMES, $LISTEN_PID, the socket first, then the store
-//   the watch  $WATCHDOG_USEC
+//   store      accepts new descriptors (each open file once) up to a maximum, passes all of them at
+//              each start, and is emptied at stop()
+//   passing    $LISTEN_FDS, $LISTEN_FDNAMES, $LISTEN_PID; the socket first, then the store
+//   watchdog   $WATCHDOG_USEC
 //
-// Its functions may be called from one thread; another one, its own, listens.
+// Its functions may be called from one thread; a thread of its own receives messages.
 #pragma once
 
 #include <sys/types.h>
@@ -29,14 +28,14 @@ namespace dssm::test {
 class ServiceManager {
  public:
   struct Options {
-    // Of dssmd, beside runtime folder and name. It listens at any free port of 127.0.0.1 unless
-    // they say where, and at the same one after a restart.
+    // dssmd's arguments besides runtime folder and name. Unless they set an address, dssmd listens at
+    // a free port of 127.0.0.1, and at the same one after a restart.
     std::vector<std::string> arguments = {};
     std::string host = "pc1";
-    bool socket = true;                  // makes and hands over the Unix socket
-    std::vector<int> more_sockets = {};  // handed over as well, as "other"; the caller's
+    bool socket = true;                  // creates and passes the Unix socket
+    std::vector<int> more_sockets = {};  // also passed, as "other"; owned by the caller
     std::size_t store_max = 32'000;      // FileDescriptorStoreMax=
-    int watchdog_us = 0;                 // WatchdogSec=; 0: none. Only told, nobody is killed
+    int watchdog_us = 0;                 // WatchdogSec=; 0: none. dssmd is never killed
   };
 
   // Starts dssmd and waits until it is ready.
@@ -49,12 +48,12 @@ class ServiceManager {
   const std::string& runtime_dir() const { return dir_; }
   std::string socket_path() const { return dir_ + "/dssmd.sock"; }
   pid_t pid() const { return pid_; }
-  std::string address();  // the first one where it listens for other hosts
+  std::string address();  // the first address at which it listens for other hosts
 
-  // The ends of dssmd, and its start; ready when those that start it return.
-  void kill_hard();  // SIGKILL; stays dead, the store is kept
-  int stop();        // systemctl stop: SIGTERM, its exit status; the store is dropped
-  void start();      // after either
+  // Ends and starts of dssmd; start() and restart() return when it is ready.
+  void kill_hard();  // SIGKILL; no restart, the store is kept
+  int stop();        // systemctl stop: SIGTERM, its exit status; the store is emptied
+  void start();      // after either of them
   void restart();    // systemctl restart: SIGTERM and a start, the store is kept
   void forget_more_sockets() { options_.more_sockets.clear(); }
   void rename_host(const std::string& host) { options_.host = host; }  // from the next start on
@@ -64,29 +63,29 @@ class ServiceManager {
   // kill(2); for SIGHUP, SIGSTOP ...
   void signal(int number) const;
 
-  // Waits until `is_so` of all that dssmd said since its last start, oldest first.
+  // Waits until `is_so` of all messages since dssmd's last start, oldest first.
   using Messages = std::vector<std::string>;
   void await(const std::function<bool(const Messages&)>& is_so);
   Messages messages();
-  // Waits for the status line to hold `text`.
+  // Waits until the status line contains `text`.
   void await_status(const std::string& text);
-  // Whether a message with `text` comes within the time.
+  // Whether a message with `text` arrives within the time.
   bool says_within(const std::string& text, std::chrono::milliseconds time);
 
-  // In the store now: by name, how many descriptors. All that dssmd sent before this call counts.
+  // The number of descriptors in the store, by name, after all messages sent before this call.
   std::map<std::string, std::size_t> stored();
   std::size_t stored_descriptors();
-  void await_stored(std::size_t descriptors);  // many at once take their time
-  // Puts something there that dssmd never sent.
+  void await_stored(std::size_t descriptors);  // for many, which take some time
+  // Adds a descriptor that dssmd did not send.
   void put_into_store(const std::string& name, UniqueFd fd);
-  // How often descriptors came that were there already.
+  // How many received descriptors were in the store already.
   int doubled();
 
  private:
   struct Stored {
     std::string name;
     UniqueFd fd;
-    ino_t inode = 0;  // the quick way to see that two are not the same
+    ino_t inode = 0;  // to find different files quickly
   };
 
   int end(int number);

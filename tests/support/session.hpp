@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Streams of, and sessions with, a test's own dssmd, patient enough for a busy machine.
+// Streams of, and sessions with, a test's dssmd, with timeouts for a busy machine.
 #pragma once
 
 #include <chrono>
@@ -11,9 +11,9 @@
 
 namespace dssm::test {
 
-// Of a stream that only has to be there.
+// For a stream that only has to exist.
 inline constexpr History kShort{16, std::chrono::milliseconds(1)};
-// Of one whose readers shall lose nothing, however busy the machine is.
+// For a stream whose readers must lose nothing, even on a busy machine.
 inline constexpr History kLong{1 << 16, std::chrono::milliseconds(1)};
 
 inline Session connect_to(const std::string& socket_path) {

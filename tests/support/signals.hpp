@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Signals for whoever waits in a system call.
+// Signals that interrupt system calls.
 #pragma once
 
 #include <pthread.h>
@@ -11,8 +11,8 @@
 
 namespace dssm::test {
 
-// Sends SIGUSR1 to the thread that made it, again and again until it is destroyed: one signal alone
-// may come before the wait that it shall interrupt.
+// Sends SIGUSR1 to the thread that created it, repeatedly until it is destroyed: a single signal might
+// arrive before the wait that it should interrupt.
 class Signals {
  public:
   Signals() {

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// stall LONGEST_MS PAUSE_MS COMMAND...: runs the command and takes all processors away meanwhile,
-// again and again, for up to LONGEST_MS at a time, with pauses of up to PAUSE_MS between. So does a
-// virtual machine's host that has better things to do; a test that counts on time shows it here.
+// stall LONGEST_MS PAUSE_MS COMMAND...: runs the command and meanwhile blocks all processors
+// repeatedly, for up to LONGEST_MS at a time, with pauses of up to PAUSE_MS. This is like a virtual
+// machine on a busy host; it reveals tests that depend on timing.
 // Ends with the command's exit status; 2: wrong arguments; 77: this machine does not allow it.
 //
-// starve.py, beside it, keeps some of the processes from them and lets the others go on.
+// starve.py, in this folder, stops only some of the processes.
 //
-// Above 950 ms there is little to gain: unless told otherwise, the kernel leaves the last 50 ms of
-// each second to those that are no real-time programs (sched(7)).
+// More than 950 ms has little effect: by default, the kernel reserves the last 50 ms of each second
+// for programs that are not real-time (sched(7)).
 #include <sched.h>
 #include <unistd.h>
 
@@ -40,7 +40,7 @@ std::vector<int> processors() {
   return numbers;
 }
 
-// The calling thread runs on this processor only, and before all that is not real-time.
+// Binds the calling thread to this processor, with priority over all that is not real-time.
 bool claim(int processor) {
   cpu_set_t only;
   CPU_ZERO(&only);
@@ -55,7 +55,7 @@ class Stalls {
   Stalls(milliseconds longest, milliseconds longest_pause, std::ptrdiff_t processors)
       : longest_(longest), longest_pause_(longest_pause), all_here_(processors) {}
 
-  // For ever. One of the threads is the first: it decides when, for all.
+  // Forever. The first thread decides when, for all.
   void take_part(bool first) {
     for (;;) {
       if (first) {
@@ -65,7 +65,7 @@ class Stalls {
       all_here_.arrive_and_wait();
       while (Clock::now() < until_) {
       }
-      all_here_.arrive_and_wait();  // nobody reads until_ any more
+      all_here_.arrive_and_wait();  // no thread reads until_ any more
     }
   }
 
@@ -106,6 +106,6 @@ int main(int argc, char** argv) {
       stalls.take_part(processor == all.front());
     }).detach();
   }
-  // The threads end with the process, not with the objects that they use.
+  // The threads end with the process; they use these objects until then.
   std::_Exit(dssm::test::wait_for(command));
 }

@@ -1,11 +1,11 @@
 #!/usr/bin/env python3
 # SPDX-License-Identifier: Apache-2.0
-"""starve.py LONGEST_MS PAUSE_MS COMMAND...: runs the command and keeps some of its processes from
-the processors meanwhile, others each time, for up to LONGEST_MS, with pauses of up to PAUSE_MS.
+"""starve.py LONGEST_MS PAUSE_MS COMMAND...: runs the command and meanwhile withholds the processors from
+some of its processes, others each time, for up to LONGEST_MS, with pauses of up to PAUSE_MS.
 
-So does a machine with more to do than it can; a test that counts on its processes going on side by
-side shows it here. (tests/support/stall.cpp keeps all of them from the processors at once.) Those
-that are picked get what busy loops, two on each processor, leave to sched(7)'s SCHED_IDLE.
+This is like an overloaded machine; it reveals tests that need their processes to run at the same time.
+(tests/support/stall.cpp stops all of them at once.) The picked processes get SCHED_IDLE of sched(7),
+beside busy loops, two on each processor.
 
 Ends with the command's exit status; 2: wrong arguments; 77: this machine does not allow it.
 """
@@ -20,7 +20,7 @@ import sys
 import time
 
 LOOPS_PER_PROCESSOR = 2
-STARVED = 0.25  # of the processes, each time
+STARVED = 0.25  # share of the processes, each time
 PR_SET_PDEATHSIG, PR_SET_CHILD_SUBREAPER = 1, 36
 AUTOGROUP = pathlib.Path("/proc/sys/kernel/sched_autogroup_enabled")
 
@@ -62,7 +62,7 @@ def reschedule(pids: list[int], only: int, policy: int) -> None:
 
 
 def start_loop(processor: int) -> int:
-    """A process that uses what it can get of the processor when it runs; it is stopped at first."""
+    """A process that uses all available processor time while it runs; initially stopped."""
     pid = os.fork()
     if pid == 0:
         prctl(PR_SET_PDEATHSIG, signal.SIGKILL)
@@ -84,7 +84,7 @@ def starve(command: subprocess.Popen[bytes], loops: list[int], longest: float, p
         time.sleep(random.uniform(0, longest))
         for loop in loops:
             os.kill(loop, signal.SIGSTOP)
-        # Those as well that were started by a picked one meanwhile.
+        # Also those that a picked process has started meanwhile.
         reschedule(processes_below(os.getpid()), os.SCHED_IDLE, os.SCHED_OTHER)
 
 
@@ -103,8 +103,8 @@ def main() -> int:
     loops = [start_loop(processor) for processor in os.sched_getaffinity(0)
              for _ in range(LOOPS_PER_PROCESSOR)]
     try:
-        os.setpriority(os.PRIO_PROCESS, 0, -20)  # whoever ends a famine must not suffer from it
-        prctl(PR_SET_CHILD_SUBREAPER, 1)         # also those whose parents have ended stay below
+        os.setpriority(os.PRIO_PROCESS, 0, -20)  # so that this process runs in time
+        prctl(PR_SET_CHILD_SUBREAPER, 1)         # orphaned processes stay below this one
         with subprocess.Popen(words[2:], preexec_fn=lambda: os.setpriority(
                 os.PRIO_PROCESS, 0, priority)) as command:
             starve(command, loops, int(words[0]) / 1000, int(words[1]) / 1000)
