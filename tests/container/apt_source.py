@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""A signed apt source of the test's own, served by HTTP from this process."""
+"""A signed apt source for a test, served by HTTP from this process."""
 
 import functools
 import hashlib
@@ -14,17 +14,17 @@ SUITE, COMPONENT = "bookworm", "main"
 
 
 class QuietHandler(http.server.SimpleHTTPRequestHandler):
-    """Serves files, and tells nobody."""
+    """Serves files without a log."""
 
     def log_message(self, *_: object) -> None:
-        """Nothing: apt-get says itself what it lacks."""
+        """Logs nothing; apt-get reports errors itself."""
 
 
 class AptSource:
-    """The source. Its files lie below `folder`, which is new; `key` is the file of its public key."""
+    """The source. Its files are below the new folder `folder`; `key` is the file of its public key."""
 
     def __init__(self, folder: pathlib.Path, address: str) -> None:
-        """Makes a key, and serves at a free port of `address`, nothing as yet."""
+        """Makes a key, and serves an empty source at a free port of `address`."""
         self._files = folder / "files"
         self._files.mkdir(parents=True)
         self.key = make_key(folder / "gpg", folder / "key.asc")
@@ -35,12 +35,12 @@ class AptSource:
         threading.Thread(target=self._server.serve_forever, daemon=True).start()
 
     def close(self) -> None:
-        """Serves no more."""
+        """Stops serving."""
         self._server.shutdown()
         self._server.server_close()
 
     def publish(self, debs: Iterable[pathlib.Path]) -> None:
-        """Adds packages to those that are there."""
+        """Adds packages."""
         pool = self._files / "pool"
         pool.mkdir(exist_ok=True)
         for deb in debs:
@@ -62,13 +62,13 @@ class AptSource:
 
 
 def gpg_of(home: pathlib.Path) -> list[str]:
-    """What runs gpg with the keys in `home`, without questions."""
+    """The command line of gpg with the keys in `home`, without questions."""
     return ["gpg", "--homedir", str(home), "--batch", "--pinentry-mode", "loopback",
             "--passphrase", ""]
 
 
 def make_key(home: pathlib.Path, public: pathlib.Path) -> pathlib.Path:
-    """Makes a key in `home`, which is new, and returns the file `public` with its public part."""
+    """Makes a key in the new folder `home`, and returns the file `public` with its public part."""
     home.mkdir(mode=0o700)
     subprocess.run([*gpg_of(home), "--quick-generate-key", "DSSM's tests", "ed25519", "sign", "never"],
                    check=True, capture_output=True)

@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """A PC as a container: a real systemd 252 with its own file system, network and processes.
 
-It shares kernel and clock with this machine, so chronyd runs there without setting the clock. For
-mount, pid and network namespaces of the test's own: what is left ends with them.
+It shares kernel and clock with this machine, so chronyd runs there without setting the clock. The test
+runs in new mount, pid and network namespaces, with which all its remains end.
 """
 
 import contextlib
@@ -21,26 +21,26 @@ sys.path.insert(0, str(HERE.parent / "packages"))
 
 from tree import Unavailable, mount_overlay  # noqa: E402
 
-# To begin with; the bare PC of a vehicle.
+# Installed at the start: the bare PC of a vehicle.
 PACKAGES = "systemd,dbus,python3,sudo,nftables"
-# What the role and the packages may want to install.
+# Packages that the role and the packages may install.
 CACHED = "avahi-daemon chrony python3-apt"
-PATIENCE_S = 60.0  # for what takes a second
+TIMEOUT_S = 60.0  # for actions that take about a second
 
 ADDRESSES = ("10.77.0.{}/24", "10.78.0.{}/24", "fd77::{}/64", "fd78::{}/64")
 
 
 class Cgroups:
-    """Control groups of the container's own, one in each hierarchy that systemd uses.
+    """Control groups for the container, one in each hierarchy that systemd uses.
 
-    Without them it would take those of this process, which others may use as well.
+    Without them it would use those of this process, which other processes may use, too.
     """
 
     def __init__(self) -> None:
-        """Makes them. Unavailable where this process may not."""
+        """Creates them. Unavailable if this process may not."""
         self.folders: list[pathlib.Path] = []
-        # Not this process's number, which is 1 in each run: one that was killed leaves its groups. And one
-        # name for all hierarchies, or systemd-nspawn makes what it misses.
+        # Not the pid, which is 1 in each run, because a killed run leaves its groups. The same name in all
+        # hierarchies, otherwise systemd-nspawn creates missing groups.
         name = f"dssm-container-{secrets.token_hex(4)}"
         for line in pathlib.Path("/proc/self/cgroup").read_text().splitlines():
             _, controllers, group = line.split(":", 2)
@@ -49,12 +49,12 @@ class Cgroups:
                 try:
                     folder.mkdir()
                 except OSError as error:
-                    raise Unavailable(f"no control groups can be made here: {error}") from error
+                    raise Unavailable(f"control groups cannot be created here: {error}") from error
                 self.folders.append(folder)
 
     @staticmethod
     def _roots(controllers: str) -> Iterator[pathlib.Path]:
-        """Where the hierarchy of these controllers is mounted, if systemd needs it."""
+        """The mount point of the hierarchy of these controllers, if systemd needs it."""
         kind = {"": "cgroup2", "name=systemd": "cgroup"}.get(controllers)
         for line in pathlib.Path("/proc/self/mounts").read_text().splitlines():
             _, mount_point, found, options, *_ = line.split(" ")
@@ -63,12 +63,12 @@ class Cgroups:
                 return
 
     def enter(self) -> None:
-        """Moves this process there."""
+        """Moves this process into them."""
         for folder in self.folders:
             (folder / "cgroup.procs").write_text(str(os.getpid()))
 
     def remove(self) -> None:
-        """When no process is in them any more."""
+        """Removes them; no process may be in them."""
         for folder in self.folders:
             for below, _, _ in os.walk(folder, topdown=False):
                 os.rmdir(below)
@@ -78,7 +78,7 @@ class Container:
     """A PC at 10.77.0.2, 10.78.0.2, fd77::2 and fd78::2. This process is at the .1 of each."""
 
     def __init__(self, bare: pathlib.Path, scratch: pathlib.Path, name: str) -> None:
-        """Lays its file system over the bare tree. Unavailable where that cannot be."""
+        """Mounts its file system over the bare tree. Unavailable if this fails."""
         scratch.mkdir()
         self.name = name
         self._scratch = scratch
@@ -88,7 +88,7 @@ class Container:
         self._left = contextlib.ExitStack()
         self._left.callback(subprocess.run, ["umount", self.root], check=True)
         self._left.callback(self.power_off)
-        self.at_end = self._left.callback  # takes what is to be called when this is left
+        self.at_end = self._left.callback  # registers functions to call at the end
 
     def __enter__(self) -> "Container":
         return self
@@ -97,11 +97,11 @@ class Container:
         self._left.close()
 
     def boot(self) -> None:
-        """Returns when systemd has started all it is to start. Unavailable when it cannot run here."""
+        """Returns when systemd has started all units. Unavailable if it cannot run here."""
         self._cgroups = Cgroups()
         with socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as ready:
             ready.bind(str(self._scratch / "ready"))
-            ready.settimeout(PATIENCE_S)
+            ready.settimeout(TIMEOUT_S)
             log = (self._scratch / "log").open("w")
             self._nspawn = subprocess.Popen(
                 ["systemd-nspawn", "--quiet", "--register=no", "--keep-unit", "--notify-ready=yes",
@@ -109,33 +109,33 @@ class Container:
                  "--console=pipe", "--resolv-conf=off", "--boot"],
                 env=os.environ | {"NOTIFY_SOCKET": str(self._scratch / "ready")},
                 stdin=subprocess.DEVNULL, stdout=log, stderr=log, preexec_fn=self._cgroups.enter)
-            said = ""
+            messages = ""
             try:
-                while "READY=1" not in said:
-                    said += ready.recv(4096).decode() + "\n"
+                while "READY=1" not in messages:
+                    messages += ready.recv(4096).decode() + "\n"
             except TimeoutError:
                 self.power_off()
                 text = (self._scratch / "log").read_text()
                 raise Unavailable(f"systemd does not start in a container here: {text}") from None
         (self._scratch / "ready").unlink()
-        self._leader = int(re.search(r"^X_NSPAWN_LEADER_PID=([0-9]+)$", said, re.MULTILINE)[1])
+        self._leader = int(re.search(r"^X_NSPAWN_LEADER_PID=([0-9]+)$", messages, re.MULTILINE)[1])
         device = f"ve-{self.name}"
         for number, ip in ((1, ["ip"]), (2, ["nsenter", f"--target={self._leader}", "--net", "ip"])):
             for address in ADDRESSES:
-                # nodad: else it could not be used for the first second or two.
+                # nodad: otherwise the address is unusable for the first seconds.
                 subprocess.run([*ip, "address", "add", address.format(number), "dev",
                                 device if number == 1 else "host0",
                                 *(["nodad"] if ":" in address else [])], check=True)
             subprocess.run([*ip, "link", "set", device if number == 1 else "host0", "up"], check=True)
 
     def power_off(self) -> None:
-        """Ends it, if it runs."""
+        """Shuts it down if it runs."""
         if not self._nspawn:
             return
         nspawn, self._nspawn = self._nspawn, None
-        nspawn.terminate()  # which it takes as a wish to shut the container down
+        nspawn.terminate()  # systemd-nspawn then shuts the container down
         try:
-            nspawn.wait(PATIENCE_S)
+            nspawn.wait(TIMEOUT_S)
         finally:
             nspawn.kill()
             nspawn.wait()
@@ -143,28 +143,28 @@ class Container:
 
     @property
     def environment(self) -> dict[str, str]:
-        """What `enter` and programs in the container need."""
+        """The environment of `enter` and of programs in the container."""
         return {"PATH": "/usr/local/sbin:/usr/local/bin:/usr/sbin:/usr/bin", "LC_ALL": "C.UTF-8",
                 "DEBIAN_FRONTEND": "noninteractive", "DSSM_CONTAINER": str(self._leader)}
 
     def attempt(self, *words: str) -> subprocess.CompletedProcess[str]:
-        """Runs a program in the container; what it said is in stdout."""
+        """Runs a program in the container; its output is in stdout."""
         return subprocess.run(["nsenter", f"--target={self._leader}", "--all", *words],
                               env=self.environment, stdin=subprocess.DEVNULL,
                               stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     def run(self, *words: str) -> str:
-        """Runs a program in the container and returns what it says; a failure is an AssertionError."""
+        """Runs a program in the container and returns its output; a failure is an AssertionError."""
         done = self.attempt(*words)
         assert done.returncode == 0, f"{' '.join(words)}: {done.returncode}\n{done.stdout[-4000:]}"
         return done.stdout.strip()
 
     def path(self, name: str) -> pathlib.Path:
-        """A file of the running container, also of what it has mounted, such as /run."""
+        """A file of the running container, also in its mounts, such as /run."""
         return pathlib.Path(f"/proc/{self._leader}/root") / name.lstrip("/")
 
     def install(self, debs: list[pathlib.Path]) -> None:
-        """Installs packages whose dependencies are in the apt cache, by apt-get."""
+        """Installs packages with apt-get; their dependencies are in the apt cache."""
         folder = self.root / "debs"
         folder.mkdir()
         for deb in debs:

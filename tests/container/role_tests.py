@@ -1,6 +1,6 @@
 # SPDX-License-Identifier: Apache-2.0
-"""The role in ansible/ in those variants that the fleet (tests/fleet) has not: an apt source, another
-user than root, IPv6, a firewall, no firewall, and a PC that keeps its streams to itself."""
+"""Tests variants of the role in ansible/ that the fleet (tests/fleet) does not cover: an apt source,
+another user than root, IPv6, a firewall, no firewall, and a PC that other PCs cannot use."""
 
 import errno
 import json
@@ -14,7 +14,7 @@ import tempfile
 from collections.abc import Callable
 
 from apt_source import AptSource, make_key
-from container import HERE, PATIENCE_S, Container
+from container import HERE, TIMEOUT_S, Container
 from tree import field, repack
 
 ANSIBLE = HERE.parent.parent / "ansible"
@@ -26,11 +26,11 @@ ConditionCapability=
 ExecStart=
 ExecStart=!/usr/sbin/chronyd -F 1 -x
 """
-# In the networks of the vehicle, and in others; a container has the same ones, with .2.
+# Our addresses in the networks of the vehicle, and in other networks; the container's end with 2.
 FRIENDS = ("10.77.0.1", "fd77::1")
 STRANGERS = ("10.78.0.1", "fd78::1")
 
-# A PC's own firewall. It rejects instead of dropping, so that nobody has to wait for nothing.
+# The PC's firewall. It rejects instead of dropping, so that tests need not wait for a timeout.
 NFTABLES = """flush ruleset
 table inet filter {
   chain input {
@@ -42,12 +42,12 @@ table inet filter {
   }
 }
 """
-# Of somebody else, and in the way of whoever loads all rules anew.
+# A table of another program, which a reload of all rules would remove.
 FOREIGN_TABLE = "add table inet docker"
 
 
 def pc_of(address: str) -> str:
-    """The container's address in the network of one of ours."""
+    """The container's address in the same network as our `address`."""
     return re.sub("1$", "2", address)
 
 
@@ -57,9 +57,9 @@ def family_of(address: str) -> socket.AddressFamily:
 
 
 def connects(address: str) -> bool:
-    """Whether one of our addresses gets a TCP connection to dssmd; a closed port is a failure."""
+    """Whether a TCP connection from our `address` to dssmd succeeds; a closed port is an error."""
     with socket.socket(family_of(address), socket.SOCK_STREAM) as mine:
-        mine.settimeout(PATIENCE_S)
+        mine.settimeout(TIMEOUT_S)
         mine.bind((address, 0))
         try:
             mine.connect((pc_of(address), PORT))
@@ -70,12 +70,12 @@ def connects(address: str) -> bool:
 
 
 def passes(address: str, port: int) -> bool:
-    """Whether a datagram of one of our addresses gets through; a closed port is a failure."""
+    """Whether a datagram from our `address` passes; a closed port is an error."""
     with socket.socket(family_of(address), socket.SOCK_DGRAM) as mine:
         mine.bind((address, 0))
         mine.connect((pc_of(address), port))
-        mine.send(bytes([0x23]) + bytes(47))  # to chronyd a question; others pass it over
-        connects(address)  # what comes back on the same way behind a refusal, if there is one
+        mine.send(bytes([0x23]) + bytes(47))  # a request for chronyd; other services ignore it
+        connects(address)  # its answer arrives after a rejection of the datagram, if any
         code = mine.getsockopt(socket.SOL_SOCKET, socket.SO_ERROR)
     assert code in (0, errno.EHOSTUNREACH, errno.EACCES), f"{address} {port}: {os.strerror(code)}"
     return code == 0
@@ -95,7 +95,7 @@ class Playbooks:
             "dssm_verify_timeout": 20} | variables
 
     def attempt(self, playbook: str, **variables: object) -> subprocess.CompletedProcess[str]:
-        """Runs a playbook, with more variables as by -e; what it said is in stdout."""
+        """Runs a playbook with variables as for -e; its output is in stdout."""
         with tempfile.TemporaryDirectory() as folder:
             inventory = pathlib.Path(folder) / "inventory.json"
             inventory.write_text(json.dumps({"dssm": {"hosts": {"pc1": self.variables}}}))
@@ -107,20 +107,20 @@ class Playbooks:
                 stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.STDOUT, text=True)
 
     def run(self, playbook: str, **variables: object) -> int:
-        """Runs one that is to succeed, and returns how many tasks changed something."""
+        """Runs a playbook that must succeed; returns the number of tasks that changed something."""
         done = self.attempt(playbook, **variables)
         assert done.returncode == 0, done.stdout[-4000:]
         return int(re.search(r"^pc1 .* changed=([0-9]+) ", done.stdout, re.MULTILINE)[1])
 
     def refused(self, playbook: str, **variables: object) -> str:
-        """Runs one that is to fail, and returns what it says."""
+        """Runs a playbook that must fail; returns its output."""
         done = self.attempt(playbook, **variables)
         assert done.returncode != 0, done.stdout[-4000:]
         return done.stdout
 
 
 class RoleTests:
-    """A PC with a firewall, deployed from an apt source by a user who is not root, over IPv6, too."""
+    """A PC with a firewall, deployed from an apt source by a user other than root, also with IPv6."""
 
     def __init__(self, container: Container, debs: list[pathlib.Path]) -> None:
         self.container = container
@@ -141,7 +141,7 @@ class RoleTests:
         container.path("/etc/nftables.conf").write_text(NFTABLES)
         container.run("systemctl", "enable", "--now", "nftables")
         container.run("nft", FOREIGN_TABLE)
-        # This source is all that the PC reaches; Debian's packages are there, too.
+        # The PC reaches only this source, which also contains the packages of Debian.
         container.path("/etc/apt/sources.list").unlink()
         self.source.publish((container.root / "var/cache/apt/archives").glob("*.deb"))
         container.run("apt-get", "clean")
@@ -154,26 +154,26 @@ class RoleTests:
     def tests(self) -> list[tuple[str, Callable[[], None]]]:
         """Names and functions."""
         return [
-            ("an apt source whose signature is another's installs nothing", self.other_signature),
-            ("the role deploys a version of an apt source, as a user with sudo", self.deploy),
+            ("an apt source with a signature by another key installs nothing", self.other_signature),
+            ("the role deploys a given version from an apt source, as a user with sudo", self.deploy),
             ("a second run changes nothing, although the apt source has a newer version",
              self.deploy_again),
-            ("the firewall lets the vehicle's networks in, IPv4 and IPv6", self.let_friends_in),
-            ("the firewall keeps other networks out", self.keep_strangers_out),
+            ("the firewall accepts the vehicle's networks, IPv4 and IPv6", self.accept_friends),
+            ("the firewall rejects other networks", self.reject_strangers),
             ("the firewall is the same after a boot", self.boot),
-            ("upgrade.yml brings what is new in the apt source", self.upgrade),
-            ("remove.yml closes the firewall and takes the apt source away", self.remove),
+            ("upgrade.yml installs the newest version of the apt source", self.upgrade),
+            ("remove.yml closes the firewall and removes the apt source", self.remove),
         ]
 
     def installed(self) -> str:
-        """The version of dssmd, empty when there is none."""
+        """The installed version of dssmd, empty if none."""
         listed = self.container.attempt("dpkg-query", "--show", "--showformat=${Version}", "dssmd")
         return listed.stdout if listed.returncode == 0 else ""
 
     def other_signature(self) -> None:
         """Test."""
-        said = self.playbooks.refused("site.yml", dssm_apt_key=str(self.other_key))
-        assert "Failed to update apt cache" in said or "NO_PUBKEY" in said, said[-2000:]
+        output = self.playbooks.refused("site.yml", dssm_apt_key=str(self.other_key))
+        assert "Failed to update apt cache" in output or "NO_PUBKEY" in output, output[-2000:]
         assert not self.installed()
 
     def deploy(self) -> None:
@@ -189,27 +189,27 @@ class RoleTests:
         """Test."""
         assert self.playbooks.run("site.yml") == 0
 
-    def let_friends_in(self) -> None:
+    def accept_friends(self) -> None:
         """Test."""
         for friend in FRIENDS:
             assert connects(friend), friend
             assert passes(friend, 123), friend
             assert passes(friend, 5353), friend
 
-    def keep_strangers_out(self) -> None:
+    def reject_strangers(self) -> None:
         """Test."""
         for stranger in STRANGERS:
             assert not connects(stranger), stranger
             assert not passes(stranger, 123), stranger
             assert not passes(stranger, 5353), stranger
         tables = self.container.run("nft", "list", "tables")
-        assert "table inet docker" in tables, "the PC's rules were loaded anew: " + tables
+        assert "table inet docker" in tables, "the PC's rules were reloaded: " + tables
 
     def boot(self) -> None:
         """Test."""
         self.container.power_off()
         self.container.boot()
-        self.let_friends_in()
+        self.accept_friends()
         assert not any(map(connects, STRANGERS))
 
     def upgrade(self) -> None:
@@ -228,8 +228,8 @@ class RoleTests:
             assert not self.container.path(f"/etc/{file}").exists(), file
 
 
-class SecludedTests:
-    """A PC without nftables, deployed from a folder, that keeps its streams to itself."""
+class IsolatedTests:
+    """A PC without nftables, deployed from a folder, that other PCs cannot use."""
 
     def __init__(self, container: Container, debs: list[pathlib.Path]) -> None:
         self.container = container
@@ -237,7 +237,7 @@ class SecludedTests:
         container.run("apt-get", "install", "--yes", "--no-install-recommends", "avahi-daemon", "chrony")
         self.folder = container.root / "srv/debs"
         self.folder.mkdir()
-        # What it depends on as well, as for a PC without a network.
+        # Also the dependencies, as for a PC without a network.
         self.extra = []
         for deb in [*debs, *(container.root / "var/cache/apt/archives").glob("*.deb")]:
             shutil.copy(deb, self.folder)
@@ -250,8 +250,8 @@ class SecludedTests:
     def tests(self) -> list[tuple[str, Callable[[], None]]]:
         """Names and functions."""
         return [
-            ("the role deploys a PC without nftables that is to be alone", self.deploy),
-            ("a PC with dssm_insecure: false listens at loopback only", self.listen),
+            ("the role deploys an isolated PC without nftables", self.deploy),
+            ("a PC with dssm_insecure: false listens only at loopback", self.listen),
         ]
 
     def deploy(self) -> None:
@@ -266,5 +266,5 @@ class SecludedTests:
         assert status.endswith(f"listening at 127.0.0.1:{PORT}, [::1]:{PORT}"), status
         for friend in FRIENDS:
             with socket.socket(family_of(friend)) as mine:
-                mine.settimeout(PATIENCE_S)
+                mine.settimeout(TIMEOUT_S)
                 assert mine.connect_ex((pc_of(friend), PORT)) == errno.ECONNREFUSED, friend

@@ -7,23 +7,23 @@ import threading
 import time
 from collections.abc import Callable
 
-from container import PATIENCE_S, Container
+from container import TIMEOUT_S, Container
 
 SOCKET = "/run/dssm/dssmd.sock"
 CONFIGURATION = "/etc/dssm/dssmd.conf"
 
 
-class Visitors:
-    """Connect to dssmd's socket again and again, one after the other, inside the `with` block."""
+class Clients:
+    """Connect to dssmd's socket repeatedly, one after the other, inside the `with` block."""
 
     def __init__(self, container: Container) -> None:
         self._path = str(container.path(SOCKET))
-        self._thread = threading.Thread(target=self._come)
+        self._thread = threading.Thread(target=self._connect)
         self._end = False
         self.served = 0
         self.refused: list[OSError] = []
 
-    def __enter__(self) -> "Visitors":
+    def __enter__(self) -> "Clients":
         self._thread.start()
         return self
 
@@ -31,31 +31,31 @@ class Visitors:
         self._end = True
         self._thread.join()
 
-    def _come(self) -> None:
+    def _connect(self) -> None:
         while not self._end:
-            with socket.socket(socket.AF_UNIX) as visitor:
+            with socket.socket(socket.AF_UNIX) as client:
                 try:
-                    visitor.connect(self._path)
+                    client.connect(self._path)
                     self.served += 1
                 except OSError as error:
                     self.refused.append(error)
 
     def wait_for_refused(self) -> None:
-        """Until a thousand more were refused."""
+        """Waits until a thousand more were refused."""
         enough = len(self.refused) + 1000
-        wait_until(lambda: len(self.refused) >= enough, "nobody refuses visitors")
+        wait_until(lambda: len(self.refused) >= enough, "clients are not refused")
 
 
 def wait_until(condition: Callable[[], bool], otherwise: str) -> None:
-    """Until it holds; if that does not come, fails with `otherwise`."""
-    end = time.monotonic() + PATIENCE_S
+    """Waits until `condition` is true; after a timeout, fails with `otherwise`."""
+    end = time.monotonic() + TIMEOUT_S
     while not condition():
         assert time.monotonic() < end, otherwise
         time.sleep(0.02)
 
 
 class ServiceTests:
-    """The tests, in the order in which they have to run."""
+    """The tests, in the order in which they must run."""
 
     def __init__(self, container: Container, debs: list[pathlib.Path]) -> None:
         self.container = container
@@ -65,13 +65,13 @@ class ServiceTests:
         """Names and functions."""
         return [
             ("installing dssmd starts it, with its socket", self.install),
-            ("who connects never meets a closed socket over crashes", self.crash),
-            ("who connects never meets a closed socket over restarts", self.restart),
-            ("who connects never meets a closed socket when dssmd hangs", self.hang),
-            ("whoever connects, a stopped dssmd stays stopped, without its socket", self.stop),
-            ("a dssmd that was stopped right after its crash stays stopped", self.stop_after_crash),
-            ("a mistake in the configuration ends service and socket", self.mistake),
-            ("after a boot dssmd runs, and its socket was there first", self.boot),
+            ("clients never find a closed socket during crashes", self.crash),
+            ("clients never find a closed socket during restarts", self.restart),
+            ("clients never find a closed socket when dssmd hangs", self.hang),
+            ("a stopped dssmd stays stopped, without its socket, although clients connect", self.stop),
+            ("a dssmd that is stopped right after a crash stays stopped", self.stop_after_crash),
+            ("a mistake in the configuration stops service and socket", self.mistake),
+            ("after a boot dssmd runs, and its socket was started first", self.boot),
             ("removing dssmd leaves neither service nor socket", self.remove),
         ]
 
@@ -100,50 +100,50 @@ class ServiceTests:
         assert self.states() == ("active", "active"), self.states()
 
     def crash(self) -> None:
-        """Test. Seven in a row, because units that start five times in 10 s may be given up."""
-        with Visitors(self.container) as visitors:
+        """Test. Seven in a row, because systemd may stop units that start five times in 10 s."""
+        with Clients(self.container) as clients:
             for signal in ("KILL", "ABRT", "TERM", "KILL", "KILL", "KILL", "KILL"):
                 self.end_and_await_next(signal)
-        assert visitors.served and not visitors.refused, visitors.refused[:3]
+        assert clients.served and not clients.refused, clients.refused[:3]
 
     def restart(self) -> None:
         """Test."""
-        with Visitors(self.container) as visitors:
+        with Clients(self.container) as clients:
             for _ in range(3):
                 self.container.run("systemctl", "restart", "dssmd")
             self.container.run("systemctl", "daemon-reexec")
-        assert visitors.served and not visitors.refused, visitors.refused[:3]
+        assert clients.served and not clients.refused, clients.refused[:3]
 
     def hang(self) -> None:
-        """Test. The watchdog takes 10 s to notice; half a second is enough here."""
+        """Test. With a watchdog of half a second instead of 10 s."""
         drop_in = self.container.path("/run/systemd/system/dssmd.service.d/watchdog.conf")
         drop_in.parent.mkdir(parents=True)
         drop_in.write_text("[Service]\nWatchdogSec=500ms\n")
         self.container.run("systemctl", "daemon-reload")
         self.container.run("systemctl", "restart", "dssmd")
-        with Visitors(self.container) as visitors:
+        with Clients(self.container) as clients:
             self.end_and_await_next("STOP")
-        # Those for whom there was no more room in the queue of a socket that nobody serves wait, too.
-        assert visitors.served and not visitors.refused, visitors.refused[:3]
+        # Clients for which the socket's queue has no more space wait, too.
+        assert clients.served and not clients.refused, clients.refused[:3]
         drop_in.unlink()
         self.container.run("systemctl", "daemon-reload")
 
     def stop(self) -> None:
         """Test."""
         for _ in range(3):
-            with Visitors(self.container) as visitors:
+            with Clients(self.container) as clients:
                 self.container.run("systemctl", "stop", "dssmd")
-                visitors.wait_for_refused()
+                clients.wait_for_refused()
                 assert self.states() == ("inactive", "inactive"), self.states()
             self.container.run("systemctl", "start", "dssmd")
             assert self.states() == ("active", "active"), self.states()
 
     def stop_after_crash(self) -> None:
         """Test."""
-        with Visitors(self.container) as visitors:
+        with Clients(self.container) as clients:
             self.kill("KILL")
             self.container.run("systemctl", "stop", "dssmd")
-            visitors.wait_for_refused()
+            clients.wait_for_refused()
             assert "active" not in self.states(), self.states()
         self.container.run("systemctl", "start", "dssmd")
 
@@ -152,9 +152,9 @@ class ServiceTests:
         file = self.container.path(CONFIGURATION)
         right = file.read_text()
         file.write_text("no_such_key = 1\n")
-        with Visitors(self.container) as visitors:
+        with Clients(self.container) as clients:
             assert self.container.attempt("systemctl", "restart", "dssmd").returncode != 0
-            visitors.wait_for_refused()
+            clients.wait_for_refused()
             assert self.states() == ("failed", "inactive"), self.states()
         file.write_text(right)
         self.container.run("systemctl", "start", "dssmd")
@@ -172,4 +172,4 @@ class ServiceTests:
     def remove(self) -> None:
         """Test."""
         self.container.run("apt-get", "purge", "--yes", "dssmd")
-        wait_until(lambda: self.states() == ("inactive", "inactive"), f"they are {self.states()}")
+        wait_until(lambda: self.states() == ("inactive", "inactive"), f"their states are {self.states()}")
