@@ -27,8 +27,8 @@ event_base* new_base() noexcept {
 
 }  // namespace
 
-Result<EventLoop> EventLoop::open() {
-  Result<std::unique_ptr<TimerQueue>> timers = TimerQueue::open();
+Result<EventLoop> EventLoop::open(TimerQueue::Time time) {
+  Result<std::unique_ptr<TimerQueue>> timers = TimerQueue::open(time);
   if (!timers) return std::move(timers).error().context("create the event loop");
   EventLoop loop(*std::move(timers));
   if (!loop.base_) return os_error("create the event loop");
@@ -103,7 +103,7 @@ void EventSource::enable() noexcept { DSSM_CHECK(event_add(event_.get(), nullptr
 void EventSource::enable_in(Duration delay) noexcept {
   if (delay > Duration::zero()) {
     event_del(event_.get());
-    return timer_->start(deadline_in(delay));
+    return timer_->start_in(delay);
   }
   timer_->stop();
   DSSM_CHECK(event_add(event_.get(), &kAtOnce) == 0);

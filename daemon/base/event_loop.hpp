@@ -23,12 +23,19 @@ struct FreeEvent {
 
 class EventLoop {
  public:
-  static Result<EventLoop> open();
+  //   time  simulated: for tests, see TimerQueue
+  static Result<EventLoop> open(TimerQueue::Time time = TimerQueue::Time::real);
 
   // Runs callbacks until stop().
   Result<void> run();
   // Lets the running callback finish, then ends run().
   void stop() noexcept;
+
+  // The time that its timers go by. Code that sets timers reads the time here, not from MonoClock.
+  MonoTime now() const noexcept { return timers_->now(); }
+  // The same at a fifth of the price, some milliseconds late (clock::coarse_now()).
+  MonoTime coarse_now() const noexcept { return timers_->coarse_now(); }
+  MonoTime deadline_in(Duration delay) const noexcept { return timers_->deadline_in(delay); }
 
   event_base* base() const noexcept { return base_.get(); }
   TimerQueue& timers() const noexcept { return *timers_; }

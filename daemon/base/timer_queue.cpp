@@ -3,22 +3,30 @@
 
 #include <sys/timerfd.h>
 
+#include <algorithm>
 #include <utility>
 
 #include "core/base/check.hpp"
 
 namespace dssm::daemon {
 
-Result<std::unique_ptr<TimerQueue>> TimerQueue::open() {
+Result<std::unique_ptr<TimerQueue>> TimerQueue::open(Time time) {
   UniqueFd fd(::timerfd_create(CLOCK_MONOTONIC, TFD_NONBLOCK | TFD_CLOEXEC));
   if (!fd) return os_error("create a timer");
-  return std::unique_ptr<TimerQueue>(new TimerQueue(std::move(fd)));
+  std::unique_ptr<TimerQueue> queue(new TimerQueue(std::move(fd)));
+  if (time == Time::simulated) queue->simulated_ = MonoClock::now();
+  return queue;
+}
+
+MonoTime TimerQueue::deadline_in(Duration delay) const noexcept {
+  const MonoTime from = now();
+  return delay > kNever - from ? kNever : from + delay;
 }
 
 // Setting the timerfd also makes it unreadable, so that nobody has to read it.
 void TimerQueue::arm() noexcept {
   const MonoTime first = waiting_.empty() ? kNever : waiting_.begin()->first;
-  if (running_ || first == armed_) return;
+  if (running_ || simulated_ || first == armed_) return;
   armed_ = first;
   itimerspec when{};
   if (first != kNever) {
@@ -33,8 +41,8 @@ void TimerQueue::arm() noexcept {
 void TimerQueue::run_due() {
   running_ = true;
   // One that a callback starts is later than this, so the loop gets to its other events.
-  const MonoTime now = MonoClock::now();
-  while (!waiting_.empty() && waiting_.begin()->first <= now) {
+  const MonoTime until = now();
+  while (!waiting_.empty() && waiting_.begin()->first <= until) {
     Timer& due = *waiting_.begin()->second;
     due.stop();
     due.callback_();
@@ -42,6 +50,14 @@ void TimerQueue::run_due() {
   running_ = false;
   armed_ = MonoTime();  // it has expired
   arm();
+}
+
+bool TimerQueue::run_next() {
+  DSSM_CHECK(simulated_);
+  if (waiting_.empty()) return false;
+  simulated_ = std::max(*simulated_, waiting_.begin()->first);
+  run_due();
+  return true;
 }
 
 TimerQueue::Timer::Timer(TimerQueue& queue, const std::function<void()>& callback)

@@ -5,16 +5,22 @@
 // the first one due stays the same for thousands of samples. Here the kernel hears of a timer
 // only when another one is the first.
 //
+// The time of a queue is MonoClock's. In tests it can be simulated: then it stands still between
+// calls of run_next(), each of which sets it to the time of the first timer.
+//
 //   threads  one
 #pragma once
 
+#include <cstdint>
 #include <dssm/result.hpp>
 #include <dssm/time.hpp>
 #include <functional>
 #include <map>
 #include <memory>
+#include <optional>
 
 #include "core/base/unique_fd.hpp"
+#include "core/clock/coarse_now.hpp"
 
 namespace dssm::daemon {
 
@@ -22,13 +28,23 @@ class TimerQueue {
  public:
   class Timer;
 
+  enum class Time : std::uint8_t { real, simulated };
+
   //   fails  os errors: no descriptor left
-  static Result<std::unique_ptr<TimerQueue>> open();
+  static Result<std::unique_ptr<TimerQueue>> open(Time time = Time::real);
+
+  MonoTime now() const noexcept { return simulated_ ? *simulated_ : MonoClock::now(); }
+  MonoTime coarse_now() const noexcept { return simulated_ ? *simulated_ : clock::coarse_now(); }
+  // The time `delay` from now; kNever where that would overflow.
+  MonoTime deadline_in(Duration delay) const noexcept;
+  bool is_simulated() const noexcept { return simulated_.has_value(); }
 
   // Gets readable when a timer is due. To be watched edge-triggered, and never read.
   int fd() const noexcept { return fd_.get(); }
   // Then calls back those that are due, in the order of their times.
   void run_due();
+  // Simulated time only: runs the first timer and those of the same time; false without a timer.
+  bool run_next();
 
  private:
   using Waiting = std::multimap<MonoTime, Timer*>;  // of one time: in the order of their starts
@@ -37,6 +53,7 @@ class TimerQueue {
   void arm() noexcept;
 
   UniqueFd fd_;
+  std::optional<MonoTime> simulated_;
   Waiting waiting_;
   MonoTime armed_ = kNever;  // what the kernel was told last
   bool running_ = false;
@@ -53,6 +70,7 @@ class TimerQueue::Timer {
   ~Timer();
 
   void start(MonoTime when) noexcept;
+  void start_in(Duration delay) noexcept { start(queue_.deadline_in(delay)); }
   void stop() noexcept;
 
  private:

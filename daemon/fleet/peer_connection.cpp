@@ -41,7 +41,8 @@ std::string_view state_name(PeerConnection::State state) noexcept {
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver,
                                std::optional<wire::HostId> expected, Dialer::Options options,
                                Observer& observer)
-    : configured_(options.addresses.front()),
+    : loop_(loop),
+      configured_(options.addresses.front()),
       expected_(expected),
       self_(options.self),
       observer_(observer),
@@ -65,7 +66,7 @@ void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) 
 }
 
 void PeerConnection::enter(State state, std::optional<Error> why) {
-  if (state != state_) since_ = MonoClock::now();
+  if (state != state_) since_ = loop_.now();
   state_ = state;
   why_ = std::move(why);
 }
@@ -149,7 +150,7 @@ void PeerConnection::keep_alive() { beat(); }
 void PeerConnection::beat() {
   FrameConnection* link = dialer_.link();
   if (!link) return;
-  const MonoTime now = MonoClock::now();
+  const MonoTime now = loop_.now();
   const Duration silence = now - link->last_heard();
   const Duration allowed = link->output_empty() ? wire::kPeerTimeout : kSilenceBehindOutput;
   if (silence >= allowed) {
@@ -173,7 +174,7 @@ void PeerConnection::take_clock(std::shared_ptr<const wire::ClockReport> clock) 
 
 void PeerConnection::on_pong(MonoTime asked, const Result<net::Frame>& answer) {
   if (!answer || !answer->has_pong()) return;
-  last_round_trip_ = MonoClock::now() - asked;
+  last_round_trip_ = loop_.now() - asked;
   least_round_trip_ = least_round_trip_ == Duration::zero()
                           ? last_round_trip_
                           : std::min(least_round_trip_, last_round_trip_);

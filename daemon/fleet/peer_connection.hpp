@@ -87,7 +87,7 @@ class PeerConnection final : private Dialer::Observer {
   // --- about the peer
 
   State state() const noexcept { return state_; }
-  Duration in_this_state_for() const noexcept { return MonoClock::now() - since_; }
+  Duration in_this_state_for() const noexcept { return loop_.now() - since_; }
   const std::optional<Error>& why() const noexcept { return why_; }  // it is not up
   // Who answers there; while it is not up, who did last.
   const std::optional<wire::Greeting>& them() const noexcept { return them_; }
@@ -117,12 +117,13 @@ class PeerConnection final : private Dialer::Observer {
   PeerConnection(const EventLoop& loop, Resolver& resolver, std::optional<wire::HostId> expected,
                  Dialer::Options options, Observer& observer);
 
+  const EventLoop& loop_;
   wire::Address configured_;
   const std::optional<wire::HostId> expected_;
   const wire::Greeting self_;
   Observer& observer_;
   State state_ = State::connecting;
-  MonoTime since_ = MonoClock::now();
+  MonoTime since_ = loop_.now();
   std::optional<Error> why_;
   std::optional<wire::Greeting> them_;
   Duration last_round_trip_{}, least_round_trip_{};

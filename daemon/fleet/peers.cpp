@@ -92,7 +92,8 @@ void Peers::on_host_found(const FoundHost& host) {
                              {.peer = host.name, .message_id = message_id::kHostRefused});
     }
     known = &peers_.emplace_back();
-    known->found.emplace();
+    known->found = Found{};
+    known->found->since = loop_.now();
   }
   known->found->listed = true;
   known->found->host = host;

@@ -108,7 +108,7 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   struct Found {
     FoundHost host;
     bool listed = true;  // mDNS still knows it
-    MonoTime since = MonoClock::now();
+    MonoTime since;
     std::vector<wire::Address> usable;  // of its addresses
     std::optional<Obstacle> obstacle;
   };

@@ -67,7 +67,7 @@ local::Host Peers::shown(const Peer& peer) const {
     host.set_name(found.name);
     host.set_host_id(found.id.data(), found.id.size());
     host.set_state("connecting");
-    host.set_since_ns(to_ns(MonoClock::now() - peer.found->since));
+    host.set_since_ns(to_ns(loop_.now() - peer.found->since));
     if (peer.use != Use::none) host.add_addresses(peer.link->address());
     for (const wire::Address& address : found.addresses) {
       if (peer.use == Use::none || address.str() != peer.link->address()) {

@@ -197,14 +197,14 @@ Result<void> Dialer::State::greet_untrusted(const net::Frame& frame) {
   them = *std::move(greeting);
   timer.disable();
   step = Step::up;
-  up_since = MonoClock::now();
+  up_since = loop.now();
   observer.on_up(*link, *them);
   return {};
 }
 
 void Dialer::State::fail(const Error& why) {
   // A server that greets and then refuses is not asked 20 times a second.
-  if (step == Step::up && MonoClock::now() - up_since >= kLongestPause) pause = kFirstPause;
+  if (step == Step::up && loop.now() - up_since >= kLongestPause) pause = kFirstPause;
   const bool of_no_use = std::exchange(given_up, false) || step == Step::greet;
   last_choice = of_no_use ? addresses[current].str() : std::string();
   step = Step::pause;

@@ -31,7 +31,8 @@ std::size_t total(std::span<const iovec> parts) noexcept {
 
 FrameConnection::FrameConnection(const EventLoop& loop, std::unique_ptr<wire::Transport> transport,
                                  Observer& observer, std::size_t max_queued_bytes)
-    : transport_(std::move(transport)),
+    : loop_(loop),
+      transport_(std::move(transport)),
       observer_(observer),
       max_queued_bytes_(max_queued_bytes),
       decoder_(*this, wire::kMaxNetworkFrameBytes),
@@ -75,7 +76,7 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& si
                                                   "middle of a frame"};
       break;
     }
-    last_heard_ = clock::coarse_now();
+    last_heard_ = loop_.coarse_now();
     received += got->bytes;
     if (!hand_out(got->bytes)) return;
     if (paused_ || held_ || got->bytes < room) break;

@@ -138,6 +138,7 @@ class FrameConnection final : private wire::FrameDelegate {
   void lose_output();
   void close(const Error& why);
 
+  const EventLoop& loop_;
   std::unique_ptr<wire::Transport> transport_;
   Observer& observer_;
   SampleDelegate* samples_ = nullptr;
@@ -154,7 +155,7 @@ class FrameConnection final : private wire::FrameDelegate {
   bool handing_out_ = false;  // the decoder is at work
   bool held_ = false;         // it was told to stop, and may have more
   Error why_;
-  MonoTime last_heard_ = MonoClock::now();
+  MonoTime last_heard_ = loop_.now();
   EventSource readable_, writable_, next_turn_, ended_;
 };
 

@@ -50,7 +50,8 @@ Error unexpected(const std::string& host) {
 FleetService::FleetService(const EventLoop& loop, Self self, const Registry& registry,
                            Catalog& catalog, Peers& peers, MirrorKeeper& mirrors,
                            RemoteWriterKeeper& writers)
-    : self_(std::move(self)),
+    : loop_(loop),
+      self_(std::move(self)),
       registry_(registry),
       catalog_(catalog),
       peers_(peers),
@@ -230,7 +231,7 @@ std::vector<StreamInfo> FleetService::known_streams() const {
 void FleetService::list(Then<std::vector<proto::Stream>> then) {
   const auto listing = std::make_shared<Listing>();
   listing->then = std::move(then);
-  listing->deadline = deadline_in(kFreshTimeout);
+  listing->deadline = loop_.deadline_in(kFreshTimeout);
   listing->unanswered = catalog_.hosts().size() + 1;  // this function is one of them until its end
   for (const auto& [id, host] : catalog_.hosts()) {
     net::Frame request;
@@ -278,8 +279,8 @@ void FleetService::finish(Listing& listing) {
 void FleetService::on_list_timeout() {
   while (!listings_.empty()) {
     const std::shared_ptr<Listing> first = listings_.front();
-    if (!first->done && first->deadline > MonoClock::now()) {
-      return list_timer_.enable_in(first->deadline - MonoClock::now());
+    if (!first->done && first->deadline > loop_.now()) {
+      return list_timer_.enable_in(first->deadline - loop_.now());
     }
     listings_.pop_front();
     finish(*first);
@@ -343,11 +344,11 @@ void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {
     PeerConnection& link = *peers_.link_to((*known)->greeting.host_id);
     net::Frame request;
     wire::send_clock(self_.greeting, *request.mutable_ping()->mutable_clock());
-    link.ask(std::move(request), [address = link.address(), sent = MonoClock::now(),
+    link.ask(std::move(request), [address = link.address(), &loop = loop_, sent = loop_.now(),
                                   then = std::move(then)](Result<net::Frame> answer) {
       if (!answer) return then(std::move(answer).error());
       local::RoundTrip round_trip;
-      round_trip.set_round_trip_ns(to_ns(MonoClock::now() - sent));
+      round_trip.set_round_trip_ns(to_ns(loop.now() - sent));
       round_trip.set_address(address);
       then(std::move(round_trip));
     });

@@ -95,6 +95,7 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
 
   Duration clock_distance_to(const local::Host& host) const;
 
+  const EventLoop& loop_;
   const Self self_;
   const Registry& registry_;
   Catalog& catalog_;

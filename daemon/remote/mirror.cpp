@@ -118,7 +118,7 @@ Result<void> Mirror::on_opened_untrusted(const net::Opened& opened) {
   step_ = Step::subscribing;
   link.send(frame);
   state_ = State::filling;
-  patience_ends_ = deadline_in(kFillTimeout);
+  patience_ends_ = parts_.loop.deadline_in(kFillTimeout);
   for (Waiting& one : waiting_) one.deadline = patience_ends_;
   arm_wait_timer();
   return {};
@@ -283,7 +283,7 @@ void Mirror::open(Then then) {
   }
   done_ = false;
   const Duration longest = state_ == State::filling ? kFillTimeout : kOwnerTimeout;
-  waiting_.push_back({std::move(then), deadline_in(longest)});
+  waiting_.push_back({std::move(then), parts_.loop.deadline_in(longest)});
   arm_wait_timer();
   if (state_ == State::removed) channel_.try_again();
 }
@@ -352,12 +352,12 @@ void Mirror::arm_wait_timer() {
   if (waiting_.empty() && replaced_.empty()) return wait_timer_.disable();
   MonoTime first = replaced_.empty() ? kNever : patience_ends_;
   for (const Waiting& one : waiting_) first = std::min(first, one.deadline);
-  wait_timer_.enable_in(std::max(first - MonoClock::now(), Duration::zero()));
+  wait_timer_.enable_in(std::max(first - parts_.loop.now(), Duration::zero()));
 }
 
 // What has come by now has to do; those who came later may wait longer.
 void Mirror::on_wait_timer() {
-  const MonoTime now = MonoClock::now();
+  const MonoTime now = parts_.loop.now();
   if (now >= patience_ends_) notify_replaced();
   const auto later = std::stable_partition(
       waiting_.begin(), waiting_.end(), [now](const Waiting& one) { return one.deadline <= now; });
@@ -409,7 +409,7 @@ void Mirror::log_error() {
 }
 
 void Mirror::log_gaps(std::uint64_t samples) {
-  const auto unlogged = gap_lines_.admit(MonoClock::now(), samples);
+  const auto unlogged = gap_lines_.admit(parts_.loop.now(), samples);
   if (!unlogged) return;
   parts_.logger.warning(
       "mirror '" + name_ + "' lacks " + std::to_string(*unlogged) +

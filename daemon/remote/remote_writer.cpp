@@ -27,7 +27,7 @@ RemoteWriter::RemoteWriter(const ChannelParts& parts, Keeper& keeper, StreamId i
       room_(std::move(room)),
       name_(id_.str()),
       lender_([this] {
-        drain_ends_ = deadline_in(kDrainTimeout);
+        drain_ends_ = parts_.loop.deadline_in(kDrainTimeout);
         drain_timer_.enable_in(Duration::zero());
       }),
       wait_timer_(EventSource::timer(parts.loop, [this] { on_wait_timer(); })),
@@ -217,7 +217,7 @@ Result<void> RemoteWriter::note_published_untrusted(Tid last) {
 
 void RemoteWriter::on_gap(Tid, std::uint64_t count) {
   lost_samples_ += count;
-  const auto unlogged = loss_lines_.admit(MonoClock::now(), count);
+  const auto unlogged = loss_lines_.admit(parts_.loop.now(), count);
   if (!unlogged) return;
   parts_.logger.warning(
       "stream '" + name_ + "' lacks " + std::to_string(*unlogged) + " samples written here, " +
@@ -240,8 +240,8 @@ void RemoteWriter::open(const CreatePlan* plan, Then then) {
     if (Result<void> usable = check_plan(plan); !usable) return then(std::move(usable).error());
     return then(lend(false));
   }
-  waiting_.push_back(
-      {std::move(then), plan ? std::optional(*plan) : std::nullopt, deadline_in(kOwnerTimeout)});
+  waiting_.push_back({std::move(then), plan ? std::optional(*plan) : std::nullopt,
+                      parts_.loop.deadline_in(kOwnerTimeout)});
   arm_wait_timer();
   if (ring_) channel_.try_again();
 }
@@ -300,11 +300,11 @@ void RemoteWriter::fail_waiting(const Error& why) {
 
 void RemoteWriter::arm_wait_timer() {
   if (waiting_.empty()) return wait_timer_.disable();
-  wait_timer_.enable_in(std::max(waiting_.front().deadline - MonoClock::now(), Duration::zero()));
+  wait_timer_.enable_in(std::max(waiting_.front().deadline - parts_.loop.now(), Duration::zero()));
 }
 
 void RemoteWriter::on_wait_timer() {
-  const MonoTime now = MonoClock::now();
+  const MonoTime now = parts_.loop.now();
   const auto later = std::find_if(waiting_.begin(), waiting_.end(),
                                   [now](const Waiting& one) { return one.deadline > now; });
   const std::vector<Waiting> overdue(waiting_.begin(), later);
@@ -321,7 +321,7 @@ void RemoteWriter::on_wait_timer() {
 // All programs have closed it.
 void RemoteWriter::on_drain_timer() {
   if (lender_.any_lent() || !waiting_.empty()) return;
-  const MonoTime now = MonoClock::now();
+  const MonoTime now = parts_.loop.now();
   if (ring_->all_published()) return end();
   if (now < drain_ends_) {
     feed_->look();  // a writer that was killed may not have rung

@@ -150,7 +150,7 @@ void ChannelServer::on_stream_removed(const Stream& stream) {
 
 void ChannelServer::on_heartbeat() {
   if (parts_.on_heartbeat) parts_.on_heartbeat();
-  const MonoTime now = MonoClock::now();
+  const MonoTime now = parts_.loop.now();
   if (now - looked_ < kLookPeriod) return;
   looked_ = now;
   streams_.look_at_all();

@@ -240,7 +240,7 @@ void DataCommunicator::on_output_empty() { work_now(); }
 }
 
 void DataCommunicator::watch_silence() {
-  const Duration silent = MonoClock::now() - link_.last_heard();
+  const Duration silent = parts_.loop.now() - link_.last_heard();
   // While the link is paused it is us who do not listen.
   if (silent < wire::kPeerTimeout || link_.is_paused()) {
     const Duration rest = wire::kPeerTimeout - silent;

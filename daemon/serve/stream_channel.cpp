@@ -139,7 +139,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
 
 [[gnu::hot]] Result<void> StreamChannel::go_on_pumping(bool request_waits) {
   if (!pump_) return {};
-  const MonoTime now = pump_->thins() ? MonoClock::now() : MonoTime{};
+  const MonoTime now = pump_->thins() ? parts_.loop.now() : MonoTime{};
   feed_->forget(*this);
   Result<PumpWait> wait = pump_->pump(now, request_waits);
   for (int looks = 0; wait && *wait == PumpWait::news; ++looks) {

@@ -47,6 +47,24 @@ class TimerQueueTest : public testing::Test {
   std::string fired;
 };
 
+TEST_F(TimerQueueTest, SimulatedTimeStandsStillBetweenTimers) {
+  queue = TimerQueue::open(TimerQueue::Time::simulated).value();
+  const MonoTime begin = queue->now();
+  EXPECT_FALSE(queue->run_next());
+  const auto hour = noting('h'), second = noting('s'), same = noting('e');
+  hour->timer.start_in(1h);
+  second->timer.start_in(1s);
+  same->timer.start_in(1s);
+  EXPECT_TRUE(queue->run_next());
+  EXPECT_EQ(fired, "se");
+  EXPECT_EQ(queue->now(), begin + 1s);
+  EXPECT_EQ(queue->coarse_now(), queue->now());
+  EXPECT_TRUE(queue->run_next());
+  EXPECT_EQ(queue->now(), begin + 1h);
+  EXPECT_EQ(queue->deadline_in(Duration::max()), kNever);
+  EXPECT_FALSE(is_readable(0)) << "the kernel has no part in it";
+}
+
 TEST_F(TimerQueueTest, FiresInTheOrderOfTimesNotBefore) {
   const auto a = noting('a'), b = noting('b'), c = noting('c'), d = noting('d');
   const MonoTime begin = MonoClock::now();

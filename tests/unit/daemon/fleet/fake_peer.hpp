@@ -36,7 +36,10 @@ inline net::Frame answer_to(const net::Frame& request) {
 // A peer that answers heartbeats and Watch by itself.
 class FakePeer {
  public:
-  explicit FakePeer(const EventLoop& loop, const std::string& name = "pc2") : owner(loop, name) {}
+  explicit FakePeer(const EventLoop& loop, const std::string& name = "pc2")
+      : owner(loop, name), delay_timer_(EventSource::timer(loop, [this] {
+          for (const net::Frame& pong : std::exchange(delayed_, {})) owner.send(pong);
+        })) {}
 
   // Answers what came; to be called while waiting for something.
   void serve() {
@@ -48,6 +51,9 @@ class FakePeer {
         if (silent) continue;
         answer.mutable_pong()->mutable_clock()->set_bound_ns(1000);
         answer.mutable_pong()->mutable_clock()->set_anchor(std::string(16, 'r'));
+        delayed_.push_back(answer);
+        delay_timer_.enable_in(delay);
+        continue;
       } else if (request.has_watch()) {
         ++watches;
         for (const std::string& stream : streams) tell(stream, false);
@@ -74,7 +80,12 @@ class FakePeer {
   std::vector<std::string> streams;
   std::vector<net::Frame> asked;
   bool silent = false;
+  Duration delay{};  // until a ping is answered
   int pings = 0, watches = 0;
+
+ private:
+  std::vector<net::Frame> delayed_;
+  EventSource delay_timer_;
 };
 
 }  // namespace dssm::daemon

@@ -16,7 +16,7 @@ namespace {
 
 class FleetServiceTest : public testing::Test {
  protected:
-  EventLoop loop = EventLoop::open().value();
+  EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Resolver resolver{loop};
   Registry registry{"pc1", kLimits};
   KeptLog log;

@@ -24,13 +24,9 @@
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/link/frame_connection.hpp"
 #include "daemon/link/raw_bytes.hpp"
+#include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
-
-// Runs callbacks until `done`; meson's time-out is the watchdog.
-inline void run_until(const EventLoop& loop, const std::function<bool()>& done) {
-  while (!done()) event_base_loop(loop.base(), EVLOOP_ONCE);
-}
 
 inline wire::Greeting greeting_of(const std::string& host) {
   wire::Greeting greeting;
@@ -133,6 +129,7 @@ class FakeOwner final : private FrameConnection::Observer, private FrameConnecti
   void accept_one() {
     UniqueFd socket(::accept4(listening_.get(), nullptr, nullptr, SOCK_NONBLOCK | SOCK_CLOEXEC));
     ASSERT_TRUE(socket);
+    wire::set_channel_options(socket.get());
     got_.clear();
     ended_ = false;
     greeted_ = false;

@@ -51,7 +51,7 @@ class Program {
 
 class RemoteWritersTest : public testing::Test {
  protected:
-  EventLoop loop = EventLoop::open().value();
+  EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Resolver resolver{loop};
   Registry registry{"pc1", kLimits};
   KeptLines logger;
