@@ -1,4 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// Timers behind one timerfd, alone and in an event loop: their order, starting and stopping in
+// callbacks, which system calls they cost, and simulated time.
 #include "daemon/base/timer_queue.hpp"
 
 #include <gtest/gtest.h>
