@@ -11,8 +11,8 @@
 #include <dssm/result.hpp>
 #include <memory>
 
+#include "core/base/sealed_memory.hpp"
 #include "core/base/shared_snapshot.hpp"
-#include "core/base/unique_fd.hpp"
 
 namespace dssm::clock {
 
@@ -57,7 +57,6 @@ class PlaybackRecord {
   static Result<std::shared_ptr<PlaybackRecord>> open_untrusted(int fd);
   PlaybackRecord(const PlaybackRecord&) = delete;
   PlaybackRecord& operator=(const PlaybackRecord&) = delete;
-  ~PlaybackRecord();
 
   // Real time, where a hostile program keeps changing it.
   PlaybackSetting load() const noexcept;
@@ -67,16 +66,17 @@ class PlaybackRecord {
   template <class Change>
   bool update(Change change) noexcept {
     if (!lock()) return false;
-    page_->setting.store(change(load()));
+    page().setting.store(change(load()));
     unlock();
     return true;
   }
 
  private:
-  PlaybackRecord() = default;
+  explicit PlaybackRecord(SharedMapping mapping) noexcept : mapping_(std::move(mapping)) {}
+  PlaybackPage& page() const noexcept { return mapping_.as<PlaybackPage>(); }
   bool lock() noexcept;
   void unlock() noexcept;
-  PlaybackPage* page_ = nullptr;
+  SharedMapping mapping_;
 };
 
 }  // namespace dssm::clock

@@ -1,10 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/ring/bell.hpp"
 
-#include <fcntl.h>
 #include <linux/futex.h>
-#include <sys/mman.h>
-#include <sys/stat.h>
 #include <sys/syscall.h>
 #include <unistd.h>
 
@@ -14,11 +11,11 @@
 #include <climits>
 
 #include "core/base/timespec.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ring {
 namespace {
 
-constexpr int kBellSeals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL;
 constexpr std::size_t kMaxBells = 128;  // FUTEX_WAITV_MAX
 
 // Linux 5.16's futex_waitv; Debian 12's headers have it, the C library has no wrapper.
@@ -44,41 +41,20 @@ WaitStatus outcome(long result, int error, MonoTime deadline) noexcept {
 
 }  // namespace
 
-Result<UniqueFd> create_bell() {
-  UniqueFd fd(::memfd_create("dssm-bell", MFD_CLOEXEC | MFD_ALLOW_SEALING));
-  if (!fd) return os_error("create a bell: memfd_create");
-  if (::ftruncate(fd.get(), sizeof(BellPage)) || ::fchmod(fd.get(), 0600) ||
-      ::fcntl(fd.get(), F_ADD_SEALS, kBellSeals)) {
-    return os_error("create a bell");
-  }
-  return fd;
-}
+Result<UniqueFd> create_bell() { return create_sealed_memory("dssm-bell", sizeof(BellPage), 0600); }
 
 Result<std::shared_ptr<Bell>> Bell::open_untrusted(int fd) {
-  struct stat file {};
-  const int seals = ::fcntl(fd, F_GET_SEALS);
-  if (seals < 0 || (seals & kBellSeals) != kBellSeals || ::fstat(fd, &file) ||
-      file.st_size != sizeof(BellPage)) {
-    return Error{Errc::protocol, "this is no bell: no memory file of one page with a sealed size"};
-  }
-  void* page = ::mmap(nullptr, sizeof(BellPage), PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0);
-  if (page == MAP_FAILED) return os_error("map a bell");
-  std::shared_ptr<Bell> bell(new Bell);
-  bell->page_ = static_cast<BellPage*>(page);
-  return bell;
-}
-
-Bell::~Bell() {
-  if (page_) ::munmap(page_, sizeof(BellPage));
+  return std::shared_ptr<Bell>(
+      new Bell(DSSM_TRY(SharedMapping::map_sealed_untrusted(fd, sizeof(BellPage), "bell"))));
 }
 
 [[gnu::hot]] void Bell::ring_slowly() noexcept {
   // The addition clears bit 0 and moves the count; between the load in ring() and here another
   // writer may have done so, then it also woke all.
-  std::uint32_t word = page_->word.load(std::memory_order_relaxed);
+  std::uint32_t word = page().word.load(std::memory_order_relaxed);
   while (word & kSleeper) {
-    if (page_->word.compare_exchange_weak(word, word + 1, std::memory_order_seq_cst)) {
-      ::syscall(SYS_futex, &page_->word, FUTEX_WAKE, INT_MAX, nullptr, nullptr, 0);
+    if (page().word.compare_exchange_weak(word, word + 1, std::memory_order_seq_cst)) {
+      ::syscall(SYS_futex, &page().word, FUTEX_WAKE, INT_MAX, nullptr, nullptr, 0);
       return;
     }
   }
@@ -87,11 +63,11 @@ Bell::~Bell() {
 [[gnu::hot]] WaitStatus Bell::sleep(std::uint32_t announced, MonoTime deadline) noexcept {
   if (deadline == kNever) {  // kMaxSleep from now on, without asking when that is
     const long result =
-        ::syscall(SYS_futex, &page_->word, FUTEX_WAIT, announced, &kMaxSleepTime, nullptr, 0);
+        ::syscall(SYS_futex, &page().word, FUTEX_WAIT, announced, &kMaxSleepTime, nullptr, 0);
     return outcome(result, errno, deadline);
   }
   const timespec until = timespec_of(look_up(deadline));
-  const long result = ::syscall(SYS_futex, &page_->word, FUTEX_WAIT_BITSET, announced, &until,
+  const long result = ::syscall(SYS_futex, &page().word, FUTEX_WAIT_BITSET, announced, &until,
                                 nullptr, FUTEX_BITSET_MATCH_ANY);
   return outcome(result, errno, deadline);
 }
@@ -101,7 +77,7 @@ WaitStatus Bell::sleep_any(std::span<Bell* const> bells, std::span<const std::ui
   std::array<WaitVector, kMaxBells> vectors;
   const std::size_t count = std::min(bells.size(), kMaxBells);
   for (std::size_t i = 0; i < count; ++i) {
-    vectors[i] = {announced[i], reinterpret_cast<std::uintptr_t>(&bells[i]->page_->word), kFutex32,
+    vectors[i] = {announced[i], reinterpret_cast<std::uintptr_t>(&bells[i]->page().word), kFutex32,
                   0};
   }
   timespec until = timespec_of(look_up(deadline));

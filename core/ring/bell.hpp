@@ -16,7 +16,7 @@
 #include <memory>
 #include <span>
 
-#include "core/base/unique_fd.hpp"
+#include "core/base/sealed_memory.hpp"
 #include "core/ring/layout.hpp"
 
 namespace dssm::ring {
@@ -29,39 +29,38 @@ Result<UniqueFd> create_bell();
 // A mapped bell page. Shared by shared_ptr; thread-safe.
 class Bell {
  public:
-  // Fails with `protocol` when `fd` is no sealed file of the right size. Does not keep `fd`.
+  // Fails with `protocol` when `fd` is not a sealed memory file of the right size. Does not keep `fd`.
   static Result<std::shared_ptr<Bell>> open_untrusted(int fd);
 
   Bell(const Bell&) = delete;
   Bell& operator=(const Bell&) = delete;
-  ~Bell();
 
   // --- writers, after publishing
 
   // Before: a sleeper or dssmd wrote to the line that ring() looks at, so it has to come from
   // another processor, and may do so while the payload is copied.
-  void expect_ring() const noexcept { __builtin_prefetch(page_); }
+  void expect_ring() const noexcept { __builtin_prefetch(mapping_.base()); }
 
   // Wakes all sleepers; without any, one load of a line that nobody writes.
   void ring() noexcept {
-    if (page_->word.load(std::memory_order_seq_cst) & kSleeper) ring_slowly();
+    if (page().word.load(std::memory_order_seq_cst) & kSleeper) ring_slowly();
   }
 
   // Whether dssmd wants to be rung through the stream's eventfd.
   bool doorbell_armed() const noexcept {
-    return page_->doorbell_armed.load(std::memory_order_seq_cst) != 0;
+    return page().doorbell_armed.load(std::memory_order_seq_cst) != 0;
   }
 
   // --- dssmd
   void arm_doorbell(bool armed) noexcept {
-    page_->doorbell_armed.store(armed ? 1 : 0, std::memory_order_seq_cst);
+    page().doorbell_armed.store(armed ? 1 : 0, std::memory_order_seq_cst);
   }
 
   // --- sleepers
 
   // Announces a sleeper; returns the value to hand to sleep(). Look at the ring between the two.
   std::uint32_t announce() noexcept {
-    return page_->word.fetch_or(kSleeper, std::memory_order_seq_cst) | kSleeper;
+    return page().word.fetch_or(kSleeper, std::memory_order_seq_cst) | kSleeper;
   }
 
   // Sleeps until the word differs from `announced`, or `deadline`. May also return `ready` without
@@ -75,9 +74,10 @@ class Bell {
 
  private:
   static constexpr std::uint32_t kSleeper = 1;
-  Bell() = default;
+  explicit Bell(SharedMapping mapping) noexcept : mapping_(std::move(mapping)) {}
+  BellPage& page() const noexcept { return mapping_.as<BellPage>(); }
   void ring_slowly() noexcept;
-  BellPage* page_ = nullptr;
+  SharedMapping mapping_;
 };
 
 }  // namespace dssm::ring

@@ -12,7 +12,7 @@
 #include <memory>
 #include <string>
 
-#include "core/base/unique_fd.hpp"
+#include "core/base/sealed_memory.hpp"
 #include "core/ring/geometry.hpp"
 #include "core/ring/layout.hpp"
 
@@ -39,13 +39,6 @@ Result<UniqueFd> create_ring(const RingIdentity& identity, const Geometry& geome
 //   fails  no_memory
 Result<void> reserve(int fd, const Geometry& geometry);
 
-// A second descriptor for the same ring that cannot be mapped or made writable. Only for the user
-// who created the ring.
-Result<UniqueFd> reopen_read_only(int fd);
-
-// The way back, for a daemon that got back only read-only descriptors of a ring it created once.
-Result<UniqueFd> reopen_read_write(int fd);
-
 // A mapped ring. Immutable after open(); share it by shared_ptr between readers and writers of one
 // process. Unmapped by the destructor.
 class RingMapping {
@@ -58,17 +51,16 @@ class RingMapping {
 
   RingMapping(const RingMapping&) = delete;
   RingMapping& operator=(const RingMapping&) = delete;
-  ~RingMapping();
 
   const Geometry& geometry() const noexcept { return geometry_; }
   const RingIdentity& identity() const noexcept { return identity_; }
   bool writable() const noexcept { return access_ == Access::read_write; }
-  std::byte* base() const noexcept { return base_; }
-  RingHeader& header() const noexcept { return *reinterpret_cast<RingHeader*>(base_); }
+  std::byte* base() const noexcept { return memory_.base(); }
+  RingHeader& header() const noexcept { return memory_.as<RingHeader>(); }
 
  private:
   RingMapping() = default;
-  std::byte* base_ = nullptr;
+  SharedMapping memory_;
   Access access_ = Access::read_only;
   Geometry geometry_;
   RingIdentity identity_;

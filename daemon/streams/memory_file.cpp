@@ -9,15 +9,15 @@
 
 #include <string>
 
+#include "core/base/sealed_memory.hpp"
+
 namespace dssm::daemon {
 
 Result<void> check_own_memory_file(int fd, int seals, std::string_view what) {
   const std::string name = "the offered " + std::string(what);
   struct stat file {};
   if (::fstat(fd, &file)) return os_error("look at " + name);
-  // Only memfds and files of a tmpfs answer, and the latter carry no such seals.
-  const int found = ::fcntl(fd, F_GET_SEALS);
-  if (found < 0 || (found & seals) != seals) {
+  if (!has_seals(fd, seals)) {
     return Error{Errc::protocol, name + " is no sealed memory file of dssmd's making"};
   }
   if (file.st_uid != ::geteuid()) {

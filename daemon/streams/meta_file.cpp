@@ -9,7 +9,8 @@
 #include <cerrno>
 #include <string>
 
-#include "core/ring/ring_memory.hpp"
+#include "core/base/sealed_memory.hpp"
+#include "core/base/try.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/streams/memory_file.hpp"
 
@@ -83,27 +84,17 @@ Result<MetaHeader> read_header_untrusted(int fd) {
 }  // namespace
 
 Result<MetaFile> MetaFile::create(const local::StreamMeta& meta) {
-  UniqueFd fd(::memfd_create("dssm-meta", MFD_CLOEXEC | MFD_ALLOW_SEALING));
-  if (!fd) return os_error("create a stream's meta file");
-  MetaFile file(std::move(fd));
-  if (Result<void> done = file.write_header(MetaHeader{}); !done) return std::move(done).error();
-  if (Result<void> done = file.replace(meta); !done) return std::move(done).error();
-  if (::fcntl(file.fd(), F_ADD_SEALS, kMetaSeals) || ::fchmod(file.fd(), 0400)) {
-    return os_error("protect a stream's meta file");
-  }
+  MetaFile file(DSSM_TRY(create_sealed_memory("dssm-meta", 0, 0400, kMetaSeals)));
+  DSSM_TRY(file.write_header(MetaHeader{}));
+  DSSM_TRY(file.replace(meta));
   return file;
 }
 
 Result<MetaFile> MetaFile::open_untrusted(UniqueFd fd) {
-  if (Result<void> own = check_own_memory_file(fd.get(), kMetaSeals, "meta file"); !own) {
-    return std::move(own).error();
-  }
-  const Result<MetaHeader> header = read_header_untrusted(fd.get());
-  if (!header) return header.error();
+  DSSM_TRY(check_own_memory_file(fd.get(), kMetaSeals, "meta file"));
+  DSSM_TRY(read_header_untrusted(fd.get()));
   // One that was offered for writing might be shared with whoever offered it: take a new one.
-  Result<UniqueFd> writable = ring::reopen_read_write(fd.get());
-  if (!writable) return std::move(writable).error();
-  return MetaFile(*std::move(writable));
+  return MetaFile(DSSM_TRY(reopen_read_write(fd.get())));
 }
 
 Result<local::StreamMeta> MetaFile::read_untrusted() const {

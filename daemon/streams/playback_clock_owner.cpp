@@ -1,20 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/streams/playback_clock_owner.hpp"
 
-#include <fcntl.h>
-
+#include "core/base/sealed_memory.hpp"
 #include "core/clock/playback_record.hpp"
 #include "daemon/streams/memory_file.hpp"
 
 namespace dssm::daemon {
 
 Result<void> PlaybackClockOwner::adopt_untrusted(UniqueFd offered) {
-  constexpr int kSeals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL;
   if (clock_) {
     if (same_file(offered.get(), clock_.get())) return {};
     return Error{Errc::conflict, "another playback clock is in use by now"};
   }
-  if (Result<void> own = check_own_memory_file(offered.get(), kSeals, "playback clock"); !own) {
+  if (Result<void> own = check_own_memory_file(offered.get(), kSizeSeals, "playback clock"); !own) {
     return own;
   }
   if (auto record = clock::PlaybackRecord::open_untrusted(offered.get()); !record) {

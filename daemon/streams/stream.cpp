@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <cerrno>
 
+#include "core/base/sealed_memory.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "core/wire/local_protocol.hpp"
@@ -16,8 +17,6 @@
 
 namespace dssm::daemon {
 namespace {
-
-constexpr int kSizeSeals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL;
 
 // The rate is taken over this many of the newest samples.
 constexpr Tid kRateSamples = 100;
@@ -170,7 +169,7 @@ Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, Memo
   Result<MemoryShare> property_share = budget.take(content->property().size());
   if (!property_share) return std::move(property_share).error();
   // Always anew, whatever came: writers get a descriptor that does not depend on the client's.
-  Result<UniqueFd> ring = ring::reopen_read_write(files.ring.get());
+  Result<UniqueFd> ring = reopen_read_write(files.ring.get());
   if (!ring) return std::move(ring).error();
   std::shared_ptr<Stream> stream(
       new Stream(*std::move(plan), Files{*std::move(ring), std::move(files.bell), {}},
@@ -202,10 +201,9 @@ Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role) {
     add_doorbell(*std::move(made));
   }
   Result<UniqueFd> all[] = {
-      role == Role::writer ? duplicate(files_.ring.get())
-                           : ring::reopen_read_only(files_.ring.get()),
+      role == Role::writer ? duplicate(files_.ring.get()) : reopen_read_only(files_.ring.get()),
       duplicate(files_.bell.get()),
-      ring::reopen_read_only(meta_.fd()),
+      reopen_read_only(meta_.fd()),
       role == Role::writer ? duplicate(files_.doorbells.front().get()) : UniqueFd(),
   };
   std::vector<UniqueFd> descriptors;

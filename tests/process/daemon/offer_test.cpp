@@ -8,6 +8,7 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include "core/base/sealed_memory.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "core/ring/ring_writer.hpp"
@@ -22,8 +23,6 @@ UniqueFd memory_file(std::size_t bytes, int seals) {
   EXPECT_EQ(::fcntl(fd.get(), F_ADD_SEALS, seals), 0);
   return fd;
 }
-
-constexpr int kSizeSeals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL;
 
 class Offer : public testing::Test {
  protected:

@@ -9,6 +9,7 @@
 #include <cerrno>
 #include <dssm/stream.hpp>
 
+#include "core/base/sealed_memory.hpp"
 #include "tests/unit/core/ring/test_ring.hpp"
 
 namespace dssm::ring {

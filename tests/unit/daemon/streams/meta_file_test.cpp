@@ -17,6 +17,7 @@
 #include <cstring>
 #include <random>
 
+#include "core/base/sealed_memory.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 
@@ -89,7 +90,7 @@ TEST(MetaFile, GivesTheNewestContentAfterManyReplacementsAndKeepsItsMemorySmall)
 TEST(MetaFile, CannotBeWrittenThroughTheDescriptorThatClientsGet) {
   const Result<MetaFile> file = MetaFile::create(meta_with(""));
   ASSERT_TRUE(file);
-  const Result<UniqueFd> for_clients = ring::reopen_read_only(file->fd());
+  const Result<UniqueFd> for_clients = reopen_read_only(file->fd());
   ASSERT_TRUE(for_clients);
   EXPECT_EQ(::pwrite(for_clients->get(), "x", 1, 0), -1);
   struct stat inode {};
@@ -103,7 +104,7 @@ TEST(MetaFile, CanBeTakenBackFromADescriptorForReading) {
   {
     const Result<MetaFile> file = MetaFile::create(meta_with("kept"));
     ASSERT_TRUE(file);
-    Result<UniqueFd> for_clients = ring::reopen_read_only(file->fd());
+    Result<UniqueFd> for_clients = reopen_read_only(file->fd());
     ASSERT_TRUE(for_clients);
     kept.push_back(*std::move(for_clients));
   }
