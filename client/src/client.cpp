@@ -68,7 +68,7 @@ OpenStream::~OpenStream() { client->close(*this); }
 
 void OpenStream::supersede() const noexcept {
   superseded->store(true, std::memory_order_release);
-  ring->bell->ring();  // who sleeps on the old ring shall look up
+  ring->bell->notify();  // who sleeps on the old ring shall look up
 }
 
 // --- setting up a connection

@@ -54,7 +54,7 @@ Notifier::~Notifier() {
     const std::lock_guard guard(mutex_);
     stopping_ = true;
   }
-  control_->ring();
+  control_->notify();
   thread_.join();
 }
 
@@ -65,7 +65,7 @@ bool Notifier::add(const std::shared_ptr<ReadyFd>& ready) {
     if (watched_.size() == kMaxWatched) return false;
     watched_.push_back(ready);
   }
-  control_->ring();
+  control_->notify();
   return true;
 }
 

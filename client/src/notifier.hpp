@@ -57,7 +57,7 @@ class Notifier {
 
   // False when it has no room.
   bool add(const std::shared_ptr<ReadyFd>& ready);
-  void look_again() noexcept { control_->ring(); }
+  void look_again() noexcept { control_->notify(); }
 
  private:
   Notifier() = default;

@@ -30,8 +30,10 @@ constexpr std::uint32_t kFutex32 = 2;    // FUTEX_32; shared, as FUTEX_PRIVATE_F
 
 constexpr timespec kMaxSleepTime = timespec_of(kMaxSleep);
 
-// When to look up although nobody rang.
-MonoTime look_up(MonoTime deadline) noexcept { return std::min(deadline, deadline_in(kMaxSleep)); }
+// When to return although no writer notified.
+MonoTime latest_return(MonoTime deadline) noexcept {
+  return std::min(deadline, deadline_in(kMaxSleep));
+}
 
 WaitStatus outcome(long result, int error, MonoTime deadline) noexcept {
   if (result >= 0 || error == EAGAIN) return WaitStatus::ready;
@@ -48,9 +50,9 @@ Result<std::shared_ptr<Bell>> Bell::open_untrusted(int fd) {
       new Bell(DSSM_TRY(SharedMapping::map_sealed_untrusted(fd, sizeof(BellPage), "bell"))));
 }
 
-[[gnu::hot]] void Bell::ring_slowly() noexcept {
-  // The addition clears bit 0 and moves the count; between the load in ring() and here another
-  // writer may have done so, then it also woke all.
+[[gnu::hot]] void Bell::notify_slow() noexcept {
+  // The addition clears bit 0 and changes the count. If another writer did so since the load in
+  // notify(), it also woke all.
   std::uint32_t word = page().word.load(std::memory_order_relaxed);
   while (word & kSleeper) {
     if (page().word.compare_exchange_weak(word, word + 1, std::memory_order_seq_cst)) {
@@ -66,7 +68,7 @@ Result<std::shared_ptr<Bell>> Bell::open_untrusted(int fd) {
         ::syscall(SYS_futex, &page().word, FUTEX_WAIT, announced, &kMaxSleepTime, nullptr, 0);
     return outcome(result, errno, deadline);
   }
-  const timespec until = timespec_of(look_up(deadline));
+  const timespec until = timespec_of(latest_return(deadline));
   const long result = ::syscall(SYS_futex, &page().word, FUTEX_WAIT_BITSET, announced, &until,
                                 nullptr, FUTEX_BITSET_MATCH_ANY);
   return outcome(result, errno, deadline);
@@ -80,7 +82,7 @@ WaitStatus Bell::sleep_any(std::span<Bell* const> bells, std::span<const std::ui
     vectors[i] = {announced[i], reinterpret_cast<std::uintptr_t>(&bells[i]->page().word), kFutex32,
                   0};
   }
-  timespec until = timespec_of(look_up(deadline));
+  timespec until = timespec_of(latest_return(deadline));
   const long result =
       ::syscall(kFutexWaitvNumber, vectors.data(), count, 0, &until, CLOCK_MONOTONIC);
   if (result >= 0 || errno != ENOSYS) return outcome(result, errno, deadline);

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The bell: how a writer wakes those who sleep on its stream. Readers cannot write to the ring, so
-// the word they sleep on stands in a page of its own that all users of the stream map writable. The
-// worst that a hostile reader can do with it is to disturb the wake-ups of this one stream, and
-// sleepers look up by themselves every kMaxSleep.
+// The bell: a word in shared memory through which a writer wakes the threads that wait for samples
+// of its stream. Readers cannot write to the ring, so the word is in a page of its own, which all
+// programs that use the stream map writable. A hostile reader can only disturb the wake-ups of this
+// stream, and sleepers check the ring every kMaxSleep in any case.
 //
-// Protocol (docs/ring-layout.md "Bell page"): bit 0 of `word` means "somebody sleeps", the other
-// bits count the rings. A sleeper sets bit 0, looks at the ring once more, and waits in the kernel
-// for the word to change. A writer that finds bit 0 set after publishing adds 1, which clears it
-// and changes the count, and wakes all. A sleeper that dies leaves at most one needless wake-up.
+// Protocol (docs/ring-layout.md "Bell page"): bit 0 of `word` means that a thread sleeps, the other
+// bits count notifications. A sleeper sets bit 0, checks the ring again, and waits in the kernel for
+// the word to change. A writer that finds bit 0 set after publishing adds 1, which clears the bit
+// and changes the count, and wakes all. A sleeper that dies causes at most one needless wake-up.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -23,7 +23,7 @@ namespace dssm::ring {
 
 inline constexpr Duration kMaxSleep = std::chrono::seconds(1);
 
-// Creates the memfd of a bell page, sealed like a ring, mode 0600.
+// Creates the memory file of a bell page: size sealed, mode 0600.
 Result<UniqueFd> create_bell();
 
 // A mapped bell page. Shared by shared_ptr; thread-safe.
@@ -37,16 +37,16 @@ class Bell {
 
   // --- writers, after publishing
 
-  // Before: a sleeper or dssmd wrote to the line that ring() looks at, so it has to come from
-  // another processor, and may do so while the payload is copied.
-  void expect_ring() const noexcept { __builtin_prefetch(mapping_.base()); }
+  // Before: starts to fetch the line that notify() loads. A sleeper or dssmd wrote to it, so it
+  // comes from another processor, and can do so while the payload is copied.
+  void prefetch() const noexcept { __builtin_prefetch(mapping_.base()); }
 
-  // Wakes all sleepers; without any, one load of a line that nobody writes.
-  void ring() noexcept {
-    if (page().word.load(std::memory_order_seq_cst) & kSleeper) ring_slowly();
+  // Wakes all sleepers; without any, one load of a line that is in this processor's cache.
+  void notify() noexcept {
+    if (page().word.load(std::memory_order_seq_cst) & kSleeper) notify_slow();
   }
 
-  // Whether dssmd wants to be rung through the stream's eventfd.
+  // Whether dssmd wants to be notified through the stream's eventfd.
   bool doorbell_armed() const noexcept {
     return page().doorbell_armed.load(std::memory_order_seq_cst) != 0;
   }
@@ -58,7 +58,7 @@ class Bell {
 
   // --- sleepers
 
-  // Announces a sleeper; returns the value to hand to sleep(). Look at the ring between the two.
+  // Announces a sleeper; returns the value to pass to sleep(). Check the ring between the two.
   std::uint32_t announce() noexcept {
     return page().word.fetch_or(kSleeper, std::memory_order_seq_cst) | kSleeper;
   }
@@ -67,8 +67,8 @@ class Bell {
   // cause.
   WaitStatus sleep(std::uint32_t announced, MonoTime deadline) noexcept;
 
-  // Sleeps until one of several bells rings; at most 128 of them. announced[i] belongs to bells[i].
-  // On a kernel without futex_waitv (before 5.16) it looks every millisecond instead.
+  // Sleeps until one of several bells is notified; at most 128 of them. announced[i] belongs to
+  // bells[i]. On a kernel without futex_waitv (before 5.16) it polls every millisecond instead.
   static WaitStatus sleep_any(std::span<Bell* const> bells,
                               std::span<const std::uint32_t> announced, MonoTime deadline) noexcept;
 
@@ -76,7 +76,7 @@ class Bell {
   static constexpr std::uint32_t kSleeper = 1;
   explicit Bell(SharedMapping mapping) noexcept : mapping_(std::move(mapping)) {}
   BellPage& page() const noexcept { return mapping_.as<BellPage>(); }
-  void ring_slowly() noexcept;
+  void notify_slow() noexcept;
   SharedMapping mapping_;
 };
 

@@ -1,17 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Copying payloads in and out of a slot while the other side may be at it too, and the fences
-// around such a copy. Three forms of one thing (docs/ring-layout.md "Copying a payload" has the
-// argument):
+// Copies payloads into and out of a slot that the other side may access at the same time, with the
+// fences around such a copy. There are three forms (docs/ring-layout.md "Copying a payload" proves
+// them):
 //
-//   plain       memcpy between fences; data that was overwritten meanwhile is thrown away after the
-//               sequence is checked. Sound on x86-64 and AArch64.
-//   large       from kLargeBytes on memcpy may use non-temporal stores and string instructions,
-//   which
-//               x86's usual ordering does not cover: full fences on both sides.
-//   ThreadSanitizer   words as atomics, stores release and loads acquire, so that no fence is
-//   needed
-//               (it cannot see them) and no race is reported that is none.
+//   plain            memcpy between fences; data that was overwritten meanwhile is discarded after
+//                    the check of the sequence. Sound on x86-64 and AArch64.
+//   large            from kLargeBytes on, memcpy may use non-temporal stores and string
+//                    instructions, which x86's usual ordering of stores does not cover: the writer
+//                    adds store fences before and after.
+//   ThreadSanitizer  words as atomics, release stores and acquire loads: it cannot see fences, and
+//                    reports no race for these.
 #pragma once
 
 #include <atomic>
@@ -29,8 +28,8 @@
 
 namespace dssm::ring {
 
-// Below this no memcpy that we know uses anything but ordinary loads and stores (glibc's
-// x86_rep_movsb_threshold starts at 2048 and its non-temporal threshold far above).
+// Below this size no known memcpy uses anything but ordinary loads and stores (glibc's
+// x86_rep_movsb_threshold starts at 2048, its non-temporal threshold is far above).
 inline constexpr std::size_t kLargeBytes = 2048;
 
 #if defined(DSSM_TSAN)
@@ -61,13 +60,13 @@ inline void fence_after_copying_out() noexcept {}
 inline constexpr std::memory_order kProbe = std::memory_order_acquire;
 inline void fence_after_probing() noexcept {}
 
-// Each store is a release: whoever sees a word also sees the odd sequence stored before it.
+// Each store is a release: a reader that sees a word also sees the odd sequence stored before it.
 inline void copy_in(std::byte* slot, const std::byte* from, std::size_t bytes) noexcept {
   detail::store_words<std::uint64_t>(slot, from, bytes);
   detail::store_words<std::uint8_t>(slot, from, bytes);
 }
 
-// Each load is an acquire: the sequence is looked at after all of them; pairs with copy_in().
+// Each load is an acquire: the sequence is loaded after all of them; pairs with copy_in().
 inline void copy_out(std::byte* to, const std::byte* slot, std::size_t bytes) noexcept {
   detail::load_words<std::uint64_t>(to, slot, bytes);
   detail::load_words<std::uint8_t>(to, slot, bytes);
@@ -75,7 +74,7 @@ inline void copy_out(std::byte* to, const std::byte* slot, std::size_t bytes) no
 
 #else
 
-// Orders all stores before it before all stores after it, also those that x86 leaves unordered.
+// Orders all stores before it before all stores after it, including non-temporal ones.
 inline void store_fence() noexcept {
 #if defined(__x86_64__)
   __builtin_ia32_sfence();
@@ -84,8 +83,8 @@ inline void store_fence() noexcept {
 #endif
 }
 
-// After the odd sequence, before the first byte of the payload: nobody sees new bytes under an even
-// sequence. Pairs with fence_after_copying_out().
+// After the odd sequence, before the first byte of the payload: no reader sees new bytes under the
+// old even sequence. Pairs with fence_after_copying_out().
 inline void fence_before_filling(bool large) noexcept {
   std::atomic_thread_fence(std::memory_order_release);
   if (large) store_fence();
@@ -97,13 +96,13 @@ inline void fence_after_filling(bool large) noexcept {
   if (large) store_fence();
 }
 
-// After the last byte was read, before the sequence is looked at again.
+// After the last byte was read, before the sequence is loaded again.
 inline void fence_after_copying_out() noexcept {
   std::atomic_thread_fence(std::memory_order_acquire);
 }
 
-// Looks at many entries of the time index, then one fence before `top` is looked at again; pairs
-// with the release store to the index in RingWriter.
+// A search loads many entries of the time index, then passes one fence before it loads `top` again.
+// Pairs with the release store to the index in SlotWriter::publish().
 inline constexpr std::memory_order kProbe = std::memory_order_relaxed;
 inline void fence_after_probing() noexcept { std::atomic_thread_fence(std::memory_order_acquire); }
 

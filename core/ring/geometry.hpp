@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Where things are in a ring: computed once from payload size and depth, checked when read from a
+// Offsets and sizes in a ring: follow from payload size and depth, and are checked when read from a
 // mapping.
 #pragma once
 
@@ -17,8 +17,8 @@ struct Geometry {
   std::uint64_t slots_offset = 0;  // of slot 0
   std::uint64_t total_bytes = 0;   // of the whole ring, multiple of the page size
 
-  // The one geometry for these. Fails with invalid_argument or limit_exceeded, naming value and
-  // range: payload 1 byte to 64 MiB, depth 2 to 2^24.
+  // The geometry for these. Fails with invalid_argument, naming value and range: payload 1 byte to
+  // 64 MiB, depth 2 to 2^24.
   static Result<Geometry> of(std::uint64_t payload_bytes, std::uint64_t depth);
 
   friend bool operator==(const Geometry&, const Geometry&) = default;

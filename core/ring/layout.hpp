@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The ring's layout in memory: the ABI between all processes that map one. docs/ring-layout.md
-// explains it byte by byte; tests/unit/core/ring/ring_memory_test.cpp has its numbers by hand.
+// explains each byte; tests/unit/core/ring/ring_memory_test.cpp repeats its numbers.
 // Little endian. An incompatible change raises kLayoutVersion.
 //
-//   offset 0       RingHeader, one page; its first part is written once, before anybody maps it
+//   offset 0       RingHeader, one page; its first part is written once, before the descriptor is
+//                  passed to any process
 //   times_offset   depth * 8 bytes: time_ns of sample tid at index tid % depth ("time index")
-//   slots_offset   depth slots: SlotHeader, payload, at least kGuardBytes that belong to nobody
+//   slots_offset   depth slots: SlotHeader, payload, at least kGuardBytes of padding
 #pragma once
 
 #include <pthread.h>
@@ -25,24 +26,25 @@ inline constexpr std::uint32_t kLayoutVersion = 3;
 inline constexpr std::size_t kPageBytes = 4096;
 inline constexpr std::size_t kLineBytes = 64;
 
-// Behind each payload: one widespread SSM wrapper writes 8 bytes more than it asked for.
+// After each payload: one widespread SSM wrapper writes 8 bytes more than its sample has.
 inline constexpr std::size_t kGuardBytes = 64;
 
 static_assert(std::atomic<std::int64_t>::is_always_lock_free);
 static_assert(std::atomic<std::uint32_t>::is_always_lock_free);
 
-// Few enough to search one by one, and more than write to one stream at a time. A PConnector is one
-// for as long as it lives; the one that wrote longest ago makes room.
+// Publishers per stream: few enough for a linear search, and more than write to one stream at the
+// same time. Each PConnector is one publisher; a new one replaces the one that wrote longest ago.
 inline constexpr std::size_t kMaxPublishers = 64;
 
 //   off size field              unit  written by  order
 //     0    8 publisher          -     dssmd       before tid_end
-//     8    8 tid_end            tid   dssmd       behind its last sample's tid; 0: free
-//    16    8 number_end         -     dssmd       behind its last sample's number
-//    24    8 earlier_tid_end    tid   dssmd       the same of its sample before; 0: none. They
-//    count 32    8 earlier_number_end -     dssmd       while tid_end is beyond top + 1; who gets a
-//    dead
-//                                                 writer's lock puts them back
+//     8    8 tid_end            tid   dssmd       its last sample's tid + 1; 0: free
+//    16    8 number_end         -     dssmd       its last sample's number + 1
+//    24    8 earlier_tid_end    tid   dssmd       the same of the sample before; 0: none
+//    32    8 earlier_number_end -     dssmd       the same of the sample before
+//
+// While tid_end is beyond top + 1, the earlier pair is valid; a writer that takes over the lock of a
+// dead one restores that pair.
 struct PublisherCursor {
   std::atomic<std::uint64_t> publisher;
   std::atomic<std::uint64_t> tid_end, number_end;
@@ -51,7 +53,7 @@ struct PublisherCursor {
 static_assert(sizeof(PublisherCursor) == 40);
 
 //   off  size field            unit   written by  order
-//     0     8 magic            -      dssmd       before the first hand-out, as all up to 320
+//     0     8 magic            -      dssmd       before any other process sees it, as all up to 320
 //     8     4 layout_version   -      dssmd
 //    12     4 alignment_bytes  bytes  dssmd
 //    16     8 payload_bytes    bytes  dssmd
@@ -121,8 +123,7 @@ static_assert(sizeof(RingHeader) == kPageBytes);
 //    24    8 clock_error_ns  ns    writer      >= 0; 2^63-1: unknown; 2^63-2: of another clock
 //    32    8 run_start       tid   writer      first sample of the run this one belongs to
 //    40    8 run_parent      tid   writer      run_start's sample only: newest earlier sample with
-//    an
-//                                              earlier time; -1: none
+//                                              an earlier time; -1: none
 //    48    8 run_jump        tid   writer      run_start's sample only: start of an ancestor run
 //    56    8 run_level       -     writer      run_start's sample only: number of ancestor runs
 //    64    - payload
@@ -135,8 +136,9 @@ static_assert(offsetof(SlotHeader, time_ns) == 16 && offsetof(SlotHeader, run_le
 static_assert(sizeof(SlotHeader) == kLineBytes);
 
 //   off  size field           written by           order
-//     0     4 word            writers, sleepers    seq_cst; bit 0: somebody sleeps; rest: a count
-//     4     4 doorbell_armed  dssmd                seq_cst; not 0: ring the stream's eventfd
+//     0     4 word            writers, sleepers    seq_cst; bit 0: a thread sleeps; rest: a count
+//     4     4 doorbell_armed  dssmd                seq_cst; not 0: writers also write to the
+//                                                  stream's eventfd
 //     8  4088 reserved        -                    zero
 struct BellPage {
   std::atomic<std::uint32_t> word;

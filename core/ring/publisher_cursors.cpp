@@ -2,7 +2,7 @@
 //
 // A process that is killed has done all that is before some instruction and nothing behind it, so
 // the order in the program is what counts. The stores are releases so that the compiler keeps it,
-// and so that who reads without the lock while another process takes a note back sees it, too.
+// and so that who reads without the lock while another process takes a cursor back sees it, too.
 #include "core/ring/publisher_cursors.hpp"
 
 #include <algorithm>
@@ -11,9 +11,9 @@
 namespace dssm::ring {
 namespace {
 
-bool is_of(const PublisherCursor& note, std::uint64_t publisher) noexcept {
-  return note.publisher.load(std::memory_order_acquire) == publisher &&
-         note.tid_end.load(std::memory_order_acquire) != 0;
+bool is_of(const PublisherCursor& cursor, std::uint64_t publisher) noexcept {
+  return cursor.publisher.load(std::memory_order_acquire) == publisher &&
+         cursor.tid_end.load(std::memory_order_acquire) != 0;
 }
 
 }  // namespace
@@ -28,9 +28,9 @@ std::uint64_t PublisherCursors::end() const noexcept {
     std::uint64_t publisher) const noexcept {
   const PublisherCursor* const found =
       std::find_if(std::begin(header_->publishers), std::end(header_->publishers),
-                   [publisher](const PublisherCursor& note) { return is_of(note, publisher); });
+                   [publisher](const PublisherCursor& cursor) { return is_of(cursor, publisher); });
   if (found == std::end(header_->publishers)) return {};
-  // The end first: a program may take the note back meanwhile and write a sample of its own under
+  // The end first: meanwhile a program may restore the cursor and write a sample of its own under
   // that tid.
   const std::uint64_t end = this->end();
   std::uint64_t tid_end = found->tid_end.load(std::memory_order_acquire);
@@ -43,42 +43,42 @@ std::uint64_t PublisherCursors::end() const noexcept {
   return tid_end == 0 || tid_end > end || last.number < 0 ? Last{} : last;
 }
 
-// The note of `publisher`, or one that is made its own.
-[[gnu::hot]] PublisherCursor& PublisherCursors::place_for(std::uint64_t publisher) const noexcept {
+// The cursor of `publisher`, or one that is made its own.
+[[gnu::hot]] PublisherCursor& PublisherCursors::cursor_of(std::uint64_t publisher) const noexcept {
   PublisherCursor* oldest = std::begin(header_->publishers);
-  for (PublisherCursor& note : header_->publishers) {
-    if (is_of(note, publisher)) return note;
-    if (note.tid_end.load(std::memory_order_acquire) <
+  for (PublisherCursor& cursor : header_->publishers) {
+    if (is_of(cursor, publisher)) return cursor;
+    if (cursor.tid_end.load(std::memory_order_acquire) <
         oldest->tid_end.load(std::memory_order_acquire)) {
-      oldest = &note;
+      oldest = &cursor;
     }
   }
-  // From here on it is nobody's, until there is a tid again.
+  // From here on the cursor is free, until it has a tid again.
   oldest->tid_end.store(0, std::memory_order_release);
   oldest->publisher.store(publisher, std::memory_order_release);
   return *oldest;
 }
 
-[[gnu::hot]] void PublisherCursors::note(const PublishedSample& sample, Tid tid) const noexcept {
-  PublisherCursor& note = place_for(sample.publisher);
-  note.earlier_number_end.store(note.number_end.load(std::memory_order_relaxed),
-                                std::memory_order_release);
-  note.earlier_tid_end.store(note.tid_end.load(std::memory_order_relaxed),
-                             std::memory_order_release);
-  // From here on it is the note of a sample that is not there yet.
-  note.tid_end.store(static_cast<std::uint64_t>(tid) + 1, std::memory_order_release);
-  note.number_end.store(static_cast<std::uint64_t>(sample.number) + 1, std::memory_order_release);
+[[gnu::hot]] void PublisherCursors::advance(const PublishedSample& sample, Tid tid) const noexcept {
+  PublisherCursor& cursor = cursor_of(sample.publisher);
+  cursor.earlier_number_end.store(cursor.number_end.load(std::memory_order_relaxed),
+                                  std::memory_order_release);
+  cursor.earlier_tid_end.store(cursor.tid_end.load(std::memory_order_relaxed),
+                               std::memory_order_release);
+  // From here on the cursor points to a sample that is not published yet.
+  cursor.tid_end.store(static_cast<std::uint64_t>(tid) + 1, std::memory_order_release);
+  cursor.number_end.store(static_cast<std::uint64_t>(sample.number) + 1, std::memory_order_release);
 }
 
 void PublisherCursors::recover() const noexcept {
   const std::uint64_t end = this->end();
-  for (PublisherCursor& note : header_->publishers) {
-    if (note.tid_end.load(std::memory_order_acquire) <= end) continue;
-    // The tid last: whoever is killed in between leaves the note as it was.
-    note.number_end.store(note.earlier_number_end.load(std::memory_order_acquire),
-                          std::memory_order_release);
-    note.tid_end.store(note.earlier_tid_end.load(std::memory_order_acquire),
-                       std::memory_order_release);
+  for (PublisherCursor& cursor : header_->publishers) {
+    if (cursor.tid_end.load(std::memory_order_acquire) <= end) continue;
+    // The tid last: a process that is killed in between leaves the cursor to be restored again.
+    cursor.number_end.store(cursor.earlier_number_end.load(std::memory_order_acquire),
+                            std::memory_order_release);
+    cursor.tid_end.store(cursor.earlier_tid_end.load(std::memory_order_acquire),
+                         std::memory_order_release);
   }
 }
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The memory behind a ring: creating it, mapping it, and checking that what was mapped is a ring
-// before anybody trusts it. Both the daemon and the client library map rings through RingMapping,
-// and nobody reads the header's geometry a second time: another process may be scribbling over it.
+// Creates and maps the memory of a ring, and checks that what is mapped is a ring. Both the daemon
+// and the client library map rings through RingMapping. Its geometry is a checked copy: no code reads
+// the header's geometry again, because another process may overwrite it at any time.
 #pragma once
 
 #include <cstddef>
@@ -18,7 +18,7 @@
 
 namespace dssm::ring {
 
-// What a ring says about itself, in its header.
+// What the ring's header states about its stream.
 struct RingIdentity {
   StreamId id;                    // with host
   std::uint64_t incarnation = 0;  // random; differs between two rings of one name
@@ -28,9 +28,9 @@ struct RingIdentity {
 
 enum class Access : unsigned char { read_only, read_write };
 
-// Creates the memfd of a new ring: header written, size sealed (F_SEAL_SHRINK, F_SEAL_GROW,
-// F_SEAL_SEAL), inode mode 0400, so that only its creator (and root) can open it anew through
-// /proc. Memory is taken as it is touched; see reserve().
+// Creates the memory file of a new ring: header written, size sealed, inode mode 0400, so that only
+// its creator (and root) can open it again through /proc. The system takes memory for it at the first
+// write to each page; see reserve().
 //   returns  a read-write descriptor
 Result<UniqueFd> create_ring(const RingIdentity& identity, const Geometry& geometry);
 

@@ -7,7 +7,7 @@
 namespace dssm::ring {
 namespace {
 
-// The stamps of a slot. Acquire, so that the sequence is looked at after all of them.
+// The stamps of a slot. Acquire, so that the sequence is loaded again after all of them.
 SampleInfo load_info(const SlotHeader& slot, Tid tid) noexcept {
   SampleInfo info;
   info.tid = tid;
@@ -23,8 +23,8 @@ ReadStatus RingReader::locate(Tid tid, Place& place, SampleInfo& info) const noe
   if (tid > top) return ReadStatus::not_yet;
   if (tid < 0 || tid < slots_.oldest_for(top)) return ReadStatus::too_old;
   SlotHeader& slot = slots_.slot(tid);
-  // Pairs with the release store of the even sequence in RingWriter: what was stored before it is
-  // seen after this.
+  // Pairs with the release store of the even sequence in SlotWriter::publish(): what was stored
+  // before it is visible after this.
   if (slot.sequence.load(std::memory_order_acquire) != published_sequence(tid)) {
     return ReadStatus::too_old;  // overwritten since `top` was read
   }
@@ -78,8 +78,9 @@ ReadStatus RingReader::find(Time t, Tid& tid) const noexcept {
   for (int attempt = 0; attempt < kMaxRetries; ++attempt) {
     const Tid top = newest();
     if (top < 0) return ReadStatus::not_yet;
-    // Run starts only grow, and top's was stored before top: one that is not beyond top is top's.
-    // Beyond it: a backward step is just being written, or its writer died; the slot knows then.
+    // Run starts only grow, and that of `top` was stored before `top`: a value up to `top` belongs
+    // to its run. A greater one means that a writer is beginning a new run, or died while doing so;
+    // then the slot has the right value.
     Tid run_start = header_->run_start.load(std::memory_order_acquire);
     if (run_start > top || run_start < 0) {
       SlotHeader& slot = slots_.slot(top);
@@ -91,8 +92,9 @@ ReadStatus RingReader::find(Time t, Tid& tid) const noexcept {
     }
     const FoundSample found =
         find_newest_at_or_before(slots_, slots_.oldest_for(top), top, run_start, to_ns(t));
-    // The times looked at were those of the tids meant if none of them has left the ring since:
-    // whoever reuses a place in the index has published a top that says so before.
+    // The loaded times belong to the expected tids if none of these has left the window since: a
+    // writer reuses an entry of the index only after it published a `top` that moved the entry's
+    // sample out of the window.
     fence_after_probing();
     const Tid now = header_->top.load(std::memory_order_relaxed);
     if (found.status == ReadStatus::lapped || found.lowest_probed < slots_.oldest_for(now))

@@ -4,8 +4,8 @@
 // mapping is checked before it becomes an address, and every sample is validated by its sequence,
 // so that a hostile writer can make a read fail or return nonsense, but not fault or hang.
 //
-// Readable are the tids oldest(top) ... top: depth - 1 samples, because the slot of the oldest one
-// may be being overwritten at any moment.
+// The tids oldest(top) ... top are readable: depth - 1 samples, because the slot of the next sample
+// may be written at any moment.
 #pragma once
 
 #include <dssm/sample.hpp>
@@ -30,7 +30,7 @@ class RingReader {
   //   returns  ok | not_yet | too_old
   ReadStatus read(Tid tid, std::span<std::byte> payload, SampleInfo& info) const noexcept;
 
-  // Copies the newest sample. Tries kMaxRetries times when the writer laps it.
+  // Copies the newest sample. Retries up to kMaxRetries times when the writer laps it.
   //   returns  ok | not_yet | lapped
   ReadStatus read_newest(std::span<std::byte> payload, SampleInfo& info) const noexcept;
 
@@ -51,8 +51,8 @@ class RingReader {
   //   returns  ok | not_yet (empty) | too_old | lapped
   ReadStatus find(Time t, Tid& tid) const noexcept;
 
-  // In place: the payload of sample `tid` and the sequence that must still be in `sequence` when
-  // the work on it is done.
+  // The payload of sample `tid` in place. It was that sample's if `sequence` still holds `expected`
+  // after the last access: see still_valid().
   struct Place {
     const std::byte* payload;
     const std::atomic<std::uint64_t>* sequence;
@@ -60,12 +60,12 @@ class RingReader {
   };
   ReadStatus locate(Tid tid, Place& place, SampleInfo& info) const noexcept;
 
-  // Whether the sample at `place` was not touched since locate(): the loads before it are ordered
-  // before its own.
+  // Whether the sample was not overwritten since locate(). The caller's loads of the payload are
+  // ordered before the load of the sequence.
   static bool still_valid(const std::atomic<std::uint64_t>& sequence,
                           std::uint64_t expected) noexcept;
 
-  static constexpr int kMaxRetries = 1000;  // a reader this often lapped is not keeping up
+  static constexpr int kMaxRetries = 1000;  // a reader that is lapped more often cannot keep up
 
  private:
   const RingHeader* header_;

@@ -11,8 +11,9 @@
 namespace dssm::ring {
 namespace {
 
-// The rings whose slots this thread has on loan: taking such a lock again would wait for ever.
-struct HeldRings {
+// The rings of which this thread has a slot on loan, and so the lock: to take it again would block
+// for ever.
+struct LoanedRings {
   std::array<const RingHeader*, 8> rings{};
   std::size_t count = 0;
 
@@ -26,45 +27,45 @@ struct HeldRings {
   }
 };
 // Initial-exec: one load instead of a call, on the path of every write. It takes 72 bytes of the
-// room that the C library keeps for libraries that are loaded late.
-[[gnu::tls_model("initial-exec")]] thread_local constinit HeldRings held_rings;
+// static TLS space that the C library reserves for libraries loaded by dlopen().
+[[gnu::tls_model("initial-exec")]] thread_local constinit LoanedRings loaned_rings;
 
 }  // namespace
 
 RingWriter::RingWriter(const RingMapping& mapping, Bell& bell, int doorbell) noexcept
-    : publisher_(mapping), bell_(&bell), doorbell_(doorbell) {}
+    : slots_(mapping), bell_(&bell), doorbell_(doorbell) {}
 
 [[gnu::hot]] bool RingWriter::lock() noexcept {
-  RingHeader& header = publisher_.header();
-  if (held_rings.count != 0 && held_rings.holds(&header)) return false;
+  RingHeader& header = slots_.header();
+  if (loaned_rings.count != 0 && loaned_rings.holds(&header)) return false;
   return take(lock_robust(header.lock));
 }
 
 [[gnu::hot]] bool RingWriter::take(LockResult result) noexcept {
-  if (result == LockResult::recovered) publisher_.recover();
+  if (result == LockResult::recovered) slots_.recover();
   return result == LockResult::locked || result == LockResult::recovered;
 }
 
-[[gnu::hot]] void RingWriter::unlock() noexcept { pthread_mutex_unlock(&publisher_.header().lock); }
+[[gnu::hot]] void RingWriter::unlock() noexcept { pthread_mutex_unlock(&slots_.header().lock); }
 
 std::byte* RingWriter::begin() noexcept {
-  if (held_rings.count == held_rings.rings.size() || !lock()) return nullptr;
-  held_rings.add(&publisher_.header());
-  return publisher_.begin(newest() + 1);
+  if (loaned_rings.count == loaned_rings.rings.size() || !lock()) return nullptr;
+  loaned_rings.add(&slots_.header());
+  return slots_.begin(newest() + 1);
 }
 
 void RingWriter::cancel() noexcept {
-  // The slot keeps its odd sequence: it was outside the readable window already.
-  held_rings.remove(&publisher_.header());
+  // The slot keeps its odd sequence: it is outside the readable window.
+  loaned_rings.remove(&slots_.header());
   unlock();
 }
 
 Tid RingWriter::commit(Time time, Duration clock_error) noexcept {
-  // No fence: glibc's memcpy ends its non-temporal stores with one, and who uses such stores
-  // directly has to, as before any other publication.
+  // No fence: glibc's memcpy ends its non-temporal stores with one, and a program that uses such
+  // stores directly must end them with one, as before any other release.
   const Tid tid = newest() + 1;
-  publisher_.publish(tid, time, clock_error);
-  held_rings.remove(&publisher_.header());
+  slots_.publish(tid, time, clock_error);
+  loaned_rings.remove(&slots_.header());
   unlock();
   follow_up(tid);
   return tid;
@@ -79,36 +80,35 @@ Tid RingWriter::commit(Time time, Duration clock_error) noexcept {
 RingWriter::Attempt RingWriter::try_publish(const PublishedSample& sample,
                                             std::span<const std::byte> payload, Time time,
                                             Duration clock_error) noexcept {
-  RingHeader& header = publisher_.header();
+  RingHeader& header = slots_.header();
   const LockResult result = try_lock_robust(header.lock);
   if (result == LockResult::busy) return {Attempt::Outcome::busy, kNoTid};
   if (!take(result)) return {Attempt::Outcome::refused, kNoTid};
-  PublisherCursors(header).note(sample, newest() + 1);
+  PublisherCursors(header).advance(sample, newest() + 1);
   return {Attempt::Outcome::written, write_locked(payload, time, clock_error)};
 }
 
 [[gnu::hot]] Tid RingWriter::write_locked(std::span<const std::byte> payload, Time time,
                                           Duration clock_error) noexcept {
-  bell_->expect_ring();
+  bell_->prefetch();
   const Tid tid = newest() + 1;
-  publisher_.begin(tid);
-  publisher_.fill(tid, payload);
-  publisher_.publish(tid, time, clock_error);
+  slots_.begin(tid);
+  slots_.fill(tid, payload);
+  slots_.publish(tid, time, clock_error);
   unlock();
   follow_up(tid);
   return tid;
 }
 
-// What follows a sample, outside of the lock: waking who sleeps, and getting ready for the next
-// one.
+// After a sample, outside of the lock: wakes sleepers and prepares for the next sample.
 [[gnu::hot]] void RingWriter::follow_up(Tid tid) noexcept {
-  bell_->ring();
+  bell_->notify();
   if (doorbell_ >= 0 && bell_->doorbell_armed()) {
     const std::uint64_t one = 1;
-    // Non-blocking: a counter that is full has been rung enough.
+    // Non-blocking: fails only when the counter is full, and then dssmd is notified already.
     [[maybe_unused]] const ssize_t written = ::write(doorbell_, &one, sizeof one);
   }
-  publisher_.expect_next(tid);
+  slots_.prefetch_next(tid);
 }
 
 }  // namespace dssm::ring

@@ -1,8 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Writing to a mapped ring. Writers of one stream take turns by the robust lock in its header; a
-// writer that dies at any instruction leaves the lock to the next one, who repairs what it needs,
-// and a slot that no reader accepts.
+// Writing to a mapped ring. The classes between a program's call and the memory:
+//
+//   Writer<T>   (client/include/dssm)  a typed sample
+//   RawWriter   (client/include/dssm)  its bytes, and the clock error of its time
+//   RingWriter                         the lock, and the wake-up of readers and dssmd
+//   SlotWriter                         the slot, the time index, `top`
+//
+// In a mirror, MirrorWriter takes the place of RingWriter: dssmd is the only writer and needs no
+// lock. A remote writer (daemon/remote) is a ring that programs fill like any other and that dssmd
+// reads.
+//
+// Writers of one stream take turns by the robust lock in its header. A writer that dies at any
+// instruction leaves a slot that no reader accepts, and the lock to the next writer, which repairs
+// what the dead one left.
 #pragma once
 
 #include <dssm/sample.hpp>
@@ -12,35 +23,35 @@
 #include "core/ring/publisher_cursors.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "core/ring/robust_lock.hpp"
-#include "core/ring/sample_publisher.hpp"
+#include "core/ring/slot_writer.hpp"
 
 namespace dssm::ring {
 
 // One per writing thread; the mapping (read-write) and the bell outlive it.
 class RingWriter {
  public:
-  // doorbell: the stream's eventfd, rung while the bell says so; -1: none. Not owned.
+  // doorbell: the stream's eventfd, written to while dssmd has armed it; -1: none. Not owned.
   RingWriter(const RingMapping& mapping, Bell& bell, int doorbell) noexcept;
 
   // Writes one sample; payload.size() == payload_bytes. Returns its tid; kNoTid when this thread
   // holds the lock already (a loan).
   Tid write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
 
-  // The same with a bound that has yet to be looked up: `clock_error()` is called once, with the
-  // lock held, so that the processor waits for its loads while it copies the payload. Before the
-  // lock, whose atomic operation waits for all that came before, it would cost what it takes.
+  // The same with a clock error that is still to be found: `clock_error()` is called once, with the
+  // lock held, so that its loads overlap with the copy of the payload. Before the lock they would
+  // add their whole latency, because the lock's atomic operation waits for all earlier loads.
   template <class LookUp>
   Tid write_with(std::span<const std::byte> payload, Time time, LookUp clock_error) noexcept {
     return lock() ? write_locked(payload, time, clock_error()) : kNoTid;
   }
 
-  // Writes one sample for somebody on another PC and notes how far that one is by it
-  // (PublisherCursors). Does not wait for another writer: dssmd's loop must not wait for a program.
+  // Writes one sample for a publisher on another PC and advances its cursor (PublisherCursors).
+  // Does not wait for another writer: dssmd's loop must not wait for a program.
   struct Attempt {
     enum class Outcome : unsigned char {
       written,
-      busy,     // another writer is at it: try again soon
-      refused,  // somebody has damaged the lock
+      busy,     // another writer has the lock: try again soon
+      refused,  // a program has damaged the lock
     } outcome;
     Tid tid;
   };
@@ -53,7 +64,7 @@ class RingWriter {
   Tid commit(Time time, Duration clock_error) noexcept;
   void cancel() noexcept;
 
-  Tid newest() const noexcept { return publisher_.newest(); }
+  Tid newest() const noexcept { return slots_.newest(); }
 
  private:
   bool lock() noexcept;
@@ -62,7 +73,7 @@ class RingWriter {
   Tid write_locked(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
   void follow_up(Tid tid) noexcept;
 
-  SamplePublisher publisher_;
+  SlotWriter slots_;
   Bell* bell_;
   int doorbell_;
 };

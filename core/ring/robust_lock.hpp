@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The lock between processes that survives its holder's death: glibc's robust, process-shared
-// mutex. The kernel marks it when a thread dies holding it, and the next locker is told. Lives in
-// shared memory, never destroyed: the memory just goes.
+// A lock between processes that survives the death of its holder: glibc's robust, process-shared
+// mutex. The kernel marks it when a thread dies with the lock held, and the next call of
+// lock_robust() returns `recovered`. It is in shared memory and is never destroyed.
 //
-// Not the error-checking kind: it recognises "I hold it already" by the thread's number, and
-// threads in two containers may have the same one.
+// Not the error-checking kind: that one recognizes its holder by the thread id, and threads in two
+// containers may have the same one.
 #pragma once
 
 #include <pthread.h>
@@ -25,9 +25,9 @@ inline void init_robust_lock(pthread_mutex_t& mutex) noexcept {
 
 enum class LockResult : unsigned char {
   locked,
-  recovered,  // locked; the last holder died: repair what it may have left half done
-  busy,       // try_lock_robust() only: somebody holds it
-  refused,    // somebody with write access has damaged the mutex
+  recovered,  // locked; the last holder died: repair what it left
+  busy,       // try_lock_robust() only: another thread holds it
+  refused,    // a program with write access has damaged the mutex
 };
 
 namespace detail {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// From a tid to its slot and its place in the time index. The arithmetic uses the geometry that was
-// checked when the ring was mapped, never the mapping's own numbers.
+// From a tid to its slot and its entry in the time index. The arithmetic uses the geometry that was
+// checked when the ring was mapped, never the numbers in the mapping.
 #pragma once
 
 #include <dssm/sample.hpp>
@@ -50,8 +50,9 @@ class SlotTable {
   std::atomic<std::int64_t>& time_ns(Tid tid) const noexcept { return times_[index(tid)]; }
 
   // Oldest readable tid when the newest is `top`; kNoTid for an empty ring. SSM's rule: one slot is
-  // left out because it may be being overwritten. A mirror holds nothing before `first`; one beyond
-  // `top` says that a gap is just being crossed: then only the newest sample is sure to be there.
+  // left out because it may be written at any moment. A mirror holds no sample before `first`; a
+  // `first` beyond `top` means that a sample after a gap is being published: then only `top` is
+  // certain to be valid.
   Tid oldest_for(Tid top) const noexcept {
     if (top < 0) return kNoTid;
     const Tid first = first_->load(std::memory_order_acquire);

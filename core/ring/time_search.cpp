@@ -17,8 +17,8 @@ class Probe {
     lowest_ = std::min(lowest_, tid);
     return slots_.time_ns(tid).load(kProbe);  // the caller calls fence_after_probing()
   }
-  // Fetches the slot of a likely answer while its time is being looked at.
-  void expect(Tid tid) const noexcept {
+  // Fetches the slot of a likely answer while its time is compared.
+  void prefetch(Tid tid) const noexcept {
     const SlotHeader& slot = slots_.slot(tid);
     __builtin_prefetch(&slot);
     __builtin_prefetch(&slot + 1);  // the payload's first line
@@ -46,10 +46,10 @@ Tid interpolate(Tid low, Tid high, std::int64_t low_ns, std::int64_t high_ns,
 Tid search_run(Probe& probe, Tid low, Tid high, std::int64_t low_ns, std::int64_t high_ns,
                std::int64_t t_ns) noexcept {
   // A regular stream needs one step: the guess is right, or its neighbour is. A second step helps
-  // streams with a gap; more would only delay the galloping on irregular ones.
+  // streams with a gap; more would only delay the bisection of irregular ones.
   for (int step = 0; step < 2 && high - low > 1; ++step) {
     const Tid guess = interpolate(low, high, low_ns, high_ns, t_ns);
-    if (step == 0) probe.expect(guess);
+    if (step == 0) probe.prefetch(guess);
     const std::int64_t guess_ns = probe.time(guess);
     Tid width = 1;
     if (guess_ns <= t_ns) {
@@ -62,7 +62,7 @@ Tid search_run(Probe& probe, Tid low, Tid high, std::int64_t low_ns, std::int64_
           break;
         }
         low = next, low_ns = next_ns;
-        if (width >= 4) break;  // far off: interpolate anew, or bisect
+        if (width >= 4) break;  // the guess was far off: interpolate again, or bisect
       }
     } else {
       high = guess, high_ns = guess_ns;
@@ -78,8 +78,6 @@ Tid search_run(Probe& probe, Tid low, Tid high, std::int64_t low_ns, std::int64_
       }
     }
   }
-  // What is left after interpolation is often near one end: gallop from the nearer one, so that the
-  // cost is the logarithm of the guess's error, not of the depth; then bisect.
   while (high - low > 1) {
     const Tid middle = low + (high - low) / 2;
     (probe.time(middle) <= t_ns ? low : high) = middle;
@@ -118,7 +116,8 @@ FoundSample find_newest_at_or_before(const SlotTable& slots, Tid oldest, Tid top
       found.lowest_probed = probe.lowest();
       return found;
     }
-    if (first != start || start <= oldest) {  // the run's beginning, or all before it, is gone
+    if (first != start ||
+        start <= oldest) {  // the run's start, or all before it, has left the ring
       found.lowest_probed = probe.lowest();
       return found;
     }

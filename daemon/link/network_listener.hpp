@@ -23,9 +23,8 @@ class NetworkListener {
   // Listens at the configured addresses, which are numbers; an empty list: nowhere. Nothing
   // configured: at the default port of 127.0.0.1 and ::1, as far as this PC has them and no other
   // dssmd took the port before; what is missing is logged as a warning.
-  //   inherited  those that are bound to a wanted address are used, and taken out of the list; of
-  //   the
-  //              others, those that keep_in() had kept listen no more
+  //   inherited  those that are bound to a wanted address are used and removed from the list; of
+  //              the others, those that keep_in() had kept stop listening
   //   fails      naming the configured address that cannot be had
   static Result<NetworkListener> open(const std::optional<std::vector<wire::Address>>& configured,
                                       Inherited& inherited, Logger& logger);

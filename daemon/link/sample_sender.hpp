@@ -4,8 +4,7 @@
 // at any moment, so each way of sending has to make sure that no receiver accepts such a sample:
 //
 //   copied    small payloads, as many at a time as there are, into whole frames, each checked by
-//   its
-//             slot's sequence, then sent at once. One copy.
+//             its slot's sequence, then sent at once. One copy.
 //   in place  large payloads go out straight from their slot by gathered sends. When all bytes are
 //             with the kernel, the sequence is checked, and the verdict follows as the frame's last
 //             field (network.proto, Frame.torn). What the socket does not take is copied aside at

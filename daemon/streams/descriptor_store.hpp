@@ -44,9 +44,8 @@ class DescriptorStore final : private StreamObserver {
   // a warning. To be called once, before anything is created.
   //   store_is_there  something else came from the store: had there been streams, they would have,
   //                   too
-  //   returns         whether streams may be missing that an earlier dssmd had: nothing was kept,
-  //   or
-  //                   some of it was dropped, or the store was full
+  //   returns         whether streams of an earlier dssmd may be missing: nothing was kept, some of
+  //                   it was dropped, or the store was full
   bool restore_untrusted(std::vector<NamedDescriptor> kept, bool store_is_there);
 
   std::size_t descriptors() const noexcept { return descriptors_; }

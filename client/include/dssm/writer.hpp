@@ -65,10 +65,10 @@ class RawWriter {
   // Writes one sample.
   //   payload      exactly payload_bytes() long
   //   time         when it was measured; stored as given, also when it runs backwards
-  //   clock_error  >= 0: bound on the error of `time`. kOwnClockError: what dssmd knows of this
-  //   PC's
-  //                clock at `time`, which was some seconds ago at most. A time that is more than
-  //                10 s from now is none of this clock, but a recording's: kForeignClockError
+  //   clock_error  >= 0: bound on the error of `time`. kOwnClockError: the bound that dssmd knows
+  //                for this PC's clock at `time`, which was a few seconds ago at most. A time that
+  //                is more than 10 s from now does not come from this clock but from a recording:
+  //                it gets kForeignClockError
   //   returns      its tid; kNoTid when the length is wrong or this thread holds a loan
   Tid write(std::span<const std::byte> payload, Time time = WallClock::now(),
             Duration clock_error = kOwnClockError) noexcept;

@@ -7,8 +7,7 @@
 //   writing   fill *wdata, then write(); `data` is not sent
 //   reading   read(), readNew() ... fill `data`: one round trip over the network each
 //   buffered  after readyRingBuf() a thread collects the stream's samples, beginning with the
-//   oldest
-//             that its owner holds, and the ...Buf functions read them here, every one
+//             oldest one that its owner holds, and the ...Buf functions read each of them here
 #ifndef DSSM_DSSM_HPP
 #define DSSM_DSSM_HPP
 

@@ -8,8 +8,7 @@
 //   T        anything: structs, arrays, classes that own memory (with callbacks of their own, see
 //            readSSMP). Exactly one T and one P live inside the object.
 //   copies   objects may be copied; the copy of an SSMApi uses its own data and property, and
-//   shares
-//            the open stream
+//            shares the open stream
 //   signals  close() and release() may be called from a signal handler at any moment
 #ifndef DSSM_SSM_HPP
 #define DSSM_SSM_HPP

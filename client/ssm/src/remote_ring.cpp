@@ -11,7 +11,7 @@
 #include <vector>
 
 #include "core/base/quiet_thread.hpp"
-#include "core/ring/sample_publisher.hpp"
+#include "core/ring/slot_writer.hpp"
 #include "messages.hpp"
 
 namespace dssm::ssm {
@@ -81,7 +81,7 @@ bool RemoteRing::pause() {
 void RemoteRing::fill() {
   // Samples are received beside the ring and then copied into it as its readers expect it; they are
   // in the same process, and must not meet the decoder's plain stores.
-  const ring::SamplePublisher ring(*mapping_);
+  const ring::SlotWriter ring(*mapping_);
   std::vector<std::byte> payload(mapping_->geometry().payload_bytes);
   Tid offset = 0;  // the ring's tids are so far ahead of the stream's
   bool complained = false;

@@ -9,9 +9,8 @@
 //
 //   tids     as in stream.hpp: they keep rising when the stream begins anew
 //   threads  calls take turns
-//   signals  close() at any moment; a call in a handler that interrupted another one, of this
-//   object
-//            or another in its own thread, fails (but reading what was collected)
+//   signals  close() at any moment; other calls in a handler that interrupted a call of a remote
+//            stream fail, except for reading collected samples
 #pragma once
 
 #include <atomic>

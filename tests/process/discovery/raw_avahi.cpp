@@ -11,8 +11,7 @@
 //   raw-avahi record DOMAIN_NAME TXT             waits for the TXT record of this PC's own, prints
 //                                                its strings in the order of the wire; ends
 //   raw-avahi rename NAME                        lets the Avahi daemon call this PC so; ends when
-//   it
-//                                                has announced that
+//                                                it has announced that
 #include <avahi-client/client.h>
 #include <avahi-client/lookup.h>
 #include <avahi-client/publish.h>

@@ -65,7 +65,7 @@ constexpr std::uint64_t kPublisher = 77;
 Deaths die_at_every_instruction(TimeOf time_of, bool publishes = false) {
   const TestRing ring(kPayloadBytes, 5);
   const RingReader reader = ring.reader();
-  const PublisherCursors notes(ring.mapping->header());
+  const PublisherCursors cursors(ring.mapping->header());
   RingWriter survivor = ring.writer();
   if (publishes) {
     survivor.try_publish({kPublisher, 7}, payload_for(0, kPayloadBytes), {}, {});
@@ -74,7 +74,7 @@ Deaths die_at_every_instruction(TimeOf time_of, bool publishes = false) {
   bool finished = false;
   for (int steps = 0; !finished; steps += publishes ? kPublishingStride : kStride) {
     const Tid next = reader.newest() + 1;
-    const std::int64_t number = notes.last_untrusted(kPublisher).number + 1;
+    const std::int64_t number = cursors.last_untrusted(kPublisher).number + 1;
     const auto payload = payload_for(next, kPayloadBytes);
     const pid_t child = ::fork();
     if (child == 0) {
@@ -106,8 +106,8 @@ Deaths die_at_every_instruction(TimeOf time_of, bool publishes = false) {
     // It is known whose sample that was exactly when it is there.
     const auto expect_noted = [&] {
       if (!publishes) return;
-      EXPECT_EQ(notes.last_untrusted(kPublisher).number, expected == next ? number - 1 : number);
-      EXPECT_LT(notes.last_untrusted(kPublisher).tid, expected);
+      EXPECT_EQ(cursors.last_untrusted(kPublisher).number, expected == next ? number - 1 : number);
+      EXPECT_LT(cursors.last_untrusted(kPublisher).tid, expected);
     };
     expect_noted();
     EXPECT_EQ(survivor.write(payload_for(expected, kPayloadBytes), time_from_ns(time_of(expected)),
@@ -152,13 +152,13 @@ TEST(KilledWriter, KnowsAtEveryInstructionWhetherWhatItPublishesIsWritten) {
 // What a writer changes in a ring's header, step by step.
 struct HeaderState {
   explicit HeaderState(const RingHeader& header) : top(header.top.load()) {
-    std::memcpy(notes, header.publishers, sizeof notes);
+    std::memcpy(cursors, header.publishers, sizeof cursors);
   }
   bool operator==(const HeaderState& other) const {
-    return top == other.top && std::memcmp(notes, other.notes, sizeof notes) == 0;
+    return top == other.top && std::memcmp(cursors, other.cursors, sizeof cursors) == 0;
   }
   Tid top;
-  std::byte notes[sizeof(RingHeader::publishers)];
+  std::byte cursors[sizeof(RingHeader::publishers)];
 };
 
 // Runs `act` in a child and kills it right after its `changes`-th change to the header, which is as
@@ -201,12 +201,12 @@ class KilledDaemon : public testing::Test {
     writer.try_publish({publisher, number}, payload, {}, Duration(0));
   }
   std::int64_t last(std::uint64_t publisher) const {
-    return notes.last_untrusted(publisher).number;
+    return cursors.last_untrusted(publisher).number;
   }
 
   const TestRing ring{kPayloadBytes, 5};
   const RingHeader& header = ring.mapping->header();
-  const PublisherCursors notes{ring.mapping->header()};
+  const PublisherCursors cursors{ring.mapping->header()};
   RingWriter survivor = ring.writer();
   const std::vector<std::byte> payload = payload_for(0, kPayloadBytes);
 };
@@ -236,7 +236,7 @@ TEST_F(KilledDaemon, IsRecoveredByWritersThatDieToo) {
     if (daemon == 0) {
       RingWriter writer = ring.writer();
       writer.begin();
-      notes.note({kPublisher, 8}, writer.newest() + 1);
+      cursors.advance({kPublisher, 8}, writer.newest() + 1);
       ::_exit(0);  // with the lock
     }
     int status = 0;

@@ -18,11 +18,11 @@ class PublisherNotesTest : public testing::Test {
     EXPECT_EQ(attempt.outcome, RingWriter::Attempt::Outcome::written);
     return attempt.tid;
   }
-  std::int64_t number(std::uint64_t publisher) { return notes.last_untrusted(publisher).number; }
-  Tid tid(std::uint64_t publisher) { return notes.last_untrusted(publisher).tid; }
+  std::int64_t number(std::uint64_t publisher) { return cursors.last_untrusted(publisher).number; }
+  Tid tid(std::uint64_t publisher) { return cursors.last_untrusted(publisher).tid; }
 
   const TestRing ring{8, 4};
-  const PublisherCursors notes{ring.mapping->header()};
+  const PublisherCursors cursors{ring.mapping->header()};
 };
 
 TEST_F(PublisherNotesTest, KnowWhereEachStopped) {
@@ -64,17 +64,17 @@ TEST_F(PublisherNotesTest, TakeTheLargestNumbers) {
   EXPECT_EQ(number(~std::uint64_t{0}), kLargest);
 }
 
-// A dssmd that died between the note and the sample.
+// A dssmd that died between the cursor and the sample.
 TEST_F(PublisherNotesTest, DoNotCountASampleThatIsNotThere) {
   publish(5, 10);
-  notes.note({5, 11}, 1);
-  notes.note({6, 0}, 1);
+  cursors.advance({5, 11}, 1);
+  cursors.advance({6, 0}, 1);
   for (int recovered = 0; recovered < 3; ++recovered) {
     EXPECT_EQ(number(5), 10);
     EXPECT_EQ(tid(5), 0);
     EXPECT_EQ(number(6), -1);
     EXPECT_EQ(tid(6), kNoTid);
-    notes.recover();  // what the next holder of the lock does, if it is not killed in between
+    cursors.recover();  // what the next holder of the lock does, if it is not killed in between
   }
   EXPECT_EQ(ring.writer().write(payload_for(0, 8), {}, {}), 1) << "another one has its tid now";
   EXPECT_EQ(number(5), 10);
@@ -85,29 +85,29 @@ TEST_F(PublisherNotesTest, DoNotCountASampleThatIsNotThere) {
 
 TEST_F(PublisherNotesTest, DoNotGiveANewPublisherWhatAForgottenOneWrote) {
   for (std::uint64_t i = 0; i < kMaxPublishers; ++i) publish(i, 7);
-  notes.note({1000, 1}, static_cast<Tid>(kMaxPublishers));
+  cursors.advance({1000, 1}, static_cast<Tid>(kMaxPublishers));
   EXPECT_EQ(number(1000), -1);
   EXPECT_EQ(number(0), -1);
-  notes.recover();
+  cursors.recover();
   EXPECT_EQ(number(1000), -1);
   EXPECT_EQ(number(1), 7);
 }
 
 TEST_F(PublisherNotesTest, NonsenseOfAProgramIsNoNote) {
   publish(5, 10);
-  PublisherCursor& note = ring.mapping->header().publishers[0];
+  PublisherCursor& cursor = ring.mapping->header().publishers[0];
   constexpr std::uint64_t kAll = ~std::uint64_t{0};
   for (const std::uint64_t nonsense : {std::uint64_t{3}, kAll >> 1, kAll}) {
-    note.tid_end.store(nonsense);
-    note.earlier_tid_end.store(nonsense);
+    cursor.tid_end.store(nonsense);
+    cursor.earlier_tid_end.store(nonsense);
     EXPECT_EQ(number(5), -1);
     EXPECT_EQ(tid(5), kNoTid);
   }
-  note.tid_end.store(1);
-  note.number_end.store(kAll);
+  cursor.tid_end.store(1);
+  cursor.number_end.store(kAll);
   EXPECT_EQ(number(5), -1);
-  note.tid_end.store(kAll);
-  notes.recover();
+  cursor.tid_end.store(kAll);
+  cursors.recover();
   EXPECT_EQ(publish(5, 11), 1);
   EXPECT_EQ(number(5), 11);
   ring.mapping->header().top.store(std::numeric_limits<std::int64_t>::max());

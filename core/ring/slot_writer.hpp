@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What makes the bytes in a slot a sample: stamps, run links, time index, sequence, top. Shared by
-// the writers of a stream and by dssmd, which fills mirrors.
+// Makes the bytes in a slot a sample: writes its stamps, run links, time index, sequence and `top`,
+// in the order that readers rely on. RingWriter (programs) and MirrorWriter (dssmd) are built on it.
 #pragma once
 
 #include <dssm/sample.hpp>
@@ -12,11 +12,11 @@
 
 namespace dssm::ring {
 
-// A value; the mapping (read-write) outlives it. Only whoever is the ring's writer at the moment
-// calls it: the holder of the lock, or the dssmd of a mirror.
-class SamplePublisher {
+// A value; the mapping (read-write) outlives it. Only the ring's current writer may call it: the
+// holder of the lock, or the dssmd that fills a mirror.
+class SlotWriter {
  public:
-  explicit SamplePublisher(const RingMapping& mapping) noexcept;
+  explicit SlotWriter(const RingMapping& mapping) noexcept;
 
   Tid newest() const noexcept { return header_->top.load(std::memory_order_acquire); }
   RingHeader& header() const noexcept { return *header_; }
@@ -24,19 +24,19 @@ class SamplePublisher {
   // Marks the slot of sample `tid` as being filled; returns where its payload goes.
   std::byte* begin(Tid tid) const noexcept;
 
-  // Copies the payload of sample `tid`, which begin() gave the place of.
+  // Copies the payload of sample `tid` to the place that begin() returned.
   void fill(Tid tid, std::span<const std::byte> payload) const noexcept;
 
   // The payload is in place: makes it sample `tid`. A tid that does not follow the newest one (in
-  // mirrors only) leaves a gap, and what was before it is not readable any more.
+  // mirrors only) leaves a gap, and samples before the gap are no longer readable.
   void publish(Tid tid, Time time, Duration clock_error) const noexcept;
 
-  // Sets right what a writer left that died before its sample was there.
+  // Repairs what a writer left that died before it published its sample.
   void recover() const noexcept;
 
-  // Takes the line of the sample after `tid` away from the readers of the last lap, so that the
-  // next write does not wait for it. Halves the time of a hand-over to a spinning reader.
-  void expect_next(Tid tid) const noexcept;
+  // Fetches the slot of the sample after `tid` for writing from the caches of the readers that read
+  // it one lap ago. Halves the time of a hand-over to a spinning reader.
+  void prefetch_next(Tid tid) const noexcept;
 
  private:
   RingHeader* header_;
