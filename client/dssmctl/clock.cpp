@@ -36,8 +36,8 @@ std::string offset_text(Duration offset) {
 
 std::string status_text(const ClockInfo& clock) {
   const std::string status(name_of(clock.status));
-  return clock.trouble == ClockReason::none ? status
-                                            : status + ": " + std::string(name_of(clock.trouble));
+  return clock.reason == ClockReason::none ? status
+                                           : status + ": " + std::string(name_of(clock.reason));
 }
 
 std::string reference_text(const ClockInfo& clock) {
@@ -66,7 +66,7 @@ Json clock_json(const HostInfo& host) {
   json["state"] = host.state;
   const ClockInfo clock = host.clock.value_or(ClockInfo());
   json["status"] = name_of(clock.status);
-  json["trouble"] = clock.trouble == ClockReason::none ? Json() : Json(name_of(clock.trouble));
+  json["trouble"] = clock.reason == ClockReason::none ? Json() : Json(name_of(clock.reason));
   json["basis"] = name_of(clock.basis);
   json["bound_ns"] = bound_json(host.clock_bound);
   json["distance_ns"] = bound_json(clock.distance);
@@ -113,7 +113,7 @@ bool wait_a_period(MonoTime until) {
 Result<void> watch_clocks(Session& session, const Options& options, Output& out) {
   catch_stop_signals();
   for (MonoTime next = MonoClock::now();; next += kReadingPeriod) {
-    const Result<std::vector<HostInfo>> hosts = session.hosts();
+    const Result<std::vector<HostInfo>> hosts = session.list_hosts();
     if (!hosts) return hosts.error();
     print_clocks(*hosts, options.json, out);
     if (!options.json) out.add("\n");
@@ -179,7 +179,7 @@ Result<void> tabulate_clocks(Session& session, const Options& options, Output& o
   MonoTime next = MonoClock::now();
   for (std::uint64_t i = 0; i < count; ++i, next += kReadingPeriod) {
     if (!wait_a_period(next)) break;
-    const Result<std::vector<HostInfo>> hosts = session.hosts();
+    const Result<std::vector<HostInfo>> hosts = session.list_hosts();
     if (!hosts) return hosts.error();
     for (const HostInfo& host : *hosts) {
       if (!is_there(host)) continue;
@@ -201,7 +201,7 @@ Result<void> await_clock(Session& session, const Options& options, Output& out) 
   catch_stop_signals();
   const MonoTime deadline = deadline_in(*options.clock_wait);
   for (;;) {
-    const Result<std::vector<HostInfo>> hosts = session.hosts();
+    const Result<std::vector<HostInfo>> hosts = session.list_hosts();
     if (!hosts) return hosts.error();
     const HostInfo& self = hosts->front();
     if (self.clock && is_good(*self.clock)) {
@@ -226,7 +226,7 @@ Result<void> run_clock(const Options& options, Output& out) {
   if (options.clock_wait) return await_clock(*session, options, out);
   if (options.table) return tabulate_clocks(*session, options, out);
   if (options.watch) return watch_clocks(*session, options, out);
-  const Result<std::vector<HostInfo>> hosts = session->hosts();
+  const Result<std::vector<HostInfo>> hosts = session->list_hosts();
   if (!hosts) return hosts.error();
   print_clocks(*hosts, options.json, out);
   return {};

@@ -22,7 +22,7 @@ std::uint32_t likely_alignment(std::uint64_t payload_bytes) {
 }
 
 Result<History> history_of(const Options& options) {
-  if (options.life) return History::of(*options.life, *options.cycle);
+  if (options.life) return History::for_life(*options.life, *options.cycle);
   return History{options.depth, options.cycle.value_or(kDefaultCycle)};
 }
 
@@ -44,15 +44,15 @@ Result<void> run_create(const Options& options, Output& out) {
   if (!session) return std::move(session).error();
   StreamId wanted = *id;
   if (wanted.host.empty()) {  // created here, whatever other hosts have
-    const Result<DaemonInfo> daemon = session->daemon();
+    const Result<DaemonInfo> daemon = session->daemon_info();
     if (!daemon) return daemon.error();
     wanted.host = daemon->host;
   }
-  const bool there = session->info(wanted).has_value();
+  const bool there = session->stream_info(wanted).has_value();
   Result<RawWriter> writer = session->create_raw(*id, type, *history);
   if (!writer) return std::move(writer).error();
   // Not the writer's own figures: for another host's stream those of a ring on the way there.
-  const Result<StreamInfo> stream = session->info(writer->id());
+  const Result<StreamInfo> stream = session->stream_info(writer->id());
   if (!stream) return stream.error();
   if (options.json) {
     out.add(json_document({{"stream", stream->id.str()},

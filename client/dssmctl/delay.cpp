@@ -52,8 +52,8 @@ Result<void> run_delay(const Options& options, Output& out) {
   };
   meter.on_report = [&](const MeterState& state, Session& session) {
     // While dssmd is away the last figures stay; nobody shall wait for it here.
-    if (session.connected()) {
-      if (const auto hosts = session.hosts()) clocks.update(*hosts, state.stream.host);
+    if (session.is_connected()) {
+      if (const auto hosts = session.list_hosts()) clocks.update(*hosts, state.stream.host);
     }
     const auto print = options.json ? print_json : print_text;
     print(state, delays.statistics(), clocks, out);

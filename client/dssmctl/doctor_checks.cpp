@@ -280,7 +280,7 @@ Finding mdns_waiting(const Facts& facts) {
   const DaemonInfo::Mdns& mdns = facts.daemon.mdns;
   Finding finding{"mdns",
                   Status::warn,
-                  "waits for Avahi" + (mdns.trouble.empty() ? "" : ": " + mdns.trouble),
+                  "waits for Avahi" + (mdns.error.empty() ? "" : ": " + mdns.error),
                   {},
                   {}};
   if (!facts.avahi_installed) {
@@ -312,7 +312,7 @@ void check_mdns(const Facts& facts, Findings& findings) {
                       std::to_string(mdns.hosts_heard) + " other hosts heard",
                   {},
                   {}};
-  if (!mdns.trouble.empty()) finding.text += ": " + mdns.trouble;
+  if (!mdns.error.empty()) finding.text += ": " + mdns.error;
   if (mdns.withheld > 0) {
     finding.status = Status::warn;
     finding.text += "; " + std::to_string(mdns.withheld) + " not announced";
@@ -328,7 +328,7 @@ void check_mdns(const Facts& facts, Findings& findings) {
     finding.status = Status::warn;
     finding.cause = "the network or a firewall swallows multicast: others are up, none is heard";
     finding.command = "sudo ufw allow 5353/udp  # on each host; or list all hosts in peers";
-  } else if (!mdns.trouble.empty()) {
+  } else if (!mdns.error.empty()) {
     finding.status = Status::warn;
     finding.cause = "Avahi refused something";
     finding.command = "journalctl -u avahi-daemon -n 50";

@@ -151,9 +151,9 @@ void ask_dssmd(const Options& options, Facts& facts) {
     facts.failed = std::move(session).error();
     return;
   }
-  take(session->daemon(), facts.daemon, facts.failed) &&
-      take(session->hosts(), facts.hosts, facts.failed) &&
-      take(session->list(), facts.streams, facts.failed);
+  take(session->daemon_info(), facts.daemon, facts.failed) &&
+      take(session->list_hosts(), facts.hosts, facts.failed) &&
+      take(session->list_streams(), facts.streams, facts.failed);
 }
 
 }  // namespace

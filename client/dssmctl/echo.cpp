@@ -51,8 +51,8 @@ class Echo {
       if (status == ReadStatus::restarted) reopen();
     }
     if (status == ReadStatus::ok) {
-      printer_.sample(info, payload_, {reader_.lost() - lost_, reader_.restarts()});
-      lost_ = reader_.lost();
+      printer_.sample(info, payload_, {reader_.lost_samples() - lost_, reader_.restarts()});
+      lost_ = reader_.lost_samples();
       --left_;
     }
     return status;
@@ -60,12 +60,12 @@ class Echo {
 
   // Prints what is there at this moment. Whether to go on.
   bool print_new() {
-    const Tid last = reader_.newest();
+    const Tid last = reader_.newest_tid();
     const std::uint64_t restarts = reader_.restarts();
     bool more = true;  // at least one look: only a read finds out that the stream began anew
     while (more && go_on()) {
       const ReadStatus status =
-          print([&](auto payload, auto& info) { return reader_.next(payload, info); });
+          print([&](auto payload, auto& info) { return reader_.read_next(payload, info); });
       if (status == ReadStatus::not_yet || !out_.flush_some()) break;
       more = reader_.cursor() < last || reader_.restarts() != restarts;
     }
@@ -106,7 +106,7 @@ Error failed_read(const RawReader& reader, const std::string& what, ReadStatus s
   SampleInfo oldest;
   switch (status) {
     case ReadStatus::too_old:
-      if (reader.stamp(reader.oldest(), oldest) == ReadStatus::ok) {
+      if (reader.read_info(reader.oldest_tid(), oldest) == ReadStatus::ok) {
         return {Errc::not_found, tried + "too old, the ring holds samples from " +
                                      seconds_text(to_ns(oldest.time)) + " on"};
       }
@@ -132,8 +132,8 @@ Result<Time> moment(const RawReader& reader, const Options& options) {
   SampleInfo newest;
   ReadStatus status = ReadStatus::not_yet;
   do {  // the newest one may be overtaken between the two calls
-    status = reader.stamp(reader.newest(), newest);
-  } while (status == ReadStatus::too_old && reader.newest() != kNoTid);
+    status = reader.read_info(reader.newest_tid(), newest);
+  } while (status == ReadStatus::too_old && reader.newest_tid() != kNoTid);
   if (status != ReadStatus::ok)
     return failed_read(reader, "the newest sample", ReadStatus::not_yet);
   return saturating_add(newest.time, *options.at);
@@ -146,18 +146,18 @@ Result<void> begin(const Options& options, bool awaited, RawReader& reader, Echo
     const Result<Time> time = moment(reader, options);
     if (!time) return time.error();
     const ReadStatus status =
-        echo.print([&](auto payload, auto& info) { return reader.at(*time, payload, info); });
+        echo.print([&](auto payload, auto& info) { return reader.read_at(*time, payload, info); });
     if (!echo.result()) return echo.result();
     if (status != ReadStatus::ok) {
       return failed_read(reader, "the sample at " + seconds_text(to_ns(*time)), status);
     }
   } else if (options.last) {
     const ReadStatus status =
-        echo.print([&](auto payload, auto& info) { return reader.latest(payload, info); });
+        echo.print([&](auto payload, auto& info) { return reader.read_newest(payload, info); });
     if (!echo.result()) return echo.result();
     if (status != ReadStatus::ok) return failed_read(reader, "the newest sample", status);
   } else {
-    reader.seek(awaited ? kNoTid : reader.newest());
+    reader.seek(awaited ? kNoTid : reader.newest_tid());
   }
   return {};
 }

@@ -9,7 +9,7 @@
 namespace dssm::ctl {
 
 Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out) {
-  const Result<DaemonInfo> daemon = session.daemon();
+  const Result<DaemonInfo> daemon = session.daemon_info();
   if (!daemon) return daemon.error();
   const bool own = reader.id().host == daemon->host;
   Follower follower(session, reader, out, own ? kStopLookUp : kMayComeBack);
@@ -29,8 +29,8 @@ Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out
 // knows.
 bool Follower::removed() {
   bool gone = false;
-  if (suspicion_->load(std::memory_order_relaxed) && session_.connected()) {
-    const Result<StreamInfo> now = session_.info(reader_.id());
+  if (suspicion_->load(std::memory_order_relaxed) && session_.is_connected()) {
+    const Result<StreamInfo> now = session_.stream_info(reader_.id());
     gone = !now && now.error().code == Errc::not_found;
   }
   if (!gone) {
@@ -44,7 +44,7 @@ bool Follower::removed() {
 Follower::Wake Follower::wait(MonoTime deadline) {
   while (true) {
     if (stop_requested() || out_.reader_gone()) return Wake::stop;
-    if (removed() || reader_.trouble()) return Wake::ended;
+    if (removed() || reader_.restart_error()) return Wake::ended;
     const MonoTime look_up = std::min(deadline, deadline_in(kStopLookUp));
     if (reader_.wait(look_up) == WaitStatus::ready) return Wake::sample;
     if (MonoClock::now() >= deadline) return Wake::deadline;
@@ -52,7 +52,7 @@ Follower::Wake Follower::wait(MonoTime deadline) {
 }
 
 Error end_of(const RawReader& reader) {
-  if (std::optional<Error> trouble = reader.trouble()) return *std::move(trouble);
+  if (std::optional<Error> trouble = reader.restart_error()) return *std::move(trouble);
   return {Errc::not_found,
           "follow '" + reader.id().str() + "': it was removed; start again if it was created anew"};
 }

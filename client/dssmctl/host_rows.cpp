@@ -29,7 +29,7 @@ Json host_json(const HostInfo& host) {
   json["found_by"] = host.found_by;
   json["version"] = or_null(host.version);
   json["round_trip_ns"] = round_trip_json(host.round_trip);
-  json["least_round_trip_ns"] = round_trip_json(host.least_round_trip);
+  json["least_round_trip_ns"] = round_trip_json(host.min_round_trip);
   json["streams"] = host.streams;
   json["clock_bound_ns"] = bound_json(host.clock_bound);
   json["insecure"] = host.insecure;

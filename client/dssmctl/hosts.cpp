@@ -27,7 +27,7 @@ void print_names(const std::vector<HostInfo>& hosts, Output& out) {
 Result<void> run_hosts(const Options& options, Output& out) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
-  const Result<std::vector<HostInfo>> hosts = session->hosts();
+  const Result<std::vector<HostInfo>> hosts = session->list_hosts();
   if (!hosts) return hosts.error();
   if (options.json) {
     Json all = Json::array();

@@ -33,7 +33,7 @@ void print_fields(const StreamInfo& stream, Output& out) {
   constexpr auto kRight = Table::Align::right;
   Table table({{"FIELD"}, {"KIND"}, {"OFFSET", kRight}, {"COUNT", kRight}, {"STRIDE", kRight}});
   for (const Field& field : stream.type.fields) {
-    table.add_row({escaped(field.name), std::string(scalar_name(field.kind)),
+    table.add_row({escaped(field.name), std::string(name_of(field.kind)),
                    std::to_string(field.offset_bytes), std::to_string(field.count),
                    field.count > 1 ? std::to_string(field.stride_bytes) : "-"});
   }
@@ -91,9 +91,9 @@ void print_stream(const StreamInfo& stream, Output& out) {
 }
 
 Result<void> print_daemon(Session& session, const Options& options, Output& out) {
-  const Result<DaemonInfo> daemon = session.daemon();
+  const Result<DaemonInfo> daemon = session.daemon_info();
   if (!daemon) return daemon.error();
-  const Result<std::vector<HostInfo>> hosts = session.hosts();
+  const Result<std::vector<HostInfo>> hosts = session.list_hosts();
   if (!hosts) return hosts.error();
   const std::vector<std::string> addresses =
       hosts->empty() ? std::vector<std::string>() : hosts->front().addresses;
@@ -129,7 +129,7 @@ Result<void> run_info(const Options& options, Output& out) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
   if (!id) return print_daemon(*session, options, out);
-  Result<StreamInfo> stream = session->info(*id);
+  Result<StreamInfo> stream = session->stream_info(*id);
   if (!stream) return with_similar_names(std::move(stream).error(), *session, *id);
   if (options.json) {
     Json json = stream_json(*stream, WallClock::now());

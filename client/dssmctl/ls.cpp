@@ -123,7 +123,7 @@ void print_table(const Listing& listing, Time now, Output& out) {
 // A program must get a name as it is; a terminal must not.
 Result<void> print_names(Session& session, const std::vector<StreamInfo>& all,
                          const StreamFilter& filter, Output& out) {
-  const Result<DaemonInfo> daemon = session.daemon();
+  const Result<DaemonInfo> daemon = session.daemon_info();
   if (!daemon) return daemon.error();
   const std::vector<std::string> names = opening_names(all, daemon->host);
   for (std::size_t i = 0; i < all.size(); ++i) {
@@ -136,7 +136,7 @@ Result<void> print_names(Session& session, const std::vector<StreamInfo>& all,
 // A name that is no host's would show nothing for ever.
 Result<void> check_hosts(Session& session, const std::vector<std::string>& wanted) {
   if (wanted.empty()) return {};
-  const Result<std::vector<HostInfo>> hosts = session.hosts();
+  const Result<std::vector<HostInfo>> hosts = session.list_hosts();
   if (!hosts) return hosts.error();
   std::set<std::string> known;
   for (const HostInfo& host : *hosts) {
@@ -160,7 +160,7 @@ Result<void> check_hosts(Session& session, const std::vector<std::string>& wante
 Result<StreamFilter> filter_of(Session& session, const Options& options) {
   std::vector<std::string> hosts = options.hosts;
   if (options.own) {
-    const Result<DaemonInfo> daemon = session.daemon();
+    const Result<DaemonInfo> daemon = session.daemon_info();
     if (!daemon) return daemon.error();
     hosts = {daemon->host};
   }
@@ -177,7 +177,8 @@ Result<void> run_ls(const Options& options, Output& out) {
     const Result<StreamFilter> filter = filter_of(*session, options);
     return filter ? watch_streams(*session, options, *filter, out) : filter.error();
   }
-  Result<std::vector<StreamInfo>> streams = options.own ? session->list_own() : session->list();
+  Result<std::vector<StreamInfo>> streams =
+      options.own ? session->list_own_streams() : session->list_streams();
   if (!streams) return std::move(streams).error();
   sort_streams(*streams, options.sort);
   if (options.reverse) std::reverse(streams->begin(), streams->end());

@@ -30,12 +30,12 @@ class StampReader {
  private:
   void read_ring() {
     const Time arrival = WallClock::now();
-    const Tid newest = reader_.newest();
+    const Tid newest = reader_.newest_tid();
     Tid tid = reader_.cursor() + 1;
     while (tid <= newest) {
       SampleInfo info;
-      if (reader_.stamp(tid, info) != ReadStatus::ok) {
-        const Tid next = std::max(reader_.oldest(), tid + 1);
+      if (reader_.read_info(tid, info) != ReadStatus::ok) {
+        const Tid next = std::max(reader_.oldest_tid(), tid + 1);
         state_.lost += static_cast<std::uint64_t>(next - tid);
         if (meter_.on_gap) meter_.on_gap();
         tid = next;
@@ -68,9 +68,9 @@ class StampReader {
 
 // The last sample not to look at: before the newest `window` ones, or before what is to come.
 Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t window, bool awaited) {
-  const Tid newest = reader.newest();
+  const Tid newest = reader.newest_tid();
   if (!meter.from_history) return awaited ? kNoTid : newest;
-  return std::max(newest - static_cast<Tid>(window), reader.oldest() - 1);
+  return std::max(newest - static_cast<Tid>(window), reader.oldest_tid() - 1);
 }
 
 }  // namespace

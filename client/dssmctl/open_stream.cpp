@@ -57,7 +57,7 @@ Result<void> with_stream(const Options& options,
 
 Error with_similar_names(Error error, Session& session, const StreamId& wanted) {
   if (error.code != Errc::not_found) return error;
-  const Result<std::vector<StreamInfo>> streams = session.list();
+  const Result<std::vector<StreamInfo>> streams = session.list_streams();
   if (!streams) return error;  // the first failure is the one to tell
   if (streams->empty()) {
     error.message += "; there are no streams at all";

@@ -89,7 +89,7 @@ class Ping {
 
 // Whether dssmd knows a host of that name, even if it does not answer.
 bool is_known(Session& session, const std::string& name) {
-  const Result<std::vector<HostInfo>> hosts = session.hosts();
+  const Result<std::vector<HostInfo>> hosts = session.list_hosts();
   return hosts && std::any_of(hosts->begin(), hosts->end(),
                               [&](const HostInfo& host) { return host.name == name; });
 }

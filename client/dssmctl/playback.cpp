@@ -49,7 +49,7 @@ void print(const PlaybackClock& clock, const Options& options, Output& out) {
 Result<void> run_playback(const Options& options, Output& out) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
-  Result<PlaybackClock> clock = session->playback_clock();
+  Result<PlaybackClock> clock = session->open_playback_clock();
   if (!clock) return std::move(clock).error();
   turn(*clock, options);
   const bool asked = options.verb == Verb::playback_show;

@@ -53,7 +53,7 @@ void add_details(Json& json, const StreamInfo& stream) {
   Json& fields = json["fields"] = Json::array();
   for (const Field& field : stream.type.fields) {
     fields.push_back({{"name", field.name},
-                      {"kind", scalar_name(field.kind)},
+                      {"kind", name_of(field.kind)},
                       {"offset_bytes", field.offset_bytes},
                       {"count", field.count},
                       {"stride_bytes", field.stride_bytes}});

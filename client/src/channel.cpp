@@ -496,7 +496,7 @@ Result<void> Channel::unsubscribe() {
   }
   if (!subscriber_->active()) {
     if (subscription_refused_) return Error(*subscription_refused_).context(what("subscribe to"));
-    return Error{Errc::invalid_argument, what("read") + ": call subscribe() before next()"};
+    return Error{Errc::invalid_argument, what("read") + ": call subscribe() before read_next()"};
   }
   if (auto kept = subscriber_->take_kept(payload, info)) return *kept;
   subscriber_->keep(false);

@@ -12,11 +12,11 @@ Reading now() noexcept {
   reading.latest = Time::max();
   const ClockPage* page = detail::latest_clock_page().load(std::memory_order_acquire);
   if (!page) return reading;
-  reading.error = error_at(*page, reading.time).value_or(kUnknownClockError);
+  reading.clock_error = error_at(*page, reading.time).value_or(kUnknownClockError);
   reading.status = status_of(*page);
-  if (reading.error == kUnknownClockError) return reading;
-  reading.earliest = reading.time - reading.error;
-  reading.latest = reading.time + reading.error;
+  if (reading.clock_error == kUnknownClockError) return reading;
+  reading.earliest = reading.time - reading.clock_error;
+  reading.latest = reading.time + reading.clock_error;
   return reading;
 }
 

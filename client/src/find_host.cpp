@@ -13,7 +13,7 @@ std::vector<wire::SocketAddress> ask_catalog(const wire::Address& address) {
   std::vector<wire::SocketAddress> found;
   const auto usual = default_port();
   auto session = Session::connect();
-  auto hosts = session ? session->hosts() : std::move(session).error();
+  auto hosts = session ? session->list_hosts() : std::move(session).error();
   if (!hosts) return found;
   for (const HostInfo& host : *hosts) {
     if (host.name != address.host) continue;

@@ -116,7 +116,7 @@ Result<PConnector> PConnector::create(const StreamId& id, const TypeInfo& type,
   return PConnector(std::make_unique<detail::PConnectorState>(std::move(*channel)));
 }
 
-Result<std::vector<StreamInfo>> PConnector::list(PConnectorOptions options) {
+Result<std::vector<StreamInfo>> PConnector::list_streams(PConnectorOptions options) {
   const std::string what = "list the streams of '" + options.address + "'";
   auto host = detail::parse_host(options.address);
   if (!host) return std::move(host).error().context(what);
@@ -129,19 +129,20 @@ Result<std::vector<StreamInfo>> PConnector::list(PConnectorOptions options) {
 
 using Which = detail::ReadRequest::Which;
 
-Result<ReadStatus> PConnector::latest(std::span<std::byte> payload, SampleInfo& info) {
+Result<ReadStatus> PConnector::read_newest(std::span<std::byte> payload, SampleInfo& info) {
   return state_->channel->read({Which::newest}, payload, info);
 }
 
-Result<ReadStatus> PConnector::tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) {
+Result<ReadStatus> PConnector::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) {
   return state_->channel->read({Which::tid, tid}, payload, info);
 }
 
-Result<ReadStatus> PConnector::at(Time t, std::span<std::byte> payload, SampleInfo& info) {
+Result<ReadStatus> PConnector::read_at(Time t, std::span<std::byte> payload, SampleInfo& info) {
   return state_->channel->read({Which::time, to_ns(t)}, payload, info);
 }
 
-Result<ReadStatus> PConnector::newer(Tid than, std::span<std::byte> payload, SampleInfo& info) {
+Result<ReadStatus> PConnector::read_newer(Tid than, std::span<std::byte> payload,
+                                          SampleInfo& info) {
   return state_->channel->read({Which::newer_than, than}, payload, info);
 }
 
@@ -160,13 +161,13 @@ Result<net::Range> ask_range(detail::Channel& channel, std::optional<Time> t) {
 
 }  // namespace
 
-Result<Tid> PConnector::newest() {
+Result<Tid> PConnector::newest_tid() {
   auto range = ask_range(*state_->channel, std::nullopt);
   if (!range) return std::move(range).error();
   return std::max(range->newest(), kNoTid);
 }
 
-Result<Tid> PConnector::oldest() {
+Result<Tid> PConnector::oldest_tid() {
   auto range = ask_range(*state_->channel, std::nullopt);
   if (!range) return std::move(range).error();
   return std::max(range->oldest(), kNoTid);
@@ -186,14 +187,14 @@ Result<void> PConnector::subscribe(const Subscription& what) {
 
 Result<void> PConnector::unsubscribe() { return state_->channel->unsubscribe(); }
 
-Result<ReadStatus> PConnector::next(std::span<std::byte> payload, SampleInfo& info) {
+Result<ReadStatus> PConnector::read_next(std::span<std::byte> payload, SampleInfo& info) {
   return state_->channel->next(payload, info);
 }
 
 WaitStatus PConnector::wait(MonoTime deadline) { return state_->channel->wait(deadline); }
-std::uint64_t PConnector::lost() const noexcept { return state_->channel->lost(); }
+std::uint64_t PConnector::lost_samples() const noexcept { return state_->channel->lost(); }
 std::uint64_t PConnector::restarts() const noexcept { return state_->channel->restarts(); }
-int PConnector::fd() const noexcept { return state_->channel->fd(); }
+int PConnector::ready_fd() const noexcept { return state_->channel->fd(); }
 
 // --- writing
 
@@ -212,7 +213,7 @@ Result<void> PConnector::post(std::span<const std::byte> payload, Time time, Dur
 }
 
 Result<Tid> PConnector::flush(MonoTime deadline) { return state_->channel->flush(deadline); }
-std::uint64_t PConnector::dropped() const noexcept { return state_->channel->dropped(); }
+std::uint64_t PConnector::dropped_samples() const noexcept { return state_->channel->dropped(); }
 
 // --- about the stream
 
@@ -248,7 +249,7 @@ Duration PConnector::cycle() const noexcept { return state_->channel->stream().c
 std::uint64_t PConnector::incarnation() const noexcept {
   return state_->channel->stream().incarnation;
 }
-bool PConnector::connected() const noexcept { return state_->channel->is_connected(); }
+bool PConnector::is_connected() const noexcept { return state_->channel->is_connected(); }
 const std::string& PConnector::address() const noexcept { return state_->channel->address(); }
 PConnector::Counters PConnector::counters() const noexcept { return state_->channel->counters(); }
 

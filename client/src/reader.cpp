@@ -96,7 +96,7 @@ bool ReaderState::restart() noexcept {
   ring = ring::RingReader(*stream->ring->mapping);
   next_attempt_ns = 0;
   if (!same_samples) {
-    cursor = kNoTid;  // next() goes on with the first sample there; a fresh reader stays so
+    cursor = kNoTid;  // read_next() goes on with the first sample there; a fresh reader stays so
     ++restarts;
   }
   if (ready) client.notifiers().follow(*ready, {stream->ring, stream->superseded, cursor});
@@ -121,7 +121,8 @@ RawReader::RawReader(RawReader&&) noexcept = default;
 RawReader& RawReader::operator=(RawReader&&) noexcept = default;
 RawReader::~RawReader() = default;
 
-[[gnu::hot]] ReadStatus RawReader::latest(std::span<std::byte> payload, SampleInfo& info) noexcept {
+[[gnu::hot]] ReadStatus RawReader::read_newest(std::span<std::byte> payload,
+                                               SampleInfo& info) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read_newest(payload, info);
@@ -129,7 +130,7 @@ RawReader::~RawReader() = default;
   return status;
 }
 
-ReadStatus RawReader::tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) noexcept {
+ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read(tid, payload, info);
@@ -137,8 +138,9 @@ ReadStatus RawReader::tid(Tid tid, std::span<std::byte> payload, SampleInfo& inf
   return status;
 }
 
-[[gnu::hot]] ReadStatus RawReader::next(std::span<std::byte> payload, SampleInfo& info) noexcept {
-  if (state_->fresh) return latest(payload, info);
+[[gnu::hot]] ReadStatus RawReader::read_next(std::span<std::byte> payload,
+                                             SampleInfo& info) noexcept {
+  if (state_->fresh) return read_newest(payload, info);
   DSSM_CHECK(payload.size() == payload_bytes());
   Tid wanted = state_->cursor + 1;
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
@@ -157,13 +159,13 @@ ReadStatus RawReader::tid(Tid tid, std::span<std::byte> payload, SampleInfo& inf
   return ReadStatus::lapped;
 }
 
-ReadStatus RawReader::previous(std::span<std::byte> payload, SampleInfo& info) noexcept {
+ReadStatus RawReader::read_previous(std::span<std::byte> payload, SampleInfo& info) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   if (state_->cursor < 0) return ReadStatus::not_yet;
-  return tid(state_->cursor - 1, payload, info);
+  return read_tid(state_->cursor - 1, payload, info);
 }
 
-ReadStatus RawReader::at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
+ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == payload_bytes());
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
@@ -180,7 +182,8 @@ ReadStatus RawReader::at(Time t, std::span<std::byte> payload, SampleInfo& info)
   return ReadStatus::lapped;
 }
 
-ReadStatus RawReader::at_or_after(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
+ReadStatus RawReader::read_at_or_after(Time t, std::span<std::byte> payload,
+                                       SampleInfo& info) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
     // Behind the newest sample before `t` all samples have time >= t.
@@ -191,13 +194,14 @@ ReadStatus RawReader::at_or_after(Time t, std::span<std::byte> payload, SampleIn
     const Tid wanted = found == ReadStatus::too_old ? state_->ring.oldest() : before + 1;
     const ReadStatus checked = check_clock(state_->ring, wanted);
     if (checked == ReadStatus::clock_out_of_bounds) return checked;
-    const ReadStatus status = tid(wanted, payload, info);
+    const ReadStatus status = read_tid(wanted, payload, info);
     if (status != ReadStatus::too_old) return status;
   }
   return ReadStatus::lapped;
 }
 
-ReadStatus RawReader::nearest(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
+ReadStatus RawReader::read_nearest(Time t, std::span<std::byte> payload,
+                                   SampleInfo& info) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
     Tid before = kNoTid;
@@ -213,13 +217,13 @@ ReadStatus RawReader::nearest(Time t, std::span<std::byte> payload, SampleInfo& 
     }
     const ReadStatus checked = check_clock(state_->ring, wanted);
     if (checked == ReadStatus::clock_out_of_bounds) return checked;
-    const ReadStatus status = tid(wanted, payload, info);
+    const ReadStatus status = read_tid(wanted, payload, info);
     if (status != ReadStatus::too_old) return status;
   }
   return ReadStatus::lapped;
 }
 
-ReadStatus RawReader::neighbours(Time t, Neighbours& out) const noexcept {
+ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
     Tid before = kNoTid;
     const ReadStatus found = state_->ring.find(t, before);
@@ -248,7 +252,7 @@ bool RawReader::clock_in_bounds(const SampleInfo& info) const noexcept {
   return state_->ring.clock().is_good(info, coarse_now());
 }
 
-JointRead at(Time t, std::span<JointSample> samples, Duration max_error) noexcept {
+JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_error) noexcept {
   for (const JointSample& sample : samples) {
     detail::ReaderState& state = *sample.reader->state_;
     if (state.restart_due() && state.restart()) {
@@ -264,9 +268,9 @@ JointRead at(Time t, std::span<JointSample> samples, Duration max_error) noexcep
       const ReadStatus status = reader.find(t, samples[i].info);
       if (status != ReadStatus::ok) return {status, i, kUnknownClockError};
       const Duration error = reader.clock_error(samples[i].info);
-      if (error > read.error) read = {ReadStatus::ok, i, error};
+      if (error > read.clock_error) read = {ReadStatus::ok, i, error};
     }
-    if (read.error > max_error) read.status = ReadStatus::clock_out_of_bounds;
+    if (read.clock_error > max_error) read.status = ReadStatus::clock_out_of_bounds;
     for (std::size_t i = 0; i < samples.size() && read.status == ReadStatus::ok; ++i) {
       JointSample& sample = samples[i];
       DSSM_CHECK(sample.payload.size() == sample.reader->payload_bytes());
@@ -281,10 +285,10 @@ JointRead at(Time t, std::span<JointSample> samples, Duration max_error) noexcep
   return read;
 }
 
-Tid RawReader::newest() const noexcept { return state_->ring.newest(); }
-Tid RawReader::oldest() const noexcept { return state_->ring.oldest(); }
+Tid RawReader::newest_tid() const noexcept { return state_->ring.newest(); }
+Tid RawReader::oldest_tid() const noexcept { return state_->ring.oldest(); }
 
-ReadStatus RawReader::stamp(Tid tid, SampleInfo& info) const noexcept {
+ReadStatus RawReader::read_info(Tid tid, SampleInfo& info) const noexcept {
   return state_->ring.stamp(tid, info);
 }
 
@@ -306,9 +310,9 @@ Tid RawReader::cursor() const noexcept { return state_->cursor; }
 
 void RawReader::seek(Tid tid) noexcept { state_->took(std::max(tid, kNoTid)); }
 
-std::uint64_t RawReader::lost() const noexcept { return state_->lost; }
+std::uint64_t RawReader::lost_samples() const noexcept { return state_->lost; }
 std::uint64_t RawReader::restarts() const noexcept { return state_->restarts; }
-std::optional<Error> RawReader::trouble() const { return state_->trouble; }
+std::optional<Error> RawReader::restart_error() const { return state_->trouble; }
 
 ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
@@ -336,7 +340,7 @@ WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noex
   DSSM_CHECK(!readers.empty() && readers.size() <= kMaxWaitAny);
   const auto ready = [&] {
     return std::any_of(readers.begin(), readers.end(), [](const RawReader* reader) {
-      return reader->newest() > reader->cursor() ||
+      return reader->newest_tid() > reader->cursor() ||
              reader->state_->restart_wakes(*reader->state_->stream);
     });
   };

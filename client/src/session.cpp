@@ -61,7 +61,7 @@ HostInfo host_info(const local::Host& message) {
   host.state = message.state();
   host.since = Duration(message.since_ns());
   host.round_trip = Duration(message.round_trip_ns());
-  host.least_round_trip = Duration(message.least_round_trip_ns());
+  host.min_round_trip = Duration(message.least_round_trip_ns());
   host.streams = message.streams();
   host.clock_bound = Duration(message.clock_bound_ns());
   host.insecure = message.insecure();
@@ -211,11 +211,11 @@ Result<void> Session::remove(const StreamId& id) {
   return without_answer(client_->call(std::move(request)), quoted("remove", id));
 }
 
-Result<std::vector<StreamInfo>> Session::list() { return listed(*client_, false); }
+Result<std::vector<StreamInfo>> Session::list_streams() { return listed(*client_, false); }
 
-Result<std::vector<StreamInfo>> Session::list_own() { return listed(*client_, true); }
+Result<std::vector<StreamInfo>> Session::list_own_streams() { return listed(*client_, true); }
 
-Result<StreamInfo> Session::info(const StreamId& id) {
+Result<StreamInfo> Session::stream_info(const StreamId& id) {
   local::Request request;
   wire::to_message(id, *request.mutable_info()->mutable_id());
   auto answer = client_->call(std::move(request));
@@ -251,7 +251,7 @@ Result<std::vector<std::byte>> Session::property(const StreamId& id) {
   return detail::get_property(*client_, id);
 }
 
-Result<std::vector<HostInfo>> Session::hosts() {
+Result<std::vector<HostInfo>> Session::list_hosts() {
   local::Request request;
   request.mutable_list_hosts();
   auto answer = client_->call(std::move(request));
@@ -272,14 +272,14 @@ Result<RoundTrip> Session::ping(const std::string& host) {
   return RoundTrip{Duration(round_trip.round_trip_ns()), round_trip.address()};
 }
 
-Result<PlaybackClock> Session::playback_clock() {
+Result<PlaybackClock> Session::open_playback_clock() {
   auto record = client_->playback_clock();
   if (!record) return std::move(record).error().context("open the playback clock");
   return PlaybackClock(
       std::make_shared<detail::PlaybackClockState>(detail::PlaybackClockState{*record}));
 }
 
-Result<std::vector<ClientInfo>> Session::clients() {
+Result<std::vector<ClientInfo>> Session::list_clients() {
   local::Request request;
   request.mutable_list_clients();
   auto answer = client_->call(std::move(request));
@@ -291,7 +291,7 @@ Result<std::vector<ClientInfo>> Session::clients() {
   return clients;
 }
 
-Result<std::vector<OpenInfo>> Session::opens() {
+Result<std::vector<OpenInfo>> Session::list_opens() {
   local::Request request;
   request.mutable_list_opens();
   auto answer = client_->call(std::move(request));
@@ -307,7 +307,7 @@ Result<std::vector<OpenInfo>> Session::opens() {
   return opens;
 }
 
-Result<DaemonInfo> Session::daemon() {
+Result<DaemonInfo> Session::daemon_info() {
   local::Request request;
   request.mutable_get_daemon();
   auto answer = client_->call(std::move(request));
@@ -325,6 +325,6 @@ Result<DaemonInfo> Session::daemon() {
        mdns.announced(), mdns.withheld(), mdns.own_host_seen(), mdns.hosts_heard()}};
 }
 
-bool Session::connected() const noexcept { return client_->connected(); }
+bool Session::is_connected() const noexcept { return client_->connected(); }
 
 }  // namespace dssm

@@ -5,17 +5,17 @@
 
 namespace dssm {
 
-Loan::Loan(detail::WriterState* state) noexcept : state_(state) {
+LoanedSample::LoanedSample(detail::WriterState* state) noexcept : state_(state) {
   if (std::byte* slot = state->ring.begin()) payload_ = {slot, state->payload_bytes};
 }
 
-Tid Loan::publish(Time time, Duration clock_error) noexcept {
+Tid LoanedSample::publish(Time time, Duration clock_error) noexcept {
   if (payload_.empty()) return kNoTid;
   payload_ = {};
   return state_->ring.commit(time, state_->stamp(time, clock_error));
 }
 
-void Loan::abandon() noexcept {
+void LoanedSample::abandon() noexcept {
   if (payload_.empty()) return;
   payload_ = {};
   state_->ring.cancel();
@@ -33,13 +33,13 @@ RawWriter::~RawWriter() = default;
   return state_->ring.write_with(payload, time, [&] { return state_->stamp(time, clock_error); });
 }
 
-Loan RawWriter::loan() noexcept { return Loan(state_.get()); }
+LoanedSample RawWriter::loan() noexcept { return LoanedSample(state_.get()); }
 
 Result<void> RawWriter::set_property(std::span<const std::byte> property) {
   return detail::set_property(*state_->stream->client, id(), property);
 }
 
-Tid RawWriter::newest() const noexcept { return state_->ring.newest(); }
+Tid RawWriter::newest_tid() const noexcept { return state_->ring.newest(); }
 const StreamId& RawWriter::id() const noexcept { return state_->stream->id; }
 const TypeInfo& RawWriter::type() const noexcept { return state_->stream->type; }
 std::uint64_t RawWriter::payload_bytes() const noexcept { return state_->payload_bytes; }

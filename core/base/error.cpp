@@ -21,14 +21,12 @@ std::string_view name_in(const std::array<std::string_view, n>& names, Enum valu
 
 }  // namespace
 
-std::string_view errc_name(Errc code) noexcept {
+std::string_view name_of(Errc code) noexcept {
   switch (code) {
     case Errc::invalid_argument:
       return "invalid_argument";
     case Errc::not_found:
       return "not_found";
-    case Errc::already_exists:
-      return "already_exists";
     case Errc::type_mismatch:
       return "type_mismatch";
     case Errc::limit_exceeded:
@@ -55,7 +53,7 @@ std::string_view errc_name(Errc code) noexcept {
   return "system";
 }
 
-std::string_view status_name(ReadStatus status) noexcept {
+std::string_view name_of(ReadStatus status) noexcept {
   switch (status) {
     case ReadStatus::ok:
       return "ok";

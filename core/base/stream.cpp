@@ -98,7 +98,7 @@ std::uint32_t scalar_bytes(Scalar kind) noexcept {
   return 0;
 }
 
-std::string_view scalar_name(Scalar kind) noexcept {
+std::string_view name_of(Scalar kind) noexcept {
   switch (kind) {
     case Scalar::boolean:
       return "bool";
@@ -174,7 +174,7 @@ Result<void> TypeInfo::check() const {
   return {};
 }
 
-Result<History> History::of(Duration life, Duration cycle) {
+Result<History> History::for_life(Duration life, Duration cycle) {
   if (cycle <= Duration::zero()) {
     return invalid("a cycle of " + std::to_string(to_ns(cycle)) +
                    " ns is not possible; it takes the time between two samples, more than 0");

@@ -79,7 +79,7 @@ void to_message(const MirrorInfo& info, proto::Mirror& out) {
 }
 
 void to_message(const Error& error, proto::Failure& out) {
-  out.set_code(std::string(errc_name(error.code)));
+  out.set_code(std::string(name_of(error.code)));
   out.set_message(error.message);
 }
 
@@ -132,14 +132,13 @@ StreamInfo stream_info(const proto::Stream& message) {
 }
 
 Error failure(const proto::Failure& message) {
-  constexpr Errc kCodes[] = {Errc::invalid_argument,   Errc::not_found,      Errc::already_exists,
-                             Errc::type_mismatch,      Errc::limit_exceeded, Errc::no_memory,
-                             Errc::no_permission,      Errc::no_daemon,      Errc::unavailable,
-                             Errc::protocol,           Errc::conflict,       Errc::closed,
-                             Errc::clock_out_of_bounds};
+  constexpr Errc kCodes[] = {Errc::invalid_argument, Errc::not_found,   Errc::type_mismatch,
+                             Errc::limit_exceeded,   Errc::no_memory,   Errc::no_permission,
+                             Errc::no_daemon,        Errc::unavailable, Errc::protocol,
+                             Errc::conflict,         Errc::closed,      Errc::clock_out_of_bounds};
   Errc code = Errc::system;
   for (const Errc known : kCodes) {
-    if (errc_name(known) == message.code()) code = known;
+    if (name_of(known) == message.code()) code = known;
   }
   return Error{code, message.message()};
 }

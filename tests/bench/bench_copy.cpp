@@ -46,7 +46,7 @@ void small(Session& session) {
   print_pair("clock_gettime", "write 64 B, given stamp", measure(2000, 1000, raw_clock, write),
              "<= 1.8");
   const auto read = [&] {
-    if (stream.reader.latest(payload, info) != ReadStatus::ok) std::abort();
+    if (stream.reader.read_newest(payload, info) != ReadStatus::ok) std::abort();
     keep(payload);
   };
   print_pair("clock_gettime", "read newest 64 B", measure(2000, 1000, raw_clock, read), "<= 1.2");
@@ -102,7 +102,7 @@ void large(Session& session, std::uint64_t bytes, std::uint64_t depth, int batch
   std::vector<std::byte*> slots;
   SampleInfo info;
   for (std::uint64_t i = 0; i < depth; ++i) {
-    Loan loan = stream.writer.loan();
+    LoanedSample loan = stream.writer.loan();
     slots.push_back(loan.payload().data());
     loan.publish(time_from_ns(1));
   }
@@ -117,7 +117,7 @@ void large(Session& session, std::uint64_t bytes, std::uint64_t depth, int batch
                  },
                  [&] { stream.writer.write(mine, time_from_ns(1)); }),
              "<= 1.1");
-  const auto newest = static_cast<std::uint64_t>(stream.writer.newest()) % depth;
+  const auto newest = static_cast<std::uint64_t>(stream.writer.newest_tid()) % depth;
   print_pair("memcpy " + size, "read " + size,
              measure(
                  batches, 1,
@@ -126,7 +126,7 @@ void large(Session& session, std::uint64_t bytes, std::uint64_t depth, int batch
                    keep(mine);
                  },
                  [&] {
-                   if (stream.reader.latest(mine, info) != ReadStatus::ok) std::abort();
+                   if (stream.reader.read_newest(mine, info) != ReadStatus::ok) std::abort();
                    keep(mine);
                  }),
              "<= 1.1");
@@ -136,7 +136,7 @@ void large(Session& session, std::uint64_t bytes, std::uint64_t depth, int batch
              measure(
                  1000, 100, [&] { tiny.writer.write(payload, time_from_ns(1)); },
                  [&] {
-                   Loan loan = stream.writer.loan();
+                   LoanedSample loan = stream.writer.loan();
                    keep(loan);
                    loan.publish(time_from_ns(1));
                  }),
@@ -145,12 +145,12 @@ void large(Session& session, std::uint64_t bytes, std::uint64_t depth, int batch
              measure(
                  1000, 100,
                  [&] {
-                   if (tiny.reader.latest(payload, info) != ReadStatus::ok) std::abort();
+                   if (tiny.reader.read_newest(payload, info) != ReadStatus::ok) std::abort();
                    keep(payload);
                  },
                  [&] {
                    BorrowedSample sample;
-                   if (stream.reader.borrow(stream.reader.newest(), sample) != ReadStatus::ok ||
+                   if (stream.reader.borrow(stream.reader.newest_tid(), sample) != ReadStatus::ok ||
                        !sample.still_valid()) {
                      std::abort();
                    }

@@ -62,7 +62,7 @@ double seconds_since(MonoTime begin) {
 
 bool knows_all(Session& session) {
   std::uint32_t streams = 0;
-  for (const HostInfo& host : session.hosts().value()) streams += host.streams;
+  for (const HostInfo& host : session.list_hosts().value()) streams += host.streams;
   return streams == kHosts * kStreamsPerHost;
 }
 
@@ -93,7 +93,7 @@ int main() {
               seconds_since(begin));
   std::fflush(stdout);
   for (int pc = 1; pc <= kHosts; ++pc) {
-    while (vehicle.session(pc).daemon().value().mdns.announced != 1 + kStreamsPerHost) {
+    while (vehicle.session(pc).daemon_info().value().mdns.announced != 1 + kStreamsPerHost) {
       ::usleep(10'000);
     }
   }

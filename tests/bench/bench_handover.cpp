@@ -68,7 +68,7 @@ struct Ball {
     shared.raw_wake_ns[i] = static_cast<double>(now_ns() - shared.sent_ns);
     while (there.wait(kNever) != WaitStatus::ready) {
     }
-    if (there.next(ball, info) != ReadStatus::ok) std::abort();
+    if (there.read_next(ball, info) != ReadStatus::ok) std::abort();
     shared.our_wake_ns[i] = static_cast<double>(now_ns() - ball.number);
   }
   for (std::int64_t i = 0; i < kRounds; ++i) {
@@ -77,7 +77,7 @@ struct Ball {
     shared.ball.store(2 * i + 2, std::memory_order_release);
   }
   for (int i = 0; i < kRounds; ++i) {
-    while (there.next(ball, info) != ReadStatus::ok) {
+    while (there.read_next(ball, info) != ReadStatus::ok) {
     }
     back.write(ball, time_from_ns(i));
   }
@@ -134,7 +134,7 @@ int main() {
     const std::int64_t start = now_ns();
     ball.number = i;
     there.write(ball, time_from_ns(i));
-    while (back.next(ball, info) != ReadStatus::ok || ball.number != i) {
+    while (back.read_next(ball, info) != ReadStatus::ok || ball.number != i) {
     }
     ours.push_back(static_cast<double>(now_ns() - start) / 2);
   }

@@ -40,14 +40,14 @@ pid_t start_reader(const std::string& socket) {
   Bytes64 payload;
   SampleInfo info;
   for (;;) {
-    (void)reader.latest(payload, info);
+    (void)reader.read_newest(payload, info);
     ::usleep(1000);
   }
 }
 
 // Waits until dssmd counts `wanted` readers.
 void await_readers(Session& session, std::uint32_t wanted) {
-  while (session.info(StreamId{"busy", 0, ""}).value().readers != wanted) ::usleep(1000);
+  while (session.stream_info(StreamId{"busy", 0, ""}).value().readers != wanted) ::usleep(1000);
 }
 
 std::vector<double> write_batches(Writer<Bytes64>& writer, int batches) {

@@ -56,7 +56,7 @@ void bench_questions(const Hosts& hosts, const std::string& address, Session& se
       },
       [&] {
         at = (at + kStride) % kAnswers;
-        if (connector.at(time_from_ns(1'000'000 * static_cast<std::int64_t>(at)), out, info)
+        if (connector.read_at(time_from_ns(1'000'000 * static_cast<std::int64_t>(at)), out, info)
                 .value() != ReadStatus::ok) {
           fail("read by time");
         }
@@ -78,12 +78,12 @@ void bench_mirror(Session& owner, Session& other) {
   const StreamId id{"history", 0, "pc1"};
   RawReader here = owner.open_raw_reader(id).value();
   RawReader there = other.await_raw_reader(id, deadline_in(10s)).value();
-  while (there.newest() != here.newest()) ::usleep(1000);
+  while (there.newest_tid() != here.newest_tid()) ::usleep(1000);
   std::mt19937_64 random(1);
   SampleInfo info;
   const auto read = [&](RawReader& reader) {
     const auto t = static_cast<std::int64_t>(random() % (kDepth - 2)) + kDepth + 1;
-    if (reader.at(time_from_ns(1'000'000 * t), payload, info) != ReadStatus::ok) fail("at");
+    if (reader.read_at(time_from_ns(1'000'000 * t), payload, info) != ReadStatus::ok) fail("at");
   };
   // The first access to each page of the two rings causes a page fault.
   for (int i = 0; i < 20 * kDepth; ++i) read(here), read(there);
@@ -135,7 +135,7 @@ void bench_writer(const Hosts& hosts, const std::string& address, const std::str
     ready.fetch_add(1);
     std::vector<std::byte> out(64);
     for (SampleInfo info;; ::usleep(100)) {
-      if (reader.latest(out, info) != ReadStatus::ok) fail("read");
+      if (reader.read_newest(out, info) != ReadStatus::ok) fail("read");
     }
   });
   std::vector<pid_t> readers;
@@ -149,7 +149,7 @@ void bench_writer(const Hosts& hosts, const std::string& address, const std::str
       for (SampleInfo info;;) {
         while (connector.wait(kNever) != WaitStatus::ready) {
         }
-        while (connector.next(out, info).value() == ReadStatus::ok) {
+        while (connector.read_next(out, info).value() == ReadStatus::ok) {
         }
       }
     }));

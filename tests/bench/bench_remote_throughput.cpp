@@ -97,7 +97,7 @@ double drain_ns(PConnector& connector, std::size_t bytes, std::size_t count) {
   const std::int64_t start = now_ns();
   connector.subscribe({.start = Subscription::Start::oldest}).value();
   for (std::size_t i = 0; i < count;) {
-    if (connector.next(one, info).value() != ReadStatus::ok) {
+    if (connector.read_next(one, info).value() != ReadStatus::ok) {
       static_cast<void>(connector.wait(kNever));
     } else {
       ++i;
@@ -189,9 +189,9 @@ void bench_small(const Hosts& hosts, const std::string& address, Session& sessio
   const std::int64_t start = now_ns();
   RawReader reader = other.await_raw_reader(id, deadline_in(30s)).value();
   const auto last = static_cast<Tid>(kCount) - 1;
-  while (reader.newest() != last) static_cast<void>(reader.wait_for_tid(last, kNever));
+  while (reader.newest_tid() != last) static_cast<void>(reader.wait_for_tid(last, kNever));
   mirror_rate.push_back(static_cast<double>(kCount) * 1e9 / static_cast<double>(now_ns() - start));
-  if (reader.oldest() != 0) fail("samples are missing");
+  if (reader.oldest_tid() != 0) fail("samples are missing");
   print_row("mirror from nothing, 64 B [samples/s]", figures_of(mirror_rate),
             "         >= 1000000");
   session.remove(id).value();

@@ -91,12 +91,12 @@ std::int64_t cpu_of(const std::vector<pid_t>& processes) {
   RawReader reader = session.await_raw_reader(StreamId{"chain", 0, "pc1"}, kNever).value();
   std::vector<std::byte> payload(reader.payload_bytes());
   SampleInfo info;
-  reader.seek(reader.newest());
+  reader.seek(reader.newest_tid());
   chain.word.store(1);
   for (;;) {
     while (reader.wait(kNever) != WaitStatus::ready) {
     }
-    while (reader.next(payload, info) == ReadStatus::ok) chain.arrive(payload.data());
+    while (reader.read_next(payload, info) == ReadStatus::ok) chain.arrive(payload.data());
   }
 }
 
@@ -109,7 +109,8 @@ std::int64_t cpu_of(const std::vector<pid_t>& processes) {
   for (;;) {
     while (connector.wait(kNever) != WaitStatus::ready) {
     }
-    while (connector.next(payload, info).value() == ReadStatus::ok) chain.arrive(payload.data());
+    while (connector.read_next(payload, info).value() == ReadStatus::ok)
+      chain.arrive(payload.data());
   }
 }
 

@@ -21,7 +21,7 @@ constexpr int kQuestions = 1 << 16;
 
 // The stream's ring, mapped a second time, for the raw limit.
 std::shared_ptr<const ring::RingMapping> ring_of(Session& session, const StreamId& id) {
-  const std::string wanted = "dssm-ring:" + session.info(id).value().id.str();
+  const std::string wanted = "dssm-ring:" + session.stream_info(id).value().id.str();
   for (const auto& entry : std::filesystem::directory_iterator("/proc/self/fd")) {
     std::error_code gone;
     const std::string target = std::filesystem::read_symlink(entry, gone).string();
@@ -52,8 +52,8 @@ void shape(Session& session, const std::string& name, std::uint64_t depth, Durat
   std::vector<Time> questions;
   std::vector<Tid> places;
   SampleInfo oldest, newest, found;
-  if (reader.stamp(reader.oldest() + 1, oldest) != ReadStatus::ok ||
-      reader.stamp(reader.newest(), newest) != ReadStatus::ok) {
+  if (reader.read_info(reader.oldest_tid() + 1, oldest) != ReadStatus::ok ||
+      reader.read_info(reader.newest_tid(), newest) != ReadStatus::ok) {
     std::abort();
   }
   while (questions.size() < kQuestions) {
@@ -61,7 +61,7 @@ void shape(Session& session, const std::string& name, std::uint64_t depth, Durat
     const Tid tid =
         oldest.tid +
         static_cast<Tid>(random() % static_cast<std::uint64_t>(newest.tid - oldest.tid + 1));
-    if (reader.stamp(tid, any) != ReadStatus::ok) std::abort();
+    if (reader.read_info(tid, any) != ReadStatus::ok) std::abort();
     const Time t = any.time + Duration(static_cast<std::int64_t>(random() % 500));
     if (reader.find(t, found) != ReadStatus::ok) continue;  // older than the oldest sample
     questions.push_back(t);
@@ -78,7 +78,8 @@ void shape(Session& session, const std::string& name, std::uint64_t depth, Durat
     keep(payload);
   };
   const auto read = [&] {
-    if (reader.at(questions[our_at++ % kQuestions], payload, info) != ReadStatus::ok) std::abort();
+    if (reader.read_at(questions[our_at++ % kQuestions], payload, info) != ReadStatus::ok)
+      std::abort();
     keep(payload);
   };
   char label[80];

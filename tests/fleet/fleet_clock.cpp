@@ -116,7 +116,7 @@ void put(nlohmann::json& to, const Clocks& clocks) {
 // A sample, and DSSM's statement about its time on this PC.
 nlohmann::json statement(const Reader<Clocks>& reader, ReadStatus status, const Clocks& sample,
                          const SampleInfo& info) {
-  nlohmann::json out{{"status", status_name(status)}};
+  nlohmann::json out{{"status", name_of(status)}};
   if (status != ReadStatus::ok) return out;
   out["time"] = to_ns(info.time);
   put(out, sample);
@@ -129,9 +129,9 @@ nlohmann::json statement(const Reader<Clocks>& reader, ReadStatus status, const 
 nlohmann::json statements(Reader<Clocks>& reader) {
   Clocks sample;
   SampleInfo info;
-  ReadStatus status = reader.at(WallClock::now(), sample, info);
+  ReadStatus status = reader.read_at(WallClock::now(), sample, info);
   nlohmann::json by_time = statement(reader, status, sample, info);
-  status = reader.latest(sample, info);
+  status = reader.read_newest(sample, info);
   return {{"by_time", by_time}, {"newest", statement(reader, status, sample, info)}};
 }
 
@@ -139,9 +139,10 @@ nlohmann::json statements(Reader<Clocks>& reader) {
 nlohmann::json joint_statement(const std::vector<Reader<Clocks>*>& readers) {
   std::vector<Clocks> samples(readers.size());
   std::vector<JointSample> joint;
-  for (std::size_t i = 0; i < readers.size(); ++i) joint.push_back(readers[i]->joint(samples[i]));
-  const JointRead read = at(WallClock::now(), joint, 1ms);
-  nlohmann::json out{{"status", status_name(read.status)}, {"error", known_ns(read.error)}};
+  for (std::size_t i = 0; i < readers.size(); ++i)
+    joint.push_back(readers[i]->joint_sample(samples[i]));
+  const JointRead read = read_joint_at(WallClock::now(), joint, 1ms);
+  nlohmann::json out{{"status", name_of(read.status)}, {"error", known_ns(read.clock_error)}};
   for (std::size_t i = 0; read.status == ReadStatus::ok && i < readers.size(); ++i) {
     nlohmann::json& of_one = out["samples"][readers[i]->id().host];
     of_one["time"] = to_ns(joint[i].info.time);
@@ -159,11 +160,12 @@ nlohmann::json joint_statement(const std::vector<Reader<Clocks>*>& readers) {
 // streams of all others are open.
 std::string answer(std::int64_t number, const Clocks& came, std::deque<Other>& others) {
   const clock::Reading own = clock::now();
-  nlohmann::json out{{"number", number},
-                     {"wall", came.wall_ns},
-                     {"mono", came.mono_ns},
-                     {"own", {{"status", name_of(own.status)}, {"error", known_ns(own.error)}}},
-                     {"others", nlohmann::json::object()}};
+  nlohmann::json out{
+      {"number", number},
+      {"wall", came.wall_ns},
+      {"mono", came.mono_ns},
+      {"own", {{"status", name_of(own.status)}, {"error", known_ns(own.clock_error)}}},
+      {"others", nlohmann::json::object()}};
   put(out, came);
   std::vector<Reader<Clocks>*> readers;
   for (Other& other : others) {

@@ -87,7 +87,7 @@ void write(const std::vector<KnownStream>& streams) {
     if (tid == 0) print("ready");
   }
   nlohmann::json written;
-  for (const RawWriter& writer : writers) written[writer.id().str()] = writer.newest() + 1;
+  for (const RawWriter& writer : writers) written[writer.id().str()] = writer.newest_tid() + 1;
   print(nlohmann::json{{"written", written}}.dump());
 }
 
@@ -115,7 +115,7 @@ void read(const std::vector<KnownStream>& streams) {
   print("ready");
   while (!stdin_ended(moved)) take();
   for (Follower& follower : followers) {
-    const Tid newest = session.info(follower.known().id).value().newest;
+    const Tid newest = session.stream_info(follower.known().id).value().newest;
     while (follower.last() < newest) take();
   }
   nlohmann::json found;

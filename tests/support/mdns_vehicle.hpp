@@ -83,7 +83,7 @@ class MdnsVehicle {
 
   static std::vector<HostInfo> hosts(Session& on, const std::string& name) {
     std::vector<HostInfo> found;
-    for (HostInfo& host : on.hosts().value()) {
+    for (HostInfo& host : on.list_hosts().value()) {
       if (host.name == name) found.push_back(std::move(host));
     }
     return found;
@@ -93,7 +93,7 @@ class MdnsVehicle {
     return found.size() == 1 && found[0].state == "up";
   }
   static bool lists(Session& on, const StreamId& id) {
-    for (const StreamInfo& stream : on.list().value()) {
+    for (const StreamInfo& stream : on.list_streams().value()) {
       if (stream.id == id) return true;
     }
     return false;

@@ -10,10 +10,10 @@
 namespace dssm::clock {
 
 struct Reading {
-  Time time;                            // by this PC's clock
-  Time earliest;                        // the fleet's time lies between these two, both within;
-  Time latest;                          // the ends of what a Time holds when nothing is known
-  Duration error = kUnknownClockError;  // >= 0: time - earliest, latest - time
+  Time time;      // by this PC's clock
+  Time earliest;  // the fleet's time lies between these two, both within;
+  Time latest;    // the ends of what a Time holds when nothing is known
+  Duration clock_error = kUnknownClockError;  // >= 0: time - earliest, latest - time
   ClockStatus status = ClockStatus::unknown;
 };
 

@@ -12,12 +12,12 @@
 //            receive each while they come one by one, and one for many when they come many at a
 //            time; each is copied once, or, when it is large, received where the caller wants it
 //   trouble  when the connection breaks, calls reconnect (at most request_timeout, then
-//            unavailable; next(), post() and fd() never wait for it), subscriptions resume at the
+//            unavailable; read_next(), post() and ready_fd() never wait for it), subscriptions resume at the
 //            tid they had, and posted samples are sent again from where the owner stopped: each is
 //            written once, also when the owner's dssmd is killed (but what was under way when a
 //            connection broke comes twice if 64 others wrote to the stream since)
 //   anew     when the owner's ring was replaced by a new one, whose tids begin anew, the next read
-//            returns `restarted`, once; next() after all that came of the old ring
+//            returns `restarted`, once; read_next() after all that came of the old ring
 //   fork     a child must open a PConnector of its own
 //   moved    a moved-from object may only be assigned to or destroyed
 #pragma once
@@ -83,7 +83,7 @@ class PConnector {
                                    PConnectorOptions options = {});
 
   // Streams that the dssmd at `options.address` owns.
-  static Result<std::vector<StreamInfo>> list(PConnectorOptions options = {});
+  static Result<std::vector<StreamInfo>> list_streams(PConnectorOptions options = {});
 
   PConnector(PConnector&&) noexcept;
   PConnector& operator=(PConnector&&) noexcept;
@@ -95,21 +95,21 @@ class PConnector {
   //   returns  as RawReader's functions of these names
   //   fails    unavailable, protocol, invalid_argument (size), type_mismatch (the stream
   //            was created anew with another type)
-  Result<ReadStatus> latest(std::span<std::byte> payload, SampleInfo& info);
-  Result<ReadStatus> tid(Tid tid, std::span<std::byte> payload, SampleInfo& info);
-  Result<ReadStatus> at(Time t, std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> read_newest(std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> read_at(Time t, std::span<std::byte> payload, SampleInfo& info);
   // The newest sample if its tid is above `than`, else not_yet.
-  Result<ReadStatus> newer(Tid than, std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> read_newer(Tid than, std::span<std::byte> payload, SampleInfo& info);
 
   // kNoTid while nothing is written.
-  Result<Tid> newest();
-  Result<Tid> oldest();
+  Result<Tid> newest_tid();
+  Result<Tid> oldest_tid();
   // Tid of the newest sample with time <= t; kNoTid when there is none.
   Result<Tid> find(Time t);
 
   // --- subscription
 
-  // Samples come by themselves from now on, to be taken by next(). A second call replaces the
+  // Samples come by themselves from now on, to be taken by read_next(). A second call replaces the
   // first subscription.
   Result<void> subscribe(const Subscription& what);
   Result<void> unsubscribe();  // opens the channel anew; samples under way are dropped
@@ -121,11 +121,11 @@ class PConnector {
   //   fails    unavailable (the connection is down; call again, each call does what can be done at
   //            once to have it back), not_found (the stream was removed; call again, it may come
   //            back), invalid_argument (no subscription, size)
-  Result<ReadStatus> next(std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> read_next(std::span<std::byte> payload, SampleInfo& info);
 
-  // Waits until next() has something, a failure included that waiting does not mend, or until the
+  // Waits until read_next() has something, a failure included that waiting does not mend, or until the
   // monotonic clock reaches `deadline`. `ready` may come when a large sample has only begun to
-  // come: after it next() may say not_yet. Without a subscription: timeout, at once. While data
+  // come: after it read_next() may say not_yet. Without a subscription: timeout, at once. While data
   // come fast it looks for them without sleeping, for 30 us at a time: always at 2 GB/s, for 5 % of
   // the time at most at 100 MB/s.
   WaitStatus wait(MonoTime deadline);
@@ -133,14 +133,14 @@ class PConnector {
   // Samples that the owner's ring no longer held when their turn came, and those that came while
   // this object was waiting for answers and that nobody took: more than 16 MiB of them are not
   // kept.
-  std::uint64_t lost() const noexcept;
+  std::uint64_t lost_samples() const noexcept;
   // How often the owner's ring was replaced by a new one, whose tids begin anew.
   std::uint64_t restarts() const noexcept;
 
-  // To be polled for reading, after next() said not_yet or failed; then call next() again. It
+  // To be polled for reading, after read_next() said not_yet or failed; then call read_next() again. It
   // stands for the connection while there is one, and for the next attempt while there is none. Ask
   // for it before each poll: asking tells it what to wait for.
-  int fd() const noexcept;
+  int ready_fd() const noexcept;
 
   // --- writing
 
@@ -162,7 +162,7 @@ class PConnector {
   Result<Tid> flush(MonoTime deadline);
 
   // Posted samples that were dropped because too many waited to be sent or acknowledged.
-  std::uint64_t dropped() const noexcept;
+  std::uint64_t dropped_samples() const noexcept;
 
   // --- about the stream
 
@@ -175,7 +175,7 @@ class PConnector {
   std::uint64_t depth() const noexcept;
   Duration cycle() const noexcept;
   std::uint64_t incarnation() const noexcept;
-  bool connected() const noexcept;
+  bool is_connected() const noexcept;
   const std::string& address() const noexcept;  // connected to, or to be
 
   // How payloads that came moved inside this process, for tests and benchmarks: by a copy, or

@@ -2,7 +2,7 @@
 //
 // Reading a stream. RawReader works on bytes; Reader<T> on a trivially copyable T.
 //
-// A reader has a cursor: the tid of the last sample it returned. next() and previous() move
+// A reader has a cursor: the tid of the last sample it returned. read_next() and read_previous() move
 // relative to it, wait() waits for something newer than it. Every read that returns `ok` sets it;
 // a read that returns anything else leaves cursor and arguments untouched.
 //
@@ -14,7 +14,7 @@
 //   moved    a moved-from reader may only be assigned to or destroyed
 //   anew     when the stream is removed and created anew, or its owner came back without its rings,
 //            the reader goes on with the new ring by itself: one read returns `restarted`, once
-//            (next() only after it has returned all that the old ring held), the cursor is kNoTid
+//            (read_next() only after it has returned all that the old ring held), the cursor is kNoTid
 //            then, and tids begin anew. Until the new ring can be had the old one is read.
 #pragma once
 
@@ -74,21 +74,21 @@ class RawReader {
 
   // Copies the newest sample. `payload` is exactly payload_bytes() long in all calls below.
   //   returns  ok | not_yet (nothing written) | lapped
-  ReadStatus latest(std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_newest(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   // Copies sample number `tid`.
-  //   returns  ok | not_yet (tid > newest()) | too_old (tid < oldest(), or negative)
-  ReadStatus tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) noexcept;
+  //   returns  ok | not_yet (tid > newest_tid()) | too_old (tid < oldest_tid(), or negative)
+  ReadStatus read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   // Copies the sample after the cursor. The first call on a fresh reader returns the newest sample,
   // as SSM does; call seek() before to start elsewhere. A reader that was lapped goes on with the
-  // oldest sample there is, and the tids in between are added to lost().
+  // oldest sample there is, and the tids in between are added to lost_samples().
   //   returns  ok | not_yet | lapped
-  ReadStatus next(std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_next(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   // Copies the sample before the cursor.
   //   returns  ok | not_yet (nothing was read before) | too_old
-  ReadStatus previous(std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_previous(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   // --- reading by time
   // All of these, find() too, return clock_out_of_bounds for a sample of another host that may be
@@ -100,21 +100,21 @@ class RawReader {
 
   // Copies the newest sample with time <= `t`; the newest sample of all for any `t` after it.
   //   returns  ok | not_yet (nothing written) | too_old (all samples held lie after `t`) | lapped
-  ReadStatus at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   // Copies the first sample from which on all samples have time >= `t`: the first one with
   // time >= t on a stream whose times do not run backwards.
   //   returns  ok | not_yet (no such sample yet, or nothing written) | lapped
-  ReadStatus at_or_after(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_at_or_after(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   // Copies the one of the two neighbours of `t` that is closer in time; the earlier one of two
   // equally close ones; the only one where there is only one.
   //   returns  ok | not_yet (nothing written) | lapped
-  ReadStatus nearest(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_nearest(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
-  // The stamps of the two neighbours of `t`; read their payloads with tid(). Leaves the cursor.
+  // The stamps of the two neighbours of `t`; read their payloads with read_tid(). Leaves the cursor.
   //   returns  ok | not_yet (no sample after `t` yet, or nothing written) | too_old | lapped
-  ReadStatus neighbours(Time t, Neighbours& out) const noexcept;
+  ReadStatus find_neighbours(Time t, Neighbours& out) const noexcept;
 
   // How far info.time may be from this PC's clock: its clock_error and what is known of both clocks
   // at this moment. 0 for a stream of this PC, or of another host with the same kernel, which has
@@ -126,38 +126,38 @@ class RawReader {
   // --- stamps and places without payloads
 
   // Tid of the newest sample, kNoTid while nothing is written; of the oldest readable one.
-  Tid newest() const noexcept;
-  Tid oldest() const noexcept;
+  Tid newest_tid() const noexcept;
+  Tid oldest_tid() const noexcept;
 
   // Stamps of sample `tid`, without copying its payload. Leaves the cursor.
   //   returns  ok | not_yet | too_old
-  ReadStatus stamp(Tid tid, SampleInfo& info) const noexcept;
+  ReadStatus read_info(Tid tid, SampleInfo& info) const noexcept;
 
-  // What at() would return, without its payload. Leaves the cursor.
+  // What read_at() would return, without its payload. Leaves the cursor.
   ReadStatus find(Time t, SampleInfo& info) const noexcept;
 
   // The cursor: tid of the last sample read, kNoTid on a fresh reader.
   Tid cursor() const noexcept;
 
-  // Puts the cursor on `tid`, so that next() returns tid + 1; kNoTid: next() starts at tid 0 or
+  // Puts the cursor on `tid`, so that read_next() returns tid + 1; kNoTid: read_next() starts at tid 0 or
   // the oldest held. Any value is allowed.
   void seek(Tid tid) noexcept;
 
-  // Samples that next() had to skip because the ring no longer held them: the writer was faster, or
+  // Samples that read_next() had to skip because the ring no longer held them: the writer was faster, or
   // the link to the stream's host was down for longer than its ring reaches back.
-  std::uint64_t lost() const noexcept;
+  std::uint64_t lost_samples() const noexcept;
 
   // How often this reader went on with a new ring.
   std::uint64_t restarts() const noexcept;
 
   // Why this reader cannot go on with the stream's new ring (it has another type); nothing while
   // all is well.
-  std::optional<Error> trouble() const;
+  std::optional<Error> restart_error() const;
 
   // --- in place
 
   // Looks at sample `tid` in place.
-  //   returns  as tid(); sets the cursor
+  //   returns  as read_tid(); sets the cursor
   ReadStatus borrow(Tid tid, BorrowedSample& out) noexcept;
 
   // --- waiting
@@ -166,11 +166,11 @@ class RawReader {
   // clock reaches `deadline` (kNever: no limit; a deadline in the past: just look).
   WaitStatus wait(MonoTime deadline) noexcept;
 
-  // The same for newest() >= `tid`. May run in one thread while another one uses this reader.
+  // The same for newest_tid() >= `tid`. May run in one thread while another one uses this reader.
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
 
   // A descriptor for poll(), epoll or an event library: readable when there may be samples newer
-  // than at the last clear_ready(). On wake-up: clear_ready(), then next() until not_yet. The
+  // than at the last clear_ready(). On wake-up: clear_ready(), then read_next() until not_yet. The
   // first call starts one thread per session that waits on behalf of all such descriptors.
   // Owned by the reader; do not read or close it.
   Result<int> ready_fd() noexcept;
@@ -191,7 +191,8 @@ class RawReader {
 
  private:
   friend class Session;
-  friend JointRead at(Time t, std::span<JointSample> samples, Duration max_error) noexcept;
+  friend JointRead read_joint_at(Time t, std::span<JointSample> samples,
+                                 Duration max_error) noexcept;
   friend WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
   explicit RawReader(std::unique_ptr<detail::ReaderState> state) noexcept;
   std::unique_ptr<detail::ReaderState> state_;
@@ -206,17 +207,18 @@ struct JointSample {
 
 struct JointRead {
   ReadStatus status = ReadStatus::ok;
-  std::size_t which = 0;  // of the samples: why it is not ok; if it is, the one that is worst known
-  Duration error = kUnknownClockError;  // >= 0: how far the time of any of them may be from this
-                                        // PC's clock; also when that is the reason
+  std::size_t index = 0;  // of the samples: why it is not ok; if it is, the one that is worst known
+  Duration clock_error =
+      kUnknownClockError;  // >= 0: how far the time of any of them may be from this
+                           // PC's clock; also when that is the reason
 };
 
 // What at(t) gives of several streams: all of them or none.
 //   max_error  >= 0: no sample's time may be further from this PC's clock
-//   returns    as at(); clock_out_of_bounds also when max_error is not kept. Unless ok,
+//   returns    as read_at(); clock_out_of_bounds also when max_error is not kept. Unless ok,
 //              payloads and infos are unspecified, and the cursors are where they were
-JointRead at(Time t, std::span<JointSample> samples,
-             Duration max_error = kUnknownClockError) noexcept;
+JointRead read_joint_at(Time t, std::span<JointSample> samples,
+                        Duration max_error = kUnknownClockError) noexcept;
 
 // Waits until one of `readers` has a sample newer than its cursor, or until `deadline`. At most
 // kMaxWaitAny readers; all must be valid. Returns `ready` also at once when one has already.
@@ -229,28 +231,30 @@ class Reader : public RawReader {
  public:
   explicit Reader(RawReader raw) noexcept : RawReader(std::move(raw)) {}
 
-  ReadStatus latest(T& out, SampleInfo& info) noexcept {
-    return RawReader::latest(bytes(out), info);
+  ReadStatus read_newest(T& out, SampleInfo& info) noexcept {
+    return RawReader::read_newest(bytes(out), info);
   }
-  ReadStatus tid(Tid n, T& out, SampleInfo& info) noexcept {
-    return RawReader::tid(n, bytes(out), info);
+  ReadStatus read_tid(Tid n, T& out, SampleInfo& info) noexcept {
+    return RawReader::read_tid(n, bytes(out), info);
   }
-  ReadStatus next(T& out, SampleInfo& info) noexcept { return RawReader::next(bytes(out), info); }
-  ReadStatus previous(T& out, SampleInfo& info) noexcept {
-    return RawReader::previous(bytes(out), info);
+  ReadStatus read_next(T& out, SampleInfo& info) noexcept {
+    return RawReader::read_next(bytes(out), info);
   }
-  ReadStatus at(Time t, T& out, SampleInfo& info) noexcept {
-    return RawReader::at(t, bytes(out), info);
+  ReadStatus read_previous(T& out, SampleInfo& info) noexcept {
+    return RawReader::read_previous(bytes(out), info);
   }
-  ReadStatus at_or_after(Time t, T& out, SampleInfo& info) noexcept {
-    return RawReader::at_or_after(t, bytes(out), info);
+  ReadStatus read_at(Time t, T& out, SampleInfo& info) noexcept {
+    return RawReader::read_at(t, bytes(out), info);
   }
-  ReadStatus nearest(Time t, T& out, SampleInfo& info) noexcept {
-    return RawReader::nearest(t, bytes(out), info);
+  ReadStatus read_at_or_after(Time t, T& out, SampleInfo& info) noexcept {
+    return RawReader::read_at_or_after(t, bytes(out), info);
+  }
+  ReadStatus read_nearest(Time t, T& out, SampleInfo& info) noexcept {
+    return RawReader::read_nearest(t, bytes(out), info);
   }
 
-  // For at() of several streams: this one's sample, to be put into `out`.
-  JointSample joint(T& out) noexcept { return {this, bytes(out), {}}; }
+  // For read_at() of several streams: this one's sample, to be put into `out`.
+  JointSample joint_sample(T& out) noexcept { return {this, bytes(out), {}}; }
 
   // The borrowed payload as a T. Check still_valid() after the last use of what was read.
   static const T& view(const BorrowedSample& sample) noexcept {

@@ -65,7 +65,7 @@ struct DaemonInfo {
   // How it fares with finding other hosts by mDNS.
   struct Mdns {
     std::string phase;              // "off", "waiting" (for the Avahi daemon), "running"
-    std::string trouble;            // why it waits, or what goes wrong; empty: nothing
+    std::string error;              // why it waits, or what goes wrong; empty: nothing
     std::string avahi_version;      // "avahi 0.8"
     std::uint32_t announced = 0;    // services: streams, and the host itself
     std::uint32_t withheld = 0;     // services that could not be announced
@@ -78,7 +78,7 @@ struct DaemonInfo {
 // What a host says of its clock (docs/clocks.md), aged until now.
 struct ClockInfo {
   ClockStatus status = ClockStatus::unknown;
-  ClockReason trouble = ClockReason::none;
+  ClockReason reason = ClockReason::none;
   ClockBasis basis = ClockBasis::nothing;
   Duration offset{};      // its clock minus what its chronyd takes for the right time
   std::string reference;  // whom it follows: a host's name or an address; empty: nobody
@@ -95,12 +95,12 @@ struct HostInfo {
   std::string name;                    // empty while it never answered
   std::vector<std::string> addresses;  // as configured and as reached: "pc2:13776"
   std::string version;                 // of its dssmd
-  std::string state;            // "self", "up", "connecting", "down", "refused", "closed" (it
-                                // was found by mDNS, but listens on its own loopback only)
-  Duration since{};             // how long it has been in this state
-  Duration round_trip{};        // of the last heartbeat, which comes once a second; 0: none
-  Duration least_round_trip{};  // of this connection's heartbeats; 0: none
-  std::uint32_t streams = 0;    // that it owns
+  std::string state;          // "self", "up", "connecting", "down", "refused", "closed" (it
+                              // was found by mDNS, but listens on its own loopback only)
+  Duration since{};           // how long it has been in this state
+  Duration round_trip{};      // of the last heartbeat, which comes once a second; 0: none
+  Duration min_round_trip{};  // of this connection's heartbeats; 0: none
+  std::uint32_t streams = 0;  // that it owns
   Duration clock_bound = kUnknownClockError;  // of its samples' stamps, against the reference PC
   std::optional<ClockInfo> clock;             // nothing: it says nothing of it
   bool insecure = false;                      // its traffic crosses the network in the clear
@@ -170,7 +170,7 @@ class Session {
   }
   template <Payload T>
   Result<Writer<T>> create(std::string_view name, Duration life, Duration cycle) {
-    Result<History> history = History::of(life, cycle);
+    Result<History> history = History::for_life(life, cycle);
     if (!history) return std::move(history).error();
     return create<T>(name, *history);
   }
@@ -199,14 +199,14 @@ class Session {
   // All streams: first this PC's, then the other hosts' in the order of their names, each in the
   // order of creation. A host that does not answer within half a second is listed with what is
   // known of its streams; one that is down is left out.
-  Result<std::vector<StreamInfo>> list();
+  Result<std::vector<StreamInfo>> list_streams();
 
   // Those of this PC only, in the order of creation.
-  Result<std::vector<StreamInfo>> list_own();
+  Result<std::vector<StreamInfo>> list_own_streams();
 
   // One stream, with its users.
   //   fails  not_found
-  Result<StreamInfo> info(const StreamId& id);
+  Result<StreamInfo> stream_info(const StreamId& id);
 
   // Calls `on_event` for each stream that is there, then for each that comes or goes, until the
   // watch is destroyed or the session's last copy is. Called from the session's thread: be short,
@@ -238,7 +238,7 @@ class Session {
 
   // This PC first, then the configured peers and those found by mDNS, each with its state at this
   // moment.
-  Result<std::vector<HostInfo>> hosts();
+  Result<std::vector<HostInfo>> list_hosts();
 
   // Asks the dssmd of that host for a sign of life, over the connection that this PC's dssmd keeps.
   //   fails  not_found (no host of that name is up), conflict (several are), unavailable (it does
@@ -247,13 +247,13 @@ class Session {
 
   // --- the rest
 
-  Result<PlaybackClock> playback_clock();
-  Result<std::vector<ClientInfo>> clients();
-  Result<std::vector<OpenInfo>> opens();
-  Result<DaemonInfo> daemon();
+  Result<PlaybackClock> open_playback_clock();
+  Result<std::vector<ClientInfo>> list_clients();
+  Result<std::vector<OpenInfo>> list_opens();
+  Result<DaemonInfo> daemon_info();
 
   // Whether the connection stands at this moment.
-  bool connected() const noexcept;
+  bool is_connected() const noexcept;
 
  private:
   explicit Session(std::shared_ptr<detail::Client> client) noexcept;

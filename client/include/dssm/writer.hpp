@@ -29,11 +29,11 @@ struct WriterState;
 
 // The next slot, to be filled in place. Holds the stream's writer lock: publish() or abandon() it
 // soon; destroying it abandons it. Not movable, so that it cannot outlive its writer unnoticed.
-class Loan {
+class LoanedSample {
  public:
-  Loan(const Loan&) = delete;
-  Loan& operator=(const Loan&) = delete;
-  ~Loan() { abandon(); }
+  LoanedSample(const LoanedSample&) = delete;
+  LoanedSample& operator=(const LoanedSample&) = delete;
+  ~LoanedSample() { abandon(); }
 
   // Whether the slot was lent: false when this thread holds another loan of this stream already.
   explicit operator bool() const noexcept { return !payload_.empty(); }
@@ -51,7 +51,7 @@ class Loan {
 
  private:
   friend class RawWriter;
-  explicit Loan(detail::WriterState* state) noexcept;
+  explicit LoanedSample(detail::WriterState* state) noexcept;
   detail::WriterState* state_;
   std::span<std::byte> payload_;
 };
@@ -74,13 +74,13 @@ class RawWriter {
             Duration clock_error = kOwnClockError) noexcept;
 
   // Lends the next slot for filling in place. Waits for other writers of this stream.
-  Loan loan() noexcept;
+  LoanedSample loan() noexcept;
 
   // Replaces the stream's property (0 bytes: removes it). Asks dssmd.
   Result<void> set_property(std::span<const std::byte> property);
 
   // Tid of the newest sample, kNoTid while nothing is written.
-  Tid newest() const noexcept;
+  Tid newest_tid() const noexcept;
 
   const StreamId& id() const noexcept;    // with its owner's host
   const TypeInfo& type() const noexcept;  // as stored with the stream
@@ -107,7 +107,9 @@ class Writer : public RawWriter {
   }
 
   // The lent slot as a T, unspecified content; only while `loan` is true.
-  static T& view(const Loan& loan) noexcept { return *reinterpret_cast<T*>(loan.payload().data()); }
+  static T& view(const LoanedSample& loan) noexcept {
+    return *reinterpret_cast<T*>(loan.payload().data());
+  }
 
   // Replaces the stream's property by the bytes of `property`.
   template <Payload P>

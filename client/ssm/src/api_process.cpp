@@ -23,7 +23,7 @@ struct Edge {
 // The pids of the registered processes, each once, in the order of registration.
 std::optional<std::vector<int>> registered_pids() {
   auto session = process().session();
-  auto clients = session ? session->clients() : std::move(session).error();
+  auto clients = session ? session->list_clients() : std::move(session).error();
   if (!clients) return dssm::ssm::remember_error(clients.error().message), std::nullopt;
   std::vector<int> pids;
   for (const dssm::ClientInfo& client : *clients) {
@@ -35,7 +35,7 @@ std::optional<std::vector<int>> registered_pids() {
 // Who opened what that whom created. Programs that use DSSM's own interface are seen as readers.
 std::optional<std::vector<Edge>> edges() {
   auto session = process().session();
-  auto opens = session ? session->opens() : std::move(session).error();
+  auto opens = session ? session->list_opens() : std::move(session).error();
   if (!opens) return dssm::ssm::remember_error(opens.error().message), std::nullopt;
   std::vector<Edge> found;
   for (const dssm::OpenInfo& open : *opens) {

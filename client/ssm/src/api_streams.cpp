@@ -38,7 +38,7 @@ bool name_too_long(const char* name) { return !name || name_length(name) > SSM_S
 dssm::Result<dssm::StreamInfo> ask(const dssm::StreamId& id) {
   auto session = process().session();
   if (!session) return std::move(session).error();
-  return session->info(id);
+  return session->stream_info(id);
 }
 
 }  // namespace
@@ -97,14 +97,14 @@ int releaseSSM(SSM_sid* sid) { return closeSSM(sid); }
 
 int getSSM_num(void) {
   auto session = process().session();
-  auto streams = session ? session->list_own() : std::move(session).error();
+  auto streams = session ? session->list_own_streams() : std::move(session).error();
   if (!streams) return remember_error(streams.error().message), -1;
   return static_cast<int>(streams->size());
 }
 
 int getSSM_name(int n, char* stream_name, int* stream_id, size_t* size) {
   auto session = process().session();
-  auto streams = session ? session->list_own() : std::move(session).error();
+  auto streams = session ? session->list_own_streams() : std::move(session).error();
   if (!streams) return remember_error(streams.error().message), -1;
   if (n < 0 || static_cast<std::size_t>(n) >= streams->size()) return -1;
   const dssm::StreamInfo& stream = (*streams)[static_cast<std::size_t>(n)];

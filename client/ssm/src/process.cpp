@@ -135,11 +135,11 @@ Result<void> Process::start() {
   if (Result<void> ready = prepare_locked(); !ready) return ready;
   reap_locked();
   if (registered_locked()) {
-    if (!registration_->session.connected()) {
+    if (!registration_->session.is_connected()) {
       return Error{Errc::unavailable, "dssmd is gone; this program goes on when it is back"};
     }
     if (clock_.attached()) return {};
-    Result<PlaybackClock> clock = registration_->session.playback_clock();
+    Result<PlaybackClock> clock = registration_->session.open_playback_clock();
     if (!clock) return std::move(clock).error();
     clock_.attach(std::move(*clock), generation_);
     return {};
@@ -147,7 +147,7 @@ Result<void> Process::start() {
   std::string path;
   Result<Session> session = connect_anywhere(path);
   if (!session) return std::move(session).error();
-  Result<PlaybackClock> clock = session->playback_clock();
+  Result<PlaybackClock> clock = session->open_playback_clock();
   if (!clock) return std::move(clock).error();
   std::strncpy(socket_path_, path.c_str(), sizeof socket_path_ - 1);
   registration_ = new Registration{std::move(*session), ends, nullptr};
@@ -204,7 +204,7 @@ bool Process::attach_clock() {
   reap_locked();
   if (!registered_locked()) return false;
   if (clock_.attached()) return true;
-  Result<PlaybackClock> clock = registration_->session.playback_clock();
+  Result<PlaybackClock> clock = registration_->session.open_playback_clock();
   if (!clock) return false;
   clock_.attach(std::move(*clock), generation_);
   return true;

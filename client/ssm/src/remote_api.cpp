@@ -123,7 +123,7 @@ void dssm_ssm_remote_set_offset(const char* address, ssmTimeT offset) {
     return;
   }
   auto session = dssm::ssm::process().any_session();
-  auto clock = session ? session->playback_clock() : std::move(session).error();
+  auto clock = session ? session->open_playback_clock() : std::move(session).error();
   if (!clock) return report_error("setOffset : " + clock.error().message);
   clock->set_offset(offset);
 }

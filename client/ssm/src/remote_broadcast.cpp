@@ -45,7 +45,7 @@ Result<void> Broadcast::show(std::span<const std::byte> block) {
 Result<std::vector<Broadcast::Host>> Broadcast::hosts() {
   auto local = session();
   if (!local) return std::move(local).error();
-  auto known = (*local)->hosts();
+  auto known = (*local)->list_hosts();
   if (!known) return std::move(known).error();
   std::vector<Host> found;
   for (const HostInfo& info : *known) {

@@ -73,7 +73,7 @@ void* RemoteRing::run(void* self) {
 
 // Waits until there may be something to take. False: the thread shall end.
 bool RemoteRing::pause() {
-  pollfd ready[] = {{connector_.fd(), POLLIN, 0}, {stop_.get(), POLLIN, 0}};
+  pollfd ready[] = {{connector_.ready_fd(), POLLIN, 0}, {stop_.get(), POLLIN, 0}};
   while (::poll(ready, 2, -1) < 0) continue;
   return ready[1].revents == 0;
 }
@@ -87,7 +87,7 @@ void RemoteRing::fill() {
   bool complained = false;
   for (;;) {
     SampleInfo info;
-    const auto status = connector_.next(payload, info);
+    const auto status = connector_.read_next(payload, info);
     if (!status && !complained) report_error(status.error().message + "; trying again");
     complained = !status;
     if (!status || *status == ReadStatus::not_yet) {

@@ -129,7 +129,7 @@ bool RemoteStream::connect(const std::string& address) {
   const Call call(*this);
   if (!call) return false;
   const std::string what = "connect to '" + address + "'";
-  const auto listed = retry(what, [&] { return PConnector::list(options(address, 0)); });
+  const auto listed = retry(what, [&] { return PConnector::list_streams(options(address, 0)); });
   if (!listed) report_error(what + " : " + listed.error().message);
   return listed.has_value();
 }
@@ -209,11 +209,12 @@ ReadStatus RemoteStream::fetch_by(Ask ask, SampleInfo& info) {
 }
 
 ReadStatus RemoteStream::fetch(Tid tid, SampleInfo& info) {
-  return fetch_by([&](PConnector& from) { return from.tid(tid - offset_, sample_, info); }, info);
+  return fetch_by([&](PConnector& from) { return from.read_tid(tid - offset_, sample_, info); },
+                  info);
 }
 
 Tid RemoteStream::ask_newest() {
-  const auto newest = connector_->newest();
+  const auto newest = connector_->newest_tid();
   follow_restart();
   if (!newest) return complain(newest.error()), kNoTid;
   complaint_.clear();
@@ -223,7 +224,7 @@ Tid RemoteStream::ask_newest() {
 }
 
 Tid RemoteStream::ask_oldest() {
-  const auto oldest = connector_->oldest();
+  const auto oldest = connector_->oldest_tid();
   follow_restart();
   if (!oldest) return complain(oldest.error()), kNoTid;
   complaint_.clear();
@@ -253,7 +254,7 @@ SSM_tid RemoteStream::read(const Request& request, void* data, std::size_t bytes
   }
   SampleInfo info;
   ReadStatus status = ReadStatus::not_yet;
-  const auto newest = [&](PConnector& from) { return from.latest(sample_, info); };
+  const auto newest = [&](PConnector& from) { return from.read_newest(sample_, info); };
   switch (request.which) {
     case Which::newest:
       status = fetch_by(newest, info);
@@ -265,7 +266,7 @@ SSM_tid RemoteStream::read(const Request& request, void* data, std::size_t bytes
       const Tid than = request.tid < 0 ? kNoTid : ring_tid_of(request.tid);
       status = fetch_by(
           [&](PConnector& from) {
-            return from.newer(std::max(than - offset_, kNoTid), sample_, info);
+            return from.read_newer(std::max(than - offset_, kNoTid), sample_, info);
           },
           info);
       break;
@@ -294,7 +295,7 @@ SSM_tid RemoteStream::read(const Request& request, void* data, std::size_t bytes
       status = request.time > 0
                    ? fetch_by(
                          [&](PConnector& from) {
-                           return from.at(time_from_seconds(request.time), sample_, info);
+                           return from.read_at(time_from_seconds(request.time), sample_, info);
                          },
                          info)
                    : fetch_by(newest, info);
@@ -344,7 +345,7 @@ bool RemoteStream::write(const void* data, std::size_t bytes, double time) {
   const auto posted =
       connector_->post({static_cast<const std::byte*>(data), bytes}, time_from_seconds(time));
   if (!posted) return complain(posted.error()), false;
-  if (connector_->connected()) {
+  if (connector_->is_connected()) {
     complaint_.clear();
   } else {
     complain({Errc::unavailable, "write " + quoted_name() + " : '" + address_ +

@@ -129,12 +129,12 @@ void Stream::follow_ring(RawReader& open) noexcept {
 
 Tid Stream::newest() noexcept {
   RawReader* const open = reader_.load(std::memory_order_acquire);
-  if (!open) return writer_.load(std::memory_order_acquire)->newest();
+  if (!open) return writer_.load(std::memory_order_acquire)->newest_tid();
   const std::lock_guard guard(read_lock_);
   // A program that reads one sample after the other is not through with the old ring yet.
   const Tid read = read_.load(std::memory_order_relaxed);
-  if (read == kNoTid || open->newest() + offset() <= read) follow_ring(*open);
-  const Tid newest = open->newest();
+  if (read == kNoTid || open->newest_tid() + offset() <= read) follow_ring(*open);
+  const Tid newest = open->newest_tid();
   if (newest < 0) return offset() - 1;  // kNoTid, or the last one of the old ring
   tell(newest + offset());
   return newest + offset();
@@ -146,7 +146,7 @@ Tid Stream::oldest() noexcept {
   const RawReader* const open = reader_.load(std::memory_order_acquire);
   if (!open) return std::max<Tid>(0, top - static_cast<Tid>(depth()) + 2);
   const std::lock_guard guard(read_lock_);
-  const Tid oldest = open->oldest();
+  const Tid oldest = open->oldest_tid();
   return oldest < 0 ? top : oldest + offset();  // a new ring, still empty: nothing before `top`
 }
 
@@ -188,7 +188,7 @@ ReadStatus Stream::copy(Copy& out, Read read) noexcept {
 }
 
 ReadStatus Stream::latest(Copy& out) noexcept {
-  return copy(out, [&](RawReader& open) { return open.latest(out.payload(), out.info); });
+  return copy(out, [&](RawReader& open) { return open.read_newest(out.payload(), out.info); });
 }
 
 ReadStatus Stream::tid(Tid tid, Copy& out) noexcept {
@@ -196,11 +196,11 @@ ReadStatus Stream::tid(Tid tid, Copy& out) noexcept {
     const Tid wanted = tid - offset();
     if (wanted < 0) return ReadStatus::too_old;
     for (int attempt = 0; attempt < kAttempts; ++attempt) {
-      // Not by RawReader::tid(), which leaves the old ring at once.
+      // Not by RawReader::read_tid(), which leaves the old ring at once.
       open.seek(wanted - 1);
-      const ReadStatus status = open.next(out.payload(), out.info);
+      const ReadStatus status = open.read_next(out.payload(), out.info);
       if (status != ReadStatus::ok || out.info.tid == wanted) return status;
-      if (wanted < open.oldest()) return ReadStatus::too_old;
+      if (wanted < open.oldest_tid()) return ReadStatus::too_old;
       // A signal handler that reads too moved the cursor in between.
     }
     return ReadStatus::lapped;
@@ -208,7 +208,7 @@ ReadStatus Stream::tid(Tid tid, Copy& out) noexcept {
 }
 
 ReadStatus Stream::at(Time t, Copy& out) noexcept {
-  return copy(out, [&](RawReader& open) { return open.at(t, out.payload(), out.info); });
+  return copy(out, [&](RawReader& open) { return open.read_at(t, out.payload(), out.info); });
 }
 
 ReadStatus Stream::find(Time t, SampleInfo& info) noexcept {
@@ -227,8 +227,8 @@ Duration Stream::clock_error(Tid tid) noexcept {
   const std::lock_guard guard(read_lock_);
   follow_ring(*open);
   SampleInfo info;
-  return open->stamp(tid - offset(), info) == ReadStatus::ok ? open->clock_error(info)
-                                                             : kUnknownClockError;
+  return open->read_info(tid - offset(), info) == ReadStatus::ok ? open->clock_error(info)
+                                                                 : kUnknownClockError;
 }
 
 WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
@@ -268,7 +268,7 @@ Tid Stream::write_in_place(const std::function<void(std::byte*)>& fill, Time tim
   const Writing writing(incarnation_);
   if (!writing) return kNoTid;
   const std::lock_guard guard(write_lock_);
-  Loan loan = open->loan();
+  LoanedSample loan = open->loan();
   if (!loan) return kNoTid;
   fill(loan.payload().data());
   return loan.publish(time);

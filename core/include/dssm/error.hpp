@@ -14,7 +14,6 @@ namespace dssm {
 enum class Errc {
   invalid_argument,     // the caller's words are wrong: a name, a size, a duration, a configuration
   not_found,            // no such stream, or no property
-  already_exists,       // there is a stream of that name already, and it is not the same
   type_mismatch,        // the stream has another payload size, alignment or type
   limit_exceeded,       // a configured limit of dssmd, or one of the format
   no_memory,            // the machine has no memory for it
@@ -29,7 +28,7 @@ enum class Errc {
 };
 
 // The code's name as written in docs/errors.md, e.g. "not_found". Static storage.
-std::string_view errc_name(Errc code) noexcept;
+std::string_view name_of(Errc code) noexcept;
 
 // A value; copy and move freely.
 struct Error {

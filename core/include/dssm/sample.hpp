@@ -42,7 +42,7 @@ enum class [[nodiscard]] WaitStatus : std::uint8_t{
 };
 
 // "ok", "not_yet" ...; static storage.
-std::string_view status_name(ReadStatus status) noexcept;
+std::string_view name_of(ReadStatus status) noexcept;
 
 }  // namespace dssm
 #pragma GCC visibility pop

@@ -59,7 +59,7 @@ enum class Scalar : std::uint8_t {
 };
 
 std::uint32_t scalar_bytes(Scalar kind) noexcept;
-std::string_view scalar_name(Scalar kind) noexcept;  // "float64"; static storage
+std::string_view name_of(Scalar kind) noexcept;  // "float64"; static storage
 
 // One field of a payload. Nested structs are written with dots: "pose.x". Arrays have count > 1;
 // for an array of structs each member is a field with the struct's size as stride: "points.x".
@@ -101,7 +101,7 @@ struct History {
   // Enough slots for `life` of history at one sample per `cycle`, with SSM's 20 % margin:
   // trunc(1.2 * life / cycle + 1). Fails with invalid_argument unless 0 < cycle <= life, and with
   // limit_exceeded when that is more than kMaxDepth.
-  static Result<History> of(Duration life, Duration cycle);
+  static Result<History> for_life(Duration life, Duration cycle);
 };
 
 enum class Role : std::uint8_t { reader = 1, writer };
@@ -144,9 +144,11 @@ struct StreamInfo {
   double rate_hz = 0;  // from the stamps of the newest samples; 0 when unknown
   std::uint32_t writers = 0;
   std::uint32_t readers = 0;
-  std::uint32_t channels = 0;        // connections from other hosts that carry it
-  std::vector<StreamUser> users;     // filled by Session::info(), not by Session::list()
-  std::optional<MirrorInfo> mirror;  // of another host's stream that is read here; by info() only
+  std::uint32_t channels = 0;  // connections from other hosts that carry it
+  std::vector<StreamUser>
+      users;  // filled by Session::stream_info(), not by Session::list_streams()
+  std::optional<MirrorInfo>
+      mirror;  // of another host's stream that is read here; by stream_info() only
 };
 
 }  // namespace dssm

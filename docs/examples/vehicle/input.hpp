@@ -44,9 +44,9 @@ template <class T>
 void seek_to_drive(dssm::Reader<T>& reader, bool late) {
   T sample;
   dssm::SampleInfo info;
-  const dssm::Tid newest = reader.newest();
+  const dssm::Tid newest = reader.newest_tid();
   for (dssm::Tid tid = newest; tid >= 0; --tid) {
-    if (reader.tid(tid, sample, info) != dssm::ReadStatus::ok) break;
+    if (reader.read_tid(tid, sample, info) != dssm::ReadStatus::ok) break;
     if (sample.is_end() && !(late && tid == newest)) return reader.seek(tid);
   }
   reader.seek(dssm::kNoTid);

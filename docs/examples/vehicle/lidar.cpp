@@ -37,7 +37,7 @@ float step_rad(std::size_t beams) {
 // Fills the ring's next slot and publishes it. A null `reading` gives the end mark.
 void publish(dssm::Writer<vehicle::Scan>& writer, const vehicle::ScanReading* reading,
              dssm::Time time) {
-  dssm::Loan loan = writer.loan();  // cannot fail: there is no other loan
+  dssm::LoanedSample loan = writer.loan();  // cannot fail: there is no other loan
   vehicle::Scan& scan = dssm::Writer<vehicle::Scan>::view(loan);
   scan = {};
   if (reading) {

@@ -60,13 +60,13 @@ int main(int argc, char** argv) {
     if (without_odometry) {
       text += ", " + std::to_string(without_odometry) + " scans without odometry";
     }
-    if (lidar.lost()) text += ", " + std::to_string(lidar.lost()) + " scans missed";
+    if (lidar.lost_samples()) text += ", " + std::to_string(lidar.lost_samples()) + " scans missed";
     return text;
   };
   vehicle::Scan scan;
   dssm::SampleInfo info;
   while (!vehicle::stop_requested()) {
-    if (lidar.next(scan, info) != dssm::ReadStatus::ok) {
+    if (lidar.read_next(scan, info) != dssm::ReadStatus::ok) {
       (void)lidar.wait(dssm::deadline_in(vehicle::kSlice));
       continue;
     }
@@ -81,5 +81,5 @@ int main(int argc, char** argv) {
   }
   poses->write({0, 0, 0, dssm::kNoTid}, info.time);  // the end mark
   progress.print(summary());
-  return complete && without_odometry + lidar.lost() > 0 ? vehicle::kIncompleteStatus : 0;
+  return complete && without_odometry + lidar.lost_samples() > 0 ? vehicle::kIncompleteStatus : 0;
 }

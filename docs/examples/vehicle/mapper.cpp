@@ -66,7 +66,7 @@ int main(int argc, char** argv) {
   const auto summary = [&] {
     std::string text = std::to_string(way.size()) + " scans drawn";
     if (without_scan) text += ", " + std::to_string(without_scan) + " poses without their scan";
-    if (poses.lost()) text += ", " + std::to_string(poses.lost()) + " poses missed";
+    if (poses.lost_samples()) text += ", " + std::to_string(poses.lost_samples()) + " poses missed";
     return text;
   };
   vehicle::Pose pose;
@@ -74,7 +74,7 @@ int main(int argc, char** argv) {
   dssm::SampleInfo pose_info;
   dssm::MonoTime deadline = dssm::kNever;  // no timeout before the first pose
   while (!vehicle::stop_requested()) {
-    if (poses.next(pose, pose_info) != dssm::ReadStatus::ok) {
+    if (poses.read_next(pose, pose_info) != dssm::ReadStatus::ok) {
       if (dssm::MonoClock::now() >= deadline) {
         progress.print("no pose for " + std::to_string(std::lround(timeout_s)) +
                        " s and no end mark: the map shows the poses until then");
@@ -101,5 +101,5 @@ int main(int argc, char** argv) {
   }
   progress.print(summary() + "; " + std::to_string(grid.count(vehicle::OccupancyGrid::Cell::wall)) +
                  " wall cells; the map is in '" + out + "'");
-  return complete && without_scan + poses.lost() > 0 ? vehicle::kIncompleteStatus : 0;
+  return complete && without_scan + poses.lost_samples() > 0 ? vehicle::kIncompleteStatus : 0;
 }

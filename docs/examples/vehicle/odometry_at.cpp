@@ -9,13 +9,13 @@
 namespace vehicle {
 
 OdometryAt::OdometryAt(dssm::Reader<Odometry> reader, dssm::Duration deadline)
-    : reader_(std::move(reader)), deadline_(deadline), newest_at_start_(reader_.newest()) {}
+    : reader_(std::move(reader)), deadline_(deadline), newest_at_start_(reader_.newest_tid()) {}
 
 std::optional<Pose2> OdometryAt::between(dssm::Time t, const dssm::Neighbours& readings) {
   Odometry before, after;
   dssm::SampleInfo info;
-  if (reader_.tid(readings.before.tid, before, info) != dssm::ReadStatus::ok ||
-      reader_.tid(readings.after.tid, after, info) != dssm::ReadStatus::ok) {
+  if (reader_.read_tid(readings.before.tid, before, info) != dssm::ReadStatus::ok ||
+      reader_.read_tid(readings.after.tid, after, info) != dssm::ReadStatus::ok) {
     return std::nullopt;  // overwritten since the search, or the stream restarted
   }
   return interpolate({before.x_m, before.y_m, before.theta_rad},
@@ -27,7 +27,7 @@ std::optional<Pose2> OdometryAt::between(dssm::Time t, const dssm::Neighbours& r
 bool OdometryAt::follow_restart() {
   Odometry newest;
   dssm::SampleInfo info;
-  (void)reader_.latest(newest, info);
+  (void)reader_.read_newest(newest, info);
   if (reader_.restarts() == restarts_) return false;
   restarts_ = reader_.restarts();
   newest_at_start_ = dssm::kNoTid;
@@ -37,9 +37,10 @@ bool OdometryAt::follow_restart() {
 std::optional<Pose2> OdometryAt::at(dssm::Time t) {
   const dssm::MonoTime deadline = dssm::deadline_in(deadline_);
   while (!stop_requested()) {
-    const dssm::Tid newest = reader_.newest();  // before the search: wait_for_tid() misses nothing
+    const dssm::Tid newest =
+        reader_.newest_tid();  // before the search: wait_for_tid() misses nothing
     dssm::Neighbours readings;
-    const dssm::ReadStatus status = reader_.neighbours(t, readings);
+    const dssm::ReadStatus status = reader_.find_neighbours(t, readings);
     if (status == dssm::ReadStatus::ok) {
       if (const std::optional<Pose2> pose = between(t, readings)) return pose;
     }

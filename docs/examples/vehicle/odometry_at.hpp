@@ -24,7 +24,7 @@ class OdometryAt {
 
  private:
   std::optional<Pose2> between(dssm::Time t, const dssm::Neighbours& readings);
-  // Moves the reader to a restarted stream's new ring, which neighbours() does not do because it does
+  // Moves the reader to a restarted stream's new ring, which find_neighbours() does not do because it does
   // not move the cursor. True if there was a restart.
   bool follow_restart();
 

@@ -15,8 +15,9 @@ bool ScanAt::at(dssm::Time t, dssm::Tid tid, Scan& out) {
   const dssm::MonoTime deadline = dssm::deadline_in(deadline_);
   dssm::SampleInfo info;
   while (!stop_requested()) {
-    const bool written = reader_.newest() >= tid;  // before the read, so that at() misses no scan
-    const dssm::ReadStatus status = reader_.at(t, out, info);
+    const bool written =
+        reader_.newest_tid() >= tid;  // before the read, so that at() misses no scan
+    const dssm::ReadStatus status = reader_.read_at(t, out, info);
     if (status == dssm::ReadStatus::restarted) continue;
     if (status == dssm::ReadStatus::ok && info.tid == tid) return true;
     const dssm::MonoTime now = dssm::MonoClock::now();

@@ -20,6 +20,6 @@ int main() {
   if (!reader) return std::fprintf(stderr, "%s\n", reader.error().message.c_str()), 1;
   Climate climate{};
   dssm::SampleInfo info;
-  if (reader->latest(climate, info) != dssm::ReadStatus::ok) return 2;
+  if (reader->read_newest(climate, info) != dssm::ReadStatus::ok) return 2;
   return climate.temperature_c == 21.5 ? 0 : 3;
 }

@@ -54,51 +54,51 @@ TEST_F(Api, ReadsByTidByTimeAndInOrder) {
   auto reader = session.open_reader<Odometry>("odometry").value();
   Odometry out{};
   SampleInfo info;
-  EXPECT_EQ(reader.latest(out, info), ReadStatus::not_yet);
-  EXPECT_EQ(reader.next(out, info), ReadStatus::not_yet);
-  EXPECT_EQ(reader.at(time_of(1), out, info), ReadStatus::not_yet);
+  EXPECT_EQ(reader.read_newest(out, info), ReadStatus::not_yet);
+  EXPECT_EQ(reader.read_next(out, info), ReadStatus::not_yet);
+  EXPECT_EQ(reader.read_at(time_of(1), out, info), ReadStatus::not_yet);
   for (Tid tid = 0; tid < 10; ++tid) write(writer, tid);
 
-  ASSERT_EQ(reader.next(out, info), ReadStatus::ok) << "a fresh reader begins with the newest";
+  ASSERT_EQ(reader.read_next(out, info), ReadStatus::ok) << "a fresh reader begins with the newest";
   EXPECT_EQ(info.tid, 9);
-  EXPECT_EQ(reader.next(out, info), ReadStatus::not_yet);
+  EXPECT_EQ(reader.read_next(out, info), ReadStatus::not_yet);
   EXPECT_EQ(info.tid, 9) << "arguments stay as they were";
   write(writer, 10);
-  ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_next(out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 10);
-  ASSERT_EQ(reader.previous(out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_previous(out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 9);
-  ASSERT_EQ(reader.tid(3, out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_tid(3, out, info), ReadStatus::ok);
   EXPECT_EQ(out.x, 3);
   EXPECT_EQ(info.time, time_of(3));
-  ASSERT_EQ(reader.at(time_of(5) + 1ms, out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_at(time_of(5) + 1ms, out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 5);
-  ASSERT_EQ(reader.at(time_of(5), out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_at(time_of(5), out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 5);
-  ASSERT_EQ(reader.at(time_of(500), out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_at(time_of(500), out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 10);
-  EXPECT_EQ(reader.at(time_of(0) - 1ns, out, info), ReadStatus::too_old);
-  ASSERT_EQ(reader.at_or_after(time_of(5) + 1ns, out, info), ReadStatus::ok);
+  EXPECT_EQ(reader.read_at(time_of(0) - 1ns, out, info), ReadStatus::too_old);
+  ASSERT_EQ(reader.read_at_or_after(time_of(5) + 1ns, out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 6);
-  ASSERT_EQ(reader.at_or_after(time_of(5), out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_at_or_after(time_of(5), out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 5);
-  ASSERT_EQ(reader.at_or_after(time_of(-5), out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_at_or_after(time_of(-5), out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 0);
-  EXPECT_EQ(reader.at_or_after(time_of(10) + 1ns, out, info), ReadStatus::not_yet);
-  ASSERT_EQ(reader.nearest(time_of(5) + 50ms, out, info), ReadStatus::ok);
+  EXPECT_EQ(reader.read_at_or_after(time_of(10) + 1ns, out, info), ReadStatus::not_yet);
+  ASSERT_EQ(reader.read_nearest(time_of(5) + 50ms, out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 5) << "the earlier one of two equally close ones";
-  ASSERT_EQ(reader.nearest(time_of(5) + 51ms, out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_nearest(time_of(5) + 51ms, out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 6);
-  ASSERT_EQ(reader.nearest(time_of(-3), out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_nearest(time_of(-3), out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 0);
-  ASSERT_EQ(reader.nearest(time_of(33), out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_nearest(time_of(33), out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 10);
   Neighbours around;
-  ASSERT_EQ(reader.neighbours(time_of(5) + 30ms, around), ReadStatus::ok);
+  ASSERT_EQ(reader.find_neighbours(time_of(5) + 30ms, around), ReadStatus::ok);
   EXPECT_EQ(around.before.tid, 5);
   EXPECT_EQ(around.after.tid, 6);
-  EXPECT_EQ(reader.neighbours(time_of(10), around), ReadStatus::not_yet);
-  EXPECT_EQ(reader.neighbours(time_of(0) - 1ns, around), ReadStatus::too_old);
+  EXPECT_EQ(reader.find_neighbours(time_of(10), around), ReadStatus::not_yet);
+  EXPECT_EQ(reader.find_neighbours(time_of(0) - 1ns, around), ReadStatus::too_old);
 }
 
 TEST_F(Api, ReadsSeveralStreamsAtOneTimeOrNone) {
@@ -111,10 +111,10 @@ TEST_F(Api, ReadsSeveralStreamsAtOneTimeOrNone) {
   auto rough_reader = session.open_reader<Odometry>("rough").value();
   auto empty_reader = session.open_reader<Odometry>("empty").value();
   Odometry out{}, rough_out{}, empty_out{};
-  std::array samples{reader.joint(out), rough_reader.joint(rough_out)};
-  JointRead read = at(time_of(2), samples, 0ns);
+  std::array samples{reader.joint_sample(out), rough_reader.joint_sample(rough_out)};
+  JointRead read = read_joint_at(time_of(2), samples, 0ns);
   EXPECT_EQ(read.status, ReadStatus::ok);
-  EXPECT_EQ(read.error, 0ns) << "both are of this PC's clock";
+  EXPECT_EQ(read.clock_error, 0ns) << "both are of this PC's clock";
   EXPECT_EQ(samples[0].info.tid, 2);
   EXPECT_EQ(out.x, sample(2).x);
   EXPECT_EQ(samples[1].info.tid, 1);
@@ -122,11 +122,12 @@ TEST_F(Api, ReadsSeveralStreamsAtOneTimeOrNone) {
   EXPECT_EQ(reader.cursor(), 2);
   EXPECT_EQ(rough_reader.cursor(), 1);
 
-  EXPECT_EQ(at(time_of(0) - 1ns, samples).status, ReadStatus::too_old);
-  std::array three{reader.joint(out), rough_reader.joint(rough_out), empty_reader.joint(empty_out)};
-  read = at(time_of(3), three);
+  EXPECT_EQ(read_joint_at(time_of(0) - 1ns, samples).status, ReadStatus::too_old);
+  std::array three{reader.joint_sample(out), rough_reader.joint_sample(rough_out),
+                   empty_reader.joint_sample(empty_out)};
+  read = read_joint_at(time_of(3), three);
   EXPECT_EQ(read.status, ReadStatus::not_yet);
-  EXPECT_EQ(read.which, 2U);
+  EXPECT_EQ(read.index, 2U);
   EXPECT_EQ(reader.cursor(), 2) << "all or none";
 }
 
@@ -136,18 +137,18 @@ TEST_F(Api, CountsWhatAReaderLostWhenItWasLapped) {
   Odometry out{};
   SampleInfo info;
   write(writer, 0);
-  ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_next(out, info), ReadStatus::ok);
   for (Tid tid = 1; tid <= 20; ++tid) write(writer, tid);
-  ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_next(out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 14) << "8 slots hold 7 samples";
-  EXPECT_EQ(reader.lost(), 13u);
+  EXPECT_EQ(reader.lost_samples(), 13u);
   for (Tid tid = 15; tid <= 20; ++tid) {
-    ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_next(out, info), ReadStatus::ok);
     EXPECT_EQ(info.tid, tid);
   }
-  EXPECT_EQ(reader.lost(), 13u);
+  EXPECT_EQ(reader.lost_samples(), 13u);
   reader.seek(kNoTid);
-  ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_next(out, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 14);
 }
 
@@ -155,15 +156,15 @@ TEST_F(Api, LendsSlotsInPlace) {
   auto writer = make();
   auto reader = session.open_reader<Odometry>("odometry").value();
   {
-    Loan loan = writer.loan();
+    LoanedSample loan = writer.loan();
     ASSERT_TRUE(loan);
     Writer<Odometry>::view(loan) = sample(0);
     EXPECT_FALSE(writer.loan()) << "a second loan in the same thread would wait for ever";
     EXPECT_EQ(loan.publish(time_of(0)), 0);
     EXPECT_EQ(loan.publish(time_of(0)), kNoTid);
   }
-  { Loan dropped = writer.loan(); }
-  EXPECT_EQ(writer.newest(), 0);
+  { LoanedSample dropped = writer.loan(); }
+  EXPECT_EQ(writer.newest_tid(), 0);
   BorrowedSample borrowed;
   ASSERT_EQ(reader.borrow(0, borrowed), ReadStatus::ok);
   EXPECT_EQ(Reader<Odometry>::view(borrowed).theta, 0.5);
@@ -182,7 +183,7 @@ TEST_F(Api, KeepsAnExistingRingWhenCreatedAgain) {
   write(first, 2);
   auto reader = session.open_reader<Odometry>("odometry").value();
   SampleInfo info;
-  ASSERT_EQ(reader.stamp(0, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_info(0, info), ReadStatus::ok);
   EXPECT_EQ(info.time, time_of(0)) << "SSM zeroed all stamps here";
 }
 
@@ -221,7 +222,7 @@ TEST_F(Api, SaysInWordsWhatIsWrongWithARequest) {
   expect(session.create_raw({"a", 0, ""}, TypeInfo{"", 64 << 20, 1, {}}, {1 << 20, 1ms}),
          Errc::limit_exceeded, "memory");
   expect(session.remove({"nothing", 0, ""}), Errc::not_found, "nothing");
-  expect(session.info({"nothing", 0, ""}), Errc::not_found, "nothing");
+  expect(session.stream_info({"nothing", 0, ""}), Errc::not_found, "nothing");
   expect(session.property({"nothing", 0, ""}), Errc::not_found, "nothing");
   make();
   expect(session.property({"odometry", 0, ""}), Errc::not_found, "property");
@@ -248,7 +249,7 @@ TEST_F(Api, KeepsPropertiesOfAnySizeUpToTheirLimit) {
     std::vector<std::byte> property(bytes, static_cast<std::byte>(bytes % 251));
     ASSERT_TRUE(writer.set_property(property));
     EXPECT_EQ(session.property({"odometry", 0, ""}).value(), property);
-    EXPECT_EQ(session.info({"odometry", 0, ""}).value().property_bytes, bytes);
+    EXPECT_EQ(session.stream_info({"odometry", 0, ""}).value().property_bytes, bytes);
   }
   EXPECT_EQ(writer.set_property(std::vector<std::byte>((16 << 20) + 1)).error().code,
             Errc::limit_exceeded);
@@ -274,7 +275,7 @@ TEST_F(Api, WaitsForSamplesWithADeadline) {
     for (Tid tid = 0; tid < 5; ++tid) write(writer, tid);
   });
   EXPECT_EQ(reader.wait_for_tid(4, kNever), WaitStatus::ready);
-  EXPECT_EQ(reader.newest(), 4);
+  EXPECT_EQ(reader.newest_tid(), 4);
   more.join();
 }
 
@@ -297,7 +298,7 @@ TEST_F(Api, OffersADescriptorToEventLoops) {
     write(writer, tid);
     ASSERT_EQ(::poll(&poller, 1, -1), 1);
     reader.clear_ready();
-    ASSERT_EQ(reader.next(out, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_next(out, info), ReadStatus::ok);
     ASSERT_EQ(info.tid, tid);
   }
 }
@@ -320,7 +321,7 @@ TEST_F(Api, ListsStreamsWithTheirFigures) {
   auto reader = session.open_reader<Odometry>("odometry:2").value();
   for (Tid tid = 0; tid < 30; ++tid) write(writer, tid);
   make("second");
-  const std::vector<StreamInfo> list = session.list().value();
+  const std::vector<StreamInfo> list = session.list_streams().value();
   ASSERT_EQ(list.size(), 2u);
   const StreamInfo& first = list[0];
   EXPECT_EQ(first.id, (StreamId{"odometry", 2, "pc1"}));
@@ -337,17 +338,17 @@ TEST_F(Api, ListsStreamsWithTheirFigures) {
   EXPECT_EQ(list[1].id.name, "second");
   EXPECT_EQ(list[1].newest, kNoTid);
   EXPECT_EQ(list[1].writers, 0u) << "its writer is gone";
-  const StreamInfo info = session.info({"odometry", 2, ""}).value();
+  const StreamInfo info = session.stream_info({"odometry", 2, ""}).value();
   ASSERT_EQ(info.users.size(), 2u);
   EXPECT_EQ(info.users[0].pid, ::getpid());
-  EXPECT_EQ(session.info({"odometry", 2, "pc1"}).value().id, first.id);
-  EXPECT_EQ(session.info({"odometry", 2, "pc9"}).error().code, Errc::not_found);
-  EXPECT_EQ(session.daemon().value().host, "pc1");
-  EXPECT_EQ(session.daemon().value().pid, daemon.pid());
-  EXPECT_EQ(session.daemon().value().streams, 2u);
-  ASSERT_EQ(session.clients().value().size(), 1u);
-  EXPECT_EQ(session.clients().value()[0].pid, ::getpid());
-  ASSERT_EQ(session.opens().value().size(), 2u);
+  EXPECT_EQ(session.stream_info({"odometry", 2, "pc1"}).value().id, first.id);
+  EXPECT_EQ(session.stream_info({"odometry", 2, "pc9"}).error().code, Errc::not_found);
+  EXPECT_EQ(session.daemon_info().value().host, "pc1");
+  EXPECT_EQ(session.daemon_info().value().pid, daemon.pid());
+  EXPECT_EQ(session.daemon_info().value().streams, 2u);
+  ASSERT_EQ(session.list_clients().value().size(), 1u);
+  EXPECT_EQ(session.list_clients().value()[0].pid, ::getpid());
+  ASSERT_EQ(session.list_opens().value().size(), 2u);
 }
 
 TEST_F(Api, RemovesAStreamButNotFromThoseWhoHoldIt) {
@@ -357,10 +358,10 @@ TEST_F(Api, RemovesAStreamButNotFromThoseWhoHoldIt) {
   ASSERT_TRUE(session.remove({"odometry", 0, ""}));
   EXPECT_EQ(session.open_reader<Odometry>("odometry").error().code, Errc::not_found);
   write(writer, 1);
-  EXPECT_EQ(reader.newest(), 1);
+  EXPECT_EQ(reader.newest_tid(), 1);
   auto anew = make();
   EXPECT_NE(anew.incarnation(), writer.incarnation());
-  EXPECT_EQ(anew.newest(), kNoTid);
+  EXPECT_EQ(anew.newest_tid(), kNoTid);
 }
 
 TEST_F(Api, TellsWatchersWhatComesAndGoes) {
@@ -391,7 +392,8 @@ TEST_F(Api, AwaitsAStreamThatComesLater) {
 
 TEST_F(Api, SharesOnePlaybackClock) {
   Session other = test::connect(daemon);
-  PlaybackClock clock = session.playback_clock().value(), seen = other.playback_clock().value();
+  PlaybackClock clock = session.open_playback_clock().value(),
+                seen = other.open_playback_clock().value();
   EXPECT_EQ(seen.setting().speed, 1);
   clock.set_paused(true);
   clock.set_time(500);
@@ -418,16 +420,16 @@ TEST_F(Api, LeaksNothingIn10000OpensAndCloses) {
     auto second = session.open_writer<Odometry>("odometry").value();
   };
   once();
-  ASSERT_TRUE(session.list());  // an answer after the closes: they are done
+  ASSERT_TRUE(session.list_streams());  // an answer after the closes: they are done
   const std::size_t ours = count_of(files_of(::getpid())), maps = count_of("/proc/self/map_files");
   const std::size_t theirs = count_of(files_of(daemon.pid()));
   for (int i = 0; i < 10'000; ++i) once();
-  ASSERT_TRUE(session.list());
+  ASSERT_TRUE(session.list_streams());
   EXPECT_EQ(count_of(files_of(::getpid())), ours);
   EXPECT_LE(count_of("/proc/self/map_files"), maps + 4);  // malloc may map an arena
   EXPECT_EQ(count_of(files_of(daemon.pid())), theirs);
-  EXPECT_EQ(session.info({"odometry", 0, ""}).value().writers, 1u);
-  EXPECT_EQ(session.opens().value().size(), 1u);
+  EXPECT_EQ(session.stream_info({"odometry", 0, ""}).value().writers, 1u);
+  EXPECT_EQ(session.list_opens().value().size(), 1u);
 }
 
 TEST_F(Api, Serves1000StreamsAnd1000Clients) {
@@ -450,11 +452,11 @@ TEST_F(Api, Serves1000StreamsAnd1000Clients) {
   for (int i = 0; i < 1000; ++i) {
     double out = 0;
     SampleInfo info;
-    ASSERT_EQ(readers[static_cast<std::size_t>(i)].latest(out, info), ReadStatus::ok);
+    ASSERT_EQ(readers[static_cast<std::size_t>(i)].read_newest(out, info), ReadStatus::ok);
     ASSERT_EQ(out, i);
   }
-  EXPECT_EQ(session.list().value().size(), 1000u);
-  EXPECT_EQ(session.clients().value().size(), 1001u);
+  EXPECT_EQ(session.list_streams().value().size(), 1000u);
+  EXPECT_EQ(session.list_clients().value().size(), 1001u);
 }
 
 }  // namespace

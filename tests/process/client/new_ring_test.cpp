@@ -31,7 +31,7 @@ Writer<double> recreate(Session& session) {
 // Waits for the next outcome of next() that is not not_yet.
 ReadStatus next(Reader<double>& reader, double& value, SampleInfo& info) {
   for (;;) {
-    const ReadStatus status = reader.next(value, info);
+    const ReadStatus status = reader.read_next(value, info);
     if (status != ReadStatus::not_yet) return status;
     EXPECT_NE(reader.wait(kNever), WaitStatus::timeout);
   }
@@ -65,8 +65,8 @@ TEST(NewRing, IsGoneOnWithAfterTheOldOneIsReadToItsEnd) {
     EXPECT_EQ(info.tid, i);
     EXPECT_EQ(value, 100 + i);
   }
-  EXPECT_EQ(reader.next(value, info), ReadStatus::not_yet);
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.read_next(value, info), ReadStatus::not_yet);
+  EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
 TEST(NewRing, WakesWhoSleepsOnTheOldOne) {
@@ -92,7 +92,7 @@ TEST(NewRing, WakesWhoSleepsOnTheOldOne) {
   ASSERT_EQ(::poll(&event, 1, -1), 1);
   double value = 0;
   SampleInfo info;
-  ASSERT_EQ(reader.next(value, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_next(value, info), ReadStatus::ok);
   EXPECT_EQ(value, 8);
 }
 
@@ -108,12 +108,12 @@ TEST(NewRing, IsToldByReadsByTimeAtOnce) {
   again.write(2, time_from_ns(2000));
   double value = 0;
   SampleInfo info;
-  while (reader.at(time_from_ns(1500), value, info) != ReadStatus::restarted) {
+  while (reader.read_at(time_from_ns(1500), value, info) != ReadStatus::restarted) {
     EXPECT_NE(reader.wait(kNever), WaitStatus::timeout);
   }
   EXPECT_EQ(Reader<double>::view(borrowed), 1) << "what was borrowed stays mapped";
-  EXPECT_EQ(reader.at(time_from_ns(1500), value, info), ReadStatus::too_old);
-  ASSERT_EQ(reader.at(time_from_ns(2500), value, info), ReadStatus::ok);
+  EXPECT_EQ(reader.read_at(time_from_ns(1500), value, info), ReadStatus::too_old);
+  ASSERT_EQ(reader.read_at(time_from_ns(2500), value, info), ReadStatus::ok);
   EXPECT_EQ(value, 2);
 }
 
@@ -127,12 +127,12 @@ TEST(NewRing, OfAnotherTypeLeavesTheReaderOnTheOldOneAndSaysWhy) {
   RawWriter other = session.create_raw(kId, {"", 3, 1, {}}, History{16, 1ms}).value();
   double value = 0;
   SampleInfo info;
-  while (!reader.trouble()) {
-    ASSERT_EQ(reader.latest(value, info), ReadStatus::ok);
+  while (!reader.restart_error()) {
+    ASSERT_EQ(reader.read_newest(value, info), ReadStatus::ok);
     EXPECT_EQ(value, 1);
   }
-  EXPECT_EQ(reader.trouble()->code, Errc::type_mismatch);
-  EXPECT_NE(reader.trouble()->message.find("anew:0"), std::string::npos);
+  EXPECT_EQ(reader.restart_error()->code, Errc::type_mismatch);
+  EXPECT_NE(reader.restart_error()->message.find("anew:0"), std::string::npos);
   EXPECT_EQ(reader.restarts(), 0u);
 }
 
@@ -167,7 +167,7 @@ TEST(NewRing, IsToldWhileTheConnectionIsSetUpAnew) {
     const int before = relay.opens();
     for (const MonoTime end = deadline_in(30s); relay.opens() == before;) {
       ASSERT_LT(MonoClock::now(), end) << reader.id().str() << " does not know";
-      EXPECT_EQ(reader.next(value, info), ReadStatus::not_yet);
+      EXPECT_EQ(reader.read_next(value, info), ReadStatus::not_yet);
     }
   }
 }
@@ -191,14 +191,14 @@ TEST(NewRing, IsFoundWhenTheNameWasTakenWhileDssmdWasAway) {
     writer = eager.create<double>("anew", History{16, 1ms}).value();
     writer->write(5);
     // A question that the reading session's keeper answers only when it is back and has offered.
-    ASSERT_TRUE(reading.daemon());
+    ASSERT_TRUE(reading.daemon_info());
     const bool took_the_name = writer->incarnation() != reader.incarnation();
     if (!took_the_name) continue;
-    while (reader.latest(value, info) != ReadStatus::restarted) {
+    while (reader.read_newest(value, info) != ReadStatus::restarted) {
       EXPECT_NE(reader.wait(kNever), WaitStatus::timeout);
     }
     restarts = reader.restarts();
-    ASSERT_EQ(reader.latest(value, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_newest(value, info), ReadStatus::ok);
     EXPECT_EQ(value, 5);
     EXPECT_EQ(reader.incarnation(), writer->incarnation());
   }

@@ -56,7 +56,7 @@ TEST(Restart, LosesNoSampleWhenTheDaemonIsKilledUnderLoad) {
     SampleInfo info;
     for (std::int64_t expected = 0; !done || expected < written.load();) {
       if (reader.wait(deadline_in(100ms)) != WaitStatus::ready) continue;
-      ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+      ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok);
       ASSERT_EQ(info.tid, expected);
       ASSERT_EQ(sample.number, expected);
       for (const std::int64_t word : sample.again) ASSERT_EQ(word, expected);
@@ -71,7 +71,7 @@ TEST(Restart, LosesNoSampleWhenTheDaemonIsKilledUnderLoad) {
     // Both sessions are back with what they hold, under the same ring.
     const StreamInfo info = [&] {
       for (;;) {
-        auto seen = reading.info({"load", 0, ""});
+        auto seen = reading.stream_info({"load", 0, ""});
         if (seen && seen->writers == 1 && seen->readers == 1) return *seen;
         std::this_thread::sleep_for(test::kLookPause);
       }
@@ -87,7 +87,7 @@ TEST(Restart, LosesNoSampleWhenTheDaemonIsKilledUnderLoad) {
   done = true;
   write.join();
   read.join();
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
 TEST(Restart, BringsBackAStreamThatOnlyReadersHold) {
@@ -105,7 +105,7 @@ TEST(Restart, BringsBackAStreamThatOnlyReadersHold) {
   auto writer = session.open_writer<Counted>("kept");
   ASSERT_TRUE(writer) << writer.error().message;
   EXPECT_EQ(writer->write(counted(1)), 1);
-  EXPECT_EQ(reader.newest(), 1);
+  EXPECT_EQ(reader.newest_tid(), 1);
   EXPECT_EQ(session.property({"kept", 0, ""}).value(), std::vector<std::byte>(1000, std::byte{7}));
 }
 
@@ -128,22 +128,22 @@ TEST(Restart, ForgetsStreamsThatNobodyHolds) {
   DaemonProcess daemon;
   Session session = connect(daemon);
   session.create<Counted>("gone", History{16, 1ms}).value();
-  ASSERT_EQ(session.list().value().size(), 1u);
+  ASSERT_EQ(session.list_streams().value().size(), 1u);
   daemon.kill_hard();
   daemon.start();
-  EXPECT_EQ(session.list().value().size(), 0u);
+  EXPECT_EQ(session.list_streams().value().size(), 0u);
 }
 
 TEST(Restart, KeepsThePlaybackClock) {
   DaemonProcess daemon;
   Session session = connect(daemon);
-  PlaybackClock clock = session.playback_clock().value();
+  PlaybackClock clock = session.open_playback_clock().value();
   clock.set_paused(true);
   clock.set_time(1234);
   daemon.kill_hard();
   daemon.start();
-  ASSERT_TRUE(session.list());  // back, and what it held offered
-  EXPECT_EQ(connect(daemon).playback_clock().value().now_s(), 1234);
+  ASSERT_TRUE(session.list_streams());  // back, and what it held offered
+  EXPECT_EQ(connect(daemon).open_playback_clock().value().now_s(), 1234);
 }
 
 TEST(Restart, TellsWatchersWhatIsGone) {
@@ -187,7 +187,7 @@ TEST(Restart, FailsRequestsInWordsWhileTheDaemonIsAway) {
     return impatient.has_value();
   });
   daemon.kill_hard();
-  const auto list = impatient->list();
+  const auto list = impatient->list_streams();
   ASSERT_FALSE(list);
   EXPECT_EQ(list.error().code, Errc::unavailable);
   EXPECT_NE(list.error().message.find("list the streams"), std::string::npos);
@@ -212,9 +212,9 @@ TEST(Restart, DaemonKeepsNothingOfClientsThatWereKilled) {
     ::close(started[0]);
   }
   // Its sockets are closed by the kernel before its death is reported; dssmd has them on its loop.
-  await([&] { return session.clients().value().size() == 1; });
-  EXPECT_EQ(session.opens().value().size(), 0u);
-  for (const StreamInfo& stream : session.list().value()) {
+  await([&] { return session.list_clients().value().size() == 1; });
+  EXPECT_EQ(session.list_opens().value().size(), 0u);
+  for (const StreamInfo& stream : session.list_streams().value()) {
     auto writer = session.open_raw_writer(stream.id);
     ASSERT_TRUE(writer) << writer.error().message;
     EXPECT_EQ(writer->write(std::vector<std::byte>(128), Time()), stream.newest + 1)

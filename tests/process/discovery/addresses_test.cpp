@@ -34,7 +34,7 @@ class Addresses : public Vehicle {
     double value = 0;
     SampleInfo info;
     await("the reader goes on",
-          [&] { return reader_->latest(value, info) == ReadStatus::ok && value == written_; });
+          [&] { return reader_->read_newest(value, info) == ReadStatus::ok && value == written_; });
     EXPECT_EQ(reader_->restarts(), 0u);
   }
   Duration await_gone(const std::string& why) {
@@ -83,8 +83,8 @@ TEST_F(Addresses, MakeOneHostOfAPcWithCableAndWifiAndOneOfThemIsEnough) {
   for (int pc = 1; pc <= 2; ++pc) start_avahi(pc), add_dssmd(kEverywhere);
   share();
   for (const int pc : {1, 2}) {
-    EXPECT_EQ(session(pc).hosts().value().size(), 2u) << "the other one, and itself";
-    EXPECT_EQ(session(pc).list().value().size(), 1u);
+    EXPECT_EQ(session(pc).list_hosts().value().size(), 2u) << "the other one, and itself";
+    EXPECT_EQ(session(pc).list_streams().value().size(), 1u);
   }
   // Whichever has the address in use goes; when it is back the other one goes.
   for (int turn = 0; turn < 4; ++turn) {
@@ -106,7 +106,7 @@ TEST_F(Addresses, MakeOneHostOfAPcWithCableAndWifiAndOneOfThemIsEnough) {
               kWhenAvahiKnows);
     expect_that_the_reader_follows();
     network().configure(2, "link set " + interface + " up\n" + addresses_of(interface));
-    EXPECT_EQ(session(1).hosts().value().size(), 2u);
+    EXPECT_EQ(session(1).list_hosts().value().size(), 2u);
   }
 }
 
@@ -127,7 +127,7 @@ TEST_F(Addresses, FindAHostBehindAnInterfaceThatComesLater) {
   network().configure(2, "link del eth0\n");
   for (int pc = 1; pc <= 2; ++pc) start_avahi(pc), add_dssmd(kEverywhere);
   for (int pc = 1; pc <= 2; ++pc) {
-    await("Avahi is used", [&] { return session(pc).daemon().value().mdns.own_host_seen; });
+    await("Avahi is used", [&] { return session(pc).daemon_info().value().mdns.own_host_seen; });
   }
   plug_in_eth0();
   EXPECT_LT(await("pc1 has found pc2", [&] { return is_up(session(1), "pc2"); }), kWhenAvahiKnows);

@@ -14,7 +14,7 @@ bool says(const std::string& text, const std::string& part) {
 
 class Names : public Vehicle {
  protected:
-  static HostInfo self(Session& on) { return on.hosts().value().at(0); }
+  static HostInfo self(Session& on) { return on.list_hosts().value().at(0); }
   std::string doctor(int pc) {
     return run({built("client/dssmctl/dssmctl"), "doctor"}, {dssmd(pc).environment()}).out;
   }
@@ -32,22 +32,22 @@ TEST_F(Names, OfAvahiMayChangeAndTheHostStaysTheSameOne) {
   const Finished renamed = run({built("tests/process/discovery/raw-avahi"), "rename", "front-left"},
                                {avahi(2).environment()});
   ASSERT_EQ(renamed.exit_status, 0) << renamed.err;
-  EXPECT_EQ(session(1).hosts().value().size(), 2u);
+  EXPECT_EQ(session(1).list_hosts().value().size(), 2u);
   EXPECT_TRUE(is_up(session(1), "pc2"));
   EXPECT_TRUE(lists(session(1), id));
   // And is found by the new name.
-  await("all is announced", [&] { return session(2).daemon().value().mdns.announced == 2; });
+  await("all is announced", [&] { return session(2).daemon_info().value().mdns.announced == 2; });
   dssmd(1).kill_hard();
   start_dssmd(1);
   await("pc1 is there again", [&] { return is_up(session(2), "pc1"); });
   await("pc2 is found", [&] { return is_up(session(1), "pc2") && lists(session(1), id); });
-  EXPECT_EQ(session(1).hosts().value().size(), 2u);
+  EXPECT_EQ(session(1).list_hosts().value().size(), 2u);
   EXPECT_EQ(hosts(session(1), "pc2").at(0).id, before);
   writer.write(2);
   double value = 0;
   SampleInfo info;
   await("the reader goes on",
-        [&] { return reader.latest(value, info) == ReadStatus::ok && value == 2; });
+        [&] { return reader.read_newest(value, info) == ReadStatus::ok && value == 2; });
 }
 
 TEST_F(Names, OfAvahiMayCollide) {
@@ -55,11 +55,11 @@ TEST_F(Names, OfAvahiMayCollide) {
   network().cut(3);
   for (int pc = 1; pc <= 3; ++pc) start_avahi(pc), add_dssmd();
   await("pc2 is found", [&] { return is_up(session(1), "pc2") && is_up(session(2), "pc1"); });
-  await("pc3 has its name", [&] { return session(3).daemon().value().mdns.announced == 1; });
+  await("pc3 has its name", [&] { return session(3).daemon_info().value().mdns.announced == 1; });
   network().heal(3);  // now two PCs are called pc2.local, and one has to change that
   await_all_up();
   for (const int pc : {1, 2, 3}) {
-    EXPECT_EQ(session(pc).hosts().value().size(), 3u);
+    EXPECT_EQ(session(pc).list_hosts().value().size(), 3u);
     if (pc == 1) continue;
     EXPECT_TRUE(hosts(session(1), Network::name(pc))
                     .at(0)
@@ -97,7 +97,7 @@ TEST_F(Names, OfADssmdMayChangeWithItsRestart) {
   double value = 0;
   SampleInfo info;
   await("what is written arrives",
-        [&] { return reader.latest(value, info) == ReadStatus::ok && value == 2; });
+        [&] { return reader.read_newest(value, info) == ReadStatus::ok && value == 2; });
 }
 
 // As after the disk of one PC was copied to another: machine id and name are the same. (All PCs of
@@ -111,7 +111,7 @@ TEST_F(Names, OfACopiedPcAreToldOnBothAndMendedByAnotherName) {
     await("the copy is noticed", [&] { return says(self(session(pc)).error, there); });
     const std::string warning = self(session(pc)).error;
     EXPECT_TRUE(says(warning, "this host's name 'pc1' and machine id")) << warning;
-    const std::vector<HostInfo> all = session(pc).hosts().value();
+    const std::vector<HostInfo> all = session(pc).list_hosts().value();
     ASSERT_EQ(all.size(), 2u);
     EXPECT_EQ(all[1].state, "refused");
     EXPECT_EQ(all[1].id, all[0].id);
@@ -127,7 +127,7 @@ TEST_F(Names, OfACopiedPcAreToldOnBothAndMendedByAnotherName) {
   await_all_up();
   for (const int pc : {1, 2}) {
     await("nothing is wrong any more", [&] {
-      return self(session(pc)).error.empty() && session(pc).hosts().value().size() == 2;
+      return self(session(pc)).error.empty() && session(pc).list_hosts().value().size() == 2;
     });
   }
   EXPECT_FALSE(says(doctor(1), "machine-id"));

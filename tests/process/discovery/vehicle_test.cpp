@@ -25,7 +25,7 @@ TEST_F(Vehicle, ListsEveryStreamOfEveryPcWithNothingConfigured) {
   Reader<double> reader = session(3).await_reader<double>("lidar", deadline_in(1min)).value();
   double value = 0;
   SampleInfo info;
-  EXPECT_EQ(reader.latest(value, info), ReadStatus::ok);
+  EXPECT_EQ(reader.read_newest(value, info), ReadStatus::ok);
   EXPECT_EQ(value, 7);
   session(2).remove(lidar).value();
   for (const int pc : {1, 3}) {
@@ -53,7 +53,7 @@ TEST_F(Vehicle, LosesAHostThatFallsSilentAndFindsItAgain) {
   double value = 0;
   SampleInfo info;
   await("the sample comes",
-        [&] { return reader.latest(value, info) == ReadStatus::ok && value == 2; });
+        [&] { return reader.read_newest(value, info) == ReadStatus::ok && value == 2; });
   EXPECT_EQ(reader.restarts(), 0u);
 }
 
@@ -70,15 +70,16 @@ TEST_F(Vehicle, KeepsWhatItKnowsWhenAvahiDiesAndFindsNewHostsWhenItIsBack) {
   if (!make(3)) GTEST_SKIP() << why_;
   await_all_up();
   for (int pc = 1; pc <= 3; ++pc) avahi(pc).kill_avahi();
-  await("the trouble is told", [&] { return session(1).daemon().value().mdns.phase == "waiting"; });
-  EXPECT_NE(session(1).daemon().value().mdns.trouble, "");
+  await("the trouble is told",
+        [&] { return session(1).daemon_info().value().mdns.phase == "waiting"; });
+  EXPECT_NE(session(1).daemon_info().value().mdns.trouble, "");
   EXPECT_TRUE(is_up(session(1), "pc2")) << "connections are the truth";
   dssmd(3).kill_hard();
   await("its death is noticed", [&] { return !is_up(session(1), "pc3"); });
   start_dssmd(3);
   for (int pc = 1; pc <= 3; ++pc) avahi(pc).start_avahi();
   await_all_up();
-  EXPECT_EQ(session(1).daemon().value().mdns.phase, "running");
+  EXPECT_EQ(session(1).daemon_info().value().mdns.phase, "running");
 }
 
 TEST_F(Vehicle, ShowsASecondDssmdOfTheSamePcAsAnotherHost) {
@@ -99,8 +100,9 @@ TEST_F(Vehicle, ShowsAHostThatListensOnLoopbackOnlyAsClosedAndKeepsItsStreamsOut
   // On the same PC it can be reached.
   await("it is found", [&] { return is_up(session(1), "shy"); });
   await("its stream is listed", [&] { return lists(session(1), {"secret", 0, "shy"}); });
-  await("all of it is announced", [&] { return on_closed.daemon().value().mdns.announced >= 1; });
-  EXPECT_EQ(on_closed.daemon().value().mdns.announced, 1u) << "the host, and no stream of it";
+  await("all of it is announced",
+        [&] { return on_closed.daemon_info().value().mdns.announced >= 1; });
+  EXPECT_EQ(on_closed.daemon_info().value().mdns.announced, 1u) << "the host, and no stream of it";
 }
 
 TEST_F(Vehicle, FollowsAStreamThatMovesUnderARunningReader) {
@@ -112,12 +114,12 @@ TEST_F(Vehicle, FollowsAStreamThatMovesUnderARunningReader) {
   Reader<double> reader = session(1).await_reader<double>("moving", deadline_in(1min)).value();
   double value = 0;
   SampleInfo info;
-  EXPECT_EQ(reader.latest(value, info), ReadStatus::ok);
+  EXPECT_EQ(reader.read_newest(value, info), ReadStatus::ok);
   session(2).remove({"moving", 0, "pc2"}).value();
   writer = session(3).create<double>("moving", History{64, 1ms}).value();
   writer->write(2);
   await("the reader goes on at the other host",
-        [&] { return reader.latest(value, info) == ReadStatus::ok && value == 2; });
+        [&] { return reader.read_newest(value, info) == ReadStatus::ok && value == 2; });
   EXPECT_EQ(reader.restarts(), 1u);
 }
 

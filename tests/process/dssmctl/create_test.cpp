@@ -16,7 +16,7 @@ TEST_F(Create, MakesAStreamOfTheGivenShapeThatStays) {
       {"create", "s:2", "--size", "24", "--depth", "10", "--cycle", "0.025", "--type", "Odometry"});
   EXPECT_EQ(created, Json::parse(R"({"stream":"s:2@pc1","created":true,"payload_bytes":24,
                                       "depth":10,"cycle_ns":25000000})"));
-  const StreamInfo info = session_.info({"s", 2, ""}).value();
+  const StreamInfo info = session_.stream_info({"s", 2, ""}).value();
   EXPECT_EQ(info.type.payload_bytes, 24U);
   EXPECT_EQ(info.type.alignment_bytes, 8U);
   EXPECT_EQ(info.type.name, "Odometry");
@@ -26,7 +26,7 @@ TEST_F(Create, MakesAStreamOfTheGivenShapeThatStays) {
 }
 
 TEST_F(Create, ComputesTheDepthFromLifeAndCycle) {
-  const History history = History::of(2s, 10ms).value();
+  const History history = History::for_life(2s, 10ms).value();
   EXPECT_EQ(json({"create", "s", "--size", "4", "--life", "2", "--cycle", "0.01"})["depth"],
             history.depth);
   EXPECT_NE(output({"create", "t", "--size", "4", "--life", "2", "--cycle", "0.01"})
@@ -36,11 +36,11 @@ TEST_F(Create, ComputesTheDepthFromLifeAndCycle) {
 
 TEST_F(Create, KeepsAStreamThatIsThereAlready) {
   output({"create", "s", "--size", "24", "--depth", "10"});
-  const std::uint64_t incarnation = session_.info({"s", 0, ""}).value().incarnation;
+  const std::uint64_t incarnation = session_.stream_info({"s", 0, ""}).value().incarnation;
   const Json again = json({"create", "s", "--size", "24", "--depth", "99"});
   EXPECT_EQ(again["created"], false);
   EXPECT_EQ(again["depth"], 10);
-  EXPECT_EQ(session_.info({"s", 0, ""}).value().incarnation, incarnation);
+  EXPECT_EQ(session_.stream_info({"s", 0, ""}).value().incarnation, incarnation);
 }
 
 TEST_F(Create, RefusesAnotherSizeNamingBoth) {
@@ -60,7 +60,7 @@ TEST_F(Create, RefusesImpossibleNamesAndLivesAsWrongUsage) {
     EXPECT_EQ(finished.err.find('\n'), finished.err.size() - 1) << finished.err;
   }
   EXPECT_EQ(ctl({"create", "s", "--size", "4", "--life", "1", "--cycle", "2"}).exit_status, 2);
-  EXPECT_EQ(session_.list().value().size(), 0U);
+  EXPECT_EQ(session_.list_streams().value().size(), 0U);
 }
 
 TEST_F(Rm, RemovesStreams) {
@@ -68,7 +68,7 @@ TEST_F(Rm, RemovesStreams) {
     output({"create", name, "--size", "4", "--depth", "4"});
   EXPECT_EQ(output({"rm", "a"}), "");
   EXPECT_EQ(json({"rm", "b", "c:1"}), Json::parse(R"({"removed":["b:0","c:1"]})"));
-  EXPECT_EQ(session_.list().value().size(), 0U);
+  EXPECT_EQ(session_.list_streams().value().size(), 0U);
 }
 
 TEST_F(Rm, RemovesTheOthersWhenOneIsMissing) {

@@ -121,7 +121,7 @@ TEST_F(DoctorInAFleet, FindsStreamsOfOneName) {
 TEST_F(Doctor, FindsTwoHostsOfOneName) {
   DaemonProcess namesake({"--peer", daemon_.address()}, "pc1");
   Session session = session_with(namesake);
-  await([&] { return session.hosts().value().at(1).state == "refused"; });
+  await([&] { return session.list_hosts().value().at(1).state == "refused"; });
   const Json document = doctor({"--socket", namesake.socket_path()});
   EXPECT_EQ(check(document, "host names")["status"], "fail") << document;
 }

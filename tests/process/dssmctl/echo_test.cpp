@@ -157,13 +157,13 @@ TEST_F(Echo, CountsWhatWasOverwrittenBeforeItCouldBeShown) {
   auto small = session_.create<double>("small", depth_of(4)).value();
   Running echo(argv({"echo", "small", "--json"}), environment());
   std::int64_t tid = Json::parse(echo.line([&] { small.write(1); }))["tid"];
-  while (tid < small.newest()) tid = Json::parse(echo.line())["tid"];
+  while (tid < small.newest_tid()) tid = Json::parse(echo.line())["tid"];
   echo.stop();
   for (int i = 0; i < 100; ++i) small.write(2);
   echo.signal(SIGCONT);
   const Json line = Json::parse(echo.line());
   // A ring of 4 slots keeps 3 readable.
-  EXPECT_EQ(line["tid"].get<std::int64_t>(), small.newest() - 2);
+  EXPECT_EQ(line["tid"].get<std::int64_t>(), small.newest_tid() - 2);
   EXPECT_EQ(line["lost"], 97);
   EXPECT_EQ(Json::parse(echo.line())["lost"], 0);
 }
@@ -175,8 +175,8 @@ TEST_F(Echo, AwaitsAStreamAndShowsItFromItsFirstSample) {
   for (int attempt = 0; attempt < 20 && !from_the_first; ++attempt) {
     const std::string name = "late" + std::to_string(attempt);
     Running echo(argv({"echo", name, "--wait", "60", "--count", "3", "--csv"}), environment());
-    await([&] { return session_.clients().value().size() == 2; });
-    for (int i = 0; i < 50; ++i) ASSERT_TRUE(session_.list());  // leaves it some time
+    await([&] { return session_.list_clients().value().size() == 2; });
+    for (int i = 0; i < 50; ++i) ASSERT_TRUE(session_.list_streams());  // leaves it some time
     auto late = session_.create<double>(name, depth_of(16)).value();
     for (int i = 0; i < 3; ++i) late.write(i, at_ns(i));
     EXPECT_EQ(echo.line(), "tid,time_ns,clock_error_ns,value");

@@ -24,7 +24,7 @@ class FleetTest : protected OtherHosts, public CtlTest {
   }
 
   HostInfo host(const std::string& name) {
-    for (HostInfo& host : session_.hosts().value()) {
+    for (HostInfo& host : session_.list_hosts().value()) {
       if (host.name == name) return host;
     }
     return {};

@@ -64,7 +64,7 @@ TEST_F(Hosts, GivesEachNameOnceToPrograms) {
   const std::string other_address = "localhost" + pc2_.address().substr(pc2_.address().find(':'));
   DaemonProcess pc4({"--peer", pc2_.address(), "--peer", nobody, "--peer", other_address}, "pc4");
   Session session = session_with(pc4);
-  const auto state = [&](std::size_t i) { return session.hosts().value()[i].state; };
+  const auto state = [&](std::size_t i) { return session.list_hosts().value()[i].state; };
   await([&] { return state(1) == "up" && state(2) == "down" && state(3) == "up"; });
   EXPECT_EQ(output({"--socket", pc4.socket_path(), "hosts", "--names"}), "pc4\npc2\n");
   const Json hosts = json({"--socket", pc4.socket_path(), "hosts"})["hosts"];
@@ -118,7 +118,7 @@ TEST_F(Ping, EndsWithItsSummaryOnASignal) {
 TEST_F(Ping, EndsWithoutWaitingForAnAnswer) {
   ::kill(pc2_.pid(), SIGSTOP);
   Running ping(argv({"ping", "pc2"}), environment());
-  await([&] { return session_.clients().value().size() == 2; });
+  await([&] { return session_.list_clients().value().size() == 2; });
   ping.signal(SIGINT);
   EXPECT_EQ(ping.line(), "--- pc2: asked 1, answered 0 ---");
   ping.rest();

@@ -60,7 +60,7 @@ TEST_F(Property, RefusesToReadWithoutEnd) {
 using Playback = CtlTest;
 
 TEST_F(Playback, ShowsAndTurnsTheClock) {
-  const PlaybackClock clock = session_.playback_clock().value();
+  const PlaybackClock clock = session_.open_playback_clock().value();
   EXPECT_EQ(json({"playback"})["speed"], 1.0);
   EXPECT_EQ(json({"playback", "set", "--speed", "2", "--offset", "5"})["offset_s"], 5.0);
   EXPECT_EQ(clock.setting().speed, 2);

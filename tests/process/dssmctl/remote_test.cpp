@@ -161,12 +161,12 @@ TEST_F(Remote, CreateAndRmWorkOnTheNamedHost) {
   EXPECT_EQ(json({"create", "s:2@pc2", "--size", "24", "--depth", "10"}),
             Json::parse(R"({"stream":"s:2@pc2","created":true,"payload_bytes":24,
                             "depth":10,"cycle_ns":100000000})"));
-  EXPECT_EQ(on_pc2_.info({"s", 2, ""}).value().depth, 10U);
+  EXPECT_EQ(on_pc2_.stream_info({"s", 2, ""}).value().depth, 10U);
   EXPECT_EQ(json({"create", "s:2@pc2", "--size", "24", "--depth", "99"})["created"], false);
   EXPECT_EQ(json({"ls", "--own"})["streams"].size(), 0U);
   await_streams(1);
   EXPECT_EQ(json({"rm", "s:2@pc2"})["removed"][0], "s:2@pc2");
-  EXPECT_EQ(on_pc2_.list_own().value().size(), 0U);
+  EXPECT_EQ(on_pc2_.list_own_streams().value().size(), 0U);
 }
 
 TEST_F(Remote, CreateWithoutAHostMakesAnOwnStreamWhateverOthersHave) {
@@ -250,7 +250,7 @@ TEST_F(Remote, EchoGoesOnWhenTheStreamComesBackLaterThanItsOwner) {
   const std::vector<std::byte> payload(4);
   output({"--socket", pc2_.socket_path(), "create", "s", "--size", "4", "--depth", "100"});
   Running holder(argv({"--socket", pc2_.socket_path(), "echo", "s"}), environment());
-  await([&] { return on_pc2_.info({"s", 0, ""}).value().readers == 1; });
+  await([&] { return on_pc2_.stream_info({"s", 0, ""}).value().readers == 1; });
   await_streams(1);
   Running echo(argv({"echo", "s", "--csv"}), environment());
   echo.line();  // the header
@@ -264,13 +264,13 @@ TEST_F(Remote, EchoGoesOnWhenTheStreamComesBackLaterThanItsOwner) {
   holder.stop();
   pc2_.start();
   // The mirror's, until pc2 says that there is none.
-  await([&] { return !session_.info({"s", 0, "pc2"}); });
+  await([&] { return !session_.stream_info({"s", 0, "pc2"}); });
   // Nobody sees from outside that echo has noticed; it looks every 100 ms.
   for (const MonoTime noticed = deadline_in(300ms); MonoClock::now() < noticed;) {
-    ASSERT_FALSE(session_.info({"s", 0, "pc2"}));
+    ASSERT_FALSE(session_.stream_info({"s", 0, "pc2"}));
   }
   holder.signal(SIGCONT);
-  await([&] { return on_pc2_.info({"s", 0, ""}).has_value(); });
+  await([&] { return on_pc2_.stream_info({"s", 0, ""}).has_value(); });
   const Tid last = on_pc2_.open_raw_writer({"s", 0, ""}).value().write(payload);
   while (tid < last) {
     const std::string line = echo.line();

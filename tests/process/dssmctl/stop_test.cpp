@@ -17,7 +17,7 @@ struct Stop : CtlTest {
 
   // Waits until `readers` processes read the stream, dssmctl among them.
   void await_readers(std::uint32_t readers) {
-    await([&] { return session_.info(writer_.id()).value().readers == readers; });
+    await([&] { return session_.stream_info(writer_.id()).value().readers == readers; });
   }
 };
 
@@ -37,7 +37,7 @@ TEST_F(Stop, EndsWithSuccessOnASignalWhileNothingIsWritten) {
 TEST_F(Stop, EndsWithSuccessOnASignalWhileAwaitingAStream) {
   Running running(argv({"echo", "never", "--wait", "1000"}), environment());
   // Nobody sees from outside that it waits; connected is as near as it gets.
-  await([&] { return session_.clients().value().size() == 2; });
+  await([&] { return session_.list_clients().value().size() == 2; });
   running.signal(SIGINT);
   EXPECT_EQ(running.rest(), "");
   EXPECT_EQ(running.status(), 0);

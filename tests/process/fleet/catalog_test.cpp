@@ -36,9 +36,9 @@ TEST_F(FleetCatalog, ListsOwnStreamsThenThoseOfTheOthers) {
   auto one = on1.create<double>("odometry", kHistory).value();
   for (int i = 0; i < 5; ++i) two.write(1.5, time_from_ns(1000 + i));
   await_list(on1, {"odometry:0@pc1", "lidar:0@pc2", "camera:0@pc2", "imu:0@pc3"});
-  EXPECT_EQ(names(on1.list_own().value()), Strings{"odometry:0@pc1"});
-  EXPECT_EQ(names(on2.list().value()), (Strings{"lidar:0@pc2", "camera:0@pc2"}));
-  const StreamInfo lidar = on1.list().value().at(1);
+  EXPECT_EQ(names(on1.list_own_streams().value()), Strings{"odometry:0@pc1"});
+  EXPECT_EQ(names(on2.list_streams().value()), (Strings{"lidar:0@pc2", "camera:0@pc2"}));
+  const StreamInfo lidar = on1.list_streams().value().at(1);
   EXPECT_EQ(lidar.newest, 4);
   EXPECT_EQ(to_ns(lidar.newest_time), 1004) << "as fresh as at its owner's";
   EXPECT_EQ(lidar.type, type_of<double>());
@@ -50,9 +50,9 @@ TEST_F(FleetCatalog, IsAnsweredWithWhatIsKnownWhenAHostHangs) {
   auto three = on3.create<double>("imu", kHistory).value();
   await_list(on1, {"lidar:0@pc2", "imu:0@pc3"});
   ::kill(pc2.pid(), SIGSTOP);
-  EXPECT_EQ(names(on1.list().value()), (Strings{"lidar:0@pc2", "imu:0@pc3"}));
+  EXPECT_EQ(names(on1.list_streams().value()), (Strings{"lidar:0@pc2", "imu:0@pc3"}));
   await_state(on1, pc2, "down");
-  EXPECT_EQ(names(on1.list().value()), Strings{"imu:0@pc3"});
+  EXPECT_EQ(names(on1.list_streams().value()), Strings{"imu:0@pc3"});
   ::kill(pc2.pid(), SIGCONT);
   await_list(on1, {"lidar:0@pc2", "imu:0@pc3"});
 }
@@ -92,7 +92,7 @@ TEST_F(FleetCatalog, OpensWhatANameMeans) {
     Reader<double> reader = on1.await_reader<double>(name).value();
     double sample = 0;
     SampleInfo info;
-    await([&] { return reader.latest(sample, info) == ReadStatus::ok; });
+    await([&] { return reader.read_newest(sample, info) == ReadStatus::ok; });
     return sample;
   };
   EXPECT_EQ(value("lidar"), 2) << "the only one there is";
@@ -100,7 +100,7 @@ TEST_F(FleetCatalog, OpensWhatANameMeans) {
 
   auto three = on3.create<double>("lidar", kHistory).value();
   three.write(3);
-  await([&] { return on1.list().value().size() == 2; });
+  await([&] { return on1.list_streams().value().size() == 2; });
   const auto both = on1.open_reader<double>("lidar");
   ASSERT_FALSE(both);
   EXPECT_EQ(both.error().code, Errc::conflict);
@@ -157,7 +157,7 @@ TEST_F(FleetCatalog, CarriesPropertiesInfoAndRemoval) {
   EXPECT_EQ(on1.property(there).value(), large);
   EXPECT_EQ(peer_at(on1, pc2.address()).state, "up");
 
-  const StreamInfo info = on1.info(any).value();
+  const StreamInfo info = on1.stream_info(any).value();
   EXPECT_EQ(info.id, there);
   EXPECT_EQ(info.property_bytes, large.size());
   ASSERT_EQ(info.users.size(), 1u);
@@ -166,17 +166,17 @@ TEST_F(FleetCatalog, CarriesPropertiesInfoAndRemoval) {
   {
     Reader<double> reader = on1.open_reader<double>("lidar").value();
     two.write(1);
-    await([&] { return reader.newest() == 0; });
-    const StreamInfo read = on1.info(any).value();
+    await([&] { return reader.newest_tid() == 0; });
+    const StreamInfo read = on1.stream_info(any).value();
     ASSERT_TRUE(read.mirror);
     EXPECT_EQ(read.mirror->state, "live");
     EXPECT_EQ(read.mirror->newest, 0);
     EXPECT_EQ(read.channels, 1u);
   }
   ASSERT_TRUE(on1.remove(any));
-  EXPECT_TRUE(on2.list().value().empty());
+  EXPECT_TRUE(on2.list_streams().value().empty());
   await_list(on1, {});
-  const auto gone = on1.info(there);
+  const auto gone = on1.stream_info(there);
   ASSERT_FALSE(gone) << "not even while its mirror lingers";
   EXPECT_EQ(gone.error().code, Errc::not_found);
   EXPECT_FALSE(on1.open_reader<double>("lidar"));
@@ -205,7 +205,7 @@ TEST_F(FleetCatalog, LetsReadersFollowAStreamThatMoves) {
   double sample = 0;
   SampleInfo info;
   const auto await_value = [&](double value) {
-    await([&] { return reader.latest(sample, info) == ReadStatus::ok && sample == value; });
+    await([&] { return reader.read_newest(sample, info) == ReadStatus::ok && sample == value; });
   };
   await_value(2);
   ASSERT_TRUE(on2.remove({"lidar", 0, ""}));
@@ -218,7 +218,7 @@ TEST_F(FleetCatalog, LetsReadersFollowAStreamThatMoves) {
   two_again.write(22);
   await_list(on1, {"lidar:0@pc2", "lidar:0@pc3"});
   EXPECT_EQ(particular.restarts(), 0u);
-  await([&] { return particular.latest(sample, info) == ReadStatus::ok && sample == 22; });
+  await([&] { return particular.read_newest(sample, info) == ReadStatus::ok && sample == 22; });
   pc3.kill_hard();
   await_value(22);
   auto one = on1.create<double>("lidar", kHistory).value();
@@ -236,19 +236,19 @@ TEST_F(FleetCatalog, KeepsTheMirrorOfAnOwnerThatIsAway) {
     two.write(2);
   }
   Reader<double> reader = on1.await_reader<double>("lidar").value();
-  await([&] { return reader.newest() == 0; });
+  await([&] { return reader.newest_tid() == 0; });
   pc2.kill_hard();
   await_state(on1, pc2, "down");
   for (const std::string name : {"lidar", "lidar@pc2"}) {
     const auto another = on1.open_reader<double>(name);
     ASSERT_TRUE(another) << another.error().message;
-    EXPECT_EQ(another->newest(), 0);
-    const StreamInfo info = on1.info(StreamId::parse(name).value()).value();
+    EXPECT_EQ(another->newest_tid(), 0);
+    const StreamInfo info = on1.stream_info(StreamId::parse(name).value()).value();
     ASSERT_TRUE(info.mirror);
     EXPECT_NE(info.mirror->error, "");
     EXPECT_EQ(info.newest, 0);
   }
-  EXPECT_TRUE(on1.list().value().empty()) << "it is not to be had anew";
+  EXPECT_TRUE(on1.list_streams().value().empty()) << "it is not to be had anew";
 }
 
 // Programs that start together with dssmd find what other hosts have.

@@ -18,7 +18,7 @@ namespace dssm::test {
 
 // What `session`'s dssmd says about the peer at `address`.
 inline HostInfo peer_at(Session& session, const std::string& address) {
-  for (HostInfo& host : session.hosts().value()) {
+  for (HostInfo& host : session.list_hosts().value()) {
     if (host.state != "self" && host.addresses.at(0) == address) return std::move(host);
   }
   return {};
@@ -26,7 +26,7 @@ inline HostInfo peer_at(Session& session, const std::string& address) {
 
 inline void await_up(Session& session, const std::string& host) {
   await([&] {
-    const std::vector<HostInfo> hosts = session.hosts().value();
+    const std::vector<HostInfo> hosts = session.list_hosts().value();
     return std::any_of(hosts.begin(), hosts.end(),
                        [&](const HostInfo& one) { return one.name == host && one.state == "up"; });
   });
@@ -51,7 +51,7 @@ Reader<T> open_filled(Session& session, const std::string& stream) {
     return reader.has_value();
   });
   await([&] {
-    const Result<StreamInfo> info = session.info(reader->id());
+    const Result<StreamInfo> info = session.stream_info(reader->id());
     return info && info->mirror && info->mirror->state == "live";
   });
   return *std::move(reader);
@@ -65,7 +65,7 @@ inline std::vector<std::string> names(const std::vector<StreamInfo>& streams) {
 }
 
 inline void await_list(Session& session, const std::vector<std::string>& expected) {
-  await([&] { return names(session.list().value()) == expected; });
+  await([&] { return names(session.list_streams().value()) == expected; });
 }
 
 inline constexpr History kHistory{16, std::chrono::milliseconds(10)};

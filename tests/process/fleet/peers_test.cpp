@@ -31,7 +31,7 @@ TEST(FleetPeers, ShowThemselvesWithVersionAndRoundTrip) {
   const DaemonProcess pc1({"--peer", pc2.address()});
   Session session = connect(pc1);
   await([&] { return peer_at(session, pc2.address()).round_trip > 0ns; });
-  const std::vector<HostInfo> hosts = session.hosts().value();
+  const std::vector<HostInfo> hosts = session.list_hosts().value();
   ASSERT_EQ(hosts.size(), 2u);
   EXPECT_EQ(hosts[0].name, "pc1");
   EXPECT_EQ(hosts[0].state, "self");
@@ -41,7 +41,7 @@ TEST(FleetPeers, ShowThemselvesWithVersionAndRoundTrip) {
   EXPECT_EQ(hosts[1].state, "up");
   EXPECT_EQ(hosts[1].addresses, std::vector{pc2.address()});
   EXPECT_EQ(hosts[1].version, hosts[0].version);
-  EXPECT_LE(hosts[1].least_round_trip, hosts[1].round_trip);
+  EXPECT_LE(hosts[1].min_round_trip, hosts[1].round_trip);
   EXPECT_FALSE(hosts[1].insecure) << "it does not leave this PC";
   EXPECT_EQ(hosts[1].error, "");
 }
@@ -54,10 +54,10 @@ TEST(FleetPeers, AreDownWhenKilledAndComeBackByThemselves) {
   const std::uint64_t incarnation = kept.incarnation();
   for (int round = 0; round < 3; ++round) {
     await_list(on1, {"kept:0@pc2"});
-    EXPECT_EQ(on1.list().value()[0].incarnation, incarnation) << "given back by its writer";
+    EXPECT_EQ(on1.list_streams().value()[0].incarnation, incarnation) << "given back by its writer";
     pc2.kill_hard();
     await_state(on1, pc2, "down");
-    EXPECT_TRUE(on1.list().value().empty());
+    EXPECT_TRUE(on1.list_streams().value().empty());
     const HostInfo down = peer_at(on1, pc2.address());
     EXPECT_EQ(down.name, "pc2") << "who it was";
     EXPECT_NE(down.error, "");
@@ -74,7 +74,7 @@ TEST(FleetPeers, AreDownWhenTheyHangAndComeBackWhenTheyGoOn) {
   ::kill(pc2.pid(), SIGSTOP);
   await_state(on1, pc2, "down");
   EXPECT_NE(peer_at(on1, pc2.address()).error, "");
-  EXPECT_TRUE(on1.list().value().empty());
+  EXPECT_TRUE(on1.list_streams().value().empty());
   ::kill(pc2.pid(), SIGCONT);
   await_list(on1, {"kept:0@pc2"});
 }
@@ -107,9 +107,9 @@ TEST(FleetPeers, MayBeOneself) {
   const DaemonProcess pc1({"--listen", address, "--peer", address});
   Session session = connect(pc1);
   auto writer = session.create<double>("lidar", kHistory).value();
-  await([&] { return session.hosts().value()[1].state == "self"; });
-  EXPECT_EQ(names(session.list().value()), std::vector<std::string>{"lidar:0@pc1"});
-  EXPECT_EQ(session.hosts().value()[0].error, "");
+  await([&] { return session.list_hosts().value()[1].state == "self"; });
+  EXPECT_EQ(names(session.list_streams().value()), std::vector<std::string>{"lidar:0@pc1"});
+  EXPECT_EQ(session.list_hosts().value()[0].error, "");
 }
 
 TEST(FleetPeers, AreOneHostAtTwoAddresses) {
@@ -139,7 +139,7 @@ TEST(FleetPeers, WithTheSameNameAreWarnedOf) {
   EXPECT_NE(peer_at(on1, namesake.address()).error.find("this host's name 'pc1'"),
             std::string::npos)
       << peer_at(on1, namesake.address()).error;
-  EXPECT_EQ(on1.hosts().value()[0].error, peer_at(on1, namesake.address()).error);
+  EXPECT_EQ(on1.list_hosts().value()[0].error, peer_at(on1, namesake.address()).error);
 }
 
 }  // namespace

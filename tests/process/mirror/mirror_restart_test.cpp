@@ -30,7 +30,7 @@ TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonIsKilledUnderLoad) {
     written = writing.stop();
   }
   reading.await_taken(written);
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.lost_samples(), 0u);
   EXPECT_EQ(reader.restarts(), 0u) << "the ring is the same";
   EXPECT_EQ(mirror("load").gap_samples, 0u);
   EXPECT_EQ(mirror("load").reconnects, 5u);
@@ -56,7 +56,7 @@ TEST_F(TwoHosts, LoseNothingWhenTheMirrorsDaemonIsKilledUnderLoad) {
   }
   reading.await_taken(written);
   reading_too.await_taken(written);
-  EXPECT_EQ(reader.lost() + second.lost(), 0u);
+  EXPECT_EQ(reader.lost_samples() + second.lost_samples(), 0u);
   EXPECT_EQ(reader.restarts() + second.restarts(), 0u);
   // One mirror serves them both, and new ones.
   auto later = open_filled<Counted>(there, "load");
@@ -80,7 +80,7 @@ TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonHangs) {
   await([&] { return mirror("load").state == "live"; });
   EXPECT_EQ(mirror("load").error, "");
   reading.await_taken(writing.stop());
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
 TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsAway) {
@@ -94,7 +94,7 @@ TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsAway) {
   Counted sample{};
   SampleInfo info;
   for (Tid tid = 0; tid < 100; ++tid) {
-    ASSERT_EQ(joined->tid(tid, sample, info), ReadStatus::ok);
+    ASSERT_EQ(joined->read_tid(tid, sample, info), ReadStatus::ok);
     EXPECT_EQ(sample.number, tid);
   }
 }
@@ -108,7 +108,7 @@ TEST_F(TwoHosts, CountExactlyWhatTheOwnersRingLostMeanwhile) {
   for (int i = 0; i < 10; ++i) writer.write(counted(i));
   for (int i = 0; i < 10; ++i) {
     ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
-    ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok);
   }
   pc1.kill_hard();
   await([&] { return mirror("short").state == "owner away"; });
@@ -117,13 +117,13 @@ TEST_F(TwoHosts, CountExactlyWhatTheOwnersRingLostMeanwhile) {
   pc1.start();
   for (Tid tid = oldest; tid < 1000; ++tid) {
     ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
-    ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok);
     ASSERT_EQ(info.tid, tid);
     EXPECT_EQ(sample.number, tid);
   }
-  EXPECT_EQ(reader.lost(), static_cast<std::uint64_t>(oldest) - 10);
+  EXPECT_EQ(reader.lost_samples(), static_cast<std::uint64_t>(oldest) - 10);
   EXPECT_EQ(mirror("short").gap_samples, static_cast<std::uint64_t>(oldest) - 10);
-  EXPECT_EQ(reader.oldest(), oldest);
+  EXPECT_EQ(reader.oldest_tid(), oldest);
 }
 
 // Its rings died with it: nobody held them.
@@ -145,14 +145,14 @@ TEST_F(TwoHosts, TellReadersThatTheOwnerCameBackWithoutItsRing) {
   Counted sample{};
   SampleInfo info;
   for (int i = 0; i < 10; ++i) {
-    ASSERT_EQ(reader.next(sample, info), ReadStatus::ok) << "first what the old ring held";
+    ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok) << "first what the old ring held";
     EXPECT_EQ(sample.number, i);
   }
   ReadStatus status = ReadStatus::not_yet;
-  await([&] { return (status = reader.next(sample, info)) != ReadStatus::not_yet; });
+  await([&] { return (status = reader.read_next(sample, info)) != ReadStatus::not_yet; });
   EXPECT_EQ(status, ReadStatus::restarted);
   ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
-  ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 0);
   EXPECT_EQ(sample.number, 100);
   EXPECT_EQ(reader.incarnation(), writer.incarnation());
@@ -176,7 +176,7 @@ TEST_F(TwoHosts, FindEachOtherAgainWhenBothDaemonsAreKilled) {
     reading.await_taken(writing.written());
   }
   reading.await_taken(writing.stop());
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.lost_samples(), 0u);
   EXPECT_EQ(reader.restarts(), 0u);
 }
 

@@ -19,12 +19,12 @@ TEST_F(TwoHosts, ReadTheHistoryFromBeforeTheReaderCame) {
   EXPECT_EQ(reader.depth(), 1024u);
   EXPECT_EQ(reader.cycle(), 1ms);
   EXPECT_EQ(reader.incarnation(), writer.incarnation());
-  EXPECT_EQ(reader.newest(), 2999);
-  EXPECT_EQ(reader.oldest(), here.open_reader<Counted>("odometry").value().oldest());
-  for (Tid tid = reader.oldest(); tid <= reader.newest(); ++tid) {
+  EXPECT_EQ(reader.newest_tid(), 2999);
+  EXPECT_EQ(reader.oldest_tid(), here.open_reader<Counted>("odometry").value().oldest_tid());
+  for (Tid tid = reader.oldest_tid(); tid <= reader.newest_tid(); ++tid) {
     Counted sample{};
     SampleInfo info;
-    ASSERT_EQ(reader.tid(tid, sample, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_tid(tid, sample, info), ReadStatus::ok);
     EXPECT_EQ(sample.number, tid);
     EXPECT_TRUE(is_whole(sample));
     EXPECT_EQ(to_ns(info.time), 1000 * tid);
@@ -53,8 +53,8 @@ TEST_F(TwoHosts, AnswerReadsByTimeAsTheOwnerDoes) {
       const Time t = time_from_ns(time - 3000 + static_cast<std::int64_t>(random() % 4000));
       Counted there_sample{}, here_sample{};
       SampleInfo there_info, here_info;
-      const ReadStatus status = owned.at(t, here_sample, here_info);
-      ASSERT_EQ(mirrored.at(t, there_sample, there_info), status);
+      const ReadStatus status = owned.read_at(t, here_sample, here_info);
+      ASSERT_EQ(mirrored.read_at(t, there_sample, there_info), status);
       if (status != ReadStatus::ok) continue;
       ASSERT_EQ(there_info.tid, here_info.tid);
       ASSERT_EQ(there_info.time, here_info.time);
@@ -81,7 +81,7 @@ TEST_F(TwoHosts, ShareOneChannelAmongAllReaders) {
 TEST_F(TwoHosts, ReadAnEmptyStreamFromItsFirstSampleOn) {
   auto writer = here.create<Counted>("later", History{64, 1ms}).value();
   auto reader = open_filled<Counted>(there, "later");
-  EXPECT_EQ(reader.newest(), kNoTid);
+  EXPECT_EQ(reader.newest_tid(), kNoTid);
   EXPECT_EQ(mirror("later").state, "live");
   writer.write(counted(0));
   EXPECT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
@@ -94,15 +94,15 @@ class LingeringHosts : public TwoHosts {
 
 TEST_F(LingeringHosts, CloseTheChannelAfterTheLastReaderLeft) {
   auto writer = here.create<Counted>("imu", History{64, 1ms}).value();
-  const std::uint64_t memory = there.daemon().value().memory_bytes;
+  const std::uint64_t memory = there.daemon_info().value().memory_bytes;
   for (int round = 0; round < 3; ++round) {
     {
       auto reader = open_filled<Counted>(there, "imu");
       EXPECT_EQ(channels("imu"), 1u);
-      EXPECT_GT(there.daemon().value().memory_bytes, memory);
+      EXPECT_GT(there.daemon_info().value().memory_bytes, memory);
     }
     await([&] { return channels("imu") == 0; });
-    await([&] { return there.daemon().value().memory_bytes == memory; });
+    await([&] { return there.daemon_info().value().memory_bytes == memory; });
   }
 }
 
@@ -128,7 +128,7 @@ TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
   ASSERT_TRUE(here.remove({"anew", 0, ""}));
   // The owner is asked, and says so.
   await([&] {
-    const auto info = there.info({"anew", 0, "pc1"});
+    const auto info = there.stream_info({"anew", 0, "pc1"});
     return !info && info.error().code == Errc::not_found;
   });
   const auto none = there.open_reader<Counted>("anew@pc1");
@@ -137,17 +137,17 @@ TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
   Counted sample{};
   SampleInfo info;
   for (int i = 0; i < 5; ++i) {
-    ASSERT_EQ(reader.next(sample, info), ReadStatus::ok) << "what it had is still there";
+    ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok) << "what it had is still there";
     EXPECT_EQ(sample.number, i);
   }
-  EXPECT_EQ(reader.next(sample, info), ReadStatus::not_yet);
+  EXPECT_EQ(reader.read_next(sample, info), ReadStatus::not_yet);
   writer = here.create<Counted>("anew", History{64, 1ms}).value();
   writer->write(counted(100));
   ReadStatus status = ReadStatus::not_yet;
-  await([&] { return (status = reader.next(sample, info)) != ReadStatus::not_yet; });
+  await([&] { return (status = reader.read_next(sample, info)) != ReadStatus::not_yet; });
   EXPECT_EQ(status, ReadStatus::restarted);
   ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
-  ASSERT_EQ(reader.next(sample, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok);
   EXPECT_EQ(info.tid, 0);
   EXPECT_EQ(sample.number, 100);
   EXPECT_EQ(mirror("anew").restarts, 1u);
@@ -169,7 +169,7 @@ TEST_F(TwoHosts, CarryTheLargestSamples) {
     ASSERT_EQ(writer.write(payload, time_from_ns(1)), static_cast<Tid>(tid));
     ASSERT_EQ(reader.wait_for_tid(static_cast<Tid>(tid), kNever), WaitStatus::ready);
     SampleInfo info;
-    ASSERT_EQ(reader.tid(static_cast<Tid>(tid), got, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_tid(static_cast<Tid>(tid), got, info), ReadStatus::ok);
     ASSERT_TRUE(got == payload);
   }
   EXPECT_EQ(mirror("camera").gap_samples, 0u);
@@ -188,7 +188,7 @@ TEST_F(TwoHosts, CarrySamplesOfOneByteAtRate) {
     std::byte byte{};
     SampleInfo info;
     ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
-    ASSERT_EQ(reader.next({&byte, 1}, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_next({&byte, 1}, info), ReadStatus::ok);
     ASSERT_EQ(info.tid, tid);
     ASSERT_EQ(byte, static_cast<std::byte>(tid * 7));
   }

@@ -26,12 +26,12 @@ TEST_F(RemoteWriter, CreatesTheStreamAndWritesWithTheOwnersTids) {
     ASSERT_EQ(reader.wait_for_tid(i, kNever), WaitStatus::ready);
     Counted sample{};
     SampleInfo info;
-    ASSERT_EQ(reader.tid(i, sample, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_tid(i, sample, info), ReadStatus::ok);
     EXPECT_EQ(sample.number, i);
     EXPECT_EQ(to_ns(info.time), i);
     EXPECT_EQ(to_ns(info.clock_error), 2 * i);
   }
-  EXPECT_EQ(names(there.list_own().value()), std::vector<std::string>{});
+  EXPECT_EQ(names(there.list_own_streams().value()), std::vector<std::string>{});
 }
 
 TEST_F(RemoteWriter, GoesOnWithTheTidsOfAStreamThatIsThere) {
@@ -64,7 +64,7 @@ TEST_F(RemoteWriter, IsRefusedInWords) {
   const auto nowhere = there.create<Counted>("goal@pc9", kLong);
   ASSERT_FALSE(nowhere);
   EXPECT_EQ(nowhere.error().code, Errc::not_found);
-  EXPECT_EQ(there.daemon().value().memory_bytes, 0u);
+  EXPECT_EQ(there.daemon_info().value().memory_bytes, 0u);
 }
 
 TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonWasKilled) {
@@ -80,8 +80,8 @@ TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonWasKilled) {
     reading.await_taken(writing.written());
   }
   reading.await_taken(writing.stop());
-  EXPECT_EQ(reader.newest(), writing.written() - 1) << "none twice";
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.newest_tid(), writing.written() - 1) << "none twice";
+  EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
 // Much more is under way, and written, than was acknowledged.
@@ -94,15 +94,15 @@ TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonIsKilledInTheMidstOfABacklog) {
   for (int round = 0; round < 5; ++round) {
     ::kill(pc1.pid(), SIGSTOP);
     for (std::int64_t i = 0; i < kBacklog; ++i) writer.write(counted(written++));
-    const Tid before = reader.newest();
+    const Tid before = reader.newest_tid();
     ::kill(pc1.pid(), SIGCONT);
-    await([&] { return reader.newest() > before + 1000 * (round + 1); });
+    await([&] { return reader.newest_tid() > before + 1000 * (round + 1); });
     pc1.kill_hard();
     pc1.start();
     reading.await_taken(written);
   }
-  EXPECT_EQ(reader.newest(), written - 1) << "none twice";
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.newest_tid(), written - 1) << "none twice";
+  EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
 TEST_F(RemoteWriter, CatchesUpWhenItsOwnDaemonWasKilled) {
@@ -118,8 +118,8 @@ TEST_F(RemoteWriter, CatchesUpWhenItsOwnDaemonWasKilled) {
     reading.await_taken(writing.written());
   }
   reading.await_taken(writing.stop());
-  EXPECT_EQ(reader.newest(), writing.written() - 1);
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.newest_tid(), writing.written() - 1);
+  EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
 TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonHangs) {
@@ -133,13 +133,13 @@ TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonHangs) {
   ::kill(pc1.pid(), SIGCONT);
   reading.await_taken(writing.written() + 100);
   reading.await_taken(writing.stop());
-  EXPECT_EQ(reader.newest(), writing.written() - 1);
+  EXPECT_EQ(reader.newest_tid(), writing.written() - 1);
 }
 
 TEST_F(RemoteWriter, CreatesTheStreamAgainWhenTheOwnerLostIt) {
   auto writer = there.create<Counted>("goal@pc1", kLong).value();
   writer.write(counted(0));
-  await([&] { return here.info({"goal", 0, ""}).value().newest == 0; });
+  await([&] { return here.stream_info({"goal", 0, ""}).value().newest == 0; });
   pc1.kill_hard();
   pc1.start();
   writer.write(counted(1));
@@ -147,7 +147,7 @@ TEST_F(RemoteWriter, CreatesTheStreamAgainWhenTheOwnerLostIt) {
   ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
   Counted sample{};
   SampleInfo info;
-  ASSERT_EQ(reader.latest(sample, info), ReadStatus::ok);
+  ASSERT_EQ(reader.read_newest(sample, info), ReadStatus::ok);
   EXPECT_EQ(sample.number, 1);
 }
 
@@ -161,8 +161,8 @@ TEST_F(RemoteWriter, PublishesTheRestAfterItsProgramHasGone) {
   auto reader = here.open_reader<Counted>("goal").value();
   Reading reading(reader);
   reading.await_taken(1000);
-  await([&] { return there.daemon().value().memory_bytes == 0; });
-  EXPECT_EQ(reader.newest(), 999);
+  await([&] { return there.daemon_info().value().memory_bytes == 0; });
+  EXPECT_EQ(reader.newest_tid(), 999);
 }
 
 TEST_F(RemoteWriter, CarriesLargeSamples) {
@@ -175,7 +175,7 @@ TEST_F(RemoteWriter, CarriesLargeSamples) {
     ASSERT_EQ(writer.write(payload, time_from_ns(1)), tid);
     ASSERT_EQ(reader.wait_for_tid(tid, kNever), WaitStatus::ready);
     SampleInfo info;
-    ASSERT_EQ(reader.tid(tid, got, info), ReadStatus::ok);
+    ASSERT_EQ(reader.read_tid(tid, got, info), ReadStatus::ok);
     ASSERT_TRUE(got == payload);
   }
 }

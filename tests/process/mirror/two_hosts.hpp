@@ -50,11 +50,11 @@ class TwoHosts : public testing::Test {
 
   // What pc2 says about its copy of `name`, a stream of pc1.
   MirrorInfo mirror(const std::string& name) {
-    const auto info = there.info({name, 0, "pc1"});
+    const auto info = there.stream_info({name, 0, "pc1"});
     return info && info->mirror ? *info->mirror : MirrorInfo{};
   }
   std::uint32_t channels(const std::string& name) {
-    return here.info({name, 0, ""}).value().channels;
+    return here.stream_info({name, 0, ""}).value().channels;
   }
 
   const std::string linger_;
@@ -119,7 +119,7 @@ class Reading {
     SampleInfo info;
     while (!done_) {
       if (reader_.wait(deadline_in(50ms)) != WaitStatus::ready) continue;
-      if (reader_.next(sample, info) != ReadStatus::ok) continue;
+      if (reader_.read_next(sample, info) != ReadStatus::ok) continue;
       if (!wrong_) check(sample, info);
       ++taken_;
     }

@@ -31,7 +31,7 @@ struct Watched {
   std::vector<std::byte> scratch = std::vector<std::byte>(known.payload_bytes);
 
   void write_next() {
-    const SampleInfo info = known.info(writer.newest() + 1);
+    const SampleInfo info = known.info(writer.newest_tid() + 1);
     known.fill(scratch, 1, info.tid);
     ASSERT_EQ(writer.write(scratch, info.time, info.clock_error), info.tid);
   }
@@ -46,7 +46,7 @@ class Equality : public NetworkTest {
                        percent_of_reads,
                        sessions[0].create_raw(known.id, known.type(), known.history()).value(),
                        {}});
-    while (streams.back().writer.newest() + 1 < history) streams.back().write_next();
+    while (streams.back().writer.newest_tid() + 1 < history) streams.back().write_next();
   }
 
   // Reads by `read(reader, payload, info)` on all hosts, and compares. True if all reads were ok; while
@@ -61,7 +61,7 @@ class Equality : public NetworkTest {
     }
     for (std::size_t host = 1; host < kHosts; ++host) {
       if (paused) {
-        EXPECT_EQ(status_name(statuses[host]), status_name(statuses[0]));
+        EXPECT_EQ(name_of(statuses[host]), name_of(statuses[0]));
       }
       if (statuses[host] != ReadStatus::ok || statuses[0] != ReadStatus::ok) return false;
       EXPECT_EQ(infos[host].tid, infos[0].tid);
@@ -83,23 +83,23 @@ class Equality : public NetworkTest {
   // Waits until all mirrors have the owner's newest sample.
   void await_mirrors(Watched& stream) {
     for (RawReader& reader : stream.readers) {
-      ASSERT_EQ(reader.wait_for_tid(stream.writer.newest(), kNever), WaitStatus::ready);
-      EXPECT_EQ(reader.newest(), stream.writer.newest());
-      EXPECT_EQ(reader.oldest(), stream.readers[0].oldest()) << "not the same window";
+      ASSERT_EQ(reader.wait_for_tid(stream.writer.newest_tid(), kNever), WaitStatus::ready);
+      EXPECT_EQ(reader.newest_tid(), stream.writer.newest_tid());
+      EXPECT_EQ(reader.oldest_tid(), stream.readers[0].oldest_tid()) << "not the same window";
     }
   }
 
   void compare_by_time_in_a_pause(Watched& stream, int reads) {
     await_mirrors(stream);
     for (int i = 0; i < reads && !HasFailure(); ++i) {
-      const Tid oldest = stream.readers[0].oldest();
+      const Tid oldest = stream.readers[0].oldest_tid();
       // A third of the reads are of samples from before the first read.
-      const Tid newest = i % 3 == 0 ? stream.history - 1 : stream.writer.newest();
+      const Tid newest = i % 3 == 0 ? stream.history - 1 : stream.writer.newest_tid();
       const Time t = random_time(stream, std::min(oldest, newest), newest);
       compare(
           stream,
           [&](RawReader& reader, auto& payload, SampleInfo& info) {
-            return reader.at(t, payload, info);
+            return reader.read_at(t, payload, info);
           },
           true);
     }
@@ -109,26 +109,27 @@ class Equality : public NetworkTest {
   void compare_while_written(const std::atomic<bool>& done) {
     while (!done && !HasFailure()) {
       for (Watched& stream : streams) {
-        std::uniform_int_distribution<Tid> tids(stream.readers[0].oldest(),
-                                                stream.readers[kHosts - 1].newest());
+        std::uniform_int_distribution<Tid> tids(stream.readers[0].oldest_tid(),
+                                                stream.readers[kHosts - 1].newest_tid());
         const Tid tid = tids(random);
         compared_while_written += compare(
             stream,
             [&](RawReader& reader, auto& payload, SampleInfo& info) {
-              return reader.tid(tid, payload, info);
+              return reader.read_tid(tid, payload, info);
             },
             false);
         if (stream.known.jitter >= stream.known.cycle / 2) continue;
         // Up to the newest sample that all hosts have, the answer is final. Any mirror may be older,
         // also than `tid`.
-        Tid newest = stream.readers[0].newest();
-        for (const RawReader& reader : stream.readers) newest = std::min(newest, reader.newest());
+        Tid newest = stream.readers[0].newest_tid();
+        for (const RawReader& reader : stream.readers)
+          newest = std::min(newest, reader.newest_tid());
         const Time t = std::min(random_time(stream, std::min(tid, newest), newest),
                                 stream.known.info(newest).time);
         compared_while_written += compare(
             stream,
             [&](RawReader& reader, auto& payload, SampleInfo& info) {
-              return reader.at(t, payload, info);
+              return reader.read_at(t, payload, info);
             },
             false);
       }
@@ -175,10 +176,11 @@ TEST_F(Equality, MirrorsAnswerEveryReadAsTheOwnerDoes) {
   }
   EXPECT_GT(compared_while_written, 0u);
   for (Watched& stream : streams) {
-    EXPECT_EQ(stream.readers[0].oldest(), 0) << "the samples from before the readers are missing";
+    EXPECT_EQ(stream.readers[0].oldest_tid(), 0)
+        << "the samples from before the readers are missing";
     // The writer laps the ring at full speed; afterwards the same samples remain on all hosts.
     for (std::uint64_t i = 0; i < 2 * stream.known.depth; ++i) stream.write_next();
-    stream.history = stream.writer.newest();
+    stream.history = stream.writer.newest_tid();
     compare_by_time_in_a_pause(stream, 1000);
     for (RawReader& reader : stream.readers) EXPECT_EQ(reader.restarts(), 0u);
   }

@@ -58,7 +58,7 @@ std::string dssmd_address(int host, IpVersion version) {
 }
 
 HostInfo host_info(Session& session, const std::string& name) {
-  for (HostInfo& host : session.hosts().value()) {
+  for (HostInfo& host : session.list_hosts().value()) {
     if (host.name == name) return host;
   }
   return {};

@@ -20,12 +20,12 @@ Follower::Follower(const KnownStream& known, PConnector connector, std::optional
       payload_(known.payload_bytes) {}
 
 std::uint64_t Follower::lost() const {
-  return std::visit([](const auto& source) { return source.lost(); }, source_);
+  return std::visit([](const auto& source) { return source.lost_samples(); }, source_);
 }
 
 ReadStatus Follower::next(SampleInfo& info) {
-  if (auto* reader = std::get_if<RawReader>(&source_)) return reader->next(payload_, info);
-  const Result<ReadStatus> status = connector().next(payload_, info);
+  if (auto* reader = std::get_if<RawReader>(&source_)) return reader->read_next(payload_, info);
+  const Result<ReadStatus> status = connector().read_next(payload_, info);
   return status ? *status : ReadStatus::not_yet;  // unavailable: the next call tries again
 }
 
@@ -84,9 +84,10 @@ void Follower::check(const SampleInfo& info) {
           " are missing, and " + std::to_string(counted) + " were counted");
   }
   // Queried after the loss: the samples of the ring now were in it when they were counted as lost.
-  if (left_out > 0 && owner_ && owner_->oldest() < info.tid) {
+  if (left_out > 0 && owner_ && owner_->oldest_tid() < info.tid) {
     fault("tids " + std::to_string(last_ + 1) + " to " + std::to_string(info.tid - 1) +
-          " were lost, and the owner's ring holds those from " + std::to_string(owner_->oldest()));
+          " were lost, and the owner's ring holds those from " +
+          std::to_string(owner_->oldest_tid()));
   }
   last_ = info.tid;
   lost_ += left_out;

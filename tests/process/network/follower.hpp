@@ -33,7 +33,7 @@ class Follower {
   PConnector& connector() { return std::get<PConnector>(source_); }
   const KnownStream& known() const { return known_; }
   // The newest sample of the owner's ring has been taken.
-  bool has_all() const { return owner_ && last_ == owner_->newest(); }
+  bool has_all() const { return owner_ && last_ == owner_->newest_tid(); }
 
   Tid first() const { return first_; }  // the first available one of the last ring
   Tid last() const { return last_; }

@@ -26,7 +26,7 @@ class Hosts : public NetworkTest {
   }
 
   static bool lists(Session& session, const std::string& stream) {
-    for (const StreamInfo& each : session.list().value()) {
+    for (const StreamInfo& each : session.list_streams().value()) {
       if (each.id.name == stream) return true;
     }
     return false;
@@ -42,8 +42,8 @@ class Hosts : public NetworkTest {
 
   static void write_until(RawWriter& writer, const KnownStream& known, Tid last) {
     std::vector<std::byte> payload(known.payload_bytes);
-    while (writer.newest() < last) {
-      const SampleInfo info = known.info(writer.newest() + 1);
+    while (writer.newest_tid() < last) {
+      const SampleInfo info = known.info(writer.newest_tid() + 1);
       known.fill(payload, 1, info.tid);
       ASSERT_EQ(writer.write(payload, info.time, info.clock_error), info.tid);
     }
@@ -55,7 +55,7 @@ class Hosts : public NetworkTest {
     SampleInfo info;
     for (Tid tid = first; tid <= last; ++tid) {
       ASSERT_EQ(reader.wait_for_tid(tid, kNever), WaitStatus::ready);
-      ASSERT_EQ(reader.next(payload, info), ReadStatus::ok);
+      ASSERT_EQ(reader.read_next(payload, info), ReadStatus::ok);
       ASSERT_EQ(info.tid, tid);
       ASSERT_EQ(known.fault(payload, info, 1), "");
     }
@@ -113,14 +113,14 @@ TEST_F(Hosts, MirrorsResumeAtTheirTidAfterACut) {
     fleet->network().heal(1);
     expect_samples(reader, known, last - 999, last);
   }
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.lost_samples(), 0u);
   EXPECT_EQ(reader.restarts(), 0u);
   await_up(there, 1);
-  const StreamInfo info = there.info(known.id).value();
+  const StreamInfo info = there.stream_info(known.id).value();
   ASSERT_TRUE(info.mirror);
   EXPECT_EQ(info.mirror->gap_samples, 0u);
   EXPECT_GE(info.mirror->reconnects, 3u);
-  EXPECT_EQ(info.mirror->newest, writer.newest());
+  EXPECT_EQ(info.mirror->newest, writer.newest_tid());
   EXPECT_EQ(info.mirror->received_samples, 3100u) << "not each came once";
 }
 
@@ -142,7 +142,7 @@ TEST_F(Hosts, MirrorsResumeAtTheirTidAfterADssmdWasKilled) {
     expect_samples(reader, known, last + 1, last + 900);
     last += 900;
   }
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.lost_samples(), 0u);
   EXPECT_EQ(reader.restarts(), 0u);
 }
 
@@ -160,7 +160,7 @@ TEST_F(Hosts, ShortCutsLoseNothing) {
     fleet->network().heal(1);
     expect_samples(reader, known, 100 * round, 100 * round + 99);
   }
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
 TEST_F(Hosts, GapsAfterACutAreCountedExactly) {
@@ -179,8 +179,8 @@ TEST_F(Hosts, GapsAfterACutAreCountedExactly) {
   // 64 slots hold 63 samples: 937 to 999; 10 to 936 are lost.
   ASSERT_EQ(reader.wait_for_tid(999, kNever), WaitStatus::ready);
   expect_samples(reader, known, 937, 999);
-  EXPECT_EQ(reader.lost(), 927u);
-  EXPECT_EQ(there.info(known.id).value().mirror->gap_samples, 927u);
+  EXPECT_EQ(reader.lost_samples(), 927u);
+  EXPECT_EQ(there.stream_info(known.id).value().mirror->gap_samples, 927u);
 }
 
 // A network that carries a third of a stream: gaps are counted, and other streams do not suffer.
@@ -232,7 +232,7 @@ TEST_F(Hosts, WithALongDelayLoseNothing) {
     write_until(writer, known, last);
     expect_samples(reader, known, last - 99, last);
   }
-  EXPECT_EQ(reader.lost(), 0u);
+  EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
 TEST_F(Hosts, StreamsOfOneNameDifferByHost) {
@@ -249,7 +249,7 @@ TEST_F(Hosts, StreamsOfOneNameDifferByHost) {
     std::vector<std::byte> payload(8);
     SampleInfo info;
     if (!reader) return 100;
-    EXPECT_EQ(reader->latest(payload, info), ReadStatus::ok);
+    EXPECT_EQ(reader->read_newest(payload, info), ReadStatus::ok);
     return static_cast<int>(payload[0]);
   };
   for (int host = 1; host <= 2; ++host) {
@@ -284,7 +284,7 @@ TEST_F(Hosts, FindAStreamThatMovedToAnotherHost) {
   ReadStatus status = ReadStatus::not_yet;
   while (status == ReadStatus::not_yet) {
     (void)reader.wait(kNever);
-    status = reader.next(payload, info);
+    status = reader.read_next(payload, info);
   }
   ASSERT_EQ(status, ReadStatus::restarted);
   EXPECT_EQ(reader.id().host, "pc2");
@@ -338,7 +338,7 @@ TEST_F(Hosts, ReportThatAPeerOfALaterVersionWasRefused) {
   Session session = connect_to(dssmd.socket_path());
   HostInfo refused;
   await("the other host is refused", [&] {
-    for (HostInfo& host : session.hosts().value()) {
+    for (HostInfo& host : session.list_hosts().value()) {
       if (host.state == "refused") refused = host;
     }
     return refused.state == "refused";

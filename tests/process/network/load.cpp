@@ -28,7 +28,7 @@ std::uint64_t life_of(Session& session, const KnownStream& known) {
   RawReader reader = session.open_raw_reader(known.id).value();
   std::vector<std::byte> payload(known.payload_bytes);
   SampleInfo info;
-  while (reader.latest(payload, info) != ReadStatus::ok) continue;  // not lapped forever
+  while (reader.read_newest(payload, info) != ReadStatus::ok) continue;  // not lapped forever
   return KnownStream::life(payload);
 }
 
@@ -53,7 +53,7 @@ LoadWriter::LoadWriter(Session session, const std::vector<KnownStream>& streams,
                        std::uint64_t life) {
   for (const KnownStream& known : streams) {
     RawWriter writer = session.create_raw(known.id, known.type(), known.history()).value();
-    const bool begins = writer.newest() == kNoTid;
+    const bool begins = writer.newest_tid() == kNoTid;
     streams_.push_back({known, std::move(writer), begins ? life : life_of(session, known)});
   }
 }
@@ -71,8 +71,8 @@ void LoadWriter::write_until(const std::atomic<bool>& stop) {
 }
 
 void LoadWriter::Written::write_next() {
-  const SampleInfo info = known.info(writer.newest() + 1);
-  Loan loan = writer.loan();
+  const SampleInfo info = known.info(writer.newest_tid() + 1);
+  LoanedSample loan = writer.loan();
   known.fill(loan.payload(), life, info.tid);
   loan.publish(info.time, info.clock_error);
   ++written;

@@ -26,7 +26,7 @@ class LoadWriter {
   void write_until(const std::atomic<bool>& stop);
 
   // `stream` is an index into the list.
-  Tid newest(std::size_t stream) const { return streams_[stream].writer.newest(); }
+  Tid newest(std::size_t stream) const { return streams_[stream].writer.newest_tid(); }
 
  private:
   struct Written {

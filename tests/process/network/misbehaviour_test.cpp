@@ -184,7 +184,7 @@ TEST_F(Misbehaviour, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
   for (std::size_t i = 0; i < lazy.size(); ++i) {
     Tid next = 0;
     std::uint64_t samples = 0;
-    const Tid enough = i % 2 == 0 ? large.newest() : 2000;
+    const Tid enough = i % 2 == 0 ? large.newest_tid() : 2000;
     while (next <= enough) {
       const std::optional<net::Frame> frame = lazy[i].receive();
       if (!frame && MonoClock::now() - begun > 29s) break;

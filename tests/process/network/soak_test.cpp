@@ -89,7 +89,8 @@ class Soak : public NetworkTest {
   void read_on(std::vector<Follower>& connected) {
     for (bool all_done = false; !all_done && !give_up;) {
       std::vector<pollfd> fds;
-      for (Follower& follower : connected) fds.push_back({follower.connector().fd(), POLLIN, 0});
+      for (Follower& follower : connected)
+        fds.push_back({follower.connector().ready_fd(), POLLIN, 0});
       ::poll(fds.data(), fds.size(), 20);
       all_done = finishing;
       for (Follower& follower : connected) {
@@ -184,7 +185,7 @@ class Soak : public NetworkTest {
                        std::to_string(follower.first()) + " to " + std::to_string(follower.last()) +
                        ", life " + std::to_string(follower.life()) + ", restarts " +
                        std::to_string(follower.restarts());
-    const auto info = sessions[static_cast<std::size_t>(host) - 1].info(follower.known().id);
+    const auto info = sessions[static_cast<std::size_t>(host) - 1].stream_info(follower.known().id);
     if (!info) return text + "; " + info.error().message;
     text += "; owner's newest " + std::to_string(info->newest);
     if (!info->mirror) return text;

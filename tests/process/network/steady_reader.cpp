@@ -48,7 +48,7 @@ Outcome read_mirror() {
     (void)follower.reader().wait(deadline_in(50ms));
     follower.take(1000);
   }
-  const Tid newest = session.info(known.id).value().newest;
+  const Tid newest = session.stream_info(known.id).value().newest;
   while (follower.last() < newest) {
     (void)follower.reader().wait_for_tid(newest, kNever);
     follower.take(1000);
@@ -69,7 +69,7 @@ Outcome read_by_connector(const std::string& address) {
   const auto take = [&](MonoTime deadline) {
     (void)connector.wait(deadline);
     for (;;) {
-      const Result<ReadStatus> status = connector.next(payload, info);
+      const Result<ReadStatus> status = connector.read_next(payload, info);
       if (!status || *status != ReadStatus::ok) return;  // unavailable: the next call tries again
       if (info.tid <= last) outcome.faults += "tid " + std::to_string(info.tid) + " again\n";
       last = info.tid;
@@ -80,9 +80,9 @@ Outcome read_by_connector(const std::string& address) {
   while (outcome.taken == 0) take(kNever);
   report_begin();
   while (!stdin_ended()) take(deadline_in(50ms));
-  const Tid newest = connector.newest().value();
+  const Tid newest = connector.newest_tid().value();
   while (last < newest) take(kNever);
-  outcome.lost = connector.lost();
+  outcome.lost = connector.lost_samples();
   if (outcome.taken + outcome.lost != static_cast<std::uint64_t>(last) + 1) {
     outcome.faults += std::to_string(outcome.taken) + " taken and " + std::to_string(outcome.lost) +
                       " lost up to tid " + std::to_string(last) + "\n";

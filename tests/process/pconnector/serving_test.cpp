@@ -78,7 +78,7 @@ void expect_is(const Sample& sample, const SampleInfo& info, Tid tid) {
 ReadStatus await_next(PConnector& con, Sample& sample, SampleInfo& info) {
   for (;;) {
     EXPECT_EQ(con.wait(kNever), WaitStatus::ready);
-    const auto status = con.next(writable(sample), info);
+    const auto status = con.read_next(writable(sample), info);
     if (!status) {
       ADD_FAILURE() << status.error().message;
       return ReadStatus::not_yet;
@@ -104,7 +104,7 @@ TEST_F(PConnectorServing, KnowsTheStream) {
   EXPECT_EQ(con.cycle(), 5ms);
   EXPECT_EQ(con.incarnation(), writer.incarnation());
   EXPECT_EQ(con.address(), daemon.address());
-  EXPECT_TRUE(con.connected());
+  EXPECT_TRUE(con.is_connected());
 }
 
 TEST_F(PConnectorServing, RefusesInWords) {
@@ -129,9 +129,9 @@ TEST_F(PConnectorServing, ReadsAsALocalReaderDoes) {
   auto local = session.open_reader<Sample>("lidar").value();
   Sample here, there;
   SampleInfo info_here, info_there;
-  EXPECT_EQ(con.latest(writable(there), info_there).value(), ReadStatus::not_yet);
-  EXPECT_EQ(con.newest().value(), kNoTid);
-  EXPECT_EQ(con.oldest().value(), kNoTid);
+  EXPECT_EQ(con.read_newest(writable(there), info_there).value(), ReadStatus::not_yet);
+  EXPECT_EQ(con.newest_tid().value(), kNoTid);
+  EXPECT_EQ(con.oldest_tid().value(), kNoTid);
   EXPECT_EQ(con.find(time_of(3)).value(), kNoTid);
   for (Tid tid = 0; tid < 200; ++tid) write(writer, tid);
   const std::random_device::result_type seed = std::random_device()();
@@ -140,23 +140,23 @@ TEST_F(PConnectorServing, ReadsAsALocalReaderDoes) {
   for (int i = 0; i < 2000; ++i) {
     const Tid tid = static_cast<Tid>(random() % 220) - 10;
     const Time time = time_of(tid) + Duration(static_cast<std::int64_t>(random() % 1'000'000));
-    const auto by_tid = con.tid(tid, writable(there), info_there);
+    const auto by_tid = con.read_tid(tid, writable(there), info_there);
     ASSERT_TRUE(by_tid) << by_tid.error().message;
-    ASSERT_EQ(*by_tid, local.tid(tid, here, info_here));
+    ASSERT_EQ(*by_tid, local.read_tid(tid, here, info_here));
     if (*by_tid == ReadStatus::ok) expect_is(there, info_there, tid);
-    const auto by_time = con.at(time, writable(there), info_there);
+    const auto by_time = con.read_at(time, writable(there), info_there);
     ASSERT_TRUE(by_time) << by_time.error().message;
-    ASSERT_EQ(*by_time, local.at(time, here, info_here));
+    ASSERT_EQ(*by_time, local.read_at(time, here, info_here));
     if (*by_time == ReadStatus::ok) expect_is(there, info_there, info_here.tid);
     SampleInfo found;
     const bool is_there = local.find(time, found) == ReadStatus::ok;
     ASSERT_EQ(con.find(time).value(), is_there ? found.tid : kNoTid);
   }
-  EXPECT_EQ(con.newest().value(), 199);
-  EXPECT_EQ(con.oldest().value(), local.oldest());
-  EXPECT_EQ(con.newer(198, writable(there), info_there).value(), ReadStatus::ok);
+  EXPECT_EQ(con.newest_tid().value(), 199);
+  EXPECT_EQ(con.oldest_tid().value(), local.oldest_tid());
+  EXPECT_EQ(con.read_newer(198, writable(there), info_there).value(), ReadStatus::ok);
   EXPECT_EQ(info_there.tid, 199);
-  EXPECT_EQ(con.newer(199, writable(there), info_there).value(), ReadStatus::not_yet);
+  EXPECT_EQ(con.read_newer(199, writable(there), info_there).value(), ReadStatus::not_yet);
 }
 
 TEST_F(PConnectorServing, SubscribesFromWhereItIsAsked) {
@@ -172,15 +172,15 @@ TEST_F(PConnectorServing, SubscribesFromWhereItIsAsked) {
   ASSERT_TRUE(con.subscribe({}));
   Sample sample;
   SampleInfo info;
-  EXPECT_EQ(con.next(writable(sample), info).value(), ReadStatus::not_yet);
+  EXPECT_EQ(con.read_next(writable(sample), info).value(), ReadStatus::not_yet);
   write(writer, 40);
   expect_next(con, 40);
   ASSERT_TRUE(con.unsubscribe());
   write(writer, 41);
-  EXPECT_EQ(con.next(writable(sample), info).error().code, Errc::invalid_argument);
-  EXPECT_EQ(con.latest(writable(sample), info).value(), ReadStatus::ok);
+  EXPECT_EQ(con.read_next(writable(sample), info).error().code, Errc::invalid_argument);
+  EXPECT_EQ(con.read_newest(writable(sample), info).value(), ReadStatus::ok);
   EXPECT_EQ(info.tid, 41);
-  EXPECT_EQ(con.lost(), 0u);
+  EXPECT_EQ(con.lost_samples(), 0u);
 }
 
 TEST_F(PConnectorServing, CountsExactlyWhatTheRingLost) {
@@ -201,8 +201,8 @@ TEST_F(PConnectorServing, CountsExactlyWhatTheRingLost) {
     expect_is(sample, info, info.tid);
     ++taken;
   }
-  EXPECT_GT(con.lost(), 0u);
-  EXPECT_EQ(con.lost() + taken, 1000u);
+  EXPECT_GT(con.lost_samples(), 0u);
+  EXPECT_EQ(con.lost_samples() + taken, 1000u);
 }
 
 TEST_F(PConnectorServing, TakesEverySampleOfAFastWriter) {
@@ -221,7 +221,7 @@ TEST_F(PConnectorServing, TakesEverySampleOfAFastWriter) {
     ASSERT_EQ(sample.number, tid);
   }
   writing.join();
-  EXPECT_EQ(con.lost(), 0u);
+  EXPECT_EQ(con.lost_samples(), 0u);
   const auto counters = con.counters();
   EXPECT_EQ(counters.samples, static_cast<std::uint64_t>(kCount));
   EXPECT_LE(counters.copied_payload_bytes, counters.samples * sizeof(Sample)) << "one copy at most";
@@ -247,7 +247,7 @@ TEST_F(PConnectorServing, ThinsAtTheSource) {
     EXPECT_EQ(sample.number, info.tid);
   }
   EXPECT_GE(MonoClock::now() - begin, 9 * 20ms);
-  EXPECT_EQ(con.lost(), 0u);
+  EXPECT_EQ(con.lost_samples(), 0u);
   stop = true;
   writing.join();
 }
@@ -267,7 +267,7 @@ TEST_F(PConnectorServing, ResumesOverRestartsOfDssmdWhileTheWriterGoesOn) {
     for (int i = 0; i < 100; ++i) write(writer, next_tid++);
     while (due < next_tid) expect_next(con, due++);
   }
-  EXPECT_EQ(con.lost(), 0u);
+  EXPECT_EQ(con.lost_samples(), 0u);
   EXPECT_EQ(con.restarts(), 0u);
   EXPECT_EQ(con.counters().reconnects, 5u);
 }
@@ -290,8 +290,8 @@ TEST_F(PConnectorServing, TellsOfAStreamThatWasRemovedAndMadeAnew) {
   EXPECT_EQ(con.restarts(), 1u);
   EXPECT_EQ(con.incarnation(), anew.incarnation());
   // And by request: told once, too.
-  EXPECT_EQ(con.latest(writable(sample), info).value(), ReadStatus::restarted);
-  EXPECT_EQ(con.latest(writable(sample), info).value(), ReadStatus::ok);
+  EXPECT_EQ(con.read_newest(writable(sample), info).value(), ReadStatus::restarted);
+  EXPECT_EQ(con.read_newest(writable(sample), info).value(), ReadStatus::ok);
 }
 
 TEST_F(PConnectorServing, WritesAndReadsBackItsOwnTids) {
@@ -303,7 +303,7 @@ TEST_F(PConnectorServing, WritesAndReadsBackItsOwnTids) {
     EXPECT_EQ(*written, tid);
     Sample sample;
     SampleInfo info;
-    ASSERT_EQ(local.latest(sample, info), ReadStatus::ok);
+    ASSERT_EQ(local.read_newest(sample, info), ReadStatus::ok);
     expect_is(sample, info, tid);
   }
   for (Tid tid = 20; tid < 120; ++tid) {
@@ -313,7 +313,7 @@ TEST_F(PConnectorServing, WritesAndReadsBackItsOwnTids) {
   for (Tid tid = 0; tid < 120; ++tid) {
     Sample sample;
     SampleInfo info;
-    ASSERT_EQ(local.tid(tid, sample, info), ReadStatus::ok);
+    ASSERT_EQ(local.read_tid(tid, sample, info), ReadStatus::ok);
     expect_is(sample, info, tid);
   }
 }
@@ -334,12 +334,12 @@ TEST_F(PConnectorServing, PostsEachSampleOnceOverRestartsOfDssmd) {
   }
   const auto flushed = con.flush(kNever);
   ASSERT_TRUE(flushed) << flushed.error().message;
-  EXPECT_EQ(con.dropped(), 0u);
+  EXPECT_EQ(con.dropped_samples(), 0u);
   local.seek(kNoTid);
   Tid last = -1;
   Sample sample;
   SampleInfo info;
-  while (local.next(sample, info) == ReadStatus::ok) {
+  while (local.read_next(sample, info) == ReadStatus::ok) {
     ASSERT_EQ(sample.number, last + 1);
     EXPECT_EQ(sample.bytes, sample_of(sample.number).bytes);
     last = sample.number;
@@ -367,7 +367,7 @@ TEST_F(PConnectorServing, CarriesProperties) {
 TEST_F(PConnectorServing, ListsTheHostsStreams) {
   make({64, 1ms}, "lidar");
   make({64, 1ms}, "odometry:2");
-  const auto streams = PConnector::list(options());
+  const auto streams = PConnector::list_streams(options());
   ASSERT_TRUE(streams) << streams.error().message;
   ASSERT_EQ(streams->size(), 2u);
   EXPECT_EQ((*streams)[0].id.str(), "lidar:0@pc2");
@@ -410,7 +410,7 @@ TEST_F(PConnectorServing, CarriesTheSmallestAndTheLargestSamples) {
       SampleInfo info;
       for (;;) {
         ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
-        const auto status = reader.next(received, info);
+        const auto status = reader.read_next(received, info);
         ASSERT_TRUE(status) << status.error().message;
         if (*status == ReadStatus::ok) break;
       }
@@ -418,12 +418,12 @@ TEST_F(PConnectorServing, CarriesTheSmallestAndTheLargestSamples) {
       EXPECT_EQ(info.time, time_of(tid));
       EXPECT_TRUE(received == sent);
       std::fill(received.begin(), received.end(), std::byte{});
-      const auto read = reader.tid(tid, received, info);
+      const auto read = reader.read_tid(tid, received, info);
       ASSERT_TRUE(read) << read.error().message;
       ASSERT_EQ(*read, ReadStatus::ok);
       EXPECT_TRUE(received == sent);
     }
-    EXPECT_EQ(reader.lost(), 0u);
+    EXPECT_EQ(reader.lost_samples(), 0u);
   }
 }
 

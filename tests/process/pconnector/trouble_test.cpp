@@ -57,7 +57,7 @@ void expect_sample(PConnector& con, std::int64_t tid) {
   for (;;) {
     const WaitStatus waited = con.wait(kNever);
     ASSERT_EQ(waited, WaitStatus::ready);
-    const auto status = con.next(sample.span(), sample.info);
+    const auto status = con.read_next(sample.span(), sample.info);
     ASSERT_TRUE(status) << status.error().message;
     if (*status == ReadStatus::not_yet) continue;
     ASSERT_EQ(*status, ReadStatus::ok);
@@ -70,7 +70,7 @@ void expect_sample(PConnector& con, std::int64_t tid) {
 }
 
 void expect_words(const Error& error, Errc code, const std::vector<std::string>& words) {
-  EXPECT_EQ(errc_name(error.code), errc_name(code)) << error.message;
+  EXPECT_EQ(name_of(error.code), name_of(code)) << error.message;
   for (const std::string& word : words) {
     EXPECT_NE(error.message.find(word), std::string::npos) << word << "\n" << error.message;
   }
@@ -243,7 +243,7 @@ TEST(PConnectorRequest, IsAskedAgainOnANewConnection) {
   });
   auto con = open(daemon).value();
   TakenSample sample;
-  ASSERT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
+  ASSERT_EQ(con.read_newest(sample.span(), sample.info).value(), ReadStatus::ok);
   EXPECT_EQ(sample.info.tid, 5);
   EXPECT_EQ(sample.bytes, text_of(5));
   EXPECT_EQ(asked, 2);
@@ -262,11 +262,11 @@ TEST(PConnectorRequest, FailsAtOnceWhenTheAnswerIsGarbageAndTheNextOneWorks) {
   });
   auto con = open(daemon).value();
   TakenSample sample;
-  const auto bad = con.latest(sample.span(), sample.info);
+  const auto bad = con.read_newest(sample.span(), sample.info);
   ASSERT_FALSE(bad);
   expect_words(bad.error(), Errc::protocol, {"lidar"});
   EXPECT_EQ(sample.info.tid, kNoTid);
-  EXPECT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
+  EXPECT_EQ(con.read_newest(sample.span(), sample.info).value(), ReadStatus::ok);
 }
 
 TEST(PConnectorRequest, RefusesSamplesOfAnotherSize) {
@@ -278,7 +278,7 @@ TEST(PConnectorRequest, RefusesSamplesOfAnotherSize) {
   });
   auto con = open(daemon).value();
   TakenSample sample;
-  const auto bad = con.latest(sample.span(), sample.info);
+  const auto bad = con.read_newest(sample.span(), sample.info);
   ASSERT_FALSE(bad);
   expect_words(bad.error(), Errc::protocol, {"9"});
 }
@@ -294,7 +294,7 @@ TEST(PConnectorRequest, AsksAgainForATornSample) {
   });
   auto con = open(daemon).value();
   TakenSample sample;
-  ASSERT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
+  ASSERT_EQ(con.read_newest(sample.span(), sample.info).value(), ReadStatus::ok);
   EXPECT_EQ(sample.info.tid, 5);
 }
 
@@ -304,10 +304,10 @@ TEST(PConnectorRequest, TellsDaemonAwayWhenItStaysAway) {
   const std::string address = daemon->address();
   daemon.reset();
   TakenSample sample;
-  const auto away = con.latest(sample.span(), sample.info);
+  const auto away = con.read_newest(sample.span(), sample.info);
   ASSERT_FALSE(away);
   expect_words(away.error(), Errc::unavailable, {"lidar", address});
-  EXPECT_FALSE(con.connected());
+  EXPECT_FALSE(con.is_connected());
 }
 
 TEST(PConnectorRequest, TellsOnceThatTheStreamBeganAnew) {
@@ -322,11 +322,11 @@ TEST(PConnectorRequest, TellsOnceThatTheStreamBeganAnew) {
   });
   auto con = open(daemon).value();
   TakenSample sample;
-  ASSERT_EQ(con.tid(5, sample.span(), sample.info).value(), ReadStatus::ok);
-  EXPECT_EQ(con.tid(5, sample.span(), sample.info).value(), ReadStatus::restarted);
+  ASSERT_EQ(con.read_tid(5, sample.span(), sample.info).value(), ReadStatus::ok);
+  EXPECT_EQ(con.read_tid(5, sample.span(), sample.info).value(), ReadStatus::restarted);
   EXPECT_EQ(con.restarts(), 1u);
   EXPECT_EQ(con.incarnation(), 2u);
-  EXPECT_EQ(con.tid(5, sample.span(), sample.info).value(), ReadStatus::ok);
+  EXPECT_EQ(con.read_tid(5, sample.span(), sample.info).value(), ReadStatus::ok);
 }
 
 TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
@@ -340,7 +340,7 @@ TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
   });
   auto con = open(daemon).value();
   TakenSample sample;
-  const auto bad = con.latest(sample.span(), sample.info);
+  const auto bad = con.read_newest(sample.span(), sample.info);
   ASSERT_FALSE(bad);
   expect_words(bad.error(), Errc::type_mismatch, {"anew", "8 bytes", "9 bytes"});
 }
@@ -363,7 +363,7 @@ TEST(PConnectorRequest, AWaitForAStreamThatCannotBeUsedAnyMoreIsNoLoop) {
     const int before = connections;
     ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
     EXPECT_GT(connections, before) << "each time after one more attempt";
-    const auto status = con.next(sample.span(), sample.info);
+    const auto status = con.read_next(sample.span(), sample.info);
     ASSERT_FALSE(status);
     EXPECT_NE(status.error().message.find("anew"), std::string::npos) << status.error().message;
   }
@@ -374,8 +374,8 @@ TEST(PConnectorRequest, RefusesABufferOfAnotherSize) {
   auto con = open(daemon).value();
   std::array<std::byte, 7> small;
   SampleInfo info;
-  EXPECT_EQ(con.latest(small, info).error().code, Errc::invalid_argument);
-  EXPECT_EQ(con.next(small, info).error().code, Errc::invalid_argument);
+  EXPECT_EQ(con.read_newest(small, info).error().code, Errc::invalid_argument);
+  EXPECT_EQ(con.read_next(small, info).error().code, Errc::invalid_argument);
   EXPECT_EQ(con.post(small).error().code, Errc::invalid_argument);
   EXPECT_EQ(con.write(small).error().code, Errc::invalid_argument);
 }
@@ -404,8 +404,8 @@ TEST(PConnectorSubscription, ComesInOrderHoweverTheBytesCome) {
     ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
     for (std::int64_t tid = 0; tid < 20; ++tid) expect_sample(con, tid);
     TakenSample sample;
-    EXPECT_EQ(con.next(sample.span(), sample.info).value(), ReadStatus::not_yet);
-    EXPECT_EQ(con.lost(), 0u);
+    EXPECT_EQ(con.read_next(sample.span(), sample.info).value(), ReadStatus::not_yet);
+    EXPECT_EQ(con.lost_samples(), 0u);
   }
 }
 
@@ -413,7 +413,7 @@ TEST(PConnectorSubscription, NeedsOne) {
   const FakeDaemon daemon([](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
   auto con = open(daemon).value();
   TakenSample sample;
-  const auto none = con.next(sample.span(), sample.info);
+  const auto none = con.read_next(sample.span(), sample.info);
   ASSERT_FALSE(none);
   expect_words(none.error(), Errc::invalid_argument, {"subscribe"});
   EXPECT_EQ(con.wait(kNever), WaitStatus::timeout);
@@ -435,7 +435,7 @@ TEST(PConnectorSubscription, KeepsWhatComesWhileARequestWaits) {
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
   expect_sample(con, 0);
   TakenSample sample;
-  ASSERT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok);
+  ASSERT_EQ(con.read_newest(sample.span(), sample.info).value(), ReadStatus::ok);
   EXPECT_EQ(sample.info.tid, 5);
   for (std::int64_t tid = 1; tid < 7; ++tid) expect_sample(con, tid);
 }
@@ -462,7 +462,7 @@ TEST(PConnectorSubscription, ResumesAtTheSampleThatIsDue) {
   const net::Subscribe request = resumed.get_future().get();
   EXPECT_EQ(request.from_tid(), 5);
   EXPECT_EQ(request.incarnation(), 1u);
-  EXPECT_EQ(con.lost(), 2u);
+  EXPECT_EQ(con.lost_samples(), 2u);
   EXPECT_EQ(con.restarts(), 0u);
 }
 
@@ -479,9 +479,9 @@ TEST(PConnectorSubscription, TellsOfANewRingBetweenItsSamplesAndThoseOfTheOld) {
   expect_sample(con, 8);
   ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
   TakenSample sample;
-  EXPECT_EQ(con.next(sample.span(), sample.info).value(), ReadStatus::restarted);
+  EXPECT_EQ(con.read_next(sample.span(), sample.info).value(), ReadStatus::restarted);
   expect_sample(con, 0);
-  EXPECT_EQ(con.lost(), 0u);
+  EXPECT_EQ(con.lost_samples(), 0u);
   EXPECT_EQ(con.restarts(), 1u);
 }
 
@@ -498,7 +498,7 @@ TEST(PConnectorSubscription, TellsWhenTheConnectionIsDownWithoutWaiting) {
   ASSERT_TRUE(con.subscribe({}));
   TakenSample sample;
   for (;;) {
-    const auto status = con.next(sample.span(), sample.info);
+    const auto status = con.read_next(sample.span(), sample.info);
     if (!status) {
       expect_words(status.error(), Errc::unavailable, {"lidar"});
       break;
@@ -533,7 +533,7 @@ TEST(PConnectorSubscription, SaysThatTheStreamWasRemovedAndGoesOnWhenItIsBack) {
   ASSERT_TRUE(con.subscribe({}));
   TakenSample sample;
   for (;;) {
-    const auto status = con.next(sample.span(), sample.info);
+    const auto status = con.read_next(sample.span(), sample.info);
     if (status) {
       ASSERT_EQ(*status, ReadStatus::not_yet);
       continue;
@@ -543,7 +543,7 @@ TEST(PConnectorSubscription, SaysThatTheStreamWasRemovedAndGoesOnWhenItIsBack) {
   }
   back = true;
   ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
-  EXPECT_EQ(con.next(sample.span(), sample.info).value(), ReadStatus::restarted);
+  EXPECT_EQ(con.read_next(sample.span(), sample.info).value(), ReadStatus::restarted);
   expect_sample(con, 0);
 }
 
@@ -562,8 +562,8 @@ TEST(PConnectorSubscription, PassesOnWhyItIsRefused) {
   ASSERT_FALSE(refused);
   expect_words(refused.error(), Errc::no_permission, {"lidar", "not for you"});
   TakenSample sample;
-  EXPECT_FALSE(con.next(sample.span(), sample.info));
-  EXPECT_EQ(con.latest(sample.span(), sample.info).value(), ReadStatus::ok)
+  EXPECT_FALSE(con.read_next(sample.span(), sample.info));
+  EXPECT_EQ(con.read_newest(sample.span(), sample.info).value(), ReadStatus::ok)
       << "the connection is still good";
 }
 
@@ -608,16 +608,16 @@ TEST(PConnectorSubscription, ItsDescriptorStandsForTheConnectionAndForTheNextAtt
   for (const std::int64_t tid : {0, 2}) {
     for (;;) {
       TakenSample sample;
-      const auto status = con.next(sample.span(), sample.info);
+      const auto status = con.read_next(sample.span(), sample.info);
       if (status && *status == ReadStatus::ok) {
         EXPECT_EQ(sample.info.tid, tid);
         break;
       }
-      pollfd ready{con.fd(), POLLIN, 0};
+      pollfd ready{con.ready_fd(), POLLIN, 0};
       ASSERT_EQ(::poll(&ready, 1, -1), 1);
     }
   }
-  EXPECT_EQ(con.lost(), 1u);
+  EXPECT_EQ(con.lost_samples(), 1u);
 }
 
 // --- large samples
@@ -649,13 +649,15 @@ TEST(PConnectorLargeSamples, ArePutAsideWhenTheRestDoesNotCome) {
   ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
   std::string first(kLargeBytes, '?'), second(kLargeBytes, '?');
   SampleInfo info;
-  EXPECT_EQ(con.next(std::as_writable_bytes(std::span(first)), info).value(), ReadStatus::not_yet);
+  EXPECT_EQ(con.read_next(std::as_writable_bytes(std::span(first)), info).value(),
+            ReadStatus::not_yet);
   first.assign(kLargeBytes, '!');  // ours again
-  EXPECT_EQ(con.next(std::as_writable_bytes(std::span(first)), info).value(), ReadStatus::not_yet);
+  EXPECT_EQ(con.read_next(std::as_writable_bytes(std::span(first)), info).value(),
+            ReadStatus::not_yet);
   EXPECT_EQ(con.wait(deadline_in(10ms)), WaitStatus::timeout) << "what is put aside is not ready";
   go_on.set_value();
   ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
-  ASSERT_EQ(con.next(std::as_writable_bytes(std::span(second)), info).value(), ReadStatus::ok);
+  ASSERT_EQ(con.read_next(std::as_writable_bytes(std::span(second)), info).value(), ReadStatus::ok);
   EXPECT_EQ(second, large('a'));
   EXPECT_EQ(first, large('!'));
   EXPECT_EQ(info.tid, 0);
@@ -683,7 +685,7 @@ TEST(PConnectorLargeSamples, AreReceivedWhereTheyAreWanted) {
   std::uint64_t stalls = 0;  // of a busy machine: what had come is put aside
   for (std::int64_t tid = 0; tid < 20;) {
     ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
-    const ReadStatus status = con.next(span, info).value();
+    const ReadStatus status = con.read_next(span, info).value();
     if (status == ReadStatus::not_yet) {
       ++stalls;
       continue;
@@ -693,7 +695,7 @@ TEST(PConnectorLargeSamples, AreReceivedWhereTheyAreWanted) {
     ASSERT_EQ(sample, large(static_cast<char>('a' + tid)));
     ++tid;
   }
-  ASSERT_EQ(con.latest(span, info).value(), ReadStatus::ok);
+  ASSERT_EQ(con.read_newest(span, info).value(), ReadStatus::ok);
   EXPECT_EQ(sample, large('!'));
   const auto counters = con.counters();
   EXPECT_EQ(counters.samples, 21u);
@@ -721,12 +723,12 @@ TEST(PConnectorLargeSamples, OneThatWasCutComesAnew) {
   std::string sample(kLargeBytes, '?');
   SampleInfo info;
   for (;;) {
-    const auto status = con.next(std::as_writable_bytes(std::span(sample)), info);
+    const auto status = con.read_next(std::as_writable_bytes(std::span(sample)), info);
     if (status && *status == ReadStatus::ok) break;
     ASSERT_EQ(con.wait(kNever), WaitStatus::ready);
   }
   EXPECT_EQ(sample, large('a'));
-  EXPECT_EQ(con.lost(), 0u);
+  EXPECT_EQ(con.lost_samples(), 0u);
   EXPECT_EQ(con.counters().reconnects, 3u);
 }
 
@@ -791,7 +793,7 @@ TEST(PConnectorPublishing, WritesEachSampleOnceOverBrokenConnections) {
     const auto written = con.write(bytes_of(text_of(500)));
     ASSERT_TRUE(written) << written.error().message;
     EXPECT_EQ(*written, 500);
-    EXPECT_EQ(con.dropped(), 0u);
+    EXPECT_EQ(con.dropped_samples(), 0u);
     EXPECT_GE(con.counters().reconnects, 20u);
   }
   ASSERT_EQ(owner.written.size(), 501u);
@@ -828,7 +830,7 @@ TEST(PConnectorPublishing, SendsNothingTwiceOnOneConnection) {
     });
     auto con = open(daemon).value();
     for (std::int64_t i = 0; i < 300; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
-    ASSERT_TRUE(con.newest());
+    ASSERT_TRUE(con.newest_tid());
     ASSERT_TRUE(con.flush(kNever));
     for (std::int64_t i = 300; i < 310; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
     ASSERT_TRUE(con.flush(kNever));
@@ -857,10 +859,10 @@ TEST(PConnectorPublishing, NoticesABrokenConnectionByTheNextPosts) {
     ASSERT_TRUE(con.post(bytes_of(text_of(posts++))));
     await([&] { return daemon.ended() != 0; });
     // The first one tells the kernel, the second one us.
-    for (int i = 0; i < 3 && con.counters().reconnects == 0 && con.connected(); ++i) {
+    for (int i = 0; i < 3 && con.counters().reconnects == 0 && con.is_connected(); ++i) {
       ASSERT_TRUE(con.post(bytes_of(text_of(posts++))));
     }
-    EXPECT_FALSE(con.connected());
+    EXPECT_FALSE(con.is_connected());
     ASSERT_TRUE(con.flush(kNever));
     EXPECT_EQ(owner.written.size(), static_cast<std::size_t>(posts));
   }
@@ -888,10 +890,10 @@ TEST(PConnectorPublishing, KeepsTheNewestWhileDssmdIsAwayAndCountsTheOthers) {
     auto con =
         PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .max_unsent_samples = 10})
             .value();
-    while (con.connected()) ASSERT_TRUE(con.post(bytes_of(text_of(0))));
-    const std::uint64_t before = con.dropped();
+    while (con.is_connected()) ASSERT_TRUE(con.post(bytes_of(text_of(0))));
+    const std::uint64_t before = con.dropped_samples();
     for (std::int64_t i = 1; i <= 30; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
-    EXPECT_GE(con.dropped(), before + 20);
+    EXPECT_GE(con.dropped_samples(), before + 20);
     back = true;
     ASSERT_TRUE(con.flush(kNever));
   }

@@ -60,7 +60,7 @@ TEST(WatchdogMessages, AreSentWhileTheLoopRunsAndNotWhileItHangs) {
 
 TEST(WatchdogMessages, AreNotSentWithoutAWatchdog) {
   ServiceManager manager({.arguments = {"--listen", ""}});
-  connect_to(manager.socket_path()).list().value();
+  connect_to(manager.socket_path()).list_streams().value();
   EXPECT_EQ(count(manager.messages(), "WATCHDOG=1"), 0u);
 }
 
@@ -125,10 +125,10 @@ TEST(Reload, ConnectsToNewPeersAndDropsOldOnes) {
   const auto await_hosts = [&](const std::vector<std::string>& names) {
     await([&] {
       std::vector<std::string> up;
-      for (const HostInfo& host : session.hosts().value()) {
+      for (const HostInfo& host : session.list_hosts().value()) {
         if (host.state == "up") up.push_back(host.name);
       }
-      return up == names && session.hosts().value().size() == names.size() + 1;
+      return up == names && session.list_hosts().value().size() == names.size() + 1;
     });
   };
   await_hosts({"pc2"});

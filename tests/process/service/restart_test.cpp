@@ -85,7 +85,7 @@ class Taker {
   void await_taken(std::int64_t count) const {
     while (taken() < count && !testing::Test::HasFailure()) std::this_thread::sleep_for(1ms);
   }
-  std::uint64_t lost() const { return reader_.lost(); }
+  std::uint64_t lost() const { return reader_.lost_samples(); }
 
  private:
   void take() {
@@ -94,7 +94,7 @@ class Taker {
     SampleInfo info;
     while (!done_) {
       if (reader_.wait(deadline_in(50ms)) != WaitStatus::ready) continue;
-      const ReadStatus status = reader_.next(sample, info);
+      const ReadStatus status = reader_.read_next(sample, info);
       if (status == ReadStatus::not_yet) continue;
       ASSERT_EQ(status, ReadStatus::ok);  // nothing else happens to a reader
       ASSERT_EQ(info.tid, taken_.load());
@@ -147,7 +147,7 @@ class ServiceUnderLoad : public testing::Test {
       EXPECT_EQ(local[s]->lost(), 0u);
       EXPECT_EQ(remote[s]->lost(), 0u);
     }
-    ASSERT_TRUE(watching.list());  // it has reconnected and received all events
+    ASSERT_TRUE(watching.list_streams());  // it has reconnected and received all events
     EXPECT_EQ(events.load(), kStreams) << "a watching program on this PC noticed the restart";
   }
 
@@ -184,7 +184,7 @@ TEST(Service, KeepsStreamsWhoseProgramsHaveAllEnded) {
     incarnation = writer.incarnation();
     for (int i = 0; i < 5; ++i) writer.write(numbered(i));
     ASSERT_TRUE(writer.set_property(std::vector<std::byte>(1000, std::byte{7})));
-    PlaybackClock clock = session.playback_clock().value();
+    PlaybackClock clock = session.open_playback_clock().value();
     clock.set_paused(true);
     clock.set_time(1234);
   }
@@ -192,16 +192,16 @@ TEST(Service, KeepsStreamsWhoseProgramsHaveAllEnded) {
     hard ? manager.kill_hard() : manager.restart();
     if (hard) manager.start();
     Session session = connect_to(manager.socket_path());
-    const StreamInfo info = session.info({"kept", 0, ""}).value();
+    const StreamInfo info = session.stream_info({"kept", 0, ""}).value();
     EXPECT_EQ(info.incarnation, incarnation);
     EXPECT_EQ(info.type, type_of<Numbered>());
     EXPECT_EQ(session.property({"kept", 0, ""}).value(),
               std::vector<std::byte>(1000, std::byte{7}));
-    EXPECT_EQ(session.playback_clock().value().now_s(), 1234);
+    EXPECT_EQ(session.open_playback_clock().value().now_s(), 1234);
     auto reader = session.open_reader<Numbered>("kept").value();
     Numbered sample{};
     SampleInfo sample_info;
-    EXPECT_EQ(reader.latest(sample, sample_info), ReadStatus::ok);
+    EXPECT_EQ(reader.read_newest(sample, sample_info), ReadStatus::ok);
     EXPECT_EQ(sample_info.tid, 4);
     EXPECT_EQ(sample.number, 4);
   }

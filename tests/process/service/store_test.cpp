@@ -25,7 +25,7 @@ ServiceManager::Options without_network() { return {.arguments = {"--listen", ""
 
 std::vector<std::string> stream_names(Session& session) {
   std::vector<std::string> names;
-  for (const StreamInfo& stream : session.list().value()) names.push_back(stream.id.name);
+  for (const StreamInfo& stream : session.list_streams().value()) names.push_back(stream.id.name);
   return names;
 }
 
@@ -67,10 +67,10 @@ TEST(DescriptorStore, HoldsTheListeningSocketOnceOverManyRestarts) {
 
 TEST(DescriptorStore, HoldsThePlaybackClock) {
   ServiceManager manager(without_network());
-  ASSERT_TRUE(connect_to(manager.socket_path()).playback_clock());
+  ASSERT_TRUE(connect_to(manager.socket_path()).open_playback_clock());
   EXPECT_EQ(manager.stored_descriptors(), 1u);
   manager.restart();
-  ASSERT_TRUE(connect_to(manager.socket_path()).playback_clock());
+  ASSERT_TRUE(connect_to(manager.socket_path()).open_playback_clock());
   EXPECT_EQ(manager.stored_descriptors(), 1u);
 }
 
@@ -89,7 +89,7 @@ TEST(DescriptorStore, DropsInvalidDescriptorsAndKeepsTheRest) {
   manager.put_into_store("clock", UniqueFd(::memfd_create("dssm-playback-clock", MFD_CLOEXEC)));
   manager.start();
   EXPECT_EQ(stream_names(session), std::vector<std::string>{"good"});
-  EXPECT_EQ(session.info({"good", 0, ""}).value().incarnation, writer.incarnation());
+  EXPECT_EQ(session.stream_info({"good", 0, ""}).value().incarnation, writer.incarnation());
   EXPECT_EQ(manager.stored_descriptors(), kPerStream)
       << "dropped descriptors are still in the store";
 }
@@ -148,7 +148,7 @@ TEST(DescriptorStore, RecoversThousandsOfStreams) {
   manager.await_stored(streams * kPerStream);
   manager.kill_hard();
   manager.start();
-  EXPECT_EQ(connect_to(manager.socket_path()).list().value().size(), streams);
+  EXPECT_EQ(connect_to(manager.socket_path()).list_streams().value().size(), streams);
 }
 
 }  // namespace

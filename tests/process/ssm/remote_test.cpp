@@ -89,7 +89,7 @@ TEST_F(SsmFleet, AnSsmProgramReadsAndWritesStreamsOfAnotherPcByTheirNames) {
       run({program("remote_names-gnu++98"), folder, "pc2"}, {pc1.environment()});
   EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
   remove_tree(folder);
-  EXPECT_TRUE(far.info({"ours", 0, {}}));
+  EXPECT_TRUE(far.stream_info({"ours", 0, {}}));
 }
 
 TEST(SsmBroadcast, EachHostSeesWhatAllShow) {

@@ -51,7 +51,7 @@ std::string content(const std::string& path) {
 
 dssm::Tid written(const dssm::test::DaemonProcess& host, const std::string& stream) {
   dssm::Session session = connect(host);
-  return session.info(dssm::StreamId{stream, 0, ""}).value().newest + 1;
+  return session.stream_info(dssm::StreamId{stream, 0, ""}).value().newest + 1;
 }
 
 }  // namespace vehicle::test

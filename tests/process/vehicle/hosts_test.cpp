@@ -45,7 +45,7 @@ std::unique_ptr<DaemonProcess> start_host(int host, int hosts) {
 // The mirror of `stream` on `host` has no gap.
 void expect_no_gap(const DaemonProcess& host, const std::string& stream) {
   dssm::Session session = test::connect(host);
-  const dssm::StreamInfo info = session.info(dssm::StreamId{stream, 0, ""}).value();
+  const dssm::StreamInfo info = session.stream_info(dssm::StreamId{stream, 0, ""}).value();
   ASSERT_TRUE(info.mirror) << info.id.str();
   EXPECT_EQ(info.mirror->gap_samples, 0u) << info.id.str();
 }
@@ -146,7 +146,7 @@ TEST_F(VehicleHosts, DrawTheSameMapWhenEachDssmdIsKilledDuringTheDrive) {
   dssm::Tid reached = 0;
   for (DaemonProcess* dssmd : {pc1.get(), pc2.get(), pc3.get()}) {
     reached += scans_and_end_mark() / 5;
-    while (poses.newest() < reached) (void)poses.wait_for_tid(reached, dssm::kNever);
+    while (poses.newest_tid() < reached) (void)poses.wait_for_tid(reached, dssm::kNever);
     dssmd->kill_hard();
     dssmd->start();
   }

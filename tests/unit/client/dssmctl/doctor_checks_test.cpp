@@ -210,7 +210,7 @@ TEST(Doctor, TellsWhatMdnsLacks) {
   EXPECT_FINDING(facts, "mdns", Status::warn, "5353");
   facts.hosts[1].state = "down";  // then nobody knows whether it could be heard
   EXPECT_FINDING(facts, "mdns", Status::ok, "");
-  facts.daemon.mdns.trouble = "a name was taken";
+  facts.daemon.mdns.error = "a name was taken";
   EXPECT_FINDING(facts, "mdns", Status::warn, "journalctl -u avahi-daemon");
   facts.daemon.mdns.own_host_seen = false;
   EXPECT_FINDING(facts, "mdns", Status::warn, "avahi-browse");

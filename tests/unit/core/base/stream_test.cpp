@@ -125,13 +125,13 @@ TEST(TypeInfo, RefusesFieldsOutsideThePayload) {
 
 TEST(History, HoldsTwentyPercentMoreThanAskedFor) {
   using namespace std::chrono_literals;
-  EXPECT_EQ(History::of(1s, 100ms).value().depth, 13u);
-  EXPECT_EQ(History::of(5s, 5ms).value().depth, 1201u);
-  EXPECT_EQ(History::of(100ms, 100ms).value().depth, 2u);
-  EXPECT_EQ(History::of(1s, 0s).error().code, Errc::invalid_argument);
-  EXPECT_EQ(History::of(1s, -1s).error().code, Errc::invalid_argument);
-  EXPECT_EQ(History::of(0s, 1s).error().code, Errc::invalid_argument);
-  EXPECT_EQ(History::of(1h, 1ns).error().code, Errc::limit_exceeded);
+  EXPECT_EQ(History::for_life(1s, 100ms).value().depth, 13u);
+  EXPECT_EQ(History::for_life(5s, 5ms).value().depth, 1201u);
+  EXPECT_EQ(History::for_life(100ms, 100ms).value().depth, 2u);
+  EXPECT_EQ(History::for_life(1s, 0s).error().code, Errc::invalid_argument);
+  EXPECT_EQ(History::for_life(1s, -1s).error().code, Errc::invalid_argument);
+  EXPECT_EQ(History::for_life(0s, 1s).error().code, Errc::invalid_argument);
+  EXPECT_EQ(History::for_life(1h, 1ns).error().code, Errc::limit_exceeded);
 }
 
 TEST(Utf8, TellsWellFormedFromOtherText) {
