@@ -30,19 +30,6 @@ constexpr unsigned kPostsPerReceive = 32;
 
 constexpr Duration kCloseTimeout = 1s;  // ~Channel sends what was posted for so long
 
-// Whether what went wrong may go right when it is tried again soon.
-bool is_worth_waiting(Errc code) noexcept {
-  switch (code) {
-    case Errc::type_mismatch:
-    case Errc::protocol:
-    case Errc::invalid_argument:
-    case Errc::no_permission:
-      return false;
-    default:
-      return true;
-  }
-}
-
 Result<StreamInfo> stream_untrusted(const proto::Stream& message) {
   auto id = wire::stream_id_untrusted(message.id());
   if (!id) return std::move(id).error();
@@ -269,7 +256,7 @@ Result<void> Channel::get_up(MonoTime deadline) {
 // Whether an attempt to connect failed, after there had been `failed_before`, in a way that trying
 // again soon does not mend.
 bool Channel::is_hopeless_since(std::uint64_t failed_before) const noexcept {
-  return failed_attempts_ != failed_before && why_down_ && !is_worth_waiting(why_down_->code);
+  return failed_attempts_ != failed_before && why_down_ && !is_retryable(why_down_->code);
 }
 
 Error Channel::away(const std::string& how) const {
@@ -404,7 +391,7 @@ Result<void> Channel::exchange(Queue queue) {
       went_down(error);
       return error;
     }
-    if (why_down_ && !is_worth_waiting(why_down_->code)) return *why_down_;
+    if (why_down_ && !is_retryable(why_down_->code)) return *why_down_;
   }
 }
 

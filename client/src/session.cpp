@@ -47,12 +47,6 @@ Result<std::vector<StreamInfo>> listed(detail::Client& client, bool own_only) {
 // Between two tries for what is no event of a stream.
 constexpr Duration kLookAgain = std::chrono::milliseconds(500);
 
-// Whether a stream that cannot be opened because of this may be had later.
-bool is_worth_waiting_for(const Error& why) {
-  return why.code == Errc::not_found || why.code == Errc::clock_out_of_bounds ||
-         why.code == Errc::unavailable;
-}
-
 HostInfo host_info(const local::Host& message) {
   HostInfo host;
   host.name = message.name();
@@ -188,7 +182,7 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
   if (!watching) return std::move(watching).error().context(quoted("wait for", id));
   for (std::uint64_t seen = 0;;) {
     auto reader = open_raw_reader(id, wanted);
-    if (reader || !is_worth_waiting_for(reader.error())) return reader;
+    if (reader || !is_retryable(reader.error().code)) return reader;
     // That a clock is good again, or that a host answers again, is no event of a stream.
     const bool is_told = reader.error().code == Errc::not_found;
     const MonoTime next = is_told ? deadline : std::min(deadline, deadline_in(kLookAgain));

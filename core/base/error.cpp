@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The names of all that can go wrong, and of what clocks can be.
+// Names of the codes and enumerators, and which errors are retryable.
 #include <array>
 #include <cerrno>
 #include <cstddef>
@@ -51,6 +51,27 @@ std::string_view name_of(Errc code) noexcept {
       return "system";
   }
   return "system";
+}
+
+bool is_retryable(Errc code) noexcept {
+  switch (code) {
+    case Errc::not_found:
+    case Errc::limit_exceeded:
+    case Errc::no_memory:
+    case Errc::no_daemon:
+    case Errc::unavailable:
+    case Errc::clock_out_of_bounds:
+    case Errc::system:
+      return true;
+    case Errc::invalid_argument:
+    case Errc::type_mismatch:
+    case Errc::no_permission:
+    case Errc::protocol:
+    case Errc::conflict:
+    case Errc::closed:
+      return false;
+  }
+  return false;
 }
 
 std::string_view name_of(ReadStatus status) noexcept {

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// This PC's clock, with what dssmd knows of how far it may be from the fleet's (docs/clocks.md).
+// This PC's clock, and the bound on its distance from the fleet's reference (docs/clocks.md).
 #pragma once
 
 #include <dssm/clock_status.hpp>
@@ -10,16 +10,16 @@
 namespace dssm::clock {
 
 struct Reading {
-  Time time;      // by this PC's clock
-  Time earliest;  // the fleet's time lies between these two, both within;
-  Time latest;    // the ends of what a Time holds when nothing is known
+  Time time;      // of this PC's clock
+  Time earliest;  // the reference's time is from `earliest` to `latest`, both included;
+  Time latest;    // Time::min() and Time::max() while the bound is unknown
   Duration clock_error = kUnknownClockError;  // >= 0: time - earliest, latest - time
   ClockStatus status = ClockStatus::unknown;
 };
 
-// The time now. Takes what a Session of this process has brought: without one, or when dssmd is
-// gone for more than some seconds, nothing is known of the clock.
-//   threads  any; async-signal-safe
+// The time now with its bound. The bound comes from dssmd through a Session of this process: it is
+// unknown without a Session, and after dssmd has been unavailable for some seconds.
+//   threads  any thread; async-signal-safe
 //   cost     clock_gettime and some loads
 Reading now() noexcept;
 

@@ -1,11 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The PC's shared playback clock (SSM time): `speed * real time + offset`, or frozen while paused.
-// One record for all programs of this PC's dssmd; anyone who may connect may change it and all see
-// it at once. Players of recordings turn it; programs that read log time follow it.
+// All programs of this PC's dssmd share one record. Any program that may connect to dssmd may
+// change it, and all see the change at once. Players of recordings set it; programs that work on
+// recorded times read it.
 //
-//   threads  all functions may be called from any thread, readers also from signal handlers
-//   cost     reading takes no lock and makes no system call beyond clock_gettime
+//   threads  any thread may call any function; setting() and now_s() are async-signal-safe
+//   cost     setting() and now_s() take no lock; now_s() calls clock_gettime()
+//   moved    a moved-from object may only be assigned to or destroyed
+//   errors   none: Session::open_playback_clock() reports what can fail
 #pragma once
 
 #include <memory>
@@ -17,24 +20,25 @@ namespace detail {
 struct PlaybackClockState;
 }
 
-// Seconds since 1970 as a double, as SSM programs use them.
+// A handle; copies share one clock. Times are seconds since 1970 as a double, as in SSM.
 class PlaybackClock {
  public:
   struct Setting {
     double offset_s = 0;
-    double speed = 1;  // negative runs backwards, 0 stands
+    double speed = 1;  // negative: runs backwards; 0: stands still
     bool paused = false;
-    double paused_at_s = 0;  // the frozen time; meaningful while paused
+    double paused_at_s = 0;  // SSM time while paused
   };
 
-  // The setting as one consistent whole, never a mix of two.
+  // The present setting, never a mix of two.
   Setting setting() const noexcept;
 
   // SSM time now [s]: paused_at_s while paused, else speed * CLOCK_REALTIME + offset_s.
   double now_s() const noexcept;
 
-  // All setters keep the clock continuous unless they set the time itself. They are serialised by a
-  // robust lock; a process killed inside one leaves the old or the new setting.
+  // reset(), set_time() and set_offset() may change now_s() at once; set_speed() and set_paused()
+  // do not. A robust lock serialises all setters: a process that is killed inside one leaves the
+  // old or the new setting.
   void reset() noexcept;                  // offset 0, speed 1, not paused
   void set_time(double time_s) noexcept;  // SSM time becomes `time_s` now, paused or not
   void set_offset(double offset_s) noexcept;

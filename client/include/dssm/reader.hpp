@@ -2,20 +2,21 @@
 //
 // Reading a stream. RawReader works on bytes; Reader<T> on a trivially copyable T.
 //
-// A reader has a cursor: the tid of the last sample it returned. read_next() and read_previous() move
-// relative to it, wait() waits for something newer than it. Every read that returns `ok` sets it;
-// a read that returns anything else leaves cursor and arguments untouched.
+// A reader has a cursor: the tid of the last sample it returned. read_next() and read_previous()
+// move relative to it, wait() waits for a sample after it. Each read_...() of a payload, and
+// borrow(), sets it when it returns `ok`; with any other result, cursor and arguments keep their
+// values.
 //
-//   threads  one reader object belongs to one thread at a time; any number of readers may read one
-//            stream, in any processes, beside its writers
-//   cost     reading takes no lock and makes no system call; see docs/ring-layout.md
-//   life     a reader keeps its ring mapped, and stays usable after its Session object is gone and
-//            while dssmd is away
-//   moved    a moved-from reader may only be assigned to or destroyed
-//   anew     when the stream is removed and created anew, or its owner came back without its rings,
-//            the reader goes on with the new ring by itself: one read returns `restarted`, once
-//            (read_next() only after it has returned all that the old ring held), the cursor is kNoTid
-//            then, and tids begin anew. Until the new ring can be had the old one is read.
+//   threads   one reader belongs to one thread at a time; any number of readers, in any processes,
+//             may read one stream beside its writers
+//   cost      reading takes no lock and makes no system call (docs/ring-layout.md)
+//   lifetime  a reader keeps its ring mapped, and stays usable after its Session is destroyed and
+//             while dssmd is unavailable
+//   moved     a moved-from reader may only be assigned to or destroyed
+//   restart   when the stream is removed and recreated, or its owner lost its rings, the reader
+//             opens the new ring by itself. One read returns `restarted`, once (read_next() after
+//             it has returned all samples of the old ring). Then the cursor is kNoTid, and tids
+//             start at 0 again. Until the new ring can be opened, the old one is read
 #pragma once
 
 #include <cstddef>
@@ -34,17 +35,19 @@ namespace detail {
 struct ReaderState;
 }
 
-// A sample looked at in place, without a copy. The bytes are the ring's own: a writer that laps
-// the ring overwrites them under the reader's eyes, so use them, then ask still_valid(), and only
-// then believe what was computed. Valid no longer than the reader it came from.
+// A sample in its slot, read without a copy. A writer may overwrite the slot at any time: compute
+// with the payload first, then call still_valid(), and use the result only when it returns true.
+//
+//   lifetime  usable while its reader exists and until that reader returns `restarted` twice
+//   threads   one thread at a time
 class BorrowedSample {
  public:
-  // The payload; aligned to 64 bytes, and the 64 bytes behind it can be read as well. May change
-  // while it is looked at: treat as untrusted until still_valid() says true.
+  // The payload, aligned to 64 bytes; the 64 bytes after it are readable, too. It may change while
+  // it is read: untrusted until still_valid() returns true.
   std::span<const std::byte> payload() const noexcept { return payload_; }
   const SampleInfo& info() const noexcept { return info_; }
 
-  // Whether nothing was overwritten since borrow(): true means all that was read was the sample.
+  // Whether the slot was not overwritten since borrow(): all bytes read so far are the sample's.
   bool still_valid() const noexcept;
 
  private:
@@ -72,7 +75,10 @@ class RawReader {
 
   // --- reading by tid
 
-  // Copies the newest sample. `payload` is exactly payload_bytes() long in all calls below.
+  // In all functions: `payload` is exactly payload_bytes() long, another length ends the program;
+  // `restarted` is a further result of each that takes a payload or borrows.
+
+  // Copies the newest sample.
   //   returns  ok | not_yet (nothing written) | lapped
   ReadStatus read_newest(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
@@ -80,9 +86,9 @@ class RawReader {
   //   returns  ok | not_yet (tid > newest_tid()) | too_old (tid < oldest_tid(), or negative)
   ReadStatus read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
-  // Copies the sample after the cursor. The first call on a fresh reader returns the newest sample,
-  // as SSM does; call seek() before to start elsewhere. A reader that was lapped goes on with the
-  // oldest sample there is, and the tids in between are added to lost_samples().
+  // Copies the sample after the cursor. The first call on a new reader returns the newest sample,
+  // as in SSM; seek() selects another start. When the ring no longer holds the next sample, the
+  // oldest one it holds is returned, and the tids in between are added to lost_samples().
   //   returns  ok | not_yet | lapped
   ReadStatus read_next(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
@@ -91,15 +97,17 @@ class RawReader {
   ReadStatus read_previous(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   // --- reading by time
-  // All of these, find() too, return clock_out_of_bounds for a sample of another host that may be
-  // further from this PC's clock than is allowed (keys clock_policy and clock_limit of dssmd).
-  // Reading by tid is never refused: clock_in_bounds() tells such samples.
-  // Exact for every sequence of times, also one that runs backwards (docs/ring-layout.md "Search by
-  // time"). "The newest sample" is the one with the greatest tid.
+
+  // All of these, find() and find_neighbours() included, return clock_out_of_bounds for a sample of
+  // another host whose time may be further from this PC's clock than dssmd's keys clock_policy and
+  // clock_limit allow. Reads by tid never do: use clock_in_bounds() there.
+  //
+  // They are exact for every sequence of times, also one that runs backwards (docs/ring-layout.md
+  // "Search by time"). "The newest sample" is the one with the greatest tid.
   //   cost     O(1) on a regular stream, else O(log depth)
 
   // Copies the newest sample with time <= `t`; the newest sample of all for any `t` after it.
-  //   returns  ok | not_yet (nothing written) | too_old (all samples held lie after `t`) | lapped
+  //   returns  ok | not_yet (nothing written) | too_old (all samples are later than `t`) | lapped
   ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   // Copies the first sample from which on all samples have time >= `t`: the first one with
@@ -112,73 +120,75 @@ class RawReader {
   //   returns  ok | not_yet (nothing written) | lapped
   ReadStatus read_nearest(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
-  // The stamps of the two neighbours of `t`; read their payloads with read_tid(). Leaves the cursor.
+  // The infos of the two neighbours of `t`; read_tid() reads their payloads. Keeps the cursor.
   //   returns  ok | not_yet (no sample after `t` yet, or nothing written) | too_old | lapped
   ReadStatus find_neighbours(Time t, Neighbours& out) const noexcept;
 
-  // How far info.time may be from this PC's clock: its clock_error and what is known of both clocks
-  // at this moment. 0 for a stream of this PC, or of another host with the same kernel, which has
-  // the same clock; kUnknownClockError: unknown. `info` is of this reader's stream.
+  // The bound [ns, >= 0] on the distance of info.time from this PC's clock: info.clock_error plus
+  // the present bounds of both clocks. 0 for a stream of this PC or of a host on the same kernel,
+  // which has the same clock; kUnknownClockError: unknown. `info` comes from this reader.
   Duration clock_error(const SampleInfo& info) const noexcept;
-  // Whether that is allowed; always, where the stream's policy is `off`.
+  // Whether reads by time accept the sample: that bound is within the limit, or the policy is
+  // `off`.
   bool clock_in_bounds(const SampleInfo& info) const noexcept;
 
-  // --- stamps and places without payloads
+  // --- tids and infos without payloads
 
-  // Tid of the newest sample, kNoTid while nothing is written; of the oldest readable one.
+  // The tids of the newest and of the oldest readable sample; kNoTid while nothing is written.
   Tid newest_tid() const noexcept;
   Tid oldest_tid() const noexcept;
 
-  // Stamps of sample `tid`, without copying its payload. Leaves the cursor.
+  // The info of sample `tid`, without its payload. Keeps the cursor.
   //   returns  ok | not_yet | too_old
   ReadStatus read_info(Tid tid, SampleInfo& info) const noexcept;
 
-  // What read_at() would return, without its payload. Leaves the cursor.
+  // The info of the sample that read_at() would copy. Keeps the cursor.
+  //   returns  as read_at()
   ReadStatus find(Time t, SampleInfo& info) const noexcept;
 
-  // The cursor: tid of the last sample read, kNoTid on a fresh reader.
+  // The cursor: the tid of the last sample read; kNoTid on a new reader.
   Tid cursor() const noexcept;
 
-  // Puts the cursor on `tid`, so that read_next() returns tid + 1; kNoTid: read_next() starts at tid 0 or
-  // the oldest held. Any value is allowed.
+  // Sets the cursor to `tid`, so that read_next() returns tid + 1; kNoTid: read_next() starts at
+  // tid 0 or the oldest sample. Any value is allowed.
   void seek(Tid tid) noexcept;
 
-  // Samples that read_next() had to skip because the ring no longer held them: the writer was faster, or
-  // the link to the stream's host was down for longer than its ring reaches back.
+  // Samples that read_next() skipped because the ring no longer held them: the writer was faster,
+  // or the connection to the stream's host was down for longer than the host's ring keeps samples.
   std::uint64_t lost_samples() const noexcept;
 
-  // How often this reader went on with a new ring.
+  // How often the stream restarted while this reader read it.
   std::uint64_t restarts() const noexcept;
 
-  // Why this reader cannot go on with the stream's new ring (it has another type); nothing while
-  // all is well.
+  // Why this reader cannot use the stream's new ring (it has another type); empty otherwise.
   std::optional<Error> restart_error() const;
 
   // --- in place
 
-  // Looks at sample `tid` in place.
-  //   returns  as read_tid(); sets the cursor
+  // Finds sample `tid` in its slot, without a copy.
+  //   returns  as read_tid()
   ReadStatus borrow(Tid tid, BorrowedSample& out) noexcept;
 
   // --- waiting
 
-  // Waits until there is a sample newer than the cursor, or the stream began anew, or the monotonic
-  // clock reaches `deadline` (kNever: no limit; a deadline in the past: just look).
+  // Waits until there is a sample after the cursor, the stream has restarted, or the monotonic
+  // clock reaches `deadline` (kNever: no limit; a deadline in the past: only checks).
   WaitStatus wait(MonoTime deadline) noexcept;
 
-  // The same for newest_tid() >= `tid`. May run in one thread while another one uses this reader.
+  // The same for newest_tid() >= `tid`. One thread may call it while another one reads.
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
 
   // A descriptor for poll(), epoll or an event library: readable when there may be samples newer
-  // than at the last clear_ready(). On wake-up: clear_ready(), then read_next() until not_yet. The
-  // first call starts one thread per session that waits on behalf of all such descriptors.
-  // Owned by the reader; do not read or close it.
+  // than at the last clear_ready(). On wake-up call clear_ready(), then read_next() until it
+  // returns not_yet. The reader owns it: do not read or close it. One thread per session and 127
+  // readers, started by the first call, waits for all such descriptors.
+  //   fails    system, no_memory (no descriptor or thread left)
   Result<int> ready_fd() noexcept;
   void clear_ready() noexcept;
 
   // --- about the stream
 
-  // References stay good until a read returns `restarted`.
+  // References stay valid until a read returns `restarted`.
   const StreamId& id() const noexcept;    // with its owner's host
   const TypeInfo& type() const noexcept;  // as stored with the stream
   std::uint64_t payload_bytes() const noexcept;
@@ -186,7 +196,8 @@ class RawReader {
   Duration cycle() const noexcept;
   std::uint64_t incarnation() const noexcept;
 
-  // The stream's property; not_found when none is set. Asks dssmd.
+  // The stream's property: one request to dssmd.
+  //   fails    as Session::property()
   Result<std::vector<std::byte>> property() const;
 
  private:
@@ -207,21 +218,26 @@ struct JointSample {
 
 struct JointRead {
   ReadStatus status = ReadStatus::ok;
-  std::size_t index = 0;  // of the samples: why it is not ok; if it is, the one that is worst known
+  std::size_t index =
+      0;  // ok: the sample with the greatest bound; else the one that caused `status`
   Duration clock_error =
       kUnknownClockError;  // >= 0: how far the time of any of them may be from this
                            // PC's clock; also when that is the reason
 };
 
-// What at(t) gives of several streams: all of them or none.
-//   max_error  >= 0: no sample's time may be further from this PC's clock
-//   returns    as read_at(); clock_out_of_bounds also when max_error is not kept. Unless ok,
-//              payloads and infos are unspecified, and the cursors are where they were
+// Copies from each stream the sample that read_at(t) copies: from all of them or from none.
+//   max_error  >= 0: greatest bound accepted on the distance of a sample's time from this PC's
+//              clock
+//   returns    as read_at(), restarted included; clock_out_of_bounds also when a bound exceeds
+//              max_error. Unless ok, payloads and infos are unspecified, and cursors keep their
+//              values
+//   threads    each reader belongs to the calling thread
+//   cost       as one read_at() per stream
 JointRead read_joint_at(Time t, std::span<JointSample> samples,
                         Duration max_error = kUnknownClockError) noexcept;
 
-// Waits until one of `readers` has a sample newer than its cursor, or until `deadline`. At most
-// kMaxWaitAny readers; all must be valid. Returns `ready` also at once when one has already.
+// Waits until one of `readers` has a sample after its cursor or a restarted stream, or until
+// `deadline`. 1 to kMaxWaitAny readers, all of the calling thread.
 inline constexpr std::size_t kMaxWaitAny = 128;  // FUTEX_WAITV_MAX of Linux
 WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
 
@@ -253,7 +269,7 @@ class Reader : public RawReader {
     return RawReader::read_nearest(t, bytes(out), info);
   }
 
-  // For read_at() of several streams: this one's sample, to be put into `out`.
+  // This reader's part of a read_joint_at(), which copies the sample to `out`.
   JointSample joint_sample(T& out) noexcept { return {this, bytes(out), {}}; }
 
   // The borrowed payload as a T. Check still_valid() after the last use of what was read.

@@ -1,16 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // A Session is this process's connection to its PC's dssmd: it creates, opens, lists and watches
-// streams. Reading and writing itself goes past dssmd, through shared memory.
+// streams. Samples do not pass through dssmd: readers and writers use shared memory.
 //
-// When dssmd goes away (restart, crash), readers and writers keep working; the session reconnects
-// by itself, offers back the rings it still holds, and calls that need dssmd wait for it up to
-// `request_timeout`.
+// While dssmd is unavailable (restart, crash), readers and writers keep working. The session
+// reconnects by itself and offers the rings that it still holds to the new dssmd. Calls that need
+// dssmd wait for it up to `request_timeout`.
 //
-//   threads  all functions may be called from any thread. A session runs one thread of its own,
-//            with all signals blocked.
+//   threads  any thread may call any function. A session has one thread of its own, with all
+//            signals blocked
 //   fork     a child must connect a session of its own; using the parent's there is undefined
-//   errors   besides those named at each function: unavailable (no answer in time), protocol
+//   moved    a moved-from session may only be assigned to or destroyed
+//   errors   each function names its own; unavailable (no answer in time) and protocol can come
+//            from all that return a Result
 #pragma once
 
 #include <dssm/clock_status.hpp>
@@ -34,6 +36,7 @@ class Client;
 struct SessionOptions {
   std::string socket_path = {};  // empty: $DSSM_SOCKET, else /run/dssm/dssmd.sock
   std::string program = {};      // shown by dssmctl; empty: this program's name
+  // How long a call waits for dssmd's answer, reconnecting included.
   Duration request_timeout = std::chrono::seconds(5);
 };
 
@@ -49,8 +52,7 @@ struct OpenInfo {
   StreamId stream;
   std::int32_t creator_pid = 0;  // who created the stream
   std::int32_t opener_pid = 0;
-  std::uint32_t tag =
-      0;  // as given to open_reader() or open_writer(); SSM keeps its open mode here
+  std::uint32_t tag = 0;  // from create_raw() or open_raw_...(); SSM stores its open mode here
   Role role = Role::reader;
 };
 
@@ -62,10 +64,10 @@ struct DaemonInfo {
   std::uint64_t memory_bytes = 0;        // of all rings
   std::uint64_t memory_limit_bytes = 0;  // for all rings
 
-  // How it fares with finding other hosts by mDNS.
+  // The search for other hosts by mDNS.
   struct Mdns {
     std::string phase;              // "off", "waiting" (for the Avahi daemon), "running"
-    std::string error;              // why it waits, or what goes wrong; empty: nothing
+    std::string error;              // why it waits, or what fails; empty: nothing does
     std::string avahi_version;      // "avahi 0.8"
     std::uint32_t announced = 0;    // services: streams, and the host itself
     std::uint32_t withheld = 0;     // services that could not be announced
@@ -75,60 +77,62 @@ struct DaemonInfo {
   Mdns mdns;
 };
 
-// What a host says of its clock (docs/clocks.md), aged until now.
+// A host's clock as that host reports it (docs/clocks.md), aged to the present.
 struct ClockInfo {
   ClockStatus status = ClockStatus::unknown;
   ClockReason reason = ClockReason::none;
   ClockBasis basis = ClockBasis::nothing;
-  Duration offset{};      // its clock minus what its chronyd takes for the right time
-  std::string reference;  // whom it follows: a host's name or an address; empty: nobody
+  Duration offset{};      // its clock minus what its chronyd estimates as the true time
+  std::string reference;  // what it follows: a host's name or an address; empty: nothing
   std::uint16_t stratum = 0;
   Duration update_interval{};                // between two measurements of its chronyd
-  Duration age{};                            // of the last one
+  Duration age{};                            // of the last measurement
   Duration root_bound = kUnknownClockError;  // from UTC
   Duration distance = kUnknownClockError;    // greatest distance from this PC's clock
 };
 
-// A host of the fleet, as this PC's dssmd sees it: this PC itself, each configured peer, and each
-// host that was found by mDNS.
+// A host of the fleet as this PC's dssmd sees it: this PC itself, each configured peer, and each
+// host found by mDNS.
 struct HostInfo {
-  std::string name;                    // empty while it never answered
+  std::string name;                    // empty until it has answered
   std::vector<std::string> addresses;  // as configured and as reached: "pc2:13776"
   std::string version;                 // of its dssmd
-  std::string state;          // "self", "up", "connecting", "down", "refused", "closed" (it
-                              // was found by mDNS, but listens on its own loopback only)
-  Duration since{};           // how long it has been in this state
-  Duration round_trip{};      // of the last heartbeat, which comes once a second; 0: none
-  Duration min_round_trip{};  // of this connection's heartbeats; 0: none
-  std::uint32_t streams = 0;  // that it owns
-  Duration clock_bound = kUnknownClockError;  // of its samples' stamps, against the reference PC
-  std::optional<ClockInfo> clock;             // nothing: it says nothing of it
-  bool insecure = false;                      // its traffic crosses the network in the clear
-  std::string error;  // why it is not up, or a warning that concerns it; empty: all is well
-  std::string id;     // 32 hex digits, of the host whatever it is called; empty: not known
-  std::vector<std::string> found_by;  // "peer" (configured), "mdns"; empty: it is this PC
+  std::string state;                   // "self", "up", "connecting", "down", "refused", "closed"
+                                       // (found by mDNS, but listens on its own loopback only)
+  Duration since{};                    // how long it has been in this state
+  Duration round_trip{};               // of the last heartbeat (one a second); 0: none yet
+  Duration min_round_trip{};           // of all heartbeats of this connection; 0: none yet
+  std::uint32_t streams = 0;           // that it owns
+  Duration clock_bound = kUnknownClockError;  // of its samples' times, against the reference PC
+  std::optional<ClockInfo> clock;             // empty: it reports none
+  bool insecure = false;                      // its traffic is unencrypted
+  std::string error;                          // why it is not up, or a warning; empty: neither
+  std::string id;                     // 32 hex digits, independent of the name; empty: unknown
+  std::vector<std::string> found_by;  // "peer" (configured), "mdns"; empty: this PC
 };
 
-// A sign of life that was asked for.
+// The result of ping().
 struct RoundTrip {
   Duration round_trip{};  // from dssmd to dssmd and back
-  std::string address;    // where it was reached; empty: it is this PC
+  std::string address;    // that was used; empty: this PC
 };
 
-// What a watcher is told.
+// A change of the list of streams.
 struct StreamEvent {
   enum class Kind : std::uint8_t { added, removed };
   Kind kind = Kind::added;
   StreamInfo stream;  // for removed: identity only
 };
 
+// A handle; copies share one connection.
 class Session {
  public:
-  // Connects. Fails with no_daemon (nothing listens), no_permission (not in the socket's group),
-  // protocol (dssmd speaks an incompatible version).
+  // Connects.
+  //   fails  no_daemon (nothing listens), no_permission (not in the socket's group), protocol
+  //          (dssmd has an incompatible version), invalid_argument (socket_path)
   static Result<Session> connect(SessionOptions options = {});
 
-  Session(const Session&);  // copies share the connection
+  Session(const Session&);
   Session& operator=(const Session&);
   Session(Session&&) noexcept;
   Session& operator=(Session&&) noexcept;
@@ -136,33 +140,37 @@ class Session {
 
   // --- streams
 
-  // A stream's name may say whose it is: "lidar@pc2". Without a host, this PC's own stream of that
-  // name is meant if there is one, else the only other host's that is known; a new one is created
-  // on this PC. Wherever a stream is, reading and writing it is the same.
+  // A stream's name may name its host: "lidar@pc2". A name without a host means this PC's own
+  // stream of that name if there is one, else the only known stream of that name on another host.
+  // create without a host creates on this PC. Local and remote streams are read and written alike.
 
-  // Creates the stream and opens it for writing. When it exists with the same payload size, its
-  // ring is kept, whatever history was asked for, and the writer continues its tids.
+  // Creates the stream and opens it for writing. An existing stream with the same payload size
+  // keeps its ring and its history, and the writer continues its tids.
+  //   tag    stored with the open, see OpenInfo
   //   fails  invalid_argument (name, sizes), type_mismatch (exists with another size or type),
-  //          limit_exceeded, no_memory
+  //          limit_exceeded, no_memory, conflict (several hosts have a stream of that name)
   Result<RawWriter> create_raw(const StreamId& id, const TypeInfo& type, const History& history,
                                std::uint32_t tag = 0);
 
   // Opens an existing stream. With `wanted`, fails with type_mismatch unless
   // TypeInfo::check_usable_as(wanted).
-  //   fails  not_found, type_mismatch, clock_out_of_bounds (for reading on another host)
+  //   fails  not_found, type_mismatch, conflict (several hosts have a stream of that name),
+  //          clock_out_of_bounds (reading another host's stream)
   Result<RawWriter> open_raw_writer(const StreamId& id, const TypeInfo* wanted = nullptr,
                                     std::uint32_t tag = 0);
   Result<RawReader> open_raw_reader(const StreamId& id, const TypeInfo* wanted = nullptr,
                                     std::uint32_t tag = 0);
 
-  // Opens a stream for reading, waiting until `deadline` for it to be created, for its host to
-  // answer, and for the clocks of that and of this PC to be good enough.
-  //   fails  as open_raw_reader(); not_found, unavailable, clock_out_of_bounds when the deadline
-  //          passed
+  // Opens a stream for reading. Repeats, until `deadline`, what fails with an error that
+  // is_retryable(): waits for the stream to be created, for its host to answer, and for the clocks
+  // of both PCs to be good enough.
+  //   fails  as open_raw_reader(): at once with an error that is not retryable, at the deadline
+  //          with the last one
   Result<RawReader> await_raw_reader(const StreamId& id, MonoTime deadline,
                                      const TypeInfo* wanted = nullptr);
 
-  // The same with a type; `name` as StreamId::parse() reads it.
+  // The same with a type; `name` is parsed by StreamId::parse(), whose errors they also return.
+  // create() with a duration also returns those of History::for_life().
   template <Payload T>
   Result<Writer<T>> create(std::string_view name, const History& history) {
     return typed<Writer<T>>(
@@ -191,27 +199,27 @@ class Session {
         name, [&](const StreamId& id) { return await_raw_reader(id, deadline, &type); });
   }
 
-  // Removes a stream: it leaves the list at once and can be created anew; processes that have it
-  // open keep their ring until they close it.
-  //   fails  not_found
+  // Removes a stream: it leaves the list at once and can be created again. Processes that have it
+  // open keep its ring until they close it.
+  //   fails  not_found, conflict (several hosts have a stream of that name)
   Result<void> remove(const StreamId& id);
 
-  // All streams: first this PC's, then the other hosts' in the order of their names, each in the
-  // order of creation. A host that does not answer within half a second is listed with what is
-  // known of its streams; one that is down is left out.
+  // All streams: this PC's, then those of the other hosts in the order of host names; each host's
+  // in the order of creation. A host that does not answer within 0.5 s is listed with the last
+  // known data of its streams; a host that is down is left out.
   Result<std::vector<StreamInfo>> list_streams();
 
-  // Those of this PC only, in the order of creation.
+  // This PC's streams only, in the order of creation.
   Result<std::vector<StreamInfo>> list_own_streams();
 
-  // One stream, with its users.
-  //   fails  not_found
+  // One stream, with the processes that have it open.
+  //   fails  not_found, conflict (several hosts have a stream of that name)
   Result<StreamInfo> stream_info(const StreamId& id);
 
-  // Calls `on_event` for each stream that is there, then for each that comes or goes, until the
-  // watch is destroyed or the session's last copy is. Called from the session's thread: be short,
-  // and do not call the session from it. After a reconnect the streams that are there are told
-  // again, and those that are gone as removed.
+  // Calls `on_event` for each existing stream, then for each one added or removed, until the watch
+  // is destroyed. A stream that is recreated is reported as added again. The calls come from the
+  // session's thread, and from watch() itself: `on_event` must return soon and must not call the
+  // session. After a reconnect only differences are reported.
   class Watch {
    public:
     Watch(Watch&&) noexcept;
@@ -228,31 +236,34 @@ class Session {
 
   // --- properties
 
-  // A small constant block attached to a stream. No open is needed. At most 16 MiB, or what dssmd
-  // is configured to take.
-  //   fails  not_found (no stream; for get also: none set), limit_exceeded
+  // A constant block of bytes attached to a stream, which need not be open. At most 16 MiB, or the
+  // limit that dssmd is configured with; 0 bytes remove it.
+  //   fails  not_found (no such stream; property() also: none set), limit_exceeded, conflict
   Result<void> set_property(const StreamId& id, std::span<const std::byte> property);
   Result<std::vector<std::byte>> property(const StreamId& id);
 
   // --- other hosts
 
-  // This PC first, then the configured peers and those found by mDNS, each with its state at this
-  // moment.
+  // This PC first, then the configured peers and the hosts found by mDNS, each with its present
+  // state.
   Result<std::vector<HostInfo>> list_hosts();
 
-  // Asks the dssmd of that host for a sign of life, over the connection that this PC's dssmd keeps.
-  //   fails  not_found (no host of that name is up), conflict (several are), unavailable (it does
-  //          not answer)
+  // Measures a round trip from this PC's dssmd to that host's, over their open connection.
+  //   fails  not_found (no host of that name is up), conflict (several are), unavailable (no
+  //          answer)
   Result<RoundTrip> ping(const std::string& host);
 
-  // --- the rest
+  // --- this PC's dssmd
 
+  // The PC's shared playback clock. It stays usable after the Session is destroyed.
   Result<PlaybackClock> open_playback_clock();
+  // The processes connected to dssmd.
   Result<std::vector<ClientInfo>> list_clients();
+  // All streams that processes have open.
   Result<std::vector<OpenInfo>> list_opens();
   Result<DaemonInfo> daemon_info();
 
-  // Whether the connection stands at this moment.
+  // Whether the session is connected at this moment.
   bool is_connected() const noexcept;
 
  private:

@@ -2,15 +2,15 @@
 //
 // Writing a stream. RawWriter works on bytes; Writer<T> on a trivially copyable T.
 //
-//   threads  one writer object belongs to one thread at a time; several writers of one stream, in
-//            any threads and processes, are serialised by the ring's robust lock
-//   signals  not from a handler that may interrupt a write to the same stream in its own thread:
-//            it would wait for itself
-//   cost     a copy; no system call unless a reader sleeps on the stream or a remote one is
-//            subscribed. A writer that dies at any instruction blocks nobody.
-//   life     a writer keeps its ring mapped, and stays usable after its Session object is gone and
-//            while dssmd is away
-//   moved    a moved-from writer may only be assigned to or destroyed
+//   threads   one writer belongs to one thread at a time; the ring's robust lock serialises several
+//             writers of one stream, in any threads and processes
+//   signals   a signal handler must not write to a stream that its thread may be writing to: the
+//             lock would never be released
+//   cost      a copy; no system call unless a reader sleeps on the stream or a remote reader is
+//             subscribed. A writer that is killed at any instruction does not block others
+//   lifetime  a writer keeps its ring mapped, and stays usable after its Session is destroyed and
+//             while dssmd is unavailable
+//   moved     a moved-from writer may only be assigned to or destroyed
 #pragma once
 
 #include <cstddef>
@@ -27,26 +27,29 @@ namespace detail {
 struct WriterState;
 }
 
-// The next slot, to be filled in place. Holds the stream's writer lock: publish() or abandon() it
-// soon; destroying it abandons it. Not movable, so that it cannot outlive its writer unnoticed.
+// The next slot, to be filled in place. It holds the stream's writer lock: call publish() or
+// abandon() soon; the destructor abandons it. It must not outlive its writer, and is not movable.
+//   threads   the one that called loan()
 class LoanedSample {
  public:
   LoanedSample(const LoanedSample&) = delete;
   LoanedSample& operator=(const LoanedSample&) = delete;
   ~LoanedSample() { abandon(); }
 
-  // Whether the slot was lent: false when this thread holds another loan of this stream already.
+  // Whether there is a slot: false when this thread holds another LoanedSample of this stream, and
+  // after publish() or abandon().
   explicit operator bool() const noexcept { return !payload_.empty(); }
 
-  // The slot's payload, payload_bytes() long, aligned to 64 bytes; its content is unspecified. At
-  // least 64 bytes behind its end belong to nobody. Empty without a loan. Who fills it with
-  // non-temporal stores of their own ends them with a store fence (x86: sfence), as always.
+  // The slot's payload: payload_bytes() long, aligned to 64 bytes, with unspecified content; empty
+  // without a slot. At least 64 unused bytes follow it. Non-temporal stores into it need a store
+  // fence (x86: sfence) before publish().
   std::span<std::byte> payload() const noexcept { return payload_; }
 
-  // Makes the sample visible, stamped with `time`, and gives its tid. kNoTid without a loan.
+  // Makes the sample visible. Arguments as RawWriter::write().
+  //   returns  its tid; kNoTid without a slot
   Tid publish(Time time, Duration clock_error = kOwnClockError) noexcept;
 
-  // Gives the slot back; nobody sees what was written into it.
+  // Returns the slot; its content never becomes visible.
   void abandon() noexcept;
 
  private:
@@ -65,21 +68,23 @@ class RawWriter {
   // Writes one sample.
   //   payload      exactly payload_bytes() long
   //   time         when it was measured; stored as given, also when it runs backwards
-  //   clock_error  >= 0: bound on the error of `time`. kOwnClockError: the bound that dssmd knows
-  //                for this PC's clock at `time`, which was a few seconds ago at most. A time that
-  //                is more than 10 s from now does not come from this clock but from a recording:
-  //                it gets kForeignClockError
-  //   returns      its tid; kNoTid when the length is wrong or this thread holds a loan
+  //   clock_error  bound on the error of `time` [ns, >= 0], or
+  //                kOwnClockError: `time` is of this PC's clock, whose bound at that time is
+  //                stored; for a time more than 10 s from now kForeignClockError is stored, since
+  //                it is a recording's
+  //                kForeignClockError: `time` is of another clock
+  //   returns      its tid; kNoTid when the length is wrong or this thread holds a LoanedSample
   Tid write(std::span<const std::byte> payload, Time time = WallClock::now(),
             Duration clock_error = kOwnClockError) noexcept;
 
-  // Lends the next slot for filling in place. Waits for other writers of this stream.
+  // The next slot, to be filled in place. Waits for other writers of this stream.
   LoanedSample loan() noexcept;
 
-  // Replaces the stream's property (0 bytes: removes it). Asks dssmd.
+  // Replaces the stream's property (0 bytes: removes it): one request to dssmd.
+  //   fails  as Session::set_property()
   Result<void> set_property(std::span<const std::byte> property);
 
-  // Tid of the newest sample, kNoTid while nothing is written.
+  // The tid of the newest sample of any writer; kNoTid while nothing is written.
   Tid newest_tid() const noexcept;
 
   const StreamId& id() const noexcept;    // with its owner's host
@@ -106,7 +111,7 @@ class Writer : public RawWriter {
     return RawWriter::write(std::as_bytes(std::span<const T, 1>(&sample, 1)), time, clock_error);
   }
 
-  // The lent slot as a T, unspecified content; only while `loan` is true.
+  // The slot as a T with unspecified content; only while `loan` is true.
   static T& view(const LoanedSample& loan) noexcept {
     return *reinterpret_cast<T*>(loan.payload().data());
   }

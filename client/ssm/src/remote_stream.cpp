@@ -34,12 +34,6 @@ MonoTime give_up_at() {
   return deadline_in(Duration(std::max<std::int64_t>(0, ns_from_seconds(seconds))));
 }
 
-// Whether waiting may mend it: the other PC may start, the stream may be created.
-bool is_worth_waiting(Errc code) noexcept {
-  return code == Errc::no_daemon || code == Errc::unavailable || code == Errc::not_found ||
-         code == Errc::system || code == Errc::limit_exceeded;
-}
-
 // Tries until it works, fails for good, is interrupted, or is given up. What is wrong is said once.
 template <class Try>
 auto retry(const std::string& what, Try attempt) -> decltype(attempt()) {
@@ -48,7 +42,7 @@ auto retry(const std::string& what, Try attempt) -> decltype(attempt()) {
   std::string said;
   for (;;) {
     auto result = attempt();
-    if (result || !is_worth_waiting(result.error().code)) return result;
+    if (result || !is_retryable(result.error().code)) return result;
     if (MonoClock::now() >= give_up) return result;
     if (result.error().message != said) {
       said = result.error().message;

@@ -1,17 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// From a C++ struct to a TypeInfo. Without any help a type has a name, a size and an alignment;
-// one line adds its fields, for `dssmctl echo` and other tools:
+// From a C++ struct to a TypeInfo. Name, size and alignment of a type are known by themselves; one
+// line adds its fields, for `dssmctl echo` and other tools:
 //
 //   struct Odometry { double x, y, theta; float v[2]; };
 //   DSSM_DESCRIBE(Odometry, x, y, theta, v)
 //
-// The line stands in the struct's namespace, after the struct, lists up to 64 members, and names
-// the type by its first argument without namespaces, so that two programs which put the same
-// struct into different namespaces still understand each other. A member may be an arithmetic
-// type, an enum, an array or std::array of such, or another described struct. For a class with
-// private members, write by hand what the macro writes: a function
-// `dssm::TypeInfo dssm_describe(const T*)` found by argument-dependent lookup.
+// Write the line in the struct's namespace, after the struct; it lists up to 64 members. The type's
+// name is the first argument without namespaces, so that programs which have the struct in
+// different namespaces use one name. A member may be an arithmetic type, an enum, an array or
+// std::array of them, or another described struct. For a class with private members write what the
+// macro generates: a function `dssm::TypeInfo dssm_describe(const T*)` in the class's namespace.
+//
+//   threads  any
 #pragma once
 
 #include <array>
@@ -22,7 +23,7 @@
 #pragma GCC visibility push(default)  // the library hides everything else
 namespace dssm {
 
-// What a sample may be: copied as bytes, aligned to a cache line at most.
+// A type that a sample may have: trivially copyable, aligned to at most 64 bytes (a cache line).
 template <class T>
 concept Payload = std::is_trivially_copyable_v<T> && !std::is_const_v<T> && alignof(T) <= 64;
 
@@ -33,7 +34,7 @@ concept Described = requires(const T* null) {
 
 namespace detail {
 
-// T's name as the compiler spells it, e.g. "nav::Odometry".
+// T's name as the compiler prints it, e.g. "nav::Odometry".
 template <class T>
 std::string spelled_name() {
   std::string_view text =
@@ -114,8 +115,8 @@ void append_field(std::vector<Field>& fields, const std::string& name, std::uint
 
 }  // namespace detail
 
-// The TypeInfo of T: described by its DSSM_DESCRIBE line where there is one, a single field
-// "value" for arithmetic types, otherwise without fields.
+// The TypeInfo of T: with the fields of its DSSM_DESCRIBE line, with one field "value" for an
+// arithmetic type or an array of one, otherwise without fields.
 template <Payload T>
 TypeInfo type_of() {
   if constexpr (Described<T>) {

@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Failures: what they are (Errc) and what a person reads about them (Error). docs/errors.md says
-// for each code when it is used and whether trying again helps.
+// Failures: a code for programs (Errc) and a sentence for people (Error). docs/errors.md describes
+// when each code is used.
+//
+//   threads  any
 #pragma once
 
 #include <string>
@@ -12,30 +14,34 @@
 namespace dssm {
 
 enum class Errc {
-  invalid_argument,     // the caller's words are wrong: a name, a size, a duration, a configuration
+  invalid_argument,     // the caller's input is wrong: a name, a size, a duration, a setting
   not_found,            // no such stream, or no property
   type_mismatch,        // the stream has another payload size, alignment or type
   limit_exceeded,       // a configured limit of dssmd, or one of the format
-  no_memory,            // the machine has no memory for it
+  no_memory,            // the PC has no memory for it
   no_permission,        // the operating system or dssmd refuses this user
-  no_daemon,            // nothing listens at the socket
-  unavailable,          // dssmd was there and is gone; this process keeps trying
-  protocol,             // the other side speaks another version, or garbage
-  conflict,             // two things claim one name, e.g. a second dssmd in one folder
+  no_daemon,            // nothing listens at the socket or address
+  unavailable,          // dssmd does not answer or disconnected; this process keeps reconnecting
+  protocol,             // the other side has another protocol version, or sent invalid data
+  conflict,             // two things have one name, e.g. a second dssmd in one folder
   clock_out_of_bounds,  // two hosts' clocks may be further apart than is allowed
   closed,               // the object was closed by this process
-  system,               // the operating system failed; the message has its words
+  system,               // the operating system failed; the message quotes it
 };
 
-// The code's name as written in docs/errors.md, e.g. "not_found". Static storage.
+// The code's name as in docs/errors.md, e.g. "not_found". Static storage.
 std::string_view name_of(Errc code) noexcept;
+
+// Whether the same request may succeed later, when something outside this process changes: the
+// stream is created, dssmd answers again, memory is freed. The table in docs/errors.md lists it.
+bool is_retryable(Errc code) noexcept;
 
 // A value; copy and move freely.
 struct Error {
   Errc code = Errc::system;
   std::string message;  // what was tried, on what, why it failed, what to do; no trailing newline
 
-  // Puts "`what`: " in front, on the way up: the reader sees the outer intention first.
+  // Puts "`what`: " before the message: what was tried comes first.
   [[nodiscard]] Error context(std::string_view what) && {
     message.insert(0, std::string(what) + ": ");
     return std::move(*this);

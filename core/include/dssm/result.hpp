@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Result<T>: a value or an Error, with the member names of C++23's std::expected, which g++ 12
-// offers only under -std=c++23; when that is the minimum this file becomes an alias. Nothing in
-// DSSM throws, but for value() of a Result that holds an error: that is the edge for people who
-// prefer exceptions.
+// offers only under -std=c++23; when that is the minimum this file becomes an alias. DSSM throws
+// nothing except from value() of a Result that holds an error, for programs that prefer exceptions.
+//
+//   threads  as any value: no two threads may use one object if one of them changes it
 #pragma once
 
 #include <dssm/error.hpp>

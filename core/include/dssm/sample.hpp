@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What every sample carries beside its payload, and the outcomes of reading one.
+// What each sample has besides its payload, and the outcomes of reading one.
 #pragma once
 
 #include <cstdint>
@@ -13,32 +13,31 @@ namespace dssm {
 // The number of a sample in its stream: 0, 1, 2 ... in write order.
 using Tid = std::int64_t;
 
-// "No sample": the newest tid of a stream that nobody has written to yet.
+// No sample, e.g. the newest tid of a stream without samples.
 inline constexpr Tid kNoTid = -1;
 
 struct SampleInfo {
   Tid tid = kNoTid;
   Time time{};                                // when it was measured, by the writer's clock
-  Duration clock_error = kUnknownClockError;  // >= 0: how far `time` may be from the truth
+  Duration clock_error = kUnknownClockError;  // >= 0 [ns]: bound on the error of `time`
 };
 
-// Outcomes of a read: part of normal work, no text, nothing allocated.
+// Outcomes of a read: part of normal work, without a text.
 enum class [[nodiscard]] ReadStatus : std::uint8_t{
     ok,
-    not_yet,    // nothing is there yet: an empty stream, or a tid that is not written yet
+    not_yet,    // the stream is empty, or that sample is not written yet
     too_old,    // the ring no longer holds it
-    lapped,     // the writer overtook this reader again and again; nothing torn was returned
-    restarted,  // the stream began anew, with a new ring and new tids: the reader is on it now,
-                // call again
-    clock_out_of_bounds,  // reads by time: the clocks of this PC and the stream's host may be
-                          // further apart than is allowed (key clock_limit)
+    lapped,     // the writer overtook the reader 1,000 times in a row
+    restarted,  // the stream has a new ring with new tids; the reader uses it now: call again
+    clock_out_of_bounds,  // reads by time: the clocks of this PC and of the owner may differ
+                          // by more than dssmd's key clock_limit
 };
 
 // Outcomes of a wait.
 enum class [[nodiscard]] WaitStatus : std::uint8_t{
     ready,
     timeout,      // the deadline passed
-    interrupted,  // a signal handler ran; wait again or leave
+    interrupted,  // a signal handler ran
 };
 
 // "ok", "not_yet" ...; static storage.

@@ -1,7 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Names and descriptions of streams: what identifies one, what its samples look like, how much
-// history it keeps, and what is known about it at a moment. All plain values.
+// Names and descriptions of streams: identity, type of the samples, history, and present state.
+// All are plain values.
+//
+//   threads  as any value: no two threads may use one object if one of them changes it
 #pragma once
 
 #include <cstdint>
@@ -27,13 +29,15 @@ inline constexpr std::uint64_t kMaxDepth = 1ULL << 24;
 struct StreamId {
   std::string name;
   std::int32_t id = 0;
-  std::string host;  // empty: wherever it is
+  std::string host;  // empty: any host
 
-  // Reads "lidar", "lidar:1", "lidar:1@pc2". Fails with invalid_argument, saying what is wrong.
+  // Parses "lidar", "lidar:1", "lidar:1@pc2".
+  //   fails  invalid_argument
   static Result<StreamId> parse(std::string_view text);
 
-  // Checks name and id: 1 to kMaxNameBytes bytes, no control characters, none of ':' '@',
-  // id >= 0, and the full name at most kMaxFullNameBytes.
+  // Checks the name (UTF-8, 1 to kMaxNameBytes bytes without control characters, ':' and '@'), that
+  // id >= 0, and that str() has at most kMaxFullNameBytes.
+  //   fails  invalid_argument
   Result<void> check() const;
 
   // "name:id", with "@host" when there is a host.
@@ -42,7 +46,7 @@ struct StreamId {
   friend bool operator==(const StreamId&, const StreamId&) = default;
 };
 
-// What a field of a payload is.
+// The type of a field's elements.
 enum class Scalar : std::uint8_t {
   boolean = 1,
   character,
@@ -73,7 +77,7 @@ struct Field {
   friend bool operator==(const Field&, const Field&) = default;
 };
 
-// What a payload is. An empty name means "just bytes" and matches every name.
+// The type of a payload. An empty name means plain bytes and matches every name.
 struct TypeInfo {
   std::string name;
   std::uint64_t payload_bytes = 0;
@@ -83,24 +87,26 @@ struct TypeInfo {
   // "Odometry (40 bytes, aligned to 8)" or "40 bytes".
   std::string str() const;
 
-  // Whether a program that expects `wanted` may work on this stream: same size, same alignment,
-  // and the same name where both have one. Fails with type_mismatch, naming both types.
+  // Whether a program that expects `wanted` may use this stream: same size, and same name and
+  // alignment where both have a name.
+  //   fails  type_mismatch, naming both types
   Result<void> check_usable_as(const TypeInfo& wanted) const;
 
   // Checks sizes, alignment (a power of two up to 64) and that each field lies inside the payload.
+  //   fails  invalid_argument
   Result<void> check() const;
 
   friend bool operator==(const TypeInfo&, const TypeInfo&) = default;
 };
 
-// How much a ring keeps.
+// How many samples a ring keeps.
 struct History {
   std::uint64_t depth = 0;  // slots; depth - 1 samples are readable at any moment
-  Duration cycle{};         // expected time between two samples; only tools look at it
+  Duration cycle{};         // expected time between two samples, for tools and time search
 
-  // Enough slots for `life` of history at one sample per `cycle`, with SSM's 20 % margin:
-  // trunc(1.2 * life / cycle + 1). Fails with invalid_argument unless 0 < cycle <= life, and with
-  // limit_exceeded when that is more than kMaxDepth.
+  // Slots for `life` of history at one sample per `cycle`, with SSM's margin of 20 %:
+  // trunc(1.2 * life / cycle + 1).
+  //   fails  invalid_argument unless 0 < cycle <= life, limit_exceeded beyond kMaxDepth slots
   static Result<History> for_life(Duration life, Duration cycle);
 };
 
@@ -114,21 +120,21 @@ struct StreamUser {
   Role role = Role::reader;
 };
 
-// How this PC's copy of another host's stream is doing.
+// The state of this PC's mirror of another host's stream.
 struct MirrorInfo {
   std::string state;              // for people: "live", "filling", "connecting", "owner away" ...
-  std::uint64_t gap_samples = 0;  // lost: the owner's ring no longer held them when asked for
+  std::uint64_t gap_samples = 0;  // lost: the owner's ring no longer held them
   std::uint64_t reconnects = 0;
   std::uint64_t restarts = 0;  // times the owner's ring was replaced by a new one
-  Tid newest = kNoTid;         // newest sample that is here
+  Tid newest = kNoTid;         // newest sample in the mirror
   std::uint64_t received_samples = 0;
   std::uint64_t received_bytes = 0;  // of payloads
   std::string error;                 // why it is not live; empty when it is
-  std::string clock;  // why the times of its samples are not good; empty when they are
+  std::string clock;  // why the times of its samples are suspect; empty when they are not
 };
 
-// What is known about a stream at the moment of asking. Of a stream of another host: what its owner
-// knows, pids and users included.
+// The present state of a stream. For a stream of another host, pids and users are those of its
+// owner.
 struct StreamInfo {
   StreamId id;  // with its owner's host
   TypeInfo type;
@@ -144,11 +150,9 @@ struct StreamInfo {
   double rate_hz = 0;  // from the stamps of the newest samples; 0 when unknown
   std::uint32_t writers = 0;
   std::uint32_t readers = 0;
-  std::uint32_t channels = 0;  // connections from other hosts that carry it
-  std::vector<StreamUser>
-      users;  // filled by Session::stream_info(), not by Session::list_streams()
-  std::optional<MirrorInfo>
-      mirror;  // of another host's stream that is read here; by stream_info() only
+  std::uint32_t channels = 0;        // connections from other hosts that carry it
+  std::vector<StreamUser> users;     // from Session::stream_info() only
+  std::optional<MirrorInfo> mirror;  // the same; of another host's stream that is read here
 };
 
 }  // namespace dssm

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Time and durations. Three chrono types that do not convert into each other by accident: a point
-// on the wall clock, a point on the monotonic clock, and a duration. All count nanoseconds in a
-// signed 64-bit integer (design: "Times are signed 64-bit nanoseconds since the Unix epoch").
+// Times and durations: a point on the wall clock, a point on the monotonic clock, and a duration.
+// The compiler refuses to mix them. All count nanoseconds in a signed 64-bit integer.
+//
+//   threads  any; now() and deadline_in() call clock_gettime() and are async-signal-safe
 #pragma once
 
 #include <chrono>
@@ -16,7 +17,7 @@ using Duration = std::chrono::nanoseconds;
 
 namespace detail {
 
-// A clock of the operating system, as <chrono> wants clocks.
+// A clock of the operating system with the members that <chrono> requires.
 template <clockid_t kClock, bool kSteady>
 struct PosixClock {
   using duration = Duration;
@@ -33,27 +34,27 @@ struct PosixClock {
 
 }  // namespace detail
 
-// CLOCK_REALTIME: nanoseconds since 1970-01-01 00:00 UTC. Can be stepped; used for sample stamps
-// only.
+// CLOCK_REALTIME: nanoseconds since 1970-01-01 00:00 UTC. Can be stepped; used for the times of
+// samples only.
 using WallClock = detail::PosixClock<CLOCK_REALTIME, false>;
 
-// CLOCK_MONOTONIC: nanoseconds since boot. Never steps; used for every deadline and time-out.
+// CLOCK_MONOTONIC: nanoseconds since boot. Never steps; used for deadlines and timeouts.
 using MonoClock = detail::PosixClock<CLOCK_MONOTONIC, true>;
 
 using Time = WallClock::time_point;
 using MonoTime = MonoClock::time_point;
 
-// The bound on a stamp's error when nothing is known about the clock that made it.
+// The bound on a time's error when nothing is known about its clock.
 inline constexpr Duration kUnknownClockError = Duration::max();
 
-// Instead of a bound: the stamp is none of its PC's clock, but of a recording, or of a device with
-// a clock of its own. How good this PC's clock is says nothing about it.
+// Instead of a bound: the time is not of the writing PC's clock but of a recording, or of a device
+// with a clock of its own, so the bound of the PC's clock does not apply to it.
 inline constexpr Duration kForeignClockError = Duration::max() - Duration(1);
 
-// For writers: the stamp is one of this PC's clock, whose bound dssmd knows.
+// For writers: the time is of this PC's clock, whose bound dssmd knows.
 inline constexpr Duration kOwnClockError = Duration(-1);
 
-// A deadline that never comes.
+// No deadline.
 inline constexpr MonoTime kNever = MonoTime::max();
 
 // Nanoseconds since 1970 to a Time and back.
