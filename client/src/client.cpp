@@ -134,17 +134,14 @@ Result<Client::Handshake> Client::shake_hands() {
   local::Request hello;
   hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
   hello.mutable_hello()->set_program(options_.program);
-  hello.mutable_hello()->set_library_version(DSSM_VERSION);
+  hello.mutable_hello()->set_version(DSSM_VERSION);
   auto welcome = link.exchange(std::move(hello));
   if (!welcome)
     return std::move(welcome).error().context("greet dssmd at '" + options_.socket_path + "'");
-  if (!welcome->has_welcome() ||
-      welcome->welcome().protocol_version() != wire::kLocalProtocolVersion) {
-    return Error{Errc::protocol, "dssmd at '" + options_.socket_path + "' speaks version " +
-                                     std::to_string(welcome->welcome().protocol_version()) +
-                                     " of the local protocol, this program version " +
-                                     std::to_string(wire::kLocalProtocolVersion) +
-                                     "; install the same version of DSSM everywhere on this PC"};
+  if (!welcome->has_hello() || welcome->hello().protocol_version() != wire::kLocalProtocolVersion) {
+    return wire::other_protocol_version(
+        {"local", wire::kLocalProtocolVersion}, "dssmd at '" + options_.socket_path + "'",
+        welcome->hello().protocol_version(), welcome->hello().version());
   }
   open_clock_page(link);
   offer_streams(link);
@@ -321,10 +318,10 @@ Result<std::shared_ptr<OpenStream>> Client::open(local::Request request, Role ro
   if (!answer->response.has_opened()) {
     return Error{Errc::protocol, "dssmd answered something else than the opened stream"};
   }
-  const local::Opened& opened = answer->response.opened();
-  auto id = wire::stream_id_untrusted(opened.id());
+  const proto::Opened& opened = answer->response.opened();
+  auto id = wire::stream_id_untrusted(opened.stream().id());
   if (!id) return std::move(id).error();
-  auto type = wire::type_untrusted(opened.type());
+  auto type = wire::type_untrusted(opened.stream().type());
   if (!type) return std::move(type).error();
   auto ring = rings_.get(std::move(answer->fds),
                          role == Role::writer ? ring::Access::read_write : ring::Access::read_only,
@@ -449,7 +446,7 @@ void Client::remove_watch(std::uint64_t key) {
   watches_.erase(key);
 }
 
-void Client::on_stream_event(const local::StreamEvent& message) {
+void Client::on_stream_event(const proto::StreamEvent& message) {
   StreamEvent event{message.removed() ? StreamEvent::Kind::removed : StreamEvent::Kind::added,
                     wire::stream_info(message.stream())};
   const std::string name = event.stream.id.str();

@@ -122,7 +122,7 @@ class Client : public std::enable_shared_from_this<Client> {
   void keep();  // the keeper thread
   Result<void> read_connection(int socket);
   Result<void> dispatch(local::Response response);
-  void on_stream_event(const local::StreamEvent& message);
+  void on_stream_event(const proto::StreamEvent& message);
   void on_replaced(std::uint64_t handle);
   void on_rewatched();
   void start_using(Handshake link);

@@ -128,7 +128,7 @@ Result<RawWriter> Session::create_raw(const StreamId& id, const TypeInfo& type,
   if (Result<void> checked = type.check(); !checked)
     return std::move(checked).error().context(what);
   local::Request request;
-  local::Create& create = *request.mutable_create();
+  proto::Create& create = *request.mutable_create();
   wire::to_message(id, *create.mutable_id());
   wire::to_message(type, *create.mutable_type());
   create.set_depth(history.depth);

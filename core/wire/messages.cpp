@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/wire/messages.hpp"
 
+#include <fmt/format.h>
+
 namespace dssm::wire {
 namespace {
 
@@ -81,6 +83,15 @@ void to_message(const MirrorInfo& info, proto::Mirror& out) {
 void to_message(const Error& error, proto::Failure& out) {
   out.set_code(std::string(name_of(error.code)));
   out.set_message(error.message);
+}
+
+Error other_protocol_version(const ProtocolVersion& ours, const std::string& who,
+                             std::uint32_t theirs, const std::string& software) {
+  return {Errc::protocol,
+          fmt::format("{} speaks version {} of the {} protocol{}, this side (DSSM {}) version {}; "
+                      "install the same DSSM on both",
+                      who, theirs, ours.name, software.empty() ? "" : " (DSSM " + software + ")",
+                      DSSM_VERSION, ours.number)};
 }
 
 Result<StreamId> stream_id_untrusted(const proto::StreamId& message) {

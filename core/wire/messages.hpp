@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The way between the messages of proto/common.proto and the public types, for both protocols. The
-// functions named *_untrusted check every value they take over.
+// Converts between the messages of proto/common.proto and the public types, for both protocols. The
+// functions named *_untrusted check every value.
 #pragma once
 
 #include <dssm/result.hpp>
 #include <dssm/stream.hpp>
+#include <string>
+#include <string_view>
 
 #include "common.pb.h"
 
@@ -21,6 +23,17 @@ void to_message(const TypeInfo& type, proto::Type& out);
 void to_message(const MirrorInfo& info, proto::Mirror& out);
 void to_message(const StreamInfo& info, proto::Stream& out);
 void to_message(const Error& error, proto::Failure& out);
+
+// A protocol's name ("local", "network") and the version that this side speaks.
+struct ProtocolVersion {
+  std::string_view name;
+  std::uint32_t number = 0;
+};
+
+// Why this side cannot talk to `who`, who speaks version `theirs`.
+//   software  "0.3.0"; empty: not known
+Error other_protocol_version(const ProtocolVersion& ours, const std::string& who,
+                             std::uint32_t theirs, const std::string& software = {});
 
 // Messages to public types.
 Result<StreamId> stream_id_untrusted(const proto::StreamId& message);

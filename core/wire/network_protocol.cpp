@@ -69,7 +69,7 @@ std::string Greeting::str() const {
   return "'" + program + "' on host '" + host + "'";
 }
 
-void to_message(const Greeting& greeting, net::Hello& out) {
+void to_message(const Greeting& greeting, proto::Hello& out) {
   out.set_protocol_version(kNetworkProtocolVersion);
   out.set_host(greeting.host);
   out.set_host_id(greeting.host_id.data(), greeting.host_id.size());
@@ -82,14 +82,10 @@ void to_message(const Greeting& greeting, net::Hello& out) {
 
 Error other_protocol_version(const std::string& who, std::uint32_t theirs,
                              const std::string& software) {
-  return {Errc::protocol,
-          who + " speaks version " + std::to_string(theirs) + " of the network protocol" +
-              (software.empty() ? "" : " (DSSM " + software + ")") +
-              ", this side (DSSM " DSSM_VERSION ") version " +
-              std::to_string(kNetworkProtocolVersion) + "; install the same DSSM on both"};
+  return other_protocol_version({"network", kNetworkProtocolVersion}, who, theirs, software);
 }
 
-Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string& who) {
+Result<Greeting> greeting_untrusted(const proto::Hello& message, const std::string& who) {
   const bool words_are_good =
       message.program().size() <= kMaxProgramBytes && !has_control(message.program()) &&
       message.version().size() <= kMaxProgramBytes && !has_control(message.version());

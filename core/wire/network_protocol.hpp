@@ -49,13 +49,13 @@ struct Greeting {
   std::string str() const;  // "'mapper' on host 'pc3'", "dssmd of host 'pc2'"
 };
 
-void to_message(const Greeting& greeting, net::Hello& out);
+void to_message(const Greeting& greeting, proto::Hello& out);
 
 // Takes over the other side's Hello.
 //   fails  protocol: another version (the message names both versions and both sides, and says what
 //          to do), or values out of their limits
 //   who    for the message: "dssmd at '10.0.0.2:13776'", "the program at '10.0.0.3:40000'"
-Result<Greeting> greeting_untrusted(const net::Hello& message, const std::string& who);
+Result<Greeting> greeting_untrusted(const proto::Hello& message, const std::string& who);
 
 // Why this side cannot talk to `who`, who speaks `theirs`.
 //   software  "0.3.0"; empty: not known

@@ -45,7 +45,7 @@ class PeerConnection final : private Dialer::Observer {
     virtual void on_link_down(PeerConnection& link, const Error& why, bool attempt) = 0;
     // After watch(): a change of the peer's streams. Fails when that is nonsense.
     virtual Result<void> on_stream_event_untrusted(PeerConnection& link,
-                                                   const net::StreamEvent& event) = 0;
+                                                   const proto::StreamEvent& event) = 0;
     virtual void on_watched(PeerConnection& link) = 0;    // all that was there has been told
     virtual void on_heartbeat(PeerConnection& link) = 0;  // them() has news of the peer's clock
 

@@ -339,7 +339,8 @@ void Peers::take_over(const wire::HostId& id) {
   }
 }
 
-Result<void> Peers::on_stream_event_untrusted(PeerConnection& link, const net::StreamEvent& event) {
+Result<void> Peers::on_stream_event_untrusted(PeerConnection& link,
+                                              const proto::StreamEvent& event) {
   const wire::Greeting& them = *link.them();
   proto::StreamId named = event.stream().id();
   named.set_host(them.host);  // nobody speaks for another host

@@ -127,7 +127,7 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   void on_link_up(PeerConnection& link) override;
   void on_link_down(PeerConnection& link, const Error& why, bool attempt) override;
   Result<void> on_stream_event_untrusted(PeerConnection& link,
-                                         const net::StreamEvent& event) override;
+                                         const proto::StreamEvent& event) override;
   void on_watched(PeerConnection& link) override;
   void on_heartbeat(PeerConnection& link) override;
 

@@ -54,10 +54,10 @@ class Fleet {
   virtual Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
                                                           OfferedFiles files) = 0;
 
-  virtual void info(const StreamId& id, Then<proto::Stream> then) = 0;  // with mirror, when it has
-  virtual void get_property(const StreamId& id, Then<std::string> then) = 0;
-  virtual void set_property(const StreamId& id, std::string property, Then<void> then) = 0;
-  virtual void remove(const StreamId& id, Then<void> then) = 0;
+  // Has the owner of the stream `id` serve `request`: Info, GetProperty, SetProperty or Remove. The
+  // response to Info has `mirror` when this host mirrors the stream.
+  virtual void forward(const StreamId& id, const local::Request& request,
+                       Then<local::Response> then) = 0;
 
   // The streams of all other hosts, with fresh figures of those that answer within kFreshTimeout,
   // in the order of hosts' names, then of creation.

@@ -1,10 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/local/fleet_service.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <utility>
 
 #include "core/base/text.hpp"
+#include "core/base/try.hpp"
 #include "daemon/base/log.hpp"
 
 namespace dssm::daemon {
@@ -42,7 +45,29 @@ std::string_view phase_name(MdnsState::Phase phase) {
 }
 
 Error unexpected(const std::string& host) {
-  return Error{Errc::protocol, "host '" + host + "' answered something else than it was asked"};
+  return {Errc::protocol, fmt::format("host '{}' sent a response of another kind", host)};
+}
+
+// The request that has the owner of `id` do what a program asks for.
+net::Frame network_request(const StreamId& id, const local::Request& request) {
+  net::Frame frame;
+  proto::StreamId* named = nullptr;
+  switch (request.body_case()) {
+    case local::Request::kInfo:
+      named = frame.mutable_info()->mutable_id();
+      break;
+    case local::Request::kGetProperty:
+      named = frame.mutable_get_property()->mutable_id();
+      break;
+    case local::Request::kSetProperty:
+      frame.mutable_set_property()->set_property(request.set_property().property());
+      named = frame.mutable_set_property()->mutable_id();
+      break;
+    default:
+      named = frame.mutable_remove()->mutable_id();
+  }
+  wire::to_message(id, *named);
+  return frame;
 }
 
 }  // namespace
@@ -98,23 +123,6 @@ std::shared_ptr<Stream> FleetService::orphan(const StreamId& id) const {
   return !owner && owner.error().code == Errc::not_found ? std::move(mirror) : nullptr;
 }
 
-void FleetService::ask_owner(const StreamId& id, Fill fill, FromOwner then) {
-  when_known(id, [this, id, fill = std::move(fill), then = std::move(then)]() mutable {
-    const Result<const KnownHost*> owner = catalog_.find_owner(id);
-    if (!owner) return then({}, with_trouble(owner.error()));
-    const wire::Greeting& host = (*owner)->greeting;
-    net::Frame request;
-    proto::StreamId message;
-    wire::to_message(owned_by(**owner, id), message);
-    fill(request, message);
-    // In the catalog is who has a connection in use.
-    peers_.link_to(host.host_id)
-        ->ask(std::move(request), [name = host.host, then](Result<net::Frame> answer) {
-          then(name, std::move(answer));
-        });
-  });
-}
-
 void FleetService::open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) {
   when_known(id, [this, id, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
@@ -141,72 +149,55 @@ Result<std::shared_ptr<Stream>> FleetService::adopt_untrusted(const StreamId& id
 
 // --- about one stream
 
-proto::Stream FleetService::told_of_mirror(const Stream& mirror) const {
-  proto::Stream stream;
+local::Response FleetService::describe_mirror(const Stream& mirror) const {
+  local::Response response;
+  proto::Stream& stream = *response.mutable_stream_list()->add_streams();
   wire::to_message(mirror.info(), stream);
   mirrors_.describe(mirror.id(), *stream.mutable_mirror());
-  return stream;
+  return response;
 }
 
-void FleetService::info(const StreamId& id, Then<proto::Stream> then) {
-  ask_owner(
-      id,
-      [](net::Frame& request, const proto::StreamId& of) {
-        *request.mutable_info()->mutable_id() = of;
-      },
-      [this, id, then = std::move(then)](const std::string& owner, Result<net::Frame> answer) {
-        if (!answer) {
-          // What its mirror knows is better than nothing.
-          if (const auto mirror = orphan(id)) return then(told_of_mirror(*mirror));
-          return then(std::move(answer).error());
-        }
-        proto::StreamList& list = *answer->mutable_stream_list();
-        if (list.streams_size() != 1) return then(unexpected(owner));
-        Result<proto::Stream> stream = stream_untrusted(owner, std::move(*list.mutable_streams(0)));
-        if (!stream) return then(std::move(stream));
-        proto::Mirror mirror;
-        if (mirrors_.describe({id.name, id.id, owner}, mirror)) {
-          *stream->mutable_mirror() = std::move(mirror);
-        }
-        then(std::move(stream));
-      });
+void FleetService::forward(const StreamId& id, const local::Request& request,
+                           Then<local::Response> then) {
+  when_known(id, [this, id, request, then = std::move(then)]() mutable {
+    const Result<const KnownHost*> owner = catalog_.find_owner(id);
+    if (!owner) {
+      // Info of a mirror whose owner is unavailable comes from here.
+      const auto mirror = request.has_info() ? orphan(id) : nullptr;
+      return mirror ? then(describe_mirror(*mirror)) : then(with_trouble(owner.error()));
+    }
+    const StreamId named = owned_by(**owner, id);
+    // A host in the catalog has a connection.
+    peers_.link_to((*owner)->greeting.host_id)
+        ->ask(network_request(named, request), [this, named, body = request.body_case(),
+                                                then = std::move(then)](Result<net::Frame> answer) {
+          if (answer) return then(response_to(body, named, *std::move(answer)));
+          const auto mirror = body == local::Request::kInfo ? orphan(named) : nullptr;
+          mirror ? then(describe_mirror(*mirror)) : then(std::move(answer).error());
+        });
+  });
 }
 
-void FleetService::get_property(const StreamId& id, Then<std::string> then) {
-  ask_owner(
-      id,
-      [](net::Frame& request, const proto::StreamId& of) {
-        *request.mutable_get_property()->mutable_id() = of;
-      },
-      [then = std::move(then)](const std::string&, Result<net::Frame> answer) {
-        if (!answer) return then(std::move(answer).error());
-        then(std::move(*answer->mutable_property()->mutable_property()));
-      });
-}
-
-void FleetService::set_property(const StreamId& id, std::string property, Then<void> then) {
-  ask_owner(
-      id,
-      [property = std::move(property)](net::Frame& request, const proto::StreamId& of) mutable {
-        *request.mutable_set_property()->mutable_id() = of;
-        request.mutable_set_property()->set_property(std::move(property));
-      },
-      [then = std::move(then)](const std::string&, Result<net::Frame> answer) {
-        if (!answer) return then(std::move(answer).error());
-        then({});
-      });
-}
-
-void FleetService::remove(const StreamId& id, Then<void> then) {
-  ask_owner(
-      id,
-      [](net::Frame& request, const proto::StreamId& of) {
-        *request.mutable_remove()->mutable_id() = of;
-      },
-      [then = std::move(then)](const std::string&, Result<net::Frame> answer) {
-        if (!answer) return then(std::move(answer).error());
-        then({});
-      });
+Result<local::Response> FleetService::response_to(local::Request::BodyCase request,
+                                                  const StreamId& id, net::Frame answer) const {
+  local::Response response;
+  switch (request) {
+    case local::Request::kInfo: {
+      if (answer.stream_list().streams_size() != 1) return unexpected(id.host);
+      proto::Stream& stream = *response.mutable_stream_list()->add_streams();
+      stream = DSSM_TRY(
+          stream_untrusted(id.host, std::move(*answer.mutable_stream_list()->mutable_streams(0))));
+      proto::Mirror mirror;
+      if (mirrors_.describe(id, mirror)) *stream.mutable_mirror() = std::move(mirror);
+      break;
+    }
+    case local::Request::kGetProperty:
+      *response.mutable_property() = std::move(*answer.mutable_property());
+      break;
+    default:
+      response.mutable_done();
+  }
+  return response;
 }
 
 // --- lists

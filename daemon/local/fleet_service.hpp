@@ -56,10 +56,8 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
   void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) override;
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
                                                   OfferedFiles files) override;
-  void info(const StreamId& id, Then<proto::Stream> then) override;
-  void get_property(const StreamId& id, Then<std::string> then) override;
-  void set_property(const StreamId& id, std::string property, Then<void> then) override;
-  void remove(const StreamId& id, Then<void> then) override;
+  void forward(const StreamId& id, const local::Request& request,
+               Then<local::Response> then) override;
   void list(Then<std::vector<proto::Stream>> then) override;
   std::vector<StreamInfo> known_streams() const override;
   std::vector<local::Host> hosts() const override;
@@ -77,13 +75,12 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
     bool done = false;
   };
 
-  using Fill = std::function<void(net::Frame&, const proto::StreamId&)>;
-  using FromOwner = std::function<void(const std::string& owner, Result<net::Frame>)>;
-  void ask_owner(const StreamId& id, Fill fill, FromOwner then);
+  Result<local::Response> response_to(local::Request::BodyCase request, const StreamId& id,
+                                      net::Frame answer) const;
   void when_known(const StreamId& id, std::function<void()> go_on);
   Error with_trouble(Error error) const;
   std::shared_ptr<Stream> orphan(const StreamId& id) const;
-  proto::Stream told_of_mirror(const Stream& mirror) const;
+  local::Response describe_mirror(const Stream& mirror) const;
   std::vector<const KnownHost*> hosts_by_name() const;
   void on_list_answer(Listing& listing, const wire::HostId& id, Result<net::Frame> answer);
   void finish(Listing& listing);

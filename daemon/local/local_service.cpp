@@ -101,7 +101,7 @@ bool LocalService::refuse(const Client& client, std::uint64_t serial, const Erro
   return false;
 }
 
-bool LocalService::greet(Client& client, std::uint64_t serial, const local::Hello& hello) {
+bool LocalService::greet(Client& client, std::uint64_t serial, const proto::Hello& hello) {
   if (client.greeted) {
     return refuse(client, serial, {Errc::protocol, "Hello comes once, as the first request"});
   }
@@ -111,20 +111,17 @@ bool LocalService::greet(Client& client, std::uint64_t serial, const local::Hell
   client.identity = std::make_shared<ClientIdentity>(std::move(identity));
   if (hello.protocol_version() != wire::kLocalProtocolVersion) {
     return refuse(client, serial,
-                  {Errc::protocol,
-                   "this dssmd (" DSSM_VERSION ") speaks version " +
-                       std::to_string(wire::kLocalProtocolVersion) +
-                       " of the local protocol, the program speaks version " +
-                       std::to_string(hello.protocol_version()) +
-                       "; install the same version of DSSM on both sides and restart the older"});
+                  wire::other_protocol_version({"local", wire::kLocalProtocolVersion},
+                                               "the program " + client.identity->str(),
+                                               hello.protocol_version()));
   }
   client.greeted = true;
   logger_.debug("client came", {.peer = client.identity->str()});
   Reply reply;
-  local::Welcome& welcome = *reply.response.mutable_welcome();
-  welcome.set_protocol_version(wire::kLocalProtocolVersion);
-  welcome.set_host(registry_.host());
-  welcome.set_daemon_version(DSSM_VERSION);
+  proto::Hello& ours = *reply.response.mutable_hello();
+  ours.set_protocol_version(wire::kLocalProtocolVersion);
+  ours.set_host(registry_.host());
+  ours.set_version(DSSM_VERSION);
   send(client, serial, std::move(reply));
   return true;
 }
@@ -138,7 +135,7 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
     return serve_remote(number, request, descriptors);
   }
   const auto identity = clients_.at(number).identity;
-  Result<Reply> reply = requests_.handle_untrusted(identity, request, descriptors);
+  Result<Reply> reply = requests_.serve_untrusted(identity, request, descriptors);
   if (request.has_offer()) log_offer(*identity, request.offer(), reply);
   if (request.has_get_daemon() && reply && remote_) {
     remote_->complete_daemon(*reply->response.mutable_daemon());
@@ -258,7 +255,7 @@ void LocalService::send_failure(const Client& client, std::uint64_t serial, cons
   client.output->send(wire::encode_frame(failure_response(serial, error)), {});
 }
 
-void LocalService::broadcast(const local::StreamEvent& event) {
+void LocalService::broadcast(const proto::StreamEvent& event) {
   std::vector<ClientNumber> watchers;  // sending may end connections
   for (const auto& [number, client] : clients_) {
     if (client.watching) watchers.push_back(number);
@@ -275,7 +272,7 @@ void LocalService::broadcast(const local::StreamEvent& event) {
 }
 
 void LocalService::on_stream_added(const Stream& stream) {
-  local::StreamEvent event;
+  proto::StreamEvent event;
   describe(stream, opens_, *event.mutable_stream());
   broadcast(event);
   logger_.debug("stream '" + stream.id().str() + "' is there",
@@ -285,7 +282,7 @@ void LocalService::on_stream_added(const Stream& stream) {
 
 void LocalService::on_stream_removed(const Stream& stream) {
   const StreamId& id = stream.id();
-  local::StreamEvent event;
+  proto::StreamEvent event;
   event.set_removed(true);
   wire::to_message(id, *event.mutable_stream()->mutable_id());
   broadcast(event);
@@ -295,14 +292,14 @@ void LocalService::on_stream_removed(const Stream& stream) {
 }
 
 void LocalService::on_remote_stream_added(const StreamInfo& stream) {
-  local::StreamEvent event;
+  proto::StreamEvent event;
   wire::to_message(stream, *event.mutable_stream());
   broadcast(event);
   look_for_successors(stream.id);
 }
 
 void LocalService::on_remote_stream_removed(const StreamId& id) {
-  local::StreamEvent event;
+  proto::StreamEvent event;
   event.set_removed(true);
   wire::to_message(id, *event.mutable_stream()->mutable_id());
   broadcast(event);
@@ -349,7 +346,7 @@ bool LocalService::must_wait(const local::Request& request) const {
   if (request.has_open_clock()) return !request.open_clock().offered() && !clock_.has_one();
   // Whoever watches would be told that streams are gone which are about to come back.
   if (request.has_watch()) return true;
-  const proto::StreamId* subject = StreamRequests::subject(request);
+  const proto::StreamId* subject = LocalRequests::subject(request);
   if (!subject) return false;
   // A name that is no name is refused at once.
   const Result<StreamId> id = wire::stream_id_untrusted(*subject);

@@ -30,8 +30,8 @@
 #include "core/base/unique_fd.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/local/fleet.hpp"
+#include "daemon/local/local_requests.hpp"
 #include "daemon/local/remote_requests.hpp"
-#include "daemon/local/stream_requests.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"
@@ -94,7 +94,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   };
 
   bool refuse(const Client& client, std::uint64_t serial, const Error& error);
-  bool greet(Client& client, std::uint64_t serial, const local::Hello& hello);
+  bool greet(Client& client, std::uint64_t serial, const proto::Hello& hello);
   void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
   void serve_remote(ClientNumber number, const local::Request& request,
                     DescriptorQueue& descriptors);
@@ -106,7 +106,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void list_clients(const Client& client, std::uint64_t serial);
   void send(const Client& client, std::uint64_t serial, Reply reply);
   void send_failure(const Client& client, std::uint64_t serial, const Error& error);
-  void broadcast(const local::StreamEvent& event);
+  void broadcast(const proto::StreamEvent& event);
 
   bool must_wait(const local::Request& request) const;
   void hold(Client& client, const local::Request& request, std::size_t bytes);
@@ -125,7 +125,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   OpenTable& opens_;
   PlaybackClockOwner& clock_;
   Logger& logger_;
-  StreamRequests requests_;
+  LocalRequests requests_;
   Fleet* fleet_;
   std::optional<RemoteRequests> remote_;  // with a fleet
   bool recovering_;

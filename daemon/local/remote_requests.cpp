@@ -3,27 +3,15 @@
 
 #include <utility>
 
-#include "daemon/local/stream_requests.hpp"
+#include "daemon/local/local_requests.hpp"
 
 namespace dssm::daemon {
-namespace {
-
-// An answer without content, as `then` of a request that has none.
-Fleet::Then<void> answer_done(RemoteRequests::Answer answer) {
-  return [answer = std::move(answer)](Result<void> result) {
-    if (!result) return answer(std::move(result).error());
-    answer(done());
-  };
-}
-
-}  // namespace
-
 bool RemoteRequests::takes(const local::Request& request,
                            const std::function<bool(const StreamId&)>& own_knows) const {
   if (request.has_list_hosts() || request.has_ping_host() || request.has_open_clock_page()) {
     return true;
   }
-  const proto::StreamId* subject = StreamRequests::subject(request);
+  const proto::StreamId* subject = LocalRequests::subject(request);
   if (!subject) return false;
   const Result<StreamId> id = wire::stream_id_untrusted(*subject);
   if (!id) return false;  // refused like any other
@@ -37,7 +25,7 @@ void RemoteRequests::handle_untrusted(const Client& client, const local::Request
   if (request.has_list_hosts()) return answer(list_hosts());
   if (request.has_open_clock_page()) return answer(open_clock_page());
   if (request.has_ping_host()) return ping(request.ping_host().host(), std::move(answer));
-  const StreamId id = *wire::stream_id_untrusted(*StreamRequests::subject(request));
+  const StreamId id = *wire::stream_id_untrusted(*LocalRequests::subject(request));
   switch (request.body_case()) {
     case local::Request::kCreate:
       return create(client, id, request.create(), std::move(answer));
@@ -45,31 +33,16 @@ void RemoteRequests::handle_untrusted(const Client& client, const local::Request
       return open(client, id, request.open(), std::move(answer));
     case local::Request::kOffer:
       return answer(offer(client, id, request.offer(), descriptors));
-    case local::Request::kInfo:
-      return fleet_.info(id, [answer = std::move(answer)](Result<proto::Stream> stream) {
-        if (!stream) return answer(std::move(stream).error());
-        Reply reply;
-        *reply.response.mutable_stream_list()->add_streams() = *std::move(stream);
-        answer(std::move(reply));
-      });
-    case local::Request::kGetProperty:
-      return fleet_.get_property(id, [answer = std::move(answer)](Result<std::string> property) {
-        if (!property) return answer(std::move(property).error());
-        Reply reply;
-        reply.response.mutable_property()->set_property(*std::move(property));
-        answer(std::move(reply));
-      });
-    case local::Request::kSetProperty:
-      return fleet_.set_property(id, request.set_property().property(),
-                                 answer_done(std::move(answer)));
-    case local::Request::kRemove:
-      return fleet_.remove(id, answer_done(std::move(answer)));
     default:
-      return answer(Error{Errc::protocol, "there is no such request about a stream"});
+      return fleet_.forward(id, request,
+                            [answer = std::move(answer)](Result<local::Response> response) {
+                              if (!response) return answer(std::move(response).error());
+                              answer(Reply{*std::move(response), {}});
+                            });
   }
 }
 
-void RemoteRequests::create(const Client& client, const StreamId& id, const local::Create& request,
+void RemoteRequests::create(const Client& client, const StreamId& id, const proto::Create& request,
                             Answer answer) {
   const Result<TypeInfo> type = wire::type_untrusted(request.type());
   if (!type) return answer(type.error());
@@ -88,7 +61,7 @@ void RemoteRequests::create(const Client& client, const StreamId& id, const loca
       });
 }
 
-void RemoteRequests::open(const Client& client, const StreamId& id, const local::Open& request,
+void RemoteRequests::open(const Client& client, const StreamId& id, const proto::Open& request,
                           Answer answer) {
   if (Result<void> room = opens_.check_quota(*client); !room)
     return answer(std::move(room).error());
@@ -120,7 +93,7 @@ Result<Reply> RemoteRequests::offer(const Client& client, const StreamId& id,
   const Result<std::shared_ptr<Stream>> stream =
       fleet_.adopt_untrusted(id, role, *std::move(files));
   if (!stream) return stream.error();
-  return noted_open(opens_, {client, *stream, role, request.tag(), request.any_host()});
+  return record_open(opens_, {client, *stream, role, request.tag(), request.any_host()});
 }
 
 void RemoteRequests::complete_list(Reply own, Answer answer) {

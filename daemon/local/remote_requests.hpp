@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // What clients may ask about streams of other hosts, and about the hosts: from the protocol's
-// messages to Fleet and OpenTable, and back. The counterpart of StreamRequests; answers may take as
+// messages to Fleet and OpenTable, and back. The counterpart of LocalRequests; responses may take as
 // long as the other host takes.
 #pragma once
 
@@ -40,9 +40,9 @@ class RemoteRequests {
   void complete_daemon(local::Daemon& daemon) const { *daemon.mutable_mdns() = fleet_.mdns(); }
 
  private:
-  void create(const Client& client, const StreamId& id, const local::Create& request,
+  void create(const Client& client, const StreamId& id, const proto::Create& request,
               Answer answer);
-  void open(const Client& client, const StreamId& id, const local::Open& request, Answer answer);
+  void open(const Client& client, const StreamId& id, const proto::Open& request, Answer answer);
   Result<Reply> offer(const Client& client, const StreamId& id, const local::Offer& request,
                       DescriptorQueue& descriptors);
   Reply list_hosts() const;

@@ -3,6 +3,8 @@
 
 #include <utility>
 
+#include "core/base/try.hpp"
+
 namespace dssm::daemon {
 
 Reply done() {
@@ -28,21 +30,20 @@ Result<OfferedFiles> offered_files(DescriptorQueue& queue, Role role) {
   return files;
 }
 
-Reply noted_open(OpenTable& opens, const OpenEntry& entry) {
+Reply record_open(OpenTable& opens, const OpenEntry& entry) {
   Reply reply;
-  local::Opened& message = *reply.response.mutable_opened();
+  proto::Opened& message = *reply.response.mutable_opened();
   message.set_handle(opens.add(entry));
-  wire::to_message(entry.stream->id(), *message.mutable_id());
-  wire::to_message(entry.stream->type(), *message.mutable_type());
+  wire::to_message(entry.stream->id(), *message.mutable_stream()->mutable_id());
+  wire::to_message(entry.stream->type(), *message.mutable_stream()->mutable_type());
   return reply;
 }
 
 Result<Reply> opened(OpenTable& opens, const OpenEntry& entry) {
-  if (Result<void> room = opens.check_quota(*entry.client); !room) return std::move(room).error();
-  Result<std::vector<UniqueFd>> descriptors = entry.stream->descriptors_for(entry.role);
-  if (!descriptors) return std::move(descriptors).error();
-  Reply reply = noted_open(opens, entry);
-  reply.descriptors = *std::move(descriptors);
+  DSSM_TRY(opens.check_quota(*entry.client));
+  std::vector<UniqueFd> descriptors = DSSM_TRY(entry.stream->descriptors_for(entry.role));
+  Reply reply = record_open(opens, entry);
+  reply.descriptors = std::move(descriptors);
   return reply;
 }
 

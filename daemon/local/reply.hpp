@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What an answer to a program is made of, and the answers that several requests share.
+// A response to a program with its descriptors, and the responses that several requests share.
 #pragma once
 
 #include <deque>
@@ -14,7 +14,7 @@
 
 namespace dssm::daemon {
 
-// An answer and the descriptors that go with it, in the order that local.proto says.
+// A response and the descriptors that go with it, in the order that local.proto says.
 struct Reply {
   local::Response response;
   std::vector<UniqueFd> descriptors;
@@ -24,10 +24,10 @@ struct Reply {
 // descriptors takes the oldest element.
 using DescriptorQueue = std::deque<std::vector<UniqueFd>>;
 
-// Lists leave room for what frames them; fields of types go first when a list gets too long.
+// Of a StreamList; the rest of a frame is for the response around it.
 inline constexpr std::size_t kMaxListBytes = wire::kMaxLocalFrameBytes - (1U << 20);
 
-// Success with nothing to tell.
+// Success without content.
 Reply done();
 
 // The descriptors of the oldest message that brought any.
@@ -37,11 +37,11 @@ std::vector<UniqueFd> take_descriptors(DescriptorQueue& queue);
 //   fails  protocol: some are missing
 Result<OfferedFiles> offered_files(DescriptorQueue& queue, Role role);
 
-// Notes that a client has a stream open and tells it so, without descriptors.
-Reply noted_open(OpenTable& opens, const OpenEntry& entry);
+// Records that a client has a stream open. The reply comes without descriptors.
+Reply record_open(OpenTable& opens, const OpenEntry& entry);
 
 // The same, with the descriptors that go with a Create or an Open.
-//   fails  limit_exceeded (opens), os errors; then nothing is noted
+//   fails  limit_exceeded (opens), os errors; then nothing is recorded
 Result<Reply> opened(OpenTable& opens, const OpenEntry& entry);
 
 }  // namespace dssm::daemon

@@ -96,7 +96,7 @@ Result<void> Mirror::on_frame(net::Frame& frame) {
   }
 }
 
-Result<void> Mirror::on_opened_untrusted(const net::Opened& opened) {
+Result<void> Mirror::on_opened_untrusted(const proto::Opened& opened) {
   if (step_ != Step::opening) return unexpected_frame("Opened");
   const Result<StreamInfo> theirs = owner_stream_untrusted(opened, id_);
   if (!theirs) return theirs.error();

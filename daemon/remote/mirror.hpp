@@ -103,7 +103,7 @@ class Mirror final : private OwnerConnection::Observer, private FrameConnection:
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   void on_batch_end() override;
 
-  Result<void> on_opened_untrusted(const net::Opened& opened);
+  Result<void> on_opened_untrusted(const proto::Opened& opened);
   Result<void> on_subscribed_untrusted(const net::Subscribed& subscribed);
   void on_caught_up();
   Result<void> on_gap_untrusted(const net::Gap& gap);

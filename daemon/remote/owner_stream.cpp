@@ -9,7 +9,7 @@
 
 namespace dssm::daemon {
 
-Result<StreamInfo> owner_stream_untrusted(const net::Opened& opened, const StreamId& expected) {
+Result<StreamInfo> owner_stream_untrusted(const proto::Opened& opened, const StreamId& expected) {
   const Result<StreamId> id = wire::stream_id_untrusted(opened.stream().id());
   if (!id) return id.error();
   if (*id != expected) {

@@ -13,7 +13,7 @@ namespace dssm::daemon {
 
 // The stream in `opened`, which must be `expected`.
 //   fails  protocol
-Result<StreamInfo> owner_stream_untrusted(const net::Opened& opened, const StreamId& expected);
+Result<StreamInfo> owner_stream_untrusted(const proto::Opened& opened, const StreamId& expected);
 
 // `what` came out of turn.
 Error unexpected_frame(const char* what);

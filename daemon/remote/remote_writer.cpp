@@ -54,7 +54,7 @@ void RemoteWriter::ask() {
     plan = CreatePlan{ring_->stream()->type(), history_};
   }
   if (plan) {
-    net::Create& create = *frame.mutable_create();
+    proto::Create& create = *frame.mutable_create();
     wire::to_message(id_, *create.mutable_id());
     wire::to_message(plan->type, *create.mutable_type());
     create.set_depth(plan->history.depth);
@@ -100,7 +100,7 @@ Result<void> RemoteWriter::on_frame(net::Frame& frame) {
   }
 }
 
-Result<void> RemoteWriter::on_opened_untrusted(const net::Opened& opened) {
+Result<void> RemoteWriter::on_opened_untrusted(const proto::Opened& opened) {
   if (step_ != Step::opening) return unexpected_frame("Opened");
   const Result<StreamInfo> theirs = owner_stream_untrusted(opened, id_);
   if (!theirs) return theirs.error();

@@ -91,7 +91,7 @@ class RemoteWriter final : private OwnerConnection::Observer,
   void on_gap(Tid first, std::uint64_t count) override;
 
   void ask();
-  Result<void> on_opened_untrusted(const net::Opened& opened);
+  Result<void> on_opened_untrusted(const proto::Opened& opened);
   Result<void> follow(const StreamInfo& theirs);
   Result<void> take_ring(std::unique_ptr<OutgoingRing> ring);
   Result<void> on_publishing_untrusted(const net::Publishing& publishing);

@@ -3,14 +3,26 @@
 
 #include <utility>
 
+#include "core/base/try.hpp"
 #include "daemon/base/message_ids.hpp"
 #include "daemon/streams/description.hpp"
 
 namespace dssm::daemon {
 namespace {
 
+// What receivers take of a frame, less what frames a list.
+constexpr std::size_t kMaxPlainListBytes = wire::kMaxPlainBytes - (4U << 10);
+
 bool opens_a_stream(const net::Frame& request) noexcept {
-  return request.body_case() == net::Frame::kOpen || request.body_case() == net::Frame::kCreate;
+  return request.has_open() || request.has_create();
+}
+
+// Whether only a control connection takes `request`. A channel takes requests for properties too:
+// there without a name.
+bool is_control(const net::Frame& request) noexcept {
+  return request.has_list() || request.has_watch() || request.has_info() || request.has_remove() ||
+         (request.has_set_property() && request.set_property().has_id()) ||
+         (request.has_get_property() && request.get_property().has_id());
 }
 
 }  // namespace
@@ -22,7 +34,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
       place_(std::move(place)),
       peer_address_(std::move(peer_address)),
       link_(parts.loop, std::move(transport), *this, kMaxQueuedBytes),
-      control_(parts.registry, parts.opens),
+      catalog_(parts.registry, parts.opens, kMaxPlainListBytes),
       next_turn_(EventSource::timer(parts.loop, [this] { work_now(); })),
       greeting_is_late_(EventSource::timer(
           parts.loop,
@@ -100,7 +112,7 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
     parts_.observer.on_heartbeat();
     return {};
   }
-  if (!channel_ && ControlRequests::is_control(request)) return serve_control(request);
+  if (!channel_ && is_control(request)) return serve_control(request);
   if (!channel_ && opens_a_stream(request)) {
     if (is_control_) {
       return Error{Errc::protocol, "this is a control connection; open another one for the stream"};
@@ -123,7 +135,7 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
   }
   net::Frame answer;
   answer.set_serial(request.serial());
-  if (Result<void> done = control_.serve_untrusted(request, answer); !done) return done;
+  DSSM_TRY(catalog_.serve_untrusted(request, answer));
   link_.send(answer);
   return {};
 }
@@ -145,12 +157,9 @@ void DataCommunicator::send_failure(std::uint64_t serial, const Error& error) {
 // --- opening
 
 Result<void> DataCommunicator::open(const net::Frame& request) {
-  const Result<StreamId> id = wire::stream_id_untrusted(request.open().id());
-  if (!id) return id.error();
-  Result<std::shared_ptr<Stream>> stream = parts_.registry.find(*id);
-  if (!stream) return std::move(stream).error();
-  if (Result<void> known = check_clock((*stream)->id()); !known) return known;
-  opening_ = {request.serial(), *std::move(stream), false, std::nullopt};
+  std::shared_ptr<Stream> stream = DSSM_TRY(catalog_.find_untrusted(request.open().id()));
+  DSSM_TRY(check_clock(stream->id()));
+  opening_ = {request.serial(), std::move(stream), false, std::nullopt};
   return go_on_opening();
 }
 
@@ -159,18 +168,11 @@ Result<void> DataCommunicator::check_clock(const StreamId& id) const {
 }
 
 Result<void> DataCommunicator::create(const net::Frame& request) {
-  const net::Create& create = request.create();
-  const Result<StreamId> id = wire::stream_id_untrusted(create.id());
-  if (!id) return id.error();
-  const Result<TypeInfo> type = wire::type_untrusted(create.type());
-  if (!type) return type.error();
-  if (Result<void> known = check_clock(*id); !known) return known;
-  // No program of this host is the creator.
-  Result<Registry::Created> created =
-      parts_.registry.create(*id, *type, {create.depth(), Duration(create.cycle_ns())}, 0);
-  if (!created) return std::move(created).error();
-  opening_ = {request.serial(), created->stream, created->created, std::nullopt};
-  if (created->created) opening_->reservation.emplace(created->stream);
+  const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.create().id()));
+  DSSM_TRY(check_clock(id));
+  const Registry::Created created = DSSM_TRY(catalog_.create_untrusted(request.create(), 0));
+  opening_ = {request.serial(), created.stream, created.created, std::nullopt};
+  if (created.created) opening_->reservation.emplace(created.stream);
   return go_on_opening();
 }
 
@@ -194,7 +196,7 @@ Result<void> DataCommunicator::go_on_opening() {
   }
   const Opening opening = *std::exchange(opening_, std::nullopt);
   channel_ = std::make_unique<StreamChannel>(
-      StreamChannel::Parts{parts_.loop, parts_.registry, link_, place_.budget(), *this, parts_.self,
+      StreamChannel::Parts{parts_.loop, catalog_, link_, place_.budget(), *this, parts_.self,
                            *them_, parts_.clock},
       parts_.streams.get(opening.stream), them_->has_feature(wire::kFeatureTorn));
   net::Frame answer;

@@ -3,7 +3,7 @@
 // The server end of one connection from another host or a remote program: greets, brings requests
 // to whoever serves them, and watches that they take turns. What the connection is for its first
 // request says: a channel carries one stream (StreamChannel), a control connection asks about all
-// of them (ControlRequests, StreamWatch).
+// of them (CatalogRequests, StreamWatch).
 //
 // Backpressure: a request is served only while nothing waits to be sent; until then one waits here
 // and the others on the peer's side. So a peer that asks and never reads costs one answer.
@@ -19,12 +19,12 @@
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/link/frame_connection.hpp"
-#include "daemon/serve/control_requests.hpp"
 #include "daemon/serve/peer_table.hpp"
 #include "daemon/serve/ring_reservation.hpp"
 #include "daemon/serve/served_stream.hpp"
 #include "daemon/serve/stream_channel.hpp"
 #include "daemon/serve/stream_watch.hpp"
+#include "daemon/streams/catalog_requests.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
 
@@ -115,7 +115,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   std::optional<net::Frame> waiting_;   // a request whose turn has not come; the link is paused
   int served_ = 0;                      // in this turn
   bool is_control_ = false;
-  ControlRequests control_;
+  CatalogRequests catalog_;
   std::unique_ptr<StreamWatch> watch_;
   std::optional<Opening> opening_;
   std::unique_ptr<StreamChannel> channel_;

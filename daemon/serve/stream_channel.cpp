@@ -5,8 +5,8 @@
 #include <cmath>
 #include <utility>
 
+#include "core/base/try.hpp"
 #include "core/wire/messages.hpp"
-#include "daemon/streams/description.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -59,9 +59,8 @@ Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
     case net::Frame::kStartPublishing:
       return start_publishing(request.serial(), request.start_publishing());
     case net::Frame::kSetProperty:
-      return set_property(request.serial(), request.set_property());
     case net::Frame::kGetProperty:
-      return get_property(request.serial());
+      return serve_property(request);
     case net::Frame::kOpen:
     case net::Frame::kCreate:
       return Error{Errc::protocol, "this channel carries '" + stream().id().str() +
@@ -351,21 +350,9 @@ Result<void> StreamChannel::assess_writer() {
   return served_->assess(parts_.clock->assess_own(id));
 }
 
-Result<void> StreamChannel::set_property(std::uint64_t serial, const net::SetProperty& request) {
-  if (Result<void> set = parts_.registry.set_property(stream().id(), request.property()); !set) {
-    return set;
-  }
-  net::Frame frame = answer_to(serial);
-  frame.mutable_done();
-  parts_.link.send(frame);
-  return {};
-}
-
-Result<void> StreamChannel::get_property(std::uint64_t serial) {
-  Result<std::string> property = property_of(stream());
-  if (!property) return std::move(property).error();
-  net::Frame frame = answer_to(serial);
-  frame.mutable_property()->set_property(*std::move(property));
+Result<void> StreamChannel::serve_property(const net::Frame& request) {
+  net::Frame frame = answer_to(request.serial());
+  DSSM_TRY(parts_.catalog.serve_untrusted(request, frame, &stream().id()));
   parts_.link.send(frame);
   return {};
 }

@@ -17,7 +17,7 @@
 #include "daemon/link/sample_sender.hpp"
 #include "daemon/serve/sample_receiver.hpp"
 #include "daemon/serve/served_stream.hpp"
-#include "daemon/streams/registry.hpp"
+#include "daemon/streams/catalog_requests.hpp"
 
 namespace dssm::daemon {
 
@@ -36,7 +36,7 @@ class StreamChannel final : private SamplePump::Observer,
   };
   struct Parts {
     const EventLoop& loop;
-    Registry& registry;
+    CatalogRequests& catalog;
     FrameConnection& link;
     MemoryBudget& budget;  // of the peer
     Observer& observer;
@@ -85,8 +85,7 @@ class StreamChannel final : private SamplePump::Observer,
   Result<void> get_range(std::uint64_t serial, const net::GetRange& request);
   Result<void> start_publishing(std::uint64_t serial, const net::StartPublishing& request);
   Result<void> assess_writer();
-  Result<void> set_property(std::uint64_t serial, const net::SetProperty& request);
-  Result<void> get_property(std::uint64_t serial);
+  Result<void> serve_property(const net::Frame& request);
 
   void go_on_reading();
   SendStatus begin_reading();

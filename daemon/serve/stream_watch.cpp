@@ -46,7 +46,7 @@ void StreamWatch::on_stream_added(const Stream& stream) {
 // Also of one that was not told yet: whoever does not know it has nothing to forget.
 void StreamWatch::on_stream_removed(const Stream& stream) {
   net::Frame frame;
-  net::StreamEvent& event = *frame.mutable_stream_event();
+  proto::StreamEvent& event = *frame.mutable_stream_event();
   event.set_removed(true);
   wire::to_message(stream.id(), *event.mutable_stream()->mutable_id());
   event.mutable_stream()->set_incarnation(stream.incarnation());

@@ -38,24 +38,22 @@ class LateFleet final : public Fleet {
                                                   OfferedFiles files) override {
     return pc2_.adopt_untrusted(id, std::move(files));
   }
-  void info(const StreamId& id, Then<proto::Stream> then) override {
-    due_.push_back([this, id, then = std::move(then)] {
-      const Result<std::shared_ptr<Stream>> stream = ring(id);
-      if (!stream) return then(stream.error());
-      proto::Stream message;
-      wire::to_message((*stream)->info(), message);
-      then(std::move(message));
+  void forward(const StreamId& id, const local::Request& request,
+               Then<local::Response> then) override {
+    if (request.has_remove()) replace(id);
+    due_.push_back([this, id, body = request.body_case(), then = std::move(then)] {
+      local::Response response;
+      if (body == local::Request::kInfo) {
+        const Result<std::shared_ptr<Stream>> stream = ring(id);
+        if (!stream) return then(stream.error());
+        wire::to_message((*stream)->info(), *response.mutable_stream_list()->add_streams());
+      } else if (body == local::Request::kGetProperty) {
+        response.mutable_property()->set_property("x");
+      } else {
+        response.mutable_done();
+      }
+      then(std::move(response));
     });
-  }
-  void get_property(const StreamId&, Then<std::string> then) override {
-    due_.push_back([then = std::move(then)] { then(std::string("x")); });
-  }
-  void set_property(const StreamId&, std::string, Then<void> then) override {
-    due_.push_back([then = std::move(then)] { then({}); });
-  }
-  void remove(const StreamId& id, Then<void> then) override {
-    replace(id);
-    due_.push_back([then = std::move(then)] { then({}); });
   }
   void list(Then<std::vector<proto::Stream>> then) override {
     due_.push_back([this, then = std::move(then)] {
@@ -73,6 +71,7 @@ class LateFleet final : public Fleet {
   }
   std::vector<local::Host> hosts() const override { return std::vector<local::Host>(2); }
   local::Mdns mdns() const override { return {}; }
+  Result<UniqueFd> clock_page() const override { return Error{Errc::not_found, "no page here"}; }
   void ping(const std::string&, Then<local::RoundTrip> then) override {
     due_.push_back([then = std::move(then)] { then(local::RoundTrip()); });
   }

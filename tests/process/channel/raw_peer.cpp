@@ -94,7 +94,7 @@ std::string RawPeer::final_failure() {
   }
 }
 
-net::Opened RawPeer::open(const std::string& name) {
+proto::Opened RawPeer::open(const std::string& name) {
   net::Frame request;
   request.mutable_open()->mutable_id()->set_name(name);
   const Received answer = ask(request);
@@ -103,10 +103,10 @@ net::Opened RawPeer::open(const std::string& name) {
   return answer.frame.opened();
 }
 
-net::Opened RawPeer::create(const std::string& name, std::uint64_t payload_bytes,
-                            std::uint64_t depth) {
+proto::Opened RawPeer::create(const std::string& name, std::uint64_t payload_bytes,
+                              std::uint64_t depth) {
   net::Frame request;
-  net::Create& create = *request.mutable_create();
+  proto::Create& create = *request.mutable_create();
   create.mutable_id()->set_name(name);
   create.mutable_type()->set_payload_bytes(payload_bytes);
   create.mutable_type()->set_alignment_bytes(8);

@@ -48,12 +48,12 @@ class RawPeer final : private wire::FrameDelegate {
   std::string final_failure();
 
   // Opens or creates a stream for this channel.
-  net::Opened open(const std::string& name);
-  net::Opened create(const std::string& name, std::uint64_t payload_bytes, std::uint64_t depth);
+  proto::Opened open(const std::string& name);
+  proto::Opened create(const std::string& name, std::uint64_t payload_bytes, std::uint64_t depth);
 
   int fd() const { return socket_.get(); }
   void close() { socket_.reset(); }
-  const net::Hello& server() const { return server_; }
+  const proto::Hello& server() const { return server_; }
 
  private:
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
@@ -64,7 +64,7 @@ class RawPeer final : private wire::FrameDelegate {
   wire::FrameDecoder decoder_{*this, wire::kMaxNetworkFrameBytes};
   std::deque<Received> received_;
   Received arriving_;
-  net::Hello server_;
+  proto::Hello server_;
   std::uint64_t serial_ = 0;
 };
 

@@ -32,7 +32,7 @@ with open("/proc/sys/kernel/random/boot_id", "rb") as boot_id_file:
 def compile_messages(proto_folder):
     """The Python classes of proto/*.proto, made by protoc."""
     with tempfile.TemporaryDirectory() as folder:
-        files = [os.path.join(proto_folder, name) for name in ("common.proto", "network.proto")]
+        files = [os.path.join(proto_folder, name) for name in ("common.proto", "catalog.proto", "network.proto")]
         command = ["protoc", "--proto_path=" + proto_folder, "--python_out=" + folder]
         subprocess.run(command + files, check=True)
         sys.path.insert(0, folder)

@@ -24,7 +24,7 @@ RawClient::RawClient(const std::string& socket_path, bool greet, const std::stri
   hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
   hello.mutable_hello()->set_program(program);
   const Answer answer = ask(hello);
-  EXPECT_TRUE(answer.response.has_welcome()) << answer.response.failure().message();
+  EXPECT_TRUE(answer.response.has_hello()) << answer.response.failure().message();
 }
 
 std::uint64_t RawClient::send(local::Request request, std::span<const int> descriptors) {
@@ -82,7 +82,7 @@ bool RawClient::has_answer() {
 
 local::Request create_request(const std::string& name, std::uint64_t depth) {
   local::Request request;
-  local::Create& create = *request.mutable_create();
+  proto::Create& create = *request.mutable_create();
   create.mutable_id()->set_name(name);
   create.mutable_type()->set_name("Odometry");
   create.mutable_type()->set_payload_bytes(24);

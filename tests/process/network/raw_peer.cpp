@@ -117,7 +117,7 @@ std::optional<net::Frame> RawPeer::greet(const std::vector<std::string>& feature
 
 net::Frame hello_frame(std::uint32_t protocol_version, const std::vector<std::string>& features) {
   net::Frame frame;
-  net::Hello& hello = *frame.mutable_hello();
+  proto::Hello& hello = *frame.mutable_hello();
   hello.set_protocol_version(protocol_version);
   hello.set_host("raw");
   hello.set_host_id(std::string(16, 'r'));

@@ -24,14 +24,14 @@ Greeting mapper() {
   return greeting;
 }
 
-net::Hello hello() {
-  net::Hello message;
+proto::Hello hello() {
+  proto::Hello message;
   to_message(mapper(), message);
   return message;
 }
 
 // Checks that the greeting is refused with a text that holds `why`.
-void expect_refused(const net::Hello& message, const std::string& why) {
+void expect_refused(const proto::Hello& message, const std::string& why) {
   const auto greeting = greeting_untrusted(message, "the program at '10.0.0.3:4'");
   ASSERT_FALSE(greeting) << why;
   EXPECT_EQ(greeting.error().code, Errc::protocol);
@@ -58,7 +58,7 @@ TEST(Greeting, CrossesTheWire) {
 }
 
 TEST(Greeting, NamesBothVersionsAndBothSidesWhenTheyDiffer) {
-  net::Hello message = hello();
+  proto::Hello message = hello();
   message.set_protocol_version(9);
   message.set_version("7.1.0");
   message.clear_host_id();  // whatever else changed: the version is what counts
@@ -66,11 +66,11 @@ TEST(Greeting, NamesBothVersionsAndBothSidesWhenTheyDiffer) {
   expect_refused(message, "version 1; install the same DSSM on both");
   message.set_version("\n");
   expect_refused(message, "speaks version 9 of the network protocol, this side");
-  expect_refused(net::Hello(), "speaks version 0");
+  expect_refused(proto::Hello(), "speaks version 0");
 }
 
 TEST(Greeting, ChecksEveryValue) {
-  net::Hello message = hello();
+  proto::Hello message = hello();
   for (const char* host : {"", "pc.3", "pc 3", "\xc3\xa4", "a-name-of-thirty-two-characters-x"}) {
     message.set_host(host);
     expect_refused(message, "a host name");
@@ -97,7 +97,7 @@ TEST(Greeting, ChecksEveryValue) {
 }
 
 TEST(Greeting, TakesValuesAtTheirLimits) {
-  net::Hello message = hello();
+  proto::Hello message = hello();
   message.set_host(std::string(31, 'z'));
   message.set_program(std::string(127, 'x'));
   message.clear_features();
@@ -106,7 +106,7 @@ TEST(Greeting, TakesValuesAtTheirLimits) {
 }
 
 TEST(Greeting, SaysNothingOfTheClockUnlessItIsKnown) {
-  net::Hello message = hello();
+  proto::Hello message = hello();
   message.clear_clock();
   EXPECT_EQ(clock_bound_of(*greeting_untrusted(message, "x")), kUnknownClockError);
   message = hello();

@@ -67,7 +67,7 @@ class FakePeer {
   }
   void tell(const std::string& name, bool removed, const std::string& as_host = "") {
     net::Frame frame;
-    net::StreamEvent& event = *frame.mutable_stream_event();
+    proto::StreamEvent& event = *frame.mutable_stream_event();
     event.set_removed(removed);
     event.mutable_stream()->mutable_id()->set_name(name);
     event.mutable_stream()->mutable_id()->set_host(as_host);

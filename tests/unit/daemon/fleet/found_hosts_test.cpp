@@ -403,7 +403,7 @@ TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheySpeakAnotherVersion) {
   peers->on_host_found(other);
   look_around();
   EXPECT_EQ(host().state(), "refused");
-  net::Hello hello;
+  proto::Hello hello;
   wire::to_message(pc2, hello);
   hello.set_protocol_version(77);
   hello.clear_version();

@@ -73,7 +73,7 @@ class FakeClient final : public ClientOutput {
     local::Request hello;
     hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
     hello.mutable_hello()->set_program("test");
-    EXPECT_TRUE(ask(hello).has_welcome());
+    EXPECT_TRUE(ask(hello).has_hello());
     return *this;
   }
 
@@ -90,7 +90,7 @@ class FakeClient final : public ClientOutput {
 
 inline local::Request create_request(const std::string& name) {
   local::Request request;
-  local::Create& create = *request.mutable_create();
+  proto::Create& create = *request.mutable_create();
   create.mutable_id()->set_name(name);
   wire::to_message(odometry_type(), *create.mutable_type());
   create.set_depth(16);

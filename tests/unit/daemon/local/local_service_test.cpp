@@ -30,8 +30,8 @@ TEST(LocalService, WelcomesAProgramThatSpeaksItsVersion) {
   hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
   const local::Response response = client.ask(hello);
   EXPECT_EQ(response.serial(), 1u);
-  EXPECT_EQ(response.welcome().host(), "pc1");
-  EXPECT_EQ(response.welcome().daemon_version(), DSSM_VERSION);
+  EXPECT_EQ(response.hello().host(), "pc1");
+  EXPECT_EQ(response.hello().version(), DSSM_VERSION);
 }
 
 TEST(LocalService, RefusesAVersionFromTheFutureAndNamesBoth) {
@@ -45,7 +45,7 @@ TEST(LocalService, RefusesAVersionFromTheFutureAndNamesBoth) {
   EXPECT_EQ(response.serial(), 9u);
   EXPECT_EQ(response.failure().code(), "protocol");
   EXPECT_NE(response.failure().message().find("version 77"), std::string::npos);
-  EXPECT_NE(response.failure().message().find("version 1 "), std::string::npos);
+  EXPECT_NE(response.failure().message().find("version 1;"), std::string::npos);
 }
 
 TEST(LocalService, EndsAConnectionThatDoesNotBeginWithHello) {
@@ -85,7 +85,7 @@ TEST(LocalService, CutsTheProgramsNameToWhatPeopleCanRead) {
   local::Request hello;
   hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
   hello.mutable_hello()->set_program(std::string(126, 'x') + "\xc3\xa4\n" + std::string(500, 'y'));
-  EXPECT_TRUE(client.ask(hello).has_welcome());
+  EXPECT_TRUE(client.ask(hello).has_hello());
   local::Request list;
   list.mutable_list_clients();
   EXPECT_EQ(client.ask(list).client_list().clients(0).program(), std::string(126, 'x'));
@@ -99,12 +99,12 @@ TEST(LocalService, CreatesOpensListsAndClosesStreams) {
   writer.greet(), reader.greet();
   const local::Response created = writer.ask(create_request("odometry"));
   EXPECT_TRUE(created.opened().created());
-  EXPECT_EQ(created.opened().id().host(), "pc1");
+  EXPECT_EQ(created.opened().stream().id().host(), "pc1");
   EXPECT_EQ(writer.last_descriptors.size(), 4u);
   EXPECT_FALSE(writer.ask(create_request("odometry")).opened().created());
   const local::Response opened = reader.ask(open_request("odometry"));
   EXPECT_EQ(reader.last_descriptors.size(), 3u);
-  EXPECT_EQ(opened.opened().type().name(), "Odometry");
+  EXPECT_EQ(opened.opened().stream().type().name(), "Odometry");
 
   const local::Response list = reader.ask(list_request());
   ASSERT_EQ(list.stream_list().streams_size(), 1);

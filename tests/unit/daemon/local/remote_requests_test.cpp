@@ -41,24 +41,25 @@ class FakeFleet final : public Fleet {
                     id.str());
     return owner.adopt_untrusted(id, std::move(files));
   }
-  void info(const StreamId& id, Then<proto::Stream> then) override {
-    asked.push_back("info " + id.str());
-    proto::Stream stream;
-    wire::to_message(lidar_at("pc2"), stream);
-    stream.mutable_mirror()->set_state("live");
-    then(stream);
-  }
-  void get_property(const StreamId& id, Then<std::string> then) override {
-    asked.push_back("get_property " + id.str());
-    then(std::string("calibration"));
-  }
-  void set_property(const StreamId& id, std::string property, Then<void> then) override {
-    asked.push_back("set_property " + id.str() + " " + property);
-    then({});
-  }
-  void remove(const StreamId& id, Then<void> then) override {
-    asked.push_back("remove " + id.str());
-    then(Error{Errc::not_found, "no such stream there"});
+  void forward(const StreamId& id, const local::Request& request,
+               Then<local::Response> then) override {
+    local::Response response;
+    if (request.has_info()) {
+      asked.push_back("info " + id.str());
+      proto::Stream& stream = *response.mutable_stream_list()->add_streams();
+      wire::to_message(lidar_at("pc2"), stream);
+      stream.mutable_mirror()->set_state("live");
+    } else if (request.has_get_property()) {
+      asked.push_back("get_property " + id.str());
+      response.mutable_property()->set_property("calibration");
+    } else if (request.has_set_property()) {
+      asked.push_back("set_property " + id.str() + " " + request.set_property().property());
+      response.mutable_done();
+    } else {
+      asked.push_back("remove " + id.str());
+      return then(Error{Errc::not_found, "no such stream there"});
+    }
+    then(response);
   }
   void list(Then<std::vector<proto::Stream>> then) override {
     asked.push_back("list");
@@ -139,7 +140,7 @@ TEST_F(RemoteRequestsTest, OpensAMirrorWhenItIsThere) {
   const local::Response answer = client->next();
   EXPECT_EQ(answer.serial(), 77u);
   EXPECT_TRUE(answer.opened().mirror());
-  EXPECT_EQ(answer.opened().id().host(), "pc2");
+  EXPECT_EQ(answer.opened().stream().id().host(), "pc2");
   EXPECT_EQ(client->last_descriptors.size(), 3u);
   EXPECT_EQ(opens.counts(*ring).readers, 1u) << "so that its keeper knows of it";
   local::Request close;
@@ -166,7 +167,7 @@ TEST_F(RemoteRequestsTest, NeverLooksElsewhereForAStreamNamedAsItsOwn) {
 
 TEST_F(RemoteRequestsTest, CreatesHereUnlessToldOtherwise) {
   fleet.known = {lidar_at("pc2")};
-  EXPECT_EQ(client->ask(create_request("lidar")).opened().id().host(), "pc1");
+  EXPECT_EQ(client->ask(create_request("lidar")).opened().stream().id().host(), "pc1");
   EXPECT_TRUE(fleet.asked.empty());
   local::Request create = create_request("lidar");
   create.mutable_create()->mutable_id()->set_host("pc2");
@@ -176,7 +177,7 @@ TEST_F(RemoteRequestsTest, CreatesHereUnlessToldOtherwise) {
   const local::Response answer = client->next();
   EXPECT_TRUE(answer.opened().created());
   EXPECT_FALSE(answer.opened().mirror());
-  EXPECT_EQ(answer.opened().id().host(), "pc2");
+  EXPECT_EQ(answer.opened().stream().id().host(), "pc2");
   EXPECT_EQ(client->last_descriptors.size(), 4u);
 }
 

@@ -19,7 +19,7 @@ net::Frame create_request(std::uint64_t serial, const std::string& name,
                           std::uint64_t payload_bytes, std::uint64_t depth) {
   net::Frame frame;
   frame.set_serial(serial);
-  net::Create& create = *frame.mutable_create();
+  proto::Create& create = *frame.mutable_create();
   create.mutable_id()->set_name(name);
   create.mutable_type()->set_payload_bytes(payload_bytes);
   create.mutable_type()->set_alignment_bytes(1);
@@ -319,7 +319,7 @@ std::string events(const std::vector<SentItem>& items) {
   for (const SentItem& item : items) {
     if (item.frame.has_done()) text += "done ";
     if (!item.frame.has_stream_event()) continue;
-    const net::StreamEvent& event = item.frame.stream_event();
+    const proto::StreamEvent& event = item.frame.stream_event();
     text += (event.removed() ? "-" : "+") + event.stream().id().name() + " ";
   }
   return text;

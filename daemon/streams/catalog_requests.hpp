@@ -1,0 +1,76 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Serves the requests of catalog.proto about the streams of this host: for its programs
+// (LocalService) and for other hosts (DataCommunicator) alike. Both protocols carry these messages in
+// fields of the same names, so one template serves local::Request and net::Frame.
+//
+// Stateless. Watch, which has state, and what a created or opened stream means to a connection
+// (descriptors, or a channel) belong to the two callers.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <memory>
+#include <string>
+
+#include "catalog.pb.h"
+#include "daemon/streams/open_table.hpp"
+#include "daemon/streams/registry.hpp"
+
+namespace dssm::daemon {
+
+class CatalogRequests {
+ public:
+  // max_list_bytes: of a StreamList that fits into a frame. Both references outlive this.
+  CatalogRequests(Registry& registry, const OpenTable& opens, std::size_t max_list_bytes)
+      : registry_(registry), opens_(opens), max_list_bytes_(max_list_bytes) {}
+
+  // Serves List, Info, Remove, SetProperty and GetProperty, and fills in the response's body.
+  //   Request   local::Request or net::Frame; Response: local::Response or net::Frame
+  //   channel   the stream of the channel that the request came on, for properties; nullptr: the
+  //             request names its stream
+  //   fails     with the failure that is the response; protocol: any other request
+  template <class Request, class Response>
+  Result<void> serve_untrusted(const Request& request, Response& response,
+                               const StreamId* channel = nullptr);
+
+  // For Open and Create.
+  Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
+  //   creator_pid  of the program of this host; 0: another host creates it
+  Result<Registry::Created> create_untrusted(const proto::Create& request,
+                                             std::int32_t creator_pid);
+
+ private:
+  Result<void> list(proto::StreamList& out) const;
+
+  Registry& registry_;
+  const OpenTable& opens_;
+  const std::size_t max_list_bytes_;
+};
+
+// The stream that `request` (local::Request or net::Frame) names; nullptr: none.
+template <class Request>
+const proto::StreamId* subject(const Request& request) noexcept {
+  switch (request.body_case()) {
+    case Request::kOpen:
+      return &request.open().id();
+    case Request::kCreate:
+      return &request.create().id();
+    case Request::kInfo:
+      return &request.info().id();
+    case Request::kRemove:
+      return &request.remove().id();
+    case Request::kSetProperty:
+      return &request.set_property().id();
+    case Request::kGetProperty:
+      return &request.get_property().id();
+    default:
+      return nullptr;
+  }
+}
+
+// For requests that dssmd of `host` does not know.
+Error unknown_request(const std::string& host);
+
+}  // namespace dssm::daemon
