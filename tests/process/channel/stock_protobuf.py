@@ -36,8 +36,9 @@ def compile_messages(proto_folder):
         command = ["protoc", "--proto_path=" + proto_folder, "--python_out=" + folder]
         subprocess.run(command + files, check=True)
         sys.path.insert(0, folder)
+        import common_pb2
         import network_pb2
-    return network_pb2
+    return network_pb2, common_pb2.Hello
 
 
 def check(what, got, expected):
@@ -61,7 +62,7 @@ class Connection:
         self.socket = socket.create_connection((host, int(port)))
         self.file = self.socket.makefile("rb")
         self.serials = itertools.count(1)
-        self.hello = net.Hello(
+        self.hello = Hello(
             protocol_version=version,
             host="pc9",
             host_id=b"0123456789abcdef",
@@ -352,5 +353,5 @@ def main():
     print("all as it should be")
 
 
-net = compile_messages(sys.argv[2])
+net, Hello = compile_messages(sys.argv[2])
 main()
