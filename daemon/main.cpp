@@ -220,7 +220,7 @@ class Dssmd {
         hosts_(config, loop, sockets.network, std::move(page), streams_.registry, logger),
         local_(streams_.registry, streams_.opens, streams_.playback_clock, logger, recovering_,
                &hosts_.service),
-        server_(loop, sockets.listener, config.max_clients, local_, logger),
+        server_(loop, sockets.listener, config.name, config.max_clients, local_, logger),
         channels_({loop, streams_.registry, streams_.opens, logger, &hosts_.clock,
                    [this] { hosts_.clock.poll_if_due(); }},
                   hosts_.self, peer_limits(config)),

@@ -1,11 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/wire/frame.hpp"
 
+#include <fmt/format.h>
 #include <google/protobuf/io/coded_stream.h>
 #include <google/protobuf/message_lite.h>
 
 #include <algorithm>
 #include <cstring>
+
+#include "core/wire/varint.hpp"
 
 namespace dssm::wire {
 
@@ -21,43 +24,46 @@ std::string encode_frame(const google::protobuf::MessageLite& message) {
 }
 
 std::span<std::byte> FrameBuffer::space() {
-  constexpr std::size_t kRoom = 4096, kKeptBytes = 64 << 10;
+  constexpr std::size_t kMinSpace = 4096, kKeptBytes = 64 << 10;
   if (begin_ == end_) {
     begin_ = end_ = 0;
     if (buffer_.size() > kKeptBytes)
-      buffer_ = std::vector<std::byte>();  // a rare large frame does not cost memory for ever
+      buffer_ = std::vector<std::byte>();  // a rare large frame does not keep its memory
   }
-  if (buffer_.size() - end_ < kRoom) {
+  if (buffer_.size() - end_ < kMinSpace) {
     if (begin_ > 0) {
       std::memmove(buffer_.data(), buffer_.data() + begin_, end_ - begin_);
       end_ -= begin_;
       begin_ = 0;
     }
-    if (buffer_.size() - end_ < kRoom) buffer_.resize(std::max(2 * buffer_.size(), end_ + kRoom));
+    if (buffer_.size() - end_ < kMinSpace)
+      buffer_.resize(std::max(2 * buffer_.size(), end_ + kMinSpace));
   }
   return std::span(buffer_).subspan(end_);
 }
 
 Result<std::optional<std::span<const std::byte>>> FrameBuffer::next() {
+  const std::span<const std::byte> input = std::span(buffer_).subspan(begin_, end_ - begin_);
+  const std::byte* at = input.data();
+  const std::byte* const end = at + input.size();
   std::uint64_t length = 0;
-  std::size_t at = begin_;
-  for (int shift = 0;; shift += 7) {
-    if (shift > 28) {  // five bytes hold more than any frame that we take
-      return Error{Errc::protocol, "the input is no varint-delimited frame"};
-    }
-    if (at == end_) return std::optional<std::span<const std::byte>>();
-    const auto byte = std::to_integer<std::uint64_t>(buffer_[at++]);
-    length |= (byte & 0x7f) << shift;
-    if (!(byte & 0x80)) break;
+  switch (read_varint(at, end, kMaxLengthBytes, length)) {
+    case VarintStatus::ok:
+      break;
+    case VarintStatus::cut:
+      return std::optional<std::span<const std::byte>>();
+    case VarintStatus::too_long:
+      return Error{Errc::protocol, "the input is not a varint-delimited frame"};
   }
   if (length > max_frame_bytes_) {
-    return Error{Errc::protocol, "a frame of " + std::to_string(length) +
-                                     " bytes is longer than the " +
-                                     std::to_string(max_frame_bytes_) + " that are taken"};
+    return Error{Errc::protocol, fmt::format("a frame of {} bytes is longer than the limit of {}",
+                                             length, max_frame_bytes_)};
   }
-  if (end_ - at < length) return std::optional<std::span<const std::byte>>();
-  const auto frame = std::span<const std::byte>(buffer_).subspan(at, length);
-  begin_ = at + length;
+  if (static_cast<std::uint64_t>(end - at) < length) {
+    return std::optional<std::span<const std::byte>>();
+  }
+  const std::span<const std::byte> frame(at, length);
+  begin_ = static_cast<std::size_t>(frame.data() - buffer_.data()) + length;
   return std::optional(frame);
 }
 

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Varint-delimited protobuf frames in a byte stream: cutting them out of what arrives, and putting
-// them together. Used on the local socket, and made for the network channels as well.
+// Varint-delimited protobuf frames in a byte stream: encoding them, for both protocols, and cutting
+// whole frames out of what arrives at the local socket. The network protocol's FrameDecoder puts
+// payloads where they belong, without a buffer of its own.
 #pragma once
 
 #include <cstddef>
@@ -28,7 +29,7 @@ class FrameBuffer {
   // taken for it.
   explicit FrameBuffer(std::size_t max_frame_bytes) : max_frame_bytes_(max_frame_bytes) {}
 
-  // Room for at least 4 KiB of input; fill from its start, then commit() what was filled.
+  // Space for at least 4 KiB of input; fill from its start, then commit() what was filled.
   std::span<std::byte> space();
   void commit(std::size_t bytes) noexcept { end_ += bytes; }
 

@@ -3,6 +3,9 @@
 
 #include <fmt/format.h>
 
+#include "core/wire/frame.hpp"
+#include "network.pb.h"
+
 namespace dssm::wire {
 namespace {
 
@@ -83,6 +86,12 @@ void to_message(const MirrorInfo& info, proto::Mirror& out) {
 void to_message(const Error& error, proto::Failure& out) {
   out.set_code(std::string(name_of(error.code)));
   out.set_message(error.message);
+}
+
+std::string final_failure(const Error& error) {
+  net::Frame frame;
+  to_message(error, *frame.mutable_failure());
+  return encode_frame(frame);
 }
 
 Error other_protocol_version(const ProtocolVersion& ours, const std::string& who,

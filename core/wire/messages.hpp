@@ -24,6 +24,9 @@ void to_message(const MirrorInfo& info, proto::Mirror& out);
 void to_message(const StreamInfo& info, proto::Stream& out);
 void to_message(const Error& error, proto::Failure& out);
 
+// The frame that a side sends before it closes the connection: the same bytes in both protocols.
+std::string final_failure(const Error& error);
+
 // A protocol's name ("local", "network") and the version that this side speaks.
 struct ProtocolVersion {
   std::string_view name;

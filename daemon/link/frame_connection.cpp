@@ -278,9 +278,7 @@ void FrameConnection::lose_output() {
 void FrameConnection::close_with(const Error& why) {
   if (closed_) return;
   if (!output_lost_ && !mid_frame_ && flush()) {
-    net::Frame final_failure;
-    wire::to_message(why, *final_failure.mutable_failure());
-    const std::string encoded = wire::encode_frame(final_failure);
+    const std::string encoded = wire::final_failure(why);
     const iovec part = part_of(std::as_bytes(std::span(encoded)));
     transmit({&part, 1});
   }

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/local/connection.hpp"
 
+#include <fmt/format.h>
+
 #include <utility>
 
 #include "core/wire/fd_socket.hpp"
@@ -9,13 +11,13 @@
 
 namespace dssm::daemon {
 
-Connection::Connection(const EventLoop& loop, UniqueFd socket, std::int32_t pid, std::uint32_t uid,
+Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
                        LocalService& service, Logger& logger, std::function<void()> on_closed)
     : socket_(std::move(socket)),
       service_(service),
       logger_(logger),
       on_closed_(std::move(on_closed)),
-      number_(service.connect(pid, uid, *this)),
+      number_(service.connect(identity, *this)),
       input_(wire::kMaxLocalFrameBytes),
       readable_(EventSource::readable(loop, socket_.get(), [this] { on_readable(); })),
       writable_(EventSource::writable(loop, socket_.get(), [this] { on_writable(); })),
@@ -42,8 +44,8 @@ bool Connection::take_descriptors(std::vector<UniqueFd> arrived) {
   std::size_t unclaimed = arrived.size();
   for (const std::vector<UniqueFd>& some : arrived_) unclaimed += some.size();
   if (unclaimed > kMaxUnclaimedDescriptors) {
-    end_with({Errc::protocol, "more than " + std::to_string(kMaxUnclaimedDescriptors) +
-                                  " descriptors came that no request takes"});
+    end_with({Errc::protocol, fmt::format("more than {} descriptors came that no request takes",
+                                          kMaxUnclaimedDescriptors)});
     return false;
   }
   arrived_.push_back(std::move(arrived));
@@ -64,7 +66,7 @@ void Connection::serve_frames() {
     }
     if (!service_.on_frame_untrusted(number_, **frame, arrived_)) return close();
   }
-  if (is_open()) readable_.disable();  // paused: on_writable() goes on
+  if (is_open()) readable_.disable();  // paused: on_writable() continues
 }
 
 void Connection::send(const std::string& frame, std::vector<UniqueFd> descriptors) {
@@ -79,9 +81,10 @@ void Connection::send(const std::string& frame, std::vector<UniqueFd> descriptor
   queued_descriptors_ += outgoing.descriptors.size();
   output_.push_back(std::move(outgoing));
   if (queued_bytes_ <= kMaxQueuedBytes) return;
-  logger_.warning("close a connection: the program does not read, and " +
-                      std::to_string(queued_bytes_) + " bytes wait for it",
-                  {.message_id = message_id::kClientRefused});
+  logger_.warning(
+      fmt::format("close a connection: the program does not read, and {} bytes wait for it",
+                  queued_bytes_),
+      {.message_id = message_id::kClientRefused});
   close();
 }
 
@@ -112,16 +115,16 @@ void Connection::on_writable() {
     output_.pop_front();
   }
   if (output_.empty()) writable_.disable();
-  // Whole frames may be waiting in input_, which no new byte would announce.
+  // Whole frames may be waiting in input_; for them the socket does not become readable.
   if (!is_paused()) next_turn_.enable_in(Duration::zero());
 }
 
-// Tells the client why, as far as its socket takes it at once; a client that does not read does not
-// keep its connection for that.
+// The final failure is sent as far as the socket takes it at once; the connection does not wait for a
+// client that does not read.
 void Connection::end_with(const Error& error) {
   logger_.warning("close a connection: " + error.message,
                   {.message_id = message_id::kClientRefused});
-  send(final_failure(error), {});
+  send(wire::final_failure(error), {});
   close();
 }
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One client's socket: cuts its bytes into frames for LocalService and sends what LocalService
-// says. It never waits for the client. What the client does not take is queued up to
-// kMaxQueuedBytes, then the connection is closed; whatever goes wrong costs this connection only.
+// One client's socket: cuts its bytes into frames for LocalService and sends the responses. It never
+// waits for the client. What the client does not receive is queued up to kMaxQueuedBytes, then the
+// connection is closed; an error closes this connection only.
 #pragma once
 
 #include <cstddef>
@@ -23,10 +23,10 @@ namespace dssm::daemon {
 // Bytes that wait for one client. A list of all streams has at most 16 MiB.
 inline constexpr std::size_t kMaxQueuedBytes = 64U << 20;
 
-// Descriptors that wait for one client; while there are so many its requests wait, too.
+// Descriptors that wait for one client; from this number on its requests wait, too.
 inline constexpr std::size_t kMaxQueuedDescriptors = 256;
 
-// Descriptors that a client sent and that no request took yet; more are an error.
+// Descriptors that a client sent and that no request has taken yet; more are an error.
 inline constexpr std::size_t kMaxUnclaimedDescriptors = 64;
 
 // Requests of one client served in a row before others get their turn.
@@ -36,7 +36,7 @@ class Connection final : public ClientOutput {
  public:
   // on_closed: called once, when the connection ended by itself; the connection must not be
   // destroyed within it.
-  Connection(const EventLoop& loop, UniqueFd socket, std::int32_t pid, std::uint32_t uid,
+  Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
              LocalService& service, Logger& logger, std::function<void()> on_closed);
   Connection(const Connection&) = delete;
   Connection& operator=(const Connection&) = delete;

@@ -25,18 +25,15 @@ local::Response failure_response(std::uint64_t serial, const Error& error) {
 
 }  // namespace
 
-std::string final_failure(const Error& error) {
-  return wire::encode_frame(failure_response(0, error));
-}
-
 LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
-                           Logger& logger, bool recovering, Fleet* fleet)
+                           Logger& logger, bool recovering, Fleet* fleet, Authorizer authorizer)
     : registry_(registry),
       opens_(opens),
       clock_(clock),
       logger_(logger),
       requests_(registry, opens, clock),
       fleet_(fleet),
+      authorizer_(std::move(authorizer)),
       recovering_(recovering) {
   registry_.add_observer(*this);
   if (!fleet_) return;
@@ -49,10 +46,10 @@ LocalService::~LocalService() {
   registry_.remove_observer(*this);
 }
 
-ClientNumber LocalService::connect(std::int32_t pid, std::uint32_t uid, ClientOutput& output) {
+ClientNumber LocalService::connect(const Identity& identity, ClientOutput& output) {
   const ClientNumber number = next_client_++;
   Client client;
-  client.identity = std::make_shared<ClientIdentity>(ClientIdentity{number, pid, uid, "?"});
+  client.identity = std::make_shared<ClientIdentity>(ClientIdentity{identity, number});
   client.output = &output;
   clients_.emplace(number, std::move(client));
   return number;
@@ -73,7 +70,8 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
   Client& client = clients_.at(number);
   local::Request request;
   if (!request.ParseFromArray(frame.data(), static_cast<int>(frame.size()))) {
-    return refuse(client, 0, {Errc::protocol, "the frame is no request of DSSM's local protocol"});
+    return refuse(client, 0,
+                  {Errc::protocol, "the frame is not a request of DSSM's local protocol"});
   }
   const std::uint64_t serial = request.serial();
   if (serial == 0) {
@@ -84,7 +82,9 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
     return refuse(client, serial,
                   {Errc::protocol, "the first request on a connection has to be Hello"});
   }
-  if (must_wait(request)) {
+  if (Result<void> allowed = check_access(client, request); !allowed) {
+    send_failure(client, serial, allowed.error());
+  } else if (must_wait(request)) {
     hold(client, request, frame.size());
   } else {
     serve(number, request, descriptors);
@@ -92,6 +92,16 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
     if (recovering_ && (request.has_offer() || request.has_open_clock())) release_held();
   }
   return true;
+}
+
+Result<void> LocalService::check_access(const Client& client, const local::Request& request) const {
+  const std::optional<Action> action = action_of(request);
+  if (!action) return unknown_request(registry_.host());
+  StreamId stream;
+  if (const proto::StreamId* named = LocalRequests::subject(request)) {
+    stream = {named->name(), named->id(), named->host()};
+  }
+  return authorizer_(*client.identity, *action, stream);
 }
 
 bool LocalService::refuse(const Client& client, std::uint64_t serial, const Error& error) {
@@ -114,6 +124,9 @@ bool LocalService::greet(Client& client, std::uint64_t serial, const proto::Hell
                   wire::other_protocol_version({"local", wire::kLocalProtocolVersion},
                                                "the program " + client.identity->str(),
                                                hello.protocol_version()));
+  }
+  if (Result<void> allowed = authorizer_(*client.identity, Action::greet, {}); !allowed) {
+    return refuse(client, serial, allowed.error());
   }
   client.greeted = true;
   logger_.debug("client came", {.peer = client.identity->str()});

@@ -32,6 +32,7 @@
 #include "daemon/local/fleet.hpp"
 #include "daemon/local/local_requests.hpp"
 #include "daemon/local/remote_requests.hpp"
+#include "daemon/streams/authorize.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"
@@ -48,9 +49,6 @@ class ClientOutput {
   ~ClientOutput() = default;
 };
 
-// The answer to a peer that gets no further one: a failure that belongs to no request.
-std::string final_failure(const Error& error);
-
 class LocalService final : private StreamObserver, private Fleet::Observer {
  public:
   // Requests of one client that wait for other hosts.
@@ -59,13 +57,14 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   // recovering: the dssmd before this one did not end properly.
   // fleet: outlives this; nullptr: there are no other hosts.
   LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock, Logger& logger,
-               bool recovering, Fleet* fleet = nullptr);
+               bool recovering, Fleet* fleet = nullptr, Authorizer authorizer = authorize);
   LocalService(const LocalService&) = delete;
   LocalService& operator=(const LocalService&) = delete;
   ~LocalService();
 
   // A client connected; `output` stays until disconnect().
-  ClientNumber connect(std::int32_t pid, std::uint32_t uid, ClientOutput& output);
+  //   identity  without the program's name
+  ClientNumber connect(const Identity& identity, ClientOutput& output);
   void disconnect(ClientNumber number);
   std::size_t clients() const noexcept { return clients_.size(); }
 
@@ -94,6 +93,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   };
 
   bool refuse(const Client& client, std::uint64_t serial, const Error& error);
+  Result<void> check_access(const Client& client, const local::Request& request) const;
   bool greet(Client& client, std::uint64_t serial, const proto::Hello& hello);
   void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
   void serve_remote(ClientNumber number, const local::Request& request,
@@ -128,6 +128,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   LocalRequests requests_;
   Fleet* fleet_;
   std::optional<RemoteRequests> remote_;  // with a fleet
+  const Authorizer authorizer_;
   bool recovering_;
   ClientNumber next_client_ = 1;
   std::map<ClientNumber, Client> clients_;

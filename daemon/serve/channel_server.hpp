@@ -11,13 +11,14 @@
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/network_protocol.hpp"
+#include "daemon/base/acceptor.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/rate_limited_logger.hpp"
-#include "daemon/base/spare_descriptor.hpp"
 #include "daemon/link/network_listener.hpp"
 #include "daemon/serve/data_communicator.hpp"
 #include "daemon/serve/peer_table.hpp"
 #include "daemon/serve/served_stream.hpp"
+#include "daemon/streams/authorize.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
 
@@ -32,16 +33,17 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     Logger& logger;
     ClockAssessor* clock = nullptr;           // nullptr: the clock is not watched
     std::function<void()> on_heartbeat = {};  // of another host, about once a second; may be empty
+    Authorizer authorizer = authorize;
   };
 
   // self: how this dssmd greets. All in `parts` outlive it.
   ChannelServer(const Parts& parts, wire::Greeting self, const PeerTable::Limits& limits);
   ChannelServer(const ChannelServer&) = delete;
   ChannelServer& operator=(const ChannelServer&) = delete;
-  ~ChannelServer();  // tells those who are connected
+  ~ChannelServer();  // connected peers get a final failure
 
-  // Accepts from now on. Until then whoever connects waits: while the programs of this PC give
-  // streams back after a crash, nobody else may take their names. `listener` outlives the server.
+  // Accepts from now on. Until then connections wait: while the programs of this PC give streams back
+  // after a crash, no other host may take their names. `listener` outlives the server.
   void serve(const NetworkListener& listener);
 
   // For tests and fuzzers: a connection that is there already.
@@ -58,11 +60,9 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   std::size_t connections() const noexcept { return communicators_.size(); }
 
  private:
-  void on_connection(int listener);
-  void accept(UniqueFd socket);
+  Result<void> accept(UniqueFd& socket);
   void keep(PeerPlace place, std::unique_ptr<wire::Transport> transport,
             const wire::SocketAddress& address);
-  void turn_away(UniqueFd socket, const wire::SocketAddress* address, const Error& error);
   void sweep();
 
   void on_stream_added(const Stream& stream) override;
@@ -75,12 +75,11 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   wire::Greeting self_;
   PeerTable peers_;
   ServedStreams streams_;
-  SpareDescriptor spare_;
   MonoTime looked_{};  // at all streams
   std::map<DataCommunicator*, std::unique_ptr<DataCommunicator>> communicators_;
   std::vector<DataCommunicator*> ended_;  // to be destroyed outside of their own callbacks
-  std::vector<EventSource> incoming_;
   EventSource sweep_;
+  Acceptor acceptor_;
 };
 
 }  // namespace dssm::daemon

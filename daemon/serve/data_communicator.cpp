@@ -85,6 +85,11 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
     return std::move(them).error().context("dssmd of host '" + parts_.self.host + "' refuses");
   }
   them_ = *std::move(them);
+  identity_.address = peer_address_;
+  identity_.host = them_->host;
+  identity_.host_id = them_->host_id;
+  identity_.program = them_->program;
+  DSSM_TRY(parts_.authorizer(identity_, Action::greet, {}));
   greeting_is_late_.disable();
   net::Frame hello;
   wire::to_message(parts_.self, *hello.mutable_hello());
@@ -101,7 +106,19 @@ void DataCommunicator::serve(const net::Frame& request) {
   if (Result<void> done = dispatch(request); !done) send_failure(request.serial(), done.error());
 }
 
+Result<void> DataCommunicator::check_access(const net::Frame& request) const {
+  const std::optional<Action> action = action_of(request);
+  if (!action) return unknown_request(parts_.self.host);
+  if (channel_) return parts_.authorizer(identity_, *action, channel_->stream().id());
+  StreamId stream;
+  if (const proto::StreamId* named = subject(request)) {
+    stream = {named->name(), named->id(), named->host()};
+  }
+  return parts_.authorizer(identity_, *action, stream);
+}
+
 Result<void> DataCommunicator::dispatch(const net::Frame& request) {
+  DSSM_TRY(check_access(request));
   if (request.has_ping()) {
     is_control_ = true;
     silence_.enable_in(wire::kPeerTimeout);

@@ -24,6 +24,7 @@
 #include "daemon/serve/served_stream.hpp"
 #include "daemon/serve/stream_channel.hpp"
 #include "daemon/serve/stream_watch.hpp"
+#include "daemon/streams/authorize.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
@@ -59,6 +60,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     Logger& logger;
     Observer& observer;
     ClockAssessor* clock;  // nullptr: the clock is not watched
+    const Authorizer& authorizer;
   };
 
   // peer_address: for the log, "10.0.0.3:40000". All in `parts` outlive it.
@@ -95,6 +97,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   Result<void> greet(const net::Frame& frame);
   bool can_serve() const noexcept;
   void serve(const net::Frame& request);
+  Result<void> check_access(const net::Frame& request) const;
   Result<void> dispatch(const net::Frame& request);
   Result<void> serve_control(const net::Frame& request);
   Result<void> open(const net::Frame& request);
@@ -110,7 +113,8 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   PeerPlace place_;
   std::string peer_address_;
   FrameConnection link_;
-  std::optional<wire::Greeting> them_;  // once they said Hello
+  std::optional<wire::Greeting> them_;  // after their Hello
+  Identity identity_;                   // likewise
   Error their_words_;                   // why they are about to close; empty: did not say
   std::optional<net::Frame> waiting_;   // a request whose turn has not come; the link is paused
   int served_ = 0;                      // in this turn

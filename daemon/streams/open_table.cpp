@@ -3,10 +3,6 @@
 
 namespace dssm::daemon {
 
-std::string ClientIdentity::str() const {
-  return "'" + program + "' (pid " + std::to_string(pid) + ", uid " + std::to_string(uid) + ")";
-}
-
 Result<void> OpenTable::check_quota(const ClientIdentity& client) const {
   if (entries_.size() >= limits_.max_opens) {
     return Error{Errc::limit_exceeded,

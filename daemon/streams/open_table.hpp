@@ -15,21 +15,16 @@
 #include <unordered_map>
 #include <vector>
 
+#include "daemon/streams/authorize.hpp"
 #include "daemon/streams/stream.hpp"
 
 namespace dssm::daemon {
 
-// A connection of this dssmd's life; rises, never used twice.
+// A local connection in this run of dssmd; rises, never used twice.
 using ClientNumber = std::uint64_t;
 
-// Who is at the other end: process and user from the kernel, the program's name from itself.
-struct ClientIdentity {
+struct ClientIdentity : Identity {
   ClientNumber number = 0;
-  std::int32_t pid = 0;
-  std::uint32_t uid = 0;
-  std::string program;
-
-  std::string str() const;  // "'mapper' (pid 12, uid 1000)"
 };
 
 // Rises with each open; unique, so it serves as the protocol's handle.

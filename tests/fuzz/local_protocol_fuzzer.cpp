@@ -89,13 +89,13 @@ void run(std::span<const std::uint8_t> input) {
   input = input.subspan(2);
   Daemon daemon(control & 1);
   Sink sink;
-  const ClientNumber watcher = daemon.service.connect(1, 0, sink);
+  const ClientNumber watcher = daemon.service.connect({}, sink);
   put(daemon, watcher, hello());
   local::Request watch;
   watch.set_serial(2);
   watch.mutable_watch();
   put(daemon, watcher, watch);
-  const ClientNumber client = daemon.service.connect(2, 0, sink);
+  const ClientNumber client = daemon.service.connect({}, sink);
   put(daemon, client, hello());
 
   wire::FrameBuffer buffer(1 << 16);

@@ -46,10 +46,10 @@ class BadClient : public testing::Test {
 TEST_F(BadClient, ThatSendsGarbageIsToldSo) {
   RawClient http(daemon_.socket_path(), false);
   http.send_bytes("\x05HELLO");
-  EXPECT_NE(final_failure(http).find("no request of DSSM's local protocol"), std::string::npos);
+  EXPECT_NE(final_failure(http).find("not a request of DSSM's local protocol"), std::string::npos);
   RawClient endless(daemon_.socket_path(), false);
   endless.send_bytes(std::string(64, '\xff'));
-  EXPECT_NE(final_failure(endless).find("no varint-delimited frame"), std::string::npos);
+  EXPECT_NE(final_failure(endless).find("not a varint-delimited frame"), std::string::npos);
 }
 
 TEST_F(BadClient, ThatSendsRandomBytesCostsOnlyItself) {

@@ -28,8 +28,11 @@ inline constexpr Registry::Limits kLimits{
     .max_streams = 400, .max_memory_bytes = 64 << 20, .max_property_bytes = 1 << 20};
 
 inline std::shared_ptr<const ClientIdentity> client(ClientNumber number) {
-  return std::make_shared<ClientIdentity>(
-      ClientIdentity{number, static_cast<std::int32_t>(1000 + number), 0, "test"});
+  const auto identity = std::make_shared<ClientIdentity>();
+  identity->number = number;
+  identity->pid = static_cast<std::int32_t>(1000 + number);
+  identity->program = "test";
+  return identity;
 }
 
 // The descriptors of an Open, as the memory files of an Offer.

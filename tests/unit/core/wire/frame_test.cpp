@@ -6,6 +6,7 @@
 #include <cstring>
 
 #include "core/wire/local_protocol.hpp"
+#include "network.pb.h"
 
 namespace dssm::wire {
 namespace {
@@ -110,6 +111,22 @@ TEST(LocalProtocol, ChecksTypesThatCome) {
     field.set_count(1);
   }
   EXPECT_EQ(type_untrusted(message).error().code, Errc::limit_exceeded);
+}
+
+TEST(FinalFailure, HasTheSameBytesInBothProtocols) {
+  const std::string frame = final_failure({Errc::limit_exceeded, "full"});
+  FrameBuffer buffer(kMaxLocalFrameBytes);
+  feed(buffer, frame);
+  const auto message = buffer.next();
+  ASSERT_TRUE(message && *message);
+  local::Response response;
+  net::Frame network;
+  const int bytes = static_cast<int>((*message)->size());
+  ASSERT_TRUE(response.ParseFromArray((*message)->data(), bytes));
+  ASSERT_TRUE(network.ParseFromArray((*message)->data(), bytes));
+  EXPECT_EQ(response.failure().code(), "limit_exceeded");
+  EXPECT_EQ(network.failure().message(), "full");
+  EXPECT_EQ(response.serial(), 0u);
 }
 
 }  // namespace

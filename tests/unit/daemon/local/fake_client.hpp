@@ -25,7 +25,7 @@ class SilentLogger final : public Logger {
 class FakeClient final : public ClientOutput {
  public:
   FakeClient(LocalService& service, std::int32_t pid)
-      : service_(service), number_(service.connect(pid, 1000, *this)) {}
+      : service_(service), number_(service.connect(program_of(pid), *this)) {}
   ~FakeClient() { service_.disconnect(number_); }
 
   void send(const std::string& frame, std::vector<UniqueFd> descriptors) override {
@@ -83,6 +83,13 @@ class FakeClient final : public ClientOutput {
   DescriptorQueue offered;
 
  private:
+  static Identity program_of(std::int32_t pid) {
+    Identity identity;
+    identity.pid = pid;
+    identity.uid = 1000;
+    return identity;
+  }
+
   LocalService& service_;
   ClientNumber number_;
   std::uint64_t serial_ = 0;

@@ -66,8 +66,9 @@ inline net::Frame sample_read(std::uint64_t serial, Tid tid) {
 class ServerRig {
  public:
   explicit ServerRig(const PeerTable::Limits& limits = {16, 8, 32U << 20},
-                     ClockAssessor* clock = nullptr)
-      : server({loop, registry, opens, logger, clock}, greeting_of("dssmd", "pc1"), limits) {}
+                     ClockAssessor* clock = nullptr, Authorizer authorizer = authorize)
+      : server({loop, registry, opens, logger, clock, {}, std::move(authorizer)},
+               greeting_of("dssmd", "pc1"), limits) {}
 
   // Connects; without `greet` it says nothing. The peer outlives the rig's use of it.
   void connect(FakePeer& peer, bool greet = true, bool torn = true, std::uint32_t host = 2) {

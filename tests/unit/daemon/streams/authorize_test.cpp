@@ -1,0 +1,124 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Each kind of request on both sockets passes the rule that decides who may do what: a rule that
+// forbids everything refuses all of them. Kinds are found by trying all field numbers, so that a new
+// one is tested without being listed here.
+#include "daemon/streams/authorize.hpp"
+
+#include <gtest/gtest.h>
+
+#include "core/wire/varint.hpp"
+#include "tests/unit/daemon/local/fake_client.hpp"
+#include "tests/unit/daemon/serve/server_rig.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+// A message whose field `number` is an empty message; its body is not set if there is no such field.
+template <class Message>
+Message with_field(std::uint64_t number) {
+  std::byte bytes[10];
+  std::byte* end = wire::write_varint(bytes, number << 3 | 2);
+  end = wire::write_varint(end, 0);
+  Message message;
+  EXPECT_TRUE(message.ParseFromArray(bytes, static_cast<int>(end - bytes)));
+  return message;
+}
+
+constexpr std::uint64_t kMaxField = 200;
+
+class AuthorizeTest : public testing::Test {
+ protected:
+  const Authorizer rule = [this](const Identity& identity, Action action, const StreamId& stream) {
+    last_identity = identity;
+    last_action = action;
+    last_stream = stream;
+    return forbids ? Result<void>(Error{Errc::no_permission, "forbidden"}) : Result<void>();
+  };
+  bool forbids = false;
+  Identity last_identity;
+  Action last_action = Action::greet;
+  StreamId last_stream;
+
+  // The number of kinds of requests that are refused, without Hello; each is put by `ask`.
+  int refused(const std::function<net::Frame(const net::Frame&)>& ask) {
+    int kinds = 0;
+    for (std::uint64_t field = 2; field < kMaxField; ++field) {
+      net::Frame frame = with_field<net::Frame>(field);
+      if (frame.body_case() == net::Frame::BODY_NOT_SET || frame.has_hello()) continue;
+      frame.set_serial(field);
+      const bool is_request = action_of(frame).has_value();
+      EXPECT_EQ(ask(frame).failure().code(), is_request ? "no_permission" : "protocol") << field;
+      kinds += is_request;
+    }
+    return kinds;
+  }
+};
+
+TEST_F(AuthorizeTest, RefusesEachRequestOfALocalProgram) {
+  Registry registry{"pc1", kLimits};
+  OpenTable opens{{100, 100}};
+  PlaybackClockOwner clock;
+  SilentLogger logger;
+  LocalService service(registry, opens, clock, logger, false, nullptr, rule);
+  FakeClient client(service, 5);
+  client.greet();
+  EXPECT_EQ(last_action, Action::greet);
+  EXPECT_EQ(last_identity.str(), "'test' (pid 5, uid 1000)");
+  forbids = true;
+  int kinds = 0;
+  for (std::uint64_t field = 2; field < kMaxField; ++field) {
+    const local::Request request = with_field<local::Request>(field);
+    if (request.body_case() == local::Request::BODY_NOT_SET || request.has_hello()) continue;
+    ++kinds;
+    EXPECT_EQ(client.ask(request).failure().code(), "no_permission") << field;
+  }
+  EXPECT_EQ(kinds, 17) << "the requests of local.proto besides Hello";
+  EXPECT_EQ(client.ask(open_request("odometry", true)).failure().message(), "forbidden");
+  EXPECT_EQ(last_action, Action::open_for_writing);
+  EXPECT_EQ(last_stream.name, "odometry");
+
+  FakeClient late(service, 6);
+  local::Request hello;
+  hello.set_serial(1);
+  hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
+  EXPECT_FALSE(late.put(hello)) << "the connection must end";
+  EXPECT_EQ(late.next().failure().code(), "no_permission");
+}
+
+TEST_F(AuthorizeTest, RefusesEachRequestOfAnotherHost) {
+  ServerRig rig({16, 8, 32U << 20}, nullptr, rule);
+  rig.create("odometry");
+  FakePeer control, channel, late;
+  rig.connect(control);
+  EXPECT_EQ(last_action, Action::greet);
+  EXPECT_EQ(last_identity.host, "pc2");
+  EXPECT_EQ(last_identity.address, "10.0.0.2:40000");
+  EXPECT_EQ(last_identity.program, "test");
+  EXPECT_FALSE(last_identity.is_local());
+  rig.connect(channel);
+  rig.open(channel, "odometry");
+  forbids = true;
+  constexpr int kKinds = 13;  // the requests of network.proto besides Hello
+  EXPECT_EQ(refused([&](const net::Frame& frame) { return rig.ask(control, frame); }), kKinds);
+  EXPECT_EQ(refused([&](const net::Frame& frame) { return rig.ask(channel, frame, 24); }), kKinds);
+  EXPECT_EQ(last_stream.str(), "odometry:0@pc1") << "the stream of the channel";
+
+  rig.connect(late, false);
+  late.put(hello_frame(greeting_of("test", "pc2")));
+  rig.turns();
+  EXPECT_TRUE(late.closed);
+  const std::vector<SentItem> items = rig.take(late);
+  ASSERT_EQ(items.size(), 1u);
+  EXPECT_EQ(items[0].frame.failure().code(), "no_permission");
+}
+
+TEST_F(AuthorizeTest, AllowsEverythingToday) {
+  const Identity identity;
+  for (int action = 0; action <= static_cast<int>(Action::ping); ++action) {
+    EXPECT_TRUE(authorize(identity, static_cast<Action>(action), {}));
+  }
+}
+
+}  // namespace
+}  // namespace dssm::daemon
