@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What the programs of this PC may ask of other hosts, as LocalService sees it. Answers come later,
-// by a function that is called once, from the loop, or at once from within the call; never after
-// the Fleet is gone. An id without a host means the only other host that has such a stream: own
-// streams are looked for first, by the caller.
+// The other hosts, as LocalService uses them. Results come by a callback that is called once: later from
+// the loop, or at once from within the call; never after the Fleet is destroyed. An id without a host
+// refers to the only other host that has such a stream; the caller searches the own streams first.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -24,12 +23,12 @@ class Fleet {
   template <class T>
   using Then = std::function<void(Result<T>)>;
 
-  // Told about changes on other hosts.
+  // Notified of changes on other hosts.
   class Observer {
    public:
     virtual void on_remote_stream_added(const StreamInfo& stream) = 0;
     virtual void on_remote_stream_removed(const StreamId& id) = 0;
-    // Readers of `stream` (a mirror's ring) shall open it anew: there is a new ring.
+    // Readers of `stream` (a mirror's ring) shall reopen it: there is a new ring.
     virtual void on_ring_replaced(const Stream& stream) = 0;
 
    protected:
@@ -49,8 +48,7 @@ class Fleet {
   //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist
   virtual void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) = 0;
 
-  // A mirror's or remote writer's ring that a program held while dssmd was away, to be gone on
-  // with.
+  // Takes back a mirror's or remote writer's ring that a program held while no dssmd ran.
   virtual Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
                                                           OfferedFiles files) = 0;
 
@@ -63,12 +61,12 @@ class Fleet {
   // in the order of hosts' names, then of creation.
   static constexpr Duration kFreshTimeout = std::chrono::milliseconds(500);
   virtual void list(Then<std::vector<proto::Stream>> then) = 0;
-  // What is in the catalog now, without asking anybody: for Watch.
+  // What is in the catalog now, without a request to other hosts: for Watch.
   virtual std::vector<StreamInfo> known_streams() const = 0;
 
   virtual std::vector<local::Host> hosts() const = 0;  // this one first
-  virtual local::Mdns mdns() const = 0;                // how finding them by mDNS fares
-  // The page that says how good this PC's clock is; not_found: nobody watches it.
+  virtual local::Mdns mdns() const = 0;                // the state of mDNS
+  // The page with the state of this PC's clock; not_found: it is not watched.
   virtual Result<UniqueFd> clock_page() const = 0;
   virtual void ping(const std::string& host, Then<local::RoundTrip> then) = 0;
 

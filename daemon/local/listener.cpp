@@ -9,19 +9,21 @@
 #include <cerrno>
 #include <cstring>
 
+#include "core/base/try.hpp"
+
 namespace dssm::daemon {
 namespace {
 
-// Removes a dead dssmd's socket. Gives whether there was one.
+// Removes the socket of a dssmd that was killed. Returns whether there was one.
 Result<bool> remove_stale(const std::string& path) {
   struct stat file {};
   if (::lstat(path.c_str(), &file)) {
     if (errno == ENOENT) return false;
-    return os_error("look for an old socket '" + path + "'");
+    return os_error("check for an old socket '" + path + "'");
   }
   if (!S_ISSOCK(file.st_mode)) {
     return Error{Errc::conflict,
-                 "listen at '" + path + "': there is a file that is no socket; move it away"};
+                 "listen at '" + path + "': there is a file that is not a socket; move it"};
   }
   if (::unlink(path.c_str())) return os_error("remove the old socket '" + path + "'");
   return true;
@@ -44,19 +46,18 @@ Result<Listener> Listener::open(const std::string& path, std::optional<gid_t> gr
   if (inherited) {
     Listener listener(path, std::move(inherited));
     listener.inherited_ = true;
-    if (Result<void> allowed = listener.allow(group, mode); !allowed) return allowed.error();
+    DSSM_TRY(listener.allow(group, mode));
     return listener;
   }
-  const Result<bool> stale = remove_stale(path);
-  if (!stale) return stale.error();
+  const bool stale = DSSM_TRY(remove_stale(path));
   UniqueFd fd(::socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC | SOCK_NONBLOCK, 0));
   if (!fd) return os_error(what);
   if (::bind(fd.get(), reinterpret_cast<const sockaddr*>(&address), sizeof address)) {
     return os_error(what);
   }
   Listener listener(path, std::move(fd));
-  listener.predecessor_died_ = *stale;
-  if (Result<void> allowed = listener.allow(group, mode); !allowed) return allowed.error();
+  listener.predecessor_died_ = stale;
+  DSSM_TRY(listener.allow(group, mode));
   if (::listen(listener.fd(), SOMAXCONN)) return os_error(what);
   return listener;
 }

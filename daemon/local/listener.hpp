@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The Unix socket that programs of this PC connect to. Whoever holds one also holds the lock on its
-// folder (RuntimeDir), so a socket file that is there already belongs to a dssmd that died, or is
-// that of a socket which the service manager listens at and handed over. Such a one is used as it
-// is and left behind: programs that connect while no dssmd runs wait there.
+// The Unix socket that programs of this PC connect to. Its owner also holds the lock on the folder
+// (RuntimeDir), so an existing socket file is that of a dssmd that was killed, or of a socket that the
+// service manager passed. The latter is used as it is and not removed: programs that connect while no
+// dssmd runs wait there.
 #pragma once
 
 #include <sys/types.h>
@@ -18,8 +18,8 @@ namespace dssm::daemon {
 
 class Listener {
  public:
-  // Listens at `path` with that group (none: leave it) and mode; nobody can connect before both are
-  // set. inherited: the socket that was handed over for `path`; none: makes one.
+  // Listens at `path` with that group (none: keep it) and mode; no program can connect before both are
+  // set. inherited: the socket that the service manager passed for `path`; none: makes one.
   static Result<Listener> open(const std::string& path, std::optional<gid_t> group, mode_t mode,
                                UniqueFd inherited = {});
 
@@ -32,7 +32,7 @@ class Listener {
   // A socket file was there: the dssmd before this one did not end properly.
   bool predecessor_died() const noexcept { return predecessor_died_; }
 
-  // It was handed over. Then nothing tells whether there was a dssmd before.
+  // The service manager passed it. Then it is unknown whether a dssmd ran before.
   bool inherited() const noexcept { return inherited_; }
 
  private:

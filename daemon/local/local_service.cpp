@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/local/local_service.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <utility>
 
@@ -61,7 +63,7 @@ void LocalService::disconnect(ClientNumber number) {
   opens_.remove_all(number);
   std::erase_if(held_, [number](const Held& held) { return held.client == number; });
   if (client.mapped().greeted) {
-    logger_.debug("client left", {.peer = client.mapped().identity->str()});
+    logger_.debug("client disconnected", {.peer = client.mapped().identity->str()});
   }
 }
 
@@ -88,7 +90,7 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
     hold(client, request, frame.size());
   } else {
     serve(number, request, descriptors);
-    // Only something that came back can end a wait.
+    // Only an offer can end a wait.
     if (recovering_ && (request.has_offer() || request.has_open_clock())) release_held();
   }
   return true;
@@ -129,7 +131,7 @@ bool LocalService::greet(Client& client, std::uint64_t serial, const proto::Hell
     return refuse(client, serial, allowed.error());
   }
   client.greeted = true;
-  logger_.debug("client came", {.peer = client.identity->str()});
+  logger_.debug("client connected", {.peer = client.identity->str()});
   Reply reply;
   proto::Hello& ours = *reply.response.mutable_hello();
   ours.set_protocol_version(wire::kLocalProtocolVersion);
@@ -175,15 +177,16 @@ void LocalService::serve_remote(ClientNumber number, const local::Request& reque
   }
 }
 
-// Where the answer of another host is to go; none when this client waits for too many already,
-// which it is told.
+// Takes the response of another host to the client; none when this client waits for too many already:
+// then it has got a failure.
 RemoteRequests::Answer LocalService::await(ClientNumber number, std::uint64_t serial) {
   Client& client = clients_.at(number);
   if (client.awaited >= kMaxAwaited) {
     send_failure(
         client, serial,
-        {Errc::limit_exceeded, "other hosts have not answered " + std::to_string(kMaxAwaited) +
-                                   " requests of this program yet; wait for them"});
+        {Errc::limit_exceeded,
+         fmt::format("other hosts have not answered {} requests of this program yet; wait for them",
+                     kMaxAwaited)});
     return {};
   }
   ++client.awaited;
@@ -196,7 +199,7 @@ RemoteRequests::Answer LocalService::await(ClientNumber number, std::uint64_t se
 void LocalService::on_answer(ClientNumber number, std::uint64_t serial, Result<Reply> reply) {
   const auto client = clients_.find(number);
   if (client == clients_.end()) {
-    // It left meanwhile: events of this very request may have cost it its connection.
+    // It disconnected meanwhile, perhaps because of the events of this request.
     opens_.remove_all(number);
     return;
   }
@@ -220,8 +223,8 @@ void LocalService::log_offer(const ClientIdentity& client, const local::Offer& o
 }
 
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
-  // First what is there, then the answer: who watched before a reconnect knows from it that it has
-  // been told all, and that what was not among it is gone.
+  // First the existing streams, then the response: after a reconnect it tells the client that streams
+  // which were not among them do not exist any more.
   for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
     const auto client = clients_.find(number);
     if (client == clients_.end()) return;
@@ -288,9 +291,9 @@ void LocalService::on_stream_added(const Stream& stream) {
   proto::StreamEvent event;
   describe(stream, opens_, *event.mutable_stream());
   broadcast(event);
-  logger_.debug("stream '" + stream.id().str() + "' is there",
+  logger_.debug("stream '" + stream.id().str() + "' is added",
                 {.stream = stream.id().str(), .message_id = message_id::kStreamCreated});
-  look_for_successors(stream.id());
+  notify_successors(stream.id());
 }
 
 void LocalService::on_stream_removed(const Stream& stream) {
@@ -301,14 +304,14 @@ void LocalService::on_stream_removed(const Stream& stream) {
   broadcast(event);
   logger_.debug("stream '" + id.str() + "' is removed",
                 {.stream = id.str(), .message_id = message_id::kStreamRemoved});
-  look_for_successors(id);
+  notify_successors(id);
 }
 
 void LocalService::on_remote_stream_added(const StreamInfo& stream) {
   proto::StreamEvent event;
   wire::to_message(stream, *event.mutable_stream());
   broadcast(event);
-  look_for_successors(stream.id);
+  notify_successors(stream.id);
 }
 
 void LocalService::on_remote_stream_removed(const StreamId& id) {
@@ -316,14 +319,14 @@ void LocalService::on_remote_stream_removed(const StreamId& id) {
   event.set_removed(true);
   wire::to_message(id, *event.mutable_stream()->mutable_id());
   broadcast(event);
-  look_for_successors(id);
+  notify_successors(id);
 }
 
 // --- rings with a successor
 
 void LocalService::notify_replaced(const OpenTable::Reading& reading) {
   const auto client = clients_.find(reading.client);
-  if (client == clients_.end()) return;  // sending to another one may have ended this one
+  if (client == clients_.end()) return;  // sending to another one may have closed it
   Reply event;
   event.response.mutable_replaced()->set_handle(reading.number);
   send(client->second, 0, std::move(event));
@@ -333,9 +336,9 @@ void LocalService::on_ring_replaced(const Stream& stream) {
   for (const OpenTable::Reading& reading : opens_.readers_of(stream)) notify_replaced(reading);
 }
 
-// Streams with the name in `id` came or went. Whoever reads one of that name that will get no
-// sample any more is told when the name they used stands for another one now.
-void LocalService::look_for_successors(const StreamId& id) {
+// A stream with the name in `id` was added or removed. Notifies the readers of streams of that name
+// that get no samples any more, if the name that they used refers to another stream now.
+void LocalService::notify_successors(const StreamId& id) {
   const StreamId any{id.name, id.id, ""};
   const bool here = registry_.knows(any), elsewhere = fleet_ && fleet_->is_there(any);
   for (const auto& stream : opens_.open_streams(id.name, id.id)) {
@@ -357,13 +360,14 @@ bool LocalService::is_gone(const Stream& stream) const {
 bool LocalService::must_wait(const local::Request& request) const {
   if (!recovering_ || request.has_offer()) return false;
   if (request.has_open_clock()) return !request.open_clock().offered() && !clock_.has_one();
-  // Whoever watches would be told that streams are gone which are about to come back.
+  // Otherwise a Watch would leave out streams that are about to be offered.
   if (request.has_watch()) return true;
   const proto::StreamId* subject = LocalRequests::subject(request);
   if (!subject) return false;
-  // A name that is no name is refused at once.
+  // An invalid name is refused at once.
   const Result<StreamId> id = wire::stream_id_untrusted(*subject);
-  if (id && !id->host.empty() && id->host != registry_.host()) return false;  // nobody here has it
+  if (id && !id->host.empty() && id->host != registry_.host())
+    return false;  // no program here has it
   return id && !registry_.knows(*id);
 }
 

@@ -1,21 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The local protocol without its socket: knows all clients of this PC, takes their frames, answers
-// them, and tells those who watch. Connection and Server carry the bytes; tests and fuzzers put
-// frames in directly.
+// The local protocol without its socket: serves the requests of all clients of this PC, and sends
+// StreamEvents to those that watch. Connection and Server carry the bytes; tests and fuzzers pass
+// frames directly.
 //
-// Requests about streams of other hosts go to the Fleet, whose answers come when they come; the
-// client may be gone by then, and with it all interest.
+// Each request passes the Authorizer (daemon/streams/authorize.hpp). Requests about streams of other
+// hosts go to the Fleet, which responds later; when the client has disconnected by then, the response
+// is dropped.
 //
-// A ring can get a successor: a stream is created anew under the name of a removed one, its owner
-// comes back without its rings, or another host has it now. Whoever reads the old ring is told
-// (Replaced) and opens the stream anew, by the name used the first time: so the stream may move to
-// another host only for those who named none.
+// A ring can get a successor: a stream is created again under the name of a removed one, its owner
+// restarted without its rings, or another host has it now. Readers of the old ring get the event
+// Replaced and reopen the stream by the name that they used the first time: so it may move to another
+// host only for those that named none.
 //
-// After a crash of the dssmd before this one, programs that still hold streams come back and offer
-// them. Until end_recovery() a Watch, and a request about a stream that nobody offered yet, is held
-// back, not refused: otherwise a writer that starts anew could take the name of a ring that others
-// still use.
+// After a crash of the dssmd before this one, programs that still hold streams reconnect and offer
+// them. Until end_recovery() a Watch, and a request about a stream that is not offered yet, is held
+// back, not refused: otherwise a restarted writer could take the name of a ring that others still use.
 #pragma once
 
 #include <cstddef>
@@ -68,8 +68,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void disconnect(ClientNumber number);
   std::size_t clients() const noexcept { return clients_.size(); }
 
-  // One frame of a client, without its length. Whatever is to be said goes to its output before
-  // this returns, or later for a request that is held back.
+  // One frame of a client, without its length. The response goes to its output before this returns, or
+  // later for a request that is held back.
   //   returns  false: the client does not keep to the protocol, the connection must end
   bool on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
                           DescriptorQueue& descriptors);
@@ -118,7 +118,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void on_remote_stream_removed(const StreamId& id) override;
   void on_ring_replaced(const Stream& stream) override;
   void notify_replaced(const OpenTable::Reading& reading);
-  void look_for_successors(const StreamId& id);
+  void notify_successors(const StreamId& id);
   bool is_gone(const Stream& stream) const;
 
   Registry& registry_;

@@ -3,6 +3,7 @@
 
 #include <utility>
 
+#include "core/base/try.hpp"
 #include "daemon/local/local_requests.hpp"
 
 namespace dssm::daemon {
@@ -46,8 +47,9 @@ void RemoteRequests::create(const Client& client, const StreamId& id, const prot
                             Answer answer) {
   const Result<TypeInfo> type = wire::type_untrusted(request.type());
   if (!type) return answer(type.error());
-  if (Result<void> room = opens_.check_quota(*client); !room)
-    return answer(std::move(room).error());
+  if (Result<void> quota = opens_.check_quota(*client); !quota) {
+    return answer(std::move(quota).error());
+  }
   const CreatePlan plan{*type, {request.depth(), Duration(request.cycle_ns())}};
   fleet_.open_writer(
       id, &plan,
@@ -63,8 +65,9 @@ void RemoteRequests::create(const Client& client, const StreamId& id, const prot
 
 void RemoteRequests::open(const Client& client, const StreamId& id, const proto::Open& request,
                           Answer answer) {
-  if (Result<void> room = opens_.check_quota(*client); !room)
-    return answer(std::move(room).error());
+  if (Result<void> quota = opens_.check_quota(*client); !quota) {
+    return answer(std::move(quota).error());
+  }
   const std::uint32_t tag = request.tag();
   const bool any_host = id.host.empty();
   if (request.for_writing()) {
@@ -87,13 +90,11 @@ void RemoteRequests::open(const Client& client, const StreamId& id, const proto:
 Result<Reply> RemoteRequests::offer(const Client& client, const StreamId& id,
                                     const local::Offer& request, DescriptorQueue& descriptors) {
   const Role role = request.for_writing() ? Role::writer : Role::reader;
-  Result<OfferedFiles> files = offered_files(descriptors, role);
-  if (!files) return std::move(files).error();
-  if (Result<void> room = opens_.check_quota(*client); !room) return std::move(room).error();
-  const Result<std::shared_ptr<Stream>> stream =
-      fleet_.adopt_untrusted(id, role, *std::move(files));
-  if (!stream) return stream.error();
-  return record_open(opens_, {client, *stream, role, request.tag(), request.any_host()});
+  OfferedFiles files = DSSM_TRY(offered_files(descriptors, role));
+  DSSM_TRY(opens_.check_quota(*client));
+  const std::shared_ptr<Stream> stream =
+      DSSM_TRY(fleet_.adopt_untrusted(id, role, std::move(files)));
+  return record_open(opens_, {client, stream, role, request.tag(), request.any_host()});
 }
 
 void RemoteRequests::complete_list(Reply own, Answer answer) {
@@ -129,17 +130,15 @@ Reply RemoteRequests::list_hosts() const {
 }
 
 Result<Reply> RemoteRequests::open_clock_page() const {
-  Result<UniqueFd> page = fleet_.clock_page();
-  if (!page) return std::move(page).error();
   Reply reply;
   reply.response.mutable_clock_page();
-  reply.descriptors.push_back(*std::move(page));
+  reply.descriptors.push_back(DSSM_TRY(fleet_.clock_page()));
   return reply;
 }
 
 void RemoteRequests::ping(const std::string& host, Answer answer) {
   Reply reply;
-  if (host == own_host_) {  // whoever reads this got its sign of life
+  if (host == own_host_) {  // this response shows that it is alive
     reply.response.mutable_round_trip();
     return answer(std::move(reply));
   }

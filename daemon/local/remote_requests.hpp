@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What clients may ask about streams of other hosts, and about the hosts: from the protocol's
-// messages to Fleet and OpenTable, and back. The counterpart of LocalRequests; responses may take as
-// long as the other host takes.
+// Serves what programs ask about streams of other hosts, and about the hosts, through Fleet and
+// OpenTable. The counterpart of LocalRequests; responses take as long as the other host takes.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -20,12 +19,12 @@ class RemoteRequests {
       : own_host_(own_host), fleet_(fleet), opens_(opens) {}
 
   using Client = std::shared_ptr<const ClientIdentity>;
-  // Called once: later, or at once. Whoever opened a stream for a client that is gone by then
-  // forgets its opens.
+  // Called once: later, or at once. If the client has disconnected by then, its opens are removed
+  // again.
   using Answer = std::function<void(Result<Reply>)>;
 
-  // Whether `request` is for other hosts: it is about a stream of another host, or `own_knows` says
-  // that the stream it is about is none of this host's own, or it is about hosts.
+  // Whether `request` is for other hosts: it is about hosts, or names a stream of another host, or one
+  // without a host that this host does not own (`own_knows`).
   bool takes(const local::Request& request,
              const std::function<bool(const StreamId&)>& own_knows) const;
 
@@ -36,7 +35,7 @@ class RemoteRequests {
   // Adds the other hosts' streams to the list of the own ones.
   void complete_list(Reply own, Answer answer);
 
-  // Adds to what this dssmd tells of itself how it finds others.
+  // Adds the state of mDNS to the description of this dssmd.
   void complete_daemon(local::Daemon& daemon) const { *daemon.mutable_mdns() = fleet_.mdns(); }
 
  private:

@@ -11,9 +11,9 @@
 namespace dssm::daemon {
 namespace {
 
-// How often heartbeats make us look at the streams whose doorbells did not ring: a writer may have
-// been killed between writing and ringing.
-constexpr Duration kLookPeriod = std::chrono::milliseconds(900);
+// Heartbeats cause a check of all streams at most once in this period: a writer may have been killed
+// after it wrote a sample and before it wrote to the doorbell.
+constexpr Duration kCheckPeriod = std::chrono::milliseconds(900);
 
 }  // namespace
 
@@ -33,8 +33,7 @@ ChannelServer::ChannelServer(const Parts& parts, wire::Greeting self,
 ChannelServer::~ChannelServer() {
   parts_.registry.remove_observer(*this);
   for (const auto& [key, communicator] : communicators_) {
-    communicator->close_with(
-        {Errc::unavailable, "dssmd of host '" + self_.host + "' is being stopped"});
+    communicator->close_with({Errc::unavailable, "dssmd of host '" + self_.host + "' is stopping"});
   }
 }
 
@@ -110,9 +109,9 @@ void ChannelServer::on_stream_removed(const Stream& stream) {
 void ChannelServer::on_heartbeat() {
   if (parts_.on_heartbeat) parts_.on_heartbeat();
   const MonoTime now = parts_.loop.now();
-  if (now - looked_ < kLookPeriod) return;
-  looked_ = now;
-  streams_.look_at_all();
+  if (now - checked_ < kCheckPeriod) return;
+  checked_ = now;
+  streams_.check_all();
 }
 
 }  // namespace dssm::daemon

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Accepts connections of other hosts and remote programs, within the limits, and keeps them.
+// Accepts connections of other hosts and remote programs, within the limits, and owns them.
 #pragma once
 
 #include <cstdint>
@@ -75,7 +75,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   wire::Greeting self_;
   PeerTable peers_;
   ServedStreams streams_;
-  MonoTime looked_{};  // at all streams
+  MonoTime checked_{};  // all streams
   std::map<DataCommunicator*, std::unique_ptr<DataCommunicator>> communicators_;
   std::vector<DataCommunicator*> ended_;  // to be destroyed outside of their own callbacks
   EventSource sweep_;

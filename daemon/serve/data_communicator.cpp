@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/serve/data_communicator.hpp"
 
+#include <fmt/format.h>
+
 #include <utility>
 
 #include "core/base/try.hpp"
@@ -36,20 +38,20 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
       link_(parts.loop, std::move(transport), *this, kMaxQueuedBytes),
       catalog_(parts.registry, parts.opens, kMaxPlainListBytes),
       next_turn_(EventSource::timer(parts.loop, [this] { work_now(); })),
-      greeting_is_late_(EventSource::timer(
+      greeting_timeout_(EventSource::timer(
           parts.loop,
           [this] {
-            link_.close_with({Errc::protocol, peer() + " connected and said no Hello for 3 s"});
+            link_.close_with({Errc::protocol, peer() + " connected and sent no Hello for 3 s"});
           })),
-      silence_(EventSource::timer(parts.loop, [this] { watch_silence(); })) {
+      peer_timeout_(EventSource::timer(parts.loop, [this] { check_peer_timeout(); })) {
   link_.set_budget(place_.budget());
-  greeting_is_late_.enable_in(wire::kHelloTimeout);
+  greeting_timeout_.enable_in(wire::kHelloTimeout);
 }
 
 DataCommunicator::~DataCommunicator() = default;
 
 std::string DataCommunicator::peer() const {
-  return (them_ ? them_->str() : "somebody") + " at '" + peer_address_ + "'";
+  return (them_ ? them_->str() : "a peer") + " at '" + peer_address_ + "'";
 }
 
 // --- frames
@@ -60,7 +62,7 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
     if (!frame.has_failure()) {
       return Error{Errc::protocol, "a request has no serial; it takes one above 0"};
     }
-    their_words_ = wire::failure(frame.failure());
+    their_failure_ = wire::failure(frame.failure());
     return {};
   }
   if (served_ < kRequestsPerTurn && can_serve()) {
@@ -69,7 +71,7 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
   }
   waiting_ = std::move(frame);
   link_.pause();
-  // Otherwise whatever is in the way ends with work_now().
+  // Otherwise work_now() serves it when what is in progress ends.
   if (can_serve()) work_soon();
   return {};
 }
@@ -81,7 +83,7 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
   Result<wire::Greeting> them =
       wire::greeting_untrusted(frame.hello(), "the program at '" + peer_address_ + "'");
   if (!them) {
-    // So that both ends have both names: they see it in the words that they get.
+    // With the names of both ends, which the peer logs.
     return std::move(them).error().context("dssmd of host '" + parts_.self.host + "' refuses");
   }
   them_ = *std::move(them);
@@ -90,7 +92,7 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
   identity_.host_id = them_->host_id;
   identity_.program = them_->program;
   DSSM_TRY(parts_.authorizer(identity_, Action::greet, {}));
-  greeting_is_late_.disable();
+  greeting_timeout_.disable();
   net::Frame hello;
   wire::to_message(parts_.self, *hello.mutable_hello());
   link_.send(hello);
@@ -121,7 +123,7 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
   DSSM_TRY(check_access(request));
   if (request.has_ping()) {
     is_control_ = true;
-    silence_.enable_in(wire::kPeerTimeout);
+    peer_timeout_.enable_in(wire::kPeerTimeout);
     net::Frame pong;
     pong.set_serial(request.serial());
     wire::send_clock(parts_.self, *pong.mutable_pong()->mutable_clock());
@@ -197,7 +199,7 @@ Result<void> DataCommunicator::go_on_opening() {
   if (opening_->stream->removed()) {
     const std::string id = opening_->stream->id().str();
     opening_.reset();
-    return Error{Errc::not_found, "stream '" + id + "' was removed meanwhile; create it anew"};
+    return Error{Errc::not_found, "stream '" + id + "' was removed meanwhile; create it again"};
   }
   if (opening_->reservation) {
     const Result<bool> reserved = opening_->reservation->go_on();
@@ -258,16 +260,15 @@ void DataCommunicator::on_output_empty() { work_now(); }
   if (waiting_ && can_serve()) work_soon();
 }
 
-void DataCommunicator::watch_silence() {
+void DataCommunicator::check_peer_timeout() {
   const Duration silent = parts_.loop.now() - link_.last_heard();
-  // While the link is paused it is us who do not listen.
+  // While the link is paused, this side does not receive.
   if (silent < wire::kPeerTimeout || link_.is_paused()) {
     const Duration rest = wire::kPeerTimeout - silent;
-    return silence_.enable_in(link_.is_paused() ? wire::kPeerTimeout : rest);
+    return peer_timeout_.enable_in(link_.is_paused() ? wire::kPeerTimeout : rest);
   }
-  link_.close_with({Errc::unavailable, "nothing came from " + peer() + " for " +
-                                           std::to_string(silent / std::chrono::milliseconds(1)) +
-                                           " ms"});
+  link_.close_with({Errc::unavailable, fmt::format("no bytes came from {} for {} ms", peer(),
+                                                   silent / std::chrono::milliseconds(1))});
 }
 
 // --- what happens to streams
@@ -285,10 +286,9 @@ void DataCommunicator::on_stream_removed(const Stream& stream) {
 
 void DataCommunicator::on_closed(const Error& why) {
   next_turn_.disable();
-  greeting_is_late_.disable();
-  silence_.disable();
-  // A ring whose memory is not all there yet, and that nobody else has found, is as if it had never
-  // been.
+  greeting_timeout_.disable();
+  peer_timeout_.disable();
+  // Removes a ring whose memory is not fully reserved, unless a program or peer has opened it meanwhile.
   if (opening_ && opening_->created && opening_->stream->channels() == 0 &&
       !opening_->stream->removed()) {
     const OpenTable::Counts counts = parts_.opens.counts(*opening_->stream);
@@ -303,7 +303,7 @@ void DataCommunicator::on_closed(const Error& why) {
 }
 
 void DataCommunicator::log_end(const Error& why) {
-  const std::string reason = their_words_.message.empty() ? why.message : their_words_.message;
+  const std::string reason = their_failure_.message.empty() ? why.message : their_failure_.message;
   if (why.code != Errc::unavailable) {
     parts_.logger.warning("closed the connection of " + peer() + ": " + why.message,
                           {.peer = peer_address_, .message_id = message_id::kPeerRefused});
@@ -322,13 +322,12 @@ void DataCommunicator::log_end(const Error& why) {
   const SampleSender::Counters& sent = channel_->counters();
   const wire::DecoderCounters& received = link_.counters();
   parts_.logger.debug(
-      "channel of '" + id + "': " + std::to_string(sent.samples) + " samples sent (" +
-          std::to_string(sent.copied_payload_bytes) + " payload bytes copied, " +
-          std::to_string(sent.in_place_payload_bytes) + " sent in place, " +
-          std::to_string(sent.torn) + " samples torn, " + std::to_string(channel_->lost()) +
-          " lost), " + std::to_string(received.samples) + " received (" +
-          std::to_string(received.copied_payload_bytes) + " payload bytes copied, " +
-          std::to_string(received.direct_payload_bytes) + " received in place)",
+      fmt::format("channel of '{}': {} samples sent ({} payload bytes copied, {} sent in place, {} "
+                  "samples torn, {} lost), {} received ({} payload bytes copied, {} received in "
+                  "place)",
+                  id, sent.samples, sent.copied_payload_bytes, sent.in_place_payload_bytes,
+                  sent.torn, channel_->lost(), received.samples, received.copied_payload_bytes,
+                  received.direct_payload_bytes),
       {.stream = id, .peer = peer_address_});
 }
 

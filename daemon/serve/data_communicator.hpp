@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The server end of one connection from another host or a remote program: greets, brings requests
-// to whoever serves them, and watches that they take turns. What the connection is for its first
-// request says: a channel carries one stream (StreamChannel), a control connection asks about all
+// The server end of one connection from another host or a remote program: greets, authorizes each
+// request and passes it on in its turn. The first request decides what the connection is for: a
+// channel carries one stream (StreamChannel), a control connection asks about all
 // of them (CatalogRequests, StreamWatch).
 //
 // Backpressure: a request is served only while nothing waits to be sent; until then one waits here
@@ -38,12 +38,12 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   // Answers and events that may wait for one connection: the longest answer is a property.
   static constexpr std::size_t kMaxQueuedBytes = wire::kMaxNetworkFrameBytes + (1U << 20);
 
-  // Who keeps the connection.
+  // The owner of the connection.
   class Observer {
    public:
     // It ended; to be destroyed later, not from within this call.
     virtual void on_ended(DataCommunicator& communicator) = 0;
-    // A host that is alive said so.
+    // A heartbeat arrived.
     virtual void on_heartbeat() {}
 
    protected:
@@ -76,7 +76,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   // This host's clock has a new generation: notifies control connections with the feature.
   void send_clock();
 
-  // Tells the peer why, as far as that goes at once.
+  // Sends a final failure, as far as the socket takes it at once.
   void close_with(const Error& why) { link_.close_with(why); }
 
  private:
@@ -105,7 +105,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   Result<void> check_clock(const StreamId& id) const;
   Result<void> go_on_opening();
   void send_failure(std::uint64_t serial, const Error& error);
-  void watch_silence();
+  void check_peer_timeout();
   std::string peer() const;
   void log_end(const Error& why);
 
@@ -115,7 +115,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   FrameConnection link_;
   std::optional<wire::Greeting> them_;  // after their Hello
   Identity identity_;                   // likewise
-  Error their_words_;                   // why they are about to close; empty: did not say
+  Error their_failure_;                 // the peer's final failure; empty: none
   std::optional<net::Frame> waiting_;   // a request whose turn has not come; the link is paused
   int served_ = 0;                      // in this turn
   bool is_control_ = false;
@@ -124,7 +124,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   std::optional<Opening> opening_;
   std::unique_ptr<StreamChannel> channel_;
   bool turn_is_due_ = false;
-  EventSource next_turn_, greeting_is_late_, silence_;
+  EventSource next_turn_, greeting_timeout_, peer_timeout_;
 };
 
 }  // namespace dssm::daemon

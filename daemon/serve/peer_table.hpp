@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Who is connected over the network, by address, and what they cost. Everything that a peer can
-// make grow (frames that wait for it, samples that are received from it, ...) is charged to the
-// account of its address, so that one bad peer cannot use up what the others need.
+// The connections over the network, by address, and the memory that they use. Everything that a peer
+// can make grow (frames that wait for it, samples that are received from it, ...) is charged to the
+// account of its address, so that one peer cannot use up the memory of the others.
 #pragma once
 
 #include <cstdint>
@@ -27,7 +27,7 @@ struct PeerAccount {
 
 class PeerTable;
 
-// One connection's place; given back by the destructor. The table outlives it.
+// One connection's quota; given back by the destructor. The table outlives it.
 class PeerPlace {
  public:
   PeerPlace(PeerPlace&& other) noexcept;
@@ -60,7 +60,7 @@ class PeerTable {
   PeerTable(const PeerTable&) = delete;
   PeerTable& operator=(const PeerTable&) = delete;
 
-  // For who comes, the accounts of those who are there included.
+  // For new connections, and for the budgets of existing accounts.
   void set_limits(const Limits& limits);
 
   // A place for one more connection from `address`.

@@ -89,7 +89,7 @@ Result<void> SampleReceiver::write() {
       return Error{Errc::system,
                    "write to '" + stream_.stream().id().str() +
                        "': a program has damaged the lock of its ring; remove the stream (dssmctl "
-                       "rm) and create it anew"};
+                       "rm) and create it again"};
   }
   retry_ = kFirstRetry;
   written_ = true;
@@ -115,7 +115,7 @@ void SampleReceiver::answer(std::uint64_t serial) {
 }
 
 void SampleReceiver::acknowledge() {
-  if (std::exchange(written_, false)) stream_.look();
+  if (std::exchange(written_, false)) stream_.check();
   // One acknowledgement stands for all before it: those that would wait for the socket are not
   // sent.
   if (!unacknowledged_ || !link_.output_empty()) return;

@@ -47,7 +47,7 @@ Result<void> ServedStream::assess(const ring::ClockAssessment& assessment) {
   return {};
 }
 
-void ServedStream::look() {
+void ServedStream::check() {
   if (const std::shared_ptr<StreamFeed> feed = feed_.lock()) feed->look();
 }
 
@@ -57,8 +57,8 @@ std::shared_ptr<ServedStream> ServedStreams::get(std::shared_ptr<Stream> stream)
   return served;
 }
 
-void ServedStreams::look_at_all() {
-  for (const auto& [key, served] : streams_) served->look();
+void ServedStreams::check_all() {
+  for (const auto& [key, served] : streams_) served->check();
 }
 
 }  // namespace dssm::daemon

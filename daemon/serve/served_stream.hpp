@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What all channels of one stream share: the feed that tells of new samples, and the way to write.
-// They are there only while somebody uses them.
+// What all channels of one stream share: the feed that notifies of new samples, and the writer. They
+// exist only while a channel uses them.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -25,7 +25,7 @@ class OwnWriter {
   OwnWriter(const OwnWriter&) = delete;
   OwnWriter& operator=(const OwnWriter&) = delete;
 
-  // Without doorbell: who writes by it calls the feed.
+  // Without doorbell: the caller notifies the feed of what it writes.
   ring::RingWriter& writer() noexcept { return writer_; }
   ring::PublisherCursors publishers() noexcept {
     return ring::PublisherCursors(mapping_->header());
@@ -58,8 +58,8 @@ class ServedStream {
   // ClockAssessment::kValidFor, also by the next dssmd. Fails with os errors.
   Result<void> assess(const ring::ClockAssessment& assessment);
 
-  // dssmd wrote to the ring, or a writer may have died before it could ring.
-  void look();
+  // dssmd wrote to the ring, or a writer may have been killed before it wrote to the doorbell.
+  void check();
 
  private:
   const EventLoop& loop_;
@@ -78,7 +78,7 @@ class ServedStreams {
 
   std::shared_ptr<ServedStream> get(std::shared_ptr<Stream> stream);
   void forget(const Stream& stream) { streams_.erase(&stream); }
-  void look_at_all();
+  void check_all();
 
  private:
   const EventLoop& loop_;

@@ -45,7 +45,7 @@ StreamChannel::~StreamChannel() {
 Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
   if (stream().removed()) {
     return Error{Errc::not_found,
-                 "stream '" + stream().id().str() + "' was removed; create it anew"};
+                 "stream '" + stream().id().str() + "' was removed; create it again"};
   }
   switch (request.body_case()) {
     case net::Frame::kSubscribe:

@@ -11,16 +11,16 @@ StreamWatch::StreamWatch(const Registry& registry, const OpenTable& opens, Frame
     : opens_(opens),
       link_(link),
       serial_(serial),
-      untold_(registry.streams().begin(), registry.streams().end()) {}
+      pending_(registry.streams().begin(), registry.streams().end()) {}
 
 bool StreamWatch::work() {
-  for (int told = 0; !untold_.empty() && link_.output_empty(); ++told) {
-    if (told == kStreamsPerTurn) return true;
-    const std::shared_ptr<const Stream> stream = untold_.front().lock();
-    untold_.pop_front();
-    if (stream && !stream->removed()) tell(*stream);
+  for (int sent = 0; !pending_.empty() && link_.output_empty(); ++sent) {
+    if (sent == kStreamsPerTurn) return true;
+    const std::shared_ptr<const Stream> stream = pending_.front().lock();
+    pending_.pop_front();
+    if (stream && !stream->removed()) send_added(*stream);
   }
-  if (!untold_.empty() || serial_ == 0) return false;
+  if (!pending_.empty() || serial_ == 0) return false;
   net::Frame done;
   done.set_serial(serial_);
   done.mutable_done();
@@ -29,21 +29,21 @@ bool StreamWatch::work() {
   return false;
 }
 
-void StreamWatch::tell(const Stream& stream) {
+void StreamWatch::send_added(const Stream& stream) {
   net::Frame frame;
   describe(stream, opens_, *frame.mutable_stream_event()->mutable_stream());
   link_.send(frame);
 }
 
 void StreamWatch::on_stream_added(const Stream& stream) {
-  if (untold_.empty()) {
-    tell(stream);
+  if (pending_.empty()) {
+    send_added(stream);
   } else {
-    untold_.push_back(stream.weak_from_this());
+    pending_.push_back(stream.weak_from_this());
   }
 }
 
-// Also of one that was not told yet: whoever does not know it has nothing to forget.
+// Also for one whose addition was not sent yet: a receiver ignores the removal of an unknown stream.
 void StreamWatch::on_stream_removed(const Stream& stream) {
   net::Frame frame;
   proto::StreamEvent& event = *frame.mutable_stream_event();

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One control connection that watches the streams of this host: first all that are there, then the
-// answer to Watch, then what changes. What was there at first goes out as fast as the peer takes
-// it, so that thousands of streams need no memory to wait in.
+// One control connection that watches the streams of this host: first an event for each existing
+// stream, then the response to Watch, then changes. The first events are sent as fast as the peer
+// receives them, so that thousands of streams need no memory for a queue.
 #pragma once
 
 #include <cstdint>
@@ -17,27 +17,27 @@ namespace dssm::daemon {
 
 class StreamWatch {
  public:
-  // Streams told in a row before others get their turn.
+  // Events sent in a row before others get their turn.
   static constexpr int kStreamsPerTurn = 64;
 
   // All outlive it.
   StreamWatch(const Registry& registry, const OpenTable& opens, FrameConnection& link,
               std::uint64_t serial);
 
-  // Goes on telling while the link takes it. True when others should have their turn and work()
-  // be called again; else nothing is left, or on_output_empty() comes.
+  // Sends events while the link takes them. True when others should have their turn and work() be
+  // called again; else nothing is left, or on_output_empty() comes.
   bool work();
 
   void on_stream_added(const Stream& stream);
   void on_stream_removed(const Stream& stream);
 
  private:
-  void tell(const Stream& stream);
+  void send_added(const Stream& stream);
 
   const OpenTable& opens_;
   FrameConnection& link_;
   std::uint64_t serial_;  // of Watch; 0: answered
-  std::deque<std::weak_ptr<const Stream>> untold_;
+  std::deque<std::weak_ptr<const Stream>> pending_;
 };
 
 }  // namespace dssm::daemon

@@ -41,7 +41,7 @@ Result<void> set_runtime_dir(Config& config, std::string_view text) {
   if (text.find('\0') != text.npos) return error("holds a zero byte");
   // "/dssmd.sock" and the end mark have to fit into a socket's address.
   if (text.size() + 12 > sizeof(sockaddr_un::sun_path)) {
-    return error("is longer than the 96 bytes that leave room for a socket's name");
+    return error("is longer than the 96 bytes that leave space for a socket's name");
   }
   config.runtime_dir = text;
   return {};
@@ -89,7 +89,7 @@ Result<void> add_interface(std::vector<std::string>& interfaces, std::string_vie
   return {};
 }
 
-// A name may stand for any address, now or tomorrow; only "localhost" may not.
+// A name may resolve to any address, now or later; only "localhost" may not.
 bool stays_on_this_pc(const wire::Address& address) {
   if (address.host == "localhost") return true;
   const std::vector<wire::SocketAddress> numbers = wire::resolve_number(address);
@@ -111,11 +111,12 @@ Result<void> check_secure(const Config& config) {
   if (config.listen) note("listen", *config.listen);
   note("peer", config.peers);
   if (addresses.empty()) return {};
-  return Error{Errc::invalid_argument,
-               addresses +
-                   ": other PCs are reached in the clear, and whoever reaches this one can read "
-                   "and write all its streams; set insecure = true (--insecure) if you own that "
-                   "network, or use loopback addresses only"};
+  return Error{
+      Errc::invalid_argument,
+      addresses +
+          ": traffic to other PCs is unencrypted, and any host that reaches this one can read "
+          "and write all its streams; set insecure = true (--insecure) if you own that "
+          "network, or use loopback addresses only"};
 }
 
 template <auto member>
@@ -239,7 +240,8 @@ constexpr ConfigKey kKeys[] = {
      }},
     {"clock_policy", "POLICY",
      "what to do with streams of hosts whose clocks may be too far from this one's: enforce (not "
-     "open them, and answer reads by time with an error), mark (tell who asks) or off; default: "
+     "open them, and answer reads by time with an error), mark (flag their samples) or off; "
+     "default: "
      "enforce",
      ValueForm::text, at_once<&Config::clocks>,
      [](Config& c, std::string_view text) {
@@ -262,7 +264,7 @@ constexpr ConfigKey kKeys[] = {
        return {};
      },
      [](Config& c) { c.clocks.exceptions.clear(); }, "clock-stream"},
-    {"max_drift", "PPM", "how fast this PC's clock runs away at worst; default: 50 ppm",
+    {"max_drift", "PPM", "highest drift of this PC's free-running clock; default: 50 ppm",
      ValueForm::text, at_once<&Config::max_drift>,
      [](Config& c, std::string_view text) { return take(c.max_drift, parse_drift(text)); }},
     {"chronyd", "ADDR:PORT",
@@ -375,7 +377,7 @@ std::string ConfigKey::flag() const {
 
 Result<void> apply_text_untrusted(Config& config, std::string_view text, const std::string& path) {
   if (!is_utf8(text)) {
-    return Error{Errc::invalid_argument, path + ": the file is no UTF-8 text"};
+    return Error{Errc::invalid_argument, path + ": the file is not UTF-8 text"};
   }
   const Result<toml::table> table = parse_toml(text, path);
   if (!table) return table.error();

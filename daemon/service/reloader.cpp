@@ -38,7 +38,7 @@ void Reloader::reload() {
   }
   applied_ = *read;
   apply_(applied_);
-  logger_.notice("configuration read anew: " +
+  logger_.notice("configuration read again: " +
                      (changed.empty() ? "nothing changed at once" : "changed " + changed),
                  {.message_id = message_id::kReloaded});
   if (needs_restart.empty()) return;

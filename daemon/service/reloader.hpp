@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// SIGHUP: reads the configuration anew. With a mistake in it everything stays as it was, and all
-// mistakes are logged; else what can change while dssmd runs changes at once, and the keys that
-// take a restart are named.
+// SIGHUP: reads the configuration again. If it has a mistake, all mistakes are logged and nothing
+// changes. Otherwise the keys that may change while dssmd runs take effect at once, and those that
+// need a restart are logged.
 #pragma once
 
 #include <dssm/result.hpp>

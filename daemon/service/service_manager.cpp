@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The protocol of sd_notify(3), written here because libsystemd's own function waits while the
-// manager's queue is full, and dssmd waits for nobody.
+// manager's queue is full, and dssmd never blocks.
 #include "daemon/service/service_manager.hpp"
 
 #include <fcntl.h>
@@ -24,8 +24,8 @@ namespace {
 
 constexpr std::size_t kMostDescriptorsPerMessage = 253;  // the kernel's SCM_MAX_FD
 
-// Until what the manager did not take is tried again when the socket does not tell: too many
-// descriptors under way are no matter of room in it.
+// Pause before a retry when the socket does not become writable: that too many descriptors are in
+// flight has nothing to do with free space in its queue.
 constexpr Duration kPause = std::chrono::milliseconds(10);
 
 }  // namespace
@@ -78,8 +78,7 @@ void ServiceManager::alive() {
   if (waiting_.empty()) static_cast<void>(send_now({"WATCHDOG=1", {}, {}}));
 }
 
-// FDPOLL=0: the manager is not to look whether they are ready for anything: any writer could make
-// it throw an eventfd away.
+// FDPOLL=0: the manager shall not poll them: otherwise any writer could make it drop an eventfd.
 void ServiceManager::keep(const std::string& name, const std::vector<int>& fds) {
   DSSM_CHECK(!fds.empty() && fds.size() <= kMostDescriptorsPerMessage);
   send({"FDSTORE=1\nFDPOLL=0\nFDNAME=" + name, fds, name});
@@ -103,19 +102,19 @@ void ServiceManager::send(Message message) {
 }
 
 ServiceManager::Sent ServiceManager::send_now(const Message& message) {
-  if (path_.empty()) return Sent::nobody_there;
-  // A manager that was started anew has another socket at the same place.
+  if (path_.empty()) return Sent::no_manager;
+  // A restarted manager has another socket at the same path.
   for (int attempt = 0; attempt < 2; ++attempt) {
-    if (!connected_ && !connect()) return Sent::nobody_there;
+    if (!connected_ && !connect()) return Sent::no_manager;
     const Sent sent = try_send(message);
     if (sent == Sent::not_now) {
       writable_.enable();
       try_again_.enable_in(kPause);
     }
-    if (sent != Sent::nobody_there) return sent;
+    if (sent != Sent::no_manager) return sent;
     connected_ = false;
   }
-  return Sent::nobody_there;
+  return Sent::no_manager;
 }
 
 bool ServiceManager::connect() {
@@ -157,7 +156,7 @@ ServiceManager::Sent ServiceManager::try_send(const Message& message) const {
     if (errno == EINTR) continue;
     // ETOOMANYREFS: too many descriptors are on their way; the manager takes them off it.
     const bool later = errno == EAGAIN || errno == ENOBUFS || errno == ETOOMANYREFS;
-    return later ? Sent::not_now : Sent::nobody_there;
+    return later ? Sent::not_now : Sent::no_manager;
   }
 }
 

@@ -1,12 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The service manager (systemd) as dssmd sees it: it is told how dssmd is doing, keeps descriptors
-// over a restart (FileDescriptorStoreMax=), and hands over sockets and what it kept. Where there is
-// none ($NOTIFY_SOCKET, $LISTEN_FDS) nothing of this does anything.
+// The service manager (systemd): dssmd reports its state to it; it keeps descriptors over a restart
+// (FileDescriptorStoreMax=), and passes sockets and kept descriptors to the next dssmd. Without one
+// ($NOTIFY_SOCKET, $LISTEN_FDS) nothing of this has an effect.
 //
-// Nothing here waits: what the manager does not take at once goes out in order when it does. A
-// dssmd that is killed before that did not say it: streams of that moment come back from their
-// programs. Watchdog signs are the exception, they are worthless later.
+// Nothing here blocks: messages that the manager does not take at once are queued. If dssmd is killed
+// before they are sent, streams of that moment are offered back by their programs. Watchdog messages
+// are never queued.
 #pragma once
 
 #include <cstddef>
@@ -23,15 +23,15 @@
 
 namespace dssm::daemon {
 
-// A descriptor that the manager handed over, and the name that goes with it (FDNAME=,
+// A descriptor that the manager passed, and its name (FDNAME=,
 // FileDescriptorName=).
 struct NamedDescriptor {
   std::string name;
   UniqueFd fd;
 };
 
-// Those that were handed to this process ($LISTEN_FDS). To be called once, before threads begin:
-// the environment is taken off.
+// Those that were passed to this process ($LISTEN_FDS). To be called once, before threads start: it
+// removes the variables from the environment.
 std::vector<NamedDescriptor> take_handed_over();
 
 class ServiceManager {
@@ -58,7 +58,7 @@ class ServiceManager {
   void keep(const std::string& name, const std::vector<int>& fds);
   void forget(const std::string& name);
 
-  // Messages that the manager has not taken yet.
+  // Messages that the manager has not taken yet; for tests.
   std::size_t waiting() const noexcept { return waiting_.size(); }
 
  private:
@@ -67,7 +67,7 @@ class ServiceManager {
     std::vector<int> fds;
     std::string keeps;  // the name under which `fds` shall be kept
   };
-  enum class Sent : unsigned char { taken, not_now, nobody_there };
+  enum class Sent : unsigned char { taken, not_now, no_manager };
 
   void send(Message message);
   Sent send_now(const Message& message);
@@ -80,12 +80,12 @@ class ServiceManager {
   UniqueFd socket_;
   bool connected_ = false;
   std::deque<Message> waiting_;
-  EventSource writable_;  // of the socket; only hurries try_again_
+  EventSource writable_;  // of the socket; only speeds up try_again_
   EventSource try_again_;
 };
 
-// Shows the manager that the loop turns, at half of the interval that it asks for
-// ($WATCHDOG_USEC): a loop that hangs is noticed, and dssmd is killed and started anew.
+// Reports to the manager that the loop runs, twice in the interval that it requires ($WATCHDOG_USEC):
+// when the loop hangs, the manager kills and restarts dssmd.
 class Watchdog {
  public:
   // Begins at once. manager: outlives it.
@@ -94,7 +94,7 @@ class Watchdog {
   Watchdog& operator=(const Watchdog&) = delete;
 
  private:
-  Duration pause_{};  // zero: nobody asks
+  Duration pause_{};  // zero: not required
   EventSource timer_;
 };
 

@@ -11,7 +11,7 @@ StatusLine::StatusLine(const EventLoop& loop, ServiceManager& manager,
       text_(std::move(text)),
       timer_(EventSource::timer(loop, [this] { update(); })) {}
 
-std::string StatusLine::now() { return told_ = text_(); }
+std::string StatusLine::now() { return sent_ = text_(); }
 
 void StatusLine::touch() {
   if (manager_.is_there() && !std::exchange(due_, true)) timer_.enable_in(kPause);
@@ -20,9 +20,9 @@ void StatusLine::touch() {
 void StatusLine::update() {
   due_ = false;
   std::string text = text_();
-  if (text == told_) return;
-  told_ = std::move(text);
-  manager_.status(told_);
+  if (text == sent_) return;
+  sent_ = std::move(text);
+  manager_.status(sent_);
 }
 
 }  // namespace dssm::daemon

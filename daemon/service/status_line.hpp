@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Keeps the line that `systemctl status` shows current, at most once in kPause and only when it
-// changed. Costs nothing where nobody asks for it.
+// Updates the line that `systemctl status` shows, at most once in kPause and only when it changed. Does
+// nothing without a service manager.
 #pragma once
 
 #include <dssm/time.hpp>
@@ -22,7 +22,7 @@ class StatusLine {
   StatusLine(const StatusLine&) = delete;
   StatusLine& operator=(const StatusLine&) = delete;
 
-  // The line as it is now, which the caller tells the manager.
+  // The line as it is now, for the caller to send to the manager.
   std::string now();
 
   // Something changed that is in the line.
@@ -33,7 +33,7 @@ class StatusLine {
 
   ServiceManager& manager_;
   std::function<std::string()> text_;
-  std::string told_;
+  std::string sent_;
   bool due_ = false;
   EventSource timer_;
 };

@@ -1,7 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What dssmd tells of the streams of this host: in the same words to its own programs and to other
-// hosts.
+// Descriptions of this host's streams, the same for its own programs and for other hosts.
 #pragma once
 
 #include <cstddef>
@@ -20,9 +19,8 @@ void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out);
 // The same, with the programs of this host that use it.
 void describe_with_users(const Stream& stream, const OpenTable& opens, proto::Stream& out);
 
-// All streams in the order of creation. From `max_bytes` on their types' fields are left out: a
-// list has to fit into one frame, and there are few who want the fields of thousands of streams at
-// once.
+// All streams in the order of creation. From `max_bytes` on their types' fields are left out, because a
+// list has to fit into one frame.
 void describe_all(const Registry& registry, const OpenTable& opens, std::size_t max_bytes,
                   proto::StreamList& out);
 

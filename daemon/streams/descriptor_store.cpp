@@ -38,7 +38,7 @@ bool DescriptorStore::restore_untrusted(std::vector<NamedDescriptor> kept, bool 
   std::map<std::string, std::vector<UniqueFd>> groups;
   for (NamedDescriptor& one : kept) groups[one.name].push_back(std::move(one.fd));
   bool all_is_here =
-      (store_is_there || !groups.empty()) && kept.size() + Stream::kMostKept <= max_descriptors_;
+      (store_is_there || !groups.empty()) && kept.size() + Stream::kMaxKept <= max_descriptors_;
   for (auto& [name, fds] : groups) {
     switch (take_back(name, std::move(fds))) {
       case Taken::good:
@@ -126,12 +126,12 @@ void DescriptorStore::on_stream_added(const Stream& stream) {
   if (!manager_.is_there()) return;
   const std::vector<int> fds = stream.descriptors_to_keep();
   if (descriptors_ + fds.size() > max_descriptors_) {
-    if (std::exchange(told_full_, true)) return;
+    if (std::exchange(logged_full_, true)) return;
     return logger_.warning(
         "stream '" + stream.id().str() + "' and further ones are not kept while dssmd restarts: " +
             std::to_string(max_descriptors_) +
             " descriptors are in the service manager's store already; the programs that hold "
-            "these streams give them back, remove (dssmctl rm) those that nobody needs",
+            "these streams give them back, remove (dssmctl rm) those that are not needed",
         {.stream = stream.id().str(), .message_id = message_id::kStoreFull});
   }
   const Entry entry{new_name(), fds.size()};
@@ -146,10 +146,10 @@ void DescriptorStore::on_stream_removed(const Stream& stream) {
   manager_.forget(entry.mapped().name);
   names_.erase(entry.mapped().name);
   descriptors_ -= entry.mapped().descriptors;
-  told_full_ = false;
+  logged_full_ = false;
 }
 
-// A name that nothing has; there are more names than places.
+// An unused name; there are more names than descriptors in the store.
 std::string DescriptorStore::new_name() {
   for (;;) {
     const std::uint32_t number = next_++ % kNames;

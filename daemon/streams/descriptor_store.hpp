@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The streams of this host, and the playback clock, in the service manager's descriptor store: a
-// dssmd that was started anew has them at once, those included whose programs have all ended. Who
-// has what open is told by the programs, which come back and offer what they hold; an offered ring
-// that came from the store is joined.
+// Keeps the streams of this host, and the playback clock, in the service manager's descriptor store: a
+// restarted dssmd has them at once, also streams whose programs have all ended. Which program has what
+// open is known from the programs, which reconnect and offer what they hold; an offered ring that came
+// from the store is joined.
 //
-// All descriptors of a stream (ring, bell, meta, doorbell) go under one name of three characters,
-// "#" alone of the same kind is the clock; what each is, it says itself. Longer names would be
-// easier to read, but systemd hands all of them over in one environment variable, and Linux starts
-// no program with a variable above 128 KiB: dssmd could never be started again.
+// All descriptors of a stream (ring, bell, meta, doorbell) have one name of three characters; the
+// clock's name is "#". Names of memory files tell which is which. Longer names would be easier to read,
+// but systemd passes all of them in one environment variable, and Linux starts no program with a
+// variable above 128 KiB: dssmd could never be started again.
 //
 // A doorbell that is made later is not kept: the writer that has it offers it back.
 #pragma once
@@ -69,7 +69,7 @@ class DescriptorStore final : private StreamObserver {
   ServiceManager& manager_;
   Logger& logger_;
   const std::size_t max_descriptors_;
-  bool told_full_ = false;
+  bool logged_full_ = false;
   std::size_t descriptors_ = 0;
   std::uint32_t next_ = 0;
   std::set<std::string> names_;  // in use

@@ -18,7 +18,7 @@ Result<void> check_own_memory_file(int fd, int seals, std::string_view what) {
   struct stat file {};
   if (::fstat(fd, &file)) return os_error("look at " + name);
   if (!has_seals(fd, seals)) {
-    return Error{Errc::protocol, name + " is no sealed memory file of dssmd's making"};
+    return Error{Errc::protocol, name + " is not a sealed memory file that dssmd created"};
   }
   if (file.st_uid != ::geteuid()) {
     return Error{Errc::no_permission, name + " belongs to user " + std::to_string(file.st_uid) +

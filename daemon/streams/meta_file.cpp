@@ -101,7 +101,7 @@ Result<local::StreamMeta> MetaFile::read_untrusted() const {
   const Result<MetaHeader> header = read_header_untrusted(fd_.get());
   if (!header) return header.error();
   if (header->length_bytes == 0) {
-    return Error{Errc::not_found, "the stream was removed (dssmctl rm); create it anew"};
+    return Error{Errc::not_found, "the stream was removed (dssmctl rm); create it again"};
   }
   std::string content(header->length_bytes, '\0');
   if (!read_all(fd_.get(), content.data(), content.size(), header->offset_bytes)) {

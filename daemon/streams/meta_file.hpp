@@ -3,7 +3,7 @@
 // The meta file: all that dssmd knows about a stream and that is not in its ring, in a memfd beside
 // it: type with fields, property, creator, place in the list. With ring, bell and this file alone a
 // new dssmd brings a stream back. Only dssmd writes it; clients hold a descriptor for reading, only
-// to offer it back. It is read with pread() and never mapped, so that its size cannot hurt anybody.
+// to offer it back. It is read with pread() and never mapped: a wrong size is an error, not a signal.
 //
 // Layout, little endian; the pages not named are holes:
 //
@@ -11,15 +11,14 @@
 //     0    8 magic     -      "DSSMMETA"
 //     8    4 version   -      1
 //    12    4 reserved  -      zero
-//    16    8 offset    bytes  where the content begins, a multiple of 4096; 0: the stream was
-//    removed 24    8 length    bytes  of the content, a protobuf message dssm.local.StreamMeta; 0:
-//    removed
+//    16    8 offset    bytes  of the content, a multiple of 4096; 0: the stream was removed
+//    24    8 length    bytes  of the content, a protobuf message dssm.local.StreamMeta; 0: removed
 //
 // Replacing the content must survive `kill -9` at any instruction. So the new content goes to pages
 // that the current one does not use; then the header is replaced by one write of 32 bytes inside
-// one page, which the kernel copies without looking at signals in between; then the old pages are
-// given back. Whoever reads before the header changed gets the old content, afterwards the new one.
-// (Loss of power needs no thought: the file is memory.)
+// one page, which the kernel copies without handling signals in between; then the old pages are
+// freed. A reader gets the old content before the header changes, the new one afterwards. (Loss of
+// power does not matter: the file is memory.)
 //
 // The file is sealed against shrinking and further seals, its mode is 0400: a descriptor for
 // reading cannot be turned into one for writing but by dssmd's own user.
@@ -51,8 +50,8 @@ class MetaFile {
   // Creates one that holds `meta`.
   static Result<MetaFile> create(const local::StreamMeta& meta);
 
-  // Takes one that dssmd created in an earlier life; `fd` may be for reading only. Fails with
-  // `protocol` when it is no meta file, no_permission when it is somebody else's.
+  // Opens one that an earlier run of dssmd created; `fd` may be for reading only. Fails with
+  // `protocol` when it is not a meta file, no_permission when another user created it.
   static Result<MetaFile> open_untrusted(UniqueFd fd);
 
   // The content. Fails with `protocol` when it is not in order, not_found when the stream was
@@ -62,7 +61,7 @@ class MetaFile {
   // Replaces the content, at once for all readers.
   Result<void> replace(const local::StreamMeta& meta);
 
-  // Marks the stream as removed for ever: nobody can bring it back by offering it.
+  // Marks the stream as removed for ever: no offer restores it.
   Result<void> mark_removed();
 
   int fd() const noexcept { return fd_.get(); }

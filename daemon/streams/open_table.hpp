@@ -50,7 +50,7 @@ class OpenTable {
 
   explicit OpenTable(const Limits& limits) : limits_(limits) {}
 
-  void set_limits(const Limits& limits) { limits_ = limits; }  // for what comes
+  void set_limits(const Limits& limits) { limits_ = limits; }  // for new opens
 
   // Whether `client` may open one more. Fails with limit_exceeded, naming the key.
   Result<void> check_quota(const ClientIdentity& client) const;
@@ -64,7 +64,7 @@ class OpenTable {
   Counts counts(const Stream& stream) const;
   std::vector<StreamUser> users(const Stream& stream) const;  // in the order of opening
 
-  // Who reads `stream`, in the order of opening.
+  // The opens of `stream` for reading, in the order of opening.
   struct Reading {
     ClientNumber client = 0;
     OpenNumber number = 0;
@@ -72,8 +72,8 @@ class OpenTable {
   };
   std::vector<Reading> readers_of(const Stream& stream) const;
 
-  // The streams of that name and id that somebody has open, whosever they are: own ones, removed
-  // ones, mirrors. Looks at all open streams.
+  // The open streams of that name and id, of any host: own ones, removed ones, mirrors. Searches all
+  // open streams.
   std::vector<std::shared_ptr<const Stream>> open_streams(const std::string& name,
                                                           std::int32_t id) const;
 

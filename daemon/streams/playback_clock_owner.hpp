@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Keeps the one playback clock of this PC (core/clock/playback_record.hpp) and hands it out. Made
-// when first asked for; after a restart of dssmd, taken back from the first program that still has
-// it.
+// Owns the one playback clock of this PC (core/clock/playback_record.hpp). It is made when first
+// requested, or after a restart of dssmd taken back from the first program that still has it.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -24,7 +23,7 @@ class PlaybackClockOwner {
   // A descriptor (read and write) for a client; its own.
   Result<UniqueFd> get();
 
-  // Called with each clock from now on that was not there before; {}: nobody.
+  // Called with each new clock from now on; {}: no call.
   void on_new_clock(std::function<void(int fd)> then) { on_new_clock_ = std::move(then); }
 
  private:

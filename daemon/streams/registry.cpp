@@ -3,6 +3,8 @@
 
 #include <algorithm>
 
+#include "core/base/try.hpp"
+
 namespace dssm::daemon {
 
 Result<StreamId> Registry::own_id(StreamId id) const {
@@ -27,7 +29,7 @@ Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
 }
 
 Result<void> Registry::check_quota() const {
-  if (by_name_.size() + rooms_ < limits_.max_streams) return {};
+  if (by_name_.size() + other_rings_ < limits_.max_streams) return {};
   return Error{Errc::limit_exceeded,
                "there are max_streams = " + std::to_string(limits_.max_streams) +
                    " streams already, counting those of other hosts that are read or written here; "
@@ -35,8 +37,8 @@ Result<void> Registry::check_quota() const {
 }
 
 Result<RingQuota> Registry::acquire_quota() {
-  if (Result<void> room = check_quota(); !room) return std::move(room).error();
-  return RingQuota(rooms_);
+  DSSM_TRY(check_quota());
+  return RingQuota(other_rings_);
 }
 
 Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& type,
@@ -55,7 +57,7 @@ Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& t
                                              std::to_string(to_ns(history.cycle)) +
                                              " ns; give the expected time between two samples"};
   }
-  if (Result<void> room = check_quota(); !room) return std::move(room).error().context(context);
+  DSSM_TRY(check_quota(), context);
   Result<std::shared_ptr<Stream>> stream =
       Stream::create({*own, type, history.depth, history.cycle, creator_pid, next_order_}, budget_);
   if (!stream) return std::move(stream).error().context(context);
@@ -73,10 +75,10 @@ Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, Of
       return found->second;
     }
     return Error{Errc::conflict, context +
-                                     ": another ring has that name by now; close this one and open "
-                                     "the stream anew"};
+                                     ": another ring has that name by now; close this one and "
+                                     "reopen the stream"};
   }
-  if (Result<void> room = check_quota(); !room) return std::move(room).error().context(context);
+  DSSM_TRY(check_quota(), context);
   Result<std::shared_ptr<Stream>> stream = Stream::adopt_untrusted(std::move(files), budget_);
   if (!stream) return std::move(stream).error().context(context);
   if ((*stream)->id() != *own) {
@@ -87,7 +89,7 @@ Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, Of
 }
 
 Result<std::shared_ptr<Stream>> Registry::adopt_stored_untrusted(OfferedFiles files) {
-  if (Result<void> room = check_quota(); !room) return std::move(room).error();
+  DSSM_TRY(check_quota());
   Result<std::shared_ptr<Stream>> stream = Stream::adopt_untrusted(std::move(files), budget_);
   if (!stream) return stream;
   const StreamId& id = (*stream)->id();
@@ -140,7 +142,7 @@ Result<void> Registry::set_property(const StreamId& id, std::string_view propert
 
 void Registry::add(std::shared_ptr<Stream> stream) {
   by_name_.emplace(Key{stream->id().name, stream->id().id}, stream);
-  // Streams of an earlier life of dssmd come back in any order and find their places again.
+  // Streams of an earlier run of dssmd come back in any order; each gets its old place in the list.
   const auto place = std::upper_bound(in_order_.begin(), in_order_.end(), stream->created_order(),
                                       [](std::uint64_t order, const std::shared_ptr<Stream>& s) {
                                         return order < s->created_order();

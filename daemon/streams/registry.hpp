@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The streams that this host owns, by name. One thread, no sockets: who asked, and what for, is
-// settled elsewhere (daemon/local).
+// The streams that this host owns, by name. One thread, no sockets: authorize() has allowed what is
+// asked here.
 #pragma once
 
 #include <cstdint>
@@ -20,7 +20,7 @@
 
 namespace dssm::daemon {
 
-// Told about streams that come and go.
+// Notified of streams that are added and removed.
 class StreamObserver {
  public:
   virtual void on_stream_added(const Stream& stream) = 0;
@@ -43,22 +43,22 @@ class Registry {
   Registry(const Registry&) = delete;
   Registry& operator=(const Registry&) = delete;
 
-  // For what comes; what is there stays.
+  // For new streams; existing ones stay.
   void set_limits(const Limits& limits) {
     limits_ = limits;
     budget_.set_limit(limits.max_memory_bytes);
   }
 
-  // Told in the order in which they were added. Each outlives the registry or takes itself off;
-  // none does either while it is told.
+  // Notified in the order in which they were added. Each outlives the registry or is removed before;
+  // none is added or removed by an observer.
   void add_observer(StreamObserver& observer) { observers_.push_back(&observer); }
   void remove_observer(StreamObserver& observer) { std::erase(observers_, &observer); }
 
   const std::string& host() const noexcept { return host_; }
   const MemoryBudget& budget() const noexcept { return budget_; }
 
-  // For rings that stand elsewhere (mirrors, remote writers) but count like those here. The
-  // registry outlives what it gives.
+  // For rings that are not in the registry (mirrors, remote writers) but count like those that are.
+  // The registry outlives the quotas.
   MemoryBudget& budget() noexcept { return budget_; }
   Result<RingQuota> acquire_quota();  // fails with limit_exceeded, naming the key
 
@@ -79,8 +79,8 @@ class Registry {
   Result<Created> create(const StreamId& id, const TypeInfo& type, const History& history,
                          std::int32_t creator_pid);
 
-  // Takes back a stream that a client kept while no dssmd ran; gives the
-  // registered one when it is the very same ring.
+  // Takes back a stream that a client kept while no dssmd ran. Returns the registered stream when it
+  // has the same ring.
   //   fails  conflict (another ring has that name), protocol, no_permission, limit_exceeded
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, OfferedFiles files);
 
@@ -88,7 +88,7 @@ class Registry {
   //   fails  also not_found (the stream was removed)
   Result<std::shared_ptr<Stream>> adopt_stored_untrusted(OfferedFiles files);
 
-  // The name is free at once; whoever has the stream open keeps it.
+  // The name is free at once; programs that have the stream open keep its ring.
   //   fails  not_found
   Result<void> remove(const StreamId& id);
 
@@ -104,8 +104,8 @@ class Registry {
 
   std::string host_;
   Limits limits_;
-  MemoryBudget budget_;      // before the streams, which hold shares of it
-  std::uint64_t rooms_ = 0;  // taken by acquire_quota()
+  MemoryBudget budget_;            // before the streams, which hold shares of it
+  std::uint64_t other_rings_ = 0;  // that hold a RingQuota
   std::map<Key, std::shared_ptr<Stream>> by_name_;
   std::vector<std::shared_ptr<Stream>> in_order_;
   std::uint64_t next_order_ = 1;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A place under max_streams for a ring without a name in the Registry: a mirror's, a remote
-// writer's. Counted while the object lives.
+// One ring's share of max_streams, for a ring that is not in the Registry: a mirror's, a remote
+// writer's. Held while the object exists.
 #pragma once
 
 #include <cstdint>
@@ -12,18 +12,18 @@ namespace dssm::daemon {
 class RingQuota {
  public:
   RingQuota() = default;
-  explicit RingQuota(std::uint64_t& taken) noexcept : taken_(&taken) { ++taken; }  // outlives it
-  RingQuota(RingQuota&& other) noexcept : taken_(std::exchange(other.taken_, nullptr)) {}
+  explicit RingQuota(std::uint64_t& used) noexcept : used_(&used) { ++used; }  // outlives it
+  RingQuota(RingQuota&& other) noexcept : used_(std::exchange(other.used_, nullptr)) {}
   RingQuota& operator=(RingQuota&& other) noexcept {
-    std::swap(taken_, other.taken_);
+    std::swap(used_, other.used_);
     return *this;
   }
   ~RingQuota() {
-    if (taken_) --*taken_;
+    if (used_) --*used_;
   }
 
  private:
-  std::uint64_t* taken_ = nullptr;
+  std::uint64_t* used_ = nullptr;
 };
 
 }  // namespace dssm::daemon

@@ -21,8 +21,8 @@ namespace {
 // The rate is taken over this many of the newest samples.
 constexpr Tid kRateSamples = 100;
 
-// How often to look again when the writer overtakes us between two looks.
-constexpr int kLooks = 4;
+// Attempts to read the newest stamps while writers overtake this reader.
+constexpr int kMaxAttempts = 4;
 
 Result<std::uint64_t> new_incarnation() {
   std::uint64_t value = 0;
@@ -99,7 +99,7 @@ Result<Stream::Plan> plan_untrusted(const local::StreamMeta& meta,
 void fill_figures(const ring::RingMapping& mapping, StreamInfo& info) {
   const ring::RingReader reader(mapping);
   SampleInfo last;
-  for (int look = 0; look < kLooks; ++look) {
+  for (int attempt = 0; attempt < kMaxAttempts; ++attempt) {
     const Tid newest = reader.newest();
     if (newest < 0 || reader.stamp(newest, last) != ReadStatus::ok) continue;
     info.newest = newest;
@@ -168,7 +168,7 @@ Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, Memo
   if (!share) return std::move(share).error();
   Result<MemoryShare> property_share = budget.take(content->property().size());
   if (!property_share) return std::move(property_share).error();
-  // Always anew, whatever came: writers get a descriptor that does not depend on the client's.
+  // Always a new one: writers get a descriptor that does not depend on the client's.
   Result<UniqueFd> ring = reopen_read_write(files.ring.get());
   if (!ring) return std::move(ring).error();
   std::shared_ptr<Stream> stream(
@@ -244,7 +244,7 @@ bool Stream::is_ring(int fd) const noexcept { return same_file(fd, files_.ring.g
 
 void Stream::take_doorbell_untrusted(UniqueFd doorbell) {
   if (!doorbell || files_.doorbells.size() == kMaxDoorbells) return;
-  // A blocking one could stop whoever reads it.
+  // Reading a blocking one could block dssmd.
   const int flags = ::fcntl(doorbell.get(), F_GETFL);
   if (kind_of_untrusted(doorbell.get()) != DescriptorKind::doorbell || !(flags & O_NONBLOCK))
     return;

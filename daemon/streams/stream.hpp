@@ -1,12 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One ring of this host: the memory files behind it and what dssmd knows about it. A stream that
-// this host owns lives as long as it has a name in the Registry or somebody has it open; mirrors
-// and the rings of remote writers as long as their keepers want. What programs hold of its memory
-// lives on by itself.
+// One ring of this host: its memory files and what dssmd knows about it. A stream that this host owns
+// exists as long as it is in the Registry or a program has it open; mirrors and the rings of remote
+// writers as long as their tables hold them. Memory that a program has mapped stays valid after that.
 //
-// dssmd never reads a payload here, and of the rings only the newest stamps, to tell how the stream
-// is doing.
+// dssmd never reads a payload here, and of the rings only the newest stamps, to report the stream's
+// state.
 #pragma once
 
 #include <cstdint>
@@ -34,10 +33,10 @@ struct OfferedFiles {
   UniqueFd doorbell;  // may be missing
 };
 
-// Told about the doorbells of a stream: eventfds that its writers write to while the bell says so.
+// Notified of a stream's doorbells: eventfds that its writers write to while the bell requests it.
 class DoorbellObserver {
  public:
-  virtual void on_doorbell_added(int fd) = 0;  // the stream's; good as long as it
+  virtual void on_doorbell_added(int fd) = 0;  // open as long as the stream exists
 
  protected:
   ~DoorbellObserver() = default;
@@ -67,8 +66,8 @@ class Stream : public std::enable_shared_from_this<Stream> {
   // that asked reserves the ring's.
   static Result<std::shared_ptr<Stream>> create(const Plan& plan, MemoryBudget& budget);
 
-  // Brings a stream back from its memory files, after checking owner, seals, geometry, and that
-  // ring and meta file tell the same story. Serves clients' offers and DescriptorStore.
+  // Restores a stream from its memory files, after checking owner, seals, geometry, and that ring and
+  // meta file agree. For clients' offers and DescriptorStore.
   static Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles files, MemoryBudget& budget);
 
   Stream(const Stream&) = delete;
@@ -81,17 +80,17 @@ class Stream : public std::enable_shared_from_this<Stream> {
   Purpose purpose() const noexcept { return plan_.purpose; }
   std::uint64_t incarnation() const noexcept { return mapping_->identity().incarnation; }
 
-  // What is known now, but for the users. Costs two looks at the ring.
+  // All but the users. Reads the newest stamps of the ring twice.
   StreamInfo info() const;
 
   // Descriptors to hand out, in the order of local.proto's Opened; the caller's own. For writers a
   // missing doorbell is made.
   Result<std::vector<UniqueFd>> descriptors_for(Role role);
 
-  // All that brings this stream back, at most kMostKept; the stream's own.
+  // All that restores this stream, at most kMaxKept; the stream keeps them open.
   std::vector<int> descriptors_to_keep() const;
 
-  // The ring for dssmd itself: to look at, to write to (mirrors), and its bell.
+  // The ring for dssmd itself: for reading, for writing (mirrors), and its bell.
   const ring::RingMapping& mapping() const noexcept { return *mapping_; }
   Result<std::shared_ptr<const ring::RingMapping>> map_for_writing() const;
   Result<std::shared_ptr<ring::Bell>> map_bell() const;
@@ -104,14 +103,13 @@ class Stream : public std::enable_shared_from_this<Stream> {
   // Whether `fd` is this stream's ring.
   bool is_ring(int fd) const noexcept;
 
-  // Takes the doorbell that a writer kept over a restart of dssmd, beside those that there are
-  // already: another one may have been made for another writer meanwhile. Whatever is no such
-  // eventfd, and what would be more than kMaxDoorbells, is dropped.
+  // Adds the doorbell that a writer kept over a restart of dssmd: another one may have been made for
+  // another writer meanwhile. Drops it if it is not such an eventfd, or one more than kMaxDoorbells.
   void take_doorbell_untrusted(UniqueFd doorbell);
   static constexpr std::size_t kMaxDoorbells = 8;
-  static constexpr std::size_t kMostKept = 3 + kMaxDoorbells;
+  static constexpr std::size_t kMaxKept = 3 + kMaxDoorbells;
 
-  // Tells of each doorbell, those that are there at once. At most one observer; nullptr: none.
+  // Reports each doorbell, existing ones at once. At most one observer; nullptr: none.
   void observe_doorbells(DoorbellObserver* observer);
 
   Result<std::string> property() const;
@@ -122,7 +120,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
   void add_channel() noexcept { ++channels_; }
   void remove_channel() noexcept { --channels_; }
 
-  // So that no later offer brings it back.
+  // No later offer restores it.
   Result<void> mark_removed();
   bool removed() const noexcept { return removed_; }
 

@@ -196,7 +196,7 @@ TEST(BadClients, DoNotStopADssmdWhoseLogNobodyReads) {
   ASSERT_TRUE(eventually([&] { return wire::connect_unix(path).has_value(); }));
   for (int i = 0; i < 1000; ++i) {  // some 150 bytes of log each, a pipe holds 64 KiB
     RawClient client(path, false);
-    client.send_bytes("\x05\x12\x03\x12\x01\xff");  // a Hello whose program is no UTF-8
+    client.send_bytes("\x05\x1a\x03\x2a\x01\xff");  // a Hello whose program is not UTF-8
     while (!client.receive().ended) {
     }
   }
