@@ -93,7 +93,7 @@ Result<void> NetworkConnection::connect_next() {
 }
 
 Result<void> NetworkConnection::greet() {
-  transport_ = wire::make_tcp_transport(std::move(connecting_));
+  transport_ = wire::make_transport(std::move(connecting_), wire::TransportEnd::connected);
   wire::FrameDelegate& sink = *this;
   decoder_ = std::make_unique<wire::FrameDecoder>(sink, wire::kMaxNetworkFrameBytes);
   wire::Greeting self;

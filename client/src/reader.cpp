@@ -63,8 +63,7 @@ ReadStatus check_clock(const ring::RingReader& ring, Tid tid) noexcept {
 
 bool BorrowedSample::still_valid() const noexcept {
   return sequence_ &&
-         ring::RingReader::still_valid(*static_cast<const std::atomic<std::uint64_t>*>(sequence_),
-                                       ring::published_sequence(info_.tid));
+         ring::RingReader::still_valid(*sequence_, ring::published_sequence(info_.tid));
 }
 
 namespace detail {

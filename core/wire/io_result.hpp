@@ -5,12 +5,12 @@
 
 namespace dssm::wire {
 
-// How sending or receiving without waiting went.
+// The outcome of sending or receiving without waiting.
 enum class IoStatus : unsigned char {
   ok,
   would_block,
-  interrupted,  // a signal handler ran meanwhile; only of what waits
-  end,          // the other side closed the connection or is gone
+  interrupted,  // a signal handler ran; only from functions that wait
+  end,          // the other side closed the connection, or its process died
 };
 
 struct IoResult {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// TCP as DSSM uses it. Two kinds of ends are told apart: a peer that closed or died (`end`, part of
-// normal work), and a network that does not carry (an error whose text says so).
+// TCP as DSSM uses it. A connection ends in one of two ways: the peer closed it or its process died
+// (`end`, part of normal work), or the network failed (an error that says so).
 #include "core/wire/tcp.hpp"
 
 #include <fcntl.h>
@@ -18,13 +18,13 @@ namespace dssm::wire {
 namespace {
 
 constexpr int kProbeAfterSeconds = 1, kProbeEverySeconds = 1, kProbes = 2;
-// A peer is given up when probes or data were left unanswered for so long (tcp.hpp says why two).
+// The connection ends when probes or data were not answered for so long (tcp.hpp says why two).
 constexpr int kUnansweredMs = 3000, kUntakenMs = 30'000;
 constexpr int kBacklog = 128;  // connections that wait for accept(); more get no answer yet
 constexpr std::size_t kMaxParts = 16;
 
 void set_option(int socket, int level, int option, int value) noexcept {
-  // The only failure is a socket that is none, and then everything else fails too.
+  // Fails only when `socket` is not a socket, and then every other call on it fails too.
   static_cast<void>(::setsockopt(socket, level, option, &value, sizeof value));
 }
 
@@ -41,7 +41,7 @@ int user_timeout_ms(int socket) noexcept {
   return value;
 }
 
-// Why a connection does not work, in words that say what to look at; `what` is tried.
+// The failure of `what`, with a hint at what to check.
 Error network_error(const std::string& what, int errno_value, int socket) {
   switch (errno_value) {
     case ETIMEDOUT:
@@ -77,7 +77,7 @@ class TcpTransport final : public Transport {
     const int flags = MSG_NOSIGNAL | MSG_DONTWAIT;
     const msghdr message = header(parts);
     ssize_t bytes = 0;
-    do {  // the kernel has less to look at when there is but one part
+    do {  // send() is cheaper than sendmsg(), and often there is one part only
       bytes = parts.size() == 1 ? ::send(socket_.get(), parts[0].iov_base, parts[0].iov_len, flags)
                                 : ::sendmsg(socket_.get(), &message, flags);
     } while (bytes < 0 && errno == EINTR);
@@ -136,7 +136,7 @@ Result<SocketAddress> address_by(NameOf name_of, int socket, const char* what) {
   return address;
 }
 
-// With nobody listening at a port of this PC that the kernel also picks for outgoing connections,
+// When no process listens at a port of this PC that the kernel also picks for outgoing connections,
 // a socket can be connected to itself.
 bool is_connected_to_itself(int socket) {
   const Result<SocketAddress> local = local_address(socket), peer = peer_address(socket);
@@ -235,7 +235,8 @@ void set_channel_options(int socket) noexcept {
   set_option(socket, IPPROTO_TCP, TCP_USER_TIMEOUT, kUntakenMs);
 }
 
-std::unique_ptr<Transport> make_tcp_transport(UniqueFd socket) {
+std::unique_ptr<Transport> make_transport(UniqueFd socket, TransportEnd end) {
+  if (end == TransportEnd::accepted) set_channel_options(socket.get());
   return std::make_unique<TcpTransport>(std::move(socket));
 }
 

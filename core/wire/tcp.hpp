@@ -1,15 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// TCP sockets as DSSM uses them: non-blocking, close-on-exec, without Nagle's delay, and with a
-// kernel that notices when the other PC is gone, so that idle channels need no heartbeats of their
-// own. How soon depends on the end:
+// TCP sockets as DSSM uses them: non-blocking, close-on-exec, without Nagle's delay. Keep-alive
+// probes let the kernel detect a PC that no longer answers, so that idle channels need no heartbeat
+// of their own. How soon depends on the end:
 //
-//   the end that connected  3 s (keep-alive probes, and TCP_USER_TIMEOUT for what was sent):
-//                           mirrors and remote writers want to know, and begin anew.
-//   the end that accepted   30 s. Linux counts a receiver whose window stays closed like one that
-//                           is gone. A program that looks at its subscription every few seconds is
-//                           not to be cut off for it; one that takes nothing for 30 s is, and
-//                           resumes where it was when it looks again.
+//   connected  3 s (keep-alive probes, and TCP_USER_TIMEOUT for sent bytes). The dialer of dssmd
+//              sets 30 s as for the other end: heartbeats of the control connection detect a dead
+//              host, and an owner that pauses a remote writer must not lose it.
+//   accepted   30 s. Linux treats a receiver whose window stays closed like one that does not
+//              answer. A program that reads its subscription every few seconds must not be
+//              disconnected for that; one that reads nothing for 30 s is, and resumes at the next
+//              read.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -30,22 +31,23 @@ Result<UniqueFd> listen_tcp(const SocketAddress& address);
 Result<SocketAddress> local_address(int socket);
 Result<SocketAddress> peer_address(int socket);  // IPv4 as such, also over a socket of IPv6
 
-// Whether connections over IPv4 arrive at this listening socket of "::", too, as at one that
-// systemd made with its defaults.
+// Whether this listening socket of "::" also accepts connections over IPv4, as one that systemd
+// made with its defaults does.
 bool takes_ipv4_too(int socket) noexcept;
 
-// Begins to connect; the socket becomes writable when it is done or failed, then ask
-// finish_connect(). Sets the options of the end that connected.
+// Begins to connect; the socket becomes writable when that succeeded or failed: then call
+// finish_connect(). Sets the options of the connected end.
 Result<UniqueFd> start_connect(const SocketAddress& address);
 
-// How connecting ended; the error says whom and why ("connect to '10.0.0.2:13776': Connection
+// The result of connecting; the error names the address and the reason ("connect to '10.0.0.2:13776': Connection
 // refused; is dssmd running there, and does it listen on that address?").
 Result<void> finish_connect(int socket, const SocketAddress& address);
 
-// Sets the options of the end that accepted.
+// Sets the options of the accepted end.
 void set_channel_options(int socket) noexcept;
 
-// A transport over a connected socket; takes it over.
-std::unique_ptr<Transport> make_tcp_transport(UniqueFd socket);
+// The transport over a connected or accepted socket, for both ends of a connection; for the
+// accepted end it sets the socket's options.
+std::unique_ptr<Transport> make_transport(UniqueFd socket, TransportEnd end);
 
 }  // namespace dssm::wire

@@ -1,7 +1,30 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The seam between frames and what carries them: TCP today, TLS over TCP in a later round, a pair
-// of buffers in tests.
+// Transport: moves the bytes of one connection. TCP today (tcp.hpp); tests use pairs of buffers.
+// Frames, limits and greeting are above it (FrameConnection in dssmd, NetworkConnection in libdssm)
+// and know no sockets except fd(). make_transport() in tcp.hpp is where both ends get theirs.
+//
+// A TLS transport fits behind this interface. It needs, beyond what TCP needs:
+//
+//   pending input  A TLS library may hold decrypted bytes while fd() is not readable. The callers
+//                  stop calling receive() when it returned less than the spaces hold, when their
+//                  turn is over, or while they are paused, and then wait for fd(). So either
+//                  receive() fills the spaces as long as it holds bytes, or a has_pending() is
+//                  added that they check before they wait.
+//   handshake      It runs inside send() and receive(): each may have to read and to write.
+//                  would_block then means "wait for the direction that the handshake needs": an
+//                  events() beside fd() gives it. The time limit of the greeting covers it.
+//                  TransportEnd says which side begins.
+//   retry          After would_block, send() may be called with other bytes than before: a final
+//                  failure replaces queued frames, and payloads that are sent from a ring's slot
+//                  may be overwritten. TLS libraries expect the same bytes again, so the transport
+//                  copies what it has begun to encrypt, and reports it as sent.
+//   identity       After the handshake it knows who the peer is. The function that decides whether
+//                  a request is allowed takes that in place of the name in `Hello`.
+//   ends           TLS closes with a message of its own: a connection that ends without it is an
+//                  error, not `end`.
+//   copies         In-place sending (daemon/link/sample_sender.hpp) saves a copy only where the
+//                  kernel copies; behind TLS, "copied" is the better way for all sizes.
 #pragma once
 
 #include <poll.h>
@@ -15,8 +38,11 @@
 
 namespace dssm::wire {
 
-// One connection's bytes. A resource with one owner; one thread at a time. Never waits, but where
-// it says so: whoever wants to wait polls fd().
+// Which end of the connection a transport is.
+enum class TransportEnd : unsigned char { connected, accepted };
+
+// A resource with one owner; one thread at a time. Its functions never wait, except for
+// receive_waiting(); callers that want to wait poll fd().
 class Transport {
  public:
   Transport() = default;
@@ -24,17 +50,17 @@ class Transport {
   Transport& operator=(const Transport&) = delete;
   virtual ~Transport() = default;
 
-  // Sends as much of `parts` (at most 16), in order, as goes without waiting.
-  //   returns  ok with the number of bytes (0 < bytes) | would_block | end (the peer is gone)
+  // Sends as much of `parts` (at most 16), in order, as is possible without waiting.
+  //   returns  ok with the number of bytes (0 < bytes) | would_block | end (the peer closed)
   virtual Result<IoResult> send(std::span<const iovec> parts) = 0;
 
   // Receives into `spaces`, in order.
   //   returns  ok with the number of bytes (0 < bytes) | would_block | end
   virtual Result<IoResult> receive(std::span<const iovec> spaces) = 0;
 
-  // The same, waiting for bytes: for kReceiveWait, or until a signal handler runs. For programs
-  // that have nothing else to do until an answer comes: one system call instead of two.
-  //   returns  besides: would_block (nothing came) | interrupted
+  // The same, but waits for bytes: up to kReceiveWait, or until a signal handler runs. For programs
+  // that have nothing else to do until an answer arrives: one system call instead of two.
+  //   returns  ok | would_block (nothing arrived) | interrupted | end
   virtual Result<IoResult> receive_waiting(std::span<const iovec> spaces) {
     pollfd ready{fd(), POLLIN, 0};
     ::poll(&ready, 1, static_cast<int>(kReceiveWait.count()));
@@ -42,7 +68,7 @@ class Transport {
   }
   static constexpr std::chrono::milliseconds kReceiveWait{10};
 
-  // Readable or writable when receive() or send() may go on.
+  // Readable or writable when receive() or send() can continue.
   virtual int fd() const noexcept = 0;
 };
 

@@ -142,8 +142,9 @@ void Dialer::State::on_connected() {
   wire::set_channel_options(socket.get());
   step = Step::greet;
   timer.enable_in(wire::kHelloTimeout);
-  link = std::make_unique<FrameConnection>(loop, wire::make_tcp_transport(std::move(socket)),
-                                           link_user, options.max_queued_bytes);
+  link = std::make_unique<FrameConnection>(
+      loop, wire::make_transport(std::move(socket), wire::TransportEnd::connected), link_user,
+      options.max_queued_bytes);
   net::Frame hello;
   wire::to_message(options.self, *hello.mutable_hello());
   link->send(hello);

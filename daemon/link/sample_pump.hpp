@@ -3,7 +3,7 @@
 // Sends a ring's samples over a link from a given one on: each once, in the order of their tids, as
 // fast as the link takes them, until it has caught up; then waits to be called again. What the ring
 // no longer holds when its turn comes is told as a gap. Knows neither subscriptions nor doorbells:
-// DataCommunicator and RemoteWriter use it at the two ends of a channel.
+// StreamChannel (subscriptions) and RemoteWriter (publishing) use it at the two ends of a channel.
 //
 // Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
 #pragma once

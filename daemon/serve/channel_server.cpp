@@ -49,8 +49,8 @@ Result<void> ChannelServer::accept(UniqueFd& socket) {
     return std::move(place).error().context(
         fmt::format("dssmd of host '{}' refuses '{}'", self_.host, address->str()));
   }
-  wire::set_channel_options(socket.get());
-  keep(*std::move(place), wire::make_tcp_transport(std::move(socket)), *address);
+  keep(*std::move(place), wire::make_transport(std::move(socket), wire::TransportEnd::accepted),
+       *address);
   return {};
 }
 

@@ -39,7 +39,7 @@ class SampleReceiver {
     return writer_->publishers().last_untrusted(publisher_);
   }
 
-  // As FrameConnection::Observer.
+  // As SampleDelegate.
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out);
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn);
 

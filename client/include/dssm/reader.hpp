@@ -19,6 +19,7 @@
 //             start at 0 again. Until the new ring can be opened, the old one is read
 #pragma once
 
+#include <atomic>
 #include <cstddef>
 #include <dssm/describe.hpp>
 #include <dssm/sample.hpp>
@@ -54,7 +55,7 @@ class BorrowedSample {
   friend class RawReader;
   std::span<const std::byte> payload_;
   SampleInfo info_;
-  const void* sequence_ = nullptr;
+  const std::atomic<std::uint64_t>* sequence_ = nullptr;  // of the slot; null: nothing borrowed
 };
 
 // The two samples around a time, for interpolation.

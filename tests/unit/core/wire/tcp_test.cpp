@@ -44,10 +44,10 @@ Pair connect_pair(const std::string& at = "127.0.0.1:0") {
   await(listener.get(), POLLIN);
   UniqueFd server(::accept4(listener.get(), nullptr, nullptr, SOCK_CLOEXEC | SOCK_NONBLOCK));
   EXPECT_TRUE(server);
-  set_channel_options(server.get());
   EXPECT_EQ(peer_address(client.get())->str(), address.str());
   EXPECT_EQ(peer_address(server.get())->str(), local_address(client.get())->str());
-  return {make_tcp_transport(std::move(client)), make_tcp_transport(std::move(server))};
+  return {make_transport(std::move(client), TransportEnd::connected),
+          make_transport(std::move(server), TransportEnd::accepted)};
 }
 
 int option(int socket, int level, int name) {

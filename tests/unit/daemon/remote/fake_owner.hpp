@@ -133,8 +133,9 @@ class FakeOwner final : private FrameConnection::Observer, private FrameConnecti
     got_.clear();
     ended_ = false;
     greeted_ = false;
-    link_.reset(
-        new FrameConnection(loop_, wire::make_tcp_transport(std::move(socket)), *this, 1U << 20));
+    link_.reset(new FrameConnection(
+        loop_, wire::make_transport(std::move(socket), wire::TransportEnd::accepted), *this,
+        1U << 20));
     ++connections_;
   }
   Result<void> on_frame(net::Frame& frame) override {
