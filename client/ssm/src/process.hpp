@@ -2,14 +2,14 @@
 //
 // This process as an SSM program: its registration with dssmd (one libdssm Session from initSSM to
 // endSSM), its open sids and its clock. One object for the life of the process, never destroyed,
-// because other threads may still be inside it while the program ends.
+// because other threads may still use it while the program exits.
 //
-// endSSM and closeSSM run in signal handlers, so they only change atomics and post a semaphore; a
-// thread of this library, the reaper, does what they asked for, as does every call that takes the
-// lock anyway.
+// endSSM and closeSSM run in signal handlers, so they only change atomics and post a semaphore. A
+// thread of this library, the reaper, then destroys what they closed; so does each call that takes
+// the lock.
 //
-// A forked child starts without a registration. What it inherits stays readable and writable, but
-// is never destroyed: it belongs to the parent.
+// A forked child starts without a registration. Streams that it inherits stay readable and writable
+// but are never destroyed: they belong to the parent.
 #pragma once
 
 #include <semaphore.h>
@@ -27,7 +27,7 @@ class Process {
  public:
   Process() noexcept;
 
-  // initSSM: registers this process and attaches the clock. Fails with what Session::connect says.
+  // initSSM: registers this process and attaches the clock. Fails as Session::connect does.
   Result<void> start();
 
   // endSSM; async-signal-safe. Whether a dssmd listens where this process was registered; false
@@ -37,14 +37,14 @@ class Process {
   // The session; fails with `closed` before start() and after end(). Call it without the lock.
   Result<Session> session();
 
-  // The session, or a new one for the moment: for sids that outlive endSSM, and for what needs no
+  // The session, or a temporary one: for sids that outlive endSSM, and for calls that need no
   // initSSM.
   Result<Session> any_session();
 
   // A sid for the stream.
   SSM_sid add(std::unique_ptr<Stream> stream);
 
-  // Attaches the clock anew; false without a session.
+  // Attaches the clock again; false without a session.
   bool attach_clock();
 
   SidTable& sids() noexcept { return sids_; }
@@ -53,7 +53,7 @@ class Process {
  private:
   struct Registration {
     Session session;
-    std::uint64_t ends;  // ends_ when it began: it is over when that has changed
+    std::uint64_t ends;  // value of ends_ at its start: it has ended when that has changed
     Registration* next;  // in abandoned_
   };
 

@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The samples of another PC's stream, collected in a ring of this process: a thread takes a
-// subscription and fills the ring, readers read it without the network. Every sample is in it, in
-// order, as long as the link keeps up; what was lost is missing, and is told as missing.
+// The samples of another PC's stream, collected in a ring of this process: a thread with a
+// subscription fills the ring, and readers read it without the network. It holds each sample, in
+// order, as long as the connection is fast enough; lost samples leave a gap.
 //
-// The ring is a copy as dssmd keeps them, but its tids go on rising when the stream begins anew, so
-// that old programs' loops go on, and nobody sleeps on it, so it has no bell.
+// The ring is a copy like dssmd's mirrors, but its tids keep rising when the stream restarts, so that
+// loops of old programs continue. No thread sleeps on it, so it has no bell.
 #pragma once
 
 #include <pthread.h>
@@ -20,11 +20,11 @@
 
 namespace dssm::ssm {
 
-// A resource with one owner. A forked child may read what its parent collects, and leaves the
-// thread alone.
+// A resource with one owner. A forked child may read what its parent collects; its copy of the
+// object does not stop the thread.
 class RemoteRing {
  public:
-  // Takes `connector` over, which has a subscription. History: of the ring.
+  // Takes over `connector`, which has a subscription. `history` is that of the ring.
   //   fails  limit_exceeded, no_memory, system
   static Result<std::unique_ptr<RemoteRing>> start(PConnector connector, const History& history);
   RemoteRing(const RemoteRing&) = delete;
@@ -41,7 +41,7 @@ class RemoteRing {
 
   PConnector connector_;  // the thread's
   std::shared_ptr<const ring::RingMapping> mapping_;
-  UniqueFd stop_;  // eventfd: readable when the thread shall end
+  UniqueFd stop_;  // eventfd: readable when the thread must end
   const pid_t owner_pid_;
   pthread_t thread_{};
   bool runs_ = false;

@@ -138,7 +138,7 @@ bool RemoteStream::take(Result<PConnector> opened, const std::string& what) {
   connector_ = std::move(*opened);
   sample_.resize(connector_->payload_bytes());
   offset_ = 0;
-  told_ = kNoTid;
+  seen_ = kNoTid;
   restarts_ = 0;
   complaint_.clear();
   open_.store(true);
@@ -180,7 +180,7 @@ bool RemoteStream::open(const std::string& address, const StreamId& id, std::siz
 void RemoteStream::follow_restart() {
   if (connector_->restarts() == restarts_) return;
   restarts_ = connector_->restarts();
-  offset_ = told_ + 1;
+  offset_ = seen_ + 1;
 }
 
 template <class Ask>
@@ -196,7 +196,7 @@ ReadStatus RemoteStream::fetch_by(Ask ask, SampleInfo& info) {
     if (*status == ReadStatus::restarted) continue;
     if (*status == ReadStatus::ok) {
       info.tid += offset_;
-      told_ = std::max(told_, info.tid);
+      seen_ = std::max(seen_, info.tid);
     }
     return *status;
   }
@@ -213,7 +213,7 @@ Tid RemoteStream::ask_newest() {
   if (!newest) return complain(newest.error()), kNoTid;
   complaint_.clear();
   const Tid tid = *newest + offset_;  // of a new ring that is empty: the last one of the old
-  told_ = std::max(told_, tid);
+  seen_ = std::max(seen_, tid);
   return tid;
 }
 
@@ -227,8 +227,8 @@ Tid RemoteStream::ask_oldest() {
 
 // The 64-bit tid that a program means.
 Tid RemoteStream::ring_tid_of(SSM_tid tid) {
-  if (told_ < 0) told_ = ask_newest();
-  return ring_tid(tid, told_);
+  if (seen_ < 0) seen_ = ask_newest();
+  return ring_tid(tid, seen_);
 }
 
 SSM_tid RemoteStream::hand_over(const SampleInfo& info, void* data, double* time) {
@@ -325,7 +325,7 @@ SSM_tid RemoteStream::tid_at(double time) {
   follow_restart();
   if (!found) return complain(found.error()), SSM_ERROR_NO_DATA;
   if (*found >= 0) {
-    told_ = std::max(told_, *found + offset_);
+    seen_ = std::max(seen_, *found + offset_);
     return ssm_tid(*found + offset_);
   }
   return ask_newest() < 0 ? SSM_ERROR_NO_DATA : SSM_ERROR_PAST;

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What is behind a PConnector of the old interface: a dssm::PConnector, and the ring of its samples
-// once the program asked for one.
+// Implements a PConnector of the old interface: a dssm::PConnector, and the ring of its samples after
+// the program asked for one.
 //
-// Calls that fail say why on stderr, once until something works again. While other PC or network
-// are away, each call tries for about two seconds and fails then; the waits (connect, open) go on
-// until a signal handler runs, or $DSSM_CONNECT_TIMEOUT seconds have passed.
+// A call that fails prints the reason on stderr, once until a call succeeds again. While the other PC
+// or the network is unavailable, each call tries for about two seconds and then fails; the waits
+// (connect, open) last until a signal handler runs, or $DSSM_CONNECT_TIMEOUT seconds have passed.
 //
-//   tids     as in stream.hpp: they keep rising when the stream begins anew
+//   tids     as in stream.hpp: they keep rising when the stream restarts
 //   threads  calls take turns
 //   signals  close() at any moment; other calls in a handler that interrupted a call of a remote
 //            stream fail, except for reading collected samples
@@ -88,7 +88,7 @@ class RemoteStream {
   std::optional<PConnector> connector_;
   std::string address_;
   std::vector<std::byte> sample_;  // read into, before it is the program's
-  Tid offset_ = 0, told_ = kNoTid;
+  Tid offset_ = 0, seen_ = kNoTid;
   std::uint64_t restarts_ = 0;  // of connector_, that offset_ knows of
   std::string complaint_;       // made, and not mended since
   std::unique_ptr<RemoteRing> ring_;

@@ -12,7 +12,7 @@ ssmtime shown;  // what timecontrol points to
 
 template <class T>
 void store_changed(T& field, T value) noexcept {
-  const std::atomic_ref shared(field);  // programs look at it from any thread
+  const std::atomic_ref shared(field);  // programs read it from any thread
   if (shared.load(std::memory_order_relaxed) == value) return;
   shared.store(value, std::memory_order_relaxed);
 }

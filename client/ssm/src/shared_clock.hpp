@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The playback clock as this process has it attached, or none, and the `timecontrol` of <libssm.h>.
+// The playback clock that this process has attached, or none, and the `timecontrol` of <libssm.h>.
 // endSSM detaches it from a signal handler while the interrupted thread may be reading it, so a
-// detached clock is destroyed only when nobody is inside: the same scheme as in sid_table.hpp.
+// detached clock is destroyed only when its use count is 0: the same order as in sid_table.hpp.
 //
 //   threads  attach() and reap() under one lock; the rest from any thread and from signal handlers
 #pragma once
@@ -37,7 +37,7 @@ class SharedClock {
     return true;
   }
 
-  // Destroys what was detached and nobody uses; leaves alone what a parent process attached.
+  // Destroys detached clocks when none is in use; keeps those that a parent process attached.
   void reap(std::uint64_t process_generation);
 
  private:
@@ -47,7 +47,7 @@ class SharedClock {
     Box* next;
   };
 
-  // While it lives, its box does.
+  // Holds a use: the box is not destroyed before this object.
   struct Use {
     explicit Use(SharedClock& owner_clock) noexcept;
     Use(const Use&) = delete;

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// From a sid to its stream. A sid is not an address but a number in disguise: the place in this
-// table and a generation that is never used twice, so that a sid that was closed, however old, is
-// recognised. Places are never freed, only used again.
+// From a sid to its stream. A sid has a pointer type, but holds a number: the place in this table and
+// a generation that is never used twice, so that a closed sid is always recognized. Places are never
+// freed, only reused.
 //
-// Programs close streams from signal handlers while the interrupted thread is inside a read. So
-// closing only marks the place, and the stream is destroyed by whoever calls reap() once nobody is
-// inside any more. The order that makes this safe: a user counts itself in and then looks whether
-// the place is open; the reaper sees "closed" and then looks whether anybody is counted in. Both
-// are seq_cst, so at least one of the two sees the other.
+// Programs close streams from signal handlers while the interrupted thread is in a read. So close()
+// only marks the place, and reap() destroys the stream when its use count is 0. The order that makes
+// this safe: a call increments the use count and then checks that the place is open; the reaper
+// finds "closed" and then checks the use count. Both are seq_cst, so at least one of the two sees
+// the other. (SharedClock uses the same order for one pointer instead of a table.)
 //
 //   threads  SidUse and close() from any thread and from signal handlers; the rest under one lock
 #pragma once
@@ -28,7 +28,7 @@ struct SidPlace {
   // generation << 1 | open
   std::atomic<std::uint64_t> state{0};
   std::atomic<std::uint32_t> users{0};
-  Stream* stream = nullptr;   // owned; stands still while open or in use
+  Stream* stream = nullptr;   // owned; does not change while open or in use
   std::uint64_t made_in = 0;  // process generation that opened it
   ssm_header header{};        // what shm_get_address() shows
   std::uint64_t index = 0;
@@ -46,8 +46,8 @@ class SidTable {
   // Marks the stream closed; nothing for a sid that is not open.
   void close(SSM_sid sid) noexcept;
 
-  // Destroys the streams that are closed and that nobody uses. Those of another process generation
-  // belong to the parent: they are left alone.
+  // Destroys the streams that are closed and whose use count is 0. Those of another process
+  // generation belong to the parent and are kept.
   void reap(std::uint64_t process_generation);
 
   // In a forked child.
@@ -70,7 +70,7 @@ class SidTable {
   Stream* abandoned_ = nullptr;  // keeps the parent's streams reachable for leak checkers
 };
 
-// A call inside a stream: while it lives, the stream does.
+// Holds a use of the stream during a call: the stream is not destroyed before this object.
 class SidUse {
  public:
   explicit SidUse(SSM_sid sid) noexcept;
@@ -82,7 +82,7 @@ class SidUse {
   Stream* operator->() const noexcept { return place_->stream; }
   Stream& operator*() const noexcept { return *place_->stream; }
 
-  // Whether the sid was closed since.
+  // Whether the sid was closed meanwhile.
   bool closed() const noexcept { return (place_->state.load() & 1) == 0; }
   ssm_header& header() const noexcept { return place_->header; }
 

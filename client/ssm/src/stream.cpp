@@ -112,11 +112,11 @@ RawWriter* Stream::writer() noexcept {
 // --- tids
 
 void Stream::tell(Tid tid) noexcept {
-  if (tid > told_.load(std::memory_order_relaxed)) told_.store(tid, std::memory_order_relaxed);
+  if (tid > seen_.load(std::memory_order_relaxed)) seen_.store(tid, std::memory_order_relaxed);
 }
 
 void Stream::on_restart(const RawReader& open) noexcept {
-  offset_.store(told_.load(std::memory_order_relaxed) + 1, std::memory_order_relaxed);
+  offset_.store(seen_.load(std::memory_order_relaxed) + 1, std::memory_order_relaxed);
   depth_.store(open.depth(), std::memory_order_relaxed);
   cycle_ns_.store(to_ns(open.cycle()), std::memory_order_relaxed);
 }

@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What is behind an open sid: one stream, a reader and a writer of it. SSM's open modes restrict
-// nothing, so whichever of the two was not opened at first is opened when it is first used.
+// The stream of an open sid, with a reader and a writer. SSM's open modes do not restrict anything,
+// so the one that was not opened with the sid is opened at its first use.
 //
-// Reads go through a private copy: what a caller's buffer or callback gets is a whole sample, and a
-// read that fails has not touched the buffer.
+// Reads use a private copy: a caller's buffer or callback gets a complete sample, and a read that
+// fails does not change the buffer.
 //
-// When the stream begins anew (removed and created, or its owner came back without its rings), the
-// reader goes on with the new ring, and old programs' loops go on with it: to them tids keep
-// rising, the first sample of the new ring following the last tid that they were told. All tids
-// here are such; `offset_` is what they are ahead of the ring's. What the old ring still held is
-// read first where samples are read by tid, one after the other.
+// When the stream restarts (it was removed and recreated, or its owner lost its rings), the reader
+// continues with the new ring, and so do loops of old programs: for them tids keep rising, and the
+// first sample of the new ring follows the last tid that they got. All tids here are of that kind;
+// `offset_` is their distance from the ring's. Reads by tid return the remaining samples of the old
+// ring first.
 //
 //   threads  all functions may be called from any thread, and from a signal handler once the reader
 //            and the writer are open
@@ -54,12 +54,12 @@ class Stream {
   std::uint64_t depth() const noexcept { return depth_.load(std::memory_order_relaxed); }
   Duration cycle() const noexcept { return Duration(cycle_ns_.load(std::memory_order_relaxed)); }
 
-  // As in RawReader. A lock that nobody holds for long, and a load.
+  // As in RawReader. Takes a lock that is held for a short time only.
   Tid newest() noexcept;
   Tid oldest() noexcept;
 
-  // A copy of a sample and its stamps. The 64 bytes behind its payload are those behind the slot:
-  // writing callbacks of real programs go a few bytes too far, and their reading ones as far.
+  // A copy of a sample and its stamps. The 64 bytes after its payload are those after the slot's:
+  // callbacks of real programs write a few bytes too many, and read as many.
   class Copy {
    public:
     explicit Copy(Stream& stream);
@@ -85,11 +85,11 @@ class Stream {
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
 
   // Writes one sample; kNoTid when the writer cannot be opened or this thread is writing to the
-  // stream already, in a callback or under the signal handler that asks.
+  // stream already, in a callback or in the code that a signal handler interrupted.
   Tid write(const void* data, Time time) noexcept;
 
-  // Lets `fill` write into the next slot and publishes it; what `fill` throws comes through, and
-  // nobody sees the slot then.
+  // Lets `fill` write into the next slot and publishes it. An exception of `fill` passes through, and
+  // the slot is not published.
   Tid write_in_place(const std::function<void(std::byte*)>& fill, Time time);
 
   // In a forked child: locks that other threads of the parent held are free.
@@ -114,8 +114,8 @@ class Stream {
   std::atomic<std::int64_t> cycle_ns_;
 
   // Written under the read lock.
-  std::atomic<Tid> offset_{0};     // tids here are so far ahead of the ring's
-  std::atomic<Tid> told_{kNoTid};  // the greatest that the program was told
+  std::atomic<Tid> offset_{0};     // tids here minus the ring's
+  std::atomic<Tid> seen_{kNoTid};  // the greatest that the program got
   std::atomic<Tid> read_{kNoTid};  // the last that it read
 
   ReentrantLock read_lock_, write_lock_;
