@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "core/ring/geometry.hpp"
 
+#include <fmt/core.h>
+
 #include <dssm/stream.hpp>
 
 #include "core/ring/layout.hpp"
@@ -16,12 +18,13 @@ constexpr std::uint64_t round_up(std::uint64_t value, std::uint64_t unit) noexce
 
 Result<Geometry> Geometry::of(std::uint64_t payload_bytes, std::uint64_t depth) {
   if (payload_bytes < 1 || payload_bytes > kMaxPayloadBytes) {
-    return Error{Errc::invalid_argument, "a payload of " + std::to_string(payload_bytes) +
-                                             " bytes is not possible; it takes 1 byte to 64 MiB"};
+    return Error{Errc::invalid_argument,
+                 fmt::format("a payload of {} bytes is not possible; it takes 1 byte to 64 MiB",
+                             payload_bytes)};
   }
   if (depth < kMinDepth || depth > kMaxDepth) {
-    return Error{Errc::invalid_argument, "a depth of " + std::to_string(depth) +
-                                             " slots is not possible; it takes 2 to 16777216"};
+    return Error{Errc::invalid_argument,
+                 fmt::format("a depth of {} slots is not possible; it takes 2 to 16777216", depth)};
   }
   Geometry geometry;
   geometry.payload_bytes = payload_bytes;

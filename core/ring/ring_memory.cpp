@@ -2,6 +2,7 @@
 #include "core/ring/ring_memory.hpp"
 
 #include <fcntl.h>
+#include <fmt/core.h>
 #include <sys/stat.h>
 
 #include <bit>
@@ -15,7 +16,7 @@ namespace dssm::ring {
 namespace {
 
 Error not_a_ring(const std::string& why) {
-  return Error{Errc::protocol, "this is no ring that can be used: " + why};
+  return Error{Errc::protocol, "this is not a usable ring: " + why};
 }
 
 std::string text_of(const char* field, std::size_t capacity) {
@@ -58,7 +59,7 @@ Result<void> reserve(int fd, const Geometry& geometry) {
     failed = ::posix_fallocate(fd, 0, static_cast<off_t>(geometry.total_bytes));
   } while (failed == EINTR);
   if (!failed) return {};
-  return os_error("reserve " + std::to_string(geometry.total_bytes) + " bytes of memory for a ring",
+  return os_error(fmt::format("reserve {} bytes of memory for a ring", geometry.total_bytes),
                   failed);
 }
 
@@ -67,10 +68,10 @@ Result<std::shared_ptr<const RingMapping>> RingMapping::open_untrusted(int fd, A
     return not_a_ring("it is not a memory file of a sealed size");
   }
   struct stat file {};
-  if (::fstat(fd, &file)) return os_error("look at a ring's file");
+  if (::fstat(fd, &file)) return os_error("get the size of a ring's file");
   const auto file_bytes = static_cast<std::uint64_t>(file.st_size);
   if (file_bytes < sizeof(RingHeader)) {
-    return not_a_ring("its " + std::to_string(file_bytes) + " bytes hold no header");
+    return not_a_ring(fmt::format("its {} bytes are too few for a header", file_bytes));
   }
   std::shared_ptr<RingMapping> mapping(new RingMapping);
   mapping->access_ = access;
@@ -85,9 +86,10 @@ Result<std::shared_ptr<const RingMapping>> RingMapping::open_untrusted(int fd, A
   const auto& header = *std::launder(reinterpret_cast<const RingHeader*>(&snapshot));
   if (header.magic != kMagic) return not_a_ring("it does not begin with \"DSSMRING\"");
   if (header.layout_version != kLayoutVersion) {
-    return not_a_ring("it has the layout version " + std::to_string(header.layout_version) +
-                      ", this program knows " + std::to_string(kLayoutVersion) +
-                      "; install the same version of DSSM everywhere on this PC");
+    return not_a_ring(fmt::format(
+        "it has the layout version {}, this program knows {}; install the same version of DSSM "
+        "everywhere on this PC",
+        header.layout_version, kLayoutVersion));
   }
   const Result<Geometry> geometry = Geometry::of(header.payload_bytes, header.depth);
   if (!geometry) return not_a_ring(geometry.error().message);
@@ -106,7 +108,7 @@ Result<std::shared_ptr<const RingMapping>> RingMapping::open_untrusted(int fd, A
   identity.cycle = Duration(header.cycle_ns);
   identity.alignment_bytes = header.alignment_bytes;
   if (!std::has_single_bit(identity.alignment_bytes) || identity.alignment_bytes > kLineBytes) {
-    return not_a_ring("its alignment is no power of two up to 64");
+    return not_a_ring("its alignment is not a power of two up to 64");
   }
   mapping->geometry_ = *geometry;
   return std::shared_ptr<const RingMapping>(std::move(mapping));
