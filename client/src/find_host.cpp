@@ -8,7 +8,7 @@
 namespace dssm::detail {
 namespace {
 
-// The addresses by which this PC's dssmd reaches the host that calls itself `address.host`.
+// The addresses under which this PC's dssmd knows the host named `address.host`.
 std::vector<wire::SocketAddress> ask_catalog(const wire::Address& address) {
   std::vector<wire::SocketAddress> found;
   const auto usual = default_port();
@@ -20,7 +20,7 @@ std::vector<wire::SocketAddress> ask_catalog(const wire::Address& address) {
     for (const std::string& text : host.addresses) {
       auto known = wire::Address::parse(text);
       if (!known || known->host == address.host) continue;  // that name was looked up already
-      if (usual && address.port != *usual) known->port = address.port;  // somebody asked for it
+      if (usual && address.port != *usual) known->port = address.port;  // the program named it
       auto resolved = wire::resolve(*known);
       if (resolved) found.insert(found.end(), resolved->begin(), resolved->end());
     }
@@ -55,7 +55,7 @@ Result<std::vector<wire::SocketAddress>> find_host(const wire::Address& address)
   std::vector<wire::SocketAddress> known = ask_catalog(address);
   if (!known.empty()) return known;
   Error error = std::move(resolved).error();
-  error.message += "; nor does a dssmd of this PC know a host of that name";
+  error.message += "; and the dssmd of this PC, if one runs, does not know a host of that name";
   return error;
 }
 

@@ -15,7 +15,7 @@
 namespace dssm::detail {
 namespace {
 
-// For one address: longer than a lost first packet takes to be sent again (1 s).
+// For one address: longer than the kernel takes to repeat a lost first packet (1 s).
 constexpr Duration kConnectTimeout = std::chrono::seconds(2);
 
 // This PC's name as a greeting wants it: letters, digits and '-'.
@@ -39,12 +39,12 @@ void add(wire::DecoderCounters& sum, const wire::DecoderCounters& more) noexcept
 
 }  // namespace
 
-NetworkConnection::NetworkConnection(wire::FrameDelegate& user, std::string program,
-                                     Duration patience)
-    : user_(user),
+NetworkConnection::NetworkConnection(wire::FrameDelegate& delegate, std::string program,
+                                     Duration greeting_timeout)
+    : delegate_(delegate),
       program_(std::move(program)),
-      patience_(std::max(patience, wire::kHelloTimeout)),
-      life_(wire::random_number()) {}
+      greeting_timeout_(std::max(greeting_timeout, wire::kHelloTimeout)),
+      instance_id_(wire::random_number()) {}
 
 void NetworkConnection::start(std::vector<wire::SocketAddress> addresses) {
   close();
@@ -65,12 +65,12 @@ void NetworkConnection::close() {
   step_deadline_ = kNever;
 }
 
-Error NetworkConnection::down(Error why) {
+Error NetworkConnection::fail(Error why) {
   close();
   return why;
 }
 
-Error NetworkConnection::lost() const {
+Error NetworkConnection::closed_error() const {
   return Error{Errc::unavailable, "dssmd at '" + address_ + "' closed the connection"};
 }
 
@@ -89,28 +89,28 @@ Result<void> NetworkConnection::connect_next() {
     }
     last = std::move(socket).error();
   }
-  return down(std::move(last));
+  return fail(std::move(last));
 }
 
 Result<void> NetworkConnection::greet() {
   transport_ = wire::make_transport(std::move(connecting_), wire::TransportEnd::connected);
-  wire::FrameDelegate& sink = *this;
-  decoder_ = std::make_unique<wire::FrameDecoder>(sink, wire::kMaxNetworkFrameBytes);
+  wire::FrameDelegate& delegate = *this;
+  decoder_ = std::make_unique<wire::FrameDecoder>(delegate, wire::kMaxNetworkFrameBytes);
   wire::Greeting self;
   self.host = own_host();
   self.host_id = wire::host_id_for(self.host);
-  self.life = life_;
+  self.life = instance_id_;
   self.program = program_;
   self.version = DSSM_VERSION;
   self.features = {std::string(wire::kFeatureTorn)};
-  // Nobody here watches the clock, but the host may have the same one.
+  // This program does not watch the clock, but its kernel may be the host's.
   const auto clock = std::make_shared<wire::ClockReport>();
   clock->standing.boot_id = clock::boot_id();
   self.clock = clock;
   net::Frame frame;
   wire::to_message(self, *frame.mutable_hello());
   phase_ = Phase::greeting;
-  step_deadline_ = deadline_in(patience_);
+  step_deadline_ = deadline_in(greeting_timeout_);
   queue(frame);
   return send_queued();
 }
@@ -127,21 +127,21 @@ Result<void> NetworkConnection::greet() {
       if (connected) return greet();
       connecting_.reset();
       if (next_address_ < addresses_.size()) return connect_next();
-      return down(std::move(connected).error());
+      return fail(std::move(connected).error());
     }
     if (MonoClock::now() < step_deadline_) return {};
     connecting_.reset();
     if (next_address_ < addresses_.size()) return connect_next();
-    return down(silence());
+    return fail(no_answer_error());
   }
   if (has_queued()) {
     if (Result<void> sent = send_queued(); !sent) return sent;
   }
   if (MonoClock::now() < step_deadline_ || has_arrived()) return {};
-  return down(silence());
+  return fail(no_answer_error());
 }
 
-Error NetworkConnection::silence() const {
+Error NetworkConnection::no_answer_error() const {
   switch (phase_) {
     case Phase::connecting:
       return {Errc::no_daemon,
@@ -186,8 +186,8 @@ Result<std::size_t> NetworkConnection::send_some(std::span<const std::byte> byte
   while (sent < bytes.size()) {
     const iovec part{const_cast<std::byte*>(bytes.data()) + sent, bytes.size() - sent};
     auto result = transport_->send({&part, 1});
-    if (!result) return down(std::move(result).error());
-    // Gone: its last words may be there to read, and then the end.
+    if (!result) return fail(std::move(result).error());
+    // Closed: a final failure may be there to be read, and then the end.
     if (result->status != wire::IoStatus::ok) break;
     sent += result->bytes;
   }
@@ -196,39 +196,39 @@ Result<std::size_t> NetworkConnection::send_some(std::span<const std::byte> byte
 
 [[gnu::hot]] Result<wire::IoStatus> NetworkConnection::receive() {
   if (!transport_) return wire::IoStatus::would_block;
-  return take(transport_->receive(decoder_->spaces()));
+  return on_received(transport_->receive(decoder_->spaces()));
 }
 
 [[gnu::hot]] Result<wire::IoStatus> NetworkConnection::receive_waiting() {
   if (!transport_) return wire::IoStatus::would_block;
-  return take(transport_->receive_waiting(decoder_->spaces()));
+  return on_received(transport_->receive_waiting(decoder_->spaces()));
 }
 
-[[gnu::hot]] Result<wire::IoStatus> NetworkConnection::receive_watching() {
+[[gnu::hot]] Result<wire::IoStatus> NetworkConnection::receive_spinning() {
   if (!transport_) return wire::IoStatus::would_block;
-  return take(spin_budget_.receive(*transport_, decoder_->spaces()));
+  return on_received(spin_budget_.receive(*transport_, decoder_->spaces()));
 }
 
-[[gnu::hot]] Result<wire::IoStatus> NetworkConnection::take(
+[[gnu::hot]] Result<wire::IoStatus> NetworkConnection::on_received(
     const Result<wire::IoResult>& received) {
-  if (!received) return down(received.error());
-  if (received->status == wire::IoStatus::end) return down(lost());
+  if (!received) return fail(received.error());
+  if (received->status == wire::IoStatus::end) return fail(closed_error());
   if (received->status != wire::IoStatus::ok) return received->status;
   spin_budget_.on_received(received->bytes);
   if (Result<void> done = decoder_->commit(received->bytes); !done) {
-    return down(std::move(done).error());
+    return fail(std::move(done).error());
   }
   return wire::IoStatus::ok;
 }
 
 Result<void> NetworkConnection::resume() {
   if (!decoder_) return {};
-  if (Result<void> done = decoder_->commit(0); !done) return down(std::move(done).error());
+  if (Result<void> done = decoder_->commit(0); !done) return fail(std::move(done).error());
   return {};
 }
 
 Result<void> NetworkConnection::on_frame(net::Frame& frame) {
-  if (phase_ == Phase::up) return user_.on_frame(frame);
+  if (phase_ == Phase::up) return delegate_.on_frame(frame);
   const std::string who = "dssmd at '" + address_ + "'";
   if (frame.has_failure()) return wire::failure(frame.failure()).context(who + " refuses");
   if (!frame.has_hello()) {
@@ -236,7 +236,7 @@ Result<void> NetworkConnection::on_frame(net::Frame& frame) {
   }
   auto them = wire::greeting_untrusted(frame.hello(), who);
   if (!them) return std::move(them).error();
-  them_ = std::move(*them);
+  greeting_ = std::move(*them);
   phase_ = Phase::up;
   step_deadline_ = kNever;
   return {};
@@ -244,12 +244,12 @@ Result<void> NetworkConnection::on_frame(net::Frame& frame) {
 
 [[gnu::hot]] Result<void> NetworkConnection::on_sample_begin(const wire::IncomingSample& sample,
                                                              std::byte*& out) {
-  return user_.on_sample_begin(sample, out);  // refused by the decoder before a size is set
+  return delegate_.on_sample_begin(sample, out);  // refused by the decoder before a size is set
 }
 
 [[gnu::hot]] Result<void> NetworkConnection::on_sample_end(const wire::IncomingSample& sample,
                                                            bool torn) {
-  return user_.on_sample_end(sample, torn);
+  return delegate_.on_sample_end(sample, torn);
 }
 
 wire::DecoderCounters NetworkConnection::counters() const noexcept {

@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A program's connection to the network port of a dssmd: connects, greets, sends frames, cuts what
-// arrives into frames. Knows nothing of what they mean. It never waits by itself: its user polls
-// fd() for events() until next_step(), and then calls advance() and receive().
+// A program's connection to the network port of a dssmd: connects, greets, sends frames, and splits
+// what arrives into frames, whose meaning it does not know. It never waits by itself: its owner
+// polls fd() for events() until next_step(), then calls advance() and receive().
 //
-// Any failure takes the link down and is returned; start() begins anew.
+// Any failure closes the connection and is returned; start() connects again.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -26,25 +26,25 @@ namespace dssm::detail {
 // A resource with one owner; one thread.
 class NetworkConnection final : private wire::FrameDelegate {
  public:
-  // What arrives after the greeting goes to `user`, from within receive() and resume(). A dssmd
-  // that is very busy may greet late: it is given `patience`, kHelloTimeout at least.
-  NetworkConnection(wire::FrameDelegate& user, std::string program, Duration patience);
+  // What arrives after the greeting goes to `delegate`, during receive() and resume(). A busy dssmd
+  // may greet late: the greeting may take `greeting_timeout`, at least kHelloTimeout.
+  NetworkConnection(wire::FrameDelegate& delegate, std::string program, Duration greeting_timeout);
   NetworkConnection(const NetworkConnection&) = delete;
   NetworkConnection& operator=(const NetworkConnection&) = delete;
 
-  // Begins to connect to one of `addresses` (at least one), tried in turn. Takes an open link down
-  // first.
+  // Begins to connect to one of `addresses` (at least one), tried in turn. Closes an open
+  // connection first.
   void start(std::vector<wire::SocketAddress> addresses);
   void close();
 
   bool is_down() const noexcept { return phase_ == Phase::down; }
   bool is_up() const noexcept { return phase_ == Phase::up; }
 
-  // Takes the steps of connecting and greeting that can be taken now.
+  // Takes the steps of connecting and greeting that need no waiting.
   //   fails  when no address is left (the last one's error), or the greeting failed
   Result<void> advance();
-  // What it has waited for in vain, for who gives up waiting.
-  Error silence() const;
+  // The error of a caller that stops waiting: which answer is missing.
+  Error no_answer_error() const;
 
   // --- once up
 
@@ -53,20 +53,19 @@ class NetworkConnection final : private wire::FrameDelegate {
   void queue(std::span<const std::byte> encoded);
   bool has_queued() const noexcept { return queued_from_ < queued_.size(); }
   Result<void> send_queued();
-  // Sends bytes of the user's own; returns how many went. Nothing may be queued.
+  // Sends bytes directly; returns how many. Nothing may be queued.
   Result<std::size_t> send_some(std::span<const std::byte> bytes);
 
   // Receives once. Not while a sample is held back.
   //   returns  ok | would_block (nothing was there)
-  //   fails    besides: what `user` returned
+  //   fails    besides: what `delegate` returned
   Result<wire::IoStatus> receive();
   // The same, waiting as Transport::receive_waiting() does.
   //   returns  besides: interrupted
   Result<wire::IoStatus> receive_waiting();
-  // The same, after staying awake for a moment where that pays (spin_budget.hpp). A signal within that
-  // moment does not interrupt.
-  Result<wire::IoStatus> receive_watching();
-  // Goes on with what was received, after the user held a sample back.
+  // The same, after a spin where that pays (spin_budget.hpp), which a signal does not interrupt.
+  Result<wire::IoStatus> receive_spinning();
+  // Continues with what was received, after the delegate held a sample back.
   Result<void> resume();
 
   void set_payload_bytes(std::size_t bytes) noexcept { decoder_->set_payload_bytes(bytes); }
@@ -75,8 +74,8 @@ class NetworkConnection final : private wire::FrameDelegate {
   // Of this connection and all before it.
   wire::DecoderCounters counters() const noexcept;
 
-  // Whether there is something to receive. Asked before a silence is judged: after a stall of this
-  // program, what it waits for may have been there for long.
+  // Whether there is something to receive. To be checked before a timeout is declared: after a
+  // stall of this program, the answer may have arrived long ago.
   bool has_arrived() const noexcept;
 
   // --- waiting
@@ -85,9 +84,9 @@ class NetworkConnection final : private wire::FrameDelegate {
   short events(bool more_to_send) const noexcept;
   MonoTime next_step() const noexcept;  // when advance() has to be called at the latest
 
-  // "10.0.0.2:13776"; where it is connected to, or tries to be; empty before the first start().
+  // "10.0.0.2:13776": what it is connected to, or tried last; empty before the first start().
   const std::string& address() const noexcept { return address_; }
-  const wire::Greeting& them() const noexcept { return them_; }  // once up
+  const wire::Greeting& greeting() const noexcept { return greeting_; }  // once up
 
  private:
   enum class Phase : unsigned char { down, connecting, greeting, up };
@@ -97,14 +96,14 @@ class NetworkConnection final : private wire::FrameDelegate {
   Result<void> on_frame(net::Frame& frame) override;
   Result<void> connect_next();
   Result<void> greet();
-  Result<wire::IoStatus> take(const Result<wire::IoResult>& received);
-  Error down(Error why);
-  Error lost() const;
+  Result<wire::IoStatus> on_received(const Result<wire::IoResult>& received);
+  Error fail(Error why);
+  Error closed_error() const;
 
-  wire::FrameDelegate& user_;
+  wire::FrameDelegate& delegate_;
   const std::string program_;
-  const Duration patience_;
-  const std::uint64_t life_;
+  const Duration greeting_timeout_;
+  const std::uint64_t instance_id_;
 
   Phase phase_ = Phase::down;
   MonoTime step_deadline_ = kNever;
@@ -118,7 +117,7 @@ class NetworkConnection final : private wire::FrameDelegate {
   SpinBudget spin_budget_;
   std::string queued_;
   std::size_t queued_from_ = 0;
-  wire::Greeting them_;
+  wire::Greeting greeting_;
 };
 
 }  // namespace dssm::detail

@@ -14,13 +14,13 @@ std::shared_ptr<const SharedRing> ReadyFd::ring() {
   return ring_.ring;
 }
 
-bool ReadyFd::look() noexcept {
+bool ReadyFd::poll() noexcept {
   const std::lock_guard guard(mutex_);
   const Tid newest = ring::RingReader(*ring_.ring->mapping).newest();
   const bool superseded = ring_.superseded->load(std::memory_order_acquire);
-  if (newest <= ring_.seen && superseded == told_superseded_) return false;
+  if (newest <= ring_.seen && superseded == notified_superseded_) return false;
   ring_.seen = newest;
-  told_superseded_ = superseded;
+  notified_superseded_ = superseded;
   const std::uint64_t one = 1;
   [[maybe_unused]] const ssize_t written = ::write(event_.get(), &one, sizeof one);
   return true;
@@ -29,7 +29,7 @@ bool ReadyFd::look() noexcept {
 void ReadyFd::follow(ReadyRing ring) {
   const std::lock_guard guard(mutex_);
   ring_ = std::move(ring);
-  told_superseded_ = false;
+  notified_superseded_ = false;
 }
 
 void ReadyFd::clear() noexcept {
@@ -76,7 +76,7 @@ void Notifier::run() {
   std::vector<std::uint32_t> announced;
   for (;;) {
     awake.clear(), rings.clear(), bells.clear(), announced.clear();
-    // Announce first, look afterwards: what happens in between is not missed.
+    // Announce before polling, so that no change in between is missed.
     bells.push_back(control_.get());
     announced.push_back(control_->announce());
     {
@@ -86,15 +86,15 @@ void Notifier::run() {
         if (auto ready = entry.lock()) awake.push_back(std::move(ready));
       }
     }
-    bool news = false;
+    bool changed = false;
     for (const auto& ready : awake) {
       rings.push_back(ready->ring());
       bells.push_back(rings.back()->bell.get());
       announced.push_back(bells.back()->announce());
-      news |= ready->look();
+      changed |= ready->poll();
     }
-    if (news) continue;
-    // Readers that go away meanwhile stay mapped until the next wake-up; that is a second at most.
+    if (changed) continue;
+    // Rings of readers that are destroyed meanwhile stay mapped until the next wake-up.
     [[maybe_unused]] const WaitStatus woken = ring::Bell::sleep_any(bells, announced, kNever);
   }
 }
@@ -102,7 +102,7 @@ void Notifier::run() {
 void NotifierPool::follow(ReadyFd& ready, ReadyRing ring) {
   ready.follow(std::move(ring));
   const std::lock_guard guard(mutex_);
-  for (const auto& notifier : notifiers_) notifier->look_again();
+  for (const auto& notifier : notifiers_) notifier->wake();
 }
 
 Result<std::shared_ptr<ReadyFd>> NotifierPool::watch(ReadyRing ring) {

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Pollable descriptors for readers. Writers wake sleepers through futexes, which poll() does not
-// know; a notifier thread sleeps on behalf of up to kMaxWatched readers and rings an eventfd for
-// each that has news. It needs no dssmd.
+// Pollable descriptors for readers. Writers wake readers through futexes, which poll() cannot wait
+// for; a notifier thread waits for up to kMaxWatched readers and signals an eventfd for each whose
+// ring changed. It works without dssmd.
 #pragma once
 
 #include <atomic>
@@ -18,11 +18,11 @@
 
 namespace dssm::detail {
 
-// The ring that a reader's descriptor speaks of.
+// The ring that a reader's descriptor is about.
 struct ReadyRing {
   std::shared_ptr<const SharedRing> ring;
   std::shared_ptr<const std::atomic<bool>> superseded;  // by another ring
-  Tid seen = kNoTid;                                    // news is what is newer
+  Tid seen = kNoTid;                                    // newest sample already signalled
 };
 
 // A reader's descriptor. Readable when the ring's newest tid rose since the last clear(), or when
@@ -38,16 +38,16 @@ class ReadyFd {
   friend class Notifier;
   friend class NotifierPool;
   std::shared_ptr<const SharedRing> ring();
-  bool look() noexcept;  // rings when there is news
+  bool poll() noexcept;  // signals fd() if the ring changed
   void follow(ReadyRing ring);
 
-  std::mutex mutex_;  // guards ring_ and told_
+  std::mutex mutex_;  // guards ring_ and notified_superseded_
   ReadyRing ring_;
-  bool told_superseded_ = false;
+  bool notified_superseded_ = false;
   UniqueFd event_;
 };
 
-// One thread and the readers it sleeps for. Thread-safe.
+// One thread and the readers that it waits for. Thread-safe.
 class Notifier {
  public:
   static constexpr std::size_t kMaxWatched = 127;  // of futex_waitv's 128 one is our own
@@ -55,9 +55,9 @@ class Notifier {
   static Result<std::unique_ptr<Notifier>> start();
   ~Notifier();
 
-  // False when it has no room.
+  // False when it is full.
   bool add(const std::shared_ptr<ReadyFd>& ready);
-  void look_again() noexcept { control_->notify(); }
+  void wake() noexcept { control_->notify(); }
 
  private:
   Notifier() = default;
@@ -74,7 +74,7 @@ class Notifier {
 class NotifierPool {
  public:
   Result<std::shared_ptr<ReadyFd>> watch(ReadyRing ring);
-  // From now on `ready` speaks of another ring.
+  // From now on `ready` is about another ring.
   void follow(ReadyFd& ready, ReadyRing ring);
 
  private:

@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Samples on their way to another host's stream: kept as whole frames, one behind the other, from
-// when they are posted until the owner says that they are written, so that a new connection can
-// send again what was lost with the old one. Samples are numbered 0, 1, 2 ... as they are posted.
+// Samples on their way to another host's stream, kept as complete frames from post() until the
+// owner acknowledges that they are written, so that a new connection can send again what the old
+// one lost. Samples are numbered 0, 1, 2 ... as they are posted.
 //
 //   first ........ send ........ next       numbers
 //     sent, not      waiting
 //     acknowledged   to be sent
 //
-// Bounded: when there is no room, the oldest goes. One that was never sent is dropped for certain;
-// one that was sent is probably written, and only a new connection will tell.
+// Bounded: when it is full, the oldest sample is removed. One that was never sent counts as
+// dropped; one that was sent is probably written: the next acknowledgement or connection shows it.
 #pragma once
 
 #include <cstddef>
@@ -31,20 +31,19 @@ class Outbox {
   // Keeps the sample, to be sent; returns its number.
   std::int64_t push(std::span<const std::byte> payload, Time time, Duration clock_error);
 
-  // Bytes to be sent next, in one piece of whole frames (the first one may be begun); empty when
-  // there is nothing.
+  // Bytes to be sent next: consecutive frames, the first one perhaps sent in part; may be empty.
   std::span<const std::byte> unsent() const noexcept;
-  // Of unsent(), only what completes a frame that was begun.
+  // Of unsent(), only the rest of a frame that was sent in part.
   std::span<const std::byte> rest_of_frame() const noexcept;
-  // So many bytes from the start of unsent() or rest_of_frame() went.
+  // So many bytes from the start of unsent() or rest_of_frame() were sent.
   void sent(std::size_t bytes) noexcept;
 
-  // All up to this number are written; `tid` is what the newest of them became.
+  // All up to this number are written; `tid` is the tid of the newest of them.
   //   fails  protocol (a number that was never posted)
   Result<void> acknowledge(std::int64_t last, Tid tid);
-  // The connection is gone: nothing is to be sent before restart().
+  // The connection ended: nothing is sent before restart().
   void on_down() noexcept;
-  // There is a new connection, and the owner has written all up to this number.
+  // A new connection is up, and the owner has written all up to this number.
   //   fails  as acknowledge()
   Result<void> restart(std::int64_t last, Tid tid);
 
@@ -56,20 +55,20 @@ class Outbox {
  private:
   std::byte* frame(std::int64_t number) noexcept;
   const std::byte* frame(std::int64_t number) const noexcept;
-  void make_room();
+  void make_space();
   void drop_oldest();
-  void leave_begun_frame();
+  void detach_begun_frame();
 
   std::size_t payload_bytes_, frame_bytes_;
-  std::int64_t max_count_, room_ = 0;  // frames
-  std::vector<std::byte> frames_;      // frame `number` at number % room_
-  std::vector<std::byte> begun_;       // rest of a frame that was begun and had to make room
+  std::int64_t max_count_, capacity_ = 0;  // frames
+  std::vector<std::byte> frames_;          // frame `number` at number % capacity_
+  std::vector<std::byte> begun_;           // rest of a frame that was sent in part and then removed
   std::int64_t first_ = 0, send_ = 0, next_ = 0;
-  std::size_t sent_of_send_ = 0;  // bytes of frame `send_` that went
+  std::size_t sent_of_send_ = 0;  // bytes of frame `send_` that were sent
   struct Range {
     std::int64_t from, to;  // without `to`
   };
-  std::deque<Range> unsure_;  // sent, gone from here since, and perhaps not written; rising
+  std::deque<Range> unacked_dropped_;  // sent, then removed, perhaps not written; ascending
   std::int64_t written_ = -1;
   Tid written_tid_ = kNoTid;
   std::uint64_t dropped_ = 0;

@@ -6,24 +6,24 @@
 #include <algorithm>
 #include <dssm/pconnector.hpp>
 
-#include "client/src/channel.hpp"
 #include "client/src/find_host.hpp"
 #include "client/src/program_name.hpp"
 #include "client/src/states.hpp"
+#include "client/src/stream_client.hpp"
 #include "core/base/timespec.hpp"
 
 namespace dssm {
 namespace detail {
 
 struct PConnectorState {
-  explicit PConnectorState(std::unique_ptr<Channel> opened) : channel(std::move(opened)) {}
-  std::unique_ptr<Channel> channel;
+  explicit PConnectorState(std::unique_ptr<StreamClient> opened) : client(std::move(opened)) {}
+  std::unique_ptr<StreamClient> client;
 };
 
 namespace {
 
 // Nobody hears from outside what a connection that only lists says.
-class ListSink final : public wire::FrameDelegate {
+class ListDelegate final : public wire::FrameDelegate {
  public:
   Result<void> on_sample_begin(const wire::IncomingSample&, std::byte*&) override {
     return Error{Errc::protocol, "a sample came on a connection that carries none"};
@@ -46,32 +46,33 @@ Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
   const MonoTime deadline = deadline_in(options.request_timeout);
   auto addresses = find_host(host);
   if (!addresses) return std::move(addresses).error();
-  ListSink sink;
-  NetworkConnection link(sink, options.program.empty() ? default_program() : options.program,
-                         options.request_timeout);
-  link.start(std::move(*addresses));
-  for (bool asked = false; !sink.streams;) {
-    if (Result<void> done = link.advance(); !done) return std::move(done).error();
-    if (link.is_up() && !asked) {
+  ListDelegate delegate;
+  NetworkConnection connection(delegate,
+                               options.program.empty() ? default_program() : options.program,
+                               options.request_timeout);
+  connection.start(std::move(*addresses));
+  for (bool asked = false; !delegate.streams;) {
+    if (Result<void> done = connection.advance(); !done) return std::move(done).error();
+    if (connection.is_up() && !asked) {
       asked = true;
       net::Frame frame;
       frame.set_serial(1);
       frame.mutable_list();
-      link.queue(frame);
+      connection.queue(frame);
     }
-    if (link.is_up() && link.has_queued()) {
-      if (Result<void> sent = link.send_queued(); !sent) return std::move(sent).error();
+    if (connection.is_up() && connection.has_queued()) {
+      if (Result<void> sent = connection.send_queued(); !sent) return std::move(sent).error();
     }
     const MonoTime now = MonoClock::now();
-    const timespec timeout = timespec_of(std::min(deadline, link.next_step()) - now);
-    pollfd ready{link.fd(), link.events(false), 0};
+    const timespec timeout = timespec_of(std::min(deadline, connection.next_step()) - now);
+    pollfd ready{connection.fd(), connection.events(false), 0};
     if (::ppoll(&ready, 1, &timeout, nullptr) > 0) {
-      if (auto received = link.receive(); !received) return std::move(received).error();
+      if (auto received = connection.receive(); !received) return std::move(received).error();
     }
     // After what has arrived was looked at: this program may have been stalled.
-    if (now >= deadline && !sink.streams) return link.silence();
+    if (now >= deadline && !delegate.streams) return connection.no_answer_error();
   }
-  return std::move(*sink.streams);
+  return std::move(*delegate.streams);
 }
 
 // "open 'lidar:0' at '10.0.0.2'"
@@ -94,14 +95,14 @@ Result<PConnector> PConnector::open(const StreamId& id, PConnectorOptions option
                                     const TypeInfo* wanted) {
   const std::string what = detail::attempt("open", id, options);
   if (Result<void> checked = id.check(); !checked) return std::move(checked).error().context(what);
-  auto channel = detail::Channel::open({id}, std::move(options));
-  if (!channel) return std::move(channel).error().context(what);
+  auto client = detail::StreamClient::open({id}, std::move(options));
+  if (!client) return std::move(client).error().context(what);
   if (wanted) {
-    if (Result<void> usable = (*channel)->stream().type.check_usable_as(*wanted); !usable) {
+    if (Result<void> usable = (*client)->stream().type.check_usable_as(*wanted); !usable) {
       return std::move(usable).error().context(what);
     }
   }
-  return PConnector(std::make_unique<detail::PConnectorState>(std::move(*channel)));
+  return PConnector(std::make_unique<detail::PConnectorState>(std::move(*client)));
 }
 
 Result<PConnector> PConnector::create(const StreamId& id, const TypeInfo& type,
@@ -111,9 +112,9 @@ Result<PConnector> PConnector::create(const StreamId& id, const TypeInfo& type,
   if (Result<void> checked = type.check(); !checked) {
     return std::move(checked).error().context(what);
   }
-  auto channel = detail::Channel::open({id, type, history}, std::move(options));
-  if (!channel) return std::move(channel).error().context(what);
-  return PConnector(std::make_unique<detail::PConnectorState>(std::move(*channel)));
+  auto client = detail::StreamClient::open({id, type, history}, std::move(options));
+  if (!client) return std::move(client).error().context(what);
+  return PConnector(std::make_unique<detail::PConnectorState>(std::move(*client)));
 }
 
 Result<std::vector<StreamInfo>> PConnector::list_streams(PConnectorOptions options) {
@@ -130,31 +131,31 @@ Result<std::vector<StreamInfo>> PConnector::list_streams(PConnectorOptions optio
 using Which = detail::ReadRequest::Which;
 
 Result<ReadStatus> PConnector::read_newest(std::span<std::byte> payload, SampleInfo& info) {
-  return state_->channel->read({Which::newest}, payload, info);
+  return state_->client->read({Which::newest}, payload, info);
 }
 
 Result<ReadStatus> PConnector::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) {
-  return state_->channel->read({Which::tid, tid}, payload, info);
+  return state_->client->read({Which::tid, tid}, payload, info);
 }
 
 Result<ReadStatus> PConnector::read_at(Time t, std::span<std::byte> payload, SampleInfo& info) {
-  return state_->channel->read({Which::time, to_ns(t)}, payload, info);
+  return state_->client->read({Which::time, to_ns(t)}, payload, info);
 }
 
 Result<ReadStatus> PConnector::read_newer(Tid than, std::span<std::byte> payload,
                                           SampleInfo& info) {
-  return state_->channel->read({Which::newer_than, than}, payload, info);
+  return state_->client->read({Which::newer_than, than}, payload, info);
 }
 
 namespace {
 
-Result<net::Range> ask_range(detail::Channel& channel, std::optional<Time> t) {
+Result<net::Range> ask_range(detail::StreamClient& client, std::optional<Time> t) {
   net::Frame frame;
   frame.mutable_get_range();
   if (t) frame.mutable_get_range()->set_time_ns(to_ns(*t));
-  auto answer = channel.ask(std::move(frame));
+  auto answer = client.ask(std::move(frame));
   if (!answer) {
-    return std::move(answer).error().context("look at '" + channel.stream().id.str() + "'");
+    return std::move(answer).error().context("look at '" + client.stream().id.str() + "'");
   }
   return std::move(*answer->mutable_range());
 }
@@ -162,19 +163,19 @@ Result<net::Range> ask_range(detail::Channel& channel, std::optional<Time> t) {
 }  // namespace
 
 Result<Tid> PConnector::newest_tid() {
-  auto range = ask_range(*state_->channel, std::nullopt);
+  auto range = ask_range(*state_->client, std::nullopt);
   if (!range) return std::move(range).error();
   return std::max(range->newest(), kNoTid);
 }
 
 Result<Tid> PConnector::oldest_tid() {
-  auto range = ask_range(*state_->channel, std::nullopt);
+  auto range = ask_range(*state_->client, std::nullopt);
   if (!range) return std::move(range).error();
   return std::max(range->oldest(), kNoTid);
 }
 
 Result<Tid> PConnector::find(Time t) {
-  auto range = ask_range(*state_->channel, t);
+  auto range = ask_range(*state_->client, t);
   if (!range) return std::move(range).error();
   return std::max(range->at_tid(), kNoTid);
 }
@@ -182,19 +183,19 @@ Result<Tid> PConnector::find(Time t) {
 // --- subscription
 
 Result<void> PConnector::subscribe(const Subscription& what) {
-  return state_->channel->subscribe(what);
+  return state_->client->subscribe(what);
 }
 
-Result<void> PConnector::unsubscribe() { return state_->channel->unsubscribe(); }
+Result<void> PConnector::unsubscribe() { return state_->client->unsubscribe(); }
 
 Result<ReadStatus> PConnector::read_next(std::span<std::byte> payload, SampleInfo& info) {
-  return state_->channel->next(payload, info);
+  return state_->client->next(payload, info);
 }
 
-WaitStatus PConnector::wait(MonoTime deadline) { return state_->channel->wait(deadline); }
-std::uint64_t PConnector::lost_samples() const noexcept { return state_->channel->lost(); }
-std::uint64_t PConnector::restarts() const noexcept { return state_->channel->restarts(); }
-int PConnector::ready_fd() const noexcept { return state_->channel->fd(); }
+WaitStatus PConnector::wait(MonoTime deadline) { return state_->client->wait(deadline); }
+std::uint64_t PConnector::lost_samples() const noexcept { return state_->client->lost(); }
+std::uint64_t PConnector::restarts() const noexcept { return state_->client->restarts(); }
+int PConnector::ready_fd() const noexcept { return state_->client->ready_fd(); }
 
 // --- writing
 
@@ -202,25 +203,25 @@ Result<Tid> PConnector::write(std::span<const std::byte> payload, Time time, Dur
   if (Result<void> posted = post(payload, time, clock_error); !posted) {
     return std::move(posted).error();
   }
-  return flush(deadline_in(state_->channel->request_timeout()));
+  return flush(deadline_in(state_->client->request_timeout()));
 }
 
 Result<void> PConnector::post(std::span<const std::byte> payload, Time time, Duration clock_error) {
-  return state_->channel->post(payload, time,
-                               clock_error == kOwnClockError
-                                   ? detail::error_by(detail::latest_clock_page(), time)
-                                   : clock_error);
+  return state_->client->post(payload, time,
+                              clock_error == kOwnClockError
+                                  ? detail::clock_error_by(detail::latest_clock_page(), time)
+                                  : clock_error);
 }
 
-Result<Tid> PConnector::flush(MonoTime deadline) { return state_->channel->flush(deadline); }
-std::uint64_t PConnector::dropped_samples() const noexcept { return state_->channel->dropped(); }
+Result<Tid> PConnector::flush(MonoTime deadline) { return state_->client->flush(deadline); }
+std::uint64_t PConnector::dropped_samples() const noexcept { return state_->client->dropped(); }
 
 // --- about the stream
 
 Result<std::vector<std::byte>> PConnector::property() {
   net::Frame frame;
   frame.mutable_get_property();
-  auto answer = state_->channel->ask(std::move(frame));
+  auto answer = state_->client->ask(std::move(frame));
   if (!answer) return std::move(answer).error().context("get the property of '" + id().str() + "'");
   const std::string& property = answer->property().property();
   const auto* bytes = reinterpret_cast<const std::byte*>(property.data());
@@ -236,21 +237,21 @@ Result<void> PConnector::set_property(std::span<const std::byte> property) {
   }
   net::Frame frame;
   frame.mutable_set_property()->set_property(property.data(), property.size());
-  auto answer = state_->channel->ask(std::move(frame));
+  auto answer = state_->client->ask(std::move(frame));
   if (!answer) return std::move(answer).error().context(what);
   return {};
 }
 
-const StreamId& PConnector::id() const noexcept { return state_->channel->stream().id; }
-const TypeInfo& PConnector::type() const noexcept { return state_->channel->stream().type; }
+const StreamId& PConnector::id() const noexcept { return state_->client->stream().id; }
+const TypeInfo& PConnector::type() const noexcept { return state_->client->stream().type; }
 std::uint64_t PConnector::payload_bytes() const noexcept { return type().payload_bytes; }
-std::uint64_t PConnector::depth() const noexcept { return state_->channel->stream().depth; }
-Duration PConnector::cycle() const noexcept { return state_->channel->stream().cycle; }
+std::uint64_t PConnector::depth() const noexcept { return state_->client->stream().depth; }
+Duration PConnector::cycle() const noexcept { return state_->client->stream().cycle; }
 std::uint64_t PConnector::incarnation() const noexcept {
-  return state_->channel->stream().incarnation;
+  return state_->client->stream().incarnation;
 }
-bool PConnector::is_connected() const noexcept { return state_->channel->is_connected(); }
-const std::string& PConnector::address() const noexcept { return state_->channel->address(); }
-PConnector::Counters PConnector::counters() const noexcept { return state_->channel->counters(); }
+bool PConnector::is_connected() const noexcept { return state_->client->is_connected(); }
+const std::string& PConnector::address() const noexcept { return state_->client->address(); }
+PConnector::Counters PConnector::counters() const noexcept { return state_->client->counters(); }
 
 }  // namespace dssm

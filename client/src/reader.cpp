@@ -1,6 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// RawReader on top of ring::RingReader: cursor, counting of losses, waiting.
+// RawReader on top of ring::RingReader: adds the cursor, the count of lost samples, the check of
+// the clock, the switch to a restarted stream's new ring, and waiting.
+//
+// Each read is an attempt that a writer may overtake; retry() repeats it. All reads by time that
+// copy go through read_by_time(): choose a sample, check its clock, copy it.
 #include <algorithm>
 #include <array>
 #include <dssm/reader.hpp>
@@ -13,8 +17,8 @@
 namespace dssm {
 namespace {
 
-// Waits until ready() or the deadline: look, announce, look again, sleep. An interruption is
-// reported only when there is nothing to report otherwise.
+// Waits until ready() or the deadline: check, announce, check again, sleep. Returns interrupted
+// only while not ready().
 template <class Ready>
 WaitStatus wait_until(ring::Bell& bell, MonoTime deadline, Ready ready) noexcept {
   if (ready()) return WaitStatus::ready;
@@ -40,23 +44,48 @@ Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
 // Assessments are valid for seconds, so a coarse clock is precise enough.
 using clock::coarse_now;
 
-// Whether reads by time must not deliver that sample.
+// Whether reads by time must not return that sample.
 bool is_refused(const ring::ClockAssessment& clock, const SampleInfo& info) noexcept {
   return clock.policy == ClockPolicy::enforce && !clock.is_good(info, coarse_now());
 }
-bool is_refused(const ring::RingReader& ring, const SampleInfo& info) noexcept {
-  return is_refused(ring.clock(), info);
+
+// The same by tid, before the sample is copied.
+bool is_refused(const ring::RingReader& ring, Tid tid) noexcept {
+  const ring::ClockAssessment clock = ring.clock();
+  SampleInfo info;
+  return clock.policy == ClockPolicy::enforce && ring.stamp(tid, info) == ReadStatus::ok &&
+         is_refused(clock, info);
 }
 
-// The same by tid; for a read by time, before the sample is copied.
-//   returns  ok | too_old | not_yet | clock_out_of_bounds
-ReadStatus check_clock(const ring::RingReader& ring, Tid tid) noexcept {
-  const ring::ClockAssessment clock = ring.clock();
-  if (clock.policy != ClockPolicy::enforce) return ReadStatus::ok;
-  SampleInfo info;
-  const ReadStatus status = ring.stamp(tid, info);
-  if (status != ReadStatus::ok) return status;
-  return is_refused(clock, info) ? ReadStatus::clock_out_of_bounds : ReadStatus::ok;
+// What an attempt to read returns when a writer overtook it.
+constexpr std::optional<ReadStatus> kOvertaken = std::nullopt;
+
+// Repeats `attempt` until no writer overtakes it.
+template <class Attempt>
+[[gnu::always_inline]] inline ReadStatus retry(Attempt attempt) noexcept {
+  for (int i = 0; i < ring::RingReader::kMaxRetries; ++i) {
+    if (const std::optional<ReadStatus> done = attempt()) return *done;
+  }
+  return ReadStatus::lapped;
+}
+
+// Copies the sample that `choose` finds: std::optional<ReadStatus> choose(Tid& chosen).
+template <class Choose>
+[[gnu::always_inline]] inline ReadStatus read_by_time(detail::ReaderState& state,
+                                                      std::span<std::byte> payload,
+                                                      SampleInfo& info, Choose choose) noexcept {
+  if (state.restart_due() && state.restart()) return ReadStatus::restarted;
+  DSSM_CHECK(payload.size() == state.stream->ring->mapping->geometry().payload_bytes);
+  return retry([&]() -> std::optional<ReadStatus> {
+    Tid chosen = kNoTid;
+    const std::optional<ReadStatus> found = choose(chosen);
+    if (found != ReadStatus::ok) return found;
+    if (is_refused(state.ring, chosen)) return ReadStatus::clock_out_of_bounds;
+    const ReadStatus status = state.ring.read(chosen, payload, info);
+    if (status == ReadStatus::too_old) return kOvertaken;
+    if (status == ReadStatus::ok) state.set_cursor(chosen);
+    return status;
+  });
 }
 
 }  // namespace
@@ -71,31 +100,30 @@ namespace detail {
 bool ReaderState::restart() noexcept {
   const MonoTime now = MonoClock::now();
   Client& client = *stream->client;
-  // While dssmd is away nobody can give the new ring, and a read must not wait for it.
-  if (to_ns(now.time_since_epoch()) < next_attempt_ns || !client.connected()) return false;
+  // Only dssmd can open the new ring, and a read must not wait until dssmd is available.
+  if (to_ns(now.time_since_epoch()) < next_attempt_ns || !client.connection().is_up()) return false;
   next_attempt_ns = to_ns((now + kRestartPause).time_since_epoch());
-  auto anew = client.open_reader(stream->asked, stream->tag);
-  if (!anew) return false;
-  if (Result<void> usable = (*anew)->type.check_usable_as(stream->type); !usable) {
+  auto newer = client.open_reader(stream->requested, stream->tag);
+  if (!newer) return false;
+  if (Result<void> usable = (*newer)->type.check_usable_as(stream->type); !usable) {
     next_attempt_ns = INT64_MAX;
-    trouble =
-        std::move(usable).error().context("go on with the new ring of '" + (*anew)->id.str() + "'");
+    restart_error = std::move(usable).error().context("continue with the new ring of '" +
+                                                      (*newer)->id.str() + "'");
     return false;
   }
-  if ((*anew)->ring == stream->ring) return false;  // asked too early: try again
-  // A mirror that was made anew, because dssmd lost the old one, has the same samples with the same
-  // tids: nobody needs to be told.
-  const bool same_samples = (*anew)->ring->mapping->identity().incarnation ==
+  if ((*newer)->ring == stream->ring) return false;  // dssmd has no new ring yet
+  // A mirror that dssmd recreated has the same samples with the same tids: not a restart.
+  const bool same_samples = (*newer)->ring->mapping->identity().incarnation ==
                             stream->ring->mapping->identity().incarnation;
   previous = stream->ring;
   {
     const std::lock_guard guard(stream_mutex);
-    stream = *std::move(anew);
+    stream = *std::move(newer);
   }
   ring = ring::RingReader(*stream->ring->mapping);
   next_attempt_ns = 0;
   if (!same_samples) {
-    cursor = kNoTid;  // read_next() goes on with the first sample there; a fresh reader stays so
+    cursor = kNoTid;  // read_next() continues with the first sample; a fresh reader stays fresh
     ++restarts;
   }
   if (ready) client.notifiers().follow(*ready, {stream->ring, stream->superseded, cursor});
@@ -125,7 +153,7 @@ RawReader::~RawReader() = default;
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read_newest(payload, info);
-  if (status == ReadStatus::ok) state_->took(info.tid);
+  if (status == ReadStatus::ok) state_->set_cursor(info.tid);
   return status;
 }
 
@@ -133,7 +161,7 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read(tid, payload, info);
-  if (status == ReadStatus::ok) state_->took(tid);
+  if (status == ReadStatus::ok) state_->set_cursor(tid);
   return status;
 }
 
@@ -142,20 +170,20 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
   if (state_->fresh) return read_newest(payload, info);
   DSSM_CHECK(payload.size() == payload_bytes());
   Tid wanted = state_->cursor + 1;
-  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+  return retry([&]() -> std::optional<ReadStatus> {
     const ReadStatus status = state_->ring.read(wanted, payload, info);
     if (status == ReadStatus::not_yet) {
-      // Only now: what the old ring held is read first.
+      // Only now: the samples of the old ring are read first.
       return state_->restart_due() && state_->restart() ? ReadStatus::restarted : status;
     }
     if (status == ReadStatus::ok) {
       state_->lost += static_cast<std::uint64_t>(wanted - (state_->cursor + 1));
-      state_->took(wanted);
+      state_->set_cursor(wanted);
       return status;
     }
-    wanted = std::max(wanted, state_->ring.oldest());  // lapped: go on with the oldest there is
-  }
-  return ReadStatus::lapped;
+    wanted = std::max(wanted, state_->ring.oldest());
+    return kOvertaken;
+  });
 }
 
 ReadStatus RawReader::read_previous(std::span<std::byte> payload, SampleInfo& info) noexcept {
@@ -165,82 +193,60 @@ ReadStatus RawReader::read_previous(std::span<std::byte> payload, SampleInfo& in
 }
 
 ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
-  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
-  DSSM_CHECK(payload.size() == payload_bytes());
-  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
-    Tid found = kNoTid;
-    const ReadStatus status = state_->ring.find(t, found);
-    if (status != ReadStatus::ok) return status;
-    const ReadStatus checked = check_clock(state_->ring, found);
-    if (checked == ReadStatus::clock_out_of_bounds) return checked;
-    if (state_->ring.read(found, payload, info) == ReadStatus::ok) {
-      state_->took(found);
-      return ReadStatus::ok;
-    }
-  }
-  return ReadStatus::lapped;
+  return read_by_time(*state_, payload, info,
+                      [&](Tid& chosen) { return state_->ring.find(t, chosen); });
 }
 
 ReadStatus RawReader::read_at_or_after(Time t, std::span<std::byte> payload,
                                        SampleInfo& info) noexcept {
-  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
-  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
-    // Behind the newest sample before `t` all samples have time >= t.
+  return read_by_time(*state_, payload, info, [&](Tid& chosen) {
+    // After the newest sample before `t` all samples have time >= t.
     Tid before = kNoTid;
     const ReadStatus found =
         to_ns(t) == INT64_MIN ? ReadStatus::too_old : state_->ring.find(t - Duration(1), before);
-    if (found == ReadStatus::not_yet || found == ReadStatus::lapped) return found;
-    const Tid wanted = found == ReadStatus::too_old ? state_->ring.oldest() : before + 1;
-    const ReadStatus checked = check_clock(state_->ring, wanted);
-    if (checked == ReadStatus::clock_out_of_bounds) return checked;
-    const ReadStatus status = read_tid(wanted, payload, info);
-    if (status != ReadStatus::too_old) return status;
-  }
-  return ReadStatus::lapped;
+    if (found != ReadStatus::ok && found != ReadStatus::too_old) return found;
+    chosen = found == ReadStatus::too_old ? state_->ring.oldest() : before + 1;
+    return ReadStatus::ok;
+  });
 }
 
 ReadStatus RawReader::read_nearest(Time t, std::span<std::byte> payload,
                                    SampleInfo& info) noexcept {
-  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
-  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
-    Tid before = kNoTid;
-    const ReadStatus found = state_->ring.find(t, before);
-    if (found == ReadStatus::not_yet || found == ReadStatus::lapped) return found;
-    Tid wanted = before;
+  return read_by_time(*state_, payload, info, [&](Tid& chosen) -> std::optional<ReadStatus> {
+    const ReadStatus found = state_->ring.find(t, chosen);
     if (found == ReadStatus::too_old) {
-      wanted = state_->ring.oldest();
-    } else {
-      SampleInfo left, right;
-      if (state_->ring.stamp(before, left) != ReadStatus::ok) continue;
-      if (state_->ring.stamp(before + 1, right) == ReadStatus::ok) wanted = closer(t, left, right);
+      chosen = state_->ring.oldest();
+      return ReadStatus::ok;
     }
-    const ReadStatus checked = check_clock(state_->ring, wanted);
-    if (checked == ReadStatus::clock_out_of_bounds) return checked;
-    const ReadStatus status = read_tid(wanted, payload, info);
-    if (status != ReadStatus::too_old) return status;
-  }
-  return ReadStatus::lapped;
+    if (found != ReadStatus::ok) return found;
+    SampleInfo before, after;
+    if (state_->ring.stamp(chosen, before) != ReadStatus::ok) return kOvertaken;
+    if (state_->ring.stamp(chosen + 1, after) == ReadStatus::ok) chosen = closer(t, before, after);
+    return ReadStatus::ok;
+  });
 }
 
 ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
-  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+  return retry([&]() -> std::optional<ReadStatus> {
+    const ring::RingReader& ring = state_->ring;
     Tid before = kNoTid;
-    const ReadStatus found = state_->ring.find(t, before);
+    const ReadStatus found = ring.find(t, before);
     if (found != ReadStatus::ok) return found;
     Neighbours seen;
-    const ReadStatus right = state_->ring.stamp(before + 1, seen.after);
-    if (right == ReadStatus::not_yet) return right;
-    if (right != ReadStatus::ok) continue;
-    if (state_->ring.stamp(before, seen.before) != ReadStatus::ok) continue;
-    // A sample that ran backwards may have come between: then it is the newest with time <= t.
-    if (seen.after.time <= t) continue;
-    if (is_refused(state_->ring, seen.before) || is_refused(state_->ring, seen.after)) {
+    const ReadStatus after = ring.stamp(before + 1, seen.after);
+    if (after == ReadStatus::not_yet) return after;
+    if (after != ReadStatus::ok) return kOvertaken;
+    if (ring.stamp(before, seen.before) != ReadStatus::ok) return kOvertaken;
+    // A sample whose time runs backwards was written meanwhile: now it is the newest with time <=
+    // t.
+    if (seen.after.time <= t) return kOvertaken;
+    const ring::ClockAssessment clock = ring.clock();
+    if (is_refused(clock, seen.before) || is_refused(clock, seen.after)) {
       return ReadStatus::clock_out_of_bounds;
     }
     out = seen;
     return ReadStatus::ok;
-  }
-  return ReadStatus::lapped;
+  });
 }
 
 Duration RawReader::clock_error(const SampleInfo& info) const noexcept {
@@ -260,27 +266,31 @@ JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_err
     }
   }
   JointRead read;
-  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+  read.status = retry([&]() -> std::optional<ReadStatus> {
     read = {ReadStatus::ok, 0, Duration::zero()};
     for (std::size_t i = 0; i < samples.size(); ++i) {
       const RawReader& reader = *samples[i].reader;
       const ReadStatus status = reader.find(t, samples[i].info);
-      if (status != ReadStatus::ok) return {status, i, kUnknownClockError};
+      if (status != ReadStatus::ok) {
+        read = {status, i, kUnknownClockError};
+        return status;
+      }
       const Duration error = reader.clock_error(samples[i].info);
       if (error > read.clock_error) read = {ReadStatus::ok, i, error};
     }
-    if (read.clock_error > max_error) read.status = ReadStatus::clock_out_of_bounds;
-    for (std::size_t i = 0; i < samples.size() && read.status == ReadStatus::ok; ++i) {
+    if (read.clock_error > max_error) return ReadStatus::clock_out_of_bounds;
+    for (std::size_t i = 0; i < samples.size(); ++i) {
       JointSample& sample = samples[i];
       DSSM_CHECK(sample.payload.size() == sample.reader->payload_bytes());
       const ring::RingReader& ring = sample.reader->state_->ring;
       if (ring.read(sample.info.tid, sample.payload, sample.info) == ReadStatus::ok) continue;
       read = {ReadStatus::lapped, i, kUnknownClockError};
+      return kOvertaken;
     }
-    if (read.status != ReadStatus::lapped) break;
-  }
+    return ReadStatus::ok;
+  });
   if (read.status != ReadStatus::ok) return read;
-  for (const JointSample& sample : samples) sample.reader->state_->took(sample.info.tid);
+  for (const JointSample& sample : samples) sample.reader->state_->set_cursor(sample.info.tid);
   return read;
 }
 
@@ -292,26 +302,25 @@ ReadStatus RawReader::read_info(Tid tid, SampleInfo& info) const noexcept {
 }
 
 ReadStatus RawReader::find(Time t, SampleInfo& info) const noexcept {
-  for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
+  return retry([&]() -> std::optional<ReadStatus> {
     Tid found = kNoTid;
     const ReadStatus status = state_->ring.find(t, found);
     if (status != ReadStatus::ok) return status;
     SampleInfo seen;
-    if (state_->ring.stamp(found, seen) != ReadStatus::ok) continue;
-    if (is_refused(state_->ring, seen)) return ReadStatus::clock_out_of_bounds;
+    if (state_->ring.stamp(found, seen) != ReadStatus::ok) return kOvertaken;
+    if (is_refused(state_->ring.clock(), seen)) return ReadStatus::clock_out_of_bounds;
     info = seen;
     return ReadStatus::ok;
-  }
-  return ReadStatus::lapped;
+  });
 }
 
 Tid RawReader::cursor() const noexcept { return state_->cursor; }
 
-void RawReader::seek(Tid tid) noexcept { state_->took(std::max(tid, kNoTid)); }
+void RawReader::seek(Tid tid) noexcept { state_->set_cursor(std::max(tid, kNoTid)); }
 
 std::uint64_t RawReader::lost_samples() const noexcept { return state_->lost; }
 std::uint64_t RawReader::restarts() const noexcept { return state_->restarts; }
-std::optional<Error> RawReader::restart_error() const { return state_->trouble; }
+std::optional<Error> RawReader::restart_error() const { return state_->restart_error; }
 
 ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
@@ -320,7 +329,7 @@ ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
   if (status != ReadStatus::ok) return status;
   out.payload_ = {place.payload, payload_bytes()};
   out.sequence_ = place.sequence;
-  state_->took(tid);
+  state_->set_cursor(tid);
   return ReadStatus::ok;
 }
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One descriptor for poll() and event libraries that stands for a connection which comes and goes:
-// readable when its socket is, or when the time has come to try again.
+// One descriptor for poll() and event libraries that covers a connection across reconnects:
+// readable when its socket is ready, or when the next attempt is due.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -16,7 +16,7 @@ class Readiness {
  public:
   static Result<Readiness> make();
 
-  // What fd() stands for from now on: `socket` (-1: none) with poll's `events`, and `at`.
+  // From now on fd() covers `socket` (-1: none) with poll's `events`, and the time `at`.
   void follow(int socket, short events, MonoTime at) noexcept;
   int fd() const noexcept { return epoll_.get(); }
 

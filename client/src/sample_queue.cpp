@@ -36,19 +36,19 @@ void SampleQueue::pop(std::span<std::byte> payload, SampleInfo& info) noexcept {
 void SampleQueue::remove_oldest() noexcept {
   first_ = index(1);
   --count_;
-  ++gone_;
+  ++removed_;
 }
 
 void SampleQueue::clear() noexcept {
-  gone_ += count_;
+  removed_ += count_;
   first_ = count_ = 0;
 }
 
 void SampleQueue::grow() {
-  const std::size_t most = max_count_ + 1;  // one is arriving
-  const std::size_t room = std::min(most, std::max(kFirstCount, 2 * infos_.size()));
-  std::vector<std::byte> payloads(room * payload_bytes_);
-  std::vector<SampleInfo> infos(room);
+  const std::size_t max_capacity = max_count_ + 1;  // one is arriving
+  const std::size_t capacity = std::min(max_capacity, std::max(kFirstCount, 2 * infos_.size()));
+  std::vector<std::byte> payloads(capacity * payload_bytes_);
+  std::vector<SampleInfo> infos(capacity);
   for (std::size_t n = 0; n < count_; ++n) {
     std::memcpy(payloads.data() + n * payload_bytes_, payloads_.data() + index(n) * payload_bytes_,
                 payload_bytes_);

@@ -1,9 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Samples of a subscription that came while their reader was busy with something else: a circular
-// buffer of equal entries in one piece of memory, which grows as it fills and is then used again
-// and again. Bounded: beyond its limit the oldest samples go, each when its successor is complete
-// and not before: what has begun to come may be cut off, or void.
+// Samples of a subscription that arrived while the program used the connection for another request:
+// a circular buffer that grows up to a limit. Beyond it the oldest sample is removed, but only when
+// its successor is complete: a sample that has arrived in part may still be cut off or torn.
 #pragma once
 
 #include <cstddef>
@@ -23,7 +22,7 @@ class SampleQueue {
   bool empty() const noexcept { return count_ == 0; }
   std::size_t size() const noexcept { return count_; }
 
-  // Where the next sample's payload goes, until it is pushed or given up by another call of this.
+  // Where the next sample's payload goes, until push() or another place().
   std::byte* place();
   // The payload at place() is complete. May drop the oldest sample: then dropped() rises.
   void push(const SampleInfo& info) noexcept;
@@ -33,8 +32,8 @@ class SampleQueue {
 
   void clear() noexcept;
   std::uint64_t dropped() const noexcept { return dropped_; }
-  // How many samples left the queue so far, by whatever way.
-  std::uint64_t gone() const noexcept { return gone_; }
+  // Samples removed from the queue so far: popped, dropped or cleared.
+  std::uint64_t removed() const noexcept { return removed_; }
 
  private:
   std::size_t index(std::size_t n) const noexcept { return (first_ + n) % infos_.size(); }
@@ -43,9 +42,9 @@ class SampleQueue {
 
   std::size_t payload_bytes_, max_count_;
   std::vector<std::byte> payloads_;
-  std::vector<SampleInfo> infos_;  // its size is how many samples there is room for
+  std::vector<SampleInfo> infos_;  // its size is the capacity
   std::size_t first_ = 0, count_ = 0;
-  std::uint64_t dropped_ = 0, gone_ = 0;
+  std::uint64_t dropped_ = 0, removed_ = 0;
 };
 
 }  // namespace dssm::detail

@@ -1,12 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Session's functions as requests to dssmd.
+// Session's functions as requests to dssmd: each builds one message, and turns the answer into the
+// API's types. await_raw_reader() repeats an open until it succeeds or fails for good.
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <dssm/session.hpp>
 
 #include "client/src/client.hpp"
 #include "client/src/states.hpp"
 #include "core/base/text.hpp"
+#include "core/base/try.hpp"
 #include "core/wire/clock_report.hpp"
 
 namespace dssm {
@@ -15,10 +19,10 @@ namespace {
 using namespace std::chrono_literals;
 
 std::string quoted(const char* verb, const StreamId& id) {
-  return std::string(verb) + " '" + id.str() + "'";
+  return fmt::format("{} '{}'", verb, id.str());
 }
 
-// Opens and wraps; every failure says what was tried.
+// A handle of the opened stream; a failure names what was tried.
 template <class Raw, class State, class Wrap>
 Result<Raw> opened(Result<std::shared_ptr<detail::OpenStream>> stream, const std::string& what,
                    Wrap wrap) {
@@ -34,18 +38,18 @@ Result<void> without_answer(Result<detail::Answer> answer, const std::string& wh
 Result<std::vector<StreamInfo>> listed(detail::Client& client, bool own_only) {
   local::Request request;
   request.mutable_list()->set_own_only(own_only);
-  auto answer = client.call(std::move(request));
-  if (!answer) return std::move(answer).error().context("list the streams");
+  const detail::Answer answer =
+      DSSM_TRY(client.connection().call(std::move(request)), "list the streams");
   std::vector<StreamInfo> streams;
-  streams.reserve(static_cast<std::size_t>(answer->response.stream_list().streams_size()));
-  for (const proto::Stream& stream : answer->response.stream_list().streams()) {
+  streams.reserve(static_cast<std::size_t>(answer.response.stream_list().streams_size()));
+  for (const proto::Stream& stream : answer.response.stream_list().streams()) {
     streams.push_back(wire::stream_info(stream));
   }
   return streams;
 }
 
-// Between two tries for what is no event of a stream.
-constexpr Duration kLookAgain = std::chrono::milliseconds(500);
+// Between attempts where no event of a stream announces success.
+constexpr Duration kRetryPause = std::chrono::milliseconds(500);
 
 HostInfo host_info(const local::Host& message) {
   HostInfo host;
@@ -85,9 +89,9 @@ namespace detail {
 Result<std::vector<std::byte>> get_property(Client& client, const StreamId& id) {
   local::Request request;
   wire::to_message(id, *request.mutable_get_property()->mutable_id());
-  auto answer = client.call(std::move(request));
-  if (!answer) return std::move(answer).error().context(quoted("get the property of", id));
-  const std::string& text = answer->response.property().property();
+  const detail::Answer answer =
+      DSSM_TRY(client.connection().call(std::move(request)), quoted("get the property of", id));
+  const std::string& text = answer.response.property().property();
   const auto bytes = std::as_bytes(std::span(text));
   return std::vector<std::byte>(bytes.begin(), bytes.end());
 }
@@ -95,15 +99,15 @@ Result<std::vector<std::byte>> get_property(Client& client, const StreamId& id) 
 Result<void> set_property(Client& client, const StreamId& id, std::span<const std::byte> property) {
   const std::string what = quoted("set the property of", id);
   if (property.size() > wire::kMaxPropertyBytes) {
-    return Error{Errc::limit_exceeded, what + ": it has " + std::to_string(property.size()) +
-                                           " bytes, at most " +
-                                           std::to_string(wire::kMaxPropertyBytes) +
-                                           " are possible; put large data into a stream"};
+    return Error{
+        Errc::limit_exceeded,
+        fmt::format("{}: it has {} bytes, at most {} are possible; put large data into a stream",
+                    what, property.size(), wire::kMaxPropertyBytes)};
   }
   local::Request request;
   wire::to_message(id, *request.mutable_set_property()->mutable_id());
   request.mutable_set_property()->set_property(property.data(), property.size());
-  return without_answer(client.call(std::move(request)), what);
+  return without_answer(client.connection().call(std::move(request)), what);
 }
 
 }  // namespace detail
@@ -116,17 +120,14 @@ Session& Session::operator=(Session&&) noexcept = default;
 Session::~Session() = default;
 
 Result<Session> Session::connect(SessionOptions options) {
-  auto client = detail::Client::connect(std::move(options));
-  if (!client) return std::move(client).error();
-  return Session(std::move(*client));
+  return Session(DSSM_TRY(detail::Client::connect(std::move(options))));
 }
 
 Result<RawWriter> Session::create_raw(const StreamId& id, const TypeInfo& type,
                                       const History& history, std::uint32_t tag) {
   const std::string what = quoted("create", id);
-  if (Result<void> checked = id.check(); !checked) return std::move(checked).error().context(what);
-  if (Result<void> checked = type.check(); !checked)
-    return std::move(checked).error().context(what);
+  DSSM_TRY(id.check(), what);
+  DSSM_TRY(type.check(), what);
   local::Request request;
   proto::Create& create = *request.mutable_create();
   wire::to_message(id, *create.mutable_id());
@@ -143,11 +144,7 @@ Result<RawWriter> Session::open_raw_writer(const StreamId& id, const TypeInfo* w
                                            std::uint32_t tag) {
   const std::string what = quoted("open", id) + " for writing";
   auto stream = client_->open_writer(id, tag);
-  if (stream && wanted) {
-    if (Result<void> usable = (*stream)->type.check_usable_as(*wanted); !usable) {
-      return std::move(usable).error().context(what);
-    }
-  }
+  if (stream && wanted) DSSM_TRY((*stream)->type.check_usable_as(*wanted), what);
   return opened<RawWriter, detail::WriterState>(
       std::move(stream), what, [](auto state) { return RawWriter(std::move(state)); });
 }
@@ -156,11 +153,7 @@ Result<RawReader> Session::open_raw_reader(const StreamId& id, const TypeInfo* w
                                            std::uint32_t tag) {
   const std::string what = quoted("open", id);
   auto stream = client_->open_reader(id, tag);
-  if (stream && wanted) {
-    if (Result<void> usable = (*stream)->type.check_usable_as(*wanted); !usable) {
-      return std::move(usable).error().context(what);
-    }
-  }
+  if (stream && wanted) DSSM_TRY((*stream)->type.check_usable_as(*wanted), what);
   return opened<RawReader, detail::ReaderState>(
       std::move(stream), what, [](auto state) { return RawReader(std::move(state)); });
 }
@@ -168,41 +161,41 @@ Result<RawReader> Session::open_raw_reader(const StreamId& id, const TypeInfo* w
 Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadline,
                                             const TypeInfo* wanted) {
   std::mutex mutex;
-  std::condition_variable came;
-  std::uint64_t times = 0;
+  std::condition_variable added;
+  std::uint64_t times_added = 0;
   auto watching = watch([&](const StreamEvent& event) {
     if (event.kind != StreamEvent::Kind::added || event.stream.id.name != id.name ||
         event.stream.id.id != id.id) {
       return;
     }
     const std::lock_guard guard(mutex);
-    ++times;
-    came.notify_one();
+    ++times_added;
+    added.notify_one();
   });
   if (!watching) return std::move(watching).error().context(quoted("wait for", id));
   for (std::uint64_t seen = 0;;) {
     auto reader = open_raw_reader(id, wanted);
     if (reader || !is_retryable(reader.error().code)) return reader;
-    // That a clock is good again, or that a host answers again, is no event of a stream.
-    const bool is_told = reader.error().code == Errc::not_found;
-    const MonoTime next = is_told ? deadline : std::min(deadline, deadline_in(kLookAgain));
+    // Only for a missing stream is there an event when it can be opened.
+    const bool has_event = reader.error().code == Errc::not_found;
+    const MonoTime next = has_event ? deadline : std::min(deadline, deadline_in(kRetryPause));
     std::unique_lock lock(mutex);
     if (next == kNever) {
-      came.wait(lock, [&] { return times > seen; });
+      added.wait(lock, [&] { return times_added > seen; });
     } else {
       // steady_clock is CLOCK_MONOTONIC too, with the same origin.
       const std::chrono::steady_clock::time_point until(next.time_since_epoch());
-      const bool news = came.wait_until(lock, until, [&] { return times > seen; });
-      if (!news && next == deadline) return std::move(reader).error();
+      const bool changed = added.wait_until(lock, until, [&] { return times_added > seen; });
+      if (!changed && next == deadline) return std::move(reader).error();
     }
-    seen = times;
+    seen = times_added;
   }
 }
 
 Result<void> Session::remove(const StreamId& id) {
   local::Request request;
   wire::to_message(id, *request.mutable_remove()->mutable_id());
-  return without_answer(client_->call(std::move(request)), quoted("remove", id));
+  return without_answer(client_->connection().call(std::move(request)), quoted("remove", id));
 }
 
 Result<std::vector<StreamInfo>> Session::list_streams() { return listed(*client_, false); }
@@ -212,18 +205,19 @@ Result<std::vector<StreamInfo>> Session::list_own_streams() { return listed(*cli
 Result<StreamInfo> Session::stream_info(const StreamId& id) {
   local::Request request;
   wire::to_message(id, *request.mutable_info()->mutable_id());
-  auto answer = client_->call(std::move(request));
-  if (!answer) return std::move(answer).error().context(quoted("look at", id));
-  if (answer->response.stream_list().streams_size() != 1) {
-    return Error{Errc::protocol, quoted("look at", id) + ": dssmd answered without the stream"};
+  const detail::Answer answer =
+      DSSM_TRY(client_->connection().call(std::move(request)), quoted("get information on", id));
+  if (answer.response.stream_list().streams_size() != 1) {
+    return Error{Errc::protocol,
+                 quoted("get information on", id) + ": dssmd's answer does not contain the stream"};
   }
-  return wire::stream_info(answer->response.stream_list().streams(0));
+  return wire::stream_info(answer.response.stream_list().streams(0));
 }
 
 struct Session::Watch::State {
   std::shared_ptr<detail::Client> client;
   std::uint64_t key;
-  ~State() { client->remove_watch(key); }
+  ~State() { client->watches().remove(key); }
 };
 
 Session::Watch::Watch(std::unique_ptr<State> state) noexcept : state_(std::move(state)) {}
@@ -232,9 +226,9 @@ Session::Watch& Session::Watch::operator=(Watch&&) noexcept = default;
 Session::Watch::~Watch() = default;
 
 Result<Session::Watch> Session::watch(std::function<void(const StreamEvent&)> on_event) {
-  auto key = client_->add_watch(std::move(on_event));
-  if (!key) return std::move(key).error().context("watch the streams");
-  return Watch(std::unique_ptr<Watch::State>(new Watch::State{client_, *key}));
+  const std::uint64_t key =
+      DSSM_TRY(client_->watches().add(std::move(on_event)), "watch the streams");
+  return Watch(std::unique_ptr<Watch::State>(new Watch::State{client_, key}));
 }
 
 Result<void> Session::set_property(const StreamId& id, std::span<const std::byte> property) {
@@ -248,10 +242,10 @@ Result<std::vector<std::byte>> Session::property(const StreamId& id) {
 Result<std::vector<HostInfo>> Session::list_hosts() {
   local::Request request;
   request.mutable_list_hosts();
-  auto answer = client_->call(std::move(request));
-  if (!answer) return std::move(answer).error().context("list the hosts");
+  const detail::Answer answer =
+      DSSM_TRY(client_->connection().call(std::move(request)), "list the hosts");
   std::vector<HostInfo> hosts;
-  for (const local::Host& host : answer->response.host_list().hosts()) {
+  for (const local::Host& host : answer.response.host_list().hosts()) {
     hosts.push_back(host_info(host));
   }
   return hosts;
@@ -260,26 +254,25 @@ Result<std::vector<HostInfo>> Session::list_hosts() {
 Result<RoundTrip> Session::ping(const std::string& host) {
   local::Request request;
   request.mutable_ping_host()->set_host(host);
-  auto answer = client_->call(std::move(request));
-  if (!answer) return std::move(answer).error().context("ping '" + host + "'");
-  const local::RoundTrip& round_trip = answer->response.round_trip();
+  const detail::Answer answer =
+      DSSM_TRY(client_->connection().call(std::move(request)), "ping '" + host + "'");
+  const local::RoundTrip& round_trip = answer.response.round_trip();
   return RoundTrip{Duration(round_trip.round_trip_ns()), round_trip.address()};
 }
 
 Result<PlaybackClock> Session::open_playback_clock() {
-  auto record = client_->playback_clock();
-  if (!record) return std::move(record).error().context("open the playback clock");
+  auto record = DSSM_TRY(client_->open_playback_clock(), "open the playback clock");
   return PlaybackClock(
-      std::make_shared<detail::PlaybackClockState>(detail::PlaybackClockState{*record}));
+      std::make_shared<detail::PlaybackClockState>(detail::PlaybackClockState{std::move(record)}));
 }
 
 Result<std::vector<ClientInfo>> Session::list_clients() {
   local::Request request;
   request.mutable_list_clients();
-  auto answer = client_->call(std::move(request));
-  if (!answer) return std::move(answer).error().context("list the processes");
+  const detail::Answer answer =
+      DSSM_TRY(client_->connection().call(std::move(request)), "list the processes");
   std::vector<ClientInfo> clients;
-  for (const local::Client& client : answer->response.client_list().clients()) {
+  for (const local::Client& client : answer.response.client_list().clients()) {
     clients.push_back({client.pid(), client.uid(), client.program()});
   }
   return clients;
@@ -288,10 +281,10 @@ Result<std::vector<ClientInfo>> Session::list_clients() {
 Result<std::vector<OpenInfo>> Session::list_opens() {
   local::Request request;
   request.mutable_list_opens();
-  auto answer = client_->call(std::move(request));
-  if (!answer) return std::move(answer).error().context("list the open streams");
+  const detail::Answer answer =
+      DSSM_TRY(client_->connection().call(std::move(request)), "list the open streams");
   std::vector<OpenInfo> opens;
-  for (const local::OpenEntry& entry : answer->response.open_list().opens()) {
+  for (const local::OpenEntry& entry : answer.response.open_list().opens()) {
     opens.push_back({{entry.id().name(), entry.id().id(), entry.id().host()},
                      entry.creator_pid(),
                      entry.opener_pid(),
@@ -304,9 +297,9 @@ Result<std::vector<OpenInfo>> Session::list_opens() {
 Result<DaemonInfo> Session::daemon_info() {
   local::Request request;
   request.mutable_get_daemon();
-  auto answer = client_->call(std::move(request));
-  if (!answer) return std::move(answer).error().context("ask dssmd about itself");
-  const local::Daemon& daemon = answer->response.daemon();
+  const detail::Answer answer =
+      DSSM_TRY(client_->connection().call(std::move(request)), "ask dssmd about itself");
+  const local::Daemon& daemon = answer.response.daemon();
   const local::Mdns& mdns = daemon.mdns();
   return DaemonInfo{
       daemon.host(),
@@ -319,6 +312,6 @@ Result<DaemonInfo> Session::daemon_info() {
        mdns.announced(), mdns.withheld(), mdns.own_host_seen(), mdns.hosts_heard()}};
 }
 
-bool Session::is_connected() const noexcept { return client_->connected(); }
+bool Session::is_connected() const noexcept { return client_->connection().is_up(); }
 
 }  // namespace dssm

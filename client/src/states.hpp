@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What is behind the handles of the public API.
+// The state of the handles of the public API.
 #pragma once
 
 #include <atomic>
@@ -19,51 +19,50 @@ namespace dssm::detail {
 // How long a reader waits before it tries again to open the ring that superseded its own.
 inline constexpr Duration kRestartPause = std::chrono::milliseconds(200);
 
-// A time that is further from now than this is none of this PC's clock.
-inline constexpr Duration kLongestDelay = std::chrono::seconds(10);
+// A time that is further from now than this is not of this PC's clock.
+inline constexpr Duration kMaxDelay = std::chrono::seconds(10);
 
-// How far this PC's clock may have been off at `time`, by the page at `place`; kForeignClockError
-// for a time that is none of it.
-inline Duration error_by(const Client::ClockPlace& place, Time time) noexcept {
+// The bound on the error of this PC's clock at `time`, from the page at `place`; kForeignClockError
+// for a time that is not of this clock.
+inline Duration clock_error_by(const Client::ClockPlace& place, Time time) noexcept {
   const clock::ClockPage* page = place.load(std::memory_order_acquire);
   const std::optional<Duration> error = page ? clock::error_at(*page, time) : std::nullopt;
   if (error) return *error;
-  // Only now, because it costs more than all the rest.
+  // Last, because clock_gettime() costs more than all the rest.
   const Time now = WallClock::now();
-  return time < now - kLongestDelay || time > now + kLongestDelay ? kForeignClockError
-                                                                  : kUnknownClockError;
+  return time < now - kMaxDelay || time > now + kMaxDelay ? kForeignClockError : kUnknownClockError;
 }
 
 struct ReaderState {
   explicit ReaderState(std::shared_ptr<OpenStream> opened)
       : stream(std::move(opened)), ring(*stream->ring->mapping) {}
 
-  // Whether there is another ring to go on with, as far as is known without asking.
+  // Whether there is a new ring, as far as is known without a request.
   bool restart_due() const noexcept { return stream->superseded->load(std::memory_order_acquire); }
-  // Goes on with the new ring. False: it cannot be had now, the old one stays.
+  // Opens the new ring. False: not possible now, the old one stays.
   bool restart() noexcept;
-  // The stream as it is now, for a thread that waits beside the one that reads.
+  // The present stream, for a thread that waits while another one reads.
   std::shared_ptr<OpenStream> stream_now() const;
-  // Whether a wait on `on` shall end so that the reader can try to restart.
+  // Whether a wait on `on` must end so that the reader can try to restart.
   bool restart_wakes(const OpenStream& on) const noexcept;
 
-  // From now on next() goes on behind `tid`.
-  void took(Tid tid) noexcept {
+  // read_next() continues after `tid`.
+  void set_cursor(Tid tid) noexcept {
     cursor = tid;
     fresh = false;
   }
 
-  // Changed by restart() only, in the thread that reads; stream_mutex lets another one wait.
+  // Changed only by restart(), in the thread that reads; stream_mutex is for one that waits.
   mutable std::mutex stream_mutex;
   std::shared_ptr<OpenStream> stream;
-  std::shared_ptr<const SharedRing> previous;  // so that what was borrowed stays mapped
+  std::shared_ptr<const SharedRing> previous;  // keeps borrowed samples mapped
   ring::RingReader ring;
   Tid cursor = kNoTid;
-  bool fresh = true;  // next() has not been told where to start
+  bool fresh = true;  // neither read nor seek() has set the cursor
   std::uint64_t lost = 0;
   std::uint64_t restarts = 0;
-  std::optional<Error> trouble;
-  std::atomic<std::int64_t> next_attempt_ns = 0;  // monotonic: not before it restart() asks dssmd
+  std::optional<Error> restart_error;
+  std::atomic<std::int64_t> next_attempt_ns = 0;  // monotonic: restart() sends no request before
   std::shared_ptr<ReadyFd> ready;
 };
 
@@ -74,12 +73,12 @@ struct WriterState {
         ring(*stream->ring->mapping, *stream->ring->bell, stream->ring->doorbell_fd.get()),
         payload_bytes(stream->ring->mapping->geometry().payload_bytes) {}
 
-  // What a sample is stamped with that a writer says this about.
-  Duration stamp(Time time, Duration clock_error) noexcept {
+  // The clock_error to store for a sample that is written with these arguments.
+  Duration clock_error_for(Time time, Duration clock_error) noexcept {
     if (clock_error != kOwnClockError) return clock_error;
     Duration error{};
     const bool found = own_error.find(clock.load(std::memory_order_acquire), time, error);
-    return found ? error : error_by(clock, time);
+    return found ? error : clock_error_by(clock, time);
   }
 
   std::shared_ptr<OpenStream> stream;

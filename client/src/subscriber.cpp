@@ -9,13 +9,13 @@
 namespace dssm::detail {
 namespace {
 
-// Samples that come while the program waits for an answer. The answer comes within a round trip, so
-// this is much; what is beyond it counts as lost.
-constexpr std::size_t kMaxKeptBytes = 16U << 20;
+// Of samples that arrive while the program waits for an answer, which takes a round trip. Samples
+// beyond it count as lost.
+constexpr std::size_t kMaxBufferedBytes = 16U << 20;
 
 }  // namespace
 
-Subscriber::Subscriber(std::size_t payload_bytes) : queue_(payload_bytes, kMaxKeptBytes) {}
+Subscriber::Subscriber(std::size_t payload_bytes) : queue_(payload_bytes, kMaxBufferedBytes) {}
 
 void Subscriber::begin(const Subscription& what) {
   end();
@@ -27,7 +27,7 @@ void Subscriber::end() {
   live_ = resumes_ = false;
   if (arriving_ != Arriving::nothing) arriving_ = Arriving::nowhere;
   target_ = nullptr;
-  taken_.reset();
+  delivered_.reset();
   queue_.clear();
   restart_at_.reset();
 }
@@ -71,19 +71,19 @@ Result<void> Subscriber::on_subscribed(const net::Subscribed& message) {
 
 void Subscriber::on_gap(const net::Gap& message) noexcept {
   if (!live_ || message.first_tid() < 0) return;
-  const auto room = static_cast<std::uint64_t>(INT64_MAX - message.first_tid());
-  const Tid behind = message.first_tid() + static_cast<Tid>(std::min(message.count(), room));
+  const auto max_count = static_cast<std::uint64_t>(INT64_MAX - message.first_tid());
+  const Tid end = message.first_tid() + static_cast<Tid>(std::min(message.count(), max_count));
   const Tid from = is_thinned() ? std::max(message.first_tid(), due_) : due_;
-  if (behind <= from) return;
-  lost_ += static_cast<std::uint64_t>(behind - from);
-  due_ = behind;
+  if (end <= from) return;
+  lost_ += static_cast<std::uint64_t>(end - from);
+  due_ = end;
 }
 
 void Subscriber::on_restart() noexcept {
   if (!resumes_) return;
-  resumes_ = false;  // the new ring's tids have nothing to do with `due_`
+  resumes_ = false;  // `due_` is a tid of the old ring
   what_->start = Subscription::Start::oldest;
-  restart_at_ = queue_.gone() + queue_.size();
+  restart_at_ = queue_.removed() + queue_.size();
 }
 
 void Subscriber::on_down() noexcept {
@@ -101,12 +101,12 @@ void Subscriber::on_down() noexcept {
     return Error{Errc::protocol, "sample " + std::to_string(info.tid) + " came when " +
                                      std::to_string(due_) + " was due"};
   }
-  if (target_ && !has_kept()) {
+  if (target_ && !has_buffered()) {
     arriving_ = Arriving::in_target;
     out = target_;
     return true;
   }
-  if (!keep_) return false;
+  if (!buffering_) return false;
   arriving_ = Arriving::in_queue;
   out = queue_.place();
   return true;
@@ -118,25 +118,25 @@ void Subscriber::on_down() noexcept {
   if (!is_thinned()) lost_ += static_cast<std::uint64_t>(info.tid - due_);
   due_ = info.tid + 1;
   if (arrived == Arriving::in_queue) return queue_.push(info);
-  taken_ = info;
+  delivered_ = info;
   target_ = nullptr;
 }
 
-[[gnu::hot]] bool Subscriber::taken(SampleInfo& info) noexcept {
-  if (!taken_) return false;
-  info = *taken_;
-  taken_.reset();
+[[gnu::hot]] bool Subscriber::delivered(SampleInfo& info) noexcept {
+  if (!delivered_) return false;
+  info = *delivered_;
+  delivered_.reset();
   return true;
 }
 
-std::byte* Subscriber::leave_target() {
+std::byte* Subscriber::detach_target() {
   arriving_ = Arriving::in_queue;
   return queue_.place();
 }
 
-[[gnu::hot]] std::optional<ReadStatus> Subscriber::take_kept(std::span<std::byte> payload,
-                                                             SampleInfo& info) noexcept {
-  if (must_tell_restart()) {
+[[gnu::hot]] std::optional<ReadStatus> Subscriber::pop_buffered(std::span<std::byte> payload,
+                                                                SampleInfo& info) noexcept {
+  if (is_restart_next()) {
     restart_at_.reset();
     return ReadStatus::restarted;
   }

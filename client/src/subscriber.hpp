@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A subscription as its client sees it: which sample is due next, where the bytes of the one that
-// is arriving go, what was lost, and where to go on after a cut.
+// The client end of a subscription: which sample is due next, where the bytes of the arriving
+// sample go, what was lost, and where to resume after a reconnect.
 //
-// Samples go straight into the memory of who waits for one (set_target), or into a queue while the
-// program does something else with the connection (keep), or they stay in the connection's input
-// buffer, and behind it in the owner's ring, until somebody asks.
+// A sample is received directly into the caller's memory (set_target), or into a queue while the
+// program uses the connection for another request (set_buffering); otherwise it stays in the
+// connection's input buffer, and the following ones in the owner's ring, until the program reads.
 #pragma once
 
 #include <cstddef>
@@ -23,45 +23,45 @@ class Subscriber {
  public:
   explicit Subscriber(std::size_t payload_bytes);
 
-  // A subscription as the user asked for it; what is left of another one is forgotten.
+  // A subscription as the program requested it; it replaces any other.
   void begin(const Subscription& what);
   void end();
   bool active() const noexcept { return what_.has_value(); }
   bool granted() const noexcept { return resumes_; }  // on_subscribed() came since begin()
 
-  // The request that begins it, or after a cut goes on with it.
+  // The request that begins it, or resumes it after a reconnect.
   void to_message(std::uint64_t incarnation, net::Subscribe& out) const;
 
-  // --- what the connection brings
+  // --- what arrives
 
-  // From here on samples are this subscription's.
+  // From now on samples belong to this subscription.
   Result<void> on_subscribed(const net::Subscribed& message);
   void on_gap(const net::Gap& message) noexcept;
   // The owner's ring was replaced; comes before on_subscribed().
   void on_restart() noexcept;
-  // The connection is gone, and with it what had come of a sample.
+  // The connection ended, and with it a sample that had arrived in part.
   void on_down() noexcept;
 
-  // A sample begins: where it goes (nullptr: nowhere), or false: it has to wait.
+  // A sample begins: `out` is where it goes (nullptr: nowhere). False: it has to wait.
   Result<bool> on_sample_begin(const SampleInfo& info, std::byte*& out);
   void on_sample_end(const SampleInfo& info, bool torn) noexcept;
 
-  // --- what the user gets
+  // --- what the program reads
 
-  // Whether samples that nobody waits for are kept in the queue.
-  void keep(bool keep) noexcept { keep_ = keep; }
+  // Whether samples without a target go to the queue.
+  void set_buffering(bool on) noexcept { buffering_ = on; }
   // Where the next sample goes: all of its payload's bytes; nullptr: nowhere.
   void set_target(std::byte* target) noexcept { target_ = target; }
-  // Whether a sample came into the target; once.
-  bool taken(SampleInfo& info) noexcept;
-  // Whether one has begun to.
+  // Whether a sample has arrived in the target; once.
+  bool delivered(SampleInfo& info) noexcept;
+  // Whether one has arrived there in part.
   bool is_filling_target() const noexcept { return arriving_ == Arriving::in_target; }
-  // Where the one that fills the target shall go on, because the target is needed back.
-  std::byte* leave_target();
+  // Where the sample that fills the target continues, because the caller needs the target back.
+  std::byte* detach_target();
 
-  bool has_kept() const noexcept { return !queue_.empty() || must_tell_restart(); }
-  // From what was kept: a sample, or the news that the ring was replaced.
-  std::optional<ReadStatus> take_kept(std::span<std::byte> payload, SampleInfo& info) noexcept;
+  bool has_buffered() const noexcept { return !queue_.empty() || is_restart_next(); }
+  // From the queue: a sample, or `restarted`.
+  std::optional<ReadStatus> pop_buffered(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
   std::uint64_t lost() const noexcept { return lost_ + queue_.dropped(); }
   // Copied out of the queue.
@@ -70,21 +70,21 @@ class Subscriber {
  private:
   enum class Arriving : unsigned char { nothing, in_target, in_queue, nowhere };
 
-  bool must_tell_restart() const noexcept { return restart_at_ && *restart_at_ <= queue_.gone(); }
+  bool is_restart_next() const noexcept { return restart_at_ && *restart_at_ <= queue_.removed(); }
   bool is_thinned() const noexcept { return what_ && what_->max_rate_hz > 0; }
 
   std::optional<Subscription> what_;
-  bool live_ = false;     // this connection brings it
-  bool resumes_ = false;  // some connection did
+  bool live_ = false;     // on this connection
+  bool resumes_ = false;  // on some connection: to_message() resumes it
   Tid due_ = 0;           // tid of the next sample
   std::uint64_t lost_ = 0, copied_bytes_ = 0;
 
-  bool keep_ = false;
+  bool buffering_ = false;
   std::byte* target_ = nullptr;
-  std::optional<SampleInfo> taken_;
+  std::optional<SampleInfo> delivered_;
   Arriving arriving_ = Arriving::nothing;
   SampleQueue queue_;
-  std::optional<std::uint64_t> restart_at_;  // to be told when so many are gone from the queue
+  std::optional<std::uint64_t> restart_at_;  // report it when so many were removed from the queue
 };
 
 }  // namespace dssm::detail

@@ -12,7 +12,7 @@ LoanedSample::LoanedSample(detail::WriterState* state) noexcept : state_(state) 
 Tid LoanedSample::publish(Time time, Duration clock_error) noexcept {
   if (payload_.empty()) return kNoTid;
   payload_ = {};
-  return state_->ring.commit(time, state_->stamp(time, clock_error));
+  return state_->ring.commit(time, state_->clock_error_for(time, clock_error));
 }
 
 void LoanedSample::abandon() noexcept {
@@ -30,7 +30,8 @@ RawWriter::~RawWriter() = default;
 [[gnu::hot]] Tid RawWriter::write(std::span<const std::byte> payload, Time time,
                                   Duration clock_error) noexcept {
   if (payload.size() != state_->payload_bytes) return kNoTid;
-  return state_->ring.write_with(payload, time, [&] { return state_->stamp(time, clock_error); });
+  return state_->ring.write_with(payload, time,
+                                 [&] { return state_->clock_error_for(time, clock_error); });
 }
 
 LoanedSample RawWriter::loan() noexcept { return LoanedSample(state_.get()); }

@@ -342,7 +342,7 @@ TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
   TakenSample sample;
   const auto bad = con.read_newest(sample.span(), sample.info);
   ASSERT_FALSE(bad);
-  expect_words(bad.error(), Errc::type_mismatch, {"anew", "8 bytes", "9 bytes"});
+  expect_words(bad.error(), Errc::type_mismatch, {"recreated", "8 bytes", "9 bytes"});
 }
 
 TEST(PConnectorRequest, AWaitForAStreamThatCannotBeUsedAnyMoreIsNoLoop) {
@@ -365,7 +365,7 @@ TEST(PConnectorRequest, AWaitForAStreamThatCannotBeUsedAnyMoreIsNoLoop) {
     EXPECT_GT(connections, before) << "each time after one more attempt";
     const auto status = con.read_next(sample.span(), sample.info);
     ASSERT_FALSE(status);
-    EXPECT_NE(status.error().message.find("anew"), std::string::npos) << status.error().message;
+    EXPECT_NE(status.error().message.find("recreated"), std::string::npos) << status.error().message;
   }
 }
 

@@ -47,8 +47,8 @@ struct NetworkConnectionTest : testing::Test {
               static_cast<ssize_t>(bytes.size()));
   }
 
-  NoUser user;
-  NetworkConnection link{user, "test", 0s};
+  NoUser delegate;
+  NetworkConnection link{delegate, "test", 0s};
   UniqueFd listener, connection;
 };
 

@@ -42,7 +42,7 @@ TEST(SampleQueue, GivesBackWhatItTookInOrderOverManyTurns) {
   }
   EXPECT_TRUE(queue.empty());
   EXPECT_EQ(queue.dropped(), 0u);
-  EXPECT_EQ(queue.gone(), static_cast<std::uint64_t>(in));
+  EXPECT_EQ(queue.removed(), static_cast<std::uint64_t>(in));
 }
 
 TEST(SampleQueue, GrowsInTheMidstOfATurn) {
@@ -60,7 +60,7 @@ TEST(SampleQueue, DropsAndCountsTheOldestBeyondItsLimit) {
   for (Tid tid = 0; tid < 25; ++tid) push(queue, tid);
   EXPECT_EQ(queue.size(), 10u);
   EXPECT_EQ(queue.dropped(), 15u);
-  EXPECT_EQ(queue.gone(), 15u);
+  EXPECT_EQ(queue.removed(), 15u);
   for (Tid tid = 15; tid < 25; ++tid) expect_pop(queue, tid);
 }
 

@@ -46,8 +46,8 @@ struct SubscriberTest : testing::Test {
     return true;
   }
   void expect_kept(Tid tid) {
-    ASSERT_TRUE(subscriber.has_kept());
-    ASSERT_EQ(subscriber.take_kept(target, info), ReadStatus::ok);
+    ASSERT_TRUE(subscriber.has_buffered());
+    ASSERT_EQ(subscriber.pop_buffered(target, info), ReadStatus::ok);
     EXPECT_EQ(info.tid, tid);
     EXPECT_EQ(std::memcmp(target.data(), &tid, sizeof tid), 0);
   }
@@ -76,29 +76,29 @@ TEST_F(SubscriberTest, ASampleThatNobodyWaitsForHasToWait) {
   EXPECT_FALSE(arrive(0));
   subscriber.set_target(target.data());
   EXPECT_TRUE(arrive(0));
-  ASSERT_TRUE(subscriber.taken(info));
+  ASSERT_TRUE(subscriber.delivered(info));
   EXPECT_EQ(info.tid, 0);
-  EXPECT_FALSE(subscriber.taken(info));
+  EXPECT_FALSE(subscriber.delivered(info));
   EXPECT_FALSE(arrive(1)) << "the target is taken";
 }
 
 TEST_F(SubscriberTest, KeepsSamplesInOrderAndGivesThemBeforeNewOnes) {
   begin();
-  subscriber.keep(true);
+  subscriber.set_buffering(true);
   EXPECT_TRUE(arrive(0));
   EXPECT_TRUE(arrive(1));
-  subscriber.keep(false);
+  subscriber.set_buffering(false);
   subscriber.set_target(target.data());
   EXPECT_FALSE(arrive(2));
   expect_kept(0);
   expect_kept(1);
   EXPECT_TRUE(arrive(2));
-  EXPECT_TRUE(subscriber.taken(info));
+  EXPECT_TRUE(subscriber.delivered(info));
 }
 
 TEST_F(SubscriberTest, ResumesAtTheSampleThatIsDueAndCountsWhatTheRingLost) {
   begin({.start = Subscription::Start::tid, .tid = 10});
-  subscriber.keep(true);
+  subscriber.set_buffering(true);
   arrive(10);
   arrive(11);
   subscriber.on_down();
@@ -111,7 +111,7 @@ TEST_F(SubscriberTest, ResumesAtTheSampleThatIsDueAndCountsWhatTheRingLost) {
   expect_kept(10);
   expect_kept(11);
   expect_kept(15);
-  EXPECT_FALSE(subscriber.has_kept());
+  EXPECT_FALSE(subscriber.has_buffered());
 }
 
 TEST_F(SubscriberTest, ResumesEvenWhenNothingHadCome) {
@@ -123,7 +123,7 @@ TEST_F(SubscriberTest, ResumesEvenWhenNothingHadCome) {
 
 TEST_F(SubscriberTest, CountsEachLostSampleOnceByGapOrByTid) {
   begin();
-  subscriber.keep(true);
+  subscriber.set_buffering(true);
   arrive(0);
   gap(1, 4);
   EXPECT_EQ(subscriber.lost(), 4u);
@@ -145,7 +145,7 @@ TEST_F(SubscriberTest, CountsEachLostSampleOnceByGapOrByTid) {
 
 TEST_F(SubscriberTest, DoesNotCountWhatWasLeftOutForTheRate) {
   begin({.max_rate_hz = 10});
-  subscriber.keep(true);
+  subscriber.set_buffering(true);
   arrive(0);
   arrive(50);
   gap(60, 5);
@@ -159,15 +159,15 @@ TEST_F(SubscriberTest, ATornSampleIsNeverGivenOut) {
   begin();
   subscriber.set_target(target.data());
   EXPECT_TRUE(arrive(0, true));
-  EXPECT_FALSE(subscriber.taken(info));
+  EXPECT_FALSE(subscriber.delivered(info));
   EXPECT_TRUE(arrive(1)) << "the target is still free";
-  EXPECT_TRUE(subscriber.taken(info));
+  EXPECT_TRUE(subscriber.delivered(info));
   EXPECT_EQ(subscriber.lost(), 1u);
 }
 
 TEST_F(SubscriberTest, TellsOfANewRingAfterTheOldOnesSamples) {
   begin();
-  subscriber.keep(true);
+  subscriber.set_buffering(true);
   arrive(0);
   arrive(1);
   subscriber.on_down();
@@ -177,9 +177,9 @@ TEST_F(SubscriberTest, TellsOfANewRingAfterTheOldOnesSamples) {
   arrive(0);
   expect_kept(0);
   expect_kept(1);
-  EXPECT_EQ(subscriber.take_kept(target, info), ReadStatus::restarted);
+  EXPECT_EQ(subscriber.pop_buffered(target, info), ReadStatus::restarted);
   expect_kept(0);
-  EXPECT_FALSE(subscriber.take_kept(target, info));
+  EXPECT_FALSE(subscriber.pop_buffered(target, info));
   EXPECT_EQ(subscriber.lost(), 0u);
 }
 
@@ -188,7 +188,7 @@ TEST_F(SubscriberTest, TellsOfANewRingAlsoWhenTheQueueOverflows) {
   small.begin({});
   net::Subscribed message;
   ASSERT_TRUE(small.on_subscribed(message));
-  small.keep(true);
+  small.set_buffering(true);
   std::byte* out = nullptr;
   ASSERT_TRUE(small.on_sample_begin({0, {}, {}}, out));
   small.on_sample_end({0, {}, {}}, false);
@@ -199,13 +199,13 @@ TEST_F(SubscriberTest, TellsOfANewRingAlsoWhenTheQueueOverflows) {
   small.on_sample_end({0, {}, {}}, false);
   EXPECT_EQ(small.lost(), 1u);
   std::vector<std::byte> payload(16U << 20);
-  EXPECT_EQ(small.take_kept(payload, info), ReadStatus::restarted);
-  EXPECT_EQ(small.take_kept(payload, info), ReadStatus::ok);
+  EXPECT_EQ(small.pop_buffered(payload, info), ReadStatus::restarted);
+  EXPECT_EQ(small.pop_buffered(payload, info), ReadStatus::ok);
 }
 
 TEST_F(SubscriberTest, RefusesTidsThatFallAndTheOneThatHasNoSuccessor) {
   begin();
-  subscriber.keep(true);
+  subscriber.set_buffering(true);
   arrive(7);
   std::byte* out = nullptr;
   EXPECT_EQ(subscriber.on_sample_begin({7, {}, {}}, out).error().code, Errc::protocol);
@@ -222,7 +222,7 @@ TEST_F(SubscriberTest, PutsAsideTheSampleThatFillsTheTarget) {
   ASSERT_TRUE(subscriber.on_sample_begin({3, {}, {}}, out));
   EXPECT_EQ(out, target.data());
   EXPECT_TRUE(subscriber.is_filling_target());
-  out = subscriber.leave_target();
+  out = subscriber.detach_target();
   EXPECT_FALSE(subscriber.is_filling_target());
   subscriber.set_target(nullptr);
   const Tid tid = 3;
@@ -233,12 +233,12 @@ TEST_F(SubscriberTest, PutsAsideTheSampleThatFillsTheTarget) {
 
 TEST_F(SubscriberTest, ANewSubscriptionForgetsTheOldOne) {
   begin();
-  subscriber.keep(true);
+  subscriber.set_buffering(true);
   arrive(0);
   subscriber.begin({.start = Subscription::Start::oldest});
-  EXPECT_FALSE(subscriber.has_kept());
+  EXPECT_FALSE(subscriber.has_buffered());
   EXPECT_TRUE(arrive(1)) << "of the old one: thrown away";
-  EXPECT_FALSE(subscriber.has_kept());
+  EXPECT_FALSE(subscriber.has_buffered());
   subscribed(0);
   arrive(0);
   expect_kept(0);

@@ -1,0 +1,132 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/src/open_streams.hpp"
+
+#include "core/base/try.hpp"
+
+namespace dssm::detail {
+namespace {
+
+// More than the threads of a process that are inside an open at one time.
+constexpr std::size_t kMaxReplacedEarly = 1024;
+
+local::Request offer_request(const OpenStream& stream) {
+  local::Request request;
+  wire::to_message(stream.id, *request.mutable_offer()->mutable_id());
+  request.mutable_offer()->set_for_writing(stream.role == Role::writer);
+  request.mutable_offer()->set_tag(stream.tag);
+  request.mutable_offer()->set_any_host(stream.requested.host.empty());
+  return request;
+}
+
+// As dssmd sent them with the stream; readers have no doorbell.
+std::vector<int> fds_of(const SharedRing& ring, Role role) {
+  std::vector<int> fds{ring.ring_fd.get(), ring.bell_fd.get(), ring.meta_fd.get()};
+  if (role == Role::writer) fds.push_back(ring.doorbell_fd.get());
+  return fds;
+}
+
+local::Request close_request(std::uint64_t handle) {
+  local::Request request;
+  request.mutable_close()->set_handle(handle);
+  return request;
+}
+
+}  // namespace
+
+void OpenStream::supersede() const noexcept {
+  superseded->store(true, std::memory_order_release);
+  ring->bell->notify();
+}
+
+Result<void> OpenStreams::add(OpenStream& stream, const Answer& answer) {
+  {
+    const std::lock_guard guard(mutex_);
+    stream.key_ = next_key_++;
+    streams_[stream.key_] = &stream;
+    if (answer.connection == offered_to_) {  // else offer_all() has begun without this stream
+      stream.handle_ = answer.response.opened().handle();
+      if (std::erase(replaced_early_, stream.handle_) > 0) stream.supersede();
+      return {};
+    }
+  }
+  const Answer offered =
+      DSSM_TRY(connection_.call(offer_request(stream), fds_of(*stream.ring, stream.role)));
+  const std::uint64_t handle = offered.response.opened().handle();
+  {
+    const std::lock_guard guard(mutex_);
+    if (offered.connection != offered_to_) return {};
+    if (stream.handle_ == 0) {
+      stream.handle_ = handle;
+      return {};
+    }
+  }
+  connection_.post(close_request(handle), offered.connection);  // offer_all() has offered it, too
+  return {};
+}
+
+void OpenStreams::close(const OpenStream& stream) {
+  std::uint64_t handle = 0, connection = 0;
+  {
+    const std::lock_guard guard(mutex_);
+    streams_.erase(stream.key_);
+    handle = stream.handle_;
+    connection = offered_to_;
+  }
+  if (handle != 0) connection_.post(close_request(handle), connection);
+}
+
+void OpenStreams::offer_all(NewConnection& connection) {
+  std::vector<std::uint64_t> keys;
+  {
+    const std::lock_guard guard(mutex_);
+    offered_to_ = connection.number();
+    replaced_early_.clear();
+    for (const auto& [key, stream] : streams_) {
+      stream->handle_ = 0;
+      keys.push_back(key);
+    }
+  }
+  for (const std::uint64_t key : keys) offer(connection, key);
+}
+
+// Without the mutex while dssmd answers: the stream may be closed meanwhile.
+void OpenStreams::offer(NewConnection& connection, std::uint64_t key) {
+  local::Request request;
+  std::shared_ptr<const SharedRing> ring;
+  std::vector<int> fds;
+  {
+    const std::lock_guard guard(mutex_);
+    const auto entry = streams_.find(key);
+    if (entry == streams_.end()) return;
+    request = offer_request(*entry->second);
+    ring = entry->second->ring;
+    fds = fds_of(*ring, entry->second->role);
+  }
+  const auto opened = connection.exchange(std::move(request), fds);
+  std::uint64_t unused_handle = 0;
+  {
+    const std::lock_guard guard(mutex_);
+    const auto entry = streams_.find(key);
+    const bool is_open = entry != streams_.end();
+    if (!opened) {
+      // Refused: its users keep this ring; readers continue with the ring that has its name now.
+      if (is_open && opened.error().code == Errc::conflict) entry->second->supersede();
+    } else if (opened->has_opened()) {
+      (is_open ? entry->second->handle_ : unused_handle) = opened->opened().handle();
+    }
+  }
+  if (unused_handle != 0) {
+    [[maybe_unused]] const auto closed = connection.exchange(close_request(unused_handle));
+  }
+}
+
+void OpenStreams::on_replaced(std::uint64_t handle) {
+  const std::lock_guard guard(mutex_);
+  for (const auto& [key, stream] : streams_) {
+    if (stream->handle_ == handle) return stream->supersede();
+  }
+  // Its open was answered but is not added yet, or it is closed.
+  if (replaced_early_.size() < kMaxReplacedEarly) replaced_early_.push_back(handle);
+}
+
+}  // namespace dssm::detail

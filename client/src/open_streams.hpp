@@ -1,0 +1,83 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The streams that this process has open, as dssmd knows them: one handle each, on one connection.
+// A new connection begins with offering all their rings, so that a restarted dssmd has them again.
+#pragma once
+
+#include <atomic>
+#include <dssm/stream.hpp>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <vector>
+
+#include "client/src/daemon_connection.hpp"
+#include "client/src/shared_ring.hpp"
+
+namespace dssm::detail {
+
+class Client;
+
+// One stream opened by one reader or writer; closed at dssmd when destroyed.
+struct OpenStream {
+  OpenStream(std::shared_ptr<Client> opener, StreamId requested_id, StreamId stream,
+             TypeInfo payload_type, Role user_role, std::uint32_t user_tag,
+             std::shared_ptr<const SharedRing> shared)
+      : client(std::move(opener)),
+        requested(std::move(requested_id)),
+        id(std::move(stream)),
+        type(std::move(payload_type)),
+        role(user_role),
+        tag(user_tag),
+        ring(std::move(shared)) {}
+  OpenStream(const OpenStream&) = delete;
+  OpenStream& operator=(const OpenStream&) = delete;
+  ~OpenStream();
+
+  // Marks that the stream has another ring now, and wakes the readers that sleep on this one.
+  void supersede() const noexcept;
+
+  const std::shared_ptr<Client> client;
+  const StreamId requested;  // as the program named it, perhaps without host
+  const StreamId id;
+  const TypeInfo type;
+  const Role role;
+  const std::uint32_t tag;
+  const std::shared_ptr<const SharedRing> ring;
+  // Set once: the stream has another ring. Shared with the reader's ReadyFd.
+  const std::shared_ptr<std::atomic<bool>> superseded = std::make_shared<std::atomic<bool>>(false);
+
+ private:
+  friend class OpenStreams;
+  std::uint64_t key_ = 0;     // unique in OpenStreams, whose mutex guards both
+  std::uint64_t handle_ = 0;  // dssmd's, on the last connection offered to; 0: none
+};
+
+// Thread-safe; offer_all() is for the thread that connects.
+class OpenStreams {
+ public:
+  explicit OpenStreams(DaemonConnection& connection) : connection_(connection) {}
+
+  // Adds the stream that `answer` opened. If another connection was set up since that answer,
+  // offers the ring on it.
+  Result<void> add(OpenStream& stream, const Answer& answer);
+  // Removes the stream, and closes it at dssmd.
+  void close(const OpenStream& stream);
+
+  // Offers all streams on a connection that is being set up.
+  void offer_all(NewConnection& connection);
+  // dssmd has replaced the ring behind this handle.
+  void on_replaced(std::uint64_t handle);
+
+ private:
+  void offer(NewConnection& connection, std::uint64_t key);
+
+  DaemonConnection& connection_;
+  std::mutex mutex_;              // guards all that follows
+  std::uint64_t offered_to_ = 0;  // number of the last connection that offer_all() began with
+  std::uint64_t next_key_ = 1;
+  std::map<std::uint64_t, OpenStream*> streams_;  // by key
+  std::vector<std::uint64_t> replaced_early_;     // handles replaced before their add()
+};
+
+}  // namespace dssm::detail
