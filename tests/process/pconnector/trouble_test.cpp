@@ -365,7 +365,8 @@ TEST(PConnectorRequest, AWaitForAStreamThatCannotBeUsedAnyMoreIsNoLoop) {
     EXPECT_GT(connections, before) << "each time after one more attempt";
     const auto status = con.read_next(sample.span(), sample.info);
     ASSERT_FALSE(status);
-    EXPECT_NE(status.error().message.find("recreated"), std::string::npos) << status.error().message;
+    EXPECT_NE(status.error().message.find("recreated"), std::string::npos)
+        << status.error().message;
   }
 }
 
