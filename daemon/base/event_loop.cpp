@@ -4,6 +4,7 @@
 #include <event2/event.h>
 
 #include "core/base/check.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -28,9 +29,8 @@ event_base* new_base() noexcept {
 }  // namespace
 
 Result<EventLoop> EventLoop::open(TimerQueue::Time time) {
-  Result<std::unique_ptr<TimerQueue>> timers = TimerQueue::open(time);
-  if (!timers) return std::move(timers).error().context("create the event loop");
-  EventLoop loop(*std::move(timers));
+  std::unique_ptr<TimerQueue> timers = DSSM_TRY(TimerQueue::open(time), "create the event loop");
+  EventLoop loop(std::move(timers));
   if (!loop.base_) return os_error("create the event loop");
   loop.watch_timers();
   return loop;

@@ -7,6 +7,7 @@
 #include <set>
 #include <utility>
 
+#include "core/base/try.hpp"
 #include "core/wire/tcp.hpp"
 
 namespace dssm::daemon {
@@ -76,13 +77,11 @@ Result<void> NetworkListener::add(const wire::Address& address, Inherited& inher
       inherited.erase(found);
       continue;
     }
-    Result<UniqueFd> socket = wire::listen_tcp(number);
-    if (!socket) return std::move(socket).error();
-    const Result<wire::SocketAddress> bound = wire::local_address(socket->get());
-    if (!bound) return bound.error();
-    addresses_.push_back(bound->str());
+    UniqueFd socket = DSSM_TRY(wire::listen_tcp(number));
+    const wire::SocketAddress bound = DSSM_TRY(wire::local_address(socket.get()));
+    addresses_.push_back(bound.str());
     names_.emplace_back();
-    sockets_.push_back(*std::move(socket));
+    sockets_.push_back(std::move(socket));
   }
   return {};
 }

@@ -5,6 +5,8 @@
 #include <optional>
 #include <utility>
 
+#include "core/base/try.hpp"
+
 namespace dssm::daemon {
 
 Result<std::unique_ptr<SampleReceiver>> SampleReceiver::open(const EventLoop& loop,
@@ -22,10 +24,9 @@ Result<std::unique_ptr<SampleReceiver>> SampleReceiver::open(const EventLoop& lo
                      std::to_string(budget.limit()) +
                      " bytes for this address; close other connections or raise that key"};
   }
-  Result<std::shared_ptr<OwnWriter>> writer = stream.writer();
-  if (!writer) return std::move(writer).error();
+  std::shared_ptr<OwnWriter> writer = DSSM_TRY(stream.writer());
   return std::unique_ptr<SampleReceiver>(
-      new SampleReceiver(loop, link, *std::move(share), stream, *std::move(writer), publisher));
+      new SampleReceiver(loop, link, *std::move(share), stream, std::move(writer), publisher));
 }
 
 SampleReceiver::SampleReceiver(const EventLoop& loop, FrameConnection& link, MemoryShare share,

@@ -3,6 +3,8 @@
 
 #include <utility>
 
+#include "core/base/try.hpp"
+
 namespace dssm::daemon {
 namespace {
 
@@ -18,11 +20,9 @@ Result<std::shared_ptr<T>> shared(std::weak_ptr<T>& pointer, Open open) {
 }  // namespace
 
 Result<std::shared_ptr<OwnWriter>> OwnWriter::open(const Stream& stream) {
-  Result<std::shared_ptr<const ring::RingMapping>> mapping = stream.map_for_writing();
-  if (!mapping) return std::move(mapping).error();
-  Result<std::shared_ptr<ring::Bell>> bell = stream.map_bell();
-  if (!bell) return std::move(bell).error();
-  return std::shared_ptr<OwnWriter>(new OwnWriter(*std::move(mapping), *std::move(bell)));
+  std::shared_ptr<const ring::RingMapping> mapping = DSSM_TRY(stream.map_for_writing());
+  std::shared_ptr<ring::Bell> bell = DSSM_TRY(stream.map_bell());
+  return std::shared_ptr<OwnWriter>(new OwnWriter(std::move(mapping), std::move(bell)));
 }
 
 OwnWriter::OwnWriter(std::shared_ptr<const ring::RingMapping> mapping,
@@ -39,9 +39,7 @@ Result<std::shared_ptr<OwnWriter>> ServedStream::writer() {
 
 Result<void> ServedStream::assess(const ring::ClockAssessment& assessment) {
   if (!assessed_) {
-    Result<std::shared_ptr<OwnWriter>> writer = this->writer();
-    if (!writer) return std::move(writer).error();
-    assessed_ = *std::move(writer);
+    assessed_ = DSSM_TRY(this->writer());
   }
   assessed_->set_clock(assessment);
   return {};

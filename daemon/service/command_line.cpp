@@ -6,6 +6,8 @@
 #include <string>
 #include <vector>
 
+#include "core/base/try.hpp"
+
 namespace dssm::daemon {
 namespace {
 
@@ -91,9 +93,7 @@ Result<CommandLine> parse_command_line(int argc, const char* const* argv) {
                  std::string(error.what()) + "; `dssmd --help` lists the flags"};
   }
   line.action = check ? CommandLine::Action::check_config : CommandLine::Action::run;
-  if (Result<void> collected = collect(line, flags); !collected) {
-    return std::move(collected).error();
-  }
+  DSSM_TRY(collect(line, flags));
   return line;
 }
 

@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "core/base/text.hpp"
+#include "core/base/try.hpp"
 #include "core/base/unique_fd.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/service/config_values.hpp"
@@ -50,42 +51,36 @@ Result<void> set_runtime_dir(Config& config, std::string_view text) {
 // An empty text adds nothing, so that the flag can ask for an empty list.
 Result<void> add_listen_address(Config& config, std::string_view text) {
   if (text.empty()) return {};
-  Result<wire::Address> address = wire::Address::parse(text, wire::kDefaultPort, true);
-  if (!address) return std::move(address).error();
-  if (wire::resolve_number(*address).empty()) {
+  wire::Address address = DSSM_TRY(wire::Address::parse(text, wire::kDefaultPort, true));
+  if (wire::resolve_number(address).empty()) {
     return Error{Errc::invalid_argument,
                  in_quotes(text) +
                      " is a name; write the number of an address of this PC, such as "
                      "\"127.0.0.1:13776\", \"[::]:13776\" or \"0.0.0.0:13776\""};
   }
-  config.listen->push_back(*std::move(address));
+  config.listen->push_back(std::move(address));
   return {};
 }
 
 Result<void> add_peer(Config& config, std::string_view text) {
   if (text.empty()) return {};
-  Result<wire::Address> address = wire::Address::parse(text);
-  if (!address) return std::move(address).error();
-  config.peers.push_back(*std::move(address));
+  config.peers.push_back(DSSM_TRY(wire::Address::parse(text)));
   return {};
 }
 
 Result<void> set_chronyd(Config& config, std::string_view text) {
-  Result<wire::Address> address = wire::Address::parse(text, kChronydPort);
-  if (!address) return std::move(address).error();
-  if (wire::resolve_number(*address).empty()) {
+  wire::Address address = DSSM_TRY(wire::Address::parse(text, kChronydPort));
+  if (wire::resolve_number(address).empty()) {
     return Error{Errc::invalid_argument,
                  in_quotes(text) + " is a name; write a number such as \"127.0.0.1:323\""};
   }
-  config.chronyd = *std::move(address);
+  config.chronyd = std::move(address);
   return {};
 }
 
 Result<void> add_interface(std::vector<std::string>& interfaces, std::string_view text) {
   if (text.empty()) return {};
-  Result<std::string> interface = parse_interface(text);
-  if (!interface) return std::move(interface).error();
-  interfaces.push_back(*std::move(interface));
+  interfaces.push_back(DSSM_TRY(parse_interface(text)));
   return {};
 }
 
@@ -134,7 +129,7 @@ constexpr ConfigKey kKeys[] = {
      "first dot",
      ValueForm::text, at_restart<&Config::name>,
      [](Config& c, std::string_view text) -> Result<void> {
-       if (Result<void> checked = check_host_name(text); !checked) return checked;
+       DSSM_TRY(check_host_name(text));
        c.name = text;
        return {};
      }},
@@ -258,9 +253,7 @@ constexpr ConfigKey kKeys[] = {
      ValueForm::list, at_once<&Config::clocks>,
      [](Config& c, std::string_view text) -> Result<void> {
        if (text.empty()) return {};
-       Result<clock::ClockPolicies::Exception> exception = parse_clock_exception(text);
-       if (!exception) return std::move(exception).error();
-       c.clocks.exceptions.push_back(*std::move(exception));
+       c.clocks.exceptions.push_back(DSSM_TRY(parse_clock_exception(text)));
        return {};
      },
      [](Config& c) { c.clocks.exceptions.clear(); }, "clock-stream"},
@@ -315,9 +308,8 @@ Result<void> set_list(Config& config, const ConfigKey& key, const toml::node& no
   if (!node.is_array()) return text_of(node, ValueForm::list).error();
   key.clear(config);
   for (const toml::node& element : *node.as_array()) {
-    const Result<std::string> text = text_of(element, ValueForm::text);
-    if (!text) return text.error();
-    if (Result<void> set = key.set(config, *text); !set) return set;
+    const std::string text = DSSM_TRY(text_of(element, ValueForm::text));
+    DSSM_TRY(key.set(config, text));
   }
   return {};
 }
@@ -379,10 +371,9 @@ Result<void> apply_text_untrusted(Config& config, std::string_view text, const s
   if (!is_utf8(text)) {
     return Error{Errc::invalid_argument, path + ": the file is not UTF-8 text"};
   }
-  const Result<toml::table> table = parse_toml(text, path);
-  if (!table) return table.error();
+  const toml::table table = DSSM_TRY(parse_toml(text, path));
   std::vector<Mistake> mistakes;
-  for (const auto& [name, node] : *table) {
+  for (const auto& [name, node] : table) {
     const toml::source_region where = name.source();
     const auto mistake = [&](const std::string& why) {
       mistakes.push_back({where.begin.line, place(path, where) + why});
@@ -422,7 +413,7 @@ Result<void> apply_file(Config& config, const std::string& path) {
 }
 
 Result<void> finish(Config& config) {
-  if (Result<void> secure = check_secure(config); !secure) return secure;
+  DSSM_TRY(check_secure(config));
   if (!config.name.empty()) return {};
   char name[256] = {};
   if (::gethostname(name, sizeof name - 1)) return os_error("ask for the machine's name");

@@ -11,6 +11,7 @@
 #include <vector>
 
 #include "core/base/text.hpp"
+#include "core/base/try.hpp"
 #include "daemon/service/config.hpp"
 
 namespace dssm::daemon {
@@ -57,31 +58,29 @@ Error out_of_range(std::string_view text, std::uint64_t least, std::uint64_t mos
 }  // namespace
 
 Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t least, std::uint64_t most) {
-  const Result<Quantity> quantity = parse_quantity(text);
-  if (!quantity) return quantity.error();
-  if (!quantity->unit.empty()) return invalid(in_quotes(text) + " is no whole number");
-  if (quantity->number < least || quantity->number > most) {
+  const Quantity quantity = DSSM_TRY(parse_quantity(text));
+  if (!quantity.unit.empty()) return invalid(in_quotes(text) + " is not a whole number");
+  if (quantity.number < least || quantity.number > most) {
     return out_of_range(text, least, most, "");
   }
-  return quantity->number;
+  return quantity.number;
 }
 
 Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, std::uint64_t most) {
-  const Result<Quantity> quantity = parse_quantity(text);
-  if (!quantity) return quantity.error();
-  std::uint64_t bytes = quantity->number;
-  if (quantity->unit == "%") {
-    if (quantity->number > 100) return invalid(in_quotes(text) + " is more than the whole memory");
-    bytes = memory_of_the_machine() / 100 * quantity->number;
-  } else if (quantity->unit == "KiB") {
+  const Quantity quantity = DSSM_TRY(parse_quantity(text));
+  std::uint64_t bytes = quantity.number;
+  if (quantity.unit == "%") {
+    if (quantity.number > 100) return invalid(in_quotes(text) + " is more than the whole memory");
+    bytes = memory_of_the_machine() / 100 * quantity.number;
+  } else if (quantity.unit == "KiB") {
     bytes = product(bytes, 1ULL << 10);
-  } else if (quantity->unit == "MiB") {
+  } else if (quantity.unit == "MiB") {
     bytes = product(bytes, 1ULL << 20);
-  } else if (quantity->unit == "GiB") {
+  } else if (quantity.unit == "GiB") {
     bytes = product(bytes, 1ULL << 30);
-  } else if (quantity->unit == "TiB") {
+  } else if (quantity.unit == "TiB") {
     bytes = product(bytes, 1ULL << 40);
-  } else if (!quantity->unit.empty()) {
+  } else if (!quantity.unit.empty()) {
     return invalid(in_quotes(text) + " has an unknown unit; write bytes, KiB, MiB, GiB, TiB or %");
   }
   if (bytes < least || bytes > most) return out_of_range(text, least, most, " bytes");
@@ -89,14 +88,13 @@ Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, st
 }
 
 Result<Duration> parse_duration(std::string_view text, Duration least, Duration most) {
-  const Result<Quantity> quantity = parse_quantity(text);
-  if (!quantity) return quantity.error();
-  std::uint64_t ns = quantity->number;
-  if (quantity->unit == "us") {
+  const Quantity quantity = DSSM_TRY(parse_quantity(text));
+  std::uint64_t ns = quantity.number;
+  if (quantity.unit == "us") {
     ns = product(ns, 1'000);
-  } else if (quantity->unit == "ms") {
+  } else if (quantity.unit == "ms") {
     ns = product(ns, 1'000'000);
-  } else if (quantity->unit == "s") {
+  } else if (quantity.unit == "s") {
     ns = product(ns, 1'000'000'000);
   } else {
     return invalid(in_quotes(text) + " needs a unit: 'us', 'ms' or 's'");
@@ -116,7 +114,7 @@ Result<ClockPolicy> parse_clock_policy(std::string_view text) {
     if (text == name_of(policy)) return policy;
   }
   return Error{Errc::invalid_argument,
-               in_quotes(text) + " is no policy; it is \"enforce\", \"mark\" or \"off\""};
+               in_quotes(text) + " is not a policy; it is \"enforce\", \"mark\" or \"off\""};
 }
 
 Result<Duration> parse_clock_limit(std::string_view text) {
@@ -152,13 +150,12 @@ Result<clock::ClockPolicies::Exception> parse_clock_exception(std::string_view t
 }
 
 Result<clock::PartsPerBillion> parse_drift(std::string_view text) {
-  const Result<Quantity> quantity = parse_quantity(text);
-  if (!quantity) return quantity.error();
-  if (quantity->unit != "ppm") return invalid(in_quotes(text) + " needs the unit 'ppm'");
-  if (quantity->number < 1 || quantity->number > kMostDriftPpm) {
+  const Quantity quantity = DSSM_TRY(parse_quantity(text));
+  if (quantity.unit != "ppm") return invalid(in_quotes(text) + " needs the unit 'ppm'");
+  if (quantity.number < 1 || quantity.number > kMostDriftPpm) {
     return out_of_range(text, 1, kMostDriftPpm, " ppm");
   }
-  return static_cast<clock::PartsPerBillion>(quantity->number) * 1000;
+  return static_cast<clock::PartsPerBillion>(quantity.number) * 1000;
 }
 
 Result<mode_t> parse_mode(std::string_view text) {
@@ -226,7 +223,7 @@ Result<LogLevel> parse_log_level(std::string_view text) {
   if (text == "notice") return LogLevel::notice;
   if (text == "info") return LogLevel::info;
   if (text == "debug") return LogLevel::debug;
-  return invalid(in_quotes(text) + " is no level; write error, warning, notice, info or debug");
+  return invalid(in_quotes(text) + " is not a level; write error, warning, notice, info or debug");
 }
 
 std::uint64_t memory_of_the_machine() noexcept {

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/streams/description.hpp"
 
+#include "core/base/try.hpp"
 #include "core/wire/messages.hpp"
 
 namespace dssm::daemon {
@@ -39,11 +40,8 @@ void describe_all(const Registry& registry, const OpenTable& opens, std::size_t 
 }
 
 Result<std::string> property_of(const Stream& stream) {
-  Result<std::string> property = stream.property();
-  if (!property) {
-    return std::move(property).error().context("stream '" + stream.id().str() + "'");
-  }
-  if (!property->empty()) return property;
+  std::string property = DSSM_TRY(stream.property(), "stream '" + stream.id().str() + "'");
+  if (!property.empty()) return property;
   return Error{Errc::not_found, "stream '" + stream.id().str() +
                                     "' has no property set; `dssmctl property set` sets one"};
 }

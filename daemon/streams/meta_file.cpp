@@ -98,13 +98,12 @@ Result<MetaFile> MetaFile::open_untrusted(UniqueFd fd) {
 }
 
 Result<local::StreamMeta> MetaFile::read_untrusted() const {
-  const Result<MetaHeader> header = read_header_untrusted(fd_.get());
-  if (!header) return header.error();
-  if (header->length_bytes == 0) {
+  const MetaHeader header = DSSM_TRY(read_header_untrusted(fd_.get()));
+  if (header.length_bytes == 0) {
     return Error{Errc::not_found, "the stream was removed (dssmctl rm); create it again"};
   }
-  std::string content(header->length_bytes, '\0');
-  if (!read_all(fd_.get(), content.data(), content.size(), header->offset_bytes)) {
+  std::string content(header.length_bytes, '\0');
+  if (!read_all(fd_.get(), content.data(), content.size(), header.offset_bytes)) {
     return not_a_meta_file("its content cannot be read");
   }
   local::StreamMeta meta;
@@ -119,20 +118,19 @@ Result<void> MetaFile::replace(const local::StreamMeta& meta) {
                                            std::to_string(content.size()) +
                                            " bytes are too much for its meta file"};
   }
-  const Result<MetaHeader> current = read_header_untrusted(fd_.get());
-  if (!current) return current.error();
+  const MetaHeader current = DSSM_TRY(read_header_untrusted(fd_.get()));
   const bool fits_before =
-      current->offset_bytes == 0 || kPage + pages_up(content.size()) <= current->offset_bytes;
+      current.offset_bytes == 0 || kPage + pages_up(content.size()) <= current.offset_bytes;
   MetaHeader next;
-  next.offset_bytes = fits_before ? kPage : current->offset_bytes + pages_up(current->length_bytes);
+  next.offset_bytes = fits_before ? kPage : current.offset_bytes + pages_up(current.length_bytes);
   next.length_bytes = content.size();
-  if (Result<void> done = write_all(fd_.get(), content, next.offset_bytes); !done) return done;
-  if (Result<void> done = write_header(next); !done) return done;
-  if (current->offset_bytes > 0) {
+  DSSM_TRY(write_all(fd_.get(), content, next.offset_bytes));
+  DSSM_TRY(write_header(next));
+  if (current.offset_bytes > 0) {
     // Only gives memory back; without it everything is as correct.
     ::fallocate(fd_.get(), FALLOC_FL_PUNCH_HOLE | FALLOC_FL_KEEP_SIZE,
-                static_cast<off_t>(current->offset_bytes),
-                static_cast<off_t>(pages_up(current->length_bytes)));
+                static_cast<off_t>(current.offset_bytes),
+                static_cast<off_t>(pages_up(current.length_bytes)));
   }
   return {};
 }

@@ -2,6 +2,7 @@
 #include "daemon/streams/playback_clock_owner.hpp"
 
 #include "core/base/sealed_memory.hpp"
+#include "core/base/try.hpp"
 #include "core/clock/playback_record.hpp"
 #include "daemon/streams/memory_file.hpp"
 
@@ -12,9 +13,7 @@ Result<void> PlaybackClockOwner::adopt_untrusted(UniqueFd offered) {
     if (same_file(offered.get(), clock_.get())) return {};
     return Error{Errc::conflict, "another playback clock is in use by now"};
   }
-  if (Result<void> own = check_own_memory_file(offered.get(), kSizeSeals, "playback clock"); !own) {
-    return own;
-  }
+  DSSM_TRY(check_own_memory_file(offered.get(), kSizeSeals, "playback clock"));
   if (auto record = clock::PlaybackRecord::open_untrusted(offered.get()); !record) {
     return std::move(record).error();
   }
@@ -24,9 +23,7 @@ Result<void> PlaybackClockOwner::adopt_untrusted(UniqueFd offered) {
 
 Result<UniqueFd> PlaybackClockOwner::get() {
   if (!clock_) {
-    Result<UniqueFd> made = clock::create_playback_clock();
-    if (!made) return std::move(made).error();
-    take(*std::move(made));
+    take(DSSM_TRY(clock::create_playback_clock()));
   }
   return duplicate(clock_.get());
 }

@@ -15,16 +15,15 @@ Result<StreamId> Registry::own_id(StreamId id) const {
                                       "' out, or ask the dssmd of that host"};
   }
   id.host = host_;
-  if (Result<void> checked = id.check(); !checked) return std::move(checked).error();
+  DSSM_TRY(id.check());
   return id;
 }
 
 Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
-  const Result<StreamId> own = own_id(id);
-  if (!own) return own.error();
-  const auto found = by_name_.find(Key{own->name, own->id});
+  const StreamId own = DSSM_TRY(own_id(id));
+  const auto found = by_name_.find(Key{own.name, own.id});
   if (found != by_name_.end()) return found->second;
-  return Error{Errc::not_found, "there is no stream '" + own->str() +
+  return Error{Errc::not_found, "there is no stream '" + own.str() +
                                     "'; create it first (`dssmctl ls` lists those that are there)"};
 }
 
@@ -43,13 +42,10 @@ Result<RingQuota> Registry::acquire_quota() {
 
 Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& type,
                                            const History& history, std::int32_t creator_pid) {
-  const Result<StreamId> own = own_id(id);
-  if (!own) return own.error();
-  const std::string context = "stream '" + own->str() + "'";
-  if (const auto found = by_name_.find(Key{own->name, own->id}); found != by_name_.end()) {
-    if (Result<void> usable = found->second->type().check_usable_as(type); !usable) {
-      return std::move(usable).error().context(context);
-    }
+  const StreamId own = DSSM_TRY(own_id(id));
+  const std::string context = "stream '" + own.str() + "'";
+  if (const auto found = by_name_.find(Key{own.name, own.id}); found != by_name_.end()) {
+    DSSM_TRY(found->second->type().check_usable_as(type), context);
     return Created{found->second, false};
   }
   if (history.cycle <= Duration::zero()) {
@@ -58,18 +54,17 @@ Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& t
                                              " ns; give the expected time between two samples"};
   }
   DSSM_TRY(check_quota(), context);
-  Result<std::shared_ptr<Stream>> stream =
-      Stream::create({*own, type, history.depth, history.cycle, creator_pid, next_order_}, budget_);
-  if (!stream) return std::move(stream).error().context(context);
-  add(*stream);
-  return Created{*std::move(stream), true};
+  std::shared_ptr<Stream> stream = DSSM_TRY(
+      Stream::create({own, type, history.depth, history.cycle, creator_pid, next_order_}, budget_),
+      context);
+  add(stream);
+  return Created{std::move(stream), true};
 }
 
 Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, OfferedFiles files) {
-  const Result<StreamId> own = own_id(id);
-  if (!own) return own.error();
-  const std::string context = "stream '" + own->str() + "'";
-  if (const auto found = by_name_.find(Key{own->name, own->id}); found != by_name_.end()) {
+  const StreamId own = DSSM_TRY(own_id(id));
+  const std::string context = "stream '" + own.str() + "'";
+  if (const auto found = by_name_.find(Key{own.name, own.id}); found != by_name_.end()) {
     if (found->second->is_ring(files.ring.get())) {
       found->second->take_doorbell_untrusted(std::move(files.doorbell));
       return found->second;
@@ -79,13 +74,13 @@ Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, Of
                                      "reopen the stream"};
   }
   DSSM_TRY(check_quota(), context);
-  Result<std::shared_ptr<Stream>> stream = Stream::adopt_untrusted(std::move(files), budget_);
-  if (!stream) return std::move(stream).error().context(context);
-  if ((*stream)->id() != *own) {
+  std::shared_ptr<Stream> stream =
+      DSSM_TRY(Stream::adopt_untrusted(std::move(files), budget_), context);
+  if (stream->id() != own) {
     return Error{Errc::protocol,
-                 context + ": the offered ring is that of '" + (*stream)->id().str() + "'"};
+                 context + ": the offered ring is that of '" + stream->id().str() + "'"};
   }
-  return add_adopted(*std::move(stream));
+  return add_adopted(std::move(stream));
 }
 
 Result<std::shared_ptr<Stream>> Registry::adopt_stored_untrusted(OfferedFiles files) {
@@ -111,12 +106,8 @@ Result<std::shared_ptr<Stream>> Registry::add_adopted(std::shared_ptr<Stream> st
 }
 
 Result<void> Registry::remove(const StreamId& id) {
-  const Result<std::shared_ptr<Stream>> found = find(id);
-  if (!found) return found.error();
-  const std::shared_ptr<Stream> stream = *found;
-  if (Result<void> marked = stream->mark_removed(); !marked) {
-    return std::move(marked).error().context("stream '" + stream->id().str() + "'");
-  }
+  const std::shared_ptr<Stream> stream = DSSM_TRY(find(id));
+  DSSM_TRY(stream->mark_removed(), "stream '" + stream->id().str() + "'");
   by_name_.erase(Key{stream->id().name, stream->id().id});
   in_order_.erase(std::find(in_order_.begin(), in_order_.end(), stream));
   for (StreamObserver* observer : observers_) observer->on_stream_removed(*stream);
@@ -124,9 +115,8 @@ Result<void> Registry::remove(const StreamId& id) {
 }
 
 Result<void> Registry::set_property(const StreamId& id, std::string_view property) {
-  const Result<std::shared_ptr<Stream>> stream = find(id);
-  if (!stream) return stream.error();
-  const std::string context = "stream '" + (*stream)->id().str() + "'";
+  const std::shared_ptr<Stream> stream = DSSM_TRY(find(id));
+  const std::string context = "stream '" + stream->id().str() + "'";
   if (property.size() > limits_.max_property_bytes) {
     return Error{
         Errc::limit_exceeded,
@@ -134,9 +124,7 @@ Result<void> Registry::set_property(const StreamId& id, std::string_view propert
             " bytes is longer than max_property = " + std::to_string(limits_.max_property_bytes) +
             " bytes; shorten it or raise the key max_property"};
   }
-  if (Result<void> set = (*stream)->set_property(property, budget_); !set) {
-    return std::move(set).error().context(context);
-  }
+  DSSM_TRY(stream->set_property(property, budget_), context);
   return {};
 }
 

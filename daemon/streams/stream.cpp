@@ -10,6 +10,7 @@
 #include <cerrno>
 
 #include "core/base/sealed_memory.hpp"
+#include "core/base/try.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "core/wire/local_protocol.hpp"
@@ -69,25 +70,23 @@ Result<MemoryShare> take_share(MemoryBudget& budget, const TypeInfo& type,
 // The plan that `meta` and the ring agree on.
 Result<Stream::Plan> plan_untrusted(const local::StreamMeta& meta,
                                     const ring::RingMapping& mapping) {
-  const Result<StreamId> id = wire::stream_id_untrusted(meta.id());
-  if (!id) return id.error();
-  const Result<TypeInfo> type = wire::type_untrusted(meta.type());
-  if (!type) return type.error();
+  const StreamId id = DSSM_TRY(wire::stream_id_untrusted(meta.id()));
+  const TypeInfo type = DSSM_TRY(wire::type_untrusted(meta.type()));
   const ring::RingIdentity& ring = mapping.identity();
-  if (*id != ring.id || type->payload_bytes != mapping.geometry().payload_bytes ||
-      type->alignment_bytes != ring.alignment_bytes) {
-    return Error{Errc::protocol, "the offered meta file describes '" + id->str() + "' with " +
-                                     type->str() + ", the offered ring is that of '" +
+  if (id != ring.id || type.payload_bytes != mapping.geometry().payload_bytes ||
+      type.alignment_bytes != ring.alignment_bytes) {
+    return Error{Errc::protocol, "the offered meta file describes '" + id.str() + "' with " +
+                                     type.str() + ", the offered ring is that of '" +
                                      ring.id.str() + "' with " +
                                      std::to_string(mapping.geometry().payload_bytes) + " bytes"};
   }
   if (!local::StreamMeta::Purpose_IsValid(meta.purpose())) {
-    return Error{Errc::protocol, "the offered ring of '" + id->str() +
+    return Error{Errc::protocol, "the offered ring of '" + id.str() +
                                      "' has a purpose that this dssmd does not know; install the "
                                      "newer version of DSSM again"};
   }
-  return Stream::Plan{*id,
-                      *type,
+  return Stream::Plan{id,
+                      type,
                       mapping.geometry().depth,
                       ring.cycle,
                       meta.creator_pid(),
@@ -121,60 +120,43 @@ void fill_figures(const ring::RingMapping& mapping, StreamInfo& info) {
 }  // namespace
 
 Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& budget) {
-  const Result<ring::Geometry> geometry = ring::Geometry::of(plan.type.payload_bytes, plan.depth);
-  if (!geometry) return geometry.error();
-  Result<MemoryShare> share = take_share(budget, plan.type, *geometry);
-  if (!share) return std::move(share).error();
-  const Result<std::uint64_t> incarnation =
-      plan.incarnation != 0 ? Result(plan.incarnation) : new_incarnation();
-  if (!incarnation) return incarnation.error();
-  Result<UniqueFd> ring =
-      ring::create_ring({plan.id, *incarnation, plan.cycle, plan.type.alignment_bytes}, *geometry);
-  if (!ring) return std::move(ring).error();
-  Result<UniqueFd> bell = ring::create_bell();
-  if (!bell) return std::move(bell).error();
-  Result<UniqueFd> doorbell = create_doorbell();
-  if (!doorbell) return std::move(doorbell).error();
+  const ring::Geometry geometry = DSSM_TRY(ring::Geometry::of(plan.type.payload_bytes, plan.depth));
+  MemoryShare share = DSSM_TRY(take_share(budget, plan.type, geometry));
+  const std::uint64_t incarnation =
+      DSSM_TRY(plan.incarnation != 0 ? Result(plan.incarnation) : new_incarnation());
+  UniqueFd ring = DSSM_TRY(
+      ring::create_ring({plan.id, incarnation, plan.cycle, plan.type.alignment_bytes}, geometry));
+  UniqueFd bell = DSSM_TRY(ring::create_bell());
+  UniqueFd doorbell = DSSM_TRY(create_doorbell());
   std::vector<UniqueFd> doorbells;
-  doorbells.push_back(*std::move(doorbell));
-  Result<MetaFile> meta = MetaFile::create(meta_of(plan, {}));
-  if (!meta) return std::move(meta).error();
-  auto mapping = ring::RingMapping::open_untrusted(ring->get(), ring::Access::read_only);
+  doorbells.push_back(std::move(doorbell));
+  MetaFile meta = DSSM_TRY(MetaFile::create(meta_of(plan, {})));
+  auto mapping = ring::RingMapping::open_untrusted(ring.get(), ring::Access::read_only);
   if (!mapping) return std::move(mapping).error();
   return std::shared_ptr<Stream>(
-      new Stream(plan, Files{*std::move(ring), *std::move(bell), std::move(doorbells)},
-                 *std::move(meta), *std::move(mapping), *std::move(share)));
+      new Stream(plan, Files{std::move(ring), std::move(bell), std::move(doorbells)},
+                 std::move(meta), *std::move(mapping), std::move(share)));
 }
 
 Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, MemoryBudget& budget) {
-  if (Result<void> own = check_own_memory_file(files.ring.get(), kSizeSeals, "ring"); !own) {
-    return std::move(own).error();
-  }
-  if (Result<void> own = check_own_memory_file(files.bell.get(), kSizeSeals, "bell"); !own) {
-    return std::move(own).error();
-  }
+  DSSM_TRY(check_own_memory_file(files.ring.get(), kSizeSeals, "ring"));
+  DSSM_TRY(check_own_memory_file(files.bell.get(), kSizeSeals, "bell"));
   auto mapping = ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_only);
   if (!mapping) return std::move(mapping).error();
   if (auto bell = ring::Bell::open_untrusted(files.bell.get()); !bell) {
     return std::move(bell).error();
   }
-  Result<MetaFile> meta = MetaFile::open_untrusted(std::move(files.meta));
-  if (!meta) return std::move(meta).error();
-  const Result<local::StreamMeta> content = meta->read_untrusted();
-  if (!content) return content.error();
-  Result<Plan> plan = plan_untrusted(*content, **mapping);
-  if (!plan) return std::move(plan).error();
-  Result<MemoryShare> share = take_share(budget, plan->type, (*mapping)->geometry());
-  if (!share) return std::move(share).error();
-  Result<MemoryShare> property_share = budget.take(content->property().size());
-  if (!property_share) return std::move(property_share).error();
+  MetaFile meta = DSSM_TRY(MetaFile::open_untrusted(std::move(files.meta)));
+  const local::StreamMeta content = DSSM_TRY(meta.read_untrusted());
+  Plan plan = DSSM_TRY(plan_untrusted(content, **mapping));
+  MemoryShare share = DSSM_TRY(take_share(budget, plan.type, (*mapping)->geometry()));
+  MemoryShare property_share = DSSM_TRY(budget.take(content.property().size()));
   // Always a new one: writers get a descriptor that does not depend on the client's.
-  Result<UniqueFd> ring = reopen_read_write(files.ring.get());
-  if (!ring) return std::move(ring).error();
+  UniqueFd ring = DSSM_TRY(reopen_read_write(files.ring.get()));
   std::shared_ptr<Stream> stream(
-      new Stream(*std::move(plan), Files{*std::move(ring), std::move(files.bell), {}},
-                 *std::move(meta), *std::move(mapping), *std::move(share)));
-  stream->property_share_ = *std::move(property_share);
+      new Stream(std::move(plan), Files{std::move(ring), std::move(files.bell), {}},
+                 std::move(meta), *std::move(mapping), std::move(share)));
+  stream->property_share_ = std::move(property_share);
   stream->take_doorbell_untrusted(std::move(files.doorbell));
   return stream;
 }
@@ -196,9 +178,7 @@ StreamInfo Stream::info() const {
 
 Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role) {
   if (role == Role::writer && files_.doorbells.empty()) {
-    Result<UniqueFd> made = create_doorbell();
-    if (!made) return std::move(made).error();
-    add_doorbell(*std::move(made));
+    add_doorbell(DSSM_TRY(create_doorbell()));
   }
   Result<UniqueFd> all[] = {
       role == Role::writer ? duplicate(files_.ring.get()) : reopen_read_only(files_.ring.get()),
@@ -266,24 +246,22 @@ void Stream::observe_doorbells(DoorbellObserver* observer) {
 }
 
 Result<void> Stream::mark_removed() {
-  if (Result<void> marked = meta_.mark_removed(); !marked) return marked;
+  DSSM_TRY(meta_.mark_removed());
   removed_ = true;
   return {};
 }
 
 Result<std::string> Stream::property() const {
   // Kept only in the meta file: dssmd's own memory stays small.
-  Result<local::StreamMeta> meta = meta_.read_untrusted();
-  if (!meta) return std::move(meta).error();
-  return std::move(*meta->mutable_property());
+  local::StreamMeta meta = DSSM_TRY(meta_.read_untrusted());
+  return std::move(*meta.mutable_property());
 }
 
 Result<void> Stream::set_property(std::string_view property, MemoryBudget& budget) {
   // Old and new one exist side by side for a moment, so the new share is taken first.
-  Result<MemoryShare> share = budget.take(property.size());
-  if (!share) return std::move(share).error();
-  if (Result<void> done = meta_.replace(meta_of(plan_, property)); !done) return done;
-  property_share_ = *std::move(share);
+  MemoryShare share = DSSM_TRY(budget.take(property.size()));
+  DSSM_TRY(meta_.replace(meta_of(plan_, property)));
+  property_share_ = std::move(share);
   return {};
 }
 
