@@ -138,7 +138,7 @@ int main() {
     }
     ours.push_back(static_cast<double>(now_ns() - start) / 2);
   }
-  print_pair("hand over a cache line", "hand 64 B to a spinning reader",
+  print_pair("pass a cache line", "pass 64 B to a spinning reader",
              {figures_of(std::move(raw)), figures_of(std::move(ours))}, "<= 2");
   ::waitpid(pid, nullptr, 0);
 }

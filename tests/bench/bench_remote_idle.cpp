@@ -45,7 +45,7 @@ int main() {
   ::sleep(kSeconds);
   const double owner_rate = static_cast<double>(sleeps(owner->pid()) - owner_before) / kSeconds;
   const double other_rate = static_cast<double>(sleeps(other->pid()) - other_before) / kSeconds;
-  std::printf("100 remote streams, nobody writing       wake-ups a second  heartbeats\n");
+  std::printf("100 remote streams, without writers      wake-ups a second  heartbeats\n");
   std::printf("  owner: a Ping a second arrives         %17.1f  1\n", owner_rate);
   std::printf("  mirrors: sends it, and gets the Pong   %17.1f  2\n", other_rate);
 }

@@ -165,11 +165,12 @@ void bench_large(const Hosts& hosts, const std::string& address, Session& sessio
   print_row("  raw TCP [MB/s]" + tail, raw_figures);
   print_row("one channel [MB/s]" + tail, our_figures, rest);
   print_row("  raw TCP that never sleeps [MB/s]" + tail, awake_figures);
-  std::printf("%-44s %47.2f\n", "  one channel beside that",
+  std::printf("%-44s %47.2f\n", "  one channel compared with that",
               our_figures.median / awake_figures.median);
   print_receiver_copies(connector.counters(), bytes);
   print_row("PConnector::post [MB/s]" + tail, posted_figures);
-  std::printf("%-44s %47.2f\n", "  beside raw TCP", posted_figures.median / raw_figures.median);
+  std::printf("%-44s %47.2f\n", "  compared with raw TCP",
+              posted_figures.median / raw_figures.median);
   session.remove(id).value();
 }
 

@@ -23,8 +23,8 @@ constexpr int kQuestions = 1 << 16;
 std::shared_ptr<const ring::RingMapping> ring_of(Session& session, const StreamId& id) {
   const std::string wanted = "dssm-ring:" + session.stream_info(id).value().id.str();
   for (const auto& entry : std::filesystem::directory_iterator("/proc/self/fd")) {
-    std::error_code gone;
-    const std::string target = std::filesystem::read_symlink(entry, gone).string();
+    std::error_code error;
+    const std::string target = std::filesystem::read_symlink(entry, error).string();
     if (target.find(wanted) == std::string::npos) continue;
     const int fd = std::stoi(entry.path().filename().string());
     auto mapping = ring::RingMapping::open_untrusted(fd, ring::Access::read_only);
@@ -70,10 +70,10 @@ void shape(Session& session, const std::string& name, std::uint64_t depth, Durat
   std::size_t raw_at = 0, our_at = 0;
   SampleInfo info;
   const auto touch = [&] {
-    const Tid told = places[raw_at++ % kQuestions];
-    const std::int64_t time_ns = slots.time_ns(told).load(std::memory_order_relaxed);
+    const Tid known = places[raw_at++ % kQuestions];
+    const std::int64_t time_ns = slots.time_ns(known).load(std::memory_order_relaxed);
     // The tid depends on the time, as in a search; the difference is always 0.
-    const Tid tid = told + (time_ns < 0 ? 1 : 0);
+    const Tid tid = known + (time_ns < 0 ? 1 : 0);
     if (raw_reader.read(tid, payload, info) != ReadStatus::ok) std::abort();
     keep(payload);
   };

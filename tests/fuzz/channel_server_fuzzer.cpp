@@ -30,8 +30,8 @@ class SilentLogger final : public Logger {
 struct Peer {
   std::string input;
   std::size_t cut = 1;  // bytes of one receive
-  std::size_t room = 1U << 20;
-  bool gone = false;
+  std::size_t space = 1U << 20;
+  bool closed = false;
   bool closed = false;
 };
 
@@ -44,13 +44,13 @@ class PeerTransport final : public wire::Transport {
   Result<wire::IoResult> send(std::span<const iovec> parts, bool) override {
     std::size_t bytes = 0;
     for (const iovec& part : parts) bytes += part.iov_len;
-    bytes = std::min(bytes, peer_.room);
-    peer_.room -= bytes;
+    bytes = std::min(bytes, peer_.space);
+    peer_.space -= bytes;
     return wire::IoResult{bytes > 0 ? wire::IoStatus::ok : wire::IoStatus::would_block, bytes};
   }
   Result<wire::IoResult> receive(std::span<const iovec> spaces) override {
     if (peer_.input.empty()) {
-      return wire::IoResult{peer_.gone ? wire::IoStatus::end : wire::IoStatus::would_block, 0};
+      return wire::IoResult{peer_.closed ? wire::IoStatus::end : wire::IoStatus::would_block, 0};
     }
     const std::size_t bytes = std::min({peer_.input.size(), peer_.cut, spaces[0].iov_len});
     std::memcpy(spaces[0].iov_base, peer_.input.data(), bytes);
@@ -130,15 +130,15 @@ void run(std::span<const std::uint8_t> input) {
   }
   const auto step = [&] {
     program.write(payload, {}, Duration(1));
-    fuzzed.room = input[2] * 100U;
-    watcher.room = 1U << 20;
+    fuzzed.space = input[2] * 100U;
+    watcher.space = 1U << 20;
     turn(*loop);
   };
   for (int i = 0; i < 2000 && !fuzzed.closed && !fuzzed.input.empty(); ++i) step();
-  fuzzed.gone = true;
+  fuzzed.closed = true;
   fuzzed.input.clear();
   for (int i = 0; i < 2000 && !fuzzed.closed; ++i) {
-    fuzzed.room = 1U << 20;
+    fuzzed.space = 1U << 20;
     turn(*loop);
   }
   // This connection is closed, and the other one is not.

@@ -90,8 +90,8 @@ class LateFleet final : public Fleet {
     const Result<std::shared_ptr<Stream>> old = pc2_.find(there);
     if (!old || !pc2_.remove(there)) return;
     if (observer_) observer_->on_remote_stream_removed(there);
-    if (const auto anew = ring(id); anew && observer_) {
-      observer_->on_remote_stream_added((*anew)->info());
+    if (const auto replaced = ring(id); replaced && observer_) {
+      observer_->on_remote_stream_added((*replaced)->info());
     }
     if (observer_) observer_->on_ring_replaced(**old);
   }

@@ -323,7 +323,7 @@ def expect_true(truth: Truth) -> None:
     unnoticed = [(each.came - step) / 1e6 for each in wrong for step in truth.watched[each.reader].steps
                  if 0 <= each.came - step < NOTICE_NS]
     if unnoticed:
-        print(f"  | on the PC whose clock was set, {len(unnoticed)} statements were wrong before its dssmd knew, the"
+        print(f"  | on the PC whose clock was set, {len(unnoticed)} statements were wrong before its dssmd noticed, the"
               f" last one {max(unnoticed):.1f} ms after that", flush=True)
     wrong = [each for each in wrong if not any(0 <= each.came - step < NOTICE_NS
                                                for step in truth.watched[each.reader].steps)]

@@ -61,9 +61,9 @@ LoadWriter::LoadWriter(Session session, const std::vector<KnownStream>& streams,
 void LoadWriter::write_until(const std::atomic<bool>& stop) {
   const MonoTime begin = MonoClock::now();
   while (!stop) {
-    const Duration gone = MonoClock::now() - begin;
+    const Duration elapsed = MonoClock::now() - begin;
     for (Written& stream : streams_) {
-      const auto due = static_cast<std::uint64_t>(gone / stream.known.cycle);
+      const auto due = static_cast<std::uint64_t>(elapsed / stream.known.cycle);
       while (stream.written < due) stream.write_next();
     }
     std::this_thread::sleep_for(1ms);  // the load's rate, not a wait for anything

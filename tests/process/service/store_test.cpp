@@ -112,8 +112,8 @@ TEST(DescriptorStore, LetsProgramsGiveBackStreamsThatTheStoreLost) {
 TEST(DescriptorStore, DoesNotRecoverARemovedStream) {
   ServiceManager manager(without_network());
   Session session = connect_to(manager.socket_path());
-  session.create<int>("gone", kShort).value();
-  ASSERT_TRUE(session.remove({"gone", 0, ""}));
+  session.create<int>("removed", kShort).value();
+  ASSERT_TRUE(session.remove({"removed", 0, ""}));
   manager.kill_hard();
   manager.start();
   EXPECT_EQ(stream_names(session), std::vector<std::string>());
