@@ -31,7 +31,7 @@ struct Peer {
   std::string input;
   std::size_t cut = 1;  // bytes of one receive
   std::size_t space = 1U << 20;
-  bool closed = false;
+  bool input_ended = false;
   bool closed = false;
 };
 
@@ -50,7 +50,8 @@ class PeerTransport final : public wire::Transport {
   }
   Result<wire::IoResult> receive(std::span<const iovec> spaces) override {
     if (peer_.input.empty()) {
-      return wire::IoResult{peer_.closed ? wire::IoStatus::end : wire::IoStatus::would_block, 0};
+      return wire::IoResult{peer_.input_ended ? wire::IoStatus::end : wire::IoStatus::would_block,
+                            0};
     }
     const std::size_t bytes = std::min({peer_.input.size(), peer_.cut, spaces[0].iov_len});
     std::memcpy(spaces[0].iov_base, peer_.input.data(), bytes);
@@ -135,7 +136,7 @@ void run(std::span<const std::uint8_t> input) {
     turn(*loop);
   };
   for (int i = 0; i < 2000 && !fuzzed.closed && !fuzzed.input.empty(); ++i) step();
-  fuzzed.closed = true;
+  fuzzed.input_ended = true;
   fuzzed.input.clear();
   for (int i = 0; i < 2000 && !fuzzed.closed; ++i) {
     fuzzed.space = 1U << 20;
