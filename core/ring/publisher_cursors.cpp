@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A process that is killed has done all that is before some instruction and nothing behind it, so
-// the order in the program is what counts. The stores are releases so that the compiler keeps it,
-// and so that who reads without the lock while another process takes a cursor back sees it, too.
+// A process that is killed has executed everything before some instruction and nothing after it, so
+// the order in the program decides. The stores are releases so that the compiler keeps that order,
+// and so that a reader without the lock sees it while another process restores a cursor.
 #include "core/ring/publisher_cursors.hpp"
 
 #include <algorithm>

@@ -43,7 +43,7 @@ Result<void> reserve(int fd, const Geometry& geometry);
 // process. Unmapped by the destructor.
 class RingMapping {
  public:
-  // Maps the ring behind `fd` after checking that it is one: a sealed memfd, magic and layout
+  // Maps the ring in the file `fd` after a check that it is one: a sealed memfd, magic and layout
   // version, and a geometry that follows from payload size and depth and fits the file's size.
   // Does not keep `fd`.
   //   fails  protocol (not a ring, or another layout version; the message says which), os errors

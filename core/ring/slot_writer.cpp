@@ -65,9 +65,9 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
   header_->top.store(tid, std::memory_order_seq_cst);
 }
 
-// With the sample that it did not finish the dead writer may have begun a run, crossed a gap, or
-// noted its publisher. Its slot needs no repair: it is outside of the window, and the next sample
-// of that tid fills it anew.
+// With the sample that it did not publish, the dead writer may have begun a run, crossed a gap, or
+// advanced a cursor. The slot needs no repair: it is outside of the window, and the next sample with
+// that tid overwrites it.
 void SlotWriter::recover() const noexcept {
   const Tid top = header_->top.load(std::memory_order_relaxed);
   const Tid run_start = top < 0 ? 0 : slots_.slot(top).run_start.load(std::memory_order_relaxed);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Addresses as people write them. What is plainly wrong is refused here with words, where
-// getaddrinfo would say "Name or service not known" after some seconds, or, for "10.1", take
-// something that nobody meant.
+// Addresses as people write them. An address that is clearly wrong is refused here with a helpful
+// message; getaddrinfo() would fail with "Name or service not known" after some seconds, or, for
+// "10.1", return an address that was not meant.
 #include "core/wire/address.hpp"
 
 #include <arpa/inet.h>

@@ -40,7 +40,7 @@ struct SocketAddress {
   bool is_loopback() const noexcept;  // 127.0.0.0/8, ::1, ::ffff:127.0.0.0/104
 };
 
-// The addresses behind `address`: at once for numbers; names are looked up (getaddrinfo), which may
+// The addresses of `address`: at once for numbers; names are resolved (getaddrinfo), which may
 // take seconds, so dssmd does it in a thread of its own. In the system's order of preference.
 //   fails  not_found (no such host), system
 Result<std::vector<SocketAddress>> resolve(const Address& address);

@@ -115,7 +115,7 @@ class FrameDecoder {
   enum class Stage : unsigned char {
     head,     // a frame's length and, if it is a sample, all that comes before the payload
     payload,  // payload_left_ bytes of a sample's payload
-    trailer,  // trailer_left_ bytes behind it
+    trailer,  // trailer_left_ bytes after it
     whole,    // whole_left_ bytes of a frame that is collected
   };
 

@@ -63,20 +63,20 @@ Error other_protocol_version(const std::string& who, std::uint32_t theirs,
                              const std::string& software = {});
 
 // This PC's id for a dssmd that calls its host `name`: from the machine id (machine-id(5)), which
-// is not told to others, and the name, so that several dssmd with different names on one machine
-// are different hosts. Without a machine id: random, and so different after each start.
+// does not leave this PC, and the name, so that several dssmd with different names on one machine are
+// different hosts. Without a machine id it is random, and so different after each start.
 HostId host_id_for(std::string_view name);
 
 // Random and never 0.
 std::uint64_t random_number();
 
-// What we say of our own clock at this moment; nothing when nothing is known.
+// Writes the current report on this PC's clock; nothing when there is none.
 void send_clock(const Greeting& self, proto::ClockStatus& out);
 
-// What a Pong that nobody asked for says of its sender's clock.
+// The report on its sender's clock in a Pong that is an event.
 std::shared_ptr<const ClockReport> clock_report_untrusted(const net::Pong& pong);
 
-// How far the host behind the greeting says that its clock may be off: its bound, aged until now.
+// The clock bound of the host that sent the greeting, as of now.
 Duration clock_bound_of(const Greeting& greeting) noexcept;
 
 }  // namespace dssm::wire

@@ -23,7 +23,7 @@ std::size_t encode_sample_header(std::array<std::byte, kMaxSampleHeaderBytes>& o
                                  std::uint64_t serial, const SampleInfo& info,
                                  std::size_t payload_bytes, Trailer trailer) noexcept;
 
-// The field `torn`, to be sent right behind the payload.
+// The field `torn`, to be sent directly after the payload.
 std::array<std::byte, kTornTrailerBytes> torn_trailer(bool torn) noexcept;
 
 }  // namespace dssm::wire

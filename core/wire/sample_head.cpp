@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Our order of fields is: serial or nothing, sample, payload, and at most `torn` behind it. Within
-// the sample any order of the three stamps is taken, and any of them may be missing (protobuf
-// leaves out zeros). What is anything else, or merely odd, is left to protobuf.
+// Our order of fields is: serial or nothing, sample, payload, and at most `torn` after it. Within
+// the sample any order of the three stamps is accepted, and any of them may be missing (protobuf
+// leaves out zeros). Protobuf's own parser decodes everything else.
 #include "core/wire/sample_head.hpp"
 
 #include <algorithm>

@@ -13,7 +13,7 @@ inline constexpr unsigned kMaxLengthBytes =
     5;  // of a frame's or a field's length: 32 bits and more
 inline constexpr unsigned kMaxVarintBytes = 10;  // of any 64-bit value
 
-// Writes `value` at `out`; returns the place behind it.
+// Writes `value` at `out`; returns the place after it.
 inline std::byte* write_varint(std::byte* out, std::uint64_t value) noexcept {
   for (; value >= 0x80; value >>= 7) *out++ = static_cast<std::byte>(value | 0x80);
   *out++ = static_cast<std::byte>(value);
@@ -32,7 +32,7 @@ enum class VarintStatus : unsigned char {
   too_long,  // more than max_bytes
 };
 
-// Reads one from [at, end) and moves `at` behind it; on failure `at` stays.
+// Reads one from [at, end) and moves `at` past it; on failure `at` is unchanged.
 inline VarintStatus read_varint(const std::byte*& at, const std::byte* end, unsigned max_bytes,
                                 std::uint64_t& value) noexcept {
   std::uint64_t result = 0;
