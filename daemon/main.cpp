@@ -85,10 +85,10 @@ PeerTable::Limits peer_limits(const Config& config) {
 std::string status_text(const Registry& registry, const Peers& peers, const FleetClock& clock,
                         const NetworkListener& network) {
   std::size_t up = 0, known = 0;
-  for (const local::Host& host : peers.hosts()) {
-    if (host.state() == "self") continue;
+  for (const local::Host& host : peers.report().hosts()) {
+    if (host.state() == local::Host::SELF) continue;
     ++known;
-    if (host.state() == "up") ++up;
+    if (host.state() == local::Host::UP) ++up;
   }
   return fmt::format("host '{}', {} streams, {} of {} other hosts up, {}, {}", registry.host(),
                      registry.streams().size(), up, known, clock.str(), network.str());

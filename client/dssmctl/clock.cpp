@@ -19,9 +19,11 @@
 namespace dssm::ctl {
 namespace {
 
-constexpr Duration kReadingPeriod = std::chrono::seconds(1);  // as often as hosts tell
+constexpr Duration kReadingPeriod = std::chrono::seconds(1);  // as often as hosts send their clocks
 
-bool is_there(const HostInfo& host) { return host.state == "self" || host.state == "up"; }
+bool is_there(const HostInfo& host) {
+  return host.state == HostState::self || host.state == HostState::up;
+}
 
 bool is_good(const ClockInfo& clock) {
   return clock.status == ClockStatus::synchronized || clock.status == ClockStatus::holdover;
@@ -63,7 +65,7 @@ std::vector<std::string> clock_row(const HostInfo& host) {
 Json clock_json(const HostInfo& host) {
   Json json;
   json["host"] = host.name;
-  json["state"] = host.state;
+  json["state"] = name_of(host.state);
   const ClockInfo clock = host.clock.value_or(ClockInfo());
   json["status"] = name_of(clock.status);
   json["trouble"] = clock.reason == ClockReason::none ? Json() : Json(name_of(clock.reason));
@@ -101,23 +103,23 @@ void print_clocks(const std::vector<HostInfo>& hosts, bool json, Output& out) {
   table.print(out);
 }
 
-// False when told to stop before.
+// False when a stop signal came before.
 bool wait_a_period(MonoTime until) {
   while (MonoClock::now() < until) {
     if (stop_requested()) return false;
-    std::this_thread::sleep_for(std::min(until - MonoClock::now(), kStopLookUp));
+    std::this_thread::sleep_for(std::min(until - MonoClock::now(), kStopCheckPeriod));
   }
   return !stop_requested();
 }
 
-Result<void> watch_clocks(Session& session, const Options& options, Output& out) {
+Result<void> watch_clocks(Session& session, const ClockOptions& options, Output& out) {
   catch_stop_signals();
   for (MonoTime next = MonoClock::now();; next += kReadingPeriod) {
     const Result<std::vector<HostInfo>> hosts = session.list_hosts();
     if (!hosts) return hosts.error();
     print_clocks(*hosts, options.json, out);
     if (!options.json) out.add("\n");
-    if (!out.flush() || out.reader_gone() || !wait_a_period(next + kReadingPeriod)) return {};
+    if (!out.flush() || out.reader_ended() || !wait_a_period(next + kReadingPeriod)) return {};
   }
 }
 
@@ -172,7 +174,7 @@ void print_table(const std::map<std::string, Readings>& all, bool json, Output& 
   }
 }
 
-Result<void> tabulate_clocks(Session& session, const Options& options, Output& out) {
+Result<void> tabulate_clocks(Session& session, const ClockOptions& options, Output& out) {
   catch_stop_signals();
   const std::uint64_t count = *options.table;
   std::map<std::string, Readings> all;
@@ -196,10 +198,10 @@ Result<void> tabulate_clocks(Session& session, const Options& options, Output& o
   return {};
 }
 
-// Until this host's clock is good enough; says so, or why it is not.
-Result<void> await_clock(Session& session, const Options& options, Output& out) {
+// Waits until this host's clock is good enough; prints it, or fails with the reason.
+Result<void> await_clock(Session& session, const ClockOptions& options, Output& out) {
   catch_stop_signals();
-  const MonoTime deadline = deadline_in(*options.clock_wait);
+  const MonoTime deadline = deadline_in(*options.wait);
   for (;;) {
     const Result<std::vector<HostInfo>> hosts = session.list_hosts();
     if (!hosts) return hosts.error();
@@ -209,21 +211,21 @@ Result<void> await_clock(Session& session, const Options& options, Output& out) 
       return {};
     }
     const MonoTime now = MonoClock::now();
-    if (now >= deadline || !wait_a_period(std::min(deadline, now + kStopLookUp))) {
+    if (now >= deadline || !wait_a_period(std::min(deadline, now + kStopCheckPeriod))) {
       return Error{Errc::clock_out_of_bounds,
                    "the clock of this host is " +
                        (self.clock ? status_text(*self.clock) : "not watched") +
-                       "; look at `chronyc tracking` and `systemctl status chrony`"};
+                       "; see `chronyc tracking` and `systemctl status chrony`"};
     }
   }
 }
 
 }  // namespace
 
-Result<void> run_clock(const Options& options, Output& out) {
+Result<void> run(const ClockOptions& options, Output& out) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
-  if (options.clock_wait) return await_clock(*session, options, out);
+  if (options.wait) return await_clock(*session, options, out);
   if (options.table) return tabulate_clocks(*session, options, out);
   if (options.watch) return watch_clocks(*session, options, out);
   const Result<std::vector<HostInfo>> hosts = session->list_hosts();

@@ -14,10 +14,10 @@ void Clocks::add(const SampleInfo& info) {
 void Clocks::update(const std::vector<HostInfo>& hosts, std::string_view owner) {
   owner_bound_ = kUnknownClockError;  // a host that is not up says nothing about its clock
   for (const HostInfo& host : hosts) {
-    if (host.state == "self") {
+    if (host.state == HostState::self) {
       two_clocks_ = host.name != owner;
       own_bound_ = host.clock_bound;
-    } else if (host.state == "up" && host.name == owner) {
+    } else if (host.state == HostState::up && host.name == owner) {
       owner_bound_ = host.clock_bound;
     }
   }

@@ -11,7 +11,7 @@
 namespace dssm::ctl {
 namespace {
 
-// The cycle of a stream for which nobody named one; only tools look at it.
+// The cycle of a stream when --cycle is not given; only tools use it.
 constexpr Duration kDefaultCycle = std::chrono::milliseconds(100);
 
 // A C++ type's size is a multiple of its alignment, so the greatest power of two in the size is
@@ -21,14 +21,14 @@ std::uint32_t likely_alignment(std::uint64_t payload_bytes) {
   return static_cast<std::uint32_t>(std::min(kMost, payload_bytes & (~payload_bytes + 1)));
 }
 
-Result<History> history_of(const Options& options) {
+Result<History> history_of(const CreateOptions& options) {
   if (options.life) return History::for_life(*options.life, *options.cycle);
   return History{options.depth, options.cycle.value_or(kDefaultCycle)};
 }
 
 }  // namespace
 
-Result<void> run_create(const Options& options, Output& out) {
+Result<void> run(const CreateOptions& options, Output& out) {
   Result<StreamId> id = StreamId::parse(options.stream);
   if (!id) return std::move(id).error();
   const std::string tried = "create '" + id->str() + "'";
@@ -70,7 +70,7 @@ Result<void> run_create(const Options& options, Output& out) {
 }
 
 // Removes as many as it can; the message then names all that failed.
-Result<void> run_rm(const Options& options, Output& out) {
+Result<void> run(const RmOptions& options, Output& out) {
   std::vector<StreamId> ids;
   for (const std::string& text : options.streams) {
     Result<StreamId> id = StreamId::parse(text);

@@ -27,7 +27,7 @@ void print_json(const MeterState& state, const Statistics& delays, const Clocks&
 
 void print_text(const MeterState& state, const Statistics& delays, const Clocks& clocks,
                 Output& out) {
-  if (state.final) out.add(farewell(state));
+  if (state.final) out.add(final_line(state));
   if (!state.final && state.new_samples == 0) return out.add("no new samples\n");
   if (delays.count == 0) return;
   out.add("average delay: " + fixed_text(delays.mean_ns / 1e9, 9) + " s\n\tmin: " +
@@ -42,7 +42,7 @@ void print_text(const MeterState& state, const Statistics& delays, const Clocks&
 
 }  // namespace
 
-Result<void> run_delay(const Options& options, Output& out) {
+Result<void> run(const DelayOptions& options, Output& out) {
   Window delays(options.window);
   Clocks clocks(options.window);
   Meter meter;
@@ -51,7 +51,7 @@ Result<void> run_delay(const Options& options, Output& out) {
     clocks.add(info);
   };
   meter.on_report = [&](const MeterState& state, Session& session) {
-    // While dssmd is away the last figures stay; nobody shall wait for it here.
+    // While dssmd is unavailable the last bounds stay; the reports do not wait for it.
     if (session.is_connected()) {
       if (const auto hosts = session.list_hosts()) clocks.update(*hosts, state.stream.host);
     }

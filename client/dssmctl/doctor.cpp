@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl doctor: looks at all that usually goes wrong, and says for each what it found, why it is
-// so, and what mends it. It changes nothing itself.
+// dssmctl doctor: checks what usually goes wrong, and reports for each check what it found, the
+// likely cause, and a command that fixes it or shows more. It changes nothing itself.
 #include <algorithm>
 
 #include "client/dssmctl/doctor_checks.hpp"
@@ -42,15 +42,16 @@ void print_text(const std::vector<Finding>& findings, Output& out) {
 
 }  // namespace
 
-Result<void> run_doctor(const Options& options, Output& out) {
+Result<void> run(const DoctorOptions& options, Output& out) {
   const std::vector<Finding> findings = findings_of(collect_facts(options));
   const auto failed = std::count_if(findings.begin(), findings.end(), [](const Finding& finding) {
     return finding.status == Finding::Status::fail;
   });
   options.json ? print_json(findings, failed == 0, out) : print_text(findings, out);
   if (failed == 0) return {};
-  return Error{Errc::system, std::to_string(failed) + " of " + std::to_string(findings.size()) +
-                                 " checks failed; do what stands behind them, then run it again"};
+  return Error{Errc::system,
+               std::to_string(failed) + " of " + std::to_string(findings.size()) +
+                   " checks failed; run the commands beside them, then run doctor again"};
 }
 
 }  // namespace dssm::ctl

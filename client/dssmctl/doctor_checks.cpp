@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One function per check. Texts of other hosts are shown as they are here; who prints them escapes
-// them.
+// One function per check. Texts of other hosts are used as they came; doctor.cpp escapes them when
+// it prints.
 #include "client/dssmctl/doctor_checks.hpp"
 
 #include <algorithm>
@@ -22,15 +22,11 @@ constexpr std::uint64_t kMebibyte = 1U << 20;
 constexpr std::uint64_t kDescriptorsPerStream = 4;  // of dssmd
 // What dssmd has open beside its streams: its own, and a few programs and hosts. A guess.
 constexpr std::uint64_t kOtherDescriptors = 200;
-constexpr std::size_t kMostNamed = 5;  // of streams in one text
+constexpr std::size_t kMaxNamed = 5;  // of streams in one text
 constexpr const char* kConfigFile = "/etc/dssm/dssmd.conf";
 constexpr const char* kDefaultGroup = "dssm";
 
 std::string in_quotes(const std::string& text) { return "'" + text + "'"; }
-
-bool contains_text(const std::string& text, std::string_view part) {
-  return text.find(part) != std::string::npos;
-}
 
 // Starts one of Debian's own services, in a container too.
 std::string start_command(const Facts& facts, const std::string& service) {
@@ -56,11 +52,11 @@ Finding no_permission(const Facts& facts) {
   } else if (socket.user_in_group) {
     finding.cause = "user " + in_quotes(facts.user) + " joined the group " + in_quotes(group) +
                     ", but not before this login";
-    finding.command = "newgrp " + group + "  # or log in anew";
+    finding.command = "newgrp " + group + "  # or log in again";
   } else {
     finding.cause =
         "user " + in_quotes(facts.user) + " is not in the socket's group " + in_quotes(group);
-    finding.command = "sudo usermod -aG " + group + " " + facts.user + "  # then log in anew";
+    finding.command = "sudo usermod -aG " + group + " " + facts.user + "  # then log in again";
   }
   return finding;
 }
@@ -69,14 +65,15 @@ Finding no_daemon(const Facts& facts) {
   const SocketFacts& socket = facts.socket;
   Finding finding{"daemon", Status::fail, facts.failed->message, {}, {}};
   if (socket.kind == SocketFacts::Kind::something_else) {
-    finding.cause = in_quotes(socket.path) + " is there, but is no socket";
+    finding.cause = in_quotes(socket.path) + " is there, but is not a socket";
     finding.command = "ls -l " + socket.path + "  # then correct --socket or $DSSM_SOCKET";
   } else if (socket.chosen) {
     finding.cause = "no dssmd runs for the socket that --socket or $DSSM_SOCKET names";
     finding.command = "unset DSSM_SOCKET  # for the usual one, or start that dssmd";
   } else if (facts.service == "failed") {
     finding.cause = "dssmd could not start or crashed";
-    finding.command = "journalctl -u dssmd -n 50  # says why; then: systemctl restart dssmd";
+    finding.command =
+        "journalctl -u dssmd -n 50  # shows the reason; then: systemctl restart dssmd";
   } else if (facts.service == "active") {
     finding.cause = "dssmd runs, but listens elsewhere (key runtime_dir)";
     finding.command = "grep runtime_dir " + std::string(kConfigFile) + "  # then set $DSSM_SOCKET";
@@ -121,13 +118,13 @@ void check_version(const Facts& facts, Findings& findings) {
   if (facts.daemon.version != facts.version) {
     findings.push_back({"version", Status::warn,
                         "dssmd is " + facts.daemon.version + ", dssmctl is " + facts.version,
-                        "dssmd was not started anew after an upgrade, or comes from elsewhere",
+                        "dssmd was not restarted after an upgrade, or comes from elsewhere",
                         "sudo systemctl restart dssmd"});
     return;
   }
   std::string others;
   for (const HostInfo& host : facts.hosts) {
-    if (host.state != "up" || host.version == facts.version) continue;
+    if (host.state != HostState::up || host.version == facts.version) continue;
     others += (others.empty() ? "" : ", ") + host.name + " has " + host.version;
   }
   if (!others.empty()) {
@@ -151,7 +148,7 @@ void check_memory(const Facts& facts, Findings& findings) {
   Finding finding{"memory",
                   Status::ok,
                   "rings take " + bytes_text(daemon.memory_bytes) + " of the " +
-                      bytes_text(daemon.memory_limit_bytes) + " that they may",
+                      bytes_text(daemon.memory_limit_bytes) + " that are allowed",
                   {},
                   {}};
   const std::uint64_t left =
@@ -160,7 +157,7 @@ void check_memory(const Facts& facts, Findings& findings) {
   if (left < daemon.memory_limit_bytes / 10) {
     finding.status = Status::warn;
     finding.cause = "streams with long histories; soon no further one can be created";
-    finding.command = "dssmctl ls --sort memory  # rm what nobody needs, or raise max_memory in " +
+    finding.command = "dssmctl ls --sort memory  # rm what is not needed, or raise max_memory in " +
                       std::string(kConfigFile);
   } else if (machine.total_bytes > 0 && machine.available_bytes < left &&
              machine.available_bytes < machine.total_bytes / 20) {
@@ -174,7 +171,7 @@ void check_memory(const Facts& facts, Findings& findings) {
 
 void check_descriptors(const Facts& facts, Findings& findings) {
   const std::uint64_t limit = facts.descriptors.soft_limit;
-  if (limit == 0) return;  // dssmd in another container: nobody here can tell
+  if (limit == 0) return;  // dssmd is in another container: not known here
   const std::uint64_t wanted = facts.daemon.streams * kDescriptorsPerStream + kOtherDescriptors;
   Finding finding{"descriptors",
                   Status::ok,
@@ -239,7 +236,7 @@ bool on_loopback(const std::string& address) {
 }
 
 bool is_other_pc(const HostInfo& host) {
-  if (host.state == "self") return false;
+  if (host.state == HostState::self) return false;
   // Found but closed: its announcement comes from outside, or it would have an address.
   return host.addresses.empty() ||
          !std::all_of(host.addresses.begin(), host.addresses.end(), on_loopback);
@@ -277,7 +274,7 @@ void check_listening(const Facts& facts, Findings& findings) {
 }
 
 Finding mdns_waiting(const Facts& facts) {
-  const DaemonInfo::Mdns& mdns = facts.daemon.mdns;
+  const MdnsInfo& mdns = facts.daemon.mdns;
   Finding finding{"mdns",
                   Status::warn,
                   "waits for Avahi" + (mdns.error.empty() ? "" : ": " + mdns.error),
@@ -297,15 +294,15 @@ Finding mdns_waiting(const Facts& facts) {
 }
 
 void check_mdns(const Facts& facts, Findings& findings) {
-  const DaemonInfo::Mdns& mdns = facts.daemon.mdns;
-  if (mdns.phase == "off") {
+  const MdnsInfo& mdns = facts.daemon.mdns;
+  if (mdns.phase == MdnsPhase::off) {
     return findings.push_back({"mdns", Status::ok, "off: only configured peers are found", {}, {}});
   }
-  if (mdns.phase == "waiting") return findings.push_back(mdns_waiting(facts));
+  if (mdns.phase == MdnsPhase::waiting) return findings.push_back(mdns_waiting(facts));
 
-  const auto up_by_peers =
-      std::count_if(facts.hosts.begin(), facts.hosts.end(),
-                    [](const HostInfo& host) { return host.state == "up" && is_other_pc(host); });
+  const auto up_by_peers = std::count_if(
+      facts.hosts.begin(), facts.hosts.end(),
+      [](const HostInfo& host) { return host.state == HostState::up && is_other_pc(host); });
   Finding finding{"mdns",
                   Status::ok,
                   mdns.avahi_version + ", " + std::to_string(mdns.announced) + " announced, " +
@@ -326,7 +323,7 @@ void check_mdns(const Facts& facts, Findings& findings) {
     finding.command = "avahi-browse -rt _dssm._tcp  # see /etc/avahi/avahi-daemon.conf";
   } else if (mdns.hosts_heard == 0 && up_by_peers > 0) {
     finding.status = Status::warn;
-    finding.cause = "the network or a firewall swallows multicast: others are up, none is heard";
+    finding.cause = "the network or a firewall drops multicast: others are up, none is heard";
     finding.command = "sudo ufw allow 5353/udp  # on each host; or list all hosts in peers";
   } else if (!mdns.error.empty()) {
     finding.status = Status::warn;
@@ -340,91 +337,116 @@ Finding host_down(const HostInfo& host) {
   Finding finding{"host " + name_of(host), Status::fail, "down: " + host.error, {}, {}};
   const std::string where =
       host.addresses.empty() ? host.name : without_port(host.addresses.front());
-  if (contains_text(host.error, "refused")) {
-    finding.cause = "no dssmd runs there, or it listens at another address or port";
-    finding.command = "systemctl status dssmd  # there; and look at its key listen";
-  } else if (contains_text(host.error, "does not greet")) {
-    finding.cause = "the dssmd there hangs, or another program has its port";
-    finding.command = "ss -ltnp  # there; then: systemctl restart dssmd";
-  } else if (contains_text(host.error, "look up") || contains_text(host.error, "resolve") ||
-             contains_text(host.error, "not known")) {
-    finding.cause = "its name is not known here";
-    finding.command = "getent hosts " + where + "  # then correct peers, or give an address there";
-  } else {
-    finding.cause = "it is off, the cable is out, or a firewall is in between";
-    finding.command = "ping " + where + "  # it answers: open TCP port 13776 in its firewall";
+  switch (host.reason) {
+    case HostReason::connection_refused:
+      finding.cause = "no dssmd runs there, or it listens at another address or port";
+      finding.command = "systemctl status dssmd  # there; and check its key listen";
+      break;
+    case HostReason::no_greeting:
+      finding.cause = "the dssmd there hangs, or another program has its port";
+      finding.command = "ss -ltnp  # there; then: systemctl restart dssmd";
+      break;
+    case HostReason::name_not_found:
+      finding.cause = "its name is not known here";
+      finding.command =
+          "getent hosts " + where + "  # then correct peers, or give an address there";
+      break;
+    default:
+      finding.cause = "it is off, the cable is out, or a firewall is in between";
+      finding.command = "ping " + where + "  # it answers: open TCP port 13776 in its firewall";
   }
   return finding;
+}
+
+Finding host_refused(const HostInfo& host) {
+  Finding finding{"host " + name_of(host), Status::fail, "refused: " + host.error, {}, {}};
+  switch (host.reason) {
+    case HostReason::duplicate:
+      finding.cause =
+          "one PC's disk was copied to the other, or two dssmd of this PC have one name";
+      finding.command = rename_command("one of them") +
+                        "; on a copied PC also: sudo rm /etc/machine-id && sudo "
+                        "systemd-machine-id-setup";
+      break;
+    case HostReason::namesake:
+      finding.cause = "both hosts have the same name";
+      finding.command = rename_command("one of them");
+      break;
+    default:
+      finding.cause = "the two do not fit together: versions, names or limits";
+      finding.command =
+          "dssmctl hosts  # shows the reason; install the same version of DSSM on both";
+  }
+  return finding;
+}
+
+// Found by mDNS, but the keys of one of both PCs do not allow the connection.
+Finding host_closed(const HostInfo& host) {
+  const bool here = host.reason == HostReason::closed_here;
+  return {"host " + name_of(host), Status::warn,
+          "found by mDNS, but not connected to: " + host.error,
+          here ? "the key insecure of this PC does not let its dssmd connect to others"
+               : "its keys listen and insecure do not let others in",
+          "echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines in " +
+              std::string(here ? "" : "its ") + kConfigFile + ", then restart " +
+              (here ? "this" : "its") + " dssmd"};
+}
+
+// What is wrong with this host mostly concerns another one too, and is reported there.
+void check_own_host(const Facts& facts, const HostInfo& self, Findings& findings) {
+  if (self.reason == HostReason::none) return;
+  const bool is_reported =
+      std::any_of(facts.hosts.begin(), facts.hosts.end(), [&](const HostInfo& other) {
+        return other.state != HostState::self && other.reason == self.reason;
+      });
+  if (is_reported) return;
+  findings.push_back({"host " + name_of(self), Status::fail, self.error,
+                      "another host has this one's name, and is refused for that",
+                      "dssmctl hosts  # shows where; see 'host names'"});
+}
+
+// `also_up`: the same host is up at another address.
+Finding host_finding(const HostInfo& host, bool also_up) {
+  const std::string name = "host " + name_of(host);
+  if (host.state == HostState::up) {
+    const std::string warning = host.error.empty() ? "" : ": " + host.error;
+    return {name, Status::ok, "up at " + list_text(host.addresses) + warning, {}, {}};
+  }
+  if (host.state == HostState::refused) return host_refused(host);
+  if (also_up) {
+    const std::string reason =
+        host.error.empty() ? std::string(dssm::name_of(host.state)) : host.error;
+    return {name,
+            Status::ok,
+            "also at " + list_text(host.addresses) + ", which is not used: " + reason,
+            {},
+            {}};
+  }
+  if (host.state == HostState::connecting) {
+    return {name, Status::warn, "being connected to", "dssmd or the network has just come up",
+            "dssmctl hosts"};
+  }
+  return host.state == HostState::closed ? host_closed(host) : host_down(host);
 }
 
 void check_hosts(const Facts& facts, Findings& findings) {
   std::set<std::string> up;  // ids
   for (const HostInfo& host : facts.hosts) {
-    if (host.state == "up" || host.state == "self") up.insert(host.id);
+    if (host.state == HostState::up || host.state == HostState::self) up.insert(host.id);
   }
   for (const HostInfo& host : facts.hosts) {
-    const std::string name = "host " + name_of(host);
-    if (host.state == "self") {
-      // What is wrong with this host is mostly wrong with another one too, and told there.
-      const bool told =
-          std::any_of(facts.hosts.begin(), facts.hosts.end(), [&](const HostInfo& other) {
-            return other.state != "self" && other.error == host.error;
-          });
-      if (host.error.empty() || told) continue;
-      findings.push_back({name, Status::fail, host.error,
-                          "another host has this one's name, and is not let in for that",
-                          "dssmctl hosts  # shows where; see 'host names'"});
-    } else if (host.state == "up") {
-      findings.push_back(
-          {name,
-           Status::ok,
-           "up at " + list_text(host.addresses) + (host.error.empty() ? "" : ": " + host.error),
-           {},
-           {}});
-    } else if (host.state == "refused" && host.name == facts.daemon.host) {
-      const bool copied = host.id == facts.hosts.front().id;
-      findings.push_back(
-          {name, Status::fail, "refused: " + host.error,
-           copied ? "one PC's disk was copied to the other, or two dssmd of this PC have one name"
-                  : "both hosts have the same name",
-           rename_command("one of them") +
-               (copied ? "; on a copied PC also: sudo rm /etc/machine-id && sudo "
-                         "systemd-machine-id-setup"
-                       : "")});
-    } else if (host.state == "refused") {
-      findings.push_back({name, Status::fail, "refused: " + host.error,
-                          "the two do not fit together: versions, names or limits",
-                          "dssmctl hosts  # says why; install the same version of DSSM on both"});
-    } else if (!host.id.empty() && up.contains(host.id)) {
-      findings.push_back({name,
-                          Status::ok,
-                          "also at " + list_text(host.addresses) + ", which is not used: " +
-                              (host.error.empty() ? host.state : host.error),
-                          {},
-                          {}});
-    } else if (host.state == "connecting") {
-      findings.push_back({name, Status::warn, "being connected to",
-                          "dssmd or the network has just come up", "dssmctl hosts"});
-    } else if (host.state == "closed") {
-      // Either end may keep the other out.
-      const bool by_us = contains_text(host.error, "this dssmd connects");
-      findings.push_back(
-          {name, Status::warn, "found by mDNS, but not connected to: " + host.error,
-           by_us ? "the key insecure of this PC does not let its dssmd go to others"
-                 : "its keys listen and insecure do not let others in",
-           "echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines in " +
-               std::string(by_us ? "" : "its ") + kConfigFile + ", then restart " +
-               (by_us ? "this" : "its") + " dssmd"});
+    if (host.state == HostState::self) {
+      check_own_host(facts, host, findings);
     } else {
-      findings.push_back(host_down(host));
+      findings.push_back(host_finding(host, !host.id.empty() && up.contains(host.id)));
     }
   }
 }
 
-// What the fleet's clocks are worth to each other; a PC that is alone has nobody to differ from.
+// How far the clocks of the other PCs may be from this one's.
 void check_fleet_clocks(const Facts& facts, Findings& findings) {
   for (const HostInfo& host : facts.hosts) {
-    if (host.state != "up" || !is_other_pc(host) || !host.clock) continue;
+    if (host.state != HostState::up || !is_other_pc(host) || !host.clock) continue;
     const ClockInfo& clock = *host.clock;
     Finding finding{"clock of " + name_of(host),
                     Status::ok,
@@ -449,8 +471,8 @@ void check_host_names(const Facts& facts, Findings& findings) {
   for (const HostInfo& host : facts.hosts) {
     if (host.name.empty() || host.id.empty()) continue;
     ids[host.name].insert(host.id);
-    // With this PC's machine id too it has this one's id: a copied PC, or a second dssmd here.
-    if (host.state == "refused" && host.name == facts.daemon.host) ids[host.name].insert("refused");
+    // A copied PC, or a second dssmd on this one, has the same id.
+    if (host.reason == HostReason::duplicate) ids[host.name].insert("duplicate");
   }
   std::string doubled;
   for (const auto& [name, of_name] : ids) {
@@ -477,8 +499,8 @@ void check_stream_names(const Facts& facts, Findings& findings) {
   std::string text, example;
   std::size_t named = 0;
   for (const auto& [key, hosts] : duplicates.owners()) {
-    if (named++ == kMostNamed) {
-      text += " and " + std::to_string(duplicates.owners().size() - kMostNamed) + " more";
+    if (named++ == kMaxNamed) {
+      text += " and " + std::to_string(duplicates.owners().size() - kMaxNamed) + " more";
       break;
     }
     const std::string name = key.first + ":" + std::to_string(key.second);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What `dssmctl doctor` makes of the facts: pure, so that tests can put any of them here.
+// The findings of `dssmctl doctor`: a pure function of the facts, so that tests can give any.
 #pragma once
 
 #include <cstdint>
@@ -18,11 +18,11 @@ struct Finding {
   Status status = Status::ok;
   std::string text;     // what was found
   std::string cause;    // the likely one; empty when ok
-  std::string command;  // that mends it, or shows more; empty when ok
+  std::string command;  // that fixes it, or shows more; empty when ok
 };
 
-// In the order in which a person would look: dssmd, this PC, the others. While dssmd does not
-// answer, nothing is said about what only it knows.
+// In the order of a person's search: dssmd, this PC, the others. While dssmd does not answer, there
+// are no findings about what only it knows.
 std::vector<Finding> findings_of(const Facts& facts);
 
 }  // namespace dssm::ctl

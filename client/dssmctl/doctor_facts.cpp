@@ -60,7 +60,7 @@ bool process_has_group(gid_t gid) {
   return std::find(groups.begin(), groups.end(), gid) != groups.end();
 }
 
-SocketFacts socket_facts(const Options& options, const std::string& user) {
+SocketFacts socket_facts(const CommonOptions& options, const std::string& user) {
   SocketFacts facts;
   const char* given = std::getenv("DSSM_SOCKET");  // NOLINT(concurrency-mt-unsafe): one thread
   facts.path = !options.socket_path.empty() ? options.socket_path
@@ -145,7 +145,7 @@ bool take(Result<T> answer, T& into, std::optional<Error>& failed) {
   return true;
 }
 
-void ask_dssmd(const Options& options, Facts& facts) {
+void ask_dssmd(const CommonOptions& options, Facts& facts) {
   Result<Session> session = connect(options);
   if (!session) {
     facts.failed = std::move(session).error();
@@ -183,7 +183,7 @@ std::uint64_t soft_limit_untrusted(const std::string& limits) {
   return words >> limit ? limit : 0;
 }
 
-Facts collect_facts(const Options& options) {
+Facts collect_facts(const CommonOptions& options) {
   Facts facts;
   facts.user = user_name();
   facts.version = DSSM_VERSION;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What `dssmctl doctor` looks at: collected here, judged in doctor_checks.hpp.
+// What `dssmctl doctor` checks: collected here, assessed in doctor_checks.hpp.
 #pragma once
 
 #include <cstdint>
@@ -18,7 +18,7 @@ struct SocketFacts {
   enum class Kind : std::uint8_t { missing, socket, something_else, hidden };
   std::string path;
   bool chosen = false;            // by --socket or $DSSM_SOCKET
-  Kind kind = Kind::missing;      // hidden: this user may not look there
+  Kind kind = Kind::missing;      // hidden: this user may not read its folder
   std::string group;              // that may connect; empty: not known
   bool user_in_group = false;     // by the system's list of groups
   bool process_in_group = false;  // as of its login
@@ -38,7 +38,7 @@ struct DiskFacts {
   std::uint64_t total_bytes = 0, free_bytes = 0;  // free for programs of ordinary users
 };
 
-// The clock of this PC, by what chronyc tells.
+// The clock of this PC, as chronyc reports it.
 struct ClockFacts {
   enum class State : std::uint8_t { no_chrony, no_answer, unsynchronized, synchronized };
   State state = State::no_chrony;
@@ -64,7 +64,7 @@ struct Facts {
 };
 
 // Asks dssmd, the kernel, systemctl and chronyc; takes some seconds when one of them hangs.
-Facts collect_facts(const Options& options);
+Facts collect_facts(const CommonOptions& options);
 
 // What `chronyc -c tracking` printed, taken apart.
 ClockFacts clock_facts_untrusted(int exit_status, const std::string& output);

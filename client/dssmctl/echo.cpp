@@ -15,13 +15,13 @@
 namespace dssm::ctl {
 namespace {
 
-SampleForm form_of(const Options& options) {
+SampleForm form_of(const EchoOptions& options) {
   if (options.json) return SampleForm::json;
   return options.csv ? SampleForm::csv : SampleForm::text;
 }
 
 // The fields to show of the reader's stream as it is now.
-Result<std::vector<Field>> wanted_fields(const RawReader& reader, const Options& options) {
+Result<std::vector<Field>> wanted_fields(const RawReader& reader, const EchoOptions& options) {
   Result<std::vector<Field>> fields =
       select_fields(readable_fields_untrusted(reader.type()), options.fields);
   if (!fields) return std::move(fields).error().context("show '" + reader.id().str() + "'");
@@ -31,7 +31,7 @@ Result<std::vector<Field>> wanted_fields(const RawReader& reader, const Options&
 // Prints the samples after the reader's cursor, in order.
 class Echo {
  public:
-  Echo(RawReader& reader, SamplePrinter& printer, Output& out, const Options& options)
+  Echo(RawReader& reader, SamplePrinter& printer, Output& out, const EchoOptions& options)
       : reader_(reader),
         printer_(printer),
         out_(out),
@@ -40,8 +40,8 @@ class Echo {
             options.at || options.last ? 1 : std::numeric_limits<std::uint64_t>::max())),
         payload_(reader.payload_bytes()) {}
 
-  // Reads one sample with `read`, as the members of RawReader do, and prints it; goes on with the
-  // new ring of a stream that began anew. Never `restarted`, unless result() says why not to go on.
+  // Reads one sample with `read`, as the members of RawReader do, and prints it; after a
+  // restart of the stream it continues with the new ring. `restarted` only with a failed result().
   template <class Read>
   ReadStatus print(Read read) {
     SampleInfo info;
@@ -58,35 +58,35 @@ class Echo {
     return status;
   }
 
-  // Prints what is there at this moment. Whether to go on.
+  // Prints what is there at this moment. Returns whether to continue.
   bool print_new() {
     const Tid last = reader_.newest_tid();
     const std::uint64_t restarts = reader_.restarts();
-    bool more = true;  // at least one look: only a read finds out that the stream began anew
-    while (more && go_on()) {
+    bool more = true;  // at least one read: only a read reports a restart
+    while (more && continues()) {
       const ReadStatus status =
           print([&](auto payload, auto& info) { return reader_.read_next(payload, info); });
       if (status == ReadStatus::not_yet || !out_.flush_some()) break;
       more = reader_.cursor() < last || reader_.restarts() != restarts;
     }
-    return out_.flush() && go_on();
+    return out_.flush() && continues();
   }
 
   // Why the stream cannot be shown any longer.
   const Result<void>& result() const { return result_; }
 
  private:
-  bool go_on() const { return left_ > 0 && result_ && !stop_requested(); }
+  bool continues() const { return left_ > 0 && result_ && !stop_requested(); }
 
   void reopen() {
     out_.flush();  // so that the lines come in order where both outputs go to one place
-    say_began_anew(reader_);
+    report_restart(reader_);
     Result<std::vector<Field>> fields = wanted_fields(reader_, options_);
     if (!fields) {
       result_ = std::move(fields).error();
     } else if (*fields != printer_.fields()) {
-      result_ = Error{Errc::type_mismatch, "go on with '" + reader_.id().str() +
-                                               "': it began anew with other fields; start again "
+      result_ = Error{Errc::type_mismatch, "continue with '" + reader_.id().str() +
+                                               "': it restarted with other fields; start again "
                                                "to see them"};
     }
   }
@@ -94,7 +94,7 @@ class Echo {
   RawReader& reader_;
   SamplePrinter& printer_;
   Output& out_;
-  const Options& options_;
+  const EchoOptions& options_;
   std::uint64_t left_;
   std::uint64_t lost_ = 0;
   std::vector<std::byte> payload_;
@@ -118,7 +118,7 @@ Error failed_read(const RawReader& reader, const std::string& what, ReadStatus s
     case ReadStatus::clock_out_of_bounds:
       return {Errc::clock_out_of_bounds,
               tried +
-                  "the clocks of its host and of this PC may be too far apart; look at `dssmctl "
+                  "the clocks of its host and of this PC may be too far apart; see `dssmctl "
                   "clock`"};
     default:
       return {Errc::not_found, tried + "nothing was written to it yet"};
@@ -127,7 +127,7 @@ Error failed_read(const RawReader& reader, const std::string& what, ReadStatus s
 
 // The moment that --at means. It counts back from the newest sample, not from now, because the
 // stamps of a recording have nothing to do with the time on the wall.
-Result<Time> moment(const RawReader& reader, const Options& options) {
+Result<Time> moment(const RawReader& reader, const EchoOptions& options) {
   if (!options.at_counts_back) return Time(*options.at);
   SampleInfo newest;
   ReadStatus status = ReadStatus::not_yet;
@@ -141,7 +141,7 @@ Result<Time> moment(const RawReader& reader, const Options& options) {
 
 // Prints the sample that --at or --last asks for; without them puts the cursor before the first
 // sample to show.
-Result<void> begin(const Options& options, bool awaited, RawReader& reader, Echo& echo) {
+Result<void> begin(const EchoOptions& options, bool awaited, RawReader& reader, Echo& echo) {
   if (options.at) {
     const Result<Time> time = moment(reader, options);
     if (!time) return time.error();
@@ -164,7 +164,7 @@ Result<void> begin(const Options& options, bool awaited, RawReader& reader, Echo
 
 }  // namespace
 
-Result<void> run_echo(const Options& options, Output& out) {
+Result<void> run(const EchoOptions& options, Output& out) {
   return with_stream(options, [&](OpenedStream& opened) -> Result<void> {
     RawReader& reader = opened.reader;
     Result<std::vector<Field>> fields = wanted_fields(reader, options);

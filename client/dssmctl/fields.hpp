@@ -19,7 +19,7 @@ namespace dssm::ctl {
 // description with one wrong field describes something else.
 std::vector<Field> readable_fields_untrusted(const TypeInfo& type);
 
-// Those of `fields` that `wanted` asks for, in the order of the payload. "pose" stands for the
+// Those of `fields` that `wanted` asks for, in the order of the payload. "pose" means the
 // field pose and for all of pose.*; without any wish all are wanted. Fails with invalid_argument,
 // naming the fields there are.
 Result<std::vector<Field>> select_fields(std::vector<Field> fields,

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Waiting on a stream that is being shown: for its next sample, the next report, Ctrl-C, the end of
-// whoever reads our output, and the stream's end. A stream that begins anew, with a new ring, is
-// followed; one that was removed and is not there is at its end.
+// Waits on a stream that is being shown: for its next sample, the next report, Ctrl-C, the end of
+// the program that reads our output, and the stream's end. A stream that restarts, with a new ring,
+// is followed; a stream that was removed and not recreated is at its end.
 #pragma once
 
 #include <atomic>
@@ -16,9 +16,9 @@ namespace dssm::ctl {
 class Follower {
  public:
   enum class Wake : unsigned char {
-    sample,  // there is something newer than the reader's cursor, or the stream began anew
+    sample,  // there is something newer than the reader's cursor, or the stream restarted
     deadline,
-    stop,   // by signal, or because nobody reads our output any more
+    stop,   // by signal, or because our output is no longer read
     ended,  // nothing more will come; samples written before may still be unread
   };
 
@@ -28,29 +28,29 @@ class Follower {
   Wake wait(MonoTime deadline);
 
  private:
-  Follower(Session& session, RawReader& reader, Output& out, Duration patience)
-      : session_(session), reader_(reader), out_(out), patience_(patience) {}
+  Follower(Session& session, RawReader& reader, Output& out, Duration removed_after)
+      : session_(session), reader_(reader), out_(out), removed_after_(removed_after) {}
   bool removed();
 
-  // A stream of another host that is not there any more may be back in a moment: its dssmd was
-  // restarted, and the programs that hold the stream are about to offer it.
+  // A stream of another host that is not there any more may return soon: its dssmd was restarted,
+  // and the programs that hold the stream are about to offer it.
   static constexpr Duration kMayComeBack = std::chrono::seconds(3);
 
   Session& session_;
   RawReader& reader_;
   Output& out_;
-  Duration patience_;  // so long the stream has to be gone to count as removed
+  Duration removed_after_;  // how long the stream has to be missing to count as removed
   // Set by the session's thread: whether a stream of this name was removed, and none came since.
   // Shared with the callback, which moves with the watch.
   std::shared_ptr<std::atomic<bool>> suspicion_ = std::make_shared<std::atomic<bool>>(false);
-  std::optional<MonoTime> gone_since_;
+  std::optional<MonoTime> missing_since_;
   std::optional<Session::Watch> watch_;
 };
 
-// Why nothing more comes to `reader`: its stream was removed, or began anew as something else.
+// Why nothing more comes to `reader`: its stream was removed, or restarted with another type.
 Error end_of(const RawReader& reader);
 
-// Says on standard error that `reader`'s stream began anew.
-void say_began_anew(const RawReader& reader);
+// Reports on standard error that `reader`'s stream restarted.
+void report_restart(const RawReader& reader);
 
 }  // namespace dssm::ctl

@@ -23,7 +23,7 @@ Json host_json(const HostInfo& host) {
   Json json;
   json["host"] = or_null(host.name);
   json["id"] = or_null(host.id);
-  json["state"] = host.state;
+  json["state"] = name_of(host.state);
   json["state_for_ns"] = to_ns(host.since);
   json["addresses"] = host.addresses;
   json["found_by"] = host.found_by;
@@ -33,6 +33,7 @@ Json host_json(const HostInfo& host) {
   json["streams"] = host.streams;
   json["clock_bound_ns"] = bound_json(host.clock_bound);
   json["insecure"] = host.insecure;
+  json["reason"] = host.reason == HostReason::none ? Json() : Json(name_of(host.reason));
   json["error"] = or_null(host.error);
   return json;
 }
@@ -46,7 +47,7 @@ std::vector<Table::Column> host_columns() {
 std::vector<std::string> host_row(const HostInfo& host) {
   const auto or_dash = [](std::string text) { return text.empty() ? "-" : std::move(text); };
   return {or_dash(escaped(host.name)),
-          escaped(host.state),
+          std::string(name_of(host.state)),
           or_dash(list_text(host.addresses)),
           or_dash(list_text(host.found_by)),
           or_dash(escaped(host.version)),

@@ -24,7 +24,7 @@ void print_names(const std::vector<HostInfo>& hosts, Output& out) {
 
 }  // namespace
 
-Result<void> run_hosts(const Options& options, Output& out) {
+Result<void> run(const HostsOptions& options, Output& out) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
   const Result<std::vector<HostInfo>> hosts = session->list_hosts();

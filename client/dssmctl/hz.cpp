@@ -39,9 +39,9 @@ std::string precise_rate_text(double rate) {
   return rate > 0 ? fixed_text(rate, 3) + " Hz" : "unknown";
 }
 
-// Whether there is something to measure; prints why not.
+// Whether there is something to measure; prints the reason when there is not.
 bool measurable(const MeterState& state, const Statistics& intervals, Output& out) {
-  if (state.final) out.add(farewell(state));
+  if (state.final) out.add(final_line(state));
   if (!state.final && state.new_samples == 0) {
     out.add(state.seen == 0 ? "no samples yet\n" : "no new samples\n");
     return false;
@@ -91,7 +91,7 @@ void print_bw(const MeterState& state, const Statistics& intervals, bool as_json
 }
 
 template <class Print>
-Result<void> run_interval_meter(const Options& options, Output& out, Print print) {
+Result<void> run_interval_meter(const MeterOptions& options, Output& out, Print print) {
   Intervals intervals(options.window);
   Meter meter;
   meter.from_history = true;
@@ -105,11 +105,11 @@ Result<void> run_interval_meter(const Options& options, Output& out, Print print
 
 }  // namespace
 
-Result<void> run_hz(const Options& options, Output& out) {
+Result<void> run(const HzOptions& options, Output& out) {
   return run_interval_meter(options, out, print_hz);
 }
 
-Result<void> run_bw(const Options& options, Output& out) {
+Result<void> run(const BwOptions& options, Output& out) {
   return run_interval_meter(options, out, print_bw);
 }
 

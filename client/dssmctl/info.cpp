@@ -53,11 +53,11 @@ void print_users(const StreamInfo& stream, Output& out) {
   table.print(out);
 }
 
-// Of another host's stream: the copy that this PC keeps of it, while somebody reads it here.
+// Of another host's stream: the copy that this PC keeps of it, while a program reads it here.
 void print_mirror(const MirrorInfo& mirror, Output& out) {
-  add_line(
-      out, "mirror",
-      escaped(mirror.state) + (mirror.error.empty() ? "" : ": " + escaped_message(mirror.error)));
+  add_line(out, "mirror",
+           std::string(name_of(mirror.state)) +
+               (mirror.error.empty() ? "" : ": " + escaped_message(mirror.error)));
   add_line(out, "received",
            mirror.newest == kNoTid ? "nothing yet"
                                    : std::to_string(mirror.received_samples) + " samples, " +
@@ -82,7 +82,7 @@ void print_stream(const StreamInfo& stream, Output& out) {
   add_line(out, "memory", bytes_text(stream.memory_bytes));
   add_line(out, "property", stream.property_bytes ? bytes_text(stream.property_bytes) : "none");
   add_line(out, "incarnation", std::to_string(stream.incarnation));
-  if (stream.creator_pid != 0) {  // of a mirror whose owner is away it is not known
+  if (stream.creator_pid != 0) {  // not known of a mirror whose owner is unavailable
     add_line(out, "created by", "pid " + std::to_string(stream.creator_pid));
   }
   if (stream.mirror) print_mirror(*stream.mirror, out);
@@ -90,7 +90,7 @@ void print_stream(const StreamInfo& stream, Output& out) {
   print_users(stream, out);
 }
 
-Result<void> print_daemon(Session& session, const Options& options, Output& out) {
+Result<void> print_daemon(Session& session, const InfoOptions& options, Output& out) {
   const Result<DaemonInfo> daemon = session.daemon_info();
   if (!daemon) return daemon.error();
   const Result<std::vector<HostInfo>> hosts = session.list_hosts();
@@ -119,7 +119,7 @@ Result<void> print_daemon(Session& session, const Options& options, Output& out)
 
 }  // namespace
 
-Result<void> run_info(const Options& options, Output& out) {
+Result<void> run(const InfoOptions& options, Output& out) {
   std::optional<StreamId> id;
   if (!options.stream.empty()) {
     Result<StreamId> parsed = StreamId::parse(options.stream);

@@ -23,7 +23,7 @@ inline Json bound_json(Duration bound) {
   return bound >= kForeignClockError ? Json() : Json(to_ns(bound));
 }
 
-// A document of its own: indented, because people look at it too.
+// A document of its own: indented, because people read it too.
 inline std::string json_document(const Json& json) {
   return json.dump(2, ' ', true, Json::error_handler_t::replace) + "\n";
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl ls: all streams of all hosts, own ones first, each host's in the order of their creation
-// unless told otherwise. One question to dssmd (two for names or hosts), one write; it is run in
+// without --sort. One request to dssmd (two for names or hosts), one write; it is run in
 // loops and by the shell's completion, so it has to be quick.
 #include <algorithm>
 #include <set>
@@ -68,8 +68,8 @@ std::vector<std::string> row(const StreamInfo& stream, bool duplicate, Time now)
   };
 }
 
-// What to show, in order. The marks follow from all that there is, shown or not; without the other
-// hosts' streams nobody knows them.
+// What to show, in order. The marks follow from all that there is, shown or not; without the
+// other hosts' streams they are not known.
 struct Listing {
   std::vector<StreamInfo> streams;
   std::optional<Duplicates> duplicates;
@@ -133,7 +133,7 @@ Result<void> print_names(Session& session, const std::vector<StreamInfo>& all,
   return {};
 }
 
-// A name that is no host's would show nothing for ever.
+// A name that no host has would show nothing forever.
 Result<void> check_hosts(Session& session, const std::vector<std::string>& wanted) {
   if (wanted.empty()) return {};
   const Result<std::vector<HostInfo>> hosts = session.list_hosts();
@@ -144,7 +144,8 @@ Result<void> check_hosts(Session& session, const std::vector<std::string>& wante
   }
   for (const std::string& name : wanted) {
     if (known.contains(name)) continue;
-    Error error{Errc::not_found, "look for host '" + name + "': no such host is known here; known"};
+    Error error{Errc::not_found,
+                "list the streams of host '" + name + "': no such host is known here; known"};
     std::string_view separator = " are '";
     for (const std::string& other : known) {
       error.message.append(separator).append(other).append("'");
@@ -157,7 +158,7 @@ Result<void> check_hosts(Session& session, const std::vector<std::string>& wante
 }
 
 // With --own the streams of this host, as with --host and its name.
-Result<StreamFilter> filter_of(Session& session, const Options& options) {
+Result<StreamFilter> filter_of(Session& session, const LsOptions& options) {
   std::vector<std::string> hosts = options.hosts;
   if (options.own) {
     const Result<DaemonInfo> daemon = session.daemon_info();
@@ -169,7 +170,7 @@ Result<StreamFilter> filter_of(Session& session, const Options& options) {
 
 }  // namespace
 
-Result<void> run_ls(const Options& options, Output& out) {
+Result<void> run(const LsOptions& options, Output& out) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
   if (Result<void> known = check_hosts(*session, options.hosts); !known) return known;

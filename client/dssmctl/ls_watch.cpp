@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl ls --watch: what is there, then each stream that comes or goes, a line for each, until
-// Ctrl-C. Nobody is asked again and again: dssmd tells. While dssmd itself is away nothing is told;
-// when it is back, only what has changed meanwhile.
+// Ctrl-C. dssmd sends events, nothing is polled. While dssmd is unavailable there are none; when it
+// is available again, only what has changed meanwhile is shown.
 #include "client/dssmctl/ls_watch.hpp"
 
 #include <condition_variable>
@@ -16,8 +16,8 @@
 namespace dssm::ctl {
 namespace {
 
-// What the session's thread tells and this program has not shown yet. It grows only while whoever
-// reads our output takes nothing, by what comes and goes meanwhile.
+// Events of the session's thread that this program has not shown yet. It grows only while our output
+// is not read, by the streams that are added and removed meanwhile.
 class EventQueue {
  public:
   void put(const StreamEvent& event) {
@@ -26,10 +26,10 @@ class EventQueue {
     came_.notify_one();
   }
 
-  // All that came; waits for the first one, but not for longer than kStopLookUp.
+  // All that came; waits for the first one, but not for longer than kStopCheckPeriod.
   std::vector<StreamEvent> take() {
     std::unique_lock lock(mutex_);
-    came_.wait_for(lock, kStopLookUp, [this] { return !events_.empty(); });
+    came_.wait_for(lock, kStopCheckPeriod, [this] { return !events_.empty(); });
     return std::exchange(events_, {});
   }
 
@@ -42,7 +42,7 @@ class EventQueue {
 // Prints a line for each stream that comes or goes.
 class StreamLog {
  public:
-  StreamLog(const Options& options, const StreamFilter& filter, Output& out)
+  StreamLog(const LsOptions& options, const StreamFilter& filter, Output& out)
       : json_(options.json), filter_(filter), out_(out) {}
 
   void on_event(const StreamEvent& event) {
@@ -52,7 +52,7 @@ class StreamLog {
       shown_.erase(name);
       return print_removed(event.stream.id);
     }
-    // One that was created anew while dssmd was away is told as added only.
+    // A stream that was recreated while dssmd was unavailable is reported as added only.
     if (!shown_.insert(name).second) print_removed(event.stream.id);
     print_added(event.stream);
   }
@@ -87,7 +87,7 @@ class StreamLog {
 
 }  // namespace
 
-Result<void> watch_streams(Session& session, const Options& options, const StreamFilter& filter,
+Result<void> watch_streams(Session& session, const LsOptions& options, const StreamFilter& filter,
                            Output& out) {
   catch_stop_signals();
   const auto queue = std::make_shared<EventQueue>();
@@ -97,7 +97,7 @@ Result<void> watch_streams(Session& session, const Options& options, const Strea
   StreamLog log(options, filter, out);
   do {
     for (const StreamEvent& event : queue->take()) log.on_event(event);
-  } while (out.flush() && !out.reader_gone() && !stop_requested());
+  } while (out.flush() && !out.reader_ended() && !stop_requested());
   return {};
 }
 

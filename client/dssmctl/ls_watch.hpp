@@ -11,8 +11,8 @@
 
 namespace dssm::ctl {
 
-// Success when told to stop, or when nobody reads `out` any more.
-Result<void> watch_streams(Session& session, const Options& options, const StreamFilter& filter,
+// Success after a stop signal, or when `out` is no longer read.
+Result<void> watch_streams(Session& session, const LsOptions& options, const StreamFilter& filter,
                            Output& out);
 
 }  // namespace dssm::ctl

@@ -18,8 +18,8 @@ class StampReader {
 
   void read_new() {
     read_ring();
-    while (began_anew()) {
-      say_began_anew(reader_);
+    while (restarted()) {
+      report_restart(reader_);
       state_.restarts = reader_.restarts();
       if (meter_.on_gap) meter_.on_gap();
       read_ring();
@@ -50,9 +50,9 @@ class StampReader {
     reader_.seek(tid - 1);
   }
 
-  // Goes on with the stream's new ring, when there is one; stamps alone would never tell. No
-  // payload is read.
-  bool began_anew() {
+  // Continues with the stream's new ring, when there is one; reading stamps alone would not report
+  // it. No payload is read.
+  bool restarted() {
     const Tid cursor = reader_.cursor();
     BorrowedSample next;
     if (reader_.borrow(cursor + 1, next) == ReadStatus::restarted) return true;
@@ -66,7 +66,7 @@ class StampReader {
   Time newest_time_{};
 };
 
-// The last sample not to look at: before the newest `window` ones, or before what is to come.
+// The last sample not to count: before the newest `window` ones, or before what is to come.
 Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t window, bool awaited) {
   const Tid newest = reader.newest_tid();
   if (!meter.from_history) return awaited ? kNoTid : newest;
@@ -75,7 +75,7 @@ Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t wind
 
 }  // namespace
 
-Result<void> run_meter(const Options& options, Output& out, const Meter& meter) {
+Result<void> run_meter(const MeterOptions& options, Output& out, const Meter& meter) {
   return with_stream(options, [&](OpenedStream& opened) -> Result<void> {
     RawReader& reader = opened.reader;
     Result<Follower> follower = Follower::open(opened.session, reader, out);
@@ -122,10 +122,10 @@ Json report_json(const MeterState& state, const char* measured_key, std::uint64_
   return json;
 }
 
-std::string farewell(const MeterState& state) {
+std::string final_line(const MeterState& state) {
   std::string text = "--- " + escaped(state.stream.str()) + ": " + std::to_string(state.seen) +
                      " samples, " + std::to_string(state.lost) + " lost";
-  if (state.restarts > 0) text += ", began anew: " + std::to_string(state.restarts);
+  if (state.restarts > 0) text += ", restarts: " + std::to_string(state.restarts);
   return text + " ---\n";
 }
 

@@ -15,7 +15,7 @@
 
 namespace dssm::ctl {
 
-// What a report may tell beside the measurements.
+// What a report may show beside the measurements.
 struct MeterState {
   StreamId stream;
   std::uint64_t payload_bytes = 0;
@@ -38,13 +38,13 @@ struct Meter {
 
 // Runs until `options.count` reports are made; or until Ctrl-C or the end of the stream, with one
 // more report.
-Result<void> run_meter(const Options& options, Output& out, const Meter& meter);
+Result<void> run_meter(const MeterOptions& options, Output& out, const Meter& meter);
 
 // The keys with which every report as JSON begins. `measured` is the number of what was measured,
 // called `measured_key`: the samples of delays, the intervals of rates.
 Json report_json(const MeterState& state, const char* measured_key, std::uint64_t measured);
 
 // "--- odom:0@pc1: 12 samples, 0 lost ---", before a final report for people.
-std::string farewell(const MeterState& state);
+std::string final_line(const MeterState& state);
 
 }  // namespace dssm::ctl

@@ -16,7 +16,7 @@ std::string short_name(const StreamId& id);
 
 // For each of `streams`, which are all that there are, the shortest name that opens it on the host
 // `own_host`: short_name() where that is enough. dssmd takes a name without a host for its own
-// stream, and refuses one that only several other hosts have; such get "@pc2" behind it.
+// stream, and refuses one that only several other hosts have; such names get "@pc2".
 std::vector<std::string> opening_names(const std::vector<StreamInfo>& streams,
                                        std::string_view own_host);
 

@@ -16,8 +16,8 @@ bool may_come(const Error& why) {
   return why.code == Errc::not_found || why.code == Errc::unavailable;
 }
 
-// Without a reader and without an error when told to stop.
-Result<std::optional<OpenedStream>> open_stream(const Options& options) {
+// Without a reader and without an error after a stop signal.
+Result<std::optional<OpenedStream>> open_stream(const ReadingOptions& options) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
   Result<StreamId> id = StreamId::parse(options.stream);
@@ -28,7 +28,7 @@ Result<std::optional<OpenedStream>> open_stream(const Options& options) {
   const MonoTime deadline = deadline_in(options.wait);
   while (may_come(reader.error()) && MonoClock::now() < deadline) {
     if (stop_requested()) return std::optional<OpenedStream>();
-    reader = session->await_raw_reader(*id, std::min(deadline, deadline_in(kStopLookUp)));
+    reader = session->await_raw_reader(*id, std::min(deadline, deadline_in(kStopCheckPeriod)));
     if (reader) return std::optional(OpenedStream{*session, std::move(*reader), true});
   }
   Error error = with_similar_names(std::move(reader).error(), *session, *id);
@@ -40,14 +40,14 @@ Result<std::optional<OpenedStream>> open_stream(const Options& options) {
 
 }  // namespace
 
-Result<Session> connect(const Options& options) {
+Result<Session> connect(const CommonOptions& options) {
   SessionOptions session_options;
   session_options.socket_path = options.socket_path;
   session_options.program = "dssmctl " + options.verb_name;
   return Session::connect(std::move(session_options));
 }
 
-Result<void> with_stream(const Options& options,
+Result<void> with_stream(const ReadingOptions& options,
                          const std::function<Result<void>(OpenedStream&)>& work) {
   catch_stop_signals();
   Result<std::optional<OpenedStream>> opened = open_stream(options);
@@ -58,7 +58,7 @@ Result<void> with_stream(const Options& options,
 Error with_similar_names(Error error, Session& session, const StreamId& wanted) {
   if (error.code != Errc::not_found) return error;
   const Result<std::vector<StreamInfo>> streams = session.list_streams();
-  if (!streams) return error;  // the first failure is the one to tell
+  if (!streams) return error;  // the first failure is the one to report
   if (streams->empty()) {
     error.message += "; there are no streams at all";
     return error;

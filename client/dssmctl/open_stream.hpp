@@ -11,7 +11,7 @@
 
 namespace dssm::ctl {
 
-Result<Session> connect(const Options& options);
+Result<Session> connect(const CommonOptions& options);
 
 struct OpenedStream {
   Session session;
@@ -19,10 +19,10 @@ struct OpenedStream {
   bool awaited;  // it was not there at first: nothing of it was missed
 };
 
-// For verbs that run until told otherwise: catches stop signals, connects, opens `options.stream`
+// For verbs that run until a stop signal: catches stop signals, connects, opens `options.stream`
 // for reading, waiting up to `options.wait` for it, and does `work` with it. Success without `work`
-// when told to stop before; a failure to open names similar streams.
-Result<void> with_stream(const Options& options,
+// when a stop signal came before; a failure to open names similar streams.
+Result<void> with_stream(const ReadingOptions& options,
                          const std::function<Result<void>(OpenedStream&)>& work);
 
 // `error` with a hint at streams named like `wanted` when it says that there is no such stream.

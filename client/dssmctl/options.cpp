@@ -1,10 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// CLI11 throws what it finds, help included; parse_command_line() is where that ends.
+// Each verb is a subcommand of CLI11. Its options are stored in a struct that the subcommand's
+// callback holds; the callback of the verb that was typed checks what only several options together
+// can get wrong, and hands the struct over. CLI11 throws what it finds, help included;
+// parse_command_line() is where that ends.
 #include "client/dssmctl/options.hpp"
 
 #include <CLI/CLI.hpp>
 #include <limits>
+#include <memory>
+#include <type_traits>
 
 #include "client/dssmctl/text.hpp"
 
@@ -13,7 +18,7 @@ namespace {
 
 constexpr std::uint64_t kMaxWindow = 1'000'000;
 
-// An option whose text is read by `read`: std::string(const std::string&), empty or a complaint.
+// An option whose text is read by `read`: std::string(const std::string&), empty or an error.
 template <class Read>
 CLI::Option* add_parsed(CLI::App* app, const std::string& name, const std::string& placeholder,
                         const std::string& description, Read read) {
@@ -26,11 +31,11 @@ CLI::Option* add_parsed(CLI::App* app, const std::string& name, const std::strin
 
 template <class Target>
 CLI::Option* add_whole(CLI::App* app, const std::string& name, const std::string& placeholder,
-                       const std::string& description, Target& target, std::uint64_t least,
-                       std::uint64_t most = std::numeric_limits<std::uint64_t>::max()) {
+                       const std::string& description, Target& target, std::uint64_t min,
+                       std::uint64_t max = std::numeric_limits<std::uint64_t>::max()) {
   return add_parsed(app, name, placeholder, description,
-                    [&target, least, most](const std::string& text) -> std::string {
-                      const Result<std::uint64_t> value = parse_whole(text, least, most);
+                    [&target, min, max](const std::string& text) -> std::string {
+                      const Result<std::uint64_t> value = parse_whole(text, min, max);
                       if (!value) return value.error().message;
                       if constexpr (std::is_integral_v<Target>) {
                         target = static_cast<Target>(*value);
@@ -74,17 +79,72 @@ CLI::Option* add_real(CLI::App* app, const std::string& name, const std::string&
 
 constexpr const char* kStreamHelp = "the stream, as NAME, NAME:ID or NAME:ID@HOST";
 
-void add_stream(CLI::App* app, Options& options) {
-  app->add_option("STREAM", options.stream, kStreamHelp)->required()->type_name("");
+// What the callbacks of the verbs fill in.
+struct Parsed {
+  CommonOptions common;
+  std::optional<Options> options;
+};
+
+// Not what CLI11 checks itself.
+void require(bool condition, const std::string& error) {
+  if (!condition) throw CLI::ValidationError(error);
 }
 
-void add_wait(CLI::App* app, Options& options) {
-  add_seconds(app, "--wait", "wait so long for the stream to appear, or its host to answer",
-              options.wait, Range::not_negative);
+// The options of `verb`, which are handed over when it is the innermost verb that was typed.
+// `check` may call require(); options are complete then, global ones included.
+template <class VerbOptions, class Check>
+VerbOptions& add_options(CLI::App* verb, Parsed& parsed, Check check) {
+  const auto options = std::make_shared<VerbOptions>();
+  verb->callback([verb, options, check, &parsed] {
+    if (!verb->get_subcommands().empty()) return;
+    static_cast<CommonOptions&>(*options) = parsed.common;
+    check(*options);
+    parsed.options = *options;
+  });
+  return *options;
 }
 
-void add_ls(CLI::App& app, Options& options) {
+template <class VerbOptions>
+VerbOptions& add_options(CLI::App* verb, Parsed& parsed) {
+  return add_options<VerbOptions>(verb, parsed, [](const VerbOptions&) {});
+}
+
+void add_stream(CLI::App* verb, std::string& stream) {
+  verb->add_option("STREAM", stream, kStreamHelp)->required()->type_name("");
+}
+
+void add_wait(CLI::App* verb, Duration& wait) {
+  add_seconds(verb, "--wait", "wait so long for the stream to appear, or its host to answer", wait,
+              Range::not_negative);
+}
+
+void add_interval(CLI::App* verb, const std::string& of, Duration& interval) {
+  add_seconds(verb, "-i,--interval", "time between two " + of + " (default: 1)", interval,
+              Range::positive);
+}
+
+void add_names(CLI::App* verb, bool& names) {
+  verb->add_flag("--names", names, "only names, one per line, for programs");
+}
+
+void check_ls(const LsOptions& options) {
+  require(!options.names || !options.json, "--names and --json: choose one");
+  require(!options.names || !options.watch, "--names and --watch: choose one");
+  require(!options.watch || (!options.reverse && options.sort == LsOptions().sort),
+          "--watch shows changes in the order in which they come: omit --sort and --reverse");
+}
+
+std::string check_sort_key(std::string& key) {
+  for (const char* known : {"created", "name", "id", "host", "size", "depth", "cycle", "rate",
+                            "age", "writers", "readers", "type", "memory"}) {
+    if (key == known) return {};
+  }
+  return "'" + escaped(key) + "' is not a key to sort by";
+}
+
+void add_ls(CLI::App& app, Parsed& parsed) {
   CLI::App* ls = app.add_subcommand("ls", "list the streams of all hosts");
+  LsOptions& options = add_options<LsOptions>(ls, parsed, check_ls);
   ls->add_option("PATTERN", options.pattern,
                  "only streams whose NAME or NAME:ID this shell pattern fits, as 'camera*'")
       ->type_name("");
@@ -93,51 +153,62 @@ void add_ls(CLI::App& app, Options& options) {
       ->type_name("HOST")
       ->allow_extra_args(false)  // one value per --host, so that PATTERN may follow
       ->excludes(own);
-  ls->add_flag("--watch", options.watch, "go on: a line for each stream that comes or goes");
-  ls->add_flag("--names", options.names, "only names, one per line, for programs");
+  ls->add_flag("--watch", options.watch,
+               "continue: a line for each stream that is added or removed");
+  add_names(ls, options.names);
   ls->add_option("--sort", options.sort,
                  "created, name, id, host, size, depth, cycle, rate, age, writers, readers, type "
                  "or memory (default: created)")
       ->type_name("KEY")
-      ->check(CLI::Validator(
-          [](std::string& key) -> std::string {
-            for (const char* known : {"created", "name", "id", "host", "size", "depth", "cycle",
-                                      "rate", "age", "writers", "readers", "type", "memory"}) {
-              if (key == known) return {};
-            }
-            return "'" + escaped(key) + "' is no key to sort by";
-          },
-          ""));
-  ls->add_flag("-r,--reverse", options.reverse, "the other way round");
+      ->check(CLI::Validator(check_sort_key, ""));
+  ls->add_flag("-r,--reverse", options.reverse, "in reverse order");
 }
 
-void add_hosts(CLI::App& app, Options& options) {
+void add_hosts(CLI::App& app, Parsed& parsed) {
   CLI::App* hosts = app.add_subcommand("hosts", "list the hosts, and how they are reached");
-  hosts->add_flag("--names", options.names, "only names, one per line, for programs");
+  HostsOptions& options = add_options<HostsOptions>(hosts, parsed, [](const HostsOptions& all) {
+    require(!all.names || !all.json, "--names and --json: choose one");
+  });
+  add_names(hosts, options.names);
+}
+
+void add_clock(CLI::App& app, Parsed& parsed) {
   CLI::App* clock = app.add_subcommand("clock", "how good the hosts' clocks are");
-  CLI::Option* watch = clock->add_flag("--watch", options.watch, "go on: anew each second");
+  ClockOptions& options = add_options<ClockOptions>(clock, parsed);
+  CLI::Option* watch = clock->add_flag("--watch", options.watch, "continue: all again each second");
   CLI::Option* table = add_whole(clock, "--table", "N",
                                  "average, maximum, minimum and standard deviation of N readings, "
                                  "one a second",
                                  options.table, 1, kMaxWindow);
-  add_seconds(clock, "--wait", "until this host's clock is good, for so long at most",
-              options.clock_wait, Range::not_negative)
+  add_seconds(clock, "--wait", "until this host's clock is good, for so long at most", options.wait,
+              Range::not_negative)
       ->excludes(watch)
       ->excludes(table);
   table->excludes(watch);
-  app.add_subcommand("doctor", "look for what is wrong, and say what mends it");
-  CLI::App* ping = app.add_subcommand("ping", "ask another host's dssmd for a sign of life");
+}
+
+void add_ping(CLI::App& app, Parsed& parsed) {
+  CLI::App* ping = app.add_subcommand("ping", "test whether another host's dssmd answers");
+  PingOptions& options = add_options<PingOptions>(ping, parsed);
   ping->add_option("HOST", options.host, "a name that `dssmctl hosts` shows")
       ->required()
       ->type_name("");
   add_whole(ping, "-c,--count", "N", "end after N questions", options.count, 1);
-  add_seconds(ping, "-i,--interval", "time between two questions (default: 1)", options.interval,
-              Range::positive);
+  add_interval(ping, "questions", options.interval);
 }
 
-void add_echo(CLI::App& app, Options& options) {
+void add_info(CLI::App& app, Parsed& parsed) {
+  CLI::App* info = app.add_subcommand("info", "all about one stream, or about dssmd");
+  InfoOptions& options = add_options<InfoOptions>(info, parsed);
+  info->add_option("STREAM", options.stream, kStreamHelp)->type_name("");
+}
+
+void add_echo(CLI::App& app, Parsed& parsed) {
   CLI::App* echo = app.add_subcommand("echo", "show samples as they come");
-  add_stream(echo, options);
+  EchoOptions& options = add_options<EchoOptions>(echo, parsed, [](const EchoOptions& all) {
+    require(!all.csv || !all.json, "--csv and --json: choose one");
+  });
+  add_stream(echo, options.stream);
   CLI::Option* last = echo->add_flag("--last", options.last, "the newest sample, then end");
   add_parsed(echo, "--at", "TIME",
              "the newest sample at or before TIME, then end: seconds since 1970, or, with a minus "
@@ -158,23 +229,28 @@ void add_echo(CLI::App& app, Options& options) {
       ->allow_extra_args(false);  // one value per --field, so that STREAM may follow
   echo->add_flag("--full", options.full, "leave nothing out of long payloads");
   echo->add_flag("--csv", options.csv, "a header line, then one row per sample");
-  add_wait(echo, options);
+  add_wait(echo, options.wait);
 }
 
-void add_meter(CLI::App& app, const std::string& name, const std::string& description,
-               Options& options) {
+template <class VerbOptions>
+void add_meter(CLI::App& app, Parsed& parsed, const std::string& name,
+               const std::string& description) {
   CLI::App* meter = app.add_subcommand(name, description);
-  add_stream(meter, options);
+  VerbOptions& options = add_options<VerbOptions>(meter, parsed);
+  add_stream(meter, options.stream);
   add_whole(meter, "-w,--window", "N", "over the newest N samples (default: 10000)", options.window,
             2, kMaxWindow);
   add_whole(meter, "-n,--count", "N", "end after N reports", options.count, 1);
-  add_seconds(meter, "-i,--interval", "time between two reports (default: 1)", options.interval,
-              Range::positive);
-  add_wait(meter, options);
+  add_interval(meter, "reports", options.interval);
+  add_wait(meter, options.wait);
 }
 
-void add_create(CLI::App& app, Options& options) {
+void add_create(CLI::App& app, Parsed& parsed) {
   CLI::App* create = app.add_subcommand("create", "create a stream");
+  CreateOptions& options = add_options<CreateOptions>(create, parsed, [](const CreateOptions& all) {
+    require(all.depth > 0 || all.life,
+            "how much history? give --depth N, or --life SECONDS and --cycle SECONDS");
+  });
   create->add_option("NAME", options.stream, "its name, as NAME, NAME:ID or NAME:ID@HOST")
       ->required()
       ->type_name("");
@@ -194,78 +270,78 @@ void add_create(CLI::App& app, Options& options) {
              [&options](const std::string& text) -> std::string {
                const Result<std::uint64_t> value = parse_whole(text, 1, 64);
                if (!value) return value.error().message;
-               if ((*value & (*value - 1)) != 0) return "'" + text + "' is no power of two";
+               if ((*value & (*value - 1)) != 0) return "'" + text + "' is not a power of two";
                options.alignment_bytes = static_cast<std::uint32_t>(*value);
                return {};
              });
 }
 
-void add_property(CLI::App& app, Options& options) {
+void add_rm(CLI::App& app, Parsed& parsed) {
+  CLI::App* rm = app.add_subcommand("rm", "remove streams");
+  RmOptions& options = add_options<RmOptions>(rm, parsed);
+  rm->add_option("STREAM", options.streams, kStreamHelp)->required()->type_name("");
+}
+
+void add_property(CLI::App& app, Parsed& parsed) {
   CLI::App* property = app.add_subcommand("property", "show or set a stream's property");
   property->require_subcommand(1);
   CLI::App* get = property->add_subcommand("get", "write the property's bytes to a file");
-  add_stream(get, options);
-  get->add_option("FILE", options.file, "where to; - or nothing: standard output")->type_name("");
+  PropertyOptions& to = add_options<PropertyGetOptions>(get, parsed);
+  add_stream(get, to.stream);
+  get->add_option("FILE", to.file, "where to; - or nothing: standard output")->type_name("");
   CLI::App* set = property->add_subcommand("set", "replace the property by a file's bytes");
-  add_stream(set, options);
-  set->add_option("FILE", options.file, "where from; - or nothing: standard input")->type_name("");
+  PropertyOptions& from = add_options<PropertySetOptions>(set, parsed);
+  add_stream(set, from.stream);
+  set->add_option("FILE", from.file, "where from; - or nothing: standard input")->type_name("");
 }
 
-void add_playback(CLI::App& app, Options& options) {
-  CLI::App* playback = app.add_subcommand("playback", "show or turn the PC's playback clock");
+void add_playback(CLI::App& app, Parsed& parsed) {
+  CLI::App* playback = app.add_subcommand("playback", "show or change the PC's playback clock");
   playback->require_subcommand(0, 1);
-  playback->add_subcommand("show", "show the clock");
-  CLI::App* set = playback->add_subcommand("set", "turn the clock");
-  CLI::Option* offset = add_real(set, "--offset", "SECONDS", "its offset from speed * real time",
-                                 options.playback_offset_s);
-  add_real(set, "--speed", "X", "how fast it runs: 1 as real time, 0 stands, -1 backwards",
-           options.playback_speed);
-  add_real(set, "--time", "SECONDS", "what time it is on it now, in seconds since 1970",
-           options.playback_time_s)
+  const auto add = [&](const char* name, const char* description) -> PlaybackOptions& {
+    return add_options<PlaybackOptions>(playback->add_subcommand(name, description), parsed);
+  };
+  add_options<PlaybackOptions>(playback, parsed);
+  add("show", "show the clock");
+  PlaybackOptions& changed = add("set", "change the clock");
+  CLI::App* set = playback->get_subcommand("set");
+  CLI::Option* offset =
+      add_real(set, "--offset", "SECONDS", "its offset from speed * real time", changed.offset_s);
+  add_real(set, "--speed", "X", "how fast it runs: 1 as real time, 0 not at all, -1 backwards",
+           changed.speed);
+  add_real(set, "--time", "SECONDS", "its time now, in seconds since 1970", changed.time_s)
       ->excludes(offset);
   set->require_option(1, 0);
-  playback->add_subcommand("pause", "stop the clock");
-  playback->add_subcommand("resume", "let it run again");
-  playback->add_subcommand("reset", "back to real time");
+  add("pause", "stop the clock").paused = true;
+  add("resume", "let it run again").paused = false;
+  add("reset", "back to real time").reset = true;
 }
 
-void add_all(CLI::App& app, Options& options) {
-  // Global options may also stand behind the verb; verbs made after these lines inherit both.
+void add_all(CLI::App& app, Parsed& parsed) {
+  // Global options may also follow the verb; verbs made after these lines inherit both.
   app.fallthrough();
-  app.footer("--socket and --json may stand before or behind the verb; more in dssmctl(1).");
+  app.footer("--socket and --json may precede or follow the verb; more in dssmctl(1).");
   app.require_subcommand(1);
   app.set_version_flag("--version", "dssmctl " DSSM_VERSION, "show the version and end");
-  app.add_option("--socket", options.socket_path,
+  app.add_option("--socket", parsed.common.socket_path,
                  "where dssmd listens (default: $DSSM_SOCKET, else /run/dssm/dssmd.sock)")
       ->type_name("PATH");
-  app.add_flag("--json", options.json, "output for programs");
-  add_ls(app, options);
-  add_hosts(app, options);
-  CLI::App* info = app.add_subcommand("info", "all about one stream, or about dssmd");
-  info->add_option("STREAM", options.stream, kStreamHelp)->type_name("");
-  add_echo(app, options);
-  add_meter(app, "hz", "how often samples come", options);
-  add_meter(app, "bw", "how many bytes come", options);
-  add_meter(app, "delay", "how old samples are when they arrive", options);
-  add_create(app, options);
-  CLI::App* rm = app.add_subcommand("rm", "remove streams");
-  rm->add_option("STREAM", options.streams, kStreamHelp)->required()->type_name("");
-  add_property(app, options);
-  add_playback(app, options);
-}
-
-// What only several options together can get wrong.
-std::string complaint_about(const Options& options) {
-  if (options.verb == Verb::create && options.depth == 0 && !options.life) {
-    return "how much history? give --depth N, or --life SECONDS and --cycle SECONDS";
-  }
-  if (options.csv && options.json) return "--csv and --json: choose one";
-  if (options.names && options.json) return "--names and --json: choose one";
-  if (options.names && options.watch) return "--names and --watch: choose one";
-  if (options.watch && (options.reverse || options.sort != Options().sort)) {
-    return "--watch shows changes in the order in which they come: leave --sort and --reverse away";
-  }
-  return {};
+  app.add_flag("--json", parsed.common.json, "output for programs");
+  add_ls(app, parsed);
+  add_hosts(app, parsed);
+  add_clock(app, parsed);
+  add_options<DoctorOptions>(
+      app.add_subcommand("doctor", "check for what usually goes wrong, and how to fix it"), parsed);
+  add_ping(app, parsed);
+  add_info(app, parsed);
+  add_echo(app, parsed);
+  add_meter<HzOptions>(app, parsed, "hz", "how often samples come");
+  add_meter<BwOptions>(app, parsed, "bw", "how many bytes come");
+  add_meter<DelayOptions>(app, parsed, "delay", "how old samples are when they arrive");
+  add_create(app, parsed);
+  add_rm(app, parsed);
+  add_property(app, parsed);
+  add_playback(app, parsed);
 }
 
 // The innermost verb that was recognised; `app` itself when there was none.
@@ -284,39 +360,10 @@ std::string verb_name(const CLI::App& app) {
   return name;
 }
 
-std::optional<Verb> verb_of(std::string_view name) {
-  static constexpr std::pair<std::string_view, Verb> kVerbs[] = {
-      {"ls", Verb::ls},
-      {"hosts", Verb::hosts},
-      {"clock", Verb::clock},
-      {"doctor", Verb::doctor},
-      {"ping", Verb::ping},
-      {"info", Verb::info},
-      {"echo", Verb::echo},
-      {"hz", Verb::hz},
-      {"bw", Verb::bw},
-      {"delay", Verb::delay},
-      {"create", Verb::create},
-      {"rm", Verb::rm},
-      {"property get", Verb::property_get},
-      {"property set", Verb::property_set},
-      {"playback", Verb::playback_show},
-      {"playback show", Verb::playback_show},
-      {"playback set", Verb::playback_set},
-      {"playback pause", Verb::playback_pause},
-      {"playback resume", Verb::playback_resume},
-      {"playback reset", Verb::playback_reset},
-  };
-  for (const auto& [known, verb] : kVerbs) {
-    if (known == name) return verb;
-  }
-  return std::nullopt;
-}
-
-CommandLine usage_error(const CLI::App& app, const std::string& complaint) {
+CommandLine usage_error(const CLI::App& app, const std::string& error) {
   const std::string verb = verb_name(app);
   return {std::nullopt,
-          "dssmctl: " + (verb.empty() ? "" : verb + ": ") + escaped_message(complaint) +
+          "dssmctl: " + (verb.empty() ? "" : verb + ": ") + escaped_message(error) +
               "; see 'dssmctl " + (verb.empty() ? "" : verb + " ") + "--help'\n",
           false};
 }
@@ -324,9 +371,9 @@ CommandLine usage_error(const CLI::App& app, const std::string& complaint) {
 }  // namespace
 
 CommandLine parse_command_line(int argc, const char* const* argv) {
-  Options options;
+  Parsed parsed;
   CLI::App app("Show and manage streams of sensor samples, on this PC and on others.", "dssmctl");
-  add_all(app, options);
+  add_all(app, parsed);
   if (argc < 2) return {std::nullopt, app.help(), false};
   try {
     app.parse(argc, argv);
@@ -344,14 +391,9 @@ CommandLine parse_command_line(int argc, const char* const* argv) {
     }
     return usage_error(app, "there is no verb " + word);
   }
-  options.verb_name = verb_name(app);
-  const std::optional<Verb> verb = verb_of(options.verb_name);
-  if (!verb) return usage_error(app, "a verb is missing");  // not reached: CLI11 insists on one
-  options.verb = *verb;
-  if (std::string complaint = complaint_about(options); !complaint.empty()) {
-    return usage_error(app, complaint);
-  }
-  return {std::move(options), {}, true};
+  if (!parsed.options) return usage_error(app, "a verb is missing");  // CLI11 requires one
+  std::visit([&](CommonOptions& options) { options.verb_name = verb_name(app); }, *parsed.options);
+  return {std::move(parsed.options), {}, true};
 }
 
 }  // namespace dssm::ctl

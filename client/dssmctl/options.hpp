@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The command line: what it may say, checked as far as that is possible without asking anybody.
+// The command line: one struct of options per verb, checked as far as that is possible without
+// asking dssmd. run() of verbs.hpp takes each of them.
 #pragma once
 
 #include <cstdint>
@@ -8,90 +9,109 @@
 #include <dssm/time.hpp>
 #include <optional>
 #include <string>
+#include <variant>
 #include <vector>
 
 namespace dssm::ctl {
 
-enum class Verb : unsigned char {
-  ls,
-  hosts,
-  clock,
-  doctor,
-  ping,
-  info,
-  echo,
-  hz,
-  bw,
-  delay,
-  create,
-  rm,
-  property_get,
-  property_set,
-  playback_show,
-  playback_set,
-  playback_pause,
-  playback_resume,
-  playback_reset
+// Of all verbs.
+struct CommonOptions {
+  std::string verb_name;    // as typed, "property get": for messages
+  std::string socket_path;  // empty: the default
+  bool json = false;
 };
 
-struct Options {
-  Verb verb = Verb::ls;
-  std::string verb_name;  // as typed, "property get": for messages
-
-  // for all verbs
-  std::string socket_path;
-  bool json = false;
-
-  // most: which stream; empty for `info` about dssmd itself
-  std::string stream;
-  std::vector<std::string> streams;  // rm
-  Duration wait{};                   // echo, hz, bw, delay: how long for the stream to appear
-
-  // ls
+struct LsOptions : CommonOptions {
+  std::string pattern;             // only streams whose names fit; empty: all
   bool own = false;                // only this host's
   std::vector<std::string> hosts;  // only theirs; empty: of all
-  std::string pattern;             // only streams whose names fit; empty: all
-  bool watch = false;              // also for clock
-  bool names = false;              // also for hosts
+  bool watch = false;
+  bool names = false;
   std::string sort = "created";
   bool reverse = false;
+};
 
-  // clock
-  std::optional<std::uint64_t> table;  // readings
-  std::optional<Duration> clock_wait;
+struct HostsOptions : CommonOptions {
+  bool names = false;
+};
 
-  // ping
+struct ClockOptions : CommonOptions {
+  bool watch = false;
+  std::optional<std::uint64_t> table;  // number of readings
+  std::optional<Duration> wait;
+};
+
+struct DoctorOptions : CommonOptions {};
+
+struct PingOptions : CommonOptions {
   std::string host;
-
-  // echo; `count` also for hz, bw, delay (reports) and ping (questions)
   std::optional<std::uint64_t> count;
+  Duration interval = std::chrono::seconds(1);
+};
+
+struct InfoOptions : CommonOptions {
+  std::string stream;  // empty: about dssmd itself
+};
+
+// Of verbs that read a stream.
+struct ReadingOptions : CommonOptions {
+  std::string stream;
+  Duration wait{};                     // how long for the stream to appear
+  std::optional<std::uint64_t> count;  // of samples or reports
+};
+
+struct EchoOptions : ReadingOptions {
   std::optional<Duration> at;
   bool at_counts_back = false;  // from the newest sample; `at` is then 0 or less
   bool last = false;
   bool csv = false;
   bool full = false;
   std::vector<std::string> fields;
-
-  // hz, bw, delay; `interval` also for ping
-  std::uint64_t window = 10'000;
-  Duration interval = std::chrono::seconds(1);
-
-  // create
-  std::uint64_t payload_bytes = 0;
-  std::uint32_t alignment_bytes = 0;  // 0: the greatest that a type of this size may have
-  std::uint64_t depth = 0;
-  std::optional<Duration> life, cycle;
-  std::string type;
-
-  // property
-  std::string file = "-";
-
-  // playback set
-  std::optional<double> playback_offset_s, playback_speed, playback_time_s;
 };
 
+// Of hz, bw and delay.
+struct MeterOptions : ReadingOptions {
+  std::uint64_t window = 10'000;
+  Duration interval = std::chrono::seconds(1);
+};
+struct HzOptions : MeterOptions {};
+struct BwOptions : MeterOptions {};
+struct DelayOptions : MeterOptions {};
+
+struct CreateOptions : CommonOptions {
+  std::string stream;
+  std::uint64_t payload_bytes = 0;
+  std::uint32_t alignment_bytes = 0;  // 0: the greatest that a type of this size may have
+  std::uint64_t depth = 0;            // 0: `life` and `cycle` are given
+  std::optional<Duration> life, cycle;
+  std::string type;
+};
+
+struct RmOptions : CommonOptions {
+  std::vector<std::string> streams;
+};
+
+struct PropertyOptions : CommonOptions {
+  std::string stream;
+  std::string file = "-";
+};
+struct PropertyGetOptions : PropertyOptions {};
+struct PropertySetOptions : PropertyOptions {};
+
+// What to change of the playback clock; nothing: show it.
+struct PlaybackOptions : CommonOptions {
+  std::optional<bool> paused;
+  bool reset = false;
+  std::optional<double> offset_s, speed, time_s;
+};
+
+using Options =
+    std::variant<LsOptions, HostsOptions, ClockOptions, DoctorOptions, PingOptions, InfoOptions,
+                 EchoOptions, HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions,
+                 PropertyGetOptions, PropertySetOptions, PlaybackOptions>;
+
 // Either options to work with, or a text that ends the program at once: help and version on
-// standard output, a complaint on standard error.
+// standard output, an error on standard error.
 struct CommandLine {
   std::optional<Options> options;
   std::string text;

@@ -20,7 +20,7 @@ bool Output::flush() {
     const ssize_t written = ::write(fd_, rest.data(), rest.size());
     if (written >= 0) {
       rest.remove_prefix(static_cast<std::size_t>(written));
-    } else if (errno == EAGAIN) {  // somebody made our terminal or pipe non-blocking
+    } else if (errno == EAGAIN) {  // another program made our terminal or pipe non-blocking
       pollfd wanted{fd_, POLLOUT, 0};
       ::poll(&wanted, 1, -1);
     } else if (errno != EINTR) {
@@ -32,7 +32,7 @@ bool Output::flush() {
   return !stopped_;
 }
 
-bool Output::reader_gone() {
+bool Output::reader_ended() {
   pollfd state{fd_, 0, 0};
   if (::poll(&state, 1, 0) > 0 && (state.revents & POLLERR)) stopped_ = true;
   return stopped_;
@@ -42,7 +42,7 @@ std::string Output::bold(std::string_view text) const {
   return colour_ ? "\x1b[1m" + std::string(text) + "\x1b[0m" : std::string(text);
 }
 
-void complain(std::string_view text) {
+void print_error(std::string_view text) {
   Output err(STDERR_FILENO);
   err.add(text);
   err.flush();

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Standard output, gathered in one string and written with as few system calls as possible: a list
-// of a thousand streams is one write. A reader that goes away (`| head`) is no failure: writing
+// of a thousand streams is one write. A reader that ends (`| head`) is not an error: writing
 // then stops quietly, and the program ends with success, as a person expects of a pipe.
 #pragma once
 
@@ -18,22 +18,22 @@ class Output {
   // Appends to what the next flush() writes.
   void add(std::string_view text) { pending_ += text; }
 
-  // Writes all that is pending. Whether it is worth to go on: false when the reader is gone or
-  // writing failed.
+  // Writes all that is pending. Returns whether to continue: false when the reader ended or writing
+  // failed.
   bool flush();
 
   // Flushes when a good amount is pending: for verbs that print without end.
   bool flush_some() { return pending_.size() < kBatchBytes ? !stopped_ : flush(); }
 
   // Whether the other end of a pipe was closed, also while nothing is written.
-  bool reader_gone();
+  bool reader_ended();
 
   // What went wrong when writing; a closed pipe does not count.
   const Result<void>& result() const { return result_; }
 
   bool terminal() const { return terminal_; }
 
-  // `text` in bold where a person looks at a terminal and $NO_COLOR is not set.
+  // `text` in bold on a terminal when $NO_COLOR is not set.
   std::string bold(std::string_view text) const;
 
  private:
@@ -48,6 +48,6 @@ class Output {
 };
 
 // Writes `text` to standard error, at once.
-void complain(std::string_view text);
+void print_error(std::string_view text);
 
 }  // namespace dssm::ctl

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl ping: asks the dssmd of another host for a sign of life, over the connection that this
-// PC's dssmd keeps to it, in the manner of ping(8). The time is from dssmd to dssmd: how long a
+// dssmctl ping: sends a heartbeat to the dssmd of another host, over the connection that this PC's
+// dssmd keeps to it, in the manner of ping(8). The time is from dssmd to dssmd: how long a
 // request of one to the other takes.
 #include <algorithm>
 #include <cmath>
@@ -19,12 +19,13 @@
 namespace dssm::ctl {
 namespace {
 
-// For the summary: more answers than anybody waits for; then the newest ones.
+// For the summary; of more answers the newest ones.
 constexpr std::size_t kKeptAnswers = 1'000'000;
 
 class Ping {
  public:
-  Ping(const Options& options, Output& out) : host_(options.host), json_(options.json), out_(out) {}
+  Ping(const PingOptions& options, Output& out)
+      : host_(options.host), json_(options.json), out_(out) {}
 
   void on_answer(const RoundTrip& answer) {
     ++asked_;
@@ -41,20 +42,19 @@ class Ping {
              std::to_string(asked_) + " time=" + duration_text(answer.round_trip) + "\n");
   }
 
-  // Told to stop before the answer came.
+  // A stop signal came before the answer.
   void on_stop() { ++asked_; }
 
-  void on_silence(const Error& why) {
+  void on_no_answer(const Error& error) {
     ++asked_;
     if (json_) {
       return out_.add(json_line(
-          {{"host", host_}, {"seq", asked_}, {"round_trip_ns", Json()}, {"error", why.message}}));
+          {{"host", host_}, {"seq", asked_}, {"round_trip_ns", Json()}, {"error", error.message}}));
     }
-    out_.add("no answer: seq=" + std::to_string(asked_) + ": " + escaped_message(why.message) +
+    out_.add("no answer: seq=" + std::to_string(asked_) + ": " + escaped_message(error.message) +
              "\n");
   }
 
-  // The last words.
   void summary() {
     const Statistics times = times_.statistics();
     if (json_) {
@@ -94,26 +94,26 @@ bool is_known(Session& session, const std::string& name) {
                               [&](const HostInfo& host) { return host.name == name; });
 }
 
-bool must_stop(Output& out) { return stop_requested() || out.reader_gone(); }
+bool must_stop(Output& out) { return stop_requested() || out.reader_ended(); }
 
-// Asks in a thread of its own, because the answer of a host that is silent takes seconds, and
-// nobody who wants to stop waits for it: then none.
+// Asks in a thread of its own, because it takes seconds until a host counts as not answering, and
+// Ctrl-C must not wait for that: nothing then.
 std::optional<Result<RoundTrip>> ask(const Session& session, const std::string& host, Output& out) {
   std::packaged_task<Result<RoundTrip>()> question(
       [asked = session, host]() mutable { return asked.ping(host); });
   std::future<Result<RoundTrip>> answer = question.get_future();
   std::thread(std::move(question)).detach();
-  while (answer.wait_for(kStopLookUp) != std::future_status::ready) {
+  while (answer.wait_for(kStopCheckPeriod) != std::future_status::ready) {
     if (must_stop(out)) return std::nullopt;
   }
   return answer.get();
 }
 
-// Sleeps until `due`. Whether to go on: false when told to stop or when nobody reads our output.
+// Sleeps until `due`. False when a stop signal came or our output is no longer read.
 bool wait_until(MonoTime due, Output& out) {
   while (MonoClock::now() < due) {
     if (must_stop(out)) return false;
-    const Duration rest = std::min(due - MonoClock::now(), kStopLookUp);
+    const Duration rest = std::min(due - MonoClock::now(), kStopCheckPeriod);
     std::this_thread::sleep_for(rest);
   }
   return true;
@@ -121,7 +121,7 @@ bool wait_until(MonoTime due, Output& out) {
 
 }  // namespace
 
-Result<void> run_ping(const Options& options, Output& out) {
+Result<void> run(const PingOptions& options, Output& out) {
   catch_stop_signals();
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
@@ -138,7 +138,7 @@ Result<void> run_ping(const Options& options, Output& out) {
     } else if (ping.asked() == 0 && !is_known(*session, options.host)) {
       return answer->error();
     } else {
-      ping.on_silence(answer->error());
+      ping.on_no_answer(answer->error());
     }
     due = std::max(due + options.interval, MonoClock::now());
   } while (out.flush() && ping.asked() != options.count && wait_until(due, out));

@@ -10,26 +10,18 @@
 namespace dssm::ctl {
 namespace {
 
-void turn(PlaybackClock& clock, const Options& options) {
-  switch (options.verb) {
-    case Verb::playback_pause:
-      return clock.set_paused(true);
-    case Verb::playback_resume:
-      return clock.set_paused(false);
-    case Verb::playback_reset:
-      return clock.reset();
-    case Verb::playback_set:
-      // Speed first: it moves the offset to keep the clock continuous.
-      if (options.playback_speed) clock.set_speed(*options.playback_speed);
-      if (options.playback_offset_s) clock.set_offset(*options.playback_offset_s);
-      if (options.playback_time_s) clock.set_time(*options.playback_time_s);
-      return;
-    default:
-      return;
-  }
+// Whether there was something to change.
+bool change(PlaybackClock& clock, const PlaybackOptions& options) {
+  if (options.reset) clock.reset();
+  if (options.paused) clock.set_paused(*options.paused);
+  // Speed first: it moves the offset to keep the clock continuous.
+  if (options.speed) clock.set_speed(*options.speed);
+  if (options.offset_s) clock.set_offset(*options.offset_s);
+  if (options.time_s) clock.set_time(*options.time_s);
+  return options.reset || options.paused || options.speed || options.offset_s || options.time_s;
 }
 
-void print(const PlaybackClock& clock, const Options& options, Output& out) {
+void print(const PlaybackClock& clock, const PlaybackOptions& options, Output& out) {
   const PlaybackClock::Setting setting = clock.setting();
   const double now_s = clock.now_s();
   if (options.json) {
@@ -46,14 +38,13 @@ void print(const PlaybackClock& clock, const Options& options, Output& out) {
 
 }  // namespace
 
-Result<void> run_playback(const Options& options, Output& out) {
+Result<void> run(const PlaybackOptions& options, Output& out) {
   Result<Session> session = connect(options);
   if (!session) return std::move(session).error();
   Result<PlaybackClock> clock = session->open_playback_clock();
   if (!clock) return std::move(clock).error();
-  turn(*clock, options);
-  const bool asked = options.verb == Verb::playback_show;
-  if (asked || options.json) print(*clock, options, out);
+  const bool changed = change(*clock, options);
+  if (!changed || options.json) print(*clock, options, out);
   return {};
 }
 

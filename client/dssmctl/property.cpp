@@ -14,7 +14,7 @@
 namespace dssm::ctl {
 namespace {
 
-// A descriptor that is closed unless it is one of the standard ones.
+// A descriptor; closed unless it is one of the standard ones.
 class File {
  public:
   explicit File(int fd) : fd_(fd) {}
@@ -29,7 +29,7 @@ class File {
   int fd_;
 };
 
-// No property is longer; whoever feeds us /dev/zero shall hear so instead of filling the memory.
+// The greatest property; a read of /dev/zero fails instead of filling the memory.
 constexpr std::size_t kMaxPropertyBytes = 16U << 20;
 
 Result<std::vector<std::byte>> read_all(const std::string& path) {
@@ -69,7 +69,7 @@ Result<void> write_all(const std::string& path, std::span<const std::byte> bytes
 
 }  // namespace
 
-Result<void> run_property_get(const Options& options, Output& out) {
+Result<void> run(const PropertyGetOptions& options, Output& out) {
   Result<StreamId> id = StreamId::parse(options.stream);
   if (!id) return std::move(id).error();
   Result<Session> session = connect(options);
@@ -92,7 +92,7 @@ Result<void> run_property_get(const Options& options, Output& out) {
   return {};
 }
 
-Result<void> run_property_set(const Options& options, Output& out) {
+Result<void> run(const PropertySetOptions& options, Output& out) {
   Result<StreamId> id = StreamId::parse(options.stream);
   if (!id) return std::move(id).error();
   const Result<std::vector<std::byte>> property = read_all(options.file);

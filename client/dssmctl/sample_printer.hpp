@@ -29,7 +29,7 @@ class SamplePrinter {
   SamplePrinter(Output& out, SampleForm form, bool full, StreamId stream,
                 std::vector<Field> fields);
 
-  // What stands before the first sample: CSV's header line.
+  // What precedes the first sample: CSV's header line.
   void begin();
 
   const std::vector<Field>& fields() const { return fields_; }
@@ -37,7 +37,7 @@ class SamplePrinter {
   // What came between a sample and those before it.
   struct Breaks {
     std::uint64_t lost = 0;      // samples right before it that were overwritten unread
-    std::uint64_t restarts = 0;  // how often the stream began anew since the start
+    std::uint64_t restarts = 0;  // of the stream, since the start
   };
   void sample(const SampleInfo& info, std::span<const std::byte> payload, const Breaks& breaks);
 

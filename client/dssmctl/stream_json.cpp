@@ -8,7 +8,7 @@ namespace dssm::ctl {
 namespace {
 
 Json mirror_json(const MirrorInfo& mirror) {
-  return {{"state", mirror.state},
+  return {{"state", name_of(mirror.state)},
           {"newest_tid", mirror.newest != kNoTid ? Json(mirror.newest) : Json()},
           {"received_samples", mirror.received_samples},
           {"received_bytes", mirror.received_bytes},

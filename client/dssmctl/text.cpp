@@ -47,7 +47,8 @@ std::string quoted(std::string_view text) {
 }
 
 Error bad_seconds(std::string_view text) {
-  return {Errc::invalid_argument, quoted(text) + " is no number of seconds, such as 0.025 or -1.5"};
+  return {Errc::invalid_argument,
+          quoted(text) + " is not a number of seconds, such as 0.025 or -1.5"};
 }
 
 Error too_many_seconds(std::string_view text) {
@@ -232,7 +233,7 @@ Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t least, st
   if (error != std::errc() || end != text.data() + text.size() || value < least || value > most) {
     std::string range = "from " + std::to_string(least);
     if (most != std::numeric_limits<std::uint64_t>::max()) range += " to " + std::to_string(most);
-    return Error{Errc::invalid_argument, quoted(text) + " is no whole number " + range};
+    return Error{Errc::invalid_argument, quoted(text) + " is not a whole number " + range};
   }
   return value;
 }
@@ -243,7 +244,7 @@ Result<double> parse_real(std::string_view text) {
   if (digits.starts_with('+')) digits.remove_prefix(1);  // from_chars takes no plus sign
   const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), value);
   if (error != std::errc() || end != digits.data() + digits.size() || !std::isfinite(value)) {
-    return Error{Errc::invalid_argument, quoted(text) + " is no number"};
+    return Error{Errc::invalid_argument, quoted(text) + " is not a number"};
   }
   return value;
 }

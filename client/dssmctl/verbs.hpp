@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What dssmctl can do: one function per verb, one file per group of them. Each connects, works, and
-// adds what it has to say to `out`; main() flushes and turns a failure into an exit status.
+// What dssmctl can do: run() once per verb, one file per group of them. Each connects, works, and
+// adds its output to `out`; main() flushes and turns a failure into an exit status.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -11,20 +11,20 @@
 
 namespace dssm::ctl {
 
-Result<void> run_ls(const Options& options, Output& out);
-Result<void> run_hosts(const Options& options, Output& out);
-Result<void> run_clock(const Options& options, Output& out);
-Result<void> run_doctor(const Options& options, Output& out);
-Result<void> run_ping(const Options& options, Output& out);
-Result<void> run_info(const Options& options, Output& out);
-Result<void> run_echo(const Options& options, Output& out);
-Result<void> run_hz(const Options& options, Output& out);
-Result<void> run_bw(const Options& options, Output& out);
-Result<void> run_delay(const Options& options, Output& out);
-Result<void> run_create(const Options& options, Output& out);
-Result<void> run_rm(const Options& options, Output& out);
-Result<void> run_property_get(const Options& options, Output& out);
-Result<void> run_property_set(const Options& options, Output& out);
-Result<void> run_playback(const Options& options, Output& out);
+Result<void> run(const LsOptions& options, Output& out);
+Result<void> run(const HostsOptions& options, Output& out);
+Result<void> run(const ClockOptions& options, Output& out);
+Result<void> run(const DoctorOptions& options, Output& out);
+Result<void> run(const PingOptions& options, Output& out);
+Result<void> run(const InfoOptions& options, Output& out);
+Result<void> run(const EchoOptions& options, Output& out);
+Result<void> run(const HzOptions& options, Output& out);
+Result<void> run(const BwOptions& options, Output& out);
+Result<void> run(const DelayOptions& options, Output& out);
+Result<void> run(const CreateOptions& options, Output& out);
+Result<void> run(const RmOptions& options, Output& out);
+Result<void> run(const PropertyGetOptions& options, Output& out);
+Result<void> run(const PropertySetOptions& options, Output& out);
+Result<void> run(const PlaybackOptions& options, Output& out);
 
 }  // namespace dssm::ctl

@@ -56,7 +56,8 @@ HostInfo host_info(const local::Host& message) {
   host.name = message.name();
   host.addresses.assign(message.addresses().begin(), message.addresses().end());
   host.version = message.version();
-  host.state = message.state();
+  host.state = wire::enum_untrusted(message.state(), HostState::closed);
+  host.reason = wire::enum_untrusted(message.reason(), HostReason::namesake);
   host.since = Duration(message.since_ns());
   host.round_trip = Duration(message.round_trip_ns());
   host.min_round_trip = Duration(message.least_round_trip_ns());
@@ -308,7 +309,7 @@ Result<DaemonInfo> Session::daemon_info() {
       daemon.streams(),
       daemon.memory_bytes(),
       daemon.memory_limit_bytes(),
-      {mdns.phase().empty() ? "off" : mdns.phase(), mdns.trouble(), mdns.avahi_version(),
+      {wire::enum_untrusted(mdns.phase(), MdnsPhase::running), mdns.error(), mdns.avahi_version(),
        mdns.announced(), mdns.withheld(), mdns.own_host_seen(), mdns.hosts_heard()}};
 }
 

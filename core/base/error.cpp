@@ -6,7 +6,9 @@
 #include <cstddef>
 #include <dssm/clock_status.hpp>
 #include <dssm/error.hpp>
+#include <dssm/host_state.hpp>
 #include <dssm/sample.hpp>
+#include <dssm/stream.hpp>
 #include <system_error>
 
 namespace dssm {
@@ -111,6 +113,31 @@ std::string_view name_of(ClockReason trouble) noexcept {
   static constexpr std::array<std::string_view, 6> kNames = {
       "none", "no chronyd", "chronyd is silent", "not synchronised", "stepped", "too far"};
   return name_in(kNames, trouble);
+}
+
+std::string_view name_of(HostState state) noexcept {
+  static constexpr std::array<std::string_view, 7> kNames = {
+      "unknown", "self", "up", "connecting", "down", "refused", "closed"};
+  return name_in(kNames, state);
+}
+
+std::string_view name_of(HostReason reason) noexcept {
+  static constexpr std::array<std::string_view, 12> kNames = {
+      "none",        "name not found", "connection refused", "no answer",
+      "no greeting", "not accepted",   "no address",         "closed there",
+      "closed here", "spare address",  "duplicate",          "namesake"};
+  return name_in(kNames, reason);
+}
+
+std::string_view name_of(MdnsPhase phase) noexcept {
+  static constexpr std::array<std::string_view, 3> kNames = {"off", "waiting", "running"};
+  return name_in(kNames, phase);
+}
+
+std::string_view name_of(MirrorState state) noexcept {
+  static constexpr std::array<std::string_view, 6> kNames = {
+      "unknown", "connecting", "filling", "live", "owner unavailable", "removed"};
+  return name_in(kNames, state);
 }
 
 std::string_view name_of(ClockBasis basis) noexcept {

@@ -4,6 +4,8 @@
 #include <algorithm>
 #include <cstring>
 
+#include "core/wire/messages.hpp"
+
 namespace dssm::wire {
 namespace {
 
@@ -20,11 +22,6 @@ bool take_16_untrusted(const std::string& bytes, std::array<std::uint8_t, 16>& i
   if (bytes.size() != id.size()) return false;
   std::memcpy(id.data(), bytes.data(), id.size());
   return true;
-}
-
-template <class Enum>
-Enum enum_untrusted(std::uint32_t value, Enum last, Enum otherwise) noexcept {
-  return value <= static_cast<std::uint32_t>(last) ? static_cast<Enum>(value) : otherwise;
 }
 
 void take_standing_untrusted(const proto::ClockStatus& message, clock::SyncChain& out) {
@@ -87,10 +84,9 @@ ClockReport clock_report_untrusted(const proto::ClockStatus& message, MonoTime h
   ClockReport report;
   report.heard = heard;
   take_standing_untrusted(message, report.standing);
-  report.status =
-      enum_untrusted(message.status(), ClockStatus::out_of_bounds, ClockStatus::unknown);
-  report.trouble = enum_untrusted(message.trouble(), ClockReason::too_far, ClockReason::none);
-  report.basis = enum_untrusted(message.basis(), ClockBasis::own, ClockBasis::nothing);
+  report.status = enum_untrusted(message.status(), ClockStatus::out_of_bounds);
+  report.trouble = enum_untrusted(message.trouble(), ClockReason::too_far);
+  report.basis = enum_untrusted(message.basis(), ClockBasis::own);
   report.offset = Duration(message.offset_ns());
   report.update_interval = Duration(std::max<std::int64_t>(message.update_interval_ns(), 0));
   report.age = Duration(std::max<std::int64_t>(message.age_ns(), 0));

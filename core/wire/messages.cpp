@@ -19,9 +19,15 @@ TypeInfo type_info(const proto::Type& message) {
 }
 
 MirrorInfo mirror_info(const proto::Mirror& message) {
-  return {message.state(),          message.gap_samples(), message.reconnects(),
-          message.restarts(),       message.newest(),      message.received_samples(),
-          message.received_bytes(), message.error(),       message.clock()};
+  return {enum_untrusted(message.state(), MirrorState::removed),
+          message.gap_samples(),
+          message.reconnects(),
+          message.restarts(),
+          message.newest(),
+          message.received_samples(),
+          message.received_bytes(),
+          message.error(),
+          message.clock()};
 }
 
 }  // namespace
@@ -73,7 +79,7 @@ void to_message(const StreamInfo& info, proto::Stream& out) {
 }
 
 void to_message(const MirrorInfo& info, proto::Mirror& out) {
-  out.set_state(info.state);
+  out.set_state(static_cast<proto::Mirror::State>(info.state));
   out.set_gap_samples(info.gap_samples);
   out.set_reconnects(info.reconnects);
   out.set_restarts(info.restarts);

@@ -17,6 +17,13 @@ inline constexpr std::size_t kMaxPropertyBytes = 16U << 20;
 inline constexpr std::size_t kMaxFields = 1024;
 inline constexpr std::size_t kMaxProgramBytes = 127;
 
+// The value of an enum that came in a message; the first one, which means that nothing is known,
+// when it is beyond the last one that is known here.
+template <class Enum>
+Enum enum_untrusted(std::int64_t value, Enum last) noexcept {
+  return value >= 0 && value <= static_cast<std::int64_t>(last) ? static_cast<Enum>(value) : Enum{};
+}
+
 // Public types to messages.
 void to_message(const StreamId& id, proto::StreamId& out);
 void to_message(const TypeInfo& type, proto::Type& out);

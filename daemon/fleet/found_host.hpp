@@ -5,6 +5,7 @@
 #pragma once
 
 #include <cstdint>
+#include <dssm/host_state.hpp>
 #include <string>
 #include <vector>
 
@@ -26,30 +27,12 @@ struct FoundHost {
   friend bool operator==(const FoundHost&, const FoundHost&) = default;
 };
 
-// How mDNS fares here. A value.
-struct MdnsState {
-  enum class Phase : std::uint8_t {
-    off,      // not wanted (mdns = false)
-    waiting,  // there is no Avahi daemon to talk to; tried again and again
-    running,
-  };
-  Phase phase = Phase::off;
-  std::string trouble;            // why it waits; or what goes wrong while it runs; may be empty
-  std::string avahi_version;      // "avahi 0.8"
-  std::uint32_t announced = 0;    // services that are established: streams, and the host itself
-  std::uint32_t withheld = 0;     // wanted, but refused or beyond Avahi's limits; see `trouble`
-  bool own_host_seen = false;     // our browser sees our own host's service
-  std::uint32_t hosts_heard = 0;  // other hosts heard of by multicast, not this PC's own
-
-  friend bool operator==(const MdnsState&, const MdnsState&) = default;
-};
-
 // Told in the thread of the event loop that the finder was given.
 class HostFinderObserver {
  public:
   virtual void on_host_found(const FoundHost& host) = 0;  // or something of it has changed
   virtual void on_host_lost(const wire::HostId& id) = 0;  // mDNS does not know it any more
-  virtual void on_mdns_state(const MdnsState&) {}
+  virtual void on_mdns_state(const MdnsInfo&) {}
 
  protected:
   ~HostFinderObserver() = default;

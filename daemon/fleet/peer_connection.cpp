@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/fleet/peer_connection.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <utility>
 
@@ -10,33 +12,33 @@ namespace {
 // A frame that we send is no larger than a property and its stream's name.
 constexpr std::size_t kMaxOutputBytes = PeerConnection::kMaxWaitingBytes + (2U << 20);
 
-// Silence while bytes of ours still wait for the peer's kernel to take them: a large property on a
-// slow network keeps our heartbeats from going out. Whether the peer's PC is alive is then watched
-// by our kernel (TCP_USER_TIMEOUT); this bounds how long its dssmd may hang.
-constexpr Duration kSilenceBehindOutput = 10 * wire::kPeerTimeout;
+// The peer timeout while bytes of ours wait for the peer's kernel to take them: a large property on
+// a slow network delays our heartbeats. Whether the peer's PC is alive is then observed by our
+// kernel (TCP_USER_TIMEOUT); this bounds how long its dssmd may hang.
+constexpr Duration kPeerTimeoutWithOutput = 10 * wire::kPeerTimeout;
 
-// It is there, but will not do before somebody changes something.
-bool is_refusal(const Error& why) noexcept {
-  return why.code == Errc::protocol || why.code == Errc::conflict ||
-         why.code == Errc::no_permission || why.code == Errc::limit_exceeded ||
-         why.code == Errc::invalid_argument;
+// The peer answers, but retries do not help until somebody changes something.
+bool is_refusal(const Error& error) noexcept {
+  return error.code == Errc::protocol || error.code == Errc::conflict ||
+         error.code == Errc::no_permission || error.code == Errc::limit_exceeded ||
+         error.code == Errc::invalid_argument;
+}
+
+HostReason reason_of(const Error& error, Dialer::Phase reached) noexcept {
+  if (is_refusal(error)) return HostReason::not_accepted;
+  switch (reached) {
+    case Dialer::Phase::look_up:
+      return HostReason::name_not_found;
+    case Dialer::Phase::greet:
+      return HostReason::no_greeting;
+    case Dialer::Phase::connect:
+    case Dialer::Phase::up:
+      break;
+  }
+  return error.code == Errc::no_daemon ? HostReason::connection_refused : HostReason::no_answer;
 }
 
 }  // namespace
-
-std::string_view state_name(PeerConnection::State state) noexcept {
-  switch (state) {
-    case PeerConnection::State::connecting:
-      return "connecting";
-    case PeerConnection::State::up:
-      return "up";
-    case PeerConnection::State::down:
-      return "down";
-    case PeerConnection::State::refused:
-      return "refused";
-  }
-  return "";
-}
 
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver,
                                std::optional<wire::HostId> expected, Dialer::Options options,
@@ -62,51 +64,56 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const 
 void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) {
   configured_ = addresses.front();
   dialer_.set_addresses(addresses);
-  if (state_ != State::up) dialer_.retry_now();
+  if (state_ != HostState::up) dialer_.retry_now();
 }
 
-void PeerConnection::enter(State state, std::optional<Error> why) {
+void PeerConnection::enter(HostState state, HostReason reason, std::optional<Error> error) {
   if (state != state_) since_ = loop_.now();
   state_ = state;
-  why_ = std::move(why);
+  reason_ = reason;
+  last_error_ = std::move(error);
 }
 
 void PeerConnection::on_up(FrameConnection&, const wire::Greeting& them) {
   if (expected_ && them.host_id != *expected_) {
-    return dialer_.restart({Errc::conflict, "at '" + address() + "' answers " + them.str() +
-                                                ", which is another one than was found there"});
+    return dialer_.restart({Errc::conflict, fmt::format("{} answers at '{}', not the host that is "
+                                                        "announced there",
+                                                        them.str(), address())});
   }
   them_ = them;
-  enter(State::up, std::nullopt);
-  observer_.on_link_up(*this);
+  enter(HostState::up, HostReason::none, std::nullopt);
+  observer_.on_peer_up(*this);
 }
 
-void PeerConnection::on_down(const Error& why) {
-  const bool attempt = state_ != State::up;
+void PeerConnection::on_down(const Error& error) {
+  const bool attempt = state_ != HostState::up;
   heartbeat_.disable();
   watching_ = false;
   last_round_trip_ = least_round_trip_ = Duration::zero();
-  enter(is_refusal(why) ? State::refused : State::down, why);
+  enter(is_refusal(error) ? HostState::refused : HostState::down,
+        reason_of(error, dialer_.reached()), error);
   const std::map<std::uint64_t, Waiting> unanswered = std::exchange(waiting_, {});
   waiting_bytes_ = 0;
   for (const auto& [serial, waiting] : unanswered) {
-    waiting.then(Error{Errc::unavailable, "host '" + (them_ ? them_->host : configured_.str()) +
-                                              "' went away before it answered: " + why.message});
+    waiting.then(Error{Errc::unavailable,
+                       fmt::format("the connection to host '{}' ended before it answered: {}",
+                                   them_ ? them_->host : configured_.str(), error.message)});
   }
-  observer_.on_link_down(*this, why, attempt);
+  observer_.on_peer_down(*this, error, attempt);
 }
 
 void PeerConnection::ask(net::Frame request, Then then) {
   FrameConnection* link = dialer_.link();
   if (!link || !link->is_open()) {
-    return then(Error{Errc::unavailable, "host at '" + address() + "' does not answer any more"});
+    return then(
+        Error{Errc::unavailable, "the host at '" + address() + "' is not connected any more"});
   }
   const std::size_t bytes = request.ByteSizeLong();
   if (waiting_.size() >= kMaxWaiting || waiting_bytes_ + bytes > kMaxWaitingBytes) {
     return then(Error{Errc::limit_exceeded,
-                      "host '" + them_->host + "' has not answered " +
-                          std::to_string(waiting_.size()) +
-                          " requests of this host's programs yet; ask again in a second"});
+                      fmt::format("host '{}' has not answered {} requests of this host's programs "
+                                  "yet; retry in a second",
+                                  them_->host, waiting_.size())});
   }
   request.set_serial(next_serial_++);
   waiting_bytes_ += bytes;
@@ -117,7 +124,7 @@ void PeerConnection::ask(net::Frame request, Then then) {
 Result<void> PeerConnection::on_frame(net::Frame& frame) {
   if (frame.serial() != 0) {
     auto waiting = waiting_.extract(frame.serial());
-    if (!waiting) return Error{Errc::protocol, "it answers what nobody asked"};
+    if (!waiting) return Error{Errc::protocol, "it sends a response without a request"};
     waiting_bytes_ -= waiting.mapped().bytes;
     if (frame.has_failure()) {
       waiting.mapped().then(wire::failure(frame.failure()));
@@ -139,32 +146,31 @@ void PeerConnection::watch() {
   request.mutable_watch();
   ask(std::move(request), [this](const Result<net::Frame>& answer) {
     if (answer) return observer_.on_watched(*this);
-    // Words of the peer: without its streams it is of no use. (When the connection broke, nothing.)
+    // The peer refuses: without its streams it is of no use. (When the connection broke, no effect.)
     drop(Error(answer.error()).context("watch the streams of host '" + them_->host + "'"));
   });
 }
 
-void PeerConnection::keep_alive() { beat(); }
+void PeerConnection::start_heartbeat() { beat(); }
 
-// Comes every kHeartbeat, or when the silence has lasted too long, whichever is first.
+// Called every kHeartbeat, or when the peer timeout is over, whichever is first. This is where a
+// peer that does not answer any more counts as dead (peers.hpp).
 void PeerConnection::beat() {
   FrameConnection* link = dialer_.link();
   if (!link) return;
   const MonoTime now = loop_.now();
-  const Duration silence = now - link->last_heard();
-  const Duration allowed = link->output_empty() ? wire::kPeerTimeout : kSilenceBehindOutput;
-  if (silence >= allowed) {
+  const Duration silent = now - link->last_heard();
+  const Duration timeout = link->output_empty() ? wire::kPeerTimeout : kPeerTimeoutWithOutput;
+  if (silent >= timeout) {
     return dialer_.restart(
         {Errc::unavailable,
-         "no sign of life from host '" + them_->host + "' ('" + address() + "') for " +
-             std::to_string(
-                 std::chrono::duration_cast<std::chrono::milliseconds>(silence).count()) +
-             " ms"});
+         fmt::format("no bytes came from host '{}' ('{}') for {} ms", them_->host, address(),
+                     std::chrono::duration_cast<std::chrono::milliseconds>(silent).count())});
   }
   net::Frame request;
   wire::send_clock(self_, *request.mutable_ping()->mutable_clock());
   ask(std::move(request), [this, now](const Result<net::Frame>& answer) { on_pong(now, answer); });
-  heartbeat_.enable_in(std::min(wire::kHeartbeat, allowed - silence));
+  heartbeat_.enable_in(std::min(wire::kHeartbeat, timeout - silent));
 }
 
 void PeerConnection::take_clock(std::shared_ptr<const wire::ClockReport> clock) {

@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The control connection to one configured peer, or to one host that was found: keeps it up,
-// carries requests and their answers, listens to changes of the peer's streams, and measures that
-// it is alive. What a peer means for the catalog is decided by Peers.
+// carries requests and their answers, receives changes of the peer's streams, and decides by
+// heartbeats whether the peer is alive. What a peer means for the catalog is decided by Peers.
 #pragma once
 
+#include <dssm/host_state.hpp>
 #include <functional>
 #include <map>
 #include <optional>
 #include <string>
-#include <string_view>
 #include <vector>
 
 #include "core/wire/address.hpp"
@@ -30,33 +30,28 @@ class PeerConnection final : private Dialer::Observer {
   static constexpr Duration kFoundRoundTime = std::chrono::milliseconds(1500);
   static constexpr Duration kFoundPause = std::chrono::seconds(1);
 
-  enum class State : unsigned char {
-    connecting,  // not decided yet
-    up,
-    down,     // it cannot be reached
-    refused,  // it answers, but we do not fit together
-  };
-
-  // Told from the loop; must not destroy the link.
+  // Called from the loop; must not destroy the connection.
   class Observer {
    public:
-    virtual void on_link_up(PeerConnection& link) = 0;
+    virtual void on_peer_up(PeerConnection& connection) = 0;
     // It was up, or, `attempt`: it could not be brought up.
-    virtual void on_link_down(PeerConnection& link, const Error& why, bool attempt) = 0;
-    // After watch(): a change of the peer's streams. Fails when that is nonsense.
-    virtual Result<void> on_stream_event_untrusted(PeerConnection& link,
+    virtual void on_peer_down(PeerConnection& connection, const Error& error, bool attempt) = 0;
+    // After watch(): a change of the peer's streams. Fails when it is not valid.
+    virtual Result<void> on_stream_event_untrusted(PeerConnection& connection,
                                                    const proto::StreamEvent& event) = 0;
-    virtual void on_watched(PeerConnection& link) = 0;    // all that was there has been told
-    virtual void on_heartbeat(PeerConnection& link) = 0;  // them() has news of the peer's clock
+    virtual void on_watched(
+        PeerConnection& connection) = 0;  // all streams that it had are reported
+    virtual void on_heartbeat(
+        PeerConnection& connection) = 0;  // them() has the peer's newest clock
 
    protected:
     ~Observer() = default;
   };
 
-  // Starts at once; what is given outlives it. To a configured peer, whoever that is:
+  // Starts at once; what is given outlives it. To a configured peer, whichever host that is:
   PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::Address& peer,
                  const wire::Greeting& self, Observer& observer);
-  // To the host `id`, which is said to be at one of `addresses` (numbers, best first, at least
+  // To the host `id`, which is announced at one of `addresses` (numbers, best first, at least
   // one); any other that answers there is refused.
   PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
                  const std::vector<wire::Address>& addresses, const wire::Greeting& self,
@@ -66,8 +61,8 @@ class PeerConnection final : private Dialer::Observer {
 
   // --- to be called while it is up
 
-  // Sends a request (its serial is set here). `then` gets the answer, or why there is none: the
-  // peer's own words, limit_exceeded (too much is waiting), unavailable (not up, or the connection
+  // Sends a request (its serial is set here). `then` gets the answer or an error: the
+  // peer's own, limit_exceeded (too much is waiting), unavailable (not up, or the connection
   // broke). Called once, from the loop, or at once when nothing was sent.
   using Then = std::function<void(Result<net::Frame>)>;
   void ask(net::Frame request, Then then);
@@ -75,21 +70,22 @@ class PeerConnection final : private Dialer::Observer {
   // From now on on_stream_event_untrusted().
   void watch();
 
-  // Heartbeats, and death after kPeerTimeout without any sign of life.
-  void keep_alive();
+  // Sends a heartbeat each second, and closes the connection when the peer is dead: see beat().
+  void start_heartbeat();
 
-  // Gives the connection up and tries again later.
-  void drop(const Error& why) { dialer_.restart(why); }
+  // Closes the connection and dials again later.
+  void drop(const Error& error) { dialer_.restart(error); }
 
   // Where to go from the next attempt on, which comes at once unless it is up.
   void set_addresses(const std::vector<wire::Address>& addresses);
 
   // --- about the peer
 
-  State state() const noexcept { return state_; }
+  HostState state() const noexcept { return state_; }     // connecting, up, down or refused
+  HostReason reason() const noexcept { return reason_; }  // none while it is up or connecting
   Duration in_this_state_for() const noexcept { return loop_.now() - since_; }
-  const std::optional<Error>& why() const noexcept { return why_; }  // it is not up
-  // Who answers there; while it is not up, who did last.
+  const std::optional<Error>& last_error() const noexcept { return last_error_; }  // while not up
+  // The greeting of the host that answers there; while it is not up, of the last one.
   const std::optional<wire::Greeting>& them() const noexcept { return them_; }
   // As configured; of a found host: its first address.
   const wire::Address& configured() const noexcept { return configured_; }
@@ -108,11 +104,11 @@ class PeerConnection final : private Dialer::Observer {
 
   void on_up(FrameConnection& link, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
-  void on_down(const Error& why) override;
+  void on_down(const Error& error) override;
   void beat();
   void take_clock(std::shared_ptr<const wire::ClockReport> clock);
   void on_pong(MonoTime asked, const Result<net::Frame>& answer);
-  void enter(State state, std::optional<Error> why);
+  void enter(HostState state, HostReason reason, std::optional<Error> error);
 
   PeerConnection(const EventLoop& loop, Resolver& resolver, std::optional<wire::HostId> expected,
                  Dialer::Options options, Observer& observer);
@@ -122,9 +118,10 @@ class PeerConnection final : private Dialer::Observer {
   const std::optional<wire::HostId> expected_;
   const wire::Greeting self_;
   Observer& observer_;
-  State state_ = State::connecting;
+  HostState state_ = HostState::connecting;
+  HostReason reason_ = HostReason::none;
   MonoTime since_ = loop_.now();
-  std::optional<Error> why_;
+  std::optional<Error> last_error_;
   std::optional<wire::Greeting> them_;
   Duration last_round_trip_{}, least_round_trip_{};
   bool watching_ = false;
@@ -134,8 +131,5 @@ class PeerConnection final : private Dialer::Observer {
   EventSource heartbeat_;
   Dialer dialer_;  // last: it calls the others
 };
-
-// "connecting", "up" ...; static storage.
-std::string_view state_name(PeerConnection::State state) noexcept;
 
 }  // namespace dssm::daemon

@@ -1,9 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Configured peers (key peers) and hosts that mDNS finds, as the two sources of the catalog: a
-// control connection to each, of which at most one per host is in use. It is the connection whose
-// life is the host's life: when it comes up the host is up, when it breaks or falls silent the host
-// is down, with all its streams.
+// control connection to each, of which at most one per host is in use. While that connection is up,
+// the host is up; when it ends, the host is down, and its streams leave the catalog.
+//
+// Which code decides that a host is dead:
+//
+//   PeerConnection::beat()      once a second: no byte came for 2.8 s (wire::kPeerTimeout), or, while
+//                               output waits for the peer's kernel to take it, for 28 s
+//                               (kPeerTimeoutWithOutput): a large property on a slow network delays
+//                               our own heartbeats. Then it closes the connection. (That the peer's
+//                               PC is off, our kernel finds out earlier: TCP_USER_TIMEOUT.)
+//   Peers::on_peer_down()       the host is down, by this or because the connection broke:
+//                               another connection to it takes over, else
+//                               Catalog::host_down() removes it, and mirrors and remote writers, as
+//                               observers of the catalog, end their channels to it
 //
 //   a host at two configured addresses
 //     The second connection stands by and takes over when the first ends.
@@ -12,27 +23,26 @@
 //     connection to that host is up; when that one breaks, the found addresses are tried at once
 //     beside the configured one, and the first that comes up is used.
 //   a host that mDNS does not know any more
-//     The connection is the truth: the host is forgotten when that is not up.
+//     The connection decides: the host is removed when it is not up.
 //   an announcement with a wrong id
-//     Whoever answers there is refused, and while a host is up nobody else is looked for at its
-//     address, so that announcements cannot bring up, replace or disturb another host than the one
-//     that they name.
+//     Any other host that answers there is refused, and while a host is up no other one is dialed at
+//     its address, so that announcements cannot bring up, replace or disturb another host than the
+//     one that they name.
 //   this very dssmd
-//     Is left alone.
-//   another PC with this one's id (a cloned disk, and the same name)
-//     Is left alone, with a warning. Found ones too are asked who they are: what mDNS tells of our
-//     own id may be an echo of our own announcement, which is passed over without a word.
-//   two hosts of one name
+//     Is connected to and not used.
+//   a duplicate: another dssmd with this host's id (a cloned disk, and the same name)
+//     Is connected to and not used, with a warning. Found ones are asked for their instance id, too:
+//     what mDNS finds with our own id may be an echo of our own announcement, which is ignored.
+//   namesakes: two hosts of one name
 //     Both are kept; `@name` is then a conflict; a warning.
-//   a host with our own name
-//     Is known, but its streams are not: nothing could tell them from our own; a warning.
+//   a namesake of this host
+//     Is known, but its streams are not: they could not be distinguished from our own; a warning.
 #pragma once
 
 #include <functional>
 #include <list>
 #include <map>
 #include <memory>
-#include <optional>
 #include <string>
 #include <vector>
 
@@ -41,135 +51,104 @@
 #include "daemon/base/rate_limited_logger.hpp"
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/fleet/found_host.hpp"
-#include "daemon/fleet/peer_connection.hpp"
-#include "local.pb.h"
+#include "daemon/fleet/peer.hpp"
+#include "daemon/fleet/peer_report.hpp"
 
 namespace dssm::daemon {
 
 class Peers final : public HostFinderObserver, private PeerConnection::Observer {
  public:
-  // So long after the start nobody waits any more for peers that were not heard of.
-  static constexpr Duration kSettleTime = std::chrono::seconds(1);
-  // What mDNS may have us follow: anybody on the network can announce hosts.
+  // How long requests wait at most, after the start, for peers that were not tried yet.
+  static constexpr Duration kStartupTime = std::chrono::seconds(1);
+  // Limits for mDNS: any PC on the network can announce hosts.
   static constexpr std::size_t kMaxFoundHosts = 256;
   static constexpr std::size_t kMaxAddressesOfHost = 16;
 
-  // self: what to say, and how to know oneself. What is given by reference outlives it.
+  // self: the greeting, by which this host recognizes itself. What is given by reference outlives
+  // it.
   Peers(const EventLoop& loop, Resolver& resolver, const std::vector<wire::Address>& peers,
         wire::Greeting self, Catalog& catalog, Logger& logger);
   Peers(const Peers&) = delete;
   Peers& operator=(const Peers&) = delete;
   ~Peers();
 
-  // Takes these configured peers in place of those before: new ones are dialed, those that are not
-  // among them any more are dropped. To be called from the loop.
+  // Replaces the configured peers: new ones are dialed, those that are no longer configured are
+  // dropped. To be called from the loop.
   void set_configured(const std::vector<wire::Address>& peers);
 
-  // Called from the loop after changes, several of them together; {}: nobody.
+  // Called from the loop after changes, several of them together; {}: no callback.
   void on_change(std::function<void()> then) { on_change_ = std::move(then); }
 
   // There is a finder, which will call the functions below. To be called before the loop runs.
-  //   insecure  found hosts may be reached over the network, in the clear; else only those on this
+  //   insecure  found hosts may be reached over the network, unencrypted; else only those on this
   //             PC's loopback
   void expect_finder(bool insecure);
   void on_host_found(const FoundHost& host) override;
   void on_host_lost(const wire::HostId& id) override;
-  void on_mdns_state(const MdnsState& state) override;
+  void on_mdns_state(const MdnsInfo& state) override;
   // How the finder fares; off: there is none.
-  const MdnsState& mdns() const noexcept { return mdns_; }
+  const MdnsInfo& mdns() const noexcept { return mdns_; }
 
   // The connection to a host that is up; nullptr: there is none.
-  PeerConnection* link_to(const wire::HostId& id);
+  PeerConnection* connection_to(const wire::HostId& id);
 
-  // Whether kSettleTime passed, or the first word of each configured peer came, good or bad, and
-  // there is no finder that might still find others: mDNS has no end, so when it works the time is
-  // waited for, and when there is no Avahi nobody waits for it.
-  bool settled() const noexcept { return settled_; }
-  // Called once, from the loop, when it settles.
-  void on_settled(std::function<void()> then) { on_settled_ = std::move(then); }
+  // Whether kStartupTime passed, or each configured peer was tried and there is no finder that
+  // might still find others: mDNS has no end, so while it works the time is waited for; without an
+  // Avahi daemon it is not.
+  bool startup_is_over() const noexcept { return startup_is_over_; }
+  // Called once, from the loop.
+  void on_startup_over(std::function<void()> then) { on_startup_over_ = std::move(then); }
 
-  // All configured peers, in the order of the configuration, then the found hosts that none of
-  // their connections stands for.
-  std::vector<local::Host> hosts() const;
-  // What a program may have to know when something is not found: "'pc3:13776' (Connection
-  // refused)"; empty: all peers are up.
-  std::string trouble() const;
-  // A warning that concerns this host itself; empty: none.
-  std::string own_warning() const;
+  // To be used at once.
+  PeerReport report() const { return {peers_, self_.host_id, catalog_, loop_.now()}; }
 
  private:
-  // What a connection that is up is good for.
-  enum class Use : unsigned char { none, in_use, standing_by, self, not_usable };
-  // Why a found host is not dialed, as the list of hosts tells it.
-  struct Obstacle {
-    std::string state;
-    std::string error;
-  };
-  struct Found {
-    FoundHost host;
-    bool listed = true;  // mDNS still knows it
-    MonoTime since;
-    std::vector<wire::Address> usable;  // of its addresses
-    std::optional<Obstacle> obstacle;
-  };
-  struct Peer {
-    std::optional<Found> found;            // else it is configured
-    std::unique_ptr<PeerConnection> link;  // nullptr: a found host that is not dialed
-    Use use = Use::none;
-    bool decided = false;    // its first word came
-    bool told_down = false;  // the log says that it is not up
-    bool leaving = false;    // is not configured any more
-    std::string warning;     // concerns this peer while it is up
-  };
   // Addresses, written as numbers, and who answers there at this moment.
   using Occupied = std::map<std::string, const wire::Greeting*>;
 
-  void on_link_up(PeerConnection& link) override;
-  void on_link_down(PeerConnection& link, const Error& why, bool attempt) override;
-  Result<void> on_stream_event_untrusted(PeerConnection& link,
+  void on_peer_up(PeerConnection& connection) override;
+  void on_peer_down(PeerConnection& connection, const Error& error, bool attempt) override;
+  Result<void> on_stream_event_untrusted(PeerConnection& connection,
                                          const proto::StreamEvent& event) override;
-  void on_watched(PeerConnection& link) override;
-  void on_heartbeat(PeerConnection& link) override;
+  void on_watched(PeerConnection& connection) override;
+  void on_heartbeat(PeerConnection& connection) override;
 
-  Peer& peer_of(const PeerConnection& link);
+  Peer& peer_of(const PeerConnection& connection);
   Peer* found_host(const wire::HostId& id);
   const Peer* in_use(const wire::HostId& id) const;
   bool is_up_as_configured(const wire::HostId& id) const;
   void on_own_id(Peer& peer);
-  void use(Peer& peer);
+  void start_use(Peer& peer);
   void take_over(const wire::HostId& id);
-  void tend();
-  void tend_found_host(std::list<Peer>::iterator peer, const Occupied& now_occupied);
-  void look_at(Found& found, const Occupied& occupied) const;
-  Occupied occupied() const;
-  void decide(Peer& peer);
-  void settle_if_decided();
-  void settle();
+  std::unique_ptr<PeerConnection> dial(const wire::Address& configured);
 
-  static std::string same_host_warning(const Peer& in_use, const Peer& by);
-  std::string namesake_warning(const Peer& peer) const;
-  bool is_shown(const Peer& peer) const;
-  bool is_shown_by_configured(const Peer& found) const;
-  bool shows_use(const Peer& peer) const;
-  local::Host shown(const Peer& peer) const;
+  void reconcile_soon() { reconcile_soon_.enable_in(Duration::zero()); }
+  void reconcile();
+  void reconcile_found_host(std::list<Peer>::iterator peer, const Occupied& now_occupied);
+  void find_usable_addresses(Peer::Found& found, const Occupied& occupied) const;
+  Occupied occupied() const;
+
+  void set_tried(Peer& peer);
+  void end_startup_if_all_tried();
+  void end_startup();
 
   const EventLoop& loop_;
   Resolver& resolver_;
   const wire::Greeting self_;
   Catalog& catalog_;
-  RateLimitedLogger logger_;  // found hosts come and go as whoever announces them likes
+  RateLimitedLogger logger_;  // how often found hosts change is decided by those who announce them
   std::list<Peer> peers_;     // the configured ones first
   bool insecure_ = false;
-  bool told_too_many_ = false;
-  std::uint64_t told_twin_ = 0;  // the life of the one with our id of which the log knows
-  MdnsState mdns_;
+  bool logged_too_many_ = false;
+  std::uint64_t logged_duplicate_ = 0;  // instance id of the duplicate that the log names
+  MdnsInfo mdns_;
   bool finder_is_searching_ = false;
-  bool settled_ = false;
-  std::function<void()> on_settled_, on_change_;
-  EventSource settle_timer_;
-  // Connections end, and those to found hosts begin, only here: never within a call of another
-  // one's.
-  EventSource tend_soon_;
+  bool startup_is_over_ = false;
+  std::function<void()> on_startup_over_, on_change_;
+  EventSource startup_timer_;
+  // Connections end, and those to found hosts begin, only in reconcile(): never within a call of
+  // another one.
+  EventSource reconcile_soon_;
 };
 
 }  // namespace dssm::daemon

@@ -53,7 +53,8 @@ struct Dialer::State {
   FrameConnection::Observer& link_user;
 
   Step step = Step::pause;
-  Duration pause = kFirstPause;  // the next one
+  Phase reached = Phase::look_up;  // in this round, or in the last one
+  Duration pause = kFirstPause;    // the next one
   MonoTime up_since{};
   Resolver::Ticket looking_up;
   std::vector<wire::SocketAddress> addresses;
@@ -90,6 +91,7 @@ void Dialer::State::begin_round() {
   reason.reset();
   last.reset();
   step = Step::look_up;
+  reached = Phase::look_up;
   std::vector<wire::SocketAddress> numbers;
   for (const wire::Address& address : options.addresses) {
     const std::vector<wire::SocketAddress> found = wire::resolve_number(address);
@@ -115,6 +117,7 @@ void Dialer::State::begin_with(std::vector<wire::SocketAddress> found) {
 
 // Tries addresses[current] and, while they fail at once, those behind it.
 void Dialer::State::try_next_address() {
+  reached = Phase::connect;
   for (; current < addresses.size(); ++current) {
     Result<UniqueFd> started = wire::start_connect(addresses[current]);
     if (!started) {
@@ -141,6 +144,7 @@ void Dialer::State::on_connected() {
   }
   wire::set_channel_options(socket.get());
   step = Step::greet;
+  reached = Phase::greet;
   timer.enable_in(wire::kHelloTimeout);
   link = std::make_unique<FrameConnection>(
       loop, wire::make_transport(std::move(socket), wire::TransportEnd::connected), link_user,
@@ -198,6 +202,7 @@ Result<void> Dialer::State::greet_untrusted(const net::Frame& frame) {
   them = *std::move(greeting);
   timer.disable();
   step = Step::up;
+  reached = Phase::up;
   up_since = loop.now();
   observer.on_up(*link, *them);
   return {};
@@ -257,6 +262,8 @@ void Dialer::set_addresses(std::vector<wire::Address> addresses) {
 FrameConnection* Dialer::link() noexcept {
   return state_->step == State::Step::up ? state_->link.get() : nullptr;
 }
+
+Dialer::Phase Dialer::reached() const noexcept { return state_->reached; }
 
 std::string Dialer::address() const {
   const State& state = *state_;

@@ -66,7 +66,10 @@ class Dialer final : private FrameConnection::Observer {
   // for somebody to answer; what is up stays as it is.
   void set_addresses(std::vector<wire::Address> addresses);
 
-  FrameConnection* link() noexcept;       // nullptr unless up
+  FrameConnection* link() noexcept;  // nullptr unless up
+  // For on_down(): how far the attempt or connection had come that ended.
+  enum class Phase : unsigned char { look_up, connect, greet, up };
+  Phase reached() const noexcept;
   std::string address() const;            // connected to, else the first
   bool crosses_network() const noexcept;  // connected to another address than loopback
 

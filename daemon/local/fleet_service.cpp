@@ -32,18 +32,6 @@ Result<proto::Stream> stream_untrusted(const std::string& host, proto::Stream st
   return stream;
 }
 
-std::string_view phase_name(MdnsState::Phase phase) {
-  switch (phase) {
-    case MdnsState::Phase::off:
-      return "off";
-    case MdnsState::Phase::waiting:
-      return "waiting";
-    case MdnsState::Phase::running:
-      return "running";
-  }
-  return "off";
-}
-
 Error unexpected(const std::string& host) {
   return {Errc::protocol, fmt::format("host '{}' sent a response of another kind", host)};
 }
@@ -85,13 +73,13 @@ FleetService::FleetService(const EventLoop& loop, Self self, const Registry& reg
       list_timer_(EventSource::timer(loop, [this] { on_list_timeout(); })) {
   catalog_.add_observer(*this);
   mirrors_.observe(this);
-  peers_.on_settled([this] {
+  peers_.on_startup_over([this] {
     for (const std::function<void()>& go_on : std::exchange(early_, {})) go_on();
   });
 }
 
 FleetService::~FleetService() {
-  peers_.on_settled({});
+  peers_.on_startup_over({});
   mirrors_.observe(nullptr);
   catalog_.remove_observer(*this);
 }
@@ -101,15 +89,15 @@ FleetService::~FleetService() {
 // Goes on when the owner of `id` can be told, or when it is clear that it cannot.
 void FleetService::when_known(const StreamId& id, std::function<void()> go_on) {
   const bool known = !id.host.empty() && catalog_.find_host(id.host);
-  if (known || peers_.settled() || early_.size() >= kMaxEarlyRequests) return go_on();
+  if (known || peers_.startup_is_over() || early_.size() >= kMaxEarlyRequests) return go_on();
   early_.push_back(std::move(go_on));
 }
 
 // What is not found may be at a peer that is away.
-Error FleetService::with_trouble(Error error) const {
+Error FleetService::with_unavailable_peers(Error error) const {
   if (error.code != Errc::not_found) return error;
-  if (const std::string trouble = peers_.trouble(); !trouble.empty()) {
-    error.message += "; not answering at the moment: " + trouble;
+  if (const std::string unavailable = peers_.report().unavailable_peers(); !unavailable.empty()) {
+    error.message += "; not answering at the moment: " + unavailable;
   }
   return error;
 }
@@ -128,7 +116,7 @@ void FleetService::open_reader(const StreamId& id, Then<std::shared_ptr<Stream>>
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (owner) return mirrors_.open(**owner, owned_by(**owner, id), std::move(then));
     if (std::shared_ptr<Stream> mirror = orphan(id)) return then(std::move(mirror));
-    then(with_trouble(owner.error()));
+    then(with_unavailable_peers(owner.error()));
   });
 }
 
@@ -136,7 +124,7 @@ void FleetService::open_writer(const StreamId& id, const CreatePlan* plan, Then<
   const std::optional<CreatePlan> kept = plan ? std::optional(*plan) : std::nullopt;
   when_known(id, [this, id, kept, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
-    if (!owner) return then(with_trouble(owner.error()));
+    if (!owner) return then(with_unavailable_peers(owner.error()));
     writers_.open(**owner, owned_by(**owner, id), kept ? &*kept : nullptr, std::move(then));
   });
 }
@@ -164,11 +152,11 @@ void FleetService::forward(const StreamId& id, const local::Request& request,
     if (!owner) {
       // Info of a mirror whose owner is unavailable comes from here.
       const auto mirror = request.has_info() ? orphan(id) : nullptr;
-      return mirror ? then(describe_mirror(*mirror)) : then(with_trouble(owner.error()));
+      return mirror ? then(describe_mirror(*mirror)) : then(with_unavailable_peers(owner.error()));
     }
     const StreamId named = owned_by(**owner, id);
     // A host in the catalog has a connection.
-    peers_.link_to((*owner)->greeting.host_id)
+    peers_.connection_to((*owner)->greeting.host_id)
         ->ask(network_request(named, request), [this, named, body = request.body_case(),
                                                 then = std::move(then)](Result<net::Frame> answer) {
           if (answer) return then(response_to(body, named, *std::move(answer)));
@@ -227,10 +215,10 @@ void FleetService::list(Then<std::vector<proto::Stream>> then) {
   for (const auto& [id, host] : catalog_.hosts()) {
     net::Frame request;
     request.mutable_list();
-    peers_.link_to(id)->ask(std::move(request),
-                            [this, listing, host_id = id](Result<net::Frame> answer) {
-                              on_list_answer(*listing, host_id, std::move(answer));
-                            });
+    peers_.connection_to(id)->ask(std::move(request),
+                                  [this, listing, host_id = id](Result<net::Frame> answer) {
+                                    on_list_answer(*listing, host_id, std::move(answer));
+                                  });
   }
   if (--listing->unanswered == 0) return finish(*listing);
   listings_.push_back(listing);
@@ -287,14 +275,17 @@ std::vector<local::Host> FleetService::hosts() const {
   self.set_host_id(self_.greeting.host_id.data(), self_.greeting.host_id.size());
   for (const std::string& address : self_.addresses) self.add_addresses(address);
   self.set_version(self_.greeting.version);
-  self.set_state("self");
+  self.set_state(local::Host::SELF);
   self.set_streams(static_cast<std::uint32_t>(registry_.streams().size()));
   self.set_clock_bound_ns(to_ns(wire::clock_bound_of(self_.greeting)));
   wire::send_clock(self_.greeting, *self.mutable_clock());
   self.set_insecure(self_.insecure);
-  self.set_error(peers_.own_warning());
+  const PeerReport report = peers_.report();
+  const PeerProblem warning = report.own_warning();
+  self.set_reason(static_cast<local::Host::Reason>(warning.reason));
+  self.set_error(warning.text);
   self.set_clock_distance_ns(0);
-  for (local::Host& host : peers_.hosts()) {
+  for (local::Host& host : report.hosts()) {
     host.set_clock_distance_ns(to_ns(clock_distance_to(host)));
     hosts.push_back(std::move(host));
   }
@@ -316,10 +307,10 @@ Result<UniqueFd> FleetService::clock_page() const {
 }
 
 local::Mdns FleetService::mdns() const {
-  const MdnsState& state = peers_.mdns();
+  const MdnsInfo& state = peers_.mdns();
   local::Mdns mdns;
-  mdns.set_phase(std::string(phase_name(state.phase)));
-  mdns.set_trouble(printable(state.trouble));
+  mdns.set_phase(static_cast<local::Mdns::Phase>(state.phase));
+  mdns.set_error(printable(state.error));
   mdns.set_avahi_version(printable(state.avahi_version));
   mdns.set_announced(state.announced);
   mdns.set_withheld(state.withheld);
@@ -331,8 +322,8 @@ local::Mdns FleetService::mdns() const {
 void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {
   when_known({"", 0, host}, [this, host, then = std::move(then)]() mutable {
     const Result<const KnownHost*> known = catalog_.find_host(host);
-    if (!known) return then(with_trouble(known.error()));
-    PeerConnection& link = *peers_.link_to((*known)->greeting.host_id);
+    if (!known) return then(with_unavailable_peers(known.error()));
+    PeerConnection& link = *peers_.connection_to((*known)->greeting.host_id);
     net::Frame request;
     wire::send_clock(self_.greeting, *request.mutable_ping()->mutable_clock());
     link.ask(std::move(request), [address = link.address(), &loop = loop_, sent = loop_.now(),

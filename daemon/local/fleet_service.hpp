@@ -78,7 +78,7 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
   Result<local::Response> response_to(local::Request::BodyCase request, const StreamId& id,
                                       net::Frame answer) const;
   void when_known(const StreamId& id, std::function<void()> go_on);
-  Error with_trouble(Error error) const;
+  Error with_unavailable_peers(Error error) const;
   std::shared_ptr<Stream> orphan(const StreamId& id) const;
   local::Response describe_mirror(const Stream& mirror) const;
   std::vector<const KnownHost*> hosts_by_name() const;

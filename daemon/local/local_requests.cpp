@@ -105,7 +105,6 @@ Reply LocalRequests::get_daemon() const {
   daemon.set_streams(registry_.streams().size());
   daemon.set_memory_bytes(registry_.budget().used());
   daemon.set_memory_limit_bytes(registry_.budget().limit());
-  daemon.mutable_mdns()->set_phase("off");  // LocalService fills in more when there is a fleet
   return reply;
 }
 

@@ -310,9 +310,10 @@ Result<std::shared_ptr<Stream>> Mirror::adopt_untrusted(OfferedFiles files) {
 }
 
 void Mirror::describe(proto::Mirror& out) const {
-  static constexpr const char* kWords[] = {"connecting", "filling", "live", "owner away",
-                                           "removed"};
-  out.set_state(kWords[static_cast<int>(state_)]);
+  static constexpr proto::Mirror::State kStates[] = {
+      proto::Mirror::CONNECTING, proto::Mirror::FILLING, proto::Mirror::LIVE,
+      proto::Mirror::OWNER_UNAVAILABLE, proto::Mirror::REMOVED};
+  out.set_state(kStates[static_cast<int>(state_)]);
   out.set_gap_samples(before_.gap_samples + (ring_ ? ring_->gap_samples() : 0));
   out.set_reconnects(reconnects_);
   out.set_restarts(restarts_);

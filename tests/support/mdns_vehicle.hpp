@@ -90,7 +90,7 @@ class MdnsVehicle {
   }
   static bool is_up(Session& on, const std::string& name) {
     const std::vector<HostInfo> found = hosts(on, name);
-    return found.size() == 1 && found[0].state == "up";
+    return found.size() == 1 && found[0].state == HostState::up;
   }
   static bool lists(Session& on, const StreamId& id) {
     for (const StreamInfo& stream : on.list_streams().value()) {

@@ -16,6 +16,7 @@
 #pragma once
 
 #include <dssm/clock_status.hpp>
+#include <dssm/host_state.hpp>
 #include <dssm/playback_clock.hpp>
 #include <dssm/reader.hpp>
 #include <dssm/stream.hpp>
@@ -63,18 +64,7 @@ struct DaemonInfo {
   std::uint64_t streams = 0;
   std::uint64_t memory_bytes = 0;        // of all rings
   std::uint64_t memory_limit_bytes = 0;  // for all rings
-
-  // The search for other hosts by mDNS.
-  struct Mdns {
-    std::string phase;              // "off", "waiting" (for the Avahi daemon), "running"
-    std::string error;              // why it waits, or what fails; empty: nothing does
-    std::string avahi_version;      // "avahi 0.8"
-    std::uint32_t announced = 0;    // services: streams, and the host itself
-    std::uint32_t withheld = 0;     // services that could not be announced
-    bool own_host_seen = false;     // this host's own announcement is visible here
-    std::uint32_t hosts_heard = 0;  // other hosts heard of by multicast
-  };
-  Mdns mdns;
+  MdnsInfo mdns;
 };
 
 // A host's clock as that host reports it (docs/clocks.md), aged to the present.
@@ -97,16 +87,16 @@ struct HostInfo {
   std::string name;                    // empty until it has answered
   std::vector<std::string> addresses;  // as configured and as reached: "pc2:13776"
   std::string version;                 // of its dssmd
-  std::string state;                   // "self", "up", "connecting", "down", "refused", "closed"
-                                       // (found by mDNS, but listens on its own loopback only)
-  Duration since{};                    // how long it has been in this state
-  Duration round_trip{};               // of the last heartbeat (one a second); 0: none yet
-  Duration min_round_trip{};           // of all heartbeats of this connection; 0: none yet
-  std::uint32_t streams = 0;           // that it owns
+  HostState state = HostState::unknown;
+  HostReason reason = HostReason::none;       // why it is not up, or which warning concerns it
+  Duration since{};                           // how long it has been in this state
+  Duration round_trip{};                      // of the last heartbeat (one a second); 0: none yet
+  Duration min_round_trip{};                  // of all heartbeats of this connection; 0: none yet
+  std::uint32_t streams = 0;                  // that it owns
   Duration clock_bound = kUnknownClockError;  // of its samples' times, against the reference PC
   std::optional<ClockInfo> clock;             // empty: it reports none
   bool insecure = false;                      // its traffic is unencrypted
-  std::string error;                          // why it is not up, or a warning; empty: neither
+  std::string error;                          // `reason` in a sentence, for people; empty: none
   std::string id;                     // 32 hex digits, independent of the name; empty: unknown
   std::vector<std::string> found_by;  // "peer" (configured), "mdns"; empty: this PC
 };

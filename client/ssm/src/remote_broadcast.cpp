@@ -49,7 +49,7 @@ Result<std::vector<Broadcast::Host>> Broadcast::hosts() {
   if (!known) return std::move(known).error();
   std::vector<Host> found;
   for (const HostInfo& info : *known) {
-    if (info.state != "self" && info.state != "up") continue;
+    if (info.state != HostState::self && info.state != HostState::up) continue;
     Host host;
     // The last one is where it was reached, if it was configured by another name.
     if (!info.addresses.empty()) split(info.addresses.back(), host.address, host.port);

@@ -120,9 +120,21 @@ struct StreamUser {
   Role role = Role::reader;
 };
 
+enum class MirrorState : std::uint8_t {
+  unknown,            // dssmd is of a later version
+  connecting,         // to the owner, for the first time
+  filling,            // the owner's history is on its way
+  live,               // the mirror has each sample as soon as it is written
+  owner_unavailable,  // the mirror keeps what it has; dssmd reconnects
+  removed,            // the stream was removed; dssmd retries
+};
+
+// "live", "owner unavailable" ...; static storage.
+std::string_view name_of(MirrorState state) noexcept;
+
 // The state of this PC's mirror of another host's stream.
 struct MirrorInfo {
-  std::string state;              // for people: "live", "filling", "connecting", "owner away" ...
+  MirrorState state = MirrorState::unknown;
   std::uint64_t gap_samples = 0;  // lost: the owner's ring no longer held them
   std::uint64_t reconnects = 0;
   std::uint64_t restarts = 0;  // times the owner's ring was replaced by a new one

@@ -30,7 +30,7 @@ struct Mdns::Impl {
 
   HostFinderObserver& observer;
   RateLimitedLogger calm;  // others decide how often there is something to say
-  MdnsState state;
+  MdnsInfo state;
   FoundHosts told;
   std::shared_ptr<MdnsMailbox> mailbox;
   std::thread thread;
@@ -39,9 +39,9 @@ struct Mdns::Impl {
 
 Mdns::Mdns(const EventLoop& loop, Options options, HostFinderObserver& observer, Logger& logger)
     : impl_(std::make_unique<Impl>(observer, logger)) {
-  impl_->state.phase = MdnsState::Phase::waiting;
+  impl_->state.phase = MdnsPhase::waiting;
   if (const Result<void> started = impl_->start(loop, options); !started) {
-    impl_->state.trouble = started.error().message;
+    impl_->state.error = started.error().message;
     logger.error("mDNS is not to be had, only configured peers are found: " +
                  started.error().message);
   }

@@ -65,7 +65,7 @@ std::optional<std::vector<ServiceRecord>> MdnsMailbox::take_wanted() {
   return std::exchange(wanted_, std::nullopt);
 }
 
-void MdnsMailbox::tell(FoundHosts hosts, MdnsState state) {
+void MdnsMailbox::tell(FoundHosts hosts, MdnsInfo state) {
   {
     const std::lock_guard lock(mutex_);
     untold_.hosts = std::move(hosts);

@@ -27,7 +27,7 @@ class MdnsMailbox {
   // What the thread has to say since it was last asked.
   struct News {
     std::optional<FoundHosts> hosts;  // all of them
-    std::optional<MdnsState> state;
+    std::optional<MdnsInfo> state;
     std::vector<std::pair<LogLevel, std::string>> lines;
   };
 
@@ -44,7 +44,7 @@ class MdnsMailbox {
   int orders_fd() const noexcept { return orders_.get(); }
   std::optional<std::vector<ServiceRecord>> take_wanted();  // when it has changed
   bool stopping() const noexcept { return stopping_.load(); }
-  void tell(FoundHosts hosts, MdnsState state);
+  void tell(FoundHosts hosts, MdnsInfo state);
   void log(LogLevel level, std::string text);
   void done();  // the thread's last word
 

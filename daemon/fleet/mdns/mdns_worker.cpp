@@ -62,7 +62,7 @@ MdnsWorker::MdnsWorker(EventLoop& loop, const Mdns::Options& options, MdnsMailbo
       publisher_(loop, options.port, options.stream_pause, *this),
       browser_(loop, options.self, options.port, filter_, *this),
       pause_(kFirstConnectPause) {
-  state_.phase = MdnsState::Phase::waiting;
+  state_.phase = MdnsPhase::waiting;
   orders_ = EventSource::readable(loop, mailbox.orders_fd(), [this] { on_orders(); });
   settle_ = EventSource::timer(loop, [this] { on_settled(); });
   connect_ = EventSource::timer(loop, [this] { connect(); });
@@ -147,21 +147,21 @@ void MdnsWorker::follow_state() {
       failure_ = avahi_client_errno(client_);
       return reopen();
     case AVAHI_CLIENT_CONNECTING:
-      state_.phase = MdnsState::Phase::waiting;
-      state_.trouble = why_waiting(AVAHI_ERR_NO_DAEMON);
+      state_.phase = MdnsPhase::waiting;
+      state_.error = why_waiting(AVAHI_ERR_NO_DAEMON);
       break;
     case AVAHI_CLIENT_S_RUNNING:
     case AVAHI_CLIENT_S_REGISTERING:
     case AVAHI_CLIENT_S_COLLISION: {
-      if (state_.phase != MdnsState::Phase::running) {
+      if (state_.phase != MdnsPhase::running) {
         const char* const version = avahi_client_get_version_string(client_);
         if (!version) {
           failure_ = avahi_client_errno(client_);
           return reopen();
         }
         state_.avahi_version = printable(std::string_view(version).substr(0, 64));
-        state_.phase = MdnsState::Phase::running;
-        state_.trouble.clear();
+        state_.phase = MdnsPhase::running;
+        state_.error.clear();
         pause_ = kFirstConnectPause;
         log(LogLevel::notice, "mDNS works (" + state_.avahi_version + ")");
         told_waiting_ = false;
@@ -182,8 +182,8 @@ void MdnsWorker::reopen() {
 }
 
 void MdnsWorker::wait_for_avahi(int error) {
-  state_.phase = MdnsState::Phase::waiting;
-  state_.trouble = why_waiting(error);
+  state_.phase = MdnsPhase::waiting;
+  state_.error = why_waiting(error);
   connect_.enable_in(pause_);
   pause_ = std::min(2 * pause_, kLongestConnectPause);
   report();
@@ -206,16 +206,16 @@ void MdnsWorker::choose_interfaces() {
 void MdnsWorker::on_avahi_change() { report_.enable_in(kReportSettle); }
 
 void MdnsWorker::report() {
-  MdnsState state = state_;
-  if (state.phase == MdnsState::Phase::waiting) {
+  MdnsInfo state = state_;
+  if (state.phase == MdnsPhase::waiting) {
     // The log hears of it once, however often it is tried again.
     if (!std::exchange(told_waiting_, true)) {
       log(LogLevel::warning,
-          "mDNS waits, other hosts are found only as configured peers: " + state.trouble);
+          "mDNS waits, other hosts are found only as configured peers: " + state.error);
     }
   } else {
     for (const std::string& text : {interface_trouble_, publisher_.trouble(), browser_.trouble()}) {
-      if (!text.empty()) state.trouble += (state.trouble.empty() ? "" : "; ") + text;
+      if (!text.empty()) state.error += (state.error.empty() ? "" : "; ") + text;
     }
     state.announced = publisher_.announced();
     state.own_host_seen = browser_.own_host_seen();

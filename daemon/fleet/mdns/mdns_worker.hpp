@@ -54,7 +54,7 @@ class MdnsWorker final : private AvahiObserver {
   ServicePublisher publisher_;
   HostBrowser browser_;
   AvahiClient* client_ = nullptr;
-  MdnsState state_;
+  MdnsInfo state_;
   std::string interface_trouble_;
   int failure_ = 0;            // of the client, to be dealt with outside its callbacks
   bool renamed_ = false;       // this PC got another name since follow_state() looked

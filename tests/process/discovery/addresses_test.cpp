@@ -100,7 +100,7 @@ TEST_F(Addresses, MakeOneHostOfAPcWithCableAndWifiAndOneOfThemIsEnough) {
     EXPECT_LT(await("pc2 is there by the other interface",
                     [&] {
                       const std::vector<HostInfo> now = hosts(session(1), "pc2");
-                      return now.size() == 1 && now[0].state == "up" &&
+                      return now.size() == 1 && now[0].state == HostState::up &&
                              now[0].addresses.at(0) != used && lists(session(1), kKept);
                     }),
               kWhenAvahiKnows);
@@ -171,7 +171,7 @@ TEST_F(Addresses, MayBeChangedByDhcpOnEitherSide) {
     EXPECT_LT(await("it is up at its new address",
                     [&] {
                       const auto found = hosts(session(other), Network::name(pc));
-                      return found.size() == 1 && found[0].state == "up" &&
+                      return found.size() == 1 && found[0].state == HostState::up &&
                              found[0].addresses.at(0) == fresh + ":13776";
                     }),
               kWhenAvahiKnows);

@@ -17,7 +17,7 @@
 //
 //   found ID NAME closed|open ADDRESS...
 //   lost ID
-//   state PHASE announced=N withheld=N own=0|1 heard=N version=... trouble=...
+//   state PHASE announced=N withheld=N own=0|1 heard=N version=... error=...
 //   log LEVEL TEXT
 //   ended                after Mdns is destroyed
 #include <unistd.h>
@@ -43,12 +43,10 @@ class Printer final : public HostFinderObserver, public Logger {
     std::printf("\n");
   }
   void on_host_lost(const wire::HostId& id) override { std::printf("lost %d\n", id[0]); }
-  void on_mdns_state(const MdnsState& state) override {
-    const char* const phases[] = {"off", "waiting", "running"};
-    std::printf("state %s announced=%u withheld=%u own=%d heard=%u version=%s trouble=%s\n",
-                phases[static_cast<int>(state.phase)], state.announced, state.withheld,
-                state.own_host_seen, state.hosts_heard, state.avahi_version.c_str(),
-                state.trouble.c_str());
+  void on_mdns_state(const MdnsInfo& state) override {
+    std::printf("state %s announced=%u withheld=%u own=%d heard=%u version=%s error=%s\n",
+                name_of(state.phase).data(), state.announced, state.withheld, state.own_host_seen,
+                state.hosts_heard, state.avahi_version.c_str(), state.error.c_str());
   }
   void write(LogLevel level, std::string_view text, const LogFields&) noexcept override {
     std::printf("log %d %.*s\n", static_cast<int>(level), static_cast<int>(text.size()),

@@ -113,7 +113,7 @@ TEST_F(Names, OfACopiedPcAreToldOnBothAndMendedByAnotherName) {
     EXPECT_TRUE(says(warning, "this host's name 'pc1' and machine id")) << warning;
     const std::vector<HostInfo> all = session(pc).list_hosts().value();
     ASSERT_EQ(all.size(), 2u);
-    EXPECT_EQ(all[1].state, "refused");
+    EXPECT_EQ(all[1].state, HostState::refused);
     EXPECT_EQ(all[1].id, all[0].id);
     EXPECT_EQ(all[1].error, warning);
     const std::string advice = doctor(pc);

@@ -71,15 +71,15 @@ TEST_F(Vehicle, KeepsWhatItKnowsWhenAvahiDiesAndFindsNewHostsWhenItIsBack) {
   await_all_up();
   for (int pc = 1; pc <= 3; ++pc) avahi(pc).kill_avahi();
   await("the trouble is told",
-        [&] { return session(1).daemon_info().value().mdns.phase == "waiting"; });
-  EXPECT_NE(session(1).daemon_info().value().mdns.trouble, "");
+        [&] { return session(1).daemon_info().value().mdns.phase == MdnsPhase::waiting; });
+  EXPECT_NE(session(1).daemon_info().value().mdns.error, "");
   EXPECT_TRUE(is_up(session(1), "pc2")) << "connections are the truth";
   dssmd(3).kill_hard();
   await("its death is noticed", [&] { return !is_up(session(1), "pc3"); });
   start_dssmd(3);
   for (int pc = 1; pc <= 3; ++pc) avahi(pc).start_avahi();
   await_all_up();
-  EXPECT_EQ(session(1).daemon_info().value().mdns.phase, "running");
+  EXPECT_EQ(session(1).daemon_info().value().mdns.phase, MdnsPhase::running);
 }
 
 TEST_F(Vehicle, ShowsASecondDssmdOfTheSamePcAsAnotherHost) {

@@ -22,7 +22,7 @@ class Clock : public FleetTest {
 
 TEST_F(Clock, HasARowForEachHostThatIsThere) {
   pc3_.kill_hard();
-  await_state("pc3", "down");
+  await_state("pc3", HostState::down);
   const Json shown = clocks();
   ASSERT_EQ(shown.size(), 2U);
   EXPECT_EQ(shown[0]["host"], "pc1");

@@ -72,7 +72,7 @@ TEST_F(Doctor, TellsAFileFromASocket) {
   std::ofstream(file) << "x";
   const Json daemon = check(doctor({"--socket", file}), "daemon");
   EXPECT_EQ(daemon["status"], "fail");
-  EXPECT_TRUE(contains(daemon["cause"], "is no socket")) << daemon;
+  EXPECT_TRUE(contains(daemon["cause"], "is not a socket")) << daemon;
   const Json nothing = check(doctor({"--socket", file + "-at-all"}), "daemon");
   EXPECT_TRUE(contains(nothing["command"], "unset DSSM_SOCKET")) << nothing;
 }
@@ -97,7 +97,7 @@ TEST_F(DoctorInAFleet, FindsTheHostThatIsDown) {
   EXPECT_EQ(document["ok"], true);
   EXPECT_EQ(Doctor::check(document, "host pc3")["status"], "ok");
   pc3_.kill_hard();
-  await_state("pc3", "down");
+  await_state("pc3", HostState::down);
   document = Doctor::checked(ctl({"doctor", "--json"}));
   EXPECT_EQ(document["ok"], false);
   EXPECT_EQ(Doctor::check(document, "host pc2")["status"], "ok");
@@ -121,7 +121,7 @@ TEST_F(DoctorInAFleet, FindsStreamsOfOneName) {
 TEST_F(Doctor, FindsTwoHostsOfOneName) {
   DaemonProcess namesake({"--peer", daemon_.address()}, "pc1");
   Session session = session_with(namesake);
-  await([&] { return session.list_hosts().value().at(1).state == "refused"; });
+  await([&] { return session.list_hosts().value().at(1).state == HostState::refused; });
   const Json document = doctor({"--socket", namesake.socket_path()});
   EXPECT_EQ(check(document, "host names")["status"], "fail") << document;
 }

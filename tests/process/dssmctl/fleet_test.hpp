@@ -19,8 +19,8 @@ class OtherHosts {
 class FleetTest : protected OtherHosts, public CtlTest {
  protected:
   FleetTest() : CtlTest({"--peer", pc2_.address(), "--peer", pc3_.address()}) {
-    await_state("pc2", "up");
-    await_state("pc3", "up");
+    await_state("pc2", HostState::up);
+    await_state("pc3", HostState::up);
   }
 
   HostInfo host(const std::string& name) {
@@ -29,7 +29,7 @@ class FleetTest : protected OtherHosts, public CtlTest {
     }
     return {};
   }
-  void await_state(const std::string& name, const std::string& state) {
+  void await_state(const std::string& name, HostState state) {
     await([&] { return host(name).state == state; });
   }
 

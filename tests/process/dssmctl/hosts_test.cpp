@@ -45,7 +45,7 @@ TEST_F(Hosts, ShowsThisHostFirstAndHowTheOthersAreReached) {
 
 TEST_F(Hosts, IsASuccessThatSaysWhyAHostIsDown) {
   pc3_.kill_hard();
-  await_state("pc3", "down");
+  await_state("pc3", HostState::down);
   const std::string row = lines_of(output({"hosts"}))[3];
   EXPECT_TRUE(row.starts_with("pc3   down")) << row;
   const Json down = json({"hosts"})["hosts"][2];
@@ -65,7 +65,9 @@ TEST_F(Hosts, GivesEachNameOnceToPrograms) {
   DaemonProcess pc4({"--peer", pc2_.address(), "--peer", nobody, "--peer", other_address}, "pc4");
   Session session = session_with(pc4);
   const auto state = [&](std::size_t i) { return session.list_hosts().value()[i].state; };
-  await([&] { return state(1) == "up" && state(2) == "down" && state(3) == "up"; });
+  await([&] {
+    return state(1) == HostState::up && state(2) == HostState::down && state(3) == HostState::up;
+  });
   EXPECT_EQ(output({"--socket", pc4.socket_path(), "hosts", "--names"}), "pc4\npc2\n");
   const Json hosts = json({"--socket", pc4.socket_path(), "hosts"})["hosts"];
   ASSERT_EQ(hosts.size(), 4U);
@@ -135,7 +137,7 @@ TEST_F(Ping, EndsQuietlyWhenItsReaderHasEnough) {
 
 TEST_F(Ping, FailsWhenNothingAnswered) {
   pc3_.kill_hard();
-  await_state("pc3", "down");
+  await_state("pc3", HostState::down);
   const Finished finished = ctl({"ping", "pc3", "-c", "2", "-i", "0.01"});
   EXPECT_EQ(finished.exit_status, 1);
   const Strings lines = lines_of(finished.out);

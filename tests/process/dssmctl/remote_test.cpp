@@ -151,9 +151,9 @@ TEST_F(Remote, InfoTellsOwnerChannelsAndHowTheMirrorIsDoing) {
   }
 
   pc2_.kill_hard();
-  await_state("pc2", "down");
+  await_state("pc2", HostState::down);
   const Json alone = json({"info", "s@pc2"});
-  EXPECT_EQ(alone["mirror"]["state"], "owner away");
+  EXPECT_EQ(alone["mirror"]["state"], "owner unavailable");
   EXPECT_FALSE(alone["mirror"]["error"].get<std::string>().empty());
 }
 
@@ -218,7 +218,7 @@ TEST_F(Remote, EchoGoesOnWhileTheOwnerIsAwayAndAfterItsReturn) {
   std::int64_t tid = Json::parse(echo.line(write_one))["tid"];
   for (const bool crash : {true, false}) {
     crash ? pc2_.kill_hard() : static_cast<void>(pc2_.stop());
-    await_state("pc2", "down");
+    await_state("pc2", HostState::down);
     const Tid written_meanwhile = writer.write(2);
     pc2_.start();
     while (tid < written_meanwhile + 10) {
@@ -237,7 +237,7 @@ TEST_F(Remote, EchoAwaitsAHostThatDoesNotAnswer) {
   await_streams(1);
   ::kill(pc2_.pid(), SIGSTOP);
   Running echo(argv({"echo", "s@pc2", "--wait", "60", "--count", "1", "--csv"}), environment());
-  await_state("pc2", "down");
+  await_state("pc2", HostState::down);
   ::kill(pc2_.pid(), SIGCONT);
   echo.line();  // the header
   EXPECT_TRUE(echo.line().starts_with("0,"));
@@ -297,7 +297,7 @@ TEST_F(Remote, FollowersGoOnWithTheNewRingOfAStreamThatBeganAnew) {
     std::string line;
     while ((line = running.line()).starts_with('{')) {
     }
-    EXPECT_EQ(line, "dssmctl: 's:0@pc2': the stream began anew");
+    EXPECT_EQ(line, "dssmctl: 's:0@pc2': the stream restarted");
   };
   await_news(echo);
   for (int tid = 0; tid <= 4; ++tid) {

@@ -104,7 +104,7 @@ TEST_F(Stop, GoesOnWithAStreamThatIsCreatedAnew) {
     std::string line;
     while ((line = running.line()).starts_with('{')) {
     }
-    EXPECT_EQ(line, "dssmctl: 's:0@pc1': the stream began anew");
+    EXPECT_EQ(line, "dssmctl: 's:0@pc1': the stream restarted");
   };
   await_news(echo);
   for (int tid = 0; tid < 3; ++tid) {

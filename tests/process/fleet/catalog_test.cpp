@@ -24,8 +24,8 @@ class FleetCatalog : public testing::Test {
   Session on1 = connect(pc1), on2 = connect(pc2), on3 = connect(pc3);
 
   FleetCatalog() {
-    await_state(on1, pc2, "up");
-    await_state(on1, pc3, "up");
+    await_state(on1, pc2, HostState::up);
+    await_state(on1, pc3, HostState::up);
   }
 };
 
@@ -51,7 +51,7 @@ TEST_F(FleetCatalog, IsAnsweredWithWhatIsKnownWhenAHostHangs) {
   await_list(on1, {"lidar:0@pc2", "imu:0@pc3"});
   ::kill(pc2.pid(), SIGSTOP);
   EXPECT_EQ(names(on1.list_streams().value()), (Strings{"lidar:0@pc2", "imu:0@pc3"}));
-  await_state(on1, pc2, "down");
+  await_state(on1, pc2, HostState::down);
   EXPECT_EQ(names(on1.list_streams().value()), Strings{"imu:0@pc3"});
   ::kill(pc2.pid(), SIGCONT);
   await_list(on1, {"lidar:0@pc2", "imu:0@pc3"});
@@ -121,7 +121,7 @@ TEST_F(FleetCatalog, SaysWhereItLookedAndWhoDoesNotAnswer) {
   EXPECT_NE(nowhere.error().message.find("'pc2', 'pc3'"), std::string::npos)
       << nowhere.error().message;
   pc3.kill_hard();
-  await_state(on1, pc3, "down");
+  await_state(on1, pc3, HostState::down);
   nowhere = on1.open_reader<double>("gps");
   EXPECT_NE(nowhere.error().message.find("not answering at the moment: '" + pc3.address()),
             std::string::npos)
@@ -155,7 +155,7 @@ TEST_F(FleetCatalog, CarriesPropertiesInfoAndRemoval) {
   const std::vector<std::byte> large(kLarge, std::byte{9});
   ASSERT_TRUE(on1.set_property(there, large));
   EXPECT_EQ(on1.property(there).value(), large);
-  EXPECT_EQ(peer_at(on1, pc2.address()).state, "up");
+  EXPECT_EQ(peer_at(on1, pc2.address()).state, HostState::up);
 
   const StreamInfo info = on1.stream_info(any).value();
   EXPECT_EQ(info.id, there);
@@ -169,7 +169,7 @@ TEST_F(FleetCatalog, CarriesPropertiesInfoAndRemoval) {
     await([&] { return reader.newest_tid() == 0; });
     const StreamInfo read = on1.stream_info(any).value();
     ASSERT_TRUE(read.mirror);
-    EXPECT_EQ(read.mirror->state, "live");
+    EXPECT_EQ(read.mirror->state, MirrorState::live);
     EXPECT_EQ(read.mirror->newest, 0);
     EXPECT_EQ(read.channels, 1u);
   }
@@ -238,7 +238,7 @@ TEST_F(FleetCatalog, KeepsTheMirrorOfAnOwnerThatIsAway) {
   Reader<double> reader = on1.await_reader<double>("lidar").value();
   await([&] { return reader.newest_tid() == 0; });
   pc2.kill_hard();
-  await_state(on1, pc2, "down");
+  await_state(on1, pc2, HostState::down);
   for (const std::string name : {"lidar", "lidar@pc2"}) {
     const auto another = on1.open_reader<double>(name);
     ASSERT_TRUE(another) << another.error().message;

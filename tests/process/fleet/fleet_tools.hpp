@@ -19,7 +19,7 @@ namespace dssm::test {
 // What `session`'s dssmd says about the peer at `address`.
 inline HostInfo peer_at(Session& session, const std::string& address) {
   for (HostInfo& host : session.list_hosts().value()) {
-    if (host.state != "self" && host.addresses.at(0) == address) return std::move(host);
+    if (host.state != HostState::self && host.addresses.at(0) == address) return std::move(host);
   }
   return {};
 }
@@ -27,12 +27,13 @@ inline HostInfo peer_at(Session& session, const std::string& address) {
 inline void await_up(Session& session, const std::string& host) {
   await([&] {
     const std::vector<HostInfo> hosts = session.list_hosts().value();
-    return std::any_of(hosts.begin(), hosts.end(),
-                       [&](const HostInfo& one) { return one.name == host && one.state == "up"; });
+    return std::any_of(hosts.begin(), hosts.end(), [&](const HostInfo& one) {
+      return one.name == host && one.state == HostState::up;
+    });
   });
 }
 
-inline void await_state(Session& session, const DaemonProcess& peer, const std::string& state) {
+inline void await_state(Session& session, const DaemonProcess& peer, HostState state) {
   await([&] { return peer_at(session, peer.address()).state == state; });
 }
 
@@ -52,7 +53,7 @@ Reader<T> open_filled(Session& session, const std::string& stream) {
   });
   await([&] {
     const Result<StreamInfo> info = session.stream_info(reader->id());
-    return info && info->mirror && info->mirror->state == "live";
+    return info && info->mirror && info->mirror->state == MirrorState::live;
   });
   return *std::move(reader);
 }

@@ -34,11 +34,11 @@ TEST(FleetPeers, ShowThemselvesWithVersionAndRoundTrip) {
   const std::vector<HostInfo> hosts = session.list_hosts().value();
   ASSERT_EQ(hosts.size(), 2u);
   EXPECT_EQ(hosts[0].name, "pc1");
-  EXPECT_EQ(hosts[0].state, "self");
+  EXPECT_EQ(hosts[0].state, HostState::self);
   EXPECT_EQ(hosts[0].addresses, pc1.addresses());
   EXPECT_EQ(hosts[0].error, "");
   EXPECT_EQ(hosts[1].name, "pc2");
-  EXPECT_EQ(hosts[1].state, "up");
+  EXPECT_EQ(hosts[1].state, HostState::up);
   EXPECT_EQ(hosts[1].addresses, std::vector{pc2.address()});
   EXPECT_EQ(hosts[1].version, hosts[0].version);
   EXPECT_LE(hosts[1].min_round_trip, hosts[1].round_trip);
@@ -56,7 +56,7 @@ TEST(FleetPeers, AreDownWhenKilledAndComeBackByThemselves) {
     await_list(on1, {"kept:0@pc2"});
     EXPECT_EQ(on1.list_streams().value()[0].incarnation, incarnation) << "given back by its writer";
     pc2.kill_hard();
-    await_state(on1, pc2, "down");
+    await_state(on1, pc2, HostState::down);
     EXPECT_TRUE(on1.list_streams().value().empty());
     const HostInfo down = peer_at(on1, pc2.address());
     EXPECT_EQ(down.name, "pc2") << "who it was";
@@ -72,7 +72,7 @@ TEST(FleetPeers, AreDownWhenTheyHangAndComeBackWhenTheyGoOn) {
   auto kept = on2.create<double>("kept", kHistory).value();
   await_list(on1, {"kept:0@pc2"});
   ::kill(pc2.pid(), SIGSTOP);
-  await_state(on1, pc2, "down");
+  await_state(on1, pc2, HostState::down);
   EXPECT_NE(peer_at(on1, pc2.address()).error, "");
   EXPECT_TRUE(on1.list_streams().value().empty());
   ::kill(pc2.pid(), SIGCONT);
@@ -83,11 +83,11 @@ TEST(FleetPeers, MayStartLater) {
   const std::string address = free_address();
   const DaemonProcess pc1({"--peer", address});
   Session on1 = connect(pc1);
-  await([&] { return peer_at(on1, address).state == "down"; });
+  await([&] { return peer_at(on1, address).state == HostState::down; });
   EXPECT_EQ(peer_at(on1, address).name, "");
   EXPECT_NE(peer_at(on1, address).error.find(address), std::string::npos);
   const DaemonProcess pc2({"--listen", address}, "pc2");
-  await([&] { return peer_at(on1, address).state == "up"; });
+  await([&] { return peer_at(on1, address).state == HostState::up; });
   EXPECT_EQ(peer_at(on1, address).name, "pc2");
 }
 
@@ -107,7 +107,7 @@ TEST(FleetPeers, MayBeOneself) {
   const DaemonProcess pc1({"--listen", address, "--peer", address});
   Session session = connect(pc1);
   auto writer = session.create<double>("lidar", kHistory).value();
-  await([&] { return session.list_hosts().value()[1].state == "self"; });
+  await([&] { return session.list_hosts().value()[1].state == HostState::self; });
   EXPECT_EQ(names(session.list_streams().value()), std::vector<std::string>{"lidar:0@pc1"});
   EXPECT_EQ(session.list_hosts().value()[0].error, "");
 }
@@ -121,7 +121,7 @@ TEST(FleetPeers, AreOneHostAtTwoAddresses) {
   await_list(on1, {"lidar:0@pc2"});
   const auto first = [&] { return peer_at(on1, pc2.addresses()[0]); };
   const auto second = [&] { return peer_at(on1, pc2.addresses()[1]); };
-  await([&] { return first().state == "up" && second().state == "up"; });
+  await([&] { return first().state == HostState::up && second().state == HostState::up; });
   EXPECT_EQ(first().streams + second().streams, 1u);
   EXPECT_NE((first().error + second().error).find("same host as '127.0.0."), std::string::npos);
   EXPECT_TRUE(on1.open_reader<double>("lidar@pc2"));
@@ -135,7 +135,7 @@ TEST(FleetPeers, WithTheSameNameAreWarnedOf) {
   await([&] {
     return peer_at(on1, pc2.address()).error + peer_at(on1, other.address()).error != "";
   });
-  await([&] { return peer_at(on1, namesake.address()).state == "refused"; });
+  await([&] { return peer_at(on1, namesake.address()).state == HostState::refused; });
   EXPECT_NE(peer_at(on1, namesake.address()).error.find("this host's name 'pc1'"),
             std::string::npos)
       << peer_at(on1, namesake.address()).error;

@@ -72,12 +72,12 @@ TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonHangs) {
   reading.await_taken(100);
   ::kill(pc1.pid(), SIGSTOP);
   // For long enough that its silence counts as death.
-  await([&] { return mirror("load").state == "owner away"; });
+  await([&] { return mirror("load").state == MirrorState::owner_unavailable; });
   EXPECT_NE(mirror("load").error, "");
   const std::int64_t before = writing.written();
   ::kill(pc1.pid(), SIGCONT);
   reading.await_taken(before + 100);
-  await([&] { return mirror("load").state == "live"; });
+  await([&] { return mirror("load").state == MirrorState::live; });
   EXPECT_EQ(mirror("load").error, "");
   reading.await_taken(writing.stop());
   EXPECT_EQ(reader.lost_samples(), 0u);
@@ -88,7 +88,7 @@ TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsAway) {
   for (int i = 0; i < 100; ++i) writer.write(counted(i));
   auto reader = open_filled<Counted>(there, "kept");
   pc1.kill_hard();
-  await([&] { return mirror("kept").state == "owner away"; });
+  await([&] { return mirror("kept").state == MirrorState::owner_unavailable; });
   auto joined = there.open_reader<Counted>("kept@pc1");
   ASSERT_TRUE(joined) << joined.error().message;
   Counted sample{};
@@ -111,7 +111,7 @@ TEST_F(TwoHosts, CountExactlyWhatTheOwnersRingLostMeanwhile) {
     ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok);
   }
   pc1.kill_hard();
-  await([&] { return mirror("short").state == "owner away"; });
+  await([&] { return mirror("short").state == MirrorState::owner_unavailable; });
   for (int i = 10; i < 1000; ++i) writer.write(counted(i));
   const Tid oldest = 1000 - 63;
   pc1.start();
@@ -202,7 +202,7 @@ TEST_F(TwoHosts, GoOnWithAMirrorThatWasMadeMeanwhile) {
   pc2.kill_hard();
   pc2.start();
   writer.write(counted(1));
-  await_state(there, pc1, "up");
+  await_state(there, pc1, HostState::up);
   auto eager = open_filled<Counted>(there, "load@pc1");
   ::kill(holder, SIGCONT);
   expect_line(1);
@@ -222,7 +222,7 @@ TEST_F(TwoHosts, WaitForAHostThatDoesNotAnswer) {
     return there.await_reader<Counted>("odometry@pc1", deadline_in(60s));
   });
   Session another = connect(pc2);  // the other one's questions wait for each other
-  await([&] { return peer_at(another, pc1.address()).state == "down"; });
+  await([&] { return peer_at(another, pc1.address()).state == HostState::down; });
   ::kill(pc1.pid(), SIGCONT);
   const auto reader = opened.get();
   EXPECT_TRUE(reader) << reader.error().message;

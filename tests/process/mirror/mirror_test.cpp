@@ -30,7 +30,7 @@ TEST_F(TwoHosts, ReadTheHistoryFromBeforeTheReaderCame) {
     EXPECT_EQ(to_ns(info.time), 1000 * tid);
     EXPECT_EQ(to_ns(info.clock_error), tid);
   }
-  EXPECT_EQ(mirror("odometry").state, "live");
+  EXPECT_EQ(mirror("odometry").state, MirrorState::live);
   EXPECT_EQ(mirror("odometry").gap_samples, 0u);
 }
 
@@ -82,7 +82,7 @@ TEST_F(TwoHosts, ReadAnEmptyStreamFromItsFirstSampleOn) {
   auto writer = here.create<Counted>("later", History{64, 1ms}).value();
   auto reader = open_filled<Counted>(there, "later");
   EXPECT_EQ(reader.newest_tid(), kNoTid);
-  EXPECT_EQ(mirror("later").state, "live");
+  EXPECT_EQ(mirror("later").state, MirrorState::live);
   writer.write(counted(0));
   EXPECT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
 }
@@ -203,7 +203,7 @@ TEST(TightHosts, SayWhichLimitAMirrorWouldBreak) {
   DaemonProcess pc2({"--peer", pc1.address(), "--max-memory", "1 MiB", "--max-streams", "2"},
                     "pc2");
   Session here = connect(pc1), there = connect(pc2);
-  await_state(there, pc1, "up");
+  await_state(there, pc1, HostState::up);
   auto big = here.create<Counted>("big", History{1 << 16, 1ms}).value();
   auto small = here.create<Counted>("small", History{16, 1ms}).value();
   auto more = here.create<Counted>("more", History{16, 1ms}).value();

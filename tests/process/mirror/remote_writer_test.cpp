@@ -129,7 +129,7 @@ TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonHangs) {
   Writing writing(writer);
   reading.await_taken(100);
   ::kill(pc1.pid(), SIGSTOP);
-  await_state(there, pc1, "down");
+  await_state(there, pc1, HostState::down);
   ::kill(pc1.pid(), SIGCONT);
   reading.await_taken(writing.written() + 100);
   reading.await_taken(writing.stop());

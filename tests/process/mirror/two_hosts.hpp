@@ -45,7 +45,7 @@ class TwoHosts : public testing::Test {
  protected:
   explicit TwoHosts(const std::string& linger = "5 s", std::vector<std::string> of_pc1 = {})
       : linger_(linger), pc1(std::move(of_pc1), "pc1") {
-    await_state(there, pc1, "up");
+    await_state(there, pc1, HostState::up);
   }
 
   // What pc2 says about its copy of `name`, a stream of pc1.

@@ -22,7 +22,8 @@ class Hosts : public NetworkTest {
  protected:
   // Waits until `session`'s dssmd is connected to `host`.
   void await_up(Session& session, int host) {
-    await("the host is up", [&] { return host_info(session, Network::name(host)).state == "up"; });
+    await("the host is up",
+          [&] { return host_info(session, Network::name(host)).state == HostState::up; });
   }
 
   static bool lists(Session& session, const std::string& stream) {
@@ -73,7 +74,8 @@ TEST_F(Hosts, ThatAreUnreachableAreDownWithin3SecondsAndUpAgain) {
   for (int attempt = 0; attempt < 2; ++attempt) {
     const MonoTime cut = MonoClock::now();
     fleet->network().cut(2);
-    await("the dead host is noticed", [&] { return host_info(here, "pc2").state != "up"; });
+    await("the dead host is noticed",
+          [&] { return host_info(here, "pc2").state != HostState::up; });
     noticed = MonoClock::now() - cut;
     EXPECT_FALSE(lists(here, "there"));
     EXPECT_NE(host_info(here, "pc2").error, "");
@@ -91,7 +93,7 @@ TEST_F(Hosts, ThatDieAreDownAtOnceAndUpAgain) {
   Session here = fleet->session(1);
   await_up(here, 2);
   fleet->kill_dssmd(2);
-  await("the dead dssmd is noticed", [&] { return host_info(here, "pc2").state != "up"; });
+  await("the dead dssmd is noticed", [&] { return host_info(here, "pc2").state != HostState::up; });
   fleet->start_dssmd(2);
   await_up(here, 2);
 }
@@ -108,7 +110,7 @@ TEST_F(Hosts, MirrorsResumeAtTheirTidAfterACut) {
   for (Tid last = 1099; last < 4000; last += 1000) {
     fleet->network().cut(1);
     write_until(writer, known, last - 500);
-    await("the cut is noticed", [&] { return host_info(there, "pc1").state != "up"; });
+    await("the cut is noticed", [&] { return host_info(there, "pc1").state != HostState::up; });
     write_until(writer, known, last);
     fleet->network().heal(1);
     expect_samples(reader, known, last - 999, last);
@@ -173,7 +175,7 @@ TEST_F(Hosts, GapsAfterACutAreCountedExactly) {
   reader.seek(kNoTid);
   expect_samples(reader, known, 0, 9);
   fleet->network().cut(1);
-  await("the cut is noticed", [&] { return host_info(there, "pc1").state != "up"; });
+  await("the cut is noticed", [&] { return host_info(there, "pc1").state != HostState::up; });
   write_until(writer, known, 999);
   fleet->network().heal(1);
   // 64 slots hold 63 samples: 937 to 999; 10 to 936 are lost.
@@ -339,9 +341,9 @@ TEST_F(Hosts, ReportThatAPeerOfALaterVersionWasRefused) {
   HostInfo refused;
   await("the other host is refused", [&] {
     for (HostInfo& host : session.list_hosts().value()) {
-      if (host.state == "refused") refused = host;
+      if (host.state == HostState::refused) refused = host;
     }
-    return refused.state == "refused";
+    return refused.state == HostState::refused;
   });
   EXPECT_NE(refused.error.find("99"), std::string::npos) << refused.error;
   EXPECT_NE(refused.error.find(dssmd_address(2)), std::string::npos) << refused.error;

@@ -42,8 +42,8 @@ class Soak : public NetworkTest {
     for (Session& session : sessions) {
       for (int host = 1; host <= kHosts; ++host) {
         await("every host sees every other", [&] {
-          const std::string state = host_info(session, Network::name(host)).state;
-          return state == "up" || state == "self";
+          const HostState state = host_info(session, Network::name(host)).state;
+          return state == HostState::up || state == HostState::self;
         });
       }
     }
@@ -189,7 +189,7 @@ class Soak : public NetworkTest {
     if (!info) return text + "; " + info.error().message;
     text += "; owner's newest " + std::to_string(info->newest);
     if (!info->mirror) return text;
-    return text + "; mirror " + info->mirror->state + " at " +
+    return text + "; mirror " + std::string(name_of(info->mirror->state)) + " at " +
            std::to_string(info->mirror->newest) + ": " + info->mirror->error;
   }
 

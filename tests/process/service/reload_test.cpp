@@ -126,7 +126,7 @@ TEST(Reload, ConnectsToNewPeersAndDropsOldOnes) {
     await([&] {
       std::vector<std::string> up;
       for (const HostInfo& host : session.list_hosts().value()) {
-        if (host.state == "up") up.push_back(host.name);
+        if (host.state == HostState::up) up.push_back(host.name);
       }
       return up == names && session.list_hosts().value().size() == names.size() + 1;
     });

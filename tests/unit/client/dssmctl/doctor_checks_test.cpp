@@ -15,14 +15,16 @@ using Status = Finding::Status;
 
 constexpr std::uint64_t kGiB = 1ULL << 30;
 
-HostInfo host_at(std::string name, std::string state, std::string address, std::string error = {}) {
+HostInfo host_at(std::string name, HostState state, std::string address,
+                 HostReason reason = HostReason::none) {
   HostInfo host;
   host.id = "id of " + name;
   host.name = std::move(name);
-  host.state = std::move(state);
+  host.state = state;
   if (!address.empty()) host.addresses = {std::move(address)};
   host.version = "1.2";
-  host.error = std::move(error);
+  host.reason = reason;
+  if (reason != HostReason::none) host.error = "a sentence";
   return host;
 }
 
@@ -49,12 +51,13 @@ Facts healthy() {
   facts.daemon.streams = 3;
   facts.daemon.memory_bytes = kGiB;
   facts.daemon.memory_limit_bytes = 4 * kGiB;
-  facts.daemon.mdns.phase = "running";
+  facts.daemon.mdns.phase = MdnsPhase::running;
   facts.daemon.mdns.avahi_version = "avahi 0.8";
   facts.daemon.mdns.announced = 4;
   facts.daemon.mdns.own_host_seen = true;
   facts.daemon.mdns.hosts_heard = 1;
-  facts.hosts = {host_at("pc1", "self", "10.0.0.1:13776"), host_at("pc2", "up", "10.0.0.2:13776")};
+  facts.hosts = {host_at("pc1", HostState::self, "10.0.0.1:13776"),
+                 host_at("pc2", HostState::up, "10.0.0.2:13776")};
   facts.streams = {stream_of("lidar", "pc1"), stream_of("odom", "pc2")};
   facts.memory = {8 * kGiB, 6 * kGiB};
   facts.descriptors.soft_limit = 1024;
@@ -194,13 +197,13 @@ TEST(Doctor, WarnsOfLoopbackOnlyWhereThereAreOtherPcs) {
 
 TEST(Doctor, TellsWhatAvahiLacks) {
   Facts facts = healthy();
-  facts.daemon.mdns.phase = "waiting";
+  facts.daemon.mdns.phase = MdnsPhase::waiting;
   EXPECT_FINDING(facts, "mdns", Status::warn, "dbus");
   facts.avahi_running = false;
   EXPECT_FINDING(facts, "mdns", Status::warn, "systemctl enable --now avahi-daemon");
   facts.avahi_installed = false;
   EXPECT_FINDING(facts, "mdns", Status::warn, "apt install avahi-daemon");
-  facts.daemon.mdns.phase = "off";
+  facts.daemon.mdns.phase = MdnsPhase::off;
   EXPECT_FINDING(facts, "mdns", Status::ok, "");
 }
 
@@ -208,7 +211,7 @@ TEST(Doctor, TellsWhatMdnsLacks) {
   Facts facts = healthy();
   facts.daemon.mdns.hosts_heard = 0;
   EXPECT_FINDING(facts, "mdns", Status::warn, "5353");
-  facts.hosts[1].state = "down";  // then nobody knows whether it could be heard
+  facts.hosts[1].state = HostState::down;  // then nobody knows whether it could be heard
   EXPECT_FINDING(facts, "mdns", Status::ok, "");
   facts.daemon.mdns.error = "a name was taken";
   EXPECT_FINDING(facts, "mdns", Status::warn, "journalctl -u avahi-daemon");
@@ -218,29 +221,31 @@ TEST(Doctor, TellsWhatMdnsLacks) {
   EXPECT_FINDING(facts, "mdns", Status::warn, "objects-per");
 }
 
-TEST(Doctor, TellsOfEachHostWhyItIsNotUp) {
+TEST(Doctor, ReportsOfEachHostWhyItIsNotUp) {
+  struct Case {
+    HostState state;
+    HostReason reason;
+    const char* command;
+  };
+  for (const Case& one : {
+           Case{HostState::down, HostReason::connection_refused, "systemctl status dssmd"},
+           Case{HostState::down, HostReason::no_answer, "ping 10.0.0.2 "},
+           Case{HostState::down, HostReason::no_greeting, "ss -ltnp"},
+           Case{HostState::down, HostReason::name_not_found, "getent hosts 10.0.0.2 "},
+           Case{HostState::refused, HostReason::not_accepted, "same version"},
+           Case{HostState::closed, HostReason::closed_there, "in its /etc/dssm/dssmd.conf"},
+           Case{HostState::closed, HostReason::closed_here,
+                "in /etc/dssm/dssmd.conf, then restart this"},
+           Case{HostState::connecting, HostReason::none, "dssmctl hosts"},
+       }) {
+    Facts facts = healthy();
+    facts.hosts[1] = host_at("pc2", one.state, "10.0.0.2:13776", one.reason);
+    const bool works = one.state == HostState::closed || one.state == HostState::connecting;
+    EXPECT_FINDING(facts, "host pc2", works ? Status::warn : Status::fail, one.command);
+  }
   Facts facts = healthy();
-  facts.hosts[1] = host_at("pc2", "down", "10.0.0.2:13776",
-                           "connect to '10.0.0.2:13776': Connection refused; is dssmd running?");
-  EXPECT_FINDING(facts, "host pc2", Status::fail, "systemctl status dssmd");
-  facts.hosts[1].error = "connect to '10.0.0.2:13776': no answer; is that PC on?";
-  EXPECT_FINDING(facts, "host pc2", Status::fail, "ping 10.0.0.2 ");
-  facts.hosts[1] = host_at("", "down", "[fe80::2%eth0]:13776", "no answer");
+  facts.hosts[1] = host_at("", HostState::down, "[fe80::2%eth0]:13776", HostReason::no_answer);
   EXPECT_FINDING(facts, "host [fe80::2%eth0]:13776", Status::fail, "ping fe80::2%eth0 ");
-  facts.hosts[1].addresses = {"pc9:13776"};
-  facts.hosts[1].error = "look up 'pc9': Name or service not known";
-  EXPECT_FINDING(facts, "host pc9:13776", Status::fail, "getent hosts pc9 ");
-  facts.hosts[1] = host_at("pc2", "refused", "10.0.0.2:13776", "it speaks version 9");
-  EXPECT_FINDING(facts, "host pc2", Status::fail, "same version");
-  facts.hosts[1] = host_at("pc2", "connecting", "10.0.0.2:13776");
-  EXPECT_FINDING(facts, "host pc2", Status::warn, "dssmctl hosts");
-  facts.hosts[1] = host_at("pc2", "closed", "");
-  facts.hosts[1].error = "host 'pc2' listens on its own loopback only";
-  EXPECT_FINDING(facts, "host pc2", Status::warn, "in its /etc/dssm/dssmd.conf");
-  facts.hosts[1].error = "host 'pc2' is on another PC, and this dssmd connects to others only with";
-  EXPECT_FINDING(facts, "host pc2", Status::warn, "in /etc/dssm/dssmd.conf, then restart this");
-  facts.hosts[1] = host_at("pc2", "down", "10.0.0.2:13776", "it does not greet; is it a dssmd?");
-  EXPECT_FINDING(facts, "host pc2", Status::fail, "ss -ltnp");
 }
 
 TEST(Doctor, NamesCommandsThatWorkWithoutSystemd) {
@@ -251,17 +256,18 @@ TEST(Doctor, NamesCommandsThatWorkWithoutSystemd) {
   facts.systemd = false;
   facts.clock.state = ClockFacts::State::no_answer;
   EXPECT_FINDING(facts, "clock", Status::warn, "sudo service chrony start");
-  facts.daemon.mdns.phase = "waiting";
+  facts.daemon.mdns.phase = MdnsPhase::waiting;
   facts.avahi_running = false;
   EXPECT_FINDING(facts, "mdns", Status::warn, "sudo service avahi-daemon start");
 }
 
 TEST(Doctor, ForgivesAnAddressThatDoesNotWorkWhileAnotherOfThatHostDoes) {
   Facts facts = healthy();
-  facts.hosts.push_back(host_at("pc2", "down", "192.168.0.2:13776", "no answer"));
+  facts.hosts.push_back(
+      host_at("pc2", HostState::down, "192.168.0.2:13776", HostReason::no_answer));
   EXPECT_FINDING(facts, "host pc2", Status::ok, "");
   EXPECT_FINDING(facts, "host names", Status::ok, "");
-  facts.hosts[1].state = "down";
+  facts.hosts[1].state = HostState::down;
   EXPECT_FINDING(facts, "host pc2", Status::fail, "ping");
 }
 
@@ -279,7 +285,7 @@ TEST(Doctor, SaysHowFarClocksAreApartAndWarnsWhenNobodyKnows) {
 
 TEST(Doctor, FindsHostsOfOneName) {
   Facts facts = healthy();
-  facts.hosts.push_back(host_at("pc2", "up", "10.0.0.3:13776"));
+  facts.hosts.push_back(host_at("pc2", HostState::up, "10.0.0.3:13776"));
   facts.hosts.back().id = "another one";
   EXPECT_FINDING(facts, "host names", Status::fail, "name = ");
   facts = healthy();
@@ -289,12 +295,14 @@ TEST(Doctor, FindsHostsOfOneName) {
 
 TEST(Doctor, FindsACopyOfThisHost) {
   Facts facts = healthy();
-  facts.hosts[1] = host_at("pc1", "refused", "10.0.0.2:13776", "it has this host's name and id");
+  facts.hosts[1] = host_at("pc1", HostState::refused, "10.0.0.2:13776", HostReason::duplicate);
   EXPECT_FINDING(facts, "host names", Status::fail, "name = ");
   EXPECT_FINDING(facts, "host pc1", Status::fail, "rm /etc/machine-id");
-  facts.hosts[1].id += "9";  // the name alone
+  facts.hosts[1].id += "9";
+  facts.hosts[1].reason = HostReason::namesake;
   EXPECT_EQ(finding_of(facts, "host pc1").command.find("machine-id"), std::string::npos);
   EXPECT_FINDING(facts, "host pc1", Status::fail, "name = ");
+  facts.hosts[0].reason = facts.hosts[1].reason;
   facts.hosts[0].error = facts.hosts[1].error;
   facts.hosts.pop_back();
   EXPECT_FINDING(facts, "host pc1", Status::fail, "host names");

@@ -9,7 +9,7 @@ namespace {
 HostInfo closed_host() {
   HostInfo host;
   host.name = "pc2";
-  host.state = "closed";
+  host.state = HostState::closed;
   host.id = "00ff";
   host.found_by = {"peer", "mdns"};
   return host;

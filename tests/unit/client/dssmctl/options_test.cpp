@@ -3,6 +3,8 @@
 
 #include <gtest/gtest.h>
 
+#include <variant>
+
 namespace dssm::ctl {
 namespace {
 
@@ -13,82 +15,90 @@ CommandLine parse(std::vector<const char*> words) {
   return parse_command_line(static_cast<int>(words.size()), words.data());
 }
 
-Options options_of(std::vector<const char*> words) {
+// The options of the verb that `words` name, which has to be the one that takes VerbOptions.
+template <class VerbOptions>
+VerbOptions options_of(std::vector<const char*> words) {
   CommandLine line = parse(std::move(words));
   EXPECT_TRUE(line.options) << line.text;
-  return line.options.value_or(Options{});
+  return std::get<VerbOptions>(line.options.value());
 }
 
-std::string complaint_of(std::vector<const char*> words) {
+std::string error_of(std::vector<const char*> words) {
   const CommandLine line = parse(std::move(words));
   EXPECT_FALSE(line.options || line.ok);
   return line.text;
 }
 
 TEST(CommandLine, TakesGlobalOptionsOnBothSidesOfTheVerb) {
-  for (const Options& options : {options_of({"--json", "--socket", "/s", "ls"}),
-                                 options_of({"ls", "--json", "--socket", "/s"})}) {
-    EXPECT_EQ(options.verb, Verb::ls);
+  for (const LsOptions& options : {options_of<LsOptions>({"--json", "--socket", "/s", "ls"}),
+                                   options_of<LsOptions>({"ls", "--json", "--socket", "/s"})}) {
+    EXPECT_EQ(options.verb_name, "ls");
     EXPECT_TRUE(options.json);
     EXPECT_EQ(options.socket_path, "/s");
   }
 }
 
-TEST(CommandLine, TellsAtBeforeTheNewestFromAtSince1970) {
-  EXPECT_FALSE(options_of({"echo", "s", "--at", "1.5"}).at_counts_back);
-  const Options back = options_of({"echo", "s", "--at", "-1.5"});
+TEST(CommandLine, DistinguishesTimesBeforeTheNewestFromTimesSince1970) {
+  EXPECT_FALSE(options_of<EchoOptions>({"echo", "s", "--at", "1.5"}).at_counts_back);
+  const EchoOptions back = options_of<EchoOptions>({"echo", "s", "--at", "-1.5"});
   EXPECT_TRUE(back.at_counts_back);
   EXPECT_EQ(back.at, -1500ms);
-  EXPECT_TRUE(options_of({"echo", "s", "--at", "-0"}).at_counts_back);
+  EXPECT_TRUE(options_of<EchoOptions>({"echo", "s", "--at", "-0"}).at_counts_back);
 }
 
 TEST(CommandLine, TakesOneFieldPerOption) {
-  const Options options = options_of({"echo", "--field", "a", "--field", "b", "s"});
+  const EchoOptions options =
+      options_of<EchoOptions>({"echo", "--field", "a", "--field", "b", "s"});
   EXPECT_EQ(options.fields, (std::vector<std::string>{"a", "b"}));
   EXPECT_EQ(options.stream, "s");
 }
 
 TEST(CommandLine, KnowsVerbsInsideVerbs) {
-  EXPECT_EQ(options_of({"playback"}).verb, Verb::playback_show);
-  EXPECT_EQ(options_of({"playback", "pause"}).verb, Verb::playback_pause);
-  const Options set = options_of({"property", "set", "s", "file"});
-  EXPECT_EQ(set.verb, Verb::property_set);
+  const PlaybackOptions show = options_of<PlaybackOptions>({"playback"});
+  EXPECT_EQ(show.verb_name, "playback");
+  EXPECT_FALSE(show.paused || show.reset || show.speed);
+  EXPECT_EQ(options_of<PlaybackOptions>({"playback", "pause"}).paused, true);
+  EXPECT_EQ(options_of<PlaybackOptions>({"playback", "resume"}).paused, false);
+  EXPECT_TRUE(options_of<PlaybackOptions>({"playback", "reset"}).reset);
+  EXPECT_EQ(options_of<PlaybackOptions>({"playback", "set", "--speed", "2"}).speed, 2);
+  const PropertySetOptions set = options_of<PropertySetOptions>({"property", "set", "s", "file"});
   EXPECT_EQ(set.verb_name, "property set");
   EXPECT_EQ(set.file, "file");
+  EXPECT_EQ(options_of<PropertyGetOptions>({"property", "get", "s"}).file, "-");
 }
 
 TEST(CommandLine, ReadsTheSizesOfAStreamToCreate) {
-  const Options options =
-      options_of({"create", "s", "--size", "40", "--life", "2", "--cycle", "0.025"});
+  const CreateOptions options =
+      options_of<CreateOptions>({"create", "s", "--size", "40", "--life", "2", "--cycle", "0.025"});
   EXPECT_EQ(options.payload_bytes, 40U);
   EXPECT_EQ(options.life, 2s);
   EXPECT_EQ(options.cycle, 25ms);
 }
 
 TEST(CommandLine, ReadsWhichStreamsToList) {
-  const Options some = options_of({"ls", "--host", "pc2", "--host", "pc3", "camera*", "--watch"});
+  const LsOptions some =
+      options_of<LsOptions>({"ls", "--host", "pc2", "--host", "pc3", "camera*", "--watch"});
   EXPECT_EQ(some.hosts, (std::vector<std::string>{"pc2", "pc3"}));
   EXPECT_EQ(some.pattern, "camera*");
   EXPECT_TRUE(some.watch);
   EXPECT_FALSE(some.own);
-  EXPECT_TRUE(options_of({"ls", "--own"}).own);
-  EXPECT_TRUE(options_of({"ls", "--local"}).own);
-  EXPECT_EQ(options_of({"doctor", "--json"}).verb, Verb::doctor);
+  EXPECT_TRUE(options_of<LsOptions>({"ls", "--own"}).own);
+  EXPECT_TRUE(options_of<LsOptions>({"ls", "--local"}).own);
+  EXPECT_TRUE(options_of<DoctorOptions>({"doctor", "--json"}).json);
 }
 
 TEST(CommandLine, ReadsHowToPing) {
-  const Options options = options_of({"ping", "pc2", "-c", "3", "-i", "0.5"});
-  EXPECT_EQ(options.verb, Verb::ping);
+  const PingOptions options = options_of<PingOptions>({"ping", "pc2", "-c", "3", "-i", "0.5"});
   EXPECT_EQ(options.host, "pc2");
   EXPECT_EQ(options.count, 3U);
   EXPECT_EQ(options.interval, 500ms);
-  EXPECT_EQ(options_of({"ping", "pc2"}).interval, 1s);
+  EXPECT_EQ(options_of<PingOptions>({"ping", "pc2"}).interval, 1s);
 }
 
 TEST(CommandLine, SaysWhatIsWrongAndWhereHelpIs) {
   const struct {
     std::vector<const char*> words;
-    const char* complaint;
+    const char* error;
   } cases[] = {
       {{"lss"}, "dssmctl: there is no verb 'lss'; see 'dssmctl --help'\n"},
       {{"--wrong"}, "dssmctl: there is no option '--wrong'; see 'dssmctl --help'\n"},
@@ -98,12 +108,12 @@ TEST(CommandLine, SaysWhatIsWrongAndWhereHelpIs) {
       {{"property", "del"},
        "dssmctl: property: there is no verb 'del'; see 'dssmctl property --help'\n"},
       {{"ls", "--sort", "x"},
-       "dssmctl: ls: --sort: 'x' is no key to sort by; see 'dssmctl ls --help'\n"},
+       "dssmctl: ls: --sort: 'x' is not a key to sort by; see 'dssmctl ls --help'\n"},
       {{"create", "s", "--size", "0", "--depth", "2"},
-       "dssmctl: create: --size: '0' is no whole number from 1 to 67108864; see 'dssmctl create "
+       "dssmctl: create: --size: '0' is not a whole number from 1 to 67108864; see 'dssmctl create "
        "--help'\n"},
   };
-  for (const auto& test : cases) EXPECT_EQ(complaint_of(test.words), test.complaint);
+  for (const auto& test : cases) EXPECT_EQ(error_of(test.words), test.error);
 }
 
 TEST(CommandLine, RefusesWhatDoesNotFitTogether) {

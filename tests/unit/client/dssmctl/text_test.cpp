@@ -76,7 +76,7 @@ TEST(Text, RefusesWhatIsNoNumberOfSeconds) {
     const Result<Duration> result = parse_seconds(text);
     ASSERT_FALSE(result) << text;
     EXPECT_EQ(result.error().code, Errc::invalid_argument) << text;
-    EXPECT_NE(result.error().message.find("no number of seconds"), std::string::npos) << text;
+    EXPECT_NE(result.error().message.find("not a number of seconds"), std::string::npos) << text;
   }
   for (const char* text : {"9223372036.854775808", "1e30", "99999999999999999999999"}) {
     const Result<Duration> result = parse_seconds(text);
@@ -91,7 +91,7 @@ TEST(Text, ReadsWholeNumbersInTheirRangeOnly) {
   for (const char* text : {"1", "6", "-1", "", "3x", "3.0", " 3", "99999999999999999999"}) {
     EXPECT_FALSE(parse_whole(text, 2, 5)) << text;
   }
-  EXPECT_EQ(parse_whole("x", 2, 5).error().message, "'x' is no whole number from 2 to 5");
+  EXPECT_EQ(parse_whole("x", 2, 5).error().message, "'x' is not a whole number from 2 to 5");
 }
 
 TEST(Text, ReadsFiniteNumbersOnly) {

@@ -12,8 +12,8 @@
 namespace dssm::daemon {
 namespace {
 
-MdnsState mdns_in(MdnsState::Phase phase) {
-  MdnsState state;
+MdnsInfo mdns_in(MdnsPhase phase) {
+  MdnsInfo state;
   state.phase = phase;
   return state;
 }
@@ -73,7 +73,7 @@ class FoundHostsTest : public testing::Test {
       serve();
     }
   }
-  local::Host host(std::size_t index = 0) const { return peers->hosts().at(index); }
+  local::Host host(std::size_t index = 0) const { return peers->report().hosts().at(index); }
   std::vector<std::string> found_by(std::size_t index = 0) const {
     const local::Host shown = host(index);
     return {shown.found_by().begin(), shown.found_by().end()};
@@ -85,18 +85,18 @@ TEST_F(FoundHostsTest, GoIntoTheCatalogWithTheirStreams) {
   one->streams = {"lidar", "imu"};
   start();
   peers->on_host_found(host_at({at(*one)}));
-  EXPECT_EQ(host().state(), "connecting");
+  EXPECT_EQ(host().state(), local::Host::CONNECTING);
   wait([&] { return catalog.has({"lidar", 0, "pc2"}) && catalog.has({"imu", 0, "pc2"}); });
-  ASSERT_EQ(peers->hosts().size(), 1u);
+  ASSERT_EQ(peers->report().hosts().size(), 1u);
   EXPECT_EQ(host().name(), "pc2");
   EXPECT_EQ(host().host_id(), std::string(pc2.host_id.begin(), pc2.host_id.end()));
-  EXPECT_EQ(host().state(), "up");
+  EXPECT_EQ(host().state(), local::Host::UP);
   EXPECT_EQ(host().streams(), 2u);
   EXPECT_EQ(host().error(), "");
   EXPECT_EQ(host().addresses_size(), 1);
   EXPECT_EQ(found_by(), std::vector<std::string>{"mdns"});
-  EXPECT_EQ(peers->trouble(), "");
-  EXPECT_TRUE(peers->link_to(pc2.host_id));
+  EXPECT_EQ(peers->report().unavailable_peers(), "");
+  EXPECT_TRUE(peers->connection_to(pc2.host_id));
 }
 
 TEST_F(FoundHostsTest, AreDialedAtTheirAddressesInTurn) {
@@ -162,16 +162,17 @@ TEST_F(FoundHostsTest, KeepAConnectionThatWorksWhenTheAddressesChange) {
 TEST_F(FoundHostsTest, AreDialedAtOnceWhenTheyHaveNewAddresses) {
   start();
   peers->on_host_found(host_at({nobody()}));
-  wait([&] { return host().state() == "down" && host().since_ns() > 1'600'000'000; });
+  wait([&] { return host().state() == local::Host::DOWN && host().since_ns() > 1'600'000'000; });
   EXPECT_NE(host().error().find("refused"), std::string::npos) << host().error();
-  EXPECT_NE(peers->trouble().find("'pc2' (connect to"), std::string::npos) << peers->trouble();
-  EXPECT_TRUE(log.says("host 'pc2' (found by mDNS) is not there"));
+  EXPECT_NE(peers->report().unavailable_peers().find("'pc2' (connect to"), std::string::npos)
+      << peers->report().unavailable_peers();
+  EXPECT_TRUE(log.says("host 'pc2' (found by mDNS) is not available, retrying"));
   bool waited = false;  // for most of a pause
   EventSource timer = EventSource::timer(loop, [&] { waited = true; });
   timer.enable_in(PeerConnection::kFoundPause * 9 / 10);
   peers->on_host_found(host_at({at(*one)}));
-  wait([&] { return waited || host().state() == "up"; });
-  EXPECT_EQ(host().state(), "up");
+  wait([&] { return waited || host().state() == local::Host::UP; });
+  EXPECT_EQ(host().state(), local::Host::UP);
 }
 
 TEST_F(FoundHostsTest, AreNotDialedASecondTimeWhenTheyAreConfiguredToo) {
@@ -181,14 +182,14 @@ TEST_F(FoundHostsTest, AreNotDialedASecondTimeWhenTheyAreConfiguredToo) {
   peers->on_host_found(host_at({at(*two)}));
   look_around();
   EXPECT_EQ(two->owner.connections(), 0);
-  ASSERT_EQ(peers->hosts().size(), 1u);
+  ASSERT_EQ(peers->report().hosts().size(), 1u);
   EXPECT_EQ(found_by(), (std::vector<std::string>{"peer", "mdns"}));
   EXPECT_EQ(host().error(), "");
   one.reset();
   wait([&] { return two->watches == 1 && catalog.has({"lidar", 0, "pc2"}); });
-  ASSERT_EQ(peers->hosts().size(), 2u);
-  EXPECT_EQ(host(0).state(), "down");
-  EXPECT_EQ(host(1).state(), "up");
+  ASSERT_EQ(peers->report().hosts().size(), 2u);
+  EXPECT_EQ(host(0).state(), local::Host::DOWN);
+  EXPECT_EQ(host(1).state(), local::Host::UP);
   EXPECT_EQ(host(1).streams(), 1u);
   EXPECT_EQ(found_by(1), std::vector<std::string>{"mdns"});
 }
@@ -199,7 +200,9 @@ TEST_F(FoundHostsTest, StopTryingWhenTheConfiguredConnectionComesUp) {
   start({at(*one)});
   wait_until_up();
   peers->on_host_found(host_at({at(*two)}));
-  wait([&] { return peers->hosts().size() == 2 && host(1).state() == "refused"; });
+  wait([&] {
+    return peers->report().hosts().size() == 2 && host(1).state() == local::Host::REFUSED;
+  });
   one->owner.greet_as(pc2);
   one->owner.cut();
   wait([&] { return catalog.find(pc2.host_id) != nullptr; });
@@ -208,9 +211,9 @@ TEST_F(FoundHostsTest, StopTryingWhenTheConfiguredConnectionComesUp) {
   peers->on_host_found(host_at({at(*two), nobody()}));  // which would be dialed at once
   look_around();
   EXPECT_EQ(two->owner.connections(), before);
-  ASSERT_EQ(peers->hosts().size(), 1u);
-  EXPECT_EQ(host().state(), "up");
-  EXPECT_EQ(peers->trouble(), "");
+  ASSERT_EQ(peers->report().hosts().size(), 1u);
+  EXPECT_EQ(host().state(), local::Host::UP);
+  EXPECT_EQ(peers->report().unavailable_peers(), "");
 }
 
 TEST_F(FoundHostsTest, StayInUseWhenTheConfiguredConnectionComesLater) {
@@ -220,10 +223,10 @@ TEST_F(FoundHostsTest, StayInUseWhenTheConfiguredConnectionComesLater) {
   wait_until_up();
   peers->on_host_found(host_at({at(*two)}));
   wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
-  EXPECT_EQ(peers->hosts().size(), 2u);
+  EXPECT_EQ(peers->report().hosts().size(), 2u);
   one->owner.greet_as(pc2);
   one->owner.cut();
-  wait([&] { return peers->hosts().size() == 1 && host().state() == "up"; });
+  wait([&] { return peers->report().hosts().size() == 1 && host().state() == local::Host::UP; });
   EXPECT_EQ(host().error(), "");
   EXPECT_EQ(host().streams(), 1u) << "it speaks for both";
   EXPECT_EQ(found_by(), (std::vector<std::string>{"peer", "mdns"}));
@@ -241,9 +244,9 @@ TEST_F(FoundHostsTest, StayWhileTheirConnectionIsUpWhenMdnsLosesThem) {
   wait_until_up();
   peers->on_host_lost(pc2.host_id);
   look_around();
-  EXPECT_EQ(host().state(), "up");
+  EXPECT_EQ(host().state(), local::Host::UP);
   one->owner.cut();
-  wait([&] { return peers->hosts().empty(); });
+  wait([&] { return peers->report().hosts().empty(); });
   EXPECT_TRUE(catalog.hosts().empty());
   look_around();
   EXPECT_EQ(one->owner.connections(), 1) << "forgotten";
@@ -265,20 +268,20 @@ TEST_F(FoundHostsTest, StayWhenMdnsFindsThemAgain) {
 TEST_F(FoundHostsTest, GoAtOnceWhenMdnsLosesThemWhileTheyAreDown) {
   start();
   peers->on_host_found(host_at({nobody()}));
-  wait([&] { return host().state() == "down"; });
+  wait([&] { return host().state() == local::Host::DOWN; });
   peers->on_host_lost(pc2.host_id);
   peers->on_host_lost(wire::host_id_for("pc3"));
   look_around();
-  EXPECT_TRUE(peers->hosts().empty());
-  EXPECT_EQ(peers->trouble(), "");
+  EXPECT_TRUE(peers->report().hosts().empty());
+  EXPECT_EQ(peers->report().unavailable_peers(), "");
 }
 
 TEST_F(FoundHostsTest, AreNotTakenForAnotherThatAnswersAtTheirAddress) {
   one->owner.call_itself("pc3");
   start();
   peers->on_host_found(host_at({at(*one)}));
-  wait([&] { return host().state() == "refused"; });
-  EXPECT_NE(host().error().find("answers dssmd of host 'pc3'"), std::string::npos)
+  wait([&] { return host().state() == local::Host::REFUSED; });
+  EXPECT_NE(host().error().find("dssmd of host 'pc3' answers at"), std::string::npos)
       << host().error();
   EXPECT_EQ(host().name(), "pc2");
   EXPECT_TRUE(catalog.hosts().empty());
@@ -293,16 +296,16 @@ TEST_F(FoundHostsTest, AreNotLookedForWhereAnotherHostIsUp) {
   wait_until_up();
   peers->on_host_found(host_at({at(*one)}, "pc3"));
   look_around();
-  ASSERT_EQ(peers->hosts().size(), 2u);
-  EXPECT_EQ(host(1).state(), "refused");
+  ASSERT_EQ(peers->report().hosts().size(), 2u);
+  EXPECT_EQ(host(1).state(), local::Host::REFUSED);
   EXPECT_NE(host(1).error().find("where host 'pc2' answers"), std::string::npos) << host(1).error();
   EXPECT_EQ(one->owner.connections(), 1) << "it is not disturbed";
-  EXPECT_EQ(host(0).state(), "up");
+  EXPECT_EQ(host(0).state(), local::Host::UP);
   one->owner.call_itself("pc3");
   one->owner.cut();
   wait([&] { return catalog.find(wire::host_id_for("pc3")) != nullptr; });
   look_around();
-  EXPECT_EQ(host(0).state(), "refused") << "now it is the other way round";
+  EXPECT_EQ(host(0).state(), local::Host::REFUSED) << "now it is the other way round";
 }
 
 TEST_F(FoundHostsTest, AreNeverThisVeryHost) {
@@ -311,9 +314,9 @@ TEST_F(FoundHostsTest, AreNeverThisVeryHost) {
   peers->on_host_found(host_at({at(*one)}, "pc1"));
   wait([&] { return one->owner.connections() == 1; });
   look_around();
-  EXPECT_TRUE(peers->hosts().empty()) << "an echo of our own announcement";
-  EXPECT_EQ(peers->own_warning(), "");
-  EXPECT_EQ(peers->trouble(), "");
+  EXPECT_TRUE(peers->report().hosts().empty()) << "an echo of our own announcement";
+  EXPECT_EQ(peers->report().own_warning().text, "");
+  EXPECT_EQ(peers->report().unavailable_peers(), "");
   EXPECT_TRUE(log.lines.empty());
 }
 
@@ -325,21 +328,21 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   start();
   // With the copy's address came one of our own.
   peers->on_host_found(host_at({at(*one), at(*two)}, "pc1"));
-  wait([&] { return !peers->own_warning().empty(); });
-  const std::string warning = peers->own_warning();
+  wait([&] { return !peers->report().own_warning().text.empty(); });
+  const std::string warning = peers->report().own_warning().text;
   for (const std::string& part : {at(*two).str(), hex(self.host_id),
                                   std::string("rm /etc/machine-id"), std::string("(key name)")}) {
     EXPECT_NE(warning.find(part), std::string::npos) << part << " is missing in " << warning;
   }
-  ASSERT_EQ(peers->hosts().size(), 1u);
-  EXPECT_EQ(host().state(), "refused");
+  ASSERT_EQ(peers->report().hosts().size(), 1u);
+  EXPECT_EQ(host().state(), local::Host::REFUSED);
   EXPECT_EQ(host().error(), warning);
   EXPECT_EQ(host().addresses(0), at(*two).str());
   EXPECT_TRUE(catalog.hosts().empty());
   EXPECT_TRUE(two->owner.connected()) << "it is not asked again and again";
   two->owner.cut();
-  wait([&] { return peers->own_warning().empty(); });
-  wait([&] { return !peers->own_warning().empty(); });
+  wait([&] { return peers->report().own_warning().text.empty(); });
+  wait([&] { return !peers->report().own_warning().text.empty(); });
   EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
                           [](const std::string& line) {
                             return line.find("this host's name") != std::string::npos;
@@ -351,8 +354,8 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   two->owner.cut();
   peers->on_host_found(host_at({at(*two)}));
   wait_until_up();
-  EXPECT_EQ(peers->hosts().size(), 1u);
-  EXPECT_EQ(peers->own_warning(), "");
+  EXPECT_EQ(peers->report().hosts().size(), 1u);
+  EXPECT_EQ(peers->report().own_warning().text, "");
 }
 
 TEST_F(FoundHostsTest, AreAskedThoughThisHostIsAmongItsOwnPeers) {
@@ -361,21 +364,21 @@ TEST_F(FoundHostsTest, AreAskedThoughThisHostIsAmongItsOwnPeers) {
   one->owner.greet_as(self);
   two->owner.greet_as(copy);
   start({at(*one)});
-  wait([&] { return host().state() == "self"; });
+  wait([&] { return host().state() == local::Host::SELF; });
   peers->on_host_found(host_at({at(*two)}, "pc1"));
-  wait([&] { return !peers->own_warning().empty(); });
-  ASSERT_EQ(peers->hosts().size(), 2u);
-  EXPECT_EQ(host(0).state(), "self");
+  wait([&] { return !peers->report().own_warning().text.empty(); });
+  ASSERT_EQ(peers->report().hosts().size(), 2u);
+  EXPECT_EQ(host(0).state(), local::Host::SELF);
   EXPECT_EQ(found_by(0), std::vector<std::string>{"peer"});
-  EXPECT_EQ(host(1).state(), "refused");
+  EXPECT_EQ(host(1).state(), local::Host::REFUSED);
 }
 
 TEST_F(FoundHostsTest, AreSaidToHaveOurIdAlsoWhenTheyMayNotBeAsked) {
   start({}, false);
   peers->on_host_found(host_at({{"192.0.2.7", 13776}}, "pc1"));
   look_around();
-  ASSERT_EQ(peers->hosts().size(), 1u);
-  EXPECT_EQ(host().state(), "closed");
+  ASSERT_EQ(peers->report().hosts().size(), 1u);
+  EXPECT_EQ(host().state(), local::Host::CLOSED);
   EXPECT_NE(host().error().find("with this host's name 'pc1' and machine id"), std::string::npos)
       << host().error();
 }
@@ -386,14 +389,16 @@ TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheyAreClosed) {
   start();
   peers->on_host_found(closed);
   look_around();
-  EXPECT_EQ(host().state(), "closed");
+  EXPECT_EQ(host().state(), local::Host::CLOSED);
+  EXPECT_EQ(host().reason(), local::Host::CLOSED_THERE);
   EXPECT_NE(host().error().find("set listen and insecure there"), std::string::npos);
-  EXPECT_NE(peers->trouble().find("'pc2' (host 'pc2' listens"), std::string::npos)
-      << peers->trouble();
+  EXPECT_NE(peers->report().unavailable_peers().find("'pc2' (host 'pc2' listens"),
+            std::string::npos)
+      << peers->report().unavailable_peers();
   closed.addresses = {at(*one)};  // another dssmd of this PC
   peers->on_host_found(closed);
   wait_until_up();
-  EXPECT_EQ(host().state(), "up");
+  EXPECT_EQ(host().state(), local::Host::UP);
 }
 
 TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheySpeakAnotherVersion) {
@@ -402,7 +407,7 @@ TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheySpeakAnotherVersion) {
   start();
   peers->on_host_found(other);
   look_around();
-  EXPECT_EQ(host().state(), "refused");
+  EXPECT_EQ(host().state(), local::Host::REFUSED);
   proto::Hello hello;
   wire::to_message(pc2, hello);
   hello.set_protocol_version(77);
@@ -419,7 +424,8 @@ TEST_F(FoundHostsTest, AreNotReachedInTheClearUnlessThatIsAllowed) {
   peers->on_host_found(host_at({{"192.0.2.8", 13776}, at(*one)}));
   wait_until_up();
   EXPECT_EQ(address_in_catalog(), at(*one)) << "a dssmd of this PC";
-  EXPECT_EQ(host(0).state(), "closed");
+  EXPECT_EQ(host(0).state(), local::Host::CLOSED);
+  EXPECT_EQ(host(0).reason(), local::Host::CLOSED_HERE);
   EXPECT_NE(host(0).error().find("only with insecure = true"), std::string::npos);
 }
 
@@ -430,15 +436,16 @@ TEST_F(FoundHostsTest, AreBoundedInNumberAndAddresses) {
                                  "pc" + std::to_string(1000 + i)));
   }
   look_around();
-  ASSERT_EQ(peers->hosts().size(), Peers::kMaxFoundHosts);
+  ASSERT_EQ(peers->report().hosts().size(), Peers::kMaxFoundHosts);
   EXPECT_EQ(static_cast<std::size_t>(host().addresses_size()), Peers::kMaxAddressesOfHost);
   EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
                           [](const std::string& line) {
                             return line.find("more than 256 hosts") != std::string::npos;
                           }),
             1);
-  EXPECT_LT(peers->trouble().size(), 4000u);
-  EXPECT_NE(peers->trouble().find("and 248 more"), std::string::npos) << peers->trouble();
+  EXPECT_LT(peers->report().unavailable_peers().size(), 4000u);
+  EXPECT_NE(peers->report().unavailable_peers().find("and 248 more"), std::string::npos)
+      << peers->report().unavailable_peers();
   peers->on_host_lost(wire::host_id_for("pc1000"));
   look_around();
   peers->on_host_found(host_at({at(*one)}));
@@ -453,7 +460,7 @@ TEST_F(FoundHostsTest, AreReachedThoughOneOfTheirAddressesNeverGreets) {
   start();
   peers->on_host_found(host_at({never}, "pc3"));
   peers->on_host_found(host_at({never, at(*one)}));
-  wait([&] { return host(0).state() == "down"; });
+  wait([&] { return host(0).state() == local::Host::DOWN; });
   EXPECT_NE(host(0).error().find("does not greet"), std::string::npos) << host(0).error();
   wait_until_up();
   EXPECT_EQ(address_in_catalog(), at(*one));
@@ -466,8 +473,8 @@ TEST_F(FoundHostsTest, MayBeSeveralAtOneIpNumber) {
   peers->on_host_found(host_at({at(*one)}));
   peers->on_host_found(host_at({at(*two)}, "pc3"));
   wait([&] { return catalog.hosts().size() == 2; });
-  EXPECT_EQ(host(0).state(), "up");
-  EXPECT_EQ(host(1).state(), "up");
+  EXPECT_EQ(host(0).state(), local::Host::UP);
+  EXPECT_EQ(host(1).state(), local::Host::UP);
   EXPECT_EQ(catalog.hosts().at(pc3.host_id).address, at(*two));
 }
 
@@ -493,9 +500,9 @@ TEST_F(FoundHostsTest, AreWarnedOfWhenTheyHaveOurName) {
   found.id = namesake.host_id;
   start();
   peers->on_host_found(found);
-  wait([&] { return !peers->own_warning().empty(); });
-  EXPECT_EQ(host().state(), "refused");
-  EXPECT_EQ(host().error(), peers->own_warning());
+  wait([&] { return !peers->report().own_warning().text.empty(); });
+  EXPECT_EQ(host().state(), local::Host::REFUSED);
+  EXPECT_EQ(host().error(), peers->report().own_warning().text);
   EXPECT_TRUE(catalog.hosts().empty());
   look_around();
   EXPECT_EQ(one->owner.connections(), 1);
@@ -506,27 +513,27 @@ TEST_F(FoundHostsTest, AreWarnedOfWhenTheyHaveOurName) {
 TEST_F(FoundHostsTest, AreWaitedForWhileMdnsWorks) {
   const MonoTime begin = loop.now();
   start({at(*one)});
-  EXPECT_FALSE(peers->settled());
+  EXPECT_FALSE(peers->startup_is_over());
   bool told = false;
-  peers->on_settled([&] { told = true; });
-  peers->on_mdns_state(mdns_in(MdnsState::Phase::running));
+  peers->on_startup_over([&] { told = true; });
+  peers->on_mdns_state(mdns_in(MdnsPhase::running));
   wait([&] { return told; });
   // The loop's clock is as coarse as the kernel's ticks.
-  EXPECT_GE(loop.now() - begin, Peers::kSettleTime - std::chrono::milliseconds(20));
+  EXPECT_GE(loop.now() - begin, Peers::kStartupTime - std::chrono::milliseconds(20));
 }
 
 TEST_F(FoundHostsTest, AreNotWaitedForWithoutAvahi) {
   start();
-  EXPECT_FALSE(peers->settled()) << "not before the finder said so";
-  peers->on_mdns_state(mdns_in(MdnsState::Phase::waiting));
-  EXPECT_TRUE(peers->settled());
+  EXPECT_FALSE(peers->startup_is_over()) << "not before the finder said so";
+  peers->on_mdns_state(mdns_in(MdnsPhase::waiting));
+  EXPECT_TRUE(peers->startup_is_over());
 }
 
 TEST_F(FoundHostsTest, LetPeersBeWaitedForWithoutAvahi) {
   start({at(*one)});
-  peers->on_mdns_state(mdns_in(MdnsState::Phase::waiting));
-  EXPECT_FALSE(peers->settled());
-  wait([&] { return peers->settled(); });
+  peers->on_mdns_state(mdns_in(MdnsPhase::waiting));
+  EXPECT_FALSE(peers->startup_is_over());
+  wait([&] { return peers->startup_is_over(); });
   EXPECT_EQ(one->watches, 1);
 }
 

@@ -33,26 +33,26 @@ class PeersTest : public testing::Test {
       return done();
     });
   }
-  void wait_until_settled() {
-    wait([this] { return peers->settled(); });
+  void wait_for_startup() {
+    wait([this] { return peers->startup_is_over(); });
   }
-  local::Host host(std::size_t index) const { return peers->hosts().at(index); }
+  local::Host host(std::size_t index) const { return peers->report().hosts().at(index); }
 };
 
 TEST_F(PeersTest, AreSettledAtOnceWithoutAny) {
   start({});
-  EXPECT_TRUE(peers->settled());
-  EXPECT_TRUE(peers->hosts().empty());
+  EXPECT_TRUE(peers->startup_is_over());
+  EXPECT_TRUE(peers->report().hosts().empty());
 }
 
 TEST_F(PeersTest, PutAHostAndItsStreamsIntoTheCatalog) {
   one.streams = {"lidar", "imu"};
   start({&one});
   bool told = false;
-  peers->on_settled([&] { told = true; });
-  EXPECT_FALSE(peers->settled());
+  peers->on_startup_over([&] { told = true; });
+  EXPECT_FALSE(peers->startup_is_over());
   wait([&] { return told; });
-  EXPECT_TRUE(peers->settled());
+  EXPECT_TRUE(peers->startup_is_over());
   ASSERT_EQ(catalog.hosts().size(), 1u);
   const KnownHost& known = catalog.hosts().begin()->second;
   EXPECT_EQ(known.greeting.host, "pc2");
@@ -65,7 +65,7 @@ TEST_F(PeersTest, PutAHostAndItsStreamsIntoTheCatalog) {
   EXPECT_EQ(known.streams.size(), 2u);
   const local::Host shown = host(0);
   EXPECT_EQ(shown.name(), "pc2");
-  EXPECT_EQ(shown.state(), "up");
+  EXPECT_EQ(shown.state(), local::Host::UP);
   EXPECT_EQ(shown.streams(), 2u);
   EXPECT_EQ(shown.error(), "");
   EXPECT_FALSE(shown.insecure());
@@ -88,13 +88,13 @@ TEST_F(PeersTest, MeasureTheRoundTripAndHearOfTheClock) {
 TEST_F(PeersTest, TakeAHostOutWhenItsConnectionBreaks) {
   one.streams = {"lidar"};
   start({&one});
-  wait_until_settled();
+  wait_for_startup();
   one.owner.cut();
   wait([&] { return catalog.hosts().empty(); });
   EXPECT_TRUE(log.says("host 'pc2' is down"));
   wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
   EXPECT_EQ(one.watches, 2);
-  EXPECT_EQ(host(0).state(), "up");
+  EXPECT_EQ(host(0).state(), local::Host::UP);
 }
 
 TEST_F(PeersTest, TakeAHostOutWhenItFallsSilent) {
@@ -104,8 +104,9 @@ TEST_F(PeersTest, TakeAHostOutWhenItFallsSilent) {
   const MonoTime begin = loop.now();
   wait([&] { return catalog.hosts().empty(); });
   EXPECT_GE(loop.now() - begin, wire::kPeerTimeout - wire::kHeartbeat);
-  EXPECT_EQ(host(0).state(), "down");
-  EXPECT_NE(host(0).error().find("no sign of life from host 'pc2'"), std::string::npos)
+  EXPECT_EQ(host(0).state(), local::Host::DOWN);
+  EXPECT_EQ(host(0).reason(), local::Host::NO_ANSWER);
+  EXPECT_NE(host(0).error().find("no bytes came from host 'pc2'"), std::string::npos)
       << host(0).error();
   one.silent = false;
   wait([&] { return !catalog.hosts().empty(); });
@@ -113,16 +114,17 @@ TEST_F(PeersTest, TakeAHostOutWhenItFallsSilent) {
 
 TEST_F(PeersTest, LeaveAPeerAloneThatTalksNonsenseAboutItsStreams) {
   start({&one});
-  wait_until_settled();
+  wait_for_startup();
   one.tell("a:b", false);
   wait([&] { return catalog.hosts().empty(); });
-  EXPECT_EQ(host(0).state(), "refused");
+  EXPECT_EQ(host(0).state(), local::Host::REFUSED);
+  EXPECT_EQ(host(0).reason(), local::Host::NOT_ACCEPTED);
   EXPECT_NE(host(0).error().find("a stream event"), std::string::npos) << host(0).error();
 }
 
 TEST_F(PeersTest, LetNobodySpeakForAnotherHost) {
   start({&one});
-  wait_until_settled();
+  wait_for_startup();
   one.tell("lidar", false, "pc3");
   wait([&] { return !catalog.hosts().begin()->second.streams.empty(); });
   EXPECT_TRUE(catalog.has({"lidar", 0, "pc2"}));
@@ -131,15 +133,16 @@ TEST_F(PeersTest, LetNobodySpeakForAnotherHost) {
 TEST_F(PeersTest, SettleWhenAPeerIsNotThereAndSayWhy) {
   const wire::Address nobody = FakeOwner(loop).host().address;
   peers = std::make_unique<Peers>(loop, resolver, std::vector{nobody}, self, catalog, log);
-  wait_until_settled();
-  EXPECT_EQ(host(0).state(), "down");
+  wait_for_startup();
+  EXPECT_EQ(host(0).state(), local::Host::DOWN);
   EXPECT_EQ(host(0).name(), "");
+  EXPECT_EQ(host(0).reason(), local::Host::CONNECTION_REFUSED);
   EXPECT_NE(host(0).error().find("refused"), std::string::npos) << host(0).error();
-  EXPECT_NE(peers->trouble().find(nobody.str()), std::string::npos);
+  EXPECT_NE(peers->report().unavailable_peers().find(nobody.str()), std::string::npos);
   wait([&] { return host(0).since_ns() > 300'000'000; });  // several attempts
   EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
                           [](const std::string& line) {
-                            return line.find("is not there") != std::string::npos;
+                            return line.find("is not available, retrying") != std::string::npos;
                           }),
             1)
       << "once, not at each attempt";
@@ -153,20 +156,20 @@ TEST_F(PeersTest, SettleAfterAWhileWhenAPeerSaysNothing) {
   const auto address =
       wire::Address::parse(wire::local_address(listening.get()).value().str()).value();
   peers = std::make_unique<Peers>(loop, resolver, std::vector{address}, self, catalog, log);
-  wait_until_settled();
-  EXPECT_EQ(host(0).state(), "connecting");
+  wait_for_startup();
+  EXPECT_EQ(host(0).state(), local::Host::CONNECTING);
 }
 
 TEST_F(PeersTest, UseOneOfTwoAddressesAndTakeTheOtherWhenItFails) {
   two.owner.greet_as(one.owner.host().greeting);
   one.streams = two.streams = {"lidar"};
   start({&one, &two});
-  wait([&] { return one.watches + two.watches > 0 && peers->settled(); });
+  wait([&] { return one.watches + two.watches > 0 && peers->startup_is_over(); });
   ASSERT_EQ(one.watches + two.watches, 1) << "only one is used";
   FakePeer& used = one.watches ? one : two;
   FakePeer& spare = one.watches ? two : one;
   const std::size_t spare_index = one.watches ? 1 : 0;
-  EXPECT_EQ(host(spare_index).state(), "up");
+  EXPECT_EQ(host(spare_index).state(), local::Host::UP);
   EXPECT_NE(host(spare_index).error().find("same host as '" + used.owner.host().address.str()),
             std::string::npos)
       << host(spare_index).error();
@@ -184,7 +187,7 @@ TEST_F(PeersTest, WarnOfTwoPcsWithOneIdAndUseTheFirst) {
   ++clone.life;
   two.owner.greet_as(clone);
   start({&one, &two});
-  wait([&] { return one.watches + two.watches > 0 && peers->settled(); });
+  wait([&] { return one.watches + two.watches > 0 && peers->startup_is_over(); });
   ASSERT_EQ(one.watches + two.watches, 1);
   const local::Host spare = host(one.watches ? 1 : 0);
   EXPECT_NE(spare.error().find("but is another dssmd"), std::string::npos) << spare.error();
@@ -195,7 +198,7 @@ TEST_F(PeersTest, KeepTwoHostsOfOneNameAndWarnAtBoth) {
   namesake.host_id[0] = static_cast<std::uint8_t>(namesake.host_id[0] + 1);
   two.owner.greet_as(namesake);
   start({&one, &two});
-  wait_until_settled();
+  wait_for_startup();
   EXPECT_EQ(catalog.hosts().size(), 2u);
   EXPECT_NE(host(0).error().find("is called 'pc2' too"), std::string::npos) << host(0).error();
   EXPECT_NE(host(1).error().find(one.owner.host().address.str()), std::string::npos)
@@ -208,12 +211,12 @@ TEST_F(PeersTest, KeepTwoHostsOfOneNameAndWarnAtBoth) {
 TEST_F(PeersTest, KnowThemselves) {
   one.owner.greet_as(self);
   start({&one});
-  wait_until_settled();
-  EXPECT_EQ(host(0).state(), "self");
+  wait_for_startup();
+  EXPECT_EQ(host(0).state(), local::Host::SELF);
   EXPECT_EQ(host(0).error(), "");
   EXPECT_TRUE(catalog.hosts().empty());
   EXPECT_EQ(one.owner.connections(), 1) << "left standing, not dialed again and again";
-  EXPECT_EQ(peers->own_warning(), "");
+  EXPECT_EQ(peers->report().own_warning().text, "");
 }
 
 TEST_F(PeersTest, RefuseAnotherPcWithTheirOwnId) {
@@ -221,10 +224,12 @@ TEST_F(PeersTest, RefuseAnotherPcWithTheirOwnId) {
   ++clone.life;
   one.owner.greet_as(clone);
   start({&one});
-  wait_until_settled();
-  EXPECT_EQ(host(0).state(), "refused");
+  wait_for_startup();
+  EXPECT_EQ(host(0).state(), local::Host::REFUSED);
+  EXPECT_EQ(host(0).reason(), local::Host::DUPLICATE);
+  EXPECT_EQ(peers->report().own_warning().reason, HostReason::duplicate);
   EXPECT_NE(host(0).error().find("machine id"), std::string::npos) << host(0).error();
-  EXPECT_EQ(peers->own_warning(), host(0).error());
+  EXPECT_EQ(peers->report().own_warning().text, host(0).error());
   EXPECT_TRUE(catalog.hosts().empty());
 }
 
@@ -233,11 +238,12 @@ TEST_F(PeersTest, DoNotShowTheStreamsOfAHostWithTheirOwnName) {
   namesake.host_id[0] = static_cast<std::uint8_t>(namesake.host_id[0] + 1);
   one.owner.greet_as(namesake);
   start({&one});
-  wait_until_settled();
+  wait_for_startup();
   EXPECT_TRUE(catalog.hosts().empty());
   EXPECT_EQ(one.watches, 0);
+  EXPECT_EQ(host(0).reason(), local::Host::NAMESAKE);
   EXPECT_NE(host(0).error().find("as this one is"), std::string::npos) << host(0).error();
-  EXPECT_EQ(peers->own_warning(), host(0).error());
+  EXPECT_EQ(peers->report().own_warning().text, host(0).error());
 }
 
 // --- configured peers change
@@ -249,7 +255,7 @@ TEST_F(PeersTest, DialWhoIsConfiguredAnewAndKeepWhoStays) {
   peers->set_configured({two.owner.host().address, one.owner.host().address});
   wait([&] { return catalog.hosts().size() == 2; });
   EXPECT_EQ(one.watches, 1) << "its connection is the one of before";
-  EXPECT_EQ(peers->hosts().size(), 2u);
+  EXPECT_EQ(peers->report().hosts().size(), 2u);
   EXPECT_EQ(host(0).name(), "pc2");
   EXPECT_EQ(host(1).name(), "pc3");
 }
@@ -261,23 +267,22 @@ TEST_F(PeersTest, DropWhoIsNotConfiguredAnyMoreAndTellWhoeverWaits) {
   std::string got;
   net::Frame request;
   request.mutable_get_property()->mutable_id()->set_name("lidar");
-  peers->link_to(one.owner.host().greeting.host_id)->ask(request, [&](Result<net::Frame> answer) {
-    got = answer.error().message;
-  });
+  peers->connection_to(one.owner.host().greeting.host_id)
+      ->ask(request, [&](Result<net::Frame> answer) { got = answer.error().message; });
   peers->set_configured({});
-  wait([&] { return peers->hosts().empty(); });
+  wait([&] { return peers->report().hosts().empty(); });
   EXPECT_TRUE(catalog.hosts().empty());
-  EXPECT_EQ(peers->link_to(one.owner.host().greeting.host_id), nullptr);
-  EXPECT_NE(got.find("not among the peers any more"), std::string::npos) << got;
+  EXPECT_EQ(peers->connection_to(one.owner.host().greeting.host_id), nullptr);
+  EXPECT_NE(got.find("no longer among the peers"), std::string::npos) << got;
 }
 
 TEST_F(PeersTest, DropWhoWasNeverThere) {
   const wire::Address nobody = FakeOwner(loop).host().address;
   peers = std::make_unique<Peers>(loop, resolver, std::vector{nobody}, self, catalog, log);
-  wait_until_settled();
+  wait_for_startup();
   peers->set_configured({});
-  wait([&] { return peers->hosts().empty(); });
-  EXPECT_EQ(peers->trouble(), "");
+  wait([&] { return peers->report().hosts().empty(); });
+  EXPECT_EQ(peers->report().unavailable_peers(), "");
 }
 
 TEST_F(PeersTest, DialAgainWhoComesBackIntoTheConfiguration) {
@@ -286,8 +291,8 @@ TEST_F(PeersTest, DialAgainWhoComesBackIntoTheConfiguration) {
   wait([&] { return one.watches == 1; });
   peers->set_configured({});
   peers->set_configured(configured);  // before the first is through
-  wait([&] { return one.watches == 2 && peers->hosts().size() == 1; });
-  EXPECT_EQ(host(0).state(), "up");
+  wait([&] { return one.watches == 2 && peers->report().hosts().size() == 1; });
+  EXPECT_EQ(host(0).state(), local::Host::UP);
   EXPECT_EQ(catalog.hosts().size(), 1u);
 }
 
@@ -295,8 +300,8 @@ TEST_F(PeersTest, DialAgainWhoComesBackIntoTheConfiguration) {
 
 TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {
   start({&one});
-  wait_until_settled();
-  PeerConnection* link = peers->link_to(one.owner.host().greeting.host_id);
+  wait_for_startup();
+  PeerConnection* link = peers->connection_to(one.owner.host().greeting.host_id);
   ASSERT_TRUE(link);
   std::vector<std::string> got;
   const auto ask = [&](const std::string& name) {
@@ -320,14 +325,14 @@ TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {
   wait([&] { return one.asked.size() == 3; });
   one.owner.cut();
   wait([&] { return got.size() == 3; });
-  EXPECT_EQ(got[2].find("c: host 'pc2' went away before it answered"), 0u) << got[2];
-  EXPECT_EQ(peers->link_to(one.owner.host().greeting.host_id), nullptr);
+  EXPECT_EQ(got[2].find("c: the connection to host 'pc2' ended before it answered"), 0u) << got[2];
+  EXPECT_EQ(peers->connection_to(one.owner.host().greeting.host_id), nullptr);
 }
 
 TEST_F(PeersTest, BoundTheRequestsThatWait) {
   start({&one});
-  wait_until_settled();
-  PeerConnection& link = *peers->link_to(one.owner.host().greeting.host_id);
+  wait_for_startup();
+  PeerConnection& link = *peers->connection_to(one.owner.host().greeting.host_id);
   std::size_t refused = 0;
   for (std::size_t i = 0; i < PeerConnection::kMaxWaiting + 10; ++i) {
     net::Frame request;
@@ -348,8 +353,8 @@ TEST_F(PeersTest, BoundTheRequestsThatWait) {
 
 TEST_F(PeersTest, MakeRoomForRequestsWithEachAnswer) {
   start({&one});
-  wait_until_settled();
-  PeerConnection& link = *peers->link_to(one.owner.host().greeting.host_id);
+  wait_for_startup();
+  PeerConnection& link = *peers->connection_to(one.owner.host().greeting.host_id);
   for (std::size_t i = 0; i < 4; ++i) {
     net::Frame large;
     large.mutable_set_property()->set_property(
@@ -368,13 +373,14 @@ TEST_F(PeersTest, MakeRoomForRequestsWithEachAnswer) {
 
 TEST_F(PeersTest, EndAConnectionThatAnswersWhatNobodyAsked) {
   start({&one});
-  wait_until_settled();
+  wait_for_startup();
   net::Frame answer;
   answer.set_serial(999);
   answer.mutable_done();
   one.owner.send(answer);
   wait([&] { return catalog.hosts().empty(); });
-  EXPECT_NE(host(0).error().find("what nobody asked"), std::string::npos) << host(0).error();
+  EXPECT_NE(host(0).error().find("a response without a request"), std::string::npos)
+      << host(0).error();
 }
 
 }  // namespace

@@ -308,6 +308,7 @@ TEST_F(DialerTest, GivesUpWhoDoesNotGreetInTime) {
   dial(server.address());
   const Error& why = wait_for_down();
   EXPECT_EQ(why.code, Errc::unavailable);
+  EXPECT_EQ(dialer->reached(), Dialer::Phase::greet);
   EXPECT_NE(why.message.find("does not greet"), std::string::npos) << why.message;
 }
 

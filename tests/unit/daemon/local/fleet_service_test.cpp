@@ -33,21 +33,21 @@ class FleetServiceTest : public testing::Test {
 
 TEST_F(FleetServiceTest, TellsThatMdnsIsOffUntilItHearsOtherwise) {
   const local::Mdns told = fleet.mdns();
-  EXPECT_EQ(told.phase(), "off");
-  EXPECT_EQ(told.trouble(), "");
+  EXPECT_EQ(told.phase(), local::Mdns::OFF);
+  EXPECT_EQ(told.error(), "");
   EXPECT_EQ(told.announced(), 0u);
   EXPECT_FALSE(told.own_host_seen());
 }
 
 TEST_F(FleetServiceTest, TellsTheNewestStateOfMdns) {
-  MdnsState state;
-  state.phase = MdnsState::Phase::waiting;
-  state.trouble = "no Avahi";
+  MdnsInfo state;
+  state.phase = MdnsPhase::waiting;
+  state.error = "no Avahi";
   peers.on_mdns_state(state);
-  EXPECT_EQ(fleet.mdns().phase(), "waiting");
-  EXPECT_EQ(fleet.mdns().trouble(), "no Avahi");
-  state.phase = MdnsState::Phase::running;
-  state.trouble.clear();
+  EXPECT_EQ(fleet.mdns().phase(), local::Mdns::WAITING);
+  EXPECT_EQ(fleet.mdns().error(), "no Avahi");
+  state.phase = MdnsPhase::running;
+  state.error.clear();
   state.avahi_version = "avahi 0.8";
   state.announced = 3;
   state.withheld = 2;
@@ -55,8 +55,8 @@ TEST_F(FleetServiceTest, TellsTheNewestStateOfMdns) {
   state.hosts_heard = 5;
   peers.on_mdns_state(state);
   const local::Mdns told = fleet.mdns();
-  EXPECT_EQ(told.phase(), "running");
-  EXPECT_EQ(told.trouble(), "");
+  EXPECT_EQ(told.phase(), local::Mdns::RUNNING);
+  EXPECT_EQ(told.error(), "");
   EXPECT_EQ(told.avahi_version(), "avahi 0.8");
   EXPECT_EQ(told.announced(), 3u);
   EXPECT_EQ(told.withheld(), 2u);
@@ -65,11 +65,11 @@ TEST_F(FleetServiceTest, TellsTheNewestStateOfMdns) {
 }
 
 TEST_F(FleetServiceTest, TellsWordsOfOthersInPrintableCharactersOnly) {
-  MdnsState state;
-  state.trouble = "more than \x1b[31m";
+  MdnsInfo state;
+  state.error = "more than \x1b[31m";
   state.avahi_version = "avahi\n0.8";
   peers.on_mdns_state(state);
-  EXPECT_EQ(fleet.mdns().trouble().find('\x1b'), std::string::npos) << fleet.mdns().trouble();
+  EXPECT_EQ(fleet.mdns().error().find('\x1b'), std::string::npos) << fleet.mdns().error();
   EXPECT_EQ(fleet.mdns().avahi_version().find('\n'), std::string::npos);
 }
 
@@ -78,10 +78,10 @@ TEST_F(FleetServiceTest, TellsOfThisHostFirstAndWhatIsWrongWithIt) {
   ++copy.life;
   peer.owner.greet_as(copy);
   EXPECT_EQ(fleet.hosts().at(0).error(), "");
-  run_until(loop, [&] { return fleet.hosts().at(1).state() == "refused"; });
+  run_until(loop, [&] { return fleet.hosts().at(1).state() == local::Host::REFUSED; });
   const local::Host told = fleet.hosts().at(0);
   EXPECT_EQ(told.name(), "pc1");
-  EXPECT_EQ(told.state(), "self");
+  EXPECT_EQ(told.state(), local::Host::SELF);
   EXPECT_EQ(told.addresses(0), "10.0.0.1:13776");
   EXPECT_TRUE(told.insecure());
   EXPECT_NE(told.error(), "");

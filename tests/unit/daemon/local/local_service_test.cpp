@@ -310,7 +310,7 @@ TEST(LocalService, TellsAboutItself) {
   EXPECT_EQ(response.daemon().streams(), 1u);
   EXPECT_EQ(response.daemon().memory_limit_bytes(), kLimits.max_memory_bytes);
   EXPECT_GT(response.daemon().memory_bytes(), 16u * 24);
-  EXPECT_EQ(response.daemon().mdns().phase(), "off");  // without a network
+  EXPECT_EQ(response.daemon().mdns().phase(), local::Mdns::OFF);  // without a network
 }
 
 // --- recovery

@@ -48,7 +48,7 @@ class FakeFleet final : public Fleet {
       asked.push_back("info " + id.str());
       proto::Stream& stream = *response.mutable_stream_list()->add_streams();
       wire::to_message(lidar_at("pc2"), stream);
-      stream.mutable_mirror()->set_state("live");
+      stream.mutable_mirror()->set_state(proto::Mirror::LIVE);
     } else if (request.has_get_property()) {
       asked.push_back("get_property " + id.str());
       response.mutable_property()->set_property("calibration");
@@ -74,7 +74,7 @@ class FakeFleet final : public Fleet {
   }
   local::Mdns mdns() const override {
     local::Mdns mdns;
-    mdns.set_phase("running");
+    mdns.set_phase(local::Mdns::RUNNING);
     mdns.set_hosts_heard(7);
     return mdns;
   }
@@ -203,7 +203,7 @@ TEST_F(RemoteRequestsTest, PassesOnTheRest) {
   info.mutable_info()->mutable_id()->set_name("lidar");
   const local::Response told = client->ask(info);
   ASSERT_EQ(told.stream_list().streams_size(), 1);
-  EXPECT_EQ(told.stream_list().streams(0).mirror().state(), "live");
+  EXPECT_EQ(told.stream_list().streams(0).mirror().state(), proto::Mirror::LIVE);
   get.mutable_get_property()->mutable_id()->set_name("lidar");
   EXPECT_EQ(client->ask(get).property().property(), "calibration");
   set.mutable_set_property()->mutable_id()->set_name("lidar");
@@ -268,7 +268,7 @@ TEST_F(RemoteRequestsTest, TellsHowOtherHostsAreFound) {
   request.mutable_get_daemon();
   const local::Daemon daemon = client->ask(request).daemon();
   EXPECT_EQ(daemon.host(), "pc1");
-  EXPECT_EQ(daemon.mdns().phase(), "running");
+  EXPECT_EQ(daemon.mdns().phase(), local::Mdns::RUNNING);
   EXPECT_EQ(daemon.mdns().hosts_heard(), 7u);
 }
 

@@ -89,8 +89,8 @@ class MirrorsTest : public testing::Test, protected MirrorKeeper::Observer {
     EXPECT_TRUE(mirrors->describe(kId, state));
     return state;
   }
-  void until_state(const std::string& word) {
-    run_until(loop, [&] { return state().state() == word; });
+  void until_state(proto::Mirror::State wanted) {
+    run_until(loop, [&] { return state().state() == wanted; });
   }
   static Tid newest(const Stream& stream) { return ring::RingReader(stream.mapping()).newest(); }
   void until_newest(const Stream& stream, Tid tid) {
@@ -106,7 +106,7 @@ TEST_F(MirrorsTest, FillsARingWithTheOwnersHistoryBeforeItAnswers) {
   samples(100, 110);
   run_until(loop, [&] { return mirrors->find(kId) && newest(*mirrors->find(kId)) == 110; });
   EXPECT_FALSE(answer->has_value()) << "more may follow";
-  EXPECT_EQ(state().state(), "filling");
+  EXPECT_EQ(state().state(), proto::Mirror::FILLING);
   owner->caught_up();
   const std::shared_ptr<Stream> stream = wait(answer);
   EXPECT_EQ(stream->id(), kId);
@@ -116,7 +116,7 @@ TEST_F(MirrorsTest, FillsARingWithTheOwnersHistoryBeforeItAnswers) {
   EXPECT_EQ(stream->info().depth, 16u);
   EXPECT_EQ(stream->info().cycle, 10ms);
   EXPECT_EQ(stream->info().oldest, 100);
-  EXPECT_EQ(state().state(), "live");
+  EXPECT_EQ(state().state(), proto::Mirror::LIVE);
   EXPECT_EQ(state().received_samples(), 11u);
   EXPECT_EQ(state().received_bytes(), 11u * 24);
   EXPECT_EQ(state().newest(), 110);
@@ -138,7 +138,7 @@ TEST_F(MirrorsTest, AnswersWithWhatCameWhenTheHistoryTakesLong) {
   serve(0);
   samples(0, 3);
   EXPECT_EQ(newest(*wait(answer)), 3);
-  EXPECT_EQ(state().state(), "filling");
+  EXPECT_EQ(state().state(), proto::Mirror::FILLING);
 }
 
 TEST_F(MirrorsTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
@@ -229,7 +229,7 @@ TEST_F(MirrorsTest, ResumesBehindWhatItHas) {
   samples(6, 8);
   owner->caught_up();
   until_newest(*stream, 8);
-  until_state("live");
+  until_state(proto::Mirror::LIVE);
   EXPECT_EQ(state().reconnects(), 1u);
   EXPECT_EQ(state().gap_samples(), 0u);
   EXPECT_EQ(state().error(), "");
@@ -252,7 +252,7 @@ TEST_F(MirrorsTest, CountsWhatTheOwnerNoLongerHas) {
 TEST_F(MirrorsTest, KeepsTheRingWhileTheOwnerIsAway) {
   const std::shared_ptr<Stream> stream = opened(5);
   catalog.host_down(owner->host().greeting.host_id, {Errc::unavailable, "no sign of life"});
-  until_state("owner away");
+  until_state(proto::Mirror::OWNER_UNAVAILABLE);
   EXPECT_NE(state().error().find("no sign of life"), std::string::npos) << state().error();
   const auto answer = open();
   ASSERT_TRUE(answer->has_value()) << "the history is here";
@@ -285,7 +285,7 @@ TEST_F(MirrorsTest, LosesNothingWhenTheSameOwnerIsReachedAtAnotherAddress) {
   samples(6, 8);
   owner->caught_up();
   until_newest(*stream, 8);
-  until_state("live");
+  until_state(proto::Mirror::LIVE);
   EXPECT_EQ(stream->info().oldest, 0);
   EXPECT_EQ(state().gap_samples(), 0u);
   EXPECT_EQ(before->connections(), 1);
@@ -316,7 +316,7 @@ TEST_F(MirrorsTest, KeepsTheRingOfARemovedStreamAndTriesAgain) {
   const std::shared_ptr<Stream> stream = opened(5);
   catalog.stream_added(owner->host().greeting.host_id, theirs).value();
   owner->removed();
-  until_state("removed");
+  until_state(proto::Mirror::REMOVED);
   EXPECT_NE(state().error(), "");
   catalog.stream_removed(owner->host().greeting.host_id, kId);
   theirs.incarnation = 8;
@@ -324,7 +324,7 @@ TEST_F(MirrorsTest, KeepsTheRingOfARemovedStreamAndTriesAgain) {
   run_until(loop, [&] { return owner->connections() == 2; });
   serve(0);
   owner->caught_up();
-  until_state("live");
+  until_state(proto::Mirror::LIVE);
   EXPECT_EQ(replaced.size(), 1u);
 }
 
@@ -369,7 +369,7 @@ TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
 TEST_F(MirrorsTest, AsksAgainForARemovedStreamWhenSomebodyOpensIt) {
   const std::shared_ptr<Stream> stream = opened(5);
   owner->removed();
-  until_state("removed");
+  until_state(proto::Mirror::REMOVED);
   const auto answer = open();
   EXPECT_FALSE(answer->has_value());
   run_until(loop, [&] { return owner->connections() == 2; });
@@ -381,7 +381,7 @@ TEST_F(MirrorsTest, AsksAgainForARemovedStreamWhenSomebodyOpensIt) {
   run_until(loop, [&] { return owner->connections() == 3; });
   serve(6);
   owner->caught_up();
-  until_state("live");
+  until_state(proto::Mirror::LIVE);
 }
 
 TEST_F(MirrorsTest, GoesOnWithARingThatAProgramKept) {
@@ -396,7 +396,7 @@ TEST_F(MirrorsTest, GoesOnWithARingThatAProgramKept) {
   for (const UniqueFd& fd : kept) again.push_back(copy_of(fd));
   auto stream = mirrors->adopt_untrusted(kId, as_offer(std::move(again)));
   ASSERT_TRUE(stream) << stream.error().message;
-  EXPECT_EQ(state().state(), "connecting");
+  EXPECT_EQ(state().state(), local::Host::CONNECTING);
   EXPECT_EQ(state().newest(), 5);
   // The second program that holds it.
   auto second = mirrors->adopt_untrusted(kId, as_offer(std::move(kept)));
@@ -463,7 +463,7 @@ TEST_F(MirrorsTest, ClosesTheChannelOfAnOwnerThatBreaksTheProtocol) {
     ++connections;
     serve(6);
     owner->caught_up();
-    until_state("live");
+    until_state(proto::Mirror::LIVE);
     EXPECT_EQ(newest(*stream), 5);
   };
   expect_closed([&] { samples(5, 5); });                     // a tid twice
