@@ -41,7 +41,7 @@ class PeerTransport final : public wire::Transport {
   explicit PeerTransport(Peer& peer) : peer_(peer), fd_(::eventfd(1, EFD_CLOEXEC)) {}
   ~PeerTransport() override { peer_.closed = true; }
 
-  Result<wire::IoResult> send(std::span<const iovec> parts, bool) override {
+  Result<wire::IoResult> send(std::span<const iovec> parts) override {
     std::size_t bytes = 0;
     for (const iovec& part : parts) bytes += part.iov_len;
     bytes = std::min(bytes, peer_.space);
@@ -110,7 +110,8 @@ void run(std::span<const std::uint8_t> input) {
   const auto created = registry.create({"a", 0, ""}, {"T", payload_bytes, 8, {}},
                                        {4, std::chrono::milliseconds(1)}, 1);
   if (!created) std::abort();
-  const auto mapping = created->stream->map_for_writing(), bell = created->stream->map_bell();
+  const auto mapping = created->stream->map_for_writing();
+  const auto bell = created->stream->map_bell();
   if (!mapping || !bell) std::abort();
   const auto doorbell = created->stream->descriptors_for(Role::writer);
   if (!doorbell) std::abort();
