@@ -23,13 +23,13 @@ void Catalog::add_observer(CatalogObserver& observer) { observers_.push_back(&ob
 
 void Catalog::remove_observer(CatalogObserver& observer) { std::erase(observers_, &observer); }
 
-template <class Tell>
-void Catalog::notify(const Tell& tell) {
-  const std::vector<CatalogObserver*> told = observers_;
-  for (CatalogObserver* observer : told) {
-    // One told before may have taken this one off.
+template <class Notify>
+void Catalog::notify(const Notify& call) {
+  const std::vector<CatalogObserver*> all = observers_;
+  for (CatalogObserver* observer : all) {
+    // An observer that was notified before may have removed this one.
     if (std::find(observers_.begin(), observers_.end(), observer) != observers_.end()) {
-      tell(*observer);
+      call(*observer);
     }
   }
 }
@@ -44,14 +44,14 @@ void Catalog::host_up(const wire::Greeting& greeting, const wire::Address& addre
   notify([&](CatalogObserver& observer) { observer.on_host_up(host); });
 }
 
-void Catalog::host_down(const wire::HostId& id, const Error& why) {
-  const auto gone = hosts_.extract(id);
-  if (!gone) return;
-  const KnownHost& host = gone.mapped();
+void Catalog::host_down(const wire::HostId& id, const Error& error) {
+  const auto removed = hosts_.extract(id);
+  if (!removed) return;
+  const KnownHost& host = removed.mapped();
   for (const auto& [key, stream] : host.streams) {
     notify([&](CatalogObserver& observer) { observer.on_remote_stream_removed(host, stream); });
   }
-  notify([&](CatalogObserver& observer) { observer.on_host_down(host, why); });
+  notify([&](CatalogObserver& observer) { observer.on_host_down(host, error); });
 }
 
 Result<void> Catalog::stream_added(const wire::HostId& id, StreamInfo stream) {
@@ -82,11 +82,12 @@ void Catalog::stream_removed(const wire::HostId& id, const StreamId& stream) {
   const auto found = hosts_.find(id);
   if (found == hosts_.end()) return;
   KnownHost& host = found->second;
-  const auto gone = host.streams.extract(Key{stream.name, stream.id});
-  if (!gone) return;
-  host.stream_bytes -= bytes_of(gone.mapped());
-  notify(
-      [&](CatalogObserver& observer) { observer.on_remote_stream_removed(host, gone.mapped()); });
+  const auto removed = host.streams.extract(Key{stream.name, stream.id});
+  if (!removed) return;
+  host.stream_bytes -= bytes_of(removed.mapped());
+  notify([&](CatalogObserver& observer) {
+    observer.on_remote_stream_removed(host, removed.mapped());
+  });
 }
 
 void Catalog::set_clock(const wire::HostId& id, std::shared_ptr<const wire::ClockReport> clock) {
@@ -121,7 +122,7 @@ Result<const KnownHost*> Catalog::find_host(const std::string& name) const {
         hosts_.empty() ? "no other host answers" : "those that answer are " + host_names();
     return Error{Errc::not_found,
                  "there is no host '" + name + "': " + known +
-                     "; look at `dssmctl hosts`, and name it as a peer if it is missing there"};
+                     "; see `dssmctl hosts`, and add it to the key peers if it is missing there"};
   }
   std::string addresses;
   for (const KnownHost* host : found) {

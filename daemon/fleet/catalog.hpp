@@ -4,8 +4,8 @@
 // stand in the Registry; this holds the others'. It is fed by discovery (Peers, configured or
 // found) and asked by everybody who has to find a stream. One thread, no sockets.
 //
-// A host is known by its id. Names may collide: then both hosts are kept, and whoever asks by that
-// name is told of both.
+// A host is known by its id. Names may collide: then both hosts are kept, and a search by that name
+// fails with both of them.
 #pragma once
 
 #include <cstdint>
@@ -64,10 +64,10 @@ class Catalog {
   // --- fed by discovery
 
   // The host answers. When it is known already by another address, the first one stays; a host that
-  // comes with another `life` has restarted: it is told as down first, with all its streams.
+  // comes with another `life` has restarted: it is reported as down first, with all its streams.
   void host_up(const wire::Greeting& greeting, const wire::Address& address);
   // It does not answer any more: its streams leave the catalog.
-  void host_down(const wire::HostId& id, const Error& why);
+  void host_down(const wire::HostId& id, const Error& error);
   // A stream is there, or has a new ring. Its id names the owner's host. Descriptions of fields are
   // left out when a host has too many of them.
   //   fails  limit_exceeded (this host has too many streams), not_found (no such host)
@@ -97,8 +97,8 @@ class Catalog {
 
  private:
   using Key = std::pair<std::string, std::int32_t>;
-  template <class Tell>
-  void notify(const Tell& tell);
+  template <class Notify>
+  void notify(const Notify& call);
   std::string host_names() const;  // "'pc2', 'pc3'"
 
   std::string own_host_;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What mDNS tells: the dssmd of other hosts, and how this host's own announcements fare. Between
-// the finder (Mdns) and those who use what it finds (Peers).
+// What mDNS reports: the dssmd of other hosts, and how this host's own announcements fare. Between
+// the finder (Mdns) and the observer of what it finds (Peers).
 #pragma once
 
 #include <cstdint>
@@ -14,7 +14,7 @@
 
 namespace dssm::daemon {
 
-// A dssmd that was found: never this very one, as far as mDNS can tell. A value.
+// A dssmd that was found: never this very one, as far as mDNS knows. A value.
 struct FoundHost {
   wire::HostId id{};  // this host's own: of a PC that was copied from this one, or the like
   std::string name;   // "pc2"; two hosts may have the same one
@@ -27,7 +27,7 @@ struct FoundHost {
   friend bool operator==(const FoundHost&, const FoundHost&) = default;
 };
 
-// Told in the thread of the event loop that the finder was given.
+// Called in the thread of the event loop that the finder was given.
 class HostFinderObserver {
  public:
   virtual void on_host_found(const FoundHost& host) = 0;  // or something of it has changed

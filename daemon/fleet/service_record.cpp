@@ -107,14 +107,14 @@ class TxtReader {
     if (!checked) fail(checked.error().message);
   }
 
-  void fail(std::string why) {
+  void fail(std::string reason) {
     if (!status_) return;
     // It may quote the record, and goes on in messages that take nothing but UTF-8.
-    if (!is_utf8(why)) {
+    if (!is_utf8(reason)) {
       std::replace_if(
-          why.begin(), why.end(), [](char c) { return (c & 0x80) != 0; }, '?');
+          reason.begin(), reason.end(), [](char c) { return (c & 0x80) != 0; }, '?');
     }
-    status_ = Error{Errc::protocol, "its TXT record cannot be used: " + printable(why)};
+    status_ = Error{Errc::protocol, "its TXT record cannot be used: " + printable(reason)};
   }
 
   const Result<void>& status() const { return status_; }
@@ -163,7 +163,7 @@ std::string ServiceRecord::instance() const {
 
 std::string ServiceRecord::subtype() const {
   if (!stream) return std::string(kHostSubtype);
-  // Avahi takes no label of two bytes for a subtype; no name holds a colon, so this is nobody's.
+  // Avahi takes no label of two bytes for a subtype; no name holds a colon, so this one is free.
   const std::string_view end = stream->name.size() == 1 ? ":" : "";
   return "_" + escaped_label(stream->name) + std::string(end) + "._sub." +
          std::string(kServiceType);

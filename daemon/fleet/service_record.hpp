@@ -62,7 +62,7 @@ struct ServiceRecord {
 // (docs/discovery.md "Records").
 std::uint64_t type_hash(const TypeInfo& type);
 
-// What somebody else announces; only hosts' records are of use to us.
+// What another host announces; only hosts' records are of use to us.
 //   fails  protocol: another txtvers, values that are missing, wrong or out of their limits
 Result<ServiceRecord> service_record_untrusted(const TxtRecord& txt);
 

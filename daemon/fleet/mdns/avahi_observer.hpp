@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What the parts that use an AvahiClient tell the one that owns it.
+// What the parts that use an AvahiClient report to the one that owns it.
 #pragma once
 
 #include <string>

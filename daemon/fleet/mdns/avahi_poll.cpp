@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // A watch has two event sources, since ours wait for one kind of event each. Hang-ups and errors
-// are not told apart from readiness: whoever then reads or writes learns what is the matter, and
+// are not distinguished from readiness: the next read or write reports the error, and
 // libdbus does.
 #include "daemon/fleet/mdns/avahi_poll.hpp"
 

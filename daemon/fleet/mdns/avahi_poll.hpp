@@ -15,7 +15,7 @@ namespace dssm::daemon {
 
 // How long to wait for a time that Avahi gives by the wall clock. Once converted, a step of the
 // wall clock does not matter any more; one that falls in between costs a minute at most, twice as
-// long as anything libavahi-client waits for (D-Bus's patience, 25 s).
+// long as anything libavahi-client waits for (D-Bus's timeout, 25 s).
 //   returns  0 to one minute
 Duration delay_until(const timeval& when, Time now) noexcept;
 

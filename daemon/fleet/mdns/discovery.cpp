@@ -7,7 +7,7 @@
 namespace dssm::daemon {
 namespace {
 
-// After a change: each list describes all streams anew, and a thousand may be created in a row.
+// After a change: each list describes all streams, and a thousand may be created in a row.
 constexpr Duration kAnnouncePause = std::chrono::milliseconds(50);
 
 }  // namespace

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Everything here comes from whoever is on the network: names, addresses, TXT records and how many
+// Everything here comes from any PC on the network: names, addresses, TXT records and how many
 // there are of them.
 #include "daemon/fleet/mdns/host_browser.hpp"
 
@@ -122,7 +122,7 @@ FoundHosts HostBrowser::hosts() const {
     if (!result.heard || is_own(*result.heard)) continue;
     Merged& host = merged[result.heard->record.host_id];
     host.all.push_back(&*result.heard);
-    // What this PC's own Avahi says cannot be somebody else's claim.
+    // What this PC's own Avahi announces cannot be a claim of another PC.
     if (!host.best || (result.heard->local && !host.best->local)) host.best = &*result.heard;
   }
   FoundHosts hosts;
@@ -159,7 +159,7 @@ std::uint32_t HostBrowser::hosts_heard() const {
       heard.begin(), heard.end(), [&](const auto& id) { return !local.contains(id); }));
 }
 
-std::string HostBrowser::trouble() const {
+std::string HostBrowser::problem() const {
   if (waiting_.empty()) return {};
   return "more than " + std::to_string(kMaxResults) +
          " hosts, counted once per interface and protocol, announce themselves; the others are "
@@ -199,7 +199,8 @@ void HostBrowser::refill() {
   for (int n = 0; n < kRefillPerTurn && !waiting_.empty(); ++n) {
     if (observer_.stopping() || !client_) return;
     if (results_.size() >= kMaxResults && !make_room()) {
-      if (!std::exchange(told_full_, true)) observer_.log(LogLevel::warning, "mDNS: " + trouble());
+      if (!std::exchange(logged_full_, true))
+        observer_.log(LogLevel::warning, "mDNS: " + problem());
       return observer_.on_avahi_change();
     }
     const auto next = waiting_.extract(waiting_.begin());
@@ -252,7 +253,7 @@ void HostBrowser::resolve_again() {
 
 // Two hosts cannot be at one address and port, nor another with our id at ours. When two PCs had
 // one name until Avahi gave one of them another, a resolver keeps the address that it heard first,
-// also after that has become the other one's: both are asked for anew.
+// also after that has become the other one's: both are resolved again.
 void HostBrowser::check_contest(Result& result) {
   for (auto& [key, other] : results_) {
     if (!other.heard || (other.heard->record.host_id == result.heard->record.host_id &&
@@ -293,11 +294,11 @@ void HostBrowser::on_resolved_untrusted(Result& result, const AvahiAddress* addr
   result.heard.reset();
   result.useless = true;
   const std::string interface = interface_name(result.key.interface);
-  const auto bad = [&](const std::string& why) {
-    if (std::exchange(result.told_bad, true)) return;
+  const auto bad = [&](const std::string& reason) {
+    if (std::exchange(result.logged_bad, true)) return;
     observer_.log(LogLevel::warning, "mDNS: " + in_quotes(result.key.instance) + " on interface " +
                                          in_quotes(interface) + " calls itself a DSSM host, but " +
-                                         why + ", skipping");
+                                         reason + ", skipping");
   };
   const dssm::Result<TxtRecord> pairs = txt_untrusted(txt);
   if (!pairs) return bad(pairs.error().message);
@@ -309,7 +310,7 @@ void HostBrowser::on_resolved_untrusted(Result& result, const AvahiAddress* addr
   if (!usable || port == 0) return bad("its address or port cannot be reached");
   result.heard = Heard{*std::move(record), usable->text, usable->rank, port, local};
   result.useless = false;
-  result.told_bad = false;
+  result.logged_bad = false;
   check_contest(result);
 }
 
@@ -319,7 +320,7 @@ void HostBrowser::on_not_resolved(Result& result) {
   result.useless = true;
   const int error = avahi_client_errno(client_);
   if (error == AVAHI_ERR_TIMEOUT) return;
-  // Freed inside its own callback, as Avahi's examples do, and made anew later.
+  // Freed inside its own callback, as Avahi's examples do, and recreated later.
   free_resolver(result);
   retry_.enable_in(kResolverPause);
 }

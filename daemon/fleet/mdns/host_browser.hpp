@@ -3,9 +3,9 @@
 // Finds the dssmd of all hosts: browses for their host services, resolves them, and merges what
 // was heard on several interfaces, by IPv4 and IPv6, into one host per id.
 //
-// A resolver stays as long as its result, because a changed TXT record or address is told only to
-// resolvers. So results are bounded: the ones beyond wait for the place of one that has gone or
-// turned out to be of no use, so that whoever announces rubbish cannot keep the good ones out.
+// A resolver stays as long as its result, because a changed TXT record or address is reported only to
+// resolvers. So results are bounded: the ones beyond wait for the place of one that was removed
+// or is of no use, so that a PC that announces invalid records cannot displace the valid ones.
 #pragma once
 
 #include <avahi-client/lookup.h>
@@ -38,12 +38,12 @@ class HostBrowser {
   HostBrowser& operator=(const HostBrowser&) = delete;
 
   void start(AvahiClient* client);  // already started: nothing
-  void forget();                    // the client is gone or about to be freed, with all of ours
+  void forget();                    // the client is freed or about to be, with all of ours
 
   FoundHosts hosts() const;           // without this very one
   bool own_host_seen() const;         // this host's own service
   std::uint32_t hosts_heard() const;  // others that are not of this PC
-  std::string trouble() const;        // empty: none
+  std::string problem() const;        // empty: none
 
  private:
   struct Key {
@@ -64,8 +64,8 @@ class HostBrowser {
     Key key;
     AvahiServiceResolver* resolver = nullptr;
     std::optional<Heard> heard;
-    bool useless = false;   // it did not resolve, or is no record of ours
-    bool told_bad = false;  // the log knows
+    bool useless = false;  // it did not resolve, or is no record of ours
+    bool logged_bad = false;
   };
 
   static void on_browser(AvahiServiceBrowser* browser, AvahiIfIndex interface,
@@ -98,7 +98,7 @@ class HostBrowser {
   AvahiServiceBrowser* browser_ = nullptr;
   std::map<Key, Result> results_;
   std::set<Key> waiting_;  // beyond kMaxResults
-  bool told_full_ = false;
+  bool logged_full_ = false;
   EventSource retry_, refill_;
 };
 

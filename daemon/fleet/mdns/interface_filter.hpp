@@ -32,10 +32,10 @@ class InterfaceFilter {
   std::vector<std::string> use_, avoid_;
 };
 
-// The name of the interface with that index; empty: it is gone.
+// The name of the interface with that index; empty: it is not there any more.
 std::string interface_name(int index);
 
-// Calls back when interfaces may have come, gone or been renamed.
+// Calls back when interfaces may have been added, removed or renamed.
 class InterfaceWatch {
  public:
   InterfaceWatch(const EventLoop& loop, std::function<void()> on_change);

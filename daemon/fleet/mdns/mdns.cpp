@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmd's side: passes on what is to be announced, and tells what has changed among what was found.
+// dssmd's side: passes on what is to be announced, and reports what has changed of what was found.
 #include "daemon/fleet/mdns/mdns.hpp"
 
 #include <signal.h>
@@ -10,54 +10,35 @@
 
 #include "core/base/quiet_thread.hpp"
 #include "core/base/try.hpp"
-#include "daemon/base/rate_limited_logger.hpp"
-#include "daemon/fleet/mdns/mdns_mailbox.hpp"
 #include "daemon/fleet/mdns/mdns_worker.hpp"
 
 namespace dssm::daemon {
 namespace {
 
 // How long a hung Avahi daemon may delay dssmd's end.
-constexpr Duration kPatienceAtEnd = std::chrono::milliseconds(900);
+constexpr Duration kEndTimeout = std::chrono::milliseconds(900);
 
 }  // namespace
 
-struct Mdns::Impl {
-  Impl(HostFinderObserver& observer_, Logger& logger) : observer(observer_), calm(logger) {}
-
-  Result<void> start(const EventLoop& main_loop, const Options& options);
-  void on_news();
-
-  HostFinderObserver& observer;
-  RateLimitedLogger calm;  // others decide how often there is something to say
-  MdnsInfo state;
-  FoundHosts told;
-  std::shared_ptr<MdnsMailbox> mailbox;
-  std::thread thread;
-  EventSource news;
-};
-
 Mdns::Mdns(const EventLoop& loop, Options options, HostFinderObserver& observer, Logger& logger)
-    : impl_(std::make_unique<Impl>(observer, logger)) {
-  impl_->state.phase = MdnsPhase::waiting;
-  if (const Result<void> started = impl_->start(loop, options); !started) {
-    impl_->state.error = started.error().message;
-    logger.error("mDNS is not to be had, only configured peers are found: " +
+    : observer_(observer), logger_(logger) {
+  state_.phase = MdnsPhase::waiting;
+  if (const Result<void> started = start(loop, options); !started) {
+    state_.error = started.error().message;
+    logger.error("mDNS is not available, only configured peers are found: " +
                  started.error().message);
   }
 }
 
-Result<void> Mdns::Impl::start(const EventLoop& main_loop, const Options& options) {
-  Result<std::shared_ptr<MdnsMailbox>> made = MdnsMailbox::open();
-  if (!made) return std::move(made).error().context("start the thread for mDNS");
-  Result<EventLoop> opened = EventLoop::open();
-  if (!opened) return std::move(opened).error().context("start the thread for mDNS");
-  mailbox = *std::move(made);
-  news = EventSource::readable(main_loop, mailbox->news_fd(), [this] { on_news(); });
-  news.enable();
+Result<void> Mdns::start(const EventLoop& main_loop, const Options& options) {
+  const std::string what = "start the thread for mDNS";
+  mailbox_ = DSSM_TRY(MdnsMailbox::open(), what);
+  EventLoop thread_loop = DSSM_TRY(EventLoop::open(), what);
+  updates_ = EventSource::readable(main_loop, mailbox_->updates_fd(), [this] { on_update(); });
+  updates_.enable();
   // The thread has nothing of ours but the mailbox, which it owns as well: see ~Mdns().
-  thread =
-      DSSM_TRY(quiet_thread("mDNS", [box = mailbox, loop = *std::move(opened), options]() mutable {
+  thread_ = DSSM_TRY(
+      quiet_thread("mDNS", [box = mailbox_, loop = std::move(thread_loop), options]() mutable {
         {
           MdnsWorker worker(loop, options, *box);
           worker.run();
@@ -67,39 +48,39 @@ Result<void> Mdns::Impl::start(const EventLoop& main_loop, const Options& option
   return {};
 }
 
-// A thread that waits for an answer by D-Bus can neither be woken nor ended. It is left to itself
-// then: it finds the word to stop in the mailbox as soon as D-Bus gives up, and everything that it
-// uses until then is its own.
+// A thread that waits for an answer by D-Bus can neither be woken nor ended. It is detached then: it
+// finds the request to stop in the mailbox as soon as D-Bus gives up, and everything that it uses
+// until then is its own.
 Mdns::~Mdns() {
-  if (!impl_->thread.joinable()) return;
-  impl_->mailbox->stop();
-  if (impl_->mailbox->wait_until_done(kPatienceAtEnd)) {
-    impl_->thread.join();
+  if (!thread_.joinable()) return;
+  mailbox_->stop();
+  if (mailbox_->wait_until_done(kEndTimeout)) {
+    thread_.join();
   } else {
-    impl_->thread.detach();
+    thread_.detach();
   }
 }
 
 void Mdns::announce(std::vector<ServiceRecord> records) {
-  if (impl_->mailbox) impl_->mailbox->want(std::move(records));
+  if (mailbox_) mailbox_->want(std::move(records));
 }
 
-void Mdns::Impl::on_news() {
-  MdnsMailbox::News fresh = mailbox->take_news();
-  for (const auto& [level, text] : fresh.lines) calm.write(level, text, {});
-  if (fresh.hosts) {
-    const FoundHosts before = std::exchange(told, *std::move(fresh.hosts));
+void Mdns::on_update() {
+  MdnsMailbox::Update update = mailbox_->take_update();
+  for (const auto& [level, text] : update.lines) logger_.write(level, text, {});
+  if (update.hosts) {
+    const FoundHosts before = std::exchange(reported_, *std::move(update.hosts));
     for (const auto& [id, host] : before) {
-      if (!told.contains(id)) observer.on_host_lost(id);
+      if (!reported_.contains(id)) observer_.on_host_lost(id);
     }
-    for (const auto& [id, host] : told) {
+    for (const auto& [id, host] : reported_) {
       const auto known = before.find(id);
-      if (known == before.end() || known->second != host) observer.on_host_found(host);
+      if (known == before.end() || known->second != host) observer_.on_host_found(host);
     }
   }
-  if (fresh.state && *fresh.state != state) {
-    state = *std::move(fresh.state);
-    observer.on_mdns_state(state);
+  if (update.state && *update.state != state_) {
+    state_ = *std::move(update.state);
+    observer_.on_mdns_state(state_);
   }
 }
 

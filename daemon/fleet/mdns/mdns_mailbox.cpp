@@ -8,8 +8,8 @@
 namespace dssm::daemon {
 namespace {
 
-// Lines that dssmd's loop has not taken yet; a loop that is so far behind logs the rest no more.
-constexpr std::size_t kMaxUntoldLines = 64;
+// Lines that dssmd's loop has not taken yet; beyond them lines are dropped.
+constexpr std::size_t kMaxPendingLines = 64;
 
 void ring_bell(const UniqueFd& bell) {
   const std::uint64_t one = 1;
@@ -17,7 +17,7 @@ void ring_bell(const UniqueFd& bell) {
   [[maybe_unused]] const ssize_t written = ::write(bell.get(), &one, sizeof one);
 }
 
-void silence_bell(const UniqueFd& bell) {
+void clear_bell(const UniqueFd& bell) {
   std::uint64_t count;
   // Fails only when it has not been rung.
   [[maybe_unused]] const ssize_t n = ::read(bell.get(), &count, sizeof count);
@@ -27,7 +27,7 @@ void silence_bell(const UniqueFd& bell) {
 
 Result<std::shared_ptr<MdnsMailbox>> MdnsMailbox::open() {
   std::shared_ptr<MdnsMailbox> made(new MdnsMailbox);
-  for (UniqueFd* bell : {&made->orders_, &made->news_, &made->done_}) {
+  for (UniqueFd* bell : {&made->orders_, &made->updates_, &made->done_}) {
     bell->reset(::eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK));
     if (!*bell) return os_error("make an eventfd");
   }
@@ -47,39 +47,40 @@ void MdnsMailbox::stop() {
   ring_bell(orders_);
 }
 
-MdnsMailbox::News MdnsMailbox::take_news() {
-  silence_bell(news_);
+MdnsMailbox::Update MdnsMailbox::take_update() {
+  clear_bell(updates_);
   const std::lock_guard lock(mutex_);
-  return std::exchange(untold_, {});
+  return std::exchange(pending_, {});
 }
 
-bool MdnsMailbox::wait_until_done(Duration patience) const {
+bool MdnsMailbox::wait_until_done(Duration timeout) const {
   pollfd bell{done_.get(), POLLIN, 0};
-  const auto ms = std::chrono::duration_cast<std::chrono::milliseconds>(patience).count();
+  const auto ms = std::chrono::duration_cast<std::chrono::milliseconds>(timeout).count();
   return ::poll(&bell, 1, static_cast<int>(ms)) > 0;
 }
 
 std::optional<std::vector<ServiceRecord>> MdnsMailbox::take_wanted() {
-  silence_bell(orders_);
+  clear_bell(orders_);
   const std::lock_guard lock(mutex_);
   return std::exchange(wanted_, std::nullopt);
 }
 
-void MdnsMailbox::tell(FoundHosts hosts, MdnsInfo state) {
+void MdnsMailbox::report(FoundHosts hosts, MdnsInfo state) {
   {
     const std::lock_guard lock(mutex_);
-    untold_.hosts = std::move(hosts);
-    untold_.state = std::move(state);
+    pending_.hosts = std::move(hosts);
+    pending_.state = std::move(state);
   }
-  ring_bell(news_);
+  ring_bell(updates_);
 }
 
 void MdnsMailbox::log(LogLevel level, std::string text) {
   {
     const std::lock_guard lock(mutex_);
-    if (untold_.lines.size() < kMaxUntoldLines) untold_.lines.emplace_back(level, std::move(text));
+    if (pending_.lines.size() < kMaxPendingLines)
+      pending_.lines.emplace_back(level, std::move(text));
   }
-  ring_bell(news_);
+  ring_bell(updates_);
 }
 
 void MdnsMailbox::done() { ring_bell(done_); }

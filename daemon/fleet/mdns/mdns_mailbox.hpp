@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Between dssmd's loop and the thread that talks to Avahi. Both own it, so that either may outlive
-// the other. It holds the newest word of each side, not a queue: neither can be flooded.
+// the other. It holds the newest state of each side, not a queue: neither can be flooded.
 #pragma once
 
 #include <atomic>
@@ -24,8 +24,8 @@ using FoundHosts = std::map<wire::HostId, FoundHost>;
 
 class MdnsMailbox {
  public:
-  // What the thread has to say since it was last asked.
-  struct News {
+  // What the thread has reported since the last call of take_update().
+  struct Update {
     std::optional<FoundHosts> hosts;  // all of them
     std::optional<MdnsInfo> state;
     std::vector<std::pair<LogLevel, std::string>> lines;
@@ -36,26 +36,26 @@ class MdnsMailbox {
   // dssmd's side.
   void want(std::vector<ServiceRecord> records);
   void stop();
-  int news_fd() const noexcept { return news_.get(); }  // readable: there are news
-  News take_news();
-  bool wait_until_done(Duration patience) const;
+  int updates_fd() const noexcept { return updates_.get(); }  // readable: there is an update
+  Update take_update();
+  bool wait_until_done(Duration timeout) const;
 
   // The thread's side.
   int orders_fd() const noexcept { return orders_.get(); }
   std::optional<std::vector<ServiceRecord>> take_wanted();  // when it has changed
   bool stopping() const noexcept { return stopping_.load(); }
-  void tell(FoundHosts hosts, MdnsInfo state);
+  void report(FoundHosts hosts, MdnsInfo state);
   void log(LogLevel level, std::string text);
-  void done();  // the thread's last word
+  void done();  // the thread is about to end
 
  private:
   MdnsMailbox() = default;
 
-  UniqueFd orders_, news_, done_;       // eventfds
-  std::atomic<bool> stopping_ = false;  // set before the bell is rung, looked at after it is read
+  UniqueFd orders_, updates_, done_;    // eventfds
+  std::atomic<bool> stopping_ = false;  // set before the bell is rung, checked after it is read
   std::mutex mutex_;                    // for all below
   std::optional<std::vector<ServiceRecord>> wanted_;
-  News untold_;
+  Update pending_;
 };
 
 }  // namespace dssm::daemon

@@ -5,13 +5,13 @@
 //   connect()       makes a client. Without D-Bus that fails, and is tried again; without an Avahi
 //                   daemon the client waits for it (AVAHI_CLIENT_NO_FAIL)
 //   follow_state()  announces and browses as soon as the daemon is there; pauses announcing while
-//                   it looks for another name for this PC
-//   reopen()    frees the client with all that it made when the daemon or D-Bus has gone, and
+//                   it tries another name for this PC
+//   reopen()    frees the client with all that it made when the daemon or D-Bus has ended, and
 //                   connects again
 //
 // Avahi's callbacks only take notes: what they lead to is done by timers without delay, so that
 // nothing is freed while it is in use further up the stack. Freeing a client closes its connection
-// to D-Bus first and calls nobody; the Avahi daemon then withdraws what it had announced.
+// to D-Bus first and calls nothing else; the Avahi daemon then withdraws what it had announced.
 #include "daemon/fleet/mdns/mdns_worker.hpp"
 
 #include <avahi-common/error.h>
@@ -33,7 +33,7 @@ constexpr Duration kReportSettle = std::chrono::milliseconds(20);
 // Beside Avahi's own, which are negative.
 constexpr int kErrorNoBus = 1;
 
-std::string why_waiting(int error) {
+std::string waiting_reason(int error) {
   switch (error) {
     case kErrorNoBus:
       return "the D-Bus system bus cannot be reached: install and start it, and the Avahi daemon "
@@ -48,7 +48,7 @@ std::string why_waiting(int error) {
              "): see that both run (systemctl status dbus avahi-daemon)";
     default:
       return "Avahi cannot be used (" + std::string(avahi_strerror(error)) +
-             "): see what its daemon says (journalctl -u avahi-daemon)";
+             "): see the log of its daemon (journalctl -u avahi-daemon)";
   }
 }
 
@@ -79,7 +79,7 @@ MdnsWorker::MdnsWorker(EventLoop& loop, const Mdns::Options& options, MdnsMailbo
 MdnsWorker::~MdnsWorker() { disconnect(); }
 
 void MdnsWorker::run() {
-  // A loop that fails has said why; dssmd goes on without mDNS.
+  // dssmd continues without mDNS.
   const Result<void> ran = loop_.run();
   if (!ran) log(LogLevel::error, "mDNS ends: " + ran.error().message);
 }
@@ -128,7 +128,7 @@ void MdnsWorker::disconnect() {
 // Also called from within avahi_client_new().
 void MdnsWorker::on_client(AvahiClient*, AvahiClientState state, void* self) {
   auto& worker = *static_cast<MdnsWorker*>(self);
-  // It may have passed before anybody looks, and what was announced with the old name with it.
+  // It may have passed before follow_state() runs, and what was announced with the old name with it.
   worker.renamed_ |= state == AVAHI_CLIENT_S_REGISTERING || state == AVAHI_CLIENT_S_COLLISION;
   worker.follow_.enable_in(Duration::zero());
 }
@@ -148,7 +148,7 @@ void MdnsWorker::follow_state() {
       return reopen();
     case AVAHI_CLIENT_CONNECTING:
       state_.phase = MdnsPhase::waiting;
-      state_.error = why_waiting(AVAHI_ERR_NO_DAEMON);
+      state_.error = waiting_reason(AVAHI_ERR_NO_DAEMON);
       break;
     case AVAHI_CLIENT_S_RUNNING:
     case AVAHI_CLIENT_S_REGISTERING:
@@ -164,7 +164,7 @@ void MdnsWorker::follow_state() {
         state_.error.clear();
         pause_ = kFirstConnectPause;
         log(LogLevel::notice, "mDNS works (" + state_.avahi_version + ")");
-        told_waiting_ = false;
+        logged_waiting_ = false;
       }
       browser_.start(client_);
       if (std::exchange(renamed_, false)) publisher_.pause();
@@ -183,7 +183,7 @@ void MdnsWorker::reopen() {
 
 void MdnsWorker::wait_for_avahi(int error) {
   state_.phase = MdnsPhase::waiting;
-  state_.error = why_waiting(error);
+  state_.error = waiting_reason(error);
   connect_.enable_in(pause_);
   pause_ = std::min(2 * pause_, kLongestConnectPause);
   report();
@@ -195,10 +195,10 @@ void MdnsWorker::choose_interfaces() {
     if (chosen.size() == ServicePublisher::kMaxInterfaces) break;
     chosen.push_back(index);
   }
-  interface_trouble_ = chosen.empty()
-                           ? "no network interface matches the configured " + filter_.selection() +
-                                 ": nothing is announced or found until there is one (ip link)"
-                           : "";
+  interface_error_ = chosen.empty()
+                         ? "no network interface matches the configured " + filter_.selection() +
+                               ": nothing is announced or found until there is one (ip link)"
+                         : "";
   publisher_.use_interfaces(std::move(chosen));
   on_avahi_change();
 }
@@ -209,12 +209,12 @@ void MdnsWorker::report() {
   MdnsInfo state = state_;
   if (state.phase == MdnsPhase::waiting) {
     // The log hears of it once, however often it is tried again.
-    if (!std::exchange(told_waiting_, true)) {
+    if (!std::exchange(logged_waiting_, true)) {
       log(LogLevel::warning,
           "mDNS waits, other hosts are found only as configured peers: " + state.error);
     }
   } else {
-    for (const std::string& text : {interface_trouble_, publisher_.trouble(), browser_.trouble()}) {
+    for (const std::string& text : {interface_error_, publisher_.problem(), browser_.problem()}) {
       if (!text.empty()) state.error += (state.error.empty() ? "" : "; ") + text;
     }
     state.announced = publisher_.announced();
@@ -222,7 +222,7 @@ void MdnsWorker::report() {
     state.hosts_heard = browser_.hosts_heard();
   }
   state.withheld = publisher_.withheld();
-  mailbox_.tell(browser_.hosts(), std::move(state));
+  mailbox_.report(browser_.hosts(), std::move(state));
 }
 
 void MdnsWorker::log(LogLevel level, std::string text) { mailbox_.log(level, std::move(text)); }

@@ -55,11 +55,11 @@ class MdnsWorker final : private AvahiObserver {
   HostBrowser browser_;
   AvahiClient* client_ = nullptr;
   MdnsInfo state_;
-  std::string interface_trouble_;
-  int failure_ = 0;            // of the client, to be dealt with outside its callbacks
-  bool renamed_ = false;       // this PC got another name since follow_state() looked
-  bool told_waiting_ = false;  // the log knows
-  Duration pause_;             // before the next attempt to connect
+  std::string interface_error_;
+  int failure_ = 0;              // of the client, to be dealt with outside its callbacks
+  bool renamed_ = false;         // this PC got another name since the last follow_state()
+  bool logged_waiting_ = false;  // the log knows
+  Duration pause_;               // before the next attempt to connect
   std::unique_ptr<InterfaceWatch> interfaces_;
   EventSource orders_, settle_, connect_, follow_, report_;
 };

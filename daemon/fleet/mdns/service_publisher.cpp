@@ -17,7 +17,7 @@ namespace {
 constexpr int kServicesPerTurn = 16;
 // Before the pauses begin. Few PCs have more.
 constexpr int kStreamsAtOnce = 32;
-// After so many collisions in a row somebody claims every name that is tried.
+// After so many collisions in a row another PC claims every name that is tried.
 constexpr int kMaxRenames = 20;
 // Until what was refused is tried again.
 constexpr Duration kWithheldPause = std::chrono::seconds(30);
@@ -83,7 +83,7 @@ void ServicePublisher::want(std::vector<ServiceRecord> records) {
     service.record = std::move(record);
     if (service.record.stream) queue(service);
   }
-  // What goes makes room for what comes; and the host is what others look for.
+  // Removed services free quota for new ones; and the host is what others browse.
   for (auto& [instance, service] : services_) {
     if (!service.wanted) queue(service, true);
   }
@@ -139,7 +139,7 @@ std::uint32_t ServicePublisher::withheld() const {
                     [](const auto& entry) { return entry.second.state == State::withheld; }));
 }
 
-std::string ServicePublisher::trouble() const {
+std::string ServicePublisher::problem() const {
   const std::uint32_t count = withheld();
   if (count == 0) return {};
   const auto first = std::find_if(services_.begin(), services_.end(), [](const auto& entry) {
@@ -167,7 +167,7 @@ void ServicePublisher::queue(Service& service, bool first) {
   worker_.enable_in(Duration::zero());
 }
 
-// All of them anew: with another client, other interfaces, or not at all.
+// All of them again: with another client, other interfaces, or not at all.
 void ServicePublisher::queue_all() {
   for (auto& [instance, service] : services_) {
     service.state = State::idle;
@@ -339,9 +339,9 @@ void ServicePublisher::withhold(Service& service, int error) {
   service.error =
       error == AVAHI_OK ? "" : "Avahi refuses it: " + std::string(avahi_strerror(error));
   if (error != AVAHI_OK) retry_.enable_in(kWithheldPause);
-  if (!told_withheld_ && !is_avahi_connection_error(error)) {
-    told_withheld_ = true;
-    observer_.log(LogLevel::warning, "mDNS: " + trouble());
+  if (!logged_withheld_ && !is_avahi_connection_error(error)) {
+    logged_withheld_ = true;
+    observer_.log(LogLevel::warning, "mDNS: " + problem());
   }
   if (!service.record.stream) queue_new_streams();
 }
@@ -352,7 +352,7 @@ void ServicePublisher::on_group(AvahiEntryGroup*, AvahiEntryGroupState state, vo
 }
 
 void ServicePublisher::on_group(Service& service, AvahiEntryGroupState state) {
-  // While it is made, or about to be freed or registered anew, its word does not count.
+  // While it is made, or about to be freed or registered again, its state does not count.
   if (!service.group || !service.wanted || !running_) return;
   switch (state) {
     case AVAHI_ENTRY_GROUP_ESTABLISHED:

@@ -47,11 +47,11 @@ class ServicePublisher {
 
   void start(AvahiClient* client);  // its host name is established; already started: nothing
   void pause();                     // the host name is being changed: withdraws all
-  void forget();                    // the client is gone or about to be freed, with all its groups
+  void forget();                    // the client is freed or about to be, with all its groups
 
   std::uint32_t announced() const;
   std::uint32_t withheld() const;
-  std::string trouble() const;  // empty: none
+  std::string problem() const;  // empty: none
 
  private:
   enum class State : unsigned char { idle, registering, established, withheld };
@@ -60,7 +60,7 @@ class ServicePublisher {
     ServiceRecord record;
     TxtRecord txt;      // as registered
     std::string name;   // the instance, with " #2" after a collision
-    std::string error;  // why it is withheld; empty: for want of room
+    std::string error;  // why it is withheld; empty: beyond the limits
     AvahiEntryGroup* group = nullptr;
     State state = State::idle;
     bool wanted = true;
@@ -90,9 +90,9 @@ class ServicePublisher {
   bool running_ = false;
   std::vector<AvahiIfIndex> interfaces_{AVAHI_IF_UNSPEC};
   Services services_;
-  std::deque<std::string> queue_;  // instances to look at
+  std::deque<std::string> queue_;  // instances to check
   std::size_t groups_ = 0;
-  bool told_withheld_ = false;
+  bool logged_withheld_ = false;
   RateLimiter pace_;
   EventSource worker_, retry_;
 };
