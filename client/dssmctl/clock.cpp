@@ -29,7 +29,7 @@ bool is_good(const ClockInfo& clock) {
   return clock.status == ClockStatus::synchronized || clock.status == ClockStatus::holdover;
 }
 
-std::string or_dash(std::string text) { return text.empty() ? "-" : text; }
+std::string or_dash(const std::string& text) { return text.empty() ? "-" : text; }
 
 // "1.25 ms", "-87 us"
 std::string offset_text(Duration offset) {

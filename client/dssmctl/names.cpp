@@ -60,6 +60,7 @@ std::vector<std::string> similar_names(std::string_view wanted, std::vector<std:
   ranked.erase(std::unique(ranked.begin(), ranked.end()), ranked.end());
   if (ranked.size() > kMost) ranked.resize(kMost);
   std::vector<std::string> best;
+  best.reserve(ranked.size());
   for (auto& [distance, name] : ranked) best.push_back(std::move(name));
   return best;
 }

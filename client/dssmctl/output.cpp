@@ -10,7 +10,8 @@
 namespace dssm::ctl {
 
 Output::Output(int fd) : fd_(fd), terminal_(::isatty(fd) == 1) {
-  const char* no_color = std::getenv("NO_COLOR");  // https://no-color.org: set and not empty
+  // https://no-color.org: set and not empty
+  const char* no_color = std::getenv("NO_COLOR");  // NOLINT(concurrency-mt-unsafe): one thread
   colour_ = terminal_ && (!no_color || !*no_color);
 }
 

@@ -21,6 +21,7 @@ constexpr int kNotExecuted = 127;  // posix_spawn(3)
 // Starts it with both outputs at `out_fd`; -1 when there is no such program.
 pid_t spawn(std::vector<std::string>& argv, int out_fd) {
   std::vector<char*> words;
+  words.reserve(argv.size() + 1);
   for (std::string& word : argv) words.push_back(word.data());
   words.push_back(nullptr);
   posix_spawn_file_actions_t actions;

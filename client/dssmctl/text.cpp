@@ -114,9 +114,10 @@ std::string duration_text(Duration d) {
   if (ns < 999'500'000) return three_digits(value / 1e6) + " ms";
   const std::int64_t s = ns / kNsPerSecond;
   if (s < 120) return three_digits(value / 1e9) + " s";
-  if (s < 2 * 3600) return two_units(s / 60, 'm', s % 60, 's');
-  if (s < 48 * 3600) return two_units(s / 3600, 'h', s / 60 % 60, 'm');
-  return two_units(s / 86400, 'd', s / 3600 % 24, 'h');
+  constexpr std::int64_t kHour = 3600, kDay = 24 * kHour;
+  if (s < 2 * kHour) return two_units(s / 60, 'm', s % 60, 's');
+  if (s < 2 * kDay) return two_units(s / kHour, 'h', s / 60 % 60, 'm');
+  return two_units(s / kDay, 'd', s / kHour % 24, 'h');
 }
 
 std::string bound_text(Duration bound) {

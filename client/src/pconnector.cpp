@@ -117,7 +117,7 @@ Result<PConnector> PConnector::create(const StreamId& id, const TypeInfo& type,
   return PConnector(std::make_unique<detail::PConnectorState>(std::move(*client)));
 }
 
-Result<std::vector<StreamInfo>> PConnector::list_streams(PConnectorOptions options) {
+Result<std::vector<StreamInfo>> PConnector::list_streams(const PConnectorOptions& options) {
   const std::string what = "list the streams of '" + options.address + "'";
   auto host = detail::parse_host(options.address);
   if (!host) return std::move(host).error().context(what);

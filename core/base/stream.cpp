@@ -129,8 +129,7 @@ std::string_view name_of(Scalar kind) noexcept {
 }
 
 std::string TypeInfo::str() const {
-  const std::string bytes =
-      std::to_string(payload_bytes) + (payload_bytes == 1 ? " byte" : " bytes");
+  std::string bytes = std::to_string(payload_bytes) + (payload_bytes == 1 ? " byte" : " bytes");
   if (name.empty()) return bytes;
   return "'" + name + "' (" + bytes + ", aligned to " + std::to_string(alignment_bytes) + ")";
 }

@@ -25,7 +25,7 @@ template <class Work>
 auto with_record(const ClockPage& page, const Work& work) {
   for (;;) {
     const std::uint64_t generation = page.generation.load(std::memory_order_acquire);
-    const auto result = work(page.records[generation % 2], generation);
+    auto result = work(page.records[generation % 2], generation);
     if (page.generation.load(std::memory_order_relaxed) == generation) return result;
   }
 }

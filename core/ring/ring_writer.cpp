@@ -22,8 +22,8 @@ struct LoanedRings {
   }
   void add(const RingHeader* ring) noexcept { rings[count++] = ring; }
   void remove(const RingHeader* ring) noexcept {
-    std::remove(rings.begin(), rings.begin() + count, ring);
-    --count;
+    const auto end = std::remove(rings.begin(), rings.begin() + count, ring);
+    count = static_cast<std::size_t>(end - rings.begin());
   }
 };
 // Initial-exec: one load instead of a call, on the path of every write. It takes 72 bytes of the

@@ -63,7 +63,7 @@ class ChannelTable final : private CatalogObserver {
   //   fails  limit_exceeded, conflict
   Result<Kept*> find_or_make(const KnownHost& host, const StreamId& id) {
     const StreamId full{id.name, id.id, host.greeting.host};
-    const Result<Kept*> found = find_or_make(key_of(full));
+    Result<Kept*> found = find_or_make(key_of(full));
     if (!found) return found;
     OwnerConnection& channel = (*found)->channel();
     if (channel.owner() && *channel.owner() != host.greeting.host_id &&

@@ -119,117 +119,117 @@ bool is_same(const Config& one, const Config& other) {
   return one.*member == other.*member;
 }
 template <auto member>
-constexpr ConfigKey::Change at_once{true, &is_same<member>};
+constexpr ConfigKey::Change kChangesAtOnce{true, &is_same<member>};
 template <auto member>
-constexpr ConfigKey::Change at_restart{false, &is_same<member>};
+constexpr ConfigKey::Change kChangesAtRestart{false, &is_same<member>};
 
 constexpr ConfigKey kKeys[] = {
     {"name", "HOST",
      "this host's name in 'stream:id@HOST'; default: the machine's name up to the "
      "first dot",
-     ValueForm::text, at_restart<&Config::name>,
+     ValueForm::text, kChangesAtRestart<&Config::name>,
      [](Config& c, std::string_view text) -> Result<void> {
        DSSM_TRY(check_host_name(text));
        c.name = text;
        return {};
      }},
     {"runtime_dir", "DIR", "folder of the socket 'dssmd.sock'; default: /run/dssm", ValueForm::text,
-     at_restart<&Config::runtime_dir>, set_runtime_dir},
+     kChangesAtRestart<&Config::runtime_dir>, set_runtime_dir},
     {"socket_group", "GROUP", "group that owns the socket; default: dssmd's own", ValueForm::text,
-     at_restart<&Config::socket_group>,
+     kChangesAtRestart<&Config::socket_group>,
      [](Config& c, std::string_view text) { return take(c.socket_group, parse_group(text)); }},
     {"socket_mode", "MODE", "permissions of the socket, octal; default: 0660", ValueForm::text,
-     at_restart<&Config::socket_mode>,
+     kChangesAtRestart<&Config::socket_mode>,
      [](Config& c, std::string_view text) { return take(c.socket_mode, parse_mode(text)); }},
     {"log_level", "LEVEL", "error, warning, notice, info or debug; default: info", ValueForm::text,
-     at_once<&Config::log_level>,
+     kChangesAtOnce<&Config::log_level>,
      [](Config& c, std::string_view text) { return take(c.log_level, parse_log_level(text)); }},
     {"max_clients", "COUNT", "connections at once; default: 4096", ValueForm::integer,
-     at_once<&Config::max_clients>,
+     kChangesAtOnce<&Config::max_clients>,
      [](Config& c, std::string_view text) {
        return take(c.max_clients, parse_count(text, 1, kMostClients));
      }},
     {"max_streams", "COUNT", "streams at once; default: 4096", ValueForm::integer,
-     at_once<&Config::max_streams>,
+     kChangesAtOnce<&Config::max_streams>,
      [](Config& c, std::string_view text) {
        return take(c.max_streams, parse_count(text, 1, kMostStreams));
      }},
     {"max_memory", "BYTES",
      "memory of all rings and properties, e.g. '4 GiB' or '25%'; default: "
      "half of the machine's",
-     ValueForm::integer_or_text, at_once<&Config::max_memory_bytes>,
+     ValueForm::integer_or_text, kChangesAtOnce<&Config::max_memory_bytes>,
      [](Config& c, std::string_view text) {
        return take(c.max_memory_bytes, parse_bytes(text, 64 << 10, kMostMemoryBytes));
      }},
     {"max_opens", "COUNT", "open streams of all clients together; default: 65536",
-     ValueForm::integer, at_once<&Config::max_opens>,
+     ValueForm::integer, kChangesAtOnce<&Config::max_opens>,
      [](Config& c, std::string_view text) {
        return take(c.max_opens, parse_count(text, 1, kMostOpens));
      }},
     {"max_opens_per_client", "COUNT", "open streams of one client; default: 16384",
-     ValueForm::integer, at_once<&Config::max_opens_per_client>,
+     ValueForm::integer, kChangesAtOnce<&Config::max_opens_per_client>,
      [](Config& c, std::string_view text) {
        return take(c.max_opens_per_client, parse_count(text, 1, kMostOpens));
      }},
     {"max_property", "BYTES", "size of one stream's property; default: 16 MiB",
-     ValueForm::integer_or_text, at_once<&Config::max_property_bytes>,
+     ValueForm::integer_or_text, kChangesAtOnce<&Config::max_property_bytes>,
      [](Config& c, std::string_view text) {
        return take(c.max_property_bytes, parse_bytes(text, 0, wire::kMaxPropertyBytes));
      }},
     {"recovery_grace", "TIME",
      "how long after a crash programs may give their streams back before "
      "new ones take their names; default: 500 ms",
-     ValueForm::text, at_once<&Config::recovery_grace>,
+     ValueForm::text, kChangesAtOnce<&Config::recovery_grace>,
      [](Config& c, std::string_view text) {
        return take(c.recovery_grace, parse_duration(text, Duration::zero(), kLongestGrace));
      }},
     {"listen", "ADDR:PORT",
      "where to listen for other hosts; may be repeated, '' for nowhere; default: 127.0.0.1:13776 "
      "and [::1]:13776",
-     ValueForm::list, at_restart<&Config::listen>, add_listen_address,
+     ValueForm::list, kChangesAtRestart<&Config::listen>, add_listen_address,
      [](Config& c) { c.listen.emplace(); }},
     {"peers", "HOST:PORT", "another host's dssmd to share streams with; may be repeated",
-     ValueForm::list, at_once<&Config::peers>, add_peer, [](Config& c) { c.peers.clear(); },
+     ValueForm::list, kChangesAtOnce<&Config::peers>, add_peer, [](Config& c) { c.peers.clear(); },
      "peer"},
     {"insecure", "", "allow addresses of other PCs although nothing is encrypted",
-     ValueForm::boolean, at_restart<&Config::insecure>,
+     ValueForm::boolean, kChangesAtRestart<&Config::insecure>,
      [](Config& c, std::string_view text) { return take(c.insecure, parse_boolean(text)); }},
     {"mdns", "",
      "find other hosts, and announce this one and its streams, by mDNS; default: true "
      "(--mdns=false: do not)",
-     ValueForm::boolean, at_restart<&Config::mdns>,
+     ValueForm::boolean, kChangesAtRestart<&Config::mdns>,
      [](Config& c, std::string_view text) { return take(c.mdns, parse_boolean(text)); }},
     {"interfaces", "NAME",
      "network interface to use for mDNS, or a pattern such as 'eth*'; may be repeated; default: "
      "all",
-     ValueForm::list, at_restart<&Config::interfaces>,
+     ValueForm::list, kChangesAtRestart<&Config::interfaces>,
      [](Config& c, std::string_view text) { return add_interface(c.interfaces, text); },
      [](Config& c) { c.interfaces.clear(); }, "interface"},
     {"avoid_interfaces", "NAME",
      "network interface not to use for mDNS, or a pattern; may be repeated, '' for none; default: "
      "those of containers, virtual machines and tunnels",
-     ValueForm::list, at_restart<&Config::avoid_interfaces>,
+     ValueForm::list, kChangesAtRestart<&Config::avoid_interfaces>,
      [](Config& c, std::string_view text) { return add_interface(c.avoid_interfaces, text); },
      [](Config& c) { c.avoid_interfaces.clear(); }, "avoid-interface"},
     {"max_connections", "COUNT", "connections of other hosts at once; default: 256",
-     ValueForm::integer, at_once<&Config::max_connections>,
+     ValueForm::integer, kChangesAtOnce<&Config::max_connections>,
      [](Config& c, std::string_view text) {
        return take(c.max_connections, parse_count(text, 1, kMostConnections));
      }},
     {"max_connections_per_host", "COUNT", "connections from one address at once; default: 128",
-     ValueForm::integer, at_once<&Config::max_connections_per_host>,
+     ValueForm::integer, kChangesAtOnce<&Config::max_connections_per_host>,
      [](Config& c, std::string_view text) {
        return take(c.max_connections_per_host, parse_count(text, 1, kMostConnections));
      }},
     {"max_peer_memory", "BYTES",
      "memory that the connections from one address may take of dssmd; default: 96 MiB",
-     ValueForm::integer_or_text, at_once<&Config::max_peer_memory_bytes>,
+     ValueForm::integer_or_text, kChangesAtOnce<&Config::max_peer_memory_bytes>,
      [](Config& c, std::string_view text) {
        return take(c.max_peer_memory_bytes, parse_bytes(text, 1 << 20, kMostMemoryBytes));
      }},
     {"mirror_linger", "TIME",
      "how long the copy of another host's stream is kept after its last reader; default: 5 s",
-     ValueForm::text, at_once<&Config::mirror_linger>,
+     ValueForm::text, kChangesAtOnce<&Config::mirror_linger>,
      [](Config& c, std::string_view text) {
        return take(c.mirror_linger, parse_duration(text, Duration::zero(), kLongestLinger));
      }},
@@ -238,19 +238,19 @@ constexpr ConfigKey kKeys[] = {
      "open them, and answer reads by time with an error), mark (flag their samples) or off; "
      "default: "
      "enforce",
-     ValueForm::text, at_once<&Config::clocks>,
+     ValueForm::text, kChangesAtOnce<&Config::clocks>,
      [](Config& c, std::string_view text) {
        return take(c.clocks.general.policy, parse_clock_policy(text));
      }},
     {"clock_limit", "TIME", "how far two hosts' clocks may be apart; default: 1500 us",
-     ValueForm::text, at_once<&Config::clocks>,
+     ValueForm::text, kChangesAtOnce<&Config::clocks>,
      [](Config& c, std::string_view text) {
        return take(c.clocks.general.limit, parse_clock_limit(text));
      }},
     {"clock_streams", "STREAM=POLICY",
      "another policy, and limit, for some streams, e.g. 'gps=off' or 'camera*=mark 5 ms'; may be "
      "repeated, the first that matches counts",
-     ValueForm::list, at_once<&Config::clocks>,
+     ValueForm::list, kChangesAtOnce<&Config::clocks>,
      [](Config& c, std::string_view text) -> Result<void> {
        if (text.empty()) return {};
        c.clocks.exceptions.push_back(DSSM_TRY(parse_clock_exception(text)));
@@ -258,11 +258,11 @@ constexpr ConfigKey kKeys[] = {
      },
      [](Config& c) { c.clocks.exceptions.clear(); }, "clock-stream"},
     {"max_drift", "PPM", "highest drift of this PC's free-running clock; default: 50 ppm",
-     ValueForm::text, at_once<&Config::max_drift>,
+     ValueForm::text, kChangesAtOnce<&Config::max_drift>,
      [](Config& c, std::string_view text) { return take(c.max_drift, parse_drift(text)); }},
     {"chronyd", "ADDR:PORT",
      "where this PC's chronyd takes questions (cmdport); default: 127.0.0.1:323", ValueForm::text,
-     at_restart<&Config::chronyd>, set_chronyd},
+     kChangesAtRestart<&Config::chronyd>, set_chronyd},
 };
 
 std::string place(const std::string& path, const toml::source_region& source) {

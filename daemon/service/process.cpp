@@ -21,8 +21,8 @@ void silence_protobuf() noexcept { google::protobuf::SetLogHandler(nullptr); }
 // Pieces up to 4 MiB, which samples that wait for a slow network need often, are kept: page faults
 // cost as much as copying.
 void return_large_memory() noexcept {
-  ::mallopt(M_MMAP_THRESHOLD, 4 << 20);
-  ::mallopt(M_TRIM_THRESHOLD, 8 << 20);
+  ::mallopt(M_MMAP_THRESHOLD, 4 << 20);  // NOLINT(concurrency-mt-unsafe): no other thread yet
+  ::mallopt(M_TRIM_THRESHOLD, 8 << 20);  // NOLINT(concurrency-mt-unsafe): as above
 }
 
 BlockedSignals::BlockedSignals() noexcept {

@@ -88,7 +88,7 @@ class PConnector {
 
   // The streams that the dssmd at `options.address` owns.
   //   fails  no_daemon, invalid_argument (address)
-  static Result<std::vector<StreamInfo>> list_streams(PConnectorOptions options = {});
+  static Result<std::vector<StreamInfo>> list_streams(const PConnectorOptions& options = {});
 
   PConnector(PConnector&&) noexcept;
   PConnector& operator=(PConnector&&) noexcept;

@@ -60,11 +60,11 @@ void print_help() {
 
 // Nothing, or the exit status when that is all there is to do.
 std::optional<int> parse(int argc, char** argv, Options& options) {
-  enum : int { kVersion = 256, kWithoutCheck };
+  enum : int { version = 256, without_check };
   const option known[] = {{"verbose", no_argument, nullptr, 'v'},
                           {"quiet", no_argument, nullptr, 'q'},
-                          {"version", no_argument, nullptr, kVersion},
-                          {"without-check-msgque", no_argument, nullptr, kWithoutCheck},
+                          {"version", no_argument, nullptr, version},
+                          {"without-check-msgque", no_argument, nullptr, without_check},
                           {"help", no_argument, nullptr, 'h'},
                           {nullptr, 0, nullptr, 0}};
   for (;;) {
@@ -80,9 +80,9 @@ std::optional<int> parse(int argc, char** argv, Options& options) {
       case 'q':
         options.quiet = true;
         break;
-      case kWithoutCheck:
+      case without_check:
         break;
-      case kVersion:
+      case version:
         std::puts(" Ver. " DSSM_VERSION);
         return kUsage;
       default:
@@ -143,9 +143,9 @@ int open_notify_socket(std::string& name) {
   sockaddr_un address{};
   address.sun_family = AF_UNIX;
   socklen_t length = sizeof(sa_family_t);
-  ::bind(fd, reinterpret_cast<sockaddr*>(&address), length);
+  if (fd < 0 || ::bind(fd, reinterpret_cast<sockaddr*>(&address), length)) return -1;
   length = sizeof address;
-  ::getsockname(fd, reinterpret_cast<sockaddr*>(&address), &length);
+  if (::getsockname(fd, reinterpret_cast<sockaddr*>(&address), &length)) return -1;
   name.assign(address.sun_path, length - offsetof(sockaddr_un, sun_path));
   name.front() = '@';  // for the zero byte of an abstract name
   return fd;
@@ -154,9 +154,9 @@ int open_notify_socket(std::string& name) {
 [[noreturn]] void become_dssmd(const Options& options, const std::string& folder,
                                const std::string& notify, pid_t parent, const sigset_t& signals) {
   ::prctl(PR_SET_PDEATHSIG, SIGTERM);
-  if (::getppid() != parent) ::_exit(0);         // it died before that
-  ::setenv("NOTIFY_SOCKET", notify.c_str(), 1);  // NOLINT(concurrency-mt-unsafe): one thread
-  ::sigprocmask(SIG_SETMASK, &signals, nullptr);
+  if (::getppid() != parent) ::_exit(0);          // it died before that
+  ::setenv("NOTIFY_SOCKET", notify.c_str(), 1);   // NOLINT(concurrency-mt-unsafe): one thread
+  ::sigprocmask(SIG_SETMASK, &signals, nullptr);  // NOLINT(concurrency-mt-unsafe): one thread
   const char* level = options.verbose ? "debug" : options.quiet ? "error" : "notice";
   std::string tried;
   for (const std::string& place : places_of_dssmd()) {
@@ -235,7 +235,7 @@ int main(int argc, char** argv) {
   sigset_t attended, before;
   ::sigemptyset(&attended);
   for (const int signal : {SIGINT, SIGTERM, SIGHUP, SIGCHLD}) ::sigaddset(&attended, signal);
-  ::sigprocmask(SIG_BLOCK, &attended, &before);
+  ::sigprocmask(SIG_BLOCK, &attended, &before);  // NOLINT(concurrency-mt-unsafe): one thread
   const int signals_fd = ::signalfd(-1, &attended, SFD_CLOEXEC);
   const pid_t self = ::getpid();
   const pid_t dssmd = ::fork();

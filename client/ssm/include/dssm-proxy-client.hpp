@@ -89,6 +89,7 @@ class PConnector {
   ssmTimeT time;   // its time; of the last one written; 0 at first
 
   PConnector() { initPConnector(); }
+  // NOLINTNEXTLINE(google-explicit-constructor): as in DSSM
   PConnector(const char* newName, int newId = -1, const char* ipAddress = "127.0.0.1") {
     initPConnector();
     setStream(newName, newId);

@@ -46,7 +46,7 @@ auto retry(const std::string& what, Try attempt) -> decltype(attempt()) {
     if (MonoClock::now() >= give_up) return result;
     if (result.error().message != said) {
       said = result.error().message;
-      report_error(what + " : " + said + "; trying again");
+      report_error(std::string(what).append(" : ").append(said).append("; trying again"));
     }
     if (!signals.pause(std::min(kRetryPause, give_up - MonoClock::now()))) {
       return Error{Errc::closed, "interrupted by a signal"};

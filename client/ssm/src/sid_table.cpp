@@ -37,6 +37,7 @@ SSM_sid SidTable::add(std::unique_ptr<Stream> stream, std::uint64_t process_gene
   std::uint64_t next = (place.state.load() >> 1) + 1;
   if (next >> kGenerationBits) next = 1;
   place.state.store(next << 1 | 1);
+  // NOLINTNEXTLINE(performance-no-int-to-ptr): a number in the type of SSM's API
   return reinterpret_cast<SSM_sid>(next << kIndexBits | place.index);
 }
 

@@ -93,6 +93,7 @@ RawReader* Stream::reader() noexcept {
   if (!session) return remember_error(session.error().message), nullptr;
   Result<RawReader> opened = session->open_raw_reader(id_, nullptr, kTagHidden);
   if (!opened) return remember_error(opened.error().message), nullptr;
+  // NOLINTNEXTLINE(bugprone-unhandled-exception-at-new): without memory the process ends
   reader_.store(new RawReader(std::move(*opened)), std::memory_order_release);
   return reader_.load(std::memory_order_relaxed);
 }
@@ -105,6 +106,7 @@ RawWriter* Stream::writer() noexcept {
   if (!session) return remember_error(session.error().message), nullptr;
   Result<RawWriter> opened = session->open_raw_writer(id_, nullptr, kTagHidden);
   if (!opened) return remember_error(opened.error().message), nullptr;
+  // NOLINTNEXTLINE(bugprone-unhandled-exception-at-new): without memory the process ends
   writer_.store(new RawWriter(std::move(*opened)), std::memory_order_release);
   return writer_.load(std::memory_order_relaxed);
 }

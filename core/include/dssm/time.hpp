@@ -24,6 +24,7 @@ struct PosixClock {
   using rep = duration::rep;
   using period = duration::period;
   using time_point = std::chrono::time_point<PosixClock, Duration>;
+  // NOLINTNEXTLINE(readability-identifier-naming): the name that std::chrono requires
   static constexpr bool is_steady = kSteady;
   static time_point now() noexcept {
     timespec ts{};

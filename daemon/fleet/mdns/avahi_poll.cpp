@@ -107,8 +107,8 @@ void timeout_free(AvahiTimeout* timeout) {
 
 Duration delay_until(const timeval& when, Time now) noexcept {
   // Far beyond any real time the sum below would overflow.
-  constexpr std::int64_t most_seconds = std::int64_t{1} << 33;
-  const std::int64_t seconds = std::clamp<std::int64_t>(when.tv_sec, -most_seconds, most_seconds);
+  constexpr std::int64_t kMaxSeconds = std::int64_t{1} << 33;
+  const std::int64_t seconds = std::clamp<std::int64_t>(when.tv_sec, -kMaxSeconds, kMaxSeconds);
   const Duration since_1970 =
       std::chrono::seconds(seconds) +
       std::chrono::microseconds(std::clamp<std::int64_t>(when.tv_usec, 0, 999'999));
