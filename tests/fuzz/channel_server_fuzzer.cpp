@@ -17,14 +17,10 @@
 #include "core/wire/frame.hpp"
 #include "daemon/serve/channel_server.hpp"
 #include "daemon/service/process.hpp"
+#include "tests/support/log_recorder.hpp"
 
 namespace dssm::daemon {
 namespace {
-
-class SilentLogger final : public Logger {
- public:
-  void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
-};
 
 // The input and output of a transport in this file.
 struct Peer {
@@ -102,7 +98,7 @@ void run(std::span<const std::uint8_t> input) {
   const bool large = input[0] & 2;
   Result<EventLoop> loop = EventLoop::open();
   if (!loop) std::abort();
-  SilentLogger logger;
+  LogRecorder logger;
   Registry registry("pc1",
                     {.max_streams = 8, .max_memory_bytes = 4U << 20, .max_property_bytes = 4096});
   OpenTable opens({.max_opens = 16, .max_opens_per_client = 8});

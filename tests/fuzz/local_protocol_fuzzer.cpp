@@ -16,14 +16,10 @@
 #include "daemon/local/local_service.hpp"
 #include "daemon/service/process.hpp"
 #include "tests/fuzz/late_fleet.hpp"
+#include "tests/support/log_recorder.hpp"
 
 namespace dssm::daemon {
 namespace {
-
-class SilentLogger final : public Logger {
- public:
-  void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
-};
 
 // Receives all output, and checks that it consists of frames that clients accept.
 class Sink final : public ClientOutput {
@@ -39,7 +35,7 @@ struct Daemon {
                  {.max_streams = 8, .max_memory_bytes = 1 << 20, .max_property_bytes = 4096}),
         opens({.max_opens = 16, .max_opens_per_client = 8}),
         service(registry, opens, clock, logger, recovering, &fleet) {}
-  SilentLogger logger;
+  LogRecorder logger;
   Registry registry;
   OpenTable opens;
   PlaybackClockOwner clock;

@@ -21,6 +21,7 @@
 #include "core/wire/tcp.hpp"
 #include "daemon/clock/clock_watch.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/log_recorder.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -110,15 +111,10 @@ class Chronyd {
   pid_t pid_ = -1;
 };
 
-class NoLogger final : public Logger {
- public:
-  void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
-};
-
 class ChronydTest : public testing::Test, protected ClockWatch::Observer {
  protected:
   EventLoop loop = EventLoop::open().value();
-  NoLogger logger;
+  LogRecorder logger;
   int looks = 0;
   std::unique_ptr<ClockWatch> watch;
 

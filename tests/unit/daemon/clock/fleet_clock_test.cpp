@@ -6,6 +6,7 @@
 
 #include <filesystem>
 
+#include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/clock/fake_chronyd.hpp"
 #include "tests/unit/daemon/remote/fake_owner.hpp"
 
@@ -17,10 +18,6 @@ using namespace std::chrono_literals;
 constexpr wire::HostId kSelf{1}, kReference{2}, kOther{3};
 constexpr std::uint32_t kReferenceAddress = 0x0a000001;  // 10.0.0.1
 constexpr wire::IpBytes kReferenceBytes{0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, 10, 0, 0, 1};
-
-struct NoLogger final : Logger {
-  void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
-};
 
 // A host whose clock is `bound` from its own chronyd's time, and follows nobody.
 wire::Greeting host(wire::HostId id, const std::string& name, Duration bound) {
@@ -93,7 +90,7 @@ class FleetClockTest : public testing::Test {
 
   const StreamId lidar{"lidar", 0, "pc3"};
   EventLoop loop = EventLoop::open().value();
-  NoLogger logger;
+  LogRecorder logger;
   clock::Tracking tracking;
   FakeChronyd chronyd{loop, [this](const FakeChronyd::Question& question) {
                         tracking.updated = WallClock::now() - tracking.offset - 10ms;

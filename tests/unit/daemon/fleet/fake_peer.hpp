@@ -1,31 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The dssmd of another host for tests of control connections, and a log to look into.
+// The dssmd of another host for tests of control connections.
 #pragma once
 
-#include <algorithm>
 #include <string>
-#include <string_view>
+#include <utility>
 #include <vector>
 
-#include "daemon/base/log.hpp"
+#include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 #include "tests/unit/daemon/remote/fake_owner.hpp"
 
 namespace dssm::daemon {
-
-class KeptLog final : public Logger {
- public:
-  void write(LogLevel level, std::string_view text, const LogFields&) noexcept override {
-    if (level <= LogLevel::notice) lines.emplace_back(text);
-  }
-  bool says(const std::string& text) const {
-    return std::any_of(lines.begin(), lines.end(), [&](const std::string& line) {
-      return line.find(text) != std::string::npos;
-    });
-  }
-  std::vector<std::string> lines;
-};
 
 inline net::Frame answer_to(const net::Frame& request) {
   net::Frame answer;

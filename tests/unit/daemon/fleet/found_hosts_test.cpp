@@ -4,6 +4,8 @@
 // forgotten, whatever is announced.
 #include <gtest/gtest.h>
 
+#include <algorithm>
+
 #include "core/base/text.hpp"
 #include "daemon/fleet/peers.hpp"
 #include "daemon/fleet/service_record.hpp"
@@ -23,7 +25,7 @@ class FoundHostsTest : public testing::Test {
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Resolver resolver{loop};
   Catalog catalog{"pc1"};
-  KeptLog log;
+  LogRecorder log;
   const wire::Greeting self = greeting_of("pc1");
   const wire::Greeting pc2 = greeting_of("pc2");
   std::unique_ptr<FakePeer> one = std::make_unique<FakePeer>(loop);
@@ -166,7 +168,7 @@ TEST_F(FoundHostsTest, AreDialedAtOnceWhenTheyHaveNewAddresses) {
   EXPECT_NE(host().error().find("refused"), std::string::npos) << host().error();
   EXPECT_NE(peers->report().unavailable_peers().find("'pc2' (connect to"), std::string::npos)
       << peers->report().unavailable_peers();
-  EXPECT_TRUE(log.says("host 'pc2' (found by mDNS) is not available, retrying"));
+  EXPECT_TRUE(log.contains("host 'pc2' (found by mDNS) is not available, retrying"));
   bool waited = false;  // for most of a pause
   EventSource timer = EventSource::timer(loop, [&] { waited = true; });
   timer.enable_in(PeerConnection::kFoundPause * 9 / 10);
@@ -317,7 +319,7 @@ TEST_F(FoundHostsTest, AreNeverThisVeryHost) {
   EXPECT_TRUE(peers->report().hosts().empty()) << "an echo of our own announcement";
   EXPECT_EQ(peers->report().own_warning().text, "");
   EXPECT_EQ(peers->report().unavailable_peers(), "");
-  EXPECT_TRUE(log.lines.empty());
+  EXPECT_TRUE(log.notices.empty());
 }
 
 TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
@@ -343,7 +345,7 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   two->owner.cut();
   wait([&] { return peers->report().own_warning().text.empty(); });
   wait([&] { return !peers->report().own_warning().text.empty(); });
-  EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
+  EXPECT_EQ(std::count_if(log.notices.begin(), log.notices.end(),
                           [](const std::string& line) {
                             return line.find("this host's name") != std::string::npos;
                           }),
@@ -438,7 +440,7 @@ TEST_F(FoundHostsTest, AreBoundedInNumberAndAddresses) {
   look_around();
   ASSERT_EQ(peers->report().hosts().size(), Peers::kMaxFoundHosts);
   EXPECT_EQ(static_cast<std::size_t>(host().addresses_size()), Peers::kMaxAddressesOfHost);
-  EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
+  EXPECT_EQ(std::count_if(log.notices.begin(), log.notices.end(),
                           [](const std::string& line) {
                             return line.find("more than 256 hosts") != std::string::npos;
                           }),

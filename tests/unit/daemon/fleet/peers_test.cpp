@@ -6,6 +6,8 @@
 
 #include <gtest/gtest.h>
 
+#include <algorithm>
+
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 #include "tests/unit/daemon/fleet/fake_peer.hpp"
 
@@ -17,7 +19,7 @@ class PeersTest : public testing::Test {
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Resolver resolver{loop};
   Catalog catalog{"pc1"};
-  KeptLog log;
+  LogRecorder log;
   wire::Greeting self = greeting_of("pc1");
   FakePeer one{loop}, two{loop};
   std::unique_ptr<Peers> peers;
@@ -69,7 +71,7 @@ TEST_F(PeersTest, PutAHostAndItsStreamsIntoTheCatalog) {
   EXPECT_EQ(shown.streams(), 2u);
   EXPECT_EQ(shown.error(), "");
   EXPECT_FALSE(shown.insecure());
-  EXPECT_TRUE(log.says("host 'pc2'"));
+  EXPECT_TRUE(log.contains("host 'pc2'"));
 }
 
 TEST_F(PeersTest, MeasureTheRoundTripAndHearOfTheClock) {
@@ -91,7 +93,7 @@ TEST_F(PeersTest, TakeAHostOutWhenItsConnectionBreaks) {
   wait_for_startup();
   one.owner.cut();
   wait([&] { return catalog.hosts().empty(); });
-  EXPECT_TRUE(log.says("host 'pc2' is down"));
+  EXPECT_TRUE(log.contains("host 'pc2' is down"));
   wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
   EXPECT_EQ(one.watches, 2);
   EXPECT_EQ(host(0).state(), local::Host::UP);
@@ -140,7 +142,7 @@ TEST_F(PeersTest, SettleWhenAPeerIsNotThereAndSayWhy) {
   EXPECT_NE(host(0).error().find("refused"), std::string::npos) << host(0).error();
   EXPECT_NE(peers->report().unavailable_peers().find(nobody.str()), std::string::npos);
   wait([&] { return host(0).since_ns() > 300'000'000; });  // several attempts
-  EXPECT_EQ(std::count_if(log.lines.begin(), log.lines.end(),
+  EXPECT_EQ(std::count_if(log.notices.begin(), log.notices.end(),
                           [](const std::string& line) {
                             return line.find("is not available, retrying") != std::string::npos;
                           }),

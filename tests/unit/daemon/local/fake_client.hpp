@@ -12,14 +12,10 @@
 
 #include "core/wire/frame.hpp"
 #include "daemon/local/local_service.hpp"
+#include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 
 namespace dssm::daemon {
-
-class SilentLogger final : public Logger {
- public:
-  void write(LogLevel, std::string_view, const LogFields&) noexcept override {}
-};
 
 // A client without a socket: what it is sent, decoded.
 class FakeClient final : public ClientOutput {

@@ -19,7 +19,7 @@ class FleetServiceTest : public testing::Test {
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Resolver resolver{loop};
   Registry registry{"pc1", kLimits};
-  KeptLog log;
+  LogRecorder log;
   const wire::Greeting self = greeting_of("pc1");
   const ChannelParts parts{loop, resolver, registry, log, self};
   Catalog catalog{"pc1"};

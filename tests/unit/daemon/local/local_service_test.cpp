@@ -14,7 +14,7 @@ namespace {
 struct Daemon {
   explicit Daemon(bool recovering = false, const OpenTable::Limits& limits = {1000, 100})
       : opens(limits), service(registry, opens, clock, logger, recovering) {}
-  SilentLogger logger;
+  LogRecorder logger;
   Registry registry{"pc1", kLimits};
   OpenTable opens;
   PlaybackClockOwner clock;

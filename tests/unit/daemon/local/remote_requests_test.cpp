@@ -104,7 +104,7 @@ using Asked = std::vector<std::string>;
 
 class RemoteRequestsTest : public testing::Test {
  protected:
-  SilentLogger logger;
+  LogRecorder logger;
   Registry registry{"pc1", kLimits};
   OpenTable opens{{.max_opens = 2000, .max_opens_per_client = 2000}};
   PlaybackClockOwner clock;

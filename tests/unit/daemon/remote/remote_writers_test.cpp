@@ -6,6 +6,7 @@
 #include <gtest/gtest.h>
 
 #include "core/ring/ring_writer.hpp"
+#include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 #include "tests/unit/daemon/remote/fake_owner.hpp"
 
@@ -15,14 +16,6 @@ namespace {
 using namespace std::chrono_literals;
 
 const StreamId kOdometry{"odometry", 0, "pc2"};
-
-class KeptLines final : public Logger {
- public:
-  void write(LogLevel level, std::string_view text, const LogFields&) noexcept override {
-    if (level <= LogLevel::warning) warnings += std::string(text) + "\n";
-  }
-  std::string warnings;
-};
 
 // A program that has the ring open for writing.
 class Program {
@@ -54,7 +47,7 @@ class RemoteWritersTest : public testing::Test {
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Resolver resolver{loop};
   Registry registry{"pc1", kLimits};
-  KeptLines logger;
+  LogRecorder logger;
   Catalog catalog{"pc1"};
   wire::Greeting self = greeting_of("pc1");
   ChannelParts parts{loop, resolver, registry, logger, self};
@@ -307,7 +300,7 @@ TEST_F(RemoteWritersTest, CountsWhatItsRingNoLongerHolds) {
   until_published(static_cast<int>(depth) + 9);
   EXPECT_EQ(owner->published.front().info.tid, 11);
   EXPECT_EQ(owner->published.size(), static_cast<std::size_t>(depth - 1));
-  EXPECT_NE(logger.warnings.find("lacks 10 samples"), std::string::npos) << logger.warnings;
+  EXPECT_TRUE(logger.contains("lacks 10 samples"));
 }
 
 TEST_F(RemoteWritersTest, EndsWhenItsProgramsHaveGoneAndAllIsPublished) {
@@ -322,7 +315,7 @@ TEST_F(RemoteWritersTest, EndsWhenItsProgramsHaveGoneAndAllIsPublished) {
   acknowledge(0);
   run_until(loop, [&] { return writers->size() == 0 && !owner->connected(); });
   EXPECT_EQ(registry.budget().used(), 0u);
-  EXPECT_EQ(logger.warnings, "");
+  EXPECT_TRUE(logger.warnings.empty());
 }
 
 TEST_F(RemoteWritersTest, EndsAtOnceWhenNothingIsLeftToPublish) {

@@ -95,7 +95,7 @@ TEST(DataCommunicator, LogsTheLastWordsOfAPeer) {
   peer.put(words);
   peer.vanish();
   rig.turns();
-  EXPECT_TRUE(rig.logger.has("had enough"));
+  EXPECT_TRUE(rig.logger.contains("had enough"));
   EXPECT_TRUE(rig.logger.warnings.empty());
 }
 

@@ -11,23 +11,11 @@
 
 #include "core/ring/ring_writer.hpp"
 #include "daemon/serve/channel_server.hpp"
+#include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 #include "tests/unit/daemon/link/fake_transport.hpp"
 
 namespace dssm::daemon {
-
-class RecordingLogger final : public Logger {
- public:
-  void write(LogLevel level, std::string_view text, const LogFields&) noexcept override {
-    if (level <= LogLevel::warning) warnings.emplace_back(text);
-    lines.emplace_back(text);
-  }
-  bool has(std::string_view words) const {
-    return std::any_of(lines.begin(), lines.end(),
-                       [&](const std::string& line) { return line.find(words) != line.npos; });
-  }
-  std::vector<std::string> lines, warnings;
-};
 
 inline wire::Greeting greeting_of(const std::string& program, const std::string& host) {
   wire::Greeting greeting;
@@ -140,7 +128,7 @@ class ServerRig {
   EventLoop loop = *EventLoop::open();
   Registry registry{"pc1", kLimits};
   OpenTable opens{{100, 100}};
-  RecordingLogger logger;
+  LogRecorder logger;
   ChannelServer server;
 };
 

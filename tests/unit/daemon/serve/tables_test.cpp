@@ -10,13 +10,13 @@ namespace dssm::daemon {
 namespace {
 
 TEST(RateLimitedLogger, PassesSoManyLinesOnAndCountsTheOthers) {
-  RecordingLogger to;
+  LogRecorder to;
   MonoTime now{std::chrono::seconds(100)};
   RateLimitedLogger logger(to, [&] { return now; });
   for (int i = 0; i < 2 * RateLimitedLogger::kLinesPerPeriod; ++i) logger.warning("again");
   EXPECT_EQ(to.warnings.size(), static_cast<std::size_t>(RateLimitedLogger::kLinesPerPeriod));
   logger.info("of another level");
-  EXPECT_TRUE(to.has("of another level"));
+  EXPECT_TRUE(to.contains("of another level"));
   now += RateLimitedLogger::kPeriod;
   logger.warning("later");
   EXPECT_EQ(to.warnings.back(), "later (" + std::to_string(RateLimitedLogger::kLinesPerPeriod) +
