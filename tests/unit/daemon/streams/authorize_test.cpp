@@ -59,7 +59,7 @@ TEST_F(AuthorizeTest, RefusesEachRequestOfALocalProgram) {
   Registry registry{"pc1", kLimits};
   OpenTable opens{{100, 100}};
   PlaybackClockOwner clock;
-  SilentLogger logger;
+  LogRecorder logger;
   LocalService service(registry, opens, clock, logger, false, nullptr, rule);
   FakeClient client(service, 5);
   client.greet();
