@@ -36,8 +36,9 @@
 #include "daemon/local/listener.hpp"
 #include "daemon/local/local_service.hpp"
 #include "daemon/local/server.hpp"
-#include "daemon/remote/mirrors.hpp"
-#include "daemon/remote/remote_writers.hpp"
+#include "daemon/remote/mirror.hpp"
+#include "daemon/remote/remote_streams.hpp"
+#include "daemon/remote/remote_writer.hpp"
 #include "daemon/serve/channel_server.hpp"
 #include "daemon/service/command_line.hpp"
 #include "daemon/service/inherited.hpp"
@@ -184,12 +185,14 @@ struct OtherHosts {
         clock(loop, clock_options(config), std::move(page), own_clock, self.host_id, catalog,
               logger),
         resolver(loop),
-        parts{loop, resolver, registry, logger, self, &clock},
-        mirrors(parts, catalog, config.mirror_linger),
+        parts{loop, resolver, registry, logger, self, &clock, config.mirror_linger},
+        mirrors(parts, catalog),
         writers(parts, catalog),
         peers(loop, resolver, config.peers, self, catalog, logger),
         service(loop, {self, network.addresses(), config.insecure, &clock}, registry, catalog,
-                peers, mirrors, writers) {}
+                peers, mirrors, writers) {
+    parts.on_ring_replaced = [this](const Stream& old) { service.on_ring_replaced(old); };
+  }
 
   std::shared_ptr<wire::ClockReport> own_clock;
   wire::Greeting self;
@@ -197,8 +200,8 @@ struct OtherHosts {
   FleetClock clock;
   Resolver resolver;
   ChannelParts parts;
-  Mirrors mirrors;
-  RemoteWriters writers;
+  RemoteStreams<Mirror> mirrors;
+  RemoteStreams<RemoteWriter> writers;
   Peers peers;
   FleetService service;
 };
@@ -243,7 +246,7 @@ class Dssmd {
       status_.touch();
     });
     hosts_.clock.on_change([this] {
-      hosts_.mirrors.on_clock();
+      hosts_.mirrors.for_each([](Mirror& mirror) { mirror.on_own_clock(); });
       channels_.on_clock();
     });
   }
@@ -314,7 +317,7 @@ class Dssmd {
     streams_.opens.set_limits(open_limits(changed));
     server_.set_max_clients(changed.max_clients);
     channels_.set_limits(peer_limits(changed));
-    hosts_.mirrors.set_linger(changed.mirror_linger);
+    hosts_.parts.mirror_linger = changed.mirror_linger;
     hosts_.peers.set_configured(changed.peers);
     hosts_.clock.set(changed.clocks, changed.max_drift);
   }

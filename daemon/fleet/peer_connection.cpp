@@ -103,7 +103,7 @@ void PeerConnection::on_down(const Error& error) {
 }
 
 void PeerConnection::ask(net::Frame request, Then then) {
-  FrameConnection* link = dialer_.link();
+  FrameConnection* link = dialer_.connection();
   if (!link || !link->is_open()) {
     return then(
         Error{Errc::unavailable, "the host at '" + address() + "' is not connected any more"});
@@ -156,7 +156,7 @@ void PeerConnection::start_heartbeat() { beat(); }
 // Called every kHeartbeat, or when the peer timeout is over, whichever is first. This is where a
 // peer that does not answer any more counts as dead (peers.hpp).
 void PeerConnection::beat() {
-  FrameConnection* link = dialer_.link();
+  FrameConnection* link = dialer_.connection();
   if (!link) return;
   const MonoTime now = loop_.now();
   const Duration silent = now - link->last_heard();

@@ -1,290 +1,235 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One round of attempts: look the address up, try what was found in turn, greet. A round that
-// fails, and a connection that ends, lead to a pause and to the next round. Everything happens in
-// callbacks of the loop, and each step is left only by the timer or by the event it waits for.
+// One round of attempts: look the address up, try the addresses in turn, greet. A round that fails,
+// and a connection that ends, lead to a pause and to the next round. Everything happens in callbacks
+// of the loop, and each state is left only by the timer or by the event it waits for.
 #include "daemon/link/dialer.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
-#include <optional>
 #include <utility>
-#include <vector>
 
 #include "core/wire/tcp.hpp"
 
 namespace dssm::daemon {
 
-struct Dialer::State {
-  enum class Step {
-    look_up,  // until the resolver answers
-    connect,  // until the socket is connected, or the timer
-    greet,    // until their Hello came, or the timer
-    up,       // until the link closes
-    give_up,  // restart() was called: until the timer, at once
-    pause,    // until the timer
-  };
-
-  State(const EventLoop& event_loop, Resolver& with, Options given, Observer& for_user,
-        FrameConnection::Observer& of_link)
-      : loop(event_loop),
-        resolver(with),
-        options(std::move(given)),
-        observer(for_user),
-        link_user(of_link),
-        timer(EventSource::timer(loop, [this] { on_timer(); })) {
-    timer.enable_in(Duration::zero());
-  }
-
-  void begin_round();
-  void reopen();
-  void begin_with(std::vector<wire::SocketAddress> found);
-  void try_next_address();
-  void on_connected();
-  void on_timer();
-  Result<void> on_frame(net::Frame& frame);
-  Result<void> greet_untrusted(const net::Frame& frame);
-  void fail(const Error& why);
-  std::string who() const;
-
-  const EventLoop& loop;
-  Resolver& resolver;
-  Options options;
-  Observer& observer;
-  FrameConnection::Observer& link_user;
-
-  Step step = Step::pause;
-  Phase reached = Phase::look_up;  // in this round, or in the last one
-  Duration pause = kFirstPause;    // the next one
-  MonoTime up_since{};
-  Resolver::Ticket looking_up;
-  std::vector<wire::SocketAddress> addresses;
-  std::size_t current = 0;    // of `addresses`: the one that is tried or connected to
-  std::optional<Error> last;  // why the address before it did not work
-  UniqueFd socket;            // while it connects
-  std::unique_ptr<FrameConnection>
-      link;  // until the next round: it must not end in its own callbacks
-  std::optional<wire::Greeting> them;
-  std::optional<Error> reason;  // why the link is about to close, when we know better than it does
-  bool given_up = false;        // by restart(), while it was up
-  std::string last_choice;      // of addresses; empty: any
-  EventSource connected, timer;
-};
-
-// Leaves an attempt to connect for a round of its own. From the timer: it may be in the attempt's
-// own callback that somebody has learned of better addresses.
-void Dialer::State::reopen() {
-  connected.disable();
-  socket.reset();
-  step = Step::pause;
-  timer.enable_in(Duration::zero());
-}
-
-// Who is at the other end, as far as known.
-std::string Dialer::State::who() const {
-  const std::string address = "'" + addresses[current].str() + "'";
-  return them ? them->str() + " (" + address + ")" : "dssmd at " + address;
-}
-
-void Dialer::State::begin_round() {
-  link.reset();
-  them.reset();
-  reason.reset();
-  last.reset();
-  step = Step::look_up;
-  reached = Phase::look_up;
-  std::vector<wire::SocketAddress> numbers;
-  for (const wire::Address& address : options.addresses) {
-    const std::vector<wire::SocketAddress> found = wire::resolve_number(address);
-    numbers.insert(numbers.end(), found.begin(), found.end());
-  }
-  if (!numbers.empty()) return begin_with(std::move(numbers));
-  looking_up = resolver.resolve(options.addresses.front(),
-                                [this](Result<std::vector<wire::SocketAddress>> found) {
-                                  if (!found) return fail(found.error());
-                                  begin_with(*std::move(found));
-                                });
-}
-
-void Dialer::State::begin_with(std::vector<wire::SocketAddress> found) {
-  addresses = std::move(found);
-  const auto last_one = std::find_if(
-      addresses.begin(), addresses.end(),
-      [this](const wire::SocketAddress& address) { return address.str() == last_choice; });
-  if (last_one != addresses.end()) std::rotate(addresses.begin(), last_one + 1, addresses.end());
-  current = 0;
-  try_next_address();
-}
-
-// Tries addresses[current] and, while they fail at once, those behind it.
-void Dialer::State::try_next_address() {
-  reached = Phase::connect;
-  for (; current < addresses.size(); ++current) {
-    Result<UniqueFd> started = wire::start_connect(addresses[current]);
-    if (!started) {
-      last = std::move(started).error();
-      continue;
-    }
-    step = Step::connect;
-    socket = *std::move(started);
-    connected = EventSource::writable(loop, socket.get(), [this] { on_connected(); });
-    connected.enable();
-    const auto share = options.round_time / static_cast<std::int64_t>(addresses.size());
-    return timer.enable_in(std::min(kConnectTimeout, share));
-  }
-  fail(*last);
-}
-
-void Dialer::State::on_connected() {
-  connected.disable();
-  if (Result<void> done = wire::finish_connect(socket.get(), addresses[current]); !done) {
-    last = std::move(done).error();
-    socket.reset();
-    // From the timer, because `connected` must not be replaced while its callback runs.
-    return timer.enable_in(Duration::zero());
-  }
-  wire::set_channel_options(socket.get());
-  step = Step::greet;
-  reached = Phase::greet;
-  timer.enable_in(wire::kHelloTimeout);
-  link = std::make_unique<FrameConnection>(
-      loop, wire::make_transport(std::move(socket), wire::TransportEnd::connected), link_user,
-      options.max_queued_bytes);
-  net::Frame hello;
-  wire::to_message(options.self, *hello.mutable_hello());
-  link->send(hello);
-}
-
-void Dialer::State::on_timer() {
-  switch (step) {
-    case Step::pause:
-      return begin_round();
-    case Step::give_up:
-      return fail(*std::exchange(reason, {}));
-    case Step::connect:
-      if (socket) {
-        connected.disable();
-        socket.reset();
-        last =
-            Error{Errc::unavailable, "connect to '" + addresses[current].str() +
-                                         "': no answer; is that PC on, and is there a way to it?"};
-      }
-      ++current;
-      return try_next_address();
-    case Step::greet:
-      reason = Error{Errc::unavailable, who() + " does not greet; is it a dssmd?"};
-      return link->close_with(*reason);
-    case Step::look_up:
-    case Step::up:
-      return;
-  }
-}
-
-Result<void> Dialer::State::on_frame(net::Frame& frame) {
-  if (frame.serial() == 0 && frame.has_failure()) {
-    reason = wire::failure(frame.failure()).context("refused by " + who());
-    return *reason;
-  }
-  if (step == Step::greet) return greet_untrusted(frame);
-  if (frame.has_hello()) return Error{Errc::protocol, "it greets twice"};
-  return observer.on_frame(frame);
-}
-
-Result<void> Dialer::State::greet_untrusted(const net::Frame& frame) {
-  if (!frame.has_hello()) {
-    reason = Error{Errc::protocol, who() + " does not begin with Hello; is it a dssmd?"};
-    return *reason;
-  }
-  Result<wire::Greeting> greeting = wire::greeting_untrusted(frame.hello(), who());
-  if (!greeting) {
-    reason = std::move(greeting).error();
-    return *reason;
-  }
-  them = *std::move(greeting);
-  timer.disable();
-  step = Step::up;
-  reached = Phase::up;
-  up_since = loop.now();
-  observer.on_up(*link, *them);
-  return {};
-}
-
-void Dialer::State::fail(const Error& why) {
-  // A server that greets and then refuses is not asked 20 times a second.
-  if (step == Step::up && loop.now() - up_since >= kLongestPause) pause = kFirstPause;
-  const bool of_no_use = std::exchange(given_up, false) || step == Step::greet;
-  last_choice = of_no_use ? addresses[current].str() : std::string();
-  step = Step::pause;
-  timer.enable_in(pause);
-  pause = std::min(2 * pause, options.longest_pause);
-  observer.on_down(why);
-}
-
 Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, Observer& observer)
-    : state_(new State(loop, resolver, std::move(options), observer, *this)) {}
+    : loop_(loop),
+      resolver_(resolver),
+      options_(std::move(options)),
+      observer_(observer),
+      timer_(EventSource::timer(loop, [this] { on_timer(); })) {
+  timer_.enable_in(Duration::zero());
+}
 
-Dialer::~Dialer() = default;
+// --- for the user
 
 void Dialer::retry_now() {
-  state_->pause = kFirstPause;
-  if (state_->step == State::Step::pause) state_->timer.enable_in(Duration::zero());
+  pause_ = kFirstPause;
+  if (state_ == State::pause) timer_.enable_in(Duration::zero());
 }
 
 void Dialer::restart(const Error& why) {
-  State& state = *state_;
-  switch (state.step) {
-    case State::Step::pause:
-    case State::Step::give_up:
+  switch (state_) {
+    case State::pause:
+    case State::give_up:
       return;
-    case State::Step::greet:
-    case State::Step::up:
-      if (!state.link->is_open()) return;  // on_closed() is on its way
-      state.reason = why;
-      state.given_up = true;
-      return state.link->close_with(why);
-    case State::Step::look_up:
-    case State::Step::connect:
-      state.looking_up.reset();
-      state.connected.disable();
-      state.socket.reset();
-      state.reason = why;
-      state.step = State::Step::give_up;
-      return state.timer.enable_in(Duration::zero());
+    case State::greet:
+    case State::up:
+      if (!connection_->is_open()) return;  // on_closed() follows
+      reason_ = why;
+      given_up_ = true;
+      return connection_->close_with(why);
+    case State::look_up:
+    case State::connect:
+      lookup_.reset();
+      connected_.disable();
+      socket_.reset();
+      reason_ = why;
+      state_ = State::give_up;
+      return timer_.enable_in(Duration::zero());
   }
 }
 
 void Dialer::set_addresses(std::vector<wire::Address> addresses) {
-  State& state = *state_;
-  if (addresses == state.options.addresses) return;
-  state.options.addresses = std::move(addresses);
-  if (state.step == State::Step::connect) state.reopen();
+  if (addresses == options_.addresses) return;
+  options_.addresses = std::move(addresses);
+  if (state_ == State::connect) begin_round_soon();
 }
 
-FrameConnection* Dialer::link() noexcept {
-  return state_->step == State::Step::up ? state_->link.get() : nullptr;
+FrameConnection* Dialer::connection() noexcept {
+  return state_ == State::up ? connection_.get() : nullptr;
 }
-
-Dialer::Phase Dialer::reached() const noexcept { return state_->reached; }
 
 std::string Dialer::address() const {
-  const State& state = *state_;
-  return state.link && state.step != State::Step::pause ? state.addresses[state.current].str()
-                                                        : state.options.addresses.front().str();
+  return connection_ && state_ != State::pause ? addresses_[current_].str()
+                                               : options_.addresses.front().str();
 }
 
 bool Dialer::crosses_network() const noexcept {
-  const State& state = *state_;
-  return state.step == State::Step::up && !state.addresses[state.current].is_loopback();
+  return state_ == State::up && !addresses_[current_].is_loopback();
 }
 
-Result<void> Dialer::on_frame(net::Frame& frame) { return state_->on_frame(frame); }
+// --- a round of attempts
+
+// Ends an attempt to connect and begins a new round. From the timer, because the caller may be in
+// the attempt's own callback.
+void Dialer::begin_round_soon() {
+  connected_.disable();
+  socket_.reset();
+  state_ = State::pause;
+  timer_.enable_in(Duration::zero());
+}
+
+// The other side, as far as it is known.
+std::string Dialer::peer_name() const {
+  const std::string address = "'" + addresses_[current_].str() + "'";
+  return them_ ? them_->str() + " (" + address + ")" : "dssmd at " + address;
+}
+
+void Dialer::begin_round() {
+  connection_.reset();
+  them_.reset();
+  reason_.reset();
+  last_error_.reset();
+  state_ = State::look_up;
+  reached_ = Phase::look_up;
+  std::vector<wire::SocketAddress> numbers;
+  for (const wire::Address& address : options_.addresses) {
+    const std::vector<wire::SocketAddress> found = wire::resolve_number(address);
+    numbers.insert(numbers.end(), found.begin(), found.end());
+  }
+  if (!numbers.empty()) return try_addresses(std::move(numbers));
+  lookup_ = resolver_.resolve(options_.addresses.front(),
+                              [this](Result<std::vector<wire::SocketAddress>> found) {
+                                if (!found) return fail(found.error());
+                                try_addresses(*std::move(found));
+                              });
+}
+
+void Dialer::try_addresses(std::vector<wire::SocketAddress> found) {
+  addresses_ = std::move(found);
+  const auto last_one = std::find_if(
+      addresses_.begin(), addresses_.end(),
+      [this](const wire::SocketAddress& address) { return address.str() == unusable_; });
+  if (last_one != addresses_.end()) std::rotate(addresses_.begin(), last_one + 1, addresses_.end());
+  current_ = 0;
+  try_next_address();
+}
+
+// Tries addresses_[current_] and, while they fail at once, those after it.
+void Dialer::try_next_address() {
+  for (; current_ < addresses_.size(); ++current_) {
+    Result<UniqueFd> started = wire::start_connect(addresses_[current_]);
+    if (!started) {
+      last_error_ = std::move(started).error();
+      continue;
+    }
+    state_ = State::connect;
+    reached_ = Phase::connect;
+    socket_ = *std::move(started);
+    connected_ = EventSource::writable(loop_, socket_.get(), [this] { on_connected(); });
+    connected_.enable();
+    const auto share = options_.round_time / static_cast<std::int64_t>(addresses_.size());
+    return timer_.enable_in(std::min(kConnectTimeout, share));
+  }
+  fail(*last_error_);
+}
+
+void Dialer::on_connected() {
+  connected_.disable();
+  if (Result<void> done = wire::finish_connect(socket_.get(), addresses_[current_]); !done) {
+    last_error_ = std::move(done).error();
+    socket_.reset();
+    // From the timer, because `connected_` must not be replaced while its callback runs.
+    return timer_.enable_in(Duration::zero());
+  }
+  wire::set_channel_options(socket_.get());
+  state_ = State::greet;
+  reached_ = Phase::greet;
+  timer_.enable_in(wire::kHelloTimeout);
+  FrameConnection::Observer& observer = *this;
+  connection_ = std::make_unique<FrameConnection>(
+      loop_, wire::make_transport(std::move(socket_), wire::TransportEnd::connected), observer,
+      options_.max_queued_bytes);
+  net::Frame hello;
+  wire::to_message(options_.self, *hello.mutable_hello());
+  connection_->send(hello);
+}
+
+void Dialer::on_timer() {
+  switch (state_) {
+    case State::pause:
+      return begin_round();
+    case State::give_up:
+      return fail(*std::exchange(reason_, {}));
+    case State::connect:
+      if (socket_) {
+        connected_.disable();
+        socket_.reset();
+        last_error_ = Error{
+            Errc::unavailable,
+            fmt::format("connect to '{}': no answer; is that PC on, and is there a route to it?",
+                        addresses_[current_].str())};
+      }
+      ++current_;
+      return try_next_address();
+    case State::greet:
+      reason_ = Error{Errc::unavailable, peer_name() + " does not greet; is it a dssmd?"};
+      return connection_->close_with(*reason_);
+    case State::look_up:
+    case State::up:
+      return;
+  }
+}
+
+Result<void> Dialer::on_frame(net::Frame& frame) {
+  if (frame.serial() == 0 && frame.has_failure()) {
+    reason_ = wire::failure(frame.failure()).context("refused by " + peer_name());
+    return *reason_;
+  }
+  if (state_ == State::greet) return greet_untrusted(frame);
+  if (frame.has_hello()) return Error{Errc::protocol, "the other side sent a second Hello"};
+  return observer_.on_frame(frame);
+}
+
+Result<void> Dialer::greet_untrusted(const net::Frame& frame) {
+  if (!frame.has_hello()) {
+    reason_ = Error{Errc::protocol, peer_name() + " does not begin with Hello; is it a dssmd?"};
+    return *reason_;
+  }
+  Result<wire::Greeting> greeting = wire::greeting_untrusted(frame.hello(), peer_name());
+  if (!greeting) {
+    reason_ = std::move(greeting).error();
+    return *reason_;
+  }
+  them_ = *std::move(greeting);
+  timer_.disable();
+  state_ = State::up;
+  reached_ = Phase::up;
+  up_since_ = loop_.now();
+  observer_.on_up(*connection_, *them_);
+  return {};
+}
+
+void Dialer::fail(const Error& why) {
+  // A server that greets and then refuses is not connected to 20 times a second.
+  if (state_ == State::up && loop_.now() - up_since_ >= kMaxPause) pause_ = kFirstPause;
+  const bool is_unusable = std::exchange(given_up_, false) || state_ == State::greet;
+  unusable_ = is_unusable ? addresses_[current_].str() : std::string();
+  state_ = State::pause;
+  timer_.enable_in(pause_);
+  pause_ = std::min(2 * pause_, options_.max_pause);
+  observer_.on_down(why);
+}
 
 void Dialer::on_output_empty() {
-  if (state_->step == State::Step::up) state_->observer.on_output_empty();
+  if (state_ == State::up) observer_.on_output_empty();
 }
 
 void Dialer::on_closed(const Error& why) {
-  State& state = *state_;
-  state.fail(state.reason ? *std::exchange(state.reason, {}) : Error(why).context(state.who()));
+  fail(reason_ ? *std::exchange(reason_, {}) : Error(why).context(peer_name()));
 }
 
 }  // namespace dssm::daemon

@@ -1,14 +1,24 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Keeps one outgoing connection up: looks the address up, connects, greets, and when the connection
-// breaks does it all again, after a pause that grows from kFirstPause to kLongestPause and never
-// gives up. Used by PeerConnection (control connections), mirrors and remote writers (channels).
+// Keeps one outgoing connection up: looks the address up, connects, exchanges greetings. When the
+// connection breaks it does all of that again, after a back-off that grows from kFirstPause to
+// kMaxPause, and never gives up. Used by PeerConnection (control connections), mirrors and remote
+// writers (channels).
 //
-// Of several addresses the first that connects is taken. When nobody greets there, or when
-// restart() gave the connection up, the next round begins with the one behind it.
+// Of several addresses the first that connects is taken. When the other side does not greet, or
+// when restart() gave the connection up, the next round begins with the address after it.
+//
+//           found             connected            Hello
+//   look_up ------> connect ------------> greet ----------> up
+//     ^    address |  ^  | next address
+//     |            |  +--+
+//     | timer      v no address is left, no greeting, connection closed, restart()
+//   pause <------------------------------------------------ every other state
 #pragma once
 
+#include <cstdint>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
@@ -23,17 +33,18 @@ namespace dssm::daemon {
 class Dialer final : private FrameConnection::Observer {
  public:
   static constexpr Duration kFirstPause = std::chrono::milliseconds(50);
-  static constexpr Duration kLongestPause = std::chrono::seconds(2);
+  static constexpr Duration kMaxPause = std::chrono::seconds(2);
   static constexpr Duration kConnectTimeout = std::chrono::seconds(2);  // of one address
 
   class Observer {
    public:
-    // Both greetings are exchanged: ask away. `link` is the dialer's and good until on_down().
-    virtual void on_up(FrameConnection& link, const wire::Greeting& them) = 0;
+    // Both greetings are exchanged: requests may be sent. `connection` is the dialer's and valid
+    // until on_down().
+    virtual void on_up(FrameConnection& connection, const wire::Greeting& them) = 0;
     virtual Result<void> on_frame(net::Frame& frame) = 0;
     virtual void on_output_empty() {}
-    // The connection broke, or an attempt failed; the dialer goes on trying by itself. Called for
-    // each failed round of attempts too. Whoever refused us did so in words, which are in `why`.
+    // The connection broke, or a round of attempts failed; the dialer continues by itself. When the
+    // other side refused the connection, `why` holds its reason.
     virtual void on_down(const Error& why) = 0;
 
    protected:
@@ -41,12 +52,12 @@ class Dialer final : private FrameConnection::Observer {
   };
 
   struct Options {
-    // Best first, at least one: numbers, or one name, which is looked up anew for each round of
+    // Best first, at least one: numbers, or one name, which is looked up again for each round of
     // attempts.
     std::vector<wire::Address> addresses;
-    wire::Greeting self;  // what to say
+    wire::Greeting self;  // to send
     std::size_t max_queued_bytes = 1U << 20;
-    Duration longest_pause = kLongestPause;
+    Duration max_pause = kMaxPause;
     Duration round_time = Duration::max();  // all addresses share it, none gets > kConnectTimeout
   };
 
@@ -55,30 +66,69 @@ class Dialer final : private FrameConnection::Observer {
   Dialer(const EventLoop& loop, Resolver& resolver, Options options, Observer& observer);
   Dialer(const Dialer&) = delete;
   Dialer& operator=(const Dialer&) = delete;
-  ~Dialer();
 
-  // Tries at once instead of waiting for the pause to end (the other side just showed up).
+  // Ends the pause, if there is one: the other side has just become available.
   void retry_now();
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
-  // the next attempt after the pause that is due. While it pauses anyway: nothing.
+  // the next attempt after the pause that is due. During a pause: nothing.
   void restart(const Error& why);
-  // Where to go from the next round of attempts on. That begins at once when one is just waiting
-  // for somebody to answer; what is up stays as it is.
+  // The addresses from the next round of attempts on. That begins at once when an attempt waits for
+  // an answer; a connection that is up stays as it is.
   void set_addresses(std::vector<wire::Address> addresses);
 
-  FrameConnection* link() noexcept;  // nullptr unless up
+  FrameConnection* connection() noexcept;  // nullptr unless up
   // For on_down(): how far the attempt or connection had come that ended.
   enum class Phase : unsigned char { look_up, connect, greet, up };
-  Phase reached() const noexcept;
+  Phase reached() const noexcept { return reached_; }
   std::string address() const;            // connected to, else the first
   bool crosses_network() const noexcept;  // connected to another address than loopback
 
  private:
-  struct State;
-  std::unique_ptr<State> state_;
+  enum class State : std::uint8_t {
+    look_up,  // until the resolver answers
+    connect,  // until the socket is connected, or the timer
+    greet,    // until their Hello came, or the timer
+    up,       // until the connection closes
+    give_up,  // restart() was called: until the timer, at once
+    pause,    // until the timer
+  };
+
+  // FrameConnection::Observer
   Result<void> on_frame(net::Frame& frame) override;
   void on_output_empty() override;
   void on_closed(const Error& why) override;
+
+  void begin_round();
+  void begin_round_soon();
+  void try_addresses(std::vector<wire::SocketAddress> found);
+  void try_next_address();
+  void on_connected();
+  void on_timer();
+  Result<void> greet_untrusted(const net::Frame& frame);
+  void fail(const Error& why);
+  std::string peer_name() const;
+
+  const EventLoop& loop_;
+  Resolver& resolver_;
+  Options options_;
+  Observer& observer_;
+
+  State state_ = State::pause;
+  Phase reached_ = Phase::look_up;  // in this round, or in the last one
+  Duration pause_ = kFirstPause;    // the next one
+  MonoTime up_since_{};
+  Resolver::Ticket lookup_;
+  std::vector<wire::SocketAddress> addresses_;
+  std::size_t current_ = 0;          // of `addresses_`: the one that is tried or connected to
+  std::optional<Error> last_error_;  // of the address before it
+  UniqueFd socket_;                  // while it connects
+  // Until the next round: a FrameConnection must not be destroyed in its own callbacks.
+  std::unique_ptr<FrameConnection> connection_;
+  std::optional<wire::Greeting> them_;
+  std::optional<Error> reason_;  // why the connection is about to close, if known here
+  bool given_up_ = false;        // by restart(), while it was up
+  std::string unusable_;         // the address to try last; empty: none
+  EventSource connected_, timer_;
 };
 
 }  // namespace dssm::daemon

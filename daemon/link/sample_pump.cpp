@@ -1,14 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/link/sample_pump.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 
 namespace dssm::daemon {
 namespace {
 
 Duration period_of(double rate_hz) {
-  constexpr double kLongestNs = 1e18;  // some 30 years
-  return Duration(static_cast<std::int64_t>(std::min(1e9 / rate_hz, kLongestNs)));
+  constexpr double kMaxNs = 1e18;  // some 30 years
+  return Duration(static_cast<std::int64_t>(std::min(1e9 / rate_hz, kMaxNs)));
 }
 
 }  // namespace
@@ -18,11 +20,11 @@ Duration period_of(double rate_hz) {
   return newest <= kLastTid ? newest : kNoTid;
 }
 
-SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& link,
+SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connection,
                        SampleSender& sender, Observer& observer, const Plan& plan)
     : reader_(mapping),
       payload_bytes_(mapping.geometry().payload_bytes),
-      link_(link),
+      connection_(connection),
       sender_(sender),
       observer_(observer),
       plan_(plan),
@@ -40,22 +42,22 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& link,
     } else if (only_under_way) {
       break;
     } else {
-      const Look seen = look(now);
-      if (seen != Look::ready) sender_.end_run();
-      if (seen == Look::end) return PumpWait::nothing;
-      // A frame that tells of a gap, and the like, may wait for the socket.
-      if (!link_.output_empty()) return PumpWait::room;
-      if (seen == Look::news) return PumpWait::news;
-      if (seen == Look::time) return PumpWait::time;
+      const Next next = choose_next(now);
+      if (next != Next::ready) sender_.end_run();
+      if (next == Next::end) return PumpWait::ended;
+      // A frame that reports a gap, for example, may wait for the socket.
+      if (!connection_.output_empty()) return PumpWait::output;
+      if (next == Next::wait_for_sample) return PumpWait::sample;
+      if (next == Next::wait_for_time) return PumpWait::time;
       const Tid newest = std::min(newest_untrusted(reader_), last_);
       observer_.before_samples();
-      if (!link_.output_empty()) return PumpWait::room;
+      if (!connection_.output_empty()) return PumpWait::output;
       if (sender_.sends_in_place()) {
         sent_up_to = next_ + 1;
         status = sender_.send(next_, 0, next_ < newest);
         bytes += std::min(payload_bytes_, SampleSender::kSliceBytes);
       } else {
-        // The writer goes on meanwhile: a thinned stream's newest may be older already.
+        // The writer continues meanwhile: the newest sample may not be the newest any more.
         const Tid at_most = next_ + (thins() ? 1 : kSamplesPerTurn - samples) - 1;
         status = sender_.send_many(next_, std::min(newest, at_most), sent_up_to);
         bytes += static_cast<std::size_t>(sent_up_to - next_) * payload_bytes_;
@@ -68,32 +70,33 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& link,
         next_ = sent_up_to;
         after_sample(now);
         break;
-      case SendStatus::torn:  // then it is outside of the window now: look() tells the gap
+      case SendStatus::torn:  // it is outside of the window now: choose_next() reports the gap
         ++samples;
         break;
-      case SendStatus::gone:
-        // Between two looks at the ring; or the slot holds nonsense.
+      case SendStatus::not_in_ring:
+        // Overwritten since choose_next(), or the slot holds invalid values.
         ++samples;
         if (!thins() && next_ >= reader_.oldest()) lose_up_to(next_ + 1);
         break;
       case SendStatus::blocked:
         sender_.end_run();
-        return PumpWait::room;
+        return PumpWait::output;
       case SendStatus::unfinished:
         break;
       case SendStatus::no_memory:
         return Error{Errc::limit_exceeded,
-                     "no memory is left to copy a sample of " + std::to_string(payload_bytes_) +
-                         " bytes aside; use a client that has the feature 'torn', or raise the "
-                         "key max_peer_memory"};
+                     fmt::format("no memory is left to copy a sample of {} bytes aside; use a "
+                                 "client that has the feature 'torn', or raise the key "
+                                 "max_peer_memory",
+                                 payload_bytes_)};
     }
   }
   sender_.end_run();
   return PumpWait::turn;
 }
 
-// Finds out whether, and from where, to go on.
-[[gnu::hot]] SamplePump::Look SamplePump::look(MonoTime now) {
+// Chooses the next sample to send, or what to wait for.
+[[gnu::hot]] SamplePump::Next SamplePump::choose_next(MonoTime now) {
   const Tid newest = newest_untrusted(reader_);
   if (!thins() && next_ <= newest) {
     const Tid oldest = reader_.oldest();
@@ -107,13 +110,13 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& link,
   if (next_ > last_) {
     sender_.end_run();
     observer_.on_end();
-    return Look::end;
+    return Next::end;
   }
-  if (next_ > newest) return Look::news;
-  if (!thins()) return Look::ready;
-  if (now < due_) return Look::time;
+  if (next_ > newest) return Next::wait_for_sample;
+  if (!thins()) return Next::ready;
+  if (now < due_) return Next::wait_for_time;
   next_ = std::min(newest, last_);
-  return Look::ready;
+  return Next::ready;
 }
 
 void SamplePump::lose_up_to(Tid next) {

@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Sends a ring's samples over a link from a given one on: each once, in the order of their tids, as
-// fast as the link takes them, until it has caught up; then waits to be called again. What the ring
-// no longer holds when its turn comes is told as a gap. Knows neither subscriptions nor doorbells:
-// StreamChannel (subscriptions) and RemoteWriter (publishing) use it at the two ends of a channel.
+// Sends a ring's samples over a connection from a given one on: each once, in the order of their
+// tids, as fast as the connection takes them, until it has caught up; then it waits to be called
+// again. Samples that the ring no longer holds when their turn comes are reported as a gap. Knows
+// neither subscriptions nor doorbells: StreamChannel and RemoteWriter use it at the two ends of a
+// channel.
 //
 // Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
 #pragma once
@@ -19,23 +20,24 @@
 
 namespace dssm::daemon {
 
-// Tids beyond this one are no samples: somebody with write access has written nonsense into the
-// ring. Far enough from the greatest number to add to them.
+// Greater tids do not exist: they come from a program that wrote invalid values into the ring. Far
+// enough from the greatest number to add to them.
 inline constexpr Tid kLastTid = Tid{1} << 62;
 
-// The newest sample, as those see it who send samples to other hosts; kNoTid: none.
+// The newest sample that may be sent; kNoTid: none.
 Tid newest_untrusted(const ring::RingReader& reader) noexcept;
 
 // What has to happen before pump() has something to do.
 enum class PumpWait : std::uint8_t {
-  news,     // a sample newer than known()
-  room,     // on_output_empty() of the link
-  turn,     // others had theirs
-  time,     // due() comes
-  nothing,  // it has ended
+  sample,  // a sample newer than known()
+  output,  // on_output_empty() of the connection
+  turn,    // the next turn, after others had theirs
+  time,    // due() comes
+  ended,   // nothing: it has ended
 };
 
-// The mapping, link, sender and events outlive it. pump() may call events and send on the link.
+// The mapping, connection, sender and observer outlive it. pump() may call the observer and send on
+// the connection.
 class SamplePump {
  public:
   static constexpr int kSamplesPerTurn = 1024;
@@ -43,9 +45,9 @@ class SamplePump {
 
   class Observer {
    public:
-    // Samples [first, first + count) are lost. Frames may be sent on the link.
+    // Samples [first, first + count) are lost. Frames may be sent on the connection.
     virtual void on_gap(Tid first, std::uint64_t count) = 0;
-    // What was written until now may be sent next. Frames may be sent on the link.
+    // Samples that are in the ring now may be sent next. Frames may be sent on the connection.
     virtual void before_samples() {}
     // All samples up to Plan::caught_up_at were sent or lost.
     virtual void on_caught_up() {}
@@ -65,37 +67,36 @@ class SamplePump {
     double max_rate_hz = 0;
   };
 
-  SamplePump(const ring::RingMapping& mapping, FrameConnection& link, SampleSender& sender,
+  SamplePump(const ring::RingMapping& mapping, FrameConnection& connection, SampleSender& sender,
              Observer& observer, const Plan& plan);
   SamplePump(const SamplePump&) = delete;
   SamplePump& operator=(const SamplePump&) = delete;
 
-  // Whether it leaves samples out, to keep to a rate: only then pump() looks at its `now`.
+  // Whether it leaves samples out, to keep to a rate: only then pump() uses its `now`.
   bool thins() const noexcept { return plan_.max_rate_hz > 0; }
 
-  // Sends what there is to be sent in one turn. The sender must not be busy with somebody else's
-  // sample.
-  //   only_under_way  begins no other sample: somebody else wants to send in between
+  // Sends one turn's samples. The sender must not be busy with the sample of another user.
+  //   only_under_way  begins no other sample: another user wants to send in between
   //   fails           limit_exceeded (the peer's memory is used up, and it does not know "torn")
   Result<PumpWait> pump(MonoTime now, bool only_under_way = false);
 
   // No sample after `last` is sent.
   void end_at(Tid last) noexcept { last_ = last; }
 
-  // The newest sample that was looked at: only a newer one is news.
+  // The newest sample that was sent or lost; PumpWait::sample waits for a newer one.
   Tid known() const noexcept { return next_ - 1; }
   MonoTime due() const noexcept { return due_; }
   std::uint64_t lost() const noexcept { return lost_; }
 
  private:
-  enum class Look : std::uint8_t { ready, news, time, end };
-  Look look(MonoTime now);
+  enum class Next : std::uint8_t { ready, wait_for_sample, wait_for_time, end };
+  Next choose_next(MonoTime now);
   void lose_up_to(Tid next);
   void after_sample(MonoTime now);
 
   ring::RingReader reader_;
   std::size_t payload_bytes_;
-  FrameConnection& link_;
+  FrameConnection& connection_;
   SampleSender& sender_;
   Observer& observer_;
   Plan plan_;

@@ -19,30 +19,31 @@ iovec part_of(const std::byte* bytes, std::size_t size) noexcept {
 
 }  // namespace
 
-SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& link,
+SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& connection,
                            const Options& options)
     : reader_(mapping),
-      link_(link),
+      connection_(connection),
       options_(options),
       payload_bytes_(mapping.geometry().payload_bytes) {}
 
 [[gnu::hot]] SendStatus SampleSender::send(Tid tid, std::uint64_t serial, bool more_follow) {
   DSSM_CHECK(!busy_);
   const bool is_small = payload_bytes_ < kInPlaceBytes;
-  const bool may_copy = payload_bytes_ <= kMostCopiedBytes;
+  const bool may_copy = payload_bytes_ <= kMaxCopiedBytes;
   const bool copy_pays = is_small || !more_follow || !options_.may_tear;
   return may_copy && copy_pays ? send_copy(tid, serial) : begin_in_place(tid, serial);
 }
 
 [[gnu::hot]] SendStatus SampleSender::send_copy(Tid tid, std::uint64_t serial) {
-  std::byte staged[sizeof head_ + kMostCopiedBytes];
+  std::byte staged[sizeof head_ + kMaxCopiedBytes];
   SampleInfo info;
   std::byte* payload = staged + sizeof head_;
-  if (reader_.read(tid, {payload, payload_bytes_}, info) != ReadStatus::ok) return SendStatus::gone;
+  if (reader_.read(tid, {payload, payload_bytes_}, info) != ReadStatus::ok)
+    return SendStatus::not_in_ring;
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
   const std::size_t header_bytes =
       wire::encode_sample_header(header, serial, info, payload_bytes_, wire::Trailer::none);
-  // Behind the verdict on the sample before, if it is still here.
+  // After the trailer of the sample before, if it is still here.
   const std::size_t kept_bytes = head_bytes_ - head_sent_;
   keep_head(std::span(header).first(header_bytes));
   const std::size_t bytes = kept_bytes + header_bytes + payload_bytes_;
@@ -50,15 +51,15 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& li
   std::copy_n(head_.begin() + head_sent_, kept_bytes + header_bytes, begin);
   head_bytes_ -= header_bytes;
   const iovec part = part_of(begin, bytes);
-  const std::size_t sent = link_.send_now({&part, 1});
+  const std::size_t sent = connection_.send_now({&part, 1});
   if (sent <= kept_bytes) {
     head_sent_ += sent;
-    link_.want_output();
+    connection_.want_output();
     return SendStatus::blocked;
   }
   head_bytes_ = head_sent_ = 0;
   // Charged with the connection: there is at most one such rest.
-  if (sent < bytes) link_.queue_rest(RawBytes::copy_of({begin + sent, bytes - sent}));
+  if (sent < bytes) connection_.queue_rest(RawBytes::copy_of({begin + sent, bytes - sent}));
   counters_.copied_payload_bytes += payload_bytes_;
   ++counters_.samples;
   return SendStatus::sent;
@@ -70,7 +71,7 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& li
   next = first;
   std::byte staged[kBatchBytes];
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
-  // Headers of one stream have one length (sample_frame.cpp), so frames have as well.
+  // All headers of one stream have the same length (sample_frame.cpp), and so have its frames.
   const std::size_t header_bytes =
       wire::encode_sample_header(header, 0, {}, payload_bytes_, wire::Trailer::none);
   const std::size_t frame_bytes = header_bytes + payload_bytes_;
@@ -84,12 +85,12 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& li
     wire::encode_sample_header(header, 0, info, payload_bytes_, wire::Trailer::none);
     std::copy_n(header.begin(), header_bytes, staged + bytes);
   }
-  if (bytes == 0) return SendStatus::gone;
+  if (bytes == 0) return SendStatus::not_in_ring;
   const iovec part = part_of(staged, bytes);
-  const std::size_t sent = link_.send_now({&part, 1});
+  const std::size_t sent = connection_.send_now({&part, 1});
   counters_.copied_payload_bytes += static_cast<std::uint64_t>(next - first) * payload_bytes_;
   if (sent == 0) {
-    link_.want_output();
+    connection_.want_output();
     next = first;
     return SendStatus::blocked;
   }
@@ -103,8 +104,8 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& li
       next = first + static_cast<Tid>(frames);
     }
     if (sent < bytes) {
-      link_.queue_rest(RawBytes::copy_of({staged + sent, bytes - sent}),
-                       share ? *std::move(share) : MemoryShare());
+      connection_.queue_rest(RawBytes::copy_of({staged + sent, bytes - sent}),
+                             share ? *std::move(share) : MemoryShare());
     }
   }
   counters_.samples += static_cast<std::uint64_t>(next - first);
@@ -120,7 +121,7 @@ void SampleSender::keep_head(std::span<const std::byte> bytes) noexcept {
 
 SendStatus SampleSender::begin_in_place(Tid tid, std::uint64_t serial) {
   SampleInfo info;
-  if (reader_.locate(tid, place_, info) != ReadStatus::ok) return SendStatus::gone;
+  if (reader_.locate(tid, place_, info) != ReadStatus::ok) return SendStatus::not_in_ring;
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
   const std::size_t header_bytes =
       wire::encode_sample_header(header, serial, info, payload_bytes_,
@@ -137,13 +138,13 @@ SendStatus SampleSender::begin_in_place(Tid tid, std::uint64_t serial) {
     }
     return copy_slice();
   }
-  link_.set_mid_frame(true);
+  connection_.set_mid_frame(true);
   const SendStatus status = send_slice();
   if (busy_ && head_sent_ <= kept_bytes && !copying_) {
-    // Nothing of this sample went: it is not begun.
+    // No byte of this sample was sent: it is not begun.
     busy_ = false;
     head_bytes_ = kept_bytes;
-    link_.set_mid_frame(false);
+    connection_.set_mid_frame(false);
     return SendStatus::blocked;
   }
   return status;
@@ -159,7 +160,7 @@ SendStatus SampleSender::send_slice() {
   const std::size_t head = head_bytes_ - head_sent_;
   const iovec parts[] = {part_of(head_.data() + head_sent_, head),
                          part_of(place_.payload + offset_, slice)};
-  const std::size_t sent = link_.send_now(parts);
+  const std::size_t sent = connection_.send_now(parts);
   head_sent_ += std::min(sent, head);
   const std::size_t of_payload = sent - std::min(sent, head);
   offset_ += of_payload;
@@ -169,13 +170,12 @@ SendStatus SampleSender::send_slice() {
     head_bytes_ = head_sent_ = 0;
     return end_sample(RingReader::still_valid(*place_.sequence, place_.expected));
   }
-  // The socket is full. Nothing is copied aside of a sample that is not begun, nor of one that is
-  // void already.
+  // The socket is full. A sample that is not begun, or is void already, is not copied aside.
   const bool begun = head_sent_ > 0;
   if (begun && RingReader::still_valid(*place_.sequence, place_.expected) && begin_copying()) {
     return copy_slice();
   }
-  link_.want_output();
+  connection_.want_output();
   return SendStatus::blocked;
 }
 
@@ -213,22 +213,22 @@ SendStatus SampleSender::end_copying() {
     busy_ = false;
     aside_ = {};
     share_ = {};
-    return SendStatus::gone;
+    return SendStatus::not_in_ring;
   }
   if (options_.may_tear) {
-    const auto verdict = wire::torn_trailer(!valid);
-    std::copy(verdict.begin(), verdict.end(), aside_.data() + aside_bytes_);
+    const auto trailer = wire::torn_trailer(!valid);
+    std::copy(trailer.begin(), trailer.end(), aside_.data() + aside_bytes_);
   }
-  link_.queue_rest(std::exchange(aside_, {}), std::exchange(share_, {}));
+  connection_.queue_rest(std::exchange(aside_, {}), std::exchange(share_, {}));
   const SendStatus status = end_sample(valid);
-  head_bytes_ = 0;  // the verdict is queued already
+  head_bytes_ = 0;  // the trailer is queued already
   return status;
 }
 
 SendStatus SampleSender::end_sample(bool valid) {
   if (options_.may_tear) {
     keep_head(wire::torn_trailer(!valid));
-    link_.set_mid_frame(false);
+    connection_.set_mid_frame(false);
   }
   busy_ = false;
   ++counters_.samples;
@@ -240,9 +240,10 @@ SendStatus SampleSender::end_sample(bool valid) {
   if (busy_ || head_bytes_ == 0) return;
   const std::size_t bytes = head_bytes_ - head_sent_;
   const iovec part = part_of(head_.data() + head_sent_, bytes);
-  const std::size_t sent = bytes > 0 ? link_.send_now({&part, 1}) : 0;
+  const std::size_t sent = bytes > 0 ? connection_.send_now({&part, 1}) : 0;
   if (sent < bytes) {
-    link_.queue_rest(RawBytes::copy_of(std::span(head_).subspan(head_sent_ + sent, bytes - sent)));
+    connection_.queue_rest(
+        RawBytes::copy_of(std::span(head_).subspan(head_sent_ + sent, bytes - sent)));
   }
   head_bytes_ = head_sent_ = 0;
 }

@@ -4,15 +4,15 @@
 #include <algorithm>
 #include <utility>
 
+#include "core/base/try.hpp"
 #include "daemon/link/sample_pump.hpp"
 
 namespace dssm::daemon {
 
 Result<std::shared_ptr<StreamFeed>> StreamFeed::open(const EventLoop& loop,
                                                      std::shared_ptr<Stream> stream) {
-  Result<std::shared_ptr<ring::Bell>> bell = stream->map_bell();
-  if (!bell) return std::move(bell).error().context("stream '" + stream->id().str() + "'");
-  return std::shared_ptr<StreamFeed>(new StreamFeed(loop, std::move(stream), *std::move(bell)));
+  auto bell = DSSM_TRY(stream->map_bell(), "stream '" + stream->id().str() + "'");
+  return std::shared_ptr<StreamFeed>(new StreamFeed(loop, std::move(stream), std::move(bell)));
 }
 
 StreamFeed::StreamFeed(const EventLoop& loop, std::shared_ptr<Stream> stream,
@@ -27,7 +27,7 @@ StreamFeed::~StreamFeed() {
 }
 
 void StreamFeed::on_doorbell_added(int fd) {
-  doorbells_.push_back(EventSource::edge(loop_, fd, [this] { look(); }));
+  doorbells_.push_back(EventSource::edge(loop_, fd, [this] { poll(); }));
   doorbells_.back().enable();
 }
 
@@ -50,30 +50,31 @@ void StreamFeed::on_doorbell_added(int fd) {
 
 [[gnu::hot]] void StreamFeed::forget(Observer& observer) noexcept {
   std::erase_if(waiting_, [&](const Waiting& waiting) { return waiting.observer == &observer; });
-  for (Waiting& waiting : told_) {
+  for (Waiting& waiting : notifying_) {
     if (waiting.observer == &observer) waiting.observer = nullptr;
   }
   if (waiting_.empty()) arm(false);
 }
 
-[[gnu::hot]] void StreamFeed::look() {
-  look_again_ = true;
-  if (looking_) return;  // a observer wrote to the stream
-  looking_ = true;
-  while (std::exchange(look_again_, false) && !waiting_.empty()) {
-    // Disarmed, so that the writer does not ring for what is sent in this round anyway.
+[[gnu::hot]] void StreamFeed::poll() {
+  poll_again_ = true;
+  if (polling_) return;  // an observer wrote to the stream
+  polling_ = true;
+  while (std::exchange(poll_again_, false) && !waiting_.empty()) {
+    // Disarmed, so that the writer does not ring for samples that are sent in this round anyway.
     arm(false);
-    std::swap(told_, waiting_);  // neither gives its memory back
-    for (std::size_t i = 0; i < told_.size(); ++i) {
-      const Waiting waiting = std::exchange(told_[i], {nullptr, kNoTid});
+    std::swap(notifying_, waiting_);  // neither gives its memory back
+    for (std::size_t i = 0; i < notifying_.size(); ++i) {
+      const Waiting waiting = std::exchange(notifying_[i], {nullptr, kNoTid});
       if (!waiting.observer) continue;
-      // Whoever is told will wait again: only for the others it is worth arming.
-      const bool news = newest_untrusted(reader_) > waiting.known;
-      if (news || !wait(*waiting.observer, waiting.known)) waiting.observer->on_news();
+      // An observer that is notified calls wait() again: only for the others it is worth arming.
+      const bool is_available = newest_untrusted(reader_) > waiting.known;
+      if (is_available || !wait(*waiting.observer, waiting.known))
+        waiting.observer->on_sample_available();
     }
-    told_.clear();
+    notifying_.clear();
   }
-  looking_ = false;
+  polling_ = false;
 }
 
 }  // namespace dssm::daemon

@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Tells those who send a stream's samples to other hosts when there are new ones. Listens to the
-// stream's doorbells, edge-triggered: nobody ever reads them, so that a ring costs the writer one
-// write and dssmd no read.
+// Notifies the senders of a stream's samples to other hosts of new samples. It watches the stream's
+// doorbells, edge-triggered and without ever reading them: a ring costs the writer one write and
+// dssmd no read.
 //
-// The doorbells are armed only while somebody waits for news: a writer that is faster than the
-// network, or whose stream nobody waits for, writes without a system call. After arming, the ring
-// is looked at once more, so that no sample is missed: either the writer sees the doorbell armed,
-// or we see its sample (both sides store, then load, sequentially consistent).
+// The doorbells are armed only while an observer waits for a sample: a writer that is faster than
+// the network, or whose stream has no observer, writes without a system call. The ring is checked
+// again after arming, so that no sample is missed: either the writer sees the doorbell armed, or
+// the feed sees its sample (both sides store, then load, sequentially consistent).
 #pragma once
 
 #include <dssm/result.hpp>
@@ -25,9 +25,9 @@ class StreamFeed final : private DoorbellObserver {
  public:
   class Observer {
    public:
-    // There is a sample newer than the one known; called once per wait(), from the loop. May call
-    // wait() and forget().
-    virtual void on_news() = 0;
+    // A sample newer than the one known is in the ring; called once per wait(), from the loop. May
+    // call wait() and forget().
+    virtual void on_sample_available() = 0;
 
    protected:
     ~Observer() = default;
@@ -40,15 +40,15 @@ class StreamFeed final : private DoorbellObserver {
   StreamFeed& operator=(const StreamFeed&) = delete;
   ~StreamFeed();
 
-  // Waits for a sample newer than `known`, instead of what this observer waited for before. False
-  // when there is one already: then nothing follows.
+  // Waits for a sample newer than `known`; replaces an earlier wait() of this observer. False when
+  // there is one already: then the observer is not called.
   bool wait(Observer& observer, Tid known);
-  // Nothing follows any more.
+  // Ends its wait().
   void forget(Observer& observer) noexcept;
 
   // A sample was written, or may have been: by dssmd itself, or by a writer that died before it
-  // could ring.
-  void look();
+  // rang.
+  void poll();
 
  private:
   struct Waiting {
@@ -67,8 +67,9 @@ class StreamFeed final : private DoorbellObserver {
   ring::RingReader reader_;
   bool armed_ = false;
   std::vector<Waiting> waiting_;
-  std::vector<Waiting> told_;  // while look() works: those still to be told, or null by forget()
-  bool looking_ = false, look_again_ = false;
+  // During poll(): those still to be notified; nullptr after forget().
+  std::vector<Waiting> notifying_;
+  bool polling_ = false, poll_again_ = false;
   std::vector<EventSource> doorbells_;
 };
 

@@ -61,8 +61,8 @@ net::Frame network_request(const StreamId& id, const local::Request& request) {
 }  // namespace
 
 FleetService::FleetService(const EventLoop& loop, Self self, const Registry& registry,
-                           Catalog& catalog, Peers& peers, MirrorKeeper& mirrors,
-                           RemoteWriterKeeper& writers)
+                           Catalog& catalog, Peers& peers, RemoteStreams<Mirror>& mirrors,
+                           RemoteStreams<RemoteWriter>& writers)
     : loop_(loop),
       self_(std::move(self)),
       registry_(registry),
@@ -72,15 +72,13 @@ FleetService::FleetService(const EventLoop& loop, Self self, const Registry& reg
       writers_(writers),
       list_timer_(EventSource::timer(loop, [this] { on_list_timeout(); })) {
   catalog_.add_observer(*this);
-  mirrors_.observe(this);
-  peers_.on_startup_over([this] {
+  peers_.on_settled([this] {
     for (const std::function<void()>& go_on : std::exchange(early_, {})) go_on();
   });
 }
 
 FleetService::~FleetService() {
-  peers_.on_startup_over({});
-  mirrors_.observe(nullptr);
+  peers_.on_settled({});
   catalog_.remove_observer(*this);
 }
 
@@ -102,20 +100,27 @@ Error FleetService::with_unavailable_peers(Error error) const {
   return error;
 }
 
-// The mirror of a stream whose owner is away: its history is still here. While the owner is there,
-// what it says about its stream counts.
-std::shared_ptr<Stream> FleetService::orphan(const StreamId& id) const {
-  std::shared_ptr<Stream> mirror = mirrors_.find(id);
+// The mirror of a stream whose owner is unavailable: its history is still here. While the owner is
+// available, its own answer about the stream counts.
+Mirror* FleetService::mirror_without_owner(const StreamId& id) const {
+  Mirror* mirror = mirrors_.find(id);
   if (!mirror) return nullptr;
   const Result<const KnownHost*> owner = catalog_.find_host(mirror->id().host);
-  return !owner && owner.error().code == Errc::not_found ? std::move(mirror) : nullptr;
+  return !owner && owner.error().code == Errc::not_found ? mirror : nullptr;
 }
 
 void FleetService::open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) {
   when_known(id, [this, id, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
-    if (owner) return mirrors_.open(**owner, owned_by(**owner, id), std::move(then));
-    if (std::shared_ptr<Stream> mirror = orphan(id)) return then(std::move(mirror));
+    if (owner) {
+      return mirrors_.open(**owner, id, nullptr, [then = std::move(then)](Result<OpenedRing> ring) {
+        if (!ring) return then(std::move(ring).error());
+        then(std::move(ring->stream));
+      });
+    }
+    if (Mirror* mirror = mirror_without_owner(id)) {
+      if (std::shared_ptr<Stream> stream = mirror->acquire()) return then(std::move(stream));
+    }
     then(with_unavailable_peers(owner.error()));
   });
 }
@@ -125,7 +130,7 @@ void FleetService::open_writer(const StreamId& id, const CreatePlan* plan, Then<
   when_known(id, [this, id, kept, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (!owner) return then(with_unavailable_peers(owner.error()));
-    writers_.open(**owner, owned_by(**owner, id), kept ? &*kept : nullptr, std::move(then));
+    writers_.open(**owner, id, kept ? &*kept : nullptr, std::move(then));
   });
 }
 
@@ -137,11 +142,13 @@ Result<std::shared_ptr<Stream>> FleetService::adopt_untrusted(const StreamId& id
 
 // --- about one stream
 
-local::Response FleetService::describe_mirror(const Stream& mirror) const {
+// Info of a mirror whose owner is unavailable; nullopt: there is none.
+std::optional<local::Response> FleetService::describe_mirror(const StreamId& id) const {
   local::Response response;
-  proto::Stream& stream = *response.mutable_stream_list()->add_streams();
-  wire::to_message(mirror.info(), stream);
-  mirrors_.describe(mirror.id(), *stream.mutable_mirror());
+  const Mirror* mirror = mirror_without_owner(id);
+  if (!mirror || !mirror->describe_stream(*response.mutable_stream_list()->add_streams())) {
+    return std::nullopt;
+  }
   return response;
 }
 
@@ -151,8 +158,8 @@ void FleetService::forward(const StreamId& id, const local::Request& request,
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (!owner) {
       // Info of a mirror whose owner is unavailable comes from here.
-      const auto mirror = request.has_info() ? orphan(id) : nullptr;
-      return mirror ? then(describe_mirror(*mirror)) : then(with_unavailable_peers(owner.error()));
+      auto mirror = request.has_info() ? describe_mirror(id) : std::nullopt;
+      return mirror ? then(*std::move(mirror)) : then(with_unavailable_peers(owner.error()));
     }
     const StreamId named = owned_by(**owner, id);
     // A host in the catalog has a connection.
@@ -160,8 +167,8 @@ void FleetService::forward(const StreamId& id, const local::Request& request,
         ->ask(network_request(named, request), [this, named, body = request.body_case(),
                                                 then = std::move(then)](Result<net::Frame> answer) {
           if (answer) return then(response_to(body, named, *std::move(answer)));
-          const auto mirror = body == local::Request::kInfo ? orphan(named) : nullptr;
-          mirror ? then(describe_mirror(*mirror)) : then(std::move(answer).error());
+          auto mirror = body == local::Request::kInfo ? describe_mirror(named) : std::nullopt;
+          mirror ? then(*std::move(mirror)) : then(std::move(answer).error());
         });
   });
 }
@@ -175,8 +182,7 @@ Result<local::Response> FleetService::response_to(local::Request::BodyCase reque
       proto::Stream& stream = *response.mutable_stream_list()->add_streams();
       stream = DSSM_TRY(
           stream_untrusted(id.host, std::move(*answer.mutable_stream_list()->mutable_streams(0))));
-      proto::Mirror mirror;
-      if (mirrors_.describe(id, mirror)) *stream.mutable_mirror() = std::move(mirror);
+      if (const Mirror* mirror = mirrors_.find(id)) mirror->describe(*stream.mutable_mirror());
       break;
     }
     case local::Request::kGetProperty:
@@ -345,10 +351,6 @@ void FleetService::on_remote_stream_added(const KnownHost&, const StreamInfo& st
 
 void FleetService::on_remote_stream_removed(const KnownHost&, const StreamInfo& stream) {
   if (observer_) observer_->on_remote_stream_removed(stream.id);
-}
-
-void FleetService::on_ring_replaced(const Stream& stream) {
-  if (observer_) observer_->on_ring_replaced(stream);
 }
 
 }  // namespace dssm::daemon

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Fleet for a dssmd with a network: finds owners in the catalog, asks them over their control
-// connections, has mirrors and remote writers opened by their keepers, and passes on what changes.
+// connections, opens mirrors and remote writers, and passes on what changes.
 //
 // Right after its start dssmd knows no other host yet. A request that would fail for that reason
 // waits until each peer has been heard of or tried once (Peers::kSettleTime at most): programs that
@@ -22,13 +22,14 @@
 #include "daemon/fleet/found_host.hpp"
 #include "daemon/fleet/peers.hpp"
 #include "daemon/local/fleet.hpp"
-#include "daemon/remote/mirror_keeper.hpp"
-#include "daemon/remote/remote_writer_keeper.hpp"
+#include "daemon/remote/mirror.hpp"
+#include "daemon/remote/remote_streams.hpp"
+#include "daemon/remote/remote_writer.hpp"
 #include "daemon/streams/registry.hpp"
 
 namespace dssm::daemon {
 
-class FleetService final : public Fleet, private CatalogObserver, private MirrorKeeper::Observer {
+class FleetService final : public Fleet, private CatalogObserver {
  public:
   // Requests that wait for the first words of the peers; more fail at once.
   static constexpr std::size_t kMaxEarlyRequests = 4096;
@@ -43,12 +44,16 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
 
   // What is given by reference outlives it.
   FleetService(const EventLoop& loop, Self self, const Registry& registry, Catalog& catalog,
-               Peers& peers, MirrorKeeper& mirrors, RemoteWriterKeeper& writers);
+               Peers& peers, RemoteStreams<Mirror>& mirrors, RemoteStreams<RemoteWriter>& writers);
   FleetService(const FleetService&) = delete;
   FleetService& operator=(const FleetService&) = delete;
   ~FleetService();
 
   void observe(Fleet::Observer* observer) override { observer_ = observer; }
+  // A mirror has a new ring in place of that one, as ChannelParts::on_ring_replaced.
+  void on_ring_replaced(const Stream& old) {
+    if (observer_) observer_->on_ring_replaced(old);
+  }
   bool is_there(const StreamId& id) const override {
     return id.host.empty() ? catalog_.find_owner(id).has_value() : catalog_.has(id);
   }
@@ -79,8 +84,8 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
                                       net::Frame answer) const;
   void when_known(const StreamId& id, std::function<void()> go_on);
   Error with_unavailable_peers(Error error) const;
-  std::shared_ptr<Stream> orphan(const StreamId& id) const;
-  local::Response describe_mirror(const Stream& mirror) const;
+  Mirror* mirror_without_owner(const StreamId& id) const;
+  std::optional<local::Response> describe_mirror(const StreamId& id) const;
   std::vector<const KnownHost*> hosts_by_name() const;
   void on_list_answer(Listing& listing, const wire::HostId& id, Result<net::Frame> answer);
   void finish(Listing& listing);
@@ -88,7 +93,6 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
 
   void on_remote_stream_added(const KnownHost& host, const StreamInfo& stream) override;
   void on_remote_stream_removed(const KnownHost& host, const StreamInfo& stream) override;
-  void on_ring_replaced(const Stream& stream) override;
 
   Duration clock_distance_to(const local::Host& host) const;
 
@@ -97,8 +101,8 @@ class FleetService final : public Fleet, private CatalogObserver, private Mirror
   const Registry& registry_;
   Catalog& catalog_;
   Peers& peers_;
-  MirrorKeeper& mirrors_;
-  RemoteWriterKeeper& writers_;
+  RemoteStreams<Mirror>& mirrors_;
+  RemoteStreams<RemoteWriter>& writers_;
   Fleet::Observer* observer_ = nullptr;
   std::vector<std::function<void()>> early_;       // wait for the peers to settle
   std::deque<std::shared_ptr<Listing>> listings_;  // in the order of their deadlines

@@ -1,100 +1,83 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The copy of one stream of another host: one channel to its owner, one ring here, however many
-// programs read it. The ring is filled with the owner's history first and kept up to date from then
-// on; after a cut the channel goes on with the sample it stopped at.
+// The copy of one stream of another host: one channel to its owner and one ring here, for any
+// number of programs that read it. The ring is filled with the owner's history first and kept up to
+// date from then on. After a reconnect the channel resumes with the sample it stopped at.
 //
-//   ring     has the owner's type, depth, cycle and incarnation. When the owner comes back with
-//            another incarnation there is a new ring, and readers of the old one are told
-//   trouble  while the owner is away, or has removed the stream, the ring stays as it is for its
-//            readers, and the channel is tried anew for ever
-//   end      when nobody has borrowed the ring for mirror_linger
+//   ring      has the owner's type, depth, cycle and incarnation. When the owner's stream has
+//             another incarnation, the mirror makes a new ring, and readers of the old one are
+//             notified as soon as the new one is filled
+//   error     while the owner is unavailable, or has removed the stream, the ring stays as it is
+//             for its readers, and the mirror always retries
+//   end       when no program has used the ring for mirror_linger
+//
+// The states, and what leads from one to the next; "ring" where there may be one already:
+//
+//             on_up            Opened             Subscribed         CaughtUp      catalog: removed
+//   unavailable ----> opening -------> subscribing --------> filling -------> live ---------> ending
+//     ^ (ring)         (ring) ^                                                ^               |
+//     |                       |                                                +---------------+
+//     |                       |                                                 catalog: added
+//     |       on_up           | Opened
+//   removed ----> reopening --+
+//     (ring)       (ring)
+//
+//   the connection ends       removed, reopening -> removed; any other state -> unavailable
+//   Failure (not not_found)   any state -> unavailable; reopened 2 s later
+//   Failure (not_found) or
+//   Ended                     any state -> removed; reopened 2 s later, or when the catalog has it
+//
+// A program gets the ring at once in unavailable, opening and live, if there is one; in removed,
+// reopening, subscribing, filling and ending its open() waits.
 #pragma once
 
 #include <cstdint>
-#include <dssm/result.hpp>
 #include <functional>
 #include <memory>
-#include <optional>
 #include <vector>
 
 #include "common.pb.h"
-#include "daemon/base/event_loop.hpp"
-#include "daemon/base/log.hpp"
-#include "daemon/base/rate_limiter.hpp"
-#include "daemon/fleet/catalog.hpp"
-#include "daemon/remote/lender.hpp"
-#include "daemon/remote/mirror_clock.hpp"
 #include "daemon/remote/mirror_ring.hpp"
-#include "daemon/remote/owner_connection.hpp"
+#include "daemon/remote/remote_stream.hpp"
 
 namespace dssm::daemon {
 
-class Mirror final : private OwnerConnection::Observer, private FrameConnection::SampleDelegate {
+class Mirror final : public RemoteStream, private FrameConnection::SampleDelegate {
  public:
-  // How long a program that opens the mirror waits for the owner to answer, and then for the
-  // history: what has come by then is there to read, the rest follows.
-  static constexpr Duration kOwnerTimeout = std::chrono::seconds(2);
+  // How long an open() waits for the history. What has arrived by then can be read.
   static constexpr Duration kFillTimeout = std::chrono::seconds(1);
+  static constexpr bool kSeveralRings = false;
 
-  class Keeper {
-   public:
-    virtual void on_ring_replaced(const Stream& old) = 0;
-    // A mirror is done(). Destroy it later, not here.
-    virtual void on_mirror_done() = 0;
+  Mirror(const ChannelParts& parts, StreamId id, RingQuota quota, std::function<void()> on_done);
 
-   protected:
-    ~Keeper() = default;
-  };
-  using Then = std::function<void(Result<std::shared_ptr<Stream>>)>;
-
-  // id: with its owner's host. parts, keeper and linger outlive it.
-  Mirror(const ChannelParts& parts, Keeper& keeper, StreamId id, const Duration& linger,
-         RingQuota room);
-  Mirror(const Mirror&) = delete;
-  Mirror& operator=(const Mirror&) = delete;
-
-  const StreamId& id() const noexcept { return id_; }
-  // Whether there is a ring, or somebody who waits for one.
-  bool has_use() const noexcept { return ring_ || !waiting_.empty(); }
-  // Whether it may be destroyed.
-  bool done() const noexcept { return done_; }
-
-  // Where the keeper says what the catalog knows of the owner.
-  OwnerConnection& channel() noexcept { return channel_; }
-  // The owner has such a stream, or a new ring of it.
-  void on_stream_there();
-  // The owner has removed the ring of that incarnation. The channel tells so, too, behind the last
-  // samples.
-  void on_stream_gone(std::uint64_t incarnation);
-  // The owner reported its clock; this PC's clock was read again.
-  void on_owner_clock(MirrorClock::Report report);
-  void on_clock() { assess(); }
-
-  // --- for programs
-
-  // Borrows the ring, as MirrorKeeper::open(). After channel().connect().
-  void open(Then then);
-  // Takes a ring that a program held while dssmd was away. Another offer of the same ring gives the
-  // same stream.
-  Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles files);
-  // The ring as it is; nullptr: none yet.
-  std::shared_ptr<Stream> borrow();
   void describe(proto::Mirror& out) const;
+  // The stream as its ring here shows it. False: there is none yet.
+  bool describe_stream(proto::Stream& out) const;
+
+  void on_stream_added() override;
+  void on_stream_removed(std::uint64_t incarnation) override;
+  void on_owner_clock(MirrorClock::Report report) override;
+  // This PC's clock was read again.
+  void on_own_clock() { assess_clock(); }
 
  private:
-  enum class State { connecting, filling, live, owner_unavailable, removed };
-  enum class Step { none, opening, subscribing, subscribed };  // of the connection
-  struct Waiting {
-    Then then;
-    MonoTime deadline;
+  // Samples and gaps are received from `filling` on.
+  enum class State : std::uint8_t {
+    removed,
+    reopening,
+    unavailable,
+    opening,
+    subscribing,
+    filling,
+    live,
+    ending,
   };
   struct Totals {
     std::uint64_t gap_samples = 0, received_samples = 0, received_bytes = 0;
   };
 
   // OwnerConnection::Observer
-  void on_up(FrameConnection& link, const wire::Greeting& them) override;
+  void on_up(FrameConnection& connection, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
   void on_down(const Error& why) override;
   void on_reopen() override;
@@ -102,57 +85,37 @@ class Mirror final : private OwnerConnection::Observer, private FrameConnection:
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   void on_batch_end() override;
+  // RemoteStream
+  std::shared_ptr<Stream> stream() const noexcept override;
+  bool is_removed() const noexcept override { return state_ <= State::reopening; }
+  bool can_open_now() const noexcept override;
+  Duration open_timeout() const noexcept override;
+  Result<void> check_open(const CreatePlan*) override { return clock_.check_opening(); }
+  Result<void> use_offered(std::shared_ptr<Stream> stream) override;
+  void on_unused() override;
 
+  // Protocol steps
   Result<void> on_opened_untrusted(const proto::Opened& opened);
   Result<void> on_subscribed_untrusted(const net::Subscribed& subscribed);
-  void on_caught_up();
+  Result<void> on_caught_up();
   Result<void> on_gap_untrusted(const net::Gap& gap);
-  void on_removed(const Error& why);
   void on_refused(const Error& why);
+  void end_subscription(State next);
+
+  // The ring
   Result<void> follow_untrusted(const StreamInfo& theirs);
-  void take_ring(std::unique_ptr<MirrorRing> ring);
-
-  void assess();
-  std::shared_ptr<Stream> lend();
-  void lend_to(const Then& then);
-  void answer_waiting();
-  void fail_waiting(const Error& why);
-  void leave_if_alone(bool somebody_left);
-  void arm_wait_timer();
-  void on_wait_timer();
+  void replace_ring(std::unique_ptr<MirrorRing> ring);
   void notify_replaced();
-  void on_linger_timer();
-  void log_error();
-  void log_gaps(std::uint64_t samples);
-  Error away() const;
-  LogFields log_fields() const;
+  void assess_clock();
+  void log_stopped();
 
-  const ChannelParts& parts_;
-  Keeper& keeper_;
-  const StreamId id_;
-  const Duration& linger_;  // its keeper's, which may change
-  const RingQuota room_;
-
+  State state_ = State::unavailable;
   MirrorClock clock_;
-  State state_ = State::connecting;
-  Step step_ = Step::none;
-  bool ending_ = false;           // the stream was removed; the channel is still to tell so
-  std::optional<Error> trouble_;  // why it is not live
-  bool told_ = false;             // the log knows of the present trouble
   std::unique_ptr<MirrorRing> ring_;
-  std::vector<std::shared_ptr<Stream>> replaced_;  // whose readers have not been told
-  bool subscribed_before_ = false;
-  std::uint64_t reconnects_ = 0, restarts_ = 0;
-  Totals before_;  // of the rings that were replaced
-  RateLimiter gap_lines_{1, std::chrono::seconds(10)};
-
-  bool done_ = false;
-  Lender lender_;
-  std::vector<Waiting> waiting_;
-  MonoTime patience_ends_{};  // with the filling that is under way
-  EventSource wait_timer_, linger_timer_;
-  const std::string name_;   // for messages
-  OwnerConnection channel_;  // last: ends first
+  std::vector<std::shared_ptr<Stream>> replaced_;  // their readers are still to be notified
+  Totals earlier_;                                 // of the rings that were replaced
+  std::uint64_t subscriptions_ = 0, restarts_ = 0;
+  EventSource fill_timer_, linger_timer_;
 };
 
 }  // namespace dssm::daemon

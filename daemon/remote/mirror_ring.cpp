@@ -1,23 +1,32 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/remote/mirror_ring.hpp"
 
+#include <fmt/format.h>
+
 #include <cstring>
 #include <new>
-#include <string>
 #include <utility>
 
+#include "core/base/try.hpp"
 #include "daemon/link/sample_pump.hpp"
 
 namespace dssm::daemon {
+namespace {
+
+bool is_known(const MirrorClock::Report& report) noexcept {
+  return report && report->standing.bound != kUnknownClockError;
+}
+
+}  // namespace
+
+// --- the ring
 
 Result<std::unique_ptr<MirrorRing>> MirrorRing::open(std::shared_ptr<Stream> stream,
                                                      MemoryBudget& budget) {
-  auto mapping = stream->map_for_writing();
-  if (!mapping) return std::move(mapping).error();
-  auto bell = stream->map_bell();
-  if (!bell) return std::move(bell).error();
+  auto mapping = DSSM_TRY(stream->map_for_writing());
+  auto bell = DSSM_TRY(stream->map_bell());
   return std::unique_ptr<MirrorRing>(
-      new MirrorRing(std::move(stream), *std::move(mapping), *std::move(bell), budget));
+      new MirrorRing(std::move(stream), std::move(mapping), std::move(bell), budget));
 }
 
 MirrorRing::MirrorRing(std::shared_ptr<Stream> stream,
@@ -27,24 +36,26 @@ MirrorRing::MirrorRing(std::shared_ptr<Stream> stream,
       mapping_(std::move(mapping)),
       bell_(std::move(bell)),
       budget_(budget),
-      writer_(*mapping_, *bell_),
-      reader_(*mapping_),
-      next_(writer_.newest() < 0 ? kNoTid : writer_.newest() + 1) {}
+      slots_(*mapping_),
+      reader_(*mapping_) {
+  slots_.recover();
+  if (slots_.newest() >= 0) next_ = slots_.newest() + 1;
+}
 
 Result<void> MirrorRing::on_subscribed_untrusted(Tid first) {
   if (first < 0 || first > kLastTid) {
     return Error{Errc::protocol,
-                 "the subscription is said to begin with sample " + std::to_string(first)};
+                 fmt::format("the owner begins the subscription with sample {}", first)};
   }
-  // After a cut we know what comes next: what the owner no longer has of it is a gap.
+  // After a reconnect the next sample is known: what the owner no longer has of it is a gap.
   if (next_ < 0) next_ = first;
   return {};
 }
 
-// Behind a gap, the slot of sample `tid` may be one that readers still read, and the payload may
+// After a gap, the slot of sample `tid` may be one that readers still read, and the payload may
 // take long to arrive.
-bool MirrorRing::would_spoil_window(Tid tid) const noexcept {
-  const Tid newest = writer_.newest();
+bool MirrorRing::would_overwrite_window(Tid tid) const noexcept {
+  const Tid newest = slots_.newest();
   if (newest < 0) return false;
   const Tid depth = static_cast<Tid>(stream_->mapping().geometry().depth);
   const Tid same_slot = newest - (depth - (tid - newest) % depth) % depth;
@@ -54,18 +65,18 @@ bool MirrorRing::would_spoil_window(Tid tid) const noexcept {
 [[gnu::hot]] Result<std::byte*> MirrorRing::begin_untrusted(const wire::IncomingSample& sample) {
   const Tid tid = sample.info.tid;
   if (tid < next_ || tid > kLastTid) {
-    return Error{Errc::protocol, "sample " + std::to_string(tid) + " came where sample " +
-                                     std::to_string(next_) + " or a later one was due"};
+    return Error{Errc::protocol,
+                 fmt::format("sample {} came instead of sample {} or a later one", tid, next_)};
   }
   if (aside_) drop_aside();  // of one that was cut off
-  const bool behind_gap = tid != writer_.newest() + 1;
-  if (behind_gap && would_spoil_window(tid)) take_aside(sample.payload_bytes);
-  return aside_ ? aside_.get() : writer_.begin(tid);
+  const bool after_gap = tid != slots_.newest() + 1;
+  if (after_gap && would_overwrite_window(tid)) allocate_aside(sample.payload_bytes);
+  return aside_ ? aside_.get() : slots_.begin(tid);
 }
 
-// Without memory for it nothing is set aside: better a sample of the old window that cannot be read
-// for a while than none of the new ones.
-void MirrorRing::take_aside(std::size_t bytes) {
+// Without memory for it the sample goes to its slot: better one sample of the old window that
+// cannot be read for a while than none of the new ones.
+void MirrorRing::allocate_aside(std::size_t bytes) {
   Result<MemoryShare> share = budget_.take(bytes);
   if (!share) return;
   aside_.reset(new (std::nothrow) std::byte[bytes]);
@@ -80,36 +91,82 @@ void MirrorRing::drop_aside() noexcept {
 [[gnu::hot]] void MirrorRing::end(const wire::IncomingSample& sample, bool torn) {
   if (!torn) {
     const Tid tid = sample.info.tid;
-    if (aside_) std::memcpy(writer_.begin(tid), aside_.get(), sample.payload_bytes);
-    writer_.commit(sample.info.time, sample.info.clock_error);
+    if (aside_) std::memcpy(slots_.begin(tid), aside_.get(), sample.payload_bytes);
+    slots_.publish(tid, sample.info.time, sample.info.clock_error);
     gap_samples_ += static_cast<std::uint64_t>(tid - next_);
     next_ = tid + 1;
-    news_ = true;
+    wake_pending_ = true;
     ++received_samples_;
     received_bytes_ += sample.payload_bytes;
   }
-  // A torn one is missing from here on: what comes next counts it, by its own tid.
+  // A torn sample is missing: the next one counts it, by its own tid.
   if (aside_) drop_aside();
 }
 
 Result<void> MirrorRing::on_gap_untrusted(Tid first, std::uint64_t count) {
   if (first < 0 || first > kLastTid || count > static_cast<std::uint64_t>(kLastTid - first)) {
-    return Error{Errc::protocol, "a gap of " + std::to_string(count) + " samples at sample " +
-                                     std::to_string(first)};
+    return Error{
+        Errc::protocol,
+        fmt::format("the owner reports a gap of {} samples from sample {} on", count, first)};
   }
-  const Tid behind = first + static_cast<Tid>(count);
-  if (behind <= next_) {
-    return Error{Errc::protocol, "samples up to " + std::to_string(behind) +
-                                     " are said to be lost, and sample " +
-                                     std::to_string(next_ - 1) + " has come already"};
+  const Tid end = first + static_cast<Tid>(count);
+  if (end <= next_) {
+    return Error{Errc::protocol,
+                 fmt::format("the owner reports the samples before {} as lost, but sample {} has "
+                             "come already",
+                             end, next_ - 1)};
   }
-  gap_samples_ += static_cast<std::uint64_t>(behind - next_);
-  next_ = behind;
+  gap_samples_ += static_cast<std::uint64_t>(end - next_);
+  next_ = end;
   return {};
 }
 
 [[gnu::hot]] void MirrorRing::wake() noexcept {
-  if (std::exchange(news_, false)) writer_.wake();
+  if (std::exchange(wake_pending_, false)) bell_->notify();
+}
+
+// --- the clock
+
+void MirrorClock::on_owner(Report report, Tid newest) noexcept {
+  has_report_ = true;
+  const Report before = std::exchange(report_, std::move(report));
+  if (!is_known(report_)) {
+    // From the first sample that is not here yet. What was suspect before stays so, with all
+    // samples in between.
+    if (suspect_first_ > suspect_last_) suspect_first_ = newest + 1;
+    suspect_last_ = INT64_MAX;
+  } else if (is_suspect_now()) {
+    suspect_last_ = newest;
+  } else if (is_known(before) && before->standing.anchor != report_->standing.anchor) {
+    suspect_first_ = 0;
+    suspect_last_ = newest;
+  }
+}
+
+void MirrorClock::on_new_ring() noexcept {
+  suspect_first_ = 0;
+  if (!is_suspect_now()) suspect_last_ = kNoTid;
+}
+
+ring::ClockAssessment MirrorClock::assessment() const {
+  if (!assessor_) return {};
+  ring::ClockAssessment assessment = assessor_->assess_mirror(id_, report_.get());
+  assessment.suspect_first = suspect_first_;
+  assessment.suspect_last = suspect_last_;
+  return assessment;
+}
+
+Result<void> MirrorClock::check_opening() const {
+  if (!has_report_) return {};
+  const ring::ClockAssessment now = assessment();
+  if (now.policy != ClockPolicy::enforce || now.limit >= Duration::zero()) return {};
+  return assessor_->refusal(id_, report_.get());
+}
+
+std::string MirrorClock::reason() const {
+  const ring::ClockAssessment now = assessment();
+  if (now.policy == ClockPolicy::off || now.limit >= Duration::zero()) return {};
+  return assessor_->refusal(id_, report_.get()).message;
 }
 
 }  // namespace dssm::daemon

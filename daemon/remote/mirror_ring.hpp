@@ -1,29 +1,38 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The ring of a mirror while it is being filled: takes the owner's samples in, knows which one
-// comes next, and counts those that never come. Knows no connection and no clock.
+// The memory side of a mirror. MirrorRing is the ring while it is being filled: it takes the
+// owner's samples, knows which one comes next, and counts those that never come. MirrorClock knows
+// what the times of these samples are worth. Neither knows the connection.
 //
-// Promises to the ring's readers: the window has no holes, tids rise, what was received is visible
-// once it is complete, and what was not complete (torn, cut off) never is.
+// Promises to the ring's readers: the window has no holes, tids rise, a sample is visible once it
+// is complete, and one that was not complete (torn, cut off) never is.
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
 #include <dssm/result.hpp>
+#include <dssm/stream.hpp>
 #include <memory>
-#include <vector>
+#include <string>
 
-#include "core/ring/mirror_writer.hpp"
+#include "core/ring/bell.hpp"
+#include "core/ring/clock_assessment.hpp"
 #include "core/ring/ring_reader.hpp"
+#include "core/ring/slot_writer.hpp"
+#include "core/wire/clock_report.hpp"
 #include "core/wire/frame_decoder.hpp"
 #include "daemon/base/memory_budget.hpp"
+#include "daemon/fleet/clock_assessor.hpp"
 #include "daemon/streams/stream.hpp"
 
 namespace dssm::daemon {
 
+// The only writer of its ring, so it takes no lock, and a slot may stay half filled for as long as
+// the network takes.
 class MirrorRing {
  public:
-  // Goes on behind what `stream`, a mirror's ring, holds. The budget outlives it.
+  // Continues after what `stream`, a mirror's ring, holds, and repairs what a dssmd left that died
+  // while it filled the ring. The budget outlives it.
   static Result<std::unique_ptr<MirrorRing>> open(std::shared_ptr<Stream> stream,
                                                   MemoryBudget& budget);
   MirrorRing(const MirrorRing&) = delete;
@@ -31,27 +40,29 @@ class MirrorRing {
 
   const std::shared_ptr<Stream>& stream() const noexcept { return stream_; }
 
-  // The sample to ask the owner for; kNoTid: it never said where this ring begins, so the oldest.
+  // The sample to ask the owner for; kNoTid: the oldest, because it never sent where this ring
+  // begins.
   Tid next() const noexcept { return next_; }
 
   // The subscription begins with sample `first`.
   //   fails  protocol
   Result<void> on_subscribed_untrusted(Tid first);
-  // Where the payload of this sample goes, until end(), or a further begin().
+  // Where the payload of this sample goes, until end() or another begin_untrusted().
   //   fails  protocol: its tid does not rise
   Result<std::byte*> begin_untrusted(const wire::IncomingSample& sample);
+  // The payload is in place. After a gap, the samples before it leave the ring, as in the owner's.
   void end(const wire::IncomingSample& sample, bool torn);
   // The owner's ring no longer has these.
-  //   fails  protocol: they were here already
+  //   fails  protocol: they have arrived already
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
-  // What this PC's readers may make of the samples' times.
+  // How this PC's readers may use the samples' times.
   void set_clock(const ring::ClockAssessment& assessment) noexcept {
     mapping_->header().clock.store(assessment);
   }
-  // Wakes readers, when anything came since the last time.
+  // Wakes readers when a sample has come since the last call.
   void wake() noexcept;
 
-  Tid newest() const noexcept { return writer_.newest(); }
+  Tid newest() const noexcept { return slots_.newest(); }
   std::uint64_t gap_samples() const noexcept { return gap_samples_; }
   std::uint64_t received_samples() const noexcept { return received_samples_; }
   std::uint64_t received_bytes() const noexcept { return received_bytes_; }
@@ -59,21 +70,58 @@ class MirrorRing {
  private:
   MirrorRing(std::shared_ptr<Stream> stream, std::shared_ptr<const ring::RingMapping> mapping,
              std::shared_ptr<ring::Bell> bell, MemoryBudget& budget);
-  bool would_spoil_window(Tid tid) const noexcept;
-  void take_aside(std::size_t bytes);
+  bool would_overwrite_window(Tid tid) const noexcept;
+  void allocate_aside(std::size_t bytes);
   void drop_aside() noexcept;
 
   std::shared_ptr<Stream> stream_;
-  std::shared_ptr<const ring::RingMapping> mapping_;
+  std::shared_ptr<const ring::RingMapping> mapping_;  // read-write
   std::shared_ptr<ring::Bell> bell_;
   MemoryBudget& budget_;
-  ring::MirrorWriter writer_;
+  ring::SlotWriter slots_;
   ring::RingReader reader_;
-  Tid next_;
-  bool news_ = false;                   // that sleepers have not been woken for
+  Tid next_ = kNoTid;
+  bool wake_pending_ = false;           // sleeping readers are still to be woken
   std::unique_ptr<std::byte[]> aside_;  // the payload under way, when it must not go to its slot
   MemoryShare aside_share_;
   std::uint64_t gap_samples_ = 0, received_samples_ = 0, received_bytes_ = 0;
+};
+
+// What the times in one mirror are worth, from what its owner reported of its clock, and when. Knows
+// which samples are suspect: those that arrived while the owner's clock was not known, and those
+// stamped against another reference than the present one.
+class MirrorClock {
+ public:
+  using Report = std::shared_ptr<const wire::ClockReport>;
+
+  // assessor: nullptr: all times are good. Both outlive it.
+  MirrorClock(const ClockAssessor* assessor, const StreamId& id) noexcept
+      : assessor_(assessor), id_(id) {}
+
+  // The owner's latest report (nullptr: none), received when `newest` was the newest sample here.
+  void on_owner(Report report, Tid newest) noexcept;
+  // The mirror continues with another ring, whose samples all arrive from now on.
+  void on_new_ring() noexcept;
+
+  // Whether the owner has reported. Until then the assessment by the dssmd before this one stays,
+  // as long as it is valid: readers of a mirror do not notice that dssmd restarts.
+  bool has_report() const noexcept { return has_report_; }
+
+  ring::ClockAssessment assessment() const;
+  // Whether the stream may be opened; always, until the owner has reported.
+  //   fails  clock_out_of_bounds
+  Result<void> check_opening() const;
+  // Why its times are not good; empty: they are.
+  std::string reason() const;
+
+ private:
+  bool is_suspect_now() const noexcept { return suspect_last_ == INT64_MAX; }
+
+  const ClockAssessor* assessor_;
+  const StreamId& id_;
+  Report report_;
+  bool has_report_ = false;
+  Tid suspect_first_ = 0, suspect_last_ = kNoTid;
 };
 
 }  // namespace dssm::daemon

@@ -1,10 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/remote/outgoing_ring.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
-#include <string>
 #include <utility>
 
+#include "core/base/try.hpp"
 #include "daemon/link/sample_pump.hpp"
 
 namespace dssm::daemon {
@@ -12,19 +14,17 @@ namespace dssm::daemon {
 Result<std::unique_ptr<OutgoingRing>> OutgoingRing::make(const StreamInfo& theirs,
                                                          MemoryBudget& budget) {
   const std::uint64_t small = kMinRingBytes / std::max<std::uint64_t>(theirs.type.payload_bytes, 1);
-  Result<std::shared_ptr<Stream>> stream =
-      Stream::create({.id = theirs.id,
-                      .type = theirs.type,
-                      .depth = std::max(theirs.depth, std::min(kMinSlots, small)),
-                      .cycle = theirs.cycle,
-                      .purpose = Purpose::remote_writer},
-                     budget);
-  if (!stream) return std::move(stream).error();
-  Result<std::unique_ptr<OutgoingRing>> made = open(*std::move(stream));
-  if (!made) return made;
-  // Nobody has seen the ring yet. An order is needed all the same by those who come to see it: the
-  // descriptors pass through the kernel.
-  ring::RingHeader& header = (*made)->mapping_->header();
+  std::shared_ptr<Stream> stream =
+      DSSM_TRY(Stream::create({.id = theirs.id,
+                               .type = theirs.type,
+                               .depth = std::max(theirs.depth, std::min(kMinSlots, small)),
+                               .cycle = theirs.cycle,
+                               .purpose = Purpose::remote_writer},
+                              budget));
+  std::unique_ptr<OutgoingRing> made = DSSM_TRY(open(std::move(stream)));
+  // No program has the ring yet, and those that will get it receive its descriptors through the
+  // kernel, which orders these stores before their loads.
+  ring::RingHeader& header = made->mapping_->header();
   header.top.store(theirs.newest, std::memory_order_relaxed);
   header.run_start.store(theirs.newest + 1, std::memory_order_relaxed);
   header.first.store(theirs.newest + 1, std::memory_order_relaxed);
@@ -32,9 +32,8 @@ Result<std::unique_ptr<OutgoingRing>> OutgoingRing::make(const StreamInfo& their
 }
 
 Result<std::unique_ptr<OutgoingRing>> OutgoingRing::open(std::shared_ptr<Stream> stream) {
-  auto mapping = stream->map_for_writing();
-  if (!mapping) return std::move(mapping).error();
-  return std::unique_ptr<OutgoingRing>(new OutgoingRing(std::move(stream), *std::move(mapping)));
+  auto mapping = DSSM_TRY(stream->map_for_writing());
+  return std::unique_ptr<OutgoingRing>(new OutgoingRing(std::move(stream), std::move(mapping)));
 }
 
 Tid OutgoingRing::newest_untrusted() const noexcept {
@@ -46,13 +45,14 @@ Tid OutgoingRing::next_untrusted() const noexcept {
   return std::clamp<Tid>(next, 0, newest_untrusted() + 1);
 }
 
-Result<void> OutgoingRing::note_published_untrusted(Tid last) {
+Result<void> OutgoingRing::set_published_untrusted(Tid last) {
   const Tid next = next_untrusted(), newest = newest_untrusted();
   if (last < next) return {};
   if (last > newest) {
-    return Error{Errc::protocol, "it says that our sample " + std::to_string(last) +
-                                     " is written, and ours to be published are " +
-                                     std::to_string(next) + " to " + std::to_string(newest)};
+    return Error{Errc::protocol,
+                 fmt::format("the owner reports sample {} as published, but the samples to publish "
+                             "are {} to {}",
+                             last, next, newest)};
   }
   mapping_->header().first.store(last + 1, std::memory_order_relaxed);
   return {};

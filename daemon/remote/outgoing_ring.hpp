@@ -1,13 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The local ring of a remote writer. Programs write to it as to any ring; dssmd publishes what they
-// wrote into the owner's stream. Nobody reads it, so dssmd uses the header's `first` for the sample
-// that is to be published next: the ring alone, offered back after a crash of dssmd, says where to
-// go on and, by its incarnation, as which publisher.
+// The local ring of a remote writer. Programs write to it as to any ring; dssmd publishes their
+// samples into the owner's stream. It has no readers, so dssmd keeps the tid of the sample to
+// publish next in the header's `first`. So the ring alone, offered back after a crash of dssmd,
+// holds where to continue and, by its incarnation, the publisher's number.
 //
-// The ring begins where the owner's stream is at that moment. So the tid that write() returns is
-// the one that the sample gets in the owner's ring, as long as nobody else writes to that stream
-// and nothing is lost.
+// The ring begins where the owner's stream is when it is made. So the tid that write() returns is
+// the one that the sample gets in the owner's ring, as long as no other program writes to that
+// stream and nothing is lost.
 #pragma once
 
 #include <cstdint>
@@ -25,13 +25,13 @@ namespace dssm::daemon {
 class OutgoingRing {
  public:
   // At least this many slots, whatever the owner's ring has, unless they take more than
-  // kMinRingBytes: a writer that is faster than the network for a moment shall lose nothing.
+  // kMinRingBytes: a writer that is faster than the network for a moment loses nothing.
   static constexpr std::uint64_t kMinSlots = 256;
   static constexpr std::uint64_t kMinRingBytes = 4U << 20;
 
   // A new one for `theirs`, as the owner described it.
   static Result<std::unique_ptr<OutgoingRing>> make(const StreamInfo& theirs, MemoryBudget& budget);
-  // Goes on with one that a program kept.
+  // One that a program held.
   static Result<std::unique_ptr<OutgoingRing>> open(std::shared_ptr<Stream> stream);
   OutgoingRing(const OutgoingRing&) = delete;
   OutgoingRing& operator=(const OutgoingRing&) = delete;
@@ -40,16 +40,16 @@ class OutgoingRing {
   const ring::RingMapping& mapping() const noexcept { return *mapping_; }
   std::uint64_t publisher() const noexcept { return stream_->incarnation(); }
 
-  // The sample to publish next. Programs can write nonsense there; it is at least 0 and at most
-  // behind the newest one.
+  // The sample to publish next: at least 0 and at most the one after the newest, whatever programs
+  // have written into the header.
   Tid next_untrusted() const noexcept;
   Tid newest_untrusted() const noexcept;
   bool all_published() const noexcept { return next_untrusted() > newest_untrusted(); }
 
-  // Samples up to `last` are in the owner's ring, or lost. An owner may know of less than we do:
-  // its ring is another one by now, or 64 others published into it since.
-  //   fails  protocol: that was not sent
-  Result<void> note_published_untrusted(Tid last);
+  // Samples up to `last` are in the owner's ring, or lost. An owner may have stored less than is
+  // known here: it has another ring now, or 64 other publishers have published into it since.
+  //   fails  protocol: that sample was not sent
+  Result<void> set_published_untrusted(Tid last);
 
  private:
   OutgoingRing(std::shared_ptr<Stream> stream, std::shared_ptr<const ring::RingMapping> mapping)

@@ -1,145 +1,117 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Publishes what programs of this PC write into one stream of another host: one local ring, however
-// many programs write to it, and one channel to the owner.
+// Publishes what programs of this PC write into one stream of another host: one local ring, for any
+// number of programs that write to it, and one channel to the owner.
 //
-//   ring     programs write to it without waiting for anybody; what the link does not carry at the
-//            moment stays there, and what it no longer holds when its turn comes is counted and
-//            told in the log
-//   once     samples are numbered by their local tids, and the owner notes in its ring how far we
-//            are by it, so that it can say, after a cut, where to go on
-//   end      when the programs have closed it and everything is published, at most kDrainTimeout
-//            later
-//   removed  a stream that somebody removes at its owner stays removed until somebody creates it
-//            again; then it gets what the ring still holds. But an owner that comes back without
-//            its ring gets the stream created again
+//   ring     programs write to it and never wait. Samples that the network does not carry at once
+//            stay in it; those that it no longer holds when their turn comes are counted and logged
+//   once     samples are numbered by their local tids, and the owner stores in its ring which of
+//            them it has, so that it can report, after a reconnect, where to continue
+//   end      when the programs have closed it and all samples are published, at most kDrainTimeout
+//            after the last one closed it
+//   removed  a stream that is removed at its owner stays removed until a program creates it again;
+//            then it gets what the ring still holds. But when an owner comes back without its ring,
+//            the remote writer creates the stream again
+//
+// The states, and what leads from one to the next; "ring" where there may be one already:
+//
+//             on_up            Opened            Publishing
+//   unavailable ----> opening -------> starting -----------> publishing
+//       (ring)        (ring) ^
+//             on_up          | Opened
+//   removed ----> reopening -+
+//     (ring)       (ring)
+//
+//   the connection ends      removed, reopening -> removed; any other state -> unavailable
+//   Failure                  answers the first open() that waits; the next one is asked for in the
+//                            same state. Without one: removed if there is no such stream and no
+//                            program created it, else unavailable; reopened 2 s later
+//   Ended                    any state -> removed; reopened 2 s later, or when the catalog has it
+//
+// `opening` asks for Create if a program created the stream, `reopening` only if one that waits
+// does. A program gets the ring at once if there is one, except in removed and reopening.
 #pragma once
 
 #include <cstdint>
 #include <dssm/result.hpp>
+#include <functional>
 #include <memory>
 #include <optional>
-#include <string>
-#include <vector>
 
-#include "daemon/base/rate_limiter.hpp"
 #include "daemon/link/sample_pump.hpp"
 #include "daemon/link/sample_sender.hpp"
 #include "daemon/link/stream_feed.hpp"
-#include "daemon/remote/lender.hpp"
 #include "daemon/remote/outgoing_ring.hpp"
-#include "daemon/remote/owner_connection.hpp"
-#include "daemon/remote/remote_writer_keeper.hpp"
+#include "daemon/remote/remote_stream.hpp"
 
 namespace dssm::daemon {
 
-class RemoteWriter final : private OwnerConnection::Observer,
+class RemoteWriter final : public RemoteStream,
                            private StreamFeed::Observer,
                            private SamplePump::Observer {
  public:
-  // How long a program that opens it waits for the owner to answer.
-  static constexpr Duration kOwnerTimeout = std::chrono::seconds(2);
   static constexpr Duration kDrainTimeout = std::chrono::seconds(10);
+  static constexpr bool kSeveralRings = true;
 
-  class Keeper {
-   public:
-    // A remote writer is done(). Destroy it later, not here.
-    virtual void on_remote_writer_done() = 0;
-
-   protected:
-    ~Keeper() = default;
-  };
-  using Then = RemoteWriterKeeper::Then;
-
-  // id: with its owner's host. parts and keeper outlive it.
-  RemoteWriter(const ChannelParts& parts, Keeper& keeper, StreamId id, RingQuota room);
-  RemoteWriter(const RemoteWriter&) = delete;
-  RemoteWriter& operator=(const RemoteWriter&) = delete;
-  ~RemoteWriter() { stop_publishing(); }  // before its link goes
-
-  // --- for ChannelTable
-  const StreamId& id() const noexcept { return id_; }
-  OwnerConnection& channel() noexcept { return channel_; }
-  void on_stream_there();
-  bool has_use() const noexcept { return ring_ || !waiting_.empty(); }
-  bool done() const noexcept { return done_; }
-
-  // --- for programs
-
-  // Borrows the ring, as RemoteWriterKeeper::open(). After channel().connect().
-  void open(const CreatePlan* plan, Then then);
-  // Takes a ring that a program held while dssmd was away. Another offer of the same ring gives the
-  // same stream; with another ring it fails with conflict, and `files` stay as they are.
-  Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles&& files);
+  RemoteWriter(const ChannelParts& parts, StreamId id, RingQuota quota,
+               std::function<void()> on_done);
+  ~RemoteWriter() override { stop_publishing(); }
 
  private:
-  enum class Step { none, opening, starting, publishing };  // of the connection
-  struct Waiting {
-    Then then;
-    std::optional<CreatePlan> plan;
-    MonoTime deadline;
+  enum class State : std::uint8_t {
+    removed,
+    reopening,
+    unavailable,
+    opening,
+    starting,
+    publishing,
   };
 
   // OwnerConnection::Observer
-  void on_up(FrameConnection& link, const wire::Greeting& them) override;
+  void on_up(FrameConnection& connection, const wire::Greeting& them) override;
   Result<void> on_frame(net::Frame& frame) override;
   void on_output_empty() override { publish(); }
   void on_down(const Error& why) override;
   void on_reopen() override;
   // StreamFeed::Observer, SamplePump::Observer
-  void on_news() override { publish(); }
-  void on_gap(Tid first, std::uint64_t count) override;
+  void on_sample_available() override { publish(); }
+  void on_gap(Tid, std::uint64_t count) override { log_gap(count); }
+  // RemoteStream
+  std::shared_ptr<Stream> stream() const noexcept override;
+  bool is_removed() const noexcept override { return state_ <= State::reopening; }
+  Result<void> check_open(const CreatePlan* plan) override;
+  Result<void> use_offered(std::shared_ptr<Stream> stream) override;
+  void on_unused() override { drain_timer_.enable_in(Duration::zero()); }
 
-  void ask();
+  // Protocol steps
+  bool is_opening() const noexcept {
+    return state_ == State::opening || state_ == State::reopening;
+  }
+  void send_open();
   Result<void> on_opened_untrusted(const proto::Opened& opened);
-  Result<void> follow(const StreamInfo& theirs);
-  Result<void> take_ring(std::unique_ptr<OutgoingRing> ring);
   Result<void> on_publishing_untrusted(const net::Publishing& publishing);
-  Result<void> on_published_untrusted(const net::Published& published);
-  Result<void> note_published_untrusted(Tid last);
+  Result<void> on_published_untrusted(Tid last);
+  void on_failure(const Error& why);
+  void on_refused(const Error& why);
+
+  // The ring
+  Result<void> follow(const StreamInfo& theirs);
+  Result<void> use_ring(std::unique_ptr<OutgoingRing> ring);
   void start_publishing();
   void publish();
   void stop_publishing() noexcept;
-  void on_refused(const Error& why);
-
-  OpenedRing lend(bool created);
-  Result<void> check_plan(const CreatePlan* plan);
-  void answer_waiting(bool created);
-  void fail_waiting(const Error& why);
-  void arm_wait_timer();
-  void on_wait_timer();
   void on_drain_timer();
-  void end();
-  void log_error(const Error& why);
-  LogFields log_fields() const;
+  void log_stopped();
 
-  const ChannelParts& parts_;
-  Keeper& keeper_;
-  const StreamId id_;
-  const RingQuota room_;
-  const std::string name_;  // for messages
-
-  Step step_ = Step::none;
-  bool creates_ = false;  // a program wants the stream to be there
-  bool removed_ = false;  // by somebody, and not created again
+  State state_ = State::unavailable;
+  bool creates_ = false;  // a program has created the stream, not only opened it
   History history_;       // of the owner's ring
-  std::optional<Error> trouble_;
-  bool told_ = false;  // the log knows of it
-  std::uint64_t lost_samples_ = 0;
-  RateLimiter loss_lines_{1, std::chrono::seconds(10)};
-
   std::unique_ptr<OutgoingRing> ring_;
   std::shared_ptr<StreamFeed> feed_;
   bool may_tear_ = false;  // the owner has the feature "torn"
   std::optional<SampleSender> sender_;
   std::optional<SamplePump> pump_;
-
-  bool done_ = false;
-  Lender lender_;
-  std::vector<Waiting> waiting_;
-  MonoTime drain_ends_{};
-  EventSource wait_timer_, drain_timer_, turn_timer_;
-  OwnerConnection channel_;  // last: ends first
+  EventSource drain_timer_, turn_timer_;
 };
 
 }  // namespace dssm::daemon

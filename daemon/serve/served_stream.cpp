@@ -46,7 +46,7 @@ Result<void> ServedStream::assess(const ring::ClockAssessment& assessment) {
 }
 
 void ServedStream::check() {
-  if (const std::shared_ptr<StreamFeed> feed = feed_.lock()) feed->look();
+  if (const std::shared_ptr<StreamFeed> feed = feed_.lock()) feed->poll();
 }
 
 std::shared_ptr<ServedStream> ServedStreams::get(std::shared_ptr<Stream> stream) {

@@ -141,7 +141,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   const MonoTime now = pump_->thins() ? parts_.loop.now() : MonoTime{};
   feed_->forget(*this);
   Result<PumpWait> wait = pump_->pump(now, request_waits);
-  for (int looks = 0; wait && *wait == PumpWait::news; ++looks) {
+  for (int looks = 0; wait && *wait == PumpWait::sample; ++looks) {
     if (feed_->wait(*this, pump_->known())) return {};
     // One came between the look and the arming of the doorbell.
     wait = looks < kMaxLooks ? pump_->pump(now) : Result(PumpWait::turn);
@@ -149,7 +149,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   if (!wait)
     return std::move(wait).error().context("send samples of '" + stream().id().str() + "'");
   switch (*wait) {
-    case PumpWait::news:
+    case PumpWait::sample:
       break;
     case PumpWait::time:
       due_.enable_in(pump_->due() - now);
@@ -157,16 +157,16 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
     case PumpWait::turn:
       parts_.observer.work_soon();
       break;
-    case PumpWait::nothing:
+    case PumpWait::ended:
       pump_.reset();
       break;
-    case PumpWait::room:
+    case PumpWait::output:
       break;
   }
   return {};
 }
 
-[[gnu::hot]] void StreamChannel::on_news() { parts_.observer.work_now(); }
+[[gnu::hot]] void StreamChannel::on_sample_available() { parts_.observer.work_now(); }
 
 // The clock may have been set before these samples were written: the client has to know before it
 // gets them.
@@ -240,7 +240,7 @@ void StreamChannel::go_on_reading() {
       reading_.reset();
       return;
     case SendStatus::torn:  // void, and so no answer: another one follows
-    case SendStatus::gone:
+    case SendStatus::not_in_ring:
       sender_.end_run();
       if (++reading_->attempts == kMaxReadAttempts) return answer_no_sample(ReadStatus::lapped);
       return parts_.observer.work_soon();
@@ -267,7 +267,7 @@ SendStatus StreamChannel::begin_reading() {
   }
   const SendStatus status = sender_.send(tid, reading_->serial, false);
   // A tid that was found and is gone when it is looked at does not come back.
-  if (status == SendStatus::gone && reading_->request.which_case() == net::Read::kTid) {
+  if (status == SendStatus::not_in_ring && reading_->request.which_case() == net::Read::kTid) {
     answer_no_sample(ReadStatus::too_old);
   }
   return status;

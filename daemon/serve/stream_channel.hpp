@@ -99,7 +99,7 @@ class StreamChannel final : private SamplePump::Observer,
   void on_gap(Tid first, std::uint64_t count) override;
   void on_caught_up() override;
   void on_end() override;
-  void on_news() override;
+  void on_sample_available() override;
 
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;

@@ -103,7 +103,7 @@ class DialerTest : public testing::Test, protected Dialer::Observer {
   }
 
   void on_up(FrameConnection& link, const wire::Greeting& greeting) override {
-    EXPECT_EQ(&link, dialer->link());
+    EXPECT_EQ(&link, dialer->connection());
     EXPECT_FALSE(up);
     up = true;
     them = greeting;
@@ -113,7 +113,7 @@ class DialerTest : public testing::Test, protected Dialer::Observer {
     return {};
   }
   void on_down(const Error& why) override {
-    EXPECT_EQ(dialer->link(), nullptr);
+    EXPECT_EQ(dialer->connection(), nullptr);
     up = false;
     downs.push_back(why);
   }
@@ -122,7 +122,7 @@ class DialerTest : public testing::Test, protected Dialer::Observer {
 TEST_F(DialerTest, GreetsAndHandsOverTheLink) {
   FakeOwner owner(loop);
   dial(owner.host().address);
-  EXPECT_EQ(dialer->link(), nullptr);
+  EXPECT_EQ(dialer->connection(), nullptr);
   EXPECT_EQ(dialer->address(), owner.host().address.str());
   wait([this] { return up; });
   EXPECT_EQ(them->host, "pc2");
@@ -131,7 +131,7 @@ TEST_F(DialerTest, GreetsAndHandsOverTheLink) {
   net::Frame ping;
   ping.set_serial(5);
   ping.mutable_ping();
-  dialer->link()->send(ping);
+  dialer->connection()->send(ping);
   EXPECT_EQ(owner.take().serial(), 5u);
   net::Frame pong;
   pong.set_serial(5);

@@ -15,7 +15,7 @@ namespace {
 
 constexpr std::size_t kSmall = 40;
 constexpr std::size_t kMiddle = SampleSender::kInPlaceBytes;
-constexpr std::size_t kLarge = SampleSender::kMostCopiedBytes + 1;
+constexpr std::size_t kLarge = SampleSender::kMaxCopiedBytes + 1;
 constexpr MonoTime kStart{std::chrono::seconds(1000)};
 
 Time time_of(Tid tid) { return time_from_ns(1'000'000 + tid * 1000); }
@@ -46,12 +46,12 @@ class PumpRig final : private FrameConnection::Observer, private SamplePump::Obs
   PumpWait run(MonoTime now = kStart) {
     const Result<PumpWait> wait = pump->pump(now);
     EXPECT_TRUE(wait) << wait.error().message;
-    return wait ? *wait : PumpWait::nothing;
+    return wait ? *wait : PumpWait::ended;
   }
   // With as many turns of the loop as it takes. The rest of what is queued goes out, too.
   PumpWait run_on(MonoTime now = kStart) {
     PumpWait wait = run(now);
-    for (int i = 0; i < 100'000 && (wait == PumpWait::room || wait == PumpWait::turn); ++i) {
+    for (int i = 0; i < 100'000 && (wait == PumpWait::output || wait == PumpWait::turn); ++i) {
       run_turns(loop);
       wait = run(now);
     }
@@ -136,13 +136,13 @@ TEST_P(SamplePumpOfEachKind, SendsAllThatIsThereAndWaitsForNews) {
   PumpRig rig(GetParam(), 16);
   rig.write(10);
   rig.start({0, 9, 0});
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   EXPECT_EQ(rig.pump->known(), 9);
   EXPECT_EQ(rig.accepted(), tids(0, 9));
   EXPECT_EQ(rig.caught_up, 1);
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   rig.write(2);
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   EXPECT_EQ(rig.accepted(), tids(0, 11));
   EXPECT_EQ(rig.caught_up, 1);
   EXPECT_EQ(rig.pump->lost(), 0u);
@@ -151,10 +151,10 @@ TEST_P(SamplePumpOfEachKind, SendsAllThatIsThereAndWaitsForNews) {
 TEST_P(SamplePumpOfEachKind, HasCaughtUpWithAnEmptyStreamAtOnce) {
   PumpRig rig(GetParam(), 16);
   rig.start({0, kNoTid, 0});
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   EXPECT_EQ(rig.caught_up, 1);
   rig.write();
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   EXPECT_EQ(rig.accepted(), tids(0, 0));
 }
 
@@ -162,12 +162,12 @@ TEST_P(SamplePumpOfEachKind, TellsExactlyWhatTheRingNoLongerHolds) {
   PumpRig rig(GetParam(), 8);
   rig.write(30);  // 23 to 29 are held
   rig.start({5, 29, 0});
-  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.accepted(), tids(23, 29));
   EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{5, 18}}));
   EXPECT_EQ(rig.pump->lost(), 18u);
   rig.write(20);
-  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.gaps.size(), 1u);
   EXPECT_EQ(rig.accepted().back(), 49);
   EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{5, 18}, {30, 13}}));
@@ -178,12 +178,12 @@ TEST_P(SamplePumpOfEachKind, WaitsForASampleOfTheFuture) {
   PumpRig rig(GetParam(), 16);
   rig.write(3);
   rig.start({5, 2, 0});
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   rig.write(2);
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   EXPECT_TRUE(rig.accepted().empty());
   rig.write(2);
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   EXPECT_EQ(rig.accepted(), tids(5, 6));
 }
 
@@ -192,7 +192,7 @@ TEST_P(SamplePumpOfEachKind, EndsAfterTheLastOneWhereverThatIs) {
   rig.write(10);
   rig.start({5, 9, 0});
   rig.pump->end_at(8);
-  EXPECT_EQ(rig.run_on(), PumpWait::nothing);
+  EXPECT_EQ(rig.run_on(), PumpWait::ended);
   EXPECT_EQ(rig.accepted(), tids(5, 8));
   EXPECT_EQ(rig.ends, 1);
 
@@ -201,7 +201,7 @@ TEST_P(SamplePumpOfEachKind, EndsAfterTheLastOneWhereverThatIs) {
   lapped.start({5, 9, 0});
   lapped.pump->end_at(6);
   lapped.write(20);
-  EXPECT_EQ(lapped.run_on(), PumpWait::nothing);
+  EXPECT_EQ(lapped.run_on(), PumpWait::ended);
   EXPECT_TRUE(lapped.accepted().empty());
   EXPECT_EQ(lapped.gaps, (std::map<Tid, Tid>{{5, 2}})) << "not beyond the last one";
 }
@@ -215,7 +215,7 @@ TEST_P(SamplePumpOfEachKind, DoesALimitedAmountInOneTurn) {
   const std::size_t first_turn = rig.accepted().size();
   EXPECT_LE(first_turn, static_cast<std::size_t>(SamplePump::kSamplesPerTurn));
   EXPECT_LE(first_turn * GetParam(), SamplePump::kBytesPerTurn + kLarge);
-  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.accepted(), tids(0, count - 1));
 }
 
@@ -225,9 +225,9 @@ TEST_P(SamplePumpOfEachKind, TakesNonsenseInTheRingForNothing) {
   rig.write(3);
   rig.start({0, 2, 0});
   rig.ring.mapping->header().top.store(INT64_MAX);
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   rig.ring.mapping->header().top.store(-5);
-  EXPECT_EQ(rig.run(), PumpWait::news);
+  EXPECT_EQ(rig.run(), PumpWait::sample);
   rig.ring.mapping->header().top.store(kLastTid);
   rig.run();  // whatever it says: no fault, and an end
   rig.ring.mapping->header().first.store(INT64_MAX);
@@ -258,7 +258,7 @@ TEST_P(SamplePumpOfEachKind, SendsWholeSamplesWhereverTheSocketStops) {
         rig.peer.room = room;
         rig.run();
         rig.peer.room = FakePeer::kAll;
-        EXPECT_EQ(rig.run_on(), PumpWait::news);
+        EXPECT_EQ(rig.run_on(), PumpWait::sample);
         ASSERT_EQ(rig.accepted(), tids(0, 2)) << "room for " << room << " of " << total;
         EXPECT_EQ(rig.torn_seen(), 0u);
         EXPECT_EQ(rig.budget.used(), 0u);
@@ -279,7 +279,7 @@ TEST_P(SamplePumpOfEachKind, SendsAllWhenTheSocketTakesLittleAtATime) {
     rig.peer.room = 0;
     rig.peer.most_at_once = 1 + random() % (GetParam() * 2);
     PumpWait wait = rig.run();
-    while (wait != PumpWait::news) {
+    while (wait != PumpWait::sample) {
       rig.peer.room = random() % 3 == 0 ? 0 : random() % (GetParam() * 3);
       run_turns(rig.loop);
       wait = rig.run();
@@ -313,7 +313,7 @@ TEST_P(SamplePumpOfEachKind, LosesNothingWithoutSayingSoWhenItIsLapped) {
     }
     rig.peer.after_send = nullptr;
     rig.peer.room = FakePeer::kAll;
-    EXPECT_EQ(rig.run_on(), PumpWait::news);
+    EXPECT_EQ(rig.run_on(), PumpWait::sample);
     const std::vector<Tid> got = rig.accepted();  // checks bytes, order and gaps
     ASSERT_FALSE(got.empty());
     EXPECT_EQ(got.back(), rig.ring.reader().newest());
@@ -341,7 +341,7 @@ TEST(SamplePump, MarksALargeSampleThatIsOverwrittenWhileItIsSent) {
   rig.write(1);
   rig.start({0, 0, 0});
   overwrite_in(rig);
-  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.torn_seen(), 1u);
   EXPECT_EQ(rig.accepted(), tids(6, 8));
   EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{0, 6}})) << "the void sample counts as lost";
@@ -352,11 +352,11 @@ TEST(SamplePump, KeepsWhatItCopiedAsideWhenTheSlotIsOverwrittenLater) {
   rig.write(1);
   rig.start({0, 0, 0});
   rig.peer.room = 100;  // header and some of the payload: the rest is copied at once
-  EXPECT_EQ(rig.run(), PumpWait::room);
+  EXPECT_EQ(rig.run(), PumpWait::output);
   EXPECT_GT(rig.budget.used(), kLarge - 100);
   rig.write(8);
   rig.peer.room = FakePeer::kAll;
-  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.torn_seen(), 0u);
   EXPECT_EQ(rig.accepted().front(), 0);
   EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{1, 5}}));
@@ -367,12 +367,12 @@ TEST(SamplePump, RisksTheSlotWhenThePeersMemoryIsUsedUp) {
   rig.write(1);
   rig.start({0, 0, 0});
   rig.peer.room = 100;
-  EXPECT_EQ(rig.run(), PumpWait::room);
+  EXPECT_EQ(rig.run(), PumpWait::output);
   EXPECT_TRUE(rig.sender.busy());
   EXPECT_EQ(rig.budget.used(), 0u);
   rig.write(8);
   rig.peer.room = FakePeer::kAll;
-  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.torn_seen(), 1u);
   EXPECT_EQ(rig.accepted(), tids(6, 8));
 }
@@ -382,7 +382,7 @@ TEST(SamplePump, NeverSendsAVoidSampleToAPeerThatDoesNotKnowThem) {
   rig.write(1);
   rig.start({0, 0, 0});
   overwrite_in(rig);
-  EXPECT_EQ(rig.run_on(), PumpWait::news);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.torn_seen(), 0u);
   EXPECT_EQ(rig.accepted().back(), 8);
 }
@@ -408,7 +408,7 @@ TEST(SamplePump, CutsALongSampleIntoTurns) {
     if (may_tear) {
       EXPECT_EQ(rig.peer.sends, SamplePump::kBytesPerTurn / SampleSender::kSliceBytes);
     }
-    EXPECT_EQ(rig.run_on(), PumpWait::news);
+    EXPECT_EQ(rig.run_on(), PumpWait::sample);
     EXPECT_EQ(rig.accepted(), tids(0, 1));
   }
 }
@@ -423,7 +423,7 @@ TEST(SamplePump, LooksAgainAfterALongSampleIsCopiedAside) {
     EXPECT_EQ(rig.run(), PumpWait::turn) << "a part is copied";
     rig.write(8);
     rig.peer.room = FakePeer::kAll;
-    EXPECT_EQ(rig.run_on(), PumpWait::news);
+    EXPECT_EQ(rig.run_on(), PumpWait::sample);
     EXPECT_EQ(rig.torn_seen(), may_tear ? 1u : 0u);
     EXPECT_EQ(rig.accepted(), tids(6, 8));
     EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{0, 6}}));
@@ -450,7 +450,7 @@ TEST(SamplePump, CopiesOneThatIsNotLargeAndComesAlone) {
   rig.start({0, kNoTid, 0});
   for (int i = 0; i < 3; ++i) {
     rig.write();
-    EXPECT_EQ(rig.run(), PumpWait::news);
+    EXPECT_EQ(rig.run(), PumpWait::sample);
   }
   EXPECT_EQ(rig.sender.counters().copied_payload_bytes, 3 * kMiddle);
   EXPECT_EQ(rig.peer.sends, 3u) << "one send each";
@@ -466,7 +466,7 @@ TEST(SamplePump, StopsAfterTheSampleUnderWayWhenSomebodyElseWantsToSend) {
   rig.write(3);
   rig.start({0, 2, 0});
   rig.peer.room = 500;
-  EXPECT_EQ(rig.run(), PumpWait::room);
+  EXPECT_EQ(rig.run(), PumpWait::output);
   EXPECT_TRUE(rig.sender.busy());
   rig.peer.room = FakePeer::kAll;
   const Result<PumpWait> wait = rig.pump->pump(kStart, true);
@@ -483,7 +483,7 @@ TEST(SamplePump, SendsTheNewestAtEachTimeWhenItThins) {
   rig.thinned = true;
   rig.write(10);
   rig.start({0, 9, 100});
-  EXPECT_EQ(rig.run(kStart), PumpWait::news);
+  EXPECT_EQ(rig.run(kStart), PumpWait::sample);
   EXPECT_EQ(rig.accepted(), tids(9, 9));
   EXPECT_EQ(rig.caught_up, 1);
   const auto at = [](int ms) { return kStart + std::chrono::milliseconds(ms); };
@@ -513,7 +513,7 @@ TEST(SamplePump, SendsEachSampleOfAStreamThatIsSlowerThanTheHighestRate) {
   rig.start({0, kNoTid, 100});
   for (int ms = 0; ms < 500; ms += 50) {
     rig.write();
-    EXPECT_EQ(rig.run(kStart + std::chrono::milliseconds(ms)), PumpWait::news);
+    EXPECT_EQ(rig.run(kStart + std::chrono::milliseconds(ms)), PumpWait::sample);
   }
   EXPECT_EQ(rig.accepted(), tids(0, 9));
 }
@@ -524,7 +524,7 @@ TEST(SamplePump, TellsNoGapWhenAThinnedStreamLapsIt) {
   rig.write(20);
   rig.start({0, 19, 1});
   overwrite_in(rig);
-  EXPECT_EQ(rig.run_on(kStart), PumpWait::news);
+  EXPECT_EQ(rig.run_on(kStart), PumpWait::sample);
   EXPECT_EQ(rig.torn_seen(), 1u);
   EXPECT_EQ(rig.accepted().back(), 27);
   EXPECT_TRUE(rig.gaps.empty());

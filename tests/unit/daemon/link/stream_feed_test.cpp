@@ -41,7 +41,7 @@ class StreamFeedTest : public testing::Test, protected StreamFeed::Observer {
 
   Program writer() { return Program(as_offer(stream->descriptors_for(Role::writer).value())); }
 
-  void on_news() override {
+  void on_sample_available() override {
     ++news;
     if (on_notified) on_notified();
   }
@@ -139,7 +139,7 @@ TEST_F(StreamFeedTest, HearsEveryDoorbellOfItsStream) {
 
 TEST_F(StreamFeedTest, ForgetsWhoAsksForItAlsoWhileItTells) {
   struct Other final : StreamFeed::Observer {
-    void on_news() override { ++told; }
+    void on_sample_available() override { ++told; }
     int told = 0;
   } other;
   Program program = writer();
@@ -158,14 +158,14 @@ TEST_F(StreamFeedTest, ForgetsWhoAsksForItAlsoWhileItTells) {
 TEST_F(StreamFeedTest, LooksByItselfWhenAskedTo) {
   Program program = writer();
   ASSERT_TRUE(feed->wait(*this, kNoTid));
-  feed->look();
+  feed->poll();
   EXPECT_EQ(news, 0);
   // A writer that was killed before it could ring.
   UniqueFd doorbell = std::move(program.files.doorbell);
   program.write();
   run_turns(loop, 3);
   EXPECT_EQ(news, 0);
-  feed->look();
+  feed->poll();
   EXPECT_EQ(news, 1);
 }
 

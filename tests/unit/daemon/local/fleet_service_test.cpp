@@ -6,8 +6,6 @@
 
 #include <gtest/gtest.h>
 
-#include "daemon/remote/mirrors.hpp"
-#include "daemon/remote/remote_writers.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 #include "tests/unit/daemon/fleet/fake_peer.hpp"
 
@@ -23,8 +21,8 @@ class FleetServiceTest : public testing::Test {
   const wire::Greeting self = greeting_of("pc1");
   const ChannelParts parts{loop, resolver, registry, log, self};
   Catalog catalog{"pc1"};
-  Mirrors mirrors{parts, catalog, Duration::zero()};
-  RemoteWriters writers{parts, catalog};
+  RemoteStreams<Mirror> mirrors{parts, catalog};
+  RemoteStreams<RemoteWriter> writers{parts, catalog};
   FakePeer peer{loop, "pc1"};
   Peers peers{loop, resolver, {peer.owner.host().address}, self, catalog, log};
   FleetService fleet{loop,   {self, {"10.0.0.1:13776"}, true}, registry, catalog, peers, mirrors,

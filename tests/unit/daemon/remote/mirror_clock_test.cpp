@@ -1,8 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "daemon/remote/mirror_clock.hpp"
-
 #include <gtest/gtest.h>
 
+#include "daemon/remote/mirror_ring.hpp"
 #include "tests/unit/daemon/remote/fake_clock_assessor.hpp"
 
 namespace dssm::daemon {

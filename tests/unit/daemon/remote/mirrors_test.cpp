@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Mirrors against an owner that does what the test says.
-#include "daemon/remote/mirrors.hpp"
-
 #include <gtest/gtest.h>
 
+#include "daemon/remote/mirror.hpp"
+#include "daemon/remote/remote_streams.hpp"
 #include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 #include "tests/unit/daemon/remote/fake_owner.hpp"
@@ -16,7 +16,7 @@ using namespace std::chrono_literals;
 
 const StreamId kId{"odometry", 0, "pc2"};
 
-class MirrorsTest : public testing::Test, protected MirrorKeeper::Observer {
+class MirrorsTest : public testing::Test {
  protected:
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Resolver resolver{loop};
@@ -24,13 +24,14 @@ class MirrorsTest : public testing::Test, protected MirrorKeeper::Observer {
   LogRecorder logger;
   Catalog catalog{"pc1"};
   ChannelParts parts{loop, resolver, registry, logger, greeting_of("pc1")};
-  std::unique_ptr<Mirrors> mirrors = std::make_unique<Mirrors>(parts, catalog, 0ms);
+  std::unique_ptr<RemoteStreams<Mirror>> mirrors =
+      std::make_unique<RemoteStreams<Mirror>>(parts, catalog);
   std::unique_ptr<FakeOwner> owner = std::make_unique<FakeOwner>(loop);
   StreamInfo theirs;
   std::vector<const Stream*> replaced;
 
   MirrorsTest() {
-    mirrors->observe(this);
+    parts.on_ring_replaced = [this](const Stream& old) { replaced.push_back(&old); };
     theirs.id = kId;
     theirs.type = odometry_type();
     theirs.depth = 16;
@@ -38,15 +39,18 @@ class MirrorsTest : public testing::Test, protected MirrorKeeper::Observer {
     theirs.incarnation = 7;
     catalog.host_up(owner->host().greeting, owner->host().address);
   }
-  void on_ring_replaced(const Stream& stream) override { replaced.push_back(&stream); }
 
   using Answer = std::optional<Result<std::shared_ptr<Stream>>>;
   std::shared_ptr<Answer> open() {
     auto answer = std::make_shared<Answer>();
-    mirrors->open(owner->host(), kId, [answer](Result<std::shared_ptr<Stream>> result) {
-      answer->emplace(std::move(result));
+    mirrors->open(owner->host(), kId, nullptr, [answer](Result<OpenedRing> ring) {
+      ring ? answer->emplace(ring->stream) : answer->emplace(ring.error());
     });
     return answer;
+  }
+  std::shared_ptr<Stream> find() {
+    Mirror* mirror = mirrors->find(kId);
+    return mirror ? mirror->acquire() : nullptr;
   }
   std::shared_ptr<Stream> wait(const std::shared_ptr<Answer>& answer) {
     run_until(loop, [&] { return answer->has_value(); });
@@ -79,7 +83,7 @@ class MirrorsTest : public testing::Test, protected MirrorKeeper::Observer {
   }
   proto::Mirror state() {
     proto::Mirror state;
-    EXPECT_TRUE(mirrors->describe(kId, state));
+    mirrors->find(kId)->describe(state);
     return state;
   }
   void until_state(proto::Mirror::State wanted) {
@@ -97,7 +101,7 @@ TEST_F(MirrorsTest, FillsARingWithTheOwnersHistoryBeforeItAnswers) {
   const net::Frame subscribe = serve(100);
   EXPECT_TRUE(subscribe.subscribe().from_oldest());
   samples(100, 110);
-  run_until(loop, [&] { return mirrors->find(kId) && newest(*mirrors->find(kId)) == 110; });
+  run_until(loop, [&] { return find() && newest(*find()) == 110; });
   EXPECT_FALSE(answer->has_value()) << "more may follow";
   EXPECT_EQ(state().state(), proto::Mirror::FILLING);
   owner->caught_up();
@@ -139,7 +143,7 @@ TEST_F(MirrorsTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
   const KnownHost host = owner->host();
   owner.reset();  // nobody listens there any more
   std::optional<Error> error;
-  mirrors->open(host, kId, [&](Result<std::shared_ptr<Stream>> result) { error = result.error(); });
+  mirrors->open(host, kId, nullptr, [&](Result<OpenedRing> ring) { error = ring.error(); });
   run_until(loop, [&] { return error.has_value(); });
   EXPECT_EQ(error->code, Errc::unavailable);
   EXPECT_NE(error->message.find("odometry:0@pc2"), std::string::npos) << error->message;
@@ -169,15 +173,16 @@ TEST_F(MirrorsTest, RefusesWhatDoesNotFitIntoItsMemory) {
 TEST_F(MirrorsTest, CountsTowardsTheStreamsOfThisHost) {
   Registry small("pc1", {.max_streams = 1, .max_memory_bytes = 1 << 20, .max_property_bytes = 1});
   const ChannelParts small_parts{loop, resolver, small, logger, greeting_of("pc1")};
-  Mirrors few(small_parts, catalog, 0ms);
+  RemoteStreams<Mirror> few(small_parts, catalog);
   {
     std::optional<Errc> code;
-    few.open(owner->host(), kId, [&](auto result) {
+    few.open(owner->host(), kId, nullptr, [&](auto result) {
       code = result ? std::nullopt : std::optional(result.error().code);
     });
     EXPECT_EQ(small.create({"own", 0, ""}, odometry_type(), kHistory, 1).error().code,
               Errc::limit_exceeded);
-    few.open(owner->host(), {"other", 0, "pc2"}, [&](auto result) { code = result.error().code; });
+    few.open(owner->host(), {"other", 0, "pc2"}, nullptr,
+             [&](auto result) { code = result.error().code; });
     EXPECT_EQ(code, Errc::limit_exceeded);
     owner->fail(owner->take(), Errc::not_found, "none");
     run_until(loop, [&] { return few.size() == 0; });
@@ -187,7 +192,7 @@ TEST_F(MirrorsTest, CountsTowardsTheStreamsOfThisHost) {
 
 TEST_F(MirrorsTest, ClosesWhenNobodyUsesItAnyMore) {
   std::shared_ptr<Stream> stream = opened(5);
-  std::shared_ptr<Stream> second = mirrors->find(kId);
+  std::shared_ptr<Stream> second = find();
   stream.reset();
   event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
   EXPECT_TRUE(owner->connected()) << "one uses it still";
@@ -197,7 +202,7 @@ TEST_F(MirrorsTest, ClosesWhenNobodyUsesItAnyMore) {
 }
 
 TEST_F(MirrorsTest, StaysForAWhileAfterItsLastUser) {
-  mirrors = std::make_unique<Mirrors>(parts, catalog, 50ms);
+  parts.mirror_linger = 50ms;
   opened(5).reset();
   auto opened_again = open();
   ASSERT_TRUE(opened_again->has_value()) << "it is there still";
@@ -291,7 +296,7 @@ TEST_F(MirrorsTest, BeginsANewRingWhenTheOwnerLostIts) {
   const net::Frame subscribe = serve(0);
   EXPECT_TRUE(subscribe.subscribe().from_oldest());
   samples(0, 1);
-  run_until(loop, [&] { return mirrors->find(kId) != old; });
+  run_until(loop, [&] { return find() != old; });
   EXPECT_TRUE(replaced.empty()) << "not before there is something to read";
   owner->caught_up();
   run_until(loop, [&] { return !replaced.empty(); });
@@ -383,7 +388,7 @@ TEST_F(MirrorsTest, GoesOnWithARingThatAProgramKept) {
     const std::shared_ptr<Stream> stream = opened(5);
     kept = stream->descriptors_for(Role::reader).value();
   }
-  mirrors = std::make_unique<Mirrors>(parts, catalog, 0ms);
+  mirrors = std::make_unique<RemoteStreams<Mirror>>(parts, catalog);
   catalog.host_down(owner->host().greeting.host_id, {Errc::unavailable, "not known yet"});
   std::vector<UniqueFd> again;
   for (const UniqueFd& fd : kept) again.push_back(copy_of(fd));

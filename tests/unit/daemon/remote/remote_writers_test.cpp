@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Remote writers against an owner that does what the test says.
-#include "daemon/remote/remote_writers.hpp"
-
 #include <gtest/gtest.h>
 
 #include "core/ring/ring_writer.hpp"
+#include "daemon/remote/remote_streams.hpp"
+#include "daemon/remote/remote_writer.hpp"
 #include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 #include "tests/unit/daemon/remote/fake_owner.hpp"
@@ -51,7 +51,8 @@ class RemoteWritersTest : public testing::Test {
   Catalog catalog{"pc1"};
   wire::Greeting self = greeting_of("pc1");
   ChannelParts parts{loop, resolver, registry, logger, self};
-  std::unique_ptr<RemoteWriters> writers = std::make_unique<RemoteWriters>(parts, catalog);
+  std::unique_ptr<RemoteStreams<RemoteWriter>> writers =
+      std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
   std::unique_ptr<FakeOwner> owner = std::make_unique<FakeOwner>(loop);
   CreatePlan plan{odometry_type(), kHistory};
   StreamInfo theirs;
@@ -370,7 +371,7 @@ TEST_F(RemoteWritersTest, GoesOnWithARingThatAProgramKept) {
   }
   program->write(3);
   catalog.host_down(owner->host().greeting.host_id, {Errc::unavailable, "not known yet"});
-  writers = std::make_unique<RemoteWriters>(parts, catalog);
+  writers = std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
   const auto stream = writers->adopt_untrusted(kOdometry, program->offer());
   ASSERT_TRUE(stream) << stream.error().message;
   const auto again = writers->adopt_untrusted(kOdometry, program->offer());
@@ -393,7 +394,7 @@ TEST_F(RemoteWritersTest, PublishesAKeptRingBesideOneThatWasOpenedSince) {
     program.emplace(*stream);
     writers.reset();
   }
-  writers = std::make_unique<RemoteWriters>(parts, catalog);
+  writers = std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
   const std::shared_ptr<Stream> since = opened();
   const int before = owner->connections();
   const auto kept = writers->adopt_untrusted(kOdometry, program->offer());

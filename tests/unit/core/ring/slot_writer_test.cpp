@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Mirrors: rings that repeat another ring's tids, begin anywhere, and cross gaps.
-#include "core/ring/mirror_writer.hpp"
+// SlotWriter as mirrors use it: rings that repeat another ring's tids, begin anywhere, and cross
+// gaps.
+#include "core/ring/slot_writer.hpp"
 
 #include <algorithm>
 #include <map>
@@ -14,16 +15,16 @@
 namespace dssm::ring {
 namespace {
 
-void put(MirrorWriter& mirror, Tid tid, std::int64_t time_ns, std::size_t bytes) {
+void put(const SlotWriter& mirror, Tid tid, std::int64_t time_ns, std::size_t bytes) {
   const std::vector<std::byte> payload = payload_for(tid, bytes);
   copy_in(mirror.begin(tid), payload.data(), payload.size());
-  mirror.commit(time_from_ns(time_ns), Duration(tid % 100));
+  mirror.publish(tid, time_from_ns(time_ns), Duration(tid % 100));
 }
 
-TEST(MirrorWriter, BeginsWithAnyTid) {
+TEST(SlotWriter, BeginsWithAnyTid) {
   const TestRing ring(8, 13);
   const RingReader reader = ring.reader();
-  MirrorWriter mirror(*ring.mapping, *ring.bell);
+  const SlotWriter mirror(*ring.mapping);
   EXPECT_EQ(mirror.newest(), kNoTid);
   for (Tid tid = 5000; tid < 5003; ++tid) put(mirror, tid, 100 * tid, 8);
   EXPECT_EQ(reader.newest(), 5002);
@@ -43,14 +44,14 @@ TEST(MirrorWriter, BeginsWithAnyTid) {
 }
 
 // The model: what was put since the last gap and still fits into the ring.
-TEST(MirrorWriter, KeepsNoHolesWhateverIsLeftOut) {
+TEST(SlotWriter, KeepsNoHolesWhateverIsLeftOut) {
   const std::uint64_t seed = std::random_device{}();
   std::mt19937_64 random(seed);
   for (const std::uint64_t depth : {2, 3, 13, 100}) {
     SCOPED_TRACE(testing::Message() << "depth " << depth << ", seed " << seed);
     const TestRing ring(16, depth);
     const RingReader reader = ring.reader();
-    MirrorWriter mirror(*ring.mapping, *ring.bell);
+    const SlotWriter mirror(*ring.mapping);
     std::map<Tid, std::int64_t> model;
     Tid tid = static_cast<Tid>(random() % 1000);
     std::int64_t time_ns = 1'000'000;
@@ -86,10 +87,10 @@ TEST(MirrorWriter, KeepsNoHolesWhateverIsLeftOut) {
   }
 }
 
-TEST(MirrorWriter, ShowsNothingOfASampleThatWasGivenUp) {
+TEST(SlotWriter, ShowsNothingOfASampleThatIsNotPublished) {
   const TestRing ring(8, 4);
   const RingReader reader = ring.reader();
-  MirrorWriter mirror(*ring.mapping, *ring.bell);
+  const SlotWriter mirror(*ring.mapping);
   put(mirror, 7, 700, 8);
   mirror.begin(8)[0] = std::byte{0xff};
   EXPECT_EQ(reader.newest(), 7);
@@ -98,12 +99,12 @@ TEST(MirrorWriter, ShowsNothingOfASampleThatWasGivenUp) {
   EXPECT_EQ(reader.oldest(), 9);
 }
 
-// A dssmd that dies between announcing a gap and publishing the sample behind it.
-TEST(MirrorWriter, SetsRightWhatADeadDssmdLeft) {
+// A dssmd that dies between announcing a gap and publishing the sample after it.
+TEST(SlotWriter, RepairsWhatADeadDssmdLeft) {
   const TestRing ring(8, 13);
   const RingReader reader = ring.reader();
   {
-    MirrorWriter mirror(*ring.mapping, *ring.bell);
+    const SlotWriter mirror(*ring.mapping);
     for (Tid tid = 20; tid < 24; ++tid) put(mirror, tid, 100 * tid, 8);
     mirror.begin(50);
     ring.mapping->header().first.store(50);
@@ -116,7 +117,8 @@ TEST(MirrorWriter, SetsRightWhatADeadDssmdLeft) {
   Tid found = kNoTid;
   EXPECT_EQ(reader.find(time_from_ns(5000), found), ReadStatus::ok);
   EXPECT_EQ(found, 23);
-  MirrorWriter next(*ring.mapping, *ring.bell);
+  const SlotWriter next(*ring.mapping);
+  next.recover();
   put(next, 24, 2400, 8);
   EXPECT_EQ(reader.newest(), 24);
   EXPECT_EQ(reader.read(23, out, info), ReadStatus::ok);
@@ -124,12 +126,12 @@ TEST(MirrorWriter, SetsRightWhatADeadDssmdLeft) {
   EXPECT_EQ(found, 23);
 }
 
-TEST(MirrorWriter, NeverGivesReadersBesideItAnotherSampleThanTheyAskedFor) {
+TEST(SlotWriter, NeverGivesConcurrentReadersAnotherSample) {
   const TestRing ring(64, 17);
   const RingReader reader = ring.reader();
   std::atomic<bool> done = false;
   std::thread filler([&] {
-    MirrorWriter mirror(*ring.mapping, *ring.bell);
+    const SlotWriter mirror(*ring.mapping);
     std::mt19937_64 random(1);
     Tid tid = 100;
     for (int i = 0; i < 20'000; ++i, ++tid) {

@@ -1,0 +1,255 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/remote/remote_stream.hpp"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <utility>
+
+#include "core/base/try.hpp"
+#include "core/wire/messages.hpp"
+#include "daemon/link/sample_pump.hpp"
+
+namespace dssm::daemon {
+
+// --- the connection to the owner
+
+OwnerConnection::OwnerConnection(const ChannelParts& parts, const std::string& stream,
+                                 Observer& observer)
+    : parts_(parts),
+      stream_(stream),
+      observer_(observer),
+      retry_timer_(EventSource::timer(parts.loop, [this] { reopen(); })) {}
+
+void OwnerConnection::connect(const KnownHost& host) {
+  owner_ = host.greeting.host_id;
+  if (!dialer_) {
+    address_ = host.address;
+    dialer_.reset(new Dialer(parts_.loop, parts_.resolver, {{address_}, parts_.self}, *this));
+    return;
+  }
+  if (address_ != host.address) {
+    address_ = host.address;
+    dialer_->set_addresses({address_});
+    dialer_->restart({Errc::unavailable, host.str() + " has another address now"});
+  }
+  dialer_->retry_now();
+}
+
+void OwnerConnection::on_owner_down(const Error& why) {
+  if (dialer_) dialer_->restart(why);
+}
+
+void OwnerConnection::reopen() {
+  retry_timer_.disable();
+  if (!dialer_) return;
+  if (dialer_->connection()) {
+    reopening_ = true;
+    dialer_->restart({Errc::closed, "stream '" + stream_ + "' is about to be reopened"});
+  }
+  dialer_->retry_now();
+}
+
+void OwnerConnection::on_up(FrameConnection& connection, const wire::Greeting& them) {
+  if (them.host_id == *owner_) return observer_.on_up(connection, them);
+  dialer_->restart(
+      {Errc::conflict, fmt::format("{} answers at '{}', which is not the owner of stream '{}'",
+                                   them.str(), address_.str(), stream_)});
+}
+
+void OwnerConnection::on_down(const Error& why) {
+  retry_timer_.disable();
+  if (std::exchange(reopening_, false)) return observer_.on_reopen();
+  observer_.on_down(why);
+}
+
+// --- programs
+
+RemoteStream::RemoteStream(const ChannelParts& parts, Kind kind, StreamId id, RingQuota quota,
+                           std::function<void()> on_done)
+    : parts_(parts),
+      id_(std::move(id)),
+      name_(id_.str()),
+      kind_(kind),
+      quota_(std::move(quota)),
+      on_done_(std::move(on_done)),
+      pending_timer_(EventSource::timer(parts.loop, [this] { on_pending_timer(); })),
+      use_count_([this] {
+        unused_since_ = parts_.loop.now();
+        on_unused();
+      }),
+      connection_(parts, name_, *this) {}
+
+std::shared_ptr<Stream> RemoteStream::acquire() {
+  const std::shared_ptr<Stream> ring = stream();
+  if (!ring) return nullptr;
+  done_ = false;
+  return use_count_.acquire(ring);
+}
+
+Result<OpenedRing> RemoteStream::opened(const CreatePlan* plan) {
+  DSSM_TRY(check_open(plan));
+  return OpenedRing{acquire(), false};
+}
+
+void RemoteStream::open(const CreatePlan* plan, Then then) {
+  done_ = false;
+  if (can_open_now()) {
+    then(opened(plan));
+    return after_pending();
+  }
+  pending_.push_back({std::move(then), plan ? std::optional(*plan) : std::nullopt,
+                      parts_.loop.deadline_in(open_timeout())});
+  arm_pending_timer();
+  if (is_removed()) connection_.reopen();
+}
+
+Result<std::shared_ptr<Stream>> RemoteStream::adopt_untrusted(OfferedFiles&& files) {
+  const std::string context = "stream '" + name_ + "'";
+  if (const std::shared_ptr<Stream> ring = stream()) {
+    if (!ring->is_ring(files.ring.get())) {
+      return Error{Errc::conflict, context + " has another ring here now; close it and reopen it"};
+    }
+    ring->take_doorbell_untrusted(std::move(files.doorbell));
+    return acquire();
+  }
+  std::shared_ptr<Stream> offered =
+      DSSM_TRY(Stream::adopt_untrusted(std::move(files), parts_.registry.budget()), context);
+  if (offered->id() != id_ || offered->purpose() != kind_.purpose) {
+    return Error{Errc::protocol, fmt::format("{}: the offered ring belongs to '{}', or has "
+                                             "another purpose",
+                                             context, offered->id().str())};
+  }
+  DSSM_TRY(use_offered(std::move(offered)), context);
+  return acquire();
+}
+
+void RemoteStream::on_stream_added() {
+  if (is_removed()) connection_.reopen();
+}
+
+const std::optional<CreatePlan>* RemoteStream::first_pending() const noexcept {
+  return pending_.empty() ? nullptr : &pending_.front().plan;
+}
+
+void RemoteStream::set_pending_deadline(MonoTime deadline) {
+  for (PendingOpen& one : pending_) one.deadline = deadline;
+  arm_pending_timer();
+}
+
+void RemoteStream::answer_pending(bool created) {
+  if (pending_.empty()) return;
+  for (const PendingOpen& one : std::exchange(pending_, {})) {
+    Result<OpenedRing> ring = opened(one.plan ? &*one.plan : nullptr);
+    if (ring) ring->created = std::exchange(created, false);
+    one.then(std::move(ring));
+  }
+  after_pending();
+}
+
+void RemoteStream::fail_pending(const Error& why) {
+  if (pending_.empty()) return;
+  for (const PendingOpen& one : std::exchange(pending_, {})) one.then(why);
+  after_pending();
+}
+
+void RemoteStream::fail_first_pending(const Error& why) {
+  const PendingOpen first = std::move(pending_.front());
+  pending_.erase(pending_.begin());
+  first.then(why);
+  after_pending();
+}
+
+// Programs have got an answer, perhaps not the ring.
+void RemoteStream::after_pending() {
+  arm_pending_timer();
+  if (!is_unused()) return;
+  stream() ? on_unused() : finish();
+}
+
+void RemoteStream::finish() {
+  done_ = true;
+  on_done_();
+}
+
+void RemoteStream::arm_pending_timer() {
+  if (pending_.empty()) return pending_timer_.disable();
+  MonoTime first = kNever;
+  for (const PendingOpen& one : pending_) first = std::min(first, one.deadline);
+  pending_timer_.enable_in(std::max(first - parts_.loop.now(), Duration::zero()));
+}
+
+// A mirror that is being filled is handed out with what it holds.
+void RemoteStream::on_pending_timer() {
+  const MonoTime now = parts_.loop.now();
+  const auto later =
+      std::stable_partition(pending_.begin(), pending_.end(),
+                            [now](const PendingOpen& one) { return one.deadline <= now; });
+  const std::vector<PendingOpen> overdue(pending_.begin(), later);
+  pending_.erase(pending_.begin(), later);
+  for (const PendingOpen& one : overdue) {
+    if (stream() && !is_removed()) {
+      one.then(opened(one.plan ? &*one.plan : nullptr));
+    } else {
+      one.then(Error{Errc::unavailable,
+                     fmt::format("stream '{}': host '{}' does not answer at '{}'{}; see `dssmctl "
+                                 "hosts`, and retry",
+                                 name_, id_.host, connection_.address().str(),
+                                 last_error_ ? ": " + last_error_->message : "")});
+    }
+  }
+  after_pending();
+}
+
+// --- the log
+
+LogFields RemoteStream::log_fields() const {
+  return {.stream = name_, .peer = id_.host, .message_id = kind_.message_id};
+}
+
+void RemoteStream::log_error(std::string_view consequence) {
+  if (std::exchange(error_logged_, true)) return;
+  parts_.logger.notice(fmt::format("{}: {}; retrying", consequence, last_error_->message),
+                       log_fields());
+}
+
+bool RemoteStream::clear_error() {
+  last_error_.reset();
+  return std::exchange(error_logged_, false);
+}
+
+void RemoteStream::log_gap(std::uint64_t samples) {
+  gap_samples_ += samples;
+  const auto unlogged = gap_lines_.admit(parts_.loop.now(), samples);
+  if (!unlogged) return;
+  parts_.logger.warning(fmt::format("stream '{}' lacks {} samples, {} in all: {}", name_, *unlogged,
+                                    gap_samples_, kind_.gap_reason),
+                        log_fields());
+}
+
+// --- what the owner sends
+
+Result<StreamInfo> opened_stream_untrusted(const proto::Opened& opened, const StreamId& expected) {
+  const StreamId id = DSSM_TRY(wire::stream_id_untrusted(opened.stream().id()));
+  if (id != expected) {
+    return Error{Errc::protocol,
+                 fmt::format("the owner opened '{}' instead of '{}'", id.str(), expected.str())};
+  }
+  TypeInfo type = DSSM_TRY(wire::type_untrusted(opened.stream().type()));
+  StreamInfo stream = wire::stream_info(opened.stream());
+  stream.type = std::move(type);
+  if (stream.cycle <= Duration::zero() || stream.incarnation == 0 || stream.newest < kNoTid ||
+      stream.newest > kLastTid) {
+    return Error{Errc::protocol,
+                 fmt::format("the owner describes '{}' without a cycle or an incarnation, or with "
+                             "a tid that is not possible",
+                             expected.str())};
+  }
+  return stream;
+}
+
+Error unexpected_frame(std::string_view frame) {
+  return {Errc::protocol, fmt::format("the owner sent {}, which is not expected now", frame)};
+}
+
+}  // namespace dssm::daemon
