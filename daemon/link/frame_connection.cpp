@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/link/frame_connection.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <array>
 #include <optional>
@@ -38,8 +40,8 @@ FrameConnection::FrameConnection(const EventLoop& loop, std::unique_ptr<wire::Tr
       decoder_(*this, wire::kMaxNetworkFrameBytes),
       readable_(EventSource::readable(loop, transport_->fd(), [this] { on_readable(); })),
       writable_(EventSource::writable(loop, transport_->fd(), [this] { on_writable(); })),
-      next_turn_(EventSource::timer(loop, [this] { go_on(); })),
-      ended_(EventSource::timer(loop, [this] { observer_.on_closed(why_); })) {
+      next_turn_(EventSource::timer(loop, [this] { continue_receiving(); })),
+      ended_(EventSource::timer(loop, [this] { observer_.on_closed(last_error_); })) {
   readable_.enable();
 }
 
@@ -51,8 +53,8 @@ std::span<const std::byte> FrameConnection::Outgoing::unsent() const noexcept {
   return all.subspan(sent);
 }
 
-void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& sink) noexcept {
-  samples_ = &sink;
+void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& delegate) noexcept {
+  samples_ = &delegate;
   decoder_.set_payload_bytes(payload_bytes);
 }
 
@@ -64,7 +66,7 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& si
   bool ended = false;
   for (int receives = 0; receives < kReceivesPerTurn && received < kBytesPerTurn; ++receives) {
     const std::span<const iovec> spaces = decoder_.spaces();
-    const std::size_t room = total(spaces);
+    const std::size_t free_bytes = total(spaces);
     const Result<wire::IoResult> got = transport_->receive(spaces);
     if (got && got->status == wire::IoStatus::would_block) break;
     if (!got || got->status == wire::IoStatus::end) {
@@ -78,26 +80,26 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& si
     }
     last_heard_ = loop_.coarse_now();
     received += got->bytes;
-    if (!hand_out(got->bytes)) return;
-    if (paused_ || held_ || got->bytes < room) break;
+    if (!decode(got->bytes)) return;
+    if (paused_ || decoder_held_ || got->bytes < free_bytes) break;
   }
   if (received > 0 && samples_) samples_->on_batch_end();
   if (ended) close(end);
 }
 
-// Goes on with what was received before a pause.
-void FrameConnection::go_on() {
-  if (closed_ || paused_ || !hand_out(0)) return;
+// Continues with the bytes that were received before a pause.
+void FrameConnection::continue_receiving() {
+  if (closed_ || paused_ || !decode(0)) return;
   if (samples_) samples_->on_batch_end();
-  if (!closed_ && !paused_) listen_again();
+  if (!closed_ && !paused_) receive_more();
 }
 
-// False when the link closed over it.
-[[gnu::hot]] bool FrameConnection::hand_out(std::size_t bytes) {
-  held_ = false;
-  handing_out_ = true;
+// False when the connection closed meanwhile.
+[[gnu::hot]] bool FrameConnection::decode(std::size_t bytes) {
+  decoder_held_ = false;
+  decoding_ = true;
   const Result<void> taken = decoder_.commit(bytes);
-  handing_out_ = false;
+  decoding_ = false;
   if (!taken) close_with(taken.error());
   return !closed_ && charge_input();
 }
@@ -112,18 +114,19 @@ void FrameConnection::go_on() {
     return true;
   }
   close_with({Errc::limit_exceeded,
-              "no memory is left to receive a frame of more than " + std::to_string(bytes) +
-                  " bytes: max_peer_memory = " + std::to_string(budget_->limit()) +
-                  " bytes are used up; use fewer connections or raise that key"});
+              fmt::format("no memory is left to receive a frame of more than {} bytes: "
+                          "max_peer_memory = {} bytes are used up; use fewer connections or raise "
+                          "that key",
+                          bytes, budget_->limit())});
   return false;
 }
 
-void FrameConnection::listen_again() {
-  if (held_) return next_turn_.enable_in(Duration::zero());
+void FrameConnection::receive_more() {
+  if (decoder_held_) return next_turn_.enable_in(Duration::zero());
   readable_.enable();
 }
 
-// A handler may have closed the link: the decoder is stopped, too.
+// When a handler has closed the connection, an error stops the decoder.
 [[gnu::hot]] Result<void> FrameConnection::on_sample_begin(const wire::IncomingSample& sample,
                                                            std::byte*& out) {
   if (closed_) return closed_by_handler();
@@ -144,113 +147,113 @@ Result<void> FrameConnection::on_frame(net::Frame& frame) {
 void FrameConnection::pause() {
   if (closed_ || paused_) return;
   paused_ = true;
-  if (handing_out_) {
+  if (decoding_) {
     decoder_.hold();
-    held_ = true;
+    decoder_held_ = true;
   }
   readable_.disable();
   next_turn_.disable();
-  if (output_lost_) close(why_);
+  if (output_.lost) close(last_error_);
 }
 
 void FrameConnection::resume() {
   if (closed_ || !paused_) return;
   paused_ = false;
-  listen_again();
+  receive_more();
 }
 
 // --- sending
 
 void FrameConnection::send(const net::Frame& frame) {
-  if (closed_ || output_lost_) return;
+  if (closed_ || output_.lost) return;
   Outgoing outgoing{wire::encode_frame(frame), 0, true, {}};
   const std::size_t bytes = outgoing.unsent().size();
-  if (output_.empty() && !mid_frame_) {
+  if (output_.queue.empty() && !output_.mid_frame) {
     const iovec part = part_of(outgoing.unsent());
     outgoing.sent = transmit({&part, 1});
-    if (outgoing.sent == bytes || closed_ || output_lost_) return;
+    if (outgoing.sent == bytes || closed_ || output_.lost) return;
   }
-  // Last words cannot stand in the middle of a frame.
+  // The final failure cannot be sent in the middle of a frame.
   const auto refuse = [&](const Error& why) {
-    mid_frame_ = mid_frame_ || outgoing.sent > 0;
+    output_.mid_frame = output_.mid_frame || outgoing.sent > 0;
     close_with(why);
   };
-  if (queued_bytes_ + bytes > max_queued_bytes_) {
+  if (output_.queued_bytes + bytes > max_queued_bytes_) {
     return refuse({Errc::limit_exceeded,
-                   "the other side does not read: " + std::to_string(queued_bytes_) +
-                       " bytes wait for it, and " + std::to_string(bytes) +
-                       " more would be above the limit of " + std::to_string(max_queued_bytes_)});
+                   fmt::format("the other side does not read: {} bytes wait for it, and {} more "
+                               "would exceed the limit of {}",
+                               output_.queued_bytes, bytes, max_queued_bytes_)});
   }
   if (budget_) {
     std::optional<MemoryShare> share = budget_->try_take(bytes);
     if (!share) {
       return refuse({Errc::limit_exceeded,
-                     "the other side does not read: no memory is left for " +
-                         std::to_string(bytes) +
-                         " bytes more of max_peer_memory = " + std::to_string(budget_->limit()) +
-                         " bytes; read faster, use fewer connections, or raise that key"});
+                     fmt::format("the other side does not read: no memory is left for {} bytes "
+                                 "more of max_peer_memory = {} bytes; read faster, use fewer "
+                                 "connections, or raise that key",
+                                 bytes, budget_->limit())});
     }
     outgoing.share = *std::move(share);
   }
-  queued_bytes_ += bytes;
+  output_.queued_bytes += bytes;
   enqueue(std::move(outgoing));
 }
 
 [[gnu::hot]] std::size_t FrameConnection::send_now(std::span<const iovec> parts) {
-  if (closed_ || output_lost_ || (!output_.empty() && !mid_frame_)) return 0;
+  if (closed_ || output_.lost || (!output_.queue.empty() && !output_.mid_frame)) return 0;
   return transmit(parts);
 }
 
 void FrameConnection::queue_rest(RawBytes bytes, MemoryShare share) {
-  if (closed_ || output_lost_) return;
+  if (closed_ || output_.lost) return;
   Outgoing outgoing{std::move(bytes), 0, false, std::move(share)};
-  if (!mid_frame_) return enqueue(std::move(outgoing));
-  // The frame that it completes went out piece by piece: before all that waits.
-  output_.push_front(std::move(outgoing));
+  if (!output_.mid_frame) return enqueue(std::move(outgoing));
+  // The frame that it completes is sent in pieces: before the queue.
+  output_.queue.push_front(std::move(outgoing));
   writable_.enable();
 }
 
 void FrameConnection::enqueue(Outgoing outgoing) {
-  output_.push_back(std::move(outgoing));
-  if (!mid_frame_) writable_.enable();
+  output_.queue.push_back(std::move(outgoing));
+  if (!output_.mid_frame) writable_.enable();
 }
 
 void FrameConnection::set_mid_frame(bool mid_frame) {
-  mid_frame_ = mid_frame;
-  if (!mid_frame && !output_.empty()) want_output();
+  output_.mid_frame = mid_frame;
+  if (!mid_frame && !output_.queue.empty()) want_output();
 }
 
 void FrameConnection::want_output() {
-  if (!closed_ && !output_lost_) writable_.enable();
+  if (!closed_ && !output_.lost) writable_.enable();
 }
 
 void FrameConnection::on_writable() {
-  if (!mid_frame_ && !flush()) return;
+  if (!output_.mid_frame && !flush()) return;
   writable_.disable();
   observer_.on_output_empty();
 }
 
-// Sends what waits. True when nothing is left.
+// Sends the queue. True when it is empty.
 bool FrameConnection::flush() {
-  while (!output_.empty()) {
+  while (!output_.queue.empty()) {
     std::array<iovec, kMaxParts> parts;
     std::size_t count = 0, bytes = 0;
-    for (const Outgoing& next : output_) {
+    for (const Outgoing& next : output_.queue) {
       if (count == parts.size()) break;
       parts[count] = part_of(next.unsent());
       bytes += parts[count++].iov_len;
     }
     std::size_t sent = transmit(std::span(parts).first(count));
-    if (closed_ || output_lost_) return false;
+    if (closed_ || output_.lost) return false;
     const bool all = sent == bytes;
-    while (!output_.empty()) {
-      Outgoing& next = output_.front();
+    while (!output_.queue.empty()) {
+      Outgoing& next = output_.queue.front();
       const std::size_t step = std::min(sent, next.unsent().size());
       next.sent += step;
       sent -= step;
       if (!next.unsent().empty()) break;
-      if (next.counted) queued_bytes_ -= next.sent;
-      output_.pop_front();
+      if (next.counted) output_.queued_bytes -= next.sent;
+      output_.queue.pop_front();
     }
     if (!all) return false;
   }
@@ -260,24 +263,25 @@ bool FrameConnection::flush() {
 [[gnu::hot]] std::size_t FrameConnection::transmit(std::span<const iovec> parts) {
   const Result<wire::IoResult> sent = transport_->send(parts);
   if (sent && sent->status != wire::IoStatus::end) return sent->bytes;
-  why_ = sent ? Error{Errc::unavailable, "the other side closed the connection"} : sent.error();
+  last_error_ =
+      sent ? Error{Errc::unavailable, "the other side closed the connection"} : sent.error();
   lose_output();
   return 0;
 }
 
-// The peer may have said why before it closed: that waits to be received, so receiving goes on and
-// will find the end by itself.
+// The peer may have sent its reason before it closed: that is still to be received, so receiving
+// continues until the end of the input.
 void FrameConnection::lose_output() {
-  output_lost_ = true;
-  output_.clear();
-  queued_bytes_ = 0;
+  output_.lost = true;
+  output_.queue.clear();
+  output_.queued_bytes = 0;
   writable_.disable();
-  if (paused_) close(why_);
+  if (paused_) close(last_error_);
 }
 
 void FrameConnection::close_with(const Error& why) {
   if (closed_) return;
-  if (!output_lost_ && !mid_frame_ && flush()) {
+  if (!output_.lost && !output_.mid_frame && flush()) {
     const std::string encoded = wire::final_failure(why);
     const iovec part = part_of(std::as_bytes(std::span(encoded)));
     transmit({&part, 1});
@@ -288,11 +292,11 @@ void FrameConnection::close_with(const Error& why) {
 void FrameConnection::close(const Error& why) {
   if (closed_) return;
   closed_ = true;
-  why_ = why;
+  last_error_ = why;
   readable_.disable();
   writable_.disable();
   next_turn_.disable();
-  output_.clear();
+  output_.queue.clear();
   input_share_ = {};
   transport_.reset();
   ended_.enable_in(Duration::zero());
