@@ -72,13 +72,13 @@ FleetService::FleetService(const EventLoop& loop, Self self, const Registry& reg
       writers_(writers),
       list_timer_(EventSource::timer(loop, [this] { on_list_timeout(); })) {
   catalog_.add_observer(*this);
-  peers_.on_settled([this] {
+  peers_.on_startup_over([this] {
     for (const std::function<void()>& go_on : std::exchange(early_, {})) go_on();
   });
 }
 
 FleetService::~FleetService() {
-  peers_.on_settled({});
+  peers_.on_startup_over({});
   catalog_.remove_observer(*this);
 }
 
