@@ -15,8 +15,7 @@
 namespace dssm::daemon {
 namespace {
 
-// Serials of the two requests of a connection.
-constexpr std::uint64_t kOpenSerial = 1, kSubscribeSerial = 2;
+constexpr std::uint64_t kSubscribeSerial = kOpenSerial + 1;
 
 }  // namespace
 

@@ -247,6 +247,10 @@ class RemoteStream : protected OwnerConnection::Observer {
   OwnerConnection connection_;
 };
 
+// Serial of the first request of each connection, which opens or creates the stream; the requests
+// that follow count on from it.
+inline constexpr std::uint64_t kOpenSerial = 1;
+
 // The stream in `opened`, which must be `expected`.
 //   fails  protocol
 Result<StreamInfo> opened_stream_untrusted(const proto::Opened& opened, const StreamId& expected);
