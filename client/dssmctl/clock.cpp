@@ -25,7 +25,7 @@ bool is_there(const HostInfo& host) {
   return host.state == HostState::self || host.state == HostState::up;
 }
 
-bool is_good(const ClockInfo& clock) {
+bool is_good(const ClockSnapshot& clock) {
   return clock.status == ClockStatus::synchronized || clock.status == ClockStatus::holdover;
 }
 
@@ -36,28 +36,28 @@ std::string offset_text(Duration offset) {
   return offset < Duration::zero() ? "-" + duration_text(-offset) : duration_text(offset);
 }
 
-std::string status_text(const ClockInfo& clock) {
+std::string status_text(const ClockSnapshot& clock) {
   const std::string status(name_of(clock.status));
   return clock.reason == ClockReason::none ? status
                                            : status + ": " + std::string(name_of(clock.reason));
 }
 
-std::string reference_text(const ClockInfo& clock) {
-  if (clock.basis == ClockBasis::own) return "itself";
-  return or_dash(escaped(clock.reference));
+std::string reference_text(const HostInfo& host) {
+  if (host.clock->basis == ClockBasis::own) return "itself";
+  return or_dash(escaped(host.clock_reference));
 }
 
 // A host that says nothing has dashes.
 std::vector<std::string> clock_row(const HostInfo& host) {
   if (!host.clock) return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-"};
-  const ClockInfo& clock = *host.clock;
+  const ClockSnapshot& clock = *host.clock;
   const bool is_read = clock.status != ClockStatus::unknown && clock.age > Duration::zero();
   return {escaped(host.name),
           status_text(clock),
           bound_text(host.clock_bound),
-          bound_text(clock.distance),
+          bound_text(host.clock_distance),
           is_read ? offset_text(clock.offset) : "-",
-          reference_text(clock),
+          reference_text(host),
           clock.update_interval > Duration::zero() ? duration_text(clock.update_interval) : "-",
           is_read ? duration_text(clock.age) : "-"};
 }
@@ -66,15 +66,15 @@ Json clock_json(const HostInfo& host) {
   Json json;
   json["host"] = host.name;
   json["state"] = name_of(host.state);
-  const ClockInfo clock = host.clock.value_or(ClockInfo());
+  const ClockSnapshot clock = host.clock.value_or(ClockSnapshot());
   json["status"] = name_of(clock.status);
-  json["trouble"] = clock.reason == ClockReason::none ? Json() : Json(name_of(clock.reason));
+  json["reason"] = clock.reason == ClockReason::none ? Json() : Json(name_of(clock.reason));
   json["basis"] = name_of(clock.basis);
   json["bound_ns"] = bound_json(host.clock_bound);
-  json["distance_ns"] = bound_json(clock.distance);
+  json["distance_ns"] = bound_json(host.clock_distance);
   json["root_bound_ns"] = bound_json(clock.root_bound);
   json["offset_ns"] = to_ns(clock.offset);
-  json["reference"] = clock.reference.empty() ? Json() : Json(clock.reference);
+  json["reference"] = host.clock_reference.empty() ? Json() : Json(host.clock_reference);
   json["stratum"] = clock.stratum;
   json["poll_ns"] = to_ns(clock.update_interval);
   json["age_ns"] = to_ns(clock.age);

@@ -447,13 +447,13 @@ void check_hosts(const Facts& facts, Findings& findings) {
 void check_fleet_clocks(const Facts& facts, Findings& findings) {
   for (const HostInfo& host : facts.hosts) {
     if (host.state != HostState::up || !is_other_pc(host) || !host.clock) continue;
-    const ClockInfo& clock = *host.clock;
+    const ClockSnapshot& clock = *host.clock;
     Finding finding{"clock of " + name_of(host),
                     Status::ok,
-                    "at most " + bound_text(clock.distance) + " from this one's",
+                    "at most " + bound_text(host.clock_distance) + " from this one's",
                     {},
                     {}};
-    if (clock.distance == kUnknownClockError) {
+    if (host.clock_distance == kUnknownClockError) {
       finding.status = Status::warn;
       finding.text = "it is not known how far it is from this one's (" +
                      std::string(dssm::name_of(clock.status)) + " there)";

@@ -12,7 +12,7 @@ Reading now() noexcept {
   reading.latest = Time::max();
   const ClockPage* page = detail::latest_clock_page().load(std::memory_order_acquire);
   if (!page) return reading;
-  reading.clock_error = error_at(*page, reading.time).value_or(kUnknownClockError);
+  reading.clock_error = clock_error_at(*page, reading.time).value_or(kUnknownClockError);
   reading.status = status_of(*page);
   if (reading.clock_error == kUnknownClockError) return reading;
   reading.earliest = reading.time - reading.clock_error;

@@ -105,7 +105,7 @@ Result<void> NetworkConnection::greet() {
   self.features = {std::string(wire::kFeatureTorn)};
   // This program does not watch the clock, but its kernel may be the host's.
   const auto clock = std::make_shared<wire::ClockReport>();
-  clock->standing.boot_id = clock::boot_id();
+  clock->boot_id = clock::boot_id();
   self.clock = clock;
   net::Frame frame;
   wire::to_message(self, *frame.mutable_hello());

@@ -67,17 +67,10 @@ HostInfo host_info(const local::Host& message) {
   host.error = message.error();
   host.id = hex(message.host_id());
   if (message.has_clock()) {
-    const auto report = wire::clock_report_untrusted(message.clock(), MonoClock::now());
-    host.clock = {report.status,
-                  report.trouble,
-                  report.basis,
-                  report.offset,
-                  report.reference,
-                  report.stratum,
-                  report.update_interval,
-                  report.age,
-                  report.standing.root_bound,
-                  Duration(message.clock_distance_ns())};
+    wire::ClockReport report = wire::clock_report_untrusted(message.clock(), MonoClock::now());
+    host.clock = report.clock;
+    host.clock_reference = std::move(report.reference);
+    host.clock_distance = Duration(message.clock_distance_ns());
   }
   host.found_by.assign(message.found_by().begin(), message.found_by().end());
   return host;

@@ -10,7 +10,7 @@
 #include <optional>
 
 #include "client/src/client.hpp"
-#include "core/clock/error_cache.hpp"
+#include "core/clock/clock_error_cache.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "core/ring/ring_writer.hpp"
 
@@ -26,7 +26,7 @@ inline constexpr Duration kMaxDelay = std::chrono::seconds(10);
 // for a time that is not of this clock.
 inline Duration clock_error_by(const Client::ClockPlace& place, Time time) noexcept {
   const clock::ClockPage* page = place.load(std::memory_order_acquire);
-  const std::optional<Duration> error = page ? clock::error_at(*page, time) : std::nullopt;
+  const std::optional<Duration> error = page ? clock::clock_error_at(*page, time) : std::nullopt;
   if (error) return *error;
   // Last, because clock_gettime() costs more than all the rest.
   const Time now = WallClock::now();
@@ -83,7 +83,7 @@ struct WriterState {
 
   std::shared_ptr<OpenStream> stream;
   const Client::ClockPlace& clock;
-  clock::ErrorCache own_error;
+  clock::ClockErrorCache own_error;
   ring::RingWriter ring;
   std::uint64_t payload_bytes;
 };

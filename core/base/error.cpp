@@ -109,10 +109,10 @@ std::string_view name_of(ClockStatus status) noexcept {
   return name_in(kNames, status);
 }
 
-std::string_view name_of(ClockReason trouble) noexcept {
+std::string_view name_of(ClockReason reason) noexcept {
   static constexpr std::array<std::string_view, 6> kNames = {
       "none", "no chronyd", "chronyd is silent", "not synchronised", "stepped", "too far"};
-  return name_in(kNames, trouble);
+  return name_in(kNames, reason);
 }
 
 std::string_view name_of(HostState state) noexcept {

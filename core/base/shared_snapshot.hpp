@@ -53,14 +53,13 @@ class SharedSnapshot {
   // Changes with each store; one load. Acquire: what load() copies after it is at least as new.
   std::uint64_t generation() const noexcept { return generation_.load(std::memory_order_acquire); }
 
-  // Copies the current value, or the first sizeof(Part) bytes of it, where T begins with a Part.
+  // Copies the current value, or only the first `bytes` of it.
   //   returns  its generation; 0: nothing was stored, or the writer stored again during each of
   //            kMaxTries copies. Then `out` is unchanged
-  template <class Part = T>
-  std::uint64_t load(Part& out) const noexcept {
-    static_assert(std::is_trivially_copyable_v<Part> && sizeof(Part) <= sizeof(T));
-    std::array<std::uint64_t, sizeof(Part) / 8> copy;
-    static_assert(sizeof copy == sizeof(Part));
+  template <std::size_t bytes = sizeof(T)>
+  std::uint64_t load(T& out) const noexcept {
+    static_assert(bytes % 8 == 0 && bytes <= sizeof(T));
+    std::array<std::uint64_t, bytes / 8> copy;
     for (int i = 0; i < kMaxTries; ++i) {
       // Acquire: pairs with the release store of the generation in store(), so that the words of
       // this generation are visible.
@@ -73,7 +72,7 @@ class SharedSnapshot {
         copy[word] = record[word].load(std::memory_order_acquire);
       }
       if (generation_.load(std::memory_order_relaxed) != before) continue;
-      std::memcpy(static_cast<void*>(&out), copy.data(), sizeof out);
+      std::memcpy(static_cast<void*>(&out), copy.data(), bytes);
       return before;
     }
     return 0;

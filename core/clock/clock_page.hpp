@@ -1,138 +1,92 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The shared page in which dssmd says what it knows of this PC's clock, for all programs of this PC
-// to read without asking. docs/clocks.md "The shared page" has the layout byte by byte.
-//
-// Two records take turns; `generation` says which one counts (generation % 2). The only writer,
-// dssmd, fills the other one and then raises the generation: readers never see a mix and never
-// wait, and a dssmd killed half-way has changed nothing.
+// The shared page in which dssmd states what it knows of this PC's clock. All programs of this PC
+// read it without a request. docs/clocks.md "The shared page" has the layout byte by byte.
+// dssmd writes it (daemon/clock/clock_page_writer.hpp) as a SharedSnapshot: readers never see a mix
+// and never wait, and a dssmd that is killed at any instruction leaves a readable page.
 #pragma once
 
-#include <array>
-#include <atomic>
 #include <cstddef>
 #include <cstdint>
 #include <dssm/clock_status.hpp>
 #include <dssm/result.hpp>
 #include <optional>
 #include <string>
-#include <string_view>
 
-#include "core/base/unique_fd.hpp"
-#include "core/clock/clock_estimator.hpp"
+#include "core/base/shared_snapshot.hpp"
 
 namespace dssm::clock {
 
-// Layout version 1, one page, little endian. Times are nanoseconds since 1970 (wall) or since boot
-// (mono).
-struct ClockPage {
-  static constexpr std::uint64_t kMagic = 0x4b434f4c434d5353;  // "SSMCLOCK"
-  static constexpr std::uint32_t kLayoutVersion = 1;
+// What dssmd states at one time. The first kStampBytes are all that stamping a sample takes.
+//
+//   off size field                  unit
+//     0    8 wall                   ns     CLOCK_REALTIME, when this was stated
+//     8    8 earlier_from           ns     CLOCK_REALTIME; from then to `wall` ...
+//    16    8 earlier_bound          ns     ... the bound was at most this
+//    24    8 limit                  ns     beyond it the clock is out of bounds (key clock_limit)
+//    32    8 mono                   ns     CLOCK_MONOTONIC, when this was stated
+//    40   72 clock                         dssm/clock_status.hpp
+//   112   24 base_mono, _wall, _width  ns  both clocks at an instant since which the clock was not
+//                                          set: the next dssmd detects a step by them
+//   136   64 reference                     the host or address that this clock follows
+//   200   56 reserved                      zero
+struct ClockPageState {
+  static constexpr std::size_t kStampBytes = 64;
+  static constexpr std::size_t kMaxReferenceBytes = 63;
 
-  struct Record {
-    // One cache line: all that stamping a sample takes.
-    std::atomic<std::int64_t> wall_ns;           // when this was written
-    std::atomic<std::int64_t> bound_ns;          // then; 2^63-1: none
-    std::atomic<std::int64_t> ageing_ppb;        // what the bound grows by, ns per second
-    std::atomic<std::int64_t> earlier_from_ns;   // wall: from then to wall_ns
-    std::atomic<std::int64_t> earlier_bound_ns;  // the bound was at most this
-    std::atomic<std::int64_t> limit_ns;          // beyond it the clock is out of bounds
-    std::atomic<std::int64_t> reserved0[2];
-    // The rest.
-    std::atomic<std::int64_t> mono_ns;  // when this was written
-    std::atomic<std::uint32_t> status, trouble, basis, stratum;
-    std::atomic<std::uint32_t> reference_id;
-    std::atomic<std::uint32_t> reserved1;
-    std::atomic<std::int64_t> offset_ns;
-    std::atomic<std::int64_t> read_mono_ns;     // when chronyd was asked
-    std::atomic<std::int64_t> updated_mono_ns;  // when it last learned something
-    std::atomic<std::int64_t> root_dispersion_ns, root_delay_ns;
-    std::atomic<std::int64_t> base_mono_ns, base_wall_ns, base_width_ns;  // for the next dssmd
-    std::array<std::atomic<char>, 64> reference;  // a host's name or an address; zero-terminated
-    std::byte reserved2[96];
-  };
+  Time wall{};
+  Time earlier_from{};
+  Duration earlier_bound{};
+  Duration limit{};
+  MonoTime mono{};
+  ClockSnapshot clock;
+  MonoTime base_mono{};
+  Time base_wall{};
+  Duration base_width{};
+  char reference[kMaxReferenceBytes + 1] = {};  // zero-terminated
+  std::byte reserved[56] = {};
+};
+static_assert(offsetof(ClockPageState, mono) == 32 && offsetof(ClockPageState, clock) == 40);
+static_assert(offsetof(ClockSnapshot, stratum) + 4 == ClockPageState::kStampBytes - 40);
+static_assert(offsetof(ClockSnapshot, root_bound) == 24 && sizeof(ClockSnapshot) == 72);
+static_assert(offsetof(ClockPageState, base_mono) == 112);
+static_assert(offsetof(ClockPageState, reference) == 136 && sizeof(ClockPageState) == 256);
+
+// One page, little endian.
+struct ClockPage {
+  static constexpr std::uint64_t kMagic = 0x4b434c434d535344;  // "DSSMCLCK"
+  static constexpr std::uint32_t kLayoutVersion = 2;
 
   std::uint64_t magic;
   std::uint32_t layout_version;
   std::uint32_t reserved0;
-  std::atomic<std::uint64_t> generation;
   char boot_id[40];  // of the boot in which the times of mono hold; zero-terminated
-  Record records[2];
-  std::byte reserved1[4096 - 64 - 2 * 320];
+  SharedSnapshot<ClockPageState> state;
+  std::byte reserved1[4096 - 64 - 2 * sizeof(ClockPageState)];
 };
-static_assert(std::atomic<std::int64_t>::is_always_lock_free);
-static_assert(offsetof(ClockPage, generation) == 16 && offsetof(ClockPage, records) == 64);
-static_assert(offsetof(ClockPage::Record, mono_ns) == 64);
-static_assert(sizeof(ClockPage::Record) == 320 && sizeof(ClockPage) == 4096);
+static_assert(offsetof(ClockPage, state) == 56 && sizeof(ClockPage) == 4096);
 
-// A record as a value.
-struct ClockRecord {
-  Time wall;
-  MonoTime mono;
-  ClockState state;          // at `mono`
-  Time earlier_from;         // from then to `wall`
-  Duration earlier_bound{};  // the bound was at most this
-  Duration limit{};
-  Instant base;           // at which the clock was whole: later steps show against it
-  std::string reference;  // whom this clock follows; at most 63 bytes
-};
-
-// A bound stated longer ago than this says nothing: dssmd writes anew every second.
+// A statement that is older says nothing: dssmd states the clock every second.
 inline constexpr Duration kLongestUse = std::chrono::milliseconds(3500);
 
 // How far this PC's clock may have been from its reference at `t`, a time by this clock.
-//   returns  kUnknownClockError: not known then. Nothing: the page does not reach `t`: that is no
-//            time of this clock, or lies too far back, or dssmd is gone
+//   returns  kUnknownClockError: not known then. nullopt: the page does not cover `t`: it is not a
+//            time of this clock, or is too long ago, or dssmd does not run
 //   threads  any; async-signal-safe; no system call
-std::optional<Duration> error_at(const ClockPage& page, Time t) noexcept;
+std::optional<Duration> clock_error_at(const ClockPage& page, Time t) noexcept;
 
-// What error_at() answers from.
-struct StatedBound {
-  std::uint64_t generation = 0;  // of the page
-  std::int64_t wall_ns = 0, bound_ns = 0, ageing_ppb = 0;
-  std::int64_t earlier_from_ns = 0, earlier_bound_ns = 0;  // as in ClockPage::Record
-};
-StatedBound stated_bound(const ClockPage& page) noexcept;
-
-// What dssmd says of the clock; `unknown` when it has said nothing for kLongestUse. As error_at().
+// The status of the clock; `unknown` when none was stated for kLongestUse. As clock_error_at().
 ClockStatus status_of(const ClockPage& page) noexcept;
 
-// All of it. Allocates.
-ClockRecord load(const ClockPage& page);
+// Maps `fd` as a clock page.
+//   protection  PROT_READ, PROT_READ | PROT_WRITE
+//   fails       protocol: it is not such a page
+Result<ClockPage*> map_page_untrusted(int fd, int protection);
 
-// Maps the page behind `fd` for reading; it stays mapped as long as the process lives, because any
-// thread may be reading it, and further calls for the same file give the same mapping. Thread-safe.
-//   fails  protocol: this is no such page
+// The page behind `fd` for reading. It stays mapped as long as the process lives, because any thread
+// may be reading it; further calls for the same file return the same mapping. Thread-safe.
+//   fails  protocol: it is not such a page
 Result<const ClockPage*> map_clock_page_untrusted(int fd);
-
-// dssmd's side.
-class ClockPageWriter {
- public:
-  // Opens the page file `path`, or makes a new one when there is none, or one of another boot or
-  // layout. Programs that have the old one mapped keep it.
-  //   fails  os errors
-  static Result<ClockPageWriter> open(const std::string& path);
-  ClockPageWriter(ClockPageWriter&& other) noexcept;
-  ClockPageWriter& operator=(ClockPageWriter&&) = delete;
-  ~ClockPageWriter();
-
-  // Whether another dssmd of this boot wrote it before.
-  bool has_history() const noexcept { return has_history_; }
-  const ClockPage& page() const noexcept { return *page_; }
-
-  void store(const ClockRecord& record) noexcept;
-
-  // A descriptor for a program: read-only.
-  Result<UniqueFd> for_reading() const;
-
- private:
-  ClockPageWriter(std::string path, ClockPage* page, bool has_history) noexcept
-      : path_(std::move(path)), page_(page), has_history_(has_history) {}
-
-  std::string path_;
-  ClockPage* page_;
-  bool has_history_;
-};
 
 // /proc/sys/kernel/random/boot_id; empty when it cannot be read.
 std::string boot_id();

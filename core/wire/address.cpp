@@ -20,6 +20,7 @@ namespace dssm::wire {
 namespace {
 
 constexpr std::size_t kMaxHostNameBytes = 253;  // RFC 1035 2.3.4, without the final dot
+constexpr std::array<std::uint8_t, 12> kMappedIpv4{0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff};
 
 Error invalid(std::string_view text, std::string_view why) {
   return Error{Errc::invalid_argument, "address '" + std::string(text) + "': " + std::string(why)};
@@ -170,6 +171,37 @@ bool SocketAddress::is_loopback() const noexcept {
     return IN6_IS_ADDR_LOOPBACK(&ipv6.sin6_addr);
   }
   return false;
+}
+
+IpAddress IpAddress::of_ipv4(const void* four_bytes) {
+  IpAddress address;
+  std::copy(kMappedIpv4.begin(), kMappedIpv4.end(), address.bytes.begin());
+  std::memcpy(&address.bytes[kMappedIpv4.size()], four_bytes, 4);
+  return address;
+}
+
+std::optional<IpAddress> IpAddress::of(const SocketAddress& address) {
+  switch (address.storage.ss_family) {
+    case AF_INET:
+      return of_ipv4(&reinterpret_cast<const sockaddr_in*>(&address.storage)->sin_addr);
+    case AF_INET6: {
+      IpAddress ipv6;
+      std::memcpy(ipv6.bytes.data(),
+                  &reinterpret_cast<const sockaddr_in6*>(&address.storage)->sin6_addr,
+                  ipv6.bytes.size());
+      return ipv6;
+    }
+    default:
+      return {};
+  }
+}
+
+std::string IpAddress::str() const {
+  std::array<char, INET6_ADDRSTRLEN> text{};
+  const bool ipv4 = std::equal(kMappedIpv4.begin(), kMappedIpv4.end(), bytes.begin());
+  ::inet_ntop(ipv4 ? AF_INET : AF_INET6, &bytes[ipv4 ? kMappedIpv4.size() : 0], text.data(),
+              text.size());
+  return text.data();
 }
 
 Result<std::vector<SocketAddress>> resolve(const Address& address) {

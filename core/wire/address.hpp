@@ -5,8 +5,10 @@
 
 #include <sys/socket.h>
 
+#include <array>
 #include <cstdint>
 #include <dssm/result.hpp>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -38,6 +40,19 @@ struct SocketAddress {
   const sockaddr* get() const noexcept { return reinterpret_cast<const sockaddr*>(&storage); }
   std::string str() const;            // "10.0.0.2:13776", "[::1]:13776"
   bool is_loopback() const noexcept;  // 127.0.0.0/8, ::1, ::ffff:127.0.0.0/104
+};
+
+// An address without port, in 16 bytes: IPv4 as ::ffff:10.0.0.1, so that equal addresses have equal
+// bytes. A value.
+struct IpAddress {
+  std::array<std::uint8_t, 16> bytes{};
+
+  static IpAddress of_ipv4(const void* four_bytes);
+  // nullopt: it is neither IPv4 nor IPv6.
+  static std::optional<IpAddress> of(const SocketAddress& address);
+  std::string str() const;  // "10.0.0.1", "fd77::1"
+
+  friend bool operator==(const IpAddress&, const IpAddress&) = default;
 };
 
 // The addresses of `address`: at once for numbers; names are resolved (getaddrinfo), which may

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What a host says about its clock (common.proto, ClockStatus), as a value.
+// What a host reports of its clock to others (ClockReport in common.proto), as a value: a clock
+// snapshot, and the sync chain through which the clock reaches its reference. The one encoder and
+// decoder of both. docs/clocks.md "Between two PCs".
 #pragma once
 
 #include <array>
@@ -11,41 +13,50 @@
 #include <vector>
 
 #include "common.pb.h"
-#include "core/clock/sync_chain.hpp"
+#include "core/wire/address.hpp"
 
 namespace dssm::wire {
 
-// An address without port; IPv4 as such in IPv6 (::ffff:10.0.0.1).
-using IpBytes = std::array<std::uint8_t, 16>;
+using HostId = std::array<std::uint8_t, 16>;
+
+// One clock of a sync chain.
+struct ClockLink {
+  HostId host{};
+  Duration bound = kUnknownClockError;  // >= 0: from the time that this host's chronyd keeps
+
+  friend bool operator==(const ClockLink& a, const ClockLink& b) = default;
+};
 
 struct ClockReport {
-  static constexpr std::size_t kMostAddresses = 32;
+  // A chain that is longer has a loop.
+  static constexpr std::size_t kMaxLinks = 8;
+  static constexpr std::size_t kMaxAddresses = 32;
 
-  clock::SyncChain standing;
+  ClockSnapshot clock;           // bound: of its samples' times, against `anchor`
+  std::string boot_id;           // empty: not known
+  std::vector<ClockLink> chain;  // this clock, the one it follows, the one that that follows ...
+  HostId anchor{};               // the link of the chain against which samples are stamped
+  bool bound_is_root = false;    // clock.bound is clock.root_bound: it follows no host
+  bool root_is_utc = false;      // false: the root of its time is a PC that follows no other
+  std::string reference;         // the host or address that it follows, for people
+  std::vector<IpAddress> addresses;  // its own: so others recognize whom their chronyd follows
+  MonoTime as_of{};                  // when this was so, by CLOCK_MONOTONIC of this PC
 
-  // For people.
-  ClockStatus status = ClockStatus::unknown;
-  ClockReason trouble = ClockReason::none;
-  ClockBasis basis = ClockBasis::nothing;
-  Duration offset{};
-  Duration update_interval{};
-  Duration age{};  // since chronyd's last measurement
-  std::string reference;
-  std::uint16_t stratum = 0;
+  bool has_bound() const noexcept { return clock.bound != kUnknownClockError; }
+  // Whether both have the same kernel, and so the same clock.
+  bool shares_clock_with(const ClockReport& other) const noexcept {
+    return !boot_id.empty() && boot_id == other.boot_id;
+  }
+  // The link of `host`. kUnknownClockError: it is not in the chain.
+  Duration distance_from(const HostId& host) const noexcept;
 
-  // For hosts that follow this one.
-  std::vector<IpBytes> addresses;
-  clock::RootDistance root;
-
-  MonoTime heard{};  // when this was so, by our own clock
-
-  // As it is at `now`, when nothing more was heard.
+  // As it is at `now` without a later report: all bounds have grown.
   ClockReport at(MonoTime now) const;
 };
 
-void to_message(const ClockReport& report, proto::ClockStatus& out);
+void to_message(const ClockReport& report, proto::ClockReport& out);
 
-// Whatever is out of its limits counts as unknown.
-ClockReport clock_report_untrusted(const proto::ClockStatus& message, MonoTime heard);
+// Values beyond their limits count as unknown.
+ClockReport clock_report_untrusted(const proto::ClockReport& message, MonoTime as_of);
 
 }  // namespace dssm::wire

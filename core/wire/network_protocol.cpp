@@ -27,8 +27,8 @@ Error bad(const std::string& who, std::string_view why) {
   return Error{Errc::protocol, who + " greets with " + std::string(why)};
 }
 
-// Nobody knows how long it was under way, but a connection that takes longer is dead.
-std::shared_ptr<const ClockReport> news(const proto::ClockStatus& clock) {
+// It is not known how long the report was under way, but after kPeerTimeout the connection is dead.
+std::shared_ptr<const ClockReport> report_of(const proto::ClockReport& clock) {
   return std::make_shared<const ClockReport>(
       clock_report_untrusted(clock, MonoClock::now() - kPeerTimeout));
 }
@@ -122,7 +122,7 @@ Result<Greeting> greeting_untrusted(const proto::Hello& message, const std::stri
   greeting.program = message.program();
   greeting.version = message.version();
   if (message.has_clock()) {
-    greeting.clock = news(message.clock());
+    greeting.clock = report_of(message.clock());
   }
   return greeting;
 }
@@ -146,16 +146,16 @@ std::uint64_t random_number() {
   return number;
 }
 
-void send_clock(const Greeting& self, proto::ClockStatus& out) {
+void send_clock(const Greeting& self, proto::ClockReport& out) {
   if (self.clock) to_message(self.clock->at(MonoClock::now()), out);
 }
 
 std::shared_ptr<const ClockReport> clock_report_untrusted(const net::Pong& pong) {
-  return news(pong.clock());
+  return report_of(pong.clock());
 }
 
 Duration clock_bound_of(const Greeting& greeting) noexcept {
-  return greeting.clock ? greeting.clock->at(MonoClock::now()).standing.bound : kUnknownClockError;
+  return greeting.clock ? greeting.clock->at(MonoClock::now()).clock.bound : kUnknownClockError;
 }
 
 }  // namespace dssm::wire

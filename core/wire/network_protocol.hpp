@@ -31,8 +31,6 @@ inline constexpr Duration kPeerTimeout = std::chrono::milliseconds(2800);
 // For the first Hello of a connection to be complete.
 inline constexpr Duration kHelloTimeout = std::chrono::seconds(3);
 
-using HostId = std::array<std::uint8_t, 16>;
-
 // Who is at one end of a connection. A value.
 struct Greeting {
   std::string host;  // host's name, checked: 1 to 31 letters, digits and '-'
@@ -70,13 +68,13 @@ HostId host_id_for(std::string_view name);
 // Random and never 0.
 std::uint64_t random_number();
 
-// Writes the current report on this PC's clock; nothing when there is none.
-void send_clock(const Greeting& self, proto::ClockStatus& out);
+// Adds the report of our own clock as of now; nothing when nothing is known.
+void send_clock(const Greeting& self, proto::ClockReport& out);
 
-// The report on its sender's clock in a Pong that is an event.
+// The report in a Pong that was sent as an event.
 std::shared_ptr<const ClockReport> clock_report_untrusted(const net::Pong& pong);
 
-// The clock bound of the host that sent the greeting, as of now.
+// The bound that the host behind the greeting reported of its clock, aged until now.
 Duration clock_bound_of(const Greeting& greeting) noexcept;
 
 }  // namespace dssm::wire

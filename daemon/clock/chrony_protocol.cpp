@@ -30,7 +30,6 @@ constexpr std::uint16_t kNoAddress = 0, kIpv4 = 1, kIpv6 = 2, kNumber = 3;
 // The upper half of the seconds of a chronyd that counts them in 32 bits.
 constexpr std::uint32_t kNoHighSeconds = 0x7fffffff;
 
-constexpr std::array<std::uint8_t, 12> kMappedIpv4{0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff};
 constexpr std::int64_t kBillion = 1'000'000'000;
 constexpr int kCoefficientBits = 25, kExponentBits = 7;
 
@@ -91,38 +90,7 @@ Time time_at(std::uint32_t high, std::uint32_t low, std::uint32_t nanoseconds) {
   return time_from_ns(static_cast<std::int64_t>(std::min(seconds, kMost)) * kBillion + nanoseconds);
 }
 
-SourceAddress mapped(const void* ipv4) {
-  SourceAddress address;
-  std::copy(kMappedIpv4.begin(), kMappedIpv4.end(), address.bytes.begin());
-  std::memcpy(&address.bytes[kMappedIpv4.size()], ipv4, 4);
-  return address;
-}
-
 }  // namespace
-
-std::optional<SourceAddress> SourceAddress::of(const wire::SocketAddress& address) {
-  switch (address.storage.ss_family) {
-    case AF_INET:
-      return mapped(&reinterpret_cast<const sockaddr_in*>(&address.storage)->sin_addr);
-    case AF_INET6: {
-      SourceAddress ipv6;
-      std::memcpy(ipv6.bytes.data(),
-                  &reinterpret_cast<const sockaddr_in6*>(&address.storage)->sin6_addr,
-                  ipv6.bytes.size());
-      return ipv6;
-    }
-    default:
-      return {};
-  }
-}
-
-std::string SourceAddress::str() const {
-  std::array<char, INET6_ADDRSTRLEN> text{};
-  const bool ipv4 = std::equal(kMappedIpv4.begin(), kMappedIpv4.end(), bytes.begin());
-  ::inet_ntop(ipv4 ? AF_INET : AF_INET6, &bytes[ipv4 ? kMappedIpv4.size() : 0], text.data(),
-              text.size());
-  return text.data();
-}
 
 std::array<std::byte, kTrackingBytes> tracking_request(std::uint32_t sequence) {
   std::array<std::byte, kTrackingBytes> request{};
@@ -167,7 +135,7 @@ Result<TrackingReply> tracking_untrusted(std::span<const std::byte> datagram) {
   TrackingReply reply;
   switch (const std::uint16_t family = short_at(datagram, kFamily)) {
     case kIpv4:
-      reply.source = mapped(&datagram[kAddress]);
+      reply.source = wire::IpAddress::of_ipv4(&datagram[kAddress]);
       break;
     case kIpv6:
       reply.source.emplace();

@@ -19,26 +19,15 @@
 #include <span>
 #include <string>
 
-#include "core/clock/clock_estimator.hpp"
 #include "core/wire/address.hpp"
+#include "daemon/clock/clock_estimator.hpp"
 
 namespace dssm::daemon {
-
-// Whom chronyd follows. A value; IPv4 as such in IPv6 (::ffff:10.0.0.1), so that equal is equal.
-struct SourceAddress {
-  std::array<std::uint8_t, 16> bytes{};
-
-  // Without the port; nothing for what is neither IPv4 nor IPv6.
-  static std::optional<SourceAddress> of(const wire::SocketAddress& address);
-  std::string str() const;  // "10.0.0.1", "fd77::1"
-
-  friend bool operator==(const SourceAddress&, const SourceAddress&) = default;
-};
 
 // What chronyd answers.
 struct TrackingReply {
   clock::Tracking tracking;
-  std::optional<SourceAddress> source;  // nothing: it follows nobody, or a clock of this PC
+  std::optional<wire::IpAddress> source;  // nullopt: it follows no host, or a clock of this PC
 };
 
 // The length of a reply, and of a request, too, or chronyd refuses it: nobody shall make it send

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/clock/clock_watch.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <array>
 #include <cstdio>
@@ -47,35 +49,36 @@ ClockWatch::ClockWatch(const EventLoop& loop, const Options& options, Observer& 
 }
 
 Instant ClockWatch::base() {
-  look(now_());
+  observe(now_());
   return *estimator_.base();
 }
 
-clock::ClockState ClockWatch::state() {
+ClockSnapshot ClockWatch::state() {
   const Instant now = now_();
-  look(now);
-  clock::ClockState state = estimator_.at(now.mono);
-  // Whoever asks why wants to know that it was never there.
-  if (state.status == ClockStatus::unknown && absent_) state.trouble = ClockReason::no_chronyd;
+  observe(now);
+  ClockSnapshot state = estimator_.at(now.mono);
+  if (last_) state.update_interval = last_->tracking.update_interval;
+  // Before its first answer, the reason is still that it is absent.
+  if (state.status == ClockStatus::unknown && absent_) state.reason = ClockReason::no_chronyd;
   return state;
 }
 
 [[gnu::hot]] bool ClockWatch::may_differ() {
   const clock::Tick tick = tick_();
   if (seen_tick_ && tick.difference == seen_tick_->difference &&
-      tick.mono - seen_tick_->mono < kMostDelay) {
+      tick.mono - seen_tick_->mono < kMaxDelay) {
     return false;
   }
   seen_tick_ = tick;
   return true;
 }
 
-std::optional<SourceAddress> ClockWatch::source() const noexcept {
+std::optional<wire::IpAddress> ClockWatch::source() const noexcept {
   return last_ ? last_->source : std::nullopt;
 }
 
-Duration ClockWatch::update_interval() const noexcept {
-  return last_ ? last_->tracking.update_interval : Duration::zero();
+std::uint32_t ClockWatch::reference_id() {
+  return state().bound == kUnknownClockError ? 0 : estimator_.reference_id();
 }
 
 void ClockWatch::on_reference(const std::optional<clock::ReferenceReport>& report) noexcept {
@@ -83,44 +86,44 @@ void ClockWatch::on_reference(const std::optional<clock::ReferenceReport>& repor
 }
 
 void ClockWatch::on_answer(const TrackingReply& reply, MonoTime asked, const Instant& answered) {
-  look(answered);
+  observe(answered);
   if (estimator_.take_untrusted(reply.tracking, asked, answered) ==
-      clock::ClockEstimator::Verdict::nonsense) {
+      clock::ClockEstimator::Outcome::nonsense) {
     return on_no_answer(
         {Errc::protocol, "what it says cannot be; does `chronyc tracking` say so?"});
   }
   last_ = reply;
   absent_ = false;
   waiting_since_.reset();
-  changed(answered);
+  on_change(answered);
 }
 
 void ClockWatch::on_no_chronyd() {
   const Instant now = now_();
-  look(now);
+  observe(now);
   estimator_.on_no_chronyd();
   last_.reset();
   absent_ = true;
   waiting_since_.reset();
-  changed(now);
+  on_change(now);
 }
 
 void ClockWatch::on_no_answer(const Error& why) {
   const Instant now = now_();
-  look(now);
+  observe(now);
   if (!waiting_since_) waiting_since_ = now.mono;
-  why_ = why.message;
-  changed(now);
+  last_error_ = why.message;
+  on_change(now);
 }
 
 void ClockWatch::on_set() {
   const Instant now = now_();
-  look(now);
-  changed(now);
+  observe(now);
+  on_change(now);
 }
 
-void ClockWatch::look(const Instant& now) {
-  const std::optional<Duration> step = estimator_.look(now);
+void ClockWatch::observe(const Instant& now) {
+  const std::optional<Duration> step = estimator_.observe(now);
   if (!step) return;
   const auto steps = step_lines_.admit(now.mono);
   if (!steps) return;
@@ -132,17 +135,17 @@ void ClockWatch::look(const Instant& now) {
                   {.message_id = message_id::kClockStepped});
 }
 
-// Something may have: tells the log if so, and the observer in any case.
-void ClockWatch::changed(const Instant& now) {
-  const clock::ClockState state = estimator_.at(now.mono);
+// Logs a change of the condition, if there is one, and notifies the observer in any case.
+void ClockWatch::on_change(const Instant& now) {
+  const ClockSnapshot state = estimator_.at(now.mono);
   const Condition is = condition(state, now.mono);
   if (is != std::exchange(seen_, is)) ++unlogged_changes_;
-  // One that comes and goes while nothing may be said is counted; one that stays is told later.
-  if (is != told_ && change_lines_.wait(now.mono) == Duration::zero()) tell(is, state, now.mono);
+  // One that comes and goes while the log is limited is counted; one that lasts is logged later.
+  if (is != logged_ && change_lines_.wait(now.mono) == Duration::zero()) log(is, state, now.mono);
   observer_.on_clock();
 }
 
-ClockWatch::Condition ClockWatch::condition(const clock::ClockState& state,
+ClockWatch::Condition ClockWatch::condition(const ClockSnapshot& state,
                                             MonoTime now) const noexcept {
   if (absent_ || state.status == ClockStatus::unknown) {
     // A chronyd that is just starting may take a while to answer.
@@ -152,7 +155,7 @@ ClockWatch::Condition ClockWatch::condition(const clock::ClockState& state,
   }
   if (state.status == ClockStatus::holdover) return Condition::holdover;
   if (state.status == ClockStatus::synchronized) return Condition::good;
-  switch (state.trouble) {
+  switch (state.reason) {
     case ClockReason::unsynchronized:
       return Condition::unsynchronized;
     case ClockReason::stepped:
@@ -167,10 +170,10 @@ ClockWatch::Condition ClockWatch::condition(const clock::ClockState& state,
   return Condition::silent;
 }
 
-void ClockWatch::tell(Condition condition, const clock::ClockState& state, MonoTime now) {
-  const bool was_away = told_ == Condition::absent || told_ == Condition::silent;
-  const bool is_step = condition == Condition::stepped && !was_away;  // look() has told that
-  told_ = condition;
+void ClockWatch::log(Condition condition, const ClockSnapshot& state, MonoTime now) {
+  const bool was_away = logged_ == Condition::absent || logged_ == Condition::silent;
+  const bool is_step = condition == Condition::stepped && !was_away;  // observe() has logged that
+  logged_ = condition;
   if (is_step || condition == Condition::unknown) {
     --unlogged_changes_;
     return;
@@ -187,7 +190,7 @@ void ClockWatch::tell(Condition condition, const clock::ClockState& state, MonoT
                              {.message_id = message_id::kChronydAway});
     case Condition::silent:
       return logger_.warning(where_ + " does not tell how this PC's clock is" + after +
-                                 "; the clock has no bound: " + why_,
+                                 "; the clock has no bound: " + last_error_,
                              {.message_id = message_id::kChronydAway});
     case Condition::unsynchronized:
       return logger_.warning(back + "chronyd does not know the time" + after +
@@ -199,49 +202,53 @@ void ClockWatch::tell(Condition condition, const clock::ClockState& state, MonoT
           back + "this PC's clock was set, and chronyd has yet to measure it anew" + after,
           {.message_id = message_id::kClockOutOfBounds});
     case Condition::too_far:
-      return logger_.warning(back + too_far(state, now) + after,
+      return logger_.warning(back + too_far(state) + after,
                              {.message_id = message_id::kClockOutOfBounds});
     case Condition::holdover:
     case Condition::good:
-      return logger_.notice(back + in_bounds(condition, state, now) + after,
+      return logger_.notice(back + in_bounds(condition, state) + after,
                             {.message_id = message_id::kClockInBounds});
     case Condition::unknown:
       return;
   }
 }
 
-std::string ClockWatch::in_bounds(Condition condition, const clock::ClockState& state,
-                                  MonoTime now) const {
+std::string ClockWatch::in_bounds(Condition condition, const ClockSnapshot& state) const {
   const char* const from = state.basis == ClockBasis::own ? "the time that it gives to others"
                            : state.basis == ClockBasis::reference ? "the reference PC's"
                                                                   : "the right time";
-  std::string text = "this PC's clock is within " + length_text(state.bound) + " of " + from +
-                     " (limit " + length_text(estimator_.settings().limit) + ")";
+  std::string text =
+      fmt::format("this PC's clock is within {} of {} (limit {})", length_text(state.bound), from,
+                  length_text(estimator_.settings().limit));
   if (condition == Condition::holdover) {
-    text += ", but chronyd has learned nothing for " + length_text(now - state.updated) +
-            ": that grows by " + length_text(Duration(state.ageing)) +
-            " each second; does it reach its sources (`chronyc sources`)?";
+    text += fmt::format(
+        ", but chronyd has learned nothing for {}: that grows by {} each second; does it reach its "
+        "sources (`chronyc sources`)?",
+        length_text(state.age), length_text(Duration(state.ageing_ppb)));
   }
   return text;
 }
 
-std::string ClockWatch::too_far(const clock::ClockState& state, MonoTime now) const {
+std::string ClockWatch::too_far(const ClockSnapshot& state) const {
   const Duration off = std::chrono::abs(state.offset);
-  const Duration aged = clock::growth(now - state.updated, state.ageing);
+  const Duration aged = clock::growth(state.age, state.ageing_ppb);
   const Duration way = state.bound - off - aged;
-  std::string text = "this PC's clock may be wrong by " + length_text(state.bound) +
-                     ", more than its limit of " + length_text(estimator_.settings().limit);
+  const std::string text =
+      fmt::format("this PC's clock may be wrong by {}, more than its limit of {}",
+                  length_text(state.bound), length_text(estimator_.settings().limit));
   if (off >= std::max(aged, way)) {
-    return text + ": it is off by " + length_text(off) +
-           ", which chronyd is slewing away; wait, or step it (`chronyc makestep`)";
+    return fmt::format(
+        "{}: it is off by {}, which chronyd is slewing away; wait, or step it (`chronyc makestep`)",
+        text, length_text(off));
   }
   if (aged >= way) {
-    return text + ": chronyd has learned nothing for " + length_text(now - state.updated) +
-           "; does it reach its sources (`chronyc sources`)?";
+    return fmt::format(
+        "{}: chronyd has learned nothing for {}; does it reach its sources (`chronyc sources`)?",
+        text, length_text(state.age));
   }
   return text +
-         ": so far is the source that chronyd follows from its root, or the network "
-         "delays its packets (`chronyc ntpdata`); is there a nearer one?";
+         ": so far is the source that chronyd follows from its root, or the network delays its "
+         "packets (`chronyc ntpdata`); is there a nearer one?";
 }
 
 }  // namespace dssm::daemon

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What this PC's clock is worth at each moment: asks chronyd, watches for steps, keeps the
-// estimate, and tells the log what changes. docs/clocks.md
+// The snapshot of this PC's clock at each moment: asks chronyd, watches for steps, keeps the
+// estimate, and logs what changes. docs/clocks.md
 #pragma once
 
 #include <functional>
@@ -9,13 +9,13 @@
 #include <optional>
 #include <string>
 
-#include "core/clock/clock_estimator.hpp"
-#include "core/clock/clock_tick.hpp"
 #include "core/wire/address.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/base/rate_limiter.hpp"
 #include "daemon/clock/chronyd_client.hpp"
+#include "daemon/clock/clock_estimator.hpp"
+#include "daemon/clock/clock_tick.hpp"
 #include "daemon/clock/step_watch.hpp"
 
 namespace dssm::daemon {
@@ -25,7 +25,7 @@ class ClockWatch final : private ChronydClient::Observer {
   struct Options {
     wire::SocketAddress chronyd;
     clock::ClockEstimator::Settings settings;
-    // Tests put their own in their places.
+    // Tests replace these.
     ChronydClient::Now now = clock::Instant::now;
     Duration period = ChronydClient::kPeriod;
     std::function<clock::Tick()> tick = clock::Tick::last;
@@ -33,8 +33,8 @@ class ClockWatch final : private ChronydClient::Observer {
 
   class Observer {
    public:
-    // Look at state() again: after each answer of chronyd, each period without one, and at once
-    // after a step, or when chronyd is found to be gone.
+    // state() may have changed: after each answer of chronyd, each period without one, and at once
+    // after a step, or when nothing listens at chronyd's address any more.
     virtual void on_clock() = 0;
 
    protected:
@@ -46,36 +46,37 @@ class ClockWatch final : private ChronydClient::Observer {
   ClockWatch(const ClockWatch&) = delete;
   ClockWatch& operator=(const ClockWatch&) = delete;
 
-  // Takes over from an earlier dssmd of this boot, whose base() this was: the clock counts as
-  // stepped when it was set in between. Before anything else is called.
+  // Continues for an earlier dssmd of this boot, whose base() this was: the clock counts as stepped
+  // when it was set in between. Called first.
   void resume(const clock::Instant& base) noexcept { estimator_.resume(base); }
-  // Since when the clock is whole: an instant after the last step, or, until chronyd is believed
-  // again, one before it.
+  // An instant after the last step, or, until chronyd has measured enough after it, one before it.
   clock::Instant base();
 
-  clock::ClockState state();  // at this moment
+  ClockSnapshot state();  // at this moment; `bound` is the distance from the source
+  Duration own_bound() const noexcept { return estimator_.own_bound(); }
+  // Of the source that the bound is a distance from; 0 without a bound.
+  std::uint32_t reference_id();
 
-  // Whether state() may tell something else than when this was asked last. Costs much less, and
-  // misses no step; what comes with time alone (chronyd is silent) may be kMostDelay old.
+  // Whether state() may differ from when this was called last. Costs much less, and misses no step;
+  // what changes with time alone (chronyd is silent) may be kMaxDelay late.
   bool may_differ();
-  static constexpr Duration kMostDelay = std::chrono::milliseconds(50);
+  static constexpr Duration kMaxDelay = std::chrono::milliseconds(50);
 
-  // dssmd is awake anyway: chronyd is asked now when that is about due.
+  // dssmd is awake: a question to chronyd that is about due is sent now.
   void poll_if_due() { client_.poll_if_due(); }
 
-  // Of chronyd's last answer, while there is a chronyd: whom it follows, and how often it measures.
-  std::optional<SourceAddress> source() const noexcept;
-  Duration update_interval() const noexcept;  // 0 without one
+  // The host that chronyd follows, by its last answer.
+  std::optional<wire::IpAddress> source() const noexcept;
 
   void set(const clock::ClockEstimator::Settings& settings) noexcept { estimator_.set(settings); }
   void on_reference(const std::optional<clock::ReferenceReport>& report) noexcept;
 
  private:
-  // What the log tells apart.
+  // What the log distinguishes.
   enum class Condition {
     unknown,
-    absent,  // chronyd; and the following one, too
-    silent,
+    absent,  // chronyd
+    silent,  // chronyd
     unsynchronized,
     stepped,
     too_far,
@@ -89,12 +90,12 @@ class ClockWatch final : private ChronydClient::Observer {
   void on_no_answer(const Error& why) override;
   void on_set();
 
-  void look(const clock::Instant& now);
-  void changed(const clock::Instant& now);
-  Condition condition(const clock::ClockState& state, MonoTime now) const noexcept;
-  void tell(Condition condition, const clock::ClockState& state, MonoTime now);
-  std::string in_bounds(Condition condition, const clock::ClockState& state, MonoTime now) const;
-  std::string too_far(const clock::ClockState& state, MonoTime now) const;
+  void observe(const clock::Instant& now);
+  void on_change(const clock::Instant& now);
+  Condition condition(const ClockSnapshot& state, MonoTime now) const noexcept;
+  void log(Condition condition, const ClockSnapshot& state, MonoTime now);
+  std::string in_bounds(Condition condition, const ClockSnapshot& state) const;
+  std::string too_far(const ClockSnapshot& state) const;
 
   const std::string where_;  // "chronyd at '127.0.0.1:323'"
   Observer& observer_;
@@ -104,11 +105,11 @@ class ClockWatch final : private ChronydClient::Observer {
   clock::ClockEstimator estimator_;
   std::optional<clock::Tick> seen_tick_;   // before may_differ() was true last
   std::optional<TrackingReply> last_;      // while there is a chronyd
-  bool absent_ = false;                    // nothing listens there
+  bool absent_ = false;                    // nothing listens at its address
   std::optional<MonoTime> waiting_since_;  // no answer since then
-  std::string why_;                        // there is none
-  Condition seen_ = Condition::unknown, told_ = Condition::unknown;
-  // So that a clock that is set every second, or goes in and out of bounds, does not fill the log.
+  std::string last_error_;                 // why there is none
+  Condition seen_ = Condition::unknown, logged_ = Condition::unknown;
+  // A clock that is set every second, or goes in and out of bounds, must not fill the log.
   RateLimiter change_lines_{4, std::chrono::minutes(1)}, step_lines_{4, std::chrono::minutes(1)};
   std::uint64_t unlogged_changes_ = 0;
   std::unique_ptr<StepWatch> step_watch_;  // null: no descriptor was left for it

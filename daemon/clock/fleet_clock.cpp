@@ -1,6 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// refresh() runs after each answer of chronyd, each report of the host that this one follows, and
+// each step. It derives this host's report in one order: whom chronyd follows (find_source), the
+// chain through that host and the anchor of our samples (update_chain), and the status against the
+// anchor (update_status). Then it publishes the report, and notifies who depends on it.
 #include "daemon/clock/fleet_clock.hpp"
 
+#include <fmt/format.h>
 #include <ifaddrs.h>
 #include <netinet/in.h>
 #include <sys/socket.h>
@@ -9,18 +15,21 @@
 #include <cstring>
 #include <utility>
 
+#include "core/base/bound_sum.hpp"
+#include "core/clock/clock_bound.hpp"
+#include "daemon/clock/clock_distance.hpp"
+
 namespace dssm::daemon {
 namespace {
 
 constexpr Duration kAddressesPeriod = std::chrono::seconds(5);
 
 std::string in_microseconds(Duration d) {
-  if (d == kUnknownClockError) return "unknown";
-  return std::to_string((to_ns(d) + 999) / 1000) + " us";
+  return d == kUnknownClockError ? "unknown" : fmt::format("{} us", (to_ns(d) + 999) / 1000);
 }
 
-std::vector<wire::IpBytes> own_addresses() {
-  std::vector<wire::IpBytes> addresses;
+std::vector<wire::IpAddress> own_addresses() {
+  std::vector<wire::IpAddress> addresses;
   ifaddrs* all = nullptr;
   if (::getifaddrs(&all)) return addresses;
   for (const ifaddrs* one = all; one; one = one->ifa_next) {
@@ -30,10 +39,8 @@ std::vector<wire::IpBytes> own_addresses() {
     wire::SocketAddress address;
     address.length = family == AF_INET ? sizeof(sockaddr_in) : sizeof(sockaddr_in6);
     std::memcpy(&address.storage, one->ifa_addr, address.length);
-    if (address.is_loopback() || addresses.size() == wire::ClockReport::kMostAddresses) continue;
-    if (const std::optional<SourceAddress> bytes = SourceAddress::of(address)) {
-      addresses.push_back(bytes->bytes);
-    }
+    if (address.is_loopback() || addresses.size() == wire::ClockReport::kMaxAddresses) continue;
+    if (const auto ip = wire::IpAddress::of(address)) addresses.push_back(*ip);
   }
   ::freeifaddrs(all);
   return addresses;
@@ -45,11 +52,8 @@ bool is_good(ClockStatus status) noexcept {
 
 // Whether other hosts have to know of the change before they get another sample.
 bool is_new_generation(const wire::ClockReport& before, const wire::ClockReport& after) {
-  const auto is_known = [](const wire::ClockReport& report) {
-    return report.standing.bound != kUnknownClockError;
-  };
-  return before.status != after.status || is_known(before) != is_known(after) ||
-         before.standing.anchor != after.standing.anchor;
+  return before.clock.status != after.clock.status || before.has_bound() != after.has_bound() ||
+         before.anchor != after.anchor;
 }
 
 }  // namespace
@@ -64,19 +68,20 @@ FleetClock::FleetClock(const EventLoop& loop, const Options& options, clock::Clo
       policies_(options.policies),
       log_(logger),
       watch_(loop, options.watch, *this, logger) {
-  own_->standing.boot_id = clock::boot_id();
-  own_->standing.anchor = self_;
+  own_->boot_id = clock::boot_id();
+  own_->anchor = self_;
   if (page_.has_history()) {
-    const clock::ClockRecord before = clock::load(page_.page());
-    watch_.resume(before.base);
-    was_in_bounds_ = is_good(before.state.status);
+    clock::ClockPageState before;
+    page_.page().state.load(before);
+    watch_.resume({before.base_mono, before.base_wall, before.base_width});
+    was_in_bounds_ = is_good(before.clock.status);
   }
   catalog_.add_observer(*this);
 }
 
 FleetClock::~FleetClock() { catalog_.remove_observer(*this); }
 
-void FleetClock::set(const clock::ClockPolicies& policies, clock::PartsPerBillion max_drift) {
+void FleetClock::set(const ClockPolicies& policies, clock::PartsPerBillion max_drift) {
   policies_ = policies;
   watch_.set({policies.general.limit, max_drift});
   refresh();
@@ -85,7 +90,7 @@ void FleetClock::set(const clock::ClockPolicies& policies, clock::PartsPerBillio
 void FleetClock::on_clock() { refresh(); }
 
 void FleetClock::on_host_clock(const KnownHost& host) {
-  // The others are heard often enough by the tick of our own watch.
+  // The reports of others are used at the latest with the next answer of chronyd.
   if (source_ && host.greeting.host_id == source_->id) refresh();
   poll_if_due();
 }
@@ -97,25 +102,24 @@ void FleetClock::on_host_down(const KnownHost& host, const Error&) {
 
 [[gnu::hot]] std::uint64_t FleetClock::clock_generation() {
   if (!watch_.may_differ()) return generation_;
-  const bool is_known = watch_.state().bound != kUnknownClockError;
-  if (is_known != (own_->standing.bound != kUnknownClockError)) refresh();
+  const bool has_bound = watch_.state().bound != kUnknownClockError;
+  if (has_bound != own_->has_bound()) refresh();
   return generation_;
 }
 
-// --- where this clock stands
+// --- this host's report
 
 void FleetClock::refresh() {
   const clock::Instant instant = clock::Instant::now();
   const MonoTime now = instant.mono;
-  find_source(now);
-  const clock::ClockState state = watch_.state();
   const wire::ClockReport before = *own_;
-  look_up_addresses(now);
-  update_chain(state, now);
-  update_status(state);
-  publish(state, instant);
+  find_source(now);
+  update_addresses(now);
+  update_chain(now);
+  update_status();
+  publish(instant);
   log_others(now);
-  was_in_bounds_ |= is_good(own_->status);
+  was_in_bounds_ |= is_good(own_->clock.status);
   if (is_new_generation(before, *own_)) {
     ++generation_;
     if (on_new_generation_) on_new_generation_();
@@ -123,175 +127,167 @@ void FleetClock::refresh() {
   if (on_change_) on_change_();
 }
 
-const KnownHost* FleetClock::host_at(const SourceAddress& address) const {
+const KnownHost* FleetClock::host_at(const wire::IpAddress& address) const {
   for (const auto& [id, host] : catalog_.hosts()) {
     if (!host.greeting.clock) continue;
-    const std::vector<wire::IpBytes>& theirs = host.greeting.clock->addresses;
-    if (std::find(theirs.begin(), theirs.end(), address.bytes) != theirs.end()) return &host;
+    const std::vector<wire::IpAddress>& theirs = host.greeting.clock->addresses;
+    if (std::find(theirs.begin(), theirs.end(), address) != theirs.end()) return &host;
   }
   return nullptr;
 }
 
-// Whom chronyd follows. One that is away is still known for as long as chronyd names its address.
+// Whom chronyd follows. A host that becomes unavailable stays the source for as long as chronyd
+// names its address.
 void FleetClock::find_source(MonoTime now) {
-  const std::optional<SourceAddress> address = watch_.source();
+  const std::optional<wire::IpAddress> address = watch_.source();
   if (address != source_address_) source_.reset();
   source_address_ = address;
   const KnownHost* host = address ? host_at(*address) : nullptr;
-  const std::vector<wire::IpBytes>& own = own_->addresses;
-  const bool is_own = address && std::find(own.begin(), own.end(), address->bytes) != own.end();
+  const std::vector<wire::IpAddress>& own = own_->addresses;
+  const bool is_own = address && std::find(own.begin(), own.end(), *address) != own.end();
   if (host && !is_own) {
     source_ = Source{host->greeting.host_id, host->greeting.host, host->greeting.clock, {}};
-    watch_.on_reference(clock::ReferenceReport{watch_.state().reference_id, source_->report->root});
+    watch_.on_reference(clock::ReferenceReport{watch_.reference_id(), source_->report->clock.root});
   } else if (!source_) {
     watch_.on_reference(std::nullopt);
-  } else if (!source_->away_since) {
-    source_->away_since = now;
+  } else if (!source_->unavailable_since) {
+    source_->unavailable_since = now;
   }
 }
 
 bool FleetClock::is_followed() const {
   return std::any_of(catalog_.hosts().begin(), catalog_.hosts().end(), [this](const auto& entry) {
     const auto& clock = entry.second.greeting.clock;
-    if (!clock || entry.first == self_) return false;
-    const std::vector<clock::ClockLink>& chain = clock->standing.chain;
-    return chain.size() > 1 && chain[1].clock == self_;
+    return clock && entry.first != self_ && clock->chain.size() > 1 &&
+           clock->chain[1].host == self_;
   });
 }
 
-void FleetClock::look_up_addresses(MonoTime now) {
+void FleetClock::update_addresses(MonoTime now) {
   if (!own_->addresses.empty() && now - addresses_read_ < kAddressesPeriod) return;
   addresses_read_ = now;
   own_->addresses = own_addresses();
 }
 
-void FleetClock::update_chain(const clock::ClockState& state, MonoTime now) {
-  clock::SyncChain& own = own_->standing;
-  own_->heard = now;
-  own.chain.clear();
-  own.ageing = state.ageing;
-  own.root_bound = state.root_bound;
-  own.root_is_utc = state.basis != ClockBasis::own;
-  if (state.bound != kUnknownClockError) {
-    own.chain.push_back({self_, state.own_bound});
+// Bounds of the watch are distances from the source; those of the report are from the anchor.
+void FleetClock::update_chain(MonoTime now) {
+  const ClockSnapshot watched = watch_.state();
+  own_->as_of = now;
+  own_->clock = watched;
+  own_->chain.clear();
+  own_->root_is_utc = watched.basis != ClockBasis::own;
+  if (watched.bound != kUnknownClockError) {
+    own_->chain.push_back({self_, watch_.own_bound()});
     if (source_) {
-      const clock::SyncChain theirs = source_->report->at(now).standing;
-      own.root_is_utc = theirs.root_is_utc;
-      own.chain.push_back({source_->id, state.bound});
+      const wire::ClockReport theirs = source_->report->at(now);
+      own_->root_is_utc = theirs.root_is_utc;
+      own_->chain.push_back({source_->id, watched.bound});
       for (std::size_t i = 1; i < theirs.chain.size(); ++i) {
-        const clock::ClockLink& link = theirs.chain[i];
-        if (own.chain.size() == clock::SyncChain::kMostLinks) break;
-        if (own.distance_from(link.clock) != kUnknownClockError) break;  // a loop
-        own.chain.push_back({link.clock, clock::sum(state.bound, link.bound)});
+        const wire::ClockLink& link = theirs.chain[i];
+        if (own_->chain.size() == wire::ClockReport::kMaxLinks) break;
+        if (own_->distance_from(link.host) != kUnknownClockError) break;  // a loop
+        own_->chain.push_back({link.host, sum(watched.bound, link.bound)});
       }
     }
   }
-  choose_anchor(state, now);
+  choose_anchor(watched, now);
 }
 
-// What our samples are stamped against: the first host of the chain, as long as it is there.
-void FleetClock::choose_anchor(const clock::ClockState& state, MonoTime now) {
-  clock::SyncChain& own = own_->standing;
+// What our samples are stamped against: the last host of the chain while it is available.
+void FleetClock::choose_anchor(const ClockSnapshot& watched, MonoTime now) {
+  wire::ClockReport& own = *own_;
   own.bound_is_root = false;
   own.anchor = self_;
-  own.bound = state.own_bound;
-  if (state.bound == kUnknownClockError || state.basis == ClockBasis::own) {
-    own_->basis = state.basis;
+  if (watched.bound == kUnknownClockError) return;
+  own.clock.bound = watch_.own_bound();
+  if (watched.basis == ClockBasis::own) return;
+  const bool has_successor = source_ && source_->unavailable_since &&
+                             now - *source_->unavailable_since > kSuccessionDelay && is_followed();
+  if (source_ && !has_successor) {
+    const wire::HostId& theirs = source_->report->anchor;
+    const bool in_chain = own.distance_from(theirs) != kUnknownClockError;
+    own.anchor = theirs == self_ || !in_chain ? source_->id : theirs;
+    own.clock.bound = own.distance_from(own.anchor);
+    own.clock.basis = ClockBasis::reference;
     return;
   }
-  const bool is_gone =
-      source_ && source_->away_since && now - *source_->away_since > kPatience && is_followed();
-  if (source_ && !is_gone) {
-    const clock::ClockId& theirs = source_->report->standing.anchor;
-    const Duration to_theirs = own.distance_from(theirs);
-    own.anchor = theirs == self_ || to_theirs == kUnknownClockError ? source_->id : theirs;
-    own.bound = own.distance_from(own.anchor);
-    own_->basis = ClockBasis::reference;
-    return;
-  }
-  own_->basis = is_followed() ? ClockBasis::own : ClockBasis::root;
-  if (own_->basis == ClockBasis::own) return;
-  own.bound = state.root_bound;
+  own.clock.basis = is_followed() ? ClockBasis::own : ClockBasis::root;
+  if (own.clock.basis == ClockBasis::own) return;
+  own.clock.bound = watched.root_bound;
   own.bound_is_root = true;
 }
 
-// The watch judges the distance from the source; what counts is the one from the anchor.
-void FleetClock::update_status(const clock::ClockState& state) {
-  own_->status = state.status;
-  own_->trouble = state.trouble;
-  if (state.bound != kUnknownClockError) {
-    const bool is_within = own_->standing.bound <= policies_.general.limit;
-    if (is_within && state.status == ClockStatus::out_of_bounds) {
-      own_->status = ClockStatus::synchronized;
-      own_->trouble = ClockReason::none;
+// The watch compares the distance from the source with the limit; the one from the anchor decides.
+void FleetClock::update_status() {
+  ClockSnapshot& clock = own_->clock;
+  if (own_->has_bound()) {
+    const bool is_within = clock.bound <= policies_.general.limit;
+    if (is_within && clock.status == ClockStatus::out_of_bounds) {
+      clock.status = ClockStatus::synchronized;
+      clock.reason = ClockReason::none;
     } else if (!is_within) {
-      own_->status = ClockStatus::out_of_bounds;
-      own_->trouble = ClockReason::too_far;
+      clock.status = ClockStatus::out_of_bounds;
+      clock.reason = ClockReason::too_far;
     }
   }
-  own_->offset = state.offset;
-  own_->stratum = state.stratum;
-  own_->root = state.root;
-  own_->update_interval = watch_.update_interval();
-  own_->age = state.updated == MonoTime{} ? Duration{} : own_->heard - state.updated;
   own_->reference = source_           ? source_->name
                     : source_address_ ? source_address_->str()
                                       : std::string();
 }
 
-void FleetClock::publish(const clock::ClockState& state, const clock::Instant& now) {
-  const Duration bound = own_->standing.bound;
-  if (bound == kUnknownClockError) {
+void FleetClock::publish(const clock::Instant& now) {
+  const ClockSnapshot& clock = own_->clock;
+  if (!own_->has_bound()) {
     stated_.clear();  // what was stated before a step holds for no time that is read now
   } else {
-    stated_.push_back({now.wall, bound});
+    stated_.push_back({now.wall, clock.bound});
     while (stated_.front().wall < now.wall - kReach) stated_.pop_front();
   }
-  clock::ClockRecord record;
-  record.wall = now.wall;
-  record.mono = now.mono;
-  record.state = state;
-  record.state.status = own_->status;
-  record.state.trouble = own_->trouble;
-  record.state.basis = own_->basis;
-  record.state.bound = bound;
-  record.limit = policies_.general.limit;
-  record.reference = own_->reference;
-  record.base = watch_.base();
-  record.earlier_from = now.wall;
+  clock::ClockPageState state;
+  state.wall = now.wall;
+  state.mono = now.mono;
+  state.clock = clock;
+  state.limit = policies_.general.limit;
+  own_->reference.copy(state.reference, clock::ClockPageState::kMaxReferenceBytes);
+  const clock::Instant base = watch_.base();
+  state.base_mono = base.mono;
+  state.base_wall = base.wall;
+  state.base_width = base.width;
+  state.earlier_from = now.wall;
   for (const Stated& stated : stated_) {
-    record.earlier_from = std::min(record.earlier_from, stated.wall);
+    state.earlier_from = std::min(state.earlier_from, stated.wall);
     // It grew until the next one was stated.
-    record.earlier_bound =
-        std::max(record.earlier_bound,
-                 clock::sum(stated.bound, clock::growth(clock::kLongestUse, state.ageing)));
+    state.earlier_bound =
+        std::max(state.earlier_bound,
+                 sum(stated.bound, clock::growth(clock::kLongestUse, clock.ageing_ppb)));
   }
-  page_.store(record);
+  page_.store(state);
 }
 
-// While this clock is not good, nobody's is here; the log says that of this clock.
+// While this clock is not good, no other host's is good here; the log states that of this clock.
 void FleetClock::log_others(MonoTime now) {
-  if (policies_.general.policy == ClockPolicy::off || !is_good(own_->status)) return;
+  if (policies_.general.policy == ClockPolicy::off || !is_good(own_->clock.status)) return;
   for (const auto& [id, host] : catalog_.hosts()) {
     if (id == self_) continue;
-    log_.look(id, host.greeting.host,
-              reason_against(host.greeting.clock.get(), policies_.general.limit), now);
+    log_.update(id, host.greeting.host,
+                reason_against(host.greeting.clock.get(), policies_.general.limit), now);
   }
 }
 
 std::string FleetClock::str() const {
-  std::string text = "clock " + std::string(name_of(own_->status));
-  if (own_->trouble != ClockReason::none) text += ": " + std::string(name_of(own_->trouble));
-  if (own_->standing.bound == kUnknownClockError) return text;
-  text += " within " + in_microseconds(own_->standing.bound);
-  switch (own_->basis) {
+  const ClockSnapshot& clock = own_->clock;
+  std::string text = fmt::format("clock {}", name_of(clock.status));
+  if (clock.reason != ClockReason::none) text += fmt::format(": {}", name_of(clock.reason));
+  if (!own_->has_bound()) return text;
+  text += " within " + in_microseconds(clock.bound);
+  switch (clock.basis) {
     case ClockBasis::nothing:
       break;
     case ClockBasis::root:
       text += " of UTC";
       break;
     case ClockBasis::reference:
-      text += " of '" + own_->reference + "'";
+      text += fmt::format(" of '{}'", own_->reference);
       break;
     case ClockBasis::own:
       text += ", is the reference";
@@ -300,50 +296,49 @@ std::string FleetClock::str() const {
   return text;
 }
 
-// --- what others' samples are worth here
+// --- what other hosts' samples are worth here
 
 Duration FleetClock::distance_to(const wire::ClockReport& other) const {
   const MonoTime now = MonoClock::now();
-  return clock::distance(own_->at(now).standing, other.at(now).standing);
+  return clock::distance(own_->at(now), other.at(now));
 }
 
 Result<void> FleetClock::check_serving(const StreamId& id, const wire::Greeting& them) const {
   if (policies_.demand_for(id).policy != ClockPolicy::enforce) return {};
-  if (them.clock && clock::share_clock(own_->standing, them.clock->standing)) return {};
-  // A dssmd judges for itself, once this clock was ever known; a program cannot.
-  const bool is_dssmd = them.clock && !them.clock->standing.chain.empty();
-  if (is_good(own_->status) || (is_dssmd && was_in_bounds_)) return {};
+  if (them.clock && own_->shares_clock_with(*them.clock)) return {};
+  // A dssmd assesses for itself, once this clock was ever known; a program cannot.
+  const bool is_dssmd = them.clock && !them.clock->chain.empty();
+  if (is_good(own_->clock.status) || (is_dssmd && was_in_bounds_)) return {};
   return Error{Errc::clock_out_of_bounds,
-               "stream '" + id.str() + "': the " + str() +
-                   " on the host that has it, so the times of its samples mean nothing on other "
-                   "PCs; look at `dssmctl clock` there, try again once it is synchronized, or set "
-                   "its key clock_policy to \"mark\" or \"off\""};
+               fmt::format("stream '{}': the {} on the host that owns it, so the times of its "
+                           "samples mean nothing on other PCs; run `dssmctl clock` there, retry "
+                           "once it is synchronized, or set its key clock_policy to \"mark\" or "
+                           "\"off\"",
+                           id.str(), str())};
 }
 
 ring::ClockAssessment FleetClock::assess_mirror(const StreamId& id,
                                                 const wire::ClockReport* owner) const {
-  if (owner && clock::share_clock(own_->standing, owner->standing)) return {};
+  if (owner && own_->shares_clock_with(*owner)) return {};
   const MonoTime now = MonoClock::now();
-  if (!owner || owner->standing.bound == kUnknownClockError) {
-    return assessment(id, now, kUnknownClockError, 0);
-  }
-  const clock::SyncChain own = own_->at(now).standing, theirs = owner->at(now).standing;
-  return assessment(id, now, clock::distance_from_anchor(theirs, own), own.ageing + theirs.ageing);
+  if (!owner || !owner->has_bound()) return assessment(id, now, kUnknownClockError, 0);
+  const wire::ClockReport own = own_->at(now), theirs = owner->at(now);
+  return assessment(id, now, clock::distance_from_anchor(theirs, own),
+                    own.clock.ageing_ppb + theirs.clock.ageing_ppb);
 }
 
 ring::ClockAssessment FleetClock::assess_own(const StreamId& id) const {
   const MonoTime now = MonoClock::now();
-  const clock::SyncChain own = own_->at(now).standing;
-  return assessment(id, now, own.bound, own.ageing);
+  const ClockSnapshot own = own_->at(now).clock;
+  return assessment(id, now, own.bound, own.ageing_ppb);
 }
 
-// Of samples whose times may be `added` further from this clock than their clock errors say.
+// Of samples whose times may be `added` further from this clock than their clock errors state.
 ring::ClockAssessment FleetClock::assessment(const StreamId& id, MonoTime now, Duration added,
                                              clock::PartsPerBillion ageing) const {
-  const clock::ClockDemand demand = policies_.demand_for(id);
+  const ClockDemand demand = policies_.demand_for(id);
   ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(demand.policy);
   assessment.assessed = now;
-  if (added == kUnknownClockError) return assessment;
   assessment.added = added;
   assessment.ageing_ppb = static_cast<std::uint32_t>(ageing);
   if (added <= demand.limit) assessment.limit = demand.limit - added;
@@ -353,28 +348,29 @@ ring::ClockAssessment FleetClock::assessment(const StreamId& id, MonoTime now, D
 // Why the times of that host's samples are not good here; empty: they are.
 std::string FleetClock::reason_against(const wire::ClockReport* owner, Duration limit) const {
   if (!owner) return "nothing is known of its host's clock";
-  if (clock::share_clock(own_->standing, owner->standing)) return {};
-  if (own_->standing.bound == kUnknownClockError) return "the " + str() + " on this PC";
-  if (owner->standing.bound == kUnknownClockError) {
-    return "the clock of its host is " + std::string(name_of(owner->status)) + " (" +
-           std::string(name_of(owner->trouble)) + ")";
+  if (own_->shares_clock_with(*owner)) return {};
+  if (!own_->has_bound()) return fmt::format("the {} on this PC", str());
+  if (!owner->has_bound()) {
+    return fmt::format("the clock of its host is {} ({})", name_of(owner->clock.status),
+                       name_of(owner->clock.reason));
   }
   const Duration distance = distance_to(*owner);
   if (distance == kUnknownClockError) {
     return "the clocks of its host and of this PC follow different references";
   }
   if (distance <= limit) return {};
-  return "the clocks of its host and of this PC may be " + in_microseconds(distance) +
-         " apart, and " + in_microseconds(limit) + " are allowed (key clock_limit)";
+  return fmt::format(
+      "the clocks of its host and of this PC may be {} apart, and {} are allowed (key clock_limit)",
+      in_microseconds(distance), in_microseconds(limit));
 }
 
 Error FleetClock::refusal(const StreamId& id, const wire::ClockReport* owner) const {
-  const std::string trouble = reason_against(owner, policies_.demand_for(id).limit);
-  const std::string why = trouble.empty() ? "its host's clock was not known just now" : trouble;
+  std::string reason = reason_against(owner, policies_.demand_for(id).limit);
+  if (reason.empty()) reason = "its host's clock was not known a moment ago";
   return Error{Errc::clock_out_of_bounds,
-               "stream '" + id.str() + "': " + why +
-                   "; look at `dssmctl clock` and at `chronyc tracking` on both, or set the key "
-                   "clock_policy to \"mark\" or \"off\""};
+               fmt::format("stream '{}': {}; run `dssmctl clock` and `chronyc tracking` on both, "
+                           "or set the key clock_policy to \"mark\" or \"off\"",
+                           id.str(), reason)};
 }
 
 }  // namespace dssm::daemon

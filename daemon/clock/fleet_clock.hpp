@@ -1,9 +1,27 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// This PC's clock among those of the fleet: from what the watch says of it, and what the other
-// hosts say of theirs, follows where it stands; that is told to the programs of this PC (the shared
-// page), to the other hosts (the report in our greeting), and to all who ask what another host's
-// samples are worth here (ClockRules). docs/clocks.md "Between two PCs".
+// This PC's clock among those of the fleet, and what other hosts' samples are worth here.
+// docs/clocks.md "Between two PCs". Who computes, stores and decides about clocks:
+//
+//   computes  ChronydClient    asks chronyd about once a second (chrony_protocol: the datagrams)
+//             StepWatch        is notified by the kernel that the clock was set
+//             ClockEstimator   the snapshot of this clock at any moment: bound, status, reason
+//             ClockWatch       drives these three and logs changes
+//             FleetClock       sync chain and anchor: from the snapshot and other hosts' reports
+//             clock_distance   how far two clocks may be apart, from their reports
+//   stores    ClockPage        this clock, for stamping (core/clock; written by ClockPageWriter)
+//             wire::ClockReport  this clock for other hosts, in our greeting, and theirs in Catalog
+//             MirrorClock      one owner's report, and which of its samples are suspect
+//             ring header      ring::ClockAssessment of a mirror, or of a stream others write to
+//   decides   ClockPolicies    which policy and limit a stream has (configuration)
+//             FleetClock       may a stream be served (check_serving); how far are its times from
+//                              here, and what is left of the limit (assess_mirror, assess_own)
+//             ClockAssessment::is_good()  may this sample be read by time; called by client/src/
+//                              reader.cpp with what the ring's header states
+//
+// May this sample be read by time? In the order of the data: assess_mirror() here with
+// clock_distance.cpp, daemon/remote/mirror_clock.cpp (adds the suspect samples; the mirror stores it),
+// core/ring/clock_assessment.cpp (one sample), client/src/reader.cpp (is_refused).
 #pragma once
 
 #include <deque>
@@ -13,14 +31,14 @@
 #include <string>
 #include <vector>
 
-#include "core/clock/clock_page.hpp"
-#include "core/clock/clock_policies.hpp"
 #include "core/wire/clock_report.hpp"
 #include "daemon/base/event_loop.hpp"
+#include "daemon/clock/clock_page_writer.hpp"
 #include "daemon/clock/clock_watch.hpp"
 #include "daemon/clock/host_clock_log.hpp"
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/fleet/clock_assessor.hpp"
+#include "daemon/service/clock_policies.hpp"
 
 namespace dssm::daemon {
 
@@ -28,19 +46,19 @@ class FleetClock final : public ClockAssessor,
                          private ClockWatch::Observer,
                          private CatalogObserver {
  public:
-  // The host that this one follows may be away for so long before those who follow this one take
-  // it for their reference.
-  static constexpr Duration kPatience = std::chrono::seconds(5);
-  // How far back the shared page tells bounds.
+  // For so long the host that this one follows may be unavailable before this one becomes the
+  // reference of the hosts that follow it.
+  static constexpr Duration kSuccessionDelay = std::chrono::seconds(5);
+  // How far back the shared page states bounds.
   static constexpr Duration kReach = std::chrono::seconds(10);
 
   struct Options {
     ClockWatch::Options watch;
-    clock::ClockPolicies policies;
+    ClockPolicies policies;
   };
 
-  // self: with a report of its own, which is kept up to date from now on. What is given by
-  // reference outlives it.
+  // own: this host's report, which is kept up to date from now on. What is given by reference
+  // outlives it.
   FleetClock(const EventLoop& loop, const Options& options, clock::ClockPageWriter page,
              std::shared_ptr<wire::ClockReport> own, wire::HostId self, Catalog& catalog,
              Logger& logger);
@@ -53,7 +71,7 @@ class FleetClock final : public ClockAssessor,
   void on_change(std::function<void()> then) { on_change_ = std::move(then); }
   void on_new_generation(std::function<void()> then) { on_new_generation_ = std::move(then); }
 
-  void set(const clock::ClockPolicies& policies, clock::PartsPerBillion max_drift);
+  void set(const ClockPolicies& policies, clock::PartsPerBillion max_drift);
 
   const wire::ClockReport& own() const noexcept { return *own_; }
   // "clock synchronized within 120 us of 'pc1'", for people.
@@ -79,8 +97,8 @@ class FleetClock final : public ClockAssessor,
   struct Source {
     wire::HostId id{};
     std::string name;
-    std::shared_ptr<const wire::ClockReport> report;  // what it said last
-    std::optional<MonoTime> away_since;
+    std::shared_ptr<const wire::ClockReport> report;  // the latest
+    std::optional<MonoTime> unavailable_since;
   };
   struct Stated {
     Time wall;
@@ -93,13 +111,13 @@ class FleetClock final : public ClockAssessor,
 
   void refresh();
   void find_source(MonoTime now);
-  const KnownHost* host_at(const SourceAddress& address) const;
+  const KnownHost* host_at(const wire::IpAddress& address) const;
   bool is_followed() const;
-  void look_up_addresses(MonoTime now);
-  void update_chain(const clock::ClockState& state, MonoTime now);
-  void choose_anchor(const clock::ClockState& state, MonoTime now);
-  void update_status(const clock::ClockState& state);
-  void publish(const clock::ClockState& state, const clock::Instant& now);
+  void update_addresses(MonoTime now);
+  void update_chain(MonoTime now);
+  void choose_anchor(const ClockSnapshot& watched, MonoTime now);
+  void update_status();
+  void publish(const clock::Instant& now);
   void log_others(MonoTime now);
   ring::ClockAssessment assessment(const StreamId& id, MonoTime now, Duration added,
                                    clock::PartsPerBillion ageing) const;
@@ -109,8 +127,8 @@ class FleetClock final : public ClockAssessor,
   clock::ClockPageWriter page_;
   const std::shared_ptr<wire::ClockReport> own_;
   const wire::HostId self_;
-  clock::ClockPolicies policies_;
-  std::optional<SourceAddress> source_address_;
+  ClockPolicies policies_;
+  std::optional<wire::IpAddress> source_address_;
   std::optional<Source> source_;
   MonoTime addresses_read_{};
   std::deque<Stated> stated_;  // within kReach; all of them bounds

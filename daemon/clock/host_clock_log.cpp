@@ -6,26 +6,26 @@
 
 namespace dssm::daemon {
 
-void HostClockLog::look(const wire::HostId& id, const std::string& name, const std::string& trouble,
-                        MonoTime now) {
+void HostClockLog::update(const wire::HostId& id, const std::string& name,
+                          const std::string& reason, MonoTime now) {
   Seen& seen = hosts_[id];
-  const bool is_good = trouble.empty();
+  const bool is_good = reason.empty();
   if (is_good) {
     seen.bad_since.reset();
     seen.was_good = true;
   } else if (!seen.bad_since) {
     seen.bad_since = now;
   }
-  const bool is_due = seen.was_good || (seen.bad_since && now - *seen.bad_since >= kPatience);
-  // What comes and goes while nothing may be said is left out; what stays is told later.
-  if (is_good != seen.told || !is_due || seen.pace.wait(now) > Duration::zero()) return;
+  const bool is_due = seen.was_good || (seen.bad_since && now - *seen.bad_since >= kStartupDelay);
+  // A change that is reverted while the log is limited is left out; one that lasts is logged later.
+  if (is_good != seen.logged_bad || !is_due || seen.pace.wait(now) > Duration::zero()) return;
   seen.pace.take(now);
-  seen.told = !is_good;
+  seen.logged_bad = !is_good;
   if (is_good) {
     return logger_.notice("the times of " + in_quotes(name) + "'s samples are good here again",
                           {.message_id = message_id::kHostClockInBounds});
   }
-  logger_.warning("the times of " + in_quotes(name) + "'s samples are not good here: " + trouble,
+  logger_.warning("the times of " + in_quotes(name) + "'s samples are not good here: " + reason,
                   {.message_id = message_id::kHostClockOutOfBounds});
 }
 

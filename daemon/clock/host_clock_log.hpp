@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Tells the log when samples of another host are refused by time because of its clock, and when
-// they are taken again. One entry per host, however many of its streams are read here.
+// Logs when reads by time refuse another host's samples because of its clock, and when they deliver
+// them again. One entry per host, however many of its streams are read here.
 #pragma once
 
 #include <dssm/time.hpp>
@@ -17,22 +17,22 @@ namespace dssm::daemon {
 
 class HostClockLog {
  public:
-  // A host whose clock was never good: it may just have started.
-  static constexpr Duration kPatience = std::chrono::seconds(30);
+  // Before it logs a host whose clock was never good: it may just have started.
+  static constexpr Duration kStartupDelay = std::chrono::seconds(30);
 
   // The logger outlives it.
   explicit HostClockLog(Logger& logger) noexcept : logger_(logger) {}
 
-  // How it is now. trouble: why its samples' times are not good here; empty: they are.
-  void look(const wire::HostId& id, const std::string& name, const std::string& trouble,
-            MonoTime now);
-  // It is gone, which the log says elsewhere.
+  // reason: why the times of its samples are not good here; empty: they are.
+  void update(const wire::HostId& id, const std::string& name, const std::string& reason,
+              MonoTime now);
+  // It is not connected any more, which is logged elsewhere.
   void forget(const wire::HostId& id) { hosts_.erase(id); }
 
  private:
   struct Seen {
     bool was_good = false;
-    bool told = false;                  // that it is not good
+    bool logged_bad = false;
     std::optional<MonoTime> bad_since;  // nothing: it is good
     RateLimiter pace{4, std::chrono::minutes(1)};
   };

@@ -14,7 +14,7 @@ namespace dssm::daemon {
 namespace {
 
 bool is_known(const MirrorClock::Report& report) noexcept {
-  return report && report->standing.bound != kUnknownClockError;
+  return report && report->has_bound();
 }
 
 }  // namespace
@@ -137,7 +137,7 @@ void MirrorClock::on_owner(Report report, Tid newest) noexcept {
     suspect_last_ = INT64_MAX;
   } else if (is_suspect_now()) {
     suspect_last_ = newest;
-  } else if (is_known(before) && before->standing.anchor != report_->standing.anchor) {
+  } else if (is_known(before) && before->anchor != report_->anchor) {
     suspect_first_ = 0;
     suspect_last_ = newest;
   }

@@ -18,9 +18,9 @@
 #include <vector>
 
 #include "core/clock/clock_bound.hpp"
-#include "core/clock/clock_policies.hpp"
 #include "core/wire/address.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/service/clock_policies.hpp"
 
 namespace dssm::daemon {
 
@@ -60,7 +60,7 @@ struct Config {
   Duration mirror_linger = std::chrono::seconds(5);
 
   // Clocks.
-  clock::ClockPolicies clocks;
+  ClockPolicies clocks;
   clock::PartsPerBillion max_drift = 50'000;
   wire::Address chronyd{"127.0.0.1", 323};  // where it takes questions
 

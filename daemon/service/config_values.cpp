@@ -121,7 +121,7 @@ Result<Duration> parse_clock_limit(std::string_view text) {
   return parse_duration(text, kLeastClockLimit, kMostClockLimit);
 }
 
-Result<clock::ClockPolicies::Exception> parse_clock_exception(std::string_view text) {
+Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text) {
   const auto wrong = [&](const std::string& why) {
     return Error{Errc::invalid_argument,
                  in_quotes(text) + " " + why +
@@ -130,7 +130,7 @@ Result<clock::ClockPolicies::Exception> parse_clock_exception(std::string_view t
   };
   const std::size_t equals = text.rfind('=');
   if (equals == text.npos) return wrong("has no '='");
-  clock::ClockPolicies::Exception exception;
+  ClockPolicies::Exception exception;
   exception.pattern = text.substr(0, equals);
   if (exception.pattern.empty()) return wrong("names no stream");
   if (exception.pattern.size() > kMaxStreamPatternBytes) {

@@ -12,8 +12,8 @@
 #include <string_view>
 
 #include "core/clock/clock_bound.hpp"
-#include "core/clock/clock_policies.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/service/clock_policies.hpp"
 
 namespace dssm::daemon {
 
@@ -33,7 +33,7 @@ Result<ClockPolicy> parse_clock_policy(std::string_view text);
 Result<Duration> parse_clock_limit(std::string_view text);
 
 // "STREAM=POLICY", or "STREAM=POLICY LIMIT": "gps=off", "camera*=mark 5 ms".
-Result<clock::ClockPolicies::Exception> parse_clock_exception(std::string_view text);
+Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text);
 
 // How far a clock runs away: "50 ppm"; 1 to 1000. In billionths.
 Result<clock::PartsPerBillion> parse_drift(std::string_view text);

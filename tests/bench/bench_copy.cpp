@@ -7,7 +7,7 @@
 #include <dssm/dssm.hpp>
 #include <filesystem>
 
-#include "core/clock/error_cache.hpp"
+#include "core/clock/clock_error_cache.hpp"
 #include "tests/bench/harness.hpp"
 #include "tests/support/daemon_process.hpp"
 
@@ -69,28 +69,24 @@ void stamped(Session& session) {
   print_pair("write 64 B, given stamp", "write 64 B, own clock's error",
              measure(2000, 1000, given, own), "at most 5 ns more");
 
-  char folder[] = "/tmp/dssm-bench-XXXXXX";
-  if (!::mkdtemp(folder)) std::abort();
   {
-    clock::ClockPageWriter page =
-        clock::ClockPageWriter::open(std::string(folder) + "/clock").value();
-    clock::ClockRecord record;
-    record.wall = Time(50s);
-    record.state.bound = 100us;
-    record.state.ageing = 56'250;
-    page.store(record);
-    Time t = record.wall;
+    static clock::ClockPage page{};
+    clock::ClockPageState stated;
+    stated.wall = Time(50s);
+    stated.clock.bound = 100us;
+    stated.clock.ageing_ppb = 56'250;
+    page.state.store(stated);
+    Time t = stated.wall;
     const auto nothing = [&] { keep(t += 1ns); };
-    clock::ErrorCache cache;
+    clock::ClockErrorCache cache;
     const auto look = [&] {
       Duration error{};
-      if (!cache.find(&page.page(), t += 1ns, error)) std::abort();
+      if (!cache.find(&page, t += 1ns, error)) std::abort();
       keep(error);
     };
     print_pair("nothing", "read the clock page", measure(2000, 1000, nothing, look),
                "at most 5 ns more");
   }
-  std::filesystem::remove_all(folder);
 }
 
 // memcpy uses the same buffers: the caller's and the ring's slots, in the order of writing and half a

@@ -67,20 +67,6 @@ struct DaemonInfo {
   MdnsInfo mdns;
 };
 
-// A host's clock as that host reports it (docs/clocks.md), aged to the present.
-struct ClockInfo {
-  ClockStatus status = ClockStatus::unknown;
-  ClockReason reason = ClockReason::none;
-  ClockBasis basis = ClockBasis::nothing;
-  Duration offset{};      // its clock minus what its chronyd estimates as the true time
-  std::string reference;  // what it follows: a host's name or an address; empty: nothing
-  std::uint16_t stratum = 0;
-  Duration update_interval{};                // between two measurements of its chronyd
-  Duration age{};                            // of the last measurement
-  Duration root_bound = kUnknownClockError;  // from UTC
-  Duration distance = kUnknownClockError;    // greatest distance from this PC's clock
-};
-
 // A host of the fleet as this PC's dssmd sees it: this PC itself, each configured peer, and each
 // host found by mDNS.
 struct HostInfo {
@@ -94,9 +80,11 @@ struct HostInfo {
   Duration min_round_trip{};                  // of all heartbeats of this connection; 0: none yet
   std::uint32_t streams = 0;                  // that it owns
   Duration clock_bound = kUnknownClockError;  // of its samples' times, against the reference PC
-  std::optional<ClockInfo> clock;             // empty: it reports none
-  bool insecure = false;                      // its traffic is unencrypted
-  std::string error;                          // `reason` in a sentence, for people; empty: none
+  std::optional<ClockSnapshot> clock;         // aged to the present; empty: it reports none
+  std::string clock_reference;  // what its clock follows: a host's name or an address, or empty
+  Duration clock_distance = kUnknownClockError;  // greatest distance from this PC's clock
+  bool insecure = false;                         // its traffic is unencrypted
+  std::string error;  // `reason` in a sentence, for people; empty: none
   std::string id;                     // 32 hex digits, independent of the name; empty: unknown
   std::vector<std::string> found_by;  // "peer" (configured), "mdns"; empty: this PC
 };

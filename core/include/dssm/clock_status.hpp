@@ -1,35 +1,36 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What is known of a PC's clock, in words. docs/clocks.md explains them.
+// What is known of a PC's clock. docs/clocks.md explains the words and the numbers.
 #pragma once
 
 #include <cstdint>
+#include <dssm/time.hpp>
 #include <string_view>
 
 #pragma GCC visibility push(default)  // the library hides everything else
 namespace dssm {
 
 enum class ClockStatus : std::uint8_t {
-  unknown,        // chronyd has not been heard of yet
+  unknown,        // chronyd has not answered yet
   synchronized,   // the bound is within the limit
-  holdover,       // so far, but chronyd has not heard from its sources for some time
-  out_of_bounds,  // beyond the limit, or there is no bound: see ClockReason
+  holdover,       // the same, but chronyd has not measured its sources for some time
+  out_of_bounds,  // the bound is beyond the limit, or there is none: see ClockReason
 };
 
 // Why a clock is out of bounds.
 enum class ClockReason : std::uint8_t {
   none,
-  no_chronyd,      // nothing listens where it should
-  silent,          // it does not answer
-  unsynchronized,  // it answers that it does not know the time
-  stepped,         // the clock was set; chronyd has not measured it anew
+  no_chronyd,      // nothing listens at chronyd's address
+  silent,          // chronyd does not answer
+  unsynchronized,  // chronyd answers that it does not know the time
+  stepped,         // the clock was set, and chronyd has not measured it since
   too_far,         // the bound is beyond the limit
 };
 
 // What the bound is a distance from.
 enum class ClockBasis : std::uint8_t {
   nothing,    // there is no bound
-  root,       // UTC, or whatever the root of the clocks has
+  root,       // UTC, or the time that the root of the clocks has
   reference,  // the clock of the fleet's reference PC
   own,        // this PC is the reference: right by definition
 };
@@ -41,9 +42,37 @@ enum class ClockPolicy : std::uint8_t {
   off,      // all samples are delivered and count as good
 };
 
+// How far a clock is from the root of its time, in the terms of RFC 5905; both >= 0.
+struct RootDistance {
+  Duration dispersion{};
+  Duration delay{};
+
+  friend bool operator==(const RootDistance& a, const RootDistance& b) = default;
+};
+
+// All values known of a clock at one time. The one list of these fields: dssmd keeps it for this PC,
+// states it on the shared page and in its report to other hosts, and programs get it in HostInfo.
+// On the page as it is here (core/clock/clock_page.hpp), so a change raises the page's version.
+struct ClockSnapshot {
+  Duration bound = kUnknownClockError;  // of its samples' times, against what `basis` names
+  std::int64_t ageing_ppb = 0;          // what bound and root_bound grow by, ns per second
+  ClockStatus status = ClockStatus::unknown;
+  ClockReason reason = ClockReason::none;
+  ClockBasis basis = ClockBasis::nothing;
+  std::uint8_t reserved = 0;
+  std::uint32_t stratum = 0;
+  Duration root_bound = kUnknownClockError;  // distance from UTC
+  RootDistance root;
+  Duration offset{};           // this clock minus chronyd's estimate of the right time
+  Duration update_interval{};  // between two measurements of chronyd
+  Duration age{};              // since chronyd last learned something from its sources
+
+  friend bool operator==(const ClockSnapshot& a, const ClockSnapshot& b) = default;
+};
+
 // "synchronized", "out of bounds", "no chronyd", "reference", "enforce" ...; static storage.
 std::string_view name_of(ClockStatus status) noexcept;
-std::string_view name_of(ClockReason trouble) noexcept;
+std::string_view name_of(ClockReason reason) noexcept;
 std::string_view name_of(ClockBasis basis) noexcept;
 std::string_view name_of(ClockPolicy policy) noexcept;
 

@@ -207,11 +207,11 @@ TEST_F(ChronydTest, TakesTheLocalModeForRightByDefinition) {
   const Chronyd chronyd("local stratum 10\nport 0\nmanual\n");
   follow(chronyd);
   until([&] { return watch->state().status == ClockStatus::synchronized; });
-  const clock::ClockState state = watch->state();
+  const ClockSnapshot state = watch->state();
   EXPECT_EQ(state.basis, ClockBasis::own);
   EXPECT_EQ(state.bound, Duration::zero());
-  EXPECT_EQ(state.reference_id, clock::kLocalReferenceId);
-  EXPECT_EQ(state.stratum, 10);
+  EXPECT_EQ(watch->reference_id(), clock::kLocalReferenceId);
+  EXPECT_EQ(state.stratum, 10u);
   EXPECT_EQ(watch->source(), std::nullopt);
 
   // Now chronyd shall take this clock for a quarter of a second fast.
@@ -220,7 +220,7 @@ TEST_F(ChronydTest, TakesTheLocalModeForRightByDefinition) {
             std::string::npos);
   until([&] { return watch->state().offset != Duration::zero(); });
   EXPECT_EQ(watch->state().offset, 250'000'015ns) << "ahead, and a unit of chronyd's format more";
-  EXPECT_EQ(watch->state().trouble, ClockReason::too_far);
+  EXPECT_EQ(watch->state().reason, ClockReason::too_far);
   EXPECT_EQ(watch->state().bound, 250'000'015ns);
 }
 
@@ -233,7 +233,7 @@ TEST_F(ChronydTest, KnowsWithOneQuestionThatItIsGoneAndRecovers) {
     looks = 0;
     until([&] { return looks == 1; });
     EXPECT_EQ(watch->state().status, ClockStatus::out_of_bounds);
-    EXPECT_EQ(watch->state().trouble, ClockReason::no_chronyd);
+    EXPECT_EQ(watch->state().reason, ClockReason::no_chronyd);
     EXPECT_EQ(watch->state().bound, kUnknownClockError);
     chronyd.start();
     until([&] { return watch->state().status == ClockStatus::synchronized; });
@@ -246,7 +246,7 @@ TEST_F(ChronydTest, IsSilentWhileItIsStopped) {
   until([&] { return watch->state().status == ClockStatus::synchronized; });
   chronyd.signal(SIGSTOP);
   until([&] { return watch->state().status != ClockStatus::synchronized; });
-  EXPECT_EQ(watch->state().trouble, ClockReason::silent);
+  EXPECT_EQ(watch->state().reason, ClockReason::silent);
   chronyd.signal(SIGCONT);
   until([&] { return watch->state().status == ClockStatus::synchronized; });
 }

@@ -13,7 +13,7 @@ class Clock : public FleetTest {
     for (;;) {
       Json clocks = json({"clock"})["clocks"];
       const bool all = std::none_of(clocks.begin(), clocks.end(), [](const Json& clock) {
-        return clock["status"] == "unknown" && clock["trouble"].is_null();
+        return clock["status"] == "unknown" && clock["reason"].is_null();
       });
       if (all) return clocks;
     }
@@ -27,7 +27,7 @@ TEST_F(Clock, HasARowForEachHostThatIsThere) {
   ASSERT_EQ(shown.size(), 2U);
   EXPECT_EQ(shown[0]["host"], "pc1");
   EXPECT_EQ(shown[0]["state"], "self");
-  EXPECT_EQ(shown[0]["trouble"], "no chronyd");
+  EXPECT_EQ(shown[0]["reason"], "no chronyd");
   EXPECT_TRUE(shown[0]["bound_ns"].is_null());
   EXPECT_TRUE(shown[0]["reference"].is_null());
   EXPECT_EQ(shown[1]["host"], "pc2");

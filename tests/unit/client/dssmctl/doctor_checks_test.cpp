@@ -273,12 +273,12 @@ TEST(Doctor, ForgivesAnAddressThatDoesNotWorkWhileAnotherOfThatHostDoes) {
 
 TEST(Doctor, SaysHowFarClocksAreApartAndWarnsWhenNobodyKnows) {
   Facts facts = healthy();
-  facts.hosts[1].clock = ClockInfo();
-  facts.hosts[1].clock->distance = std::chrono::microseconds(250);
+  facts.hosts[1].clock = ClockSnapshot();
+  facts.hosts[1].clock_distance = std::chrono::microseconds(250);
   EXPECT_FINDING(facts, "clock of pc2", Status::ok, "");
   EXPECT_EQ(finding_of(facts, "clock of pc2").text, "at most 250 us from this one's");
   facts.hosts[1].clock->status = ClockStatus::out_of_bounds;
-  facts.hosts[1].clock->distance = kUnknownClockError;
+  facts.hosts[1].clock_distance = kUnknownClockError;
   EXPECT_FINDING(facts, "clock of pc2", Status::warn, "dssmctl clock");
   EXPECT_NE(finding_of(facts, "clock of pc2").text.find("out of bounds there"), std::string::npos);
 }

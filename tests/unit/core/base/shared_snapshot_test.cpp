@@ -42,14 +42,12 @@ TEST(SharedSnapshot, HasNoValueUntilOneIsStored) {
 }
 
 TEST(SharedSnapshot, CopiesTheBeginningAlone) {
-  struct Begin {
-    std::uint64_t first;
-  };
   Snapshot snapshot{};
   snapshot.store({{1, 2, 3, 4, 5}});
-  Begin begin{};
-  EXPECT_EQ(snapshot.load(begin), 1u);
-  EXPECT_EQ(begin.first, 1u);
+  Value value = Value::of(9);
+  EXPECT_EQ(snapshot.load<16>(value), 1u);
+  EXPECT_EQ(value.words[1], 2u);
+  EXPECT_EQ(value.words[2], 9u) << "unchanged";
 }
 
 TEST(SharedSnapshot, NeverShowsAMix) {

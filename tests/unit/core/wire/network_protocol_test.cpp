@@ -17,9 +17,9 @@ Greeting mapper() {
   greeting.version = "0.1.0";
   greeting.features = {"torn", "other"};
   auto clock = std::make_shared<ClockReport>();
-  clock->standing.anchor = greeting.host_id;
-  clock->standing.bound = std::chrono::microseconds(250);
-  clock->heard = MonoClock::now();
+  clock->anchor = greeting.host_id;
+  clock->clock.bound = std::chrono::microseconds(250);
+  clock->as_of = MonoClock::now();
   greeting.clock = clock;
   return greeting;
 }

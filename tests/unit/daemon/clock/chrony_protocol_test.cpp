@@ -69,7 +69,7 @@ TEST(ChronyProtocol, TellsWhomChronydFollows) {
     return tracking_untrusted(reply).value().source;
   };
   const auto address = [](const char* text) {
-    return SourceAddress::of(wire::resolve_number(wire::Address::parse(text).value()).at(0));
+    return wire::IpAddress::of(wire::resolve_number(wire::Address::parse(text).value()).at(0));
   };
   EXPECT_EQ(source(0, {0x0a000001}), std::nullopt);
   EXPECT_EQ(source(1, {0x0a000001}), address("10.0.0.1"));
@@ -78,7 +78,7 @@ TEST(ChronyProtocol, TellsWhomChronydFollows) {
   EXPECT_EQ(source(2, {0xfd770000, 0, 0, 1})->str(), "fd77::1");
   EXPECT_NE(source(1, {0x0a000001}), address("10.0.0.2"));
   EXPECT_EQ(source(3, {7}), std::nullopt) << "a source that waits for its address";
-  EXPECT_EQ(SourceAddress::of({}), std::nullopt);
+  EXPECT_EQ(wire::IpAddress::of({}), std::nullopt);
   expect_refused(kReplyFamily, std::uint16_t{4}, Errc::protocol, "family 4");
 }
 
@@ -204,10 +204,10 @@ TEST(ChronyProtocol, SurvivesAnyBytes) {
     // Whatever was read, the estimator states no bound below what it was told, or none.
     clock::ClockEstimator estimator{clock::ClockEstimator::Settings{}};
     const clock::Instant now{MonoTime(1000s), time_from_ns(1795323571'500000000), {}};
-    estimator.look(now);
-    const auto verdict = estimator.take_untrusted(reply->tracking, now.mono, now);
-    const clock::ClockState state = estimator.at(now.mono);
-    if (verdict != clock::ClockEstimator::Verdict::taken) continue;
+    estimator.observe(now);
+    const auto outcome = estimator.take_untrusted(reply->tracking, now.mono, now);
+    const ClockSnapshot state = estimator.at(now.mono);
+    if (outcome != clock::ClockEstimator::Outcome::taken) continue;
     EXPECT_GE(state.bound, std::chrono::abs(reply->tracking.offset));
   }
   EXPECT_GT(read, 1000);

@@ -17,17 +17,17 @@ using namespace std::chrono_literals;
 
 constexpr wire::HostId kSelf{1}, kReference{2}, kOther{3};
 constexpr std::uint32_t kReferenceAddress = 0x0a000001;  // 10.0.0.1
-constexpr wire::IpBytes kReferenceBytes{0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, 10, 0, 0, 1};
+constexpr wire::IpAddress kReferenceIp{{0, 0, 0, 0, 0, 0, 0, 0, 0, 0, 0xff, 0xff, 10, 0, 0, 1}};
 
 // A host whose clock is `bound` from its own chronyd's time, and follows nobody.
 wire::Greeting host(wire::HostId id, const std::string& name, Duration bound) {
   auto report = std::make_shared<wire::ClockReport>();
-  report->standing.boot_id = name + "'s boot";
-  report->standing.chain = {{id, bound}};
-  report->standing.anchor = id;
-  report->standing.bound = bound;
-  report->status = ClockStatus::synchronized;
-  report->heard = MonoClock::now();
+  report->boot_id = name + "'s boot";
+  report->chain = {{id, bound}};
+  report->anchor = id;
+  report->clock.bound = bound;
+  report->clock.status = ClockStatus::synchronized;
+  report->as_of = MonoClock::now();
   wire::Greeting greeting;
   greeting.host = name;
   greeting.host_id = id;
@@ -59,7 +59,7 @@ class FleetClockTest : public testing::Test {
                   FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
                   *std::move(page), own, kSelf, catalog, logger);
     fleet->on_new_generation([this] { ++news; });
-    wait([this] { return own->status != ClockStatus::unknown; });
+    wait([this] { return own->clock.status != ClockStatus::unknown; });
     return *fleet;
   }
   template <class Done>
@@ -80,7 +80,7 @@ class FleetClockTest : public testing::Test {
   void add_reference() {
     wire::Greeting reference = host(kReference, "pc1", 5us);
     auto report = std::make_shared<wire::ClockReport>(*reference.clock);
-    report->addresses = {kReferenceBytes};
+    report->addresses = {kReferenceIp};
     reference.clock = report;
     catalog.host_up(reference, {"10.0.0.1", 13776});
   }
@@ -97,7 +97,7 @@ class FleetClockTest : public testing::Test {
                         chronyd.answer(question, reply_of(tracking));
                       }};
   Catalog catalog{"self"};
-  clock::ClockPolicies policies;
+  ClockPolicies policies;
   std::shared_ptr<wire::ClockReport> own = std::make_shared<wire::ClockReport>();
   std::optional<FleetClock> fleet;
   int news = 0;
@@ -109,12 +109,12 @@ class FleetClockTest : public testing::Test {
 TEST_F(FleetClockTest, OnePcThatFollowsNobodyIsItsOwnReference) {
   follow_nobody();
   start();
-  EXPECT_EQ(own->status, ClockStatus::synchronized);
-  EXPECT_EQ(own->basis, ClockBasis::own);
-  EXPECT_EQ(own->standing.anchor, kSelf);
-  EXPECT_EQ(own->standing.chain.size(), 1U);
-  EXPECT_LT(own->standing.bound, 50us);
-  EXPECT_FALSE(own->standing.root_is_utc);
+  EXPECT_EQ(own->clock.status, ClockStatus::synchronized);
+  EXPECT_EQ(own->clock.basis, ClockBasis::own);
+  EXPECT_EQ(own->anchor, kSelf);
+  EXPECT_EQ(own->chain.size(), 1U);
+  EXPECT_LT(own->clock.bound, 50us);
+  EXPECT_FALSE(own->root_is_utc);
   EXPECT_EQ(news, 1) << "others have to know";
 }
 
@@ -122,10 +122,10 @@ TEST_F(FleetClockTest, OwnStreamsThatOthersWriteToAreAsFarOffAsThisClock) {
   EXPECT_FALSE(FleetClockTest::start().assess_own(lidar).added == kUnknownClockError);
   const ring::ClockAssessment known = fleet->assess_own(lidar);
   EXPECT_EQ(known.policy, ClockPolicy::enforce);
-  EXPECT_GE(known.added, own->standing.bound);
+  EXPECT_GE(known.added, own->clock.bound);
   EXPECT_EQ(known.limit, policies.general.limit - known.added);
   tracking.leap = clock::Tracking::kUnsynchronized;
-  wait([this] { return own->standing.bound == kUnknownClockError; });
+  wait([this] { return own->clock.bound == kUnknownClockError; });
   EXPECT_LT(fleet->assess_own(lidar).limit, 0ns);
   policies.general.policy = ClockPolicy::off;
   fleet->set(policies, 50'000);
@@ -134,23 +134,23 @@ TEST_F(FleetClockTest, OwnStreamsThatOthersWriteToAreAsFarOffAsThisClock) {
 
 TEST_F(FleetClockTest, OnlyUtcIsLeftWithoutAHostToFollow) {
   start();
-  EXPECT_EQ(own->basis, ClockBasis::root);
-  EXPECT_TRUE(own->standing.bound_is_root);
-  EXPECT_TRUE(own->standing.root_is_utc);
-  EXPECT_GE(own->standing.bound, 60us);
-  EXPECT_LT(own->standing.bound, 200us);
+  EXPECT_EQ(own->clock.basis, ClockBasis::root);
+  EXPECT_TRUE(own->bound_is_root);
+  EXPECT_TRUE(own->root_is_utc);
+  EXPECT_GE(own->clock.bound, 60us);
+  EXPECT_LT(own->clock.bound, 200us);
   EXPECT_EQ(own->reference, "10.0.0.1");
 }
 
 TEST_F(FleetClockTest, TheHostAtTheAddressThatChronydFollowsIsTheReference) {
   add_reference();
   start();
-  EXPECT_EQ(own->basis, ClockBasis::reference);
+  EXPECT_EQ(own->clock.basis, ClockBasis::reference);
   EXPECT_EQ(own->reference, "pc1");
-  EXPECT_EQ(own->standing.anchor, kReference);
-  ASSERT_EQ(own->standing.chain.size(), 2U);
-  EXPECT_EQ(own->standing.chain[1].clock, kReference);
-  EXPECT_EQ(own->standing.chain[1].bound, own->standing.bound);
+  EXPECT_EQ(own->anchor, kReference);
+  ASSERT_EQ(own->chain.size(), 2U);
+  EXPECT_EQ(own->chain[1].host, kReference);
+  EXPECT_EQ(own->chain[1].bound, own->clock.bound);
 }
 
 TEST_F(FleetClockTest, ASampleMayBeAsWrongAsIsLeftOfTheLimit) {
@@ -159,8 +159,8 @@ TEST_F(FleetClockTest, ASampleMayBeAsWrongAsIsLeftOfTheLimit) {
   const ring::ClockAssessment found = assessed(host(kReference, "pc1", 5us));
   EXPECT_EQ(found.policy, ClockPolicy::enforce);
   EXPECT_EQ(found.limit, 1500us - found.added);
-  EXPECT_GE(found.added, own->standing.bound);
-  EXPECT_LT(found.added, own->standing.bound + 200us);
+  EXPECT_GE(found.added, own->clock.bound);
+  EXPECT_LT(found.added, own->clock.bound + 200us);
 }
 
 TEST_F(FleetClockTest, NothingIsGoodOfAHostThatFollowsSomebodyElse) {
@@ -188,7 +188,7 @@ TEST_F(FleetClockTest, AHostWithThisKernelHasThisClock) {
                 FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
                 *std::move(page), own, kSelf, catalog, logger);
   wire::ClockReport same;
-  same.standing.boot_id = clock::boot_id();
+  same.boot_id = clock::boot_id();
   EXPECT_TRUE(fleet->assess_mirror(lidar, &same).same_clock);
   EXPECT_EQ(fleet->distance_to(same), 0us);
 }
@@ -218,14 +218,14 @@ TEST_F(FleetClockTest, ServesOthersFromWhenTheClockWasFirstKnown) {
   EXPECT_NE(refused.error().message.find("not synchronised"), std::string::npos)
       << refused.error().message;
   tracking.leap = 0;
-  wait([this] { return own->status == ClockStatus::synchronized; });
+  wait([this] { return own->clock.status == ClockStatus::synchronized; });
   EXPECT_TRUE(fleet->check_serving(lidar, peer));
   wire::Greeting program = peer;
   program.clock = nullptr;
   EXPECT_TRUE(fleet->check_serving(lidar, program));
   tracking.leap = clock::Tracking::kUnsynchronized;
-  wait([this] { return own->status == ClockStatus::out_of_bounds; });
-  EXPECT_TRUE(fleet->check_serving(lidar, peer)) << "a dssmd judges for itself";
+  wait([this] { return own->clock.status == ClockStatus::out_of_bounds; });
+  EXPECT_TRUE(fleet->check_serving(lidar, peer)) << "a dssmd assesses for itself";
   EXPECT_FALSE(fleet->check_serving(lidar, program)) << "who watches no clock cannot";
 }
 
@@ -235,7 +235,7 @@ TEST_F(FleetClockTest, ProgramsOfThisPcFindTheBoundOnThePage) {
   const UniqueFd file = fleet->page_for_reading().value();
   const clock::ClockPage& page = **clock::map_clock_page_untrusted(file.get());
   EXPECT_EQ(clock::status_of(page), ClockStatus::synchronized);
-  EXPECT_LT(clock::error_at(page, WallClock::now()).value(), 1ms);
+  EXPECT_LT(clock::clock_error_at(page, WallClock::now()).value(), 1ms);
 }
 
 }  // namespace

@@ -12,7 +12,7 @@ using namespace std::chrono_literals;
 
 constexpr wire::HostId kFirst{1}, kSecond{2};
 constexpr MonoTime kBegin{1000s};
-constexpr const char* kTrouble = "they may be 2 ms apart";
+constexpr const char* kReason = "they may be 2 ms apart";
 
 class HostClockLogTest : public testing::Test, protected Logger {
  protected:
@@ -27,12 +27,12 @@ class HostClockLogTest : public testing::Test, protected Logger {
 };
 
 TEST_F(HostClockLogTest, TellsWhenAClockBecomesBadAndWhenItIsGoodAgain) {
-  log.look(kFirst, "pc1", "", kBegin);
+  log.update(kFirst, "pc1", "", kBegin);
   EXPECT_TRUE(lines.empty()) << "all is well";
-  log.look(kFirst, "pc1", kTrouble, kBegin + 1s);
-  log.look(kFirst, "pc1", kTrouble, kBegin + 2s);
-  log.look(kFirst, "pc1", "", kBegin + 3s);
-  log.look(kFirst, "pc1", "", kBegin + 4s);
+  log.update(kFirst, "pc1", kReason, kBegin + 1s);
+  log.update(kFirst, "pc1", kReason, kBegin + 2s);
+  log.update(kFirst, "pc1", "", kBegin + 3s);
+  log.update(kFirst, "pc1", "", kBegin + 4s);
   EXPECT_EQ(lines, (std::vector<std::string>{
                        "warning: the times of 'pc1''s samples are not good here: they may be 2 ms "
                        "apart",
@@ -40,33 +40,33 @@ TEST_F(HostClockLogTest, TellsWhenAClockBecomesBadAndWhenItIsGoodAgain) {
 }
 
 TEST_F(HostClockLogTest, LetsAHostComeUpFirst) {
-  log.look(kFirst, "pc1", kTrouble, kBegin);
-  log.look(kFirst, "pc1", kTrouble, kBegin + HostClockLog::kPatience - 1s);
+  log.update(kFirst, "pc1", kReason, kBegin);
+  log.update(kFirst, "pc1", kReason, kBegin + HostClockLog::kStartupDelay - 1s);
   EXPECT_TRUE(lines.empty());
-  log.look(kFirst, "pc1", kTrouble, kBegin + HostClockLog::kPatience);
+  log.update(kFirst, "pc1", kReason, kBegin + HostClockLog::kStartupDelay);
   EXPECT_EQ(lines.size(), 1U);
 }
 
 TEST_F(HostClockLogTest, KnowsHostsApartAndForgetsThem) {
-  log.look(kFirst, "pc1", "", kBegin);
-  log.look(kSecond, "pc2", kTrouble, kBegin);
+  log.update(kFirst, "pc1", "", kBegin);
+  log.update(kSecond, "pc2", kReason, kBegin);
   EXPECT_TRUE(lines.empty());
-  log.look(kFirst, "pc1", kTrouble, kBegin + 1s);
+  log.update(kFirst, "pc1", kReason, kBegin + 1s);
   log.forget(kFirst);
-  log.look(kFirst, "pc1", kTrouble, kBegin + 2s);
+  log.update(kFirst, "pc1", kReason, kBegin + 2s);
   EXPECT_EQ(lines.size(), 1U) << "a host that comes back has just started";
 }
 
 TEST_F(HostClockLogTest, IsNotFilledByAClockThatComesAndGoes) {
   for (int i = 0; i < 100; ++i) {
-    log.look(kFirst, "pc1", i % 2 ? kTrouble : "", kBegin + i * 1s);
+    log.update(kFirst, "pc1", i % 2 ? kReason : "", kBegin + i * 1s);
   }
   EXPECT_GE(lines.size(), 4U);
   EXPECT_LE(lines.size(), 6U);
   // What stays is told in the end.
   lines.clear();
-  log.look(kFirst, "pc1", kTrouble, kBegin + 400s);
-  log.look(kFirst, "pc1", "", kBegin + 500s);
+  log.update(kFirst, "pc1", kReason, kBegin + 400s);
+  log.update(kFirst, "pc1", "", kBegin + 500s);
   ASSERT_FALSE(lines.empty());
   EXPECT_TRUE(lines.back().ends_with("good here again"));
 }

@@ -15,7 +15,7 @@ class FakeClockAssessor final : public ClockAssessor {
                                       const wire::ClockReport* owner) const override {
     if (same_clock) return {};
     ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(policy);
-    if (owner) assessment.limit = std::chrono::milliseconds(1) - owner->standing.bound;
+    if (owner) assessment.limit = std::chrono::milliseconds(1) - owner->clock.bound;
     return assessment;
   }
   ring::ClockAssessment assess_own(const StreamId&) const override {

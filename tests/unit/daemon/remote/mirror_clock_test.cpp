@@ -11,8 +11,8 @@ using namespace std::chrono_literals;
 
 MirrorClock::Report report(Duration bound, std::uint8_t anchor = 1) {
   auto made = std::make_shared<wire::ClockReport>();
-  made->standing.bound = bound;
-  made->standing.anchor = {anchor};
+  made->clock.bound = bound;
+  made->anchor = {anchor};
   return made;
 }
 

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "core/clock/clock_tick.hpp"
+#include "daemon/clock/clock_tick.hpp"
 
 #include "core/clock/coarse_now.hpp"
 

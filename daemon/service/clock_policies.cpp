@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "core/clock/clock_policies.hpp"
+#include "daemon/service/clock_policies.hpp"
 
 #include <fnmatch.h>
 
-namespace dssm::clock {
+namespace dssm::daemon {
 
 ClockDemand ClockPolicies::demand_for(const StreamId& id) const {
   const std::string full = id.name + ":" + std::to_string(id.id);
@@ -16,4 +16,4 @@ ClockDemand ClockPolicies::demand_for(const StreamId& id) const {
   return general;
 }
 
-}  // namespace dssm::clock
+}  // namespace dssm::daemon

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "core/clock/clock_tick.hpp"
+#include "daemon/clock/clock_tick.hpp"
 
 #include <gtest/gtest.h>
 
-#include "core/clock/clock_estimator.hpp"
+#include "daemon/clock/clock_estimator.hpp"
 
 namespace dssm::clock {
 namespace {

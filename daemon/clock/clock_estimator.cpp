@@ -1,31 +1,31 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "core/clock/clock_estimator.hpp"
+#include "daemon/clock/clock_estimator.hpp"
 
 #include <algorithm>
 
 namespace dssm::clock {
 namespace {
 
-// Nobody whose numbers are beyond this has a clock worth a bound, and sums of them do not overflow.
-constexpr Duration kMost = std::chrono::hours(24 * 365);
+// A clock with greater numbers is not worth a bound, and sums of smaller ones do not overflow.
+constexpr Duration kMaxValue = std::chrono::hours(24 * 365);
 
-// Answers whose last measurement seems to lie ahead of now by more than this are nonsense; less is
-// a measurement that was just being taken in.
-constexpr Duration kLeastAhead = std::chrono::seconds(1);
+// Answers whose last measurement seems to be after now by more than this are nonsense; less is a
+// measurement that chronyd was just processing.
+constexpr Duration kMaxAhead = std::chrono::seconds(1);
 
-// Times of measurements that are closer than this are of one. chronyd takes 128 a second at most.
+// Times of measurements that are closer than this are of the same one. chronyd takes 128 a second at most.
 constexpr Duration kSameUpdate = std::chrono::milliseconds(1);
 
 // A holdover begins after this many intervals without a measurement, or after the shortest.
 constexpr int kIntervalsToHoldover = 4;
-constexpr Duration kShortestToHoldover = std::chrono::seconds(5);
-constexpr Duration kLongestToHoldover = std::chrono::hours(1);
+constexpr Duration kMinToHoldover = std::chrono::seconds(5);
+constexpr Duration kMaxToHoldover = std::chrono::hours(1);
 
 // The monotonic clock is slewed as the wall clock is. The kernel lets it run slow by a tenth and
 // 500 ppm, so what it counts as a second may be 1.112 of them.
 constexpr PartsPerBillion slewed(PartsPerBillion drift) noexcept { return drift + (drift + 7) / 8; }
 
-bool in_range(Duration d) noexcept { return d >= Duration::zero() && d <= kMost; }
+bool in_range(Duration d) noexcept { return d >= Duration::zero() && d <= kMaxValue; }
 
 RootDistance least(const RootDistance& a, const RootDistance& b) noexcept {
   return {std::min(a.dispersion, b.dispersion), std::min(a.delay, b.delay)};
@@ -47,7 +47,7 @@ Instant Instant::now() noexcept {
   return best;
 }
 
-std::optional<Duration> ClockEstimator::look(const Instant& now) noexcept {
+std::optional<Duration> ClockEstimator::observe(const Instant& now) noexcept {
   if (!base_) {
     base_ = now;
     return {};
@@ -55,48 +55,50 @@ std::optional<Duration> ClockEstimator::look(const Instant& now) noexcept {
   const Duration step = (now.wall - base_->wall) - (now.mono - base_->mono);
   const Duration blur = now.width + base_->width;
   const Duration size = std::max(step, -step);
-  // The base stays: one that moved along would let many small steps pass.
-  unseen_ = size + blur;
-  if (size <= kLeastStep + blur) return {};
+  // The base stays: with one that moved, many small steps would not be detected.
+  noise_ = size + blur;
+  if (size <= kMinStep + blur) return {};
   if (!stepped_) before_step_ = base_;
-  unseen_ = now.width;
+  noise_ = now.width;
   base_ = now;
   stepped_ = true;
   updates_ = 0;
-  if (heard_ever_) forget(ClockReason::stepped);
+  if (has_answered_) forget(ClockReason::stepped);
   return step;
 }
 
 bool ClockEstimator::is_nonsense(const Tracking& tracking, const Instant& answered) const noexcept {
   if (!in_range(tracking.root.dispersion) || !in_range(tracking.root.delay) ||
-      !in_range(tracking.update_interval) || tracking.offset < -kMost || tracking.offset > kMost) {
+      !in_range(tracking.update_interval) || tracking.offset < -kMaxValue ||
+      tracking.offset > kMaxValue) {
     return true;
   }
   if (tracking.leap > Tracking::kUnsynchronized) return true;
   if (tracking.leap == Tracking::kUnsynchronized) return false;
-  // Nobody checked these times: compare before subtracting. A clock that was set back leaves the
-  // last measurement in the future, which is no fault of chronyd.
-  return tracking.updated > answered.wall + kMost || tracking.updated < answered.wall - kMost ||
-         (!stepped_ && tracking.updated > answered.wall - tracking.offset + kLeastAhead);
+  // These times are not checked: compare before subtracting. A clock that was set back leaves the
+  // last measurement in the future, which is not a fault of chronyd.
+  return tracking.updated > answered.wall + kMaxValue ||
+         tracking.updated < answered.wall - kMaxValue ||
+         (!stepped_ && tracking.updated > answered.wall - tracking.offset + kMaxAhead);
 }
 
-ClockEstimator::Verdict ClockEstimator::take_untrusted(const Tracking& tracking, MonoTime asked,
+ClockEstimator::Outcome ClockEstimator::take_untrusted(const Tracking& tracking, MonoTime asked,
                                                        const Instant& answered) noexcept {
-  if (is_nonsense(tracking, answered)) return Verdict::nonsense;
-  heard_ever_ = true;
-  heard_ = asked;
+  if (is_nonsense(tracking, answered)) return Outcome::nonsense;
+  has_answered_ = true;
+  answered_ = asked;
   const bool local = tracking.reference_id == kLocalReferenceId;
   if (tracking.leap == Tracking::kUnsynchronized) {
     forget(ClockReason::unsynchronized);
-    return Verdict::unsynchronized;
+    return Outcome::unsynchronized;
   }
   if (local && reference_) {
-    // Another PC is the reference, only ours does not hear it: what we knew grows old.
+    // Another PC is the reference, but ours does not reach it: the last reading ages.
     if (!reading_ || reading_->tracking.reference_id == kLocalReferenceId) {
       forget(ClockReason::unsynchronized);
-      return Verdict::unsynchronized;
+      return Outcome::unsynchronized;
     }
-    return Verdict::taken;
+    return Outcome::taken;
   }
   // chronyd stamps by its own time, which is this clock minus the offset.
   const Duration age =
@@ -109,25 +111,25 @@ ClockEstimator::Verdict ClockEstimator::take_untrusted(const Tracking& tracking,
     if (is_new) ++updates_;
     if (updates_ < kUpdatesAfterStep) {
       forget(ClockReason::stepped);
-      return Verdict::stepped;
+      return Outcome::stepped;
     }
     stepped_ = false;
   }
   reading_ = {tracking, asked, updated};
-  why_ = ClockReason::none;
-  return Verdict::taken;
+  reason_ = ClockReason::none;
+  return Outcome::taken;
 }
 
 void ClockEstimator::on_no_chronyd() noexcept {
-  if (heard_ever_) forget(ClockReason::no_chronyd);
+  if (has_answered_) forget(ClockReason::no_chronyd);
 }
 
-void ClockEstimator::forget(ClockReason why) noexcept {
+void ClockEstimator::forget(ClockReason reason) noexcept {
   reading_.reset();
-  why_ = why;
+  reason_ = reason;
 }
 
-// How far back what our chronyd says of its root may go.
+// How old what our chronyd states of its root may be.
 Duration ClockEstimator::memory() const noexcept {
   const Duration interval = reading_ ? reading_->tracking.update_interval : Duration::zero();
   return kMeasurementsBack *
@@ -149,7 +151,7 @@ void ClockEstimator::on_reference(const std::optional<ReferenceReport>& report,
     known.before = known.lately;
     known.lately = report->root;
     known.since = now;
-    known.whole = true;
+    known.is_complete = true;
   }
 }
 
@@ -159,51 +161,52 @@ bool ClockEstimator::follows_reference() const noexcept {
 
 bool ClockEstimator::is_overdue(MonoTime now) const noexcept {
   return now - reading_->updated >
-         std::clamp(kIntervalsToHoldover * reading_->tracking.update_interval, kShortestToHoldover,
-                    kLongestToHoldover);
+         std::clamp(kIntervalsToHoldover * reading_->tracking.update_interval, kMinToHoldover,
+                    kMaxToHoldover);
 }
 
-ClockState ClockEstimator::at(MonoTime now) const noexcept {
-  ClockState state;
-  if (!heard_ever_) return state;
-  state.status = ClockStatus::out_of_bounds;
-  state.read = heard_;
-  state.trouble = why_;
-  if (now - heard_ > kSilentAfter) {
-    if (why_ != ClockReason::no_chronyd) state.trouble = ClockReason::silent;
-    return state;
+Duration ClockEstimator::own_bound() const noexcept {
+  return reading_ ? sum(bound_to_root(reading_->tracking.offset, {}), noise_) : kUnknownClockError;
+}
+
+ClockSnapshot ClockEstimator::at(MonoTime now) const noexcept {
+  ClockSnapshot clock;
+  if (!has_answered_) return clock;
+  clock.status = ClockStatus::out_of_bounds;
+  clock.reason = reason_;
+  if (now - answered_ > kSilentAfter) {
+    if (reason_ != ClockReason::no_chronyd) clock.reason = ClockReason::silent;
+    return clock;
   }
-  if (!reading_) return state;
+  if (!reading_) return clock;
   const Tracking& tracking = reading_->tracking;
-  state.stratum = tracking.stratum;
-  state.reference_id = tracking.reference_id;
-  state.offset = tracking.offset;
-  state.updated = reading_->updated;
-  state.root = tracking.root;
-  state.own_bound = sum(bound_to_root(tracking.offset, {}), unseen_);
+  clock.stratum = tracking.stratum;
+  clock.offset = tracking.offset;
+  clock.age = now - reading_->updated;
+  clock.root = tracking.root;
   if (tracking.reference_id == kLocalReferenceId) {
-    state.basis = ClockBasis::own;
-    state.bound = state.root_bound = state.own_bound;
+    clock.basis = ClockBasis::own;
+    clock.bound = clock.root_bound = own_bound();
   } else {
-    const bool relative = follows_reference() && reference_->whole;
-    state.basis = relative ? ClockBasis::reference : ClockBasis::root;
-    state.ageing = slewed(settings_.max_drift);
-    // From when chronyd last learned something, not from when we asked: in between it goes by its
-    // own estimate of the drift, which is no bound.
-    const Duration aged = sum(growth(now - reading_->updated, state.ageing), unseen_);
-    state.root_bound = sum(bound_to_root(tracking.offset, tracking.root), aged);
-    state.bound = relative ? sum(bound_to_reference(tracking.offset, tracking.root,
+    const bool relative = follows_reference() && reference_->is_complete;
+    clock.basis = relative ? ClockBasis::reference : ClockBasis::root;
+    clock.ageing_ppb = slewed(settings_.max_drift);
+    // Since chronyd last learned something, not since we asked: in between it corrects by its own
+    // estimate of the drift, which is not a bound.
+    const Duration aged = sum(growth(clock.age, clock.ageing_ppb), noise_);
+    clock.root_bound = sum(bound_to_root(tracking.offset, tracking.root), aged);
+    clock.bound = relative ? sum(bound_to_reference(tracking.offset, tracking.root,
                                                     least(reference_->before, reference_->lately)),
                                  aged)
-                           : state.root_bound;
+                           : clock.root_bound;
   }
-  if (state.bound > settings_.limit) {
-    state.trouble = ClockReason::too_far;
+  if (clock.bound > settings_.limit) {
+    clock.reason = ClockReason::too_far;
   } else {
-    state.status = state.basis != ClockBasis::own && is_overdue(now) ? ClockStatus::holdover
+    clock.status = clock.basis != ClockBasis::own && is_overdue(now) ? ClockStatus::holdover
                                                                      : ClockStatus::synchronized;
   }
-  return state;
+  return clock;
 }
 
 }  // namespace dssm::clock

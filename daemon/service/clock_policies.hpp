@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Which clocks are good enough for which streams: the keys clock_policy, clock_limit and
-// clock_streams of the configuration.
+// Which clocks are good enough for which streams: the configuration keys clock_policy, clock_limit and
+// clock_streams.
 #pragma once
 
 #include <dssm/clock_status.hpp>
@@ -10,17 +10,18 @@
 #include <string>
 #include <vector>
 
-namespace dssm::clock {
+namespace dssm::daemon {
 
 struct ClockDemand {
   ClockPolicy policy = ClockPolicy::enforce;
-  Duration limit = std::chrono::microseconds(1500);  // how far two clocks may be apart
+  Duration limit =
+      std::chrono::microseconds(1500);  // the greatest clock error that reads by time accept
 
   friend bool operator==(const ClockDemand& a, const ClockDemand& b) = default;
 };
 
 struct ClockPolicies {
-  // Another demand for some streams. Where two match, the first counts.
+  // Another demand for some streams. The first that matches counts.
   struct Exception {
     std::string pattern;  // of the stream's name, or "NAME:ID", as in fnmatch(3)
     ClockPolicy policy = ClockPolicy::enforce;
@@ -37,4 +38,4 @@ struct ClockPolicies {
   friend bool operator==(const ClockPolicies& a, const ClockPolicies& b) = default;
 };
 
-}  // namespace dssm::clock
+}  // namespace dssm::daemon

@@ -15,7 +15,7 @@
 #include <optional>
 #include <random>
 
-#include "core/clock/clock_estimator.hpp"
+#include "daemon/clock/clock_estimator.hpp"
 
 namespace dssm::clock {
 
@@ -74,7 +74,7 @@ class SimulatedPc {
   }
 
   const Tally& tally() const { return tally_; }
-  ClockState state() const { return estimator_.at(now_.mono); }
+  ClockSnapshot state() const { return estimator_.at(now_.mono); }
 
  private:
   static constexpr std::int64_t kSecond = 1'000'000'000, kTick = kSecond / 20;
@@ -126,7 +126,7 @@ class SimulatedPc {
     now_ = {MonoTime(std::chrono::hours(1)) + Duration(mono),
             Time(std::chrono::hours(400'000)) + Duration(wall),
             {}};
-    estimator_.look(now_);
+    estimator_.observe(now_);
   }
 
   void change_source() {
@@ -202,7 +202,7 @@ class SimulatedPc {
   void check() {
     ++tally_.looks;
     tally_.most_ns = std::max(tally_.most_ns, std::abs(clock_error_));
-    const ClockState state = this->state();
+    const ClockSnapshot state = this->state();
     if (state.bound == kUnknownClockError) return;
     ++tally_.stated;
     auto bound = static_cast<double>(state.bound.count());

@@ -3,7 +3,7 @@
 // Long runs of simulated PCs that know the true time: the stated bound covers the true error at
 // every look. And the other way round: an estimator that is told less than the truth is found out,
 // so these runs would notice.
-#include "tests/unit/core/clock/clock_simulation.hpp"
+#include "tests/unit/daemon/clock/clock_simulation.hpp"
 
 #include <gtest/gtest.h>
 
@@ -121,7 +121,7 @@ TEST(SimulatedClock, HasNoBoundFromTheStepOn) {
     ASSERT_NE(pc.state().bound, kUnknownClockError);
     pc.step(by);
     EXPECT_EQ(pc.state().bound, kUnknownClockError);
-    EXPECT_EQ(pc.state().trouble, ClockReason::stepped);
+    EXPECT_EQ(pc.state().reason, ClockReason::stepped);
     pc.run(10s);
     EXPECT_NE(pc.state().bound, kUnknownClockError);
     EXPECT_EQ(pc.tally().not_covered, 0);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// error_at() for who asks again and again: what the page said is kept until it says something else.
-// So the loads of one answer do not wait for each other, and it costs a few instructions that the
-// processor does beside others (docs/benchmarks.md "Stamping").
+// clock_error_at() for a writer that stamps each sample: what the page states is kept until its
+// generation changes. So the loads of one answer do not wait for each other, and it costs a few
+// instructions that the processor does beside others (docs/benchmarks.md "Stamping").
 #pragma once
 
 #include <cstdint>
@@ -13,15 +13,15 @@
 namespace dssm::clock {
 
 // Of one thread.
-class ErrorCache {
+class ClockErrorCache {
  public:
-  // Whether `t` lies behind what the page says now; then `error` is what error_at() returns, or
-  // some nanoseconds more. False: ask that. nullptr: there is no page.
+  // Whether `t` is not before the page's latest statement; then `error` is what clock_error_at()
+  // returns, or some nanoseconds more. False: call that. page: nullptr: there is none.
   bool find(const ClockPage* page, Time t, Duration& error) noexcept {
     if (!page) return false;
     // Nearly always the same, so the processor goes on before it knows.
-    if (page != page_ || page->generation.load(std::memory_order_acquire) != generation_) {
-      look(*page);
+    if (page != page_ || page->state.generation() != generation_) {
+      refresh(*page);
     }
     const std::uint64_t age =
         static_cast<std::uint64_t>(to_ns(t)) - static_cast<std::uint64_t>(wall_ns_);
@@ -33,7 +33,7 @@ class ErrorCache {
  private:
   static constexpr std::uint64_t kRoundUp = (std::uint64_t{1} << 32) - 1;
 
-  void look(const ClockPage& page) noexcept;
+  void refresh(const ClockPage& page) noexcept;
 
   const ClockPage* page_ = nullptr;
   std::uint64_t generation_ = 0;

@@ -1,0 +1,31 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/clock/clock_distance.hpp"
+
+#include <algorithm>
+
+#include "core/base/bound_sum.hpp"
+
+namespace dssm::clock {
+
+Duration distance(const wire::ClockReport& one, const wire::ClockReport& other) noexcept {
+  if (one.shares_clock_with(other)) return {};
+  Duration shortest = one.root_is_utc && other.root_is_utc
+                          ? sum(one.clock.root_bound, other.clock.root_bound)
+                          : kUnknownClockError;
+  for (const wire::ClockLink& link : one.chain) {
+    shortest = std::min(shortest, sum(link.bound, other.distance_from(link.host)));
+  }
+  return shortest;
+}
+
+Duration distance_from_anchor(const wire::ClockReport& writer,
+                              const wire::ClockReport& reader) noexcept {
+  // By the anchor itself: nothing is added to what the reader knows of it.
+  const Duration by_anchor = reader.distance_from(writer.anchor);
+  // By any other way: from the anchor to the writer's clock, and from there to the reader's.
+  const Duration by_writer = sum(writer.distance_from(writer.anchor), distance(writer, reader));
+  const bool by_root = writer.bound_is_root && writer.root_is_utc && reader.root_is_utc;
+  return std::min({by_anchor, by_writer, by_root ? reader.clock.root_bound : kUnknownClockError});
+}
+
+}  // namespace dssm::clock

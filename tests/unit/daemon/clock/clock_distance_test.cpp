@@ -1,0 +1,111 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/clock/clock_distance.hpp"
+
+#include <gtest/gtest.h>
+
+namespace dssm::clock {
+namespace {
+
+using namespace std::chrono_literals;
+using wire::ClockLink, wire::ClockReport;
+
+constexpr wire::HostId kFirst{1}, kSecond{2}, kThird{3}, kStranger{4};
+
+// A clock whose samples are stamped against the last link.
+ClockReport report(std::vector<ClockLink> chain) {
+  ClockReport made;
+  made.anchor = chain.back().host;
+  made.clock.bound = chain.back().bound;
+  made.chain = std::move(chain);
+  return made;
+}
+
+TEST(ClockDistance, ClocksWithOneReferenceAreAsFarApartAsBothBoundsSay) {
+  const ClockReport pc2 = report({{kSecond, 1us}, {kFirst, 100us}});
+  const ClockReport pc3 = report({{kThird, 2us}, {kFirst, 30us}});
+  EXPECT_EQ(distance(pc2, pc3), 130us);
+  EXPECT_EQ(distance(pc3, pc2), 130us);
+}
+
+TEST(ClockDistance, AClockAndItsReferenceAreApartByBothDistancesFromTheReferencesTime) {
+  const ClockReport pc1 = report({{kFirst, 5us}});
+  const ClockReport pc2 = report({{kSecond, 1us}, {kFirst, 100us}});
+  EXPECT_EQ(distance(pc1, pc2), 105us);
+}
+
+TEST(ClockDistance, TheShortestWayCounts) {
+  // pc2 follows pc1, which is gone, and pc3 follows pc2: the way by pc2 does not grow.
+  const ClockReport pc2 = report({{kSecond, 1us}, {kFirst, 900us}});
+  const ClockReport pc3 = report({{kThird, 0us}, {kSecond, 40us}, {kFirst, 940us}});
+  EXPECT_EQ(distance(pc2, pc3), 41us);
+}
+
+TEST(ClockDistance, WithoutACommonClockOnlyUtcHelps) {
+  ClockReport one = report({{kFirst, 0us}});
+  ClockReport other = report({{kStranger, 0us}});
+  EXPECT_EQ(distance(one, other), kUnknownClockError);
+  one.clock.root_bound = 2ms;
+  other.clock.root_bound = 3ms;
+  EXPECT_EQ(distance(one, other), kUnknownClockError) << "their roots need not be UTC";
+  one.root_is_utc = true;
+  EXPECT_EQ(distance(one, other), kUnknownClockError) << "nor both";
+  other.root_is_utc = true;
+  EXPECT_EQ(distance(one, other), 5ms);
+}
+
+TEST(ClockDistance, OneKernelIsOneClock) {
+  ClockReport one = report({{kFirst, kUnknownClockError}});
+  ClockReport other;
+  EXPECT_FALSE(one.shares_clock_with(other)) << "neither is known";
+  one.boot_id = other.boot_id = "8f4e";
+  EXPECT_TRUE(one.shares_clock_with(other));
+  EXPECT_EQ(distance(one, other), 0us);
+  other.boot_id = "8f4f";
+  EXPECT_FALSE(one.shares_clock_with(other));
+}
+
+TEST(ClockDistance, NothingIsKnownOfAClockWithoutChain) {
+  const ClockReport known = report({{kSecond, 0us}, {kFirst, 100us}});
+  EXPECT_EQ(distance(known, ClockReport()), kUnknownClockError);
+  EXPECT_EQ(distance_from_anchor(ClockReport(), known), kUnknownClockError);
+  EXPECT_EQ(distance_from_anchor(known, ClockReport()), kUnknownClockError);
+}
+
+TEST(ClockDistance, ASampleIsAsFarAsItsStampAndTheReadersDistanceFromTheAnchor) {
+  const ClockReport writer = report({{kSecond, 1us}, {kFirst, 100us}});
+  const ClockReport reader = report({{kThird, 2us}, {kFirst, 30us}});
+  EXPECT_EQ(distance_from_anchor(writer, reader), 30us);
+}
+
+TEST(ClockDistance, AnAnchorThatTheReaderDoesNotKnowIsReachedByTheWritersClock) {
+  const ClockReport writer = report({{kSecond, 1us}, {kFirst, 100us}});
+  const ClockReport reader = report({{kThird, 2us}, {kSecond, 30us}});
+  EXPECT_EQ(distance_from_anchor(writer, reader), 100us + 31us);
+}
+
+TEST(ClockDistance, StampsAgainstUtcAreNotCountedTwice) {
+  ClockReport writer = report({{kFirst, 0us}});
+  writer.root_is_utc = writer.bound_is_root = true;
+  writer.clock.root_bound = writer.clock.bound = 4ms;
+  ClockReport reader = report({{kSecond, 0us}});
+  reader.root_is_utc = true;
+  reader.clock.root_bound = 3ms;
+  EXPECT_EQ(distance_from_anchor(writer, reader), 3ms);
+  writer.bound_is_root = false;  // stamped against its own time, which may be 4 ms from UTC
+  EXPECT_EQ(distance_from_anchor(writer, reader), 7ms);
+}
+
+TEST(ClockDistance, AgesAllItsBounds) {
+  ClockReport fresh = report({{kSecond, 1us}, {kFirst, 100us}});
+  fresh.clock.root_bound = 1ms;
+  fresh.clock.ageing_ppb = 50'000;
+  const ClockReport later = fresh.at(fresh.as_of + 2s);
+  EXPECT_EQ(later.chain[0].bound, 101us);
+  EXPECT_EQ(later.chain[1].bound, 200us);
+  EXPECT_EQ(later.clock.bound, 200us);
+  EXPECT_EQ(later.clock.root_bound, 1100us);
+  EXPECT_EQ(fresh.at(fresh.as_of - 1s).clock, fresh.clock) << "an earlier time adds nothing";
+}
+
+}  // namespace
+}  // namespace dssm::clock
