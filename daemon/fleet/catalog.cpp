@@ -48,8 +48,9 @@ void Catalog::host_down(const wire::HostId& id, const Error& error) {
   const auto removed = hosts_.extract(id);
   if (!removed) return;
   const KnownHost& host = removed.mapped();
-  for (const auto& [key, stream] : host.streams) {
-    notify([&](CatalogObserver& observer) { observer.on_remote_stream_removed(host, stream); });
+  for (const auto& entry : host.streams) {
+    notify(
+        [&](CatalogObserver& observer) { observer.on_remote_stream_removed(host, entry.second); });
   }
   notify([&](CatalogObserver& observer) { observer.on_host_down(host, error); });
 }

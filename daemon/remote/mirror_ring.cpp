@@ -13,9 +13,7 @@
 namespace dssm::daemon {
 namespace {
 
-bool is_known(const MirrorClock::Report& report) noexcept {
-  return report && report->has_bound();
-}
+bool is_known(const MirrorClock::Report& report) noexcept { return report && report->has_bound(); }
 
 }  // namespace
 

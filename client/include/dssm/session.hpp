@@ -84,7 +84,7 @@ struct HostInfo {
   std::string clock_reference;  // what its clock follows: a host's name or an address, or empty
   Duration clock_distance = kUnknownClockError;  // greatest distance from this PC's clock
   bool insecure = false;                         // its traffic is unencrypted
-  std::string error;  // `reason` in a sentence, for people; empty: none
+  std::string error;                             // `reason` in a sentence, for people; empty: none
   std::string id;                     // 32 hex digits, independent of the name; empty: unknown
   std::vector<std::string> found_by;  // "peer" (configured), "mdns"; empty: this PC
 };

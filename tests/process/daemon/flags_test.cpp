@@ -109,7 +109,7 @@ TEST(Start, DoesNotRemoveAFileThatIsNoSocket) {
   std::ofstream(dir + "/dssmd.sock") << "precious";
   const Finished finished = dssmd({"--runtime-dir", dir, "--name", "pc1"});
   EXPECT_EQ(finished.exit_status, 1);
-  EXPECT_NE(finished.err.find("no socket"), std::string::npos) << finished.err;
+  EXPECT_NE(finished.err.find("not a socket"), std::string::npos) << finished.err;
   EXPECT_TRUE(std::filesystem::exists(dir + "/dssmd.sock"));
   remove_tree(dir);
 }

@@ -125,7 +125,7 @@ TEST_F(Stop, FailsWhenTheStreamIsCreatedAnewAsSomethingElse) {
   ASSERT_TRUE(session_.remove(writer_.id()));
   auto other = session_.create<float>("s", depth_of(16)).value();
   const std::string rest = echo.rest();
-  EXPECT_NE(rest.find("go on with the new ring of 's:0@pc1'"), std::string::npos) << rest;
+  EXPECT_NE(rest.find("continue with the new ring of 's:0@pc1'"), std::string::npos) << rest;
   EXPECT_EQ(echo.status(), 1);
 }
 

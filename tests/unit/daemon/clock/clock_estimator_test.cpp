@@ -220,7 +220,7 @@ TEST(ClockEstimator, TakesALocalReferenceForRight) {
   EXPECT_EQ(rig.state().status, ClockStatus::synchronized);
   EXPECT_EQ(rig.state().basis, ClockBasis::own);
   EXPECT_EQ(rig.state().bound, 0ns);
-  EXPECT_EQ(rig.state().ageing, 0);
+  EXPECT_EQ(rig.state().ageing_ppb, 0);
 }
 
 TEST(ClockEstimator, KnowsThatALocalReferenceIsStillBeingSlewed) {

@@ -394,7 +394,7 @@ TEST_F(MirrorsTest, GoesOnWithARingThatAProgramKept) {
   for (const UniqueFd& fd : kept) again.push_back(copy_of(fd));
   auto stream = mirrors->adopt_untrusted(kId, as_offer(std::move(again)));
   ASSERT_TRUE(stream) << stream.error().message;
-  EXPECT_EQ(state().state(), local::Host::CONNECTING);
+  EXPECT_EQ(state().state(), proto::Mirror::CONNECTING);
   EXPECT_EQ(state().newest(), 5);
   // The second program that holds it.
   auto second = mirrors->adopt_untrusted(kId, as_offer(std::move(kept)));
