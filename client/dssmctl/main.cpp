@@ -50,4 +50,5 @@ int main_program(int argc, char** argv) {
 }  // namespace
 }  // namespace dssm::ctl
 
+// NOLINTNEXTLINE(bugprone-exception-escape): only std::visit could throw, of an empty variant
 int main(int argc, char** argv) { return dssm::ctl::main_program(argc, argv); }

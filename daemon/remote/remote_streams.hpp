@@ -58,6 +58,7 @@ class RemoteStreams final : private CatalogObserver {
     Key key = key_of(id);
     for (;; ++std::get<3>(key)) {
       Kind& entry = *DSSM_TRY(find_or_make(key));
+      // NOLINTNEXTLINE(bugprone-use-after-move): a conflict leaves the files as they are
       Result<std::shared_ptr<Stream>> stream = entry.adopt_untrusted(std::move(files));
       if (Kind::kSeveralRings && !stream && stream.error().code == Errc::conflict) continue;
       if (!entry.is_needed()) {

@@ -20,7 +20,8 @@ constexpr Duration kEndTimeout = std::chrono::milliseconds(900);
 
 }  // namespace
 
-Mdns::Mdns(const EventLoop& loop, Options options, HostFinderObserver& observer, Logger& logger)
+Mdns::Mdns(const EventLoop& loop, const Options& options, HostFinderObserver& observer,
+           Logger& logger)
     : observer_(observer), logger_(logger) {
   state_.phase = MdnsPhase::waiting;
   if (const Result<void> started = start(loop, options); !started) {

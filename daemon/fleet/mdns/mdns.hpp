@@ -40,7 +40,7 @@ class Mdns {
   };
 
   // Starts at once. loop, observer and logger outlive it; the observer is called from the loop.
-  Mdns(const EventLoop& loop, Options options, HostFinderObserver& observer, Logger& logger);
+  Mdns(const EventLoop& loop, const Options& options, HostFinderObserver& observer, Logger& logger);
   Mdns(const Mdns&) = delete;
   Mdns& operator=(const Mdns&) = delete;
   ~Mdns();  // withdraws what is announced; a hung Avahi daemon delays it by a second at most
