@@ -20,7 +20,7 @@
 //                              reader.cpp with what the ring's header states
 //
 // May this sample be read by time? In the order of the data: assess_mirror() here with
-// clock_distance.cpp, daemon/remote/mirror_clock.cpp (adds the suspect samples; the mirror stores it),
+// clock_distance.cpp, MirrorClock in daemon/remote/mirror_ring.cpp (adds the suspect samples),
 // core/ring/clock_assessment.cpp (one sample), client/src/reader.cpp (is_refused).
 #pragma once
 
