@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What is behind a Session: connects to dssmd, reconnects, and joins the parts that use the
+// What a Session uses: connects to dssmd, reconnects, and joins the parts that use the
 // connection.
 //
 //   DaemonConnection  requests and their answers

@@ -66,7 +66,7 @@ class OpenStreams {
 
   // Offers all streams on a connection that is being set up.
   void offer_all(NewConnection& connection);
-  // dssmd has replaced the ring behind this handle.
+  // dssmd has replaced the ring of this handle.
   void on_replaced(std::uint64_t handle);
 
  private:

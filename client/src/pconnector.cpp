@@ -22,7 +22,7 @@ struct PConnectorState {
 
 namespace {
 
-// Nobody hears from outside what a connection that only lists says.
+// A connection that only lists streams receives no samples.
 class ListDelegate final : public wire::FrameDelegate {
  public:
   Result<void> on_sample_begin(const wire::IncomingSample&, std::byte*&) override {

@@ -28,7 +28,7 @@ struct SharedRing {
 // All rings of a process, by the identity of their files. Thread-safe.
 class RingCache {
  public:
-  // The shared ring behind these descriptors (as in local.proto's Opened: ring, bell, meta, and for
+  // The shared ring of these descriptors (as in local.proto's Opened: ring, bell, meta, and for
   // writers the doorbell), mapped now or before. `created`: it is new, so take its memory first.
   //   fails  no_memory, protocol
   Result<std::shared_ptr<const SharedRing>> get(std::vector<UniqueFd> fds, ring::Access access,

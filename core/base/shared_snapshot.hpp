@@ -20,7 +20,7 @@
 //     writer continues from the generation that it finds; what the dead one left in the other record
 //     is overwritten.
 //   * Readers do not trust the writer. They copy each word once, from memory whose size is fixed, and
-//     give up after kMaxTries. The values themselves can be anything: whoever uses T checks them, and
+//     give up after kMaxTries. The values themselves can be anything: the user of T checks them, and
 //     T has no member of which a bit pattern is invalid (no bool, no pointer; enumerations have a
 //     fixed underlying type).
 //

@@ -83,7 +83,7 @@ ClockStatus status_of(const ClockPage& page) noexcept;
 //   fails       protocol: it is not such a page
 Result<ClockPage*> map_page_untrusted(int fd, int protection);
 
-// The page behind `fd` for reading. It stays mapped as long as the process lives, because any thread
+// The page in `fd`, for reading. It stays mapped as long as the process lives, because any thread
 // may be reading it; further calls for the same file return the same mapping. Thread-safe.
 //   fails  protocol: it is not such a page
 Result<const ClockPage*> map_clock_page_untrusted(int fd);

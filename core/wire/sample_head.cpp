@@ -80,7 +80,7 @@ bool read_stamps(const std::byte* at, const std::byte* end, SampleHead& head) no
   head.bytes = static_cast<std::size_t>(at - input.data());
   const std::uint64_t before_payload = head.bytes - head.length_bytes;
   if (before_payload > head.frame_bytes || head.payload_bytes > head.frame_bytes - before_payload) {
-    return HeadStatus::other;  // the payload ends behind its frame: protobuf will say that it is
+    return HeadStatus::other;  // the payload ends after its frame: protobuf will say that it is
                                // none
   }
   head.trailer_bytes =

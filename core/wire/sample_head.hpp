@@ -25,7 +25,7 @@ struct SampleHead {
 enum class HeadStatus : unsigned char {
   sample,      // it is a sample in our order of fields: all of `head` is set
   other,       // another frame, or a sample in another order: frame_bytes and length_bytes are set
-  incomplete,  // more input is needed to tell; never with kMaxSampleHeaderBytes or more
+  incomplete,  // more input is needed to decide; never with kMaxSampleHeaderBytes or more
   no_frame,    // what should be the frame's length is none
 };
 

@@ -4,7 +4,7 @@
 // Frames, limits and greeting are above it (FrameConnection in dssmd, NetworkConnection in libdssm)
 // and know no sockets except fd(). make_transport() in tcp.hpp is where both ends get theirs.
 //
-// A TLS transport fits behind this interface. It needs, beyond what TCP needs:
+// A TLS transport can implement this interface. It needs, beyond what TCP needs:
 //
 //   pending input  A TLS library may hold decrypted bytes while fd() is not readable. The callers
 //                  stop calling receive() when it returned less than the spaces hold, when their
@@ -24,7 +24,7 @@
 //   ends           TLS closes with a message of its own: a connection that ends without it is an
 //                  error, not `end`.
 //   copies         In-place sending (daemon/link/sample_sender.hpp) saves a copy only where the
-//                  kernel copies; behind TLS, "copied" is the better way for all sizes.
+//                  kernel copies; with TLS, "copied" is the better way for all sizes.
 #pragma once
 
 #include <poll.h>

@@ -60,7 +60,7 @@ class EventSource {
   EventSource() = default;
   static EventSource readable(const EventLoop& loop, int fd, Callback callback);
   static EventSource writable(const EventLoop& loop, int fd, Callback callback);
-  // Edge-triggered: calls back once for each time that `fd` becomes readable anew (each write to an
+  // Edge-triggered: calls back once for each time that `fd` becomes readable again (each write to an
   // eventfd), whether or not anybody reads it. `fd` must have no other source in this loop.
   static EventSource edge(const EventLoop& loop, int fd, Callback callback);
   static EventSource signal(const EventLoop& loop, int number, Callback callback);

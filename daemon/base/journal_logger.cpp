@@ -38,7 +38,7 @@ void JournalLogger::write(LogLevel level, std::string_view text, const LogFields
   if (!send(entry)) stderr_.write(level, text, fields);
 }
 
-// Addressed each time: a journald that was started anew has another socket at the same place.
+// Addressed each time: a journald that was restarted has another socket at the same place.
 bool JournalLogger::send(const std::string& entry) noexcept {
   sockaddr_un address{};
   address.sun_family = AF_UNIX;

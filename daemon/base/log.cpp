@@ -56,7 +56,7 @@ void StderrLogger::write(LogLevel level, std::string_view text, const LogFields&
   left_out_ = 0;
   line.resize(std::min(line.size(), kMaxLineBytes - 1));
   line += '\n';
-  // Nobody is left to tell when stderr itself fails.
+  // A failure of stderr itself cannot be reported anywhere.
   [[maybe_unused]] const ssize_t written = ::write(STDERR_FILENO, line.data(), line.size());
 }
 

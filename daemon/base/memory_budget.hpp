@@ -60,7 +60,7 @@ class MemoryBudget {
                      "max_memory"};
   }
 
-  // The same for whoever has other words, or another way, when it is used up.
+  // The same for callers with their own error, or another way, when it is used up.
   std::optional<MemoryShare> try_take(std::uint64_t bytes) noexcept {
     if (bytes > left()) return std::nullopt;
     used_ += bytes;

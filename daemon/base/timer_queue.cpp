@@ -23,7 +23,7 @@ MonoTime TimerQueue::deadline_in(Duration delay) const noexcept {
   return delay > kNever - from ? kNever : from + delay;
 }
 
-// Setting the timerfd also makes it unreadable, so that nobody has to read it.
+// Setting the timerfd also makes it unreadable, so that it need not be read.
 void TimerQueue::arm() noexcept {
   const MonoTime first = waiting_.empty() ? kNever : waiting_.begin()->first;
   if (running_ || simulated_ || first == armed_) return;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The timers of one event loop, behind one timerfd. libevent's own timers become a timeout of
+// The timers of one event loop, on one timerfd. libevent's own timers become a timeout of
 // epoll_wait(): the kernel sets a timer up before each sleep and takes it down after it, although
 // the first one due stays the same for thousands of samples. Here the kernel hears of a timer
 // only when another one is the first.
@@ -55,11 +55,11 @@ class TimerQueue {
   UniqueFd fd_;
   std::optional<MonoTime> simulated_;
   Waiting waiting_;
-  MonoTime armed_ = kNever;  // what the kernel was told last
+  MonoTime armed_ = kNever;  // the time that the kernel has
   bool running_ = false;
 };
 
-// Calls back once at the time that it is started for, unless it is stopped or started anew before.
+// Calls back once at the time that it is started for, unless it is stopped or started again before.
 // The callback may do both. The queue outlives it.
 class TimerQueue::Timer {
  public:

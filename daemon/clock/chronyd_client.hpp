@@ -32,7 +32,7 @@ class ChronydClient {
     // An answer, to a question sent at `asked`. What it says is not checked.
     virtual void on_answer(const TrackingReply& reply, MonoTime asked,
                            const clock::Instant& answered) = 0;
-    // Nothing listens there; told after each question.
+    // Nothing listens there; called after each question.
     virtual void on_no_chronyd() = 0;
     // A period has passed without an answer that can be read.
     virtual void on_no_answer(const Error& why) = 0;

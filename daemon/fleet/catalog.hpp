@@ -37,7 +37,7 @@ struct KnownHost {
   std::string str() const;  // "host 'pc2' ('10.0.0.2:13776')"
 };
 
-// Told about changes, after they are in the catalog. Handlers must not change the catalog.
+// Notified of changes, after they are in the catalog. Handlers must not change the catalog.
 class CatalogObserver {
  public:
   virtual void on_host_up(const KnownHost&) {}

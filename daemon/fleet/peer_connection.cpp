@@ -17,7 +17,7 @@ constexpr std::size_t kMaxOutputBytes = PeerConnection::kMaxWaitingBytes + (2U <
 // kernel (TCP_USER_TIMEOUT); this bounds how long its dssmd may hang.
 constexpr Duration kPeerTimeoutWithOutput = 10 * wire::kPeerTimeout;
 
-// The peer answers, but retries do not help until somebody changes something.
+// The peer answers, but retries do not help until something is changed there.
 bool is_refusal(const Error& error) noexcept {
   return error.code == Errc::protocol || error.code == Errc::conflict ||
          error.code == Errc::no_permission || error.code == Errc::limit_exceeded ||

@@ -90,7 +90,7 @@ class FrameConnection final : private wire::FrameDelegate {
   // follows.
   void queue_rest(RawBytes bytes, MemoryShare share = {});
   // While true, a frame is sent by several send_now() with other work between them: the frames of
-  // send() wait behind it, and send_now() may be used although the queue is not empty.
+  // send() wait after it, and send_now() may be used although the queue is not empty.
   void set_mid_frame(bool mid_frame);
   // Asks for on_output_empty() when the socket takes bytes again, after send_now() took none.
   void want_output();

@@ -29,7 +29,7 @@ class NetworkListener {
   static Result<NetworkListener> open(const std::optional<std::vector<wire::Address>>& configured,
                                       Inherited& inherited, Logger& logger);
 
-  // Has the service manager keep the sockets, so that whoever connects while dssmd is restarted
+  // Has the service manager keep the sockets, so that a peer that connects while dssmd is restarted
   // waits and is not refused. Those that it handed over are its own anyhow.
   void keep_in(ServiceManager& manager) const;
   bool has_kept() const;  // one of the sockets was kept by it

@@ -18,7 +18,7 @@
 
 namespace dssm::daemon {
 
-// What somebody waits for; the ticket keeps it alive, and with it the wish to know.
+// What a caller waits for; its ticket keeps the request alive.
 struct Resolver::Question {
   wire::Address address;
   Then then;

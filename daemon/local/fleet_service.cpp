@@ -17,9 +17,9 @@ StreamId owned_by(const KnownHost& host, const StreamId& id) {
   return {id.name, id.id, host.greeting.host};
 }
 
-// Takes over what `host` tells about one of its streams: every value is in order afterwards.
+// Takes over what `host` reports about one of its streams: afterwards every value is valid.
 Result<proto::Stream> stream_untrusted(const std::string& host, proto::Stream stream) {
-  stream.mutable_id()->set_host(host);  // nobody speaks for another host
+  stream.mutable_id()->set_host(host);  // no host reports streams of another one
   const Result<StreamId> id = wire::stream_id_untrusted(stream.id());
   if (!id) return id.error();
   if (const Result<TypeInfo> type = wire::type_untrusted(stream.type()); !type) {
@@ -28,7 +28,7 @@ Result<proto::Stream> stream_untrusted(const std::string& host, proto::Stream st
   for (proto::User& user : *stream.mutable_users()) {
     user.set_program(printable(user.program().substr(0, wire::kMaxProgramBytes)));
   }
-  stream.clear_mirror();  // that one is ours to tell
+  stream.clear_mirror();  // this host reports that
   return stream;
 }
 
@@ -84,7 +84,7 @@ FleetService::~FleetService() {
 
 // --- finding owners
 
-// Goes on when the owner of `id` can be told, or when it is clear that it cannot.
+// Continues when the owner of `id` is known, or when it is clear that there is none.
 void FleetService::when_known(const StreamId& id, std::function<void()> go_on) {
   const bool known = !id.host.empty() && catalog_.find_host(id.host);
   if (known || peers_.startup_is_over() || early_.size() >= kMaxEarlyRequests) return go_on();
@@ -343,7 +343,7 @@ void FleetService::ping(const std::string& host, Then<local::RoundTrip> then) {
   });
 }
 
-// --- news
+// --- events
 
 void FleetService::on_remote_stream_added(const KnownHost&, const StreamInfo& stream) {
   if (observer_) observer_->on_remote_stream_added(stream);

@@ -34,7 +34,7 @@ class FleetService final : public Fleet, private CatalogObserver {
   // Requests that wait for the first words of the peers; more fail at once.
   static constexpr std::size_t kMaxEarlyRequests = 4096;
 
-  // What the list of hosts tells about this one.
+  // What the list of hosts shows of this one.
   struct Self {
     wire::Greeting greeting;
     std::vector<std::string> addresses;  // that it listens at

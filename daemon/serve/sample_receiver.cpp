@@ -46,7 +46,7 @@ Result<void> SampleReceiver::on_sample_begin(const wire::IncomingSample& sample,
   return {};
 }
 
-// Also samples of a stream that was removed are dropped: nobody will find them.
+// Samples of a stream that was removed are dropped too: no reader can find them.
 bool SampleReceiver::is_done_with(const wire::IncomingSample& sample) {
   return sample.info.tid <= last().number || stream_.stream().removed();
 }

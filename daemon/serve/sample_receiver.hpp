@@ -68,7 +68,7 @@ class SampleReceiver {
   bool dropping_ = false;        // the sample under way is written already
   bool waiting_ = false;
   bool unacknowledged_ = false;
-  bool written_ = false;  // since the feed was told last
+  bool written_ = false;  // since the feed was notified last
   Duration retry_ = kFirstRetry;
   EventSource retry_timer_;
 };

@@ -55,7 +55,7 @@ class StreamChannel final : private SamplePump::Observer,
 
   // Does what the client asks for; the answer goes to the link now or, for Read, from work(). The
   // link's output is empty.
-  //   fails  with what the client is told, also for requests that no channel knows
+  //   fails  with the error for the client, also for requests that no channel knows
   Result<void> serve_untrusted(const net::Frame& request);
 
   // Whether a sample is on its way in several parts, or an answer is not complete: no request may
@@ -66,7 +66,7 @@ class StreamChannel final : private SamplePump::Observer,
   //   request_waits  no sample of the subscription is begun, so that busy() ends
   Result<void> work(bool request_waits);
 
-  // The stream lost its name: what it holds is still sent, then the client is told.
+  // The stream lost its name: what it holds is still sent, then the client is notified.
   void on_removed();
 
   const SampleSender::Counters& counters() const noexcept { return sender_.counters(); }

@@ -55,7 +55,7 @@ void add_flag(CLI::App& app, const ConfigKey& key, Flags& flags) {
       key.flag(),
       [&flags, &key](const std::vector<std::string>& texts) { flags[key.name] = texts; }, help);
   option->type_name(std::string(key.value));
-  // One value behind each flag; CLI11 takes all that follow otherwise.
+  // One value after each flag; CLI11 takes all that follow otherwise.
   option->allow_extra_args(false);
   if (key.form != ValueForm::list) option->expected(1);
 }

@@ -104,7 +104,7 @@ Result<void> apply_file(Config& config, const std::string& path);
 // The same from text; `path` is for the messages.
 Result<void> apply_text_untrusted(Config& config, std::string_view text, const std::string& path);
 
-// Fills in what was not given and checks what no single key can tell.
+// Fills in what was not given and checks what concerns several keys.
 Result<void> finish(Config& config);
 
 }  // namespace dssm::daemon

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The folder that a dssmd works in, and the lock that makes it the only one there. The lock is an
-// flock() on the folder itself: it leaves no file behind and the kernel drops it however dssmd
+// flock() on the folder itself: it leaves no file and the kernel drops it however dssmd
 // ends.
 #pragma once
 

@@ -29,7 +29,7 @@ Result<void> check_own_memory_file(int fd, int seals, std::string_view what) {
 }
 
 DescriptorKind kind_of_untrusted(int fd) {
-  char link[128] = {};  // cut off behind what is looked at
+  char link[128] = {};  // cut off after the part that is compared
   const std::string path = "/proc/self/fd/" + std::to_string(fd);
   if (::readlink(path.c_str(), link, sizeof link - 1) < 0) return DescriptorKind::other;
   const std::string_view name(link);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// <dssm-proxy-client.hpp>: the functions between the old remote interface and what is behind it.
+// <dssm-proxy-client.hpp>: the functions between the old remote interface and RemoteStream.
 #include <array>
 #include <cstring>
 #include <new>

@@ -176,7 +176,7 @@ bool RemoteStream::open(const std::string& address, const StreamId& id, std::siz
 
 // --- reading over the network
 
-// Tids go on behind the last one told when the stream began anew.
+// After a restart of the stream, tids continue after the last one that the program got.
 void RemoteStream::follow_restart() {
   if (connector_->restarts() == restarts_) return;
   restarts_ = connector_->restarts();

@@ -74,7 +74,7 @@ class RemoteStream {
   void follow_restart();
   Tid ring_tid_of(SSM_tid tid);
 
-  // In tids as programs are told them, of 64 bits.
+  // In tids as programs get them, of 64 bits.
   ReadStatus fetch(Tid tid, SampleInfo& info);
   template <class Ask>
   ReadStatus fetch_by(Ask ask, SampleInfo& info);

@@ -314,7 +314,7 @@ void HostBrowser::on_resolved_untrusted(Result& result, const AvahiAddress* addr
   check_contest(result);
 }
 
-// Nobody answers for it (any more). A resolver that timed out goes on listening.
+// No host answers for it (any more). A resolver that timed out continues to listen.
 void HostBrowser::on_not_resolved(Result& result) {
   result.heard.reset();
   result.useless = true;
