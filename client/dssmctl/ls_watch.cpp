@@ -16,8 +16,8 @@
 namespace dssm::ctl {
 namespace {
 
-// Events of the session's thread that this program has not shown yet. It grows only while our output
-// is not read, by the streams that are added and removed meanwhile.
+// Events of the session's thread that this program has not shown yet. It grows only while our
+// output is not read, by the streams that are added and removed meanwhile.
 class EventQueue {
  public:
   void put(const StreamEvent& event) {

@@ -1,14 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A value in shared memory that one writer replaces as a whole while any number of processes read it.
+// A value in shared memory that one writer replaces as a whole while any number of processes read
+// it.
 //
 //   off            size       field
 //     0               8       generation: how often the value was stored; 0: never
 //     8       sizeof(T)       record 0, as 8-byte words
 //     8 + sizeof(T)   sizeof(T)  record 1
 //
-// Record `generation % 2` holds the current value. The writer fills the other record and then raises
-// the generation; readers copy the current record and check that the generation is still the same.
+// Record `generation % 2` holds the current value. The writer fills the other record and then
+// raises the generation; readers copy the current record and check that the generation is still the
+// same.
 //
 //   * Readers never see a mix of two values. Each word is stored with release and loaded with
 //     acquire. A reader that loads a word of a later value therefore also sees the generation that
@@ -16,13 +18,13 @@
 //     tries again.
 //   * Readers never wait. Only two complete stores during one copy make a reader try again, and it
 //     tries kMaxTries times. An honest writer that stores some times a second never gets that far.
-//   * A writer that is killed at any instruction leaves the previous value, or the new one. The next
-//     writer continues from the generation that it finds; what the dead one left in the other record
-//     is overwritten.
-//   * Readers do not trust the writer. They copy each word once, from memory whose size is fixed, and
-//     give up after kMaxTries. The values themselves can be anything: the user of T checks them, and
-//     T has no member of which a bit pattern is invalid (no bool, no pointer; enumerations have a
-//     fixed underlying type).
+//   * A writer that is killed at any instruction leaves the previous value, or the new one. The
+//     next writer continues from the generation that it finds; what the dead one left in the other
+//     record is overwritten.
+//   * Readers do not trust the writer. They copy each word once, from memory whose size is fixed,
+//     and give up after kMaxTries. The values themselves can be anything: the user of T checks
+//     them, and T has no member of which a bit pattern is invalid (no bool, no pointer;
+//     enumerations have a fixed underlying type).
 //
 //   threads  one writer at a time: the caller sees to that, across processes too; any readers.
 //            All functions are async-signal-safe.

@@ -6,9 +6,10 @@
 // stream, and sleepers check the ring every kMaxSleep in any case.
 //
 // Protocol (docs/ring-layout.md "Bell page"): bit 0 of `word` means that a thread sleeps, the other
-// bits count notifications. A sleeper sets bit 0, checks the ring again, and waits in the kernel for
-// the word to change. A writer that finds bit 0 set after publishing adds 1, which clears the bit
-// and changes the count, and wakes all. A sleeper that dies causes at most one needless wake-up.
+// bits count notifications. A sleeper sets bit 0, checks the ring again, and waits in the kernel
+// for the word to change. A writer that finds bit 0 set after publishing adds 1, which clears the
+// bit and changes the count, and wakes all. A sleeper that dies causes at most one needless
+// wake-up.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -29,7 +30,8 @@ Result<UniqueFd> create_bell();
 // A mapped bell page. Shared by shared_ptr; thread-safe.
 class Bell {
  public:
-  // Fails with `protocol` when `fd` is not a sealed memory file of the right size. Does not keep `fd`.
+  // Fails with `protocol` when `fd` is not a sealed memory file of the right size. Does not keep
+  // `fd`.
   static Result<std::shared_ptr<Bell>> open_untrusted(int fd);
 
   Bell(const Bell&) = delete;

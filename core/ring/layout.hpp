@@ -43,8 +43,8 @@ inline constexpr std::size_t kMaxPublishers = 64;
 //    24    8 earlier_tid_end    tid   dssmd       the same of the sample before; 0: none
 //    32    8 earlier_number_end -     dssmd       the same of the sample before
 //
-// While tid_end is beyond top + 1, the earlier pair is valid; a writer that takes over the lock of a
-// dead one restores that pair.
+// While tid_end is beyond top + 1, the earlier pair is valid; a writer that takes over the lock of
+// a dead one restores that pair.
 struct PublisherCursor {
   std::atomic<std::uint64_t> publisher;
   std::atomic<std::uint64_t> tid_end, number_end;
@@ -53,7 +53,7 @@ struct PublisherCursor {
 static_assert(sizeof(PublisherCursor) == 40);
 
 //   off  size field            unit   written by  order
-//     0     8 magic            -      dssmd       before any other process sees it, as all up to 320
+//     0     8 magic            -      dssmd       before other processes see it, as all to 320
 //     8     4 layout_version   -      dssmd
 //    12     4 alignment_bytes  bytes  dssmd
 //    16     8 payload_bytes    bytes  dssmd

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// How far each publisher (a writer on another PC) has got with a stream, so that each of its samples
-// is written exactly once, however often a connection ends or this PC's dssmd is restarted. The
-// cursors are in the ring's header and live as long as the ring. A publisher is identified by a
+// How far each publisher (a writer on another PC) has got with a stream, so that each of its
+// samples is written exactly once, however often a connection ends or this PC's dssmd is restarted.
+// The cursors are in the ring's header and live as long as the ring. A publisher is identified by a
 // number that stays the same over reconnects, and it numbers its samples.
 //
 // A cursor is advanced before the sample's `top` is set. A dssmd that is killed in between leaves a

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Creates and maps the memory of a ring, and checks that what is mapped is a ring. Both the daemon
-// and the client library map rings through RingMapping. Its geometry is a checked copy: no code reads
-// the header's geometry again, because another process may overwrite it at any time.
+// and the client library map rings through RingMapping. Its geometry is a checked copy: no code
+// reads the header's geometry again, because another process may overwrite it at any time.
 #pragma once
 
 #include <cstddef>
@@ -29,8 +29,8 @@ struct RingIdentity {
 enum class Access : unsigned char { read_only, read_write };
 
 // Creates the memory file of a new ring: header written, size sealed, inode mode 0400, so that only
-// its creator (and root) can open it again through /proc. The system takes memory for it at the first
-// write to each page; see reserve().
+// its creator (and root) can open it again through /proc. The system takes memory for it at the
+// first write to each page; see reserve().
 //   returns  a read-write descriptor
 Result<UniqueFd> create_ring(const RingIdentity& identity, const Geometry& geometry);
 

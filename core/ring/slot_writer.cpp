@@ -66,8 +66,8 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
 }
 
 // With the sample that it did not publish, the dead writer may have begun a run, crossed a gap, or
-// advanced a cursor. The slot needs no repair: it is outside of the window, and the next sample with
-// that tid overwrites it.
+// advanced a cursor. The slot needs no repair: it is outside of the window, and the next sample
+// with that tid overwrites it.
 void SlotWriter::recover() const noexcept {
   const Tid top = header_->top.load(std::memory_order_relaxed);
   const Tid run_start = top < 0 ? 0 : slots_.slot(top).run_start.load(std::memory_order_relaxed);

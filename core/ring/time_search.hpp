@@ -13,8 +13,8 @@
 //
 // Streams with several writers are why runs are linked: two writers that measure at different times
 // and write in turn make a new run with almost every sample. Then at(t) takes 610 ns at a depth of
-// 10^5 (docs/benchmarks.md, "every other sample backwards"), where a search from run to run would be
-// linear in the depth.
+// 10^5 (docs/benchmarks.md, "every other sample backwards"), where a search from run to run would
+// be linear in the depth.
 //
 // Used by readers, and by the writer that begins a new run.
 #pragma once

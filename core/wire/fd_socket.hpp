@@ -26,8 +26,8 @@ Result<IoResult> send_some(int socket, std::span<const std::byte> bytes, std::sp
 Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<UniqueFd>& fds);
 
 // Creates a Unix stream socket connected to `path`, close-on-exec and blocking.
-//   fails  no_daemon (no such socket, or no process listens), no_permission, invalid_argument (path is
-//          longer than the 107 bytes that an address takes)
+//   fails  no_daemon (no such socket, or no process listens), no_permission, invalid_argument (path
+//          is longer than the 107 bytes that an address takes)
 Result<UniqueFd> connect_unix(const std::string& path);
 
 }  // namespace dssm::wire

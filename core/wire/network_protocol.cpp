@@ -132,8 +132,8 @@ HostId host_id_for(std::string_view name) {
     std::string id = machine_id();
     return id.empty() ? random_id() : id;
   }();
-  // The first two parts have a fixed length, so no two names give the same bytes. The machine id has
-  // 128 random bits: it cannot be found from the digest by trying.
+  // The first two parts have a fixed length, so no two names give the same bytes. The machine id
+  // has 128 random bits: it cannot be found from the digest by trying.
   const Sha256 digest = sha256(std::string(kApplicationId) + machine + std::string(name));
   HostId id{};
   std::copy_n(digest.begin(), id.size(), id.begin());

@@ -61,8 +61,8 @@ Error other_protocol_version(const std::string& who, std::uint32_t theirs,
                              const std::string& software = {});
 
 // This PC's id for a dssmd that calls its host `name`: from the machine id (machine-id(5)), which
-// does not leave this PC, and the name, so that several dssmd with different names on one machine are
-// different hosts. Without a machine id it is random, and so different after each start.
+// does not leave this PC, and the name, so that several dssmd with different names on one machine
+// are different hosts. Without a machine id it is random, and so different after each start.
 HostId host_id_for(std::string_view name);
 
 // Random and never 0.

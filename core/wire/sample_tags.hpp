@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The tags of proto/network.proto that are written and read by hand: field number times 8 plus wire
-// type (0 varint, 1 eight bytes, 2 length-delimited). tests/unit/core/wire holds them against protobuf.
+// type (0 varint, 1 eight bytes, 2 length-delimited). tests/unit/core/wire holds them against
+// protobuf.
 #pragma once
 
 #include <array>

@@ -39,8 +39,9 @@ bool takes_ipv4_too(int socket) noexcept;
 // finish_connect(). Sets the options of the connected end.
 Result<UniqueFd> start_connect(const SocketAddress& address);
 
-// The result of connecting; the error names the address and the reason ("connect to '10.0.0.2:13776': Connection
-// refused; is dssmd running there, and does it listen on that address?").
+// The result of connecting; the error names the address and the reason ("connect to
+// '10.0.0.2:13776': Connection refused; is dssmd running there, and does it listen on that
+// address?").
 Result<void> finish_connect(int socket, const SocketAddress& address);
 
 // Sets the options of the accepted end.

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What dssmd reports to its operator. The rest of the daemon knows only Logger; where the words go is
-// decided in main(). A function either logs or returns a failure, so lines appear where dssmd gives
-// something up.
+// What dssmd reports to its operator. The rest of the daemon knows only Logger; where the words go
+// is decided in main(). A function either logs or returns a failure, so lines appear where dssmd
+// gives something up.
 #pragma once
 
 #include <cstdint>

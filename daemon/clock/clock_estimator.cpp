@@ -13,7 +13,8 @@ constexpr Duration kMaxValue = std::chrono::hours(24 * 365);
 // measurement that chronyd was just processing.
 constexpr Duration kMaxAhead = std::chrono::seconds(1);
 
-// Times of measurements that are closer than this are of the same one. chronyd takes 128 a second at most.
+// Times of measurements that are closer than this are of the same one. chronyd takes 128 a second
+// at most.
 constexpr Duration kSameUpdate = std::chrono::milliseconds(1);
 
 // A holdover begins after this many intervals without a measurement, or after the shortest.

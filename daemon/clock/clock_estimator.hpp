@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What this PC knows of its own clock, from chronyd's answers and from comparing the wall clock with
-// the monotonic one. No I/O: the caller brings answers and the time. docs/clocks.md derives it.
+// What this PC knows of its own clock, from chronyd's answers and from comparing the wall clock
+// with the monotonic one. No I/O: the caller brings answers and the time. docs/clocks.md derives
+// it.
 //
 //   threads  one
 #pragma once

@@ -2,8 +2,8 @@
 //
 // A cheap check whether the wall clock was set. The kernel's coarse clocks are those of its last
 // tick, so the difference of the wall clock and the monotonic one stays the same to the nanosecond
-// until the wall clock is set (clock_gettime(2); slewing changes both alike). Only the kernel's page
-// of times is read.
+// until the wall clock is set (clock_gettime(2); slewing changes both alike). Only the kernel's
+// page of times is read.
 #pragma once
 
 #include <dssm/time.hpp>

@@ -12,7 +12,8 @@
 namespace dssm::daemon {
 namespace {
 
-// For a time that never comes. Reports at once, too, when the clock was set since it was armed last.
+// For a time that never comes. Reports at once, too, when the clock was set since it was armed
+// last.
 bool arm(int timer) noexcept {
   itimerspec never{};
   never.it_value.tv_sec = std::numeric_limits<time_t>::max();

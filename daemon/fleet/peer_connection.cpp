@@ -146,7 +146,8 @@ void PeerConnection::watch() {
   request.mutable_watch();
   ask(std::move(request), [this](const Result<net::Frame>& answer) {
     if (answer) return observer_.on_watched(*this);
-    // The peer refuses: without its streams it is of no use. (When the connection broke, no effect.)
+    // The peer refuses: without its streams it is of no use. (When the connection broke, no
+    // effect.)
     drop(Error(answer.error()).context("watch the streams of host '" + them_->host + "'"));
   });
 }

@@ -245,7 +245,8 @@ void Peers::set_configured(const std::vector<wire::Address>& peers) {
     known.push_back(address);
     if (std::find(peers.begin(), peers.end(), address) != peers.end()) continue;
     peer.leaving = true;
-    // Requests that wait for its answers fail; reconcile() removes it when the connection has ended.
+    // Requests that wait for its answers fail; reconcile() removes it when the connection has
+    // ended.
     peer.connection->drop({Errc::unavailable, "it is no longer among the peers (key peers)"});
   }
   const auto first_found = std::find_if(peers_.begin(), peers_.end(),

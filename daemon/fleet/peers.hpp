@@ -6,8 +6,8 @@
 //
 // Which code decides that a host is dead:
 //
-//   PeerConnection::beat()      once a second: no byte came for 2.8 s (wire::kPeerTimeout), or, while
-//                               output waits for the peer's kernel to take it, for 28 s
+//   PeerConnection::beat()      once a second: no byte came for 2.8 s (wire::kPeerTimeout), or,
+//                               while output waits for the peer's kernel to take it, for 28 s
 //                               (kPeerTimeoutWithOutput): a large property on a slow network delays
 //                               our own heartbeats. Then it closes the connection. (That the peer's
 //                               PC is off, our kernel finds out earlier: TCP_USER_TIMEOUT.)
@@ -25,14 +25,15 @@
 //   a host that mDNS does not know any more
 //     The connection decides: the host is removed when it is not up.
 //   an announcement with a wrong id
-//     Any other host that answers there is refused, and while a host is up no other one is dialed at
-//     its address, so that announcements cannot bring up, replace or disturb another host than the
-//     one that they name.
+//     Any other host that answers there is refused, and while a host is up no other one is dialed
+//     at its address, so that announcements cannot bring up, replace or disturb another host than
+//     the one that they name.
 //   this very dssmd
 //     Is connected to and not used.
 //   a duplicate: another dssmd with this host's id (a cloned disk, and the same name)
-//     Is connected to and not used, with a warning. Found ones are asked for their instance id, too:
-//     what mDNS finds with our own id may be an echo of our own announcement, which is ignored.
+//     Is connected to and not used, with a warning. Found ones are asked for their instance id,
+//     too: what mDNS finds with our own id may be an echo of our own announcement, which is
+//     ignored.
 //   namesakes: two hosts of one name
 //     Both are kept; `@name` is then a conflict; a warning.
 //   a namesake of this host

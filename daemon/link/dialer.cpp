@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // One round of attempts: look the address up, try the addresses in turn, greet. A round that fails,
-// and a connection that ends, lead to a pause and to the next round. Everything happens in callbacks
-// of the loop, and each state is left only by the timer or by the event it waits for.
+// and a connection that ends, lead to a pause and to the next round. Everything happens in
+// callbacks of the loop, and each state is left only by the timer or by the event it waits for.
 #include "daemon/link/dialer.hpp"
 
 #include <fmt/format.h>

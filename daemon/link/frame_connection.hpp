@@ -37,16 +37,16 @@ class FrameConnection final : private wire::FrameDelegate {
     virtual Result<void> on_frame(net::Frame& frame) = 0;
     // The queue is empty, or the socket takes bytes again: samples may follow.
     virtual void on_output_empty() {}
-    // The connection has ended, by itself or by an error; called once, as the last handler, from the
-    // loop and never from within a call of the observer's own. Destroy the connection later.
+    // The connection has ended, by itself or by an error; called once, as the last handler, from
+    // the loop and never from within a call of the observer's own. Destroy the connection later.
     virtual void on_closed(const Error& why) = 0;
 
    protected:
     ~Observer() = default;
   };
 
-  // Takes samples. Not a part of Observer, because each step of a sample's path costs time. The same
-  // rules as for the observer's handlers.
+  // Takes samples. Not a part of Observer, because each step of a sample's path costs time. The
+  // same rules as for the observer's handlers.
   class SampleDelegate {
    public:
     // As wire::FrameDelegate. When the connection is paused within on_sample_begin(), `out` is not
@@ -104,8 +104,8 @@ class FrameConnection final : private wire::FrameDelegate {
   void resume();
   bool is_paused() const noexcept { return paused_; }
 
-  // Closes with a final failure for the peer (a Failure with serial 0), as far as the socket takes it
-  // at once. on_closed() follows from the loop.
+  // Closes with a final failure for the peer (a Failure with serial 0), as far as the socket takes
+  // it at once. on_closed() follows from the loop.
   void close_with(const Error& why);
   bool is_open() const noexcept { return !closed_; }
 

@@ -3,16 +3,16 @@
 // Sends samples from a ring over a connection. It never waits for the writer, which may overwrite a
 // slot at any moment, so each way of sending makes sure that no receiver accepts such a sample:
 //
-//   copied    small payloads, as many at a time as there are, into whole frames, each checked by its
-//             slot's sequence, then sent at once. One copy.
+//   copied    small payloads, as many at a time as there are, into whole frames, each checked by
+//             its slot's sequence, then sent at once. One copy.
 //   in place  large payloads go out straight from their slot by gathered sends. When all bytes are
 //             with the kernel, the sequence is checked, and the frame's last field (network.proto,
 //             Frame.torn) says whether the sample is valid. Bytes that the socket does not take are
 //             copied aside at once and checked then, so that a slow connection does not make the
-//             sample void. When the peer's memory is used up, the sample waits in its slot, where it
-//             may be overwritten. For a peer without the feature "torn": copied as a whole, checked,
-//             then sent. Without MSG_MORE, which made the kernel send up to twice as slowly
-//             (docs/benchmarks.md).
+//             sample void. When the peer's memory is used up, the sample waits in its slot, where
+//             it may be overwritten. For a peer without the feature "torn": copied as a whole,
+//             checked, then sent. Without MSG_MORE, which made the kernel send up to twice as
+//             slowly (docs/benchmarks.md).
 //
 // The limits between the two were measured on loopback, as processor time of the sending thread per
 // sample (2 cores, busy): in runs from a ring larger than the cache, copied and in place take 1.6

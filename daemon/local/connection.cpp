@@ -119,8 +119,8 @@ void Connection::on_writable() {
   if (!is_paused()) next_turn_.enable_in(Duration::zero());
 }
 
-// The final failure is sent as far as the socket takes it at once; the connection does not wait for a
-// client that does not read.
+// The final failure is sent as far as the socket takes it at once; the connection does not wait for
+// a client that does not read.
 void Connection::end_with(const Error& error) {
   logger_.warning("close a connection: " + error.message,
                   {.message_id = message_id::kClientRefused});

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One client's socket: cuts its bytes into frames for LocalService and sends the responses. It never
-// waits for the client. What the client does not receive is queued up to kMaxQueuedBytes, then the
-// connection is closed; an error closes this connection only.
+// One client's socket: cuts its bytes into frames for LocalService and sends the responses. It
+// never waits for the client. What the client does not receive is queued up to kMaxQueuedBytes,
+// then the connection is closed; an error closes this connection only.
 #pragma once
 
 #include <cstddef>

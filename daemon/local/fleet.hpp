@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The other hosts, as LocalService uses them. Results come by a callback that is called once: later from
-// the loop, or at once from within the call; never after the Fleet is destroyed. An id without a host
-// refers to the only other host that has such a stream; the caller searches the own streams first.
+// The other hosts, as LocalService uses them. Results come by a callback that is called once: later
+// from the loop, or at once from within the call; never after the Fleet is destroyed. An id without
+// a host refers to the only other host that has such a stream; the caller searches the own streams
+// first.
 #pragma once
 
 #include <dssm/result.hpp>

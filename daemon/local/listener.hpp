@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The Unix socket that programs of this PC connect to. Its owner also holds the lock on the folder
-// (RuntimeDir), so an existing socket file is that of a dssmd that was killed, or of a socket that the
-// service manager passed. The latter is used as it is and not removed: programs that connect while no
-// dssmd runs wait there.
+// (RuntimeDir), so an existing socket file is that of a dssmd that was killed, or of a socket that
+// the service manager passed. The latter is used as it is and not removed: programs that connect
+// while no dssmd runs wait there.
 #pragma once
 
 #include <sys/types.h>
@@ -18,8 +18,8 @@ namespace dssm::daemon {
 
 class Listener {
  public:
-  // Listens at `path` with that group (none: keep it) and mode; no program can connect before both are
-  // set. inherited: the socket that the service manager passed for `path`; none: makes one.
+  // Listens at `path` with that group (none: keep it) and mode; no program can connect before both
+  // are set. inherited: the socket that the service manager passed for `path`; none: makes one.
   static Result<Listener> open(const std::string& path, std::optional<gid_t> group, mode_t mode,
                                UniqueFd inherited = {});
 

@@ -177,8 +177,8 @@ void LocalService::serve_remote(ClientNumber number, const local::Request& reque
   }
 }
 
-// Takes the response of another host to the client; none when this client waits for too many already:
-// then it has got a failure.
+// Takes the response of another host to the client; none when this client waits for too many
+// already: then it has got a failure.
 RemoteRequests::Answer LocalService::await(ClientNumber number, std::uint64_t serial) {
   Client& client = clients_.at(number);
   if (client.awaited >= kMaxAwaited) {
@@ -223,8 +223,8 @@ void LocalService::log_offer(const ClientIdentity& client, const local::Offer& o
 }
 
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
-  // First the existing streams, then the response: after a reconnect it tells the client that streams
-  // which were not among them do not exist any more.
+  // First the existing streams, then the response: after a reconnect it tells the client that
+  // streams which were not among them do not exist any more.
   for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
     const auto client = clients_.find(number);
     if (client == clients_.end()) return;

@@ -4,18 +4,19 @@
 // StreamEvents to those that watch. Connection and Server carry the bytes; tests and fuzzers pass
 // frames directly.
 //
-// Each request passes the Authorizer (daemon/streams/authorize.hpp). Requests about streams of other
-// hosts go to the Fleet, which responds later; when the client has disconnected by then, the response
-// is dropped.
+// Each request passes the Authorizer (daemon/streams/authorize.hpp). Requests about streams of
+// other hosts go to the Fleet, which responds later; when the client has disconnected by then, the
+// response is dropped.
 //
 // A ring can get a successor: a stream is created again under the name of a removed one, its owner
 // restarted without its rings, or another host has it now. Readers of the old ring get the event
-// Replaced and reopen the stream by the name that they used the first time: so it may move to another
-// host only for those that named none.
+// Replaced and reopen the stream by the name that they used the first time: so it may move to
+// another host only for those that named none.
 //
 // After a crash of the dssmd before this one, programs that still hold streams reconnect and offer
 // them. Until end_recovery() a Watch, and a request about a stream that is not offered yet, is held
-// back, not refused: otherwise a restarted writer could take the name of a ring that others still use.
+// back, not refused: otherwise a restarted writer could take the name of a ring that others still
+// use.
 #pragma once
 
 #include <cstddef>
@@ -68,8 +69,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void disconnect(ClientNumber number);
   std::size_t clients() const noexcept { return clients_.size(); }
 
-  // One frame of a client, without its length. The response goes to its output before this returns, or
-  // later for a request that is held back.
+  // One frame of a client, without its length. The response goes to its output before this returns,
+  // or later for a request that is held back.
   //   returns  false: the client does not keep to the protocol, the connection must end
   bool on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
                           DescriptorQueue& descriptors);

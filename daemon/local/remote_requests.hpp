@@ -23,8 +23,8 @@ class RemoteRequests {
   // again.
   using Answer = std::function<void(Result<Reply>)>;
 
-  // Whether `request` is for other hosts: it is about hosts, or names a stream of another host, or one
-  // without a host that this host does not own (`own_knows`).
+  // Whether `request` is for other hosts: it is about hosts, or names a stream of another host, or
+  // one without a host that this host does not own (`own_knows`).
   bool takes(const local::Request& request,
              const std::function<bool(const StreamId&)>& own_knows) const;
 

@@ -14,9 +14,9 @@
 // The states, and what leads from one to the next; "ring" where there may be one already:
 //
 //             on_up            Opened             Subscribed         CaughtUp      catalog: removed
-//   unavailable ----> opening -------> subscribing --------> filling -------> live ---------> ending
-//     ^ (ring)         (ring) ^                                                ^               |
-//     |                       |                                                +---------------+
+//   unavailable ----> opening -------> subscribing --------> filling -------> live --------> ending
+//     ^ (ring)         (ring) ^                                                ^              |
+//     |                       |                                                +--------------+
 //     |                       |                                                 catalog: added
 //     |       on_up           | Opened
 //   removed ----> reopening --+

@@ -87,9 +87,9 @@ class MirrorRing {
   std::uint64_t gap_samples_ = 0, received_samples_ = 0, received_bytes_ = 0;
 };
 
-// What the times in one mirror are worth, from what its owner reported of its clock, and when. Knows
-// which samples are suspect: those that arrived while the owner's clock was not known, and those
-// stamped against another reference than the present one.
+// What the times in one mirror are worth, from what its owner reported of its clock, and when.
+// Knows which samples are suspect: those that arrived while the owner's clock was not known, and
+// those stamped against another reference than the present one.
 class MirrorClock {
  public:
   using Report = std::shared_ptr<const wire::ClockReport>;

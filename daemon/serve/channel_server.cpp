@@ -11,8 +11,8 @@
 namespace dssm::daemon {
 namespace {
 
-// Heartbeats cause a check of all streams at most once in this period: a writer may have been killed
-// after it wrote a sample and before it wrote to the doorbell.
+// Heartbeats cause a check of all streams at most once in this period: a writer may have been
+// killed after it wrote a sample and before it wrote to the doorbell.
 constexpr Duration kCheckPeriod = std::chrono::milliseconds(900);
 
 }  // namespace

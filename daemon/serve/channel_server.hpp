@@ -42,8 +42,8 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   ChannelServer& operator=(const ChannelServer&) = delete;
   ~ChannelServer();  // connected peers get a final failure
 
-  // Accepts from now on. Until then connections wait: while the programs of this PC give streams back
-  // after a crash, no other host may take their names. `listener` outlives the server.
+  // Accepts from now on. Until then connections wait: while the programs of this PC give streams
+  // back after a crash, no other host may take their names. `listener` outlives the server.
   void serve(const NetworkListener& listener);
 
   // For tests and fuzzers: a connection that is there already.

@@ -288,7 +288,8 @@ void DataCommunicator::on_closed(const Error& why) {
   next_turn_.disable();
   greeting_timeout_.disable();
   peer_timeout_.disable();
-  // Removes a ring whose memory is not fully reserved, unless a program or peer has opened it meanwhile.
+  // Removes a ring whose memory is not fully reserved, unless a program or peer has opened it
+  // meanwhile.
   if (opening_ && opening_->created && opening_->stream->channels() == 0 &&
       !opening_->stream->removed()) {
     const OpenTable::Counts counts = parts_.opens.counts(*opening_->stream);

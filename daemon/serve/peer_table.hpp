@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The connections over the network, by address, and the memory that they use. Everything that a peer
-// can make grow (frames that wait for it, samples that are received from it, ...) is charged to the
-// account of its address, so that one peer cannot use up the memory of the others.
+// The connections over the network, by address, and the memory that they use. Everything that a
+// peer can make grow (frames that wait for it, samples that are received from it, ...) is charged
+// to the account of its address, so that one peer cannot use up the memory of the others.
 #pragma once
 
 #include <cstdint>

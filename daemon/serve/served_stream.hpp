@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What all channels of one stream share: the feed that notifies of new samples, and the writer. They
-// exist only while a channel uses them.
+// What all channels of one stream share: the feed that notifies of new samples, and the writer.
+// They exist only while a channel uses them.
 #pragma once
 
 #include <dssm/result.hpp>

@@ -43,7 +43,8 @@ void StreamWatch::on_stream_added(const Stream& stream) {
   }
 }
 
-// Also for one whose addition was not sent yet: a receiver ignores the removal of an unknown stream.
+// Also for one whose addition was not sent yet: a receiver ignores the removal of an unknown
+// stream.
 void StreamWatch::on_stream_removed(const Stream& stream) {
   net::Frame frame;
   proto::StreamEvent& event = *frame.mutable_stream_event();

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Which clocks are good enough for which streams: the configuration keys clock_policy, clock_limit and
-// clock_streams.
+// Which clocks are good enough for which streams: the configuration keys clock_policy, clock_limit
+// and clock_streams.
 #pragma once
 
 #include <dssm/clock_status.hpp>

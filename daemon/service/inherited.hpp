@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The descriptors that the service manager passed to dssmd, sorted by their kind. Names matter only to
-// distinguish sockets that dssmd put into the descriptor store from those of a socket unit.
+// The descriptors that the service manager passed to dssmd, sorted by their kind. Names matter only
+// to distinguish sockets that dssmd put into the descriptor store from those of a socket unit.
 #pragma once
 
 #include <optional>

@@ -14,8 +14,8 @@ void raise_descriptor_limit() noexcept;
 // Writing to a closed connection returns an error instead of ending dssmd (SIGPIPE).
 void ignore_broken_pipes() noexcept;
 
-// Keeps libprotobuf from writing a line to stderr for each malformed string that a client sends: that
-// has no limit, and it blocks when stderr is a full pipe. dssmd logs what it refuses.
+// Keeps libprotobuf from writing a line to stderr for each malformed string that a client sends:
+// that has no limit, and it blocks when stderr is a full pipe. dssmd logs what it refuses.
 void silence_protobuf() noexcept;
 
 // Returns large freed blocks to the system at once. Otherwise the C library raises its threshold
@@ -23,8 +23,8 @@ void silence_protobuf() noexcept;
 void return_large_memory() noexcept;
 
 // Blocks SIGINT, SIGTERM and SIGHUP while dssmd starts, so that one which is sent as soon as the
-// socket exists still ends or reloads dssmd in the usual way. To be used by the first thread, before
-// it starts others; threads started meanwhile never receive these signals.
+// socket exists still ends or reloads dssmd in the usual way. To be used by the first thread,
+// before it starts others; threads started meanwhile never receive these signals.
 class BlockedSignals {
  public:
   BlockedSignals() noexcept;

@@ -4,9 +4,9 @@
 // (FileDescriptorStoreMax=), and passes sockets and kept descriptors to the next dssmd. Without one
 // ($NOTIFY_SOCKET, $LISTEN_FDS) nothing of this has an effect.
 //
-// Nothing here blocks: messages that the manager does not take at once are queued. If dssmd is killed
-// before they are sent, streams of that moment are offered back by their programs. Watchdog messages
-// are never queued.
+// Nothing here blocks: messages that the manager does not take at once are queued. If dssmd is
+// killed before they are sent, streams of that moment are offered back by their programs. Watchdog
+// messages are never queued.
 #pragma once
 
 #include <cstddef>
@@ -84,8 +84,8 @@ class ServiceManager {
   EventSource try_again_;
 };
 
-// Reports to the manager that the loop runs, twice in the interval that it requires ($WATCHDOG_USEC):
-// when the loop hangs, the manager kills and restarts dssmd.
+// Reports to the manager that the loop runs, twice in the interval that it requires
+// ($WATCHDOG_USEC): when the loop hangs, the manager kills and restarts dssmd.
 class Watchdog {
  public:
   // Begins at once. manager: outlives it.

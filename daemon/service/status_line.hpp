@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Updates the line that `systemctl status` shows, at most once in kPause and only when it changed. Does
-// nothing without a service manager.
+// Updates the line that `systemctl status` shows, at most once in kPause and only when it changed.
+// Does nothing without a service manager.
 #pragma once
 
 #include <dssm/time.hpp>

@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Decides who may do what. Each request of a program of this PC (LocalService) and of another host or
-// remote program (DataCommunicator) passes an Authorizer once, before anything else is done for it.
+// Decides who may do what. Each request of a program of this PC (LocalService) and of another host
+// or remote program (DataCommunicator) passes an Authorizer once, before anything else is done for
+// it.
 //
 //   Identity   who asks: of a local program what the kernel says (SO_PEERCRED), of a remote one its
 //              address and what its greeting says, which is not verified

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Serves the requests of catalog.proto about the streams of this host: for its programs
-// (LocalService) and for other hosts (DataCommunicator) alike. Both protocols carry these messages in
-// fields of the same names, so one template serves local::Request and net::Frame.
+// (LocalService) and for other hosts (DataCommunicator) alike. Both protocols carry these messages
+// in fields of the same names, so one template serves local::Request and net::Frame.
 //
 // Stateless. Watch, which has state, and what a created or opened stream means to a connection
 // (descriptors, or a channel) belong to the two callers.

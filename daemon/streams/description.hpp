@@ -19,8 +19,8 @@ void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out);
 // The same, with the programs of this host that use it.
 void describe_with_users(const Stream& stream, const OpenTable& opens, proto::Stream& out);
 
-// All streams in the order of creation. From `max_bytes` on their types' fields are left out, because a
-// list has to fit into one frame.
+// All streams in the order of creation. From `max_bytes` on their types' fields are left out,
+// because a list has to fit into one frame.
 void describe_all(const Registry& registry, const OpenTable& opens, std::size_t max_bytes,
                   proto::StreamList& out);
 

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Keeps the streams of this host, and the playback clock, in the service manager's descriptor store: a
-// restarted dssmd has them at once, also streams whose programs have all ended. Which program has what
-// open is known from the programs, which reconnect and offer what they hold; an offered ring that came
-// from the store is joined.
+// Keeps the streams of this host, and the playback clock, in the service manager's descriptor
+// store: a restarted dssmd has them at once, also streams whose programs have all ended. Which
+// program has what open is known from the programs, which reconnect and offer what they hold; an
+// offered ring that came from the store is joined.
 //
 // All descriptors of a stream (ring, bell, meta, doorbell) have one name of three characters; the
-// clock's name is "#". Names of memory files tell which is which. Longer names would be easier to read,
-// but systemd passes all of them in one environment variable, and Linux starts no program with a
-// variable above 128 KiB: dssmd could never be started again.
+// clock's name is "#". Names of memory files tell which is which. Longer names would be easier to
+// read, but systemd passes all of them in one environment variable, and Linux starts no program
+// with a variable above 128 KiB: dssmd could never be started again.
 //
 // A doorbell that is made later is not kept: the writer that has it offers it back.
 #pragma once

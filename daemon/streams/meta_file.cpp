@@ -93,7 +93,8 @@ Result<MetaFile> MetaFile::create(const local::StreamMeta& meta) {
 Result<MetaFile> MetaFile::open_untrusted(UniqueFd fd) {
   DSSM_TRY(check_own_memory_file(fd.get(), kMetaSeals, "meta file"));
   DSSM_TRY(read_header_untrusted(fd.get()));
-  // One that was offered for writing might be shared with the process that offered it: take a new one.
+  // One that was offered for writing might be shared with the process that offered it: take a new
+  // one.
   return MetaFile(DSSM_TRY(reopen_read_write(fd.get())));
 }
 

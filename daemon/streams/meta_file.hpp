@@ -3,7 +3,8 @@
 // The meta file: all that dssmd knows about a stream and that is not in its ring, in a memfd beside
 // it: type with fields, property, creator, place in the list. With ring, bell and this file alone a
 // new dssmd brings a stream back. Only dssmd writes it; clients hold a descriptor for reading, only
-// to offer it back. It is read with pread() and never mapped: a wrong size is an error, not a signal.
+// to offer it back. It is read with pread() and never mapped: a wrong size is an error, not a
+// signal.
 //
 // Layout, little endian; the pages not named are holes:
 //

@@ -72,8 +72,8 @@ class OpenTable {
   };
   std::vector<Reading> readers_of(const Stream& stream) const;
 
-  // The open streams of that name and id, of any host: own ones, removed ones, mirrors. Searches all
-  // open streams.
+  // The open streams of that name and id, of any host: own ones, removed ones, mirrors. Searches
+  // all open streams.
   std::vector<std::shared_ptr<const Stream>> open_streams(const std::string& name,
                                                           std::int32_t id) const;
 

@@ -49,8 +49,8 @@ class Registry {
     budget_.set_limit(limits.max_memory_bytes);
   }
 
-  // Notified in the order in which they were added. Each outlives the registry or is removed before;
-  // none is added or removed by an observer.
+  // Notified in the order in which they were added. Each outlives the registry or is removed
+  // before; none is added or removed by an observer.
   void add_observer(StreamObserver& observer) { observers_.push_back(&observer); }
   void remove_observer(StreamObserver& observer) { std::erase(observers_, &observer); }
 
@@ -79,8 +79,8 @@ class Registry {
   Result<Created> create(const StreamId& id, const TypeInfo& type, const History& history,
                          std::int32_t creator_pid);
 
-  // Takes back a stream that a client kept while no dssmd ran. Returns the registered stream when it
-  // has the same ring.
+  // Takes back a stream that a client kept while no dssmd ran. Returns the registered stream when
+  // it has the same ring.
   //   fails  conflict (another ring has that name), protocol, no_permission, limit_exceeded
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, OfferedFiles files);
 

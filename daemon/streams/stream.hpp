@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One ring of this host: its memory files and what dssmd knows about it. A stream that this host owns
-// exists as long as it is in the Registry or a program has it open; mirrors and the rings of remote
-// writers as long as their tables hold them. Memory that a program has mapped stays valid after that.
+// One ring of this host: its memory files and what dssmd knows about it. A stream that this host
+// owns exists as long as it is in the Registry or a program has it open; mirrors and the rings of
+// remote writers as long as their tables hold them. Memory that a program has mapped stays valid
+// after that.
 //
 // dssmd never reads a payload here, and of the rings only the newest stamps, to report the stream's
 // state.
@@ -66,8 +67,8 @@ class Stream : public std::enable_shared_from_this<Stream> {
   // that asked reserves the ring's.
   static Result<std::shared_ptr<Stream>> create(const Plan& plan, MemoryBudget& budget);
 
-  // Restores a stream from its memory files, after checking owner, seals, geometry, and that ring and
-  // meta file agree. For clients' offers and DescriptorStore.
+  // Restores a stream from its memory files, after checking owner, seals, geometry, and that ring
+  // and meta file agree. For clients' offers and DescriptorStore.
   static Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles files, MemoryBudget& budget);
 
   Stream(const Stream&) = delete;
@@ -103,8 +104,9 @@ class Stream : public std::enable_shared_from_this<Stream> {
   // Whether `fd` is this stream's ring.
   bool is_ring(int fd) const noexcept;
 
-  // Adds the doorbell that a writer kept over a restart of dssmd: another one may have been made for
-  // another writer meanwhile. Drops it if it is not such an eventfd, or one more than kMaxDoorbells.
+  // Adds the doorbell that a writer kept over a restart of dssmd: another one may have been made
+  // for another writer meanwhile. Drops it if it is not such an eventfd, or one more than
+  // kMaxDoorbells.
   void take_doorbell_untrusted(UniqueFd doorbell);
   static constexpr std::size_t kMaxDoorbells = 8;
   static constexpr std::size_t kMaxKept = 3 + kMaxDoorbells;

@@ -89,8 +89,8 @@ void stamped(Session& session) {
   }
 }
 
-// memcpy uses the same buffers: the caller's and the ring's slots, in the order of writing and half a
-// lap apart, so that neither fills the caches for the other.
+// memcpy uses the same buffers: the caller's and the ring's slots, in the order of writing and half
+// a lap apart, so that neither fills the caches for the other.
 void large(Session& session, std::uint64_t bytes, std::uint64_t depth, int batches) {
   const std::string size = std::to_string(bytes / 1024) + " KiB";
   Stream stream = make_stream(session, ("large" + std::to_string(bytes)).c_str(), bytes, depth);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Eight hosts with 128 streams each, without configuration and with Avahi's default limits: the time
-// from the last start until every host knows every stream, and the cost afterwards.
+// Eight hosts with 128 streams each, without configuration and with Avahi's default limits: the
+// time from the last start until every host knows every stream, and the cost afterwards.
 #include <cinttypes>
 #include <dssm/dssm.hpp>
 #include <fstream>

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The cost of readers for a writer: alone, with 1 and with 32 reading processes, and with one of them
-// stopped by SIGSTOP. Each reader reads the newest sample 1,000 times a second, on the other core. The
-// raw limit is the writer alone, measured in the same run right before and after.
+// The cost of readers for a writer: alone, with 1 and with 32 reading processes, and with one of
+// them stopped by SIGSTOP. Each reader reads the newest sample 1,000 times a second, on the other
+// core. The raw limit is the writer alone, measured in the same run right before and after.
 #include <sched.h>
 #include <sys/prctl.h>
 #include <sys/wait.h>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// 100 streams that are read on another host and not written: how often the two dssmd wake up, compared
-// with the heartbeats of one control connection, which are the only allowed reason.
+// 100 streams that are read on another host and not written: how often the two dssmd wake up,
+// compared with the heartbeats of one control connection, which are the only allowed reason.
 #include <dssm/dssm.hpp>
 #include <fstream>
 #include <string>

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Reading across hosts: a PConnector's read by time compared with a bare TCP ping-pong of the same
-// sizes; reading a mirror by time compared with the owner's ring; and the cost of remote readers for
-// the writer, compared with one write to an eventfd.
+// sizes; reading a mirror by time compared with the owner's ring; and the cost of remote readers
+// for the writer, compared with one write to an eventfd.
 #include <sys/epoll.h>
 #include <sys/eventfd.h>
 

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The throughput of one channel: large samples compared with raw TCP with writes of the same size, and
-// the rate of small samples; and how often a payload is copied on the way.
+// The throughput of one channel: large samples compared with raw TCP with writes of the same size,
+// and the rate of small samples; and how often a payload is copied on the way.
 //
-// The samples are in the owner's ring before the clock starts, and the reader reads all of them into
-// one buffer, so only sending and receiving is measured. The raw sender's memory is as large as the
-// ring, so that neither side works only in the cache.
+// The samples are in the owner's ring before the clock starts, and the reader reads all of them
+// into one buffer, so only sending and receiving is measured. The raw sender's memory is as large
+// as the ring, so that neither side works only in the cache.
 //
-// Raw TCP is measured twice: in a straightforward way, to which the target refers, and as fast as bare
-// processes can be made.
+// Raw TCP is measured twice: in a straightforward way, to which the target refers, and as fast as
+// bare processes can be made.
 #include <fcntl.h>
 #include <sys/mman.h>
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// From a writer on one host to a sleeping reader on another, 1,000 times a second: the latency, and the
-// CPU time of all processes together. It alternates with a chain of bare processes with the same hops:
-// eventfd wake, TCP one way, futex wake.
+// From a writer on one host to a sleeping reader on another, 1,000 times a second: the latency, and
+// the CPU time of all processes together. It alternates with a chain of bare processes with the
+// same hops: eventfd wake, TCP one way, futex wake.
 #include <sys/eventfd.h>
 
 #include <cstring>
@@ -132,8 +132,9 @@ std::int64_t round(Chain& chain, const std::vector<pid_t>& processes, Send send)
   return cpu_of(processes) - cpu_before;
 }
 
-// The median of ten ratios of p99s, each of a tenth of the rounds. An external disturbance slows some
-// 50 successive samples, which is the whole p99 of the affected side; here it affects only one tenth.
+// The median of ten ratios of p99s, each of a tenth of the rounds. An external disturbance slows
+// some 50 successive samples, which is the whole p99 of the affected side; here it affects only one
+// tenth.
 double middle_p99_ratio(const Chain& raw, const Chain& ours) {
   constexpr int kParts = 10;
   constexpr int kOfPart = kSamples * kRounds / kParts;

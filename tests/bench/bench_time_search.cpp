@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Reading at random times, for several depths and shapes of streams. The raw limit is what every search
-// must do, with its cache misses, in the same memory: for a known tid, read its entry in the time index,
-// and then copy the sample from its slot.
+// Reading at random times, for several depths and shapes of streams. The raw limit is what every
+// search must do, with its cache misses, in the same memory: for a known tid, read its entry in the
+// time index, and then copy the sample from its slot.
 #include <dssm/dssm.hpp>
 #include <filesystem>
 #include <random>

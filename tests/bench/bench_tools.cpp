@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The duration of `dssmctl ls` with 1,000 streams, with process start, compared with starting a program
-// that does nothing.
+// The duration of `dssmctl ls` with 1,000 streams, with process start, compared with starting a
+// program that does nothing.
 #include <sys/resource.h>
 
 #include <dssm/dssm.hpp>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Shared by the benchmarks: timing in batches, percentiles, and the line that shows our figure with the
-// machine's raw limit.
+// Shared by the benchmarks: timing in batches, percentiles, and the line that shows our figure with
+// the machine's raw limit.
 //
 // Our operation and the raw limit alternate, batch by batch, so that other load or a change of the
 // clock rate affects both. A figure is the time of one operation: for operations that take

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The two hosts of a benchmark: "pc1" owns the streams, "pc2" reads them. They are either this machine,
-// connected by loopback, or network namespaces, connected by cables to a switch.
+// The two hosts of a benchmark: "pc1" owns the streams, "pc2" reads them. They are either this
+// machine, connected by loopback, or network namespaces, connected by cables to a switch.
 #pragma once
 
 #include <memory>

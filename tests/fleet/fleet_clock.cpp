@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Reports a PC's clock and DSSM's statements about clocks to lab/truth.py, which compares them with the
-// true values.
+// Reports a PC's clock and DSSM's statements about clocks to lab/truth.py, which compares them with
+// the true values.
 //
 //   fleet-clock PORT HOST...
 //
-// Writes the stream "truth" a hundred times a second, with this PC's clocks as payload, stamped like
-// the samples of any program, and reads that stream of each other HOST. Answers each datagram "NUMBER
-// STEP" at UDP PORT with JSON, see answer(). A STEP other than 0 first sets the wall clock forward by
-// so many nanoseconds, or backward if negative.
+// Writes the stream "truth" a hundred times a second, with this PC's clocks as payload, stamped
+// like the samples of any program, and reads that stream of each other HOST. Answers each datagram
+// "NUMBER STEP" at UDP PORT with JSON, see answer(). A STEP other than 0 first sets the wall clock
+// forward by so many nanoseconds, or backward if negative.
 //
-// Prints "ready" on stdout before it writes. Ends when stdin ends. Exit status: 0; 1 with the reason
-// on stderr.
+// Prints "ready" on stdout before it writes. Ends when stdin ends. Exit status: 0; 1 with the
+// reason on stderr.
 #include <arpa/inet.h>
 #include <poll.h>
 #include <sys/socket.h>
@@ -151,7 +151,8 @@ nlohmann::json joint_statement(const std::vector<Reader<Clocks>*>& readers) {
   return out;
 }
 
-// {"number", "wall", "mono", "raw", "within", "instance": this PC's clocks after the request arrived,
+// {"number", "wall", "mono", "raw", "within", "instance": this PC's clocks after the request
+// arrived,
 //  "raw_end": raw clock when this is sent, "own": {"status", "error"},
 //  "others": {HOST: {"by_time": SAMPLE, "newest": SAMPLE}},
 //  "joint": {"status", "error", "samples": {HOST: SAMPLE}}}

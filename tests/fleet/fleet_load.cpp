@@ -5,9 +5,9 @@
 //   fleet-load write RATE_HZ STREAM@HOST...   creates them and writes each at this rate
 //   fleet-load read RATE_HZ STREAM@HOST...    reads each from its oldest sample on
 //
-// Prints "ready" on stdout after the first sample of each stream, and for each byte on stdin the number
-// of samples written or read so far. Ends when stdin ends; readers first read all samples written until
-// then. The last line is JSON:
+// Prints "ready" on stdout after the first sample of each stream, and for each byte on stdin the
+// number of samples written or read so far. Ends when stdin ends; readers first read all samples
+// written until then. The last line is JSON:
 //
 //   write  {"written": {STREAM: COUNT}}
 //   read   {"faults": TEXT, "streams": {STREAM: {"taken": N, "lost": N, "restarts": N}}}

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Arbitrary bytes from a network peer after its Hello: through decoder and requests to the registry, its
-// rings and the answers, in a real event loop. A second peer watches and subscribes, and a program
-// writes, so that events, gaps and full sockets occur. An input's first three bytes choose whether the
-// peer has the feature "torn", how its bytes are split, and how much it reads.
+// Arbitrary bytes from a network peer after its Hello: through decoder and requests to the
+// registry, its rings and the answers, in a real event loop. A second peer watches and subscribes,
+// and a program writes, so that events, gaps and full sockets occur. An input's first three bytes
+// choose whether the peer has the feature "torn", how its bytes are split, and how much it reads.
 #include <event2/event.h>
 #include <netinet/in.h>
 #include <sys/eventfd.h>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Another host for the fuzzer of the local protocol: it has every requested stream, and answers only
-// when answer() is called.
+// Another host for the fuzzer of the local protocol: it has every requested stream, and answers
+// only when answer() is called.
 #pragma once
 
 #include <functional>

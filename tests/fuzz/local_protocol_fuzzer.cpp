@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Arbitrary bytes from a local client after its Hello: through the frame buffer, the decoding of
-// requests, the registry and its real memory files to the answers. A second client watches and has a
-// stream open, so that events and conflicts occur. Another host answers after the input, or after the
-// client has disconnected. An input's first two bytes choose whether dssmd is recovering, which
+// requests, the registry and its real memory files to the answers. A second client watches and has
+// a stream open, so that events and conflicts occur. Another host answers after the input, or after
+// the client has disconnected. An input's first two bytes choose whether dssmd is recovering, which
 // descriptors the client sends, and how its bytes are split.
 #include <fcntl.h>
 

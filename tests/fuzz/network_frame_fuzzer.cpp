@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Arbitrary bytes from a peer, through the decoder of the network protocol. Its output must not depend
-// on how the bytes are split or on a sink that pauses it, and must equal protobuf's output. An input's
-// first two bytes choose the payload size, how the bytes are split, and when the sink pauses.
+// Arbitrary bytes from a peer, through the decoder of the network protocol. Its output must not
+// depend on how the bytes are split or on a sink that pauses it, and must equal protobuf's output.
+// An input's first two bytes choose the payload size, how the bytes are split, and when the sink
+// pauses.
 #include <google/protobuf/stubs/logging.h>
 
 #include <cstdlib>

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A ring left by a hostile writer: a valid ring with some samples, and then arbitrary bytes written over
-// header, time index and slots. Opening and reading it may return wrong data, but must not crash or
-// hang. The input is a list of records: 2 bytes offset (in units of 8 bytes), 1 byte length, bytes.
+// A ring left by a hostile writer: a valid ring with some samples, and then arbitrary bytes written
+// over header, time index and slots. Opening and reading it may return wrong data, but must not
+// crash or hang. The input is a list of records: 2 bytes offset (in units of 8 bytes), 1 byte
+// length, bytes.
 #include <sys/mman.h>
 #include <unistd.h>
 

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Arbitrary TXT records of a service: accepted, or refused with a message. An accepted record is within
-// the limits, and encoding it again gives the same record. The input is a record in network format:
-// strings, each after a byte with its length.
+// Arbitrary TXT records of a service: accepted, or refused with a message. An accepted record is
+// within the limits, and encoding it again gives the same record. The input is a record in network
+// format: strings, each after a byte with its length.
 #include <algorithm>
 #include <cstdlib>
 

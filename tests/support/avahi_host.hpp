@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A D-Bus daemon and an Avahi daemon for one test PC (tests/support/network.hpp), with Avahi's default
-// limits. They are invisible outside: their files are in a temporary folder, and /run/avahi-daemon,
-// which Avahi requires, is in a mount namespace that ends with Avahi. Both end with the test, also when
-// it is killed.
+// A D-Bus daemon and an Avahi daemon for one test PC (tests/support/network.hpp), with Avahi's
+// default limits. They are invisible outside: their files are in a temporary folder, and
+// /run/avahi-daemon, which Avahi requires, is in a mount namespace that ends with Avahi. Both end
+// with the test, also when it is killed.
 //
 //   needs   root, dbus-daemon, avahi-daemon, unshare (util-linux); open() reports what is missing
 #pragma once

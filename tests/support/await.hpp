@@ -8,8 +8,8 @@
 
 namespace dssm::test {
 
-// The pause between two polls. Polling without a pause would take the processor from the process that
-// is waited for, on a machine where many tests run at once.
+// The pause between two polls. Polling without a pause would take the processor from the process
+// that is waited for, on a machine where many tests run at once.
 inline constexpr auto kLookPause = std::chrono::milliseconds(1);
 
 // Polls until `condition` is true; the test runner's time limit is the watchdog.

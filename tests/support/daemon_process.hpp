@@ -26,14 +26,14 @@ struct Finished {
 Finished run(const std::vector<std::string>& argv, const std::vector<std::string>& environment = {},
              const std::string& input = {});
 
-// Starts a program in the background. Its output goes to this test's stderr, or its stdout to `out_fd`
-// if >= 0; wait_for() returns its status, as a shell shows it.
+// Starts a program in the background. Its output goes to this test's stderr, or its stdout to
+// `out_fd` if >= 0; wait_for() returns its status, as a shell shows it.
 pid_t start(const std::vector<std::string>& argv, const std::vector<std::string>& environment = {},
             int out_fd = -1);
 int wait_for(pid_t pid);
 
-// For a dssmd that is killed while programs wait to recreate its streams: on a machine where many tests
-// run at once, programs need more than the default of 500 ms to offer their rings.
+// For a dssmd that is killed while programs wait to recreate its streams: on a machine where many
+// tests run at once, programs need more than the default of 500 ms to offer their rings.
 inline const std::vector<std::string> kPatientRecovery = {"--recovery-grace", "3 s"};
 
 class DaemonProcess {

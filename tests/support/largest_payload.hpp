@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The size of the largest samples in tests: the maximum, except under sanitizers that need a hundred
-// bytes for each of theirs.
+// The size of the largest samples in tests: the maximum, except under sanitizers that need a
+// hundred bytes for each of theirs.
 #pragma once
 
 #include <cstddef>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A vehicle without configuration for one test: PCs with D-Bus, Avahi, and a dssmd that listens on the
-// network and finds the others only by mDNS.
+// A vehicle without configuration for one test: PCs with D-Bus, Avahi, and a dssmd that listens on
+// the network and finds the others only by mDNS.
 #pragma once
 
 #include <algorithm>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Namespaces are created with unshare(2), held by descriptors, and configured with ip(8), which accepts
-// /proc/PID/fd/N as the name of a namespace.
+// Namespaces are created with unshare(2), held by descriptors, and configured with ip(8), which
+// accepts /proc/PID/fd/N as the name of a namespace.
 #include "tests/support/network.hpp"
 
 #include <fcntl.h>

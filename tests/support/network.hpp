@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// PCs for one test: network namespaces, each connected by a cable to a switch (a bridge in a separate
-// namespace). Cables can be cut, healed and slowed down.
+// PCs for one test: network namespaces, each connected by a cable to a switch (a bridge in a
+// separate namespace). Cables can be cut, healed and slowed down.
 //
-//   PC k is called "pck" and has the addresses 10.77.0.k and fd77::k. The namespaces have no names and
-//   no connection to the outside, so several tests can run at the same time. They exist as long as
-//   this object's descriptors and the programs in them, so a killed test leaves nothing behind.
+//   PC k is called "pck" and has the addresses 10.77.0.k and fd77::k. The namespaces have no names
+//   and no connection to the outside, so several tests can run at the same time. They exist as long
+//   as this object's descriptors and the programs in them, so a killed test leaves nothing behind.
 //
 //   shared  everything but the network: files, Unix sockets, processes, memory
 //   needs   root, iproute2, and a kernel with veth and bridge; open() reports what is missing
@@ -22,8 +22,8 @@
 
 namespace dssm::test {
 
-// While it exists, the thread that created it is inside a namespace. Sockets that the thread creates
-// and programs that it starts stay there, also afterwards.
+// While it exists, the thread that created it is inside a namespace. Sockets that the thread
+// creates and programs that it starts stay there, also afterwards.
 class Inside {
  public:
   explicit Inside(int network_namespace);
@@ -52,8 +52,8 @@ class Network {
     return Inside(hosts_.at(static_cast<std::size_t>(host) - 1).get());
   }
 
-  // Adds a cable from the host to the switch, at its interface `interface`, which is up and has only
-  // the addresses that the kernel assigns.
+  // Adds a cable from the host to the switch, at its interface `interface`, which is up and has
+  // only the addresses that the kernel assigns.
   void add_cable(int host, const std::string& interface);
   // Configures the host by lines of ip(8) commands, without the word ip:
   // "link del eth0\n".

@@ -28,8 +28,8 @@ namespace dssm::test {
 class ServiceManager {
  public:
   struct Options {
-    // dssmd's arguments besides runtime folder and name. Unless they set an address, dssmd listens at
-    // a free port of 127.0.0.1, and at the same one after a restart.
+    // dssmd's arguments besides runtime folder and name. Unless they set an address, dssmd listens
+    // at a free port of 127.0.0.1, and at the same one after a restart.
     std::vector<std::string> arguments = {};
     std::string host = "pc1";
     bool socket = true;                  // creates and passes the Unix socket

@@ -11,8 +11,8 @@
 
 namespace dssm::test {
 
-// Sends SIGUSR1 to the thread that created it, repeatedly until it is destroyed: a single signal might
-// arrive before the wait that it should interrupt.
+// Sends SIGUSR1 to the thread that created it, repeatedly until it is destroyed: a single signal
+// might arrive before the wait that it should interrupt.
 class Signals {
  public:
   Signals() {

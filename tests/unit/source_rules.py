@@ -10,7 +10,8 @@
 #   it in ORDER, and no files include each other in a circle.
 # * A file with more than MAX_WITHOUT_ESSAY lines opens with a comment that says what it does; for
 #   x.cpp the comment may be in x.hpp.
-# * A ruler is one line: "// --- words".
+# * A ruler is one line: "// --- words". No comment is longer than MAX_LINE columns (clang-format
+#   leaves comments alone, because it breaks tables).
 import os
 import re
 import sys
@@ -45,6 +46,7 @@ ONLY = {
 }
 INCLUDE_ROOTS = ["", "core/include", "client/include", "client/ssm/include"]
 MAX_WITHOUT_ESSAY = 200
+MAX_LINE = 100
 # A comment that is the second half of a ruler: only dashes, or words before dashes.
 SPLIT_RULER = re.compile(r"^\s*//(?! ---? ?\w).*---+$")
 INCLUDE = re.compile(r'^\s*#\s*include\s+["<]([^">]+)[">]', re.MULTILINE)
@@ -116,6 +118,8 @@ def comment_errors(root):
         for number, line in enumerate(lines, 1):
             if SPLIT_RULER.match(line):
                 yield f"{path}:{number}: a ruler is one line: // --- words"
+            if len(line.rstrip("\n")) > MAX_LINE and line.lstrip().startswith("//"):
+                yield f"{path}:{number}: the comment is longer than {MAX_LINE} columns; wrap it"
         if len(lines) > MAX_WITHOUT_ESSAY and not has_essay(root, path):
             yield f"{path}: {len(lines)} lines, and no comment at the top says what they do"
 

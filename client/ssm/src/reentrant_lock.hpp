@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // A lock that its holder may take again. Programs read and write streams from signal handlers; a
-// handler that interrupts its own thread in a read must not block, as it did not in the old library,
-// which had no lock there.
+// handler that interrupts its own thread in a read must not block, as it did not in the old
+// library, which had no lock there.
 //
 //   signals  may be locked and unlocked in a handler
 //   fork     reset_after_fork() frees it in the child, where its holder may not exist

@@ -4,8 +4,8 @@
 // subscription fills the ring, and readers read it without the network. It holds each sample, in
 // order, as long as the connection is fast enough; lost samples leave a gap.
 //
-// The ring is a copy like dssmd's mirrors, but its tids keep rising when the stream restarts, so that
-// loops of old programs continue. No thread sleeps on it, so it has no bell.
+// The ring is a copy like dssmd's mirrors, but its tids keep rising when the stream restarts, so
+// that loops of old programs continue. No thread sleeps on it, so it has no bell.
 #pragma once
 
 #include <pthread.h>

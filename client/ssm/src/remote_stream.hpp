@@ -1,10 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Implements a PConnector of the old interface: a dssm::PConnector, and the ring of its samples after
-// the program asked for one.
+// Implements a PConnector of the old interface: a dssm::PConnector, and the ring of its samples
+// after the program asked for one.
 //
-// A call that fails prints the reason on stderr, once until a call succeeds again. While the other PC
-// or the network is unavailable, each call tries for about two seconds and then fails; the waits
+// A call that fails prints the reason on stderr, once until a call succeeds again. While the other
+// PC or the network is unavailable, each call tries for about two seconds and then fails; the waits
 // (connect, open) last until a signal handler runs, or $DSSM_CONNECT_TIMEOUT seconds have passed.
 //
 //   tids     as in stream.hpp: they keep rising when the stream restarts

@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// From a sid to its stream. A sid has a pointer type, but holds a number: the place in this table and
-// a generation that is never used twice, so that a closed sid is always recognized. Places are never
-// freed, only reused.
+// From a sid to its stream. A sid has a pointer type, but holds a number: the place in this table
+// and a generation that is never used twice, so that a closed sid is always recognized. Places are
+// never freed, only reused.
 //
 // Programs close streams from signal handlers while the interrupted thread is in a read. So close()
-// only marks the place, and reap() destroys the stream when its use count is 0. The order that makes
-// this safe: a call increments the use count and then checks that the place is open; the reaper
-// finds "closed" and then checks the use count. Both are seq_cst, so at least one of the two sees
-// the other. (SharedClock uses the same order for one pointer instead of a table.)
+// only marks the place, and reap() destroys the stream when its use count is 0. The order that
+// makes this safe: a call increments the use count and then checks that the place is open; the
+// reaper finds "closed" and then checks the use count. Both are seq_cst, so at least one of the two
+// sees the other. (SharedClock uses the same order for one pointer instead of a table.)
 //
 //   threads  SidUse and close() from any thread and from signal handlers; the rest under one lock
 #pragma once

@@ -88,8 +88,8 @@ class Stream {
   // stream already, in a callback or in the code that a signal handler interrupted.
   Tid write(const void* data, Time time) noexcept;
 
-  // Lets `fill` write into the next slot and publishes it. An exception of `fill` passes through, and
-  // the slot is not published.
+  // Lets `fill` write into the next slot and publishes it. An exception of `fill` passes through,
+  // and the slot is not published.
   Tid write_in_place(const std::function<void(std::byte*)>& fill, Time time);
 
   // In a forked child: locks that other threads of the parent held are free.

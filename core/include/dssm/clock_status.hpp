@@ -50,9 +50,10 @@ struct RootDistance {
   friend bool operator==(const RootDistance& a, const RootDistance& b) = default;
 };
 
-// All values known of a clock at one time. The one list of these fields: dssmd keeps it for this PC,
-// states it on the shared page and in its report to other hosts, and programs get it in HostInfo.
-// On the page as it is here (core/clock/clock_page.hpp), so a change raises the page's version.
+// All values known of a clock at one time. The one list of these fields: dssmd keeps it for this
+// PC, states it on the shared page and in its report to other hosts, and programs get it in
+// HostInfo. On the page as it is here (core/clock/clock_page.hpp), so a change raises the page's
+// version.
 struct ClockSnapshot {
   Duration bound = kUnknownClockError;  // of its samples' times, against what `basis` names
   std::int64_t ageing_ppb = 0;          // what bound and root_bound grow by, ns per second

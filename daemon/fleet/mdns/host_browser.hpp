@@ -3,8 +3,8 @@
 // Finds the dssmd of all hosts: browses for their host services, resolves them, and merges what
 // was heard on several interfaces, by IPv4 and IPv6, into one host per id.
 //
-// A resolver stays as long as its result, because a changed TXT record or address is reported only to
-// resolvers. So results are bounded: the ones beyond wait for the place of one that was removed
+// A resolver stays as long as its result, because a changed TXT record or address is reported only
+// to resolvers. So results are bounded: the ones beyond wait for the place of one that was removed
 // or is of no use, so that a PC that announces invalid records cannot displace the valid ones.
 #pragma once
 

@@ -49,9 +49,9 @@ Result<void> Mdns::start(const EventLoop& main_loop, const Options& options) {
   return {};
 }
 
-// A thread that waits for an answer by D-Bus can neither be woken nor ended. It is detached then: it
-// finds the request to stop in the mailbox as soon as D-Bus gives up, and everything that it uses
-// until then is its own.
+// A thread that waits for an answer by D-Bus can neither be woken nor ended. It is detached then:
+// it finds the request to stop in the mailbox as soon as D-Bus gives up, and everything that it
+// uses until then is its own.
 Mdns::~Mdns() {
   if (!thread_.joinable()) return;
   mailbox_->stop();

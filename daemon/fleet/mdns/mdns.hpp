@@ -6,8 +6,8 @@
 // libavahi-client asks the Avahi daemon by D-Bus calls that wait for their answers, and a hung
 // daemon would stop everything until the timeout of D-Bus (25 s). So all of it runs in a thread of
 // its own, with an event loop of its own (AvahiPoll on libevent, see avahi_poll.hpp); what is to be
-// announced goes there, and what is found comes back, as messages. While the Avahi daemon or D-Bus is
-// not available, it retries.
+// announced goes there, and what is found comes back, as messages. While the Avahi daemon or D-Bus
+// is not available, it retries.
 #pragma once
 
 #include <cstdint>

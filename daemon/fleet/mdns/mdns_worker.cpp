@@ -128,7 +128,8 @@ void MdnsWorker::disconnect() {
 // Also called from within avahi_client_new().
 void MdnsWorker::on_client(AvahiClient*, AvahiClientState state, void* self) {
   auto& worker = *static_cast<MdnsWorker*>(self);
-  // It may have passed before follow_state() runs, and what was announced with the old name with it.
+  // It may have passed before follow_state() runs, and what was announced with the old name with
+  // it.
   worker.renamed_ |= state == AVAHI_CLIENT_S_REGISTERING || state == AVAHI_CLIENT_S_COLLISION;
   worker.follow_.enable_in(Duration::zero());
 }

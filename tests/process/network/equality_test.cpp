@@ -49,8 +49,8 @@ class Equality : public NetworkTest {
     while (streams.back().writer.newest_tid() + 1 < history) streams.back().write_next();
   }
 
-  // Reads by `read(reader, payload, info)` on all hosts, and compares. True if all reads were ok; while
-  // the stream is written, `too_old` and `not_yet` may occur on one host only.
+  // Reads by `read(reader, payload, info)` on all hosts, and compares. True if all reads were ok;
+  // while the stream is written, `too_old` and `not_yet` may occur on one host only.
   template <class Read>
   bool compare(Watched& stream, Read read, bool paused) {
     SampleInfo infos[kHosts];
@@ -119,8 +119,8 @@ class Equality : public NetworkTest {
             },
             false);
         if (stream.known.jitter >= stream.known.cycle / 2) continue;
-        // Up to the newest sample that all hosts have, the answer is final. Any mirror may be older,
-        // also than `tid`.
+        // Up to the newest sample that all hosts have, the answer is final. Any mirror may be
+        // older, also than `tid`.
         Tid newest = stream.readers[0].newest_tid();
         for (const RawReader& reader : stream.readers)
           newest = std::min(newest, reader.newest_tid());

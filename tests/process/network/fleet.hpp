@@ -34,8 +34,8 @@ class Fleet {
   void start_dssmd(int host);
   bool runs(int host) { return dssmd(host).pid() > 0; }
 
-  // A connection of this process to the host's dssmd. Programs use the network only through dssmd, so
-  // this process need not be in the host's namespace.
+  // A connection of this process to the host's dssmd. Programs use the network only through dssmd,
+  // so this process need not be in the host's namespace.
   Session session(int host);
 
  private:

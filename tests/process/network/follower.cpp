@@ -70,8 +70,9 @@ void Follower::check(const SampleInfo& info) {
   }
   const auto left_out = static_cast<std::uint64_t>(info.tid - last_ - 1);
   std::uint64_t counted = lost() - lost_;
-  // A subscription counts a gap when it is notified of it, which may be before this sample is taken.
-  // Losses that were counted when the first sample was taken may belong to a gap after that sample.
+  // A subscription counts a gap when it is notified of it, which may be before this sample is
+  // taken. Losses that were counted when the first sample was taken may belong to a gap after that
+  // sample.
   if (!is_reader && left_out > counted) {
     const auto behind_first =
         std::min(left_out - counted, static_cast<std::uint64_t>(first_taken_ - first_));

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A reader, or a PConnector's subscription, that reads every sample of a stream of known samples and
-// checks them: each sample once, in order, untorn; gaps counted exactly; no sample counted as lost
-// that the owner's ring still holds.
+// A reader, or a PConnector's subscription, that reads every sample of a stream of known samples
+// and checks them: each sample once, in order, untorn; gaps counted exactly; no sample counted as
+// lost that the owner's ring still holds.
 #pragma once
 
 #include <dssm/dssm.hpp>

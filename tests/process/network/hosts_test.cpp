@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The promises of a fleet when cables are cut, names are equal and versions differ, tested on PCs as
-// network namespaces.
+// The promises of a fleet when cables are cut, names are equal and versions differ, tested on PCs
+// as network namespaces.
 #include <fcntl.h>
 #include <unistd.h>
 

@@ -13,8 +13,8 @@
 namespace dssm::test {
 
 // The fifteen streams of `host`. They are written at `percent` of their full rates, which come to
-// 30 MB and 6000 samples a second; their rings take 120 MB. Some rings hold many seconds, others less
-// than one.
+// 30 MB and 6000 samples a second; their rings take 120 MB. Some rings hold many seconds, others
+// less than one.
 std::vector<KnownStream> load_of(int host, std::uint64_t percent);
 
 // Writes streams at their rates.
@@ -40,8 +40,8 @@ class LoadWriter {
   std::vector<Written> streams_;
 };
 
-// Four streams of pc1 that another host writes. Their rings hold more than a minute, which is longer
-// than any cut of a cable.
+// Four streams of pc1 that another host writes. Their rings hold more than a minute, which is
+// longer than any cut of a cable.
 std::vector<KnownStream> published_load(std::uint64_t percent);
 
 // A stream of pc1, 256 B at 1 kHz. Its ring holds a minute, so that readers lose nothing.

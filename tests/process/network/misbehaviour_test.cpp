@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Programs and peers that misbehave, on another PC and on the owner's, while other programs write and
-// read a stream: its readers lose nothing, dssmd's memory stays within its limit, and a bad peer's
-// connection ends. The tests compare counts, never times.
+// Programs and peers that misbehave, on another PC and on the owner's, while other programs write
+// and read a stream: its readers lose nothing, dssmd's memory stays within its limit, and a bad
+// peer's connection ends. The tests compare counts, never times.
 #include <fcntl.h>
 #include <unistd.h>
 
@@ -25,8 +25,8 @@ using namespace std::chrono_literals;
 // What dssmd's tables and malloc may add; its rings are not anonymous memory.
 constexpr std::uint64_t kOtherMemoryBytes = 8 << 20;
 
-// pc1 owns steady_stream(), which is written continuously and read on pc1 and on pc2. The misbehaving
-// peers are on pc3, or further programs.
+// pc1 owns steady_stream(), which is written continuously and read on pc1 and on pc2. The
+// misbehaving peers are on pc3, or further programs.
 class Misbehaviour : public NetworkTest {
  protected:
   // In a test: `if (!begin(8)) return;`
@@ -172,8 +172,8 @@ TEST_F(Misbehaviour, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
     lazy.back().send(open_frame(1, i % 2 == 0 ? "large" : "steady"));
     lazy.back().send(subscribe_from_oldest_frame(2));
   }
-  // This takes much less than the 30 s after which the kernel ends connections that receive nothing,
-  // unless this machine is stalled.
+  // This takes much less than the 30 s after which the kernel ends connections that receive
+  // nothing, unless this machine is stalled.
   for (int round = 0; round < (kSlowness > 1 ? 1 : 10); ++round) {
     for (int i = 0; i < 32; ++i) ASSERT_NE(large.write(payload), kNoTid);
     await_progress(200);
@@ -204,8 +204,8 @@ TEST_F(Misbehaviour, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
   if (served == 0) GTEST_SKIP() << "this machine took 30 s before it read";
 }
 
-// dssmd stops reading from them; after a minute in which they receive nothing, the kernel ends their
-// connections.
+// dssmd stops reading from them; after a minute in which they receive nothing, the kernel ends
+// their connections.
 TEST_F(Misbehaviour, PeersThatRequestAndNeverReadAreStoppedAndThenClosed) {
   if (!begin(8)) return;
   RawWriter large = make_large();

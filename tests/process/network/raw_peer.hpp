@@ -37,8 +37,8 @@ class RawPeer {
   // Reads until the connection ends; returns the last frame, if any.
   std::optional<net::Frame> await_end();
 
-  // Sends the Hello of a program of the host "raw", and reads the answer. Returns the answer if it is
-  // not a Hello.
+  // Sends the Hello of a program of the host "raw", and reads the answer. Returns the answer if it
+  // is not a Hello.
   std::optional<net::Frame> greet(const std::vector<std::string>& features = {});
 
  private:

@@ -49,8 +49,8 @@ class Soak : public NetworkTest {
     }
   }
 
-  // Followers of all streams of other hosts, on every host. With `lasting_rings` each also opens the
-  // owner's ring, which keeps it in use.
+  // Followers of all streams of other hosts, on every host. With `lasting_rings` each also opens
+  // the owner's ring, which keeps it in use.
   void follow(bool lasting_rings) {
     for (int host = 1; host <= kHosts; ++host) {
       Session& session = sessions[static_cast<std::size_t>(host) - 1];

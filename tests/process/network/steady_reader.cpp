@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A program that reads all of steady_stream() from the oldest sample on, until its stdin ends; tests
-// stop and continue it. It writes one byte to stdout after the first sample, and at the end a line
-// "TAKEN LOST" about tids 0 to the newest one, or the errors (exit status 1).
+// A program that reads all of steady_stream() from the oldest sample on, until its stdin ends;
+// tests stop and continue it. It writes one byte to stdout after the first sample, and at the end a
+// line "TAKEN LOST" about tids 0 to the newest one, or the errors (exit status 1).
 //
 //   steady_reader          through the local dssmd
 //   steady_reader ADDRESS  with a PConnector to the owner's dssmd

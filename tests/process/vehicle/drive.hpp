@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Shared by tests of the whole drive: the command lines of the vehicle's programs. They replay the
-// beginning of the recording, with rings that hold all of it, so results do not depend on the speed of
-// this machine.
+// beginning of the recording, with rings that hold all of it, so results do not depend on the speed
+// of this machine.
 #pragma once
 
 #include <dssm/dssm.hpp>

@@ -90,8 +90,8 @@ TEST_F(VehicleDrive, GivesTheSameMapWhenTheReadersStartAfterTheDrive) {
   run_all(daemon, {mapper(map_)});
   EXPECT_EQ(written(daemon, "pose"), std::ssize(scans()) + 1);
 
-  // The streams carry exactly the recording: computed here without streams, the map is the same, byte
-  // for byte.
+  // The streams carry exactly the recording: computed here without streams, the map is the same,
+  // byte for byte.
   const std::vector<OdometryReading> odometry = resample(log_.odometry, kEncoderCycleS);
   OccupancyGrid grid;
   std::vector<Pose2> way;
@@ -127,8 +127,8 @@ TEST_F(VehicleDrive, DrawsAPictureWithWallsFloorAndPath) {
     white += colour == 0xffffff;
     blue += colour == 0x266edc;
   }
-  // Four pixels per cell of 25 cm2. In its first minute the vehicle sees about 30 m of corridor: some
-  // 100 m of wall, a cell or two thick, around 50 to 150 m2 of floor.
+  // Four pixels per cell of 25 cm2. In its first minute the vehicle sees about 30 m of corridor:
+  // some 100 m of wall, a cell or two thick, around 50 to 150 m2 of floor.
   EXPECT_GT(dark, 4 * 1500u);
   EXPECT_LT(dark, 4 * 15000u);
   EXPECT_GT(white, 4 * 50 * 400u);

@@ -32,8 +32,8 @@ std::string own_address(int host) {
          std::to_string(pid % 256) + ":13776";
 }
 
-// A dssmd called pcHOST with `hosts` peers, one of which is itself, as in vehicle.conf. It keeps its
-// mirrors after the last reader, so that a test can inspect them.
+// A dssmd called pcHOST with `hosts` peers, one of which is itself, as in vehicle.conf. It keeps
+// its mirrors after the last reader, so that a test can inspect them.
 std::unique_ptr<DaemonProcess> start_host(int host, int hosts) {
   std::vector<std::string> flags{"--listen", own_address(host), "--mirror-linger", "1000 s"};
   for (int peer = 1; peer <= hosts; ++peer) {
@@ -122,7 +122,8 @@ TEST_F(VehicleHosts, WaitForAHostThatStartsLate) {
   const pid_t localizing = dssm::test::start(test::localizer(), {pc2->environment()});
   const pid_t mapping = dssm::test::start(test::mapper(map_path("map")), {pc3->environment()});
   test::run_all({{pc2.get(), source("lidar")}});
-  // The localizer creates its stream when it has opened the lidar's; then it waits for the odometry.
+  // The localizer creates its stream when it has opened the lidar's; then it waits for the
+  // odometry.
   dssm::Session session = test::connect(*pc3);
   (void)session.await_raw_reader(dssm::StreamId{"pose", 0, ""}, dssm::kNever).value();
   const auto pc1 = start_host(1, 3);

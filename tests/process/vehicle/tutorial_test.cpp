@@ -24,8 +24,8 @@ std::string program(const std::string& name) {
   return dssm::test::built("tests/process/vehicle/tutorial_" + name);
 }
 
-// A program whose output the test reads line by line. It writes to a terminal, because it would write
-// to a pipe only when a buffer is full.
+// A program whose output the test reads line by line. It writes to a terminal, because it would
+// write to a pipe only when a buffer is full.
 class Reading {
  public:
   Reading(const std::string& name, const dssm::test::DaemonProcess& daemon) {
@@ -49,8 +49,8 @@ class Reading {
     dssm::test::wait_for(pid);
   }
 
-  // Appends the lines that it prints, until there are kEnough or it ends. Returns the time since the
-  // last line.
+  // Appends the lines that it prints, until there are kEnough or it ends. Returns the time since
+  // the last line.
   std::chrono::steady_clock::duration take(std::vector<std::string>& lines) {
     char line[256];
     auto last = std::chrono::steady_clock::now();
@@ -72,8 +72,8 @@ std::vector<std::string> lines_read(const std::string& reader,
                                     const dssm::test::DaemonProcess& readers_daemon,
                                     const std::string& writer,
                                     const dssm::test::DaemonProcess& writers_daemon) {
-  // An SSM reader ends after a second without a sample, which may also happen on a busy machine; then
-  // it is started again.
+  // An SSM reader ends after a second without a sample, which may also happen on a busy machine;
+  // then it is started again.
   constexpr auto kReadNextTimeout = std::chrono::milliseconds(900);
   std::vector<std::string> lines;
   auto reading = std::make_unique<Reading>(reader, readers_daemon);

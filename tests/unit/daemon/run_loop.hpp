@@ -2,11 +2,12 @@
 //
 // Runs an event loop in unit tests, in real or in simulated time.
 //
-// Simulated time (EventLoop::open(TimerQueue::Time::simulated)) stands still while anything happens,
-// and moves to the next timer when nothing has happened for kQuietTime of real time. Sockets are real:
-// between two sockets of one process (with TCP_NODELAY) the kernel delivers within the system call
-// that sends. So a test
-// that waits for seconds takes milliseconds, and a stall of the machine does not let deadlines pass.
+// Simulated time (EventLoop::open(TimerQueue::Time::simulated)) stands still while anything
+// happens, and moves to the next timer when nothing has happened for kQuietTime of real time.
+// Sockets are real: between two sockets of one process (with TCP_NODELAY) the kernel delivers
+// within the system call that sends. So a test
+// that waits for seconds takes milliseconds, and a stall of the machine does not let deadlines
+// pass.
 #pragma once
 
 #include <event2/event.h>
@@ -18,7 +19,8 @@
 
 namespace dssm::daemon {
 
-// Runs the callbacks of one turn of the loop; in simulated time, when nothing happens, of the next timer.
+// Runs the callbacks of one turn of the loop; in simulated time, when nothing happens, of the next
+// timer.
 inline void run_once(const EventLoop& loop) {
   if (!loop.timers().is_simulated()) {
     event_base_loop(loop.base(), EVLOOP_ONCE);

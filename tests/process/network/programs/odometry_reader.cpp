@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A typical SSM program that reads odometry by time, in order, and newest first. It names the stream,
-// but no PC.
+// A typical SSM program that reads odometry by time, in order, and newest first. It names the
+// stream, but no PC.
 #include <ssm.hpp>
 
 #include "odometry.h"

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A typical sensor handler for SSM. It prints "running" after 1000 samples, and writes until the file
-// `stop` exists in its folder.
+// A typical sensor handler for SSM. It prints "running" after 1000 samples, and writes until the
+// file `stop` exists in its folder.
 #include <ssm.hpp>
 #include <string>
 

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The checks of dssmctl doctor: from a set of facts that differs from a healthy host's in one thing,
-// which finding follows, with which advice.
+// The checks of dssmctl doctor: from a set of facts that differs from a healthy host's in one
+// thing, which finding follows, with which advice.
 #include "client/dssmctl/doctor_checks.hpp"
 
 #include <gtest/gtest.h>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The subscriber of a channel without a network: what it asks for, in which order it delivers samples,
-// what it counts as lost, and how it resumes after a cut and on a new ring.
+// The subscriber of a channel without a network: what it asks for, in which order it delivers
+// samples, what it counts as lost, and how it resumes after a cut and on a new ring.
 #include "client/src/subscriber.hpp"
 
 #include <gtest/gtest.h>

@@ -10,7 +10,8 @@ namespace {
 
 using namespace std::chrono_literals;
 
-// The bound is 100 us at second 50, grows by 50 us a second, and was at most 400 us since second 40.
+// The bound is 100 us at second 50, grows by 50 us a second, and was at most 400 us since second
+// 40.
 ClockPageState state() {
   ClockPageState made;
   made.wall = Time(50s);

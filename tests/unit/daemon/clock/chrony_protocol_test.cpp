@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// chronyd's command protocol byte by byte: requests, replies recorded from a real chronyd, and replies
-// that are cut, changed or random.
+// chronyd's command protocol byte by byte: requests, replies recorded from a real chronyd, and
+// replies that are cut, changed or random.
 #include "daemon/clock/chrony_protocol.hpp"
 
 #include <cstdlib>

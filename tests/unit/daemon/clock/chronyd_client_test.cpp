@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The client of chronyd against a scripted one on a socket: which requests it sends, when, and what it
-// does with late, foreign, wrong and missing replies.
+// The client of chronyd against a scripted one on a socket: which requests it sends, when, and what
+// it does with late, foreign, wrong and missing replies.
 #include "daemon/clock/chronyd_client.hpp"
 
 #include <event2/event.h>

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The clock estimator on simulated clocks: which bound follows from chronyd's answers and from steps,
-// and when there is none.
+// The clock estimator on simulated clocks: which bound follows from chronyd's answers and from
+// steps, and when there is none.
 #include "daemon/clock/clock_estimator.hpp"
 
 #include <gtest/gtest.h>

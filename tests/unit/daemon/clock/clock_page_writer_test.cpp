@@ -35,7 +35,8 @@ class ClockPageWriterTest : public testing::Test {
   std::string folder_;
 };
 
-// The bound is 100 us at second 50, grows by 50 us a second, and was at most 400 us since second 40.
+// The bound is 100 us at second 50, grows by 50 us a second, and was at most 400 us since second
+// 40.
 ClockPageState state() {
   ClockPageState made;
   made.wall = Time(50s);

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Each kind of request on both sockets passes the rule that decides who may do what: a rule that
-// forbids everything refuses all of them. Kinds are found by trying all field numbers, so that a new
-// one is tested without being listed here.
+// forbids everything refuses all of them. Kinds are found by trying all field numbers, so that a
+// new one is tested without being listed here.
 #include "daemon/streams/authorize.hpp"
 
 #include <gtest/gtest.h>
@@ -14,7 +14,8 @@
 namespace dssm::daemon {
 namespace {
 
-// A message whose field `number` is an empty message; its body is not set if there is no such field.
+// A message whose field `number` is an empty message; its body is not set if there is no such
+// field.
 template <class Message>
 Message with_field(std::uint64_t number) {
   std::byte bytes[10];
