@@ -19,9 +19,9 @@
 namespace vehicle {
 namespace {
 
-// A stamp is accepted when it is within kBelievableS of the median of the surrounding stamps, kAround
-// lines on each side. The logger wrote lines up to a second out of order. Pauses are not a problem: on
-// each side of a pause the stamp is near the median.
+// A stamp is accepted when it is within kBelievableS of the median of the surrounding stamps,
+// kAround lines on each side. The logger wrote lines up to a second out of order. Pauses are not a
+// problem: on each side of a pause the stamp is near the median.
 constexpr double kBelievableS = 5;
 constexpr std::size_t kAround = 5;
 

@@ -45,7 +45,8 @@ struct CarmenLog {
   std::string summary() const;
 };
 
-// The maximum number of beams of a scan: half a degree apart over a half circle, both ends included.
+// The maximum number of beams of a scan: half a degree apart over a half circle, both ends
+// included.
 inline constexpr std::size_t kMaxBeams = 361;
 
 // Never fails: a text without a usable line gives an empty log.

@@ -38,8 +38,9 @@ dssm::Result<std::optional<dssm::Reader<T>>> open_when_there(dssm::Session& sess
 }
 
 // Moves the cursor before the first sample of the newest drive. Streams exist longer than the
-// programs that write them, so a ring may begin with samples of an earlier drive; end marks separate
-// drives. If the newest drive is over, the reader waits for the next one, unless `late` is set.
+// programs that write them, so a ring may begin with samples of an earlier drive; end marks
+// separate drives. If the newest drive is over, the reader waits for the next one, unless `late` is
+// set.
 template <class T>
 void seek_to_drive(dssm::Reader<T>& reader, bool late) {
   T sample;

@@ -2,9 +2,9 @@
 //
 // lidar: the vehicle's laser scanner, replayed from a recording into the stream "lidar".
 //
-// Uses <dssm/...>. Each scan is filled in place, without a copy: loan() returns the ring's next slot,
-// and publish() makes it visible to readers. At the end of the recording, or after a signal to stop,
-// the program writes an end mark (samples.hpp).
+// Uses <dssm/...>. Each scan is filled in place, without a copy: loan() returns the ring's next
+// slot, and publish() makes it visible to readers. At the end of the recording, or after a signal
+// to stop, the program writes an end mark (samples.hpp).
 #include <CLI/CLI.hpp>
 #include <algorithm>
 #include <cmath>

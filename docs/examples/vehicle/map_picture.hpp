@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The map as a picture: walls are dark, free floor is white, unknown floor is grey. The vehicle's path
-// is blue, from a green square to a red one. The bar in the lower left corner is 5 m long. One cell is
-// two pixels wide; y points up. The same grid and path give the same file, byte for byte.
+// The map as a picture: walls are dark, free floor is white, unknown floor is grey. The vehicle's
+// path is blue, from a green square to a red one. The bar in the lower left corner is 5 m long. One
+// cell is two pixels wide; y points up. The same grid and path give the same file, byte for byte.
 #pragma once
 
 #include <cstdint>

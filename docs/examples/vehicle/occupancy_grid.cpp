@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Bresenham's line algorithm visits the cells of each beam. The constants below were tuned by
-// inspecting the pictures. A wall weighs more than free floor, because beams pass the cells in front
-// of a wall many times for each beam that ends in it.
+// inspecting the pictures. A wall weighs more than free floor, because beams pass the cells in
+// front of a wall many times for each beam that ends in it.
 #include "occupancy_grid.hpp"
 
 #include <algorithm>

@@ -33,8 +33,8 @@ class OccupancyGrid {
 
   OccupancyGrid();
 
-  // Adds a scan taken by a laser at `laser`. A beam longer than kMaxRangeM is ignored, one longer than
-  // kMaxWallM is evidence only for free floor. Evidence outside the grid is ignored.
+  // Adds a scan taken by a laser at `laser`. A beam longer than kMaxRangeM is ignored, one longer
+  // than kMaxWallM is evidence only for free floor. Evidence outside the grid is ignored.
   void add(const Pose2& laser, const Beams& beams);
 
   // A cell by column (x) and row (y), both 0 to kSide - 1.

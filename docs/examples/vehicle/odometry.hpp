@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The payload of the stream "odometry". A plain struct, as usual in SSM programs: the encoder writes
-// it through <ssm.hpp>, the localizer reads it through <dssm/...>.
+// The payload of the stream "odometry". A plain struct, as usual in SSM programs: the encoder
+// writes it through <ssm.hpp>, the localizer reads it through <dssm/...>.
 #pragma once
 
 struct Odometry {

@@ -24,8 +24,8 @@ class OdometryAt {
 
  private:
   std::optional<Pose2> between(dssm::Time t, const dssm::Neighbours& readings);
-  // Moves the reader to a restarted stream's new ring, which find_neighbours() does not do because it does
-  // not move the cursor. True if there was a restart.
+  // Moves the reader to a restarted stream's new ring, which find_neighbours() does not do because
+  // it does not move the cursor. True if there was a restart.
   bool follow_restart();
 
   dssm::Reader<Odometry> reader_;

@@ -9,14 +9,14 @@
 
 namespace vehicle {
 
-// Metres and radians in the recording's frame: seen from the start of the drive, x points ahead and y
-// to the left; theta is counter-clockwise from x.
+// Metres and radians in the recording's frame: seen from the start of the drive, x points ahead and
+// y to the left; theta is counter-clockwise from x.
 struct Pose2 {
   double x_m = 0, y_m = 0, theta_rad = 0;
 };
 
-// The pose at `weight` between `a` (0) and `b` (1). The angle takes the shorter way: halfway between
-// 179 and -179 degrees is 180, not 0.
+// The pose at `weight` between `a` (0) and `b` (1). The angle takes the shorter way: halfway
+// between 179 and -179 degrees is 180, not 0.
 inline Pose2 interpolate(const Pose2& a, const Pose2& b, double weight) {
   constexpr double kFullTurn = 2 * M_PI;
   const double turn = std::remainder(b.theta_rad - a.theta_rad, kFullTurn);

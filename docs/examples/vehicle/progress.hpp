@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Shows a program's progress on stderr: on a terminal in one line that is updated in place, otherwise
-// in separate lines, for a log file.
+// Shows a program's progress on stderr: on a terminal in one line that is updated in place,
+// otherwise in separate lines, for a log file.
 #pragma once
 
 #include <unistd.h>
@@ -19,7 +19,8 @@ class Progress {
   explicit Progress(const char* program)
       : program_(program), on_terminal_(::isatty(STDERR_FILENO) == 1) {}
 
-  // Shows the result of text() at most a few times per second; cheap enough to call for each sample.
+  // Shows the result of text() at most a few times per second; cheap enough to call for each
+  // sample.
   template <class Text>
   void update(Text text) {
     const dssm::MonoTime now = dssm::MonoClock::now();

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Reads the scan of a pose. On another PC than the lidar's, the two streams have separate connections,
-// and a pose may arrive before its scan.
+// Reads the scan of a pose. On another PC than the lidar's, the two streams have separate
+// connections, and a pose may arrive before its scan.
 #pragma once
 
 #include <dssm/reader.hpp>

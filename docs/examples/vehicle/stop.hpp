@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Turns Ctrl-C and SIGTERM into stop_requested(), which loops check. A wait must not take longer than
-// kSlice, because a signal just before the wait does not interrupt it.
+// Turns Ctrl-C and SIGTERM into stop_requested(), which loops check. A wait must not take longer
+// than kSlice, because a signal just before the wait does not interrupt it.
 #pragma once
 
 #include <chrono>
