@@ -63,7 +63,7 @@ wire::Greeting own_greeting(const std::string& name,
   wire::Greeting self;
   self.host = name;
   self.host_id = wire::host_id_for(name);
-  self.life = wire::random_number();
+  self.instance_id = wire::random_number();
   self.program = "dssmd";
   self.version = DSSM_VERSION;
   self.features = {std::string(wire::kFeatureTorn), std::string(wire::kFeatureClock)};

@@ -99,7 +99,7 @@ Result<void> NetworkConnection::greet() {
   wire::Greeting self;
   self.host = own_host();
   self.host_id = wire::host_id_for(self.host);
-  self.life = instance_id_;
+  self.instance_id = instance_id_;
   self.program = program_;
   self.version = DSSM_VERSION;
   self.features = {std::string(wire::kFeatureTorn)};

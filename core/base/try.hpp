@@ -6,7 +6,11 @@
 //   DSSM_TRY(check_host_name(text));                                    // Result<void>
 //   Stream stream = DSSM_TRY(Stream::open(id), "open '" + id.str() + "'");  // with context
 //
-// The context is evaluated only on failure. Not for public headers: it is a statement expression,
+// The context is evaluated only on failure. Use it as a statement, or as the whole value of a
+// variable or of a single argument: on failure the rest of an expression around it stays half done
+// (`new T(DSSM_TRY(...))` leaks the memory of T).
+//
+// Not for public headers: it is a statement expression,
 // an extension of GCC and clang (https://gcc.gnu.org/onlinedocs/gcc/Statement-Exprs.html).
 #pragma once
 

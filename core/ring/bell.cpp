@@ -46,8 +46,9 @@ WaitStatus outcome(long result, int error, MonoTime deadline) noexcept {
 Result<UniqueFd> create_bell() { return create_sealed_memory("dssm-bell", sizeof(BellPage), 0600); }
 
 Result<std::shared_ptr<Bell>> Bell::open_untrusted(int fd) {
-  return std::shared_ptr<Bell>(
-      new Bell(DSSM_TRY(SharedMapping::map_sealed_untrusted(fd, sizeof(BellPage), "bell"))));
+  SharedMapping mapping =
+      DSSM_TRY(SharedMapping::map_sealed_untrusted(fd, sizeof(BellPage), "bell"));
+  return std::shared_ptr<Bell>(new Bell(std::move(mapping)));
 }
 
 [[gnu::hot]] void Bell::notify_slow() noexcept {

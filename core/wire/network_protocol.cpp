@@ -73,7 +73,7 @@ void to_message(const Greeting& greeting, proto::Hello& out) {
   out.set_protocol_version(kNetworkProtocolVersion);
   out.set_host(greeting.host);
   out.set_host_id(greeting.host_id.data(), greeting.host_id.size());
-  out.set_life(greeting.life);
+  out.set_instance_id(greeting.instance_id);
   out.set_program(greeting.program);
   out.set_version(greeting.version);
   for (const std::string& feature : greeting.features) out.add_features(feature);
@@ -118,7 +118,7 @@ Result<Greeting> greeting_untrusted(const proto::Hello& message, const std::stri
   }
   greeting.host = message.host();
   std::memcpy(greeting.host_id.data(), message.host_id().data(), greeting.host_id.size());
-  greeting.life = message.life();
+  greeting.instance_id = message.instance_id();
   greeting.program = message.program();
   greeting.version = message.version();
   if (message.has_clock()) {

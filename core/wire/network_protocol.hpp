@@ -35,8 +35,8 @@ inline constexpr Duration kHelloTimeout = std::chrono::seconds(3);
 struct Greeting {
   std::string host;  // host's name, checked: 1 to 31 letters, digits and '-'
   HostId host_id{};
-  std::uint64_t life = 0;  // differs between two lives of one process
-  std::string program;     // "dssmd", "mapper"
+  std::uint64_t instance_id = 0;  // random; differs between two runs of one program
+  std::string program;            // "dssmd", "mapper"
   std::string version;
   std::vector<std::string> features;
   // What it says of its clock; nullptr: nothing. Our own is kept up to date by who watches the

@@ -36,7 +36,7 @@ void Catalog::notify(const Notify& call) {
 
 void Catalog::host_up(const wire::Greeting& greeting, const wire::Address& address) {
   if (const KnownHost* known = find(greeting.host_id)) {
-    if (known->greeting.life == greeting.life) return;
+    if (known->greeting.instance_id == greeting.instance_id) return;
     host_down(greeting.host_id, {Errc::unavailable, "its dssmd was restarted"});
   }
   const KnownHost& host =

@@ -29,7 +29,7 @@ inline constexpr std::size_t kMaxBytesPerHost = 32U << 20;
 
 // A host that answers at this moment.
 struct KnownHost {
-  wire::Greeting greeting;  // name, id, life, version, clock
+  wire::Greeting greeting;  // name, id, instance id, version, clock
   wire::Address address;    // where it was reached: channels go there too
   std::map<std::pair<std::string, std::int32_t>, StreamInfo> streams;  // by name and id
   std::size_t stream_bytes = 0;                                        // what `streams` takes
@@ -64,7 +64,8 @@ class Catalog {
   // --- fed by discovery
 
   // The host answers. When it is known already by another address, the first one stays; a host that
-  // comes with another `life` has restarted: it is reported as down first, with all its streams.
+  // comes with another instance id has restarted: it is reported as down first, with all its
+  // streams.
   void host_up(const wire::Greeting& greeting, const wire::Address& address);
   // It does not answer any more: its streams leave the catalog.
   void host_down(const wire::HostId& id, const Error& error);

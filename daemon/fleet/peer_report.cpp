@@ -48,7 +48,7 @@ bool PeerReport::is_shown_by_configured(const Peer& found) const {
   return std::any_of(peers_.begin(), peers_.end(), [&](const Peer& peer) {
     if (!peer.is_configured() || !peer.is_up()) return false;
     return peer.them().host_id == found.found->host.id &&
-           (found.use != PeerUse::in_use || peer.them().life == found.them().life);
+           (found.use != PeerUse::in_use || peer.them().instance_id == found.them().instance_id);
   });
 }
 
@@ -59,7 +59,8 @@ bool PeerReport::shows_use(const Peer& peer) const {
   if (peer.use != PeerUse::standing_by || !peer.is_configured()) return false;
   return std::any_of(peers_.begin(), peers_.end(), [&](const Peer& other) {
     return other.use == PeerUse::in_use && !other.is_configured() &&
-           other.them().host_id == peer.them().host_id && other.them().life == peer.them().life;
+           other.them().host_id == peer.them().host_id &&
+           other.them().instance_id == peer.them().instance_id;
   });
 }
 

@@ -21,7 +21,7 @@ std::string describe(const PeerConnection& connection) {
 // For a connection that stands by while another is used. A dssmd that was restarted stands by until
 // its predecessor's connection is found to be dead; if both stay, they are two.
 PeerProblem same_host_warning(const Peer& in_use, const Peer& by) {
-  const bool is_same = in_use.them().life == by.them().life;
+  const bool is_same = in_use.them().instance_id == by.them().instance_id;
   if (is_same && !in_use.is_configured()) return {};  // configured and found: as it should be
   const std::string other =
       in_use.is_configured() ? in_use.connection->configured().str() : in_use.connection->address();
@@ -282,7 +282,7 @@ void Peers::on_peer_up(PeerConnection& connection) {
 void Peers::on_own_id(Peer& peer) {
   PeerConnection& connection = *peer.connection;
   const wire::Greeting& them = *connection.them();
-  const bool is_self = them.life == self_.life;
+  const bool is_self = them.instance_id == self_.instance_id;
   if (is_self && peer.found) {
     return connection.drop(
         {Errc::conflict, fmt::format("this very dssmd answers at '{}'", connection.address())});
@@ -296,7 +296,7 @@ void Peers::on_own_id(Peer& peer) {
                     "and a copied PC its own machine id (rm /etc/machine-id && "
                     "systemd-machine-id-setup)",
                     connection.address(), self_.host, hex(self_.host_id))};
-    if (std::exchange(logged_duplicate_, them.life) != them.life) {
+    if (std::exchange(logged_duplicate_, them.instance_id) != them.instance_id) {
       logger_.warning(peer.warning.text, {.message_id = message_id::kHostRefused});
     }
   }

@@ -203,9 +203,9 @@ TEST_F(Channel, SaysAfterARestartWhatWasWrittenBefore) {
   net::Frame start;
   start.mutable_start_publishing()->set_publisher(77);
   std::int64_t last = -1;
-  for (int life = 0; life < 3; ++life) {
+  for (int run = 0; run < 3; ++run) {
     RawClient local(daemon_.socket_path());
-    if (life > 0) program.offer(local);
+    if (run > 0) program.offer(local);
     RawPeer peer(daemon_.address());
     peer.open("once");
     const net::Publishing publishing = peer.ask(start).frame.publishing();
@@ -270,7 +270,7 @@ TEST_F(Channel, TellsAllAboutTheStreamsOfItsHost) {
   EXPECT_EQ(control.server().host(), "pc1");
   EXPECT_EQ(control.server().program(), "dssmd");
   EXPECT_EQ(control.server().host_id().size(), 16u);
-  EXPECT_NE(control.server().life(), 0u);
+  EXPECT_NE(control.server().instance_id(), 0u);
   channel.open("a");
   net::Frame info;
   info.mutable_info()->mutable_id()->set_name("a");

@@ -145,7 +145,7 @@ net::Frame network_hello(std::uint32_t version, bool torn) {
   wire::Greeting greeting;
   greeting.host = "elsewhere";
   greeting.host_id.fill(3);
-  greeting.life = 99;
+  greeting.instance_id = 99;
   greeting.program = "raw";
   greeting.version = "test";
   if (torn) greeting.features.emplace_back(wire::kFeatureTorn);

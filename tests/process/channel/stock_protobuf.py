@@ -66,7 +66,7 @@ class Connection:
             protocol_version=version,
             host="pc9",
             host_id=b"0123456789abcdef",
-            life=4711,
+            instance_id=4711,
             program="stock_protobuf.py",
             version="0",
             features=features,
@@ -150,7 +150,7 @@ def test_greeting(address):
     check("protocol version", hello.protocol_version, 1)
     check("host", hello.host, "pc1")
     check("bytes of the host id", len(hello.host_id), 16)
-    check("life is said", hello.life != 0, True)
+    check("an instance id is sent", hello.instance_id != 0, True)
     check("program", hello.program, "dssmd")
     check("version is said", hello.version != "", True)
     check("features", "torn" in hello.features, True)

@@ -121,7 +121,7 @@ net::Frame hello_frame(std::uint32_t protocol_version, const std::vector<std::st
   hello.set_protocol_version(protocol_version);
   hello.set_host("raw");
   hello.set_host_id(std::string(16, 'r'));
-  hello.set_life(1);
+  hello.set_instance_id(1);
   hello.set_program("raw peer");
   hello.set_version("0.0.0");
   // Its clock is this PC's.

@@ -42,7 +42,7 @@ void FakePeer::greet() {
   wire::Greeting self;
   self.host = "fake";
   self.host_id = wire::host_id_for("fake");
-  self.life = 1;
+  self.instance_id = 1;
   self.program = "dssmd";
   self.version = "0";
   net::Frame answer;

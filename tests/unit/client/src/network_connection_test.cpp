@@ -39,7 +39,7 @@ struct NetworkConnectionTest : testing::Test {
     wire::Greeting self;
     self.host = "pc1";
     self.host_id = wire::host_id_for("pc1");
-    self.life = 1;
+    self.instance_id = 1;
     net::Frame frame;
     wire::to_message(self, *frame.mutable_hello());
     const std::string bytes = wire::encode_frame(frame);

@@ -72,7 +72,7 @@ const std::map<std::string, Fill>& messages() {
          Greeting greeting;
          greeting.host = "pc2";
          for (std::uint8_t i = 0; i < 16; ++i) greeting.host_id[i] = i;
-         greeting.life = 0x1122334455667788;
+         greeting.instance_id = 0x1122334455667788;
          greeting.program = "dssmd";
          greeting.version = "0.1.0";
          greeting.features = {std::string(kFeatureTorn)};

@@ -12,7 +12,7 @@ Greeting mapper() {
   Greeting greeting;
   greeting.host = "pc3";
   greeting.host_id = {1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15, 16};
-  greeting.life = 77;
+  greeting.instance_id = 77;
   greeting.program = "mapper";
   greeting.version = "0.1.0";
   greeting.features = {"torn", "other"};
@@ -44,7 +44,7 @@ TEST(Greeting, CrossesTheWire) {
   ASSERT_TRUE(back) << back.error().message;
   EXPECT_EQ(back->host, "pc3");
   EXPECT_EQ(back->host_id, mapper().host_id);
-  EXPECT_EQ(back->life, 77u);
+  EXPECT_EQ(back->instance_id, 77u);
   EXPECT_EQ(back->program, "mapper");
   EXPECT_EQ(back->version, "0.1.0");
   EXPECT_EQ(back->features, mapper().features);

@@ -31,7 +31,7 @@ wire::Greeting host(wire::HostId id, const std::string& name, Duration bound) {
   wire::Greeting greeting;
   greeting.host = name;
   greeting.host_id = id;
-  greeting.life = 1;
+  greeting.instance_id = 1;
   greeting.program = "dssmd";
   greeting.clock = report;
   return greeting;

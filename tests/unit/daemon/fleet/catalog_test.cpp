@@ -11,11 +11,11 @@
 namespace dssm::daemon {
 namespace {
 
-wire::Greeting host(const std::string& name, std::uint8_t id, std::uint64_t life = 1) {
+wire::Greeting host(const std::string& name, std::uint8_t id, std::uint64_t instance_id = 1) {
   wire::Greeting greeting;
   greeting.host = name;
   greeting.host_id[0] = id;
-  greeting.life = life;
+  greeting.instance_id = instance_id;
   return greeting;
 }
 

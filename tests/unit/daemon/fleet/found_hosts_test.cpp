@@ -324,7 +324,7 @@ TEST_F(FoundHostsTest, AreNeverThisVeryHost) {
 
 TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   wire::Greeting copy = self;
-  ++copy.life;
+  ++copy.instance_id;
   two->owner.greet_as(copy);
   one->owner.greet_as(self);
   start();
@@ -362,7 +362,7 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
 
 TEST_F(FoundHostsTest, AreAskedThoughThisHostIsAmongItsOwnPeers) {
   wire::Greeting copy = self;
-  ++copy.life;
+  ++copy.instance_id;
   one->owner.greet_as(self);
   two->owner.greet_as(copy);
   start({at(*one)});

@@ -186,7 +186,7 @@ TEST_F(PeersTest, UseOneOfTwoAddressesAndTakeTheOtherWhenItFails) {
 
 TEST_F(PeersTest, WarnOfTwoPcsWithOneIdAndUseTheFirst) {
   wire::Greeting clone = one.owner.host().greeting;
-  ++clone.life;
+  ++clone.instance_id;
   two.owner.greet_as(clone);
   start({&one, &two});
   wait([&] { return one.watches + two.watches > 0 && peers->startup_is_over(); });
@@ -223,7 +223,7 @@ TEST_F(PeersTest, KnowThemselves) {
 
 TEST_F(PeersTest, RefuseAnotherPcWithTheirOwnId) {
   wire::Greeting clone = self;
-  ++clone.life;
+  ++clone.instance_id;
   one.owner.greet_as(clone);
   start({&one});
   wait_for_startup();

@@ -73,7 +73,7 @@ TEST_F(FleetServiceTest, TellsWordsOfOthersInPrintableCharactersOnly) {
 
 TEST_F(FleetServiceTest, TellsOfThisHostFirstAndWhatIsWrongWithIt) {
   wire::Greeting copy = self;
-  ++copy.life;
+  ++copy.instance_id;
   peer.owner.greet_as(copy);
   EXPECT_EQ(fleet.hosts().at(0).error(), "");
   run_until(loop, [&] { return fleet.hosts().at(1).state() == local::Host::REFUSED; });

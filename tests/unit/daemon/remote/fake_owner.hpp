@@ -32,7 +32,7 @@ inline wire::Greeting greeting_of(const std::string& host) {
   wire::Greeting greeting;
   greeting.host = host;
   greeting.host_id = wire::host_id_for(host);
-  greeting.life = wire::random_number();
+  greeting.instance_id = wire::random_number();
   greeting.program = "dssmd";
   greeting.version = "0.0";
   greeting.features = {std::string(wire::kFeatureTorn)};

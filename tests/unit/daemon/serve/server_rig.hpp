@@ -21,7 +21,7 @@ inline wire::Greeting greeting_of(const std::string& program, const std::string&
   wire::Greeting greeting;
   greeting.host = host;
   greeting.host_id.fill(7);
-  greeting.life = 1;
+  greeting.instance_id = 1;
   greeting.program = program;
   greeting.version = "0.1.0";
   return greeting;
