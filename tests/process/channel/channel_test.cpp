@@ -10,11 +10,18 @@
 #include <thread>
 
 #include "core/ring/ring_reader.hpp"
-#include "tests/process/channel/raw_peer.hpp"
+#include "tests/process/channel/local_writer.hpp"
 #include "tests/support/largest_payload.hpp"
+#include "tests/support/network_peer.hpp"
 
 namespace dssm::test {
 namespace {
+
+bool has_payload_of(Tid tid, const net::Frame& frame) {
+  return is_payload_of(tid, std::as_bytes(std::span(frame.payload())));
+}
+
+SampleInfo info_of(Tid tid) { return {tid, time_from_ns(1'000'000 + tid * 1000), Duration(5)}; }
 
 // Takes a subscription's frames: in order, whole, and every tid either there or in a gap.
 struct Judge {
@@ -22,32 +29,32 @@ struct Judge {
   std::uint64_t samples = 0, lost = 0, torn = 0;
   bool caught_up = false;
 
-  void take(const Received& received) {
-    if (received.frame.has_caught_up()) caught_up = true;
-    if (received.frame.has_subscribed()) next = received.frame.subscribed().first_tid();
-    if (received.frame.has_gap()) {
-      EXPECT_EQ(received.frame.gap().first_tid(), next);
-      next += static_cast<Tid>(received.frame.gap().count());
-      lost += received.frame.gap().count();
+  void take(const net::Frame& frame) {
+    if (frame.has_caught_up()) caught_up = true;
+    if (frame.has_subscribed()) next = frame.subscribed().first_tid();
+    if (frame.has_gap()) {
+      EXPECT_EQ(frame.gap().first_tid(), next);
+      next += static_cast<Tid>(frame.gap().count());
+      lost += frame.gap().count();
     }
-    if (!received.frame.has_sample()) return;
-    if (received.torn) {
+    if (!frame.has_sample()) return;
+    if (frame.torn()) {
       ++torn;
       return;
     }
-    const Tid tid = received.frame.sample().tid();
+    const Tid tid = frame.sample().tid();
     EXPECT_EQ(tid, next);
-    EXPECT_EQ(received.frame.sample().time_ns(), 1'000'000 + tid * 1000);
-    EXPECT_TRUE(is_payload_of(tid, received.payload)) << "sample " << tid;
+    EXPECT_EQ(frame.sample().time_ns(), 1'000'000 + tid * 1000);
+    EXPECT_TRUE(has_payload_of(tid, frame)) << "sample " << tid;
     next = tid + 1;
     ++samples;
   }
   // Until sample `last` was there or is lost.
-  void take_up_to(RawPeer& peer, Tid last) {
+  void take_up_to(NetworkPeer& peer, Tid last) {
     while (next <= last) {
-      const Received received = peer.receive();
-      ASSERT_FALSE(received.ended);
-      take(received);
+      const std::optional<net::Frame> frame = peer.try_receive();
+      ASSERT_TRUE(frame);
+      take(*frame);
     }
   }
 };
@@ -63,13 +70,9 @@ TEST_F(Channel, BringsEverySampleOnceWhileTheWriterWrites) {
     const int count = bytes == 64 ? 100'000 : 3000;
     LocalWriter writer(local_, "s" + std::to_string(bytes), bytes, bytes == 64 ? 131'072 : 4096);
     writer.write(count / 10);
-    RawPeer peer(daemon_.address());
+    NetworkPeer peer = NetworkPeer::greeted(daemon_.address());
     peer.open("s" + std::to_string(bytes));
-    peer.send([&] {
-      net::Frame frame = subscribe_from_oldest();
-      frame.set_serial(1000);
-      return frame;
-    }());
+    peer.send(with_serial(1000, subscribe_from_oldest_frame()));
     std::thread writing([&] { writer.write(count - count / 10); });
     Judge judge;
     judge.take_up_to(peer, count - 1);
@@ -86,10 +89,10 @@ TEST_F(Channel, SkipsALappedReaderForwardAndCountsExactly) {
     for (const std::size_t bytes : {100u, 50'000u, 3'000'000u}) {
       const std::string name = "lap" + std::to_string(bytes) + (torn ? "t" : "");
       LocalWriter writer(local_, name, bytes, 6);
-      RawPeer peer(daemon_.address(), true, torn);
+      NetworkPeer peer = NetworkPeer::greeted(daemon_.address(), torn);
       peer.open(name);
       Judge judge;
-      judge.take(peer.ask(subscribe_from_oldest()));
+      judge.take(peer.ask(subscribe_from_oldest_frame()));
       const int count = bytes > 1'000'000 ? 100 : 3000;
       std::thread writing([&] { writer.write(count); });
       judge.take_up_to(peer, count - 1);
@@ -106,25 +109,23 @@ TEST_F(Channel, AnswersReadsWholeThoughTheWriterLapsThem) {
     const std::string name = torn ? "readt" : "read";
     LocalWriter writer(local_, name, 1'000'000, 4);
     writer.write();
-    RawPeer peer(daemon_.address(), true, torn);
+    NetworkPeer peer = NetworkPeer::greeted(daemon_.address(), torn);
     peer.open(name);
     std::atomic<bool> done = false;
     std::thread writing([&] {
       while (!done) writer.write();
     });
-    net::Frame read;
-    read.mutable_read()->set_newest(true);
     Tid newest = kNoTid;
     for (int i = 0; i < 30; ++i) {
-      const Received answer = peer.ask(read);
-      ASSERT_FALSE(answer.ended);
-      if (answer.frame.has_no_sample()) {
-        EXPECT_EQ(answer.frame.no_sample().status(), 3u) << "lapped again and again, at worst";
+      const net::Frame answer = peer.ask(read_newest_frame());
+      if (answer.has_no_sample()) {
+        EXPECT_EQ(answer.no_sample().status(), 3u) << "lapped again and again, at worst";
         continue;
       }
-      EXPECT_GE(answer.frame.sample().tid(), newest);
-      newest = answer.frame.sample().tid();
-      EXPECT_TRUE(is_payload_of(newest, answer.payload));
+      ASSERT_TRUE(answer.has_sample());
+      EXPECT_GE(answer.sample().tid(), newest);
+      newest = answer.sample().tid();
+      EXPECT_TRUE(has_payload_of(newest, answer));
     }
     done = true;
     writing.join();
@@ -135,30 +136,26 @@ TEST_F(Channel, AnswersReadsWholeThoughTheWriterLapsThem) {
 TEST_F(Channel, CarriesTheLargestAndTheSmallestSamples) {
   for (const std::size_t bytes : {std::size_t{1}, kLargestPayloadBytes}) {
     const std::string name = "size" + std::to_string(bytes);
-    RawPeer publisher(daemon_.address()), reader(daemon_.address());
+    NetworkPeer publisher = NetworkPeer::greeted(daemon_.address());
+    NetworkPeer reader = NetworkPeer::greeted(daemon_.address());
     EXPECT_TRUE(publisher.create(name, bytes, 3).created());
     reader.open(name);
     Judge judge;
-    judge.take(reader.ask(subscribe_from_oldest()));
-    net::Frame start;
-    start.mutable_start_publishing()->set_publisher(5);
-    const Received started = publisher.ask(start);
-    ASSERT_TRUE(started.frame.has_publishing()) << started.frame.failure().message();
+    judge.take(reader.ask(subscribe_from_oldest_frame()));
+    const net::Frame started = publisher.ask(start_publishing_frame(5));
+    ASSERT_TRUE(started.has_publishing()) << started.failure().message();
     std::vector<std::byte> payload(bytes);
     for (Tid tid = 0; tid < 3; ++tid) {
       fill_payload(tid, payload);
-      publisher.send_sample(tid, payload, time_from_ns(1'000'000 + tid * 1000),
-                            static_cast<std::uint64_t>(tid) + 100);
-      const Received published = publisher.receive();
-      EXPECT_EQ(published.frame.published().last_tid(), tid) << published.frame.failure().message();
+      publisher.send_sample(info_of(tid), payload, static_cast<std::uint64_t>(tid) + 100);
+      const net::Frame published = publisher.receive();
+      EXPECT_EQ(published.published().last_tid(), tid) << published.failure().message();
       judge.take_up_to(reader, tid);
     }
     EXPECT_EQ(judge.samples, 3u);
-    net::Frame read;
-    read.mutable_read()->set_tid(2);
-    const Received answer = reader.ask(read);
-    EXPECT_TRUE(is_payload_of(2, answer.payload));
-    EXPECT_EQ(answer.payload.size(), bytes);
+    const net::Frame answer = reader.ask(read_frame(2));
+    EXPECT_TRUE(has_payload_of(2, answer));
+    EXPECT_EQ(answer.payload().size(), bytes);
   }
 }
 
@@ -167,31 +164,29 @@ TEST_F(Channel, WritesEachPublishedSampleOnceThoughConnectionsBreakAnywhere) {
   SCOPED_TRACE("seed " + std::to_string(seed));
   std::mt19937 random(seed);
   constexpr std::int64_t kSamples = 5000;
-  RawPeer(daemon_.address()).create("once", 40, 8192);
+  NetworkPeer::greeted(daemon_.address()).create("once", 40, 8192);
   std::vector<std::byte> payload(40);
   int connections = 0;
   for (std::int64_t acknowledged = -1; acknowledged < kSamples - 1; ++connections) {
-    RawPeer peer(daemon_.address());
+    NetworkPeer peer = NetworkPeer::greeted(daemon_.address());
     peer.open("once");
-    net::Frame start;
-    start.mutable_start_publishing()->set_publisher(77);
-    const std::int64_t last = peer.ask(start).frame.publishing().last();
+    const std::int64_t last = peer.ask(start_publishing_frame(77)).publishing().last();
     EXPECT_GE(last, acknowledged);
     acknowledged = last;
     // Some samples, the last of them cut off somewhere, and no waiting for what is acknowledged.
     const std::int64_t end = std::min<std::int64_t>(kSamples, last + 1 + random() % 400);
     for (std::int64_t number = last + 1; number < end; ++number) {
       fill_payload(number, payload);
-      peer.send_sample(number, payload, time_from_ns(1'000'000 + number * 1000));
+      peer.send_sample(info_of(number), payload);
     }
     if (random() % 2) peer.send_bytes(std::string_view("\x49\x12\x1b\x09").substr(0, random() % 4));
     if (random() % 2) ::shutdown(peer.fd(), SHUT_WR);
   }
   EXPECT_GT(connections, 10);
-  RawPeer reader(daemon_.address());
+  NetworkPeer reader = NetworkPeer::greeted(daemon_.address());
   reader.open("once");
   Judge judge;
-  judge.take(reader.ask(subscribe_from_oldest()));
+  judge.take(reader.ask(subscribe_from_oldest_frame()));
   while (!judge.caught_up) judge.take(reader.receive());  // bytes and times are checked by tid
   EXPECT_EQ(judge.samples, static_cast<std::uint64_t>(kSamples));
 }
@@ -200,20 +195,18 @@ TEST_F(Channel, WritesEachPublishedSampleOnceThoughConnectionsBreakAnywhere) {
 TEST_F(Channel, SaysAfterARestartWhatWasWrittenBefore) {
   constexpr std::int64_t kSamples = 10'000;
   LocalWriter program(local_, "once", 40, 16);  // keeps the ring
-  net::Frame start;
-  start.mutable_start_publishing()->set_publisher(77);
   std::int64_t last = -1;
   for (int run = 0; run < 3; ++run) {
     RawClient local(daemon_.socket_path());
     if (run > 0) program.offer(local);
-    RawPeer peer(daemon_.address());
+    NetworkPeer peer = NetworkPeer::greeted(daemon_.address());
     peer.open("once");
-    const net::Publishing publishing = peer.ask(start).frame.publishing();
+    const net::Publishing publishing = peer.ask(start_publishing_frame(77)).publishing();
     EXPECT_EQ(publishing.last(), last);
     EXPECT_EQ(publishing.last_tid(), last);
     const std::int64_t end = last + 1 + kSamples;
     for (std::int64_t number = last + 1; number < end; ++number) {
-      peer.send_sample(number, std::vector<std::byte>(40), time_from_ns(number));
+      peer.send_sample(info_of(number), Bytes(40));
     }
     last = end - 1;
     ASSERT_TRUE(eventually([&] { return program.newest() == last; }));
@@ -223,11 +216,9 @@ TEST_F(Channel, SaysAfterARestartWhatWasWrittenBefore) {
 }
 
 TEST_F(Channel, WakesLocalReadersOfWhatIsPublished) {
-  RawPeer publisher(daemon_.address());
+  NetworkPeer publisher = NetworkPeer::greeted(daemon_.address());
   publisher.create("wake", 16, 8);
-  net::Frame start;
-  start.mutable_start_publishing()->set_publisher(1);
-  publisher.ask(start);
+  publisher.ask(start_publishing_frame(1));
   const Answer opened = local_.ask(open_request("wake"));
   const auto mapping =
       ring::RingMapping::open_untrusted(opened.descriptors.at(0).get(), ring::Access::read_only)
@@ -236,7 +227,7 @@ TEST_F(Channel, WakesLocalReadersOfWhatIsPublished) {
   const ring::RingReader reader(*mapping);
   const std::uint32_t announced = bell->announce();
   ASSERT_EQ(reader.newest(), kNoTid);
-  publisher.send_sample(0, std::vector<std::byte>(16), {});
+  publisher.send_sample(info_of(0), Bytes(16));
   while (reader.newest() == kNoTid) {
     ASSERT_NE(bell->sleep(announced, deadline_in(std::chrono::seconds(kPatienceSeconds))),
               WaitStatus::timeout);
@@ -247,18 +238,18 @@ TEST_F(Channel, GoesOnWithTheRingThatAWriterKeptOverARestart) {
   LocalWriter writer(local_, "kept", 64, 1024);
   writer.write(10);
   {
-    RawPeer peer(daemon_.address());
+    NetworkPeer peer = NetworkPeer::greeted(daemon_.address());
     EXPECT_EQ(peer.open("kept").stream().newest(), 9);
   }
   daemon_.kill_hard();
   writer.write(5);
   daemon_.start();
   // While programs give their streams back nobody else can take their names.
-  RawPeer early(daemon_.address(), false);
-  early.send(network_hello());
+  NetworkPeer early(daemon_.address());
+  early.send(client_hello_frame());
   RawClient again(daemon_.socket_path());
   EXPECT_EQ(again.ask(create_request("other")).response.has_opened(), true);
-  EXPECT_TRUE(early.receive().frame.has_hello());
+  EXPECT_TRUE(early.receive().has_hello());
 }
 
 // --- many kinds of peers
@@ -266,7 +257,8 @@ TEST_F(Channel, GoesOnWithTheRingThatAWriterKeptOverARestart) {
 TEST_F(Channel, TellsAllAboutTheStreamsOfItsHost) {
   LocalWriter writer(local_, "a", 16, 32);
   writer.write(3);
-  RawPeer control(daemon_.address()), channel(daemon_.address());
+  NetworkPeer control = NetworkPeer::greeted(daemon_.address());
+  NetworkPeer channel = NetworkPeer::greeted(daemon_.address());
   EXPECT_EQ(control.server().host(), "pc1");
   EXPECT_EQ(control.server().program(), "dssmd");
   EXPECT_EQ(control.server().host_id().size(), 16u);
@@ -274,26 +266,21 @@ TEST_F(Channel, TellsAllAboutTheStreamsOfItsHost) {
   channel.open("a");
   net::Frame info;
   info.mutable_info()->mutable_id()->set_name("a");
-  const Received told = control.ask(info);
-  ASSERT_EQ(told.frame.stream_list().streams_size(), 1);
-  const proto::Stream& stream = told.frame.stream_list().streams(0);
+  const net::Frame answer = control.ask(info);
+  ASSERT_EQ(answer.stream_list().streams_size(), 1);
+  const proto::Stream& stream = answer.stream_list().streams(0);
   EXPECT_EQ(stream.newest(), 2);
   EXPECT_EQ(stream.writers(), 1u);
   EXPECT_EQ(stream.channels(), 1u);
   ASSERT_EQ(stream.users_size(), 1);
   EXPECT_EQ(stream.users(0).pid(), ::getpid());
-  net::Frame watch;
-  watch.mutable_watch();
-  watch.set_serial(500);
-  control.send(watch);
-  EXPECT_EQ(control.receive().frame.stream_event().stream().id().name(), "a");
-  EXPECT_TRUE(control.receive().frame.has_done());
+  control.send(with_serial(500, watch_frame()));
+  EXPECT_EQ(control.receive().stream_event().stream().id().name(), "a");
+  EXPECT_TRUE(control.receive().has_done());
   local_.ask(create_request("b"));
-  EXPECT_EQ(control.receive().frame.stream_event().stream().id().name(), "b");
-  net::Frame remove;
-  remove.mutable_remove()->mutable_id()->set_name("a");
-  EXPECT_TRUE(control.ask(remove).frame.has_done());
-  EXPECT_TRUE(channel.receive().frame.ended().removed());
+  EXPECT_EQ(control.receive().stream_event().stream().id().name(), "b");
+  EXPECT_TRUE(control.ask(remove_frame("a")).has_done());
+  EXPECT_TRUE(channel.receive().ended().removed());
 }
 
 TEST(ChannelAddresses, MayBeIPv6AndSeveral) {
@@ -302,8 +289,8 @@ TEST(ChannelAddresses, MayBeIPv6AndSeveral) {
   ASSERT_EQ(daemon.addresses().size(), 2u);
   EXPECT_TRUE(daemon.addresses()[1].starts_with("[::1]:")) << daemon.addresses()[1];
   for (const std::string& address : daemon.addresses()) {
-    RawPeer peer(address);
-    EXPECT_TRUE(peer.ask(network_list()).frame.has_stream_list());
+    NetworkPeer peer = NetworkPeer::greeted(address);
+    EXPECT_TRUE(peer.ask(list_frame()).has_stream_list());
   }
 }
 

@@ -10,7 +10,7 @@
 #include "tests/process/network/fleet.hpp"
 #include "tests/process/network/follower.hpp"
 #include "tests/process/network/load.hpp"
-#include "tests/process/network/raw_peer.hpp"
+#include "tests/support/network_peer.hpp"
 #include "tests/support/session.hpp"
 
 namespace dssm::test {
@@ -315,8 +315,8 @@ TEST_F(Hosts, UseIpv6) {
 TEST_F(Hosts, RefuseAPeerOfALaterVersionWithAnError) {
   if (!make_fleet(1)) return;
   const Inside inside = fleet->network().inside(1);
-  RawPeer peer(Network::address(1));
-  peer.send(hello_frame(99));
+  NetworkPeer peer(Network::address(1));
+  peer.send(client_hello_frame(99));
   const std::optional<net::Frame> last = peer.await_end();
   ASSERT_TRUE(last && last->has_failure()) << "no final failure";
   EXPECT_EQ(last->failure().code(), "protocol");
@@ -327,16 +327,20 @@ TEST_F(Hosts, RefuseAPeerOfALaterVersionWithAnError) {
 TEST_F(Hosts, ReportThatAPeerOfALaterVersionWasRefused) {
   std::unique_ptr<Network> network = make_network(2);
   if (!network) return;
-  const UniqueFd listener = [&] {
+  std::optional<ScriptedDaemon> later;
+  {
     const Inside inside = network->inside(2);
-    return listen_at(Network::address(2));
-  }();
+    later.emplace(
+        [](NetworkPeer& peer, int) {
+          EXPECT_TRUE(peer.try_receive()) << "its Hello";
+          peer.send(hello_frame(greeting_of("pc2"), 99));
+          peer.await_end();
+        },
+        Network::address(2));
+  }
   const Inside inside = network->inside(1);
   const DaemonProcess dssmd(
       {"--insecure", "--listen", dssmd_address(1), "--peer", dssmd_address(2)});
-  RawPeer peer = accept_peer(listener);
-  ASSERT_TRUE(peer.receive()) << "its Hello";
-  peer.send(hello_frame(99));
   Session session = connect_to(dssmd.socket_path());
   HostInfo refused;
   await("the other host is refused", [&] {
@@ -365,7 +369,7 @@ TEST_F(Hosts, ListenForOtherPcsOnlyWithInsecure) {
   // By default, it listens where only this PC can connect.
   const DaemonProcess dssmd({"--config", "/dev/null"});
   EXPECT_EQ(dssmd.addresses(), (std::vector<std::string>{"127.0.0.1:13776", "[::1]:13776"}));
-  EXPECT_FALSE(RawPeer(Network::address(1)).is_open());
+  EXPECT_FALSE(NetworkPeer(Network::address(1)).is_open());
 }
 
 }  // namespace

@@ -15,7 +15,7 @@
 #include "tests/process/network/fleet.hpp"
 #include "tests/process/network/follower.hpp"
 #include "tests/process/network/load.hpp"
-#include "tests/process/network/raw_peer.hpp"
+#include "tests/support/network_peer.hpp"
 
 namespace dssm::test {
 namespace {
@@ -95,9 +95,9 @@ class Misbehaviour : public NetworkTest {
     EXPECT_LT(anonymous_memory(), memory_before + max_peer_memory + kOtherMemoryBytes);
   }
 
-  RawPeer connect_from(int host) {
+  NetworkPeer connect_from(int host) {
     const Inside inside = fleet->network().inside(host);
-    return RawPeer(Network::address(1));
+    return NetworkPeer(Network::address(1));
   }
 
   // A stream whose ring takes 64 MiB, much more than max_peer_memory.
@@ -119,7 +119,7 @@ class Misbehaviour : public NetworkTest {
 
 TEST_F(Misbehaviour, PeersThatSendNothingOrOneByteAreClosed) {
   if (!begin(8)) return;
-  std::vector<RawPeer> silent;
+  std::vector<NetworkPeer> silent;
   for (int i = 0; i < 20; ++i) {
     silent.push_back(connect_from(3));
     ASSERT_TRUE(silent.back().is_open());
@@ -127,7 +127,7 @@ TEST_F(Misbehaviour, PeersThatSendNothingOrOneByteAreClosed) {
     if (i % 2 == 0) silent.back().send_bytes("\x20");
   }
   await_progress();
-  for (RawPeer& peer : silent) peer.await_end();
+  for (NetworkPeer& peer : silent) peer.await_end();
   await_progress();
   expect_bounded_memory();
 }
@@ -138,15 +138,14 @@ TEST_F(Misbehaviour, PeersThatSendGarbageAreClosed) {
   SCOPED_TRACE(testing::Message() << "DSSM_TEST_SEED=" << seed);
   std::mt19937_64 random(seed);
   for (int i = 0; i < 100; ++i) {
-    RawPeer peer = connect_from(3);
+    NetworkPeer peer = connect_from(3);
     ASSERT_TRUE(peer.is_open());
     // At the start; after a valid Hello; instead of a request on an open channel.
     if (i % 3 > 0) {
       ASSERT_FALSE(peer.greet());
     }
     if (i % 3 > 1) {
-      peer.send(open_frame(1, "steady"));
-      ASSERT_TRUE(peer.receive());
+      ASSERT_TRUE(peer.ask(open_frame("steady")).has_opened());
     }
     std::string garbage(1 + random() % 100'000, '\0');
     for (char& byte : garbage) byte = static_cast<char>(random());
@@ -164,13 +163,13 @@ TEST_F(Misbehaviour, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
   if (!begin(8)) return;
   RawWriter large = make_large();
   std::vector<std::byte> payload(large.payload_bytes());
-  std::vector<RawPeer> lazy;
+  std::vector<NetworkPeer> lazy;
   const MonoTime begun = MonoClock::now();
   for (int i = 0; i < 20; ++i) {
     lazy.push_back(connect_from(3));
-    ASSERT_FALSE(lazy.back().greet({"torn"}));
-    lazy.back().send(open_frame(1, i % 2 == 0 ? "large" : "steady"));
-    lazy.back().send(subscribe_from_oldest_frame(2));
+    ASSERT_FALSE(lazy.back().greet());
+    lazy.back().send(with_serial(1, open_frame(i % 2 == 0 ? "large" : "steady")));
+    lazy.back().send(with_serial(2, subscribe_from_oldest_frame()));
   }
   // This takes much less than the 30 s after which the kernel ends connections that receive
   // nothing, unless this machine is stalled.
@@ -186,7 +185,7 @@ TEST_F(Misbehaviour, PeersThatSubscribeAndNeverReadCostBoundedMemory) {
     std::uint64_t samples = 0;
     const Tid enough = i % 2 == 0 ? large.newest_tid() : 2000;
     while (next <= enough) {
-      const std::optional<net::Frame> frame = lazy[i].receive();
+      const std::optional<net::Frame> frame = lazy[i].try_receive();
       if (!frame && MonoClock::now() - begun > 29s) break;
       ASSERT_TRUE(frame) << "the connection ended at tid " << next;
       if (frame->has_gap()) {
@@ -214,18 +213,13 @@ TEST_F(Misbehaviour, PeersThatRequestAndNeverReadAreStoppedAndThenClosed) {
   std::vector<std::thread> greedy;
   for (const bool whole_samples : {false, true}) {
     greedy.emplace_back([this, whole_samples, &closed] {
-      RawPeer peer = connect_from(3);
+      NetworkPeer peer = connect_from(3);
       EXPECT_FALSE(peer.greet());
-      net::Frame ask;
-      if (whole_samples) {
-        peer.send(open_frame(1, "large"));
-        ask.mutable_read()->set_newest(true);
-      } else {
-        ask.mutable_list();
-      }
+      if (whole_samples) peer.send(with_serial(1, open_frame("large")));
+      net::Frame request = whole_samples ? read_newest_frame() : list_frame();
       for (std::uint64_t serial = 2; peer.is_open() && serial < 10'000'000; ++serial) {
-        ask.set_serial(serial);
-        peer.send(ask);
+        request.set_serial(serial);
+        peer.send(request);
       }
       EXPECT_FALSE(peer.is_open()) << "ten million requests without a limit";
       ++closed;
@@ -240,10 +234,10 @@ TEST_F(Misbehaviour, PeersThatRequestAndNeverReadAreStoppedAndThenClosed) {
 
 TEST_F(Misbehaviour, ConnectionsBeyondTheLimitAreRefusedWithAnError) {
   if (!begin(96)) return;
-  std::vector<RawPeer> many;
+  std::vector<NetworkPeer> many;
   int refused = 0, accepted = 0;
   for (int i = 0; i < 1000; ++i) {
-    RawPeer& peer = many.emplace_back(connect_from(3));
+    NetworkPeer& peer = many.emplace_back(connect_from(3));
     const std::optional<net::Frame> instead = peer.greet();
     if (!instead && peer.is_open()) {
       ++accepted;

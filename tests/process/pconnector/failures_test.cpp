@@ -12,11 +12,9 @@
 #include <optional>
 #include <thread>
 
-#include "core/wire/network_protocol.hpp"
-#include "core/wire/sample_frame.hpp"
 #include "core/wire/tcp.hpp"
-#include "tests/process/pconnector/fake_daemon.hpp"
 #include "tests/support/await.hpp"
+#include "tests/support/network_peer.hpp"
 
 namespace dssm::test {
 namespace {
@@ -29,19 +27,27 @@ std::string text_of(std::int64_t tid) {
   return std::string(8 - text.size(), '0') + text;
 }
 
+// A sample as expect_sample() expects it.
+void send_sample(NetworkPeer& peer, std::int64_t tid, const std::string& payload,
+                 std::uint64_t serial = 0, bool torn = false) {
+  const Bytes bytes = sample_bytes({tid, time_from_ns(tid * 10), 7ns}, to_bytes(payload), serial,
+                                   torn ? std::optional(true) : std::nullopt);
+  peer.send_bytes({reinterpret_cast<const char*>(bytes.data()), bytes.size()});
+}
+
 struct TakenSample {
   std::string bytes = std::string(8, '?');
   SampleInfo info;
   std::span<std::byte> span() { return std::as_writable_bytes(std::span(bytes)); }
 };
 
-Result<PConnector> open(const FakeDaemon& daemon, const TypeInfo* wanted = nullptr) {
+Result<PConnector> open(const ScriptedDaemon& daemon, const TypeInfo* wanted = nullptr) {
   return PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 60s},
                           wanted);
 }
 
 // Tried again for as long as a busy fake is later than `request_timeout`.
-PConnector open_impatient(const FakeDaemon& daemon, Duration request_timeout) {
+PConnector open_impatient(const ScriptedDaemon& daemon, Duration request_timeout) {
   std::optional<PConnector> con;
   await([&] {
     auto opened = PConnector::open(
@@ -101,7 +107,8 @@ TEST(PConnectorOpen, RefusesWhatIsNoAddressNameOrType) {
 }
 
 TEST(PConnectorOpen, TakesThePortFromTheEnvironment) {
-  const FakeDaemon daemon([](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
+  const ScriptedDaemon daemon(
+      [](NetworkPeer& peer, int) { peer.answer_open(8), peer.await_end(); });
   const std::string port = daemon.address().substr(daemon.address().find(':') + 1);
   ::setenv("DSSM_PORT", port.c_str(), 1);
   const auto con = PConnector::open({"lidar", 0, {}}, {.address = "127.0.0.1"});
@@ -113,12 +120,9 @@ TEST(PConnectorOpen, TakesThePortFromTheEnvironment) {
 }
 
 TEST(PConnectorOpen, PassesOnWhyDssmdRefuses) {
-  const FakeDaemon daemon([](FakePeer& peer, int) {
-    peer.take();
-    net::Frame frame;
-    frame.mutable_failure()->set_code("limit_exceeded");
-    frame.mutable_failure()->set_message("256 connections are the limit");
-    peer.send(frame);
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
+    peer.try_receive();
+    peer.send(failure_frame(Errc::limit_exceeded, "256 connections are the limit"));
   });
   const auto con = open(daemon);
   ASSERT_FALSE(con);
@@ -127,14 +131,10 @@ TEST(PConnectorOpen, PassesOnWhyDssmdRefuses) {
 }
 
 TEST(PConnectorOpen, SaysThatThereIsNoSuchStream) {
-  const FakeDaemon daemon([](FakePeer& peer, int) {
-    peer.greet();
-    net::Frame answer;
-    answer.set_serial(peer.take().value_or(net::Frame()).serial());
-    answer.mutable_failure()->set_code("not_found");
-    answer.mutable_failure()->set_message("no stream 'lidar:0' on host 'fake'");
-    peer.send(answer);
-    peer.wait_for_end();
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
+    peer.answer_hello();
+    peer.refuse(Errc::not_found, "no stream 'lidar:0' on host 'fake'");
+    peer.await_end();
   });
   const auto con = open(daemon);
   ASSERT_FALSE(con);
@@ -142,8 +142,8 @@ TEST(PConnectorOpen, SaysThatThereIsNoSuchStream) {
 }
 
 TEST(PConnectorOpen, NamesBothTypesWhenTheyDiffer) {
-  const FakeDaemon daemon(
-      [](FakePeer& peer, int) { peer.open(8, 1, "Scan"), peer.wait_for_end(); });
+  const ScriptedDaemon daemon(
+      [](NetworkPeer& peer, int) { peer.answer_open(8, 1, "Scan"), peer.await_end(); });
   const TypeInfo size{"Scan", 16, 1, {}}, name{"Image", 8, 1, {}}, same{"Scan", 8, 1, {}};
   expect_words(open(daemon, &size).error(), Errc::type_mismatch, {"8 bytes", "16 bytes"});
   expect_words(open(daemon, &name).error(), Errc::type_mismatch, {"Scan", "Image"});
@@ -151,14 +151,12 @@ TEST(PConnectorOpen, NamesBothTypesWhenTheyDiffer) {
 }
 
 TEST(PConnectorOpen, RefusesAnotherVersionInWords) {
-  const FakeDaemon daemon([](FakePeer& peer, int) {
-    peer.take();
-    net::Frame hello;
-    hello.mutable_hello()->set_protocol_version(9);
-    hello.mutable_hello()->set_host("future");
-    hello.mutable_hello()->set_version("7.7");
-    peer.send(hello);
-    peer.wait_for_end();
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
+    peer.try_receive();
+    wire::Greeting greeting = greeting_of("future");
+    greeting.version = "7.7";
+    peer.send(hello_frame(greeting, 9));
+    peer.await_end();
   });
   const auto con = open(daemon);
   ASSERT_FALSE(con);
@@ -171,9 +169,9 @@ TEST(PConnectorOpen, SaysThatGarbageIsNoDssmd) {
            "Request",
            "SSH-2.0-OpenSSH_9.2p1 Debian-2+deb12u3\r\n" + std::string(100, 'k'),
            std::string(100, '\xff'), std::string(3, '\0')}) {
-    const FakeDaemon daemon([&](FakePeer& peer, int) {
+    const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
       peer.send_bytes(bytes);
-      peer.wait_for_end();
+      peer.await_end();
     });
     const auto con =
         PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 10s});
@@ -183,16 +181,16 @@ TEST(PConnectorOpen, SaysThatGarbageIsNoDssmd) {
 }
 
 TEST(PConnectorOpen, SaysThatTheConnectionWasClosed) {
-  const FakeDaemon daemon([](FakePeer&, int) {});
+  const ScriptedDaemon daemon([](NetworkPeer&, int) {});
   const auto con = open(daemon);
   ASSERT_FALSE(con);
   expect_words(con.error(), Errc::unavailable, {daemon.address(), "closed"});
 }
 
 TEST(PConnectorOpen, RefusesADescriptionThatCannotBe) {
-  const FakeDaemon daemon([](FakePeer& peer, int number) {
-    peer.open(number == 0 ? (65ULL << 20) : 0);
-    peer.wait_for_end();
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int number) {
+    peer.answer_open(number == 0 ? (65ULL << 20) : 0);
+    peer.await_end();
   });
   for (int i = 0; i < 2; ++i) {
     const auto con = open(daemon);
@@ -202,7 +200,7 @@ TEST(PConnectorOpen, RefusesADescriptionThatCannotBe) {
 }
 
 TEST(PConnectorOpen, ASilentDssmdCostsTheRequestTimeout) {
-  const FakeDaemon daemon([](FakePeer& peer, int) { peer.wait_for_end(); });
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int) { peer.await_end(); });
   const auto con =
       PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 200ms});
   ASSERT_FALSE(con);
@@ -210,10 +208,10 @@ TEST(PConnectorOpen, ASilentDssmdCostsTheRequestTimeout) {
 }
 
 TEST(PConnectorOpen, GivesABusyDssmdTheRequestTimeoutToGreet) {
-  const FakeDaemon daemon([](FakePeer& peer, int) {
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
     std::this_thread::sleep_for(wire::kHelloTimeout + 100ms);
-    peer.open(8);
-    peer.wait_for_end();
+    peer.answer_open(8);
+    peer.await_end();
   });
   const auto con =
       PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 60s});
@@ -223,20 +221,20 @@ TEST(PConnectorOpen, GivesABusyDssmdTheRequestTimeoutToGreet) {
 // --- requests
 
 // Answers the reads of one connection with sample 5, until something else comes.
-void answer_reads(FakePeer& peer) {
+void answer_reads(NetworkPeer& peer) {
   for (;;) {
-    const auto request = peer.take();
+    const auto request = peer.try_receive();
     if (!request || !request->has_read()) return;
-    peer.send_sample(5, text_of(5), request->serial());
+    send_sample(peer, 5, text_of(5), request->serial());
   }
 }
 
 TEST(PConnectorRequest, IsAskedAgainOnANewConnection) {
   std::atomic<int> asked = 0;
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
-    peer.open(8);
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+    peer.answer_open(8);
     if (number < 2) {
-      if (peer.take()) ++asked;
+      if (peer.try_receive()) ++asked;
       return;  // hangs up instead of answering
     }
     answer_reads(peer);
@@ -251,12 +249,13 @@ TEST(PConnectorRequest, IsAskedAgainOnANewConnection) {
 }
 
 TEST(PConnectorRequest, FailsAtOnceWhenTheAnswerIsGarbageAndTheNextOneWorks) {
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
-    peer.open(8);
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+    peer.answer_open(8);
     if (number == 0) {
-      peer.take();
+      peer.try_receive();
       peer.send_bytes(std::string(64, '\xff'));
-      return peer.wait_for_end();
+      peer.await_end();
+      return;
     }
     answer_reads(peer);
   });
@@ -270,11 +269,11 @@ TEST(PConnectorRequest, FailsAtOnceWhenTheAnswerIsGarbageAndTheNextOneWorks) {
 }
 
 TEST(PConnectorRequest, RefusesSamplesOfAnotherSize) {
-  const FakeDaemon daemon([&](FakePeer& peer, int) {
-    peer.open(8);
-    const auto request = peer.take();
-    if (request) peer.send_sample(5, "123456789", request->serial());
-    peer.wait_for_end();
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
+    peer.answer_open(8);
+    const auto request = peer.try_receive();
+    if (request) send_sample(peer, 5, "123456789", request->serial());
+    peer.await_end();
   });
   auto con = open(daemon).value();
   TakenSample sample;
@@ -284,13 +283,13 @@ TEST(PConnectorRequest, RefusesSamplesOfAnotherSize) {
 }
 
 TEST(PConnectorRequest, AsksAgainForATornSample) {
-  const FakeDaemon daemon([&](FakePeer& peer, int) {
-    peer.open(8);
-    auto request = peer.take();
-    if (request) peer.send_sample(4, text_of(4), request->serial(), true);
-    request = peer.take();
-    if (request) peer.send_sample(5, text_of(5), request->serial(), false);
-    peer.wait_for_end();
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
+    peer.answer_open(8);
+    auto request = peer.try_receive();
+    if (request) send_sample(peer, 4, text_of(4), request->serial(), true);
+    request = peer.try_receive();
+    if (request) send_sample(peer, 5, text_of(5), request->serial(), false);
+    peer.await_end();
   });
   auto con = open(daemon).value();
   TakenSample sample;
@@ -299,7 +298,8 @@ TEST(PConnectorRequest, AsksAgainForATornSample) {
 }
 
 TEST(PConnectorRequest, TellsDaemonAwayWhenItStaysAway) {
-  auto daemon = std::make_unique<FakeDaemon>([](FakePeer& peer, int) { peer.open(8); });
+  auto daemon =
+      std::make_unique<ScriptedDaemon>([](NetworkPeer& peer, int) { peer.answer_open(8); });
   auto con = open_impatient(*daemon, 300ms);
   const std::string address = daemon->address();
   daemon.reset();
@@ -311,11 +311,11 @@ TEST(PConnectorRequest, TellsDaemonAwayWhenItStaysAway) {
 }
 
 TEST(PConnectorRequest, TellsOnceThatTheStreamBeganAnew) {
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
-    peer.open(8, number == 0 ? 1 : 2);
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+    peer.answer_open(8, number == 0 ? 1 : 2);
     if (number == 0) {
-      const auto request = peer.take();
-      if (request) peer.send_sample(5, text_of(5), request->serial());
+      const auto request = peer.try_receive();
+      if (request) send_sample(peer, 5, text_of(5), request->serial());
       return;
     }
     answer_reads(peer);
@@ -330,13 +330,13 @@ TEST(PConnectorRequest, TellsOnceThatTheStreamBeganAnew) {
 }
 
 TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
-    peer.open(number == 0 ? 8 : 9, static_cast<std::uint64_t>(number) + 1);
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+    peer.answer_open(number == 0 ? 8 : 9, static_cast<std::uint64_t>(number) + 1);
     if (number == 0) {
-      peer.take();
+      peer.try_receive();
       return;
     }
-    peer.wait_for_end();
+    peer.await_end();
   });
   auto con = open(daemon).value();
   TakenSample sample;
@@ -347,14 +347,14 @@ TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
 
 TEST(PConnectorRequest, AWaitForAStreamThatCannotBeUsedAnyMoreIsNoLoop) {
   std::atomic<int> connections = 0;
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     ++connections;
-    peer.open(number == 0 ? 8 : 9, static_cast<std::uint64_t>(number) + 1);
+    peer.answer_open(number == 0 ? 8 : 9, static_cast<std::uint64_t>(number) + 1);
     if (number == 0) {
-      peer.subscribe(0);
+      peer.answer_subscribe(0);
       return;
     }
-    peer.wait_for_end();
+    peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
@@ -371,7 +371,8 @@ TEST(PConnectorRequest, AWaitForAStreamThatCannotBeUsedAnyMoreIsNoLoop) {
 }
 
 TEST(PConnectorRequest, RefusesABufferOfAnotherSize) {
-  const FakeDaemon daemon([&](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
+  const ScriptedDaemon daemon(
+      [&](NetworkPeer& peer, int) { peer.answer_open(8), peer.await_end(); });
   auto con = open(daemon).value();
   std::array<std::byte, 7> small;
   SampleInfo info;
@@ -385,21 +386,19 @@ TEST(PConnectorRequest, RefusesABufferOfAnotherSize) {
 
 TEST(PConnectorSubscription, ComesInOrderHoweverTheBytesCome) {
   for (const std::size_t piece : {1, 7, 50, 1000}) {
-    const FakeDaemon daemon([&](FakePeer& peer, int) {
-      peer.open(8);
-      peer.subscribe(0);
+    const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
+      peer.answer_open(8);
+      peer.answer_subscribe(0);
       std::string bytes;
       for (std::int64_t tid = 0; tid < 20; ++tid) {
-        std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
-        const std::size_t length = wire::encode_sample_header(
-            header, 0, {tid, time_from_ns(tid * 10), 7ns}, 8, wire::Trailer::none);
-        bytes.append(reinterpret_cast<const char*>(header.data()), length);
-        bytes += text_of(tid);
+        const Bytes sample =
+            sample_bytes({tid, time_from_ns(tid * 10), 7ns}, to_bytes(text_of(tid)));
+        bytes.append(reinterpret_cast<const char*>(sample.data()), sample.size());
       }
       for (std::size_t at = 0; at < bytes.size(); at += piece) {
         peer.send_bytes(bytes.substr(at, piece));
       }
-      peer.wait_for_end();
+      peer.await_end();
     });
     auto con = open(daemon).value();
     ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
@@ -411,7 +410,8 @@ TEST(PConnectorSubscription, ComesInOrderHoweverTheBytesCome) {
 }
 
 TEST(PConnectorSubscription, NeedsOne) {
-  const FakeDaemon daemon([](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
+  const ScriptedDaemon daemon(
+      [](NetworkPeer& peer, int) { peer.answer_open(8), peer.await_end(); });
   auto con = open(daemon).value();
   TakenSample sample;
   const auto none = con.read_next(sample.span(), sample.info);
@@ -421,16 +421,16 @@ TEST(PConnectorSubscription, NeedsOne) {
 }
 
 TEST(PConnectorSubscription, KeepsWhatComesWhileARequestWaits) {
-  const FakeDaemon daemon([](FakePeer& peer, int) {
-    peer.open(8);
-    peer.subscribe(0);
-    for (std::int64_t tid = 0; tid < 3; ++tid) peer.send_sample(tid, text_of(tid));
-    const auto request = peer.take();
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
+    peer.answer_open(8);
+    peer.answer_subscribe(0);
+    for (std::int64_t tid = 0; tid < 3; ++tid) send_sample(peer, tid, text_of(tid));
+    const auto request = peer.try_receive();
     if (!request) return;
-    for (std::int64_t tid = 3; tid < 6; ++tid) peer.send_sample(tid, text_of(tid));
-    peer.send_sample(5, text_of(5), request->serial());
-    peer.send_sample(6, text_of(6));
-    peer.wait_for_end();
+    for (std::int64_t tid = 3; tid < 6; ++tid) send_sample(peer, tid, text_of(tid));
+    send_sample(peer, 5, text_of(5), request->serial());
+    send_sample(peer, 6, text_of(6));
+    peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
@@ -443,17 +443,17 @@ TEST(PConnectorSubscription, KeepsWhatComesWhileARequestWaits) {
 
 TEST(PConnectorSubscription, ResumesAtTheSampleThatIsDue) {
   std::promise<net::Subscribe> resumed;
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
-    peer.open(8);
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+    peer.answer_open(8);
     if (number == 0) {
-      peer.subscribe(3);
-      peer.send_sample(3, text_of(3));
-      peer.send_sample(4, text_of(4));
+      peer.answer_subscribe(3);
+      send_sample(peer, 3, text_of(3));
+      send_sample(peer, 4, text_of(4));
       return;
     }
-    resumed.set_value(peer.subscribe(7).subscribe());
-    peer.send_sample(7, text_of(7));
-    peer.wait_for_end();
+    resumed.set_value(peer.answer_subscribe(7).subscribe());
+    send_sample(peer, 7, text_of(7));
+    peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
@@ -468,12 +468,12 @@ TEST(PConnectorSubscription, ResumesAtTheSampleThatIsDue) {
 }
 
 TEST(PConnectorSubscription, TellsOfANewRingBetweenItsSamplesAndThoseOfTheOld) {
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
-    peer.open(8, number == 0 ? 1 : 2);
-    peer.subscribe(number == 0 ? 8 : 0, number == 0 ? 1 : 2);
-    peer.send_sample(number == 0 ? 8 : 0, text_of(number == 0 ? 8 : 0));
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+    peer.answer_open(8, number == 0 ? 1 : 2);
+    peer.answer_subscribe(number == 0 ? 8 : 0, number == 0 ? 1 : 2);
+    send_sample(peer, number == 0 ? 8 : 0, text_of(number == 0 ? 8 : 0));
     if (number == 0) return;
-    peer.wait_for_end();
+    peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
@@ -487,13 +487,13 @@ TEST(PConnectorSubscription, TellsOfANewRingBetweenItsSamplesAndThoseOfTheOld) {
 }
 
 TEST(PConnectorSubscription, TellsWhenTheConnectionIsDownWithoutWaiting) {
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     if (number == 0) {
-      peer.open(8);
-      peer.subscribe(0);
+      peer.answer_open(8);
+      peer.answer_subscribe(0);
       return;
     }
-    peer.wait_for_end();  // silent from now on
+    peer.await_end();  // silent from now on
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
@@ -510,25 +510,20 @@ TEST(PConnectorSubscription, TellsWhenTheConnectionIsDownWithoutWaiting) {
 
 TEST(PConnectorSubscription, SaysThatTheStreamWasRemovedAndGoesOnWhenItIsBack) {
   std::atomic<bool> back = false;
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     if (number == 0) {
-      peer.open(8);
-      peer.subscribe(0);
-      net::Frame ended;
-      ended.mutable_ended()->set_removed(true);
-      peer.send(ended);
+      peer.answer_open(8);
+      peer.answer_subscribe(0);
+      peer.send(removed_frame());
     } else if (!back) {
-      peer.greet();
-      net::Frame answer;
-      answer.set_serial(peer.take().value_or(net::Frame()).serial());
-      answer.mutable_failure()->set_code("not_found");
-      peer.send(answer);
+      peer.answer_hello();
+      peer.refuse(Errc::not_found, "");
     } else {
-      peer.open(8, 2);
-      peer.subscribe(0, 2);
-      peer.send_sample(0, text_of(0));
+      peer.answer_open(8, 2);
+      peer.answer_subscribe(0, 2);
+      send_sample(peer, 0, text_of(0));
     }
-    peer.wait_for_end();
+    peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
@@ -549,13 +544,9 @@ TEST(PConnectorSubscription, SaysThatTheStreamWasRemovedAndGoesOnWhenItIsBack) {
 }
 
 TEST(PConnectorSubscription, PassesOnWhyItIsRefused) {
-  const FakeDaemon daemon([](FakePeer& peer, int) {
-    peer.open(8);
-    net::Frame answer;
-    answer.set_serial(peer.take().value_or(net::Frame()).serial());
-    answer.mutable_failure()->set_code("no_permission");
-    answer.mutable_failure()->set_message("not for you");
-    peer.send(answer);
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
+    peer.answer_open(8);
+    peer.refuse(Errc::no_permission, "not for you");
     answer_reads(peer);
   });
   auto con = open(daemon).value();
@@ -569,10 +560,10 @@ TEST(PConnectorSubscription, PassesOnWhyItIsRefused) {
 }
 
 TEST(PConnectorSubscription, WaitEndsAtItsDeadlineAndAtASignal) {
-  const FakeDaemon daemon([](FakePeer& peer, int) {
-    peer.open(8);
-    peer.subscribe(0);
-    peer.wait_for_end();
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
+    peer.answer_open(8);
+    peer.answer_subscribe(0);
+    peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
@@ -597,12 +588,12 @@ TEST(PConnectorSubscription, WaitEndsAtItsDeadlineAndAtASignal) {
 }
 
 TEST(PConnectorSubscription, ItsDescriptorStandsForTheConnectionAndForTheNextAttempt) {
-  const FakeDaemon daemon([](FakePeer& peer, int number) {
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int number) {
     if (number == 1) return;  // one attempt fails
-    peer.open(8);
-    peer.subscribe(number);
-    peer.send_sample(number, text_of(number));
-    if (number > 1) peer.wait_for_end();
+    peer.answer_open(8);
+    peer.answer_subscribe(number);
+    send_sample(peer, number, text_of(number));
+    if (number > 1) peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({}));
@@ -631,9 +622,9 @@ std::string large(char fill) { return std::string(kLargeBytes, fill); }
 // caller's to go to.
 TEST(PConnectorLargeSamples, ArePutAsideWhenTheRestDoesNotCome) {
   std::promise<void> subscribed, go_on;
-  const FakeDaemon daemon([&](FakePeer& peer, int) {
-    peer.open(kLargeBytes);
-    peer.subscribe(0);
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
+    peer.answer_open(kLargeBytes);
+    peer.answer_subscribe(0);
     subscribed.get_future().wait();
     net::Frame frame;
     frame.mutable_sample()->set_tid(0);
@@ -642,7 +633,7 @@ TEST(PConnectorLargeSamples, ArePutAsideWhenTheRestDoesNotCome) {
     peer.send_bytes(bytes.substr(0, 2'000'000));
     go_on.get_future().wait();
     peer.send_bytes(bytes.substr(2'000'000));
-    peer.wait_for_end();
+    peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
@@ -666,16 +657,16 @@ TEST(PConnectorLargeSamples, ArePutAsideWhenTheRestDoesNotCome) {
 
 TEST(PConnectorLargeSamples, AreReceivedWhereTheyAreWanted) {
   std::promise<void> subscribed;
-  const FakeDaemon daemon([&](FakePeer& peer, int) {
-    peer.open(kLargeBytes);
-    peer.subscribe(0);
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
+    peer.answer_open(kLargeBytes);
+    peer.answer_subscribe(0);
     subscribed.get_future().wait();
     for (std::int64_t tid = 0; tid < 20; ++tid) {
-      peer.send_sample(tid, large(static_cast<char>('a' + tid)));
+      send_sample(peer, tid, large(static_cast<char>('a' + tid)));
     }
-    const auto request = peer.take();
-    if (request) peer.send_sample(5, large('!'), request->serial());
-    peer.wait_for_end();
+    const auto request = peer.try_receive();
+    if (request) send_sample(peer, 5, large('!'), request->serial());
+    peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
@@ -706,9 +697,9 @@ TEST(PConnectorLargeSamples, AreReceivedWhereTheyAreWanted) {
 }
 
 TEST(PConnectorLargeSamples, OneThatWasCutComesAnew) {
-  const FakeDaemon daemon([&](FakePeer& peer, int number) {
-    peer.open(kLargeBytes);
-    peer.subscribe(0);
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+    peer.answer_open(kLargeBytes);
+    peer.answer_subscribe(0);
     net::Frame frame;
     frame.mutable_sample()->set_tid(0);
     frame.set_payload(large('a'));
@@ -717,7 +708,7 @@ TEST(PConnectorLargeSamples, OneThatWasCutComesAnew) {
       return peer.send_bytes(
           bytes.substr(0, bytes.size() * (1 + static_cast<unsigned>(number)) / 4));
     peer.send_bytes(bytes);
-    peer.wait_for_end();
+    peer.await_end();
   });
   auto con = open(daemon).value();
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
@@ -740,9 +731,8 @@ struct Owner {
   std::int64_t last = -1;
   std::vector<std::string> written;
 
-  void answer_start(FakePeer& peer, const net::Frame& frame) const {
-    net::Frame answer;
-    answer.set_serial(frame.serial());
+  void answer_start(NetworkPeer& peer, const net::Frame& frame) const {
+    net::Frame answer = answer_to(frame);
     answer.mutable_publishing()->set_last(last);
     answer.mutable_publishing()->set_last_tid(static_cast<std::int64_t>(written.size()) - 1);
     peer.send(answer);
@@ -752,7 +742,7 @@ struct Owner {
     last = frame.sample().tid();
     written.push_back(frame.payload());
   }
-  void acknowledge(FakePeer& peer) const {
+  void acknowledge(NetworkPeer& peer) const {
     net::Frame event;
     event.mutable_published()->set_last(last);
     event.mutable_published()->set_last_tid(static_cast<std::int64_t>(written.size()) - 1);
@@ -760,17 +750,13 @@ struct Owner {
   }
 };
 
-std::span<const std::byte> bytes_of(const std::string& text) {
-  return std::as_bytes(std::span(text));
-}
-
 TEST(PConnectorPublishing, WritesEachSampleOnceOverBrokenConnections) {
   Owner owner;  // of the fake's thread until the connector is gone
   {
-    const FakeDaemon daemon([&](FakePeer& peer, int number) {
-      peer.open(8);
+    const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+      peer.answer_open(8);
       for (int frames = 0;; ++frames) {
-        const auto frame = peer.take();
+        const auto frame = peer.try_receive();
         if (!frame) return;
         if (frame->has_start_publishing()) {
           owner.answer_start(peer, *frame);
@@ -787,11 +773,11 @@ TEST(PConnectorPublishing, WritesEachSampleOnceOverBrokenConnections) {
       }
     });
     auto con = open(daemon).value();
-    for (std::int64_t i = 0; i < 500; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+    for (std::int64_t i = 0; i < 500; ++i) ASSERT_TRUE(con.post(to_bytes(text_of(i))));
     const auto flushed = con.flush(kNever);
     ASSERT_TRUE(flushed) << flushed.error().message;
     EXPECT_EQ(*flushed, 499);
-    const auto written = con.write(bytes_of(text_of(500)));
+    const auto written = con.write(to_bytes(text_of(500)));
     ASSERT_TRUE(written) << written.error().message;
     EXPECT_EQ(*written, 500);
     EXPECT_EQ(con.dropped_samples(), 0u);
@@ -806,18 +792,17 @@ TEST(PConnectorPublishing, WritesEachSampleOnceOverBrokenConnections) {
 TEST(PConnectorPublishing, SendsNothingTwiceOnOneConnection) {
   std::vector<std::int64_t> numbers;  // of the fake's thread until the connector is gone
   {
-    const FakeDaemon daemon([&](FakePeer& peer, int) {
-      peer.open(8);
+    const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
+      peer.answer_open(8);
       std::optional<net::Frame> start;
-      while (const auto frame = peer.take()) {
+      while (const auto frame = peer.try_receive()) {
         if (frame->has_start_publishing()) {
           start = frame;  // answered late
           continue;
         }
         Owner owner;
         if (frame->has_get_range()) {  // by now the answer to StartPublishing has been seen
-          net::Frame answer;
-          answer.set_serial(frame->serial());
+          net::Frame answer = answer_to(*frame);
           answer.mutable_range();
           peer.send(answer);
         } else {
@@ -830,10 +815,10 @@ TEST(PConnectorPublishing, SendsNothingTwiceOnOneConnection) {
       }
     });
     auto con = open(daemon).value();
-    for (std::int64_t i = 0; i < 300; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+    for (std::int64_t i = 0; i < 300; ++i) ASSERT_TRUE(con.post(to_bytes(text_of(i))));
     ASSERT_TRUE(con.newest_tid());
     ASSERT_TRUE(con.flush(kNever));
-    for (std::int64_t i = 300; i < 310; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+    for (std::int64_t i = 300; i < 310; ++i) ASSERT_TRUE(con.post(to_bytes(text_of(i))));
     ASSERT_TRUE(con.flush(kNever));
   }
   ASSERT_EQ(numbers.size(), 310u);
@@ -843,9 +828,9 @@ TEST(PConnectorPublishing, SendsNothingTwiceOnOneConnection) {
 TEST(PConnectorPublishing, NoticesABrokenConnectionByTheNextPosts) {
   Owner owner;
   {
-    const FakeDaemon daemon([&](FakePeer& peer, int number) {
-      peer.open(8);
-      while (const auto frame = peer.take()) {
+    const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+      peer.answer_open(8);
+      while (const auto frame = peer.try_receive()) {
         if (frame->has_start_publishing()) {
           owner.answer_start(peer, *frame);
           continue;
@@ -857,11 +842,11 @@ TEST(PConnectorPublishing, NoticesABrokenConnectionByTheNextPosts) {
     });
     auto con = open(daemon).value();
     int posts = 0;
-    ASSERT_TRUE(con.post(bytes_of(text_of(posts++))));
+    ASSERT_TRUE(con.post(to_bytes(text_of(posts++))));
     await([&] { return daemon.ended() != 0; });
     // The first one tells the kernel, the second one us.
     for (int i = 0; i < 3 && con.counters().reconnects == 0 && con.is_connected(); ++i) {
-      ASSERT_TRUE(con.post(bytes_of(text_of(posts++))));
+      ASSERT_TRUE(con.post(to_bytes(text_of(posts++))));
     }
     EXPECT_FALSE(con.is_connected());
     ASSERT_TRUE(con.flush(kNever));
@@ -873,12 +858,12 @@ TEST(PConnectorPublishing, KeepsTheNewestWhileDssmdIsAwayAndCountsTheOthers) {
   Owner owner;
   std::atomic<bool> back = false;
   {
-    const FakeDaemon daemon([&](FakePeer& peer, int number) {
+    const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
       if (number > 0 && !back) return;
-      peer.open(8);
+      peer.answer_open(8);
       if (number == 0) return;
       for (;;) {
-        const auto frame = peer.take();
+        const auto frame = peer.try_receive();
         if (!frame) return;
         if (frame->has_start_publishing()) {
           owner.answer_start(peer, *frame);
@@ -891,9 +876,9 @@ TEST(PConnectorPublishing, KeepsTheNewestWhileDssmdIsAwayAndCountsTheOthers) {
     auto con =
         PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .max_unsent_samples = 10})
             .value();
-    while (con.is_connected()) ASSERT_TRUE(con.post(bytes_of(text_of(0))));
+    while (con.is_connected()) ASSERT_TRUE(con.post(to_bytes(text_of(0))));
     const std::uint64_t before = con.dropped_samples();
-    for (std::int64_t i = 1; i <= 30; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+    for (std::int64_t i = 1; i <= 30; ++i) ASSERT_TRUE(con.post(to_bytes(text_of(i))));
     EXPECT_GE(con.dropped_samples(), before + 20);
     back = true;
     ASSERT_TRUE(con.flush(kNever));
@@ -906,9 +891,10 @@ TEST(PConnectorPublishing, KeepsTheNewestWhileDssmdIsAwayAndCountsTheOthers) {
 }
 
 TEST(PConnectorPublishing, AWriteThatIsNotAcknowledgedSaysSo) {
-  const FakeDaemon daemon([](FakePeer& peer, int) { peer.open(8), peer.wait_for_end(); });
+  const ScriptedDaemon daemon(
+      [](NetworkPeer& peer, int) { peer.answer_open(8), peer.await_end(); });
   auto con = open_impatient(daemon, 100ms);
-  const auto written = con.write(bytes_of(text_of(0)));
+  const auto written = con.write(to_bytes(text_of(0)));
   ASSERT_FALSE(written);
   expect_words(written.error(), Errc::unavailable, {"lidar", "kept"});
 }
@@ -916,9 +902,9 @@ TEST(PConnectorPublishing, AWriteThatIsNotAcknowledgedSaysSo) {
 TEST(PConnectorPublishing, TheDestructorSendsWhatWasPosted) {
   Owner owner;
   {
-    const FakeDaemon daemon([&](FakePeer& peer, int) {
-      peer.open(8);
-      while (const auto frame = peer.take()) {
+    const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
+      peer.answer_open(8);
+      while (const auto frame = peer.try_receive()) {
         if (frame->has_start_publishing()) {
           owner.answer_start(peer, *frame);
         } else {
@@ -928,7 +914,7 @@ TEST(PConnectorPublishing, TheDestructorSendsWhatWasPosted) {
       }
     });
     auto con = open(daemon).value();
-    for (std::int64_t i = 0; i < 1000; ++i) ASSERT_TRUE(con.post(bytes_of(text_of(i))));
+    for (std::int64_t i = 0; i < 1000; ++i) ASSERT_TRUE(con.post(to_bytes(text_of(i))));
   }
   EXPECT_EQ(owner.written.size(), 1000u);
 }
