@@ -40,6 +40,11 @@ inline void run_once(const EventLoop& loop) {
   if (quiet && alone) loop.timers().run_next();
 }
 
+// Runs the callbacks that are due, `turns` times; simulated time stands still.
+inline void run_turns(const EventLoop& loop, int turns = 1) {
+  for (int i = 0; i < turns; ++i) event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
+}
+
 // Runs callbacks until `done`; meson's time limit is the watchdog.
 inline void run_until(const EventLoop& loop, const std::function<bool()>& done) {
   while (!done()) run_once(loop);

@@ -6,12 +6,13 @@
 
 #include <optional>
 
-#include "core/wire/network_protocol.hpp"
-#include "core/wire/sample_frame.hpp"
-#include "tests/unit/daemon/link/fake_transport.hpp"
+#include "tests/support/memory_peer.hpp"
+#include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
 namespace {
+
+using namespace test;
 
 net::Frame property(std::uint64_t serial, std::size_t bytes) {
   net::Frame frame;
@@ -20,20 +21,9 @@ net::Frame property(std::uint64_t serial, std::size_t bytes) {
   return frame;
 }
 
-net::Frame ping(std::uint64_t serial) {
-  net::Frame frame;
-  frame.set_serial(serial);
-  frame.mutable_ping();
-  return frame;
-}
+net::Frame ping(std::uint64_t serial) { return with_serial(serial, ping_frame()); }
 
-std::vector<std::byte> bytes_of(const net::Frame& frame) {
-  const std::string text = wire::encode_frame(frame);
-  const auto bytes = std::as_bytes(std::span(text));
-  return {bytes.begin(), bytes.end()};
-}
-
-iovec part(const std::vector<std::byte>& bytes, std::size_t from, std::size_t to) {
+iovec part(const Bytes& bytes, std::size_t from, std::size_t to) {
   return {const_cast<std::byte*>(bytes.data()) + from, to - from};
 }
 
@@ -73,20 +63,20 @@ class FrameConnectionTest : public testing::Test,
 
   std::vector<std::uint64_t> serials_sent() {
     std::vector<std::uint64_t> serials;
-    for (const SentItem& item : decode(peer.sent)) serials.push_back(item.frame.serial());
+    for (const net::Frame& item : frames_of(peer.sent)) serials.push_back(item.serial());
     return serials;
   }
 
   EventLoop loop = *EventLoop::open();
-  FakePeer peer;
+  MemoryPeer peer;
   std::function<Result<void>(net::Frame&)> handler;
   std::vector<std::uint64_t> got;
   std::vector<Tid> begun, ended;
-  std::vector<std::byte> payload;
+  Bytes payload;
   bool hold_sample = false;
   int batches = 0, empties = 0;
   std::optional<Error> why;
-  std::optional<FrameConnection> link{std::in_place, loop, std::make_unique<FakeTransport>(peer),
+  std::optional<FrameConnection> link{std::in_place, loop, std::make_unique<MemoryTransport>(peer),
                                       static_cast<FrameConnection::Observer&>(*this), kMaxQueued};
 };
 
@@ -99,22 +89,22 @@ TEST_F(FrameConnectionTest, SendsAtOnceWhatThePeerTakes) {
 }
 
 TEST_F(FrameConnectionTest, KeepsTheOrderWhereverThePeerStops) {
-  const std::size_t all = bytes_of(property(1, 50)).size() + bytes_of(ping(2)).size() +
-                          bytes_of(property(3, 200)).size();
+  const std::size_t all = to_bytes(property(1, 50)).size() + to_bytes(ping(2)).size() +
+                          to_bytes(property(3, 200)).size();
   for (std::size_t room = 0; room <= all; ++room) {
-    FakePeer other;
+    MemoryPeer other;
     other.room = room;
-    FrameConnection one(loop, std::make_unique<FakeTransport>(other), *this, kMaxQueued);
+    FrameConnection one(loop, std::make_unique<MemoryTransport>(other), *this, kMaxQueued);
     one.send(property(1, 50));
     one.send(ping(2));
     one.send(property(3, 200));
     EXPECT_EQ(one.output_empty(), room == all);
-    other.room = FakePeer::kAll;
-    other.most_at_once = 7;
+    other.room = MemoryPeer::kAll;
+    other.max_send_bytes = 7;
     run_turns(loop, 100);
     EXPECT_TRUE(one.output_empty());
     Serials serials;
-    for (const SentItem& item : decode(other.sent)) serials.push_back(item.frame.serial());
+    for (const net::Frame& item : frames_of(other.sent)) serials.push_back(item.serial());
     EXPECT_EQ(serials, (Serials{1, 2, 3})) << "room for " << room;
   }
 }
@@ -123,7 +113,7 @@ TEST_F(FrameConnectionTest, TellsWhenNothingWaitsAnyMore) {
   peer.room = 3;
   link->send(ping(1));
   EXPECT_EQ(empties, 0);
-  peer.room = FakePeer::kAll;
+  peer.room = MemoryPeer::kAll;
   run_turns(loop, 3);
   EXPECT_EQ(empties, 1);
   link->want_output();
@@ -132,7 +122,7 @@ TEST_F(FrameConnectionTest, TellsWhenNothingWaitsAnyMore) {
 }
 
 TEST_F(FrameConnectionTest, PutsNoFrameIntoTheMiddleOfAnother) {
-  const std::vector<std::byte> frame = bytes_of(property(1, 300));
+  const Bytes frame = to_bytes(property(1, 300));
   for (const bool queues_rest : {true, false}) {
     peer.sent.clear();
     link->set_mid_frame(true);
@@ -174,7 +164,7 @@ TEST_F(FrameConnectionTest, ChargesWhatWaitsToTheBudgetAndGivesItBack) {
   peer.room = 0;
   link->send(property(1, 3000));
   EXPECT_GE(budget.used(), 3000u);
-  peer.room = FakePeer::kAll;
+  peer.room = MemoryPeer::kAll;
   run_turns(loop, 2);
   EXPECT_EQ(budget.used(), 0u);
   peer.room = 0;
@@ -190,7 +180,7 @@ TEST_F(FrameConnectionTest, ChargesWhatWaitsToTheBudgetAndGivesItBack) {
 TEST_F(FrameConnectionTest, ChargesALongFrameWhileItIsReceived) {
   MemoryBudget budget(1 << 20);
   link->set_budget(budget);
-  const std::vector<std::byte> frame = bytes_of(property(1, 700'000));
+  const Bytes frame = to_bytes(property(1, 700'000));
   const auto part_end = frame.begin() + 400'000;
   peer.put({frame.begin(), part_end});
   run_turns(loop, 5);
@@ -200,7 +190,7 @@ TEST_F(FrameConnectionTest, ChargesALongFrameWhileItIsReceived) {
   EXPECT_EQ(got, Serials{1});
   EXPECT_EQ(budget.used(), 0u);
 
-  const std::vector<std::byte> longer = bytes_of(property(2, 3'000'000));
+  const Bytes longer = to_bytes(property(2, 3'000'000));
   peer.put(longer);
   run_turns(loop, 20);
   EXPECT_FALSE(link->is_open());
@@ -208,9 +198,9 @@ TEST_F(FrameConnectionTest, ChargesALongFrameWhileItIsReceived) {
 }
 
 TEST_F(FrameConnectionTest, LetsOthersHaveTheirTurn) {
-  std::vector<std::byte> many;
+  Bytes many;
   for (std::uint64_t serial = 1; serial <= 30'000; ++serial) {
-    const std::vector<std::byte> one = bytes_of(property(serial, 100));
+    const Bytes one = to_bytes(property(serial, 100));
     many.insert(many.end(), one.begin(), one.end());
   }
   ASSERT_GT(many.size(), 2 * FrameConnection::kBytesPerTurn);
@@ -228,9 +218,9 @@ TEST_F(FrameConnectionTest, HandsNothingOutWhilePaused) {
     if (frame.serial() == 2) link->pause();
     return {};
   };
-  std::vector<std::byte> three;
+  Bytes three;
   for (const std::uint64_t serial : {1, 2, 3}) {
-    const std::vector<std::byte> one = bytes_of(ping(serial));
+    const Bytes one = to_bytes(ping(serial));
     three.insert(three.end(), one.begin(), one.end());
   }
   peer.put(three);
@@ -243,19 +233,14 @@ TEST_F(FrameConnectionTest, HandsNothingOutWhilePaused) {
   EXPECT_EQ(got, (Serials{1, 2, 3, 4}));
 }
 
-std::vector<std::byte> sample_frame(Tid tid, std::size_t payload_bytes, std::byte content) {
-  std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
-  const std::size_t header_bytes =
-      wire::encode_sample_header(header, 0, {tid, {}, {}}, payload_bytes, wire::Trailer::none);
-  std::vector<std::byte> frame(header.begin(), header.begin() + header_bytes);
-  frame.resize(frame.size() + payload_bytes, content);
-  return frame;
+Bytes sample(Tid tid, std::size_t payload_bytes, std::byte content) {
+  return sample_bytes({.tid = tid}, Bytes(payload_bytes, content));
 }
 
 TEST_F(FrameConnectionTest, RefusesASampleThatNobodyTakes) {
-  FakePeer other;
-  FrameConnection one(loop, std::make_unique<FakeTransport>(other), *this, kMaxQueued);
-  other.put(sample_frame(7, kPayloadBytes, std::byte{5}));
+  MemoryPeer other;
+  FrameConnection one(loop, std::make_unique<MemoryTransport>(other), *this, kMaxQueued);
+  other.put(sample(7, kPayloadBytes, std::byte{5}));
   run_turns(loop, 3);
   EXPECT_TRUE(begun.empty());
   ASSERT_TRUE(why);
@@ -265,7 +250,7 @@ TEST_F(FrameConnectionTest, RefusesASampleThatNobodyTakes) {
 
 TEST_F(FrameConnectionTest, BeginsASampleAgainThatCameInAPause) {
   hold_sample = true;
-  peer.put(sample_frame(7, kPayloadBytes, std::byte{5}));
+  peer.put(sample(7, kPayloadBytes, std::byte{5}));
   run_turns(loop, 3);
   EXPECT_EQ(begun, std::vector<Tid>{7});
   EXPECT_TRUE(ended.empty());
@@ -274,29 +259,29 @@ TEST_F(FrameConnectionTest, BeginsASampleAgainThatCameInAPause) {
   run_turns(loop, 3);
   EXPECT_EQ(begun, (std::vector<Tid>{7, 7}));
   EXPECT_EQ(ended, std::vector<Tid>{7});
-  EXPECT_EQ(payload, std::vector<std::byte>(kPayloadBytes, std::byte{5}));
+  EXPECT_EQ(payload, Bytes(kPayloadBytes, std::byte{5}));
 }
 
 TEST_F(FrameConnectionTest, TellsThePeerWhyItCloses) {
   handler = [](net::Frame&) -> Result<void> { return Error{Errc::protocol, "not like this"}; };
-  std::vector<std::byte> two = bytes_of(ping(1));
-  const std::vector<std::byte> second = bytes_of(ping(2));
+  Bytes two = to_bytes(ping(1));
+  const Bytes second = to_bytes(ping(2));
   two.insert(two.end(), second.begin(), second.end());
   peer.put(two);
   run_turns(loop, 3);
   EXPECT_EQ(got, Serials{1}) << "nothing is handed out after an error";
   EXPECT_TRUE(peer.closed);
-  const std::vector<SentItem> items = decode(peer.sent);
+  const std::vector<net::Frame> items = frames_of(peer.sent);
   ASSERT_EQ(items.size(), 1u);
-  EXPECT_EQ(items[0].frame.serial(), 0u);
-  EXPECT_EQ(items[0].frame.failure().message(), "not like this");
+  EXPECT_EQ(items[0].serial(), 0u);
+  EXPECT_EQ(items[0].failure().message(), "not like this");
   ASSERT_TRUE(why);
   EXPECT_EQ(why->message, "not like this");
 }
 
 TEST_F(FrameConnectionTest, ReadsThePeersLastWordsWhenItTakesNothingMore) {
   peer.put(ping(9));
-  peer.gone = true;
+  peer.end_silently();
   link->send(ping(1));
   EXPECT_TRUE(link->is_open()) << "what the peer said is still to be read";
   run_turns(loop, 3);
@@ -306,9 +291,9 @@ TEST_F(FrameConnectionTest, ReadsThePeersLastWordsWhenItTakesNothingMore) {
 }
 
 TEST_F(FrameConnectionTest, EndsWithThePeerAlsoInTheMiddleOfAFrame) {
-  const std::vector<std::byte> frame = bytes_of(property(1, 100));
+  const Bytes frame = to_bytes(property(1, 100));
   peer.put({frame.begin(), frame.begin() + 50});
-  peer.vanish();
+  peer.end();
   run_turns(loop, 3);
   ASSERT_TRUE(why);
   EXPECT_NE(why->message.find("middle of a frame"), std::string::npos) << why->message;

@@ -7,11 +7,14 @@
 #include <map>
 #include <random>
 
+#include "tests/support/memory_peer.hpp"
 #include "tests/unit/core/ring/test_ring.hpp"
-#include "tests/unit/daemon/link/fake_transport.hpp"
+#include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
 namespace {
+
+using namespace test;
 
 constexpr std::size_t kSmall = 40;
 constexpr std::size_t kMiddle = SampleSender::kInPlaceBytes;
@@ -28,7 +31,7 @@ class PumpRig final : private FrameConnection::Observer, private SamplePump::Obs
       : ring(payload_bytes, depth),
         payload_bytes_(payload_bytes),
         budget(budget_bytes),
-        link(loop, std::make_unique<FakeTransport>(peer), *this, 1U << 20),
+        link(loop, std::make_unique<MemoryTransport>(peer), *this, 1U << 20),
         sender(*ring.mapping, link, {may_tear, &budget}) {}
 
   void start(const SamplePump::Plan& plan) {
@@ -65,18 +68,18 @@ class PumpRig final : private FrameConnection::Observer, private SamplePump::Obs
     std::vector<Tid> tids;
     Tid next = kNoTid;
     gaps.clear();
-    for (const SentItem& item : decode(peer.sent, payload_bytes_)) {
-      if (item.frame.has_gap()) {
-        const Tid first = item.frame.gap().first_tid();
-        const auto count = static_cast<Tid>(item.frame.gap().count());
+    for (const net::Frame& item : frames_of(peer.sent)) {
+      if (item.has_gap()) {
+        const Tid first = item.gap().first_tid();
+        const auto count = static_cast<Tid>(item.gap().count());
         EXPECT_TRUE(next == kNoTid || first == next) << "a gap begins elsewhere";
         gaps[first] = count;
         next = first + count;
       }
-      if (!item.frame.has_sample() || item.torn) continue;
-      const Tid tid = item.frame.sample().tid();
-      EXPECT_EQ(item.frame.sample().time_ns(), to_ns(time_of(tid)));
-      EXPECT_EQ(item.payload, ring::payload_for(tid, payload_bytes_)) << "sample " << tid;
+      if (!item.has_sample() || item.torn()) continue;
+      const Tid tid = item.sample().tid();
+      EXPECT_EQ(item.sample().time_ns(), to_ns(time_of(tid)));
+      EXPECT_EQ(payload_of(item), ring::payload_for(tid, payload_bytes_)) << "sample " << tid;
       EXPECT_TRUE(next == kNoTid || thinned || tid == next) << tid << ", not " << next;
       next = tid + 1;
       tids.push_back(tid);
@@ -85,12 +88,12 @@ class PumpRig final : private FrameConnection::Observer, private SamplePump::Obs
   }
   std::size_t torn_seen() {
     std::size_t torn = 0;
-    for (const SentItem& item : decode(peer.sent, payload_bytes_)) torn += item.torn;
+    for (const net::Frame& item : frames_of(peer.sent)) torn += item.torn();
     return torn;
   }
 
   EventLoop loop = *EventLoop::open();
-  FakePeer peer;
+  MemoryPeer peer;
   ring::TestRing ring;
   std::size_t payload_bytes_;
   MemoryBudget budget;
@@ -257,7 +260,7 @@ TEST_P(SamplePumpOfEachKind, SendsWholeSamplesWhereverTheSocketStops) {
         rig.start({0, 2, 0});
         rig.peer.room = room;
         rig.run();
-        rig.peer.room = FakePeer::kAll;
+        rig.peer.room = MemoryPeer::kAll;
         EXPECT_EQ(rig.run_on(), PumpWait::sample);
         ASSERT_EQ(rig.accepted(), tids(0, 2)) << "room for " << room << " of " << total;
         EXPECT_EQ(rig.torn_seen(), 0u);
@@ -277,14 +280,14 @@ TEST_P(SamplePumpOfEachKind, SendsAllWhenTheSocketTakesLittleAtATime) {
     rig.write(40);
     rig.start({0, 39, 0});
     rig.peer.room = 0;
-    rig.peer.most_at_once = 1 + random() % (GetParam() * 2);
+    rig.peer.max_send_bytes = 1 + random() % (GetParam() * 2);
     PumpWait wait = rig.run();
     while (wait != PumpWait::sample) {
       rig.peer.room = random() % 3 == 0 ? 0 : random() % (GetParam() * 3);
       run_turns(rig.loop);
       wait = rig.run();
     }
-    rig.peer.room = FakePeer::kAll;
+    rig.peer.room = MemoryPeer::kAll;
     rig.run_on();
     EXPECT_EQ(rig.accepted(), tids(0, 39));
     EXPECT_EQ(rig.torn_seen(), 0u);
@@ -302,7 +305,7 @@ TEST_P(SamplePumpOfEachKind, LosesNothingWithoutSayingSoWhenItIsLapped) {
                 round % 2 == 0 ? 1U << 30 : GetParam() + 200);
     rig.write(2);
     rig.start({0, 1, 0});
-    rig.peer.most_at_once = 1 + random() % (2 * GetParam());
+    rig.peer.max_send_bytes = 1 + random() % (2 * GetParam());
     rig.peer.after_send = [&] {
       if (random() % 2) rig.write(static_cast<int>(random() % 5));
     };
@@ -312,7 +315,7 @@ TEST_P(SamplePumpOfEachKind, LosesNothingWithoutSayingSoWhenItIsLapped) {
       rig.run();
     }
     rig.peer.after_send = nullptr;
-    rig.peer.room = FakePeer::kAll;
+    rig.peer.room = MemoryPeer::kAll;
     EXPECT_EQ(rig.run_on(), PumpWait::sample);
     const std::vector<Tid> got = rig.accepted();  // checks bytes, order and gaps
     ASSERT_FALSE(got.empty());
@@ -355,7 +358,7 @@ TEST(SamplePump, KeepsWhatItCopiedAsideWhenTheSlotIsOverwrittenLater) {
   EXPECT_EQ(rig.run(), PumpWait::output);
   EXPECT_GT(rig.budget.used(), kLarge - 100);
   rig.write(8);
-  rig.peer.room = FakePeer::kAll;
+  rig.peer.room = MemoryPeer::kAll;
   EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.torn_seen(), 0u);
   EXPECT_EQ(rig.accepted().front(), 0);
@@ -371,7 +374,7 @@ TEST(SamplePump, RisksTheSlotWhenThePeersMemoryIsUsedUp) {
   EXPECT_TRUE(rig.sender.busy());
   EXPECT_EQ(rig.budget.used(), 0u);
   rig.write(8);
-  rig.peer.room = FakePeer::kAll;
+  rig.peer.room = MemoryPeer::kAll;
   EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.torn_seen(), 1u);
   EXPECT_EQ(rig.accepted(), tids(6, 8));
@@ -422,7 +425,7 @@ TEST(SamplePump, LooksAgainAfterALongSampleIsCopiedAside) {
     rig.peer.room = 100;
     EXPECT_EQ(rig.run(), PumpWait::turn) << "a part is copied";
     rig.write(8);
-    rig.peer.room = FakePeer::kAll;
+    rig.peer.room = MemoryPeer::kAll;
     EXPECT_EQ(rig.run_on(), PumpWait::sample);
     EXPECT_EQ(rig.torn_seen(), may_tear ? 1u : 0u);
     EXPECT_EQ(rig.accepted(), tids(6, 8));
@@ -468,7 +471,7 @@ TEST(SamplePump, StopsAfterTheSampleUnderWayWhenSomebodyElseWantsToSend) {
   rig.peer.room = 500;
   EXPECT_EQ(rig.run(), PumpWait::output);
   EXPECT_TRUE(rig.sender.busy());
-  rig.peer.room = FakePeer::kAll;
+  rig.peer.room = MemoryPeer::kAll;
   const Result<PumpWait> wait = rig.pump->pump(kStart, true);
   ASSERT_TRUE(wait);
   EXPECT_EQ(*wait, PumpWait::turn);

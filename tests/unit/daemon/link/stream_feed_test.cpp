@@ -9,11 +9,14 @@
 #include <unistd.h>
 
 #include "core/ring/ring_writer.hpp"
+#include "tests/support/memory_peer.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
-#include "tests/unit/daemon/link/fake_transport.hpp"
+#include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
 namespace {
+
+using namespace test;
 
 class StreamFeedTest : public testing::Test, protected StreamFeed::Observer {
  protected:
@@ -25,7 +28,7 @@ class StreamFeedTest : public testing::Test, protected StreamFeed::Observer {
       bell = ring::Bell::open_untrusted(files.bell.get()).value();
     }
     Tid write() {
-      const std::vector<std::byte> payload(24);
+      const Bytes payload(24);
       return ring::RingWriter(*mapping, *bell, files.doorbell.get())
           .write(payload, {}, kUnknownClockError);
     }

@@ -8,43 +8,31 @@
 namespace dssm::daemon {
 namespace {
 
-net::Frame list_request(std::uint64_t serial) {
-  net::Frame frame;
-  frame.set_serial(serial);
-  frame.mutable_list();
-  return frame;
-}
+net::Frame list_request(std::uint64_t serial) { return with_serial(serial, list_frame()); }
 
 net::Frame create_request(std::uint64_t serial, const std::string& name,
                           std::uint64_t payload_bytes, std::uint64_t depth) {
-  net::Frame frame;
-  frame.set_serial(serial);
-  proto::Create& create = *frame.mutable_create();
-  create.mutable_id()->set_name(name);
-  create.mutable_type()->set_payload_bytes(payload_bytes);
-  create.mutable_type()->set_alignment_bytes(1);
-  create.set_depth(depth);
-  create.set_cycle_ns(1000);
-  return frame;
+  return with_serial(serial, create_frame(name, payload_bytes, depth));
 }
 
-// The loop's timers count the ticks of the kernel's coarse clock.
-constexpr Duration kTimersAreEarly = std::chrono::milliseconds(10);
+net::Frame read_request(std::uint64_t serial, Tid tid) {
+  return with_serial(serial, read_frame(tid));
+}
 
-std::string final_failure(ServerRig& rig, FakePeer& peer) {
+std::string final_failure(ServerRig& rig, MemoryPeer& peer) {
   rig.turns();
   EXPECT_TRUE(peer.closed);
-  const std::vector<SentItem> items = rig.take(peer);
-  if (items.empty() || !items.back().frame.has_failure()) return "";
-  EXPECT_EQ(items.back().frame.serial(), 0u);
-  return items.back().frame.failure().message();
+  const std::vector<net::Frame> items = peer.take();
+  if (items.empty() || !items.back().has_failure()) return "";
+  EXPECT_EQ(items.back().serial(), 0u);
+  return items.back().failure().message();
 }
 
 // --- greeting
 
 TEST(DataCommunicator, SaysNothingBeforeThePeerSaidHello) {
   ServerRig rig;
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer, false);
   rig.turns();
   EXPECT_TRUE(peer.sent.empty());
@@ -52,7 +40,7 @@ TEST(DataCommunicator, SaysNothingBeforeThePeerSaidHello) {
 
 TEST(DataCommunicator, RefusesWhoDoesNotBeginWithHello) {
   ServerRig rig;
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer, false);
   peer.put(list_request(1));
   EXPECT_NE(final_failure(rig, peer).find("Hello"), std::string::npos);
@@ -61,11 +49,9 @@ TEST(DataCommunicator, RefusesWhoDoesNotBeginWithHello) {
 
 TEST(DataCommunicator, RefusesAnotherVersionNamingBothAndBothHosts) {
   ServerRig rig;
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer, false);
-  net::Frame hello = hello_frame(greeting_of("future", "pc2"));
-  hello.mutable_hello()->set_protocol_version(77);
-  peer.put(hello);
+  peer.put(hello_frame(greeting_of("pc2", "future"), 77));
   const std::string words = final_failure(rig, peer);
   EXPECT_NE(words.find("version 77"), std::string::npos) << words;
   EXPECT_NE(words.find("version 1"), std::string::npos) << words;
@@ -77,7 +63,7 @@ TEST(DataCommunicator, RefusesAnotherVersionNamingBothAndBothHosts) {
 
 TEST(DataCommunicator, AnswersARequestWithoutSerialWithLastWords) {
   ServerRig rig;
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
   peer.put(list_request(0));
   EXPECT_NE(final_failure(rig, peer).find("serial"), std::string::npos);
@@ -86,14 +72,11 @@ TEST(DataCommunicator, AnswersARequestWithoutSerialWithLastWords) {
 TEST(DataCommunicator, LogsTheLastWordsOfAPeer) {
   ServerRig rig;
   rig.create("a");
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
   rig.open(peer, "a");
-  net::Frame words;
-  words.mutable_failure()->set_code("closed");
-  words.mutable_failure()->set_message("had enough");
-  peer.put(words);
-  peer.vanish();
+  peer.put(failure_frame(Errc::closed, "had enough"));
+  peer.end();
   rig.turns();
   EXPECT_TRUE(rig.logger.contains("had enough"));
   EXPECT_TRUE(rig.logger.warnings.empty());
@@ -103,23 +86,20 @@ TEST(DataCommunicator, LogsTheLastWordsOfAPeer) {
 
 TEST(DataCommunicator, AnswersWhatItDoesNotKnowAndGoesOn) {
   ServerRig rig;
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
-  net::Frame nothing;
-  nothing.set_serial(5);
-  EXPECT_EQ(rig.ask(peer, nothing).failure().code(), "protocol");
-  net::Frame again = hello_frame(greeting_of("test", "pc2"));
-  again.set_serial(6);
-  EXPECT_EQ(rig.ask(peer, again).failure().code(), "protocol");
+  EXPECT_EQ(rig.ask(peer, with_serial(5)).failure().code(), "protocol");
+  const net::Frame again = hello_frame(greeting_of("pc2", "test"));
+  EXPECT_EQ(rig.ask(peer, with_serial(6, again)).failure().code(), "protocol");
   EXPECT_TRUE(rig.ask(peer, list_request(7)).has_stream_list());
 }
 
 TEST(DataCommunicator, KeepsChannelsAndControlConnectionsApart) {
   ServerRig rig;
   rig.create("a");
-  FakePeer channel, control;
+  MemoryPeer channel, control;
   rig.connect(channel);
-  EXPECT_EQ(rig.ask(channel, sample_read(1, 0)).failure().code(), "protocol") << "nothing is open";
+  EXPECT_EQ(rig.ask(channel, read_request(1, 0)).failure().code(), "protocol") << "nothing is open";
   rig.open(channel, "a");
   EXPECT_EQ(rig.ask(channel, list_request(2)).failure().code(), "protocol");
   EXPECT_EQ(rig.ask(channel, create_request(3, "b", 8, 4)).failure().code(), "protocol");
@@ -131,14 +111,14 @@ TEST(DataCommunicator, KeepsChannelsAndControlConnectionsApart) {
 TEST(DataCommunicator, CountsChannelsInTheStreamsDescription) {
   ServerRig rig;
   rig.create("a");
-  FakePeer one, two, control;
+  MemoryPeer one, two, control;
   rig.connect(one);
   rig.open(one, "a");
   rig.connect(two);
   rig.open(two, "a");
   rig.connect(control);
   EXPECT_EQ(rig.ask(control, list_request(1)).stream_list().streams(0).channels(), 2u);
-  one.vanish();
+  one.end();
   rig.turns();
   EXPECT_EQ(rig.ask(control, list_request(2)).stream_list().streams(0).channels(), 1u);
 }
@@ -147,27 +127,26 @@ TEST(DataCommunicator, ServesASlowAskerOneRequestAtATime) {
   ServerRig rig;
   const auto stream = rig.create("large", 1000, 64);
   rig.write(*stream, 20);
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
   rig.open(peer, "large");
   peer.room = 0;
-  std::vector<std::byte> requests;
+  Bytes requests;
   for (std::uint64_t serial = 1; serial <= 5000; ++serial) {
-    const std::string text = wire::encode_frame(sample_read(serial, 15));
-    const auto bytes = std::as_bytes(std::span(text));
+    const Bytes bytes = to_bytes(read_request(serial, 15));
     requests.insert(requests.end(), bytes.begin(), bytes.end());
   }
   peer.put(requests);
   rig.turns(200);
   EXPECT_TRUE(peer.sent.empty());
   EXPECT_FALSE(peer.closed) << "whoever does not read costs one answer, not its connection";
-  peer.room = FakePeer::kAll;
+  peer.room = MemoryPeer::kAll;
   rig.turns(3000);
-  const std::vector<SentItem> items = rig.take(peer, 1000);
+  const std::vector<net::Frame> items = peer.take();
   ASSERT_EQ(items.size(), 5000u);
   for (std::size_t i = 0; i < items.size(); ++i) {
-    EXPECT_EQ(items[i].frame.serial(), i + 1);
-    EXPECT_EQ(items[i].payload, ServerRig::payload_for(15, 1000));
+    EXPECT_EQ(items[i].serial(), i + 1);
+    EXPECT_EQ(payload_of(items[i]), ServerRig::payload_for(15, 1000));
   }
 }
 
@@ -175,7 +154,7 @@ TEST(DataCommunicator, KeepsOneLongAnswerForASlowAskerNotAllOfThem) {
   ServerRig rig;
   rig.create("a");
   ASSERT_TRUE(rig.registry.set_property({"a", 0, ""}, std::string(1 << 20, 'p')));
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
   rig.open(peer, "a");
   peer.room = 1000;
@@ -187,56 +166,52 @@ TEST(DataCommunicator, KeepsOneLongAnswerForASlowAskerNotAllOfThem) {
   }
   rig.turns(100);
   EXPECT_FALSE(peer.closed);
-  peer.room = FakePeer::kAll;
+  peer.room = MemoryPeer::kAll;
   rig.turns(400);
-  EXPECT_EQ(rig.take(peer).size(), 25u);
+  EXPECT_EQ(peer.take().size(), 25u);
 }
 
 TEST(DataCommunicator, LetsOthersHaveTheirTurnBetweenManyRequests) {
   ServerRig rig;
   rig.create("a");
-  FakePeer busy, other;
+  MemoryPeer busy, other;
   rig.connect(busy);
   rig.connect(other);
-  std::vector<std::byte> requests;
+  Bytes requests;
   for (std::uint64_t serial = 1; serial <= 1000; ++serial) {
-    const std::string text = wire::encode_frame(list_request(serial));
-    const auto bytes = std::as_bytes(std::span(text));
+    const Bytes bytes = to_bytes(list_request(serial));
     requests.insert(requests.end(), bytes.begin(), bytes.end());
   }
   busy.put(requests);
   other.put(list_request(1));
   rig.turns(2);
   EXPECT_FALSE(other.sent.empty());
-  EXPECT_LE(decode(busy.sent).size(), 3u * DataCommunicator::kRequestsPerTurn);
+  EXPECT_LE(frames_of(busy.sent).size(), 3u * DataCommunicator::kRequestsPerTurn);
   rig.turns(300);
-  EXPECT_EQ(rig.take(busy).size(), 1000u);
+  EXPECT_EQ(busy.take().size(), 1000u);
 }
 
 TEST(DataCommunicator, AnswersPingAndEndsWhenTheHeartStops) {
   ServerRig rig;
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
-  net::Frame ping;
-  ping.set_serial(3);
-  ping.mutable_ping();
-  const MonoTime begin = MonoClock::now();
-  EXPECT_TRUE(rig.ask(peer, ping).has_pong());
-  ASSERT_TRUE(run_until(rig.loop, [&] { return peer.closed; }));
-  EXPECT_GE(MonoClock::now() - begin, wire::kPeerTimeout);
+  const MonoTime begin = rig.loop.now();
+  EXPECT_TRUE(rig.ask(peer, with_serial(3, ping_frame())).has_pong());
+  run_until(rig.loop, [&] { return peer.closed; });
+  EXPECT_GE(rig.loop.now() - begin, wire::kPeerTimeout);
   EXPECT_NE(final_failure(rig, peer).find("no bytes came"), std::string::npos);
   EXPECT_TRUE(rig.logger.warnings.empty()) << "a host that goes away is no fault of this one";
 }
 
 TEST(DataCommunicator, WaitsForHelloOnlySoLong) {
   ServerRig rig;
-  FakePeer silent, slow;
+  MemoryPeer silent, slow;
   rig.connect(silent, false);
   rig.connect(slow, false);
-  slow.put(std::vector<std::byte>{std::byte{5}});  // the length of a frame, and no more
-  const MonoTime begin = MonoClock::now();
-  ASSERT_TRUE(run_until(rig.loop, [&] { return silent.closed && slow.closed; }));
-  EXPECT_GE(MonoClock::now() - begin, wire::kHelloTimeout - kTimersAreEarly);
+  slow.put(Bytes{std::byte{5}});  // the length of a frame, and no more
+  const MonoTime begin = rig.loop.now();
+  run_until(rig.loop, [&] { return silent.closed && slow.closed; });
+  EXPECT_GE(rig.loop.now() - begin, wire::kHelloTimeout);
   EXPECT_NE(final_failure(rig, silent).find("no Hello"), std::string::npos);
 }
 
@@ -244,7 +219,7 @@ TEST(DataCommunicator, WaitsForHelloOnlySoLong) {
 
 TEST(DataCommunicator, CreatesAStreamThatNoProgramHereCreated) {
   ServerRig rig;
-  FakePeer peer, other;
+  MemoryPeer peer, other;
   rig.connect(peer);
   const net::Frame made = rig.ask(peer, create_request(1, "new", 16, 8));
   ASSERT_TRUE(made.has_opened()) << made.failure().message();
@@ -264,7 +239,7 @@ TEST(DataCommunicator, CreatesAStreamThatNoProgramHereCreated) {
 
 TEST(DataCommunicator, TakesTheMemoryOfALongRingInTurns) {
   ServerRig rig;
-  FakePeer peer, other;
+  MemoryPeer peer, other;
   rig.connect(peer);
   rig.connect(other);
   // 40 MiB: several slices, and nobody else waits for them.
@@ -272,9 +247,9 @@ TEST(DataCommunicator, TakesTheMemoryOfALongRingInTurns) {
   other.put(list_request(1));
   rig.turns(3);
   EXPECT_TRUE(peer.sent.empty());
-  EXPECT_EQ(rig.take(other).size(), 1u);
-  ASSERT_TRUE(run_until(rig.loop, [&] { return !peer.sent.empty(); }));
-  EXPECT_TRUE(rig.take(peer)[0].frame.has_opened());
+  EXPECT_EQ(other.take().size(), 1u);
+  run_until(rig.loop, [&] { return !peer.sent.empty(); });
+  EXPECT_TRUE(peer.take()[0].has_opened());
   const auto stream = *rig.registry.find({"long", 0, ""});
   const OfferedFiles files = as_offer(stream->descriptors_for(Role::reader).value());
   struct stat file {};
@@ -284,19 +259,19 @@ TEST(DataCommunicator, TakesTheMemoryOfALongRingInTurns) {
 
 TEST(DataCommunicator, LeavesNoHalfMadeStreamBehind) {
   ServerRig rig;
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
   peer.put(create_request(1, "long", 1 << 20, 40));
   rig.turns(3);
   EXPECT_TRUE(rig.registry.knows({"long", 0, ""}));
-  peer.vanish();
+  peer.end();
   rig.turns();
   EXPECT_FALSE(rig.registry.knows({"long", 0, ""}));
 }
 
 TEST(DataCommunicator, SaysWhichLimitAStreamIsBeyond) {
   ServerRig rig;
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
   const net::Frame refused = rig.ask(peer, create_request(1, "huge", 64 << 20, 1 << 20));
   EXPECT_EQ(refused.failure().code(), "limit_exceeded");
@@ -307,19 +282,14 @@ TEST(DataCommunicator, SaysWhichLimitAStreamIsBeyond) {
 
 // --- watching
 
-net::Frame watch_request(std::uint64_t serial) {
-  net::Frame frame;
-  frame.set_serial(serial);
-  frame.mutable_watch();
-  return frame;
-}
+net::Frame watch_request(std::uint64_t serial) { return with_serial(serial, watch_frame()); }
 
-std::string events(const std::vector<SentItem>& items) {
+std::string events(const std::vector<net::Frame>& items) {
   std::string text;
-  for (const SentItem& item : items) {
-    if (item.frame.has_done()) text += "done ";
-    if (!item.frame.has_stream_event()) continue;
-    const proto::StreamEvent& event = item.frame.stream_event();
+  for (const net::Frame& item : items) {
+    if (item.has_done()) text += "done ";
+    if (!item.has_stream_event()) continue;
+    const proto::StreamEvent& event = item.stream_event();
     text += (event.removed() ? "-" : "+") + event.stream().id().name() + " ";
   }
   return text;
@@ -329,37 +299,37 @@ TEST(StreamWatch, TellsWhatIsThereThenAnswersThenTellsChanges) {
   ServerRig rig;
   rig.create("a");
   rig.create("b");
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
   peer.put(watch_request(1));
   rig.turns();
-  EXPECT_EQ(events(rig.take(peer)), "+a +b done ");
+  EXPECT_EQ(events(peer.take()), "+a +b done ");
   rig.create("c");
   ASSERT_TRUE(rig.registry.remove({"a", 0, ""}));
   rig.create("a");
   rig.turns();
-  EXPECT_EQ(events(rig.take(peer)), "+c -a +a ");
+  EXPECT_EQ(events(peer.take()), "+c -a +a ");
 }
 
 TEST(StreamWatch, NamesTheRingThatWasRemoved) {
   ServerRig rig;
   const std::uint64_t incarnation = rig.create("a")->incarnation();
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
   peer.put(watch_request(1));
   rig.turns();
-  rig.take(peer);
+  peer.take();
   ASSERT_TRUE(rig.registry.remove({"a", 0, ""}));
   rig.turns();
-  const std::vector<SentItem> items = rig.take(peer);
+  const std::vector<net::Frame> items = peer.take();
   ASSERT_EQ(items.size(), 1u);
-  EXPECT_EQ(items[0].frame.stream_event().stream().incarnation(), incarnation);
+  EXPECT_EQ(items[0].stream_event().stream().incarnation(), incarnation);
 }
 
 TEST(StreamWatch, WaitsForAPeerThatReadsSlowlyAndKeepsTheOrder) {
   ServerRig rig;
   for (int i = 0; i < 300; ++i) rig.create("s" + std::to_string(i));
-  FakePeer peer;
+  MemoryPeer peer;
   rig.connect(peer);
   peer.room = 500;
   peer.put(watch_request(1));
@@ -369,9 +339,9 @@ TEST(StreamWatch, WaitsForAPeerThatReadsSlowlyAndKeepsTheOrder) {
   ASSERT_TRUE(rig.registry.remove({"s0", 0, ""}));    // told already
   ASSERT_TRUE(rig.registry.remove({"s299", 0, ""}));  // not told yet
   rig.create("s299");
-  peer.room = FakePeer::kAll;
+  peer.room = MemoryPeer::kAll;
   rig.turns(50);
-  const std::string text = events(rig.take(peer));
+  const std::string text = events(peer.take());
   EXPECT_EQ(text.find("+s0 "), 0u);
   EXPECT_GT(text.find("-s0 "), text.find("+s0 "));
   const std::size_t again = text.find("+s299 ");
@@ -386,44 +356,44 @@ TEST(StreamWatch, WaitsForAPeerThatReadsSlowlyAndKeepsTheOrder) {
 
 TEST(ChannelServer, BoundsConnectionsInAllAndPerHost) {
   ServerRig rig({3, 2, 32U << 20});
-  FakePeer peers[5];
+  MemoryPeer peers[5];
   rig.connect(peers[0], true, true, 2);
   rig.connect(peers[1], true, true, 2);
-  const auto refused = [&](FakePeer& peer, std::uint32_t host) {
+  const auto refused = [&](MemoryPeer& peer, std::uint32_t host) {
     const Result<void> adopted =
-        rig.server.adopt(std::make_unique<FakeTransport>(peer), address_of(host));
+        rig.server.adopt(std::make_unique<MemoryTransport>(peer), address_of(host));
     return adopted ? std::string() : adopted.error().message;
   };
   EXPECT_NE(refused(peers[2], 2).find("max_connections_per_host = 2"), std::string::npos);
   EXPECT_NE(refused(peers[2], 2).find("'10.0.0.2'"), std::string::npos);
   rig.connect(peers[3], true, true, 3);
   EXPECT_NE(refused(peers[4], 4).find("max_connections = 3"), std::string::npos);
-  peers[0].vanish();
+  peers[0].end();
   rig.turns();
   EXPECT_EQ(refused(peers[2], 2), "");
 }
 
 TEST(ChannelServer, BoundsTheMemoryOfAHost) {
   ServerRig rig({100, 100, 1U << 20});
-  FakePeer peers[5];
+  MemoryPeer peers[5];
   for (int i = 0; i < 3; ++i) rig.connect(peers[i], true, true, 2);
   const Result<void> refused =
-      rig.server.adopt(std::make_unique<FakeTransport>(peers[3]), address_of(2));
+      rig.server.adopt(std::make_unique<MemoryTransport>(peers[3]), address_of(2));
   ASSERT_FALSE(refused);
   EXPECT_NE(refused.error().message.find("max_peer_memory = 1048576"), std::string::npos);
   rig.connect(peers[4], true, true, 3);  // others do not notice
 }
 
 TEST(ChannelServer, TellsWhoIsConnectedThatItStops) {
-  FakePeer peer;
+  MemoryPeer peer;
   {
     ServerRig rig;
     rig.connect(peer);
   }
-  const std::vector<SentItem> items = decode(peer.sent);
+  const std::vector<net::Frame> items = frames_of(peer.sent);
   ASSERT_EQ(items.size(), 1u);
-  EXPECT_EQ(items[0].frame.failure().code(), "unavailable");
-  EXPECT_NE(items[0].frame.failure().message().find("'pc1'"), std::string::npos);
+  EXPECT_EQ(items[0].failure().code(), "unavailable");
+  EXPECT_NE(items[0].failure().message().find("'pc1'"), std::string::npos);
 }
 
 }  // namespace

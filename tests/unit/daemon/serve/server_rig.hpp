@@ -12,20 +12,13 @@
 #include "core/ring/ring_writer.hpp"
 #include "daemon/serve/channel_server.hpp"
 #include "tests/support/log_recorder.hpp"
+#include "tests/support/memory_peer.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
-#include "tests/unit/daemon/link/fake_transport.hpp"
+#include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
 
-inline wire::Greeting greeting_of(const std::string& program, const std::string& host) {
-  wire::Greeting greeting;
-  greeting.host = host;
-  greeting.host_id.fill(7);
-  greeting.instance_id = 1;
-  greeting.program = program;
-  greeting.version = "0.1.0";
-  return greeting;
-}
+using namespace test;
 
 inline wire::SocketAddress address_of(std::uint32_t last_number) {
   wire::SocketAddress address;
@@ -38,49 +31,29 @@ inline wire::SocketAddress address_of(std::uint32_t last_number) {
   return address;
 }
 
-inline net::Frame hello_frame(const wire::Greeting& greeting) {
-  net::Frame frame;
-  wire::to_message(greeting, *frame.mutable_hello());
-  return frame;
-}
-
-inline net::Frame sample_read(std::uint64_t serial, Tid tid) {
-  net::Frame frame;
-  frame.set_serial(serial);
-  frame.mutable_read()->set_tid(tid);
-  return frame;
-}
-
 class ServerRig {
  public:
   explicit ServerRig(const PeerTable::Limits& limits = {16, 8, 32U << 20},
                      ClockAssessor* clock = nullptr, Authorizer authorizer = authorize)
       : server({loop, registry, opens, logger, clock, {}, std::move(authorizer)},
-               greeting_of("dssmd", "pc1"), limits) {}
+               greeting_of("pc1"), limits) {}
 
   // Connects; without `greet` it says nothing. The peer outlives the rig's use of it.
-  void connect(FakePeer& peer, bool greet = true, bool torn = true, std::uint32_t host = 2) {
+  void connect(MemoryPeer& peer, bool greet = true, bool torn = true, std::uint32_t host = 2) {
     const Result<void> adopted =
-        server.adopt(std::make_unique<FakeTransport>(peer), address_of(host));
+        server.adopt(std::make_unique<MemoryTransport>(peer), address_of(host));
     ASSERT_TRUE(adopted) << adopted.error().message;
     if (!greet) return;
-    wire::Greeting greeting = greeting_of("test", "pc" + std::to_string(host));
-    if (torn) greeting.features.emplace_back(wire::kFeatureTorn);
-    peer.put(hello_frame(greeting));
+    const wire::Greeting greeting = greeting_of("pc" + std::to_string(host), "test");
+    peer.put(hello_frame(torn ? greeting : without_features(greeting)));
     turns();
-    const std::vector<SentItem> items = take(peer);
-    ASSERT_EQ(items.size(), 1u);
-    EXPECT_EQ(items[0].frame.hello().host(), "pc1");
+    const std::vector<net::Frame> frames = peer.take();
+    ASSERT_EQ(frames.size(), 1u);
+    EXPECT_EQ(frames[0].hello().host(), "pc1");
   }
-  void open(FakePeer& peer, const std::string& name) {
-    net::Frame frame;
-    frame.set_serial(1000);
-    frame.mutable_open()->mutable_id()->set_name(name);
-    peer.put(frame);
-    turns();
-    const std::vector<SentItem> items = take(peer);
-    ASSERT_EQ(items.size(), 1u);
-    ASSERT_TRUE(items[0].frame.has_opened()) << items[0].frame.failure().message();
+  void open(MemoryPeer& peer, const std::string& name) {
+    const net::Frame answer = ask(peer, with_serial(1000, open_frame(name)));
+    ASSERT_TRUE(answer.has_opened()) << answer.failure().message();
   }
 
   std::shared_ptr<Stream> create(const std::string& name, std::uint64_t payload_bytes = 24,
@@ -104,28 +77,24 @@ class ServerRig {
                    Duration(3));
     }
   }
-  static std::vector<std::byte> payload_for(Tid tid, std::uint64_t bytes) {
-    return std::vector<std::byte>(bytes, static_cast<std::byte>(tid * 7 + 1));
+  static Bytes payload_for(Tid tid, std::uint64_t bytes) {
+    return Bytes(bytes, static_cast<std::byte>(tid * 7 + 1));
   }
 
   void turns(int count = 8) { run_turns(loop, count); }
 
-  // What came to the peer since this was asked last.
-  std::vector<SentItem> take(FakePeer& peer, std::size_t payload_bytes = 0) {
-    return decode(std::exchange(peer.sent, {}), payload_bytes);
-  }
   // The one answer.
-  net::Frame ask(FakePeer& peer, const net::Frame& request, std::size_t payload_bytes = 0) {
+  net::Frame ask(MemoryPeer& peer, const net::Frame& request) {
     peer.put(request);
     turns();
-    const std::vector<SentItem> items = take(peer, payload_bytes);
-    EXPECT_EQ(items.size(), 1u);
-    if (items.empty()) return {};
-    EXPECT_EQ(items[0].frame.serial(), request.serial());
-    return items[0].frame;
+    const std::vector<net::Frame> frames = peer.take();
+    EXPECT_EQ(frames.size(), 1u);
+    if (frames.empty()) return {};
+    EXPECT_EQ(frames[0].serial(), request.serial());
+    return frames[0];
   }
 
-  EventLoop loop = *EventLoop::open();
+  EventLoop loop = *EventLoop::open(TimerQueue::Time::simulated);
   Registry registry{"pc1", kLimits};
   OpenTable opens{{100, 100}};
   LogRecorder logger;

@@ -6,7 +6,6 @@
 
 #include <thread>
 
-#include "core/wire/sample_frame.hpp"
 #include "tests/unit/daemon/remote/fake_clock_assessor.hpp"
 #include "tests/unit/daemon/serve/server_rig.hpp"
 
@@ -15,16 +14,14 @@ namespace {
 
 constexpr std::uint64_t kBytes = 24;
 
-std::vector<std::byte> sample_frame(std::int64_t number, std::uint64_t serial = 0,
-                                    std::byte fill = std::byte{9},
-                                    std::uint64_t payload_bytes = kBytes) {
-  std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
-  const std::size_t bytes =
-      wire::encode_sample_header(header, serial, {number, time_from_ns(5000 + number), Duration(4)},
-                                 payload_bytes, wire::Trailer::none);
-  std::vector<std::byte> frame(header.begin(), header.begin() + bytes);
-  frame.resize(frame.size() + payload_bytes, fill);
-  return frame;
+Bytes sample_frame(std::int64_t number, std::uint64_t serial = 0,
+                   std::uint64_t payload_bytes = kBytes) {
+  return sample_bytes({number, time_from_ns(5000 + number), Duration(4)},
+                      Bytes(payload_bytes, std::byte{9}), serial);
+}
+
+net::Frame start_publishing_request(std::uint64_t publisher) {
+  return with_serial(70, start_publishing_frame(publisher));
 }
 
 class StreamChannelTest : public testing::Test {
@@ -35,31 +32,25 @@ class StreamChannelTest : public testing::Test {
     rig.open(peer, "odometry");
   }
 
-  net::Frame request(std::uint64_t serial) {
-    net::Frame frame;
-    frame.set_serial(serial);
-    return frame;
-  }
-  std::vector<SentItem> take() { return rig.take(peer, kBytes); }
-  std::vector<SentItem> ask(const net::Frame& frame) {
+  std::vector<net::Frame> ask(const net::Frame& frame) {
     peer.put(frame);
     rig.turns();
-    return take();
+    return peer.take();
   }
 
   // The tid that a Read brings, or minus its status.
   Tid read(const net::Read& what) {
-    net::Frame frame = request(50);
+    net::Frame frame = with_serial(50);
     *frame.mutable_read() = what;
-    const std::vector<SentItem> items = ask(frame);
+    const std::vector<net::Frame> items = ask(frame);
     EXPECT_EQ(items.size(), 1u);
     if (items.empty()) return -100;
-    EXPECT_EQ(items[0].frame.serial(), 50u);
-    if (items[0].frame.has_no_sample()) {
-      return -static_cast<Tid>(items[0].frame.no_sample().status());
+    EXPECT_EQ(items[0].serial(), 50u);
+    if (items[0].has_no_sample()) {
+      return -static_cast<Tid>(items[0].no_sample().status());
     }
-    const Tid tid = items[0].frame.sample().tid();
-    EXPECT_EQ(items[0].payload, ServerRig::payload_for(tid, kBytes));
+    const Tid tid = items[0].sample().tid();
+    EXPECT_EQ(payload_of(items[0]), ServerRig::payload_for(tid, kBytes));
     return tid;
   }
   Tid read_tid(Tid tid) {
@@ -74,26 +65,26 @@ class StreamChannelTest : public testing::Test {
   }
 
   // "subscribed:0 1 2 caught_up gap:3+4 ended", and the like.
-  static std::string words(const std::vector<SentItem>& items) {
+  static std::string words(const std::vector<net::Frame>& items) {
     std::string text;
-    for (const SentItem& item : items) {
+    for (const net::Frame& item : items) {
       text += text.empty() ? "" : " ";
-      if (item.frame.has_subscribed()) {
-        text += "subscribed:" + std::to_string(item.frame.subscribed().first_tid());
-      } else if (item.frame.has_gap()) {
-        text += "gap:" + std::to_string(item.frame.gap().first_tid()) + "+" +
-                std::to_string(item.frame.gap().count());
-      } else if (item.frame.has_caught_up()) {
+      if (item.has_subscribed()) {
+        text += "subscribed:" + std::to_string(item.subscribed().first_tid());
+      } else if (item.has_gap()) {
+        text += "gap:" + std::to_string(item.gap().first_tid()) + "+" +
+                std::to_string(item.gap().count());
+      } else if (item.has_caught_up()) {
         text += "caught_up";
-      } else if (item.frame.has_ended()) {
-        text += item.frame.ended().removed() ? "removed" : "ended";
-      } else if (item.frame.has_sample()) {
-        text += std::to_string(item.frame.sample().tid());
-      } else if (item.frame.has_published()) {
-        text += "published:" + std::to_string(item.frame.published().last()) + "=" +
-                std::to_string(item.frame.published().last_tid());
-      } else if (item.frame.has_failure()) {
-        text += "failure:" + item.frame.failure().code();
+      } else if (item.has_ended()) {
+        text += item.ended().removed() ? "removed" : "ended";
+      } else if (item.has_sample()) {
+        text += std::to_string(item.sample().tid());
+      } else if (item.has_published()) {
+        text += "published:" + std::to_string(item.published().last()) + "=" +
+                std::to_string(item.published().last_tid());
+      } else if (item.has_failure()) {
+        text += "failure:" + item.failure().code();
       } else {
         text += "?";
       }
@@ -101,23 +92,19 @@ class StreamChannelTest : public testing::Test {
     return text;
   }
   std::string subscribe(const std::function<void(net::Subscribe&)>& how) {
-    net::Frame frame = request(60);
+    net::Frame frame = with_serial(60);
     how(*frame.mutable_subscribe());
     return words(ask(frame));
   }
 
   net::Publishing start_publishing(std::uint64_t publisher) {
-    net::Frame frame = request(70);
-    frame.mutable_start_publishing()->set_publisher(publisher);
-    const std::vector<SentItem> items = ask(frame);
-    EXPECT_EQ(items.size(), 1u);
-    if (items.empty()) return {};
-    EXPECT_TRUE(items[0].frame.has_publishing()) << items[0].frame.failure().message();
-    return items[0].frame.publishing();
+    const net::Frame answer = rig.ask(peer, start_publishing_request(publisher));
+    EXPECT_TRUE(answer.has_publishing()) << answer.failure().message();
+    return answer.publishing();
   }
 
   ServerRig rig;
-  FakePeer peer;
+  MemoryPeer peer;
   std::shared_ptr<Stream> stream;
 };
 
@@ -146,19 +133,19 @@ TEST_F(StreamChannelTest, ReadsByTidTimeAndNewest) {
 }
 
 TEST_F(StreamChannelTest, TellsItsRange) {
-  net::Frame frame = request(1);
+  net::Frame frame = with_serial(1);
   frame.mutable_get_range()->set_time_ns(1155);
-  net::Range range = ask(frame).at(0).frame.range();
+  net::Range range = ask(frame).at(0).range();
   EXPECT_EQ(range.oldest(), -1);
   EXPECT_EQ(range.newest(), -1);
   EXPECT_EQ(range.at_tid(), -1);
   rig.write(*stream, 20);
-  range = ask(frame).at(0).frame.range();
+  range = ask(frame).at(0).range();
   EXPECT_EQ(range.oldest(), 13);
   EXPECT_EQ(range.newest(), 19);
   EXPECT_EQ(range.at_tid(), 15);
   frame.mutable_get_range()->clear_time_ns();
-  EXPECT_EQ(ask(frame).at(0).frame.range().at_tid(), -1);
+  EXPECT_EQ(ask(frame).at(0).range().at_tid(), -1);
 }
 
 // --- subscriptions
@@ -178,7 +165,7 @@ TEST_F(StreamChannelTest, BeginsASubscriptionWhereItIsAskedTo) {
             "subscribed:13 13 14 15 16 17 18 19 caught_up");
   rig.write(*stream);
   rig.turns();
-  EXPECT_EQ(words(take()), "20") << "the last subscription alone";
+  EXPECT_EQ(words(peer.take()), "20") << "the last subscription alone";
 }
 
 TEST_F(StreamChannelTest, BeginsAnewWhenTheTidIsAnotherRings) {
@@ -200,7 +187,7 @@ TEST_F(StreamChannelTest, SendsWhatIsWrittenFromThenOn) {
   for (int i = 0; i < 3; ++i) {
     rig.write(*stream);
     rig.turns();
-    EXPECT_EQ(words(take()), std::to_string(i));
+    EXPECT_EQ(words(peer.take()), std::to_string(i));
   }
 }
 
@@ -209,18 +196,18 @@ TEST_F(StreamChannelTest, ServesReadsInTheMidstOfASubscription) {
   peer.room = 30;
   rig.write(*stream, 5);
   rig.turns();
-  peer.put(sample_read(99, 4));
+  peer.put(with_serial(99, read_frame(4)));
   rig.turns();
-  peer.room = FakePeer::kAll;
+  peer.room = MemoryPeer::kAll;
   rig.turns(20);
   std::string subscribed;
   int answers = 0;
-  for (const SentItem& item : take()) {
-    if (item.frame.serial() == 99) {
+  for (const net::Frame& item : peer.take()) {
+    if (item.serial() == 99) {
       ++answers;
-      EXPECT_EQ(item.payload, ServerRig::payload_for(4, kBytes));
+      EXPECT_EQ(payload_of(item), ServerRig::payload_for(4, kBytes));
     } else {
-      subscribed += std::to_string(item.frame.sample().tid());
+      subscribed += std::to_string(item.sample().tid());
     }
   }
   EXPECT_EQ(answers, 1);
@@ -235,17 +222,17 @@ TEST_F(StreamChannelTest, ThinsAtTheSource) {
             }),
             "subscribed:0 4 caught_up");
   // A sample each millisecond; 20 ms must pass between two that are sent.
-  const MonoTime begin = MonoClock::now();
+  const MonoTime begin = rig.loop.now();
   std::vector<Tid> got;
-  ASSERT_TRUE(run_until(rig.loop, [&] {
+  run_until(rig.loop, [&] {
     rig.write(*stream);
-    for (const SentItem& item : take()) {
-      EXPECT_TRUE(item.frame.has_sample()) << "a gap for what was left out";
-      got.push_back(item.frame.sample().tid());
+    for (const net::Frame& item : peer.take()) {
+      EXPECT_TRUE(item.has_sample()) << "a gap for what was left out";
+      got.push_back(item.sample().tid());
     }
     return got.size() == 5;
-  }));
-  EXPECT_GE(MonoClock::now() - begin, std::chrono::milliseconds(20 * 4));
+  });
+  EXPECT_GE(rig.loop.now() - begin, std::chrono::milliseconds(20 * 4));
   EXPECT_TRUE(std::is_sorted(got.begin(), got.end()));
 }
 
@@ -263,19 +250,19 @@ TEST_F(StreamChannelTest, SendsTheRestThenTellsThatTheStreamWasRemoved) {
   rig.turns();
   ASSERT_TRUE(rig.registry.remove({"odometry", 0, ""}));
   rig.turns();
-  peer.room = FakePeer::kAll;
+  peer.room = MemoryPeer::kAll;
   rig.turns(20);
-  EXPECT_EQ(words(take()), "0 1 2 3 removed");
-  EXPECT_EQ(words(ask(sample_read(1, 0))), "failure:not_found");
+  EXPECT_EQ(words(peer.take()), "0 1 2 3 removed");
+  EXPECT_EQ(words(ask(with_serial(1, read_frame(0)))), "failure:not_found");
   rig.write(*stream);
   rig.turns();
-  EXPECT_EQ(words(take()), "") << "nothing follows";
+  EXPECT_EQ(words(peer.take()), "") << "nothing follows";
 }
 
 TEST_F(StreamChannelTest, TellsOfTheRemovalAlsoWhoDidNotSubscribe) {
   ASSERT_TRUE(rig.registry.remove({"odometry", 0, ""}));
   rig.turns();
-  EXPECT_EQ(words(take()), "removed");
+  EXPECT_EQ(words(peer.take()), "removed");
 }
 
 TEST_F(StreamChannelTest, DoesNotDisturbTheWriterWhileNobodySubscribes) {
@@ -283,7 +270,7 @@ TEST_F(StreamChannelTest, DoesNotDisturbTheWriterWhileNobodySubscribes) {
   EXPECT_FALSE(bell->doorbell_armed());
   subscribe([](auto& s) { s.set_from_now(true); });
   EXPECT_TRUE(bell->doorbell_armed());
-  peer.vanish();
+  peer.end();
   rig.turns();
   EXPECT_FALSE(bell->doorbell_armed());
 }
@@ -294,26 +281,26 @@ TEST_F(StreamChannelTest, WritesWhatIsPublishedAndAcknowledgesEachBatchOnce) {
   const net::Publishing publishing = start_publishing(11);
   EXPECT_EQ(publishing.last(), -1);
   EXPECT_EQ(publishing.incarnation(), stream->incarnation());
-  std::vector<std::byte> batch;
+  Bytes batch;
   for (const std::int64_t number : {0, 1, 2}) {
-    const std::vector<std::byte> one = sample_frame(number);
+    const Bytes one = sample_frame(number);
     batch.insert(batch.end(), one.begin(), one.end());
   }
   peer.put(batch);
   rig.turns();
-  EXPECT_EQ(words(take()), "published:2=2");
+  EXPECT_EQ(words(peer.take()), "published:2=2");
   const ring::RingReader reader(stream->mapping());
-  std::vector<std::byte> payload(kBytes);
+  Bytes payload(kBytes);
   SampleInfo info;
   ASSERT_EQ(reader.read(1, payload, info), ReadStatus::ok);
-  EXPECT_EQ(payload, std::vector<std::byte>(kBytes, std::byte{9}));
+  EXPECT_EQ(payload, Bytes(kBytes, std::byte{9}));
   EXPECT_EQ(to_ns(info.time), 5001);
   EXPECT_EQ(info.clock_error, Duration(4));
   peer.put(sample_frame(3, 77));
   rig.turns();
-  const std::vector<SentItem> items = take();
+  const std::vector<net::Frame> items = peer.take();
   EXPECT_EQ(words(items), "published:3=3");
-  EXPECT_EQ(items[0].frame.serial(), 77u);
+  EXPECT_EQ(items[0].serial(), 77u);
 }
 
 TEST_F(StreamChannelTest, WritesEachSampleOnceOverReconnects) {
@@ -321,27 +308,25 @@ TEST_F(StreamChannelTest, WritesEachSampleOnceOverReconnects) {
   peer.put(sample_frame(0));
   peer.put(sample_frame(1));
   rig.turns();
-  take();
-  peer.vanish();
+  peer.take();
+  peer.end();
   rig.turns();
   rig.write(*stream);  // somebody else writes meanwhile
 
-  FakePeer again;
+  MemoryPeer again;
   rig.connect(again);
   rig.open(again, "odometry");
-  net::Frame frame = request(70);
-  frame.mutable_start_publishing()->set_publisher(11);
-  const net::Frame answer = rig.ask(again, frame);
+  const net::Frame answer = rig.ask(again, start_publishing_request(11));
   EXPECT_EQ(answer.publishing().last(), 1);
   EXPECT_EQ(answer.publishing().last_tid(), 1);
   again.put(sample_frame(1));  // sent again, although it was written
   again.put(sample_frame(2));
   again.put(sample_frame(5));  // the client dropped some
   rig.turns();
-  EXPECT_EQ(words(rig.take(again, kBytes)), "published:1=1 published:2=3 published:5=4");
+  EXPECT_EQ(words(again.take()), "published:1=1 published:2=3 published:5=4");
   EXPECT_EQ(stream->info().newest, 4);
-  frame.mutable_start_publishing()->set_publisher(12);
-  EXPECT_EQ(rig.ask(again, frame).publishing().last(), -1) << "another publisher";
+  EXPECT_EQ(rig.ask(again, start_publishing_request(12)).publishing().last(), -1)
+      << "another publisher";
 }
 
 // The ring outlives dssmd, and what stands in it about publishers does.
@@ -349,25 +334,23 @@ TEST_F(StreamChannelTest, KnowsPublishersOfARingThatIsOfferedBack) {
   start_publishing(11);
   for (const std::int64_t number : {0, 3, 4}) peer.put(sample_frame(number));
   rig.turns();
-  take();
+  peer.take();
   ServerRig next;
   const std::shared_ptr<Stream> same =
       next.registry
           .adopt_untrusted({"odometry", 0, ""},
                            as_offer(stream->descriptors_for(Role::writer).value()))
           .value();
-  FakePeer again;
+  MemoryPeer again;
   next.connect(again);
   next.open(again, "odometry");
-  net::Frame frame = request(70);
-  frame.mutable_start_publishing()->set_publisher(11);
-  const net::Frame answer = next.ask(again, frame);
+  const net::Frame answer = next.ask(again, start_publishing_request(11));
   EXPECT_EQ(answer.publishing().last(), 4);
   EXPECT_EQ(answer.publishing().last_tid(), 2);
   again.put(sample_frame(4));
   again.put(sample_frame(5));
   next.turns();
-  EXPECT_EQ(words(next.take(again, kBytes)), "published:4=2 published:5=3");
+  EXPECT_EQ(words(again.take()), "published:4=2 published:5=3");
   EXPECT_EQ(same->info().newest, 3);
 }
 
@@ -376,18 +359,14 @@ TEST_F(StreamChannelTest, KnowsPublishersOfARingThatIsOfferedBack) {
 TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionComesBack) {
   constexpr std::uint64_t kInPieces = 100'000;  // received piece by piece
   const std::shared_ptr<Stream> camera = rig.create("camera", kInPieces);
-  FakePeer old, again;
-  net::Frame frame = request(70);
-  frame.mutable_start_publishing()->set_publisher(11);
-  for (FakePeer* one : {&old, &again}) {
+  MemoryPeer old, again;
+  for (MemoryPeer* one : {&old, &again}) {
     rig.connect(*one);
     rig.open(*one, "camera");
-    EXPECT_EQ(rig.ask(*one, frame).publishing().last(), -1);
+    EXPECT_EQ(rig.ask(*one, start_publishing_request(11)).publishing().last(), -1);
   }
-  const auto large = [](std::int64_t number) {
-    return sample_frame(number, 0, std::byte{9}, kInPieces);
-  };
-  const std::vector<std::byte> first = large(0);
+  const auto large = [](std::int64_t number) { return sample_frame(number, 0, kInPieces); };
+  const Bytes first = large(0);
   old.put({first.begin(), first.begin() + 50'000});
   rig.turns();
   for (const std::int64_t number : {0, 1, 2}) again.put(large(number));
@@ -397,7 +376,7 @@ TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionComesBack) {
   old.put(large(1));
   rig.turns();
   EXPECT_EQ(camera->info().newest, 2);
-  EXPECT_EQ(words(rig.take(old, kInPieces)), "published:2=2 published:2=2");
+  EXPECT_EQ(words(old.take()), "published:2=2 published:2=2");
   again.put(large(3));
   rig.turns();
   EXPECT_EQ(camera->info().newest, 3);
@@ -407,35 +386,35 @@ TEST_F(StreamChannelTest, AcknowledgesWhatWasWrittenBeforeWithoutWritingIt) {
   start_publishing(11);
   peer.put(sample_frame(4));
   rig.turns();
-  take();
+  peer.take();
   peer.put(sample_frame(4, 88));
   rig.turns();
-  const std::vector<SentItem> items = take();
+  const std::vector<net::Frame> items = peer.take();
   EXPECT_EQ(words(items), "published:4=0");
-  EXPECT_EQ(items[0].frame.serial(), 88u);
+  EXPECT_EQ(items[0].serial(), 88u);
   EXPECT_EQ(stream->info().newest, 0);
 }
 
 TEST_F(StreamChannelTest, BringsPublishedSamplesToOtherChannels) {
-  FakePeer reader;
+  MemoryPeer reader;
   rig.connect(reader);
   rig.open(reader, "odometry");
-  net::Frame frame = request(60);
+  net::Frame frame = with_serial(60);
   frame.mutable_subscribe()->set_from_now(true);
   reader.put(frame);
   rig.turns();
-  rig.take(reader, kBytes);
+  reader.take();
   start_publishing(11);
   peer.put(sample_frame(0));
   rig.turns();
-  EXPECT_EQ(words(rig.take(reader, kBytes)), "0");
+  EXPECT_EQ(words(reader.take()), "0");
 }
 
 TEST_F(StreamChannelTest, RefusesSamplesOfWhoDidNotSayThatItPublishes) {
   peer.put(sample_frame(0));
   rig.turns();
   EXPECT_TRUE(peer.closed);
-  EXPECT_NE(take().back().frame.failure().message().find("StartPublishing"), std::string::npos);
+  EXPECT_NE(peer.take().back().failure().message().find("StartPublishing"), std::string::npos);
 }
 
 TEST_F(StreamChannelTest, DoesNotWaitForAProgramThatHoldsTheLock) {
@@ -457,30 +436,28 @@ TEST_F(StreamChannelTest, DoesNotWaitForAProgramThatHoldsTheLock) {
   step.wait(0);
   for (const std::int64_t number : {0, 1, 2}) peer.put(sample_frame(number));
   rig.turns(20);
-  EXPECT_EQ(words(take()), "");
-  FakePeer other;
+  EXPECT_EQ(words(peer.take()), "");
+  MemoryPeer other;
   rig.connect(other);  // the loop goes on
   step = 2;
   step.notify_all();
   step.wait(2);
   program.join();
-  std::vector<SentItem> items;
-  ASSERT_TRUE(run_until(rig.loop, [&] {
-    for (SentItem& item : take()) items.push_back(std::move(item));
+  std::vector<net::Frame> items;
+  run_until(rig.loop, [&] {
+    for (net::Frame& item : peer.take()) items.push_back(std::move(item));
     return stream->info().newest == 2 && !items.empty() &&
-           items.back().frame.published().last() == 2;
-  }));
+           items.back().published().last() == 2;
+  });
 }
 
 TEST_F(StreamChannelTest, HoldsNoMoreForAPublisherThanItsHostMay) {
   ServerRig small({16, 8, 1U << 20});
   small.create("camera", 900 << 10, 4);
-  FakePeer camera;
+  MemoryPeer camera;
   small.connect(camera);
   small.open(camera, "camera");
-  net::Frame frame = request(1);
-  frame.mutable_start_publishing()->set_publisher(3);
-  const net::Frame refused = small.ask(camera, frame);
+  const net::Frame refused = small.ask(camera, start_publishing_request(3));
   EXPECT_EQ(refused.failure().code(), "limit_exceeded");
   EXPECT_NE(refused.failure().message().find("max_peer_memory"), std::string::npos);
   EXPECT_NE(refused.failure().message().find("'camera:0@pc1'"), std::string::npos);
@@ -489,13 +466,13 @@ TEST_F(StreamChannelTest, HoldsNoMoreForAPublisherThanItsHostMay) {
 // --- property
 
 TEST_F(StreamChannelTest, KeepsThePropertyForEverybody) {
-  net::Frame get = request(1), set = request(2);
+  net::Frame get = with_serial(1), set = with_serial(2);
   get.mutable_get_property();
   set.mutable_set_property()->set_property("calibration");
   EXPECT_EQ(words(ask(get)), "failure:not_found");
-  EXPECT_TRUE(ask(set).at(0).frame.has_done());
-  EXPECT_EQ(ask(get).at(0).frame.property().property(), "calibration");
-  FakePeer control;
+  EXPECT_TRUE(ask(set).at(0).has_done());
+  EXPECT_EQ(ask(get).at(0).property().property(), "calibration");
+  MemoryPeer control;
   rig.connect(control);
   get.mutable_get_property()->mutable_id()->set_name("odometry");
   EXPECT_EQ(rig.ask(control, get).property().property(), "calibration");
@@ -512,16 +489,13 @@ class WriterOfAnotherClock : public testing::Test {
   void start_publishing() {
     rig.connect(peer);
     rig.open(peer, "far");
-    net::Frame frame;
-    frame.set_serial(70);
-    frame.mutable_start_publishing()->set_publisher(11);
-    EXPECT_TRUE(rig.ask(peer, frame).has_publishing());
+    EXPECT_TRUE(rig.ask(peer, start_publishing_request(11)).has_publishing());
   }
   ring::ClockAssessment stated() const { return ring::RingReader(stream->mapping()).clock(); }
 
   FakeClockAssessor assessor;
   ServerRig rig{{16, 8, 32U << 20}, &assessor};
-  FakePeer peer;
+  MemoryPeer peer;
   std::shared_ptr<Stream> stream = rig.create("far");
 };
 

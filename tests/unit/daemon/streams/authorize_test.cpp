@@ -90,7 +90,7 @@ TEST_F(AuthorizeTest, RefusesEachRequestOfALocalProgram) {
 TEST_F(AuthorizeTest, RefusesEachRequestOfAnotherHost) {
   ServerRig rig({16, 8, 32U << 20}, nullptr, rule);
   rig.create("odometry");
-  FakePeer control, channel, late;
+  MemoryPeer control, channel, late;
   rig.connect(control);
   EXPECT_EQ(last_action, Action::greet);
   EXPECT_EQ(last_identity.host, "pc2");
@@ -102,16 +102,16 @@ TEST_F(AuthorizeTest, RefusesEachRequestOfAnotherHost) {
   forbids = true;
   constexpr int kKinds = 13;  // the requests of network.proto besides Hello
   EXPECT_EQ(refused([&](const net::Frame& frame) { return rig.ask(control, frame); }), kKinds);
-  EXPECT_EQ(refused([&](const net::Frame& frame) { return rig.ask(channel, frame, 24); }), kKinds);
+  EXPECT_EQ(refused([&](const net::Frame& frame) { return rig.ask(channel, frame); }), kKinds);
   EXPECT_EQ(last_stream.str(), "odometry:0@pc1") << "the stream of the channel";
 
   rig.connect(late, false);
-  late.put(hello_frame(greeting_of("test", "pc2")));
+  late.put(hello_frame(greeting_of("pc2", "test")));
   rig.turns();
   EXPECT_TRUE(late.closed);
-  const std::vector<SentItem> items = rig.take(late);
+  const std::vector<net::Frame> items = late.take();
   ASSERT_EQ(items.size(), 1u);
-  EXPECT_EQ(items[0].frame.failure().code(), "no_permission");
+  EXPECT_EQ(items[0].failure().code(), "no_permission");
 }
 
 TEST_F(AuthorizeTest, AllowsEverythingToday) {
