@@ -446,8 +446,7 @@ TEST_F(StreamChannelTest, DoesNotWaitForAProgramThatHoldsTheLock) {
   std::vector<net::Frame> items;
   run_until(rig.loop, [&] {
     for (net::Frame& item : peer.take()) items.push_back(std::move(item));
-    return stream->info().newest == 2 && !items.empty() &&
-           items.back().published().last() == 2;
+    return stream->info().newest == 2 && !items.empty() && items.back().published().last() == 2;
   });
 }
 
