@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Makes the bytes in a slot a sample: writes its stamps, run links, time index, sequence and `top`,
-// in the order that readers rely on. RingWriter (programs) and MirrorWriter (dssmd) are built on
-// it.
+// in the order that readers rely on. RingWriter (programs), MirrorWriter (dssmd) and SampleCollector
+// (libdssm) are built on it.
 #pragma once
 
 #include <dssm/sample.hpp>
@@ -14,7 +14,7 @@
 namespace dssm::ring {
 
 // A value; the mapping (read-write) outlives it. Only the ring's current writer may call it: the
-// holder of the lock, or the dssmd that fills a mirror.
+// holder of the lock, or the thread that fills a copy of another host's ring.
 class SlotWriter {
  public:
   explicit SlotWriter(const RingMapping& mapping) noexcept;
@@ -29,7 +29,7 @@ class SlotWriter {
   void fill(Tid tid, std::span<const std::byte> payload) const noexcept;
 
   // The payload is in place: makes it sample `tid`. A tid that does not follow the newest one (in
-  // mirrors only) leaves a gap, and samples before the gap are no longer readable.
+  // such copies only) leaves a gap, and samples before the gap are no longer readable.
   void publish(Tid tid, Time time, Duration clock_error) const noexcept;
 
   // Repairs what a writer left that died before it published its sample.

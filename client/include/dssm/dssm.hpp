@@ -11,6 +11,7 @@
 #include <dssm/reader.hpp>
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
+#include <dssm/sample_collector.hpp>
 #include <dssm/session.hpp>
 #include <dssm/stream.hpp>
 #include <dssm/time.hpp>

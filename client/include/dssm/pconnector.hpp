@@ -10,7 +10,8 @@
 //               long stay in the owner's ring; what the ring no longer holds then is a counted gap
 //   cost        a read is one request and its answer: one round trip. Subscribed samples are
 //               received one by one while they arrive singly, many at once when they arrive fast;
-//               each is copied once, a large one is received directly into the caller's memory
+//               each is copied once, a large one is received directly into the caller's memory.
+//               A SampleCollector receives them in a thread, for reads that need no round trip
 //   connection  when the connection breaks, calls reconnect: for at most request_timeout, then they
 //               fail with unavailable; read_next(), post() and ready_fd() never wait for it.
 //               Subscriptions resume at their tid. Posted samples that the owner has not written
