@@ -41,7 +41,7 @@ ORDER = [
 # What a rank alone does not say: these folders may include only the folders named (and their own).
 ONLY = {
     "client/include": ["core/include"],
-    "client/ssm": ["core/include", "client/include", "core/base", "core/ring"],
+    "client/ssm": ["core/include", "client/include", "core/base"],
     "client/dssmctl": ["core/include", "client/include"],
 }
 INCLUDE_ROOTS = ["", "core/include", "client/include", "client/ssm/include"]

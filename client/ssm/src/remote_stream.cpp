@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "remote_stream.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <charconv>
 #include <cstdlib>
@@ -24,6 +26,10 @@ constexpr Duration kCallTimeout = 2s;
 constexpr std::uint64_t kSlowestBytesPerSecond = 4'000'000;
 
 constexpr Duration kRetryPause = 200ms;
+
+// Programs of the oldest kind ask for "512" and mean samples, where it now means seconds: what is
+// collected must not take the machine's memory away.
+constexpr std::uint64_t kMaxCollectedBytes = 512U << 20;
 
 // When connecting and opening give up: $DSSM_CONNECT_TIMEOUT [s] from now, else never.
 MonoTime give_up_at() {
@@ -129,7 +135,7 @@ bool RemoteStream::connect(const std::string& address) {
 }
 
 bool RemoteStream::take(Result<PConnector> opened, const std::string& what) {
-  ring_.reset();
+  collector_.reset();
   connector_.reset();
   if (!opened) {
     report_error(what + " : " + opened.error().message);
@@ -383,87 +389,86 @@ bool RemoteStream::get_property(void* data, std::size_t bytes) {
 bool RemoteStream::buffer(double life, double cycle) {
   const Call call(*this);
   if (!call.has_stream()) return false;
-  ring_.reset();
+  collector_.reset();
   const std::string what = "readyRingBuf " + quoted_name() + " : ";
-  History history{connector_->depth(), connector_->cycle()};
-  const double own_cycle = seconds_from_ns(to_ns(history.cycle));
+  std::uint64_t depth = connector_->depth();
   if (life != 0 || cycle != 0) {
+    const double own_cycle = seconds_from_ns(to_ns(connector_->cycle()));
     if (cycle == 0) cycle = own_cycle;
-    if (life == 0) life = static_cast<double>(history.depth - 1) * own_cycle / SSM_BUFFER_MARGIN;
+    if (life == 0) life = static_cast<double>(depth - 1) * own_cycle / SSM_BUFFER_MARGIN;
     const double wanted = slots(life, cycle);
     if (!(life > 0 && cycle > 0 && life >= cycle && wanted <= static_cast<double>(kMaxDepth))) {
-      report_error(what + "a life of " + std::to_string(life) + " s at a cycle of " +
-                   std::to_string(cycle) +
-                   " s cannot be; both must be more than 0, life not less "
-                   "than cycle, and together not more than 2^24 samples");
+      report_error(fmt::format(
+          "{}a life of {:f} s at a cycle of {:f} s cannot be; both must be more than 0, life not "
+          "less than cycle, and together not more than 2^24 samples",
+          what, life, cycle));
       return false;
     }
-    history.depth = std::max(static_cast<std::uint64_t>(wanted), kMinDepth);
-    history.cycle = Duration(ns_from_seconds(cycle));
+    depth = std::max(static_cast<std::uint64_t>(wanted), kMinDepth);
   }
-  auto connector = PConnector::open(connector_->id(), options(address_, sample_.size()));
+  auto connector =
+      PConnector::open(connector_->id(), options(address_, sample_.size()), &connector_->type());
   if (!connector) return report_error(what + connector.error().message), false;
-  // From the oldest: programs read by time, and what happened before they came is worth having.
-  if (auto done = connector->subscribe({.start = Subscription::Start::oldest}); !done) {
-    return report_error(what + done.error().message), false;
+  const std::uint64_t max_depth =
+      std::max(kMinDepth, kMaxCollectedBytes / connector->payload_bytes());
+  if (depth > max_depth) {
+    report_error(fmt::format(
+        "keep samples of '{}' : {} instead of {}, which would take more than {} MiB; ask for less "
+        "life",
+        connector->id().str(), max_depth - 1, depth - 1, kMaxCollectedBytes >> 20));
   }
-  auto ring = RemoteRing::start(std::move(*connector), history);
-  if (!ring) return report_error(what + ring.error().message), false;
-  ring_ = std::move(*ring);
+  // From the oldest: programs read by time, and what happened before they came is worth having.
+  auto collector = SampleCollector::start(
+      std::move(*connector), {.start = Subscription::Start::oldest},
+      {.depth = std::min(depth, max_depth),
+       .on_error = [](const Error& error) { report_error(error.message + "; trying again"); }});
+  if (!collector) return report_error(what + collector.error().message), false;
+  collector_ = std::move(*collector);
   return true;
 }
 
 SSM_tid RemoteStream::top_buffered() {
   const Call call(*this, Call::Way::memory);
-  return call.has_stream() && ring_ ? ssm_tid(ring_->reader().newest()) : -1;
+  return call.has_stream() && collector_ ? ssm_tid(collector_->newest_tid()) : -1;
 }
 
 SSM_tid RemoteStream::read_buffered(const Request& request, void* data, std::size_t bytes,
                                     double* time) {
   const Call call(*this, Call::Way::memory);
-  if (!call.has_stream() || !ring_ || bytes != sample_.size()) return SSM_ERROR_NO_DATA;
-  const ring::RingReader reader = ring_->reader();
-  const Tid newest = reader.newest();
+  if (!call.has_stream() || !collector_ || bytes != sample_.size()) return SSM_ERROR_NO_DATA;
+  const SampleCollector& from = *collector_;
+  const Tid newest = from.newest_tid();
   SampleInfo info;
   ReadStatus status = ReadStatus::not_yet;
   switch (request.which) {
     case Which::newest:
-      status = reader.read_newest(sample_, info);
+      status = from.read_newest(sample_, info);
       break;
     case Which::tid:
-      status = reader.read(ring_tid(request.tid, newest), sample_, info);
+      status = from.read_tid(ring_tid(request.tid, newest), sample_, info);
       break;
     case Which::newer:
-      if (request.tid < 0 || newest > ring_tid(request.tid, newest)) {
-        status = reader.read_newest(sample_, info);
-      }
+      status =
+          from.read_newer(request.tid < 0 ? kNoTid : ring_tid(request.tid, newest), sample_, info);
       break;
     case Which::next: {
       if (request.tid < 0) {
-        status = reader.read_newest(sample_, info);
+        status = from.read_newest(sample_, info);
         break;
       }
       Tid target = ring_tid(request.tid, newest) + request.dt;
-      status = reader.read(target, sample_, info);
+      status = from.read_tid(target, sample_, info);
       for (int attempt = 0; attempt < 100 && status == ReadStatus::too_old; ++attempt) {
-        const Tid oldest = reader.oldest();
+        const Tid oldest = from.oldest_tid();
         if (oldest <= target) break;
         target = oldest;
-        status = reader.read(target, sample_, info);
+        status = from.read_tid(target, sample_, info);
       }
       break;
     }
     case Which::at:
-      if (request.time > 0) {
-        for (int attempt = 0; attempt < 100; ++attempt) {
-          Tid found = kNoTid;
-          status = reader.find(time_from_seconds(request.time), found);
-          if (status == ReadStatus::ok) status = reader.read(found, sample_, info);
-          if (status != ReadStatus::too_old || found == kNoTid) break;
-        }
-      } else {
-        status = reader.read_newest(sample_, info);
-      }
+      status = request.time > 0 ? from.read_at(time_from_seconds(request.time), sample_, info)
+                                : from.read_newest(sample_, info);
       break;
   }
   if (status != ReadStatus::ok) return error_of(status, request.which);

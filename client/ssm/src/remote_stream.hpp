@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Implements a PConnector of the old interface: a dssm::PConnector, and the ring of its samples
-// after the program asked for one.
+// Implements a PConnector of the old interface: a dssm::PConnector, and a SampleCollector after the
+// program asked for a ring.
 //
 // A call that fails prints the reason on stderr, once until a call succeeds again. While the other
 // PC or the network is unavailable, each call tries for about two seconds and then fails; the waits
@@ -14,15 +14,13 @@
 #pragma once
 
 #include <atomic>
-#include <dssm/pconnector.hpp>
-#include <memory>
+#include <dssm/sample_collector.hpp>
 #include <optional>
 #include <string>
 #include <vector>
 
 #include "../include/libssm.h"
 #include "reentrant_lock.hpp"
-#include "remote_ring.hpp"
 
 namespace dssm::ssm {
 
@@ -91,7 +89,7 @@ class RemoteStream {
   Tid offset_ = 0, seen_ = kNoTid;
   std::uint64_t restarts_ = 0;  // of connector_, that offset_ knows of
   std::string complaint_;       // made, and not mended since
-  std::unique_ptr<RemoteRing> ring_;
+  std::optional<SampleCollector> collector_;
 };
 
 }  // namespace dssm::ssm
