@@ -9,7 +9,7 @@
 #include <set>
 
 #include "tests/unit/daemon/clock/fake_chronyd.hpp"
-#include "tests/unit/daemon/remote/fake_owner.hpp"
+#include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
 namespace {

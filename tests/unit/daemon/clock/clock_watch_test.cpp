@@ -7,7 +7,7 @@
 #include <sys/resource.h>
 
 #include "tests/unit/daemon/clock/fake_chronyd.hpp"
-#include "tests/unit/daemon/remote/fake_owner.hpp"
+#include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
 namespace {

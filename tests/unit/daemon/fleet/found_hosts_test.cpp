@@ -9,7 +9,8 @@
 #include "core/base/text.hpp"
 #include "daemon/fleet/peers.hpp"
 #include "daemon/fleet/service_record.hpp"
-#include "tests/unit/daemon/fleet/fake_peer.hpp"
+#include "tests/support/log_recorder.hpp"
+#include "tests/unit/daemon/scripted_host.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -28,21 +29,21 @@ class FoundHostsTest : public testing::Test {
   LogRecorder log;
   const wire::Greeting self = greeting_of("pc1");
   const wire::Greeting pc2 = greeting_of("pc2");
-  std::unique_ptr<FakePeer> one = std::make_unique<FakePeer>(loop);
-  std::unique_ptr<FakePeer> two = std::make_unique<FakePeer>(loop);
+  std::unique_ptr<ScriptedPeer> one = std::make_unique<ScriptedPeer>(loop);
+  std::unique_ptr<ScriptedPeer> two = std::make_unique<ScriptedPeer>(loop);
   std::unique_ptr<Peers> peers;
 
   // Both are addresses of one host, unless a test says otherwise.
   FoundHostsTest() {
-    one->owner.greet_as(pc2);
-    two->owner.greet_as(pc2);
+    one->greet_as(pc2);
+    two->greet_as(pc2);
   }
   void start(const std::vector<wire::Address>& configured = {}, bool insecure = true) {
     peers = std::make_unique<Peers>(loop, resolver, configured, self, catalog, log);
     peers->expect_finder(insecure);
   }
-  static wire::Address at(FakePeer& peer) { return peer.owner.host().address; }
-  wire::Address nobody() { return FakeOwner(loop).host().address; }
+  static wire::Address at(ScriptedPeer& peer) { return peer.address(); }
+  wire::Address nobody() { return ScriptedHost(loop).address(); }
   static FoundHost host_at(const std::vector<wire::Address>& addresses,
                            const std::string& name = "pc2") {
     FoundHost host;
@@ -52,16 +53,7 @@ class FoundHostsTest : public testing::Test {
     host.addresses = addresses;
     return host;
   }
-  void serve() {
-    if (one) one->serve();
-    if (two) two->serve();
-  }
-  void wait(const std::function<bool()>& done) {
-    run_until(loop, [&] {
-      serve();
-      return done();
-    });
-  }
+  void wait(const std::function<bool()>& done) { run_until(loop, done); }
   void wait_until_up() {
     wait([this] { return !catalog.hosts().empty(); });
   }
@@ -69,12 +61,7 @@ class FoundHostsTest : public testing::Test {
     wait([this] { return catalog.hosts().empty(); });
   }
   // All that can happen without waiting for a timer.
-  void look_around() {
-    for (int i = 0; i < 300; ++i) {
-      event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
-      serve();
-    }
-  }
+  void run_without_timers() { run_turns(loop, 300); }
   local::Host host(std::size_t index = 0) const { return peers->report().hosts().at(index); }
   std::vector<std::string> found_by(std::size_t index = 0) const {
     const local::Host shown = host(index);
@@ -106,8 +93,8 @@ TEST_F(FoundHostsTest, AreDialedAtTheirAddressesInTurn) {
   peers->on_host_found(host_at({nobody(), nobody(), at(*one), at(*two)}));
   wait_until_up();
   EXPECT_EQ(address_in_catalog(), at(*one));
-  look_around();
-  EXPECT_EQ(two->owner.connections(), 0) << "one connection is enough";
+  run_without_timers();
+  EXPECT_EQ(two->connections(), 0) << "one connection is enough";
   ASSERT_EQ(host().addresses_size(), 4);
   EXPECT_EQ(host().addresses(0), at(*one).str()) << "the one that is used";
 }
@@ -116,11 +103,11 @@ TEST_F(FoundHostsTest, ComeBackAtTheirBestAddressAfterARestart) {
   start();
   peers->on_host_found(host_at({at(*one), at(*two)}));
   wait_until_up();
-  one->owner.cut();
+  one->cut();
   wait_until_down();
   wait_until_up();
   EXPECT_EQ(address_in_catalog(), at(*one));
-  EXPECT_EQ(two->owner.connections(), 0);
+  EXPECT_EQ(two->connections(), 0);
 }
 
 TEST_F(FoundHostsTest, AreReachedAtAnotherAddressWhenTheFirstIsGone) {
@@ -135,7 +122,7 @@ TEST_F(FoundHostsTest, AreReachedAtAnotherAddressWhenTheFirstIsGone) {
 }
 
 TEST_F(FoundHostsTest, AreReachedAtAnotherAddressWhenTheFirstFallsSilent) {
-  one->silent = true;  // and takes connections all the same
+  one->answers_heartbeat = false;  // and takes connections all the same
   start();
   peers->on_host_found(host_at({at(*one), at(*two)}));
   wait_until_up();
@@ -143,7 +130,7 @@ TEST_F(FoundHostsTest, AreReachedAtAnotherAddressWhenTheFirstFallsSilent) {
   wait_until_down();
   wait_until_up();
   EXPECT_EQ(address_in_catalog(), at(*two));
-  EXPECT_EQ(one->owner.connections(), 1);
+  EXPECT_EQ(one->connections(), 1);
 }
 
 TEST_F(FoundHostsTest, KeepAConnectionThatWorksWhenTheAddressesChange) {
@@ -151,14 +138,14 @@ TEST_F(FoundHostsTest, KeepAConnectionThatWorksWhenTheAddressesChange) {
   peers->on_host_found(host_at({at(*one)}));
   wait_until_up();
   peers->on_host_found(host_at({at(*two)}));
-  look_around();
+  run_without_timers();
   EXPECT_EQ(address_in_catalog(), at(*one));
-  EXPECT_TRUE(one->owner.connected());
-  one->owner.cut();  // it would take a new connection
+  EXPECT_TRUE(one->connected());
+  one->cut();  // it would take a new connection
   wait_until_down();
   wait_until_up();
   EXPECT_EQ(address_in_catalog(), at(*two));
-  EXPECT_EQ(one->owner.connections(), 1);
+  EXPECT_EQ(one->connections(), 1);
 }
 
 TEST_F(FoundHostsTest, AreDialedAtOnceWhenTheyHaveNewAddresses) {
@@ -182,8 +169,8 @@ TEST_F(FoundHostsTest, AreNotDialedASecondTimeWhenTheyAreConfiguredToo) {
   start({at(*one)});
   wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
   peers->on_host_found(host_at({at(*two)}));
-  look_around();
-  EXPECT_EQ(two->owner.connections(), 0);
+  run_without_timers();
+  EXPECT_EQ(two->connections(), 0);
   ASSERT_EQ(peers->report().hosts().size(), 1u);
   EXPECT_EQ(found_by(), (std::vector<std::string>{"peer", "mdns"}));
   EXPECT_EQ(host().error(), "");
@@ -197,44 +184,44 @@ TEST_F(FoundHostsTest, AreNotDialedASecondTimeWhenTheyAreConfiguredToo) {
 }
 
 TEST_F(FoundHostsTest, StopTryingWhenTheConfiguredConnectionComesUp) {
-  one->owner.call_itself("pc8");
-  two->owner.call_itself("pc9");
+  one->greet_as(greeting_of("pc8"));
+  two->greet_as(greeting_of("pc9"));
   start({at(*one)});
   wait_until_up();
   peers->on_host_found(host_at({at(*two)}));
   wait([&] {
     return peers->report().hosts().size() == 2 && host(1).state() == local::Host::REFUSED;
   });
-  one->owner.greet_as(pc2);
-  one->owner.cut();
+  one->greet_as(pc2);
+  one->cut();
   wait([&] { return catalog.find(pc2.host_id) != nullptr; });
-  look_around();
-  const int before = two->owner.connections();
+  run_without_timers();
+  const int before = two->connections();
   peers->on_host_found(host_at({at(*two), nobody()}));  // which would be dialed at once
-  look_around();
-  EXPECT_EQ(two->owner.connections(), before);
+  run_without_timers();
+  EXPECT_EQ(two->connections(), before);
   ASSERT_EQ(peers->report().hosts().size(), 1u);
   EXPECT_EQ(host().state(), local::Host::UP);
   EXPECT_EQ(peers->report().unavailable_peers(), "");
 }
 
 TEST_F(FoundHostsTest, StayInUseWhenTheConfiguredConnectionComesLater) {
-  one->owner.call_itself("pc9");
+  one->greet_as(greeting_of("pc9"));
   one->streams = two->streams = {"lidar"};
   start({at(*one)});
   wait_until_up();
   peers->on_host_found(host_at({at(*two)}));
   wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
   EXPECT_EQ(peers->report().hosts().size(), 2u);
-  one->owner.greet_as(pc2);
-  one->owner.cut();
+  one->greet_as(pc2);
+  one->cut();
   wait([&] { return peers->report().hosts().size() == 1 && host().state() == local::Host::UP; });
   EXPECT_EQ(host().error(), "");
   EXPECT_EQ(host().streams(), 1u) << "it speaks for both";
   EXPECT_EQ(found_by(), (std::vector<std::string>{"peer", "mdns"}));
-  look_around();
+  run_without_timers();
   EXPECT_EQ(address_in_catalog(), at(*two));
-  EXPECT_TRUE(two->owner.connected());
+  EXPECT_TRUE(two->connected());
   two.reset();
   wait([&] { return !catalog.hosts().empty() && address_in_catalog() == at(*one); });
   wait([&] { return one->watches == 2; });  // as pc9, and now
@@ -245,13 +232,13 @@ TEST_F(FoundHostsTest, StayWhileTheirConnectionIsUpWhenMdnsLosesThem) {
   peers->on_host_found(host_at({at(*one)}));
   wait_until_up();
   peers->on_host_lost(pc2.host_id);
-  look_around();
+  run_without_timers();
   EXPECT_EQ(host().state(), local::Host::UP);
-  one->owner.cut();
+  one->cut();
   wait([&] { return peers->report().hosts().empty(); });
   EXPECT_TRUE(catalog.hosts().empty());
-  look_around();
-  EXPECT_EQ(one->owner.connections(), 1) << "forgotten";
+  run_without_timers();
+  EXPECT_EQ(one->connections(), 1) << "forgotten";
 }
 
 TEST_F(FoundHostsTest, StayWhenMdnsFindsThemAgain) {
@@ -259,12 +246,12 @@ TEST_F(FoundHostsTest, StayWhenMdnsFindsThemAgain) {
   peers->on_host_found(host_at({at(*one)}));
   wait_until_up();
   peers->on_host_lost(pc2.host_id);
-  look_around();
+  run_without_timers();
   peers->on_host_found(host_at({at(*one)}));
-  one->owner.cut();
+  one->cut();
   wait_until_down();
   wait_until_up();
-  EXPECT_EQ(one->owner.connections(), 2);
+  EXPECT_EQ(one->connections(), 2);
 }
 
 TEST_F(FoundHostsTest, GoAtOnceWhenMdnsLosesThemWhileTheyAreDown) {
@@ -273,13 +260,13 @@ TEST_F(FoundHostsTest, GoAtOnceWhenMdnsLosesThemWhileTheyAreDown) {
   wait([&] { return host().state() == local::Host::DOWN; });
   peers->on_host_lost(pc2.host_id);
   peers->on_host_lost(wire::host_id_for("pc3"));
-  look_around();
+  run_without_timers();
   EXPECT_TRUE(peers->report().hosts().empty());
   EXPECT_EQ(peers->report().unavailable_peers(), "");
 }
 
 TEST_F(FoundHostsTest, AreNotTakenForAnotherThatAnswersAtTheirAddress) {
-  one->owner.call_itself("pc3");
+  one->greet_as(greeting_of("pc3"));
   start();
   peers->on_host_found(host_at({at(*one)}));
   wait([&] { return host().state() == local::Host::REFUSED; });
@@ -297,25 +284,25 @@ TEST_F(FoundHostsTest, AreNotLookedForWhereAnotherHostIsUp) {
   peers->on_host_found(host_at({at(*one)}));
   wait_until_up();
   peers->on_host_found(host_at({at(*one)}, "pc3"));
-  look_around();
+  run_without_timers();
   ASSERT_EQ(peers->report().hosts().size(), 2u);
   EXPECT_EQ(host(1).state(), local::Host::REFUSED);
   EXPECT_NE(host(1).error().find("where host 'pc2' answers"), std::string::npos) << host(1).error();
-  EXPECT_EQ(one->owner.connections(), 1) << "it is not disturbed";
+  EXPECT_EQ(one->connections(), 1) << "it is not disturbed";
   EXPECT_EQ(host(0).state(), local::Host::UP);
-  one->owner.call_itself("pc3");
-  one->owner.cut();
+  one->greet_as(greeting_of("pc3"));
+  one->cut();
   wait([&] { return catalog.find(wire::host_id_for("pc3")) != nullptr; });
-  look_around();
+  run_without_timers();
   EXPECT_EQ(host(0).state(), local::Host::REFUSED) << "now it is the other way round";
 }
 
 TEST_F(FoundHostsTest, AreNeverThisVeryHost) {
   start();
-  one->owner.greet_as(self);
+  one->greet_as(self);
   peers->on_host_found(host_at({at(*one)}, "pc1"));
-  wait([&] { return one->owner.connections() == 1; });
-  look_around();
+  wait([&] { return one->connections() == 1; });
+  run_without_timers();
   EXPECT_TRUE(peers->report().hosts().empty()) << "an echo of our own announcement";
   EXPECT_EQ(peers->report().own_warning().text, "");
   EXPECT_EQ(peers->report().unavailable_peers(), "");
@@ -325,8 +312,8 @@ TEST_F(FoundHostsTest, AreNeverThisVeryHost) {
 TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   wire::Greeting copy = self;
   ++copy.instance_id;
-  two->owner.greet_as(copy);
-  one->owner.greet_as(self);
+  two->greet_as(copy);
+  one->greet_as(self);
   start();
   // With the copy's address came one of our own.
   peers->on_host_found(host_at({at(*one), at(*two)}, "pc1"));
@@ -341,8 +328,8 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
   EXPECT_EQ(host().error(), warning);
   EXPECT_EQ(host().addresses(0), at(*two).str());
   EXPECT_TRUE(catalog.hosts().empty());
-  EXPECT_TRUE(two->owner.connected()) << "it is not asked again and again";
-  two->owner.cut();
+  EXPECT_TRUE(two->connected()) << "it is not asked again and again";
+  two->cut();
   wait([&] { return peers->report().own_warning().text.empty(); });
   wait([&] { return !peers->report().own_warning().text.empty(); });
   EXPECT_EQ(std::count_if(log.notices.begin(), log.notices.end(),
@@ -352,8 +339,8 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
             1);
   // It was given another name.
   peers->on_host_lost(self.host_id);
-  two->owner.greet_as(pc2);
-  two->owner.cut();
+  two->greet_as(pc2);
+  two->cut();
   peers->on_host_found(host_at({at(*two)}));
   wait_until_up();
   EXPECT_EQ(peers->report().hosts().size(), 1u);
@@ -363,8 +350,8 @@ TEST_F(FoundHostsTest, AreWarnedOfOnceWhenTheyHaveOurNameAndMachineId) {
 TEST_F(FoundHostsTest, AreAskedThoughThisHostIsAmongItsOwnPeers) {
   wire::Greeting copy = self;
   ++copy.instance_id;
-  one->owner.greet_as(self);
-  two->owner.greet_as(copy);
+  one->greet_as(self);
+  two->greet_as(copy);
   start({at(*one)});
   wait([&] { return host().state() == local::Host::SELF; });
   peers->on_host_found(host_at({at(*two)}, "pc1"));
@@ -378,7 +365,7 @@ TEST_F(FoundHostsTest, AreAskedThoughThisHostIsAmongItsOwnPeers) {
 TEST_F(FoundHostsTest, AreSaidToHaveOurIdAlsoWhenTheyMayNotBeAsked) {
   start({}, false);
   peers->on_host_found(host_at({{"192.0.2.7", 13776}}, "pc1"));
-  look_around();
+  run_without_timers();
   ASSERT_EQ(peers->report().hosts().size(), 1u);
   EXPECT_EQ(host().state(), local::Host::CLOSED);
   EXPECT_NE(host().error().find("with this host's name 'pc1' and machine id"), std::string::npos)
@@ -390,7 +377,7 @@ TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheyAreClosed) {
   closed.closed = true;
   start();
   peers->on_host_found(closed);
-  look_around();
+  run_without_timers();
   EXPECT_EQ(host().state(), local::Host::CLOSED);
   EXPECT_EQ(host().reason(), local::Host::CLOSED_THERE);
   EXPECT_NE(host().error().find("set listen and insecure there"), std::string::npos);
@@ -408,14 +395,14 @@ TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheySpeakAnotherVersion) {
   other.protocol_version = 77;
   start();
   peers->on_host_found(other);
-  look_around();
+  run_without_timers();
   EXPECT_EQ(host().state(), local::Host::REFUSED);
   proto::Hello hello;
   wire::to_message(pc2, hello);
   hello.set_protocol_version(77);
   hello.clear_version();
   EXPECT_EQ(host().error(), wire::greeting_untrusted(hello, "dssmd of host 'pc2'").error().message);
-  EXPECT_EQ(one->owner.connections(), 0);
+  EXPECT_EQ(one->connections(), 0);
   peers->on_host_found(host_at({at(*one)}));  // it was updated
   wait_until_up();
 }
@@ -437,7 +424,7 @@ TEST_F(FoundHostsTest, AreBoundedInNumberAndAddresses) {
     peers->on_host_found(host_at(std::vector<wire::Address>(100, {"192.0.2.7", 13776}),
                                  "pc" + std::to_string(1000 + i)));
   }
-  look_around();
+  run_without_timers();
   ASSERT_EQ(peers->report().hosts().size(), Peers::kMaxFoundHosts);
   EXPECT_EQ(static_cast<std::size_t>(host().addresses_size()), Peers::kMaxAddressesOfHost);
   EXPECT_EQ(std::count_if(log.notices.begin(), log.notices.end(),
@@ -449,7 +436,7 @@ TEST_F(FoundHostsTest, AreBoundedInNumberAndAddresses) {
   EXPECT_NE(peers->report().unavailable_peers().find("and 248 more"), std::string::npos)
       << peers->report().unavailable_peers();
   peers->on_host_lost(wire::host_id_for("pc1000"));
-  look_around();
+  run_without_timers();
   peers->on_host_found(host_at({at(*one)}));
   wait_until_up();  // there was room again
 }
@@ -470,7 +457,7 @@ TEST_F(FoundHostsTest, AreReachedThoughOneOfTheirAddressesNeverGreets) {
 
 TEST_F(FoundHostsTest, MayBeSeveralAtOneIpNumber) {
   const wire::Greeting pc3 = greeting_of("pc3");
-  two->owner.greet_as(pc3);
+  two->greet_as(pc3);
   start();
   peers->on_host_found(host_at({at(*one)}));
   peers->on_host_found(host_at({at(*two)}, "pc3"));
@@ -483,7 +470,7 @@ TEST_F(FoundHostsTest, MayBeSeveralAtOneIpNumber) {
 TEST_F(FoundHostsTest, MayHaveOneName) {
   wire::Greeting namesake = pc2;
   ++namesake.host_id[0];
-  two->owner.greet_as(namesake);
+  two->greet_as(namesake);
   FoundHost second = host_at({at(*two)});
   second.id = namesake.host_id;
   start();
@@ -497,7 +484,7 @@ TEST_F(FoundHostsTest, MayHaveOneName) {
 TEST_F(FoundHostsTest, AreWarnedOfWhenTheyHaveOurName) {
   wire::Greeting namesake = self;
   ++namesake.host_id[0];
-  one->owner.greet_as(namesake);
+  one->greet_as(namesake);
   FoundHost found = host_at({at(*one)}, "pc1");
   found.id = namesake.host_id;
   start();
@@ -506,8 +493,8 @@ TEST_F(FoundHostsTest, AreWarnedOfWhenTheyHaveOurName) {
   EXPECT_EQ(host().state(), local::Host::REFUSED);
   EXPECT_EQ(host().error(), peers->report().own_warning().text);
   EXPECT_TRUE(catalog.hosts().empty());
-  look_around();
-  EXPECT_EQ(one->owner.connections(), 1);
+  run_without_timers();
+  EXPECT_EQ(one->connections(), 1);
 }
 
 // --- the first words

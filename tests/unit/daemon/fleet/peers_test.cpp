@@ -8,8 +8,9 @@
 
 #include <algorithm>
 
+#include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
-#include "tests/unit/daemon/fleet/fake_peer.hpp"
+#include "tests/unit/daemon/scripted_host.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -21,20 +22,15 @@ class PeersTest : public testing::Test {
   Catalog catalog{"pc1"};
   LogRecorder log;
   wire::Greeting self = greeting_of("pc1");
-  FakePeer one{loop}, two{loop};
+  ScriptedPeer one{loop}, two{loop};
   std::unique_ptr<Peers> peers;
 
-  void start(const std::vector<FakePeer*>& configured) {
+  void start(const std::vector<ScriptedPeer*>& configured) {
     std::vector<wire::Address> addresses;
-    for (FakePeer* peer : configured) addresses.push_back(peer->owner.host().address);
+    for (ScriptedPeer* peer : configured) addresses.push_back(peer->address());
     peers = std::make_unique<Peers>(loop, resolver, addresses, self, catalog, log);
   }
-  void wait(const std::function<bool()>& done) {
-    run_until(loop, [&] {
-      one.serve(), two.serve();
-      return done();
-    });
-  }
+  void wait(const std::function<bool()>& done) { run_until(loop, done); }
   void wait_for_startup() {
     wait([this] { return peers->startup_is_over(); });
   }
@@ -58,11 +54,11 @@ TEST_F(PeersTest, PutAHostAndItsStreamsIntoTheCatalog) {
   ASSERT_EQ(catalog.hosts().size(), 1u);
   const KnownHost& known = catalog.hosts().begin()->second;
   EXPECT_EQ(known.greeting.host, "pc2");
-  EXPECT_EQ(known.address, one.owner.host().address);
+  EXPECT_EQ(known.address, one.address());
   EXPECT_EQ(known.streams.size(), 2u);
   EXPECT_EQ(known.streams.at({"lidar", 0}).id.str(), "lidar:0@pc2");
-  one.tell("lidar", true);
-  one.tell("gps", false);
+  one.send_event("lidar", true);
+  one.send_event("gps", false);
   wait([&] { return known.streams.contains({"gps", 0}); });
   EXPECT_EQ(known.streams.size(), 2u);
   const local::Host shown = host(0);
@@ -91,7 +87,7 @@ TEST_F(PeersTest, TakeAHostOutWhenItsConnectionBreaks) {
   one.streams = {"lidar"};
   start({&one});
   wait_for_startup();
-  one.owner.cut();
+  one.cut();
   wait([&] { return catalog.hosts().empty(); });
   EXPECT_TRUE(log.contains("host 'pc2' is down"));
   wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
@@ -102,7 +98,7 @@ TEST_F(PeersTest, TakeAHostOutWhenItsConnectionBreaks) {
 TEST_F(PeersTest, TakeAHostOutWhenItFallsSilent) {
   start({&one});
   wait([&] { return one.pings >= 1; });
-  one.silent = true;
+  one.answers_heartbeat = false;
   const MonoTime begin = loop.now();
   wait([&] { return catalog.hosts().empty(); });
   EXPECT_GE(loop.now() - begin, wire::kPeerTimeout - wire::kHeartbeat);
@@ -110,14 +106,14 @@ TEST_F(PeersTest, TakeAHostOutWhenItFallsSilent) {
   EXPECT_EQ(host(0).reason(), local::Host::NO_ANSWER);
   EXPECT_NE(host(0).error().find("no bytes came from host 'pc2'"), std::string::npos)
       << host(0).error();
-  one.silent = false;
+  one.answers_heartbeat = true;
   wait([&] { return !catalog.hosts().empty(); });
 }
 
 TEST_F(PeersTest, LeaveAPeerAloneThatTalksNonsenseAboutItsStreams) {
   start({&one});
   wait_for_startup();
-  one.tell("a:b", false);
+  one.send_event("a:b", false);
   wait([&] { return catalog.hosts().empty(); });
   EXPECT_EQ(host(0).state(), local::Host::REFUSED);
   EXPECT_EQ(host(0).reason(), local::Host::NOT_ACCEPTED);
@@ -127,13 +123,13 @@ TEST_F(PeersTest, LeaveAPeerAloneThatTalksNonsenseAboutItsStreams) {
 TEST_F(PeersTest, LetNobodySpeakForAnotherHost) {
   start({&one});
   wait_for_startup();
-  one.tell("lidar", false, "pc3");
+  one.send_event("lidar", false, "pc3");
   wait([&] { return !catalog.hosts().begin()->second.streams.empty(); });
   EXPECT_TRUE(catalog.has({"lidar", 0, "pc2"}));
 }
 
 TEST_F(PeersTest, SettleWhenAPeerIsNotThereAndSayWhy) {
-  const wire::Address nobody = FakeOwner(loop).host().address;
+  const wire::Address nobody = ScriptedHost(loop).address();
   peers = std::make_unique<Peers>(loop, resolver, std::vector{nobody}, self, catalog, log);
   wait_for_startup();
   EXPECT_EQ(host(0).state(), local::Host::DOWN);
@@ -151,10 +147,7 @@ TEST_F(PeersTest, SettleWhenAPeerIsNotThereAndSayWhy) {
 }
 
 TEST_F(PeersTest, SettleAfterAWhileWhenAPeerSaysNothing) {
-  UniqueFd listening =
-      wire::listen_tcp(
-          wire::resolve_number(wire::Address::parse("127.0.0.1:0", 0, true).value()).at(0))
-          .value();  // connects, and says nothing
+  const UniqueFd listening = listen_on_loopback();  // accepts connections, and sends nothing
   const auto address =
       wire::Address::parse(wire::local_address(listening.get()).value().str()).value();
   peers = std::make_unique<Peers>(loop, resolver, std::vector{address}, self, catalog, log);
@@ -163,31 +156,31 @@ TEST_F(PeersTest, SettleAfterAWhileWhenAPeerSaysNothing) {
 }
 
 TEST_F(PeersTest, UseOneOfTwoAddressesAndTakeTheOtherWhenItFails) {
-  two.owner.greet_as(one.owner.host().greeting);
+  two.greet_as(one.host().greeting);
   one.streams = two.streams = {"lidar"};
   start({&one, &two});
   wait([&] { return one.watches + two.watches > 0 && peers->startup_is_over(); });
   ASSERT_EQ(one.watches + two.watches, 1) << "only one is used";
-  FakePeer& used = one.watches ? one : two;
-  FakePeer& spare = one.watches ? two : one;
+  ScriptedPeer& used = one.watches ? one : two;
+  ScriptedPeer& spare = one.watches ? two : one;
   const std::size_t spare_index = one.watches ? 1 : 0;
   EXPECT_EQ(host(spare_index).state(), local::Host::UP);
-  EXPECT_NE(host(spare_index).error().find("same host as '" + used.owner.host().address.str()),
+  EXPECT_NE(host(spare_index).error().find("same host as '" + used.address().str()),
             std::string::npos)
       << host(spare_index).error();
   EXPECT_EQ(catalog.hosts().size(), 1u);
   wait([&] { return spare.pings >= 1; });
-  used.owner.cut();
+  used.cut();
   wait([&] { return spare.watches == 1; });
-  EXPECT_EQ(catalog.hosts().begin()->second.address, spare.owner.host().address);
+  EXPECT_EQ(catalog.hosts().begin()->second.address, spare.address());
   wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
   EXPECT_EQ(host(spare_index).error(), "");
 }
 
 TEST_F(PeersTest, WarnOfTwoPcsWithOneIdAndUseTheFirst) {
-  wire::Greeting clone = one.owner.host().greeting;
+  wire::Greeting clone = one.host().greeting;
   ++clone.instance_id;
-  two.owner.greet_as(clone);
+  two.greet_as(clone);
   start({&one, &two});
   wait([&] { return one.watches + two.watches > 0 && peers->startup_is_over(); });
   ASSERT_EQ(one.watches + two.watches, 1);
@@ -198,33 +191,32 @@ TEST_F(PeersTest, WarnOfTwoPcsWithOneIdAndUseTheFirst) {
 TEST_F(PeersTest, KeepTwoHostsOfOneNameAndWarnAtBoth) {
   wire::Greeting namesake = greeting_of("pc2");
   namesake.host_id[0] = static_cast<std::uint8_t>(namesake.host_id[0] + 1);
-  two.owner.greet_as(namesake);
+  two.greet_as(namesake);
   start({&one, &two});
   wait_for_startup();
   EXPECT_EQ(catalog.hosts().size(), 2u);
   EXPECT_NE(host(0).error().find("is called 'pc2' too"), std::string::npos) << host(0).error();
-  EXPECT_NE(host(1).error().find(one.owner.host().address.str()), std::string::npos)
-      << host(1).error();
-  two.owner.cut();
+  EXPECT_NE(host(1).error().find(one.address().str()), std::string::npos) << host(1).error();
+  two.cut();
   wait([&] { return catalog.hosts().size() == 1; });
   EXPECT_EQ(host(0).error(), "") << "there is only one now";
 }
 
 TEST_F(PeersTest, KnowThemselves) {
-  one.owner.greet_as(self);
+  one.greet_as(self);
   start({&one});
   wait_for_startup();
   EXPECT_EQ(host(0).state(), local::Host::SELF);
   EXPECT_EQ(host(0).error(), "");
   EXPECT_TRUE(catalog.hosts().empty());
-  EXPECT_EQ(one.owner.connections(), 1) << "left standing, not dialed again and again";
+  EXPECT_EQ(one.connections(), 1) << "left standing, not dialed again and again";
   EXPECT_EQ(peers->report().own_warning().text, "");
 }
 
 TEST_F(PeersTest, RefuseAnotherPcWithTheirOwnId) {
   wire::Greeting clone = self;
   ++clone.instance_id;
-  one.owner.greet_as(clone);
+  one.greet_as(clone);
   start({&one});
   wait_for_startup();
   EXPECT_EQ(host(0).state(), local::Host::REFUSED);
@@ -238,7 +230,7 @@ TEST_F(PeersTest, RefuseAnotherPcWithTheirOwnId) {
 TEST_F(PeersTest, DoNotShowTheStreamsOfAHostWithTheirOwnName) {
   wire::Greeting namesake = greeting_of("pc1");
   namesake.host_id[0] = static_cast<std::uint8_t>(namesake.host_id[0] + 1);
-  one.owner.greet_as(namesake);
+  one.greet_as(namesake);
   start({&one});
   wait_for_startup();
   EXPECT_TRUE(catalog.hosts().empty());
@@ -253,8 +245,8 @@ TEST_F(PeersTest, DoNotShowTheStreamsOfAHostWithTheirOwnName) {
 TEST_F(PeersTest, DialWhoIsConfiguredAnewAndKeepWhoStays) {
   start({&one});
   wait([&] { return one.watches == 1; });
-  two.owner.greet_as(greeting_of("pc3"));
-  peers->set_configured({two.owner.host().address, one.owner.host().address});
+  two.greet_as(greeting_of("pc3"));
+  peers->set_configured({two.address(), one.address()});
   wait([&] { return catalog.hosts().size() == 2; });
   EXPECT_EQ(one.watches, 1) << "its connection is the one of before";
   EXPECT_EQ(peers->report().hosts().size(), 2u);
@@ -269,17 +261,18 @@ TEST_F(PeersTest, DropWhoIsNotConfiguredAnyMoreAndTellWhoeverWaits) {
   std::string got;
   net::Frame request;
   request.mutable_get_property()->mutable_id()->set_name("lidar");
-  peers->connection_to(one.owner.host().greeting.host_id)
-      ->ask(request, [&](Result<net::Frame> answer) { got = answer.error().message; });
+  peers->connection_to(one.host().greeting.host_id)->ask(request, [&](Result<net::Frame> answer) {
+    got = answer.error().message;
+  });
   peers->set_configured({});
   wait([&] { return peers->report().hosts().empty(); });
   EXPECT_TRUE(catalog.hosts().empty());
-  EXPECT_EQ(peers->connection_to(one.owner.host().greeting.host_id), nullptr);
+  EXPECT_EQ(peers->connection_to(one.host().greeting.host_id), nullptr);
   EXPECT_NE(got.find("no longer among the peers"), std::string::npos) << got;
 }
 
 TEST_F(PeersTest, DropWhoWasNeverThere) {
-  const wire::Address nobody = FakeOwner(loop).host().address;
+  const wire::Address nobody = ScriptedHost(loop).address();
   peers = std::make_unique<Peers>(loop, resolver, std::vector{nobody}, self, catalog, log);
   wait_for_startup();
   peers->set_configured({});
@@ -288,7 +281,7 @@ TEST_F(PeersTest, DropWhoWasNeverThere) {
 }
 
 TEST_F(PeersTest, DialAgainWhoComesBackIntoTheConfiguration) {
-  const std::vector<wire::Address> configured = {one.owner.host().address};
+  const std::vector<wire::Address> configured = {one.address()};
   start({&one});
   wait([&] { return one.watches == 1; });
   peers->set_configured({});
@@ -303,7 +296,7 @@ TEST_F(PeersTest, DialAgainWhoComesBackIntoTheConfiguration) {
 TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {
   start({&one});
   wait_for_startup();
-  PeerConnection* link = peers->connection_to(one.owner.host().greeting.host_id);
+  PeerConnection* link = peers->connection_to(one.host().greeting.host_id);
   ASSERT_TRUE(link);
   std::vector<std::string> got;
   const auto ask = [&](const std::string& name) {
@@ -316,25 +309,25 @@ TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {
   };
   ask("a");
   ask("b");
-  wait([&] { return one.asked.size() == 2; });
-  net::Frame second = answer_to(one.asked[1]);
+  wait([&] { return one.requests.size() == 2; });
+  net::Frame second = answer_to(one.requests[1]);
   second.mutable_property()->set_property("B");
-  one.owner.send(second);
-  one.owner.fail(one.asked[0], Errc::not_found, "no such stream");
+  one.send(second);
+  one.fail(one.requests[0], Errc::not_found, "no such stream");
   wait([&] { return got.size() == 2; });
   EXPECT_EQ(got, (std::vector<std::string>{"b: B", "a: no such stream"}));
   ask("c");
-  wait([&] { return one.asked.size() == 3; });
-  one.owner.cut();
+  wait([&] { return one.requests.size() == 3; });
+  one.cut();
   wait([&] { return got.size() == 3; });
   EXPECT_EQ(got[2].find("c: the connection to host 'pc2' ended before it answered"), 0u) << got[2];
-  EXPECT_EQ(peers->connection_to(one.owner.host().greeting.host_id), nullptr);
+  EXPECT_EQ(peers->connection_to(one.host().greeting.host_id), nullptr);
 }
 
 TEST_F(PeersTest, BoundTheRequestsThatWait) {
   start({&one});
   wait_for_startup();
-  PeerConnection& link = *peers->connection_to(one.owner.host().greeting.host_id);
+  PeerConnection& link = *peers->connection_to(one.host().greeting.host_id);
   std::size_t refused = 0;
   for (std::size_t i = 0; i < PeerConnection::kMaxWaiting + 10; ++i) {
     net::Frame request;
@@ -356,18 +349,18 @@ TEST_F(PeersTest, BoundTheRequestsThatWait) {
 TEST_F(PeersTest, MakeRoomForRequestsWithEachAnswer) {
   start({&one});
   wait_for_startup();
-  PeerConnection& link = *peers->connection_to(one.owner.host().greeting.host_id);
+  PeerConnection& link = *peers->connection_to(one.host().greeting.host_id);
   for (std::size_t i = 0; i < 4; ++i) {
     net::Frame large;
     large.mutable_set_property()->set_property(
         std::string(PeerConnection::kMaxWaitingBytes / 3, 'x'));
     std::optional<bool> done;
     link.ask(large, [&](const Result<net::Frame>& answer) { done = answer.has_value(); });
-    wait([&] { return one.asked.size() > i || done; });
+    wait([&] { return one.requests.size() > i || done; });
     ASSERT_FALSE(done);
-    net::Frame answer = answer_to(one.asked[i]);
+    net::Frame answer = answer_to(one.requests[i]);
     answer.mutable_done();
-    one.owner.send(answer);
+    one.send(answer);
     wait([&] { return done.has_value(); });
     EXPECT_TRUE(*done);
   }
@@ -379,7 +372,7 @@ TEST_F(PeersTest, EndAConnectionThatAnswersWhatNobodyAsked) {
   net::Frame answer;
   answer.set_serial(999);
   answer.mutable_done();
-  one.owner.send(answer);
+  one.send(answer);
   wait([&] { return catalog.hosts().empty(); });
   EXPECT_NE(host(0).error().find("a response without a request"), std::string::npos)
       << host(0).error();

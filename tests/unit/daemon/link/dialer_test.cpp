@@ -7,7 +7,7 @@
 #include <netinet/in.h>
 
 #include "core/wire/frame.hpp"
-#include "tests/unit/daemon/remote/fake_owner.hpp"
+#include "tests/unit/daemon/scripted_host.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -17,8 +17,6 @@ class RawServer {
  public:
   RawServer(const EventLoop& loop, std::string words, bool hangs_up)
       : words_(std::move(words)), hangs_up_(hangs_up) {
-    const wire::Address any = wire::Address::parse("127.0.0.1:0", 0, true).value();
-    listening_ = wire::listen_tcp(wire::resolve_number(any).at(0)).value();
     accepting_ = EventSource::readable(loop, listening_.get(), [this] { on_connection(); });
     accepting_.enable();
   }
@@ -39,7 +37,7 @@ class RawServer {
   const std::string words_;
   const bool hangs_up_;
   int connections_ = 0;
-  UniqueFd listening_;
+  UniqueFd listening_ = listen_on_loopback();
   std::vector<UniqueFd> sockets_;
   EventSource accepting_;
 };
@@ -120,19 +118,16 @@ class DialerTest : public testing::Test, protected Dialer::Observer {
 };
 
 TEST_F(DialerTest, GreetsAndHandsOverTheLink) {
-  FakeOwner owner(loop);
-  dial(owner.host().address);
+  ScriptedHost owner(loop);
+  dial(owner.address());
   EXPECT_EQ(dialer->connection(), nullptr);
-  EXPECT_EQ(dialer->address(), owner.host().address.str());
+  EXPECT_EQ(dialer->address(), owner.address().str());
   wait([this] { return up; });
   EXPECT_EQ(them->host, "pc2");
   EXPECT_EQ(them->host_id, owner.host().greeting.host_id);
   EXPECT_FALSE(dialer->crosses_network());
-  net::Frame ping;
-  ping.set_serial(5);
-  ping.mutable_ping();
-  dialer->connection()->send(ping);
-  EXPECT_EQ(owner.take().serial(), 5u);
+  dialer->connection()->send(with_serial(5, ping_frame()));
+  EXPECT_EQ(owner.receive().serial(), 5u);
   net::Frame pong;
   pong.set_serial(5);
   pong.mutable_pong();
@@ -143,8 +138,8 @@ TEST_F(DialerTest, GreetsAndHandsOverTheLink) {
 }
 
 TEST_F(DialerTest, TriesTheAddressesOfANameInTurn) {
-  FakeOwner owner(loop);
-  const wire::SocketAddress good = wire::resolve_number(owner.host().address).at(0);
+  ScriptedHost owner(loop);
+  const wire::SocketAddress good = wire::resolve_number(owner.address()).at(0);
   answers = {closed_port(loop), closed_port(loop), good};
   dial({"pc2", 1});
   wait([this] { return up; });
@@ -153,8 +148,8 @@ TEST_F(DialerTest, TriesTheAddressesOfANameInTurn) {
 }
 
 TEST_F(DialerTest, TriesTheAddressesThatItIsGivenInTurn) {
-  FakeOwner owner(loop);
-  const wire::SocketAddress good = wire::resolve_number(owner.host().address).at(0);
+  ScriptedHost owner(loop);
+  const wire::SocketAddress good = wire::resolve_number(owner.address()).at(0);
   dial_in_turn({closed_port(loop), closed_port(loop), good});
   wait([this] { return up; });
   EXPECT_EQ(dialer->address(), good.str());
@@ -163,8 +158,8 @@ TEST_F(DialerTest, TriesTheAddressesThatItIsGivenInTurn) {
 
 TEST_F(DialerTest, BeginsBehindAnAddressThatIsOfNoUse) {
   RawServer talker(loop, "220 smtp ready\r\n", false);
-  FakeOwner owner(loop);
-  const wire::SocketAddress good = wire::resolve_number(owner.host().address).at(0);
+  ScriptedHost owner(loop);
+  const wire::SocketAddress good = wire::resolve_number(owner.address()).at(0);
   dial_in_turn({talker.address(), closed_port(loop), good});
   wait([this] { return up; });
   EXPECT_EQ(downs.size(), 1u);
@@ -177,10 +172,10 @@ TEST_F(DialerTest, BeginsBehindAnAddressThatIsOfNoUse) {
 TEST_F(DialerTest, LetsItsAddressesShareTheTimeOfARound) {
   const SilentServer silent;
   const wire::SocketAddress dead = silent.address();
-  FakeOwner owner(loop);
+  ScriptedHost owner(loop);
   Dialer::Options options;
   options.round_time = std::chrono::milliseconds(40);
-  dial_in_turn({dead, dead, dead, wire::resolve_number(owner.host().address).at(0)}, options);
+  dial_in_turn({dead, dead, dead, wire::resolve_number(owner.address()).at(0)}, options);
   bool timed_out = false;
   EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
   timer.enable_in(Dialer::kConnectTimeout);  // what one address would take else
@@ -191,13 +186,13 @@ TEST_F(DialerTest, LetsItsAddressesShareTheTimeOfARound) {
 
 TEST_F(DialerTest, LeavesAnAddressThatDoesNotAnswerForNewOnesAtOnce) {
   const SilentServer silent;
-  FakeOwner owner(loop);
+  ScriptedHost owner(loop);
   dial_in_turn({silent.address()});
   event_base_loop(loop.base(), EVLOOP_ONCE);  // it begins to connect
   bool timed_out = false;
   EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
   timer.enable_in(Dialer::kConnectTimeout);  // what it would wait else
-  dialer->set_addresses({owner.host().address});
+  dialer->set_addresses({owner.address()});
   wait([&] { return up || timed_out; });
   EXPECT_TRUE(up);
   EXPECT_TRUE(downs.empty());
@@ -217,15 +212,15 @@ TEST_F(DialerTest, SaysWhyNoAddressOfANameWorked) {
 TEST_F(DialerTest, SaysWhyANameCouldNotBeLookedUpAndTriesAgain) {
   dial({"pc2", 1});  // no address
   EXPECT_EQ(wait_for_down().code, Errc::not_found);
-  FakeOwner owner(loop);
+  ScriptedHost owner(loop);
   wait([this] { return downs.size() == 2; });
-  answers = {wire::resolve_number(owner.host().address).at(0)};
+  answers = {wire::resolve_number(owner.address()).at(0)};
   wait([this] { return up; });
 }
 
 TEST_F(DialerTest, ComesBackWhenTheConnectionBroke) {
-  FakeOwner owner(loop);
-  dial(owner.host().address);
+  ScriptedHost owner(loop);
+  dial(owner.address());
   for (int round = 0; round < 3; ++round) {
     wait([this] { return up; });
     owner.cut();
@@ -240,15 +235,14 @@ TEST_F(DialerTest, FindsAServerThatStartsLater) {
   const wire::SocketAddress port = closed_port(loop);
   dial(port);
   wait([this] { return downs.size() >= 2; });
-  FakeOwner owner(loop);
-  dialer->set_addresses({owner.host().address});
+  ScriptedHost owner(loop);
+  dialer->set_addresses({owner.address()});
   dialer->retry_now();
   wait([this] { return up; });
 }
 
 TEST_F(DialerTest, QuotesWhoeverRefusesIt) {
-  net::Frame failure;
-  wire::to_message(Error{Errc::limit_exceeded, "too many connections"}, *failure.mutable_failure());
+  const net::Frame failure = failure_frame(Errc::limit_exceeded, "too many connections");
   RawServer server(loop, wire::encode_frame(failure), true);
   dial(server.address());
   const Error& why = wait_for_down();
@@ -258,12 +252,10 @@ TEST_F(DialerTest, QuotesWhoeverRefusesIt) {
 }
 
 TEST_F(DialerTest, QuotesTheLastWordsOfAServerThatWasUp) {
-  FakeOwner owner(loop);
-  dial(owner.host().address);
+  ScriptedHost owner(loop);
+  dial(owner.address());
   wait([this] { return up; });
-  net::Frame failure;
-  wire::to_message(Error{Errc::no_permission, "no more"}, *failure.mutable_failure());
-  owner.send(failure);
+  owner.send(failure_frame(Errc::no_permission, "no more"));
   const Error& why = wait_for_down();
   EXPECT_EQ(why.code, Errc::no_permission);
   EXPECT_EQ(why.message.find("refused by dssmd of host 'pc2'"), 0u) << why.message;
@@ -271,10 +263,7 @@ TEST_F(DialerTest, QuotesTheLastWordsOfAServerThatWasUp) {
 }
 
 TEST_F(DialerTest, RefusesAServerOfAnotherVersionInWords) {
-  net::Frame hello;
-  wire::to_message(greeting_of("pc9"), *hello.mutable_hello());
-  hello.mutable_hello()->set_protocol_version(77);
-  RawServer server(loop, wire::encode_frame(hello), false);
+  RawServer server(loop, wire::encode_frame(hello_frame(greeting_of("pc9"), 77)), false);
   dial(server.address());
   const Error& why = wait_for_down();
   EXPECT_EQ(why.code, Errc::protocol);
@@ -313,18 +302,16 @@ TEST_F(DialerTest, GivesUpWhoDoesNotGreetInTime) {
 }
 
 TEST_F(DialerTest, GivesUpWhoGreetsTwice) {
-  FakeOwner owner(loop);
-  dial(owner.host().address);
+  ScriptedHost owner(loop);
+  dial(owner.address());
   wait([this] { return up; });
-  net::Frame hello;
-  wire::to_message(greeting_of("pc2"), *hello.mutable_hello());
-  owner.send(hello);
+  owner.send(hello_frame(greeting_of("pc2")));
   EXPECT_EQ(wait_for_down().code, Errc::protocol);
 }
 
 TEST_F(DialerTest, RestartsWhatIsUpForTheReasonThatIsGiven) {
-  FakeOwner owner(loop);
-  dial(owner.host().address);
+  ScriptedHost owner(loop);
+  dial(owner.address());
   wait([this] { return up; });
   dialer->restart({Errc::unavailable, "silent"});
   EXPECT_TRUE(downs.empty()) << "from the loop";
@@ -334,9 +321,9 @@ TEST_F(DialerTest, RestartsWhatIsUpForTheReasonThatIsGiven) {
 }
 
 TEST_F(DialerTest, RestartsAnAttemptThatIsUnderWay) {
-  FakeOwner owner(loop);
+  ScriptedHost owner(loop);
   dial({"pc2", 1});
-  answers = {wire::resolve_number(owner.host().address).at(0)};
+  answers = {wire::resolve_number(owner.address()).at(0)};
   event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);  // it looks the name up
   dialer->restart({Errc::unavailable, "moved"});
   EXPECT_EQ(wait_for_down().message, "moved");
@@ -364,16 +351,16 @@ TEST_F(DialerTest, PausesLongerAfterEachFailureAndNotWhenHurried) {
 }
 
 TEST_F(DialerTest, RefusesSamplesOnAConnectionThatCarriesNone) {
-  FakeOwner owner(loop);
-  dial(owner.host().address);
+  ScriptedHost owner(loop);
+  dial(owner.address());
   wait([this] { return up; });
-  owner.sample({0, Time(), Duration()}, std::vector<std::byte>(8));
+  owner.send_sample({0, Time(), Duration()}, Bytes(8));
   EXPECT_EQ(wait_for_down().code, Errc::protocol);
 }
 
 TEST_F(DialerTest, MayBeDestroyedAtAnyStep) {
-  FakeOwner owner(loop);
-  const wire::Address address = owner.host().address;
+  ScriptedHost owner(loop);
+  const wire::Address address = owner.address();
   for (int rounds = 0; rounds < 12; ++rounds) {
     dial(address);
     for (int i = 0; i < rounds; ++i) event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);

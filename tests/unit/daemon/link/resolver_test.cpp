@@ -8,7 +8,7 @@
 #include <atomic>
 #include <semaphore>
 
-#include "tests/unit/daemon/remote/fake_owner.hpp"
+#include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
 namespace {

@@ -6,8 +6,9 @@
 
 #include <gtest/gtest.h>
 
+#include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
-#include "tests/unit/daemon/fleet/fake_peer.hpp"
+#include "tests/unit/daemon/scripted_host.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -23,8 +24,8 @@ class FleetServiceTest : public testing::Test {
   Catalog catalog{"pc1"};
   RemoteStreams<Mirror> mirrors{parts, catalog};
   RemoteStreams<RemoteWriter> writers{parts, catalog};
-  FakePeer peer{loop, "pc1"};
-  Peers peers{loop, resolver, {peer.owner.host().address}, self, catalog, log};
+  ScriptedPeer peer{loop, "pc1"};
+  Peers peers{loop, resolver, {peer.address()}, self, catalog, log};
   FleetService fleet{loop,   {self, {"10.0.0.1:13776"}, true}, registry, catalog, peers, mirrors,
                      writers};
 };
@@ -74,7 +75,7 @@ TEST_F(FleetServiceTest, TellsWordsOfOthersInPrintableCharactersOnly) {
 TEST_F(FleetServiceTest, TellsOfThisHostFirstAndWhatIsWrongWithIt) {
   wire::Greeting copy = self;
   ++copy.instance_id;
-  peer.owner.greet_as(copy);
+  peer.greet_as(copy);
   EXPECT_EQ(fleet.hosts().at(0).error(), "");
   run_until(loop, [&] { return fleet.hosts().at(1).state() == local::Host::REFUSED; });
   const local::Host told = fleet.hosts().at(0);

@@ -7,7 +7,7 @@
 #include "daemon/remote/remote_streams.hpp"
 #include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
-#include "tests/unit/daemon/remote/fake_owner.hpp"
+#include "tests/unit/daemon/scripted_host.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -26,7 +26,7 @@ class MirrorsTest : public testing::Test {
   ChannelParts parts{loop, resolver, registry, logger, greeting_of("pc1")};
   std::unique_ptr<RemoteStreams<Mirror>> mirrors =
       std::make_unique<RemoteStreams<Mirror>>(parts, catalog);
-  std::unique_ptr<FakeOwner> owner = std::make_unique<FakeOwner>(loop);
+  std::unique_ptr<ScriptedHost> owner = std::make_unique<ScriptedHost>(loop);
   StreamInfo theirs;
   std::vector<const Stream*> replaced;
 
@@ -37,7 +37,7 @@ class MirrorsTest : public testing::Test {
     theirs.depth = 16;
     theirs.cycle = 10ms;
     theirs.incarnation = 7;
-    catalog.host_up(owner->host().greeting, owner->host().address);
+    catalog.host_up(owner->host().greeting, owner->address());
   }
 
   using Answer = std::optional<Result<std::shared_ptr<Stream>>>;
@@ -58,19 +58,19 @@ class MirrorsTest : public testing::Test {
   }
   // Answers Open and Subscribe; returns the latter.
   net::Frame serve(Tid first) {
-    const net::Frame open = owner->take();
+    const net::Frame open = owner->receive();
     EXPECT_TRUE(open.has_open());
     EXPECT_EQ(open.open().id().name(), kId.name);
-    owner->say(theirs, open);
-    net::Frame subscribe = owner->take();
+    owner->send(opened_frame(open, theirs));
+    net::Frame subscribe = owner->receive();
     EXPECT_TRUE(subscribe.has_subscribe());
-    owner->subscribed(subscribe, theirs.incarnation, first);
+    owner->send(subscribed_frame(subscribe, theirs.incarnation, first));
     return subscribe;
   }
   void samples(Tid first, Tid last) {
     for (Tid tid = first; tid <= last; ++tid) {
-      owner->sample({tid, time_from_ns(tid), Duration(1)},
-                    std::vector<std::byte>(24, static_cast<std::byte>(tid)));
+      owner->send_sample({tid, time_from_ns(tid), Duration(1)},
+                         Bytes(24, static_cast<std::byte>(tid)));
     }
   }
   // A mirror that is up to date, with samples 0 ... newest.
@@ -78,7 +78,7 @@ class MirrorsTest : public testing::Test {
     const auto answer = open();
     serve(0);
     samples(0, newest);
-    owner->caught_up();
+    owner->send_caught_up();
     return wait(answer);
   }
   proto::Mirror state() {
@@ -104,7 +104,7 @@ TEST_F(MirrorsTest, FillsARingWithTheOwnersHistoryBeforeItAnswers) {
   run_until(loop, [&] { return find() && newest(*find()) == 110; });
   EXPECT_FALSE(answer->has_value()) << "more may follow";
   EXPECT_EQ(state().state(), proto::Mirror::FILLING);
-  owner->caught_up();
+  owner->send_caught_up();
   const std::shared_ptr<Stream> stream = wait(answer);
   EXPECT_EQ(stream->id(), kId);
   EXPECT_EQ(stream->type(), odometry_type());
@@ -122,7 +122,7 @@ TEST_F(MirrorsTest, FillsARingWithTheOwnersHistoryBeforeItAnswers) {
 TEST_F(MirrorsTest, SharesOneChannelAmongAllReaders) {
   const auto first = open(), second = open();
   serve(0);
-  owner->caught_up();
+  owner->send_caught_up();
   EXPECT_EQ(wait(first), wait(second));
   const auto third = open();
   ASSERT_TRUE(third->has_value()) << "it is there";
@@ -139,7 +139,7 @@ TEST_F(MirrorsTest, AnswersWithWhatCameWhenTheHistoryTakesLong) {
 }
 
 TEST_F(MirrorsTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
-  const wire::Address nobody = owner->host().address;
+  const wire::Address nobody = owner->address();
   const KnownHost host = owner->host();
   owner.reset();  // nobody listens there any more
   std::optional<Error> error;
@@ -154,7 +154,7 @@ TEST_F(MirrorsTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
 
 TEST_F(MirrorsTest, HandsOnWhatTheOwnerRefuses) {
   const auto answer = open();
-  owner->fail(owner->take(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
+  owner->fail(owner->receive(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
   run_until(loop, [&] { return answer->has_value(); });
   EXPECT_EQ((*answer)->error().code, Errc::not_found);
   run_until(loop, [&] { return mirrors->size() == 0; });
@@ -164,7 +164,7 @@ TEST_F(MirrorsTest, HandsOnWhatTheOwnerRefuses) {
 TEST_F(MirrorsTest, RefusesWhatDoesNotFitIntoItsMemory) {
   theirs.depth = kMaxDepth;
   const auto answer = open();
-  owner->say(theirs, owner->take());
+  owner->send(opened_frame(owner->receive(), theirs));
   run_until(loop, [&] { return answer->has_value(); });
   EXPECT_EQ((*answer)->error().code, Errc::limit_exceeded);
   EXPECT_NE((*answer)->error().message.find("max_memory"), std::string::npos);
@@ -184,7 +184,7 @@ TEST_F(MirrorsTest, CountsTowardsTheStreamsOfThisHost) {
     few.open(owner->host(), {"other", 0, "pc2"}, nullptr,
              [&](auto result) { code = result.error().code; });
     EXPECT_EQ(code, Errc::limit_exceeded);
-    owner->fail(owner->take(), Errc::not_found, "none");
+    owner->fail(owner->receive(), Errc::not_found, "none");
     run_until(loop, [&] { return few.size() == 0; });
   }
   EXPECT_TRUE(small.create({"own", 0, ""}, odometry_type(), kHistory, 1));
@@ -225,7 +225,7 @@ TEST_F(MirrorsTest, ResumesBehindWhatItHas) {
   EXPECT_EQ(subscribe.subscribe().from_tid(), 6);
   EXPECT_EQ(subscribe.subscribe().incarnation(), 7u);
   samples(6, 8);
-  owner->caught_up();
+  owner->send_caught_up();
   until_newest(*stream, 8);
   until_state(proto::Mirror::LIVE);
   EXPECT_EQ(state().reconnects(), 1u);
@@ -237,9 +237,9 @@ TEST_F(MirrorsTest, CountsWhatTheOwnerNoLongerHas) {
   const std::shared_ptr<Stream> stream = opened(5);
   owner->cut();
   serve(6);
-  owner->gap(6, 14);
+  owner->send(gap_frame(6, 14));
   samples(20, 22);
-  owner->sample({23, {}, {}}, std::vector<std::byte>(24), true);
+  owner->send_sample({23, {}, {}}, Bytes(24), true);
   samples(24, 24);
   until_newest(*stream, 24);
   EXPECT_EQ(state().gap_samples(), 15u);
@@ -261,8 +261,8 @@ TEST_F(MirrorsTest, FollowsTheOwnerToANewAddress) {
   const std::shared_ptr<Stream> stream = opened(5);
   const wire::Greeting greeting = owner->host().greeting;
   catalog.host_down(greeting.host_id, {Errc::unavailable, "gone"});
-  owner = std::make_unique<FakeOwner>(loop);  // another port
-  catalog.host_up(owner->host().greeting, owner->host().address);
+  owner = std::make_unique<ScriptedHost>(loop);  // another port
+  catalog.host_up(owner->host().greeting, owner->address());
   serve(6);
   samples(6, 6);
   until_newest(*stream, 6);
@@ -272,16 +272,16 @@ TEST_F(MirrorsTest, FollowsTheOwnerToANewAddress) {
 TEST_F(MirrorsTest, LosesNothingWhenTheSameOwnerIsReachedAtAnotherAddress) {
   const std::shared_ptr<Stream> stream = opened(5);
   const wire::Greeting greeting = owner->host().greeting;
-  const std::unique_ptr<FakeOwner> before = std::move(owner);
-  owner = std::make_unique<FakeOwner>(loop);
+  const std::unique_ptr<ScriptedHost> before = std::move(owner);
+  owner = std::make_unique<ScriptedHost>(loop);
   owner->greet_as(greeting);
   catalog.host_down(greeting.host_id, {Errc::unavailable, "no sign of life"});
-  catalog.host_up(greeting, owner->host().address);
+  catalog.host_up(greeting, owner->address());
   const net::Frame subscribe = serve(6);
   EXPECT_EQ(subscribe.subscribe().from_tid(), 6);
   EXPECT_EQ(subscribe.subscribe().incarnation(), 7u);
   samples(6, 8);
-  owner->caught_up();
+  owner->send_caught_up();
   until_newest(*stream, 8);
   until_state(proto::Mirror::LIVE);
   EXPECT_EQ(stream->info().oldest, 0);
@@ -298,7 +298,7 @@ TEST_F(MirrorsTest, BeginsANewRingWhenTheOwnerLostIts) {
   samples(0, 1);
   run_until(loop, [&] { return find() != old; });
   EXPECT_TRUE(replaced.empty()) << "not before there is something to read";
-  owner->caught_up();
+  owner->send_caught_up();
   run_until(loop, [&] { return !replaced.empty(); });
   EXPECT_EQ(replaced, std::vector<const Stream*>{old.get()});
   EXPECT_EQ(newest(*old), 5) << "who holds it keeps it";
@@ -313,7 +313,7 @@ TEST_F(MirrorsTest, BeginsANewRingWhenTheOwnerLostIts) {
 TEST_F(MirrorsTest, KeepsTheRingOfARemovedStreamAndTriesAgain) {
   const std::shared_ptr<Stream> stream = opened(5);
   catalog.stream_added(owner->host().greeting.host_id, theirs).value();
-  owner->removed();
+  owner->send(removed_frame());
   until_state(proto::Mirror::REMOVED);
   EXPECT_NE(state().error(), "");
   catalog.stream_removed(owner->host().greeting.host_id, kId);
@@ -321,7 +321,7 @@ TEST_F(MirrorsTest, KeepsTheRingOfARemovedStreamAndTriesAgain) {
   catalog.stream_added(owner->host().greeting.host_id, theirs).value();
   run_until(loop, [&] { return owner->connections() == 2; });
   serve(0);
-  owner->caught_up();
+  owner->send_caught_up();
   until_state(proto::Mirror::LIVE);
   EXPECT_EQ(replaced.size(), 1u);
 }
@@ -335,7 +335,7 @@ TEST_F(MirrorsTest, LendsNoRingOfAStreamThatTheCatalogKnowsToBeRemoved) {
   const auto answer = open();
   EXPECT_FALSE(answer->has_value());
   samples(6, 6);
-  owner->removed();
+  owner->send(removed_frame());
   run_until(loop, [&] { return answer->has_value(); });
   EXPECT_EQ((*answer)->error().code, Errc::not_found);
   EXPECT_EQ(newest(*stream), 6) << "its readers get the last samples";
@@ -366,19 +366,19 @@ TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
 
 TEST_F(MirrorsTest, AsksAgainForARemovedStreamWhenSomebodyOpensIt) {
   const std::shared_ptr<Stream> stream = opened(5);
-  owner->removed();
+  owner->send(removed_frame());
   until_state(proto::Mirror::REMOVED);
   const auto answer = open();
   EXPECT_FALSE(answer->has_value());
   run_until(loop, [&] { return owner->connections() == 2; });
-  owner->fail(owner->take(), Errc::not_found, "there is no such stream");
+  owner->fail(owner->receive(), Errc::not_found, "there is no such stream");
   run_until(loop, [&] { return answer->has_value(); });
   EXPECT_EQ((*answer)->error().code, Errc::not_found);
   EXPECT_EQ(mirrors->size(), 1u) << "its reader stays";
   // Nobody has to tell: it looks by itself as well.
   run_until(loop, [&] { return owner->connections() == 3; });
   serve(6);
-  owner->caught_up();
+  owner->send_caught_up();
   until_state(proto::Mirror::LIVE);
 }
 
@@ -400,7 +400,7 @@ TEST_F(MirrorsTest, GoesOnWithARingThatAProgramKept) {
   auto second = mirrors->adopt_untrusted(kId, as_offer(std::move(kept)));
   ASSERT_TRUE(second) << second.error().message;
   EXPECT_EQ(second->get(), stream->get());
-  catalog.host_up(owner->host().greeting, owner->host().address);
+  catalog.host_up(owner->host().greeting, owner->address());
   const net::Frame subscribe = serve(6);
   EXPECT_EQ(subscribe.subscribe().from_tid(), 6);
   samples(6, 6);
@@ -442,13 +442,13 @@ TEST_F(MirrorsTest, RefusesAnOfferedRingWhenTheMirrorHasAnother) {
 }
 
 TEST_F(MirrorsTest, DoesNotReadFromAnotherPcAtTheOwnersAddress) {
-  owner->call_itself("pc3");
+  owner->greet_as(greeting_of("pc3"));
   const auto answer = open();
   run_until(loop, [&] { return answer->has_value(); });
   EXPECT_EQ((*answer)->error().code, Errc::unavailable);
   EXPECT_NE((*answer)->error().message.find("pc3"), std::string::npos)
       << (*answer)->error().message;
-  EXPECT_FALSE(owner->asked() && owner->take().has_open());
+  EXPECT_FALSE(owner->has_request() && owner->receive().has_open());
 }
 
 // Each costs the connection, and nothing else: the mirror tries again.
@@ -460,14 +460,14 @@ TEST_F(MirrorsTest, ClosesTheChannelOfAnOwnerThatBreaksTheProtocol) {
     run_until(loop, [&] { return owner->connections() > connections; });
     ++connections;
     serve(6);
-    owner->caught_up();
+    owner->send_caught_up();
     until_state(proto::Mirror::LIVE);
     EXPECT_EQ(newest(*stream), 5);
   };
-  expect_closed([&] { samples(5, 5); });                     // a tid twice
-  expect_closed([&] { owner->gap(0, 3); });                  // what is here
-  expect_closed([&] { owner->say(theirs, net::Frame()); });  // unasked
-  expect_closed([&] { owner->sample({6, {}, {}}, std::vector<std::byte>(25)); });
+  expect_closed([&] { samples(5, 5); });                                    // a tid twice
+  expect_closed([&] { owner->send(gap_frame(0, 3)); });                     // what is here
+  expect_closed([&] { owner->send(opened_frame(net::Frame(), theirs)); });  // unasked
+  expect_closed([&] { owner->send_sample({6, {}, {}}, Bytes(25)); });
 }
 
 TEST_F(MirrorsTest, IgnoresWhatALaterVersionMaySay) {

@@ -8,7 +8,7 @@
 #include "daemon/remote/remote_writer.hpp"
 #include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
-#include "tests/unit/daemon/remote/fake_owner.hpp"
+#include "tests/unit/daemon/scripted_host.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -27,8 +27,7 @@ class Program {
   // Sample i has the time i and bytes of i. Returns its tid.
   Tid write(int i) {
     ring::RingWriter writer(*mapping_, *bell_, fds_[3].get());
-    return writer.write(std::vector<std::byte>(24, static_cast<std::byte>(i)), time_from_ns(i),
-                        Duration(1));
+    return writer.write(Bytes(24, static_cast<std::byte>(i)), time_from_ns(i), Duration(1));
   }
   OfferedFiles offer() const {
     std::vector<UniqueFd> copies;
@@ -53,7 +52,7 @@ class RemoteWritersTest : public testing::Test {
   ChannelParts parts{loop, resolver, registry, logger, self};
   std::unique_ptr<RemoteStreams<RemoteWriter>> writers =
       std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
-  std::unique_ptr<FakeOwner> owner = std::make_unique<FakeOwner>(loop);
+  std::unique_ptr<ScriptedHost> owner = std::make_unique<ScriptedHost>(loop);
   CreatePlan plan{odometry_type(), kHistory};
   StreamInfo theirs;
 
@@ -63,7 +62,7 @@ class RemoteWritersTest : public testing::Test {
     theirs.depth = 16;
     theirs.cycle = 10ms;
     theirs.incarnation = 7;
-    catalog.host_up(owner->host().greeting, owner->host().address);
+    catalog.host_up(owner->host().greeting, owner->address());
   }
 
   using Answer = std::optional<Result<OpenedRing>>;
@@ -83,20 +82,17 @@ class RemoteWritersTest : public testing::Test {
   }
   // Answers Open or Create, and StartPublishing. Returns the publisher's number.
   std::uint64_t serve(Tid last, bool created = false) {
-    net::Frame opened;
-    opened.set_serial(owner->take().serial());
-    wire::to_message(theirs, *opened.mutable_opened()->mutable_stream());
+    net::Frame opened = opened_frame(owner->receive(), theirs);
     opened.mutable_opened()->set_created(created);
     owner->send(opened);
-    const net::Frame start = owner->take();
+    const net::Frame start = owner->receive();
     EXPECT_TRUE(start.has_start_publishing());
     publishing(start, last);
     return start.start_publishing().publisher();
   }
   void publishing(const net::Frame& start, Tid last) {
     owner->take_samples(24);
-    net::Frame answer;
-    answer.set_serial(start.serial());
+    net::Frame answer = answer_to(start);
     answer.mutable_publishing()->set_last(last);
     owner->send(answer);
   }
@@ -119,9 +115,9 @@ class RemoteWritersTest : public testing::Test {
   }
   std::vector<int> times() {
     std::vector<int> times;
-    for (const FakeOwner::Published& one : owner->published) {
+    for (const ScriptedHost::Published& one : owner->published) {
       times.push_back(static_cast<int>(to_ns(one.info.time)));
-      EXPECT_EQ(one.payload, std::vector<std::byte>(24, static_cast<std::byte>(times.back())));
+      EXPECT_EQ(one.payload, Bytes(24, static_cast<std::byte>(times.back())));
     }
     return times;
   }
@@ -129,14 +125,14 @@ class RemoteWritersTest : public testing::Test {
 
 TEST_F(RemoteWritersTest, CreatesTheStreamAtItsOwnerAndPublishes) {
   const auto answer = open(&plan);
-  const net::Frame create = owner->take();
+  const net::Frame create = owner->receive();
   ASSERT_TRUE(create.has_create());
   EXPECT_EQ(create.create().id().name(), "odometry");
   EXPECT_EQ(create.create().depth(), kHistory.depth);
   EXPECT_EQ(create.create().cycle_ns(), to_ns(kHistory.cycle));
   EXPECT_EQ(create.create().type().name(), "Odometry");
-  owner->say(theirs, create);
-  publishing(owner->take(), -1);
+  owner->send(opened_frame(create, theirs));
+  publishing(owner->receive(), -1);
   const OpenedRing writer = wait(answer);
   EXPECT_FALSE(writer.created);
   EXPECT_EQ(writer.stream->id(), kOdometry);
@@ -175,7 +171,7 @@ TEST_F(RemoteWritersTest, GoesOnWithTheTidsOfTheOwnersRing) {
 
 TEST_F(RemoteWritersTest, OpensAnExistingStreamWithoutCreatingIt) {
   const auto answer = open(nullptr);
-  const net::Frame request = owner->take();
+  const net::Frame request = owner->receive();
   EXPECT_TRUE(request.has_open());
   owner->fail(request, Errc::not_found, "there is no stream 'odometry:0@pc2'");
   EXPECT_EQ(wait_error(answer).code, Errc::not_found);
@@ -186,7 +182,7 @@ TEST_F(RemoteWritersTest, OpensAnExistingStreamWithoutCreatingIt) {
 // One is refused, the other not.
 TEST_F(RemoteWritersTest, AsksForEachWhoWaitsWhatItWants) {
   const auto opening = open(nullptr), creating = open(&plan);
-  owner->fail(owner->take(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
+  owner->fail(owner->receive(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
   EXPECT_EQ(wait_error(opening).code, Errc::not_found);
   EXPECT_FALSE(creating->has_value());
   serve(-1, true);
@@ -195,7 +191,7 @@ TEST_F(RemoteWritersTest, AsksForEachWhoWaitsWhatItWants) {
 
 TEST_F(RemoteWritersTest, HandsOnThatTheTypeDiffers) {
   const auto answer = open(&plan);
-  owner->fail(owner->take(), Errc::type_mismatch, "it has 8 bytes");
+  owner->fail(owner->receive(), Errc::type_mismatch, "it has 8 bytes");
   EXPECT_EQ(wait_error(answer).code, Errc::type_mismatch);
 }
 
@@ -269,7 +265,7 @@ TEST_F(RemoteWritersTest, GoesOnInANewRingOfTheOwner) {
   owner->published.clear();
   owner->cut();
   theirs.incarnation = 8;  // came back without its ring
-  EXPECT_TRUE(owner->take().has_create()) << "so it is created again";
+  EXPECT_TRUE(owner->receive().has_create()) << "so it is created again";
 }
 
 TEST_F(RemoteWritersTest, PublishesIntoANewRingWhatWasNotPublished) {
@@ -340,9 +336,9 @@ TEST_F(RemoteWritersTest, IsJoinedWhileItDrains) {
 TEST_F(RemoteWritersTest, LeavesARemovedStreamAloneUntilItIsCreatedAgain) {
   const std::shared_ptr<Stream> stream = opened();
   Program program(*stream);
-  owner->removed();
+  owner->send(removed_frame());
   run_until(loop, [&] { return owner->connections() == 2; });  // it looks by itself
-  const net::Frame look = owner->take();
+  const net::Frame look = owner->receive();
   EXPECT_TRUE(look.has_open()) << "but does not create it";
   owner->fail(look, Errc::not_found, "there is no stream");
   program.write(0);
@@ -377,7 +373,7 @@ TEST_F(RemoteWritersTest, GoesOnWithARingThatAProgramKept) {
   const auto again = writers->adopt_untrusted(kOdometry, program->offer());
   ASSERT_TRUE(again) << again.error().message;
   EXPECT_EQ(stream->get(), again->get());
-  catalog.host_up(owner->host().greeting, owner->host().address);
+  catalog.host_up(owner->host().greeting, owner->address());
   // Sample 2 was written, and the word of it was lost with both.
   EXPECT_EQ(serve(2), publisher);
   until_published(3);
@@ -438,9 +434,9 @@ TEST_F(RemoteWritersTest, ClosesTheChannelOfAnOwnerThatBreaksTheProtocol) {
     ++connections;
     serve(0);
   };
-  expect_closed([&] { acknowledge(5); });                                          // never sent
-  expect_closed([&] { acknowledge(INT64_MAX); });                                  // nor that
-  expect_closed([&] { owner->sample({0, {}, {}}, std::vector<std::byte>(24)); });  // unasked
+  expect_closed([&] { acknowledge(5); });                              // never sent
+  expect_closed([&] { acknowledge(INT64_MAX); });                      // nor that
+  expect_closed([&] { owner->send_sample({0, {}, {}}, Bytes(24)); });  // unasked
   program.write(1);
   until_published(1);
 }
