@@ -33,7 +33,6 @@
 #include "daemon/link/network_listener.hpp"
 #include "daemon/link/resolver.hpp"
 #include "daemon/local/fleet_service.hpp"
-#include "daemon/local/listener.hpp"
 #include "daemon/local/local_service.hpp"
 #include "daemon/local/server.hpp"
 #include "daemon/remote/mirror.hpp"

@@ -21,7 +21,7 @@
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/fleet/found_host.hpp"
 #include "daemon/fleet/peers.hpp"
-#include "daemon/local/fleet.hpp"
+#include "daemon/local/local_requests.hpp"
 #include "daemon/remote/mirror.hpp"
 #include "daemon/remote/remote_streams.hpp"
 #include "daemon/remote/remote_writer.hpp"

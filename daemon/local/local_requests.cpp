@@ -6,9 +6,81 @@
 #include <utility>
 
 #include "core/base/try.hpp"
-#include "core/wire/local_protocol.hpp"
 
 namespace dssm::daemon {
+namespace {
+
+// Of a StreamList; the rest of a frame is for the response around it.
+constexpr std::size_t kMaxListBytes = wire::kMaxLocalFrameBytes - (1U << 20);
+
+Role role_of(bool for_writing) noexcept { return for_writing ? Role::writer : Role::reader; }
+
+// The descriptors of the oldest message that brought any.
+std::vector<UniqueFd> take_descriptors(DescriptorQueue& queue) {
+  if (queue.empty()) return {};
+  std::vector<UniqueFd> taken = std::move(queue.front());
+  queue.pop_front();
+  return taken;
+}
+
+// The memory files of an Offer, from its descriptors.
+//   fails  protocol: some are missing
+Result<OfferedFiles> offered_files(DescriptorQueue& queue, Role role) {
+  std::vector<UniqueFd> offered = take_descriptors(queue);
+  if (offered.size() < 3) {
+    return Error{Errc::protocol, "the request comes without its descriptors (ring, bell, meta)"};
+  }
+  OfferedFiles files{std::move(offered[0]), std::move(offered[1]), std::move(offered[2]), {}};
+  if (offered.size() > 3 && role == Role::writer) files.doorbell = std::move(offered[3]);
+  return files;
+}
+
+// Adds the other hosts' streams to the list of the own ones.
+Result<Reply> with_streams(Reply reply, std::vector<proto::Stream> streams) {
+  proto::StreamList& list = *reply.response.mutable_stream_list();
+  std::size_t bytes = list.ByteSizeLong();
+  for (proto::Stream& stream : streams) {
+    if (bytes + stream.ByteSizeLong() > kMaxListBytes) stream.mutable_type()->clear_fields();
+    bytes += stream.ByteSizeLong();
+    if (bytes > kMaxListBytes) {
+      return Error{Errc::limit_exceeded,
+                   "the list of all hosts' streams is longer than one message may be; ask for "
+                   "those of this host only"};
+    }
+    *list.add_streams() = std::move(stream);
+  }
+  return reply;
+}
+
+}  // namespace
+
+LocalRequests::LocalRequests(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
+                             Fleet* fleet)
+    : registry_(registry),
+      opens_(opens),
+      clock_(clock),
+      fleet_(fleet),
+      catalog_(registry, opens, kMaxListBytes) {}
+
+// An id without a host belongs to this one if it has such a stream.
+bool LocalRequests::is_elsewhere(const StreamId& id) const {
+  if (!fleet_) return false;
+  return id.host.empty() ? !registry_.knows(id) : id.host != registry_.host();
+}
+
+bool LocalRequests::waits_for_hosts(const local::Request& request) const {
+  if (!fleet_ || request.has_offer()) return false;
+  if (request.has_ping_host()) return true;
+  if (request.has_list()) return !request.list().own_only();
+  const proto::StreamId* named = subject(request);
+  if (!named) return false;
+  const Result<StreamId> id = wire::stream_id_untrusted(*named);
+  if (!id) return false;  // serve_untrusted() refuses it
+  // Without a host a stream is created here.
+  return is_elsewhere(*id) && !(request.has_create() && id->host.empty());
+}
+
+// --- this host
 
 Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::Request& request,
                                              DescriptorQueue& descriptors) {
@@ -19,15 +91,24 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
       return open(client, request.open());
     case local::Request::kOffer:
       return offer(client, request.offer(), descriptors);
-    case local::Request::kClose:
+    case local::Request::kClose: {
       DSSM_TRY(opens_.remove(client->number, request.close().handle()));
-      return done();
+      Reply done;
+      done.response.mutable_done();
+      return done;
+    }
     case local::Request::kOpenClock:
       return open_clock(request.open_clock(), descriptors);
     case local::Request::kListOpens:
       return list_opens();
     case local::Request::kGetDaemon:
       return get_daemon();
+    case local::Request::kListHosts:
+      if (fleet_) return list_hosts();
+      break;
+    case local::Request::kOpenClockPage:
+      if (fleet_) return open_clock_page();
+      break;
     default:
       break;
   }
@@ -38,9 +119,9 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
 
 Result<Reply> LocalRequests::create(const Client& client, const proto::Create& request) {
   DSSM_TRY(opens_.check_quota(*client));
-  const Registry::Created created = DSSM_TRY(catalog_.create_untrusted(request, client->pid));
-  Result<Reply> reply = opened(
-      opens_, {client, created.stream, Role::writer, request.tag(), request.id().host().empty()});
+  const OpenedRing created = DSSM_TRY(catalog_.create_untrusted(request, client->pid));
+  Result<Reply> reply =
+      opened({client, created.stream, Role::writer, request.tag(), request.id().host().empty()});
   if (reply) {
     reply->response.mutable_opened()->set_created(created.created);
   } else if (created.created) {
@@ -52,18 +133,22 @@ Result<Reply> LocalRequests::create(const Client& client, const proto::Create& r
 
 Result<Reply> LocalRequests::open(const Client& client, const proto::Open& request) {
   const std::shared_ptr<Stream> stream = DSSM_TRY(catalog_.find_untrusted(request.id()));
-  const Role role = request.for_writing() ? Role::writer : Role::reader;
-  return opened(opens_, {client, stream, role, request.tag(), request.id().host().empty()});
+  return opened(
+      {client, stream, role_of(request.for_writing()), request.tag(), request.id().host().empty()});
 }
 
 Result<Reply> LocalRequests::offer(const Client& client, const local::Offer& request,
                                    DescriptorQueue& descriptors) {
-  const Role role = request.for_writing() ? Role::writer : Role::reader;
+  const Role role = role_of(request.for_writing());
   OfferedFiles files = DSSM_TRY(offered_files(descriptors, role));
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.id()));
   DSSM_TRY(opens_.check_quota(*client));
-  const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.adopt_untrusted(id, std::move(files)));
-  return record_open(opens_, {client, stream, role, request.tag(), request.any_host()});
+  // An offer without a host is of this one: it may not know the stream after its restart.
+  const bool is_own = id.host.empty() || !is_elsewhere(id);
+  const std::shared_ptr<Stream> stream =
+      DSSM_TRY(is_own ? registry_.adopt_untrusted(id, std::move(files))
+                      : fleet_->adopt_untrusted(id, role, std::move(files)));
+  return record_open({client, stream, role, request.tag(), request.any_host()});
 }
 
 Result<Reply> LocalRequests::open_clock(const local::OpenClock& request,
@@ -78,6 +163,13 @@ Result<Reply> LocalRequests::open_clock(const local::OpenClock& request,
   Reply reply;
   reply.response.mutable_clock();
   reply.descriptors.push_back(DSSM_TRY(clock_.get()));
+  return reply;
+}
+
+Result<Reply> LocalRequests::open_clock_page() const {
+  Reply reply;
+  reply.response.mutable_clock_page();
+  reply.descriptors.push_back(DSSM_TRY(fleet_->clock_page()));
   return reply;
 }
 
@@ -96,6 +188,13 @@ Reply LocalRequests::list_opens() const {
   return reply;
 }
 
+Reply LocalRequests::list_hosts() const {
+  Reply reply;
+  local::HostList& list = *reply.response.mutable_host_list();
+  for (local::Host& host : fleet_->hosts()) *list.add_hosts() = std::move(host);
+  return reply;
+}
+
 Reply LocalRequests::get_daemon() const {
   Reply reply;
   local::Daemon& daemon = *reply.response.mutable_daemon();
@@ -105,6 +204,112 @@ Reply LocalRequests::get_daemon() const {
   daemon.set_streams(registry_.streams().size());
   daemon.set_memory_bytes(registry_.budget().used());
   daemon.set_memory_limit_bytes(registry_.budget().limit());
+  if (fleet_) *daemon.mutable_mdns() = fleet_->mdns();
+  return reply;
+}
+
+// --- other hosts
+
+void LocalRequests::ask_hosts_untrusted(const Client& client, const local::Request& request,
+                                        Answer answer) {
+  if (request.has_list()) return list_all(std::move(answer));
+  if (request.has_ping_host()) return ping(request.ping_host().host(), std::move(answer));
+  const StreamId id = *wire::stream_id_untrusted(*subject(request));
+  if (request.has_create()) {
+    return create_elsewhere(client, id, request.create(), std::move(answer));
+  }
+  if (request.has_open()) return open_elsewhere(client, id, request.open(), std::move(answer));
+  fleet_->forward(id, request, [answer = std::move(answer)](Result<local::Response> response) {
+    if (!response) return answer(std::move(response).error());
+    answer(Reply{*std::move(response), {}});
+  });
+}
+
+void LocalRequests::create_elsewhere(const Client& client, const StreamId& id,
+                                     const proto::Create& request, Answer answer) {
+  const Result<TypeInfo> type = wire::type_untrusted(request.type());
+  if (!type) return answer(type.error());
+  if (Result<void> quota = opens_.check_quota(*client); !quota) return answer(quota.error());
+  const CreatePlan plan{*type, {request.depth(), Duration(request.cycle_ns())}};
+  fleet_->open_writer(
+      id, &plan,
+      [this, client, tag = request.tag(), answer = std::move(answer)](Result<OpenedRing> writer) {
+        if (!writer) return answer(std::move(writer).error());
+        Result<Reply> reply = opened({client, writer->stream, Role::writer, tag, false});
+        if (reply) reply->response.mutable_opened()->set_created(writer->created);
+        answer(std::move(reply));
+      });
+}
+
+void LocalRequests::open_elsewhere(const Client& client, const StreamId& id,
+                                   const proto::Open& request, Answer answer) {
+  if (Result<void> quota = opens_.check_quota(*client); !quota) return answer(quota.error());
+  OpenEntry entry{client, nullptr, role_of(request.for_writing()), request.tag(), id.host.empty()};
+  if (request.for_writing()) {
+    return fleet_->open_writer(
+        id, nullptr, [this, entry, answer = std::move(answer)](Result<OpenedRing> writer) mutable {
+          if (!writer) return answer(std::move(writer).error());
+          entry.stream = writer->stream;
+          answer(opened(entry));
+        });
+  }
+  fleet_->open_reader(id, [this, entry, answer = std::move(answer)](
+                              Result<std::shared_ptr<Stream>> stream) mutable {
+    if (!stream) return answer(std::move(stream).error());
+    entry.stream = *std::move(stream);
+    Result<Reply> reply = opened(entry);
+    if (reply) reply->response.mutable_opened()->set_mirror(true);
+    answer(std::move(reply));
+  });
+}
+
+void LocalRequests::list_all(Answer answer) {
+  // Shared, because functions that are handed around have to be copyable.
+  const auto own = std::make_shared<Reply>();
+  local::Request request;
+  request.mutable_list();
+  if (Result<void> listed = catalog_.serve_untrusted(request, own->response); !listed) {
+    return answer(std::move(listed).error());
+  }
+  fleet_->list([own, answer = std::move(answer)](Result<std::vector<proto::Stream>> streams) {
+    if (!streams) return answer(std::move(streams).error());
+    answer(with_streams(std::move(*own), *std::move(streams)));
+  });
+}
+
+void LocalRequests::ping(const std::string& host, Answer answer) {
+  if (host == registry_.host()) {  // this response shows that it is alive
+    Reply reply;
+    reply.response.mutable_round_trip();
+    return answer(std::move(reply));
+  }
+  fleet_->ping(host, [answer = std::move(answer)](Result<local::RoundTrip> round_trip) {
+    if (!round_trip) return answer(std::move(round_trip).error());
+    Reply reply;
+    *reply.response.mutable_round_trip() = *std::move(round_trip);
+    answer(std::move(reply));
+  });
+}
+
+// --- opens
+
+// Records that a client has a stream open. The reply comes without descriptors.
+Reply LocalRequests::record_open(const OpenEntry& entry) {
+  Reply reply;
+  proto::Opened& message = *reply.response.mutable_opened();
+  message.set_handle(opens_.add(entry));
+  wire::to_message(entry.stream->id(), *message.mutable_stream()->mutable_id());
+  wire::to_message(entry.stream->type(), *message.mutable_stream()->mutable_type());
+  return reply;
+}
+
+// The same, with the descriptors that go with a Create or an Open.
+//   fails  limit_exceeded (opens), os errors; then nothing is recorded
+Result<Reply> LocalRequests::opened(const OpenEntry& entry) {
+  DSSM_TRY(opens_.check_quota(*entry.client));
+  std::vector<UniqueFd> descriptors = DSSM_TRY(entry.stream->descriptors_for(entry.role));
+  Reply reply = record_open(entry);
+  reply.descriptors = std::move(descriptors);
   return reply;
 }
 

@@ -1,32 +1,117 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Serves what programs ask about this host's streams: the requests of catalog.proto through
-// CatalogRequests, and here what comes with descriptors or is about this dssmd. No sockets and no
-// events; LocalService decides when a request is served.
+// Serves the requests of the local protocol (local.proto), when LocalService passes them on: those
+// about the streams of this host, and through a Fleet those about other hosts and their streams. No
+// sockets and no events.
 #pragma once
 
+#include <deque>
 #include <dssm/result.hpp>
+#include <dssm/stream.hpp>
+#include <functional>
 #include <memory>
+#include <string>
+#include <vector>
 
-#include "daemon/local/reply.hpp"
+#include "core/base/unique_fd.hpp"
+#include "core/wire/local_protocol.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"
+#include "daemon/streams/stream.hpp"
 #include "local.pb.h"
 
 namespace dssm::daemon {
 
+// A response and the descriptors that go with it, in the order that local.proto says.
+struct Reply {
+  local::Response response;
+  std::vector<UniqueFd> descriptors;
+};
+
+// Descriptors that arrived, one element per message that brought some. A request that takes
+// descriptors takes the oldest element.
+using DescriptorQueue = std::deque<std::vector<UniqueFd>>;
+
+// The other hosts, as local requests concern them (FleetService). Results come by a callback that
+// is called once: later from the loop, or at once from within the call; never after the Fleet is
+// destroyed. An id without a host refers to the only other host that has such a stream; the caller
+// searches the own streams first.
+class Fleet {
+ public:
+  template <class T>
+  using Then = std::function<void(Result<T>)>;
+
+  // Notified of changes on other hosts.
+  class Observer {
+   public:
+    virtual void on_remote_stream_added(const StreamInfo& stream) = 0;
+    virtual void on_remote_stream_removed(const StreamId& id) = 0;
+    // Readers of `stream` (a mirror's ring) shall reopen it: there is a new ring.
+    virtual void on_ring_replaced(const Stream& stream) = 0;
+
+   protected:
+    ~Observer() = default;
+  };
+  virtual void observe(Observer* observer) = 0;  // nullptr: none
+
+  // Whether the other host that `id` names is there and has such a stream; without a host: whether
+  // exactly one other host has one.
+  virtual bool is_there(const StreamId& id) const = 0;
+
+  // The mirror of a stream, filled with its history. Kept while its Stream is in the OpenTable, and
+  // some seconds longer.
+  virtual void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) = 0;
+
+  // A ring of this host that is published into the other host's stream.
+  //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist
+  virtual void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) = 0;
+
+  // Takes back a mirror's or remote writer's ring that a program held while no dssmd ran.
+  virtual Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
+                                                          OfferedFiles files) = 0;
+
+  // Has the owner of the stream `id` serve `request`: Info, GetProperty, SetProperty or Remove. The
+  // response to Info has `mirror` when this host mirrors the stream.
+  virtual void forward(const StreamId& id, const local::Request& request,
+                       Then<local::Response> then) = 0;
+
+  // The streams of all other hosts, with fresh figures of those that answer within kFreshTimeout,
+  // in the order of hosts' names, then of creation.
+  static constexpr Duration kFreshTimeout = std::chrono::milliseconds(500);
+  virtual void list(Then<std::vector<proto::Stream>> then) = 0;
+  // What is in the catalog now, without a request to other hosts: for Watch.
+  virtual std::vector<StreamInfo> known_streams() const = 0;
+
+  virtual std::vector<local::Host> hosts() const = 0;  // this one first
+  virtual local::Mdns mdns() const = 0;                // the state of mDNS
+  // The page with the state of this PC's clock; not_found: it is not watched.
+  virtual Result<UniqueFd> clock_page() const = 0;
+  virtual void ping(const std::string& host, Then<local::RoundTrip> then) = 0;
+
+ protected:
+  ~Fleet() = default;
+};
+
 class LocalRequests {
  public:
-  LocalRequests(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock)
-      : registry_(registry),
-        opens_(opens),
-        clock_(clock),
-        catalog_(registry, opens, kMaxListBytes) {}
+  // What is given by reference outlives it.
+  //   fleet  nullptr: there are no other hosts
+  LocalRequests(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock, Fleet* fleet);
 
   using Client = std::shared_ptr<const ClientIdentity>;
+  // Called once: later, or at once. If the client has disconnected by then, its opens are removed
+  // again.
+  using Answer = std::function<void(Result<Reply>)>;
 
+  // Whether the response to `request` may have to wait for another host: it is a List of all hosts,
+  // a PingHost, or about a stream of another host. Offers never wait.
+  bool waits_for_hosts(const local::Request& request) const;
+
+  // Serves a request that waits for other hosts,
+  void ask_hosts_untrusted(const Client& client, const local::Request& request, Answer answer);
+  // and any other.
   //   fails  with the failure that is the response
   Result<Reply> serve_untrusted(const Client& client, const local::Request& request,
                                 DescriptorQueue& descriptors);
@@ -37,17 +122,31 @@ class LocalRequests {
   }
 
  private:
+  bool is_elsewhere(const StreamId& id) const;
   Result<Reply> create(const Client& client, const proto::Create& request);
   Result<Reply> open(const Client& client, const proto::Open& request);
   Result<Reply> offer(const Client& client, const local::Offer& request,
                       DescriptorQueue& descriptors);
   Result<Reply> open_clock(const local::OpenClock& request, DescriptorQueue& descriptors);
+  Result<Reply> open_clock_page() const;
   Reply list_opens() const;
+  Reply list_hosts() const;
   Reply get_daemon() const;
+
+  void create_elsewhere(const Client& client, const StreamId& id, const proto::Create& request,
+                        Answer answer);
+  void open_elsewhere(const Client& client, const StreamId& id, const proto::Open& request,
+                      Answer answer);
+  void list_all(Answer answer);
+  void ping(const std::string& host, Answer answer);
+
+  Result<Reply> opened(const OpenEntry& entry);
+  Reply record_open(const OpenEntry& entry);
 
   Registry& registry_;
   OpenTable& opens_;
   PlaybackClockOwner& clock_;
+  Fleet* const fleet_;
   CatalogRequests catalog_;
 };
 

@@ -10,13 +10,13 @@
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/base/message_ids.hpp"
-#include "daemon/streams/description.hpp"
+#include "daemon/streams/catalog_requests.hpp"
 
 namespace dssm::daemon {
 namespace {
 
-// What one client may have waiting during recovery.
-constexpr std::size_t kMaxHeldBytes = 1U << 20;
+// What one client may have deferred during recovery.
+constexpr std::size_t kMaxDeferredBytes = 1U << 20;
 
 local::Response failure_response(std::uint64_t serial, const Error& error) {
   local::Response response;
@@ -33,14 +33,12 @@ LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOw
       opens_(opens),
       clock_(clock),
       logger_(logger),
-      requests_(registry, opens, clock),
+      requests_(registry, opens, clock, fleet),
       fleet_(fleet),
       authorizer_(std::move(authorizer)),
       recovering_(recovering) {
   registry_.add_observer(*this);
-  if (!fleet_) return;
-  remote_.emplace(registry_.host(), *fleet_, opens_);
-  fleet_->observe(this);
+  if (fleet_) fleet_->observe(this);
 }
 
 LocalService::~LocalService() {
@@ -61,7 +59,7 @@ void LocalService::disconnect(ClientNumber number) {
   const auto client = clients_.extract(number);
   if (!client) return;
   opens_.remove_all(number);
-  std::erase_if(held_, [number](const Held& held) { return held.client == number; });
+  std::erase_if(deferred_, [number](const Deferred& one) { return one.client == number; });
   if (client.mapped().greeted) {
     logger_.debug("client disconnected", {.peer = client.mapped().identity->str()});
   }
@@ -87,11 +85,11 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
   if (Result<void> allowed = check_access(client, request); !allowed) {
     send_failure(client, serial, allowed.error());
   } else if (must_wait(request)) {
-    hold(client, request, frame.size());
+    defer(client, request, frame.size());
   } else {
     serve(number, request, descriptors);
     // Only an offer can end a wait.
-    if (recovering_ && (request.has_offer() || request.has_open_clock())) release_held();
+    if (recovering_ && (request.has_offer() || request.has_open_clock())) serve_deferred();
   }
   return true;
 }
@@ -145,41 +143,21 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
                          DescriptorQueue& descriptors) {
   if (request.has_watch()) return watch(number, request.serial());
   if (request.has_list_clients()) return list_clients(clients_.at(number), request.serial());
-  const auto own_knows = [this](const StreamId& id) { return registry_.knows(id); };
-  if (remote_ && remote_->takes(request, own_knows)) {
-    return serve_remote(number, request, descriptors);
-  }
   const auto identity = clients_.at(number).identity;
+  if (requests_.waits_for_hosts(request)) {
+    if (const LocalRequests::Answer answer = await(number, request.serial())) {
+      requests_.ask_hosts_untrusted(identity, request, answer);
+    }
+    return;
+  }
   Result<Reply> reply = requests_.serve_untrusted(identity, request, descriptors);
   if (request.has_offer()) log_offer(*identity, request.offer(), reply);
-  if (request.has_get_daemon() && reply && remote_) {
-    remote_->complete_daemon(*reply->response.mutable_daemon());
-  }
-  if (!reply || !remote_ || !request.has_list() || request.list().own_only()) {
-    return on_answer(number, request.serial(), std::move(reply));
-  }
-  if (const RemoteRequests::Answer answer = await(number, request.serial())) {
-    remote_->complete_list(*std::move(reply), answer);
-  }
-}
-
-void LocalService::serve_remote(ClientNumber number, const local::Request& request,
-                                DescriptorQueue& descriptors) {
-  const auto identity = clients_.at(number).identity;
-  if (request.has_offer()) {  // answered at once
-    return remote_->handle_untrusted(identity, request, descriptors, [&](Result<Reply> reply) {
-      log_offer(*identity, request.offer(), reply);
-      on_answer(number, request.serial(), std::move(reply));
-    });
-  }
-  if (const RemoteRequests::Answer answer = await(number, request.serial())) {
-    remote_->handle_untrusted(identity, request, descriptors, answer);
-  }
+  on_answer(number, request.serial(), std::move(reply));
 }
 
 // Takes the response of another host to the client; none when this client waits for too many
 // already: then it has got a failure.
-RemoteRequests::Answer LocalService::await(ClientNumber number, std::uint64_t serial) {
+LocalRequests::Answer LocalService::await(ClientNumber number, std::uint64_t serial) {
   Client& client = clients_.at(number);
   if (client.awaited >= kMaxAwaited) {
     send_failure(
@@ -222,31 +200,32 @@ void LocalService::log_offer(const ClientIdentity& client, const local::Offer& o
                {.peer = client.str(), .message_id = message_id::kStreamAdopted});
 }
 
+// First the existing streams, then the response: after a reconnect it shows the client that streams
+// which were not among them do not exist any more. All at once, unlike StreamWatch of other hosts:
+// the output of a program is bounded by kMaxQueuedBytes.
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
-  // First the existing streams, then the response: after a reconnect it tells the client that
-  // streams which were not among them do not exist any more.
+  std::vector<proto::StreamEvent> events;
   for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
-    const auto client = clients_.find(number);
-    if (client == clients_.end()) return;
-    Reply event;
-    describe(*stream, opens_, *event.response.mutable_stream_event()->mutable_stream());
-    send(client->second, 0, std::move(event));
+    events.push_back(added_event(*stream, opens_));
   }
   if (fleet_) {
     for (const StreamInfo& stream : fleet_->known_streams()) {
-      const auto client = clients_.find(number);
-      if (client == clients_.end()) return;
-      Reply event;
-      wire::to_message(stream, *event.response.mutable_stream_event()->mutable_stream());
-      send(client->second, 0, std::move(event));
+      wire::to_message(stream, *events.emplace_back().mutable_stream());
     }
+  }
+  for (proto::StreamEvent& event : events) {
+    const auto client = clients_.find(number);  // sending may end the connection
+    if (client == clients_.end()) return;
+    Reply reply;
+    *reply.response.mutable_stream_event() = std::move(event);
+    send(client->second, 0, std::move(reply));
   }
   const auto client = clients_.find(number);
   if (client == clients_.end()) return;
   client->second.watching = true;
-  Reply reply;
-  reply.response.mutable_done();
-  send(client->second, serial, std::move(reply));
+  Reply done;
+  done.response.mutable_done();
+  send(client->second, serial, std::move(done));
 }
 
 void LocalService::list_clients(const Client& client, std::uint64_t serial) {
@@ -288,9 +267,7 @@ void LocalService::broadcast(const proto::StreamEvent& event) {
 }
 
 void LocalService::on_stream_added(const Stream& stream) {
-  proto::StreamEvent event;
-  describe(stream, opens_, *event.mutable_stream());
-  broadcast(event);
+  broadcast(added_event(stream, opens_));
   logger_.debug("stream '" + stream.id().str() + "' is added",
                 {.stream = stream.id().str(), .message_id = message_id::kStreamCreated});
   notify_successors(stream.id());
@@ -298,10 +275,7 @@ void LocalService::on_stream_added(const Stream& stream) {
 
 void LocalService::on_stream_removed(const Stream& stream) {
   const StreamId& id = stream.id();
-  proto::StreamEvent event;
-  event.set_removed(true);
-  wire::to_message(id, *event.mutable_stream()->mutable_id());
-  broadcast(event);
+  broadcast(removed_event(id, stream.incarnation()));
   logger_.debug("stream '" + id.str() + "' is removed",
                 {.stream = id.str(), .message_id = message_id::kStreamRemoved});
   notify_successors(id);
@@ -315,10 +289,7 @@ void LocalService::on_remote_stream_added(const StreamInfo& stream) {
 }
 
 void LocalService::on_remote_stream_removed(const StreamId& id) {
-  proto::StreamEvent event;
-  event.set_removed(true);
-  wire::to_message(id, *event.mutable_stream()->mutable_id());
-  broadcast(event);
+  broadcast(removed_event(id));
   notify_successors(id);
 }
 
@@ -371,35 +342,36 @@ bool LocalService::must_wait(const local::Request& request) const {
   return id && !registry_.knows(*id);
 }
 
-void LocalService::hold(Client& client, const local::Request& request, std::size_t bytes) {
-  if (client.held_bytes + bytes > kMaxHeldBytes) {
+void LocalService::defer(Client& client, const local::Request& request, std::size_t bytes) {
+  if (client.deferred_bytes + bytes > kMaxDeferredBytes) {
     return send_failure(client, request.serial(),
                         {Errc::limit_exceeded,
                          "dssmd was restarted and waits for streams that programs give back; this "
                          "program has 1 MiB of requests waiting already: ask again in a second"});
   }
-  client.held_bytes += bytes;
-  held_.push_back({client.identity->number, request, bytes});
+  client.deferred_bytes += bytes;
+  deferred_.push_back({client.identity->number, request, bytes});
 }
 
-void LocalService::release_held() {
-  std::vector<Held> ready;
+void LocalService::serve_deferred() {
+  std::vector<Deferred> ready;
   const auto still_waiting = std::stable_partition(
-      held_.begin(), held_.end(), [this](const Held& held) { return must_wait(held.request); });
-  std::move(still_waiting, held_.end(), std::back_inserter(ready));
-  held_.erase(still_waiting, held_.end());
+      deferred_.begin(), deferred_.end(),
+      [this](const Deferred& deferred) { return must_wait(deferred.request); });
+  std::move(still_waiting, deferred_.end(), std::back_inserter(ready));
+  deferred_.erase(still_waiting, deferred_.end());
   DescriptorQueue none;
-  for (const Held& held : ready) {
-    const auto client = clients_.find(held.client);
+  for (const Deferred& deferred : ready) {
+    const auto client = clients_.find(deferred.client);
     if (client == clients_.end()) continue;
-    client->second.held_bytes -= held.bytes;
-    serve(held.client, held.request, none);
+    client->second.deferred_bytes -= deferred.bytes;
+    serve(deferred.client, deferred.request, none);
   }
 }
 
 void LocalService::end_recovery() {
   recovering_ = false;
-  release_held();
+  serve_deferred();
 }
 
 }  // namespace dssm::daemon

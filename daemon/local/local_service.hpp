@@ -14,9 +14,9 @@
 // another host only for those that named none.
 //
 // After a crash of the dssmd before this one, programs that still hold streams reconnect and offer
-// them. Until end_recovery() a Watch, and a request about a stream that is not offered yet, is held
-// back, not refused: otherwise a restarted writer could take the name of a ring that others still
-// use.
+// them. Until end_recovery() a Watch, and a request about a stream that is not offered yet, is
+// deferred, not refused: otherwise a restarted writer could take the name of a ring that others
+// still use.
 #pragma once
 
 #include <cstddef>
@@ -30,9 +30,7 @@
 
 #include "core/base/unique_fd.hpp"
 #include "daemon/base/log.hpp"
-#include "daemon/local/fleet.hpp"
 #include "daemon/local/local_requests.hpp"
-#include "daemon/local/remote_requests.hpp"
 #include "daemon/streams/authorize.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
@@ -70,12 +68,12 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   std::size_t clients() const noexcept { return clients_.size(); }
 
   // One frame of a client, without its length. The response goes to its output before this returns,
-  // or later for a request that is held back.
+  // or later for a request that is deferred.
   //   returns  false: the client does not keep to the protocol, the connection must end
   bool on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
                           DescriptorQueue& descriptors);
 
-  // The time to offer streams is over: held requests are answered.
+  // The time to offer streams is over: deferred requests are answered.
   void end_recovery();
 
  private:
@@ -84,10 +82,10 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
     ClientOutput* output = nullptr;
     bool greeted = false;
     bool watching = false;
-    std::size_t held_bytes = 0;
+    std::size_t deferred_bytes = 0;
     std::size_t awaited = 0;  // answers of other hosts
   };
-  struct Held {
+  struct Deferred {
     ClientNumber client = 0;
     local::Request request;
     std::size_t bytes = 0;
@@ -97,9 +95,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   Result<void> check_access(const Client& client, const local::Request& request) const;
   bool greet(Client& client, std::uint64_t serial, const proto::Hello& hello);
   void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
-  void serve_remote(ClientNumber number, const local::Request& request,
-                    DescriptorQueue& descriptors);
-  RemoteRequests::Answer await(ClientNumber number, std::uint64_t serial);
+  LocalRequests::Answer await(ClientNumber number, std::uint64_t serial);
   void on_answer(ClientNumber number, std::uint64_t serial, Result<Reply> reply);
   void log_offer(const ClientIdentity& client, const local::Offer& offer,
                  const Result<Reply>& reply);
@@ -110,8 +106,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void broadcast(const proto::StreamEvent& event);
 
   bool must_wait(const local::Request& request) const;
-  void hold(Client& client, const local::Request& request, std::size_t bytes);
-  void release_held();
+  void defer(Client& client, const local::Request& request, std::size_t bytes);
+  void serve_deferred();
 
   void on_stream_added(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
@@ -128,12 +124,11 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   Logger& logger_;
   LocalRequests requests_;
   Fleet* fleet_;
-  std::optional<RemoteRequests> remote_;  // with a fleet
   const Authorizer authorizer_;
   bool recovering_;
   ClientNumber next_client_ = 1;
   std::map<ClientNumber, Client> clients_;
-  std::vector<Held> held_;  // in the order of arrival
+  std::vector<Deferred> deferred_;  // in the order of arrival
 };
 
 }  // namespace dssm::daemon

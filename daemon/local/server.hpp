@@ -1,25 +1,124 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Accepts the programs of this PC, within max_clients, and owns their connections.
+// The Unix socket that programs of this PC connect to, and their connections. LocalService serves
+// the requests.
+//
+//   Listener    the socket
+//   Connection  one program: cuts its bytes into frames, and sends the responses
+//   Server      accepts programs, and owns their connections
 #pragma once
 
+#include <sys/types.h>
+
+#include <cstddef>
 #include <cstdint>
+#include <deque>
 #include <dssm/result.hpp>
+#include <functional>
 #include <map>
 #include <memory>
+#include <optional>
 #include <string>
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
+#include "core/wire/frame.hpp"
 #include "daemon/base/acceptor.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
-#include "daemon/local/connection.hpp"
-#include "daemon/local/listener.hpp"
 #include "daemon/local/local_service.hpp"
 
 namespace dssm::daemon {
 
+// The listening socket. Its owner also holds the lock on the folder (RuntimeDir), so an existing
+// socket file is that of a dssmd that was killed, or of a socket that the service manager passed.
+// The latter is used as it is and not removed: programs that connect while no dssmd runs wait
+// there.
+class Listener {
+ public:
+  // Listens at `path` with that group (none: keep it) and mode; no program can connect before both
+  // are set. inherited: the socket that the service manager passed for `path`; none: makes one.
+  static Result<Listener> open(const std::string& path, std::optional<gid_t> group, mode_t mode,
+                               UniqueFd inherited = {});
+
+  Listener(Listener&&) = default;
+  Listener& operator=(Listener&&) = delete;
+  ~Listener();  // removes the socket file, unless it was inherited
+
+  int fd() const noexcept { return fd_.get(); }
+
+  // A socket file was there: the dssmd before this one did not end properly.
+  bool predecessor_died() const noexcept { return predecessor_died_; }
+
+  // The service manager passed it. Then it is unknown whether a dssmd ran before.
+  bool inherited() const noexcept { return inherited_; }
+
+ private:
+  Listener(std::string path, UniqueFd fd) : path_(std::move(path)), fd_(std::move(fd)) {}
+  Result<void> allow(std::optional<gid_t> group, mode_t mode) const;
+  std::string path_;
+  UniqueFd fd_;
+  bool predecessor_died_ = false;
+  bool inherited_ = false;
+};
+
+// Bytes that wait for one client. A list of all streams has at most 16 MiB.
+inline constexpr std::size_t kMaxQueuedBytes = 64U << 20;
+
+// Descriptors that wait for one client; from this number on its requests wait, too.
+inline constexpr std::size_t kMaxQueuedDescriptors = 256;
+
+// Descriptors that a client sent and that no request has taken yet; more are an error.
+inline constexpr std::size_t kMaxUnclaimedDescriptors = 64;
+
+// Requests of one client served in a row before others get their turn.
+inline constexpr int kRequestsPerTurn = 16;
+
+// One client's socket: cuts its bytes into frames for LocalService and sends the responses. It
+// never waits for the client. What the client does not receive is queued up to kMaxQueuedBytes,
+// then the connection is closed; an error closes this connection only.
+class Connection final : public ClientOutput {
+ public:
+  // on_closed: called once, when the connection ended by itself; the connection must not be
+  // destroyed within it.
+  Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
+             LocalService& service, Logger& logger, std::function<void()> on_closed);
+  Connection(const Connection&) = delete;
+  Connection& operator=(const Connection&) = delete;
+  ~Connection();
+
+  void send(const std::string& frame, std::vector<UniqueFd> descriptors) override;
+
+ private:
+  struct Outgoing {
+    std::string frame;
+    std::size_t sent = 0;
+    std::vector<UniqueFd> descriptors;
+  };
+
+  void on_readable();
+  void on_writable();
+  void serve_frames();
+  bool take_descriptors(std::vector<UniqueFd> arrived);
+  bool send_some(Outgoing& outgoing);
+  void end_with(const Error& error);
+  void close();
+  bool is_open() const noexcept { return static_cast<bool>(socket_); }
+  bool is_paused() const noexcept { return queued_descriptors_ >= kMaxQueuedDescriptors; }
+
+  UniqueFd socket_;
+  LocalService& service_;
+  Logger& logger_;
+  std::function<void()> on_closed_;
+  ClientNumber number_;
+  wire::FrameBuffer input_;
+  DescriptorQueue arrived_;
+  std::deque<Outgoing> output_;
+  std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
+  EventSource readable_, writable_, next_turn_;
+};
+
+// Accepts the programs of this PC, within max_clients, and owns their connections.
 class Server {
  public:
   // Serves from the construction on; everything given by reference outlives it.

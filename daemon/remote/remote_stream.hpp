@@ -30,8 +30,8 @@
 #include "daemon/fleet/clock_assessor.hpp"
 #include "daemon/link/dialer.hpp"
 #include "daemon/link/resolver.hpp"
-#include "daemon/streams/create_plan.hpp"
 #include "daemon/streams/registry.hpp"
+#include "daemon/streams/stream.hpp"
 
 namespace dssm::daemon {
 

@@ -3,17 +3,20 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <utility>
 
 #include "core/base/try.hpp"
 #include "daemon/base/message_ids.hpp"
-#include "daemon/streams/description.hpp"
+#include "daemon/streams/catalog_requests.hpp"
 
 namespace dssm::daemon {
 namespace {
 
 // What receivers take of a frame, less what frames a list.
 constexpr std::size_t kMaxPlainListBytes = wire::kMaxPlainBytes - (4U << 10);
+
+constexpr std::uint64_t kReserveSliceBytes = 4U << 20;  // about 1 ms
 
 bool opens_a_stream(const net::Frame& request) noexcept {
   return request.has_open() || request.has_create();
@@ -178,7 +181,7 @@ void DataCommunicator::send_failure(std::uint64_t serial, const Error& error) {
 Result<void> DataCommunicator::open(const net::Frame& request) {
   std::shared_ptr<Stream> stream = DSSM_TRY(catalog_.find_untrusted(request.open().id()));
   DSSM_TRY(check_clock(stream->id()));
-  opening_ = {request.serial(), std::move(stream), false, std::nullopt};
+  opening_ = {request.serial(), std::move(stream), false};
   return go_on_opening();
 }
 
@@ -189,10 +192,23 @@ Result<void> DataCommunicator::check_clock(const StreamId& id) const {
 Result<void> DataCommunicator::create(const net::Frame& request) {
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.create().id()));
   DSSM_TRY(check_clock(id));
-  const Registry::Created created = DSSM_TRY(catalog_.create_untrusted(request.create(), 0));
-  opening_ = {request.serial(), created.stream, created.created, std::nullopt};
-  if (created.created) opening_->reservation.emplace(created.stream);
+  const OpenedRing created = DSSM_TRY(catalog_.create_untrusted(request.create(), 0));
+  opening_ = {request.serial(), created.stream, created.created};
   return go_on_opening();
+}
+
+// Takes a slice of a new ring's memory from the system, before anything is written to it, as the
+// library does for the programs of this PC: dssmd itself writes to this ring, and would be killed
+// by a page that cannot be had. A gigabyte takes a quarter of a second, so it is one slice per turn
+// of the loop. True when it was the last one.
+//   fails  no_memory
+Result<bool> DataCommunicator::reserve_some() {
+  Stream& stream = *opening_->stream;
+  const std::uint64_t total_bytes = stream.mapping().geometry().total_bytes;
+  const std::uint64_t slice = std::min(total_bytes - opening_->reserved_bytes, kReserveSliceBytes);
+  DSSM_TRY(stream.reserve(opening_->reserved_bytes, slice));
+  opening_->reserved_bytes += slice;
+  return opening_->reserved_bytes == total_bytes;
 }
 
 Result<void> DataCommunicator::go_on_opening() {
@@ -201,8 +217,8 @@ Result<void> DataCommunicator::go_on_opening() {
     opening_.reset();
     return Error{Errc::not_found, "stream '" + id + "' was removed meanwhile; create it again"};
   }
-  if (opening_->reservation) {
-    const Result<bool> reserved = opening_->reservation->go_on();
+  if (opening_->created) {
+    const Result<bool> reserved = reserve_some();
     if (!reserved) {
       static_cast<void>(parts_.registry.remove(opening_->stream->id()));
       opening_.reset();
@@ -330,6 +346,53 @@ void DataCommunicator::log_end(const Error& why) {
                   sent.torn, channel_->lost(), received.samples, received.copied_payload_bytes,
                   received.direct_payload_bytes),
       {.stream = id, .peer = peer_address_});
+}
+
+// --- watching
+
+StreamWatch::StreamWatch(const Registry& registry, const OpenTable& opens, FrameConnection& link,
+                         std::uint64_t serial)
+    : opens_(opens),
+      link_(link),
+      serial_(serial),
+      pending_(registry.streams().begin(), registry.streams().end()) {}
+
+bool StreamWatch::work() {
+  for (int sent = 0; !pending_.empty() && link_.output_empty(); ++sent) {
+    if (sent == kStreamsPerTurn) return true;
+    const std::shared_ptr<const Stream> stream = pending_.front().lock();
+    pending_.pop_front();
+    if (stream && !stream->removed()) send_added(*stream);
+  }
+  if (!pending_.empty() || serial_ == 0) return false;
+  net::Frame done;
+  done.set_serial(serial_);
+  done.mutable_done();
+  serial_ = 0;
+  link_.send(done);
+  return false;
+}
+
+void StreamWatch::send_added(const Stream& stream) {
+  net::Frame frame;
+  *frame.mutable_stream_event() = added_event(stream, opens_);
+  link_.send(frame);
+}
+
+void StreamWatch::on_stream_added(const Stream& stream) {
+  if (pending_.empty()) {
+    send_added(stream);
+  } else {
+    pending_.push_back(stream.weak_from_this());
+  }
+}
+
+// Also for one whose addition was not sent yet: a receiver ignores the removal of an unknown
+// stream.
+void StreamWatch::on_stream_removed(const Stream& stream) {
+  net::Frame frame;
+  *frame.mutable_stream_event() = removed_event(stream.id(), stream.incarnation());
+  link_.send(frame);
 }
 
 }  // namespace dssm::daemon

@@ -9,6 +9,7 @@
 // and the others on the peer's side. So a peer that asks and never reads costs one answer.
 #pragma once
 
+#include <deque>
 #include <dssm/result.hpp>
 #include <memory>
 #include <optional>
@@ -20,16 +21,42 @@
 #include "daemon/base/log.hpp"
 #include "daemon/link/frame_connection.hpp"
 #include "daemon/serve/peer_table.hpp"
-#include "daemon/serve/ring_reservation.hpp"
 #include "daemon/serve/served_stream.hpp"
 #include "daemon/serve/stream_channel.hpp"
-#include "daemon/serve/stream_watch.hpp"
 #include "daemon/streams/authorize.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
 
 namespace dssm::daemon {
+
+// One control connection that watches the streams of this host: first an event for each existing
+// stream, then the response to Watch, then changes. The first events are sent as fast as the peer
+// receives them, so that thousands of streams need no memory for a queue.
+class StreamWatch {
+ public:
+  // Events sent in a row before others get their turn.
+  static constexpr int kStreamsPerTurn = 64;
+
+  // All outlive it.
+  StreamWatch(const Registry& registry, const OpenTable& opens, FrameConnection& link,
+              std::uint64_t serial);
+
+  // Sends events while the link takes them. True when others should have their turn and work() be
+  // called again; else nothing is left, or on_output_empty() comes.
+  bool work();
+
+  void on_stream_added(const Stream& stream);
+  void on_stream_removed(const Stream& stream);
+
+ private:
+  void send_added(const Stream& stream);
+
+  const OpenTable& opens_;
+  FrameConnection& link_;
+  std::uint64_t serial_;  // of Watch; 0: answered
+  std::deque<std::weak_ptr<const Stream>> pending_;
+};
 
 class DataCommunicator final : private FrameConnection::Observer, private StreamChannel::Observer {
  public:
@@ -85,7 +112,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     std::uint64_t serial = 0;
     std::shared_ptr<Stream> stream;
     bool created = false;
-    std::optional<RingReservation> reservation;
+    std::uint64_t reserved_bytes = 0;  // of the ring, when it is created here
   };
 
   Result<void> on_frame(net::Frame& frame) override;
@@ -104,6 +131,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   Result<void> create(const net::Frame& request);
   Result<void> check_clock(const StreamId& id) const;
   Result<void> go_on_opening();
+  Result<bool> reserve_some();
   void send_failure(std::uint64_t serial, const Error& error);
   void check_peer_timeout();
   std::string peer() const;

@@ -7,11 +7,45 @@
 
 #include "core/base/try.hpp"
 #include "core/wire/messages.hpp"
-#include "daemon/streams/description.hpp"
 #include "local.pb.h"
 #include "network.pb.h"
 
 namespace dssm::daemon {
+namespace {
+
+void describe_users(const Stream& stream, const OpenTable& opens, proto::Stream& out) {
+  for (const StreamUser& user : opens.users(stream)) {
+    proto::User& message = *out.add_users();
+    message.set_pid(user.pid);
+    message.set_uid(user.uid);
+    message.set_program(user.program);
+    message.set_writer(user.role == Role::writer);
+  }
+}
+
+}  // namespace
+
+void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out) {
+  StreamInfo info = stream.info();
+  const OpenTable::Counts counts = opens.counts(stream);
+  info.writers = counts.writers;
+  info.readers = counts.readers;
+  wire::to_message(info, out);
+}
+
+proto::StreamEvent added_event(const Stream& stream, const OpenTable& opens) {
+  proto::StreamEvent event;
+  describe(stream, opens, *event.mutable_stream());
+  return event;
+}
+
+proto::StreamEvent removed_event(const StreamId& id, std::uint64_t incarnation) {
+  proto::StreamEvent event;
+  event.set_removed(true);
+  wire::to_message(id, *event.mutable_stream()->mutable_id());
+  event.mutable_stream()->set_incarnation(incarnation);
+  return event;
+}
 
 Error unknown_request(const std::string& host) {
   return {Errc::protocol, fmt::format("dssmd of host '{}' ({}) does not know this request; install "
@@ -29,7 +63,9 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
   switch (request.body_case()) {
     case Request::kInfo: {
       const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.find(id));
-      describe_with_users(*stream, opens_, *response.mutable_stream_list()->add_streams());
+      proto::Stream& out = *response.mutable_stream_list()->add_streams();
+      describe(*stream, opens_, out);
+      describe_users(*stream, opens_, out);
       return {};
     }
     case Request::kRemove:
@@ -42,7 +78,13 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
       return {};
     case Request::kGetProperty: {
       const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.find(id));
-      response.mutable_property()->set_property(DSSM_TRY(property_of(*stream)));
+      std::string property = DSSM_TRY(stream->property(), "stream '" + stream->id().str() + "'");
+      if (property.empty()) {
+        return Error{Errc::not_found,
+                     fmt::format("stream '{}' has no property set; `dssmctl property set` sets one",
+                                 stream->id().str())};
+      }
+      response.mutable_property()->set_property(std::move(property));
       return {};
     }
     default:
@@ -59,15 +101,22 @@ Result<std::shared_ptr<Stream>> CatalogRequests::find_untrusted(const proto::Str
   return registry_.find(DSSM_TRY(wire::stream_id_untrusted(id)));
 }
 
-Result<Registry::Created> CatalogRequests::create_untrusted(const proto::Create& request,
-                                                            std::int32_t creator_pid) {
+Result<OpenedRing> CatalogRequests::create_untrusted(const proto::Create& request,
+                                                     std::int32_t creator_pid) {
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.id()));
   const TypeInfo type = DSSM_TRY(wire::type_untrusted(request.type()));
   return registry_.create(id, type, {request.depth(), Duration(request.cycle_ns())}, creator_pid);
 }
 
+// In the order of creation. Beyond max_list_bytes_ the fields of types are left out.
 Result<void> CatalogRequests::list(proto::StreamList& out) const {
-  describe_all(registry_, opens_, max_list_bytes_, out);
+  std::size_t bytes = 0;
+  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
+    proto::Stream& entry = *out.add_streams();
+    describe(*stream, opens_, entry);
+    if (bytes + entry.ByteSizeLong() > max_list_bytes_) entry.mutable_type()->clear_fields();
+    bytes += entry.ByteSizeLong();
+  }
   if (out.ByteSizeLong() <= max_list_bytes_) return {};
   return Error{Errc::limit_exceeded,
                fmt::format("the list of the {} streams of host '{}' is longer than one message may "

@@ -4,8 +4,8 @@
 // (LocalService) and for other hosts (DataCommunicator) alike. Both protocols carry these messages
 // in fields of the same names, so one template serves local::Request and net::Frame.
 //
-// Stateless. Watch, which has state, and what a created or opened stream means to a connection
-// (descriptors, or a channel) belong to the two callers.
+// Watch, which has state, and what a created or opened stream means to a connection (descriptors,
+// or a channel) belong to the two callers.
 #pragma once
 
 #include <cstddef>
@@ -15,11 +15,20 @@
 #include <string>
 
 #include "catalog.pb.h"
+#include "common.pb.h"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
 
 namespace dssm::daemon {
 
+// The stream as it is at this moment, with how many programs and channels use it.
+void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out);
+
+// The events that Watch is answered with, to programs and hosts alike.
+proto::StreamEvent added_event(const Stream& stream, const OpenTable& opens);
+proto::StreamEvent removed_event(const StreamId& id, std::uint64_t incarnation = 0);
+
+// Stateless.
 class CatalogRequests {
  public:
   // max_list_bytes: of a StreamList that fits into a frame. Both references outlive this.
@@ -38,8 +47,7 @@ class CatalogRequests {
   // For Open and Create.
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
   //   creator_pid  of the program of this host; 0: another host creates it
-  Result<Registry::Created> create_untrusted(const proto::Create& request,
-                                             std::int32_t creator_pid);
+  Result<OpenedRing> create_untrusted(const proto::Create& request, std::int32_t creator_pid);
 
  private:
   Result<void> list(proto::StreamList& out) const;

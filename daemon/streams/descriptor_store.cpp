@@ -7,7 +7,7 @@
 #include <utility>
 
 #include "daemon/base/message_ids.hpp"
-#include "daemon/streams/memory_file.hpp"
+#include "daemon/streams/memory_files.hpp"
 
 namespace dssm::daemon {
 namespace {

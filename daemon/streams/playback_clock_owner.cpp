@@ -4,7 +4,7 @@
 #include "core/base/sealed_memory.hpp"
 #include "core/base/try.hpp"
 #include "core/clock/playback_record.hpp"
-#include "daemon/streams/memory_file.hpp"
+#include "daemon/streams/memory_files.hpp"
 
 namespace dssm::daemon {
 

@@ -40,13 +40,13 @@ Result<RingQuota> Registry::acquire_quota() {
   return RingQuota(other_rings_);
 }
 
-Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& type,
-                                           const History& history, std::int32_t creator_pid) {
+Result<OpenedRing> Registry::create(const StreamId& id, const TypeInfo& type,
+                                    const History& history, std::int32_t creator_pid) {
   const StreamId own = DSSM_TRY(own_id(id));
   const std::string context = "stream '" + own.str() + "'";
   if (const auto found = by_name_.find(Key{own.name, own.id}); found != by_name_.end()) {
     DSSM_TRY(found->second->type().check_usable_as(type), context);
-    return Created{found->second, false};
+    return OpenedRing{found->second, false};
   }
   if (history.cycle <= Duration::zero()) {
     return Error{Errc::invalid_argument, context + ": its cycle is " +
@@ -58,7 +58,7 @@ Result<Registry::Created> Registry::create(const StreamId& id, const TypeInfo& t
       Stream::create({own, type, history.depth, history.cycle, creator_pid, next_order_}, budget_),
       context);
   add(stream);
-  return Created{std::move(stream), true};
+  return OpenedRing{std::move(stream), true};
 }
 
 Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, OfferedFiles files) {

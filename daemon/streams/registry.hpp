@@ -15,7 +15,6 @@
 #include <vector>
 
 #include "daemon/base/memory_budget.hpp"
-#include "daemon/streams/ring_quota.hpp"
 #include "daemon/streams/stream.hpp"
 
 namespace dssm::daemon {
@@ -28,6 +27,25 @@ class StreamObserver {
 
  protected:
   ~StreamObserver() = default;
+};
+
+// One ring's share of max_streams, for a ring that is not in the Registry: a mirror's, a remote
+// writer's. Held while the object exists.
+class RingQuota {
+ public:
+  RingQuota() = default;
+  explicit RingQuota(std::uint64_t& used) noexcept : used_(&used) { ++used; }  // outlives it
+  RingQuota(RingQuota&& other) noexcept : used_(std::exchange(other.used_, nullptr)) {}
+  RingQuota& operator=(RingQuota&& other) noexcept {
+    std::swap(used_, other.used_);
+    return *this;
+  }
+  ~RingQuota() {
+    if (used_) --*used_;
+  }
+
+ private:
+  std::uint64_t* used_ = nullptr;
 };
 
 class Registry {
@@ -72,12 +90,8 @@ class Registry {
 
   // Creates a stream, or gives the one of that name when the type fits.
   //   fails  invalid_argument, type_mismatch, limit_exceeded, os errors
-  struct Created {
-    std::shared_ptr<Stream> stream;
-    bool created = false;
-  };
-  Result<Created> create(const StreamId& id, const TypeInfo& type, const History& history,
-                         std::int32_t creator_pid);
+  Result<OpenedRing> create(const StreamId& id, const TypeInfo& type, const History& history,
+                            std::int32_t creator_pid);
 
   // Takes back a stream that a client kept while no dssmd ran. Returns the registered stream when
   // it has the same ring.

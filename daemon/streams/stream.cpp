@@ -14,7 +14,7 @@
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "core/wire/local_protocol.hpp"
-#include "daemon/streams/memory_file.hpp"
+#include "daemon/streams/memory_files.hpp"
 
 namespace dssm::daemon {
 namespace {

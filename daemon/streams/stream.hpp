@@ -21,7 +21,7 @@
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "daemon/base/memory_budget.hpp"
-#include "daemon/streams/meta_file.hpp"
+#include "daemon/streams/memory_files.hpp"
 
 namespace dssm::daemon {
 
@@ -48,6 +48,21 @@ enum class Purpose : std::uint8_t {
   own,            // the stream is this host's
   mirror,         // repeats the ring of another host; no program gets it for writing
   remote_writer,  // what programs write to it is published into the stream of another host
+};
+
+// What a program wants of a stream that is to be created unless it is there.
+struct CreatePlan {
+  TypeInfo type;
+  History history;
+};
+
+class Stream;
+
+// A ring of this host that a program or channel may use now: of an own stream, a mirror or a remote
+// writer.
+struct OpenedRing {
+  std::shared_ptr<Stream> stream;  // its id names the owner's host
+  bool created = false;            // this open created the owner's stream
 };
 
 class Stream : public std::enable_shared_from_this<Stream> {

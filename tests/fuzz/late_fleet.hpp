@@ -8,7 +8,7 @@
 #include <utility>
 #include <vector>
 
-#include "daemon/local/fleet.hpp"
+#include "daemon/local/local_requests.hpp"
 #include "daemon/streams/registry.hpp"
 
 namespace dssm::daemon {

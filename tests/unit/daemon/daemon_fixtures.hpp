@@ -13,7 +13,7 @@
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/local_protocol.hpp"
-#include "daemon/streams/memory_file.hpp"
+#include "daemon/streams/memory_files.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
 

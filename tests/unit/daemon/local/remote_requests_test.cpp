@@ -2,12 +2,11 @@
 //
 // What programs ask about other hosts, with a fleet that answers when the test says: which requests
 // go there, what comes back, who is told of changes, and what happens to those who do not wait.
-#include "daemon/local/remote_requests.hpp"
-
 #include <gtest/gtest.h>
 
 #include <set>
 
+#include "daemon/local/local_requests.hpp"
 #include "tests/unit/daemon/local/fake_client.hpp"
 
 namespace dssm::daemon {

@@ -59,7 +59,7 @@ class ServerRig {
   std::shared_ptr<Stream> create(const std::string& name, std::uint64_t payload_bytes = 24,
                                  std::uint64_t depth = 16) {
     TypeInfo type{"", payload_bytes, 8, {}};
-    const Result<Registry::Created> created =
+    const Result<OpenedRing> created =
         registry.create({name, 0, ""}, type, {depth, std::chrono::milliseconds(10)}, 42);
     EXPECT_TRUE(created) << created.error().message;
     return created ? created->stream : nullptr;

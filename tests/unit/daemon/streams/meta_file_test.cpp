@@ -2,8 +2,6 @@
 //
 // The meta file: it keeps what it is given, survives being killed while its content is replaced,
 // and is not believed when it comes from outside.
-#include "daemon/streams/meta_file.hpp"
-
 #include <fcntl.h>
 #include <gtest/gtest.h>
 #include <signal.h>
@@ -19,6 +17,7 @@
 
 #include "core/base/sealed_memory.hpp"
 #include "core/ring/ring_memory.hpp"
+#include "daemon/streams/memory_files.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 
 namespace dssm::daemon {

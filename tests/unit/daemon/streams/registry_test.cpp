@@ -23,7 +23,7 @@ namespace {
 const StreamId kOdometry{"odometry", 0, ""};
 
 std::shared_ptr<Stream> create(Registry& registry, const StreamId& id = kOdometry) {
-  Result<Registry::Created> created = registry.create(id, odometry_type(), kHistory, 42);
+  Result<OpenedRing> created = registry.create(id, odometry_type(), kHistory, 42);
   EXPECT_TRUE(created) << created.error().message;
   return created ? created->stream : nullptr;
 }
@@ -42,12 +42,11 @@ Errc code_of(const Result<std::shared_ptr<Stream>>& result) {
 
 TEST(Registry, CreatesAStreamOnceAndJoinsItAfterwards) {
   Registry registry("pc1", kLimits);
-  const Result<Registry::Created> first = registry.create(kOdometry, odometry_type(), kHistory, 42);
+  const Result<OpenedRing> first = registry.create(kOdometry, odometry_type(), kHistory, 42);
   ASSERT_TRUE(first) << first.error().message;
   EXPECT_TRUE(first->created);
   EXPECT_EQ(first->stream->id().str(), "odometry:0@pc1");
-  const Result<Registry::Created> second =
-      registry.create(kOdometry, odometry_type(), kHistory, 43);
+  const Result<OpenedRing> second = registry.create(kOdometry, odometry_type(), kHistory, 43);
   ASSERT_TRUE(second);
   EXPECT_FALSE(second->created);
   EXPECT_EQ(second->stream, first->stream);
@@ -64,7 +63,7 @@ TEST(Registry, RefusesToJoinWithAnotherSizeOrType) {
   renamed.name = "Pose";
   TypeInfo nameless{"", 24, 8, {}};
   EXPECT_EQ(registry.create(kOdometry, larger, kHistory, 1).error().code, Errc::type_mismatch);
-  const Result<Registry::Created> other = registry.create(kOdometry, renamed, kHistory, 1);
+  const Result<OpenedRing> other = registry.create(kOdometry, renamed, kHistory, 1);
   EXPECT_EQ(other.error().code, Errc::type_mismatch);
   EXPECT_NE(other.error().message.find("'Odometry'"), std::string::npos);
   EXPECT_NE(other.error().message.find("'Pose'"), std::string::npos);

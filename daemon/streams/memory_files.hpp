@@ -1,5 +1,39 @@
 // SPDX-License-Identifier: Apache-2.0
 //
+// The memory files that dssmd creates and takes back: how they are checked, and the meta file of a
+// stream, which holds what its ring does not.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <string_view>
+
+#include "core/base/unique_fd.hpp"
+#include "local.pb.h"
+
+namespace dssm::daemon {
+
+// Whether `fd` is a memfd that dssmd's own user created and that carries all of `seals` (F_SEAL_*).
+// Only root and programs of that same user can make such a file. `what` names it in the failure:
+// "ring".
+//   fails  protocol (not a sealed memory file), no_permission (another user's)
+Result<void> check_own_memory_file(int fd, int seals, std::string_view what);
+
+// What dssmd uses a descriptor for, by the name of its file alone: not checked.
+enum class DescriptorKind : unsigned char { other, ring, bell, meta, doorbell, playback_clock };
+DescriptorKind kind_of_untrusted(int fd);
+
+// Whether both are the same file.
+bool same_file(int fd, int other_fd) noexcept;
+
+// Whether both are descriptors of the same open file, as duplicates are: eventfds all share one
+// inode. Also false where kcmp(2) is filtered.
+bool same_open_file(int fd, int other_fd) noexcept;
+
+// A second descriptor of the same open file, close-on-exec.
+Result<UniqueFd> duplicate(int fd);
+
 // The meta file: all that dssmd knows about a stream and that is not in its ring, in a memfd beside
 // it: type with fields, property, creator, place in the list. With ring, bell and this file alone a
 // new dssmd brings a stream back. Only dssmd writes it; clients hold a descriptor for reading, only
@@ -23,17 +57,6 @@
 //
 // The file is sealed against shrinking and further seals, its mode is 0400: a descriptor for
 // reading cannot be turned into one for writing but by dssmd's own user.
-#pragma once
-
-#include <cstddef>
-#include <cstdint>
-#include <dssm/result.hpp>
-
-#include "core/base/unique_fd.hpp"
-#include "local.pb.h"
-
-namespace dssm::daemon {
-
 struct MetaHeader {
   static constexpr std::uint64_t kMagic = 0x4154454d4d535344;  // "DSSMMETA"
   static constexpr std::uint32_t kVersion = 1;
