@@ -1,13 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What dssmd reports to its operator. The rest of the daemon knows only Logger; where the words go
-// is decided in main(). A function either logs or returns a failure, so lines appear where dssmd
+// What dssmd reports to its operator. The rest of the daemon knows only Logger; where the entries
+// go is decided in main(). A function either logs or returns a failure, so lines appear where dssmd
 // gives something up.
 #pragma once
 
 #include <cstdint>
+#include <dssm/time.hpp>
+#include <functional>
 #include <string>
 #include <string_view>
+#include <vector>
+
+#include "core/base/unique_fd.hpp"
+#include "daemon/base/rate_limiter.hpp"
 
 namespace dssm::daemon {
 
@@ -66,5 +72,53 @@ class StderrLogger final : public LeveledLogger {
 
 // Whether this process's stderr goes to the journal ($JOURNAL_STREAM names it).
 bool stderr_is_journal() noexcept;
+
+// The log as entries of systemd's journal, with fields that `journalctl` can search for:
+//
+//   MESSAGE MESSAGE_ID PRIORITY SYSLOG_IDENTIFIER   as in systemd.journal-fields(7)
+//   DSSM_STREAM  the stream it is about, "lidar:0@pc1"
+//   DSSM_PEER    the program or the host it is about
+//
+// Written to journald's datagram socket as systemd's JOURNAL_NATIVE_PROTOCOL describes, without
+// waiting (sd_journal_send(3) waits for a journald that hangs). What the socket does not take goes
+// to stderr, which leads to the journal by another way, without the fields.
+class JournalLogger final : public LeveledLogger {
+ public:
+  static constexpr const char* kSocket = "/run/systemd/journal/socket";
+
+  // socket: where journald listens; tests put their own in its place.
+  explicit JournalLogger(LogLevel level, std::string socket = kSocket);
+
+  void write(LogLevel level, std::string_view text, const LogFields& fields) noexcept override;
+
+ private:
+  bool send(const std::string& entry) noexcept;
+
+  std::string path_;
+  UniqueFd socket_;
+  StderrLogger stderr_;
+};
+
+// A logger that peers cannot use to fill the log. Of each level it passes at most kLinesPerPeriod
+// lines on at once and in each period on average; the next line gives the number of lines that were
+// left out.
+class RateLimitedLogger final : public Logger {
+ public:
+  static constexpr int kLinesPerPeriod = 50;
+  static constexpr Duration kPeriod = std::chrono::seconds(10);
+
+  // `to` outlives this object. `now` is the clock; tests pass their own.
+  explicit RateLimitedLogger(Logger& to, std::function<MonoTime()> now = MonoClock::now)
+      : to_(to), now_(std::move(now)) {}
+
+  void write(LogLevel level, std::string_view text, const LogFields& fields) noexcept override;
+
+ private:
+  Logger& to_;
+  std::function<MonoTime()> now_;
+  std::vector<RateLimiter> limiters_{// by level
+                                     static_cast<std::size_t>(LogLevel::debug) + 1,
+                                     RateLimiter(kLinesPerPeriod, kPeriod / kLinesPerPeriod)};
+};
 
 }  // namespace dssm::daemon

@@ -38,7 +38,7 @@
 #include "daemon/clock/host_clock_log.hpp"
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/fleet/clock_assessor.hpp"
-#include "daemon/service/clock_policies.hpp"
+#include "daemon/service/config_values.hpp"
 
 namespace dssm::daemon {
 

@@ -11,8 +11,8 @@
 #include <string>
 #include <vector>
 
-#include "daemon/fleet/found_host.hpp"
 #include "daemon/fleet/peer_connection.hpp"
+#include "daemon/fleet/service_record.hpp"
 
 namespace dssm::daemon {
 

@@ -49,11 +49,10 @@
 
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
-#include "daemon/base/rate_limited_logger.hpp"
 #include "daemon/fleet/catalog.hpp"
-#include "daemon/fleet/found_host.hpp"
 #include "daemon/fleet/peer.hpp"
 #include "daemon/fleet/peer_report.hpp"
+#include "daemon/fleet/service_record.hpp"
 
 namespace dssm::daemon {
 

@@ -157,6 +157,10 @@ ServiceRecord::Stream announced_stream_untrusted(TxtReader& txt, const std::stri
 
 }  // namespace
 
+// Service instances and their TXT records, there and back. What is written here others read for
+// years: a key keeps its meaning, and a change that old readers would misunderstand takes another
+// txtvers. What is read here anybody on the network may have written.
+
 std::string ServiceRecord::instance() const {
   return stream ? StreamId{stream->name, stream->id, host}.str() : host;
 }

@@ -13,7 +13,7 @@
 #include "core/wire/network_protocol.hpp"
 #include "daemon/base/acceptor.hpp"
 #include "daemon/base/event_loop.hpp"
-#include "daemon/base/rate_limited_logger.hpp"
+#include "daemon/base/log.hpp"
 #include "daemon/link/network_listener.hpp"
 #include "daemon/serve/data_communicator.hpp"
 #include "daemon/serve/peer_table.hpp"

@@ -20,7 +20,7 @@
 #include "core/clock/clock_bound.hpp"
 #include "core/wire/address.hpp"
 #include "daemon/base/log.hpp"
-#include "daemon/service/clock_policies.hpp"
+#include "daemon/service/config_values.hpp"
 
 namespace dssm::daemon {
 

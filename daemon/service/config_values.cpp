@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/service/config_values.hpp"
 
+#include <fnmatch.h>
 #include <grp.h>
 #include <net/if.h>
 #include <sys/types.h>
@@ -56,6 +57,17 @@ Error out_of_range(std::string_view text, std::uint64_t least, std::uint64_t mos
 }
 
 }  // namespace
+
+ClockDemand ClockPolicies::demand_for(const StreamId& id) const {
+  const std::string full = id.name + ":" + std::to_string(id.id);
+  for (const Exception& exception : exceptions) {
+    const char* pattern = exception.pattern.c_str();
+    if (::fnmatch(pattern, id.name.c_str(), 0) && ::fnmatch(pattern, full.c_str(), 0)) continue;
+    return {exception.policy,
+            exception.limit == Duration::zero() ? general.limit : exception.limit};
+  }
+  return general;
+}
 
 Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t least, std::uint64_t most) {
   const Quantity quantity = DSSM_TRY(parse_quantity(text));

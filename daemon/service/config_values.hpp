@@ -1,21 +1,53 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The values of configuration keys, from text. Each failure is a reason alone ("'5x' is no
-// number"), to which the caller adds file, line and key.
+// The values of configuration keys: from text, and what those of clock_policy, clock_limit and
+// clock_streams mean. Each failure is a reason alone ("'5x' is no number"), to which the caller
+// adds file, line and key.
 #pragma once
 
 #include <sys/types.h>
 
 #include <cstdint>
+#include <dssm/clock_status.hpp>
 #include <dssm/result.hpp>
+#include <dssm/stream.hpp>
 #include <dssm/time.hpp>
+#include <string>
 #include <string_view>
+#include <vector>
 
 #include "core/clock/clock_bound.hpp"
 #include "daemon/base/log.hpp"
-#include "daemon/service/clock_policies.hpp"
 
 namespace dssm::daemon {
+
+// Which clocks are good enough for which streams: the configuration keys clock_policy, clock_limit
+// and clock_streams.
+struct ClockDemand {
+  ClockPolicy policy = ClockPolicy::enforce;
+  Duration limit =
+      std::chrono::microseconds(1500);  // the greatest clock error that reads by time accept
+
+  friend bool operator==(const ClockDemand& a, const ClockDemand& b) = default;
+};
+
+struct ClockPolicies {
+  // Another demand for some streams. The first that matches counts.
+  struct Exception {
+    std::string pattern;  // of the stream's name, or "NAME:ID", as in fnmatch(3)
+    ClockPolicy policy = ClockPolicy::enforce;
+    Duration limit{};  // 0: the general one
+
+    friend bool operator==(const Exception& a, const Exception& b) = default;
+  };
+
+  ClockDemand general;
+  std::vector<Exception> exceptions;
+
+  ClockDemand demand_for(const StreamId& id) const;
+
+  friend bool operator==(const ClockPolicies& a, const ClockPolicies& b) = default;
+};
 
 // A whole number from `least` to `most`.
 Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t least, std::uint64_t most);

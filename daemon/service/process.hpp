@@ -1,9 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Settings of the dssmd process: descriptor limit, signals, memory.
+// The dssmd process: descriptor limit, signals, memory, and the folder that it works in.
 #pragma once
 
 #include <signal.h>
+
+#include <dssm/result.hpp>
+#include <string>
+
+#include "core/base/unique_fd.hpp"
 
 namespace dssm::daemon {
 
@@ -37,6 +42,25 @@ class BlockedSignals {
 
  private:
   sigset_t before_;
+};
+
+// The folder that a dssmd works in, and the lock that makes it the only one there. The lock is an
+// flock() on the folder itself: it leaves no file and the kernel drops it however dssmd
+// ends.
+class RuntimeDir {
+ public:
+  // Takes `path`, creating the folder (mode 0755) but not its parents.
+  //   fails  conflict (another dssmd works there), os errors
+  static Result<RuntimeDir> open(const std::string& path);
+
+  const std::string& path() const noexcept { return path_; }
+  std::string socket_path() const { return path_ + "/dssmd.sock"; }
+  std::string clock_page_path() const { return path_ + "/clock"; }
+
+ private:
+  RuntimeDir(std::string path, UniqueFd lock) : path_(std::move(path)), lock_(std::move(lock)) {}
+  std::string path_;
+  UniqueFd lock_;
 };
 
 }  // namespace dssm::daemon

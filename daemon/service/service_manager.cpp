@@ -5,12 +5,14 @@
 #include "daemon/service/service_manager.hpp"
 
 #include <fcntl.h>
+#include <netinet/in.h>
 #include <sys/socket.h>
 #include <sys/un.h>
 #include <systemd/sd-daemon.h>
 
 #include <algorithm>
 #include <cerrno>
+#include <cstddef>
 #include <cstdlib>
 #include <cstring>
 #include <utility>
@@ -28,7 +30,16 @@ constexpr std::size_t kMostDescriptorsPerMessage = 253;  // the kernel's SCM_MAX
 // flight has nothing to do with free space in its queue.
 constexpr Duration kPause = std::chrono::milliseconds(10);
 
+int socket_option(int socket, int option) noexcept {
+  int value = -1;
+  socklen_t length = sizeof value;
+  return ::getsockopt(socket, SOL_SOCKET, option, &value, &length) ? -1 : value;
+}
+
 }  // namespace
+
+// The protocol of sd_notify(3), written here because libsystemd's own function waits while the
+// manager's queue is full, and dssmd never blocks.
 
 std::vector<NamedDescriptor> take_handed_over() {
   char** names = nullptr;
@@ -173,6 +184,63 @@ Watchdog::Watchdog(const EventLoop& loop, ServiceManager& manager) {
     timer_.enable_in(pause_);
   });
   timer_.enable_in(pause_);
+}
+
+// --- the status line
+
+StatusLine::StatusLine(const EventLoop& loop, ServiceManager& manager,
+                       std::function<std::string()> text)
+    : manager_(manager),
+      text_(std::move(text)),
+      timer_(EventSource::timer(loop, [this] { update(); })) {}
+
+std::string StatusLine::now() { return sent_ = text_(); }
+
+void StatusLine::touch() {
+  if (manager_.is_there() && !std::exchange(due_, true)) timer_.enable_in(kPause);
+}
+
+void StatusLine::update() {
+  due_ = false;
+  std::string text = text_();
+  if (text == sent_) return;
+  sent_ = std::move(text);
+  manager_.status(sent_);
+}
+
+// --- descriptors of the manager
+
+Inherited Inherited::sort(std::vector<NamedDescriptor> handed_over) {
+  Inherited inherited;
+  for (NamedDescriptor& one : handed_over) {
+    const int fd = one.fd.get();
+    const bool listens =
+        socket_option(fd, SO_ACCEPTCONN) == 1 && socket_option(fd, SO_TYPE) == SOCK_STREAM;
+    const int domain = listens ? socket_option(fd, SO_DOMAIN) : -1;
+    const bool is_tcp =
+        (domain == AF_INET || domain == AF_INET6) && socket_option(fd, SO_PROTOCOL) == IPPROTO_TCP;
+    if (listens) ::fcntl(fd, F_SETFL, ::fcntl(fd, F_GETFL) | O_NONBLOCK);
+    std::vector<NamedDescriptor>& place = domain == AF_UNIX ? inherited.local
+                                          : is_tcp          ? inherited.network
+                                                            : inherited.others;
+    place.push_back(std::move(one));
+  }
+  return inherited;
+}
+
+UniqueFd Inherited::take_local(const std::string& path) {
+  for (auto one = local.begin(); one != local.end(); ++one) {
+    sockaddr_un address{};
+    socklen_t length = sizeof address;
+    if (::getsockname(one->fd.get(), reinterpret_cast<sockaddr*>(&address), &length)) continue;
+    // The kernel gives the end mark along.
+    if (length != offsetof(sockaddr_un, sun_path) + path.size() + 1) continue;
+    if (path != address.sun_path) continue;
+    UniqueFd fd = std::move(one->fd);
+    local.erase(one);
+    return fd;
+  }
+  return {};
 }
 
 }  // namespace dssm::daemon

@@ -14,6 +14,7 @@
 #include <dssm/result.hpp>
 #include <dssm/time.hpp>
 #include <functional>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -23,8 +24,7 @@
 
 namespace dssm::daemon {
 
-// A descriptor that the manager passed, and its name (FDNAME=,
-// FileDescriptorName=).
+// A descriptor that the manager passed, and its name (FDNAME=, FileDescriptorName=).
 struct NamedDescriptor {
   std::string name;
   UniqueFd fd;
@@ -96,6 +96,47 @@ class Watchdog {
  private:
   Duration pause_{};  // zero: not required
   EventSource timer_;
+};
+
+// Updates the line that `systemctl status` shows, at most once in kPause and only when it changed.
+// Does nothing without a service manager.
+class StatusLine {
+ public:
+  static constexpr Duration kPause = std::chrono::seconds(1);
+
+  // text: makes the line, from the loop. manager: outlives it.
+  StatusLine(const EventLoop& loop, ServiceManager& manager, std::function<std::string()> text);
+  StatusLine(const StatusLine&) = delete;
+  StatusLine& operator=(const StatusLine&) = delete;
+
+  // The line as it is now, for the caller to send to the manager.
+  std::string now();
+
+  // Something changed that is in the line.
+  void touch();
+
+ private:
+  void update();
+
+  ServiceManager& manager_;
+  std::function<std::string()> text_;
+  std::string sent_;
+  bool due_ = false;
+  EventSource timer_;
+};
+
+// The descriptors that the service manager passed to dssmd, sorted by their kind. Names matter only
+// to distinguish sockets that dssmd put into the descriptor store from those of a socket unit.
+struct Inherited {
+  // Listening sockets; non-blocking by now.
+  std::vector<NamedDescriptor> local;    // AF_UNIX, streams
+  std::vector<NamedDescriptor> network;  // TCP
+  std::vector<NamedDescriptor> others;   // what DescriptorStore kept, and anything else
+
+  static Inherited sort(std::vector<NamedDescriptor> handed_over);
+
+  // Takes the socket that listens at `path` out of `local`; none: none does.
+  UniqueFd take_local(const std::string& path);
 };
 
 }  // namespace dssm::daemon

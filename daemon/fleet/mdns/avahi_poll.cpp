@@ -5,6 +5,8 @@
 // libdbus does.
 #include "daemon/fleet/mdns/avahi_poll.hpp"
 
+#include <avahi-common/error.h>
+
 #include <algorithm>
 
 // Types that avahi-common only declares: each implementation of AvahiPoll has its own.
@@ -36,7 +38,7 @@ struct AvahiTimeout {
 namespace dssm::daemon {
 namespace {
 
-constexpr Duration kLongestDelay = std::chrono::minutes(1);
+constexpr Duration kMaxDelay = std::chrono::minutes(1);
 
 LoopAvahiPoll* poll_of(const AvahiPoll* api) { return static_cast<LoopAvahiPoll*>(api->userdata); }
 
@@ -73,7 +75,7 @@ void watch_free(AvahiWatch* watch) {
   watch->freed = true;
   watch->readable.disable();
   watch->writable.disable();
-  watch->poll->bury(watch);
+  watch->poll->defer_delete(watch);
 }
 
 void timeout_update(AvahiTimeout* timeout, const timeval* when) {
@@ -100,10 +102,23 @@ AvahiTimeout* timeout_new(const AvahiPoll* api, const timeval* when, AvahiTimeou
 void timeout_free(AvahiTimeout* timeout) {
   timeout->freed = true;
   timeout->timer.disable();
-  timeout->poll->bury(timeout);
+  timeout->poll->defer_delete(timeout);
 }
 
 }  // namespace
+
+bool is_avahi_connection_error(int error) noexcept {
+  switch (error) {
+    case AVAHI_ERR_DISCONNECTED:
+    case AVAHI_ERR_NO_DAEMON:
+    case AVAHI_ERR_DBUS_ERROR:  // no answer in time, too
+    case AVAHI_ERR_TIMEOUT:
+    case AVAHI_ERR_VERSION_MISMATCH:
+      return true;
+    default:
+      return false;
+  }
+}
 
 Duration delay_until(const timeval& when, Time now) noexcept {
   // Far beyond any real time the sum below would overflow.
@@ -113,7 +128,7 @@ Duration delay_until(const timeval& when, Time now) noexcept {
       std::chrono::seconds(seconds) +
       std::chrono::microseconds(std::clamp<std::int64_t>(when.tv_usec, 0, 999'999));
   if (since_1970 <= now.time_since_epoch()) return Duration::zero();
-  return std::min(since_1970 - now.time_since_epoch(), kLongestDelay);
+  return std::min(since_1970 - now.time_since_epoch(), kMaxDelay);
 }
 
 LoopAvahiPoll::LoopAvahiPoll(const EventLoop& loop) : loop_(loop) {
@@ -126,20 +141,20 @@ LoopAvahiPoll::LoopAvahiPoll(const EventLoop& loop) : loop_(loop) {
   api_.timeout_update = timeout_update;
   api_.timeout_free = timeout_free;
   sweeper_ = EventSource::timer(loop, [this] {
-    dead_watches_.clear();
-    dead_timeouts_.clear();
+    freed_watches_.clear();
+    freed_timeouts_.clear();
   });
 }
 
 LoopAvahiPoll::~LoopAvahiPoll() = default;
 
-void LoopAvahiPoll::bury(AvahiWatch* watch) {
-  dead_watches_.emplace_back(watch);
+void LoopAvahiPoll::defer_delete(AvahiWatch* watch) {
+  freed_watches_.emplace_back(watch);
   sweeper_.enable_in(Duration::zero());
 }
 
-void LoopAvahiPoll::bury(AvahiTimeout* timeout) {
-  dead_timeouts_.emplace_back(timeout);
+void LoopAvahiPoll::defer_delete(AvahiTimeout* timeout) {
+  freed_timeouts_.emplace_back(timeout);
   sweeper_.enable_in(Duration::zero());
 }
 

@@ -18,9 +18,9 @@
 #include <string>
 
 #include "daemon/base/event_loop.hpp"
-#include "daemon/fleet/mdns/avahi_observer.hpp"
+#include "daemon/fleet/mdns/avahi_poll.hpp"
 #include "daemon/fleet/mdns/interface_filter.hpp"
-#include "daemon/fleet/mdns/mdns_mailbox.hpp"
+#include "daemon/fleet/mdns/mdns.hpp"
 
 namespace dssm::daemon {
 

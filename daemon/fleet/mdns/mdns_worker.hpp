@@ -9,12 +9,10 @@
 #include <memory>
 #include <string>
 
-#include "daemon/fleet/mdns/avahi_observer.hpp"
 #include "daemon/fleet/mdns/avahi_poll.hpp"
 #include "daemon/fleet/mdns/host_browser.hpp"
 #include "daemon/fleet/mdns/interface_filter.hpp"
 #include "daemon/fleet/mdns/mdns.hpp"
-#include "daemon/fleet/mdns/mdns_mailbox.hpp"
 #include "daemon/fleet/mdns/service_publisher.hpp"
 
 namespace dssm::daemon {

@@ -47,19 +47,6 @@ const std::string& service_type() {
 
 }  // namespace
 
-bool is_avahi_connection_error(int error) noexcept {
-  switch (error) {
-    case AVAHI_ERR_DISCONNECTED:
-    case AVAHI_ERR_NO_DAEMON:
-    case AVAHI_ERR_DBUS_ERROR:  // no answer in time, too
-    case AVAHI_ERR_TIMEOUT:
-    case AVAHI_ERR_VERSION_MISMATCH:
-      return true;
-    default:
-      return false;
-  }
-}
-
 ServicePublisher::ServicePublisher(const EventLoop& loop, std::uint16_t port, Duration stream_pause,
                                    AvahiObserver& observer)
     : observer_(observer), port_(port), pace_(kStreamsAtOnce, stream_pause) {

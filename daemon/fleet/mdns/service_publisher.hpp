@@ -23,7 +23,7 @@
 
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/rate_limiter.hpp"
-#include "daemon/fleet/mdns/avahi_observer.hpp"
+#include "daemon/fleet/mdns/avahi_poll.hpp"
 #include "daemon/fleet/service_record.hpp"
 
 namespace dssm::daemon {

@@ -3,7 +3,7 @@
 // What dssmd remembers about peers: what they take, and how much it logs about them.
 #include <gtest/gtest.h>
 
-#include "daemon/base/rate_limited_logger.hpp"
+#include "daemon/base/log.hpp"
 #include "tests/unit/daemon/serve/server_rig.hpp"
 
 namespace dssm::daemon {

@@ -1,8 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // What systemd hands over, sorted by what it is, whatever it is called.
-#include "daemon/service/inherited.hpp"
-
 #include <fcntl.h>
 #include <gtest/gtest.h>
 #include <netinet/in.h>
@@ -12,6 +10,7 @@
 
 #include <cstring>
 
+#include "daemon/service/service_manager.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::daemon {

@@ -1,11 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "daemon/service/runtime_dir.hpp"
-
 #include <gtest/gtest.h>
 #include <sys/stat.h>
 
 #include <filesystem>
 
+#include "daemon/service/process.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::daemon {

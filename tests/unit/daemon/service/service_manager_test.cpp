@@ -5,7 +5,7 @@
 
 #include <gtest/gtest.h>
 
-#include "daemon/base/journal_logger.hpp"
+#include "daemon/base/log.hpp"
 #include "tests/support/inbox.hpp"
 
 namespace dssm::daemon {

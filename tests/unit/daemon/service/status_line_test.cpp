@@ -2,10 +2,9 @@
 //
 // The line of `systemctl status`: told when it changed, after a pause, and to nobody who did not
 // ask.
-#include "daemon/service/status_line.hpp"
-
 #include <gtest/gtest.h>
 
+#include "daemon/service/service_manager.hpp"
 #include "tests/support/inbox.hpp"
 
 namespace dssm::daemon {
