@@ -4,11 +4,11 @@
 #include <cstdlib>
 
 #include "daemon/service/config.hpp"
+#include "tests/fuzz/fuzzer.hpp"
 
-extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
-  dssm::daemon::Config config;
-  const std::string_view text(reinterpret_cast<const char*>(data), size);
-  const dssm::Result<void> applied = dssm::daemon::apply_text_untrusted(config, text, "fuzz.conf");
+void dssm::fuzz::run_input(std::span<const std::uint8_t> input) {
+  daemon::Config config;
+  const std::string_view text(reinterpret_cast<const char*>(input.data()), input.size());
+  const Result<void> applied = daemon::apply_text_untrusted(config, text, "fuzz.conf");
   if (!applied && applied.error().message.find("fuzz.conf:") != 0) std::abort();
-  return 0;
 }

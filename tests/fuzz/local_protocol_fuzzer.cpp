@@ -14,7 +14,7 @@
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/local/local_service.hpp"
-#include "daemon/service/process.hpp"
+#include "tests/fuzz/fuzzer.hpp"
 #include "tests/fuzz/late_fleet.hpp"
 #include "tests/support/log_recorder.hpp"
 
@@ -122,12 +122,4 @@ void run(std::span<const std::uint8_t> input) {
 }  // namespace
 }  // namespace dssm::daemon
 
-extern "C" int LLVMFuzzerInitialize(int*, char***) {
-  dssm::daemon::silence_protobuf();
-  return 0;
-}
-
-extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
-  dssm::daemon::run({data, size});
-  return 0;
-}
+void dssm::fuzz::run_input(std::span<const std::uint8_t> input) { dssm::daemon::run(input); }

@@ -4,13 +4,12 @@
 // depend on how the bytes are split or on a sink that pauses it, and must equal protobuf's output.
 // An input's first two bytes choose the payload size, how the bytes are split, and when the sink
 // pauses.
-#include <google/protobuf/stubs/logging.h>
-
 #include <cstdlib>
 #include <optional>
 
 #include "core/wire/network_protocol.hpp"
 #include "core/wire/varint.hpp"
+#include "tests/fuzz/fuzzer.hpp"
 #include "tests/unit/core/wire/recorder.hpp"
 
 namespace dssm::wire {
@@ -86,12 +85,6 @@ void run(std::string_view input) {
 }  // namespace
 }  // namespace dssm::wire
 
-extern "C" int LLVMFuzzerInitialize(int*, char***) {
-  google::protobuf::SetLogHandler(nullptr);  // it would print each refused message
-  return 0;
-}
-
-extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
-  dssm::wire::run({reinterpret_cast<const char*>(data), size});
-  return 0;
+void dssm::fuzz::run_input(std::span<const std::uint8_t> input) {
+  dssm::wire::run({reinterpret_cast<const char*>(input.data()), input.size()});
 }

@@ -15,6 +15,7 @@
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "core/ring/ring_writer.hpp"
+#include "tests/fuzz/fuzzer.hpp"
 
 namespace dssm::ring {
 namespace {
@@ -81,7 +82,4 @@ void run(std::span<const std::uint8_t> input) {
 }  // namespace
 }  // namespace dssm::ring
 
-extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
-  dssm::ring::run({data, size});
-  return 0;
-}
+void dssm::fuzz::run_input(std::span<const std::uint8_t> input) { dssm::ring::run(input); }

@@ -8,6 +8,7 @@
 
 #include "core/base/text.hpp"
 #include "daemon/fleet/service_record.hpp"
+#include "tests/fuzz/fuzzer.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -51,7 +52,6 @@ void run(std::string_view bytes) {
 }  // namespace
 }  // namespace dssm::daemon
 
-extern "C" int LLVMFuzzerTestOneInput(const std::uint8_t* data, std::size_t size) {
-  dssm::daemon::run({reinterpret_cast<const char*>(data), size});
-  return 0;
+void dssm::fuzz::run_input(std::span<const std::uint8_t> input) {
+  dssm::daemon::run({reinterpret_cast<const char*>(input.data()), input.size()});
 }

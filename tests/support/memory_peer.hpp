@@ -32,11 +32,14 @@ class MemoryPeer {
   ~MemoryPeer() { *alive_ = false; }
 
   void put(Bytes bytes) {
+    if (bytes.empty()) return;
     input_.push_back(std::move(bytes));
     signal();
   }
   void put(const net::Frame& frame) { put(to_bytes(frame)); }
-  bool has_input() const { return !input_.empty(); }  // that dssmd has not received yet
+  // Input that dssmd has not received yet.
+  bool has_input() const { return !input_.empty(); }
+  void drop_input() { input_.clear(); }
 
   // The peer ends the connection: what was put in is still received.
   void end() {
