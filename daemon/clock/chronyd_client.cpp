@@ -25,12 +25,12 @@ ChronydClient::ChronydClient(const EventLoop& loop, const wire::SocketAddress& c
 }
 
 void ChronydClient::poll_if_due() {
-  occasion_ = MonoClock::now();
+  occasion_ = loop_.now();
   if (occasion_ - asked_ >= period_ - slack_) next_question();
 }
 
 void ChronydClient::next_question() {
-  asked_ = MonoClock::now();
+  asked_ = loop_.now();
   // Behind the next occasion, if there is to be one. One that comes too early for a question comes
   // later in the period each time, until it is in time.
   const bool occasions_come = asked_ - occasion_ < period_ + slack_;
@@ -85,7 +85,7 @@ void ChronydClient::on_readable() {
       return;
     }
     if (take_untrusted({buffer.data(), static_cast<std::size_t>(size)})) return;
-    if (++question_->datagrams == kMostDatagrams) finish();
+    if (++question_->datagrams == kMaxDatagrams) finish();
   }
 }
 

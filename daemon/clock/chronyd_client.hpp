@@ -22,8 +22,8 @@ namespace dssm::daemon {
 class ChronydClient {
  public:
   static constexpr Duration kPeriod = std::chrono::seconds(1);
-  // Datagrams that are looked at for one answer; then this question counts as unanswered.
-  static constexpr int kMostDatagrams = 16;
+  // Datagrams that are read for one answer; then this question counts as unanswered.
+  static constexpr int kMaxDatagrams = 16;
 
   using Now = std::function<clock::Instant()>;
 
@@ -41,8 +41,9 @@ class ChronydClient {
     ~Observer() = default;
   };
 
-  // Asks at once when the loop runs, and then about once a period. What is given by reference
-  // outlives it.
+  // Asks at once when the loop runs, and then about once a period of the loop's time. What is given
+  // by reference outlives it.
+  //   now  stamps questions and answers
   ChronydClient(const EventLoop& loop, const wire::SocketAddress& chronyd, Observer& observer,
                 Now now, Duration period = kPeriod);
   ChronydClient(const ChronydClient&) = delete;

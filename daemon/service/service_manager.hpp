@@ -58,9 +58,6 @@ class ServiceManager {
   void keep(const std::string& name, const std::vector<int>& fds);
   void forget(const std::string& name);
 
-  // Messages that the manager has not taken yet; for tests.
-  std::size_t waiting() const noexcept { return waiting_.size(); }
-
  private:
   struct Message {
     std::string text;

@@ -19,16 +19,20 @@ namespace dssm::test {
 class Inbox {
  public:
   Inbox() {
-    sockaddr_un address{};
-    address.sun_family = AF_UNIX;
-    std::strncpy(address.sun_path, path().c_str(), sizeof address.sun_path - 1);
-    EXPECT_EQ(::bind(fd_.get(), reinterpret_cast<sockaddr*>(&address), sizeof address), 0);
+    const sockaddr_un at = address();
+    EXPECT_EQ(::bind(fd_.get(), reinterpret_cast<const sockaddr*>(&at), sizeof at), 0);
   }
   Inbox(const Inbox&) = delete;
   Inbox& operator=(const Inbox&) = delete;
   ~Inbox() { remove_tree(dir_); }
 
   std::string path() const { return dir_ + "/socket"; }
+  sockaddr_un address() const {
+    sockaddr_un address{};
+    address.sun_family = AF_UNIX;
+    std::strncpy(address.sun_path, path().c_str(), sizeof address.sun_path - 1);
+    return address;
+  }
   std::string next() {  // empty: no message
     char text[8192];
     const ssize_t bytes = ::recv(fd_.get(), text, sizeof text, MSG_DONTWAIT);

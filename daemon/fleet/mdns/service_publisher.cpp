@@ -49,7 +49,7 @@ const std::string& service_type() {
 
 ServicePublisher::ServicePublisher(const EventLoop& loop, std::uint16_t port, Duration stream_pause,
                                    AvahiObserver& observer)
-    : observer_(observer), port_(port), pace_(kStreamsAtOnce, stream_pause) {
+    : loop_(loop), observer_(observer), port_(port), pace_(kStreamsAtOnce, stream_pause) {
   worker_ = EventSource::timer(loop, [this] { work(); });
   retry_ = EventSource::timer(loop, [this] { queue_withheld(); });
 }
@@ -181,7 +181,7 @@ void ServicePublisher::work() {
     const auto at = services_.find(instance);
     if (at == services_.end()) continue;
     if (is_new_stream(at->second)) {
-      const MonoTime now = MonoClock::now();
+      const MonoTime now = loop_.now();
       if (const Duration pause = pace_.wait(now); pause > Duration::zero()) {
         // All others wait, too; what must not wait stands before it, see want().
         queue_.push_front(instance);

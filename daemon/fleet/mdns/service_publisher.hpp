@@ -84,6 +84,7 @@ class ServicePublisher {
   void withhold(Service& service, int error);
   bool rename(Service& service);
 
+  const EventLoop& loop_;
   AvahiObserver& observer_;
   const std::uint16_t port_;
   AvahiClient* client_ = nullptr;

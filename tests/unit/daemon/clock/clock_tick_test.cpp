@@ -22,11 +22,11 @@ Tick last_whole() {
   return tick;
 }
 
-// Through hundreds of ticks, also while chronyd slews the clock.
+// Through dozens of ticks, also while chronyd slews the clock.
 TEST(Tick, ShowsOneDifferenceUntilTheClockIsSet) {
   const Tick first = last_whole();
   int seen = 0;
-  for (const MonoTime end = deadline_in(1s); MonoClock::now() < end; ++seen) {
+  for (const MonoTime end = deadline_in(300ms); MonoClock::now() < end; ++seen) {
     ASSERT_EQ(last_whole().difference, first.difference) << "after " << seen << " looks";
   }
   EXPECT_GT(seen, 100);

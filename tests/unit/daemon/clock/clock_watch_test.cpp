@@ -26,7 +26,7 @@ class LinesLogger final : public Logger {
 
 class ClockWatchTest : public testing::Test, protected ClockWatch::Observer {
  protected:
-  EventLoop loop = EventLoop::open().value();
+  EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   LinesLogger logger;
   clock::Instant now{MonoTime(1000s), Time(1'795'000'000s), {}};
   clock::Tick tick;

@@ -62,16 +62,7 @@ class FleetClockTest : public testing::Test {
     wait([this] { return own->clock.status != ClockStatus::unknown; });
     return *fleet;
   }
-  template <class Done>
-  void wait(Done done) {
-    const MonoTime deadline = deadline_in(20s);
-    while (!done() && MonoClock::now() < deadline) {
-      EventSource tick = EventSource::timer(loop, [this] { loop.stop(); });
-      tick.enable_in(10ms);
-      ASSERT_TRUE(loop.run());
-    }
-    EXPECT_TRUE(done());
-  }
+  void wait(const std::function<bool()>& done) { run_until(loop, done); }
   void follow_nobody() {
     tracking.reference_id = clock::kLocalReferenceId;
     tracking.root = {};
@@ -89,7 +80,7 @@ class FleetClockTest : public testing::Test {
   }
 
   const StreamId lidar{"lidar", 0, "pc3"};
-  EventLoop loop = EventLoop::open().value();
+  EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   LogRecorder logger;
   clock::Tracking tracking;
   FakeChronyd chronyd{loop, [this](const FakeChronyd::Question& question) {

@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The line of `systemctl status`: told when it changed, after a pause, and to nobody who did not
-// ask.
+// The line of `systemctl status`: sent when it changed, after a pause, and only to a service
+// manager that is there.
+
 #include <gtest/gtest.h>
 
 #include "daemon/service/service_manager.hpp"
 #include "tests/support/inbox.hpp"
+#include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -13,18 +15,19 @@ namespace {
 class StatusLineTest : public testing::Test {
  protected:
   void run_for(Duration time) {
-    EventSource end = EventSource::timer(loop, [&] { loop.stop(); });
-    end.enable_in(time);
-    ASSERT_TRUE(loop.run());
+    const MonoTime end = loop.deadline_in(time);
+    EventSource timer = EventSource::timer(loop, [] {});
+    timer.enable_in(time);
+    run_until(loop, [&] { return loop.now() >= end; });
   }
-  EventLoop loop = EventLoop::open().value();
+  EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   test::Inbox inbox;
   std::string text = "no streams";
   int made = 0;
   std::function<std::string()> make = [this] { return ++made, text; };
 };
 
-TEST_F(StatusLineTest, TellsSeveralChangesOnceAfterThePause) {
+TEST_F(StatusLineTest, SendsSeveralChangesOnceAfterThePause) {
   ServiceManager manager{loop, inbox.path()};
   StatusLine line{loop, manager, make};
   EXPECT_EQ(line.now(), "no streams");
@@ -39,7 +42,7 @@ TEST_F(StatusLineTest, TellsSeveralChangesOnceAfterThePause) {
   EXPECT_EQ(made, 2);
 }
 
-TEST_F(StatusLineTest, DoesNotRepeatWhatWasTold) {
+TEST_F(StatusLineTest, DoesNotRepeatWhatWasSent) {
   ServiceManager manager{loop, inbox.path()};
   StatusLine line{loop, manager, make};
   line.now();
@@ -53,9 +56,9 @@ TEST_F(StatusLineTest, DoesNotRepeatWhatWasTold) {
   EXPECT_EQ(inbox.next(), "STATUS=1 stream");
 }
 
-TEST_F(StatusLineTest, MakesNoLineThatNobodyReads) {
-  ServiceManager nobody{loop, ""};
-  StatusLine line{loop, nobody, make};
+TEST_F(StatusLineTest, MakesNoLineWithoutAServiceManager) {
+  ServiceManager none{loop, ""};
+  StatusLine line{loop, none, make};
   line.touch();
   run_for(StatusLine::kPause + std::chrono::milliseconds(1));
   EXPECT_EQ(made, 0);
