@@ -2,7 +2,6 @@
 //
 // The line of `systemctl status`: sent when it changed, after a pause, and only to a service
 // manager that is there.
-
 #include <gtest/gtest.h>
 
 #include "daemon/service/service_manager.hpp"
