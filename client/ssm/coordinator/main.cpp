@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// ssm-coordinator: dssmd under its old name, for scripts that start `ssm-coordinator`, look for it
-// with ps and stop it with SIGINT. It runs dssmd as a child, passes on what it is told to stop, and
+// ssm-coordinator: dssmd under its old name, for scripts that start `ssm-coordinator`, find it
+// with ps and stop it with SIGINT. It runs dssmd as a child and passes requests to stop on to it;
 // neither of the two outlives the other. It does nothing else.
 //
 // Exit status: 0 stopped, 1 help, version or bad options, 255 cannot start or one is running
@@ -47,7 +47,7 @@ void print_help() {
                "USAGE\n"
                "  ssm-coordinator [-v] [-q]\n"
                "OPTIONS\n"
-               "  -v | --verbose              : dssmd tells what it does\n"
+               "  -v | --verbose              : dssmd logs what it does\n"
                "  -q | --quiet                : no output but errors\n"
                "       --version              : print the version\n"
                "       --without-check-msgque : accepted; there is no message queue any more\n"
@@ -58,7 +58,7 @@ void print_help() {
                "               user may write there, else $XDG_RUNTIME_DIR/dssm\n");
 }
 
-// Nothing, or the exit status when that is all there is to do.
+// Nothing, or the exit status when the program is to end.
 std::optional<int> parse(int argc, char** argv, Options& options) {
   enum : int { version = 256, without_check };
   const option known[] = {{"verbose", no_argument, nullptr, 'v'},
@@ -92,7 +92,7 @@ std::optional<int> parse(int argc, char** argv, Options& options) {
   }
 }
 
-// The folder for dssmd's socket, so that programs started in the same surroundings find it.
+// The folder for dssmd's socket, which programs started in the same environment find.
 std::optional<std::string> choose_folder() {
   if (const std::string set = environment("DSSM_SOCKET"); !set.empty()) {
     const std::size_t slash = set.rfind('/');
@@ -174,7 +174,7 @@ struct End {
   int wait_status;
   bool asked_to_stop;
 
-  // Before it can take a request to stop, a signal just ends it.
+  // Before it handles requests to stop, a signal ends it.
   bool as_asked() const {
     return (WIFEXITED(wait_status) && WEXITSTATUS(wait_status) == 0) ||
            (asked_to_stop && WIFSIGNALED(wait_status) &&
@@ -182,7 +182,7 @@ struct End {
   }
 };
 
-// Until dssmd ends: tells when it is ready and passes on requests to stop.
+// Until dssmd ends: reports when it is ready and passes on requests to stop.
 End attend(pid_t dssmd, int signals_fd, int notify_fd, const Options& options) {
   bool asked_to_stop = false;
   for (;;) {
@@ -192,7 +192,7 @@ End attend(pid_t dssmd, int signals_fd, int notify_fd, const Options& options) {
       char text[256] = {};
       if (::recv(notify_fd, text, sizeof text - 1, 0) > 0 && std::strstr(text, "READY=1") &&
           !options.quiet) {
-        // The old words, which scripts wait for; the number is dssmd's pid.
+        // The old text, which scripts wait for; the number is dssmd's pid.
         std::printf("Message queue ready.\nMsg queue ID = %d\n", static_cast<int>(dssmd));
       }
     }
@@ -248,7 +248,7 @@ int main(int argc, char** argv) {
   const End end = attend(dssmd, signals_fd, notify_fd, options);
   if (!end.as_asked()) {
     const int status = end.wait_status;
-    std::fprintf(stderr, "ERROR : dssmd ended with %s %d; its own words are above\n",
+    std::fprintf(stderr, "ERROR : dssmd ended with %s %d; its own messages are above\n",
                  WIFEXITED(status) ? "status" : "signal",
                  WIFEXITED(status) ? WEXITSTATUS(status) : WTERMSIG(status));
     return kCannotStart;

@@ -43,7 +43,7 @@ int dssm_ssm_remote_is_open(struct dssm_ssm_remote* remote);
 void dssm_ssm_remote_close(struct dssm_ssm_remote* remote); /* async-signal-safe */
 
 // What to read: the newest; number `tid`; the newest if it is newer than `tid`; the one `dt` after
-// `tid`, or the oldest where that is gone; the newest with a time <= `time`.
+// `tid`, or the oldest where that is no longer held; the newest with a time <= `time`.
 enum dssm_ssm_remote_which {
   DSSM_SSM_NEWEST,
   DSSM_SSM_TID,
@@ -155,8 +155,8 @@ class PConnector {
   }
 
   // Waits until the stream is there, as long as initRemote() waits; false when it has another size
-  // than the data. SSM_READ_BUFFER (and SSM_EXCLUSIVE, as programs between the prototype and DSSM
-  // say) means that readyRingBuf() follows.
+  // than the data. SSM_READ_BUFFER (and SSM_EXCLUSIVE, in programs between the prototype and
+  // DSSM) means that readyRingBuf() follows.
   bool open(SSM_open_mode = SSM_READ) {
     mHasDataCon = false;
     return hasBuffer("open") && dssm_ssm_remote_open(remote(), mAddress.c_str(), mName.c_str(),
@@ -230,8 +230,8 @@ class PConnector {
   }
   static ssmTimeT getRealTime() { return gettimeSSM_real(); }
 
-  // Hands what stands behind the time in `fulldata` (DSSMApi's *wdata) to the network, and never
-  // waits for it. While the other PC is away the newest samples are kept.
+  // Hands what follows the time in `fulldata` (DSSMApi's *wdata) to the network, and never waits
+  // for it. While the other PC is unavailable the newest samples are kept.
   bool write(ssmTimeT writeTime = gettimeSSM()) {
     if (!mHasDataCon || !mFullData) return false;
     const char* const sample = static_cast<const char*>(mFullData) + sizeof(ssmTimeT);
@@ -274,7 +274,7 @@ class PConnector {
   uint64_t mDataSize;
   void* mProperty;
   uint64_t mPropertySize;
-  void* mFullData;  // a time, and the sample behind it
+  void* mFullData;  // a time, and the sample after it
   uint64_t mFullDataSize;
   bool isVerbose;
   bool isBlocking;

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Kept for programs that include it: the old DSSM's own helpers, which no program called, are gone.
+// Kept for programs that include it, and empty: no program called the old DSSM's own helpers.
 #ifndef DSSM_DSSM_UTILITY_HPP
 #define DSSM_DSSM_UTILITY_HPP
 

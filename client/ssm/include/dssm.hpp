@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // DSSMApi<T, P, U>: a stream of T with a property P on another PC, and a block U that this PC shows
-// to all others. Source-compatible with the old DSSM; what each call returns stands in docs/ssm.md.
+// to all others. Source-compatible with the old DSSM; what each call returns is in docs/ssm.md.
 // Compiles as C++11 and later.
 //
 //   writing   fill *wdata, then write(); `data` is not sent
@@ -40,7 +40,7 @@ class DSSMApi : public PConnector {
   T data;          // filled by reads
   T* wdata;        // sent by write()
   P property;      //
-  void* fulldata;  // a time, and *wdata behind it
+  void* fulldata;  // a time, and *wdata after it
   U br_data;
   U* pbr_data;
 

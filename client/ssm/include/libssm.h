@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * What programs used of SSM's internals: control of the shared clock, the lists of processes and
- * open streams, the arithmetic of ring sizes, and a look at a stream's header. The rest of the old
+ * open streams, the arithmetic of ring sizes, and a stream's header. The rest of the old
  * file (message queue, locks, raw slots) has no counterpart here; docs/ssm.md.
  */
 #ifndef DSSM_LIBSSM_H

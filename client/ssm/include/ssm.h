@@ -1,7 +1,7 @@
 /* SPDX-License-Identifier: Apache-2.0
  *
  * The C interface of SSM (Streaming data Sharing Manager), as programs written for SSM and DSSM
- * include it; behind it are DSSM's rings. What each call returns stands in docs/ssm.md, with the
+ * include it; it works on DSSM's rings. What each call returns is in docs/ssm.md, with the
  * bugs of the old library that this one does not have.
  *
  * closeSSM, releaseSSM and endSSM may be called from a signal handler at any moment. All other

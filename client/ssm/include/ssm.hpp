@@ -2,7 +2,7 @@
 //
 // The C++ interface of SSM: SSMApi<T, P> reads and writes a stream of T with a property P, and
 // SSMApiBase is the part of it that knows no types. Source-compatible with SSM and DSSM: member
-// names, signatures, and which functions are virtual are theirs. What each call returns stands in
+// names, signatures, and which functions are virtual are theirs. What each call returns is in
 // docs/ssm.md. Compiles as C++98 and later.
 //
 //   T        anything: structs, arrays, classes that own memory (with callbacks of their own, see
@@ -28,7 +28,7 @@ size_t dssm_ssm_data_size(SSM_sid sid);
 // Waits until the stream exists (1), `timeout` real seconds passed (0; <= 0: no limit), a signal
 // handler ran (-1), or dssmd cannot be asked (-2).
 int dssm_ssm_wait_stream(const char* stream_name, int stream_id, double timeout);
-// As get_propertySSM, but only when the property is exactly `size` bytes; says so on stderr if not.
+// As get_propertySSM, but only when the property is exactly `size` bytes; reports on stderr if not.
 int dssm_ssm_get_property(const char* stream_name, int stream_id, void* data, size_t size);
 }
 
@@ -204,7 +204,7 @@ class SSMApiBase {
       return read(-1);
     }
     const SSM_tid target = after(timeId, dt);
-    // Again when a fast writer overtakes us between looking and reading.
+    // Again when a fast writer overtakes this thread between asking and reading.
     for (int attempt = 0; attempt < 100; ++attempt) {
       if (!isGone(target)) {
         if (isBlocking && waitTID(ssmId, target) != 1) return false;
@@ -309,7 +309,7 @@ class SSMApiBase {
     mBaseSharedSize = false;
   }
 
-  // Tids are 31 bits of a counter that goes on for ever: after 2147483647 comes 0 again, so "newer"
+  // Tids are 31 bits of a counter without end: after 2147483647 comes 0 again, so "newer"
   // is a question of distance, not of size.
   static SSM_tid after(SSM_tid tid, int dt) {
     if (tid >= 0 && dt > 0 && tid > 0x7fffffff - dt) return tid - 0x7fffffff - 1 + dt;

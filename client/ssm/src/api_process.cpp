@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// <ssm.h>, <libssm.h>: registration, and who is registered and has what open.
+// <ssm.h>, <libssm.h>: registration, and the lists of registered processes and open streams.
 #include <algorithm>
 #include <cstdio>
 #include <cstring>
@@ -8,7 +8,6 @@
 #include <optional>
 
 #include "../include/libssm.h"
-#include "messages.hpp"
 #include "process.hpp"
 
 using dssm::ssm::process;
@@ -22,9 +21,8 @@ struct Edge {
 
 // The pids of the registered processes, each once, in the order of registration.
 std::optional<std::vector<int>> registered_pids() {
-  auto session = process().session();
-  auto clients = session ? session->list_clients() : std::move(session).error();
-  if (!clients) return dssm::ssm::remember_error(clients.error().message), std::nullopt;
+  const auto clients = process().request([](dssm::Session& dssmd) { return dssmd.list_clients(); });
+  if (!clients) return std::nullopt;
   std::vector<int> pids;
   for (const dssm::ClientInfo& client : *clients) {
     if (std::find(pids.begin(), pids.end(), client.pid) == pids.end()) pids.push_back(client.pid);
@@ -32,11 +30,11 @@ std::optional<std::vector<int>> registered_pids() {
   return pids;
 }
 
-// Who opened what that whom created. Programs that use DSSM's own interface are seen as readers.
+// The open streams, with the processes that created and opened them. Readers that programs open by
+// DSSM's own interface count too.
 std::optional<std::vector<Edge>> edges() {
-  auto session = process().session();
-  auto opens = session ? session->list_opens() : std::move(session).error();
-  if (!opens) return dssm::ssm::remember_error(opens.error().message), std::nullopt;
+  const auto opens = process().request([](dssm::Session& dssmd) { return dssmd.list_opens(); });
+  if (!opens) return std::nullopt;
   std::vector<Edge> found;
   for (const dssm::OpenInfo& open : *opens) {
     if (open.tag & dssm::ssm::kTagEdge) {
@@ -58,7 +56,7 @@ std::optional<std::vector<Edge>> edges() {
 
 extern "C" {
 
-void errSSM(void) { std::fprintf(stderr, "SSM Err: %s\n", dssm::ssm::remembered_error()); }
+void errSSM(void) { std::fprintf(stderr, "SSM Err: %s\n", dssm::ssm::last_error); }
 
 int initSSM(void) {
   const dssm::Result<void> started = process().start();

@@ -6,10 +6,8 @@
 #include <optional>
 
 #include "../include/libssm.h"
-#include "messages.hpp"
+#include "convert.hpp"
 #include "process.hpp"
-#include "tid_convert.hpp"
-#include "time_convert.hpp"
 
 using dssm::ReadStatus;
 using dssm::ssm::remember_error;
@@ -35,7 +33,7 @@ SSM_tid error_of(ReadStatus status) noexcept {
   return status == ReadStatus::not_yet ? SSM_ERROR_NO_DATA : SSM_ERROR_PAST;
 }
 
-// Reads what `read` says and hands it to `take`, exactly once, when there is something.
+// Reads by `read` and passes the sample to `take`, exactly once, if there is one.
 template <class Read, class Take>
 SSM_tid read_and_take(SSM_sid sid, ssmTimeT* ytime, Read read, Take take) {
   const SidUse use(sid);
@@ -59,7 +57,7 @@ SSM_tid read_tid(Stream& stream, Stream::Copy& copy, SSM_tid tid) {
       return SSM_ERROR_FUTURE;
     case ReadStatus::too_old:
     case ReadStatus::lapped:
-    case ReadStatus::restarted:            // Stream goes on by itself
+    case ReadStatus::restarted:            // Stream continues by itself
     case ReadStatus::clock_out_of_bounds:  // not of reads by tid
       break;
   }
@@ -95,11 +93,8 @@ SSM_tid getTID_bottom(SSM_sid sid) {
 SSM_tid getTID(SSM_sid sid, ssmTimeT ytime) {
   const SidUse use(sid);
   if (!use) return SSM_ERROR_NO_DATA;
-  // Strictly before `ytime`: at most one nanosecond less.
-  const dssm::Time time = time_from_seconds(ytime);
   dssm::SampleInfo info;
-  const ReadStatus status =
-      use->find(time > dssm::Time::min() ? time - dssm::Duration(1) : time, info);
+  const ReadStatus status = use->find(dssm::ssm::time_before(ytime), info);
   return status == ReadStatus::ok ? ssm_tid(info.tid) : error_of(status);
 }
 
@@ -118,14 +113,14 @@ int waitTID(SSM_sid sid, SSM_tid tid) {
   if (tid < 0) return 1;
   const dssm::Tid wanted = ring_tid(tid, newest);
   const dssm::MonoTime deadline = dssm::deadline_in(std::chrono::seconds(1));
-  // A handler that closes the sid interrupts the wait; another thread's closing is seen by looking.
-  constexpr dssm::Duration kLook = std::chrono::milliseconds(100);
+  // A handler that closes the sid interrupts the wait; another thread's closing is seen by a check.
+  constexpr dssm::Duration kCheckPause = std::chrono::milliseconds(100);
   for (;;) {
     if (use->newest() >= wanted) return 1;
     if (use.closed()) return -1;
     const dssm::MonoTime now = dssm::MonoClock::now();
     if (now >= deadline) return 0;
-    static_cast<void>(use->wait_for_tid(wanted, std::min(deadline, now + kLook)));
+    static_cast<void>(use->wait_for_tid(wanted, std::min(deadline, now + kCheckPause)));
   }
 }
 

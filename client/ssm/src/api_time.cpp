@@ -15,17 +15,17 @@ using dssm::ssm::process;
 
 namespace {
 
-PlaybackClock::Setting look() noexcept { return process().clock().setting(); }
+PlaybackClock::Setting setting() noexcept { return process().clock().setting(); }
 
 // 1, or 0 without a clock.
 template <class Change>
 int set(Change change) noexcept {
-  return process().clock().update(change) ? 1 : 0;
+  return process().clock().change(change) ? 1 : 0;
 }
 
 // Real time per SSM time of a sleep.
 double sleep_factor() noexcept {
-  const double speed = std::fabs(look().speed);
+  const double speed = std::fabs(setting().speed);
   return speed > 0 && std::isfinite(speed) ? 1 / speed : 1;
 }
 
@@ -35,8 +35,8 @@ int sleep_scaled(double seconds, double& left) noexcept {
     return -1;
   }
   const double factor = sleep_factor();
-  constexpr double kLongest = 4e9;  // 126 years: as good as for ever, and fits
-  const double real = std::fmin(seconds * factor, kLongest);
+  constexpr double kMaxSeconds = 4e9;  // 126 years: long enough, and fits
+  const double real = std::fmin(seconds * factor, kMaxSeconds);
   const double whole = std::floor(real);
   timespec span{};
   span.tv_sec = static_cast<time_t>(whole);
@@ -58,7 +58,7 @@ ssmTimeT gettimeSSM_real(void) {
 }
 
 ssmTimeT gettimeSSM(void) {
-  const PlaybackClock::Setting clock = look();  // without one: offset 0, speed 1
+  const PlaybackClock::Setting clock = setting();  // without one: offset 0, speed 1
   return clock.paused ? clock.paused_at_s : clock.speed * gettimeSSM_real() + clock.offset_s;
 }
 
@@ -110,13 +110,13 @@ int settimeSSM_speed(double speed) {
   return set([&](PlaybackClock& clock) { clock.set_speed(speed); });
 }
 
-double gettimeSSM_speed(void) { return look().speed; }
+double gettimeSSM_speed(void) { return setting().speed; }
 
 int settimeSSM_is_pause(int is_pause) {
   return set([&](PlaybackClock& clock) { clock.set_paused(is_pause != 0); });
 }
 
-int gettimeSSM_is_pause(void) { return look().paused ? 1 : 0; }
+int gettimeSSM_is_pause(void) { return setting().paused ? 1 : 0; }
 
 int settimeSSM_is_reverse(int is_reverse) {
   const double speed = gettimeSSM_speed();
@@ -125,7 +125,7 @@ int settimeSSM_is_reverse(int is_reverse) {
 
 int gettimeSSM_is_reverse(void) { return gettimeSSM_speed() < 0 ? 1 : 0; }
 
-ssmTimeT gettimeOffset(void) { return look().offset_s; }
+ssmTimeT gettimeOffset(void) { return setting().offset_s; }
 
 void settimeOffset(ssmTimeT offset) {
   set([&](PlaybackClock& clock) { clock.set_offset(offset); });

@@ -13,10 +13,16 @@
 #include <new>
 
 #include "core/base/quiet_thread.hpp"
+#include "core/base/try.hpp"
+#include "signal_safe.hpp"
 #include "socket_path.hpp"
+
+struct ssmtime* timecontrol = nullptr;
 
 namespace dssm::ssm {
 namespace {
+
+static_assert(sizeof(SSM_sid) == 8, "a sid holds a place and a generation: 46 bits");
 
 // Trivially destructible and made when the library is loaded, so before any static object of the
 // program, and there until its last thread ends.
@@ -24,13 +30,22 @@ Process the_process;
 
 thread_local int thread_id = 0;
 
+ssmtime shown_clock;  // what timecontrol points to
+
+template <class T>
+void store_changed(T& field, T value) noexcept {
+  const std::atomic_ref shared(field);  // programs read it from any thread
+  if (shared.load(std::memory_order_relaxed) == value) return;
+  shared.store(value, std::memory_order_relaxed);
+}
+
 Result<Session> connect(const std::string& path) {
   SessionOptions options;
   options.socket_path = path;
   return Session::connect(std::move(options));
 }
 
-// Where programs look for dssmd; `path` becomes the place where it was.
+// Where programs look for dssmd; `path` becomes the place where it was found.
 Result<Session> connect_anywhere(std::string& path) {
   Error failure;
   for (const std::string& place : socket_paths()) {
@@ -39,7 +54,7 @@ Result<Session> connect_anywhere(std::string& path) {
       path = place;
       return session;
     }
-    // The first path is the one to talk about, unless a dssmd refused us at a later one.
+    // The failure at the first path is reported, unless a dssmd refused the program at a later one.
     if (failure.message.empty() || session.error().code != Errc::no_daemon) {
       failure = std::move(session).error();
     }
@@ -124,7 +139,7 @@ void Process::after_fork_in_child() {
   if (Registration* const parents = std::exchange(process.registration_, nullptr)) {
     parents->next = std::exchange(process.abandoned_, parents);
   }
-  process.sids_.reset_after_fork();
+  process.sids_.visit_objects([](Stream& stream) { stream.reset_after_fork(); });
 }
 
 // --- registration
@@ -132,26 +147,20 @@ void Process::after_fork_in_child() {
 Result<void> Process::start() {
   const std::lock_guard guard(mutex_);
   const std::uint64_t ends = ends_.load();
-  if (Result<void> ready = prepare_locked(); !ready) return ready;
+  DSSM_TRY(prepare_locked());
   reap_locked();
   if (registered_locked()) {
     if (!registration_->session.is_connected()) {
       return Error{Errc::unavailable, "dssmd is gone; this program goes on when it is back"};
     }
-    if (clock_.attached()) return {};
-    Result<PlaybackClock> clock = registration_->session.open_playback_clock();
-    if (!clock) return std::move(clock).error();
-    clock_.attach(std::move(*clock), generation_);
-    return {};
+    return attach_clock_locked();
   }
   std::string path;
-  Result<Session> session = connect_anywhere(path);
-  if (!session) return std::move(session).error();
-  Result<PlaybackClock> clock = session->open_playback_clock();
-  if (!clock) return std::move(clock).error();
+  Session session = DSSM_TRY(connect_anywhere(path));
+  PlaybackClock clock = DSSM_TRY(session.open_playback_clock());
   std::strncpy(socket_path_, path.c_str(), sizeof socket_path_ - 1);
-  registration_ = new Registration{std::move(*session), ends, nullptr};
-  clock_.attach(std::move(*clock), generation_);
+  registration_ = new Registration{std::move(session), ends, nullptr};
+  clock_.attach(std::move(clock), generation_);
   was_registered_.store(true);
   if (ends_.load() != ends) clock_.detach(), ::sem_post(&wake_);  // a handler ended it already
   return {};
@@ -164,8 +173,8 @@ bool Process::end() noexcept {
   ::sem_post(&wake_);
   bool listens = false;
   if (was_registered_.load()) {
-    // "Could the coordinator be told?" A handler can find out only by the system calls allowed in
-    // it.
+    // SSM's result is whether the coordinator was notified. A handler may use only few system calls
+    // to find out whether there is one.
     sockaddr_un address{};
     address.sun_family = AF_UNIX;
     std::memcpy(address.sun_path, socket_path_, sizeof address.sun_path);
@@ -196,18 +205,42 @@ Result<Session> Process::any_session() {
 
 SSM_sid Process::add(std::unique_ptr<Stream> stream) {
   const std::lock_guard guard(mutex_);
-  return sids_.add(std::move(stream), generation_);
+  // NOLINTNEXTLINE(performance-no-int-to-ptr): a number in the type of SSM's API
+  return reinterpret_cast<SSM_sid>(sids_.add(std::move(stream), generation_));
+}
+
+// --- the clock
+
+Result<void> Process::attach_clock_locked() {
+  if (clock_.attached()) return {};
+  clock_.attach(DSSM_TRY(registration_->session.open_playback_clock()), generation_);
+  return {};
 }
 
 bool Process::attach_clock() {
   const std::lock_guard guard(mutex_);
   reap_locked();
-  if (!registered_locked()) return false;
-  if (clock_.attached()) return true;
-  Result<PlaybackClock> clock = registration_->session.open_playback_clock();
-  if (!clock) return false;
-  clock_.attach(std::move(*clock), generation_);
-  return true;
+  return registered_locked() && attach_clock_locked().has_value();
+}
+
+void SharedClock::show(const PlaybackClock::Setting& setting) noexcept {
+  store_changed(shown_clock.offset, setting.offset_s);
+  store_changed(shown_clock.speed, setting.speed);
+  store_changed(shown_clock.is_pause, setting.paused ? 1 : 0);
+  store_changed(shown_clock.pausetime, setting.paused_at_s);
+}
+
+// In attach() and detach() current_ changes before the old clock is closed: see change().
+void SharedClock::attach(PlaybackClock clock, std::uint64_t process_generation) {
+  show(clock.setting());
+  clocks_.close(current_.exchange(
+      clocks_.add(std::make_unique<PlaybackClock>(std::move(clock)), process_generation)));
+  std::atomic_ref(timecontrol).store(&shown_clock);
+}
+
+void SharedClock::detach() noexcept {
+  std::atomic_ref(timecontrol).store(nullptr);
+  clocks_.close(current_.exchange(0));
 }
 
 }  // namespace dssm::ssm

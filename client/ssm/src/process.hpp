@@ -15,13 +15,63 @@
 #include <semaphore.h>
 
 #include <atomic>
+#include <dssm/playback_clock.hpp>
 #include <dssm/session.hpp>
 #include <mutex>
+#include <optional>
 
-#include "shared_clock.hpp"
-#include "sid_table.hpp"
+#include "../include/libssm.h"
+#include "handle_table.hpp"
+#include "messages.hpp"
+#include "stream.hpp"
 
 namespace dssm::ssm {
+
+// A sid has a pointer type, but holds a handle of this table. Kept with each place: what
+// shm_get_address() shows.
+using SidTable = HandleTable<Stream, ssm_header>;
+
+// The playback clock that this process has attached, or none, and the `timecontrol` of <libssm.h>.
+//
+//   threads  attach() and reap() under one lock; the rest from any thread and from signal handlers
+class SharedClock {
+ public:
+  // `wake` is posted when there is something to reap.
+  explicit SharedClock(sem_t& wake) noexcept : clocks_(wake) {}
+
+  bool attached() const noexcept { return current_.load() != 0; }
+  void attach(PlaybackClock clock, std::uint64_t process_generation);
+  void detach() noexcept;
+  void reap(std::uint64_t process_generation) { clocks_.reap(process_generation); }
+
+  // The setting; offset 0, speed 1 without a clock.
+  PlaybackClock::Setting setting() noexcept {
+    return change([](PlaybackClock&) {}).value_or(PlaybackClock::Setting{});
+  }
+
+  // Calls change(clock) and shows the setting that follows through timecontrol; nothing without a
+  // clock.
+  template <class Change>
+  std::optional<PlaybackClock::Setting> change(Change change) noexcept {
+    while (const Clocks::Handle handle = current_.load()) {
+      const Clocks::Use use(clocks_, handle);
+      if (!use) continue;  // detached meanwhile: current_ has changed before
+      change(*use);
+      const PlaybackClock::Setting setting = use->setting();
+      show(setting);
+      return setting;
+    }
+    return std::nullopt;
+  }
+
+ private:
+  using Clocks = HandleTable<PlaybackClock>;
+
+  static void show(const PlaybackClock::Setting& setting) noexcept;
+
+  Clocks clocks_;  // the current one, and those that were detached while they were used
+  std::atomic<Clocks::Handle> current_{0};
+};
 
 class Process {
  public:
@@ -37,11 +87,20 @@ class Process {
   // The session; fails with `closed` before start() and after end(). Call it without the lock.
   Result<Session> session();
 
+  // request(session), whose failure is kept for errSSM().
+  template <class Request>
+  auto request(Request request) -> decltype(request(std::declval<Session&>())) {
+    Result<Session> registered = session();
+    auto answer = registered ? request(*registered) : std::move(registered).error();
+    if (!answer) remember_error(answer.error().message);
+    return answer;
+  }
+
   // The session, or a temporary one: for sids that outlive endSSM, and for calls that need no
   // initSSM.
   Result<Session> any_session();
 
-  // A sid for the stream.
+  // A sid for the stream; null when too many are open.
   SSM_sid add(std::unique_ptr<Stream> stream);
 
   // Attaches the clock again; false without a session.
@@ -61,6 +120,7 @@ class Process {
   static void after_fork_in_child();
   static void at_exit();
   Result<void> prepare_locked();
+  Result<void> attach_clock_locked();
   void reap_locked();
   bool registered_locked() const noexcept;
 
@@ -80,5 +140,12 @@ class Process {
 };
 
 Process& process() noexcept;
+
+// A use of the sid's stream during a call.
+class SidUse : public SidTable::Use {
+ public:
+  explicit SidUse(SSM_sid sid) noexcept
+      : Use(process().sids(), reinterpret_cast<std::uintptr_t>(sid)) {}
+};
 
 }  // namespace dssm::ssm

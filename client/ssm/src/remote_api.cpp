@@ -1,28 +1,77 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// <dssm-proxy-client.hpp>: the functions between the old remote interface and RemoteStream.
-#include <array>
+// <dssm-proxy-client.hpp>: the functions between the old remote interface and RemoteStream, and the
+// old DSSM's broadcasts, on top of the catalog. What a host shows is the property of a small stream
+// of its own, "dssm_broadcast:0"; a program that wants to know asks the dssmd of this PC for the
+// hosts, and each host for that property.
+#include <fmt/format.h>
+
 #include <cstring>
-#include <new>
+#include <dssm/session.hpp>
+#include <optional>
+#include <string>
 
 #include "../include/dssm-proxy-client.hpp"
-#include "messages.hpp"
+#include "convert.hpp"
+#include "core/base/try.hpp"
 #include "process.hpp"
-#include "remote_broadcast.hpp"
 #include "remote_stream.hpp"
-#include "stream_arguments.hpp"
 
+namespace dssm::ssm {
+
+// One thread at a time.
+struct Broadcast {
+  Result<Session*> connect();
+  Result<void> show(std::span<const std::byte> block);
+
+  std::optional<Session> session;
+  std::optional<RawWriter> stream;  // held, so that it survives a restart of dssmd
+};
+
+static const StreamId kBroadcast{"dssm_broadcast", 0, {}};
+
+Result<Session*> Broadcast::connect() {
+  if (!session) session = DSSM_TRY(process().any_session());
+  return &*session;
+}
+
+Result<void> Broadcast::show(std::span<const std::byte> block) {
+  Session* const local = DSSM_TRY(connect());
+  if (!stream) {
+    stream = DSSM_TRY(local->create_raw(kBroadcast, TypeInfo{{}, 1, 1, {}},
+                                        History{kMinDepth, std::chrono::seconds(1)}));
+  }
+  return stream->set_property(block);
+}
+
+}  // namespace dssm::ssm
+
+using dssm::ssm::Broadcast;
+using dssm::ssm::process;
 using dssm::ssm::RemoteStream;
 using dssm::ssm::report_error;
 
 struct dssm_ssm_remote {
   RemoteStream stream;
-  dssm::ssm::Broadcast broadcast;
+  Broadcast broadcast;
 };
 
 namespace {
 
-// Whether `address` means this PC: by its words, so that no name has to be looked up.
+struct HostAddress {
+  std::string address, port;
+};
+
+// "10.0.0.2:13776", "[fe80::1]:13776" in two.
+HostAddress split(const std::string& text) {
+  const std::size_t colon = text.rfind(':');
+  if (colon == text.npos) return {text, {}};
+  std::string address = text.substr(0, colon);
+  if (address.size() > 2 && address.front() == '[') address = address.substr(1, address.size() - 2);
+  return {address, text.substr(colon + 1)};
+}
+
+// Whether `address` means this PC, judged by its text, so that no name has to be looked up.
 bool is_this_pc(const std::string& address) {
   for (const char* own : {"127.", "localhost", "::1", "[::1]"}) {
     if (address.compare(0, std::strlen(own), own) == 0) return true;
@@ -118,11 +167,12 @@ int dssm_ssm_remote_get_property(dssm_ssm_remote* remote, void* data, size_t siz
 
 void dssm_ssm_remote_set_offset(const char* address, ssmTimeT offset) {
   if (!is_this_pc(address)) {
-    report_error("setOffset : the SSM clock of '" + std::string(address) +
-                 "' cannot be set from here; call settimeOffset() in a program on that PC");
-    return;
+    return report_error(fmt::format(
+        "setOffset : the SSM clock of '{}' cannot be set from here; call settimeOffset() in a "
+        "program on that PC",
+        address));
   }
-  auto session = dssm::ssm::process().any_session();
+  auto session = process().any_session();
   auto clock = session ? session->open_playback_clock() : std::move(session).error();
   if (!clock) return report_error("setOffset : " + clock.error().message);
   clock->set_offset(offset);
@@ -142,11 +192,17 @@ void dssm_ssm_remote_receive_broadcast(dssm_ssm_remote* remote,
                                        void (*take)(const char* address, const char* port,
                                                     const void* data, size_t size, void* user_data),
                                        void* user_data) {
-  const auto hosts = remote->broadcast.hosts();
+  auto local = remote->broadcast.connect();
+  auto hosts = local ? (*local)->list_hosts() : std::move(local).error();
   if (!hosts) return report_error("receiveBroadcast : " + hosts.error().message);
-  for (const dssm::ssm::Broadcast::Host& host : *hosts) {
-    take(host.address.c_str(), host.port.c_str(), host.block ? host.block->data() : nullptr,
-         host.block ? host.block->size() : 0, user_data);
+  for (const dssm::HostInfo& host : *hosts) {
+    if (host.state != dssm::HostState::self && host.state != dssm::HostState::up) continue;
+    // The last one is where it was reached, if it was configured by another name.
+    const HostAddress at = host.addresses.empty() ? HostAddress{} : split(host.addresses.back());
+    const auto block =
+        (*local)->property({dssm::ssm::kBroadcast.name, dssm::ssm::kBroadcast.id, host.name});
+    take(at.address.c_str(), at.port.c_str(), block ? block->data() : nullptr,
+         block ? block->size() : 0, user_data);
   }
 }
 

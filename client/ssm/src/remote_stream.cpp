@@ -9,12 +9,9 @@
 #include <cstring>
 #include <mutex>
 
-#include "interruptible.hpp"
+#include "convert.hpp"
 #include "messages.hpp"
 #include "socket_path.hpp"
-#include "stream_arguments.hpp"
-#include "tid_convert.hpp"
-#include "time_convert.hpp"
 
 namespace dssm::ssm {
 namespace {
@@ -23,12 +20,12 @@ using namespace std::chrono_literals;
 
 // How long one call tries: Ctrl-C is seen after it. More for samples that take long to come.
 constexpr Duration kCallTimeout = 2s;
-constexpr std::uint64_t kSlowestBytesPerSecond = 4'000'000;
+constexpr std::uint64_t kMinBytesPerSecond = 4'000'000;
 
 constexpr Duration kRetryPause = 200ms;
 
 // Programs of the oldest kind ask for "512" and mean samples, where it now means seconds: what is
-// collected must not take the machine's memory away.
+// collected must not use up the machine's memory.
 constexpr std::uint64_t kMaxCollectedBytes = 512U << 20;
 
 // When connecting and opening give up: $DSSM_CONNECT_TIMEOUT [s] from now, else never.
@@ -40,19 +37,20 @@ MonoTime give_up_at() {
   return deadline_in(Duration(std::max<std::int64_t>(0, ns_from_seconds(seconds))));
 }
 
-// Tries until it works, fails for good, is interrupted, or is given up. What is wrong is said once.
+// Tries until it succeeds, fails with an error that is not retryable, is interrupted, or is given
+// up. Each error is reported once.
 template <class Try>
 auto retry(const std::string& what, Try attempt) -> decltype(attempt()) {
   const MonoTime give_up = give_up_at();
   Interruptible signals;
-  std::string said;
+  std::string reported;
   for (;;) {
     auto result = attempt();
     if (result || !is_retryable(result.error().code)) return result;
     if (MonoClock::now() >= give_up) return result;
-    if (result.error().message != said) {
-      said = result.error().message;
-      report_error(std::string(what).append(" : ").append(said).append("; trying again"));
+    if (result.error().message != reported) {
+      reported = result.error().message;
+      report_error(fmt::format("{} : {}; trying again", what, reported));
     }
     if (!signals.pause(std::min(kRetryPause, give_up - MonoClock::now()))) {
       return Error{Errc::closed, "interrupted by a signal"};
@@ -91,7 +89,7 @@ class RemoteStream::Call {
     stream_.lock_.unlock();
   }
   explicit operator bool() const noexcept { return allowed_; }
-  // Whether besides there is an open stream to work with.
+  // Whether there is an open stream besides.
   bool has_stream() const noexcept {
     return allowed_ && stream_.open_.load() && stream_.connector_.has_value();
   }
@@ -110,8 +108,7 @@ PConnectorOptions RemoteStream::options(const std::string& address,
                                         std::uint64_t payload_bytes) const {
   PConnectorOptions options;
   options.address = address;
-  options.request_timeout =
-      kCallTimeout + std::chrono::seconds(payload_bytes / kSlowestBytesPerSecond);
+  options.request_timeout = kCallTimeout + std::chrono::seconds(payload_bytes / kMinBytesPerSecond);
   return options;
 }
 
@@ -119,9 +116,9 @@ std::string RemoteStream::quoted_name() const {
   return quoted(connector_->id().name, connector_->id().id);
 }
 
-void RemoteStream::complain(const Error& error) {
-  if (error.message == complaint_) return remember_error(error.message);
-  complaint_ = error.message;
+void RemoteStream::report_once(const Error& error) {
+  if (error.message == reported_) return remember_error(error.message);
+  reported_ = error.message;
   report_error(error.message);
 }
 
@@ -146,7 +143,7 @@ bool RemoteStream::take(Result<PConnector> opened, const std::string& what) {
   offset_ = 0;
   seen_ = kNoTid;
   restarts_ = 0;
-  complaint_.clear();
+  reported_.clear();
   open_.store(true);
   return true;
 }
@@ -169,13 +166,11 @@ bool RemoteStream::open(const std::string& address, const StreamId& id, std::siz
   const std::string what = "open " + quoted(id.name, id.id);
   auto opened = retry(what, [&]() -> Result<PConnector> {
     auto connector = PConnector::open(id, options(address, data_bytes));
-    if (connector && connector->payload_bytes() != data_bytes) {
-      return Error{Errc::type_mismatch,
-                   "the stream has " + std::to_string(connector->payload_bytes()) +
-                       " bytes per sample, this program's type " + std::to_string(data_bytes) +
-                       " : use the type that it was created with"};
-    }
-    return connector;
+    if (!connector || connector->payload_bytes() == data_bytes) return connector;
+    return Error{Errc::type_mismatch,
+                 fmt::format("the stream has {} bytes per sample, this program's type {} : use the "
+                             "type that it was created with",
+                             connector->payload_bytes(), data_bytes)};
   });
   return take(std::move(opened), what);
 }
@@ -190,15 +185,15 @@ void RemoteStream::follow_restart() {
 }
 
 template <class Ask>
-ReadStatus RemoteStream::fetch_by(Ask ask, SampleInfo& info) {
+ReadStatus RemoteStream::fetch(Ask ask, SampleInfo& info) {
   for (;;) {
     Result<ReadStatus> status = ask(*connector_);
     follow_restart();
     if (!status) {
-      complain(status.error());
+      report_once(status.error());
       return ReadStatus::not_yet;
     }
-    complaint_.clear();
+    reported_.clear();
     if (*status == ReadStatus::restarted) continue;
     if (*status == ReadStatus::ok) {
       info.tid += offset_;
@@ -208,16 +203,11 @@ ReadStatus RemoteStream::fetch_by(Ask ask, SampleInfo& info) {
   }
 }
 
-ReadStatus RemoteStream::fetch(Tid tid, SampleInfo& info) {
-  return fetch_by([&](PConnector& from) { return from.read_tid(tid - offset_, sample_, info); },
-                  info);
-}
-
 Tid RemoteStream::ask_newest() {
   const auto newest = connector_->newest_tid();
   follow_restart();
-  if (!newest) return complain(newest.error()), kNoTid;
-  complaint_.clear();
+  if (!newest) return report_once(newest.error()), kNoTid;
+  reported_.clear();
   const Tid tid = *newest + offset_;  // of a new ring that is empty: the last one of the old
   seen_ = std::max(seen_, tid);
   return tid;
@@ -226,18 +216,82 @@ Tid RemoteStream::ask_newest() {
 Tid RemoteStream::ask_oldest() {
   const auto oldest = connector_->oldest_tid();
   follow_restart();
-  if (!oldest) return complain(oldest.error()), kNoTid;
-  complaint_.clear();
+  if (!oldest) return report_once(oldest.error()), kNoTid;
+  reported_.clear();
   return *oldest < 0 ? offset_ - 1 : *oldest + offset_;
 }
 
-// The 64-bit tid that a program means.
-Tid RemoteStream::ring_tid_of(SSM_tid tid) {
-  if (seen_ < 0) seen_ = ask_newest();
-  return ring_tid(tid, seen_);
+// Reads over the network, with the functions of SampleCollector.
+class RemoteStream::Network {
+ public:
+  explicit Network(RemoteStream& stream) noexcept : stream_(stream) {}
+
+  ReadStatus read_newest(std::span<std::byte> out, SampleInfo& info) const {
+    return stream_.fetch([&](PConnector& from) { return from.read_newest(out, info); }, info);
+  }
+  ReadStatus read_tid(Tid tid, std::span<std::byte> out, SampleInfo& info) const {
+    return stream_.fetch(
+        [&](PConnector& from) { return from.read_tid(tid - stream_.offset_, out, info); }, info);
+  }
+  ReadStatus read_newer(Tid than, std::span<std::byte> out, SampleInfo& info) const {
+    return stream_.fetch(
+        [&](PConnector& from) {
+          return from.read_newer(std::max(than - stream_.offset_, kNoTid), out, info);
+        },
+        info);
+  }
+  ReadStatus read_at(Time t, std::span<std::byte> out, SampleInfo& info) const {
+    return stream_.fetch([&](PConnector& from) { return from.read_at(t, out, info); }, info);
+  }
+  // At least as new as any that the program got: near enough to find the one that it means.
+  Tid newest_tid() const {
+    if (stream_.seen_ < 0) stream_.seen_ = stream_.ask_newest();
+    return stream_.seen_;
+  }
+  Tid oldest_tid() const { return stream_.ask_oldest(); }
+
+ private:
+  RemoteStream& stream_;
+};
+
+// Reads what is requested into sample_.
+//   report_skip  what to call with the tids of the wanted and of the next one that is still held
+template <class Source, class ReportSkip>
+ReadStatus RemoteStream::read_from(const Source& source, const Request& request, SampleInfo& info,
+                                   ReportSkip report_skip) {
+  const auto meant = [&] { return ring_tid(request.tid, source.newest_tid()); };
+  switch (request.which) {
+    case Which::tid:
+      return source.read_tid(meant(), sample_, info);
+    case Which::newer:
+      return source.read_newer(request.tid < 0 ? kNoTid : meant(), sample_, info);
+    case Which::next: {
+      if (request.tid < 0) break;
+      const Tid target = meant() + request.dt;
+      ReadStatus status = source.read_tid(target, sample_, info);
+      // Again when a fast writer overtakes this thread between asking and reading.
+      for (int attempt = 0; attempt < 100 && status == ReadStatus::too_old; ++attempt) {
+        const Tid oldest = source.oldest_tid();
+        if (oldest <= target) break;
+        status = source.read_tid(oldest, sample_, info);
+        if (status == ReadStatus::ok) report_skip(target, info.tid);
+      }
+      return status;
+    }
+    case Which::at:
+      if (request.time > 0) {
+        return source.read_at(time_from_seconds(request.time), sample_, info);
+      }
+      break;
+    case Which::newest:
+      break;
+  }
+  return source.read_newest(sample_, info);
 }
 
-SSM_tid RemoteStream::hand_over(const SampleInfo& info, void* data, double* time) {
+SSM_tid RemoteStream::hand_over(ReadStatus status, const Request& request, const SampleInfo& info,
+                                void* data, double* time) {
+  if (status != ReadStatus::ok) return error_of(status, request.which);
   std::memcpy(data, sample_.data(), sample_.size());
   if (time) *time = seconds_from_time(info.time);
   return ssm_tid(info.tid);
@@ -247,62 +301,18 @@ SSM_tid RemoteStream::read(const Request& request, void* data, std::size_t bytes
   const Call call(*this);
   if (!call.has_stream()) return SSM_ERROR_NO_DATA;
   if (bytes != sample_.size()) {
-    complain({Errc::type_mismatch, "read " + quoted_name() + " : its samples have " +
-                                       std::to_string(sample_.size()) +
-                                       " bytes, this program's type " + std::to_string(bytes)});
+    report_once({Errc::type_mismatch,
+                 fmt::format("read {} : its samples have {} bytes, this program's type {}",
+                             quoted_name(), sample_.size(), bytes)});
     return SSM_ERROR_NO_DATA;
   }
   SampleInfo info;
-  ReadStatus status = ReadStatus::not_yet;
-  const auto newest = [&](PConnector& from) { return from.read_newest(sample_, info); };
-  switch (request.which) {
-    case Which::newest:
-      status = fetch_by(newest, info);
-      break;
-    case Which::tid:
-      status = fetch(ring_tid_of(request.tid), info);
-      break;
-    case Which::newer: {
-      const Tid than = request.tid < 0 ? kNoTid : ring_tid_of(request.tid);
-      status = fetch_by(
-          [&](PConnector& from) {
-            return from.read_newer(std::max(than - offset_, kNoTid), sample_, info);
-          },
-          info);
-      break;
-    }
-    case Which::next: {
-      if (request.tid < 0) {
-        status = fetch_by(newest, info);
-        break;
-      }
-      const Tid target = ring_tid_of(request.tid) + request.dt;
-      status = fetch(target, info);
-      // Again when a fast writer overtakes us between asking and reading.
-      for (int attempt = 0; attempt < 100 && status == ReadStatus::too_old; ++attempt) {
-        const Tid oldest = ask_oldest();
-        if (oldest <= target) break;
-        status = fetch(oldest, info);
-        if (status == ReadStatus::ok) {
-          report_error("readNext : skipping " + quoted_name() +
-                       " TID: " + std::to_string(ssm_tid(target)) + " -> " +
-                       std::to_string(ssm_tid(info.tid)));
-        }
-      }
-      break;
-    }
-    case Which::at:
-      status = request.time > 0
-                   ? fetch_by(
-                         [&](PConnector& from) {
-                           return from.read_at(time_from_seconds(request.time), sample_, info);
-                         },
-                         info)
-                   : fetch_by(newest, info);
-      break;
-  }
-  if (status != ReadStatus::ok) return error_of(status, request.which);
-  return hand_over(info, data, time);
+  const auto report_skip = [&](Tid wanted, Tid got) {
+    report_error(fmt::format("readNext : skipping {} TID: {} -> {}", quoted_name(), ssm_tid(wanted),
+                             ssm_tid(got)));
+  };
+  const ReadStatus status = read_from(Network(*this), request, info, report_skip);
+  return hand_over(status, request, info, data, time);
 }
 
 SSM_tid RemoteStream::top() {
@@ -325,11 +335,9 @@ bool RemoteStream::is_newer(SSM_tid tid) {
 SSM_tid RemoteStream::tid_at(double time) {
   const Call call(*this);
   if (!call.has_stream()) return -1;
-  // Strictly before, as getTID() has it: at most one nanosecond less.
-  const Time t = time_from_seconds(time);
-  const auto found = connector_->find(t > Time::min() ? t - Duration(1) : t);
+  const auto found = connector_->find(time_before(time));
   follow_restart();
-  if (!found) return complain(found.error()), SSM_ERROR_NO_DATA;
+  if (!found) return report_once(found.error()), SSM_ERROR_NO_DATA;
   if (*found >= 0) {
     seen_ = std::max(seen_, *found + offset_);
     return ssm_tid(*found + offset_);
@@ -344,12 +352,13 @@ bool RemoteStream::write(const void* data, std::size_t bytes, double time) {
   if (!call.has_stream()) return false;
   const auto posted =
       connector_->post({static_cast<const std::byte*>(data), bytes}, time_from_seconds(time));
-  if (!posted) return complain(posted.error()), false;
+  if (!posted) return report_once(posted.error()), false;
   if (connector_->is_connected()) {
-    complaint_.clear();
+    reported_.clear();
   } else {
-    complain({Errc::unavailable, "write " + quoted_name() + " : '" + address_ +
-                                     "' is away; the newest samples are kept and sent later"});
+    report_once({Errc::unavailable,
+                 fmt::format("write {} : '{}' is away; the newest samples are kept and sent later",
+                             quoted_name(), address_)});
   }
   return true;
 }
@@ -358,7 +367,7 @@ bool RemoteStream::set_property(const void* data, std::size_t bytes) {
   const Call call(*this);
   if (!call.has_stream()) return false;
   const auto set = connector_->set_property({static_cast<const std::byte*>(data), bytes});
-  if (!set) complain(set.error());
+  if (!set) report_once(set.error());
   return set.has_value();
 }
 
@@ -370,14 +379,12 @@ bool RemoteStream::get_property(void* data, std::size_t bytes) {
     if (property.error().code == Errc::not_found) {
       remember_error(property.error().message);
     } else {
-      complain(property.error());
+      report_once(property.error());
     }
     return false;
   }
   if (property->size() != bytes) {
-    report_error("get the property of " + quoted_name() + " : it has " +
-                 std::to_string(property->size()) + " bytes, this program's type " +
-                 std::to_string(bytes) + "; use the type that it was set with");
+    report_error(property_size_error(quoted_name(), property->size(), bytes));
     return false;
   }
   std::memcpy(data, property->data(), bytes);
@@ -436,43 +443,9 @@ SSM_tid RemoteStream::read_buffered(const Request& request, void* data, std::siz
                                     double* time) {
   const Call call(*this, Call::Way::memory);
   if (!call.has_stream() || !collector_ || bytes != sample_.size()) return SSM_ERROR_NO_DATA;
-  const SampleCollector& from = *collector_;
-  const Tid newest = from.newest_tid();
   SampleInfo info;
-  ReadStatus status = ReadStatus::not_yet;
-  switch (request.which) {
-    case Which::newest:
-      status = from.read_newest(sample_, info);
-      break;
-    case Which::tid:
-      status = from.read_tid(ring_tid(request.tid, newest), sample_, info);
-      break;
-    case Which::newer:
-      status =
-          from.read_newer(request.tid < 0 ? kNoTid : ring_tid(request.tid, newest), sample_, info);
-      break;
-    case Which::next: {
-      if (request.tid < 0) {
-        status = from.read_newest(sample_, info);
-        break;
-      }
-      Tid target = ring_tid(request.tid, newest) + request.dt;
-      status = from.read_tid(target, sample_, info);
-      for (int attempt = 0; attempt < 100 && status == ReadStatus::too_old; ++attempt) {
-        const Tid oldest = from.oldest_tid();
-        if (oldest <= target) break;
-        target = oldest;
-        status = from.read_tid(target, sample_, info);
-      }
-      break;
-    }
-    case Which::at:
-      status = request.time > 0 ? from.read_at(time_from_seconds(request.time), sample_, info)
-                                : from.read_newest(sample_, info);
-      break;
-  }
-  if (status != ReadStatus::ok) return error_of(status, request.which);
-  return hand_over(info, data, time);
+  const ReadStatus status = read_from(*collector_, request, info, [](Tid, Tid) {});
+  return hand_over(status, request, info, data, time);
 }
 
 }  // namespace dssm::ssm

@@ -20,7 +20,7 @@
 #include <vector>
 
 #include "../include/libssm.h"
-#include "reentrant_lock.hpp"
+#include "signal_safe.hpp"
 
 namespace dssm::ssm {
 
@@ -35,7 +35,7 @@ class RemoteStream {
               const History& history);
   bool open(const std::string& address, const StreamId& id, std::size_t data_bytes);
   bool is_open() const noexcept { return open_.load(); }
-  void close() noexcept { open_.store(false); }  // async-signal-safe: nothing is taken down yet
+  void close() noexcept { open_.store(false); }  // async-signal-safe: frees nothing yet
 
   enum class Which { newest, tid, newer, next, at };
   struct Request {
@@ -64,21 +64,24 @@ class RemoteStream {
 
  private:
   class Call;
+  class Network;
 
   PConnectorOptions options(const std::string& address, std::uint64_t payload_bytes) const;
   bool take(Result<PConnector> opened, const std::string& what);
   std::string quoted_name() const;
-  void complain(const Error& error);
+  void report_once(const Error& error);
   void follow_restart();
-  Tid ring_tid_of(SSM_tid tid);
 
   // In tids as programs get them, of 64 bits.
-  ReadStatus fetch(Tid tid, SampleInfo& info);
   template <class Ask>
-  ReadStatus fetch_by(Ask ask, SampleInfo& info);
-  SSM_tid hand_over(const SampleInfo& info, void* data, double* time);
+  ReadStatus fetch(Ask ask, SampleInfo& info);
+  template <class Source, class ReportSkip>
+  ReadStatus read_from(const Source& source, const Request& request, SampleInfo& info,
+                       ReportSkip report_skip);
   Tid ask_newest();
   Tid ask_oldest();
+  SSM_tid hand_over(ReadStatus status, const Request& request, const SampleInfo& info, void* data,
+                    double* time);
 
   ReentrantLock lock_;
   bool inside_ = false;
@@ -87,8 +90,8 @@ class RemoteStream {
   std::string address_;
   std::vector<std::byte> sample_;  // read into, before it is the program's
   Tid offset_ = 0, seen_ = kNoTid;
-  std::uint64_t restarts_ = 0;  // of connector_, that offset_ knows of
-  std::string complaint_;       // made, and not mended since
+  std::uint64_t restarts_ = 0;  // of connector_, that offset_ includes
+  std::string reported_;        // the last error, until a call succeeds
   std::optional<SampleCollector> collector_;
 };
 

@@ -9,13 +9,14 @@
 #include <mutex>
 #include <new>
 
+#include "convert.hpp"
 #include "core/base/timespec.hpp"
 #include "messages.hpp"
 
 namespace dssm::ssm {
 namespace {
 
-// Behind a copy as behind a slot: callbacks of real programs go a few bytes too far.
+// After a copy as after a slot: callbacks of real programs read and write a few bytes too many.
 constexpr std::size_t kGuardBytes = 64;
 
 // Memory for copies comes from the system and not from the heap: a handler that reads while its own
@@ -31,7 +32,7 @@ void free_copy(std::byte* copy, std::size_t payload_bytes) noexcept {
   if (copy) ::munmap(copy, payload_bytes + kGuardBytes);
 }
 
-// A reader that the writer overtakes this often between two looks is not keeping up.
+// A reader that the writer overtakes this often during one read cannot keep up.
 constexpr int kAttempts = 1000;
 
 // The rings that this thread is writing to: a signal handler that interrupts a write must not wait
@@ -85,35 +86,36 @@ Stream::~Stream() {
   free_copy(spare_.load(), payload_bytes_);
 }
 
-RawReader* Stream::reader() noexcept {
-  if (RawReader* open = reader_.load(std::memory_order_acquire)) return open;
-  const std::lock_guard guard(read_lock_);
-  if (RawReader* open = reader_.load(std::memory_order_relaxed)) return open;
+// The end in `place`; opened by `open` if it is not yet open. Null, with the reason kept for
+// errSSM(), if it cannot be opened.
+template <class End, class Open>
+End* Stream::end_of(std::atomic<End*>& place, ReentrantLock& lock, Open open) noexcept {
+  if (End* end = place.load(std::memory_order_acquire)) return end;
+  const std::lock_guard guard(lock);
+  if (End* end = place.load(std::memory_order_relaxed)) return end;
   Result<Session> session = connect_();
-  if (!session) return remember_error(session.error().message), nullptr;
-  Result<RawReader> opened = session->open_raw_reader(id_, nullptr, kTagHidden);
+  Result<End> opened = session ? open(*session) : std::move(session).error();
   if (!opened) return remember_error(opened.error().message), nullptr;
   // NOLINTNEXTLINE(bugprone-unhandled-exception-at-new): without memory the process ends
-  reader_.store(new RawReader(std::move(*opened)), std::memory_order_release);
-  return reader_.load(std::memory_order_relaxed);
+  place.store(new End(std::move(*opened)), std::memory_order_release);
+  return place.load(std::memory_order_relaxed);
+}
+
+RawReader* Stream::reader() noexcept {
+  return end_of(reader_, read_lock_, [&](Session& session) {
+    return session.open_raw_reader(id_, nullptr, kTagHidden);
+  });
 }
 
 RawWriter* Stream::writer() noexcept {
-  if (RawWriter* open = writer_.load(std::memory_order_acquire)) return open;
-  const std::lock_guard guard(write_lock_);
-  if (RawWriter* open = writer_.load(std::memory_order_relaxed)) return open;
-  Result<Session> session = connect_();
-  if (!session) return remember_error(session.error().message), nullptr;
-  Result<RawWriter> opened = session->open_raw_writer(id_, nullptr, kTagHidden);
-  if (!opened) return remember_error(opened.error().message), nullptr;
-  // NOLINTNEXTLINE(bugprone-unhandled-exception-at-new): without memory the process ends
-  writer_.store(new RawWriter(std::move(*opened)), std::memory_order_release);
-  return writer_.load(std::memory_order_relaxed);
+  return end_of(writer_, write_lock_, [&](Session& session) {
+    return session.open_raw_writer(id_, nullptr, kTagHidden);
+  });
 }
 
 // --- tids
 
-void Stream::tell(Tid tid) noexcept {
+void Stream::on_returned(Tid tid) noexcept {
   if (tid > seen_.load(std::memory_order_relaxed)) seen_.store(tid, std::memory_order_relaxed);
 }
 
@@ -123,7 +125,7 @@ void Stream::on_restart(const RawReader& open) noexcept {
   cycle_ns_.store(to_ns(open.cycle()), std::memory_order_relaxed);
 }
 
-// Goes on with the new ring, if there is one.
+// Continues with the new ring, if there is one.
 void Stream::follow_ring(RawReader& open) noexcept {
   BorrowedSample nothing;
   if (open.borrow(kNoTid, nothing) == ReadStatus::restarted) on_restart(open);
@@ -133,12 +135,12 @@ Tid Stream::newest() noexcept {
   RawReader* const open = reader_.load(std::memory_order_acquire);
   if (!open) return writer_.load(std::memory_order_acquire)->newest_tid();
   const std::lock_guard guard(read_lock_);
-  // A program that reads one sample after the other is not through with the old ring yet.
+  // A program that reads one sample after the other may not have read all of the old ring yet.
   const Tid read = read_.load(std::memory_order_relaxed);
   if (read == kNoTid || open->newest_tid() + offset() <= read) follow_ring(*open);
   const Tid newest = open->newest_tid();
   if (newest < 0) return offset() - 1;  // kNoTid, or the last one of the old ring
-  tell(newest + offset());
+  on_returned(newest + offset());
   return newest + offset();
 }
 
@@ -175,14 +177,14 @@ ReadStatus Stream::copy(Copy& out, Read read) noexcept {
       continue;
     }
     if (status != ReadStatus::ok) return status;
-    BorrowedSample place;  // the bytes behind the slot belong to nobody, so they are there to read
+    BorrowedSample place;  // to read the bytes after the slot, which belong to no sample
     status = open->borrow(out.info.tid, place);
     if (status == ReadStatus::restarted) on_restart(*open);
     if (status != ReadStatus::ok) continue;
     std::memcpy(out.bytes_ + payload_bytes_, place.payload().data() + payload_bytes_, kGuardBytes);
     if (!place.still_valid()) continue;
     out.info.tid += offset();
-    tell(out.info.tid);
+    on_returned(out.info.tid);
     read_.store(out.info.tid, std::memory_order_relaxed);
     return ReadStatus::ok;
   }
@@ -219,7 +221,7 @@ ReadStatus Stream::find(Time t, SampleInfo& info) noexcept {
   const std::lock_guard guard(read_lock_);
   follow_ring(*open);
   const ReadStatus status = open->find(t, info);
-  if (status == ReadStatus::ok) tell(info.tid += offset());
+  if (status == ReadStatus::ok) on_returned(info.tid += offset());
   return status;
 }
 
@@ -235,15 +237,15 @@ Duration Stream::clock_error(Tid tid) noexcept {
 
 WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
   RawReader* const open = reader();
-  if (!open) {  // nothing to sleep on; the caller looks again
+  if (!open) {  // nothing to sleep on; the caller checks again
     const timespec sleep = timespec_of(deadline - MonoClock::now());
     return ::nanosleep(&sleep, nullptr) == 0 ? WaitStatus::timeout : WaitStatus::interrupted;
   }
   // Without the lock, so that other threads may read meanwhile: a wait for a given tid uses nothing
   // of the reader that reading changes.
   const WaitStatus status = open->wait_for_tid(tid - offset(), deadline);
-  // A new ring ends the wait as well: let the caller look again, but not in a tight loop while the
-  // new ring cannot be had.
+  // A new ring ends the wait as well: let the caller check again, but not in a tight loop while the
+  // new ring cannot be opened.
   if (status == WaitStatus::ready && newest() < tid) {
     const timespec pause{0, 1'000'000};
     ::nanosleep(&pause, nullptr);

@@ -22,21 +22,13 @@
 #include <memory>
 #include <span>
 
-#include "reentrant_lock.hpp"
+#include "signal_safe.hpp"
 
 namespace dssm::ssm {
 
 // Kept with each open, for the lists of edges: the mode given to openSSM in the lower 8 bits.
 inline constexpr std::uint32_t kTagEdge = 1U << 8;    // openSSM: an edge of the graph
 inline constexpr std::uint32_t kTagHidden = 1U << 9;  // createSSM, and the second end of a sid
-
-// Type name of a stream created with size 0; its ring has one byte, as rings must.
-inline constexpr const char* kEmptyType = "ssm.empty";
-
-// Bytes per sample as SSM programs see it.
-inline std::uint64_t data_bytes(const TypeInfo& type) noexcept {
-  return type.name == kEmptyType ? 0 : type.payload_bytes;
-}
 
 class Stream {
  public:
@@ -95,16 +87,16 @@ class Stream {
   // In a forked child: locks that other threads of the parent held are free.
   void reset_after_fork() noexcept;
 
-  Stream* next_abandoned = nullptr;  // in SidTable's list of the parent's streams
-
  private:
+  template <class End, class Open>
+  End* end_of(std::atomic<End*>& place, ReentrantLock& lock, Open open) noexcept;
   RawReader* reader() noexcept;
   RawWriter* writer() noexcept;
   template <class Read>
   ReadStatus copy(Copy& out, Read read) noexcept;
   void follow_ring(RawReader& open) noexcept;
   void on_restart(const RawReader& open) noexcept;
-  void tell(Tid tid) noexcept;
+  void on_returned(Tid tid) noexcept;
   Tid offset() const noexcept { return offset_.load(std::memory_order_relaxed); }
 
   const Connect connect_;

@@ -7,9 +7,8 @@
 #include <limits>
 #include <random>
 
+#include "client/ssm/src/convert.hpp"
 #include "client/ssm/src/socket_path.hpp"
-#include "client/ssm/src/tid_convert.hpp"
-#include "client/ssm/src/time_convert.hpp"
 
 namespace dssm::ssm {
 namespace {

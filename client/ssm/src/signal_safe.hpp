@@ -1,16 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A lock that its holder may take again. Programs read and write streams from signal handlers; a
-// handler that interrupts its own thread in a read must not block, as it did not in the old
-// library, which had no lock there.
-//
-//   signals  may be locked and unlocked in a handler
-//   fork     reset_after_fork() frees it in the child, where its holder may not exist
+// Beside signal handlers: programs read and write streams in them, and end waits by them.
 #pragma once
 
+#include <poll.h>
 #include <unistd.h>
 
 #include <atomic>
+#include <cerrno>
+
+#include "core/base/quiet_thread.hpp"
+#include "core/base/timespec.hpp"
 
 namespace dssm::ssm {
 
@@ -18,6 +18,11 @@ namespace dssm::ssm {
 int this_thread_id() noexcept;
 void forget_thread_id() noexcept;  // in a forked child
 
+// A lock that its holder may take again: a handler that interrupts its own thread in a read must
+// not block, as it did not in the old library, which had no lock there.
+//
+//   signals  may be locked and unlocked in a handler
+//   fork     reset_after_fork() frees it in the child, where its holder may not exist
 class ReentrantLock {
  public:
   void lock() noexcept {
@@ -47,6 +52,20 @@ class ReentrantLock {
  private:
   std::atomic<int> owner_{0};
   int depth_ = 0;  // owner only
+};
+
+// Waits in a loop until something succeeds or the person presses Ctrl-C. Blocks signals except in
+// pause(), so that none is missed between two checks.
+class Interruptible {
+ public:
+  // Sleeps for `time`. False: a signal handler ran.
+  bool pause(Duration time) noexcept {
+    const timespec sleep = timespec_of(time);
+    return !(::ppoll(nullptr, 0, &sleep, &block_.before()) < 0 && errno == EINTR);
+  }
+
+ private:
+  SignalBlock block_;
 };
 
 }  // namespace dssm::ssm

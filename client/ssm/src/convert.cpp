@@ -1,28 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "stream_arguments.hpp"
+#include "convert.hpp"
+
+#include <fmt/format.h>
 
 #include <algorithm>
-#include <cstdio>
 #include <cstring>
 
 #include "../include/libssm.h"
-#include "stream.hpp"
-#include "time_convert.hpp"
 
 namespace dssm::ssm {
-namespace {
 
-std::string number(double value) {
-  char text[32];
-  std::snprintf(text, sizeof text, "%g", value);
-  return text;
-}
-
-}  // namespace
-
-std::string quoted(std::string_view name, int id) {
-  return "'" + std::string(name) + "' [" + std::to_string(id) + "]";
-}
+std::string quoted(std::string_view name, int id) { return fmt::format("'{}' [{}]", name, id); }
 
 std::size_t name_length(const char* name) noexcept { return std::strcspn(name, "@"); }
 
@@ -41,25 +29,33 @@ std::optional<std::string> wrong_arguments(const char* name, int id, double life
   if (!name) return "create : the stream name is NULL";
   const std::size_t length = name_length(name);
   if (length == 0 || length >= SSM_SNAME_MAX) {
-    return "create '" + std::string(name) + "' : a stream name has 1 to 31 bytes, not " +
-           std::to_string(length);
+    return fmt::format("create '{}' : a stream name has 1 to 31 bytes, not {}", name, length);
   }
   if (name[length] && !name[length + 1]) {
-    return "create '" + std::string(name) + "' : there is no host's name behind the '@'";
+    return fmt::format("create '{}' : there is no host's name after the '@'", name);
   }
   const std::string what = "create " + quoted(name, id) + " : ";
   if (id < 0) return what + "a stream id is 0 or more";
-  if (!(life > 0)) return what + "life is " + number(life) + " s, must be more than 0";
-  if (!(cycle > 0)) return what + "cycle is " + number(cycle) + " s, must be more than 0";
+  if (!(life > 0)) return what + fmt::format("life is {:g} s, must be more than 0", life);
+  if (!(cycle > 0)) return what + fmt::format("cycle is {:g} s, must be more than 0", cycle);
   if (life < cycle) {
-    return what + "life (" + number(life) + " s) is shorter than cycle (" + number(cycle) + " s)";
+    return what + fmt::format("life ({:g} s) is shorter than cycle ({:g} s)", life, cycle);
   }
   if (slots(life, cycle) > static_cast<double>(kMaxDepth)) {
-    return what + "life " + number(life) + " s at cycle " + number(cycle) +
-           " s needs more slots than a ring may have (" + std::to_string(kMaxDepth) +
-           "); ask for less life";
+    return what + fmt::format(
+                      "life {:g} s at cycle {:g} s needs more slots than a ring may have ({}); ask "
+                      "for less life",
+                      life, cycle, kMaxDepth);
   }
   return std::nullopt;
+}
+
+std::string property_size_error(const std::string& quoted_name, std::size_t property_bytes,
+                                std::size_t program_bytes) {
+  return fmt::format(
+      "get the property of {} : it has {} bytes, this program's type {}; use the type that it was "
+      "set with",
+      quoted_name, property_bytes, program_bytes);
 }
 
 History history_of(double life, double cycle) noexcept {
