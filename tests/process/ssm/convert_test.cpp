@@ -1,13 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Between SSM's doubles and ints and the ring's 64-bit numbers.
+#include "client/ssm/src/convert.hpp"
+
 #include <gtest/gtest.h>
 
 #include <cmath>
 #include <limits>
 #include <random>
 
-#include "client/ssm/src/convert.hpp"
 #include "client/ssm/src/socket_path.hpp"
 
 namespace dssm::ssm {
