@@ -45,16 +45,15 @@ Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
 using clock::coarse_now;
 
 // Whether reads by time must not return that sample.
-bool is_refused(const ring::ClockAssessment& clock, const SampleInfo& info) noexcept {
-  return clock.policy == ClockPolicy::enforce && !clock.is_good(info, coarse_now());
+bool is_refused(const ring::RingReader& ring, const SampleInfo& info) noexcept {
+  return ring.enforces_clock() && !ring.clock().is_good(info, coarse_now());
 }
 
 // The same by tid, before the sample is copied.
 bool is_refused(const ring::RingReader& ring, Tid tid) noexcept {
-  const ring::ClockAssessment clock = ring.clock();
   SampleInfo info;
-  return clock.policy == ClockPolicy::enforce && ring.stamp(tid, info) == ReadStatus::ok &&
-         is_refused(clock, info);
+  return ring.enforces_clock() && ring.stamp(tid, info) == ReadStatus::ok &&
+         !ring.clock().is_good(info, coarse_now());
 }
 
 // What an attempt to read returns when a writer overtook it.
@@ -240,8 +239,7 @@ ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
     // A sample whose time runs backwards was written meanwhile: now it is the newest with time <=
     // t.
     if (seen.after.time <= t) return kOvertaken;
-    const ring::ClockAssessment clock = ring.clock();
-    if (is_refused(clock, seen.before) || is_refused(clock, seen.after)) {
+    if (is_refused(ring, seen.before) || is_refused(ring, seen.after)) {
       return ReadStatus::clock_out_of_bounds;
     }
     out = seen;
@@ -308,7 +306,7 @@ ReadStatus RawReader::find(Time t, SampleInfo& info) const noexcept {
     if (status != ReadStatus::ok) return status;
     SampleInfo seen;
     if (state_->ring.stamp(found, seen) != ReadStatus::ok) return kOvertaken;
-    if (is_refused(state_->ring.clock(), seen)) return ReadStatus::clock_out_of_bounds;
+    if (is_refused(state_->ring, seen)) return ReadStatus::clock_out_of_bounds;
     info = seen;
     return ReadStatus::ok;
   });

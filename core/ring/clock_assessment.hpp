@@ -8,6 +8,7 @@
 // In a ring that only this PC writes to nothing is stored; it is read as a ClockAssessment().
 #pragma once
 
+#include <cstddef>
 #include <cstdint>
 #include <dssm/clock_status.hpp>
 #include <dssm/sample.hpp>
@@ -38,6 +39,9 @@ struct ClockAssessment {
 
   // An older assessment counts as unknown: dssmd states one a second, and restarts in less.
   static constexpr Duration kValidFor = std::chrono::seconds(3);
+
+  // So many bytes hold the policy and whether it has an effect.
+  static constexpr std::size_t kPolicyBytes = 8;
 
   // Another clock, of which nothing is known: no sample is good, unless `policy` is off.
   static ClockAssessment unknown_clock(ClockPolicy policy) noexcept;

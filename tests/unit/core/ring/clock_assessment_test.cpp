@@ -110,6 +110,22 @@ TEST(ClockAssessment, HasItsDocumentedOffsets) {
   EXPECT_EQ(sizeof(ClockAssessment), 48u);
 }
 
+TEST(ClockAssessment, IsEnforcedInARingOnlyForAnotherClockUnderThatPolicy) {
+  const TestRing ring(8, 4);
+  const RingReader reader(*ring.mapping);
+  EXPECT_FALSE(reader.enforces_clock()) << "nothing was stored: only this PC writes to it";
+  ClockAssessment stored = enforced();
+  ring.mapping->header().clock.store(stored);
+  EXPECT_TRUE(reader.enforces_clock());
+  stored.same_clock = 1;
+  ring.mapping->header().clock.store(stored);
+  EXPECT_FALSE(reader.enforces_clock());
+  stored.same_clock = 0;
+  stored.policy = ClockPolicy::mark;
+  ring.mapping->header().clock.store(stored);
+  EXPECT_FALSE(reader.enforces_clock());
+}
+
 TEST(ClockAssessment, IsReadInARingAsItWasStored) {
   const TestRing ring(8, 4);
   const RingReader reader(*ring.mapping);
