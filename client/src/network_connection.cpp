@@ -8,15 +8,13 @@
 #include <array>
 
 #include "core/base/text.hpp"
+#include "core/base/try.hpp"
 #include "core/clock/clock_page.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/tcp.hpp"
 
 namespace dssm::detail {
 namespace {
-
-// For one address: longer than the kernel takes to repeat a lost first packet (1 s).
-constexpr Duration kConnectTimeout = std::chrono::seconds(2);
 
 // This PC's name as a greeting wants it: letters, digits and '-'.
 std::string own_host() {
@@ -46,23 +44,24 @@ NetworkConnection::NetworkConnection(wire::FrameDelegate& delegate, std::string 
       greeting_timeout_(std::max(greeting_timeout, wire::kHelloTimeout)),
       instance_id_(wire::random_number()) {}
 
-void NetworkConnection::start(std::vector<wire::SocketAddress> addresses) {
-  close();
-  addresses_ = std::move(addresses);
-  next_address_ = 0;
-  phase_ = Phase::connecting;  // advance() does the rest
-  step_deadline_ = MonoClock::now();
+Result<void> NetworkConnection::start(Result<std::vector<wire::SocketAddress>> addresses) {
+  phase_ = Phase::connecting;
+  if (!addresses) return fail(std::move(addresses).error());
+  plan_.begin_round(*std::move(addresses));
+  return connect();
 }
 
 void NetworkConnection::close() {
+  if (phase_ == Phase::down) return;
+  const MonoTime now = MonoClock::now();
+  step_at_ = now + plan_.end_round(now, phase_ == Phase::greeting);
+  phase_ = Phase::down;
   if (decoder_) add(earlier_, decoder_->counters());
   decoder_.reset();
   transport_.reset();
   connecting_.reset();
   queued_.clear();
   queued_from_ = 0;
-  phase_ = Phase::down;
-  step_deadline_ = kNever;
 }
 
 Error NetworkConnection::fail(Error why) {
@@ -76,20 +75,18 @@ Error NetworkConnection::closed_error() const {
 
 // --- connecting and greeting
 
-Result<void> NetworkConnection::connect_next() {
-  Error last{Errc::no_daemon, "no address to connect to"};
-  while (next_address_ < addresses_.size()) {
-    const wire::SocketAddress& address = addresses_[next_address_++];
-    address_ = address.str();
-    auto socket = wire::start_connect(address);
-    if (socket) {
-      connecting_ = std::move(*socket);
-      step_deadline_ = deadline_in(kConnectTimeout);
-      return {};
-    }
-    last = std::move(socket).error();
-  }
-  return fail(std::move(last));
+Result<void> NetworkConnection::connect() {
+  address_ = plan_.address().str();
+  auto socket = wire::start_connect(plan_.address());
+  if (!socket) return connect_next(std::move(socket).error());
+  connecting_ = std::move(*socket);
+  step_at_ = deadline_in(plan_.connect_timeout());
+  return {};
+}
+
+Result<void> NetworkConnection::connect_next(Error why) {
+  connecting_.reset();
+  return plan_.next_address() ? connect() : fail(std::move(why));
 }
 
 Result<void> NetworkConnection::greet() {
@@ -110,43 +107,30 @@ Result<void> NetworkConnection::greet() {
   net::Frame frame;
   wire::to_message(self, *frame.mutable_hello());
   phase_ = Phase::greeting;
-  step_deadline_ = deadline_in(greeting_timeout_);
+  step_at_ = deadline_in(greeting_timeout_);
   queue(frame);
   return send_queued();
 }
 
 [[gnu::hot]] Result<void> NetworkConnection::advance() {
-  if (phase_ == Phase::down) return {};
-  if (phase_ == Phase::up) return {};
+  if (phase_ == Phase::down || phase_ == Phase::up) return {};
   if (phase_ == Phase::connecting) {
-    if (!connecting_) return connect_next();
     pollfd ready{connecting_.get(), POLLOUT, 0};
     if (::poll(&ready, 1, 0) > 0) {
-      Result<void> connected =
-          wire::finish_connect(connecting_.get(), addresses_[next_address_ - 1]);
-      if (connected) return greet();
-      connecting_.reset();
-      if (next_address_ < addresses_.size()) return connect_next();
-      return fail(std::move(connected).error());
+      Result<void> connected = wire::finish_connect(connecting_.get(), plan_.address());
+      return connected ? greet() : connect_next(std::move(connected).error());
     }
-    if (MonoClock::now() < step_deadline_) return {};
-    connecting_.reset();
-    if (next_address_ < addresses_.size()) return connect_next();
-    return fail(no_answer_error());
+    return MonoClock::now() < step_at_ ? Result<void>() : connect_next(no_answer_error());
   }
-  if (has_queued()) {
-    if (Result<void> sent = send_queued(); !sent) return sent;
-  }
-  if (MonoClock::now() < step_deadline_ || has_arrived()) return {};
+  if (has_queued()) DSSM_TRY(send_queued());
+  if (MonoClock::now() < step_at_ || has_arrived()) return {};
   return fail(no_answer_error());
 }
 
 Error NetworkConnection::no_answer_error() const {
   switch (phase_) {
     case Phase::connecting:
-      return {Errc::no_daemon,
-              "connect to '" + address_ +
-                  "': no answer; is that PC on, and do both reach each other (`ping`)?"};
+      return {Errc::no_daemon, plan_.no_answer_text()};
     case Phase::greeting:
       return {Errc::unavailable,
               "what listens at '" + address_ + "' does not greet; is it a dssmd?"};
@@ -175,9 +159,7 @@ void NetworkConnection::queue(std::span<const std::byte> encoded) {
 }
 
 Result<void> NetworkConnection::send_queued() {
-  auto sent = send_some(std::as_bytes(std::span(queued_)).subspan(queued_from_));
-  if (!sent) return std::move(sent).error();
-  queued_from_ += *sent;
+  queued_from_ += DSSM_TRY(send_some(std::as_bytes(std::span(queued_)).subspan(queued_from_)));
   return {};
 }
 
@@ -229,16 +211,10 @@ Result<void> NetworkConnection::resume() {
 
 Result<void> NetworkConnection::on_frame(net::Frame& frame) {
   if (phase_ == Phase::up) return delegate_.on_frame(frame);
-  const std::string who = "dssmd at '" + address_ + "'";
-  if (frame.has_failure()) return wire::failure(frame.failure()).context(who + " refuses");
-  if (!frame.has_hello()) {
-    return Error{Errc::protocol, who + " does not begin with a greeting; is it a dssmd?"};
-  }
-  auto them = wire::greeting_untrusted(frame.hello(), who);
-  if (!them) return std::move(them).error();
-  greeting_ = std::move(*them);
+  DSSM_TRY(wire::server_greeting_untrusted(frame, "dssmd at '" + address_ + "'"));
   phase_ = Phase::up;
-  step_deadline_ = kNever;
+  plan_.on_up(MonoClock::now());
+  step_at_ = kNever;
   return {};
 }
 
@@ -268,7 +244,5 @@ short NetworkConnection::events(bool more_to_send) const noexcept {
   if (phase_ == Phase::connecting) return POLLOUT;
   return static_cast<short>(POLLIN | (has_queued() || more_to_send ? POLLOUT : 0));
 }
-
-MonoTime NetworkConnection::next_step() const noexcept { return step_deadline_; }
 
 }  // namespace dssm::detail

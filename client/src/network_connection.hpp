@@ -2,9 +2,10 @@
 //
 // A program's connection to the network port of a dssmd: connects, greets, sends frames, and splits
 // what arrives into frames, whose meaning it does not know. It never waits by itself: its owner
-// polls fd() for events() until next_step(), then calls advance() and receive().
+// polls fd() for events() until next_step(), then calls advance() and receive(). Which address is
+// tried next, and how long the pauses are, is ConnectPlan's.
 //
-// Any failure closes the connection and is returned; start() connects again.
+// Any failure closes the connection and is returned; from next_step() on, start() connects again.
 #pragma once
 
 #include <dssm/result.hpp>
@@ -16,6 +17,7 @@
 
 #include "client/src/spin_budget.hpp"
 #include "core/base/unique_fd.hpp"
+#include "core/channel/connect_plan.hpp"
 #include "core/wire/address.hpp"
 #include "core/wire/frame_decoder.hpp"
 #include "core/wire/network_protocol.hpp"
@@ -32,10 +34,14 @@ class NetworkConnection final : private wire::FrameDelegate {
   NetworkConnection(const NetworkConnection&) = delete;
   NetworkConnection& operator=(const NetworkConnection&) = delete;
 
-  // Begins to connect to one of `addresses` (at least one), tried in turn. Closes an open
-  // connection first.
-  void start(std::vector<wire::SocketAddress> addresses);
+  // Begins to connect to one of `addresses` (at least one), tried in turn; only while it is down.
+  //   fails  when they were not found
+  Result<void> start(Result<std::vector<wire::SocketAddress>> addresses);
   void close();
+  // start() may be called at once.
+  void end_pause() noexcept { step_at_ = MonoTime::min(); }
+  // The other side did what it was connected for: the next pause is short.
+  void mark_useful() noexcept { plan_.mark_useful(); }
 
   bool is_down() const noexcept { return phase_ == Phase::down; }
   bool is_up() const noexcept { return phase_ == Phase::up; }
@@ -82,11 +88,11 @@ class NetworkConnection final : private wire::FrameDelegate {
 
   int fd() const noexcept;  // -1 while down
   short events(bool more_to_send) const noexcept;
-  MonoTime next_step() const noexcept;  // when advance() has to be called at the latest
+  // When advance() has to be called at the latest; while it is down: when start() may be called.
+  MonoTime next_step() const noexcept { return step_at_; }
 
   // "10.0.0.2:13776": what it is connected to, or tried last; empty before the first start().
   const std::string& address() const noexcept { return address_; }
-  const wire::Greeting& greeting() const noexcept { return greeting_; }  // once up
 
  private:
   enum class Phase : unsigned char { down, connecting, greeting, up };
@@ -94,7 +100,8 @@ class NetworkConnection final : private wire::FrameDelegate {
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   Result<void> on_frame(net::Frame& frame) override;
-  Result<void> connect_next();
+  Result<void> connect();
+  Result<void> connect_next(Error why);
   Result<void> greet();
   Result<wire::IoStatus> on_received(const Result<wire::IoResult>& received);
   Error fail(Error why);
@@ -106,9 +113,8 @@ class NetworkConnection final : private wire::FrameDelegate {
   const std::uint64_t instance_id_;
 
   Phase phase_ = Phase::down;
-  MonoTime step_deadline_ = kNever;
-  std::vector<wire::SocketAddress> addresses_;
-  std::size_t next_address_ = 0;
+  MonoTime step_at_ = MonoTime::min();
+  channel::ConnectPlan plan_;
   std::string address_;
   UniqueFd connecting_;
   std::unique_ptr<wire::Transport> transport_;
@@ -117,7 +123,6 @@ class NetworkConnection final : private wire::FrameDelegate {
   SpinBudget spin_budget_;
   std::string queued_;
   std::size_t queued_from_ = 0;
-  wire::Greeting greeting_;
 };
 
 }  // namespace dssm::detail

@@ -11,6 +11,7 @@
 #include "client/src/states.hpp"
 #include "client/src/stream_client.hpp"
 #include "core/base/timespec.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm {
 namespace detail {
@@ -44,13 +45,11 @@ class ListDelegate final : public wire::FrameDelegate {
 Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
                                              const PConnectorOptions& options) {
   const MonoTime deadline = deadline_in(options.request_timeout);
-  auto addresses = find_host(host);
-  if (!addresses) return std::move(addresses).error();
   ListDelegate delegate;
   NetworkConnection connection(delegate,
                                options.program.empty() ? default_program() : options.program,
                                options.request_timeout);
-  connection.start(std::move(*addresses));
+  DSSM_TRY(connection.start(find_host(host)));
   for (bool asked = false; !delegate.streams;) {
     if (Result<void> done = connection.advance(); !done) return std::move(done).error();
     if (connection.is_up() && !asked) {
@@ -112,7 +111,7 @@ Result<PConnector> PConnector::create(const StreamId& id, const TypeInfo& type,
   if (Result<void> checked = type.check(); !checked) {
     return std::move(checked).error().context(what);
   }
-  auto client = detail::StreamClient::open({id, type, history}, std::move(options));
+  auto client = detail::StreamClient::open({id, channel::CreatePlan{type, history}}, std::move(options));
   if (!client) return std::move(client).error().context(what);
   return PConnector(std::make_unique<detail::PConnectorState>(std::move(*client)));
 }

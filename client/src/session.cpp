@@ -123,12 +123,8 @@ Result<RawWriter> Session::create_raw(const StreamId& id, const TypeInfo& type,
   DSSM_TRY(id.check(), what);
   DSSM_TRY(type.check(), what);
   local::Request request;
-  proto::Create& create = *request.mutable_create();
-  wire::to_message(id, *create.mutable_id());
-  wire::to_message(type, *create.mutable_type());
-  create.set_depth(history.depth);
-  create.set_cycle_ns(to_ns(history.cycle));
-  create.set_tag(tag);
+  wire::to_message(id, type, history, *request.mutable_create());
+  request.mutable_create()->set_tag(tag);
   return opened<RawWriter, detail::WriterState>(
       client_->open(std::move(request), Role::writer, tag), what,
       [](auto state) { return RawWriter(std::move(state)); });

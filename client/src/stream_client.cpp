@@ -18,9 +18,6 @@ namespace {
 
 using namespace std::chrono_literals;
 
-// Between attempts to set up a connection.
-constexpr Duration kFirstPause = 10ms;
-constexpr Duration kMaxPause = 1s;
 // How long next() receives a large sample that has begun to arrive in the caller's memory, before
 // it moves what has arrived to a buffer: 10 MB at 1 GB/s. The last wait within that time may end
 // Transport::kReceiveWait after it: the 20 ms that pconnector.hpp promises.
@@ -31,18 +28,6 @@ static_assert(kMaxStayWithSample + wire::Transport::kReceiveWait <= 20ms);
 constexpr unsigned kPostsPerReceive = 32;
 
 constexpr Duration kCloseTimeout = 1s;  // how long ~StreamClient sends posted samples
-
-Result<StreamInfo> stream_untrusted(const proto::Stream& message) {
-  StreamId id = DSSM_TRY(wire::stream_id_untrusted(message.id()));
-  TypeInfo type = DSSM_TRY(wire::type_untrusted(message.type()));
-  if (message.depth() < kMinDepth || message.depth() > kMaxDepth) {
-    return Error{Errc::protocol, fmt::format("a ring of {} slots", message.depth())};
-  }
-  StreamInfo info = wire::stream_info(message);
-  info.id = std::move(id);
-  info.type = std::move(type);
-  return info;
-}
 
 }  // namespace
 
@@ -76,35 +61,16 @@ StreamClient::~StreamClient() {
 // --- the connection
 
 [[gnu::hot]] bool StreamClient::is_up() const noexcept {
-  return connection_.is_up() && setup_.opened && subscription_.serial == 0 &&
-         publishing_.serial == 0;
+  return connection_.is_up() && channel_.is_settled();
 }
 
 Result<void> StreamClient::start_connecting(LookUp look_up) {
   if (look_up == LookUp::yes || host_.addresses.empty()) {
-    host_.addresses = DSSM_TRY(find_host(*host_.name));
+    auto found = find_host(*host_.name);
+    if (!found) return connection_.start(std::move(found));
+    host_.addresses = *std::move(found);
   }
-  connection_.start(host_.addresses);
-  return {};
-}
-
-void StreamClient::set_up() {
-  setup_.sent = true;
-  setup_.deadline = deadline_in(options_.request_timeout);
-  net::Frame frame;
-  setup_.serial = next_serial_++;
-  frame.set_serial(setup_.serial);
-  if (goal_.type) {
-    wire::to_message(goal_.id, *frame.mutable_create()->mutable_id());
-    wire::to_message(*goal_.type, *frame.mutable_create()->mutable_type());
-    frame.mutable_create()->set_depth(goal_.history.depth);
-    frame.mutable_create()->set_cycle_ns(to_ns(goal_.history.cycle));
-  } else {
-    wire::to_message(goal_.id, *frame.mutable_open()->mutable_id());
-  }
-  connection_.queue(frame);
-  if (subscriber_ && subscriber_->active()) request_subscription();
-  if (publishing_.started) start_publishing();
+  return connection_.start(host_.addresses);
 }
 
 void StreamClient::check_up() {
@@ -118,25 +84,22 @@ void StreamClient::check_up() {
 void StreamClient::forget_connection() {
   connection_.close();
   setup_ = {};
+  channel_.reset();
   sample_waits_ = publishing_.allowed = false;
-  subscription_.serial = publishing_.serial = request_.serial = 0;
+  request_.serial = 0;
   if (subscriber_) subscriber_->on_down();
   if (outbox_) outbox_->on_down();
 }
 
 void StreamClient::on_disconnected(Error error) {
   if (!setup_.was_up) ++attempts_.failed;
-  // After a useful connection the next attempt needs no pause.
-  attempts_.pause =
-      setup_.useful ? Duration(0) : std::clamp(2 * attempts_.pause, kFirstPause, kMaxPause);
-  attempts_.next_at = MonoClock::now() + attempts_.pause;
   attempts_.last_error = std::move(error);
   forget_connection();
 }
 
 [[gnu::hot]] void StreamClient::advance(LookUp look_up) {
   if (connection_.is_down()) {
-    if (MonoClock::now() < attempts_.next_at) return;
+    if (MonoClock::now() < connection_.next_step()) return;
     if (Result<void> begun = start_connecting(look_up); !begun) {
       return on_disconnected(std::move(begun).error());
     }
@@ -146,7 +109,10 @@ void StreamClient::on_disconnected(Error error) {
       return on_disconnected(std::move(done).error());
     if (!connection_.is_up()) return;
   }
-  if (!setup_.sent) set_up();
+  if (channel_.stream() == channel::ChannelClient::Stream::closed) {
+    setup_.deadline = deadline_in(options_.request_timeout);
+    channel_.open(goal_.id, goal_.plan ? &*goal_.plan : nullptr);
+  }
   if (setup_.deadline != kNever && MonoClock::now() >= setup_.deadline &&
       !connection_.has_arrived()) {
     return on_disconnected(connection_.no_answer_error());
@@ -209,17 +175,18 @@ bool StreamClient::has_more_to_send() const noexcept {
 
 [[gnu::hot]] wire::IoStatus StreamClient::on_received(const Result<wire::IoStatus>& received) {
   if (!received) return on_disconnected(received.error()), wire::IoStatus::end;
-  // It may have been the greeting.
-  if (*received == wire::IoStatus::ok && !setup_.sent) advance(LookUp::no);
+  // It may have been the greeting, or the answer to Open.
+  const bool is_closed = channel_.stream() == channel::ChannelClient::Stream::closed;
+  if (*received == wire::IoStatus::ok && (is_closed || connection_.has_queued())) {
+    advance(LookUp::no);
+  }
   return *received;
 }
 
 MonoTime StreamClient::next_step() const noexcept {
-  return connection_.is_down() ? attempts_.next_at
-                               : std::min(connection_.next_step(), setup_.deadline);
+  return std::min(connection_.next_step(), setup_.deadline);
 }
 
-// Works on the connection until done() or the deadline; at least once.
 template <class Done>
 WaitStatus StreamClient::run(MonoTime deadline, bool interruptible, Done done) {
   for (;;) {
@@ -277,14 +244,13 @@ Error StreamClient::size_error(const char* verb, std::size_t bytes) const {
 
 // --- protocol: what arrives
 
-Result<void> StreamClient::on_opened(const net::Frame& frame) {
-  setup_.serial = 0;
-  if (frame.has_failure()) return wire::failure(frame.failure());
-  if (!frame.has_opened()) {
-    return Error{Errc::protocol, "dssmd's answer is not the opened stream"};
-  }
-  StreamInfo stream =
-      DSSM_TRY(stream_untrusted(frame.opened().stream()), "dssmd's description of the stream");
+Result<void> StreamClient::on_frame(net::Frame& frame) {
+  DSSM_TRY(channel_.on_frame(frame));
+  check_up();
+  return {};
+}
+
+Result<void> StreamClient::on_opened(StreamInfo stream, bool) {
   if (!subscriber_) {
     subscriber_ = std::make_unique<Subscriber>(stream.type.payload_bytes);
     outbox_ = std::make_unique<Outbox>(stream.type.payload_bytes, options_.max_unsent_samples,
@@ -299,52 +265,43 @@ Result<void> StreamClient::on_opened(const net::Frame& frame) {
   }
   stream_ = std::move(stream);
   connection_.set_payload_bytes(stream_.type.payload_bytes);
-  setup_.opened = true;
+  if (subscriber_->active()) request_subscription();
+  if (publishing_.started) start_publishing();
   return {};
 }
 
-Result<void> StreamClient::on_event(const net::Frame& frame) {
-  if (frame.has_failure())
-    return wire::failure(frame.failure()).context("dssmd closed the connection");
-  if (frame.has_ended()) return Error{Errc::not_found, "the stream was removed"};
-  if (!subscriber_) return {};
-  if (frame.has_gap()) subscriber_->on_gap(frame.gap());
-  if (frame.has_published()) {
-    setup_.useful = true;
-    return outbox_->acknowledge(frame.published().last(), frame.published().last_tid());
+Result<void> StreamClient::on_subscribed_untrusted(Tid first) {
+  return subscriber_->on_subscribed_untrusted(first);
+}
+
+Result<void> StreamClient::on_gap_untrusted(Tid first, std::uint64_t count) {
+  return subscriber_->on_gap_untrusted(first, count);
+}
+
+Result<void> StreamClient::on_published_untrusted(std::int64_t last, Tid last_tid, bool begins) {
+  if (!begins) {
+    connection_.mark_useful();
+    return outbox_->acknowledge(last, last_tid);
   }
+  // A new publisher was allowed at once and has nothing to send again.
+  return std::exchange(publishing_.allowed, true) ? Result<void>()
+                                                  : outbox_->restart(last, last_tid);
+}
+
+Result<void> StreamClient::on_refused(channel::ChannelClient::Request request, const Error& why) {
+  if (request != channel::ChannelClient::Request::subscribe) return why;
+  subscription_refused_ = why;
+  subscriber_->end();
   return {};
 }
 
-Result<void> StreamClient::on_frame(net::Frame& frame) {
-  const std::uint64_t serial = frame.serial();
-  if (serial == 0) return on_event(frame);
-  Result<void> result;
-  if (serial == setup_.serial) {
-    result = on_opened(frame);
-  } else if (serial == subscription_.serial) {
-    subscription_.serial = 0;
-    if (frame.has_failure()) {
-      subscription_.refused = wire::failure(frame.failure());
-      subscriber_->end();
-    } else {
-      result = subscriber_->on_subscribed(frame.subscribed());
-    }
-  } else if (serial == publishing_.serial) {
-    publishing_.serial = 0;
-    if (frame.has_failure()) return wire::failure(frame.failure()).context("publish");
-    // A new publisher was allowed at once and has nothing to send again.
-    if (!publishing_.allowed) {
-      result = outbox_->restart(frame.publishing().last(), frame.publishing().last_tid());
-    }
-    publishing_.allowed = true;
-  } else if (serial == request_.serial) {
-    request_.answer = std::move(frame);
-    request_.serial = 0;
-    request_.answered = setup_.useful = true;
-  }
-  if (result) check_up();
-  return result;
+Result<void> StreamClient::on_other_frame(net::Frame& frame) {
+  if (frame.serial() == 0 || frame.serial() != request_.serial) return {};
+  connection_.mark_useful();
+  request_.answer = std::move(frame);
+  request_.serial = 0;
+  request_.answered = true;
+  return {};
 }
 
 [[gnu::hot]] Result<void> StreamClient::on_sample_begin(const wire::IncomingSample& sample,
@@ -363,7 +320,7 @@ Result<void> StreamClient::on_frame(net::Frame& frame) {
 
 [[gnu::hot]] Result<void> StreamClient::on_sample_end(const wire::IncomingSample& sample,
                                                       bool torn) {
-  setup_.useful = true;
+  connection_.mark_useful();
   if (sample.serial == 0) return subscriber_->on_sample_end(sample.info, torn), Result<void>();
   if (sample.serial != request_.serial || !request_.target) return {};
   request_.info = sample.info;
@@ -383,7 +340,7 @@ Result<void> StreamClient::exchange(Queue queue) {
     subscriber_->set_buffering(true);
     request_.answered = false;
     request_.info.reset();
-    request_.serial = next_serial_++;
+    request_.serial = channel_.next_serial();
     queue(request_.serial);
     const auto done = [&] { return request_.answered || request_.serial == 0; };
     advance(LookUp::no);
@@ -449,28 +406,26 @@ Result<ReadStatus> StreamClient::read(const ReadRequest& request, std::span<std:
 // --- the subscription
 
 void StreamClient::request_subscription() {
-  net::Frame frame;
-  subscription_.serial = next_serial_++;
-  frame.set_serial(subscription_.serial);
-  subscriber_->to_message(stream_.incarnation, *frame.mutable_subscribe());
-  connection_.queue(frame);
+  net::Subscribe request;
+  subscriber_->to_message(stream_.incarnation, request);
+  channel_.subscribe(request);
 }
 
 Result<void> StreamClient::subscribe(const Subscription& what_from) {
   const MonoTime deadline = deadline_in(options_.request_timeout);
   DSSM_TRY(wait_until_up(deadline), what("subscribe to"));
-  subscription_.refused.reset();
+  subscription_refused_.reset();
   subscriber_->begin(what_from);
   subscriber_->set_buffering(true);
   request_subscription();
   static_cast<void>(run(deadline, false, [&] { return is_up() || connection_.is_down(); }));
-  if (!subscriber_->granted() && !subscription_.refused) {
+  if (!subscriber_->granted() && !subscription_refused_) {
     if (Result<void> up = wait_until_up(deadline); !up) {
       subscriber_->end();
       return std::move(up).error().context(what("subscribe to"));
     }
   }
-  if (subscription_.refused) return Error(*subscription_.refused).context(what("subscribe to"));
+  if (subscription_refused_) return Error(*subscription_refused_).context(what("subscribe to"));
   return {};
 }
 
@@ -478,7 +433,7 @@ Result<void> StreamClient::unsubscribe() {
   if (!subscriber_->active()) return {};
   subscriber_->end();
   forget_connection();
-  attempts_.next_at = MonoClock::now();
+  connection_.end_pause();
   return wait_until_up(deadline_in(options_.request_timeout));
 }
 
@@ -487,7 +442,7 @@ Result<void> StreamClient::unsubscribe() {
     return size_error("read", payload.size());
   }
   if (!subscriber_->active()) {
-    if (subscription_.refused) return Error(*subscription_.refused).context(what("subscribe to"));
+    if (subscription_refused_) return Error(*subscription_refused_).context(what("subscribe to"));
     return Error{Errc::invalid_argument, what("read") + ": call subscribe() before read_next()"};
   }
   if (auto kept = subscriber_->pop_buffered(payload, info)) return *kept;
@@ -550,11 +505,7 @@ int StreamClient::ready_fd() noexcept {
 // --- publishing
 
 void StreamClient::start_publishing() {
-  net::Frame frame;
-  publishing_.serial = next_serial_++;
-  frame.set_serial(publishing_.serial);
-  frame.mutable_start_publishing()->set_publisher(publishing_.publisher);
-  connection_.queue(frame);
+  channel_.publish(publishing_.publisher);
   // The owner has no samples of a new publisher, so there is no answer to wait for.
   publishing_.allowed = !publishing_.started;
   publishing_.started = true;

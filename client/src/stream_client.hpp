@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The client end of one remote stream, in a program: a connection to the dssmd that owns the
-// stream, kept up by the calls that use it. A PConnector is a handle of it.
+// stream, kept up by the calls that use it. A PConnector is a handle of it. The protocol's steps are
+// ChannelClient's; here are the calls that wait for them, the requests, and who needs which bytes.
 //
-// A connection is set up by the greeting, Open or Create, and what was in progress when the last
-// one ended: Subscribe from the next sample, StartPublishing and all samples that are not
+// A connection is set up by the greeting, Open or Create, and then what was in progress when the
+// last one ended: Subscribe from the next sample, StartPublishing and all samples that are not
 // acknowledged. While there is none, each call makes an attempt as soon as the pause since the last
 // attempt is over. Calls that may wait do so until their deadline; the others (next(), post()) take
 // only the steps that need no waiting.
@@ -21,17 +22,18 @@
 #include "client/src/read_request.hpp"
 #include "client/src/readiness.hpp"
 #include "client/src/subscriber.hpp"
+#include "core/channel/channel_client.hpp"
 
 namespace dssm::detail {
 
 // A resource with one owner; one thread at a time.
-class StreamClient final : private wire::FrameDelegate {
+class StreamClient final : private wire::FrameDelegate,
+                           private channel::ChannelClient::Delegate {
  public:
-  // Which stream; with `type`, it is created if it does not exist.
+  // Which stream; with a plan, it is created if it does not exist.
   struct Goal {
     StreamId id;
-    std::optional<TypeInfo> type = {};
-    History history = {};
+    std::optional<channel::CreatePlan> plan = {};
   };
 
   // Connects and opens or creates. One attempt, at each of the host's addresses.
@@ -79,7 +81,6 @@ class StreamClient final : private wire::FrameDelegate {
   bool is_up() const noexcept;
   void advance(LookUp look_up);
   Result<void> start_connecting(LookUp look_up);
-  void set_up();
   void check_up();
   void on_disconnected(Error error);
   void forget_connection();
@@ -104,8 +105,14 @@ class StreamClient final : private wire::FrameDelegate {
   Result<void> on_frame(net::Frame& frame) override;
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
-  Result<void> on_event(const net::Frame& frame);
-  Result<void> on_opened(const net::Frame& frame);
+  void send(const net::Frame& frame) override { connection_.queue(frame); }
+  Result<void> on_opened(StreamInfo stream, bool created) override;
+  Result<void> on_subscribed_untrusted(Tid first) override;
+  Result<void> on_gap_untrusted(Tid first, std::uint64_t count) override;
+  Result<void> on_published_untrusted(std::int64_t last, Tid last_tid, bool begins) override;
+  Result<void> on_refused(channel::ChannelClient::Request request, const Error& why) override;
+  Result<void> on_ended(const Error& why) override { return why; }
+  Result<void> on_other_frame(net::Frame& frame) override;
   // Sends what queue(serial) queues, again after each reconnect, until it is answered.
   template <class Queue>
   Result<void> exchange(Queue queue);
@@ -114,25 +121,17 @@ class StreamClient final : private wire::FrameDelegate {
   Error size_error(const char* verb, std::size_t bytes) const;
   Result<ReadStatus> take_next(std::span<std::byte> payload, SampleInfo& info);
 
-  // Serials are of what is in progress on this connection; 0: nothing is.
-
   struct Host {
     std::optional<wire::Address> name;
     std::vector<wire::SocketAddress> addresses;  // from the last look-up
   };
   // This connection's set-up.
   struct Setup {
-    bool sent = false;    // Open or Create
-    bool opened = false;  // and its answer arrived
     bool was_up = false;
-    bool useful = false;  // an answer or a sample arrived on it
     MonoTime deadline = kNever;
-    std::uint64_t serial = 0;
   };
   // Attempts to set up a connection.
   struct Attempts {
-    MonoTime next_at = MonoTime::min();
-    Duration pause{};  // before the next one
     std::optional<Error> last_error;
     std::uint64_t failed = 0, succeeded = 0;
   };
@@ -142,22 +141,17 @@ class StreamClient final : private wire::FrameDelegate {
   };
   // The request that a call waits for.
   struct PendingRequest {
-    std::uint64_t serial = 0;
-    bool answered = false;  // by a frame or by a sample
+    std::uint64_t serial = 0;  // 0: none is in progress on this connection
+    bool answered = false;     // by a frame or by a sample
     net::Frame answer;
     std::byte* target = nullptr;     // where a sample's payload goes
     std::optional<SampleInfo> info;  // of the sample that arrived there
     bool torn = false;
   };
-  struct SubscriptionRequest {
-    std::uint64_t serial = 0;
-    std::optional<Error> refused;
-  };
   struct Publishing {
     std::uint64_t publisher = 0;  // random id
-    std::uint64_t serial = 0;
     bool started = false;  // by the program
-    bool allowed = false;  // by the owner, on this connection
+    bool allowed = false;  // samples may be sent on this connection
     unsigned posts_since_receive = 0;
   };
 
@@ -170,9 +164,9 @@ class StreamClient final : private wire::FrameDelegate {
   Attempts attempts_;
   StreamInfo stream_;
   Restart restart_;
-  std::uint64_t next_serial_ = 1;
+  channel::ChannelClient channel_{*this};
   PendingRequest request_;
-  SubscriptionRequest subscription_;
+  std::optional<Error> subscription_refused_;
   bool sample_waits_ = false;               // in the input buffer, until it has a place
   std::unique_ptr<Subscriber> subscriber_;  // both made when the payload's size is known
   std::unique_ptr<Outbox> outbox_;

@@ -1,10 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/src/subscriber.hpp"
 
-#include <algorithm>
-#include <cstdint>
-#include <string>
 #include <utility>
+
+#include "core/base/try.hpp"
 
 namespace dssm::detail {
 namespace {
@@ -20,11 +19,13 @@ Subscriber::Subscriber(std::size_t payload_bytes) : queue_(payload_bytes, kMaxBu
 void Subscriber::begin(const Subscription& what) {
   end();
   what_ = what;
+  cursor_.set_thinned(what.max_rate_hz > 0);
 }
 
 void Subscriber::end() {
   what_.reset();
-  live_ = resumes_ = false;
+  live_ = false;
+  cursor_.set_next(kNoTid);
   if (arriving_ != Arriving::nothing) arriving_ = Arriving::nowhere;
   target_ = nullptr;
   delivered_.reset();
@@ -34,11 +35,7 @@ void Subscriber::end() {
 
 void Subscriber::to_message(std::uint64_t incarnation, net::Subscribe& out) const {
   out.set_max_rate_hz(what_->max_rate_hz);
-  if (resumes_) {
-    out.set_from_tid(due_);
-    out.set_incarnation(incarnation);
-    return;
-  }
+  if (granted()) return cursor_.resume(incarnation, out);
   switch (what_->start) {
     case Subscription::Start::now:
       out.set_from_now(true);
@@ -56,32 +53,19 @@ void Subscriber::to_message(std::uint64_t incarnation, net::Subscribe& out) cons
   }
 }
 
-Result<void> Subscriber::on_subscribed(const net::Subscribed& message) {
-  if (message.first_tid() < 0) {
-    return Error{Errc::protocol,
-                 "the subscription begins with tid " + std::to_string(message.first_tid())};
-  }
-  if (resumes_ && message.first_tid() > due_ && !is_thinned()) {
-    lost_ += static_cast<std::uint64_t>(message.first_tid() - due_);
-  }
-  due_ = message.first_tid();
-  live_ = resumes_ = true;
+Result<void> Subscriber::on_subscribed_untrusted(Tid first) {
+  DSSM_TRY(cursor_.on_subscribed_untrusted(first));
+  live_ = true;
   return {};
 }
 
-void Subscriber::on_gap(const net::Gap& message) noexcept {
-  if (!live_ || message.first_tid() < 0) return;
-  const auto max_count = static_cast<std::uint64_t>(INT64_MAX - message.first_tid());
-  const Tid end = message.first_tid() + static_cast<Tid>(std::min(message.count(), max_count));
-  const Tid from = is_thinned() ? std::max(message.first_tid(), due_) : due_;
-  if (end <= from) return;
-  lost_ += static_cast<std::uint64_t>(end - from);
-  due_ = end;
+Result<void> Subscriber::on_gap_untrusted(Tid first, std::uint64_t count) {
+  return live_ ? cursor_.on_gap_untrusted(first, count) : Result<void>();
 }
 
 void Subscriber::on_restart() noexcept {
-  if (!resumes_) return;
-  resumes_ = false;  // `due_` is a tid of the old ring
+  if (!granted()) return;
+  cursor_.set_next(kNoTid);
   what_->start = Subscription::Start::oldest;
   restart_at_ = queue_.removed() + queue_.size();
 }
@@ -97,10 +81,7 @@ void Subscriber::on_down() noexcept {
     out = nullptr;
     return true;
   }
-  if (info.tid < due_ || info.tid == INT64_MAX) {
-    return Error{Errc::protocol, "sample " + std::to_string(info.tid) + " came when " +
-                                     std::to_string(due_) + " was due"};
-  }
+  if (!cursor_.accepts(info.tid)) return cursor_.unexpected(info.tid);
   if (target_ && !has_buffered()) {
     arriving_ = Arriving::in_target;
     out = target_;
@@ -115,8 +96,7 @@ void Subscriber::on_down() noexcept {
 [[gnu::hot]] void Subscriber::on_sample_end(const SampleInfo& info, bool torn) noexcept {
   const Arriving arrived = std::exchange(arriving_, Arriving::nothing);
   if (torn || arrived == Arriving::nowhere) return;
-  if (!is_thinned()) lost_ += static_cast<std::uint64_t>(info.tid - due_);
-  due_ = info.tid + 1;
+  cursor_.on_sample(info.tid);
   if (arrived == Arriving::in_queue) return queue_.push(info);
   delivered_ = info;
   target_ = nullptr;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The client end of a subscription: which sample is due next, where the bytes of the arriving
-// sample go, what was lost, and where to resume after a reconnect.
+// What a PConnector's subscription asks for, and where the bytes of the arriving sample go. Which
+// sample comes next is SampleCursor's.
 //
 // A sample is received directly into the caller's memory (set_target), or into a queue while the
 // program uses the connection for another request (set_buffering); otherwise it stays in the
@@ -14,6 +14,7 @@
 #include <optional>
 
 #include "client/src/sample_queue.hpp"
+#include "core/channel/sample_cursor.hpp"
 #include "network.pb.h"
 
 namespace dssm::detail {
@@ -27,17 +28,18 @@ class Subscriber {
   void begin(const Subscription& what);
   void end();
   bool active() const noexcept { return what_.has_value(); }
-  bool granted() const noexcept { return resumes_; }  // on_subscribed() came since begin()
+  // Whether on_subscribed_untrusted() came since begin().
+  bool granted() const noexcept { return cursor_.next() != kNoTid; }
 
   // The request that begins it, or resumes it after a reconnect.
   void to_message(std::uint64_t incarnation, net::Subscribe& out) const;
 
   // --- what arrives
 
-  // From now on samples belong to this subscription.
-  Result<void> on_subscribed(const net::Subscribed& message);
-  void on_gap(const net::Gap& message) noexcept;
-  // The owner's ring was replaced; comes before on_subscribed().
+  // From now on samples belong to this subscription, the first one with tid `first`.
+  Result<void> on_subscribed_untrusted(Tid first);
+  Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
+  // The owner's ring was replaced; comes before on_subscribed_untrusted().
   void on_restart() noexcept;
   // The connection ended, and with it a sample that had arrived in part.
   void on_down() noexcept;
@@ -63,7 +65,7 @@ class Subscriber {
   // From the queue: a sample, or `restarted`.
   std::optional<ReadStatus> pop_buffered(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
-  std::uint64_t lost() const noexcept { return lost_ + queue_.dropped(); }
+  std::uint64_t lost() const noexcept { return cursor_.lost() + queue_.dropped(); }
   // Copied out of the queue.
   std::uint64_t copied_bytes() const noexcept { return copied_bytes_; }
 
@@ -71,13 +73,11 @@ class Subscriber {
   enum class Arriving : unsigned char { nothing, in_target, in_queue, nowhere };
 
   bool is_restart_next() const noexcept { return restart_at_ && *restart_at_ <= queue_.removed(); }
-  bool is_thinned() const noexcept { return what_ && what_->max_rate_hz > 0; }
 
   std::optional<Subscription> what_;
-  bool live_ = false;     // on this connection
-  bool resumes_ = false;  // on some connection: to_message() resumes it
-  Tid due_ = 0;           // tid of the next sample
-  std::uint64_t lost_ = 0, copied_bytes_ = 0;
+  bool live_ = false;             // on this connection
+  channel::SampleCursor cursor_;  // next() is known since the first connection
+  std::uint64_t copied_bytes_ = 0;
 
   bool buffering_ = false;
   std::byte* target_ = nullptr;

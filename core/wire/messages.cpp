@@ -52,6 +52,14 @@ void to_message(const TypeInfo& type, proto::Type& out) {
   }
 }
 
+void to_message(const StreamId& id, const TypeInfo& type, const History& history,
+                proto::Create& out) {
+  to_message(id, *out.mutable_id());
+  to_message(type, *out.mutable_type());
+  out.set_depth(history.depth);
+  out.set_cycle_ns(to_ns(history.cycle));
+}
+
 void to_message(const StreamInfo& info, proto::Stream& out) {
   to_message(info.id, *out.mutable_id());
   to_message(info.type, *out.mutable_type());

@@ -9,6 +9,7 @@
 #include <string>
 #include <string_view>
 
+#include "catalog.pb.h"
 #include "common.pb.h"
 
 namespace dssm::wire {
@@ -29,6 +30,8 @@ void to_message(const StreamId& id, proto::StreamId& out);
 void to_message(const TypeInfo& type, proto::Type& out);
 void to_message(const MirrorInfo& info, proto::Mirror& out);
 void to_message(const StreamInfo& info, proto::Stream& out);
+void to_message(const StreamId& id, const TypeInfo& type, const History& history,
+                proto::Create& out);
 void to_message(const Error& error, proto::Failure& out);
 
 // The frame that a side sends before it closes the connection: the same bytes in both protocols.

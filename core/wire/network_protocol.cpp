@@ -127,6 +127,14 @@ Result<Greeting> greeting_untrusted(const proto::Hello& message, const std::stri
   return greeting;
 }
 
+Result<Greeting> server_greeting_untrusted(const net::Frame& frame, const std::string& who) {
+  if (frame.has_failure()) return failure(frame.failure()).context("refused by " + who);
+  if (!frame.has_hello()) {
+    return Error{Errc::protocol, who + " does not begin with Hello; is it a dssmd?"};
+  }
+  return greeting_untrusted(frame.hello(), who);
+}
+
 HostId host_id_for(std::string_view name) {
   static const std::string machine = [] {
     std::string id = machine_id();

@@ -55,6 +55,11 @@ void to_message(const Greeting& greeting, proto::Hello& out);
 //   who    for the message: "dssmd at '10.0.0.2:13776'", "the program at '10.0.0.3:40000'"
 Result<Greeting> greeting_untrusted(const proto::Hello& message, const std::string& who);
 
+// The same at the connecting end, from the first frame that the other side sends: its Hello, or the
+// Failure by which it refuses the connection.
+//   fails  also: the other side's reason
+Result<Greeting> server_greeting_untrusted(const net::Frame& frame, const std::string& who);
+
 // Why this side cannot talk to `who`, who speaks `theirs`.
 //   software  "0.3.0"; empty: not known
 Error other_protocol_version(const std::string& who, std::uint32_t theirs,

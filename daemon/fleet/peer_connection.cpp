@@ -59,7 +59,7 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const 
                                const std::vector<wire::Address>& addresses,
                                const wire::Greeting& self, Observer& observer)
     : PeerConnection(loop, resolver, id,
-                     {addresses, self, kMaxOutputBytes, kFoundPause, kFoundRoundTime}, observer) {}
+                     {addresses, self, kMaxOutputBytes, kFoundRoundTime}, observer) {}
 
 void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) {
   configured_ = addresses.front();

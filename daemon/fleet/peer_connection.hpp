@@ -25,10 +25,9 @@ class PeerConnection final : private Dialer::Observer {
   static constexpr std::size_t kMaxWaiting = 4096;
   static constexpr std::size_t kMaxWaitingBytes = 40U << 20;  // two properties of the largest size
 
-  // A found host that answers again is back within kFoundRoundTime + kFoundPause, whichever of its
-  // addresses are dead; the design allows 3 s.
+  // A found host that answers again is back within kFoundRoundTime + ConnectPlan::kMaxPause,
+  // whichever of its addresses are dead; the design allows 3 s.
   static constexpr Duration kFoundRoundTime = std::chrono::milliseconds(1500);
-  static constexpr Duration kFoundPause = std::chrono::seconds(1);
 
   // Called from the loop; must not destroy the connection.
   class Observer {

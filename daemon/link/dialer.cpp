@@ -19,6 +19,7 @@ Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, Obser
       resolver_(resolver),
       options_(std::move(options)),
       observer_(observer),
+      plan_(options_.round_time),
       timer_(EventSource::timer(loop, [this] { on_timer(); })) {
   timer_.enable_in(Duration::zero());
 }
@@ -26,7 +27,7 @@ Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, Obser
 // --- for the user
 
 void Dialer::retry_now() {
-  pause_ = kFirstPause;
+  plan_.restart_pauses();
   if (state_ == State::pause) timer_.enable_in(Duration::zero());
 }
 
@@ -63,12 +64,12 @@ FrameConnection* Dialer::connection() noexcept {
 }
 
 std::string Dialer::address() const {
-  return connection_ && state_ != State::pause ? addresses_[current_].str()
+  return connection_ && state_ != State::pause ? plan_.address().str()
                                                : options_.addresses.front().str();
 }
 
 bool Dialer::crosses_network() const noexcept {
-  return state_ == State::up && !addresses_[current_].is_loopback();
+  return state_ == State::up && !plan_.address().is_loopback();
 }
 
 // --- a round of attempts
@@ -84,7 +85,7 @@ void Dialer::begin_round_soon() {
 
 // The other side, as far as it is known.
 std::string Dialer::peer_name() const {
-  const std::string address = "'" + addresses_[current_].str() + "'";
+  const std::string address = "'" + plan_.address().str() + "'";
   return them_ ? them_->str() + " (" + address + ")" : "dssmd at " + address;
 }
 
@@ -92,7 +93,6 @@ void Dialer::begin_round() {
   connection_.reset();
   them_.reset();
   reason_.reset();
-  last_error_.reset();
   state_ = State::look_up;
   reached_ = Phase::look_up;
   std::vector<wire::SocketAddress> numbers;
@@ -109,38 +109,29 @@ void Dialer::begin_round() {
 }
 
 void Dialer::try_addresses(std::vector<wire::SocketAddress> found) {
-  addresses_ = std::move(found);
-  const auto last_one = std::find_if(
-      addresses_.begin(), addresses_.end(),
-      [this](const wire::SocketAddress& address) { return address.str() == unusable_; });
-  if (last_one != addresses_.end()) std::rotate(addresses_.begin(), last_one + 1, addresses_.end());
-  current_ = 0;
-  try_next_address();
+  plan_.begin_round(std::move(found));
+  try_address();
 }
 
-// Tries addresses_[current_] and, while they fail at once, those after it.
-void Dialer::try_next_address() {
-  for (; current_ < addresses_.size(); ++current_) {
-    Result<UniqueFd> started = wire::start_connect(addresses_[current_]);
-    if (!started) {
-      last_error_ = std::move(started).error();
-      continue;
-    }
-    state_ = State::connect;
-    reached_ = Phase::connect;
-    socket_ = *std::move(started);
-    connected_ = EventSource::writable(loop_, socket_.get(), [this] { on_connected(); });
-    connected_.enable();
-    const auto share = options_.round_time / static_cast<std::int64_t>(addresses_.size());
-    return timer_.enable_in(std::min(kConnectTimeout, share));
-  }
-  fail(*last_error_);
+void Dialer::try_address() {
+  Result<UniqueFd> started = wire::start_connect(plan_.address());
+  if (!started) return try_next_address(started.error());
+  state_ = State::connect;
+  reached_ = Phase::connect;
+  socket_ = *std::move(started);
+  connected_ = EventSource::writable(loop_, socket_.get(), [this] { on_connected(); });
+  connected_.enable();
+  timer_.enable_in(plan_.connect_timeout());
+}
+
+void Dialer::try_next_address(const Error& why) {
+  plan_.next_address() ? try_address() : fail(why);
 }
 
 void Dialer::on_connected() {
   connected_.disable();
-  if (Result<void> done = wire::finish_connect(socket_.get(), addresses_[current_]); !done) {
-    last_error_ = std::move(done).error();
+  if (Result<void> done = wire::finish_connect(socket_.get(), plan_.address()); !done) {
+    reason_ = std::move(done).error();
     socket_.reset();
     // From the timer, because `connected_` must not be replaced while its callback runs.
     return timer_.enable_in(Duration::zero());
@@ -165,16 +156,9 @@ void Dialer::on_timer() {
     case State::give_up:
       return fail(*std::exchange(reason_, {}));
     case State::connect:
-      if (socket_) {
-        connected_.disable();
-        socket_.reset();
-        last_error_ = Error{
-            Errc::unavailable,
-            fmt::format("connect to '{}': no answer; is that PC on, and is there a route to it?",
-                        addresses_[current_].str())};
-      }
-      ++current_;
-      return try_next_address();
+      connected_.disable();
+      if (std::exchange(socket_, {})) reason_ = Error{Errc::unavailable, plan_.no_answer_text()};
+      return try_next_address(*std::exchange(reason_, {}));
     case State::greet:
       reason_ = Error{Errc::unavailable, peer_name() + " does not greet; is it a dssmd?"};
       return connection_->close_with(*reason_);
@@ -195,11 +179,7 @@ Result<void> Dialer::on_frame(net::Frame& frame) {
 }
 
 Result<void> Dialer::greet_untrusted(const net::Frame& frame) {
-  if (!frame.has_hello()) {
-    reason_ = Error{Errc::protocol, peer_name() + " does not begin with Hello; is it a dssmd?"};
-    return *reason_;
-  }
-  Result<wire::Greeting> greeting = wire::greeting_untrusted(frame.hello(), peer_name());
+  Result<wire::Greeting> greeting = wire::server_greeting_untrusted(frame, peer_name());
   if (!greeting) {
     reason_ = std::move(greeting).error();
     return *reason_;
@@ -208,19 +188,15 @@ Result<void> Dialer::greet_untrusted(const net::Frame& frame) {
   timer_.disable();
   state_ = State::up;
   reached_ = Phase::up;
-  up_since_ = loop_.now();
+  plan_.on_up(loop_.now());
   observer_.on_up(*connection_, *them_);
   return {};
 }
 
 void Dialer::fail(const Error& why) {
-  // A server that greets and then refuses is not connected to 20 times a second.
-  if (state_ == State::up && loop_.now() - up_since_ >= kMaxPause) pause_ = kFirstPause;
-  const bool is_unusable = std::exchange(given_up_, false) || state_ == State::greet;
-  unusable_ = is_unusable ? addresses_[current_].str() : std::string();
+  const bool avoid_address = std::exchange(given_up_, false) || state_ == State::greet;
   state_ = State::pause;
-  timer_.enable_in(pause_);
-  pause_ = std::min(2 * pause_, options_.max_pause);
+  timer_.enable_in(plan_.end_round(loop_.now(), avoid_address));
   observer_.on_down(why);
 }
 

@@ -1,12 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Keeps one outgoing connection up: looks the address up, connects, exchanges greetings. When the
-// connection breaks it does all of that again, after a back-off that grows from kFirstPause to
-// kMaxPause, and never gives up. Used by PeerConnection (control connections), mirrors and remote
-// writers (channels).
-//
-// Of several addresses the first that connects is taken. When the other side does not greet, or
-// when restart() gave the connection up, the next round begins with the address after it.
+// connection breaks it does all of that again, after a pause, and never gives up. Which address is
+// tried next, and how long the pauses are, is ConnectPlan's. Used by PeerConnection (control
+// connections), mirrors and remote writers (channels).
 //
 //           found             connected            Hello
 //   look_up ------> connect ------------> greet ----------> up
@@ -22,6 +19,7 @@
 #include <string>
 #include <vector>
 
+#include "core/channel/connect_plan.hpp"
 #include "core/wire/address.hpp"
 #include "core/wire/network_protocol.hpp"
 #include "daemon/base/event_loop.hpp"
@@ -32,10 +30,6 @@ namespace dssm::daemon {
 
 class Dialer final : private FrameConnection::Observer {
  public:
-  static constexpr Duration kFirstPause = std::chrono::milliseconds(50);
-  static constexpr Duration kMaxPause = std::chrono::seconds(2);
-  static constexpr Duration kConnectTimeout = std::chrono::seconds(2);  // of one address
-
   class Observer {
    public:
     // Both greetings are exchanged: requests may be sent. `connection` is the dialer's and valid
@@ -57,8 +51,7 @@ class Dialer final : private FrameConnection::Observer {
     std::vector<wire::Address> addresses;
     wire::Greeting self;  // to send
     std::size_t max_queued_bytes = 1U << 20;
-    Duration max_pause = kMaxPause;
-    Duration round_time = Duration::max();  // all addresses share it, none gets > kConnectTimeout
+    Duration round_time = Duration::max();  // as in ConnectPlan
   };
 
   // Starts at once. resolver, loop and observer outlive it. Destroying it, outside of its own
@@ -101,7 +94,8 @@ class Dialer final : private FrameConnection::Observer {
   void begin_round();
   void begin_round_soon();
   void try_addresses(std::vector<wire::SocketAddress> found);
-  void try_next_address();
+  void try_address();
+  void try_next_address(const Error& why);
   void on_connected();
   void on_timer();
   Result<void> greet_untrusted(const net::Frame& frame);
@@ -115,19 +109,14 @@ class Dialer final : private FrameConnection::Observer {
 
   State state_ = State::pause;
   Phase reached_ = Phase::look_up;  // in this round, or in the last one
-  Duration pause_ = kFirstPause;    // the next one
-  MonoTime up_since_{};
+  channel::ConnectPlan plan_;
   Resolver::Ticket lookup_;
-  std::vector<wire::SocketAddress> addresses_;
-  std::size_t current_ = 0;          // of `addresses_`: the one that is tried or connected to
-  std::optional<Error> last_error_;  // of the address before it
-  UniqueFd socket_;                  // while it connects
+  UniqueFd socket_;  // while it connects
   // Until the next round: a FrameConnection must not be destroyed in its own callbacks.
   std::unique_ptr<FrameConnection> connection_;
   std::optional<wire::Greeting> them_;
   std::optional<Error> reason_;  // why the connection is about to close, if known here
   bool given_up_ = false;        // by restart(), while it was up
-  std::string unusable_;         // the address to try last; empty: none
   EventSource connected_, timer_;
 };
 

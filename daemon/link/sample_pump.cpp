@@ -17,7 +17,7 @@ Duration period_of(double rate_hz) {
 
 [[gnu::hot]] Tid newest_untrusted(const ring::RingReader& reader) noexcept {
   const Tid newest = reader.newest();
-  return newest <= kLastTid ? newest : kNoTid;
+  return newest <= channel::kMaxTid ? newest : kNoTid;
 }
 
 SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connection,
@@ -28,8 +28,8 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       sender_(sender),
       observer_(observer),
       plan_(plan),
-      next_(std::clamp<Tid>(plan.first, 0, kLastTid)),
-      last_(kLastTid) {}
+      next_(std::clamp<Tid>(plan.first, 0, channel::kMaxTid)),
+      last_(channel::kMaxTid) {}
 
 [[gnu::hot]] Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
   std::size_t bytes = 0;

@@ -14,15 +14,12 @@
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
 
+#include "core/channel/sample_cursor.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "daemon/link/frame_connection.hpp"
 #include "daemon/link/sample_sender.hpp"
 
 namespace dssm::daemon {
-
-// Greater tids do not exist: they come from a program that wrote invalid values into the ring. Far
-// enough from the greatest number to add to them.
-inline constexpr Tid kLastTid = Tid{1} << 62;
 
 // The newest sample that may be sent; kNoTid: none.
 Tid newest_untrusted(const ring::RingReader& reader) noexcept;

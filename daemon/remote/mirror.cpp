@@ -13,18 +13,16 @@
 #include "daemon/base/message_ids.hpp"
 
 namespace dssm::daemon {
-namespace {
 
-constexpr std::uint64_t kSubscribeSerial = kOpenSerial + 1;
-
-}  // namespace
+using channel::ChannelClient;
 
 Mirror::Mirror(const ChannelParts& parts, StreamId id, RingQuota quota,
                std::function<void()> on_done)
     : RemoteStream(parts,
                    {Purpose::mirror, message_id::kMirror,
                     "its owner's ring no longer held them when their turn came; keep more history "
-                    "there, or write less than the network carries"},
+                    "there, or write less than the network carries",
+                    "mirror '{}' keeps what it has"},
                    std::move(id), std::move(quota), std::move(on_done)),
       clock_(parts.clock, id_),
       fill_timer_(EventSource::timer(parts.loop, [this] { notify_replaced(); })),
@@ -34,79 +32,36 @@ Mirror::Mirror(const ChannelParts& parts, StreamId id, RingQuota quota,
 
 // --- protocol steps
 
-void Mirror::on_up(FrameConnection& connection, const wire::Greeting& them) {
+void Mirror::on_connected(FrameConnection&, const wire::Greeting& them) {
   on_owner_clock(them.clock);
-  state_ = is_removed() ? State::reopening : State::opening;
-  net::Frame frame;
-  frame.set_serial(kOpenSerial);
-  wire::to_message(id_, *frame.mutable_open()->mutable_id());
-  connection.send(frame);
+  channel_.open(id_, nullptr);
 }
 
-Result<void> Mirror::on_frame(net::Frame& frame) {
-  switch (frame.body_case()) {
-    case net::Frame::kOpened:
-      return on_opened_untrusted(frame.opened());
-    case net::Frame::kSubscribed:
-      return on_subscribed_untrusted(frame.subscribed());
-    case net::Frame::kCaughtUp:
-      return on_caught_up();
-    case net::Frame::kGap:
-      return on_gap_untrusted(frame.gap());
-    case net::Frame::kPong:
-      on_owner_clock(wire::clock_report_untrusted(frame.pong()));
-      return {};
-    case net::Frame::kEnded:
-      on_refused({Errc::not_found, "stream '" + name_ + "' was removed on its host"});
-      return {};
-    case net::Frame::kFailure:
-      on_refused(wire::failure(frame.failure()));
-      return {};
-    default:
-      return {};  // of a later version
-  }
-}
-
-Result<void> Mirror::on_opened_untrusted(const proto::Opened& opened) {
-  if (state_ != State::opening && state_ != State::reopening) return unexpected_frame("Opened");
-  const StreamInfo theirs = DSSM_TRY(opened_stream_untrusted(opened, id_));
+Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
   if (Result<void> followed = follow_untrusted(theirs); !followed) {
-    on_refused(followed.error());
+    stop(followed.error(), false);
     return {};
   }
-  FrameConnection& connection = *connection_.frames();
-  connection.take_samples(theirs.type.payload_bytes, *this);
-  net::Frame frame;
-  frame.set_serial(kSubscribeSerial);
-  net::Subscribe& subscribe = *frame.mutable_subscribe();
-  if (ring_->next() >= 0) {
-    subscribe.set_from_tid(ring_->next());
-    subscribe.set_incarnation(theirs.incarnation);
-  } else {
-    subscribe.set_from_oldest(true);
-  }
-  state_ = State::subscribing;
-  connection.send(frame);
+  is_removed_ = false;
+  connection_.frames()->take_samples(theirs.type.payload_bytes, *this);
+  net::Subscribe request;
+  ring_->resume(request);
+  channel_.subscribe(request);
   set_pending_deadline(parts_.loop.deadline_in(kFillTimeout));
   if (!replaced_.empty()) fill_timer_.enable_in(kFillTimeout);
   return {};
 }
 
-Result<void> Mirror::on_subscribed_untrusted(const net::Subscribed& subscribed) {
-  if (state_ != State::subscribing) return unexpected_frame("Subscribed");
-  if (subscribed.incarnation() != ring_->stream()->incarnation()) {
-    return Error{Errc::unavailable, "stream '" + name_ + "' was recreated just now"};
-  }
-  DSSM_TRY(ring_->on_subscribed_untrusted(subscribed.first_tid()));
-  state_ = State::filling;
+Result<void> Mirror::on_subscribed_untrusted(Tid first) {
+  const std::uint64_t before = ring_->gap_samples();
+  DSSM_TRY(ring_->on_subscribed_untrusted(first));
+  log_gap_since(before);
   last_error_.reset();
   ++subscriptions_;
   return {};
 }
 
 Result<void> Mirror::on_caught_up() {
-  if (state_ < State::filling) return unexpected_frame("CaughtUp");
-  if (state_ == State::filling) state_ = State::live;
   ring_->wake();
   if (clear_error()) {
     parts_.logger.notice(
@@ -122,49 +77,41 @@ Result<void> Mirror::on_caught_up() {
   return {};
 }
 
-Result<void> Mirror::on_gap_untrusted(const net::Gap& gap) {
-  if (state_ < State::filling) return unexpected_frame("Gap");
+Result<void> Mirror::on_gap_untrusted(Tid first, std::uint64_t count) {
   const std::uint64_t before = ring_->gap_samples();
-  DSSM_TRY(ring_->on_gap_untrusted(gap.first_tid(), gap.count()));
-  log_gap(ring_->gap_samples() - before);
+  DSSM_TRY(ring_->on_gap_untrusted(first, count));
+  log_gap_since(before);
   return {};
 }
 
 // The ring stays for its readers. A removed stream that is created again is found by the catalog,
 // or by asking the owner.
-void Mirror::on_refused(const Error& why) {
-  const bool removed = why.code == Errc::not_found;
-  end_subscription(removed ? State::removed : State::unavailable);
-  last_error_ = why;
-  log_stopped();
-  ring_ && !removed ? answer_pending(false) : fail_pending(why);
-  connection_.reopen_later();
+Result<void> Mirror::on_refused(ChannelClient::Request, const Error& why) {
+  stop(why, why.code == Errc::not_found);
+  return {};
 }
 
-void Mirror::on_down(const Error& why) {
-  last_error_ = why;
-  if (!is_removed()) log_stopped();
-  on_reopen();
+Result<void> Mirror::on_other_frame(net::Frame& frame) {
+  if (frame.has_pong()) on_owner_clock(wire::clock_report_untrusted(frame.pong()));
+  return {};
 }
 
-void Mirror::on_reopen() { end_subscription(is_removed() ? State::removed : State::unavailable); }
-
-void Mirror::end_subscription(State next) {
-  state_ = next;
+void Mirror::on_channel_end() {
+  is_ending_ = false;
   if (ring_) ring_->wake();  // for the last samples
 }
 
 // --- what the catalog knows
 
 void Mirror::on_stream_added() {
-  if (state_ == State::ending) state_ = State::live;
+  is_ending_ = false;
   RemoteStream::on_stream_added();
 }
 
 // The channel may be earlier than the catalog, and the mirror live with the next ring.
 void Mirror::on_stream_removed(std::uint64_t incarnation) {
-  if (state_ != State::live && state_ != State::ending) return;
-  state_ = ring_->stream()->incarnation() == incarnation ? State::ending : State::live;
+  is_ending_ = channel_.reading() == ChannelClient::Reading::live &&
+               ring_->stream()->incarnation() == incarnation;
 }
 
 void Mirror::on_owner_clock(MirrorClock::Report report) {
@@ -180,7 +127,7 @@ void Mirror::assess_clock() {
 
 [[gnu::hot]] Result<void> Mirror::on_sample_begin(const wire::IncomingSample& sample,
                                                   std::byte*& out) {
-  if (state_ < State::filling) return unexpected_frame("a sample");
+  if (!channel_.takes_samples()) return ChannelClient::unexpected("a sample");
   const Result<std::byte*> place = ring_->begin_untrusted(sample);
   if (!place) return place.error();
   out = *place;
@@ -190,7 +137,7 @@ void Mirror::assess_clock() {
 [[gnu::hot]] Result<void> Mirror::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   const std::uint64_t before = ring_->gap_samples();
   ring_->end(sample, torn);
-  if (ring_->gap_samples() != before) log_gap(ring_->gap_samples() - before);
+  log_gap_since(before);
   return {};
 }
 
@@ -262,33 +209,36 @@ void Mirror::notify_replaced() {
 // --- programs
 
 bool Mirror::can_open_now() const noexcept {
-  return ring_ &&
-         (state_ == State::unavailable || state_ == State::opening || state_ == State::live);
+  return ring_ && !is_removed_ && !is_ending_ && !is_filling();
 }
 
 Duration Mirror::open_timeout() const noexcept {
-  const bool is_filling = state_ == State::subscribing || state_ == State::filling;
-  return is_filling ? kFillTimeout : kOwnerTimeout;
+  return is_filling() ? kFillTimeout : kOwnerTimeout;
 }
 
 void Mirror::on_unused() { linger_timer_.enable_in(parts_.mirror_linger); }
 
+bool Mirror::is_filling() const noexcept {
+  return channel_.reading() == ChannelClient::Reading::asked ||
+         channel_.reading() == ChannelClient::Reading::filling;
+}
+
+proto::Mirror::State Mirror::shown_state() const noexcept {
+  if (is_removed_) return proto::Mirror::REMOVED;
+  if (is_filling()) return proto::Mirror::FILLING;
+  if (channel_.takes_samples()) return proto::Mirror::LIVE;
+  return ring_ && last_error_ ? proto::Mirror::OWNER_UNAVAILABLE : proto::Mirror::CONNECTING;
+}
+
 void Mirror::describe(proto::Mirror& out) const {
-  using Shown = proto::Mirror;
-  static constexpr proto::Mirror::State kStates[] = {
-      Shown::REMOVED, Shown::REMOVED, Shown::CONNECTING, Shown::CONNECTING,
-      Shown::FILLING, Shown::FILLING, Shown::LIVE,       Shown::LIVE,
-  };
-  const bool has_lost_owner =
-      ring_ && last_error_ && (state_ == State::unavailable || state_ == State::opening);
-  out.set_state(has_lost_owner ? Shown::OWNER_UNAVAILABLE : kStates[static_cast<int>(state_)]);
+  out.set_state(shown_state());
   out.set_gap_samples(earlier_.gap_samples + (ring_ ? ring_->gap_samples() : 0));
   out.set_reconnects(subscriptions_ > 0 ? subscriptions_ - 1 : 0);
   out.set_restarts(restarts_);
   out.set_newest(ring_ ? ring_->newest() : kNoTid);
   out.set_received_samples(earlier_.received_samples + (ring_ ? ring_->received_samples() : 0));
   out.set_received_bytes(earlier_.received_bytes + (ring_ ? ring_->received_bytes() : 0));
-  if (state_ < State::live && last_error_) out.set_error(last_error_->message);
+  if (last_error_) out.set_error(last_error_->message);
   out.set_clock(clock_.reason());
 }
 
@@ -297,10 +247,6 @@ bool Mirror::describe_stream(proto::Stream& out) const {
   wire::to_message(ring_->stream()->info(), out);
   describe(*out.mutable_mirror());
   return true;
-}
-
-void Mirror::log_stopped() {
-  if (ring_) log_error(fmt::format("mirror '{}' keeps what it has", name_));
 }
 
 }  // namespace dssm::daemon

@@ -11,24 +11,10 @@
 //             for its readers, and the mirror always retries
 //   end       when no program has used the ring for mirror_linger
 //
-// The states, and what leads from one to the next; "ring" where there may be one already:
-//
-//             on_up            Opened             Subscribed         CaughtUp      catalog: removed
-//   unavailable ----> opening -------> subscribing --------> filling -------> live --------> ending
-//     ^ (ring)         (ring) ^                                                ^              |
-//     |                       |                                                +--------------+
-//     |                       |                                                 catalog: added
-//     |       on_up           | Opened
-//   removed ----> reopening --+
-//     (ring)       (ring)
-//
-//   the connection ends       removed, reopening -> removed; any other state -> unavailable
-//   Failure (not not_found)   any state -> unavailable; reopened 2 s later
-//   Failure (not_found) or
-//   Ended                     any state -> removed; reopened 2 s later, or when the catalog has it
-//
-// A program gets the ring at once in unavailable, opening and live, if there is one; in removed,
-// reopening, subscribing, filling and ending its open() waits.
+// The states are those of ChannelClient, which subscribes: `live` when the history is here. A program
+// gets the ring at once while the channel is closed, being opened or live, if there is a ring; while
+// it subscribes and is filled, and after the catalog or the owner said that the stream was removed,
+// its open() waits.
 #pragma once
 
 #include <cstdint>
@@ -61,55 +47,43 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   void on_own_clock() { assess_clock(); }
 
  private:
-  // Samples and gaps are received from `filling` on.
-  enum class State : std::uint8_t {
-    removed,
-    reopening,
-    unavailable,
-    opening,
-    subscribing,
-    filling,
-    live,
-    ending,
-  };
   struct Totals {
     std::uint64_t gap_samples = 0, received_samples = 0, received_bytes = 0;
   };
 
-  // OwnerConnection::Observer
-  void on_up(FrameConnection& connection, const wire::Greeting& them) override;
-  Result<void> on_frame(net::Frame& frame) override;
-  void on_down(const Error& why) override;
-  void on_reopen() override;
+  // ChannelClient::Delegate
+  Result<void> on_opened(StreamInfo stream, bool created) override;
+  Result<void> on_subscribed_untrusted(Tid first) override;
+  Result<void> on_caught_up() override;
+  Result<void> on_gap_untrusted(Tid first, std::uint64_t count) override;
+  Result<void> on_refused(channel::ChannelClient::Request request, const Error& why) override;
+  Result<void> on_other_frame(net::Frame& frame) override;
   // FrameConnection::SampleDelegate
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   void on_batch_end() override;
   // RemoteStream
   std::shared_ptr<Stream> stream() const noexcept override;
-  bool is_removed() const noexcept override { return state_ <= State::reopening; }
   bool can_open_now() const noexcept override;
   Duration open_timeout() const noexcept override;
   Result<void> check_open(const CreatePlan*) override { return clock_.check_opening(); }
   Result<void> use_offered(std::shared_ptr<Stream> stream) override;
   void on_unused() override;
-
-  // Protocol steps
-  Result<void> on_opened_untrusted(const proto::Opened& opened);
-  Result<void> on_subscribed_untrusted(const net::Subscribed& subscribed);
-  Result<void> on_caught_up();
-  Result<void> on_gap_untrusted(const net::Gap& gap);
-  void on_refused(const Error& why);
-  void end_subscription(State next);
+  void on_connected(FrameConnection& connection, const wire::Greeting& them) override;
+  void on_channel_end() override;
 
   // The ring
   Result<void> follow_untrusted(const StreamInfo& theirs);
   void replace_ring(std::unique_ptr<MirrorRing> ring);
   void notify_replaced();
   void assess_clock();
-  void log_stopped();
+  void log_gap_since(std::uint64_t before) {
+    if (ring_->gap_samples() != before) log_gap(ring_->gap_samples() - before);
+  }
+  bool is_filling() const noexcept;
+  proto::Mirror::State shown_state() const noexcept;
 
-  State state_ = State::unavailable;
+  bool is_ending_ = false;  // live, but the catalog knows that this ring was removed
   MirrorClock clock_;
   std::unique_ptr<MirrorRing> ring_;
   std::vector<std::shared_ptr<Stream>> replaced_;  // their readers are still to be notified

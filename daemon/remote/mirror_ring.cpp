@@ -1,14 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/remote/mirror_ring.hpp"
 
-#include <fmt/format.h>
-
 #include <cstring>
 #include <new>
 #include <utility>
 
 #include "core/base/try.hpp"
-#include "daemon/link/sample_pump.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -37,17 +34,7 @@ MirrorRing::MirrorRing(std::shared_ptr<Stream> stream,
       slots_(*mapping_),
       reader_(*mapping_) {
   slots_.recover();
-  if (slots_.newest() >= 0) next_ = slots_.newest() + 1;
-}
-
-Result<void> MirrorRing::on_subscribed_untrusted(Tid first) {
-  if (first < 0 || first > kLastTid) {
-    return Error{Errc::protocol,
-                 fmt::format("the owner begins the subscription with sample {}", first)};
-  }
-  // After a reconnect the next sample is known: what the owner no longer has of it is a gap.
-  if (next_ < 0) next_ = first;
-  return {};
+  if (slots_.newest() >= 0) cursor_.set_next(slots_.newest() + 1);
 }
 
 // After a gap, the slot of sample `tid` may be one that readers still read, and the payload may
@@ -62,10 +49,7 @@ bool MirrorRing::would_overwrite_window(Tid tid) const noexcept {
 
 [[gnu::hot]] Result<std::byte*> MirrorRing::begin_untrusted(const wire::IncomingSample& sample) {
   const Tid tid = sample.info.tid;
-  if (tid < next_ || tid > kLastTid) {
-    return Error{Errc::protocol,
-                 fmt::format("sample {} came instead of sample {} or a later one", tid, next_)};
-  }
+  if (!cursor_.accepts(tid)) return cursor_.unexpected(tid);
   if (aside_) drop_aside();  // of one that was cut off
   const bool after_gap = tid != slots_.newest() + 1;
   if (after_gap && would_overwrite_window(tid)) allocate_aside(sample.payload_bytes);
@@ -91,32 +75,13 @@ void MirrorRing::drop_aside() noexcept {
     const Tid tid = sample.info.tid;
     if (aside_) std::memcpy(slots_.begin(tid), aside_.get(), sample.payload_bytes);
     slots_.publish(tid, sample.info.time, sample.info.clock_error);
-    gap_samples_ += static_cast<std::uint64_t>(tid - next_);
-    next_ = tid + 1;
+    cursor_.on_sample(tid);
     wake_pending_ = true;
     ++received_samples_;
     received_bytes_ += sample.payload_bytes;
   }
   // A torn sample is missing: the next one counts it, by its own tid.
   if (aside_) drop_aside();
-}
-
-Result<void> MirrorRing::on_gap_untrusted(Tid first, std::uint64_t count) {
-  if (first < 0 || first > kLastTid || count > static_cast<std::uint64_t>(kLastTid - first)) {
-    return Error{
-        Errc::protocol,
-        fmt::format("the owner reports a gap of {} samples from sample {} on", count, first)};
-  }
-  const Tid end = first + static_cast<Tid>(count);
-  if (end <= next_) {
-    return Error{Errc::protocol,
-                 fmt::format("the owner reports the samples before {} as lost, but sample {} has "
-                             "come already",
-                             end, next_ - 1)};
-  }
-  gap_samples_ += static_cast<std::uint64_t>(end - next_);
-  next_ = end;
-  return {};
 }
 
 [[gnu::hot]] void MirrorRing::wake() noexcept {

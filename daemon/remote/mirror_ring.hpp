@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The memory side of a mirror. MirrorRing is the ring while it is being filled: it takes the
-// owner's samples, knows which one comes next, and counts those that never come. MirrorClock knows
+// owner's samples. MirrorClock knows
 // what the times of these samples are worth. Neither knows the connection.
 //
 // Promises to the ring's readers: the window has no holes, tids rise, a sample is visible once it
@@ -15,6 +15,7 @@
 #include <memory>
 #include <string>
 
+#include "core/channel/sample_cursor.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/clock_assessment.hpp"
 #include "core/ring/ring_reader.hpp"
@@ -40,21 +41,20 @@ class MirrorRing {
 
   const std::shared_ptr<Stream>& stream() const noexcept { return stream_; }
 
-  // The sample to ask the owner for; kNoTid: the oldest, because it never sent where this ring
-  // begins.
-  Tid next() const noexcept { return next_; }
+  // The request for the samples that follow on what is here; all, if the owner never sent where this
+  // ring begins.
+  void resume(net::Subscribe& out) const { cursor_.resume(stream_->incarnation(), out); }
 
-  // The subscription begins with sample `first`.
-  //   fails  protocol
-  Result<void> on_subscribed_untrusted(Tid first);
+  // As in SampleCursor.
+  Result<void> on_subscribed_untrusted(Tid first) { return cursor_.on_subscribed_untrusted(first); }
+  Result<void> on_gap_untrusted(Tid first, std::uint64_t count) {
+    return cursor_.on_gap_untrusted(first, count);
+  }
   // Where the payload of this sample goes, until end() or another begin_untrusted().
   //   fails  protocol: its tid does not rise
   Result<std::byte*> begin_untrusted(const wire::IncomingSample& sample);
   // The payload is in place. After a gap, the samples before it leave the ring, as in the owner's.
   void end(const wire::IncomingSample& sample, bool torn);
-  // The owner's ring no longer has these.
-  //   fails  protocol: they have arrived already
-  Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
   // How this PC's readers may use the samples' times.
   void set_clock(const ring::ClockAssessment& assessment) noexcept {
     mapping_->header().clock.store(assessment);
@@ -63,7 +63,7 @@ class MirrorRing {
   void wake() noexcept;
 
   Tid newest() const noexcept { return slots_.newest(); }
-  std::uint64_t gap_samples() const noexcept { return gap_samples_; }
+  std::uint64_t gap_samples() const noexcept { return cursor_.lost(); }
   std::uint64_t received_samples() const noexcept { return received_samples_; }
   std::uint64_t received_bytes() const noexcept { return received_bytes_; }
 
@@ -80,11 +80,11 @@ class MirrorRing {
   MemoryBudget& budget_;
   ring::SlotWriter slots_;
   ring::RingReader reader_;
-  Tid next_ = kNoTid;
+  channel::SampleCursor cursor_;
   bool wake_pending_ = false;           // sleeping readers are still to be woken
   std::unique_ptr<std::byte[]> aside_;  // the payload under way, when it must not go to its slot
   MemoryShare aside_share_;
-  std::uint64_t gap_samples_ = 0, received_samples_ = 0, received_bytes_ = 0;
+  std::uint64_t received_samples_ = 0, received_bytes_ = 0;
 };
 
 // What the times in one mirror are worth, from what its owner reported of its clock, and when.

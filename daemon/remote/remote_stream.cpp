@@ -7,8 +7,6 @@
 #include <utility>
 
 #include "core/base/try.hpp"
-#include "core/wire/messages.hpp"
-#include "daemon/link/sample_pump.hpp"
 
 namespace dssm::daemon {
 
@@ -63,6 +61,33 @@ void OwnerConnection::on_down(const Error& why) {
   observer_.on_down(why);
 }
 
+// --- the channel
+
+void RemoteStream::end_channel() {
+  channel_.reset();
+  on_channel_end();
+}
+
+void RemoteStream::on_down(const Error& why) {
+  end_channel();
+  last_error_ = why;
+  if (!is_removed_) log_stopped();
+}
+
+Result<void> RemoteStream::on_ended(const Error& why) {
+  stop(why, true);
+  return {};
+}
+
+void RemoteStream::stop(const Error& why, bool removed) {
+  end_channel();
+  is_removed_ = removed;
+  last_error_ = why;
+  log_stopped();
+  stream() && !removed ? answer_pending(false) : fail_pending(why);
+  connection_.reopen_later();
+}
+
 // --- programs
 
 RemoteStream::RemoteStream(const ChannelParts& parts, Kind kind, StreamId id, RingQuota quota,
@@ -101,7 +126,7 @@ void RemoteStream::open(const CreatePlan* plan, Then then) {
   pending_.push_back({std::move(then), plan ? std::optional(*plan) : std::nullopt,
                       parts_.loop.deadline_in(open_timeout())});
   arm_pending_timer();
-  if (is_removed()) connection_.reopen();
+  if (is_removed_) connection_.reopen();
 }
 
 Result<std::shared_ptr<Stream>> RemoteStream::adopt_untrusted(OfferedFiles&& files) {
@@ -125,7 +150,7 @@ Result<std::shared_ptr<Stream>> RemoteStream::adopt_untrusted(OfferedFiles&& fil
 }
 
 void RemoteStream::on_stream_added() {
-  if (is_removed()) connection_.reopen();
+  if (is_removed_) connection_.reopen();
 }
 
 const std::optional<CreatePlan>* RemoteStream::first_pending() const noexcept {
@@ -188,7 +213,7 @@ void RemoteStream::on_pending_timer() {
   const std::vector<PendingOpen> overdue(pending_.begin(), later);
   pending_.erase(pending_.begin(), later);
   for (const PendingOpen& one : overdue) {
-    if (stream() && !is_removed()) {
+    if (stream() && !is_removed_) {
       one.then(opened(one.plan ? &*one.plan : nullptr));
     } else {
       one.then(Error{Errc::unavailable,
@@ -207,10 +232,12 @@ LogFields RemoteStream::log_fields() const {
   return {.stream = name_, .peer = id_.host, .message_id = kind_.message_id};
 }
 
-void RemoteStream::log_error(std::string_view consequence) {
-  if (std::exchange(error_logged_, true)) return;
-  parts_.logger.notice(fmt::format("{}: {}; retrying", consequence, last_error_->message),
-                       log_fields());
+// Why the stream is not live, once until clear_error().
+void RemoteStream::log_stopped() {
+  if (!stream() || std::exchange(error_logged_, true)) return;
+  parts_.logger.notice(
+      fmt::format("{}: {}; retrying", fmt::format(kind_.stopped, name_), last_error_->message),
+      log_fields());
 }
 
 bool RemoteStream::clear_error() {
@@ -225,31 +252,6 @@ void RemoteStream::log_gap(std::uint64_t samples) {
   parts_.logger.warning(fmt::format("stream '{}' lacks {} samples, {} in all: {}", name_, *unlogged,
                                     gap_samples_, kind_.gap_reason),
                         log_fields());
-}
-
-// --- what the owner sends
-
-Result<StreamInfo> opened_stream_untrusted(const proto::Opened& opened, const StreamId& expected) {
-  const StreamId id = DSSM_TRY(wire::stream_id_untrusted(opened.stream().id()));
-  if (id != expected) {
-    return Error{Errc::protocol,
-                 fmt::format("the owner opened '{}' instead of '{}'", id.str(), expected.str())};
-  }
-  TypeInfo type = DSSM_TRY(wire::type_untrusted(opened.stream().type()));
-  StreamInfo stream = wire::stream_info(opened.stream());
-  stream.type = std::move(type);
-  if (stream.cycle <= Duration::zero() || stream.incarnation == 0 || stream.newest < kNoTid ||
-      stream.newest > kLastTid) {
-    return Error{Errc::protocol,
-                 fmt::format("the owner describes '{}' without a cycle or an incarnation, or with "
-                             "a tid that is not possible",
-                             expected.str())};
-  }
-  return stream;
-}
-
-Error unexpected_frame(std::string_view frame) {
-  return {Errc::protocol, fmt::format("the owner sent {}, which is not expected now", frame)};
 }
 
 }  // namespace dssm::daemon

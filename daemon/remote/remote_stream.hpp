@@ -5,14 +5,22 @@
 // many use it.
 //
 //   RemoteStreams<Mirror>         one entry per stream, found by its name (remote_streams.hpp)
-//     Mirror, RemoteWriter        state machine and protocol steps of one stream
+//     Mirror, RemoteWriter        one stream
 //       RemoteStream              this file
+//         ChannelClient           core/channel: the protocol's steps, with a drawing of its states
 //         OwnerConnection         this file; connects, reconnects, checks who answers
 //       MirrorRing, OutgoingRing  the ring's memory
 //
 // A program's open() is answered at once when there is a ring that it may use. Otherwise it waits,
 // at most for kOwnerTimeout, until the derived class answers or fails it.
+//
+// While the owner does not answer, the ring stays for its programs, and the connection is retried.
+// When the owner has removed the stream, programs that open it do not get the ring that is still
+// here: they wait for the owner's answer on a new connection, which is made for them, when the
+// catalog knows the stream again, and kRetryPause after each refusal.
 #pragma once
+
+#include <fmt/core.h>
 
 #include <cstdint>
 #include <dssm/result.hpp>
@@ -23,6 +31,7 @@
 #include <string_view>
 #include <vector>
 
+#include "core/channel/channel_client.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/base/rate_limiter.hpp"
@@ -128,7 +137,8 @@ class UseCount {
   std::shared_ptr<State> state_;
 };
 
-class RemoteStream : protected OwnerConnection::Observer {
+class RemoteStream : private OwnerConnection::Observer,
+                     protected channel::ChannelClient::Delegate {
  public:
   // How long a program's open() waits for the owner to answer.
   static constexpr Duration kOwnerTimeout = std::chrono::seconds(2);
@@ -173,6 +183,8 @@ class RemoteStream : protected OwnerConnection::Observer {
     Purpose purpose;
     std::string_view message_id;  // of its log lines
     std::string_view gap_reason;  // why samples are lost, and what to do
+    // What becomes of the ring while the owner does not answer; {} is the stream.
+    fmt::format_string<const std::string&> stopped;
   };
 
   // parts outlives it. on_done: called when it is done(); destroy it later, not there.
@@ -182,10 +194,8 @@ class RemoteStream : protected OwnerConnection::Observer {
   // --- what the derived class knows
 
   virtual std::shared_ptr<Stream> stream() const noexcept = 0;  // of the ring; nullptr: none
-  // The owner has no such stream: programs do not get the ring that is still here.
-  virtual bool is_removed() const noexcept = 0;
   // Whether open() may be answered at once.
-  virtual bool can_open_now() const noexcept { return stream() && !is_removed(); }
+  virtual bool can_open_now() const noexcept { return stream() && !is_removed_; }
   virtual Duration open_timeout() const noexcept { return kOwnerTimeout; }
   // Whether a program that asks for this may have the ring.
   virtual Result<void> check_open(const CreatePlan* plan) = 0;
@@ -193,6 +203,18 @@ class RemoteStream : protected OwnerConnection::Observer {
   virtual Result<void> use_offered(std::shared_ptr<Stream> stream) = 0;
   // There is a ring, and no program uses it or waits for it.
   virtual void on_unused() = 0;
+
+  // --- the channel
+
+  // The connection is up: follow with channel_.open().
+  virtual void on_connected(FrameConnection& connection, const wire::Greeting& them) = 0;
+  virtual void on_output_empty() override {}
+  // The channel is closed.
+  virtual void on_channel_end() = 0;
+  // Ends the channel, for which the owner, or this host, has no stream; reopens it later.
+  void stop(const Error& why, bool removed);
+  void send(const net::Frame& frame) override { connection_.frames()->send(frame); }
+  Result<void> on_ended(const Error& why) override;
 
   // --- programs that wait
 
@@ -208,9 +230,7 @@ class RemoteStream : protected OwnerConnection::Observer {
   // --- the log
 
   LogFields log_fields() const;
-  // Why the stream is not live, once until clear_error(). consequence: "mirror 'x' ..."
-  void log_error(std::string_view consequence);
-  // Returns whether an error had been logged.
+  // The stream is live. Returns whether an error had been logged.
   bool clear_error();
   // `samples` more will never be in the ring. At most one line in kGapLinePeriod: a connection that
   // is too slow for its stream loses samples all the time.
@@ -220,13 +240,25 @@ class RemoteStream : protected OwnerConnection::Observer {
   const StreamId id_;
   const std::string name_;           // for messages
   std::optional<Error> last_error_;  // why it is not live
+  bool is_removed_ = false;          // the owner has no such stream
+  channel::ChannelClient channel_{*this};
 
  private:
+  // OwnerConnection::Observer
+  void on_up(FrameConnection& connection, const wire::Greeting& them) override {
+    on_connected(connection, them);
+  }
+  Result<void> on_frame(net::Frame& frame) override { return channel_.on_frame(frame); }
+  void on_down(const Error& why) override;
+  void on_reopen() override { end_channel(); }
+
   struct PendingOpen {
     Then then;
     std::optional<CreatePlan> plan;
     MonoTime deadline;
   };
+  void end_channel();
+  void log_stopped();
   Result<OpenedRing> opened(const CreatePlan* plan);
   void after_pending();
   void arm_pending_timer();
@@ -247,16 +279,5 @@ class RemoteStream : protected OwnerConnection::Observer {
  protected:
   OwnerConnection connection_;
 };
-
-// Serial of the first request of each connection, which opens or creates the stream; the requests
-// that follow count on from it.
-inline constexpr std::uint64_t kOpenSerial = 1;
-
-// The stream in `opened`, which must be `expected`.
-//   fails  protocol
-Result<StreamInfo> opened_stream_untrusted(const proto::Opened& opened, const StreamId& expected);
-
-// The owner sent a frame that this side does not expect now.
-Error unexpected_frame(std::string_view frame);
 
 }  // namespace dssm::daemon

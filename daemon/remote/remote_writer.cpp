@@ -13,129 +13,63 @@
 #include "daemon/base/message_ids.hpp"
 
 namespace dssm::daemon {
-namespace {
-
-constexpr std::uint64_t kStartSerial = kOpenSerial + 1;
-
-}  // namespace
 
 RemoteWriter::RemoteWriter(const ChannelParts& parts, StreamId id, RingQuota quota,
                            std::function<void()> on_done)
     : RemoteStream(parts,
                    {Purpose::remote_writer, message_id::kRemoteWriter,
                     "the local ring no longer held what programs here wrote when its turn came; "
-                    "keep more history, or write less than the network carries"},
+                    "keep more history, or write less than the network carries",
+                    "samples for stream '{}' stay here"},
                    std::move(id), std::move(quota), std::move(on_done)),
       drain_timer_(EventSource::timer(parts.loop, [this] { on_drain_timer(); })),
       turn_timer_(EventSource::timer(parts.loop, [this] { publish(); })) {}
 
 // --- protocol steps
 
-void RemoteWriter::on_up(FrameConnection&, const wire::Greeting& them) {
+void RemoteWriter::on_connected(FrameConnection&, const wire::Greeting& them) {
   may_tear_ = them.has_feature(wire::kFeatureTorn);
-  send_open();
+  open_at_owner();
 }
 
 // Asks for the stream as the first program that waits wants it, or as it was before.
-void RemoteWriter::send_open() {
+void RemoteWriter::open_at_owner() {
   std::optional<CreatePlan> plan;
   if (const std::optional<CreatePlan>* wanted = first_pending()) {
     plan = *wanted;
-  } else if (creates_ && !is_removed()) {
+  } else if (creates_ && !is_removed_) {
     plan = CreatePlan{ring_->stream()->type(), history_};
   }
-  state_ = is_removed() ? State::reopening : State::opening;
-  net::Frame frame;
-  frame.set_serial(kOpenSerial);
-  if (plan) {
-    proto::Create& create = *frame.mutable_create();
-    wire::to_message(id_, *create.mutable_id());
-    wire::to_message(plan->type, *create.mutable_type());
-    create.set_depth(plan->history.depth);
-    create.set_cycle_ns(to_ns(plan->history.cycle));
-  } else {
-    wire::to_message(id_, *frame.mutable_open()->mutable_id());
-  }
-  connection_.frames()->send(frame);
+  channel_.open(id_, plan ? &*plan : nullptr);
 }
 
-Result<void> RemoteWriter::on_frame(net::Frame& frame) {
-  switch (frame.body_case()) {
-    case net::Frame::kOpened:
-      return on_opened_untrusted(frame.opened());
-    case net::Frame::kPublishing:
-      return on_publishing_untrusted(frame.publishing());
-    case net::Frame::kPublished:
-      if (state_ != State::publishing) return unexpected_frame("Published");
-      return on_published_untrusted(frame.published().last());
-    case net::Frame::kEnded:
-      state_ = State::removed;
-      on_refused({Errc::not_found, "stream '" + name_ + "' was removed on its host"});
-      return {};
-    case net::Frame::kFailure:
-      on_failure(wire::failure(frame.failure()));
-      return {};
-    default:
-      return {};  // of a later version
-  }
-}
-
-Result<void> RemoteWriter::on_opened_untrusted(const proto::Opened& opened) {
-  if (!is_opening()) return unexpected_frame("Opened");
-  const StreamInfo theirs = DSSM_TRY(opened_stream_untrusted(opened, id_));
+Result<void> RemoteWriter::on_opened(StreamInfo theirs, bool created) {
   if (Result<void> followed = follow(theirs); !followed) {
-    on_refused(followed.error());
+    stop(followed.error(), is_removed_);
     return {};
   }
-  state_ = State::starting;
-  answer_pending(opened.created());
-  net::Frame start;
-  start.set_serial(kStartSerial);
-  start.mutable_start_publishing()->set_publisher(ring_->publisher());
-  connection_.frames()->send(start);
+  is_removed_ = false;
+  answer_pending(created);
+  channel_.publish(ring_->publisher());
   return {};
 }
 
-Result<void> RemoteWriter::on_publishing_untrusted(const net::Publishing& publishing) {
-  if (state_ != State::starting) return unexpected_frame("Publishing");
-  DSSM_TRY(on_published_untrusted(publishing.last()));
-  start_publishing();
-  return {};
-}
-
-Result<void> RemoteWriter::on_published_untrusted(Tid last) {
+Result<void> RemoteWriter::on_published_untrusted(std::int64_t last, Tid, bool begins) {
   DSSM_TRY(ring_->set_published_untrusted(last));
   if (is_unused()) drain_timer_.enable_in(Duration::zero());
+  if (begins) start_publishing();
   return {};
 }
 
 // The owner may refuse what one program wants, and not what the next one wants.
-void RemoteWriter::on_failure(const Error& why) {
-  if (!is_opening() || !first_pending()) return on_refused(why);
-  fail_first_pending(why);
-  if (done()) return;
-  first_pending() ? send_open() : on_refused(why);
-}
-
-void RemoteWriter::on_refused(const Error& why) {
-  stop_publishing();
-  const bool removed = is_removed() || (why.code == Errc::not_found && !creates_);
-  state_ = removed ? State::removed : State::unavailable;
-  last_error_ = why;
-  log_stopped();
-  fail_pending(why);
-  connection_.reopen_later();
-}
-
-void RemoteWriter::on_down(const Error& why) {
-  on_reopen();
-  last_error_ = why;
-  if (!is_removed()) log_stopped();
-}
-
-void RemoteWriter::on_reopen() {
-  stop_publishing();
-  state_ = is_removed() ? State::removed : State::unavailable;
+Result<void> RemoteWriter::on_refused(channel::ChannelClient::Request request, const Error& why) {
+  if (request == channel::ChannelClient::Request::open && first_pending()) {
+    fail_first_pending(why);
+    if (done()) return {};
+    if (first_pending()) return open_at_owner(), Result<void>();
+  }
+  stop(why, is_removed_ || (why.code == Errc::not_found && !creates_));
+  return {};
 }
 
 // --- the ring
@@ -174,7 +108,6 @@ Result<void> RemoteWriter::use_ring(std::unique_ptr<OutgoingRing> ring) {
 }
 
 void RemoteWriter::start_publishing() {
-  state_ = State::publishing;
   if (clear_error()) {
     parts_.logger.notice(fmt::format("stream '{}' takes our samples again, from sample {} on",
                                      name_, ring_->next_untrusted()),
@@ -232,10 +165,6 @@ void RemoteWriter::on_drain_timer() {
                   last_error_ ? ": " + last_error_->message : ""),
       log_fields());
   finish();
-}
-
-void RemoteWriter::log_stopped() {
-  if (ring_) log_error(fmt::format("samples for stream '{}' stay here", name_));
 }
 
 }  // namespace dssm::daemon

@@ -13,23 +13,9 @@
 //            then it gets what the ring still holds. But when an owner comes back without its ring,
 //            the remote writer creates the stream again
 //
-// The states, and what leads from one to the next; "ring" where there may be one already:
-//
-//             on_up            Opened            Publishing
-//   unavailable ----> opening -------> starting -----------> publishing
-//       (ring)        (ring) ^
-//             on_up          | Opened
-//   removed ----> reopening -+
-//     (ring)       (ring)
-//
-//   the connection ends      removed, reopening -> removed; any other state -> unavailable
-//   Failure                  answers the first open() that waits; the next one is asked for in the
-//                            same state. Without one: removed if there is no such stream and no
-//                            program created it, else unavailable; reopened 2 s later
-//   Ended                    any state -> removed; reopened 2 s later, or when the catalog has it
-//
-// `opening` asks for Create if a program created the stream, `reopening` only if one that waits
-// does. A program gets the ring at once if there is one, except in removed and reopening.
+// The states are those of ChannelClient, which publishes. Open is sent, or Create if a program
+// created the stream. When the owner refuses what one program that waits asks for, the next one's
+// request is sent on the same channel.
 #pragma once
 
 #include <cstdint>
@@ -58,52 +44,32 @@ class RemoteWriter final : public RemoteStream,
   ~RemoteWriter() override { stop_publishing(); }
 
  private:
-  enum class State : std::uint8_t {
-    removed,
-    reopening,
-    unavailable,
-    opening,
-    starting,
-    publishing,
-  };
-
-  // OwnerConnection::Observer
-  void on_up(FrameConnection& connection, const wire::Greeting& them) override;
-  Result<void> on_frame(net::Frame& frame) override;
-  void on_output_empty() override { publish(); }
-  void on_down(const Error& why) override;
-  void on_reopen() override;
+  // ChannelClient::Delegate
+  Result<void> on_opened(StreamInfo stream, bool created) override;
+  Result<void> on_published_untrusted(std::int64_t last, Tid last_tid, bool begins) override;
+  Result<void> on_refused(channel::ChannelClient::Request request, const Error& why) override;
+  Result<void> on_other_frame(net::Frame&) override { return {}; }
   // StreamFeed::Observer, SamplePump::Observer
   void on_sample_available() override { publish(); }
   void on_gap(Tid, std::uint64_t count) override { log_gap(count); }
   // RemoteStream
   std::shared_ptr<Stream> stream() const noexcept override;
-  bool is_removed() const noexcept override { return state_ <= State::reopening; }
   Result<void> check_open(const CreatePlan* plan) override;
   Result<void> use_offered(std::shared_ptr<Stream> stream) override;
   void on_unused() override { drain_timer_.enable_in(Duration::zero()); }
 
-  // Protocol steps
-  bool is_opening() const noexcept {
-    return state_ == State::opening || state_ == State::reopening;
-  }
-  void send_open();
-  Result<void> on_opened_untrusted(const proto::Opened& opened);
-  Result<void> on_publishing_untrusted(const net::Publishing& publishing);
-  Result<void> on_published_untrusted(Tid last);
-  void on_failure(const Error& why);
-  void on_refused(const Error& why);
+  void on_connected(FrameConnection& connection, const wire::Greeting& them) override;
+  void on_output_empty() override { publish(); }
+  void on_channel_end() override { stop_publishing(); }
 
-  // The ring
+  void open_at_owner();
   Result<void> follow(const StreamInfo& theirs);
   Result<void> use_ring(std::unique_ptr<OutgoingRing> ring);
   void start_publishing();
   void publish();
   void stop_publishing() noexcept;
   void on_drain_timer();
-  void log_stopped();
 
-  State state_ = State::unavailable;
   bool creates_ = false;  // a program has created the stream, not only opened it
   History history_;       // of the owner's ring
   std::unique_ptr<OutgoingRing> ring_;

@@ -119,7 +119,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
     case net::Subscribe::kFromTid: {
       const bool other_ring =
           request.incarnation() != 0 && request.incarnation() != stream().incarnation();
-      return other_ring ? oldest : std::clamp<Tid>(request.from_tid(), 0, kLastTid);
+      return other_ring ? oldest : std::clamp<Tid>(request.from_tid(), 0, channel::kMaxTid);
     }
     case net::Subscribe::kFromTimeNs: {
       Tid tid = kNoTid;

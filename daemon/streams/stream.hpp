@@ -18,6 +18,7 @@
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
+#include "core/channel/channel_client.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "daemon/base/memory_budget.hpp"
@@ -50,11 +51,7 @@ enum class Purpose : std::uint8_t {
   remote_writer,  // what programs write to it is published into the stream of another host
 };
 
-// What a program wants of a stream that is to be created unless it is there.
-struct CreatePlan {
-  TypeInfo type;
-  History history;
-};
+using channel::CreatePlan;
 
 class Stream;
 

@@ -24,6 +24,7 @@ ORDER = [
     ["core/ring"],
     ["core/clock"],
     ["core/wire"],
+    ["core/channel"],
     ["client/include"],
     ["client/src"],
     ["client/ssm", "client/dssmctl"],

@@ -26,7 +26,8 @@ struct NetworkConnectionTest : testing::Test {
   NetworkConnectionTest() {
     const wire::Address any = wire::Address::parse("127.0.0.1:0", 0, true).value();
     listener = wire::listen_tcp(wire::resolve_number(any).at(0)).value();
-    link.start({wire::local_address(listener.get()).value()});
+    const std::vector<wire::SocketAddress> addresses{wire::local_address(listener.get()).value()};
+    EXPECT_TRUE(link.start(addresses));
     while (link.events(false) != POLLIN) {
       EXPECT_TRUE(link.advance());
       pollfd ready{link.fd(), link.events(false), 0};

@@ -158,7 +158,7 @@ TEST_F(FoundHostsTest, AreDialedAtOnceWhenTheyHaveNewAddresses) {
   EXPECT_TRUE(log.contains("host 'pc2' (found by mDNS) is not available, retrying"));
   bool waited = false;  // for most of a pause
   EventSource timer = EventSource::timer(loop, [&] { waited = true; });
-  timer.enable_in(PeerConnection::kFoundPause * 9 / 10);
+  timer.enable_in(channel::ConnectPlan::kMaxPause * 9 / 10);
   peers->on_host_found(host_at({at(*one)}));
   wait([&] { return waited || host().state() == local::Host::UP; });
   EXPECT_EQ(host().state(), local::Host::UP);

@@ -178,7 +178,7 @@ TEST_F(DialerTest, LetsItsAddressesShareTheTimeOfARound) {
   dial_in_turn({dead, dead, dead, wire::resolve_number(owner.address()).at(0)}, options);
   bool timed_out = false;
   EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
-  timer.enable_in(Dialer::kConnectTimeout);  // what one address would take else
+  timer.enable_in(channel::ConnectPlan::kConnectTimeout);  // what one address would take else
   wait([&] { return up || timed_out; });
   EXPECT_TRUE(up);
   EXPECT_TRUE(downs.empty());
@@ -191,7 +191,7 @@ TEST_F(DialerTest, LeavesAnAddressThatDoesNotAnswerForNewOnesAtOnce) {
   event_base_loop(loop.base(), EVLOOP_ONCE);  // it begins to connect
   bool timed_out = false;
   EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
-  timer.enable_in(Dialer::kConnectTimeout);  // what it would wait else
+  timer.enable_in(channel::ConnectPlan::kConnectTimeout);  // what it would wait else
   dialer->set_addresses({owner.address()});
   wait([&] { return up || timed_out; });
   EXPECT_TRUE(up);
@@ -337,7 +337,7 @@ TEST_F(DialerTest, PausesLongerAfterEachFailureAndNotWhenHurried) {
   dial(server.address());
   const MonoTime begin = loop.now();
   wait([this] { return downs.size() == 5; });
-  const Duration pauses = Dialer::kFirstPause * (1 + 2 + 4 + 8);
+  const Duration pauses = channel::ConnectPlan::kFirstPause * (1 + 2 + 4 + 8);
   EXPECT_GE(loop.now() - begin, pauses);
   const int before = server.connections();
   const auto look_around = [&] {

@@ -231,7 +231,7 @@ TEST_P(SamplePumpOfEachKind, TakesNonsenseInTheRingForNothing) {
   EXPECT_EQ(rig.run(), PumpWait::sample);
   rig.ring.mapping->header().top.store(-5);
   EXPECT_EQ(rig.run(), PumpWait::sample);
-  rig.ring.mapping->header().top.store(kLastTid);
+  rig.ring.mapping->header().top.store(channel::kMaxTid);
   rig.run();  // whatever it says: no fault, and an end
   rig.ring.mapping->header().first.store(INT64_MAX);
   rig.run();

@@ -447,7 +447,7 @@ TEST_F(RemoteWritersTest, DoesNotBelieveNonsenseInARingThatProgramsWriteTo) {
   program.write(0);
   until_published(0);
   const auto mapping = stream->map_for_writing().value();
-  for (const Tid nonsense : {Tid{INT64_MAX}, Tid{INT64_MIN}, kLastTid + 1}) {
+  for (const Tid nonsense : {Tid{INT64_MAX}, Tid{INT64_MIN}, channel::kMaxTid + 1}) {
     mapping->header().first.store(nonsense);
     owner->cut();
     serve(0);

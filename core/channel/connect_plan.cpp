@@ -1,0 +1,44 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/channel/connect_plan.hpp"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+#include <utility>
+
+namespace dssm::channel {
+
+void ConnectPlan::begin_round(std::vector<wire::SocketAddress> addresses) {
+  addresses_ = std::move(addresses);
+  const auto avoided = std::find_if(
+      addresses_.begin(), addresses_.end(),
+      [this](const wire::SocketAddress& address) { return address.str() == avoided_; });
+  if (avoided != addresses_.end()) std::rotate(addresses_.begin(), avoided + 1, addresses_.end());
+  current_ = 0;
+}
+
+Duration ConnectPlan::connect_timeout() const noexcept {
+  return std::min(kConnectTimeout, round_time_ / static_cast<std::int64_t>(addresses_.size()));
+}
+
+std::string ConnectPlan::no_answer_text() const {
+  return fmt::format(
+      "connect to '{}': no answer; is that PC on, and do both reach each other (`ping`)?",
+      address().str());
+}
+
+bool ConnectPlan::next_address() noexcept {
+  if (current_ + 1 == addresses_.size()) return false;
+  ++current_;
+  return true;
+}
+
+Duration ConnectPlan::end_round(MonoTime now, bool avoid_address) {
+  avoided_ = avoid_address ? address().str() : std::string();
+  // One that greets and then refuses is not connected to a hundred times a second.
+  const auto up_since = std::exchange(up_since_, std::nullopt);
+  if (up_since && now - *up_since >= kUsefulTime) pause_ = kFirstPause;
+  return std::exchange(pause_, std::min(2 * pause_, kMaxPause));
+}
+
+}  // namespace dssm::channel

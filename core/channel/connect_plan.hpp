@@ -1,0 +1,66 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Where and when to connect, for both users of the network protocol's client end: dssmd (Dialer)
+// and PConnector (NetworkConnection). It opens no socket and reads no clock: its user reports what
+// happened and asks what is next.
+//
+//   round   tries all addresses, in turn, until one connects. When the other side did not greet, or
+//           the connection was given up, the next round begins with the address after it
+//   pause   between rounds, from kFirstPause on, doubled each time, up to kMaxPause. It starts again
+//           with kFirstPause after a connection that was useful
+#pragma once
+
+#include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <optional>
+#include <string>
+#include <vector>
+
+#include "core/wire/address.hpp"
+
+namespace dssm::channel {
+
+// A value; one thread.
+class ConnectPlan {
+ public:
+  static constexpr Duration kFirstPause = std::chrono::milliseconds(10);
+  static constexpr Duration kMaxPause = std::chrono::seconds(1);
+  // For one address: longer than the kernel takes to repeat a lost first packet (1 s).
+  static constexpr Duration kConnectTimeout = std::chrono::seconds(2);
+  // A connection that was up for so long was useful.
+  static constexpr Duration kUsefulTime = std::chrono::seconds(2);
+
+  // The addresses of a round share `round_time`; none gets more than kConnectTimeout.
+  explicit ConnectPlan(Duration round_time = Duration::max()) noexcept : round_time_(round_time) {}
+
+  // Begins a round with address(). `addresses`: best first, at least one.
+  void begin_round(std::vector<wire::SocketAddress> addresses);
+  // What is tried now, or connected to; only after begin_round().
+  const wire::SocketAddress& address() const noexcept { return addresses_[current_]; }
+  // How long it may take to connect to it.
+  Duration connect_timeout() const noexcept;
+  // Why it failed when that time is over.
+  std::string no_answer_text() const;
+  // Connecting to address() failed. Whether there is a next one, which is address() now.
+  bool next_address() noexcept;
+
+  // The greeting is done.
+  void on_up(MonoTime now) noexcept { up_since_ = now; }
+  // The other side did what it was connected for.
+  void mark_useful() noexcept { pause_ = kFirstPause; }
+  // The round failed, or the connection ended. avoid_address: address() is tried last in the next
+  // round. Returns the pause until that one.
+  Duration end_round(MonoTime now, bool avoid_address);
+  // The next pause is kFirstPause.
+  void restart_pauses() noexcept { pause_ = kFirstPause; }
+
+ private:
+  Duration round_time_;
+  std::vector<wire::SocketAddress> addresses_;
+  std::size_t current_ = 0;
+  std::string avoided_;  // the address to try last; empty: none
+  std::optional<MonoTime> up_since_;
+  Duration pause_ = kFirstPause;  // the next one
+};
+
+}  // namespace dssm::channel

@@ -1,0 +1,92 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "core/channel/connect_plan.hpp"
+
+#include <gtest/gtest.h>
+
+namespace dssm::channel {
+namespace {
+
+using namespace std::chrono_literals;
+
+std::vector<wire::SocketAddress> addresses(int count) {
+  std::vector<wire::SocketAddress> made;
+  for (int i = 1; i <= count; ++i) {
+    const std::string text = "10.0.0." + std::to_string(i);
+    made.push_back(wire::resolve_number(wire::Address::parse(text).value()).at(0));
+  }
+  return made;
+}
+
+std::string last_byte(const ConnectPlan& plan) {
+  const std::string text = plan.address().str();
+  return text.substr(text.rfind('.') + 1, 1);
+}
+
+// The order in which a round tries its addresses: "123".
+std::string round(ConnectPlan& plan, int count) {
+  plan.begin_round(addresses(count));
+  std::string order = last_byte(plan);
+  while (plan.next_address()) order += last_byte(plan);
+  return order;
+}
+
+TEST(ConnectPlan, TriesTheAddressesInTurn) {
+  ConnectPlan plan;
+  EXPECT_EQ(round(plan, 3), "123");
+  plan.end_round(MonoTime(), false);
+  EXPECT_EQ(round(plan, 3), "123");
+}
+
+TEST(ConnectPlan, BeginsAfterAnAddressThatIsToBeAvoidedOnce) {
+  ConnectPlan plan;
+  plan.begin_round(addresses(3));
+  ASSERT_TRUE(plan.next_address());
+  plan.end_round(MonoTime(), true);
+  EXPECT_EQ(round(plan, 3), "312");
+  plan.end_round(MonoTime(), false);
+  EXPECT_EQ(round(plan, 3), "123");
+}
+
+TEST(ConnectPlan, PausesTwiceAsLongAfterEachFailureUpToALimit) {
+  ConnectPlan plan;
+  plan.begin_round(addresses(1));
+  for (Duration pause = ConnectPlan::kFirstPause; pause < ConnectPlan::kMaxPause; pause *= 2) {
+    EXPECT_EQ(plan.end_round(MonoTime(), false), pause);
+  }
+  EXPECT_EQ(plan.end_round(MonoTime(), false), ConnectPlan::kMaxPause);
+  EXPECT_EQ(plan.end_round(MonoTime(), false), ConnectPlan::kMaxPause);
+  plan.restart_pauses();
+  EXPECT_EQ(plan.end_round(MonoTime(), false), ConnectPlan::kFirstPause);
+}
+
+TEST(ConnectPlan, PausesShortlyOnlyAfterAConnectionThatWasUseful) {
+  ConnectPlan plan;
+  plan.begin_round(addresses(1));
+  MonoTime now(100s);
+  const auto connect_for = [&](Duration time) {
+    plan.on_up(now);
+    now += time;
+    return plan.end_round(now, false);
+  };
+  EXPECT_EQ(connect_for(1ms), ConnectPlan::kFirstPause);
+  EXPECT_EQ(connect_for(1ms), 2 * ConnectPlan::kFirstPause) << "it greets and then refuses";
+  EXPECT_EQ(connect_for(ConnectPlan::kUsefulTime), ConnectPlan::kFirstPause);
+  EXPECT_EQ(connect_for(1ms), 2 * ConnectPlan::kFirstPause);
+  now += 1h;
+  EXPECT_EQ(plan.end_round(now, false), 4 * ConnectPlan::kFirstPause) << "it was not up";
+  plan.on_up(now);
+  plan.mark_useful();
+  EXPECT_EQ(plan.end_round(now, false), ConnectPlan::kFirstPause);
+}
+
+TEST(ConnectPlan, LetsTheAddressesShareTheTimeOfARound) {
+  ConnectPlan plan(2s);
+  plan.begin_round(addresses(4));
+  EXPECT_EQ(plan.connect_timeout(), 500ms);
+  ConnectPlan patient;
+  patient.begin_round(addresses(4));
+  EXPECT_EQ(patient.connect_timeout(), ConnectPlan::kConnectTimeout);
+}
+
+}  // namespace
+}  // namespace dssm::channel
