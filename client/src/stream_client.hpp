@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The client end of one remote stream, in a program: a connection to the dssmd that owns the
-// stream, kept up by the calls that use it. A PConnector is a handle of it. The protocol's steps are
-// ChannelClient's; here are the calls that wait for them, the requests, and who needs which bytes.
+// stream, kept up by the calls that use it. A PConnector is a handle of it. The protocol's steps
+// are ChannelClient's; here are the calls that wait for them, the requests, and who needs which
+// bytes.
 //
 // A connection is set up by the greeting, Open or Create, and then what was in progress when the
 // last one ended: Subscribe from the next sample, StartPublishing and all samples that are not

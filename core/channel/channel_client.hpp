@@ -60,7 +60,8 @@ class ChannelClient {
     virtual void send(const net::Frame& frame) = 0;
     // The stream is open; `stream` is checked, and has the name that was asked for.
     virtual Result<void> on_opened(StreamInfo stream, bool created) = 0;
-    // Samples come from now on, beginning with `first`, for SampleCursor::on_subscribed_untrusted().
+    // Samples come from now on, beginning with `first`, for
+    // SampleCursor::on_subscribed_untrusted().
     virtual Result<void> on_subscribed_untrusted(Tid /*first*/) { return {}; }
     // All samples that the owner had when it was asked have come.
     virtual Result<void> on_caught_up() { return {}; }

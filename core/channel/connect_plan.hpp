@@ -6,8 +6,8 @@
 //
 //   round   tries all addresses, in turn, until one connects. When the other side did not greet, or
 //           the connection was given up, the next round begins with the address after it
-//   pause   between rounds, from kFirstPause on, doubled each time, up to kMaxPause. It starts again
-//           with kFirstPause after a connection that was useful
+//   pause   between rounds, from kFirstPause on, doubled each time, up to kMaxPause. It starts
+//           again with kFirstPause after a connection that was useful
 #pragma once
 
 #include <dssm/result.hpp>

@@ -47,8 +47,8 @@ class RingReader {
     return assessment;
   }
 
-  // Whether clock().is_good() decides which samples reads by time return. Loads the policy alone: to
-  // copy the whole assessment for each read made reads of mirrors a tenth slower.
+  // Whether clock().is_good() decides which samples reads by time return. Loads the policy alone:
+  // to copy the whole assessment for each read made reads of mirrors a tenth slower.
   bool enforces_clock() const noexcept {
     if (!header_->clock.is_set()) return false;
     ClockAssessment assessment = ClockAssessment::unknown_clock(ClockPolicy::enforce);

@@ -11,10 +11,10 @@
 //             for its readers, and the mirror always retries
 //   end       when no program has used the ring for mirror_linger
 //
-// The states are those of ChannelClient, which subscribes: `live` when the history is here. A program
-// gets the ring at once while the channel is closed, being opened or live, if there is a ring; while
-// it subscribes and is filled, and after the catalog or the owner said that the stream was removed,
-// its open() waits.
+// The states are those of ChannelClient, which subscribes: `live` when the history is here. A
+// program gets the ring at once while the channel is closed, being opened or live, if there is a
+// ring; while it subscribes and is filled, and after the catalog or the owner said that the stream
+// was removed, its open() waits.
 #pragma once
 
 #include <cstdint>

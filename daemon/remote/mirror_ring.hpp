@@ -41,8 +41,8 @@ class MirrorRing {
 
   const std::shared_ptr<Stream>& stream() const noexcept { return stream_; }
 
-  // The request for the samples that follow on what is here; all, if the owner never sent where this
-  // ring begins.
+  // The request for the samples that follow on what is here; all, if the owner never sent where
+  // this ring begins.
   void resume(net::Subscribe& out) const { cursor_.resume(stream_->incarnation(), out); }
 
   // As in SampleCursor.
