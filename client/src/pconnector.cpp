@@ -111,7 +111,8 @@ Result<PConnector> PConnector::create(const StreamId& id, const TypeInfo& type,
   if (Result<void> checked = type.check(); !checked) {
     return std::move(checked).error().context(what);
   }
-  auto client = detail::StreamClient::open({id, channel::CreatePlan{type, history}}, std::move(options));
+  auto client =
+      detail::StreamClient::open({id, channel::CreatePlan{type, history}}, std::move(options));
   if (!client) return std::move(client).error().context(what);
   return PConnector(std::make_unique<detail::PConnectorState>(std::move(*client)));
 }

@@ -28,8 +28,7 @@
 namespace dssm::detail {
 
 // A resource with one owner; one thread at a time.
-class StreamClient final : private wire::FrameDelegate,
-                           private channel::ChannelClient::Delegate {
+class StreamClient final : private wire::FrameDelegate, private channel::ChannelClient::Delegate {
  public:
   // Which stream; with a plan, it is created if it does not exist.
   struct Goal {
@@ -151,8 +150,8 @@ class StreamClient final : private wire::FrameDelegate,
   };
   struct Publishing {
     std::uint64_t publisher = 0;  // random id
-    bool started = false;  // by the program
-    bool allowed = false;  // samples may be sent on this connection
+    bool started = false;         // by the program
+    bool allowed = false;         // samples may be sent on this connection
     unsigned posts_since_receive = 0;
   };
 

@@ -58,8 +58,8 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const 
 PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const wire::HostId& id,
                                const std::vector<wire::Address>& addresses,
                                const wire::Greeting& self, Observer& observer)
-    : PeerConnection(loop, resolver, id,
-                     {addresses, self, kMaxOutputBytes, kFoundRoundTime}, observer) {}
+    : PeerConnection(loop, resolver, id, {addresses, self, kMaxOutputBytes, kFoundRoundTime},
+                     observer) {}
 
 void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) {
   configured_ = addresses.front();

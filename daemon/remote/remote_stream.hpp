@@ -137,8 +137,7 @@ class UseCount {
   std::shared_ptr<State> state_;
 };
 
-class RemoteStream : private OwnerConnection::Observer,
-                     protected channel::ChannelClient::Delegate {
+class RemoteStream : private OwnerConnection::Observer, protected channel::ChannelClient::Delegate {
  public:
   // How long a program's open() waits for the owner to answer.
   static constexpr Duration kOwnerTimeout = std::chrono::seconds(2);

@@ -23,9 +23,7 @@ struct SubscriberTest : testing::Test {
     subscriber.begin(what);
     subscribed(what.start == Subscription::Start::tid ? what.tid : 0);
   }
-  void subscribed(Tid first) {
-    ASSERT_TRUE(subscriber.on_subscribed_untrusted(first));
-  }
+  void subscribed(Tid first) { ASSERT_TRUE(subscriber.on_subscribed_untrusted(first)); }
   void gap(Tid first, std::uint64_t count) {
     ASSERT_TRUE(subscriber.on_gap_untrusted(first, count));
   }
