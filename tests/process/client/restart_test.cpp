@@ -14,6 +14,7 @@
 
 #include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/samples.hpp"
 #include "tests/support/session.hpp"
 
 namespace dssm {
@@ -22,51 +23,22 @@ namespace {
 using namespace std::chrono_literals;
 using test::await;
 using test::DaemonProcess;
-
-struct Counted {
-  std::int64_t number;
-  std::int64_t again[15];  // the same, to show tearing
-};
-DSSM_DESCRIBE(Counted, number, again)
-
-Counted counted(std::int64_t number) {
-  Counted sample{number, {}};
-  for (auto& word : sample.again) word = number;
-  return sample;
-}
+using test::Numbered;
+using test::numbered;
+using test::ReaderThread;
+using test::WriterThread;
 
 TEST(Restart, LosesNoSampleWhenTheDaemonIsKilledUnderLoad) {
   DaemonProcess daemon;
-  std::atomic<bool> done = false;
-  std::atomic<std::int64_t> written = 0;
   Session writing = connect(daemon), reading = connect(daemon);
-  Writer<Counted> writer = writing.create<Counted>("load", History{1 << 16, 1ms}).value();
-  Reader<Counted> reader = reading.open_reader<Counted>("load").value();
+  Writer<Numbered> writer = writing.create<Numbered>("load", History{1 << 16, 1ms}).value();
+  Reader<Numbered> reader = reading.open_reader<Numbered>("load").value();
   const std::uint64_t incarnation = writer.incarnation();
-  reader.seek(kNoTid);
-  std::thread write([&] {
-    while (!done) {
-      ASSERT_EQ(writer.write(counted(written.load())), written.load());
-      ++written;
-      std::this_thread::sleep_for(200us);  // the load's rate, not a wait for anything
-    }
-  });
-  std::thread read([&] {
-    Counted sample{};
-    SampleInfo info;
-    for (std::int64_t expected = 0; !done || expected < written.load();) {
-      if (reader.wait(deadline_in(100ms)) != WaitStatus::ready) continue;
-      ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok);
-      ASSERT_EQ(info.tid, expected);
-      ASSERT_EQ(sample.number, expected);
-      for (const std::int64_t word : sample.again) ASSERT_EQ(word, expected);
-      ++expected;
-    }
-  });
+  WriterThread writer_thread(writer);
+  const ReaderThread reader_thread(reader);
   for (int round = 0; round < 5; ++round) {
-    const std::int64_t before = written.load();
     daemon.kill_hard();
-    await([&] { return written.load() >= before + 100; });  // it goes on without
+    writer_thread.await_more(100);  // without dssmd
     daemon.start();
     // Both sessions are back with what they hold, under the same ring.
     const StreamInfo info = [&] {
@@ -77,16 +49,14 @@ TEST(Restart, LosesNoSampleWhenTheDaemonIsKilledUnderLoad) {
       }
     }();
     EXPECT_EQ(info.incarnation, incarnation);
-    EXPECT_EQ(info.type, type_of<Counted>()) << "the description came back as well";
+    EXPECT_EQ(info.type, type_of<Numbered>()) << "the description came back as well";
     EXPECT_EQ(info.creator_pid, ::getpid());
   }
   // New readers and writers join the old ring.
   Session later = connect(daemon);
-  EXPECT_EQ(later.open_reader<Counted>("load").value().incarnation(), incarnation);
-  EXPECT_EQ(later.create<Counted>("load", History{16, 1ms}).value().incarnation(), incarnation);
-  done = true;
-  write.join();
-  read.join();
+  EXPECT_EQ(later.open_reader<Numbered>("load").value().incarnation(), incarnation);
+  EXPECT_EQ(later.create<Numbered>("load", History{16, 1ms}).value().incarnation(), incarnation);
+  reader_thread.await_taken(writer_thread.stop());
   EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
@@ -94,17 +64,17 @@ TEST(Restart, BringsBackAStreamThatOnlyReadersHold) {
   DaemonProcess daemon;
   Session session = connect(daemon);
   {
-    Writer<Counted> writer = session.create<Counted>("kept", History{16, 1ms}).value();
-    writer.write(counted(0));
+    Writer<Numbered> writer = session.create<Numbered>("kept", History{16, 1ms}).value();
+    writer.write(numbered(0));
     ASSERT_TRUE(writer.set_property(std::vector<std::byte>(1000, std::byte{7})));
   }
   // Opened before the writer is closed in dssmd's order of requests, so it is there to be kept.
-  Reader<Counted> reader = session.open_reader<Counted>("kept").value();
+  Reader<Numbered> reader = session.open_reader<Numbered>("kept").value();
   daemon.kill_hard();
   daemon.start();
-  auto writer = session.open_writer<Counted>("kept");
+  auto writer = session.open_writer<Numbered>("kept");
   ASSERT_TRUE(writer) << writer.error().message;
-  EXPECT_EQ(writer->write(counted(1)), 1);
+  EXPECT_EQ(writer->write(numbered(1)), 1);
   EXPECT_EQ(reader.newest_tid(), 1);
   EXPECT_EQ(session.property({"kept", 0, ""}).value(), std::vector<std::byte>(1000, std::byte{7}));
 }
@@ -113,12 +83,12 @@ TEST(Restart, BringsBackAStreamThatOnlyReadersHold) {
 TEST(Restart, DoesNotLetAnEagerWriterReplaceAHeldRing) {
   DaemonProcess daemon(test::kPatientRecovery);
   Session holding = connect(daemon);
-  Writer<Counted> writer = holding.create<Counted>("held", History{16, 1ms}).value();
+  Writer<Numbered> writer = holding.create<Numbered>("held", History{16, 1ms}).value();
   for (int round = 0; round < 5; ++round) {
     daemon.kill_hard();
     daemon.start();
     Session eager = connect(daemon);  // usually there before the holder is back
-    auto again = eager.create<Counted>("held", History{16, 1ms});
+    auto again = eager.create<Numbered>("held", History{16, 1ms});
     ASSERT_TRUE(again) << again.error().message;
     EXPECT_EQ(again->incarnation(), writer.incarnation());
   }
@@ -127,7 +97,7 @@ TEST(Restart, DoesNotLetAnEagerWriterReplaceAHeldRing) {
 TEST(Restart, ForgetsStreamsThatNobodyHolds) {
   DaemonProcess daemon;
   Session session = connect(daemon);
-  session.create<Counted>("gone", History{16, 1ms}).value();
+  session.create<Numbered>("gone", History{16, 1ms}).value();
   ASSERT_EQ(session.list_streams().value().size(), 1u);
   daemon.kill_hard();
   daemon.start();
@@ -158,8 +128,8 @@ TEST(Restart, TellsWatchersWhatIsGone) {
     changed.notify_all();
   });
   ASSERT_TRUE(watch);
-  auto kept = session.create<Counted>("kept", History{16, 1ms}).value();
-  other.create<Counted>("gone", History{16, 1ms}).value();
+  auto kept = session.create<Numbered>("kept", History{16, 1ms}).value();
+  other.create<Numbered>("gone", History{16, 1ms}).value();
   std::unique_lock lock(mutex);
   changed.wait(lock, [&] { return seen.size() == 2; });
   lock.unlock();
@@ -169,7 +139,7 @@ TEST(Restart, TellsWatchersWhatIsGone) {
   changed.wait(lock, [&] { return seen.size() >= 3; });
   lock.unlock();
   // Nothing else was said: the next thing is the next thing that happens.
-  other.create<Counted>("marker", History{16, 1ms}).value();
+  other.create<Numbered>("marker", History{16, 1ms}).value();
   lock.lock();
   changed.wait(lock, [&] { return seen.back() == "+marker"; });
   EXPECT_EQ(seen, (std::vector<std::string>{"+kept", "+gone", "-gone", "+marker"}));
@@ -178,7 +148,7 @@ TEST(Restart, TellsWatchersWhatIsGone) {
 TEST(Restart, FailsRequestsInWordsWhileTheDaemonIsAway) {
   DaemonProcess daemon;
   Session session = connect(daemon);
-  Writer<Counted> writer = session.create<Counted>("s", History{16, 1ms}).value();
+  Writer<Numbered> writer = session.create<Numbered>("s", History{16, 1ms}).value();
   std::optional<Session> impatient;
   await([&] {  // a busy dssmd may be late with its greeting
     auto connected =
@@ -191,7 +161,7 @@ TEST(Restart, FailsRequestsInWordsWhileTheDaemonIsAway) {
   ASSERT_FALSE(list);
   EXPECT_EQ(list.error().code, Errc::unavailable);
   EXPECT_NE(list.error().message.find("list the streams"), std::string::npos);
-  EXPECT_EQ(writer.write(counted(0)), 0) << "writing needs no daemon";
+  EXPECT_EQ(writer.write(numbered(0)), 0) << "writing needs no daemon";
 }
 
 // Clients die at any moment; a second later dssmd has nothing left of them.

@@ -14,16 +14,16 @@ namespace dssm::test {
 namespace {
 
 TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonIsKilledUnderLoad) {
-  auto writer = here.create<Counted>("load", kLong).value();
-  auto reader = open_filled<Counted>(there, "load");
-  Reading reading(reader);
+  auto writer = here.create<Numbered>("load", kLong).value();
+  auto reader = open_filled<Numbered>(there, "load");
+  ReaderThread reading(reader);
   std::int64_t written = 0;
   {
-    Writing writing(writer);
+    WriterThread writing(writer);
     for (int round = 0; round < 5; ++round) {
-      writing.more(100);
+      writing.await_more(100);
       pc1.kill_hard();
-      writing.more(100);  // the writer goes on without a dssmd
+      writing.await_more(100);  // the writer goes on without a dssmd
       pc1.start();
       reading.await_taken(writing.written());
     }
@@ -37,18 +37,18 @@ TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonIsKilledUnderLoad) {
 }
 
 TEST_F(TwoHosts, LoseNothingWhenTheMirrorsDaemonIsKilledUnderLoad) {
-  auto writer = here.create<Counted>("load", kLong).value();
-  auto reader = open_filled<Counted>(there, "load");
+  auto writer = here.create<Numbered>("load", kLong).value();
+  auto reader = open_filled<Numbered>(there, "load");
   Session another = connect(pc2);
-  auto second = open_filled<Counted>(another, "load");
-  Reading reading(reader), reading_too(second);
+  auto second = open_filled<Numbered>(another, "load");
+  ReaderThread reading(reader), reading_too(second);
   std::int64_t written = 0;
   {
-    Writing writing(writer);
+    WriterThread writing(writer);
     for (int round = 0; round < 5; ++round) {
-      writing.more(100);
+      writing.await_more(100);
       pc2.kill_hard();
-      writing.more(100);
+      writing.await_more(100);
       pc2.start();
       reading.await_taken(writing.written());
     }
@@ -59,16 +59,16 @@ TEST_F(TwoHosts, LoseNothingWhenTheMirrorsDaemonIsKilledUnderLoad) {
   EXPECT_EQ(reader.lost_samples() + second.lost_samples(), 0u);
   EXPECT_EQ(reader.restarts() + second.restarts(), 0u);
   // One mirror serves them both, and new ones.
-  auto later = open_filled<Counted>(there, "load");
+  auto later = open_filled<Numbered>(there, "load");
   EXPECT_EQ(later.incarnation(), writer.incarnation());
   EXPECT_EQ(channels("load"), 1u);
 }
 
 TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonHangs) {
-  auto writer = here.create<Counted>("load", kLong).value();
-  auto reader = open_filled<Counted>(there, "load");
-  Reading reading(reader);
-  Writing writing(writer);
+  auto writer = here.create<Numbered>("load", kLong).value();
+  auto reader = open_filled<Numbered>(there, "load");
+  ReaderThread reading(reader);
+  WriterThread writing(writer);
   reading.await_taken(100);
   ::kill(pc1.pid(), SIGSTOP);
   // For long enough that its silence counts as death.
@@ -84,14 +84,14 @@ TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonHangs) {
 }
 
 TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsAway) {
-  auto writer = here.create<Counted>("kept", kLong).value();
-  for (int i = 0; i < 100; ++i) writer.write(counted(i));
-  auto reader = open_filled<Counted>(there, "kept");
+  auto writer = here.create<Numbered>("kept", kLong).value();
+  for (int i = 0; i < 100; ++i) writer.write(numbered(i));
+  auto reader = open_filled<Numbered>(there, "kept");
   pc1.kill_hard();
   await([&] { return mirror("kept").state == MirrorState::owner_unavailable; });
-  auto joined = there.open_reader<Counted>("kept@pc1");
+  auto joined = there.open_reader<Numbered>("kept@pc1");
   ASSERT_TRUE(joined) << joined.error().message;
-  Counted sample{};
+  Numbered sample{};
   SampleInfo info;
   for (Tid tid = 0; tid < 100; ++tid) {
     ASSERT_EQ(joined->read_tid(tid, sample, info), ReadStatus::ok);
@@ -100,19 +100,19 @@ TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsAway) {
 }
 
 TEST_F(TwoHosts, CountExactlyWhatTheOwnersRingLostMeanwhile) {
-  auto writer = here.create<Counted>("short", History{64, 1ms}).value();
-  auto reader = open_filled<Counted>(there, "short");
+  auto writer = here.create<Numbered>("short", History{64, 1ms}).value();
+  auto reader = open_filled<Numbered>(there, "short");
   reader.seek(kNoTid);
-  Counted sample{};
+  Numbered sample{};
   SampleInfo info;
-  for (int i = 0; i < 10; ++i) writer.write(counted(i));
+  for (int i = 0; i < 10; ++i) writer.write(numbered(i));
   for (int i = 0; i < 10; ++i) {
     ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
     ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok);
   }
   pc1.kill_hard();
   await([&] { return mirror("short").state == MirrorState::owner_unavailable; });
-  for (int i = 10; i < 1000; ++i) writer.write(counted(i));
+  for (int i = 10; i < 1000; ++i) writer.write(numbered(i));
   const Tid oldest = 1000 - 63;
   pc1.start();
   for (Tid tid = oldest; tid < 1000; ++tid) {
@@ -130,9 +130,9 @@ TEST_F(TwoHosts, CountExactlyWhatTheOwnersRingLostMeanwhile) {
 TEST_F(TwoHosts, TellReadersThatTheOwnerCameBackWithoutItsRing) {
   auto reader = [&] {
     Session brief = connect(pc1);
-    auto writer = brief.create<Counted>("reborn", kLong).value();
-    for (int i = 0; i < 10; ++i) writer.write(counted(i));
-    auto opened = open_filled<Counted>(there, "reborn");
+    auto writer = brief.create<Numbered>("reborn", kLong).value();
+    for (int i = 0; i < 10; ++i) writer.write(numbered(i));
+    auto opened = open_filled<Numbered>(there, "reborn");
     EXPECT_EQ(opened.wait_for_tid(9, kNever), WaitStatus::ready);
     pc1.kill_hard();
     return opened;
@@ -140,9 +140,9 @@ TEST_F(TwoHosts, TellReadersThatTheOwnerCameBackWithoutItsRing) {
   reader.seek(kNoTid);
   pc1.start();
   Session again = connect(pc1);
-  auto writer = again.create<Counted>("reborn", kLong).value();
-  writer.write(counted(100));
-  Counted sample{};
+  auto writer = again.create<Numbered>("reborn", kLong).value();
+  writer.write(numbered(100));
+  Numbered sample{};
   SampleInfo info;
   for (int i = 0; i < 10; ++i) {
     ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok) << "first what the old ring held";
@@ -161,17 +161,17 @@ TEST_F(TwoHosts, TellReadersThatTheOwnerCameBackWithoutItsRing) {
 
 // Both at once: whoever comes back first waits for the other.
 TEST_F(TwoHosts, FindEachOtherAgainWhenBothDaemonsAreKilled) {
-  auto writer = here.create<Counted>("load", kLong).value();
-  auto reader = open_filled<Counted>(there, "load");
-  Reading reading(reader);
-  Writing writing(writer);
+  auto writer = here.create<Numbered>("load", kLong).value();
+  auto reader = open_filled<Numbered>(there, "load");
+  ReaderThread reading(reader);
+  WriterThread writing(writer);
   for (int round = 0; round < 2; ++round) {
-    writing.more(100);
+    writing.await_more(100);
     pc1.kill_hard();
     pc2.kill_hard();
-    writing.more(100);
+    writing.await_more(100);
     (round == 0 ? pc1 : pc2).start();
-    writing.more(100);
+    writing.await_more(100);
     (round == 0 ? pc2 : pc1).start();
     reading.await_taken(writing.written());
   }
@@ -183,7 +183,7 @@ TEST_F(TwoHosts, FindEachOtherAgainWhenBothDaemonsAreKilled) {
 // Somebody opens the stream before the program that holds its mirror has offered that: there is a
 // new mirror then, and the program goes on with it, at the very sample it was.
 TEST_F(TwoHosts, GoOnWithAMirrorThatWasMadeMeanwhile) {
-  auto writer = here.create<Counted>("load", kLong).value();
+  auto writer = here.create<Numbered>("load", kLong).value();
   int lines[2];
   ASSERT_EQ(::pipe2(lines, O_CLOEXEC), 0);
   const pid_t holder = start({built("client/dssmctl/dssmctl"), "echo", "--csv", "load@pc1"},
@@ -196,17 +196,17 @@ TEST_F(TwoHosts, GoOnWithAMirrorThatWasMadeMeanwhile) {
     ASSERT_TRUE(std::fgets(line, sizeof line, out));
     EXPECT_EQ(std::strtoll(line, nullptr, 10), tid) << line;
   };
-  writer.write(counted(0));
+  writer.write(numbered(0));
   expect_line(0);
   ::kill(holder, SIGSTOP);
   pc2.kill_hard();
   pc2.start();
-  writer.write(counted(1));
+  writer.write(numbered(1));
   await_state(there, pc1, HostState::up);
-  auto eager = open_filled<Counted>(there, "load@pc1");
+  auto eager = open_filled<Numbered>(there, "load@pc1");
   ::kill(holder, SIGCONT);
   expect_line(1);
-  writer.write(counted(2));
+  writer.write(numbered(2));
   expect_line(2);
   EXPECT_EQ(channels("load"), 1u);
   ::kill(holder, SIGKILL);
@@ -215,11 +215,11 @@ TEST_F(TwoHosts, GoOnWithAMirrorThatWasMadeMeanwhile) {
 }
 
 TEST_F(TwoHosts, WaitForAHostThatDoesNotAnswer) {
-  auto writer = here.create<Counted>("odometry", kLong).value();
+  auto writer = here.create<Numbered>("odometry", kLong).value();
   await_list(there, {"odometry:0@pc1"});
   ::kill(pc1.pid(), SIGSTOP);
   auto opened = std::async(std::launch::async, [this] {
-    return there.await_reader<Counted>("odometry@pc1", deadline_in(60s));
+    return there.await_reader<Numbered>("odometry@pc1", deadline_in(60s));
   });
   Session another = connect(pc2);  // the other one's questions wait for each other
   await([&] { return peer_at(another, pc1.address()).state == HostState::down; });
@@ -229,10 +229,10 @@ TEST_F(TwoHosts, WaitForAHostThatDoesNotAnswer) {
 }
 
 TEST_F(TwoHosts, SayThatAHostDoesNotAnswer) {
-  auto writer = here.create<Counted>("odometry", kLong).value();
+  auto writer = here.create<Numbered>("odometry", kLong).value();
   await_list(there, {"odometry:0@pc1"});
   ::kill(pc1.pid(), SIGSTOP);
-  const auto reader = there.open_reader<Counted>("odometry");
+  const auto reader = there.open_reader<Numbered>("odometry");
   ::kill(pc1.pid(), SIGCONT);
   ASSERT_FALSE(reader);
   EXPECT_EQ(reader.error().code, Errc::unavailable);

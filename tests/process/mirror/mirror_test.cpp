@@ -11,18 +11,18 @@ namespace dssm::test {
 namespace {
 
 TEST_F(TwoHosts, ReadTheHistoryFromBeforeTheReaderCame) {
-  auto writer = here.create<Counted>("odometry", History{1024, 1ms}).value();
-  for (int i = 0; i < 3000; ++i) writer.write(counted(i), time_from_ns(1000 * i), Duration(i));
-  auto reader = open_filled<Counted>(there, "odometry");
+  auto writer = here.create<Numbered>("odometry", History{1024, 1ms}).value();
+  for (int i = 0; i < 3000; ++i) writer.write(numbered(i), time_from_ns(1000 * i), Duration(i));
+  auto reader = open_filled<Numbered>(there, "odometry");
   EXPECT_EQ(reader.id(), (StreamId{"odometry", 0, "pc1"}));
-  EXPECT_EQ(reader.type(), type_of<Counted>()) << "with all its fields";
+  EXPECT_EQ(reader.type(), type_of<Numbered>()) << "with all its fields";
   EXPECT_EQ(reader.depth(), 1024u);
   EXPECT_EQ(reader.cycle(), 1ms);
   EXPECT_EQ(reader.incarnation(), writer.incarnation());
   EXPECT_EQ(reader.newest_tid(), 2999);
-  EXPECT_EQ(reader.oldest_tid(), here.open_reader<Counted>("odometry").value().oldest_tid());
+  EXPECT_EQ(reader.oldest_tid(), here.open_reader<Numbered>("odometry").value().oldest_tid());
   for (Tid tid = reader.oldest_tid(); tid <= reader.newest_tid(); ++tid) {
-    Counted sample{};
+    Numbered sample{};
     SampleInfo info;
     ASSERT_EQ(reader.read_tid(tid, sample, info), ReadStatus::ok);
     EXPECT_EQ(sample.number, tid);
@@ -39,19 +39,19 @@ TEST_F(TwoHosts, AnswerReadsByTimeAsTheOwnerDoes) {
   const auto seed = std::random_device()();
   SCOPED_TRACE("seed " + std::to_string(seed));
   std::mt19937_64 random(seed);
-  auto writer = here.create<Counted>("jumpy", History{500, 1ms}).value();
-  auto owned = here.open_reader<Counted>("jumpy").value();
-  auto mirrored = open_filled<Counted>(there, "jumpy");
+  auto writer = here.create<Numbered>("jumpy", History{500, 1ms}).value();
+  auto owned = here.open_reader<Numbered>("jumpy").value();
+  auto mirrored = open_filled<Numbered>(there, "jumpy");
   std::int64_t time = 1'000'000;
   for (int i = 0; i < 5000; ++i) {
     time += random() % 50 == 0 ? -static_cast<std::int64_t>(random() % 5000)
                                : static_cast<std::int64_t>(random() % 20);
-    writer.write(counted(i), time_from_ns(time));
+    writer.write(numbered(i), time_from_ns(time));
     if (i % 100 != 99) continue;
     ASSERT_EQ(mirrored.wait_for_tid(i, kNever), WaitStatus::ready);
     for (int reads = 0; reads < 100; ++reads) {
       const Time t = time_from_ns(time - 3000 + static_cast<std::int64_t>(random() % 4000));
-      Counted there_sample{}, here_sample{};
+      Numbered there_sample{}, here_sample{};
       SampleInfo there_info, here_info;
       const ReadStatus status = owned.read_at(t, here_sample, here_info);
       ASSERT_EQ(mirrored.read_at(t, there_sample, there_info), status);
@@ -64,26 +64,26 @@ TEST_F(TwoHosts, AnswerReadsByTimeAsTheOwnerDoes) {
 }
 
 TEST_F(TwoHosts, ShareOneChannelAmongAllReaders) {
-  auto writer = here.create<Counted>("lidar", History{64, 1ms}).value();
+  auto writer = here.create<Numbered>("lidar", History{64, 1ms}).value();
   EXPECT_EQ(channels("lidar"), 0u);
-  auto first = open_filled<Counted>(there, "lidar");
+  auto first = open_filled<Numbered>(there, "lidar");
   Session another = connect(pc2);
-  auto second = open_filled<Counted>(another, "lidar@pc1");
-  auto third = open_filled<Counted>(there, "lidar:0");
+  auto second = open_filled<Numbered>(another, "lidar@pc1");
+  auto third = open_filled<Numbered>(there, "lidar:0");
   EXPECT_EQ(channels("lidar"), 1u);
-  writer.write(counted(0));
-  for (Reader<Counted>* reader : {&first, &second, &third}) {
+  writer.write(numbered(0));
+  for (Reader<Numbered>* reader : {&first, &second, &third}) {
     EXPECT_EQ(reader->wait_for_tid(0, kNever), WaitStatus::ready);
   }
   EXPECT_EQ(channels("lidar"), 1u);
 }
 
 TEST_F(TwoHosts, ReadAnEmptyStreamFromItsFirstSampleOn) {
-  auto writer = here.create<Counted>("later", History{64, 1ms}).value();
-  auto reader = open_filled<Counted>(there, "later");
+  auto writer = here.create<Numbered>("later", History{64, 1ms}).value();
+  auto reader = open_filled<Numbered>(there, "later");
   EXPECT_EQ(reader.newest_tid(), kNoTid);
   EXPECT_EQ(mirror("later").state, MirrorState::live);
-  writer.write(counted(0));
+  writer.write(numbered(0));
   EXPECT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
 }
 
@@ -93,11 +93,11 @@ class LingeringHosts : public TwoHosts {
 };
 
 TEST_F(LingeringHosts, CloseTheChannelAfterTheLastReaderLeft) {
-  auto writer = here.create<Counted>("imu", History{64, 1ms}).value();
+  auto writer = here.create<Numbered>("imu", History{64, 1ms}).value();
   const std::uint64_t memory = there.daemon_info().value().memory_bytes;
   for (int round = 0; round < 3; ++round) {
     {
-      auto reader = open_filled<Counted>(there, "imu");
+      auto reader = open_filled<Numbered>(there, "imu");
       EXPECT_EQ(channels("imu"), 1u);
       EXPECT_GT(there.daemon_info().value().memory_bytes, memory);
     }
@@ -108,8 +108,8 @@ TEST_F(LingeringHosts, CloseTheChannelAfterTheLastReaderLeft) {
 
 // A program that is killed has left as well.
 TEST_F(LingeringHosts, CloseTheChannelOfReadersThatDied) {
-  auto writer = here.create<Counted>("imu", History{64, 1ms}).value();
-  writer.write(counted(0));
+  auto writer = here.create<Numbered>("imu", History{64, 1ms}).value();
+  writer.write(numbered(0));
   const int nowhere = ::open("/dev/null", O_WRONLY | O_CLOEXEC);
   const pid_t reader =
       start({built("client/dssmctl/dssmctl"), "echo", "imu@pc1"}, {pc2.environment()}, nowhere);
@@ -121,9 +121,9 @@ TEST_F(LingeringHosts, CloseTheChannelOfReadersThatDied) {
 }
 
 TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
-  std::optional<Writer<Counted>> writer = here.create<Counted>("anew", History{64, 1ms}).value();
-  for (int i = 0; i < 5; ++i) writer->write(counted(i));
-  auto reader = open_filled<Counted>(there, "anew");
+  std::optional<Writer<Numbered>> writer = here.create<Numbered>("anew", History{64, 1ms}).value();
+  for (int i = 0; i < 5; ++i) writer->write(numbered(i));
+  auto reader = open_filled<Numbered>(there, "anew");
   reader.seek(kNoTid);
   ASSERT_TRUE(here.remove({"anew", 0, ""}));
   // The owner is asked, and says so.
@@ -131,18 +131,18 @@ TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
     const auto info = there.stream_info({"anew", 0, "pc1"});
     return !info && info.error().code == Errc::not_found;
   });
-  const auto none = there.open_reader<Counted>("anew@pc1");
+  const auto none = there.open_reader<Numbered>("anew@pc1");
   ASSERT_FALSE(none);
   EXPECT_EQ(none.error().code, Errc::not_found);
-  Counted sample{};
+  Numbered sample{};
   SampleInfo info;
   for (int i = 0; i < 5; ++i) {
     ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok) << "what it had is still there";
     EXPECT_EQ(sample.number, i);
   }
   EXPECT_EQ(reader.read_next(sample, info), ReadStatus::not_yet);
-  writer = here.create<Counted>("anew", History{64, 1ms}).value();
-  writer->write(counted(100));
+  writer = here.create<Numbered>("anew", History{64, 1ms}).value();
+  writer->write(numbered(100));
   ReadStatus status = ReadStatus::not_yet;
   await([&] { return (status = reader.read_next(sample, info)) != ReadStatus::not_yet; });
   EXPECT_EQ(status, ReadStatus::restarted);
@@ -204,17 +204,17 @@ TEST(TightHosts, SayWhichLimitAMirrorWouldBreak) {
                     "pc2");
   Session here = connect(pc1), there = connect(pc2);
   await_state(there, pc1, HostState::up);
-  auto big = here.create<Counted>("big", History{1 << 16, 1ms}).value();
-  auto small = here.create<Counted>("small", History{16, 1ms}).value();
-  auto more = here.create<Counted>("more", History{16, 1ms}).value();
-  const auto refused = there.open_reader<Counted>("big@pc1");
+  auto big = here.create<Numbered>("big", History{1 << 16, 1ms}).value();
+  auto small = here.create<Numbered>("small", History{16, 1ms}).value();
+  auto more = here.create<Numbered>("more", History{16, 1ms}).value();
+  const auto refused = there.open_reader<Numbered>("big@pc1");
   ASSERT_FALSE(refused);
   EXPECT_EQ(refused.error().code, Errc::limit_exceeded);
   EXPECT_NE(refused.error().message.find("max_memory"), std::string::npos)
       << refused.error().message;
-  auto own = there.create<Counted>("own", History{16, 1ms}).value();
-  auto mirrored = open_filled<Counted>(there, "small@pc1");
-  const auto third = there.open_reader<Counted>("more@pc1");
+  auto own = there.create<Numbered>("own", History{16, 1ms}).value();
+  auto mirrored = open_filled<Numbered>(there, "small@pc1");
+  const auto third = there.open_reader<Numbered>("more@pc1");
   ASSERT_FALSE(third);
   EXPECT_NE(third.error().message.find("max_streams"), std::string::npos) << third.error().message;
 }

@@ -15,16 +15,16 @@ struct RemoteWriter : TwoHosts {
 };
 
 TEST_F(RemoteWriter, CreatesTheStreamAndWritesWithTheOwnersTids) {
-  auto writer = there.create<Counted>("goal@pc1", kLong).value();
+  auto writer = there.create<Numbered>("goal@pc1", kLong).value();
   EXPECT_EQ(writer.id(), (StreamId{"goal", 0, "pc1"}));
-  auto reader = here.open_reader<Counted>("goal").value();
-  EXPECT_EQ(reader.type(), type_of<Counted>());
+  auto reader = here.open_reader<Numbered>("goal").value();
+  EXPECT_EQ(reader.type(), type_of<Numbered>());
   EXPECT_EQ(reader.depth(), kLong.depth);
   EXPECT_EQ(reader.cycle(), kLong.cycle);
   for (int i = 0; i < 10; ++i) {
-    EXPECT_EQ(writer.write(counted(i), time_from_ns(i), Duration(2 * i)), i);
+    EXPECT_EQ(writer.write(numbered(i), time_from_ns(i), Duration(2 * i)), i);
     ASSERT_EQ(reader.wait_for_tid(i, kNever), WaitStatus::ready);
-    Counted sample{};
+    Numbered sample{};
     SampleInfo info;
     ASSERT_EQ(reader.read_tid(i, sample, info), ReadStatus::ok);
     EXPECT_EQ(sample.number, i);
@@ -35,47 +35,47 @@ TEST_F(RemoteWriter, CreatesTheStreamAndWritesWithTheOwnersTids) {
 }
 
 TEST_F(RemoteWriter, GoesOnWithTheTidsOfAStreamThatIsThere) {
-  auto first = here.create<Counted>("goal", kLong).value();
-  for (int i = 0; i < 7; ++i) first.write(counted(i));
-  auto writer = there.open_writer<Counted>("goal@pc1").value();
-  EXPECT_EQ(writer.write(counted(7)), 7);
-  auto joined = there.create<Counted>("goal@pc1", kLong).value();
-  EXPECT_EQ(joined.write(counted(8)), 8) << "all writers of a PC share one ring";
-  auto reader = here.open_reader<Counted>("goal").value();
+  auto first = here.create<Numbered>("goal", kLong).value();
+  for (int i = 0; i < 7; ++i) first.write(numbered(i));
+  auto writer = there.open_writer<Numbered>("goal@pc1").value();
+  EXPECT_EQ(writer.write(numbered(7)), 7);
+  auto joined = there.create<Numbered>("goal@pc1", kLong).value();
+  EXPECT_EQ(joined.write(numbered(8)), 8) << "all writers of a PC share one ring";
+  auto reader = here.open_reader<Numbered>("goal").value();
   ASSERT_EQ(reader.wait_for_tid(8, kNever), WaitStatus::ready);
   EXPECT_EQ(channels("goal"), 1u);
 }
 
 TEST_F(RemoteWriter, IsReadOnItsOwnPcAsOnAnyOther) {
-  auto writer = there.create<Counted>("goal@pc1", kLong).value();
-  auto reader = there.open_reader<Counted>("goal@pc1").value();
-  writer.write(counted(0));
+  auto writer = there.create<Numbered>("goal@pc1", kLong).value();
+  auto reader = there.open_reader<Numbered>("goal@pc1").value();
+  writer.write(numbered(0));
   EXPECT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
 }
 
 TEST_F(RemoteWriter, IsRefusedInWords) {
   auto other = here.create<double>("goal", kLong).value();
-  const auto mismatch = there.create<Counted>("goal@pc1", kLong);
+  const auto mismatch = there.create<Numbered>("goal@pc1", kLong);
   ASSERT_FALSE(mismatch);
   EXPECT_EQ(mismatch.error().code, Errc::type_mismatch);
-  const auto missing = there.open_writer<Counted>("missing@pc1");
+  const auto missing = there.open_writer<Numbered>("missing@pc1");
   ASSERT_FALSE(missing);
   EXPECT_EQ(missing.error().code, Errc::not_found);
-  const auto nowhere = there.create<Counted>("goal@pc9", kLong);
+  const auto nowhere = there.create<Numbered>("goal@pc9", kLong);
   ASSERT_FALSE(nowhere);
   EXPECT_EQ(nowhere.error().code, Errc::not_found);
   EXPECT_EQ(there.daemon_info().value().memory_bytes, 0u);
 }
 
 TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonWasKilled) {
-  auto writer = there.create<Counted>("goal@pc1", kLong).value();
-  auto reader = here.open_reader<Counted>("goal").value();  // keeps the ring
-  Reading reading(reader);
-  Writing writing(writer);
+  auto writer = there.create<Numbered>("goal@pc1", kLong).value();
+  auto reader = here.open_reader<Numbered>("goal").value();  // keeps the ring
+  ReaderThread reading(reader);
+  WriterThread writing(writer);
   for (int round = 0; round < 5; ++round) {
-    writing.more(100);
+    writing.await_more(100);
     pc1.kill_hard();
-    writing.more(100);
+    writing.await_more(100);
     pc1.start();
     reading.await_taken(writing.written());
   }
@@ -87,13 +87,13 @@ TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonWasKilled) {
 // Much more is under way, and written, than was acknowledged.
 TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonIsKilledInTheMidstOfABacklog) {
   constexpr std::int64_t kBacklog = 15'000;
-  auto writer = there.create<Counted>("goal@pc1", kLong).value();
-  auto reader = here.open_reader<Counted>("goal").value();
-  Reading reading(reader);
+  auto writer = there.create<Numbered>("goal@pc1", kLong).value();
+  auto reader = here.open_reader<Numbered>("goal").value();
+  ReaderThread reading(reader);
   std::int64_t written = 0;
   for (int round = 0; round < 5; ++round) {
     ::kill(pc1.pid(), SIGSTOP);
-    for (std::int64_t i = 0; i < kBacklog; ++i) writer.write(counted(written++));
+    for (std::int64_t i = 0; i < kBacklog; ++i) writer.write(numbered(written++));
     const Tid before = reader.newest_tid();
     ::kill(pc1.pid(), SIGCONT);
     await([&] { return reader.newest_tid() > before + 1000 * (round + 1); });
@@ -106,14 +106,14 @@ TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonIsKilledInTheMidstOfABacklog) {
 }
 
 TEST_F(RemoteWriter, CatchesUpWhenItsOwnDaemonWasKilled) {
-  auto writer = there.create<Counted>("goal@pc1", kLong).value();
-  auto reader = here.open_reader<Counted>("goal").value();
-  Reading reading(reader);
-  Writing writing(writer);
+  auto writer = there.create<Numbered>("goal@pc1", kLong).value();
+  auto reader = here.open_reader<Numbered>("goal").value();
+  ReaderThread reading(reader);
+  WriterThread writing(writer);
   for (int round = 0; round < 5; ++round) {
-    writing.more(100);
+    writing.await_more(100);
     pc2.kill_hard();
-    writing.more(100);
+    writing.await_more(100);
     pc2.start();
     reading.await_taken(writing.written());
   }
@@ -123,10 +123,10 @@ TEST_F(RemoteWriter, CatchesUpWhenItsOwnDaemonWasKilled) {
 }
 
 TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonHangs) {
-  auto writer = there.create<Counted>("goal@pc1", kLong).value();
-  auto reader = here.open_reader<Counted>("goal").value();
-  Reading reading(reader);
-  Writing writing(writer);
+  auto writer = there.create<Numbered>("goal@pc1", kLong).value();
+  auto reader = here.open_reader<Numbered>("goal").value();
+  ReaderThread reading(reader);
+  WriterThread writing(writer);
   reading.await_taken(100);
   ::kill(pc1.pid(), SIGSTOP);
   await_state(there, pc1, HostState::down);
@@ -137,15 +137,15 @@ TEST_F(RemoteWriter, CatchesUpWhenTheOwnersDaemonHangs) {
 }
 
 TEST_F(RemoteWriter, CreatesTheStreamAgainWhenTheOwnerLostIt) {
-  auto writer = there.create<Counted>("goal@pc1", kLong).value();
-  writer.write(counted(0));
+  auto writer = there.create<Numbered>("goal@pc1", kLong).value();
+  writer.write(numbered(0));
   await([&] { return here.stream_info({"goal", 0, ""}).value().newest == 0; });
   pc1.kill_hard();
   pc1.start();
-  writer.write(counted(1));
-  Reader<Counted> reader = here.await_reader<Counted>("goal").value();
+  writer.write(numbered(1));
+  Reader<Numbered> reader = here.await_reader<Numbered>("goal").value();
   ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
-  Counted sample{};
+  Numbered sample{};
   SampleInfo info;
   ASSERT_EQ(reader.read_newest(sample, info), ReadStatus::ok);
   EXPECT_EQ(sample.number, 1);
@@ -153,13 +153,13 @@ TEST_F(RemoteWriter, CreatesTheStreamAgainWhenTheOwnerLostIt) {
 
 TEST_F(RemoteWriter, PublishesTheRestAfterItsProgramHasGone) {
   {
-    auto writer = there.create<Counted>("goal@pc1", kLong).value();
+    auto writer = there.create<Numbered>("goal@pc1", kLong).value();
     ::kill(pc1.pid(), SIGSTOP);
-    for (int i = 0; i < 1000; ++i) writer.write(counted(i));
+    for (int i = 0; i < 1000; ++i) writer.write(numbered(i));
   }
   ::kill(pc1.pid(), SIGCONT);
-  auto reader = here.open_reader<Counted>("goal").value();
-  Reading reading(reader);
+  auto reader = here.open_reader<Numbered>("goal").value();
+  ReaderThread reading(reader);
   reading.await_taken(1000);
   await([&] { return there.daemon_info().value().memory_bytes == 0; });
   EXPECT_EQ(reader.newest_tid(), 999);

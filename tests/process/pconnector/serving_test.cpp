@@ -12,6 +12,7 @@
 #include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/largest_payload.hpp"
+#include "tests/support/samples.hpp"
 #include "tests/support/session.hpp"
 
 namespace dssm::test {
@@ -19,31 +20,7 @@ namespace {
 
 using namespace std::chrono_literals;
 
-struct Sample {
-  std::int64_t number = -1;
-  std::array<std::uint8_t, 56> bytes{};
-};
-DSSM_DESCRIBE(Sample, number, bytes)
-
-Sample sample_of(Tid tid) {
-  Sample sample;
-  sample.number = tid;
-  for (std::size_t i = 0; i < sample.bytes.size(); ++i) {
-    sample.bytes[i] = static_cast<std::uint8_t>(static_cast<std::size_t>(tid) * 31 + i);
-  }
-  return sample;
-}
-
 Time time_of(Tid tid) { return time_from_ns(tid * 1'000'000); }
-
-template <class T>
-std::span<std::byte> writable(T& value) {
-  return std::as_writable_bytes(std::span(&value, 1));
-}
-template <class T>
-std::span<const std::byte> bytes_of(const T& value) {
-  return std::as_bytes(std::span(&value, 1));
-}
 
 struct PConnectorServing : testing::Test {
   DaemonProcess daemon{{"--log-level", "warning"}, "pc2"};
@@ -53,32 +30,32 @@ struct PConnectorServing : testing::Test {
     return {.address = daemon.address(), .program = "test", .request_timeout = 60s};
   }
   PConnector open(const std::string& name = "lidar") const {
-    const TypeInfo type = type_of<Sample>();
+    const TypeInfo type = type_of<Numbered>();
     auto con = PConnector::open(StreamId::parse(name).value(), options(), &type);
     EXPECT_TRUE(con) << con.error().message;
     return std::move(con).value();
   }
-  Writer<Sample> make(History history = {64, 1ms}, const std::string& name = "lidar") {
-    return session.create<Sample>(name, history).value();
+  Writer<Numbered> make(History history = {64, 1ms}, const std::string& name = "lidar") {
+    return session.create<Numbered>(name, history).value();
   }
-  static void write(Writer<Sample>& writer, Tid tid) {
-    ASSERT_EQ(writer.write(sample_of(tid), time_of(tid), Duration(tid)), tid);
+  static void write(Writer<Numbered>& writer, Tid tid) {
+    ASSERT_EQ(writer.write(numbered(tid), time_of(tid), Duration(tid)), tid);
   }
 };
 
-void expect_is(const Sample& sample, const SampleInfo& info, Tid tid) {
+void expect_is(const Numbered& sample, const SampleInfo& info, Tid tid) {
   EXPECT_EQ(info.tid, tid);
   EXPECT_EQ(info.time, time_of(tid));
   EXPECT_EQ(info.clock_error, Duration(tid));
   EXPECT_EQ(sample.number, tid);
-  EXPECT_EQ(sample.bytes, sample_of(tid).bytes);
+  EXPECT_TRUE(is_whole(sample));
 }
 
 // Takes the next sample, waiting for it.
-ReadStatus await_next(PConnector& con, Sample& sample, SampleInfo& info) {
+ReadStatus await_next(PConnector& con, Numbered& sample, SampleInfo& info) {
   for (;;) {
     EXPECT_EQ(con.wait(kNever), WaitStatus::ready);
-    const auto status = con.read_next(writable(sample), info);
+    const auto status = con.read_next(writable_bytes(sample), info);
     if (!status) {
       ADD_FAILURE() << status.error().message;
       return ReadStatus::not_yet;
@@ -88,7 +65,7 @@ ReadStatus await_next(PConnector& con, Sample& sample, SampleInfo& info) {
 }
 
 void expect_next(PConnector& con, Tid tid) {
-  Sample sample;
+  Numbered sample;
   SampleInfo info;
   ASSERT_EQ(await_next(con, sample, info), ReadStatus::ok);
   expect_is(sample, info, tid);
@@ -98,8 +75,8 @@ TEST_F(PConnectorServing, KnowsTheStream) {
   auto writer = make({100, 5ms});
   const PConnector con = open();
   EXPECT_EQ(con.id().str(), "lidar:0@pc2");
-  EXPECT_EQ(con.type(), type_of<Sample>());
-  EXPECT_EQ(con.payload_bytes(), 64u);
+  EXPECT_EQ(con.type(), type_of<Numbered>());
+  EXPECT_EQ(con.payload_bytes(), sizeof(Numbered));
   EXPECT_EQ(con.depth(), 100u);
   EXPECT_EQ(con.cycle(), 5ms);
   EXPECT_EQ(con.incarnation(), writer.incarnation());
@@ -126,10 +103,10 @@ TEST_F(PConnectorServing, RefusesInWords) {
 TEST_F(PConnectorServing, ReadsAsALocalReaderDoes) {
   auto writer = make({64, 1ms});
   auto con = open();
-  auto local = session.open_reader<Sample>("lidar").value();
-  Sample here, there;
+  auto local = session.open_reader<Numbered>("lidar").value();
+  Numbered here, there;
   SampleInfo info_here, info_there;
-  EXPECT_EQ(con.read_newest(writable(there), info_there).value(), ReadStatus::not_yet);
+  EXPECT_EQ(con.read_newest(writable_bytes(there), info_there).value(), ReadStatus::not_yet);
   EXPECT_EQ(con.newest_tid().value(), kNoTid);
   EXPECT_EQ(con.oldest_tid().value(), kNoTid);
   EXPECT_EQ(con.find(time_of(3)).value(), kNoTid);
@@ -140,11 +117,11 @@ TEST_F(PConnectorServing, ReadsAsALocalReaderDoes) {
   for (int i = 0; i < 2000; ++i) {
     const Tid tid = static_cast<Tid>(random() % 220) - 10;
     const Time time = time_of(tid) + Duration(static_cast<std::int64_t>(random() % 1'000'000));
-    const auto by_tid = con.read_tid(tid, writable(there), info_there);
+    const auto by_tid = con.read_tid(tid, writable_bytes(there), info_there);
     ASSERT_TRUE(by_tid) << by_tid.error().message;
     ASSERT_EQ(*by_tid, local.read_tid(tid, here, info_here));
     if (*by_tid == ReadStatus::ok) expect_is(there, info_there, tid);
-    const auto by_time = con.read_at(time, writable(there), info_there);
+    const auto by_time = con.read_at(time, writable_bytes(there), info_there);
     ASSERT_TRUE(by_time) << by_time.error().message;
     ASSERT_EQ(*by_time, local.read_at(time, here, info_here));
     if (*by_time == ReadStatus::ok) expect_is(there, info_there, info_here.tid);
@@ -154,9 +131,9 @@ TEST_F(PConnectorServing, ReadsAsALocalReaderDoes) {
   }
   EXPECT_EQ(con.newest_tid().value(), 199);
   EXPECT_EQ(con.oldest_tid().value(), local.oldest_tid());
-  EXPECT_EQ(con.read_newer(198, writable(there), info_there).value(), ReadStatus::ok);
+  EXPECT_EQ(con.read_newer(198, writable_bytes(there), info_there).value(), ReadStatus::ok);
   EXPECT_EQ(info_there.tid, 199);
-  EXPECT_EQ(con.read_newer(199, writable(there), info_there).value(), ReadStatus::not_yet);
+  EXPECT_EQ(con.read_newer(199, writable_bytes(there), info_there).value(), ReadStatus::not_yet);
 }
 
 TEST_F(PConnectorServing, SubscribesFromWhereItIsAsked) {
@@ -170,15 +147,15 @@ TEST_F(PConnectorServing, SubscribesFromWhereItIsAsked) {
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::time, .time = time_of(35) + 10us}));
   for (Tid tid = 35; tid < 40; ++tid) expect_next(con, tid);
   ASSERT_TRUE(con.subscribe({}));
-  Sample sample;
+  Numbered sample;
   SampleInfo info;
-  EXPECT_EQ(con.read_next(writable(sample), info).value(), ReadStatus::not_yet);
+  EXPECT_EQ(con.read_next(writable_bytes(sample), info).value(), ReadStatus::not_yet);
   write(writer, 40);
   expect_next(con, 40);
   ASSERT_TRUE(con.unsubscribe());
   write(writer, 41);
-  EXPECT_EQ(con.read_next(writable(sample), info).error().code, Errc::invalid_argument);
-  EXPECT_EQ(con.read_newest(writable(sample), info).value(), ReadStatus::ok);
+  EXPECT_EQ(con.read_next(writable_bytes(sample), info).error().code, Errc::invalid_argument);
+  EXPECT_EQ(con.read_newest(writable_bytes(sample), info).value(), ReadStatus::ok);
   EXPECT_EQ(info.tid, 41);
   EXPECT_EQ(con.lost_samples(), 0u);
 }
@@ -194,7 +171,7 @@ TEST_F(PConnectorServing, CountsExactlyWhatTheRingLost) {
   for (Tid tid = 1; tid <= 1000; ++tid) write(writer, tid);
   ::kill(daemon.pid(), SIGCONT);
   std::uint64_t taken = 0;
-  Sample sample;
+  Numbered sample;
   SampleInfo info;
   while (info.tid != 1000) {
     ASSERT_EQ(await_next(con, sample, info), ReadStatus::ok);
@@ -213,7 +190,7 @@ TEST_F(PConnectorServing, TakesEverySampleOfAFastWriter) {
   std::thread writing([&] {
     for (Tid tid = 0; tid < kCount; ++tid) write(writer, tid);
   });
-  Sample sample;
+  Numbered sample;
   SampleInfo info;
   for (Tid tid = 0; tid < kCount; ++tid) {
     ASSERT_EQ(await_next(con, sample, info), ReadStatus::ok);
@@ -224,7 +201,8 @@ TEST_F(PConnectorServing, TakesEverySampleOfAFastWriter) {
   EXPECT_EQ(con.lost_samples(), 0u);
   const auto counters = con.counters();
   EXPECT_EQ(counters.samples, static_cast<std::uint64_t>(kCount));
-  EXPECT_LE(counters.copied_payload_bytes, counters.samples * sizeof(Sample)) << "one copy at most";
+  EXPECT_LE(counters.copied_payload_bytes, counters.samples * sizeof(Numbered))
+      << "one copy at most";
   EXPECT_EQ(counters.reconnects, 0u);
 }
 
@@ -240,7 +218,7 @@ TEST_F(PConnectorServing, ThinsAtTheSource) {
       std::this_thread::yield();
     }
   });
-  Sample sample;
+  Numbered sample;
   SampleInfo info;
   for (int i = 0; i < 10; ++i) {
     ASSERT_EQ(await_next(con, sample, info), ReadStatus::ok);
@@ -281,7 +259,7 @@ TEST_F(PConnectorServing, TellsOfAStreamThatWasRemovedAndMadeAnew) {
   ASSERT_TRUE(session.remove({"lidar", 0, {}}));
   auto anew = make();
   write(anew, 0);
-  Sample sample;
+  Numbered sample;
   SampleInfo info;
   ASSERT_EQ(await_next(con, sample, info), ReadStatus::restarted);
   expect_next(con, 0);
@@ -290,28 +268,29 @@ TEST_F(PConnectorServing, TellsOfAStreamThatWasRemovedAndMadeAnew) {
   EXPECT_EQ(con.restarts(), 1u);
   EXPECT_EQ(con.incarnation(), anew.incarnation());
   // And by request: told once, too.
-  EXPECT_EQ(con.read_newest(writable(sample), info).value(), ReadStatus::restarted);
-  EXPECT_EQ(con.read_newest(writable(sample), info).value(), ReadStatus::ok);
+  EXPECT_EQ(con.read_newest(writable_bytes(sample), info).value(), ReadStatus::restarted);
+  EXPECT_EQ(con.read_newest(writable_bytes(sample), info).value(), ReadStatus::ok);
 }
 
 TEST_F(PConnectorServing, WritesAndReadsBackItsOwnTids) {
-  auto con = PConnector::create({"made", 3, {}}, type_of<Sample>(), {256, 1ms}, options()).value();
-  auto local = session.open_reader<Sample>("made:3").value();
+  auto con =
+      PConnector::create({"made", 3, {}}, type_of<Numbered>(), {256, 1ms}, options()).value();
+  auto local = session.open_reader<Numbered>("made:3").value();
   for (Tid tid = 0; tid < 20; ++tid) {
-    const auto written = con.write(bytes_of(sample_of(tid)), time_of(tid), Duration(tid));
+    const auto written = con.write(bytes_of(numbered(tid)), time_of(tid), Duration(tid));
     ASSERT_TRUE(written) << written.error().message;
     EXPECT_EQ(*written, tid);
-    Sample sample;
+    Numbered sample;
     SampleInfo info;
     ASSERT_EQ(local.read_newest(sample, info), ReadStatus::ok);
     expect_is(sample, info, tid);
   }
   for (Tid tid = 20; tid < 120; ++tid) {
-    ASSERT_TRUE(con.post(bytes_of(sample_of(tid)), time_of(tid), Duration(tid)));
+    ASSERT_TRUE(con.post(bytes_of(numbered(tid)), time_of(tid), Duration(tid)));
   }
   EXPECT_EQ(con.flush(kNever).value(), 119);
   for (Tid tid = 0; tid < 120; ++tid) {
-    Sample sample;
+    Numbered sample;
     SampleInfo info;
     ASSERT_EQ(local.read_tid(tid, sample, info), ReadStatus::ok);
     expect_is(sample, info, tid);
@@ -321,12 +300,12 @@ TEST_F(PConnectorServing, WritesAndReadsBackItsOwnTids) {
 TEST_F(PConnectorServing, PostsEachSampleOnceOverRestartsOfDssmd) {
   constexpr Tid kCount = 20'000;
   auto ring = make({1U << 15, 1ms}, "posted");  // held here, so that it outlives dssmd
-  auto local = session.open_reader<Sample>("posted").value();
+  auto local = session.open_reader<Numbered>("posted").value();
   PConnectorOptions wide = options();
   wide.max_unsent_samples = kCount;
   auto con = PConnector::open({"posted", 0, {}}, wide).value();
   for (Tid tid = 0; tid < kCount; ++tid) {
-    ASSERT_TRUE(con.post(bytes_of(sample_of(tid)), time_of(tid), Duration(tid)));
+    ASSERT_TRUE(con.post(bytes_of(numbered(tid)), time_of(tid), Duration(tid)));
     if (tid % 4000 == 3999) {
       daemon.kill_hard();
       daemon.start();
@@ -337,11 +316,11 @@ TEST_F(PConnectorServing, PostsEachSampleOnceOverRestartsOfDssmd) {
   EXPECT_EQ(con.dropped_samples(), 0u);
   local.seek(kNoTid);
   Tid last = -1;
-  Sample sample;
+  Numbered sample;
   SampleInfo info;
   while (local.read_next(sample, info) == ReadStatus::ok) {
     ASSERT_EQ(sample.number, last + 1);
-    EXPECT_EQ(sample.bytes, sample_of(sample.number).bytes);
+    EXPECT_TRUE(is_whole(sample));
     last = sample.number;
   }
   EXPECT_EQ(last, kCount - 1);
@@ -372,7 +351,7 @@ TEST_F(PConnectorServing, ListsTheHostsStreams) {
   ASSERT_EQ(streams->size(), 2u);
   EXPECT_EQ((*streams)[0].id.str(), "lidar:0@pc2");
   EXPECT_EQ((*streams)[1].id.str(), "odometry:2@pc2");
-  EXPECT_EQ((*streams)[1].type, type_of<Sample>());
+  EXPECT_EQ((*streams)[1].type, type_of<Numbered>());
 }
 
 TEST_F(PConnectorServing, FindsAHostInTheCatalogOfTheLocalDssmd) {

@@ -11,6 +11,7 @@
 #include <thread>
 
 #include "tests/support/daemon_process.hpp"
+#include "tests/support/samples.hpp"
 #include "tests/support/service_manager.hpp"
 #include "tests/support/session.hpp"
 
@@ -21,94 +22,26 @@ using namespace std::chrono_literals;
 
 constexpr int kStreams = 3;
 
-struct Numbered {
-  std::int64_t number;
-  std::int64_t again[15];  // the same number, to detect tearing
-};
-DSSM_DESCRIBE(Numbered, number, again)
-
-Numbered numbered(std::int64_t number) {
-  Numbered sample{number, {}};
-  for (auto& word : sample.again) word = number;
-  return sample;
-}
-
 std::string stream_name(int number) { return "load" + std::to_string(number); }
 
 // Writes one stream at 1 kHz, with its own session, like a sensor handler.
-class Handler {
- public:
+struct Handler {
   Handler(const std::string& socket_path, int number)
-      : session_(connect_to(socket_path)),
-        writer_(session_.create<Numbered>(stream_name(number), History{1 << 16, 1ms}).value()),
-        thread_([this] {
-          while (!done_) {
-            EXPECT_EQ(writer_.write(numbered(written_.load())), written_.load());
-            ++written_;
-            std::this_thread::sleep_for(1ms);  // the load's rate, not a wait for anything
-          }
-        }) {}
-  Handler(const Handler&) = delete;
-  Handler& operator=(const Handler&) = delete;
-  ~Handler() { stop(); }
-
-  std::int64_t written() const { return written_.load(); }
-  std::int64_t stop() {
-    done_ = true;
-    if (thread_.joinable()) thread_.join();
-    return written();
-  }
-
- private:
-  Session session_;
-  Writer<Numbered> writer_;
-  std::atomic<bool> done_ = false;
-  std::atomic<std::int64_t> written_ = 0;
-  std::thread thread_;
+      : session(connect_to(socket_path)),
+        writer(session.create<Numbered>(stream_name(number), kLong).value()) {}
+  Session session;
+  Writer<Numbered> writer;
+  WriterThread thread{writer, 1ms};
 };
 
-// Reads every sample of a stream, from the first one on, and checks it.
-class Taker {
- public:
+// Reads every sample of a stream, from the first one on, with its own session.
+struct Taker {
   Taker(const std::string& socket_path, const std::string& name)
-      : session_(connect_to(socket_path)),
-        reader_(session_.await_reader<Numbered>(name, deadline_in(60s)).value()),
-        thread_([this] { take(); }) {}
-  Taker(const Taker&) = delete;
-  Taker& operator=(const Taker&) = delete;
-  ~Taker() {
-    done_ = true;
-    if (thread_.joinable()) thread_.join();
-  }
-
-  std::int64_t taken() const { return taken_.load(); }
-  void await_taken(std::int64_t count) const {
-    while (taken() < count && !testing::Test::HasFailure()) std::this_thread::sleep_for(1ms);
-  }
-  std::uint64_t lost() const { return reader_.lost_samples(); }
-
- private:
-  void take() {
-    reader_.seek(kNoTid);
-    Numbered sample{};
-    SampleInfo info;
-    while (!done_) {
-      if (reader_.wait(deadline_in(50ms)) != WaitStatus::ready) continue;
-      const ReadStatus status = reader_.read_next(sample, info);
-      if (status == ReadStatus::not_yet) continue;
-      ASSERT_EQ(status, ReadStatus::ok);  // nothing else happens to a reader
-      ASSERT_EQ(info.tid, taken_.load());
-      ASSERT_EQ(sample.number, taken_.load());
-      for (const std::int64_t word : sample.again) ASSERT_EQ(word, taken_.load());
-      ++taken_;
-    }
-  }
-
-  Session session_;
-  Reader<Numbered> reader_;
-  std::atomic<bool> done_ = false;
-  std::atomic<std::int64_t> taken_ = 0;
-  std::thread thread_;
+      : session(connect_to(socket_path)),
+        reader(session.await_reader<Numbered>(name, deadline_in(60s)).value()) {}
+  Session session;
+  Reader<Numbered> reader;
+  ReaderThread thread{reader};
 };
 
 class ServiceUnderLoad : public testing::Test {
@@ -132,20 +65,20 @@ class ServiceUnderLoad : public testing::Test {
       // All are connected again, and samples cross the network.
       for (int i = 0; i < kStreams; ++i) {
         const auto s = static_cast<std::size_t>(i);
-        remote[s]->await_taken(handlers[s]->written() + 50);
-        local[s]->await_taken(handlers[s]->written());
+        remote[s]->thread.await_taken(handlers[s]->thread.written() + 50);
+        local[s]->thread.await_taken(handlers[s]->thread.written());
       }
       ASSERT_FALSE(HasFailure());
     }
     for (int i = 0; i < kStreams; ++i) {
       const auto s = static_cast<std::size_t>(i);
-      const std::int64_t written = handlers[s]->stop();
-      local[s]->await_taken(written);
-      remote[s]->await_taken(written);
-      EXPECT_EQ(local[s]->taken(), written);
-      EXPECT_EQ(remote[s]->taken(), written);
-      EXPECT_EQ(local[s]->lost(), 0u);
-      EXPECT_EQ(remote[s]->lost(), 0u);
+      const std::int64_t written = handlers[s]->thread.stop();
+      local[s]->thread.await_taken(written);
+      remote[s]->thread.await_taken(written);
+      EXPECT_EQ(local[s]->thread.taken(), written);
+      EXPECT_EQ(remote[s]->thread.taken(), written);
+      EXPECT_EQ(local[s]->reader.lost_samples(), 0u);
+      EXPECT_EQ(remote[s]->reader.lost_samples(), 0u);
     }
     ASSERT_TRUE(watching.list_streams());  // it has reconnected and received all events
     EXPECT_EQ(events.load(), kStreams) << "a watching program on this PC noticed the restart";

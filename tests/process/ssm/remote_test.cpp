@@ -168,7 +168,7 @@ struct SsmNewRing : testing::Test {
   ~SsmNewRing() override { remove_tree(folder); }
 
   RawWriter make() {
-    return session.create_raw({"anew", 0, {}}, {"", sizeof(int), 1, {}}, History{64, 1ms}).value();
+    return session.create_raw({"recreated", 0, {}}, {"", sizeof(int), 1, {}}, History{64, 1ms}).value();
   }
   void write(int count) {
     for (int i = 0; i < count; ++i, ++number) {
@@ -182,14 +182,14 @@ struct SsmNewRing : testing::Test {
     ASSERT_EQ(program.line(), last);
   }
   void replace_ring() {
-    ASSERT_TRUE(session.remove({"anew", 0, {}}));
+    ASSERT_TRUE(session.remove({"recreated", 0, {}}));
     writer = make();
   }
 };
 
 TEST_F(SsmNewRing, LoopsOfOldProgramsGoOn) {
   write(1);
-  Talking talking({program("cpp_anew-gnu++98"), folder}, daemon.environment());
+  Talking talking({program("cpp_recreated-gnu++98"), folder}, daemon.environment());
   for (int round = 0; round < 4; ++round) {
     write(5);
     await(talking);
@@ -201,7 +201,7 @@ TEST_F(SsmNewRing, LoopsOfOldProgramsGoOn) {
 
 TEST_F(SsmNewRing, RemoteLoopsOfOldProgramsGoOnOverRestartsOfDssmdToo) {
   write(1);
-  Talking talking({program("remote_anew-c++11"), folder, daemon.address()}, daemon.environment());
+  Talking talking({program("remote_recreated-c++11"), folder, daemon.address()}, daemon.environment());
   for (int round = 0; round < 6; ++round) {
     write(5);
     await(talking);

@@ -3,38 +3,16 @@
 // Signals: programs that close everything and end SSM inside their SIGINT handler, while the main
 // loop is anywhere; waits that signals end, and waits that they do not shorten.
 #include <libssm.h>
-#include <signal.h>
-#include <sys/time.h>
-#include <sys/wait.h>
 
 #include <ssm.hpp>
 
-#include "check.h"
+#include "signals.h"
 
 namespace {
 
 struct Sample {
   double a[32];
 };
-
-volatile sig_atomic_t handled = 0;
-
-void on_signal(int number, void (*handler)(int), bool restart = false) {
-  struct sigaction action;
-  memset(&action, 0, sizeof(action));
-  action.sa_handler = handler;
-  action.sa_flags = restart ? SA_RESTART : 0;
-  sigaction(number, &action, NULL);
-}
-
-// SIGALRM after `first` and then every `next` microseconds (0: once).
-void alarm_after(int first, int next) {
-  itimerval timer;
-  memset(&timer, 0, sizeof(timer));
-  timer.it_value.tv_usec = first;
-  timer.it_interval.tv_usec = next;
-  setitimer(ITIMER_REAL, &timer, NULL);
-}
 
 // --- the storm: one child per round, ended by SIGINT at a random moment
 
@@ -95,7 +73,7 @@ int storm_child(int kind, int ready_fd) {
   alarm(60);  // a deadlock ends here, and is seen by the parent
   if (!initSSM()) return 1;
   if (!source.open() || !sink.create(1.0, 0.1)) return 2;
-  on_signal(SIGINT, close_all_and_end);
+  on_signal(SIGINT, close_all_and_end, false);
   if (write(ready_fd, "r", 1) != 1) return 3;
   while (!handled) work(kind);
   // As real programs do: a call or two more, then everything once more.
@@ -126,10 +104,7 @@ pid_t start_writer() {
     }
     for (;;) writer.write();
   }
-  close(ready[1]);
-  char byte;
-  CHECK(read(ready[0], &byte, 1) == 1);
-  close(ready[0]);
+  await_byte(ready);
   return pid;
 }
 
@@ -140,21 +115,7 @@ void storm(int rounds, unsigned seed) {
   srandom(seed);
   const pid_t writer = start_writer();
   for (int round = 0; round < rounds; ++round) {
-    int ready[2];
-    if (pipe(ready) != 0) abort();
-    fflush(stdout);
-    const pid_t child = fork();
-    if (child == 0) _exit(storm_child(round % kKinds, ready[1]));
-    close(ready[1]);
-    char byte;
-    CHECK(read(ready[0], &byte, 1) == 1);
-    close(ready[0]);
-    usleep(static_cast<useconds_t>(random() % 1500));
-    kill(child, SIGINT);
-    int status = 0;
-    waitpid(child, &status, 0);
-    if (status != 0) printf("round %d, kind %d: wait status %x\n", round, round % kKinds, status);
-    CHECK_EQUAL(status, 0);
+    interrupt_child(storm_child, round % kKinds, NULL, 1500);
   }
   kill(writer, SIGKILL);
   waitpid(writer, NULL, 0);
@@ -165,7 +126,6 @@ void storm(int rounds, unsigned seed) {
 SSMApi<Sample> own("own", 0);
 int handler_reads = 0, handler_writes = 0;
 
-void count(int) { handled = handled + 1; }
 void close_own(int) { own.close(); }
 
 void signals_do_not_shorten_wait_tid(bool restart) {
@@ -182,14 +142,14 @@ void signals_do_not_shorten_wait_tid(bool restart) {
 
 void closing_ends_wait_tid() {
   CHECK(own.create(1.0, 0.1));
-  on_signal(SIGALRM, close_own);
+  on_signal(SIGALRM, close_own, false);
   alarm_after(20000, 0);
   CHECK_EQUAL(waitTID(own.getSSMId(), 1 << 30), -1);  // not 0: it did not sit out the second
   CHECK(!own.isOpen());
 }
 
 void signals_end_sleeps() {
-  on_signal(SIGALRM, count);
+  on_signal(SIGALRM, count, false);
   alarm_after(20000, 20000);
   CHECK_EQUAL(usleepSSM(3600000000U), -1);
   CHECK(!(!sleepSSM(3600.0)));
@@ -217,7 +177,7 @@ void read_and_write(int) {
 
 void reading_in_handlers() {
   CHECK(own.create(1.0, 0.1) && own.write() && own.readLast());  // both directions are open now
-  on_signal(SIGALRM, read_and_write);
+  on_signal(SIGALRM, read_and_write, false);
   alarm_after(200, 200);
   long reads = 0;
   while (handler_reads < 500) {
@@ -227,12 +187,6 @@ void reading_in_handlers() {
   alarm_after(0, 0);
   CHECK(handler_writes > 0);
   CHECK(own.write());
-}
-
-void sigpipe_is_the_programs() {
-  struct sigaction action;
-  sigaction(SIGPIPE, NULL, &action);
-  CHECK(action.sa_handler == SIG_DFL);
 }
 
 }  // namespace
@@ -248,7 +202,7 @@ int main(int argc, char** argv) {
   signals_end_sleeps();
   signals_end_open_wait();
   reading_in_handlers();
-  sigpipe_is_the_programs();
+  check_sigpipe();
   CHECK_EQUAL(endSSM(), 1);
   return check_result();
 }

@@ -2,12 +2,8 @@
 //
 // Signals and the remote interface: Ctrl-C ends its waits, and terminate() in a handler, at any
 // moment, ends all that follows without harm. Arguments: FOLDER ADDRESS.
-#include <signal.h>
-#include <sys/time.h>
-#include <sys/wait.h>
-
-#include "check.h"
 #include "dssm.hpp"
+#include "signals.h"
 
 namespace {
 
@@ -16,29 +12,9 @@ struct Sample {
 };
 
 const char* address;
-volatile sig_atomic_t handled = 0;
-
-void on_signal(int number, void (*handler)(int)) {
-  struct sigaction action;
-  memset(&action, 0, sizeof(action));
-  action.sa_handler = handler;
-  action.sa_flags = SA_RESTART;
-  sigaction(number, &action, NULL);
-}
-
-void count(int) { handled = handled + 1; }
-
-// SIGALRM after `first` and then every `next` microseconds (0: once).
-void alarm_after(int first, int next) {
-  itimerval timer;
-  memset(&timer, 0, sizeof(timer));
-  timer.it_value.tv_usec = first;
-  timer.it_interval.tv_usec = next;
-  setitimer(ITIMER_REAL, &timer, NULL);
-}
 
 void signals_end_the_waits() {
-  on_signal(SIGALRM, count);
+  on_signal(SIGALRM, count, true);
   DSSMApi<Sample> nowhere("storm", 0, "127.0.0.1:1"), never("never", 0, address);
   catch_stderr();
   alarm_after(50000, 50000);
@@ -67,7 +43,7 @@ int storm_child(int kind, int ready_fd) {
   if (!sink->create(1.0, 0.1) || !sink->createDataCon()) return 2;
   if (!buffered->open(SSM_READ_BUFFER) || !buffered->createDataCon()) return 3;
   buffered->readyRingBuf();
-  on_signal(SIGINT, terminate_all);
+  on_signal(SIGINT, terminate_all, true);
   handled = 0;
   if (write(ready_fd, "r", 1) != 1) return 4;
   while (!handled) {
@@ -98,28 +74,20 @@ int storm_child(int kind, int ready_fd) {
   return 0;
 }
 
+DSSMApi<Sample>* storm_writer;
+
+void write_some() {
+  for (int i = 0; i < 20; ++i) storm_writer->write();
+}
+
 void storm(int rounds) {
   DSSMApi<Sample> writer("storm", 0, address);
+  storm_writer = &writer;
   CHECK(writer.create(0.3, 0.1) && writer.createDataCon() && writer.write());
   srandom(static_cast<unsigned>(getpid()));
   printf("seed %d\n", getpid());
   for (int round = 0; round < rounds; ++round) {
-    int ready[2];
-    if (pipe(ready) != 0) abort();
-    fflush(stdout);
-    const pid_t child = fork();
-    if (child == 0) _exit(storm_child(round % 5, ready[1]));
-    close(ready[1]);
-    char byte;
-    CHECK(read(ready[0], &byte, 1) == 1);
-    close(ready[0]);
-    for (int i = 0; i < 20; ++i) writer.write();
-    usleep(static_cast<useconds_t>(random() % 2000));
-    kill(child, SIGINT);
-    int status = 0;
-    waitpid(child, &status, 0);
-    if (status != 0) printf("round %d: wait status %x\n", round, status);
-    CHECK_EQUAL(status, 0);
+    interrupt_child(storm_child, round % 5, write_some, 2000);
   }
 }
 
@@ -143,18 +111,12 @@ void calls_in_handlers_fail_or_work() {
   third.readyRingBuf();
   while (!third.readNewBuf()) usleep(1000);
   handled = 0;
-  on_signal(SIGALRM, read_and_write);
+  on_signal(SIGALRM, read_and_write, true);
   alarm_after(200, 200);
   while (handler_calls < 500) CHECK(one.readLast());
   alarm_after(0, 0);
   CHECK(handled > 0);
   CHECK(other.readLast() && one.write());
-}
-
-void sigpipe_is_the_programs() {
-  struct sigaction action;
-  sigaction(SIGPIPE, NULL, &action);
-  CHECK(action.sa_handler == SIG_DFL);
 }
 
 }  // namespace
@@ -165,6 +127,6 @@ int main(int argc, char** argv) {
   storm(50);
   signals_end_the_waits();
   calls_in_handlers_fail_or_work();
-  sigpipe_is_the_programs();
+  check_sigpipe();
   return check_result();
 }
