@@ -168,7 +168,8 @@ struct SsmNewRing : testing::Test {
   ~SsmNewRing() override { remove_tree(folder); }
 
   RawWriter make() {
-    return session.create_raw({"recreated", 0, {}}, {"", sizeof(int), 1, {}}, History{64, 1ms}).value();
+    return session.create_raw({"recreated", 0, {}}, {"", sizeof(int), 1, {}}, History{64, 1ms})
+        .value();
   }
   void write(int count) {
     for (int i = 0; i < count; ++i, ++number) {
@@ -201,7 +202,8 @@ TEST_F(SsmNewRing, LoopsOfOldProgramsGoOn) {
 
 TEST_F(SsmNewRing, RemoteLoopsOfOldProgramsGoOnOverRestartsOfDssmdToo) {
   write(1);
-  Talking talking({program("remote_recreated-c++11"), folder, daemon.address()}, daemon.environment());
+  Talking talking({program("remote_recreated-c++11"), folder, daemon.address()},
+                  daemon.environment());
   for (int round = 0; round < 6; ++round) {
     write(5);
     await(talking);
