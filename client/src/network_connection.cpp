@@ -32,7 +32,6 @@ void add(wire::DecoderCounters& sum, const wire::DecoderCounters& more) noexcept
   sum.samples += more.samples;
   sum.copied_payload_bytes += more.copied_payload_bytes;
   sum.direct_payload_bytes += more.direct_payload_bytes;
-  sum.slow_frames += more.slow_frames;
 }
 
 }  // namespace

@@ -393,7 +393,6 @@ Result<void> FrameDecoder::hand_out_slowly(net::Frame& frame, std::size_t frame_
     counters_.copied_payload_bytes += payload.size();
   }
   ++counters_.samples;
-  ++counters_.slow_frames;
   return sink_.on_sample_end(sample_, frame.torn());
 }
 

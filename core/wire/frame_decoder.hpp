@@ -58,7 +58,6 @@ struct DecoderCounters {
   std::uint64_t samples = 0;
   std::uint64_t copied_payload_bytes = 0;  // out of the input buffer
   std::uint64_t direct_payload_bytes = 0;  // received where they belong
-  std::uint64_t slow_frames = 0;           // sample frames in another order of fields
 };
 
 class FrameDecoder {

@@ -32,8 +32,6 @@ class RemoteStreams final : private CatalogObserver {
   RemoteStreams& operator=(const RemoteStreams&) = delete;
   ~RemoteStreams() { catalog_.remove_observer(*this); }
 
-  std::size_t size() const noexcept { return entries_.size(); }
-
   // The ring for `id`, a stream of `host`: the one that is there, or a new one: a mirror filled
   // with the owner's history, or a remote writer's after the owner agreed. The stream's id names
   // the owner's host. The ring is kept while the OpenTable has it, and a while longer.

@@ -57,8 +57,6 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
 
   void set_limits(const PeerTable::Limits& limits) { peers_.set_limits(limits); }
 
-  std::size_t connections() const noexcept { return communicators_.size(); }
-
  private:
   Result<void> accept(UniqueFd& socket);
   void keep(PeerPlace place, std::unique_ptr<wire::Transport> transport,

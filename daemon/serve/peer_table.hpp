@@ -67,8 +67,6 @@ class PeerTable {
   //   fails  limit_exceeded, naming the key
   Result<PeerPlace> admit(const wire::SocketAddress& address);
 
-  std::uint64_t connections() const noexcept { return connections_; }
-
  private:
   friend class PeerPlace;
   void leave(PeerAccount& account);

@@ -28,6 +28,7 @@ class Recorder : public FrameDelegate {
   std::function<bool()> holds = [] { return false; };  // asked in each callback
   FrameDecoder* decoder = nullptr;                     // for holds
   int begun = 0;                                       // calls of on_sample_begin()
+  int collected = 0;  // samples whose whole frame was collected first, as `decoder` has it
 
   Result<void> on_sample_begin(const IncomingSample& sample, std::byte*& out) override {
     ++begun;
@@ -41,6 +42,7 @@ class Recorder : public FrameDelegate {
   }
 
   Result<void> on_sample_end(const IncomingSample& sample, bool torn) override {
+    if (decoder && decoder->collected_bytes() > 0) ++collected;
     log.push_back("sample " + std::to_string(sample.serial) + "/" +
                   std::to_string(sample.info.tid) + "/" + std::to_string(to_ns(sample.info.time)) +
                   "/" + std::to_string(to_ns(sample.info.clock_error)) + (torn ? " torn " : " ") +

@@ -4,63 +4,33 @@
 #include <gtest/gtest.h>
 
 #include "daemon/remote/mirror.hpp"
-#include "daemon/remote/remote_streams.hpp"
-#include "tests/support/log_recorder.hpp"
-#include "tests/unit/daemon/daemon_fixtures.hpp"
-#include "tests/unit/daemon/scripted_host.hpp"
+#include "tests/unit/daemon/remote/remote_stream_test.hpp"
 
 namespace dssm::daemon {
 namespace {
 
 using namespace std::chrono_literals;
 
-const StreamId kId{"odometry", 0, "pc2"};
-
-class MirrorsTest : public testing::Test {
+class MirrorsTest : public RemoteStreamTest<Mirror> {
  protected:
-  EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
-  Resolver resolver{loop};
-  Registry registry{"pc1", kLimits};
-  LogRecorder logger;
-  Catalog catalog{"pc1"};
-  ChannelParts parts{loop, resolver, registry, logger, greeting_of("pc1")};
-  std::unique_ptr<RemoteStreams<Mirror>> mirrors =
-      std::make_unique<RemoteStreams<Mirror>>(parts, catalog);
-  std::unique_ptr<ScriptedHost> owner = std::make_unique<ScriptedHost>(loop);
-  StreamInfo theirs;
   std::vector<const Stream*> replaced;
 
   MirrorsTest() {
     parts.on_ring_replaced = [this](const Stream& old) { replaced.push_back(&old); };
-    theirs.id = kId;
-    theirs.type = odometry_type();
-    theirs.depth = 16;
-    theirs.cycle = 10ms;
-    theirs.incarnation = 7;
-    catalog.host_up(owner->host().greeting, owner->address());
   }
 
-  using Answer = std::optional<Result<std::shared_ptr<Stream>>>;
-  std::shared_ptr<Answer> open() {
-    auto answer = std::make_shared<Answer>();
-    mirrors->open(owner->host(), kId, nullptr, [answer](Result<OpenedRing> ring) {
-      ring ? answer->emplace(ring->stream) : answer->emplace(ring.error());
-    });
-    return answer;
-  }
   std::shared_ptr<Stream> find() {
-    Mirror* mirror = mirrors->find(kId);
+    Mirror* mirror = streams->find(kOdometry);
     return mirror ? mirror->acquire() : nullptr;
   }
   std::shared_ptr<Stream> wait(const std::shared_ptr<Answer>& answer) {
-    run_until(loop, [&] { return answer->has_value(); });
-    return (*answer)->value();
+    return RemoteStreamTest::wait(answer).stream;
   }
   // Answers Open and Subscribe; returns the latter.
   net::Frame serve(Tid first) {
     const net::Frame open = owner->receive();
     EXPECT_TRUE(open.has_open());
-    EXPECT_EQ(open.open().id().name(), kId.name);
+    EXPECT_EQ(open.open().id().name(), kOdometry.name);
     owner->send(opened_frame(open, theirs));
     net::Frame subscribe = owner->receive();
     EXPECT_TRUE(subscribe.has_subscribe());
@@ -83,7 +53,7 @@ class MirrorsTest : public testing::Test {
   }
   proto::Mirror state() {
     proto::Mirror state;
-    mirrors->find(kId)->describe(state);
+    streams->find(kOdometry)->describe(state);
     return state;
   }
   void until_state(proto::Mirror::State wanted) {
@@ -106,7 +76,7 @@ TEST_F(MirrorsTest, FillsARingWithTheOwnersHistoryBeforeItAnswers) {
   EXPECT_EQ(state().state(), proto::Mirror::FILLING);
   owner->send_caught_up();
   const std::shared_ptr<Stream> stream = wait(answer);
-  EXPECT_EQ(stream->id(), kId);
+  EXPECT_EQ(stream->id(), kOdometry);
   EXPECT_EQ(stream->type(), odometry_type());
   EXPECT_EQ(stream->incarnation(), 7u);
   EXPECT_EQ(stream->purpose(), Purpose::mirror);
@@ -127,7 +97,7 @@ TEST_F(MirrorsTest, SharesOneChannelAmongAllReaders) {
   const auto third = open();
   ASSERT_TRUE(third->has_value()) << "it is there";
   EXPECT_EQ(owner->connections(), 1);
-  EXPECT_EQ(mirrors->size(), 1u);
+  EXPECT_EQ(count(), 1u);
 }
 
 TEST_F(MirrorsTest, AnswersWithWhatCameWhenTheHistoryTakesLong) {
@@ -139,25 +109,23 @@ TEST_F(MirrorsTest, AnswersWithWhatCameWhenTheHistoryTakesLong) {
 }
 
 TEST_F(MirrorsTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
-  const wire::Address nobody = owner->address();
+  const wire::Address address = owner->address();
   const KnownHost host = owner->host();
-  owner.reset();  // nobody listens there any more
-  std::optional<Error> error;
-  mirrors->open(host, kId, nullptr, [&](Result<OpenedRing> ring) { error = ring.error(); });
-  run_until(loop, [&] { return error.has_value(); });
-  EXPECT_EQ(error->code, Errc::unavailable);
-  EXPECT_NE(error->message.find("odometry:0@pc2"), std::string::npos) << error->message;
-  EXPECT_NE(error->message.find(nobody.str()), std::string::npos) << error->message;
-  EXPECT_NE(error->message.find("refused"), std::string::npos) << error->message;
-  run_until(loop, [&] { return mirrors->size() == 0; });
+  owner.reset();  // no process listens there any more
+  const Error error = wait_error(open_at(host));
+  EXPECT_EQ(error.code, Errc::unavailable);
+  for (const std::string& word :
+       {std::string("odometry:0@pc2"), address.str(), std::string("refused")}) {
+    EXPECT_NE(error.message.find(word), std::string::npos) << error.message;
+  }
+  wait_until_none();
 }
 
 TEST_F(MirrorsTest, HandsOnWhatTheOwnerRefuses) {
   const auto answer = open();
   owner->fail(owner->receive(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
-  run_until(loop, [&] { return answer->has_value(); });
-  EXPECT_EQ((*answer)->error().code, Errc::not_found);
-  run_until(loop, [&] { return mirrors->size() == 0; });
+  EXPECT_EQ(wait_error(answer).code, Errc::not_found);
+  wait_until_none();
   EXPECT_EQ(registry.budget().used(), 0u);
 }
 
@@ -176,7 +144,7 @@ TEST_F(MirrorsTest, CountsTowardsTheStreamsOfThisHost) {
   RemoteStreams<Mirror> few(small_parts, catalog);
   {
     std::optional<Errc> code;
-    few.open(owner->host(), kId, nullptr, [&](auto result) {
+    few.open(owner->host(), kOdometry, nullptr, [&](auto result) {
       code = result ? std::nullopt : std::optional(result.error().code);
     });
     EXPECT_EQ(small.create({"own", 0, ""}, odometry_type(), kHistory, 1).error().code,
@@ -185,7 +153,7 @@ TEST_F(MirrorsTest, CountsTowardsTheStreamsOfThisHost) {
              [&](auto result) { code = result.error().code; });
     EXPECT_EQ(code, Errc::limit_exceeded);
     owner->fail(owner->receive(), Errc::not_found, "none");
-    run_until(loop, [&] { return few.size() == 0; });
+    run_until(loop, [&] { return !few.find(kOdometry) && !few.find({"other", 0, "pc2"}); });
   }
   EXPECT_TRUE(small.create({"own", 0, ""}, odometry_type(), kHistory, 1));
 }
@@ -197,7 +165,7 @@ TEST_F(MirrorsTest, ClosesWhenNobodyUsesItAnyMore) {
   event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
   EXPECT_TRUE(owner->connected()) << "one uses it still";
   second.reset();
-  run_until(loop, [&] { return mirrors->size() == 0 && !owner->connected(); });
+  run_until(loop, [&] { return count() == 0 && !owner->connected(); });
   EXPECT_EQ(registry.budget().used(), 0u);
 }
 
@@ -210,10 +178,10 @@ TEST_F(MirrorsTest, StaysForAWhileAfterItsLastUser) {
   EventSource timer = EventSource::timer(loop, [&] { later = true; });
   timer.enable_in(100ms);
   run_until(loop, [&] { return later; });
-  EXPECT_EQ(mirrors->size(), 1u) << "somebody uses it again";
+  EXPECT_EQ(count(), 1u) << "somebody uses it again";
   const MonoTime left = loop.now();
   opened_again.reset();
-  run_until(loop, [&] { return mirrors->size() == 0; });
+  wait_until_none();
   EXPECT_GE(loop.now() - left, 50ms);
   EXPECT_EQ(owner->connections(), 1);
 }
@@ -254,7 +222,7 @@ TEST_F(MirrorsTest, KeepsTheRingWhileTheOwnerIsAway) {
   EXPECT_NE(state().error().find("no sign of life"), std::string::npos) << state().error();
   const auto answer = open();
   ASSERT_TRUE(answer->has_value()) << "the history is here";
-  EXPECT_EQ(newest(*(*answer)->value()), 5);
+  EXPECT_EQ(newest(*(*answer)->value().stream), 5);
 }
 
 TEST_F(MirrorsTest, FollowsTheOwnerToANewAddress) {
@@ -304,8 +272,8 @@ TEST_F(MirrorsTest, BeginsANewRingWhenTheOwnerLostIts) {
   EXPECT_EQ(newest(*old), 5) << "who holds it keeps it";
   const auto answer = open();
   ASSERT_TRUE(answer->has_value());
-  EXPECT_EQ((*answer)->value()->incarnation(), 8u);
-  EXPECT_EQ(newest(*(*answer)->value()), 1);
+  EXPECT_EQ((*answer)->value().stream->incarnation(), 8u);
+  EXPECT_EQ(newest(*(*answer)->value().stream), 1);
   EXPECT_EQ(state().restarts(), 1u);
   EXPECT_EQ(state().received_samples(), 8u) << "of both rings";
 }
@@ -316,7 +284,7 @@ TEST_F(MirrorsTest, KeepsTheRingOfARemovedStreamAndTriesAgain) {
   owner->send(removed_frame());
   until_state(proto::Mirror::REMOVED);
   EXPECT_NE(state().error(), "");
-  catalog.stream_removed(owner->host().greeting.host_id, kId);
+  catalog.stream_removed(owner->host().greeting.host_id, kOdometry);
   theirs.incarnation = 8;
   catalog.stream_added(owner->host().greeting.host_id, theirs).value();
   run_until(loop, [&] { return owner->connections() == 2; });
@@ -331,13 +299,12 @@ TEST_F(MirrorsTest, LendsNoRingOfAStreamThatTheCatalogKnowsToBeRemoved) {
   const wire::HostId host_id = owner->host().greeting.host_id;
   const std::shared_ptr<Stream> stream = opened(5);
   catalog.stream_added(host_id, theirs).value();
-  catalog.stream_removed(host_id, kId);
+  catalog.stream_removed(host_id, kOdometry);
   const auto answer = open();
   EXPECT_FALSE(answer->has_value());
   samples(6, 6);
   owner->send(removed_frame());
-  run_until(loop, [&] { return answer->has_value(); });
-  EXPECT_EQ((*answer)->error().code, Errc::not_found);
+  EXPECT_EQ(wait_error(answer).code, Errc::not_found);
   EXPECT_EQ(newest(*stream), 6) << "its readers get the last samples";
 }
 
@@ -347,10 +314,10 @@ TEST_F(MirrorsTest, LendsItsRingWhenTheCatalogHearsLateOfTheLastOnesRemoval) {
   StreamInfo last = theirs;
   last.incarnation = theirs.incarnation - 1;
   catalog.stream_added(host_id, last).value();
-  catalog.stream_removed(host_id, kId);
+  catalog.stream_removed(host_id, kOdometry);
   const auto answer = open();
   ASSERT_TRUE(answer->has_value());
-  EXPECT_EQ((*answer)->value(), stream);
+  EXPECT_EQ((*answer)->value().stream, stream);
 }
 
 TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
@@ -361,7 +328,7 @@ TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
   catalog.host_up(host.greeting, host.address);
   const auto answer = open();
   ASSERT_TRUE(answer->has_value());
-  EXPECT_EQ((*answer)->value(), stream);
+  EXPECT_EQ((*answer)->value().stream, stream);
 }
 
 TEST_F(MirrorsTest, AsksAgainForARemovedStreamWhenSomebodyOpensIt) {
@@ -372,9 +339,8 @@ TEST_F(MirrorsTest, AsksAgainForARemovedStreamWhenSomebodyOpensIt) {
   EXPECT_FALSE(answer->has_value());
   run_until(loop, [&] { return owner->connections() == 2; });
   owner->fail(owner->receive(), Errc::not_found, "there is no such stream");
-  run_until(loop, [&] { return answer->has_value(); });
-  EXPECT_EQ((*answer)->error().code, Errc::not_found);
-  EXPECT_EQ(mirrors->size(), 1u) << "its reader stays";
+  EXPECT_EQ(wait_error(answer).code, Errc::not_found);
+  EXPECT_EQ(count(), 1u) << "its reader stays";
   // Nobody has to tell: it looks by itself as well.
   run_until(loop, [&] { return owner->connections() == 3; });
   serve(6);
@@ -388,16 +354,16 @@ TEST_F(MirrorsTest, GoesOnWithARingThatAProgramKept) {
     const std::shared_ptr<Stream> stream = opened(5);
     kept = stream->descriptors_for(Role::reader).value();
   }
-  mirrors = std::make_unique<RemoteStreams<Mirror>>(parts, catalog);
+  streams = std::make_unique<RemoteStreams<Mirror>>(parts, catalog);
   catalog.host_down(owner->host().greeting.host_id, {Errc::unavailable, "not known yet"});
   std::vector<UniqueFd> again;
   for (const UniqueFd& fd : kept) again.push_back(copy_of(fd));
-  auto stream = mirrors->adopt_untrusted(kId, as_offer(std::move(again)));
+  auto stream = streams->adopt_untrusted(kOdometry, as_offer(std::move(again)));
   ASSERT_TRUE(stream) << stream.error().message;
   EXPECT_EQ(state().state(), proto::Mirror::CONNECTING);
   EXPECT_EQ(state().newest(), 5);
   // The second program that holds it.
-  auto second = mirrors->adopt_untrusted(kId, as_offer(std::move(kept)));
+  auto second = streams->adopt_untrusted(kOdometry, as_offer(std::move(kept)));
   ASSERT_TRUE(second) << second.error().message;
   EXPECT_EQ(second->get(), stream->get());
   catalog.host_up(owner->host().greeting, owner->address());
@@ -414,19 +380,20 @@ TEST_F(MirrorsTest, RefusesRingsThatAreNoMirrors) {
             {.id = id, .type = odometry_type(), .depth = 16, .cycle = 1ms, .purpose = purpose},
             registry.budget())
             .value();
-    return mirrors->adopt_untrusted(kId, as_offer(stream->descriptors_for(Role::reader).value()));
+    return streams->adopt_untrusted(kOdometry,
+                                    as_offer(stream->descriptors_for(Role::reader).value()));
   };
   // Programs can write to these: dssmd must not build on what stands there.
-  EXPECT_EQ(offer(Purpose::remote_writer, kId).error().code, Errc::protocol);
-  EXPECT_EQ(offer(Purpose::own, kId).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::remote_writer, kOdometry).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::own, kOdometry).error().code, Errc::protocol);
   EXPECT_EQ(offer(Purpose::mirror, {"other", 0, "pc2"}).error().code, Errc::protocol);
-  EXPECT_EQ(mirrors->size(), 0u);
+  EXPECT_EQ(count(), 0u);
   EXPECT_EQ(registry.budget().used(), 0u);
 }
 
 TEST_F(MirrorsTest, RefusesAnOfferedRingWhenTheMirrorHasAnother) {
   const std::shared_ptr<Stream> stream = opened(5);
-  auto other = Stream::create({.id = kId,
+  auto other = Stream::create({.id = kOdometry,
                                .type = odometry_type(),
                                .depth = 16,
                                .cycle = 1ms,
@@ -434,11 +401,12 @@ TEST_F(MirrorsTest, RefusesAnOfferedRingWhenTheMirrorHasAnother) {
                                .incarnation = 7},
                               registry.budget())
                    .value();
-  EXPECT_EQ(mirrors->adopt_untrusted(kId, as_offer(other->descriptors_for(Role::reader).value()))
-                .error()
-                .code,
-            Errc::conflict);
-  EXPECT_EQ(mirrors->size(), 1u);
+  EXPECT_EQ(
+      streams->adopt_untrusted(kOdometry, as_offer(other->descriptors_for(Role::reader).value()))
+          .error()
+          .code,
+      Errc::conflict);
+  EXPECT_EQ(count(), 1u);
 }
 
 TEST_F(MirrorsTest, DoesNotReadFromAnotherPcAtTheOwnersAddress) {

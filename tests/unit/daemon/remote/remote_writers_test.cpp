@@ -4,18 +4,13 @@
 #include <gtest/gtest.h>
 
 #include "core/ring/ring_writer.hpp"
-#include "daemon/remote/remote_streams.hpp"
 #include "daemon/remote/remote_writer.hpp"
-#include "tests/support/log_recorder.hpp"
-#include "tests/unit/daemon/daemon_fixtures.hpp"
-#include "tests/unit/daemon/scripted_host.hpp"
+#include "tests/unit/daemon/remote/remote_stream_test.hpp"
 
 namespace dssm::daemon {
 namespace {
 
 using namespace std::chrono_literals;
-
-const StreamId kOdometry{"odometry", 0, "pc2"};
 
 // A program that has the ring open for writing.
 class Program {
@@ -41,45 +36,10 @@ class Program {
   std::shared_ptr<ring::Bell> bell_;
 };
 
-class RemoteWritersTest : public testing::Test {
+class RemoteWritersTest : public RemoteStreamTest<RemoteWriter> {
  protected:
-  EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
-  Resolver resolver{loop};
-  Registry registry{"pc1", kLimits};
-  LogRecorder logger;
-  Catalog catalog{"pc1"};
-  wire::Greeting self = greeting_of("pc1");
-  ChannelParts parts{loop, resolver, registry, logger, self};
-  std::unique_ptr<RemoteStreams<RemoteWriter>> writers =
-      std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
-  std::unique_ptr<ScriptedHost> owner = std::make_unique<ScriptedHost>(loop);
   CreatePlan plan{odometry_type(), kHistory};
-  StreamInfo theirs;
 
-  RemoteWritersTest() {
-    theirs.id = kOdometry;
-    theirs.type = odometry_type();
-    theirs.depth = 16;
-    theirs.cycle = 10ms;
-    theirs.incarnation = 7;
-    catalog.host_up(owner->host().greeting, owner->address());
-  }
-
-  using Answer = std::optional<Result<OpenedRing>>;
-  std::shared_ptr<Answer> open(const CreatePlan* with) {
-    auto answer = std::make_shared<Answer>();
-    writers->open(owner->host(), kOdometry, with,
-                  [answer](Result<OpenedRing> result) { answer->emplace(std::move(result)); });
-    return answer;
-  }
-  OpenedRing wait(const std::shared_ptr<Answer>& answer) {
-    run_until(loop, [&] { return answer->has_value(); });
-    return (*answer)->value();
-  }
-  Error wait_error(const std::shared_ptr<Answer>& answer) {
-    run_until(loop, [&] { return answer->has_value(); });
-    return (*answer)->error();
-  }
   // Answers Open or Create, and StartPublishing. Returns the publisher's number.
   std::uint64_t serve(Tid last, bool created = false) {
     net::Frame opened = opened_frame(owner->receive(), theirs);
@@ -170,18 +130,18 @@ TEST_F(RemoteWritersTest, GoesOnWithTheTidsOfTheOwnersRing) {
 }
 
 TEST_F(RemoteWritersTest, OpensAnExistingStreamWithoutCreatingIt) {
-  const auto answer = open(nullptr);
+  const auto answer = open();
   const net::Frame request = owner->receive();
   EXPECT_TRUE(request.has_open());
   owner->fail(request, Errc::not_found, "there is no stream 'odometry:0@pc2'");
   EXPECT_EQ(wait_error(answer).code, Errc::not_found);
-  run_until(loop, [&] { return writers->size() == 0; });
+  wait_until_none();
   EXPECT_EQ(registry.budget().used(), 0u);
 }
 
 // One is refused, the other not.
 TEST_F(RemoteWritersTest, AsksForEachWhoWaitsWhatItWants) {
-  const auto opening = open(nullptr), creating = open(&plan);
+  const auto opening = open(), creating = open(&plan);
   owner->fail(owner->receive(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
   EXPECT_EQ(wait_error(opening).code, Errc::not_found);
   EXPECT_FALSE(creating->has_value());
@@ -207,12 +167,10 @@ TEST_F(RemoteWritersTest, ChecksTheTypeOfThoseWhoJoin) {
 TEST_F(RemoteWritersTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
   const KnownHost host = owner->host();
   owner.reset();
-  std::optional<Error> error;
-  writers->open(host, kOdometry, &plan, [&](Result<OpenedRing> result) { error = result.error(); });
-  run_until(loop, [&] { return error.has_value(); });
-  EXPECT_EQ(error->code, Errc::unavailable);
-  EXPECT_NE(error->message.find("odometry:0@pc2"), std::string::npos) << error->message;
-  run_until(loop, [&] { return writers->size() == 0; });
+  const Error error = wait_error(open_at(host, &plan));
+  EXPECT_EQ(error.code, Errc::unavailable);
+  EXPECT_NE(error.message.find("odometry:0@pc2"), std::string::npos) << error.message;
+  wait_until_none();
 }
 
 TEST_F(RemoteWritersTest, CatchesUpFromWhereTheOwnerStopped) {
@@ -308,16 +266,16 @@ TEST_F(RemoteWritersTest, EndsWhenItsProgramsHaveGoneAndAllIsPublished) {
   stream.reset();
   until_published(0);
   event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
-  EXPECT_EQ(writers->size(), 1u) << "not known to be written";
+  EXPECT_EQ(count(), 1u) << "not known to be written";
   acknowledge(0);
-  run_until(loop, [&] { return writers->size() == 0 && !owner->connected(); });
+  run_until(loop, [&] { return count() == 0 && !owner->connected(); });
   EXPECT_EQ(registry.budget().used(), 0u);
   EXPECT_TRUE(logger.warnings.empty());
 }
 
 TEST_F(RemoteWritersTest, EndsAtOnceWhenNothingIsLeftToPublish) {
   opened().reset();
-  run_until(loop, [&] { return writers->size() == 0; });
+  wait_until_none();
 }
 
 TEST_F(RemoteWritersTest, IsJoinedWhileItDrains) {
@@ -363,14 +321,14 @@ TEST_F(RemoteWritersTest, GoesOnWithARingThatAProgramKept) {
     acknowledge(1);
     run_until(loop, [&] { return stream->mapping().header().first.load() == 2; });
     owner->published.clear();
-    writers.reset();  // dies
+    streams.reset();  // dies
   }
   program->write(3);
   catalog.host_down(owner->host().greeting.host_id, {Errc::unavailable, "not known yet"});
-  writers = std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
-  const auto stream = writers->adopt_untrusted(kOdometry, program->offer());
+  streams = std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
+  const auto stream = streams->adopt_untrusted(kOdometry, program->offer());
   ASSERT_TRUE(stream) << stream.error().message;
-  const auto again = writers->adopt_untrusted(kOdometry, program->offer());
+  const auto again = streams->adopt_untrusted(kOdometry, program->offer());
   ASSERT_TRUE(again) << again.error().message;
   EXPECT_EQ(stream->get(), again->get());
   catalog.host_up(owner->host().greeting, owner->address());
@@ -388,16 +346,16 @@ TEST_F(RemoteWritersTest, PublishesAKeptRingBesideOneThatWasOpenedSince) {
   {
     const std::shared_ptr<Stream> stream = opened();
     program.emplace(*stream);
-    writers.reset();
+    streams.reset();
   }
-  writers = std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
+  streams = std::make_unique<RemoteStreams<RemoteWriter>>(parts, catalog);
   const std::shared_ptr<Stream> since = opened();
   const int before = owner->connections();
-  const auto kept = writers->adopt_untrusted(kOdometry, program->offer());
+  const auto kept = streams->adopt_untrusted(kOdometry, program->offer());
   ASSERT_TRUE(kept) << kept.error().message;
   EXPECT_NE(kept->get(), since.get());
-  EXPECT_EQ(writers->adopt_untrusted(kOdometry, program->offer()).value(), *kept);
-  EXPECT_EQ(writers->size(), 2u);
+  EXPECT_EQ(streams->adopt_untrusted(kOdometry, program->offer()).value(), *kept);
+  EXPECT_EQ(count(), 2u);
   run_until(loop, [&] { return owner->connections() > before; });
   program->write(7);
   EXPECT_EQ(serve(-1), (*kept)->incarnation()) << "as a publisher of its own";
@@ -412,13 +370,13 @@ TEST_F(RemoteWritersTest, RefusesRingsThatAreNoRemoteWriters) {
             {.id = id, .type = odometry_type(), .depth = 16, .cycle = 1ms, .purpose = purpose},
             registry.budget())
             .value();
-    return writers->adopt_untrusted(kOdometry,
+    return streams->adopt_untrusted(kOdometry,
                                     as_offer(stream->descriptors_for(Role::writer).value()));
   };
   EXPECT_EQ(offer(Purpose::mirror, kOdometry).error().code, Errc::protocol);
   EXPECT_EQ(offer(Purpose::own, kOdometry).error().code, Errc::protocol);
   EXPECT_EQ(offer(Purpose::remote_writer, {"other", 0, "pc2"}).error().code, Errc::protocol);
-  EXPECT_EQ(writers->size(), 0u);
+  EXPECT_EQ(count(), 0u);
 }
 
 // Each costs the connection, and nothing else.

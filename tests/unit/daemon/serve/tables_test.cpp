@@ -26,18 +26,20 @@ TEST(RateLimitedLogger, PassesSoManyLinesOnAndCountsTheOthers) {
 }
 
 TEST(PeerTable, GivesEverythingBack) {
-  PeerTable table({10, 10, 1U << 20});
+  PeerTable table({3, 2, 1U << 20});
   {
     const PeerPlace first = *table.admit(address_of(2));
     const PeerPlace second = *table.admit(address_of(2));
-    EXPECT_EQ(table.connections(), 2u);
+    EXPECT_FALSE(table.admit(address_of(2))) << "two of one address";
     EXPECT_EQ(&first.budget(), &second.budget()) << "one address, one account";
     EXPECT_EQ(first.budget().used(), 2 * PeerTable::kConnectionBytes);
     const PeerPlace other = *table.admit(address_of(3));
     EXPECT_NE(&first.budget(), &other.budget());
+    EXPECT_FALSE(table.admit(address_of(4))) << "three in all";
   }
-  EXPECT_EQ(table.connections(), 0u);
-  EXPECT_EQ(table.admit(address_of(2))->budget().used(), PeerTable::kConnectionBytes);
+  const PeerPlace again = *table.admit(address_of(2)), third = *table.admit(address_of(3)),
+                  fourth = *table.admit(address_of(4));
+  EXPECT_EQ(again.budget().used(), PeerTable::kConnectionBytes);
 }
 
 }  // namespace
