@@ -21,16 +21,15 @@ namespace dssm::daemon {
 namespace {
 
 constexpr std::size_t kMaxFileBytes = 1U << 20;
-constexpr std::uint64_t kMostMemoryBytes = 1ULL << 50;
-constexpr Duration kLongestGrace = std::chrono::seconds(60);
-constexpr Duration kLongestLinger = std::chrono::hours(1);
+constexpr std::uint64_t kMaxMemoryBytes = 1ULL << 50;
+constexpr std::int64_t kMaxGraceNs = to_ns(std::chrono::seconds(60));
+constexpr std::int64_t kMaxLingerNs = to_ns(std::chrono::hours(1));
 constexpr std::uint16_t kChronydPort = 323;
 
 // Puts a parsed value into its place.
 template <class T, class U>
 Result<void> take(T& place, Result<U> value) {
-  if (!value) return std::move(value).error();
-  place = *std::move(value);
+  place = DSSM_TRY(std::move(value));
   return {};
 }
 
@@ -78,9 +77,10 @@ Result<void> set_chronyd(Config& config, std::string_view text) {
   return {};
 }
 
-Result<void> add_interface(std::vector<std::string>& interfaces, std::string_view text) {
+template <auto member>
+Result<void> add_interface(Config& config, std::string_view text) {
   if (text.empty()) return {};
-  interfaces.push_back(DSSM_TRY(parse_interface(text)));
+  (config.*member).push_back(DSSM_TRY(parse_interface(text)));
   return {};
 }
 
@@ -123,10 +123,27 @@ constexpr ConfigKey::Change kChangesAtOnce{true, &is_same<member>};
 template <auto member>
 constexpr ConfigKey::Change kChangesAtRestart{false, &is_same<member>};
 
+// Setters for keys with one value.
+template <auto member, auto parse>
+Result<void> set_by(Config& config, std::string_view text) {
+  return take(config.*member, parse(text));
+}
+template <auto member, std::uint64_t max>
+Result<void> set_count(Config& config, std::string_view text) {
+  return take(config.*member, parse_count(text, 1, max));
+}
+template <auto member, std::uint64_t min, std::uint64_t max>
+Result<void> set_bytes(Config& config, std::string_view text) {
+  return take(config.*member, parse_bytes(text, min, max));
+}
+template <auto member, std::int64_t max_ns>
+Result<void> set_duration(Config& config, std::string_view text) {
+  return take(config.*member, parse_duration(text, Duration::zero(), Duration(max_ns)));
+}
+
 constexpr ConfigKey kKeys[] = {
     {"name", "HOST",
-     "this host's name in 'stream:id@HOST'; default: the machine's name up to the "
-     "first dot",
+     "this host's name in 'stream:id@HOST'; default: the machine's name up to the first dot",
      ValueForm::text, kChangesAtRestart<&Config::name>,
      [](Config& c, std::string_view text) -> Result<void> {
        DSSM_TRY(check_host_name(text));
@@ -136,53 +153,33 @@ constexpr ConfigKey kKeys[] = {
     {"runtime_dir", "DIR", "folder of the socket 'dssmd.sock'; default: /run/dssm", ValueForm::text,
      kChangesAtRestart<&Config::runtime_dir>, set_runtime_dir},
     {"socket_group", "GROUP", "group that owns the socket; default: dssmd's own", ValueForm::text,
-     kChangesAtRestart<&Config::socket_group>,
-     [](Config& c, std::string_view text) { return take(c.socket_group, parse_group(text)); }},
+     kChangesAtRestart<&Config::socket_group>, set_by<&Config::socket_group, parse_group>},
     {"socket_mode", "MODE", "permissions of the socket, octal; default: 0660", ValueForm::text,
-     kChangesAtRestart<&Config::socket_mode>,
-     [](Config& c, std::string_view text) { return take(c.socket_mode, parse_mode(text)); }},
+     kChangesAtRestart<&Config::socket_mode>, set_by<&Config::socket_mode, parse_mode>},
     {"log_level", "LEVEL", "error, warning, notice, info or debug; default: info", ValueForm::text,
-     kChangesAtOnce<&Config::log_level>,
-     [](Config& c, std::string_view text) { return take(c.log_level, parse_log_level(text)); }},
+     kChangesAtOnce<&Config::log_level>, set_by<&Config::log_level, parse_log_level>},
     {"max_clients", "COUNT", "connections at once; default: 4096", ValueForm::integer,
-     kChangesAtOnce<&Config::max_clients>,
-     [](Config& c, std::string_view text) {
-       return take(c.max_clients, parse_count(text, 1, kMostClients));
-     }},
+     kChangesAtOnce<&Config::max_clients>, set_count<&Config::max_clients, kMaxClients>},
     {"max_streams", "COUNT", "streams at once; default: 4096", ValueForm::integer,
-     kChangesAtOnce<&Config::max_streams>,
-     [](Config& c, std::string_view text) {
-       return take(c.max_streams, parse_count(text, 1, kMostStreams));
-     }},
+     kChangesAtOnce<&Config::max_streams>, set_count<&Config::max_streams, kMaxStreams>},
     {"max_memory", "BYTES",
-     "memory of all rings and properties, e.g. '4 GiB' or '25%'; default: "
-     "half of the machine's",
+     "memory of all rings and properties, e.g. '4 GiB' or '25%'; default: half of the machine's",
      ValueForm::integer_or_text, kChangesAtOnce<&Config::max_memory_bytes>,
-     [](Config& c, std::string_view text) {
-       return take(c.max_memory_bytes, parse_bytes(text, 64 << 10, kMostMemoryBytes));
-     }},
+     set_bytes<&Config::max_memory_bytes, 64 << 10, kMaxMemoryBytes>},
     {"max_opens", "COUNT", "open streams of all clients together; default: 65536",
      ValueForm::integer, kChangesAtOnce<&Config::max_opens>,
-     [](Config& c, std::string_view text) {
-       return take(c.max_opens, parse_count(text, 1, kMostOpens));
-     }},
+     set_count<&Config::max_opens, kMaxOpens>},
     {"max_opens_per_client", "COUNT", "open streams of one client; default: 16384",
      ValueForm::integer, kChangesAtOnce<&Config::max_opens_per_client>,
-     [](Config& c, std::string_view text) {
-       return take(c.max_opens_per_client, parse_count(text, 1, kMostOpens));
-     }},
+     set_count<&Config::max_opens_per_client, kMaxOpens>},
     {"max_property", "BYTES", "size of one stream's property; default: 16 MiB",
      ValueForm::integer_or_text, kChangesAtOnce<&Config::max_property_bytes>,
-     [](Config& c, std::string_view text) {
-       return take(c.max_property_bytes, parse_bytes(text, 0, wire::kMaxPropertyBytes));
-     }},
+     set_bytes<&Config::max_property_bytes, 0, wire::kMaxPropertyBytes>},
     {"recovery_grace", "TIME",
-     "how long after a crash programs may give their streams back before "
-     "new ones take their names; default: 500 ms",
+     "how long after a crash programs may give their streams back before new ones take their "
+     "names; default: 500 ms",
      ValueForm::text, kChangesAtOnce<&Config::recovery_grace>,
-     [](Config& c, std::string_view text) {
-       return take(c.recovery_grace, parse_duration(text, Duration::zero(), kLongestGrace));
-     }},
+     set_duration<&Config::recovery_grace, kMaxGraceNs>},
     {"listen", "ADDR:PORT",
      "where to listen for other hosts; may be repeated, '' for nowhere; default: 127.0.0.1:13776 "
      "and [::1]:13776",
@@ -191,53 +188,42 @@ constexpr ConfigKey kKeys[] = {
     {"peers", "HOST:PORT", "another host's dssmd to share streams with; may be repeated",
      ValueForm::list, kChangesAtOnce<&Config::peers>, add_peer, [](Config& c) { c.peers.clear(); },
      "peer"},
-    {"insecure", "", "allow addresses of other PCs although nothing is encrypted",
+    {"insecure", "", "allow addresses of other PCs; the traffic is not encrypted",
      ValueForm::boolean, kChangesAtRestart<&Config::insecure>,
-     [](Config& c, std::string_view text) { return take(c.insecure, parse_boolean(text)); }},
+     set_by<&Config::insecure, parse_boolean>},
     {"mdns", "",
      "find other hosts, and announce this one and its streams, by mDNS; default: true "
      "(--mdns=false: do not)",
-     ValueForm::boolean, kChangesAtRestart<&Config::mdns>,
-     [](Config& c, std::string_view text) { return take(c.mdns, parse_boolean(text)); }},
+     ValueForm::boolean, kChangesAtRestart<&Config::mdns>, set_by<&Config::mdns, parse_boolean>},
     {"interfaces", "NAME",
      "network interface to use for mDNS, or a pattern such as 'eth*'; may be repeated; default: "
      "all",
-     ValueForm::list, kChangesAtRestart<&Config::interfaces>,
-     [](Config& c, std::string_view text) { return add_interface(c.interfaces, text); },
+     ValueForm::list, kChangesAtRestart<&Config::interfaces>, add_interface<&Config::interfaces>,
      [](Config& c) { c.interfaces.clear(); }, "interface"},
     {"avoid_interfaces", "NAME",
      "network interface not to use for mDNS, or a pattern; may be repeated, '' for none; default: "
      "those of containers, virtual machines and tunnels",
      ValueForm::list, kChangesAtRestart<&Config::avoid_interfaces>,
-     [](Config& c, std::string_view text) { return add_interface(c.avoid_interfaces, text); },
-     [](Config& c) { c.avoid_interfaces.clear(); }, "avoid-interface"},
+     add_interface<&Config::avoid_interfaces>, [](Config& c) { c.avoid_interfaces.clear(); },
+     "avoid-interface"},
     {"max_connections", "COUNT", "connections of other hosts at once; default: 256",
      ValueForm::integer, kChangesAtOnce<&Config::max_connections>,
-     [](Config& c, std::string_view text) {
-       return take(c.max_connections, parse_count(text, 1, kMostConnections));
-     }},
+     set_count<&Config::max_connections, kMaxConnections>},
     {"max_connections_per_host", "COUNT", "connections from one address at once; default: 128",
      ValueForm::integer, kChangesAtOnce<&Config::max_connections_per_host>,
-     [](Config& c, std::string_view text) {
-       return take(c.max_connections_per_host, parse_count(text, 1, kMostConnections));
-     }},
+     set_count<&Config::max_connections_per_host, kMaxConnections>},
     {"max_peer_memory", "BYTES",
      "memory that the connections from one address may take of dssmd; default: 96 MiB",
      ValueForm::integer_or_text, kChangesAtOnce<&Config::max_peer_memory_bytes>,
-     [](Config& c, std::string_view text) {
-       return take(c.max_peer_memory_bytes, parse_bytes(text, 1 << 20, kMostMemoryBytes));
-     }},
+     set_bytes<&Config::max_peer_memory_bytes, 1 << 20, kMaxMemoryBytes>},
     {"mirror_linger", "TIME",
      "how long the copy of another host's stream is kept after its last reader; default: 5 s",
      ValueForm::text, kChangesAtOnce<&Config::mirror_linger>,
-     [](Config& c, std::string_view text) {
-       return take(c.mirror_linger, parse_duration(text, Duration::zero(), kLongestLinger));
-     }},
+     set_duration<&Config::mirror_linger, kMaxLingerNs>},
     {"clock_policy", "POLICY",
      "what to do with streams of hosts whose clocks may be too far from this one's: enforce (not "
      "open them, and answer reads by time with an error), mark (flag their samples) or off; "
-     "default: "
-     "enforce",
+     "default: enforce",
      ValueForm::text, kChangesAtOnce<&Config::clocks>,
      [](Config& c, std::string_view text) {
        return take(c.clocks.general.policy, parse_clock_policy(text));
@@ -258,11 +244,10 @@ constexpr ConfigKey kKeys[] = {
      },
      [](Config& c) { c.clocks.exceptions.clear(); }, "clock-stream"},
     {"max_drift", "PPM", "highest drift of this PC's free-running clock; default: 50 ppm",
-     ValueForm::text, kChangesAtOnce<&Config::max_drift>,
-     [](Config& c, std::string_view text) { return take(c.max_drift, parse_drift(text)); }},
+     ValueForm::text, kChangesAtOnce<&Config::max_drift>, set_by<&Config::max_drift, parse_drift>},
     {"chronyd", "ADDR:PORT",
-     "where this PC's chronyd takes questions (cmdport); default: 127.0.0.1:323", ValueForm::text,
-     kChangesAtRestart<&Config::chronyd>, set_chronyd},
+     "address of this PC's chronyd (cmdport in chrony.conf); default: 127.0.0.1:323",
+     ValueForm::text, kChangesAtRestart<&Config::chronyd>, set_chronyd},
 };
 
 std::string place(const std::string& path, const toml::source_region& source) {
@@ -285,7 +270,8 @@ const char* words_for(ValueForm form) noexcept {
   return "";
 }
 
-// The value as the flag would have it, or why it has the wrong type.
+// The value as its flag takes it.
+//   fails  invalid_argument: another type
 Result<std::string> text_of(const toml::node& node, ValueForm form) {
   const bool takes_text = form == ValueForm::text || form == ValueForm::integer_or_text;
   const bool takes_integer = form == ValueForm::integer || form == ValueForm::integer_or_text;
@@ -301,7 +287,7 @@ Result<std::string> text_of(const toml::node& node, ValueForm form) {
   if (node.is_boolean()) type = "true or false";
   if (node.is_array()) type = "a list";
   if (node.is_table()) type = "a table";
-  return Error{Errc::invalid_argument, type + " stands where " + words_for(form) + " belongs"};
+  return Error{Errc::invalid_argument, type + " instead of " + words_for(form)};
 }
 
 Result<void> set_list(Config& config, const ConfigKey& key, const toml::node& node) {
@@ -338,7 +324,7 @@ struct Mistake {
 };
 
 Result<toml::table> parse_toml(std::string_view text, const std::string& path) {
-  // The one place where a library throws at us; its exception ends here.
+  // toml::parse() throws.
   try {
     return toml::parse(text, path);
   } catch (const toml::parse_error& error) {

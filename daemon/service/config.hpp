@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmd's configuration: one table of keys that serves the file, the flags, the help text and the
-// checks alike. A key `max_streams` in the file is the flag --max-streams; both go through the same
-// words and the same range. A key that is a list is a flag that may be repeated; where the flag is
+// checks alike. A key `max_streams` in the file is the flag --max-streams; both are
+// parsed and checked in the same way. A key that is a list is a flag that may be repeated; where the flag is
 // given, it replaces the file's list. docs/configuration.md explains each key to a person.
 #pragma once
 
@@ -24,12 +24,12 @@
 
 namespace dssm::daemon {
 
-// Most that one may configure; chosen so that a list of all streams, clients or opens still fits
+// The highest values that may be configured; chosen so that a list of all streams, clients or opens still fits
 // into one frame of the local protocol (17 MiB) with the longest names.
-inline constexpr std::uint64_t kMostStreams = 32768;
-inline constexpr std::uint64_t kMostClients = 32768;
-inline constexpr std::uint64_t kMostOpens = 100'000;
-inline constexpr std::uint64_t kMostConnections = 32768;
+inline constexpr std::uint64_t kMaxStreams = 32768;
+inline constexpr std::uint64_t kMaxClients = 32768;
+inline constexpr std::uint64_t kMaxOpens = 100'000;
+inline constexpr std::uint64_t kMaxConnections = 32768;
 
 struct Config {
   std::string name;  // of this host; empty until finish() puts the machine's name there
@@ -62,11 +62,11 @@ struct Config {
   // Clocks.
   ClockPolicies clocks;
   clock::PartsPerBillion max_drift = 50'000;
-  wire::Address chronyd{"127.0.0.1", 323};  // where it takes questions
+  wire::Address chronyd{"127.0.0.1", 323};  // its cmdport
 
   static std::uint64_t half_of_the_machines_memory() noexcept;
-  // Those of containers, virtual machines and tunnels: what is found there is found again on the
-  // cable, or is no host of this vehicle.
+  // Those of containers, virtual machines and tunnels: a host that is found there is found on a
+  // cable too, or does not belong to this fleet.
   static std::vector<std::string> interfaces_between_programs();
 };
 
@@ -76,7 +76,7 @@ enum class ValueForm : std::uint8_t { text, integer, integer_or_text, boolean, l
 
 struct ConfigKey {
   std::string_view name;   // "max_streams"
-  std::string_view value;  // what stands for the value in the help text: "COUNT"
+  std::string_view value;  // the name of the value in the help text: "COUNT"
   std::string_view help;
   ValueForm form;
   // A new value in the file counts from a reload (SIGHUP) on, or not before the next start.
@@ -98,7 +98,7 @@ struct ConfigKey {
 std::span<const ConfigKey> config_keys() noexcept;
 
 // Takes over all keys of the TOML file `path`. Fails with invalid_argument and one line per
-// mistake, "FILE:LINE: key 'KEY': reason", having looked at the whole file.
+// mistake, "FILE:LINE: key 'KEY': reason", after checking the whole file.
 Result<void> apply_file(Config& config, const std::string& path);
 
 // The same from text; `path` is for the messages.

@@ -20,10 +20,10 @@ namespace {
 
 constexpr std::size_t kMaxInterfacePatternBytes = 63;
 
-constexpr Duration kLeastClockLimit = std::chrono::microseconds(10);
-constexpr Duration kMostClockLimit = std::chrono::seconds(10);
+constexpr Duration kMinClockLimit = std::chrono::microseconds(10);
+constexpr Duration kMaxClockLimit = std::chrono::seconds(10);
 constexpr std::size_t kMaxStreamPatternBytes = 63;
-constexpr std::uint64_t kMostDriftPpm = 1000;
+constexpr std::uint64_t kMaxDriftPpm = 1000;
 
 Error invalid(std::string why) { return Error{Errc::invalid_argument, std::move(why)}; }
 
@@ -50,10 +50,10 @@ Result<Quantity> parse_quantity(std::string_view text) {
   return quantity;
 }
 
-Error out_of_range(std::string_view text, std::uint64_t least, std::uint64_t most,
+Error out_of_range(std::string_view text, std::uint64_t min, std::uint64_t max,
                    std::string_view unit) {
-  return invalid(in_quotes(text) + " is outside of " + std::to_string(least) + " to " +
-                 std::to_string(most) + std::string(unit));
+  return invalid(in_quotes(text) + " is outside of " + std::to_string(min) + " to " +
+                 std::to_string(max) + std::string(unit));
 }
 
 }  // namespace
@@ -69,16 +69,16 @@ ClockDemand ClockPolicies::demand_for(const StreamId& id) const {
   return general;
 }
 
-Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t least, std::uint64_t most) {
+Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t min, std::uint64_t max) {
   const Quantity quantity = DSSM_TRY(parse_quantity(text));
   if (!quantity.unit.empty()) return invalid(in_quotes(text) + " is not a whole number");
-  if (quantity.number < least || quantity.number > most) {
-    return out_of_range(text, least, most, "");
+  if (quantity.number < min || quantity.number > max) {
+    return out_of_range(text, min, max, "");
   }
   return quantity.number;
 }
 
-Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, std::uint64_t most) {
+Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t min, std::uint64_t max) {
   const Quantity quantity = DSSM_TRY(parse_quantity(text));
   std::uint64_t bytes = quantity.number;
   if (quantity.unit == "%") {
@@ -95,11 +95,11 @@ Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, st
   } else if (!quantity.unit.empty()) {
     return invalid(in_quotes(text) + " has an unknown unit; write bytes, KiB, MiB, GiB, TiB or %");
   }
-  if (bytes < least || bytes > most) return out_of_range(text, least, most, " bytes");
+  if (bytes < min || bytes > max) return out_of_range(text, min, max, " bytes");
   return bytes;
 }
 
-Result<Duration> parse_duration(std::string_view text, Duration least, Duration most) {
+Result<Duration> parse_duration(std::string_view text, Duration min, Duration max) {
   const Quantity quantity = DSSM_TRY(parse_quantity(text));
   std::uint64_t ns = quantity.number;
   if (quantity.unit == "us") {
@@ -111,12 +111,11 @@ Result<Duration> parse_duration(std::string_view text, Duration least, Duration 
   } else {
     return invalid(in_quotes(text) + " needs a unit: 'us', 'ms' or 's'");
   }
-  if (ns < static_cast<std::uint64_t>(to_ns(least)) ||
-      ns > static_cast<std::uint64_t>(to_ns(most))) {
-    const bool fine = least % std::chrono::milliseconds(1) != Duration::zero();
+  if (ns < static_cast<std::uint64_t>(to_ns(min)) || ns > static_cast<std::uint64_t>(to_ns(max))) {
+    const bool fine = min % std::chrono::milliseconds(1) != Duration::zero();
     const std::int64_t unit = fine ? 1'000 : 1'000'000;
-    return out_of_range(text, static_cast<std::uint64_t>(to_ns(least) / unit),
-                        static_cast<std::uint64_t>(to_ns(most) / unit), fine ? " us" : " ms");
+    return out_of_range(text, static_cast<std::uint64_t>(to_ns(min) / unit),
+                        static_cast<std::uint64_t>(to_ns(max) / unit), fine ? " us" : " ms");
   }
   return Duration(static_cast<std::int64_t>(ns));
 }
@@ -130,7 +129,7 @@ Result<ClockPolicy> parse_clock_policy(std::string_view text) {
 }
 
 Result<Duration> parse_clock_limit(std::string_view text) {
-  return parse_duration(text, kLeastClockLimit, kMostClockLimit);
+  return parse_duration(text, kMinClockLimit, kMaxClockLimit);
 }
 
 Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text) {
@@ -164,8 +163,8 @@ Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text) {
 Result<clock::PartsPerBillion> parse_drift(std::string_view text) {
   const Quantity quantity = DSSM_TRY(parse_quantity(text));
   if (quantity.unit != "ppm") return invalid(in_quotes(text) + " needs the unit 'ppm'");
-  if (quantity.number < 1 || quantity.number > kMostDriftPpm) {
-    return out_of_range(text, 1, kMostDriftPpm, " ppm");
+  if (quantity.number < 1 || quantity.number > kMaxDriftPpm) {
+    return out_of_range(text, 1, kMaxDriftPpm, " ppm");
   }
   return static_cast<clock::PartsPerBillion>(quantity.number) * 1000;
 }
@@ -213,11 +212,11 @@ Result<bool> parse_boolean(std::string_view text) {
 
 Result<std::string> parse_interface(std::string_view text) {
   const bool is_pattern = text.find_first_of("*?[\\") != text.npos;
-  const std::size_t most = is_pattern ? kMaxInterfacePatternBytes : IFNAMSIZ - 1;
-  if (text.empty() || text.size() > most) {
+  const std::size_t max = is_pattern ? kMaxInterfacePatternBytes : IFNAMSIZ - 1;
+  if (text.empty() || text.size() > max) {
     return invalid(in_quotes(text) + " is " + std::to_string(text.size()) + " bytes long; " +
                    (is_pattern ? "a pattern" : "the name of a network interface") + " takes 1 to " +
-                   std::to_string(most));
+                   std::to_string(max));
   }
   for (const char c : text) {
     if (static_cast<unsigned char>(c) <= 0x20 || c == 0x7f || c == '/') {

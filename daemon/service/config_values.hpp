@@ -49,14 +49,14 @@ struct ClockPolicies {
   friend bool operator==(const ClockPolicies& a, const ClockPolicies& b) = default;
 };
 
-// A whole number from `least` to `most`.
-Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t least, std::uint64_t most);
+// A whole number from `min` to `max`.
+Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t min, std::uint64_t max);
 
 // Bytes: "1048576", "512 KiB", "64 MiB", "2 GiB", "1 TiB", or "50%" of the machine's memory.
-Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t least, std::uint64_t most);
+Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t min, std::uint64_t max);
 
 // "0 ms", "1500 us", "500 ms", "2 s"; the unit must be there.
-Result<Duration> parse_duration(std::string_view text, Duration least, Duration most);
+Result<Duration> parse_duration(std::string_view text, Duration min, Duration max);
 
 // "enforce", "mark", "off".
 Result<ClockPolicy> parse_clock_policy(std::string_view text);
@@ -67,7 +67,7 @@ Result<Duration> parse_clock_limit(std::string_view text);
 // "STREAM=POLICY", or "STREAM=POLICY LIMIT": "gps=off", "camera*=mark 5 ms".
 Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text);
 
-// How far a clock runs away: "50 ppm"; 1 to 1000. In billionths.
+// The drift of a clock: "50 ppm"; 1 to 1000. In billionths.
 Result<clock::PartsPerBillion> parse_drift(std::string_view text);
 
 // File permissions in octal, "0660"; only the nine ordinary bits, and the owner's write bit is set.

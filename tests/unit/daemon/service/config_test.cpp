@@ -88,24 +88,24 @@ TEST(Config, NamesLineAndKeyOfAnUnknownKey) {
 
 TEST(Config, NamesLineAndKeyOfAWrongType) {
   EXPECT_EQ(mistakes_in("max_streams = \"five\"\n"),
-            "dssmd.conf:1: key 'max_streams': a text stands where a whole number belongs");
+            "dssmd.conf:1: key 'max_streams': a text instead of a whole number");
   EXPECT_EQ(mistakes_in("\nname = 5\n"),
-            "dssmd.conf:2: key 'name': a whole number stands where a text in quotes belongs");
+            "dssmd.conf:2: key 'name': a whole number instead of a text in quotes");
   EXPECT_EQ(mistakes_in("max_memory = [1]\n"),
-            "dssmd.conf:1: key 'max_memory': a list stands where a whole number or a text in "
-            "quotes belongs");
-  EXPECT_NE(mistakes_in("[name]\nx = 1\n").find("a table stands"), std::string::npos);
+            "dssmd.conf:1: key 'max_memory': a list instead of a whole number or a text in "
+            "quotes");
+  EXPECT_NE(mistakes_in("[name]\nx = 1\n").find("a table instead of"), std::string::npos);
   EXPECT_NE(mistakes_in("max_clients = 1.5\n").find("a number with a point"), std::string::npos);
   EXPECT_NE(mistakes_in("max_clients = true\n").find("true or false"), std::string::npos);
 }
 
 TEST(Config, NamesLineAndKeyOfWhatIsWrongInAList) {
   EXPECT_EQ(mistakes_in("listen = \"127.0.0.1\"\n"),
-            "dssmd.conf:1: key 'listen': a text stands where a list of texts in quotes belongs");
+            "dssmd.conf:1: key 'listen': a text instead of a list of texts in quotes");
   EXPECT_EQ(mistakes_in("peers = [\"pc2\", 5]\n"),
-            "dssmd.conf:1: key 'peers': a whole number stands where a text in quotes belongs");
+            "dssmd.conf:1: key 'peers': a whole number instead of a text in quotes");
   EXPECT_EQ(mistakes_in("insecure = \"yes\"\n"),
-            "dssmd.conf:1: key 'insecure': a text stands where true or false belongs");
+            "dssmd.conf:1: key 'insecure': a text instead of true or false");
   EXPECT_NE(mistakes_in("peers = [\"pc2:99999\"]\n").find("'99999' is no port"), std::string::npos);
   EXPECT_NE(mistakes_in("peers = [\"pc2:0\"]\n").find("port 0"), std::string::npos);
   EXPECT_NE(mistakes_in("listen = [\"pc1\"]\n").find("'pc1' is a name"), std::string::npos);
