@@ -54,7 +54,7 @@ std::vector<std::string> clock_row(const HostInfo& host) {
   const bool is_read = clock.status != ClockStatus::unknown && clock.age > Duration::zero();
   return {escaped(host.name),
           status_text(clock),
-          bound_text(host.clock_bound),
+          bound_text(host.clock_bound()),
           bound_text(host.clock_distance),
           is_read ? offset_text(clock.offset) : "-",
           reference_text(host),
@@ -70,7 +70,7 @@ Json clock_json(const HostInfo& host) {
   json["status"] = name_of(clock.status);
   json["reason"] = clock.reason == ClockReason::none ? Json() : Json(name_of(clock.reason));
   json["basis"] = name_of(clock.basis);
-  json["bound_ns"] = bound_json(host.clock_bound);
+  json["bound_ns"] = bound_json(host.clock_bound());
   json["distance_ns"] = bound_json(host.clock_distance);
   json["root_bound_ns"] = bound_json(clock.root_bound);
   json["offset_ns"] = to_ns(clock.offset);
@@ -186,12 +186,12 @@ Result<void> tabulate_clocks(Session& session, const ClockOptions& options, Outp
     for (const HostInfo& host : *hosts) {
       if (!is_there(host)) continue;
       Readings& readings = all.try_emplace(host.name, count).first->second;
-      if (!host.clock || host.clock_bound == kUnknownClockError) {
+      if (!host.clock || host.clock_bound() == kUnknownClockError) {
         ++readings.unknown;
         continue;
       }
       readings.offsets.add(std::max(host.clock->offset, -host.clock->offset));
-      readings.bounds.add(host.clock_bound);
+      readings.bounds.add(host.clock_bound());
     }
   }
   print_table(all, options.json, out);

@@ -16,9 +16,9 @@ void Clocks::update(const std::vector<HostInfo>& hosts, std::string_view owner) 
   for (const HostInfo& host : hosts) {
     if (host.state == HostState::self) {
       two_clocks_ = host.name != owner;
-      own_bound_ = host.clock_bound;
+      own_bound_ = host.clock_bound();
     } else if (host.state == HostState::up && host.name == owner) {
-      owner_bound_ = host.clock_bound;
+      owner_bound_ = host.clock_bound();
     }
   }
 }

@@ -31,7 +31,7 @@ Json host_json(const HostInfo& host) {
   json["round_trip_ns"] = round_trip_json(host.round_trip);
   json["least_round_trip_ns"] = round_trip_json(host.min_round_trip);
   json["streams"] = host.streams;
-  json["clock_bound_ns"] = bound_json(host.clock_bound);
+  json["clock_bound_ns"] = bound_json(host.clock_bound());
   json["insecure"] = host.insecure;
   json["reason"] = host.reason == HostReason::none ? Json() : Json(name_of(host.reason));
   json["error"] = or_null(host.error);
@@ -53,7 +53,7 @@ std::vector<std::string> host_row(const HostInfo& host) {
           or_dash(escaped(host.version)),
           host.round_trip > Duration::zero() ? duration_text(host.round_trip) : "-",
           std::to_string(host.streams),
-          bound_text(host.clock_bound),
+          bound_text(host.clock_bound()),
           note(host)};
 }
 

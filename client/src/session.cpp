@@ -22,19 +22,6 @@ std::string quoted(const char* verb, const StreamId& id) {
   return fmt::format("{} '{}'", verb, id.str());
 }
 
-// A handle of the opened stream; a failure names what was tried.
-template <class Raw, class State, class Wrap>
-Result<Raw> opened(Result<std::shared_ptr<detail::OpenStream>> stream, const std::string& what,
-                   Wrap wrap) {
-  if (!stream) return std::move(stream).error().context(what);
-  return wrap(std::make_unique<State>(std::move(*stream)));
-}
-
-Result<void> without_answer(Result<detail::Answer> answer, const std::string& what) {
-  if (!answer) return std::move(answer).error().context(what);
-  return {};
-}
-
 Result<std::vector<StreamInfo>> listed(detail::Client& client, bool own_only) {
   local::Request request;
   request.mutable_list()->set_own_only(own_only);
@@ -62,7 +49,6 @@ HostInfo host_info(const local::Host& message) {
   host.round_trip = Duration(message.round_trip_ns());
   host.min_round_trip = Duration(message.least_round_trip_ns());
   host.streams = message.streams();
-  host.clock_bound = Duration(message.clock_bound_ns());
   host.insecure = message.insecure();
   host.error = message.error();
   host.id = hex(message.host_id());
@@ -101,7 +87,8 @@ Result<void> set_property(Client& client, const StreamId& id, std::span<const st
   local::Request request;
   wire::to_message(id, *request.mutable_set_property()->mutable_id());
   request.mutable_set_property()->set_property(property.data(), property.size());
-  return without_answer(client.connection().call(std::move(request)), what);
+  DSSM_TRY(client.connection().call(std::move(request)), what);
+  return {};
 }
 
 }  // namespace detail
@@ -125,27 +112,24 @@ Result<RawWriter> Session::create_raw(const StreamId& id, const TypeInfo& type,
   local::Request request;
   wire::to_message(id, type, history, *request.mutable_create());
   request.mutable_create()->set_tag(tag);
-  return opened<RawWriter, detail::WriterState>(
-      client_->open(std::move(request), Role::writer, tag), what,
-      [](auto state) { return RawWriter(std::move(state)); });
+  auto stream = DSSM_TRY(client_->open(std::move(request), Role::writer, tag), what);
+  return RawWriter(std::make_unique<detail::WriterState>(std::move(stream)));
 }
 
 Result<RawWriter> Session::open_raw_writer(const StreamId& id, const TypeInfo* wanted,
                                            std::uint32_t tag) {
   const std::string what = quoted("open", id) + " for writing";
-  auto stream = client_->open_writer(id, tag);
-  if (stream && wanted) DSSM_TRY((*stream)->type.check_usable_as(*wanted), what);
-  return opened<RawWriter, detail::WriterState>(
-      std::move(stream), what, [](auto state) { return RawWriter(std::move(state)); });
+  auto stream = DSSM_TRY(client_->open_writer(id, tag), what);
+  if (wanted) DSSM_TRY(stream->type.check_usable_as(*wanted), what);
+  return RawWriter(std::make_unique<detail::WriterState>(std::move(stream)));
 }
 
 Result<RawReader> Session::open_raw_reader(const StreamId& id, const TypeInfo* wanted,
                                            std::uint32_t tag) {
   const std::string what = quoted("open", id);
-  auto stream = client_->open_reader(id, tag);
-  if (stream && wanted) DSSM_TRY((*stream)->type.check_usable_as(*wanted), what);
-  return opened<RawReader, detail::ReaderState>(
-      std::move(stream), what, [](auto state) { return RawReader(std::move(state)); });
+  auto stream = DSSM_TRY(client_->open_reader(id, tag), what);
+  if (wanted) DSSM_TRY(stream->type.check_usable_as(*wanted), what);
+  return RawReader(std::make_unique<detail::ReaderState>(std::move(stream)));
 }
 
 Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadline,
@@ -153,7 +137,7 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
   std::mutex mutex;
   std::condition_variable added;
   std::uint64_t times_added = 0;
-  auto watching = watch([&](const StreamEvent& event) {
+  const auto on_event = [&](const StreamEvent& event) {
     if (event.kind != StreamEvent::Kind::added || event.stream.id.name != id.name ||
         event.stream.id.id != id.id) {
       return;
@@ -161,8 +145,8 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
     const std::lock_guard guard(mutex);
     ++times_added;
     added.notify_one();
-  });
-  if (!watching) return std::move(watching).error().context(quoted("wait for", id));
+  };
+  const Watch watching = DSSM_TRY(watch(on_event), quoted("wait for", id));
   for (std::uint64_t seen = 0;;) {
     auto reader = open_raw_reader(id, wanted);
     if (reader || !is_retryable(reader.error().code)) return reader;
@@ -185,7 +169,8 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
 Result<void> Session::remove(const StreamId& id) {
   local::Request request;
   wire::to_message(id, *request.mutable_remove()->mutable_id());
-  return without_answer(client_->connection().call(std::move(request)), quoted("remove", id));
+  DSSM_TRY(client_->connection().call(std::move(request)), quoted("remove", id));
+  return {};
 }
 
 Result<std::vector<StreamInfo>> Session::list_streams() { return listed(*client_, false); }

@@ -162,8 +162,4 @@ std::shared_ptr<const ClockReport> clock_report_untrusted(const net::Pong& pong)
   return report_of(pong.clock());
 }
 
-Duration clock_bound_of(const Greeting& greeting) noexcept {
-  return greeting.clock ? greeting.clock->at(MonoClock::now()).clock.bound : kUnknownClockError;
-}
-
 }  // namespace dssm::wire

@@ -79,7 +79,4 @@ void send_clock(const Greeting& self, proto::ClockReport& out);
 // The report in a Pong that was sent as an event.
 std::shared_ptr<const ClockReport> clock_report_untrusted(const net::Pong& pong);
 
-// The bound that the host of the greeting reported of its clock, aged until now.
-Duration clock_bound_of(const Greeting& greeting) noexcept;
-
 }  // namespace dssm::wire

@@ -48,6 +48,7 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver,
       expected_(expected),
       self_(options.self),
       observer_(observer),
+      status_{.since = loop.now()},
       heartbeat_(EventSource::timer(loop, [this] { beat(); })),
       dialer_(loop, resolver, std::move(options), *this) {}
 
@@ -64,14 +65,12 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const 
 void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) {
   configured_ = addresses.front();
   dialer_.set_addresses(addresses);
-  if (state_ != HostState::up) dialer_.retry_now();
+  if (status_.state != HostState::up) dialer_.retry_now();
 }
 
 void PeerConnection::enter(HostState state, HostReason reason, std::optional<Error> error) {
-  if (state != state_) since_ = loop_.now();
-  state_ = state;
-  reason_ = reason;
-  last_error_ = std::move(error);
+  const MonoTime since = state == status_.state ? status_.since : loop_.now();
+  status_ = {state, reason, since, std::move(error)};
 }
 
 void PeerConnection::on_up(FrameConnection&, const wire::Greeting& them) {
@@ -86,14 +85,14 @@ void PeerConnection::on_up(FrameConnection&, const wire::Greeting& them) {
 }
 
 void PeerConnection::on_down(const Error& error) {
-  const bool attempt = state_ != HostState::up;
+  const bool attempt = status_.state != HostState::up;
   heartbeat_.disable();
   watching_ = false;
-  last_round_trip_ = least_round_trip_ = Duration::zero();
+  round_trips_ = {};
   enter(is_refusal(error) ? HostState::refused : HostState::down,
         reason_of(error, dialer_.reached()), error);
-  const std::map<std::uint64_t, Waiting> unanswered = std::exchange(waiting_, {});
-  waiting_bytes_ = 0;
+  const std::map<std::uint64_t, Waiting> unanswered = std::exchange(requests_.waiting, {});
+  requests_.bytes = 0;
   for (const auto& [serial, waiting] : unanswered) {
     waiting.then(Error{Errc::unavailable,
                        fmt::format("the connection to host '{}' ended before it answered: {}",
@@ -109,23 +108,23 @@ void PeerConnection::ask(net::Frame request, Then then) {
         Error{Errc::unavailable, "the host at '" + address() + "' is not connected any more"});
   }
   const std::size_t bytes = request.ByteSizeLong();
-  if (waiting_.size() >= kMaxWaiting || waiting_bytes_ + bytes > kMaxWaitingBytes) {
+  if (requests_.waiting.size() >= kMaxWaiting || requests_.bytes + bytes > kMaxWaitingBytes) {
     return then(Error{Errc::limit_exceeded,
                       fmt::format("host '{}' has not answered {} requests of this host's programs "
                                   "yet; retry in a second",
-                                  them_->host, waiting_.size())});
+                                  them_->host, requests_.waiting.size())});
   }
-  request.set_serial(next_serial_++);
-  waiting_bytes_ += bytes;
-  waiting_.emplace(request.serial(), Waiting{std::move(then), bytes});
+  request.set_serial(requests_.next_serial++);
+  requests_.bytes += bytes;
+  requests_.waiting.emplace(request.serial(), Waiting{std::move(then), bytes});
   link->send(request);
 }
 
 Result<void> PeerConnection::on_frame(net::Frame& frame) {
   if (frame.serial() != 0) {
-    auto waiting = waiting_.extract(frame.serial());
+    auto waiting = requests_.waiting.extract(frame.serial());
     if (!waiting) return Error{Errc::protocol, "it sends a response without a request"};
-    waiting_bytes_ -= waiting.mapped().bytes;
+    requests_.bytes -= waiting.mapped().bytes;
     if (frame.has_failure()) {
       waiting.mapped().then(wire::failure(frame.failure()));
     } else {
@@ -181,10 +180,9 @@ void PeerConnection::take_clock(std::shared_ptr<const wire::ClockReport> clock) 
 
 void PeerConnection::on_pong(MonoTime asked, const Result<net::Frame>& answer) {
   if (!answer || !answer->has_pong()) return;
-  last_round_trip_ = loop_.now() - asked;
-  least_round_trip_ = least_round_trip_ == Duration::zero()
-                          ? last_round_trip_
-                          : std::min(least_round_trip_, last_round_trip_);
+  const Duration took = loop_.now() - asked;
+  const Duration min = round_trips_.min;
+  round_trips_ = {took, min == Duration::zero() ? took : std::min(min, took)};
   if (!answer->pong().has_clock()) return;
   take_clock(std::make_shared<const wire::ClockReport>(
       wire::clock_report_untrusted(answer->pong().clock(), asked)));

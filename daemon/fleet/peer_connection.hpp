@@ -38,10 +38,10 @@ class PeerConnection final : private Dialer::Observer {
     // After watch(): a change of the peer's streams. Fails when it is not valid.
     virtual Result<void> on_stream_event_untrusted(PeerConnection& connection,
                                                    const proto::StreamEvent& event) = 0;
-    virtual void on_watched(
-        PeerConnection& connection) = 0;  // all streams that it had are reported
-    virtual void on_heartbeat(
-        PeerConnection& connection) = 0;  // them() has the peer's newest clock
+    // All streams that it had are reported.
+    virtual void on_watched(PeerConnection& connection) = 0;
+    // them() has the peer's newest clock.
+    virtual void on_heartbeat(PeerConnection& connection) = 0;
 
    protected:
     ~Observer() = default;
@@ -80,10 +80,12 @@ class PeerConnection final : private Dialer::Observer {
 
   // --- about the peer
 
-  HostState state() const noexcept { return state_; }     // connecting, up, down or refused
-  HostReason reason() const noexcept { return reason_; }  // none while it is up or connecting
-  Duration in_this_state_for() const noexcept { return loop_.now() - since_; }
-  const std::optional<Error>& last_error() const noexcept { return last_error_; }  // while not up
+  HostState state() const noexcept { return status_.state; }  // connecting, up, down or refused
+  HostReason reason() const noexcept {
+    return status_.reason;
+  }  // none while it is up or connecting
+  Duration in_this_state_for() const noexcept { return loop_.now() - status_.since; }
+  const std::optional<Error>& last_error() const noexcept { return status_.error; }  // while not up
   // The greeting of the host that answers there; while it is not up, of the last one.
   const std::optional<wire::Greeting>& them() const noexcept { return them_; }
   // As configured; of a found host: its first address.
@@ -92,12 +94,28 @@ class PeerConnection final : private Dialer::Observer {
   bool crosses_network() const noexcept { return dialer_.crosses_network(); }
 
   // Of the heartbeats of this connection; zero: not known.
-  Duration last_round_trip() const noexcept { return last_round_trip_; }
-  Duration least_round_trip() const noexcept { return least_round_trip_; }
+  Duration last_round_trip() const noexcept { return round_trips_.last; }
+  Duration min_round_trip() const noexcept { return round_trips_.min; }
 
  private:
+  // What state() and the like report.
+  struct Status {
+    HostState state = HostState::connecting;
+    HostReason reason = HostReason::none;
+    MonoTime since{};
+    std::optional<Error> error = {};
+  };
+  struct RoundTrips {
+    Duration last{}, min{};
+  };
   struct Waiting {
     Then then;
+    std::size_t bytes = 0;
+  };
+  // Requests that wait for their answers, by serial.
+  struct Requests {
+    std::uint64_t next_serial = 1;
+    std::map<std::uint64_t, Waiting> waiting;
     std::size_t bytes = 0;
   };
 
@@ -117,16 +135,11 @@ class PeerConnection final : private Dialer::Observer {
   const std::optional<wire::HostId> expected_;
   const wire::Greeting self_;
   Observer& observer_;
-  HostState state_ = HostState::connecting;
-  HostReason reason_ = HostReason::none;
-  MonoTime since_ = loop_.now();
-  std::optional<Error> last_error_;
+  Status status_;
   std::optional<wire::Greeting> them_;
-  Duration last_round_trip_{}, least_round_trip_{};
+  RoundTrips round_trips_;
   bool watching_ = false;
-  std::uint64_t next_serial_ = 1;
-  std::map<std::uint64_t, Waiting> waiting_;
-  std::size_t waiting_bytes_ = 0;
+  Requests requests_;
   EventSource heartbeat_;
   Dialer dialer_;  // last: it calls the others
 };

@@ -80,7 +80,6 @@ PeerProblem PeerReport::namesake_warning(const Peer& peer) const {
 
 local::Host PeerReport::entry(const Peer& peer) const {
   local::Host host;
-  host.set_clock_bound_ns(to_ns(kUnknownClockError));
   if (!peer.is_configured()) {
     const Peer::Found& found = *peer.found;
     host.set_name(found.host.name);
@@ -115,7 +114,7 @@ void PeerReport::add_connection(const Peer& peer, local::Host& host) const {
   }
   host.set_since_ns(to_ns(connection.in_this_state_for()));
   host.set_round_trip_ns(to_ns(connection.last_round_trip()));
-  host.set_least_round_trip_ns(to_ns(connection.least_round_trip()));
+  host.set_least_round_trip_ns(to_ns(connection.min_round_trip()));
   host.set_insecure(connection.crosses_network());
   if (connection.them()) {
     host.set_name(connection.them()->host);
@@ -127,7 +126,6 @@ void PeerReport::add_connection(const Peer& peer, local::Host& host) const {
   }
   set_problem(host, peer.warning.reason, peer.warning.text);
   if (!shows_use(peer)) return;
-  host.set_clock_bound_ns(to_ns(wire::clock_bound_of(peer.them())));
   wire::send_clock(peer.them(), *host.mutable_clock());
   if (const KnownHost* known = catalog_.find(peer.them().host_id)) {
     host.set_streams(static_cast<std::uint32_t>(known->streams.size()));

@@ -20,11 +20,8 @@ StreamId owned_by(const KnownHost& host, const StreamId& id) {
 // Takes over what `host` reports about one of its streams: afterwards every value is valid.
 Result<proto::Stream> stream_untrusted(const std::string& host, proto::Stream stream) {
   stream.mutable_id()->set_host(host);  // no host reports streams of another one
-  const Result<StreamId> id = wire::stream_id_untrusted(stream.id());
-  if (!id) return id.error();
-  if (const Result<TypeInfo> type = wire::type_untrusted(stream.type()); !type) {
-    return type.error();
-  }
+  DSSM_TRY(wire::stream_id_untrusted(stream.id()));
+  DSSM_TRY(wire::type_untrusted(stream.type()));
   for (proto::User& user : *stream.mutable_users()) {
     user.set_program(printable(user.program().substr(0, wire::kMaxProgramBytes)));
   }
@@ -283,7 +280,6 @@ std::vector<local::Host> FleetService::hosts() const {
   self.set_version(self_.greeting.version);
   self.set_state(local::Host::SELF);
   self.set_streams(static_cast<std::uint32_t>(registry_.streams().size()));
-  self.set_clock_bound_ns(to_ns(wire::clock_bound_of(self_.greeting)));
   wire::send_clock(self_.greeting, *self.mutable_clock());
   self.set_insecure(self_.insecure);
   const PeerReport report = peers_.report();

@@ -74,19 +74,21 @@ struct HostInfo {
   std::vector<std::string> addresses;  // as configured and as reached: "pc2:13776"
   std::string version;                 // of its dssmd
   HostState state = HostState::unknown;
-  HostReason reason = HostReason::none;       // why it is not up, or which warning concerns it
-  Duration since{};                           // how long it has been in this state
-  Duration round_trip{};                      // of the last heartbeat (one a second); 0: none yet
-  Duration min_round_trip{};                  // of all heartbeats of this connection; 0: none yet
-  std::uint32_t streams = 0;                  // that it owns
-  Duration clock_bound = kUnknownClockError;  // of its samples' times, against the reference PC
-  std::optional<ClockSnapshot> clock;         // aged to the present; empty: it reports none
+  HostReason reason = HostReason::none;  // why it is not up, or which warning concerns it
+  Duration since{};                      // how long it has been in this state
+  Duration round_trip{};                 // of the last heartbeat (one a second); 0: none yet
+  Duration min_round_trip{};             // of all heartbeats of this connection; 0: none yet
+  std::uint32_t streams = 0;             // that it owns
+  std::optional<ClockSnapshot> clock;    // aged to the present; empty: it reports none
   std::string clock_reference;  // what its clock follows: a host's name or an address, or empty
   Duration clock_distance = kUnknownClockError;  // greatest distance from this PC's clock
   bool insecure = false;                         // its traffic is unencrypted
   std::string error;                             // `reason` in a sentence, for people; empty: none
   std::string id;                     // 32 hex digits, independent of the name; empty: unknown
   std::vector<std::string> found_by;  // "peer" (configured), "mdns"; empty: this PC
+
+  // Of its samples' times, against the reference PC.
+  Duration clock_bound() const noexcept { return clock ? clock->bound : kUnknownClockError; }
 };
 
 // The result of ping().

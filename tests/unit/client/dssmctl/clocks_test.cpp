@@ -12,7 +12,7 @@ HostInfo host(std::string name, HostState state, Duration clock_bound) {
   HostInfo info;
   info.name = std::move(name);
   info.state = state;
-  info.clock_bound = clock_bound;
+  info.clock.emplace().bound = clock_bound;
   return info;
 }
 

@@ -79,7 +79,7 @@ TEST_F(PeersTest, MeasureTheRoundTripAndHearOfTheClock) {
   const local::Host shown = host(0);  // after three answers
   EXPECT_EQ(shown.round_trip_ns(), 7'000'000);
   EXPECT_EQ(shown.least_round_trip_ns(), 3'000'000);
-  EXPECT_EQ(shown.clock_bound_ns(), 1000);
+  EXPECT_EQ(shown.clock().bound_ns(), 1000);
   EXPECT_EQ(catalog.hosts().begin()->second.greeting.clock->clock.bound, Duration(1000));
 }
 
