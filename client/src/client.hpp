@@ -21,7 +21,6 @@
 #include "client/src/daemon_connection.hpp"
 #include "client/src/notifier.hpp"
 #include "client/src/open_streams.hpp"
-#include "client/src/shared_ring.hpp"
 #include "client/src/stream_watches.hpp"
 #include "core/clock/clock_page.hpp"
 #include "core/clock/playback_record.hpp"

@@ -1,7 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// The clocks of the public API: this PC's (clock::now()) and the playback clock.
 #include <dssm/clock.hpp>
+#include <dssm/playback_clock.hpp>
 
 #include "client/src/client.hpp"
+#include "client/src/states.hpp"
 
 namespace dssm::clock {
 
@@ -21,3 +25,65 @@ Reading now() noexcept {
 }
 
 }  // namespace dssm::clock
+
+namespace dssm {
+namespace {
+
+double real_now_s() noexcept { return static_cast<double>(to_ns(WallClock::now())) * 1e-9; }
+
+// The same setting with another rate, so that the clock reads the same now.
+clock::PlaybackSetting rebased(clock::PlaybackSetting setting, double time_s,
+                               double real_s) noexcept {
+  setting.offset_s = time_s - setting.speed * real_s;
+  setting.paused_at_s = time_s;
+  return setting;
+}
+
+}  // namespace
+
+PlaybackClock::PlaybackClock(std::shared_ptr<detail::PlaybackClockState> state) noexcept
+    : state_(std::move(state)) {}
+
+PlaybackClock::Setting PlaybackClock::setting() const noexcept {
+  const clock::PlaybackSetting now = state_->record->load();
+  return {now.offset_s, now.speed, now.paused != 0, now.paused_at_s};
+}
+
+double PlaybackClock::now_s() const noexcept { return state_->record->load().at(real_now_s()); }
+
+void PlaybackClock::reset() noexcept {
+  state_->record->update([](const clock::PlaybackSetting&) { return clock::PlaybackSetting{}; });
+}
+
+void PlaybackClock::set_time(double time_s) noexcept {
+  state_->record->update([&](const clock::PlaybackSetting& setting) {
+    return rebased(setting, time_s, real_now_s());
+  });
+}
+
+void PlaybackClock::set_offset(double offset_s) noexcept {
+  state_->record->update([&](clock::PlaybackSetting setting) {
+    setting.offset_s = offset_s;
+    return setting;
+  });
+}
+
+void PlaybackClock::set_speed(double speed) noexcept {
+  state_->record->update([&](clock::PlaybackSetting setting) {
+    const double real_s = real_now_s();
+    const double time_s = setting.at(real_s);
+    setting.speed = speed;
+    return rebased(setting, time_s, real_s);
+  });
+}
+
+void PlaybackClock::set_paused(bool paused) noexcept {
+  state_->record->update([&](clock::PlaybackSetting setting) {
+    const double real_s = real_now_s();
+    const double time_s = setting.at(real_s);
+    setting.paused = paused;
+    return rebased(setting, time_s, real_s);
+  });
+}
+
+}  // namespace dssm

@@ -5,6 +5,8 @@
 #include <cstdlib>
 #include <dssm/session.hpp>
 
+#include "core/base/try.hpp"
+
 namespace dssm::detail {
 namespace {
 
@@ -44,9 +46,8 @@ Result<std::uint16_t> default_port() {
 }
 
 Result<wire::Address> parse_host(const std::string& text) {
-  auto port = default_port();
-  if (!port) return std::move(port).error();
-  return wire::Address::parse(text.empty() ? "127.0.0.1" : text, *port);
+  const std::uint16_t port = DSSM_TRY(default_port());
+  return wire::Address::parse(text.empty() ? "127.0.0.1" : text, port);
 }
 
 Result<std::vector<wire::SocketAddress>> find_host(const wire::Address& address) {

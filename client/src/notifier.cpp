@@ -38,12 +38,9 @@ void ReadyFd::clear() noexcept {
 }
 
 Result<std::unique_ptr<Notifier>> Notifier::start() {
-  auto fd = ring::create_bell();
-  if (!fd) return std::move(fd).error();
-  auto bell = ring::Bell::open_untrusted(fd->get());
-  if (!bell) return std::move(bell).error();
+  const UniqueFd fd = DSSM_TRY(ring::create_bell());
   std::unique_ptr<Notifier> notifier(new Notifier);
-  notifier->control_ = std::move(*bell);
+  notifier->control_ = DSSM_TRY(ring::Bell::open_untrusted(fd.get()));
   notifier->thread_ =
       DSSM_TRY(quiet_thread("pollable descriptors", [self = notifier.get()] { self->run(); }));
   return notifier;
@@ -113,10 +110,8 @@ Result<std::shared_ptr<ReadyFd>> NotifierPool::watch(ReadyRing ring) {
   for (const auto& notifier : notifiers_) {
     if (notifier->add(ready)) return ready;
   }
-  auto notifier = Notifier::start();
-  if (!notifier) return std::move(notifier).error();
-  (*notifier)->add(ready);
-  notifiers_.push_back(std::move(*notifier));
+  notifiers_.push_back(DSSM_TRY(Notifier::start()));
+  notifiers_.back()->add(ready);
   return ready;
 }
 

@@ -12,7 +12,7 @@
 #include <thread>
 #include <vector>
 
-#include "client/src/shared_ring.hpp"
+#include "client/src/open_streams.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_reader.hpp"
 

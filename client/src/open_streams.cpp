@@ -1,9 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/src/open_streams.hpp"
 
+#include <fmt/format.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
+
 #include <iterator>
+
 #include "core/base/try.hpp"
 
 namespace dssm::detail {
@@ -54,9 +57,9 @@ Result<std::shared_ptr<const SharedRing>> RingCache::get(std::vector<UniqueFd> f
                                                          ring::Access access, bool created) {
   const bool writer = access == ring::Access::read_write;
   if (fds.size() != (writer ? 4 : 3)) {
-    return Error{Errc::protocol, "dssmd sent " + std::to_string(fds.size()) +
-                                     " descriptors with a stream instead of " +
-                                     (writer ? "4" : "3")};
+    return Error{Errc::protocol,
+                 fmt::format("dssmd sent {} descriptors with a stream instead of {}", fds.size(),
+                             writer ? 4 : 3)};
   }
   struct stat file {};
   if (::fstat(fds[0].get(), &file)) return os_error("look at a ring's file");
@@ -66,23 +69,17 @@ Result<std::shared_ptr<const SharedRing>> RingCache::get(std::vector<UniqueFd> f
   if (auto known = rings_.find(key); known != rings_.end()) {
     if (auto ring = known->second.lock()) return ring;
   }
-  auto mapping = ring::RingMapping::open_untrusted(fds[0].get(), access);
-  if (!mapping) return std::move(mapping).error();
-  auto bell = ring::Bell::open_untrusted(fds[1].get());
-  if (!bell) return std::move(bell).error();
-  if (created) {
-    if (Result<void> done = ring::reserve(fds[0].get(), (*mapping)->geometry()); !done) {
-      return std::move(done).error();
-    }
-  }
-  prefault(**mapping);
+  auto mapping = DSSM_TRY(ring::RingMapping::open_untrusted(fds[0].get(), access));
+  auto bell = DSSM_TRY(ring::Bell::open_untrusted(fds[1].get()));
+  if (created) DSSM_TRY(ring::reserve(fds[0].get(), mapping->geometry()));
+  prefault(*mapping);
   auto ring = std::make_shared<SharedRing>();
   ring->ring_fd = std::move(fds[0]);
   ring->bell_fd = std::move(fds[1]);
   ring->meta_fd = std::move(fds[2]);
   if (writer) ring->doorbell_fd = std::move(fds[3]);
-  ring->mapping = std::move(*mapping);
-  ring->bell = std::move(*bell);
+  ring->mapping = std::move(mapping);
+  ring->bell = std::move(bell);
   rings_[key] = ring;
   return std::shared_ptr<const SharedRing>(std::move(ring));
 }

@@ -9,22 +9,22 @@
 //                them again
 #pragma once
 
+#include <atomic>
 #include <dssm/stream.hpp>
 #include <map>
 #include <memory>
 #include <mutex>
 #include <tuple>
 #include <vector>
+
+#include "client/src/daemon_connection.hpp"
 #include "core/base/unique_fd.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_memory.hpp"
-#include <atomic>
-#include "client/src/daemon_connection.hpp"
 
 namespace dssm::detail {
 
-// One ring as this process holds it: descriptors, mapping and bell, shared by all readers or all
-// writers of the stream in the process, so that opening a stream a hundred times maps it once.
+// Descriptors, mapping and bell, shared by all readers or all writers of the stream in the process.
 // Immutable once made. The descriptors are kept to offer the ring back to a restarted dssmd.
 struct SharedRing {
   UniqueFd ring_fd, bell_fd, meta_fd;
@@ -48,8 +48,6 @@ class RingCache {
   std::map<Key, std::weak_ptr<const SharedRing>> rings_;
 };
 
-// The streams that this process has open, as dssmd knows them: one handle each, on one connection.
-// A new connection begins with offering all their rings, so that a restarted dssmd has them again.
 class Client;
 
 // One stream opened by one reader or writer; closed at dssmd when destroyed.

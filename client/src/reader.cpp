@@ -12,6 +12,7 @@
 #include "client/src/client.hpp"
 #include "client/src/states.hpp"
 #include "core/base/check.hpp"
+#include "core/base/try.hpp"
 #include "core/clock/coarse_now.hpp"
 
 namespace dssm {
@@ -369,10 +370,8 @@ WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noex
 
 Result<int> RawReader::ready_fd() noexcept {
   if (!state_->ready) {
-    auto ready = state_->stream->client->notifiers().watch(
-        {state_->stream->ring, state_->stream->superseded, state_->cursor});
-    if (!ready) return std::move(ready).error();
-    state_->ready = std::move(*ready);
+    state_->ready = DSSM_TRY(state_->stream->client->notifiers().watch(
+        {state_->stream->ring, state_->stream->superseded, state_->cursor}));
   }
   return state_->ready->fd();
 }

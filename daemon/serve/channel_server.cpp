@@ -5,6 +5,7 @@
 
 #include <utility>
 
+#include "core/base/try.hpp"
 #include "core/wire/tcp.hpp"
 #include "daemon/base/message_ids.hpp"
 
@@ -56,9 +57,8 @@ Result<void> ChannelServer::accept(UniqueFd& socket) {
 
 Result<void> ChannelServer::adopt(std::unique_ptr<wire::Transport> transport,
                                   const wire::SocketAddress& address) {
-  Result<PeerPlace> place = peers_.admit(address);
-  if (!place) return std::move(place).error();
-  keep(*std::move(place), std::move(transport), address);
+  PeerPlace place = DSSM_TRY(peers_.admit(address));
+  keep(std::move(place), std::move(transport), address);
   return {};
 }
 

@@ -90,11 +90,7 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
                      std::to_string(request.max_rate_hz()) +
                      "; give 0 for all samples, or how many per second at most"};
   }
-  if (!feed_) {
-    Result<std::shared_ptr<StreamFeed>> feed = served_->feed();
-    if (!feed) return std::move(feed).error();
-    feed_ = *std::move(feed);
-  }
+  if (!feed_) feed_ = DSSM_TRY(served_->feed());
   feed_->forget(*this);
   due_.disable();
   const Tid newest = newest_untrusted(reader_);
@@ -308,11 +304,9 @@ Result<void> StreamChannel::get_range(std::uint64_t serial, const net::GetRange&
 Result<void> StreamChannel::start_publishing(std::uint64_t serial,
                                              const net::StartPublishing& request) {
   receiver_.reset();
-  Result<std::unique_ptr<SampleReceiver>> receiver =
-      SampleReceiver::open(parts_.loop, parts_.link, parts_.budget, *served_, request.publisher());
-  if (!receiver) return std::move(receiver).error();
-  receiver_ = *std::move(receiver);
-  if (Result<void> assessed = assess_writer(); !assessed) return assessed;
+  receiver_ = DSSM_TRY(
+      SampleReceiver::open(parts_.loop, parts_.link, parts_.budget, *served_, request.publisher()));
+  DSSM_TRY(assess_writer());
   const ring::PublisherCursors::Last last = receiver_->last();
   net::Frame frame = answer_to(serial);
   net::Publishing& publishing = *frame.mutable_publishing();

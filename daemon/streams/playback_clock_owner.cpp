@@ -14,9 +14,7 @@ Result<void> PlaybackClockOwner::adopt_untrusted(UniqueFd offered) {
     return Error{Errc::conflict, "another playback clock is in use by now"};
   }
   DSSM_TRY(check_own_memory_file(offered.get(), kSizeSeals, "playback clock"));
-  if (auto record = clock::PlaybackRecord::open_untrusted(offered.get()); !record) {
-    return std::move(record).error();
-  }
+  DSSM_TRY(clock::PlaybackRecord::open_untrusted(offered.get()));
   take(std::move(offered));
   return {};
 }

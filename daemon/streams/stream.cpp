@@ -131,31 +131,28 @@ Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& b
   std::vector<UniqueFd> doorbells;
   doorbells.push_back(std::move(doorbell));
   MetaFile meta = DSSM_TRY(MetaFile::create(meta_of(plan, {})));
-  auto mapping = ring::RingMapping::open_untrusted(ring.get(), ring::Access::read_only);
-  if (!mapping) return std::move(mapping).error();
+  auto mapping = DSSM_TRY(ring::RingMapping::open_untrusted(ring.get(), ring::Access::read_only));
   return std::shared_ptr<Stream>(
       new Stream(plan, Files{std::move(ring), std::move(bell), std::move(doorbells)},
-                 std::move(meta), *std::move(mapping), std::move(share)));
+                 std::move(meta), std::move(mapping), std::move(share)));
 }
 
 Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, MemoryBudget& budget) {
   DSSM_TRY(check_own_memory_file(files.ring.get(), kSizeSeals, "ring"));
   DSSM_TRY(check_own_memory_file(files.bell.get(), kSizeSeals, "bell"));
-  auto mapping = ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_only);
-  if (!mapping) return std::move(mapping).error();
-  if (auto bell = ring::Bell::open_untrusted(files.bell.get()); !bell) {
-    return std::move(bell).error();
-  }
+  auto mapping =
+      DSSM_TRY(ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_only));
+  DSSM_TRY(ring::Bell::open_untrusted(files.bell.get()));
   MetaFile meta = DSSM_TRY(MetaFile::open_untrusted(std::move(files.meta)));
   const local::StreamMeta content = DSSM_TRY(meta.read_untrusted());
-  Plan plan = DSSM_TRY(plan_untrusted(content, **mapping));
-  MemoryShare share = DSSM_TRY(take_share(budget, plan.type, (*mapping)->geometry()));
+  Plan plan = DSSM_TRY(plan_untrusted(content, *mapping));
+  MemoryShare share = DSSM_TRY(take_share(budget, plan.type, mapping->geometry()));
   MemoryShare property_share = DSSM_TRY(budget.take(content.property().size()));
   // Always a new one: writers get a descriptor that does not depend on the client's.
   UniqueFd ring = DSSM_TRY(reopen_read_write(files.ring.get()));
-  std::shared_ptr<Stream> stream(
-      new Stream(std::move(plan), Files{std::move(ring), std::move(files.bell), {}},
-                 std::move(meta), *std::move(mapping), std::move(share)));
+  std::shared_ptr<Stream> stream(new Stream(std::move(plan),
+                                            Files{std::move(ring), std::move(files.bell), {}},
+                                            std::move(meta), std::move(mapping), std::move(share)));
   stream->property_share_ = std::move(property_share);
   stream->take_doorbell_untrusted(std::move(files.doorbell));
   return stream;
@@ -180,17 +177,13 @@ Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role) {
   if (role == Role::writer && files_.doorbells.empty()) {
     add_doorbell(DSSM_TRY(create_doorbell()));
   }
-  Result<UniqueFd> all[] = {
-      role == Role::writer ? duplicate(files_.ring.get()) : reopen_read_only(files_.ring.get()),
-      duplicate(files_.bell.get()),
-      reopen_read_only(meta_.fd()),
-      role == Role::writer ? duplicate(files_.doorbells.front().get()) : UniqueFd(),
-  };
+  const bool writes = role == Role::writer;
+  const int ring = files_.ring.get();
   std::vector<UniqueFd> descriptors;
-  for (Result<UniqueFd>& one : all) {
-    if (!one) return std::move(one).error();
-    if (*one) descriptors.push_back(*std::move(one));
-  }
+  descriptors.push_back(DSSM_TRY(writes ? duplicate(ring) : reopen_read_only(ring)));
+  descriptors.push_back(DSSM_TRY(duplicate(files_.bell.get())));
+  descriptors.push_back(DSSM_TRY(reopen_read_only(meta_.fd())));
+  if (writes) descriptors.push_back(DSSM_TRY(duplicate(files_.doorbells.front().get())));
   return descriptors;
 }
 
