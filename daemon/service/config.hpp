@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmd's configuration: one table of keys that serves the file, the flags, the help text and the
-// checks alike. A key `max_streams` in the file is the flag --max-streams; both are
-// parsed and checked in the same way. A key that is a list is a flag that may be repeated; where the flag is
+// checks alike. A key `max_streams` in the file is the flag --max-streams; both are parsed and
+// checked in the same way. A key that is a list is a flag that may be repeated; where the flag is
 // given, it replaces the file's list. docs/configuration.md explains each key to a person.
 #pragma once
 
@@ -24,8 +24,8 @@
 
 namespace dssm::daemon {
 
-// The highest values that may be configured; chosen so that a list of all streams, clients or opens still fits
-// into one frame of the local protocol (17 MiB) with the longest names.
+// The highest values that may be configured; chosen so that a list of all streams, clients or opens
+// still fits into one frame of the local protocol (17 MiB) with the longest names.
 inline constexpr std::uint64_t kMaxStreams = 32768;
 inline constexpr std::uint64_t kMaxClients = 32768;
 inline constexpr std::uint64_t kMaxOpens = 100'000;
