@@ -9,7 +9,7 @@
 
 #include "client/src/program_name.hpp"
 #include "core/base/quiet_thread.hpp"
-#include "core/base/timespec.hpp"
+#include "core/base/time.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::detail {

@@ -2,12 +2,15 @@
 #include "client/src/network_connection.hpp"
 
 #include <poll.h>
+#include <sys/epoll.h>
+#include <sys/timerfd.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <array>
 
 #include "core/base/text.hpp"
+#include "core/base/time.hpp"
 #include "core/base/try.hpp"
 #include "core/clock/clock_page.hpp"
 #include "core/wire/frame.hpp"
@@ -242,6 +245,38 @@ int NetworkConnection::fd() const noexcept {
 short NetworkConnection::events(bool more_to_send) const noexcept {
   if (phase_ == Phase::connecting) return POLLOUT;
   return static_cast<short>(POLLIN | (has_queued() || more_to_send ? POLLOUT : 0));
+}
+
+bool NetworkConnection::make_epoll() noexcept {
+  if (epoll_) return true;
+  UniqueFd epoll(::epoll_create1(EPOLL_CLOEXEC));
+  timer_.reset(::timerfd_create(CLOCK_MONOTONIC, TFD_CLOEXEC | TFD_NONBLOCK));
+  epoll_event event{};
+  event.events = EPOLLIN;
+  event.data.fd = timer_.get();
+  if (!epoll || !timer_ || ::epoll_ctl(epoll.get(), EPOLL_CTL_ADD, timer_.get(), &event)) {
+    return false;
+  }
+  epoll_ = std::move(epoll);
+  return true;
+}
+
+int NetworkConnection::ready_fd(bool more_to_send, MonoTime at) noexcept {
+  if (!make_epoll()) return fd();
+  // The socket may be another one with the number of the last: a closed one leaves the set by
+  // itself.
+  if (fd() >= 0) {
+    epoll_event event{};
+    event.events = static_cast<std::uint32_t>(events(more_to_send));  // poll's bits are epoll's
+    event.data.fd = fd();
+    if (::epoll_ctl(epoll_.get(), EPOLL_CTL_MOD, fd(), &event)) {
+      ::epoll_ctl(epoll_.get(), EPOLL_CTL_ADD, fd(), &event);
+    }
+  }
+  itimerspec timer{};  // all 0: off
+  if (at != kNever) timer.it_value = timespec_of(std::max(at, MonoTime(Duration(1))));
+  ::timerfd_settime(timer_.get(), TFD_TIMER_ABSTIME, &timer, nullptr);
+  return epoll_.get();
 }
 
 }  // namespace dssm::detail

@@ -91,6 +91,11 @@ class NetworkConnection final : private wire::FrameDelegate {
   // When advance() has to be called at the latest; while it is down: when start() may be called.
   MonoTime next_step() const noexcept { return step_at_; }
 
+  // One descriptor for poll() and event libraries that covers this connection across reconnects:
+  // readable when its socket is ready for events(more_to_send), or at the time `at`. Owned by this
+  // object; fd(), when none can be made.
+  int ready_fd(bool more_to_send, MonoTime at) noexcept;
+
   // "10.0.0.2:13776": what it is connected to, or tried last; empty before the first start().
   const std::string& address() const noexcept { return address_; }
 
@@ -104,6 +109,7 @@ class NetworkConnection final : private wire::FrameDelegate {
   Result<void> connect_next(Error why);
   Result<void> greet();
   Result<wire::IoStatus> on_received(const Result<wire::IoResult>& received);
+  bool make_epoll() noexcept;
   Error fail(Error why);
   Error closed_error() const;
 
@@ -123,6 +129,7 @@ class NetworkConnection final : private wire::FrameDelegate {
   SpinBudget spin_budget_;
   std::string queued_;
   std::size_t queued_from_ = 0;
+  UniqueFd epoll_, timer_;  // of ready_fd(); made when it is first called
 };
 
 }  // namespace dssm::detail

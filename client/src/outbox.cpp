@@ -8,6 +8,7 @@
 #include <cstring>
 
 #include "core/base/check.hpp"
+#include "core/base/try.hpp"
 #include "core/wire/sample_frame.hpp"
 
 namespace dssm::detail {
@@ -142,7 +143,7 @@ void Outbox::on_down() noexcept {
 }
 
 Result<void> Outbox::restart(std::int64_t last, Tid tid) {
-  if (Result<void> done = acknowledge(last, tid); !done) return done;
+  DSSM_TRY(acknowledge(last, tid));
   // Samples that the owner has not written and that are not kept any more are lost.
   for (const Range& lost : unacked_dropped_)
     dropped_ += static_cast<std::uint64_t>(lost.to - lost.from);

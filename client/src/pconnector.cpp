@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// PConnector's requests in the network protocol's words; the rest is Channel's.
+// PConnector's requests in the network protocol's words; the rest is StreamClient's.
+#include <fmt/format.h>
 #include <poll.h>
 
 #include <algorithm>
@@ -10,7 +11,7 @@
 #include "client/src/program_name.hpp"
 #include "client/src/states.hpp"
 #include "client/src/stream_client.hpp"
-#include "core/base/timespec.hpp"
+#include "core/base/time.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm {
@@ -51,7 +52,7 @@ Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
                                options.request_timeout);
   DSSM_TRY(connection.start(find_host(host)));
   for (bool asked = false; !delegate.streams;) {
-    if (Result<void> done = connection.advance(); !done) return std::move(done).error();
+    DSSM_TRY(connection.advance());
     if (connection.is_up() && !asked) {
       asked = true;
       net::Frame frame;
@@ -59,15 +60,11 @@ Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
       frame.mutable_list();
       connection.queue(frame);
     }
-    if (connection.is_up() && connection.has_queued()) {
-      if (Result<void> sent = connection.send_queued(); !sent) return std::move(sent).error();
-    }
+    if (connection.is_up() && connection.has_queued()) DSSM_TRY(connection.send_queued());
     const MonoTime now = MonoClock::now();
     const timespec timeout = timespec_of(std::min(deadline, connection.next_step()) - now);
     pollfd ready{connection.fd(), connection.events(false), 0};
-    if (::ppoll(&ready, 1, &timeout, nullptr) > 0) {
-      if (auto received = connection.receive(); !received) return std::move(received).error();
-    }
+    if (::ppoll(&ready, 1, &timeout, nullptr) > 0) DSSM_TRY(connection.receive());
     // After what has arrived was looked at: this program may have been stalled.
     if (now >= deadline && !delegate.streams) return connection.no_answer_error();
   }
@@ -93,42 +90,32 @@ PConnector::~PConnector() = default;
 Result<PConnector> PConnector::open(const StreamId& id, PConnectorOptions options,
                                     const TypeInfo* wanted) {
   const std::string what = detail::attempt("open", id, options);
-  if (Result<void> checked = id.check(); !checked) return std::move(checked).error().context(what);
-  auto client = detail::StreamClient::open({id}, std::move(options));
-  if (!client) return std::move(client).error().context(what);
-  if (wanted) {
-    if (Result<void> usable = (*client)->stream().type.check_usable_as(*wanted); !usable) {
-      return std::move(usable).error().context(what);
-    }
-  }
-  return PConnector(std::make_unique<detail::PConnectorState>(std::move(*client)));
+  DSSM_TRY(id.check(), what);
+  auto client = DSSM_TRY(detail::StreamClient::open({id}, std::move(options)), what);
+  if (wanted) DSSM_TRY(client->stream().type.check_usable_as(*wanted), what);
+  return PConnector(std::make_unique<detail::PConnectorState>(std::move(client)));
 }
 
 Result<PConnector> PConnector::create(const StreamId& id, const TypeInfo& type,
                                       const History& history, PConnectorOptions options) {
   const std::string what = detail::attempt("create", id, options);
-  if (Result<void> checked = id.check(); !checked) return std::move(checked).error().context(what);
-  if (Result<void> checked = type.check(); !checked) {
-    return std::move(checked).error().context(what);
-  }
-  auto client =
-      detail::StreamClient::open({id, channel::CreatePlan{type, history}}, std::move(options));
-  if (!client) return std::move(client).error().context(what);
-  return PConnector(std::make_unique<detail::PConnectorState>(std::move(*client)));
+  DSSM_TRY(id.check(), what);
+  DSSM_TRY(type.check(), what);
+  auto client = DSSM_TRY(
+      detail::StreamClient::open({id, channel::CreatePlan{type, history}}, std::move(options)),
+      what);
+  return PConnector(std::make_unique<detail::PConnectorState>(std::move(client)));
 }
 
 Result<std::vector<StreamInfo>> PConnector::list_streams(const PConnectorOptions& options) {
   const std::string what = "list the streams of '" + options.address + "'";
-  auto host = detail::parse_host(options.address);
-  if (!host) return std::move(host).error().context(what);
-  auto streams = detail::list_streams(*host, options);
-  if (!streams) return std::move(streams).error().context(what);
-  return streams;
+  const wire::Address host = DSSM_TRY(detail::parse_host(options.address), what);
+  return DSSM_TRY(detail::list_streams(host, options), what);
 }
 
 // --- reading
 
-using Which = detail::ReadRequest::Which;
+using Which = wire::ReadRequest::Which;
 
 Result<ReadStatus> PConnector::read_newest(std::span<std::byte> payload, SampleInfo& info) {
   return state_->client->read({Which::newest}, payload, info);
@@ -153,31 +140,23 @@ Result<net::Range> ask_range(detail::StreamClient& client, std::optional<Time> t
   net::Frame frame;
   frame.mutable_get_range();
   if (t) frame.mutable_get_range()->set_time_ns(to_ns(*t));
-  auto answer = client.ask(std::move(frame));
-  if (!answer) {
-    return std::move(answer).error().context("look at '" + client.stream().id.str() + "'");
-  }
-  return std::move(*answer->mutable_range());
+  net::Frame answer =
+      DSSM_TRY(client.ask(std::move(frame)), "look at '" + client.stream().id.str() + "'");
+  return std::move(*answer.mutable_range());
 }
 
 }  // namespace
 
 Result<Tid> PConnector::newest_tid() {
-  auto range = ask_range(*state_->client, std::nullopt);
-  if (!range) return std::move(range).error();
-  return std::max(range->newest(), kNoTid);
+  return std::max(DSSM_TRY(ask_range(*state_->client, std::nullopt)).newest(), kNoTid);
 }
 
 Result<Tid> PConnector::oldest_tid() {
-  auto range = ask_range(*state_->client, std::nullopt);
-  if (!range) return std::move(range).error();
-  return std::max(range->oldest(), kNoTid);
+  return std::max(DSSM_TRY(ask_range(*state_->client, std::nullopt)).oldest(), kNoTid);
 }
 
 Result<Tid> PConnector::find(Time t) {
-  auto range = ask_range(*state_->client, t);
-  if (!range) return std::move(range).error();
-  return std::max(range->at_tid(), kNoTid);
+  return std::max(DSSM_TRY(ask_range(*state_->client, t)).at_tid(), kNoTid);
 }
 
 // --- subscription
@@ -200,9 +179,7 @@ int PConnector::ready_fd() const noexcept { return state_->client->ready_fd(); }
 // --- writing
 
 Result<Tid> PConnector::write(std::span<const std::byte> payload, Time time, Duration clock_error) {
-  if (Result<void> posted = post(payload, time, clock_error); !posted) {
-    return std::move(posted).error();
-  }
+  DSSM_TRY(post(payload, time, clock_error));
   return flush(deadline_in(state_->client->request_timeout()));
 }
 
@@ -221,9 +198,9 @@ std::uint64_t PConnector::dropped_samples() const noexcept { return state_->clie
 Result<std::vector<std::byte>> PConnector::property() {
   net::Frame frame;
   frame.mutable_get_property();
-  auto answer = state_->client->ask(std::move(frame));
-  if (!answer) return std::move(answer).error().context("get the property of '" + id().str() + "'");
-  const std::string& property = answer->property().property();
+  const net::Frame answer =
+      DSSM_TRY(state_->client->ask(std::move(frame)), "get the property of '" + id().str() + "'");
+  const std::string& property = answer.property().property();
   const auto* bytes = reinterpret_cast<const std::byte*>(property.data());
   return std::vector<std::byte>(bytes, bytes + property.size());
 }
@@ -231,14 +208,12 @@ Result<std::vector<std::byte>> PConnector::property() {
 Result<void> PConnector::set_property(std::span<const std::byte> property) {
   const std::string what = "set the property of '" + id().str() + "'";
   if (property.size() > wire::kMaxPropertyBytes) {
-    return Error{Errc::limit_exceeded, what + ": it has " + std::to_string(property.size()) +
-                                           " bytes; at most " +
-                                           std::to_string(wire::kMaxPropertyBytes) + " are taken"};
+    return Error{Errc::limit_exceeded, fmt::format("{}: it has {} bytes; at most {} are taken",
+                                                   what, property.size(), wire::kMaxPropertyBytes)};
   }
   net::Frame frame;
   frame.mutable_set_property()->set_property(property.data(), property.size());
-  auto answer = state_->client->ask(std::move(frame));
-  if (!answer) return std::move(answer).error().context(what);
+  DSSM_TRY(state_->client->ask(std::move(frame)), what);
   return {};
 }
 

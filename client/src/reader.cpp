@@ -12,8 +12,8 @@
 #include "client/src/client.hpp"
 #include "client/src/states.hpp"
 #include "core/base/check.hpp"
+#include "core/base/time.hpp"
 #include "core/base/try.hpp"
-#include "core/clock/coarse_now.hpp"
 
 namespace dssm {
 namespace {
@@ -43,7 +43,6 @@ Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
 }
 
 // Assessments are valid for seconds, so a coarse clock is precise enough.
-using clock::coarse_now;
 
 // Whether reads by time must not return that sample.
 bool is_refused(const ring::RingReader& ring, const SampleInfo& info) noexcept {

@@ -10,7 +10,7 @@
 #include <optional>
 
 #include "client/src/client.hpp"
-#include "core/clock/clock_error_cache.hpp"
+#include "core/clock/clock_page.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "core/ring/ring_writer.hpp"
 

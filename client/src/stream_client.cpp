@@ -10,7 +10,7 @@
 
 #include "client/src/find_host.hpp"
 #include "client/src/program_name.hpp"
-#include "core/base/timespec.hpp"
+#include "core/base/time.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::detail {
@@ -372,8 +372,8 @@ Result<net::Frame> StreamClient::ask(net::Frame request) {
   return std::move(request_.answer);
 }
 
-Result<ReadStatus> StreamClient::read(const ReadRequest& request, std::span<std::byte> payload,
-                                      SampleInfo& info) {
+Result<ReadStatus> StreamClient::read(const wire::ReadRequest& request,
+                                      std::span<std::byte> payload, SampleInfo& info) {
   if (payload.size() != stream_.type.payload_bytes) {
     return size_error("read", payload.size());
   }
@@ -381,8 +381,8 @@ Result<ReadStatus> StreamClient::read(const ReadRequest& request, std::span<std:
     if (std::exchange(restart_.pending, false)) return ReadStatus::restarted;
     request_.target = payload.data();
     Result<void> done = exchange([&](std::uint64_t serial) {
-      std::array<std::byte, kMaxReadRequestBytes> bytes;
-      connection_.queue(std::span(bytes).first(encode_read_request(bytes, serial, request)));
+      std::array<std::byte, wire::kMaxReadRequestBytes> bytes;
+      connection_.queue(std::span(bytes).first(wire::encode_read_request(bytes, serial, request)));
     });
     request_.target = nullptr;
     if (!done) return std::move(done).error().context(what("read"));
@@ -491,15 +491,8 @@ Result<void> StreamClient::unsubscribe() {
 }
 
 int StreamClient::ready_fd() noexcept {
-  if (!readiness_) {
-    auto made = Readiness::make();
-    if (!made) return connection_.fd();
-    readiness_ = std::move(*made);
-  }
   const bool has_one = sample_waits_ || subscriber_->has_buffered();
-  readiness_->follow(connection_.fd(), connection_.events(has_more_to_send()),
-                     has_one ? MonoTime::min() : next_step());
-  return readiness_->fd();
+  return connection_.ready_fd(has_more_to_send(), has_one ? MonoTime::min() : next_step());
 }
 
 // --- publishing

@@ -20,10 +20,9 @@
 
 #include "client/src/network_connection.hpp"
 #include "client/src/outbox.hpp"
-#include "client/src/read_request.hpp"
-#include "client/src/readiness.hpp"
 #include "client/src/subscriber.hpp"
 #include "core/channel/channel_client.hpp"
+#include "core/wire/sample_frame.hpp"
 
 namespace dssm::detail {
 
@@ -48,7 +47,7 @@ class StreamClient final : private wire::FrameDelegate, private channel::Channel
   //   fails  also: unavailable, protocol, and as open()
   Result<net::Frame> ask(net::Frame request);
   // The same for Read, whose answer is a sample or NoSample.
-  Result<ReadStatus> read(const ReadRequest& request, std::span<std::byte> payload,
+  Result<ReadStatus> read(const wire::ReadRequest& request, std::span<std::byte> payload,
                           SampleInfo& info);
 
   // --- as PConnector
@@ -171,7 +170,6 @@ class StreamClient final : private wire::FrameDelegate, private channel::Channel
   std::unique_ptr<Subscriber> subscriber_;  // both made when the payload's size is known
   std::unique_ptr<Outbox> outbox_;
   Publishing publishing_;
-  std::optional<Readiness> readiness_;
 };
 
 }  // namespace dssm::detail

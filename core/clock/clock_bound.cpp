@@ -36,10 +36,10 @@ Duration bound_to_reference(Duration offset, const RootDistance& own,
 
 Duration growth(Duration age, PartsPerBillion drift) noexcept {
   if (age <= kNone) return kNone;
-  constexpr std::int64_t kBillion = 1'000'000'000, kMost = std::numeric_limits<std::int64_t>::max();
+  constexpr std::int64_t kBillion = 1'000'000'000, kMax = std::numeric_limits<std::int64_t>::max();
   // Whole seconds and the rest apart, so that neither product overflows for an honest age.
   const std::int64_t seconds = age.count() / kBillion, rest = age.count() % kBillion;
-  if (drift > kMost / kBillion || (drift > 0 && seconds > (kMost - 2 * drift) / drift)) {
+  if (drift > kMax / kBillion || (drift > 0 && seconds > (kMax - 2 * drift) / drift)) {
     return kUnknownClockError;
   }
   return Duration(seconds * drift + (rest * drift + kBillion - 1) / kBillion);

@@ -12,7 +12,7 @@
 #include <cstdint>
 #include <dssm/clock_status.hpp>
 
-#include "core/base/bound_sum.hpp"
+#include "core/base/time.hpp"
 
 namespace dssm::clock {
 

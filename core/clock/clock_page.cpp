@@ -11,11 +11,12 @@
 #include <mutex>
 #include <utility>
 
-#include "core/base/bound_sum.hpp"
+#include "core/base/time.hpp"
 #include "core/base/try.hpp"
 #include "core/base/unique_fd.hpp"
 
 namespace dssm::clock {
+
 namespace {
 
 constexpr std::size_t kBootIdBytes = 36;
@@ -47,7 +48,7 @@ std::optional<Duration> clock_error_at(const ClockPage& page, Time t) noexcept {
   // Unsigned: the two may be further apart than 2^63 ns.
   const std::uint64_t age =
       static_cast<std::uint64_t>(to_ns(t)) - static_cast<std::uint64_t>(to_ns(state.wall));
-  if (age > static_cast<std::uint64_t>(to_ns(kLongestUse))) return std::nullopt;
+  if (age > static_cast<std::uint64_t>(to_ns(kMaxUse))) return std::nullopt;
   if (state.clock.bound == kUnknownClockError) return kUnknownClockError;
   // At most 3.5e9 * 10^6, so it does not overflow; the division rounds up.
   const std::uint64_t growth =
@@ -57,7 +58,7 @@ std::optional<Duration> clock_error_at(const ClockPage& page, Time t) noexcept {
 
 ClockStatus status_of(const ClockPage& page) noexcept {
   const ClockPageState state = stamp_state(page);
-  return MonoClock::now() - state.mono > kLongestUse ? ClockStatus::unknown : state.clock.status;
+  return MonoClock::now() - state.mono > kMaxUse ? ClockStatus::unknown : state.clock.status;
 }
 
 Result<ClockPage*> map_page_untrusted(int fd, int protection) {
@@ -87,6 +88,26 @@ Result<const ClockPage*> map_clock_page_untrusted(int fd) {
   const ClockPage* page = DSSM_TRY(map_page_untrusted(fd, PROT_READ));
   pages.emplace(key, page);
   return page;
+}
+
+namespace {
+
+constexpr std::uint64_t kBillion = 1'000'000'000;
+// A greater bound does not grow, so that the sum does not overflow.
+constexpr std::int64_t kMaxGrowingNs = INT64_MAX - (std::int64_t{1} << 32);
+
+}  // namespace
+
+void ClockErrorCache::refresh(const ClockPage& page) noexcept {
+  ClockPageState state;
+  generation_ = page.state.load<ClockPageState::kStampBytes>(state);
+  page_ = &page;
+  wall_ns_ = to_ns(state.wall);
+  const bool grows = to_ns(state.clock.bound) <= kMaxGrowingNs;
+  bound_ns_ = grows ? to_ns(state.clock.bound) : INT64_MAX;
+  // At most 10^6 * 2^32, and in find() 3.5e9 * 4.3e6, so neither overflows; rounds up.
+  const auto ageing = static_cast<std::uint64_t>(grows ? state.clock.ageing_ppb : 0);
+  growth_ = ((ageing << 32) + kBillion - 1) / kBillion;
 }
 
 }  // namespace dssm::clock

@@ -10,6 +10,7 @@
 #include <cstdint>
 #include <dssm/clock_status.hpp>
 #include <dssm/result.hpp>
+#include <dssm/time.hpp>
 #include <optional>
 #include <string>
 
@@ -67,7 +68,7 @@ struct ClockPage {
 static_assert(offsetof(ClockPage, state) == 56 && sizeof(ClockPage) == 4096);
 
 // A statement that is older says nothing: dssmd states the clock every second.
-inline constexpr Duration kLongestUse = std::chrono::milliseconds(3500);
+inline constexpr Duration kMaxUse = std::chrono::milliseconds(3500);
 
 // How far this PC's clock may have been from its reference at `t`, a time by this clock.
 //   returns  kUnknownClockError: not known then. nullopt: the page does not cover `t`: it is not a
@@ -75,7 +76,7 @@ inline constexpr Duration kLongestUse = std::chrono::milliseconds(3500);
 //   threads  any; async-signal-safe; no system call
 std::optional<Duration> clock_error_at(const ClockPage& page, Time t) noexcept;
 
-// The status of the clock; `unknown` when none was stated for kLongestUse. As clock_error_at().
+// The status of the clock; `unknown` when none was stated for kMaxUse. As clock_error_at().
 ClockStatus status_of(const ClockPage& page) noexcept;
 
 // Maps `fd` as a clock page.
@@ -90,5 +91,38 @@ Result<const ClockPage*> map_clock_page_untrusted(int fd);
 
 // /proc/sys/kernel/random/boot_id; empty when it cannot be read.
 std::string boot_id();
+
+// clock_error_at() for a writer that stamps each sample: what the page states is kept until its
+// generation changes. So the loads of one answer do not wait for each other, and it costs a few
+// instructions that the processor does beside others (docs/benchmarks.md "Stamping"). Of one
+// thread.
+class ClockErrorCache {
+ public:
+  // Whether `t` is not before the page's latest statement; then `error` is what clock_error_at()
+  // returns, or some nanoseconds more. False: call that. page: nullptr: there is none.
+  bool find(const ClockPage* page, Time t, Duration& error) noexcept {
+    if (!page) return false;
+    // Nearly always the same, so the processor goes on before it knows.
+    if (page != page_ || page->state.generation() != generation_) {
+      refresh(*page);
+    }
+    const std::uint64_t age =
+        static_cast<std::uint64_t>(to_ns(t)) - static_cast<std::uint64_t>(wall_ns_);
+    if (age > static_cast<std::uint64_t>(to_ns(kMaxUse))) return false;
+    error = Duration(bound_ns_ + static_cast<std::int64_t>((age * growth_ + kRoundUp) >> 32));
+    return true;
+  }
+
+ private:
+  static constexpr std::uint64_t kRoundUp = (std::uint64_t{1} << 32) - 1;
+
+  void refresh(const ClockPage& page) noexcept;
+
+  const ClockPage* page_ = nullptr;
+  std::uint64_t generation_ = 0;
+  std::int64_t wall_ns_ = 0;
+  std::int64_t bound_ns_ = 0;  // 2^63-1: none
+  std::uint64_t growth_ = 0;   // of it, 2^-32 ns per ns
+};
 
 }  // namespace dssm::clock

@@ -10,7 +10,7 @@
 #include <cerrno>
 #include <climits>
 
-#include "core/base/timespec.hpp"
+#include "core/base/time.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::ring {

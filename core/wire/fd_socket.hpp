@@ -10,7 +10,7 @@
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
-#include "core/wire/io_result.hpp"
+#include "core/wire/transport.hpp"
 
 namespace dssm::wire {
 

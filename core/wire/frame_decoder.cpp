@@ -18,9 +18,9 @@
 #include <cstring>
 
 #include "core/base/check.hpp"
+#include "core/base/try.hpp"
 #include "core/wire/network_protocol.hpp"
-#include "core/wire/sample_head.hpp"
-#include "core/wire/sample_tags.hpp"
+#include "core/wire/sample_frame.hpp"
 #include "core/wire/varint.hpp"
 
 namespace dssm::wire {
@@ -35,8 +35,8 @@ constexpr std::size_t kInputBytes = 256 << 10;
 // loopback: the receiver's processor time is the same for both at 8 KiB; at 16 KiB receiving in
 // place takes 10 % less.
 constexpr std::size_t kLargePayloadBytes = 16 << 10;
-constexpr std::size_t kRoomBehindPayload = kTornTrailerBytes + kMaxSampleHeaderBytes;
-constexpr std::size_t kLeastSpace = 4 << 10;  // in all
+constexpr std::size_t kSpaceAfterPayload = kTornTrailerBytes + kMaxSampleHeaderBytes;
+constexpr std::size_t kMinSpace = 4 << 10;  // in all
 
 // What a sample frame may have besides its payload.
 constexpr std::size_t kMaxSampleOverheadBytes = 1 << 10;
@@ -164,12 +164,12 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
   const bool throws_away = stage_ == Stage::payload && !place_;
   const bool receives_in_place =
       payload_bytes_ >= kLargePayloadBytes && stage_ != Stage::whole && !throws_away;
-  std::size_t room = kInputBytes - head_bytes_;
+  std::size_t space = kInputBytes - head_bytes_;
   if (receives_in_place) {
-    const std::size_t payload_room = in_payload() ? std::min(payload_left_, kLeastSpace) : 0;
-    room = std::max(kLeastSpace - payload_room, kRoomBehindPayload);
+    const std::size_t payload_space = in_payload() ? std::min(payload_left_, kMinSpace) : 0;
+    space = std::max(kMinSpace - payload_space, kSpaceAfterPayload);
   }
-  const iovec rest{input->bytes.data() + head_bytes_, room};
+  const iovec rest{input->bytes.data() + head_bytes_, space};
   if (!in_payload()) {
     spaces_[0] = rest;
     return std::span(spaces_).first(1);
@@ -254,8 +254,8 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
   if (status == HeadStatus::other) {
     return begin_whole(input, head.length_bytes, static_cast<std::size_t>(head.frame_bytes));
   }
-  if (Result<void> checked = check_payload_bytes(head.payload_bytes); !checked) return checked;
-  if (Result<void> checked = check_sample(head.tid, head.clock_error_ns); !checked) return checked;
+  DSSM_TRY(check_payload_bytes(head.payload_bytes));
+  DSSM_TRY(check_sample(head.tid, head.clock_error_ns));
   sample_ = incoming(head.serial, head.tid, head.time_ns, head.clock_error_ns, head.payload_bytes);
   std::byte* place = nullptr;
   Result<void> begun = begin_sample(place);
@@ -369,7 +369,7 @@ Result<void> FrameDecoder::parse_whole(Bytes message) {
 
 Result<void> FrameDecoder::hand_out_slowly(net::Frame& frame, std::size_t frame_bytes) {
   const std::string& payload = frame.payload();
-  if (Result<void> checked = check_payload_bytes(payload.size()); !checked) return checked;
+  DSSM_TRY(check_payload_bytes(payload.size()));
   if (frame_bytes - payload.size() > kMaxSampleOverheadBytes) {
     return bad("a sample's frame has " + bytes_text(frame_bytes - payload.size()) +
                " besides the payload; at most " + std::to_string(kMaxSampleOverheadBytes) +
@@ -380,9 +380,7 @@ Result<void> FrameDecoder::hand_out_slowly(net::Frame& frame, std::size_t frame_
     return bad("a frame carries a sample and another message");
   }
   const net::Sample& stamps = frame.sample();
-  if (Result<void> checked = check_sample(stamps.tid(), stamps.clock_error_ns()); !checked) {
-    return checked;
-  }
+  DSSM_TRY(check_sample(stamps.tid(), stamps.clock_error_ns()));
   sample_ = incoming(frame.serial(), stamps.tid(), stamps.time_ns(), stamps.clock_error_ns(),
                      payload.size());
   std::byte* place = nullptr;

@@ -3,6 +3,7 @@
 
 #include <fmt/format.h>
 
+#include "core/base/try.hpp"
 #include "core/wire/frame.hpp"
 #include "network.pb.h"
 
@@ -119,7 +120,7 @@ Error other_protocol_version(const ProtocolVersion& ours, const std::string& who
 
 Result<StreamId> stream_id_untrusted(const proto::StreamId& message) {
   StreamId id{message.name(), message.id(), message.host()};
-  if (Result<void> checked = id.check(); !checked) return std::move(checked).error();
+  DSSM_TRY(id.check());
   return id;
 }
 
@@ -136,7 +137,7 @@ Result<TypeInfo> type_untrusted(const proto::Type& message) {
     }
   }
   TypeInfo type = type_info(message);
-  if (Result<void> checked = type.check(); !checked) return std::move(checked).error();
+  DSSM_TRY(type.check());
   return type;
 }
 

@@ -31,12 +31,24 @@
 #include <sys/uio.h>
 
 #include <chrono>
+#include <cstddef>
 #include <dssm/result.hpp>
 #include <span>
 
-#include "core/wire/io_result.hpp"
-
 namespace dssm::wire {
+
+// The outcome of sending or receiving without waiting.
+enum class IoStatus : unsigned char {
+  ok,
+  would_block,
+  interrupted,  // a signal handler ran; only from functions that wait
+  end,          // the other side closed the connection, or its process died
+};
+
+struct IoResult {
+  IoStatus status = IoStatus::ok;
+  std::size_t bytes = 0;
+};
 
 // Which end of the connection a transport is.
 enum class TransportEnd : unsigned char { connected, accepted };

@@ -33,7 +33,7 @@ class EventLoop {
 
   // The time that its timers go by. Code that sets timers reads the time here, not from MonoClock.
   MonoTime now() const noexcept { return timers_->now(); }
-  // The same at a fifth of the price, some milliseconds late (clock::coarse_now()).
+  // The same at a fifth of the price, some milliseconds late (dssm::coarse_now()).
   MonoTime coarse_now() const noexcept { return timers_->coarse_now(); }
   MonoTime deadline_in(Duration delay) const noexcept { return timers_->deadline_in(delay); }
 

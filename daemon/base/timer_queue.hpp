@@ -19,8 +19,8 @@
 #include <memory>
 #include <optional>
 
+#include "core/base/time.hpp"
 #include "core/base/unique_fd.hpp"
-#include "core/clock/coarse_now.hpp"
 
 namespace dssm::daemon {
 
@@ -34,7 +34,7 @@ class TimerQueue {
   static Result<std::unique_ptr<TimerQueue>> open(Time time = Time::real);
 
   MonoTime now() const noexcept { return simulated_ ? *simulated_ : MonoClock::now(); }
-  MonoTime coarse_now() const noexcept { return simulated_ ? *simulated_ : clock::coarse_now(); }
+  MonoTime coarse_now() const noexcept { return simulated_ ? *simulated_ : dssm::coarse_now(); }
   // The time `delay` from now; kNever where that would overflow.
   MonoTime deadline_in(Duration delay) const noexcept;
   bool is_simulated() const noexcept { return simulated_.has_value(); }

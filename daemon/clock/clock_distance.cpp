@@ -3,7 +3,7 @@
 
 #include <algorithm>
 
-#include "core/base/bound_sum.hpp"
+#include "core/base/time.hpp"
 
 namespace dssm::clock {
 

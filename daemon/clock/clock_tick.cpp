@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/clock/clock_tick.hpp"
 
-#include "core/clock/coarse_now.hpp"
+#include "core/base/time.hpp"
 
 namespace dssm::clock {
 

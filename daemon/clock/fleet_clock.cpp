@@ -15,7 +15,7 @@
 #include <cstring>
 #include <utility>
 
-#include "core/base/bound_sum.hpp"
+#include "core/base/time.hpp"
 #include "core/clock/clock_bound.hpp"
 #include "daemon/clock/clock_distance.hpp"
 
@@ -257,9 +257,8 @@ void FleetClock::publish(const clock::Instant& now) {
   for (const Stated& stated : stated_) {
     state.earlier_from = std::min(state.earlier_from, stated.wall);
     // It grew until the next one was stated.
-    state.earlier_bound =
-        std::max(state.earlier_bound,
-                 sum(stated.bound, clock::growth(clock::kLongestUse, clock.ageing_ppb)));
+    state.earlier_bound = std::max(
+        state.earlier_bound, sum(stated.bound, clock::growth(clock::kMaxUse, clock.ageing_ppb)));
   }
   page_.store(state);
 }

@@ -8,7 +8,7 @@
 #include <optional>
 #include <utility>
 
-#include "core/clock/coarse_now.hpp"
+#include "core/base/time.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/network_protocol.hpp"
 

@@ -35,7 +35,6 @@
 #include "core/wire/sample_frame.hpp"
 #include "daemon/base/memory_budget.hpp"
 #include "daemon/link/frame_connection.hpp"
-#include "daemon/link/raw_bytes.hpp"
 
 namespace dssm::daemon {
 

@@ -84,7 +84,7 @@ Result<void> SampleReceiver::write() {
       waiting_ = true;
       link_.pause();
       retry_timer_.enable_in(retry_);
-      retry_ = std::min(2 * retry_, kLongestRetry);
+      retry_ = std::min(2 * retry_, kMaxRetryPause);
       return {};
     case Outcome::refused:
       return Error{Errc::system,

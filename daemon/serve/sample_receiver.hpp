@@ -15,7 +15,6 @@
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/memory_budget.hpp"
 #include "daemon/link/frame_connection.hpp"
-#include "daemon/link/raw_bytes.hpp"
 #include "daemon/serve/served_stream.hpp"
 
 namespace dssm::daemon {
@@ -24,7 +23,7 @@ class SampleReceiver {
  public:
   // How long to leave a lock alone that a program holds: at first, and at most after doubling it.
   static constexpr Duration kFirstRetry = std::chrono::milliseconds(1);
-  static constexpr Duration kLongestRetry = std::chrono::milliseconds(16);
+  static constexpr Duration kMaxRetryPause = std::chrono::milliseconds(16);
 
   // Begins to publish for `publisher`. All outlive it.
   //   fails  limit_exceeded (no memory of `budget` is left for one payload), os errors

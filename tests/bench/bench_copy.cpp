@@ -7,7 +7,7 @@
 #include <dssm/dssm.hpp>
 #include <filesystem>
 
-#include "core/clock/clock_error_cache.hpp"
+#include "core/clock/clock_page.hpp"
 #include "tests/bench/harness.hpp"
 #include "tests/support/daemon_process.hpp"
 

@@ -10,7 +10,7 @@
 #include <cerrno>
 
 #include "core/base/quiet_thread.hpp"
-#include "core/base/timespec.hpp"
+#include "core/base/time.hpp"
 
 namespace dssm::ssm {
 

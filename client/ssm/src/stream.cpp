@@ -10,7 +10,7 @@
 #include <new>
 
 #include "convert.hpp"
-#include "core/base/timespec.hpp"
+#include "core/base/time.hpp"
 #include "messages.hpp"
 
 namespace dssm::ssm {

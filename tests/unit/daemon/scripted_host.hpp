@@ -24,7 +24,6 @@
 #include "daemon/base/event_loop.hpp"
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/link/frame_connection.hpp"
-#include "daemon/link/raw_bytes.hpp"
 #include "tests/support/frames.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 #include "tests/unit/daemon/run_loop.hpp"

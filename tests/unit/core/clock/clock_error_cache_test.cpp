@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "core/clock/clock_error_cache.hpp"
-
 #include <gtest/gtest.h>
+
+#include "core/clock/clock_page.hpp"
 
 namespace dssm::clock {
 namespace {
@@ -38,8 +38,7 @@ class ClockErrorCacheTest : public testing::Test {
 };
 
 TEST_F(ClockErrorCacheTest, SaysWhatThePageSays) {
-  for (const Duration age :
-       {0ns, 1ns, 999ns, 1'000'000ns, 1'000'000'001ns, Duration(kLongestUse)}) {
+  for (const Duration age : {0ns, 1ns, 999ns, 1'000'000ns, 1'000'000'001ns, Duration(kMaxUse)}) {
     expect_same(stated.wall + age);
   }
 }
@@ -68,7 +67,7 @@ TEST_F(ClockErrorCacheTest, KnowsPagesApart) {
 
 TEST_F(ClockErrorCacheTest, LeavesOtherTimesToTheWholePage) {
   EXPECT_EQ(at(Time(50s) - 1ns), std::nullopt);
-  EXPECT_EQ(at(Time(50s) + kLongestUse + 1ns), std::nullopt);
+  EXPECT_EQ(at(Time(50s) + kMaxUse + 1ns), std::nullopt);
   EXPECT_EQ(at(Time::min()), std::nullopt);
   EXPECT_EQ(at(Time::max()), std::nullopt);
   Duration error{};
@@ -79,10 +78,10 @@ TEST_F(ClockErrorCacheTest, DoesNotOverflow) {
   stated.clock.bound = kUnknownClockError - 1ns;
   stated.clock.ageing_ppb = 1'000'000;
   page.state.store(stated);
-  EXPECT_EQ(at(stated.wall + kLongestUse), kUnknownClockError);
+  EXPECT_EQ(at(stated.wall + kMaxUse), kUnknownClockError);
   stated.clock.bound = Duration::zero();
   page.state.store(stated);
-  expect_same(stated.wall + kLongestUse);
+  expect_same(stated.wall + kMaxUse);
 }
 
 }  // namespace

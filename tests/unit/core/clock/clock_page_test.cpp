@@ -71,7 +71,7 @@ TEST_F(ClockPageTest, TheStatusIsUnknownWhenItIsOld) {
   ClockPageState stated = state();
   page.state.store(stated);
   EXPECT_EQ(status_of(page), ClockStatus::synchronized);
-  stated.mono -= 2 * kLongestUse;
+  stated.mono -= 2 * kMaxUse;
   page.state.store(stated);
   EXPECT_EQ(status_of(page), ClockStatus::unknown);
 }
@@ -92,8 +92,8 @@ TEST_F(ClockPageTest, ATimeBeforeTheStatementHasTheGreatestBoundSince) {
 TEST_F(ClockPageTest, SaysNothingOfTimesThatItDoesNotCover) {
   page.state.store(state());
   EXPECT_EQ(clock_error_at(page, Time(40s) - 1ns), std::nullopt);
-  EXPECT_EQ(clock_error_at(page, Time(50s) + kLongestUse), 275us);
-  EXPECT_EQ(clock_error_at(page, Time(50s) + kLongestUse + 1ns), std::nullopt)
+  EXPECT_EQ(clock_error_at(page, Time(50s) + kMaxUse), 275us);
+  EXPECT_EQ(clock_error_at(page, Time(50s) + kMaxUse + 1ns), std::nullopt)
       << "dssmd does not run, or it is not a time of this clock";
   EXPECT_EQ(clock_error_at(page, Time::max()), std::nullopt);
   EXPECT_EQ(clock_error_at(page, Time::min()), std::nullopt);
