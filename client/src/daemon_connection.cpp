@@ -6,7 +6,7 @@
 #include <sys/socket.h>
 
 #include "core/base/try.hpp"
-#include "core/wire/fd_socket.hpp"
+#include "core/wire/local_protocol.hpp"
 
 namespace dssm::detail {
 namespace {

@@ -12,7 +12,6 @@
 #include <span>
 
 #include "core/ring/ring_memory.hpp"
-#include "core/ring/slot_table.hpp"
 
 namespace dssm::ring {
 

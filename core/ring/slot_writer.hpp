@@ -9,7 +9,6 @@
 #include <span>
 
 #include "core/ring/ring_memory.hpp"
-#include "core/ring/slot_table.hpp"
 
 namespace dssm::ring {
 

@@ -21,7 +21,7 @@
 
 #include <dssm/sample.hpp>
 
-#include "core/ring/slot_table.hpp"
+#include "core/ring/ring_memory.hpp"
 
 namespace dssm::ring {
 

@@ -14,7 +14,7 @@
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
 
-#include "core/channel/sample_cursor.hpp"
+#include "core/channel/channel_client.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "daemon/link/frame_connection.hpp"
 #include "daemon/link/sample_sender.hpp"

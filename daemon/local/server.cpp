@@ -12,7 +12,6 @@
 #include <utility>
 
 #include "core/base/try.hpp"
-#include "core/wire/fd_socket.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/base/message_ids.hpp"
 

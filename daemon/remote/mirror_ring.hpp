@@ -15,7 +15,7 @@
 #include <memory>
 #include <string>
 
-#include "core/channel/sample_cursor.hpp"
+#include "core/channel/channel_client.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/clock_assessment.hpp"
 #include "core/ring/ring_reader.hpp"

@@ -12,7 +12,7 @@
 #include <random>
 #include <thread>
 
-#include "core/wire/fd_socket.hpp"
+#include "core/wire/local_protocol.hpp"
 #include "tests/process/channel/local_writer.hpp"
 #include "tests/support/network_peer.hpp"
 

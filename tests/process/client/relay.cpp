@@ -13,7 +13,6 @@
 #include <utility>
 #include <vector>
 
-#include "core/wire/fd_socket.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "tests/support/daemon_process.hpp"

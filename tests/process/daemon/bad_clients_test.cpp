@@ -10,7 +10,7 @@
 
 #include <random>
 
-#include "core/wire/fd_socket.hpp"
+#include "core/wire/local_protocol.hpp"
 #include "tests/process/daemon/raw_client.hpp"
 
 namespace dssm::test {

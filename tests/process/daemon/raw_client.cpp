@@ -7,7 +7,7 @@
 
 #include <filesystem>
 
-#include "core/wire/fd_socket.hpp"
+#include "core/wire/local_protocol.hpp"
 
 namespace dssm::test {
 

@@ -9,7 +9,7 @@
 #include <sys/wait.h>
 #include <unistd.h>
 
-#include "core/wire/fd_socket.hpp"
+#include "core/wire/local_protocol.hpp"
 #include "tests/process/daemon/raw_client.hpp"
 
 namespace dssm::test {

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "core/wire/fd_socket.hpp"
+#include "core/wire/local_protocol.hpp"
 
 #include <sys/socket.h>
 #include <sys/un.h>
