@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Accepts connections at listening sockets, of programs (Unix) and of other hosts (TCP). A
-// connection that cannot be served gets a final failure that says why. A spare descriptor is kept
+// connection that cannot be served gets a final failure with the reason. A spare descriptor is kept
 // for the time when the process has none left: without it a waiting connection could not even be
 // refused, and the loop would spin.
 #pragma once

@@ -15,7 +15,7 @@ namespace {
 
 constexpr timeval kAtOnce{};
 
-// Without a lock, because there is one thread; without a look at the clock in each turn, because
+// Without a lock, because there is one thread; without reading the clock in each turn, because
 // libevent keeps none of our times (TimerQueue does).
 event_base* new_base() noexcept {
   event_config* const config = event_config_new();
@@ -39,8 +39,8 @@ Result<EventLoop> EventLoop::open(TimerQueue::Time time) {
 EventLoop::EventLoop(std::unique_ptr<TimerQueue> timers)
     : base_(new_base()), timers_(std::move(timers)) {}
 
-// Due timers run in the next turn, when what has arrived is handed out: after a stall, who judges a
-// silence must not do so while the other side's words wait to be read.
+// Due timers run in the next turn, when what has arrived is handed out: after a stall, no
+// timeout for missing bytes may expire while such bytes wait to be read.
 void EventLoop::watch_timers() {
   run_timers_.reset(event_new(
       base(), -1, 0,

@@ -61,7 +61,7 @@ class EventSource {
   static EventSource readable(const EventLoop& loop, int fd, Callback callback);
   static EventSource writable(const EventLoop& loop, int fd, Callback callback);
   // Edge-triggered: calls back once for each time that `fd` becomes readable again (each write to
-  // an eventfd), whether or not anybody reads it. `fd` must have no other source in this loop.
+  // an eventfd), whether or not it is read. `fd` must have no other source in this loop.
   static EventSource edge(const EventLoop& loop, int fd, Callback callback);
   static EventSource signal(const EventLoop& loop, int number, Callback callback);
   // Without a delay it calls back in the loop's next turn, when other events had theirs; with one,

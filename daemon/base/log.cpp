@@ -66,7 +66,7 @@ void StderrLogger::write(LogLevel level, std::string_view text, const LogFields&
   }
   line += printable(text);
   if (!fields.peer.empty()) line.append(" [client ").append(printable(fields.peer)).append("]");
-  if (left_out_ > 0) line += " (" + std::to_string(left_out_) + " lines before this one are lost)";
+  if (left_out_ > 0) line += fmt::format(" ({} lines before this one are lost)", left_out_);
   left_out_ = 0;
   line.resize(std::min(line.size(), kMaxLineBytes - 1));
   line += '\n';
@@ -79,7 +79,7 @@ bool stderr_is_journal() noexcept {
   const char* stream = std::getenv("JOURNAL_STREAM");  // NOLINT(concurrency-mt-unsafe): one thread
   struct stat file {};
   if (!stream || ::fstat(STDERR_FILENO, &file)) return false;
-  return stream == std::to_string(file.st_dev) + ":" + std::to_string(file.st_ino);
+  return stream == fmt::format("{}:{}", file.st_dev, file.st_ino);
 }
 
 JournalLogger::JournalLogger(LogLevel level, std::string socket)

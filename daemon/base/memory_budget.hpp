@@ -1,9 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The memory that rings and properties may take, all together (key max_memory). A stream's share is
-// given back when its last user lets go of it, not when its name disappears: a removed ring that
-// somebody still holds still takes memory.
+// given back when its last user releases it, not when its name disappears: a removed ring that a
+// program still holds still takes memory.
 #pragma once
+
+#include <fmt/format.h>
 
 #include <cstdint>
 #include <dssm/result.hpp>
@@ -52,12 +54,11 @@ class MemoryBudget {
       used_ += bytes;
       return MemoryShare(*this, bytes);
     }
-    return Error{Errc::limit_exceeded,
-                 std::to_string(bytes) + " bytes of memory are needed and " +
-                     std::to_string(left()) +
-                     " are left of max_memory = " + std::to_string(limit_) +
-                     " bytes; keep less history, remove streams (dssmctl rm), or raise the key "
-                     "max_memory"};
+    return Error{
+        Errc::limit_exceeded,
+        fmt::format("{} bytes of memory are needed and {} are left of max_memory = {} bytes; keep "
+                    "less history, remove streams (dssmctl rm), or raise the key max_memory",
+                    bytes, left(), limit_)};
   }
 
   // The same for callers with their own error, or another way, when it is used up.

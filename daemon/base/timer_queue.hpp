@@ -2,11 +2,11 @@
 //
 // The timers of one event loop, on one timerfd. libevent's own timers become a timeout of
 // epoll_wait(): the kernel sets a timer up before each sleep and takes it down after it, although
-// the first one due stays the same for thousands of samples. Here the kernel hears of a timer
-// only when another one is the first.
+// the first one due stays the same for thousands of samples. Here the kernel gets another
+// time only when another timer is the first.
 //
-// The time of a queue is MonoClock's. In tests it can be simulated: then it stands still between
-// calls of run_next(), each of which sets it to the time of the first timer.
+// The time of a queue is MonoClock's. In tests it can be simulated: then it does not advance
+// between calls of run_next(), each of which sets it to the time of the first timer.
 //
 //   threads  one
 #pragma once

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/fleet/catalog.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 
 namespace dssm::daemon {
@@ -16,7 +18,7 @@ std::size_t bytes_of(const StreamInfo& stream) {
 }  // namespace
 
 std::string KnownHost::str() const {
-  return "host '" + greeting.host + "' ('" + address.str() + "')";
+  return fmt::format("host '{}' ('{}')", greeting.host, address.str());
 }
 
 void Catalog::add_observer(CatalogObserver& observer) { observers_.push_back(&observer); }
@@ -64,9 +66,10 @@ Result<void> Catalog::stream_added(const wire::HostId& id, StreamInfo stream) {
   const auto old = host.streams.find(Key{stream.id.name, stream.id.id});
   const std::size_t old_bytes = old == host.streams.end() ? 0 : bytes_of(old->second);
   if (old == host.streams.end() && host.streams.size() >= kMaxStreamsPerHost) {
-    return Error{Errc::limit_exceeded, host.str() + " has more than " +
-                                           std::to_string(kMaxStreamsPerHost) +
-                                           " streams, which is more than it can be configured to"};
+    return Error{
+        Errc::limit_exceeded,
+        fmt::format("{} has more than {} streams, which is more than it can be configured to",
+                    host.str(), kMaxStreamsPerHost)};
   }
   const std::size_t others_bytes = host.stream_bytes - old_bytes;
   if (others_bytes + bytes_of(stream) > kMaxBytesPerHost) stream.type.fields = {};
@@ -121,16 +124,17 @@ Result<const KnownHost*> Catalog::find_host(const std::string& name) const {
   if (found.empty()) {
     const std::string known =
         hosts_.empty() ? "no other host answers" : "those that answer are " + host_names();
-    return Error{Errc::not_found,
-                 "there is no host '" + name + "': " + known +
-                     "; see `dssmctl hosts`, and add it to the key peers if it is missing there"};
+    return Error{Errc::not_found, fmt::format("there is no host '{}': {}; see `dssmctl hosts`, and "
+                                              "add it to the key peers if it is missing there",
+                                              name, known)};
   }
   std::string addresses;
   for (const KnownHost* host : found) {
     addresses += (addresses.empty() ? "'" : " and '") + host->address.str() + "'";
   }
-  return Error{Errc::conflict, "several hosts are called '" + name + "', at " + addresses +
-                                   "; give each its own name (key name) and restart its dssmd"};
+  return Error{Errc::conflict, fmt::format("several hosts are called '{}', at {}; give each its "
+                                           "own name (key name) and restart its dssmd",
+                                           name, addresses)};
 }
 
 Result<const KnownHost*> Catalog::find_owner(const StreamId& id) const {
@@ -143,18 +147,18 @@ Result<const KnownHost*> Catalog::find_owner(const StreamId& id) const {
   if (found.empty()) {
     const std::string elsewhere =
         hosts_.empty() ? ", and no other host answers" : " or on " + host_names();
-    return Error{Errc::not_found,
-                 "there is no stream '" + id.str() + "' on this host '" + own_host_ + "'" +
-                     elsewhere + "; create it first (`dssmctl ls` lists those that are there)"};
+    return Error{Errc::not_found, fmt::format("there is no stream '{}' on this host '{}'{}; create "
+                                              "it first (`dssmctl ls` lists those that are there)",
+                                              id.str(), own_host_, elsewhere)};
   }
   std::sort(found.begin(), found.end(), [](const KnownHost* one, const KnownHost* other) {
     return one->greeting.host < other->greeting.host;
   });
   std::string owners;
   for (const KnownHost* host : found) owners += (owners.empty() ? "" : " and ") + host->str();
-  return Error{Errc::conflict, "several hosts have a stream '" + id.str() + "': " + owners +
-                                   "; say which one: '" + id.str() + "@" +
-                                   found.front()->greeting.host + "'"};
+  return Error{Errc::conflict,
+               fmt::format("several hosts have a stream '{}': {}; say which one: '{}@{}'", id.str(),
+                           owners, id.str(), found.front()->greeting.host)};
 }
 
 bool Catalog::has(const StreamId& id) const {

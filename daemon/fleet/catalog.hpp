@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The catalog: which hosts there are, and which streams they own, as far as known here. Own streams
-// stand in the Registry; this holds the others'. It is fed by discovery (Peers, configured or
-// found) and asked by everybody who has to find a stream. One thread, no sockets.
+// are in the Registry; this holds the others'. Peers (configured or found) updates it; whatever has
+// to find a stream searches it. One thread, no sockets.
 //
 // A host is known by its id. Names may collide: then both hosts are kept, and a search by that name
 // fails with both of them.
@@ -42,7 +42,7 @@ class CatalogObserver {
  public:
   virtual void on_host_up(const KnownHost&) {}
   virtual void on_host_down(const KnownHost&, const Error&) {}  // after its streams are removed
-  virtual void on_host_clock(const KnownHost&) {}               // it said what its clock is like
+  virtual void on_host_clock(const KnownHost&) {}               // it reported its clock
   virtual void on_remote_stream_added(const KnownHost&, const StreamInfo&) {}  // or a new ring
   virtual void on_remote_stream_removed(const KnownHost&, const StreamInfo&) {}
 
@@ -61,7 +61,7 @@ class Catalog {
   void add_observer(CatalogObserver& observer);
   void remove_observer(CatalogObserver& observer);  // also from within a handler
 
-  // --- fed by discovery
+  // --- updated by discovery
 
   // The host answers. When it is known already by another address, the first one stays; a host that
   // comes with another instance id has restarted: it is reported as down first, with all its
@@ -74,10 +74,10 @@ class Catalog {
   //   fails  limit_exceeded (this host has too many streams), not_found (no such host)
   Result<void> stream_added(const wire::HostId& id, StreamInfo stream);
   void stream_removed(const wire::HostId& id, const StreamId& stream);
-  // What the host says about its clock by now.
+  // The host's newest report of its clock.
   void set_clock(const wire::HostId& id, std::shared_ptr<const wire::ClockReport> clock);
 
-  // --- asked
+  // --- searched
 
   const std::map<wire::HostId, KnownHost>& hosts() const noexcept { return hosts_; }
 
@@ -88,8 +88,8 @@ class Catalog {
   //   fails  not_found (naming those that are known), conflict (two hosts of that name)
   Result<const KnownHost*> find_host(const std::string& name) const;
 
-  // The host that owns `id`, when it is none of this host's own: the host in `id`, which is the one
-  // to say whether it has such a stream; or, without one, the only host that has it.
+  // The host that owns `id`, when it is none of this host's own: the host in `id`, which decides
+  // whether it has such a stream; or, without one, the only host that has it.
   //   fails  not_found (what is known, what to do), conflict (naming all that have it)
   Result<const KnownHost*> find_owner(const StreamId& id) const;
 

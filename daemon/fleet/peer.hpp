@@ -6,13 +6,16 @@
 
 #include <dssm/host_state.hpp>
 #include <dssm/time.hpp>
+#include <list>
 #include <memory>
 #include <optional>
 #include <string>
 #include <vector>
 
+#include "daemon/fleet/catalog.hpp"
 #include "daemon/fleet/peer_connection.hpp"
 #include "daemon/fleet/service_record.hpp"
+#include "local.pb.h"
 
 namespace dssm::daemon {
 
@@ -35,7 +38,7 @@ struct Peer {
   // Of a peer that mDNS found.
   struct Found {
     FoundHost host;
-    bool listed = true;  // mDNS still knows it
+    bool listed = true;  // mDNS still reports it
     MonoTime since{};
     std::vector<wire::Address> usable;  // of its addresses; empty: see `obstacle`
     PeerProblem obstacle;
@@ -50,9 +53,44 @@ struct Peer {
   std::unique_ptr<PeerConnection> connection;  // nullptr: a found host that is not dialed
   PeerUse use = PeerUse::none;
   bool tried = false;  // the first attempt to connect is over, or the host's streams are known
-  bool logged_down = false;  // the log says that it is not up
+  bool logged_down = false;  // that it is not up
   bool leaving = false;      // it is not configured any more
   PeerProblem warning;       // while it is up
+};
+
+// What people and programs of this PC see of the peers: the list of hosts, and what is wrong with
+// them. A view, to be used at once: of `peers` as they are, seen from the host `self`.
+//
+// One host may be several peers (two configured addresses, or configured and found). Each
+// configured peer has an entry. A found host has one unless the entry of a configured peer shows
+// the same dssmd; what mDNS finds with this host's own id has one as soon as it is known to be
+// another dssmd. The values of the host's connection (clock, streams) are shown once.
+class PeerReport {
+ public:
+  PeerReport(const std::list<Peer>& peers, const wire::HostId& self, const Catalog& catalog,
+             MonoTime now)
+      : peers_(peers), self_(self), catalog_(catalog), now_(now) {}
+
+  // All configured peers, in the order of the configuration, then the found hosts.
+  std::vector<local::Host> hosts() const;
+  // What a program may have to know when something is not found: "'pc3:13776' (Connection
+  // refused)"; empty: all peers are up.
+  std::string unavailable_peers() const;
+  // A warning that concerns this host itself.
+  PeerProblem own_warning() const;
+
+ private:
+  bool has_entry(const Peer& peer) const;
+  bool is_shown_by_configured(const Peer& found) const;
+  bool shows_use(const Peer& peer) const;
+  local::Host entry(const Peer& peer) const;
+  void add_connection(const Peer& peer, local::Host& entry) const;
+  PeerProblem namesake_warning(const Peer& peer) const;
+
+  const std::list<Peer>& peers_;
+  const wire::HostId& self_;
+  const Catalog& catalog_;
+  const MonoTime now_;
 };
 
 }  // namespace dssm::daemon

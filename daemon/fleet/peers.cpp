@@ -19,7 +19,7 @@ std::string describe(const PeerConnection& connection) {
 }
 
 // For a connection that stands by while another is used. A dssmd that was restarted stands by until
-// its predecessor's connection is found to be dead; if both stay, they are two.
+// the connection to its predecessor times out; if both stay, they are two.
 PeerProblem same_host_warning(const Peer& in_use, const Peer& by) {
   const bool is_same = in_use.them().instance_id == by.them().instance_id;
   if (is_same && !in_use.is_configured()) return {};  // configured and found: as it should be

@@ -9,8 +9,8 @@
 //   PeerConnection::beat()      once a second: no byte came for 2.8 s (wire::kPeerTimeout), or,
 //                               while output waits for the peer's kernel to take it, for 28 s
 //                               (kPeerTimeoutWithOutput): a large property on a slow network delays
-//                               our own heartbeats. Then it closes the connection. (That the peer's
-//                               PC is off, our kernel finds out earlier: TCP_USER_TIMEOUT.)
+//                               our own heartbeats. Then it closes the connection. (Our kernel
+//                               detects earlier that the peer's PC is off: TCP_USER_TIMEOUT.)
 //   Peers::on_peer_down()       the host is down, by this or because the connection broke:
 //                               another connection to it takes over, else
 //                               Catalog::host_down() removes it, and mirrors and remote writers, as
@@ -51,7 +51,6 @@
 #include "daemon/base/log.hpp"
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/fleet/peer.hpp"
-#include "daemon/fleet/peer_report.hpp"
 #include "daemon/fleet/service_record.hpp"
 
 namespace dssm::daemon {
@@ -103,7 +102,7 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   PeerReport report() const { return {peers_, self_.host_id, catalog_, loop_.now()}; }
 
  private:
-  // Addresses, written as numbers, and who answers there at this moment.
+  // Addresses, written as numbers, and which host answers there now.
   using Occupied = std::map<std::string, const wire::Greeting*>;
 
   void on_peer_up(PeerConnection& connection) override;
@@ -136,7 +135,7 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   Resolver& resolver_;
   const wire::Greeting self_;
   Catalog& catalog_;
-  RateLimitedLogger logger_;  // how often found hosts change is decided by those who announce them
+  RateLimitedLogger logger_;  // how often found hosts change is decided by their announcements
   std::list<Peer> peers_;     // the configured ones first
   bool insecure_ = false;
   bool logged_too_many_ = false;

@@ -1,9 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Service instances and their TXT records, there and back. What is written here others read for
+// Service instances to TXT records and back. What is written here is read by other versions for
 // years: a key keeps its meaning, and a change that old readers would misunderstand takes another
-// txtvers. What is read here anybody on the network may have written.
+// txtvers. What is read here any PC on the network may have written.
 #include "daemon/fleet/service_record.hpp"
+
+#include <fmt/format.h>
 
 #include <algorithm>
 #include <charconv>
@@ -23,7 +25,7 @@ constexpr std::size_t kHexDigits = 16;  // of 64 bits
 // The longest value of ours: with its key and '=' it fits into one string of a TXT record.
 static_assert(std::string_view("type=").size() + kMaxTypeNameBytes <= 255);
 
-// A label as Avahi wants it inside the text of a domain name; equal to what avahi_escape_label()
+// A label as it is written inside the text of a domain name; equal to what avahi_escape_label()
 // makes of it.
 std::string escaped_label(std::string_view label) {
   std::string text;
@@ -78,7 +80,7 @@ class TxtReader {
   std::uint64_t number(std::string_view key, std::uint64_t least, std::uint64_t most) {
     const Result<std::uint64_t> value = parse_count(text(key), least, most);
     if (value) return *value;
-    fail("key '" + std::string(key) + "': " + value.error().message);
+    fail(fmt::format("key '{}': {}", key, value.error().message));
     return 0;
   }
 
@@ -89,8 +91,8 @@ class TxtReader {
     const std::string digits = text(key);
     wire::HostId id{};
     if (digits.size() != 2 * id.size()) {
-      fail("key '" + std::string(key) + "': " + in_quotes(digits) + " is not " +
-           std::to_string(2 * id.size()) + " hexadecimal digits long");
+      fail(fmt::format("key '{}': {} is not {} hexadecimal digits long", key, in_quotes(digits),
+                       2 * id.size()));
       return id;
     }
     for (std::size_t half = 0; half < 2; ++half) {
@@ -109,7 +111,7 @@ class TxtReader {
 
   void fail(std::string reason) {
     if (!status_) return;
-    // It may quote the record, and goes on in messages that take nothing but UTF-8.
+    // It may quote the record, and becomes part of messages that must be UTF-8.
     if (!is_utf8(reason)) {
       std::replace_if(
           reason.begin(), reason.end(), [](char c) { return (c & 0x80) != 0; }, '?');
@@ -125,8 +127,8 @@ class TxtReader {
     const char* const end = digits.data() + digits.size();
     const auto [rest, error] = std::from_chars(digits.data(), end, value, 16);
     if (digits.size() == kHexDigits && error == std::errc() && rest == end) return value;
-    fail("key '" + std::string(key) + "': " + in_quotes(digits) + " is not " +
-         std::to_string(kHexDigits) + " hexadecimal digits");
+    fail(fmt::format("key '{}': {} is not {} hexadecimal digits", key, in_quotes(digits),
+                     kHexDigits));
     return 0;
   }
 
@@ -147,8 +149,8 @@ ServiceRecord::Stream announced_stream_untrusted(TxtReader& txt, const std::stri
   // Without a name it is "just bytes", TypeInfo::name.
   if (const std::string* type = txt.find("type")) stream.type = *type;
   if (stream.type.size() > kMaxTypeNameBytes || !is_utf8(stream.type)) {
-    txt.fail("key 'type': " + in_quotes(stream.type) + " is not UTF-8, or longer than " +
-             std::to_string(kMaxTypeNameBytes) + " bytes");
+    txt.fail(fmt::format("key 'type': {} is not UTF-8, or longer than {} bytes",
+                         in_quotes(stream.type), kMaxTypeNameBytes));
   }
   stream.type_hash = txt.hex("hash");
   stream.incarnation = txt.hex("ring");
@@ -156,10 +158,6 @@ ServiceRecord::Stream announced_stream_untrusted(TxtReader& txt, const std::stri
 }
 
 }  // namespace
-
-// Service instances and their TXT records, there and back. What is written here others read for
-// years: a key keeps its meaning, and a change that old readers would misunderstand takes another
-// txtvers. What is read here anybody on the network may have written.
 
 std::string ServiceRecord::instance() const {
   return stream ? StreamId{stream->name, stream->id, host}.str() : host;
@@ -169,8 +167,7 @@ std::string ServiceRecord::subtype() const {
   if (!stream) return std::string(kHostSubtype);
   // Avahi takes no label of two bytes for a subtype; no name holds a colon, so this one is free.
   const std::string_view end = stream->name.size() == 1 ? ":" : "";
-  return "_" + escaped_label(stream->name) + std::string(end) + "._sub." +
-         std::string(kServiceType);
+  return fmt::format("_{}{}._sub.{}", escaped_label(stream->name), end, kServiceType);
 }
 
 TxtRecord ServiceRecord::txt() const {
@@ -194,11 +191,12 @@ TxtRecord ServiceRecord::txt() const {
 std::uint64_t type_hash(const TypeInfo& type) {
   // Names by their lengths, since they may hold any character.
   const auto word = [](const auto number) { return std::to_string(number) + " "; };
-  std::string text = word(type.name.size()) + type.name + " " + word(type.payload_bytes) +
-                     word(type.alignment_bytes);
+  std::string text = fmt::format("{}{} {}{}", word(type.name.size()), type.name,
+                                 word(type.payload_bytes), word(type.alignment_bytes));
   for (const Field& field : type.fields) {
-    text += word(field.name.size()) + field.name + " " + word(static_cast<unsigned>(field.kind)) +
-            word(field.offset_bytes) + word(field.count) + word(field.stride_bytes);
+    text += fmt::format("{}{} {}{}{}{}", word(field.name.size()), field.name,
+                        word(static_cast<unsigned>(field.kind)), word(field.offset_bytes),
+                        word(field.count), word(field.stride_bytes));
   }
   const Sha256 digest = sha256(text);
   std::uint64_t hash = 0;
@@ -209,15 +207,16 @@ std::uint64_t type_hash(const TypeInfo& type) {
 Result<ServiceRecord> service_record_untrusted(const TxtRecord& txt) {
   TxtReader reader(txt);
   if (const std::size_t bytes = txt_bytes(txt); bytes > kMaxTxtBytes) {
-    reader.fail("it is " + std::to_string(bytes) + " bytes long, which is more than " +
-                std::to_string(kMaxTxtBytes));
+    reader.fail(fmt::format("it is {} bytes long, which is more than {}", bytes, kMaxTxtBytes));
     return reader.status().error();
   }
   // First of all: another version may use the other keys in another way.
   if (const std::string version = reader.text("txtvers");
       reader.status() && version != kTxtVersion) {
-    reader.fail("it has the version (txtvers) " + in_quotes(version) + ", and this dssmd knows " +
-                std::string(kTxtVersion) + " only; install the same DSSM on both");
+    reader.fail(
+        fmt::format("it has the version (txtvers) {}, and this dssmd knows {} only; install the "
+                    "same DSSM on both",
+                    in_quotes(version), kTxtVersion));
   }
   if (!reader.status()) return reader.status().error();
   ServiceRecord record;

@@ -32,7 +32,7 @@ static_assert(kMaxInstanceBytes == kMaxFullNameBytes);
 // Of what others announce; ours stay far below (docs/discovery.md "Sizes").
 inline constexpr std::size_t kMaxTxtBytes = 1300;
 
-// Keys and values, in order; an empty value stands for a key alone, without '='. Values are bytes.
+// Keys and values, in order; an empty value is a key alone, without '='. Values are bytes.
 using TxtRecord = std::vector<std::pair<std::string, std::string>>;
 
 // What is announced: a stream, or (without `stream`) the host itself.
@@ -65,11 +65,11 @@ struct ServiceRecord {
 // (docs/discovery.md "Records").
 std::uint64_t type_hash(const TypeInfo& type);
 
-// What another host announces; only hosts' records are of use to us.
+// What another host announces; only records of hosts are used.
 //   fails  protocol: another txtvers, values that are missing, wrong or out of their limits
 Result<ServiceRecord> service_record_untrusted(const TxtRecord& txt);
 
-// A dssmd that was found: never this very one, as far as mDNS knows. A value.
+// A dssmd that was found: not this one, as far as is known. A value.
 struct FoundHost {
   wire::HostId id{};  // this host's own: of a PC that was copied from this one, or the like
   std::string name;   // "pc2"; two hosts may have the same one

@@ -88,7 +88,7 @@ void FleetService::when_known(const StreamId& id, std::function<void()> go_on) {
   early_.push_back(std::move(go_on));
 }
 
-// What is not found may be at a peer that is away.
+// What is not found may be at a peer that is unavailable.
 Error FleetService::with_unavailable_peers(Error error) const {
   if (error.code != Errc::not_found) return error;
   if (const std::string unavailable = peers_.report().unavailable_peers(); !unavailable.empty()) {
@@ -241,7 +241,7 @@ void FleetService::on_list_answer(Listing& listing, const wire::HostId& id,
   if (--listing.unanswered == 0) finish(listing);
 }
 
-// Answers with what came, and with what the catalog knows of those that said nothing.
+// Responds with what has arrived, and with the catalog for hosts that have not answered.
 void FleetService::finish(Listing& listing) {
   if (std::exchange(listing.done, true)) return;
   const auto then = std::exchange(listing.then, {});

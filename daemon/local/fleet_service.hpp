@@ -31,14 +31,14 @@ namespace dssm::daemon {
 
 class FleetService final : public Fleet, private CatalogObserver {
  public:
-  // Requests that wait for the first words of the peers; more fail at once.
+  // Requests that wait until the peers are heard of or tried; more fail at once.
   static constexpr std::size_t kMaxEarlyRequests = 4096;
 
   // What the list of hosts shows of this one.
   struct Self {
     wire::Greeting greeting;
     std::vector<std::string> addresses;  // that it listens at
-    bool insecure = false;               // at one of them other PCs may come in the clear
+    bool insecure = false;               // at one of them other PCs connect unencrypted
     const FleetClock* clock = nullptr;   // nullptr: the clock is not watched
   };
 

@@ -278,7 +278,7 @@ void LocalRequests::list_all(Answer answer) {
 }
 
 void LocalRequests::ping(const std::string& host, Answer answer) {
-  if (host == registry_.host()) {  // this response shows that it is alive
+  if (host == registry_.host()) {  // this response shows that it runs
     Reply reply;
     reply.response.mutable_round_trip();
     return answer(std::move(reply));

@@ -24,7 +24,7 @@
 
 namespace dssm::daemon {
 
-// A response and the descriptors that go with it, in the order that local.proto says.
+// A response and the descriptors that go with it, in the order of local.proto.
 struct Reply {
   local::Response response;
   std::vector<UniqueFd> descriptors;

@@ -73,7 +73,7 @@ Result<void> Listener::allow(std::optional<gid_t> group, mode_t mode) const {
   struct stat file {};
   if (::stat(path_.c_str(), &file)) return os_error(what);
   if (group && *group != file.st_gid && ::chown(path_.c_str(), static_cast<uid_t>(-1), *group)) {
-    Error error = os_error(what + ": give it to group " + std::to_string(*group));
+    Error error = os_error(fmt::format("{}: give it to group {}", what, *group));
     error.message +=
         "; dssmd's user has to own the socket (SocketUser=) and be a member of "
         "socket_group";

@@ -54,7 +54,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
 DataCommunicator::~DataCommunicator() = default;
 
 std::string DataCommunicator::peer() const {
-  return (them_ ? them_->str() : "a peer") + " at '" + peer_address_ + "'";
+  return fmt::format("{} at '{}'", (them_ ? them_->str() : "a peer"), peer_address_);
 }
 
 // --- frames
@@ -241,7 +241,7 @@ Result<void> DataCommunicator::go_on_opening() {
   link_.send(answer);
   const std::string id = opening.stream->id().str();
   parts_.logger.info(
-      "channel of '" + id + "' opened by " + peer(),
+      fmt::format("channel of '{}' opened by {}", id, peer()),
       {.stream = id, .peer = peer_address_, .message_id = message_id::kChannelOpened});
   return {};
 }
@@ -322,19 +322,19 @@ void DataCommunicator::on_closed(const Error& why) {
 void DataCommunicator::log_end(const Error& why) {
   const std::string reason = their_failure_.message.empty() ? why.message : their_failure_.message;
   if (why.code != Errc::unavailable) {
-    parts_.logger.warning("closed the connection of " + peer() + ": " + why.message,
+    parts_.logger.warning(fmt::format("closed the connection of {}: {}", peer(), why.message),
                           {.peer = peer_address_, .message_id = message_id::kPeerRefused});
   }
   if (!channel_) {
     if (is_control_) {
-      parts_.logger.info("control connection of " + peer() + " ended: " + reason,
+      parts_.logger.info(fmt::format("control connection of {} ended: {}", peer(), reason),
                          {.peer = peer_address_});
     }
     return;
   }
   const std::string id = channel_->stream().id().str();
   parts_.logger.info(
-      "channel of '" + id + "' of " + peer() + " ended: " + reason,
+      fmt::format("channel of '{}' of {} ended: {}", id, peer(), reason),
       {.stream = id, .peer = peer_address_, .message_id = message_id::kChannelClosed});
   const SampleSender::Counters& sent = channel_->counters();
   const wire::DecoderCounters& received = link_.counters();

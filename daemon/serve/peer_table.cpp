@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/serve/peer_table.hpp"
 
+#include <fmt/format.h>
+
 #include <optional>
 #include <utility>
 
@@ -41,26 +43,26 @@ void PeerTable::set_limits(const Limits& limits) {
 Result<PeerPlace> PeerTable::admit(const wire::SocketAddress& address) {
   if (connections_ >= limits_.max_connections) {
     return Error{Errc::limit_exceeded,
-                 "there are max_connections = " + std::to_string(limits_.max_connections) +
-                     " connections from other hosts already; close some or raise the key "
-                     "max_connections"};
+                 fmt::format("there are max_connections = {} connections from other hosts already; "
+                             "close some or raise the key max_connections",
+                             limits_.max_connections)};
   }
   const std::string name = without_port(address);
   const auto found = accounts_.find(name);
   if (found != accounts_.end() && found->second->connections >= limits_.max_connections_per_host) {
     return Error{Errc::limit_exceeded,
-                 "there are max_connections_per_host = " +
-                     std::to_string(limits_.max_connections_per_host) + " connections from '" +
-                     name + "' already; close some or raise the key max_connections_per_host"};
+                 fmt::format("there are max_connections_per_host = {} connections from '{}' "
+                             "already; close some or raise the key max_connections_per_host",
+                             limits_.max_connections_per_host, name)};
   }
   std::unique_ptr<PeerAccount>& account = accounts_[name];
   if (!account) account = std::make_unique<PeerAccount>(name, limits_.max_peer_memory_bytes);
   std::optional<MemoryShare> share = account->budget.try_take(kConnectionBytes);
   if (share) return PeerPlace(*this, *account, *std::move(share));
-  Error error{Errc::limit_exceeded, "the connections from '" + name +
-                                        "' have used up max_peer_memory = " +
-                                        std::to_string(limits_.max_peer_memory_bytes) +
-                                        " bytes; close some or raise the key max_peer_memory"};
+  Error error{Errc::limit_exceeded,
+              fmt::format("the connections from '{}' have used up max_peer_memory = {} bytes; "
+                          "close some or raise the key max_peer_memory",
+                          name, limits_.max_peer_memory_bytes)};
   if (account->connections == 0) accounts_.erase(name);
   return error;
 }

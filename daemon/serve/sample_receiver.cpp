@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/serve/sample_receiver.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <optional>
 #include <utility>
@@ -18,11 +20,10 @@ Result<std::unique_ptr<SampleReceiver>> SampleReceiver::open(const EventLoop& lo
   std::optional<MemoryShare> share = budget.try_take(payload_bytes);
   if (!share) {
     return Error{Errc::limit_exceeded,
-                 "publish into '" + stream.stream().id().str() + "': a sample of " +
-                     std::to_string(payload_bytes) +
-                     " bytes does not fit into what is left of max_peer_memory = " +
-                     std::to_string(budget.limit()) +
-                     " bytes for this address; close other connections or raise that key"};
+                 fmt::format("publish into '{}': a sample of {} bytes does not fit into what is "
+                             "left of max_peer_memory = {} bytes for this address; close other "
+                             "connections or raise that key",
+                             stream.stream().id().str(), payload_bytes, budget.limit())};
   }
   std::shared_ptr<OwnWriter> writer = DSSM_TRY(stream.writer());
   return std::unique_ptr<SampleReceiver>(
@@ -117,7 +118,7 @@ void SampleReceiver::answer(std::uint64_t serial) {
 
 void SampleReceiver::acknowledge() {
   if (std::exchange(written_, false)) stream_.check();
-  // One acknowledgement stands for all before it: those that would wait for the socket are not
+  // One acknowledgement covers all before it: those that would wait for the socket are not
   // sent.
   if (!unacknowledged_ || !link_.output_empty()) return;
   unacknowledged_ = false;

@@ -42,7 +42,8 @@ class SampleReceiver {
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out);
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn);
 
-  // All that had arrived was handed out, or the link has room again: acknowledges what is not yet.
+  // All that had arrived was handed out, or the link takes more again: acknowledges what is not
+  // yet.
   void acknowledge();
 
   // Whether a sample waits for the ring's lock; the link is paused then, and stays so.

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/serve/stream_channel.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cmath>
 #include <utility>
@@ -15,7 +17,7 @@ namespace {
 constexpr int kMaxReadAttempts = 100;
 
 // New samples that are followed at once before others get their turn.
-constexpr int kMaxLooks = 16;
+constexpr int kMaxChecks = 16;
 
 net::Frame answer_to(std::uint64_t serial) {
   net::Frame frame;
@@ -86,9 +88,9 @@ Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
 Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe& request) {
   if (!std::isfinite(request.max_rate_hz()) || request.max_rate_hz() < 0) {
     return Error{Errc::invalid_argument,
-                 "subscribe to '" + stream().id().str() + "': max_rate_hz is " +
-                     std::to_string(request.max_rate_hz()) +
-                     "; give 0 for all samples, or how many per second at most"};
+                 fmt::format("subscribe to '{}': max_rate_hz is {}; give 0 for all samples, or how "
+                             "many per second at most",
+                             stream().id().str(), request.max_rate_hz())};
   }
   if (!feed_) feed_ = DSSM_TRY(served_->feed());
   feed_->forget(*this);
@@ -137,10 +139,10 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   const MonoTime now = pump_->thins() ? parts_.loop.now() : MonoTime{};
   feed_->forget(*this);
   Result<PumpWait> wait = pump_->pump(now, request_waits);
-  for (int looks = 0; wait && *wait == PumpWait::sample; ++looks) {
+  for (int checks = 0; wait && *wait == PumpWait::sample; ++checks) {
     if (feed_->wait(*this, pump_->known())) return {};
-    // One came between the look and the arming of the doorbell.
-    wait = looks < kMaxLooks ? pump_->pump(now) : Result(PumpWait::turn);
+    // One came between the check and the arming of the doorbell.
+    wait = checks < kMaxChecks ? pump_->pump(now) : Result(PumpWait::turn);
   }
   if (!wait)
     return std::move(wait).error().context("send samples of '" + stream().id().str() + "'");
@@ -262,7 +264,7 @@ SendStatus StreamChannel::begin_reading() {
     return SendStatus::sent;
   }
   const SendStatus status = sender_.send(tid, reading_->serial, false);
-  // A tid that was found and is gone when it is looked at does not come back.
+  // A tid that was found and is lost by now does not return.
   if (status == SendStatus::not_in_ring && reading_->request.which_case() == net::Read::kTid) {
     answer_no_sample(ReadStatus::too_old);
   }

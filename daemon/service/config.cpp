@@ -2,6 +2,7 @@
 #include "daemon/service/config.hpp"
 
 #include <fcntl.h>
+#include <fmt/format.h>
 #include <sys/un.h>
 #include <toml++/toml.h>
 #include <unistd.h>
@@ -251,7 +252,7 @@ constexpr ConfigKey kKeys[] = {
 };
 
 std::string place(const std::string& path, const toml::source_region& source) {
-  return path + ":" + std::to_string(source.begin.line) + ": ";
+  return fmt::format("{}:{}: ", path, source.begin.line);
 }
 
 const char* words_for(ValueForm form) noexcept {
@@ -309,7 +310,7 @@ Result<void> set_value(Config& config, const ConfigKey& key, const toml::node& n
 std::string unknown_key(std::string_view name) {
   std::string known;
   for (const ConfigKey& key : kKeys) known.append(known.empty() ? "" : ", ").append(key.name);
-  return "key '" + printable(name) + "': unknown; the keys are " + known;
+  return fmt::format("key '{}': unknown; the keys are {}", printable(name), known);
 }
 
 const ConfigKey* find_key(std::string_view name) {
@@ -370,7 +371,7 @@ Result<void> apply_text_untrusted(Config& config, std::string_view text, const s
       continue;
     }
     const Result<void> set = set_value(config, *key, node);
-    if (!set) mistake("key " + in_quotes(key->name) + ": " + set.error().message);
+    if (!set) mistake(fmt::format("key {}: {}", in_quotes(key->name), set.error().message));
   }
   if (mistakes.empty()) return {};
   std::stable_sort(mistakes.begin(), mistakes.end(),

@@ -71,7 +71,7 @@ struct Config {
 };
 
 // How a value is written in the file: in quotes, as a plain integer, as either, as true or false
-// (its flag stands alone), or as a list of texts in quotes.
+// (its flag has no value), or as a list of texts in quotes.
 enum class ValueForm : std::uint8_t { text, integer, integer_or_text, boolean, list };
 
 struct ConfigKey {
@@ -84,7 +84,7 @@ struct ConfigKey {
     bool at_once;
     bool (*is_same)(const Config& one, const Config& other);
   } change;
-  // Takes over `text`, for lists one element; the failure says what is wrong with it, without
+  // Takes over `text`, for lists one element; the failure states what is wrong with it, without
   // naming the key.
   Result<void> (*set)(Config& config, std::string_view text);
   // Lists only: makes it an empty one, before its elements are set.

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/service/config_values.hpp"
 
+#include <fmt/format.h>
 #include <fnmatch.h>
 #include <grp.h>
 #include <net/if.h>
@@ -52,14 +53,13 @@ Result<Quantity> parse_quantity(std::string_view text) {
 
 Error out_of_range(std::string_view text, std::uint64_t min, std::uint64_t max,
                    std::string_view unit) {
-  return invalid(in_quotes(text) + " is outside of " + std::to_string(min) + " to " +
-                 std::to_string(max) + std::string(unit));
+  return invalid(fmt::format("{} is outside of {} to {}{}", in_quotes(text), min, max, unit));
 }
 
 }  // namespace
 
 ClockDemand ClockPolicies::demand_for(const StreamId& id) const {
-  const std::string full = id.name + ":" + std::to_string(id.id);
+  const std::string full = fmt::format("{}:{}", id.name, id.id);
   for (const Exception& exception : exceptions) {
     const char* pattern = exception.pattern.c_str();
     if (::fnmatch(pattern, id.name.c_str(), 0) && ::fnmatch(pattern, full.c_str(), 0)) continue;
@@ -135,9 +135,9 @@ Result<Duration> parse_clock_limit(std::string_view text) {
 Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text) {
   const auto wrong = [&](const std::string& why) {
     return Error{Errc::invalid_argument,
-                 in_quotes(text) + " " + why +
-                     "; write \"STREAM=POLICY\" or \"STREAM=POLICY LIMIT\", such as \"gps=off\" or "
-                     "\"camera*=mark 5 ms\""};
+                 fmt::format("{} {}; write \"STREAM=POLICY\" or \"STREAM=POLICY LIMIT\", such as "
+                             "\"gps=off\" or \"camera*=mark 5 ms\"",
+                             in_quotes(text), why)};
   };
   const std::size_t equals = text.rfind('=');
   if (equals == text.npos) return wrong("has no '='");
@@ -186,7 +186,7 @@ Result<mode_t> parse_mode(std::string_view text) {
 
 Result<gid_t> parse_group(std::string_view name) {
   const std::string wanted(name);
-  std::vector<char> space(16384);  // ample for one entry of the group file without its members
+  std::vector<char> space(16384);  // enough for one entry of the group file without its members
   for (;;) {
     group entry{};
     group* found = nullptr;
@@ -197,8 +197,8 @@ Result<gid_t> parse_group(std::string_view name) {
     }
     if (failed) return os_error("look for the group " + in_quotes(name), failed);
     if (!found) {
-      return invalid("there is no group " + in_quotes(name) +
-                     "; create it with `groupadd --system " + printable(name) + "`");
+      return invalid(fmt::format("there is no group {}; create it with `groupadd --system {}`",
+                                 in_quotes(name), printable(name)));
     }
     return found->gr_gid;
   }
@@ -214,9 +214,9 @@ Result<std::string> parse_interface(std::string_view text) {
   const bool is_pattern = text.find_first_of("*?[\\") != text.npos;
   const std::size_t max = is_pattern ? kMaxInterfacePatternBytes : IFNAMSIZ - 1;
   if (text.empty() || text.size() > max) {
-    return invalid(in_quotes(text) + " is " + std::to_string(text.size()) + " bytes long; " +
-                   (is_pattern ? "a pattern" : "the name of a network interface") + " takes 1 to " +
-                   std::to_string(max));
+    return invalid(
+        fmt::format("{} is {} bytes long; {} takes 1 to {}", in_quotes(text), text.size(),
+                    (is_pattern ? "a pattern" : "the name of a network interface"), max));
   }
   for (const char c : text) {
     if (static_cast<unsigned char>(c) <= 0x20 || c == 0x7f || c == '/') {

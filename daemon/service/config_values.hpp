@@ -86,7 +86,7 @@ Result<std::string> parse_interface(std::string_view text);
 // error, warning, notice, info, debug
 Result<LogLevel> parse_log_level(std::string_view text);
 
-// 0 when the system does not say.
+// 0: not known.
 std::uint64_t memory_of_the_machine() noexcept;
 
 }  // namespace dssm::daemon

@@ -1,15 +1,16 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Decides who may do what. Each request of a program of this PC (LocalService) and of another host
-// or remote program (DataCommunicator) passes an Authorizer once, before anything else is done for
-// it.
+// Decides which client may do what. Each request of a program of this PC (LocalService) and of
+// another host or remote program (DataCommunicator) passes an Authorizer once, before anything else
+// is done for it.
 //
-//   Identity   who asks: of a local program what the kernel says (SO_PEERCRED), of a remote one its
-//              address and what its greeting says, which is not verified
+//   Identity   who asks: of a local program as the kernel reports it (SO_PEERCRED), of a remote one
+//              its address and its greeting, which is not verified
 //   Action     what is asked for; action_of() derives it from the request
 //
-// authorize() allows everything today: who can connect at all is decided by the permissions of the
-// Unix socket (socket_group, socket_mode) and by the addresses of the key listen.
+// authorize() allows everything today: which clients can connect at all is decided by the
+// permissions of the Unix socket (socket_group, socket_mode) and by the addresses of the key
+// listen.
 #pragma once
 
 #include <cstdint>

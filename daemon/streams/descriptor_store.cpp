@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/streams/descriptor_store.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <optional>
 #include <string_view>
@@ -53,7 +55,7 @@ bool DescriptorStore::restore_untrusted(std::vector<NamedDescriptor> kept, bool 
   }
   if (!entries_.empty()) {
     logger_.notice(
-        "took " + std::to_string(entries_.size()) + " streams back that the service manager kept",
+        fmt::format("took {} streams back that the service manager kept", entries_.size()),
         {.message_id = message_id::kRestored});
   }
   registry_.add_observer(*this);
@@ -87,8 +89,9 @@ DescriptorStore::Taken DescriptorStore::take_back(const std::string& name,
     }
   }
   const auto drop = [&](const std::string& why) {
-    logger_.warning("drop what the service manager kept under '" + name + "': " + why +
-                        "; if it was a stream's, the programs that hold it give it back",
+    logger_.warning(fmt::format("drop what the service manager kept under '{}': {}; if it was a "
+                                "stream's, the programs that hold it give it back",
+                                name, why),
                     {.message_id = message_id::kStoredDropped});
     return Taken::bad;
   };
@@ -128,10 +131,11 @@ void DescriptorStore::on_stream_added(const Stream& stream) {
   if (descriptors_ + fds.size() > max_descriptors_) {
     if (std::exchange(logged_full_, true)) return;
     return logger_.warning(
-        "stream '" + stream.id().str() + "' and further ones are not kept while dssmd restarts: " +
-            std::to_string(max_descriptors_) +
-            " descriptors are in the service manager's store already; the programs that hold "
-            "these streams give them back, remove (dssmctl rm) those that are not needed",
+        fmt::format(
+            "stream '{}' and further ones are not kept while dssmd restarts: {} descriptors are in "
+            "the service manager's store already; the programs that hold these streams give them "
+            "back, remove (dssmctl rm) those that are not needed",
+            stream.id().str(), max_descriptors_),
         {.stream = stream.id().str(), .message_id = message_id::kStoreFull});
   }
   const Entry entry{new_name(), fds.size()};

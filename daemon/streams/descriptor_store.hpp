@@ -6,7 +6,7 @@
 // offered ring that came from the store is joined.
 //
 // All descriptors of a stream (ring, bell, meta, doorbell) have one name of three characters; the
-// clock's name is "#". Names of memory files tell which is which. Longer names would be easier to
+// clock's name is "#". The names of memory files distinguish them. Longer names would be easier to
 // read, but systemd passes all of them in one environment variable, and Linux starts no program
 // with a variable above 128 KiB: dssmd could never be started again.
 //

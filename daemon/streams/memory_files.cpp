@@ -2,6 +2,7 @@
 #include "daemon/streams/memory_files.hpp"
 
 #include <fcntl.h>
+#include <fmt/format.h>
 #include <linux/kcmp.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
@@ -67,8 +68,8 @@ Result<MetaHeader> read_header_untrusted(int fd) {
     return not_a_meta_file("it does not begin with \"DSSMMETA\"");
   }
   if (header.version != MetaHeader::kVersion) {
-    return not_a_meta_file("it has the version " + std::to_string(header.version) +
-                           ", this dssmd knows " + std::to_string(MetaHeader::kVersion));
+    return not_a_meta_file(fmt::format("it has the version {}, this dssmd knows {}", header.version,
+                                       MetaHeader::kVersion));
   }
   if (header.offset_bytes == 0 && header.length_bytes == 0) return header;
   struct stat file {};
@@ -94,9 +95,10 @@ Result<void> check_own_memory_file(int fd, int seals, std::string_view what) {
     return Error{Errc::protocol, name + " is not a sealed memory file that dssmd created"};
   }
   if (file.st_uid != ::geteuid()) {
-    return Error{Errc::no_permission, name + " belongs to user " + std::to_string(file.st_uid) +
-                                          ", not to dssmd's user " + std::to_string(::geteuid()) +
-                                          ": dssmd did not create it"};
+    return Error{
+        Errc::no_permission,
+        fmt::format("{} belongs to user {}, not to dssmd's user {}: dssmd did not create it", name,
+                    file.st_uid, ::geteuid())};
   }
   return {};
 }
@@ -166,9 +168,11 @@ Result<local::StreamMeta> MetaFile::read_untrusted() const {
 Result<void> MetaFile::replace(const local::StreamMeta& meta) {
   const std::string content = meta.SerializeAsString();
   if (content.empty() || content.size() > kMaxContentBytes) {
-    return Error{Errc::limit_exceeded, "a stream's description and property of " +
-                                           std::to_string(content.size()) +
-                                           " bytes are too much for its meta file"};
+    return Error{
+        Errc::limit_exceeded,
+        fmt::format(
+            "a stream's description and property of {} bytes are too much for its meta file",
+            content.size())};
   }
   const MetaHeader current = DSSM_TRY(read_header_untrusted(fd_.get()));
   const bool fits_before =

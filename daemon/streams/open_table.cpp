@@ -1,20 +1,23 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/streams/open_table.hpp"
 
+#include <fmt/format.h>
+
 namespace dssm::daemon {
 
 Result<void> OpenTable::check_quota(const ClientIdentity& client) const {
   if (entries_.size() >= limits_.max_opens) {
     return Error{Errc::limit_exceeded,
-                 "all programs together have max_opens = " + std::to_string(limits_.max_opens) +
-                     " streams open; close some or raise the key max_opens"};
+                 fmt::format("all programs together have max_opens = {} streams open; close some "
+                             "or raise the key max_opens",
+                             limits_.max_opens)};
   }
   const auto own = by_client_.find(client.number);
   if (own != by_client_.end() && own->second.size() >= limits_.max_opens_per_client) {
-    return Error{
-        Errc::limit_exceeded,
-        "this program has max_opens_per_client = " + std::to_string(limits_.max_opens_per_client) +
-            " streams open; close some or raise the key max_opens_per_client"};
+    return Error{Errc::limit_exceeded,
+                 fmt::format("this program has max_opens_per_client = {} streams open; close some "
+                             "or raise the key max_opens_per_client",
+                             limits_.max_opens_per_client)};
   }
   return {};
 }
@@ -32,8 +35,7 @@ OpenNumber OpenTable::add(OpenEntry entry) {
 Result<void> OpenTable::remove(ClientNumber client, OpenNumber number) {
   const auto own = by_client_.find(client);
   if (own == by_client_.end() || own->second.erase(number) == 0) {
-    return Error{Errc::not_found,
-                 "handle " + std::to_string(number) + " is not open on this connection"};
+    return Error{Errc::not_found, fmt::format("handle {} is not open on this connection", number)};
   }
   if (own->second.empty()) by_client_.erase(own);
   forget(number);

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Who has which stream open: one entry per successful Create, Open or Offer, until its Close or the
-// end of the client's connection. An entry keeps its stream alive, also after the stream was
+// end of the client's connection. An entry holds its stream, also after the stream was
 // removed.
 #pragma once
 

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/streams/registry.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 
 #include "core/base/try.hpp"
@@ -9,10 +11,10 @@ namespace dssm::daemon {
 
 Result<StreamId> Registry::own_id(StreamId id) const {
   if (!id.host.empty() && id.host != host_) {
-    return Error{Errc::not_found, "stream '" + id.str() + "' belongs to host '" + id.host +
-                                      "', and this dssmd serves host '" + host_ +
-                                      "' only; leave '@" + id.host +
-                                      "' out, or ask the dssmd of that host"};
+    return Error{Errc::not_found,
+                 fmt::format("stream '{}' belongs to host '{}', and this dssmd serves host '{}' "
+                             "only; leave '@{}' out, or ask the dssmd of that host",
+                             id.str(), id.host, host_, id.host)};
   }
   id.host = host_;
   DSSM_TRY(id.check());
@@ -29,10 +31,11 @@ Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
 
 Result<void> Registry::check_quota() const {
   if (by_name_.size() + other_rings_ < limits_.max_streams) return {};
-  return Error{Errc::limit_exceeded,
-               "there are max_streams = " + std::to_string(limits_.max_streams) +
-                   " streams already, counting those of other hosts that are read or written here; "
-                   "remove some (dssmctl rm) or raise the key max_streams"};
+  return Error{
+      Errc::limit_exceeded,
+      fmt::format("there are max_streams = {} streams already, counting those of other hosts that "
+                  "are read or written here; remove some (dssmctl rm) or raise the key max_streams",
+                  limits_.max_streams)};
 }
 
 Result<RingQuota> Registry::acquire_quota() {
@@ -49,9 +52,9 @@ Result<OpenedRing> Registry::create(const StreamId& id, const TypeInfo& type,
     return OpenedRing{found->second, false};
   }
   if (history.cycle <= Duration::zero()) {
-    return Error{Errc::invalid_argument, context + ": its cycle is " +
-                                             std::to_string(to_ns(history.cycle)) +
-                                             " ns; give the expected time between two samples"};
+    return Error{Errc::invalid_argument,
+                 fmt::format("{}: its cycle is {} ns; give the expected time between two samples",
+                             context, to_ns(history.cycle))};
   }
   DSSM_TRY(check_quota(), context);
   std::shared_ptr<Stream> stream = DSSM_TRY(
@@ -78,7 +81,7 @@ Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, Of
       DSSM_TRY(Stream::adopt_untrusted(std::move(files), budget_), context);
   if (stream->id() != own) {
     return Error{Errc::protocol,
-                 context + ": the offered ring is that of '" + stream->id().str() + "'"};
+                 fmt::format("{}: the offered ring is that of '{}'", context, stream->id().str())};
   }
   return add_adopted(std::move(stream));
 }
@@ -88,7 +91,7 @@ Result<std::shared_ptr<Stream>> Registry::adopt_stored_untrusted(OfferedFiles fi
   Result<std::shared_ptr<Stream>> stream = Stream::adopt_untrusted(std::move(files), budget_);
   if (!stream) return stream;
   const StreamId& id = (*stream)->id();
-  // With not_found, own_id() would say that the stream was removed.
+  // With not_found, the caller would take the stream for removed.
   if (Result<StreamId> own = own_id(id); !own) return Error{Errc::conflict, own.error().message};
   if (by_name_.contains(Key{id.name, id.id})) {
     return Error{Errc::conflict, "stream '" + id.str() + "': another ring has that name"};
@@ -118,11 +121,10 @@ Result<void> Registry::set_property(const StreamId& id, std::string_view propert
   const std::shared_ptr<Stream> stream = DSSM_TRY(find(id));
   const std::string context = "stream '" + stream->id().str() + "'";
   if (property.size() > limits_.max_property_bytes) {
-    return Error{
-        Errc::limit_exceeded,
-        context + ": a property of " + std::to_string(property.size()) +
-            " bytes is longer than max_property = " + std::to_string(limits_.max_property_bytes) +
-            " bytes; shorten it or raise the key max_property"};
+    return Error{Errc::limit_exceeded,
+                 fmt::format("{}: a property of {} bytes is longer than max_property = {} bytes; "
+                             "shorten it or raise the key max_property",
+                             context, property.size(), limits_.max_property_bytes)};
   }
   DSSM_TRY(stream->set_property(property, budget_), context);
   return {};

@@ -98,7 +98,7 @@ class Registry {
   //   fails  conflict (another ring has that name), protocol, no_permission, limit_exceeded
   Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, OfferedFiles files);
 
-  // The same of a stream that the service manager kept: which one, its files say.
+  // The same of a stream that the service manager kept; its files name it.
   //   fails  also not_found (the stream was removed)
   Result<std::shared_ptr<Stream>> adopt_stored_untrusted(OfferedFiles files);
 

@@ -2,6 +2,7 @@
 #include "daemon/streams/stream.hpp"
 
 #include <fcntl.h>
+#include <fmt/format.h>
 #include <sys/eventfd.h>
 #include <sys/random.h>
 #include <unistd.h>
@@ -59,10 +60,9 @@ Result<MemoryShare> take_share(MemoryBudget& budget, const TypeInfo& type,
   wire::to_message(type, message);
   const std::size_t type_bytes = message.ByteSizeLong();
   if (type_bytes > kMaxTypeBytes) {
-    return Error{Errc::limit_exceeded, "the description of its type takes " +
-                                           std::to_string(type_bytes) + " bytes; at most " +
-                                           std::to_string(kMaxTypeBytes) +
-                                           " are taken: describe fewer fields"};
+    return Error{Errc::limit_exceeded, fmt::format("the description of its type takes {} bytes; at "
+                                                   "most {} are taken: describe fewer fields",
+                                                   type_bytes, kMaxTypeBytes)};
   }
   return budget.take(geometry.total_bytes + type_bytes);
 }
@@ -75,10 +75,10 @@ Result<Stream::Plan> plan_untrusted(const local::StreamMeta& meta,
   const ring::RingIdentity& ring = mapping.identity();
   if (id != ring.id || type.payload_bytes != mapping.geometry().payload_bytes ||
       type.alignment_bytes != ring.alignment_bytes) {
-    return Error{Errc::protocol, "the offered meta file describes '" + id.str() + "' with " +
-                                     type.str() + ", the offered ring is that of '" +
-                                     ring.id.str() + "' with " +
-                                     std::to_string(mapping.geometry().payload_bytes) + " bytes"};
+    return Error{Errc::protocol, fmt::format("the offered meta file describes '{}' with {}, the "
+                                             "offered ring is that of '{}' with {} bytes",
+                                             id.str(), type.str(), ring.id.str(),
+                                             mapping.geometry().payload_bytes)};
   }
   if (!local::StreamMeta::Purpose_IsValid(meta.purpose())) {
     return Error{Errc::protocol, "the offered ring of '" + id.str() +
@@ -208,9 +208,9 @@ Result<void> Stream::reserve(std::uint64_t offset, std::uint64_t bytes) {
         ::posix_fallocate(files_.ring.get(), static_cast<off_t>(offset), static_cast<off_t>(bytes));
   } while (failed == EINTR);
   if (!failed) return {};
-  return os_error("reserve " + std::to_string(bytes) + " bytes of memory for the ring of '" +
-                      plan_.id.str() + "'",
-                  failed);
+  return os_error(
+      fmt::format("reserve {} bytes of memory for the ring of '{}'", bytes, plan_.id.str()),
+      failed);
 }
 
 bool Stream::is_ring(int fd) const noexcept { return same_file(fd, files_.ring.get()); }

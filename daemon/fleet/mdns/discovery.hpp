@@ -16,7 +16,7 @@
 
 namespace dssm::daemon {
 
-// Where others come, out of the addresses that a dssmd listens at.
+// How others reach a dssmd, from the addresses that it listens at.
 struct Reach {
   std::uint16_t port = 0;  // 0: it listens nowhere
   bool closed = true;      // at loopback only
@@ -42,7 +42,7 @@ class Discovery final : private StreamObserver {
   Discovery& operator=(const Discovery&) = delete;
   ~Discovery();
 
-  // This host serves others by now.
+  // To be called once this host serves others.
   void start_announcing();
 
  private:

@@ -7,6 +7,7 @@
 #include <arpa/inet.h>
 #include <avahi-common/error.h>
 #include <avahi-common/malloc.h>
+#include <fmt/format.h>
 #include <netinet/in.h>
 
 #include <algorithm>
@@ -14,6 +15,8 @@
 #include <vector>
 
 #include "core/base/text.hpp"
+#include "daemon/fleet/mdns/avahi_poll.hpp"
+#include "daemon/fleet/mdns/mdns_worker.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -30,9 +33,9 @@ Result<TxtRecord> txt_untrusted(AvahiStringList* list) {
   for (AvahiStringList* one = list; one; one = avahi_string_list_get_next(one)) {
     bytes += 1 + avahi_string_list_get_size(one);
     if (bytes > kMaxTxtBytes || txt.size() == kMaxTxtPairs) {
-      return Error{Errc::protocol, "its TXT record is larger than " + std::to_string(kMaxTxtBytes) +
-                                       " bytes or has more than " + std::to_string(kMaxTxtPairs) +
-                                       " keys"};
+      return Error{Errc::protocol,
+                   fmt::format("its TXT record is larger than {} bytes or has more than {} keys",
+                               kMaxTxtBytes, kMaxTxtPairs)};
     }
     char* key = nullptr;
     char* value = nullptr;
@@ -50,8 +53,8 @@ struct RankedAddress {
   int rank;
 };
 
-// IPv4 before IPv6, and what is valid everywhere before what is valid on one link. Nobody may send
-// us to ourselves, or to everybody.
+// IPv4 before IPv6, and what is valid everywhere before what is valid on one link. An
+// announcement must not direct us to this host itself, or to a multicast address.
 std::optional<RankedAddress> address_untrusted(const AvahiAddress& address,
                                                const std::string& interface, bool local) {
   char text[INET6_ADDRSTRLEN] = "";
@@ -83,8 +86,8 @@ std::optional<RankedAddress> address_untrusted(const AvahiAddress& address,
 }  // namespace
 
 HostBrowser::HostBrowser(const EventLoop& loop, const wire::HostId& self, std::uint16_t port,
-                         const InterfaceFilter& filter, AvahiObserver& observer)
-    : self_(self), port_(port), filter_(filter), observer_(observer) {
+                         const InterfaceFilter& filter, MdnsWorker& owner)
+    : self_(self), port_(port), filter_(filter), owner_(owner) {
   retry_ = EventSource::timer(loop, [this] { resolve_again(); });
   refill_ = EventSource::timer(loop, [this] { refill(); });
 }
@@ -95,7 +98,7 @@ void HostBrowser::start(AvahiClient* client) {
   const std::string type(kHostSubtype);
   browser_ = avahi_service_browser_new(client, AVAHI_IF_UNSPEC, AVAHI_PROTO_UNSPEC, type.c_str(),
                                        nullptr, AvahiLookupFlags{}, on_browser, this);
-  if (!browser_) observer_.on_avahi_failure(avahi_client_errno(client));
+  if (!browser_) owner_.on_avahi_failure(avahi_client_errno(client));
 }
 
 void HostBrowser::forget() {
@@ -161,9 +164,10 @@ std::uint32_t HostBrowser::hosts_heard() const {
 
 std::string HostBrowser::problem() const {
   if (waiting_.empty()) return {};
-  return "more than " + std::to_string(kMaxResults) +
-         " hosts, counted once per interface and protocol, announce themselves; the others are "
-         "left out (name them as peers)";
+  return fmt::format(
+      "more than {} hosts, counted once per interface and protocol, announce themselves; the "
+      "others are left out (name them as peers)",
+      kMaxResults);
 }
 
 void HostBrowser::on_browser(AvahiServiceBrowser*, AvahiIfIndex interface, AvahiProtocol protocol,
@@ -178,7 +182,7 @@ void HostBrowser::on_browser(AvahiServiceBrowser*, AvahiIfIndex interface, Avahi
       browser.on_removed(Key{interface, protocol, name, domain});
       break;
     case AVAHI_BROWSER_FAILURE:
-      browser.observer_.on_avahi_failure(avahi_client_errno(browser.client_));
+      browser.owner_.on_avahi_failure(avahi_client_errno(browser.client_));
       break;
     case AVAHI_BROWSER_CACHE_EXHAUSTED:
     case AVAHI_BROWSER_ALL_FOR_NOW:
@@ -197,11 +201,10 @@ void HostBrowser::on_new(Key key) {
 // Gives places to those that wait; a few at a time, because each costs D-Bus calls.
 void HostBrowser::refill() {
   for (int n = 0; n < kRefillPerTurn && !waiting_.empty(); ++n) {
-    if (observer_.stopping() || !client_) return;
+    if (owner_.stopping() || !client_) return;
     if (results_.size() >= kMaxResults && !make_room()) {
-      if (!std::exchange(logged_full_, true))
-        observer_.log(LogLevel::warning, "mDNS: " + problem());
-      return observer_.on_avahi_change();
+      if (!std::exchange(logged_full_, true)) owner_.log(LogLevel::warning, "mDNS: " + problem());
+      return owner_.on_avahi_change();
     }
     const auto next = waiting_.extract(waiting_.begin());
     Result& result = results_[next.value()];
@@ -219,7 +222,7 @@ void HostBrowser::on_removed(const Key& key) {
   free_resolver(at->second);
   results_.erase(at);
   if (!waiting_.empty()) refill_.enable_in(Duration::zero());
-  observer_.on_avahi_change();
+  owner_.on_avahi_change();
 }
 
 bool HostBrowser::make_room() {
@@ -241,13 +244,13 @@ void HostBrowser::resolve(Result& result) {
   if (result.resolver) return;
   const int error = avahi_client_errno(client_);
   result.useless = true;
-  if (is_avahi_connection_error(error)) return observer_.on_avahi_failure(error);
+  if (is_avahi_connection_error(error)) return owner_.on_avahi_failure(error);
   retry_.enable_in(kResolverPause);
 }
 
 void HostBrowser::resolve_again() {
   for (auto& [key, result] : results_) {
-    if (!result.resolver && client_ && !observer_.stopping()) resolve(result);
+    if (!result.resolver && client_ && !owner_.stopping()) resolve(result);
   }
 }
 
@@ -286,7 +289,7 @@ void HostBrowser::on_resolver(AvahiServiceResolver*, AvahiIfIndex, AvahiProtocol
   }
   HostBrowser& browser = *of.browser;
   if (of.useless && !browser.waiting_.empty()) browser.refill_.enable_in(Duration::zero());
-  browser.observer_.on_avahi_change();
+  browser.owner_.on_avahi_change();
 }
 
 void HostBrowser::on_resolved_untrusted(Result& result, const AvahiAddress* address,
@@ -296,9 +299,9 @@ void HostBrowser::on_resolved_untrusted(Result& result, const AvahiAddress* addr
   const std::string interface = interface_name(result.key.interface);
   const auto bad = [&](const std::string& reason) {
     if (std::exchange(result.logged_bad, true)) return;
-    observer_.log(LogLevel::warning, "mDNS: " + in_quotes(result.key.instance) + " on interface " +
-                                         in_quotes(interface) + " calls itself a DSSM host, but " +
-                                         reason + ", skipping");
+    owner_.log(LogLevel::warning,
+               fmt::format("mDNS: {} on interface {} calls itself a DSSM host, but {}, skipping",
+                           in_quotes(result.key.instance), in_quotes(interface), reason));
   };
   const dssm::Result<TxtRecord> pairs = txt_untrusted(txt);
   if (!pairs) return bad(pairs.error().message);

@@ -18,11 +18,12 @@
 #include <string>
 
 #include "daemon/base/event_loop.hpp"
-#include "daemon/fleet/mdns/avahi_poll.hpp"
 #include "daemon/fleet/mdns/interface_filter.hpp"
 #include "daemon/fleet/mdns/mdns.hpp"
 
 namespace dssm::daemon {
+
+class MdnsWorker;  // owns the AvahiClient
 
 class HostBrowser {
  public:
@@ -33,7 +34,7 @@ class HostBrowser {
   // All outlive it.
   //   self, port  of this host's own service
   HostBrowser(const EventLoop& loop, const wire::HostId& self, std::uint16_t port,
-              const InterfaceFilter& filter, AvahiObserver& observer);
+              const InterfaceFilter& filter, MdnsWorker& owner);
   HostBrowser(const HostBrowser&) = delete;
   HostBrowser& operator=(const HostBrowser&) = delete;
 
@@ -93,7 +94,7 @@ class HostBrowser {
   const wire::HostId self_;
   const std::uint16_t port_;
   const InterfaceFilter& filter_;
-  AvahiObserver& observer_;
+  MdnsWorker& owner_;
   AvahiClient* client_ = nullptr;
   AvahiServiceBrowser* browser_ = nullptr;
   std::map<Key, Result> results_;

@@ -61,7 +61,8 @@ InterfaceWatch::InterfaceWatch(const EventLoop& loop, std::function<void()> on_c
     return;
   }
   source_ = EventSource::readable(loop, netlink_.get(), [this, then = std::move(on_change)] {
-    // What it says does not matter, and what got lost (ENOBUFS) neither: the list is read again.
+    // The content of the messages does not matter, even if some are lost (ENOBUFS): the list of
+    // interfaces is read again.
     char buffer[8192];
     while (::recv(netlink_.get(), buffer, sizeof buffer, 0) >= 0 || errno == ENOBUFS ||
            errno == EINTR) {

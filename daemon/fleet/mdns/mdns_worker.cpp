@@ -1,15 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The life of a connection:
+// How a connection begins and ends:
 //
 //   connect()       makes a client. Without D-Bus that fails, and is tried again; without an Avahi
 //                   daemon the client waits for it (AVAHI_CLIENT_NO_FAIL)
 //   follow_state()  announces and browses as soon as the daemon is there; pauses announcing while
 //                   it tries another name for this PC
-//   reopen()    frees the client with all that it made when the daemon or D-Bus has ended, and
+//   reopen()        frees the client with all that it made when the daemon or D-Bus has ended, and
 //                   connects again
 //
-// Avahi's callbacks only take notes: what they lead to is done by timers without delay, so that
+// Avahi's callbacks only set flags: what follows from them is done by timers without delay, so that
 // nothing is freed while it is in use further up the stack. Freeing a client closes its connection
 // to D-Bus first and calls nothing else; the Avahi daemon then withdraws what it had announced.
 #include "daemon/fleet/mdns/mdns_worker.hpp"
@@ -25,7 +25,7 @@ namespace dssm::daemon {
 namespace {
 
 constexpr Duration kFirstConnectPause = std::chrono::milliseconds(100);
-constexpr Duration kLongestConnectPause = std::chrono::seconds(2);
+constexpr Duration kMaxConnectPause = std::chrono::seconds(2);
 // So that many changes in a row are announced as one.
 constexpr Duration kOrdersSettle = std::chrono::milliseconds(50);
 constexpr Duration kReportSettle = std::chrono::milliseconds(20);
@@ -186,7 +186,7 @@ void MdnsWorker::wait_for_avahi(int error) {
   state_.phase = MdnsPhase::waiting;
   state_.error = waiting_reason(error);
   connect_.enable_in(pause_);
-  pause_ = std::min(2 * pause_, kLongestConnectPause);
+  pause_ = std::min(2 * pause_, kMaxConnectPause);
   report();
 }
 
@@ -209,7 +209,7 @@ void MdnsWorker::on_avahi_change() { report_.enable_in(kReportSettle); }
 void MdnsWorker::report() {
   MdnsInfo state = state_;
   if (state.phase == MdnsPhase::waiting) {
-    // The log hears of it once, however often it is tried again.
+    // Logged once, however often it is tried again.
     if (!std::exchange(logged_waiting_, true)) {
       log(LogLevel::warning,
           "mDNS waits, other hosts are found only as configured peers: " + state.error);
@@ -225,9 +225,5 @@ void MdnsWorker::report() {
   state.withheld = publisher_.withheld();
   mailbox_.report(browser_.hosts(), std::move(state));
 }
-
-void MdnsWorker::log(LogLevel level, std::string text) { mailbox_.log(level, std::move(text)); }
-
-bool MdnsWorker::stopping() const noexcept { return mailbox_.stopping(); }
 
 }  // namespace dssm::daemon

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The thread that talks to Avahi: keeps a client connected, lets it announce and browse, and
-// reports to the mailbox. Any call in here may take as long as D-Bus is patient (25 s).
+// reports to the mailbox. Any call in here may take as long as the timeout of D-Bus (25 s).
 #pragma once
 
 #include <avahi-client/client.h>
@@ -17,7 +17,7 @@
 
 namespace dssm::daemon {
 
-class MdnsWorker final : private AvahiObserver {
+class MdnsWorker {
  public:
   // loop and mailbox outlive it; loop is its own.
   MdnsWorker(EventLoop& loop, const Mdns::Options& options, MdnsMailbox& mailbox);
@@ -25,14 +25,19 @@ class MdnsWorker final : private AvahiObserver {
   MdnsWorker& operator=(const MdnsWorker&) = delete;
   ~MdnsWorker();  // withdraws all
 
-  void run();  // until the mailbox says stop
+  void run();  // until MdnsMailbox::stop()
+
+  // --- for the publisher and the browser
+
+  // Something that is reported has changed.
+  void on_avahi_change();
+  // The client cannot be used any more; it is freed after this, not inside.
+  void on_avahi_failure(int error);
+  void log(LogLevel level, std::string text) { mailbox_.log(level, std::move(text)); }
+  // Whether to end quickly, without more calls to Avahi.
+  bool stopping() const noexcept { return mailbox_.stopping(); }
 
  private:
-  void on_avahi_change() override;
-  void on_avahi_failure(int error) override;
-  void log(LogLevel level, std::string text) override;
-  bool stopping() const noexcept override;
-
   static void on_client(AvahiClient* client, AvahiClientState state, void* self);
   void on_orders();
   void on_settled();
@@ -56,7 +61,7 @@ class MdnsWorker final : private AvahiObserver {
   std::string interface_error_;
   int failure_ = 0;              // of the client, to be dealt with outside its callbacks
   bool renamed_ = false;         // this PC got another name since the last follow_state()
-  bool logged_waiting_ = false;  // the log knows
+  bool logged_waiting_ = false;  // that Avahi is not available
   Duration pause_;               // before the next attempt to connect
   std::unique_ptr<InterfaceWatch> interfaces_;
   EventSource orders_, settle_, connect_, follow_, report_;

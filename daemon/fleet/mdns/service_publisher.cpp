@@ -1,15 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Every call here is a D-Bus call that waits for its answer, about five for a new service. So they
-// are made in turns of a few services, between which the loop hears what else Avahi has to say.
+// are made in turns of a few services, between which the loop serves other events of Avahi.
 #include "daemon/fleet/mdns/service_publisher.hpp"
 
 #include <avahi-common/alternative.h>
 #include <avahi-common/error.h>
 #include <avahi-common/malloc.h>
+#include <fmt/format.h>
 
 #include <algorithm>
 #include <memory>
+#include <utility>
+
+#include "daemon/fleet/mdns/avahi_poll.hpp"
+#include "daemon/fleet/mdns/mdns_worker.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -48,8 +53,8 @@ const std::string& service_type() {
 }  // namespace
 
 ServicePublisher::ServicePublisher(const EventLoop& loop, std::uint16_t port, Duration stream_pause,
-                                   AvahiObserver& observer)
-    : loop_(loop), observer_(observer), port_(port), pace_(kStreamsAtOnce, stream_pause) {
+                                   MdnsWorker& owner)
+    : loop_(loop), owner_(owner), port_(port), pace_(kStreamsAtOnce, stream_pause) {
   worker_ = EventSource::timer(loop, [this] { work(); });
   retry_ = EventSource::timer(loop, [this] { queue_withheld(); });
 }
@@ -132,13 +137,17 @@ std::string ServicePublisher::problem() const {
   const auto first = std::find_if(services_.begin(), services_.end(), [](const auto& entry) {
     return entry.second.state == State::withheld;
   });
-  return std::to_string(count) + (count == 1 ? " service is" : " services are") +
-         " not announced, '" + first->first + (count == 1 ? "': " : "' first: ") +
-         (first->second.error.empty()
-              ? "more than " + std::to_string(kMaxGroups) +
-                    " would exceed what Avahi grants one program (objects-per-client-max). They "
-                    "are found all the same by every dssmd that knows this host"
-              : first->second.error);
+  const std::string reason =
+      first->second.error.empty()
+          ? fmt::format(
+                "more than {} would exceed what Avahi grants one program "
+                "(objects-per-client-max). They are found all the same by every dssmd that "
+                "knows this host",
+                kMaxGroups)
+          : first->second.error;
+  return count == 1 ? fmt::format("1 service is not announced, '{}': {}", first->first, reason)
+                    : fmt::format("{} services are not announced, '{}' first: {}", count,
+                                  first->first, reason);
 }
 
 void ServicePublisher::queue(Service& service, bool first) {
@@ -175,7 +184,7 @@ void ServicePublisher::queue_withheld() {
 
 void ServicePublisher::work() {
   for (int n = 0; n < kServicesPerTurn && !queue_.empty(); ++n) {
-    if (observer_.stopping()) return;
+    if (owner_.stopping()) return;
     const std::string instance = std::move(queue_.front());
     queue_.pop_front();
     const auto at = services_.find(instance);
@@ -183,10 +192,10 @@ void ServicePublisher::work() {
     if (is_new_stream(at->second)) {
       const MonoTime now = loop_.now();
       if (const Duration pause = pace_.wait(now); pause > Duration::zero()) {
-        // All others wait, too; what must not wait stands before it, see want().
+        // All others wait, too; what must not wait is queued before it, see want().
         queue_.push_front(instance);
         worker_.enable_in(pause);
-        return observer_.on_avahi_change();
+        return owner_.on_avahi_change();
       }
       if (!host_is_settled()) {
         at->second.queued = false;  // queue_new_streams() comes back to it
@@ -195,11 +204,11 @@ void ServicePublisher::work() {
       pace_.take(now);
     }
     at->second.queued = false;
-    if (!bring(at->second)) return observer_.on_avahi_failure(avahi_client_errno(client_));
+    if (!bring(at->second)) return owner_.on_avahi_failure(avahi_client_errno(client_));
     if (!at->second.wanted) services_.erase(at);
   }
   if (!queue_.empty()) worker_.enable_in(Duration::zero());
-  observer_.on_avahi_change();
+  owner_.on_avahi_change();
 }
 
 bool ServicePublisher::is_new_stream(const Service& service) const {
@@ -231,7 +240,7 @@ bool ServicePublisher::bring(Service& service) {
     if (!service.group) return true;
     error = avahi_entry_group_free(std::exchange(service.group, nullptr));
     --groups_;
-    // There is room now.
+    // Another group fits now.
     if (groups_ + 1 == kMaxGroups) queue_withheld();
     return !is_avahi_connection_error(error);
   }
@@ -328,7 +337,7 @@ void ServicePublisher::withhold(Service& service, int error) {
   if (error != AVAHI_OK) retry_.enable_in(kWithheldPause);
   if (!logged_withheld_ && !is_avahi_connection_error(error)) {
     logged_withheld_ = true;
-    observer_.log(LogLevel::warning, "mDNS: " + problem());
+    owner_.log(LogLevel::warning, "mDNS: " + problem());
   }
   if (!service.record.stream) queue_new_streams();
 }
@@ -348,7 +357,7 @@ void ServicePublisher::on_group(Service& service, AvahiEntryGroupState state) {
       if (!service.record.stream) queue_new_streams();
       break;
     case AVAHI_ENTRY_GROUP_COLLISION:
-      // Another PC has that name: "pc2 #2". Who we are stands in the TXT record.
+      // Another PC has that name: "pc2 #2". The TXT record identifies this host.
       if (rename(service)) {
         service.state = State::idle;
         queue(service);
@@ -363,7 +372,7 @@ void ServicePublisher::on_group(Service& service, AvahiEntryGroupState state) {
     case AVAHI_ENTRY_GROUP_UNCOMMITED:
       break;
   }
-  observer_.on_avahi_change();
+  owner_.on_avahi_change();
 }
 
 }  // namespace dssm::daemon

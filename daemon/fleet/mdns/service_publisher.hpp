@@ -1,11 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Brings what Avahi announces to what is wanted: one entry group per service, so that one changes,
-// collides or fails without the others.
+// Reconciles what Avahi announces with what is wanted: one entry group per service, so that one
+// changes, collides or fails without the others.
 //
 // The host comes first; streams are announced when that is done, and a few at a time: all Avahi
-// daemons of the network work on each one, and those that hear of a thousand at once are late to
-// tell of the hosts (docs/discovery.md "Many streams").
+// daemons of the network process each one, and a thousand at once would delay their reports about
+// hosts (docs/discovery.md "Many streams").
 //
 // Avahi's stock limits, as its daemon counts them: 1024 objects per client, entry groups and
 // resolvers together; 32 entries per entry group, of which a service takes one and each subtype
@@ -23,21 +23,22 @@
 
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/rate_limiter.hpp"
-#include "daemon/fleet/mdns/avahi_poll.hpp"
 #include "daemon/fleet/service_record.hpp"
 
 namespace dssm::daemon {
 
+class MdnsWorker;  // owns the AvahiClient
+
 class ServicePublisher {
  public:
-  // Leaves room for the browser and its resolvers.
+  // Leaves objects for the browser and its resolvers.
   static constexpr std::size_t kMaxGroups = 740;
   // Two entries each: half of what a group may hold.
   static constexpr std::size_t kMaxInterfaces = 8;
 
-  // stream_pause: as in Mdns::Options. loop and observer outlive it.
+  // stream_pause: as in Mdns::Options. loop and owner outlive it.
   ServicePublisher(const EventLoop& loop, std::uint16_t port, Duration stream_pause,
-                   AvahiObserver& observer);
+                   MdnsWorker& owner);
   ServicePublisher(const ServicePublisher&) = delete;
   ServicePublisher& operator=(const ServicePublisher&) = delete;
 
@@ -85,7 +86,7 @@ class ServicePublisher {
   bool rename(Service& service);
 
   const EventLoop& loop_;
-  AvahiObserver& observer_;
+  MdnsWorker& owner_;
   const std::uint16_t port_;
   AvahiClient* client_ = nullptr;
   bool running_ = false;

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "daemon/fleet/peer_report.hpp"
+#include "daemon/fleet/peer.hpp"
 
 #include <fmt/format.h>
 
