@@ -2,19 +2,20 @@
 //
 // dssmctl clock: how good the fleet's clocks are, a row per host; as it changes (--watch), as a
 // table of statistics (--table), or as something to wait for (--wait).
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cmath>
 #include <dssm/clock.hpp>
 #include <map>
 #include <thread>
 
-#include "client/dssmctl/json.hpp"
 #include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/statistics.hpp"
-#include "client/dssmctl/stop_signal.hpp"
-#include "client/dssmctl/table.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -29,17 +30,9 @@ bool is_good(const ClockSnapshot& clock) {
   return clock.status == ClockStatus::synchronized || clock.status == ClockStatus::holdover;
 }
 
-std::string or_dash(const std::string& text) { return text.empty() ? "-" : text; }
-
-// "1.25 ms", "-87 us"
-std::string offset_text(Duration offset) {
-  return offset < Duration::zero() ? "-" + duration_text(-offset) : duration_text(offset);
-}
-
 std::string status_text(const ClockSnapshot& clock) {
-  const std::string status(name_of(clock.status));
-  return clock.reason == ClockReason::none ? status
-                                           : status + ": " + std::string(name_of(clock.reason));
+  if (clock.reason == ClockReason::none) return std::string(name_of(clock.status));
+  return fmt::format("{}: {}", name_of(clock.status), name_of(clock.reason));
 }
 
 std::string reference_text(const HostInfo& host) {
@@ -47,7 +40,7 @@ std::string reference_text(const HostInfo& host) {
   return or_dash(escaped(host.clock_reference));
 }
 
-// A host that says nothing has dashes.
+// A host whose clock is not known has dashes.
 std::vector<std::string> clock_row(const HostInfo& host) {
   if (!host.clock) return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-"};
   const ClockSnapshot& clock = *host.clock;
@@ -56,7 +49,7 @@ std::vector<std::string> clock_row(const HostInfo& host) {
           status_text(clock),
           bound_text(host.clock_bound()),
           bound_text(host.clock_distance),
-          is_read ? offset_text(clock.offset) : "-",
+          is_read ? duration_text(clock.offset) : "-",
           reference_text(host),
           clock.update_interval > Duration::zero() ? duration_text(clock.update_interval) : "-",
           is_read ? duration_text(clock.age) : "-"};
@@ -74,7 +67,7 @@ Json clock_json(const HostInfo& host) {
   json["distance_ns"] = bound_json(host.clock_distance);
   json["root_bound_ns"] = bound_json(clock.root_bound);
   json["offset_ns"] = to_ns(clock.offset);
-  json["reference"] = host.clock_reference.empty() ? Json() : Json(host.clock_reference);
+  json["reference"] = or_null(host.clock_reference);
   json["stratum"] = clock.stratum;
   json["poll_ns"] = to_ns(clock.update_interval);
   json["age_ns"] = to_ns(clock.age);
@@ -103,23 +96,13 @@ void print_clocks(const std::vector<HostInfo>& hosts, bool json, Output& out) {
   table.print(out);
 }
 
-// False when a stop signal came before.
-bool wait_a_period(MonoTime until) {
-  while (MonoClock::now() < until) {
-    if (stop_requested()) return false;
-    std::this_thread::sleep_for(std::min(until - MonoClock::now(), kStopCheckPeriod));
-  }
-  return !stop_requested();
-}
-
 Result<void> watch_clocks(Session& session, const ClockOptions& options, Output& out) {
   catch_stop_signals();
   for (MonoTime next = MonoClock::now();; next += kReadingPeriod) {
-    const Result<std::vector<HostInfo>> hosts = session.list_hosts();
-    if (!hosts) return hosts.error();
-    print_clocks(*hosts, options.json, out);
+    const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
+    print_clocks(hosts, options.json, out);
     if (!options.json) out.add("\n");
-    if (!out.flush() || out.reader_ended() || !wait_a_period(next + kReadingPeriod)) return {};
+    if (!out.flush() || !out.sleep_until(next + kReadingPeriod)) return {};
   }
 }
 
@@ -149,7 +132,6 @@ void print_table(const std::map<std::string, Readings>& all, bool json, Output& 
     }
     return out.add(json_document({{"clocks", std::move(hosts)}}));
   }
-  const auto ns_text = [](double ns) { return duration_text(Duration(std::llround(ns))); };
   Table table({{"HOST"},
                {"OF"},
                {"READINGS", Table::Align::right},
@@ -169,8 +151,8 @@ void print_table(const std::map<std::string, Readings>& all, bool json, Output& 
   table.print(out);
   for (const auto& [name, readings] : all) {
     if (readings.unknown == 0) continue;
-    out.add("at " + std::to_string(readings.unknown) + " readings the clock of '" + escaped(name) +
-            "' was not known\n");
+    out.add(fmt::format("at {} readings the clock of '{}' was not known\n", readings.unknown,
+                        escaped(name)));
   }
 }
 
@@ -180,10 +162,9 @@ Result<void> tabulate_clocks(Session& session, const ClockOptions& options, Outp
   std::map<std::string, Readings> all;
   MonoTime next = MonoClock::now();
   for (std::uint64_t i = 0; i < count; ++i, next += kReadingPeriod) {
-    if (!wait_a_period(next)) break;
-    const Result<std::vector<HostInfo>> hosts = session.list_hosts();
-    if (!hosts) return hosts.error();
-    for (const HostInfo& host : *hosts) {
+    if (!out.sleep_until(next)) break;
+    const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
+    for (const HostInfo& host : hosts) {
       if (!is_there(host)) continue;
       Readings& readings = all.try_emplace(host.name, count).first->second;
       if (!host.clock || host.clock_bound() == kUnknownClockError) {
@@ -203,34 +184,33 @@ Result<void> await_clock(Session& session, const ClockOptions& options, Output& 
   catch_stop_signals();
   const MonoTime deadline = deadline_in(*options.wait);
   for (;;) {
-    const Result<std::vector<HostInfo>> hosts = session.list_hosts();
-    if (!hosts) return hosts.error();
-    const HostInfo& self = hosts->front();
+    const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
+    const HostInfo& self = hosts.front();
     if (self.clock && is_good(*self.clock)) {
       print_clocks({self}, options.json, out);
       return {};
     }
     const MonoTime now = MonoClock::now();
-    if (now >= deadline || !wait_a_period(std::min(deadline, now + kStopCheckPeriod))) {
-      return Error{Errc::clock_out_of_bounds,
-                   "the clock of this host is " +
-                       (self.clock ? status_text(*self.clock) : "not watched") +
-                       "; see `chronyc tracking` and `systemctl status chrony`"};
+    if (now >= deadline || stop_requested()) {
+      return Error{
+          Errc::clock_out_of_bounds,
+          fmt::format("the clock of this host is {}; see `chronyc tracking` and `systemctl "
+                      "status chrony`",
+                      self.clock ? status_text(*self.clock) : "not watched")};
     }
+    std::this_thread::sleep_for(std::min(deadline - now, kStopCheckPeriod));
   }
 }
 
 }  // namespace
 
 Result<void> run(const ClockOptions& options, Output& out) {
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  if (options.wait) return await_clock(*session, options, out);
-  if (options.table) return tabulate_clocks(*session, options, out);
-  if (options.watch) return watch_clocks(*session, options, out);
-  const Result<std::vector<HostInfo>> hosts = session->list_hosts();
-  if (!hosts) return hosts.error();
-  print_clocks(*hosts, options.json, out);
+  Session session = DSSM_TRY(connect(options));
+  if (options.wait) return await_clock(session, options, out);
+  if (options.table) return tabulate_clocks(session, options, out);
+  if (options.watch) return watch_clocks(session, options, out);
+  const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
+  print_clocks(hosts, options.json, out);
   return {};
 }
 

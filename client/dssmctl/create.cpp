@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl create and rm.
+#include <fmt/format.h>
+
 #include <bit>
 
-#include "client/dssmctl/json.hpp"
 #include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -17,8 +20,8 @@ constexpr Duration kDefaultCycle = std::chrono::milliseconds(100);
 // A C++ type's size is a multiple of its alignment, so the greatest power of two in the size is
 // what a type of that size can have at most; no more than a double's.
 std::uint32_t likely_alignment(std::uint64_t payload_bytes) {
-  constexpr std::uint64_t kMost = 8;
-  return static_cast<std::uint32_t>(std::min(kMost, payload_bytes & (~payload_bytes + 1)));
+  constexpr std::uint64_t kMaxAlignment = 8;
+  return static_cast<std::uint32_t>(std::min(kMaxAlignment, payload_bytes & (~payload_bytes + 1)));
 }
 
 Result<History> history_of(const CreateOptions& options) {
@@ -29,42 +32,34 @@ Result<History> history_of(const CreateOptions& options) {
 }  // namespace
 
 Result<void> run(const CreateOptions& options, Output& out) {
-  Result<StreamId> id = StreamId::parse(options.stream);
-  if (!id) return std::move(id).error();
-  const std::string tried = "create '" + id->str() + "'";
-  const Result<History> history = history_of(options);
-  if (!history) return Error(history.error()).context(tried);
+  StreamId id = DSSM_TRY(StreamId::parse(options.stream));
+  const History history = DSSM_TRY(history_of(options), fmt::format("create '{}'", id.str()));
   TypeInfo type;
   type.name = options.type;
   type.payload_bytes = options.payload_bytes;
   type.alignment_bytes =
       options.alignment_bytes ? options.alignment_bytes : likely_alignment(options.payload_bytes);
 
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  StreamId wanted = *id;
+  Session session = DSSM_TRY(connect(options));
+  StreamId wanted = id;
   if (wanted.host.empty()) {  // created here, whatever other hosts have
-    const Result<DaemonInfo> daemon = session->daemon_info();
-    if (!daemon) return daemon.error();
-    wanted.host = daemon->host;
+    const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
+    wanted.host = daemon.host;
   }
-  const bool there = session->stream_info(wanted).has_value();
-  Result<RawWriter> writer = session->create_raw(*id, type, *history);
-  if (!writer) return std::move(writer).error();
+  const bool there = session.stream_info(wanted).has_value();
+  RawWriter writer = DSSM_TRY(session.create_raw(id, type, history));
   // Not the writer's own figures: for another host's stream those of a ring on the way there.
-  const Result<StreamInfo> stream = session->stream_info(writer->id());
-  if (!stream) return stream.error();
+  const StreamInfo stream = DSSM_TRY(session.stream_info(writer.id()));
   if (options.json) {
-    out.add(json_document({{"stream", stream->id.str()},
+    out.add(json_document({{"stream", stream.id.str()},
                            {"created", !there},
-                           {"payload_bytes", stream->type.payload_bytes},
-                           {"depth", stream->depth},
-                           {"cycle_ns", to_ns(stream->cycle)}}));
+                           {"payload_bytes", stream.type.payload_bytes},
+                           {"depth", stream.depth},
+                           {"cycle_ns", to_ns(stream.cycle)}}));
   } else {
-    out.add(escaped(stream->id.str()) +
-            (there ? ": exists already, kept with " : ": created with ") +
-            std::to_string(stream->depth) + " slots of " + bytes_text(stream->type.payload_bytes) +
-            "\n");
+    out.add(fmt::format("{}: {} with {} slots of {}\n", escaped(stream.id.str()),
+                        there ? "exists already, kept" : "created", stream.depth,
+                        bytes_text(stream.type.payload_bytes)));
   }
   return {};
 }
@@ -73,19 +68,16 @@ Result<void> run(const CreateOptions& options, Output& out) {
 Result<void> run(const RmOptions& options, Output& out) {
   std::vector<StreamId> ids;
   for (const std::string& text : options.streams) {
-    Result<StreamId> id = StreamId::parse(text);
-    if (!id) return std::move(id).error();
-    ids.push_back(std::move(*id));
+    ids.push_back(DSSM_TRY(StreamId::parse(text)));
   }
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
+  Session session = DSSM_TRY(connect(options));
   Json removed = Json::array();
   std::optional<Error> failure;
   for (const StreamId& id : ids) {
-    if (Result<void> result = session->remove(id); result) {
+    if (Result<void> result = session.remove(id); result) {
       removed.push_back(id.str());
     } else {
-      Error error = with_similar_names(std::move(result).error(), *session, id);
+      Error error = with_similar_names(std::move(result).error(), session, id);
       if (failure) error.message.insert(0, failure->message + "; and ");
       failure = std::move(error);
     }

@@ -3,24 +3,51 @@
 // dssmctl delay: how old samples are when they arrive here, that is the time on this PC's clock
 // when this program was woken for a sample, minus the sample's stamp. For a stream of another host
 // these are two clocks, and the figure is as good as both together.
-#include "client/dssmctl/clocks.hpp"
-#include "client/dssmctl/json.hpp"
+#include "client/dssmctl/delay.hpp"
+
+#include <fmt/format.h>
+
+#include <algorithm>
+
 #include "client/dssmctl/meter.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/statistics.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
 
 namespace dssm::ctl {
+
+void Clocks::add(const SampleInfo& info) {
+  const bool known = info.clock_error < kForeignClockError;
+  some_unknown_ |= !known;
+  if (known) known_errors_.add(info.clock_error);
+}
+
+void Clocks::update(const std::vector<HostInfo>& hosts, std::string_view owner) {
+  owner_bound_ = kUnknownClockError;  // nothing is known of the clock of a host that is not up
+  for (const HostInfo& host : hosts) {
+    if (host.state == HostState::self) {
+      two_clocks_ = host.name != owner;
+      own_bound_ = host.clock_bound();
+    } else if (host.state == HostState::up && host.name == owner) {
+      owner_bound_ = host.clock_bound();
+    }
+  }
+}
+
+Duration Clocks::delay_error() const {
+  if (!two_clocks_) return Duration::zero();
+  Duration stamps = known_errors_.statistics().max;
+  if (some_unknown_) stamps = std::max(stamps, owner_bound_);
+  return stamps > kUnknownClockError - own_bound_ ? kUnknownClockError : stamps + own_bound_;
+}
+
 namespace {
 
 void print_json(const MeterState& state, const Statistics& delays, const Clocks& clocks,
                 Output& out) {
-  const auto known = [&](auto value) { return delays.count > 0 ? Json(value) : Json(); };
   Json json = report_json(state, "samples", delays.count);
-  json["delay_mean_ns"] = known(delays.mean_ns);
-  json["delay_min_ns"] = known(to_ns(delays.min));
-  json["delay_max_ns"] = known(to_ns(delays.max));
-  json["delay_std_dev_ns"] = known(delays.std_dev_ns);
+  add_statistics(json, "delay", delays);
   json["delay_error_ns"] = bound_json(clocks.delay_error());
   out.add(json_line(json));
 }
@@ -30,14 +57,13 @@ void print_text(const MeterState& state, const Statistics& delays, const Clocks&
   if (state.final) out.add(final_line(state));
   if (!state.final && state.new_samples == 0) return out.add("no new samples\n");
   if (delays.count == 0) return;
-  out.add("average delay: " + fixed_text(delays.mean_ns / 1e9, 9) + " s\n\tmin: " +
-          seconds_text(to_ns(delays.min)) + " s max: " + seconds_text(to_ns(delays.max)) +
-          " s std dev: " + fixed_text(delays.std_dev_ns / 1e9, 9) +
-          " s window: " + std::to_string(delays.count) + "\n");
+  out.add(fmt::format("average delay: {:.9f} s\n{}", delays.mean_ns / 1e9,
+                      statistics_line(delays, delays.count)));
   if (!clocks.are_two()) return;
   const Duration error = clocks.delay_error();
-  out.add(error == kUnknownClockError ? "\tclocks: unknown, so this may be off by any amount\n"
-                                      : "\tclocks: at most " + duration_text(error) + " apart\n");
+  out.add(error == kUnknownClockError
+              ? "\tclocks: unknown, so this may be off by any amount\n"
+              : fmt::format("\tclocks: at most {} apart\n", duration_text(error)));
 }
 
 }  // namespace

@@ -2,12 +2,15 @@
 //
 // dssmctl doctor: checks what usually goes wrong, and reports for each check what it found, the
 // likely cause, and a command that fixes it or shows more. It changes nothing itself.
+#include "client/dssmctl/doctor.hpp"
+
+#include <fmt/format.h>
+
 #include <algorithm>
 
-#include "client/dssmctl/doctor_checks.hpp"
-#include "client/dssmctl/json.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -16,7 +19,6 @@ void print_json(const std::vector<Finding>& findings, bool ok, Output& out) {
   const auto status_name = [](Finding::Status status) {
     return status == Finding::Status::ok ? "ok" : status == Finding::Status::warn ? "warn" : "fail";
   };
-  const auto or_null = [](const std::string& text) { return text.empty() ? Json() : Json(text); };
   Json checks = Json::array();
   for (const Finding& finding : findings) {
     checks.push_back({{"name", finding.name},
@@ -33,10 +35,10 @@ void print_text(const std::vector<Finding>& findings, Output& out) {
     const std::string mark = finding.status == Finding::Status::ok     ? "OK    "
                              : finding.status == Finding::Status::warn ? out.bold("WARN") + "  "
                                                                        : out.bold("FAIL") + "  ";
-    out.add(mark + escaped(finding.name) + ": " + escaped_message(finding.text) + "\n");
+    out.add(fmt::format("{}{}: {}\n", mark, escaped(finding.name), escaped_message(finding.text)));
     if (finding.status == Finding::Status::ok) continue;
-    out.add("      likely: " + escaped_message(finding.cause) + "\n");
-    out.add("      try:    " + escaped_message(finding.command) + "\n");
+    out.add(fmt::format("      likely: {}\n      try:    {}\n", escaped_message(finding.cause),
+                        escaped_message(finding.command)));
   }
 }
 
@@ -49,9 +51,10 @@ Result<void> run(const DoctorOptions& options, Output& out) {
   });
   options.json ? print_json(findings, failed == 0, out) : print_text(findings, out);
   if (failed == 0) return {};
-  return Error{Errc::system,
-               std::to_string(failed) + " of " + std::to_string(findings.size()) +
-                   " checks failed; run the commands beside them, then run doctor again"};
+  return Error{
+      Errc::system,
+      fmt::format("{} of {} checks failed; run the commands beside them, then run doctor again",
+                  failed, findings.size())};
 }
 
 }  // namespace dssm::ctl

@@ -2,14 +2,15 @@
 //
 // One function per check. Texts of other hosts are used as they came; doctor.cpp escapes them when
 // it prints.
-#include "client/dssmctl/doctor_checks.hpp"
+#include <fmt/format.h>
 
 #include <algorithm>
 #include <map>
 #include <set>
 #include <string_view>
 
-#include "client/dssmctl/duplicates.hpp"
+#include "client/dssmctl/doctor.hpp"
+#include "client/dssmctl/names.hpp"
 #include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
@@ -26,63 +27,66 @@ constexpr std::size_t kMaxNamed = 5;  // of streams in one text
 constexpr const char* kConfigFile = "/etc/dssm/dssmd.conf";
 constexpr const char* kDefaultGroup = "dssm";
 
-std::string in_quotes(const std::string& text) { return "'" + text + "'"; }
-
 // Starts one of Debian's own services, in a container too.
 std::string start_command(const Facts& facts, const std::string& service) {
-  return facts.systemd ? "sudo systemctl enable --now " + service
-                       : "sudo service " + service + " start";
+  return facts.systemd ? fmt::format("sudo systemctl enable --now {}", service)
+                       : fmt::format("sudo service {} start", service);
 }
 
 // Gives a host another name; `where` says which.
 std::string rename_command(const std::string& where) {
-  return "echo 'name = \"pc2\"'  # another one on " + where + ", as a line in " +
-         std::string(kConfigFile) + "; then: sudo systemctl restart dssmd";
+  return fmt::format(
+      "echo 'name = \"pc2\"'  # another one on {}, as a line in {}; then: sudo systemctl restart "
+      "dssmd",
+      where, kConfigFile);
 }
 
 // --- dssmd
 
 Finding no_permission(const Facts& facts) {
   const SocketFacts& socket = facts.socket;
-  Finding finding{"daemon", Status::fail, facts.failed->message, {}, {}};
   const std::string group = socket.group.empty() ? kDefaultGroup : socket.group;
+  const auto found = [&](std::string cause, std::string command) {
+    return Finding{"daemon", Status::fail, facts.failed->message, cause, command};
+  };
   if (socket.process_in_group) {
-    finding.cause = "the socket or its folder shuts out even its group " + in_quotes(group);
-    finding.command = "ls -l " + socket.path + "  # see the key socket_mode in " + kConfigFile;
-  } else if (socket.user_in_group) {
-    finding.cause = "user " + in_quotes(facts.user) + " joined the group " + in_quotes(group) +
-                    ", but not before this login";
-    finding.command = "newgrp " + group + "  # or log in again";
-  } else {
-    finding.cause =
-        "user " + in_quotes(facts.user) + " is not in the socket's group " + in_quotes(group);
-    finding.command = "sudo usermod -aG " + group + " " + facts.user + "  # then log in again";
+    return found(
+        fmt::format("the socket or its folder shuts out even its group '{}'", group),
+        fmt::format("ls -l {}  # see the key socket_mode in {}", socket.path, kConfigFile));
   }
-  return finding;
+  if (socket.user_in_group) {
+    return found(fmt::format("user '{}' joined the group '{}', but not before this login",
+                             facts.user, group),
+                 fmt::format("newgrp {}  # or log in again", group));
+  }
+  return found(fmt::format("user '{}' is not in the socket's group '{}'", facts.user, group),
+               fmt::format("sudo usermod -aG {} {}  # then log in again", group, facts.user));
 }
 
 Finding no_daemon(const Facts& facts) {
   const SocketFacts& socket = facts.socket;
-  Finding finding{"daemon", Status::fail, facts.failed->message, {}, {}};
+  const auto found = [&](std::string cause, std::string command) {
+    return Finding{"daemon", Status::fail, facts.failed->message, cause, command};
+  };
   if (socket.kind == SocketFacts::Kind::something_else) {
-    finding.cause = in_quotes(socket.path) + " is there, but is not a socket";
-    finding.command = "ls -l " + socket.path + "  # then correct --socket or $DSSM_SOCKET";
-  } else if (socket.chosen) {
-    finding.cause = "no dssmd runs for the socket that --socket or $DSSM_SOCKET names";
-    finding.command = "unset DSSM_SOCKET  # for the usual one, or start that dssmd";
-  } else if (facts.service == "failed") {
-    finding.cause = "dssmd could not start or crashed";
-    finding.command =
-        "journalctl -u dssmd -n 50  # shows the reason; then: systemctl restart dssmd";
-  } else if (facts.service == "active") {
-    finding.cause = "dssmd runs, but listens elsewhere (key runtime_dir)";
-    finding.command = "grep runtime_dir " + std::string(kConfigFile) + "  # then set $DSSM_SOCKET";
-  } else {
-    finding.cause = "dssmd is not running";
-    finding.command = facts.systemd ? "sudo systemctl enable --now dssmd"
-                                    : "dssmd  # in a terminal of its own: no systemd runs here";
+    return found(fmt::format("'{}' is there, but is not a socket", socket.path),
+                 fmt::format("ls -l {}  # then correct --socket or $DSSM_SOCKET", socket.path));
   }
-  return finding;
+  if (socket.chosen) {
+    return found("no dssmd runs for the socket that --socket or $DSSM_SOCKET names",
+                 "unset DSSM_SOCKET  # for the usual one, or start that dssmd");
+  }
+  if (facts.service == "failed") {
+    return found("dssmd could not start or crashed",
+                 "journalctl -u dssmd -n 50  # shows the reason; then: systemctl restart dssmd");
+  }
+  if (facts.service == "active") {
+    return found("dssmd runs, but listens elsewhere (key runtime_dir)",
+                 fmt::format("grep runtime_dir {}  # then set $DSSM_SOCKET", kConfigFile));
+  }
+  return found("dssmd is not running",
+               facts.systemd ? "sudo systemctl enable --now dssmd"
+                             : "dssmd  # in a terminal of its own: no systemd runs here");
 }
 
 Finding unanswered(const Facts& facts) {
@@ -104,127 +108,110 @@ Finding unanswered(const Facts& facts) {
   }
 }
 
-void check_daemon(const Facts& facts, Findings& findings) {
-  if (facts.failed) return findings.push_back(unanswered(facts));
-  findings.push_back({"daemon",
-                      Status::ok,
-                      "dssmd (pid " + std::to_string(facts.daemon.pid) + ") answers at " +
-                          in_quotes(facts.socket.path) + " as host " + in_quotes(facts.daemon.host),
-                      {},
-                      {}});
+Finding check_daemon(const Facts& facts) {
+  if (facts.failed) return unanswered(facts);
+  return {"daemon", Status::ok,
+          fmt::format("dssmd (pid {}) answers at '{}' as host '{}'", facts.daemon.pid,
+                      facts.socket.path, facts.daemon.host)};
 }
 
-void check_version(const Facts& facts, Findings& findings) {
+Finding check_version(const Facts& facts) {
   if (facts.daemon.version != facts.version) {
-    findings.push_back({"version", Status::warn,
-                        "dssmd is " + facts.daemon.version + ", dssmctl is " + facts.version,
-                        "dssmd was not restarted after an upgrade, or comes from elsewhere",
-                        "sudo systemctl restart dssmd"});
-    return;
+    return {"version", Status::warn,
+            fmt::format("dssmd is {}, dssmctl is {}", facts.daemon.version, facts.version),
+            "dssmd was not restarted after an upgrade, or comes from elsewhere",
+            "sudo systemctl restart dssmd"};
   }
-  std::string others;
+  std::vector<std::string> others;
   for (const HostInfo& host : facts.hosts) {
     if (host.state != HostState::up || host.version == facts.version) continue;
-    others += (others.empty() ? "" : ", ") + host.name + " has " + host.version;
+    others.push_back(fmt::format("{} has {}", host.name, host.version));
   }
-  if (!others.empty()) {
-    findings.push_back({"version", Status::warn, "this PC has " + facts.version + ", " + others,
-                        "not all hosts were upgraded",
-                        "dssmctl hosts  # then install the same version of DSSM on each"});
-    return;
+  if (others.empty()) {
+    return {
+        "version", Status::ok,
+        fmt::format("dssmd and dssmctl are both {} and speak the same protocol", facts.version)};
   }
-  findings.push_back(
-      {"version",
-       Status::ok,
-       "dssmd and dssmctl are both " + facts.version + " and speak the same protocol",
-       {},
-       {}});
+  return {"version", Status::warn,
+          fmt::format("this PC has {}, {}", facts.version, fmt::join(others, ", ")),
+          "not all hosts were upgraded",
+          "dssmctl hosts  # then install the same version of DSSM on each"};
 }
 
 // --- this PC
 
-void check_memory(const Facts& facts, Findings& findings) {
+Finding check_memory(const Facts& facts) {
   const DaemonInfo& daemon = facts.daemon;
-  Finding finding{"memory",
-                  Status::ok,
-                  "rings take " + bytes_text(daemon.memory_bytes) + " of the " +
-                      bytes_text(daemon.memory_limit_bytes) + " that are allowed",
-                  {},
-                  {}};
+  const MemoryFacts& machine = facts.memory;
+  Finding finding{
+      "memory", Status::ok,
+      fmt::format("rings take {} of the {} that are allowed", bytes_text(daemon.memory_bytes),
+                  bytes_text(daemon.memory_limit_bytes))};
   const std::uint64_t left =
       daemon.memory_limit_bytes - std::min(daemon.memory_limit_bytes, daemon.memory_bytes);
-  const MemoryFacts& machine = facts.memory;
   if (left < daemon.memory_limit_bytes / 10) {
-    finding.status = Status::warn;
-    finding.cause = "streams with long histories; soon no further one can be created";
-    finding.command = "dssmctl ls --sort memory  # rm what is not needed, or raise max_memory in " +
-                      std::string(kConfigFile);
+    finding.warn("streams with long histories; soon no further one can be created",
+                 fmt::format("dssmctl ls --sort memory  # rm what is not needed, or raise "
+                             "max_memory in {}",
+                             kConfigFile));
   } else if (machine.total_bytes > 0 && machine.available_bytes < left &&
              machine.available_bytes < machine.total_bytes / 20) {
-    finding.status = Status::warn;
-    finding.text += ", but this PC has only " + bytes_text(machine.available_bytes) + " left";
-    finding.cause = "other programs took the memory";
-    finding.command = "ps -eo rss,comm --sort=-rss | head  # end what is not needed";
+    finding.text +=
+        fmt::format(", but this PC has only {} left", bytes_text(machine.available_bytes));
+    finding.warn("other programs took the memory",
+                 "ps -eo rss,comm --sort=-rss | head  # end what is not needed");
   }
-  findings.push_back(std::move(finding));
+  return finding;
 }
 
 void check_descriptors(const Facts& facts, Findings& findings) {
   const std::uint64_t limit = facts.descriptors.soft_limit;
   if (limit == 0) return;  // dssmd is in another container: not known here
-  const std::uint64_t wanted = facts.daemon.streams * kDescriptorsPerStream + kOtherDescriptors;
-  Finding finding{"descriptors",
-                  Status::ok,
-                  "dssmd may open " + std::to_string(limit) + " files, its " +
-                      std::to_string(facts.daemon.streams) + " streams take about " +
-                      std::to_string(facts.daemon.streams * kDescriptorsPerStream),
-                  {},
-                  {}};
-  if (wanted > limit - limit / 5) {
-    finding.status = Status::warn;
-    finding.cause = "the limit on open files is too low for many more streams";
-    finding.command =
-        "sudo systemctl edit dssmd  # [Service] LimitNOFILE=524288, then restart dssmd";
+  const std::uint64_t taken = facts.daemon.streams * kDescriptorsPerStream;
+  Finding finding{"descriptors", Status::ok,
+                  fmt::format("dssmd may open {} files, its {} streams take about {}", limit,
+                              facts.daemon.streams, taken)};
+  if (taken + kOtherDescriptors > limit - limit / 5) {
+    finding.warn("the limit on open files is too low for many more streams",
+                 "sudo systemctl edit dssmd  # [Service] LimitNOFILE=524288, then restart dssmd");
   }
   findings.push_back(std::move(finding));
 }
 
 void check_disks(const Facts& facts, Findings& findings) {
   for (const DiskFacts& disk : facts.disks) {
-    Finding finding{"disk " + disk.path,
-                    Status::ok,
-                    bytes_text(disk.free_bytes) + " of " + bytes_text(disk.total_bytes) + " free",
-                    {},
-                    {}};
+    Finding finding{
+        "disk " + disk.path, Status::ok,
+        fmt::format("{} of {} free", bytes_text(disk.free_bytes), bytes_text(disk.total_bytes))};
     if (disk.free_bytes < disk.total_bytes / 20 || disk.free_bytes < 100 * kMebibyte) {
-      finding.status = Status::warn;
-      finding.cause = "logs and recordings fill disks";
-      finding.command = disk.path == "/run" ? "du -xh -d 2 /run | sort -h | tail"
-                                            : "sudo journalctl --vacuum-size=200M";
+      finding.warn("logs and recordings fill disks", disk.path == "/run"
+                                                         ? "du -xh -d 2 /run | sort -h | tail"
+                                                         : "sudo journalctl --vacuum-size=200M");
     }
     findings.push_back(std::move(finding));
   }
 }
 
-void check_clock(const Facts& facts, Findings& findings) {
-  const std::string said = facts.clock.detail.empty() ? "" : " (" + facts.clock.detail + ")";
+Finding check_clock(const Facts& facts) {
+  const auto with_detail = [&](const char* text) {
+    return facts.clock.detail.empty() ? text : fmt::format("{} ({})", text, facts.clock.detail);
+  };
   switch (facts.clock.state) {
-    case ClockFacts::State::no_chrony:
-      return findings.push_back({"clock", Status::warn, "chrony is not installed",
-                                 "nothing bounds the difference between this clock and the others",
-                                 "sudo apt install chrony"});
     case ClockFacts::State::no_answer:
-      return findings.push_back({"clock", Status::warn, "chronyd does not answer" + said,
-                                 "chronyd is not running", start_command(facts, "chrony")});
+      return {"clock", Status::warn, with_detail("chronyd does not answer"),
+              "chronyd is not running", start_command(facts, "chrony")};
     case ClockFacts::State::unsynchronized:
-      return findings.push_back(
-          {"clock", Status::warn, "chronyd does not follow any other clock" + said,
-           "it was just started, or no source answers",
-           "chronyc sources  # then correct 'server' lines in /etc/chrony/chrony.conf"});
+      return {"clock", Status::warn, with_detail("chronyd does not follow any other clock"),
+              "it was just started, or no source answers",
+              "chronyc sources  # then correct 'server' lines in /etc/chrony/chrony.conf"};
     case ClockFacts::State::synchronized:
-      return findings.push_back(
-          {"clock", Status::ok, "chronyd keeps this clock by another one" + said, {}, {}});
+      return {"clock", Status::ok, with_detail("chronyd keeps this clock by another one")};
+    case ClockFacts::State::no_chrony:
+      break;
   }
+  return {"clock", Status::warn, "chrony is not installed",
+          "nothing bounds the difference between this clock and the others",
+          "sudo apt install chrony"};
 }
 
 // --- the others
@@ -258,126 +245,106 @@ void check_listening(const Facts& facts, Findings& findings) {
   const std::vector<std::string>& own = facts.hosts.front().addresses;
   const bool closed = std::all_of(own.begin(), own.end(), on_loopback);
   const bool others = std::any_of(facts.hosts.begin(), facts.hosts.end(), is_other_pc);
-  Finding finding{"listening",
-                  Status::ok,
-                  own.empty() ? "nowhere for other hosts" : "at " + list_text(own),
-                  {},
-                  {}};
+  Finding finding{"listening", Status::ok,
+                  own.empty() ? "nowhere for other hosts" : "at " + list_text(own)};
   if (closed && !own.empty()) finding.text += ", for programs of this PC only";
   if (closed && others) {
-    finding.status = Status::warn;
-    finding.cause = "other PCs cannot reach this one: the keys listen and insecure do not let them";
-    finding.command = "echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines in " +
-                      std::string(kConfigFile) + ", then: sudo systemctl restart dssmd";
+    finding.warn(
+        "other PCs cannot reach this one: the keys listen and insecure do not let them",
+        fmt::format("echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines "
+                    "in {}, then: sudo systemctl restart dssmd",
+                    kConfigFile));
   }
   findings.push_back(std::move(finding));
 }
 
 Finding mdns_waiting(const Facts& facts) {
-  const MdnsInfo& mdns = facts.daemon.mdns;
-  Finding finding{"mdns",
-                  Status::warn,
-                  "waits for Avahi" + (mdns.error.empty() ? "" : ": " + mdns.error),
-                  {},
-                  {}};
+  const std::string& error = facts.daemon.mdns.error;
+  Finding finding{"mdns", Status::warn, "waits for Avahi" + (error.empty() ? "" : ": " + error)};
   if (!facts.avahi_installed) {
-    finding.cause = "avahi-daemon is not installed; only configured peers are found";
-    finding.command = "sudo apt install avahi-daemon";
+    finding.warn("avahi-daemon is not installed; only configured peers are found",
+                 "sudo apt install avahi-daemon");
   } else if (!facts.avahi_running) {
-    finding.cause = "avahi-daemon is not running; only configured peers are found";
-    finding.command = start_command(facts, "avahi-daemon");
+    finding.warn("avahi-daemon is not running; only configured peers are found",
+                 start_command(facts, "avahi-daemon"));
   } else {
-    finding.cause = "avahi-daemon runs, but dssmd does not reach it over D-Bus";
-    finding.command = "systemctl status dbus avahi-daemon  # then restart what failed";
+    finding.warn("avahi-daemon runs, but dssmd does not reach it over D-Bus",
+                 "systemctl status dbus avahi-daemon  # then restart what failed");
   }
   return finding;
 }
 
-void check_mdns(const Facts& facts, Findings& findings) {
+Finding check_mdns(const Facts& facts) {
   const MdnsInfo& mdns = facts.daemon.mdns;
   if (mdns.phase == MdnsPhase::off) {
-    return findings.push_back({"mdns", Status::ok, "off: only configured peers are found", {}, {}});
+    return {"mdns", Status::ok, "off: only configured peers are found"};
   }
-  if (mdns.phase == MdnsPhase::waiting) return findings.push_back(mdns_waiting(facts));
+  if (mdns.phase == MdnsPhase::waiting) return mdns_waiting(facts);
 
-  const auto up_by_peers = std::count_if(
+  const bool others_up = std::any_of(
       facts.hosts.begin(), facts.hosts.end(),
       [](const HostInfo& host) { return host.state == HostState::up && is_other_pc(host); });
-  Finding finding{"mdns",
-                  Status::ok,
-                  mdns.avahi_version + ", " + std::to_string(mdns.announced) + " announced, " +
-                      std::to_string(mdns.hosts_heard) + " other hosts heard",
-                  {},
-                  {}};
+  Finding finding{"mdns", Status::ok,
+                  fmt::format("{}, {} announced, {} other hosts heard", mdns.avahi_version,
+                              mdns.announced, mdns.hosts_heard)};
   if (!mdns.error.empty()) finding.text += ": " + mdns.error;
   if (mdns.withheld > 0) {
-    finding.status = Status::warn;
-    finding.text += "; " + std::to_string(mdns.withheld) + " not announced";
-    finding.cause =
-        "beyond Avahi's limits, or refused by it; these streams open by NAME@HOST still";
-    finding.command = "grep objects-per /etc/avahi/avahi-daemon.conf  # raise the limits there";
+    finding.text += fmt::format("; {} not announced", mdns.withheld);
+    finding.warn("beyond Avahi's limits, or refused by it; these streams open by NAME@HOST still",
+                 "grep objects-per /etc/avahi/avahi-daemon.conf  # raise the limits there");
   } else if (!mdns.own_host_seen) {
-    finding.status = Status::warn;
     finding.text += "; this host's own announcement is not visible";
-    finding.cause = "avahi-daemon was just started, or does not publish or use any interface";
-    finding.command = "avahi-browse -rt _dssm._tcp  # see /etc/avahi/avahi-daemon.conf";
-  } else if (mdns.hosts_heard == 0 && up_by_peers > 0) {
-    finding.status = Status::warn;
-    finding.cause = "the network or a firewall drops multicast: others are up, none is heard";
-    finding.command = "sudo ufw allow 5353/udp  # on each host; or list all hosts in peers";
+    finding.warn("avahi-daemon was just started, or does not publish or use any interface",
+                 "avahi-browse -rt _dssm._tcp  # see /etc/avahi/avahi-daemon.conf");
+  } else if (mdns.hosts_heard == 0 && others_up) {
+    finding.warn("the network or a firewall drops multicast: others are up, none is heard",
+                 "sudo ufw allow 5353/udp  # on each host; or list all hosts in peers");
   } else if (!mdns.error.empty()) {
-    finding.status = Status::warn;
-    finding.cause = "Avahi refused something";
-    finding.command = "journalctl -u avahi-daemon -n 50";
+    finding.warn("Avahi refused something", "journalctl -u avahi-daemon -n 50");
   }
-  findings.push_back(std::move(finding));
+  return finding;
 }
 
 Finding host_down(const HostInfo& host) {
-  Finding finding{"host " + name_of(host), Status::fail, "down: " + host.error, {}, {}};
   const std::string where =
       host.addresses.empty() ? host.name : without_port(host.addresses.front());
+  const auto found = [&](std::string cause, std::string command) {
+    return Finding{"host " + name_of(host), Status::fail, "down: " + host.error, cause, command};
+  };
   switch (host.reason) {
     case HostReason::connection_refused:
-      finding.cause = "no dssmd runs there, or it listens at another address or port";
-      finding.command = "systemctl status dssmd  # there; and check its key listen";
-      break;
+      return found("no dssmd runs there, or it listens at another address or port",
+                   "systemctl status dssmd  # there; and check its key listen");
     case HostReason::no_greeting:
-      finding.cause = "the dssmd there hangs, or another program has its port";
-      finding.command = "ss -ltnp  # there; then: systemctl restart dssmd";
-      break;
+      return found("the dssmd there hangs, or another program has its port",
+                   "ss -ltnp  # there; then: systemctl restart dssmd");
     case HostReason::name_not_found:
-      finding.cause = "its name is not known here";
-      finding.command =
-          "getent hosts " + where + "  # then correct peers, or give an address there";
-      break;
+      return found(
+          "its name is not known here",
+          fmt::format("getent hosts {}  # then correct peers, or give an address there", where));
     default:
-      finding.cause = "it is off, the cable is out, or a firewall is in between";
-      finding.command = "ping " + where + "  # it answers: open TCP port 13776 in its firewall";
+      return found(
+          "it is off, the cable is out, or a firewall is in between",
+          fmt::format("ping {}  # it answers: open TCP port 13776 in its firewall", where));
   }
-  return finding;
 }
 
 Finding host_refused(const HostInfo& host) {
-  Finding finding{"host " + name_of(host), Status::fail, "refused: " + host.error, {}, {}};
+  const auto found = [&](std::string cause, std::string command) {
+    return Finding{"host " + name_of(host), Status::fail, "refused: " + host.error, cause, command};
+  };
   switch (host.reason) {
     case HostReason::duplicate:
-      finding.cause =
-          "one PC's disk was copied to the other, or two dssmd of this PC have one name";
-      finding.command = rename_command("one of them") +
-                        "; on a copied PC also: sudo rm /etc/machine-id && sudo "
-                        "systemd-machine-id-setup";
-      break;
+      return found("one PC's disk was copied to the other, or two dssmd of this PC have one name",
+                   rename_command("one of them") +
+                       "; on a copied PC also: sudo rm /etc/machine-id && sudo "
+                       "systemd-machine-id-setup");
     case HostReason::namesake:
-      finding.cause = "both hosts have the same name";
-      finding.command = rename_command("one of them");
-      break;
+      return found("both hosts have the same name", rename_command("one of them"));
     default:
-      finding.cause = "the two do not fit together: versions, names or limits";
-      finding.command =
-          "dssmctl hosts  # shows the reason; install the same version of DSSM on both";
+      return found("the two do not fit together: versions, names or limits",
+                   "dssmctl hosts  # shows the reason; install the same version of DSSM on both");
   }
-  return finding;
 }
 
 // Found by mDNS, but the keys of one of both PCs do not allow the connection.
@@ -387,9 +354,9 @@ Finding host_closed(const HostInfo& host) {
           "found by mDNS, but not connected to: " + host.error,
           here ? "the key insecure of this PC does not let its dssmd connect to others"
                : "its keys listen and insecure do not let others in",
-          "echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines in " +
-              std::string(here ? "" : "its ") + kConfigFile + ", then restart " +
-              (here ? "this" : "its") + " dssmd"};
+          fmt::format("echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines in "
+                      "{}{}, then restart {} dssmd",
+                      here ? "" : "its ", kConfigFile, here ? "this" : "its")};
 }
 
 // What is wrong with this host mostly concerns another one too, and is reported there.
@@ -408,19 +375,16 @@ void check_own_host(const Facts& facts, const HostInfo& self, Findings& findings
 // `also_up`: the same host is up at another address.
 Finding host_finding(const HostInfo& host, bool also_up) {
   const std::string name = "host " + name_of(host);
+  const std::string addresses = list_text(host.addresses);
   if (host.state == HostState::up) {
     const std::string warning = host.error.empty() ? "" : ": " + host.error;
-    return {name, Status::ok, "up at " + list_text(host.addresses) + warning, {}, {}};
+    return {name, Status::ok, fmt::format("up at {}{}", addresses, warning)};
   }
   if (host.state == HostState::refused) return host_refused(host);
   if (also_up) {
-    const std::string reason =
-        host.error.empty() ? std::string(dssm::name_of(host.state)) : host.error;
-    return {name,
-            Status::ok,
-            "also at " + list_text(host.addresses) + ", which is not used: " + reason,
-            {},
-            {}};
+    return {name, Status::ok,
+            fmt::format("also at {}, which is not used: {}", addresses,
+                        host.error.empty() ? dssm::name_of(host.state) : host.error)};
   }
   if (host.state == HostState::connecting) {
     return {name, Status::warn, "being connected to", "dssmd or the network has just come up",
@@ -447,26 +411,21 @@ void check_hosts(const Facts& facts, Findings& findings) {
 void check_fleet_clocks(const Facts& facts, Findings& findings) {
   for (const HostInfo& host : facts.hosts) {
     if (host.state != HostState::up || !is_other_pc(host) || !host.clock) continue;
-    const ClockSnapshot& clock = *host.clock;
-    Finding finding{"clock of " + name_of(host),
-                    Status::ok,
-                    "at most " + bound_text(host.clock_distance) + " from this one's",
-                    {},
-                    {}};
+    Finding finding{"clock of " + name_of(host), Status::ok,
+                    fmt::format("at most {} from this one's", bound_text(host.clock_distance))};
     if (host.clock_distance == kUnknownClockError) {
-      finding.status = Status::warn;
-      finding.text = "it is not known how far it is from this one's (" +
-                     std::string(dssm::name_of(clock.status)) + " there)";
-      finding.cause =
+      finding.text = fmt::format("it is not known how far it is from this one's ({} there)",
+                                 dssm::name_of(host.clock->status));
+      finding.warn(
           "one of both is not synchronized, or they follow different references; reads of its "
-          "samples by time are refused, unless clock_policy says otherwise";
-      finding.command = "dssmctl clock  # then `chronyc sources` where it is not 'synchronized'";
+          "samples by time are refused, unless clock_policy says otherwise",
+          "dssmctl clock  # then `chronyc sources` where it is not 'synchronized'");
     }
     findings.push_back(std::move(finding));
   }
 }
 
-void check_host_names(const Facts& facts, Findings& findings) {
+Finding check_host_names(const Facts& facts) {
   std::map<std::string, std::set<std::string>> ids;  // by name
   for (const HostInfo& host : facts.hosts) {
     if (host.name.empty() || host.id.empty()) continue;
@@ -474,64 +433,59 @@ void check_host_names(const Facts& facts, Findings& findings) {
     // A copied PC, or a second dssmd on this one, has the same id.
     if (host.reason == HostReason::duplicate) ids[host.name].insert("duplicate");
   }
-  std::string doubled;
+  std::vector<std::string> shared;
   for (const auto& [name, of_name] : ids) {
-    if (of_name.size() > 1) doubled += (doubled.empty() ? "" : ", ") + in_quotes(name);
+    if (of_name.size() > 1) shared.push_back(fmt::format("'{}'", name));
   }
-  if (doubled.empty()) {
-    return findings.push_back({"host names", Status::ok, "each is there once", {}, {}});
-  }
-  findings.push_back({"host names", Status::fail, "several hosts are called " + doubled,
-                      "PCs were installed from one image, or two dssmd run on one PC",
-                      rename_command("each")});
+  if (shared.empty()) return {"host names", Status::ok, "each is there once"};
+  return {"host names", Status::fail,
+          fmt::format("several hosts are called {}", fmt::join(shared, ", ")),
+          "PCs were installed from one image, or two dssmd run on one PC", rename_command("each")};
 }
 
-void check_stream_names(const Facts& facts, Findings& findings) {
+Finding check_stream_names(const Facts& facts) {
   const Duplicates duplicates(facts.streams);
   if (duplicates.owners().empty()) {
-    return findings.push_back({"stream names",
-                               Status::ok,
-                               "each of the " + std::to_string(facts.streams.size()) +
-                                   " streams can be opened without its host's name",
-                               {},
-                               {}});
+    return {"stream names", Status::ok,
+            fmt::format("each of the {} streams can be opened without its host's name",
+                        facts.streams.size())};
   }
-  std::string text, example;
-  std::size_t named = 0;
+  std::vector<std::string> named;
+  std::string example, more;
   for (const auto& [key, hosts] : duplicates.owners()) {
-    if (named++ == kMaxNamed) {
-      text += " and " + std::to_string(duplicates.owners().size() - kMaxNamed) + " more";
+    if (named.size() == kMaxNamed) {
+      more = fmt::format(" and {} more", duplicates.owners().size() - kMaxNamed);
       break;
     }
-    const std::string name = key.first + ":" + std::to_string(key.second);
-    text += (text.empty() ? "" : ", ") + in_quotes(name) + " of " + list_text(hosts);
-    if (example.empty()) example = name + "@" + hosts.front();
+    const std::string name = fmt::format("{}:{}", key.first, key.second);
+    named.push_back(fmt::format("'{}' of {}", name, list_text(hosts)));
+    if (example.empty()) example = fmt::format("{}@{}", name, hosts.front());
   }
-  findings.push_back({"stream names", Status::warn, "several hosts have " + text,
-                      "the same program runs on several hosts; a name without a host opens only a "
-                      "host's own stream",
-                      "dssmctl info " + example + "  # and so in programs"});
+  return {"stream names", Status::warn,
+          fmt::format("several hosts have {}{}", fmt::join(named, ", "), more),
+          "the same program runs on several hosts; a name without a host opens only a host's own "
+          "stream",
+          fmt::format("dssmctl info {}  # and so in programs", example)};
 }
 
 }  // namespace
 
 std::vector<Finding> findings_of(const Facts& facts) {
-  Findings findings;
-  check_daemon(facts, findings);
+  Findings findings{check_daemon(facts)};
   if (!facts.failed) {
-    check_version(facts, findings);
-    check_memory(facts, findings);
+    findings.push_back(check_version(facts));
+    findings.push_back(check_memory(facts));
     check_descriptors(facts, findings);
   }
   check_disks(facts, findings);
-  check_clock(facts, findings);
+  findings.push_back(check_clock(facts));
   if (facts.failed) return findings;
   check_listening(facts, findings);
-  check_mdns(facts, findings);
+  findings.push_back(check_mdns(facts));
   check_hosts(facts, findings);
   check_fleet_clocks(facts, findings);
-  check_host_names(facts, findings);
-  check_stream_names(facts, findings);
+  findings.push_back(check_host_names(facts));
+  findings.push_back(check_stream_names(facts));
   return findings;
 }
 

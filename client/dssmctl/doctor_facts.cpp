@@ -1,29 +1,109 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "client/dssmctl/doctor_facts.hpp"
-
+//
+// The facts of `dssmctl doctor`, from dssmd, the kernel, systemctl and chronyc.
+#include <fcntl.h>
+#include <fmt/format.h>
 #include <grp.h>
+#include <poll.h>
 #include <pwd.h>
+#include <signal.h>
+#include <spawn.h>
 #include <sys/stat.h>
 #include <sys/statvfs.h>
+#include <sys/syscall.h>
+#include <sys/wait.h>
 #include <unistd.h>
 
 #include <algorithm>
+#include <array>
 #include <cerrno>
 #include <cstdlib>
 #include <fstream>
 #include <sstream>
 
+#include "client/dssmctl/doctor.hpp"
 #include "client/dssmctl/open_stream.hpp"
-#include "client/dssmctl/program.hpp"
 #include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
 namespace {
 
+constexpr int kNotExecuted = 127;  // posix_spawn(3)
+
+// Starts it with both outputs at `out_fd`; -1 when there is no such program.
+pid_t spawn(std::vector<std::string>& argv, int out_fd) {
+  std::vector<char*> words;
+  words.reserve(argv.size() + 1);
+  for (std::string& word : argv) words.push_back(word.data());
+  words.push_back(nullptr);
+  posix_spawn_file_actions_t actions;
+  ::posix_spawn_file_actions_init(&actions);
+  ::posix_spawn_file_actions_addopen(&actions, STDIN_FILENO, "/dev/null", O_RDONLY, 0);
+  ::posix_spawn_file_actions_adddup2(&actions, out_fd, STDOUT_FILENO);
+  ::posix_spawn_file_actions_adddup2(&actions, out_fd, STDERR_FILENO);
+  pid_t pid = -1;
+  const int failed = ::posix_spawnp(&pid, words[0], &actions, nullptr, words.data(), environ);
+  ::posix_spawn_file_actions_destroy(&actions);
+  return failed ? -1 : pid;
+}
+
+// Waits for something to read, or for a program's end. Whether that came before `deadline`.
+bool await(int fd, MonoTime deadline) {
+  while (true) {
+    const auto left =
+        std::chrono::ceil<std::chrono::milliseconds>(deadline - MonoClock::now()).count();
+    if (left <= 0) return false;
+    pollfd wanted{fd, POLLIN, 0};
+    if (::poll(&wanted, 1, static_cast<int>(std::min<std::int64_t>(left, 60'000))) > 0) return true;
+  }
+}
+
+// Reads until the program closes its outputs. Whether it did so before `deadline`.
+bool read_all(int fd, MonoTime deadline, std::string& text) {
+  std::array<char, 4096> buffer;
+  while (await(fd, deadline)) {
+    const ssize_t got = ::read(fd, buffer.data(), buffer.size());
+    if (got == 0 || (got < 0 && errno != EINTR)) return true;
+    if (got < 0) continue;
+    const std::size_t rest = kMaxProgramOutput - text.size();
+    text.append(buffer.data(), std::min(rest, static_cast<std::size_t>(got)));
+  }
+  return false;
+}
+
+}  // namespace
+
+std::optional<ProgramEnd> run_program(std::vector<std::string> argv, Duration timeout) {
+  std::array<int, 2> ends{};
+  if (::pipe2(ends.data(), O_CLOEXEC)) return std::nullopt;
+  const pid_t pid = spawn(argv, ends[1]);
+  ::close(ends[1]);
+  ProgramEnd end;
+  if (pid > 0) {
+    const MonoTime deadline = deadline_in(timeout);
+    // A program closes its outputs before it has an exit status.
+    // By number: glibc 2.36 declares pidfd_open() without C linkage.
+    const int ended = static_cast<int>(::syscall(SYS_pidfd_open, pid, 0));
+    end.in_time = read_all(ends[0], deadline, end.output) && await(ended, deadline);
+    if (ended >= 0) ::close(ended);
+    if (!end.in_time) ::kill(pid, SIGKILL);
+    int status = 0;
+    while (::waitpid(pid, &status, 0) < 0 && errno == EINTR) {
+    }
+    if (WIFEXITED(status)) end.exit_status = WEXITSTATUS(status);
+  }
+  ::close(ends[0]);
+  // POSIX lets a spawn that cannot execute the program succeed, and end with that status.
+  if (pid <= 0 || end.exit_status == kNotExecuted) return std::nullopt;
+  return end;
+}
+
+namespace {
+
 constexpr Duration kProgramTimeout = std::chrono::seconds(3);
 constexpr std::size_t kMaxFileBytes = 64U << 10;   // of a file in /proc
 constexpr std::size_t kMaxEntryBytes = 64U << 10;  // of a user or group in the system's lists
-constexpr std::size_t kMaxChronyWords = 200;       // of what it says when something is wrong
+constexpr std::size_t kMaxChronyWords = 200;       // of what chronyc prints when something is wrong
 constexpr const char* kDefaultSocket = "/run/dssm/dssmd.sock";
 
 std::string user_name() {
@@ -125,7 +205,7 @@ std::string service_state() {
   const auto end = run_program({"systemctl", "is-active", "dssmd"}, kProgramTimeout);
   if (!end || !end->in_time) return {};
   for (const char* known : {"active", "activating", "inactive", "failed"}) {
-    if (end->output == std::string(known) + "\n") return known;
+    if (end->output == fmt::format("{}\n", known)) return known;
   }
   return {};
 }
@@ -193,7 +273,7 @@ Facts collect_facts(const CommonOptions& options) {
   if (facts.failed && !facts.socket.chosen) facts.service = service_state();
   if (!facts.failed) {
     facts.descriptors.soft_limit =
-        soft_limit_untrusted(file_text("/proc/" + std::to_string(facts.daemon.pid) + "/limits"));
+        soft_limit_untrusted(file_text(fmt::format("/proc/{}/limits", facts.daemon.pid)));
   }
   facts.memory = memory_facts();
   facts.avahi_installed = exists("/usr/sbin/avahi-daemon");

@@ -2,15 +2,17 @@
 //
 // dssmctl echo: samples for people and programs. Without --at or --last it shows what comes from
 // now on; a stream that had to be awaited is shown from its first sample.
+#include <fmt/format.h>
+
 #include <limits>
 
 #include "client/dssmctl/fields.hpp"
-#include "client/dssmctl/follower.hpp"
 #include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/sample_printer.hpp"
-#include "client/dssmctl/stop_signal.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -22,10 +24,8 @@ SampleForm form_of(const EchoOptions& options) {
 
 // The fields to show of the reader's stream as it is now.
 Result<std::vector<Field>> wanted_fields(const RawReader& reader, const EchoOptions& options) {
-  Result<std::vector<Field>> fields =
-      select_fields(readable_fields_untrusted(reader.type()), options.fields);
-  if (!fields) return std::move(fields).error().context("show '" + reader.id().str() + "'");
-  return fields;
+  return DSSM_TRY(select_fields(readable_fields_untrusted(reader.type()), options.fields),
+                  fmt::format("show '{}'", reader.id().str()));
 }
 
 // Prints the samples after the reader's cursor, in order.
@@ -72,7 +72,7 @@ class Echo {
     return out_.flush() && continues();
   }
 
-  // Why the stream cannot be shown any longer.
+  // The reason why the stream cannot be shown any longer.
   const Result<void>& result() const { return result_; }
 
  private:
@@ -85,9 +85,10 @@ class Echo {
     if (!fields) {
       result_ = std::move(fields).error();
     } else if (*fields != printer_.fields()) {
-      result_ = Error{Errc::type_mismatch, "continue with '" + reader_.id().str() +
-                                               "': it restarted with other fields; start again "
-                                               "to see them"};
+      result_ = Error{Errc::type_mismatch,
+                      fmt::format("continue with '{}': it restarted with other fields; start again "
+                                  "to see them",
+                                  reader_.id().str())};
     }
   }
 
@@ -102,26 +103,27 @@ class Echo {
 };
 
 Error failed_read(const RawReader& reader, const std::string& what, ReadStatus status) {
-  const std::string tried = "read " + what + " of '" + reader.id().str() + "': ";
+  const auto error = [&](Errc code, std::string_view reason) {
+    return Error{code, fmt::format("read {} of '{}': {}", what, reader.id().str(), reason)};
+  };
   SampleInfo oldest;
   switch (status) {
     case ReadStatus::too_old:
       if (reader.read_info(reader.oldest_tid(), oldest) == ReadStatus::ok) {
-        return {Errc::not_found, tried + "too old, the ring holds samples from " +
-                                     seconds_text(to_ns(oldest.time)) + " on"};
+        return error(Errc::not_found, fmt::format("too old, the ring holds samples from {} on",
+                                                  seconds_text(to_ns(oldest.time))));
       }
-      return {Errc::not_found, tried + "too old, the ring holds it no longer"};
+      return error(Errc::not_found, "too old, the ring holds it no longer");
     case ReadStatus::lapped:
-      return {Errc::system, tried +
-                                "the writer overwrites samples faster than they can be read; "
-                                "give the stream more depth"};
+      return error(Errc::system,
+                   "the writer overwrites samples faster than they can be read; give the stream "
+                   "more depth");
     case ReadStatus::clock_out_of_bounds:
-      return {Errc::clock_out_of_bounds,
-              tried +
-                  "the clocks of its host and of this PC may be too far apart; see `dssmctl "
-                  "clock`"};
+      return error(Errc::clock_out_of_bounds,
+                   "the clocks of its host and of this PC may be too far apart; see `dssmctl "
+                   "clock`");
     default:
-      return {Errc::not_found, tried + "nothing was written to it yet"};
+      return error(Errc::not_found, "nothing was written to it yet");
   }
 }
 
@@ -143,13 +145,12 @@ Result<Time> moment(const RawReader& reader, const EchoOptions& options) {
 // sample to show.
 Result<void> begin(const EchoOptions& options, bool awaited, RawReader& reader, Echo& echo) {
   if (options.at) {
-    const Result<Time> time = moment(reader, options);
-    if (!time) return time.error();
+    const Time time = DSSM_TRY(moment(reader, options));
     const ReadStatus status =
-        echo.print([&](auto payload, auto& info) { return reader.read_at(*time, payload, info); });
+        echo.print([&](auto payload, auto& info) { return reader.read_at(time, payload, info); });
     if (!echo.result()) return echo.result();
     if (status != ReadStatus::ok) {
-      return failed_read(reader, "the sample at " + seconds_text(to_ns(*time)), status);
+      return failed_read(reader, "the sample at " + seconds_text(to_ns(time)), status);
     }
   } else if (options.last) {
     const ReadStatus status =
@@ -167,19 +168,17 @@ Result<void> begin(const EchoOptions& options, bool awaited, RawReader& reader, 
 Result<void> run(const EchoOptions& options, Output& out) {
   return with_stream(options, [&](OpenedStream& opened) -> Result<void> {
     RawReader& reader = opened.reader;
-    Result<std::vector<Field>> fields = wanted_fields(reader, options);
-    if (!fields) return std::move(fields).error();
-    // Before the first sample is shown: who sees one counts on getting the next ones, too, whatever
-    // becomes of dssmd.
-    Result<Follower> follower = Follower::open(opened.session, reader, out);
-    if (!follower) return std::move(follower).error();
-    SamplePrinter printer(out, form_of(options), options.full, reader.id(), std::move(*fields));
+    std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, options));
+    // Before the first sample is shown: after it the next ones must come too, whatever happens to
+    // dssmd.
+    Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
+    SamplePrinter printer(out, form_of(options), options.full, reader.id(), std::move(fields));
     Echo echo(reader, printer, out, options);
     printer.begin();
-    if (Result<void> begun = begin(options, opened.awaited, reader, echo); !begun) return begun;
+    DSSM_TRY(begin(options, opened.awaited, reader, echo));
     if (!echo.print_new()) return echo.result();
     while (true) {
-      const Follower::Wake wake = follower->wait(kNever);
+      const Follower::Wake wake = follower.wait(kNever);
       if (wake == Follower::Wake::stop) return {};
       if (!echo.print_new()) return echo.result();
       if (wake == Follower::Wake::ended) return end_of(reader);

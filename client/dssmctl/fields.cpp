@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/dssmctl/fields.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <array>
 #include <charconv>
@@ -52,8 +54,7 @@ Value value_at(std::span<const std::byte> payload, const Field& field, std::uint
     case Scalar::float64:
       return load<double>(place);
   }
-  return std::uint64_t{
-      0};  // not reached: readable_fields_untrusted() lets known kinds through only
+  return std::uint64_t{0};  // not reached: readable_fields_untrusted() passes only known kinds
 }
 
 // Numbers so short that reading them again gives the same bits.
@@ -66,8 +67,7 @@ std::string bare_text(const Value& value) {
           return std::string(1, v);
         } else {
           std::array<char, 32> text{};
-          return std::string(text.data(),
-                             std::to_chars(text.data(), text.data() + text.size(), v).ptr);
+          return {text.data(), std::to_chars(text.data(), text.data() + text.size(), v).ptr};
         }
       },
       value);
@@ -75,7 +75,7 @@ std::string bare_text(const Value& value) {
 
 std::string quoted_text(const Value& value) {
   if (const char* c = std::get_if<char>(&value)) {
-    return std::string("'").append(escaped({c, 1})).append("'");
+    return fmt::format("'{}'", escaped({c, 1}));
   }
   return bare_text(value);
 }
@@ -96,12 +96,12 @@ bool fits_untrusted(const Field& field, std::uint64_t payload_bytes) {
   if (field.kind < Scalar::boolean || field.kind > Scalar::float64) return false;
   const std::uint64_t element_bytes = scalar_bytes(field.kind);
   if (field.count == 0 || field.offset_bytes > payload_bytes) return false;
-  const std::uint64_t room = payload_bytes - field.offset_bytes;
-  if (element_bytes > room) return false;
+  const std::uint64_t rest = payload_bytes - field.offset_bytes;
+  if (element_bytes > rest) return false;
   if (field.count == 1) return true;
   // Elements that overlap would make a small payload endless.
   return field.stride_bytes >= element_bytes &&
-         field.count - 1 <= (room - element_bytes) / field.stride_bytes;
+         field.count - 1 <= (rest - element_bytes) / field.stride_bytes;
 }
 
 bool asks_for(const std::string& wanted, const std::string& name) {
@@ -120,23 +120,23 @@ std::vector<Field> readable_fields_untrusted(const TypeInfo& type) {
 
 Result<std::vector<Field>> select_fields(std::vector<Field> fields,
                                          const std::vector<std::string>& wanted) {
-  for (const std::string& wish : wanted) {
-    const auto is_it = [&](const Field& field) { return asks_for(wish, field.name); };
+  for (const std::string& name : wanted) {
+    const auto is_it = [&](const Field& field) { return asks_for(name, field.name); };
     if (std::any_of(fields.begin(), fields.end(), is_it)) continue;
-    std::string message = "no field '" + wish + "'";
     if (fields.empty()) {
-      message += ": this stream's type does not describe its fields";
-    } else {
-      message += "; there are";
-      for (const Field& field : fields)
-        message += (&field == &fields[0] ? " '" : ", '") + field.name + "'";
+      return Error{
+          Errc::invalid_argument,
+          fmt::format("no field '{}': this stream's type does not describe its fields", name)};
     }
-    return Error{Errc::invalid_argument, std::move(message)};
+    std::vector<std::string_view> known;
+    for (const Field& field : fields) known.push_back(field.name);
+    return Error{Errc::invalid_argument,
+                 fmt::format("no field '{}'; there are '{}'", name, fmt::join(known, "', '"))};
   }
   if (!wanted.empty()) {
     std::erase_if(fields, [&](const Field& field) {
       return std::none_of(wanted.begin(), wanted.end(),
-                          [&](const std::string& wish) { return asks_for(wish, field.name); });
+                          [&](const std::string& name) { return asks_for(name, field.name); });
     });
   }
   return fields;
@@ -159,7 +159,7 @@ std::string field_text(std::span<const std::byte> payload, const Field& field, s
     std::string out = "\"";
     for (const char c : text) out += c == '"' ? "\\\"" : escaped({&c, 1});
     out += '"';
-    if (hidden > 0) out += " ... " + std::to_string(hidden) + " more";
+    if (hidden > 0) out += fmt::format(" ... {} more", hidden);
     return out;
   }
   if (field.count == 1) return quoted_text(value_at(payload, field, 0));
@@ -169,7 +169,7 @@ std::string field_text(std::span<const std::byte> payload, const Field& field, s
     if (i > 0) out += ", ";
     out += quoted_text(value_at(payload, field, i));
   }
-  if (end < field.count) out += ", ... " + std::to_string(field.count - end) + " more";
+  if (end < field.count) out += fmt::format(", ... {} more", field.count - end);
   return out + "]";
 }
 

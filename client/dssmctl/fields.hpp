@@ -11,7 +11,7 @@
 #include <string>
 #include <vector>
 
-#include "client/dssmctl/json.hpp"
+#include "client/dssmctl/output.hpp"
 
 namespace dssm::ctl {
 
@@ -20,7 +20,7 @@ namespace dssm::ctl {
 std::vector<Field> readable_fields_untrusted(const TypeInfo& type);
 
 // Those of `fields` that `wanted` asks for, in the order of the payload. "pose" means the
-// field pose and for all of pose.*; without any wish all are wanted. Fails with invalid_argument,
+// field pose and for all of pose.*; without any, all are wanted. Fails with invalid_argument,
 // naming the fields there are.
 Result<std::vector<Field>> select_fields(std::vector<Field> fields,
                                          const std::vector<std::string>& wanted);

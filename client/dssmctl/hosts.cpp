@@ -4,10 +4,11 @@
 // is down is what a person wants to see here, so it is no failure.
 #include <set>
 
-#include "client/dssmctl/host_rows.hpp"
+#include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/options.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -25,22 +26,20 @@ void print_names(const std::vector<HostInfo>& hosts, Output& out) {
 }  // namespace
 
 Result<void> run(const HostsOptions& options, Output& out) {
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  const Result<std::vector<HostInfo>> hosts = session->list_hosts();
-  if (!hosts) return hosts.error();
+  Session session = DSSM_TRY(connect(options));
+  const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
   if (options.json) {
     Json all = Json::array();
-    for (const HostInfo& host : *hosts) all.push_back(host_json(host));
+    for (const HostInfo& host : hosts) all.push_back(host_json(host));
     out.add(json_document({{"hosts", std::move(all)}}));
     return {};
   }
   if (options.names) {
-    print_names(*hosts, out);
+    print_names(hosts, out);
     return {};
   }
   Table table(host_columns());
-  for (const HostInfo& host : *hosts) table.add_row(host_row(host));
+  for (const HostInfo& host : hosts) table.add_row(host_row(host));
   table.print(out);
   return {};
 }

@@ -1,13 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl hz: how often samples come, by their own stamps; dssmctl bw: how many bytes that makes.
+#include <fmt/format.h>
+
 #include <optional>
 
-#include "client/dssmctl/json.hpp"
 #include "client/dssmctl/meter.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/statistics.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -36,7 +38,7 @@ double rate_hz(const Statistics& intervals) {
 }
 
 std::string precise_rate_text(double rate) {
-  return rate > 0 ? fixed_text(rate, 3) + " Hz" : "unknown";
+  return rate > 0 ? fmt::format("{:.3f} Hz", rate) : "unknown";
 }
 
 // Whether there is something to measure; prints the reason when there is not.
@@ -61,19 +63,13 @@ Json common_json(const MeterState& state, const Statistics& intervals) {
 
 void print_hz(const MeterState& state, const Statistics& intervals, bool as_json, Output& out) {
   if (as_json) {
-    const auto known = [&](auto value) { return intervals.count > 0 ? Json(value) : Json(); };
     Json json = common_json(state, intervals);
-    json["interval_mean_ns"] = known(intervals.mean_ns);
-    json["interval_min_ns"] = known(to_ns(intervals.min));
-    json["interval_max_ns"] = known(to_ns(intervals.max));
-    json["interval_std_dev_ns"] = known(intervals.std_dev_ns);
+    add_statistics(json, "interval", intervals);
     return out.add(json_line(json));
   }
   if (!measurable(state, intervals, out)) return;
-  out.add("average rate: " + precise_rate_text(rate_hz(intervals)) + "\n\tmin: " +
-          seconds_text(to_ns(intervals.min)) + " s max: " + seconds_text(to_ns(intervals.max)) +
-          " s std dev: " + fixed_text(intervals.std_dev_ns / 1e9, 9) +
-          " s window: " + std::to_string(intervals.count + 1) + "\n");
+  out.add(fmt::format("average rate: {}\n{}", precise_rate_text(rate_hz(intervals)),
+                      statistics_line(intervals, intervals.count + 1)));
 }
 
 void print_bw(const MeterState& state, const Statistics& intervals, bool as_json, Output& out) {
@@ -85,9 +81,10 @@ void print_bw(const MeterState& state, const Statistics& intervals, bool as_json
     return out.add(json_line(json));
   }
   if (!measurable(state, intervals, out)) return;
-  out.add("average: " + (rate > 0 ? byte_rate_text(bytes_per_second) : "unknown") +
-          "\n\tpayload: " + bytes_text(state.payload_bytes) + " rate: " + precise_rate_text(rate) +
-          " window: " + std::to_string(intervals.count + 1) + "\n");
+  out.add(fmt::format("average: {}\n\tpayload: {} rate: {} window: {}\n",
+                      rate > 0 ? byte_rate_text(bytes_per_second) : "unknown",
+                      bytes_text(state.payload_bytes), precise_rate_text(rate),
+                      intervals.count + 1));
 }
 
 template <class Print>

@@ -3,17 +3,24 @@
 // dssmctl ls: all streams of all hosts, own ones first, each host's in the order of their creation
 // without --sort. One request to dssmd (two for names or hosts), one write; it is run in
 // loops and by the shell's completion, so it has to be quick.
+//
+// With --watch: what is there, then a line for each stream that is added or removed, until Ctrl-C.
+// dssmd sends events, nothing is polled. While dssmd is unavailable there are none; when it is
+// available again, only what has changed meanwhile is shown.
+#include <fmt/format.h>
+
 #include <algorithm>
+#include <condition_variable>
+#include <mutex>
 #include <set>
 
-#include "client/dssmctl/duplicates.hpp"
-#include "client/dssmctl/ls_watch.hpp"
+#include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/names.hpp"
 #include "client/dssmctl/open_stream.hpp"
-#include "client/dssmctl/stream_json.hpp"
-#include "client/dssmctl/table.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -48,7 +55,9 @@ void sort_streams(std::vector<StreamInfo>& streams, const std::string& key) {
   }
 }
 
-std::string rate_text(double rate_hz) { return rate_hz > 0 ? fixed_text(rate_hz, 1) + " Hz" : "-"; }
+std::string rate_text(double rate_hz) {
+  return rate_hz > 0 ? fmt::format("{:.1f} Hz", rate_hz) : "-";
+}
 
 constexpr std::string_view kDuplicateMark = " *";
 
@@ -64,7 +73,7 @@ std::vector<std::string> row(const StreamInfo& stream, bool duplicate, Time now)
       stream.newest == kNoTid ? "-" : duration_text(saturating_sub(now, stream.newest_time)),
       std::to_string(stream.writers),
       std::to_string(stream.readers),
-      stream.type.name.empty() ? "-" : escaped(stream.type.name),
+      or_dash(escaped(stream.type.name)),
   };
 }
 
@@ -115,17 +124,17 @@ void print_table(const Listing& listing, Time now, Output& out) {
   }
   table.print(out);
   if (marked) {
-    out.add("* several hosts have a stream of this name and id: say which one, as in " +
-            escaped(marked->id.str()) + "\n");
+    out.add(
+        fmt::format("* several hosts have a stream of this name and id: say which one, as in {}\n",
+                    escaped(marked->id.str())));
   }
 }
 
 // A program must get a name as it is; a terminal must not.
 Result<void> print_names(Session& session, const std::vector<StreamInfo>& all,
                          const StreamFilter& filter, Output& out) {
-  const Result<DaemonInfo> daemon = session.daemon_info();
-  if (!daemon) return daemon.error();
-  const std::vector<std::string> names = opening_names(all, daemon->host);
+  const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
+  const std::vector<std::string> names = opening_names(all, daemon.host);
   for (std::size_t i = 0; i < all.size(); ++i) {
     if (!filter.takes(all[i].id)) continue;
     out.add((out.terminal() ? escaped(names[i]) : names[i]) + "\n");
@@ -136,34 +145,112 @@ Result<void> print_names(Session& session, const std::vector<StreamInfo>& all,
 // A name that no host has would show nothing forever.
 Result<void> check_hosts(Session& session, const std::vector<std::string>& wanted) {
   if (wanted.empty()) return {};
-  const Result<std::vector<HostInfo>> hosts = session.list_hosts();
-  if (!hosts) return hosts.error();
+  const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
   std::set<std::string> known;
-  for (const HostInfo& host : *hosts) {
+  for (const HostInfo& host : hosts) {
     if (!host.name.empty()) known.insert(host.name);
   }
   for (const std::string& name : wanted) {
     if (known.contains(name)) continue;
-    Error error{Errc::not_found,
-                "list the streams of host '" + name + "': no such host is known here; known"};
-    std::string_view separator = " are '";
-    for (const std::string& other : known) {
-      error.message.append(separator).append(other).append("'");
-      separator = ", '";
-    }
-    error.message += "; see `dssmctl hosts`";
-    return error;
+    return Error{Errc::not_found,
+                 fmt::format("list the streams of host '{}': no such host is known here; known are "
+                             "'{}'; see `dssmctl hosts`",
+                             name, fmt::join(known, "', '"))};
   }
   return {};
 }
+
+// --- ls --watch
+
+// Events of the session's thread that this program has not shown yet. It grows only while our
+// output is not read, by the streams that are added and removed meanwhile.
+class EventQueue {
+ public:
+  void put(const StreamEvent& event) {
+    const std::lock_guard lock(mutex_);
+    events_.push_back(event);
+    came_.notify_one();
+  }
+
+  // All that came; waits for the first one, but not for longer than kStopCheckPeriod.
+  std::vector<StreamEvent> take() {
+    std::unique_lock lock(mutex_);
+    came_.wait_for(lock, kStopCheckPeriod, [this] { return !events_.empty(); });
+    return std::exchange(events_, {});
+  }
+
+ private:
+  std::mutex mutex_;
+  std::condition_variable came_;
+  std::vector<StreamEvent> events_;
+};
+
+// Prints a line for each stream that comes or goes.
+class StreamLog {
+ public:
+  StreamLog(const LsOptions& options, const StreamFilter& filter, Output& out)
+      : json_(options.json), filter_(filter), out_(out) {}
+
+  void on_event(const StreamEvent& event) {
+    if (!filter_.takes(event.stream.id)) return;
+    const std::string name = event.stream.id.str();
+    if (event.kind == StreamEvent::Kind::removed) {
+      shown_.erase(name);
+      return print_removed(event.stream.id);
+    }
+    // A stream that was recreated while dssmd was unavailable is reported as added only.
+    if (!shown_.insert(name).second) print_removed(event.stream.id);
+    print_added(event.stream);
+  }
+
+ private:
+  void print_added(const StreamInfo& stream) {
+    if (json_) {
+      Json json = {{"event", "added"}};
+      json.update(stream_json(stream, WallClock::now()));
+      return out_.add(json_line(json));
+    }
+    out_.add(fmt::format("+ {} {} bytes, depth {}, cycle {}{}{}\n", escaped(stream.id.str()),
+                         stream.type.payload_bytes, stream.depth, duration_text(stream.cycle),
+                         stream.type.name.empty() ? "" : ", ", escaped(stream.type.name)));
+  }
+
+  void print_removed(const StreamId& id) {
+    if (!json_) return out_.add(fmt::format("- {}\n", escaped(id.str())));
+    out_.add(json_line({{"event", "removed"},
+                        {"stream", id.str()},
+                        {"name", id.name},
+                        {"id", id.id},
+                        {"host", id.host}}));
+  }
+
+  bool json_;
+  const StreamFilter& filter_;
+  Output& out_;
+  std::set<std::string> shown_;  // full names
+};
+
+Result<void> watch_streams(Session& session, const LsOptions& options, const StreamFilter& filter,
+                           Output& out) {
+  catch_stop_signals();
+  const auto queue = std::make_shared<EventQueue>();
+  const Session::Watch watch =
+      DSSM_TRY(session.watch([queue](const StreamEvent& event) { queue->put(event); }));
+  StreamLog log(options, filter, out);
+  do {
+    for (const StreamEvent& event : queue->take()) log.on_event(event);
+  } while (out.flush() && !out.must_stop());
+  return {};
+}
+
+// --- both
 
 // With --own the streams of this host, as with --host and its name.
 Result<StreamFilter> filter_of(Session& session, const LsOptions& options) {
   std::vector<std::string> hosts = options.hosts;
   if (options.own) {
-    const Result<DaemonInfo> daemon = session.daemon_info();
-    if (!daemon) return daemon.error();
-    hosts = {daemon->host};
+    const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
+    hosts = {daemon.host};
   }
   return StreamFilter(std::move(hosts), options.pattern);
 }
@@ -171,25 +258,22 @@ Result<StreamFilter> filter_of(Session& session, const LsOptions& options) {
 }  // namespace
 
 Result<void> run(const LsOptions& options, Output& out) {
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  if (Result<void> known = check_hosts(*session, options.hosts); !known) return known;
+  Session session = DSSM_TRY(connect(options));
+  DSSM_TRY(check_hosts(session, options.hosts));
   if (options.watch) {
-    const Result<StreamFilter> filter = filter_of(*session, options);
-    return filter ? watch_streams(*session, options, *filter, out) : filter.error();
+    return watch_streams(session, options, DSSM_TRY(filter_of(session, options)), out);
   }
-  Result<std::vector<StreamInfo>> streams =
-      options.own ? session->list_own_streams() : session->list_streams();
-  if (!streams) return std::move(streams).error();
-  sort_streams(*streams, options.sort);
-  if (options.reverse) std::reverse(streams->begin(), streams->end());
+  std::vector<StreamInfo> streams =
+      DSSM_TRY(options.own ? session.list_own_streams() : session.list_streams());
+  sort_streams(streams, options.sort);
+  if (options.reverse) std::reverse(streams.begin(), streams.end());
 
   const StreamFilter filter(options.hosts, options.pattern);
-  if (options.names) return print_names(*session, *streams, filter, out);
+  if (options.names) return print_names(session, streams, filter, out);
   Listing listing;
-  if (!options.own) listing.duplicates.emplace(*streams);
-  std::erase_if(*streams, [&](const StreamInfo& stream) { return !filter.takes(stream.id); });
-  listing.streams = std::move(*streams);
+  if (!options.own) listing.duplicates.emplace(streams);
+  std::erase_if(streams, [&](const StreamInfo& stream) { return !filter.takes(stream.id); });
+  listing.streams = std::move(streams);
   const Time now = WallClock::now();
   options.json ? print_json(listing, now, out) : print_table(listing, now, out);
   return {};

@@ -1,9 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl, the command-line tool: reads the command line, runs a verb, reports what went wrong. It
-// uses nothing but <dssm/dssm.hpp>, so any program can do what it does.
+// uses only <dssm/dssm.hpp>, so any program can do what it does.
 //
-// Exit status: 0 success, 1 failure, 2 wrong usage (whatever no daemon could have made work).
+// Exit status: 0 success, 1 failure, 2 wrong usage (what no dssmd could do).
+#include <fmt/format.h>
 #include <signal.h>
 #include <unistd.h>
 
@@ -13,7 +14,6 @@
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -23,7 +23,7 @@ constexpr int kFailure = 1;
 constexpr int kWrongUsage = 2;
 
 int report(const Error& error, const std::string& verb_name) {
-  print_error("dssmctl: " + verb_name + ": " + escaped_message(error.message) + "\n");
+  print_error(fmt::format("dssmctl: {}: {}\n", verb_name, escaped_message(error.message)));
   return error.code == Errc::invalid_argument ? kWrongUsage : kFailure;
 }
 

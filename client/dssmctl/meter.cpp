@@ -1,11 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/dssmctl/meter.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 
-#include "client/dssmctl/follower.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/text.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -78,8 +80,7 @@ Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t wind
 Result<void> run_meter(const MeterOptions& options, Output& out, const Meter& meter) {
   return with_stream(options, [&](OpenedStream& opened) -> Result<void> {
     RawReader& reader = opened.reader;
-    Result<Follower> follower = Follower::open(opened.session, reader, out);
-    if (!follower) return std::move(follower).error();
+    Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
 
     MeterState state;
     state.stream = reader.id();
@@ -98,7 +99,7 @@ Result<void> run_meter(const MeterOptions& options, Output& out, const Meter& me
         if (!out.flush() || ++reports == options.count) return {};
         due = deadline_in(options.interval);
       }
-      const Follower::Wake wake = follower->wait(due);
+      const Follower::Wake wake = follower.wait(due);
       stamps.read_new();
       if (wake == Follower::Wake::stop || wake == Follower::Wake::ended) {
         state.final = true;
@@ -122,11 +123,26 @@ Json report_json(const MeterState& state, const char* measured_key, std::uint64_
   return json;
 }
 
+void add_statistics(Json& json, const std::string& name, const Statistics& statistics) {
+  const auto add = [&](const char* what, auto value) {
+    json[name + what] = statistics.count > 0 ? Json(value) : Json();
+  };
+  add("_mean_ns", statistics.mean_ns);
+  add("_min_ns", to_ns(statistics.min));
+  add("_max_ns", to_ns(statistics.max));
+  add("_std_dev_ns", statistics.std_dev_ns);
+}
+
+std::string statistics_line(const Statistics& statistics, std::size_t window) {
+  return fmt::format("\tmin: {} s max: {} s std dev: {:.9f} s window: {}\n",
+                     seconds_text(to_ns(statistics.min)), seconds_text(to_ns(statistics.max)),
+                     statistics.std_dev_ns / 1e9, window);
+}
+
 std::string final_line(const MeterState& state) {
-  std::string text = "--- " + escaped(state.stream.str()) + ": " + std::to_string(state.seen) +
-                     " samples, " + std::to_string(state.lost) + " lost";
-  if (state.restarts > 0) text += ", restarts: " + std::to_string(state.restarts);
-  return text + " ---\n";
+  return fmt::format("--- {}: {} samples, {} lost{} ---\n", escaped(state.stream.str()), state.seen,
+                     state.lost,
+                     state.restarts > 0 ? fmt::format(", restarts: {}", state.restarts) : "");
 }
 
 }  // namespace dssm::ctl

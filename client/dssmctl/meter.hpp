@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // What hz, bw and delay have in common: following a stream's stamps, without ever touching a
-// payload, and reporting every now and then.
+// payload, and reporting at intervals.
 #pragma once
 
 #include <cstdint>
@@ -9,9 +9,9 @@
 #include <functional>
 #include <string>
 
-#include "client/dssmctl/json.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
+#include "client/dssmctl/statistics.hpp"
 
 namespace dssm::ctl {
 
@@ -43,6 +43,12 @@ Result<void> run_meter(const MeterOptions& options, Output& out, const Meter& me
 // The keys with which every report as JSON begins. `measured` is the number of what was measured,
 // called `measured_key`: the samples of delays, the intervals of rates.
 Json report_json(const MeterState& state, const char* measured_key, std::uint64_t measured);
+
+// Adds NAME_mean_ns, NAME_min_ns, NAME_max_ns and NAME_std_dev_ns; null while nothing was measured.
+void add_statistics(Json& json, const std::string& name, const Statistics& statistics);
+
+// "\tmin: 0.001 s max: ... window: 12\n", for people.
+std::string statistics_line(const Statistics& statistics, std::size_t window);
 
 // "--- odom:0@pc1: 12 samples, 0 lost ---", before a final report for people.
 std::string final_line(const MeterState& state);

@@ -1,12 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Names of streams as a person types them: short ones that open the right stream, and the one that
-// was perhaps meant.
+// Names of streams as a person types them: short ones that open the right stream, the one that was
+// perhaps meant, those that several hosts have, and patterns for them.
 #pragma once
 
+#include <cstdint>
 #include <dssm/stream.hpp>
+#include <map>
 #include <string>
 #include <string_view>
+#include <utility>
 #include <vector>
 
 namespace dssm::ctl {
@@ -22,5 +25,39 @@ std::vector<std::string> opening_names(const std::vector<StreamInfo>& streams,
 
 // Those of `names` that a person may have meant by `wanted`, best first, each once, at most three.
 std::vector<std::string> similar_names(std::string_view wanted, std::vector<std::string> names);
+
+// Streams of several hosts that have the same name and id: without the host in its name such a
+// stream opens only on a host that owns one.
+class Duplicates {
+ public:
+  using Key = std::pair<std::string, std::int32_t>;  // name and id
+
+  // `streams`: all that there are, of all hosts.
+  explicit Duplicates(const std::vector<StreamInfo>& streams);
+
+  bool has(const StreamId& id) const { return owners_.contains({id.name, id.id}); }
+
+  // For each of them the hosts, two or more, in the order of `streams`.
+  const std::map<Key, std::vector<std::string>>& owners() const { return owners_; }
+
+ private:
+  std::map<Key, std::vector<std::string>> owners_;
+};
+
+// Which streams `dssmctl ls` shows.
+class StreamFilter {
+ public:
+  //   hosts    only streams of these; empty: of all
+  //   pattern  a shell pattern (fnmatch(3)) for the name, or for NAME:ID, NAME@HOST or NAME:ID@HOST
+  //            where it has such a part; empty: all
+  StreamFilter(std::vector<std::string> hosts, std::string pattern)
+      : hosts_(std::move(hosts)), pattern_(std::move(pattern)) {}
+
+  bool takes(const StreamId& id) const;
+
+ private:
+  std::vector<std::string> hosts_;
+  std::string pattern_;
+};
 
 }  // namespace dssm::ctl

@@ -1,37 +1,38 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/dssmctl/open_stream.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <utility>
 
 #include "client/dssmctl/names.hpp"
-#include "client/dssmctl/stop_signal.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
 
 // What --wait waits for.
-bool may_come(const Error& why) {
-  return why.code == Errc::not_found || why.code == Errc::unavailable;
+bool may_come(const Error& error) {
+  return error.code == Errc::not_found || error.code == Errc::unavailable;
 }
 
 // Without a reader and without an error after a stop signal.
 Result<std::optional<OpenedStream>> open_stream(const ReadingOptions& options) {
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  Result<StreamId> id = StreamId::parse(options.stream);
-  if (!id) return std::move(id).error();
-  Result<RawReader> reader = session->open_raw_reader(*id);
-  if (reader) return std::optional(OpenedStream{*session, std::move(*reader), false});
+  Session session = DSSM_TRY(connect(options));
+  const StreamId id = DSSM_TRY(StreamId::parse(options.stream));
+  Result<RawReader> reader = session.open_raw_reader(id);
+  if (reader) return std::optional(OpenedStream{session, std::move(*reader), false});
 
   const MonoTime deadline = deadline_in(options.wait);
   while (may_come(reader.error()) && MonoClock::now() < deadline) {
     if (stop_requested()) return std::optional<OpenedStream>();
-    reader = session->await_raw_reader(*id, std::min(deadline, deadline_in(kStopCheckPeriod)));
-    if (reader) return std::optional(OpenedStream{*session, std::move(*reader), true});
+    reader = session.await_raw_reader(id, std::min(deadline, deadline_in(kStopCheckPeriod)));
+    if (reader) return std::optional(OpenedStream{session, std::move(*reader), true});
   }
-  Error error = with_similar_names(std::move(reader).error(), *session, *id);
+  Error error = with_similar_names(std::move(reader).error(), session, id);
   if (error.code == Errc::not_found && options.wait == Duration::zero()) {
     error.message += "; --wait SECONDS waits for it";
   }
@@ -50,9 +51,8 @@ Result<Session> connect(const CommonOptions& options) {
 Result<void> with_stream(const ReadingOptions& options,
                          const std::function<Result<void>(OpenedStream&)>& work) {
   catch_stop_signals();
-  Result<std::optional<OpenedStream>> opened = open_stream(options);
-  if (!opened) return std::move(opened).error();
-  return *opened ? work(**opened) : Result<void>();
+  std::optional<OpenedStream> opened = DSSM_TRY(open_stream(options));
+  return opened ? work(*opened) : Result<void>();
 }
 
 Error with_similar_names(Error error, Session& session, const StreamId& wanted) {
@@ -69,7 +69,7 @@ Error with_similar_names(Error error, Session& session, const StreamId& wanted) 
   std::vector<std::string> names;
   for (const StreamInfo& stream : *streams) {
     names.push_back(written(stream.id));
-    // It is there: something of it was not found.
+    // The stream is there: something else was not found.
     if (names.back() == written(wanted)) return error;
   }
   const std::vector<std::string> similar = similar_names(written(wanted), std::move(names));
@@ -78,6 +78,57 @@ Error with_similar_names(Error error, Session& session, const StreamId& wanted) 
   }
   if (!similar.empty()) error.message += "'?";
   return error;
+}
+
+Result<Follower> Follower::open(Session& session, RawReader& reader, Output& out) {
+  const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
+  const bool own = reader.id().host == daemon.host;
+  Follower follower(session, reader, out, own ? kStopCheckPeriod : kOfferTimeout);
+  follower.watch_ = DSSM_TRY(
+      session.watch([suspicion = follower.suspicion_, id = reader.id()](const StreamEvent& event) {
+        if (event.stream.id != id) return;
+        suspicion->store(event.kind == StreamEvent::Kind::removed, std::memory_order_relaxed);
+      }));
+  return follower;
+}
+
+// A stream may be recreated at once, and after a restart of its dssmd it may seem removed until the
+// programs that hold it have offered it back: only answers that there is none count, and only if
+// they stay the same for a while. While another host is unavailable, dssmd answers with what the
+// mirror knows.
+bool Follower::removed() {
+  bool missing = false;
+  if (suspicion_->load(std::memory_order_relaxed) && session_.is_connected()) {
+    const Result<StreamInfo> now = session_.stream_info(reader_.id());
+    missing = !now && now.error().code == Errc::not_found;
+  }
+  if (!missing) {
+    missing_since_.reset();
+    return false;
+  }
+  if (!missing_since_) missing_since_ = MonoClock::now();
+  return MonoClock::now() - *missing_since_ >= removed_after_;
+}
+
+Follower::Wake Follower::wait(MonoTime deadline) {
+  while (true) {
+    if (out_.must_stop()) return Wake::stop;
+    if (removed() || reader_.restart_error()) return Wake::ended;
+    const MonoTime next_check = std::min(deadline, deadline_in(kStopCheckPeriod));
+    if (reader_.wait(next_check) == WaitStatus::ready) return Wake::sample;
+    if (MonoClock::now() >= deadline) return Wake::deadline;
+  }
+}
+
+Error end_of(const RawReader& reader) {
+  if (std::optional<Error> error = reader.restart_error()) return *std::move(error);
+  return {Errc::not_found,
+          fmt::format("follow '{}': it was removed; start again if it was recreated",
+                      reader.id().str())};
+}
+
+void report_restart(const RawReader& reader) {
+  print_error(fmt::format("dssmctl: '{}': the stream restarted\n", escaped(reader.id().str())));
 }
 
 }  // namespace dssm::ctl

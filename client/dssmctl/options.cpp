@@ -6,26 +6,33 @@
 // parse_command_line() is where that ends.
 #include "client/dssmctl/options.hpp"
 
+#include <fmt/format.h>
+
 #include <CLI/CLI.hpp>
+#include <bit>
 #include <limits>
 #include <memory>
-#include <type_traits>
 
 #include "client/dssmctl/text.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
 
 constexpr std::uint64_t kMaxWindow = 1'000'000;
 
-// An option whose text is read by `read`: std::string(const std::string&), empty or an error.
+// An option whose text is read by `read`: Result<void>(const std::string&).
 template <class Read>
 CLI::Option* add_parsed(CLI::App* app, const std::string& name, const std::string& placeholder,
                         const std::string& description, Read read) {
+  const auto check = [read](std::string& text) {
+    const Result<void> done = read(text);
+    return done ? "" : done.error().message;
+  };
   return app
       ->add_option_function<std::string>(
           name, [](const std::string&) {}, description)
-      ->check(CLI::Validator(std::function<std::string(std::string&)>(read), ""))
+      ->check(CLI::Validator(std::function<std::string(std::string&)>(check), ""))
       ->type_name(placeholder);
 }
 
@@ -34,45 +41,36 @@ CLI::Option* add_whole(CLI::App* app, const std::string& name, const std::string
                        const std::string& description, Target& target, std::uint64_t min,
                        std::uint64_t max = std::numeric_limits<std::uint64_t>::max()) {
   return add_parsed(app, name, placeholder, description,
-                    [&target, min, max](const std::string& text) -> std::string {
-                      const Result<std::uint64_t> value = parse_whole(text, min, max);
-                      if (!value) return value.error().message;
-                      if constexpr (std::is_integral_v<Target>) {
-                        target = static_cast<Target>(*value);
-                      } else {
-                        target = *value;
-                      }
+                    [&target, min, max](const std::string& text) -> Result<void> {
+                      target = DSSM_TRY(parse_whole(text, min, max));
                       return {};
                     });
 }
 
-enum class Range : unsigned char { any, not_negative, positive };
+enum class Range : unsigned char { not_negative, positive };
 
 template <class Target>
 CLI::Option* add_seconds(CLI::App* app, const std::string& name, const std::string& description,
                          Target& target, Range range) {
-  return add_parsed(app, name, "SECONDS", description,
-                    [&target, range](const std::string& text) -> std::string {
-                      const Result<Duration> value = parse_seconds(text);
-                      if (!value) return value.error().message;
-                      if (range == Range::positive && *value <= Duration::zero()) {
-                        return "'" + text + "' must be greater than zero";
-                      }
-                      if (range == Range::not_negative && *value < Duration::zero()) {
-                        return "'" + text + "' must not be negative";
-                      }
-                      target = *value;
-                      return {};
-                    });
+  return add_parsed(
+      app, name, "SECONDS", description, [&target, range](const std::string& text) -> Result<void> {
+        const Duration value = DSSM_TRY(parse_seconds(text));
+        if (range == Range::positive && value <= Duration::zero()) {
+          return Error{Errc::invalid_argument, fmt::format("'{}' must be greater than zero", text)};
+        }
+        if (value < Duration::zero()) {
+          return Error{Errc::invalid_argument, fmt::format("'{}' must not be negative", text)};
+        }
+        target = value;
+        return {};
+      });
 }
 
 CLI::Option* add_real(CLI::App* app, const std::string& name, const std::string& placeholder,
                       const std::string& description, std::optional<double>& target) {
   return add_parsed(app, name, placeholder, description,
-                    [&target](const std::string& text) -> std::string {
-                      const Result<double> value = parse_real(text);
-                      if (!value) return value.error().message;
-                      target = *value;
+                    [&target](const std::string& text) -> Result<void> {
+                      target = DSSM_TRY(parse_real(text));
                       return {};
                     });
 }
@@ -119,7 +117,7 @@ void add_wait(CLI::App* verb, Duration& wait) {
 }
 
 void add_interval(CLI::App* verb, const std::string& of, Duration& interval) {
-  add_seconds(verb, "-i,--interval", "time between two " + of + " (default: 1)", interval,
+  add_seconds(verb, "-i,--interval", fmt::format("time between two {} (default: 1)", of), interval,
               Range::positive);
 }
 
@@ -139,7 +137,7 @@ std::string check_sort_key(std::string& key) {
                             "age", "writers", "readers", "type", "memory"}) {
     if (key == known) return {};
   }
-  return "'" + escaped(key) + "' is not a key to sort by";
+  return fmt::format("'{}' is not a key to sort by", escaped(key));
 }
 
 void add_ls(CLI::App& app, Parsed& parsed) {
@@ -213,10 +211,8 @@ void add_echo(CLI::App& app, Parsed& parsed) {
   add_parsed(echo, "--at", "TIME",
              "the newest sample at or before TIME, then end: seconds since 1970, or, with a minus "
              "sign, seconds before the newest sample",
-             [&options](const std::string& text) -> std::string {
-               const Result<Duration> time = parse_seconds(text);
-               if (!time) return time.error().message;
-               options.at = *time;
+             [&options](const std::string& text) -> Result<void> {
+               options.at = DSSM_TRY(parse_seconds(text));
                options.at_counts_back = text.starts_with('-');  // also "-0"
                return {};
              })
@@ -266,14 +262,16 @@ void add_create(CLI::App& app, Parsed& parsed) {
                                    options.cycle, Range::positive);
   life->needs(cycle);
   create->add_option("--type", options.type, "name of the samples' type")->type_name("NAME");
-  add_parsed(create, "--align", "BYTES", "alignment of a sample (default: what fits its size)",
-             [&options](const std::string& text) -> std::string {
-               const Result<std::uint64_t> value = parse_whole(text, 1, 64);
-               if (!value) return value.error().message;
-               if ((*value & (*value - 1)) != 0) return "'" + text + "' is not a power of two";
-               options.alignment_bytes = static_cast<std::uint32_t>(*value);
-               return {};
-             });
+  add_parsed(
+      create, "--align", "BYTES", "alignment of a sample (default: what fits its size)",
+      [&options](const std::string& text) -> Result<void> {
+        const std::uint64_t value = DSSM_TRY(parse_whole(text, 1, 64));
+        if (!std::has_single_bit(value)) {
+          return Error{Errc::invalid_argument, fmt::format("'{}' is not a power of two", text)};
+        }
+        options.alignment_bytes = static_cast<std::uint32_t>(value);
+        return {};
+      });
 }
 
 void add_rm(CLI::App& app, Parsed& parsed) {
@@ -363,8 +361,8 @@ std::string verb_name(const CLI::App& app) {
 CommandLine usage_error(const CLI::App& app, const std::string& error) {
   const std::string verb = verb_name(app);
   return {std::nullopt,
-          "dssmctl: " + (verb.empty() ? "" : verb + ": ") + escaped_message(error) +
-              "; see 'dssmctl " + (verb.empty() ? "" : verb + " ") + "--help'\n",
+          fmt::format("dssmctl: {}{}{}; see 'dssmctl {}{}--help'\n", verb, verb.empty() ? "" : ": ",
+                      escaped_message(error), verb, verb.empty() ? "" : " "),
           false};
 }
 
@@ -384,7 +382,7 @@ CommandLine parse_command_line(int argc, const char* const* argv) {
   } catch (const CLI::ParseError& error) {
     const std::vector<std::string> rest = app.remaining(true);
     if (rest.empty()) return usage_error(app, error.what());
-    const std::string word = "'" + rest.front() + "'";
+    const std::string word = fmt::format("'{}'", rest.front());
     if (rest.front().starts_with('-')) return usage_error(app, "there is no option " + word);
     if (innermost(app).get_subcommands({}).empty()) {
       return usage_error(app, word + " is one word too many");

@@ -1,16 +1,19 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The command line: one struct of options per verb, checked as far as that is possible without
-// asking dssmd. run() of verbs.hpp takes each of them.
+// asking dssmd; and the verbs themselves, which take these.
 #pragma once
 
 #include <cstdint>
+#include <dssm/result.hpp>
 #include <dssm/stream.hpp>
 #include <dssm/time.hpp>
 #include <optional>
 #include <string>
 #include <variant>
 #include <vector>
+
+#include "client/dssmctl/output.hpp"
 
 namespace dssm::ctl {
 
@@ -119,5 +122,24 @@ struct CommandLine {
 };
 
 CommandLine parse_command_line(int argc, const char* const* argv);
+
+// --- the verbs, one source per group of them. Each connects, works, and adds its output to `out`;
+// main() flushes and turns a failure into an exit status.
+
+Result<void> run(const LsOptions& options, Output& out);
+Result<void> run(const HostsOptions& options, Output& out);
+Result<void> run(const ClockOptions& options, Output& out);
+Result<void> run(const DoctorOptions& options, Output& out);
+Result<void> run(const PingOptions& options, Output& out);
+Result<void> run(const InfoOptions& options, Output& out);
+Result<void> run(const EchoOptions& options, Output& out);
+Result<void> run(const HzOptions& options, Output& out);
+Result<void> run(const BwOptions& options, Output& out);
+Result<void> run(const DelayOptions& options, Output& out);
+Result<void> run(const CreateOptions& options, Output& out);
+Result<void> run(const RmOptions& options, Output& out);
+Result<void> run(const PropertyGetOptions& options, Output& out);
+Result<void> run(const PropertySetOptions& options, Output& out);
+Result<void> run(const PlaybackOptions& options, Output& out);
 
 }  // namespace dssm::ctl

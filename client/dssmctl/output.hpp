@@ -1,16 +1,20 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Standard output, gathered in one string and written with as few system calls as possible: a list
-// of a thousand streams is one write. A reader that ends (`| head`) is not an error: writing
-// then stops quietly, and the program ends with success, as a person expects of a pipe.
+// Standard output as text, tables and JSON; and Ctrl-C, which ends it.
 #pragma once
 
 #include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <nlohmann/json.hpp>
 #include <string>
 #include <string_view>
+#include <vector>
 
 namespace dssm::ctl {
 
+// Gathered in one string and written with as few system calls as possible: a list of a thousand
+// streams is one write. A reader that ends (`| head`) is not an error: writing then stops quietly,
+// and the program ends with success, as a person expects of a pipe.
 class Output {
  public:
   explicit Output(int fd);
@@ -25,8 +29,12 @@ class Output {
   // Flushes when a good amount is pending: for verbs that print without end.
   bool flush_some() { return pending_.size() < kBatchBytes ? !stopped_ : flush(); }
 
-  // Whether the other end of a pipe was closed, also while nothing is written.
-  bool reader_ended();
+  // Whether a verb that runs until Ctrl-C must end: a stop signal came, or the other end of a pipe
+  // was closed, also while nothing is written.
+  bool must_stop();
+
+  // Sleeps until `due`. False: it must stop.
+  bool sleep_until(MonoTime due);
 
   // What went wrong when writing; a closed pipe does not count.
   const Result<void>& result() const { return result_; }
@@ -49,5 +57,64 @@ class Output {
 
 // Writes `text` to standard error, at once.
 void print_error(std::string_view text);
+
+// Rows of cells as aligned columns, two spaces apart, as wide as their contents. Cells are ASCII
+// (see text.hpp), so bytes are columns on the screen.
+class Table {
+ public:
+  enum class Align : unsigned char { left, right };
+  struct Column {
+    std::string title;
+    Align align = Align::left;
+  };
+
+  explicit Table(std::vector<Column> columns) : columns_(std::move(columns)) {}
+
+  // One cell per column.
+  void add_row(std::vector<std::string> cells) { rows_.push_back(std::move(cells)); }
+
+  // Header (bold on a terminal) and rows, without blanks at the ends of lines.
+  void print(Output& out) const;
+
+ private:
+  std::vector<Column> columns_;
+  std::vector<std::vector<std::string>> rows_;
+};
+
+// --- JSON: keys in the order in which they are written, whole numbers exact, NaN and infinity as
+// null, everything outside ASCII as \u escapes. Bytes that are not UTF-8 become U+FFFD.
+
+using Json = nlohmann::ordered_json;
+
+inline std::string json_text(const Json& json) {
+  return json.dump(-1, ' ', true, Json::error_handler_t::replace);
+}
+
+inline std::string json_line(const Json& json) { return json_text(json) + "\n"; }
+
+// A bound on a clock's or stamp's error [ns]; null: unknown.
+inline Json bound_json(Duration bound) {
+  return bound >= kForeignClockError ? Json() : Json(to_ns(bound));
+}
+
+// null for an empty text.
+inline Json or_null(std::string_view text) { return text.empty() ? Json() : Json(text); }
+
+// A document of its own: indented, because people read it too.
+inline std::string json_document(const Json& json) {
+  return json.dump(2, ' ', true, Json::error_handler_t::replace) + "\n";
+}
+
+// --- Ctrl-C, for verbs that run until then: SIGINT and SIGTERM end them with success, after their
+// final output. All other verbs end by these signals at once, as programs do.
+
+// From now on SIGINT and SIGTERM only set a mark, and interrupt system calls.
+void catch_stop_signals();
+
+bool stop_requested();
+
+// How long to wait at most before checking stop_requested() again: a signal that comes between the
+// check and the wait does not interrupt the wait.
+inline constexpr Duration kStopCheckPeriod = std::chrono::milliseconds(100);
 
 }  // namespace dssm::ctl

@@ -3,18 +3,20 @@
 // dssmctl ping: sends a heartbeat to the dssmd of another host, over the connection that this PC's
 // dssmd keeps to it, in the manner of ping(8). The time is from dssmd to dssmd: how long a
 // request of one to the other takes.
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cmath>
 #include <future>
 #include <optional>
 #include <thread>
 
-#include "client/dssmctl/json.hpp"
 #include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/statistics.hpp"
-#include "client/dssmctl/stop_signal.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -38,8 +40,8 @@ class Ping {
                                  {"address", answer.address.empty() ? Json() : Json(address)},
                                  {"round_trip_ns", to_ns(answer.round_trip)}}));
     }
-    out_.add("answer from " + escaped(host_) + " (" + escaped(address) + "): seq=" +
-             std::to_string(asked_) + " time=" + duration_text(answer.round_trip) + "\n");
+    out_.add(fmt::format("answer from {} ({}): seq={} time={}\n", escaped(host_), escaped(address),
+                         asked_, duration_text(answer.round_trip)));
   }
 
   // A stop signal came before the answer.
@@ -51,8 +53,7 @@ class Ping {
       return out_.add(json_line(
           {{"host", host_}, {"seq", asked_}, {"round_trip_ns", Json()}, {"error", error.message}}));
     }
-    out_.add("no answer: seq=" + std::to_string(asked_) + ": " + escaped_message(error.message) +
-             "\n");
+    out_.add(fmt::format("no answer: seq={}: {}\n", asked_, escaped_message(error.message)));
   }
 
   void summary() {
@@ -67,13 +68,11 @@ class Ping {
                                  {"round_trip_max_ns", known(to_ns(times.max))},
                                  {"round_trip_std_dev_ns", known(times.std_dev_ns)}}));
     }
-    out_.add("--- " + escaped(host_) + ": asked " + std::to_string(asked_) + ", answered " +
-             std::to_string(answered_) + " ---\n");
+    out_.add(fmt::format("--- {}: asked {}, answered {} ---\n", escaped(host_), asked_, answered_));
     if (times.count == 0) return;
-    const auto rounded = [](double ns) { return duration_text(Duration(std::llround(ns))); };
-    out_.add("round trip min/avg/max/mdev: " + duration_text(times.min) + " / " +
-             rounded(times.mean_ns) + " / " + duration_text(times.max) + " / " +
-             rounded(times.std_dev_ns) + "\n");
+    out_.add(fmt::format("round trip min/avg/max/mdev: {} / {} / {} / {}\n",
+                         duration_text(times.min), ns_text(times.mean_ns), duration_text(times.max),
+                         ns_text(times.std_dev_ns)));
   }
 
   std::uint64_t asked() const { return asked_; }
@@ -94,8 +93,6 @@ bool is_known(Session& session, const std::string& name) {
                               [&](const HostInfo& host) { return host.name == name; });
 }
 
-bool must_stop(Output& out) { return stop_requested() || out.reader_ended(); }
-
 // Asks in a thread of its own, because it takes seconds until a host counts as not answering, and
 // Ctrl-C must not wait for that: nothing then.
 std::optional<Result<RoundTrip>> ask(const Session& session, const std::string& host, Output& out) {
@@ -104,48 +101,37 @@ std::optional<Result<RoundTrip>> ask(const Session& session, const std::string& 
   std::future<Result<RoundTrip>> answer = question.get_future();
   std::thread(std::move(question)).detach();
   while (answer.wait_for(kStopCheckPeriod) != std::future_status::ready) {
-    if (must_stop(out)) return std::nullopt;
+    if (out.must_stop()) return std::nullopt;
   }
   return answer.get();
-}
-
-// Sleeps until `due`. False when a stop signal came or our output is no longer read.
-bool wait_until(MonoTime due, Output& out) {
-  while (MonoClock::now() < due) {
-    if (must_stop(out)) return false;
-    const Duration rest = std::min(due - MonoClock::now(), kStopCheckPeriod);
-    std::this_thread::sleep_for(rest);
-  }
-  return true;
 }
 
 }  // namespace
 
 Result<void> run(const PingOptions& options, Output& out) {
   catch_stop_signals();
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
+  Session session = DSSM_TRY(connect(options));
   Ping ping(options, out);
   MonoTime due = MonoClock::now();
   do {
-    const std::optional<Result<RoundTrip>> answer = ask(*session, options.host, out);
+    const std::optional<Result<RoundTrip>> answer = ask(session, options.host, out);
     if (!answer) {
       ping.on_stop();
       break;
     }
     if (*answer) {
       ping.on_answer(**answer);
-    } else if (ping.asked() == 0 && !is_known(*session, options.host)) {
+    } else if (ping.asked() == 0 && !is_known(session, options.host)) {
       return answer->error();
     } else {
       ping.on_no_answer(answer->error());
     }
     due = std::max(due + options.interval, MonoClock::now());
-  } while (out.flush() && ping.asked() != options.count && wait_until(due, out));
+  } while (out.flush() && ping.asked() != options.count && out.sleep_until(due));
   ping.summary();
   if (ping.answered() > 0) return {};
   return Error{Errc::unavailable,
-               "host '" + options.host + "' did not answer; see `dssmctl hosts`"};
+               fmt::format("host '{}' did not answer; see `dssmctl hosts`", options.host)};
 }
 
 }  // namespace dssm::ctl

@@ -2,10 +2,13 @@
 //
 // dssmctl playback: the PC's shared playback clock (SSM time), which players of recordings turn and
 // programs that live in log time follow.
-#include "client/dssmctl/json.hpp"
+#include <fmt/format.h>
+
 #include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -30,21 +33,17 @@ void print(const PlaybackClock& clock, const PlaybackOptions& options, Output& o
                                   {"speed", setting.speed},
                                   {"paused", setting.paused}}));
   }
-  out.add("time:    " + fixed_text(now_s, 6) + " s\n");
-  out.add("offset:  " + fixed_text(setting.offset_s, 6) + " s\n");
-  out.add("speed:   " + fixed_text(setting.speed, 3) + "\n");
-  out.add(std::string("paused:  ") + (setting.paused ? "yes" : "no") + "\n");
+  out.add(fmt::format("time:    {:.6f} s\noffset:  {:.6f} s\nspeed:   {:.3f}\npaused:  {}\n", now_s,
+                      setting.offset_s, setting.speed, setting.paused ? "yes" : "no"));
 }
 
 }  // namespace
 
 Result<void> run(const PlaybackOptions& options, Output& out) {
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  Result<PlaybackClock> clock = session->open_playback_clock();
-  if (!clock) return std::move(clock).error();
-  const bool changed = change(*clock, options);
-  if (!changed || options.json) print(*clock, options, out);
+  Session session = DSSM_TRY(connect(options));
+  PlaybackClock clock = DSSM_TRY(session.open_playback_clock());
+  const bool changed = change(clock, options);
+  if (!changed || options.json) print(clock, options, out);
   return {};
 }
 

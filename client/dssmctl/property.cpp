@@ -2,14 +2,16 @@
 //
 // dssmctl property get and set: bytes in, the same bytes out.
 #include <fcntl.h>
+#include <fmt/format.h>
 #include <unistd.h>
 
 #include <cerrno>
 
-#include "client/dssmctl/json.hpp"
 #include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
-#include "client/dssmctl/verbs.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -34,7 +36,7 @@ constexpr std::size_t kMaxPropertyBytes = 16U << 20;
 
 Result<std::vector<std::byte>> read_all(const std::string& path) {
   const bool standard = path == "-";
-  const std::string tried = "read '" + (standard ? "standard input" : path) + "'";
+  const std::string tried = fmt::format("read '{}'", standard ? "standard input" : path);
   const File file(standard ? STDIN_FILENO : ::open(path.c_str(), O_RDONLY | O_CLOEXEC));
   if (file.fd() < 0) return os_error(tried);
   std::vector<std::byte> bytes;
@@ -48,15 +50,14 @@ Result<std::vector<std::byte>> read_all(const std::string& path) {
     if (got == 0) return bytes;
     if (got < 0 && reason != EINTR) return os_error(tried, reason);
     if (bytes.size() > kMaxPropertyBytes) {
-      return Error{
-          Errc::limit_exceeded,
-          tried + ": longer than the " + bytes_text(kMaxPropertyBytes) + " a property may have"};
+      return Error{Errc::limit_exceeded, fmt::format("{}: longer than the {} a property may have",
+                                                     tried, bytes_text(kMaxPropertyBytes))};
     }
   }
 }
 
 Result<void> write_all(const std::string& path, std::span<const std::byte> bytes) {
-  const std::string tried = "write '" + path + "'";
+  const std::string tried = fmt::format("write '{}'", path);
   const File file(::open(path.c_str(), O_WRONLY | O_CREAT | O_TRUNC | O_CLOEXEC, 0666));
   if (file.fd() < 0) return os_error(tried);
   while (!bytes.empty()) {
@@ -70,18 +71,14 @@ Result<void> write_all(const std::string& path, std::span<const std::byte> bytes
 }  // namespace
 
 Result<void> run(const PropertyGetOptions& options, Output& out) {
-  Result<StreamId> id = StreamId::parse(options.stream);
-  if (!id) return std::move(id).error();
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  Result<std::vector<std::byte>> property = session->property(*id);
-  if (!property) return with_similar_names(std::move(property).error(), *session, *id);
+  StreamId id = DSSM_TRY(StreamId::parse(options.stream));
+  Session session = DSSM_TRY(connect(options));
+  Result<std::vector<std::byte>> property = session.property(id);
+  if (!property) return with_similar_names(std::move(property).error(), session, id);
   const bool to_file = options.file != "-";
-  if (to_file) {
-    if (Result<void> written = write_all(options.file, *property); !written) return written;
-  }
+  if (to_file) DSSM_TRY(write_all(options.file, *property));
   if (options.json) {
-    Json json{{"stream", id->str()}, {"property_bytes", property->size()}};
+    Json json{{"stream", id.str()}, {"property_bytes", property->size()}};
     if (!to_file) json["property_hex"] = hex_text(*property);
     out.add(json_document(json));
   } else if (!to_file && out.terminal()) {
@@ -93,17 +90,14 @@ Result<void> run(const PropertyGetOptions& options, Output& out) {
 }
 
 Result<void> run(const PropertySetOptions& options, Output& out) {
-  Result<StreamId> id = StreamId::parse(options.stream);
-  if (!id) return std::move(id).error();
-  const Result<std::vector<std::byte>> property = read_all(options.file);
-  if (!property) return property.error();
-  Result<Session> session = connect(options);
-  if (!session) return std::move(session).error();
-  if (Result<void> set = session->set_property(*id, *property); !set) {
-    return with_similar_names(std::move(set).error(), *session, *id);
+  StreamId id = DSSM_TRY(StreamId::parse(options.stream));
+  const std::vector<std::byte> property = DSSM_TRY(read_all(options.file));
+  Session session = DSSM_TRY(connect(options));
+  if (Result<void> set = session.set_property(id, property); !set) {
+    return with_similar_names(std::move(set).error(), session, id);
   }
   if (options.json) {
-    out.add(json_document({{"stream", id->str()}, {"property_bytes", property->size()}}));
+    out.add(json_document({{"stream", id.str()}, {"property_bytes", property.size()}}));
   }
   return {};
 }

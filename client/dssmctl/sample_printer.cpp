@@ -1,11 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/dssmctl/sample_printer.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <limits>
 
 #include "client/dssmctl/fields.hpp"
-#include "client/dssmctl/json.hpp"
 #include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
 
@@ -32,7 +33,7 @@ SamplePrinter::SamplePrinter(Output& out, SampleForm form, bool full, StreamId s
                              std::vector<Field> fields)
     : out_(out), form_(form), full_(full), stream_(std::move(stream)), fields_(std::move(fields)) {}
 
-// A terminal is no place for foreign control characters; a file gets the cell as it is.
+// A terminal must not get control characters from a stream; a file gets the cell as it is.
 std::string SamplePrinter::cell(std::string_view text) const {
   return csv_cell(out_.terminal() ? escaped(text) : std::string(text));
 }
@@ -46,7 +47,7 @@ void SamplePrinter::begin() {
       continue;
     }
     for (std::uint64_t i = 0; i < field.count; ++i) {
-      line.append(",").append(cell(field.name + "[" + std::to_string(i) + "]"));
+      line.append(",").append(cell(fmt::format("{}[{}]", field.name, i)));
     }
   }
   if (fields_.empty()) line += ",payload_hex";
@@ -69,21 +70,20 @@ void SamplePrinter::text_sample(const SampleInfo& info, std::span<const std::byt
                                 const Breaks& breaks) {
   std::string text;
   if (breaks.lost > 0) {
-    text += "# " + std::to_string(breaks.lost) +
-            " samples were overwritten before they could be shown\n";
+    text += fmt::format("# {} samples were overwritten before they could be shown\n", breaks.lost);
   }
-  text += "tid: " + std::to_string(info.tid) + "\ntime: " + seconds_text(to_ns(info.time));
-  text += "\nclock_error: " + bound_text(info.clock_error) + "\n";
+  text += fmt::format("tid: {}\ntime: {}\nclock_error: {}\n", info.tid,
+                      seconds_text(to_ns(info.time)), bound_text(info.clock_error));
   const std::size_t shown = full_ ? std::numeric_limits<std::size_t>::max() : kShownElements;
   for (const Field& field : fields_) {
-    text += escaped(field.name) + ": " + field_text(payload, field, shown) + "\n";
+    text += fmt::format("{}: {}\n", escaped(field.name), field_text(payload, field, shown));
   }
   if (fields_.empty()) {
-    text += "payload: " + bytes_text(payload.size()) + "\n";
     const std::size_t end = full_ ? payload.size() : std::min(payload.size(), kShownBytes);
-    text += hex_dump(payload.first(end), "  ");
+    text += fmt::format("payload: {}\n{}", bytes_text(payload.size()),
+                        hex_dump(payload.first(end), "  "));
     if (end < payload.size()) {
-      text += "  ... " + bytes_text(payload.size() - end) + " more (--full shows all)\n";
+      text += fmt::format("  ... {} more (--full shows all)\n", bytes_text(payload.size() - end));
     }
   }
   out_.add(text + "---\n");
@@ -109,7 +109,7 @@ void SamplePrinter::json_sample(const SampleInfo& info, std::span<const std::byt
 }
 
 void SamplePrinter::csv_sample(const SampleInfo& info, std::span<const std::byte> payload) {
-  std::string line = std::to_string(info.tid) + "," + std::to_string(to_ns(info.time)) + ",";
+  std::string line = fmt::format("{},{},", info.tid, to_ns(info.time));
   if (info.clock_error < kForeignClockError) line += std::to_string(to_ns(info.clock_error));
   for (const Field& field : fields_) {
     const std::uint64_t cells = is_text(field) ? 1 : field.count;

@@ -1,6 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/dssmctl/text.hpp"
 
+#include <fmt/format.h>
+
 #include <array>
 #include <charconv>
 #include <cmath>
@@ -11,48 +13,39 @@ namespace dssm::ctl {
 namespace {
 
 constexpr std::int64_t kNsPerSecond = 1'000'000'000;
-constexpr char kHexDigits[] = "0123456789abcdef";
-
 bool printable(char c) { return c >= 0x20 && c < 0x7f; }
 
-void add_hex(std::string& out, unsigned byte) {
-  out += kHexDigits[(byte >> 4) & 15];
-  out += kHexDigits[byte & 15];
-}
-
-void add_escaped(std::string& out, char c) {
-  switch (c) {
-    case '\n':
+// `bytes` with what cannot be printed, and what `escape_too` names, as escape sequences.
+std::string escape(std::string_view bytes, std::string_view escape_too) {
+  std::string out;
+  for (const char c : bytes) {
+    if (c == '\n') {
       out += "\\n";
-      return;
-    case '\t':
+    } else if (c == '\t') {
       out += "\\t";
-      return;
-    case '\r':
+    } else if (c == '\r') {
       out += "\\r";
-      return;
-    default:
-      out += "\\x";
-      add_hex(out, static_cast<unsigned char>(c));
+    } else if (!printable(c)) {
+      out += fmt::format("\\x{:02x}", static_cast<unsigned char>(c));
+    } else {
+      if (escape_too.find(c) != std::string_view::npos) out += '\\';
+      out += c;
+    }
   }
-}
-
-// In quotes, for messages. Built step by step: g++ 12 warns falsely (-Wrestrict) about a literal
-// plus a temporary string.
-std::string quoted(std::string_view text) {
-  std::string out = "'";
-  out += escaped(text);
-  out += '\'';
   return out;
 }
 
+// "'abc' is not a number"
+Error bad(std::string_view text, std::string_view problem) {
+  return {Errc::invalid_argument, fmt::format("'{}' {}", escaped(text), problem)};
+}
+
 Error bad_seconds(std::string_view text) {
-  return {Errc::invalid_argument,
-          quoted(text) + " is not a number of seconds, such as 0.025 or -1.5"};
+  return bad(text, "is not a number of seconds, such as 0.025 or -1.5");
 }
 
 Error too_many_seconds(std::string_view text) {
-  return {Errc::invalid_argument, quoted(text) + " seconds are more than 292 years"};
+  return bad(text, "seconds are more than 292 years");
 }
 
 // Three significant digits, as far as a value below 1000 has them.
@@ -63,38 +56,14 @@ std::string three_digits(double value) {
 
 // "2h05m"
 std::string two_units(std::int64_t big, char big_unit, std::int64_t small, char small_unit) {
-  std::string text = std::to_string(big) + big_unit;
-  if (small < 10) text += '0';
-  return text + std::to_string(small) + small_unit;
+  return fmt::format("{}{}{:02}{}", big, big_unit, small, small_unit);
 }
 
 }  // namespace
 
-std::string escaped(std::string_view bytes) {
-  std::string out;
-  for (const char c : bytes) {
-    if (c == '\\') {
-      out += "\\\\";
-    } else if (printable(c)) {
-      out += c;
-    } else {
-      add_escaped(out, c);
-    }
-  }
-  return out;
-}
+std::string escaped(std::string_view bytes) { return escape(bytes, "\\"); }
 
-std::string escaped_message(std::string_view message) {
-  std::string out;
-  for (const char c : message) {
-    if (printable(c)) {
-      out += c;
-    } else {
-      add_escaped(out, c);
-    }
-  }
-  return out;
-}
+std::string escaped_message(std::string_view message) { return escape(message, ""); }
 
 std::string list_text(const std::vector<std::string>& texts) {
   std::string out;
@@ -102,11 +71,13 @@ std::string list_text(const std::vector<std::string>& texts) {
   return out;
 }
 
+std::string or_dash(std::string text) { return text.empty() ? "-" : text; }
+
 std::string duration_text(Duration d) {
   const std::int64_t ns = to_ns(d);
   if (ns < 0) {
     const bool has_opposite = ns != std::numeric_limits<std::int64_t>::min();
-    return std::string("-").append(duration_text(has_opposite ? -d : Duration::max()));
+    return "-" + duration_text(has_opposite ? -d : Duration::max());
   }
   const double value = static_cast<double>(ns);
   if (ns < 1'000) return std::to_string(ns) + " ns";
@@ -120,6 +91,8 @@ std::string duration_text(Duration d) {
   return two_units(s / kDay, 'd', s / kHour % 24, 'h');
 }
 
+std::string ns_text(double ns) { return duration_text(Duration(std::llround(ns))); }
+
 std::string bound_text(Duration bound) {
   if (bound == kForeignClockError) return "of another clock";
   return bound == kUnknownClockError ? "unknown" : duration_text(bound);
@@ -129,17 +102,11 @@ std::string seconds_text(std::int64_t ns) {
   // By the unsigned magnitude, so that the smallest number has one too.
   const std::uint64_t size =
       ns < 0 ? 0 - static_cast<std::uint64_t>(ns) : static_cast<std::uint64_t>(ns);
-  std::string fraction = std::to_string(size % kNsPerSecond);
-  fraction.insert(0, 9 - fraction.size(), '0');
-  std::string text = ns < 0 ? "-" : "";
-  return text.append(std::to_string(size / kNsPerSecond)).append(".").append(fraction);
+  return fmt::format("{}{}.{:09}", ns < 0 ? "-" : "", size / kNsPerSecond, size % kNsPerSecond);
 }
 
 std::string fixed_text(double value, int decimals) {
-  std::array<char, 400> text{};  // DBL_MAX has 309 digits before the point
-  const auto [end, error] = std::to_chars(text.data(), text.data() + text.size(), value,
-                                          std::chars_format::fixed, decimals);
-  return error == std::errc() ? std::string(text.data(), end) : "?";
+  return fmt::format("{:.{}f}", value, decimals);
 }
 
 std::string bytes_text(std::uint64_t bytes) {
@@ -163,9 +130,13 @@ std::string byte_rate_text(double bytes_per_second) {
 }
 
 std::string hex_text(std::span<const std::byte> bytes) {
+  constexpr char kDigits[] = "0123456789abcdef";
   std::string out;
   out.reserve(bytes.size() * 2);
-  for (const std::byte byte : bytes) add_hex(out, std::to_integer<unsigned>(byte));
+  for (const std::byte byte : bytes) {  // by hand: there may be 64 MiB of them
+    out += kDigits[std::to_integer<unsigned>(byte) >> 4];
+    out += kDigits[std::to_integer<unsigned>(byte) & 15];
+  }
   return out;
 }
 
@@ -174,21 +145,19 @@ std::string hex_dump(std::span<const std::byte> bytes, std::string_view indent) 
   std::string out;
   for (std::size_t start = 0; start < bytes.size(); start += kPerLine) {
     const auto line = bytes.subspan(start, std::min(kPerLine, bytes.size() - start));
-    out += indent;
-    for (int shift = 28; shift >= 0; shift -= 4) out += kHexDigits[(start >> shift) & 15];
-    out += ' ';
+    out += fmt::format("{}{:08x} ", indent, start);
     std::string characters;
     for (std::size_t i = 0; i < kPerLine; ++i) {
       out += i == kPerLine / 2 ? "  " : " ";
-      if (i < line.size()) {
-        add_hex(out, std::to_integer<unsigned>(line[i]));
-        const char c = std::to_integer<char>(line[i]);
-        characters += printable(c) ? c : '.';
-      } else {
+      if (i >= line.size()) {
         out += "  ";
+        continue;
       }
+      out += fmt::format("{:02x}", std::to_integer<unsigned>(line[i]));
+      const char c = std::to_integer<char>(line[i]);
+      characters += printable(c) ? c : '.';
     }
-    out += "  |" + characters + "|\n";
+    out += fmt::format("  |{}|\n", characters);
   }
   return out;
 }
@@ -228,13 +197,13 @@ Result<Duration> parse_seconds(std::string_view text) {
   return Duration(negative ? -ns : ns);
 }
 
-Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t least, std::uint64_t most) {
+Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t min, std::uint64_t max) {
   std::uint64_t value = 0;
   const auto [end, error] = std::from_chars(text.data(), text.data() + text.size(), value);
-  if (error != std::errc() || end != text.data() + text.size() || value < least || value > most) {
-    std::string range = "from " + std::to_string(least);
-    if (most != std::numeric_limits<std::uint64_t>::max()) range += " to " + std::to_string(most);
-    return Error{Errc::invalid_argument, quoted(text) + " is not a whole number " + range};
+  if (error != std::errc() || end != text.data() + text.size() || value < min || value > max) {
+    const bool bounded = max != std::numeric_limits<std::uint64_t>::max();
+    return bad(text, fmt::format("is not a whole number from {}{}", min,
+                                 bounded ? fmt::format(" to {}", max) : ""));
   }
   return value;
 }
@@ -245,7 +214,7 @@ Result<double> parse_real(std::string_view text) {
   if (digits.starts_with('+')) digits.remove_prefix(1);  // from_chars takes no plus sign
   const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), value);
   if (error != std::errc() || end != digits.data() + digits.size() || !std::isfinite(value)) {
-    return Error{Errc::invalid_argument, quoted(text) + " is not a number"};
+    return bad(text, "is not a number");
   }
   return value;
 }

@@ -26,8 +26,14 @@ std::string escaped_message(std::string_view message);
 // `texts`, escaped, with commas between them: "a, b".
 std::string list_text(const std::vector<std::string>& texts);
 
+// `text`, or "-" when it is empty.
+std::string or_dash(std::string text);
+
 // A duration with three digits and its unit: "1.25 ms", "2h05m". For people only.
 std::string duration_text(Duration d);
+
+// The same for nanoseconds that are not whole.
+std::string ns_text(double ns);
 
 // A bound on a clock's or stamp's error, as duration_text(), or "unknown".
 std::string bound_text(Duration bound);
@@ -51,8 +57,8 @@ std::string hex_dump(std::span<const std::byte> bytes, std::string_view indent);
 // finer than a nanosecond are cut off. Fails with invalid_argument.
 Result<Duration> parse_seconds(std::string_view text);
 
-// Reads a whole number from `least` to `most`. Fails with invalid_argument.
-Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t least, std::uint64_t most);
+// Reads a whole number from `min` to `max`. Fails with invalid_argument.
+Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t min, std::uint64_t max);
 
 // Reads a finite number. Fails with invalid_argument.
 Result<double> parse_real(std::string_view text);

@@ -2,11 +2,11 @@
 //
 // The checks of dssmctl doctor: from a set of facts that differs from a healthy host's in one
 // thing, which finding follows, with which advice.
-#include "client/dssmctl/doctor_checks.hpp"
-
 #include <gtest/gtest.h>
 
 #include <algorithm>
+
+#include "client/dssmctl/doctor.hpp"
 
 namespace dssm::ctl {
 namespace {

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "client/dssmctl/doctor_facts.hpp"
-
 #include <gtest/gtest.h>
+
+#include "client/dssmctl/doctor.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -48,6 +48,42 @@ TEST(SoftLimit, IsTheFirstNumberOfItsLine) {
   for (const char* text : {"", "Max open files", "Max open files unlimited unlimited files"}) {
     EXPECT_EQ(soft_limit_untrusted(text), 0U) << text;
   }
+}
+
+using namespace std::chrono_literals;
+
+constexpr Duration kAmple = 1h;  // for programs that are to end by themselves
+
+TEST(RunProgram, GivesOutputsAndExitStatus) {
+  const auto end = run_program({"sh", "-c", "echo out; echo err >&2; exit 3"}, kAmple);
+  ASSERT_TRUE(end);
+  EXPECT_TRUE(end->in_time);
+  EXPECT_EQ(end->exit_status, 3);
+  EXPECT_EQ(end->output, "out\nerr\n");
+}
+
+TEST(RunProgram, WaitsForTheStatusOfAProgramThatClosedItsOutputs) {
+  const auto end = run_program({"sh", "-c", "exec >&- 2>&-; sleep 0.1; exit 4"}, kAmple);
+  ASSERT_TRUE(end);
+  EXPECT_EQ(end->exit_status, 4);
+}
+
+TEST(RunProgram, SaysWhenThereIsNoSuchProgram) {
+  EXPECT_FALSE(run_program({"a-program-that-nobody-has"}, kAmple));
+}
+
+TEST(RunProgram, KillsAProgramThatDoesNotEnd) {
+  const auto end = run_program({"sh", "-c", "echo began; exec sleep 1000"}, 100ms);
+  ASSERT_TRUE(end);
+  EXPECT_FALSE(end->in_time);
+  EXPECT_EQ(end->exit_status, -1);
+}
+
+TEST(RunProgram, GivesNoInputAndKeepsOnlySoMuchOutput) {
+  const auto end = run_program({"sh", "-c", "cat; head -c 1000000 /dev/zero"}, kAmple);
+  ASSERT_TRUE(end);
+  EXPECT_EQ(end->exit_status, 0);
+  EXPECT_EQ(end->output.size(), kMaxProgramOutput);
 }
 
 }  // namespace

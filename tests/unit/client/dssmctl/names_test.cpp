@@ -56,5 +56,52 @@ TEST(SimilarNames, HasNoGuessForWhatIsNothingAlike) {
   EXPECT_EQ(similar_names(std::string(100'000, 'x'), {"odom"}), Names{});
 }
 
+bool fits(const std::string& pattern, const StreamId& id) {
+  return StreamFilter({}, pattern).takes(id);
+}
+
+TEST(StreamFilter, FitsAPatternToTheNameOrTheNameWithItsId) {
+  const StreamId camera{"camera_left", 3, "pc2"};
+  for (const char* pattern : {"", "*", "camera*", "camera_left", "c?mera_[lr]*", "camera_left:3",
+                              "camera*:*", "*:3", "camera_[[:alpha:]]*"}) {
+    EXPECT_TRUE(fits(pattern, camera)) << pattern;
+  }
+  for (const char* pattern : {"camera", "*:4", "Camera*", "3", "*3", "camera_[[:digit:]]*"}) {
+    EXPECT_FALSE(fits(pattern, camera)) << pattern;
+  }
+}
+
+TEST(StreamFilter, LooksAtTheHostOnlyWhereThePatternHasOne) {
+  const StreamId lidar{"lidar", 0, "pc2"};
+  for (const char* pattern : {"lidar@pc2", "*@pc2", "lidar:0@pc?", "*@*"}) {
+    EXPECT_TRUE(fits(pattern, lidar)) << pattern;
+  }
+  for (const char* pattern : {"lidar@pc3", "*2", "lidar:1@pc2"}) {
+    EXPECT_FALSE(fits(pattern, lidar)) << pattern;
+  }
+}
+
+TEST(StreamFilter, TakesStreamsOfTheGivenHostsOnly) {
+  const StreamFilter filter({"pc2", "pc3"}, "l*");
+  EXPECT_TRUE(filter.takes({"lidar", 0, "pc2"}));
+  EXPECT_TRUE(filter.takes({"lidar", 0, "pc3"}));
+  EXPECT_FALSE(filter.takes({"lidar", 0, "pc1"}));
+  EXPECT_FALSE(filter.takes({"odom", 0, "pc2"}));
+}
+
+TEST(Duplicates, AreStreamsOfOneNameAndIdOnSeveralHosts) {
+  std::vector<StreamInfo> streams;
+  for (const StreamId& id : std::vector<StreamId>{
+           {"lidar", 0, "pc1"}, {"lidar", 1, "pc1"}, {"odom", 0, "pc2"}, {"lidar", 0, "pc3"}}) {
+    streams.emplace_back().id = id;
+  }
+  const Duplicates duplicates(streams);
+  EXPECT_TRUE(duplicates.has({"lidar", 0, "pc3"}));
+  EXPECT_FALSE(duplicates.has({"lidar", 1, "pc1"}));
+  EXPECT_FALSE(duplicates.has({"odom", 0, "pc2"}));
+  ASSERT_EQ(duplicates.owners().size(), 1U);
+  EXPECT_EQ(duplicates.owners().begin()->second, (std::vector<std::string>{"pc1", "pc3"}));
+}
+
 }  // namespace
 }  // namespace dssm::ctl

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "client/dssmctl/host_rows.hpp"
+#include "client/dssmctl/describe.hpp"
 
 #include <gtest/gtest.h>
 

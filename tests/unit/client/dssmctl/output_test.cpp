@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "client/dssmctl/table.hpp"
+#include "client/dssmctl/output.hpp"
 
 #include <gtest/gtest.h>
 

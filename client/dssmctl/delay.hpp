@@ -18,7 +18,8 @@ class Clocks {
 
   void add(const SampleInfo& info);
 
-  // Takes over what `hosts` say about their clocks. `owner`: the host whose clock makes the stamps.
+  // Takes over what is known of the clocks of `hosts`. `owner`: the host whose clock makes the
+  // stamps.
   void update(const std::vector<HostInfo>& hosts, std::string_view owner);
 
   // Whether the stamps come from another host's clock. False before update().

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "client/dssmctl/clocks.hpp"
+#include "client/dssmctl/delay.hpp"
 
 #include <gtest/gtest.h>
 

@@ -1,11 +1,21 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "client/dssmctl/stream_json.hpp"
+#include "client/dssmctl/describe.hpp"
+
+#include <fmt/format.h>
 
 #include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
-
 namespace {
+
+Json round_trip_json(Duration round_trip) {
+  return round_trip > Duration::zero() ? Json(to_ns(round_trip)) : Json();
+}
+
+std::string note(const HostInfo& host) {
+  return fmt::format("{}{}{}", host.insecure ? "insecure: nothing is encrypted" : "",
+                     host.insecure && !host.error.empty() ? "; " : "", escaped_message(host.error));
+}
 
 Json mirror_json(const MirrorInfo& mirror) {
   return {{"state", name_of(mirror.state)},
@@ -15,11 +25,48 @@ Json mirror_json(const MirrorInfo& mirror) {
           {"gap_samples", mirror.gap_samples},
           {"reconnects", mirror.reconnects},
           {"restarts", mirror.restarts},
-          {"clock", mirror.clock.empty() ? Json() : Json(mirror.clock)},
-          {"error", mirror.error.empty() ? Json() : Json(mirror.error)}};
+          {"clock", or_null(mirror.clock)},
+          {"error", or_null(mirror.error)}};
 }
 
 }  // namespace
+
+Json host_json(const HostInfo& host) {
+  Json json;
+  json["host"] = or_null(host.name);
+  json["id"] = or_null(host.id);
+  json["state"] = name_of(host.state);
+  json["state_for_ns"] = to_ns(host.since);
+  json["addresses"] = host.addresses;
+  json["found_by"] = host.found_by;
+  json["version"] = or_null(host.version);
+  json["round_trip_ns"] = round_trip_json(host.round_trip);
+  json["least_round_trip_ns"] = round_trip_json(host.min_round_trip);
+  json["streams"] = host.streams;
+  json["clock_bound_ns"] = bound_json(host.clock_bound());
+  json["insecure"] = host.insecure;
+  json["reason"] = host.reason == HostReason::none ? Json() : Json(name_of(host.reason));
+  json["error"] = or_null(host.error);
+  return json;
+}
+
+std::vector<Table::Column> host_columns() {
+  constexpr auto kRight = Table::Align::right;
+  return {{"HOST"},        {"STATE"},           {"ADDRESS"},       {"FOUND BY"}, {"VERSION"},
+          {"RTT", kRight}, {"STREAMS", kRight}, {"CLOCK", kRight}, {"NOTE"}};
+}
+
+std::vector<std::string> host_row(const HostInfo& host) {
+  return {or_dash(escaped(host.name)),
+          std::string(name_of(host.state)),
+          or_dash(list_text(host.addresses)),
+          or_dash(list_text(host.found_by)),
+          or_dash(escaped(host.version)),
+          host.round_trip > Duration::zero() ? duration_text(host.round_trip) : "-",
+          std::to_string(host.streams),
+          bound_text(host.clock_bound()),
+          note(host)};
+}
 
 Json stream_json(const StreamInfo& stream, Time now) {
   const bool written = stream.newest != kNoTid;
@@ -29,7 +76,7 @@ Json stream_json(const StreamInfo& stream, Time now) {
   json["name"] = stream.id.name;
   json["id"] = stream.id.id;
   json["host"] = stream.id.host;
-  json["type"] = stream.type.name.empty() ? Json() : Json(stream.type.name);
+  json["type"] = or_null(stream.type.name);
   json["payload_bytes"] = stream.type.payload_bytes;
   json["depth"] = stream.depth;
   json["cycle_ns"] = to_ns(stream.cycle);

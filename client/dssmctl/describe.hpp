@@ -1,0 +1,31 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A HostInfo and a StreamInfo as several verbs show them.
+#pragma once
+
+#include <dssm/session.hpp>
+#include <dssm/stream.hpp>
+#include <string>
+#include <vector>
+
+#include "client/dssmctl/output.hpp"
+
+namespace dssm::ctl {
+
+// --- hosts, as `dssmctl hosts` shows them
+
+std::vector<Table::Column> host_columns();
+std::vector<std::string> host_row(const HostInfo& host);  // a cell for each column
+
+Json host_json(const HostInfo& host);
+
+// --- streams: the same keys in `ls` and `info`
+
+Json stream_json(const StreamInfo& stream, Time now);
+
+// What `info` adds: fields, users, and how the mirror is doing.
+void add_details(Json& json, const StreamInfo& stream);
+
+std::string_view role_name(Role role);
+
+}  // namespace dssm::ctl
