@@ -81,7 +81,7 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& de
     last_heard_ = loop_.coarse_now();
     received += got->bytes;
     if (!decode(got->bytes)) return;
-    if (paused_ || decoder_held_ || got->bytes < free_bytes) break;
+    if (input_.paused || input_.decoder_held || got->bytes < free_bytes) break;
   }
   if (received > 0 && samples_) samples_->on_batch_end();
   if (ended) close(end);
@@ -89,28 +89,28 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& de
 
 // Continues with the bytes that were received before a pause.
 void FrameConnection::continue_receiving() {
-  if (closed_ || paused_ || !decode(0)) return;
+  if (closed_ || input_.paused || !decode(0)) return;
   if (samples_) samples_->on_batch_end();
-  if (!closed_ && !paused_) receive_more();
+  if (!closed_ && !input_.paused) receive_more();
 }
 
 // False when the connection closed meanwhile.
 [[gnu::hot]] bool FrameConnection::decode(std::size_t bytes) {
-  decoder_held_ = false;
-  decoding_ = true;
+  input_.decoder_held = false;
+  input_.decoding = true;
   const Result<void> taken = decoder_.commit(bytes);
-  decoding_ = false;
+  input_.decoding = false;
   if (!taken) close_with(taken.error());
   return !closed_ && charge_input();
 }
 
 [[gnu::hot]] bool FrameConnection::charge_input() {
   const std::size_t bytes = decoder_.collected_bytes();
-  if (!budget_ || bytes == input_share_.bytes()) return true;
-  input_share_ = {};
+  if (!budget_ || bytes == input_.share.bytes()) return true;
+  input_.share = {};
   std::optional<MemoryShare> share = budget_->try_take(bytes);
   if (share) {
-    input_share_ = *std::move(share);
+    input_.share = *std::move(share);
     return true;
   }
   close_with({Errc::limit_exceeded,
@@ -122,7 +122,7 @@ void FrameConnection::continue_receiving() {
 }
 
 void FrameConnection::receive_more() {
-  if (decoder_held_) return next_turn_.enable_in(Duration::zero());
+  if (input_.decoder_held) return next_turn_.enable_in(Duration::zero());
   readable_.enable();
 }
 
@@ -145,11 +145,11 @@ Result<void> FrameConnection::on_frame(net::Frame& frame) {
 }
 
 void FrameConnection::pause() {
-  if (closed_ || paused_) return;
-  paused_ = true;
-  if (decoding_) {
+  if (closed_ || input_.paused) return;
+  input_.paused = true;
+  if (input_.decoding) {
     decoder_.hold();
-    decoder_held_ = true;
+    input_.decoder_held = true;
   }
   readable_.disable();
   next_turn_.disable();
@@ -157,8 +157,8 @@ void FrameConnection::pause() {
 }
 
 void FrameConnection::resume() {
-  if (closed_ || !paused_) return;
-  paused_ = false;
+  if (closed_ || !input_.paused) return;
+  input_.paused = false;
   receive_more();
 }
 
@@ -276,7 +276,7 @@ void FrameConnection::lose_output() {
   output_.queue.clear();
   output_.queued_bytes = 0;
   writable_.disable();
-  if (paused_) close(last_error_);
+  if (input_.paused) close(last_error_);
 }
 
 void FrameConnection::close_with(const Error& why) {
@@ -297,7 +297,7 @@ void FrameConnection::close(const Error& why) {
   writable_.disable();
   next_turn_.disable();
   output_.queue.clear();
-  input_share_ = {};
+  input_.share = {};
   transport_.reset();
   ended_.enable_in(Duration::zero());
 }

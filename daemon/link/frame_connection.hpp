@@ -127,7 +127,7 @@ class FrameConnection final : private wire::FrameDelegate {
   // on_sample_begin()).
   void pause();
   void resume();
-  bool is_paused() const noexcept { return paused_; }
+  bool is_paused() const noexcept { return input_.paused; }
 
   // Closes with a final failure for the peer (a Failure with serial 0), as far as the socket takes
   // it at once. on_closed() follows from the loop.
@@ -146,6 +146,12 @@ class FrameConnection final : private wire::FrameDelegate {
     MemoryShare share;
 
     std::span<const std::byte> unsent() const noexcept;
+  };
+  struct Input {
+    MemoryShare share;  // of a long frame that is being received
+    bool paused = false;
+    bool decoding = false;
+    bool decoder_held = false;  // pause() stopped the decoder, which may have more bytes
   };
   struct Output {
     std::deque<Outgoing> queue;
@@ -178,11 +184,8 @@ class FrameConnection final : private wire::FrameDelegate {
   MemoryBudget* budget_ = nullptr;
   wire::FrameDecoder decoder_;
   Output output_;
-  MemoryShare input_share_;
+  Input input_;
   bool closed_ = false;
-  bool paused_ = false;
-  bool decoding_ = false;
-  bool decoder_held_ = false;  // pause() stopped the decoder, which may have more bytes
   Error last_error_;
   MonoTime last_heard_ = loop_.now();
   EventSource readable_, writable_, next_turn_, ended_;
