@@ -18,6 +18,35 @@ namespace {
 
 using namespace std::chrono_literals;
 
+KnownStream small_stream(const std::string& name, std::uint64_t depth) {
+  return {{name, 0, "pc1"}, 64, depth, 1ms, 0ms, 1};
+}
+
+RawWriter make(Session session, const KnownStream& known) {
+  return session.create_raw(known.id, known.type(), known.history()).value();
+}
+
+void write_until(RawWriter& writer, const KnownStream& known, Tid last) {
+  std::vector<std::byte> payload(known.payload_bytes);
+  while (writer.newest_tid() < last) {
+    const SampleInfo info = known.info(writer.newest_tid() + 1);
+    known.fill(payload, 1, info.tid);
+    ASSERT_EQ(writer.write(payload, info.time, info.clock_error), info.tid);
+  }
+}
+
+// Takes all samples from `first` to `last`, each once.
+void expect_samples(RawReader& reader, const KnownStream& known, Tid first, Tid last) {
+  std::vector<std::byte> payload(known.payload_bytes);
+  SampleInfo info;
+  for (Tid tid = first; tid <= last; ++tid) {
+    ASSERT_EQ(reader.wait_for_tid(tid, kNever), WaitStatus::ready);
+    ASSERT_EQ(reader.read_next(payload, info), ReadStatus::ok);
+    ASSERT_EQ(info.tid, tid);
+    ASSERT_EQ(known.fault(payload, info, 1), "");
+  }
+}
+
 class Hosts : public NetworkTest {
  protected:
   // Waits until `session`'s dssmd is connected to `host`.
@@ -26,41 +55,43 @@ class Hosts : public NetworkTest {
           [&] { return host_info(session, Network::name(host)).state == HostState::up; });
   }
 
+  void await_down(Session& session, int host) {
+    await("the host is down",
+          [&] { return host_info(session, Network::name(host)).state != HostState::up; });
+  }
+
   static bool lists(Session& session, const std::string& stream) {
     for (const StreamInfo& each : session.list_streams().value()) {
       if (each.id.name == stream) return true;
     }
     return false;
   }
+};
 
-  static KnownStream small(const std::string& name, std::uint64_t depth) {
-    return {{name, 0, "pc1"}, 64, depth, 1ms, 0ms, 1};
+// A stream of pc1, written there and read on pc2.
+class ReadStream {
+ public:
+  // With samples 0 to `last`, which are written before it is opened for reading, and read at once.
+  ReadStream(Fleet& fleet, const std::string& name, std::uint64_t depth, Tid last = kNoTid)
+      : here(fleet.session(1)),
+        there(fleet.session(2)),
+        known(small_stream(name, depth)),
+        writer(make(here, known)),
+        reader([&] {
+          write_until(last);
+          return there.await_raw_reader(known.id, kNever).value();
+        }()) {
+    reader.seek(kNoTid);
+    expect(0, last);
   }
+  void write_until(Tid last) { test::write_until(writer, known, last); }
+  void expect(Tid first, Tid last) { expect_samples(reader, known, first, last); }
+  MirrorInfo mirror() { return there.stream_info(known.id).value().mirror.value(); }
 
-  static RawWriter make(Session session, const KnownStream& known) {
-    return session.create_raw(known.id, known.type(), known.history()).value();
-  }
-
-  static void write_until(RawWriter& writer, const KnownStream& known, Tid last) {
-    std::vector<std::byte> payload(known.payload_bytes);
-    while (writer.newest_tid() < last) {
-      const SampleInfo info = known.info(writer.newest_tid() + 1);
-      known.fill(payload, 1, info.tid);
-      ASSERT_EQ(writer.write(payload, info.time, info.clock_error), info.tid);
-    }
-  }
-
-  // Takes all samples from `first` to `last`, each once.
-  static void expect_samples(RawReader& reader, const KnownStream& known, Tid first, Tid last) {
-    std::vector<std::byte> payload(known.payload_bytes);
-    SampleInfo info;
-    for (Tid tid = first; tid <= last; ++tid) {
-      ASSERT_EQ(reader.wait_for_tid(tid, kNever), WaitStatus::ready);
-      ASSERT_EQ(reader.read_next(payload, info), ReadStatus::ok);
-      ASSERT_EQ(info.tid, tid);
-      ASSERT_EQ(known.fault(payload, info, 1), "");
-    }
-  }
+  Session here, there;
+  KnownStream known;
+  RawWriter writer;
+  RawReader reader;
 };
 
 TEST_F(Hosts, ThatAreUnreachableAreDownWithin3SecondsAndUpAgain) {
@@ -74,8 +105,7 @@ TEST_F(Hosts, ThatAreUnreachableAreDownWithin3SecondsAndUpAgain) {
   for (int attempt = 0; attempt < 2; ++attempt) {
     const MonoTime cut = MonoClock::now();
     fleet->network().cut(2);
-    await("the dead host is noticed",
-          [&] { return host_info(here, "pc2").state != HostState::up; });
+    await_down(here, 2);
     noticed = MonoClock::now() - cut;
     EXPECT_FALSE(lists(here, "there"));
     EXPECT_NE(host_info(here, "pc2").error, "");
@@ -93,96 +123,73 @@ TEST_F(Hosts, ThatDieAreDownAtOnceAndUpAgain) {
   Session here = fleet->session(1);
   await_up(here, 2);
   fleet->kill_dssmd(2);
-  await("the dead dssmd is noticed", [&] { return host_info(here, "pc2").state != HostState::up; });
+  await_down(here, 2);
   fleet->start_dssmd(2);
   await_up(here, 2);
 }
 
 TEST_F(Hosts, MirrorsResumeAtTheirTidAfterACut) {
   if (!make_fleet(2)) return;
-  Session owner = fleet->session(1), there = fleet->session(2);
-  const KnownStream known = small("kept", 4096);
-  RawWriter writer = make(owner, known);
-  write_until(writer, known, 99);
-  RawReader reader = there.await_raw_reader(known.id, kNever).value();
-  reader.seek(kNoTid);
-  expect_samples(reader, known, 0, 99);
+  ReadStream stream(*fleet, "kept", 4096, 99);
   for (Tid last = 1099; last < 4000; last += 1000) {
     fleet->network().cut(1);
-    write_until(writer, known, last - 500);
-    await("the cut is noticed", [&] { return host_info(there, "pc1").state != HostState::up; });
-    write_until(writer, known, last);
+    stream.write_until(last - 500);
+    await_down(stream.there, 1);
+    stream.write_until(last);
     fleet->network().heal(1);
-    expect_samples(reader, known, last - 999, last);
+    stream.expect(last - 999, last);
   }
-  EXPECT_EQ(reader.lost_samples(), 0u);
-  EXPECT_EQ(reader.restarts(), 0u);
-  await_up(there, 1);
-  const StreamInfo info = there.stream_info(known.id).value();
-  ASSERT_TRUE(info.mirror);
-  EXPECT_EQ(info.mirror->gap_samples, 0u);
-  EXPECT_GE(info.mirror->reconnects, 3u);
-  EXPECT_EQ(info.mirror->newest, writer.newest_tid());
-  EXPECT_EQ(info.mirror->received_samples, 3100u) << "not each came once";
+  EXPECT_EQ(stream.reader.lost_samples(), 0u);
+  EXPECT_EQ(stream.reader.restarts(), 0u);
+  await_up(stream.there, 1);
+  const MirrorInfo mirror = stream.mirror();
+  EXPECT_EQ(mirror.gap_samples, 0u);
+  EXPECT_GE(mirror.reconnects, 3u);
+  EXPECT_EQ(mirror.newest, stream.writer.newest_tid());
+  EXPECT_EQ(mirror.received_samples, 3100u) << "not each came once";
 }
 
 TEST_F(Hosts, MirrorsResumeAtTheirTidAfterADssmdWasKilled) {
   if (!make_fleet(2)) return;
-  Session owner = fleet->session(1), there = fleet->session(2);
-  const KnownStream known = small("kept", 4096);
-  RawWriter writer = make(owner, known);
-  write_until(writer, known, 99);
-  RawReader reader = there.await_raw_reader(known.id, kNever).value();
-  reader.seek(kNoTid);
-  expect_samples(reader, known, 0, 99);
+  ReadStream stream(*fleet, "kept", 4096, 99);
   Tid last = 99;
   for (const std::vector<int>& killed : std::vector<std::vector<int>>{{1}, {2}, {1, 2}, {1}}) {
     for (const int host : killed) fleet->kill_dssmd(host);
-    write_until(writer, known, last + 500);
+    stream.write_until(last + 500);
     for (const int host : killed) fleet->start_dssmd(host);
-    write_until(writer, known, last + 900);
-    expect_samples(reader, known, last + 1, last + 900);
+    stream.write_until(last + 900);
+    stream.expect(last + 1, last + 900);
     last += 900;
   }
-  EXPECT_EQ(reader.lost_samples(), 0u);
-  EXPECT_EQ(reader.restarts(), 0u);
+  EXPECT_EQ(stream.reader.lost_samples(), 0u);
+  EXPECT_EQ(stream.reader.restarts(), 0u);
 }
 
 // Shorter than the peer timeout: TCP sends again.
 TEST_F(Hosts, ShortCutsLoseNothing) {
   if (!make_fleet(2)) return;
-  Session owner = fleet->session(1), there = fleet->session(2);
-  const KnownStream known = small("kept", 4096);
-  RawWriter writer = make(owner, known);
-  RawReader reader = there.await_raw_reader(known.id, kNever).value();
-  reader.seek(kNoTid);
+  ReadStream stream(*fleet, "kept", 4096);
   for (int round = 0; round < 10; ++round) {
     fleet->network().cut(1);
-    write_until(writer, known, 100 * round + 99);
+    stream.write_until(100 * round + 99);
     fleet->network().heal(1);
-    expect_samples(reader, known, 100 * round, 100 * round + 99);
+    stream.expect(100 * round, 100 * round + 99);
   }
-  EXPECT_EQ(reader.lost_samples(), 0u);
+  EXPECT_EQ(stream.reader.lost_samples(), 0u);
 }
 
 TEST_F(Hosts, GapsAfterACutAreCountedExactly) {
   if (!make_fleet(2)) return;
-  Session owner = fleet->session(1), there = fleet->session(2);
-  const KnownStream known = small("short", 64);
-  RawWriter writer = make(owner, known);
-  write_until(writer, known, 9);
-  RawReader reader = there.await_raw_reader(known.id, kNever).value();
-  reader.seek(kNoTid);
-  expect_samples(reader, known, 0, 9);
+  ReadStream stream(*fleet, "short", 64, 9);
   fleet->network().cut(1);
-  await("the cut is noticed", [&] { return host_info(there, "pc1").state != HostState::up; });
-  write_until(writer, known, 999);
+  await_down(stream.there, 1);
+  stream.write_until(999);
   fleet->network().heal(1);
   // 64 slots hold 63 samples: 937 to 999; 10 to 936 are lost.
-  ASSERT_EQ(reader.wait_for_tid(999, kNever), WaitStatus::ready);
-  expect_samples(reader, known, 937, 999);
-  EXPECT_EQ(reader.lost_samples(), 927u);
-  EXPECT_EQ(there.stream_info(known.id).value().mirror->gap_samples, 927u);
+  ASSERT_EQ(stream.reader.wait_for_tid(999, kNever), WaitStatus::ready);
+  stream.expect(937, 999);
+  EXPECT_EQ(stream.reader.lost_samples(), 927u);
+  EXPECT_EQ(stream.mirror().gap_samples, 927u);
 }
 
 // A network that carries a third of a stream: gaps are counted, and other streams do not suffer.
@@ -225,16 +232,12 @@ TEST_F(Hosts, WithALongDelayLoseNothing) {
     const Result<void> far = fleet->network().shape(host, "netem delay 50ms 10ms loss 1%");
     if (!far) GTEST_SKIP() << far.error().message;
   }
-  Session owner = fleet->session(1), there = fleet->session(2);
-  const KnownStream known = small("far", 4096);
-  RawWriter writer = make(owner, known);
-  RawReader reader = there.await_raw_reader(known.id, kNever).value();
-  reader.seek(kNoTid);
+  ReadStream stream(*fleet, "far", 4096);
   for (Tid last = 99; last < 3000; last += 100) {
-    write_until(writer, known, last);
-    expect_samples(reader, known, last - 99, last);
+    stream.write_until(last);
+    stream.expect(last - 99, last);
   }
-  EXPECT_EQ(reader.lost_samples(), 0u);
+  EXPECT_EQ(stream.reader.lost_samples(), 0u);
 }
 
 TEST_F(Hosts, StreamsOfOneNameDifferByHost) {
@@ -269,7 +272,7 @@ TEST_F(Hosts, StreamsOfOneNameDifferByHost) {
 // A PC dies, and another one creates a stream of the same name.
 TEST_F(Hosts, FindAStreamThatMovedToAnotherHost) {
   if (!make_fleet(3)) return;
-  KnownStream known = small("moving", 64);
+  KnownStream known = small_stream("moving", 64);
   RawWriter first = make(fleet->session(1), known);
   write_until(first, known, 9);
   Session third = fleet->session(3);
@@ -302,14 +305,8 @@ TEST_F(Hosts, FindAStreamThatMovedToAnotherHost) {
 
 TEST_F(Hosts, UseIpv6) {
   if (!make_fleet(2, {}, IpVersion::v6)) return;
-  Session owner = fleet->session(1), there = fleet->session(2);
-  const KnownStream known = small("six", 64);
-  RawWriter writer = make(owner, known);
-  write_until(writer, known, 49);
-  RawReader reader = there.await_raw_reader(known.id, kNever).value();
-  reader.seek(kNoTid);
-  expect_samples(reader, known, 0, 49);
-  EXPECT_GT(there.ping("pc1").value().round_trip, 0ns);
+  ReadStream stream(*fleet, "six", 64, 49);
+  EXPECT_GT(stream.there.ping("pc1").value().round_trip, 0ns);
 }
 
 TEST_F(Hosts, RefuseAPeerOfALaterVersionWithAnError) {
