@@ -44,7 +44,7 @@ class BadPeer : public testing::Test {
   int descriptors_ = open_descriptors(daemon_.pid());
 };
 
-TEST_F(BadPeer, ThatSendsGarbageIsToldSo) {
+TEST_F(BadPeer, ThatSendsGarbageGetsAnError) {
   NetworkPeer http(daemon_.address());
   http.send_bytes(
       "GET / HTTP/1.1\r\nHost: pc1\r\nUser-Agent: a browser that lost its way home\r\n\r\n");
@@ -108,7 +108,7 @@ TEST_F(BadPeer, ThatChangesBytesOfGoodFramesCostsOnlyItself) {
   }
 }
 
-TEST_F(BadPeer, ThatComesFromTheFutureIsToldBothVersionsAndHosts) {
+TEST_F(BadPeer, OfALaterVersionIsRefusedNamingBothVersionsAndHosts) {
   NetworkPeer peer(daemon_.address());
   peer.send(client_hello_frame(1000));
   const std::string words = peer.final_failure();
@@ -149,7 +149,7 @@ TEST_F(BadPeer, ThatPublishesWithoutSayingSoOrInAnotherSizeIsRefused) {
 }
 
 // Never reads: neither its subscription, nor what it asks for.
-TEST_F(BadPeer, ThatNeverReadsTakesNoMoreThanItsHostMayAndDelaysNobody) {
+TEST_F(BadPeer, ThatNeverReadsStaysWithinItsHostsMemoryAndDelaysNoOther) {
   RawClient writing(daemon_.socket_path());
   {
     LocalWriter camera(writing, "camera", kMiB, 4), fast(writing, "fast", 64, 65536);
@@ -189,7 +189,7 @@ TEST_F(BadPeer, ThatNeverReadsTakesNoMoreThanItsHostMayAndDelaysNobody) {
   }
 }
 
-TEST_F(BadPeer, ThatAsksWithoutPauseDoesNotKeepOthersWaiting) {
+TEST_F(BadPeer, ThatRequestsWithoutPauseDoesNotDelayOthers) {
   NetworkPeer busy = NetworkPeer::greeted(daemon_.address());
   std::string many;
   for (std::uint64_t serial = 100; serial < 50'100; ++serial) {

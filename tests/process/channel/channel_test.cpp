@@ -192,7 +192,7 @@ TEST_F(Channel, WritesEachPublishedSampleOnceThoughConnectionsBreakAnywhere) {
 }
 
 // Whatever was acknowledged: the next dssmd gets the ring back, and knows it from there.
-TEST_F(Channel, SaysAfterARestartWhatWasWrittenBefore) {
+TEST_F(Channel, ReportsAfterARestartWhatWasWrittenBefore) {
   constexpr std::int64_t kSamples = 10'000;
   LocalWriter program(local_, "once", 40, 16);  // keeps the ring
   std::int64_t last = -1;
@@ -229,12 +229,12 @@ TEST_F(Channel, WakesLocalReadersOfWhatIsPublished) {
   ASSERT_EQ(reader.newest(), kNoTid);
   publisher.send_sample(info_of(0), Bytes(16));
   while (reader.newest() == kNoTid) {
-    ASSERT_NE(bell->sleep(announced, deadline_in(std::chrono::seconds(kPatienceSeconds))),
+    ASSERT_NE(bell->sleep(announced, deadline_in(std::chrono::seconds(kTimeoutSeconds))),
               WaitStatus::timeout);
   }
 }
 
-TEST_F(Channel, GoesOnWithTheRingThatAWriterKeptOverARestart) {
+TEST_F(Channel, ContinuesWithTheRingThatAWriterKeptOverARestart) {
   LocalWriter writer(local_, "kept", 64, 1024);
   writer.write(10);
   {
@@ -254,7 +254,7 @@ TEST_F(Channel, GoesOnWithTheRingThatAWriterKeptOverARestart) {
 
 // --- many kinds of peers
 
-TEST_F(Channel, TellsAllAboutTheStreamsOfItsHost) {
+TEST_F(Channel, DescribesTheStreamsOfItsHost) {
   LocalWriter writer(local_, "a", 16, 32);
   writer.write(3);
   NetworkPeer control = NetworkPeer::greeted(daemon_.address());

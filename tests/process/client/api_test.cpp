@@ -152,7 +152,7 @@ TEST_F(Api, CountsWhatAReaderLostWhenItWasLapped) {
   EXPECT_EQ(info.tid, 14);
 }
 
-TEST_F(Api, LendsSlotsInPlace) {
+TEST_F(Api, ReadsSlotsInPlace) {
   auto writer = make();
   auto reader = session.open_reader<Odometry>("odometry").value();
   {
@@ -204,7 +204,7 @@ TEST_F(Api, NamesBothTypesWhenTheyDoNotMatch) {
   EXPECT_EQ(bytes.code, Errc::type_mismatch);
 }
 
-TEST_F(Api, SaysInWordsWhatIsWrongWithARequest) {
+TEST_F(Api, ReportsWhatIsWrongWithARequest) {
   const auto expect = [](const auto& result, Errc code, const char* words) {
     ASSERT_FALSE(result) << "should have failed with: " << words;
     EXPECT_EQ(result.error().code, code) << result.error().message;
@@ -232,7 +232,7 @@ TEST_F(Api, SaysInWordsWhatIsWrongWithARequest) {
          "107 bytes");
 }
 
-TEST(Connect, TellsWhyItWasTurnedAway) {
+TEST(Connect, ReportsWhyItWasRefused) {
   DaemonProcess daemon({"--max-clients", "1"});
   auto first = Session::connect({.socket_path = daemon.socket_path()});
   ASSERT_TRUE(first) << first.error().message;
@@ -359,12 +359,12 @@ TEST_F(Api, RemovesAStreamButNotFromThoseWhoHoldIt) {
   EXPECT_EQ(session.open_reader<Odometry>("odometry").error().code, Errc::not_found);
   write(writer, 1);
   EXPECT_EQ(reader.newest_tid(), 1);
-  auto anew = make();
-  EXPECT_NE(anew.incarnation(), writer.incarnation());
-  EXPECT_EQ(anew.newest_tid(), kNoTid);
+  auto recreated = make();
+  EXPECT_NE(recreated.incarnation(), writer.incarnation());
+  EXPECT_EQ(recreated.newest_tid(), kNoTid);
 }
 
-TEST_F(Api, TellsWatchersWhatComesAndGoes) {
+TEST_F(Api, NotifiesWatchersOfAddedAndRemovedStreams) {
   make("before");
   std::mutex mutex;
   std::condition_variable changed;

@@ -69,7 +69,7 @@ TEST(NewRing, IsGoneOnWithAfterTheOldOneIsReadToItsEnd) {
   EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
-TEST(NewRing, WakesWhoSleepsOnTheOldOne) {
+TEST(NewRing, WakesReadersThatSleepOnTheOldOne) {
   const DaemonProcess daemon;
   Session session = connect(daemon);
   Writer<double> writer = session.create<double>("anew", History{16, 1ms}).value();
@@ -96,7 +96,7 @@ TEST(NewRing, WakesWhoSleepsOnTheOldOne) {
   EXPECT_EQ(value, 8);
 }
 
-TEST(NewRing, IsToldByReadsByTimeAtOnce) {
+TEST(NewRing, IsReportedByReadsByTimeAtOnce) {
   const DaemonProcess daemon;
   Session session = connect(daemon);
   Writer<double> writer = session.create<double>("anew", History{16, 1ms}).value();
@@ -117,7 +117,7 @@ TEST(NewRing, IsToldByReadsByTimeAtOnce) {
   EXPECT_EQ(value, 2);
 }
 
-TEST(NewRing, OfAnotherTypeLeavesTheReaderOnTheOldOneAndSaysWhy) {
+TEST(NewRing, OfAnotherTypeLeavesTheReaderOnTheOldOneAndReportsWhy) {
   const DaemonProcess daemon;
   Session session = connect(daemon);
   Writer<double> writer = session.create<double>("anew", History{16, 1ms}).value();
@@ -138,7 +138,7 @@ TEST(NewRing, OfAnotherTypeLeavesTheReaderOnTheOldOneAndSaysWhy) {
 
 // While a program sets up its connection anew, dssmd may tell it already that a ring which it has
 // just taken back has a successor: a mirror whose owner began anew.
-TEST(NewRing, IsToldWhileTheConnectionIsSetUpAnew) {
+TEST(NewRing, IsReportedDuringAReconnect) {
   const DaemonProcess daemon;
   Session writing = connect(daemon);
   test::Relay relay(daemon.socket_path());
@@ -149,16 +149,16 @@ TEST(NewRing, IsToldWhileTheConnectionIsSetUpAnew) {
     writers.push_back(writing.create<double>(name, History{16, 1ms}).value());
     readers.push_back(session.open_reader<double>(name).value());
   }
-  std::atomic<int> told = 0;
-  relay.set_behind([&told](const local::Response& response) {
+  std::atomic<int> notifications = 0;
+  relay.set_behind([&notifications](const local::Response& response) {
     if (!response.has_opened()) return std::string();
-    ++told;
+    ++notifications;
     local::Response event;
     event.mutable_replaced()->set_handle(response.opened().handle());
     return wire::encode_frame(event);
   });
   relay.cut();
-  await([&] { return told == 2; });
+  await([&] { return notifications == 2; });
   relay.set_behind(nullptr);
   // Each asks for its new ring, again and again: there is none yet.
   double value = 0;
@@ -174,7 +174,7 @@ TEST(NewRing, IsToldWhileTheConnectionIsSetUpAnew) {
 
 // A dssmd that died, and a writer that took the name before the reader's process was back: that
 // process holds a ring that nobody else knows.
-TEST(NewRing, IsFoundWhenTheNameWasTakenWhileDssmdWasAway) {
+TEST(NewRing, IsFoundWhenTheNameWasTakenWhileDssmdWasDown) {
   DaemonProcess daemon({"--recovery-grace", "0 ms"});
   Session reading = connect(daemon);
   std::uint64_t restarts = 0;

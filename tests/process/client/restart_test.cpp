@@ -45,7 +45,7 @@ TEST(Restart, LosesNoSampleWhenTheDaemonIsKilledUnderLoad) {
       for (;;) {
         auto seen = reading.stream_info({"load", 0, ""});
         if (seen && seen->writers == 1 && seen->readers == 1) return *seen;
-        std::this_thread::sleep_for(test::kLookPause);
+        std::this_thread::sleep_for(test::kPollPause);
       }
     }();
     EXPECT_EQ(info.incarnation, incarnation);
@@ -94,7 +94,7 @@ TEST(Restart, DoesNotLetAnEagerWriterReplaceAHeldRing) {
   }
 }
 
-TEST(Restart, ForgetsStreamsThatNobodyHolds) {
+TEST(Restart, ForgetsStreamsThatNoProgramHolds) {
   DaemonProcess daemon;
   Session session = connect(daemon);
   session.create<Numbered>("gone", History{16, 1ms}).value();
@@ -116,7 +116,7 @@ TEST(Restart, KeepsThePlaybackClock) {
   EXPECT_EQ(connect(daemon).open_playback_clock().value().now_s(), 1234);
 }
 
-TEST(Restart, TellsWatchersWhatIsGone) {
+TEST(Restart, NotifiesWatchersOfRemovedStreams) {
   DaemonProcess daemon;
   Session session = connect(daemon), other = connect(daemon);
   std::mutex mutex;
@@ -145,7 +145,7 @@ TEST(Restart, TellsWatchersWhatIsGone) {
   EXPECT_EQ(seen, (std::vector<std::string>{"+kept", "+gone", "-gone", "+marker"}));
 }
 
-TEST(Restart, FailsRequestsInWordsWhileTheDaemonIsAway) {
+TEST(Restart, FailsRequestsWithAReasonWhileTheDaemonIsDown) {
   DaemonProcess daemon;
   Session session = connect(daemon);
   Writer<Numbered> writer = session.create<Numbered>("s", History{16, 1ms}).value();

@@ -115,7 +115,7 @@ class ChronydTest : public testing::Test, protected ClockWatch::Observer {
  protected:
   EventLoop loop = EventLoop::open().value();
   LogRecorder logger;
-  int looks = 0;
+  int clock_events = 0;
   std::unique_ptr<ClockWatch> watch;
 
   void SetUp() override {
@@ -124,7 +124,7 @@ class ChronydTest : public testing::Test, protected ClockWatch::Observer {
     }
     if (::geteuid() != 0) GTEST_SKIP() << "chronyd runs as root only";
   }
-  void on_clock() override { ++looks; }
+  void on_clock() override { ++clock_events; }
 
   void follow(const Chronyd& chronyd) {
     // Both clocks tick as one here, so that what they add to the bound is nothing.
@@ -171,7 +171,7 @@ void expect_printed(Duration ours, double a, double b) {
   EXPECT_LE(static_cast<double>(ours.count()), most + (most > 0 ? slack(most) : 0.6));
 }
 
-TEST_F(ChronydTest, SaysWhatChronycPrints) {
+TEST_F(ChronydTest, ReportsWhatChronycPrints) {
   const std::uint16_t ntp_port = free_port();
   const Chronyd reference("local stratum 10\nallow 127.0.0.1\nbindaddress 127.0.0.1\nport " +
                           std::to_string(ntp_port) + "\n");
@@ -224,14 +224,14 @@ TEST_F(ChronydTest, TakesTheLocalModeForRightByDefinition) {
   EXPECT_EQ(watch->state().bound, 250'000'015ns);
 }
 
-TEST_F(ChronydTest, KnowsWithOneQuestionThatItIsGoneAndRecovers) {
+TEST_F(ChronydTest, IsFoundMissingByOneRequestAndRecovers) {
   Chronyd chronyd("local stratum 10\nport 0\n");
   follow(chronyd);
   until([&] { return watch->state().status == ClockStatus::synchronized; });
   for (int i = 0; i < 2; ++i) {
     chronyd.kill();
-    looks = 0;
-    until([&] { return looks == 1; });
+    clock_events = 0;
+    until([&] { return clock_events == 1; });
     EXPECT_EQ(watch->state().status, ClockStatus::out_of_bounds);
     EXPECT_EQ(watch->state().reason, ClockReason::no_chronyd);
     EXPECT_EQ(watch->state().bound, kUnknownClockError);
@@ -240,7 +240,7 @@ TEST_F(ChronydTest, KnowsWithOneQuestionThatItIsGoneAndRecovers) {
   }
 }
 
-TEST_F(ChronydTest, IsSilentWhileItIsStopped) {
+TEST_F(ChronydTest, DoesNotAnswerWhileItIsStopped) {
   const Chronyd chronyd("local stratum 10\nport 0\n");
   follow(chronyd);
   until([&] { return watch->state().status == ClockStatus::synchronized; });

@@ -43,7 +43,7 @@ class BadClient : public testing::Test {
   int descriptors_ = open_descriptors(daemon_.pid());
 };
 
-TEST_F(BadClient, ThatSendsGarbageIsToldSo) {
+TEST_F(BadClient, ThatSendsGarbageGetsAnError) {
   RawClient http(daemon_.socket_path(), false);
   http.send_bytes("\x05HELLO");
   EXPECT_NE(final_failure(http).find("not a request of DSSM's local protocol"), std::string::npos);
@@ -67,7 +67,7 @@ TEST_F(BadClient, ThatSendsRandomBytesCostsOnlyItself) {
   }
 }
 
-TEST_F(BadClient, ThatComesFromTheFutureIsToldBothVersions) {
+TEST_F(BadClient, OfALaterVersionIsRefusedNamingBothVersions) {
   RawClient client(daemon_.socket_path(), false);
   local::Request hello;
   hello.mutable_hello()->set_protocol_version(1000);
@@ -83,13 +83,13 @@ TEST_F(BadClient, ThatAnnouncesAnEndlessFrameIsRefusedBeforeItSendsOne) {
   EXPECT_NE(final_failure(client).find("4294967295 bytes"), std::string::npos);
 }
 
-TEST_F(BadClient, ThatAsksBeforeHelloIsToldTheOrder) {
+TEST_F(BadClient, ThatRequestsBeforeHelloGetsAnErrorThatNamesHello) {
   RawClient client(daemon_.socket_path(), false);
   client.send(list_request());
   EXPECT_NE(final_failure(client).find("Hello"), std::string::npos);
 }
 
-TEST_F(BadClient, ThatAsksForSomethingUnknownIsAnsweredAndServedOn) {
+TEST_F(BadClient, ThatSendsAnUnknownRequestIsAnsweredAndStaysConnected) {
   RawClient client(daemon_.socket_path());
   EXPECT_EQ(client.ask({}).response.failure().code(), "protocol");
   EXPECT_TRUE(client.ask(list_request()).response.has_stream_list());
@@ -119,7 +119,7 @@ TEST_F(BadClient, ThatSendsTooManyDescriptorsAtOnceIsRefused) {
   ::close(null);
 }
 
-TEST_F(BadClient, ThatKeepsSendingDescriptorsNobodyAskedForIsRefused) {
+TEST_F(BadClient, ThatKeepsSendingUnrequestedDescriptorsIsRefused) {
   RawClient client(daemon_.socket_path());
   const int null = ::open("/dev/null", O_RDWR | O_CLOEXEC);
   const std::vector<int> some(16, null);
@@ -149,7 +149,7 @@ TEST_F(BadClient, ThatDoesNotReadIsClosedAtTheLimit) {
   EXPECT_TRUE(good_.ask(remove).response.has_done());
 }
 
-TEST_F(BadClient, ThatAsksWithoutPauseDoesNotKeepOthersWaiting) {
+TEST_F(BadClient, ThatRequestsWithoutPauseDoesNotDelayOthers) {
   RawClient busy(daemon_.socket_path());
   std::string many;
   local::Request list = list_request();
@@ -181,7 +181,7 @@ TEST_F(BadClient, ThatStopsInTheMiddleOfAFrameIsNotMissed) {
 }
 
 // stderr is a pipe that nobody reads: neither dssmd's own lines nor a library's may wait for it.
-TEST(BadClients, DoNotStopADssmdWhoseLogNobodyReads) {
+TEST(BadClients, DoNotStopADssmdWhoseLogIsNotRead) {
   const std::string dir = make_temp_dir(), path = dir + "/dssmd.sock";
   int ends[2];
   ASSERT_EQ(::pipe2(ends, O_CLOEXEC), 0);

@@ -73,7 +73,7 @@ TEST(KilledClient, LeavesNothingInDssmdWheneverItIsKilled) {
   }
 }
 
-TEST(KilledClient, DoesNotDisturbThoseWhoWatch) {
+TEST(KilledClient, DoesNotDisturbWatchers) {
   DaemonProcess daemon({"--log-level", "error"});
   RawClient watcher(daemon.socket_path()), creator(daemon.socket_path());
   local::Request watch;

@@ -68,7 +68,7 @@ TEST_F(EarlyRequest, ToStopEndsItAsAtAnyTime) {
   }
 }
 
-TEST_F(EarlyRequest, ToReadItsConfigurationAnewDoesNotEndIt) {
+TEST_F(EarlyRequest, ToReloadItsConfigurationDoesNotEndIt) {
   for (int i = 0; i < kTries; ++i) ASSERT_EQ(start_and_send({SIGHUP, SIGTERM}), 0);
 }
 

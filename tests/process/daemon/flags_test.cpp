@@ -62,7 +62,7 @@ TEST(Flags, FailWithOneWhereTheFolderCannotBe) {
   EXPECT_NE(finished.err.find("'/nowhere/at/all'"), std::string::npos) << finished.err;
 }
 
-TEST(Start, TellsThatItIsReadyWithHostAndSocket) {
+TEST(Start, ReportsThatItIsReadyWithHostAndSocket) {
   const std::string dir = make_temp_dir();
   int ends[2];
   ASSERT_EQ(::pipe2(ends, O_CLOEXEC), 0);

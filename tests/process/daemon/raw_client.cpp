@@ -16,9 +16,9 @@ RawClient::RawClient(const std::string& socket_path, bool greet, const std::stri
   EXPECT_TRUE(connected) << connected.error().message;
   if (!connected) return;
   socket_ = *std::move(connected);
-  const timeval patience{kPatienceSeconds, 0};
-  ::setsockopt(socket_.get(), SOL_SOCKET, SO_RCVTIMEO, &patience, sizeof patience);
-  ::setsockopt(socket_.get(), SOL_SOCKET, SO_SNDTIMEO, &patience, sizeof patience);
+  const timeval timeout{kTimeoutSeconds, 0};
+  ::setsockopt(socket_.get(), SOL_SOCKET, SO_RCVTIMEO, &timeout, sizeof timeout);
+  ::setsockopt(socket_.get(), SOL_SOCKET, SO_SNDTIMEO, &timeout, sizeof timeout);
   if (!greet) return;
   local::Request hello;
   hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);

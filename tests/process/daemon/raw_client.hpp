@@ -2,7 +2,7 @@
 //
 // A program that speaks the local protocol by hand: the tests of dssmd use no client library, so
 // that they can do what none would. Blocking; a dssmd that does not answer ends the test after
-// kPatience.
+// kTimeoutSeconds.
 #pragma once
 
 #include <dssm/stream.hpp>
@@ -20,7 +20,7 @@
 
 namespace dssm::test {
 
-inline constexpr int kPatienceSeconds = 60;
+inline constexpr int kTimeoutSeconds = 60;
 
 struct Answer {
   local::Response response;
@@ -70,13 +70,13 @@ std::vector<int> numbers(const std::vector<UniqueFd>& descriptors);
 int open_descriptors(pid_t pid);
 
 // Asks again and again until `done` is true; for what happens soon, but not as an answer. Returns
-// false when it did not happen in kPatienceSeconds.
+// false when it did not happen in kTimeoutSeconds.
 template <class Done>
 bool eventually(Done done) {
-  const MonoTime deadline = deadline_in(std::chrono::seconds(kPatienceSeconds));
+  const MonoTime deadline = deadline_in(std::chrono::seconds(kTimeoutSeconds));
   while (!done()) {
     if (MonoClock::now() > deadline) return false;
-    std::this_thread::sleep_for(kLookPause);
+    std::this_thread::sleep_for(kPollPause);
   }
   return true;
 }

@@ -53,7 +53,7 @@ TEST(Socket, LetsOnlyMembersOfItsGroupIn) {
   EXPECT_EQ(connect_as_nobody(daemon.socket_path(), {number}), 0);
 }
 
-TEST(Socket, TellsWhoIsConnected) {
+TEST(Socket, ListsItsClients) {
   DaemonProcess daemon;
   RawClient client(daemon.socket_path(), true, "mapper");
   const local::Response list = client.ask(list_clients_request()).response;

@@ -110,19 +110,19 @@ TEST_F(Addresses, MakeOneHostOfAPcWithCableAndWifiAndOneOfThemIsEnough) {
   }
 }
 
-TEST_F(Addresses, LoseAndFindAHostWhoseInterfaceIsDeletedAndMadeAnew) {
+TEST_F(Addresses, LoseAndFindAHostWhoseInterfaceIsRecreated) {
   if (!make(2, kEverywhere)) GTEST_SKIP() << why_;
   expect_that_eth0_may_go_and_come();
 }
 
-TEST_F(Addresses, LoseAndFindAHostWhoseChosenInterfaceIsDeletedAndMadeAnew) {
+TEST_F(Addresses, LoseAndFindAHostWhoseChosenInterfaceIsRecreated) {
   Flags flags = kEverywhere;
   flags.insert(flags.end(), {"--interface", "eth*"});
   if (!make(2, flags)) GTEST_SKIP() << why_;
   expect_that_eth0_may_go_and_come();
 }
 
-TEST_F(Addresses, FindAHostBehindAnInterfaceThatComesLater) {
+TEST_F(Addresses, FindAHostOnAnInterfaceThatIsAddedLater) {
   if (!possible(open_without_avahi(2))) GTEST_SKIP() << why_;
   network().configure(2, "link del eth0\n");
   for (int pc = 1; pc <= 2; ++pc) start_avahi(pc), add_dssmd(kEverywhere);

@@ -175,7 +175,7 @@ TEST_F(MdnsNeedsRoot, AnnouncesAndFindsAllAgainWhenAvahiWasKilledAndStarted) {
   EXPECT_TRUE(seen.starts_with("port 7000\n")) << seen;
 }
 
-TEST_F(MdnsNeedsRoot, WaitsForDBusAndAvahiAndSaysSoOnce) {
+TEST_F(MdnsNeedsRoot, WaitsForDBusAndAvahiAndLogsItOnce) {
   if (!make({"pc1", "pc2"}, false)) GTEST_SKIP() << why_;
   pc(2).start_dbus();
   pc(2).start_avahi();
@@ -229,7 +229,7 @@ TEST_F(MdnsNeedsRoot, UsesOnlyTheInterfacesThatAreConfigured) {
   EXPECT_FALSE(avoiding.hosts().contains(2));
 }
 
-TEST_F(MdnsNeedsRoot, WithholdsWhatIsBeyondAvahisLimitsAndSaysSoOnce) {
+TEST_F(MdnsNeedsRoot, WithholdsWhatIsBeyondAvahisLimitsAndLogsItOnce) {
   if (!make({"pc1", "pc2"})) GTEST_SKIP() << why_;
   Probe one(pc(1), 1, "pc1", {"pause=0"});
   one.command("many 800");
@@ -242,7 +242,7 @@ TEST_F(MdnsNeedsRoot, WithholdsWhatIsBeyondAvahisLimitsAndSaysSoOnce) {
   EXPECT_EQ(one.count("log 4 mDNS: "), 1);
 }
 
-TEST_F(MdnsNeedsRoot, HostileRecordsHarmNobody) {
+TEST_F(MdnsNeedsRoot, HostileRecordsHarmNoHost) {
   if (!make({"pc1", "pc2", "pc3"})) GTEST_SKIP() << why_;
   const std::string type = "_host:._sub._dssm._tcp";
   Probe three(pc(3), 3, "pc3");  // a good one in bad company

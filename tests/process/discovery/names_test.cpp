@@ -102,7 +102,7 @@ TEST_F(Names, OfADssmdMayChangeWithItsRestart) {
 
 // As after the disk of one PC was copied to another: machine id and name are the same. (All PCs of
 // a test have this machine's id.)
-TEST_F(Names, OfACopiedPcAreToldOnBothAndMendedByAnotherName) {
+TEST_F(Names, OfACopiedPcAreReportedOnBothAndFixedByAnotherName) {
   if (!possible(open(2))) GTEST_SKIP() << why_;
   add_dssmd();
   add_dssmd({}, "pc1");
@@ -133,7 +133,7 @@ TEST_F(Names, OfACopiedPcAreToldOnBothAndMendedByAnotherName) {
   EXPECT_FALSE(says(doctor(1), "machine-id"));
 }
 
-TEST_F(Names, OfASecondDssmdOfThisPcAreToldToo) {
+TEST_F(Names, OfASecondDssmdOfThisPcAreReportedToo) {
   if (!possible(open(1))) GTEST_SKIP() << why_;
   add_dssmd();
   const auto second = make_dssmd(1, "pc1");

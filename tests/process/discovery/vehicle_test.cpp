@@ -34,7 +34,7 @@ TEST_F(Vehicle, ListsEveryStreamOfEveryPcWithNothingConfigured) {
   }
 }
 
-TEST_F(Vehicle, LosesAHostThatFallsSilentAndFindsItAgain) {
+TEST_F(Vehicle, LosesAHostThatStopsAnsweringAndFindsItAgain) {
   if (!make(2)) GTEST_SKIP() << why_;
   await_all_up();
   const StreamId id{"kept", 0, "pc2"};
@@ -66,7 +66,7 @@ TEST_F(Vehicle, FindsADssmdThatWasKilledAndOneThatIsNew) {
   await("it is back", [&] { return is_up(session(1), "pc2"); });
 }
 
-TEST_F(Vehicle, KeepsWhatItKnowsWhenAvahiDiesAndFindsNewHostsWhenItIsBack) {
+TEST_F(Vehicle, KeepsItsHostsWhenAvahiDiesAndFindsNewOnesAfterItsRestart) {
   if (!make(3)) GTEST_SKIP() << why_;
   await_all_up();
   for (int pc = 1; pc <= 3; ++pc) avahi(pc).kill_avahi();

@@ -40,7 +40,7 @@ TEST_F(Clock, HasARowForEachHostThatIsThere) {
   EXPECT_TRUE(contains(lines[1], "no chronyd")) << lines[1];
 }
 
-TEST_F(Clock, IsWaitedForAndSaysWhyInVain) {
+TEST_F(Clock, IsWaitedForAndReportsWhyItFailed) {
   clocks();
   const Finished finished = ctl({"clock", "--wait", "0"});
   EXPECT_EQ(finished.exit_status, 1);
@@ -57,7 +57,7 @@ TEST_F(Clock, IsTabulatedWithHowOftenItWasNotKnown) {
   EXPECT_EQ(table[0]["unknown"], 2);
 }
 
-TEST_F(Clock, IsShownAnewAsLongAsSomebodyLooks) {
+TEST_F(Clock, IsRefreshedUntilItIsInterrupted) {
   Running watch({dssmctl_path(), "clock", "--watch", "--json"}, {daemon_.environment()});
   for (int i = 0; i < 2; ++i) EXPECT_EQ(Json::parse(watch.line())["clocks"].size(), 3U);
   watch.signal(SIGINT);

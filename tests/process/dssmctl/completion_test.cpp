@@ -77,7 +77,7 @@ TEST_F(Completion, OffersStreamNamesWhereAStreamBelongs) {
   EXPECT_EQ(offered({"create", ""}), Strings{});
 }
 
-TEST_F(Completion, CompletesBehindColonsAtWhichBashSplitsWords) {
+TEST_F(Completion, CompletesAfterColonsAtWhichBashSplitsWords) {
   for (const char* name : {"lidar", "lidar:1", "lidar:12"}) create(name);
   EXPECT_EQ(offered({"echo", "lidar", ":"}), (Strings{"1", "12"}));
   EXPECT_EQ(offered({"echo", "lidar", ":", "12"}), Strings{"12"});
@@ -90,7 +90,7 @@ TEST_F(CompletionInAFleet, OffersTheNamesThatOpenOtherHostsStreams) {
   EXPECT_EQ(offered({"echo", "lid"}), (Strings{"lidar@pc2", "lidar@pc3"}));
 }
 
-TEST_F(CompletionInAFleet, OffersHostsBehindAnAtSignAtWhichBashSplitsWords) {
+TEST_F(CompletionInAFleet, OffersHostsAfterAnAtSignAtWhichBashSplitsWords) {
   create("imu:1@pc3");
   await_streams(1);
   EXPECT_EQ(offered({"echo", "imu", ":", "1", "@"}), (Strings{"pc1", "pc2", "pc3"}));
@@ -112,7 +112,7 @@ TEST_F(Completion, QuotesNamesForTheShell) {
   EXPECT_EQ(offered({"echo", "a\\ n"}), Strings{"a\\ name"});
 }
 
-TEST_F(Completion, AsksTheDaemonThatTheCommandLineNames) {
+TEST_F(Completion, UsesTheDaemonThatTheCommandLineNames) {
   create("here");
   DaemonProcess other;
   const Strings none = offered({"--socket", other.socket_path(), "echo", ""});

@@ -53,7 +53,7 @@ TEST_F(Doctor, FindsAHealthyDssmdAndSucceeds) {
   EXPECT_TRUE(lines[0].starts_with("OK    daemon: dssmd (pid ")) << lines[0];
 }
 
-TEST_F(Doctor, SaysWhatToDoWithoutADssmd) {
+TEST_F(Doctor, ReportsWhatToDoWithoutADssmd) {
   daemon_.kill_hard();
   const Finished finished = ctl({"doctor"});
   EXPECT_EQ(finished.exit_status, 1);
@@ -67,7 +67,7 @@ TEST_F(Doctor, SaysWhatToDoWithoutADssmd) {
   EXPECT_EQ(check(doctor(), "daemon")["status"], "fail");
 }
 
-TEST_F(Doctor, TellsAFileFromASocket) {
+TEST_F(Doctor, DistinguishesAFileFromASocket) {
   const std::string file = daemon_.runtime_dir() + "/no-socket";
   std::ofstream(file) << "x";
   const Json daemon = check(doctor({"--socket", file}), "daemon");
@@ -77,7 +77,7 @@ TEST_F(Doctor, TellsAFileFromASocket) {
   EXPECT_TRUE(contains(nothing["command"], "unset DSSM_SOCKET")) << nothing;
 }
 
-TEST_F(Doctor, AsksChronyc) {
+TEST_F(Doctor, RunsChronyc) {
   const std::string folder = daemon_.runtime_dir() + "/bin";
   ASSERT_EQ(::mkdir(folder.c_str(), 0755), 0);
   std::ofstream(folder + "/chronyc") << "#!/bin/sh\n[ \"$*\" = '-c tracking' ] || exit 9\n"

@@ -125,7 +125,7 @@ TEST_F(Echo, FailsWhereTheRingHoldsNothing) {
   EXPECT_NE(finished.err.find("from 100.000000000 on"), std::string::npos) << finished.err;
 }
 
-TEST_F(Echo, GoesOnAfterATimeWithSamplesThatAreStillToCome) {
+TEST_F(Echo, ContinuesAfterATimeWithLaterSamples) {
   write(0, 3);
   Running echo(argv({"echo", "s", "--at", "102", "--count", "4", "--field", "number", "--csv"}),
                environment());

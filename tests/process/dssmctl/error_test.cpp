@@ -22,7 +22,7 @@ const std::vector<std::vector<std::string>> kVerbsThatAsk = {
     {"property", "set", "s"},
     {"playback"}};
 
-TEST(Dssmctl, SaysWhereNobodyListensAndWhatToDo) {
+TEST(Dssmctl, ReportsWhereNoDssmdListensAndWhatToDo) {
   const std::string socket = make_temp_dir() + "/nobody";
   for (std::vector<std::string> words : kVerbsThatAsk) {
     words.insert(words.begin(), dssmctl_path());

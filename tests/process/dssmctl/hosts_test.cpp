@@ -43,7 +43,7 @@ TEST_F(Hosts, ShowsThisHostFirstAndHowTheOthersAreReached) {
   EXPECT_TRUE(lines[2].starts_with("pc2   up     " + pc2_.address())) << lines[2];
 }
 
-TEST_F(Hosts, IsASuccessThatSaysWhyAHostIsDown) {
+TEST_F(Hosts, SucceedsAndReportsWhyAHostIsDown) {
   pc3_.kill_hard();
   await_state("pc3", HostState::down);
   const std::string row = lines_of(output({"hosts"}))[3];
@@ -59,10 +59,10 @@ TEST_F(Hosts, IsASuccessThatSaysWhyAHostIsDown) {
 
 TEST_F(Hosts, GivesEachNameOnceToPrograms) {
   EXPECT_EQ(output({"hosts", "--names"}), "pc1\npc2\npc3\n");
-  const std::string nobody = pc3_.address();
+  const std::string closed = pc3_.address();
   pc3_.kill_hard();
   const std::string other_address = "localhost" + pc2_.address().substr(pc2_.address().find(':'));
-  DaemonProcess pc4({"--peer", pc2_.address(), "--peer", nobody, "--peer", other_address}, "pc4");
+  DaemonProcess pc4({"--peer", pc2_.address(), "--peer", closed, "--peer", other_address}, "pc4");
   Session session = session_with(pc4);
   const auto state = [&](std::size_t i) { return session.list_hosts().value()[i].state; };
   await([&] {
@@ -72,13 +72,13 @@ TEST_F(Hosts, GivesEachNameOnceToPrograms) {
   const Json hosts = json({"--socket", pc4.socket_path(), "hosts"})["hosts"];
   ASSERT_EQ(hosts.size(), 4U);
   EXPECT_TRUE(hosts[2]["host"].is_null());
-  EXPECT_EQ(hosts[2]["addresses"][0], nobody);
+  EXPECT_EQ(hosts[2]["addresses"][0], closed);
   // Whichever came first is in use.
   const Json& spare = hosts[1]["error"].is_null() ? hosts[3] : hosts[1];
   EXPECT_TRUE(contains(spare["error"].get<std::string>(), "same host as")) << hosts;
 }
 
-TEST_F(Ping, TellsEachAnswerAndTheirTimes) {
+TEST_F(Ping, PrintsEachAnswerAndAllTimes) {
   const Strings lines = lines_of(output({"ping", "pc2", "-c", "3", "-i", "0.01"}));
   ASSERT_EQ(lines.size(), 5U);
   for (std::size_t i = 0; i < 3; ++i) {
@@ -90,7 +90,7 @@ TEST_F(Ping, TellsEachAnswerAndTheirTimes) {
   EXPECT_TRUE(lines[4].starts_with("round trip min/avg/max/mdev: ")) << lines[4];
 }
 
-TEST_F(Ping, TellsProgramsTheSame) {
+TEST_F(Ping, PrintsTheSameAsJson) {
   const Strings lines = lines_of(output({"ping", "pc2", "-c", "2", "-i", "0.01", "--json"}));
   ASSERT_EQ(lines.size(), 3U);
   const Json first = Json::parse(lines[0]), second = Json::parse(lines[1]);
@@ -147,7 +147,7 @@ TEST_F(Ping, FailsWhenNothingAnswered) {
   EXPECT_TRUE(contains(finished.err, "'pc3' did not answer")) << finished.err;
 }
 
-TEST_F(Ping, GoesOnWhileTheHostIsAwayAndAfterItsReturn) {
+TEST_F(Ping, ContinuesWhileTheHostIsDownAndAfterwards) {
   Running ping(argv({"ping", "pc3", "-i", "0.01"}), environment());
   EXPECT_TRUE(ping.line().starts_with("answer from pc3"));
   pc3_.kill_hard();

@@ -55,7 +55,7 @@ TEST_F(Ls, ShowsWhatIsKnownOfEachStreamInAlignedColumns) {
   EXPECT_EQ(lines[1].find("Pose"), lines[0].find("TYPE"));
 }
 
-TEST_F(Ls, TellsProgramsTheSameWithUnits) {
+TEST_F(Ls, PrintsTheSameAsJsonWithUnits) {
   auto pose = session_.create<Pose>("pose:3", depth_of(8)).value();
   const Time last = WallClock::now();
   for (int i = 4; i >= 0; --i) pose.write({}, last - i * std::chrono::milliseconds(20));
@@ -171,7 +171,7 @@ TEST_F(Info, ShowsFieldsUsersAndSamples) {
   EXPECT_EQ(info["users"][0]["program"], "the test");
 }
 
-TEST_F(Info, TellsAboutTheDaemonWithoutAStream) {
+TEST_F(Info, DescribesTheDaemonWithoutAStream) {
   auto pose = session_.create<Pose>("pose", depth_of(8)).value();
   const Json info = json({"info"});
   EXPECT_EQ(info["host"], "pc1");

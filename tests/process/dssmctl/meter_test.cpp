@@ -45,14 +45,14 @@ TEST_F(Meter, HzPrintsTheNumbersForPeople) {
             "\tmin: 0.002000000 s max: 0.009000000 s std dev: 0.002000000 s window: 9\n");
 }
 
-TEST_F(Meter, HzLooksAtTheNewestSamplesOfItsWindow) {
+TEST_F(Meter, HzUsesTheNewestSamplesOfItsWindow) {
   write_at({0, 1000, 2000, 2010, 2020});
   const Json report = first_report({"hz", "s", "--window", "3"});
   EXPECT_EQ(report["intervals"], 2);
   EXPECT_DOUBLE_EQ(report["rate_hz"].get<double>(), 100);
 }
 
-TEST_F(Meter, HzKnowsNoRateWhereTheStampsDoNotMoveOn) {
+TEST_F(Meter, HzHasNoRateWhereTheStampsDoNotAdvance) {
   write_at({1000, 1000, 1000});
   EXPECT_TRUE(first_report({"hz", "s"})["rate_hz"].is_null());
   EXPECT_NE(output({"hz", "s", "-n", "1"}).find("average rate: unknown"), std::string::npos);
@@ -73,7 +73,7 @@ TEST_F(Meter, HzReportsAnEmptyStreamAfterAnInterval) {
   EXPECT_EQ(output({"hz", "s", "-n", "1", "-i", "0.01"}), "no samples yet\n");
 }
 
-TEST_F(Meter, HzSaysWhenNothingNewCame) {
+TEST_F(Meter, HzReportsThatNothingNewCame) {
   write_at({1000, 1010});
   const auto lines = lines_of(output({"hz", "s", "-n", "2", "-i", "0.01"}));
   ASSERT_EQ(lines.size(), 3U);

@@ -104,7 +104,7 @@ TEST_F(Remote, HzAndBwFollowFromTheOwnersStamps) {
   EXPECT_DOUBLE_EQ(json({"bw", "s@pc2", "--count", "1"})["bytes_per_second"].get<double>(), 8);
 }
 
-TEST_F(Remote, DelaySaysThatNobodyKnowsTheClocks) {
+TEST_F(Remote, DelayReportsThatTheClocksAreUnknown) {
   auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
   await_streams(1);
   Running delay(argv({"delay", "s@pc2", "--interval", "0.05"}), environment());
@@ -123,7 +123,7 @@ TEST_F(Remote, DelaySaysThatNobodyKnowsTheClocks) {
   EXPECT_TRUE(report["delay_error_ns"].is_null());
 }
 
-TEST_F(Remote, InfoTellsOwnerChannelsAndHowTheMirrorIsDoing) {
+TEST_F(Remote, InfoShowsOwnerChannelsAndTheMirrorsState) {
   auto writer = on_pc2_.create<double>("s", depth_of(16)).value();
   write(writer, 0, 9);
   await_streams(1);
@@ -210,7 +210,7 @@ TEST_F(Remote, EchoAndHzEndWhenTheOwnerRemovesTheStream) {
 }
 
 // The owner's dssmd comes back and gets the ring from the program that holds it.
-TEST_F(Remote, EchoGoesOnWhileTheOwnerIsAwayAndAfterItsReturn) {
+TEST_F(Remote, EchoContinuesWhileTheOwnerIsDownAndAfterwards) {
   auto writer = on_pc2_.create<double>("s", depth_of(10'000)).value();
   await_streams(1);
   Running echo(argv({"echo", "s", "--json"}), environment());
@@ -246,7 +246,7 @@ TEST_F(Remote, EchoAwaitsAHostThatDoesNotAnswer) {
 }
 
 // The same, but that program takes its time: meanwhile there is no such stream.
-TEST_F(Remote, EchoGoesOnWhenTheStreamComesBackLaterThanItsOwner) {
+TEST_F(Remote, EchoContinuesWhenTheStreamReturnsLaterThanItsOwner) {
   const std::vector<std::byte> payload(4);
   output({"--socket", pc2_.socket_path(), "create", "s", "--size", "4", "--depth", "100"});
   Running holder(argv({"--socket", pc2_.socket_path(), "echo", "s"}), environment());
@@ -279,7 +279,7 @@ TEST_F(Remote, EchoGoesOnWhenTheStreamComesBackLaterThanItsOwner) {
   }
 }
 
-TEST_F(Remote, FollowersGoOnWithTheNewRingOfAStreamThatBeganAnew) {
+TEST_F(Remote, FollowersContinueWithTheRingOfARecreatedStream) {
   auto writer = std::optional(on_pc2_.create<double>("s", depth_of(1000)).value());
   write(*writer, 0, 9);
   await_streams(1);

@@ -88,7 +88,7 @@ TEST_F(Stop, MeasuresOnceMoreWhenTheStreamIsRemoved) {
   EXPECT_EQ(hz.status(), 1);
 }
 
-TEST_F(Stop, GoesOnWithAStreamThatIsCreatedAnew) {
+TEST_F(Stop, ContinuesWithARecreatedStream) {
   ASSERT_TRUE(session_.remove(writer_.id()));
   writer_ = session_.create<double>("s", depth_of(1 << 20)).value();  // nobody is lapped
   writer_.write(1);
@@ -119,7 +119,7 @@ TEST_F(Stop, GoesOnWithAStreamThatIsCreatedAnew) {
   EXPECT_EQ(report["lost_samples"], 0);
 }
 
-TEST_F(Stop, FailsWhenTheStreamIsCreatedAnewAsSomethingElse) {
+TEST_F(Stop, FailsWhenTheStreamIsRecreatedWithAnotherType) {
   Running echo(argv({"echo", "s"}), environment());
   echo.line([&] { writer_.write(1); });
   ASSERT_TRUE(session_.remove(writer_.id()));
@@ -129,7 +129,7 @@ TEST_F(Stop, FailsWhenTheStreamIsCreatedAnewAsSomethingElse) {
   EXPECT_EQ(echo.status(), 1);
 }
 
-TEST_F(Stop, GoesOnWhileTheDaemonIsAwayAndAfterItsReturn) {
+TEST_F(Stop, ContinuesWhileTheDaemonIsDownAndAfterwards) {
   Running echo(argv({"echo", "s", "--json"}), environment());
   std::int64_t tid = Json::parse(echo.line([&] { writer_.write(1); }))["tid"];
   const auto follow = [&] {
@@ -152,7 +152,7 @@ TEST_F(Stop, GoesOnWhileTheDaemonIsAwayAndAfterItsReturn) {
 }
 
 // From its first sample on echo has all that it needs to go on without dssmd.
-TEST_F(Stop, GoesOnWhenTheDaemonGoesAwayWhileTheFirstSampleIsShown) {
+TEST_F(Stop, ContinuesWhenTheDaemonEndsWhileTheFirstSampleIsShown) {
   using Large = std::array<double, 1 << 14>;
   Writer<Large> writer = session_.create<Large>("large", depth_of(4)).value();
   writer.write(Large{});

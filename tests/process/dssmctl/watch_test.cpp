@@ -57,7 +57,7 @@ TEST_F(LsInAFleet, MarksStreamsThatSeveralHostsHave) {
   EXPECT_EQ(output({"ls", "--names", "--host", "pc2"}), "odom@pc2\n");
 }
 
-TEST_F(LsInAFleet, WatchTellsOfOtherHostsToo) {
+TEST_F(LsInAFleet, WatchShowsOtherHostsToo) {
   Running watch(argv({"ls", "--watch", "--host", "pc2"}), environment());
   auto on_3 = on_pc3_.create<double>("c", depth_of(4)).value();
   auto on_2 = on_pc2_.create<double>("b", depth_of(4)).value();
@@ -76,7 +76,7 @@ TEST_F(LsWatch, ShowsOnlyWhatFitsThePattern) {
   EXPECT_EQ(json({"ls", "nothing*"})["streams"].size(), 0U);
 }
 
-TEST_F(LsWatch, TellsWhatIsThereAndThenEachChange) {
+TEST_F(LsWatch, ShowsWhatIsThereAndThenEachChange) {
   output({"create", "first", "--size", "4", "--depth", "4", "--cycle", "0.01", "--type", "T"});
   Running watch(argv({"ls", "--watch"}), environment());
   EXPECT_EQ(watch.line(), "+ first:0@pc1 4 bytes, depth 4, cycle 10.0 ms, T");
@@ -89,7 +89,7 @@ TEST_F(LsWatch, TellsWhatIsThereAndThenEachChange) {
   EXPECT_EQ(watch.status(), 0);
 }
 
-TEST_F(LsWatch, TellsProgramsOneObjectPerLine) {
+TEST_F(LsWatch, PrintsOneJsonObjectPerLine) {
   Running watch(argv({"ls", "--watch", "--json", "l*"}), environment());
   output({"create", "odom", "--size", "4", "--depth", "4"});
   output({"create", "lidar", "--size", "4", "--depth", "4"});
@@ -106,7 +106,7 @@ TEST_F(LsWatch, TellsProgramsOneObjectPerLine) {
   EXPECT_EQ(watch.status(), 0);
 }
 
-TEST_F(LsWatch, TellsAfterARestartOfDssmdOnlyWhatHasChanged) {
+TEST_F(LsWatch, ShowsAfterARestartOfDssmdOnlyWhatHasChanged) {
   auto kept = session_.create<double>("kept", depth_of(4)).value();
   output({"create", "orphan", "--size", "4", "--depth", "4"});
   Running watch(argv({"ls", "--watch"}), environment());
@@ -130,7 +130,7 @@ TEST_F(LsWatch, TellsAfterARestartOfDssmdOnlyWhatHasChanged) {
   await_there({"kept:0@pc1", "last:0@pc1"});
 }
 
-TEST_F(LsWatch, TellsThatAStreamWasCreatedAnewWhileItDidNotLook) {
+TEST_F(LsWatch, ShowsThatAStreamWasRecreatedWhileItWasDisconnected) {
   output({"create", "s", "--size", "4", "--depth", "4"});
   Running watch(argv({"ls", "--watch"}), environment());
   EXPECT_TRUE(watch.line().starts_with("+ s:0@pc1 4 bytes"));

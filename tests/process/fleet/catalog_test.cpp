@@ -57,7 +57,7 @@ TEST_F(FleetCatalog, IsAnsweredWithWhatIsKnownWhenAHostHangs) {
   await_list(on1, {"lidar:0@pc2", "imu:0@pc3"});
 }
 
-TEST_F(FleetCatalog, TellsWatchersWhatComesAndGoesAnywhere) {
+TEST_F(FleetCatalog, NotifiesWatchersOfAddedAndRemovedStreamsOfAllHosts) {
   std::mutex mutex;
   std::condition_variable changed;
   Strings seen;
@@ -114,7 +114,7 @@ TEST_F(FleetCatalog, OpensWhatANameMeans) {
   EXPECT_EQ(value("lidar@pc2"), 2);
 }
 
-TEST_F(FleetCatalog, SaysWhereItLookedAndWhoDoesNotAnswer) {
+TEST_F(FleetCatalog, ReportsWhereItSearchedAndWhichHostsDoNotAnswer) {
   auto nowhere = on1.open_reader<double>("gps");
   ASSERT_FALSE(nowhere);
   EXPECT_EQ(nowhere.error().code, Errc::not_found);
@@ -230,7 +230,7 @@ TEST_F(FleetCatalog, LetsReadersFollowAStreamThatMoves) {
 }
 
 // Its history is here, and goes on being here while its owner is away.
-TEST_F(FleetCatalog, KeepsTheMirrorOfAnOwnerThatIsAway) {
+TEST_F(FleetCatalog, KeepsTheMirrorOfAnUnavailableOwner) {
   {
     auto two = on2.create<double>("lidar", kHistory).value();
     two.write(2);

@@ -65,7 +65,7 @@ TEST(FleetPeers, AreDownWhenKilledAndComeBackByThemselves) {
   }
 }
 
-TEST(FleetPeers, AreDownWhenTheyHangAndComeBackWhenTheyGoOn) {
+TEST(FleetPeers, AreDownWhileTheyHangAndUpAfterwards) {
   DaemonProcess pc2({}, "pc2");
   const DaemonProcess pc1({"--peer", pc2.address()});
   Session on1 = connect(pc1), on2 = connect(pc2);

@@ -83,7 +83,7 @@ TEST_F(TwoHosts, LoseNothingWhenTheOwnersDaemonHangs) {
   EXPECT_EQ(reader.lost_samples(), 0u);
 }
 
-TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsAway) {
+TEST_F(TwoHosts, KeepTheHistoryWhileTheOwnerIsUnavailable) {
   auto writer = here.create<Numbered>("kept", kLong).value();
   for (int i = 0; i < 100; ++i) writer.write(numbered(i));
   auto reader = open_filled<Numbered>(there, "kept");
@@ -127,7 +127,7 @@ TEST_F(TwoHosts, CountExactlyWhatTheOwnersRingLostMeanwhile) {
 }
 
 // Its rings died with it: nobody held them.
-TEST_F(TwoHosts, TellReadersThatTheOwnerCameBackWithoutItsRing) {
+TEST_F(TwoHosts, NotifyReadersThatTheOwnerRestartedWithoutItsRing) {
   auto reader = [&] {
     Session brief = connect(pc1);
     auto writer = brief.create<Numbered>("reborn", kLong).value();
@@ -182,7 +182,7 @@ TEST_F(TwoHosts, FindEachOtherAgainWhenBothDaemonsAreKilled) {
 
 // Somebody opens the stream before the program that holds its mirror has offered that: there is a
 // new mirror then, and the program goes on with it, at the very sample it was.
-TEST_F(TwoHosts, GoOnWithAMirrorThatWasMadeMeanwhile) {
+TEST_F(TwoHosts, ContinueWithAMirrorThatWasMadeMeanwhile) {
   auto writer = here.create<Numbered>("load", kLong).value();
   int lines[2];
   ASSERT_EQ(::pipe2(lines, O_CLOEXEC), 0);

@@ -120,7 +120,7 @@ TEST_F(LingeringHosts, CloseTheChannelOfReadersThatDied) {
   await([&] { return channels("imu") == 0; });
 }
 
-TEST_F(TwoHosts, FollowAStreamThatIsRemovedAndCreatedAnew) {
+TEST_F(TwoHosts, FollowAStreamThatIsRecreated) {
   std::optional<Writer<Numbered>> writer = here.create<Numbered>("anew", History{64, 1ms}).value();
   for (int i = 0; i < 5; ++i) writer->write(numbered(i));
   auto reader = open_filled<Numbered>(there, "anew");

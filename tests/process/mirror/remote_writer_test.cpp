@@ -34,7 +34,7 @@ TEST_F(RemoteWriter, CreatesTheStreamAndWritesWithTheOwnersTids) {
   EXPECT_EQ(names(there.list_own_streams().value()), std::vector<std::string>{});
 }
 
-TEST_F(RemoteWriter, GoesOnWithTheTidsOfAStreamThatIsThere) {
+TEST_F(RemoteWriter, ContinuesTheTidsOfAnExistingStream) {
   auto first = here.create<Numbered>("goal", kLong).value();
   for (int i = 0; i < 7; ++i) first.write(numbered(i));
   auto writer = there.open_writer<Numbered>("goal@pc1").value();
@@ -53,7 +53,7 @@ TEST_F(RemoteWriter, IsReadOnItsOwnPcAsOnAnyOther) {
   EXPECT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
 }
 
-TEST_F(RemoteWriter, IsRefusedInWords) {
+TEST_F(RemoteWriter, IsRefusedWithAReason) {
   auto other = here.create<double>("goal", kLong).value();
   const auto mismatch = there.create<Numbered>("goal@pc1", kLong);
   ASSERT_FALSE(mismatch);

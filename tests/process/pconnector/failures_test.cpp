@@ -84,7 +84,7 @@ void expect_words(const Error& error, Errc code, const std::vector<std::string>&
 
 // --- opening
 
-TEST(PConnectorOpen, SaysThatNobodyListens) {
+TEST(PConnectorOpen, ReportsThatNoProcessListens) {
   // A port that was ours a moment ago.
   std::string address;
   {
@@ -97,7 +97,7 @@ TEST(PConnectorOpen, SaysThatNobodyListens) {
   expect_words(con.error(), Errc::no_daemon, {"lidar:1", address, "refused", "dssmd"});
 }
 
-TEST(PConnectorOpen, RefusesWhatIsNoAddressNameOrType) {
+TEST(PConnectorOpen, RefusesInvalidAddressesNamesAndTypes) {
   const auto port = PConnector::open({"lidar", 0, {}}, {.address = "127.0.0.1:99999"});
   expect_words(port.error(), Errc::invalid_argument, {"99999"});
   const auto name = PConnector::open({"li:dar", 0, {}}, {.address = "127.0.0.1"});
@@ -119,7 +119,7 @@ TEST(PConnectorOpen, TakesThePortFromTheEnvironment) {
   expect_words(bad.error(), Errc::invalid_argument, {"DSSM_PORT", "many"});
 }
 
-TEST(PConnectorOpen, PassesOnWhyDssmdRefuses) {
+TEST(PConnectorOpen, ReportsWhyDssmdRefuses) {
   const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
     peer.try_receive();
     peer.send(failure_frame(Errc::limit_exceeded, "256 connections are the limit"));
@@ -130,7 +130,7 @@ TEST(PConnectorOpen, PassesOnWhyDssmdRefuses) {
                {"lidar", daemon.address(), "256 connections are the limit"});
 }
 
-TEST(PConnectorOpen, SaysThatThereIsNoSuchStream) {
+TEST(PConnectorOpen, ReportsThatThereIsNoSuchStream) {
   const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
     peer.answer_hello();
     peer.refuse(Errc::not_found, "no stream 'lidar:0' on host 'fake'");
@@ -150,7 +150,7 @@ TEST(PConnectorOpen, NamesBothTypesWhenTheyDiffer) {
   EXPECT_TRUE(open(daemon, &same));
 }
 
-TEST(PConnectorOpen, RefusesAnotherVersionInWords) {
+TEST(PConnectorOpen, RefusesAnotherVersionNamingBoth) {
   const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
     peer.try_receive();
     wire::Greeting greeting = greeting_of("future");
@@ -163,7 +163,7 @@ TEST(PConnectorOpen, RefusesAnotherVersionInWords) {
   expect_words(con.error(), Errc::protocol, {daemon.address(), "version 9", "version 1", "7.7"});
 }
 
-TEST(PConnectorOpen, SaysThatGarbageIsNoDssmd) {
+TEST(PConnectorOpen, ReportsThatGarbageDoesNotComeFromADssmd) {
   for (const std::string& bytes : std::vector<std::string>{
            "HTTP/1.1 400 Bad Request\r\nContent-Type: text/plain; charset=utf-8\r\n\r\n400 Bad "
            "Request",
@@ -180,14 +180,14 @@ TEST(PConnectorOpen, SaysThatGarbageIsNoDssmd) {
   }
 }
 
-TEST(PConnectorOpen, SaysThatTheConnectionWasClosed) {
+TEST(PConnectorOpen, ReportsThatTheConnectionWasClosed) {
   const ScriptedDaemon daemon([](NetworkPeer&, int) {});
   const auto con = open(daemon);
   ASSERT_FALSE(con);
   expect_words(con.error(), Errc::unavailable, {daemon.address(), "closed"});
 }
 
-TEST(PConnectorOpen, RefusesADescriptionThatCannotBe) {
+TEST(PConnectorOpen, RefusesAnInvalidDescription) {
   const ScriptedDaemon daemon([](NetworkPeer& peer, int number) {
     peer.answer_open(number == 0 ? (65ULL << 20) : 0);
     peer.await_end();
@@ -199,7 +199,7 @@ TEST(PConnectorOpen, RefusesADescriptionThatCannotBe) {
   }
 }
 
-TEST(PConnectorOpen, ASilentDssmdCostsTheRequestTimeout) {
+TEST(PConnectorOpen, ADssmdThatDoesNotAnswerCostsTheRequestTimeout) {
   const ScriptedDaemon daemon([](NetworkPeer& peer, int) { peer.await_end(); });
   const auto con =
       PConnector::open({"lidar", 0, {}}, {.address = daemon.address(), .request_timeout = 200ms});
@@ -229,7 +229,7 @@ void answer_reads(NetworkPeer& peer) {
   }
 }
 
-TEST(PConnectorRequest, IsAskedAgainOnANewConnection) {
+TEST(PConnectorRequest, IsRepeatedOnANewConnection) {
   std::atomic<int> asked = 0;
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     peer.answer_open(8);
@@ -282,7 +282,7 @@ TEST(PConnectorRequest, RefusesSamplesOfAnotherSize) {
   expect_words(bad.error(), Errc::protocol, {"9"});
 }
 
-TEST(PConnectorRequest, AsksAgainForATornSample) {
+TEST(PConnectorRequest, RequestsATornSampleAgain) {
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
     peer.answer_open(8);
     auto request = peer.try_receive();
@@ -297,7 +297,7 @@ TEST(PConnectorRequest, AsksAgainForATornSample) {
   EXPECT_EQ(sample.info.tid, 5);
 }
 
-TEST(PConnectorRequest, TellsDaemonAwayWhenItStaysAway) {
+TEST(PConnectorRequest, FailsWithUnavailableWhileDssmdStaysDown) {
   auto daemon =
       std::make_unique<ScriptedDaemon>([](NetworkPeer& peer, int) { peer.answer_open(8); });
   auto con = open_impatient(*daemon, 300ms);
@@ -310,7 +310,7 @@ TEST(PConnectorRequest, TellsDaemonAwayWhenItStaysAway) {
   EXPECT_FALSE(con.is_connected());
 }
 
-TEST(PConnectorRequest, TellsOnceThatTheStreamBeganAnew) {
+TEST(PConnectorRequest, ReportsOnceThatTheStreamWasRecreated) {
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     peer.answer_open(8, number == 0 ? 1 : 2);
     if (number == 0) {
@@ -329,7 +329,7 @@ TEST(PConnectorRequest, TellsOnceThatTheStreamBeganAnew) {
   EXPECT_EQ(con.read_tid(5, sample.span(), sample.info).value(), ReadStatus::ok);
 }
 
-TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
+TEST(PConnectorRequest, RefusesAStreamThatWasRecreatedWithAnotherSize) {
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     peer.answer_open(number == 0 ? 8 : 9, static_cast<std::uint64_t>(number) + 1);
     if (number == 0) {
@@ -345,7 +345,7 @@ TEST(PConnectorRequest, RefusesAStreamThatCameBackWithAnotherSize) {
   expect_words(bad.error(), Errc::type_mismatch, {"recreated", "8 bytes", "9 bytes"});
 }
 
-TEST(PConnectorRequest, AWaitForAStreamThatCannotBeUsedAnyMoreIsNoLoop) {
+TEST(PConnectorRequest, AWaitForAnUnusableStreamDoesNotSpin) {
   std::atomic<int> connections = 0;
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     ++connections;
@@ -420,7 +420,7 @@ TEST(PConnectorSubscription, NeedsOne) {
   EXPECT_EQ(con.wait(kNever), WaitStatus::timeout);
 }
 
-TEST(PConnectorSubscription, KeepsWhatComesWhileARequestWaits) {
+TEST(PConnectorSubscription, KeepsSamplesThatArriveDuringARequest) {
   const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
     peer.answer_open(8);
     peer.answer_subscribe(0);
@@ -441,7 +441,7 @@ TEST(PConnectorSubscription, KeepsWhatComesWhileARequestWaits) {
   for (std::int64_t tid = 1; tid < 7; ++tid) expect_sample(con, tid);
 }
 
-TEST(PConnectorSubscription, ResumesAtTheSampleThatIsDue) {
+TEST(PConnectorSubscription, ResumesAtTheNextSample) {
   std::promise<net::Subscribe> resumed;
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     peer.answer_open(8);
@@ -467,7 +467,7 @@ TEST(PConnectorSubscription, ResumesAtTheSampleThatIsDue) {
   EXPECT_EQ(con.restarts(), 0u);
 }
 
-TEST(PConnectorSubscription, TellsOfANewRingBetweenItsSamplesAndThoseOfTheOld) {
+TEST(PConnectorSubscription, ReportsANewRingBetweenItsSamplesAndThoseOfTheOldOne) {
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     peer.answer_open(8, number == 0 ? 1 : 2);
     peer.answer_subscribe(number == 0 ? 8 : 0, number == 0 ? 1 : 2);
@@ -486,7 +486,7 @@ TEST(PConnectorSubscription, TellsOfANewRingBetweenItsSamplesAndThoseOfTheOld) {
   EXPECT_EQ(con.restarts(), 1u);
 }
 
-TEST(PConnectorSubscription, TellsWhenTheConnectionIsDownWithoutWaiting) {
+TEST(PConnectorSubscription, ReportsThatTheConnectionIsDownWithoutWaiting) {
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     if (number == 0) {
       peer.answer_open(8);
@@ -508,7 +508,7 @@ TEST(PConnectorSubscription, TellsWhenTheConnectionIsDownWithoutWaiting) {
   }
 }
 
-TEST(PConnectorSubscription, SaysThatTheStreamWasRemovedAndGoesOnWhenItIsBack) {
+TEST(PConnectorSubscription, ReportsThatTheStreamWasRemovedAndContinuesWhenItIsRecreated) {
   std::atomic<bool> back = false;
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     if (number == 0) {
@@ -543,7 +543,7 @@ TEST(PConnectorSubscription, SaysThatTheStreamWasRemovedAndGoesOnWhenItIsBack) {
   expect_sample(con, 0);
 }
 
-TEST(PConnectorSubscription, PassesOnWhyItIsRefused) {
+TEST(PConnectorSubscription, ReportsWhyItIsRefused) {
   const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
     peer.answer_open(8);
     peer.refuse(Errc::no_permission, "not for you");
@@ -587,7 +587,7 @@ TEST(PConnectorSubscription, WaitEndsAtItsDeadlineAndAtASignal) {
   }
 }
 
-TEST(PConnectorSubscription, ItsDescriptorStandsForTheConnectionAndForTheNextAttempt) {
+TEST(PConnectorSubscription, ItsDescriptorCoversTheConnectionAndTheNextAttempt) {
   const ScriptedDaemon daemon([](NetworkPeer& peer, int number) {
     if (number == 1) return;  // one attempt fails
     peer.answer_open(8);
@@ -696,7 +696,7 @@ TEST(PConnectorLargeSamples, AreReceivedWhereTheyAreWanted) {
             (21 + 2 * stalls) * kLargeBytes);
 }
 
-TEST(PConnectorLargeSamples, OneThatWasCutComesAnew) {
+TEST(PConnectorLargeSamples, OneThatWasCutIsSentAgain) {
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
     peer.answer_open(kLargeBytes);
     peer.answer_subscribe(0);
@@ -854,7 +854,7 @@ TEST(PConnectorPublishing, NoticesABrokenConnectionByTheNextPosts) {
   }
 }
 
-TEST(PConnectorPublishing, KeepsTheNewestWhileDssmdIsAwayAndCountsTheOthers) {
+TEST(PConnectorPublishing, KeepsTheNewestWhileDssmdIsDownAndCountsTheOthers) {
   Owner owner;
   std::atomic<bool> back = false;
   {
@@ -890,7 +890,7 @@ TEST(PConnectorPublishing, KeepsTheNewestWhileDssmdIsAwayAndCountsTheOthers) {
   }
 }
 
-TEST(PConnectorPublishing, AWriteThatIsNotAcknowledgedSaysSo) {
+TEST(PConnectorPublishing, AWriteThatIsNotAcknowledgedFails) {
   const ScriptedDaemon daemon(
       [](NetworkPeer& peer, int) { peer.answer_open(8), peer.await_end(); });
   auto con = open_impatient(daemon, 100ms);

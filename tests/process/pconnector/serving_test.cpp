@@ -84,7 +84,7 @@ TEST_F(PConnectorServing, KnowsTheStream) {
   EXPECT_TRUE(con.is_connected());
 }
 
-TEST_F(PConnectorServing, RefusesInWords) {
+TEST_F(PConnectorServing, RefusesWithAReason) {
   make();
   const auto none = PConnector::open({"radar", 0, {}}, options());
   ASSERT_FALSE(none);
@@ -230,7 +230,7 @@ TEST_F(PConnectorServing, ThinsAtTheSource) {
   writing.join();
 }
 
-TEST_F(PConnectorServing, ResumesOverRestartsOfDssmdWhileTheWriterGoesOn) {
+TEST_F(PConnectorServing, ResumesOverRestartsOfDssmdWhileTheWriterContinues) {
   auto writer = make({1U << 16, 1ms});
   write(writer, 0);
   auto con = open();
@@ -250,23 +250,23 @@ TEST_F(PConnectorServing, ResumesOverRestartsOfDssmdWhileTheWriterGoesOn) {
   EXPECT_EQ(con.counters().reconnects, 5u);
 }
 
-TEST_F(PConnectorServing, TellsOfAStreamThatWasRemovedAndMadeAnew) {
+TEST_F(PConnectorServing, ReportsAStreamThatWasRecreated) {
   auto writer = make();
   for (Tid tid = 0; tid < 3; ++tid) write(writer, tid);
   auto con = open();
   ASSERT_TRUE(con.subscribe({.start = Subscription::Start::oldest}));
   for (Tid tid = 0; tid < 3; ++tid) expect_next(con, tid);
   ASSERT_TRUE(session.remove({"lidar", 0, {}}));
-  auto anew = make();
-  write(anew, 0);
+  auto recreated = make();
+  write(recreated, 0);
   Numbered sample;
   SampleInfo info;
   ASSERT_EQ(await_next(con, sample, info), ReadStatus::restarted);
   expect_next(con, 0);
-  write(anew, 1);
+  write(recreated, 1);
   expect_next(con, 1);
   EXPECT_EQ(con.restarts(), 1u);
-  EXPECT_EQ(con.incarnation(), anew.incarnation());
+  EXPECT_EQ(con.incarnation(), recreated.incarnation());
   // And by request: told once, too.
   EXPECT_EQ(con.read_newest(writable_bytes(sample), info).value(), ReadStatus::restarted);
   EXPECT_EQ(con.read_newest(writable_bytes(sample), info).value(), ReadStatus::ok);

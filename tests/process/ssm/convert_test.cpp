@@ -74,7 +74,7 @@ TEST(SsmTid, IsTheRingsOwnWhileTheStreamIsYoung) {
   EXPECT_EQ(ssm_tid(kTidMask), 2'147'483'647);
 }
 
-TEST(SsmTid, GoesOnAtZeroAfter31BitsAndMeansTheClosestSample) {
+TEST(SsmTid, ContinuesAtZeroAfter31BitsAndMeansTheClosestSample) {
   const Tid wrap = kTidMask + 1;
   EXPECT_EQ(ssm_tid(wrap), 0);
   EXPECT_EQ(ssm_tid(5 * wrap + 7), 7);

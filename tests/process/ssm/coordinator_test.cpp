@@ -126,7 +126,7 @@ TEST(SsmCoordinator, PrintsTheOldBannerAndServesUntilSigintOrSigterm) {
   }
 }
 
-TEST(SsmCoordinator, SaysThatOneIsRunningAlready) {
+TEST(SsmCoordinator, ReportsThatOneIsRunningAlready) {
   Coordinator running({"-q"});
   await([&] {
     return Session::connect({.socket_path = running.folder + "/dssmd.sock"}).has_value();

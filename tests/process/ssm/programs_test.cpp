@@ -53,7 +53,7 @@ INSTANTIATE_TEST_SUITE_P(Cpp, SsmProcesses,
                                          "cpp_processes-gnu++98", "cpp_processes-c++20"),
                          test_name);
 
-TEST(SsmProgramAcrossRestart, LosesNoSampleWhenDssmdIsKilledAndComesBack) {
+TEST(SsmProgramAcrossRestart, LosesNoSampleWhenDssmdIsKilledAndRestarted) {
   DaemonProcess daemon({"--log-level", "warning"});
   const std::string folder = make_temp_dir();
   int out[2];

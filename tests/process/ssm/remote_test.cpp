@@ -115,9 +115,9 @@ TEST(SsmBroadcast, EachHostSeesWhatAllShow) {
 }
 
 // A program whose standard input and output are the test's.
-class Talking {
+class PipedProgram {
  public:
-  Talking(const std::vector<std::string>& argv, const std::string& environment) {
+  PipedProgram(const std::vector<std::string>& argv, const std::string& environment) {
     int in[2], out[2];
     if (::pipe2(in, O_CLOEXEC) || ::pipe2(out, O_CLOEXEC)) std::abort();
     // start() leaves stdin alone: the shell takes it from the pipe's path in /proc.
@@ -130,10 +130,10 @@ class Talking {
     to_ = in[1];
     from_ = out[0];
   }
-  Talking(const Talking&) = delete;
-  Talking& operator=(const Talking&) = delete;
+  PipedProgram(const PipedProgram&) = delete;
+  PipedProgram& operator=(const PipedProgram&) = delete;
 
-  void say(const std::string& line) const {
+  void write_line(const std::string& line) const {
     ASSERT_EQ(::write(to_, line.data(), line.size()), static_cast<ssize_t>(line.size()));
   }
   std::string line() const {
@@ -177,9 +177,9 @@ struct SsmNewRing : testing::Test {
     }
   }
   // Until the program has read all that was written.
-  void await(const Talking& program) {
+  void await(const PipedProgram& program) {
     const std::string last = std::to_string(number - 1);
-    program.say(last + "\n");
+    program.write_line(last + "\n");
     ASSERT_EQ(program.line(), last);
   }
   void replace_ring() {
@@ -188,25 +188,25 @@ struct SsmNewRing : testing::Test {
   }
 };
 
-TEST_F(SsmNewRing, LoopsOfOldProgramsGoOn) {
+TEST_F(SsmNewRing, LoopsOfOldProgramsContinue) {
   write(1);
-  Talking talking({program("cpp_recreated-gnu++98"), folder}, daemon.environment());
+  PipedProgram piped({program("cpp_recreated-gnu++98"), folder}, daemon.environment());
   for (int round = 0; round < 4; ++round) {
     write(5);
-    await(talking);
+    await(piped);
     replace_ring();
   }
   std::string rest;
-  EXPECT_EQ(talking.end(rest), 0) << rest;
+  EXPECT_EQ(piped.end(rest), 0) << rest;
 }
 
-TEST_F(SsmNewRing, RemoteLoopsOfOldProgramsGoOnOverRestartsOfDssmdToo) {
+TEST_F(SsmNewRing, RemoteLoopsOfOldProgramsContinueOverRestartsOfDssmdToo) {
   write(1);
-  Talking talking({program("remote_recreated-c++11"), folder, daemon.address()},
-                  daemon.environment());
+  PipedProgram piped({program("remote_recreated-c++11"), folder, daemon.address()},
+                     daemon.environment());
   for (int round = 0; round < 6; ++round) {
     write(5);
-    await(talking);
+    await(piped);
     if (round % 2 == 0) {
       replace_ring();
     } else {
@@ -216,7 +216,7 @@ TEST_F(SsmNewRing, RemoteLoopsOfOldProgramsGoOnOverRestartsOfDssmdToo) {
     }
   }
   std::string rest;
-  EXPECT_EQ(talking.end(rest), 0) << rest;
+  EXPECT_EQ(piped.end(rest), 0) << rest;
 }
 
 }  // namespace

@@ -15,7 +15,7 @@ HostInfo closed_host() {
   return host;
 }
 
-TEST(HostRow, HasACellForEachColumnAndSaysByWhatTheHostWasFound) {
+TEST(HostRow, HasACellForEachColumnAndShowsHowTheHostWasFound) {
   const std::vector<std::string> row = host_row(closed_host());
   ASSERT_EQ(row.size(), host_columns().size());
   EXPECT_EQ(host_columns()[3].title, "FOUND BY");
@@ -32,7 +32,7 @@ TEST(HostRow, EscapesWhatOthersSay) {
   }
 }
 
-TEST(HostJson, TellsProgramsTheSame) {
+TEST(HostJson, PrintsTheSameAsJson) {
   const Json json = host_json(closed_host());
   EXPECT_EQ(json["host"], "pc2");
   EXPECT_EQ(json["id"], "00ff");

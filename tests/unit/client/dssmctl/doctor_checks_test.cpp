@@ -101,7 +101,7 @@ TEST(Doctor, FindsNothingWhereAllIsWell) {
   }
 }
 
-TEST(Doctor, TellsWhyDssmdIsNotThere) {
+TEST(Doctor, ReportsWhyDssmdIsNotThere) {
   Facts facts = unreachable(Errc::no_daemon);
   EXPECT_FINDING(facts, "daemon", Status::fail, "systemctl enable --now dssmd");
   facts.service = "failed";
@@ -117,7 +117,7 @@ TEST(Doctor, TellsWhyDssmdIsNotThere) {
   EXPECT_FINDING(unreachable(Errc::invalid_argument), "daemon", Status::fail, "DSSM_SOCKET");
 }
 
-TEST(Doctor, TellsWhatPermissionIsMissing) {
+TEST(Doctor, ReportsWhichPermissionIsMissing) {
   Facts facts = unreachable(Errc::no_permission);
   EXPECT_FINDING(facts, "daemon", Status::fail, "socket_mode");
   facts.socket.process_in_group = false;
@@ -130,7 +130,7 @@ TEST(Doctor, TellsWhatPermissionIsMissing) {
   EXPECT_FINDING(facts, "daemon", Status::fail, "usermod -aG robots anna");
 }
 
-TEST(Doctor, SaysNothingOfWhatOnlyDssmdKnowsWhileItIsAway) {
+TEST(Doctor, LeavesOutWhatOnlyDssmdKnowsWhileItIsDown) {
   for (const Finding& finding : findings_of(unreachable(Errc::no_daemon))) {
     EXPECT_TRUE(finding.name == "daemon" || finding.name == "clock" ||
                 finding.name.starts_with("disk "))
@@ -173,7 +173,7 @@ TEST(Doctor, WarnsOfFullDisks) {
   EXPECT_FINDING(facts, "disk /run", Status::warn, "du ");
 }
 
-TEST(Doctor, LooksAtTheClock) {
+TEST(Doctor, ChecksTheClock) {
   Facts facts = healthy();
   facts.clock = {ClockFacts::State::no_chrony, ""};
   EXPECT_FINDING(facts, "clock", Status::warn, "apt install chrony");
@@ -195,7 +195,7 @@ TEST(Doctor, WarnsOfLoopbackOnlyWhereThereAreOtherPcs) {
   EXPECT_FINDING(facts, "listening", Status::ok, "");
 }
 
-TEST(Doctor, TellsWhatAvahiLacks) {
+TEST(Doctor, ReportsWhatAvahiLacks) {
   Facts facts = healthy();
   facts.daemon.mdns.phase = MdnsPhase::waiting;
   EXPECT_FINDING(facts, "mdns", Status::warn, "dbus");
@@ -207,7 +207,7 @@ TEST(Doctor, TellsWhatAvahiLacks) {
   EXPECT_FINDING(facts, "mdns", Status::ok, "");
 }
 
-TEST(Doctor, TellsWhatMdnsLacks) {
+TEST(Doctor, ReportsWhatMdnsLacks) {
   Facts facts = healthy();
   facts.daemon.mdns.hosts_heard = 0;
   EXPECT_FINDING(facts, "mdns", Status::warn, "5353");
@@ -271,7 +271,7 @@ TEST(Doctor, ForgivesAnAddressThatDoesNotWorkWhileAnotherOfThatHostDoes) {
   EXPECT_FINDING(facts, "host pc2", Status::fail, "ping");
 }
 
-TEST(Doctor, SaysHowFarClocksAreApartAndWarnsWhenNobodyKnows) {
+TEST(Doctor, ReportsHowFarClocksAreApartAndWarnsWhenThatIsUnknown) {
   Facts facts = healthy();
   facts.hosts[1].clock = ClockSnapshot();
   facts.hosts[1].clock_distance = std::chrono::microseconds(250);

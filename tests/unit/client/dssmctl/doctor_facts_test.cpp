@@ -14,7 +14,7 @@ std::string tracking(const std::string& leap) {
          leap + "\n";
 }
 
-TEST(ClockFacts, FollowFromWhatChronycTells) {
+TEST(ClockFacts, FollowFromWhatChronycPrints) {
   for (const char* leap : {"Normal", "Insert second", "Delete second"}) {
     const ClockFacts facts = clock_facts_untrusted(0, tracking(leap));
     EXPECT_EQ(facts.state, State::synchronized) << leap;
@@ -25,7 +25,7 @@ TEST(ClockFacts, FollowFromWhatChronycTells) {
   EXPECT_EQ(facts.detail, "Not synchronised");
 }
 
-TEST(ClockFacts, AreNoneWhenChronycSaysSomethingElse) {
+TEST(ClockFacts, AreNoneWhenChronycPrintsSomethingElse) {
   const ClockFacts facts = clock_facts_untrusted(1, "506 Cannot talk to daemon\n");
   EXPECT_EQ(facts.state, State::no_answer);
   EXPECT_EQ(facts.detail, "506 Cannot talk to daemon");
@@ -68,7 +68,7 @@ TEST(RunProgram, WaitsForTheStatusOfAProgramThatClosedItsOutputs) {
   EXPECT_EQ(end->exit_status, 4);
 }
 
-TEST(RunProgram, SaysWhenThereIsNoSuchProgram) {
+TEST(RunProgram, ReportsThatThereIsNoSuchProgram) {
   EXPECT_FALSE(run_program({"a-program-that-nobody-has"}, kAmple));
 }
 

@@ -71,7 +71,7 @@ TEST(StreamFilter, FitsAPatternToTheNameOrTheNameWithItsId) {
   }
 }
 
-TEST(StreamFilter, LooksAtTheHostOnlyWhereThePatternHasOne) {
+TEST(StreamFilter, ChecksTheHostOnlyWhereThePatternHasOne) {
   const StreamId lidar{"lidar", 0, "pc2"};
   for (const char* pattern : {"lidar@pc2", "*@pc2", "lidar:0@pc?", "*@*"}) {
     EXPECT_TRUE(fits(pattern, lidar)) << pattern;

@@ -95,7 +95,7 @@ TEST(CommandLine, ReadsHowToPing) {
   EXPECT_EQ(options_of<PingOptions>({"ping", "pc2"}).interval, 1s);
 }
 
-TEST(CommandLine, SaysWhatIsWrongAndWhereHelpIs) {
+TEST(CommandLine, ReportsWhatIsWrongAndWhereHelpIs) {
   const struct {
     std::vector<const char*> words;
     const char* error;

@@ -55,7 +55,7 @@ TEST(SamplePrinter, LeavesAnUnknownClockErrorEmptyInCsvAndNullInJson) {
             "\"lost\":2,\"restarts\":3,\"payload_bytes\":1,\"payload_hex\":\"ab\"}\n");
 }
 
-TEST(SamplePrinter, ShortensLongPayloadsUnlessToldOtherwise) {
+TEST(SamplePrinter, ShortensLongPayloadsByDefault) {
   const std::vector<std::byte> payload(200, std::byte{'.'});
   const std::string shortened = print(SampleForm::text, {}, payload, info_of());
   EXPECT_NE(shortened.find("... 136 bytes more"), std::string::npos) << shortened;
@@ -65,7 +65,7 @@ TEST(SamplePrinter, ShortensLongPayloadsUnlessToldOtherwise) {
   EXPECT_NE(full.find("000000c0"), std::string::npos) << full;
 }
 
-TEST(SamplePrinter, SaysInTextHowManySamplesAreMissing) {
+TEST(SamplePrinter, PrintsHowManySamplesAreMissing) {
   const std::byte payload[1] = {};
   EXPECT_TRUE(print(SampleForm::text, {}, payload, info_of(), false, 5).starts_with("# 5 samples"));
   EXPECT_TRUE(print(SampleForm::text, {}, payload, info_of()).starts_with("tid: 7\n"));

@@ -40,7 +40,7 @@ TEST(Text, WritesDurationsWithThreeDigitsAndAUnit) {
   EXPECT_EQ(duration_text(Duration::min()), "-" + duration_text(Duration::max()));
 }
 
-TEST(Text, WritesBoundsThatNobodyKnows) {
+TEST(Text, WritesUnknownBounds) {
   EXPECT_EQ(bound_text(1500us), "1.50 ms");
   EXPECT_EQ(bound_text(kUnknownClockError), "unknown");
 }

@@ -140,7 +140,7 @@ TEST(Outbox, RefusesAnAcknowledgementOfWhatWasNeverPosted) {
   EXPECT_EQ(outbox.restart(INT64_MAX, 0).error().code, Errc::protocol);
 }
 
-TEST(Outbox, NeverForgetsASampleBecauseOfAStrangeAcknowledgement) {
+TEST(Outbox, NeverDropsASampleBecauseOfAStrangeAcknowledgement) {
   Outbox outbox(kPayloadBytes, 100, 1 << 20);
   Owner owner;
   for (int i = 0; i < 4; ++i) push(outbox, i);

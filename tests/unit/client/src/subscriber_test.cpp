@@ -51,7 +51,7 @@ struct SubscriberTest : testing::Test {
   }
 };
 
-TEST_F(SubscriberTest, AsksForWhatTheUserAskedFor) {
+TEST_F(SubscriberTest, RequestsWhatTheUserRequested) {
   subscriber.begin({});
   EXPECT_TRUE(request().from_now());
   subscriber.begin({.start = Subscription::Start::oldest, .max_rate_hz = 12.5});
@@ -64,7 +64,7 @@ TEST_F(SubscriberTest, AsksForWhatTheUserAskedFor) {
   EXPECT_EQ(request().from_time_ns(), -5);
 }
 
-TEST_F(SubscriberTest, ASampleThatNobodyWaitsForHasToWait) {
+TEST_F(SubscriberTest, ASampleWithoutAReaderWaits) {
   begin();
   EXPECT_FALSE(arrive(0));
   subscriber.set_target(target.data());
@@ -157,7 +157,7 @@ TEST_F(SubscriberTest, ATornSampleIsNeverGivenOut) {
   EXPECT_EQ(subscriber.lost(), 1u);
 }
 
-TEST_F(SubscriberTest, TellsOfANewRingAfterTheOldOnesSamples) {
+TEST_F(SubscriberTest, ReportsANewRingAfterTheOldOnesSamples) {
   begin();
   subscriber.set_buffering(true);
   arrive(0);
@@ -175,7 +175,7 @@ TEST_F(SubscriberTest, TellsOfANewRingAfterTheOldOnesSamples) {
   EXPECT_EQ(subscriber.lost(), 0u);
 }
 
-TEST_F(SubscriberTest, TellsOfANewRingAlsoWhenTheQueueOverflows) {
+TEST_F(SubscriberTest, ReportsANewRingAlsoWhenTheQueueOverflows) {
   Subscriber small(16U << 20);  // one sample fills the queue
   small.begin({});
   ASSERT_TRUE(small.on_subscribed_untrusted(0));
@@ -220,7 +220,7 @@ TEST_F(SubscriberTest, PutsAsideTheSampleThatFillsTheTarget) {
   expect_kept(3);
 }
 
-TEST_F(SubscriberTest, ANewSubscriptionForgetsTheOldOne) {
+TEST_F(SubscriberTest, ANewSubscriptionReplacesTheOldOne) {
   begin();
   subscriber.set_buffering(true);
   arrive(0);

@@ -40,7 +40,7 @@ TEST(StreamId, ReadsEveryFormOfAName) {
   EXPECT_EQ(StreamId::parse("lidar:7@pc2").value().str(), "lidar:7@pc2");
 }
 
-TEST(StreamId, RefusesBadNamesInWords) {
+TEST(StreamId, RefusesBadNamesWithAReason) {
   const std::pair<const char*, const char*> cases[] = {
       {"", "empty"},
       {":1", "empty"},
@@ -134,7 +134,7 @@ TEST(History, HoldsTwentyPercentMoreThanAskedFor) {
   EXPECT_EQ(History::for_life(1h, 1ns).error().code, Errc::limit_exceeded);
 }
 
-TEST(Utf8, TellsWellFormedFromOtherText) {
+TEST(Utf8, DistinguishesWellFormedFromOtherText) {
   for (const char* good : {"", "a", "\u00e9", "\u65e5\u672c", "\U0001F916", "\u07ff\uffff"}) {
     EXPECT_TRUE(is_utf8(good)) << good;
   }

@@ -168,7 +168,7 @@ TEST_F(ChannelClientTest, PublishesFromWhereTheOwnerStopped) {
   EXPECT_EQ(published, std::vector<std::int64_t>{4});
 }
 
-TEST_F(ChannelClientTest, HandsOnWhatTheOwnerRefuses) {
+TEST_F(ChannelClientTest, ForwardsTheOwnersRefusal) {
   client.open(kId, nullptr);
   ASSERT_TRUE(receive(failure(take().serial(), Errc::type_mismatch)));
   ASSERT_EQ(refused.size(), 1u);
@@ -217,7 +217,7 @@ TEST_F(ChannelClientTest, RefusesWhatCannotComeNow) {
   EXPECT_TRUE(gaps.empty() && published.empty() && !opened && caught_up == 0);
 }
 
-TEST_F(ChannelClientTest, RefusesADescriptionThatCannotBe) {
+TEST_F(ChannelClientTest, RefusesAnInvalidDescription) {
   const StreamInfo good = theirs;
   const auto expect_refused = [&](const std::function<void()>& spoil) {
     theirs = good;

@@ -16,11 +16,11 @@ TEST(ClockBound, AddsOffsetDispersionAndHalfTheDelay) {
 
 TEST(ClockBound, RoundsHalfTheDelayUp) { EXPECT_EQ(bound_to_root({}, {0ns, 7ns}), 4ns); }
 
-TEST(ClockBound, LeavesOutWhatIsBehindTheReference) {
+TEST(ClockBound, LeavesOutWhatIsBeyondTheReference) {
   EXPECT_EQ(bound_to_reference(-1us, {300us, 500us}, {200us, 100us}), 1us + 100us + 200us);
 }
 
-TEST(ClockBound, TakesNothingAwayForAReferenceThatIsFartherFromTheRoot) {
+TEST(ClockBound, SubtractsNothingForAReferenceThatIsFartherFromTheRoot) {
   EXPECT_EQ(bound_to_reference(1us, {200us, 500us}, {300us, 100us}), 1us + 200us);
   EXPECT_EQ(bound_to_reference(1us, {300us, 100us}, {200us, 500us}), 1us + 100us);
 }

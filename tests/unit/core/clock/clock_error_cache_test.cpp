@@ -37,7 +37,7 @@ class ClockErrorCacheTest : public testing::Test {
   ClockErrorCache cache;
 };
 
-TEST_F(ClockErrorCacheTest, SaysWhatThePageSays) {
+TEST_F(ClockErrorCacheTest, ReturnsWhatThePageStates) {
   for (const Duration age : {0ns, 1ns, 999ns, 1'000'000ns, 1'000'000'001ns, Duration(kMaxUse)}) {
     expect_same(stated.wall + age);
   }
@@ -55,7 +55,7 @@ TEST_F(ClockErrorCacheTest, SeesWhatIsStoredLater) {
   EXPECT_EQ(at(Time(52s)), kUnknownClockError);
 }
 
-TEST_F(ClockErrorCacheTest, KnowsPagesApart) {
+TEST_F(ClockErrorCacheTest, DistinguishesPages) {
   EXPECT_EQ(at(Time(50s)), 100us);
   ClockPage other{};
   stated.clock.bound = 3us;

@@ -62,7 +62,7 @@ TEST(ClockPageLayout, HasItsDocumentedOffsets) {
   EXPECT_EQ(ClockPage::kLayoutVersion, 2u) << "raise it with every change, and fix this test";
 }
 
-TEST_F(ClockPageTest, SaysNothingUntilSomethingIsStored) {
+TEST_F(ClockPageTest, StatesNothingUntilSomethingIsStored) {
   EXPECT_EQ(clock_error_at(page, WallClock::now()), std::nullopt);
   EXPECT_EQ(status_of(page), ClockStatus::unknown);
 }
@@ -89,7 +89,7 @@ TEST_F(ClockPageTest, ATimeBeforeTheStatementHasTheGreatestBoundSince) {
   EXPECT_EQ(clock_error_at(page, Time(40s)), 400us);
 }
 
-TEST_F(ClockPageTest, SaysNothingOfTimesThatItDoesNotCover) {
+TEST_F(ClockPageTest, StatesNothingAboutTimesThatItDoesNotCover) {
   page.state.store(state());
   EXPECT_EQ(clock_error_at(page, Time(40s) - 1ns), std::nullopt);
   EXPECT_EQ(clock_error_at(page, Time(50s) + kMaxUse), 275us);

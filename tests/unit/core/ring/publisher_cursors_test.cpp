@@ -48,7 +48,7 @@ TEST_F(PublisherNotesTest, LiveInTheRing) {
   EXPECT_EQ(PublisherCursors(other->header()).last_untrusted(5).number, 10);
 }
 
-TEST_F(PublisherNotesTest, ForgetTheOneThatWroteLongestAgo) {
+TEST_F(PublisherNotesTest, ReplaceTheOneThatWroteLongestAgo) {
   for (std::uint64_t i = 0; i < kMaxPublishers; ++i) publish(i, 7);
   publish(0, 8);
   publish(1000, 1);

@@ -70,7 +70,7 @@ TEST(RingReader, KeepsOneSlotFreeForTheSampleBeingWritten) {
   EXPECT_EQ(ring.reader().oldest(), 8);
 }
 
-TEST(RingWriter, KeepsGuardBytesBehindEachPayload) {
+TEST(RingWriter, KeepsGuardBytesAfterEachPayload) {
   const TestRing ring(40, 3);
   RingWriter writer = ring.writer();
   for (Tid tid = 0; tid < 7; ++tid) {
@@ -216,7 +216,7 @@ TEST(Bell, SleepEndsAtTheDeadline) {
 }
 
 // A writer may have died between publishing and ringing.
-TEST(Bell, SleepersLookUpThoughNobodyRings) {
+TEST(Bell, SleepersCheckTheRingThoughNoWriterRings) {
   const TestRing ring(8, 4);
   for (const MonoTime deadline : {kNever, deadline_in(std::chrono::hours(1))}) {
     const MonoTime begin = MonoClock::now();

@@ -41,7 +41,7 @@ TEST(Address, ReadsHostsWithAndWithoutPort) {
   EXPECT_EQ(Address::parse("pc2", 7)->port, 7);
 }
 
-TEST(Address, SaysWhatIsWrong) {
+TEST(Address, ReportsWhatIsWrong) {
   const std::pair<std::string, const char*> cases[] = {
       {"", "the host is missing"},
       {":80", "the host is missing"},
@@ -108,7 +108,7 @@ TEST(Resolve, FindsNames) {
   for (const SocketAddress& address : *found) EXPECT_TRUE(address.is_loopback());
 }
 
-TEST(Resolve, SaysThatThereIsNoSuchHost) {
+TEST(Resolve, ReportsThatThereIsNoSuchHost) {
   // RFC 6761: "invalid" never exists. Without a name server the answer is another one.
   const auto found = resolve(Address{"pc2.invalid", 80});
   ASSERT_FALSE(found);

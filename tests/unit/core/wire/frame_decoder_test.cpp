@@ -228,7 +228,7 @@ TEST(FrameDecoder, TakesFieldsInEveryOrder) {
   EXPECT_EQ(orders, 24);
 }
 
-TEST(FrameDecoder, RefusesASerialBehindALargePayloadThatItCouldNotWaitFor) {
+TEST(FrameDecoder, RefusesASerialAfterALargePayloadThatItCouldNotWaitFor) {
   expect_refused(in_order("Sps", sample_message(300, 5, 20)), 20,
                  "field 1 came behind a sample's payload");
 }
@@ -285,13 +285,13 @@ TEST(FrameDecoder, CopiesSmallPayloadsOnceAndLargeOnesHardly) {
   EXPECT_LT(direct.counters.copied_payload_bytes, (20u << 20) / 1000);
 }
 
-TEST(FrameDecoder, ThrowsPayloadsAwayThatHaveNoPlace) {
+TEST(FrameDecoder, DropsPayloadsWithoutAPlace) {
   for (const std::size_t payload_bytes : {20u, 40'000u, 1'000'000u}) {
     const std::string stream = sample_frame(0, 1, payload_bytes, Torn::no) + published(3) +
                                in_order("pS", sample_message(0, 2, payload_bytes));
     for (const std::size_t at_most : {SIZE_MAX, std::size_t{777}}) {
       Recorder recorder;
-      recorder.throws_away = true;
+      recorder.drops_payloads = true;
       FrameDecoder decoder(recorder, kMaxFrame);
       decoder.set_payload_bytes(payload_bytes);
       ASSERT_TRUE(feed(decoder, stream, at_most));
@@ -316,7 +316,7 @@ TEST(FrameDecoder, LearnsThePayloadSizeInTheMidstOfABatch) {
   EXPECT_EQ(recorder.log.size(), 2u);
 }
 
-TEST(FrameDecoder, SaysWhetherAPayloadIsUnderWay) {
+TEST(FrameDecoder, ReportsWhetherAPayloadIsUnderWay) {
   const std::string frame = sample_frame(0, 1, 20);
   Recorder recorder;
   FrameDecoder decoder(recorder, kMaxFrame);
@@ -448,7 +448,7 @@ TEST(FrameDecoder, LetsASinkDriveAnotherDecoder) {
   EXPECT_EQ(recorder.log, log);
 }
 
-TEST(FrameDecoder, GoesOnInAnotherThread) {
+TEST(FrameDecoder, ContinuesInAnotherThread) {
   const std::string stream = mixed_stream();
   Recorder recorder;
   FrameDecoder decoder(recorder, kMaxFrame);

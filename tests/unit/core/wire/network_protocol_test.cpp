@@ -110,7 +110,7 @@ TEST(Greeting, TakesValuesAtTheirLimits) {
   EXPECT_TRUE(greeting_untrusted(message, "x"));
 }
 
-TEST(Greeting, SaysNothingOfTheClockUnlessItIsKnown) {
+TEST(Greeting, LeavesOutTheClockUnlessItIsKnown) {
   proto::Hello message = hello();
   message.clear_clock();
   EXPECT_EQ(reported_bound(*greeting_untrusted(message, "x")), kUnknownClockError);
@@ -126,7 +126,7 @@ TEST(HostId, DiffersBetweenNamesAndStaysTheSame) {
   EXPECT_NE(host_id_for("pc1"), HostId{});
 }
 
-TEST(HostId, DoesNotTellTheMachineId) {
+TEST(HostId, DoesNotRevealTheMachineId) {
   std::string machine;
   std::getline(std::ifstream("/etc/machine-id"), machine);
   if (machine.size() != 32) GTEST_SKIP() << "this machine has no id";

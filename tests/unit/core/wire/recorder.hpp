@@ -23,7 +23,7 @@ class Recorder : public FrameDelegate {
   // An entry per sample, "sample SERIAL/TID/TIME/CLOCK_ERROR [torn] PAYLOAD", or frame, "frame
   // BYTES".
   std::vector<std::string> log;
-  bool throws_away = false;                            // gives no place for payloads
+  bool drops_payloads = false;                         // gives no place for payloads
   std::function<void(const net::Frame&)> then;         // called in on_frame()
   std::function<bool()> holds = [] { return false; };  // asked in each callback
   FrameDecoder* decoder = nullptr;                     // for holds
@@ -37,7 +37,7 @@ class Recorder : public FrameDelegate {
       return {};
     }
     payload_.assign(sample.payload_bytes, '?');
-    out = throws_away ? nullptr : reinterpret_cast<std::byte*>(payload_.data());
+    out = drops_payloads ? nullptr : reinterpret_cast<std::byte*>(payload_.data());
     return {};
   }
 

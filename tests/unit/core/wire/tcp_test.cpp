@@ -94,7 +94,7 @@ TEST_P(TcpTransport, WaitsForBytesForAWhileAndThenNeverAgain) {
   EXPECT_EQ(space.substr(0, 5), "bytes");
 }
 
-TEST_P(TcpTransport, TellsOfASignalThatEndsItsWait) {
+TEST_P(TcpTransport, ReportsASignalThatEndsItsWait) {
   const Pair pair = connect_pair(GetParam());
   std::string space(20, '?');
   const iovec spaces[] = {part_of(space)};
@@ -121,7 +121,7 @@ TEST(Tcp, NeverWaits) {
   }
 }
 
-TEST(Tcp, SaysWhenThePeerClosed) {
+TEST(Tcp, ReportsThatThePeerClosed) {
   Pair pair = connect_pair();
   std::string bytes(10, 'x');
   const iovec part[] = {part_of(bytes)};
@@ -185,7 +185,7 @@ TEST(ListenTcp, TakesItsPortBackAtOnce) {
   EXPECT_TRUE(again) << again.error().message;
 }
 
-TEST(ListenTcp, SaysThatAPortIsTakenOrAnAddressNotHere) {
+TEST(ListenTcp, ReportsThatAPortIsTakenOrAnAddressNotHere) {
   const UniqueFd listener = listen_tcp(number("127.0.0.1:0")).value();
   const SocketAddress address = local_address(listener.get()).value();
   const auto second = listen_tcp(address);
@@ -198,7 +198,7 @@ TEST(ListenTcp, SaysThatAPortIsTakenOrAnAddressNotHere) {
   EXPECT_NE(elsewhere.error().message.find("no such address"), std::string::npos);
 }
 
-TEST(Connect, SaysThatNobodyListens) {
+TEST(Connect, ReportsThatNoProcessListens) {
   SocketAddress address;
   {  // a port that was free a moment ago
     const UniqueFd listener = listen_tcp(number("127.0.0.1:0")).value();

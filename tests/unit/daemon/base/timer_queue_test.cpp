@@ -84,7 +84,7 @@ TEST_F(TimerQueueTest, FiresInTheOrderOfTimesNotBefore) {
 }
 
 // What was moved or stopped wakes nobody up.
-TEST_F(TimerQueueTest, TellsTheKernelWhenTheFirstOneChanges) {
+TEST_F(TimerQueueTest, SetsTheKernelsTimerWhenTheFirstOneChanges) {
   const auto a = noting('a'), b = noting('b');
   a->timer.start(deadline_in(1ms));
   a->timer.start(deadline_in(10min));
@@ -163,7 +163,7 @@ TEST_F(TimerQueueTest, KeepsThousandsInOrder) {
 }
 
 // After a stall both are due: whoever judges a silence has to hear first what has been said.
-TEST(EventLoopTimers, ComeBehindWhatHasArrived) {
+TEST(EventLoopTimers, RunAfterWhatHasArrived) {
   EventLoop loop = EventLoop::open().value();
   const UniqueFd arrival(::eventfd(0, EFD_CLOEXEC));
   std::string order;

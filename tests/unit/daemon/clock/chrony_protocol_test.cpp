@@ -32,7 +32,7 @@ void expect_refused(std::size_t at, Number number, Errc code, const std::string&
   EXPECT_NE(reply.error().message.find(text), std::string::npos) << reply.error().message;
 }
 
-TEST(ChronyProtocol, AsksAsChronycDoes) {
+TEST(ChronyProtocol, SendsTheRequestsOfChronyc) {
   // chronyc 4.3 sends these 20 bytes and pads them.
   constexpr std::array<int, 20> kHead{6, 1, 0, 0, 0, 33, 0, 0, 0x11, 0x22, 0x33, 0x44};
   const auto request = tracking_request(kSequence);
@@ -60,7 +60,7 @@ TEST(ChronyProtocol, ReadsARealReply) {
   EXPECT_NEAR(static_cast<double>(tracking.update_interval.count()), 1e9, 5e7);
 }
 
-TEST(ChronyProtocol, TellsWhomChronydFollows) {
+TEST(ChronyProtocol, DecodesTheSourceOfChronyd) {
   const auto source = [](std::uint16_t family, std::vector<std::uint32_t> words) {
     Datagram reply = real_reply();
     put_number(reply, kReplyFamily, family);
@@ -111,7 +111,7 @@ TEST(ChronyProtocol, RefusesRepliesThatItDoesNotKnow) {
   }
 }
 
-TEST(ChronyProtocol, TellsWhyChronydRefuses) {
+TEST(ChronyProtocol, ReportsWhyChronydRefuses) {
   expect_refused(kReplyStatus, std::uint16_t{1}, Errc::system, "status 1;");
   expect_refused(kReplyStatus, std::uint16_t{2}, Errc::no_permission, "cmdallow");
   expect_refused(kReplyStatus, std::uint16_t{3}, Errc::protocol, "does not know the question");

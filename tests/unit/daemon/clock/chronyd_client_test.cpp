@@ -20,7 +20,7 @@ constexpr Duration kPeriod = 200ms;
 
 class ChronydClientTest : public testing::Test, protected ChronydClient::Observer {
  protected:
-  using Question = FakeChronyd::Question;
+  using Request = FakeChronyd::Request;
   struct Answer {
     TrackingReply reply;
     MonoTime asked;
@@ -29,11 +29,11 @@ class ChronydClientTest : public testing::Test, protected ChronydClient::Observe
 
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   // What happens with each question; every test says so.
-  std::function<void(const Question&)> then;
-  std::vector<Question> questions;
-  FakeChronyd chronyd{loop, [this](const Question& question) {
-                        questions.push_back(question);
-                        then(question);
+  std::function<void(const Request&)> on_request;
+  std::vector<Request> requests;
+  FakeChronyd chronyd{loop, [this](const Request& request) {
+                        requests.push_back(request);
+                        on_request(request);
                       }};
   std::vector<Answer> answers;
   std::vector<std::string> unanswered;
@@ -45,7 +45,7 @@ class ChronydClientTest : public testing::Test, protected ChronydClient::Observe
     answers.push_back({reply, asked, answered});
   }
   void on_no_chronyd() override { ++absent; }
-  void on_no_answer(const Error& why) override { unanswered.push_back(why.message); }
+  void on_no_answer(const Error& error) override { unanswered.push_back(error.message); }
 
   void start() { start(chronyd.address()); }
   void start(const wire::SocketAddress& address) {
@@ -57,20 +57,20 @@ class ChronydClientTest : public testing::Test, protected ChronydClient::Observe
         },
         kPeriod);
   }
-  void reply(const Question& question) { chronyd.answer(question, real_reply()); }
+  void reply(const Request& request) { chronyd.answer(request, real_reply()); }
   void until(const std::function<bool()>& done) { run_until(loop, done); }
 };
 
-TEST_F(ChronydClientTest, AsksAgainAndAgainWithOtherNumbers) {
-  then = [this](const Question& question) { reply(question); };
+TEST_F(ChronydClientTest, SendsRequestsWithDifferentNumbers) {
+  on_request = [this](const Request& request) { reply(request); };
   const MonoTime begin = loop.now();
   start();
   until([&] { return answers.size() == 3; });
   EXPECT_GE(loop.now() - begin, 2 * kPeriod);
   std::set<std::uint32_t> numbers;
-  for (const Question& question : questions) {
-    EXPECT_EQ(question.bytes.size(), kTrackingBytes);
-    numbers.insert(question.sequence());
+  for (const Request& request : requests) {
+    EXPECT_EQ(request.bytes.size(), kTrackingBytes);
+    numbers.insert(request.sequence());
   }
   EXPECT_EQ(numbers.size(), 3u);
   EXPECT_TRUE(unanswered.empty());
@@ -84,8 +84,8 @@ TEST_F(ChronydClientTest, AsksAgainAndAgainWithOtherNumbers) {
   }
 }
 
-TEST_F(ChronydClientTest, AsksWhenTheProcessIsAwakeAnyway) {
-  then = [this](const Question& question) { reply(question); };
+TEST_F(ChronydClientTest, SendsRequestsWhenTheProcessIsAwakeAnyway) {
+  on_request = [this](const Request& request) { reply(request); };
   start();
   until([&] { return answers.size() == 1; });
   struct Occasion {
@@ -110,8 +110,8 @@ TEST_F(ChronydClientTest, AsksWhenTheProcessIsAwakeAnyway) {
 }
 
 // A heartbeat between two questions is none to ask at; from some later one on each is.
-TEST_F(ChronydClientTest, FallsInWithHeartbeats) {
-  then = [this](const Question& question) { reply(question); };
+TEST_F(ChronydClientTest, AdaptsToHeartbeats) {
+  on_request = [this](const Request& request) { reply(request); };
   MonoTime begin, end;  // of the last heartbeat
   EventSource heartbeat = EventSource::timer(loop, [&] {
     begin = loop.now();
@@ -132,14 +132,14 @@ TEST_F(ChronydClientTest, FallsInWithHeartbeats) {
   });
 }
 
-TEST_F(ChronydClientTest, KnowsAtOnceThatNobodyListens) {
+TEST_F(ChronydClientTest, NoticesAtOnceThatNoProcessListens) {
   chronyd.stop();
   const MonoTime begin = loop.now();
   start();
   until([&] { return absent == 1; });
   EXPECT_LT(loop.now() - begin, kPeriod) << "with the first question";
   until([&] { return absent == 2; });
-  then = [this](const Question& question) { reply(question); };
+  on_request = [this](const Request& request) { reply(request); };
   chronyd.start();
   until([&] { return answers.size() == 1; });
   chronyd.stop();
@@ -148,24 +148,24 @@ TEST_F(ChronydClientTest, KnowsAtOnceThatNobodyListens) {
   EXPECT_TRUE(unanswered.empty());
 }
 
-TEST_F(ChronydClientTest, DoesNotWaitForOneThatIsSilent) {
-  then = [](const Question&) {};
+TEST_F(ChronydClientTest, DoesNotWaitForAChronydThatDoesNotAnswer) {
+  on_request = [](const Request&) {};
   start();
   until([&] { return unanswered.size() == 2; });
   EXPECT_NE(unanswered[0].find("does not answer"), std::string::npos) << unanswered[0];
-  then = [this](const Question& question) { reply(question); };
+  on_request = [this](const Request& request) { reply(request); };
   until([&] { return answers.size() == 1; });
   EXPECT_EQ(absent, 0);
 }
 
-TEST_F(ChronydClientTest, LeavesLateAnswersAlone) {
-  then = [this](const Question&) {
-    if (questions.size() == 1) return;
+TEST_F(ChronydClientTest, IgnoresLateAnswers) {
+  on_request = [this](const Request&) {
+    if (requests.size() == 1) return;
     // The first one's comes with the second question, to where either came from.
-    reply(questions[0]);
+    reply(requests[0]);
     Datagram late = real_reply();
-    put_number(late, kReplySequence, questions[0].sequence());
-    chronyd.send(questions.back(), late);
+    put_number(late, kReplySequence, requests[0].sequence());
+    chronyd.send(requests.back(), late);
   };
   start();
   until([&] { return unanswered.size() == 2; });
@@ -173,55 +173,55 @@ TEST_F(ChronydClientTest, LeavesLateAnswersAlone) {
   EXPECT_NE(unanswered[1].find("no question of ours"), std::string::npos) << unanswered[1];
 }
 
-TEST_F(ChronydClientTest, FindsTheAnswerBehindGarbage) {
-  then = [this](const Question& question) {
-    chronyd.send(question, {});
-    chronyd.send(question, Datagram(3, std::byte{0xff}));
-    chronyd.send(question, Datagram(2000, std::byte{6}));
+TEST_F(ChronydClientTest, FindsTheAnswerAfterGarbage) {
+  on_request = [this](const Request& request) {
+    chronyd.send(request, {});
+    chronyd.send(request, Datagram(3, std::byte{0xff}));
+    chronyd.send(request, Datagram(2000, std::byte{6}));
     Datagram other = real_reply();
-    put_number(other, kReplySequence, question.sequence() + 1);
-    chronyd.send(question, other);
+    put_number(other, kReplySequence, request.sequence() + 1);
+    chronyd.send(request, other);
     Datagram damaged = real_reply();
     damaged.pop_back();
-    chronyd.answer(question, damaged);
-    reply(question);
-    reply(question);
+    chronyd.answer(request, damaged);
+    reply(request);
+    reply(request);
   };
   start();
   until([&] { return answers.size() == 2; });
-  EXPECT_EQ(questions.size(), 2u) << "one answer for each question";
+  EXPECT_EQ(requests.size(), 2u) << "one answer for each question";
   EXPECT_TRUE(unanswered.empty());
 }
 
-TEST_F(ChronydClientTest, LooksAtSoManyDatagramsOnly) {
-  then = [this](const Question& question) {
-    for (int i = 0; i < ChronydClient::kMaxDatagrams; ++i) chronyd.send(question, {});
-    reply(question);
+TEST_F(ChronydClientTest, ReadsALimitedNumberOfDatagrams) {
+  on_request = [this](const Request& request) {
+    for (int i = 0; i < ChronydClient::kMaxDatagrams; ++i) chronyd.send(request, {});
+    reply(request);
   };
   start();
   until([&] { return unanswered.size() == 1; });
   EXPECT_TRUE(answers.empty());
   // And it is as good as new then.
-  then = [this](const Question& question) {
-    for (int i = 1; i < ChronydClient::kMaxDatagrams; ++i) chronyd.send(question, {});
-    reply(question);
+  on_request = [this](const Request& request) {
+    for (int i = 1; i < ChronydClient::kMaxDatagrams; ++i) chronyd.send(request, {});
+    reply(request);
   };
   until([&] { return answers.size() == 1; });
 }
 
-TEST_F(ChronydClientTest, TellsWhyItWasRefused) {
-  then = [this](const Question& question) {
+TEST_F(ChronydClientTest, ReportsWhyItWasRefused) {
+  on_request = [this](const Request& request) {
     Datagram refusal = real_reply();
     refusal.resize(28);
     put_number(refusal, kReplyStatus, std::uint16_t{6});
-    chronyd.answer(question, refusal);
+    chronyd.answer(request, refusal);
   };
   start();
   until([&] { return unanswered.size() == 1; });
   EXPECT_NE(unanswered[0].find("not enabled"), std::string::npos) << unanswered[0];
 }
 
-TEST_F(ChronydClientTest, TriesAgainWhereThereIsNoWay) {
+TEST_F(ChronydClientTest, RetriesWithoutARoute) {
   // Linux lets no socket send to everybody that has not asked for it.
   const auto nowhere = wire::Address::parse("255.255.255.255:323").value();
   start(wire::resolve_number(nowhere).at(0));

@@ -100,7 +100,7 @@ TEST(ClockEstimator, AgesFromTheQuestionWhenTheAnswerTookTime) {
   EXPECT_EQ(rig.state().bound, 60us + growth(500ms, kAgeing));
 }
 
-TEST(ClockEstimator, AddsWhatItCannotTellFromAStep) {
+TEST(ClockEstimator, AddsWhatItCannotDistinguishFromAStep) {
   Rig rig;
   rig.hear();
   rig.now.wall += 600ns;
@@ -137,7 +137,7 @@ TEST(ClockEstimator, FallsIntoHoldoverWhenChronydLearnsNothing) {
   EXPECT_EQ(rig.state().bound, 60us + growth(29s, kAgeing)) << "still true";
 }
 
-TEST(ClockEstimator, HasNoBoundWhenChronydIsSilent) {
+TEST(ClockEstimator, HasNoBoundWhenChronydDoesNotAnswer) {
   Rig rig;
   rig.hear();
   rig.pass(ClockEstimator::kSilentAfter);
@@ -175,7 +175,7 @@ TEST(ClockEstimator, TakesAnnouncedLeapSecondsForNormal) {
   }
 }
 
-TEST(ClockEstimator, HasNoBoundAfterAStepUntilChronydMeasuredAnew) {
+TEST(ClockEstimator, HasNoBoundAfterAStepUntilChronydMeasuredAgain) {
   for (const Duration by : {Duration(200ms), Duration(-200ms), Duration(1h), Duration(-1h)}) {
     Rig rig;
     rig.hear();
@@ -197,7 +197,7 @@ TEST(ClockEstimator, HasNoBoundAfterAStepUntilChronydMeasuredAnew) {
   }
 }
 
-TEST(ClockEstimator, CountsAnewWhenTheClockIsSteppedAgain) {
+TEST(ClockEstimator, CountsFromZeroWhenTheClockIsSteppedAgain) {
   Rig rig;
   rig.hear();
   rig.step(200ms);
@@ -231,7 +231,7 @@ TEST(ClockEstimator, KnowsThatALocalReferenceIsStillBeingSlewed) {
   EXPECT_EQ(rig.state().bound, 40us);
 }
 
-TEST(ClockEstimator, HoldsOutWhenItHearsNoMoreFromTheReferencePc) {
+TEST(ClockEstimator, HoldsOverWithoutReportsOfTheReferencePc) {
   Rig rig;
   rig.hear();
   rig.estimator.on_reference(ReferenceReport{kPc1, {}}, rig.now.mono);
@@ -276,7 +276,7 @@ TEST(ClockEstimator, StatesTheDistanceFromTheReferencePcOnceThatIsKnownLongEnoug
 }
 
 // What chronyd says here may go back to a measurement 256 intervals ago.
-TEST(ClockEstimator, GoesByTheLeastThatTheReferencePcSaidInTheTimeThatCounts) {
+TEST(ClockEstimator, UsesTheLeastReportOfTheReferencePcInTheTimeThatCounts) {
   Rig rig;
   rig.tracking.root = {520us, 1060us};
   hear_with_reference(rig, {kPc1, {500us, 1000us}}, 300);
@@ -290,7 +290,7 @@ TEST(ClockEstimator, GoesByTheLeastThatTheReferencePcSaidInTheTimeThatCounts) {
   EXPECT_EQ(rig.state().bound, 60us);
 }
 
-TEST(ClockEstimator, StatesTheDistanceFromTheRootWhenItFollowsSomebodyElse) {
+TEST(ClockEstimator, StatesTheDistanceFromTheRootWhenItFollowsAnotherSource) {
   Rig rig;
   rig.tracking.root = {520us, 1060us};
   hear_with_reference(rig, {kPc1, {500us, 1000us}}, 300);
@@ -300,7 +300,7 @@ TEST(ClockEstimator, StatesTheDistanceFromTheRootWhenItFollowsSomebodyElse) {
   EXPECT_EQ(rig.state().bound, 1060us);
 }
 
-TEST(ClockEstimator, TakesNonsenseForNoAnswer) {
+TEST(ClockEstimator, TreatsNonsenseAsNoAnswer) {
   const auto refused = [](auto spoil) {
     Rig rig;
     rig.hear();

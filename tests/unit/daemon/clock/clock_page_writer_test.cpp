@@ -58,7 +58,7 @@ ClockPageState state() {
   return made;
 }
 
-TEST_F(ClockPageWriterTest, ANewPageSaysNothing) {
+TEST_F(ClockPageWriterTest, ANewPageStatesNothing) {
   const ClockPageWriter writer = open();
   EXPECT_EQ(clock_error_at(writer.page(), WallClock::now()), std::nullopt);
   EXPECT_EQ(status_of(writer.page()), ClockStatus::unknown);
@@ -92,7 +92,7 @@ TEST_F(ClockPageWriterTest, ThePageOutlivesItsDssmdForTheNextOne) {
   EXPECT_EQ(read.base_wall, Time(8s));
 }
 
-TEST_F(ClockPageWriterTest, APageOfAnotherBootIsReplacedAndStaysWithWhoHasItMapped) {
+TEST_F(ClockPageWriterTest, APageOfAnotherBootIsReplacedAndStaysMapped) {
   ClockPageWriter writer = open();
   writer.store(state());
   const ClockPage& old = mapped(writer);

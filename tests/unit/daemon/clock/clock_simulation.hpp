@@ -33,7 +33,7 @@ class SimulatedPc {
   };
   // What the bound was in the run.
   struct Tally {
-    int looks = 0;
+    int observations = 0;
     int stated = 0;  // looks with a bound
     int not_covered = 0;
     int steps = 0;
@@ -200,7 +200,7 @@ class SimulatedPc {
   // What chronyd learned since it was asked is not known yet; if it is for the worse, it may slew
   // beyond the bound until it is asked again. Otherwise the bound must cover the true error.
   void check() {
-    ++tally_.looks;
+    ++tally_.observations;
     tally_.most_ns = std::max(tally_.most_ns, std::abs(clock_error_));
     const ClockSnapshot state = this->state();
     if (state.bound == kUnknownClockError) return;

@@ -29,15 +29,16 @@ void expect_covered(const Traits& traits, const ClockEstimator::Settings& settin
                     double least_stated = 0.5) {
   const std::uint32_t seed = first_seed();
   SCOPED_TRACE("DSSM_TEST_SEED=" + std::to_string(seed));
-  double looks = 0, stated = 0;
+  double observations = 0, stated = 0;
   for (std::uint32_t i = 0; i < kRuns; ++i) {
     SimulatedPc pc(traits, settings, seed + i);
     pc.run(time);
     EXPECT_EQ(pc.tally().not_covered, 0) << "PC " << i << ", by " << pc.tally().worst_ns << " ns";
-    looks += pc.tally().looks;
+    observations += pc.tally().observations;
     stated += pc.tally().stated;
   }
-  EXPECT_GT(stated, looks * least_stated) << "a bound that is never stated covers everything";
+  EXPECT_GT(stated, observations * least_stated)
+      << "a bound that is never stated covers everything";
 }
 
 int not_covered(const Traits& traits, const ClockEstimator::Settings& settings) {

@@ -13,7 +13,7 @@ using namespace std::chrono_literals;
 // No tick came while we looked: twice in a row it would have been another one.
 Tick last_whole() {
   Tick tick = Tick::last();
-  for (int looks = 0; looks < 1000; ++looks) {
+  for (int attempts = 0; attempts < 1000; ++attempts) {
     const Tick next = Tick::last();
     if (next.difference == tick.difference) return tick;
     tick = next;

@@ -32,15 +32,15 @@ class ClockWatchTest : public testing::Test, protected ClockWatch::Observer {
   clock::Tick tick;
   clock::Tracking tracking;
   Duration age{};  // of its last measurement
-  bool mute = false;
-  int asked = 0;
-  FakeChronyd chronyd{loop, [this](const FakeChronyd::Question& question) {
-                        ++asked;
+  bool is_silent = false;
+  int requests = 0;
+  FakeChronyd chronyd{loop, [this](const FakeChronyd::Request& request) {
+                        ++requests;
                         tracking.updated = now.wall - tracking.offset - age;
-                        if (!mute) chronyd.answer(question, reply_of(tracking));
+                        if (!is_silent) chronyd.answer(request, reply_of(tracking));
                       }};
   std::unique_ptr<ClockWatch> watch;
-  int looks = 0;
+  int clock_events = 0;
 
   ClockWatchTest() {
     tracking.reference_id = 0x0a000001;
@@ -51,7 +51,7 @@ class ClockWatchTest : public testing::Test, protected ClockWatch::Observer {
     tracking.root = {20us, 60us};
     restart();
   }
-  void on_clock() override { ++looks; }
+  void on_clock() override { ++clock_events; }
 
   void restart() {
     const ClockWatch::Options options{
@@ -63,14 +63,14 @@ class ClockWatchTest : public testing::Test, protected ClockWatch::Observer {
     now.mono += time;
     now.wall += time;
   }
-  void until_looks(int count) {
-    run_until(loop, [&, wanted = looks + count] { return looks >= wanted; });
+  void until_events(int count) {
+    run_until(loop, [&, wanted = clock_events + count] { return clock_events >= wanted; });
   }
   // Until something was logged that has `text` in it.
-  void until_told(const std::string& text) {
-    run_until(loop, [&] { return told(text) > 0; });
+  void until_logged(const std::string& text) {
+    run_until(loop, [&] { return logged(text) > 0; });
   }
-  long told(const std::string& text) const {
+  long logged(const std::string& text) const {
     return std::count_if(logger.lines.begin(), logger.lines.end(), [&](const std::string& line) {
       return line.find(text) != std::string::npos;
     });
@@ -84,7 +84,7 @@ TEST_F(ClockWatchTest, StatesABoundAfterTheFirstAnswer) {
   EXPECT_EQ(watch->state().status, ClockStatus::unknown);
   EXPECT_EQ(watch->source(), std::nullopt);
   EXPECT_EQ(watch->state().update_interval, 0s);
-  until_looks(1);
+  until_events(1);
   const ClockSnapshot state = watch->state();
   EXPECT_EQ(state.status, ClockStatus::synchronized);
   EXPECT_EQ(state.basis, ClockBasis::root);
@@ -93,103 +93,104 @@ TEST_F(ClockWatchTest, StatesABoundAfterTheFirstAnswer) {
   ASSERT_TRUE(watch->source());
   EXPECT_EQ(watch->source()->str(), "10.0.0.1");
   EXPECT_NEAR(static_cast<double>(watch->state().update_interval.count()), 1e9, 1e3);
-  until_looks(2);
+  until_events(2);
   EXPECT_EQ(logger.lines,
             std::vector<std::string>({"this PC's clock is within 0.060 ms of the right "
                                       "time (limit 1.500 ms)"}))
       << "what does not change is told once";
 }
 
-TEST_F(ClockWatchTest, TellsThatChronydIsNotThereGoesAndComesBack) {
+TEST_F(ClockWatchTest, LogsThatChronydIsMissingStopsAndStartsAgain) {
   chronyd.stop();
-  until_told("warning: there is no chronyd at '" + chronyd.address().str() + "'");
+  until_logged("warning: there is no chronyd at '" + chronyd.address().str() + "'");
   EXPECT_EQ(watch->state().status, ClockStatus::unknown) << "it has never been heard";
-  until_looks(2);
+  until_events(2);
   EXPECT_EQ(logger.lines.size(), 1u);
   chronyd.start();
-  until_told("answers again; this PC's clock is within");
+  until_logged("answers again; this PC's clock is within");
   chronyd.stop();
-  until_looks(1);
-  EXPECT_EQ(told("there is no chronyd"), 2);
+  until_events(1);
+  EXPECT_EQ(logged("there is no chronyd"), 2);
   EXPECT_EQ(watch->state().status, ClockStatus::out_of_bounds);
   EXPECT_EQ(watch->state().reason, ClockReason::no_chronyd);
   EXPECT_EQ(watch->source(), std::nullopt);
   chronyd.start();
   until_status(ClockStatus::synchronized);
-  until_looks(1);
-  EXPECT_EQ(told("answers again"), 2);
+  until_events(1);
+  EXPECT_EQ(logged("answers again"), 2);
 }
 
-TEST_F(ClockWatchTest, TellsThatChronydIsSilent) {
-  until_looks(1);
-  mute = true;
+TEST_F(ClockWatchTest, LogsThatChronydDoesNotAnswer) {
+  until_events(1);
+  is_silent = true;
   pass(4s);
   EXPECT_EQ(watch->state().reason, ClockReason::silent) << "nobody waits for a callback";
-  until_told("warning: chronyd at");
+  until_logged("warning: chronyd at");
   EXPECT_EQ(
-      told("does not tell how this PC's clock is; the clock has no bound: it does not answer"), 1);
-  until_looks(2);
+      logged("does not tell how this PC's clock is; the clock has no bound: it does not answer"),
+      1);
+  until_events(2);
   EXPECT_EQ(logger.lines.size(), 2u);
-  mute = false;
-  until_told("answers again");
+  is_silent = false;
+  until_logged("answers again");
 }
 
-TEST_F(ClockWatchTest, TellsThatChronydHasAlwaysBeenSilent) {
-  mute = true;
-  until_looks(1);
+TEST_F(ClockWatchTest, LogsThatChronydHasNeverAnswered) {
+  is_silent = true;
+  until_events(1);
   EXPECT_TRUE(logger.lines.empty()) << "it may be starting";
   pass(4s);
-  until_told("does not tell");
+  until_logged("does not tell");
   EXPECT_EQ(watch->state().status, ClockStatus::unknown);
 }
 
 TEST_F(ClockWatchTest, GivesAStartingChronydTime) {
   chronyd.stop();
-  until_looks(1);
-  mute = true;
+  until_events(1);
+  is_silent = true;
   chronyd.start();
-  run_until(loop, [&] { return asked == 2; });
+  run_until(loop, [&] { return requests == 2; });
   EXPECT_EQ(logger.lines.size(), 1u) << "there is no chronyd";
   pass(4s);
-  until_told("does not tell");
+  until_logged("does not tell");
 }
 
-TEST_F(ClockWatchTest, TakesNonsenseForNoAnswer) {
+TEST_F(ClockWatchTest, TreatsNonsenseAsNoAnswer) {
   tracking.root.delay = -1s;
-  until_looks(1);
+  until_events(1);
   EXPECT_EQ(watch->state().status, ClockStatus::unknown);
   EXPECT_EQ(watch->source(), std::nullopt);
   pass(4s);
-  until_told("what it says cannot be");
+  until_logged("what it says cannot be");
 }
 
-TEST_F(ClockWatchTest, TellsThatChronydDoesNotKnowTheTime) {
+TEST_F(ClockWatchTest, LogsThatChronydIsNotSynchronized) {
   tracking.leap = clock::Tracking::kUnsynchronized;
-  until_told("warning: chronyd does not know the time, so");
+  until_logged("warning: chronyd does not know the time, so");
   EXPECT_EQ(watch->state().reason, ClockReason::unsynchronized);
   tracking.leap = 0;
-  until_told("this PC's clock is within");
+  until_logged("this PC's clock is within");
 }
 
-TEST_F(ClockWatchTest, TellsWhyTheClockIsTooFarAway) {
+TEST_F(ClockWatchTest, LogsWhyTheClockIsTooFarAway) {
   tracking.offset = -2ms;
-  until_told("more than its limit of 1.500 ms: it is off by 2.000 ms");
+  until_logged("more than its limit of 1.500 ms: it is off by 2.000 ms");
   EXPECT_EQ(watch->state().reason, ClockReason::too_far);
   tracking.offset = 1us;
-  until_told("is within");
+  until_logged("is within");
   tracking.root.delay = 4ms;
-  until_told("so far is the source that chronyd follows");
+  until_logged("so far is the source that chronyd follows");
 }
 
-TEST_F(ClockWatchTest, TellsThatChronydLearnsNothing) {
-  until_looks(1);
+TEST_F(ClockWatchTest, LogsThatChronydHasNoNewMeasurements) {
+  until_events(1);
   age = 8s;
-  until_told(
+  until_logged(
       "right time (limit 1.500 ms), but chronyd has learned nothing for 8.000 s: that grows by "
       "0.056 ms each second");
   EXPECT_EQ(watch->state().status, ClockStatus::holdover);
   age = 60s;
-  until_told(
+  until_logged(
       "warning: this PC's clock may be wrong by 3.435 ms, more than its limit of 1.500 ms: "
       "chronyd has learned nothing for 60.000 s");
 }
@@ -203,79 +204,80 @@ TEST_F(ClockWatchTest, VoidsTheBoundOfAClockThatWasSet) {
     // chronyd measures once for each question.
     for (int i = 1; i < clock::ClockEstimator::kUpdatesAfterStep; ++i) {
       pass(1s);
-      until_looks(1);
+      until_events(1);
       EXPECT_EQ(watch->state().reason, ClockReason::stepped) << i;
     }
     pass(1s);
-    until_looks(1);
+    until_events(1);
     EXPECT_EQ(watch->state().status, ClockStatus::synchronized);
   }
-  EXPECT_EQ(told("warning: this PC's clock was set forward by 3600.000 s; it is out of bounds"), 1);
-  EXPECT_EQ(told("warning: this PC's clock was set back by 200.000 ms; it is out of bounds"), 1);
-  EXPECT_EQ(told("is within"), 3);
+  EXPECT_EQ(logged("warning: this PC's clock was set forward by 3600.000 s; it is out of bounds"),
+            1);
+  EXPECT_EQ(logged("warning: this PC's clock was set back by 200.000 ms; it is out of bounds"), 1);
+  EXPECT_EQ(logged("is within"), 3);
   EXPECT_EQ(logger.lines.size(), 5u);
-  EXPECT_EQ(told("left out"), 0);
+  EXPECT_EQ(logged("left out"), 0);
 }
 
 TEST_F(ClockWatchTest, DoesNotFillTheLogWithSteps) {
-  until_looks(1);
+  until_events(1);
   const auto step = [this] {
     now.wall += 1s;
     watch->state();
   };
   for (int i = 0; i < 100; ++i) step();
-  EXPECT_EQ(told("was set"), 4);
+  EXPECT_EQ(logged("was set"), 4);
   pass(1min);
   step();
-  EXPECT_EQ(told("was set forward by 1.000 s (96 steps before this were left out);"), 1);
+  EXPECT_EQ(logged("was set forward by 1.000 s (96 steps before this were left out);"), 1);
 }
 
 TEST_F(ClockWatchTest, DoesNotFillTheLogWithChanges) {
   // Each answer is another change; the fifth and the sixth are too many.
   for (int i = 0; i < 6; ++i) {
     tracking.offset = i % 2 ? 2ms : 1ms;
-    until_looks(1);
+    until_events(1);
   }
   EXPECT_EQ(logger.lines.size(), 4u);
   EXPECT_NE(logger.lines.back().find("off by 2.000 ms"), std::string::npos);
   // The seventh is what lasts; it is told when there is room for it.
   tracking.offset = 1ms;
-  until_looks(1);
+  until_events(1);
   EXPECT_EQ(logger.lines.size(), 4u);
   pass(1min);
-  until_told(
+  until_logged(
       "is within 1.050 ms of the right time (limit 1.500 ms) (2 changes before this were left "
       "out)");
-  until_looks(1);
+  until_events(1);
   EXPECT_EQ(logger.lines.size(), 5u);
 }
 
-TEST_F(ClockWatchTest, SeesWhatHappenedWhileNoDssmdRan) {
-  until_looks(1);
+TEST_F(ClockWatchTest, NoticesStepsThatHappenedWhileNoDssmdRan) {
+  until_events(1);
   const clock::Instant base = watch->base();
   EXPECT_EQ(base.mono, now.mono);
   pass(10s);
   restart();
   watch->resume(base);
   EXPECT_EQ(watch->base().mono, base.mono);
-  until_looks(1);
+  until_events(1);
   EXPECT_EQ(watch->state().status, ClockStatus::synchronized) << "nothing has";
   pass(10s);
   now.wall -= 5ms;
   restart();
   watch->resume(base);
-  until_looks(1);
+  until_events(1);
   EXPECT_EQ(watch->state().reason, ClockReason::stepped);
-  EXPECT_EQ(told("was set back by 5.000 ms"), 1);
+  EXPECT_EQ(logged("was set back by 5.000 ms"), 1);
 }
 
 TEST_F(ClockWatchTest, MeasuresAgainstTheReferencePc) {
   tracking.root = {800us, 100us};
   const clock::ReferenceReport report{tracking.reference_id, {780us, 60us}};
-  until_looks(1);
+  until_events(1);
   watch->on_reference(report);
   pass(clock::ClockEstimator::kMeasurementsBack * 1001ms);
-  until_looks(1);
+  until_events(1);
   watch->on_reference(report);
   const ClockSnapshot state = watch->state();
   EXPECT_EQ(state.basis, ClockBasis::reference);
@@ -286,13 +288,13 @@ TEST_F(ClockWatchTest, MeasuresAgainstTheReferencePc) {
 }
 
 TEST_F(ClockWatchTest, TakesOtherLimits) {
-  until_looks(1);
+  until_events(1);
   watch->set({.limit = 50us});
   EXPECT_EQ(watch->state().reason, ClockReason::too_far);
-  until_told("more than its limit of 0.050 ms");
+  until_logged("more than its limit of 0.050 ms");
 }
 
-TEST_F(ClockWatchTest, SaysCheaplyThatNothingHasChanged) {
+TEST_F(ClockWatchTest, ReportsCheaplyThatNothingHasChanged) {
   tick = {now.mono, now.wall - time_from_ns(0) - now.mono.time_since_epoch()};
   EXPECT_TRUE(watch->may_differ()) << "nothing was known";
   EXPECT_FALSE(watch->may_differ());
@@ -316,8 +318,8 @@ TEST_F(ClockWatchTest, LivesWithoutDescriptors) {
   none.rlim_cur = static_cast<rlim_t>(free);
   ASSERT_EQ(::setrlimit(RLIMIT_NOFILE, &none), 0);
   restart();
-  until_looks(1);
-  EXPECT_EQ(told("warning: watch the wall clock for steps: Too many open files"), 1);
+  until_events(1);
+  EXPECT_EQ(logged("warning: watch the wall clock for steps: Too many open files"), 1);
   ASSERT_EQ(::setrlimit(RLIMIT_NOFILE, &before), 0);
   until_status(ClockStatus::synchronized);
 }

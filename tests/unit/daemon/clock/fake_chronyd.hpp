@@ -97,15 +97,15 @@ inline Datagram reply_of(const clock::Tracking& tracking) {
 
 class FakeChronyd {
  public:
-  struct Question {
+  struct Request {
     Datagram bytes;
     sockaddr_in from{};
     std::uint32_t sequence() const { return number_at(bytes, 8); }
   };
-  using OnQuestion = std::function<void(const Question&)>;
+  using OnRequest = std::function<void(const Request&)>;
 
-  FakeChronyd(const EventLoop& loop, OnQuestion on_question)
-      : loop_(loop), on_question_(std::move(on_question)) {
+  FakeChronyd(const EventLoop& loop, OnRequest on_request)
+      : loop_(loop), on_request_(std::move(on_request)) {
     start();
   }
 
@@ -127,29 +127,29 @@ class FakeChronyd {
     socket_.reset();
   }
 
-  void send(const Question& to, const Datagram& bytes) {
+  void send(const Request& to, const Datagram& bytes) {
     ::sendto(socket_.get(), bytes.data(), bytes.size(), 0,
              reinterpret_cast<const sockaddr*>(&to.from), sizeof to.from);
   }
-  void answer(const Question& question, Datagram reply) {
-    put_number(reply, kReplySequence, question.sequence());
-    send(question, reply);
+  void answer(const Request& request, Datagram reply) {
+    put_number(reply, kReplySequence, request.sequence());
+    send(request, reply);
   }
 
  private:
   void take() {
-    Question question;
-    question.bytes.resize(1024);
-    socklen_t length = sizeof question.from;
-    const ssize_t size = ::recvfrom(socket_.get(), question.bytes.data(), question.bytes.size(), 0,
-                                    reinterpret_cast<sockaddr*>(&question.from), &length);
+    Request request;
+    request.bytes.resize(1024);
+    socklen_t length = sizeof request.from;
+    const ssize_t size = ::recvfrom(socket_.get(), request.bytes.data(), request.bytes.size(), 0,
+                                    reinterpret_cast<sockaddr*>(&request.from), &length);
     if (size < 0) return;  // an earlier answer was refused
-    question.bytes.resize(static_cast<std::size_t>(size));
-    on_question_(question);
+    request.bytes.resize(static_cast<std::size_t>(size));
+    on_request_(request);
   }
 
   const EventLoop& loop_;
-  OnQuestion on_question_;
+  OnRequest on_request_;
   wire::SocketAddress address_;
   UniqueFd socket_;
   EventSource readable_;

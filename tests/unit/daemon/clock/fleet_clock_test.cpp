@@ -58,12 +58,12 @@ class FleetClockTest : public testing::Test {
     fleet.emplace(loop,
                   FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
                   *std::move(page), own, kSelf, catalog, logger);
-    fleet->on_new_generation([this] { ++news; });
+    fleet->on_new_generation([this] { ++generations; });
     wait([this] { return own->clock.status != ClockStatus::unknown; });
     return *fleet;
   }
   void wait(const std::function<bool()>& done) { run_until(loop, done); }
-  void follow_nobody() {
+  void follow_no_source() {
     tracking.reference_id = clock::kLocalReferenceId;
     tracking.root = {};
     tracking.offset = 0us;
@@ -83,22 +83,22 @@ class FleetClockTest : public testing::Test {
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   LogRecorder logger;
   clock::Tracking tracking;
-  FakeChronyd chronyd{loop, [this](const FakeChronyd::Question& question) {
+  FakeChronyd chronyd{loop, [this](const FakeChronyd::Request& request) {
                         tracking.updated = WallClock::now() - tracking.offset - 10ms;
-                        chronyd.answer(question, reply_of(tracking));
+                        chronyd.answer(request, reply_of(tracking));
                       }};
   Catalog catalog{"self"};
   ClockPolicies policies;
   std::shared_ptr<wire::ClockReport> own = std::make_shared<wire::ClockReport>();
   std::optional<FleetClock> fleet;
-  int news = 0;
+  int generations = 0;
 
  private:
   std::string folder_;
 };
 
-TEST_F(FleetClockTest, OnePcThatFollowsNobodyIsItsOwnReference) {
-  follow_nobody();
+TEST_F(FleetClockTest, APcWithoutASourceIsItsOwnReference) {
+  follow_no_source();
   start();
   EXPECT_EQ(own->clock.status, ClockStatus::synchronized);
   EXPECT_EQ(own->clock.basis, ClockBasis::own);
@@ -106,7 +106,7 @@ TEST_F(FleetClockTest, OnePcThatFollowsNobodyIsItsOwnReference) {
   EXPECT_EQ(own->chain.size(), 1U);
   EXPECT_LT(own->clock.bound, 50us);
   EXPECT_FALSE(own->root_is_utc);
-  EXPECT_EQ(news, 1) << "others have to know";
+  EXPECT_EQ(generations, 1) << "others have to know";
 }
 
 TEST_F(FleetClockTest, OwnStreamsThatOthersWriteToAreAsFarOffAsThisClock) {
@@ -154,7 +154,7 @@ TEST_F(FleetClockTest, ASampleMayBeAsWrongAsIsLeftOfTheLimit) {
   EXPECT_LT(found.added, own->clock.bound + 200us);
 }
 
-TEST_F(FleetClockTest, NothingIsGoodOfAHostThatFollowsSomebodyElse) {
+TEST_F(FleetClockTest, NothingIsGoodOfAHostThatFollowsAnotherReference) {
   add_reference();
   start();
   EXPECT_LT(assessed(host(kOther, "pc3", 5us)).limit, 0us);
@@ -221,7 +221,7 @@ TEST_F(FleetClockTest, ServesOthersFromWhenTheClockWasFirstKnown) {
 }
 
 TEST_F(FleetClockTest, ProgramsOfThisPcFindTheBoundOnThePage) {
-  follow_nobody();
+  follow_no_source();
   start();
   const UniqueFd file = fleet->page_for_reading().value();
   const clock::ClockPage& page = **clock::map_clock_page_untrusted(file.get());

@@ -26,7 +26,7 @@ class HostClockLogTest : public testing::Test, protected Logger {
   HostClockLog log{logger()};
 };
 
-TEST_F(HostClockLogTest, TellsWhenAClockBecomesBadAndWhenItIsGoodAgain) {
+TEST_F(HostClockLogTest, LogsWhenAClockBecomesBadAndWhenItIsGoodAgain) {
   log.update(kFirst, "pc1", "", kBegin);
   EXPECT_TRUE(lines.empty()) << "all is well";
   log.update(kFirst, "pc1", kReason, kBegin + 1s);
@@ -47,7 +47,7 @@ TEST_F(HostClockLogTest, LetsAHostComeUpFirst) {
   EXPECT_EQ(lines.size(), 1U);
 }
 
-TEST_F(HostClockLogTest, KnowsHostsApartAndForgetsThem) {
+TEST_F(HostClockLogTest, DistinguishesHostsAndForgetsThem) {
   log.update(kFirst, "pc1", "", kBegin);
   log.update(kSecond, "pc2", kReason, kBegin);
   EXPECT_TRUE(lines.empty());

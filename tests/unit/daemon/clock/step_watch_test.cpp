@@ -24,7 +24,7 @@ std::string timer_info() {
   return "";
 }
 
-TEST(StepWatch, AsksToBeToldWhenTheWallClockIsSet) {
+TEST(StepWatch, IsNotifiedWhenTheWallClockIsSet) {
   const EventLoop loop = EventLoop::open().value();
   int calls = 0;
   const auto watch = StepWatch::open(loop, [&] { ++calls; }).value();

@@ -35,23 +35,25 @@ StreamInfo stream(const std::string& name, const std::string& owner,
 // Writes down what it is told.
 class Recorder final : public CatalogObserver {
  public:
-  void on_host_up(const KnownHost& known) override { told.push_back("up " + known.greeting.host); }
+  void on_host_up(const KnownHost& known) override {
+    events.push_back("up " + known.greeting.host);
+  }
   void on_host_down(const KnownHost& known, const Error& why) override {
-    told.push_back("down " + known.greeting.host + ": " + why.message);
+    events.push_back("down " + known.greeting.host + ": " + why.message);
   }
   void on_remote_stream_added(const KnownHost&, const StreamInfo& info) override {
-    told.push_back("+" + info.id.str());
+    events.push_back("+" + info.id.str());
   }
   void on_remote_stream_removed(const KnownHost&, const StreamInfo& info) override {
-    told.push_back("-" + info.id.str());
+    events.push_back("-" + info.id.str());
   }
-  std::vector<std::string> take() { return std::exchange(told, {}); }
-  std::vector<std::string> told;
+  std::vector<std::string> take() { return std::exchange(events, {}); }
+  std::vector<std::string> events;
 };
 
 using Told = std::vector<std::string>;
 
-TEST(Catalog, TellsWhatComesAndGoesInOrder) {
+TEST(Catalog, ReportsAdditionsAndRemovalsInOrder) {
   Catalog catalog("pc1");
   Recorder recorder;
   catalog.add_observer(recorder);
@@ -68,10 +70,10 @@ TEST(Catalog, TellsWhatComesAndGoesInOrder) {
   EXPECT_TRUE(catalog.hosts().empty());
   catalog.remove_observer(recorder);
   catalog.host_up(host("pc2", 2), at("10.0.0.2"));
-  EXPECT_TRUE(recorder.told.empty());
+  EXPECT_TRUE(recorder.events.empty());
 }
 
-TEST(Catalog, TellsANewRingAndNotTheSameOneAgain) {
+TEST(Catalog, ReportsANewRingAndNotTheSameOneAgain) {
   Catalog catalog("pc1");
   Recorder recorder;
   catalog.host_up(host("pc2", 2), at("10.0.0.2"));
@@ -159,7 +161,7 @@ TEST(Catalog, NamesBothAddressesOfAHostsNameThatTwoClaim) {
       << "the stream itself is not in doubt";
 }
 
-TEST(Catalog, SaysWhatItKnowsWhenItDoesNotFindSomething) {
+TEST(Catalog, ReportsWhatItKnowsWhenItDoesNotFindAStream) {
   Catalog catalog("pc1");
   auto found = catalog.find_owner({"lidar", 0, ""});
   ASSERT_FALSE(found);
@@ -216,17 +218,17 @@ TEST(Catalog, LeavesOutFieldsWhenOneHostDescribesTooMuch) {
   EXPECT_EQ(catalog.find(id_of(2))->stream_bytes, 0u) << "all is given back";
 }
 
-TEST(Catalog, LetsAnObserverLeaveWhileItIsTold) {
+TEST(Catalog, LetsAnObserverLeaveDuringItsNotification) {
   struct Leaving final : CatalogObserver {
     explicit Leaving(Catalog& of) : catalog(of) {}
     void on_host_up(const KnownHost&) override {
       catalog.remove_observer(*this);
       if (other) catalog.remove_observer(*other);
-      ++told;
+      ++events;
     }
     Catalog& catalog;
     CatalogObserver* other = nullptr;
-    int told = 0;
+    int events = 0;
   };
   Catalog catalog("pc1");
   Leaving first(catalog), second(catalog);
@@ -234,8 +236,8 @@ TEST(Catalog, LetsAnObserverLeaveWhileItIsTold) {
   catalog.add_observer(first);
   catalog.add_observer(second);
   catalog.host_up(host("pc2", 2), at("10.0.0.2"));
-  EXPECT_EQ(first.told, 1);
-  EXPECT_EQ(second.told, 0) << "it is gone";
+  EXPECT_EQ(first.events, 1);
+  EXPECT_EQ(second.events, 0) << "it is gone";
 }
 
 }  // namespace

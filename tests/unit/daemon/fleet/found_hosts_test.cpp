@@ -43,7 +43,7 @@ class FoundHostsTest : public testing::Test {
     peers->expect_finder(insecure);
   }
   static wire::Address at(ScriptedPeer& peer) { return peer.address(); }
-  wire::Address nobody() { return ScriptedHost(loop).address(); }
+  wire::Address closed_address() { return ScriptedHost(loop).address(); }
   static FoundHost host_at(const std::vector<wire::Address>& addresses,
                            const std::string& name = "pc2") {
     FoundHost host;
@@ -90,7 +90,7 @@ TEST_F(FoundHostsTest, GoIntoTheCatalogWithTheirStreams) {
 
 TEST_F(FoundHostsTest, AreDialedAtTheirAddressesInTurn) {
   start();
-  peers->on_host_found(host_at({nobody(), nobody(), at(*one), at(*two)}));
+  peers->on_host_found(host_at({closed_address(), closed_address(), at(*one), at(*two)}));
   wait_until_up();
   EXPECT_EQ(address_in_catalog(), at(*one));
   run_without_timers();
@@ -121,7 +121,7 @@ TEST_F(FoundHostsTest, AreReachedAtAnotherAddressWhenTheFirstIsGone) {
   EXPECT_EQ(address_in_catalog(), at(*two)) << "which is where channels go";
 }
 
-TEST_F(FoundHostsTest, AreReachedAtAnotherAddressWhenTheFirstFallsSilent) {
+TEST_F(FoundHostsTest, AreReachedAtAnotherAddressWhenTheFirstStopsAnswering) {
   one->answers_heartbeat = false;  // and takes connections all the same
   start();
   peers->on_host_found(host_at({at(*one), at(*two)}));
@@ -150,7 +150,7 @@ TEST_F(FoundHostsTest, KeepAConnectionThatWorksWhenTheAddressesChange) {
 
 TEST_F(FoundHostsTest, AreDialedAtOnceWhenTheyHaveNewAddresses) {
   start();
-  peers->on_host_found(host_at({nobody()}));
+  peers->on_host_found(host_at({closed_address()}));
   wait([&] { return host().state() == local::Host::DOWN && host().since_ns() > 1'600'000'000; });
   EXPECT_NE(host().error().find("refused"), std::string::npos) << host().error();
   EXPECT_NE(peers->report().unavailable_peers().find("'pc2' (connect to"), std::string::npos)
@@ -197,7 +197,7 @@ TEST_F(FoundHostsTest, StopTryingWhenTheConfiguredConnectionComesUp) {
   wait([&] { return catalog.find(pc2.host_id) != nullptr; });
   run_without_timers();
   const int before = two->connections();
-  peers->on_host_found(host_at({at(*two), nobody()}));  // which would be dialed at once
+  peers->on_host_found(host_at({at(*two), closed_address()}));  // which would be dialed at once
   run_without_timers();
   EXPECT_EQ(two->connections(), before);
   ASSERT_EQ(peers->report().hosts().size(), 1u);
@@ -256,7 +256,7 @@ TEST_F(FoundHostsTest, StayWhenMdnsFindsThemAgain) {
 
 TEST_F(FoundHostsTest, GoAtOnceWhenMdnsLosesThemWhileTheyAreDown) {
   start();
-  peers->on_host_found(host_at({nobody()}));
+  peers->on_host_found(host_at({closed_address()}));
   wait([&] { return host().state() == local::Host::DOWN; });
   peers->on_host_lost(pc2.host_id);
   peers->on_host_lost(wire::host_id_for("pc3"));
@@ -279,7 +279,7 @@ TEST_F(FoundHostsTest, AreNotTakenForAnotherThatAnswersAtTheirAddress) {
   EXPECT_EQ(address_in_catalog(), at(*two)) << "the next address is tried too";
 }
 
-TEST_F(FoundHostsTest, AreNotLookedForWhereAnotherHostIsUp) {
+TEST_F(FoundHostsTest, AreNotDialedWhereAnotherHostIsUp) {
   start();
   peers->on_host_found(host_at({at(*one)}));
   wait_until_up();
@@ -503,10 +503,10 @@ TEST_F(FoundHostsTest, AreWaitedForWhileMdnsWorks) {
   const MonoTime begin = loop.now();
   start({at(*one)});
   EXPECT_FALSE(peers->startup_is_over());
-  bool told = false;
-  peers->on_startup_over([&] { told = true; });
+  bool is_over = false;
+  peers->on_startup_over([&] { is_over = true; });
   peers->on_mdns_state(mdns_in(MdnsPhase::running));
-  wait([&] { return told; });
+  wait([&] { return is_over; });
   // The loop's clock is as coarse as the kernel's ticks.
   EXPECT_GE(loop.now() - begin, Peers::kStartupTime - std::chrono::milliseconds(20));
 }

@@ -46,10 +46,10 @@ TEST_F(PeersTest, AreSettledAtOnceWithoutAny) {
 TEST_F(PeersTest, PutAHostAndItsStreamsIntoTheCatalog) {
   one.streams = {"lidar", "imu"};
   start({&one});
-  bool told = false;
-  peers->on_startup_over([&] { told = true; });
+  bool is_over = false;
+  peers->on_startup_over([&] { is_over = true; });
   EXPECT_FALSE(peers->startup_is_over());
-  wait([&] { return told; });
+  wait([&] { return is_over; });
   EXPECT_TRUE(peers->startup_is_over());
   ASSERT_EQ(catalog.hosts().size(), 1u);
   const KnownHost& known = catalog.hosts().begin()->second;
@@ -70,7 +70,7 @@ TEST_F(PeersTest, PutAHostAndItsStreamsIntoTheCatalog) {
   EXPECT_TRUE(log.contains("host 'pc2'"));
 }
 
-TEST_F(PeersTest, MeasureTheRoundTripAndHearOfTheClock) {
+TEST_F(PeersTest, MeasureTheRoundTripAndTakeTheClock) {
   start({&one});
   for (const int milliseconds : {5, 3, 7, 0}) {
     one.delay = std::chrono::milliseconds(milliseconds);
@@ -95,7 +95,7 @@ TEST_F(PeersTest, TakeAHostOutWhenItsConnectionBreaks) {
   EXPECT_EQ(host(0).state(), local::Host::UP);
 }
 
-TEST_F(PeersTest, TakeAHostOutWhenItFallsSilent) {
+TEST_F(PeersTest, TakeAHostOutWhenItStopsAnswering) {
   start({&one});
   wait([&] { return one.pings >= 1; });
   one.answers_heartbeat = false;
@@ -110,7 +110,7 @@ TEST_F(PeersTest, TakeAHostOutWhenItFallsSilent) {
   wait([&] { return !catalog.hosts().empty(); });
 }
 
-TEST_F(PeersTest, LeaveAPeerAloneThatTalksNonsenseAboutItsStreams) {
+TEST_F(PeersTest, RefuseAPeerThatSendsInvalidStreamEvents) {
   start({&one});
   wait_for_startup();
   one.send_event("a:b", false);
@@ -120,7 +120,7 @@ TEST_F(PeersTest, LeaveAPeerAloneThatTalksNonsenseAboutItsStreams) {
   EXPECT_NE(host(0).error().find("a stream event"), std::string::npos) << host(0).error();
 }
 
-TEST_F(PeersTest, LetNobodySpeakForAnotherHost) {
+TEST_F(PeersTest, LetNoPeerReportStreamsOfAnotherHost) {
   start({&one});
   wait_for_startup();
   one.send_event("lidar", false, "pc3");
@@ -128,15 +128,15 @@ TEST_F(PeersTest, LetNobodySpeakForAnotherHost) {
   EXPECT_TRUE(catalog.has({"lidar", 0, "pc2"}));
 }
 
-TEST_F(PeersTest, SettleWhenAPeerIsNotThereAndSayWhy) {
-  const wire::Address nobody = ScriptedHost(loop).address();
-  peers = std::make_unique<Peers>(loop, resolver, std::vector{nobody}, self, catalog, log);
+TEST_F(PeersTest, SettleWhenAPeerIsNotThereAndReportWhy) {
+  const wire::Address closed = ScriptedHost(loop).address();
+  peers = std::make_unique<Peers>(loop, resolver, std::vector{closed}, self, catalog, log);
   wait_for_startup();
   EXPECT_EQ(host(0).state(), local::Host::DOWN);
   EXPECT_EQ(host(0).name(), "");
   EXPECT_EQ(host(0).reason(), local::Host::CONNECTION_REFUSED);
   EXPECT_NE(host(0).error().find("refused"), std::string::npos) << host(0).error();
-  EXPECT_NE(peers->report().unavailable_peers().find(nobody.str()), std::string::npos);
+  EXPECT_NE(peers->report().unavailable_peers().find(closed.str()), std::string::npos);
   wait([&] { return host(0).since_ns() > 300'000'000; });  // several attempts
   EXPECT_EQ(std::count_if(log.notices.begin(), log.notices.end(),
                           [](const std::string& line) {
@@ -146,7 +146,7 @@ TEST_F(PeersTest, SettleWhenAPeerIsNotThereAndSayWhy) {
       << "once, not at each attempt";
 }
 
-TEST_F(PeersTest, SettleAfterAWhileWhenAPeerSaysNothing) {
+TEST_F(PeersTest, SettleAfterAWhileWhenAPeerSendsNothing) {
   const UniqueFd listening = listen_on_loopback();  // accepts connections, and sends nothing
   const auto address =
       wire::Address::parse(wire::local_address(listening.get()).value().str()).value();
@@ -242,7 +242,7 @@ TEST_F(PeersTest, DoNotShowTheStreamsOfAHostWithTheirOwnName) {
 
 // --- configured peers change
 
-TEST_F(PeersTest, DialWhoIsConfiguredAnewAndKeepWhoStays) {
+TEST_F(PeersTest, DialNewlyConfiguredPeersAndKeepTheOthers) {
   start({&one});
   wait([&] { return one.watches == 1; });
   two.greet_as(greeting_of("pc3"));
@@ -254,7 +254,7 @@ TEST_F(PeersTest, DialWhoIsConfiguredAnewAndKeepWhoStays) {
   EXPECT_EQ(host(1).name(), "pc3");
 }
 
-TEST_F(PeersTest, DropWhoIsNotConfiguredAnyMoreAndTellWhoeverWaits) {
+TEST_F(PeersTest, DropPeersThatAreNoLongerConfiguredAndFailTheirRequests) {
   one.streams = {"lidar"};
   start({&one});
   wait([&] { return catalog.has({"lidar", 0, "pc2"}); });
@@ -271,16 +271,16 @@ TEST_F(PeersTest, DropWhoIsNotConfiguredAnyMoreAndTellWhoeverWaits) {
   EXPECT_NE(got.find("no longer among the peers"), std::string::npos) << got;
 }
 
-TEST_F(PeersTest, DropWhoWasNeverThere) {
-  const wire::Address nobody = ScriptedHost(loop).address();
-  peers = std::make_unique<Peers>(loop, resolver, std::vector{nobody}, self, catalog, log);
+TEST_F(PeersTest, DropPeersThatWereNeverUp) {
+  const wire::Address closed = ScriptedHost(loop).address();
+  peers = std::make_unique<Peers>(loop, resolver, std::vector{closed}, self, catalog, log);
   wait_for_startup();
   peers->set_configured({});
   wait([&] { return peers->report().hosts().empty(); });
   EXPECT_EQ(peers->report().unavailable_peers(), "");
 }
 
-TEST_F(PeersTest, DialAgainWhoComesBackIntoTheConfiguration) {
+TEST_F(PeersTest, DialAPeerAgainThatIsConfiguredAgain) {
   const std::vector<wire::Address> configured = {one.address()};
   start({&one});
   wait([&] { return one.watches == 1; });
@@ -346,7 +346,7 @@ TEST_F(PeersTest, BoundTheRequestsThatWait) {
   EXPECT_FALSE(catalog.hosts().empty()) << "the connection does not suffer";
 }
 
-TEST_F(PeersTest, MakeRoomForRequestsWithEachAnswer) {
+TEST_F(PeersTest, TakeFurtherRequestsAfterEachAnswer) {
   start({&one});
   wait_for_startup();
   PeerConnection& link = *peers->connection_to(one.host().greeting.host_id);
@@ -366,7 +366,7 @@ TEST_F(PeersTest, MakeRoomForRequestsWithEachAnswer) {
   }
 }
 
-TEST_F(PeersTest, EndAConnectionThatAnswersWhatNobodyAsked) {
+TEST_F(PeersTest, EndAConnectionThatAnswersWithoutARequest) {
   start({&one});
   wait_for_startup();
   net::Frame answer;

@@ -200,7 +200,7 @@ TEST(TypeHash, IsTheOneThatIsDocumented) {
   EXPECT_EQ(type_hash(type), 0xfa6373e11c664df0u);
 }
 
-TEST(TypeHash, TellsTypesApart) {
+TEST(TypeHash, DistinguishesTypes) {
   const TypeInfo type{"Odometry", 24, 8, {{"x", Scalar::float64, 0, 1, 0}}};
   std::vector<TypeInfo> others(7, type);
   others[0].name = "odometry";
@@ -225,7 +225,7 @@ TEST(ServiceRecordUntrusted, TakesBackWhatIsAnnounced) {
   }
 }
 
-TEST(ServiceRecordUntrusted, RefusesAnotherVersionWhateverElseItSays) {
+TEST(ServiceRecordUntrusted, RefusesAnotherVersionWhateverElseItHolds) {
   const std::string words = refusal(with(host_record().txt(), "txtvers", "2"));
   EXPECT_NE(words.find("version (txtvers) '2'"), std::string::npos) << words;
   EXPECT_NE(words.find("install the same DSSM"), std::string::npos) << words;

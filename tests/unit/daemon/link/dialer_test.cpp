@@ -110,10 +110,10 @@ class DialerTest : public testing::Test, protected Dialer::Observer {
     frames.push_back(std::move(frame));
     return {};
   }
-  void on_down(const Error& why) override {
+  void on_down(const Error& error) override {
     EXPECT_EQ(dialer->connection(), nullptr);
     up = false;
-    downs.push_back(why);
+    downs.push_back(error);
   }
 };
 
@@ -156,7 +156,7 @@ TEST_F(DialerTest, TriesTheAddressesThatItIsGivenInTurn) {
   EXPECT_TRUE(downs.empty());
 }
 
-TEST_F(DialerTest, BeginsBehindAnAddressThatIsOfNoUse) {
+TEST_F(DialerTest, ContinuesAfterAnAddressThatDoesNotWork) {
   RawServer talker(loop, "220 smtp ready\r\n", false);
   ScriptedHost owner(loop);
   const wire::SocketAddress good = wire::resolve_number(owner.address()).at(0);
@@ -201,15 +201,15 @@ TEST_F(DialerTest, LeavesAnAddressThatDoesNotAnswerForNewOnesAtOnce) {
   EXPECT_TRUE(up) << "what is up stays";
 }
 
-TEST_F(DialerTest, SaysWhyNoAddressOfANameWorked) {
+TEST_F(DialerTest, ReportsWhyNoAddressOfANameWorked) {
   answers = {closed_port(loop), closed_port(loop)};
   dial({"pc2", 1});
-  const Error& why = wait_for_down();
-  EXPECT_NE(why.message.find(answers[1].str()), std::string::npos) << why.message;
-  EXPECT_NE(why.message.find("refused"), std::string::npos) << why.message;
+  const Error& error = wait_for_down();
+  EXPECT_NE(error.message.find(answers[1].str()), std::string::npos) << error.message;
+  EXPECT_NE(error.message.find("refused"), std::string::npos) << error.message;
 }
 
-TEST_F(DialerTest, SaysWhyANameCouldNotBeLookedUpAndTriesAgain) {
+TEST_F(DialerTest, ReportsWhyANameCouldNotBeResolvedAndRetries) {
   dial({"pc2", 1});  // no address
   EXPECT_EQ(wait_for_down().code, Errc::not_found);
   ScriptedHost owner(loop);
@@ -218,7 +218,7 @@ TEST_F(DialerTest, SaysWhyANameCouldNotBeLookedUpAndTriesAgain) {
   wait([this] { return up; });
 }
 
-TEST_F(DialerTest, ComesBackWhenTheConnectionBroke) {
+TEST_F(DialerTest, ReconnectsWhenTheConnectionBroke) {
   ScriptedHost owner(loop);
   dial(owner.address());
   for (int round = 0; round < 3; ++round) {
@@ -241,37 +241,37 @@ TEST_F(DialerTest, FindsAServerThatStartsLater) {
   wait([this] { return up; });
 }
 
-TEST_F(DialerTest, QuotesWhoeverRefusesIt) {
+TEST_F(DialerTest, QuotesAServerThatRefusesIt) {
   const net::Frame failure = failure_frame(Errc::limit_exceeded, "too many connections");
   RawServer server(loop, wire::encode_frame(failure), true);
   dial(server.address());
-  const Error& why = wait_for_down();
-  EXPECT_EQ(why.code, Errc::limit_exceeded);
-  EXPECT_EQ(why.message,
+  const Error& error = wait_for_down();
+  EXPECT_EQ(error.code, Errc::limit_exceeded);
+  EXPECT_EQ(error.message,
             "refused by dssmd at '" + server.address().str() + "': too many connections");
 }
 
-TEST_F(DialerTest, QuotesTheLastWordsOfAServerThatWasUp) {
+TEST_F(DialerTest, QuotesTheFinalFailureOfAServerThatWasUp) {
   ScriptedHost owner(loop);
   dial(owner.address());
   wait([this] { return up; });
   owner.send(failure_frame(Errc::no_permission, "no more"));
-  const Error& why = wait_for_down();
-  EXPECT_EQ(why.code, Errc::no_permission);
-  EXPECT_EQ(why.message.find("refused by dssmd of host 'pc2'"), 0u) << why.message;
-  EXPECT_NE(why.message.find("no more"), std::string::npos);
+  const Error& error = wait_for_down();
+  EXPECT_EQ(error.code, Errc::no_permission);
+  EXPECT_EQ(error.message.find("refused by dssmd of host 'pc2'"), 0u) << error.message;
+  EXPECT_NE(error.message.find("no more"), std::string::npos);
 }
 
-TEST_F(DialerTest, RefusesAServerOfAnotherVersionInWords) {
+TEST_F(DialerTest, RefusesAServerOfAnotherVersionNamingIt) {
   RawServer server(loop, wire::encode_frame(hello_frame(greeting_of("pc9"), 77)), false);
   dial(server.address());
-  const Error& why = wait_for_down();
-  EXPECT_EQ(why.code, Errc::protocol);
-  EXPECT_NE(why.message.find("77"), std::string::npos) << why.message;
-  EXPECT_NE(why.message.find(server.address().str()), std::string::npos) << why.message;
+  const Error& error = wait_for_down();
+  EXPECT_EQ(error.code, Errc::protocol);
+  EXPECT_NE(error.message.find("77"), std::string::npos) << error.message;
+  EXPECT_NE(error.message.find(server.address().str()), std::string::npos) << error.message;
 }
 
-TEST_F(DialerTest, GivesUpWhoSaysSomethingElseThanHello) {
+TEST_F(DialerTest, GivesUpAServerThatSendsAnotherFrameThanHello) {
   net::Frame frame;
   frame.mutable_done();
   RawServer server(loop, wire::encode_frame(frame), false);
@@ -279,29 +279,29 @@ TEST_F(DialerTest, GivesUpWhoSaysSomethingElseThanHello) {
   EXPECT_EQ(wait_for_down().code, Errc::protocol);
 }
 
-TEST_F(DialerTest, GivesUpWhoSendsGarbage) {
+TEST_F(DialerTest, GivesUpAServerThatSendsGarbage) {
   RawServer server(loop, "SSH-2.0-OpenSSH_9.2\r\n" + std::string(100, '\xff'), false);
   dial(server.address());
   EXPECT_EQ(wait_for_down().code, Errc::protocol);
 }
 
-TEST_F(DialerTest, GivesUpWhoHangsUpWithoutAWord) {
+TEST_F(DialerTest, GivesUpAServerThatClosesWithoutAFrame) {
   RawServer server(loop, "", true);
   dial(server.address());
-  const Error& why = wait_for_down();
-  EXPECT_NE(why.message.find(server.address().str()), std::string::npos) << why.message;
+  const Error& error = wait_for_down();
+  EXPECT_NE(error.message.find(server.address().str()), std::string::npos) << error.message;
 }
 
-TEST_F(DialerTest, GivesUpWhoDoesNotGreetInTime) {
+TEST_F(DialerTest, GivesUpAServerThatDoesNotGreetInTime) {
   RawServer server(loop, "", false);
   dial(server.address());
-  const Error& why = wait_for_down();
-  EXPECT_EQ(why.code, Errc::unavailable);
+  const Error& error = wait_for_down();
+  EXPECT_EQ(error.code, Errc::unavailable);
   EXPECT_EQ(dialer->reached(), Dialer::Phase::greet);
-  EXPECT_NE(why.message.find("does not greet"), std::string::npos) << why.message;
+  EXPECT_NE(error.message.find("does not greet"), std::string::npos) << error.message;
 }
 
-TEST_F(DialerTest, GivesUpWhoGreetsTwice) {
+TEST_F(DialerTest, GivesUpAServerThatGreetsTwice) {
   ScriptedHost owner(loop);
   dial(owner.address());
   wait([this] { return up; });
@@ -340,13 +340,13 @@ TEST_F(DialerTest, PausesLongerAfterEachFailureAndNotWhenHurried) {
   const Duration pauses = channel::ConnectPlan::kFirstPause * (1 + 2 + 4 + 8);
   EXPECT_GE(loop.now() - begin, pauses);
   const int before = server.connections();
-  const auto look_around = [&] {
+  const auto run_without_timers = [&] {
     for (int i = 0; i < 1000; ++i) event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
   };
-  look_around();
+  run_without_timers();
   EXPECT_EQ(server.connections(), before) << "it pauses";
   dialer->retry_now();
-  look_around();
+  run_without_timers();
   EXPECT_EQ(server.connections(), before + 1);
 }
 

@@ -37,7 +37,7 @@ class FrameConnectionTest : public testing::Test,
   FrameConnectionTest() { link->take_samples(kPayloadBytes, *this); }
 
   Result<void> on_frame(net::Frame& frame) override {
-    got.push_back(frame.serial());
+    received_serials.push_back(frame.serial());
     return handler ? handler(frame) : Result<void>();
   }
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override {
@@ -57,8 +57,8 @@ class FrameConnectionTest : public testing::Test,
   void on_batch_end() override { ++batches; }
   void on_output_empty() override { ++empties; }
   void on_closed(const Error& error) override {
-    EXPECT_FALSE(why) << "told twice";
-    why = error;
+    EXPECT_FALSE(closed_with) << "told twice";
+    closed_with = error;
   }
 
   std::vector<std::uint64_t> serials_sent() {
@@ -70,12 +70,12 @@ class FrameConnectionTest : public testing::Test,
   EventLoop loop = *EventLoop::open();
   MemoryPeer peer;
   std::function<Result<void>(net::Frame&)> handler;
-  std::vector<std::uint64_t> got;
+  std::vector<std::uint64_t> received_serials;
   std::vector<Tid> begun, ended;
   Bytes payload;
   bool hold_sample = false;
   int batches = 0, empties = 0;
-  std::optional<Error> why;
+  std::optional<Error> closed_with;
   std::optional<FrameConnection> link{std::in_place, loop, std::make_unique<MemoryTransport>(peer),
                                       static_cast<FrameConnection::Observer&>(*this), kMaxQueued};
 };
@@ -109,7 +109,7 @@ TEST_F(FrameConnectionTest, KeepsTheOrderWhereverThePeerStops) {
   }
 }
 
-TEST_F(FrameConnectionTest, TellsWhenNothingWaitsAnyMore) {
+TEST_F(FrameConnectionTest, ReportsWhenItsOutputIsEmpty) {
   peer.room = 3;
   link->send(ping(1));
   EXPECT_EQ(empties, 0);
@@ -146,16 +146,16 @@ TEST_F(FrameConnectionTest, PutsNoFrameIntoTheMiddleOfAnother) {
   }
 }
 
-TEST_F(FrameConnectionTest, ClosesOnWhoAsksAndDoesNotRead) {
+TEST_F(FrameConnectionTest, ClosesOnAPeerThatRequestsAndDoesNotRead) {
   peer.room = 0;
   int sent = 0;
   for (; link->is_open() && sent < 100; ++sent) link->send(property(1, 1000));
   EXPECT_EQ(sent, 10) << "10,000 bytes may wait, frames have a few bytes more than 1,000";
   EXPECT_TRUE(peer.closed);
-  EXPECT_FALSE(why) << "not from within a call of ours";
+  EXPECT_FALSE(closed_with) << "not from within a call of ours";
   run_turns(loop, 2);
-  ASSERT_TRUE(why);
-  EXPECT_EQ(why->code, Errc::limit_exceeded);
+  ASSERT_TRUE(closed_with);
+  EXPECT_EQ(closed_with->code, Errc::limit_exceeded);
 }
 
 TEST_F(FrameConnectionTest, ChargesWhatWaitsToTheBudgetAndGivesItBack) {
@@ -173,8 +173,9 @@ TEST_F(FrameConnectionTest, ChargesWhatWaitsToTheBudgetAndGivesItBack) {
   EXPECT_FALSE(link->is_open()) << "the budget is smaller than what may wait otherwise";
   EXPECT_EQ(budget.used(), 0u);
   run_turns(loop, 2);
-  ASSERT_TRUE(why);
-  EXPECT_NE(why->message.find("max_peer_memory"), std::string::npos) << why->message;
+  ASSERT_TRUE(closed_with);
+  EXPECT_NE(closed_with->message.find("max_peer_memory"), std::string::npos)
+      << closed_with->message;
 }
 
 TEST_F(FrameConnectionTest, ChargesALongFrameWhileItIsReceived) {
@@ -187,7 +188,7 @@ TEST_F(FrameConnectionTest, ChargesALongFrameWhileItIsReceived) {
   EXPECT_GE(budget.used(), 300'000u);
   peer.put({part_end, frame.end()});
   run_turns(loop, 5);
-  EXPECT_EQ(got, Serials{1});
+  EXPECT_EQ(received_serials, Serials{1});
   EXPECT_EQ(budget.used(), 0u);
 
   const Bytes longer = to_bytes(property(2, 3'000'000));
@@ -206,11 +207,11 @@ TEST_F(FrameConnectionTest, LetsOthersHaveTheirTurn) {
   ASSERT_GT(many.size(), 2 * FrameConnection::kBytesPerTurn);
   peer.put(many);
   run_turns(loop, 1);
-  EXPECT_GT(got.size(), 0u);
-  EXPECT_LT(got.size(), 20'000u) << "all of it in one turn";
+  EXPECT_GT(received_serials.size(), 0u);
+  EXPECT_LT(received_serials.size(), 20'000u) << "all of it in one turn";
   EXPECT_EQ(batches, 1);
   run_turns(loop, 50);
-  EXPECT_EQ(got.size(), 30'000u);
+  EXPECT_EQ(received_serials.size(), 30'000u);
 }
 
 TEST_F(FrameConnectionTest, HandsNothingOutWhilePaused) {
@@ -226,26 +227,27 @@ TEST_F(FrameConnectionTest, HandsNothingOutWhilePaused) {
   peer.put(three);
   peer.put(ping(4));
   run_turns(loop, 5);
-  EXPECT_EQ(got, (Serials{1, 2})) << "though 3 was received together with 2";
+  EXPECT_EQ(received_serials, (Serials{1, 2})) << "though 3 was received together with 2";
   EXPECT_EQ(batches, 1);
   link->resume();
   run_turns(loop, 5);
-  EXPECT_EQ(got, (Serials{1, 2, 3, 4}));
+  EXPECT_EQ(received_serials, (Serials{1, 2, 3, 4}));
 }
 
 Bytes sample(Tid tid, std::size_t payload_bytes, std::byte content) {
   return sample_bytes({.tid = tid}, Bytes(payload_bytes, content));
 }
 
-TEST_F(FrameConnectionTest, RefusesASampleThatNobodyTakes) {
+TEST_F(FrameConnectionTest, RefusesASampleWithoutADelegate) {
   MemoryPeer other;
   FrameConnection one(loop, std::make_unique<MemoryTransport>(other), *this, kMaxQueued);
   other.put(sample(7, kPayloadBytes, std::byte{5}));
   run_turns(loop, 3);
   EXPECT_TRUE(begun.empty());
-  ASSERT_TRUE(why);
-  EXPECT_EQ(why->code, Errc::protocol);
-  EXPECT_NE(why->message.find("none is awaited"), std::string::npos) << why->message;
+  ASSERT_TRUE(closed_with);
+  EXPECT_EQ(closed_with->code, Errc::protocol);
+  EXPECT_NE(closed_with->message.find("none is awaited"), std::string::npos)
+      << closed_with->message;
 }
 
 TEST_F(FrameConnectionTest, BeginsASampleAgainThatCameInAPause) {
@@ -262,32 +264,32 @@ TEST_F(FrameConnectionTest, BeginsASampleAgainThatCameInAPause) {
   EXPECT_EQ(payload, Bytes(kPayloadBytes, std::byte{5}));
 }
 
-TEST_F(FrameConnectionTest, TellsThePeerWhyItCloses) {
+TEST_F(FrameConnectionTest, SendsThePeerTheReasonBeforeItCloses) {
   handler = [](net::Frame&) -> Result<void> { return Error{Errc::protocol, "not like this"}; };
   Bytes two = to_bytes(ping(1));
   const Bytes second = to_bytes(ping(2));
   two.insert(two.end(), second.begin(), second.end());
   peer.put(two);
   run_turns(loop, 3);
-  EXPECT_EQ(got, Serials{1}) << "nothing is handed out after an error";
+  EXPECT_EQ(received_serials, Serials{1}) << "nothing is handed out after an error";
   EXPECT_TRUE(peer.closed);
   const std::vector<net::Frame> items = frames_of(peer.sent);
   ASSERT_EQ(items.size(), 1u);
   EXPECT_EQ(items[0].serial(), 0u);
   EXPECT_EQ(items[0].failure().message(), "not like this");
-  ASSERT_TRUE(why);
-  EXPECT_EQ(why->message, "not like this");
+  ASSERT_TRUE(closed_with);
+  EXPECT_EQ(closed_with->message, "not like this");
 }
 
-TEST_F(FrameConnectionTest, ReadsThePeersLastWordsWhenItTakesNothingMore) {
+TEST_F(FrameConnectionTest, ReadsThePeersFinalFailureWhenItTakesNothingMore) {
   peer.put(ping(9));
   peer.end_silently();
   link->send(ping(1));
   EXPECT_TRUE(link->is_open()) << "what the peer said is still to be read";
   run_turns(loop, 3);
-  EXPECT_EQ(got, Serials{9});
-  ASSERT_TRUE(why);
-  EXPECT_EQ(why->code, Errc::unavailable);
+  EXPECT_EQ(received_serials, Serials{9});
+  ASSERT_TRUE(closed_with);
+  EXPECT_EQ(closed_with->code, Errc::unavailable);
 }
 
 TEST_F(FrameConnectionTest, EndsWithThePeerAlsoInTheMiddleOfAFrame) {
@@ -295,8 +297,9 @@ TEST_F(FrameConnectionTest, EndsWithThePeerAlsoInTheMiddleOfAFrame) {
   peer.put({frame.begin(), frame.begin() + 50});
   peer.end();
   run_turns(loop, 3);
-  ASSERT_TRUE(why);
-  EXPECT_NE(why->message.find("middle of a frame"), std::string::npos) << why->message;
+  ASSERT_TRUE(closed_with);
+  EXPECT_NE(closed_with->message.find("middle of a frame"), std::string::npos)
+      << closed_with->message;
 }
 
 TEST_F(FrameConnectionTest, DoesNothingAfterItClosed) {
@@ -312,15 +315,15 @@ TEST_F(FrameConnectionTest, DoesNothingAfterItClosed) {
   link->close_with({Errc::closed, "again"});
   run_turns(loop, 3);
   EXPECT_TRUE(peer.sent.empty());
-  ASSERT_TRUE(why);
-  EXPECT_EQ(why->message, "enough");
+  ASSERT_TRUE(closed_with);
+  EXPECT_EQ(closed_with->message, "enough");
 }
 
-TEST_F(FrameConnectionTest, MayBeDestroyedBeforeItsEndIsTold) {
+TEST_F(FrameConnectionTest, MayBeDestroyedBeforeItsEndIsReported) {
   link->close_with({Errc::closed, "enough"});
   link.reset();
   run_turns(loop, 3);
-  EXPECT_FALSE(why);
+  EXPECT_FALSE(closed_with);
 }
 
 }  // namespace

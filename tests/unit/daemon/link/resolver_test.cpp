@@ -19,7 +19,7 @@ Addresses number(const std::string& text) {
   return wire::resolve_number(wire::Address::parse(text).value());
 }
 
-TEST(Resolver, AnswersNumbersWithoutLookingThemUp) {
+TEST(Resolver, AnswersNumbersWithoutALookup) {
   EventLoop loop = EventLoop::open().value();
   std::atomic<int> lookups = 0;
   Resolver resolver(loop, [&](const wire::Address&) -> Result<Addresses> {
@@ -35,7 +35,7 @@ TEST(Resolver, AnswersNumbersWithoutLookingThemUp) {
   EXPECT_EQ(lookups, 0);
 }
 
-TEST(Resolver, KeepsTheLoopGoingWhileANameIsLookedUp) {
+TEST(Resolver, KeepsTheLoopRunningDuringALookup) {
   EventLoop loop = EventLoop::open().value();
   std::binary_semaphore go_on(0);
   Resolver resolver(loop, [&](const wire::Address& address) -> Result<Addresses> {
@@ -57,7 +57,7 @@ TEST(Resolver, KeepsTheLoopGoingWhileANameIsLookedUp) {
   EXPECT_EQ(none->error().code, Errc::not_found);
 }
 
-TEST(Resolver, LooksANameUpOnceForAllWhoWait) {
+TEST(Resolver, ResolvesANameOnceForAllRequests) {
   EventLoop loop = EventLoop::open().value();
   std::counting_semaphore<> go_on(0);
   std::atomic<int> lookups = 0;
@@ -79,7 +79,7 @@ TEST(Resolver, LooksANameUpOnceForAllWhoWait) {
   EXPECT_EQ(lookups, 1);
 }
 
-TEST(Resolver, ForgetsWhoGaveUpTheirTicket) {
+TEST(Resolver, DoesNotCallBackADestroyedTicket) {
   EventLoop loop = EventLoop::open().value();
   std::atomic<int> lookups = 0;
   std::counting_semaphore<> go_on(0);

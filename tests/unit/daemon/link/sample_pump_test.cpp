@@ -135,7 +135,7 @@ INSTANTIATE_TEST_SUITE_P(, SamplePumpOfEachKind, testing::Values(kSmall, kMiddle
                                                           : std::string("Large");
                          });
 
-TEST_P(SamplePumpOfEachKind, SendsAllThatIsThereAndWaitsForNews) {
+TEST_P(SamplePumpOfEachKind, SendsAllThatIsThereAndWaitsForSamples) {
   PumpRig rig(GetParam(), 16);
   rig.write(10);
   rig.start({0, 9, 0});
@@ -161,7 +161,7 @@ TEST_P(SamplePumpOfEachKind, HasCaughtUpWithAnEmptyStreamAtOnce) {
   EXPECT_EQ(rig.accepted(), tids(0, 0));
 }
 
-TEST_P(SamplePumpOfEachKind, TellsExactlyWhatTheRingNoLongerHolds) {
+TEST_P(SamplePumpOfEachKind, ReportsExactlyWhatTheRingNoLongerHolds) {
   PumpRig rig(GetParam(), 8);
   rig.write(30);  // 23 to 29 are held
   rig.start({5, 29, 0});
@@ -416,7 +416,7 @@ TEST(SamplePump, CutsALongSampleIntoTurns) {
   }
 }
 
-TEST(SamplePump, LooksAgainAfterALongSampleIsCopiedAside) {
+TEST(SamplePump, ChecksAgainAfterALongSampleIsCopiedAside) {
   constexpr std::size_t kLong = 3 * SamplePump::kBytesPerTurn;
   for (const bool may_tear : {true, false}) {
     PumpRig rig(kLong, 4, may_tear);
@@ -464,7 +464,7 @@ TEST(SamplePump, CopiesOneThatIsNotLargeAndComesAlone) {
   EXPECT_EQ(rig.accepted(), tids(0, 5));
 }
 
-TEST(SamplePump, StopsAfterTheSampleUnderWayWhenSomebodyElseWantsToSend) {
+TEST(SamplePump, StopsAfterTheSampleUnderWayWhenAnotherFrameIsToBeSent) {
   PumpRig rig(kLarge, 8, true, 1000);
   rig.write(3);
   rig.start({0, 2, 0});
@@ -501,7 +501,7 @@ TEST(SamplePump, SendsTheNewestAtEachTimeWhenItThins) {
   EXPECT_TRUE(rig.gaps.empty());
 }
 
-TEST(SamplePump, SendsOneSampleAtATimeThoughTheWriterGoesOnMeanwhile) {
+TEST(SamplePump, SendsOneSampleAtATimeThoughTheWriterContinues) {
   PumpRig rig(kSmall, 64);
   rig.thinned = true;
   rig.write(10);
@@ -521,7 +521,7 @@ TEST(SamplePump, SendsEachSampleOfAStreamThatIsSlowerThanTheHighestRate) {
   EXPECT_EQ(rig.accepted(), tids(0, 9));
 }
 
-TEST(SamplePump, TellsNoGapWhenAThinnedStreamLapsIt) {
+TEST(SamplePump, ReportsNoGapWhenAThinnedStreamLapsIt) {
   PumpRig rig(kLarge, 4);
   rig.thinned = true;
   rig.write(20);

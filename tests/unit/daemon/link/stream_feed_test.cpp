@@ -45,7 +45,7 @@ class StreamFeedTest : public testing::Test, protected StreamFeed::Observer {
   Program writer() { return Program(as_offer(stream->descriptors_for(Role::writer).value())); }
 
   void on_sample_available() override {
-    ++news;
+    ++notifications;
     if (on_notified) on_notified();
   }
 
@@ -54,24 +54,24 @@ class StreamFeedTest : public testing::Test, protected StreamFeed::Observer {
   std::shared_ptr<Stream> stream =
       registry.create({"odometry", 0, ""}, odometry_type(), kHistory, 1)->stream;
   std::shared_ptr<StreamFeed> feed = StreamFeed::open(loop, stream).value();
-  int news = 0;
+  int notifications = 0;
   std::function<void()> on_notified;
 };
 
-TEST_F(StreamFeedTest, TellsOnceOfASampleThatIsNewer) {
+TEST_F(StreamFeedTest, NotifiesOnceOfANewerSample) {
   Program program = writer();
   ASSERT_TRUE(feed->wait(*this, kNoTid));
   run_turns(loop, 3);
-  EXPECT_EQ(news, 0);
+  EXPECT_EQ(notifications, 0);
   program.write();
   run_turns(loop, 3);
-  EXPECT_EQ(news, 1);
+  EXPECT_EQ(notifications, 1);
   program.write();
   run_turns(loop, 3);
-  EXPECT_EQ(news, 1) << "it does not wait any more";
+  EXPECT_EQ(notifications, 1) << "it does not wait any more";
 }
 
-TEST_F(StreamFeedTest, SaysAtOnceThatThereIsNewsAlready) {
+TEST_F(StreamFeedTest, ReportsAtOnceASampleThatIsThere) {
   Program program = writer();
   program.write();
   EXPECT_FALSE(feed->wait(*this, kNoTid));
@@ -79,7 +79,7 @@ TEST_F(StreamFeedTest, SaysAtOnceThatThereIsNewsAlready) {
   EXPECT_TRUE(feed->wait(*this, 0));
 }
 
-TEST_F(StreamFeedTest, LetsWritersRingOnlyWhileSomebodyWaits) {
+TEST_F(StreamFeedTest, LetsWritersRingOnlyWhileAnObserverWaits) {
   Program program = writer();
   EXPECT_FALSE(program.bell->doorbell_armed());
   program.write();
@@ -88,25 +88,25 @@ TEST_F(StreamFeedTest, LetsWritersRingOnlyWhileSomebodyWaits) {
   program.write();
   run_turns(loop, 3);
   EXPECT_EQ(program.rings(), 1u);
-  EXPECT_EQ(news, 1);
+  EXPECT_EQ(notifications, 1);
   for (int i = 0; i < 100; ++i) program.write();
   EXPECT_EQ(program.rings(), 0u) << "whoever was told is at work, and needs no ring";
 }
 
-TEST_F(StreamFeedTest, ArmsAgainForOneWhoWaitsForALaterSample) {
+TEST_F(StreamFeedTest, ArmsAgainForAnObserverThatWaitsForALaterSample) {
   Program program = writer();
   ASSERT_TRUE(feed->wait(*this, 2));  // wants sample 3
   for (int i = 0; i < 3; ++i) {
     program.write();
     run_turns(loop, 3);
   }
-  EXPECT_EQ(news, 0);
+  EXPECT_EQ(notifications, 0);
   program.write();
   run_turns(loop, 3);
-  EXPECT_EQ(news, 1);
+  EXPECT_EQ(notifications, 1);
 }
 
-TEST_F(StreamFeedTest, MissesNoSampleThatIsWrittenWhileItTells) {
+TEST_F(StreamFeedTest, MissesNoSampleThatIsWrittenDuringANotification) {
   Program program = writer();
   Tid known = kNoTid;
   on_notified = [&] {
@@ -117,14 +117,14 @@ TEST_F(StreamFeedTest, MissesNoSampleThatIsWrittenWhileItTells) {
   ASSERT_TRUE(feed->wait(*this, known));
   program.write();
   run_turns(loop, 3);
-  EXPECT_EQ(news, 1);
+  EXPECT_EQ(notifications, 1);
   program.write();
   run_turns(loop, 3);
-  EXPECT_EQ(news, 2);
+  EXPECT_EQ(notifications, 2);
   EXPECT_EQ(known, 3);
 }
 
-TEST_F(StreamFeedTest, HearsEveryDoorbellOfItsStream) {
+TEST_F(StreamFeedTest, WatchesEveryDoorbellOfItsStream) {
   Program first = writer();
   // A writer that kept a doorbell of its own over a restart.
   UniqueFd kept(::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC));
@@ -132,18 +132,18 @@ TEST_F(StreamFeedTest, HearsEveryDoorbellOfItsStream) {
   second.files.doorbell = copy_of(kept);
   stream->take_doorbell_untrusted(std::move(kept));
   for (Program* program : {&first, &second, &first, &second}) {
-    const int before = news;
+    const int before = notifications;
     ASSERT_TRUE(feed->wait(*this, ring::RingReader(stream->mapping()).newest()));
     program->write();
     run_turns(loop, 3);
-    EXPECT_EQ(news, before + 1);
+    EXPECT_EQ(notifications, before + 1);
   }
 }
 
-TEST_F(StreamFeedTest, ForgetsWhoAsksForItAlsoWhileItTells) {
+TEST_F(StreamFeedTest, RemovesAnObserverAlsoDuringANotification) {
   struct Other final : StreamFeed::Observer {
-    void on_sample_available() override { ++told; }
-    int told = 0;
+    void on_sample_available() override { ++notifications; }
+    int notifications = 0;
   } other;
   Program program = writer();
   ASSERT_TRUE(feed->wait(*this, kNoTid));
@@ -151,25 +151,25 @@ TEST_F(StreamFeedTest, ForgetsWhoAsksForItAlsoWhileItTells) {
   on_notified = [&] { feed->forget(other); };
   program.write();
   run_turns(loop, 3);
-  EXPECT_EQ(news, 1);
-  EXPECT_EQ(other.told, 0);
+  EXPECT_EQ(notifications, 1);
+  EXPECT_EQ(other.notifications, 0);
   ASSERT_TRUE(feed->wait(other, 0));
   feed->forget(other);
   EXPECT_FALSE(program.bell->doorbell_armed());
 }
 
-TEST_F(StreamFeedTest, LooksByItselfWhenAskedTo) {
+TEST_F(StreamFeedTest, ChecksTheRingWhenPolled) {
   Program program = writer();
   ASSERT_TRUE(feed->wait(*this, kNoTid));
   feed->poll();
-  EXPECT_EQ(news, 0);
+  EXPECT_EQ(notifications, 0);
   // A writer that was killed before it could ring.
   UniqueFd doorbell = std::move(program.files.doorbell);
   program.write();
   run_turns(loop, 3);
-  EXPECT_EQ(news, 0);
+  EXPECT_EQ(notifications, 0);
   feed->poll();
-  EXPECT_EQ(news, 1);
+  EXPECT_EQ(notifications, 1);
 }
 
 TEST_F(StreamFeedTest, DisarmsWhenItGoes) {

@@ -30,15 +30,15 @@ class FleetServiceTest : public testing::Test {
                      writers};
 };
 
-TEST_F(FleetServiceTest, TellsThatMdnsIsOffUntilItHearsOtherwise) {
-  const local::Mdns told = fleet.mdns();
-  EXPECT_EQ(told.phase(), local::Mdns::OFF);
-  EXPECT_EQ(told.error(), "");
-  EXPECT_EQ(told.announced(), 0u);
-  EXPECT_FALSE(told.own_host_seen());
+TEST_F(FleetServiceTest, ReportsThatMdnsIsOffUntilItsFirstState) {
+  const local::Mdns shown = fleet.mdns();
+  EXPECT_EQ(shown.phase(), local::Mdns::OFF);
+  EXPECT_EQ(shown.error(), "");
+  EXPECT_EQ(shown.announced(), 0u);
+  EXPECT_FALSE(shown.own_host_seen());
 }
 
-TEST_F(FleetServiceTest, TellsTheNewestStateOfMdns) {
+TEST_F(FleetServiceTest, ReportsTheNewestStateOfMdns) {
   MdnsInfo state;
   state.phase = MdnsPhase::waiting;
   state.error = "no Avahi";
@@ -53,17 +53,17 @@ TEST_F(FleetServiceTest, TellsTheNewestStateOfMdns) {
   state.own_host_seen = true;
   state.hosts_heard = 5;
   peers.on_mdns_state(state);
-  const local::Mdns told = fleet.mdns();
-  EXPECT_EQ(told.phase(), local::Mdns::RUNNING);
-  EXPECT_EQ(told.error(), "");
-  EXPECT_EQ(told.avahi_version(), "avahi 0.8");
-  EXPECT_EQ(told.announced(), 3u);
-  EXPECT_EQ(told.withheld(), 2u);
-  EXPECT_TRUE(told.own_host_seen());
-  EXPECT_EQ(told.hosts_heard(), 5u);
+  const local::Mdns shown = fleet.mdns();
+  EXPECT_EQ(shown.phase(), local::Mdns::RUNNING);
+  EXPECT_EQ(shown.error(), "");
+  EXPECT_EQ(shown.avahi_version(), "avahi 0.8");
+  EXPECT_EQ(shown.announced(), 3u);
+  EXPECT_EQ(shown.withheld(), 2u);
+  EXPECT_TRUE(shown.own_host_seen());
+  EXPECT_EQ(shown.hosts_heard(), 5u);
 }
 
-TEST_F(FleetServiceTest, TellsWordsOfOthersInPrintableCharactersOnly) {
+TEST_F(FleetServiceTest, ReportsForeignTextInPrintableCharactersOnly) {
   MdnsInfo state;
   state.error = "more than \x1b[31m";
   state.avahi_version = "avahi\n0.8";
@@ -72,19 +72,19 @@ TEST_F(FleetServiceTest, TellsWordsOfOthersInPrintableCharactersOnly) {
   EXPECT_EQ(fleet.mdns().avahi_version().find('\n'), std::string::npos);
 }
 
-TEST_F(FleetServiceTest, TellsOfThisHostFirstAndWhatIsWrongWithIt) {
+TEST_F(FleetServiceTest, ListsThisHostFirstAndWhatIsWrongWithIt) {
   wire::Greeting copy = self;
   ++copy.instance_id;
   peer.greet_as(copy);
   EXPECT_EQ(fleet.hosts().at(0).error(), "");
   run_until(loop, [&] { return fleet.hosts().at(1).state() == local::Host::REFUSED; });
-  const local::Host told = fleet.hosts().at(0);
-  EXPECT_EQ(told.name(), "pc1");
-  EXPECT_EQ(told.state(), local::Host::SELF);
-  EXPECT_EQ(told.addresses(0), "10.0.0.1:13776");
-  EXPECT_TRUE(told.insecure());
-  EXPECT_NE(told.error(), "");
-  EXPECT_EQ(told.error(), fleet.hosts().at(1).error());
+  const local::Host shown = fleet.hosts().at(0);
+  EXPECT_EQ(shown.name(), "pc1");
+  EXPECT_EQ(shown.state(), local::Host::SELF);
+  EXPECT_EQ(shown.addresses(0), "10.0.0.1:13776");
+  EXPECT_TRUE(shown.insecure());
+  EXPECT_NE(shown.error(), "");
+  EXPECT_EQ(shown.error(), fleet.hosts().at(1).error());
 }
 
 }  // namespace

@@ -70,7 +70,7 @@ TEST(LocalService, EndsAConnectionThatSendsGarbageOrNoSerial) {
   EXPECT_EQ(other.next().serial(), 0u) << "last words belong to no request";
 }
 
-TEST(LocalService, AnswersARequestItDoesNotKnowAndGoesOn) {
+TEST(LocalService, AnswersAnUnknownRequestAndContinues) {
   Daemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
@@ -114,11 +114,11 @@ TEST(LocalService, CreatesOpensListsAndClosesStreams) {
 
   local::Request info;
   info.mutable_info()->mutable_id()->set_name("odometry");
-  const local::Response told = reader.ask(info);
-  ASSERT_EQ(told.stream_list().streams_size(), 1);
-  ASSERT_EQ(told.stream_list().streams(0).users_size(), 3);
-  EXPECT_EQ(told.stream_list().streams(0).users(2).pid(), 6);
-  EXPECT_FALSE(told.stream_list().streams(0).users(2).writer());
+  const local::Response answer = reader.ask(info);
+  ASSERT_EQ(answer.stream_list().streams_size(), 1);
+  ASSERT_EQ(answer.stream_list().streams(0).users_size(), 3);
+  EXPECT_EQ(answer.stream_list().streams(0).users(2).pid(), 6);
+  EXPECT_FALSE(answer.stream_list().streams(0).users(2).writer());
 
   local::Request opens;
   opens.mutable_list_opens();
@@ -136,7 +136,7 @@ TEST(LocalService, CreatesOpensListsAndClosesStreams) {
   EXPECT_EQ(reader.ask(list_request()).stream_list().streams(0).readers(), 0u);
 }
 
-TEST(LocalService, TellsWhatIsWrongWithAStreamThatCannotBeCreatedOrOpened) {
+TEST(LocalService, ReportsWhyAStreamCannotBeCreatedOrOpened) {
   Daemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
@@ -198,7 +198,7 @@ TEST(LocalService, KeepsAndGivesProperties) {
   EXPECT_EQ(client.ask(get).property().property(), std::string("a\0b", 3));
 }
 
-TEST(LocalService, TellsWatchersWhatIsThereAndWhatChanges) {
+TEST(LocalService, NotifiesWatchersOfExistingStreamsAndOfChanges) {
   Daemon daemon;
   FakeClient client(daemon.service, 5), watcher(daemon.service, 6);
   client.greet(), watcher.greet();
@@ -298,7 +298,7 @@ TEST(LocalService, TakesBackAPlaybackClockOnlyBeforeItHandedOneOut) {
   EXPECT_FALSE(same_file(other.last_descriptors[0].get(), kept.get()));
 }
 
-TEST(LocalService, TellsAboutItself) {
+TEST(LocalService, DescribesItself) {
   Daemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
@@ -331,7 +331,7 @@ local::Request offer_request(const std::string& name) {
   return request;
 }
 
-TEST(LocalService, HoldsBackWhoWantsAStreamThatMayStillBeOffered) {
+TEST(LocalService, DelaysRequestsForAStreamThatMayStillBeOffered) {
   std::vector<UniqueFd> kept = descriptors_from_before("odometry");
   const UniqueFd ring = copy_of(kept[0]);
   Daemon daemon(true);
@@ -369,7 +369,7 @@ TEST(LocalService, AnswersBlockedSignalsWhenRecoveryEnds) {
   EXPECT_TRUE(client.ask(create_request("next")).has_opened()) << "at once from now on";
 }
 
-TEST(LocalService, RefusesAtOnceWhatNoOfferCouldMend) {
+TEST(LocalService, RefusesAtOnceWhatNoOfferCouldFix) {
   Daemon daemon(true);
   FakeClient client(daemon.service, 6);
   client.greet();
@@ -402,7 +402,7 @@ TEST(LocalService, BoundsWhatOneClientHasWaiting) {
   EXPECT_EQ(client.next().failure().code(), "limit_exceeded");
 }
 
-TEST(LocalService, HoldsBackWhoWantsAPlaybackClockThatMayStillBeOffered) {
+TEST(LocalService, DelaysRequestsForAPlaybackClockThatMayStillBeOffered) {
   UniqueFd kept;
   {
     Daemon before;

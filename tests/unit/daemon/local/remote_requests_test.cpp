@@ -148,7 +148,7 @@ TEST_F(RemoteRequestsTest, OpensAMirrorWhenItIsThere) {
   EXPECT_EQ(opens.counts(*ring).readers, 0u);
 }
 
-TEST_F(RemoteRequestsTest, PrefersAnOwnStreamAndAsksForWhatIsNone) {
+TEST_F(RemoteRequestsTest, PrefersAnOwnStreamAndOpensOthersRemotely) {
   client->ask(create_request("lidar"));
   EXPECT_TRUE(client->ask(open_request("lidar")).has_opened());
   EXPECT_FALSE(client->ask(open_at("lidar", "pc1")).opened().mirror());
@@ -159,12 +159,12 @@ TEST_F(RemoteRequestsTest, PrefersAnOwnStreamAndAsksForWhatIsNone) {
   EXPECT_EQ(client->next().failure().code(), "conflict");
 }
 
-TEST_F(RemoteRequestsTest, NeverLooksElsewhereForAStreamNamedAsItsOwn) {
+TEST_F(RemoteRequestsTest, NeverSearchesElsewhereForAStreamNamedAsItsOwn) {
   EXPECT_EQ(client->ask(open_at("imu", "pc1")).failure().code(), "not_found");
   EXPECT_TRUE(fleet.asked.empty());
 }
 
-TEST_F(RemoteRequestsTest, CreatesHereUnlessToldOtherwise) {
+TEST_F(RemoteRequestsTest, CreatesHereByDefault) {
   fleet.known = {lidar_at("pc2")};
   EXPECT_EQ(client->ask(create_request("lidar")).opened().stream().id().host(), "pc1");
   EXPECT_TRUE(fleet.asked.empty());
@@ -200,9 +200,9 @@ TEST_F(RemoteRequestsTest, ForgetsWhatAClientOpenedThatLeft) {
 TEST_F(RemoteRequestsTest, PassesOnTheRest) {
   local::Request info, get, set, remove;
   info.mutable_info()->mutable_id()->set_name("lidar");
-  const local::Response told = client->ask(info);
-  ASSERT_EQ(told.stream_list().streams_size(), 1);
-  EXPECT_EQ(told.stream_list().streams(0).mirror().state(), proto::Mirror::LIVE);
+  const local::Response answer = client->ask(info);
+  ASSERT_EQ(answer.stream_list().streams_size(), 1);
+  EXPECT_EQ(answer.stream_list().streams(0).mirror().state(), proto::Mirror::LIVE);
   get.mutable_get_property()->mutable_id()->set_name("lidar");
   EXPECT_EQ(client->ask(get).property().property(), "calibration");
   set.mutable_set_property()->mutable_id()->set_name("lidar");
@@ -232,7 +232,7 @@ TEST_F(RemoteRequestsTest, ListsOwnStreamsFirst) {
   EXPECT_EQ(fleet.asked, Asked{"list"});
 }
 
-TEST_F(RemoteRequestsTest, LeavesOutFieldsOrSaysSoWhenTheListGetsTooLong) {
+TEST_F(RemoteRequestsTest, LeavesOutFieldsOrFailsWhenTheListGetsTooLong) {
   put(list_request(), 80);
   put(list_request(), 81);
   proto::Stream stream;
@@ -249,7 +249,7 @@ TEST_F(RemoteRequestsTest, LeavesOutFieldsOrSaysSoWhenTheListGetsTooLong) {
   EXPECT_EQ(client->next().failure().code(), "limit_exceeded");
 }
 
-TEST_F(RemoteRequestsTest, TellsAboutHosts) {
+TEST_F(RemoteRequestsTest, ListsHosts) {
   local::Request hosts, ping;
   hosts.mutable_list_hosts();
   const local::Response list = client->ask(hosts);
@@ -262,7 +262,7 @@ TEST_F(RemoteRequestsTest, TellsAboutHosts) {
   EXPECT_EQ(fleet.asked, Asked{"ping pc2"});
 }
 
-TEST_F(RemoteRequestsTest, TellsHowOtherHostsAreFound) {
+TEST_F(RemoteRequestsTest, ReportsHowOtherHostsAreFound) {
   local::Request request;
   request.mutable_get_daemon();
   const local::Daemon daemon = client->ask(request).daemon();
@@ -286,7 +286,7 @@ TEST_F(RemoteRequestsTest, BoundsWhatOneClientWaitsFor) {
 
 // --- changes
 
-TEST_F(RemoteRequestsTest, TellsWatchersOfAllHosts) {
+TEST_F(RemoteRequestsTest, NotifiesWatchersOfTheStreamsOfAllHosts) {
   client->ask(create_request("odometry"));
   fleet.known = {lidar_at("pc2")};
   local::Request watch;
@@ -305,7 +305,7 @@ TEST_F(RemoteRequestsTest, TellsWatchersOfAllHosts) {
   EXPECT_EQ(removed.stream_event().stream().id().host(), "pc3");
 }
 
-TEST_F(RemoteRequestsTest, TellsReadersOfAReplacedMirror) {
+TEST_F(RemoteRequestsTest, NotifiesReadersOfAReplacedMirror) {
   put(open_at("lidar", "pc2"));
   const auto ring = fleet.ring("lidar");
   fleet.reader_then(ring);
@@ -320,7 +320,7 @@ TEST_F(RemoteRequestsTest, TellsReadersOfAReplacedMirror) {
   EXPECT_TRUE(client->received.empty()) << "writers are not concerned";
 }
 
-TEST_F(RemoteRequestsTest, TellsReadersWhenAnOwnStreamIsCreatedAnew) {
+TEST_F(RemoteRequestsTest, NotifiesReadersWhenAnOwnStreamIsRecreated) {
   client->ask(create_request("odometry"));
   client->ask(create_request("other"));
   const std::uint64_t handle = client->ask(open_request("odometry")).opened().handle();
@@ -341,7 +341,7 @@ TEST_F(RemoteRequestsTest, TellsReadersWhenAnOwnStreamIsCreatedAnew) {
   EXPECT_TRUE(client->received.empty()) << "what is read is still there";
 }
 
-TEST_F(RemoteRequestsTest, TellsReadersOfAStreamThatMovedToAnotherHost) {
+TEST_F(RemoteRequestsTest, NotifiesReadersOfAStreamThatMovedToAnotherHost) {
   FakeClient particular(*service, 6);
   particular.greet();
   const auto ring = fleet.ring("lidar");
@@ -374,7 +374,7 @@ TEST_F(RemoteRequestsTest, TellsReadersOfAStreamThatMovedToAnotherHost) {
   EXPECT_TRUE(particular.received.empty()) << "who names a host wants no other";
 }
 
-TEST_F(RemoteRequestsTest, TellsReadersOfAnOwnStreamThatMovedAway) {
+TEST_F(RemoteRequestsTest, NotifiesReadersOfAnOwnStreamThatMovedToAnotherHost) {
   client->ask(create_request("lidar"));
   const std::uint64_t any = client->ask(open_request("lidar")).opened().handle();
   const std::uint64_t own = client->ask(open_at("lidar", "pc1")).opened().handle();

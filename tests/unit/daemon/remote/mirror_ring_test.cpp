@@ -87,7 +87,7 @@ TEST_F(MirrorRingTest, NeverShowsATornSampleAndCountsItOnce) {
   EXPECT_EQ(ring->gap_samples(), 1u);
 }
 
-TEST_F(MirrorRingTest, CountsATornSampleThatIsToldAsAGapOnce) {
+TEST_F(MirrorRingTest, CountsATornSampleThatIsReportedAsAGapOnce) {
   ASSERT_TRUE(ring->on_subscribed_untrusted(0));
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(take(1, true));
@@ -96,7 +96,7 @@ TEST_F(MirrorRingTest, CountsATornSampleThatIsToldAsAGapOnce) {
   EXPECT_EQ(ring->gap_samples(), 1u);
 }
 
-TEST_F(MirrorRingTest, CountsToldAndUntoldGapsAlike) {
+TEST_F(MirrorRingTest, CountsReportedAndUnreportedGapsAlike) {
   ASSERT_TRUE(ring->on_subscribed_untrusted(0));
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(ring->on_gap_untrusted(1, 9));
@@ -115,7 +115,7 @@ TEST_F(MirrorRingTest, CountsWhatTheOwnerLostWhileTheLinkWasCut) {
   EXPECT_EQ(ring->gap_samples(), 99u);
 }
 
-TEST_F(MirrorRingTest, KeepsTheWindowWholeWhileASampleBehindAGapArrives) {
+TEST_F(MirrorRingTest, KeepsTheWindowWholeWhileASampleAfterAGapArrives) {
   ASSERT_TRUE(ring->on_subscribed_untrusted(0));
   for (Tid tid = 0; tid < 20; ++tid) ASSERT_TRUE(take(tid));
   for (const Tid behind : {22, 28, 33, 35}) {  // their slots hold 6, 12, 17 and the newest
@@ -166,7 +166,7 @@ TEST_F(MirrorRingTest, RefusesTidsThatDoNotRise) {
   EXPECT_EQ(ring->gap_samples(), 0u);
 }
 
-TEST_F(MirrorRingTest, GoesOnBehindWhatAnEarlierLifeReceived) {
+TEST_F(MirrorRingTest, ContinuesAfterWhatAnEarlierDssmdReceived) {
   ASSERT_TRUE(ring->on_subscribed_untrusted(0));
   for (Tid tid = 0; tid < 40; ++tid) ASSERT_TRUE(take(tid));
   ASSERT_TRUE(ring->begin_untrusted(incoming(40)));  // dies here

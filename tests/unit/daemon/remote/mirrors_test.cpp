@@ -108,7 +108,7 @@ TEST_F(MirrorsTest, AnswersWithWhatCameWhenTheHistoryTakesLong) {
   EXPECT_EQ(state().state(), proto::Mirror::FILLING);
 }
 
-TEST_F(MirrorsTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
+TEST_F(MirrorsTest, FailsWithAReasonWhenTheOwnerDoesNotAnswer) {
   const wire::Address address = owner->address();
   const KnownHost host = owner->host();
   owner.reset();  // no process listens there any more
@@ -121,7 +121,7 @@ TEST_F(MirrorsTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
   wait_until_none();
 }
 
-TEST_F(MirrorsTest, HandsOnWhatTheOwnerRefuses) {
+TEST_F(MirrorsTest, ForwardsTheOwnersRefusal) {
   const auto answer = open();
   owner->fail(owner->receive(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
   EXPECT_EQ(wait_error(answer).code, Errc::not_found);
@@ -158,7 +158,7 @@ TEST_F(MirrorsTest, CountsTowardsTheStreamsOfThisHost) {
   EXPECT_TRUE(small.create({"own", 0, ""}, odometry_type(), kHistory, 1));
 }
 
-TEST_F(MirrorsTest, ClosesWhenNobodyUsesItAnyMore) {
+TEST_F(MirrorsTest, ClosesWhenNoProgramUsesItAnyMore) {
   std::shared_ptr<Stream> stream = opened(5);
   std::shared_ptr<Stream> second = find();
   stream.reset();
@@ -186,7 +186,7 @@ TEST_F(MirrorsTest, StaysForAWhileAfterItsLastUser) {
   EXPECT_EQ(owner->connections(), 1);
 }
 
-TEST_F(MirrorsTest, ResumesBehindWhatItHas) {
+TEST_F(MirrorsTest, ResumesAfterItsNewestSample) {
   const std::shared_ptr<Stream> stream = opened(5);
   owner->cut();
   const net::Frame subscribe = serve(6);
@@ -215,7 +215,7 @@ TEST_F(MirrorsTest, CountsWhatTheOwnerNoLongerHas) {
   EXPECT_EQ(stream->info().oldest, 24);
 }
 
-TEST_F(MirrorsTest, KeepsTheRingWhileTheOwnerIsAway) {
+TEST_F(MirrorsTest, KeepsTheRingWhileTheOwnerIsUnavailable) {
   const std::shared_ptr<Stream> stream = opened(5);
   catalog.host_down(owner->host().greeting.host_id, {Errc::unavailable, "no sign of life"});
   until_state(proto::Mirror::OWNER_UNAVAILABLE);
@@ -257,7 +257,7 @@ TEST_F(MirrorsTest, LosesNothingWhenTheSameOwnerIsReachedAtAnotherAddress) {
   EXPECT_EQ(before->connections(), 1);
 }
 
-TEST_F(MirrorsTest, BeginsANewRingWhenTheOwnerLostIts) {
+TEST_F(MirrorsTest, BeginsANewRingWhenTheOwnerLostItsOwn) {
   const std::shared_ptr<Stream> old = opened(5);
   owner->cut();
   theirs.incarnation = 8;
@@ -295,7 +295,7 @@ TEST_F(MirrorsTest, KeepsTheRingOfARemovedStreamAndTriesAgain) {
 }
 
 // The catalog's connection may be quicker than the channel.
-TEST_F(MirrorsTest, LendsNoRingOfAStreamThatTheCatalogKnowsToBeRemoved) {
+TEST_F(MirrorsTest, OpensNoRingOfAStreamThatTheCatalogKnowsToBeRemoved) {
   const wire::HostId host_id = owner->host().greeting.host_id;
   const std::shared_ptr<Stream> stream = opened(5);
   catalog.stream_added(host_id, theirs).value();
@@ -308,7 +308,7 @@ TEST_F(MirrorsTest, LendsNoRingOfAStreamThatTheCatalogKnowsToBeRemoved) {
   EXPECT_EQ(newest(*stream), 6) << "its readers get the last samples";
 }
 
-TEST_F(MirrorsTest, LendsItsRingWhenTheCatalogHearsLateOfTheLastOnesRemoval) {
+TEST_F(MirrorsTest, OpensItsRingWhenTheCatalogNoticesTheLastOnesRemovalLate) {
   const wire::HostId host_id = owner->host().greeting.host_id;
   const std::shared_ptr<Stream> stream = opened(5);
   StreamInfo last = theirs;
@@ -320,7 +320,7 @@ TEST_F(MirrorsTest, LendsItsRingWhenTheCatalogHearsLateOfTheLastOnesRemoval) {
   EXPECT_EQ((*answer)->value().stream, stream);
 }
 
-TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
+TEST_F(MirrorsTest, OpensItsRingWhenTheOwnerWasDownWithItsStreams) {
   const std::shared_ptr<Stream> stream = opened(5);
   const KnownHost host = owner->host();
   catalog.stream_added(host.greeting.host_id, theirs).value();
@@ -331,7 +331,7 @@ TEST_F(MirrorsTest, LendsItsRingWhenTheOwnerWentAwayWithItsStreams) {
   EXPECT_EQ((*answer)->value().stream, stream);
 }
 
-TEST_F(MirrorsTest, AsksAgainForARemovedStreamWhenSomebodyOpensIt) {
+TEST_F(MirrorsTest, RequestsARemovedStreamAgainWhenAProgramOpensIt) {
   const std::shared_ptr<Stream> stream = opened(5);
   owner->send(removed_frame());
   until_state(proto::Mirror::REMOVED);
@@ -348,7 +348,7 @@ TEST_F(MirrorsTest, AsksAgainForARemovedStreamWhenSomebodyOpensIt) {
   until_state(proto::Mirror::LIVE);
 }
 
-TEST_F(MirrorsTest, GoesOnWithARingThatAProgramKept) {
+TEST_F(MirrorsTest, ContinuesWithARingThatAProgramKept) {
   std::vector<UniqueFd> kept;
   {
     const std::shared_ptr<Stream> stream = opened(5);
@@ -438,7 +438,7 @@ TEST_F(MirrorsTest, ClosesTheChannelOfAnOwnerThatBreaksTheProtocol) {
   expect_closed([&] { owner->send_sample({6, {}, {}}, Bytes(25)); });
 }
 
-TEST_F(MirrorsTest, IgnoresWhatALaterVersionMaySay) {
+TEST_F(MirrorsTest, IgnoresFramesOfALaterVersion) {
   const std::shared_ptr<Stream> stream = opened(5);
   owner->send(net::Frame());
   samples(6, 6);

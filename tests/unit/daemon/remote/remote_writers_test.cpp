@@ -109,7 +109,7 @@ TEST_F(RemoteWritersTest, CreatesTheStreamAtItsOwnerAndPublishes) {
   }
 }
 
-TEST_F(RemoteWritersTest, TellsWhoCreatedTheStream) {
+TEST_F(RemoteWritersTest, ReportsWhichRequestCreatedTheStream) {
   const auto first = open(&plan), second = open(&plan);
   serve(-1, true);
   EXPECT_TRUE(wait(first).created);
@@ -119,7 +119,7 @@ TEST_F(RemoteWritersTest, TellsWhoCreatedTheStream) {
 }
 
 // Then write() returns the tid that the sample gets over there.
-TEST_F(RemoteWritersTest, GoesOnWithTheTidsOfTheOwnersRing) {
+TEST_F(RemoteWritersTest, ContinuesTheTidsOfTheOwnersRing) {
   theirs.newest = 99;
   Program program(*opened());
   EXPECT_EQ(program.write(0), 100);
@@ -140,7 +140,7 @@ TEST_F(RemoteWritersTest, OpensAnExistingStreamWithoutCreatingIt) {
 }
 
 // One is refused, the other not.
-TEST_F(RemoteWritersTest, AsksForEachWhoWaitsWhatItWants) {
+TEST_F(RemoteWritersTest, SendsTheRequestOfEachProgramThatWaits) {
   const auto opening = open(), creating = open(&plan);
   owner->fail(owner->receive(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
   EXPECT_EQ(wait_error(opening).code, Errc::not_found);
@@ -149,7 +149,7 @@ TEST_F(RemoteWritersTest, AsksForEachWhoWaitsWhatItWants) {
   EXPECT_TRUE(wait(creating).created);
 }
 
-TEST_F(RemoteWritersTest, HandsOnThatTheTypeDiffers) {
+TEST_F(RemoteWritersTest, ForwardsThatTheTypeDiffers) {
   const auto answer = open(&plan);
   owner->fail(owner->receive(), Errc::type_mismatch, "it has 8 bytes");
   EXPECT_EQ(wait_error(answer).code, Errc::type_mismatch);
@@ -164,7 +164,7 @@ TEST_F(RemoteWritersTest, ChecksTheTypeOfThoseWhoJoin) {
   EXPECT_TRUE(open(&plan)->has_value());
 }
 
-TEST_F(RemoteWritersTest, FailsInWordsWhenTheOwnerDoesNotAnswer) {
+TEST_F(RemoteWritersTest, FailsWithAReasonWhenTheOwnerDoesNotAnswer) {
   const KnownHost host = owner->host();
   owner.reset();
   const Error error = wait_error(open_at(host, &plan));
@@ -189,7 +189,7 @@ TEST_F(RemoteWritersTest, CatchesUpFromWhereTheOwnerStopped) {
 
 // Its ring is another one, or 64 others have published since. Also while it is connected: when the
 // first sample comes torn, for example, it has none to acknowledge.
-TEST_F(RemoteWritersTest, GoesOnBehindWhatItKnowsWhenTheOwnerHasForgottenIt) {
+TEST_F(RemoteWritersTest, ContinuesAfterTheAcknowledgedSampleWhenTheOwnerHasForgottenIt) {
   const std::shared_ptr<Stream> stream = opened();
   const auto expect_known = [&](Tid last) {
     run_until(loop, [&] { return stream->mapping().header().first.load() == last + 1; });
@@ -215,7 +215,7 @@ TEST_F(RemoteWritersTest, GoesOnBehindWhatItKnowsWhenTheOwnerHasForgottenIt) {
   EXPECT_EQ(owner->connections(), 3);
 }
 
-TEST_F(RemoteWritersTest, GoesOnInANewRingOfTheOwner) {
+TEST_F(RemoteWritersTest, ContinuesInANewRingOfTheOwner) {
   Program program(*opened());
   for (int i = 0; i < 3; ++i) program.write(i);
   until_published(2);
@@ -309,7 +309,7 @@ TEST_F(RemoteWritersTest, LeavesARemovedStreamAloneUntilItIsCreatedAgain) {
   EXPECT_EQ(times(), (std::vector<int>{0}));
 }
 
-TEST_F(RemoteWritersTest, GoesOnWithARingThatAProgramKept) {
+TEST_F(RemoteWritersTest, ContinuesWithARingThatAProgramKept) {
   std::optional<Program> program;
   std::uint64_t publisher = 0;
   {
@@ -399,7 +399,7 @@ TEST_F(RemoteWritersTest, ClosesTheChannelOfAnOwnerThatBreaksTheProtocol) {
   until_published(1);
 }
 
-TEST_F(RemoteWritersTest, DoesNotBelieveNonsenseInARingThatProgramsWriteTo) {
+TEST_F(RemoteWritersTest, RefusesNonsenseInARingThatProgramsWriteTo) {
   const std::shared_ptr<Stream> stream = opened();
   Program program(*stream);
   program.write(0);

@@ -30,7 +30,7 @@ std::string final_failure(ServerRig& rig, MemoryPeer& peer) {
 
 // --- greeting
 
-TEST(DataCommunicator, SaysNothingBeforeThePeerSaidHello) {
+TEST(DataCommunicator, SendsNothingBeforeThePeersHello) {
   ServerRig rig;
   MemoryPeer peer;
   rig.connect(peer, false);
@@ -38,7 +38,7 @@ TEST(DataCommunicator, SaysNothingBeforeThePeerSaidHello) {
   EXPECT_TRUE(peer.sent.empty());
 }
 
-TEST(DataCommunicator, RefusesWhoDoesNotBeginWithHello) {
+TEST(DataCommunicator, RefusesAPeerThatDoesNotBeginWithHello) {
   ServerRig rig;
   MemoryPeer peer;
   rig.connect(peer, false);
@@ -51,16 +51,16 @@ TEST(DataCommunicator, RefusesAnotherVersionNamingBothAndBothHosts) {
   MemoryPeer peer;
   rig.connect(peer, false);
   peer.put(hello_frame(greeting_of("pc2", "future"), 77));
-  const std::string words = final_failure(rig, peer);
-  EXPECT_NE(words.find("version 77"), std::string::npos) << words;
-  EXPECT_NE(words.find("version 1"), std::string::npos) << words;
-  EXPECT_NE(words.find("'pc1'"), std::string::npos) << words;
-  EXPECT_NE(words.find("10.0.0.2"), std::string::npos) << words;
+  const std::string message = final_failure(rig, peer);
+  EXPECT_NE(message.find("version 77"), std::string::npos) << message;
+  EXPECT_NE(message.find("version 1"), std::string::npos) << message;
+  EXPECT_NE(message.find("'pc1'"), std::string::npos) << message;
+  EXPECT_NE(message.find("10.0.0.2"), std::string::npos) << message;
   ASSERT_EQ(rig.logger.warnings.size(), 1u);
   EXPECT_NE(rig.logger.warnings[0].find("version 77"), std::string::npos);
 }
 
-TEST(DataCommunicator, AnswersARequestWithoutSerialWithLastWords) {
+TEST(DataCommunicator, AnswersARequestWithoutSerialWithAFinalFailure) {
   ServerRig rig;
   MemoryPeer peer;
   rig.connect(peer);
@@ -68,7 +68,7 @@ TEST(DataCommunicator, AnswersARequestWithoutSerialWithLastWords) {
   EXPECT_NE(final_failure(rig, peer).find("serial"), std::string::npos);
 }
 
-TEST(DataCommunicator, LogsTheLastWordsOfAPeer) {
+TEST(DataCommunicator, LogsTheFinalFailureOfAPeer) {
   ServerRig rig;
   rig.create("a");
   MemoryPeer peer;
@@ -83,7 +83,7 @@ TEST(DataCommunicator, LogsTheLastWordsOfAPeer) {
 
 // --- requests
 
-TEST(DataCommunicator, AnswersWhatItDoesNotKnowAndGoesOn) {
+TEST(DataCommunicator, AnswersUnknownRequestsAndContinues) {
   ServerRig rig;
   MemoryPeer peer;
   rig.connect(peer);
@@ -122,7 +122,7 @@ TEST(DataCommunicator, CountsChannelsInTheStreamsDescription) {
   EXPECT_EQ(rig.ask(control, list_request(2)).stream_list().streams(0).channels(), 1u);
 }
 
-TEST(DataCommunicator, ServesASlowAskerOneRequestAtATime) {
+TEST(DataCommunicator, ServesASlowPeerOneRequestAtATime) {
   ServerRig rig;
   const auto stream = rig.create("large", 1000, 64);
   rig.write(*stream, 20);
@@ -149,7 +149,7 @@ TEST(DataCommunicator, ServesASlowAskerOneRequestAtATime) {
   }
 }
 
-TEST(DataCommunicator, KeepsOneLongAnswerForASlowAskerNotAllOfThem) {
+TEST(DataCommunicator, KeepsOneLongAnswerForASlowPeerNotAllOfThem) {
   ServerRig rig;
   rig.create("a");
   ASSERT_TRUE(rig.registry.set_property({"a", 0, ""}, std::string(1 << 20, 'p')));
@@ -190,7 +190,7 @@ TEST(DataCommunicator, LetsOthersHaveTheirTurnBetweenManyRequests) {
   EXPECT_EQ(busy.take().size(), 1000u);
 }
 
-TEST(DataCommunicator, AnswersPingAndEndsWhenTheHeartStops) {
+TEST(DataCommunicator, AnswersPingAndEndsWithoutHeartbeats) {
   ServerRig rig;
   MemoryPeer peer;
   rig.connect(peer);
@@ -202,7 +202,7 @@ TEST(DataCommunicator, AnswersPingAndEndsWhenTheHeartStops) {
   EXPECT_TRUE(rig.logger.warnings.empty()) << "a host that goes away is no fault of this one";
 }
 
-TEST(DataCommunicator, WaitsForHelloOnlySoLong) {
+TEST(DataCommunicator, WaitsForHelloUntilItsTimeout) {
   ServerRig rig;
   MemoryPeer silent, slow;
   rig.connect(silent, false);
@@ -256,7 +256,7 @@ TEST(DataCommunicator, TakesTheMemoryOfALongRingInTurns) {
   EXPECT_GE(static_cast<std::uint64_t>(file.st_blocks) * 512, 40U << 20);
 }
 
-TEST(DataCommunicator, LeavesNoHalfMadeStreamBehind) {
+TEST(DataCommunicator, LeavesNoHalfMadeStream) {
   ServerRig rig;
   MemoryPeer peer;
   rig.connect(peer);
@@ -268,7 +268,7 @@ TEST(DataCommunicator, LeavesNoHalfMadeStreamBehind) {
   EXPECT_FALSE(rig.registry.knows({"long", 0, ""}));
 }
 
-TEST(DataCommunicator, SaysWhichLimitAStreamIsBeyond) {
+TEST(DataCommunicator, ReportsWhichLimitAStreamExceeds) {
   ServerRig rig;
   MemoryPeer peer;
   rig.connect(peer);
@@ -294,7 +294,7 @@ std::string events(const std::vector<net::Frame>& items) {
   return text;
 }
 
-TEST(StreamWatch, TellsWhatIsThereThenAnswersThenTellsChanges) {
+TEST(StreamWatch, SendsWhatIsThereThenAnswersThenSendsChanges) {
   ServerRig rig;
   rig.create("a");
   rig.create("b");
@@ -333,8 +333,8 @@ TEST(StreamWatch, WaitsForAPeerThatReadsSlowlyAndKeepsTheOrder) {
   peer.room = 500;
   peer.put(watch_request(1));
   rig.turns();
-  const std::size_t told = peer.sent.size();
-  EXPECT_LE(told, 500u);
+  const std::size_t sent_bytes = peer.sent.size();
+  EXPECT_LE(sent_bytes, 500u);
   ASSERT_TRUE(rig.registry.remove({"s0", 0, ""}));    // told already
   ASSERT_TRUE(rig.registry.remove({"s299", 0, ""}));  // not told yet
   rig.create("s299");
@@ -383,7 +383,7 @@ TEST(ChannelServer, BoundsTheMemoryOfAHost) {
   rig.connect(peers[4], true, true, 3);  // others do not notice
 }
 
-TEST(ChannelServer, TellsWhoIsConnectedThatItStops) {
+TEST(ChannelServer, NotifiesConnectedPeersThatItStops) {
   MemoryPeer peer;
   {
     ServerRig rig;

@@ -132,7 +132,7 @@ TEST_F(StreamChannelTest, ReadsByTidTimeAndNewest) {
   EXPECT_EQ(read(newer), kNotYet);
 }
 
-TEST_F(StreamChannelTest, TellsItsRange) {
+TEST_F(StreamChannelTest, ReportsItsRange) {
   net::Frame frame = with_serial(1);
   frame.mutable_get_range()->set_time_ns(1155);
   net::Range range = ask(frame).at(0).range();
@@ -168,7 +168,7 @@ TEST_F(StreamChannelTest, BeginsASubscriptionWhereItIsAskedTo) {
   EXPECT_EQ(words(peer.take()), "20") << "the last subscription alone";
 }
 
-TEST_F(StreamChannelTest, BeginsAnewWhenTheTidIsAnotherRings) {
+TEST_F(StreamChannelTest, BeginsAtTheOldestWhenTheTidIsAnotherRings) {
   rig.write(*stream, 3);
   EXPECT_EQ(subscribe([&](auto& s) {
               s.set_from_tid(2);
@@ -191,7 +191,7 @@ TEST_F(StreamChannelTest, SendsWhatIsWrittenFromThenOn) {
   }
 }
 
-TEST_F(StreamChannelTest, ServesReadsInTheMidstOfASubscription) {
+TEST_F(StreamChannelTest, ServesReadsDuringASubscription) {
   subscribe([](auto& s) { s.set_from_now(true); });
   peer.room = 30;
   rig.write(*stream, 5);
@@ -236,14 +236,14 @@ TEST_F(StreamChannelTest, ThinsAtTheSource) {
   EXPECT_TRUE(std::is_sorted(got.begin(), got.end()));
 }
 
-TEST_F(StreamChannelTest, RefusesARateThatIsNone) {
+TEST_F(StreamChannelTest, RefusesAnInvalidRate) {
   for (const double rate :
        {-1.0, std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::infinity()}) {
     EXPECT_EQ(subscribe([rate](auto& s) { s.set_max_rate_hz(rate); }), "failure:invalid_argument");
   }
 }
 
-TEST_F(StreamChannelTest, SendsTheRestThenTellsThatTheStreamWasRemoved) {
+TEST_F(StreamChannelTest, SendsTheRestThenThatTheStreamWasRemoved) {
   EXPECT_EQ(subscribe([](auto& s) { s.set_from_now(true); }), "subscribed:0 caught_up");
   peer.room = 0;
   rig.write(*stream, 4);
@@ -259,13 +259,13 @@ TEST_F(StreamChannelTest, SendsTheRestThenTellsThatTheStreamWasRemoved) {
   EXPECT_EQ(words(peer.take()), "") << "nothing follows";
 }
 
-TEST_F(StreamChannelTest, TellsOfTheRemovalAlsoWhoDidNotSubscribe) {
+TEST_F(StreamChannelTest, ReportsTheRemovalAlsoWithoutASubscription) {
   ASSERT_TRUE(rig.registry.remove({"odometry", 0, ""}));
   rig.turns();
   EXPECT_EQ(words(peer.take()), "removed");
 }
 
-TEST_F(StreamChannelTest, DoesNotDisturbTheWriterWhileNobodySubscribes) {
+TEST_F(StreamChannelTest, DoesNotDisturbTheWriterWithoutASubscriber) {
   const auto bell = stream->map_bell().value();
   EXPECT_FALSE(bell->doorbell_armed());
   subscribe([](auto& s) { s.set_from_now(true); });
@@ -356,7 +356,7 @@ TEST_F(StreamChannelTest, KnowsPublishersOfARingThatIsOfferedBack) {
 
 // A connection was cut in the middle of a sample, and what was under way arrives after all, while
 // the publisher has gone on by another one.
-TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionComesBack) {
+TEST_F(StreamChannelTest, WritesEachSampleOnceWhenAnOldConnectionContinues) {
   constexpr std::uint64_t kInPieces = 100'000;  // received piece by piece
   const std::shared_ptr<Stream> camera = rig.create("camera", kInPieces);
   MemoryPeer old, again;
@@ -410,7 +410,7 @@ TEST_F(StreamChannelTest, BringsPublishedSamplesToOtherChannels) {
   EXPECT_EQ(words(reader.take()), "0");
 }
 
-TEST_F(StreamChannelTest, RefusesSamplesOfWhoDidNotSayThatItPublishes) {
+TEST_F(StreamChannelTest, RefusesSamplesBeforeStartPublishing) {
   peer.put(sample_frame(0));
   rig.turns();
   EXPECT_TRUE(peer.closed);
@@ -464,7 +464,7 @@ TEST_F(StreamChannelTest, HoldsNoMoreForAPublisherThanItsHostMay) {
 
 // --- property
 
-TEST_F(StreamChannelTest, KeepsThePropertyForEverybody) {
+TEST_F(StreamChannelTest, KeepsThePropertyForAllPeers) {
   net::Frame get = with_serial(1), set = with_serial(2);
   get.mutable_get_property();
   set.mutable_set_property()->set_property("calibration");

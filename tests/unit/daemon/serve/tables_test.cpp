@@ -9,7 +9,7 @@
 namespace dssm::daemon {
 namespace {
 
-TEST(RateLimitedLogger, PassesSoManyLinesOnAndCountsTheOthers) {
+TEST(RateLimitedLogger, PassesALimitedNumberOfLinesAndCountsTheOthers) {
   LogRecorder to;
   MonoTime now{std::chrono::seconds(100)};
   RateLimitedLogger logger(to, [&] { return now; });

@@ -111,7 +111,7 @@ TEST(Config, NamesLineAndKeyOfWhatIsWrongInAList) {
   EXPECT_NE(mistakes_in("listen = [\"pc1\"]\n").find("'pc1' is a name"), std::string::npos);
 }
 
-TEST(Config, TellsNoNetworkFromNothingSaid) {
+TEST(Config, DistinguishesNoNetworkFromNoSetting) {
   Config config;
   EXPECT_FALSE(config.listen);
   ASSERT_TRUE(apply_text_untrusted(config, "listen = []", "dssmd.conf"));
@@ -145,7 +145,7 @@ TEST(Config, PutsAListOfInterfacesInPlaceOfTheDefault) {
   EXPECT_TRUE(config.avoid_interfaces.empty());
 }
 
-TEST(Config, AsksForInsecureWhereAnAddressIsNotOnThisPc) {
+TEST(Config, RequiresInsecureForAnAddressThatIsNotOfThisPc) {
   const auto finished = [](const std::string& text) {
     Config config;
     config.name = "pc1";
@@ -187,7 +187,7 @@ TEST(Config, NamesTheLineOfASyntaxError) {
   EXPECT_NE(mistakes_in("name = \"\xff\"\n"), "");
 }
 
-TEST(Config, SaysThatAFileIsMissing) {
+TEST(Config, ReportsThatAFileIsMissing) {
   Config config;
   const Result<void> applied = apply_file(config, "/nowhere/dssmd.conf");
   ASSERT_FALSE(applied);

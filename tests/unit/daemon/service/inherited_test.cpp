@@ -44,7 +44,7 @@ class InheritedTest : public testing::Test {
   std::string dir = test::make_temp_dir();
 };
 
-TEST_F(InheritedTest, TellsListeningSocketsByWhatTheyAre) {
+TEST_F(InheritedTest, DistinguishesListeningSocketsByTheirKind) {
   EXPECT_EQ(sort_one(local("/a")).local.size(), 1u);
   EXPECT_EQ(sort_one(network(AF_INET, SOCK_STREAM)).network.size(), 1u);
   EXPECT_EQ(sort_one(network(AF_INET6, SOCK_STREAM)).network.size(), 1u);

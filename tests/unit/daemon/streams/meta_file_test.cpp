@@ -114,7 +114,7 @@ TEST(MetaFile, CanBeTakenBackFromADescriptorForReading) {
   EXPECT_EQ(again->read_untrusted()->property(), "newer");
 }
 
-TEST(MetaFile, SaysThatTheStreamWasRemovedOnceItIsMarked) {
+TEST(MetaFile, ReportsThatTheStreamWasRemovedOnceItIsMarked) {
   Result<MetaFile> file = MetaFile::create(meta_with("x"));
   ASSERT_TRUE(file);
   ASSERT_TRUE(file->mark_removed());

@@ -70,7 +70,7 @@ TEST(Registry, RefusesToJoinWithAnotherSizeOrType) {
   EXPECT_TRUE(registry.create(kOdometry, nameless, kHistory, 1));
 }
 
-TEST(Registry, TellsStreamsApartByNameAndId) {
+TEST(Registry, DistinguishesStreamsByNameAndId) {
   Registry registry("pc1", kLimits);
   const auto zero = create(registry, {"lidar", 0, ""});
   const auto one = create(registry, {"lidar", 1, "pc1"});
@@ -189,7 +189,7 @@ TEST(Stream, HandsOutARingThatReadersCannotMapWritable) {
   EXPECT_TRUE(ring::Bell::open_untrusted(for_reader.bell.get()));
 }
 
-TEST(Stream, TellsNewestOldestAndRateFromTheRing) {
+TEST(Stream, ReadsNewestOldestAndRateFromTheRing) {
   Registry registry("pc1", kLimits);
   const auto stream = create(registry);
   EXPECT_EQ(stream->info().newest, kNoTid);
@@ -379,7 +379,7 @@ TEST_F(Adoption, RefusesFilesThatAreNotSealedOrNoMemoryFiles) {
   }
 }
 
-TEST_F(Adoption, RefusesARingOfAnotherGeometryThanItsMetaFileSays) {
+TEST_F(Adoption, RefusesARingOfAnotherGeometryThanInItsMetaFile) {
   OfferedFiles files = held(Role::writer);
   Registry before("pc1", kLimits);
   TypeInfo larger = odometry_type();
@@ -422,7 +422,7 @@ TEST(Registry, FreesTheNameOfARemovedStreamAndLeavesItsHoldersAlone) {
   EXPECT_NE(next->info().incarnation, removed->info().incarnation);
 }
 
-TEST(Registry, TellsItsObserversWhatComesAndGoes) {
+TEST(Registry, NotifiesItsObserversOfAdditionsAndRemovals) {
   struct Recorder final : StreamObserver {
     void on_stream_added(const Stream& stream) override { text += "+" + stream.id().name; }
     void on_stream_removed(const Stream& stream) override { text += "-" + stream.id().name; }
