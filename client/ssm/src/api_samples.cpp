@@ -3,7 +3,6 @@
 // <ssm.h>: reading, writing and waiting.
 #include <algorithm>
 #include <cstring>
-#include <optional>
 
 #include "../include/libssm.h"
 #include "convert.hpp"
@@ -45,29 +44,29 @@ SSM_tid read_and_take(SSM_sid sid, ssmTimeT* ytime, Read read, Take take) {
   return ssm_tid(copy.info.tid);
 }
 
-SSM_tid read_tid(Stream& stream, Stream::Copy& copy, SSM_tid tid) {
-  if (tid < 0) {
-    const ReadStatus status = stream.latest(copy);
-    return status == ReadStatus::ok ? 0 : error_of(status);
-  }
-  switch (stream.tid(ring_tid(tid, stream.newest()), copy)) {
-    case ReadStatus::ok:
-      return 0;
-    case ReadStatus::not_yet:
-      return SSM_ERROR_FUTURE;
-    case ReadStatus::too_old:
-    case ReadStatus::lapped:
-    case ReadStatus::restarted:            // Stream continues by itself
-    case ReadStatus::clock_out_of_bounds:  // not of reads by tid
-      break;
-  }
-  return SSM_ERROR_PAST;
-}
+// --- for read_and_take()
 
-SSM_tid read_time(Stream& stream, Stream::Copy& copy, ssmTimeT time) {
-  const ReadStatus status =
-      time > 0 ? stream.at(time_from_seconds(time), copy) : stream.latest(copy);
-  return status == ReadStatus::ok ? 0 : error_of(status);
+auto by_tid(SSM_tid tid) {
+  return [tid](Stream& stream, Stream::Copy& copy) -> SSM_tid {
+    const ReadStatus status =
+        tid < 0 ? stream.latest(copy) : stream.tid(ring_tid(tid, stream.newest()), copy);
+    if (status == ReadStatus::ok) return 0;
+    if (tid < 0) return error_of(status);
+    return status == ReadStatus::not_yet ? SSM_ERROR_FUTURE : SSM_ERROR_PAST;
+  };
+}
+auto by_time(ssmTimeT time) {
+  return [time](Stream& stream, Stream::Copy& copy) -> SSM_tid {
+    const ReadStatus status =
+        time > 0 ? stream.at(time_from_seconds(time), copy) : stream.latest(copy);
+    return status == ReadStatus::ok ? 0 : error_of(status);
+  };
+}
+auto copy_to(void* data) {
+  return [data](const void* sample, std::size_t bytes) { std::memcpy(data, sample, bytes); };
+}
+auto pass_to(ReadCallback callback, void* adata, void* user_data) {
+  return [=](const void* sample, std::size_t) { callback(sample, adata, user_data); };
 }
 
 SSM_tid written(dssm::Tid tid) {
@@ -125,31 +124,21 @@ int waitTID(SSM_sid sid, SSM_tid tid) {
 }
 
 SSM_tid readSSM(SSM_sid sid, void* data, ssmTimeT* ytime, SSM_tid tid) {
-  return read_and_take(
-      sid, ytime, [&](Stream& stream, Stream::Copy& copy) { return read_tid(stream, copy, tid); },
-      [&](const void* sample, std::size_t bytes) { std::memcpy(data, sample, bytes); });
+  return read_and_take(sid, ytime, by_tid(tid), copy_to(data));
 }
 
 SSM_tid readSSM_time(SSM_sid sid, void* data, ssmTimeT ytime, ssmTimeT* ret_time) {
-  return read_and_take(
-      sid, ret_time,
-      [&](Stream& stream, Stream::Copy& copy) { return read_time(stream, copy, ytime); },
-      [&](const void* sample, std::size_t bytes) { std::memcpy(data, sample, bytes); });
+  return read_and_take(sid, ret_time, by_time(ytime), copy_to(data));
 }
 
 SSM_tid readSSMP(SSM_sid sid, void* adata, ssmTimeT* ytime, SSM_tid tid, ReadCallback callback,
                  void* user_data) {
-  return read_and_take(
-      sid, ytime, [&](Stream& stream, Stream::Copy& copy) { return read_tid(stream, copy, tid); },
-      [&](const void* sample, std::size_t) { callback(sample, adata, user_data); });
+  return read_and_take(sid, ytime, by_tid(tid), pass_to(callback, adata, user_data));
 }
 
 SSM_tid readSSMP_time(SSM_sid sid, void* adata, ssmTimeT ytime, ssmTimeT* ret_time,
                       ReadCallback callback, void* user_data) {
-  return read_and_take(
-      sid, ret_time,
-      [&](Stream& stream, Stream::Copy& copy) { return read_time(stream, copy, ytime); },
-      [&](const void* sample, std::size_t) { callback(sample, adata, user_data); });
+  return read_and_take(sid, ret_time, by_time(ytime), pass_to(callback, adata, user_data));
 }
 
 SSM_tid writeSSM(SSM_sid sid, const void* data, ssmTimeT ytime) {

@@ -24,9 +24,10 @@ namespace {
 
 static_assert(sizeof(SSM_sid) == 8, "a sid holds a place and a generation: 46 bits");
 
-// Trivially destructible and made when the library is loaded, so before any static object of the
-// program, and there until its last thread ends.
+// Made when the library is loaded, so before any static object of the program, and there until its
+// last thread ends.
 Process the_process;
+static_assert(std::is_trivially_destructible_v<Process>);
 
 thread_local int thread_id = 0;
 
