@@ -22,14 +22,19 @@ std::string quoted(const char* verb, const StreamId& id) {
   return fmt::format("{} '{}'", verb, id.str());
 }
 
+// The response to `request`; a failure begins with `what`.
+Result<local::Response> ask(detail::Client& client, local::Request request,
+                            const std::string& what) {
+  return DSSM_TRY(client.connection().call(std::move(request)), what).response;
+}
+
 Result<std::vector<StreamInfo>> listed(detail::Client& client, bool own_only) {
   local::Request request;
   request.mutable_list()->set_own_only(own_only);
-  const detail::Answer answer =
-      DSSM_TRY(client.connection().call(std::move(request)), "list the streams");
+  const auto response = DSSM_TRY(ask(client, std::move(request), "list the streams"));
   std::vector<StreamInfo> streams;
-  streams.reserve(static_cast<std::size_t>(answer.response.stream_list().streams_size()));
-  for (const proto::Stream& stream : answer.response.stream_list().streams()) {
+  streams.reserve(static_cast<std::size_t>(response.stream_list().streams_size()));
+  for (const proto::Stream& stream : response.stream_list().streams()) {
     streams.push_back(wire::stream_info(stream));
   }
   return streams;
@@ -69,9 +74,9 @@ namespace detail {
 Result<std::vector<std::byte>> get_property(Client& client, const StreamId& id) {
   local::Request request;
   wire::to_message(id, *request.mutable_get_property()->mutable_id());
-  const detail::Answer answer =
-      DSSM_TRY(client.connection().call(std::move(request)), quoted("get the property of", id));
-  const std::string& text = answer.response.property().property();
+  const auto response =
+      DSSM_TRY(ask(client, std::move(request), quoted("get the property of", id)));
+  const std::string& text = response.property().property();
   const auto bytes = std::as_bytes(std::span(text));
   return std::vector<std::byte>(bytes.begin(), bytes.end());
 }
@@ -87,7 +92,7 @@ Result<void> set_property(Client& client, const StreamId& id, std::span<const st
   local::Request request;
   wire::to_message(id, *request.mutable_set_property()->mutable_id());
   request.mutable_set_property()->set_property(property.data(), property.size());
-  DSSM_TRY(client.connection().call(std::move(request)), what);
+  DSSM_TRY(ask(client, std::move(request), what));
   return {};
 }
 
@@ -169,7 +174,7 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
 Result<void> Session::remove(const StreamId& id) {
   local::Request request;
   wire::to_message(id, *request.mutable_remove()->mutable_id());
-  DSSM_TRY(client_->connection().call(std::move(request)), quoted("remove", id));
+  DSSM_TRY(ask(*client_, std::move(request), quoted("remove", id)));
   return {};
 }
 
@@ -180,13 +185,13 @@ Result<std::vector<StreamInfo>> Session::list_own_streams() { return listed(*cli
 Result<StreamInfo> Session::stream_info(const StreamId& id) {
   local::Request request;
   wire::to_message(id, *request.mutable_info()->mutable_id());
-  const detail::Answer answer =
-      DSSM_TRY(client_->connection().call(std::move(request)), quoted("get information on", id));
-  if (answer.response.stream_list().streams_size() != 1) {
+  const auto response =
+      DSSM_TRY(ask(*client_, std::move(request), quoted("get information on", id)));
+  if (response.stream_list().streams_size() != 1) {
     return Error{Errc::protocol,
                  quoted("get information on", id) + ": dssmd's answer does not contain the stream"};
   }
-  return wire::stream_info(answer.response.stream_list().streams(0));
+  return wire::stream_info(response.stream_list().streams(0));
 }
 
 struct Session::Watch::State {
@@ -217,10 +222,9 @@ Result<std::vector<std::byte>> Session::property(const StreamId& id) {
 Result<std::vector<HostInfo>> Session::list_hosts() {
   local::Request request;
   request.mutable_list_hosts();
-  const detail::Answer answer =
-      DSSM_TRY(client_->connection().call(std::move(request)), "list the hosts");
+  const auto response = DSSM_TRY(ask(*client_, std::move(request), "list the hosts"));
   std::vector<HostInfo> hosts;
-  for (const local::Host& host : answer.response.host_list().hosts()) {
+  for (const local::Host& host : response.host_list().hosts()) {
     hosts.push_back(host_info(host));
   }
   return hosts;
@@ -229,9 +233,8 @@ Result<std::vector<HostInfo>> Session::list_hosts() {
 Result<RoundTrip> Session::ping(const std::string& host) {
   local::Request request;
   request.mutable_ping_host()->set_host(host);
-  const detail::Answer answer =
-      DSSM_TRY(client_->connection().call(std::move(request)), "ping '" + host + "'");
-  const local::RoundTrip& round_trip = answer.response.round_trip();
+  const auto response = DSSM_TRY(ask(*client_, std::move(request), "ping '" + host + "'"));
+  const local::RoundTrip& round_trip = response.round_trip();
   return RoundTrip{Duration(round_trip.round_trip_ns()), round_trip.address()};
 }
 
@@ -244,10 +247,9 @@ Result<PlaybackClock> Session::open_playback_clock() {
 Result<std::vector<ClientInfo>> Session::list_clients() {
   local::Request request;
   request.mutable_list_clients();
-  const detail::Answer answer =
-      DSSM_TRY(client_->connection().call(std::move(request)), "list the processes");
+  const auto response = DSSM_TRY(ask(*client_, std::move(request), "list the processes"));
   std::vector<ClientInfo> clients;
-  for (const local::Client& client : answer.response.client_list().clients()) {
+  for (const local::Client& client : response.client_list().clients()) {
     clients.push_back({client.pid(), client.uid(), client.program()});
   }
   return clients;
@@ -256,10 +258,9 @@ Result<std::vector<ClientInfo>> Session::list_clients() {
 Result<std::vector<OpenInfo>> Session::list_opens() {
   local::Request request;
   request.mutable_list_opens();
-  const detail::Answer answer =
-      DSSM_TRY(client_->connection().call(std::move(request)), "list the open streams");
+  const auto response = DSSM_TRY(ask(*client_, std::move(request), "list the open streams"));
   std::vector<OpenInfo> opens;
-  for (const local::OpenEntry& entry : answer.response.open_list().opens()) {
+  for (const local::OpenEntry& entry : response.open_list().opens()) {
     opens.push_back({{entry.id().name(), entry.id().id(), entry.id().host()},
                      entry.creator_pid(),
                      entry.opener_pid(),
@@ -272,9 +273,8 @@ Result<std::vector<OpenInfo>> Session::list_opens() {
 Result<DaemonInfo> Session::daemon_info() {
   local::Request request;
   request.mutable_get_daemon();
-  const detail::Answer answer =
-      DSSM_TRY(client_->connection().call(std::move(request)), "ask dssmd about itself");
-  const local::Daemon& daemon = answer.response.daemon();
+  const auto response = DSSM_TRY(ask(*client_, std::move(request), "ask dssmd about itself"));
+  const local::Daemon& daemon = response.daemon();
   const local::Mdns& mdns = daemon.mdns();
   return DaemonInfo{
       daemon.host(),

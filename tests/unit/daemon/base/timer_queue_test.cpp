@@ -2,7 +2,7 @@
 //
 // Timers behind one timerfd, alone and in an event loop: their order, starting and stopping in
 // callbacks, which system calls they cost, and simulated time.
-#include "daemon/base/timer_queue.hpp"
+#include "daemon/base/event_loop.hpp"
 
 #include <gtest/gtest.h>
 #include <poll.h>
@@ -15,7 +15,6 @@
 #include <string>
 #include <vector>
 
-#include "daemon/base/event_loop.hpp"
 
 namespace dssm::daemon {
 namespace {
