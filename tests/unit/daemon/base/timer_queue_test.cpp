@@ -2,8 +2,6 @@
 //
 // Timers behind one timerfd, alone and in an event loop: their order, starting and stopping in
 // callbacks, which system calls they cost, and simulated time.
-#include "daemon/base/event_loop.hpp"
-
 #include <gtest/gtest.h>
 #include <poll.h>
 #include <sys/eventfd.h>
@@ -15,6 +13,7 @@
 #include <string>
 #include <vector>
 
+#include "daemon/base/event_loop.hpp"
 
 namespace dssm::daemon {
 namespace {
