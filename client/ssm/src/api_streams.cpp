@@ -62,18 +62,18 @@ SSM_sid createSSM(const char* stream_name, int stream_id, size_t stream_size, ss
     report_error(*wrong);
     return nullptr;
   }
-  const std::string what = "create " + quoted(stream_name, stream_id) + " : ";
+  const std::string what = "create " + quoted(stream_name, stream_id);
   auto writer = process().request([&](dssm::Session& dssmd) {
     return dssmd.create_raw(dssm::ssm::stream_id(stream_name, stream_id),
                             dssm::ssm::type_for(stream_size), dssm::ssm::history_of(life, cycle),
                             dssm::ssm::kTagHidden);
   });
-  if (!writer) return report_error(what + writer.error().message), nullptr;
+  if (!writer) return dssm::ssm::report_failure(what, writer.error()), nullptr;
   const std::uint64_t bytes = dssm::ssm::data_bytes(writer->type());
   if (bytes != stream_size) {
     report_error(fmt::format(
-        "{}the stream exists with {} bytes per sample, not {}; use its type or another name", what,
-        bytes, stream_size));
+        "{} : the stream exists with {} bytes per sample, not {}; use its type or another name",
+        what, bytes, stream_size));
     return nullptr;
   }
   return process().add(

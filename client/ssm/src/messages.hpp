@@ -3,9 +3,12 @@
 // What this library reports to people: lines on stderr, and the text that errSSM() prints.
 #pragma once
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cstdio>
 #include <cstring>
+#include <dssm/error.hpp>
 #include <string_view>
 
 namespace dssm::ssm {
@@ -25,6 +28,11 @@ inline void remember_error(std::string_view text) noexcept {
 inline void report_error(std::string_view text) noexcept {
   remember_error(text);
   std::fprintf(stderr, "SSM ERROR : %.*s\n", static_cast<int>(text.size()), text.data());
+}
+
+// The same for a failure of `what`.
+inline void report_failure(std::string_view what, const Error& error) {
+  report_error(fmt::format("{} : {}", what, error.message));
 }
 
 }  // namespace dssm::ssm

@@ -50,6 +50,7 @@ using dssm::ssm::Broadcast;
 using dssm::ssm::process;
 using dssm::ssm::RemoteStream;
 using dssm::ssm::report_error;
+using dssm::ssm::report_failure;
 
 struct dssm_ssm_remote {
   RemoteStream stream;
@@ -122,7 +123,7 @@ int dssm_ssm_remote_open(dssm_ssm_remote* remote, const char* address, const cha
                          size_t size) {
   const dssm::StreamId stream = dssm::ssm::stream_id(name, id);
   if (dssm::Result<void> checked = stream.check(); !checked) {
-    report_error("open " + dssm::ssm::quoted(name, id) + " : " + checked.error().message);
+    report_failure("open " + dssm::ssm::quoted(name, id), checked.error());
     return 0;
   }
   return remote->stream.open(address, stream, size) ? 1 : 0;
@@ -174,7 +175,7 @@ void dssm_ssm_remote_set_offset(const char* address, ssmTimeT offset) {
   }
   auto session = process().any_session();
   auto clock = session ? session->open_playback_clock() : std::move(session).error();
-  if (!clock) return report_error("setOffset : " + clock.error().message);
+  if (!clock) return report_failure("setOffset", clock.error());
   clock->set_offset(offset);
 }
 
@@ -184,7 +185,7 @@ int dssm_ssm_remote_buffer(dssm_ssm_remote* remote, ssmTimeT life, ssmTimeT cycl
 
 int dssm_ssm_remote_send_broadcast(dssm_ssm_remote* remote, const void* data, size_t size) {
   const auto shown = remote->broadcast.show({static_cast<const std::byte*>(data), size});
-  if (!shown) report_error("sendBroadcast : " + shown.error().message);
+  if (!shown) report_failure("sendBroadcast", shown.error());
   return shown ? 1 : 0;
 }
 
@@ -194,7 +195,7 @@ void dssm_ssm_remote_receive_broadcast(dssm_ssm_remote* remote,
                                        void* user_data) {
   auto local = remote->broadcast.connect();
   auto hosts = local ? (*local)->list_hosts() : std::move(local).error();
-  if (!hosts) return report_error("receiveBroadcast : " + hosts.error().message);
+  if (!hosts) return report_failure("receiveBroadcast", hosts.error());
   for (const dssm::HostInfo& host : *hosts) {
     if (host.state != dssm::HostState::self && host.state != dssm::HostState::up) continue;
     // The last one is where it was reached, if it was configured by another name.

@@ -125,9 +125,9 @@ void RemoteStream::report_once(const Error& error) {
 bool RemoteStream::connect(const std::string& address) {
   const Call call(*this);
   if (!call) return false;
-  const std::string what = "connect to '" + address + "'";
+  const std::string what = fmt::format("connect to '{}'", address);
   const auto listed = retry(what, [&] { return PConnector::list_streams(options(address, 0)); });
-  if (!listed) report_error(what + " : " + listed.error().message);
+  if (!listed) report_failure(what, listed.error());
   return listed.has_value();
 }
 
@@ -135,7 +135,7 @@ bool RemoteStream::take(Result<PConnector> opened, const std::string& what) {
   collector_.reset();
   connector_.reset();
   if (!opened) {
-    report_error(what + " : " + opened.error().message);
+    report_failure(what, opened.error());
     return false;
   }
   connector_ = std::move(*opened);
@@ -397,7 +397,7 @@ bool RemoteStream::buffer(double life, double cycle) {
   const Call call(*this);
   if (!call.has_stream()) return false;
   collector_.reset();
-  const std::string what = "readyRingBuf " + quoted_name() + " : ";
+  const std::string what = "readyRingBuf " + quoted_name();
   std::uint64_t depth = connector_->depth();
   if (life != 0 || cycle != 0) {
     const double own_cycle = seconds_from_ns(to_ns(connector_->cycle()));
@@ -405,17 +405,18 @@ bool RemoteStream::buffer(double life, double cycle) {
     if (life == 0) life = static_cast<double>(depth - 1) * own_cycle / SSM_BUFFER_MARGIN;
     const double wanted = slots(life, cycle);
     if (!(life > 0 && cycle > 0 && life >= cycle && wanted <= static_cast<double>(kMaxDepth))) {
-      report_error(fmt::format(
-          "{}a life of {:f} s at a cycle of {:f} s cannot be; both must be more than 0, life not "
-          "less than cycle, and together not more than 2^24 samples",
-          what, life, cycle));
+      report_error(
+          fmt::format("{} : a life of {:f} s at a cycle of {:f} s cannot be; both must be more "
+                      "than 0, life not "
+                      "less than cycle, and together not more than 2^24 samples",
+                      what, life, cycle));
       return false;
     }
     depth = std::max(static_cast<std::uint64_t>(wanted), kMinDepth);
   }
   auto connector =
       PConnector::open(connector_->id(), options(address_, sample_.size()), &connector_->type());
-  if (!connector) return report_error(what + connector.error().message), false;
+  if (!connector) return report_failure(what, connector.error()), false;
   const std::uint64_t max_depth =
       std::max(kMinDepth, kMaxCollectedBytes / connector->payload_bytes());
   if (depth > max_depth) {
@@ -429,7 +430,7 @@ bool RemoteStream::buffer(double life, double cycle) {
       std::move(*connector), {.start = Subscription::Start::oldest},
       {.depth = std::min(depth, max_depth),
        .on_error = [](const Error& error) { report_error(error.message + "; trying again"); }});
-  if (!collector) return report_error(what + collector.error().message), false;
+  if (!collector) return report_failure(what, collector.error()), false;
   collector_ = std::move(*collector);
   return true;
 }
