@@ -24,7 +24,7 @@
 namespace dssm::daemon {
 namespace {
 
-constexpr std::size_t kMostDescriptorsPerMessage = 253;  // the kernel's SCM_MAX_FD
+constexpr std::size_t kMaxDescriptorsPerMessage = 253;  // the kernel's SCM_MAX_FD
 
 // Pause before a retry when the socket does not become writable: that too many descriptors are in
 // flight has nothing to do with free space in its queue.
@@ -91,7 +91,7 @@ void ServiceManager::alive() {
 
 // FDPOLL=0: the manager shall not poll them: otherwise any writer could make it drop an eventfd.
 void ServiceManager::keep(const std::string& name, const std::vector<int>& fds) {
-  DSSM_CHECK(!fds.empty() && fds.size() <= kMostDescriptorsPerMessage);
+  DSSM_CHECK(!fds.empty() && fds.size() <= kMaxDescriptorsPerMessage);
   send({"FDSTORE=1\nFDPOLL=0\nFDNAME=" + name, fds, name});
 }
 
