@@ -16,6 +16,8 @@
 #include <cstring>
 #include <memory>
 
+#include "core/base/try.hpp"
+
 namespace dssm::wire {
 namespace {
 
@@ -113,9 +115,7 @@ Result<Address> Address::parse(std::string_view text, std::uint16_t default_port
     const std::string_view rest = text.substr(bracket + 1);
     if (rest.empty()) return address;
     if (rest.front() != ':') return invalid(text, "after ']' comes :PORT or nothing");
-    const Result<std::uint16_t> port = parse_port(text, rest.substr(1), port_0_allowed);
-    if (!port) return port.error();
-    address.port = *port;
+    address.port = DSSM_TRY(parse_port(text, rest.substr(1), port_0_allowed));
     return address;
   }
   if (is_ipv6(text)) {
@@ -137,9 +137,7 @@ Result<Address> Address::parse(std::string_view text, std::uint16_t default_port
                              "' is no host name; these are letters, digits, '-', '_' and '.'");
   }
   if (colon == text.npos) return address;
-  const Result<std::uint16_t> port = parse_port(text, text.substr(colon + 1), port_0_allowed);
-  if (!port) return port.error();
-  address.port = *port;
+  address.port = DSSM_TRY(parse_port(text, text.substr(colon + 1), port_0_allowed));
   return address;
 }
 

@@ -14,6 +14,8 @@
 // decoder take the buffer with it.
 #include "core/wire/frame_decoder.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cstring>
 
@@ -41,13 +43,13 @@ constexpr std::size_t kMinSpace = 4 << 10;  // in all
 // What a sample frame may have besides its payload.
 constexpr std::size_t kMaxSampleOverheadBytes = 1 << 10;
 
-Error bad(std::string why) { return Error{Errc::protocol, std::move(why)}; }
-
-std::string bytes_text(std::uint64_t bytes) { return std::to_string(bytes) + " bytes"; }
+template <class... Values>
+Error no_frame(fmt::format_string<Values...> text, Values&&... values) {
+  return Error{Errc::protocol, fmt::format(text, std::forward<Values>(values)...)};
+}
 
 Error too_long(std::uint64_t bytes, std::size_t limit) {
-  return bad("a frame of " + bytes_text(bytes) + " is longer than the " + std::to_string(limit) +
-             " that are taken");
+  return no_frame("a frame of {} bytes is longer than the {} that are taken", bytes, limit);
 }
 
 bool is_bulk(std::uint64_t field) noexcept {
@@ -92,10 +94,10 @@ std::size_t plain_bytes(std::span<const std::byte> message) noexcept {
 }
 
 [[gnu::hot]] Result<void> check_sample(std::int64_t tid, std::uint64_t clock_error_ns) {
-  if (tid < 0) return bad("a sample has the tid " + std::to_string(tid) + "; they start at 0");
+  if (tid < 0) return no_frame("a sample has the tid {}; they start at 0", tid);
   if (clock_error_ns > static_cast<std::uint64_t>(INT64_MAX)) {
-    return bad("a sample has the clock error " + std::to_string(clock_error_ns) +
-               " ns; more than 2^63-1 is not possible");
+    return no_frame("a sample has the clock error {} ns; more than 2^63-1 is not possible",
+                    clock_error_ns);
   }
   return {};
 }
@@ -141,10 +143,10 @@ std::size_t FrameDecoder::longest_frame_bytes() const noexcept {
 }
 
 [[gnu::hot]] Result<void> FrameDecoder::check_payload_bytes(std::uint64_t payload_bytes) const {
-  if (payload_bytes_ == 0) return bad("a sample came where none is awaited");
+  if (payload_bytes_ == 0) return no_frame("a sample came where none is awaited");
   if (payload_bytes == payload_bytes_) return {};
-  return bad("a sample of " + bytes_text(payload_bytes) + " came; the stream's samples have " +
-             std::to_string(payload_bytes_));
+  return no_frame("a sample of {} bytes came; the stream's samples have {}", payload_bytes,
+                  payload_bytes_);
 }
 
 // --- the input buffer
@@ -241,7 +243,7 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
 [[gnu::hot]] Result<void> FrameDecoder::take_head(Bytes& input) {
   SampleHead head;
   const HeadStatus status = read_sample_head_untrusted(input, head);
-  if (status == HeadStatus::no_frame) return bad("the input is no varint-delimited frame");
+  if (status == HeadStatus::no_frame) return no_frame("the input is no varint-delimited frame");
   if (head.frame_bytes > longest_frame_bytes()) {
     return too_long(head.frame_bytes, longest_frame_bytes());
   }
@@ -300,11 +302,10 @@ Result<void> FrameDecoder::take_trailer(Bytes& input) {
   net::Frame trailer;
   if (read_varint(at, trailer_.end(), kMaxLengthBytes, tag) != VarintStatus::ok ||
       !trailer.ParseFromArray(trailer_.data(), static_cast<int>(trailer_.size()))) {
-    return bad("what follows a sample's payload is no field");
+    return no_frame("what follows a sample's payload is no field");
   }
   if (tag >> 3 <= net::Frame::kTornFieldNumber) {
-    return bad("field " + std::to_string(tag >> 3) +
-               " came behind a sample's payload; it has to come before it");
+    return no_frame("field {} came after a sample's payload; it has to come before it", tag >> 3);
   }
   return end_sample(false);
 }
@@ -353,12 +354,12 @@ Result<void> FrameDecoder::take_whole(Bytes& input) {
 
 Result<void> FrameDecoder::parse_whole(Bytes message) {
   if (message.size() > kMaxPlainBytes && plain_bytes(message) > kMaxPlainBytes) {
-    return bad("a frame of " + bytes_text(message.size()) + " has more than " +
-               std::to_string(kMaxPlainBytes) + " that are neither payload nor property");
+    return no_frame("a frame of {} bytes has more than {} that are neither payload nor property",
+                    message.size(), kMaxPlainBytes);
   }
   net::Frame frame;
   if (!frame.ParseFromArray(message.data(), static_cast<int>(message.size()))) {
-    return bad("a frame of " + bytes_text(message.size()) + " is no message of this protocol");
+    return no_frame("a frame of {} bytes is no message of this protocol", message.size());
   }
   if (frame.has_sample() || !frame.payload().empty()) {
     return hand_out_slowly(frame, message.size());
@@ -371,13 +372,12 @@ Result<void> FrameDecoder::hand_out_slowly(net::Frame& frame, std::size_t frame_
   const std::string& payload = frame.payload();
   DSSM_TRY(check_payload_bytes(payload.size()));
   if (frame_bytes - payload.size() > kMaxSampleOverheadBytes) {
-    return bad("a sample's frame has " + bytes_text(frame_bytes - payload.size()) +
-               " besides the payload; at most " + std::to_string(kMaxSampleOverheadBytes) +
-               " are taken");
+    return no_frame("a sample's frame has {} bytes besides the payload; at most {} are taken",
+                    frame_bytes - payload.size(), kMaxSampleOverheadBytes);
   }
-  if (!frame.has_sample()) return bad("a payload came without its sample");
+  if (!frame.has_sample()) return no_frame("a payload came without its sample");
   if (frame.body_case() != net::Frame::BODY_NOT_SET) {
-    return bad("a frame carries a sample and another message");
+    return no_frame("a frame carries a sample and another message");
   }
   const net::Sample& stamps = frame.sample();
   DSSM_TRY(check_sample(stamps.tid(), stamps.clock_error_ns()));

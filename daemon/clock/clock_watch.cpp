@@ -25,7 +25,7 @@ std::string length_text(Duration d) {
 }
 
 std::string left_out_text(std::uint64_t count, const char* what) {
-  return count ? " (" + std::to_string(count) + " " + what + " before this were left out)" : "";
+  return count ? fmt::format(" ({} {} before this were left out)", count, what) : "";
 }
 
 }  // namespace
@@ -127,12 +127,12 @@ void ClockWatch::observe(const Instant& now) {
   if (!step) return;
   const auto steps = step_lines_.admit(now.mono);
   if (!steps) return;
-  logger_.warning("this PC's clock was set " +
-                      std::string(*step > Duration::zero() ? "forward" : "back") + " by " +
-                      length_text(*step) + left_out_text(*steps - 1, "steps") +
-                      "; it is out of bounds until chronyd has measured it " +
-                      std::to_string(clock::ClockEstimator::kUpdatesAfterStep) + " times anew",
-                  {.message_id = message_id::kClockStepped});
+  logger_.warning(
+      fmt::format("this PC's clock was set {} by {}{}; it is out of bounds until chronyd "
+                  "has measured it {} times again",
+                  *step > Duration::zero() ? "forward" : "back", length_text(*step),
+                  left_out_text(*steps - 1, "steps"), clock::ClockEstimator::kUpdatesAfterStep),
+      {.message_id = message_id::kClockStepped});
 }
 
 // Logs a change of the condition, if there is one, and notifies the observer in any case.
@@ -189,7 +189,7 @@ void ClockWatch::log(Condition condition, const ClockSnapshot& state, MonoTime n
                                  "chrony`), and does chrony.conf leave its `cmdport` at that?",
                              {.message_id = message_id::kChronydAway});
     case Condition::silent:
-      return logger_.warning(where_ + " does not tell how this PC's clock is" + after +
+      return logger_.warning(where_ + " does not report the state of this PC's clock" + after +
                                  "; the clock has no bound: " + last_error_,
                              {.message_id = message_id::kChronydAway});
     case Condition::unsynchronized:
@@ -199,7 +199,7 @@ void ClockWatch::log(Condition condition, const ClockSnapshot& state, MonoTime n
                              {.message_id = message_id::kClockOutOfBounds});
     case Condition::stepped:
       return logger_.warning(
-          back + "this PC's clock was set, and chronyd has yet to measure it anew" + after,
+          back + "this PC's clock was set, and chronyd has not measured it since" + after,
           {.message_id = message_id::kClockOutOfBounds});
     case Condition::too_far:
       return logger_.warning(back + too_far(state) + after,

@@ -230,7 +230,7 @@ TEST(FrameDecoder, TakesFieldsInEveryOrder) {
 
 TEST(FrameDecoder, RefusesASerialAfterALargePayloadThatItCouldNotWaitFor) {
   expect_refused(in_order("Sps", sample_message(300, 5, 20)), 20,
-                 "field 1 came behind a sample's payload");
+                 "field 1 came after a sample's payload");
 }
 
 TEST(FrameDecoder, TakesStampsInEveryOrderAndLeftOut) {

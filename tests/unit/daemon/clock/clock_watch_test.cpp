@@ -127,7 +127,7 @@ TEST_F(ClockWatchTest, LogsThatChronydDoesNotAnswer) {
   EXPECT_EQ(watch->state().reason, ClockReason::silent) << "nobody waits for a callback";
   until_logged("warning: chronyd at");
   EXPECT_EQ(
-      logged("does not tell how this PC's clock is; the clock has no bound: it does not answer"),
+      logged("does not report the state of this PC's clock; the clock has no bound: it does not answer"),
       1);
   until_events(2);
   EXPECT_EQ(logger.lines.size(), 2u);
@@ -140,7 +140,7 @@ TEST_F(ClockWatchTest, LogsThatChronydHasNeverAnswered) {
   until_events(1);
   EXPECT_TRUE(logger.lines.empty()) << "it may be starting";
   pass(4s);
-  until_logged("does not tell");
+  until_logged("does not report the state");
   EXPECT_EQ(watch->state().status, ClockStatus::unknown);
 }
 
@@ -152,7 +152,7 @@ TEST_F(ClockWatchTest, GivesAStartingChronydTime) {
   run_until(loop, [&] { return requests == 2; });
   EXPECT_EQ(logger.lines.size(), 1u) << "there is no chronyd";
   pass(4s);
-  until_logged("does not tell");
+  until_logged("does not report the state");
 }
 
 TEST_F(ClockWatchTest, TreatsNonsenseAsNoAnswer) {
