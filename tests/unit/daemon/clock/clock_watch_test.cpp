@@ -126,9 +126,9 @@ TEST_F(ClockWatchTest, LogsThatChronydDoesNotAnswer) {
   pass(4s);
   EXPECT_EQ(watch->state().reason, ClockReason::silent) << "nobody waits for a callback";
   until_logged("warning: chronyd at");
-  EXPECT_EQ(
-      logged("does not report the state of this PC's clock; the clock has no bound: it does not answer"),
-      1);
+  EXPECT_EQ(logged("does not report the state of this PC's clock; the clock has no bound: it does "
+                   "not answer"),
+            1);
   until_events(2);
   EXPECT_EQ(logger.lines.size(), 2u);
   is_silent = false;
