@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Makes the bytes in a slot a sample: writes its stamps, run links, time index, sequence and `top`,
-// in the order that readers rely on. RingWriter (programs), MirrorWriter (dssmd) and
-// SampleCollector (libdssm) are built on it.
+// in the order that readers rely on. RingWriter (programs), MirrorRing (dssmd) and SampleCollector
+// (libdssm) are built on it.
 #pragma once
 
 #include <dssm/sample.hpp>

@@ -32,7 +32,7 @@ namespace {
 constexpr std::size_t kInputBytes = 256 << 10;
 
 // From this size on a receive ends behind the payload under way, with little room for what follows:
-// the verdict on it and the next one's head. So all but that little is received in place. Below,
+// its torn trailer and the next one's head. So all but that little is received in place. Below,
 // one receive for several samples and a copy that stays in the cache are cheaper. Measured over
 // loopback: the receiver's processor time is the same for both at 8 KiB; at 16 KiB receiving in
 // place takes 10 % less.

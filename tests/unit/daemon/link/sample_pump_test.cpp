@@ -252,7 +252,7 @@ TEST_P(SamplePumpOfEachKind, SendsWholeSamplesWhereverTheSocketStops) {
         total = rig.peer.sent.size();
       }
       for (std::size_t room = 0; room <= total; ++room) {
-        // All around the borders of frames, headers and verdicts; samples of the rest.
+        // All around the borders of frames, headers and torn trailers; samples of the rest.
         const std::size_t in_frame = room % (total / 3);
         if (in_frame > 45 && in_frame < total / 3 - 5 && room % (total / 16) != 0) continue;
         PumpRig rig(payload_bytes, 8, may_tear, budget);
@@ -445,7 +445,7 @@ TEST(SamplePump, CopiesNothingWhenTheSocketTakesAllOfALargeSample) {
   EXPECT_EQ(large.sender.counters().in_place_payload_bytes, 5 * kLarge);
   EXPECT_EQ(small.sender.counters().copied_payload_bytes, 5 * kSmall);
   EXPECT_EQ(small.peer.sends, 1u) << "all small samples in one send";
-  EXPECT_EQ(large.peer.sends, 6u) << "one send each, and one for the last verdict";
+  EXPECT_EQ(large.peer.sends, 6u) << "one send each, and one for the last torn trailer";
 }
 
 TEST(SamplePump, CopiesOneThatIsNotLargeAndComesAlone) {
@@ -460,7 +460,7 @@ TEST(SamplePump, CopiesOneThatIsNotLargeAndComesAlone) {
   rig.write(3);
   rig.run_on();
   EXPECT_EQ(rig.sender.counters().in_place_payload_bytes, 2 * kMiddle);
-  EXPECT_EQ(rig.peer.sends, 6u) << "the last of a run brings the verdict on the one before";
+  EXPECT_EQ(rig.peer.sends, 6u) << "the last of a run brings the torn trailer of the one before";
   EXPECT_EQ(rig.accepted(), tids(0, 5));
 }
 
@@ -476,7 +476,7 @@ TEST(SamplePump, StopsAfterTheSampleUnderWayWhenAnotherFrameIsToBeSent) {
   ASSERT_TRUE(wait);
   EXPECT_EQ(*wait, PumpWait::turn);
   EXPECT_FALSE(rig.sender.busy());
-  EXPECT_EQ(rig.accepted(), tids(0, 0)) << "whole, with its verdict";
+  EXPECT_EQ(rig.accepted(), tids(0, 0)) << "whole, with its torn trailer";
 }
 
 // --- thinning
