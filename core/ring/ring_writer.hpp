@@ -7,8 +7,8 @@
 //   RingWriter                         the lock, and the wake-up of readers and dssmd
 //   SlotWriter                         the slot, the time index, `top`
 //
-// In a mirror, MirrorRing (daemon/remote) takes the place of RingWriter: dssmd is the only writer and
-// needs no lock. OutgoingRing is a ring that programs fill like any other and that dssmd reads.
+// In a mirror, MirrorRing (daemon/remote) takes the place of RingWriter: dssmd is the only writer
+// and needs no lock. OutgoingRing is a ring that programs fill like any other and that dssmd reads.
 //
 // Writers of one stream take turns by the robust lock in its header. A writer that dies at any
 // instruction leaves a slot that no reader accepts, and the lock to the next writer, which repairs

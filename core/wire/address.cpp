@@ -67,10 +67,10 @@ Result<std::uint16_t> parse_port(std::string_view text, std::string_view port, b
   const auto [end, error] = std::from_chars(port.data(), port.data() + port.size(), number);
   if (error != std::errc() || end != port.data() + port.size()) {
     return invalid(text, "'" + std::string(port) +
-                             "' is no port; write HOST:PORT with a port from 1 to 65535");
+                             "' is not a port; write HOST:PORT with a port from 1 to 65535");
   }
   if (number == 0 && !zero_allowed) {
-    return invalid(text, "port 0 is no port to connect to; take one from 1 to 65535");
+    return invalid(text, "port 0 cannot be connected to; take one from 1 to 65535");
   }
   return number;
 }
@@ -110,7 +110,7 @@ Result<Address> Address::parse(std::string_view text, std::uint16_t default_port
     if (bracket == text.npos) return invalid(text, "the ']' is missing; write [IPV6]:PORT");
     address.host = text.substr(1, bracket - 1);
     if (!is_ipv6(address.host)) {
-      return invalid(text, "'" + address.host + "' in brackets is no IPv6 number");
+      return invalid(text, "'" + address.host + "' in brackets is not an IPv6 number");
     }
     const std::string_view rest = text.substr(bracket + 1);
     if (rest.empty()) return address;
@@ -125,16 +125,16 @@ Result<Address> Address::parse(std::string_view text, std::uint16_t default_port
   const auto colon = text.find(':');
   address.host = text.substr(0, colon);
   if (text.find(':', colon + 1) != text.npos && colon != text.npos) {
-    return invalid(text, "this is no IPv6 number; write one with a port as [IPV6]:PORT");
+    return invalid(text, "this is not an IPv6 number; write one with a port as [IPV6]:PORT");
   }
   if (address.host.empty()) return invalid(text, "the host is missing; write HOST or HOST:PORT");
   if (looks_like_ipv4(address.host)) {
     if (!is_ipv4(address.host)) {
-      return invalid(text, "'" + address.host + "' is no IPv4 number; write it like 10.0.0.2");
+      return invalid(text, "'" + address.host + "' is not an IPv4 number; write it like 10.0.0.2");
     }
   } else if (!is_name(address.host)) {
     return invalid(text, "'" + address.host +
-                             "' is no host name; these are letters, digits, '-', '_' and '.'");
+                             "' is not a host name; these are letters, digits, '-', '_' and '.'");
   }
   if (colon == text.npos) return address;
   address.port = DSSM_TRY(parse_port(text, text.substr(colon + 1), port_0_allowed));

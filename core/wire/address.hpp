@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Where a dssmd is to be found, as people write it, and as the system wants it.
+// The address of a dssmd: as people write it, and as the system takes it.
 #pragma once
 
 #include <sys/socket.h>

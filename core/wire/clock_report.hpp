@@ -39,8 +39,9 @@ struct ClockReport {
   bool bound_is_root = false;    // clock.bound is clock.root_bound: it follows no host
   bool root_is_utc = false;      // false: the root of its time is a PC that follows no other
   std::string reference;         // the host or address that it follows, for people
-  std::vector<IpAddress> addresses;  // its own: so others recognize whom their chronyd follows
-  MonoTime as_of{};                  // when this was so, by CLOCK_MONOTONIC of this PC
+  std::vector<IpAddress>
+      addresses;     // its own: others recognize the host that their chronyd follows
+  MonoTime as_of{};  // when this was so, by CLOCK_MONOTONIC of this PC
 
   bool has_bound() const noexcept { return clock.bound != kUnknownClockError; }
   // Whether both have the same kernel, and so the same clock.

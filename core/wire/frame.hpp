@@ -22,7 +22,7 @@ namespace dssm::wire {
 // One message with its length in front, ready to be sent.
 std::string encode_frame(const google::protobuf::MessageLite& message);
 
-// Collects bytes as they arrive and gives out whole frames. A value; one per connection.
+// Collects bytes as they arrive and returns whole frames. A value; one per connection.
 class FrameBuffer {
  public:
   // max_frame_bytes: a longer frame is an error, found from its length alone, before memory is
@@ -35,13 +35,13 @@ class FrameBuffer {
 
   // The next whole frame's message, without its length; nullopt when more input is needed. The view
   // holds until the next call of any member. Fails with `protocol` on a length that is too large or
-  // no varint; the stream is useless from then on.
+  // not a varint; nothing after it can be read.
   Result<std::optional<std::span<const std::byte>>> next();
 
  private:
   std::size_t max_frame_bytes_;
   std::vector<std::byte> buffer_;
-  std::size_t begin_ = 0, end_ = 0;  // buffer_[begin_, end_) is input not yet given out
+  std::size_t begin_ = 0, end_ = 0;  // buffer_[begin_, end_) is input not yet returned
 };
 
 }  // namespace dssm::wire

@@ -10,8 +10,8 @@
 //
 // The input buffer belongs to the thread, not to the decoder, so nothing may stay in it: when a
 // commit() ends within a frame, a head is kept in head_ (a few bytes), payload and trailer are
-// where they belong already, other frames are in whole_. Only while the sink holds back does the
-// decoder take the buffer with it.
+// where they belong already, other frames are in whole_. Only from hold() to the next commit() does
+// the decoder keep the buffer.
 #include "core/wire/frame_decoder.hpp"
 
 #include <fmt/format.h>
@@ -31,11 +31,10 @@ namespace {
 // About 2,000 small samples in one receive, and still in the processor's second cache.
 constexpr std::size_t kInputBytes = 256 << 10;
 
-// From this size on a receive ends behind the payload under way, with little room for what follows:
-// its torn trailer and the next one's head. So all but that little is received in place. Below,
-// one receive for several samples and a copy that stays in the cache are cheaper. Measured over
-// loopback: the receiver's processor time is the same for both at 8 KiB; at 16 KiB receiving in
-// place takes 10 % less.
+// From this size on a receive ends shortly after the payload under way: its torn trailer and the
+// next one's head still fit. So nearly all is received in place. Below, one receive for several
+// samples and a copy that stays in the cache are cheaper. Measured over loopback: the receiver's
+// processor time is the same for both at 8 KiB; at 16 KiB receiving in place takes 10 % less.
 constexpr std::size_t kLargePayloadBytes = 16 << 10;
 constexpr std::size_t kSpaceAfterPayload = kTornTrailerBytes + kMaxSampleHeaderBytes;
 constexpr std::size_t kMinSpace = 4 << 10;  // in all
@@ -112,13 +111,13 @@ IncomingSample incoming(std::uint64_t serial, std::int64_t tid, std::int64_t tim
 }  // namespace
 
 struct FrameDecoder::InputBuffer {
-  const FrameDecoder* user;  // whose spaces() lent it out last
+  const FrameDecoder* user;  // whose spaces() used it last
   std::size_t begin, end;    // in kept_input_: bytes[begin, end) are not decoded yet
   std::array<std::byte, kInputBytes> bytes;
 };
 
-FrameDecoder::FrameDecoder(FrameDelegate& sink, std::size_t max_frame_bytes)
-    : sink_(sink), max_frame_bytes_(max_frame_bytes) {}
+FrameDecoder::FrameDecoder(FrameDelegate& delegate, std::size_t max_frame_bytes)
+    : delegate_(delegate), max_frame_bytes_(max_frame_bytes) {}
 
 FrameDecoder::~FrameDecoder() = default;
 
@@ -143,7 +142,7 @@ std::size_t FrameDecoder::longest_frame_bytes() const noexcept {
 }
 
 [[gnu::hot]] Result<void> FrameDecoder::check_payload_bytes(std::uint64_t payload_bytes) const {
-  if (payload_bytes_ == 0) return no_frame("a sample came where none is awaited");
+  if (payload_bytes_ == 0) return no_frame("a sample came where none is expected");
   if (payload_bytes == payload_bytes_) return {};
   return no_frame("a sample of {} bytes came; the stream's samples have {}", payload_bytes,
                   payload_bytes_);
@@ -151,8 +150,8 @@ std::size_t FrameDecoder::longest_frame_bytes() const noexcept {
 
 // --- the input buffer
 
-// The thread's input buffer; null while a commit() works on it, so that a sink which drives another
-// connection from within a callback gets another one.
+// The thread's input buffer; null while a commit() works on it, so that a delegate which drives
+// another connection from within a callback gets another one.
 std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
   thread_local std::unique_ptr<InputBuffer> input;
   return input;
@@ -181,7 +180,7 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
 }
 
 [[gnu::hot]] Result<void> FrameDecoder::commit(std::size_t bytes) {
-  DSSM_CHECK(!held_ || bytes == 0);  // nothing is received while the sink holds back
+  DSSM_CHECK(!held_ || bytes == 0);  // nothing is received after hold()
   held_ = refused_ = false;
   if (in_payload()) {
     const std::size_t direct = std::min(bytes, payload_left_);
@@ -216,9 +215,9 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
 [[gnu::hot]] Result<void> FrameDecoder::decode(Bytes& input) {
   // Without any input too: the last byte may have been received in place, and a frame that was
   // collected may have been held back.
-  bool goes_on = !input.empty() || (stage_ == Stage::payload && payload_left_ == 0) ||
-                 (stage_ == Stage::whole && whole_left_ == 0);
-  while (goes_on) {
+  bool continues = !input.empty() || (stage_ == Stage::payload && payload_left_ == 0) ||
+                   (stage_ == Stage::whole && whole_left_ == 0);
+  while (continues) {
     Result<void> taken;
     switch (stage_) {
       case Stage::head:
@@ -235,7 +234,7 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
         break;
     }
     if (!taken) return taken;
-    goes_on = !input.empty() && !held_;
+    continues = !input.empty() && !held_;
   }
   return {};
 }
@@ -243,7 +242,7 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
 [[gnu::hot]] Result<void> FrameDecoder::take_head(Bytes& input) {
   SampleHead head;
   const HeadStatus status = read_sample_head_untrusted(input, head);
-  if (status == HeadStatus::no_frame) return no_frame("the input is no varint-delimited frame");
+  if (status == HeadStatus::no_frame) return no_frame("the input is not a varint-delimited frame");
   if (head.frame_bytes > longest_frame_bytes()) {
     return too_long(head.frame_bytes, longest_frame_bytes());
   }
@@ -285,8 +284,8 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
   return {};
 }
 
-// Behind the payload comes `torn`, or a field that is not known here and was not known to be there:
-// the head said only how long it is.
+// After the payload comes `torn`, or a field that is not known here: the head states only how long
+// it is.
 Result<void> FrameDecoder::take_trailer(Bytes& input) {
   const std::size_t bytes = std::min(input.size(), trailer_left_);
   std::copy_n(input.begin(), bytes, trailer_.begin() + (trailer_bytes_ - trailer_left_));
@@ -302,7 +301,7 @@ Result<void> FrameDecoder::take_trailer(Bytes& input) {
   net::Frame trailer;
   if (read_varint(at, trailer_.end(), kMaxLengthBytes, tag) != VarintStatus::ok ||
       !trailer.ParseFromArray(trailer_.data(), static_cast<int>(trailer_.size()))) {
-    return no_frame("what follows a sample's payload is no field");
+    return no_frame("what follows a sample's payload is not a field");
   }
   if (tag >> 3 <= net::Frame::kTornFieldNumber) {
     return no_frame("field {} came after a sample's payload; it has to come before it", tag >> 3);
@@ -311,7 +310,7 @@ Result<void> FrameDecoder::take_trailer(Bytes& input) {
 }
 
 [[gnu::hot]] Result<void> FrameDecoder::begin_sample(std::byte*& place) {
-  Result<void> begun = sink_.on_sample_begin(sample_, place);
+  Result<void> begun = delegate_.on_sample_begin(sample_, place);
   refused_ = held_;
   return begun;
 }
@@ -320,7 +319,7 @@ Result<void> FrameDecoder::take_trailer(Bytes& input) {
   ++counters_.samples;
   place_ = nullptr;
   stage_ = Stage::head;
-  return sink_.on_sample_end(sample_, torn);
+  return delegate_.on_sample_end(sample_, torn);
 }
 
 // --- frames that protobuf parses
@@ -359,13 +358,13 @@ Result<void> FrameDecoder::parse_whole(Bytes message) {
   }
   net::Frame frame;
   if (!frame.ParseFromArray(message.data(), static_cast<int>(message.size()))) {
-    return no_frame("a frame of {} bytes is no message of this protocol", message.size());
+    return no_frame("a frame of {} bytes is not a message of this protocol", message.size());
   }
   if (frame.has_sample() || !frame.payload().empty()) {
     return hand_out_slowly(frame, message.size());
   }
   if (message.size() > max_frame_bytes_) return too_long(message.size(), max_frame_bytes_);
-  return sink_.on_frame(frame);
+  return delegate_.on_frame(frame);
 }
 
 Result<void> FrameDecoder::hand_out_slowly(net::Frame& frame, std::size_t frame_bytes) {
@@ -391,7 +390,7 @@ Result<void> FrameDecoder::hand_out_slowly(net::Frame& frame, std::size_t frame_
     counters_.copied_payload_bytes += payload.size();
   }
   ++counters_.samples;
-  return sink_.on_sample_end(sample_, frame.torn());
+  return delegate_.on_sample_end(sample_, frame.torn());
 }
 
 }  // namespace dssm::wire

@@ -1,17 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Cuts what arrives over a network connection into frames. A sample's payload goes where the
-// receiver wants it: straight from the kernel for large ones (the space that spaces() gives is the
-// slot itself), with one copy out of the input buffer for those that arrive many at a time. Frames
+// Cuts what arrives over a network connection into frames. A sample's payload is received where the
+// delegate wants it: a large one directly by the kernel (the space that spaces() returns is the
+// slot itself), small ones that arrive many at a time with one copy out of the input buffer. Frames
 // whose fields come in another order than ours are collected and parsed by protobuf: slower, same
 // result.
 //
 //   use     spaces() -> Transport::receive() -> commit() ; again
-//   trust   nothing that arrives is believed: lengths are checked against the limits, and memory
+//   trust   nothing that arrives is trusted: lengths are checked against the limits, and memory
 //           grows with what has arrived, not with what was announced
 //   memory  a decoder that waits for the next frame owns no buffer: the input buffer belongs to the
-//           thread and is lent from spaces() to commit(). A hundred idle channels cost a hundred
-//           small objects, and a busy one always finds the buffer in the processor's cache.
+//           thread, and a decoder uses it from spaces() to commit(). A hundred idle channels cost a
+//           hundred small objects, and a busy one finds the buffer in the processor's cache.
 #pragma once
 
 #include <sys/uio.h>
@@ -33,19 +33,18 @@ namespace dssm::wire {
 // A sample frame's fields before its payload.
 struct IncomingSample {
   std::uint64_t serial = 0;
-  SampleInfo
-      info;  // tid >= 0, clock_error >= 0; else as it came: the receiver knows what it awaits
+  SampleInfo info;  // tid >= 0, clock_error >= 0; the receiver checks the rest
   std::size_t payload_bytes = 0;
 };
 
-// What the decoder hands out; called from commit(). An error ends the decoding: the connection is
-// to be closed.
+// Gets what the decoder has decoded; called from commit(). An error ends the decoding: the
+// connection is to be closed.
 class FrameDelegate {
  public:
-  // A sample begins. `out` is set to where its payload_bytes are to go, or nullptr to throw them
-  // away. The place stays valid until on_sample_end(), or until the decoder is used no more.
+  // A sample begins. `out` is set to where its payload_bytes are stored, or nullptr to drop them.
+  // The place stays valid until on_sample_end(), or as long as the decoder is used.
   virtual Result<void> on_sample_begin(const IncomingSample& sample, std::byte*& out) = 0;
-  // Its payload is complete. torn: the sender says that it is void.
+  // Its payload is complete. torn: the sender marked it as void.
   virtual Result<void> on_sample_end(const IncomingSample& sample, bool torn) = 0;
   // Any other frame. May be moved from.
   virtual Result<void> on_frame(net::Frame& frame) = 0;
@@ -63,12 +62,12 @@ struct DecoderCounters {
 class FrameDecoder {
  public:
   // max_frame_bytes: of frames without a payload, before set_payload_bytes() also of all.
-  FrameDecoder(FrameDelegate& sink, std::size_t max_frame_bytes);
+  FrameDecoder(FrameDelegate& delegate, std::size_t max_frame_bytes);
   FrameDecoder(const FrameDecoder&) = delete;
   FrameDecoder& operator=(const FrameDecoder&) = delete;
   ~FrameDecoder();
 
-  // From now on samples have exactly so many bytes; a frame that says otherwise is an error.
+  // From now on samples have exactly so many bytes; a sample of another size is an error.
   // 0 (at first): samples are refused.
   void set_payload_bytes(std::size_t payload_bytes) noexcept;
 
@@ -77,30 +76,30 @@ class FrameDecoder {
   // decoder's spaces() in the same thread.
   std::span<const iovec> spaces();
 
-  // `bytes` were received into spaces(), in the same thread. Calls the sink for all that is
+  // `bytes` were received into spaces(), in the same thread. Calls the delegate for all that is
   // complete now.
-  //   fails  protocol (no frame, too long, wrong payload size ...), and what the sink returned;
+  //   fails  protocol (no frame, too long, wrong payload size ...), and what the delegate returned;
   //          the decoder is not usable afterwards
   Result<void> commit(std::size_t bytes);
 
-  // From within the sink: commit() shall return now, though more may be buffered. The next
-  // commit(), which may be one of 0 bytes, goes on. Until then nothing is to be received.
+  // Called by the delegate: commit() shall return now, though more may be buffered. The next
+  // commit(), which may be one of 0 bytes, continues. Until then nothing is to be received.
   //   in on_sample_begin()  there is no place for this sample now: `out` is not used, the sample
   //                         stays in the input buffer, and on_sample_begin() comes again for it
-  //   in the others         what was handed out is taken; commit() returns after it
+  //   in the others         what they were called with is handled; commit() returns after it
   void hold() noexcept { held_ = true; }
 
-  // Whether a payload has begun that is not complete: the place that the sink gave is in use.
+  // Whether a payload has begun that is not complete: the place that the delegate set is in use.
   bool in_payload() const noexcept { return stage_ == Stage::payload && place_ != nullptr; }
 
-  // The sample under way, between on_sample_begin() and on_sample_end(), goes on at `place`: what
-  // has come of its payload is copied there, and its old place is free.
+  // The rest of the sample under way, between on_sample_begin() and on_sample_end(), goes to
+  // `place`: what has arrived of its payload is copied there, and its old place is free.
   void move_payload(std::byte* place) noexcept;
 
   // Whether nothing is buffered: the last commit() ended at the end of a frame.
   bool at_frame_end() const noexcept;
 
-  // Memory that the frame under way takes: not yet complete, and no sample in our order of fields.
+  // Memory that the frame under way takes, when it is not a sample in our order of fields.
   std::size_t collected_bytes() const noexcept { return whole_.capacity(); }
 
   const DecoderCounters& counters() const noexcept { return counters_; }
@@ -133,14 +132,14 @@ class FrameDecoder {
   Result<void> check_payload_bytes(std::uint64_t payload_bytes) const;
   std::size_t longest_frame_bytes() const noexcept;
 
-  FrameDelegate& sink_;
+  FrameDelegate& delegate_;
   std::size_t max_frame_bytes_;
   std::size_t payload_bytes_ = 0;
   DecoderCounters counters_;
   std::array<iovec, 2> spaces_{};
 
   Stage stage_ = Stage::head;
-  bool held_ = false;     // the sink wants commit() to return
+  bool held_ = false;     // the delegate called hold()
   bool refused_ = false;  // it did so in on_sample_begin(): the sample is still in the input
   std::size_t head_bytes_ = 0;
   std::array<std::byte, kMaxSampleHeaderBytes> head_{};  // a head that is not complete
@@ -151,7 +150,7 @@ class FrameDecoder {
   std::array<std::byte, kTornTrailerBytes> trailer_{};
   std::vector<std::byte> whole_;
   std::size_t whole_left_ = 0;
-  std::unique_ptr<InputBuffer> kept_input_;  // what the sink did not want yet
+  std::unique_ptr<InputBuffer> kept_input_;  // not decoded yet, because of hold()
 };
 
 }  // namespace dssm::wire

@@ -63,7 +63,7 @@ Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<U
   if (message.msg_flags & MSG_CTRUNC) {
     return Error{Errc::protocol,
                  "more descriptors came with one message than are taken, or this "
-                 "process has no room for them (ulimit -n)"};
+                 "process may not open as many (ulimit -n)"};
   }
   if (received == 0) return IoResult{IoStatus::end, 0};
   return IoResult{IoStatus::ok, static_cast<std::size_t>(received)};
@@ -95,7 +95,7 @@ Result<UniqueFd> connect_unix(const std::string& path) {
     return Error{Errc::no_permission, what +
                                           ": this user may not; join the socket's group (see `ls "
                                           "-l " +
-                                          path + "`) and log in anew"};
+                                          path + "`) and log in again"};
   }
   return os_error(what);
 }

@@ -26,11 +26,11 @@ inline constexpr const char* kDefaultSocketPath = "/run/dssm/dssmd.sock";
 inline constexpr std::size_t kMaxFdsPerMessage = 16;
 
 // Sends as much of `bytes` as the socket takes, with `fds` attached to the first byte (when at
-// least one byte went, the descriptors went). SIGPIPE is suppressed; a vanished peer is `end`.
+// least one byte was sent, they were sent). SIGPIPE is suppressed; a closed connection is `end`.
 Result<IoResult> send_some(int socket, std::span<const std::byte> bytes, std::span<const int> fds);
 
 // Receives up to space.size() bytes; descriptors that came along are appended to `fds`,
-// close-on-exec. Fails with `protocol` when the kernel had to cut the descriptors.
+// close-on-exec. Fails with `protocol` when the kernel dropped some of them.
 Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<UniqueFd>& fds);
 
 // Creates a Unix stream socket connected to `path`, close-on-exec and blocking.

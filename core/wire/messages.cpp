@@ -128,7 +128,7 @@ Result<TypeInfo> type_untrusted(const proto::Type& message) {
   if (static_cast<std::size_t>(message.fields_size()) > kMaxFields) {
     return Error{Errc::limit_exceeded, "a type with " + std::to_string(message.fields_size()) +
                                            " fields; at most " + std::to_string(kMaxFields) +
-                                           " are taken: describe fewer"};
+                                           " are possible: describe fewer"};
   }
   for (const proto::Field& field : message.fields()) {
     if (field.scalar() > 255) {

@@ -18,8 +18,8 @@ inline constexpr std::size_t kMaxPropertyBytes = 16U << 20;
 inline constexpr std::size_t kMaxFields = 1024;
 inline constexpr std::size_t kMaxProgramBytes = 127;
 
-// The value of an enum that came in a message; the first one, which means that nothing is known,
-// when it is beyond the last one that is known here.
+// The value of an enum that came in a message; when it is beyond `last`, the first one, which means
+// that nothing is known.
 template <class Enum>
 Enum enum_untrusted(std::int64_t value, Enum last) noexcept {
   return value >= 0 && value <= static_cast<std::int64_t>(last) ? static_cast<Enum>(value) : Enum{};
@@ -43,7 +43,7 @@ struct ProtocolVersion {
   std::uint32_t number = 0;
 };
 
-// Why this side cannot talk to `who`, who speaks version `theirs`.
+// Why this side cannot communicate with `who`, which has the version `theirs`.
 //   software  "0.3.0"; empty: not known
 Error other_protocol_version(const ProtocolVersion& ours, const std::string& who,
                              std::uint32_t theirs, const std::string& software = {});

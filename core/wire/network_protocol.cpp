@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The greeting: what both ends say first, and what is believed of it. Words that a peer sends end
-// up in logs and tables, so they are short and hold no control characters.
+// The greeting: the first frame of both ends, and how it is checked. Texts that a peer sends are
+// shown in logs and tables, so they are short and hold no control characters.
 #include "core/wire/network_protocol.hpp"
 
 #include <fcntl.h>
@@ -18,8 +18,8 @@
 namespace dssm::wire {
 namespace {
 
-// Sets what is hashed here apart from what other software hashes of the same machine id. Random,
-// made once; changing it changes the identity of every host.
+// Makes the result differ from what other software hashes of the same machine id. Random, made
+// once; changing it changes the identity of every host.
 constexpr std::string_view kApplicationId = "677a14dda84aa85900164edec47f0e46";
 constexpr std::size_t kMachineIdBytes = 32;  // hexadecimal digits, machine-id(5)
 
@@ -27,15 +27,14 @@ Error bad(const std::string& who, std::string_view why) {
   return Error{Errc::protocol, who + " greets with " + std::string(why)};
 }
 
-// It is not known how long the report was under way, but after kPeerTimeout the connection is dead.
+// It is not known how old the report is, but after kPeerTimeout the connection would be dead.
 std::shared_ptr<const ClockReport> report_of(const proto::ClockReport& clock) {
   return std::make_shared<const ClockReport>(
       clock_report_untrusted(clock, MonoClock::now() - kPeerTimeout));
 }
 
 void fill_randomly(void* bytes, std::size_t size) {
-  // Up to 256 bytes come at once and never fail; early in the boot this waits for the kernel's
-  // pool.
+  // For up to 256 bytes it neither fails nor fills fewer; early in the boot it waits for entropy.
   while (::getrandom(bytes, size, 0) != static_cast<ssize_t>(size)) {
   }
 }

@@ -25,7 +25,8 @@ inline constexpr std::size_t kMaxFeatureBytes = 63;
 inline constexpr std::string_view kFeatureTorn = "torn";    // network.proto, Frame.torn
 inline constexpr std::string_view kFeatureClock = "clock";  // network.proto, Pong as an event
 
-// Heartbeats of control connections, and when their silence means death (design: within 3 s).
+// Heartbeats of control connections, and how long no bytes may arrive until the peer counts as dead
+// (design: within 3 s).
 inline constexpr Duration kHeartbeat = std::chrono::seconds(1);
 inline constexpr Duration kPeerTimeout = std::chrono::milliseconds(2800);
 // For the first Hello of a connection to be complete.
@@ -39,8 +40,8 @@ struct Greeting {
   std::string program;            // "dssmd", "mapper"
   std::string version;
   std::vector<std::string> features;
-  // What it says of its clock; nullptr: nothing. Our own is kept up to date by who watches the
-  // clock, and all copies of our greeting share it.
+  // What it reports of its clock; nullptr: nothing. Our own is kept up to date by FleetClock, and
+  // all copies of our greeting share it.
   std::shared_ptr<const ClockReport> clock;
 
   bool has_feature(std::string_view feature) const noexcept;
@@ -50,8 +51,8 @@ struct Greeting {
 void to_message(const Greeting& greeting, proto::Hello& out);
 
 // Takes over the other side's Hello.
-//   fails  protocol: another version (the message names both versions and both sides, and says what
-//          to do), or values out of their limits
+//   fails  protocol: another version (the message names both versions, both sides and what to do),
+//          or values out of their limits
 //   who    for the message: "dssmd at '10.0.0.2:13776'", "the program at '10.0.0.3:40000'"
 Result<Greeting> greeting_untrusted(const proto::Hello& message, const std::string& who);
 
@@ -60,7 +61,7 @@ Result<Greeting> greeting_untrusted(const proto::Hello& message, const std::stri
 //   fails  also: the other side's reason
 Result<Greeting> server_greeting_untrusted(const net::Frame& frame, const std::string& who);
 
-// Why this side cannot talk to `who`, who speaks `theirs`.
+// Why this side cannot communicate with `who`, which has the version `theirs`.
 //   software  "0.3.0"; empty: not known
 Error other_protocol_version(const std::string& who, std::uint32_t theirs,
                              const std::string& software = {});

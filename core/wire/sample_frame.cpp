@@ -87,7 +87,7 @@ bool read_stamps(const std::byte* at, const std::byte* end, SampleHead& head) no
       break;
   }
   head.length_bytes = static_cast<std::size_t>(at - input.data());
-  // What to say when the bytes end here: the frame is there as a whole, or more of it is to come.
+  // The status when the bytes end here: the frame is there as a whole, or more of it is to come.
   HeadStatus at_the_end = HeadStatus::incomplete;
   const auto bytes_there = static_cast<std::uint64_t>(end - at);
   if (bytes_there >= head.frame_bytes) {
@@ -120,8 +120,7 @@ bool read_stamps(const std::byte* at, const std::byte* end, SampleHead& head) no
   head.bytes = static_cast<std::size_t>(at - input.data());
   const std::uint64_t before_payload = head.bytes - head.length_bytes;
   if (before_payload > head.frame_bytes || head.payload_bytes > head.frame_bytes - before_payload) {
-    return HeadStatus::other;  // the payload ends after its frame: protobuf will say that it is
-                               // none
+    return HeadStatus::other;  // the payload ends after its frame: protobuf will refuse it
   }
   head.trailer_bytes =
       static_cast<std::size_t>(head.frame_bytes - before_payload - head.payload_bytes);

@@ -2,7 +2,7 @@
 //
 // The frame that carries a sample, and the one that asks for a sample, written and read by hand: a
 // payload must not pass through a protobuf object, and building a Read as one took a twentieth of
-// its round trip. proto/network.proto is the specification; tests hold these bytes against stock
+// its round trip. proto/network.proto is the specification; tests compare these bytes with stock
 // protobuf and tests/golden.
 #pragma once
 
@@ -38,13 +38,13 @@ std::size_t encode_sample_header(std::array<std::byte, kMaxSampleHeaderBytes>& o
                                  std::uint64_t serial, const SampleInfo& info,
                                  std::size_t payload_bytes, Trailer trailer) noexcept;
 
-// The field `torn`, to be sent directly after the payload.
+// The torn trailer: the field `torn`, sent directly after the payload.
 std::array<std::byte, kTornTrailerBytes> torn_trailer(bool torn) noexcept;
 
 // What comes before a sample's payload, as encode_sample_header() writes it and stock protobuf does
 // in its place. As on the wire; nothing is checked.
 struct SampleHead {
-  std::uint64_t frame_bytes = 0;  // the frame's length, without the varint that says it
+  std::uint64_t frame_bytes = 0;  // the frame's length, without its varint
   std::size_t length_bytes = 0;   // of that varint
   std::uint64_t serial = 0;
   std::int64_t tid = 0, time_ns = 0;
@@ -58,10 +58,10 @@ enum class HeadStatus : unsigned char {
   sample,      // it is a sample in our order of fields: all of `head` is set
   other,       // another frame, or a sample in another order: frame_bytes and length_bytes are set
   incomplete,  // more input is needed to decide; never with kMaxSampleHeaderBytes or more
-  no_frame,    // what should be the frame's length is none
+  no_frame,    // it does not begin with a length
 };
 
-// Looks at the beginning of a frame.
+// Reads the beginning of a frame.
 HeadStatus read_sample_head_untrusted(std::span<const std::byte> input, SampleHead& head) noexcept;
 
 // Which sample a Read asks for. A value.

@@ -47,15 +47,15 @@ Error network_error(const std::string& what, int errno_value, int socket) {
     case ETIMEDOUT:
       return Error{Errc::unavailable, what + ": no answer from the other PC for " +
                                           std::to_string(user_timeout_ms(socket) / 1000) +
-                                          " s; is it on, is the network between us whole, and "
-                                          "does the program there still read?"};
+                                          " s; is it on, does the network between both work, "
+                                          "and does the program there still read?"};
     case EHOSTUNREACH:
     case ENETUNREACH:
     case EHOSTDOWN:
     case ENETDOWN:
       return Error{Errc::unavailable, os_error(what, errno_value).message +
-                                          "; is the other PC on, and does this one have a way to "
-                                          "it (`ip route get`)?"};
+                                          "; is the other PC on, and does this one have a route "
+                                          "to it (`ip route get`)?"};
     default:
       return os_error(what, errno_value);
   }
@@ -106,7 +106,7 @@ class TcpTransport final : public Transport {
   int fd() const noexcept override { return socket_.get(); }
 
  private:
-  // All other calls say MSG_DONTWAIT, so the socket's own mode is free for this.
+  // All other calls pass MSG_DONTWAIT, so that the socket's own mode may be blocking.
   void make_waitable() noexcept {
     waits_ = true;
     constexpr timeval kWait{0, std::chrono::microseconds(kReceiveWait).count()};

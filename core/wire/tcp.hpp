@@ -22,9 +22,9 @@
 
 namespace dssm::wire {
 
-// Listens at `address`; IPv6 sockets take IPv6 only, so that "0.0.0.0" and "::" go side by side.
+// Listens at `address`; IPv6 sockets take IPv6 only, so that "0.0.0.0" and "::" do not conflict.
 // Non-blocking; SO_REUSEADDR, so that a restarted dssmd gets its port back.
-//   fails  with what to do: the port is taken (by whom is for `ss -ltnp`), no such address here
+//   fails  with what to do: the port is taken (`ss -ltnp` shows by which process), no such address
 Result<UniqueFd> listen_tcp(const SocketAddress& address);
 
 // The address that a socket is bound to (after listening on port 0), or connected to.

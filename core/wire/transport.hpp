@@ -2,7 +2,7 @@
 //
 // Transport: moves the bytes of one connection. TCP today (tcp.hpp); tests use pairs of buffers.
 // Frames, limits and greeting are above it (FrameConnection in dssmd, NetworkConnection in libdssm)
-// and know no sockets except fd(). make_transport() in tcp.hpp is where both ends get theirs.
+// and use nothing of the socket but fd(). Both ends get theirs from make_transport() in tcp.hpp.
 //
 // A TLS transport can implement this interface. It needs, beyond what TCP needs:
 //
@@ -24,7 +24,7 @@
 //   ends           TLS closes with a message of its own: a connection that ends without it is an
 //                  error, not `end`.
 //   copies         In-place sending (daemon/link/sample_sender.hpp) saves a copy only where the
-//                  kernel copies; with TLS, "copied" is the better way for all sizes.
+//                  kernel copies; with TLS, "copied" is better for all sizes.
 #pragma once
 
 #include <poll.h>

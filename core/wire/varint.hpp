@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Protobuf's varints by hand, for the few places that do not go through protobuf: frame lengths and
-// the heads of sample frames. Seven bits a byte, lowest first; the top bit says that more follow.
+// the heads of sample frames. Seven bits a byte, lowest first; the top bit means that more follow.
 #pragma once
 
 #include <cstddef>

@@ -56,7 +56,7 @@ std::int32_t with_sign(std::uint32_t number, int bits) noexcept {
 }
 
 Error refusal_of(std::uint16_t status) {
-  const std::string what = "it refuses to tell: ";
+  const std::string what = "it refuses to answer: ";
   switch (status) {
     case 2:   // STT_UNAUTH
     case 10:  // STT_NOHOSTACCESS
@@ -82,12 +82,13 @@ Error not_understood(const std::string& what, int theirs, int ours) {
                               "; is it chronyd, and of a version that this one knows?"};
 }
 
-// Saturates: times of no use to anybody stay such.
+// Saturates: a time that far from now is not valid in any case.
 Time time_at(std::uint32_t high, std::uint32_t low, std::uint32_t nanoseconds) {
-  constexpr std::uint64_t kMost = std::numeric_limits<std::int64_t>::max() / kBillion - 1;
+  constexpr std::uint64_t kMaxSeconds = std::numeric_limits<std::int64_t>::max() / kBillion - 1;
   const std::uint64_t seconds =
       static_cast<std::uint64_t>(high == kNoHighSeconds ? 0 : high) << 32 | low;
-  return time_from_ns(static_cast<std::int64_t>(std::min(seconds, kMost)) * kBillion + nanoseconds);
+  return time_from_ns(static_cast<std::int64_t>(std::min(seconds, kMaxSeconds)) * kBillion +
+                      nanoseconds);
 }
 
 }  // namespace
@@ -154,7 +155,7 @@ Result<TrackingReply> tracking_untrusted(std::span<const std::byte> datagram) {
   tracking.updated =
       time_at(word_at(datagram, kSecondsHigh), word_at(datagram, kSecondsLow), nanoseconds);
   tracking.update_interval = seconds_untrusted(word_at(datagram, kUpdateInterval));
-  // The correction is what is to be added to this clock to get chronyd's time: the other way round.
+  // The correction is what is added to this clock to get chronyd's time: the opposite sign.
   tracking.offset = -seconds_untrusted(word_at(datagram, kCorrection));
   tracking.root = {seconds_untrusted(word_at(datagram, kRootDispersion)),
                    seconds_untrusted(word_at(datagram, kRootDelay))};
@@ -164,14 +165,14 @@ Result<TrackingReply> tracking_untrusted(std::span<const std::byte> datagram) {
 Duration seconds_untrusted(std::uint32_t number) noexcept {
   const int exponent = with_sign(number >> kCoefficientBits, kExponentBits) - kCoefficientBits;
   const std::int64_t coefficient = with_sign(number, kCoefficientBits);
-  // chronyd writes 0 for 0 and for what is too small for its format, less than 2^-64 s.
+  // chronyd sends 0 for 0 and for what is too small for its format, less than 2^-64 s.
   if (coefficient == 0) return {};
   // Less than 2^55: a coefficient and one unit more, in nanoseconds.
   const std::int64_t size = ((coefficient < 0 ? -coefficient : coefficient) + 1) * kBillion;
-  constexpr std::int64_t kMost = std::numeric_limits<std::int64_t>::max();
+  constexpr std::int64_t kMaxNs = std::numeric_limits<std::int64_t>::max();
   std::int64_t nanoseconds = 1;  // of anything smaller
   if (exponent >= 0) {
-    nanoseconds = size > kMost >> exponent ? kMost : size << exponent;
+    nanoseconds = size > kMaxNs >> exponent ? kMaxNs : size << exponent;
   } else if (exponent > -62) {
     nanoseconds = (size + (std::int64_t{1} << -exponent) - 1) >> -exponent;
   }

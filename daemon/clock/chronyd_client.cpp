@@ -25,16 +25,16 @@ ChronydClient::ChronydClient(const EventLoop& loop, const wire::SocketAddress& c
 }
 
 void ChronydClient::poll_if_due() {
-  occasion_ = loop_.now();
-  if (occasion_ - asked_ >= period_ - slack_) next_question();
+  awake_ = loop_.now();
+  if (awake_ - asked_ >= period_ - slack_) next_question();
 }
 
 void ChronydClient::next_question() {
   asked_ = loop_.now();
-  // Behind the next occasion, if there is to be one. One that comes too early for a question comes
-  // later in the period each time, until it is in time.
-  const bool occasions_come = asked_ - occasion_ < period_ + slack_;
-  timer_.enable_in(occasions_come ? period_ + slack_ : period_);
+  // Where poll_if_due() is called regularly, the timer expires only after its next call. A call
+  // that is too early for a question is later within the period each time, until it is in time.
+  const bool is_polled = asked_ - awake_ < period_ + slack_;
+  timer_.enable_in(is_polled ? period_ + slack_ : period_);
   if (question_) {
     const Question unanswered = *std::exchange(question_, {});
     observer_.on_no_answer(unanswered.why.value_or(
@@ -58,11 +58,11 @@ Result<void> ChronydClient::ask() {
   question_ = std::move(question);
   readable_ = EventSource::readable(loop_, socket_.get(), [this] { on_readable(); });
   readable_.enable();
-  on_readable();  // that nothing listens on this PC is known at once
+  on_readable();  // ECONNREFUSED is there at once
   return {};
 }
 
-// Nothing more is expected at this socket.
+// The question needs its socket no more.
 void ChronydClient::finish() {
   readable_.disable();
   socket_.reset();
@@ -70,7 +70,7 @@ void ChronydClient::finish() {
 
 void ChronydClient::on_readable() {
   while (socket_) {
-    std::array<std::byte, 2 * kTrackingBytes> buffer;  // what is longer is no answer
+    std::array<std::byte, 2 * kTrackingBytes> buffer;  // a longer one is not an answer
     const ssize_t size = ::recv(socket_.get(), buffer.data(), buffer.size(), 0);
     if (size < 0) {
       if (errno == EAGAIN) return;
@@ -93,8 +93,8 @@ void ChronydClient::on_readable() {
 bool ChronydClient::take_untrusted(std::span<const std::byte> datagram) {
   if (!answers_untrusted(datagram, question_->sequence)) {
     question_->why = Error{Errc::protocol,
-                           "what comes from there answers no question of ours; is "
-                           "it chronyd that listens there (`ss -lunp`)?"};
+                           "what it sends does not answer our question; is it "
+                           "chronyd that listens there (`ss -lunp`)?"};
     return false;
   }
   const clock::Instant answered = now_();

@@ -1,9 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Asks chronyd again and again how the clock is. Each question goes out of a socket of its own,
-// with a random number: an answer that comes late, or to somebody else, finds nobody; nothing is
-// carried over from one question to the next, so a chronyd that comes, goes, or hangs needs no
-// handling. Never blocks, and does bounded work in each period whatever is sent to it.
+// Asks chronyd for the state of the clock, once a period. Each question has a socket and a random
+// number of its own, so an answer that is late or belongs to another question is not accepted. No
+// state is kept from one question to the next, so a chronyd that starts, ends or hangs is not a
+// special case. Never blocks, and does bounded work in each period whatever is sent to it.
 #pragma once
 
 #include <cstddef>
@@ -29,12 +29,12 @@ class ChronydClient {
 
   class Observer {
    public:
-    // An answer, to a question sent at `asked`. What it says is not checked.
+    // An answer, to a question sent at `asked`. Its values are not checked.
     virtual void on_answer(const TrackingReply& reply, MonoTime asked,
                            const clock::Instant& answered) = 0;
     // Nothing listens there; called after each question.
     virtual void on_no_chronyd() = 0;
-    // A period has passed without an answer that can be read.
+    // A period has passed without a valid answer.
     virtual void on_no_answer(const Error& why) = 0;
 
    protected:
@@ -49,16 +49,16 @@ class ChronydClient {
   ChronydClient(const ChronydClient&) = delete;
   ChronydClient& operator=(const ChronydClient&) = delete;
 
-  // The process is awake anyway: asks now when a question is about due. Where such occasions come
-  // once a period, the timer does not wake it.
+  // The process is awake for another reason: asks now when a question is nearly due. When this is
+  // called once a period, the timer does not wake the process.
   void poll_if_due();
 
  private:
   struct Question {
     std::uint32_t sequence = 0;
     MonoTime asked;
-    int datagrams = 0;         // that came to its socket
-    std::optional<Error> why;  // none of them was an answer
+    int datagrams = 0;         // that its socket received
+    std::optional<Error> why;  // why none of them is the answer
   };
 
   void next_question();
@@ -72,7 +72,7 @@ class ChronydClient {
   Observer& observer_;
   const Now now_;
   const Duration period_, slack_;
-  MonoTime asked_{}, occasion_{};     // the last ones
+  MonoTime asked_{}, awake_{};        // the last question; the last poll_if_due()
   std::optional<Question> question_;  // until it is answered or refused
   UniqueFd socket_;
   EventSource readable_, timer_;

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // How far the clocks of two hosts may be apart. Each statement about such a pair is a bound that
-// holds by itself, so of several statements the least counts. There is one source of statements:
+// holds by itself, so the least of several statements counts. There is one source of statements:
 // the reports of both hosts, whose sync chains meet in a clock or in UTC. Another source, such as a
 // measurement between the two, would be combined with it here and nowhere else: FleetClock calls
 // these two functions for every assessment and for the distance that programs are shown.

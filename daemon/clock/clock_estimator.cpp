@@ -6,10 +6,10 @@
 namespace dssm::clock {
 namespace {
 
-// A clock with greater numbers is not worth a bound, and sums of smaller ones do not overflow.
+// A clock with greater values has no bound, and sums of smaller ones do not overflow.
 constexpr Duration kMaxValue = std::chrono::hours(24 * 365);
 
-// Answers whose last measurement seems to be after now by more than this are nonsense; less is a
+// Answers whose last measurement seems to be after now by more than this are invalid; less is a
 // measurement that chronyd was just processing.
 constexpr Duration kMaxAhead = std::chrono::seconds(1);
 

@@ -55,15 +55,14 @@ class ClockEstimator {
  public:
   // A chronyd that has not answered for so long is silent. Two answers may be lost.
   static constexpr Duration kSilentAfter = std::chrono::milliseconds(3500);
-  // Measurements after a step that it takes to believe chronyd again. It fits a line through its
-  // last measurements, through three at least: from the third on there is such a fit without any
-  // from before the step. One more, because the first that is new to us may have been
-  // taken just before the step.
+  // Measurements after a step until chronyd's answers are used again. It fits a line through its
+  // last measurements, at least three: from the third on such a fit has none from before the step.
+  // One more, because the first that is new here may have been taken just before the step.
   static constexpr int kUpdatesAfterStep = 4;
   // Smaller jumps between the clocks count as noise, and are added to the bound.
   static constexpr Duration kMinStep = std::chrono::microseconds(1);
-  // What chronyd states of its root may be as old as its oldest measurement. It keeps 64; as many
-  // again, and both again, may have been lost in between.
+  // chronyd's values of its root may be as old as its oldest measurement. It keeps 64, and for each
+  // of them three others may have been lost.
   static constexpr int kMeasurementsBack = 256;
 
   struct Settings {
@@ -91,7 +90,7 @@ class ClockEstimator {
   std::optional<Duration> observe(const Instant& now) noexcept;
 
   // chronyd's answer to a question that was sent at `asked` and answered at `answered`, after
-  // observe(answered). Nonsense counts as no answer.
+  // observe(answered). Impossible values count as no answer.
   Outcome take_untrusted(const Tracking& tracking, MonoTime asked,
                          const Instant& answered) noexcept;
 

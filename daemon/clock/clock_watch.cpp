@@ -90,7 +90,7 @@ void ClockWatch::on_answer(const TrackingReply& reply, MonoTime asked, const Ins
   if (estimator_.take_untrusted(reply.tracking, asked, answered) ==
       clock::ClockEstimator::Outcome::nonsense) {
     return on_no_answer(
-        {Errc::protocol, "what it says cannot be; does `chronyc tracking` say so?"});
+        {Errc::protocol, "its values are not possible; does `chronyc tracking` show them, too?"});
   }
   last_ = reply;
   absent_ = false;
@@ -171,8 +171,9 @@ ClockWatch::Condition ClockWatch::condition(const ClockSnapshot& state,
 }
 
 void ClockWatch::log(Condition condition, const ClockSnapshot& state, MonoTime now) {
-  const bool was_away = logged_ == Condition::absent || logged_ == Condition::silent;
-  const bool is_step = condition == Condition::stepped && !was_away;  // observe() has logged that
+  const bool was_unavailable = logged_ == Condition::absent || logged_ == Condition::silent;
+  const bool is_step =
+      condition == Condition::stepped && !was_unavailable;  // observe() has logged that
   logged_ = condition;
   if (is_step || condition == Condition::unknown) {
     --unlogged_changes_;
@@ -180,8 +181,8 @@ void ClockWatch::log(Condition condition, const ClockSnapshot& state, MonoTime n
   }
   change_lines_.take(now);
   const std::string others = left_out_text(std::exchange(unlogged_changes_, 0) - 1, "changes");
-  const std::string back = was_away ? where_ + " answers again" + others + "; " : "";
-  const std::string after = was_away ? "" : others;
+  const std::string back = was_unavailable ? where_ + " answers again" + others + "; " : "";
+  const std::string after = was_unavailable ? "" : others;
   switch (condition) {
     case Condition::absent:
       return logger_.warning("there is no " + where_ + after +
@@ -232,22 +233,22 @@ std::string ClockWatch::in_bounds(Condition condition, const ClockSnapshot& stat
 std::string ClockWatch::too_far(const ClockSnapshot& state) const {
   const Duration off = std::chrono::abs(state.offset);
   const Duration aged = clock::growth(state.age, state.ageing_ppb);
-  const Duration way = state.bound - off - aged;
+  const Duration of_source = state.bound - off - aged;
   const std::string text =
       fmt::format("this PC's clock may be wrong by {}, more than its limit of {}",
                   length_text(state.bound), length_text(estimator_.settings().limit));
-  if (off >= std::max(aged, way)) {
+  if (off >= std::max(aged, of_source)) {
     return fmt::format(
         "{}: it is off by {}, which chronyd is slewing away; wait, or step it (`chronyc makestep`)",
         text, length_text(off));
   }
-  if (aged >= way) {
+  if (aged >= of_source) {
     return fmt::format(
         "{}: chronyd has learned nothing for {}; does it reach its sources (`chronyc sources`)?",
         text, length_text(state.age));
   }
   return text +
-         ": so far is the source that chronyd follows from its root, or the network delays its "
+         ": the source that chronyd follows is that far from its root, or the network delays its "
          "packets (`chronyc ntpdata`); is there a nearer one?";
 }
 

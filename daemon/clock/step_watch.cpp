@@ -12,8 +12,7 @@
 namespace dssm::daemon {
 namespace {
 
-// For a time that never comes. Reports at once, too, when the clock was set since it was armed
-// last.
+// For a time that never comes. It expires at once when the clock was set since it was armed last.
 bool arm(int timer) noexcept {
   itimerspec never{};
   never.it_value.tv_sec = std::numeric_limits<time_t>::max();
@@ -40,9 +39,9 @@ StepWatch::StepWatch(const EventLoop& loop, UniqueFd timer, std::function<void()
 
 void StepWatch::on_readable() {
   std::uint64_t expired = 0;
-  // Fails with ECANCELED when the clock was set, which is what we are here for.
+  // Fails with ECANCELED when the clock was set: that is the event.
   [[maybe_unused]] const ssize_t got = ::read(timer_.get(), &expired, sizeof expired);
-  // Armed before anybody looks at the clock, so that no step falls in between.
+  // Armed before the clock is read, so that no step is missed in between.
   arm(timer_.get());
   on_set_();
 }

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Tells at once when somebody sets the wall clock (timerfd_create(2), TFD_TIMER_CANCEL_ON_SET), and
-// also when the PC wakes from sleep. Not how far; slewing is none.
+// Notifies at once that the wall clock was set (timerfd_create(2), TFD_TIMER_CANCEL_ON_SET), or
+// that the PC woke from sleep, but not by how much. Slewing is not reported.
 #pragma once
 
 #include <dssm/result.hpp>

@@ -470,7 +470,7 @@ TEST(FrameDecoder, RefusesALengthBeyondTheLimitsBeforeTheFrameIsThere) {
 }
 
 TEST(FrameDecoder, RefusesALengthThatIsNoVarint) {
-  expect_refused(std::string(5, '\xff'), 20, "no varint-delimited frame");
+  expect_refused(std::string(5, '\xff'), 20, "not a varint-delimited frame");
 }
 
 TEST(FrameDecoder, RefusesALongFrameThatTurnsOutToBeNoSample) {
@@ -480,8 +480,8 @@ TEST(FrameDecoder, RefusesALongFrameThatTurnsOutToBeNoSample) {
 }
 
 TEST(FrameDecoder, RefusesSamplesBeforeItKnowsTheirSize) {
-  expect_refused(sample_frame(0, 1, 20), 0, "where none is awaited");
-  expect_refused(in_order("pS", sample_message(0, 1, 20)), 0, "where none is awaited");
+  expect_refused(sample_frame(0, 1, 20), 0, "where none is expected");
+  expect_refused(in_order("pS", sample_message(0, 1, 20)), 0, "where none is expected");
 }
 
 TEST(FrameDecoder, RefusesSamplesOfAnotherSize) {

@@ -246,7 +246,7 @@ TEST_F(FrameConnectionTest, RefusesASampleWithoutADelegate) {
   EXPECT_TRUE(begun.empty());
   ASSERT_TRUE(closed_with);
   EXPECT_EQ(closed_with->code, Errc::protocol);
-  EXPECT_NE(closed_with->message.find("none is awaited"), std::string::npos)
+  EXPECT_NE(closed_with->message.find("none is expected"), std::string::npos)
       << closed_with->message;
 }
 
