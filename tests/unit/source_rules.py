@@ -12,6 +12,8 @@
 #   x.cpp the comment may be in x.hpp.
 # * A ruler is one line: "// --- words". No comment is longer than MAX_LINE columns (clang-format
 #   leaves comments alone, because it breaks tables).
+# * A path of the sources in README.md or a document of docs/, and the target of a link, exists.
+import glob
 import os
 import re
 import sys
@@ -51,6 +53,9 @@ MAX_WITHOUT_ESSAY = 200
 MAX_LINE = 100
 # A comment that is the second half of a ruler: only dashes, or words before dashes.
 SPLIT_RULER = re.compile(r"^\s*//(?! ---? ?\w).*---+$")
+# A path of the sources, without its ending where that is .hpp and .cpp; with * and {a,b}.
+SOURCE_PATH = re.compile(r"(?<![\w./-])(?:core|client|daemon|proto|tests|scripts)/[\w./{,}*-]*[\w}*/]")
+LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)")
 INCLUDE = re.compile(r'^\s*#\s*include\s+["<]([^">]+)[">]', re.MULTILINE)
 
 
@@ -153,8 +158,27 @@ def include_errors(root):
         yield f"{root} has no sources"
 
 
+def path_exists(pattern):
+    choice = re.search(r"{([^}]*)}", pattern)
+    if choice:
+        return all(path_exists(pattern.replace(choice[0], one, 1)) for one in choice[1].split(","))
+    return bool(glob.glob(pattern) or glob.glob(pattern + ".[hc]pp"))
+
+
+def document_errors(root):
+    documents = glob.glob(os.path.join(root, "docs/**/*.md"), recursive=True)
+    for path in sorted([os.path.join(root, "README.md"), *documents]):
+        with open(path, encoding="utf-8") as file:
+            text = file.read()
+        named = [os.path.join(root, name) for name in SOURCE_PATH.findall(text)]
+        linked = [os.path.join(os.path.dirname(path), name) for name in LINK.findall(text)]
+        for name in sorted({*named, *linked}):
+            if not path_exists(name):
+                yield f"{os.path.relpath(path, root)}: there is no {os.path.relpath(name, root)}"
+
+
 def main(root):
-    errors = [*include_errors(root), *comment_errors(root)]
+    errors = [*include_errors(root), *comment_errors(root), *document_errors(root)]
     for error in errors:
         print(error)
     return 1 if errors else 0

@@ -523,12 +523,12 @@ TEST(FrameDecoder, RefusesTooMuchBesideAPayload) {
 }
 
 TEST(FrameDecoder, RefusesWhatIsNoMessage) {
-  expect_refused(framed("garbage!"), 20, "no message of this protocol");
-  // A payload that would end behind its frame.
-  expect_refused(framed(std::string("\x12\x00\x7a\x14short", 9)), 20, "no message");
-  // Behind the payload: three bytes that are no field.
+  expect_refused(framed("garbage!"), 20, "not a message of this protocol");
+  // A payload that would end after its frame.
+  expect_refused(framed(std::string("\x12\x00\x7a\x14short", 9)), 20, "not a message");
+  // After the payload: three bytes that are not a field.
   std::string sample = sample_message(0, 1, 20).SerializeAsString();
-  expect_refused(framed(sample + "\xff\xff\xff"), 20, "no field");
+  expect_refused(framed(sample + "\xff\xff\xff"), 20, "not a field");
 }
 
 // Two bytes make an empty Stream in a list; protobuf takes some hundred bytes of memory for it.
