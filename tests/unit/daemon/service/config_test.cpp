@@ -106,7 +106,8 @@ TEST(Config, NamesLineAndKeyOfWhatIsWrongInAList) {
             "dssmd.conf:1: key 'peers': a whole number instead of a text in quotes");
   EXPECT_EQ(mistakes_in("insecure = \"yes\"\n"),
             "dssmd.conf:1: key 'insecure': a text instead of true or false");
-  EXPECT_NE(mistakes_in("peers = [\"pc2:99999\"]\n").find("'99999' is not a port"), std::string::npos);
+  EXPECT_NE(mistakes_in("peers = [\"pc2:99999\"]\n").find("'99999' is not a port"),
+            std::string::npos);
   EXPECT_NE(mistakes_in("peers = [\"pc2:0\"]\n").find("port 0"), std::string::npos);
   EXPECT_NE(mistakes_in("listen = [\"pc1\"]\n").find("'pc1' is a name"), std::string::npos);
 }
