@@ -4,8 +4,8 @@
 // connections, opens mirrors and remote writers, and passes on what changes.
 //
 // Right after its start dssmd knows no other host yet. A request that would fail for that reason
-// waits until each peer has been heard of or tried once (Peers::kStartupTime at most): programs that
-// start together with dssmd find remote streams as they find local ones.
+// waits until each peer has been heard of or tried once (Peers::kStartupTime at most): programs
+// that start together with dssmd find remote streams as they find local ones.
 #pragma once
 
 #include <deque>
