@@ -38,12 +38,12 @@
 #include <string_view>
 #include <vector>
 
-#pragma GCC visibility push(default)  // the library hides everything else
-namespace dssm {
-
-namespace detail {
+namespace dssm::detail {
 struct PConnectorState;
 }
+
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 struct PConnectorOptions {
   // Where dssmd listens: "pc2", "10.0.0.2:13776", "[::1]:13776". Without a port $DSSM_PORT, else

@@ -13,12 +13,12 @@
 
 #include <memory>
 
-#pragma GCC visibility push(default)  // the library hides everything else
-namespace dssm {
-
-namespace detail {
+namespace dssm::detail {
 struct PlaybackClockState;
 }
+
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 // A handle; copies share one clock. Times are seconds since 1970 as a double, as in SSM.
 class PlaybackClock {

@@ -29,12 +29,12 @@
 #include <span>
 #include <vector>
 
-#pragma GCC visibility push(default)  // the library hides everything else
-namespace dssm {
-
-namespace detail {
+namespace dssm::detail {
 struct ReaderState;
 }
+
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 // A sample in its slot, read without a copy. A writer may overwrite the slot at any time: compute
 // with the payload first, then call still_valid(), and use the result only when it returns true.

@@ -27,12 +27,12 @@
 #include <memory>
 #include <span>
 
-#pragma GCC visibility push(default)  // the library hides everything else
-namespace dssm {
-
-namespace detail {
+namespace dssm::detail {
 struct SampleCollectorState;
 }
+
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 struct SampleCollectorOptions {
   // Slots of the ring, which holds one sample less; 0: as many as the owner's ring has.

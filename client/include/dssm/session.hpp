@@ -27,12 +27,12 @@
 #include <string>
 #include <vector>
 
-#pragma GCC visibility push(default)  // the library hides everything else
-namespace dssm {
-
-namespace detail {
+namespace dssm::detail {
 class Client;
 }
+
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 struct SessionOptions {
   std::string socket_path = {};  // empty: $DSSM_SOCKET, else /run/dssm/dssmd.sock

@@ -20,12 +20,12 @@
 #include <memory>
 #include <span>
 
-#pragma GCC visibility push(default)  // the library hides everything else
-namespace dssm {
-
-namespace detail {
+namespace dssm::detail {
 struct WriterState;
 }
+
+#pragma GCC visibility push(default)  // the library hides everything else
+namespace dssm {
 
 // The next slot, to be filled in place. It holds the stream's writer lock: call publish() or
 // abandon() soon; the destructor abandons it. It must not outlive its writer, and is not movable.
