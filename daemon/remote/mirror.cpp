@@ -32,7 +32,7 @@ Mirror::Mirror(const ChannelParts& parts, StreamId id, RingQuota quota,
 
 // --- protocol steps
 
-void Mirror::on_connected(FrameConnection&, const wire::Greeting& them) {
+void Mirror::on_connected(const wire::Greeting& them) {
   on_owner_clock(them.clock);
   channel_.open(id_, nullptr);
 }

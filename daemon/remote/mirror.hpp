@@ -11,10 +11,9 @@
 //             for its readers, and the mirror always retries
 //   end       when no program has used the ring for mirror_linger
 //
-// The states are those of ChannelClient, which subscribes: `live` when the history is here. A
-// program gets the ring at once while the channel is closed, being opened or live, if there is a
-// ring; while it subscribes and is filled, and after the catalog or the owner said that the stream
-// was removed, its open() waits.
+// The states are drawn in remote_stream.hpp; `live` when the history is here. If there is a ring, a
+// program gets it at once while the channel is closed, opening or live. While it is subscribing and
+// filling, and after the catalog or the owner said that the stream was removed, its open() waits.
 #pragma once
 
 #include <cstdint>
@@ -69,7 +68,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   Result<void> check_open(const CreatePlan*) override { return clock_.check_opening(); }
   Result<void> use_offered(std::shared_ptr<Stream> stream) override;
   void on_unused() override;
-  void on_connected(FrameConnection& connection, const wire::Greeting& them) override;
+  void on_connected(const wire::Greeting& them) override;
   void on_channel_end() override;
 
   // The ring

@@ -14,10 +14,20 @@
 // A program's open() is answered at once when there is a ring that it may use. Otherwise it waits,
 // at most for kOwnerTimeout, until the derived class answers or fails it.
 //
-// While the owner does not answer, the ring stays for its programs, and the connection is retried.
-// When the owner has removed the stream, programs that open it do not get the ring that is still
-// here: they wait for the owner's answer on a new connection, which is made for them, when the
-// catalog knows the stream again, and kRetryPause after each refusal.
+// The states of channel_ (ChannelClient), and what leads from one to the next. There may be a ring
+// in each of them:
+//
+//          connected         Opened                Subscribed         CaughtUp
+//   closed --------> opening ------> subscribing ------------> filling ------> live      Mirror
+//                            ------> starting --------------> publishing           RemoteWriter
+//                                                 Publishing
+//
+//   the connection ends   any state -> closed; it is retried after a pause
+//   Failure, Ended        any state -> closed; retried after kRetryPause, or at once when the
+//                         catalog has the stream again or a program opens it
+//   is_removed_           set by Ended and by the Failure not_found, cleared by Opened. While it is
+//                         set, programs do not get the ring that is still here: their open() waits
+//                         for the owner's answer
 #pragma once
 
 #include <fmt/core.h>
@@ -206,7 +216,7 @@ class RemoteStream : private OwnerConnection::Observer, protected channel::Chann
   // --- the channel
 
   // The connection is up: follow with channel_.open().
-  virtual void on_connected(FrameConnection& connection, const wire::Greeting& them) = 0;
+  virtual void on_connected(const wire::Greeting& them) = 0;
   virtual void on_output_empty() override {}
   // The channel is closed.
   virtual void on_channel_end() = 0;
@@ -244,9 +254,7 @@ class RemoteStream : private OwnerConnection::Observer, protected channel::Chann
 
  private:
   // OwnerConnection::Observer
-  void on_up(FrameConnection& connection, const wire::Greeting& them) override {
-    on_connected(connection, them);
-  }
+  void on_up(FrameConnection&, const wire::Greeting& them) override { on_connected(them); }
   Result<void> on_frame(net::Frame& frame) override { return channel_.on_frame(frame); }
   void on_down(const Error& why) override;
   void on_reopen() override { end_channel(); }

@@ -27,7 +27,7 @@ RemoteWriter::RemoteWriter(const ChannelParts& parts, StreamId id, RingQuota quo
 
 // --- protocol steps
 
-void RemoteWriter::on_connected(FrameConnection&, const wire::Greeting& them) {
+void RemoteWriter::on_connected(const wire::Greeting& them) {
   may_tear_ = them.has_feature(wire::kFeatureTorn);
   open_at_owner();
 }

@@ -13,8 +13,8 @@
 //            then it gets what the ring still holds. But when an owner comes back without its ring,
 //            the remote writer creates the stream again
 //
-// The states are those of ChannelClient, which publishes. Open is sent, or Create if a program
-// created the stream. When the owner refuses what one program that waits asks for, the next one's
+// The states are drawn in remote_stream.hpp. Open is sent, or Create if a program created the
+// stream. When the owner refuses what one program that waits asks for, the next one's
 // request is sent on the same channel.
 #pragma once
 
@@ -58,7 +58,7 @@ class RemoteWriter final : public RemoteStream,
   Result<void> use_offered(std::shared_ptr<Stream> stream) override;
   void on_unused() override { drain_timer_.enable_in(Duration::zero()); }
 
-  void on_connected(FrameConnection& connection, const wire::Greeting& them) override;
+  void on_connected(const wire::Greeting& them) override;
   void on_output_empty() override { publish(); }
   void on_channel_end() override { stop_publishing(); }
 
