@@ -43,7 +43,7 @@ NetworkConnection::NetworkConnection(wire::FrameDelegate& delegate, std::string 
                                      Duration greeting_timeout)
     : delegate_(delegate),
       program_(std::move(program)),
-      greeting_timeout_(std::max(greeting_timeout, wire::kHelloTimeout)),
+      greeting_timeout_(greeting_timeout),
       instance_id_(wire::random_number()) {}
 
 Result<void> NetworkConnection::start(Result<std::vector<wire::SocketAddress>> addresses) {

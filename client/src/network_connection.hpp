@@ -28,8 +28,8 @@ namespace dssm::detail {
 // A resource with one owner; one thread.
 class NetworkConnection final : private wire::FrameDelegate {
  public:
-  // What arrives after the greeting goes to `delegate`, during receive() and resume(). A busy dssmd
-  // may greet late: the greeting may take `greeting_timeout`, at least kHelloTimeout.
+  // What arrives after the greeting goes to `delegate`, during receive() and resume(). The greeting
+  // may take `greeting_timeout`.
   NetworkConnection(wire::FrameDelegate& delegate, std::string program, Duration greeting_timeout);
   NetworkConnection(const NetworkConnection&) = delete;
   NetworkConnection& operator=(const NetworkConnection&) = delete;

@@ -36,7 +36,8 @@ StreamClient::StreamClient(Goal goal, PConnectorOptions options)
       options_(std::move(options)),
       owner_pid_(::getpid()),
       connection_(*this, options_.program.empty() ? default_program() : options_.program,
-                  options_.request_timeout) {
+                  // A busy dssmd may greet late.
+                  std::max(options_.request_timeout, wire::kHelloTimeout)) {
   publishing_.publisher = wire::random_number();
 }
 

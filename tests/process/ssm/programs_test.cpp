@@ -10,7 +10,7 @@
 #include <cstdlib>
 #include <fstream>
 
-#include "tests/process/ssm/test_name.hpp"
+#include "tests/process/ssm/run_program.hpp"
 #include "tests/support/daemon_process.hpp"
 
 namespace dssm::test {
@@ -18,16 +18,7 @@ namespace {
 
 class SsmProgram : public testing::TestWithParam<std::string> {};
 
-void expect_checks_hold(const std::string& program) {
-  const DaemonProcess daemon({"--log-level", "warning"});
-  const std::string folder = make_temp_dir();
-  const Finished finished =
-      run({built("tests/process/ssm/" + program), folder}, {daemon.environment()});
-  EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
-  remove_tree(folder);
-}
-
-TEST_P(SsmProgram, ChecksHold) { expect_checks_hold(GetParam()); }
+TEST_P(SsmProgram, ChecksHold) { expect_checks_hold(GetParam(), false); }
 
 class SsmProcesses : public testing::TestWithParam<std::string> {};
 
@@ -35,7 +26,7 @@ TEST_P(SsmProcesses, ChecksHold) {
 #ifdef __SANITIZE_THREAD__
   GTEST_SKIP() << "the thread sanitizer holds signals back and knows no threads in forked children";
 #endif
-  expect_checks_hold(GetParam());
+  expect_checks_hold(GetParam(), false);
 }
 
 INSTANTIATE_TEST_SUITE_P(C, SsmProgram,

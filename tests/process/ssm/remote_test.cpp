@@ -11,7 +11,7 @@
 #include <thread>
 
 #include "tests/process/fleet/fleet_tools.hpp"
-#include "tests/process/ssm/test_name.hpp"
+#include "tests/process/ssm/run_program.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/session.hpp"
 
@@ -24,14 +24,7 @@ std::string program(const std::string& name) { return built("tests/process/ssm/"
 
 class SsmRemoteProgram : public testing::TestWithParam<std::string> {};
 
-TEST_P(SsmRemoteProgram, ChecksHold) {
-  const DaemonProcess daemon({"--log-level", "warning"});
-  const std::string folder = make_temp_dir();
-  const Finished finished =
-      run({program(GetParam()), folder, daemon.address()}, {daemon.environment()});
-  EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
-  remove_tree(folder);
-}
+TEST_P(SsmRemoteProgram, ChecksHold) { expect_checks_hold(GetParam(), true); }
 
 class SsmRemoteProcesses : public testing::TestWithParam<std::string> {};
 
@@ -39,12 +32,7 @@ TEST_P(SsmRemoteProcesses, ChecksHold) {
 #ifdef __SANITIZE_THREAD__
   GTEST_SKIP() << "the thread sanitizer holds signals back and knows no threads in forked children";
 #endif
-  const DaemonProcess daemon({"--log-level", "warning"});
-  const std::string folder = make_temp_dir();
-  const Finished finished =
-      run({program(GetParam()), folder, daemon.address()}, {daemon.environment()});
-  EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
-  remove_tree(folder);
+  expect_checks_hold(GetParam(), true);
 }
 
 INSTANTIATE_TEST_SUITE_P(Cpp, SsmRemoteProgram,

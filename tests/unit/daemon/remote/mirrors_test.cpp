@@ -374,19 +374,10 @@ TEST_F(MirrorsTest, ContinuesWithARingThatAProgramKept) {
 }
 
 TEST_F(MirrorsTest, RefusesRingsThatAreNoMirrors) {
-  const auto offer = [&](Purpose purpose, const StreamId& id) {
-    auto stream =
-        Stream::create(
-            {.id = id, .type = odometry_type(), .depth = 16, .cycle = 1ms, .purpose = purpose},
-            registry.budget())
-            .value();
-    return streams->adopt_untrusted(kOdometry,
-                                    as_offer(stream->descriptors_for(Role::reader).value()));
-  };
   // Programs can write to these: dssmd must not build on what stands there.
-  EXPECT_EQ(offer(Purpose::remote_writer, kOdometry).error().code, Errc::protocol);
-  EXPECT_EQ(offer(Purpose::own, kOdometry).error().code, Errc::protocol);
-  EXPECT_EQ(offer(Purpose::mirror, {"other", 0, "pc2"}).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::remote_writer, kOdometry, Role::reader).code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::own, kOdometry, Role::reader).code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::mirror, {"other", 0, "pc2"}, Role::reader).code, Errc::protocol);
   EXPECT_EQ(count(), 0u);
   EXPECT_EQ(registry.budget().used(), 0u);
 }

@@ -61,6 +61,19 @@ class RemoteStreamTest : public testing::Test {
     return (*answer)->error();
   }
 
+  // Offers a ring that does not fit; returns why it is refused.
+  Error offer(Purpose purpose, const StreamId& id, Role role) {
+    const auto stream = Stream::create({.id = id,
+                                        .type = odometry_type(),
+                                        .depth = 16,
+                                        .cycle = std::chrono::milliseconds(1),
+                                        .purpose = purpose},
+                                       registry.budget())
+                            .value();
+    return streams->adopt_untrusted(kOdometry, as_offer(stream->descriptors_for(role).value()))
+        .error();
+  }
+
   // How many mirrors or remote writers there are.
   std::size_t count() const {
     std::size_t count = 0;

@@ -364,18 +364,9 @@ TEST_F(RemoteWritersTest, PublishesAKeptRingBesideOneThatWasOpenedSince) {
 }
 
 TEST_F(RemoteWritersTest, RefusesRingsThatAreNoRemoteWriters) {
-  const auto offer = [&](Purpose purpose, const StreamId& id) {
-    auto stream =
-        Stream::create(
-            {.id = id, .type = odometry_type(), .depth = 16, .cycle = 1ms, .purpose = purpose},
-            registry.budget())
-            .value();
-    return streams->adopt_untrusted(kOdometry,
-                                    as_offer(stream->descriptors_for(Role::writer).value()));
-  };
-  EXPECT_EQ(offer(Purpose::mirror, kOdometry).error().code, Errc::protocol);
-  EXPECT_EQ(offer(Purpose::own, kOdometry).error().code, Errc::protocol);
-  EXPECT_EQ(offer(Purpose::remote_writer, {"other", 0, "pc2"}).error().code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::mirror, kOdometry, Role::writer).code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::own, kOdometry, Role::writer).code, Errc::protocol);
+  EXPECT_EQ(offer(Purpose::remote_writer, {"other", 0, "pc2"}, Role::writer).code, Errc::protocol);
   EXPECT_EQ(count(), 0u);
 }
 
