@@ -21,13 +21,6 @@ namespace {
 
 constexpr std::size_t kBootIdBytes = 36;
 
-// What stamping takes of the page; the rest is as it is constructed.
-ClockPageState stamp_state(const ClockPage& page) noexcept {
-  ClockPageState state;
-  page.state.load<ClockPageState::kStampBytes>(state);
-  return state;
-}
-
 }  // namespace
 
 std::string boot_id() {
@@ -40,7 +33,10 @@ std::string boot_id() {
 }
 
 std::optional<Duration> clock_error_at(const ClockPage& page, Time t) noexcept {
-  const ClockPageState state = stamp_state(page);
+  // A time after the latest statement is usually found in a ClockErrorCache.
+  ClockPageState state;
+  page.state.load<ClockPageState::kEarlierBytes>(state);
+  if (t >= state.wall) page.state.load<ClockPageState::kStampBytes>(state);
   if (t < state.wall) {
     if (t < state.earlier_from) return std::nullopt;
     return state.earlier_bound;
@@ -57,7 +53,8 @@ std::optional<Duration> clock_error_at(const ClockPage& page, Time t) noexcept {
 }
 
 ClockStatus status_of(const ClockPage& page) noexcept {
-  const ClockPageState state = stamp_state(page);
+  ClockPageState state;
+  page.state.load<ClockPageState::kStampBytes>(state);
   return MonoClock::now() - state.mono > kMaxUse ? ClockStatus::unknown : state.clock.status;
 }
 

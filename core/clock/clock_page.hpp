@@ -18,7 +18,8 @@
 
 namespace dssm::clock {
 
-// What dssmd states at one time. The first kStampBytes are all that stamping a sample takes.
+// What dssmd states at one time. The first kStampBytes are all that stamping a sample takes, and
+// the first kEarlierBytes all that it takes of a time before `wall`.
 //
 //   off size field                  unit
 //     0    8 wall                   ns     CLOCK_REALTIME, when this was stated
@@ -33,6 +34,7 @@ namespace dssm::clock {
 //   200   56 reserved                      zero
 struct ClockPageState {
   static constexpr std::size_t kStampBytes = 64;
+  static constexpr std::size_t kEarlierBytes = 24;
   static constexpr std::size_t kMaxReferenceBytes = 63;
 
   Time wall{};
