@@ -84,18 +84,6 @@ void to_message(const StreamInfo& info, proto::Stream& out) {
     message.set_program(user.program);
     message.set_writer(user.role == Role::writer);
   }
-  if (info.mirror) to_message(*info.mirror, *out.mutable_mirror());
-}
-
-void to_message(const MirrorInfo& info, proto::Mirror& out) {
-  out.set_state(static_cast<proto::Mirror::State>(info.state));
-  out.set_gap_samples(info.gap_samples);
-  out.set_reconnects(info.reconnects);
-  out.set_restarts(info.restarts);
-  out.set_newest(info.newest);
-  out.set_received_samples(info.received_samples);
-  out.set_received_bytes(info.received_bytes);
-  out.set_error(info.error);
 }
 
 void to_message(const Error& error, proto::Failure& out) {

@@ -28,7 +28,7 @@ Enum enum_untrusted(std::int64_t value, Enum last) noexcept {
 // Public types to messages.
 void to_message(const StreamId& id, proto::StreamId& out);
 void to_message(const TypeInfo& type, proto::Type& out);
-void to_message(const MirrorInfo& info, proto::Mirror& out);
+// Without its mirror, which Mirror::describe() sets.
 void to_message(const StreamInfo& info, proto::Stream& out);
 void to_message(const StreamId& id, const TypeInfo& type, const History& history,
                 proto::Create& out);

@@ -144,7 +144,7 @@ TEST(ChronyProtocol, RoundsAwayFromZero) {
   const auto ns = [](std::int32_t coefficient, int exponent) {
     return to_ns(seconds_untrusted(chrony_float(coefficient, exponent)));
   };
-  constexpr std::int64_t kMost = std::numeric_limits<std::int64_t>::max();
+  constexpr std::int64_t kMax = std::numeric_limits<std::int64_t>::max();
   EXPECT_EQ(ns(0, 0), 0) << "a clock that needs no correction";
   EXPECT_EQ(ns(0, 63), 0);
   // 1 s, and one unit of 2^-23 s for what chronyd rounded.
@@ -157,9 +157,9 @@ TEST(ChronyProtocol, RoundsAwayFromZero) {
   EXPECT_EQ(ns((1 << 24) - 1, -37), 1);
   EXPECT_EQ(ns((1 << 24) - 1, -64), 1);
   EXPECT_EQ(ns(1, 25), 2'000'000'000);
-  EXPECT_EQ(ns((1 << 24) - 1, 63), kMost);
-  EXPECT_EQ(ns(-(1 << 24), 63), -kMost);
-  EXPECT_EQ(ns(1, 63), kMost) << "17,000 years";
+  EXPECT_EQ(ns((1 << 24) - 1, 63), kMax);
+  EXPECT_EQ(ns(-(1 << 24), 63), -kMax);
+  EXPECT_EQ(ns(1, 63), kMax) << "17,000 years";
 }
 
 std::uint32_t first_chrony_seed() {

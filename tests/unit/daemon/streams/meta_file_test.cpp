@@ -54,7 +54,7 @@ std::string header_bytes(const MetaHeader& header) {
 }
 
 // Whether a file of these bytes passes for a meta file with content.
-Errc verdict_on(const std::string& content) {
+Errc error_of(const std::string& content) {
   Result<MetaFile> opened = MetaFile::open_untrusted(forged(content));
   if (!opened) return opened.error().code;
   const Result<local::StreamMeta> read = opened->read_untrusted();
@@ -124,12 +124,12 @@ TEST(MetaFile, ReportsThatTheStreamWasRemovedOnceItIsMarked) {
 }
 
 TEST(MetaFile, RefusesWhatIsNoMetaFile) {
-  EXPECT_EQ(verdict_on(""), Errc::protocol);
-  EXPECT_EQ(verdict_on("DSSMMETA"), Errc::protocol) << "shorter than its header";
-  EXPECT_EQ(verdict_on(std::string(8192, '\0')), Errc::protocol) << "no magic";
+  EXPECT_EQ(error_of(""), Errc::protocol);
+  EXPECT_EQ(error_of("DSSMMETA"), Errc::protocol) << "shorter than its header";
+  EXPECT_EQ(error_of(std::string(8192, '\0')), Errc::protocol) << "no magic";
   MetaHeader other_version;
   other_version.version = 2;
-  EXPECT_EQ(verdict_on(header_bytes(other_version)), Errc::protocol);
+  EXPECT_EQ(error_of(header_bytes(other_version)), Errc::protocol);
 }
 
 TEST(MetaFile, RefusesAHeaderThatPointsOutsideOfTheFile) {
@@ -141,13 +141,13 @@ TEST(MetaFile, RefusesAHeaderThatPointsOutsideOfTheFile) {
     content.resize(3 * 4096);
     return content;
   };
-  EXPECT_EQ(verdict_on(file_with(4096, 8193)), Errc::protocol);
-  EXPECT_EQ(verdict_on(file_with(16384, 1)), Errc::protocol);
-  EXPECT_EQ(verdict_on(file_with(4096, UINT64_MAX)), Errc::protocol);
-  EXPECT_EQ(verdict_on(file_with(UINT64_MAX - 4095, 8192)), Errc::protocol);
-  EXPECT_EQ(verdict_on(file_with(0, 16)), Errc::protocol) << "on its own header";
-  EXPECT_EQ(verdict_on(file_with(4097, 16)), Errc::protocol) << "not on a page";
-  EXPECT_EQ(verdict_on(file_with(4096, 0)), Errc::protocol) << "half a mark of removal";
+  EXPECT_EQ(error_of(file_with(4096, 8193)), Errc::protocol);
+  EXPECT_EQ(error_of(file_with(16384, 1)), Errc::protocol);
+  EXPECT_EQ(error_of(file_with(4096, UINT64_MAX)), Errc::protocol);
+  EXPECT_EQ(error_of(file_with(UINT64_MAX - 4095, 8192)), Errc::protocol);
+  EXPECT_EQ(error_of(file_with(0, 16)), Errc::protocol) << "on its own header";
+  EXPECT_EQ(error_of(file_with(4097, 16)), Errc::protocol) << "not on a page";
+  EXPECT_EQ(error_of(file_with(4096, 0)), Errc::protocol) << "half a mark of removal";
 }
 
 TEST(MetaFile, RefusesContentThatIsNoStreamMeta) {
@@ -157,7 +157,7 @@ TEST(MetaFile, RefusesContentThatIsNoStreamMeta) {
   std::string content = header_bytes(header);
   content.resize(4096);
   content.append(16, '\xff');
-  EXPECT_EQ(verdict_on(content), Errc::protocol);
+  EXPECT_EQ(error_of(content), Errc::protocol);
 }
 
 TEST(MetaFile, RefusesAFileThatIsNotSealed) {

@@ -258,7 +258,7 @@ class Adoption : public testing::Test {
     EXPECT_TRUE(before.set_property(id, "kept"));
     return kept_by(role, *stream);
   }
-  Errc verdict_on(OfferedFiles files) {
+  Errc error_of(OfferedFiles files) {
     return code_of(registry_.adopt_untrusted(kOdometry, std::move(files)));
   }
   static UniqueFd memory_file(int seals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL) {
@@ -297,7 +297,7 @@ TEST_F(Adoption, OnlyNotesTheSecondOfferOfTheSameRing) {
 
 TEST_F(Adoption, RefusesAnotherRingOfATakenName) {
   create(registry_);
-  EXPECT_EQ(verdict_on(held(Role::writer)), Errc::conflict);
+  EXPECT_EQ(error_of(held(Role::writer)), Errc::conflict);
 }
 
 TEST_F(Adoption, TakesTheDoorbellThatAWriterKeptButNothingElseForOne) {
@@ -351,7 +351,7 @@ TEST_F(Adoption, DoesNotBringBackWhatWasRemoved) {
     files = kept_by(Role::writer, *create(before));
     ASSERT_TRUE(before.remove(kOdometry));
   }
-  EXPECT_EQ(verdict_on(std::move(files)), Errc::not_found);
+  EXPECT_EQ(error_of(std::move(files)), Errc::not_found);
 }
 
 TEST_F(Adoption, RefusesFilesOfAnotherUser) {
@@ -360,7 +360,7 @@ TEST_F(Adoption, RefusesFilesOfAnotherUser) {
        {&OfferedFiles::ring, &OfferedFiles::bell, &OfferedFiles::meta}) {
     OfferedFiles files = held(Role::writer);
     ASSERT_EQ(::fchown((files.*file).get(), 65534, 65534), 0);
-    EXPECT_EQ(verdict_on(std::move(files)), Errc::no_permission);
+    EXPECT_EQ(error_of(std::move(files)), Errc::no_permission);
   }
 }
 
@@ -369,13 +369,13 @@ TEST_F(Adoption, RefusesFilesThatAreNotSealedOrNoMemoryFiles) {
        {&OfferedFiles::ring, &OfferedFiles::bell, &OfferedFiles::meta}) {
     OfferedFiles files = held(Role::writer);
     files.*file = memory_file(0);
-    EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+    EXPECT_EQ(error_of(std::move(files)), Errc::protocol);
     files = held(Role::writer);
     (files.*file).reset(::open("/dev/null", O_RDWR | O_CLOEXEC));
-    EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+    EXPECT_EQ(error_of(std::move(files)), Errc::protocol);
     files = held(Role::writer);
     files.*file = memory_file();  // sealed, but empty
-    EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+    EXPECT_EQ(error_of(std::move(files)), Errc::protocol);
   }
 }
 
@@ -386,12 +386,12 @@ TEST_F(Adoption, RefusesARingOfAnotherGeometryThanInItsMetaFile) {
   larger.payload_bytes = 32;
   const auto stream = before.create(kOdometry, larger, kHistory, 1)->stream;
   files.ring = std::move(kept_by(Role::writer, *stream).ring);
-  EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+  EXPECT_EQ(error_of(std::move(files)), Errc::protocol);
 }
 
 TEST_F(Adoption, RefusesARingUnderAnotherName) {
-  EXPECT_EQ(verdict_on(held(Role::writer, {"lidar", 0, ""})), Errc::protocol);
-  EXPECT_EQ(verdict_on(held(Role::writer, {"odometry", 1, ""})), Errc::protocol);
+  EXPECT_EQ(error_of(held(Role::writer, {"lidar", 0, ""})), Errc::protocol);
+  EXPECT_EQ(error_of(held(Role::writer, {"odometry", 1, ""})), Errc::protocol);
   EXPECT_TRUE(registry_.streams().empty());
 }
 
@@ -405,7 +405,7 @@ TEST_F(Adoption, RefusesARingWhoseHeaderWasRewritten) {
   const auto mapping =
       ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_write);
   (*mapping)->header().depth = 1 << 20;
-  EXPECT_EQ(verdict_on(std::move(files)), Errc::protocol);
+  EXPECT_EQ(error_of(std::move(files)), Errc::protocol);
 }
 
 // --- removing and watching
