@@ -35,13 +35,13 @@ class NetworkConnection final : private wire::FrameDelegate {
   NetworkConnection& operator=(const NetworkConnection&) = delete;
 
   // Begins to connect to one of `addresses` (at least one), tried in turn; only while it is down.
-  //   fails  when they were not found
+  //   fails  they were not found, or connecting to each failed at once
   Result<void> start(Result<std::vector<wire::SocketAddress>> addresses);
   void close();
   // start() may be called at once.
   void end_pause() noexcept { step_at_ = MonoTime::min(); }
   // The other side did what it was connected for: the next pause is short.
-  void mark_useful() noexcept { plan_.mark_useful(); }
+  void mark_useful() noexcept { plan_.reset_pause(); }
 
   bool is_down() const noexcept { return phase_ == Phase::down; }
   bool is_up() const noexcept { return phase_ == Phase::up; }

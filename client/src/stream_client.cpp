@@ -290,7 +290,8 @@ Result<void> StreamClient::on_published_untrusted(std::int64_t last, Tid last_ti
 }
 
 Result<void> StreamClient::on_refused(channel::ChannelClient::Request request, const Error& why) {
-  if (request != channel::ChannelClient::Request::subscribe) return why;
+  if (request == channel::ChannelClient::Request::open) return why;
+  if (request == channel::ChannelClient::Request::publish) return Error(why).context("publish");
   subscription_refused_ = why;
   subscriber_->end();
   return {};
@@ -422,8 +423,11 @@ Result<void> StreamClient::subscribe(const Subscription& what_from) {
   static_cast<void>(run(deadline, false, [&] { return is_up() || connection_.is_down(); }));
   if (!subscriber_->granted() && !subscription_refused_) {
     if (Result<void> up = wait_until_up(deadline); !up) {
+      // A late answer must not begin a subscription that the program does not have any more.
+      Error error = std::move(up).error();
       subscriber_->end();
-      return std::move(up).error().context(what("subscribe to"));
+      if (!connection_.is_down()) on_disconnected(error);
+      return std::move(error).context(what("subscribe to"));
     }
   }
   if (subscription_refused_) return Error(*subscription_refused_).context(what("subscribe to"));
@@ -511,7 +515,7 @@ Result<void> StreamClient::post(std::span<const std::byte> payload, Time time,
     return size_error("write", payload.size());
   }
   if (!publishing_.started) {
-    if (is_up()) {
+    if (channel_.stream() == channel::ChannelClient::Stream::open) {
       start_publishing();
     } else {
       publishing_.started = true;
@@ -519,8 +523,11 @@ Result<void> StreamClient::post(std::span<const std::byte> payload, Time time,
   }
   outbox_->push(payload, time, clock_error);
   advance(LookUp::no);
-  // Unsent bytes show that the other side is slow or disconnected.
-  if (++publishing_.posts_since_receive < kPostsPerReceive && !has_more_to_send()) return {};
+  // Unsent bytes show that the other side is slow. While the connection is being set up, each call
+  // takes the next step.
+  if (++publishing_.posts_since_receive < kPostsPerReceive && is_up() && !has_more_to_send()) {
+    return {};
+  }
   publishing_.posts_since_receive = 0;
   subscriber_->set_buffering(true);
   while (receive()) {

@@ -14,17 +14,22 @@ namespace {
 
 // The stream in `opened`, which must be `expected`.
 Result<StreamInfo> opened_stream_untrusted(const proto::Opened& opened, const StreamId& expected) {
-  const StreamId id = DSSM_TRY(wire::stream_id_untrusted(opened.stream().id()));
+  const auto invalid = [](const Error& why) {
+    return Error{Errc::protocol, "the owner's description of a stream: " + why.message};
+  };
+  const Result<StreamId> named = wire::stream_id_untrusted(opened.stream().id());
+  if (!named) return invalid(named.error());
+  const StreamId& id = *named;
   const bool is_host = expected.host.empty() || id.host == expected.host;
   if (id.name != expected.name || id.id != expected.id || !is_host) {
     return Error{Errc::protocol,
                  fmt::format("the owner opened '{}' instead of '{}'", id.str(), expected.str())};
   }
-  TypeInfo type = DSSM_TRY(wire::type_untrusted(opened.stream().type()),
-                           "the owner's description of '" + id.str() + "'");
+  Result<TypeInfo> type = wire::type_untrusted(opened.stream().type());
+  if (!type) return invalid(type.error());
   StreamInfo stream = wire::stream_info(opened.stream());
   stream.id = id;
-  stream.type = std::move(type);
+  stream.type = *std::move(type);
   if (stream.depth < kMinDepth || stream.depth > kMaxDepth || stream.cycle <= Duration::zero() ||
       stream.incarnation == 0 || stream.newest < kNoTid || stream.newest > kMaxTid) {
     return Error{Errc::protocol,
@@ -55,6 +60,7 @@ void ChannelClient::open(const StreamId& id, const CreatePlan* plan) {
 }
 
 void ChannelClient::subscribe(const net::Subscribe& request) {
+  if (reading_ != Reading::asked) before_asked_ = reading_;
   reading_ = Reading::asked;
   subscribe_serial_ = next_serial();
   net::Frame frame;
@@ -110,10 +116,11 @@ Result<void> ChannelClient::on_open_answer(const net::Frame& frame) {
 
 Result<void> ChannelClient::on_subscribe_answer(const net::Frame& frame) {
   subscribe_serial_ = 0;
-  reading_ = Reading::none;
   if (frame.has_failure()) {
+    reading_ = before_asked_;  // that subscription goes on
     return delegate_.on_refused(Request::subscribe, wire::failure(frame.failure()));
   }
+  reading_ = Reading::none;
   if (!frame.has_subscribed()) return unexpected("another answer than Subscribed");
   if (frame.subscribed().incarnation() != incarnation_) {
     return Error{Errc::unavailable, "stream '" + id_.str() + "' was recreated just now"};

@@ -89,7 +89,8 @@ struct CreatePlan {
   History history;
 };
 
-// A value; one thread. Called by the delegate's owner only, and calls the delegate from within.
+// A value; one thread. Its functions call the delegate, which may call open(), subscribe(),
+// publish() and reset() in return.
 class ChannelClient {
  public:
   enum class Stream : std::uint8_t { closed, opening, open };
@@ -169,6 +170,7 @@ class ChannelClient {
   StreamId id_;
   Stream stream_ = Stream::closed;
   Reading reading_ = Reading::none;
+  Reading before_asked_ = Reading::none;  // what it was before `asked`
   Writing writing_ = Writing::none;
   std::uint64_t incarnation_ = 0;  // of the ring that is open
   // Of the requests that wait for their answers; 0: none.

@@ -46,13 +46,12 @@ class ConnectPlan {
 
   // The greeting is done.
   void on_up(MonoTime now) noexcept { up_since_ = now; }
-  // The other side did what it was connected for.
-  void mark_useful() noexcept { pause_ = kFirstPause; }
   // The round failed, or the connection ended. avoid_address: address() is tried last in the next
   // round. Returns the pause until that one.
   Duration end_round(MonoTime now, bool avoid_address);
-  // The next pause is kFirstPause.
-  void restart_pauses() noexcept { pause_ = kFirstPause; }
+  // The next pause is kFirstPause: the other side did what it was connected for, or has just become
+  // available.
+  void reset_pause() noexcept { pause_ = kFirstPause; }
 
  private:
   Duration round_time_;

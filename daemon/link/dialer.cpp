@@ -27,7 +27,7 @@ Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, Obser
 // --- for the user
 
 void Dialer::retry_now() {
-  plan_.restart_pauses();
+  plan_.reset_pause();
   if (state_ == State::pause) timer_.enable_in(Duration::zero());
 }
 

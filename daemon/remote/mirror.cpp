@@ -53,9 +53,8 @@ Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
 }
 
 Result<void> Mirror::on_subscribed_untrusted(Tid first) {
-  const std::uint64_t before = ring_->gap_samples();
   DSSM_TRY(ring_->on_subscribed_untrusted(first));
-  log_gap_since(before);
+  log_new_gap();
   last_error_.reset();
   ++subscriptions_;
   return {};
@@ -78,9 +77,8 @@ Result<void> Mirror::on_caught_up() {
 }
 
 Result<void> Mirror::on_gap_untrusted(Tid first, std::uint64_t count) {
-  const std::uint64_t before = ring_->gap_samples();
   DSSM_TRY(ring_->on_gap_untrusted(first, count));
-  log_gap_since(before);
+  log_new_gap();
   return {};
 }
 
@@ -92,7 +90,8 @@ Result<void> Mirror::on_refused(ChannelClient::Request, const Error& why) {
 }
 
 Result<void> Mirror::on_other_frame(net::Frame& frame) {
-  if (frame.has_pong()) on_owner_clock(wire::clock_report_untrusted(frame.pong()));
+  if (!frame.has_pong()) return RemoteStream::on_other_frame(frame);
+  on_owner_clock(wire::clock_report_untrusted(frame.pong()));
   return {};
 }
 
@@ -135,9 +134,8 @@ void Mirror::assess_clock() {
 }
 
 [[gnu::hot]] Result<void> Mirror::on_sample_end(const wire::IncomingSample& sample, bool torn) {
-  const std::uint64_t before = ring_->gap_samples();
   ring_->end(sample, torn);
-  log_gap_since(before);
+  log_new_gap();
   return {};
 }
 
@@ -195,6 +193,7 @@ void Mirror::replace_ring(std::unique_ptr<MirrorRing> ring) {
     clock_.on_new_ring();
   }
   ring_ = std::move(ring);
+  logged_gap_ = 0;
   assess_clock();
 }
 

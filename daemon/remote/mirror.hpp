@@ -19,6 +19,7 @@
 #include <cstdint>
 #include <functional>
 #include <memory>
+#include <utility>
 #include <vector>
 
 #include "common.pb.h"
@@ -76,8 +77,9 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   void replace_ring(std::unique_ptr<MirrorRing> ring);
   void notify_replaced();
   void assess_clock();
-  void log_gap_since(std::uint64_t before) {
-    if (ring_->gap_samples() != before) log_gap(ring_->gap_samples() - before);
+  void log_new_gap() {
+    const std::uint64_t lost = ring_->gap_samples();
+    if (lost != logged_gap_) log_gap(lost - std::exchange(logged_gap_, lost));
   }
   bool is_filling() const noexcept;
   proto::Mirror::State shown_state() const noexcept;
@@ -85,6 +87,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   bool is_ending_ = false;  // live, but the catalog knows that this ring was removed
   MirrorClock clock_;
   std::unique_ptr<MirrorRing> ring_;
+  std::uint64_t logged_gap_ = 0;                   // of this ring
   std::vector<std::shared_ptr<Stream>> replaced_;  // their readers are still to be notified
   Totals earlier_;                                 // of the rings that were replaced
   std::uint64_t subscriptions_ = 0, restarts_ = 0;

@@ -79,6 +79,13 @@ Result<void> RemoteStream::on_ended(const Error& why) {
   return {};
 }
 
+// After stop() late answers may come.
+Result<void> RemoteStream::on_other_frame(net::Frame& frame) {
+  const bool is_in_use = channel_.stream() != channel::ChannelClient::Stream::closed;
+  if (frame.serial() == 0 || !is_in_use) return {};
+  return channel::ChannelClient::unexpected("an answer that was not asked for");
+}
+
 void RemoteStream::stop(const Error& why, bool removed) {
   end_channel();
   is_removed_ = removed;

@@ -14,8 +14,9 @@
 // A program's open() is answered at once when there is a ring that it may use. Otherwise it waits,
 // at most for kOwnerTimeout, until the derived class answers or fails it.
 //
-// The states of channel_ (ChannelClient), and what leads from one to the next. There may be a ring
-// in each of them:
+// The states, and what leads from one to the next; there may be a ring in each of them. They are
+// kept by channel_ (ChannelClient), where subscribing and starting are `asked`, publishing is
+// `granted`:
 //
 //          connected         Opened                Subscribed         CaughtUp
 //   closed --------> opening ------> subscribing ------------> filling ------> live      Mirror
@@ -24,8 +25,11 @@
 //
 //   the connection ends   any state -> closed; it is retried after a pause
 //   Failure, Ended        any state -> closed; retried after kRetryPause, or at once when the
-//                         catalog has the stream again or a program opens it
-//   is_removed_           set by Ended and by the Failure not_found, cleared by Opened. While it is
+//                         catalog has the stream again or a program opens it. But when the owner
+//                         refuses Open to a remote writer and another program waits, that one's
+//                         request is sent on the same channel
+//   is_removed_           set by Ended and by the Failure not_found (not for a remote writer that
+//                         creates the stream), cleared by Opened and other Failures. While it is
 //                         set, programs do not get the ring that is still here: their open() waits
 //                         for the owner's answer
 #pragma once
@@ -224,6 +228,7 @@ class RemoteStream : private OwnerConnection::Observer, protected channel::Chann
   void stop(const Error& why, bool removed);
   void send(const net::Frame& frame) override { connection_.frames()->send(frame); }
   Result<void> on_ended(const Error& why) override;
+  Result<void> on_other_frame(net::Frame& frame) override;
 
   // --- programs that wait
 

@@ -45,6 +45,7 @@ void RemoteWriter::open_at_owner() {
 
 Result<void> RemoteWriter::on_opened(StreamInfo theirs, bool created) {
   if (Result<void> followed = follow(theirs); !followed) {
+    fail_pending(followed.error());  // its samples could not be published
     stop(followed.error(), is_removed_);
     return {};
   }

@@ -48,7 +48,6 @@ class RemoteWriter final : public RemoteStream,
   Result<void> on_opened(StreamInfo stream, bool created) override;
   Result<void> on_published_untrusted(std::int64_t last, Tid last_tid, bool begins) override;
   Result<void> on_refused(channel::ChannelClient::Request request, const Error& why) override;
-  Result<void> on_other_frame(net::Frame&) override { return {}; }
   // StreamFeed::Observer, SamplePump::Observer
   void on_sample_available() override { publish(); }
   void on_gap(Tid, std::uint64_t count) override { log_gap(count); }

@@ -559,6 +559,26 @@ TEST(PConnectorSubscription, ReportsWhyItIsRefused) {
       << "the connection is still good";
 }
 
+// Else no request would get through any more, or a late answer would begin a subscription.
+TEST(PConnectorSubscription, OneThatIsNotAnsweredEndsTheConnection) {
+  const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
+    peer.answer_open(8);
+    while (const auto request = peer.try_receive()) {
+      if (request->has_read()) send_sample(peer, 5, text_of(5), request->serial());
+    }
+  });
+  auto con = open_impatient(daemon, 200ms);
+  const auto refused = con.subscribe({});
+  ASSERT_FALSE(refused);
+  expect_words(refused.error(), Errc::unavailable, {"lidar"});
+  TakenSample sample;
+  await([&] {
+    const auto status = con.read_newest(sample.span(), sample.info);
+    return status && *status == ReadStatus::ok;
+  });
+  EXPECT_EQ(sample.info.tid, 5);
+}
+
 TEST(PConnectorSubscription, WaitEndsAtItsDeadlineAndAtASignal) {
   const ScriptedDaemon daemon([](NetworkPeer& peer, int) {
     peer.answer_open(8);
@@ -787,6 +807,43 @@ TEST(PConnectorPublishing, WritesEachSampleOnceOverBrokenConnections) {
   for (std::int64_t i = 0; i <= 500; ++i) {
     EXPECT_EQ(owner.written[static_cast<std::size_t>(i)], text_of(i));
   }
+}
+
+TEST(PConnectorPublishing, BeginsWhileASubscriptionIsBeingResumed) {
+  Owner owner;  // of the daemon's thread until the connector is gone
+  std::atomic<bool> asked = false;
+  {
+    const ScriptedDaemon daemon([&](NetworkPeer& peer, int number) {
+      peer.answer_open(8);
+      if (number == 0) {
+        peer.answer_subscribe(0);
+        return;
+      }
+      const net::Frame subscribe = peer.receive();
+      asked = true;
+      while (const auto frame = peer.try_receive()) {
+        if (frame->has_start_publishing()) {
+          owner.answer_start(peer, *frame);
+          net::Frame answer = answer_to(subscribe);
+          answer.mutable_subscribed()->set_incarnation(1);
+          peer.send(answer);
+        } else {
+          owner.take(*frame);
+          owner.acknowledge(peer);
+        }
+      }
+    });
+    auto con = open(daemon).value();
+    ASSERT_TRUE(con.subscribe({}));
+    TakenSample sample;
+    await([&] {
+      static_cast<void>(con.read_next(sample.span(), sample.info));
+      return asked.load();
+    });
+    ASSERT_TRUE(con.post(to_bytes(text_of(0))));
+    ASSERT_TRUE(con.flush(kNever));
+  }
+  EXPECT_EQ(owner.written, std::vector<std::string>{text_of(0)});
 }
 
 TEST(PConnectorPublishing, SendsNothingTwiceOnOneConnection) {

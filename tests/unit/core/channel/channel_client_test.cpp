@@ -230,6 +230,8 @@ TEST_F(ChannelClientTest, RefusesAnInvalidDescription) {
   expect_refused([&] { theirs.id.name = "odometry"; });
   expect_refused([&] { theirs.id.id = 3; });
   expect_refused([&] { theirs.id.host = "pc3"; });
+  expect_refused([&] { theirs.id.name = ""; });
+  expect_refused([&] { theirs.type.payload_bytes = 0; });
   expect_refused([&] { theirs.depth = 1; });
   expect_refused([&] { theirs.depth = kMaxDepth + 1; });
   expect_refused([&] { theirs.cycle = 0ns; });
@@ -255,6 +257,18 @@ TEST_F(ChannelClientTest, IgnoresTheEventsOfASubscriptionThatIsBeingReplaced) {
   ASSERT_TRUE(receive(caught_up_frame()));
   EXPECT_TRUE(gaps.empty());
   EXPECT_EQ(caught_up, 0);
+}
+
+TEST_F(ChannelClientTest, KeepsASubscriptionWhenTheNextOneIsRefused) {
+  ASSERT_TRUE(answer_open());
+  ASSERT_TRUE(answer_subscribe());
+  client.subscribe({});
+  client.subscribe({});
+  sent.pop_front();
+  ASSERT_TRUE(receive(failure(take().serial(), Errc::invalid_argument)));
+  EXPECT_EQ(client.reading(), ChannelClient::Reading::filling);
+  ASSERT_TRUE(receive(gap()));
+  EXPECT_EQ(gaps.size(), 1u);
 }
 
 TEST_F(ChannelClientTest, StartsOverOnANewConnection) {

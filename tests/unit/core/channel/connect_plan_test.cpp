@@ -55,7 +55,7 @@ TEST(ConnectPlan, PausesTwiceAsLongAfterEachFailureUpToALimit) {
   }
   EXPECT_EQ(plan.end_round(MonoTime(), false), ConnectPlan::kMaxPause);
   EXPECT_EQ(plan.end_round(MonoTime(), false), ConnectPlan::kMaxPause);
-  plan.restart_pauses();
+  plan.reset_pause();
   EXPECT_EQ(plan.end_round(MonoTime(), false), ConnectPlan::kFirstPause);
 }
 
@@ -75,7 +75,7 @@ TEST(ConnectPlan, PausesShortlyOnlyAfterAConnectionThatWasUseful) {
   now += 1h;
   EXPECT_EQ(plan.end_round(now, false), 4 * ConnectPlan::kFirstPause) << "it was not up";
   plan.on_up(now);
-  plan.mark_useful();
+  plan.reset_pause();
   EXPECT_EQ(plan.end_round(now, false), ConnectPlan::kFirstPause);
 }
 

@@ -426,6 +426,9 @@ TEST_F(MirrorsTest, ClosesTheChannelOfAnOwnerThatBreaksTheProtocol) {
   expect_closed([&] { samples(5, 5); });                                    // a tid twice
   expect_closed([&] { owner->send(gap_frame(0, 3)); });                     // what is here
   expect_closed([&] { owner->send(opened_frame(net::Frame(), theirs)); });  // unasked
+  net::Frame another;
+  another.set_serial(77);
+  expect_closed([&] { owner->send(opened_frame(another, theirs)); });  // to no request
   expect_closed([&] { owner->send_sample({6, {}, {}}, Bytes(25)); });
 }
 
