@@ -13,7 +13,7 @@ namespace dssm::daemon {
 // --- the connection to the owner
 
 OwnerConnection::OwnerConnection(const ChannelParts& parts, const std::string& stream,
-                                 Observer& observer)
+                                 Dialer::Observer& observer)
     : parts_(parts),
       stream_(stream),
       observer_(observer),
@@ -57,8 +57,8 @@ void OwnerConnection::on_up(FrameConnection& connection, const wire::Greeting& t
 
 void OwnerConnection::on_down(const Error& why) {
   retry_timer_.disable();
-  if (std::exchange(reopening_, false)) return observer_.on_reopen();
   observer_.on_down(why);
+  reopening_ = false;
 }
 
 // --- the channel
@@ -70,6 +70,7 @@ void RemoteStream::end_channel() {
 
 void RemoteStream::on_down(const Error& why) {
   end_channel();
+  if (connection_.is_reopening()) return;
   last_error_ = why;
   if (!is_removed_) log_stopped();
 }

@@ -80,17 +80,8 @@ class OwnerConnection final : private Dialer::Observer {
   // Between two attempts to open a stream that was removed or refused.
   static constexpr Duration kRetryPause = std::chrono::seconds(2);
 
-  class Observer : public Dialer::Observer {
-   public:
-    // Instead of on_down(), when the connection ends because of reopen().
-    virtual void on_reopen() = 0;
-
-   protected:
-    ~Observer() = default;
-  };
-
   // stream: its name, for messages. All outlive it.
-  OwnerConnection(const ChannelParts& parts, const std::string& stream, Observer& observer);
+  OwnerConnection(const ChannelParts& parts, const std::string& stream, Dialer::Observer& observer);
   OwnerConnection(const OwnerConnection&) = delete;
   OwnerConnection& operator=(const OwnerConnection&) = delete;
 
@@ -108,6 +99,8 @@ class OwnerConnection final : private Dialer::Observer {
   // removed or refused. At once, or after kRetryPause.
   void reopen();
   void reopen_later() { retry_timer_.enable_in(kRetryPause); }
+  // In on_down(): the connection ends because of reopen().
+  bool is_reopening() const noexcept { return reopening_; }
 
  private:
   void on_up(FrameConnection& connection, const wire::Greeting& them) override;
@@ -117,7 +110,7 @@ class OwnerConnection final : private Dialer::Observer {
 
   const ChannelParts& parts_;
   const std::string& stream_;
-  Observer& observer_;
+  Dialer::Observer& observer_;
   std::optional<wire::HostId> owner_;
   wire::Address address_;
   bool reopening_ = false;  // the connection is about to end because of reopen()
@@ -151,7 +144,7 @@ class UseCount {
   std::shared_ptr<State> state_;
 };
 
-class RemoteStream : private OwnerConnection::Observer, protected channel::ChannelClient::Delegate {
+class RemoteStream : private Dialer::Observer, protected channel::ChannelClient::Delegate {
  public:
   // How long a program's open() waits for the owner to answer.
   static constexpr Duration kOwnerTimeout = std::chrono::seconds(2);
@@ -258,11 +251,10 @@ class RemoteStream : private OwnerConnection::Observer, protected channel::Chann
   channel::ChannelClient channel_{*this};
 
  private:
-  // OwnerConnection::Observer
+  // Dialer::Observer, of connection_
   void on_up(FrameConnection&, const wire::Greeting& them) override { on_connected(them); }
   Result<void> on_frame(net::Frame& frame) override { return channel_.on_frame(frame); }
   void on_down(const Error& why) override;
-  void on_reopen() override { end_channel(); }
 
   struct PendingOpen {
     Then then;
