@@ -46,7 +46,7 @@ std::string rename_command(const std::string& where) {
 Finding no_permission(const Facts& facts) {
   const SocketFacts& socket = facts.socket;
   const std::string group = socket.group.empty() ? kDefaultGroup : socket.group;
-  const auto found = [&](std::string cause, std::string command) {
+  const auto found = [&](const std::string& cause, const std::string& command) {
     return Finding{"daemon", Status::fail, facts.failed->message, cause, command};
   };
   if (socket.process_in_group) {
@@ -65,7 +65,7 @@ Finding no_permission(const Facts& facts) {
 
 Finding no_daemon(const Facts& facts) {
   const SocketFacts& socket = facts.socket;
-  const auto found = [&](std::string cause, std::string command) {
+  const auto found = [&](const std::string& cause, const std::string& command) {
     return Finding{"daemon", Status::fail, facts.failed->message, cause, command};
   };
   if (socket.kind == SocketFacts::Kind::something_else) {
@@ -308,7 +308,7 @@ Finding check_mdns(const Facts& facts) {
 Finding host_down(const HostInfo& host) {
   const std::string where =
       host.addresses.empty() ? host.name : without_port(host.addresses.front());
-  const auto found = [&](std::string cause, std::string command) {
+  const auto found = [&](const std::string& cause, const std::string& command) {
     return Finding{"host " + name_of(host), Status::fail, "down: " + host.error, cause, command};
   };
   switch (host.reason) {
@@ -330,7 +330,7 @@ Finding host_down(const HostInfo& host) {
 }
 
 Finding host_refused(const HostInfo& host) {
-  const auto found = [&](std::string cause, std::string command) {
+  const auto found = [&](const std::string& cause, const std::string& command) {
     return Finding{"host " + name_of(host), Status::fail, "refused: " + host.error, cause, command};
   };
   switch (host.reason) {

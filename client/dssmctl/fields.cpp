@@ -129,6 +129,7 @@ Result<std::vector<Field>> select_fields(std::vector<Field> fields,
           fmt::format("no field '{}': this stream's type does not describe its fields", name)};
     }
     std::vector<std::string_view> known;
+    known.reserve(fields.size());
     for (const Field& field : fields) known.push_back(field.name);
     return Error{Errc::invalid_argument,
                  fmt::format("no field '{}'; there are '{}'", name, fmt::join(known, "', '"))};

@@ -71,7 +71,7 @@ std::string list_text(const std::vector<std::string>& texts) {
   return out;
 }
 
-std::string or_dash(std::string text) { return text.empty() ? "-" : text; }
+std::string or_dash(const std::string& text) { return text.empty() ? "-" : text; }
 
 std::string duration_text(Duration d) {
   const std::int64_t ns = to_ns(d);

@@ -27,7 +27,7 @@ std::string escaped_message(std::string_view message);
 std::string list_text(const std::vector<std::string>& texts);
 
 // `text`, or "-" when it is empty.
-std::string or_dash(std::string text);
+std::string or_dash(const std::string& text);
 
 // A duration with three digits and its unit: "1.25 ms", "2h05m". For people only.
 std::string duration_text(Duration d);

@@ -193,8 +193,8 @@ void dssm_ssm_remote_receive_broadcast(dssm_ssm_remote* remote,
                                        void (*take)(const char* address, const char* port,
                                                     const void* data, size_t size, void* user_data),
                                        void* user_data) {
-  auto local = remote->broadcast.connect();
-  auto hosts = local ? (*local)->list_hosts() : std::move(local).error();
+  const auto local = remote->broadcast.connect();
+  const auto hosts = local ? (*local)->list_hosts() : local.error();
   if (!hosts) return report_failure("receiveBroadcast", hosts.error());
   for (const dssm::HostInfo& host : *hosts) {
     if (host.state != dssm::HostState::self && host.state != dssm::HostState::up) continue;
