@@ -32,8 +32,8 @@ namespace {
 // Rounded as gettimeSSM_real() rounds it: or a clock that was set to a time could show, right after
 // that, one that is a step of the number's resolution (0.24 us) earlier.
 double real_now_s() noexcept {
-  const std::int64_t ns = to_ns(WallClock::now());
-  return static_cast<double>(ns / 1'000'000'000) + static_cast<double>(ns % 1'000'000'000) * 1e-9;
+  const std::int64_t ns = to_ns(WallClock::now()), seconds = ns / 1'000'000'000;
+  return static_cast<double>(seconds) + static_cast<double>(ns - seconds * 1'000'000'000) * 1e-9;
 }
 
 // The same setting with another rate, so that the clock reads the same now.
