@@ -104,7 +104,9 @@ TEST(OpensAndCloses, TenThousandOfThemLeakNothing) {
     ASSERT_TRUE(client.ask(close).response.has_done());
   }
   EXPECT_EQ(client.ask(list_opens_request()).response.open_list().opens_size(), 1);
-  EXPECT_LE(open_descriptors(daemon.pid()), descriptors);
+  // dssmd has one open for a moment now and then, such as to ask chronyd.
+  EXPECT_TRUE(eventually([&] { return open_descriptors(daemon.pid()) <= descriptors; }))
+      << open_descriptors(daemon.pid()) << " descriptors instead of " << descriptors;
 }
 
 }  // namespace
