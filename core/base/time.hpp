@@ -18,6 +18,13 @@ constexpr timespec timespec_of(MonoTime time) noexcept {
   return timespec_of(time.time_since_epoch());
 }
 
+// CLOCK_MONOTONIC_RAW: what the PC's oscillator counts. No program sets or slews it; it stands still
+// while the PC sleeps. Nanoseconds by the oscillator's own speed.
+using RawClock = detail::PosixClock<CLOCK_MONOTONIC_RAW, true>;
+using RawTime = RawClock::time_point;
+
+constexpr std::int64_t to_ns(RawTime t) noexcept { return t.time_since_epoch().count(); }
+
 // The monotonic clock at the kernel's last tick, some milliseconds ago at most, for a fifth of the
 // cost of MonoClock::now(): only the kernel's page of times is read. Thread-safe.
 inline MonoTime coarse_now() noexcept {

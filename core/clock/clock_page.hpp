@@ -31,7 +31,9 @@ namespace dssm::clock {
 //   112   24 base_mono, _wall, _width  ns  both clocks at an instant since which the clock was not
 //                                          set: the next dssmd detects a step by them
 //   136   64 reference                     the host or address that this clock follows
-//   200   56 reserved                      zero
+//   200    8 setting_from           ns     CLOCK_REALTIME; times from here on are of the clock as it
+//                                          is set now
+//   208   48 reserved                      zero
 struct ClockPageState {
   static constexpr std::size_t kStampBytes = 64;
   static constexpr std::size_t kEarlierBytes = 24;
@@ -47,18 +49,20 @@ struct ClockPageState {
   Time base_wall{};
   Duration base_width{};
   char reference[kMaxReferenceBytes + 1] = {};  // zero-terminated
-  std::byte reserved[56] = {};
+  Time setting_from{};
+  std::byte reserved[48] = {};
 };
 static_assert(offsetof(ClockPageState, mono) == 32 && offsetof(ClockPageState, clock) == 40);
 static_assert(offsetof(ClockSnapshot, stratum) + 4 == ClockPageState::kStampBytes - 40);
 static_assert(offsetof(ClockSnapshot, root_bound) == 24 && sizeof(ClockSnapshot) == 72);
 static_assert(offsetof(ClockPageState, base_mono) == 112);
-static_assert(offsetof(ClockPageState, reference) == 136 && sizeof(ClockPageState) == 256);
+static_assert(offsetof(ClockPageState, reference) == 136 &&
+              offsetof(ClockPageState, setting_from) == 200 && sizeof(ClockPageState) == 256);
 
 // One page, little endian.
 struct ClockPage {
   static constexpr std::uint64_t kMagic = 0x4b434c434d535344;  // "DSSMCLCK"
-  static constexpr std::uint32_t kLayoutVersion = 2;
+  static constexpr std::uint32_t kLayoutVersion = 3;
 
   std::uint64_t magic;
   std::uint32_t layout_version;

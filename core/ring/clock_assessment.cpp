@@ -6,13 +6,23 @@
 #include "core/base/time.hpp"
 
 namespace dssm::ring {
+namespace {
+
+// What `bound` has become at an age of at most kValidFor, so that nothing overflows; rounded up.
+Duration grown(Duration bound, Duration age, std::uint32_t ppb) noexcept {
+  const std::int64_t ns = std::max<std::int64_t>(to_ns(age), 0);
+  const std::int64_t per_billion = std::min<std::int64_t>(ppb, ClockAssessment::kMaxAgeingPpb);
+  return sum(bound, Duration((ns * per_billion + 999'999'999) / 1'000'000'000));
+}
+
+}  // namespace
 
 ClockAssessment ClockAssessment::unknown_clock(ClockPolicy policy) noexcept {
   ClockAssessment unknown;
   unknown.policy = policy;
   unknown.same_clock = 0;
   unknown.added = kUnknownClockError;
-  unknown.limit = Duration(-1);
+  unknown.limit = {};
   return unknown;
 }
 
@@ -20,26 +30,30 @@ bool ClockAssessment::is_suspect(const SampleInfo& info) const noexcept {
   return info.tid >= suspect_first && info.tid <= suspect_last;
 }
 
-bool ClockAssessment::is_trusted(const SampleInfo& info, MonoTime now) const noexcept {
-  return !is_suspect(info) && assessed >= now - kValidFor;
-}
-
-// Only of one that is_trusted(), so that nothing overflows; rounded up.
-Duration ClockAssessment::grown_by(MonoTime now) const noexcept {
-  const std::int64_t age = std::max<std::int64_t>(to_ns(now - assessed), 0);
-  return Duration((age * ageing_ppb + 999'999'999) / 1'000'000'000);
-}
-
 Duration ClockAssessment::distance(const SampleInfo& info, MonoTime now) const noexcept {
   if (same_clock) return {};
-  if (!is_trusted(info, now) || info.clock_error == kForeignClockError) return kUnknownClockError;
-  return sum(info.clock_error, sum(added, grown_by(now)));
+  if (assessed < now - kValidFor || info.clock_error == kForeignClockError) {
+    return kUnknownClockError;
+  }
+  const Duration age = now - assessed;
+  Duration distance = kUnknownClockError;
+  if (!is_suspect(info)) distance = sum(info.clock_error, grown(added, age, ageing_ppb));
+  if (info.time >= measured_from) {
+    distance = std::min(distance, grown(measured, age, measured_ageing_ppb));
+  }
+  return distance;
 }
 
 bool ClockAssessment::is_good(const SampleInfo& info, MonoTime now) const noexcept {
   if (same_clock || policy == ClockPolicy::off) return true;
   if (info.clock_error == kForeignClockError) return !is_suspect(info);
-  return is_trusted(info, now) && sum(info.clock_error, grown_by(now)) <= limit;
+  const Duration found = distance(info, now);
+  return found != kUnknownClockError && found <= limit;
+}
+
+bool ClockAssessment::can_be_good() const noexcept {
+  const Duration least = std::min(added, measured);
+  return least != kUnknownClockError && least <= limit;
 }
 
 }  // namespace dssm::ring

@@ -14,6 +14,7 @@ constexpr std::size_t kMaxBootIdBytes = 64;
 constexpr std::size_t kMaxReferenceBytes = 63;
 constexpr std::int64_t kMaxAgeing = 10'000'000;  // a clock that loses a percent
 constexpr std::uint32_t kMaxStratum = 16;
+constexpr std::int64_t kMaxTimeNs = std::int64_t{1} << 62;  // sums and differences do not overflow
 
 Duration error_untrusted(std::int64_t ns) noexcept {
   return ns < 0 ? kUnknownClockError : Duration(ns);
@@ -67,6 +68,19 @@ void take_bounds_untrusted(const proto::ClockReport& message, ClockReport& out) 
   out.bound_is_root = message.bound_is_root();
 }
 
+bool is_time(std::int64_t ns) noexcept { return ns > 0 && ns < kMaxTimeNs; }
+
+void take_line_untrusted(const proto::ClockLine& message, ClockReport& out) {
+  const std::int64_t rate = message.rate_ppb();
+  if (!is_time(message.raw_ns()) || !is_time(message.wall_ns()) || message.setting() == 0 ||
+      rate < -clock::ClockLine::kMaxRate || rate > clock::ClockLine::kMaxRate) {
+    return;
+  }
+  out.line = {RawTime(Duration(message.raw_ns())), time_from_ns(message.wall_ns()), rate};
+  out.setting = message.setting();
+  out.setting_from = time_from_ns(message.setting_from_ns());
+}
+
 }  // namespace
 
 Duration ClockReport::distance_from(const HostId& host) const noexcept {
@@ -111,6 +125,14 @@ void to_message(const ClockReport& report, proto::ClockReport& out) {
   for (const IpAddress& address : report.addresses) {
     out.add_addresses(address.bytes.data(), address.bytes.size());
   }
+  if (report.line.exists()) {
+    proto::ClockLine& line = *out.mutable_line();
+    line.set_raw_ns(to_ns(report.line.raw));
+    line.set_wall_ns(to_ns(report.line.wall));
+    line.set_rate_ppb(report.line.rate);
+    line.set_setting(report.setting);
+    line.set_setting_from_ns(to_ns(report.setting_from));
+  }
   out.set_root_dispersion_ns(to_ns(clock.root.dispersion));
   out.set_root_delay_ns(to_ns(clock.root.delay));
 }
@@ -120,6 +142,7 @@ ClockReport clock_report_untrusted(const proto::ClockReport& message, MonoTime a
   report.as_of = as_of;
   report.clock = snapshot_untrusted(message);
   take_bounds_untrusted(message, report);
+  if (message.has_line()) take_line_untrusted(message.line(), report);
   if (message.boot_id().size() <= kMaxBootIdBytes) report.boot_id = message.boot_id();
   if (message.reference().size() <= kMaxReferenceBytes && is_printable_ascii(message.reference())) {
     report.reference = message.reference();

@@ -9,10 +9,12 @@
 #include <cstdint>
 #include <dssm/clock_status.hpp>
 #include <dssm/time.hpp>
+#include <optional>
 #include <string>
 #include <vector>
 
 #include "common.pb.h"
+#include "core/clock/clock_line.hpp"
 #include "core/wire/address.hpp"
 
 namespace dssm::wire {
@@ -38,10 +40,15 @@ struct ClockReport {
   HostId anchor{};               // the link of the chain against which samples are stamped
   bool bound_is_root = false;    // clock.bound is clock.root_bound: it follows no host
   bool root_is_utc = false;      // false: the root of its time is a PC that follows no other
-  std::string reference;         // the host or address that it follows, for people
+  // How far two clocks are apart is also measured (docs/clocks.md "Measured between two PCs"):
+  clock::ClockLine line;     // what the clock shows at each moment, until another line is reported
+  std::int64_t setting = 0;  // changes when the clock is set; 0: not known
+  Time setting_from{};       // times from here on are of this setting
+  std::string reference;     // the host or address that it follows, for people
   std::vector<IpAddress>
       addresses;     // its own: others recognize the host that their chronyd follows
   MonoTime as_of{};  // when this was so, by CLOCK_MONOTONIC of this PC
+  std::optional<clock::HeartbeatTimes> heartbeat;  // that this report answered; not sent
 
   bool has_bound() const noexcept { return clock.bound != kUnknownClockError; }
   // Whether both have the same kernel, and so the same clock.

@@ -29,6 +29,10 @@ void ChronydClient::poll_if_due() {
   if (awake_ - asked_ >= period_ - slack_) next_question();
 }
 
+void ChronydClient::poll_now() {
+  if (!question_ && loop_.now() - asked_ >= kMinPause) next_question();
+}
+
 void ChronydClient::next_question() {
   asked_ = loop_.now();
   // Where poll_if_due() is called regularly, the timer expires only after its next call. A call

@@ -53,6 +53,10 @@ class ChronydClient {
   // called once a period, the timer does not wake the process.
   void poll_if_due();
 
+  // Something has changed: asks now, unless it did within kMinPause.
+  static constexpr Duration kMinPause = std::chrono::milliseconds(50);
+  void poll_now();
+
  private:
   struct Question {
     std::uint32_t sequence = 0;

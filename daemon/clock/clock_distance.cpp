@@ -2,6 +2,7 @@
 #include "daemon/clock/clock_distance.hpp"
 
 #include <algorithm>
+#include <cstdlib>
 
 #include "core/base/time.hpp"
 
@@ -26,6 +27,20 @@ Duration distance_from_anchor(const wire::ClockReport& writer,
   const Duration by_writer = sum(writer.distance_from(writer.anchor), distance(writer, reader));
   const bool by_root = writer.bound_is_root && writer.root_is_utc && reader.root_is_utc;
   return std::min({by_anchor, by_writer, by_root ? reader.clock.root_bound : kUnknownClockError});
+}
+
+std::optional<WallDifference> wall_difference(const PairMeasurement::Difference& raws,
+                                              const ClockLine& theirs, const ClockLine& ours,
+                                              const Instant& now) noexcept {
+  const std::optional<Time> least = theirs.at(now.raw + raws.least);
+  const std::optional<Time> greatest = theirs.at(now.raw + raws.greatest);
+  if (!least || !greatest || !ours.exists()) return std::nullopt;
+  const Duration blur = ClockLine::kTolerance + now.width;
+  // The rates of the lines differ by what the daemons of the clocks correct and slew.
+  const PartsPerBillion corrected = theirs.rate - ours.rate;
+  return WallDifference{
+      *least - now.wall - blur, *greatest - now.wall + blur,
+      std::max(std::abs(corrected + raws.slowest), std::abs(corrected + raws.fastest))};
 }
 
 }  // namespace dssm::clock

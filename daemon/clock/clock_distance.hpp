@@ -1,16 +1,18 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// How far the clocks of two hosts may be apart. Each statement about such a pair is a bound that
-// holds by itself, so the least of several statements counts. There is one source of statements:
-// the reports of both hosts, whose sync chains meet in a clock or in UTC. Another source, such as a
-// measurement between the two, would be combined with it here and nowhere else: FleetClock calls
-// these two functions for every assessment and for the distance that programs are shown.
-// docs/clocks.md "Between two PCs" derives them.
+// How far the clocks of two hosts may be apart. There are two sources of statements, and each is a
+// bound that holds by itself: the reports of both hosts, whose sync chains meet in a clock or in
+// UTC, and a measurement between the two. FleetClock combines them. docs/clocks.md "Between two
+// PCs" and "Measured between two PCs" derive them.
 #pragma once
 
+#include <algorithm>
 #include <dssm/time.hpp>
+#include <optional>
 
 #include "core/wire/clock_report.hpp"
+#include "daemon/clock/clock_estimator.hpp"
+#include "daemon/clock/pair_measurement.hpp"
 
 namespace dssm::clock {
 
@@ -24,5 +26,20 @@ Duration distance(const wire::ClockReport& one, const wire::ClockReport& other) 
 // Not for clocks that are shared: those have no distance, whatever the clock error.
 Duration distance_from_anchor(const wire::ClockReport& writer,
                               const wire::ClockReport& reader) noexcept;
+
+// What was measured: their wall clock minus this one.
+struct WallDifference {
+  Duration least{}, greatest{};
+  PartsPerBillion ageing = 0;  // by so much may each of the two grow
+
+  Duration bound() const noexcept { return std::max({-least, greatest, Duration::zero()}); }
+  // Whether the clocks cannot be as close as `chain` states.
+  bool excludes(Duration chain) const noexcept { return least > chain || -greatest > chain; }
+};
+
+// `raws` is the measured difference of the RawClocks at `now`. nullopt: a line is missing or old.
+std::optional<WallDifference> wall_difference(const PairMeasurement::Difference& raws,
+                                              const ClockLine& theirs, const ClockLine& ours,
+                                              const Instant& now) noexcept;
 
 }  // namespace dssm::clock

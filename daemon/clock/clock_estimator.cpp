@@ -41,9 +41,10 @@ Instant Instant::now() noexcept {
   best.width = Duration::max();
   for (int i = 0; i < kTries && best.width > kCloseEnough; ++i) {
     const MonoTime before = MonoClock::now();
+    const RawTime raw = RawClock::now();
     const Time wall = WallClock::now();
     const Duration width = MonoClock::now() - before;
-    if (width < best.width) best = {before, wall, width};
+    if (width < best.width) best = {before, wall, width, raw};
   }
   return best;
 }
@@ -61,11 +62,18 @@ std::optional<Duration> ClockEstimator::observe(const Instant& now) noexcept {
   if (size <= kMinStep + blur) return {};
   if (!stepped_) before_step_ = base_;
   noise_ = now.width;
+  setting_from_ = std::max({setting_from_, now.wall, now.wall - step});
   base_ = now;
   stepped_ = true;
   updates_ = 0;
   if (has_answered_) forget(ClockReason::stepped);
   return step;
+}
+
+void ClockEstimator::on_source_step() noexcept {
+  source_stepped_ = true;
+  updates_ = 0;
+  if (has_answered_) forget(ClockReason::stepped);
 }
 
 bool ClockEstimator::is_nonsense(const Tracking& tracking, const Instant& answered) const noexcept {
@@ -108,13 +116,13 @@ ClockEstimator::Outcome ClockEstimator::take_untrusted(const Tracking& tracking,
   const bool is_new = local || tracking.updated > last_update_ + kSameUpdate ||
                       tracking.updated < last_update_ - kSameUpdate;
   last_update_ = tracking.updated;
-  if (stepped_) {
+  if (stepped_ || source_stepped_) {
     if (is_new) ++updates_;
     if (updates_ < kUpdatesAfterStep) {
       forget(ClockReason::stepped);
       return Outcome::stepped;
     }
-    stepped_ = false;
+    stepped_ = source_stepped_ = false;
   }
   reading_ = {tracking, asked, updated};
   reason_ = ClockReason::none;

@@ -20,13 +20,14 @@ namespace dssm::clock {
 // in chrony.conf).
 inline constexpr std::uint32_t kLocalReferenceId = 0x7f7f0101;
 
-// Both clocks at one instant.
+// The clocks at one instant.
 struct Instant {
   MonoTime mono;
   Time wall;
-  Duration width{};  // the two were read within this
+  Duration width{};  // all were read within this
+  RawTime raw{};
 
-  // Reads both, several times until they are close together.
+  // Reads all, several times until they are close together.
   static Instant now() noexcept;
 };
 
@@ -76,13 +77,24 @@ class ClockEstimator {
   void set(const Settings& settings) noexcept { settings_ = settings; }
   const Settings& settings() const noexcept { return settings_; }
 
-  // Continues an estimator of the same boot, whose base() this was: a step between then and now
-  // counts as one that was observed. Before the first observe().
-  void resume(const Instant& base) noexcept { base_ = base; }
+  // Continues an estimator of the same boot, whose base() and setting_from() these were: a step
+  // between then and now counts as one that was observed. Before the first observe().
+  void resume(const Instant& base, Time setting_from) noexcept {
+    base_ = base;
+    setting_from_ = setting_from;
+  }
   // An instant since which the clock has not been set; as long as chronyd has not measured enough
   // after a step, one before it, so that an estimator that resumes from it observes the step too.
   // nullopt: before the first observe().
   const std::optional<Instant>& base() const noexcept { return stepped_ ? before_step_ : base_; }
+
+  // Changes with each step; 0 before the first observe().
+  std::int64_t setting() const noexcept {
+    return base_ ? to_ns(base_->mono.time_since_epoch()) : 0;
+  }
+  // Times by this clock from here on are of the present setting: none before the last step was as
+  // late. 1970 when no step was observed.
+  Time setting_from() const noexcept { return setting_from_; }
 
   // Compares the clocks; called first at each instant.
   //   returns  how far the wall clock was set since the last time, if it was: there is no bound
@@ -100,6 +112,10 @@ class ClockEstimator {
   // Each report of the reference PC; nullopt: it is not known any more, or it is this PC. While
   // there is one, a chronyd here in `local` mode is not right by definition.
   void on_reference(const std::optional<ReferenceReport>& report, MonoTime now) noexcept;
+
+  // The clock that chronyd follows was set: as after a step of this one, there is no bound until
+  // chronyd has measured kUpdatesAfterStep times.
+  void on_source_step() noexcept;
 
   // The clock at `now`, after observe(now). `bound` is its distance from the source that chronyd
   // follows.
@@ -135,10 +151,12 @@ class ClockEstimator {
   Settings settings_;
   std::optional<Instant> base_;         // since the last step
   std::optional<Instant> before_step_;  // of the first step that chronyd has not measured yet
+  Time setting_from_{};
   std::optional<Reading> reading_;
   std::optional<Reference> reference_;
   Duration noise_{};                        // how far the clock may have been set without a step
   bool stepped_ = false;                    // and not measured kUpdatesAfterStep times since
+  bool source_stepped_ = false;             // likewise
   Time last_update_;                        // chronyd's last measurement, by its own time
   int updates_ = 0;                         // after the step
   MonoTime answered_;                       // the question of the last answer was sent

@@ -85,6 +85,18 @@ void ClockWatch::on_reference(const std::optional<clock::ReferenceReport>& repor
   estimator_.on_reference(report, now_().mono);
 }
 
+void ClockWatch::on_source_step(const std::string& name) {
+  estimator_.on_source_step();
+  const auto steps = step_lines_.admit(now_().mono);
+  if (!steps) return;
+  logger_.warning(
+      fmt::format("the clock of '{}', which this PC's chronyd follows, was set{}; what chronyd "
+                  "states is not used until it has measured that clock {} times again",
+                  name, left_out_text(*steps - 1, "steps"),
+                  clock::ClockEstimator::kUpdatesAfterStep),
+      {.peer = name, .message_id = message_id::kClockStepped});
+}
+
 void ClockWatch::on_answer(const TrackingReply& reply, MonoTime asked, const Instant& answered) {
   observe(answered);
   if (estimator_.take_untrusted(reply.tracking, asked, answered) ==

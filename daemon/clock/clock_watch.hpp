@@ -46,11 +46,16 @@ class ClockWatch final : private ChronydClient::Observer {
   ClockWatch(const ClockWatch&) = delete;
   ClockWatch& operator=(const ClockWatch&) = delete;
 
-  // Continues for an earlier dssmd of this boot, whose base() this was: the clock counts as stepped
-  // when it was set in between. Called first.
-  void resume(const clock::Instant& base) noexcept { estimator_.resume(base); }
+  // Continues for an earlier dssmd of this boot, whose base() and setting_from() these were: the
+  // clock counts as stepped when it was set in between. Called first.
+  void resume(const clock::Instant& base, Time setting_from) noexcept {
+    estimator_.resume(base, setting_from);
+  }
   // An instant after the last step, or, until chronyd has measured enough after it, one before it.
   clock::Instant base();
+  // As in ClockEstimator.
+  std::int64_t setting() const noexcept { return estimator_.setting(); }
+  Time setting_from() const noexcept { return estimator_.setting_from(); }
 
   ClockSnapshot state();  // at this moment; `bound` is the distance from the source
   Duration own_bound() const noexcept { return estimator_.own_bound(); }
@@ -64,12 +69,16 @@ class ClockWatch final : private ChronydClient::Observer {
 
   // dssmd is awake: a question to chronyd that is about due is sent now.
   void poll_if_due() { client_.poll_if_due(); }
+  // Someone slews the clock anew, probably chronyd, which may have measured since it was asked.
+  void poll_now() { client_.poll_now(); }
 
   // The host that chronyd follows, by its last answer.
   std::optional<wire::IpAddress> source() const noexcept;
 
   void set(const clock::ClockEstimator::Settings& settings) noexcept { estimator_.set(settings); }
   void on_reference(const std::optional<clock::ReferenceReport>& report) noexcept;
+  // The clock of the host `name`, which chronyd follows, was set.
+  void on_source_step(const std::string& name);
 
  private:
   // What the log distinguishes.

@@ -17,12 +17,16 @@
 
 #include "core/base/time.hpp"
 #include "core/clock/clock_bound.hpp"
-#include "daemon/clock/clock_distance.hpp"
 
 namespace dssm::daemon {
 namespace {
 
 constexpr Duration kAddressesPeriod = std::chrono::seconds(5);
+
+// What others are promised is ClockLine::kTolerance; the rest is for reading two clocks.
+constexpr Duration kLineTolerance = clock::ClockLine::kTolerance - std::chrono::microseconds(2);
+// A line is replaced before it is too old for others.
+constexpr Duration kLineAge = clock::ClockLine::kMaxAge / 4;
 
 std::string in_microseconds(Duration d) {
   return d == kUnknownClockError ? "unknown" : fmt::format("{} us", (to_ns(d) + 999) / 1000);
@@ -46,6 +50,11 @@ std::vector<wire::IpAddress> own_addresses() {
   return addresses;
 }
 
+std::uint32_t ppb(clock::PartsPerBillion ageing) noexcept {
+  return static_cast<std::uint32_t>(
+      std::clamp<clock::PartsPerBillion>(ageing, 0, ring::ClockAssessment::kMaxAgeingPpb));
+}
+
 bool is_good(ClockStatus status) noexcept {
   return status == ClockStatus::synchronized || status == ClockStatus::holdover;
 }
@@ -53,7 +62,8 @@ bool is_good(ClockStatus status) noexcept {
 // Whether other hosts have to know of the change before they get another sample.
 bool is_new_generation(const wire::ClockReport& before, const wire::ClockReport& after) {
   return before.clock.status != after.clock.status || before.has_bound() != after.has_bound() ||
-         before.anchor != after.anchor;
+         before.anchor != after.anchor || before.line != after.line ||
+         before.setting != after.setting;
 }
 
 }  // namespace
@@ -73,8 +83,7 @@ FleetClock::FleetClock(const EventLoop& loop, const Options& options, clock::Clo
   if (page_.has_history()) {
     clock::ClockPageState before;
     page_.page().state.load(before);
-    watch_.resume({before.base_mono, before.base_wall, before.base_width});
-    was_in_bounds_ = is_good(before.clock.status);
+    watch_.resume({before.base_mono, before.base_wall, before.base_width, {}}, before.setting_from);
   }
   catalog_.add_observer(*this);
 }
@@ -90,6 +99,10 @@ void FleetClock::set(const ClockPolicies& policies, clock::PartsPerBillion max_d
 void FleetClock::on_clock() { refresh(); }
 
 void FleetClock::on_host_clock(const KnownHost& host) {
+  if (host.greeting.clock) {
+    clock_generation();  // first: whether this clock was set since the heartbeat was sent
+    measure(*host.greeting.clock, clock::Instant::now());
+  }
   // The reports of others are used at the latest with the next answer of chronyd.
   if (source_ && host.greeting.host_id == source_->id) refresh();
   poll_if_due();
@@ -101,10 +114,18 @@ void FleetClock::on_host_down(const KnownHost& host, const Error&) {
 }
 
 [[gnu::hot]] std::uint64_t FleetClock::clock_generation() {
-  if (!watch_.may_differ()) return generation_;
+  const bool is_on_line = holds_line();
+  if (!watch_.may_differ() && is_on_line) return generation_;
   const bool has_bound = watch_.state().bound != kUnknownClockError;
-  if (has_bound != own_->has_bound()) refresh();
+  if (has_bound != own_->has_bound() || !is_on_line) refresh();
   return generation_;
+}
+
+// Read in between two instructions: when this process lost its processor there, refresh() reads the
+// clocks again.
+[[gnu::hot]] bool FleetClock::holds_line() const noexcept {
+  const std::optional<Time> expected = own_->line.at(RawClock::now());
+  return expected && std::chrono::abs(WallClock::now() - *expected) <= kLineTolerance;
 }
 
 // --- this host's report
@@ -117,9 +138,9 @@ void FleetClock::refresh() {
   update_addresses(now);
   update_chain(now);
   update_status();
+  update_line(instant);
   publish(instant);
   log_others(now);
-  was_in_bounds_ |= is_good(own_->clock.status);
   if (is_new_generation(before, *own_)) {
     ++generation_;
     if (on_new_generation_) on_new_generation_();
@@ -146,6 +167,12 @@ void FleetClock::find_source(MonoTime now) {
   const std::vector<wire::IpAddress>& own = own_->addresses;
   const bool is_own = address && std::find(own.begin(), own.end(), *address) != own.end();
   if (host && !is_own) {
+    const std::int64_t setting = host->greeting.clock->setting;
+    const bool is_same = source_ && source_->id == host->greeting.host_id &&
+                         source_->report->boot_id == host->greeting.clock->boot_id;
+    if (is_same && source_->report->setting != 0 && setting != source_->report->setting) {
+      watch_.on_source_step(host->greeting.host);
+    }
     source_ = Source{host->greeting.host_id, host->greeting.host, host->greeting.clock, {}};
     watch_.on_reference(clock::ReferenceReport{watch_.reference_id(), source_->report->clock.root});
   } else if (!source_) {
@@ -253,6 +280,7 @@ void FleetClock::publish(const clock::Instant& now) {
   state.base_mono = base.mono;
   state.base_wall = base.wall;
   state.base_width = base.width;
+  state.setting_from = watch_.setting_from();
   state.earlier_from = now.wall;
   for (const Stated& stated : stated_) {
     state.earlier_from = std::min(state.earlier_from, stated.wall);
@@ -263,9 +291,37 @@ void FleetClock::publish(const clock::Instant& now) {
   page_.store(state);
 }
 
-// While this clock is not good, no other host's is good here; the log states that of this clock.
+// The line through the present reading, with the rate since the line before it began: after two or
+// three of them it has the rate that the clock has now.
+void FleetClock::update_line(const clock::Instant& now) {
+  wire::ClockReport& own = *own_;
+  own.setting_from = watch_.setting_from();
+  if (const std::int64_t setting = watch_.setting();
+      setting != std::exchange(own.setting, setting)) {
+    // How far others are is measured anew: the PC may have slept, and its oscillator stood still.
+    pairs_.clear();
+    pairs_since_ = now.raw;
+    own.line = {now.raw, now.wall, own.line.rate};
+    return;
+  }
+  const Duration age = now.raw - own.line.raw;
+  const std::optional<Time> expected = own.line.at(now.raw);
+  if (expected && std::chrono::abs(now.wall - *expected) <= kLineTolerance && age < kLineAge) {
+    return;
+  }
+  if (expected && age > Duration::zero()) {
+    const Duration gained = (now.wall - own.line.wall) - age;
+    const double rate = static_cast<double>(gained.count()) / static_cast<double>(age.count());
+    constexpr auto kMax = static_cast<double>(clock::ClockLine::kMaxRate);
+    own.line.rate = static_cast<clock::PartsPerBillion>(std::clamp(rate * 1e9, -kMax, kMax));
+  }
+  own.line.raw = now.raw;
+  own.line.wall = now.wall;
+  watch_.poll_now();
+}
+
 void FleetClock::log_others(MonoTime now) {
-  if (policies_.general.policy == ClockPolicy::off || !is_good(own_->clock.status)) return;
+  if (policies_.general.policy == ClockPolicy::off) return;
   for (const auto& [id, host] : catalog_.hosts()) {
     if (id == self_) continue;
     log_.update(id, host.greeting.host,
@@ -297,17 +353,79 @@ std::string FleetClock::str() const {
 
 // --- what other hosts' samples are worth here
 
+void FleetClock::measure(const wire::ClockReport& theirs, const clock::Instant& now) {
+  if (!theirs.line.exists() || theirs.boot_id.empty() || own_->shares_clock_with(theirs)) return;
+  Pair& pair = pairs_[theirs.boot_id];
+  if (pair.setting != theirs.setting) {
+    pair = {};
+    pair.setting = theirs.setting;
+  }
+  if (theirs.heartbeat && theirs.heartbeat->asked > pairs_since_) {
+    pair.raws.add_untrusted(*theirs.heartbeat);
+  }
+  const auto raws = pair.raws.at(now.raw);
+  const auto walls =
+      raws ? clock::wall_difference(*raws, theirs.line, own_->line, now) : std::nullopt;
+  if (!walls) return;
+  pair.last = *walls;
+  pair.measured_at = now.mono;
+  constexpr Duration kSpan = std::chrono::seconds(1);
+  if (pair.stated.empty() || now.wall - pair.stated.back().wall >= kSpan) {
+    pair.stated.push_back({now.wall, walls->bound()});
+  }
+  pair.stated.back().bound = std::max(pair.stated.back().bound, walls->bound());
+  while (pair.stated.front().wall < now.wall - kMeasuredReach) pair.stated.pop_front();
+}
+
+std::optional<FleetClock::Measured> FleetClock::measured(const wire::ClockReport& theirs,
+                                                         const clock::Instant& now) const {
+  const auto found = pairs_.find(theirs.boot_id);
+  if (found == pairs_.end()) return std::nullopt;
+  const Pair& pair = found->second;
+  if (pair.stated.empty() || pair.setting != theirs.setting) return std::nullopt;
+  Measured measured{pair.last, now.mono - pair.measured_at <= kMeasuredFor, {}, {}};
+  if (measured.is_fresh) {
+    const auto raws = pair.raws.at(now.raw);
+    const auto walls =
+        raws ? clock::wall_difference(*raws, theirs.line, own_->line, now) : std::nullopt;
+    if (!walls) return std::nullopt;
+    measured.now = *walls;
+  } else {
+    // No sample comes from there any more: those that are here were stamped while it was fresh.
+    const Duration aged =
+        clock::growth(now.mono - pair.measured_at,
+                      own_->clock.ageing_ppb + theirs.clock.ageing_ppb + pair.last.ageing);
+    measured.now.least -= aged;
+    measured.now.greatest += aged;
+  }
+  measured.greatest = measured.now.bound();
+  for (const Stated& stated : pair.stated) {
+    measured.greatest = std::max(measured.greatest, stated.bound);
+  }
+  // Their clock may be ahead of this one, which the times of `stated` are of.
+  measured.from = std::max(theirs.setting_from, pair.stated.front().wall + measured.greatest);
+  return measured;
+}
+
+Duration FleetClock::chain_distance(const wire::ClockReport& theirs, MonoTime now) const {
+  return clock::distance(own_->at(now), theirs.at(now));
+}
+
 Duration FleetClock::distance_to(const wire::ClockReport& other) const {
-  const MonoTime now = MonoClock::now();
-  return clock::distance(own_->at(now), other.at(now));
+  const clock::Instant now = clock::Instant::now();
+  const Duration chain = chain_distance(other, now.mono);
+  if (own_->shares_clock_with(other)) return chain;
+  const std::optional<Measured> found = measured(other, now);
+  if (!found) return chain;
+  if (found->is_fresh && found->now.excludes(chain)) return kUnknownClockError;
+  return std::min(chain, found->now.bound());
 }
 
 Result<void> FleetClock::check_serving(const StreamId& id, const wire::Greeting& them) const {
   if (policies_.demand_for(id).policy != ClockPolicy::enforce) return {};
   if (them.clock && own_->shares_clock_with(*them.clock)) return {};
-  // A dssmd assesses for itself, once this clock was ever known; a program cannot.
-  const bool is_dssmd = them.clock && !them.clock->chain.empty();
-  if (is_good(own_->clock.status) || (is_dssmd && was_in_bounds_)) return {};
+  // A dssmd assesses for itself; a program cannot.
+  if (is_good(own_->clock.status) || them.has_feature(wire::kFeatureClock)) return {};
   return Error{Errc::clock_out_of_bounds,
                fmt::format("stream '{}': the {} on the host that owns it, so the times of its "
                            "samples mean nothing on other PCs; run `dssmctl clock` there, retry "
@@ -319,28 +437,42 @@ Result<void> FleetClock::check_serving(const StreamId& id, const wire::Greeting&
 ring::ClockAssessment FleetClock::assess_mirror(const StreamId& id,
                                                 const wire::ClockReport* owner) const {
   if (owner && own_->shares_clock_with(*owner)) return {};
-  const MonoTime now = MonoClock::now();
-  if (!owner || !owner->has_bound()) return assessment(id, now, kUnknownClockError, 0);
-  const wire::ClockReport own = own_->at(now), theirs = owner->at(now);
-  return assessment(id, now, clock::distance_from_anchor(theirs, own),
-                    own.clock.ageing_ppb + theirs.clock.ageing_ppb);
+  const clock::Instant now = clock::Instant::now();
+  ring::ClockAssessment found = assessment(id, now.mono);
+  if (!owner) return found;
+  const std::optional<Measured> by_heartbeats = measured(*owner, now);
+  if (by_heartbeats && by_heartbeats->is_fresh &&
+      by_heartbeats->now.excludes(chain_distance(*owner, now.mono))) {
+    return found;  // one of the two is wrong, and it is not known which
+  }
+  if (owner->has_bound()) {
+    const wire::ClockReport own = own_->at(now.mono), theirs = owner->at(now.mono);
+    found.added = clock::distance_from_anchor(theirs, own);
+    found.ageing_ppb = ppb(own.clock.ageing_ppb + theirs.clock.ageing_ppb);
+  }
+  if (by_heartbeats) {
+    found.measured = by_heartbeats->greatest;
+    found.measured_from = by_heartbeats->from;
+    found.measured_ageing_ppb = ppb(by_heartbeats->now.ageing);
+  }
+  return found;
 }
 
 ring::ClockAssessment FleetClock::assess_own(const StreamId& id) const {
   const MonoTime now = MonoClock::now();
   const ClockSnapshot own = own_->at(now).clock;
-  return assessment(id, now, own.bound, own.ageing_ppb);
+  ring::ClockAssessment found = assessment(id, now);
+  found.added = own.bound;
+  found.ageing_ppb = ppb(own.ageing_ppb);
+  return found;
 }
 
-// Of samples whose times may be `added` further from this clock than their clock errors state.
-ring::ClockAssessment FleetClock::assessment(const StreamId& id, MonoTime now, Duration added,
-                                             clock::PartsPerBillion ageing) const {
+// Of samples of which nothing is known yet.
+ring::ClockAssessment FleetClock::assessment(const StreamId& id, MonoTime now) const {
   const ClockDemand demand = policies_.demand_for(id);
   ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(demand.policy);
   assessment.assessed = now;
-  assessment.added = added;
-  assessment.ageing_ppb = static_cast<std::uint32_t>(ageing);
-  if (added <= demand.limit) assessment.limit = demand.limit - added;
+  assessment.limit = demand.limit;
   return assessment;
 }
 
@@ -348,19 +480,31 @@ ring::ClockAssessment FleetClock::assessment(const StreamId& id, MonoTime now, D
 std::string FleetClock::reason_against(const wire::ClockReport* owner, Duration limit) const {
   if (!owner) return "nothing is known of its host's clock";
   if (own_->shares_clock_with(*owner)) return {};
+  const Duration distance = distance_to(*owner);
+  if (distance <= limit) return {};
+  const clock::Instant now = clock::Instant::now();
+  const Duration chain = chain_distance(*owner, now.mono);
+  const std::optional<Measured> by_heartbeats = measured(*owner, now);
+  if (by_heartbeats && by_heartbeats->is_fresh && by_heartbeats->now.excludes(chain)) {
+    return fmt::format(
+        "the heartbeats show that the clocks of its host and of this PC are {} apart or more, but "
+        "by what chronyd states there and here they are at most {} apart: one of them follows a "
+        "clock that was set or is wrong",
+        in_microseconds(std::max(by_heartbeats->now.least, -by_heartbeats->now.greatest)),
+        in_microseconds(chain));
+  }
+  if (distance != kUnknownClockError) {
+    return fmt::format(
+        "the clocks of its host and of this PC may be {} apart, and {} are allowed (key "
+        "clock_limit)",
+        in_microseconds(distance), in_microseconds(limit));
+  }
   if (!own_->has_bound()) return fmt::format("the {} on this PC", str());
   if (!owner->has_bound()) {
     return fmt::format("the clock of its host is {} ({})", name_of(owner->clock.status),
                        name_of(owner->clock.reason));
   }
-  const Duration distance = distance_to(*owner);
-  if (distance == kUnknownClockError) {
-    return "the clocks of its host and of this PC follow different references";
-  }
-  if (distance <= limit) return {};
-  return fmt::format(
-      "the clocks of its host and of this PC may be {} apart, and {} are allowed (key clock_limit)",
-      in_microseconds(distance), in_microseconds(limit));
+  return "the clocks of its host and of this PC follow different references";
 }
 
 Error FleetClock::refusal(const StreamId& id, const wire::ClockReport* owner) const {

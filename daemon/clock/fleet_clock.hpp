@@ -8,7 +8,8 @@
 //             ClockEstimator   the snapshot of this clock at any moment: bound, status, reason
 //             ClockWatch       drives these three and logs changes
 //             FleetClock       sync chain and anchor: from the snapshot and other hosts' reports
-//             clock_distance   how far two clocks may be apart, from their reports
+//             PairMeasurement  how far another PC's oscillator is from this one's, by heartbeats
+//             clock_distance   how far two clocks may be apart, from their reports and from that
 //   stores    ClockPage        this clock, for stamping (core/clock; written by ClockPageWriter)
 //             wire::ClockReport  this clock for other hosts, in our greeting, and theirs in Catalog
 //             MirrorClock      one owner's report, and which of its samples are suspect
@@ -26,6 +27,7 @@
 
 #include <deque>
 #include <functional>
+#include <map>
 #include <memory>
 #include <optional>
 #include <string>
@@ -33,6 +35,7 @@
 
 #include "core/wire/clock_report.hpp"
 #include "daemon/base/event_loop.hpp"
+#include "daemon/clock/clock_distance.hpp"
 #include "daemon/clock/clock_page_writer.hpp"
 #include "daemon/clock/clock_watch.hpp"
 #include "daemon/clock/host_clock_log.hpp"
@@ -51,6 +54,10 @@ class FleetClock final : public ClockAssessor,
   static constexpr Duration kSuccessionDelay = std::chrono::seconds(5);
   // How far back the shared page states bounds.
   static constexpr Duration kReach = std::chrono::seconds(10);
+  // Samples that are older count by their clock error only, and not by what was measured since.
+  static constexpr Duration kMeasuredReach = std::chrono::seconds(60);
+  // Without a heartbeat for so long, the last measurement ages.
+  static constexpr Duration kMeasuredFor = std::chrono::seconds(3);
 
   struct Options {
     ClockWatch::Options watch;
@@ -104,6 +111,21 @@ class FleetClock final : public ClockAssessor,
     Time wall;
     Duration bound;
   };
+  // What is measured between this PC and another one.
+  struct Pair {
+    clock::PairMeasurement raws;
+    std::int64_t setting = 0;    // of their clock, while this was measured
+    std::deque<Stated> stated;   // within kMeasuredReach, about one a second
+    clock::WallDifference last;  // the latest
+    MonoTime measured_at{};      // then
+  };
+  // What follows from a Pair at one moment.
+  struct Measured {
+    clock::WallDifference now;
+    bool is_fresh = false;  // else it has aged since the last heartbeat
+    Duration greatest{};    // bound on all that was stated ...
+    Time from;              // ... since then
+  };
 
   void on_clock() override;
   void on_host_clock(const KnownHost& host) override;
@@ -118,9 +140,14 @@ class FleetClock final : public ClockAssessor,
   void choose_anchor(const ClockSnapshot& watched, MonoTime now);
   void update_status();
   void publish(const clock::Instant& now);
+  bool holds_line() const noexcept;
+  void update_line(const clock::Instant& now);
+  void measure(const wire::ClockReport& theirs, const clock::Instant& now);
+  std::optional<Measured> measured(const wire::ClockReport& theirs,
+                                   const clock::Instant& now) const;
+  Duration chain_distance(const wire::ClockReport& theirs, MonoTime now) const;
   void log_others(MonoTime now);
-  ring::ClockAssessment assessment(const StreamId& id, MonoTime now, Duration added,
-                                   clock::PartsPerBillion ageing) const;
+  ring::ClockAssessment assessment(const StreamId& id, MonoTime now) const;
   std::string reason_against(const wire::ClockReport* owner, Duration limit) const;
 
   Catalog& catalog_;
@@ -131,8 +158,9 @@ class FleetClock final : public ClockAssessor,
   std::optional<wire::IpAddress> source_address_;
   std::optional<Source> source_;
   MonoTime addresses_read_{};
-  std::deque<Stated> stated_;  // within kReach; all of them bounds
-  bool was_in_bounds_ = false;
+  std::deque<Stated> stated_;          // within kReach; all of them bounds
+  std::map<std::string, Pair> pairs_;  // by the boot id of the other PC
+  RawTime pairs_since_{};              // heartbeats from before do not count
   std::uint64_t generation_ = 0;
   std::function<void()> on_change_, on_new_generation_;
   HostClockLog log_;

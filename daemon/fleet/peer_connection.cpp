@@ -169,7 +169,9 @@ void PeerConnection::beat() {
   }
   net::Frame request;
   wire::send_clock(self_, *request.mutable_ping()->mutable_clock());
-  ask(std::move(request), [this, now](const Result<net::Frame>& answer) { on_pong(now, answer); });
+  ask(std::move(request), [this, now, asked = RawClock::now()](const Result<net::Frame>& answer) {
+    on_pong(now, asked, answer);
+  });
   heartbeat_.enable_in(std::min(wire::kHeartbeat, timeout - silent));
 }
 
@@ -178,14 +180,16 @@ void PeerConnection::take_clock(std::shared_ptr<const wire::ClockReport> clock) 
   observer_.on_heartbeat(*this);
 }
 
-void PeerConnection::on_pong(MonoTime asked, const Result<net::Frame>& answer) {
+void PeerConnection::on_pong(MonoTime asked, RawTime asked_raw, const Result<net::Frame>& answer) {
+  const RawTime answered_raw = RawClock::now();
   if (!answer || !answer->has_pong()) return;
   const Duration took = loop_.now() - asked;
   const Duration min = round_trips_.min;
   round_trips_ = {took, min == Duration::zero() ? took : std::min(min, took)};
   if (!answer->pong().has_clock()) return;
-  take_clock(std::make_shared<const wire::ClockReport>(
-      wire::clock_report_untrusted(answer->pong().clock(), asked)));
+  wire::ClockReport clock = wire::clock_report_untrusted(answer->pong().clock(), asked);
+  clock.heartbeat = {asked_raw, RawTime(Duration(answer->pong().raw_ns())), answered_raw};
+  take_clock(std::make_shared<const wire::ClockReport>(std::move(clock)));
 }
 
 }  // namespace dssm::daemon

@@ -12,6 +12,7 @@
 #include <string>
 #include <vector>
 
+#include "core/base/time.hpp"
 #include "core/wire/address.hpp"
 #include "core/wire/network_protocol.hpp"
 #include "daemon/base/event_loop.hpp"
@@ -124,7 +125,7 @@ class PeerConnection final : private Dialer::Observer {
   void on_down(const Error& error) override;
   void beat();
   void take_clock(std::shared_ptr<const wire::ClockReport> clock);
-  void on_pong(MonoTime asked, const Result<net::Frame>& answer);
+  void on_pong(MonoTime asked, RawTime asked_raw, const Result<net::Frame>& answer);
   void enter(HostState state, HostReason reason, std::optional<Error> error);
 
   PeerConnection(const EventLoop& loop, Resolver& resolver, std::optional<wire::HostId> expected,

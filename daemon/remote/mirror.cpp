@@ -127,6 +127,8 @@ void Mirror::assess_clock() {
 [[gnu::hot]] Result<void> Mirror::on_sample_begin(const wire::IncomingSample& sample,
                                                   std::byte*& out) {
   if (!channel_.takes_samples()) return ChannelClient::unexpected("a sample");
+  // This clock may have been set or slewed: readers have to know before they get the samples.
+  if (!std::exchange(in_batch_, true) && parts_.clock) parts_.clock->clock_generation();
   const Result<std::byte*> place = ring_->begin_untrusted(sample);
   if (!place) return place.error();
   out = *place;
@@ -140,6 +142,7 @@ void Mirror::assess_clock() {
 }
 
 [[gnu::hot]] void Mirror::on_batch_end() {
+  in_batch_ = false;
   if (ring_) ring_->wake();
 }
 

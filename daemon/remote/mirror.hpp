@@ -86,6 +86,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
 
   bool is_ending_ = false;  // live, but the catalog knows that this ring was removed
   MirrorClock clock_;
+  bool in_batch_ = false;  // samples have come, and on_batch_end() has not
   std::unique_ptr<MirrorRing> ring_;
   std::uint64_t logged_gap_ = 0;                   // of this ring
   std::vector<std::shared_ptr<Stream>> replaced_;  // their readers are still to be notified

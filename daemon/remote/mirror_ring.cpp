@@ -122,13 +122,13 @@ ring::ClockAssessment MirrorClock::assessment() const {
 Result<void> MirrorClock::check_opening() const {
   if (!has_report_) return {};
   const ring::ClockAssessment now = assessment();
-  if (now.policy != ClockPolicy::enforce || now.limit >= Duration::zero()) return {};
+  if (now.policy != ClockPolicy::enforce || now.can_be_good()) return {};
   return assessor_->refusal(id_, report_.get());
 }
 
 std::string MirrorClock::reason() const {
   const ring::ClockAssessment now = assessment();
-  if (now.policy == ClockPolicy::off || now.limit >= Duration::zero()) return {};
+  if (now.policy == ClockPolicy::off || now.can_be_good()) return {};
   return assessor_->refusal(id_, report_.get()).message;
 }
 

@@ -65,7 +65,7 @@ struct ChannelParts {
   Registry& registry;  // for memory and quotas
   Logger& logger;
   wire::Greeting self;
-  const ClockAssessor* clock = nullptr;  // nullptr: the clock is not watched
+  ClockAssessor* clock = nullptr;  // nullptr: the clock is not watched
   // How long a mirror stays after its last reader closed it. May change.
   Duration mirror_linger{};
   // Readers of this ring, a mirror's, shall reopen the stream: it has a new ring.

@@ -127,9 +127,11 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
   if (request.has_ping()) {
     is_control_ = true;
     peer_timeout_.enable_in(wire::kPeerTimeout);
+    if (parts_.clock) parts_.clock->clock_generation();  // so that the report is of now
     net::Frame pong;
     pong.set_serial(request.serial());
     wire::send_clock(parts_.self, *pong.mutable_pong()->mutable_clock());
+    pong.mutable_pong()->set_raw_ns(to_ns(RawClock::now()));
     link_.send(pong);
     parts_.observer.on_heartbeat();
     return {};

@@ -11,13 +11,14 @@ using namespace std::chrono_literals;
 
 constexpr MonoTime kAssessed(100s);
 
-// Of a limit of 1500 us, 300 us are used up by the two clocks, which lose 100 us a second.
+// Of a limit of 1500 us, 300 us are used up by the two clocks, which lose 100 us a second. Nothing is
+// measured.
 ClockAssessment enforced() {
   return {.policy = ClockPolicy::enforce,
           .same_clock = 0,
           .ageing_ppb = 100'000,
           .added = 300us,
-          .limit = 1200us,
+          .limit = 1500us,
           .assessed = kAssessed};
 }
 
@@ -44,12 +45,6 @@ TEST(ClockAssessment, AnOldOneCountsAsUnknown) {
   EXPECT_EQ(enforced().distance(sample(0us), last + 1ns), kUnknownClockError);
 }
 
-TEST(ClockAssessment, NothingIsGoodBelowALimitOfZero) {
-  ClockAssessment clock = enforced();
-  clock.limit = Duration(-1);
-  EXPECT_FALSE(clock.is_good(sample(0us), kAssessed));
-}
-
 TEST(ClockAssessment, SuspectSamplesAreNotGood) {
   ClockAssessment clock = enforced();
   clock.suspect_first = 5;
@@ -61,9 +56,63 @@ TEST(ClockAssessment, SuspectSamplesAreNotGood) {
   EXPECT_EQ(clock.distance(sample(0us, 5), kAssessed), kUnknownClockError);
 }
 
+// 80 us between the two clocks, for samples of the last minute.
+ClockAssessment measured() {
+  ClockAssessment clock = enforced();
+  clock.measured = 80us;
+  clock.measured_from = time_from_ns(1'000);
+  clock.measured_ageing_ppb = 10'000;
+  return clock;
+}
+
+SampleInfo sample_at(std::int64_t ns, Duration clock_error) {
+  return {7, time_from_ns(ns), clock_error};
+}
+
+TEST(ClockAssessment, WhatIsMeasuredCountsWhereItIsLess) {
+  EXPECT_EQ(measured().distance(sample_at(1'000, 200us), kAssessed), 80us);
+  EXPECT_EQ(measured().distance(sample_at(1'000, 200us), kAssessed + 2s), 100us);
+  EXPECT_EQ(measured().distance(sample_at(999, 200us), kAssessed), 500us) << "before it began";
+  ClockAssessment clock = measured();
+  clock.measured = 2ms;
+  EXPECT_EQ(clock.distance(sample_at(1'000, 200us), kAssessed), 500us);
+  EXPECT_TRUE(clock.is_good(sample_at(1'000, 200us), kAssessed));
+}
+
+TEST(ClockAssessment, AMeasurementNeedsNoClockErrorAndNoTrustInIt) {
+  EXPECT_TRUE(measured().is_good(sample_at(1'000, kUnknownClockError), kAssessed));
+  EXPECT_FALSE(measured().is_good(sample_at(999, kUnknownClockError), kAssessed));
+  ClockAssessment clock = measured();
+  clock.suspect_first = 0;
+  clock.suspect_last = 100;
+  EXPECT_TRUE(clock.is_good(sample_at(1'000, 0us), kAssessed));
+  clock.measured = 1501us;
+  EXPECT_FALSE(clock.is_good(sample_at(1'000, 0us), kAssessed));
+  const MonoTime last = kAssessed + ClockAssessment::kValidFor;
+  EXPECT_FALSE(measured().is_good(sample_at(1'000, 0us), last + 1ns)) << "dssmd is away";
+}
+
+TEST(ClockAssessment, AnAgeingThatNoHonestDssmdStatesDoesNotOverflow) {
+  ClockAssessment clock = measured();
+  clock.measured_ageing_ppb = UINT32_MAX;
+  EXPECT_EQ(clock.distance(sample_at(1'000, kUnknownClockError), kAssessed + 3s), 3s + 80us);
+}
+
+TEST(ClockAssessment, CanBeGoodByEitherOfBoth) {
+  EXPECT_TRUE(enforced().can_be_good());
+  ClockAssessment clock = measured();
+  clock.added = kUnknownClockError;
+  EXPECT_TRUE(clock.can_be_good());
+  clock.measured = 1501us;
+  EXPECT_FALSE(clock.can_be_good());
+  clock.measured = kUnknownClockError;
+  clock.limit = kUnknownClockError;
+  EXPECT_FALSE(clock.can_be_good());
+}
+
 TEST(ClockAssessment, ARecordingsTimesAreGoodButWhileTheClockIsBeingSet) {
   ClockAssessment clock = enforced();
-  clock.limit = Duration(-1);
+  clock.limit = 100us;
   EXPECT_TRUE(clock.is_good(sample(kForeignClockError), kAssessed + 1h));
   EXPECT_EQ(clock.distance(sample(kForeignClockError), kAssessed), kUnknownClockError);
   clock.suspect_first = 7;
@@ -83,7 +132,7 @@ TEST(ClockAssessment, OneClockHasNoDistance) {
 TEST(ClockAssessment, WithoutAPolicyAllIsGoodAndTheDistanceStillKnown) {
   ClockAssessment clock = enforced();
   clock.policy = ClockPolicy::off;
-  clock.limit = Duration(-1);
+  clock.limit = 100us;
   EXPECT_TRUE(clock.is_good(sample(kUnknownClockError), kAssessed));
   EXPECT_EQ(clock.distance(sample(100us), kAssessed), 400us);
 }
@@ -107,7 +156,10 @@ TEST(ClockAssessment, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(ClockAssessment, assessed), 24u);
   EXPECT_EQ(offsetof(ClockAssessment, suspect_first), 32u);
   EXPECT_EQ(offsetof(ClockAssessment, suspect_last), 40u);
-  EXPECT_EQ(sizeof(ClockAssessment), 48u);
+  EXPECT_EQ(offsetof(ClockAssessment, measured), 48u);
+  EXPECT_EQ(offsetof(ClockAssessment, measured_from), 56u);
+  EXPECT_EQ(offsetof(ClockAssessment, measured_ageing_ppb), 64u);
+  EXPECT_EQ(sizeof(ClockAssessment), 72u);
 }
 
 TEST(ClockAssessment, IsEnforcedInARingOnlyForAnotherClockUnderThatPolicy) {
@@ -138,7 +190,7 @@ TEST(ClockAssessment, IsReadInARingAsItWasStored) {
   EXPECT_EQ(read.policy, ClockPolicy::enforce);
   EXPECT_FALSE(read.same_clock);
   EXPECT_EQ(read.added, 300us);
-  EXPECT_EQ(read.limit, 1200us);
+  EXPECT_EQ(read.limit, 1500us);
   EXPECT_EQ(read.ageing_ppb, 100'000U);
   EXPECT_EQ(read.assessed, kAssessed);
   EXPECT_EQ(read.suspect_first, 3);

@@ -340,7 +340,7 @@ TEST(ClockEstimator, SeesStepsFromBeforeItWasMade) {
   for (const Duration step : {0s, 5s, -5s}) {
     ClockEstimator next{ClockEstimator::Settings{}};
     EXPECT_EQ(next.base(), std::nullopt);
-    next.resume(*rig.estimator.base());
+    next.resume(*rig.estimator.base(), rig.estimator.setting_from());
     Rig later = rig;
     later.now.mono += 10s;
     later.now.wall += 10s + step;
@@ -360,7 +360,7 @@ TEST(ClockEstimator, HandsAStepOnUntilItIsMeasured) {
   rig.step(1s);
   const auto seen_by_next = [&] {
     ClockEstimator next{ClockEstimator::Settings{}};
-    next.resume(*rig.estimator.base());
+    next.resume(*rig.estimator.base(), rig.estimator.setting_from());
     return next.observe(rig.now);
   };
   EXPECT_EQ(seen_by_next(), Duration(6s));

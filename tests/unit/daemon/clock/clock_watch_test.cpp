@@ -258,14 +258,14 @@ TEST_F(ClockWatchTest, NoticesStepsThatHappenedWhileNoDssmdRan) {
   EXPECT_EQ(base.mono, now.mono);
   pass(10s);
   restart();
-  watch->resume(base);
+  watch->resume(base, {});
   EXPECT_EQ(watch->base().mono, base.mono);
   until_events(1);
   EXPECT_EQ(watch->state().status, ClockStatus::synchronized) << "nothing has";
   pass(10s);
   now.wall -= 5ms;
   restart();
-  watch->resume(base);
+  watch->resume(base, {});
   until_events(1);
   EXPECT_EQ(watch->state().reason, ClockReason::stepped);
   EXPECT_EQ(logged("was set back by 5.000 ms"), 1);

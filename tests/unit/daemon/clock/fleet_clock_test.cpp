@@ -5,6 +5,7 @@
 #include "daemon/clock/fleet_clock.hpp"
 
 #include <filesystem>
+#include <thread>
 
 #include "tests/support/log_recorder.hpp"
 #include "tests/unit/daemon/clock/fake_chronyd.hpp"
@@ -79,6 +80,8 @@ class FleetClockTest : public testing::Test {
     return fleet->assess_mirror(lidar, owner.clock.get());
   }
 
+  const std::string& folder() const { return folder_; }
+
   const StreamId lidar{"lidar", 0, "pc3"};
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   LogRecorder logger;
@@ -114,10 +117,10 @@ TEST_F(FleetClockTest, OwnStreamsThatOthersWriteToAreAsFarOffAsThisClock) {
   const ring::ClockAssessment known = fleet->assess_own(lidar);
   EXPECT_EQ(known.policy, ClockPolicy::enforce);
   EXPECT_GE(known.added, own->clock.bound);
-  EXPECT_EQ(known.limit, policies.general.limit - known.added);
+  EXPECT_EQ(known.limit, policies.general.limit);
   tracking.leap = clock::Tracking::kUnsynchronized;
   wait([this] { return own->clock.bound == kUnknownClockError; });
-  EXPECT_LT(fleet->assess_own(lidar).limit, 0ns);
+  EXPECT_FALSE(fleet->assess_own(lidar).can_be_good());
   policies.general.policy = ClockPolicy::off;
   fleet->set(policies, 50'000);
   EXPECT_EQ(fleet->assess_own(lidar).policy, ClockPolicy::off);
@@ -149,7 +152,7 @@ TEST_F(FleetClockTest, ASampleMayBeAsWrongAsIsLeftOfTheLimit) {
   start();
   const ring::ClockAssessment found = assessed(host(kReference, "pc1", 5us));
   EXPECT_EQ(found.policy, ClockPolicy::enforce);
-  EXPECT_EQ(found.limit, 1500us - found.added);
+  EXPECT_EQ(found.limit, 1500us);
   EXPECT_GE(found.added, own->clock.bound);
   EXPECT_LT(found.added, own->clock.bound + 200us);
 }
@@ -157,7 +160,7 @@ TEST_F(FleetClockTest, ASampleMayBeAsWrongAsIsLeftOfTheLimit) {
 TEST_F(FleetClockTest, NothingIsGoodOfAHostThatFollowsAnotherReference) {
   add_reference();
   start();
-  EXPECT_LT(assessed(host(kOther, "pc3", 5us)).limit, 0us);
+  EXPECT_FALSE(assessed(host(kOther, "pc3", 5us)).can_be_good());
   const Error why = fleet->refusal(lidar, host(kOther, "pc3", 5us).clock.get());
   EXPECT_EQ(why.code, Errc::clock_out_of_bounds);
   EXPECT_NE(why.message.find("follow different references"), std::string::npos) << why.message;
@@ -166,8 +169,8 @@ TEST_F(FleetClockTest, NothingIsGoodOfAHostThatFollowsAnotherReference) {
 TEST_F(FleetClockTest, NothingIsGoodOfAHostWhoseClockIsUnknown) {
   add_reference();
   start();
-  EXPECT_LT(assessed(host(kReference, "pc1", kUnknownClockError)).limit, 0us);
-  EXPECT_LT(fleet->assess_mirror(lidar, nullptr).limit, 0us);
+  EXPECT_FALSE(assessed(host(kReference, "pc1", kUnknownClockError)).can_be_good());
+  EXPECT_FALSE(fleet->assess_mirror(lidar, nullptr).can_be_good());
 }
 
 TEST_F(FleetClockTest, AHostWithThisKernelHasThisClock) {
@@ -196,28 +199,150 @@ TEST_F(FleetClockTest, PoliciesDecide) {
   const ring::ClockAssessment camera =
       fleet->assess_mirror({"camera", 1, "pc1"}, owner.clock.get());
   EXPECT_EQ(camera.policy, ClockPolicy::enforce);
-  EXPECT_EQ(camera.limit, 5ms - camera.added);
+  EXPECT_EQ(camera.limit, 5ms);
 }
 
-TEST_F(FleetClockTest, ServesOthersFromWhenTheClockWasFirstKnown) {
+TEST_F(FleetClockTest, ServesProgramsOfOtherPcsWhileItsClockIsGood) {
   tracking.leap = clock::Tracking::kUnsynchronized;
   start();
-  const wire::Greeting peer = host(kOther, "pc3", 5us);
-  const Result<void> refused = fleet->check_serving(lidar, peer);
+  wire::Greeting peer = host(kOther, "pc3", 5us);
+  peer.features = {std::string(wire::kFeatureClock)};
+  wire::Greeting program = host(kOther, "pc3", 5us);
+  program.clock = nullptr;
+  EXPECT_TRUE(fleet->check_serving(lidar, peer)) << "a dssmd assesses for itself";
+  const Result<void> refused = fleet->check_serving(lidar, program);
   ASSERT_FALSE(refused);
   EXPECT_EQ(refused.error().code, Errc::clock_out_of_bounds);
   EXPECT_NE(refused.error().message.find("not synchronised"), std::string::npos)
       << refused.error().message;
   tracking.leap = 0;
   wait([this] { return own->clock.status == ClockStatus::synchronized; });
-  EXPECT_TRUE(fleet->check_serving(lidar, peer));
-  wire::Greeting program = peer;
-  program.clock = nullptr;
   EXPECT_TRUE(fleet->check_serving(lidar, program));
   tracking.leap = clock::Tracking::kUnsynchronized;
   wait([this] { return own->clock.status == ClockStatus::out_of_bounds; });
-  EXPECT_TRUE(fleet->check_serving(lidar, peer)) << "a dssmd assesses for itself";
   EXPECT_FALSE(fleet->check_serving(lidar, program)) << "who watches no clock cannot";
+}
+
+// --- measured by heartbeats
+
+class MeasuredTest : public FleetClockTest {
+ protected:
+  // pc3, whose clock is `ahead` of this one and of which nothing else is known than what heartbeats
+  // with a round trip of 100 us say.
+  void heartbeat(Duration ahead, std::int64_t setting = 1, Duration bound = kUnknownClockError) {
+    wire::Greeting other = host(kOther, "pc3", bound);
+    auto report = std::make_shared<wire::ClockReport>(*other.clock);
+    const clock::Instant now = later();
+    report->line = {now.raw, now.wall + ahead, 0};
+    report->setting = setting;
+    report->heartbeat = {now.raw - 100us, now.raw - 50us, now.raw};
+    other.clock = report;
+    pc3 = report;
+    if (!catalog.find(kOther)) catalog.host_up(other, {"10.0.0.3", 13776});
+    catalog.set_clock(kOther, report);
+  }
+  // Heartbeats from before its start count for nothing.
+  static clock::Instant later() {
+    std::this_thread::sleep_for(150us);
+    return clock::Instant::now();
+  }
+  ring::ClockAssessment found() const { return fleet->assess_mirror(lidar, pc3.get()); }
+
+  std::shared_ptr<const wire::ClockReport> pc3;
+};
+
+TEST_F(MeasuredTest, NeedsNoChronydAtAll) {
+  chronyd.stop();
+  follow_no_source();
+  Result<clock::ClockPageWriter> page = clock::ClockPageWriter::open(folder() + "/clock");
+  fleet.emplace(loop,
+                FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
+                *std::move(page), own, kSelf, catalog, logger);
+  wait([this] { return own->line.exists(); });
+  heartbeat(200us);
+  EXPECT_EQ(own->clock.bound, kUnknownClockError);
+  EXPECT_TRUE(found().can_be_good());
+  EXPECT_EQ(found().added, kUnknownClockError);
+  EXPECT_GE(found().measured, 200us);
+  EXPECT_LT(fleet->distance_to(*pc3), kUnknownClockError);
+  const SampleInfo sample{0, WallClock::now() + 1s, kUnknownClockError};
+  EXPECT_TRUE(found().is_good(sample, MonoClock::now()));
+}
+
+TEST_F(MeasuredTest, AClockThatIsMeasuredToBeTooFarOffIsRefused) {
+  start();
+  heartbeat(50ms);
+  EXPECT_GE(found().measured, 50ms);
+  EXPECT_FALSE(found().can_be_good());
+  const Error why = fleet->refusal(lidar, pc3.get());
+  EXPECT_NE(why.message.find("1500 us are allowed"), std::string::npos) << why.message;
+}
+
+TEST_F(MeasuredTest, IsVoidAfterAStepThereUntilItWasMeasuredAgain) {
+  start();
+  heartbeat(0us, 1);
+  EXPECT_TRUE(found().can_be_good());
+  auto stepped = std::make_shared<wire::ClockReport>(*pc3);
+  stepped->setting = 2;
+  stepped->heartbeat.reset();
+  pc3 = stepped;
+  EXPECT_FALSE(found().can_be_good()) << "a channel may bring it first";
+  catalog.set_clock(kOther, stepped);
+  EXPECT_FALSE(found().can_be_good());
+  heartbeat(0us, 2);
+  EXPECT_TRUE(found().can_be_good());
+}
+
+TEST_F(MeasuredTest, TimesFromBeforeAStepThereAreNotMeasured) {
+  start();
+  heartbeat(0us);
+  auto later = std::make_shared<wire::ClockReport>(*pc3);
+  later->setting_from = WallClock::now() + 1h;  // it was set back by an hour
+  EXPECT_EQ(fleet->assess_mirror(lidar, later.get()).measured_from, later->setting_from);
+}
+
+TEST_F(MeasuredTest, StatementsThatExcludeEachOtherAreRefused) {
+  add_reference();
+  start();
+  wire::Greeting reference = host(kReference, "pc1", 5us);
+  auto report = std::make_shared<wire::ClockReport>(*reference.clock);
+  const clock::Instant now = later();
+  report->line = {now.raw, now.wall + 1ms, 0};  // and chronyd states some 50 us
+  report->setting = 1;
+  EXPECT_TRUE(fleet->assess_mirror(lidar, report.get()).can_be_good());
+  report->heartbeat = {now.raw - 100us, now.raw - 50us, now.raw};
+  catalog.set_clock(kReference, report);
+  EXPECT_FALSE(fleet->assess_mirror(lidar, report.get()).can_be_good());
+  EXPECT_EQ(fleet->distance_to(*report), kUnknownClockError);
+  const Error why = fleet->refusal(lidar, report.get());
+  EXPECT_NE(why.message.find("the heartbeats show"), std::string::npos) << why.message;
+}
+
+TEST_F(MeasuredTest, AStepOfTheReferenceTakesAwayWhatChronydStates) {
+  add_reference();
+  start();
+  auto report = std::make_shared<wire::ClockReport>(*catalog.find(kReference)->greeting.clock);
+  const clock::Instant now = clock::Instant::now();
+  report->line = {now.raw, now.wall, 0};
+  report->setting = 1;
+  catalog.set_clock(kReference, report);
+  EXPECT_TRUE(own->has_bound());
+  report = std::make_shared<wire::ClockReport>(*report);
+  report->setting = 2;
+  const int before = generations;
+  catalog.set_clock(kReference, report);
+  EXPECT_FALSE(own->has_bound());
+  EXPECT_EQ(own->clock.reason, ClockReason::stepped);
+  EXPECT_GT(generations, before) << "others have to know";
+  EXPECT_TRUE(logger.contains("the clock of 'pc1', which this PC's chronyd follows, was set"));
+}
+
+TEST_F(MeasuredTest, OwnReportsSayWhatTheClockShows) {
+  start();
+  const std::optional<Time> shown = own->line.at(RawClock::now());
+  ASSERT_TRUE(shown);
+  EXPECT_LT(std::chrono::abs(*shown - WallClock::now()), 1s);
+  EXPECT_NE(own->setting, 0);
 }
 
 TEST_F(FleetClockTest, ProgramsOfThisPcFindTheBoundOnThePage) {

@@ -15,13 +15,14 @@ class FakeClockAssessor final : public ClockAssessor {
                                       const wire::ClockReport* owner) const override {
     if (same_clock) return {};
     ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(policy);
-    if (owner) assessment.limit = std::chrono::milliseconds(1) - owner->clock.bound;
+    assessment.limit = std::chrono::milliseconds(1);
+    if (owner) assessment.added = owner->clock.bound;
     return assessment;
   }
   ring::ClockAssessment assess_own(const StreamId&) const override {
     ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(policy);
     assessment.added = own_bound;
-    assessment.limit = std::chrono::milliseconds(1) - own_bound;
+    assessment.limit = std::chrono::milliseconds(1);
     assessment.assessed = MonoClock::now();
     return assessment;
   }

@@ -1,0 +1,264 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// Two simulated PCs with a known true difference: oscillators of different speed, wall clocks that
+// are slewed and set, heartbeats that take longer one way than the other.
+#include "daemon/clock/pair_measurement.hpp"
+
+#include <gtest/gtest.h>
+
+#include <cmath>
+#include <cstdlib>
+#include <random>
+
+#include "daemon/clock/clock_distance.hpp"
+
+namespace dssm::clock {
+namespace {
+
+using namespace std::chrono_literals;
+
+Duration ns(double value) { return Duration(std::llround(value)); }
+
+// An oscillator and the wall clock that is made of it.
+struct Pc {
+  double raw_ns = 1e12;
+  double wall_ns = 1.795e18;
+  double rate = 0;        // of the oscillator, beyond the true time
+  double correction = 0;  // of the wall clock, beyond the oscillator
+  ClockLine line;
+  int lines = 0;
+
+  void pass(double true_ns) {
+    const double counted = true_ns * (1 + rate);
+    raw_ns += counted;
+    wall_ns += counted * (1 + correction);
+  }
+  RawTime raw() const { return RawTime(ns(raw_ns)); }
+  Time wall() const { return Time(ns(wall_ns)); }
+  void step(double by_ns) {
+    wall_ns += by_ns;
+    line.raw = raw();
+    line.wall = wall();
+  }
+  // As FleetClock does before each batch of samples.
+  void keep_line() {
+    const std::optional<Time> expected = line.at(raw());
+    if (expected && std::chrono::abs(wall() - *expected) <= 8us) return;
+    if (expected) {
+      const auto age = static_cast<double>((raw() - line.raw).count());
+      line.rate =
+          std::llround((static_cast<double>((wall() - line.wall).count()) - age) / age * 1e9);
+    }
+    line.raw = raw();
+    line.wall = wall();
+    ++lines;
+  }
+};
+
+class PairMeasurementTest : public testing::Test {
+ protected:
+  PairMeasurementTest() {
+    const char* given = std::getenv("DSSM_TEST_SEED");
+    const unsigned seed = given ? std::atoi(given) : std::random_device()();
+    RecordProperty("seed", std::to_string(seed));
+    SCOPED_TRACE(seed);
+    random.seed(seed);
+    theirs.raw_ns = 5e14;
+  }
+
+  double uniform(double least, double most) {
+    return std::uniform_real_distribution<double>(least, most)(random);
+  }
+  void pass(double true_ns) {
+    ours.pass(true_ns);
+    theirs.pass(true_ns);
+  }
+  // At least 50 us each way, and up to `most_ns` more in one of them.
+  void beat(double most_ns = 2e6) {
+    const bool is_forth = uniform(0, 1) < 0.5;
+    HeartbeatTimes times;
+    times.asked = ours.raw();
+    pass(5e4 + (is_forth ? uniform(0, most_ns) : 0));
+    times.theirs = theirs.raw();
+    pass(5e4 + (is_forth ? 0 : uniform(0, most_ns)));
+    times.answered = ours.raw();
+    pair.add_untrusted(times);
+  }
+  PairMeasurement::Difference difference() const { return pair.at(ours.raw()).value(); }
+  double true_ns() const { return theirs.raw_ns - ours.raw_ns; }
+  void expect_true() const {
+    const PairMeasurement::Difference found = difference();
+    EXPECT_LE(static_cast<double>(to_ns(found.least)), true_ns() + 300);
+    EXPECT_GE(static_cast<double>(to_ns(found.greatest)), true_ns() - 300);
+  }
+
+  Pc ours, theirs;
+  PairMeasurement pair;
+  std::mt19937 random;
+};
+
+TEST_F(PairMeasurementTest, OneHeartbeatBoundsTheDifferenceByItsRoundTrip) {
+  EXPECT_FALSE(pair.at(ours.raw()));
+  beat(0);
+  expect_true();
+  EXPECT_LE(difference().greatest - difference().least, 101us);
+  EXPECT_EQ(pair.best_round_trip(), 100us);
+}
+
+TEST_F(PairMeasurementTest, TheDifferenceIsWithinTheBoundsWhateverTheDelays) {
+  for (const double rate : {0.0, 50e-6, -300e-6}) {
+    pair.clear();
+    theirs.rate = rate;
+    for (int i = 0; i < 300; ++i) {
+      beat();
+      for (int j = 0; j < 10; ++j) {
+        pass(1e8);
+        expect_true();
+      }
+    }
+  }
+}
+
+// The oscillators warm up and cool down: by all that is allowed, at any time.
+TEST_F(PairMeasurementTest, TheRateMayChangeByAllThatIsAllowed) {
+  for (int i = 0; i < 2000; ++i) {
+    if (i % 7 == 0) theirs.rate = 40e-6 + uniform(-5e-6, 5e-6);
+    beat(1e5);
+    pass(1e9);
+    expect_true();
+  }
+}
+
+// What the issue of this measurement asks for: half of the best round trip and 30 us.
+TEST_F(PairMeasurementTest, TheBoundsAreAsTightAsTheBestRoundTrips) {
+  theirs.rate = 35e-6;
+  ours.rate = -20e-6;
+  for (int i = 0; i < 64; ++i) {
+    beat();
+    pass(1e9);
+  }
+  const Duration half_width = (difference().greatest - difference().least) / 2;
+  EXPECT_LE(half_width, pair.best_round_trip() / 2 + 30us)
+      << "best of " << to_ns(pair.best_round_trip()) << " ns";
+}
+
+TEST_F(PairMeasurementTest, AHeartbeatThatTookLongTakesNothingAway) {
+  for (int i = 0; i < 10; ++i) {
+    beat(1e4);
+    pass(1e9);
+  }
+  const PairMeasurement::Difference before = difference();
+  beat(2e9);
+  expect_true();
+  const PairMeasurement::Difference after = difference();
+  EXPECT_LE(after.greatest - after.least, before.greatest - before.least + 200us);
+}
+
+TEST_F(PairMeasurementTest, AfterAPcHasSleptOnlyNewHeartbeatsCount) {
+  for (int i = 0; i < 20; ++i) {
+    beat(1e4);
+    pass(1e9);
+  }
+  ours.pass(5e9);  // theirs stands still
+  beat(1e4);
+  expect_true();
+}
+
+TEST_F(PairMeasurementTest, HeartbeatsEndWithTheWindow) {
+  beat();
+  pass(65e9);
+  EXPECT_FALSE(pair.at(ours.raw()));
+}
+
+TEST_F(PairMeasurementTest, ImpossibleTimesAreIgnored) {
+  const RawTime now = ours.raw();
+  pair.add_untrusted({now, RawTime(Duration::max()), now + 1ms});
+  pair.add_untrusted({now, RawTime(Duration::min()), now + 1ms});
+  pair.add_untrusted({now, RawTime(), now + 1ms});
+  pair.add_untrusted({now, now, now});
+  pair.add_untrusted({now + 1ms, now, now});
+  EXPECT_FALSE(pair.at(now + 1ms));
+}
+
+// --- the wall clocks of both
+
+class WallDifferenceTest : public PairMeasurementTest {
+ protected:
+  void pass_and_keep_lines(double true_ns) {
+    pass(true_ns);
+    ours.keep_line();
+    theirs.keep_line();
+  }
+  WallDifference walls() const {
+    const Instant now{MonoTime(), ours.wall(), {}, ours.raw()};
+    return wall_difference(difference(), theirs.line, ours.line, now).value();
+  }
+  double true_walls_ns() const { return theirs.wall_ns - ours.wall_ns; }
+  void expect_true_walls() const {
+    const WallDifference found = walls();
+    EXPECT_LE(static_cast<double>(to_ns(found.least)), true_walls_ns() + 1000);
+    EXPECT_GE(static_cast<double>(to_ns(found.greatest)), true_walls_ns() - 1000);
+  }
+};
+
+TEST_F(WallDifferenceTest, IsWithinTheBoundsWhileBothAreSlewedAndSet) {
+  theirs.rate = 60e-6;
+  ours.keep_line();
+  theirs.keep_line();
+  for (int i = 0; i < 300; ++i) {
+    beat(1e5);
+    if (i % 3 == 0) theirs.correction = uniform(-1e-4, 1e-4);
+    if (i % 5 == 0) ours.correction = uniform(-0.08, 0.08);  // as fast as chronyd can
+    if (i % 17 == 0) theirs.step(uniform(-1e10, 1e10));
+    for (int j = 0; j < 20; ++j) {
+      pass_and_keep_lines(5e7);
+      expect_true_walls();
+    }
+  }
+}
+
+TEST_F(WallDifferenceTest, BetweenTwoReadingsItGrowsNoFasterThanTheAgeing) {
+  theirs.correction = -0.08;
+  for (int i = 0; i < 10; ++i) {
+    beat(1e4);
+    pass_and_keep_lines(1e9);
+  }
+  const WallDifference before = walls();
+  pass(1e9);
+  const double grown = static_cast<double>(before.ageing);
+  EXPECT_LE(static_cast<double>(to_ns(before.least)) - grown, true_walls_ns());
+  EXPECT_GE(static_cast<double>(to_ns(before.greatest)) + grown, true_walls_ns());
+  EXPECT_LT(grown, 1.1 * 0.08e9);
+}
+
+TEST_F(WallDifferenceTest, ALineLastsWhileTheRateOfTheClockDoes) {
+  theirs.rate = 60e-6;
+  theirs.correction = -59e-6;
+  for (int i = 0; i < 600; ++i) pass_and_keep_lines(1e9);
+  EXPECT_LE(theirs.lines, 3);
+}
+
+TEST_F(WallDifferenceTest, ExcludesAChainThatIsShorterThanItCanBe) {
+  ours.keep_line();
+  theirs.step(5e6);
+  beat(0);
+  pass_and_keep_lines(1e6);
+  EXPECT_TRUE(walls().excludes(4900us));
+  EXPECT_FALSE(walls().excludes(5ms));
+  EXPECT_FALSE(walls().excludes(kUnknownClockError));
+  theirs.step(-1e7);
+  pass_and_keep_lines(1e6);
+  EXPECT_TRUE(walls().excludes(4900us));
+  EXPECT_FALSE(walls().excludes(5ms));
+  EXPECT_GE(walls().bound(), 5ms);
+  EXPECT_LE(walls().bound(), 5200us);
+}
+
+TEST_F(WallDifferenceTest, NothingIsKnownWithoutALine) {
+  beat(0);
+  const Instant now{MonoTime(), ours.wall(), {}, ours.raw()};
+  EXPECT_FALSE(wall_difference(difference(), theirs.line, ours.line, now));
+}
+
+}  // namespace
+}  // namespace dssm::clock
