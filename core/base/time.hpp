@@ -18,8 +18,8 @@ constexpr timespec timespec_of(MonoTime time) noexcept {
   return timespec_of(time.time_since_epoch());
 }
 
-// CLOCK_MONOTONIC_RAW: what the PC's oscillator counts. No program sets or slews it; it stands still
-// while the PC sleeps. Nanoseconds by the oscillator's own speed.
+// CLOCK_MONOTONIC_RAW: what the PC's oscillator counts, in nanoseconds by its own speed. No program
+// sets or slews it; it stands still while the PC sleeps.
 using RawClock = detail::PosixClock<CLOCK_MONOTONIC_RAW, true>;
 using RawTime = RawClock::time_point;
 

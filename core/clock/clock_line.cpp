@@ -4,7 +4,7 @@
 namespace dssm::clock {
 
 std::optional<Time> ClockLine::at(RawTime t) const noexcept {
-  // A line may begin a little after `t`: it is of another PC, whose RawClock is known within bounds.
+  // A line may begin after `t`: it is of another PC, whose RawClock is known within bounds.
   if (!exists() || t < raw - kMaxAge || t > raw + kMaxAge) return std::nullopt;
   const Duration age = t - raw;
   return wall + age +

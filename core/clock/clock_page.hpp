@@ -31,8 +31,8 @@ namespace dssm::clock {
 //   112   24 base_mono, _wall, _width  ns  both clocks at an instant since which the clock was not
 //                                          set: the next dssmd detects a step by them
 //   136   64 reference                     the host or address that this clock follows
-//   200    8 setting_from           ns     CLOCK_REALTIME; times from here on are of the clock as it
-//                                          is set now
+//   200    8 setting_from           ns     CLOCK_REALTIME; times from here on are of the clock as
+//                                          it is set now
 //   208   48 reserved                      zero
 struct ClockPageState {
   static constexpr std::size_t kStampBytes = 64;

@@ -7,7 +7,7 @@
 namespace dssm::clock {
 namespace {
 
-// RawClocks count from boot: later times are invalid, and differences of valid ones do not overflow.
+// RawClocks count from boot: later times are invalid; differences of valid ones do not overflow.
 constexpr RawTime kLastValid{std::chrono::hours(24 * 365 * 100)};
 
 bool is_valid(RawTime t) noexcept { return t > RawTime() && t < kLastValid; }

@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// Which samples are good: by their clock errors, and by what was measured between the two clocks.
 #include "core/ring/clock_assessment.hpp"
 
 #include "core/ring/ring_reader.hpp"
@@ -11,8 +13,8 @@ using namespace std::chrono_literals;
 
 constexpr MonoTime kAssessed(100s);
 
-// Of a limit of 1500 us, 300 us are used up by the two clocks, which lose 100 us a second. Nothing is
-// measured.
+// Of a limit of 1500 us, 300 us are used up by the two clocks, which lose 100 us a second.
+// Nothing is measured.
 ClockAssessment enforced() {
   return {.policy = ClockPolicy::enforce,
           .same_clock = 0,
