@@ -2,8 +2,8 @@
 //
 // A PC's wall clock as a line over its RawClock. While no program sets or slews the wall clock
 // anew, the line says what it shows; dssmd tells other hosts a new line as soon as the wall clock
-// has left the old one by more than kTolerance. So they know that clock at each moment, and not
-// only when they asked. docs/clocks.md "Measured between two PCs".
+// has left the old one. So they know that clock at each moment, and not only when they asked.
+// docs/clocks.md "Measured between two PCs".
 #pragma once
 
 #include <dssm/time.hpp>
@@ -15,8 +15,8 @@
 namespace dssm::clock {
 
 struct ClockLine {
-  // How far the wall clock may be from the line that counts.
-  static constexpr Duration kTolerance = std::chrono::microseconds(10);
+  // Beyond this the wall clock has left the line. On top comes what reading two clocks takes.
+  static constexpr Duration kMaxOff = std::chrono::microseconds(8);
   // A line that is older is not used: dssmd draws a new one much earlier.
   static constexpr Duration kMaxAge = std::chrono::hours(1);
   // Faster or slower than this no program can make the wall clock (adjtimex(2): a tenth).
@@ -25,10 +25,16 @@ struct ClockLine {
   RawTime raw{};             // where the line begins; zero: there is none
   Time wall{};               // what the wall clock showed there
   PartsPerBillion rate = 0;  // the wall clock gains so much on the RawClock; negative: loses
+  Duration tolerance{};      // the wall clock is no further from the line, until there is another
+
+  // A line through this moment.
+  static ClockLine now(PartsPerBillion rate) noexcept;
 
   bool exists() const noexcept { return raw != RawTime(); }
   // What the wall clock shows at `t`; nullopt: there is no line, or it is too old.
   std::optional<Time> at(RawTime t) const noexcept;
+  // Whether this PC's wall clock is on the line, which is its own. Three clocks are read.
+  bool holds() const noexcept;
 
   friend bool operator==(const ClockLine& a, const ClockLine& b) = default;
 };

@@ -73,10 +73,12 @@ bool is_time(std::int64_t ns) noexcept { return ns > 0 && ns < kMaxTimeNs; }
 void take_line_untrusted(const proto::ClockLine& message, ClockReport& out) {
   const std::int64_t rate = message.rate_ppb();
   if (!is_time(message.raw_ns()) || !is_time(message.wall_ns()) || message.setting() == 0 ||
-      rate < -clock::ClockLine::kMaxRate || rate > clock::ClockLine::kMaxRate) {
+      rate < -clock::ClockLine::kMaxRate || rate > clock::ClockLine::kMaxRate ||
+      !is_time(message.tolerance_ns())) {
     return;
   }
-  out.line = {RawTime(Duration(message.raw_ns())), time_from_ns(message.wall_ns()), rate};
+  out.line = {RawTime(Duration(message.raw_ns())), time_from_ns(message.wall_ns()), rate,
+              Duration(message.tolerance_ns())};
   out.setting = message.setting();
   out.setting_from = time_from_ns(message.setting_from_ns());
 }
@@ -130,6 +132,7 @@ void to_message(const ClockReport& report, proto::ClockReport& out) {
     line.set_raw_ns(to_ns(report.line.raw));
     line.set_wall_ns(to_ns(report.line.wall));
     line.set_rate_ppb(report.line.rate);
+    line.set_tolerance_ns(to_ns(report.line.tolerance));
     line.set_setting(report.setting);
     line.set_setting_from_ns(to_ns(report.setting_from));
   }

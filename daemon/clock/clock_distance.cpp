@@ -7,6 +7,12 @@
 #include "core/base/time.hpp"
 
 namespace dssm::clock {
+namespace {
+
+// Lines that promise less are not worth a statement, and sums with them would overflow.
+constexpr Duration kMaxBlur = std::chrono::seconds(1);
+
+}  // namespace
 
 Duration distance(const wire::ClockReport& one, const wire::ClockReport& other) noexcept {
   if (one.shares_clock_with(other)) return {};
@@ -35,9 +41,10 @@ std::optional<WallDifference> wall_difference(const PairMeasurement::Difference&
   const std::optional<Time> least = theirs.at(now.raw + raws.least);
   const std::optional<Time> greatest = theirs.at(now.raw + raws.greatest);
   if (!least || !greatest || !ours.exists()) return std::nullopt;
-  const Duration blur = ClockLine::kTolerance + now.width;
+  const Duration blur = sum(theirs.tolerance, now.width);
   // The rates of the lines differ by what the daemons of the clocks correct and slew.
   const PartsPerBillion corrected = theirs.rate - ours.rate;
+  if (blur > kMaxBlur) return std::nullopt;
   return WallDifference{
       *least - now.wall - blur, *greatest - now.wall + blur,
       std::max(std::abs(corrected + raws.slowest), std::abs(corrected + raws.fastest))};

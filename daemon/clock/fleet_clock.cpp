@@ -23,8 +23,6 @@ namespace {
 
 constexpr Duration kAddressesPeriod = std::chrono::seconds(5);
 
-// What others are promised is ClockLine::kTolerance; the rest is for reading two clocks.
-constexpr Duration kLineTolerance = clock::ClockLine::kTolerance - std::chrono::microseconds(2);
 // A line is replaced before it is too old for others.
 constexpr Duration kLineAge = clock::ClockLine::kMaxAge / 4;
 
@@ -100,7 +98,9 @@ void FleetClock::on_clock() { refresh(); }
 
 void FleetClock::on_host_clock(const KnownHost& host) {
   if (host.greeting.clock) {
-    clock_generation();  // first: whether this clock was set since the heartbeat was sent
+    // First whether this clock was set since the heartbeat was sent. Not for other reports: two
+    // hosts must not make each other report for ever.
+    if (host.greeting.clock->heartbeat) clock_generation();
     measure(*host.greeting.clock, clock::Instant::now());
   }
   // The reports of others are used at the latest with the next answer of chronyd.
@@ -114,18 +114,11 @@ void FleetClock::on_host_down(const KnownHost& host, const Error&) {
 }
 
 [[gnu::hot]] std::uint64_t FleetClock::clock_generation() {
-  const bool is_on_line = holds_line();
+  const bool is_on_line = own_->line.holds();
   if (!watch_.may_differ() && is_on_line) return generation_;
   const bool has_bound = watch_.state().bound != kUnknownClockError;
   if (has_bound != own_->has_bound() || !is_on_line) refresh();
   return generation_;
-}
-
-// Read in between two instructions: when this process lost its processor there, refresh() reads the
-// clocks again.
-[[gnu::hot]] bool FleetClock::holds_line() const noexcept {
-  const std::optional<Time> expected = own_->line.at(RawClock::now());
-  return expected && std::chrono::abs(WallClock::now() - *expected) <= kLineTolerance;
 }
 
 // --- this host's report
@@ -138,7 +131,7 @@ void FleetClock::refresh() {
   update_addresses(now);
   update_chain(now);
   update_status();
-  update_line(instant);
+  update_line(instant.raw);
   publish(instant);
   log_others(now);
   if (is_new_generation(before, *own_)) {
@@ -291,32 +284,29 @@ void FleetClock::publish(const clock::Instant& now) {
   page_.store(state);
 }
 
-// The line through the present reading, with the rate since the line before it began: after two or
-// three of them it has the rate that the clock has now.
-void FleetClock::update_line(const clock::Instant& now) {
+// The next line has the rate since the one before it began: after two or three of them that is the
+// rate that the clock has now.
+void FleetClock::update_line(RawTime now) {
   wire::ClockReport& own = *own_;
+  clock::ClockLine& line = own.line;
   own.setting_from = watch_.setting_from();
   if (const std::int64_t setting = watch_.setting();
       setting != std::exchange(own.setting, setting)) {
     // How far others are is measured anew: the PC may have slept, and its oscillator stood still.
     pairs_.clear();
-    pairs_since_ = now.raw;
-    own.line = {now.raw, now.wall, own.line.rate};
+    pairs_since_ = now;
+    line = clock::ClockLine::now(line.rate);
     return;
   }
-  const Duration age = now.raw - own.line.raw;
-  const std::optional<Time> expected = own.line.at(now.raw);
-  if (expected && std::chrono::abs(now.wall - *expected) <= kLineTolerance && age < kLineAge) {
-    return;
-  }
-  if (expected && age > Duration::zero()) {
-    const Duration gained = (now.wall - own.line.wall) - age;
-    const double rate = static_cast<double>(gained.count()) / static_cast<double>(age.count());
+  if (line.holds() && now - line.raw < kLineAge) return;
+  clock::ClockLine next = clock::ClockLine::now(line.rate);
+  if (const Duration age = next.raw - line.raw; line.exists() && age > Duration::zero()) {
+    const double gained = static_cast<double>(((next.wall - line.wall) - age).count());
     constexpr auto kMax = static_cast<double>(clock::ClockLine::kMaxRate);
-    own.line.rate = static_cast<clock::PartsPerBillion>(std::clamp(rate * 1e9, -kMax, kMax));
+    next.rate = static_cast<clock::PartsPerBillion>(
+        std::clamp(gained / static_cast<double>(age.count()) * 1e9, -kMax, kMax));
   }
-  own.line.raw = now.raw;
-  own.line.wall = now.wall;
+  line = next;
   watch_.poll_now();
 }
 

@@ -140,8 +140,7 @@ class FleetClock final : public ClockAssessor,
   void choose_anchor(const ClockSnapshot& watched, MonoTime now);
   void update_status();
   void publish(const clock::Instant& now);
-  bool holds_line() const noexcept;
-  void update_line(const clock::Instant& now);
+  void update_line(RawTime now);
   void measure(const wire::ClockReport& theirs, const clock::Instant& now);
   std::optional<Measured> measured(const wire::ClockReport& theirs,
                                    const clock::Instant& now) const;

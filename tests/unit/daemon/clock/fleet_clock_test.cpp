@@ -233,7 +233,7 @@ class MeasuredTest : public FleetClockTest {
     wire::Greeting other = host(kOther, "pc3", bound);
     auto report = std::make_shared<wire::ClockReport>(*other.clock);
     const clock::Instant now = later();
-    report->line = {now.raw, now.wall + ahead, 0};
+    report->line = {now.raw, now.wall + ahead, 0, 10us};
     report->setting = setting;
     report->heartbeat = {now.raw - 100us, now.raw - 50us, now.raw};
     other.clock = report;
@@ -307,7 +307,7 @@ TEST_F(MeasuredTest, StatementsThatExcludeEachOtherAreRefused) {
   wire::Greeting reference = host(kReference, "pc1", 5us);
   auto report = std::make_shared<wire::ClockReport>(*reference.clock);
   const clock::Instant now = later();
-  report->line = {now.raw, now.wall + 1ms, 0};  // and chronyd states some 50 us
+  report->line = {now.raw, now.wall + 1ms, 0, 10us};  // and chronyd states some 50 us
   report->setting = 1;
   EXPECT_TRUE(fleet->assess_mirror(lidar, report.get()).can_be_good());
   report->heartbeat = {now.raw - 100us, now.raw - 50us, now.raw};
@@ -323,7 +323,7 @@ TEST_F(MeasuredTest, AStepOfTheReferenceTakesAwayWhatChronydStates) {
   start();
   auto report = std::make_shared<wire::ClockReport>(*catalog.find(kReference)->greeting.clock);
   const clock::Instant now = clock::Instant::now();
-  report->line = {now.raw, now.wall, 0};
+  report->line = {now.raw, now.wall, 0, 10us};
   report->setting = 1;
   catalog.set_clock(kReference, report);
   EXPECT_TRUE(own->has_bound());

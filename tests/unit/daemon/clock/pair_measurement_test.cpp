@@ -37,8 +37,7 @@ struct Pc {
   Time wall() const { return Time(ns(wall_ns)); }
   void step(double by_ns) {
     wall_ns += by_ns;
-    line.raw = raw();
-    line.wall = wall();
+    line = {raw(), wall(), line.rate, 10us};
   }
   // As FleetClock does before each batch of samples.
   void keep_line() {
@@ -51,6 +50,7 @@ struct Pc {
     }
     line.raw = raw();
     line.wall = wall();
+    line.tolerance = 10us;
     ++lines;
   }
 };
