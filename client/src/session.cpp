@@ -63,6 +63,8 @@ HostInfo host_info(const local::Host& message) {
     host.clock_reference = std::move(report.reference);
     host.clock_distance = Duration(message.clock_distance_ns());
   }
+  host.clock_reason = message.clock_reason();
+  host.clock_refused = message.clock_refused();
   host.found_by.assign(message.found_by().begin(), message.found_by().end());
   return host;
 }

@@ -107,7 +107,7 @@ void ClockWatch::on_answer(const TrackingReply& reply, MonoTime asked, const Ins
   last_ = reply;
   absent_ = false;
   waiting_since_.reset();
-  on_change(answered);
+  observer_.on_clock();
 }
 
 void ClockWatch::on_no_chronyd() {
@@ -117,7 +117,7 @@ void ClockWatch::on_no_chronyd() {
   last_.reset();
   absent_ = true;
   waiting_since_.reset();
-  on_change(now);
+  observer_.on_clock();
 }
 
 void ClockWatch::on_no_answer(const Error& why) {
@@ -125,13 +125,13 @@ void ClockWatch::on_no_answer(const Error& why) {
   observe(now);
   if (!waiting_since_) waiting_since_ = now.mono;
   last_error_ = why.message;
-  on_change(now);
+  observer_.on_clock();
 }
 
 void ClockWatch::on_set() {
   const Instant now = now_();
   observe(now);
-  on_change(now);
+  observer_.on_clock();
 }
 
 void ClockWatch::observe(const Instant& now) {
@@ -147,14 +147,12 @@ void ClockWatch::observe(const Instant& now) {
       {.message_id = message_id::kClockStepped});
 }
 
-// Logs a change of the condition, if there is one, and notifies the observer in any case.
-void ClockWatch::on_change(const Instant& now) {
-  const ClockSnapshot state = estimator_.at(now.mono);
-  const Condition is = condition(state, now.mono);
+void ClockWatch::log_change(const ClockSnapshot& state) {
+  const MonoTime now = now_().mono;
+  const Condition is = condition(state, now);
   if (is != std::exchange(seen_, is)) ++unlogged_changes_;
   // One that comes and goes while the log is limited is counted; one that lasts is logged later.
-  if (is != logged_ && change_lines_.wait(now.mono) == Duration::zero()) log(is, state, now.mono);
-  observer_.on_clock();
+  if (is != logged_ && change_lines_.wait(now) == Duration::zero()) log(is, state, now);
 }
 
 ClockWatch::Condition ClockWatch::condition(const ClockSnapshot& state,
@@ -244,7 +242,8 @@ std::string ClockWatch::in_bounds(Condition condition, const ClockSnapshot& stat
 
 std::string ClockWatch::too_far(const ClockSnapshot& state) const {
   const Duration off = std::chrono::abs(state.offset);
-  const Duration aged = clock::growth(state.age, state.ageing_ppb);
+  const Duration aged = state.basis == ClockBasis::own ? Duration::zero()
+                                                       : clock::growth(state.age, state.ageing_ppb);
   const Duration of_source = state.bound - off - aged;
   const std::string text =
       fmt::format("this PC's clock may be wrong by {}, more than its limit of {}",

@@ -67,6 +67,10 @@ class ClockWatch final : private ChronydClient::Observer {
   bool may_differ();
   static constexpr Duration kMaxDelay = std::chrono::milliseconds(50);
 
+  // Logs the state of this clock, if it has changed: what others get, whose bound may be against
+  // another clock than that of the source. The observer calls it each time.
+  void log_change(const ClockSnapshot& state);
+
   // dssmd is awake: a question to chronyd that is about due is sent now.
   void poll_if_due() { client_.poll_if_due(); }
   // Someone slews the clock anew, probably chronyd, which may have measured since it was asked.
@@ -100,7 +104,6 @@ class ClockWatch final : private ChronydClient::Observer {
   void on_set();
 
   void observe(const clock::Instant& now);
-  void on_change(const clock::Instant& now);
   Condition condition(const ClockSnapshot& state, MonoTime now) const noexcept;
   void log(Condition condition, const ClockSnapshot& state, MonoTime now);
   std::string in_bounds(Condition condition, const ClockSnapshot& state) const;

@@ -53,6 +53,12 @@ std::uint32_t ppb(clock::PartsPerBillion ageing) noexcept {
       std::clamp<clock::PartsPerBillion>(ageing, 0, ring::ClockAssessment::kMaxAgeingPpb));
 }
 
+// "out of bounds (stepped)"
+std::string status_text(const ClockSnapshot& clock) {
+  if (clock.reason == ClockReason::none) return std::string(name_of(clock.status));
+  return fmt::format("{} ({})", name_of(clock.status), name_of(clock.reason));
+}
+
 bool is_good(ClockStatus status) noexcept {
   return status == ClockStatus::synchronized || status == ClockStatus::holdover;
 }
@@ -133,6 +139,7 @@ void FleetClock::refresh() {
   update_status();
   update_line(instant.raw);
   publish(instant);
+  watch_.log_change(own_->clock);
   log_others(now);
   if (is_new_generation(before, *own_)) {
     ++generation_;
@@ -470,7 +477,7 @@ ring::ClockAssessment FleetClock::assessment(const StreamId& id, MonoTime now) c
 std::string FleetClock::reason_against(const wire::ClockReport* owner, Duration limit) const {
   if (!owner) return "nothing is known of its host's clock";
   if (own_->shares_clock_with(*owner)) return {};
-  const Duration distance = distance_to(*owner);
+  const Duration distance = distance_of_samples(*owner);
   if (distance <= limit) return {};
   const clock::Instant now = clock::Instant::now();
   const Duration chain = chain_distance(*owner, now.mono);
@@ -485,16 +492,25 @@ std::string FleetClock::reason_against(const wire::ClockReport* owner, Duration 
   }
   if (distance != kUnknownClockError) {
     return fmt::format(
-        "the clocks of its host and of this PC may be {} apart, and {} are allowed (key "
-        "clock_limit)",
+        "its samples' times may be {} from this PC's clock, and {} are allowed (key clock_limit)",
         in_microseconds(distance), in_microseconds(limit));
   }
-  if (!own_->has_bound()) return fmt::format("the {} on this PC", str());
-  if (!owner->has_bound()) {
-    return fmt::format("the clock of its host is {} ({})", name_of(owner->clock.status),
-                       name_of(owner->clock.reason));
-  }
+  if (!own_->has_bound()) return "this PC's clock is " + status_text(own_->clock);
+  if (!owner->has_bound()) return "the clock of its host is " + status_text(owner->clock);
   return "the clocks of its host and of this PC follow different references";
+}
+
+std::string FleetClock::reason_against(const wire::ClockReport* owner) const {
+  if (policies_.general.policy == ClockPolicy::off) return {};
+  return reason_against(owner, policies_.general.limit);
+}
+
+// Of one that the host writes now, as readers compute it. It may be more than distance_to(): a
+// sample's clock error is against the anchor, which may be further away than its writer.
+Duration FleetClock::distance_of_samples(const wire::ClockReport& owner) const {
+  const MonoTime now = MonoClock::now();
+  const SampleInfo latest{0, Time::max(), owner.at(now).clock.bound};  // after measured_from
+  return assess_mirror({}, &owner).distance(latest, now);
 }
 
 Error FleetClock::refusal(const StreamId& id, const wire::ClockReport* owner) const {

@@ -88,6 +88,11 @@ class FleetClock final : public ClockAssessor,
   void poll_if_due() { watch_.poll_if_due(); }
   // How far that host's clock may be from this one's.
   Duration distance_to(const wire::ClockReport& other) const;
+  // Why the times of that host's samples are not good here, in a sentence; empty: they are, or
+  // clock_policy is off. nullptr: it reports no clock. Not by the exceptions in clock_streams.
+  std::string reason_against(const wire::ClockReport* owner) const;
+  // Whether reads by time are refused for such a reason; otherwise it is only shown.
+  bool refuses() const noexcept { return policies_.general.policy == ClockPolicy::enforce; }
   // The shared page for this PC's programs, for reading (core/clock/clock_page.hpp).
   Result<UniqueFd> page_for_reading() const { return page_.for_reading(); }
 
@@ -148,6 +153,7 @@ class FleetClock final : public ClockAssessor,
   void log_others(MonoTime now);
   ring::ClockAssessment assessment(const StreamId& id, MonoTime now) const;
   std::string reason_against(const wire::ClockReport* owner, Duration limit) const;
+  Duration distance_of_samples(const wire::ClockReport& owner) const;
 
   Catalog& catalog_;
   clock::ClockPageWriter page_;

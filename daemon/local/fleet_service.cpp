@@ -288,19 +288,25 @@ std::vector<local::Host> FleetService::hosts() const {
   self.set_error(warning.text);
   self.set_clock_distance_ns(0);
   for (local::Host& host : report.hosts()) {
-    host.set_clock_distance_ns(to_ns(clock_distance_to(host)));
+    state_clock(host);
     hosts.push_back(std::move(host));
   }
   return hosts;
 }
 
-Duration FleetService::clock_distance_to(const local::Host& host) const {
+// How far its clock is from this PC's, and whether its samples' times are good here.
+void FleetService::state_clock(local::Host& host) const {
+  host.set_clock_distance_ns(to_ns(kUnknownClockError));
   wire::HostId id{};
-  if (!self_.clock || host.host_id().size() != id.size()) return kUnknownClockError;
+  if (!self_.clock || host.host_id().size() != id.size()) return;
   std::copy(host.host_id().begin(), host.host_id().end(), id.begin());
   const KnownHost* known = catalog_.find(id);
-  if (!known || !known->greeting.clock) return kUnknownClockError;
-  return self_.clock->distance_to(*known->greeting.clock);
+  if (!known) return;
+  const wire::ClockReport* clock = known->greeting.clock.get();
+  if (clock) host.set_clock_distance_ns(to_ns(self_.clock->distance_to(*clock)));
+  if (host.state() != local::Host::UP) return;
+  host.set_clock_reason(self_.clock->reason_against(clock));
+  host.set_clock_refused(!host.clock_reason().empty() && self_.clock->refuses());
 }
 
 Result<UniqueFd> FleetService::clock_page() const {

@@ -94,7 +94,7 @@ class FleetService final : public Fleet, private CatalogObserver {
   void on_remote_stream_added(const KnownHost& host, const StreamInfo& stream) override;
   void on_remote_stream_removed(const KnownHost& host, const StreamInfo& stream) override;
 
-  Duration clock_distance_to(const local::Host& host) const;
+  void state_clock(local::Host& host) const;
 
   const EventLoop& loop_;
   const Self self_;

@@ -82,8 +82,13 @@ struct HostInfo {
   std::optional<ClockSnapshot> clock;    // aged to the present; empty: it reports none
   std::string clock_reference;  // what its clock follows: a host's name or an address, or empty
   Duration clock_distance = kUnknownClockError;  // greatest distance from this PC's clock
-  bool insecure = false;                         // its traffic is unencrypted
-  std::string error;                             // `reason` in a sentence, for people; empty: none
+  // Why the times of its samples are not good here, in a sentence, for people; empty: they are, or
+  // it is this PC, or not up. With clock_policy "enforce", reads by time refuse them for that.
+  // Streams for which clock_streams has another policy or limit may differ.
+  std::string clock_reason;
+  bool clock_refused = false;
+  bool insecure = false;              // its traffic is unencrypted
+  std::string error;                  // `reason` in a sentence, for people; empty: none
   std::string id;                     // 32 hex digits, independent of the name; empty: unknown
   std::vector<std::string> found_by;  // "peer" (configured), "mdns"; empty: this PC
 

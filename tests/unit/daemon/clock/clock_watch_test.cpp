@@ -51,7 +51,10 @@ class ClockWatchTest : public testing::Test, protected ClockWatch::Observer {
     tracking.root = {20us, 60us};
     restart();
   }
-  void on_clock() override { ++clock_events; }
+  void on_clock() override {
+    ++clock_events;
+    watch->log_change(watch->state());
+  }
 
   void restart() {
     const ClockWatch::Options options{

@@ -38,6 +38,10 @@ wire::Greeting host(wire::HostId id, const std::string& name, Duration bound) {
   return greeting;
 }
 
+bool contains(const std::string& text, std::string_view words) {
+  return text.find(words) != std::string::npos;
+}
+
 class FleetClockTest : public testing::Test {
  protected:
   FleetClockTest() {
@@ -75,6 +79,19 @@ class FleetClockTest : public testing::Test {
     report->addresses = {kReferenceIp};
     reference.clock = report;
     catalog.host_up(reference, {"10.0.0.1", 13776});
+  }
+  // pc2, which follows pc1 within `bound`, and which chronyd here follows.
+  void add_follower(Duration bound) {
+    catalog.host_up(host(kOther, "pc2", 5us), {"10.0.0.1", 13776});
+    set_follower(bound);
+  }
+  void set_follower(Duration bound) {
+    auto report = std::make_shared<wire::ClockReport>(*host(kOther, "pc2", 5us).clock);
+    report->addresses = {kReferenceIp};
+    report->chain.push_back({kReference, bound});
+    report->anchor = kReference;
+    report->clock.bound = bound;
+    catalog.set_clock(kOther, report);
   }
   ring::ClockAssessment assessed(const wire::Greeting& owner) const {
     return fleet->assess_mirror(lidar, owner.clock.get());
@@ -343,6 +360,55 @@ TEST_F(MeasuredTest, OwnReportsSayWhatTheClockShows) {
   ASSERT_TRUE(shown);
   EXPECT_LT(std::chrono::abs(*shown - WallClock::now()), 1s);
   EXPECT_NE(own->setting, 0);
+}
+
+// What programs and the log are told must be what readers do: these differed, once.
+
+TEST_F(FleetClockTest, RefusesForTheErrorOfItsSamplesEvenWhereItsClockIsNear) {
+  add_follower(1200us);
+  start();
+  const wire::ClockReport& pc2 = *catalog.find(kOther)->greeting.clock;
+  EXPECT_LT(fleet->distance_to(pc2), policies.general.limit);
+  const SampleInfo latest{0, WallClock::now(), pc2.clock.bound};
+  EXPECT_FALSE(fleet->assess_mirror(lidar, &pc2).is_good(latest, MonoClock::now()));
+  EXPECT_TRUE(contains(fleet->reason_against(&pc2), "1500 us are allowed"));
+  EXPECT_TRUE(fleet->refuses());
+  EXPECT_TRUE(contains(fleet->refusal(lidar, &pc2).message, "1500 us are allowed"));
+  policies.general.policy = ClockPolicy::mark;
+  fleet->set(policies, 50'000);
+  EXPECT_FALSE(fleet->reason_against(&pc2).empty());
+  EXPECT_FALSE(fleet->refuses());
+  policies.general.policy = ClockPolicy::off;
+  fleet->set(policies, 50'000);
+  EXPECT_EQ(fleet->reason_against(&pc2), "");
+}
+
+TEST_F(FleetClockTest, LogsThatItIsTooFarFromTheReferenceThoughNotFromItsSource) {
+  add_follower(20us);
+  start();
+  EXPECT_EQ(own->anchor, kReference);
+  EXPECT_EQ(own->clock.status, ClockStatus::synchronized);
+  EXPECT_TRUE(logger.contains("this PC's clock is within"));
+  set_follower(1490us);
+  wait([this] { return own->clock.reason == ClockReason::too_far; });
+  EXPECT_TRUE(logger.contains("more than its limit of 1.500 ms"));
+}
+
+TEST_F(FleetClockTest, LogsOfOtherHostsWhatReadersDoWhileThisClockIsBad) {
+  add_reference();
+  start();
+  EXPECT_FALSE(logger.contains("'pc1''s samples"));
+  tracking.leap = clock::Tracking::kUnsynchronized;
+  wait([this] { return own->clock.bound == kUnknownClockError; });
+  EXPECT_EQ(logger.warnings.back(),
+            "the times of 'pc1''s samples are not good here: this PC's clock is out of bounds (not "
+            "synchronised)");
+  tracking.leap = 0;
+  wait([this] { return own->clock.status == ClockStatus::synchronized; });
+  EXPECT_EQ(logger.notices.back(), "the times of 'pc1''s samples are good here again");
+  EXPECT_EQ(std::count_if(logger.lines.begin(), logger.lines.end(),
+                          [](const std::string& line) { return contains(line, "'pc1''s"); }),
+            2);
 }
 
 TEST_F(FleetClockTest, ProgramsOfThisPcFindTheBoundOnThePage) {
