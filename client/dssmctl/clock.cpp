@@ -10,6 +10,7 @@
 #include <map>
 #include <thread>
 
+#include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
@@ -26,23 +27,29 @@ bool is_there(const HostInfo& host) {
   return host.state == HostState::self || host.state == HostState::up;
 }
 
-bool is_good(const ClockSnapshot& clock) {
-  return clock.status == ClockStatus::synchronized || clock.status == ClockStatus::holdover;
-}
-
-std::string status_text(const ClockSnapshot& clock) {
-  if (clock.reason == ClockReason::none) return std::string(name_of(clock.status));
-  return fmt::format("{}: {}", name_of(clock.status), name_of(clock.reason));
-}
-
 std::string reference_text(const HostInfo& host) {
   if (host.clock->basis == ClockBasis::own) return "itself";
   return or_dash(escaped(host.clock_reference));
 }
 
+// What reads by time do with its samples here; nullptr: it is this PC.
+const char* reads_text(const HostInfo& host) {
+  if (host.state == HostState::self) return nullptr;
+  return host.clock_reason.empty() ? "good" : host.clock_refused ? "refused" : "marked";
+}
+
+std::string reads_cell(const HostInfo& host) {
+  const char* const reads = reads_text(host);
+  if (!reads) return "-";
+  if (host.clock_reason.empty()) return reads;
+  return fmt::format("{}: {}", reads, escaped_message(host.clock_reason));
+}
+
 // A host whose clock is not known has dashes.
 std::vector<std::string> clock_row(const HostInfo& host) {
-  if (!host.clock) return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-"};
+  if (!host.clock) {
+    return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-", reads_cell(host)};
+  }
   const ClockSnapshot& clock = *host.clock;
   const bool is_read = clock.status != ClockStatus::unknown && clock.age > Duration::zero();
   return {escaped(host.name),
@@ -52,7 +59,8 @@ std::vector<std::string> clock_row(const HostInfo& host) {
           is_read ? duration_text(clock.offset) : "-",
           reference_text(host),
           clock.update_interval > Duration::zero() ? duration_text(clock.update_interval) : "-",
-          is_read ? duration_text(clock.age) : "-"};
+          is_read ? duration_text(clock.age) : "-",
+          reads_cell(host)};
 }
 
 Json clock_json(const HostInfo& host) {
@@ -71,6 +79,9 @@ Json clock_json(const HostInfo& host) {
   json["stratum"] = clock.stratum;
   json["poll_ns"] = to_ns(clock.update_interval);
   json["age_ns"] = to_ns(clock.age);
+  const char* const reads = reads_text(host);
+  json["reads"] = reads ? Json(reads) : Json();
+  json["reads_reason"] = or_null(host.clock_reason);
   return json;
 }
 
@@ -89,7 +100,8 @@ void print_clocks(const std::vector<HostInfo>& hosts, bool json, Output& out) {
                {"OFFSET", Table::Align::right},
                {"REFERENCE"},
                {"POLL", Table::Align::right},
-               {"AGE", Table::Align::right}});
+               {"AGE", Table::Align::right},
+               {"READS"}});
   for (const HostInfo& host : hosts) {
     if (is_there(host)) table.add_row(clock_row(host));
   }

@@ -31,6 +31,15 @@ Json mirror_json(const MirrorInfo& mirror) {
 
 }  // namespace
 
+bool is_good(const ClockSnapshot& clock) {
+  return clock.status == ClockStatus::synchronized || clock.status == ClockStatus::holdover;
+}
+
+std::string status_text(const ClockSnapshot& clock) {
+  if (clock.reason == ClockReason::none) return std::string(name_of(clock.status));
+  return fmt::format("{}: {}", name_of(clock.status), name_of(clock.reason));
+}
+
 Json host_json(const HostInfo& host) {
   Json json;
   json["host"] = or_null(host.name);

@@ -19,6 +19,9 @@ std::vector<std::string> host_row(const HostInfo& host);  // a cell for each col
 
 Json host_json(const HostInfo& host);
 
+bool is_good(const ClockSnapshot& clock);             // its bound is within the limit
+std::string status_text(const ClockSnapshot& clock);  // "out of bounds: stepped"
+
 // --- streams: the same keys in `ls` and `info`
 
 Json stream_json(const StreamInfo& stream, Time now);

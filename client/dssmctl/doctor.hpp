@@ -45,7 +45,8 @@ struct DiskFacts {
 struct ClockFacts {
   enum class State : std::uint8_t { no_chrony, no_answer, unsynchronized, synchronized };
   State state = State::no_chrony;
-  std::string detail;  // what chronyc printed; the source when synchronized
+  std::string detail;   // what chronyc printed; the source when synchronized
+  bool serves = false;  // the Ansible role made this PC serve its clock to the others
 };
 
 struct Facts {
@@ -100,6 +101,10 @@ struct Finding {
   std::string cause = {};    // the likely one; empty when ok
   std::string command = {};  // that fixes it, or shows more; empty when ok
 
+  void fail(std::string likely_cause, std::string helpful_command) {
+    warn(std::move(likely_cause), std::move(helpful_command));
+    status = Status::fail;
+  }
   void warn(std::string likely_cause, std::string helpful_command) {
     status = Status::warn;
     cause = std::move(likely_cause);

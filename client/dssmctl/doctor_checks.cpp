@@ -9,6 +9,7 @@
 #include <set>
 #include <string_view>
 
+#include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/doctor.hpp"
 #include "client/dssmctl/names.hpp"
 #include "client/dssmctl/text.hpp"
@@ -20,6 +21,8 @@ using Status = Finding::Status;
 using Findings = std::vector<Finding>;
 
 constexpr std::uint64_t kMebibyte = 1U << 20;
+// With less, systemd refuses to reload its units, and so does a restart after an upgrade.
+constexpr std::uint64_t kMinRunBytes = 16 * kMebibyte;
 constexpr std::uint64_t kDescriptorsPerStream = 4;  // of dssmd
 // What dssmd has open beside its streams: its own, and a few programs and hosts. A guess.
 constexpr std::uint64_t kOtherDescriptors = 200;
@@ -183,7 +186,11 @@ void check_disks(const Facts& facts, Findings& findings) {
     Finding finding{
         "disk " + disk.path, Status::ok,
         fmt::format("{} of {} free", bytes_text(disk.free_bytes), bytes_text(disk.total_bytes))};
-    if (disk.free_bytes < disk.total_bytes / 20 || disk.free_bytes < 100 * kMebibyte) {
+    // dssmd itself needs some pages of /run, whose size is a part of the memory's.
+    const bool is_short = disk.path == "/run" ? disk.free_bytes < kMinRunBytes
+                                              : disk.free_bytes < disk.total_bytes / 20 ||
+                                                    disk.free_bytes < 100 * kMebibyte;
+    if (is_short) {
       finding.warn("logs and recordings fill disks", disk.path == "/run"
                                                          ? "du -xh -d 2 /run | sort -h | tail"
                                                          : "sudo journalctl --vacuum-size=200M");
@@ -192,26 +199,134 @@ void check_disks(const Facts& facts, Findings& findings) {
   }
 }
 
-Finding check_clock(const Facts& facts) {
+std::string restart_chrony(const Facts& facts) {
+  return facts.systemd ? "sudo systemctl restart chrony" : "sudo service chrony restart";
+}
+
+// By chronyc alone, while dssmd does not answer.
+Finding check_chronyd(const Facts& facts) {
   const auto with_detail = [&](const char* text) {
     return facts.clock.detail.empty() ? text : fmt::format("{} ({})", text, facts.clock.detail);
   };
   switch (facts.clock.state) {
     case ClockFacts::State::no_answer:
       return {"clock", Status::warn, with_detail("chronyd does not answer"),
-              "chronyd is not running", start_command(facts, "chrony")};
+              "chronyd is not running", restart_chrony(facts)};
     case ClockFacts::State::unsynchronized:
-      return {"clock", Status::warn, with_detail("chronyd does not follow any other clock"),
-              "it was just started, or no source answers",
-              "chronyc sources  # then correct 'server' lines in /etc/chrony/chrony.conf"};
+      return {"clock", Status::warn, with_detail("chronyd does not know the time"),
+              "it was just started, or no source answers", "chronyc sources"};
     case ClockFacts::State::synchronized:
-      return {"clock", Status::ok, with_detail("chronyd keeps this clock by another one")};
+      return {"clock", Status::ok, with_detail("chronyd keeps this clock")};
     case ClockFacts::State::no_chrony:
       break;
   }
   return {"clock", Status::warn, "chrony is not installed",
           "nothing bounds the difference between this clock and the others",
           "sudo apt install chrony"};
+}
+
+struct Advice {
+  std::string cause, command;
+};
+
+// What helps a clock that is not good. `where`: "", or "on pc2: ".
+Advice clock_advice(const Facts& facts, const ClockSnapshot& clock, bool serves,
+                    const std::string& where) {
+  const Duration offset = std::chrono::abs(clock.offset);
+  switch (clock.reason) {
+    case ClockReason::no_chronyd:
+    case ClockReason::silent:
+      return {where + "chronyd is not running, hangs, or its cmdport is closed",
+              restart_chrony(facts)};
+    case ClockReason::unsynchronized:
+      if (serves) {
+        return {where +
+                    "chronyd lost the set-up of a PC that serves its clock ('local stratum'), "
+                    "as after a crash",
+                restart_chrony(facts)};
+      }
+      return {where + "chronyd was just started, or no source answers",
+              "chronyc sources  # then correct 'server' lines in /etc/chrony"};
+    case ClockReason::stepped:
+      return {where + "a program set the clock, or chronyd did",
+              "dssmctl clock --wait 60  # chronyd has to measure it some times again"};
+    case ClockReason::too_far:
+      if (2 * offset > clock.bound) {
+        return {fmt::format("{}the clock is {} off, which chronyd slews away", where,
+                            duration_text(offset)),
+                "sudo chronyc makestep  # or wait"};
+      }
+      return {where + "chronyd has no near source, or has not heard it for long",
+              "chronyc sources  # and chronyc ntpdata: which source, how far, since when"};
+    case ClockReason::none:
+      break;
+  }
+  return {where + "dssmd or chronyd was just started", "dssmctl clock --wait 60"};
+}
+
+bool follows(const HostInfo& host, const HostInfo& other) {
+  return host.state == HostState::up && !other.name.empty() && host.clock_reference == other.name;
+}
+
+// Those whose clocks follow that host's.
+std::vector<std::string> followers(const Facts& facts, const HostInfo& of) {
+  std::vector<std::string> names;
+  for (const HostInfo& host : facts.hosts) {
+    if (follows(host, of)) names.push_back(host.name);
+  }
+  return names;
+}
+
+std::string good_clock_text(const Facts& facts, const HostInfo& self) {
+  const ClockSnapshot& clock = *self.clock;
+  if (clock.basis == ClockBasis::own) {
+    const std::vector<std::string> names = followers(facts, self);
+    return names.empty() ? "this PC is the fleet's reference; no other PC's clock follows it now"
+                         : "this PC is the fleet's reference; other PCs' clocks follow it: " +
+                               list_text(names);
+  }
+  return fmt::format("at most {} from {}; chronyd follows '{}'", bound_text(clock.bound),
+                     clock.basis == ClockBasis::reference ? "the fleet's reference" : "UTC",
+                     self.clock_reference);
+}
+
+// As dssmd uses it. It is an error when reads by time fail for it: a PC without others has none.
+Finding check_clock(const Facts& facts) {
+  if (facts.failed || facts.hosts.empty() || !facts.hosts.front().clock) {
+    return check_chronyd(facts);
+  }
+  const HostInfo& self = facts.hosts.front();
+  const ClockSnapshot& clock = *self.clock;
+  if (is_good(clock)) {
+    Finding finding{"clock", Status::ok, good_clock_text(facts, self)};
+    if (clock.status == ClockStatus::holdover) {
+      finding.text += fmt::format("; chronyd has not measured for {}", duration_text(clock.age));
+      finding.warn("the PC that it follows is off, or its packets do not arrive",
+                   "chronyc sources");
+    }
+    return finding;
+  }
+  Finding finding{"clock", Status::ok, status_text(clock)};
+  if (clock.bound != kUnknownClockError) {
+    finding.text += fmt::format("; it may be {} off", bound_text(clock.bound));
+  }
+  if (facts.clock.state == ClockFacts::State::synchronized && !facts.clock.detail.empty()) {
+    finding.text += fmt::format("; chronyc reports that chronyd follows {}", facts.clock.detail);
+  }
+  const bool serves = facts.clock.serves || !followers(facts, self).empty();
+  Advice advice = clock_advice(facts, clock, serves, "");
+  if (facts.clock.state == ClockFacts::State::no_chrony &&
+      clock.reason == ClockReason::no_chronyd) {
+    advice = {"chrony is not installed", "sudo apt install chrony"};
+  }
+  const bool refused = std::any_of(facts.hosts.begin(), facts.hosts.end(),
+                                   [](const HostInfo& host) { return host.clock_refused; });
+  if (refused) {
+    finding.fail(std::move(advice.cause), std::move(advice.command));
+  } else {
+    finding.warn(std::move(advice.cause), std::move(advice.command));
+  }
+  return finding;
 }
 
 // --- the others
@@ -407,19 +522,32 @@ void check_hosts(const Facts& facts, Findings& findings) {
   }
 }
 
-// How far the clocks of the other PCs may be from this one's.
+// Whether reads by time of the other PCs' samples succeed here, by what readers themselves use.
 void check_fleet_clocks(const Facts& facts, Findings& findings) {
   for (const HostInfo& host : facts.hosts) {
-    if (host.state != HostState::up || !is_other_pc(host) || !host.clock) continue;
+    if (host.state != HostState::up || (!host.clock && host.clock_reason.empty())) continue;
+    if (!is_other_pc(host) && host.clock_reason.empty()) continue;
     Finding finding{"clock of " + name_of(host), Status::ok,
                     fmt::format("at most {} from this one's", bound_text(host.clock_distance))};
-    if (host.clock_distance == kUnknownClockError) {
-      finding.text = fmt::format("it is not known how far it is from this one's ({} there)",
-                                 dssm::name_of(host.clock->status));
-      finding.warn(
-          "one of both is not synchronized, or they follow different references; reads of its "
-          "samples by time are refused, unless clock_policy says otherwise",
-          "dssmctl clock  # then `chronyc sources` where it is not 'synchronized'");
+    if (!host.clock_reason.empty()) {
+      finding.text =
+          fmt::format("reads of its samples by time are {}: {}",
+                      host.clock_refused ? "refused" : "marked as bad", host.clock_reason);
+      const std::optional<ClockSnapshot>& own = facts.hosts.front().clock;
+      Advice advice{"the two follow different clocks, or the network delays packets",
+                    "chronyc sources  # here and there: both have to follow one reference"};
+      if (host.clock && !is_good(*host.clock)) {
+        advice = clock_advice(facts, *host.clock, !followers(facts, host).empty(),
+                              fmt::format("on {}: ", name_of(host)));
+        const bool has_note = advice.command.find("  # ") != std::string::npos;
+        advice.command += fmt::format("{} on {}", has_note ? ";" : "  #", name_of(host));
+      } else if (own && !is_good(*own)) {
+        advice = clock_advice(facts, *own,
+                              facts.clock.serves || !followers(facts, facts.hosts.front()).empty(),
+                              "on this PC: ");
+      }
+      finding.warn(std::move(advice.cause), std::move(advice.command));
+      if (host.clock_refused) finding.status = Status::fail;
     }
     findings.push_back(std::move(finding));
   }

@@ -196,7 +196,7 @@ std::vector<DiskFacts> disk_facts() {
 ClockFacts clock_facts() {
   const auto end = run_program({"chronyc", "-c", "tracking"}, kProgramTimeout);
   if (!end) return {};
-  if (!end->in_time) return {ClockFacts::State::no_answer, "chronyc did not end"};
+  if (!end->in_time) return {ClockFacts::State::no_answer, "chronyc did not end", false};
   return clock_facts_untrusted(end->exit_status, end->output);
 }
 
@@ -246,12 +246,12 @@ ClockFacts clock_facts_untrusted(int exit_status, const std::string& output) {
   std::istringstream stream(line);
   for (std::string field; std::getline(stream, field, ',');) fields.push_back(field);
   if (exit_status != 0 || fields.size() != kFields) {
-    return {ClockFacts::State::no_answer, line.substr(0, kMaxChronyWords)};
+    return {ClockFacts::State::no_answer, line.substr(0, kMaxChronyWords), false};
   }
   const std::string& leap = fields[kLeap];
   const bool synchronized = leap == "Normal" || leap == "Insert second" || leap == "Delete second";
   return {synchronized ? ClockFacts::State::synchronized : ClockFacts::State::unsynchronized,
-          synchronized ? fields[kName] : leap};
+          synchronized ? fields[kName] : leap, false};
 }
 
 std::uint64_t soft_limit_untrusted(const std::string& limits) {
@@ -279,6 +279,7 @@ Facts collect_facts(const CommonOptions& options) {
   facts.avahi_installed = exists("/usr/sbin/avahi-daemon");
   facts.avahi_running = exists("/run/avahi-daemon/pid");
   facts.clock = clock_facts();
+  facts.clock.serves = exists("/etc/systemd/system/dssm-clock-server.service");
   facts.disks = disk_facts();
   return facts;
 }

@@ -31,12 +31,16 @@ TEST_F(Clock, HasARowForEachHostThatIsThere) {
   EXPECT_TRUE(shown[0]["bound_ns"].is_null());
   EXPECT_TRUE(shown[0]["reference"].is_null());
   EXPECT_EQ(shown[1]["host"], "pc2");
+  EXPECT_TRUE(shown[0]["reads"].is_null());
   EXPECT_EQ(shown[1]["distance_ns"], 0) << "both have this kernel's clock";
+  EXPECT_EQ(shown[1]["reads"], "good");
+  EXPECT_TRUE(shown[1]["reads_reason"].is_null());
 
   const std::vector<std::string> lines = lines_of(output({"clock"}));
   ASSERT_EQ(lines.size(), 3U);
-  EXPECT_EQ(words_of(lines[0]), (std::vector<std::string>{"HOST", "STATUS", "BOUND", "FROM", "HERE",
-                                                          "OFFSET", "REFERENCE", "POLL", "AGE"}));
+  EXPECT_EQ(words_of(lines[0]),
+            (std::vector<std::string>{"HOST", "STATUS", "BOUND", "FROM", "HERE", "OFFSET",
+                                      "REFERENCE", "POLL", "AGE", "READS"}));
   EXPECT_TRUE(contains(lines[1], "no chronyd")) << lines[1];
 }
 

@@ -88,7 +88,7 @@ TEST_F(Doctor, RunsChronyc) {
       run(argv({"doctor", "--json"}),
           {daemon_.environment(), "PATH=" + folder + ":" + (path ? path : "/usr/bin:/bin")});
   const Json clock = check(checked(finished), "clock");
-  EXPECT_EQ(clock["status"], "ok") << clock;
+  EXPECT_EQ(clock["status"], "warn") << "dssmd reaches no chronyd: " << clock;
   EXPECT_TRUE(contains(clock["text"], "ntp.pc9")) << clock;
 }
 

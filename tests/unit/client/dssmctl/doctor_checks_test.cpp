@@ -62,7 +62,7 @@ Facts healthy() {
   facts.memory = {8 * kGiB, 6 * kGiB};
   facts.descriptors.soft_limit = 1024;
   facts.avahi_installed = facts.avahi_running = true;
-  facts.clock = {ClockFacts::State::synchronized, "pc2"};
+  facts.clock = {ClockFacts::State::synchronized, "pc2", false};
   facts.disks = {{"/", 100 * kGiB, 50 * kGiB}, {"/run", kGiB, kGiB}};
   return facts;
 }
@@ -169,18 +169,103 @@ TEST(Doctor, WarnsOfFullDisks) {
   Facts facts = healthy();
   facts.disks[0].free_bytes = 4 * kGiB;  // of 100
   EXPECT_FINDING(facts, "disk /", Status::warn, "vacuum");
-  facts.disks[1].free_bytes = 99ULL << 20;  // of 1 GiB
+}
+
+TEST(Doctor, WarnsOfRunOnlyWhenSystemdHasTooLittle) {
+  Facts facts = healthy();
+  facts.disks[1] = {"/run", 70ULL << 20, 68ULL << 20};  // of a PC with 384 MiB of memory
+  EXPECT_FINDING(facts, "disk /run", Status::ok, "");
+  facts.disks[1].free_bytes = 15ULL << 20;
   EXPECT_FINDING(facts, "disk /run", Status::warn, "du ");
 }
 
-TEST(Doctor, ChecksTheClock) {
+TEST(Doctor, ChecksTheClockByChronycWhileDssmdDoesNotReport) {
   Facts facts = healthy();
-  facts.clock = {ClockFacts::State::no_chrony, ""};
+  facts.clock = {ClockFacts::State::no_chrony, "", false};
   EXPECT_FINDING(facts, "clock", Status::warn, "apt install chrony");
-  facts.clock = {ClockFacts::State::no_answer, "506 Cannot talk to daemon"};
-  EXPECT_FINDING(facts, "clock", Status::warn, "systemctl enable --now chrony");
-  facts.clock = {ClockFacts::State::unsynchronized, "Not synchronised"};
+  facts.clock = {ClockFacts::State::no_answer, "506 Cannot talk to daemon", false};
+  EXPECT_FINDING(facts, "clock", Status::warn, "systemctl restart chrony");
+  facts.clock = {ClockFacts::State::unsynchronized, "Not synchronised", false};
   EXPECT_FINDING(facts, "clock", Status::warn, "chronyc sources");
+}
+
+ClockSnapshot clock_of(ClockStatus status, ClockReason reason, ClockBasis basis,
+                       Duration bound = kUnknownClockError) {
+  ClockSnapshot clock;
+  clock.status = status;
+  clock.reason = reason;
+  clock.basis = basis;
+  clock.bound = bound;
+  return clock;
+}
+
+// Both clocks are good; pc2's follows pc1's.
+Facts with_clocks() {
+  Facts facts = healthy();
+  facts.hosts[0].clock = clock_of(ClockStatus::synchronized, ClockReason::none, ClockBasis::own,
+                                  std::chrono::microseconds(1));
+  facts.hosts[1].clock = clock_of(ClockStatus::synchronized, ClockReason::none,
+                                  ClockBasis::reference, std::chrono::microseconds(250));
+  facts.hosts[1].clock_reference = "pc1";
+  facts.hosts[1].clock_distance = std::chrono::microseconds(250);
+  return facts;
+}
+
+void refuse(Facts& facts, std::string reason) {
+  facts.hosts[1].clock_reason = std::move(reason);
+  facts.hosts[1].clock_refused = true;
+}
+
+TEST(Doctor, CallsTheReferenceTheReference) {
+  Facts facts = with_clocks();
+  EXPECT_EQ(finding_of(facts, "clock").text,
+            "this PC is the fleet's reference; other PCs' clocks follow it: pc2");
+  std::swap(facts.hosts[0].clock, facts.hosts[1].clock);
+  facts.hosts[0].clock_reference = "pc2";
+  EXPECT_EQ(finding_of(facts, "clock").text,
+            "at most 250 us from the fleet's reference; chronyd follows 'pc2'");
+  facts.hosts[0].clock->status = ClockStatus::holdover;
+  EXPECT_FINDING(facts, "clock", Status::warn, "chronyc sources");
+}
+
+TEST(Doctor, FailsWhereThisClockIsWhyReadsAreRefused) {
+  for (const auto& [reason, command] :
+       {std::pair(ClockReason::no_chronyd, "sudo systemctl restart chrony"),
+        std::pair(ClockReason::silent, "sudo systemctl restart chrony"),
+        std::pair(ClockReason::unsynchronized, "chronyc sources"),
+        std::pair(ClockReason::stepped, "dssmctl clock --wait"),
+        std::pair(ClockReason::too_far, "chronyc sources")}) {
+    Facts facts = with_clocks();
+    facts.hosts[1].clock_reference.clear();
+    facts.hosts[0].clock = clock_of(ClockStatus::out_of_bounds, reason, ClockBasis::nothing);
+    EXPECT_FINDING(facts, "clock", Status::warn, command);  // no reads fail for it
+    refuse(facts, "this PC's clock is out of bounds");
+    EXPECT_FINDING(facts, "clock", Status::fail, command);
+    EXPECT_FINDING(facts, "clock of pc2", Status::fail, command);
+  }
+}
+
+TEST(Doctor, LetsAClockThatIsFarOffBeStepped) {
+  Facts facts = with_clocks();
+  facts.hosts[0].clock = clock_of(ClockStatus::out_of_bounds, ClockReason::too_far,
+                                  ClockBasis::reference, std::chrono::milliseconds(553));
+  facts.hosts[0].clock->offset = std::chrono::milliseconds(552);
+  refuse(facts, "its samples' times may be 552800 us from this PC's clock");
+  EXPECT_FINDING(facts, "clock", Status::fail, "chronyc makestep");
+  EXPECT_NE(finding_of(facts, "clock").text.find("it may be 553 ms off"), std::string::npos)
+      << finding_of(facts, "clock").text;
+}
+
+TEST(Doctor, GivesAReferenceAdviceOfItsRole) {
+  Facts facts = with_clocks();
+  facts.hosts[0].clock =
+      clock_of(ClockStatus::out_of_bounds, ClockReason::unsynchronized, ClockBasis::nothing);
+  refuse(facts, "this PC's clock is out of bounds (not synchronised)");
+  EXPECT_FINDING(facts, "clock", Status::fail, "systemctl restart chrony");  // pc2 names it
+  facts.hosts[1].clock_reference.clear();
+  EXPECT_FINDING(facts, "clock", Status::fail, "chronyc sources");
+  facts.clock.serves = true;
+  EXPECT_FINDING(facts, "clock", Status::fail, "systemctl restart chrony");
 }
 
 TEST(Doctor, WarnsOfLoopbackOnlyWhereThereAreOtherPcs) {
@@ -255,7 +340,7 @@ TEST(Doctor, NamesCommandsThatWorkWithoutSystemd) {
   facts = healthy();
   facts.systemd = false;
   facts.clock.state = ClockFacts::State::no_answer;
-  EXPECT_FINDING(facts, "clock", Status::warn, "sudo service chrony start");
+  EXPECT_FINDING(facts, "clock", Status::warn, "sudo service chrony restart");
   facts.daemon.mdns.phase = MdnsPhase::waiting;
   facts.avahi_running = false;
   EXPECT_FINDING(facts, "mdns", Status::warn, "sudo service avahi-daemon start");
@@ -271,16 +356,22 @@ TEST(Doctor, ForgivesAnAddressThatDoesNotWorkWhileAnotherOfThatHostDoes) {
   EXPECT_FINDING(facts, "host pc2", Status::fail, "ping");
 }
 
-TEST(Doctor, ReportsHowFarClocksAreApartAndWarnsWhenThatIsUnknown) {
-  Facts facts = healthy();
-  facts.hosts[1].clock = ClockSnapshot();
-  facts.hosts[1].clock_distance = std::chrono::microseconds(250);
+TEST(Doctor, FailsWhereReadersRefuse) {
+  Facts facts = with_clocks();
   EXPECT_FINDING(facts, "clock of pc2", Status::ok, "");
   EXPECT_EQ(finding_of(facts, "clock of pc2").text, "at most 250 us from this one's");
-  facts.hosts[1].clock->status = ClockStatus::out_of_bounds;
-  facts.hosts[1].clock_distance = kUnknownClockError;
-  EXPECT_FINDING(facts, "clock of pc2", Status::warn, "dssmctl clock");
-  EXPECT_NE(finding_of(facts, "clock of pc2").text.find("out of bounds there"), std::string::npos);
+  refuse(facts, "its samples' times may be 1600 us from this PC's clock");
+  EXPECT_FINDING(facts, "clock of pc2", Status::fail, "chronyc sources  # here and there");
+  EXPECT_EQ(finding_of(facts, "clock of pc2").text,
+            "reads of its samples by time are refused: its samples' times may be 1600 us from this "
+            "PC's clock");
+  facts.hosts[1].clock =
+      clock_of(ClockStatus::out_of_bounds, ClockReason::no_chronyd, ClockBasis::nothing);
+  EXPECT_FINDING(facts, "clock of pc2", Status::fail, "sudo systemctl restart chrony  # on pc2");
+  facts.hosts[1].clock_refused = false;  // clock_policy = "mark"
+  EXPECT_FINDING(facts, "clock of pc2", Status::warn, "# on pc2");
+  facts.hosts[1].clock.reset();  // it reports none
+  EXPECT_FINDING(facts, "clock of pc2", Status::warn, "chronyc sources");
 }
 
 TEST(Doctor, FindsHostsOfOneName) {
