@@ -113,9 +113,13 @@ ClockEstimator::Outcome ClockEstimator::take_untrusted(const Tracking& tracking,
   const Duration age =
       local ? Duration::zero() : answered.wall - tracking.offset - tracking.updated;
   const MonoTime updated = std::min(answered.mono - age, asked);
-  const bool is_new = local || tracking.updated > last_update_ + kSameUpdate ||
-                      tracking.updated < last_update_ - kSameUpdate;
+  // chronyd moves the time of its last measurement along when it slews, and a step moves our own
+  // idea of it: a new measurement changes both.
+  const bool is_new = local || ((tracking.updated > last_update_ + kSameUpdate ||
+                                 tracking.updated < last_update_ - kSameUpdate) &&
+                                updated > last_updated_ + kSameUpdate);
   last_update_ = tracking.updated;
+  last_updated_ = updated;
   if (stepped_ || source_stepped_) {
     if (is_new) ++updates_;
     if (updates_ < kUpdatesAfterStep) {

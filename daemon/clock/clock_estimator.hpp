@@ -158,6 +158,7 @@ class ClockEstimator {
   bool stepped_ = false;                    // and not measured kUpdatesAfterStep times since
   bool source_stepped_ = false;             // likewise
   Time last_update_;                        // chronyd's last measurement, by its own time
+  MonoTime last_updated_;                   // the same by ours
   int updates_ = 0;                         // after the step
   MonoTime answered_;                       // the question of the last answer was sent
   ClockReason reason_ = ClockReason::none;  // why there is no reading

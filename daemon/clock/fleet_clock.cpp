@@ -299,8 +299,7 @@ void FleetClock::update_line(RawTime now) {
   own.setting_from = watch_.setting_from();
   if (const std::int64_t setting = watch_.setting();
       setting != std::exchange(own.setting, setting)) {
-    // How far others are is measured anew: the PC may have slept, and its oscillator stood still.
-    pairs_.clear();
+    for (auto& [boot_id, pair] : pairs_) pair.await_heartbeat();
     pairs_since_ = now;
     line = clock::ClockLine::now(line.rate);
     return;
@@ -353,13 +352,13 @@ std::string FleetClock::str() const {
 void FleetClock::measure(const wire::ClockReport& theirs, const clock::Instant& now) {
   if (!theirs.line.exists() || theirs.boot_id.empty() || own_->shares_clock_with(theirs)) return;
   Pair& pair = pairs_[theirs.boot_id];
-  if (pair.setting != theirs.setting) {
-    pair = {};
-    pair.setting = theirs.setting;
-  }
+  if (pair.setting != theirs.setting) pair.await_heartbeat();
+  pair.setting = theirs.setting;
   if (theirs.heartbeat && theirs.heartbeat->asked > pairs_since_) {
     pair.raws.add_untrusted(*theirs.heartbeat);
+    pair.is_confirmed = true;
   }
+  if (!pair.is_confirmed) return;
   const auto raws = pair.raws.at(now.raw);
   const auto walls =
       raws ? clock::wall_difference(*raws, theirs.line, own_->line, now) : std::nullopt;

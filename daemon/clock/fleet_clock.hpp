@@ -118,7 +118,15 @@ class FleetClock final : public ClockAssessor,
   };
   // What is measured between this PC and another one.
   struct Pair {
+    // One of the clocks was set. The oscillators were not, unless a PC slept: the next heartbeat
+    // excludes those before it then.
+    void await_heartbeat() {
+      stated.clear();
+      is_confirmed = false;
+    }
+
     clock::PairMeasurement raws;
+    bool is_confirmed = false;   // by a heartbeat since a clock was set
     std::int64_t setting = 0;    // of their clock, while this was measured
     std::deque<Stated> stated;   // within kMeasuredReach, about one a second
     clock::WallDifference last;  // the latest

@@ -197,6 +197,47 @@ TEST(ClockEstimator, HasNoBoundAfterAStepUntilChronydMeasuredAgain) {
   }
 }
 
+// chronyd states its last measurement by its own time, which goes along when it slews.
+TEST(ClockEstimator, ASlewIsNoMeasurement) {
+  Rig rig;
+  rig.hear();
+  rig.step(200ms);
+  Duration age = 0s;
+  for (int i = 0; i < 100; ++i) {
+    rig.pass(100ms);
+    rig.tracking.offset -= 5ms;
+    EXPECT_EQ(rig.hear(age += 100ms), Outcome::stepped);
+  }
+}
+
+TEST(ClockEstimator, HasNoBoundAfterAStepOfTheSourceUntilChronydMeasuredAgain) {
+  Rig rig;
+  rig.hear();
+  rig.estimator.on_source_step();
+  expect_void(rig.state(), ClockReason::stepped);
+  for (int i = 1; i < ClockEstimator::kUpdatesAfterStep; ++i) {
+    rig.pass(1s);
+    EXPECT_EQ(rig.hear(), Outcome::stepped);
+  }
+  rig.pass(1s);
+  EXPECT_EQ(rig.hear(), Outcome::taken);
+  EXPECT_EQ(rig.estimator.setting(), to_ns(MonoTime(1000s).time_since_epoch())) << "not this clock";
+}
+
+TEST(ClockEstimator, TimesAreOfTheSettingFromTheLaterOfBothClocksOn) {
+  Rig rig;
+  EXPECT_EQ(rig.estimator.setting_from(), Time());
+  const std::int64_t first = rig.estimator.setting();
+  rig.pass(1s);
+  rig.step(1h);
+  EXPECT_NE(rig.estimator.setting(), first);
+  EXPECT_EQ(rig.estimator.setting_from(), rig.now.wall);
+  rig.pass(1s);
+  const Time before = rig.now.wall;
+  rig.step(-1h);
+  EXPECT_EQ(rig.estimator.setting_from(), before);
+}
+
 TEST(ClockEstimator, CountsFromZeroWhenTheClockIsSteppedAgain) {
   Rig rig;
   rig.hear();
