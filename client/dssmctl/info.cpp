@@ -76,9 +76,9 @@ void print_stream(const StreamInfo& stream, Output& out) {
   add_line(out, "depth", fmt::format("{} slots", stream.depth));
   add_line(out, "cycle", duration_text(stream.cycle));
   print_samples(stream, out);
-  add_line(out, "writers", stream.writers);
-  add_line(out, "readers", stream.readers);
-  add_line(out, "channels", fmt::format("{} to other hosts", stream.channels));
+  add_line(out, "writers", fmt::format("{} on its host", stream.writers));
+  add_line(out, "readers", fmt::format("{} on its host", stream.readers));
+  add_line(out, "channels", fmt::format("{} to other hosts, for programs there", stream.channels));
   add_line(out, "memory", bytes_text(stream.memory_bytes));
   add_line(out, "property", stream.property_bytes ? bytes_text(stream.property_bytes) : "none");
   add_line(out, "incarnation", stream.incarnation);

@@ -152,7 +152,7 @@ TEST_F(Info, ShowsFieldsUsersAndSamples) {
   const std::string text = output({"info", "pose"});
   for (const char* part :
        {"pose:0@pc1\n", "'Pose' (16 bytes, aligned to 8)", "8 slots", "tid 0 to 0", "1.500000000",
-        "8 bytes", "float64", "float32", "the test", "writer"}) {
+        "8 bytes", "float64", "float32", "the test", "writer", "1 on its host"}) {
     EXPECT_NE(text.find(part), std::string::npos) << part << " in\n" << text;
   }
 
