@@ -6,7 +6,7 @@ passes `dssmctl doctor` and lists all sensors.
 """
 
 from lab.guest import Guest
-from lab.lab import Lab
+from lab.lab import Lab, await_that
 from lab.load import Load
 
 UNIT = "fleet-sensor"
@@ -20,12 +20,21 @@ def run(lab: Lab) -> None:
         lab.on_all(lambda guest: guest.reboot(lab.all_cores))
         lab.on_all(Guest.await_running)
     lab.await_streams(*names)
-    lab.on_all(lambda guest: guest.ssh.run("dssmctl doctor"))
+    lab.on_all(await_healthy)
     reader = Load(lab["pc3"], "read", names, rate_hz=100).await_ready()
     found = reader.finish()
     assert not found["faults"], found["faults"]
     lab.on_all(remove_sensor)
     lab.await_streams()
+
+
+def await_healthy(guest: Guest) -> None:
+    """Waits until doctor finds no error: after the boot, clocks are refused for some seconds."""
+    def check() -> tuple[bool, object]:
+        done = guest.ssh.attempt("dssmctl doctor")
+        return done.returncode == 0, done.stdout.decode(errors="replace")
+
+    await_that(f"{guest.name} passes dssmctl doctor", check)
 
 
 def install_sensor(guest: Guest) -> None:
