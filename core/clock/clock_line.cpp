@@ -10,33 +10,31 @@ namespace {
 constexpr int kTries = 5;
 
 // What is allowed for reading two clocks, however fast that is.
-constexpr Duration kLeastWidth = std::chrono::microseconds(2);
+constexpr Duration kLeastBlur = std::chrono::microseconds(2);
 
 // The wall clock between two readings of the RawClock.
-struct Reading {
-  RawTime before;
-  Time wall;
-  RawTime after;
-
-  static Reading now() noexcept {
-    const RawTime before = RawClock::now();
-    const Time wall = WallClock::now();
-    return {before, wall, RawClock::now()};
-  }
-  Duration width() const noexcept { return after - before; }
-};
+ClockReading read_once() noexcept {
+  const RawTime before = RawClock::now();
+  const Time wall = WallClock::now();
+  const Duration half = (RawClock::now() - before + Duration(1)) / 2;
+  return {before + half, wall, half};
+}
 
 }  // namespace
 
-ClockLine ClockLine::now(PartsPerBillion rate) noexcept {
-  Reading best = Reading::now();
-  for (int i = 1; i < kTries && best.width() > kLeastWidth / 4; ++i) {
-    const Reading reading = Reading::now();
-    if (reading.width() < best.width()) best = reading;
+ClockReading ClockReading::now() noexcept {
+  ClockReading best = read_once();
+  for (int i = 1; i < kTries && best.blur > kLeastBlur / 8; ++i) {
+    const ClockReading reading = read_once();
+    if (reading.blur < best.blur) best = reading;
   }
+  return best;
+}
+
+ClockLine ClockLine::now(PartsPerBillion rate) noexcept {
+  const ClockReading reading = ClockReading::now();
   // Later readings may take twice as long.
-  return {best.before + best.width() / 2, best.wall, rate,
-          kMaxOff + std::max(kLeastWidth, 3 * best.width())};
+  return {reading.raw, reading.wall, rate, kMaxOff + std::max(kLeastBlur, 3 * reading.blur)};
 }
 
 std::optional<Time> ClockLine::at(RawTime t) const noexcept {
@@ -50,10 +48,10 @@ std::optional<Time> ClockLine::at(RawTime t) const noexcept {
 
 [[gnu::hot]] bool ClockLine::holds() const noexcept {
   for (int i = 0; i < kTries; ++i) {
-    const Reading reading = Reading::now();
-    if (kMaxOff + reading.width() > tolerance) continue;
-    const std::optional<Time> first = at(reading.before), last = at(reading.after);
-    return first && last && reading.wall >= *first - kMaxOff && reading.wall <= *last + kMaxOff;
+    const ClockReading reading = read_once();
+    if (kMaxOff + reading.blur > tolerance) continue;
+    const std::optional<Time> expected = at(reading.raw);
+    return expected && std::chrono::abs(reading.wall - *expected) <= kMaxOff + reading.blur;
   }
   return false;  // this PC now takes longer to read its clocks: others have to know
 }

@@ -14,6 +14,16 @@
 
 namespace dssm::clock {
 
+// Both clocks at one moment.
+struct ClockReading {
+  RawTime raw{};
+  Time wall{};
+  Duration blur{};  // the wall clock showed `wall` when the RawClock was at most so far from `raw`
+
+  // Reads both, several times until they are close together.
+  static ClockReading now() noexcept;
+};
+
 struct ClockLine {
   // Beyond this the wall clock has left the line. On top comes what reading two clocks takes.
   static constexpr Duration kMaxOff = std::chrono::microseconds(8);

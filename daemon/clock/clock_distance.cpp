@@ -37,11 +37,11 @@ Duration distance_from_anchor(const wire::ClockReport& writer,
 
 std::optional<WallDifference> wall_difference(const PairMeasurement::Difference& raws,
                                               const ClockLine& theirs, const ClockLine& ours,
-                                              const Instant& now) noexcept {
+                                              const ClockReading& now) noexcept {
   const std::optional<Time> least = theirs.at(now.raw + raws.least);
   const std::optional<Time> greatest = theirs.at(now.raw + raws.greatest);
   if (!least || !greatest || !ours.exists()) return std::nullopt;
-  const Duration blur = sum(theirs.tolerance, now.width);
+  const Duration blur = sum(theirs.tolerance, now.blur);
   // The rates of the lines differ by what the daemons of the clocks correct and slew.
   const PartsPerBillion corrected = theirs.rate - ours.rate;
   if (blur > kMaxBlur) return std::nullopt;

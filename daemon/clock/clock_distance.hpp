@@ -11,7 +11,6 @@
 #include <optional>
 
 #include "core/wire/clock_report.hpp"
-#include "daemon/clock/clock_estimator.hpp"
 #include "daemon/clock/pair_measurement.hpp"
 
 namespace dssm::clock {
@@ -40,6 +39,6 @@ struct WallDifference {
 // `raws` is the measured difference of the RawClocks at `now`. nullopt: a line is missing or old.
 std::optional<WallDifference> wall_difference(const PairMeasurement::Difference& raws,
                                               const ClockLine& theirs, const ClockLine& ours,
-                                              const Instant& now) noexcept;
+                                              const ClockReading& now) noexcept;
 
 }  // namespace dssm::clock

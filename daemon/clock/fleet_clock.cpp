@@ -107,7 +107,7 @@ void FleetClock::on_host_clock(const KnownHost& host) {
     // First whether this clock was set since the heartbeat was sent. Not for other reports: two
     // hosts must not make each other report for ever.
     if (host.greeting.clock->heartbeat) clock_generation();
-    measure(*host.greeting.clock, clock::Instant::now());
+    measure(*host.greeting.clock);
   }
   // The reports of others are used at the latest with the next answer of chronyd.
   if (source_ && host.greeting.host_id == source_->id) refresh();
@@ -138,6 +138,9 @@ void FleetClock::refresh() {
   update_chain(now);
   update_status();
   update_line(instant.raw);
+  for (const auto& [id, host] : catalog_.hosts()) {
+    if (host.greeting.clock) measure(*host.greeting.clock);
+  }
   publish(instant);
   watch_.log_change(own_->clock);
   log_others(now);
@@ -349,7 +352,7 @@ std::string FleetClock::str() const {
 
 // --- what other hosts' samples are worth here
 
-void FleetClock::measure(const wire::ClockReport& theirs, const clock::Instant& now) {
+void FleetClock::measure(const wire::ClockReport& theirs) {
   if (!theirs.line.exists() || theirs.boot_id.empty() || own_->shares_clock_with(theirs)) return;
   Pair& pair = pairs_[theirs.boot_id];
   if (pair.setting != theirs.setting) pair.await_heartbeat();
@@ -359,47 +362,56 @@ void FleetClock::measure(const wire::ClockReport& theirs, const clock::Instant& 
     pair.is_confirmed = true;
   }
   if (!pair.is_confirmed) return;
-  const auto raws = pair.raws.at(now.raw);
-  const auto walls =
-      raws ? clock::wall_difference(*raws, theirs.line, own_->line, now) : std::nullopt;
+  const auto walls = walls_of(pair, theirs);
   if (!walls) return;
   pair.last = *walls;
-  pair.measured_at = now.mono;
+  pair.measured_at = MonoClock::now();
+  const Time now = WallClock::now();
   constexpr Duration kSpan = std::chrono::seconds(1);
-  if (pair.stated.empty() || now.wall - pair.stated.back().wall >= kSpan) {
-    pair.stated.push_back({now.wall, walls->bound()});
+  if (pair.stated.empty() || now - pair.stated.back().wall >= kSpan) {
+    pair.stated.push_back({now, walls->bound()});
   }
   pair.stated.back().bound = std::max(pair.stated.back().bound, walls->bound());
-  while (pair.stated.front().wall < now.wall - kMeasuredReach) pair.stated.pop_front();
+  while (pair.stated.front().wall < now - kMeasuredReach) pair.stated.pop_front();
+}
+
+// At this moment.
+std::optional<clock::WallDifference> FleetClock::walls_of(const Pair& pair,
+                                                          const wire::ClockReport& theirs) const {
+  const clock::ClockReading now = clock::ClockReading::now();
+  const auto raws = pair.raws.at(now.raw);
+  return raws ? clock::wall_difference(*raws, theirs.line, own_->line, now) : std::nullopt;
 }
 
 std::optional<FleetClock::Measured> FleetClock::measured(const wire::ClockReport& theirs,
-                                                         const clock::Instant& now) const {
+                                                         MonoTime now, Duration limit) const {
   const auto found = pairs_.find(theirs.boot_id);
   if (found == pairs_.end()) return std::nullopt;
   const Pair& pair = found->second;
   if (pair.stated.empty() || pair.setting != theirs.setting) return std::nullopt;
-  Measured measured{pair.last, now.mono - pair.measured_at <= kMeasuredFor, {}, {}};
+  Measured measured{pair.last, now - pair.measured_at <= kMeasuredFor, {}, {}};
   if (measured.is_fresh) {
-    const auto raws = pair.raws.at(now.raw);
-    const auto walls =
-        raws ? clock::wall_difference(*raws, theirs.line, own_->line, now) : std::nullopt;
+    const auto walls = walls_of(pair, theirs);
     if (!walls) return std::nullopt;
     measured.now = *walls;
   } else {
     // No sample comes from there any more: those that are here were stamped while it was fresh.
     const Duration aged =
-        clock::growth(now.mono - pair.measured_at,
+        clock::growth(now - pair.measured_at,
                       own_->clock.ageing_ppb + theirs.clock.ageing_ppb + pair.last.ageing);
     measured.now.least -= aged;
     measured.now.greatest += aged;
   }
+  // As far back as the clocks were close enough: good samples are not to suffer from earlier ones.
   measured.greatest = measured.now.bound();
-  for (const Stated& stated : pair.stated) {
-    measured.greatest = std::max(measured.greatest, stated.bound);
+  Time from = WallClock::now();
+  for (auto stated = pair.stated.rbegin(); stated != pair.stated.rend(); ++stated) {
+    if (stated->bound > std::max(limit, measured.greatest)) break;
+    measured.greatest = std::max(measured.greatest, stated->bound);
+    from = stated->wall;
   }
   // Their clock may be ahead of this one, which the times of `stated` are of.
-  measured.from = std::max(theirs.setting_from, pair.stated.front().wall + measured.greatest);
+  measured.from = std::max(theirs.setting_from, from + measured.greatest);
   return measured;
 }
 
@@ -408,10 +420,10 @@ Duration FleetClock::chain_distance(const wire::ClockReport& theirs, MonoTime no
 }
 
 Duration FleetClock::distance_to(const wire::ClockReport& other) const {
-  const clock::Instant now = clock::Instant::now();
-  const Duration chain = chain_distance(other, now.mono);
+  const MonoTime now = MonoClock::now();
+  const Duration chain = chain_distance(other, now);
   if (own_->shares_clock_with(other)) return chain;
-  const std::optional<Measured> found = measured(other, now);
+  const std::optional<Measured> found = measured(other, now, policies_.general.limit);
   if (!found) return chain;
   if (found->is_fresh && found->now.excludes(chain)) return kUnknownClockError;
   return std::min(chain, found->now.bound());
@@ -433,16 +445,16 @@ Result<void> FleetClock::check_serving(const StreamId& id, const wire::Greeting&
 ring::ClockAssessment FleetClock::assess_mirror(const StreamId& id,
                                                 const wire::ClockReport* owner) const {
   if (owner && own_->shares_clock_with(*owner)) return {};
-  const clock::Instant now = clock::Instant::now();
-  ring::ClockAssessment found = assessment(id, now.mono);
+  const MonoTime now = MonoClock::now();
+  ring::ClockAssessment found = assessment(id, now);
   if (!owner) return found;
-  const std::optional<Measured> by_heartbeats = measured(*owner, now);
+  const std::optional<Measured> by_heartbeats = measured(*owner, now, found.limit);
   if (by_heartbeats && by_heartbeats->is_fresh &&
-      by_heartbeats->now.excludes(chain_distance(*owner, now.mono))) {
+      by_heartbeats->now.excludes(chain_distance(*owner, now))) {
     return found;  // one of the two is wrong, and it is not known which
   }
   if (owner->has_bound()) {
-    const wire::ClockReport own = own_->at(now.mono), theirs = owner->at(now.mono);
+    const wire::ClockReport own = own_->at(now), theirs = owner->at(now);
     found.added = clock::distance_from_anchor(theirs, own);
     found.ageing_ppb = ppb(own.clock.ageing_ppb + theirs.clock.ageing_ppb);
   }
@@ -478,9 +490,9 @@ std::string FleetClock::reason_against(const wire::ClockReport* owner, Duration 
   if (own_->shares_clock_with(*owner)) return {};
   const Duration distance = distance_of_samples(*owner);
   if (distance <= limit) return {};
-  const clock::Instant now = clock::Instant::now();
-  const Duration chain = chain_distance(*owner, now.mono);
-  const std::optional<Measured> by_heartbeats = measured(*owner, now);
+  const MonoTime now = MonoClock::now();
+  const Duration chain = chain_distance(*owner, now);
+  const std::optional<Measured> by_heartbeats = measured(*owner, now, limit);
   if (by_heartbeats && by_heartbeats->is_fresh && by_heartbeats->now.excludes(chain)) {
     return fmt::format(
         "the heartbeats show that the clocks of its host and of this PC are {} apart or more, but "

@@ -154,9 +154,12 @@ class FleetClock final : public ClockAssessor,
   void update_status();
   void publish(const clock::Instant& now);
   void update_line(RawTime now);
-  void measure(const wire::ClockReport& theirs, const clock::Instant& now);
-  std::optional<Measured> measured(const wire::ClockReport& theirs,
-                                   const clock::Instant& now) const;
+  void measure(const wire::ClockReport& theirs);
+  std::optional<clock::WallDifference> walls_of(const Pair& pair,
+                                                const wire::ClockReport& theirs) const;
+  // limit: earlier samples that were further off are not covered
+  std::optional<Measured> measured(const wire::ClockReport& theirs, MonoTime now,
+                                   Duration limit) const;
   Duration chain_distance(const wire::ClockReport& theirs, MonoTime now) const;
   void log_others(MonoTime now);
   ring::ClockAssessment assessment(const StreamId& id, MonoTime now) const;

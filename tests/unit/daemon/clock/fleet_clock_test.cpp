@@ -310,6 +310,16 @@ TEST_F(MeasuredTest, IsVoidAfterAStepThereUntilItWasMeasuredAgain) {
   EXPECT_TRUE(found().can_be_good());
 }
 
+TEST_F(MeasuredTest, AClockThatWasFarOffAMomentAgoCostsOnlyTheSamplesOfThatTime) {
+  start();
+  heartbeat(50ms);
+  EXPECT_FALSE(found().can_be_good());
+  const Time before = WallClock::now();
+  heartbeat(100us);  // it was slewed
+  EXPECT_TRUE(found().can_be_good());
+  EXPECT_GT(found().measured_from, before);
+}
+
 TEST_F(MeasuredTest, TimesFromBeforeAStepThereAreNotMeasured) {
   start();
   heartbeat(0us);

@@ -190,7 +190,7 @@ class WallDifferenceTest : public PairMeasurementTest {
     theirs.keep_line();
   }
   WallDifference walls() const {
-    const Instant now{MonoTime(), ours.wall(), {}, ours.raw()};
+    const ClockReading now{ours.raw(), ours.wall(), {}};
     return wall_difference(difference(), theirs.line, ours.line, now).value();
   }
   double true_walls_ns() const { return theirs.wall_ns - ours.wall_ns; }
@@ -256,7 +256,7 @@ TEST_F(WallDifferenceTest, ExcludesAChainThatIsShorterThanItCanBe) {
 
 TEST_F(WallDifferenceTest, NothingIsKnownWithoutALine) {
   beat(0);
-  const Instant now{MonoTime(), ours.wall(), {}, ours.raw()};
+  const ClockReading now{ours.raw(), ours.wall(), {}};
   EXPECT_FALSE(wall_difference(difference(), theirs.line, ours.line, now));
 }
 
