@@ -83,6 +83,12 @@ FleetClock::FleetClock(const EventLoop& loop, const Options& options, clock::Clo
       log_(logger),
       watch_(loop, options.watch, *this, logger) {
   own_->boot_id = clock::boot_id();
+  if (own_->boot_id.empty()) {
+    logger.warning(
+        "/proc/sys/kernel/random/boot_id cannot be read: how far other PCs' clocks are is not "
+        "measured, and a step of this one while no dssmd runs is not noticed; does the unit have "
+        "ProcSubset=?");
+  }
   own_->anchor = self_;
   if (page_.has_history()) {
     clock::ClockPageState before;
