@@ -360,6 +360,11 @@ std::string FleetClock::str() const {
 
 void FleetClock::measure(const wire::ClockReport& theirs) {
   if (!theirs.line.exists() || theirs.boot_id.empty() || own_->shares_clock_with(theirs)) return;
+  if (pairs_.size() == kMaxPairs && !pairs_.contains(theirs.boot_id)) {
+    pairs_.erase(std::min_element(pairs_.begin(), pairs_.end(), [](const auto& a, const auto& b) {
+      return a.second.measured_at < b.second.measured_at;
+    }));
+  }
   Pair& pair = pairs_[theirs.boot_id];
   if (pair.setting != theirs.setting) pair.await_heartbeat();
   pair.setting = theirs.setting;

@@ -56,6 +56,8 @@ class FleetClock final : public ClockAssessor,
   static constexpr Duration kReach = std::chrono::seconds(10);
   // Samples that are older count by their clock error only, and not by what was measured since.
   static constexpr Duration kMeasuredReach = std::chrono::seconds(60);
+  // PCs of which measurements are kept; a further one replaces that which was silent the longest.
+  static constexpr std::size_t kMaxPairs = 256;
   // Without a heartbeat for so long, the last measurement ages.
   static constexpr Duration kMeasuredFor = std::chrono::seconds(3);
 

@@ -320,6 +320,20 @@ TEST_F(MeasuredTest, AClockThatWasFarOffAMomentAgoCostsOnlyTheSamplesOfThatTime)
   EXPECT_GT(found().measured_from, before);
 }
 
+TEST_F(MeasuredTest, AHostThatReportsEverNewBootsFillsNoMoreThanTheTable) {
+  start();
+  heartbeat(0us);
+  EXPECT_TRUE(found().can_be_good());
+  for (std::size_t i = 0; i < FleetClock::kMaxPairs; ++i) {
+    auto other = std::make_shared<wire::ClockReport>(*pc3);
+    other->boot_id = "boot " + std::to_string(i);
+    catalog.set_clock(kOther, other);
+  }
+  EXPECT_FALSE(found().can_be_good()) << "it made room for the last one";
+  heartbeat(0us);
+  EXPECT_TRUE(found().can_be_good());
+}
+
 TEST_F(MeasuredTest, TimesFromBeforeAStepThereAreNotMeasured) {
   start();
   heartbeat(0us);
