@@ -46,6 +46,12 @@ std::optional<Time> ClockLine::at(RawTime t) const noexcept {
                                             static_cast<double>(rate) / 1e9));
 }
 
+Duration ClockLine::left_by(const ClockLine& later) const noexcept {
+  if (!exists() || !later.exists()) return {};
+  const std::optional<Time> expected = at(later.raw);
+  return expected ? std::chrono::abs(later.wall - *expected) : kUnknownClockError;
+}
+
 [[gnu::hot]] bool ClockLine::holds() const noexcept {
   for (int i = 0; i < kTries; ++i) {
     const ClockReading reading = read_once();

@@ -43,6 +43,9 @@ struct ClockLine {
   bool exists() const noexcept { return raw != RawTime(); }
   // What the wall clock shows at `t`; nullopt: there is no line, or it is too old.
   std::optional<Time> at(RawTime t) const noexcept;
+  // How far from it a later line of the same PC begins: so far the clock was slewed or set. Zero if
+  // one of them does not exist; kUnknownClockError if this one is too old.
+  Duration left_by(const ClockLine& later) const noexcept;
   // Whether this PC's wall clock is on the line, which is its own. Three clocks are read.
   bool holds() const noexcept;
 

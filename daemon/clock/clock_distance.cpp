@@ -12,6 +12,11 @@ namespace {
 // Lines that promise less are not worth a statement, and sums with them would overflow.
 constexpr Duration kMaxBlur = std::chrono::seconds(1);
 
+Duration gained(Duration age, PartsPerBillion rate) noexcept {
+  return Duration(static_cast<std::int64_t>(static_cast<double>(age.count()) *
+                                            static_cast<double>(rate) / 1e9));
+}
+
 }  // namespace
 
 Duration distance(const wire::ClockReport& one, const wire::ClockReport& other) noexcept {
@@ -45,9 +50,18 @@ std::optional<WallDifference> wall_difference(const PairMeasurement::Difference&
   // The rates of the lines differ by what the daemons of the clocks correct and slew.
   const PartsPerBillion corrected = theirs.rate - ours.rate;
   if (blur > kMaxBlur) return std::nullopt;
-  return WallDifference{
-      *least - now.wall - blur, *greatest - now.wall + blur,
-      std::max(std::abs(corrected + raws.slowest), std::abs(corrected + raws.fastest))};
+  WallDifference found{
+      *least - now.wall - blur,
+      *greatest - now.wall + blur,
+      std::max(std::abs(corrected + raws.slowest), std::abs(corrected + raws.fastest)),
+      {}};
+  const Duration age = now.raw + raws.greatest - theirs.raw;
+  if (age > Duration::zero() && age <= WallDifference::kNewLine) {
+    const Duration lost = gained(age, corrected + raws.fastest);
+    const Duration won = gained(age, corrected + raws.slowest);
+    found.earlier = std::max(lost - found.least, found.greatest - won);
+  }
+  return found;
 }
 
 }  // namespace dssm::clock

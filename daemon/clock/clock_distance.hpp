@@ -28,10 +28,16 @@ Duration distance_from_anchor(const wire::ClockReport& writer,
 
 // What was measured: their wall clock minus this one.
 struct WallDifference {
+  // For so long after it was drawn, a line's beginning counts, too.
+  static constexpr Duration kNewLine = std::chrono::seconds(1);
+
   Duration least{}, greatest{};
   PartsPerBillion ageing = 0;  // by so much may each of the two grow
+  // Bound when their line was drawn, if that was within kNewLine: the samples that come after it
+  // were stamped before it, and a clock that is slewed was further off then.
+  Duration earlier{};
 
-  Duration bound() const noexcept { return std::max({-least, greatest, Duration::zero()}); }
+  Duration bound() const noexcept { return std::max({-least, greatest, earlier}); }
   // Whether the clocks cannot be as close as `chain` states.
   bool excludes(Duration chain) const noexcept { return least > chain || -greatest > chain; }
 };

@@ -114,12 +114,14 @@ void Mirror::on_stream_removed(std::uint64_t incarnation) {
 }
 
 void Mirror::on_owner_clock(MirrorClock::Report report) {
-  clock_.on_owner(std::move(report), ring_ ? ring_->newest() : kNoTid);
+  clock_.on_owner(std::move(report), ring_ ? ring_->newest() : kNoTid, MonoClock::now());
   assess_clock();
 }
 
 void Mirror::assess_clock() {
-  if (ring_ && clock_.has_report()) ring_->set_clock(clock_.assessment());
+  if (!ring_ || !clock_.has_report()) return;
+  clock_.on_time(ring_->newest(), MonoClock::now());
+  ring_->set_clock(clock_.assessment());
 }
 
 // --- samples

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "daemon/remote/mirror_ring.hpp"
 
+#include <algorithm>
 #include <cstring>
 #include <new>
 #include <utility>
@@ -90,20 +91,28 @@ void MirrorRing::drop_aside() noexcept {
 
 // --- the clock
 
-void MirrorClock::on_owner(Report report, Tid newest) noexcept {
+void MirrorClock::on_owner(Report report, Tid newest, MonoTime now) noexcept {
   has_report_ = true;
   const Report before = std::exchange(report_, std::move(report));
-  if (!is_known(report_)) {
+  if (before && report_ && before->boot_id == report_->boot_id &&
+      before->line.left_by(report_->line) > kSlewed) {
+    slewed_at_ = now;
+  }
+  if (!is_known(report_) || is_stale(now)) {
     // From the first sample that is not here yet. What was suspect before stays so, with all
     // samples in between.
     if (suspect_first_ > suspect_last_) suspect_first_ = newest + 1;
     suspect_last_ = INT64_MAX;
-  } else if (is_suspect_now()) {
-    suspect_last_ = newest;
-  } else if (is_known(before) && before->anchor != report_->anchor) {
-    suspect_first_ = 0;
-    suspect_last_ = newest;
   }
+  on_time(newest, now);
+  if (is_known(before) && is_known(report_) && before->anchor != report_->anchor) {
+    suspect_first_ = 0;
+    suspect_last_ = std::max(suspect_last_, newest);
+  }
+}
+
+void MirrorClock::on_time(Tid newest, MonoTime now) noexcept {
+  if (is_suspect_now() && is_known(report_) && !is_stale(now)) suspect_last_ = newest;
 }
 
 void MirrorClock::on_new_ring() noexcept {

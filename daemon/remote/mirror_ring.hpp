@@ -13,6 +13,7 @@
 #include <dssm/result.hpp>
 #include <dssm/stream.hpp>
 #include <memory>
+#include <optional>
 #include <string>
 
 #include "core/channel/channel_client.hpp"
@@ -89,7 +90,8 @@ class MirrorRing {
 
 // What the times in one mirror are worth, from what its owner reported of its clock, and when.
 // Knows which samples are suspect: those that arrived while the owner's clock was not known, and
-// those stamped against another reference than the present one.
+// those stamped against another reference than the present one. And those that arrive just after
+// the owner's clock was slewed anew: their clock errors are by what chronyd stated before that.
 class MirrorClock {
  public:
   using Report = std::shared_ptr<const wire::ClockReport>;
@@ -98,8 +100,16 @@ class MirrorClock {
   MirrorClock(const ClockAssessor* assessor, const StreamId& id) noexcept
       : assessor_(assessor), id_(id) {}
 
-  // The owner's latest report (nullptr: none), received when `newest` was the newest sample here.
-  void on_owner(Report report, Tid newest) noexcept;
+  // chronyd's usual corrections are less.
+  static constexpr Duration kSlewed = std::chrono::microseconds(100);
+  // The owner asks chronyd once a second, and samples need some time.
+  static constexpr Duration kStaleFor = std::chrono::seconds(3);
+
+  // The owner's latest report (nullptr: none), received at `now`, when `newest` was the newest
+  // sample here.
+  void on_owner(Report report, Tid newest, MonoTime now) noexcept;
+  // Ends what was suspect for a time; about once a second.
+  void on_time(Tid newest, MonoTime now) noexcept;
   // The mirror continues with another ring, whose samples all arrive from now on.
   void on_new_ring() noexcept;
 
@@ -116,11 +126,13 @@ class MirrorClock {
 
  private:
   bool is_suspect_now() const noexcept { return suspect_last_ == INT64_MAX; }
+  bool is_stale(MonoTime now) const noexcept { return slewed_at_ && now - *slewed_at_ < kStaleFor; }
 
   const ClockAssessor* assessor_;
   const StreamId& id_;
   Report report_;
   bool has_report_ = false;
+  std::optional<MonoTime> slewed_at_;
   Tid suspect_first_ = 0, suspect_last_ = kNoTid;
 };
 

@@ -129,17 +129,22 @@ TEST_F(PairMeasurementTest, TheRateMayChangeByAllThatIsAllowed) {
   }
 }
 
-// What the issue of this measurement asks for: half of the best round trip and 30 us.
+// Half of the best round trip and 30 us; more only while the best heartbeat is old and few others are
+// good, so that the rate is not well known.
 TEST_F(PairMeasurementTest, TheBoundsAreAsTightAsTheBestRoundTrips) {
   theirs.rate = 35e-6;
   ours.rate = -20e-6;
-  for (int i = 0; i < 64; ++i) {
+  constexpr int kSeconds = 2000;
+  int tight = 0;
+  for (int i = 0; i < 64 + kSeconds; ++i) {
     beat();
+    if (i >= 64) {
+      const Duration half_width = (difference().greatest - difference().least) / 2;
+      if (half_width <= pair.best_round_trip() / 2 + 30us) ++tight;
+    }
     pass(1e9);
   }
-  const Duration half_width = (difference().greatest - difference().least) / 2;
-  EXPECT_LE(half_width, pair.best_round_trip() / 2 + 30us)
-      << "best of " << to_ns(pair.best_round_trip()) << " ns";
+  EXPECT_GE(tight, kSeconds * 9 / 10) << tight;
 }
 
 TEST_F(PairMeasurementTest, AHeartbeatThatTookLongTakesNothingAway) {
@@ -229,6 +234,22 @@ TEST_F(WallDifferenceTest, BetweenTwoReadingsItGrowsNoFasterThanTheAgeing) {
   EXPECT_LE(static_cast<double>(to_ns(before.least)) - grown, true_walls_ns());
   EXPECT_GE(static_cast<double>(to_ns(before.greatest)) + grown, true_walls_ns());
   EXPECT_LT(grown, 1.1 * 0.08e9);
+}
+
+TEST_F(WallDifferenceTest, CoversTheTimeSinceALineWasDrawn) {
+  for (int i = 0; i < 10; ++i) {
+    beat(1e4);
+    pass_and_keep_lines(1e9);
+  }
+  theirs.step(-2.4e6);
+  pass_and_keep_lines(1e6);
+  theirs.correction = 0.08;
+  pass_and_keep_lines(1e7);
+  const double at_line = -true_walls_ns();
+  EXPECT_GT(at_line, 1e6);
+  pass(1e7);
+  EXPECT_LT(-true_walls_ns(), at_line - 7e5);
+  EXPECT_GE(static_cast<double>(to_ns(walls().bound())), at_line - 1000);
 }
 
 TEST_F(WallDifferenceTest, ALineLastsWhileTheRateOfTheClockDoes) {

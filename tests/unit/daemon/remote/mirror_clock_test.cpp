@@ -26,6 +26,7 @@ class MirrorClockTest : public testing::Test {
   const StreamId id{"lidar", 0, "pc2"};
   FakeClockAssessor assessor;
   MirrorClock clock{&assessor, id};
+  MonoTime now{1000s};
 };
 
 TEST_F(MirrorClockTest, WithoutAnAssessorAllTimesAreGood) {
@@ -36,10 +37,10 @@ TEST_F(MirrorClockTest, WithoutAnAssessorAllTimesAreGood) {
 }
 
 TEST_F(MirrorClockTest, AStreamIsOpenedWhenSomethingIsAllowed) {
-  clock.on_owner(report(1ms), kNoTid);
+  clock.on_owner(report(1ms), kNoTid, now);
   EXPECT_TRUE(clock.check_opening());
   EXPECT_EQ(clock.reason(), "");
-  clock.on_owner(report(1ms + 1ns), kNoTid);
+  clock.on_owner(report(1ms + 1ns), kNoTid, now);
   const Result<void> refused = clock.check_opening();
   ASSERT_FALSE(refused);
   EXPECT_EQ(refused.error().code, Errc::clock_out_of_bounds);
@@ -49,27 +50,27 @@ TEST_F(MirrorClockTest, AStreamIsOpenedWhenSomethingIsAllowed) {
 TEST_F(MirrorClockTest, AStreamIsOpenedUntilItsOwnerReports) {
   EXPECT_FALSE(clock.has_report());
   EXPECT_TRUE(clock.check_opening());
-  clock.on_owner(nullptr, kNoTid);  // a dssmd that reports nothing of its clock
+  clock.on_owner(nullptr, kNoTid, now);  // a dssmd that reports nothing of its clock
   EXPECT_TRUE(clock.has_report());
   EXPECT_FALSE(clock.check_opening());
 }
 
 TEST_F(MirrorClockTest, MarkedStreamsAreOpenedAndHaveAReason) {
   assessor.policy = ClockPolicy::mark;
-  clock.on_owner(report(2ms), kNoTid);
+  clock.on_owner(report(2ms), kNoTid, now);
   EXPECT_TRUE(clock.check_opening());
   EXPECT_EQ(clock.reason(), "not 'lidar:0@pc2'");
 }
 
 TEST_F(MirrorClockTest, SamplesThatComeWhileTheOwnersClockIsUnknownStaySuspect) {
-  clock.on_owner(report(1us), 9);
+  clock.on_owner(report(1us), 9, now);
   EXPECT_FALSE(is_suspect(9));
-  clock.on_owner(report(kUnknownClockError), 9);  // it was set
+  clock.on_owner(report(kUnknownClockError), 9, now);  // it was set
   EXPECT_FALSE(is_suspect(9));
   EXPECT_TRUE(is_suspect(10));
-  clock.on_owner(report(kUnknownClockError), 15);
+  clock.on_owner(report(kUnknownClockError), 15, now);
   EXPECT_TRUE(is_suspect(10)) << "from the first one on";
-  clock.on_owner(report(1us), 20);
+  clock.on_owner(report(1us), 20, now);
   EXPECT_FALSE(is_suspect(9));
   EXPECT_TRUE(is_suspect(10));
   EXPECT_TRUE(is_suspect(20));
@@ -77,10 +78,10 @@ TEST_F(MirrorClockTest, SamplesThatComeWhileTheOwnersClockIsUnknownStaySuspect) 
 }
 
 TEST_F(MirrorClockTest, WhatWasSuspectOnceStaysSoWhenTheClockIsSetAgain) {
-  clock.on_owner(report(1us), 9);
+  clock.on_owner(report(1us), 9, now);
   for (const Tid newest : {10, 20}) {
-    clock.on_owner(report(kUnknownClockError), newest);
-    clock.on_owner(report(1us), newest + 5);
+    clock.on_owner(report(kUnknownClockError), newest, now);
+    clock.on_owner(report(1us), newest + 5, now);
   }
   EXPECT_FALSE(is_suspect(10));
   EXPECT_TRUE(is_suspect(11));
@@ -89,22 +90,40 @@ TEST_F(MirrorClockTest, WhatWasSuspectOnceStaysSoWhenTheClockIsSetAgain) {
 }
 
 TEST_F(MirrorClockTest, WhatWasStampedAgainstAnotherReferenceIsSuspect) {
-  clock.on_owner(report(1us, 1), 9);
-  clock.on_owner(report(1us, 2), 12);
+  clock.on_owner(report(1us, 1), 9, now);
+  clock.on_owner(report(1us, 2), 12, now);
   EXPECT_TRUE(is_suspect(0));
   EXPECT_TRUE(is_suspect(12));
   EXPECT_FALSE(is_suspect(13));
 }
 
+TEST_F(MirrorClockTest, ClockErrorsFromBeforeASlewAreSuspect) {
+  const auto shows = [](RawTime raw, Duration wall) {
+    auto made = std::make_shared<wire::ClockReport>(*report(1us));
+    made->line = {raw, Time(wall), 0, 10us};
+    return made;
+  };
+  clock.on_owner(shows(RawTime(1s), 1s), 9, now);
+  clock.on_owner(shows(RawTime(2s), 2s + MirrorClock::kSlewed), 11, now);
+  EXPECT_EQ(clock.assessment().suspect_last, kNoTid) << "a usual correction";
+  clock.on_owner(shows(RawTime(3s), 3s + 1ms), 12, now);
+  EXPECT_EQ(clock.assessment().suspect_first, 13);
+  clock.on_time(20, now + MirrorClock::kStaleFor - 1ns);
+  EXPECT_EQ(clock.assessment().suspect_last, INT64_MAX);
+  clock.on_time(25, now + MirrorClock::kStaleFor);
+  EXPECT_EQ(clock.assessment().suspect_first, 13);
+  EXPECT_EQ(clock.assessment().suspect_last, 25);
+}
+
 TEST_F(MirrorClockTest, ANewRingHasNoSuspectSamples) {
-  clock.on_owner(report(1us, 1), 9);
-  clock.on_owner(report(1us, 2), 12);
+  clock.on_owner(report(1us, 1), 9, now);
+  clock.on_owner(report(1us, 2), 12, now);
   clock.on_new_ring();
   EXPECT_FALSE(is_suspect(0));
 }
 
 TEST_F(MirrorClockTest, ANewRingOfAnUnknownClockIsAllSuspect) {
-  clock.on_owner(report(kUnknownClockError), 9);
+  clock.on_owner(report(kUnknownClockError), 9, now);
   clock.on_new_ring();
   EXPECT_TRUE(is_suspect(0));
 }
