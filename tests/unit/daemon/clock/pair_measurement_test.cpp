@@ -129,8 +129,8 @@ TEST_F(PairMeasurementTest, TheRateMayChangeByAllThatIsAllowed) {
   }
 }
 
-// Half of the best round trip and 30 us; more only while the best heartbeat is old and few others are
-// good, so that the rate is not well known.
+// Half of the best round trip and 30 us; more only while the best heartbeat is old and few others
+// are good, so that the rate is not well known.
 TEST_F(PairMeasurementTest, TheBoundsAreAsTightAsTheBestRoundTrips) {
   theirs.rate = 35e-6;
   ours.rate = -20e-6;
