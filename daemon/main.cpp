@@ -17,6 +17,7 @@
 #include <cstdio>
 #include <memory>
 #include <optional>
+#include <thread>
 #include <utility>
 #include <vector>
 
@@ -50,6 +51,9 @@ namespace dssm::daemon {
 namespace {
 
 constexpr int kFailed = 1, kUsage = 2;
+
+// systemd starts a dssmd that failed again at once (RestartSec=0), and what is wrong may last.
+constexpr Duration kRetryPause = std::chrono::milliseconds(250);
 
 // How this dssmd greets other hosts.
 wire::Greeting own_greeting(const std::string& name,
@@ -411,8 +415,10 @@ int main(int argc, char** argv) {
       return DSSM_TRY(parse_command_line(argc, argv)).config;
     };
   }
+  const bool is_service = !ServiceManager::notify_socket().empty();
   if (Result<void> ran = run(line->config, read_again, *logger); !ran) {
     logger->error(ran.error().message, {.message_id = message_id::kFailed});
+    if (is_service) std::this_thread::sleep_for(kRetryPause);
     return kFailed;
   }
   return 0;

@@ -10,8 +10,10 @@
 // written until then. The last line is JSON:
 //
 //   write  {"written": {STREAM: COUNT}}
-//   read   {"faults": TEXT, "streams": {STREAM: {"taken": N, "lost": N, "restarts": N}}}
+//   read   {"faults": TEXT, "streams": {STREAM: {"taken": N, "lost": N, "restarts": N}},
+//           "silences_ms": {STREAM: [N]}}
 //
+// Silences are the times without a new sample, from 100 ms on, in their order.
 // A fault is a sample that was torn, read twice, out of order, or lost without being counted.
 // Exit status: 0; 1 with the reason on stderr.
 #include <poll.h>
@@ -36,6 +38,7 @@ using namespace std::chrono_literals;
 
 constexpr std::uint64_t kPayloadBytes = 256;
 constexpr std::uint64_t kHistorySeconds = 20;
+constexpr Duration kLeastSilence = 100ms;
 
 KnownStream known_stream(const std::string& name, std::uint64_t rate_hz) {
   KnownStream known;
@@ -91,6 +94,27 @@ void write(const std::vector<KnownStream>& streams) {
   print(nlohmann::json{{"written", written}}.dump());
 }
 
+// The times in which one stream brought nothing new.
+class Silences {
+ public:
+  void update(std::uint64_t taken) {
+    const MonoTime now = MonoClock::now();
+    if (taken == taken_) return;
+    const Duration silent = now - since_;
+    if (taken_ > 0 && silent >= kLeastSilence) {
+      found_ms_.push_back(std::chrono::duration_cast<std::chrono::milliseconds>(silent).count());
+    }
+    taken_ = taken;
+    since_ = now;
+  }
+  const std::vector<std::int64_t>& found_ms() const { return found_ms_; }
+
+ private:
+  std::uint64_t taken_ = 0;
+  MonoTime since_{};
+  std::vector<std::int64_t> found_ms_;
+};
+
 void read(const std::vector<KnownStream>& streams) {
   Session session = Session::connect({.request_timeout = 60s}).value();
   std::vector<Follower> followers;
@@ -99,9 +123,13 @@ void read(const std::vector<KnownStream>& streams) {
   }
   std::vector<RawReader*> readers;
   for (Follower& follower : followers) readers.push_back(&follower.reader());
+  std::vector<Silences> silences(followers.size());
   const auto take = [&] {
     (void)wait_any(readers, deadline_in(100ms));
-    for (Follower& follower : followers) follower.take(1000);
+    for (std::size_t i = 0; i < followers.size(); ++i) {
+      followers[i].take(1000);
+      silences[i].update(followers[i].taken());
+    }
   };
   const auto all = [&](auto condition) {
     return std::all_of(followers.begin(), followers.end(), condition);
@@ -118,14 +146,17 @@ void read(const std::vector<KnownStream>& streams) {
     const Tid newest = session.stream_info(follower.known().id).value().newest;
     while (follower.last() < newest) take();
   }
-  nlohmann::json found;
+  nlohmann::json found, silent;
   std::string text;
-  for (const Follower& follower : followers) {
+  for (std::size_t i = 0; i < followers.size(); ++i) {
+    const Follower& follower = followers[i];
+    const std::string stream = follower.known().id.str();
     text += follower.faults();
-    found[follower.known().id.str()] = {
+    found[stream] = {
         {"taken", follower.taken()}, {"lost", follower.lost()}, {"restarts", follower.restarts()}};
+    silent[stream] = silences[i].found_ms();
   }
-  print(nlohmann::json{{"faults", text}, {"streams", found}}.dump());
+  print(nlohmann::json{{"faults", text}, {"streams", found}, {"silences_ms", silent}}.dump());
 }
 
 }  // namespace

@@ -70,6 +70,12 @@ class Load:
         return GuestError(f"{self._guest.name}: '{self._command}' {what}")
 
 
+def print_silences(read: dict[str, Any], who: str) -> None:
+    """Prints how long the streams brought nothing new, from 100 ms on."""
+    for stream, silences in read["silences_ms"].items():
+        print(f"  | {who}, '{stream}': silent for {', '.join(map(str, silences)) or 'less than 100'} ms", flush=True)
+
+
 def expect_complete(written: dict[str, Any], read: dict[str, Any], who: str) -> None:
     """Checks that every written sample was read once, in order, untorn, and from the same ring."""
     assert not read["faults"], f"{who}: {read['faults']}"

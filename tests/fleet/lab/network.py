@@ -5,7 +5,7 @@ It is in the network namespace of the harness (run), so names and addresses are 
 and nothing must be removed.
 """
 
-from collections.abc import Iterable
+from collections.abc import Collection
 
 from lab.command import run
 
@@ -40,11 +40,9 @@ class Network:
         for number in range(1, guests + 1):
             self._ip("tuntap", "add", tap(number), "mode", "tap")
             self._ip("link", "set", tap(number), "master", BRIDGE, "up")
-        self._nft("add table bridge lab; add set bridge lab left { type ifname; };"
-                  " add set bridge lab right { type ifname; };"
+        self._nft("add table bridge lab; add set bridge lab blocked { type ifname . ifname; };"
                   " add chain bridge lab forward { type filter hook forward priority 0; };"
-                  " add rule bridge lab forward iifname @left oifname @right drop;"
-                  " add rule bridge lab forward iifname @right oifname @left drop")
+                  " add rule bridge lab forward iifname . oifname @blocked drop")
 
     def unplug(self, number: int) -> None:
         """Pulls the cable of a guest; this machine cannot reach the guest either."""
@@ -55,14 +53,20 @@ class Network:
         """Reconnects the cable of a guest."""
         self._ip("link", "set", tap(number), "master", BRIDGE)
 
-    def part(self, left: Iterable[int], right: Iterable[int]) -> None:
+    def part(self, left: Collection[int], right: Collection[int]) -> None:
         """Blocks packets between two groups of guests; ssh from this machine still works."""
-        for name, members in (("left", left), ("right", right)):
-            self._nft(f"add element bridge lab {name} {{ {', '.join(map(tap, members))} }}")
+        for one in left:
+            for other in right:
+                self.block(one, other)
+                self.block(other, one)
+
+    def block(self, sender: int, receiver: int) -> None:
+        """Blocks packets of one guest to another, and only in this direction."""
+        self._nft(f"add element bridge lab blocked {{ {tap(sender)} . {tap(receiver)} }}")
 
     def join(self) -> None:
-        """Ends the effect of part()."""
-        self._nft("flush set bridge lab left; flush set bridge lab right")
+        """Ends the effect of part() and block()."""
+        self._nft("flush set bridge lab blocked")
 
     @staticmethod
     def _ip(*arguments: str) -> None:

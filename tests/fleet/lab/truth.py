@@ -194,6 +194,11 @@ class Truth:
         statuses = [observation.status_of(owner) for observation in self.watched[reader].last.observations if observation.came > since]
         return statuses.count("ok") / max(len(statuses), 1)
 
+    def count(self) -> int:
+        """How many statements were observed."""
+        return sum(1 for watched in self.watched.values() for run in watched.runs.values()
+                   for observation in run.observations for kind in KINDS for _ in statements(observation, kind))
+
     def _last_not_good(self, names: Iterable[str], begin: int) -> tuple[str, int]:
         last = ("nothing", begin)
         for name in names:

@@ -8,7 +8,7 @@ stream that no program has open, and so no program can give back, keeps all its 
 
 from lab.dssmd import await_new_samples, await_restarted, kill_dssmd, main_pid
 from lab.lab import Lab
-from lab.load import RATE_HZ, Load, expect_complete
+from lab.load import RATE_HZ, Load, expect_complete, print_silences
 
 STREAMS = [f"load{number}:0@pc1" for number in (1, 2, 3)]
 ALONE = "alone:0@pc1"
@@ -34,7 +34,9 @@ def run(lab: Lab) -> None:
     written = {"written": {stream: count for writer in writers
                            for stream, count in writer.finish()["written"].items()}}
     for name, reader in readers.items():
-        expect_complete(written, reader.finish(), f"reader on {name}")
+        read = reader.finish()
+        print_silences(read, f"reader on {name}")
+        expect_complete(written, read, f"reader on {name}")
     lab.await_streams(*STREAMS, ALONE)
     for guest in (pc1, pc2):
         found = Load(guest, "read", [ALONE]).await_ready().finish()
