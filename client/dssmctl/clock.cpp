@@ -1,7 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl clock: how good the fleet's clocks are, a row per host; as it changes (--watch), as a
-// table of statistics (--table), or as something to wait for (--wait).
+// dssmctl clock: how good the fleet's clocks are, a row per host, or per pair of hosts (--matrix);
+// as it changes (--watch), as a table of statistics (--table), or as something to wait for
+// (--wait).
 #include <fmt/format.h>
 
 #include <algorithm>
@@ -32,10 +33,14 @@ std::string reference_text(const HostInfo& host) {
   return or_dash(escaped(host.clock_reference));
 }
 
+const char* reads_text(const std::string& reason, bool refused) {
+  return reason.empty() ? "good" : refused ? "refused" : "marked";
+}
+
 // What reads by time do with its samples here; nullptr: it is this PC.
 const char* reads_text(const HostInfo& host) {
   if (host.state == HostState::self) return nullptr;
-  return host.clock_reason.empty() ? "good" : host.clock_refused ? "refused" : "marked";
+  return reads_text(host.clock_reason, host.clock_refused);
 }
 
 std::string reads_cell(const HostInfo& host) {
@@ -108,11 +113,78 @@ void print_clocks(const std::vector<HostInfo>& hosts, bool json, Output& out) {
   table.print(out);
 }
 
+std::string bound_cell(Duration bound) {
+  return bound == kUnknownClockError ? "-" : duration_text(bound);
+}
+
+std::vector<std::string> pair_row(const ClockPair& pair) {
+  const std::string reader = or_dash(escaped(pair.reader)), owner = or_dash(escaped(pair.owner));
+  if (!pair.error.empty()) {
+    return {reader, owner, "-", "-", "-", "-", "-", "-", "-", "-", escaped_message(pair.error)};
+  }
+  return {reader,
+          owner,
+          reads_text(pair.reason, pair.refused),
+          bound_text(pair.bound),
+          bar_text(pair.bound, pair.limit),
+          duration_text(pair.limit),
+          pair.basis == DistanceBasis::nothing ? "-" : std::string(name_of(pair.basis)),
+          bound_cell(pair.chain),
+          bound_cell(pair.measured),
+          pair.round_trip > Duration::zero() ? duration_text(pair.round_trip) : "-",
+          escaped_message(pair.reason)};
+}
+
+Json pair_json(const ClockPair& pair) {
+  const bool is_known = pair.error.empty();
+  const bool is_measured = pair.round_trip > Duration::zero();
+  return {{"reader", pair.reader},
+          {"owner", or_null(pair.owner)},
+          {"reads", is_known ? Json(reads_text(pair.reason, pair.refused)) : Json()},
+          {"reads_reason", or_null(pair.reason)},
+          {"bound_ns", bound_json(pair.bound)},
+          {"limit_ns", is_known ? Json(to_ns(pair.limit)) : Json()},
+          {"known_by", pair.basis == DistanceBasis::nothing ? Json() : Json(name_of(pair.basis))},
+          {"chain_ns", bound_json(pair.chain)},
+          {"measured_ns", bound_json(pair.measured)},
+          {"round_trip_ns", is_measured ? Json(to_ns(pair.round_trip)) : Json()},
+          {"error", or_null(pair.error)}};
+}
+
+void print_matrix(const std::vector<ClockPair>& pairs, bool json, Output& out) {
+  if (json) {
+    Json all = Json::array();
+    for (const ClockPair& pair : pairs) all.push_back(pair_json(pair));
+    return out.add(json_line({{"clock_pairs", std::move(all)}}));
+  }
+  Table table({{"ON"},
+               {"OF"},
+               {"READS"},
+               {"BOUND", Table::Align::right},
+               {"OF LIMIT"},
+               {"LIMIT", Table::Align::right},
+               {"KNOWN BY"},
+               {"CHAIN", Table::Align::right},
+               {"MEASURED", Table::Align::right},
+               {"RTT", Table::Align::right},
+               {"REASON"}});
+  for (const ClockPair& pair : pairs) table.add_row(pair_row(pair));
+  table.print(out);
+}
+
+Result<void> print_once(Session& session, const ClockOptions& options, Output& out) {
+  if (options.matrix) {
+    print_matrix(DSSM_TRY(session.list_clock_pairs()), options.json, out);
+  } else {
+    print_clocks(DSSM_TRY(session.list_hosts()), options.json, out);
+  }
+  return {};
+}
+
 Result<void> watch_clocks(Session& session, const ClockOptions& options, Output& out) {
   catch_stop_signals();
   for (MonoTime next = MonoClock::now();; next += kReadingPeriod) {
-    const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
-    print_clocks(hosts, options.json, out);
+    DSSM_TRY(print_once(session, options, out));
     if (!options.json) out.add("\n");
     if (!out.flush() || !out.sleep_until(next + kReadingPeriod)) return {};
   }
@@ -221,9 +293,7 @@ Result<void> run(const ClockOptions& options, Output& out) {
   if (options.wait) return await_clock(session, options, out);
   if (options.table) return tabulate_clocks(session, options, out);
   if (options.watch) return watch_clocks(session, options, out);
-  const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
-  print_clocks(hosts, options.json, out);
-  return {};
+  return print_once(session, options, out);
 }
 
 }  // namespace dssm::ctl

@@ -112,7 +112,7 @@ _dssmctl() {
     "") options="--version" ;;
     ls) options="--host --local --names --own --reverse --sort --watch" ;;
     hosts) options="--names" ;;
-    clock) options="--table --wait --watch" ;;
+    clock) options="--matrix --table --wait --watch" ;;
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
     hz | bw | delay) options="--count --interval --wait --window" ;;

@@ -174,6 +174,9 @@ void add_clock(CLI::App& app, Parsed& parsed) {
   CLI::App* clock = app.add_subcommand("clock", "how good the hosts' clocks are");
   ClockOptions& options = add_options<ClockOptions>(clock, parsed);
   CLI::Option* watch = clock->add_flag("--watch", options.watch, "continue: all again each second");
+  CLI::Option* matrix =
+      clock->add_flag("--matrix", options.matrix,
+                      "a row for each pair of hosts: how far their clocks may be apart");
   CLI::Option* table = add_whole(clock, "--table", "N",
                                  "average, maximum, minimum and standard deviation of N readings, "
                                  "one a second",
@@ -181,8 +184,9 @@ void add_clock(CLI::App& app, Parsed& parsed) {
   add_seconds(clock, "--wait", "until this host's clock is good, for so long at most", options.wait,
               Range::not_negative)
       ->excludes(watch)
+      ->excludes(matrix)
       ->excludes(table);
-  table->excludes(watch);
+  table->excludes(watch)->excludes(matrix);
 }
 
 void add_ping(CLI::App& app, Parsed& parsed) {

@@ -40,6 +40,7 @@ struct HostsOptions : CommonOptions {
 
 struct ClockOptions : CommonOptions {
   bool watch = false;
+  bool matrix = false;                 // a row per pair of hosts
   std::optional<std::uint64_t> table;  // number of readings
   std::optional<Duration> wait;
 };

@@ -98,6 +98,20 @@ std::string bound_text(Duration bound) {
   return bound == kUnknownClockError ? "unknown" : duration_text(bound);
 }
 
+std::string bar_text(Duration bound, Duration limit) {
+  constexpr std::size_t kCells = 10;
+  if (bound == kUnknownClockError) return "-";
+  if (bound > limit) return "[" + std::string(kCells, '#') + ">";
+  std::string cells;
+  if (bound > Duration::zero()) {
+    const double tenths =
+        kCells * static_cast<double>(to_ns(bound)) / static_cast<double>(to_ns(limit));
+    cells.assign(static_cast<std::size_t>(std::ceil(tenths)), '#');
+  }
+  cells.resize(kCells, ' ');
+  return "[" + cells + "]";
+}
+
 std::string seconds_text(std::int64_t ns) {
   // By the unsigned magnitude, so that the smallest number has one too.
   const std::uint64_t size =

@@ -38,6 +38,10 @@ std::string ns_text(double ns);
 // A bound on a clock's or stamp's error, as duration_text(), or "unknown".
 std::string bound_text(Duration bound);
 
+// `bound` as a part of `limit`, 12 characters: "[###       ]". A '#' is a tenth, rounded up; beyond
+// the limit it ends with '>': "[##########>". Unknown: "-".
+std::string bar_text(Duration bound, Duration limit);
+
 // Nanoseconds as exact seconds: "-1.500000000".
 std::string seconds_text(std::int64_t ns);
 

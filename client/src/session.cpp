@@ -232,6 +232,17 @@ Result<std::vector<HostInfo>> Session::list_hosts() {
   return hosts;
 }
 
+Result<std::vector<ClockPair>> Session::list_clock_pairs() {
+  local::Request request;
+  request.mutable_list_clock_pairs();
+  const auto response = DSSM_TRY(ask(*client_, std::move(request), "list the pairs of clocks"));
+  std::vector<ClockPair> pairs;
+  for (const proto::ClockPair& pair : response.clock_pair_list().pairs()) {
+    pairs.push_back(wire::clock_pair_untrusted(pair));
+  }
+  return pairs;
+}
+
 Result<RoundTrip> Session::ping(const std::string& host) {
   local::Request request;
   request.mutable_ping_host()->set_host(host);

@@ -150,4 +150,10 @@ std::string_view name_of(ClockPolicy policy) noexcept {
   return name_in(kNames, policy);
 }
 
+std::string_view name_of(DistanceBasis basis) noexcept {
+  static constexpr std::array<std::string_view, 4> kNames = {"nothing", "chain", "measured",
+                                                             "one clock"};
+  return name_in(kNames, basis);
+}
+
 }  // namespace dssm

@@ -4,6 +4,7 @@
 #include <algorithm>
 #include <cstring>
 
+#include "core/base/text.hpp"
 #include "core/clock/clock_bound.hpp"
 #include "core/wire/messages.hpp"
 
@@ -66,6 +67,10 @@ void take_bounds_untrusted(const proto::ClockReport& message, ClockReport& out) 
   if (!take_16_untrusted(message.anchor(), out.anchor)) return;
   out.clock.bound = error_untrusted(message.bound_ns());
   out.bound_is_root = message.bound_is_root();
+}
+
+std::string host_untrusted(const std::string& name) {
+  return check_host_name(name) ? name : std::string();
 }
 
 bool is_time(std::int64_t ns) noexcept { return ns > 0 && ns < kMaxTimeNs; }
@@ -156,6 +161,36 @@ ClockReport clock_report_untrusted(const proto::ClockReport& message, MonoTime a
     if (take_16_untrusted(address, taken.bytes)) report.addresses.push_back(taken);
   }
   return report;
+}
+
+void to_message(const ClockPair& pair, proto::ClockPair& out) {
+  out.set_reader(pair.reader);
+  out.set_owner(pair.owner);
+  out.set_refused(pair.refused);
+  out.set_reason(pair.reason);
+  out.set_bound_ns(to_ns(pair.bound));
+  out.set_basis(static_cast<std::uint32_t>(pair.basis));
+  out.set_chain_ns(to_ns(pair.chain));
+  out.set_measured_ns(to_ns(pair.measured));
+  out.set_round_trip_ns(to_ns(pair.round_trip));
+  out.set_limit_ns(to_ns(pair.limit));
+  out.set_error(pair.error);
+}
+
+ClockPair clock_pair_untrusted(const proto::ClockPair& message) {
+  ClockPair pair;
+  pair.reader = host_untrusted(message.reader());
+  pair.owner = host_untrusted(message.owner());
+  pair.refused = message.refused();
+  pair.reason = text_untrusted(message.reason(), kMaxSentenceBytes);
+  pair.bound = error_untrusted(message.bound_ns());
+  pair.basis = enum_untrusted(message.basis(), DistanceBasis::one_clock);
+  pair.chain = error_untrusted(message.chain_ns());
+  pair.measured = error_untrusted(message.measured_ns());
+  pair.round_trip = length_untrusted(message.round_trip_ns());
+  pair.limit = length_untrusted(message.limit_ns());
+  pair.error = text_untrusted(message.error(), kMaxSentenceBytes);
+  return pair;
 }
 
 }  // namespace dssm::wire

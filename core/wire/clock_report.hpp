@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // What a host reports of its clock to others (ClockReport in common.proto), as a value: a clock
-// snapshot, and the sync chain through which the clock reaches its reference. The one encoder and
-// decoder of both. docs/clocks.md "Between two PCs".
+// snapshot, and the sync chain through which the clock reaches its reference; and what it states of
+// the clocks of others (ClockPair in catalog.proto). The one encoder and decoder of both.
+// docs/clocks.md "Between two PCs".
 #pragma once
 
 #include <array>
@@ -13,6 +14,7 @@
 #include <string>
 #include <vector>
 
+#include "catalog.pb.h"
 #include "common.pb.h"
 #include "core/clock/clock_line.hpp"
 #include "core/wire/address.hpp"
@@ -66,5 +68,14 @@ void to_message(const ClockReport& report, proto::ClockReport& out);
 
 // Values beyond their limits count as unknown.
 ClockReport clock_report_untrusted(const proto::ClockReport& message, MonoTime as_of);
+
+// Of one host: it connects to at most 256 that it found and those that it is configured with.
+inline constexpr std::size_t kMaxClockPairs = 512;
+
+void to_message(const ClockPair& pair, proto::ClockPair& out);
+
+// Values beyond their limits count as unknown, and names that no host can have as empty. Text is
+// printable, and cut off when it is too long.
+ClockPair clock_pair_untrusted(const proto::ClockPair& message);
 
 }  // namespace dssm::wire

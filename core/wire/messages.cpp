@@ -3,6 +3,7 @@
 
 #include <fmt/format.h>
 
+#include "core/base/text.hpp"
 #include "core/base/try.hpp"
 #include "core/wire/frame.hpp"
 #include "network.pb.h"
@@ -32,6 +33,12 @@ MirrorInfo mirror_info(const proto::Mirror& message) {
 }
 
 }  // namespace
+
+std::string text_untrusted(const std::string& text, std::size_t max_bytes) {
+  std::string taken = printable(text.substr(0, max_bytes));
+  while (!is_utf8(taken)) taken.pop_back();
+  return taken;
+}
 
 void to_message(const StreamId& id, proto::StreamId& out) {
   out.set_name(id.name);

@@ -17,6 +17,7 @@ namespace dssm::wire {
 inline constexpr std::size_t kMaxPropertyBytes = 16U << 20;
 inline constexpr std::size_t kMaxFields = 1024;
 inline constexpr std::size_t kMaxProgramBytes = 127;
+inline constexpr std::size_t kMaxSentenceBytes = 511;  // for people, of another host
 
 // The value of an enum that came in a message; when it is beyond `last`, the first one, which means
 // that nothing is known.
@@ -24,6 +25,9 @@ template <class Enum>
 Enum enum_untrusted(std::int64_t value, Enum last) noexcept {
   return value >= 0 && value <= static_cast<std::int64_t>(last) ? static_cast<Enum>(value) : Enum{};
 }
+
+// `text` with '?' for control characters, and cut off after `max_bytes` or where it is not UTF-8.
+std::string text_untrusted(const std::string& text, std::size_t max_bytes);
 
 // Public types to messages.
 void to_message(const StreamId& id, proto::StreamId& out);

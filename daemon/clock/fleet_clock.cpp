@@ -535,6 +535,43 @@ Duration FleetClock::distance_of_samples(const wire::ClockReport& owner) const {
   return assess_mirror({}, &owner).distance(latest, now);
 }
 
+std::vector<ClockPair> FleetClock::clock_pairs() {
+  clock_generation();  // so that what was measured is about this clock as it is now
+  std::vector<ClockPair> pairs;
+  for (const auto& [id, host] : catalog_.hosts()) {
+    if (pairs.size() == wire::kMaxClockPairs) break;
+    if (id != self_) pairs.push_back(pair_with(host.greeting));
+  }
+  return pairs;
+}
+
+ClockPair FleetClock::pair_with(const wire::Greeting& owner) const {
+  const wire::ClockReport* const theirs = owner.clock.get();
+  ClockPair pair;
+  pair.owner = owner.host;
+  pair.limit = policies_.general.limit;
+  pair.reason = reason_against(theirs);
+  pair.refused = !pair.reason.empty() && refuses();
+  if (!theirs) return pair;
+  pair.bound = distance_of_samples(*theirs);
+  if (own_->shares_clock_with(*theirs)) {
+    pair.basis = DistanceBasis::one_clock;
+    return pair;
+  }
+  // Both statements, also when they exclude each other.
+  const MonoTime now = MonoClock::now();
+  const wire::ClockReport latest = theirs->at(now);
+  pair.chain = sum(latest.clock.bound, clock::distance_from_anchor(latest, own_->at(now)));
+  if (const auto by_heartbeats = measured(*theirs, now, policies_.general.limit)) {
+    pair.measured = by_heartbeats->greatest;
+    pair.round_trip = pairs_.at(theirs->boot_id).raws.best_round_trip();
+  }
+  if (pair.bound != kUnknownClockError) {
+    pair.basis = pair.measured <= pair.chain ? DistanceBasis::measured : DistanceBasis::chain;
+  }
+  return pair;
+}
+
 Error FleetClock::refusal(const StreamId& id, const wire::ClockReport* owner) const {
   std::string reason = reason_against(owner, policies_.demand_for(id).limit);
   if (reason.empty()) reason = "its host's clock was not known a moment ago";

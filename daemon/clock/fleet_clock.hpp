@@ -105,6 +105,7 @@ class FleetClock final : public ClockAssessor,
                                       const wire::ClockReport* owner) const override;
   ring::ClockAssessment assess_own(const StreamId& id) const override;
   Error refusal(const StreamId& id, const wire::ClockReport* owner) const override;
+  std::vector<ClockPair> clock_pairs() override;
 
  private:
   // The host whose address chronyd names.
@@ -167,6 +168,7 @@ class FleetClock final : public ClockAssessor,
   ring::ClockAssessment assessment(const StreamId& id, MonoTime now) const;
   std::string reason_against(const wire::ClockReport* owner, Duration limit) const;
   Duration distance_of_samples(const wire::ClockReport& owner) const;
+  ClockPair pair_with(const wire::Greeting& owner) const;
 
   Catalog& catalog_;
   clock::ClockPageWriter page_;

@@ -1,13 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What the ends of channels ask about clocks: may samples be carried between this host and another
-// one, and what are their times worth here. FleetClock answers. Where it is absent (nullptr), every
-// sample is carried and counts as good.
+// What the ends of connections ask about clocks: may samples be carried between this host and
+// another one, and what are their times worth here. FleetClock answers. Where it is absent
+// (nullptr), every sample is carried and counts as good.
 #pragma once
 
 #include <cstdint>
 #include <dssm/result.hpp>
 #include <dssm/stream.hpp>
+#include <vector>
 
 #include "core/ring/clock_assessment.hpp"
 #include "core/wire/clock_report.hpp"
@@ -36,6 +37,10 @@ class ClockAssessor {
 
   // Why a mirror of `id` is not good enough to be opened; for the log and for programs.
   virtual Error refusal(const StreamId& id, const wire::ClockReport* owner) const = 0;
+
+  // What is stated here of the samples of each other host that is up, at most wire::kMaxClockPairs.
+  // Checks this PC's clock first. Without `reader`.
+  virtual std::vector<ClockPair> clock_pairs() = 0;
 
  protected:
   ~ClockAssessor() = default;

@@ -4,6 +4,8 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <set>
+#include <tuple>
 #include <utility>
 
 #include "core/base/text.hpp"
@@ -31,6 +33,71 @@ Result<proto::Stream> stream_untrusted(const std::string& host, proto::Stream st
 
 Error unexpected(const std::string& host) {
   return {Errc::protocol, fmt::format("host '{}' sent a response of another kind", host)};
+}
+
+// What one host states of the clocks of others.
+struct ClockRow {
+  std::string reader;
+  Result<std::vector<ClockPair>> pairs = std::vector<ClockPair>();
+};
+
+Error has_not_answered(const std::string& host) {
+  return {Errc::unavailable, fmt::format("host '{}' has not answered within {} ms", host,
+                                         Fleet::kFreshTimeout / std::chrono::milliseconds(1))};
+}
+
+// The answer of `host` to ListClockPairs.
+Result<std::vector<ClockPair>> clock_pairs_untrusted(const std::string& host,
+                                                     const Result<net::Frame>& answer) {
+  if (!answer) return answer.error();
+  if (!answer->has_clock_pair_list()) return unexpected(host);
+  std::vector<ClockPair> pairs;
+  for (const proto::ClockPair& message : answer->clock_pair_list().pairs()) {
+    if (pairs.size() == wire::kMaxClockPairs) break;
+    ClockPair pair = wire::clock_pair_untrusted(message);
+    if (pair.owner.empty()) continue;
+    pair.error.clear();  // only clock_matrix() states one
+    pairs.push_back(std::move(pair));
+  }
+  return pairs;
+}
+
+ClockPair unknown_pair(const std::string& reader, const std::string& owner,
+                       const std::string& error) {
+  ClockPair pair;
+  pair.reader = reader;
+  pair.owner = owner;
+  pair.error = wire::text_untrusted(error, wire::kMaxSentenceBytes);
+  return pair;
+}
+
+// All pairs of `rows`, by reader, then owner. Each host has its own peers, so a row may lack a host
+// that has one itself.
+std::vector<ClockPair> clock_matrix(const std::vector<ClockRow>& rows) {
+  std::vector<ClockPair> all;
+  for (const auto& [reader, pairs] : rows) {
+    if (!pairs) {
+      all.push_back(unknown_pair(reader, {}, pairs.error().message));
+      continue;
+    }
+    std::set<std::string> owners = {reader};
+    for (const ClockPair& pair : *pairs) {
+      owners.insert(pair.owner);
+      all.push_back(pair);
+      all.back().reader = reader;
+    }
+    for (const ClockRow& other : rows) {
+      if (!owners.insert(other.reader).second) continue;
+      all.push_back(unknown_pair(
+          reader, other.reader,
+          fmt::format("'{}' has no connection to '{}'; see `dssmctl hosts` and the key peers there",
+                      reader, other.reader)));
+    }
+  }
+  std::stable_sort(all.begin(), all.end(), [](const ClockPair& a, const ClockPair& b) {
+    return std::tie(a.reader, a.owner) < std::tie(b.reader, b.owner);
+  });
+  return all;
 }
 
 // The request that has the owner of `id` do what a program asks for.
@@ -210,52 +277,27 @@ std::vector<StreamInfo> FleetService::known_streams() const {
   return streams;
 }
 
-void FleetService::list(Then<std::vector<proto::Stream>> then) {
+// Calls `then` when all have answered, or at the timeout.
+void FleetService::ask_all(const net::Frame& request, std::function<void(Answers)> then) {
   const auto listing = std::make_shared<Listing>();
   listing->then = std::move(then);
   listing->deadline = loop_.deadline_in(kFreshTimeout);
   listing->unanswered = catalog_.hosts().size() + 1;  // this function is one of them until its end
   for (const auto& [id, host] : catalog_.hosts()) {
-    net::Frame request;
-    request.mutable_list();
-    peers_.connection_to(id)->ask(std::move(request),
-                                  [this, listing, host_id = id](Result<net::Frame> answer) {
-                                    on_list_answer(*listing, host_id, std::move(answer));
-                                  });
+    peers_.connection_to(id)->ask(request, [listing, host_id = id](Result<net::Frame> answer) {
+      if (!listing->done) listing->answers.emplace(host_id, std::move(answer));
+      if (--listing->unanswered == 0) finish(*listing);
+    });
   }
   if (--listing->unanswered == 0) return finish(*listing);
   listings_.push_back(listing);
   if (listings_.size() == 1) list_timer_.enable_in(kFreshTimeout);
 }
 
-void FleetService::on_list_answer(Listing& listing, const wire::HostId& id,
-                                  Result<net::Frame> answer) {
-  const KnownHost* host = catalog_.find(id);
-  if (answer && host && !listing.done) {
-    std::vector<proto::Stream>& streams = listing.answers[id];
-    for (proto::Stream& message : *answer->mutable_stream_list()->mutable_streams()) {
-      Result<proto::Stream> stream = stream_untrusted(host->greeting.host, std::move(message));
-      if (stream) streams.push_back(*std::move(stream));
-    }
-  }
-  if (--listing.unanswered == 0) finish(listing);
-}
-
-// Responds with what has arrived, and with the catalog for hosts that have not answered.
 void FleetService::finish(Listing& listing) {
   if (std::exchange(listing.done, true)) return;
   const auto then = std::exchange(listing.then, {});
-  auto answers = std::exchange(listing.answers, {});
-  std::vector<proto::Stream> streams;
-  for (const KnownHost* host : hosts_by_name()) {
-    if (const auto answer = answers.find(host->greeting.host_id); answer != answers.end()) {
-      std::move(answer->second.begin(), answer->second.end(), std::back_inserter(streams));
-      continue;
-    }
-    for (const auto& [key, stream] : host->streams)
-      wire::to_message(stream, streams.emplace_back());
-  }
-  then(std::move(streams));
+  then(std::exchange(listing.answers, {}));
 }
 
 void FleetService::on_list_timeout() {
@@ -267,6 +309,46 @@ void FleetService::on_list_timeout() {
     listings_.pop_front();
     finish(*first);
   }
+}
+
+// With what has arrived, and with the catalog for hosts that have not answered.
+void FleetService::list(Then<std::vector<proto::Stream>> then) {
+  net::Frame request;
+  request.mutable_list();
+  ask_all(request, [this, then = std::move(then)](Answers answers) {
+    std::vector<proto::Stream> streams;
+    for (const KnownHost* host : hosts_by_name()) {
+      const auto answer = answers.find(host->greeting.host_id);
+      if (answer == answers.end() || !answer->second) {
+        for (const auto& [key, stream] : host->streams)
+          wire::to_message(stream, streams.emplace_back());
+        continue;
+      }
+      for (proto::Stream& message : *answer->second->mutable_stream_list()->mutable_streams()) {
+        Result<proto::Stream> stream = stream_untrusted(host->greeting.host, std::move(message));
+        if (stream) streams.push_back(*std::move(stream));
+      }
+    }
+    then(std::move(streams));
+  });
+}
+
+void FleetService::list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) {
+  net::Frame request;
+  request.mutable_list_clock_pairs();
+  ask_all(request, [this, then = std::move(then)](const Answers& answers) {
+    std::vector<ClockRow> rows(1);
+    rows.front().reader = self_.greeting.host;
+    if (self_.clock) rows.front().pairs = self_.clock->clock_pairs();
+    for (const KnownHost* host : hosts_by_name()) {
+      const auto answer = answers.find(host->greeting.host_id);
+      rows.push_back(
+          {host->greeting.host, answer == answers.end()
+                                    ? has_not_answered(host->greeting.host)
+                                    : clock_pairs_untrusted(host->greeting.host, answer->second)});
+    }
+    then(clock_matrix(rows));
+  });
 }
 
 // --- hosts

@@ -39,7 +39,7 @@ class FleetService final : public Fleet, private CatalogObserver {
     wire::Greeting greeting;
     std::vector<std::string> addresses;  // that it listens at
     bool insecure = false;               // at one of them other PCs connect unencrypted
-    const FleetClock* clock = nullptr;   // nullptr: the clock is not watched
+    FleetClock* clock = nullptr;         // nullptr: the clock is not watched
   };
 
   // What is given by reference outlives it.
@@ -64,6 +64,7 @@ class FleetService final : public Fleet, private CatalogObserver {
   void forward(const StreamId& id, const local::Request& request,
                Then<local::Response> then) override;
   void list(Then<std::vector<proto::Stream>> then) override;
+  void list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) override;
   std::vector<StreamInfo> known_streams() const override;
   std::vector<local::Host> hosts() const override;
   local::Mdns mdns() const override;
@@ -71,11 +72,13 @@ class FleetService final : public Fleet, private CatalogObserver {
   void ping(const std::string& host, Then<local::RoundTrip> then) override;
 
  private:
-  // A List of all hosts that is under way.
+  // Of all hosts to one request; without those that have not answered within kFreshTimeout.
+  using Answers = std::map<wire::HostId, Result<net::Frame>>;
+  // A request to all hosts that is under way.
   struct Listing {
-    Then<std::vector<proto::Stream>> then;
+    std::function<void(Answers)> then;
     MonoTime deadline;
-    std::map<wire::HostId, std::vector<proto::Stream>> answers;
+    Answers answers;
     std::size_t unanswered = 0;
     bool done = false;
   };
@@ -87,8 +90,8 @@ class FleetService final : public Fleet, private CatalogObserver {
   Mirror* mirror_without_owner(const StreamId& id) const;
   std::optional<local::Response> describe_mirror(const StreamId& id) const;
   std::vector<const KnownHost*> hosts_by_name() const;
-  void on_list_answer(Listing& listing, const wire::HostId& id, Result<net::Frame> answer);
-  void finish(Listing& listing);
+  void ask_all(const net::Frame& request, std::function<void(Answers)> then);
+  static void finish(Listing& listing);
   void on_list_timeout();
 
   void on_remote_stream_added(const KnownHost& host, const StreamInfo& stream) override;

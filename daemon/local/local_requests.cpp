@@ -6,6 +6,7 @@
 #include <utility>
 
 #include "core/base/try.hpp"
+#include "core/wire/clock_report.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -70,7 +71,7 @@ bool LocalRequests::is_elsewhere(const StreamId& id) const {
 
 bool LocalRequests::waits_for_hosts(const local::Request& request) const {
   if (!fleet_ || request.has_offer()) return false;
-  if (request.has_ping_host()) return true;
+  if (request.has_ping_host() || request.has_list_clock_pairs()) return true;
   if (request.has_list()) return !request.list().own_only();
   const proto::StreamId* named = subject(request);
   if (!named) return false;
@@ -213,6 +214,7 @@ Reply LocalRequests::get_daemon() const {
 void LocalRequests::ask_hosts_untrusted(const Client& client, const local::Request& request,
                                         Answer answer) {
   if (request.has_list()) return list_all(std::move(answer));
+  if (request.has_list_clock_pairs()) return list_clock_pairs(std::move(answer));
   if (request.has_ping_host()) return ping(request.ping_host().host(), std::move(answer));
   const StreamId id = *wire::stream_id_untrusted(*subject(request));
   if (request.has_create()) {
@@ -274,6 +276,17 @@ void LocalRequests::list_all(Answer answer) {
   fleet_->list([own, answer = std::move(answer)](Result<std::vector<proto::Stream>> streams) {
     if (!streams) return answer(std::move(streams).error());
     answer(with_streams(std::move(*own), *std::move(streams)));
+  });
+}
+
+void LocalRequests::list_clock_pairs(Answer answer) {
+  fleet_->list_clock_pairs([answer = std::move(answer)](const std::vector<ClockPair>& pairs) {
+    Reply reply;
+    proto::ClockPairList& list = *reply.response.mutable_clock_pair_list();
+    for (const ClockPair& pair : pairs) wire::to_message(pair, *list.add_pairs());
+    if (list.ByteSizeLong() <= kMaxListBytes) return answer(std::move(reply));
+    answer(Error{Errc::limit_exceeded,
+                 "the list of all hosts' clocks is longer than one message may be"});
   });
 }
 

@@ -81,6 +81,10 @@ class Fleet {
   // in the order of hosts' names, then of creation.
   static constexpr Duration kFreshTimeout = std::chrono::milliseconds(500);
   virtual void list(Then<std::vector<proto::Stream>> then) = 0;
+  // What each host that is up, this one included, states of the samples of the others, by reader,
+  // then owner. A host that does not answer within kFreshTimeout, or fails, has one entry, with the
+  // error; so has each pair of which its reader states nothing.
+  virtual void list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) = 0;
   // What is in the catalog now, without a request to other hosts: for Watch.
   virtual std::vector<StreamInfo> known_streams() const = 0;
 
@@ -106,7 +110,7 @@ class LocalRequests {
   using Answer = std::function<void(Result<Reply>)>;
 
   // Whether the response to `request` may have to wait for another host: it is a List of all hosts,
-  // a PingHost, or about a stream of another host. Offers never wait.
+  // a ListClockPairs, a PingHost, or about a stream of another host. Offers never wait.
   bool waits_for_hosts(const local::Request& request) const;
 
   // Serves a request that waits for other hosts,
@@ -138,6 +142,7 @@ class LocalRequests {
   void open_elsewhere(const Client& client, const StreamId& id, const proto::Open& request,
                       Answer answer);
   void list_all(Answer answer);
+  void list_clock_pairs(Answer answer);
   void ping(const std::string& host, Answer answer);
 
   Result<Reply> opened(const OpenEntry& entry);

@@ -6,7 +6,6 @@
 #include <algorithm>
 #include <utility>
 
-#include "core/base/text.hpp"
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/base/message_ids.hpp"
@@ -116,8 +115,7 @@ bool LocalService::greet(Client& client, std::uint64_t serial, const proto::Hell
     return refuse(client, serial, {Errc::protocol, "Hello comes once, as the first request"});
   }
   ClientIdentity identity = *client.identity;
-  identity.program = printable(hello.program().substr(0, wire::kMaxProgramBytes));
-  while (!identity.program.empty() && !is_utf8(identity.program)) identity.program.pop_back();
+  identity.program = wire::text_untrusted(hello.program(), wire::kMaxProgramBytes);
   client.identity = std::make_shared<ClientIdentity>(std::move(identity));
   if (hello.protocol_version() != wire::kLocalProtocolVersion) {
     return refuse(client, serial,

@@ -26,6 +26,7 @@ bool opens_a_stream(const net::Frame& request) noexcept {
 // there without a name.
 bool is_control(const net::Frame& request) noexcept {
   return request.has_list() || request.has_watch() || request.has_info() || request.has_remove() ||
+         request.has_list_clock_pairs() ||
          (request.has_set_property() && request.set_property().has_id()) ||
          (request.has_get_property() && request.get_property().has_id());
 }
@@ -159,7 +160,14 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
   }
   net::Frame answer;
   answer.set_serial(request.serial());
-  DSSM_TRY(catalog_.serve_untrusted(request, answer));
+  if (request.has_list_clock_pairs() && parts_.clock) {
+    proto::ClockPairList& list = *answer.mutable_clock_pair_list();
+    for (const ClockPair& pair : parts_.clock->clock_pairs()) {
+      wire::to_message(pair, *list.add_pairs());
+    }
+  } else {
+    DSSM_TRY(catalog_.serve_untrusted(request, answer));
+  }
   link_.send(answer);
   return {};
 }

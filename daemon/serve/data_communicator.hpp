@@ -3,7 +3,7 @@
 // The server end of one connection from another host or a remote program: greets, authorizes each
 // request and passes it on in its turn. The first request decides what the connection is for: a
 // channel carries one stream (StreamChannel), a control connection asks about all
-// of them (CatalogRequests, StreamWatch).
+// of them (CatalogRequests, StreamWatch) and about clocks.
 //
 // Backpressure: a request is served only while nothing waits to be sent; until then one waits here
 // and the others on the peer's side. So a peer that asks and never reads costs one answer.

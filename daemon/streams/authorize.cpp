@@ -26,6 +26,8 @@ std::optional<Action> catalog_action(const Request& request) noexcept {
     case Request::kWatch:
     case Request::kInfo:
       return Action::list;
+    case Request::kListClockPairs:
+      return Action::inspect;
     default:
       return std::nullopt;
   }

@@ -58,7 +58,7 @@ enum class Action : std::uint8_t {
   list,             // also one stream, and changes of the list
   open_clock,       // the playback clock, for reading and writing
   open_clock_page,  // the state of this PC's clock
-  inspect,          // clients, opens, hosts and dssmd itself
+  inspect,          // clients, opens, hosts, pairs of clocks and dssmd itself
   ping,             // heartbeat; round trip to another host
 };
 

@@ -64,6 +64,9 @@ class LateFleet final : public Fleet {
       then(std::move(streams));
     });
   }
+  void list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) override {
+    due_.push_back([then = std::move(then)] { then({ClockPair()}); });
+  }
   std::vector<StreamInfo> known_streams() const override {
     std::vector<StreamInfo> streams;
     for (const auto& stream : pc2_.streams()) streams.push_back(stream->info());

@@ -233,6 +233,13 @@ class Session {
   // state.
   Result<std::vector<HostInfo>> list_hosts();
 
+  // What reads by time do with the samples of each host on each other one, and how far their clocks
+  // may be apart: a pair for each two hosts that are up and each direction, sorted by reader, then
+  // owner. A reader that does not answer within 0.5 s, or whose dssmd is too old, has one entry,
+  // with an `error` and without an owner; a pair of which its reader states nothing has an `error`.
+  //   fails  limit_exceeded (tens of thousands of pairs)
+  Result<std::vector<ClockPair>> list_clock_pairs();
+
   // Measures a round trip from this PC's dssmd to that host's, over their open connection.
   //   fails  not_found (no host of that name is up), conflict (several are), unavailable (no
   //          answer)

@@ -1,10 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// What is known of a PC's clock. docs/clocks.md explains the words and the numbers.
+// What is known of a PC's clock, and of the distance of two PCs' clocks. docs/clocks.md explains
+// the words and the numbers.
 #pragma once
 
 #include <cstdint>
 #include <dssm/time.hpp>
+#include <string>
 #include <string_view>
 
 #pragma GCC visibility push(default)  // the library hides everything else
@@ -71,11 +73,46 @@ struct ClockSnapshot {
   friend bool operator==(const ClockSnapshot& a, const ClockSnapshot& b) = default;
 };
 
-// "synchronized", "out of bounds", "no chronyd", "reference", "enforce" ...; static storage.
+// What a bound on the distance of two clocks follows from.
+enum class DistanceBasis : std::uint8_t {
+  nothing,    // there is no bound
+  chain,      // what chronyd states on both hosts
+  measured,   // heartbeats between both hosts
+  one_clock,  // both have the same kernel
+};
+
+// What one host, the reader, states of the samples of another one, their owner. All of it holds at
+// the time of the request, for a sample that is written then. Bounds are >= 0; kUnknownClockError:
+// unknown.
+struct ClockPair {
+  std::string reader;  // the host that reads
+  std::string owner;   // the host whose samples are read; empty: `error` is about all of them
+  // Why the times of the owner's samples are not good for the reader, in a sentence, for people;
+  // empty: they are, or its clock_policy is off. Streams for which clock_streams has another policy
+  // or limit may differ.
+  std::string reason;
+  bool refused = false;  // for `reason`, the reader refuses reads by time
+  // How far the times of the samples may be from the reader's clock: the lesser of `chain` and
+  // `measured`, unknown when these exclude each other, 0 for one clock.
+  Duration bound = kUnknownClockError;
+  DistanceBasis basis = DistanceBasis::nothing;  // what `bound` follows from
+  Duration chain = kUnknownClockError;  // by what chronyd states on both; unknown for one clock
+  // By heartbeats, the greatest of the last minute; unknown for one clock.
+  Duration measured = kUnknownClockError;
+  Duration round_trip{};  // the shortest of the last 64 heartbeats; 0: not measured
+  Duration limit{};       // clock_limit of the reader, the greatest good `bound`
+  std::string error;      // why none of this is known, in a sentence, for people; empty: it is
+
+  friend bool operator==(const ClockPair&, const ClockPair&) = default;
+};
+
+// "synchronized", "out of bounds", "no chronyd", "reference", "enforce", "one clock" ...; static
+// storage.
 std::string_view name_of(ClockStatus status) noexcept;
 std::string_view name_of(ClockReason reason) noexcept;
 std::string_view name_of(ClockBasis basis) noexcept;
 std::string_view name_of(ClockPolicy policy) noexcept;
+std::string_view name_of(DistanceBasis basis) noexcept;
 
 }  // namespace dssm
 #pragma GCC visibility pop

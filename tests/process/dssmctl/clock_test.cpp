@@ -68,5 +68,71 @@ TEST_F(Clock, IsRefreshedUntilItIsInterrupted) {
   EXPECT_EQ(watch.status(), 0);
 }
 
+// pc1 knows pc2 and pc3, which know no other host.
+TEST_F(Clock, MatrixHasARowForEachPairOfHosts) {
+  const Json pairs = json({"clock", "--matrix"})["clock_pairs"];
+  std::string shown;
+  for (const Json& pair : pairs) {
+    shown += pair["reader"].get<std::string>() + pair["owner"].get<std::string>() + " ";
+  }
+  EXPECT_EQ(shown, "pc1pc2 pc1pc3 pc2pc1 pc2pc3 pc3pc1 pc3pc2 ");
+  EXPECT_EQ(pairs.at(0), Json({{"reader", "pc1"},
+                               {"owner", "pc2"},
+                               {"reads", "good"},
+                               {"reads_reason", nullptr},
+                               {"bound_ns", 0},
+                               {"limit_ns", 1'500'000},
+                               {"known_by", "one clock"},
+                               {"chain_ns", nullptr},
+                               {"measured_ns", nullptr},
+                               {"round_trip_ns", nullptr},
+                               {"error", nullptr}}));
+  EXPECT_TRUE(pairs.at(2)["reads"].is_null());
+  EXPECT_TRUE(pairs.at(2)["bound_ns"].is_null());
+  EXPECT_TRUE(pairs.at(2)["limit_ns"].is_null());
+  EXPECT_TRUE(contains(pairs.at(2)["error"], "'pc2' has no connection to 'pc1'"));
+
+  const std::vector<std::string> lines = lines_of(output({"clock", "--matrix"}));
+  ASSERT_EQ(lines.size(), 7U);
+  EXPECT_EQ(words_of(lines[0]),
+            (std::vector<std::string>{"ON", "OF", "READS", "BOUND", "OF", "LIMIT", "LIMIT", "KNOWN",
+                                      "BY", "CHAIN", "MEASURED", "RTT", "REASON"}));
+  EXPECT_EQ(words_of(lines[1]),
+            (std::vector<std::string>{"pc1", "pc2", "good", "0", "ns", "[", "]", "1.50", "ms",
+                                      "one", "clock", "-", "-", "-"}));
+  EXPECT_TRUE(contains(lines[6], "'pc3' has no connection to 'pc2'")) << lines[6];
+}
+
+TEST_F(Clock, MatrixHasWhatOtherHostsStateOfHostsThatAreNotKnownHere) {
+  const DaemonProcess pc4({"--peer", daemon_.address(), "--clock-limit", "2 ms"}, "pc4");
+  Session on_pc4 = session_with(pc4);
+  await([&] { return on_pc4.list_hosts().value().at(1).state == HostState::up; });
+  const std::vector<ClockPair> pairs = on_pc4.list_clock_pairs().value();
+  ASSERT_EQ(pairs.size(), 4U);
+  EXPECT_EQ(pairs[0].reader + pairs[0].owner, "pc1pc2");
+  EXPECT_EQ(pairs[0].basis, DistanceBasis::one_clock);
+  EXPECT_EQ(pairs[0].bound, Duration::zero());
+  EXPECT_EQ(pairs[0].limit, std::chrono::microseconds(1500)) << "pc1's";
+  EXPECT_EQ(pairs[1].reader + pairs[1].owner, "pc1pc3");
+  EXPECT_EQ(pairs[2].reader + pairs[2].owner, "pc1pc4");
+  EXPECT_NE(pairs[2].error, "");
+  EXPECT_EQ(pairs[2].bound, kUnknownClockError);
+  EXPECT_EQ(pairs[3].reader + pairs[3].owner, "pc4pc1");
+  EXPECT_EQ(pairs[3].limit, std::chrono::milliseconds(2)) << "its own";
+}
+
+TEST_F(Clock, MatrixIsRefreshedUntilItIsInterrupted) {
+  Running watch({dssmctl_path(), "clock", "--matrix", "--watch", "--json"},
+                {daemon_.environment()});
+  for (int i = 0; i < 2; ++i) EXPECT_EQ(Json::parse(watch.line())["clock_pairs"].size(), 6U);
+  watch.signal(SIGINT);
+  EXPECT_EQ(watch.status(), 0);
+}
+
+TEST_F(Clock, MatrixGoesWithNeitherTableNorWait) {
+  EXPECT_EQ(ctl({"clock", "--matrix", "--table", "2"}).exit_status, 2);
+  EXPECT_EQ(ctl({"clock", "--matrix", "--wait", "1"}).exit_status, 2);
+}
+
 }  // namespace
 }  // namespace dssm::test

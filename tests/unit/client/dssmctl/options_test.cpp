@@ -128,6 +128,8 @@ TEST(CommandLine, RefusesWhatDoesNotFitTogether) {
       {"ls", "--watch", "--reverse"},
       {"ls", "--local", "--host", "pc2"},
       {"ls", "--host"},
+      {"clock", "--matrix", "--table", "2"},
+      {"clock", "--matrix", "--wait", "1"},
       {"doctor", "pc2"},
       {"hosts", "--names", "--json"},
       {"ping"},

@@ -23,6 +23,19 @@ TEST(Text, EscapesMessagesIntoOneLineButKeepsTheirBackslashes) {
   EXPECT_EQ(escaped_message("one\ntwo \\ \x1b"), "one\\ntwo \\ \\x1b");
 }
 
+TEST(Text, DrawsABarToTheScaleOfTheLimit) {
+  EXPECT_EQ(bar_text(0ns, 1ms), "[          ]");
+  EXPECT_EQ(bar_text(1ns, 1ms), "[#         ]");
+  EXPECT_EQ(bar_text(300us, 1ms), "[###       ]");
+  EXPECT_EQ(bar_text(301us, 1ms), "[####      ]");
+  EXPECT_EQ(bar_text(1ms, 1ms), "[##########]");
+  EXPECT_EQ(bar_text(1ms + 1ns, 1ms), "[##########>");
+  EXPECT_EQ(bar_text(kUnknownClockError - 1ns, kUnknownClockError - 1ns), "[##########]");
+  EXPECT_EQ(bar_text(0ns, 0ns), "[          ]");
+  EXPECT_EQ(bar_text(1ns, 0ns), "[##########>");
+  EXPECT_EQ(bar_text(kUnknownClockError, 1ms), "-");
+}
+
 TEST(Text, WritesDurationsWithThreeDigitsAndAUnit) {
   EXPECT_EQ(duration_text(0ns), "0 ns");
   EXPECT_EQ(duration_text(999ns), "999 ns");

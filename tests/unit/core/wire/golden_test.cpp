@@ -272,6 +272,24 @@ const std::map<std::string, Fill>& messages() {
          frame.set_serial(9);
          frame.mutable_pong()->mutable_clock()->set_bound_ns(250'000);
        }},
+      {"list_clock_pairs",
+       [](net::Frame& frame) {
+         frame.set_serial(10);
+         frame.mutable_list_clock_pairs();
+       }},
+      {"clock_pair_list",
+       [](net::Frame& frame) {
+         frame.set_serial(10);
+         ClockPair pair;
+         pair.owner = "pc3";
+         pair.bound = Duration(250'000);
+         pair.basis = DistanceBasis::measured;
+         pair.chain = Duration(1'000'000);
+         pair.measured = Duration(250'000);
+         pair.round_trip = Duration(70'000);
+         pair.limit = Duration(1'500'000);
+         to_message(pair, *frame.mutable_clock_pair_list()->add_pairs());
+       }},
       {"stream_list",
        [](net::Frame& frame) {
          frame.set_serial(8);

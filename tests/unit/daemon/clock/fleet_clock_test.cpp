@@ -248,19 +248,28 @@ class MeasuredTest : public FleetClockTest {
   // with a round trip of 100 us say.
   void heartbeat(Duration ahead, std::int64_t setting = 1, Duration bound = kUnknownClockError) {
     wire::Greeting other = host(kOther, "pc3", bound);
-    auto report = std::make_shared<wire::ClockReport>(*other.clock);
-    const clock::Instant now = later();
+    other.clock = pc3 = answered(*other.clock, ahead, setting);
+    if (!catalog.find(kOther)) catalog.host_up(other, {"10.0.0.3", 13776});
+    catalog.set_clock(kOther, pc3);
+  }
+  // The reference, likewise.
+  void heartbeat_of_reference(Duration ahead, Duration round_trip = 100us) {
+    const wire::Greeting& reference = catalog.find(kReference)->greeting;
+    catalog.set_clock(kReference, answered(*reference.clock, ahead, 1, round_trip));
+  }
+  static std::shared_ptr<const wire::ClockReport> answered(const wire::ClockReport& before,
+                                                           Duration ahead, std::int64_t setting,
+                                                           Duration round_trip = 100us) {
+    auto report = std::make_shared<wire::ClockReport>(before);
+    const clock::Instant now = later(round_trip);
     report->line = {now.raw, now.wall + ahead, 0, 10us};
     report->setting = setting;
-    report->heartbeat = {now.raw - 100us, now.raw - 50us, now.raw};
-    other.clock = report;
-    pc3 = report;
-    if (!catalog.find(kOther)) catalog.host_up(other, {"10.0.0.3", 13776});
-    catalog.set_clock(kOther, report);
+    report->heartbeat = {now.raw - round_trip, now.raw - round_trip / 2, now.raw};
+    return report;
   }
   // Heartbeats from before its start count for nothing.
-  static clock::Instant later() {
-    std::this_thread::sleep_for(150us);
+  static clock::Instant later(Duration round_trip = 100us) {
+    std::this_thread::sleep_for(round_trip + 50us);
     return clock::Instant::now();
   }
   ring::ClockAssessment found() const { return fleet->assess_mirror(lidar, pc3.get()); }
@@ -433,6 +442,112 @@ TEST_F(FleetClockTest, LogsOfOtherHostsWhatReadersDoWhileThisClockIsBad) {
   EXPECT_EQ(std::count_if(logger.lines.begin(), logger.lines.end(),
                           [](const std::string& line) { return contains(line, "'pc1''s"); }),
             2);
+}
+
+// --- pairs of clocks
+
+TEST_F(FleetClockTest, StatesThePairWithAHostWhoseChainIsKnown) {
+  add_reference();
+  start();
+  const ClockPair pair = fleet->clock_pairs().at(0);
+  EXPECT_EQ(pair.reader, "") << "the host that asks sets it";
+  EXPECT_EQ(pair.owner, "pc1");
+  EXPECT_EQ(pair.basis, DistanceBasis::chain);
+  EXPECT_GE(pair.bound, own->clock.bound + 5us);
+  EXPECT_GE(pair.chain, own->clock.bound + 5us);
+  EXPECT_LT(pair.chain, kUnknownClockError);
+  EXPECT_EQ(pair.measured, kUnknownClockError);
+  EXPECT_EQ(pair.round_trip, 0us);
+  EXPECT_EQ(pair.limit, 1500us);
+  EXPECT_EQ(pair.refused, !pair.reason.empty());
+  EXPECT_EQ(pair.error, "");
+}
+
+TEST_F(FleetClockTest, ChecksThisClockBeforeItStatesPairs) {
+  start();
+  own->line = {};  // as if this clock had left it
+  fleet->clock_pairs();
+  EXPECT_TRUE(own->line.exists());
+}
+
+TEST_F(FleetClockTest, StatesTheErrorOfItsSamplesEvenWhereItsClockIsNear) {
+  add_follower(1200us);
+  start();
+  EXPECT_LT(fleet->distance_to(*catalog.find(kOther)->greeting.clock), 1200us);
+  const ClockPair pair = fleet->clock_pairs().at(0);
+  EXPECT_GE(pair.bound, 1200us);
+  EXPECT_GE(pair.chain, 1200us);
+  EXPECT_TRUE(pair.refused);
+  EXPECT_TRUE(contains(pair.reason, "1500 us are allowed")) << pair.reason;
+}
+
+TEST_F(MeasuredTest, StatesWhatIsMeasuredOfAHostWithoutAChain) {
+  start();
+  heartbeat(2ms);
+  const ClockPair pair = fleet->clock_pairs().at(0);
+  EXPECT_EQ(pair.owner, "pc3");
+  EXPECT_EQ(pair.basis, DistanceBasis::measured);
+  EXPECT_EQ(pair.chain, kUnknownClockError);
+  EXPECT_GE(pair.measured, 2ms);
+  EXPECT_LT(pair.measured, kUnknownClockError);
+  EXPECT_GE(pair.bound, 2ms);
+  EXPECT_LT(pair.bound, kUnknownClockError);
+  EXPECT_EQ(pair.round_trip, 100us);
+  EXPECT_TRUE(pair.refused);
+}
+
+TEST_F(MeasuredTest, StatesBothAndWhichOneCounts) {
+  add_reference();
+  start();
+  heartbeat_of_reference(0us, 2ms);
+  const ClockPair chained = fleet->clock_pairs().at(0);
+  EXPECT_GE(chained.measured, 1ms);
+  EXPECT_LT(chained.measured, kUnknownClockError);
+  EXPECT_LT(chained.chain, chained.measured);
+  EXPECT_EQ(chained.basis, DistanceBasis::chain);
+  EXPECT_LT(chained.bound, chained.measured);
+}
+
+TEST_F(MeasuredTest, StatesNoBoundWhereStatementsExcludeEachOther) {
+  add_reference();
+  start();
+  heartbeat_of_reference(10ms);
+  const ClockPair pair = fleet->clock_pairs().at(0);
+  EXPECT_EQ(pair.bound, kUnknownClockError);
+  EXPECT_EQ(pair.basis, DistanceBasis::nothing);
+  EXPECT_LT(pair.chain, 10ms);
+  EXPECT_GE(pair.measured, 10ms);
+  EXPECT_LT(pair.measured, kUnknownClockError);
+  EXPECT_TRUE(pair.refused);
+  EXPECT_TRUE(contains(pair.reason, "the heartbeats show")) << pair.reason;
+}
+
+TEST_F(FleetClockTest, StatesOneClockForAHostWithThisKernel) {
+  start();
+  wire::Greeting same = host(kOther, "pc2", kUnknownClockError);
+  auto report = std::make_shared<wire::ClockReport>(*same.clock);
+  report->boot_id = own->boot_id;
+  same.clock = report;
+  catalog.host_up(same, {"10.0.0.2", 13776});
+  ClockPair expected;
+  expected.owner = "pc2";
+  expected.bound = 0us;
+  expected.basis = DistanceBasis::one_clock;
+  expected.limit = 1500us;
+  EXPECT_EQ(fleet->clock_pairs(), std::vector{expected});
+}
+
+TEST_F(FleetClockTest, StatesThatItKnowsNothingOfAHostThatReportsNoClock) {
+  policies.general = {ClockPolicy::mark, 2ms};
+  start();
+  wire::Greeting silent = host(kOther, "pc2", 5us);
+  silent.clock = nullptr;
+  catalog.host_up(silent, {"10.0.0.2", 13776});
+  ClockPair expected;
+  expected.owner = "pc2";
+  expected.limit = 2ms;
+  expected.reason = "nothing is known of its host's clock";
+  EXPECT_EQ(fleet->clock_pairs(), std::vector{expected}) << "not refused, only marked";
 }
 
 TEST_F(FleetClockTest, ProgramsOfThisPcFindTheBoundOnThePage) {

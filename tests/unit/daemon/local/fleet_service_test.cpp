@@ -6,7 +6,10 @@
 
 #include <gtest/gtest.h>
 
+#include <filesystem>
+
 #include "tests/support/log_recorder.hpp"
+#include "tests/unit/daemon/clock/fake_chronyd.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
 #include "tests/unit/daemon/scripted_host.hpp"
 
@@ -15,6 +18,17 @@ namespace {
 
 class FleetServiceTest : public testing::Test {
  protected:
+  FleetServiceTest() {
+    char folder[] = "/tmp/dssm-fleet-service-XXXXXX";
+    EXPECT_TRUE(::mkdtemp(folder));
+    const FleetClock::Options options{{chronyd.address(), {}}, {}};
+    clock.emplace(loop, options, *clock::ClockPageWriter::open(folder + std::string("/clock")),
+                  std::make_shared<wire::ClockReport>(), self.host_id, catalog, log);
+    std::filesystem::remove_all(folder);
+    fleet.emplace(loop, FleetService::Self{self, {"10.0.0.1:13776"}, true, &*clock}, registry,
+                  catalog, peers, mirrors, writers);
+  }
+
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Resolver resolver{loop};
   Registry registry{"pc1", kLimits};
@@ -22,16 +36,17 @@ class FleetServiceTest : public testing::Test {
   const wire::Greeting self = greeting_of("pc1");
   const ChannelParts parts{loop, resolver, registry, log, self};
   Catalog catalog{"pc1"};
+  FakeChronyd chronyd{loop, [](const FakeChronyd::Request&) {}};  // silent
+  std::optional<FleetClock> clock;
   RemoteStreams<Mirror> mirrors{parts, catalog};
   RemoteStreams<RemoteWriter> writers{parts, catalog};
-  ScriptedPeer peer{loop, "pc1"};
-  Peers peers{loop, resolver, {peer.address()}, self, catalog, log};
-  FleetService fleet{loop,   {self, {"10.0.0.1:13776"}, true}, registry, catalog, peers, mirrors,
-                     writers};
+  ScriptedPeer peer{loop, "pc2"}, other{loop, "pc3"};
+  Peers peers{loop, resolver, {peer.address(), other.address()}, self, catalog, log};
+  std::optional<FleetService> fleet;
 };
 
 TEST_F(FleetServiceTest, ReportsThatMdnsIsOffUntilItsFirstState) {
-  const local::Mdns shown = fleet.mdns();
+  const local::Mdns shown = fleet->mdns();
   EXPECT_EQ(shown.phase(), local::Mdns::OFF);
   EXPECT_EQ(shown.error(), "");
   EXPECT_EQ(shown.announced(), 0u);
@@ -43,8 +58,8 @@ TEST_F(FleetServiceTest, ReportsTheNewestStateOfMdns) {
   state.phase = MdnsPhase::waiting;
   state.error = "no Avahi";
   peers.on_mdns_state(state);
-  EXPECT_EQ(fleet.mdns().phase(), local::Mdns::WAITING);
-  EXPECT_EQ(fleet.mdns().error(), "no Avahi");
+  EXPECT_EQ(fleet->mdns().phase(), local::Mdns::WAITING);
+  EXPECT_EQ(fleet->mdns().error(), "no Avahi");
   state.phase = MdnsPhase::running;
   state.error.clear();
   state.avahi_version = "avahi 0.8";
@@ -53,7 +68,7 @@ TEST_F(FleetServiceTest, ReportsTheNewestStateOfMdns) {
   state.own_host_seen = true;
   state.hosts_heard = 5;
   peers.on_mdns_state(state);
-  const local::Mdns shown = fleet.mdns();
+  const local::Mdns shown = fleet->mdns();
   EXPECT_EQ(shown.phase(), local::Mdns::RUNNING);
   EXPECT_EQ(shown.error(), "");
   EXPECT_EQ(shown.avahi_version(), "avahi 0.8");
@@ -68,23 +83,121 @@ TEST_F(FleetServiceTest, ReportsForeignTextInPrintableCharactersOnly) {
   state.error = "more than \x1b[31m";
   state.avahi_version = "avahi\n0.8";
   peers.on_mdns_state(state);
-  EXPECT_EQ(fleet.mdns().error().find('\x1b'), std::string::npos) << fleet.mdns().error();
-  EXPECT_EQ(fleet.mdns().avahi_version().find('\n'), std::string::npos);
+  EXPECT_EQ(fleet->mdns().error().find('\x1b'), std::string::npos) << fleet->mdns().error();
+  EXPECT_EQ(fleet->mdns().avahi_version().find('\n'), std::string::npos);
 }
 
 TEST_F(FleetServiceTest, ListsThisHostFirstAndWhatIsWrongWithIt) {
   wire::Greeting copy = self;
   ++copy.instance_id;
   peer.greet_as(copy);
-  EXPECT_EQ(fleet.hosts().at(0).error(), "");
-  run_until(loop, [&] { return fleet.hosts().at(1).state() == local::Host::REFUSED; });
-  const local::Host shown = fleet.hosts().at(0);
+  EXPECT_EQ(fleet->hosts().at(0).error(), "");
+  run_until(loop, [&] { return fleet->hosts().at(1).state() == local::Host::REFUSED; });
+  const local::Host shown = fleet->hosts().at(0);
   EXPECT_EQ(shown.name(), "pc1");
   EXPECT_EQ(shown.state(), local::Host::SELF);
   EXPECT_EQ(shown.addresses(0), "10.0.0.1:13776");
   EXPECT_TRUE(shown.insecure());
   EXPECT_NE(shown.error(), "");
-  EXPECT_EQ(shown.error(), fleet.hosts().at(1).error());
+  EXPECT_EQ(shown.error(), fleet->hosts().at(1).error());
+}
+
+// --- pairs of clocks
+
+class ClockPairsTest : public FleetServiceTest {
+ protected:
+  // Asks for all pairs, until each peer has the request.
+  void ask() {
+    run_until(loop, [this] { return catalog.hosts().size() == 2; });
+    fleet->list_clock_pairs([this](std::vector<ClockPair> all) { pairs = std::move(all); });
+    run_until(loop, [this] { return !peer.requests.empty() && !other.requests.empty(); });
+  }
+  // The answer of one of them, with a pair for each owner.
+  static net::Frame answer(const ScriptedPeer& from, const std::vector<std::string>& owners) {
+    EXPECT_TRUE(from.requests.at(0).has_list_clock_pairs());
+    net::Frame frame = answer_to(from.requests.at(0));
+    frame.mutable_clock_pair_list();
+    for (const std::string& owner : owners) {
+      ClockPair pair;
+      pair.owner = owner;
+      pair.limit = Duration(7);
+      wire::to_message(pair, *frame.mutable_clock_pair_list()->add_pairs());
+    }
+    return frame;
+  }
+  void wait() {
+    run_until(loop, [this] { return pairs.has_value(); });
+  }
+  // "pc1 of pc2", and the error.
+  static std::string text(const ClockPair& pair) {
+    return pair.reader + " of " + pair.owner + (pair.error.empty() ? "" : ": " + pair.error);
+  }
+  std::vector<std::string> texts() const {
+    std::vector<std::string> texts;
+    for (const ClockPair& pair : *pairs) texts.push_back(text(pair));
+    return texts;
+  }
+
+  std::optional<std::vector<ClockPair>> pairs;
+};
+
+using Texts = std::vector<std::string>;
+
+TEST_F(ClockPairsTest, AreThoseOfAllHostsByReaderThenOwner) {
+  ask();
+  other.send(answer(other, {}));
+  peer.send(answer(peer, {"pc9", "pc3"}));
+  wait();
+  const char* const none = " has no connection to ";
+  const char* const see = "; see `dssmctl hosts` and the key peers there";
+  EXPECT_EQ(texts(), (Texts{"pc1 of pc2", "pc1 of pc3",
+                            std::string("pc2 of pc1: 'pc2'") + none + "'pc1'" + see, "pc2 of pc3",
+                            "pc2 of pc9", std::string("pc3 of pc1: 'pc3'") + none + "'pc1'" + see,
+                            std::string("pc3 of pc2: 'pc3'") + none + "'pc2'" + see}));
+  EXPECT_EQ(pairs->at(0).limit, ClockDemand().limit) << "this host's own";
+  EXPECT_EQ(pairs->at(3).limit, Duration(7)) << "as stated there";
+}
+
+TEST_F(ClockPairsTest, ShowThatAHostDoesNotAnswerOrDoesNotKnowTheRequest) {
+  ask();
+  other.fail(other.requests.at(0), Errc::protocol, "dssmd of host 'pc3' does not \x1b know this");
+  wait();
+  EXPECT_EQ(texts(),
+            (Texts{"pc1 of pc2", "pc1 of pc3", "pc2 of : host 'pc2' has not answered within 500 ms",
+                   "pc3 of : dssmd of host 'pc3' does not ? know this"}));
+  pairs.reset();
+  peer.send(answer(peer, {"pc1"}));
+  run_until(loop, [&, pings = peer.pings] { return peer.pings > pings + 1; });
+  EXPECT_FALSE(pairs) << "a late answer is dropped";
+}
+
+TEST_F(ClockPairsTest, TakeNothingFromAPeerThatCannotBe) {
+  ask();
+  other.send(answer_to(other.requests.at(0)));
+  Texts owners = {"pc1", "", "pc\n3"};
+  for (std::size_t i = 0; i < wire::kMaxClockPairs + 5; ++i) {
+    owners.push_back("n" + std::to_string(i));
+  }
+  net::Frame frame = answer(peer, owners);
+  proto::ClockPair& first = *frame.mutable_clock_pair_list()->mutable_pairs(0);
+  first.set_reader("pc7");
+  first.set_error("a lie");
+  first.set_reason("\a");
+  peer.send(frame);
+  wait();
+  const auto from_peer = std::count_if(pairs->begin(), pairs->end(), [](const ClockPair& pair) {
+    return pair.reader == "pc2" && pair.error.empty();
+  });
+  EXPECT_EQ(from_peer, wire::kMaxClockPairs);
+  EXPECT_FALSE(std::any_of(pairs->begin(), pairs->end(), [](const ClockPair& pair) {
+    return pair.reader == "pc2" && pair.owner.empty();
+  })) << "what has no valid name of an owner is left out";
+  const auto found = std::find_if(pairs->begin(), pairs->end(), [](const ClockPair& pair) {
+    return pair.reader == "pc2" && pair.owner == "pc1";
+  });
+  ASSERT_NE(found, pairs->end());
+  EXPECT_EQ(found->reason, "?");
+  EXPECT_EQ(text(pairs->back()), "pc3 of : host 'pc3' sent a response of another kind");
 }
 
 }  // namespace

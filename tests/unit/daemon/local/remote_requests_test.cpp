@@ -64,6 +64,10 @@ class FakeFleet final : public Fleet {
     asked.push_back("list");
     list_then.push_back(std::move(then));
   }
+  void list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) override {
+    asked.push_back("list_clock_pairs");
+    then(pairs);
+  }
   std::vector<StreamInfo> known_streams() const override { return known; }
   std::vector<local::Host> hosts() const override {
     std::vector<local::Host> hosts(2);
@@ -96,6 +100,7 @@ class FakeFleet final : public Fleet {
   Then<OpenedRing> writer_then;
   std::vector<Then<std::vector<proto::Stream>>> list_then;
   std::vector<StreamInfo> known;
+  std::vector<ClockPair> pairs;
   std::set<std::string> there;
 };
 
@@ -260,6 +265,22 @@ TEST_F(RemoteRequestsTest, ListsHosts) {
   ping.mutable_ping_host()->set_host("pc1");
   EXPECT_TRUE(client->ask(ping).has_round_trip());
   EXPECT_EQ(fleet.asked, Asked{"ping pc2"});
+}
+
+TEST_F(RemoteRequestsTest, ListsPairsOfClocks) {
+  local::Request request;
+  request.mutable_list_clock_pairs();
+  fleet.pairs.resize(1);
+  fleet.pairs[0].reader = "pc2";
+  fleet.pairs[0].owner = "pc1";
+  fleet.pairs[0].limit = Duration(7);
+  const local::Response list = client->ask(request);
+  ASSERT_EQ(list.clock_pair_list().pairs_size(), 1);
+  EXPECT_EQ(wire::clock_pair_untrusted(list.clock_pair_list().pairs(0)), fleet.pairs[0]);
+  fleet.pairs[0].reason = std::string(500, 'r');
+  fleet.pairs.resize(40'000, fleet.pairs[0]);
+  EXPECT_EQ(client->ask(request).failure().code(), "limit_exceeded");
+  EXPECT_EQ(fleet.asked, (Asked{"list_clock_pairs", "list_clock_pairs"}));
 }
 
 TEST_F(RemoteRequestsTest, ReportsHowOtherHostsAreFound) {

@@ -29,7 +29,9 @@ class FakeClockAssessor final : public ClockAssessor {
   Error refusal(const StreamId& id, const wire::ClockReport*) const override {
     return {Errc::clock_out_of_bounds, "not '" + id.str() + "'"};
   }
+  std::vector<ClockPair> clock_pairs() override { return pairs; }
 
+  std::vector<ClockPair> pairs;
   ClockPolicy policy = ClockPolicy::enforce;
   bool same_clock = false;
   Duration own_bound{};

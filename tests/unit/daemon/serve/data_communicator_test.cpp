@@ -3,6 +3,7 @@
 // One connection to dssmd: greeting, requests in turns, what is refused and how.
 #include "daemon/serve/data_communicator.hpp"
 
+#include "tests/unit/daemon/remote/fake_clock_assessor.hpp"
 #include "tests/unit/daemon/serve/server_rig.hpp"
 
 namespace dssm::daemon {
@@ -105,6 +106,29 @@ TEST(DataCommunicator, KeepsChannelsAndControlConnectionsApart) {
   rig.connect(control);
   EXPECT_TRUE(rig.ask(control, list_request(4)).has_stream_list());
   EXPECT_EQ(rig.ask(control, create_request(5, "b", 8, 4)).failure().code(), "protocol");
+}
+
+TEST(DataCommunicator, StatesItsPairsOfClocksOnControlConnections) {
+  FakeClockAssessor assessor;
+  ServerRig rig({16, 8, 32U << 20}, &assessor);
+  assessor.pairs.resize(2);
+  assessor.pairs[0].owner = "pc2";
+  assessor.pairs[1].owner = "pc3";
+  assessor.pairs[1].bound = std::chrono::milliseconds(2);
+  rig.create("a");
+  MemoryPeer control, channel;
+  rig.connect(control);
+  net::Frame request = with_serial(1);
+  request.mutable_list_clock_pairs();
+  const proto::ClockPairList list = rig.ask(control, request).clock_pair_list();
+  ASSERT_EQ(list.pairs_size(), 2);
+  EXPECT_EQ(wire::clock_pair_untrusted(list.pairs(0)), assessor.pairs[0]);
+  EXPECT_EQ(wire::clock_pair_untrusted(list.pairs(1)), assessor.pairs[1]);
+  EXPECT_EQ(rig.ask(control, create_request(2, "b", 8, 4)).failure().code(), "protocol")
+      << "it is a control connection now";
+  rig.connect(channel);
+  rig.open(channel, "a");
+  EXPECT_EQ(rig.ask(channel, request).failure().code(), "protocol");
 }
 
 TEST(DataCommunicator, CountsChannelsInTheStreamsDescription) {

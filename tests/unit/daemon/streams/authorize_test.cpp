@@ -74,7 +74,7 @@ TEST_F(AuthorizeTest, RefusesEachRequestOfALocalProgram) {
     ++kinds;
     EXPECT_EQ(client.ask(request).failure().code(), "no_permission") << field;
   }
-  EXPECT_EQ(kinds, 17) << "the requests of local.proto besides Hello";
+  EXPECT_EQ(kinds, 18) << "the requests of local.proto besides Hello";
   EXPECT_EQ(client.ask(open_request("odometry", true)).failure().message(), "forbidden");
   EXPECT_EQ(last_action, Action::open_for_writing);
   EXPECT_EQ(last_stream.name, "odometry");
@@ -100,7 +100,7 @@ TEST_F(AuthorizeTest, RefusesEachRequestOfAnotherHost) {
   rig.connect(channel);
   rig.open(channel, "odometry");
   forbids = true;
-  constexpr int kKinds = 13;  // the requests of network.proto besides Hello
+  constexpr int kKinds = 14;  // the requests of network.proto besides Hello
   EXPECT_EQ(refused([&](const net::Frame& frame) { return rig.ask(control, frame); }), kKinds);
   EXPECT_EQ(refused([&](const net::Frame& frame) { return rig.ask(channel, frame); }), kKinds);
   EXPECT_EQ(last_stream.str(), "odometry:0@pc1") << "the stream of the channel";
