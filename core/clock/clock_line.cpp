@@ -2,6 +2,7 @@
 #include "core/clock/clock_line.hpp"
 
 #include <algorithm>
+#include <cmath>
 
 namespace dssm::clock {
 namespace {
@@ -50,6 +51,16 @@ Duration ClockLine::left_by(const ClockLine& later) const noexcept {
   if (!exists() || !later.exists()) return {};
   const std::optional<Time> expected = at(later.raw);
   return expected ? std::chrono::abs(later.wall - *expected) : kUnknownClockError;
+}
+
+RawTime ClockLine::arrival(std::optional<Time> arrived, RawTime now) const noexcept {
+  if (!arrived || !exists() || *arrived < wall || now > raw + kMaxAge || !holds()) return now;
+  const Duration shown = *arrived - wall;
+  const double elapsed_ns =
+      static_cast<double>(shown.count()) / (1 + static_cast<double>(rate) / 1e9);
+  const RawTime found =
+      raw + Duration(static_cast<std::int64_t>(std::ceil(elapsed_ns))) + tolerance;
+  return std::min(found, now);
 }
 
 [[gnu::hot]] bool ClockLine::holds() const noexcept {

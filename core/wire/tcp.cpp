@@ -10,6 +10,7 @@
 #include <sys/time.h>
 
 #include <algorithm>
+#include <array>
 #include <cerrno>
 #include <cstring>
 #include <string>
@@ -85,6 +86,7 @@ class TcpTransport final : public Transport {
   }
 
   [[gnu::hot]] Result<IoResult> receive(std::span<const iovec> spaces) override {
+    if (stamps_) return receive_stamped(spaces);
     msghdr message = header(spaces);
     ssize_t bytes = 0;
     do {
@@ -103,9 +105,39 @@ class TcpTransport final : public Transport {
     return io_result(bytes, "receive from the other side", socket_.get());
   }
 
+  // SO_TIMESTAMPNS: of TCP the kernel gives the time of the last packet that a call received from.
+  void stamp_arrivals() noexcept override {
+    constexpr int kOn = 1;
+    stamps_ = ::setsockopt(socket_.get(), SOL_SOCKET, SO_TIMESTAMPNS, &kOn, sizeof kOn) == 0;
+  }
+  std::optional<Time> arrived() const noexcept override { return arrived_; }
+
   int fd() const noexcept override { return socket_.get(); }
 
  private:
+  Result<IoResult> receive_stamped(std::span<const iovec> spaces) {
+    alignas(cmsghdr) std::array<char, CMSG_SPACE(sizeof(timespec))> control{};
+    msghdr message = header(spaces);
+    ssize_t bytes = 0;
+    do {
+      message.msg_control = control.data();
+      message.msg_controllen = control.size();
+      bytes = ::recvmsg(socket_.get(), &message, MSG_DONTWAIT);
+    } while (bytes < 0 && errno == EINTR);
+    if (bytes > 0) arrived_ = stamp_of(message);
+    return io_result(bytes, "receive from the other side", socket_.get());
+  }
+
+  static std::optional<Time> stamp_of(const msghdr& message) noexcept {
+    const cmsghdr* header = CMSG_FIRSTHDR(&message);
+    if (!header || header->cmsg_level != SOL_SOCKET || header->cmsg_type != SCM_TIMESTAMPNS) {
+      return std::nullopt;
+    }
+    timespec stamp{};
+    std::memcpy(&stamp, CMSG_DATA(header), sizeof stamp);
+    return time_from_ns(stamp.tv_sec * std::int64_t{1'000'000'000} + stamp.tv_nsec);
+  }
+
   // All other calls pass MSG_DONTWAIT, so that the socket's own mode may be blocking.
   void make_waitable() noexcept {
     waits_ = true;
@@ -123,6 +155,8 @@ class TcpTransport final : public Transport {
 
   UniqueFd socket_;
   bool waits_ = false;  // receive_waiting() was prepared
+  bool stamps_ = false;
+  std::optional<Time> arrived_;
 };
 
 using NameOf = int (*)(int, sockaddr*, socklen_t*);

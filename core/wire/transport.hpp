@@ -33,6 +33,8 @@
 #include <chrono>
 #include <cstddef>
 #include <dssm/result.hpp>
+#include <dssm/time.hpp>
+#include <optional>
 #include <span>
 
 namespace dssm::wire {
@@ -79,6 +81,12 @@ class Transport {
     return receive(spaces);
   }
   static constexpr std::chrono::milliseconds kReceiveWait{10};
+
+  // From now on the kernel stamps the bytes that arrive, if it can, and arrived() returns that.
+  virtual void stamp_arrivals() noexcept {}
+  // When the last bytes of the last receive() arrived, by this PC's wall clock, however late they
+  // were received. nullopt: not known.
+  virtual std::optional<Time> arrived() const noexcept { return std::nullopt; }
 
   // Readable or writable when receive() or send() can continue.
   virtual int fd() const noexcept = 0;

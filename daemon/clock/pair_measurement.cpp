@@ -3,6 +3,7 @@
 
 #include <algorithm>
 #include <cmath>
+#include <limits>
 
 namespace dssm::clock {
 namespace {
@@ -12,76 +13,117 @@ constexpr RawTime kLastValid{std::chrono::hours(24 * 365 * 100)};
 
 bool is_valid(RawTime t) noexcept { return t > RawTime() && t < kLastValid; }
 
-// What a rate makes of a time, rounded down or up.
-Duration gained(Duration age, PartsPerBillion rate, bool up) noexcept {
-  const double ns = static_cast<double>(age.count()) * static_cast<double>(rate) / 1e9;
-  return Duration(static_cast<std::int64_t>(up ? std::ceil(ns) : std::floor(ns)));
+// The limits are chosen for this time after a heartbeat: until about the next one.
+constexpr Duration kChosenFor = std::chrono::seconds(1);
+
+double ns(Duration d) noexcept { return static_cast<double>(d.count()); }
+
+Duration rounded_up(double ns) noexcept {
+  return Duration(static_cast<std::int64_t>(std::ceil(std::clamp(ns, -1e18, 1e18))));
 }
 
-PartsPerBillion rate_of(Duration gain, Duration time, bool up) noexcept {
-  const double ppb = static_cast<double>(gain.count()) / static_cast<double>(time.count()) * 1e9;
-  const double limit = 2.0 * static_cast<double>(PairMeasurement::kMaxRate);
-  const double clamped = std::clamp(ppb, -limit, limit);
-  return static_cast<PartsPerBillion>(up ? std::ceil(clamped) : std::floor(clamped));
+PartsPerBillion rounded_up_ppb(double ppb) noexcept {
+  return static_cast<PartsPerBillion>(std::ceil(ppb));
 }
 
 }  // namespace
 
 void PairMeasurement::add_untrusted(const HeartbeatTimes& times) noexcept {
-  if (!is_valid(times.asked) || !is_valid(times.theirs) || !is_valid(times.answered)) return;
-  const Duration took = times.answered - times.asked;
-  if (took <= Duration::zero()) return;
+  for (const RawTime t : {times.asked, times.received, times.sent, times.answered}) {
+    if (!is_valid(t)) return;
+  }
+  const Duration took = times.answered - times.asked, there = times.sent - times.received;
+  if (took <= Duration::zero() || there < Duration::zero()) return;
+  // Their clock may count up to kMaxRate more or less than this one.
+  const Duration most = took - there + growth(there, kMaxRate);
+  if (most < Duration::zero()) return;
   if (!heartbeats_.empty() && times.answered <= heartbeats_.back().answered) return;
   while (!heartbeats_.empty() && (heartbeats_.size() == kMaxHeartbeats ||
                                   times.answered - heartbeats_.front().answered > kWindow)) {
     heartbeats_.pop_front();
   }
-  // The difference was within the round trip's bounds at some moment of it, not just at its end.
-  const Duration moved = growth(took, kMaxRate);
-  const Duration ours_first = times.asked.time_since_epoch();
-  const Duration ours_last = times.answered.time_since_epoch();
-  const Duration theirs = times.theirs.time_since_epoch();
-  const Heartbeat newest{times.answered, theirs - ours_last - moved, theirs - ours_first + moved,
-                         took};
+  // The question took at most `most`, and so did the answer: by then the difference may have moved.
+  const Duration moved = growth(most, kMaxRate);
+  const Duration greatest = times.received.time_since_epoch() - times.asked.time_since_epoch();
+  const Duration least = times.sent.time_since_epoch() - times.answered.time_since_epoch();
+  const Heartbeat newest{times.answered,
+                         {times.answered, least - moved},
+                         {std::min(times.asked + most, times.answered), greatest + moved},
+                         std::max(took - there, Duration::zero())};
+  if (is_excluded(newest)) heartbeats_.clear();
   heartbeats_.push_back(newest);
-  find_rate();
-  const std::optional<Difference> now = at(times.answered);
-  if (slowest_ > fastest_ || now->least > now->greatest) {
+  find_sides();
+  const double from_above = above_.limit.at(times.answered);
+  const double from_below = -below_.limit.at(times.answered);
+  if (from_above < from_below || above_.fastest_ppb < -below_.fastest_ppb) {
     heartbeats_ = {newest};
-    find_rate();
+    find_sides();
   }
+}
+
+// Whether the earlier heartbeats exclude it.
+bool PairMeasurement::is_excluded(const Heartbeat& newest) const noexcept {
+  if (heartbeats_.empty()) return false;
+  const Duration since = newest.answered - newest.greatest.at;
+  const double greatest = ns(newest.greatest.difference + growth(since, kMaxRate));
+  return above_.limit.at(newest.answered) < ns(newest.least.difference) ||
+         -below_.limit.at(newest.answered) > greatest;
+}
+
+void PairMeasurement::find_sides() noexcept {
+  const RawTime when = heartbeats_.back().answered + kChosenFor;
+  above_ = find_side(true, when);
+  below_ = find_side(false, when);
 }
 
 // From each two heartbeats: the difference cannot have grown more between them than from the least
-// value of the first to the greatest of the second.
-void PairMeasurement::find_rate() noexcept {
-  PartsPerBillion least = -kMaxRate, greatest = kMaxRate;
-  for (std::size_t later = 1; later < heartbeats_.size(); ++later) {
-    const Heartbeat& second = heartbeats_[later];
-    for (std::size_t earlier = 0; earlier < later; ++earlier) {
-      const Heartbeat& first = heartbeats_[earlier];
-      const Duration time = second.answered - first.answered;
-      greatest = std::min(greatest, rate_of(second.greatest - first.least, time, true));
-      least = std::max(least, rate_of(second.least - first.greatest, time, false));
+// value of the first to the greatest of the second. The same holds for the opposite difference,
+// which is at least what this one is at most.
+PairMeasurement::Side PairMeasurement::find_side(bool from_above, RawTime when) const noexcept {
+  const auto opposite = [](Bound bound) { return Bound{bound.at, -bound.difference}; };
+  Side side{{}, kMaxRate};
+  double best = std::numeric_limits<double>::infinity();
+  for (std::size_t j = 0; j < heartbeats_.size(); ++j) {
+    const Heartbeat& second = heartbeats_[j];
+    const Bound later = from_above ? second.greatest : opposite(second.least);
+    const auto consider = [&](RawTime since, double rate_ppb) {
+      const Limit limit{later, since, std::min(rate_ppb, static_cast<double>(kMaxRate))};
+      const double then = limit.at(when);
+      if (then >= best) return;
+      best = then;
+      side.limit = limit;
+    };
+    consider(later.at, kMaxRate);
+    for (std::size_t i = 0; i < j; ++i) {
+      const Heartbeat& first = heartbeats_[i];
+      const Bound earlier = from_above ? first.least : opposite(first.greatest);
+      const Duration time = later.at - earlier.at;
+      if (time <= Duration::zero()) continue;
+      const double mean_ppb = ns(later.difference - earlier.difference) / ns(time) * 1e9;
+      consider(earlier.at, mean_ppb);
+      // A mean is the rate of some moment between, in the middle when the rate changes evenly.
+      const Duration since_middle = when - later.at + time / 2;
+      side.fastest_ppb =
+          std::min(side.fastest_ppb, mean_ppb + kMaxRateChange * ns(since_middle) / 1e9);
     }
   }
-  // These are means, and the rate itself may be beyond them by all that it changes in the window.
-  slowest_ = std::max(-kMaxRate, least - kMaxRateChange);
-  fastest_ = std::min(kMaxRate, greatest + kMaxRateChange);
+  return side;
+}
+
+// A function whose second derivative is at most c departs from the line through its values at t and
+// s by at most c / 2 * (now - t) * (now - s).
+double PairMeasurement::Limit::at(RawTime now) const noexcept {
+  const double time = ns(now - later.at);
+  const double change_ppb = kMaxRateChange * ns(now - since) / 1e9 / 2;
+  return ns(later.difference) + time * (rate_ppb + change_ppb) / 1e9;
 }
 
 std::optional<PairMeasurement::Difference> PairMeasurement::at(RawTime now) const noexcept {
-  Difference found{Duration::min(), Duration::max(), slowest_, fastest_};
-  bool any = false;
-  for (const Heartbeat& heartbeat : heartbeats_) {
-    const Duration age = now - heartbeat.answered;
-    if (age > kWindow || age < Duration::zero()) continue;
-    any = true;
-    found.least = std::max(found.least, heartbeat.least + gained(age, slowest_, false));
-    found.greatest = std::min(found.greatest, heartbeat.greatest + gained(age, fastest_, true));
-  }
-  if (!any) return std::nullopt;
-  return found;
+  if (heartbeats_.empty()) return std::nullopt;
+  const Duration age = now - heartbeats_.back().answered;
+  if (age < Duration::zero() || age > kWindow) return std::nullopt;
+  return Difference{-rounded_up(below_.limit.at(now)), rounded_up(above_.limit.at(now)),
+                    -rounded_up_ppb(below_.fastest_ppb), rounded_up_ppb(above_.fastest_ppb)};
 }
 
 Duration PairMeasurement::best_round_trip() const noexcept {

@@ -3,11 +3,11 @@
 // How far another PC's RawClock is from this one's, measured with heartbeats. No I/O.
 // docs/clocks.md "Measured between two PCs" derives it.
 //
-// The other PC reads its clock after the question was sent and before the answer was here, so each
-// heartbeat bounds the difference by its round trip (as NTP, RFC 5905, but both ends of the
+// The question arrives after it was sent, and the answer too, so each heartbeat bounds the
+// difference from above and from below (the four timestamps of NTP, RFC 5905, but both ends of the
 // interval are kept: no delay is assumed to be the same in both directions). Nothing slews or sets
-// these clocks, so heartbeats of a minute are combined: all of them together bound how fast the
-// clocks depart from each other, and so what the best of them says of the present moment.
+// these clocks, so heartbeats of a minute are combined: each two of them bound how fast the clocks
+// depart from each other, and so what both say of the present moment.
 //
 //   threads  one
 #pragma once
@@ -28,9 +28,9 @@ class PairMeasurement {
   // Two oscillators depart from each other by less than this. Twice what the kernel can correct of
   // one of them (adjtimex(2): 500 ppm).
   static constexpr PartsPerBillion kMaxRate = 1'000'000;
-  // By so much at most does that rate change within kWindow: oscillators change with temperature,
-  // by about 1 ppm per kelvin at the worst.
-  static constexpr PartsPerBillion kMaxRateChange = 10'000;
+  // By so much at most that rate changes in a second: oscillators change with temperature, by about
+  // 1 ppm per kelvin at the worst, and a PC warms up by less than 10 K in a minute.
+  static constexpr PartsPerBillion kMaxRateChange = 160;
 
   // Their clock minus this one, and how fast that grows.
   struct Difference {
@@ -43,23 +43,45 @@ class PairMeasurement {
   void add_untrusted(const HeartbeatTimes& times) noexcept;
   void clear() noexcept { heartbeats_.clear(); }
 
-  // At `now`, not before the last heartbeat. nullopt: there is none within kWindow.
+  // At `now`. nullopt: there is no heartbeat within kWindow before it, or one after it.
   std::optional<Difference> at(RawTime now) const noexcept;
 
-  // The shortest round trip in the window; zero: there is none.
+  // The shortest round trip in the window, without the time that the other PC took to answer; zero:
+  // there is none.
   Duration best_round_trip() const noexcept;
 
  private:
+  // What a heartbeat says of the difference at one moment.
+  struct Bound {
+    RawTime at{};
+    Duration difference{};
+  };
   struct Heartbeat {
     RawTime answered;
-    Duration least, greatest;  // of the difference then
+    Bound least, greatest;
     Duration round_trip;
   };
+  // What two heartbeats say of later moments: the difference is at most `later`, and what it gains
+  // after that by `rate`, the greatest mean from `since` on, and by what that changes.
+  struct Limit {
+    Bound later;
+    RawTime since{};
+    double rate_ppb = 0;
 
-  void find_rate() noexcept;
+    double at(RawTime now) const noexcept;  // [ns]
+  };
+  // The difference from above, or with the opposite sign from below.
+  struct Side {
+    Limit limit;
+    double fastest_ppb = 0;  // what it gains
+  };
+
+  Side find_side(bool from_above, RawTime when) const noexcept;
+  void find_sides() noexcept;
+  bool is_excluded(const Heartbeat& newest) const noexcept;
 
   std::deque<Heartbeat> heartbeats_;  // oldest first
-  PartsPerBillion slowest_ = -kMaxRate, fastest_ = kMaxRate;
+  Side above_, below_;  // of all heartbeats; those that say most about the next second
 };
 
 }  // namespace dssm::clock

@@ -73,13 +73,14 @@ void PeerConnection::enter(HostState state, HostReason reason, std::optional<Err
   status_ = {state, reason, since, std::move(error)};
 }
 
-void PeerConnection::on_up(FrameConnection&, const wire::Greeting& them) {
+void PeerConnection::on_up(FrameConnection& connection, const wire::Greeting& them) {
   if (expected_ && them.host_id != *expected_) {
     return dialer_.restart({Errc::conflict, fmt::format("{} answers at '{}', not the host that is "
                                                         "announced there",
                                                         them.str(), address())});
   }
   them_ = them;
+  connection.stamp_arrivals();
   enter(HostState::up, HostReason::none, std::nullopt);
   observer_.on_peer_up(*this);
 }
@@ -181,14 +182,19 @@ void PeerConnection::take_clock(std::shared_ptr<const wire::ClockReport> clock) 
 }
 
 void PeerConnection::on_pong(MonoTime asked, RawTime asked_raw, const Result<net::Frame>& answer) {
-  const RawTime answered_raw = RawClock::now();
+  RawTime answered_raw = RawClock::now();
   if (!answer || !answer->has_pong()) return;
   const Duration took = loop_.now() - asked;
   const Duration min = round_trips_.min;
   round_trips_ = {took, min == Duration::zero() ? took : std::min(min, took)};
   if (!answer->pong().has_clock()) return;
   wire::ClockReport clock = wire::clock_report_untrusted(answer->pong().clock(), asked);
-  clock.heartbeat = {asked_raw, RawTime(Duration(answer->pong().raw_ns())), answered_raw};
+  const FrameConnection* link = dialer_.connection();
+  if (link && self_.clock) answered_raw = self_.clock->line.arrival(link->arrived(), answered_raw);
+  const net::Pong& pong = answer->pong();
+  const std::int64_t received_ns = pong.received_ns() ? pong.received_ns() : pong.raw_ns();
+  clock.heartbeat = {asked_raw, RawTime(Duration(received_ns)), RawTime(Duration(pong.raw_ns())),
+                     answered_raw};
   take_clock(std::make_shared<const wire::ClockReport>(std::move(clock)));
 }
 

@@ -13,6 +13,7 @@
 #include <cstddef>
 #include <deque>
 #include <memory>
+#include <optional>
 #include <span>
 #include <string>
 #include <variant>
@@ -136,6 +137,13 @@ class FrameConnection final : private wire::FrameDelegate {
 
   // When bytes arrived last, to some milliseconds; for heartbeats.
   MonoTime last_heard() const noexcept { return last_heard_; }
+  // As wire::Transport, for the frame that is being handled: not before its last byte came.
+  void stamp_arrivals() noexcept {
+    if (!closed_) transport_->stamp_arrivals();
+  }
+  std::optional<Time> arrived() const noexcept {
+    return closed_ ? std::nullopt : transport_->arrived();
+  }
   const wire::DecoderCounters& counters() const noexcept { return decoder_.counters(); }
 
  private:

@@ -126,12 +126,15 @@ Result<void> DataCommunicator::check_access(const net::Frame& request) const {
 Result<void> DataCommunicator::dispatch(const net::Frame& request) {
   DSSM_TRY(check_access(request));
   if (request.has_ping()) {
-    is_control_ = true;
+    if (!std::exchange(is_control_, true)) link_.stamp_arrivals();
+    RawTime received = RawClock::now();
+    if (parts_.self.clock) received = parts_.self.clock->line.arrival(link_.arrived(), received);
     peer_timeout_.enable_in(wire::kPeerTimeout);
     if (parts_.clock) parts_.clock->clock_generation();  // so that the report is of now
     net::Frame pong;
     pong.set_serial(request.serial());
     wire::send_clock(parts_.self, *pong.mutable_pong()->mutable_clock());
+    pong.mutable_pong()->set_received_ns(to_ns(received));
     pong.mutable_pong()->set_raw_ns(to_ns(RawClock::now()));
     link_.send(pong);
     parts_.observer.on_heartbeat();

@@ -13,7 +13,7 @@
 //   read   {"faults": TEXT, "streams": {STREAM: {"taken": N, "lost": N, "restarts": N}},
 //           "silences_ms": {STREAM: [N]}}
 //
-// Silences are the times without a new sample, from 100 ms on, in their order.
+// Silences are the times without a new sample, from 400 ms on, in their order.
 // A fault is a sample that was torn, read twice, out of order, or lost without being counted.
 // Exit status: 0; 1 with the reason on stderr.
 #include <poll.h>
@@ -38,7 +38,7 @@ using namespace std::chrono_literals;
 
 constexpr std::uint64_t kPayloadBytes = 256;
 constexpr std::uint64_t kHistorySeconds = 20;
-constexpr Duration kLeastSilence = 100ms;
+constexpr Duration kLeastSilence = 400ms;
 
 KnownStream known_stream(const std::string& name, std::uint64_t rate_hz) {
   KnownStream known;

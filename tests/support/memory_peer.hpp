@@ -57,8 +57,9 @@ class MemoryPeer {
   std::size_t max_send_bytes = kAll;     // of one send
   std::size_t max_receive_bytes = kAll;  // of one receive
   std::function<void()> after_send;
-  std::size_t sends = 0;  // that took bytes
-  bool closed = false;    // by dssmd
+  std::optional<Time> arrived;  // what dssmd gets as the time of its input, once it asks for it
+  std::size_t sends = 0;        // that took bytes
+  bool closed = false;          // by dssmd
 
  private:
   friend class MemoryTransport;
@@ -121,9 +122,15 @@ class MemoryTransport final : public wire::Transport {
     return wire::IoResult{wire::IoStatus::ok, taken};
   }
 
+  void stamp_arrivals() noexcept override { stamps_ = true; }
+  std::optional<Time> arrived() const noexcept override {
+    return stamps_ ? peer_.arrived : std::nullopt;
+  }
+
   int fd() const noexcept override { return fd_.get(); }
 
  private:
+  bool stamps_ = false;
   MemoryPeer& peer_;
   std::shared_ptr<bool> alive_;
   UniqueFd fd_;

@@ -71,9 +71,9 @@ class Load:
 
 
 def print_silences(read: dict[str, Any], who: str) -> None:
-    """Prints how long the streams brought nothing new, from 100 ms on."""
+    """Prints how long the streams brought nothing new, from 400 ms on."""
     for stream, silences in read["silences_ms"].items():
-        print(f"  | {who}, '{stream}': silent for {', '.join(map(str, silences)) or 'less than 100'} ms", flush=True)
+        print(f"  | {who}, '{stream}': silent for {', '.join(map(str, silences)) or 'less than 400'} ms", flush=True)
 
 
 def expect_complete(written: dict[str, Any], read: dict[str, Any], who: str) -> None:

@@ -41,6 +41,39 @@ TEST(ClockLine, HoldsUntilTheClockHasLeftIt) {
   EXPECT_FALSE(line.holds());
 }
 
+// Bytes that came 5 ms ago.
+class Arrival : public testing::Test {
+ protected:
+  Arrival() : line(ClockLine::now(0)) {
+    line.tolerance = 1ms;  // a slow machine, between two instructions
+    while (RawClock::now() < line.raw + 2ms) {
+    }
+    before = RawClock::now();
+    stamp = WallClock::now();
+    while (RawClock::now() < before + 5ms) {
+    }
+    now = RawClock::now();
+  }
+
+  ClockLine line;
+  RawTime before, now;
+  Time stamp;
+};
+
+TEST_F(Arrival, IsFoundByTheLineAndNeverTooEarly) {
+  EXPECT_GE(line.arrival(stamp, now), before);
+  EXPECT_LT(line.arrival(stamp, now), now);
+  EXPECT_EQ(line.arrival(stamp + 1h, now), now);
+}
+
+TEST_F(Arrival, IsNowIfItIsNotKnownOrTheClockWasSet) {
+  EXPECT_EQ(line.arrival(std::nullopt, now), now);
+  EXPECT_EQ(ClockLine().arrival(stamp, now), now);
+  EXPECT_EQ(line.arrival(line.wall - 1ns, now), now) << "by the clock before it was set";
+  line.wall -= 10s;
+  EXPECT_EQ(line.arrival(stamp - 10s, now), now) << "the clock has left the line";
+}
+
 TEST(ClockLine, DoesNotHoldWhereTheClocksCannotBeReadSoFast) {
   ClockLine line = ClockLine::now(0);
   EXPECT_GE(line.tolerance, 10us);

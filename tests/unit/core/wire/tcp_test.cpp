@@ -106,6 +106,32 @@ TEST_P(TcpTransport, ReportsASignalThatEndsItsWait) {
   EXPECT_EQ(status, IoStatus::interrupted);
 }
 
+TEST_P(TcpTransport, KnowsWhenBytesArrivedHoweverLateTheyAreReceived) {
+  const Pair pair = connect_pair(GetParam());
+  const std::string text = "bytes";
+  const iovec part[] = {part_of(text)};
+  std::string space(20, '?');
+  const iovec spaces[] = {part_of(space)};
+  const auto exchange = [&] {
+    EXPECT_EQ(pair.client->send(part)->bytes, 5u);
+    await(pair.server->fd(), POLLIN);
+    const Time readable = WallClock::now();
+    while (WallClock::now() < readable + std::chrono::milliseconds(2)) {
+    }
+    EXPECT_EQ(pair.server->receive(spaces)->bytes, 5u);
+    return readable;
+  };
+  exchange();
+  EXPECT_FALSE(pair.server->arrived());
+  pair.server->stamp_arrivals();
+  exchange();  // the kernel begins to stamp packets some moments after it was asked to
+  const Time sent = WallClock::now();
+  const Time readable = exchange();
+  ASSERT_TRUE(pair.server->arrived());
+  EXPECT_GE(*pair.server->arrived(), sent);
+  EXPECT_LE(*pair.server->arrived(), readable);
+}
+
 INSTANTIATE_TEST_SUITE_P(BothKinds, TcpTransport, testing::Values("127.0.0.1:0", "[::1]:0"));
 
 TEST(Tcp, NeverWaits) {

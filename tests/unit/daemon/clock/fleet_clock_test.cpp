@@ -264,7 +264,8 @@ class MeasuredTest : public FleetClockTest {
     const clock::Instant now = later(round_trip);
     report->line = {now.raw, now.wall + ahead, 0, 10us};
     report->setting = setting;
-    report->heartbeat = {now.raw - round_trip, now.raw - round_trip / 2, now.raw};
+    const RawTime there = now.raw - round_trip / 2;
+    report->heartbeat = {now.raw - round_trip, there, there, now.raw};
     return report;
   }
   // Heartbeats from before its start count for nothing.
@@ -360,7 +361,7 @@ TEST_F(MeasuredTest, StatementsThatExcludeEachOtherAreRefused) {
   report->line = {now.raw, now.wall + 1ms, 0, 10us};  // and chronyd states some 50 us
   report->setting = 1;
   EXPECT_TRUE(fleet->assess_mirror(lidar, report.get()).can_be_good());
-  report->heartbeat = {now.raw - 100us, now.raw - 50us, now.raw};
+  report->heartbeat = {now.raw - 100us, now.raw - 50us, now.raw - 50us, now.raw};
   catalog.set_clock(kReference, report);
   EXPECT_FALSE(fleet->assess_mirror(lidar, report.get()).can_be_good());
   EXPECT_EQ(fleet->distance_to(*report), kUnknownClockError);

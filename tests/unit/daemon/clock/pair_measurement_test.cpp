@@ -73,13 +73,15 @@ class PairMeasurementTest : public testing::Test {
     ours.pass(true_ns);
     theirs.pass(true_ns);
   }
-  // At least 50 us each way, and up to `most_ns` more in one of them.
-  void beat(double most_ns = 2e6) {
+  // At least 50 us each way, and up to `most_ns` more in one of them; and what the other PC takes.
+  void beat(double most_ns = 2e6, double there_ns = 0) {
     const bool is_forth = uniform(0, 1) < 0.5;
     HeartbeatTimes times;
     times.asked = ours.raw();
     pass(5e4 + (is_forth ? uniform(0, most_ns) : 0));
-    times.theirs = theirs.raw();
+    times.received = theirs.raw();
+    pass(there_ns);
+    times.sent = theirs.raw();
     pass(5e4 + (is_forth ? 0 : uniform(0, most_ns)));
     times.answered = ours.raw();
     pair.add_untrusted(times);
@@ -105,12 +107,24 @@ TEST_F(PairMeasurementTest, OneHeartbeatBoundsTheDifferenceByItsRoundTrip) {
   EXPECT_EQ(pair.best_round_trip(), 100us);
 }
 
+TEST_F(PairMeasurementTest, WhatTheOtherPcTakesToAnswerMakesNothingLessExact) {
+  theirs.rate = 40e-6;
+  for (int i = 0; i < 20; ++i) {
+    beat(0, 4e7);
+    expect_true();
+    EXPECT_LE(difference().greatest - difference().least, i == 0 ? 141us : 105us);
+    pass(1e9);
+  }
+  EXPECT_LE(pair.best_round_trip(), 102us);
+  EXPECT_GE(pair.best_round_trip(), 98us);
+}
+
 TEST_F(PairMeasurementTest, TheDifferenceIsWithinTheBoundsWhateverTheDelays) {
   for (const double rate : {0.0, 50e-6, -300e-6}) {
     pair.clear();
     theirs.rate = rate;
     for (int i = 0; i < 300; ++i) {
-      beat();
+      beat(2e6, uniform(0, 1) < 0.3 ? uniform(0, 5e8) : 0);
       for (int j = 0; j < 10; ++j) {
         pass(1e8);
         expect_true();
@@ -121,10 +135,16 @@ TEST_F(PairMeasurementTest, TheDifferenceIsWithinTheBoundsWhateverTheDelays) {
 
 // The oscillators warm up and cool down: by all that is allowed, at any time.
 TEST_F(PairMeasurementTest, TheRateMayChangeByAllThatIsAllowed) {
-  for (int i = 0; i < 2000; ++i) {
-    if (i % 7 == 0) theirs.rate = 40e-6 + uniform(-5e-6, 5e-6);
+  theirs.rate = 40e-6;
+  double change = 0;  // of the rate, in a second
+  for (int i = 0; i < 4000; ++i) {
+    if (i % 50 == 0)
+      change = 1e-9 * PairMeasurement::kMaxRateChange * (uniform(0, 1) < 0.5 ? -1 : 1);
     beat(1e5);
-    pass(1e9);
+    for (int j = 0; j < 20; ++j) {
+      theirs.rate += change / 20;
+      pass(5e7);
+    }
     expect_true();
   }
 }
@@ -177,11 +197,14 @@ TEST_F(PairMeasurementTest, HeartbeatsEndWithTheWindow) {
 
 TEST_F(PairMeasurementTest, ImpossibleTimesAreIgnored) {
   const RawTime now = ours.raw();
-  pair.add_untrusted({now, RawTime(Duration::max()), now + 1ms});
-  pair.add_untrusted({now, RawTime(Duration::min()), now + 1ms});
-  pair.add_untrusted({now, RawTime(), now + 1ms});
-  pair.add_untrusted({now, now, now});
-  pair.add_untrusted({now + 1ms, now, now});
+  for (const RawTime bad : {RawTime(Duration::max()), RawTime(Duration::min()), RawTime()}) {
+    pair.add_untrusted({now, bad, now, now + 1ms});
+    pair.add_untrusted({now, now, bad, now + 1ms});
+  }
+  pair.add_untrusted({now, now, now, now});
+  pair.add_untrusted({now + 1ms, now, now, now});
+  pair.add_untrusted({now, now + 1ms, now, now + 1ms});  // sent before it was received
+  pair.add_untrusted({now, now, now + 2ms, now + 1ms});  // answered before it was sent
   EXPECT_FALSE(pair.at(now + 1ms));
 }
 

@@ -9,6 +9,8 @@
 namespace dssm::daemon {
 namespace {
 
+using namespace std::chrono_literals;
+
 net::Frame list_request(std::uint64_t serial) { return with_serial(serial, list_frame()); }
 
 net::Frame create_request(std::uint64_t serial, const std::string& name,
@@ -224,6 +226,25 @@ TEST(DataCommunicator, AnswersPingAndEndsWithoutHeartbeats) {
   EXPECT_GE(rig.loop.now() - begin, wire::kPeerTimeout);
   EXPECT_NE(final_failure(rig, peer).find("no bytes came"), std::string::npos);
   EXPECT_TRUE(rig.logger.warnings.empty()) << "a host that goes away is no fault of this one";
+}
+
+// The first Ping shows that it is a control connection.
+TEST(DataCommunicator, SaysWhenAPingArrivedAndWhenItWasAnswered) {
+  ServerRig rig;
+  MemoryPeer peer;
+  rig.connect(peer);
+  rig.ask(peer, with_serial(3, ping_frame()));
+  rig.own_clock->line = clock::ClockLine::now(0);
+  rig.own_clock->line.tolerance = 1ms;  // a slow machine, between two instructions
+  const RawTime put = RawClock::now();
+  peer.arrived = WallClock::now();
+  while (RawClock::now() < put + 20ms) {
+  }
+  const net::Pong pong = rig.ask(peer, with_serial(4, ping_frame())).pong();
+  EXPECT_GE(pong.received_ns(), to_ns(put));
+  EXPECT_GE(pong.raw_ns(), to_ns(put + 20ms));
+  EXPECT_LE(pong.raw_ns(), to_ns(RawClock::now()));
+  EXPECT_LT(pong.received_ns(), to_ns(put + 10ms)) << "not when it was received from the kernel";
 }
 
 TEST(DataCommunicator, WaitsForHelloUntilItsTimeout) {

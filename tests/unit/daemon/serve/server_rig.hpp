@@ -36,7 +36,7 @@ class ServerRig {
   explicit ServerRig(const PeerTable::Limits& limits = {16, 8, 32U << 20},
                      ClockAssessor* clock = nullptr, Authorizer authorizer = authorize)
       : server({loop, registry, opens, logger, clock, {}, std::move(authorizer)},
-               greeting_of("pc1"), limits) {}
+               greeting_with(own_clock), limits) {}
 
   // Connects; without `greet` it says nothing. The peer outlives the rig's use of it.
   void connect(MemoryPeer& peer, bool greet = true, bool torn = true, std::uint32_t host = 2) {
@@ -94,6 +94,14 @@ class ServerRig {
     return frames[0];
   }
 
+  static wire::Greeting greeting_with(std::shared_ptr<const wire::ClockReport> clock) {
+    wire::Greeting greeting = greeting_of("pc1");
+    greeting.clock = std::move(clock);
+    return greeting;
+  }
+
+  // What it reports of its clock.
+  const std::shared_ptr<wire::ClockReport> own_clock = std::make_shared<wire::ClockReport>();
   EventLoop loop = *EventLoop::open(TimerQueue::Time::simulated);
   Registry registry{"pc1", kLimits};
   OpenTable opens{{100, 100}};
