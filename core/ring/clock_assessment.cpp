@@ -41,6 +41,9 @@ Duration ClockAssessment::distance(const SampleInfo& info, MonoTime now) const n
   if (info.time >= measured_from) {
     distance = std::min(distance, grown(measured, age, measured_ageing_ppb));
   }
+  if (info.time >= recent_from) {
+    distance = std::min(distance, grown(recent, age, measured_ageing_ppb));
+  }
   return distance;
 }
 
@@ -52,7 +55,7 @@ bool ClockAssessment::is_good(const SampleInfo& info, MonoTime now) const noexce
 }
 
 bool ClockAssessment::can_be_good() const noexcept {
-  const Duration least = std::min(added, measured);
+  const Duration least = std::min({added, measured, recent});
   return least != kUnknownClockError && least <= limit;
 }
 

@@ -31,6 +31,8 @@ namespace dssm::ring {
 //    56    8 measured_from  ns    of samples with this time or a later one
 //    64    4 measured_ageing_ppb  ns/s  what `measured` grows by
 //    68    4 reserved       -     zero
+//    72    8 recent         ns    as `measured`, which it is at most; it grows in the same way
+//    80    8 recent_from    ns    of samples with this time or a later one: the last seconds
 struct ClockAssessment {
   ClockPolicy policy = ClockPolicy::off;
   std::uint8_t same_clock = 1;
@@ -45,6 +47,8 @@ struct ClockAssessment {
   Time measured_from{};
   std::uint32_t measured_ageing_ppb = 0;
   std::uint32_t reserved1 = 0;
+  Duration recent = kUnknownClockError;
+  Time recent_from{};
 
   // An older assessment counts as unknown: dssmd states one a second, and restarts in less.
   static constexpr Duration kValidFor = std::chrono::seconds(3);
@@ -70,6 +74,6 @@ struct ClockAssessment {
  private:
   bool is_suspect(const SampleInfo& info) const noexcept;
 };
-static_assert(sizeof(ClockAssessment) == 72);
+static_assert(sizeof(ClockAssessment) == 88);
 
 }  // namespace dssm::ring

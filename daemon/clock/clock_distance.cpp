@@ -64,4 +64,18 @@ std::optional<WallDifference> wall_difference(const PairMeasurement::Difference&
   return found;
 }
 
+PastBounds past_bounds(const std::deque<StatedBound>& stated, Duration latest, Time now,
+                       Duration limit) noexcept {
+  PastBounds past{latest, now, latest, now};
+  for (auto one = stated.rbegin(); one != stated.rend(); ++one) {
+    if (one->bound > std::max(limit, past.greatest)) break;
+    past.greatest = std::max(past.greatest, one->bound);
+    past.from = one->wall;
+    if (one->wall < now - PastBounds::kRecent) continue;
+    past.recent = past.greatest;
+    past.recent_from = one->wall;
+  }
+  return past;
+}
+
 }  // namespace dssm::clock

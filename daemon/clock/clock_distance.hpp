@@ -7,6 +7,7 @@
 #pragma once
 
 #include <algorithm>
+#include <deque>
 #include <dssm/time.hpp>
 #include <optional>
 
@@ -46,5 +47,26 @@ struct WallDifference {
 std::optional<WallDifference> wall_difference(const PairMeasurement::Difference& raws,
                                               const ClockLine& theirs, const ClockLine& ours,
                                               const ClockReading& now) noexcept;
+
+// A bound on a distance that was stated from `wall` on, until the next one.
+struct StatedBound {
+  Time wall;
+  Duration bound;
+};
+
+// Bounds on all that was stated since a time, up to now.
+struct PastBounds {
+  // Samples of the last seconds count by what was stated in that time.
+  static constexpr Duration kRecent = std::chrono::seconds(3);
+
+  Duration greatest{};  // as far back as all of it was within the limit
+  Time from;
+  Duration recent{};  // the same, for kRecent
+  Time recent_from;
+};
+
+// `stated`: in the order of time. `latest`: the bound at `now`, which may be beyond the limit.
+PastBounds past_bounds(const std::deque<StatedBound>& stated, Duration latest, Time now,
+                       Duration limit) noexcept;
 
 }  // namespace dssm::clock

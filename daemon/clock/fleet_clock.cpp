@@ -291,7 +291,7 @@ void FleetClock::publish(const clock::Instant& now) {
   state.base_width = base.width;
   state.setting_from = watch_.setting_from();
   state.earlier_from = now.wall;
-  for (const Stated& stated : stated_) {
+  for (const clock::StatedBound& stated : stated_) {
     state.earlier_from = std::min(state.earlier_from, stated.wall);
     // It grew until the next one was stated.
     state.earlier_bound = std::max(
@@ -400,7 +400,7 @@ std::optional<FleetClock::Measured> FleetClock::measured(const wire::ClockReport
   if (found == pairs_.end()) return std::nullopt;
   const Pair& pair = found->second;
   if (pair.stated.empty() || pair.setting != theirs.setting) return std::nullopt;
-  Measured measured{pair.last, now - pair.measured_at <= kMeasuredFor, {}, {}};
+  Measured measured{pair.last, now - pair.measured_at <= kMeasuredFor, {}};
   if (measured.is_fresh) {
     const auto walls = walls_of(pair, theirs);
     if (!walls) return std::nullopt;
@@ -414,15 +414,11 @@ std::optional<FleetClock::Measured> FleetClock::measured(const wire::ClockReport
     measured.now.greatest += aged;
   }
   // As far back as the clocks were close enough: good samples are not to suffer from earlier ones.
-  measured.greatest = measured.now.bound();
-  Time from = WallClock::now();
-  for (auto stated = pair.stated.rbegin(); stated != pair.stated.rend(); ++stated) {
-    if (stated->bound > std::max(limit, measured.greatest)) break;
-    measured.greatest = std::max(measured.greatest, stated->bound);
-    from = stated->wall;
-  }
+  clock::PastBounds& past = measured.past;
+  past = clock::past_bounds(pair.stated, measured.now.bound(), WallClock::now(), limit);
   // Their clock may be ahead of this one, which the times of `stated` are of.
-  measured.from = std::max(theirs.setting_from, from + measured.greatest);
+  past.from = std::max(theirs.setting_from, past.from + past.greatest);
+  past.recent_from = std::max(theirs.setting_from, past.recent_from + past.recent);
   return measured;
 }
 
@@ -470,8 +466,10 @@ ring::ClockAssessment FleetClock::assess_mirror(const StreamId& id,
     found.ageing_ppb = ppb(own.clock.ageing_ppb + theirs.clock.ageing_ppb);
   }
   if (by_heartbeats) {
-    found.measured = by_heartbeats->greatest;
-    found.measured_from = by_heartbeats->from;
+    found.measured = by_heartbeats->past.greatest;
+    found.measured_from = by_heartbeats->past.from;
+    found.recent = by_heartbeats->past.recent;
+    found.recent_from = by_heartbeats->past.recent_from;
     found.measured_ageing_ppb = ppb(by_heartbeats->now.ageing);
   }
   return found;
@@ -563,7 +561,7 @@ ClockPair FleetClock::pair_with(const wire::Greeting& owner) const {
   const wire::ClockReport latest = theirs->at(now);
   pair.chain = sum(latest.clock.bound, clock::distance_from_anchor(latest, own_->at(now)));
   if (const auto by_heartbeats = measured(*theirs, now, policies_.general.limit)) {
-    pair.measured = by_heartbeats->greatest;
+    pair.measured = by_heartbeats->past.recent;
     pair.round_trip = pairs_.at(theirs->boot_id).raws.best_round_trip();
   }
   if (pair.bound != kUnknownClockError) {

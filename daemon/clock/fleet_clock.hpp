@@ -115,10 +115,6 @@ class FleetClock final : public ClockAssessor,
     std::shared_ptr<const wire::ClockReport> report;  // the latest
     std::optional<MonoTime> unavailable_since;
   };
-  struct Stated {
-    Time wall;
-    Duration bound;
-  };
   // What is measured between this PC and another one.
   struct Pair {
     // One of the clocks was set. The oscillators were not, unless a PC slept: the next heartbeat
@@ -129,18 +125,17 @@ class FleetClock final : public ClockAssessor,
     }
 
     clock::PairMeasurement raws;
-    bool is_confirmed = false;   // by a heartbeat since a clock was set
-    std::int64_t setting = 0;    // of their clock, while this was measured
-    std::deque<Stated> stated;   // within kMeasuredReach, about one a second
-    clock::WallDifference last;  // the latest
-    MonoTime measured_at{};      // then
+    bool is_confirmed = false;              // by a heartbeat since a clock was set
+    std::int64_t setting = 0;               // of their clock, while this was measured
+    std::deque<clock::StatedBound> stated;  // within kMeasuredReach, about one a second
+    clock::WallDifference last;             // the latest
+    MonoTime measured_at{};                 // then
   };
   // What follows from a Pair at one moment.
   struct Measured {
     clock::WallDifference now;
-    bool is_fresh = false;  // else it has aged since the last heartbeat
-    Duration greatest{};    // bound on all that was stated ...
-    Time from;              // ... since then
+    bool is_fresh = false;   // else it has aged since the last heartbeat
+    clock::PastBounds past;  // for samples with their times, by this PC's clock or theirs
   };
 
   void on_clock() override;
@@ -178,9 +173,9 @@ class FleetClock final : public ClockAssessor,
   std::optional<wire::IpAddress> source_address_;
   std::optional<Source> source_;
   MonoTime addresses_read_{};
-  std::deque<Stated> stated_;          // within kReach; all of them bounds
-  std::map<std::string, Pair> pairs_;  // by the boot id of the other PC
-  RawTime pairs_since_{};              // heartbeats from before do not count
+  std::deque<clock::StatedBound> stated_;  // within kReach; all of them bounds
+  std::map<std::string, Pair> pairs_;      // by the boot id of the other PC
+  RawTime pairs_since_{};                  // heartbeats from before do not count
   std::uint64_t generation_ = 0;
   std::function<void()> on_change_, on_new_generation_;
   HostClockLog log_;

@@ -97,7 +97,7 @@ struct ClockPair {
   Duration bound = kUnknownClockError;
   DistanceBasis basis = DistanceBasis::nothing;  // what `bound` follows from
   Duration chain = kUnknownClockError;  // by what chronyd states on both; unknown for one clock
-  // By heartbeats, the greatest of the last minute; unknown for one clock.
+  // By heartbeats, the greatest of the last seconds; unknown for one clock.
   Duration measured = kUnknownClockError;
   Duration round_trip{};  // the shortest of the last 64 heartbeats; 0: not measured
   Duration limit{};       // clock_limit of the reader, the greatest good `bound`

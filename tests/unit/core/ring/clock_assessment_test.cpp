@@ -81,6 +81,19 @@ TEST(ClockAssessment, WhatIsMeasuredCountsWhereItIsLess) {
   EXPECT_TRUE(clock.is_good(sample_at(1'000, 200us), kAssessed));
 }
 
+TEST(ClockAssessment, SamplesOfTheLastSecondsCountByWhatWasMeasuredThen) {
+  ClockAssessment clock = measured();
+  clock.recent = 30us;
+  clock.recent_from = time_from_ns(5'000);
+  EXPECT_EQ(clock.distance(sample_at(4'999, 200us), kAssessed), 80us);
+  EXPECT_EQ(clock.distance(sample_at(5'000, 200us), kAssessed), 30us);
+  EXPECT_EQ(clock.distance(sample_at(5'000, 200us), kAssessed + 2s), 50us);
+  clock.measured = clock.added = kUnknownClockError;
+  EXPECT_TRUE(clock.can_be_good());
+  EXPECT_TRUE(clock.is_good(sample_at(5'000, kUnknownClockError), kAssessed));
+  EXPECT_FALSE(clock.is_good(sample_at(4'999, kUnknownClockError), kAssessed));
+}
+
 TEST(ClockAssessment, AMeasurementNeedsNoClockErrorAndNoTrustInIt) {
   EXPECT_TRUE(measured().is_good(sample_at(1'000, kUnknownClockError), kAssessed));
   EXPECT_FALSE(measured().is_good(sample_at(999, kUnknownClockError), kAssessed));
@@ -161,7 +174,9 @@ TEST(ClockAssessment, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(ClockAssessment, measured), 48u);
   EXPECT_EQ(offsetof(ClockAssessment, measured_from), 56u);
   EXPECT_EQ(offsetof(ClockAssessment, measured_ageing_ppb), 64u);
-  EXPECT_EQ(sizeof(ClockAssessment), 72u);
+  EXPECT_EQ(offsetof(ClockAssessment, recent), 72u);
+  EXPECT_EQ(offsetof(ClockAssessment, recent_from), 80u);
+  EXPECT_EQ(sizeof(ClockAssessment), 88u);
 }
 
 TEST(ClockAssessment, IsEnforcedInARingOnlyForAnotherClockUnderThatPolicy) {

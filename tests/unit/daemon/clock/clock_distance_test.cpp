@@ -107,5 +107,46 @@ TEST(ClockDistance, AgesAllItsBounds) {
   EXPECT_EQ(fresh.at(fresh.as_of - 1s).clock, fresh.clock) << "an earlier time adds nothing";
 }
 
+// What was stated so many seconds before kNow.
+class PastBoundsTest : public testing::Test {
+ protected:
+  void state(Duration before, Duration bound) { stated.push_back({kNow - before, bound}); }
+  PastBounds past(Duration latest = 40us) const {
+    return past_bounds(stated, latest, kNow, 1500us);
+  }
+
+  static constexpr Time kNow{1'795'000'000s};
+  std::deque<StatedBound> stated;
+};
+
+TEST_F(PastBoundsTest, AreOfThisMomentWhenNothingWasStated) {
+  EXPECT_EQ(past().greatest, 40us);
+  EXPECT_EQ(past().from, kNow);
+  EXPECT_EQ(past().recent, 40us);
+  EXPECT_EQ(past().recent_from, kNow);
+}
+
+TEST_F(PastBoundsTest, LastSecondsDoNotCountByWhatWasStatedBefore) {
+  state(10s, 900us);
+  state(2s, 60us);
+  state(1s, 50us);
+  EXPECT_EQ(past().greatest, 900us);
+  EXPECT_EQ(past().from, kNow - 10s);
+  EXPECT_EQ(past().recent, 60us);
+  EXPECT_EQ(past().recent_from, kNow - 2s);
+  EXPECT_EQ(past(70us).recent, 70us);
+}
+
+TEST_F(PastBoundsTest, EndWhereAClockWasTooFarOff) {
+  state(10s, 100us);
+  state(2s, 1501us);
+  state(1s, 50us);
+  EXPECT_EQ(past().greatest, 50us);
+  EXPECT_EQ(past().from, kNow - 1s);
+  EXPECT_EQ(past().recent, 50us);
+  EXPECT_EQ(past().recent_from, kNow - 1s);
+  EXPECT_EQ(past(2ms).from, kNow - 10s) << "it still is";
+}
+
 }  // namespace
 }  // namespace dssm::clock

@@ -164,7 +164,7 @@ TEST_F(PairMeasurementTest, TheBoundsAreAsTightAsTheBestRoundTrips) {
     }
     pass(1e9);
   }
-  EXPECT_GE(tight, kSeconds * 9 / 10) << tight;
+  EXPECT_GE(tight, kSeconds * 99 / 100) << tight;
 }
 
 TEST_F(PairMeasurementTest, AHeartbeatThatTookLongTakesNothingAway) {

@@ -19,8 +19,8 @@ MirrorClock::Report report(Duration bound, std::uint8_t anchor = 1) {
 class MirrorClockTest : public testing::Test {
  protected:
   bool is_suspect(Tid tid) const {
-    const ring::ClockAssessment now = clock.assessment();
-    return tid >= now.suspect_first && tid <= now.suspect_last;
+    const ring::ClockAssessment found = clock.assessment();
+    return tid >= found.suspect_first && tid <= found.suspect_last;
   }
 
   const StreamId id{"lidar", 0, "pc2"};
