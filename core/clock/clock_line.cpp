@@ -10,6 +10,9 @@ namespace {
 // A process may lose its processor between two readings; again and again it does not.
 constexpr int kTries = 5;
 
+// A clock that has left the line may have come back to it in a longer time.
+constexpr Duration kMaxArrivalAge = std::chrono::milliseconds(500);
+
 // What is allowed for reading two clocks, however fast that is.
 constexpr Duration kLeastBlur = std::chrono::microseconds(2);
 
@@ -60,7 +63,7 @@ RawTime ClockLine::arrival(std::optional<Time> arrived, RawTime now) const noexc
       static_cast<double>(shown.count()) / (1 + static_cast<double>(rate) / 1e9);
   const RawTime found =
       raw + Duration(static_cast<std::int64_t>(std::ceil(elapsed_ns))) + tolerance;
-  return std::min(found, now);
+  return now - found > kMaxArrivalAge ? now : std::min(found, now);
 }
 
 [[gnu::hot]] bool ClockLine::holds() const noexcept {

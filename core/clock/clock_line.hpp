@@ -48,7 +48,7 @@ struct ClockLine {
   Duration left_by(const ClockLine& later) const noexcept;
   // When bytes came that the kernel stamped with this PC's wall clock: as exactly as the line,
   // which is this PC's, allows, and never too early. `now` if the line does not show it, because
-  // the clock was set or slewed anew since then, or there is no stamp.
+  // the clock was set or slewed since then, or there is no stamp.
   RawTime arrival(std::optional<Time> arrived, RawTime now) const noexcept;
   // Whether this PC's wall clock is on the line, which is its own. Three clocks are read.
   bool holds() const noexcept;

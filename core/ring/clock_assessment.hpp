@@ -31,7 +31,7 @@ namespace dssm::ring {
 //    56    8 measured_from  ns    of samples with this time or a later one
 //    64    4 measured_ageing_ppb  ns/s  what `measured` grows by
 //    68    4 reserved       -     zero
-//    72    8 recent         ns    as `measured`, which it is at most; it grows in the same way
+//    72    8 recent         ns    the same for later samples; grows as `measured`
 //    80    8 recent_from    ns    of samples with this time or a later one: the last seconds
 struct ClockAssessment {
   ClockPolicy policy = ClockPolicy::off;

@@ -84,8 +84,8 @@ class Transport {
 
   // From now on the kernel stamps the bytes that arrive, if it can, and arrived() returns that.
   virtual void stamp_arrivals() noexcept {}
-  // When the last bytes of the last receive() arrived, by this PC's wall clock, however late they
-  // were received. nullopt: not known.
+  // When the last bytes of the last receive() arrived, by this PC's wall clock, however late
+  // receive() is called. nullopt: not known.
   virtual std::optional<Time> arrived() const noexcept { return std::nullopt; }
 
   // Readable or writable when receive() or send() can continue.

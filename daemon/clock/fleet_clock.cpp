@@ -365,11 +365,13 @@ void FleetClock::measure(const wire::ClockReport& theirs) {
       return a.second.measured_at < b.second.measured_at;
     }));
   }
-  Pair& pair = pairs_[theirs.boot_id];
-  if (pair.setting != theirs.setting) pair.await_heartbeat();
-  pair.setting = theirs.setting;
-  if (theirs.heartbeat && theirs.heartbeat->asked > pairs_since_) {
-    pair.raws.add_untrusted(*theirs.heartbeat);
+  const auto [found, is_new] = pairs_.try_emplace(theirs.boot_id);
+  Pair& pair = found->second;
+  // A heartbeat that brings a new setting may have been under way while that PC slept.
+  const bool is_same_setting = std::exchange(pair.setting, theirs.setting) == theirs.setting;
+  if (!is_same_setting) pair.await_heartbeat();
+  if (theirs.heartbeat && theirs.heartbeat->asked > pairs_since_ && (is_same_setting || is_new) &&
+      pair.raws.add_untrusted(*theirs.heartbeat)) {
     pair.is_confirmed = true;
   }
   if (!pair.is_confirmed) return;

@@ -16,6 +16,9 @@ bool is_valid(RawTime t) noexcept { return t > RawTime() && t < kLastValid; }
 // The limits are chosen for this time after a heartbeat: until about the next one.
 constexpr Duration kChosenFor = std::chrono::seconds(1);
 
+// For so long a difference is aged by its rates (ring::ClockAssessment::kValidFor).
+constexpr Duration kAgesFor = std::chrono::seconds(3);
+
 double ns(Duration d) noexcept { return static_cast<double>(d.count()); }
 
 Duration rounded_up(double ns) noexcept {
@@ -28,16 +31,16 @@ PartsPerBillion rounded_up_ppb(double ppb) noexcept {
 
 }  // namespace
 
-void PairMeasurement::add_untrusted(const HeartbeatTimes& times) noexcept {
+bool PairMeasurement::add_untrusted(const HeartbeatTimes& times) noexcept {
   for (const RawTime t : {times.asked, times.received, times.sent, times.answered}) {
-    if (!is_valid(t)) return;
+    if (!is_valid(t)) return false;
   }
   const Duration took = times.answered - times.asked, there = times.sent - times.received;
-  if (took <= Duration::zero() || there < Duration::zero()) return;
+  if (took <= Duration::zero() || there < Duration::zero()) return false;
   // Their clock may count up to kMaxRate more or less than this one.
   const Duration most = took - there + growth(there, kMaxRate);
-  if (most < Duration::zero()) return;
-  if (!heartbeats_.empty() && times.answered <= heartbeats_.back().answered) return;
+  if (most < Duration::zero()) return false;
+  if (!heartbeats_.empty() && times.answered <= heartbeats_.back().answered) return false;
   while (!heartbeats_.empty() && (heartbeats_.size() == kMaxHeartbeats ||
                                   times.answered - heartbeats_.front().answered > kWindow)) {
     heartbeats_.pop_front();
@@ -59,6 +62,7 @@ void PairMeasurement::add_untrusted(const HeartbeatTimes& times) noexcept {
     heartbeats_ = {newest};
     find_sides();
   }
+  return true;
 }
 
 // Whether the earlier heartbeats exclude it.
@@ -101,7 +105,7 @@ PairMeasurement::Side PairMeasurement::find_side(bool from_above, RawTime when) 
       if (time <= Duration::zero()) continue;
       const double mean_ppb = ns(later.difference - earlier.difference) / ns(time) * 1e9;
       consider(earlier.at, mean_ppb);
-      // A mean is the rate of some moment between, in the middle when the rate changes evenly.
+      // The rate at `when` exceeds the mean by at most what it changes since the middle of both.
       const Duration since_middle = when - later.at + time / 2;
       side.fastest_ppb =
           std::min(side.fastest_ppb, mean_ppb + kMaxRateChange * ns(since_middle) / 1e9);
@@ -122,8 +126,10 @@ std::optional<PairMeasurement::Difference> PairMeasurement::at(RawTime now) cons
   if (heartbeats_.empty()) return std::nullopt;
   const Duration age = now - heartbeats_.back().answered;
   if (age < Duration::zero() || age > kWindow) return std::nullopt;
+  const double change_ppb = kMaxRateChange * ns(age - kChosenFor + kAgesFor) / 1e9;
   return Difference{-rounded_up(below_.limit.at(now)), rounded_up(above_.limit.at(now)),
-                    -rounded_up_ppb(below_.fastest_ppb), rounded_up_ppb(above_.fastest_ppb)};
+                    -rounded_up_ppb(below_.fastest_ppb + change_ppb),
+                    rounded_up_ppb(above_.fastest_ppb + change_ppb)};
 }
 
 Duration PairMeasurement::best_round_trip() const noexcept {

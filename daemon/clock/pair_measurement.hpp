@@ -7,7 +7,7 @@
 // difference from above and from below (the four timestamps of NTP, RFC 5905, but both ends of the
 // interval are kept: no delay is assumed to be the same in both directions). Nothing slews or sets
 // these clocks, so heartbeats of a minute are combined: each two of them bound how fast the clocks
-// depart from each other, and so what both say of the present moment.
+// depart from each other, and with that the difference at later moments.
 //
 //   threads  one
 #pragma once
@@ -32,15 +32,16 @@ class PairMeasurement {
   // 1 ppm per kelvin at the worst, and a PC warms up by less than 10 K in a minute.
   static constexpr PartsPerBillion kMaxRateChange = 160;
 
-  // Their clock minus this one, and how fast that grows.
+  // Their clock minus this one, and how fast that grows in the next 3 s.
   struct Difference {
     Duration least{}, greatest{};
     PartsPerBillion slowest = 0, fastest = 0;
   };
 
-  // Impossible times are ignored. Heartbeats that exclude each other show that one of the clocks
-  // stood still (the PC slept, or a virtual machine was moved): then only the newest one counts.
-  void add_untrusted(const HeartbeatTimes& times) noexcept;
+  // Heartbeats that exclude each other show that one of the clocks stood still (the PC slept, or a
+  // virtual machine was moved): then only the newest one counts. False: its times are impossible,
+  // or a later one was answered before, and it is ignored.
+  bool add_untrusted(const HeartbeatTimes& times) noexcept;
   void clear() noexcept { heartbeats_.clear(); }
 
   // At `now`. nullopt: there is no heartbeat within kWindow before it, or one after it.
@@ -61,8 +62,9 @@ class PairMeasurement {
     Bound least, greatest;
     Duration round_trip;
   };
-  // What two heartbeats say of later moments: the difference is at most `later`, and what it gains
-  // after that by `rate`, the greatest mean from `since` on, and by what that changes.
+  // What two heartbeats say of later moments:
+  //   difference <= later.difference + (now - later.at) * rate
+  //                 + kMaxRateChange / 2 * (now - later.at) * (now - since)
   struct Limit {
     Bound later;
     RawTime since{};
@@ -81,7 +83,7 @@ class PairMeasurement {
   bool is_excluded(const Heartbeat& newest) const noexcept;
 
   std::deque<Heartbeat> heartbeats_;  // oldest first
-  Side above_, below_;  // of all heartbeats; those that say most about the next second
+  Side above_, below_;  // by the two heartbeats that say most about the second after the newest
 };
 
 }  // namespace dssm::clock

@@ -137,7 +137,7 @@ class FrameConnection final : private wire::FrameDelegate {
 
   // When bytes arrived last, to some milliseconds; for heartbeats.
   MonoTime last_heard() const noexcept { return last_heard_; }
-  // As wire::Transport, for the frame that is being handled: not before its last byte came.
+  // As wire::Transport. While a frame is handled, arrived() is never before the frame was sent.
   void stamp_arrivals() noexcept {
     if (!closed_) transport_->stamp_arrivals();
   }

@@ -107,6 +107,10 @@ bool DataCommunicator::can_serve() const noexcept {
   return link_.is_open() && link_.output_empty() && !opening_ && !(channel_ && channel_->busy());
 }
 
+void DataCommunicator::become_control() {
+  if (!std::exchange(is_control_, true)) link_.stamp_arrivals();  // of heartbeats
+}
+
 void DataCommunicator::serve(const net::Frame& request) {
   ++served_;
   if (Result<void> done = dispatch(request); !done) send_failure(request.serial(), done.error());
@@ -126,7 +130,7 @@ Result<void> DataCommunicator::check_access(const net::Frame& request) const {
 Result<void> DataCommunicator::dispatch(const net::Frame& request) {
   DSSM_TRY(check_access(request));
   if (request.has_ping()) {
-    if (!std::exchange(is_control_, true)) link_.stamp_arrivals();
+    become_control();
     RawTime received = RawClock::now();
     if (parts_.self.clock) received = parts_.self.clock->line.arrival(link_.arrived(), received);
     peer_timeout_.enable_in(wire::kPeerTimeout);
@@ -155,7 +159,7 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
 }
 
 Result<void> DataCommunicator::serve_control(const net::Frame& request) {
-  is_control_ = true;
+  become_control();
   if (request.has_watch()) {
     watch_ = std::make_unique<StreamWatch>(parts_.registry, parts_.opens, link_, request.serial());
     work_soon();

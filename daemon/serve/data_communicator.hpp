@@ -122,6 +122,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   void work_soon() override;
 
   Result<void> greet(const net::Frame& frame);
+  void become_control();
   bool can_serve() const noexcept;
   void serve(const net::Frame& request);
   Result<void> check_access(const net::Frame& request) const;

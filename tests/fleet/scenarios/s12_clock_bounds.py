@@ -23,9 +23,9 @@ def run(lab: Lab) -> None:
     with Truth(lab.guests).watching() as truth:
         begin = truth.await_good()
         print(pc3.ssh.run(f"dssmctl clock --table {READINGS}", timeout=READINGS + 60), end="", flush=True)
-        for guest in (pc2, pc3):
-            print(f"  | {guest.name} - pc1 by the truth: {summary(truth.true_offsets(guest.name, 'pc1', begin))} us",
-                  flush=True)
+        print(pc3.ssh.run("dssmctl clock --matrix"), end="", flush=True)
+        for one, other in (("pc2", "pc1"), ("pc3", "pc1"), ("pc3", "pc2")):
+            print(f"  | {one} - {other} by the truth: {summary(truth.true_offsets(one, other, begin))} us", flush=True)
         stepped = truth.step(pc2, STEP_NS)
         good = truth.await_good()
         print(f"  | a step of 200 ms: refused after {truth.await_refused('pc2', stepped):.3f} s, good again after"

@@ -110,7 +110,7 @@ def step_and_back(guest: Guest, ns: int) -> Callable[[Lab, Truth], None]:
     return happen
 
 
-def signal_chronyd(guest: Guest, signal: str) -> str:
+def signal_chronyd(signal: str) -> str:
     """The command that sends a signal to chronyd."""
     return f"kill -{signal} $(cat /run/chrony/chronyd.pid)"
 
@@ -118,7 +118,7 @@ def signal_chronyd(guest: Guest, signal: str) -> str:
 def chronyd_killed(guest: Guest) -> Callable[[Lab, Truth], None]:
     """chronyd crashes, and systemd starts it again."""
     def happen(_lab: Lab, _truth: Truth) -> None:
-        guest.ssh.run(signal_chronyd(guest, "KILL"))
+        guest.ssh.run(signal_chronyd("KILL"))
         time.sleep(WATCHED_SECONDS)
 
     return happen
@@ -127,9 +127,9 @@ def chronyd_killed(guest: Guest) -> Callable[[Lab, Truth], None]:
 def chronyd_stopped(guest: Guest) -> Callable[[Lab, Truth], None]:
     """chronyd hangs for a while."""
     def happen(_lab: Lab, _truth: Truth) -> None:
-        guest.ssh.run(signal_chronyd(guest, "STOP"))
+        guest.ssh.run(signal_chronyd("STOP"))
         time.sleep(WATCHED_SECONDS)
-        guest.ssh.run(signal_chronyd(guest, "CONT"))
+        guest.ssh.run(signal_chronyd("CONT"))
 
     return happen
 
@@ -137,8 +137,8 @@ def chronyd_stopped(guest: Guest) -> Callable[[Lab, Truth], None]:
 def chronyd_slowed(guest: Guest) -> Callable[[Lab, Truth], None]:
     """chronyd runs for a tenth of the time only."""
     def happen(_lab: Lab, _truth: Truth) -> None:
-        guest.ssh.run(f"for i in $(seq {WATCHED_SECONDS:.0f}); do {signal_chronyd(guest, 'STOP')}; sleep 0.9;"
-                      f" {signal_chronyd(guest, 'CONT')}; sleep 0.1; done")
+        guest.ssh.run(f"for i in $(seq {WATCHED_SECONDS:.0f}); do {signal_chronyd('STOP')}; sleep 0.9;"
+                      f" {signal_chronyd('CONT')}; sleep 0.1; done")
 
     return happen
 

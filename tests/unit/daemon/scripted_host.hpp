@@ -158,7 +158,8 @@ class ScriptedPeer final : public ScriptedHost {
   std::vector<std::string> streams;  // that it has when a Watch begins
   std::vector<net::Frame> requests;  // of other kinds, which the test answers
   bool answers_heartbeat = true;
-  Duration delay{};  // until a Ping is answered
+  Duration delay{};                                     // until a Ping is answered
+  std::int64_t ping_received_ns = 0, pong_sent_ns = 0;  // what its Pongs say
   int pings = 0, watches = 0;
 
  private:
@@ -169,6 +170,8 @@ class ScriptedPeer final : public ScriptedHost {
       if (!answers_heartbeat) return;
       answer.mutable_pong()->mutable_clock()->set_bound_ns(1000);
       answer.mutable_pong()->mutable_clock()->set_anchor(std::string(16, 'r'));
+      answer.mutable_pong()->set_received_ns(ping_received_ns);
+      answer.mutable_pong()->set_raw_ns(pong_sent_ns);
       pongs_.push_back(answer);
       pong_timer_.enable_in(delay);
     } else if (request.has_watch()) {

@@ -66,6 +66,18 @@ TEST_F(Arrival, IsFoundByTheLineAndNeverTooEarly) {
   EXPECT_EQ(line.arrival(stamp + 1h, now), now);
 }
 
+// A clock that is slewed: after 40 s it shows 4 ms more, and is 1 ms off the line.
+TEST_F(Arrival, FollowsTheRateOfTheLineAndAllowsForItsTolerance) {
+  constexpr PartsPerBillion kRate = 100'000;
+  line.raw -= 40s;
+  line.wall -= 40s + 4ms;
+  line.rate = kRate;
+  line.tolerance = 3ms;
+  EXPECT_GE(line.arrival(stamp - 1ms, now), before);
+  EXPECT_LT(line.arrival(stamp - 1ms, now), before + 3ms);
+  EXPECT_EQ(line.arrival(stamp - 10s, now), now) << "too long ago";
+}
+
 TEST_F(Arrival, IsNowIfItIsNotKnownOrTheClockWasSet) {
   EXPECT_EQ(line.arrival(std::nullopt, now), now);
   EXPECT_EQ(ClockLine().arrival(stamp, now), now);

@@ -286,11 +286,15 @@ TEST_F(MeasuredTest, NeedsNoChronydAtAll) {
                 FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
                 *std::move(page), own, kSelf, catalog, logger);
   wait([this] { return own->line.exists(); });
+  const Time before = WallClock::now();
   heartbeat(200us);
   EXPECT_EQ(own->clock.bound, kUnknownClockError);
   EXPECT_TRUE(found().can_be_good());
   EXPECT_EQ(found().added, kUnknownClockError);
   EXPECT_GE(found().measured, 200us);
+  EXPECT_GE(found().recent, 200us);
+  EXPECT_LE(found().recent, 2ms);
+  EXPECT_GE(found().recent_from, before + 200us) << "their clock is ahead";
   EXPECT_LT(fleet->distance_to(*pc3), kUnknownClockError);
   const SampleInfo sample{0, WallClock::now() + 1s, kUnknownClockError};
   EXPECT_TRUE(found().is_good(sample, MonoClock::now()));
@@ -315,6 +319,15 @@ TEST_F(MeasuredTest, IsVoidAfterAStepThereUntilItWasMeasuredAgain) {
   pc3 = stepped;
   EXPECT_FALSE(found().can_be_good()) << "a channel may bring it first";
   catalog.set_clock(kOther, stepped);
+  EXPECT_FALSE(found().can_be_good());
+  heartbeat(0us, 2);
+  EXPECT_TRUE(found().can_be_good());
+}
+
+TEST_F(MeasuredTest, AHeartbeatThatBringsANewSettingDoesNotConfirmIt) {
+  start();
+  heartbeat(0us, 1);
+  heartbeat(0us, 2);  // that PC may have slept before it answered
   EXPECT_FALSE(found().can_be_good());
   heartbeat(0us, 2);
   EXPECT_TRUE(found().can_be_good());
@@ -350,6 +363,7 @@ TEST_F(MeasuredTest, TimesFromBeforeAStepThereAreNotMeasured) {
   auto later = std::make_shared<wire::ClockReport>(*pc3);
   later->setting_from = WallClock::now() + 1h;  // it was set back by an hour
   EXPECT_EQ(fleet->assess_mirror(lidar, later.get()).measured_from, later->setting_from);
+  EXPECT_EQ(fleet->assess_mirror(lidar, later.get()).recent_from, later->setting_from);
 }
 
 TEST_F(MeasuredTest, StatementsThatExcludeEachOtherAreRefused) {

@@ -110,6 +110,26 @@ TEST_F(PeersTest, TakeAHostOutWhenItStopsAnswering) {
   wait([&] { return !catalog.hosts().empty(); });
 }
 
+TEST_F(PeersTest, ReportTheFourTimesOfAHeartbeat) {
+  const auto heartbeat = [this] {
+    wait([&, before = one.pings] { return one.pings > before + 1; });
+    return catalog.hosts().begin()->second.greeting.clock->heartbeat.value();
+  };
+  one.ping_received_ns = 7;
+  one.pong_sent_ns = 9;
+  const RawTime before = RawClock::now();
+  start({&one});
+  const clock::HeartbeatTimes times = heartbeat();
+  EXPECT_EQ(times.received, RawTime(Duration(7)));
+  EXPECT_EQ(times.sent, RawTime(Duration(9)));
+  EXPECT_GE(times.asked, before);
+  EXPECT_GT(times.answered, times.asked);
+  EXPECT_LE(times.answered, RawClock::now());
+  one.ping_received_ns = 0;  // a dssmd that does not say it
+  wait([&, pings = one.pings] { return one.pings > pings + 1; });
+  EXPECT_EQ(heartbeat().received, RawTime(Duration(9)));
+}
+
 TEST_F(PeersTest, RefuseAPeerThatSendsInvalidStreamEvents) {
   start({&one});
   wait_for_startup();
