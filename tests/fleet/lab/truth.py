@@ -57,6 +57,11 @@ class Observation:
         status: str = self.answer["others"].get(owner, {"by_time": {"status": "closed"}})["by_time"]["status"]
         return status
 
+    def bound_of(self, owner: str) -> int:
+        """The bound of such a read whose status is "ok"; 0: unknown."""
+        bound: int = self.answer["others"][owner]["by_time"]["error"]
+        return max(bound, 0)
+
 
 @dataclasses.dataclass
 class Checked:
@@ -165,18 +170,18 @@ class Truth:
         await_that(f"{guest.name}'s clock is set", lambda: (len(steps) > before, len(steps)))
         return steps[-1]
 
-    def await_good(self, *names: str) -> int:
-        """Waits until these guests, or all, have accepted each other's samples for STEADY_SECONDS, and
-        returns when that began."""
+    def await_good(self, *names: str, bound_ns: int = LIMIT_NS) -> int:
+        """Waits until these guests, or all, have accepted each other's samples for STEADY_SECONDS and stated
+        at most this bound, and returns when that began."""
         begin = time.monotonic_ns()
         wanted = names or tuple(self.watched)
 
         def check() -> tuple[bool, object]:
-            bad, since = self._last_not_good(wanted, begin)
+            bad, since = self._last_not_good(wanted, begin, bound_ns)
             return time.monotonic_ns() - since > STEADY_SECONDS * SECOND_NS, bad
 
         await_that(f"{', '.join(wanted)} accept each other's clocks", check, RECOVERY_SECONDS)
-        return self._last_not_good(wanted, begin)[1]
+        return self._last_not_good(wanted, begin, bound_ns)[1]
 
     def await_refused(self, owner: str, since: int) -> float:
         """Waits until a read by time of a guest's samples is refused on another PC; returns the seconds from
@@ -199,7 +204,7 @@ class Truth:
         return sum(1 for watched in self.watched.values() for run in watched.runs.values()
                    for observation in run.observations for kind in KINDS for _ in statements(observation, kind))
 
-    def _last_not_good(self, names: Iterable[str], begin: int) -> tuple[str, int]:
+    def _last_not_good(self, names: Iterable[str], begin: int, bound_ns: int) -> tuple[str, int]:
         last = ("nothing", begin)
         for name in names:
             observations = self.watched[name].last.observations
@@ -209,8 +214,11 @@ class Truth:
                 for observation in reversed(observations) if owner != name else ():
                     if observation.came < last[1]:
                         break
-                    if observation.status_of(owner) != "ok":
-                        last = (f"{name} reads {owner}: {observation.status_of(owner)}", observation.came)
+                    status = observation.status_of(owner)
+                    if status == "ok" and observation.bound_of(owner) > bound_ns:
+                        status = f"within {observation.bound_of(owner)} ns"
+                    if status != "ok":
+                        last = (f"{name} reads {owner}: {status}", observation.came)
                         break
         return last
 
