@@ -367,10 +367,12 @@ void FleetClock::measure(const wire::ClockReport& theirs) {
   }
   const auto [found, is_new] = pairs_.try_emplace(theirs.boot_id);
   Pair& pair = found->second;
-  // A heartbeat that brings a new setting may have been under way while that PC slept.
-  const bool is_same_setting = std::exchange(pair.setting, theirs.setting) == theirs.setting;
-  if (!is_same_setting) pair.await_heartbeat();
-  if (theirs.heartbeat && theirs.heartbeat->asked > pairs_since_ && (is_same_setting || is_new) &&
+  if (std::exchange(pair.setting, theirs.setting) != theirs.setting) {
+    pair.await_heartbeat();
+    // A heartbeat that brings a new setting may have been under way while that PC slept.
+    if (theirs.heartbeat && !is_new) pair.since = theirs.heartbeat->answered;
+  }
+  if (theirs.heartbeat && theirs.heartbeat->asked > std::max(pairs_since_, pair.since) &&
       pair.raws.add_untrusted(*theirs.heartbeat)) {
     pair.is_confirmed = true;
   }

@@ -127,6 +127,7 @@ class FleetClock final : public ClockAssessor,
     clock::PairMeasurement raws;
     bool is_confirmed = false;              // by a heartbeat since a clock was set
     std::int64_t setting = 0;               // of their clock, while this was measured
+    RawTime since{};                        // heartbeats from before do not count
     std::deque<clock::StatedBound> stated;  // within kMeasuredReach, about one a second
     clock::WallDifference last;             // the latest
     MonoTime measured_at{};                 // then
@@ -175,7 +176,7 @@ class FleetClock final : public ClockAssessor,
   MonoTime addresses_read_{};
   std::deque<clock::StatedBound> stated_;  // within kReach; all of them bounds
   std::map<std::string, Pair> pairs_;      // by the boot id of the other PC
-  RawTime pairs_since_{};                  // heartbeats from before do not count
+  RawTime pairs_since_{};                  // the same for all pairs
   std::uint64_t generation_ = 0;
   std::function<void()> on_change_, on_new_generation_;
   HostClockLog log_;

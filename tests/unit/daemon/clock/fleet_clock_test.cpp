@@ -329,6 +329,8 @@ TEST_F(MeasuredTest, AHeartbeatThatBringsANewSettingDoesNotConfirmIt) {
   heartbeat(0us, 1);
   heartbeat(0us, 2);  // that PC may have slept before it answered
   EXPECT_FALSE(found().can_be_good());
+  catalog.set_clock(kOther, pc3);
+  EXPECT_FALSE(found().can_be_good()) << "the same report again";
   heartbeat(0us, 2);
   EXPECT_TRUE(found().can_be_good());
 }
