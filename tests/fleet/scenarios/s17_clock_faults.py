@@ -4,11 +4,14 @@
 One fault after the other on each PC; between two of them all PCs accept each other's samples again by
 themselves. A pair that a fault does not concern stays good all the time, whatever happens to the
 reference. DSSM_FLEET_STATEMENTS: rounds are added until so many statements were compared with the truth.
-DSSM_FLEET_FAULTS: only so many faults in each round; DSSM_FLEET_SEED selects others.
+DSSM_FLEET_FAULTS: only faults that match this regular expression, as "pc1: (frozen|power lost)";
+DSSM_FLEET_SEED: another order.
 """
 
 import os
 import random
+import re
+import statistics
 import time
 from collections.abc import Callable, Iterator
 
@@ -20,7 +23,7 @@ from lab.truth import SECOND_NS, Truth, expect_true
 
 ONLY_BY_NAME = "a round of all faults takes a quarter of an hour"
 STATEMENTS = int(os.environ.get("DSSM_FLEET_STATEMENTS", "0"))
-FAULTS = int(os.environ.get("DSSM_FLEET_FAULTS", "0"))
+FAULTS = re.compile(os.environ.get("DSSM_FLEET_FAULTS", ""))
 SEED = int(os.environ.get("DSSM_FLEET_SEED", "17"))
 WATCHED_SECONDS = 12.0  # for faults that last: longer than it takes to follow the successor
 SECOND, HOUR = SECOND_NS, 3600 * SECOND_NS
@@ -41,9 +44,10 @@ def run(lab: Lab) -> None:
     with Truth(lab.guests).watching() as truth:
         truth.await_good()
         while True:
-            faults = [(guest, fault) for guest in lab.guests for fault in faults_of(guest, order)]
+            faults = [(guest, fault) for guest in lab.guests for fault in faults_of(guest, order)
+                      if FAULTS.search(f"{guest.name}: {fault[0]}")]
             order.shuffle(faults)
-            for guest, fault in faults[:FAULTS or None]:
+            for guest, fault in faults:
                 failures += suffer(lab, truth, guest, fault)
             if truth.count() >= STATEMENTS:
                 break
@@ -65,11 +69,19 @@ def suffer(lab: Lab, truth: Truth, guest: Guest, fault: Fault) -> list[str]:
     shares = [100 * share for share in (truth.share_good(one, other, began), truth.share_good(other, one, began))]
     print(f"  | {guest.name}: {name}, {(ended - began) / SECOND_NS:.1f} s: all good"
           f" {max(good - ended, 0) / SECOND_NS:.1f} s after that; {one} and {other}: {min(shares):.1f} % good", flush=True)
+    offsets = [abs(offset) / 1e3 for offset, _ in truth.true_offsets(one, other, began)]
+    if min(shares) < 100:
+        print(f"  |   true distance of {one} and {other} meanwhile: {spread_us(offsets)}", flush=True)
     # A step that is within the limit is slewed away while all samples are good: the next fault waits for that.
     truth.await_good(bound_ns=SETTLED_NS)
     if not spares_others or min(shares) == 100:
         return []
     return [f"{one} and {other} refused each other when {guest.name}: {name}"]
+
+
+def spread_us(values: list[float]) -> str:
+    """Median and greatest."""
+    return f"median {statistics.median(values):.0f} us, max {max(values):.0f} us"
 
 
 def faults_of(guest: Guest, order: random.Random) -> Iterator[Fault]:
