@@ -13,6 +13,7 @@ only if it is false for all values within that width.
 """
 
 import bisect
+import collections
 import dataclasses
 import itertools
 import json
@@ -194,10 +195,20 @@ class Truth:
         await_that(f"reads of {owner}'s samples by time are refused", lambda: (bool(refused()), None))
         return (min(refused()) - since) / SECOND_NS
 
+    def statuses(self, reader: str, owner: str, since: int) -> dict[str, int]:
+        """How often reads of `owner`'s samples had each status since then."""
+        return dict(collections.Counter(observation.status_of(owner) for observation in self.watched[reader].last.observations
+                                        if observation.came > since))
+
+    def refuses(self, reader: str, owner: str) -> bool:
+        """Whether the last read of `owner`'s samples was refused."""
+        observations = self.watched[reader].last.observations
+        return bool(observations) and observations[-1].status_of(owner) == "clock_out_of_bounds"
+
     def share_good(self, reader: str, owner: str, since: int) -> float:
         """The share of good reads of `owner`'s samples since then."""
-        statuses = [observation.status_of(owner) for observation in self.watched[reader].last.observations if observation.came > since]
-        return statuses.count("ok") / max(len(statuses), 1)
+        statuses = self.statuses(reader, owner, since)
+        return statuses.get("ok", 0) / max(sum(statuses.values()), 1)
 
     def count(self) -> int:
         """How many statements were observed."""
@@ -339,7 +350,13 @@ def expect_true(truth: Truth) -> None:
               f" last one {max(unnoticed):.1f} ms after that", flush=True)
     wrong = [each for each in wrong if not any(0 <= each.came - step < NOTICE_NS
                                                for step in truth.watched[each.reader].steps)]
-    assert not wrong, f"{len(wrong)} of {len(everything)} statements are false, the first ones: {wrong[:5]}"
+    groups: dict[tuple[str, str, bool], list[Checked]] = {}
+    for each in wrong:
+        groups.setdefault((each.reader, each.owner, each.good), []).append(each)
+    assert not wrong, f"{len(wrong)} of {len(everything)} statements are false: " + "; ".join(
+        f"on {reader} about {owner}, {'good' if good else 'not good'}: {len(found)} from"
+        f" {found[0].came / SECOND_NS:.2f} to {found[-1].came / SECOND_NS:.2f} s, for example {found[0]}"
+        for (reader, owner, good), found in groups.items())
 
 
 def is_slewed(truth: Truth, checked: Checked) -> bool:

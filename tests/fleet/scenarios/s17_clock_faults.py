@@ -18,7 +18,7 @@ from collections.abc import Callable, Iterator
 from lab.clocks import await_reference
 from lab.dssmd import main_pid
 from lab.guest import Guest
-from lab.lab import Lab
+from lab.lab import Lab, await_that
 from lab.truth import SECOND_NS, Truth, expect_true
 
 ONLY_BY_NAME = "a round of all faults takes a quarter of an hour"
@@ -67,11 +67,12 @@ def suffer(lab: Lab, truth: Truth, guest: Guest, fault: Fault) -> list[str]:
     ended = time.monotonic_ns()
     good = truth.await_good()
     shares = [100 * share for share in (truth.share_good(one, other, began), truth.share_good(other, one, began))]
-    print(f"  | {guest.name}: {name}, {(ended - began) / SECOND_NS:.1f} s: all good"
+    print(f"  | {began / SECOND_NS:.2f} s: {guest.name}: {name}, {(ended - began) / SECOND_NS:.1f} s: all good"
           f" {max(good - ended, 0) / SECOND_NS:.1f} s after that; {one} and {other}: {min(shares):.1f} % good", flush=True)
     offsets = [abs(offset) / 1e3 for offset, _ in truth.true_offsets(one, other, began)]
     if min(shares) < 100:
-        print(f"  |   true distance of {one} and {other} meanwhile: {spread_us(offsets)}", flush=True)
+        print(f"  |   true distance of {one} and {other} meanwhile: {spread_us(offsets)}; statuses of reads:"
+              f" {truth.statuses(one, other, began)}, {truth.statuses(other, one, began)}", flush=True)
     # A step that is within the limit is slewed away while all samples are good: the next fault waits for that.
     truth.await_good(bound_ns=SETTLED_NS)
     if not spares_others or min(shares) == 100:
@@ -248,6 +249,8 @@ def restarted_with_wrong_time(guest: Guest) -> Callable[[Lab, Truth], None]:
     """The reference is switched on again with the time of its battery: it takes over its successor's."""
     def happen(lab: Lab, truth: Truth) -> None:
         guest.ssh.run("systemctl stop dssmd.socket dssmd chrony")
+        # Without dssmd, its last statement counts for 3 s.
+        await_that(f"{guest.name} refuses samples", lambda: (truth.refuses(guest.name, "pc2"), None))
         await_reference(lab["pc3"], "pc2")
         truth.step(guest, 2 * SECOND)
         guest.ssh.run("systemctl start chrony dssmd")
