@@ -19,7 +19,7 @@ from lab.clocks import await_reference
 from lab.dssmd import main_pid
 from lab.guest import Guest
 from lab.lab import Lab, await_that
-from lab.truth import SECOND_NS, Truth, expect_true
+from lab.truth import LIMIT_NS, SECOND_NS, Truth, expect_true
 
 ONLY_BY_NAME = "a round of all faults takes a quarter of an hour"
 STATEMENTS = int(os.environ.get("DSSM_FLEET_STATEMENTS", "0"))
@@ -75,7 +75,9 @@ def suffer(lab: Lab, truth: Truth, guest: Guest, fault: Fault) -> list[str]:
               f" {truth.statuses(one, other, began)}, {truth.statuses(other, one, began)}", flush=True)
     # A step that is within the limit is slewed away while all samples are good: the next fault waits for that.
     truth.await_good(bound_ns=SETTLED_NS)
-    if not spares_others or min(shares) == 100:
+    # Reads may be refused while chronyd really moves these two clocks apart, as it does for some time after
+    # the reference was set.
+    if not spares_others or min(shares) == 100 or max(offsets) > LIMIT_NS / 3e3:
         return []
     return [f"{one} and {other} refused each other when {guest.name}: {name}"]
 
