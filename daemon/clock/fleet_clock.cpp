@@ -310,6 +310,7 @@ void FleetClock::update_line(RawTime now) {
       setting != std::exchange(own.setting, setting)) {
     for (auto& [boot_id, pair] : pairs_) pair.await_heartbeat();
     pairs_since_ = now;
+    set_at_ = MonoClock::now();
     line = clock::ClockLine::now(line.rate);
     return;
   }
@@ -426,7 +427,13 @@ std::optional<FleetClock::Measured> FleetClock::measured(const wire::ClockReport
   return measured;
 }
 
+// By this PC's clock as it was before it was set: only a reference stays where it was set to.
+bool FleetClock::is_outdated(const wire::ClockReport& theirs) const noexcept {
+  return own_->clock.basis == ClockBasis::own && theirs.as_of < set_at_;
+}
+
 Duration FleetClock::chain_distance(const wire::ClockReport& theirs, MonoTime now) const {
+  if (is_outdated(theirs) && !own_->shares_clock_with(theirs)) return kUnknownClockError;
   return clock::distance(own_->at(now), theirs.at(now));
 }
 
@@ -464,7 +471,7 @@ ring::ClockAssessment FleetClock::assess_mirror(const StreamId& id,
       by_heartbeats->now.excludes(chain_distance(*owner, now))) {
     return found;  // one of the two is wrong, and it is not known which
   }
-  if (owner->has_bound()) {
+  if (owner->has_bound() && !is_outdated(*owner)) {
     const wire::ClockReport own = own_->at(now), theirs = owner->at(now);
     found.added = clock::distance_from_anchor(theirs, own);
     found.ageing_ppb = ppb(own.clock.ageing_ppb + theirs.clock.ageing_ppb);

@@ -159,6 +159,7 @@ class FleetClock final : public ClockAssessor,
   // limit: earlier samples that were further off are not covered
   std::optional<Measured> measured(const wire::ClockReport& theirs, MonoTime now,
                                    Duration limit) const;
+  bool is_outdated(const wire::ClockReport& theirs) const noexcept;
   Duration chain_distance(const wire::ClockReport& theirs, MonoTime now) const;
   void log_others(MonoTime now);
   ring::ClockAssessment assessment(const StreamId& id, MonoTime now) const;
@@ -177,6 +178,7 @@ class FleetClock final : public ClockAssessor,
   std::deque<clock::StatedBound> stated_;  // within kReach; all of them bounds
   std::map<std::string, Pair> pairs_;      // by the boot id of the other PC
   RawTime pairs_since_{};                  // the same for all pairs
+  MonoTime set_at_{};                      // when this clock was set last
   std::uint64_t generation_ = 0;
   std::function<void()> on_change_, on_new_generation_;
   HostClockLog log_;

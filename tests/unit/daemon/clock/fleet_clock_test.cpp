@@ -129,6 +129,20 @@ TEST_F(FleetClockTest, APcWithoutASourceIsItsOwnReference) {
   EXPECT_EQ(generations, 1) << "others have to know";
 }
 
+// It stays where it was set to, and samples that came before are by the clock that it was.
+TEST_F(FleetClockTest, AReferenceTrustsNoReportFromBeforeItsClockWasSet) {
+  follow_no_source();
+  auto follower = std::make_shared<wire::ClockReport>(*host(kOther, "pc2", 5us).clock);
+  follower->chain.push_back({kSelf, 100us});
+  follower->anchor = kSelf;
+  start();  // with a new setting
+  EXPECT_FALSE(fleet->assess_mirror(lidar, follower.get()).can_be_good());
+  EXPECT_EQ(fleet->distance_to(*follower), kUnknownClockError);
+  follower->as_of = MonoClock::now();
+  EXPECT_TRUE(fleet->assess_mirror(lidar, follower.get()).can_be_good());
+  EXPECT_LT(fleet->distance_to(*follower), 1ms);
+}
+
 TEST_F(FleetClockTest, OwnStreamsThatOthersWriteToAreAsFarOffAsThisClock) {
   EXPECT_FALSE(FleetClockTest::start().assess_own(lidar).added == kUnknownClockError);
   const ring::ClockAssessment known = fleet->assess_own(lidar);
