@@ -38,6 +38,7 @@ Duration ClockAssessment::distance(const SampleInfo& info, MonoTime now) const n
   const Duration age = now - assessed;
   Duration distance = kUnknownClockError;
   if (!is_suspect(info)) distance = sum(info.clock_error, grown(added, age, ageing_ppb));
+  if (info.tid < measured_first_tid) return distance;
   if (info.time >= measured_from) {
     distance = std::min(distance, grown(measured, age, measured_ageing_ppb));
   }

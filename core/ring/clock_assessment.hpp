@@ -33,6 +33,8 @@ namespace dssm::ring {
 //    68    4 reserved       -     zero
 //    72    8 recent         ns    the same for later samples; grows as `measured`
 //    80    8 recent_from    ns    of samples with this time or a later one: the last seconds
+//    88    8 measured_first_tid   both are of this sample and later ones: earlier ones may have
+//                                 been stamped before the clock was set back
 struct ClockAssessment {
   ClockPolicy policy = ClockPolicy::off;
   std::uint8_t same_clock = 1;
@@ -49,6 +51,7 @@ struct ClockAssessment {
   std::uint32_t reserved1 = 0;
   Duration recent = kUnknownClockError;
   Time recent_from{};
+  Tid measured_first_tid = 0;
 
   // An older assessment counts as unknown: dssmd states one a second, and restarts in less.
   static constexpr Duration kValidFor = std::chrono::seconds(3);
@@ -74,6 +77,6 @@ struct ClockAssessment {
  private:
   bool is_suspect(const SampleInfo& info) const noexcept;
 };
-static_assert(sizeof(ClockAssessment) == 88);
+static_assert(sizeof(ClockAssessment) == 96);
 
 }  // namespace dssm::ring

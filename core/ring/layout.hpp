@@ -76,8 +76,8 @@ static_assert(sizeof(PublisherCursor) == 40);
 //   528     8 first            tid    dssmd       before top; see "Window"
 //   536   104 reserved         -      -           zero
 //   640  2560 publishers       -      dssmd       before top: see publisher_cursors.hpp
-//  3200   184 clock            -      dssmd       see clock_assessment.hpp, shared_snapshot.hpp
-//  3384   712 reserved         -      -           zero
+//  3200   200 clock            -      dssmd       see clock_assessment.hpp, shared_snapshot.hpp
+//  3400   696 reserved         -      -           zero
 struct RingHeader {
   std::uint64_t magic;
   std::uint32_t layout_version;
@@ -106,7 +106,7 @@ struct RingHeader {
   std::byte reserved3[104];
   PublisherCursor publishers[kMaxPublishers];
   SharedSnapshot<ClockAssessment> clock;
-  std::byte reserved4[712];
+  std::byte reserved4[696];
 };
 static_assert(sizeof(pthread_mutex_t) <= 64);
 static_assert(offsetof(RingHeader, incarnation) == 64 && offsetof(RingHeader, name) == 88);

@@ -86,6 +86,7 @@ void take_line_untrusted(const proto::ClockLine& message, ClockReport& out) {
               Duration(message.tolerance_ns())};
   out.setting = message.setting();
   out.setting_from = time_from_ns(message.setting_from_ns());
+  out.shown_before = time_from_ns(message.shown_before_ns());
 }
 
 }  // namespace
@@ -140,6 +141,7 @@ void to_message(const ClockReport& report, proto::ClockReport& out) {
     line.set_tolerance_ns(to_ns(report.line.tolerance));
     line.set_setting(report.setting);
     line.set_setting_from_ns(to_ns(report.setting_from));
+    line.set_shown_before_ns(to_ns(report.shown_before));
   }
   out.set_root_dispersion_ns(to_ns(clock.root.dispersion));
   out.set_root_delay_ns(to_ns(clock.root.delay));

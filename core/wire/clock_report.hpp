@@ -46,7 +46,10 @@ struct ClockReport {
   clock::ClockLine line;     // what the clock shows at each moment, until another line is reported
   std::int64_t setting = 0;  // changes when the clock is set; 0: not known
   Time setting_from{};       // times from here on are of this setting
-  std::string reference;     // the host or address that it follows, for people
+  // If not 1970: earlier settings showed times before this one, too. Of those only samples are of
+  // this setting that were written after the setting and setting_from were first reported.
+  Time shown_before{};
+  std::string reference;  // the host or address that it follows, for people
   std::vector<IpAddress>
       addresses;     // its own: others recognize the host that their chronyd follows
   MonoTime as_of{};  // when this was so, by CLOCK_MONOTONIC of this PC

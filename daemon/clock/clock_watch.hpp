@@ -75,6 +75,8 @@ class ClockWatch final : private ChronydClient::Observer {
   void poll_if_due() { client_.poll_if_due(); }
   // Someone slews the clock anew, probably chronyd, which may have measured since it was asked.
   void poll_now() { client_.poll_now(); }
+  // By Options::now.
+  clock::Instant now() const { return now_(); }
 
   // The host that chronyd follows, by its last answer.
   std::optional<wire::IpAddress> source() const noexcept;

@@ -67,7 +67,7 @@ bool is_good(ClockStatus status) noexcept {
 bool is_new_generation(const wire::ClockReport& before, const wire::ClockReport& after) {
   return before.clock.status != after.clock.status || before.has_bound() != after.has_bound() ||
          before.anchor != after.anchor || before.line != after.line ||
-         before.setting != after.setting;
+         before.setting != after.setting || before.setting_from != after.setting_from;
 }
 
 }  // namespace
@@ -136,13 +136,14 @@ void FleetClock::on_host_down(const KnownHost& host, const Error&) {
 // --- this host's report
 
 void FleetClock::refresh() {
-  const clock::Instant instant = clock::Instant::now();
+  const clock::Instant instant = watch_.now();
   const MonoTime now = instant.mono;
   const wire::ClockReport before = *own_;
   find_source(now);
   update_addresses(now);
   update_chain(now);
   update_status();
+  update_setting(instant);
   update_line(instant.raw);
   for (const auto& [id, host] : catalog_.hosts()) {
     if (host.greeting.clock) measure(*host.greeting.clock);
@@ -300,20 +301,28 @@ void FleetClock::publish(const clock::Instant& now) {
   page_.store(state);
 }
 
+// A clock that was set back will show times again that it showed before. kWrittenWithin later, no
+// program writes samples of the earlier setting any more: from then on tids tell them apart.
+void FleetClock::update_setting(const clock::Instant& now) {
+  wire::ClockReport& own = *own_;
+  if (const std::int64_t setting = watch_.setting();
+      setting != std::exchange(own.setting, setting)) {
+    for (auto& [boot_id, pair] : pairs_) pair.await_heartbeat();
+    pairs_since_ = now.raw;
+    set_at_ = now.mono;
+    own.setting_from = watch_.setting_from();
+    own.shown_before = {};
+    own.line = clock::ClockLine::now(own.line.rate);
+  } else if (now.wall < own.setting_from && now.mono - set_at_ >= kWrittenWithin) {
+    own.shown_before = std::exchange(own.setting_from, now.wall);
+  }
+}
+
 // The next line has the rate since the one before it began: after two or three of them that is the
 // rate that the clock has now.
 void FleetClock::update_line(RawTime now) {
   wire::ClockReport& own = *own_;
   clock::ClockLine& line = own.line;
-  own.setting_from = watch_.setting_from();
-  if (const std::int64_t setting = watch_.setting();
-      setting != std::exchange(own.setting, setting)) {
-    for (auto& [boot_id, pair] : pairs_) pair.await_heartbeat();
-    pairs_since_ = now;
-    set_at_ = MonoClock::now();
-    line = clock::ClockLine::now(line.rate);
-    return;
-  }
   if (line.holds() && now - line.raw < kLineAge) return;
   clock::ClockLine next = clock::ClockLine::now(line.rate);
   if (const Duration age = next.raw - line.raw; line.exists() && age > Duration::zero()) {

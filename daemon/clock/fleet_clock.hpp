@@ -58,6 +58,8 @@ class FleetClock final : public ClockAssessor,
   static constexpr Duration kMeasuredReach = std::chrono::seconds(60);
   // PCs of which measurements are kept; a further one replaces that which was silent the longest.
   static constexpr std::size_t kMaxPairs = 256;
+  // A program writes a sample at most so long after the sample's time.
+  static constexpr Duration kWrittenWithin = std::chrono::seconds(3);
   // Without a heartbeat for so long, the last measurement ages.
   static constexpr Duration kMeasuredFor = std::chrono::seconds(3);
 
@@ -152,6 +154,7 @@ class FleetClock final : public ClockAssessor,
   void choose_anchor(const ClockSnapshot& watched, MonoTime now);
   void update_status();
   void publish(const clock::Instant& now);
+  void update_setting(const clock::Instant& now);
   void update_line(RawTime now);
   void measure(const wire::ClockReport& theirs);
   std::optional<clock::WallDifference> walls_of(const Pair& pair,

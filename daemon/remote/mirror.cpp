@@ -91,7 +91,11 @@ Result<void> Mirror::on_refused(ChannelClient::Request, const Error& why) {
 
 Result<void> Mirror::on_other_frame(net::Frame& frame) {
   if (!frame.has_pong()) return RemoteStream::on_other_frame(frame);
-  on_owner_clock(wire::clock_report_untrusted(frame.pong()));
+  std::optional<Tid> newest;
+  if (frame.pong().has_newest_tid()) {
+    newest = std::clamp<Tid>(frame.pong().newest_tid(), kNoTid, channel::kMaxTid);
+  }
+  on_owner_clock(wire::clock_report_untrusted(frame.pong()), newest);
   return {};
 }
 
@@ -113,8 +117,9 @@ void Mirror::on_stream_removed(std::uint64_t incarnation) {
                ring_->stream()->incarnation() == incarnation;
 }
 
-void Mirror::on_owner_clock(MirrorClock::Report report) {
-  clock_.on_owner(std::move(report), ring_ ? ring_->newest() : kNoTid, MonoClock::now());
+void Mirror::on_owner_clock(MirrorClock::Report report, std::optional<Tid> owners_newest) {
+  clock_.on_owner(std::move(report), ring_ ? ring_->newest() : kNoTid, MonoClock::now(),
+                  owners_newest);
   assess_clock();
 }
 

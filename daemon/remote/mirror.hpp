@@ -42,7 +42,9 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
 
   void on_stream_added() override;
   void on_stream_removed(std::uint64_t incarnation) override;
-  void on_owner_clock(MirrorClock::Report report) override;
+  void on_owner_clock(MirrorClock::Report report) override {
+    on_owner_clock(std::move(report), std::nullopt);
+  }
   // This PC's clock was read again.
   void on_own_clock() { assess_clock(); }
 
@@ -76,6 +78,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   Result<void> follow_untrusted(const StreamInfo& theirs);
   void replace_ring(std::unique_ptr<MirrorRing> ring);
   void notify_replaced();
+  void on_owner_clock(MirrorClock::Report report, std::optional<Tid> owners_newest);
   void assess_clock();
   void log_new_gap() {
     const std::uint64_t lost = ring_->gap_samples();

@@ -91,9 +91,15 @@ void MirrorRing::drop_aside() noexcept {
 
 // --- the clock
 
-void MirrorClock::on_owner(Report report, Tid newest, MonoTime now) noexcept {
+void MirrorClock::on_owner(Report report, Tid newest, MonoTime now,
+                           std::optional<Tid> owners_newest) noexcept {
   has_report_ = true;
   const Report before = std::exchange(report_, std::move(report));
+  if (!before || !report_ || before->setting != report_->setting ||
+      before->setting_from != report_->setting_from) {
+    setting_first_.reset();
+  }
+  if (owners_newest && !setting_first_) setting_first_ = *owners_newest + 1;
   if (before && report_ && before->boot_id == report_->boot_id &&
       before->line.left_by(report_->line) > kSlewed) {
     slewed_at_ = now;
@@ -118,6 +124,7 @@ void MirrorClock::on_time(Tid newest, MonoTime now) noexcept {
 void MirrorClock::on_new_ring() noexcept {
   suspect_first_ = 0;
   if (!is_suspect_now()) suspect_last_ = kNoTid;
+  setting_first_.reset();
 }
 
 ring::ClockAssessment MirrorClock::assessment() const {
@@ -125,6 +132,10 @@ ring::ClockAssessment MirrorClock::assessment() const {
   ring::ClockAssessment assessment = assessor_->assess_mirror(id_, report_.get());
   assessment.suspect_first = suspect_first_;
   assessment.suspect_last = suspect_last_;
+  const Time from = std::min(assessment.measured_from, assessment.recent_from);
+  if (report_ && from < report_->shown_before) {
+    assessment.measured_first_tid = setting_first_.value_or(INT64_MAX);
+  }
   return assessment;
 }
 

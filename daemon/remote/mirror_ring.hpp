@@ -106,8 +106,9 @@ class MirrorClock {
   static constexpr Duration kStaleFor = std::chrono::seconds(3);
 
   // The owner's latest report (nullptr: none), received at `now`, when `newest` was the newest
-  // sample here.
-  void on_owner(Report report, Tid newest, MonoTime now) noexcept;
+  // sample here; and in the owner's ring, if the report says so.
+  void on_owner(Report report, Tid newest, MonoTime now,
+                std::optional<Tid> owners_newest = std::nullopt) noexcept;
   // Ends what was suspect for a time; about once a second.
   void on_time(Tid newest, MonoTime now) noexcept;
   // The mirror continues with another ring, whose samples all arrive from now on.
@@ -134,6 +135,8 @@ class MirrorClock {
   bool has_report_ = false;
   std::optional<MonoTime> slewed_at_;
   Tid suspect_first_ = 0, suspect_last_ = kNoTid;
+  // Samples from here on are of the setting that the owner reports; nothing: not known yet.
+  std::optional<Tid> setting_first_;
 };
 
 }  // namespace dssm::daemon

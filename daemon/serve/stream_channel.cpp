@@ -175,6 +175,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   clock_generation_ = generation;
   sender_.end_run();
   net::Frame frame;
+  frame.mutable_pong()->set_newest_tid(reader_.newest());
   wire::send_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
   parts_.link.send(frame);
 }

@@ -37,6 +37,8 @@ CALIBRATION = 300  # requests to each guest, one after the other, at the start
 MAX_PENDING = 300  # requests that wait for an answer
 QUICK_NS = 150_000  # slower readings of a guest's clocks are not used as measurements
 LIMIT_NS = 1_500_000  # dssmd's default clock_limit
+NEAR_NS = LIMIT_NS / 3
+NEAR_SECONDS = 5  # longer than a sample counts by what was measured before
 STEADY_SECONDS = 1.5  # recovered after this time with good statements only
 RECOVERY_SECONDS = 180
 SECOND_NS = 10**9
@@ -62,6 +64,15 @@ class Observation:
         """The bound of such a read whose status is "ok"; 0: unknown."""
         bound: int = self.answer["others"][owner]["by_time"]["error"]
         return max(bound, 0)
+
+
+@dataclasses.dataclass
+class Offset:
+    """How far a guest's clock was ahead of another's. In ns."""
+
+    came: int
+    ns: float
+    width: float
 
 
 @dataclasses.dataclass
@@ -210,6 +221,16 @@ class Truth:
         statuses = self.statuses(reader, owner, since)
         return statuses.get("ok", 0) / max(sum(statuses.values()), 1)
 
+    def refused_while_near(self, reader: str, owner: str, since: int) -> int:
+        """How many reads of `owner`'s samples were refused since then, although both clocks had been within
+        NEAR_NS of each other for NEAR_SECONDS."""
+        far = [offset.came for offset in self.true_offsets(reader, owner, since - NEAR_SECONDS * SECOND_NS)
+               if abs(offset.ns) > NEAR_NS]
+        refused = [observation.came for observation in self.watched[reader].last.observations
+                   if observation.came > since and observation.status_of(owner) == "clock_out_of_bounds"]
+        return sum(1 for came in refused if bisect.bisect_left(far, came - NEAR_SECONDS * SECOND_NS)
+                   == bisect.bisect_right(far, came))
+
     def count(self) -> int:
         """How many statements were observed."""
         return sum(1 for watched in self.watched.values() for run in watched.runs.values()
@@ -304,8 +325,8 @@ class Truth:
                        statement["time"] - wall[0],
                        width + writer_width + wall[1] + statement["within"])
 
-    def true_offsets(self, name: str, reference: str, since: int) -> list[tuple[float, float]]:
-        """The offset of a guest's clock from another's, and its width, at each quick observation [ns]."""
+    def true_offsets(self, name: str, reference: str, since: int) -> list[Offset]:
+        """The offset of a guest's clock from another's at each quick observation."""
         found = []
         own, other = self.watched[name].last, self.watched[reference].last
         (own_ahead, own_width), (other_ahead, other_width) = own.ahead(), other.ahead()
@@ -314,8 +335,8 @@ class Truth:
             index = bisect.bisect_right(other.observations, raw, key=lambda each: each.raw) - 1
             near = other.observations[max(index, 0)]
             if observation.came > since and index >= 0 and max(observation.within, near.within) < QUICK_NS:
-                found.append((observation.wall - (near.wall + raw - near.raw),
-                              own_width + other_width + (observation.within + near.within) / 2))
+                found.append(Offset(observation.came, observation.wall - (near.wall + raw - near.raw),
+                                    own_width + other_width + (observation.within + near.within) / 2))
         return found
 
 
@@ -383,9 +404,8 @@ def statements(observation: Observation, kind: str) -> Iterator[tuple[str, dict[
             yield owner, answers[kind]
 
 
-def summary(offsets: Iterable[tuple[float, float]]) -> str:
+def summary(offsets: list[Offset]) -> str:
     """A row of the paper's Table I: average, maximum, minimum and standard deviation of the size."""
-    pairs = list(offsets)
-    sizes = [abs(offset) / 1e3 for offset, _ in pairs]
+    sizes = [abs(offset.ns) / 1e3 for offset in offsets]
     return (f"average {statistics.fmean(sizes):.1f} us, max {max(sizes):.1f}, min {min(sizes):.1f}, std dev"
-            f" {statistics.pstdev(sizes):.1f}, of {len(sizes)}, known within {max(width for _, width in pairs) / 1e3:.1f}")
+            f" {statistics.pstdev(sizes):.1f}, of {len(sizes)}, known within {max(offset.width for offset in offsets) / 1e3:.1f}")

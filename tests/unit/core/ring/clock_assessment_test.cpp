@@ -94,6 +94,14 @@ TEST(ClockAssessment, SamplesOfTheLastSecondsCountByWhatWasMeasuredThen) {
   EXPECT_FALSE(clock.is_good(sample_at(4'999, kUnknownClockError), kAssessed));
 }
 
+TEST(ClockAssessment, SamplesFromBeforeTheClockWasSetBackAreNotMeasured) {
+  ClockAssessment clock = measured();
+  clock.recent = 30us;
+  clock.measured_first_tid = 7;
+  EXPECT_EQ(clock.distance({7, time_from_ns(1'000), 200us}, kAssessed), 30us);
+  EXPECT_EQ(clock.distance({6, time_from_ns(1'000), 200us}, kAssessed), 500us);
+}
+
 TEST(ClockAssessment, AMeasurementNeedsNoClockErrorAndNoTrustInIt) {
   EXPECT_TRUE(measured().is_good(sample_at(1'000, kUnknownClockError), kAssessed));
   EXPECT_FALSE(measured().is_good(sample_at(999, kUnknownClockError), kAssessed));
@@ -176,7 +184,8 @@ TEST(ClockAssessment, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(ClockAssessment, measured_ageing_ppb), 64u);
   EXPECT_EQ(offsetof(ClockAssessment, recent), 72u);
   EXPECT_EQ(offsetof(ClockAssessment, recent_from), 80u);
-  EXPECT_EQ(sizeof(ClockAssessment), 88u);
+  EXPECT_EQ(offsetof(ClockAssessment, measured_first_tid), 88u);
+  EXPECT_EQ(sizeof(ClockAssessment), 96u);
 }
 
 TEST(ClockAssessment, IsEnforcedInARingOnlyForAnotherClockUnderThatPolicy) {

@@ -38,7 +38,7 @@ TEST(Layout, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(RingHeader, first), 528u);
   EXPECT_EQ(offsetof(RingHeader, publishers), 640u);
   EXPECT_EQ(offsetof(RingHeader, clock), 3200u);
-  EXPECT_EQ(sizeof(RingHeader::clock), 184u);
+  EXPECT_EQ(sizeof(RingHeader::clock), 200u);
   EXPECT_EQ(sizeof(RingHeader::publishers), 64u * 40);
   EXPECT_EQ(offsetof(PublisherCursor, publisher), 0u);
   EXPECT_EQ(offsetof(PublisherCursor, tid_end), 8u);

@@ -25,6 +25,11 @@ Greeting mapper() {
   clock->anchor = greeting.host_id;
   clock->clock.bound = std::chrono::microseconds(250);
   clock->as_of = MonoClock::now();
+  clock->line = {RawTime(std::chrono::seconds(5)), Time(std::chrono::hours(9)), -7,
+                 std::chrono::microseconds(12)};
+  clock->setting = 3;
+  clock->setting_from = Time(std::chrono::hours(8));
+  clock->shown_before = Time(std::chrono::hours(10));
   greeting.clock = clock;
   return greeting;
 }
@@ -54,6 +59,10 @@ TEST(Greeting, CrossesTheWire) {
   EXPECT_EQ(back->version, "0.1.0");
   EXPECT_EQ(back->features, mapper().features);
   EXPECT_EQ(reported_bound(*back), std::chrono::microseconds(250)) << "it does not age";
+  EXPECT_EQ(back->clock->line, mapper().clock->line);
+  EXPECT_EQ(back->clock->setting, mapper().clock->setting);
+  EXPECT_EQ(back->clock->setting_from, mapper().clock->setting_from);
+  EXPECT_EQ(back->clock->shown_before, mapper().clock->shown_before);
   EXPECT_TRUE(back->has_feature(kFeatureTorn));
   EXPECT_FALSE(back->has_feature("tor"));
   EXPECT_EQ(back->str(), "'mapper' on host 'pc3'");

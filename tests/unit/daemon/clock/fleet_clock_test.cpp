@@ -60,14 +60,19 @@ class FleetClockTest : public testing::Test {
   // Starts, and waits until chronyd has answered.
   FleetClock& start() {
     Result<clock::ClockPageWriter> page = clock::ClockPageWriter::open(folder_ + "/clock");
-    fleet.emplace(loop,
-                  FleetClock::Options{{chronyd.address(), {}, clock::Instant::now, 50ms}, policies},
-                  *std::move(page), own, kSelf, catalog, logger);
+    fleet.emplace(
+        loop,
+        FleetClock::Options{{chronyd.address(), {}, [this] { return now(); }, 50ms}, policies},
+        *std::move(page), own, kSelf, catalog, logger);
     fleet->on_new_generation([this] { ++generations; });
     wait([this] { return own->clock.status != ClockStatus::unknown; });
     return *fleet;
   }
   void wait(const std::function<bool()>& done) { run_until(loop, done); }
+  clock::Instant now() const {
+    clock::Instant now = clock::Instant::now();
+    return {now.mono + passed, now.wall + passed + set_by, now.width, now.raw + passed};
+  }
   void follow_no_source() {
     tracking.reference_id = clock::kLocalReferenceId;
     tracking.root = {};
@@ -112,6 +117,7 @@ class FleetClockTest : public testing::Test {
   std::shared_ptr<wire::ClockReport> own = std::make_shared<wire::ClockReport>();
   std::optional<FleetClock> fleet;
   int generations = 0;
+  Duration passed{}, set_by{};  // by how much all clocks, or the wall clock, are ahead
 
  private:
   std::string folder_;
@@ -380,6 +386,26 @@ TEST_F(MeasuredTest, TimesFromBeforeAStepThereAreNotMeasured) {
   later->setting_from = WallClock::now() + 1h;  // it was set back by an hour
   EXPECT_EQ(fleet->assess_mirror(lidar, later.get()).measured_from, later->setting_from);
   EXPECT_EQ(fleet->assess_mirror(lidar, later.get()).recent_from, later->setting_from);
+}
+
+// For an hour it shows times that it showed before.
+TEST_F(MeasuredTest, OfAClockThatWasSetBackNewSamplesAreToldFromEarlierOnesByTheirTids) {
+  set_by = 1h;
+  start();
+  EXPECT_EQ(own->setting_from, Time());
+  const std::int64_t earlier_setting = own->setting;
+  set_by = 0h;
+  wait([&] { return own->setting != earlier_setting; });
+  const Time shown_before = own->setting_from;
+  EXPECT_GT(shown_before, WallClock::now() + 59min);
+  EXPECT_EQ(own->shown_before, Time()) << "programs may still write samples of the earlier setting";
+  const int before = generations;
+  passed = FleetClock::kWrittenWithin;
+  wait([&] { return own->setting_from != shown_before; });
+  EXPECT_EQ(own->shown_before, shown_before);
+  EXPECT_GE(own->setting_from, WallClock::now());
+  EXPECT_LT(own->setting_from, WallClock::now() + 1min);
+  EXPECT_EQ(generations, before + 1) << "others have to know before they get another sample";
 }
 
 TEST_F(MeasuredTest, StatementsThatExcludeEachOtherAreRefused) {

@@ -9,13 +9,14 @@ namespace dssm::daemon {
 
 class FakeClockAssessor final : public ClockAssessor {
  public:
-  std::uint64_t clock_generation() override { return 0; }
+  std::uint64_t clock_generation() override { return generation; }
   Result<void> check_serving(const StreamId&, const wire::Greeting&) const override { return {}; }
   ring::ClockAssessment assess_mirror(const StreamId&,
                                       const wire::ClockReport* owner) const override {
     if (same_clock) return {};
     ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(policy);
     assessment.limit = std::chrono::milliseconds(1);
+    assessment.measured_from = assessment.recent_from = measured_from;
     if (owner) assessment.added = owner->clock.bound;
     return assessment;
   }
@@ -31,10 +32,12 @@ class FakeClockAssessor final : public ClockAssessor {
   }
   std::vector<ClockPair> clock_pairs() override { return pairs; }
 
+  std::uint64_t generation = 0;
   std::vector<ClockPair> pairs;
   ClockPolicy policy = ClockPolicy::enforce;
   bool same_clock = false;
   Duration own_bound{};
+  Time measured_from{};
 };
 
 }  // namespace dssm::daemon

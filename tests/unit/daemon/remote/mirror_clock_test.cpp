@@ -97,6 +97,33 @@ TEST_F(MirrorClockTest, WhatWasStampedAgainstAnotherReferenceIsSuspect) {
   EXPECT_FALSE(is_suspect(13));
 }
 
+TEST_F(MirrorClockTest, WhatIsMeasuredOfAClockThatWasSetBackIsOfSamplesThatCameAfterIt) {
+  const auto set_back = [](std::int64_t setting, Duration shown_before) {
+    auto made = std::make_shared<wire::ClockReport>(*report(1us));
+    made->setting = setting;
+    made->setting_from = Time(1h);
+    made->shown_before = Time(shown_before);
+    return made;
+  };
+  const auto first = [this] { return clock.assessment().measured_first_tid; };
+  assessor.measured_from = Time(2h);
+  clock.on_owner(set_back(1, 0h), 9, now, 11);
+  EXPECT_EQ(first(), 0) << "it was not";
+  clock.on_owner(set_back(2, 3h), 12, now);
+  EXPECT_EQ(first(), INT64_MAX) << "which ones is said on the stream's channel";
+  clock.on_owner(set_back(2, 3h), 12, now, 20);
+  EXPECT_EQ(first(), 21) << "those up to there were written before";
+  clock.on_owner(set_back(2, 3h), 30, now);
+  clock.on_owner(set_back(2, 3h), 30, now, 35);
+  EXPECT_EQ(first(), 21) << "still";
+  clock.on_new_ring();
+  EXPECT_EQ(first(), INT64_MAX);
+  clock.on_owner(set_back(2, 3h), kNoTid, now, 0);
+  EXPECT_EQ(first(), 1);
+  assessor.measured_from = Time(3h);
+  EXPECT_EQ(first(), 0) << "it never showed such times before";
+}
+
 TEST_F(MirrorClockTest, ClockErrorsFromBeforeASlewAreSuspect) {
   const auto shows = [](RawTime raw, Duration wall) {
     auto made = std::make_shared<wire::ClockReport>(*report(1us));

@@ -83,6 +83,8 @@ class StreamChannelTest : public testing::Test {
       } else if (item.has_published()) {
         text += "published:" + std::to_string(item.published().last()) + "=" +
                 std::to_string(item.published().last_tid());
+      } else if (item.has_pong()) {
+        text += "clock@" + std::to_string(item.pong().newest_tid());
       } else if (item.has_failure()) {
         text += "failure:" + item.failure().code();
       } else {
@@ -509,6 +511,35 @@ TEST_F(WriterOfAnotherClock, HasTheStreamsTimesAssessedFromThenOn) {
   assessor.own_bound = std::chrono::microseconds(300);
   rig.server.on_clock();
   EXPECT_EQ(stated().added, assessor.own_bound);
+}
+
+// Which samples are of the new setting of a clock follows from it.
+TEST_F(StreamChannelTest, BeforeSamplesOfANewGenerationOfTheClockComeItsReportAndTheNewestTid) {
+  FakeClockAssessor assessor;
+  ServerRig with_clock{{16, 8, 32U << 20}, &assessor};
+  MemoryPeer reader;
+  stream = with_clock.create("odometry", kBytes, 8);
+  with_clock.write(*stream, 3);
+  with_clock.connect(reader, false);
+  wire::Greeting greeting = greeting_of("pc2");
+  greeting.features = {std::string(wire::kFeatureClock)};
+  reader.put(hello_frame(greeting));
+  with_clock.turns();
+  reader.take();
+  with_clock.open(reader, "odometry");
+  const auto came = [&] {
+    with_clock.turns();
+    return words(reader.take());
+  };
+  net::Frame subscribe = with_serial(60);
+  subscribe.mutable_subscribe()->set_from_oldest(true);
+  reader.put(subscribe);
+  EXPECT_EQ(came(), "subscribed:0 clock@2 0 1 2 caught_up");
+  with_clock.write(*stream);
+  EXPECT_EQ(came(), "3");
+  ++assessor.generation;
+  with_clock.write(*stream, 2);
+  EXPECT_EQ(came(), "clock@5 4 5");
 }
 
 TEST_F(WriterOfAnotherClock, IsNoneWhenItsKernelIsThisOne) {
