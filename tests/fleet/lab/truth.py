@@ -231,6 +231,11 @@ class Truth:
         return sum(1 for came in refused if bisect.bisect_left(far, came - NEAR_SECONDS * SECOND_NS)
                    == bisect.bisect_right(far, came))
 
+    def longest_silence(self) -> float:
+        """The longest time [s] in which a guest did not answer: because this machine is busy, for example."""
+        return max(after.came - before.came for watched in self.watched.values() for run in watched.runs.values()
+                   for before, after in itertools.pairwise(run.observations)) / SECOND_NS
+
     def count(self) -> int:
         """How many statements were observed."""
         return sum(1 for watched in self.watched.values() for run in watched.runs.values()
