@@ -221,15 +221,16 @@ class Truth:
         statuses = self.statuses(reader, owner, since)
         return statuses.get("ok", 0) / max(sum(statuses.values()), 1)
 
-    def refused_while_near(self, reader: str, owner: str, since: int) -> int:
-        """How many reads of `owner`'s samples were refused since then, although both clocks had been within
-        NEAR_NS of each other for NEAR_SECONDS."""
+    def refused_while_near(self, reader: str, owner: str, since: int) -> list[str]:
+        """The reads of `owner`'s samples that were refused since then, although both clocks had been within
+        NEAR_NS of each other for NEAR_SECONDS: when, and what was stated about the newest sample."""
         far = [offset.came for offset in self.true_offsets(reader, owner, since - NEAR_SECONDS * SECOND_NS)
                if abs(offset.ns) > NEAR_NS]
-        refused = [observation.came for observation in self.watched[reader].last.observations
+        refused = [observation for observation in self.watched[reader].last.observations
                    if observation.came > since and observation.status_of(owner) == "clock_out_of_bounds"]
-        return sum(1 for came in refused if bisect.bisect_left(far, came - NEAR_SECONDS * SECOND_NS)
-                   == bisect.bisect_right(far, came))
+        return [f"on {reader} at {each.came / SECOND_NS:.2f} s, newest {each.answer['others'][owner]['newest']}"
+                for each in refused if bisect.bisect_left(far, each.came - NEAR_SECONDS * SECOND_NS)
+                == bisect.bisect_right(far, each.came)]
 
     def longest_silence(self) -> float:
         """The longest time [s] in which a guest did not answer: because this machine is busy, for example."""

@@ -75,13 +75,13 @@ def suffer(lab: Lab, truth: Truth, guest: Guest, fault: Fault) -> list[str]:
     if min(shares) < 100:
         offsets = [abs(offset.ns) / 1e3 for offset in truth.true_offsets(one, other, began)]
         print(f"  |   true distance of {one} and {other} meanwhile: {spread_us(offsets)}; statuses of reads:"
-              f" {truth.statuses(one, other, began)}, {truth.statuses(other, one, began)}; {refused} refused while"
-              " they were near each other", flush=True)
+              f" {truth.statuses(one, other, began)}, {truth.statuses(other, one, began)}; {len(refused)} refused while"
+              f" they were near each other {refused[:3]}", flush=True)
     # A step that is within the limit is slewed away while all samples are good: the next fault waits for that.
     truth.await_good(bound_ns=SETTLED_NS)
-    if not spares_others or refused == 0:
+    if not spares_others or not refused:
         return []
-    return [f"{one} and {other} refused each other {refused} times when {guest.name}: {name}"]
+    return [f"{one} and {other} refused each other {len(refused)} times when {guest.name}: {name}"]
 
 
 def spread_us(values: list[float]) -> str:
