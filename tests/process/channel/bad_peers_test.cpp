@@ -41,7 +41,7 @@ class BadPeer : public testing::Test {
   DaemonProcess daemon_{{"--log-level", "error"}};
   RawClient local_{daemon_.socket_path()};
   NetworkPeer good_ = NetworkPeer::greeted(daemon_.address());
-  int descriptors_ = open_descriptors(daemon_.pid());
+  int descriptors_ = idle_descriptors(daemon_.pid());
 };
 
 TEST_F(BadPeer, ThatSendsGarbageGetsAnError) {

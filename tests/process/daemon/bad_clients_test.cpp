@@ -40,7 +40,7 @@ class BadClient : public testing::Test {
 
   DaemonProcess daemon_{{"--log-level", "error"}};
   RawClient good_{daemon_.socket_path()};
-  int descriptors_ = open_descriptors(daemon_.pid());
+  int descriptors_ = idle_descriptors(daemon_.pid());
 };
 
 TEST_F(BadClient, ThatSendsGarbageGetsAnError) {

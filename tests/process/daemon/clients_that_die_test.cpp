@@ -43,7 +43,7 @@ TEST(KilledClient, LeavesNothingInDssmdWheneverItIsKilled) {
     return watcher.ask(list_clients_request()).response.client_list().clients_size() == 1;
   };
   ASSERT_TRUE(eventually(only_the_watcher_is_left));
-  const int descriptors = open_descriptors(daemon.pid());
+  const int descriptors = idle_descriptors(daemon.pid());
 
   const auto seed = std::random_device()();
   SCOPED_TRACE("seed " + std::to_string(seed));
@@ -97,7 +97,7 @@ TEST(OpensAndCloses, TenThousandOfThemLeakNothing) {
   RawClient client(daemon.socket_path());
   ASSERT_TRUE(client.ask(create_request("odometry")).response.has_opened());
   client.ask(list_request());  // its answer comes after those of Create were sent and closed
-  const int descriptors = open_descriptors(daemon.pid());
+  const int descriptors = idle_descriptors(daemon.pid());
   local::Request close;
   for (int i = 0; i < 10'000; ++i) {
     const Answer opened = client.ask(open_request("odometry", i % 2 == 0));

@@ -5,7 +5,10 @@
 #include <poll.h>
 #include <sys/socket.h>
 
+#include <algorithm>
+#include <chrono>
 #include <filesystem>
+#include <thread>
 
 #include "core/wire/local_protocol.hpp"
 
@@ -141,6 +144,15 @@ int open_descriptors(pid_t pid) {
     ++count;
   }
   return count;
+}
+
+int idle_descriptors(pid_t pid) {
+  int least = open_descriptors(pid);
+  for (int i = 0; i < 50; ++i) {
+    std::this_thread::sleep_for(std::chrono::milliseconds(2));
+    least = std::min(least, open_descriptors(pid));
+  }
+  return least;
 }
 
 }  // namespace dssm::test

@@ -68,6 +68,9 @@ std::vector<int> numbers(const std::vector<UniqueFd>& descriptors);
 
 // How many descriptors process `pid` has open.
 int open_descriptors(pid_t pid);
+// The same for a dssmd that has nothing to do: without the socket that it opens for a moment to ask
+// chronyd, in which a busy machine may interrupt it.
+int idle_descriptors(pid_t pid);
 
 // Asks again and again until `done` is true; for what happens soon, but not as an answer. Returns
 // false when it did not happen in kTimeoutSeconds.
