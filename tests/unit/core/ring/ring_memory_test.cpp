@@ -7,7 +7,11 @@
 #include <unistd.h>
 
 #include <cerrno>
+#include <cstdlib>
 #include <dssm/stream.hpp>
+#include <fstream>
+#include <iterator>
+#include <string>
 
 #include "core/base/sealed_memory.hpp"
 #include "tests/unit/core/ring/test_ring.hpp"
@@ -55,6 +59,15 @@ TEST(Layout, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(SlotHeader, run_jump), 48u);
   EXPECT_EQ(offsetof(SlotHeader, run_level), 56u);
   EXPECT_EQ(kLayoutVersion, 5u) << "raise it with every incompatible change, and fix this test";
+}
+
+TEST(Layout, HasItsDocumentedVersion) {
+  const char* root = std::getenv("DSSM_SOURCE_ROOT");  // NOLINT(concurrency-mt-unsafe)
+  ASSERT_TRUE(root) << "run me through `meson test`";
+  std::ifstream file(std::string(root) + "/docs/ring-layout.md");
+  const std::string text{std::istreambuf_iterator<char>(file), {}};
+  EXPECT_NE(text.find("layout_version, " + std::to_string(kLayoutVersion) + " |"),
+            std::string::npos);
 }
 
 TEST(Geometry, RefusesWhatARingCannotBe) {
