@@ -86,7 +86,7 @@ void take_line_untrusted(const proto::ClockLine& message, ClockReport& out) {
               Duration(message.tolerance_ns())};
   out.setting = message.setting();
   out.setting_from = time_from_ns(message.setting_from_ns());
-  out.shown_before = time_from_ns(message.shown_before_ns());
+  out.settled_from = time_from_ns(message.settled_from_ns());
 }
 
 }  // namespace
@@ -141,7 +141,7 @@ void to_message(const ClockReport& report, proto::ClockReport& out) {
     line.set_tolerance_ns(to_ns(report.line.tolerance));
     line.set_setting(report.setting);
     line.set_setting_from_ns(to_ns(report.setting_from));
-    line.set_shown_before_ns(to_ns(report.shown_before));
+    line.set_settled_from_ns(to_ns(report.settled_from));
   }
   out.set_root_dispersion_ns(to_ns(clock.root.dispersion));
   out.set_root_delay_ns(to_ns(clock.root.delay));

@@ -46,9 +46,9 @@ struct ClockReport {
   clock::ClockLine line;     // what the clock shows at each moment, until another line is reported
   std::int64_t setting = 0;  // changes when the clock is set; 0: not known
   Time setting_from{};       // times from here on are of this setting
-  // If not 1970: earlier settings showed times before this one, too. Of those only samples are of
-  // this setting that were written after the setting and setting_from were first reported.
-  Time shown_before{};
+  // If not 1970: the clock was set back. Times from here on are of this setting, too, of samples
+  // that were written after this was first reported.
+  Time settled_from{};
   std::string reference;  // the host or address that it follows, for people
   std::vector<IpAddress>
       addresses;     // its own: others recognize the host that their chronyd follows

@@ -67,7 +67,7 @@ bool is_good(ClockStatus status) noexcept {
 bool is_new_generation(const wire::ClockReport& before, const wire::ClockReport& after) {
   return before.clock.status != after.clock.status || before.has_bound() != after.has_bound() ||
          before.anchor != after.anchor || before.line != after.line ||
-         before.setting != after.setting || before.setting_from != after.setting_from;
+         before.setting != after.setting || before.settled_from != after.settled_from;
 }
 
 }  // namespace
@@ -311,10 +311,11 @@ void FleetClock::update_setting(const clock::Instant& now) {
     pairs_since_ = now.raw;
     set_at_ = now.mono;
     own.setting_from = watch_.setting_from();
-    own.shown_before = {};
+    own.settled_from = {};
     own.line = clock::ClockLine::now(own.line.rate);
-  } else if (now.wall < own.setting_from && now.mono - set_at_ >= kWrittenWithin) {
-    own.shown_before = std::exchange(own.setting_from, now.wall);
+  } else if (own.settled_from == Time() && now.wall < own.setting_from &&
+             now.mono - set_at_ >= kWrittenWithin) {
+    own.settled_from = now.wall;
   }
 }
 
@@ -431,8 +432,9 @@ std::optional<FleetClock::Measured> FleetClock::measured(const wire::ClockReport
   clock::PastBounds& past = measured.past;
   past = clock::past_bounds(pair.stated, measured.now.bound(), WallClock::now(), limit);
   // Their clock may be ahead of this one, which the times of `stated` are of.
-  past.from = std::max(theirs.setting_from, past.from + past.greatest);
-  past.recent_from = std::max(theirs.setting_from, past.recent_from + past.recent);
+  const Time from = theirs.settled_from == Time() ? theirs.setting_from : theirs.settled_from;
+  past.from = std::max(from, past.from + past.greatest);
+  past.recent_from = std::max(from, past.recent_from + past.recent);
   return measured;
 }
 

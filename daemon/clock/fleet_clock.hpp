@@ -58,8 +58,9 @@ class FleetClock final : public ClockAssessor,
   static constexpr Duration kMeasuredReach = std::chrono::seconds(60);
   // PCs of which measurements are kept; a further one replaces that which was silent the longest.
   static constexpr std::size_t kMaxPairs = 256;
-  // A program writes a sample at most so long after the sample's time.
-  static constexpr Duration kWrittenWithin = std::chrono::seconds(3);
+  // A program writes a sample at most so long after the sample's time, or the time counts as that
+  // of another clock (kMaxDelay in client/src/states.hpp).
+  static constexpr Duration kWrittenWithin = std::chrono::seconds(10);
   // Without a heartbeat for so long, the last measurement ages.
   static constexpr Duration kMeasuredFor = std::chrono::seconds(3);
 

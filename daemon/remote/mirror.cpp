@@ -91,11 +91,13 @@ Result<void> Mirror::on_refused(ChannelClient::Request, const Error& why) {
 
 Result<void> Mirror::on_other_frame(net::Frame& frame) {
   if (!frame.has_pong()) return RemoteStream::on_other_frame(frame);
-  std::optional<Tid> newest;
-  if (frame.pong().has_newest_tid()) {
-    newest = std::clamp<Tid>(frame.pong().newest_tid(), kNoTid, channel::kMaxTid);
+  const net::Pong& pong = frame.pong();
+  std::optional<MirrorClock::OnChannel> on_channel;
+  if (pong.has_newest_tid()) {
+    on_channel = {std::clamp<Tid>(pong.newest_tid(), kNoTid, channel::kMaxTid),
+                  pong.has_other_clocks()};
   }
-  on_owner_clock(wire::clock_report_untrusted(frame.pong()), newest);
+  on_owner_clock(wire::clock_report_untrusted(pong), on_channel);
   return {};
 }
 
@@ -117,9 +119,10 @@ void Mirror::on_stream_removed(std::uint64_t incarnation) {
                ring_->stream()->incarnation() == incarnation;
 }
 
-void Mirror::on_owner_clock(MirrorClock::Report report, std::optional<Tid> owners_newest) {
+void Mirror::on_owner_clock(MirrorClock::Report report,
+                            const std::optional<MirrorClock::OnChannel>& on_channel) {
   clock_.on_owner(std::move(report), ring_ ? ring_->newest() : kNoTid, MonoClock::now(),
-                  owners_newest);
+                  on_channel);
   assess_clock();
 }
 

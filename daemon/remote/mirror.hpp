@@ -78,7 +78,8 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   Result<void> follow_untrusted(const StreamInfo& theirs);
   void replace_ring(std::unique_ptr<MirrorRing> ring);
   void notify_replaced();
-  void on_owner_clock(MirrorClock::Report report, std::optional<Tid> owners_newest);
+  void on_owner_clock(MirrorClock::Report report,
+                      const std::optional<MirrorClock::OnChannel>& on_channel);
   void assess_clock();
   void log_new_gap() {
     const std::uint64_t lost = ring_->gap_samples();

@@ -92,14 +92,23 @@ void MirrorRing::drop_aside() noexcept {
 // --- the clock
 
 void MirrorClock::on_owner(Report report, Tid newest, MonoTime now,
-                           std::optional<Tid> owners_newest) noexcept {
+                           const std::optional<OnChannel>& on_channel) {
   has_report_ = true;
-  const Report before = std::exchange(report_, std::move(report));
-  if (!before || !report_ || before->setting != report_->setting ||
-      before->setting_from != report_->setting_from) {
-    setting_first_.reset();
+  if (on_channel) has_other_clocks_ = on_channel->has_other_clocks;
+  if (on_channel && report &&
+      !(settled_ && settled_->setting == report->setting &&
+        settled_->from == report->settled_from)) {
+    settled_ = {report->setting, report->settled_from, on_channel->newest + 1};
   }
-  if (owners_newest && !setting_first_) setting_first_ = *owners_newest + 1;
+  if (report && report_ && report->boot_id == report_->boot_id &&
+      report->line.raw < report_->line.raw) {
+    return;
+  }
+  const Report before = std::exchange(report_, std::move(report));
+  if (report_ && report_->boot_id != boot_id_) {
+    if (!boot_id_.empty()) boot_first_ = newest + 1;
+    boot_id_ = report_->boot_id;
+  }
   if (before && report_ && before->boot_id == report_->boot_id &&
       before->line.left_by(report_->line) > kSlewed) {
     slewed_at_ = now;
@@ -124,30 +133,39 @@ void MirrorClock::on_time(Tid newest, MonoTime now) noexcept {
 void MirrorClock::on_new_ring() noexcept {
   suspect_first_ = 0;
   if (!is_suspect_now()) suspect_last_ = kNoTid;
-  setting_first_.reset();
+  settled_.reset();
+  boot_first_ = 0;
 }
 
-ring::ClockAssessment MirrorClock::assessment() const {
+ring::ClockAssessment MirrorClock::assessment() const { return assess(has_other_clocks_ == false); }
+
+// by_measurement: the distance of the owner's clock says something about the stream's samples.
+ring::ClockAssessment MirrorClock::assess(bool by_measurement) const {
   if (!assessor_) return {};
   ring::ClockAssessment assessment = assessor_->assess_mirror(id_, report_.get());
   assessment.suspect_first = suspect_first_;
   assessment.suspect_last = suspect_last_;
+  if (!by_measurement) assessment.measured = assessment.recent = kUnknownClockError;
+  assessment.measured_first_tid = boot_first_;
   const Time from = std::min(assessment.measured_from, assessment.recent_from);
-  if (report_ && from < report_->shown_before) {
-    assessment.measured_first_tid = setting_first_.value_or(INT64_MAX);
+  if (report_ && report_->settled_from != Time() && from < report_->setting_from) {
+    const bool is_known = settled_ && settled_->setting == report_->setting &&
+                          settled_->from == report_->settled_from;
+    assessment.measured_first_tid =
+        std::max(boot_first_, is_known ? settled_->first_tid : INT64_MAX);
   }
   return assessment;
 }
 
 Result<void> MirrorClock::check_opening() const {
   if (!has_report_) return {};
-  const ring::ClockAssessment now = assessment();
+  const ring::ClockAssessment now = assess(has_other_clocks_ != true);
   if (now.policy != ClockPolicy::enforce || now.can_be_good()) return {};
   return assessor_->refusal(id_, report_.get());
 }
 
 std::string MirrorClock::reason() const {
-  const ring::ClockAssessment now = assessment();
+  const ring::ClockAssessment now = assess(has_other_clocks_ != true);
   if (now.policy == ClockPolicy::off || now.can_be_good()) return {};
   return assessor_->refusal(id_, report_.get()).message;
 }

@@ -105,10 +105,17 @@ class MirrorClock {
   // The owner asks chronyd once a second, and samples need some time.
   static constexpr Duration kStaleFor = std::chrono::seconds(3);
 
-  // The owner's latest report (nullptr: none), received at `now`, when `newest` was the newest
-  // sample here; and in the owner's ring, if the report says so.
+  // What the owner says on the stream's channel, with a report.
+  struct OnChannel {
+    Tid newest = kNoTid;  // in the owner's ring
+    bool has_other_clocks = false;
+  };
+
+  // The owner's report (nullptr: none), received at `now`, when `newest` was the newest sample
+  // here.
+  // Reports come on two connections: one that was overtaken by a later one has no effect.
   void on_owner(Report report, Tid newest, MonoTime now,
-                std::optional<Tid> owners_newest = std::nullopt) noexcept;
+                const std::optional<OnChannel>& on_channel = std::nullopt);
   // Ends what was suspect for a time; about once a second.
   void on_time(Tid newest, MonoTime now) noexcept;
   // The mirror continues with another ring, whose samples all arrive from now on.
@@ -126,6 +133,14 @@ class MirrorClock {
   std::string reason() const;
 
  private:
+  // Of a clock that was set back: which samples are of that setting.
+  struct Settled {
+    std::int64_t setting = 0;
+    Time from;
+    Tid first_tid = 0;
+  };
+
+  ring::ClockAssessment assess(bool by_measurement) const;
   bool is_suspect_now() const noexcept { return suspect_last_ == INT64_MAX; }
   bool is_stale(MonoTime now) const noexcept { return slewed_at_ && now - *slewed_at_ < kStaleFor; }
 
@@ -135,8 +150,10 @@ class MirrorClock {
   bool has_report_ = false;
   std::optional<MonoTime> slewed_at_;
   Tid suspect_first_ = 0, suspect_last_ = kNoTid;
-  // Samples from here on are of the setting that the owner reports; nothing: not known yet.
-  std::optional<Tid> setting_first_;
+  std::optional<Settled> settled_;
+  std::optional<bool> has_other_clocks_;  // nothing: not known yet
+  std::string boot_id_;                   // of the owner
+  Tid boot_first_ = 0;                    // earlier samples were stamped in another boot
 };
 
 }  // namespace dssm::daemon

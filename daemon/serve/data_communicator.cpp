@@ -180,6 +180,7 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
 }
 
 void DataCommunicator::send_clock() {
+  if (channel_ && link_.is_open()) channel_->on_new_clock();
   if (!is_control_ || !link_.is_open() || !them_->has_feature(wire::kFeatureClock)) return;
   net::Frame frame;
   wire::send_clock(parts_.self, *frame.mutable_pong()->mutable_clock());

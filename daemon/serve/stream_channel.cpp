@@ -105,6 +105,8 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
   parts_.link.send(frame);
   pump_.emplace(stream().mapping(), parts_.link, sender_, static_cast<SamplePump::Observer&>(*this),
                 SamplePump::Plan{first, newest, request.max_rate_hz()});
+  clock_generation_.reset();
+  before_samples();
   parts_.observer.work_soon();
   return {};
 }
@@ -171,13 +173,25 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
 [[gnu::hot]] void StreamChannel::before_samples() {
   if (!sends_clock_) return;
   const std::uint64_t generation = parts_.clock->clock_generation();
-  if (clock_generation_ == generation) return;
+  const bool has_other_clocks = stream().mapping().header().clock.is_set();
+  if (clock_generation_ == generation && has_other_clocks == sent_other_clocks_) return;
   clock_generation_ = generation;
+  sent_other_clocks_ = has_other_clocks;
+  sent_settled_from_ = parts_.self.clock ? parts_.self.clock->settled_from : Time();
   sender_.end_run();
   net::Frame frame;
-  frame.mutable_pong()->set_newest_tid(reader_.newest());
+  frame.mutable_pong()->set_newest_tid(newest_untrusted(reader_));
+  frame.mutable_pong()->set_has_other_clocks(has_other_clocks);
   wire::send_clock(parts_.self, *frame.mutable_pong()->mutable_clock());
   parts_.link.send(frame);
+}
+
+// What is written from now on is of the present setting: so the client has to hear of it now, and
+// not with the next sample, which would be the first one after that.
+void StreamChannel::on_new_clock() {
+  if (!sends_clock_ || !pump_ || !parts_.self.clock || sender_.busy()) return;
+  if (parts_.self.clock->settled_from == sent_settled_from_) return;
+  if (parts_.link.output_empty()) before_samples();
 }
 
 void StreamChannel::on_gap(Tid first, std::uint64_t count) {

@@ -66,6 +66,9 @@ class StreamChannel final : private SamplePump::Observer,
   //   request_waits  no sample of the subscription is begun, so that busy() ends
   Result<void> work(bool request_waits);
 
+  // The clock has a new generation.
+  void on_new_clock();
+
   // The stream lost its name: what it holds is still sent, then the client is notified.
   void on_removed();
 
@@ -115,8 +118,10 @@ class StreamChannel final : private SamplePump::Observer,
   std::unique_ptr<SampleReceiver> receiver_;
   std::optional<Reading> reading_;
   std::uint64_t lost_ = 0;
-  std::optional<std::uint64_t> clock_generation_;  // last sent
-  EventSource due_;                                // for subscriptions with a highest rate
+  std::optional<std::uint64_t> clock_generation_;  // last sent, and with it:
+  bool sent_other_clocks_ = false;
+  Time sent_settled_from_{};
+  EventSource due_;  // for subscriptions with a highest rate
 };
 
 }  // namespace dssm::daemon

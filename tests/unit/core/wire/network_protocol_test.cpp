@@ -29,7 +29,7 @@ Greeting mapper() {
                  std::chrono::microseconds(12)};
   clock->setting = 3;
   clock->setting_from = Time(std::chrono::hours(8));
-  clock->shown_before = Time(std::chrono::hours(10));
+  clock->settled_from = Time(std::chrono::hours(7));
   greeting.clock = clock;
   return greeting;
 }
@@ -62,7 +62,7 @@ TEST(Greeting, CrossesTheWire) {
   EXPECT_EQ(back->clock->line, mapper().clock->line);
   EXPECT_EQ(back->clock->setting, mapper().clock->setting);
   EXPECT_EQ(back->clock->setting_from, mapper().clock->setting_from);
-  EXPECT_EQ(back->clock->shown_before, mapper().clock->shown_before);
+  EXPECT_EQ(back->clock->settled_from, mapper().clock->settled_from);
   EXPECT_TRUE(back->has_feature(kFeatureTorn));
   EXPECT_FALSE(back->has_feature("tor"));
   EXPECT_EQ(back->str(), "'mapper' on host 'pc3'");

@@ -396,16 +396,26 @@ TEST_F(MeasuredTest, OfAClockThatWasSetBackNewSamplesAreToldFromEarlierOnesByThe
   const std::int64_t earlier_setting = own->setting;
   set_by = 0h;
   wait([&] { return own->setting != earlier_setting; });
-  const Time shown_before = own->setting_from;
-  EXPECT_GT(shown_before, WallClock::now() + 59min);
-  EXPECT_EQ(own->shown_before, Time()) << "programs may still write samples of the earlier setting";
+  const Time setting_from = own->setting_from;
+  EXPECT_GT(setting_from, WallClock::now() + 59min);
+  EXPECT_EQ(own->settled_from, Time()) << "programs may still write samples of the earlier setting";
   const int before = generations;
   passed = FleetClock::kWrittenWithin;
-  wait([&] { return own->setting_from != shown_before; });
-  EXPECT_EQ(own->shown_before, shown_before);
-  EXPECT_GE(own->setting_from, WallClock::now());
-  EXPECT_LT(own->setting_from, WallClock::now() + 1min);
+  wait([&] { return own->settled_from != Time(); });
+  EXPECT_EQ(own->setting_from, setting_from);
+  EXPECT_GE(own->settled_from, WallClock::now());
+  EXPECT_LT(own->settled_from, WallClock::now() + 1min);
   EXPECT_EQ(generations, before + 1) << "others have to know before they get another sample";
+}
+
+TEST_F(MeasuredTest, TimesAreMeasuredFromWhenAClockThatWasSetBackHadSettled) {
+  start();
+  heartbeat(0us);
+  auto later = std::make_shared<wire::ClockReport>(*pc3);
+  later->setting_from = WallClock::now() + 1h;
+  later->settled_from = WallClock::now() + 1min;
+  EXPECT_EQ(fleet->assess_mirror(lidar, later.get()).measured_from, later->settled_from);
+  EXPECT_EQ(fleet->assess_mirror(lidar, later.get()).recent_from, later->settled_from);
 }
 
 TEST_F(MeasuredTest, StatementsThatExcludeEachOtherAreRefused) {

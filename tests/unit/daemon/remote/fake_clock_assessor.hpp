@@ -16,6 +16,7 @@ class FakeClockAssessor final : public ClockAssessor {
     if (same_clock) return {};
     ring::ClockAssessment assessment = ring::ClockAssessment::unknown_clock(policy);
     assessment.limit = std::chrono::milliseconds(1);
+    assessment.measured = assessment.recent = measured;
     assessment.measured_from = assessment.recent_from = measured_from;
     if (owner) assessment.added = owner->clock.bound;
     return assessment;
@@ -37,6 +38,7 @@ class FakeClockAssessor final : public ClockAssessor {
   ClockPolicy policy = ClockPolicy::enforce;
   bool same_clock = false;
   Duration own_bound{};
+  Duration measured = kUnknownClockError;
   Time measured_from{};
 };
 

@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// Which samples of a mirror count, and by what, as reports of its owner come on both connections.
 #include <gtest/gtest.h>
 
 #include "daemon/remote/mirror_ring.hpp"
@@ -98,30 +100,83 @@ TEST_F(MirrorClockTest, WhatWasStampedAgainstAnotherReferenceIsSuspect) {
 }
 
 TEST_F(MirrorClockTest, WhatIsMeasuredOfAClockThatWasSetBackIsOfSamplesThatCameAfterIt) {
-  const auto set_back = [](std::int64_t setting, Duration shown_before) {
+  const auto reported = [](std::int64_t setting, Duration settled_from, std::int64_t line_ns = 1) {
     auto made = std::make_shared<wire::ClockReport>(*report(1us));
     made->setting = setting;
-    made->setting_from = Time(1h);
-    made->shown_before = Time(shown_before);
+    made->setting_from = Time(3h);
+    made->settled_from = Time(settled_from);
+    made->line.raw = RawTime(Duration(line_ns));
     return made;
   };
   const auto first = [this] { return clock.assessment().measured_first_tid; };
   assessor.measured_from = Time(2h);
-  clock.on_owner(set_back(1, 0h), 9, now, 11);
-  EXPECT_EQ(first(), 0) << "it was not";
-  clock.on_owner(set_back(2, 3h), 12, now);
+  clock.on_owner(reported(1, 0h), 9, now, {{11}});
+  EXPECT_EQ(first(), 0) << "it was not set back, or not for long";
+  clock.on_owner(reported(1, 1h), 12, now);
   EXPECT_EQ(first(), INT64_MAX) << "which ones is said on the stream's channel";
-  clock.on_owner(set_back(2, 3h), 12, now, 20);
+  clock.on_owner(reported(1, 1h), 12, now, {{20}});
   EXPECT_EQ(first(), 21) << "those up to there were written before";
-  clock.on_owner(set_back(2, 3h), 30, now);
-  clock.on_owner(set_back(2, 3h), 30, now, 35);
+  clock.on_owner(reported(1, 1h), 30, now);
+  clock.on_owner(reported(1, 1h), 30, now, {{35}});
   EXPECT_EQ(first(), 21) << "still";
+  clock.on_owner(reported(1, 0h), 30, now);  // it was overtaken by the others
+  clock.on_owner(reported(1, 1h), 30, now);
+  EXPECT_EQ(first(), 21);
+  clock.on_owner(nullptr, 30, now);
+  clock.on_owner(reported(1, 1h), 30, now);
+  EXPECT_EQ(first(), 21);
   clock.on_new_ring();
   EXPECT_EQ(first(), INT64_MAX);
-  clock.on_owner(set_back(2, 3h), kNoTid, now, 0);
+  clock.on_owner(reported(1, 1h), kNoTid, now, {{0}});
   EXPECT_EQ(first(), 1);
   assessor.measured_from = Time(3h);
   EXPECT_EQ(first(), 0) << "it never showed such times before";
+}
+
+TEST_F(MirrorClockTest, AReportThatWasOvertakenHasNoEffect) {
+  const auto of_line = [](std::int64_t line_ns, Duration bound) {
+    auto made = std::make_shared<wire::ClockReport>(*report(bound));
+    made->line.raw = RawTime(Duration(line_ns));
+    return made;
+  };
+  clock.on_owner(of_line(7, 2us), 9, now);
+  clock.on_owner(of_line(6, 1us), 9, now);
+  EXPECT_EQ(clock.assessment().added, 2us);
+  clock.on_owner(of_line(8, 3us), 9, now);
+  EXPECT_EQ(clock.assessment().added, 3us);
+}
+
+TEST_F(MirrorClockTest, SamplesOfAnEarlierBootOfTheirOwnerAreNotMeasured) {
+  const auto of_boot = [](const char* boot_id) {
+    auto made = std::make_shared<wire::ClockReport>(*report(1us));
+    made->boot_id = boot_id;
+    return made;
+  };
+  const auto first = [this] { return clock.assessment().measured_first_tid; };
+  clock.on_owner(of_boot("one"), 9, now);
+  EXPECT_EQ(first(), 0);
+  clock.on_owner(nullptr, 12, now);
+  clock.on_owner(of_boot("two"), 12, now);
+  EXPECT_EQ(first(), 13);
+  clock.on_owner(of_boot("two"), 20, now);
+  EXPECT_EQ(first(), 13);
+  clock.on_new_ring();
+  EXPECT_EQ(first(), 0);
+}
+
+// By their own clocks, which the owner's says nothing about.
+TEST_F(MirrorClockTest, SamplesThatOtherHostsWriteAreNotMeasured) {
+  assessor.measured = 1us;
+  clock.on_owner(report(2ms), 9, now);
+  EXPECT_EQ(clock.assessment().measured, kUnknownClockError) << "not before the owner says so";
+  EXPECT_TRUE(clock.check_opening());
+  clock.on_owner(report(2ms), 9, now, {{9, false}});
+  EXPECT_EQ(clock.assessment().measured, 1us);
+  EXPECT_EQ(clock.assessment().recent, 1us);
+  clock.on_owner(report(2ms), 9, now, {{9, true}});
+  EXPECT_EQ(clock.assessment().measured, kUnknownClockError);
+  EXPECT_EQ(clock.assessment().recent, kUnknownClockError);
+  EXPECT_FALSE(clock.check_opening());
 }
 
 TEST_F(MirrorClockTest, ClockErrorsFromBeforeASlewAreSuspect) {

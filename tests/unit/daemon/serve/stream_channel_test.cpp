@@ -84,7 +84,8 @@ class StreamChannelTest : public testing::Test {
         text += "published:" + std::to_string(item.published().last()) + "=" +
                 std::to_string(item.published().last_tid());
       } else if (item.has_pong()) {
-        text += "clock@" + std::to_string(item.pong().newest_tid());
+        text += item.pong().has_other_clocks() ? "mixed" : "clock";
+        text += "@" + std::to_string(item.pong().newest_tid());
       } else if (item.has_failure()) {
         text += "failure:" + item.failure().code();
       } else {
@@ -540,6 +541,17 @@ TEST_F(StreamChannelTest, BeforeSamplesOfANewGenerationOfTheClockComeItsReportAn
   ++assessor.generation;
   with_clock.write(*stream, 2);
   EXPECT_EQ(came(), "clock@5 4 5");
+  ++assessor.generation;
+  with_clock.server.send_clock();
+  EXPECT_EQ(came(), "") << "it can wait for the next sample";
+  with_clock.own_clock->settled_from = time_from_ns(7);
+  with_clock.server.send_clock();
+  EXPECT_EQ(came(), "clock@5") << "the next sample is of this setting";
+  with_clock.write(*stream);
+  EXPECT_EQ(came(), "6");
+  stream->mapping().header().clock.store(ring::ClockAssessment());  // another host writes to it
+  with_clock.write(*stream);
+  EXPECT_EQ(came(), "mixed@7 7");
 }
 
 TEST_F(WriterOfAnotherClock, IsNoneWhenItsKernelIsThisOne) {
