@@ -549,7 +549,8 @@ TEST_F(StreamChannelTest, BeforeSamplesOfANewGenerationOfTheClockComeItsReportAn
   EXPECT_EQ(came(), "clock@5") << "the next sample is of this setting";
   with_clock.write(*stream);
   EXPECT_EQ(came(), "6");
-  stream->mapping().header().clock.store(ring::ClockAssessment());  // another host writes to it
+  const auto mapping = stream->map_for_writing().value();
+  mapping->header().clock.store(ring::ClockAssessment());  // as when another host writes to it
   with_clock.write(*stream);
   EXPECT_EQ(came(), "mixed@7 7");
 }
