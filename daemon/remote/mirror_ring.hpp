@@ -112,8 +112,7 @@ class MirrorClock {
   };
 
   // The owner's report (nullptr: none), received at `now`, when `newest` was the newest sample
-  // here.
-  // Reports come on two connections: one that was overtaken by a later one has no effect.
+  // here. Reports come on two connections: one that was overtaken by a later one has no effect.
   void on_owner(Report report, Tid newest, MonoTime now,
                 const std::optional<OnChannel>& on_channel = std::nullopt);
   // Ends what was suspect for a time; about once a second.
