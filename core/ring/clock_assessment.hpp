@@ -33,8 +33,9 @@ namespace dssm::ring {
 //    68    4 reserved       -     zero
 //    72    8 recent         ns    the same for later samples; grows as `measured`
 //    80    8 recent_from    ns    of samples with this time or a later one: the last seconds
-//    88    8 measured_first_tid   both are of this sample and later ones: earlier ones may have
-//                                 been stamped before the clock was set back
+//    88    8 measured_first_tid   `measured` and `recent` are of this sample and later ones;
+//                                 earlier ones may have been stamped before the writer's clock
+//                                 was set back, or before its PC booted
 struct ClockAssessment {
   ClockPolicy policy = ClockPolicy::off;
   std::uint8_t same_clock = 1;

@@ -46,8 +46,8 @@ struct ClockReport {
   clock::ClockLine line;     // what the clock shows at each moment, until another line is reported
   std::int64_t setting = 0;  // changes when the clock is set; 0: not known
   Time setting_from{};       // times from here on are of this setting
-  // If not 1970: the clock was set back. Times from here on are of this setting, too, of samples
-  // that were written after this was first reported.
+  // If not 1970: the clock was set back, and it shows times before setting_from again. Samples that
+  // were written after this was first reported are of this setting if their times are from here on.
   Time settled_from{};
   std::string reference;  // the host or address that it follows, for people
   std::vector<IpAddress>

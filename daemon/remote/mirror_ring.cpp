@@ -95,9 +95,7 @@ void MirrorClock::on_owner(Report report, Tid newest, MonoTime now,
                            const std::optional<OnChannel>& on_channel) {
   has_report_ = true;
   if (on_channel) has_other_clocks_ = on_channel->has_other_clocks;
-  if (on_channel && report &&
-      !(settled_ && settled_->setting == report->setting &&
-        settled_->from == report->settled_from)) {
+  if (on_channel && report && !(settled_ && settled_->is_of(*report))) {
     settled_ = {report->setting, report->settled_from, on_channel->newest + 1};
   }
   if (report && report_ && report->boot_id == report_->boot_id &&
@@ -149,8 +147,7 @@ ring::ClockAssessment MirrorClock::assess(bool by_measurement) const {
   assessment.measured_first_tid = boot_first_;
   const Time from = std::min(assessment.measured_from, assessment.recent_from);
   if (report_ && report_->settled_from != Time() && from < report_->setting_from) {
-    const bool is_known = settled_ && settled_->setting == report_->setting &&
-                          settled_->from == report_->settled_from;
+    const bool is_known = settled_ && settled_->is_of(*report_);
     assessment.measured_first_tid =
         std::max(boot_first_, is_known ? settled_->first_tid : INT64_MAX);
   }

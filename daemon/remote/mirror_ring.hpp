@@ -137,6 +137,10 @@ class MirrorClock {
     std::int64_t setting = 0;
     Time from;
     Tid first_tid = 0;
+
+    bool is_of(const wire::ClockReport& report) const noexcept {
+      return setting == report.setting && from == report.settled_from;
+    }
   };
 
   ring::ClockAssessment assess(bool by_measurement) const;

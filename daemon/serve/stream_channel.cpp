@@ -105,6 +105,7 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
   parts_.link.send(frame);
   pump_.emplace(stream().mapping(), parts_.link, sender_, static_cast<SamplePump::Observer&>(*this),
                 SamplePump::Plan{first, newest, request.max_rate_hz()});
+  // Also without samples: the client needs it for those that it has from an earlier connection.
   clock_generation_.reset();
   before_samples();
   parts_.observer.work_soon();

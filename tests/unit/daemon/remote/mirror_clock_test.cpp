@@ -100,12 +100,11 @@ TEST_F(MirrorClockTest, WhatWasStampedAgainstAnotherReferenceIsSuspect) {
 }
 
 TEST_F(MirrorClockTest, WhatIsMeasuredOfAClockThatWasSetBackIsOfSamplesThatCameAfterIt) {
-  const auto reported = [](std::int64_t setting, Duration settled_from, std::int64_t line_ns = 1) {
+  const auto reported = [](std::int64_t setting, Duration settled_from) {
     auto made = std::make_shared<wire::ClockReport>(*report(1us));
     made->setting = setting;
     made->setting_from = Time(3h);
     made->settled_from = Time(settled_from);
-    made->line.raw = RawTime(Duration(line_ns));
     return made;
   };
   const auto first = [this] { return clock.assessment().measured_first_tid; };

@@ -553,6 +553,9 @@ TEST_F(StreamChannelTest, BeforeSamplesOfANewGenerationOfTheClockComeItsReportAn
   mapping->header().clock.store(ring::ClockAssessment());  // as when another host writes to it
   with_clock.write(*stream);
   EXPECT_EQ(came(), "mixed@7 7");
+  subscribe.mutable_subscribe()->set_from_now(true);
+  reader.put(subscribe);
+  EXPECT_EQ(came(), "subscribed:8 mixed@7 caught_up") << "the client may have earlier samples";
 }
 
 TEST_F(WriterOfAnotherClock, IsNoneWhenItsKernelIsThisOne) {
