@@ -84,6 +84,10 @@ std::string_view name_of(ReadStatus status) noexcept {
       return "not_yet";
     case ReadStatus::too_old:
       return "too_old";
+    case ReadStatus::arriving:
+      return "arriving";
+    case ReadStatus::lost:
+      return "lost";
     case ReadStatus::lapped:
       return "lapped";
     case ReadStatus::restarted:

@@ -22,7 +22,7 @@
 namespace dssm::ring {
 
 inline constexpr std::uint64_t kMagic = 0x474e49524d535344;  // "DSSMRING"
-inline constexpr std::uint32_t kLayoutVersion = 5;
+inline constexpr std::uint32_t kLayoutVersion = 6;
 inline constexpr std::size_t kPageBytes = 4096;
 inline constexpr std::size_t kLineBytes = 64;
 
@@ -74,7 +74,9 @@ static_assert(sizeof(PublisherCursor) == 40);
 //   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
 //   520     8 run_start        tid    writer      before top; see "Search by time"
 //   528     8 first            tid    dssmd       before top; see "Window"
-//   536   104 reserved         -      -           zero
+//   536     8 hole_begin       tid    dssmd       see "Hole"; above 0 only in mirrors
+//   544     8 hole_end         tid    dssmd       before top; likewise
+//   552    88 reserved         -      -           zero
 //   640  2560 publishers       -      dssmd       before top: see publisher_cursors.hpp
 //  3200   200 clock            -      dssmd       see clock_assessment.hpp, shared_snapshot.hpp
 //  3400   696 reserved         -      -           zero
@@ -103,7 +105,9 @@ struct RingHeader {
   std::atomic<std::int64_t> top;
   std::atomic<std::int64_t> run_start;
   std::atomic<std::int64_t> first;
-  std::byte reserved3[104];
+  std::atomic<std::int64_t> hole_begin;
+  std::atomic<std::int64_t> hole_end;
+  std::byte reserved3[88];
   PublisherCursor publishers[kMaxPublishers];
   SharedSnapshot<ClockAssessment> clock;
   std::byte reserved4[696];
@@ -112,12 +116,14 @@ static_assert(sizeof(pthread_mutex_t) <= 64);
 static_assert(offsetof(RingHeader, incarnation) == 64 && offsetof(RingHeader, name) == 88);
 static_assert(offsetof(RingHeader, host) == 128 && offsetof(RingHeader, lock) == 320);
 static_assert(offsetof(RingHeader, top) == 512 && offsetof(RingHeader, run_start) == 520);
-static_assert(offsetof(RingHeader, first) == 528);
+static_assert(offsetof(RingHeader, first) == 528 && offsetof(RingHeader, hole_begin) == 536);
+static_assert(offsetof(RingHeader, hole_end) == 544);
 static_assert(offsetof(RingHeader, publishers) == 640 && offsetof(RingHeader, clock) == 3200);
 static_assert(sizeof(RingHeader) == kPageBytes);
 
 //   off size field           unit  written by  order
-//     0    8 sequence        -     writer      2*tid+1 while being filled, 2*tid+2 when published
+//     0    8 sequence        -     writer      2*tid+1 while being filled, 2*tid+2 when published;
+//                                            of a lost sample (mirrors) 2^63 + 2*tid+2
 //     8    8 tid             -     writer      inside the sequence bracket, as all below
 //    16    8 time_ns         ns    writer      signed, since 1970, CLOCK_REALTIME of the writer
 //    24    8 clock_error_ns  ns    writer      >= 0; 2^63-1: unknown; 2^63-2: of another clock

@@ -88,6 +88,29 @@ constexpr std::uint64_t published_sequence(Tid tid) noexcept {
   return 2 * static_cast<std::uint64_t>(tid) + 2;
 }
 
+// That of sample `tid` of a mirror that will never come, although older ones are here. Its entry in
+// the time index has the time of the sample after it, so that no search finds it.
+constexpr std::uint64_t lost_sequence(Tid tid) noexcept {
+  return published_sequence(tid) | std::uint64_t{1} << 63;
+}
+
+// Samples [begin, end).
+struct TidRange {
+  Tid begin = 0, end = 0;
+
+  bool is_empty() const noexcept { return begin >= end; }
+  Tid count() const noexcept { return end - begin; }
+  bool holds(Tid tid) const noexcept { return tid >= begin && tid < end; }
+};
+
+// Of these samples of a mirror all or some are still to come; those after them are here, or lost.
+// Searches by time begin there. In other rings it is empty.
+// In this order: while a hole is opened, the one that is seen may be greater, and not smaller.
+inline TidRange hole_of(const RingHeader& header) noexcept {
+  const Tid end = header.hole_end.load(std::memory_order_acquire);
+  return {header.hole_begin.load(std::memory_order_acquire), end};
+}
+
 // From a tid to its slot and its entry in the time index. The arithmetic uses the geometry that was
 // checked when the ring was mapped, never the numbers in the mapping. A value; the mapping outlives
 // it.

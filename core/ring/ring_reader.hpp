@@ -24,9 +24,15 @@ class RingReader {
 
   Tid newest() const noexcept { return header_->top.load(std::memory_order_acquire); }
   Tid oldest() const noexcept { return slots_.oldest_for(newest()); }
+  // What is still to come to a mirror, before its newest samples.
+  TidRange hole() const noexcept { return hole_of(*header_); }
+  // Whether a read of sample `tid` has a result for good: it is here, or will never be.
+  bool is_settled(Tid tid) const noexcept;
+  // The first sample from `tid` on that is not known to be lost; a tid after the newest: itself.
+  Tid skip_lost(Tid tid) const noexcept;
 
   // Copies sample `tid` into `payload` (payload_bytes long; unspecified unless ok).
-  //   returns  ok | not_yet | too_old
+  //   returns  ok | not_yet | arriving | lost | too_old
   ReadStatus read(Tid tid, std::span<std::byte> payload, SampleInfo& info) const noexcept;
 
   // Copies the newest sample. Retries up to kMaxRetries times when the writer laps it.
@@ -34,7 +40,7 @@ class RingReader {
   ReadStatus read_newest(std::span<std::byte> payload, SampleInfo& info) const noexcept;
 
   // The stamps of sample `tid`.
-  //   returns  ok | not_yet | too_old
+  //   returns  ok | not_yet | arriving | lost | too_old
   ReadStatus stamp(Tid tid, SampleInfo& info) const noexcept;
 
   // What this PC's dssmd states about the times in this ring. One load where it states nothing:
@@ -58,7 +64,7 @@ class RingReader {
   }
 
   // Tid of the newest sample with time <= `t`; kNoTid with too_old when all lie after it.
-  //   returns  ok | not_yet (empty) | too_old | lapped
+  //   returns  ok | not_yet (empty) | arriving (it may be in the hole or before) | too_old | lapped
   ReadStatus find(Time t, Tid& tid) const noexcept;
 
   // The payload of sample `tid` in place. It was that sample's if `sequence` still holds `expected`
@@ -78,6 +84,8 @@ class RingReader {
   static constexpr int kMaxRetries = 1000;  // a reader that is lapped more often cannot keep up
 
  private:
+  ReadStatus status_of_absent(Tid tid) const noexcept;
+
   const RingHeader* header_;
   SlotTable slots_;
 };

@@ -12,6 +12,8 @@
 
 namespace dssm::ring {
 
+struct RunLinks;
+
 // A value; the mapping (read-write) outlives it. Only the ring's current writer may call it: the
 // holder of the lock, or the thread that fills a copy of another host's ring.
 class SlotWriter {
@@ -28,8 +30,28 @@ class SlotWriter {
   void fill(Tid tid, std::span<const std::byte> payload) const noexcept;
 
   // The payload is in place: makes it sample `tid`. A tid that does not follow the newest one (in
-  // such copies only) leaves a gap, and samples before the gap are no longer readable.
+  // such copies only) leaves a gap, and samples before the gap are no longer readable; unless
+  // lose_before_next() or skip_to() came before.
   void publish(Tid tid, Time time, Duration clock_error) const noexcept;
+
+  // In mirrors: samples that are lost, or come later than newer ones. docs/ring-layout.md "Hole".
+
+  // Sample `tid` is the next one to be published: those that then leave the window leave it now, so
+  // that their slots can be written. Needed before begin() if it does not follow on the newest one.
+  void make_room(Tid tid) const noexcept;
+  // Sample `tid`, of that time, is the next one to be published; those between the newest one and
+  // it will never come.
+  void lose_before_next(Tid tid, Time time) const noexcept;
+  // Sample `tid` is the next one to be published; samples [from, tid) belong to the hole, until
+  // they come or are lost.
+  //   from  newest() + 1; in an empty ring any: none before it is readable
+  void skip_to(Tid tid, Tid from) const noexcept;
+  // The payload is in place: makes it sample `tid`, which is in the hole.
+  void publish_in_hole(Tid tid, Time time, Duration clock_error) const noexcept;
+  // Those of samples [first, end) that are in the hole and not here will never come.
+  void lose_in_hole(Tid first, Tid end) const noexcept;
+  // The hole ends where its last samples begin that are here or lost.
+  void shrink_hole() const noexcept;
 
   // Repairs what a writer left that died before it published its sample.
   void recover() const noexcept;
@@ -39,6 +61,16 @@ class SlotWriter {
   void prefetch_next(Tid tid) const noexcept;
 
  private:
+  void store(SlotHeader& slot, Tid tid, std::int64_t time_ns, Duration clock_error,
+             Tid run_start) const noexcept;
+  void begin_run(Tid tid, const RunLinks& links) const noexcept;
+  Tid link(Tid tid, Tid previous_run) const noexcept;
+  void join(Tid begin, Tid end, bool is_continued) const noexcept;
+  void continue_run(Tid begin, Tid end, Tid run) const noexcept;
+  bool continues_after_lost(Tid tid) const noexcept;
+  bool is_here(Tid tid) const noexcept;
+  bool is_lost(Tid tid) const noexcept;
+
   RingHeader* header_;
   SlotTable slots_;
   bool large_;  // payload so large that memcpy may use non-temporal stores

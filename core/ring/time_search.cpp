@@ -89,9 +89,10 @@ Tid search_run(Probe& probe, Tid low, Tid high, std::int64_t low_ns, std::int64_
 bool load_field(const SlotTable& slots, Tid tid, std::atomic<std::int64_t> SlotHeader::*field,
                 std::int64_t& value) noexcept {
   SlotHeader& slot = slots.slot(tid);
-  if (slot.sequence.load(std::memory_order_acquire) != published_sequence(tid)) return false;
+  const std::uint64_t sequence = slot.sequence.load(std::memory_order_acquire);
+  if (sequence != published_sequence(tid) && sequence != lost_sequence(tid)) return false;
   value = (slot.*field).load(std::memory_order_acquire);
-  return slot.sequence.load(std::memory_order_relaxed) == published_sequence(tid);
+  return slot.sequence.load(std::memory_order_relaxed) == sequence;
 }
 
 }  // namespace
@@ -149,14 +150,12 @@ FoundSample find_newest_at_or_before(const SlotTable& slots, Tid oldest, Tid top
   return found;
 }
 
-RunLinks links_for_new_run(const SlotTable& slots, Tid start, Tid previous_run_start,
+RunLinks links_for_new_run(const SlotTable& slots, Tid oldest, Tid start, Tid previous_run_start,
                            std::int64_t time_ns) noexcept {
   RunLinks links;
   if (time_ns == INT64_MIN) return links;  // nothing is earlier
-  const Tid top = start - 1;
-  const Tid oldest = slots.oldest_for(top);
   const FoundSample parent =
-      find_newest_at_or_before(slots, oldest, top, previous_run_start, time_ns - 1);
+      find_newest_at_or_before(slots, oldest, start - 1, previous_run_start, time_ns - 1);
   if (parent.status != ReadStatus::ok) return links;
   links.parent = parent.tid;
   links.level = 1;

@@ -45,8 +45,8 @@ struct RunLinks {
 };
 
 // Links for the run that begins with sample `start` of time `time_ns`, which is earlier than the
-// time of sample start - 1. Writer only, under the lock.
-RunLinks links_for_new_run(const SlotTable& slots, Tid start, Tid previous_run_start,
+// time of sample start - 1; among the samples from `oldest` on. Writer only, under the lock.
+RunLinks links_for_new_run(const SlotTable& slots, Tid oldest, Tid start, Tid previous_run_start,
                            std::int64_t time_ns) noexcept;
 
 inline constexpr int kMaxHops = 512;  // log2(2^24) jumps and as many parents, with a wide margin

@@ -31,6 +31,9 @@ enum class [[nodiscard]] ReadStatus : std::uint8_t{
     restarted,  // the stream has a new ring with new tids; the reader uses it now: call again
     clock_out_of_bounds,  // reads by time: the clocks of this PC and of the owner may differ
                           // by more than dssmd's key clock_limit
+    arriving,  // of another host's stream: the sample is still to be sent from there, or it is not
+               // known yet which one it is
+    lost,      // of another host's stream: the network could not carry it, and it will never come
 };
 
 // Outcomes of a wait.
