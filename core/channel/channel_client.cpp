@@ -126,7 +126,8 @@ Result<void> ChannelClient::on_subscribe_answer(const net::Frame& frame) {
     return Error{Errc::unavailable, "stream '" + id_.str() + "' was recreated just now"};
   }
   reading_ = Reading::filling;
-  return delegate_.on_subscribed_untrusted(frame.subscribed().first_tid());
+  return delegate_.on_subscribed_untrusted(frame.subscribed().first_tid(),
+                                           frame.subscribed().newest_first());
 }
 
 Result<void> ChannelClient::on_publish_answer(const net::Frame& frame) {
@@ -191,11 +192,14 @@ Error SampleCursor::unexpected(Tid tid) const {
           fmt::format("sample {} came instead of sample {} or a later one", tid, next_)};
 }
 
+Error SampleCursor::invalid_gap(Tid first, std::uint64_t count) {
+  return {Errc::protocol,
+          fmt::format("the owner reports a gap of {} samples from sample {} on", count, first)};
+}
+
 Result<void> SampleCursor::on_gap_untrusted(Tid first, std::uint64_t count) {
   if (first < 0 || first > kMaxTid || count > static_cast<std::uint64_t>(kMaxTid - first)) {
-    return Error{
-        Errc::protocol,
-        fmt::format("the owner reports a gap of {} samples from sample {} on", count, first)};
+    return invalid_gap(first, count);
   }
   const Tid end = first + static_cast<Tid>(count);
   if (end <= next_) {

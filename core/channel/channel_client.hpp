@@ -42,7 +42,7 @@ namespace dssm::channel {
 
 // Greater tids do not exist: they come from a program that wrote invalid values into a ring. Far
 // enough from the greatest number to add to them.
-inline constexpr Tid kMaxTid = Tid{1} << 62;
+inline constexpr Tid kMaxTid = Tid{1} << 61;
 
 // Which sample of a subscription comes next, and how many never will: what a receiver asks for when
 // its connection is back, and what it accepts. A value; one thread. After an error it is as before.
@@ -76,6 +76,7 @@ class SampleCursor {
   // The owner's ring no longer has these.
   //   fails  protocol: they have come already, or are no tids
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
+  static Error invalid_gap(Tid first, std::uint64_t count);
 
  private:
   Tid next_ = kNoTid;
@@ -105,8 +106,10 @@ class ChannelClient {
     // The stream is open; `stream` is checked, and has the name that was asked for.
     virtual Result<void> on_opened(StreamInfo stream, bool created) = 0;
     // Samples come from now on, beginning with `first`, for
-    // SampleCursor::on_subscribed_untrusted().
-    virtual Result<void> on_subscribed_untrusted(Tid /*first*/) { return {}; }
+    // SampleCursor::on_subscribed_untrusted(). newest_first: as it was asked for.
+    virtual Result<void> on_subscribed_untrusted(Tid /*first*/, bool /*newest_first*/) {
+      return {};
+    }
     // All samples that the owner had when it was asked have come.
     virtual Result<void> on_caught_up() { return {}; }
     // For SampleCursor::on_gap_untrusted().

@@ -29,7 +29,10 @@ MirrorInfo mirror_info(const proto::Mirror& message) {
           message.received_samples(),
           message.received_bytes(),
           message.error(),
-          message.clock()};
+          message.clock(),
+          message.filling_samples(),
+          message.recent_samples(),
+          message.recent_lost_samples()};
 }
 
 }  // namespace

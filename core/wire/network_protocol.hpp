@@ -22,7 +22,8 @@ inline constexpr std::size_t kMaxNetworkFrameBytes = 17U << 20;  // without a pa
 inline constexpr std::size_t kMaxPlainBytes = 1U << 20;  // of a frame, without payload and property
 inline constexpr std::size_t kMaxFeatures = 32;
 inline constexpr std::size_t kMaxFeatureBytes = 63;
-inline constexpr std::string_view kFeatureTorn = "torn";    // network.proto, Frame.torn
+inline constexpr std::string_view kFeatureTorn = "torn";  // network.proto, Frame.torn
+inline constexpr std::string_view kFeatureNewestFirst = "newest_first";  // Subscribe
 inline constexpr std::string_view kFeatureClock = "clock";  // network.proto, Pong as an event
 
 // Heartbeats of control connections, and how long no bytes may arrive until the peer counts as dead

@@ -5,8 +5,8 @@
 #include "core/wire/tcp.hpp"
 
 #include <fcntl.h>
+#include <linux/tcp.h>  // glibc's tcp_info has no rates
 #include <netinet/in.h>
-#include <netinet/tcp.h>
 #include <sys/time.h>
 
 #include <algorithm>
@@ -111,6 +111,22 @@ class TcpTransport final : public Transport {
     stamps_ = ::setsockopt(socket_.get(), SOL_SOCKET, SO_TIMESTAMPNS, &kOn, sizeof kOn) == 0;
   }
   std::optional<Time> arrived() const noexcept override { return arrived_; }
+
+  void limit_unsent(std::size_t bytes) noexcept override {
+    const auto most = static_cast<int>(bytes);
+    static_cast<void>(
+        ::setsockopt(socket_.get(), IPPROTO_TCP, TCP_NOTSENT_LOWAT, &most, sizeof most));
+  }
+
+  std::optional<std::uint64_t> carried_per_s() const noexcept override {
+    tcp_info info{};
+    socklen_t length = sizeof info;
+    if (::getsockopt(socket_.get(), IPPROTO_TCP, TCP_INFO, &info, &length) != 0 ||
+        info.tcpi_delivery_rate == 0) {
+      return std::nullopt;
+    }
+    return info.tcpi_delivery_rate;
+  }
 
   int fd() const noexcept override { return socket_.get(); }
 

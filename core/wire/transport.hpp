@@ -32,6 +32,7 @@
 
 #include <chrono>
 #include <cstddef>
+#include <cstdint>
 #include <dssm/result.hpp>
 #include <dssm/time.hpp>
 #include <optional>
@@ -87,6 +88,14 @@ class Transport {
   // When the last bytes of the last receive() arrived, by this PC's wall clock, however late
   // receive() is called. nullopt: not known.
   virtual std::optional<Time> arrived() const noexcept { return std::nullopt; }
+
+  // From now on send() takes no more while so many bytes wait that are not on the network yet, if
+  // the kernel can do that: what it has taken cannot be replaced by something newer. 0: the
+  // system's usual limit.
+  virtual void limit_unsent(std::size_t /*bytes*/) noexcept {}
+  // How many bytes a second the network has carried lately, while there was enough to send.
+  // nullopt: not known.
+  virtual std::optional<std::uint64_t> carried_per_s() const noexcept { return std::nullopt; }
 
   // Readable or writable when receive() or send() can continue.
   virtual int fd() const noexcept = 0;

@@ -144,6 +144,13 @@ class FrameConnection final : private wire::FrameDelegate {
   std::optional<Time> arrived() const noexcept {
     return closed_ ? std::nullopt : transport_->arrived();
   }
+  // As wire::Transport.
+  void limit_unsent(std::size_t bytes) noexcept {
+    if (!closed_) transport_->limit_unsent(bytes);
+  }
+  std::optional<std::uint64_t> carried_per_s() const noexcept {
+    return closed_ ? std::nullopt : transport_->carried_per_s();
+  }
   const wire::DecoderCounters& counters() const noexcept { return decoder_.counters(); }
 
  private:

@@ -4,9 +4,16 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <utility>
 
 namespace dssm::daemon {
 namespace {
+
+// As many bytes as the network carries in that time, when it carries so many each second.
+std::size_t bytes_in(Duration time, std::uint64_t carried_per_s) noexcept {
+  return static_cast<std::size_t>(std::chrono::duration<double>(time).count() *
+                                  static_cast<double>(carried_per_s));
+}
 
 Duration period_of(double rate_hz) {
   constexpr double kMaxNs = 1e18;  // some 30 years
@@ -29,13 +36,21 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       observer_(observer),
       plan_(plan),
       next_(std::clamp<Tid>(plan.first, 0, channel::kMaxTid)),
-      last_(channel::kMaxTid) {}
+      last_(channel::kMaxTid) {
+  unsent_bytes_ = plan.newest_first ? kUnsentBytes : 0;
+  connection_.limit_unsent(unsent_bytes_);
+  const Tid newest = newest_untrusted(reader_);
+  const ring::TidRange held{std::max(plan.held.begin, next_), std::min(plan.held.end, newest + 1)};
+  if (!plan.newest_first || held.end <= held.begin) return;
+  if (held.begin > next_) passed_over_.push_back({next_, held.begin});
+  next_ = held.end;
+}
 
 [[gnu::hot]] Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
   std::size_t bytes = 0;
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
-    Tid sent_up_to = next_ + 1;
+    Tid sent_up_to = (fills_ ? back_fill_.begin : next_) + 1;
     if (under_way_) {
       status = sender_.go_on();
       bytes += SampleSender::kSliceBytes;
@@ -49,25 +64,27 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       if (!connection_.output_empty()) return PumpWait::output;
       if (next == Next::wait_for_sample) return PumpWait::sample;
       if (next == Next::wait_for_time) return PumpWait::time;
-      const Tid newest = std::min(newest_untrusted(reader_), last_);
+      const Tid last = last_of_run();
       observer_.before_samples();
       if (!connection_.output_empty()) return PumpWait::output;
+      const Tid at = fills_ ? back_fill_.begin : next_;
       if (sender_.sends_in_place()) {
-        sent_up_to = next_ + 1;
-        status = sender_.send(next_, 0, next_ < newest);
+        sent_up_to = at + 1;
+        status = sender_.send(at, 0, at < last);
         bytes += std::min(payload_bytes_, SampleSender::kSliceBytes);
       } else {
         // The writer continues meanwhile: the newest sample may not be the newest any more.
-        const Tid at_most = next_ + (thins() ? 1 : kSamplesPerTurn - samples) - 1;
-        status = sender_.send_many(next_, std::min(newest, at_most), sent_up_to);
-        bytes += static_cast<std::size_t>(sent_up_to - next_) * payload_bytes_;
+        const Tid at_most = at + (thins() ? 1 : kSamplesPerTurn - samples) - 1;
+        status = sender_.send_many(at, std::min(last, at_most), sent_up_to);
+        bytes += static_cast<std::size_t>(sent_up_to - at) * payload_bytes_;
       }
     }
+    Tid& at = fills_ ? back_fill_.begin : next_;
     under_way_ = sender_.busy();
     switch (status) {
       case SendStatus::sent:
-        samples += static_cast<int>(sent_up_to - next_);
-        next_ = sent_up_to;
+        samples += static_cast<int>(sent_up_to - at);
+        at = sent_up_to;
         after_sample(now);
         break;
       case SendStatus::torn:  // it is outside of the window now: choose_next() reports the gap
@@ -76,7 +93,13 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       case SendStatus::not_in_ring:
         // Overwritten since choose_next(), or the slot holds invalid values.
         ++samples;
-        if (!thins() && next_ >= reader_.oldest()) lose_up_to(next_ + 1);
+        if (thins() || at < reader_.oldest()) break;
+        if (fills_) {
+          lose({at, at + 1});
+          back_fill_.begin = at + 1;
+        } else {
+          lose_up_to(at + 1);
+        }
         break;
       case SendStatus::blocked:
         sender_.end_run();
@@ -97,6 +120,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
 
 // Chooses the next sample to send, or what to wait for.
 [[gnu::hot]] SamplePump::Next SamplePump::choose_next(MonoTime now) {
+  if (plan_.newest_first) return choose_newest_first(now);
   const Tid newest = newest_untrusted(reader_);
   if (!thins() && next_ <= newest) {
     const Tid oldest = reader_.oldest();
@@ -119,12 +143,127 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   return Next::ready;
 }
 
-void SamplePump::lose_up_to(Tid next) {
-  const auto count = static_cast<std::uint64_t>(next - next_);
+[[gnu::hot]] SamplePump::Next SamplePump::choose_newest_first(MonoTime now) {
+  const Tid newest = std::min(newest_untrusted(reader_), last_);
+  const Tid oldest = reader_.oldest();
+  lose_passed_over(oldest);
+  if (next_ < oldest && next_ <= newest) {
+    lose_up_to(std::min(oldest, newest + 1));
+  }
+  const Tid lowest = !passed_over_.empty()    ? passed_over_.front().begin
+                     : back_fill_.count() > 0 ? back_fill_.begin
+                                              : next_;
+  if (!caught_up_ && lowest > plan_.caught_up_at) {
+    caught_up_ = true;
+    sender_.end_run();
+    observer_.on_caught_up();
+  }
+  fills_ = next_ > newest;
+  if (!fills_) {
+    if (newest > next_ && takes_long(newest - next_ + 1)) pass_over(newest, now);
+    return Next::ready;
+  }
+  // What was sent last still waits for the socket, and pump() with it.
+  if (!connection_.output_empty()) return Next::wait_for_sample;
+  has_kept_up_ = true;
+  // Otherwise there is time between the samples, but not for all that waits.
+  if (back_fill_.count() == 0 &&
+      (passed_over_.empty() || passed_over_.back().end <= behind_from_)) {
+    passed_over_since_ = 0;
+  }
+  if (back_fill_.count() == 0 && !passed_over_.empty()) {
+    ring::TidRange& range = passed_over_.back();
+    const auto piece = static_cast<Tid>(kInOrderBytes / (payload_bytes_ + kHeaderBytes) + 1);
+    back_fill_ = {std::max(range.begin, range.end - piece), range.end};
+    range.end = back_fill_.begin;
+    if (range.count() == 0) passed_over_.pop_back();
+  }
+  if (back_fill_.count() > 0) return Next::ready;
+  fills_ = false;
+  limit_unsent(kUnsentBytes);
+  if (next_ <= last_) return Next::wait_for_sample;
+  sender_.end_run();
+  observer_.on_end();
+  return Next::end;
+}
+
+// Of those that are sent one after the other.
+Tid SamplePump::last_of_run() const noexcept {
+  return fills_ ? back_fill_.end - 1 : std::min(newest_untrusted(reader_), last_);
+}
+
+bool SamplePump::takes_long(Tid count) const noexcept {
+  const std::size_t bytes = static_cast<std::size_t>(count) * (payload_bytes_ + kHeaderBytes);
+  if (bytes <= kInOrderBytes) return false;
+  const std::optional<std::uint64_t> carried = connection_.carried_per_s();
+  return !carried || bytes > bytes_in(kInOrderFor, *carried);
+}
+
+void SamplePump::pass_over(Tid next, MonoTime now) {
+  while (passed_over_.size() + 1 >= kMaxPassedOver) lose_passed_over(passed_over_.front().end);
+  // What is being filled in is older than that.
+  if (back_fill_.count() > 0) passed_over_.push_back(back_fill_);
+  back_fill_ = {};
+  passed_over_.push_back({next_, next});
+  next_ = next;
+  if (const std::optional<std::uint64_t> carried = connection_.carried_per_s()) {
+    limit_unsent(std::clamp(bytes_in(kUnsentFor, *carried), kMinUnsentBytes, kUnsentBytes));
+  }
+  if (passed_over_since_ == 0) {
+    behind_from_ = has_kept_up_ ? passed_over_.back().begin : next;  // history is no overload
+  }
+  give_up_what_is_never_carried(now);
+}
+
+// How many samples wait that were passed over is measured again and again: when they become more,
+// the network carries less than is written.
+void SamplePump::give_up_what_is_never_carried(MonoTime now) {
+  const auto first =
+      std::find_if(passed_over_.begin(), passed_over_.end(),
+                   [&](const ring::TidRange& range) { return range.begin >= behind_from_; });
+  Tid waiting = 0;
+  for (auto range = first; range != passed_over_.end(); ++range) waiting += range->count();
+  ++passed_over_since_;
+  const bool is_measured =
+      passed_over_since_ >= kOverloadedSamples && now - behind_since_ >= kOverloadedAfter;
+  if (passed_over_since_ == 1 || (is_measured && waiting <= waiting_before_)) {
+    passed_over_since_ = 1;
+    behind_since_ = now;
+    waiting_before_ = waiting;
+  } else if (is_measured) {
+    for (auto range = first; range != passed_over_.end(); ++range) lose(*range);
+    passed_over_.erase(first, passed_over_.end());
+    waiting_before_ = 0;
+  }
+}
+
+void SamplePump::limit_unsent(std::size_t bytes) {
+  if (std::exchange(unsent_bytes_, bytes) != bytes) connection_.limit_unsent(bytes);
+}
+
+// Those before that sample will not be sent.
+void SamplePump::lose_passed_over(Tid before) {
+  while (!passed_over_.empty() && passed_over_.front().begin < before) {
+    ring::TidRange& front = passed_over_.front();
+    const ring::TidRange lost{front.begin, std::min(front.end, before)};
+    front.begin = lost.end;
+    if (front.count() == 0) passed_over_.pop_front();
+    lose(lost);
+  }
+  if (back_fill_.count() > 0 && back_fill_.begin < before) {
+    const ring::TidRange lost{back_fill_.begin, std::min(back_fill_.end, before)};
+    back_fill_.begin = lost.end;
+    lose(lost);
+  }
+}
+
+void SamplePump::lose_up_to(Tid next) { lose({std::exchange(next_, next), next}); }
+
+void SamplePump::lose(ring::TidRange range) {
+  const auto count = static_cast<std::uint64_t>(range.count());
   lost_ += count;
   sender_.end_run();
-  observer_.on_gap(next_, count);
-  next_ = next;
+  observer_.on_gap(range.begin, count);
 }
 
 void SamplePump::after_sample(MonoTime now) {

@@ -6,11 +6,17 @@
 // neither subscriptions nor doorbells: StreamChannel and RemoteWriter use it at the two ends of a
 // channel.
 //
+// With Plan::newest_first, a receiver that shows what is now does not wait for what was: samples
+// that wait for long are passed over, and sent when no newer ones wait, the newest of them first.
+// When the network carries fewer samples than are written, those would never be sent: they are lost
+// at once.
+//
 // Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
 #pragma once
 
 #include <cstddef>
 #include <cstdint>
+#include <deque>
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
 
@@ -37,6 +43,21 @@ enum class PumpWait : std::uint8_t {
 // the connection.
 class SamplePump {
  public:
+  // With newest_first: so much is sent in the order of their tids all the same, and at least one
+  // sample; more when the network carries more in that time.
+  static constexpr std::size_t kInOrderBytes = 64U << 10;
+  static constexpr Duration kInOrderFor = std::chrono::milliseconds(4);
+  static constexpr std::size_t kHeaderBytes = 32;  // of a sample's frame, about
+  // So much waits in the kernel, where nothing newer can take its place; less when the network
+  // needs longer than that for it. Half as much made sending slower on a fast link.
+  static constexpr std::size_t kUnsentBytes = 128U << 10, kMinUnsentBytes = 16U << 10;
+  static constexpr Duration kUnsentFor = std::chrono::milliseconds(2);
+  // When samples were passed over for so long and so often, and more of them wait than before, the
+  // network carries less than is written. Once may be a pause of the network.
+  static constexpr Duration kOverloadedAfter = std::chrono::seconds(3);
+  static constexpr int kOverloadedSamples = 4;
+  // Of what was passed over; the oldest one is lost when there is one more.
+  static constexpr std::size_t kMaxPassedOver = 4096;
   static constexpr int kSamplesPerTurn = 1024;
   static constexpr std::size_t kBytesPerTurn = 1U << 20;
 
@@ -62,6 +83,9 @@ class SamplePump {
     // gap. Above 1000 the loop's timers, which count milliseconds, make it less when samples come
     // faster than that.
     double max_rate_hz = 0;
+    // Without max_rate_hz. Then no sample of `held` is sent, which the receiver has.
+    bool newest_first = false;
+    ring::TidRange held = {};
   };
 
   SamplePump(const ring::RingMapping& mapping, FrameConnection& connection, SampleSender& sender,
@@ -69,10 +93,11 @@ class SamplePump {
   SamplePump(const SamplePump&) = delete;
   SamplePump& operator=(const SamplePump&) = delete;
 
-  // Whether it leaves samples out, to keep to a rate: only then pump() uses its `now`.
+  // Whether it leaves samples out, to keep to a rate.
   bool thins() const noexcept { return plan_.max_rate_hz > 0; }
 
-  // Sends one turn's samples. The sender must not be busy with the sample of another user.
+  // Sends one turn's samples. now: only for rates and with newest_first. The sender must not be
+  // busy with the sample of another user.
   //   only_under_way  begins no other sample: another user wants to send in between
   //   fails           limit_exceeded (the peer's memory is used up, and it does not know "torn")
   Result<PumpWait> pump(MonoTime now, bool only_under_way = false);
@@ -88,7 +113,15 @@ class SamplePump {
  private:
   enum class Next : std::uint8_t { ready, wait_for_sample, wait_for_time, end };
   Next choose_next(MonoTime now);
+  Next choose_newest_first(MonoTime now);
+  Tid last_of_run() const noexcept;
+  bool takes_long(Tid count) const noexcept;
+  void pass_over(Tid next, MonoTime now);
+  void give_up_what_is_never_carried(MonoTime now);
+  void limit_unsent(std::size_t bytes);
+  void lose_passed_over(Tid before);
   void lose_up_to(Tid next);
+  void lose(ring::TidRange range);
   void after_sample(MonoTime now);
 
   ring::RingReader reader_;
@@ -99,7 +132,17 @@ class SamplePump {
   Plan plan_;
   Tid next_;
   Tid last_;
-  bool under_way_ = false;  // the sender is busy with sample next_
+  std::deque<ring::TidRange> passed_over_;  // and not sent yet; rising
+  ring::TidRange back_fill_;                // of these, what is sent next
+  bool fills_ = false;        // the sample that is sent is the first one of back_fill_
+  bool has_kept_up_ = false;  // once, no newer sample waited
+  // How often samples were passed over since none of them waited, or since they were counted last:
+  // when, which, and how many waited.
+  int passed_over_since_ = 0;
+  MonoTime behind_since_{};
+  Tid behind_from_ = 0, waiting_before_ = 0;
+  std::size_t unsent_bytes_ = 0;  // the limit on what waits in the kernel
+  bool under_way_ = false;        // the sender is busy with it
   bool caught_up_ = false;
   MonoTime due_{};
   std::uint64_t lost_ = 0;

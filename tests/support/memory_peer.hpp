@@ -59,7 +59,9 @@ class MemoryPeer {
   std::function<void()> after_send;
   std::optional<Time> arrived;  // what dssmd gets as the time of its input, once it asks for it
   std::size_t sends = 0;        // that took bytes
-  bool closed = false;          // by dssmd
+  std::optional<std::uint64_t> carried_per_s;
+  std::size_t unsent_limit = 0;  // that dssmd set
+  bool closed = false;           // by dssmd
 
  private:
   friend class MemoryTransport;
@@ -125,6 +127,10 @@ class MemoryTransport final : public wire::Transport {
   void stamp_arrivals() noexcept override { stamps_ = true; }
   std::optional<Time> arrived() const noexcept override {
     return stamps_ ? peer_.arrived : std::nullopt;
+  }
+  void limit_unsent(std::size_t bytes) noexcept override { peer_.unsent_limit = bytes; }
+  std::optional<std::uint64_t> carried_per_s() const noexcept override {
+    return peer_.carried_per_s;
   }
 
   int fd() const noexcept override { return fd_.get(); }

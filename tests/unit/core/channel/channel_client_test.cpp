@@ -40,7 +40,7 @@ struct ChannelClientTest : testing::Test, ChannelClient::Delegate {
     opened = std::move(stream);
     return {};
   }
-  Result<void> on_subscribed_untrusted(Tid tid) override {
+  Result<void> on_subscribed_untrusted(Tid tid, bool) override {
     first = tid;
     return {};
   }

@@ -148,6 +148,25 @@ const std::map<std::string, Fill>& messages() {
          frame.mutable_subscribe()->set_from_now(true);
          frame.mutable_subscribe()->set_max_rate_hz(10);
        }},
+      {"subscribe_newest_first",
+       [](net::Frame& frame) {
+         frame.set_serial(2);
+         net::Subscribe& subscribe = *frame.mutable_subscribe();
+         subscribe.set_from_tid(1500);
+         subscribe.set_incarnation(kIncarnation);
+         subscribe.set_newest_first(true);
+         subscribe.set_held_from(1600);
+         subscribe.set_held_to(2001);
+       }},
+      {"subscribed_newest_first",
+       [](net::Frame& frame) {
+         frame.set_serial(2);
+         net::Subscribed& subscribed = *frame.mutable_subscribed();
+         subscribed.set_incarnation(kIncarnation);
+         subscribed.set_first_tid(1500);
+         subscribed.set_newest(2000);
+         subscribed.set_newest_first(true);
+       }},
       {"subscribed",
        [](net::Frame& frame) {
          frame.set_serial(2);
