@@ -64,7 +64,8 @@ wire::Greeting own_greeting(const std::string& name,
   self.instance_id = wire::random_number();
   self.program = "dssmd";
   self.version = DSSM_VERSION;
-  self.features = {std::string(wire::kFeatureTorn), std::string(wire::kFeatureClock)};
+  self.features = {std::string(wire::kFeatureTorn), std::string(wire::kFeatureClock),
+                   std::string(wire::kFeatureNewestFirst)};
   self.clock = std::move(clock);
   return self;
 }

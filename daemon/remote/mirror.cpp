@@ -20,8 +20,8 @@ Mirror::Mirror(const ChannelParts& parts, StreamId id, RingQuota quota,
                std::function<void()> on_done)
     : RemoteStream(parts,
                    {Purpose::mirror, message_id::kMirror,
-                    "its owner's ring no longer held them when their turn came; keep more history "
-                    "there, or write less than the network carries",
+                    "the network did not carry them in time; keep more history on its host, or "
+                    "write less than the network carries",
                     "mirror '{}' keeps what it has"},
                    std::move(id), std::move(quota), std::move(on_done)),
       clock_(parts.clock, id_),
@@ -34,6 +34,7 @@ Mirror::Mirror(const ChannelParts& parts, StreamId id, RingQuota quota,
 
 void Mirror::on_connected(const wire::Greeting& them) {
   on_owner_clock(them.clock);
+  newest_first_ = them.has_feature(wire::kFeatureNewestFirst);
   channel_.open(id_, nullptr);
 }
 
@@ -45,15 +46,15 @@ Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
   is_removed_ = false;
   connection_.frames()->take_samples(theirs.type.payload_bytes, *this);
   net::Subscribe request;
-  ring_->resume(request);
+  ring_->resume(newest_first_, request);
   channel_.subscribe(request);
   set_pending_deadline(parts_.loop.deadline_in(kFillTimeout));
   if (!replaced_.empty()) fill_timer_.enable_in(kFillTimeout);
   return {};
 }
 
-Result<void> Mirror::on_subscribed_untrusted(Tid first) {
-  DSSM_TRY(ring_->on_subscribed_untrusted(first));
+Result<void> Mirror::on_subscribed_untrusted(Tid first, bool newest_first) {
+  DSSM_TRY(ring_->on_subscribed_untrusted(first, newest_first));
   log_new_gap();
   last_error_.reset();
   ++subscriptions_;
@@ -78,6 +79,7 @@ Result<void> Mirror::on_caught_up() {
 
 Result<void> Mirror::on_gap_untrusted(Tid first, std::uint64_t count) {
   DSSM_TRY(ring_->on_gap_untrusted(first, count));
+  ring_->wake();  // readers that wait for these
   log_new_gap();
   return {};
 }
@@ -85,6 +87,7 @@ Result<void> Mirror::on_gap_untrusted(Tid first, std::uint64_t count) {
 // The ring stays for its readers. A removed stream that is created again is found by the catalog,
 // or by asking the owner.
 Result<void> Mirror::on_refused(ChannelClient::Request, const Error& why) {
+  if (ring_ && why.code == Errc::not_found) ring_->end_filling();
   stop(why, why.code == Errc::not_found);
   return {};
 }
@@ -196,6 +199,7 @@ Result<void> Mirror::use_offered(std::shared_ptr<Stream> stream) {
 void Mirror::replace_ring(std::unique_ptr<MirrorRing> ring) {
   if (ring_) {
     ++restarts_;
+    ring_->end_filling();
     earlier_.gap_samples += ring_->gap_samples();
     earlier_.received_samples += ring_->received_samples();
     earlier_.received_bytes += ring_->received_bytes();
@@ -252,6 +256,11 @@ void Mirror::describe(proto::Mirror& out) const {
   out.set_received_bytes(earlier_.received_bytes + (ring_ ? ring_->received_bytes() : 0));
   if (last_error_) out.set_error(last_error_->message);
   out.set_clock(clock_.reason());
+  if (!ring_) return;
+  out.set_filling_samples(ring_->filling_samples());
+  const MirrorRing::Recent recent = ring_->recent();
+  out.set_recent_samples(recent.samples);
+  out.set_recent_lost_samples(recent.lost);
 }
 
 bool Mirror::describe_stream(proto::Stream& out) const {

@@ -1,8 +1,10 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The copy of one stream of another host: one channel to its owner and one ring here, for any
-// number of programs that read it. The ring is filled with the owner's history first and kept up to
-// date from then on. After a reconnect the channel resumes with the sample it stopped at.
+// number of programs that read it. The newest samples come first, then the owner's history, and
+// after a reconnect what is missing. A program that opens the stream gets the ring when all of that
+// is here, or after kFillTimeout. While the owner is away, those that read one sample after the
+// other wait before what is missing.
 //
 //   ring      has the owner's type, depth, cycle and incarnation. When the owner's stream has
 //             another incarnation, the mirror makes a new ring, and readers of the old one are
@@ -55,7 +57,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
 
   // ChannelClient::Delegate
   Result<void> on_opened(StreamInfo stream, bool created) override;
-  Result<void> on_subscribed_untrusted(Tid first) override;
+  Result<void> on_subscribed_untrusted(Tid first, bool newest_first) override;
   Result<void> on_caught_up() override;
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count) override;
   Result<void> on_refused(channel::ChannelClient::Request request, const Error& why) override;
@@ -88,7 +90,8 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   bool is_filling() const noexcept;
   proto::Mirror::State shown_state() const noexcept;
 
-  bool is_ending_ = false;  // live, but the catalog knows that this ring was removed
+  bool newest_first_ = false;  // the owner has that feature
+  bool is_ending_ = false;     // live, but the catalog knows that this ring was removed
   MirrorClock clock_;
   bool in_batch_ = false;  // samples have come, and on_batch_end() has not
   std::unique_ptr<MirrorRing> ring_;

@@ -35,6 +35,7 @@ MirrorRing::MirrorRing(std::shared_ptr<Stream> stream,
       slots_(*mapping_),
       reader_(*mapping_) {
   slots_.recover();
+  slots_.shrink_hole();
   if (slots_.newest() >= 0) cursor_.set_next(slots_.newest() + 1);
 }
 
@@ -48,8 +49,124 @@ bool MirrorRing::would_overwrite_window(Tid tid) const noexcept {
   return same_slot >= reader_.oldest();
 }
 
+void MirrorRing::end_filling() noexcept {
+  lose_late(reader_.hole());
+  wake();
+}
+
+void MirrorRing::resume(bool newest_first, net::Subscribe& out) {
+  if (!newest_first) end_filling();
+  lost_ahead_.clear();  // they will be sent, or reported again
+  cursor_.resume(stream_->incarnation(), out);
+  out.set_newest_first(newest_first);
+  const ring::TidRange hole = reader_.hole();
+  if (hole.is_empty() || hole.end <= reader_.oldest()) return;
+  out.set_from_tid(std::max(hole.begin, reader_.oldest()));
+  out.set_held_from(hole.end);
+  out.set_held_to(cursor_.next());
+}
+
+Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first) {
+  newest_first_ = newest_first;
+  cursor_.set_thinned(newest_first);  // what is passed over comes later
+  const Tid next = cursor_.next();
+  if (!newest_first || next == kNoTid) {
+    DSSM_TRY(cursor_.on_subscribed_untrusted(first));
+    begins_at_ = first;
+    return {};
+  }
+  if (first > next) return on_gap_untrusted(next, static_cast<std::uint64_t>(first - next));
+  return {};  // continues in the hole
+}
+
+Result<void> MirrorRing::on_gap_untrusted(Tid first, std::uint64_t count) {
+  if (!newest_first_) return cursor_.on_gap_untrusted(first, count);
+  if (first < 0 || first > channel::kMaxTid ||
+      count > static_cast<std::uint64_t>(channel::kMaxTid - first)) {
+    return channel::SampleCursor::invalid_gap(first, count);
+  }
+  const Tid end = first + static_cast<Tid>(count), next = cursor_.next();
+  lose_late({first, std::min(end, next)});
+  lose_ahead({std::max(first, next), end});
+  return {};
+}
+
+// Samples before the newest one: those in the hole that are missing will not come.
+void MirrorRing::lose_late(ring::TidRange range) noexcept {
+  const ring::TidRange hole = reader_.hole();
+  const Tid begin = std::max({range.begin, hole.begin, reader_.oldest()});
+  const Tid end = std::min(range.end, hole.end);
+  if (begin >= end) return;
+  for (Tid tid = begin; tid < end; ++tid) lost_late_ += is_missing(tid) ? 1U : 0U;
+  slots_.lose_in_hole(begin, end);
+  wake_pending_ = late_pending_ = true;
+}
+
+// Samples after the newest one, which have no slots yet.
+void MirrorRing::lose_ahead(ring::TidRange range) {
+  if (range.is_empty()) return;
+  const bool follows = !lost_ahead_.empty() && lost_ahead_.back().end >= range.begin;
+  if (follows || lost_ahead_.size() == kMaxLostAhead) {
+    lost_ahead_.back().end = std::max(lost_ahead_.back().end, range.end);
+  } else {
+    lost_ahead_.push_back(range);
+  }
+}
+
+// Those of the hole that leave the window before they have come, when `tid` is the newest sample.
+void MirrorRing::count_what_leaves(Tid tid) noexcept {
+  const ring::TidRange hole = reader_.hole();
+  if (hole.is_empty()) return;
+  const Tid oldest = tid - static_cast<Tid>(stream_->mapping().geometry().depth) + 2;
+  for (Tid gone = std::max(hole.begin, reader_.oldest()); gone < std::min(hole.end, oldest);
+       ++gone) {
+    lost_late_ += is_missing(gone) ? 1U : 0U;
+  }
+}
+
+std::uint64_t MirrorRing::filling_samples() const noexcept {
+  const ring::TidRange hole = reader_.hole();
+  const Tid length = hole.end - std::max(hole.begin, reader_.oldest());
+  return !hole.is_empty() && length > 0 ? static_cast<std::uint64_t>(length) : 0;
+}
+
+MirrorRing::Recent MirrorRing::recent() const noexcept {
+  constexpr Duration kRecent = std::chrono::seconds(3);
+  Recent recent;
+  SampleInfo newest, info;
+  const Tid top = reader_.newest();
+  if (top < 0 || reader_.stamp(top, newest) != ReadStatus::ok) return recent;
+  for (Tid tid = top; tid >= std::max(reader_.oldest(), top - kMaxRecent + 1); --tid) {
+    const ReadStatus status = reader_.stamp(tid, info);
+    // Unsigned, because the distance of two int64 may not fit into one; and earlier runs are not
+    // recent.
+    const auto age_ns = static_cast<std::uint64_t>(to_ns(newest.time)) -
+                        static_cast<std::uint64_t>(to_ns(info.time));
+    if (status == ReadStatus::ok && age_ns > static_cast<std::uint64_t>(to_ns(kRecent))) break;
+    ++recent.samples;
+    recent.lost += status == ReadStatus::lost ? 1U : 0U;
+  }
+  return recent;
+}
+
+// Whether it is in the hole and the window, and has not come.
+bool MirrorRing::is_missing(Tid tid) const noexcept {
+  return reader_.hole().holds(tid) && !reader_.is_settled(tid);
+}
+
+// One that newer ones were sent before. Its slot may be in use for one of these by now.
+std::byte* MirrorRing::begin_late(const wire::IncomingSample& sample) noexcept {
+  is_dropped_ = !is_missing(sample.info.tid);
+  // No reader looks at the slot of the sample after the newest one.
+  return slots_.begin(is_dropped_ ? slots_.newest() + 1 : sample.info.tid);
+}
+
 [[gnu::hot]] Result<std::byte*> MirrorRing::begin_untrusted(const wire::IncomingSample& sample) {
   const Tid tid = sample.info.tid;
+  if (newest_first_ && tid >= 0 && tid < cursor_.next()) {
+    if (aside_) drop_aside();
+    return begin_late(sample);
+  }
   if (!cursor_.accepts(tid)) return cursor_.unexpected(tid);
   if (aside_) drop_aside();  // of one that was cut off
   const bool after_gap = tid != slots_.newest() + 1;
@@ -72,10 +189,24 @@ void MirrorRing::drop_aside() noexcept {
 }
 
 [[gnu::hot]] void MirrorRing::end(const wire::IncomingSample& sample, bool torn) {
-  if (!torn) {
-    const Tid tid = sample.info.tid;
+  const Tid tid = sample.info.tid;
+  const bool is_late = newest_first_ && tid < cursor_.next();
+  if (!torn && is_late) {
+    if (is_dropped_) return;
+    slots_.publish_in_hole(tid, sample.info.time, sample.info.clock_error);
+    wake_pending_ = late_pending_ = true;
+    ++received_samples_;
+    received_bytes_ += sample.payload_bytes;
+  } else if (!torn) {
+    if (newest_first_) count_what_leaves(tid);
+    if (tid != slots_.newest() + 1) slots_.make_room(tid);
     if (aside_) std::memcpy(slots_.begin(tid), aside_.get(), sample.payload_bytes);
-    slots_.publish(tid, sample.info.time, sample.info.clock_error);
+    if (newest_first_ && tid != slots_.newest() + 1) {
+      publish_after_gap(sample.info);
+    } else {
+      slots_.publish(tid, sample.info.time, sample.info.clock_error);
+    }
+    lost_ahead_.clear();
     cursor_.on_sample(tid);
     wake_pending_ = true;
     ++received_samples_;
@@ -85,8 +216,38 @@ void MirrorRing::drop_aside() noexcept {
   if (aside_) drop_aside();
 }
 
+// Publishes a sample that does not follow on the newest one: those in between are lost, or come
+// later.
+void MirrorRing::publish_after_gap(const SampleInfo& info) noexcept {
+  const Tid begin = std::max<Tid>(slots_.newest() + 1, begins_at_);
+  const bool are_lost = lost_ahead_.size() == 1 && lost_ahead_.front().begin <= begin &&
+                        lost_ahead_.front().end >= info.tid;
+  if (are_lost) {
+    lost_late_ += static_cast<std::uint64_t>(info.tid - begin);
+    slots_.lose_before_next(info.tid, info.time);
+  } else if (begin < info.tid) {
+    slots_.skip_to(info.tid, begin);
+  }
+  slots_.publish(info.tid, info.time, info.clock_error);
+  if (are_lost) return;
+  for (const ring::TidRange& lost : lost_ahead_) {
+    const Tid first = std::max(lost.begin, begin), end = std::min(lost.end, info.tid);
+    if (first >= end) continue;
+    lost_late_ += static_cast<std::uint64_t>(end - first);
+    slots_.lose_in_hole(first, end);
+    late_pending_ = true;
+  }
+}
+
 [[gnu::hot]] void MirrorRing::wake() noexcept {
-  if (std::exchange(wake_pending_, false)) bell_->notify();
+  if (!std::exchange(wake_pending_, false)) return;
+  if (std::exchange(late_pending_, false)) {
+    slots_.shrink_hole();
+    // As the store of `top` does: either a sleeper that has just announced itself sees what came,
+    // or this sees the announcement.
+    std::atomic_thread_fence(std::memory_order_seq_cst);
+  }
+  bell_->notify();
 }
 
 // --- the clock

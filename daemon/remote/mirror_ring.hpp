@@ -1,11 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The memory side of a mirror. MirrorRing is the ring while it is being filled: it takes the
-// owner's samples. MirrorClock knows
-// what the times of these samples are worth. Neither knows the connection.
+// owner's samples. MirrorClock knows what the times of these samples are worth. Neither knows the
+// connection.
 //
-// Promises to the ring's readers: the window has no holes, tids rise, a sample is visible once it
-// is complete, and one that was not complete (torn, cut off) never is.
+// Promises to the ring's readers: the window has no holes but one, which is filled (ring-layout.md
+// "Hole"), a sample is visible once it is complete, and one that was not complete (torn, cut off)
+// never is.
 #pragma once
 
 #include <cstddef>
@@ -15,6 +16,7 @@
 #include <memory>
 #include <optional>
 #include <string>
+#include <vector>
 
 #include "core/channel/channel_client.hpp"
 #include "core/ring/bell.hpp"
@@ -42,19 +44,22 @@ class MirrorRing {
 
   const std::shared_ptr<Stream>& stream() const noexcept { return stream_; }
 
-  // The request for the samples that follow on what is here; all, if the owner never sent where
-  // this ring begins.
-  void resume(net::Subscribe& out) const { cursor_.resume(stream_->incarnation(), out); }
+  // The request for the samples that are missing in the hole, and that follow on what is here; for
+  // all, if the owner never sent where this ring begins. The newest first.
+  //   newest_first  the owner has that feature; else what is missing in the hole will never come
+  void resume(bool newest_first, net::Subscribe& out);
+  // The owner will not send what is missing in the hole: it counts as lost.
+  void end_filling() noexcept;
 
   // As in SampleCursor.
-  Result<void> on_subscribed_untrusted(Tid first) { return cursor_.on_subscribed_untrusted(first); }
-  Result<void> on_gap_untrusted(Tid first, std::uint64_t count) {
-    return cursor_.on_gap_untrusted(first, count);
-  }
+  Result<void> on_subscribed_untrusted(Tid first, bool newest_first);
+  Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
   // Where the payload of this sample goes, until end() or another begin_untrusted().
-  //   fails  protocol: its tid does not rise
+  //   fails  protocol: it does not come now; limit_exceeded: no memory to receive what is dropped
   Result<std::byte*> begin_untrusted(const wire::IncomingSample& sample);
-  // The payload is in place. After a gap, the samples before it leave the ring, as in the owner's.
+  // The payload is in place. Of the samples between the newest one and it, those that were reported
+  // as lost are marked so, and the others become the hole. Without newest_first, the samples before
+  // such a gap leave the ring, as in the owner's.
   void end(const wire::IncomingSample& sample, bool torn);
   // How this PC's readers may use the samples' times.
   void set_clock(const ring::ClockAssessment& assessment) noexcept {
@@ -64,7 +69,18 @@ class MirrorRing {
   void wake() noexcept;
 
   Tid newest() const noexcept { return slots_.newest(); }
-  std::uint64_t gap_samples() const noexcept { return cursor_.lost(); }
+  std::uint64_t gap_samples() const noexcept { return cursor_.lost() + lost_late_; }
+  // The length of the hole, as far as it is in the window.
+  std::uint64_t filling_samples() const noexcept;
+  // What was written in the last 3 s before the newest sample, at most kMaxRecent of them.
+  struct Recent {
+    std::uint64_t samples = 0, lost = 0;
+  };
+  Recent recent() const noexcept;
+  static constexpr Tid kMaxRecent = 10'000;
+  // Ranges of lost samples after the newest one here; with one more, what is between also counts as
+  // lost.
+  static constexpr std::size_t kMaxLostAhead = 64;
   std::uint64_t received_samples() const noexcept { return received_samples_; }
   std::uint64_t received_bytes() const noexcept { return received_bytes_; }
 
@@ -72,6 +88,12 @@ class MirrorRing {
   MirrorRing(std::shared_ptr<Stream> stream, std::shared_ptr<const ring::RingMapping> mapping,
              std::shared_ptr<ring::Bell> bell, MemoryBudget& budget);
   bool would_overwrite_window(Tid tid) const noexcept;
+  bool is_missing(Tid tid) const noexcept;
+  std::byte* begin_late(const wire::IncomingSample& sample) noexcept;
+  void lose_late(ring::TidRange range) noexcept;
+  void lose_ahead(ring::TidRange range);
+  void count_what_leaves(Tid tid) noexcept;
+  void publish_after_gap(const SampleInfo& info) noexcept;
   void allocate_aside(std::size_t bytes);
   void drop_aside() noexcept;
 
@@ -82,9 +104,15 @@ class MirrorRing {
   ring::SlotWriter slots_;
   ring::RingReader reader_;
   channel::SampleCursor cursor_;
+  bool newest_first_ = false;               // the owner sends so
+  Tid begins_at_ = 0;                       // an empty ring: earlier ones were never asked for
+  std::vector<ring::TidRange> lost_ahead_;  // of those after the newest one here; rising
+  bool is_dropped_ = false;             // the sample in the hole that arrives, which is not missing
+  bool late_pending_ = false;           // the hole has become smaller since the last wake()
   bool wake_pending_ = false;           // sleeping readers are still to be woken
   std::unique_ptr<std::byte[]> aside_;  // the payload under way, when it must not go to its slot
   MemoryShare aside_share_;
+  std::uint64_t lost_late_ = 0;  // of what newer samples were sent before
   std::uint64_t received_samples_ = 0, received_bytes_ = 0;
 };
 

@@ -102,9 +102,17 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
   subscribed.set_incarnation(stream().incarnation());
   subscribed.set_first_tid(first);
   subscribed.set_newest(newest);
+  SamplePump::Plan plan{first, newest, request.max_rate_hz(), false, {}};
+  if (request.newest_first() && request.max_rate_hz() == 0) {
+    plan.newest_first = true;
+    if (request.incarnation() == stream().incarnation()) {
+      plan.held = {request.held_from(), request.held_to()};
+    }
+    subscribed.set_newest_first(true);
+  }
   parts_.link.send(frame);
   pump_.emplace(stream().mapping(), parts_.link, sender_, static_cast<SamplePump::Observer&>(*this),
-                SamplePump::Plan{first, newest, request.max_rate_hz()});
+                plan);
   // Also without samples: the client needs it for those that it has from an earlier connection.
   clock_generation_.reset();
   before_samples();
@@ -139,7 +147,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
 
 [[gnu::hot]] Result<void> StreamChannel::go_on_pumping(bool request_waits) {
   if (!pump_) return {};
-  const MonoTime now = pump_->thins() ? parts_.loop.now() : MonoTime{};
+  const MonoTime now = pump_->thins() ? parts_.loop.now() : parts_.loop.coarse_now();
   feed_->forget(*this);
   Result<PumpWait> wait = pump_->pump(now, request_waits);
   for (int checks = 0; wait && *wait == PumpWait::sample; ++checks) {
@@ -232,8 +240,11 @@ ReadStatus StreamChannel::find(const net::Read& request, Tid& tid) const {
       tid = request.tid();
       if (tid > newest) return ReadStatus::not_yet;
       return tid < 0 || tid < reader_.oldest() ? ReadStatus::too_old : ReadStatus::ok;
-    case net::Read::kTimeNs:
-      return reader_.find(time_from_ns(request.time_ns()), tid);
+    case net::Read::kTimeNs: {
+      const ReadStatus found = reader_.find(time_from_ns(request.time_ns()), tid);
+      // An owner's ring has no hole, unless a program wrote one into it.
+      return found == ReadStatus::arriving ? ReadStatus::too_old : found;
+    }
     case net::Read::kNewerThan:
       tid = newest;
       return newest < 0 || newest <= request.newer_than() ? ReadStatus::not_yet : ReadStatus::ok;

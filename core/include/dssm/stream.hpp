@@ -124,7 +124,7 @@ enum class MirrorState : std::uint8_t {
   unknown,            // dssmd is of a later version
   connecting,         // to the owner, for the first time
   filling,            // the owner's history is on its way
-  live,               // the mirror has each sample as soon as it is written
+  live,               // the mirror has the newest sample as soon as the network carries it
   owner_unavailable,  // the mirror keeps what it has; dssmd reconnects
   removed,            // the stream was removed; dssmd retries
 };
@@ -135,7 +135,8 @@ std::string_view name_of(MirrorState state) noexcept;
 // The state of this PC's mirror of another host's stream.
 struct MirrorInfo {
   MirrorState state = MirrorState::unknown;
-  std::uint64_t gap_samples = 0;  // lost: the owner's ring no longer held them
+  std::uint64_t gap_samples = 0;  // lost: the owner's ring no longer held them, or the network
+                                  // carried less than the stream has
   std::uint64_t reconnects = 0;
   std::uint64_t restarts = 0;  // times the owner's ring was replaced by a new one
   Tid newest = kNoTid;         // newest sample in the mirror
@@ -143,6 +144,11 @@ struct MirrorInfo {
   std::uint64_t received_bytes = 0;  // of payloads
   std::string error;                 // why it is not live; empty when it is
   std::string clock;  // why the times of its samples are suspect; empty when they are not
+  std::uint64_t filling_samples = 0;  // of the part that is being filled; newer ones are here
+  // Of the last 3 s before the newest sample: how many were written, and how many of these are
+  // lost.
+  std::uint64_t recent_samples = 0;
+  std::uint64_t recent_lost_samples = 0;
 };
 
 // The present state of a stream. For a stream of another host, pids and users are those of its

@@ -1,4 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// A mirror's ring takes the owner's samples, in their order and the newest first, and never shows
+// one that is torn.
 #include "daemon/remote/mirror_ring.hpp"
 
 #include <gtest/gtest.h>
@@ -45,7 +48,7 @@ class MirrorRingTest : public testing::Test {
   // The sample that it asks the owner for; kNoTid: the oldest.
   Tid wanted() const {
     net::Subscribe request;
-    ring->resume(request);
+    ring->resume(true, request);
     return request.from_oldest() ? kNoTid : request.from_tid();
   }
   ReadStatus read(Tid tid) {
@@ -64,7 +67,7 @@ class MirrorRingTest : public testing::Test {
 
 TEST_F(MirrorRingTest, RepeatsTheOwnersTidsWhereverTheyBegin) {
   EXPECT_EQ(wanted(), kNoTid) << "nothing known: the oldest is wanted";
-  ASSERT_TRUE(ring->on_subscribed_untrusted(1000));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(1000, false));
   for (Tid tid = 1000; tid < 1010; ++tid) ASSERT_TRUE(take(tid));
   EXPECT_EQ(reader.oldest(), 1000);
   EXPECT_EQ(reader.newest(), 1009);
@@ -76,7 +79,7 @@ TEST_F(MirrorRingTest, RepeatsTheOwnersTidsWhereverTheyBegin) {
 }
 
 TEST_F(MirrorRingTest, NeverShowsATornSampleAndCountsItOnce) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(take(1, true));
   EXPECT_EQ(reader.newest(), 0);
@@ -88,7 +91,7 @@ TEST_F(MirrorRingTest, NeverShowsATornSampleAndCountsItOnce) {
 }
 
 TEST_F(MirrorRingTest, CountsATornSampleThatIsReportedAsAGapOnce) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(take(1, true));
   ASSERT_TRUE(ring->on_gap_untrusted(1, 1));
@@ -97,7 +100,7 @@ TEST_F(MirrorRingTest, CountsATornSampleThatIsReportedAsAGapOnce) {
 }
 
 TEST_F(MirrorRingTest, CountsReportedAndUnreportedGapsAlike) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(ring->on_gap_untrusted(1, 9));
   EXPECT_EQ(ring->gap_samples(), 9u) << "before anything comes behind it";
@@ -108,15 +111,16 @@ TEST_F(MirrorRingTest, CountsReportedAndUnreportedGapsAlike) {
 }
 
 TEST_F(MirrorRingTest, CountsWhatTheOwnerLostWhileTheLinkWasCut) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
   ASSERT_TRUE(take(0));
-  ASSERT_TRUE(ring->on_subscribed_untrusted(100));  // after a reconnect: the oldest it still has
+  ASSERT_TRUE(
+      ring->on_subscribed_untrusted(100, false));  // after a reconnect: the oldest it still has
   ASSERT_TRUE(take(100));
   EXPECT_EQ(ring->gap_samples(), 99u);
 }
 
 TEST_F(MirrorRingTest, KeepsTheWindowWholeWhileASampleAfterAGapArrives) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
   for (Tid tid = 0; tid < 20; ++tid) ASSERT_TRUE(take(tid));
   for (const Tid behind : {22, 28, 33, 35}) {  // their slots hold 6, 12, 17 and the newest
     const wire::IncomingSample sample = incoming(behind);
@@ -133,7 +137,7 @@ TEST_F(MirrorRingTest, KeepsTheWindowWholeWhileASampleAfterAGapArrives) {
 }
 
 TEST_F(MirrorRingTest, DoesNotTakeWhatWasCutOffForTheNextSample) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
   for (Tid tid = 0; tid < 20; ++tid) ASSERT_TRUE(take(tid));
   const std::uint64_t used = budget.used();
   ASSERT_TRUE(ring->begin_untrusted(incoming(28)));  // aside; then the connection breaks
@@ -145,7 +149,7 @@ TEST_F(MirrorRingTest, DoesNotTakeWhatWasCutOffForTheNextSample) {
 }
 
 TEST_F(MirrorRingTest, ReceivesInPlaceWhenThereIsNoMemoryToSetAside) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
   for (Tid tid = 0; tid < 20; ++tid) ASSERT_TRUE(take(tid));
   const MemoryShare rest = budget.take(budget.limit() - budget.used()).value();
   ASSERT_TRUE(take(28));
@@ -153,9 +157,9 @@ TEST_F(MirrorRingTest, ReceivesInPlaceWhenThereIsNoMemoryToSetAside) {
 }
 
 TEST_F(MirrorRingTest, RefusesTidsThatDoNotRise) {
-  EXPECT_FALSE(ring->on_subscribed_untrusted(-1));
-  EXPECT_FALSE(ring->on_subscribed_untrusted(channel::kMaxTid + 1));
-  ASSERT_TRUE(ring->on_subscribed_untrusted(5));
+  EXPECT_FALSE(ring->on_subscribed_untrusted(-1, false));
+  EXPECT_FALSE(ring->on_subscribed_untrusted(channel::kMaxTid + 1, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(5, false));
   ASSERT_TRUE(take(5));
   EXPECT_EQ(take(5).error().code, Errc::protocol);
   EXPECT_EQ(take(4).error().code, Errc::protocol);
@@ -167,7 +171,7 @@ TEST_F(MirrorRingTest, RefusesTidsThatDoNotRise) {
 }
 
 TEST_F(MirrorRingTest, ContinuesAfterWhatAnEarlierDssmdReceived) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
   for (Tid tid = 0; tid < 40; ++tid) ASSERT_TRUE(take(tid));
   ASSERT_TRUE(ring->begin_untrusted(incoming(40)));  // dies here
   ring = MirrorRing::open(stream, budget).value();
@@ -180,7 +184,7 @@ TEST_F(MirrorRingTest, ContinuesAfterWhatAnEarlierDssmdReceived) {
 
 TEST_F(MirrorRingTest, WakesSleepersOncePerBatch) {
   auto bell = stream->map_bell().value();
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
   const std::uint32_t announced = bell->announce();
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(take(1));
@@ -190,6 +194,155 @@ TEST_F(MirrorRingTest, WakesSleepersOncePerBatch) {
   const std::uint32_t again = bell->announce();
   ring->wake();
   EXPECT_EQ(bell->announce(), again) << "nothing new came";
+}
+
+// --- the newest first
+
+class NewestFirstTest : public MirrorRingTest {
+ protected:
+  net::Subscribe request() const {
+    net::Subscribe request;
+    ring->resume(true, request);
+    return request;
+  }
+  ReadStatus find(std::int64_t ns) const {
+    Tid tid = kNoTid;
+    return reader.find(time_from_ns(ns), tid);
+  }
+  Tid found(std::int64_t ns) const {
+    Tid tid = kNoTid;
+    EXPECT_EQ(reader.find(time_from_ns(ns), tid), ReadStatus::ok);
+    return tid;
+  }
+};
+
+TEST_F(NewestFirstTest, TheNewestIsReadableBeforeThoseThatCameBeforeIt) {
+  EXPECT_TRUE(request().newest_first());
+  ASSERT_TRUE(ring->on_subscribed_untrusted(2, true));
+  ASSERT_TRUE(take(9));
+  EXPECT_EQ(reader.newest(), 9);
+  EXPECT_EQ(reader.oldest(), 2);
+  EXPECT_EQ(read(9), ReadStatus::ok);
+  EXPECT_EQ(read(8), ReadStatus::arriving);
+  EXPECT_EQ(read(1), ReadStatus::too_old);
+  EXPECT_EQ(find(1009), ReadStatus::ok);
+  EXPECT_EQ(find(1008), ReadStatus::arriving);
+  for (const Tid tid : {7, 8}) ASSERT_TRUE(take(tid));
+  ring->wake();
+  EXPECT_EQ(find(1007), ReadStatus::ok);
+  EXPECT_EQ(find(1006), ReadStatus::arriving);
+  ASSERT_TRUE(take(10));
+  for (Tid tid = 2; tid < 7; ++tid) ASSERT_TRUE(take(tid));
+  ring->wake();
+  for (Tid tid = 2; tid <= 10; ++tid) EXPECT_EQ(read(tid), ReadStatus::ok);
+  EXPECT_EQ(find(1002), ReadStatus::ok);
+  EXPECT_EQ(find(1001), ReadStatus::too_old);
+  EXPECT_EQ(ring->gap_samples(), 0u);
+  EXPECT_EQ(ring->received_samples(), 9u);
+}
+
+TEST_F(NewestFirstTest, AsksForTheHoleAfterACutAndAfterADssmdThatDied) {
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  for (const Tid tid : {0, 1, 8, 6, 7, 9}) ASSERT_TRUE(take(tid));
+  ring->wake();
+  for (const bool died : {false, true}) {
+    if (died) {
+      ASSERT_TRUE(ring->begin_untrusted(incoming(5)));
+      ring = MirrorRing::open(stream, budget).value();
+    }
+    EXPECT_EQ(request().from_tid(), 2);
+    EXPECT_EQ(request().held_from(), 6);
+    EXPECT_EQ(request().held_to(), 10);
+    ASSERT_TRUE(ring->on_subscribed_untrusted(2, true));
+  }
+  ASSERT_TRUE(take(12));
+  for (const Tid tid : {10, 11, 2, 3, 4, 5}) ASSERT_TRUE(take(tid));
+  ring->wake();
+  for (Tid tid = 0; tid <= 12; ++tid) EXPECT_EQ(read(tid), ReadStatus::ok);
+  EXPECT_TRUE(reader.hole().is_empty());
+  EXPECT_EQ(request().from_tid(), 13);
+}
+
+TEST_F(NewestFirstTest, WhatTheOwnerLostIsNoLongerAwaited) {
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  for (const Tid tid : {0, 1, 8}) ASSERT_TRUE(take(tid));
+  ASSERT_TRUE(ring->on_gap_untrusted(2, 3));
+  EXPECT_EQ(ring->gap_samples(), 3u);
+  EXPECT_EQ(read(4), ReadStatus::lost);
+  EXPECT_EQ(read(5), ReadStatus::arriving);
+  ASSERT_TRUE(take(7));
+  ASSERT_TRUE(ring->on_gap_untrusted(5, 2));
+  ring->wake();
+  EXPECT_EQ(ring->gap_samples(), 5u);
+  EXPECT_TRUE(reader.hole().is_empty());
+  for (const Tid tid : {0, 1, 7, 8}) {
+    EXPECT_EQ(read(tid), ReadStatus::ok);
+    EXPECT_EQ(found(1000 + tid), tid);
+  }
+  EXPECT_EQ(found(1006), 1) << "the newest one that is here";
+}
+
+TEST_F(NewestFirstTest, WhatTheNetworkCannotCarryIsLostBetweenThoseThatAreHere) {
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  ASSERT_TRUE(take(0));
+  for (const Tid newest : {3, 6, 9}) {
+    ASSERT_TRUE(ring->on_gap_untrusted(newest - 2, 2));
+    ASSERT_TRUE(take(newest));
+    ring->wake();
+    EXPECT_TRUE(reader.hole().is_empty());
+  }
+  EXPECT_EQ(ring->gap_samples(), 6u);
+  EXPECT_EQ(ring->recent().samples, 10u);
+  EXPECT_EQ(ring->recent().lost, 6u);
+  EXPECT_EQ(reader.oldest(), 0);
+  for (Tid tid = 0; tid < 10; ++tid) {
+    EXPECT_EQ(read(tid), tid % 3 == 0 ? ReadStatus::ok : ReadStatus::lost);
+    EXPECT_EQ(found(1000 + tid), tid / 3 * 3);
+  }
+  // Some lost, some still to come, and one that it wants to send nevertheless.
+  ASSERT_TRUE(ring->on_gap_untrusted(10, 1));
+  ASSERT_TRUE(take(13));
+  EXPECT_EQ(read(10), ReadStatus::lost);
+  EXPECT_EQ(read(11), ReadStatus::arriving);
+  for (const Tid tid : {10, 11, 12}) ASSERT_TRUE(take(tid));
+  ring->wake();
+  EXPECT_EQ(read(10), ReadStatus::lost);
+  EXPECT_EQ(found(1012), 12);
+  // More than the ring holds.
+  ASSERT_TRUE(ring->on_gap_untrusted(14, 100));
+  ASSERT_TRUE(take(114));
+  EXPECT_EQ(reader.oldest(), 114);
+}
+
+TEST_F(NewestFirstTest, WhatTheOwnerNoLongerHasAfterACutIsLost) {
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  ASSERT_TRUE(take(0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(3, true));
+  ASSERT_TRUE(take(6));
+  EXPECT_EQ(ring->gap_samples(), 2u);
+  EXPECT_EQ(read(2), ReadStatus::lost);
+  EXPECT_EQ(read(3), ReadStatus::arriving);
+}
+
+TEST_F(NewestFirstTest, DropsWhatHasNoPlaceAnyMore) {
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  for (const Tid tid : {3, 25}) ASSERT_TRUE(take(tid));
+  for (const Tid late : {3, 1, 9}) ASSERT_TRUE(take(late));  // the window begins at 11
+  EXPECT_EQ(read(25), ReadStatus::ok) << "9 has its slot";
+  EXPECT_EQ(read(9), ReadStatus::too_old);
+  ASSERT_TRUE(take(24));
+  ASSERT_TRUE(take(24)) << "twice";
+  EXPECT_EQ(read(24), ReadStatus::ok);
+  const MemoryShare rest = budget.take(budget.limit() - budget.used()).value();
+  EXPECT_TRUE(take(9)) << "that needs no memory";
+}
+
+TEST_F(NewestFirstTest, ALossThatCannotBeIsBounded) {
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  ASSERT_TRUE(take(channel::kMaxTid));
+  EXPECT_FALSE(ring->on_gap_untrusted(0, ~std::uint64_t{0}));
+  ASSERT_TRUE(ring->on_gap_untrusted(0, channel::kMaxTid)) << "and it does not take for ever";
+  EXPECT_EQ(read(channel::kMaxTid), ReadStatus::ok);
 }
 
 }  // namespace
