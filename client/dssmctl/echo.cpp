@@ -114,6 +114,12 @@ Error failed_read(const RawReader& reader, const std::string& what, ReadStatus s
                                                   seconds_text(to_ns(oldest.time))));
       }
       return error(Errc::not_found, "too old, the ring holds it no longer");
+    case ReadStatus::arriving:
+      return error(Errc::unavailable,
+                   "its host has not sent it yet, because newer samples go first; try again");
+    case ReadStatus::lost:
+      return error(Errc::not_found,
+                   "lost, because the network could not carry all of the stream's samples");
     case ReadStatus::lapped:
       return error(Errc::system,
                    "the writer overwrites samples faster than they can be read; give the stream "

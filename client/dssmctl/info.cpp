@@ -54,7 +54,7 @@ void print_users(const StreamInfo& stream, Output& out) {
 }
 
 // Of another host's stream: the copy that this PC keeps of it, while a program reads it here.
-void print_mirror(const MirrorInfo& mirror, Output& out) {
+void print_mirror(const MirrorInfo& mirror, double rate_hz, Output& out) {
   add_line(out, "mirror",
            fmt::format("{}{}{}", name_of(mirror.state), mirror.error.empty() ? "" : ": ",
                        escaped_message(mirror.error)));
@@ -65,6 +65,19 @@ void print_mirror(const MirrorInfo& mirror, Output& out) {
                              bytes_text(mirror.received_bytes), mirror.newest));
   if (!mirror.clock.empty()) add_line(out, "clock", escaped_message(mirror.clock));
   add_line(out, "missing", fmt::format("{} samples", mirror.gap_samples));
+  if (mirror.recent_lost_samples > 0) {
+    const double share = 1 - static_cast<double>(mirror.recent_lost_samples) /
+                                 static_cast<double>(mirror.recent_samples);
+    add_line(out, "network",
+             fmt::format("carries {:.3g} of {:.3g} samples a second; the others are missing",
+                         share * rate_hz, rate_hz));
+  }
+  if (mirror.filling_samples > 0) {
+    add_line(out, "filling",
+             fmt::format("a part of {} samples, some of which are still to come; "
+                         "newer ones are here",
+                         mirror.filling_samples));
+  }
   add_line(out, "reconnects", mirror.reconnects);
   add_line(out, "restarts", mirror.restarts);
 }
@@ -85,7 +98,7 @@ void print_stream(const StreamInfo& stream, Output& out) {
   if (stream.creator_pid != 0) {  // not known of a mirror whose owner is unavailable
     add_line(out, "created by", fmt::format("pid {}", stream.creator_pid));
   }
-  if (stream.mirror) print_mirror(*stream.mirror, out);
+  if (stream.mirror) print_mirror(*stream.mirror, stream.rate_hz, out);
   print_fields(stream, out);
   print_users(stream, out);
 }

@@ -36,7 +36,9 @@ class StampReader {
     Tid tid = reader_.cursor() + 1;
     while (tid <= newest) {
       SampleInfo info;
-      if (reader_.read_info(tid, info) != ReadStatus::ok) {
+      const ReadStatus status = reader_.read_info(tid, info);
+      if (status == ReadStatus::arriving) break;  // counted when it is here
+      if (status != ReadStatus::ok) {
         const Tid next = std::max(reader_.oldest_tid(), tid + 1);
         state_.lost += static_cast<std::uint64_t>(next - tid);
         if (meter_.on_gap) meter_.on_gap();
@@ -72,7 +74,11 @@ class StampReader {
 Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t window, bool awaited) {
   const Tid newest = reader.newest_tid();
   if (!meter.from_history) return awaited ? kNoTid : newest;
-  return std::max(newest - static_cast<Tid>(window), reader.oldest_tid() - 1);
+  const Tid start = std::max(newest - static_cast<Tid>(window), reader.oldest_tid() - 1);
+  SampleInfo info;
+  Tid tid = newest;
+  while (tid > start && reader.read_info(tid, info) != ReadStatus::arriving) --tid;
+  return tid;
 }
 
 }  // namespace

@@ -115,7 +115,10 @@ Follower::Wake Follower::wait(MonoTime deadline) {
     if (out_.must_stop()) return Wake::stop;
     if (removed() || reader_.restart_error()) return Wake::ended;
     const MonoTime next_check = std::min(deadline, deadline_in(kStopCheckPeriod));
-    if (reader_.wait(next_check) == WaitStatus::ready) return Wake::sample;
+    // Not wait(): the meters read no payloads, so the reader does not know which one is awaited.
+    Tid next = std::max(reader_.cursor() + 1, reader_.oldest_tid());
+    for (SampleInfo info; reader_.read_info(next, info) == ReadStatus::lost;) ++next;
+    if (reader_.wait_for_sample(next, next_check) == WaitStatus::ready) return Wake::sample;
     if (MonoClock::now() >= deadline) return Wake::deadline;
   }
 }

@@ -16,10 +16,14 @@ std::shared_ptr<const SharedRing> ReadyFd::ring() {
 
 bool ReadyFd::poll() noexcept {
   const std::lock_guard guard(mutex_);
-  const Tid newest = ring::RingReader(*ring_.ring->mapping).newest();
+  const ring::RingReader reader(*ring_.ring->mapping);
+  const Tid newest = reader.newest(), hole_end = reader.hole().end;
   const bool superseded = ring_.superseded->load(std::memory_order_acquire);
-  if (newest <= ring_.seen && superseded == notified_superseded_) return false;
+  if (newest <= ring_.seen && hole_end == seen_hole_end_ && superseded == notified_superseded_) {
+    return false;
+  }
   ring_.seen = newest;
+  seen_hole_end_ = hole_end;
   notified_superseded_ = superseded;
   const std::uint64_t one = 1;
   [[maybe_unused]] const ssize_t written = ::write(event_.get(), &one, sizeof one);

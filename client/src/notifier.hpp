@@ -25,8 +25,8 @@ struct ReadyRing {
   Tid seen = kNoTid;                                    // newest sample already signalled
 };
 
-// A reader's descriptor. Readable when the ring's newest tid rose since the last clear(), or when
-// the ring was superseded. Thread-safe.
+// A reader's descriptor. Readable when the ring's newest tid rose since the last clear(), when a
+// part of a mirror's hole was filled, or when the ring was superseded. Thread-safe.
 class ReadyFd {
  public:
   ReadyFd(ReadyRing ring, UniqueFd event) : ring_(std::move(ring)), event_(std::move(event)) {}
@@ -41,9 +41,10 @@ class ReadyFd {
   bool poll() noexcept;  // signals fd() if the ring changed
   void follow(ReadyRing ring);
 
-  std::mutex mutex_;  // guards ring_ and notified_superseded_
+  std::mutex mutex_;  // guards what follows, but for event_
   ReadyRing ring_;
   bool notified_superseded_ = false;
+  Tid seen_hole_end_ = 0;  // when it changed, samples may have come that a reader waits for
   UniqueFd event_;
 };
 

@@ -81,7 +81,7 @@ template <class Choose>
     if (found != ReadStatus::ok) return found;
     if (is_refused(state.ring, chosen)) return ReadStatus::clock_out_of_bounds;
     const ReadStatus status = state.ring.read(chosen, payload, info);
-    if (status == ReadStatus::too_old) return kOvertaken;
+    if (status == ReadStatus::too_old || status == ReadStatus::lost) return kOvertaken;
     if (status == ReadStatus::ok) state.set_cursor(chosen);
     return status;
   });
@@ -123,6 +123,7 @@ bool ReaderState::restart() noexcept {
   next_attempt_ns = 0;
   if (!same_samples) {
     cursor = kNoTid;  // read_next() continues with the first sample; a fresh reader stays fresh
+    awaited = kNoTid;
     ++restarts;
   }
   if (ready) client.notifiers().follow(*ready, {stream->ring, stream->superseded, cursor});
@@ -170,7 +171,11 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
   DSSM_CHECK(payload.size() == payload_bytes());
   Tid wanted = state_->cursor + 1;
   return retry([&]() -> std::optional<ReadStatus> {
-    const ReadStatus status = state_->ring.read(wanted, payload, info);
+    ReadStatus status = state_->ring.read(wanted, payload, info);
+    if (status == ReadStatus::arriving) {
+      state_->awaited = wanted;
+      status = ReadStatus::not_yet;
+    }
     if (status == ReadStatus::not_yet) {
       // Only now: the samples of the old ring are read first.
       return state_->restart_due() && state_->restart() ? ReadStatus::restarted : status;
@@ -180,7 +185,7 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
       state_->set_cursor(wanted);
       return status;
     }
-    wanted = std::max(wanted, state_->ring.oldest());
+    wanted = state_->ring.skip_lost(std::max(wanted, state_->ring.oldest()));
     return kOvertaken;
   });
 }
@@ -188,7 +193,10 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
 ReadStatus RawReader::read_previous(std::span<std::byte> payload, SampleInfo& info) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   if (state_->cursor < 0) return ReadStatus::not_yet;
-  return read_tid(state_->cursor - 1, payload, info);
+  Tid wanted = state_->cursor - 1;
+  ReadStatus status = read_tid(wanted, payload, info);
+  while (status == ReadStatus::lost) status = read_tid(--wanted, payload, info);
+  return status;
 }
 
 ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
@@ -204,7 +212,8 @@ ReadStatus RawReader::read_at_or_after(Time t, std::span<std::byte> payload,
     const ReadStatus found =
         to_ns(t) == INT64_MIN ? ReadStatus::too_old : state_->ring.find(t - Duration(1), before);
     if (found != ReadStatus::ok && found != ReadStatus::too_old) return found;
-    chosen = found == ReadStatus::too_old ? state_->ring.oldest() : before + 1;
+    chosen =
+        state_->ring.skip_lost(found == ReadStatus::too_old ? state_->ring.oldest() : before + 1);
     return ReadStatus::ok;
   });
 }
@@ -214,13 +223,15 @@ ReadStatus RawReader::read_nearest(Time t, std::span<std::byte> payload,
   return read_by_time(*state_, payload, info, [&](Tid& chosen) -> std::optional<ReadStatus> {
     const ReadStatus found = state_->ring.find(t, chosen);
     if (found == ReadStatus::too_old) {
-      chosen = state_->ring.oldest();
+      chosen = state_->ring.skip_lost(state_->ring.oldest());
       return ReadStatus::ok;
     }
     if (found != ReadStatus::ok) return found;
     SampleInfo before, after;
     if (state_->ring.stamp(chosen, before) != ReadStatus::ok) return kOvertaken;
-    if (state_->ring.stamp(chosen + 1, after) == ReadStatus::ok) chosen = closer(t, before, after);
+    if (state_->ring.stamp(state_->ring.skip_lost(chosen + 1), after) == ReadStatus::ok) {
+      chosen = closer(t, before, after);
+    }
     return ReadStatus::ok;
   });
 }
@@ -232,7 +243,7 @@ ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
     const ReadStatus found = ring.find(t, before);
     if (found != ReadStatus::ok) return found;
     Neighbours seen;
-    const ReadStatus after = ring.stamp(before + 1, seen.after);
+    const ReadStatus after = ring.stamp(ring.skip_lost(before + 1), seen.after);
     if (after == ReadStatus::not_yet) return after;
     if (after != ReadStatus::ok) return kOvertaken;
     if (ring.stamp(before, seen.before) != ReadStatus::ok) return kOvertaken;
@@ -332,7 +343,10 @@ ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
 }
 
 [[gnu::hot]] WaitStatus RawReader::wait(MonoTime deadline) noexcept {
-  return wait_for_tid(state_->cursor + 1, deadline);
+  const std::shared_ptr<detail::OpenStream> stream = state_->stream_now();
+  const ring::RingReader ring(*stream->ring->mapping);
+  return wait_until(*stream->ring->bell, deadline,
+                    [&] { return state_->has_news(ring) || state_->restart_wakes(*stream); });
 }
 
 [[gnu::hot]] WaitStatus RawReader::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
@@ -342,11 +356,18 @@ ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
                     [&] { return ring.newest() >= tid || state_->restart_wakes(*stream); });
 }
 
+WaitStatus RawReader::wait_for_sample(Tid tid, MonoTime deadline) noexcept {
+  const std::shared_ptr<detail::OpenStream> stream = state_->stream_now();
+  const ring::RingReader ring(*stream->ring->mapping);
+  return wait_until(*stream->ring->bell, deadline,
+                    [&] { return ring.is_settled(tid) || state_->restart_wakes(*stream); });
+}
+
 WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept {
   DSSM_CHECK(!readers.empty() && readers.size() <= kMaxWaitAny);
   const auto ready = [&] {
     return std::any_of(readers.begin(), readers.end(), [](const RawReader* reader) {
-      return reader->newest_tid() > reader->cursor() ||
+      return reader->state_->has_news(reader->state_->ring) ||
              reader->state_->restart_wakes(*reader->state_->stream);
     });
   };

@@ -49,7 +49,13 @@ struct ReaderState {
   // read_next() continues after `tid`.
   void set_cursor(Tid tid) noexcept {
     cursor = tid;
+    awaited = kNoTid;
     fresh = false;
+  }
+  // Whether there is something to read that was not there: after the cursor; or, after read_next()
+  // found that the next one is still arriving, that one.
+  bool has_news(const ring::RingReader& from) const noexcept {
+    return awaited == kNoTid ? from.newest() > cursor : from.is_settled(awaited);
   }
 
   // Changed only by restart(), in the thread that reads; stream_mutex is for one that waits.
@@ -58,7 +64,8 @@ struct ReaderState {
   std::shared_ptr<const SharedRing> previous;  // keeps borrowed samples mapped
   ring::RingReader ring;
   Tid cursor = kNoTid;
-  bool fresh = true;  // neither read nor seek() has set the cursor
+  Tid awaited = kNoTid;  // by read_next()
+  bool fresh = true;     // neither read nor seek() has set the cursor
   std::uint64_t lost = 0;
   std::uint64_t restarts = 0;
   std::optional<Error> restart_error;

@@ -271,7 +271,7 @@ Result<void> StreamClient::on_opened(StreamInfo stream, bool) {
   return {};
 }
 
-Result<void> StreamClient::on_subscribed_untrusted(Tid first) {
+Result<void> StreamClient::on_subscribed_untrusted(Tid first, bool /*newest_first*/) {
   return subscriber_->on_subscribed_untrusted(first);
 }
 

@@ -61,7 +61,7 @@ class BorrowedSample {
 // The two samples around a time, for interpolation.
 struct Neighbours {
   SampleInfo before;  // newest sample with time <= t
-  SampleInfo after;   // the sample written right after `before`; its time is > t
+  SampleInfo after;   // the one after it that is not lost; its time is > t
 };
 
 class RawReader;
@@ -78,6 +78,12 @@ class RawReader {
 
   // In all functions: `payload` is exactly payload_bytes() long, another length ends the program;
   // `restarted` is a further result of each that takes a payload or borrows.
+  //
+  // Of a stream of another host the newest samples come first. One that is still to come is
+  // `arriving`: a further result of read_tid(), read_previous(), read_info(), borrow() and all
+  // reads by time; read_next() returns not_yet until it is here or lost, read_newest() never waits
+  // for it. One that the network could not carry is `lost`: a further result of read_tid(),
+  // read_info() and borrow(); the others pass over it.
 
   // Copies the newest sample.
   //   returns  ok | not_yet (nothing written) | lapped
@@ -89,7 +95,8 @@ class RawReader {
 
   // Copies the sample after the cursor. The first call on a new reader returns the newest sample,
   // as in SSM; seek() selects another start. When the ring no longer holds the next sample, the
-  // oldest one it holds is returned, and the tids in between are added to lost_samples().
+  // oldest one it holds is returned, and the tids in between are added to lost_samples(), as are
+  // those of samples that are lost.
   //   returns  ok | not_yet | lapped
   ReadStatus read_next(std::span<std::byte> payload, SampleInfo& info) noexcept;
 
@@ -107,7 +114,8 @@ class RawReader {
   // "Search by time"). "The newest sample" is the one with the greatest tid.
   //   cost     O(1) on a regular stream, else O(log depth)
 
-  // Copies the newest sample with time <= `t`; the newest sample of all for any `t` after it.
+  // Copies the newest sample with time <= `t` that is not lost; the newest sample of all for any
+  // `t` after it.
   //   returns  ok | not_yet (nothing written) | too_old (all samples are later than `t`) | lapped
   ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
@@ -155,7 +163,8 @@ class RawReader {
   void seek(Tid tid) noexcept;
 
   // Samples that read_next() skipped because the ring no longer held them: the writer was faster,
-  // or the connection to the stream's host was down for longer than the host's ring keeps samples.
+  // the connection to the stream's host was down for longer than the host's ring keeps samples, or
+  // it carries less than is written.
   std::uint64_t lost_samples() const noexcept;
 
   // How often the stream restarted while this reader read it.
@@ -173,11 +182,15 @@ class RawReader {
   // --- waiting
 
   // Waits until there is a sample after the cursor, the stream has restarted, or the monotonic
-  // clock reaches `deadline` (kNever: no limit; a deadline in the past: only checks).
+  // clock reaches `deadline` (kNever: no limit; a deadline in the past: only checks). After
+  // read_next() returned not_yet: until it has something else to return.
   WaitStatus wait(MonoTime deadline) noexcept;
 
   // The same for newest_tid() >= `tid`. One thread may call it while another one reads.
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
+  // The same until sample `tid` is here or never will be: of a stream of another host it may be
+  // `arriving` when newer ones are here.
+  WaitStatus wait_for_sample(Tid tid, MonoTime deadline) noexcept;
 
   // A descriptor for poll(), epoll or an event library: readable when there may be samples newer
   // than at the last clear_ready(). On wake-up call clear_ready(), then read_next() until it
@@ -237,8 +250,8 @@ struct JointRead {
 JointRead read_joint_at(Time t, std::span<JointSample> samples,
                         Duration max_error = kUnknownClockError) noexcept;
 
-// Waits until one of `readers` has a sample after its cursor or a restarted stream, or until
-// `deadline`. 1 to kMaxWaitAny readers, all of the calling thread.
+// Waits until one of `readers` need not wait(), or until `deadline`. 1 to kMaxWaitAny readers, all
+// of the calling thread.
 inline constexpr std::size_t kMaxWaitAny = 128;  // FUTEX_WAITV_MAX of Linux
 WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
 

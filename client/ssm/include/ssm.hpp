@@ -30,6 +30,9 @@ size_t dssm_ssm_data_size(SSM_sid sid);
 int dssm_ssm_wait_stream(const char* stream_name, int stream_id, double timeout);
 // As get_propertySSM, but only when the property is exactly `size` bytes; reports on stderr if not.
 int dssm_ssm_get_property(const char* stream_name, int stream_id, void* data, size_t size);
+// The first of the samples from `tid` on that is not lost. One that is not here yet is an error;
+// with `waits` only after a second.
+SSM_tid dssm_ssm_next(SSM_sid sid, SSM_tid tid, int waits);
 }
 
 // The default property: none.
@@ -196,28 +199,29 @@ class SSMApiBase {
   }
 
   // The sample `dt` after the last one; the newest at first. When the ring no longer holds it, the
-  // oldest it holds.
+  // oldest it holds; when it is lost, the next one that is not.
   bool readNext(int dt = 1) {
     if (!isOpen()) return false;
     if (timeId < 0) {
       if (isBlocking && waitTID(ssmId, 0) != 1) return false;
       return read(-1);
     }
-    const SSM_tid target = after(timeId, dt);
+    const SSM_tid wanted = after(timeId, dt);
+    SSM_tid target = wanted;
     // Again when a fast writer overtakes this thread between asking and reading.
     for (int attempt = 0; attempt < 100; ++attempt) {
-      if (!isGone(target)) {
-        if (isBlocking && waitTID(ssmId, target) != 1) return false;
-        if (target >= 0 && read(target)) return true;
-        if (!isGone(target)) return false;  // not there yet
+      if (isGone(target)) target = getTID_bottom(ssmId);
+      target = dssm_ssm_next(ssmId, target, isBlocking);
+      if (target < 0) return false;  // not there yet
+      if (read(target)) {
+        if (target != wanted && isVerbose) {
+          std::cerr << "SSM::readNext() : skipping read data  '" << getStreamName()
+                    << "', id = " << streamId << " TID: " << wanted << " -> " << target
+                    << std::endl;
+        }
+        return true;
       }
-      const SSM_tid bottom = getTID_bottom(ssmId);
-      if (!read(bottom)) continue;
-      if (isVerbose) {
-        std::cerr << "SSM::readNext() : skipping read data  '" << getStreamName()
-                  << "', id = " << streamId << " TID: " << target << " -> " << bottom << std::endl;
-      }
-      return true;
+      if (!isGone(target)) return false;
     }
     return false;
   }

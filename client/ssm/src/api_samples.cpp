@@ -22,6 +22,14 @@ namespace {
 using ReadCallback = void (*)(const void* ssmp, void* data, void* user_data);
 using WriteCallback = void (*)(void* ssmp, const void* data, void* user_data);
 
+constexpr dssm::Duration kWait = std::chrono::seconds(1);
+// A handler that closes the sid interrupts a wait; another thread's closing is seen by a check.
+constexpr dssm::Duration kCheckPause = std::chrono::milliseconds(100);
+
+bool is_to_come(ReadStatus status) noexcept {
+  return status == ReadStatus::not_yet || status == ReadStatus::arriving;
+}
+
 SSM_tid error_of(ReadStatus status) noexcept {
   if (status == ReadStatus::clock_out_of_bounds) {
     remember_error(
@@ -29,7 +37,7 @@ SSM_tid error_of(ReadStatus status) noexcept {
         "enough (dssmctl clock)");
     return SSM_ERROR_NO_DATA;
   }
-  return status == ReadStatus::not_yet ? SSM_ERROR_NO_DATA : SSM_ERROR_PAST;
+  return is_to_come(status) ? SSM_ERROR_NO_DATA : SSM_ERROR_PAST;
 }
 
 // Reads by `read` and passes the sample to `take`, exactly once, if there is one.
@@ -48,11 +56,18 @@ SSM_tid read_and_take(SSM_sid sid, ssmTimeT* ytime, Read read, Take take) {
 
 auto by_tid(SSM_tid tid) {
   return [tid](Stream& stream, Stream::Copy& copy) -> SSM_tid {
-    const ReadStatus status =
-        tid < 0 ? stream.latest(copy) : stream.tid(ring_tid(tid, stream.newest()), copy);
+    if (tid < 0) {
+      const ReadStatus status = stream.latest(copy);
+      return status == ReadStatus::ok ? 0 : error_of(status);
+    }
+    dssm::Tid wanted = ring_tid(tid, stream.newest());
+    ReadStatus status = stream.tid(wanted, copy);
+    // Programs that read one sample after the other would wait for it for ever.
+    if (status == ReadStatus::lost && !is_to_come(status = stream.skip_lost(wanted))) {
+      status = stream.tid(wanted, copy);
+    }
     if (status == ReadStatus::ok) return 0;
-    if (tid < 0) return error_of(status);
-    return status == ReadStatus::not_yet ? SSM_ERROR_FUTURE : SSM_ERROR_PAST;
+    return is_to_come(status) ? SSM_ERROR_FUTURE : SSM_ERROR_PAST;
   };
 }
 auto by_time(ssmTimeT time) {
@@ -111,15 +126,27 @@ int waitTID(SSM_sid sid, SSM_tid tid) {
   const dssm::Tid newest = use->newest();
   if (tid < 0) return 1;
   const dssm::Tid wanted = ring_tid(tid, newest);
-  const dssm::MonoTime deadline = dssm::deadline_in(std::chrono::seconds(1));
-  // A handler that closes the sid interrupts the wait; another thread's closing is seen by a check.
-  constexpr dssm::Duration kCheckPause = std::chrono::milliseconds(100);
+  const dssm::MonoTime deadline = dssm::deadline_in(kWait);
   for (;;) {
     if (use->newest() >= wanted) return 1;
     if (use.closed()) return -1;
     const dssm::MonoTime now = dssm::MonoClock::now();
     if (now >= deadline) return 0;
     static_cast<void>(use->wait_for_tid(wanted, std::min(deadline, now + kCheckPause)));
+  }
+}
+
+SSM_tid dssm_ssm_next(SSM_sid sid, SSM_tid tid, int waits) {
+  const SidUse use(sid);
+  if (!use || tid < 0) return SSM_ERROR_NO_DATA;
+  dssm::Tid next = ring_tid(tid, use->newest());
+  const dssm::MonoTime deadline = dssm::deadline_in(waits ? kWait : dssm::Duration::zero());
+  for (;;) {
+    if (use->newest() >= next && !is_to_come(use->skip_lost(next))) return ssm_tid(next);
+    if (use.closed()) return SSM_ERROR_NO_DATA;
+    const dssm::MonoTime now = dssm::MonoClock::now();
+    if (now >= deadline) return SSM_ERROR_FUTURE;
+    static_cast<void>(use->wait_for_sample(next, std::min(deadline, now + kCheckPause)));
   }
 }
 

@@ -199,6 +199,8 @@ ReadStatus Stream::tid(Tid tid, Copy& out) noexcept {
   return copy(out, [&](RawReader& open) {
     const Tid wanted = tid - offset();
     if (wanted < 0) return ReadStatus::too_old;
+    SampleInfo info;
+    if (open.read_info(wanted, info) == ReadStatus::lost) return ReadStatus::lost;
     for (int attempt = 0; attempt < kAttempts; ++attempt) {
       // Not by RawReader::read_tid(), which leaves the old ring at once.
       open.seek(wanted - 1);
@@ -235,7 +237,26 @@ Duration Stream::clock_error(Tid tid) noexcept {
                                                                  : kUnknownClockError;
 }
 
+ReadStatus Stream::skip_lost(Tid& tid) noexcept {
+  RawReader* const open = reader();
+  if (!open) return ReadStatus::not_yet;
+  const std::lock_guard guard(read_lock_);
+  SampleInfo info;
+  ReadStatus status = open->read_info(tid - offset(), info);
+  for (; status == ReadStatus::lost; status = open->read_info(tid - offset(), info)) ++tid;
+  return status;
+}
+
 WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
+  return wait_for(tid, &RawReader::wait_for_tid, deadline);
+}
+
+WaitStatus Stream::wait_for_sample(Tid tid, MonoTime deadline) noexcept {
+  return wait_for(tid, &RawReader::wait_for_sample, deadline);
+}
+
+WaitStatus Stream::wait_for(Tid tid, WaitStatus (RawReader::*wait)(Tid, MonoTime),
+                            MonoTime deadline) noexcept {
   RawReader* const open = reader();
   if (!open) {  // nothing to sleep on; the caller checks again
     const timespec sleep = timespec_of(deadline - MonoClock::now());
@@ -243,10 +264,12 @@ WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
   }
   // Without the lock, so that other threads may read meanwhile: a wait for a given tid uses nothing
   // of the reader that reading changes.
-  const WaitStatus status = open->wait_for_tid(tid - offset(), deadline);
+  const WaitStatus status = (open->*wait)(tid - offset(), deadline);
   // A new ring ends the wait as well: let the caller check again, but not in a tight loop while the
   // new ring cannot be opened.
-  if (status == WaitStatus::ready && newest() < tid) {
+  const auto is_arriving = [&](Tid next) { return skip_lost(next) == ReadStatus::arriving; };
+  if (status == WaitStatus::ready &&
+      (newest() < tid || (wait == &RawReader::wait_for_sample && is_arriving(tid)))) {
     const timespec pause{0, 1'000'000};
     ::nanosleep(&pause, nullptr);
   }

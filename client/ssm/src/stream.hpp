@@ -74,7 +74,11 @@ class Stream {
   ReadStatus find(Time t, SampleInfo& info) noexcept;
   // RawReader::clock_error() of sample `tid`; kUnknownClockError also when it is not held.
   Duration clock_error(Tid tid) noexcept;
+  // Makes `tid` that of the first sample from there on that is not lost. Returns what
+  // RawReader::read_info() says of it.
+  ReadStatus skip_lost(Tid& tid) noexcept;
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
+  WaitStatus wait_for_sample(Tid tid, MonoTime deadline) noexcept;
 
   // Writes one sample; kNoTid when the writer cannot be opened or this thread is writing to the
   // stream already, in a callback or in the code that a signal handler interrupted.
@@ -88,6 +92,8 @@ class Stream {
   void reset_after_fork() noexcept;
 
  private:
+  WaitStatus wait_for(Tid tid, WaitStatus (RawReader::*wait)(Tid, MonoTime),
+                      MonoTime deadline) noexcept;
   template <class End, class Open>
   End* end_of(std::atomic<End*>& place, ReentrantLock& lock, Open open) noexcept;
   RawReader* reader() noexcept;

@@ -47,7 +47,14 @@ void seek_to_drive(dssm::Reader<T>& reader, bool late) {
   dssm::SampleInfo info;
   const dssm::Tid newest = reader.newest_tid();
   for (dssm::Tid tid = newest; tid >= 0; --tid) {
-    if (reader.read_tid(tid, sample, info) != dssm::ReadStatus::ok) break;
+    dssm::ReadStatus status = reader.read_tid(tid, sample, info);
+    // From another PC the newest samples come first.
+    while (status == dssm::ReadStatus::arriving && !stop_requested()) {
+      (void)reader.wait_for_sample(tid, dssm::deadline_in(kSlice));
+      status = reader.read_tid(tid, sample, info);
+    }
+    if (status == dssm::ReadStatus::lost) continue;
+    if (status != dssm::ReadStatus::ok) break;
     if (sample.is_end() && !(late && tid == newest)) return reader.seek(tid);
   }
   reader.seek(dssm::kNoTid);

@@ -21,8 +21,10 @@ bool ScanAt::at(dssm::Time t, dssm::Tid tid, Scan& out) {
     if (status == dssm::ReadStatus::restarted) continue;
     if (status == dssm::ReadStatus::ok && info.tid == tid) return true;
     const dssm::MonoTime now = dssm::MonoClock::now();
-    if (written || now >= deadline) return false;
-    (void)reader_.wait_for_tid(tid, std::min(deadline, now + kSlice));
+    // From another PC the newest scans come first, and this one may be on its way.
+    const bool is_awaited = !written || status == dssm::ReadStatus::arriving;
+    if (!is_awaited || now >= deadline) return false;
+    (void)reader_.wait_for_sample(tid, std::min(deadline, now + kSlice));
   }
   return false;
 }
