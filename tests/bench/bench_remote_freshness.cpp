@@ -5,11 +5,16 @@
 // it, bare TCP that sends the newest frame each time the last one is with the kernel.
 //
 // The stream is a camera's, 640 x 480 x 3 bytes 30 times a second (27.6 MB/s), with a history of
-// 5 s. The network namespaces of both hosts have one clock, so ages are exact.
+// 5 s. Then an encoder's stream, 64 bytes 1,000 times a second, alone, and beside a history of 1 GB
+// that fills the same link.
+//
+// The network namespaces of both hosts have one clock, so ages are exact. TCP's congestion control
+// is Debian's default, cubic.
 #include <atomic>
 #include <cmath>
 #include <cstring>
 #include <dssm/dssm.hpp>
+#include <fstream>
 #include <optional>
 #include <string>
 #include <thread>
@@ -167,9 +172,93 @@ void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_
   end_child(writer);
 }
 
+// --- a small stream beside a large history
+
+constexpr std::size_t kEncoderBytes = 64;
+constexpr Duration kEncoderPeriod = 1ms;
+constexpr std::uint64_t kManyFrames = (1U << 30) / kFrameBytes;
+
+[[noreturn]] void write_encoder_and_frames(const std::string& socket,
+                                           std::atomic<bool>& is_filled) {
+  Session session = Session::connect({.socket_path = socket}).value();
+  RawWriter frames = session
+                         .create_raw({"camera", 0, ""}, {"", kFrameBytes, 1, {}},
+                                     History{kManyFrames + 2, kPeriod})
+                         .value();
+  const std::vector<std::byte> frame(kFrameBytes, std::byte{1});
+  for (std::uint64_t i = 0; i < kManyFrames; ++i) frames.write(frame, WallClock::now());
+  RawWriter encoder = session
+                          .create_raw({"encoder", 0, ""}, {"", kEncoderBytes, 1, {}},
+                                      History{10'000, kEncoderPeriod})
+                          .value();
+  const std::vector<std::byte> sample(kEncoderBytes);
+  is_filled.store(true);
+  for (MonoTime next = MonoClock::now();;) {
+    sleep_until(next += kEncoderPeriod);
+    encoder.write(sample, WallClock::now());
+  }
+}
+
+// How long each sample of the encoder took until a program on the other PC had it.
+std::vector<double> one_way_times(RawReader& encoder, Duration how_long) {
+  std::vector<std::byte> payload(kEncoderBytes);
+  std::vector<double> times;
+  encoder.seek(encoder.newest_tid());
+  const std::uint64_t lost = encoder.lost_samples();
+  for (const MonoTime end = MonoClock::now() + how_long; MonoClock::now() < end;) {
+    static_cast<void>(encoder.wait(end));
+    for (SampleInfo info; encoder.read_next(payload, info) == ReadStatus::ok;) {
+      times.push_back(age_ns(info.time));
+    }
+  }
+  if (encoder.lost_samples() != lost) fail("samples of the encoder were lost");
+  return times;
+}
+
+void measure_beside(test::Network& network, const Hosts& hosts, int megabytes_per_s) {
+  const std::string rate = std::to_string(megabytes_per_s * 8) + "mbit";
+  if (!network.shape(2, "tbf rate " + rate + " burst 256kb latency 10ms")) return;
+  const auto owner = hosts.start_owner("error");
+  const std::string socket = owner->socket_path();
+  auto& is_filled = shared<std::atomic<bool>>();
+  const pid_t writer = in_child([&] { write_encoder_and_frames(socket, is_filled); });
+  while (!is_filled.load()) ::usleep(10'000);
+  {
+    const auto other = hosts.start_other(*owner);
+    Session session = Session::connect({.socket_path = other->socket_path()}).value();
+    RawReader encoder =
+        session.await_raw_reader(StreamId{"encoder", 0, "pc1"}, deadline_in(60s)).value();
+    one_way_times(encoder, 1s);
+    const Figures alone = figures_of(one_way_times(encoder, kWatched));
+    RawReader camera =
+        session.await_raw_reader(StreamId{"camera", 0, "pc1"}, deadline_in(60s)).value();
+    const auto filling = [&] { return session.stream_info(camera.id()).value().mirror.value(); };
+    const std::uint64_t before = filling().received_bytes;
+    const Figures beside = figures_of(one_way_times(encoder, kWatched));
+    const double carried = static_cast<double>(filling().received_bytes - before) /
+                           std::chrono::duration<double>(kWatched).count() / 1e6;
+    const std::string tail = ", " + std::to_string(megabytes_per_s) + " MB/s [ms]";
+    print_row("  encoder alone" + tail,
+              {alone.min / 1e6, alone.median / 1e6, alone.p99 / 1e6, alone.p999 / 1e6});
+    char rest[96];
+    std::snprintf(rest, sizeof rest, "%7.2f  %.0f MB/s of history", beside.p99 / alone.p99,
+                  carried);
+    print_row("encoder beside a history" + tail,
+              {beside.min / 1e6, beside.median / 1e6, beside.p99 / 1e6, beside.p999 / 1e6}, rest);
+  }
+  end_child(writer);
+}
+
+void use_cubic(const Hosts& hosts) {
+  for (const int host : {1, 2}) {
+    const auto inside = hosts.inside(host);
+    std::ofstream("/proc/sys/net/ipv4/tcp_congestion_control") << "cubic\n";
+  }
+}
+
 }  // namespace
 
-int main() {
+int main(int argc, char** argv) {
   auto network = test::Network::open(2);
   if (!network) {
     std::printf("--- SKIPPED: %s\n", network.error().message.c_str());
@@ -177,6 +266,11 @@ int main() {
   }
   test::Network& shaped = **network;
   const Hosts hosts(*std::move(network));
+  use_cubic(hosts);
   print_head();
-  for (const int megabytes_per_s : {10, 60, 110}) measure_link(shaped, hosts, megabytes_per_s);
+  const bool only_beside = argc > 1 && std::string(argv[1]) == "beside";
+  for (const int megabytes_per_s : {10, 60, 110}) {
+    if (!only_beside) measure_link(shaped, hosts, megabytes_per_s);
+    measure_beside(shaped, hosts, megabytes_per_s);
+  }
 }

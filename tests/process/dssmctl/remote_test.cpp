@@ -141,6 +141,7 @@ TEST_F(Remote, InfoShowsOwnerChannelsAndTheMirrorsState) {
   EXPECT_EQ(info["mirror"]["received_samples"], 10);
   EXPECT_EQ(info["mirror"]["received_bytes"], 80);
   EXPECT_EQ(info["mirror"]["gap_samples"], 0);
+  EXPECT_EQ(info["mirror"]["filling_samples"], 0);
   EXPECT_EQ(info["mirror"]["reconnects"], 0);
   EXPECT_EQ(info["mirror"]["restarts"], 0);
   EXPECT_TRUE(info["mirror"]["error"].is_null());

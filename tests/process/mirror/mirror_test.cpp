@@ -187,7 +187,7 @@ TEST_F(TwoHosts, CarrySamplesOfOneByteAtRate) {
   for (Tid tid = 0; tid < kSamples; ++tid) {
     std::byte byte{};
     SampleInfo info;
-    ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+    ASSERT_EQ(reader.wait_for_sample(tid, kNever), WaitStatus::ready);
     ASSERT_EQ(reader.read_next({&byte, 1}, info), ReadStatus::ok);
     ASSERT_EQ(info.tid, tid);
     ASSERT_EQ(byte, static_cast<std::byte>(tid * 7));

@@ -80,11 +80,16 @@ class Equality : public NetworkTest {
     return time_from_ns(times(random));
   }
 
-  // Waits until all mirrors have the owner's newest sample.
+  // Waits until all mirrors have all that the owner has.
   void await_mirrors(Watched& stream) {
     for (RawReader& reader : stream.readers) {
       ASSERT_EQ(reader.wait_for_tid(stream.writer.newest_tid(), kNever), WaitStatus::ready);
       EXPECT_EQ(reader.newest_tid(), stream.writer.newest_tid());
+      SampleInfo info;
+      await("nothing is on its way", [&] {
+        return reader.find(stream.known.info(reader.oldest_tid()).time, info) !=
+               ReadStatus::arriving;
+      });
       EXPECT_EQ(reader.oldest_tid(), stream.readers[0].oldest_tid()) << "not the same window";
     }
   }

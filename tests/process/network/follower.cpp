@@ -32,7 +32,8 @@ ReadStatus Follower::next(SampleInfo& info) {
 void Follower::take(int most) {
   SampleInfo info;
   for (int i = 0; i < most; ++i) {
-    switch (next(info)) {
+    const ReadStatus status = next(info);
+    switch (status) {
       case ReadStatus::ok:
         check(info);
         break;
@@ -48,7 +49,9 @@ void Follower::take(int most) {
       case ReadStatus::lapped:               // repeatedly; the next call continues
         return;
       case ReadStatus::too_old:
-        fault("next() returned too_old");
+      case ReadStatus::arriving:
+      case ReadStatus::lost:
+        fault("next() returned " + std::string(name_of(status)));
         return;
     }
   }
@@ -85,7 +88,7 @@ void Follower::check(const SampleInfo& info) {
           " are missing, and " + std::to_string(counted) + " were counted");
   }
   // Queried after the loss: the samples of the ring now were in it when they were counted as lost.
-  if (left_out > 0 && owner_ && owner_->oldest_tid() < info.tid) {
+  if (left_out > 0 && owner_ && !is_thinned_ && owner_->oldest_tid() < info.tid) {
     fault("tids " + std::to_string(last_ + 1) + " to " + std::to_string(info.tid - 1) +
           " were lost, and the owner's ring holds those from " +
           std::to_string(owner_->oldest_tid()));

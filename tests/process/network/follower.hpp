@@ -33,6 +33,8 @@ class Follower {
   PConnector& connector() { return std::get<PConnector>(source_); }
   const KnownStream& known() const { return known_; }
   // The newest sample of the owner's ring has been taken.
+  // The network carries less than the stream: what is lost may still be in the owner's ring.
+  void expect_thinning() { is_thinned_ = true; }
   bool has_all() const { return owner_ && last_ == owner_->newest_tid(); }
 
   Tid first() const { return first_; }  // the first available one of the last ring
@@ -52,6 +54,7 @@ class Follower {
 
   KnownStream known_;
   std::variant<RawReader, PConnector> source_;
+  bool is_thinned_ = false;
   std::optional<RawReader> owner_;
   std::vector<std::byte> payload_;
   std::uint64_t life_ = 0;  // 0: of the next sample

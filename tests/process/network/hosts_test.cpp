@@ -40,7 +40,7 @@ void expect_samples(RawReader& reader, const KnownStream& known, Tid first, Tid 
   std::vector<std::byte> payload(known.payload_bytes);
   SampleInfo info;
   for (Tid tid = first; tid <= last; ++tid) {
-    ASSERT_EQ(reader.wait_for_tid(tid, kNever), WaitStatus::ready);
+    ASSERT_EQ(reader.wait_for_sample(tid, kNever), WaitStatus::ready);
     ASSERT_EQ(reader.read_next(payload, info), ReadStatus::ok);
     ASSERT_EQ(info.tid, tid);
     ASSERT_EQ(known.fault(payload, info, 1), "");
@@ -207,6 +207,7 @@ TEST_F(Hosts, WithASlowNetworkSkipSamplesAndCountThem) {
     followers.emplace_back(known, there.await_raw_reader(known.id, kNever).value(),
                            owner.await_raw_reader(known.id, kNever).value());
   }
+  followers[0].expect_thinning();
   RawReader* const readers[] = {&followers[0].reader(), &followers[1].reader()};
   const auto take_until = [&](auto enough) {
     while (!enough()) {
@@ -224,6 +225,104 @@ TEST_F(Hosts, WithASlowNetworkSkipSamplesAndCountThem) {
   }
   EXPECT_GT(followers[0].taken(), 100u);
   EXPECT_EQ(followers[1].lost(), 0u);
+}
+
+// The history would take the network for some nine seconds. In the order of tids, the newest sample
+// would be a hundred tids behind meanwhile.
+TEST_F(Hosts, WithASlowNetworkShowTheNewestSampleBeforeTheHistory) {
+  if (!make_fleet(2)) return;
+  const Result<void> slow = fleet->network().shape(2, "tbf rate 40mbit burst 64kb latency 50ms");
+  if (!slow) GTEST_SKIP() << slow.error().message;
+  const KnownStream known{{"camera", 0, "pc1"}, 64 << 10, 256, 20ms, 0ms, 1};
+  constexpr Tid kMostBehind = 30;  // of a network that carries 76 samples a second
+  Session here = fleet->session(1), there = fleet->session(2);
+  RawWriter writer = make(here, known);
+  write_until(writer, known, 299);
+  const RawReader owners = here.await_raw_reader(known.id, kNever).value();
+  RawReader reader = there.await_raw_reader(known.id, kNever).value();
+  const auto mirror = [&] { return there.stream_info(known.id).value().mirror.value(); };
+  EXPECT_GT(mirror().filling_samples, 0u) << "the network was faster than it should be";
+  std::atomic<bool> stop = false;
+  std::thread writing([&] {
+    for (Tid last = 300; !stop; ++last) {
+      write_until(writer, known, last);
+      std::this_thread::sleep_for(known.cycle);
+    }
+  });
+  Tid behind = 0;
+  const auto look = [&] { behind = std::max(behind, owners.newest_tid() - reader.newest_tid()); };
+  std::vector<std::byte> payload(known.payload_bytes);
+  SampleInfo info;
+  EXPECT_EQ(reader.read_at(known.info(owners.oldest_tid() + 1).time, payload, info),
+            ReadStatus::arriving);
+  await("the history is here", [&] { return look(), mirror().filling_samples == 0; });
+  stop = true;
+  writing.join();
+  await("all is here", [&] {
+    return reader.newest_tid() == owners.newest_tid() && mirror().filling_samples == 0;
+  });
+  EXPECT_LE(behind, kMostBehind);
+  for (Tid tid = reader.oldest_tid(); tid <= reader.newest_tid(); ++tid) {
+    ASSERT_EQ(reader.read_at(known.info(tid).time, payload, info), ReadStatus::ok) << tid;
+    ASSERT_EQ(info.tid, tid);
+    ASSERT_EQ(known.fault(payload, info, 1), "");
+  }
+}
+
+// The network carries 38 of 200 samples a second.
+TEST_F(Hosts, WithANetworkThatCarriesLessThanAStreamStayFresh) {
+  if (!make_fleet(2)) return;
+  const Result<void> slow = fleet->network().shape(2, "tbf rate 20mbit burst 64kb latency 50ms");
+  if (!slow) GTEST_SKIP() << slow.error().message;
+  const KnownStream known{{"camera", 0, "pc1"}, 64 << 10, 1024, 5ms, 0ms, 1};
+  constexpr Tid kMostBehind = 200;  // a second: on a busy machine
+  Session here = fleet->session(1), there = fleet->session(2);
+  RawWriter writer = make(here, known);
+  write_until(writer, known, 0);
+  const std::jthread writing([&](const std::stop_token& stop) {
+    for (Tid last = 1; !stop.stop_requested(); ++last) {
+      write_until(writer, known, last);
+      std::this_thread::sleep_for(known.cycle);
+    }
+  });
+  const RawReader owners = here.await_raw_reader(known.id, kNever).value();
+  RawReader reader = there.await_raw_reader(known.id, kNever).value();
+  std::vector<std::byte> payload(known.payload_bytes);
+  SampleInfo info;
+  Tid last = kNoTid, left_out = 0;
+  int found_by_time = 0;
+  const auto read_some = [&] {
+    while (reader.read_next(payload, info) == ReadStatus::ok) {
+      ASSERT_EQ(known.fault(payload, info, 1), "");
+      ASSERT_GT(info.tid, last);
+      if (last != kNoTid) left_out += info.tid - last - 1;
+      last = info.tid;
+    }
+  };
+  const auto mirror = [&] { return there.stream_info(known.id).value().mirror.value(); };
+  await("the network is known to be too slow, and what waited before that is lost", [&] {
+    read_some();
+    return HasFatalFailure() ||
+           (mirror().recent_lost_samples > 0 && owners.newest_tid() - last <= kMostBehind);
+  });
+  for (const Tid end = last + 500; last < end && !HasFatalFailure();) {
+    ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+    read_some();
+    ASSERT_LE(owners.newest_tid() - last, 4 * kMostBehind) << "in their order";
+    ASSERT_LE(owners.newest_tid() - reader.newest_tid(), kMostBehind);
+    ASSERT_EQ(reader.read_info(last, info), ReadStatus::ok);
+    // On a busy machine the writer may be slow for a moment, and then there is time for the past.
+    const ReadStatus found = reader.find(known.info(last - 100).time, info);
+    ASSERT_TRUE(found == ReadStatus::ok || found == ReadStatus::arriving) << name_of(found);
+    if (found != ReadStatus::ok) continue;
+    ++found_by_time;
+    ASSERT_LE(info.tid, last - 100);
+    ASSERT_GE(info.tid, last - 200);
+  }
+  EXPECT_GT(left_out, 0);
+  EXPECT_GT(found_by_time, 0);
+  EXPECT_EQ(reader.lost_samples(), static_cast<std::uint64_t>(left_out));
+  EXPECT_GE(mirror().gap_samples, reader.lost_samples());
 }
 
 TEST_F(Hosts, WithALongDelayLoseNothing) {
