@@ -192,16 +192,17 @@ Error SampleCursor::unexpected(Tid tid) const {
           fmt::format("sample {} came instead of sample {} or a later one", tid, next_)};
 }
 
-Error SampleCursor::invalid_gap(Tid first, std::uint64_t count) {
-  return {Errc::protocol,
-          fmt::format("the owner reports a gap of {} samples from sample {} on", count, first)};
+Result<Tid> SampleCursor::end_of_gap_untrusted(Tid first, std::uint64_t count) {
+  if (first < 0 || first > kMaxTid || count > static_cast<std::uint64_t>(kMaxTid - first)) {
+    return Error{
+        Errc::protocol,
+        fmt::format("the owner reports a gap of {} samples from sample {} on", count, first)};
+  }
+  return first + static_cast<Tid>(count);
 }
 
 Result<void> SampleCursor::on_gap_untrusted(Tid first, std::uint64_t count) {
-  if (first < 0 || first > kMaxTid || count > static_cast<std::uint64_t>(kMaxTid - first)) {
-    return invalid_gap(first, count);
-  }
-  const Tid end = first + static_cast<Tid>(count);
+  const Tid end = DSSM_TRY(end_of_gap_untrusted(first, count));
   if (end <= next_) {
     return Error{Errc::protocol,
                  fmt::format("the owner reports the samples before {} as lost, but sample {} has "

@@ -76,7 +76,9 @@ class SampleCursor {
   // The owner's ring no longer has these.
   //   fails  protocol: they have come already, or are no tids
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
-  static Error invalid_gap(Tid first, std::uint64_t count);
+  // The tid after the last one of a gap.
+  //   fails  protocol: they are no tids
+  static Result<Tid> end_of_gap_untrusted(Tid first, std::uint64_t count);
 
  private:
   Tid next_ = kNoTid;

@@ -103,9 +103,10 @@ struct TidRange {
   bool holds(Tid tid) const noexcept { return tid >= begin && tid < end; }
 };
 
-// Of these samples of a mirror all or some are still to come; those after them are here, or lost.
-// Searches by time begin there. In other rings it is empty.
-// In this order: while a hole is opened, the one that is seen may be greater, and not smaller.
+// The hole of a mirror: samples of which some are still to come. All samples after it are here or
+// lost, and searches by time begin after it. In other rings it is empty. The end is loaded first,
+// because it is stored first: while the hole grows, a reader may see it greater than it is, but
+// never smaller.
 inline TidRange hole_of(const RingHeader& header) noexcept {
   const Tid end = header.hole_end.load(std::memory_order_acquire);
   return {header.hole_begin.load(std::memory_order_acquire), end};

@@ -50,7 +50,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   std::size_t bytes = 0;
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
-    Tid sent_up_to = (fills_ ? back_fill_.begin : next_) + 1;
+    Tid sent_up_to = chosen() + 1;
     if (under_way_) {
       status = sender_.go_on();
       bytes += SampleSender::kSliceBytes;
@@ -67,7 +67,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       const Tid last = last_of_run();
       observer_.before_samples();
       if (!connection_.output_empty()) return PumpWait::output;
-      const Tid at = fills_ ? back_fill_.begin : next_;
+      const Tid at = chosen();
       if (sender_.sends_in_place()) {
         sent_up_to = at + 1;
         status = sender_.send(at, 0, at < last);
@@ -79,7 +79,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
         bytes += static_cast<std::size_t>(sent_up_to - at) * payload_bytes_;
       }
     }
-    Tid& at = fills_ ? back_fill_.begin : next_;
+    Tid& at = chosen();
     under_way_ = sender_.busy();
     switch (status) {
       case SendStatus::sent:

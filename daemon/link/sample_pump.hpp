@@ -8,8 +8,8 @@
 //
 // With Plan::newest_first, a receiver that shows what is now does not wait for what was: samples
 // that wait for long are passed over, and sent when no newer ones wait, the newest of them first.
-// When the network carries fewer samples than are written, those would never be sent: they are lost
-// at once.
+// When the network carries fewer samples than are written, those would never be sent: after some
+// seconds they are reported as lost.
 //
 // Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
 #pragma once
@@ -114,6 +114,8 @@ class SamplePump {
   enum class Next : std::uint8_t { ready, wait_for_sample, wait_for_time, end };
   Next choose_next(MonoTime now);
   Next choose_newest_first(MonoTime now);
+  // The sample that is sent, or is to be sent next.
+  Tid& chosen() noexcept { return fills_ ? back_fill_.begin : next_; }
   Tid last_of_run() const noexcept;
   bool takes_long(Tid count) const noexcept;
   void pass_over(Tid next, MonoTime now);

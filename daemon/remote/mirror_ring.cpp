@@ -81,11 +81,8 @@ Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first) {
 
 Result<void> MirrorRing::on_gap_untrusted(Tid first, std::uint64_t count) {
   if (!newest_first_) return cursor_.on_gap_untrusted(first, count);
-  if (first < 0 || first > channel::kMaxTid ||
-      count > static_cast<std::uint64_t>(channel::kMaxTid - first)) {
-    return channel::SampleCursor::invalid_gap(first, count);
-  }
-  const Tid end = first + static_cast<Tid>(count), next = cursor_.next();
+  const Tid end = DSSM_TRY(channel::SampleCursor::end_of_gap_untrusted(first, count));
+  const Tid next = cursor_.next();
   lose_late({first, std::min(end, next)});
   lose_ahead({std::max(first, next), end});
   return {};

@@ -55,7 +55,7 @@ class MirrorRing {
   Result<void> on_subscribed_untrusted(Tid first, bool newest_first);
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
   // Where the payload of this sample goes, until end() or another begin_untrusted().
-  //   fails  protocol: it does not come now; limit_exceeded: no memory to receive what is dropped
+  //   fails  protocol: its tid may not come now
   Result<std::byte*> begin_untrusted(const wire::IncomingSample& sample);
   // The payload is in place. Of the samples between the newest one and it, those that were reported
   // as lost are marked so, and the others become the hole. Without newest_first, the samples before

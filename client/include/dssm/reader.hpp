@@ -250,8 +250,8 @@ struct JointRead {
 JointRead read_joint_at(Time t, std::span<JointSample> samples,
                         Duration max_error = kUnknownClockError) noexcept;
 
-// Waits until one of `readers` need not wait(), or until `deadline`. 1 to kMaxWaitAny readers, all
-// of the calling thread.
+// Waits until wait() of one of `readers` would return `ready`, or until `deadline`. 1 to
+// kMaxWaitAny readers, all of the calling thread.
 inline constexpr std::size_t kMaxWaitAny = 128;  // FUTEX_WAITV_MAX of Linux
 WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
 
