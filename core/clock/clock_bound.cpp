@@ -45,4 +45,9 @@ Duration growth(Duration age, PartsPerBillion drift) noexcept {
   return Duration(seconds * drift + (rest * drift + kBillion - 1) / kBillion);
 }
 
+Duration gained(Duration age, PartsPerBillion rate) noexcept {
+  return Duration(static_cast<std::int64_t>(static_cast<double>(age.count()) *
+                                            static_cast<double>(rate) / 1e9));
+}
+
 }  // namespace dssm::clock

@@ -33,4 +33,7 @@ Duration bound_to_reference(Duration offset, const RootDistance& own,
 // What `drift` adds in `age`. An age below 0 adds nothing.
 Duration growth(Duration age, PartsPerBillion drift) noexcept;
 
+// What a clock that runs faster than another by `rate` gains on it in `age`, or loses if negative.
+Duration gained(Duration age, PartsPerBillion rate) noexcept;
+
 }  // namespace dssm::clock

@@ -143,6 +143,7 @@ void to_message(const ClockReport& report, proto::ClockReport& out) {
     line.set_setting_from_ns(to_ns(report.setting_from));
     line.set_settled_from_ns(to_ns(report.settled_from));
   }
+  out.set_corrected_ns(to_ns(report.corrected));
   out.set_root_dispersion_ns(to_ns(clock.root.dispersion));
   out.set_root_delay_ns(to_ns(clock.root.delay));
 }
@@ -152,6 +153,7 @@ ClockReport clock_report_untrusted(const proto::ClockReport& message, MonoTime a
   report.as_of = as_of;
   report.clock = snapshot_untrusted(message);
   take_bounds_untrusted(message, report);
+  report.corrected = length_untrusted(message.corrected_ns());
   if (message.has_line()) take_line_untrusted(message.line(), report);
   if (message.boot_id().size() <= kMaxBootIdBytes) report.boot_id = message.boot_id();
   if (message.reference().size() <= kMaxReferenceBytes && is_printable_ascii(message.reference())) {

@@ -49,6 +49,9 @@ struct ClockReport {
   // If not 1970: the clock was set back, and it shows times before setting_from again. Samples that
   // were written after this was first reported are of this setting if their times are from here on.
   Time settled_from{};
+  // By how much its chronyd's time was corrected in all, since its dssmd runs: with each correction
+  // that time leaves what others measured of it.
+  Duration corrected{};
   std::string reference;  // the host or address that it follows, for people
   std::vector<IpAddress>
       addresses;     // its own: others recognize the host that their chronyd follows

@@ -22,7 +22,7 @@ constexpr std::size_t kCommand = 4, kReport = 6, kStatus = 8, kSequence = 16, kH
 // The report, in the order of its parts.
 constexpr std::size_t kReferenceId = 28, kAddress = 32, kFamily = 48, kStratum = 52, kLeap = 54,
                       kSecondsHigh = 56, kSecondsLow = 60, kNanoseconds = 64, kCorrection = 68,
-                      kRootDelay = 92, kRootDispersion = 96, kUpdateInterval = 100;
+                      kFrequency = 80, kRootDelay = 92, kRootDispersion = 96, kUpdateInterval = 100;
 static_assert(kUpdateInterval + 4 == kTrackingBytes);
 
 // Families of addresses. The last one is the number of a source without an address.
@@ -157,6 +157,9 @@ Result<TrackingReply> tracking_untrusted(std::span<const std::byte> datagram) {
   tracking.update_interval = seconds_untrusted(word_at(datagram, kUpdateInterval));
   // The correction is what is added to this clock to get chronyd's time: the opposite sign.
   tracking.offset = -seconds_untrusted(word_at(datagram, kCorrection));
+  // The frequency is that of this clock against chronyd's, if chronyd did not correct it: the
+  // opposite sign. It is in ppm; as seconds it is 10^6 times too large for ns per second.
+  tracking.rate_ppb = -seconds_untrusted(word_at(datagram, kFrequency)).count() / 1'000'000;
   tracking.root = {seconds_untrusted(word_at(datagram, kRootDispersion)),
                    seconds_untrusted(word_at(datagram, kRootDelay))};
   return reply;

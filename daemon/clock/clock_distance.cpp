@@ -12,11 +12,6 @@ namespace {
 // Lines that promise less are not worth a statement, and sums with them would overflow.
 constexpr Duration kMaxBlur = std::chrono::seconds(1);
 
-Duration gained(Duration age, PartsPerBillion rate) noexcept {
-  return Duration(static_cast<std::int64_t>(static_cast<double>(age.count()) *
-                                            static_cast<double>(rate) / 1e9));
-}
-
 }  // namespace
 
 Duration distance(const wire::ClockReport& one, const wire::ClockReport& other) noexcept {

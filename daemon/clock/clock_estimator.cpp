@@ -2,12 +2,16 @@
 #include "daemon/clock/clock_estimator.hpp"
 
 #include <algorithm>
+#include <utility>
 
 namespace dssm::clock {
 namespace {
 
 // A clock with greater values has no bound, and sums of smaller ones do not overflow.
 constexpr Duration kMaxValue = std::chrono::hours(24 * 365);
+
+// The kernel slews by less than a tenth. chronyd does not, so it cannot correct a greater rate.
+constexpr PartsPerBillion kMaxRate = 100'000'000;
 
 // Answers whose last measurement seems to be after now by more than this are invalid; less is a
 // measurement that chronyd was just processing.
@@ -65,6 +69,7 @@ std::optional<Duration> ClockEstimator::observe(const Instant& now) noexcept {
   setting_from_ = std::max({setting_from_, now.wall, now.wall - step});
   base_ = now;
   stepped_ = true;
+  chronyd_time_.reset();
   updates_ = 0;
   if (has_answered_) forget(ClockReason::stepped);
   return step;
@@ -76,10 +81,16 @@ void ClockEstimator::on_source_step() noexcept {
   if (has_answered_) forget(ClockReason::stepped);
 }
 
+void ClockEstimator::on_source_correction(Duration by) noexcept {
+  source_corrected_ = sum(source_corrected_, by);
+  updates_of_source_ = 0;
+}
+
 bool ClockEstimator::is_nonsense(const Tracking& tracking, const Instant& answered) const noexcept {
   if (!in_range(tracking.root.dispersion) || !in_range(tracking.root.delay) ||
       !in_range(tracking.update_interval) || tracking.offset < -kMaxValue ||
-      tracking.offset > kMaxValue) {
+      tracking.offset > kMaxValue || tracking.rate_ppb < -kMaxRate ||
+      tracking.rate_ppb > kMaxRate) {
     return true;
   }
   if (tracking.leap > Tracking::kUnsynchronized) return true;
@@ -96,6 +107,7 @@ ClockEstimator::Outcome ClockEstimator::take_untrusted(const Tracking& tracking,
   if (is_nonsense(tracking, answered)) return Outcome::nonsense;
   has_answered_ = true;
   answered_ = asked;
+  if (!stepped_) find_correction(tracking, answered);
   const bool local = tracking.reference_id == kLocalReferenceId;
   if (tracking.leap == Tracking::kUnsynchronized) {
     forget(ClockReason::unsynchronized);
@@ -128,9 +140,22 @@ ClockEstimator::Outcome ClockEstimator::take_untrusted(const Tracking& tracking,
     }
     stepped_ = source_stepped_ = false;
   }
+  if (is_new && ++updates_of_source_ >= kUpdatesAfterStep) source_corrected_ = Duration::zero();
   reading_ = {tracking, asked, updated};
   reason_ = ClockReason::none;
   return Outcome::taken;
+}
+
+// Slewing does not change chronyd's time; only a measurement does.
+void ClockEstimator::find_correction(const Tracking& tracking, const Instant& answered) noexcept {
+  const ChronydTime now{answered.wall - tracking.offset, answered.raw, answered.width};
+  const std::optional<ChronydTime> before = std::exchange(chronyd_time_, now);
+  if (!before) return;
+  const Duration elapsed = now.raw - before->raw;
+  const Duration by =
+      std::chrono::abs(now.time - before->time - elapsed - gained(elapsed, tracking.rate_ppb));
+  const Duration expected = growth(elapsed, settings_.max_drift) + now.width + before->width;
+  if (by >= sum(kMinCorrection, expected)) corrected_ = sum(corrected_, by);
 }
 
 void ClockEstimator::on_no_chronyd() noexcept {
@@ -212,6 +237,7 @@ ClockSnapshot ClockEstimator::at(MonoTime now) const noexcept {
                                                     least(reference_->before, reference_->lately)),
                                  aged)
                            : clock.root_bound;
+    clock.bound = sum(clock.bound, source_corrected_);
   }
   if (clock.bound > settings_.limit) {
     clock.reason = ClockReason::too_far;

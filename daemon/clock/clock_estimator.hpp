@@ -42,6 +42,7 @@ struct Tracking {
   Time updated;                          // when it last learned something from its sources
   Duration update_interval{};            // between that and the time before
   Duration offset{};                     // this clock minus chronyd's time; positive: ahead
+  PartsPerBillion rate_ppb = 0;          // by so much chronyd's time gains on the RawClock
   RootDistance root;
 };
 
@@ -70,6 +71,9 @@ class ClockEstimator {
     Duration limit = std::chrono::microseconds(1500);
     PartsPerBillion max_drift = 50'000;
   };
+
+  // By less than this chronyd's time may move with a measurement: its root dispersion covers that.
+  static constexpr Duration kMinCorrection = std::chrono::microseconds(100);
 
   enum class Outcome : std::uint8_t { taken, unsynchronized, stepped, nonsense };
 
@@ -117,6 +121,14 @@ class ClockEstimator {
   // chronyd has measured kUpdatesAfterStep times.
   void on_source_step() noexcept;
 
+  // The time of the source that chronyd follows was corrected by so much, after chronyd measured
+  // it. That is added to the bound until chronyd has measured kUpdatesAfterStep times.
+  void on_source_correction(Duration by) noexcept;
+
+  // The sum of all corrections of chronyd's time of kMinCorrection or more, of either sign: by so
+  // much that time may have left what others measured.
+  Duration corrected() const noexcept { return corrected_; }
+
   // The clock at `now`, after observe(now). `bound` is its distance from the source that chronyd
   // follows.
   ClockSnapshot at(MonoTime now) const noexcept;
@@ -141,10 +153,17 @@ class ClockEstimator {
     MonoTime asked;
     MonoTime updated;
   };
+  // What chronyd's clock showed.
+  struct ChronydTime {
+    Time time;
+    RawTime raw;
+    Duration width{};
+  };
 
   bool is_nonsense(const Tracking& tracking, const Instant& answered) const noexcept;
   void forget(ClockReason reason) noexcept;
   Duration memory() const noexcept;
+  void find_correction(const Tracking& tracking, const Instant& answered) noexcept;
   bool follows_reference() const noexcept;
   bool is_overdue(MonoTime now) const noexcept;
 
@@ -154,14 +173,18 @@ class ClockEstimator {
   Time setting_from_{};
   std::optional<Reading> reading_;
   std::optional<Reference> reference_;
-  Duration noise_{};                        // how far the clock may have been set without a step
-  bool stepped_ = false;                    // and not measured kUpdatesAfterStep times since
-  bool source_stepped_ = false;             // likewise
-  Time last_update_;                        // chronyd's last measurement, by its own time
-  MonoTime last_updated_;                   // the same by ours
-  int updates_ = 0;                         // after the step
-  MonoTime answered_;                       // the question of the last answer was sent
-  ClockReason reason_ = ClockReason::none;  // why there is no reading
+  Duration noise_{};                         // how far the clock may have been set without a step
+  bool stepped_ = false;                     // and not measured kUpdatesAfterStep times since
+  bool source_stepped_ = false;              // likewise
+  Duration source_corrected_{};              // since what chronyd measured of its source
+  int updates_of_source_ = 0;                // after the last correction of the source
+  std::optional<ChronydTime> chronyd_time_;  // at its last answer; none since the last step
+  Duration corrected_{};                     // of chronyd's time
+  Time last_update_;                         // chronyd's last measurement, by its own time
+  MonoTime last_updated_;                    // the same by ours
+  int updates_ = 0;                          // after the step
+  MonoTime answered_;                        // the question of the last answer was sent
+  ClockReason reason_ = ClockReason::none;   // why there is no reading
   bool has_answered_ = false;
 };
 

@@ -56,6 +56,7 @@ class ClockWatch final : private ChronydClient::Observer {
   // As in ClockEstimator.
   std::int64_t setting() const noexcept { return estimator_.setting(); }
   Time setting_from() const noexcept { return estimator_.setting_from(); }
+  Duration corrected() const noexcept { return estimator_.corrected(); }
 
   ClockSnapshot state();  // at this moment; `bound` is the distance from the source
   Duration own_bound() const noexcept { return estimator_.own_bound(); }
@@ -85,6 +86,7 @@ class ClockWatch final : private ChronydClient::Observer {
   void on_reference(const std::optional<clock::ReferenceReport>& report) noexcept;
   // The clock of the host `name`, which chronyd follows, was set.
   void on_source_step(const std::string& name);
+  void on_source_correction(Duration by) noexcept { estimator_.on_source_correction(by); }
 
  private:
   // What the log distinguishes.

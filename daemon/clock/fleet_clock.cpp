@@ -67,7 +67,8 @@ bool is_good(ClockStatus status) noexcept {
 bool is_new_generation(const wire::ClockReport& before, const wire::ClockReport& after) {
   return before.clock.status != after.clock.status || before.has_bound() != after.has_bound() ||
          before.anchor != after.anchor || before.line != after.line ||
-         before.setting != after.setting || before.settled_from != after.settled_from;
+         before.setting != after.setting || before.settled_from != after.settled_from ||
+         before.corrected != after.corrected;
 }
 
 }  // namespace
@@ -183,6 +184,10 @@ void FleetClock::find_source(MonoTime now) {
     if (is_same && source_->report->setting != 0 && setting != source_->report->setting) {
       watch_.on_source_step(host->greeting.host);
     }
+    // It starts from zero when dssmd does.
+    if (is_same && host->greeting.clock->corrected > source_->report->corrected) {
+      watch_.on_source_correction(host->greeting.clock->corrected - source_->report->corrected);
+    }
     source_ = Source{host->greeting.host_id, host->greeting.host, host->greeting.clock, {}};
     watch_.on_reference(clock::ReferenceReport{watch_.reference_id(), source_->report->clock.root});
   } else if (!source_) {
@@ -211,6 +216,7 @@ void FleetClock::update_chain(MonoTime now) {
   const ClockSnapshot watched = watch_.state();
   own_->as_of = now;
   own_->clock = watched;
+  own_->corrected = watch_.corrected();
   own_->chain.clear();
   own_->root_is_utc = watched.basis != ClockBasis::own;
   if (watched.bound != kUnknownClockError) {

@@ -30,6 +30,7 @@ Greeting mapper() {
   clock->setting = 3;
   clock->setting_from = Time(std::chrono::hours(8));
   clock->settled_from = Time(std::chrono::hours(7));
+  clock->corrected = Duration(8);
   greeting.clock = clock;
   return greeting;
 }
@@ -63,6 +64,7 @@ TEST(Greeting, CrossesTheWire) {
   EXPECT_EQ(back->clock->setting, mapper().clock->setting);
   EXPECT_EQ(back->clock->setting_from, mapper().clock->setting_from);
   EXPECT_EQ(back->clock->settled_from, mapper().clock->settled_from);
+  EXPECT_EQ(back->clock->corrected, mapper().clock->corrected);
   EXPECT_TRUE(back->has_feature(kFeatureTorn));
   EXPECT_FALSE(back->has_feature("tor"));
   EXPECT_EQ(back->str(), "'mapper' on host 'pc3'");

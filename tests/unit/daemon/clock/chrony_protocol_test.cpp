@@ -58,6 +58,10 @@ TEST(ChronyProtocol, ReadsARealReply) {
   EXPECT_GE(to_ns(tracking.offset), 285) << "fast, so ahead";
   EXPECT_LE(to_ns(tracking.offset), 383);
   EXPECT_NEAR(static_cast<double>(tracking.update_interval.count()), 1e9, 5e7);
+  EXPECT_EQ(tracking.rate_ppb, 287);
+  EXPECT_EQ(with(kReplyFrequency, chrony_float(12.5)).value().tracking.rate_ppb, -12'500)
+      << "12.5 ppm fast, so chronyd's time runs slower than the oscillator";
+  EXPECT_EQ(with(kReplyFrequency, chrony_float(-0.25)).value().tracking.rate_ppb, 250);
 }
 
 TEST(ChronyProtocol, DecodesTheSourceOfChronyd) {

@@ -37,6 +37,7 @@ struct Rig {
   void pass(Duration time) {
     now.mono += time;
     now.wall += time;
+    now.raw += time;
     estimator.observe(now);
   }
   void step(Duration by) {
@@ -341,6 +342,85 @@ TEST(ClockEstimator, StatesTheDistanceFromTheRootWhenItFollowsAnotherSource) {
   EXPECT_EQ(rig.state().bound, 1060us);
 }
 
+// --- corrections: others follow the time that chronyd here keeps
+
+// chronyd measures that its time is wrong.
+void correct(Rig& rig, Duration by) { rig.tracking.offset -= by; }
+
+TEST(ClockEstimator, SumsUpTheCorrectionsOfChronydsTime) {
+  Rig rig;
+  rig.hear();
+  correct(rig, 2200us);
+  rig.pass(1s);
+  rig.hear();
+  EXPECT_EQ(rig.estimator.corrected(), 2200us);
+  correct(rig, -300us);
+  rig.pass(1s);
+  rig.hear();
+  EXPECT_EQ(rig.estimator.corrected(), 2500us) << "the sum of the sizes";
+}
+
+TEST(ClockEstimator, ASlewIsNoCorrection) {
+  Rig rig;
+  rig.tracking.offset = -2200us;
+  rig.hear();
+  rig.pass(1s);
+  rig.now.wall += 2200us;  // both clocks are slewed alike
+  rig.now.mono += 2200us;
+  rig.tracking.offset = 0us;
+  rig.hear();
+  EXPECT_EQ(rig.estimator.corrected(), 0us);
+}
+
+TEST(ClockEstimator, NeitherTheRateThatChronydStatesNorDriftIsACorrection) {
+  Rig rig;
+  rig.tracking.rate_ppb = 400'000;
+  rig.hear();
+  for (const Duration drift : {49us, -49us, 149us}) {
+    rig.pass(1s);
+    rig.now.wall += 400us + drift;
+    rig.now.mono += 400us + drift;
+    rig.hear();
+    EXPECT_EQ(rig.estimator.corrected(), 0us) << "kMinCorrection and a drift of 50 ppm";
+  }
+  rig.pass(1s);
+  rig.hear();
+  EXPECT_EQ(rig.estimator.corrected(), 400us);
+}
+
+TEST(ClockEstimator, AStepIsNoCorrection) {
+  Rig rig;
+  rig.hear();
+  rig.step(5ms);
+  for (int i = 0; i < 8; ++i) {
+    rig.pass(1s);
+    rig.hear();
+    if (i == 0) correct(rig, -5ms);  // it measures that the clock was set
+  }
+  EXPECT_EQ(rig.state().bound, 5060us);
+  EXPECT_EQ(rig.estimator.corrected(), 0us) << "others hear of the step itself";
+}
+
+TEST(ClockEstimator, ACorrectionOfTheSourceCountsUntilChronydHasMeasuredThatAgain) {
+  Rig rig;
+  rig.hear();
+  rig.estimator.on_source_correction(2200us);
+  rig.estimator.on_source_correction(100us);
+  EXPECT_EQ(rig.state().bound, 60us + 2300us);
+  EXPECT_EQ(rig.state().reason, ClockReason::too_far);
+  EXPECT_EQ(rig.state().root_bound, 60us) << "it was as near to the root as it stated";
+  for (int i = 1; i < ClockEstimator::kUpdatesAfterStep; ++i) {
+    rig.pass(1s);
+    rig.hear();
+    EXPECT_EQ(rig.state().bound, 60us + 2300us) << i;
+  }
+  rig.hear_the_same();
+  EXPECT_EQ(rig.state().bound, 60us + 2300us) << "nothing new was measured";
+  rig.pass(1s);
+  rig.hear();
+  EXPECT_EQ(rig.state().bound, 60us);
+}
+
 TEST(ClockEstimator, TreatsNonsenseAsNoAnswer) {
   const auto refused = [](auto spoil) {
     Rig rig;
@@ -359,6 +439,8 @@ TEST(ClockEstimator, TreatsNonsenseAsNoAnswer) {
   refused([](Tracking& t) { t.root.dispersion = Duration::max(); });
   refused([](Tracking& t) { t.offset = Duration::min(); });
   refused([](Tracking& t) { t.offset = Duration::max(); });
+  refused([](Tracking& t) { t.rate_ppb = INT64_MIN; });
+  refused([](Tracking& t) { t.rate_ppb = 100'000'001; });
   refused([](Tracking& t) { t.update_interval = -1s; });
   refused([](Tracking& t) { t.leap = 4; });
   refused([](Tracking& t) { t.updated = Time::min(); });

@@ -29,8 +29,8 @@ inline constexpr std::size_t kReplyVersion = 0, kReplyType = 1, kReplyCommand = 
                              kReplyStatus = 8, kReplySequence = 16, kReplyReferenceId = 28,
                              kReplyAddress = 32, kReplyFamily = 48, kReplyStratum = 52,
                              kReplyLeap = 54, kReplySeconds = 56, kReplyNanoseconds = 64,
-                             kReplyCorrection = 68, kReplyDelay = 92, kReplyDispersion = 96,
-                             kReplyInterval = 100;
+                             kReplyCorrection = 68, kReplyFrequency = 80, kReplyDelay = 92,
+                             kReplyDispersion = 96, kReplyInterval = 100;
 
 template <class Number>
 void put_number(Datagram& to, std::size_t at, Number number) {
@@ -89,6 +89,7 @@ inline Datagram reply_of(const clock::Tracking& tracking) {
   put_number(reply, kReplyNanoseconds,
              static_cast<std::uint32_t>(to_ns(tracking.updated) % 1'000'000'000));
   put_number(reply, kReplyCorrection, seconds(-tracking.offset));
+  put_number(reply, kReplyFrequency, chrony_float(static_cast<double>(-tracking.rate_ppb) / 1000));
   put_number(reply, kReplyDelay, seconds(tracking.root.delay));
   put_number(reply, kReplyDispersion, seconds(tracking.root.dispersion));
   put_number(reply, kReplyInterval, seconds(tracking.update_interval));

@@ -454,6 +454,37 @@ TEST_F(MeasuredTest, AStepOfTheReferenceTakesAwayWhatChronydStates) {
   EXPECT_TRUE(logger.contains("the clock of 'pc1', which this PC's chronyd follows, was set"));
 }
 
+// The source follows another host from now on, which is far from the one that it followed before.
+// chronyd here has not measured the source since, and nothing is measured with that host yet.
+TEST_F(FleetClockTest, ACorrectionOfTheSourceCountsForAllThatIsKnownThroughIt) {
+  constexpr wire::HostId kBack{4};
+  catalog.host_up(host(kOther, "pc2", 5us), {"10.0.0.1", 13776});
+  auto report = std::make_shared<wire::ClockReport>(*host(kOther, "pc2", 5us).clock);
+  report->addresses = {kReferenceIp};
+  catalog.set_clock(kOther, report);
+  start();
+  const wire::Greeting back = host(kBack, "pc1", 5us);
+  EXPECT_EQ(assessed(back).added, kUnknownClockError);
+  report = std::make_shared<wire::ClockReport>(*report);
+  report->chain.push_back({kBack, 100us});
+  report->corrected = 2200us;
+  catalog.set_clock(kOther, report);
+  EXPECT_GE(assessed(back).added, 2200us);
+  EXPECT_LT(assessed(back).added, 2200us + 1ms);
+  EXPECT_FALSE(fleet->reason_against(back.clock.get()).empty());
+  EXPECT_FALSE(fleet->reason_against(report.get()).empty()) << "the source has moved, too";
+}
+
+TEST_F(FleetClockTest, ReportsItsOwnCorrections) {
+  start();
+  EXPECT_EQ(own->corrected, 0us);
+  const int before = generations;
+  tracking.offset = -2200us;
+  wait([this] { return own->corrected != 0us; });
+  EXPECT_GE(own->corrected, 2200us);
+  EXPECT_GT(generations, before) << "others have to know";
+}
+
 TEST_F(MeasuredTest, OwnReportsSayWhatTheClockShows) {
   start();
   const std::optional<Time> shown = own->line.at(RawClock::now());
