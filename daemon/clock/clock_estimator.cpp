@@ -10,7 +10,7 @@ namespace {
 // A clock with greater values has no bound, and sums of smaller ones do not overflow.
 constexpr Duration kMaxValue = std::chrono::hours(24 * 365);
 
-// The kernel slews by less than a tenth. chronyd does not, so it cannot correct a greater rate.
+// chronyd slews by less than a tenth, and corrects no clock that is off by more.
 constexpr PartsPerBillion kMaxRate = 100'000'000;
 
 // Answers whose last measurement seems to be after now by more than this are invalid; less is a
@@ -82,8 +82,8 @@ void ClockEstimator::on_source_step() noexcept {
 }
 
 void ClockEstimator::on_source_correction(Duration by) noexcept {
-  source_corrected_ = sum(source_corrected_, by);
-  updates_of_source_ = 0;
+  Duration& latest = source_corrected_.front();
+  latest = std::min(sum(latest, by), kMaxValue);
 }
 
 bool ClockEstimator::is_nonsense(const Tracking& tracking, const Instant& answered) const noexcept {
@@ -107,7 +107,8 @@ ClockEstimator::Outcome ClockEstimator::take_untrusted(const Tracking& tracking,
   if (is_nonsense(tracking, answered)) return Outcome::nonsense;
   has_answered_ = true;
   answered_ = asked;
-  if (!stepped_) find_correction(tracking, answered);
+  // An answer from before a step is about another clock.
+  if (asked >= base_->mono) find_correction(tracking, asked, answered);
   const bool local = tracking.reference_id == kLocalReferenceId;
   if (tracking.leap == Tracking::kUnsynchronized) {
     forget(ClockReason::unsynchronized);
@@ -132,6 +133,10 @@ ClockEstimator::Outcome ClockEstimator::take_untrusted(const Tracking& tracking,
                                 updated > last_updated_ + kSameUpdate);
   last_update_ = tracking.updated;
   last_updated_ = updated;
+  if (is_new) {
+    std::shift_right(source_corrected_.begin(), source_corrected_.end(), 1);
+    source_corrected_.front() = Duration::zero();
+  }
   if (stepped_ || source_stepped_) {
     if (is_new) ++updates_;
     if (updates_ < kUpdatesAfterStep) {
@@ -140,15 +145,19 @@ ClockEstimator::Outcome ClockEstimator::take_untrusted(const Tracking& tracking,
     }
     stepped_ = source_stepped_ = false;
   }
-  if (is_new && ++updates_of_source_ >= kUpdatesAfterStep) source_corrected_ = Duration::zero();
   reading_ = {tracking, asked, updated};
   reason_ = ClockReason::none;
   return Outcome::taken;
 }
 
-// Slewing does not change chronyd's time; only a measurement does.
-void ClockEstimator::find_correction(const Tracking& tracking, const Instant& answered) noexcept {
-  const ChronydTime now{answered.wall - tracking.offset, answered.raw, answered.width};
+// Slewing does not change chronyd's time, but a measurement does.
+void ClockEstimator::find_correction(const Tracking& tracking, MonoTime asked,
+                                     const Instant& answered) noexcept {
+  // The offset is of some moment since the question was asked; this clock may have been slewed
+  // towards chronyd's since, but not past it.
+  const Duration slewed =
+      std::min(growth(answered.mono - asked, kMaxRate), std::chrono::abs(tracking.offset));
+  const ChronydTime now{answered.wall - tracking.offset, answered.raw, answered.width + slewed};
   const std::optional<ChronydTime> before = std::exchange(chronyd_time_, now);
   if (!before) return;
   const Duration elapsed = now.raw - before->raw;
@@ -237,7 +246,7 @@ ClockSnapshot ClockEstimator::at(MonoTime now) const noexcept {
                                                     least(reference_->before, reference_->lately)),
                                  aged)
                            : clock.root_bound;
-    clock.bound = sum(clock.bound, source_corrected_);
+    for (const Duration by : source_corrected_) clock.bound = sum(clock.bound, by);
   }
   if (clock.bound > settings_.limit) {
     clock.reason = ClockReason::too_far;

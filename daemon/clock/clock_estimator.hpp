@@ -7,6 +7,7 @@
 //   threads  one
 #pragma once
 
+#include <array>
 #include <cstdint>
 #include <dssm/clock_status.hpp>
 #include <dssm/time.hpp>
@@ -72,7 +73,8 @@ class ClockEstimator {
     PartsPerBillion max_drift = 50'000;
   };
 
-  // By less than this chronyd's time may move with a measurement: its root dispersion covers that.
+  // By less than this chronyd's time may move with a measurement: that is within the jitter that a
+  // chronyd which follows it states.
   static constexpr Duration kMinCorrection = std::chrono::microseconds(100);
 
   enum class Outcome : std::uint8_t { taken, unsynchronized, stepped, nonsense };
@@ -121,8 +123,9 @@ class ClockEstimator {
   // chronyd has measured kUpdatesAfterStep times.
   void on_source_step() noexcept;
 
-  // The time of the source that chronyd follows was corrected by so much, after chronyd measured
-  // it. That is added to the bound until chronyd has measured kUpdatesAfterStep times.
+  // The time of the source that chronyd follows was corrected by so much since the last call: added
+  // to the bound until chronyd has measured kUpdatesAfterStep times. More than a year counts as
+  // one.
   void on_source_correction(Duration by) noexcept;
 
   // The sum of all corrections of chronyd's time of kMinCorrection or more, of either sign: by so
@@ -153,7 +156,7 @@ class ClockEstimator {
     MonoTime asked;
     MonoTime updated;
   };
-  // What chronyd's clock showed.
+  // What chronyd's clock showed, within `width`.
   struct ChronydTime {
     Time time;
     RawTime raw;
@@ -163,7 +166,7 @@ class ClockEstimator {
   bool is_nonsense(const Tracking& tracking, const Instant& answered) const noexcept;
   void forget(ClockReason reason) noexcept;
   Duration memory() const noexcept;
-  void find_correction(const Tracking& tracking, const Instant& answered) noexcept;
+  void find_correction(const Tracking& tracking, MonoTime asked, const Instant& answered) noexcept;
   bool follows_reference() const noexcept;
   bool is_overdue(MonoTime now) const noexcept;
 
@@ -173,11 +176,11 @@ class ClockEstimator {
   Time setting_from_{};
   std::optional<Reading> reading_;
   std::optional<Reference> reference_;
-  Duration noise_{};                         // how far the clock may have been set without a step
-  bool stepped_ = false;                     // and not measured kUpdatesAfterStep times since
-  bool source_stepped_ = false;              // likewise
-  Duration source_corrected_{};              // since what chronyd measured of its source
-  int updates_of_source_ = 0;                // after the last correction of the source
+  Duration noise_{};             // how far the clock may have been set without a step
+  bool stepped_ = false;         // and not measured kUpdatesAfterStep times since
+  bool source_stepped_ = false;  // likewise
+  // Corrections of the source, by how often chronyd has measured since.
+  std::array<Duration, kUpdatesAfterStep> source_corrected_{};
   std::optional<ChronydTime> chronyd_time_;  // at its last answer; none since the last step
   Duration corrected_{};                     // of chronyd's time
   Time last_update_;                         // chronyd's last measurement, by its own time

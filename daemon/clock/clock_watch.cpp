@@ -259,8 +259,9 @@ std::string ClockWatch::too_far(const ClockSnapshot& state) const {
         text, length_text(state.age));
   }
   return text +
-         ": the source that chronyd follows is that far from its root, or the network delays its "
-         "packets (`chronyc ntpdata`); is there a nearer one?";
+         ": the source that chronyd follows is that far from its root or was just corrected, or "
+         "the "
+         "network delays its packets (`chronyc ntpdata`); is there a nearer one?";
 }
 
 }  // namespace dssm::daemon

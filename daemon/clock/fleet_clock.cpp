@@ -109,6 +109,8 @@ void FleetClock::set(const ClockPolicies& policies, clock::PartsPerBillion max_d
 
 void FleetClock::on_clock() { refresh(); }
 
+void FleetClock::on_host_up(const KnownHost& host) { on_host_clock(host); }
+
 void FleetClock::on_host_clock(const KnownHost& host) {
   if (host.greeting.clock) {
     // First whether this clock was set since the heartbeat was sent. Not for other reports: two
@@ -178,22 +180,26 @@ void FleetClock::find_source(MonoTime now) {
   const std::vector<wire::IpAddress>& own = own_->addresses;
   const bool is_own = address && std::find(own.begin(), own.end(), *address) != own.end();
   if (host && !is_own) {
-    const std::int64_t setting = host->greeting.clock->setting;
-    const bool is_same = source_ && source_->id == host->greeting.host_id &&
-                         source_->report->boot_id == host->greeting.clock->boot_id;
-    if (is_same && source_->report->setting != 0 && setting != source_->report->setting) {
-      watch_.on_source_step(host->greeting.host);
-    }
-    // It starts from zero when dssmd does.
-    if (is_same && host->greeting.clock->corrected > source_->report->corrected) {
-      watch_.on_source_correction(host->greeting.clock->corrected - source_->report->corrected);
-    }
+    if (source_ && source_->id == host->greeting.host_id) compare_source(*host);
     source_ = Source{host->greeting.host_id, host->greeting.host, host->greeting.clock, {}};
     watch_.on_reference(clock::ReferenceReport{watch_.reference_id(), source_->report->clock.root});
   } else if (!source_) {
     watch_.on_reference(std::nullopt);
   } else if (!source_->unavailable_since) {
     source_->unavailable_since = now;
+  }
+}
+
+// What its clock was subject to since its last report. Its time may be another one after a boot.
+void FleetClock::compare_source(const KnownHost& host) {
+  const wire::ClockReport& before = *source_->report;
+  const wire::ClockReport& after = *host.greeting.clock;
+  if (before.boot_id != after.boot_id || (before.setting != 0 && before.setting != after.setting)) {
+    watch_.on_source_step(host.greeting.host);
+  }
+  // The sum starts from zero when dssmd does.
+  if (after.corrected > before.corrected) {
+    watch_.on_source_correction(after.corrected - before.corrected);
   }
 }
 

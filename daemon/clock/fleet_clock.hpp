@@ -143,11 +143,13 @@ class FleetClock final : public ClockAssessor,
   };
 
   void on_clock() override;
+  void on_host_up(const KnownHost& host) override;
   void on_host_clock(const KnownHost& host) override;
   void on_host_down(const KnownHost& host, const Error& why) override;
 
   void refresh();
   void find_source(MonoTime now);
+  void compare_source(const KnownHost& host);
   const KnownHost* host_at(const wire::IpAddress& address) const;
   bool is_followed() const;
   void update_addresses(MonoTime now);

@@ -388,17 +388,36 @@ TEST(ClockEstimator, NeitherTheRateThatChronydStatesNorDriftIsACorrection) {
   EXPECT_EQ(rig.estimator.corrected(), 400us);
 }
 
-TEST(ClockEstimator, AStepIsNoCorrection) {
+TEST(ClockEstimator, AStepIsNoCorrectionButWhatItMakesChronydCorrectIsOne) {
   Rig rig;
   rig.hear();
+  const MonoTime asked = rig.now.mono;
+  rig.pass(1ms);
   rig.step(5ms);
+  rig.estimator.take_untrusted(rig.tracking, asked, rig.now);  // answered before the step
   for (int i = 0; i < 8; ++i) {
     rig.pass(1s);
     rig.hear();
-    if (i == 0) correct(rig, -5ms);  // it measures that the clock was set
+    EXPECT_EQ(rig.estimator.corrected(), 0us) << "others hear of the step itself";
   }
-  EXPECT_EQ(rig.state().bound, 5060us);
-  EXPECT_EQ(rig.estimator.corrected(), 0us) << "others hear of the step itself";
+  correct(rig, -5ms);  // it measures late that the clock was set
+  rig.pass(1s);
+  rig.hear();
+  EXPECT_EQ(rig.estimator.corrected(), 5ms);
+}
+
+TEST(ClockEstimator, ALateAnswerDuringASlewIsNoCorrection) {
+  Rig rig;
+  rig.tracking.offset = -1ms;
+  rig.hear();
+  rig.pass(1s);
+  const MonoTime asked = rig.now.mono;
+  rig.tracking.updated = rig.now.wall - rig.tracking.offset;
+  rig.now.mono += 10ms + 900us;
+  rig.now.wall += 10ms + 900us;
+  rig.now.raw += 10ms;
+  EXPECT_EQ(rig.estimator.take_untrusted(rig.tracking, asked, rig.now), Outcome::taken);
+  EXPECT_EQ(rig.estimator.corrected(), 0us);
 }
 
 TEST(ClockEstimator, ACorrectionOfTheSourceCountsUntilChronydHasMeasuredThatAgain) {
@@ -419,6 +438,36 @@ TEST(ClockEstimator, ACorrectionOfTheSourceCountsUntilChronydHasMeasuredThatAgai
   rig.pass(1s);
   rig.hear();
   EXPECT_EQ(rig.state().bound, 60us);
+}
+
+TEST(ClockEstimator, ASourceThatIsCorrectedOftenAddsNoMoreThanTheLastFew) {
+  Rig rig;
+  for (int i = 0; i < 20; ++i) {
+    rig.hear();
+    rig.estimator.on_source_correction(200us);
+    EXPECT_LE(rig.state().bound, 60us + ClockEstimator::kUpdatesAfterStep * 200us) << i;
+    rig.pass(1s);
+  }
+}
+
+TEST(ClockEstimator, NoCorrectionOfTheSourceIsTooLarge) {
+  Rig rig;
+  rig.hear();
+  for (int i = 0; i < 2; ++i) rig.estimator.on_source_correction(Duration::max());
+  EXPECT_EQ(rig.state().reason, ClockReason::too_far);
+  EXPECT_NE(rig.state().bound, kUnknownClockError);
+}
+
+TEST(ClockEstimator, MeasurementsAfterAStepCountForCorrectionsOfTheSourceToo) {
+  Rig rig;
+  rig.hear();
+  rig.step(1ms);
+  rig.estimator.on_source_correction(2200us);
+  for (int i = 0; i < ClockEstimator::kUpdatesAfterStep; ++i) {
+    rig.pass(1s);
+    rig.hear();
+  }
+  EXPECT_LT(rig.state().bound, 100us);
 }
 
 TEST(ClockEstimator, TreatsNonsenseAsNoAnswer) {
