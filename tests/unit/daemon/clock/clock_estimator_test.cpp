@@ -391,10 +391,8 @@ TEST(ClockEstimator, NeitherTheRateThatChronydStatesNorDriftIsACorrection) {
 TEST(ClockEstimator, AStepIsNoCorrectionButWhatItMakesChronydCorrectIsOne) {
   Rig rig;
   rig.hear();
-  const MonoTime asked = rig.now.mono;
   rig.pass(1ms);
   rig.step(5ms);
-  rig.estimator.take_untrusted(rig.tracking, asked, rig.now);  // answered before the step
   for (int i = 0; i < 8; ++i) {
     rig.pass(1s);
     rig.hear();
@@ -404,6 +402,20 @@ TEST(ClockEstimator, AStepIsNoCorrectionButWhatItMakesChronydCorrectIsOne) {
   rig.pass(1s);
   rig.hear();
   EXPECT_EQ(rig.estimator.corrected(), 5ms);
+}
+
+TEST(ClockEstimator, AnAnswerFromBeforeAStepSaysNothingOfCorrections) {
+  Rig rig;
+  rig.tracking.offset = -5ms;
+  rig.hear();
+  const MonoTime asked = rig.now.mono;
+  rig.pass(1ms);
+  rig.step(5ms);  // by chronyd, so that its time stays
+  rig.estimator.take_untrusted(rig.tracking, asked, rig.now);
+  rig.tracking.offset = 0us;
+  rig.pass(1s);
+  rig.hear();
+  EXPECT_EQ(rig.estimator.corrected(), 0us);
 }
 
 TEST(ClockEstimator, ALateAnswerDuringASlewIsNoCorrection) {
