@@ -20,10 +20,12 @@ std::string note(const HostInfo& host) {
 Json mirror_json(const MirrorInfo& mirror) {
   return {{"state", name_of(mirror.state)},
           {"newest_tid", mirror.newest != kNoTid ? Json(mirror.newest) : Json()},
+          {"newest_time_ns", mirror.newest != kNoTid ? Json(to_ns(mirror.newest_time)) : Json()},
           {"received_samples", mirror.received_samples},
           {"received_bytes", mirror.received_bytes},
           {"gap_samples", mirror.gap_samples},
           {"filling_samples", mirror.filling_samples},
+          {"history_wanted", mirror.history_wanted},
           {"recent_samples", mirror.recent_samples},
           {"recent_lost_samples", mirror.recent_lost_samples},
           {"reconnects", mirror.reconnects},

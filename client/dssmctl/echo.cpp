@@ -51,7 +51,8 @@ class Echo {
       if (status == ReadStatus::restarted) reopen();
     }
     if (status == ReadStatus::ok) {
-      printer_.sample(info, payload_, {reader_.lost_samples() - lost_, reader_.restarts()});
+      printer_.sample(info, std::span(payload_).first(info.payload_bytes),
+                      {reader_.lost_samples() - lost_, reader_.restarts()});
       lost_ = reader_.lost_samples();
       --left_;
     }
@@ -172,7 +173,8 @@ Result<void> begin(const EchoOptions& options, bool awaited, RawReader& reader, 
 }  // namespace
 
 Result<void> run(const EchoOptions& options, Output& out) {
-  return with_stream(options, [&](OpenedStream& opened) -> Result<void> {
+  const FetchHistory history = options.at ? FetchHistory::at_once : FetchHistory::when_read;
+  return with_stream(options, history, [&](OpenedStream& opened) -> Result<void> {
     RawReader& reader = opened.reader;
     std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, options));
     // Before the first sample is shown: after it the next ones must come too, whatever happens to

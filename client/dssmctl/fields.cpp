@@ -92,6 +92,14 @@ Json value_json(const Value& value) {
       value);
 }
 
+// How many elements of the field the sample has, which may be shorter than its stream's samples.
+std::uint64_t elements_in(std::span<const std::byte> payload, const Field& field) {
+  const std::uint64_t first_end = field.offset_bytes + scalar_bytes(field.kind);
+  if (payload.size() < first_end) return 0;
+  if (field.count == 1) return 1;
+  return std::min(field.count, (payload.size() - first_end) / field.stride_bytes + 1);
+}
+
 bool fits_untrusted(const Field& field, std::uint64_t payload_bytes) {
   if (field.kind < Scalar::boolean || field.kind > Scalar::float64) return false;
   const std::uint64_t element_bytes = scalar_bytes(field.kind);
@@ -149,7 +157,7 @@ bool is_text(const Field& field) {
 
 std::string text_of(std::span<const std::byte> payload, const Field& field) {
   const auto* start = reinterpret_cast<const char*>(payload.data() + field.offset_bytes);
-  return std::string(start, ::strnlen(start, field.count));
+  return std::string(start, ::strnlen(start, elements_in(payload, field)));
 }
 
 std::string field_text(std::span<const std::byte> payload, const Field& field, std::size_t shown) {
@@ -163,29 +171,32 @@ std::string field_text(std::span<const std::byte> payload, const Field& field, s
     if (hidden > 0) out += fmt::format(" ... {} more", hidden);
     return out;
   }
-  if (field.count == 1) return quoted_text(value_at(payload, field, 0));
+  const std::uint64_t count = elements_in(payload, field);
+  if (field.count == 1) return count == 0 ? "-" : quoted_text(value_at(payload, field, 0));
   std::string out = "[";
-  const std::uint64_t end = std::min<std::uint64_t>(field.count, shown);
+  const std::uint64_t end = std::min<std::uint64_t>(count, shown);
   for (std::uint64_t i = 0; i < end; ++i) {
     if (i > 0) out += ", ";
     out += quoted_text(value_at(payload, field, i));
   }
-  if (end < field.count) out += fmt::format(", ... {} more", field.count - end);
+  if (end < count) out += fmt::format(", ... {} more", count - end);
   return out + "]";
 }
 
 Json field_json(std::span<const std::byte> payload, const Field& field) {
   if (is_text(field)) return text_of(payload, field);
-  if (field.count == 1) return value_json(value_at(payload, field, 0));
+  const std::uint64_t count = elements_in(payload, field);
+  if (field.count == 1) return count == 0 ? Json() : value_json(value_at(payload, field, 0));
   Json array = Json::array();
-  for (std::uint64_t i = 0; i < field.count; ++i) {
+  for (std::uint64_t i = 0; i < count; ++i) {
     array.push_back(value_json(value_at(payload, field, i)));
   }
   return array;
 }
 
 std::string element_text(std::span<const std::byte> payload, const Field& field, std::uint64_t i) {
-  return is_text(field) ? text_of(payload, field) : bare_text(value_at(payload, field, i));
+  if (is_text(field)) return text_of(payload, field);
+  return i < elements_in(payload, field) ? bare_text(value_at(payload, field, i)) : "";
 }
 
 }  // namespace dssm::ctl

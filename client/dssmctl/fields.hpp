@@ -29,14 +29,18 @@ Result<std::vector<Field>> select_fields(std::vector<Field> fields,
 bool is_text(const Field& field);
 std::string text_of(std::span<const std::byte> payload, const Field& field);
 
+// In these functions `payload` may be shorter than the stream's samples: it has fewer elements
+// then.
+
 // For people: 1.5, true, 'a', "text", [1, 2, 3]; of more than `shown` elements the first `shown`
-// and how many are left out.
+// and how many are left out; "-" for one that the payload does not have.
 std::string field_text(std::span<const std::byte> payload, const Field& field, std::size_t shown);
 
-// The same for programs: a number, boolean, string, or an array of them, always complete.
+// The same for programs: a number, boolean, string, or an array of them, with all elements; null
+// for one that the payload does not have.
 Json field_json(std::span<const std::byte> payload, const Field& field);
 
-// One element as in field_text(), but text and characters bare.
+// One element as in field_text(), but text and characters bare; empty when there is none.
 std::string element_text(std::span<const std::byte> payload, const Field& field, std::uint64_t i);
 
 }  // namespace dssm::ctl

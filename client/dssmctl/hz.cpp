@@ -3,6 +3,9 @@
 // dssmctl hz: how often samples come, by their own stamps; dssmctl bw: how many bytes that makes.
 #include <fmt/format.h>
 
+#include <cmath>
+#include <deque>
+#include <numeric>
 #include <optional>
 
 #include "client/dssmctl/meter.hpp"
@@ -14,22 +17,32 @@
 namespace dssm::ctl {
 namespace {
 
-// The intervals between neighbouring samples; none across a gap.
-class Intervals {
+// The newest samples: the intervals between neighbouring ones, none across a gap, and how long they
+// are.
+class NewestSamples {
  public:
-  explicit Intervals(std::uint64_t window) : window_(window - 1) {}
+  explicit NewestSamples(std::uint64_t window) : intervals_(window - 1), window_(window) {}
 
   void on_sample(const SampleInfo& info) {
-    if (previous_) window_.add(saturating_sub(info.time, *previous_));
+    if (previous_) intervals_.add(saturating_sub(info.time, *previous_));
     previous_ = info.time;
+    payload_bytes_.push_back(info.payload_bytes);
+    if (payload_bytes_.size() > window_) payload_bytes_.pop_front();
   }
   void on_gap() { previous_.reset(); }
 
-  Statistics statistics() const { return window_.statistics(); }
+  Statistics intervals() const { return intervals_.statistics(); }
+  // 0 without samples.
+  double mean_payload_bytes() const {
+    const double sum = std::accumulate(payload_bytes_.begin(), payload_bytes_.end(), 0.0);
+    return payload_bytes_.empty() ? 0 : sum / static_cast<double>(payload_bytes_.size());
+  }
 
  private:
-  Window window_;
+  Window intervals_;
   std::optional<Time> previous_;
+  std::uint64_t window_;
+  std::deque<std::uint64_t> payload_bytes_;
 };
 
 // 0 when unknown: too few samples, or stamps that do not move on.
@@ -61,7 +74,8 @@ Json common_json(const MeterState& state, const Statistics& intervals) {
   return json;
 }
 
-void print_hz(const MeterState& state, const Statistics& intervals, bool as_json, Output& out) {
+void print_hz(const MeterState& state, const NewestSamples& samples, bool as_json, Output& out) {
+  const Statistics intervals = samples.intervals();
   if (as_json) {
     Json json = common_json(state, intervals);
     add_statistics(json, "interval", intervals);
@@ -72,30 +86,32 @@ void print_hz(const MeterState& state, const Statistics& intervals, bool as_json
                       statistics_line(intervals, intervals.count + 1)));
 }
 
-void print_bw(const MeterState& state, const Statistics& intervals, bool as_json, Output& out) {
+void print_bw(const MeterState& state, const NewestSamples& samples, bool as_json, Output& out) {
+  const Statistics intervals = samples.intervals();
   const double rate = rate_hz(intervals);
-  const double bytes_per_second = rate * static_cast<double>(state.payload_bytes);
+  const double bytes_per_second = rate * samples.mean_payload_bytes();
   if (as_json) {
     Json json = common_json(state, intervals);
+    json["mean_payload_bytes"] = state.seen > 0 ? Json(samples.mean_payload_bytes()) : Json();
     json["bytes_per_second"] = rate > 0 ? Json(bytes_per_second) : Json();
     return out.add(json_line(json));
   }
   if (!measurable(state, intervals, out)) return;
   out.add(fmt::format("average: {}\n\tpayload: {} rate: {} window: {}\n",
                       rate > 0 ? byte_rate_text(bytes_per_second) : "unknown",
-                      bytes_text(state.payload_bytes), precise_rate_text(rate),
-                      intervals.count + 1));
+                      bytes_text(std::llround(samples.mean_payload_bytes())),
+                      precise_rate_text(rate), intervals.count + 1));
 }
 
 template <class Print>
 Result<void> run_interval_meter(const MeterOptions& options, Output& out, Print print) {
-  Intervals intervals(options.window);
+  NewestSamples samples(options.window);
   Meter meter;
   meter.from_history = true;
-  meter.on_sample = [&](const SampleInfo& info, Time) { intervals.on_sample(info); };
-  meter.on_gap = [&] { intervals.on_gap(); };
+  meter.on_sample = [&](const SampleInfo& info, Time) { samples.on_sample(info); };
+  meter.on_gap = [&] { samples.on_gap(); };
   meter.on_report = [&](const MeterState& state, Session&) {
-    print(state, intervals.statistics(), options.json, out);
+    print(state, samples, options.json, out);
   };
   return run_meter(options, out, meter);
 }

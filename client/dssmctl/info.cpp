@@ -53,10 +53,25 @@ void print_users(const StreamInfo& stream, Output& out) {
   table.print(out);
 }
 
+// How much older the newest sample here is than its owner's. Both times are of the owner's clock. A
+// sample may be on its way, and the two were looked at one after the other.
+Duration behind_owner(const StreamInfo& stream, const MirrorInfo& mirror) {
+  constexpr Duration kOnItsWay = std::chrono::milliseconds(100);
+  if (mirror.newest == kNoTid || stream.newest <= mirror.newest) return {};
+  const Duration behind = saturating_sub(stream.newest_time, mirror.newest_time);
+  return behind > 2 * stream.cycle + kOnItsWay ? behind : Duration();
+}
+
 // Of another host's stream: the copy that this PC keeps of it, while a program reads it here.
-void print_mirror(const MirrorInfo& mirror, double rate_hz, Output& out) {
+void print_mirror(const StreamInfo& stream, const MirrorInfo& mirror, Output& out) {
+  std::string state(name_of(mirror.state));
+  if (const Duration behind = behind_owner(stream, mirror); behind > Duration()) {
+    const bool is_live = mirror.state == MirrorState::live;
+    state =
+        fmt::format("{}{} behind its owner", is_live ? "" : state + ", ", duration_text(behind));
+  }
   add_line(out, "mirror",
-           fmt::format("{}{}{}", name_of(mirror.state), mirror.error.empty() ? "" : ": ",
+           fmt::format("{}{}{}", state, mirror.error.empty() ? "" : ": ",
                        escaped_message(mirror.error)));
   add_line(out, "received",
            mirror.newest == kNoTid
@@ -70,9 +85,13 @@ void print_mirror(const MirrorInfo& mirror, double rate_hz, Output& out) {
                                  static_cast<double>(mirror.recent_samples);
     add_line(out, "network",
              fmt::format("carries {:.3g} of {:.3g} samples a second; the others are missing",
-                         share * rate_hz, rate_hz));
+                         share * stream.rate_hz, stream.rate_hz));
   }
-  if (mirror.filling_samples > 0) {
+  if (mirror.filling_samples > 0 && !mirror.history_wanted) {
+    add_line(out, "history",
+             fmt::format("{} samples are on its host only, until a program here reads them",
+                         mirror.filling_samples));
+  } else if (mirror.filling_samples > 0) {
     add_line(out, "filling",
              fmt::format("a part of {} samples, some of which are still to come; "
                          "newer ones are here",
@@ -98,7 +117,7 @@ void print_stream(const StreamInfo& stream, Output& out) {
   if (stream.creator_pid != 0) {  // not known of a mirror whose owner is unavailable
     add_line(out, "created by", fmt::format("pid {}", stream.creator_pid));
   }
-  if (stream.mirror) print_mirror(*stream.mirror, stream.rate_hz, out);
+  if (stream.mirror) print_mirror(stream, *stream.mirror, out);
   print_fields(stream, out);
   print_users(stream, out);
 }

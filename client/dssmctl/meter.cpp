@@ -84,7 +84,8 @@ Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t wind
 }  // namespace
 
 Result<void> run_meter(const MeterOptions& options, Output& out, const Meter& meter) {
-  return with_stream(options, [&](OpenedStream& opened) -> Result<void> {
+  const FetchHistory history = meter.from_history ? FetchHistory::at_once : FetchHistory::when_read;
+  return with_stream(options, history, [&](OpenedStream& opened) -> Result<void> {
     RawReader& reader = opened.reader;
     Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
 

@@ -18,13 +18,13 @@ namespace dssm::ctl {
 // What a report may show beside the measurements.
 struct MeterState {
   StreamId stream;
-  std::uint64_t payload_bytes = 0;
-  std::uint64_t seen = 0;         // samples since the start
-  std::uint64_t new_samples = 0;  // since the last report
-  std::uint64_t lost = 0;         // overwritten before their stamps were read, since the start
-  std::uint64_t restarts = 0;     // of the stream, since the start
-  Duration age{};                 // of the newest sample seen; meaningless while seen is 0
-  bool final = false;             // the last one, not after an interval
+  std::uint64_t payload_bytes = 0;  // of the stream: of its longest samples
+  std::uint64_t seen = 0;           // samples since the start
+  std::uint64_t new_samples = 0;    // since the last report
+  std::uint64_t lost = 0;           // overwritten before their stamps were read, since the start
+  std::uint64_t restarts = 0;       // of the stream, since the start
+  Duration age{};                   // of the newest sample seen; meaningless while seen is 0
+  bool final = false;               // the last one, not after an interval
 };
 
 struct Meter {

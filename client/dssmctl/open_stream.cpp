@@ -20,16 +20,18 @@ bool may_come(const Error& error) {
 }
 
 // Without a reader and without an error after a stop signal.
-Result<std::optional<OpenedStream>> open_stream(const ReadingOptions& options) {
+Result<std::optional<OpenedStream>> open_stream(const ReadingOptions& options,
+                                                FetchHistory history) {
   Session session = DSSM_TRY(connect(options));
   const StreamId id = DSSM_TRY(StreamId::parse(options.stream));
-  Result<RawReader> reader = session.open_raw_reader(id);
+  Result<RawReader> reader = session.open_raw_reader(id, nullptr, 0, history);
   if (reader) return std::optional(OpenedStream{session, std::move(*reader), false});
 
   const MonoTime deadline = deadline_in(options.wait);
   while (may_come(reader.error()) && MonoClock::now() < deadline) {
     if (stop_requested()) return std::optional<OpenedStream>();
-    reader = session.await_raw_reader(id, std::min(deadline, deadline_in(kStopCheckPeriod)));
+    reader = session.await_raw_reader(id, std::min(deadline, deadline_in(kStopCheckPeriod)),
+                                      nullptr, history);
     if (reader) return std::optional(OpenedStream{session, std::move(*reader), true});
   }
   Error error = with_similar_names(std::move(reader).error(), session, id);
@@ -48,10 +50,10 @@ Result<Session> connect(const CommonOptions& options) {
   return Session::connect(std::move(session_options));
 }
 
-Result<void> with_stream(const ReadingOptions& options,
+Result<void> with_stream(const ReadingOptions& options, FetchHistory history,
                          const std::function<Result<void>(OpenedStream&)>& work) {
   catch_stop_signals();
-  std::optional<OpenedStream> opened = DSSM_TRY(open_stream(options));
+  std::optional<OpenedStream> opened = DSSM_TRY(open_stream(options, history));
   return opened ? work(*opened) : Result<void>();
 }
 

@@ -55,7 +55,8 @@ Client::Client(SessionOptions options)
     : options_(std::move(options)),
       owner_pid_(::getpid()),
       connection_(options_.socket_path, options_.request_timeout),
-      stop_fd_(::eventfd(0, EFD_CLOEXEC)) {}
+      stop_fd_(::eventfd(0, EFD_CLOEXEC)),
+      wish_fd_(::eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK)) {}
 
 Client::~Client() {
   if (!thread_.joinable()) return;
@@ -70,7 +71,7 @@ Client::~Client() {
 
 Result<std::shared_ptr<Client>> Client::connect(SessionOptions options) {
   auto client = std::make_shared<Client>(completed(std::move(options)));
-  if (!client->stop_fd_) return os_error("create an eventfd");
+  if (!client->stop_fd_ || !client->wish_fd_) return os_error("create an eventfd");
   DSSM_TRY(client->set_up());
   client->thread_ =
       DSSM_TRY(quiet_thread("the connection to dssmd", [self = client.get()] { self->run(); }));
@@ -87,6 +88,7 @@ Result<void> Client::set_up() {
   connection_.use(std::move(connection));
   for (const std::uint64_t handle : replaced) streams_.on_replaced(handle);
   watches_.on_connected();
+  streams_.post_wishes(true);
   return {};
 }
 
@@ -130,8 +132,14 @@ void Client::run() {
       watches_.on_message(message);
     }
   };
+  const auto on_wish = [this] {
+    std::uint64_t count = 0;
+    [[maybe_unused]] const ssize_t got = ::read(wish_fd_.get(), &count, sizeof count);
+    streams_.post_wishes(false);
+  };
   for (;;) {
-    const Result<void> stopped = connection_.read(stop_fd_.get(), on_message);
+    const Result<void> stopped =
+        connection_.read(stop_fd_.get(), on_message, wish_fd_.get(), on_wish);
     connection_.drop();
     if (stopped) return;
     Duration time = kFirstReconnectPause;
@@ -148,6 +156,9 @@ Result<std::shared_ptr<OpenStream>> Client::open(local::Request request, Role ro
                                                  std::uint32_t tag) {
   const proto::StreamId& name = request.has_create() ? request.create().id() : request.open().id();
   const StreamId requested{name.name(), name.id(), name.host()};
+  const FetchHistory history = request.has_open() && request.open().history()
+                                   ? FetchHistory::at_once
+                                   : FetchHistory::when_read;
   Answer answer = DSSM_TRY(connection_.call(std::move(request)));
   if (!answer.response.has_opened()) {
     return Error{Errc::protocol, "dssmd's answer is not the opened stream"};
@@ -158,8 +169,8 @@ Result<std::shared_ptr<OpenStream>> Client::open(local::Request request, Role ro
   const auto access = role == Role::writer ? ring::Access::read_write : ring::Access::read_only;
   auto ring = rings_.get(std::move(answer.fds), access, opened.created());
   if (ring) {
-    auto stream =
-        std::make_shared<OpenStream>(shared_from_this(), requested, id, type, role, tag, *ring);
+    auto stream = std::make_shared<OpenStream>(shared_from_this(), requested, id, type, role, tag,
+                                               history, *ring);
     DSSM_TRY(streams_.add(*stream, answer));
     if ((*ring)->mapping->geometry().payload_bytes != type.payload_bytes) {
       return Error{Errc::protocol, "the ring's payload size differs from the one dssmd reports"};
@@ -176,8 +187,19 @@ Result<std::shared_ptr<OpenStream>> Client::open(local::Request request, Role ro
   return std::move(ring).error();
 }
 
-Result<std::shared_ptr<OpenStream>> Client::open_reader(const StreamId& id, std::uint32_t tag) {
-  return open(open_request(id, false, tag), Role::reader, tag);
+Result<std::shared_ptr<OpenStream>> Client::open_reader(const StreamId& id, std::uint32_t tag,
+                                                        FetchHistory history) {
+  local::Request request = open_request(id, false, tag);
+  request.mutable_open()->set_history(history == FetchHistory::at_once);
+  return open(std::move(request), Role::reader, tag);
+}
+
+void Client::want_history(const OpenStream& stream) noexcept {
+  if (::getpid() != owner_pid_) return;
+  stream.wishes = true;
+  stream.wish_is_new = true;
+  const std::uint64_t one = 1;
+  [[maybe_unused]] const ssize_t written = ::write(wish_fd_.get(), &one, sizeof one);
 }
 
 Result<std::shared_ptr<OpenStream>> Client::open_writer(const StreamId& id, std::uint32_t tag) {

@@ -36,7 +36,11 @@ class Client : public std::enable_shared_from_this<Client> {
 
   // Opens for reading or writing as `request` (Create or Open) asks.
   Result<std::shared_ptr<OpenStream>> open(local::Request request, Role role, std::uint32_t tag);
-  Result<std::shared_ptr<OpenStream>> open_reader(const StreamId& id, std::uint32_t tag);
+  Result<std::shared_ptr<OpenStream>> open_reader(const StreamId& id, std::uint32_t tag,
+                                                  FetchHistory history);
+  // A program reads what is missing in the stream's mirror: the thread tells dssmd. Takes no lock
+  // and does not wait, so that a signal handler may read.
+  void want_history(const OpenStream& stream) noexcept;
   Result<std::shared_ptr<OpenStream>> open_writer(const StreamId& id, std::uint32_t tag);
 
   Result<std::shared_ptr<clock::PlaybackRecord>> open_playback_clock();
@@ -74,6 +78,7 @@ class Client : public std::enable_shared_from_this<Client> {
 
   std::uint64_t connections_ = 0;  // of the thread, which counts them
   UniqueFd stop_fd_;               // eventfd: readable when the thread must end
+  UniqueFd wish_fd_;               // eventfd, non-blocking: when a stream has a wish
   std::thread thread_;
 };
 

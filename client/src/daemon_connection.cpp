@@ -173,7 +173,8 @@ Result<void> DaemonConnection::send_locked(const local::Request& request,
 }
 
 Result<void> DaemonConnection::read(int stop_fd,
-                                    const std::function<void(const local::Response&)>& on_message) {
+                                    const std::function<void(const local::Response&)>& on_message,
+                                    int wake_fd, const std::function<void()>& on_wake) {
   int socket = -1;
   {
     const std::lock_guard guard(mutex_);
@@ -186,9 +187,11 @@ Result<void> DaemonConnection::read(int stop_fd,
       const bool delivered = DSSM_TRY(deliver(*message));
       if (!delivered) on_message(*message);
     }
-    pollfd ready[] = {{socket, POLLIN, 0}, {stop_fd, POLLIN, 0}};
-    if (::poll(ready, 2, -1) < 0) continue;
+    pollfd ready[] = {{socket, POLLIN, 0}, {stop_fd, POLLIN, 0}, {wake_fd, POLLIN, 0}};
+    if (::poll(ready, 3, -1) < 0) continue;
     if (ready[1].revents) return {};
+    if (ready[2].revents) on_wake();
+    if (!ready[0].revents) continue;
     const auto received = DSSM_TRY(wire::recv_some(socket, input_.frames.space(), input_.fds));
     if (received.status == wire::IoStatus::end) return no_answer_error();
     input_.frames.commit(received.bytes);

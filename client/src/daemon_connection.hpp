@@ -89,8 +89,10 @@ class DaemonConnection {
   std::uint64_t post(local::Request request, std::uint64_t number = 0);
 
   // Reads until the connection ends (an error) or `stop_fd` is readable (success). Messages that no
-  // call waits for go to `on_message`: events, and answers to post(). One thread.
-  Result<void> read(int stop_fd, const std::function<void(const local::Response&)>& on_message);
+  // call waits for go to `on_message`: events, and answers to post(). `on_wake` is called when
+  // `wake_fd` is readable. One thread.
+  Result<void> read(int stop_fd, const std::function<void(const local::Response&)>& on_message,
+                    int wake_fd, const std::function<void()>& on_wake);
 
  private:
   // A thread that waits for an answer.

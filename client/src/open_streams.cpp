@@ -33,6 +33,7 @@ local::Request offer_request(const OpenStream& stream) {
   request.mutable_offer()->set_for_writing(stream.role == Role::writer);
   request.mutable_offer()->set_tag(stream.tag);
   request.mutable_offer()->set_any_host(stream.requested.host.empty());
+  request.mutable_offer()->set_history(stream.history == FetchHistory::at_once);
   return request;
 }
 
@@ -171,6 +172,20 @@ void OpenStreams::offer(NewConnection& connection, std::uint64_t key) {
   if (unused_handle != 0) {
     [[maybe_unused]] const auto closed = connection.exchange(close_request(unused_handle));
   }
+}
+
+void OpenStreams::post_wishes(bool all) {
+  std::vector<local::Request> requests;
+  {
+    const std::lock_guard guard(mutex_);
+    for (const auto& [key, stream] : streams_) {
+      const bool is_new = stream->wish_is_new.exchange(false);
+      if (!is_new && !(all && stream->wishes)) continue;
+      local::Request& request = requests.emplace_back();
+      wire::to_message(stream->id, *request.mutable_want_history()->mutable_id());
+    }
+  }
+  for (local::Request& request : requests) connection_.post(std::move(request));
 }
 
 void OpenStreams::on_replaced(std::uint64_t handle) {

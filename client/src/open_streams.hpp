@@ -54,13 +54,14 @@ class Client;
 struct OpenStream {
   OpenStream(std::shared_ptr<Client> opener, StreamId requested_id, StreamId stream,
              TypeInfo payload_type, Role user_role, std::uint32_t user_tag,
-             std::shared_ptr<const SharedRing> shared)
+             FetchHistory fetch_history, std::shared_ptr<const SharedRing> shared)
       : client(std::move(opener)),
         requested(std::move(requested_id)),
         id(std::move(stream)),
         type(std::move(payload_type)),
         role(user_role),
         tag(user_tag),
+        history(fetch_history),
         ring(std::move(shared)) {}
   OpenStream(const OpenStream&) = delete;
   OpenStream& operator=(const OpenStream&) = delete;
@@ -75,9 +76,12 @@ struct OpenStream {
   const TypeInfo type;
   const Role role;
   const std::uint32_t tag;
+  const FetchHistory history;
   const std::shared_ptr<const SharedRing> ring;
   // Set once: the stream has another ring. Shared with the reader's ReadyFd.
   const std::shared_ptr<std::atomic<bool>> superseded = std::make_shared<std::atomic<bool>>(false);
+  // Whether the program has read what is missing in the mirror; and since dssmd was told last.
+  mutable std::atomic<bool> wishes = false, wish_is_new = false;
 
  private:
   friend class OpenStreams;
@@ -98,6 +102,8 @@ class OpenStreams {
 
   // Offers all streams on a connection that is being set up.
   void offer_all(NewConnection& connection);
+  // Tells dssmd which mirrors' history is read: new wishes, or after a reconnect all.
+  void post_wishes(bool all);
   // dssmd has replaced the ring of this handle.
   void on_replaced(std::uint64_t handle);
 

@@ -20,39 +20,44 @@ constexpr std::int64_t kFirstCapacity = 16;
 // as written.
 constexpr std::size_t kMaxUnackedRanges = 1024;
 
+// Of unsent bytes that are found at a time: more than one send takes, or a long frame.
+constexpr std::size_t kEnoughBytes = 256U << 10;
+
 using Header = std::array<std::byte, wire::kMaxSampleHeaderBytes>;
 
-std::size_t header_bytes(std::size_t payload_bytes) {
-  Header header;  // all headers of a stream have one length
-  return wire::encode_sample_header(header, 0, SampleInfo{}, payload_bytes, wire::Trailer::none);
+std::size_t frame_bytes(std::size_t payload_bytes) {
+  Header header;
+  SampleInfo info;
+  info.payload_bytes = payload_bytes;
+  return wire::encode_sample_header(header, 0, info, wire::Trailer::none) + payload_bytes;
 }
 
 }  // namespace
 
 Outbox::Outbox(std::size_t payload_bytes, std::uint64_t max_samples, std::uint64_t max_bytes)
     : payload_bytes_(payload_bytes),
-      frame_bytes_(header_bytes(payload_bytes) + payload_bytes),
+      most_frame_bytes_(frame_bytes(payload_bytes)),
       max_count_(static_cast<std::int64_t>(std::clamp<std::uint64_t>(
           std::min(max_samples, max_bytes / payload_bytes), 1, std::uint64_t{1} << 32))) {}
 
-std::byte* Outbox::frame(std::int64_t number) noexcept {
-  return frames_.data() + static_cast<std::size_t>(number % capacity_) * frame_bytes_;
+std::byte* Outbox::place(std::int64_t number) noexcept {
+  return frames_.data() + static_cast<std::size_t>(number % capacity_) * most_frame_bytes_;
 }
 
-const std::byte* Outbox::frame(std::int64_t number) const noexcept {
-  return frames_.data() + static_cast<std::size_t>(number % capacity_) * frame_bytes_;
+std::span<const std::byte> Outbox::frame(std::int64_t number) const noexcept {
+  const auto at = static_cast<std::size_t>(number % capacity_);
+  return {frames_.data() + at * most_frame_bytes_, frame_bytes_[at]};
 }
 
 std::int64_t Outbox::push(std::span<const std::byte> payload, Time time, Duration clock_error) {
-  DSSM_CHECK(payload.size() == payload_bytes_);
+  DSSM_CHECK(payload.size() <= payload_bytes_);
   make_space();
   Header header;
-  const std::size_t length = wire::encode_sample_header(header, 0, {next_, time, clock_error},
-                                                        payload_bytes_, wire::Trailer::none);
-  DSSM_CHECK(length + payload_bytes_ == frame_bytes_);
-  std::byte* const place = frame(next_);
-  std::memcpy(place, header.data(), length);
-  std::memcpy(place + length, payload.data(), payload.size());
+  const std::size_t header_bytes = wire::encode_sample_header(
+      header, 0, {next_, time, clock_error, payload.size()}, wire::Trailer::none);
+  std::byte* const begin = std::copy_n(header.begin(), header_bytes, place(next_));
+  std::copy(payload.begin(), payload.end(), begin);
+  frame_bytes_[static_cast<std::size_t>(next_ % capacity_)] = header_bytes + payload.size();
   return next_++;
 }
 
@@ -60,19 +65,24 @@ void Outbox::make_space() {
   if (next_ - first_ < capacity_) return;
   if (capacity_ == max_count_) return drop_oldest();
   const std::int64_t capacity = std::min(max_count_, std::max(kFirstCapacity, 2 * capacity_));
-  std::vector<std::byte> frames(static_cast<std::size_t>(capacity) * frame_bytes_);
+  std::vector<std::byte> frames(static_cast<std::size_t>(capacity) * most_frame_bytes_);
+  std::vector<std::size_t> lengths(static_cast<std::size_t>(capacity));
   for (std::int64_t number = first_; number < next_; ++number) {
-    std::memcpy(frames.data() + static_cast<std::size_t>(number % capacity) * frame_bytes_,
-                frame(number), frame_bytes_);
+    const std::span<const std::byte> kept = frame(number);
+    const auto at = static_cast<std::size_t>(number % capacity);
+    std::memcpy(frames.data() + at * most_frame_bytes_, kept.data(), kept.size());
+    lengths[at] = kept.size();
   }
   frames_ = std::move(frames);
+  frame_bytes_ = std::move(lengths);
   capacity_ = capacity;
 }
 
 // A frame that was sent in part must be completed, or the other side cannot find the next one.
 void Outbox::detach_begun_frame() {
   if (sent_of_send_ == 0) return;
-  begun_.assign(frame(send_) + sent_of_send_, frame(send_) + frame_bytes_);
+  const std::span<const std::byte> rest = frame(send_).subspan(sent_of_send_);
+  begun_.assign(rest.begin(), rest.end());
   sent_of_send_ = 0;
   ++send_;
 }
@@ -94,16 +104,20 @@ void Outbox::drop_oldest() {
 std::span<const std::byte> Outbox::rest_of_frame() const noexcept {
   if (!begun_.empty()) return begun_;
   if (sent_of_send_ == 0) return {};
-  return {frame(send_) + sent_of_send_, frame_bytes_ - sent_of_send_};
+  return frame(send_).subspan(sent_of_send_);
 }
 
 std::span<const std::byte> Outbox::unsent() const noexcept {
   if (!begun_.empty()) return begun_;
   if (send_ == next_) return {};
-  const std::int64_t end = std::min(
-      next_, send_ - send_ % capacity_ + capacity_);  // up to the end of the circular buffer
-  return {frame(send_) + sent_of_send_,
-          static_cast<std::size_t>(end - send_) * frame_bytes_ - sent_of_send_};
+  // Up to the end of the circular buffer, or the first frame that is followed by unused bytes.
+  const std::int64_t end = std::min(next_, send_ - send_ % capacity_ + capacity_);
+  std::size_t bytes = 0;
+  for (std::int64_t number = send_; number < end; ++number) {
+    bytes += frame(number).size();
+    if (frame(number).size() != most_frame_bytes_ || bytes >= kEnoughBytes) break;
+  }
+  return {frame(send_).data() + sent_of_send_, bytes - sent_of_send_};
 }
 
 void Outbox::sent(std::size_t bytes) noexcept {
@@ -111,9 +125,10 @@ void Outbox::sent(std::size_t bytes) noexcept {
     begun_.erase(begun_.begin(), begun_.begin() + static_cast<std::ptrdiff_t>(bytes));
     return;
   }
-  const std::size_t all = sent_of_send_ + bytes;
-  send_ += static_cast<std::int64_t>(all / frame_bytes_);
-  sent_of_send_ = all % frame_bytes_;
+  sent_of_send_ += bytes;
+  while (sent_of_send_ > 0 && sent_of_send_ >= frame(send_).size()) {
+    sent_of_send_ -= frame(send_++).size();
+  }
 }
 
 Result<void> Outbox::acknowledge(std::int64_t last, Tid tid) {

@@ -8,6 +8,8 @@
 //     sent, not      waiting
 //     acknowledged   to be sent
 //
+// A frame has room for the longest sample; a shorter one is followed by unused bytes.
+//
 // Bounded: when it is full, the oldest sample is removed. One that was never sent counts as
 // dropped; one that was sent is probably written: the next acknowledgement or connection shows it.
 #pragma once
@@ -25,13 +27,15 @@ namespace dssm::detail {
 // A value; one thread.
 class Outbox {
  public:
-  // max_bytes: of all payloads; one sample is always kept, however large.
+  // max_bytes: of all payloads, each as long as the longest; one sample is always kept, however
+  // large.
   Outbox(std::size_t payload_bytes, std::uint64_t max_samples, std::uint64_t max_bytes);
 
-  // Keeps the sample, to be sent; returns its number.
+  // Keeps the sample, of at most payload_bytes, to be sent; returns its number.
   std::int64_t push(std::span<const std::byte> payload, Time time, Duration clock_error);
 
   // Bytes to be sent next: consecutive frames, the first one perhaps sent in part; may be empty.
+  // More may be unsent than these.
   std::span<const std::byte> unsent() const noexcept;
   // Of unsent(), only the rest of a frame that was sent in part.
   std::span<const std::byte> rest_of_frame() const noexcept;
@@ -53,15 +57,16 @@ class Outbox {
   std::uint64_t dropped() const noexcept { return dropped_; }
 
  private:
-  std::byte* frame(std::int64_t number) noexcept;
-  const std::byte* frame(std::int64_t number) const noexcept;
+  std::byte* place(std::int64_t number) noexcept;
+  std::span<const std::byte> frame(std::int64_t number) const noexcept;
   void make_space();
   void drop_oldest();
   void detach_begun_frame();
 
-  std::size_t payload_bytes_, frame_bytes_;
+  std::size_t payload_bytes_, most_frame_bytes_;
   std::int64_t max_count_, capacity_ = 0;  // frames
   std::vector<std::byte> frames_;          // frame `number` at number % capacity_
+  std::vector<std::size_t> frame_bytes_;   // its length, likewise
   std::vector<std::byte> begun_;           // rest of a frame that was sent in part and then removed
   std::int64_t first_ = 0, send_ = 0, next_ = 0;
   std::size_t sent_of_send_ = 0;  // bytes of frame `send_` that were sent

@@ -68,6 +68,13 @@ template <class Attempt>
   return ReadStatus::lapped;
 }
 
+// What a read returns to the program.
+[[gnu::always_inline]] inline ReadStatus result(detail::ReaderState& state,
+                                                ReadStatus status) noexcept {
+  if (status == ReadStatus::arriving) state.want_history();
+  return status;
+}
+
 // Copies the sample that `choose` finds: std::optional<ReadStatus> choose(Tid& chosen).
 template <class Choose>
 [[gnu::always_inline]] inline ReadStatus read_by_time(detail::ReaderState& state,
@@ -75,16 +82,17 @@ template <class Choose>
                                                       SampleInfo& info, Choose choose) noexcept {
   if (state.restart_due() && state.restart()) return ReadStatus::restarted;
   DSSM_CHECK(payload.size() == state.stream->ring->mapping->geometry().payload_bytes);
-  return retry([&]() -> std::optional<ReadStatus> {
-    Tid chosen = kNoTid;
-    const std::optional<ReadStatus> found = choose(chosen);
-    if (found != ReadStatus::ok) return found;
-    if (is_refused(state.ring, chosen)) return ReadStatus::clock_out_of_bounds;
-    const ReadStatus status = state.ring.read(chosen, payload, info);
-    if (status == ReadStatus::too_old || status == ReadStatus::lost) return kOvertaken;
-    if (status == ReadStatus::ok) state.set_cursor(chosen);
-    return status;
-  });
+  return result(state, retry([&]() -> std::optional<ReadStatus> {
+                  Tid chosen = kNoTid;
+                  const std::optional<ReadStatus> found = choose(chosen);
+                  if (found != ReadStatus::ok) return found;
+                  if (is_refused(state.ring, chosen)) return ReadStatus::clock_out_of_bounds;
+                  const ReadStatus status = state.ring.read(chosen, payload, info);
+                  if (status == ReadStatus::too_old || status == ReadStatus::lost)
+                    return kOvertaken;
+                  if (status == ReadStatus::ok) state.set_cursor(chosen);
+                  return status;
+                }));
 }
 
 }  // namespace
@@ -102,7 +110,7 @@ bool ReaderState::restart() noexcept {
   // Only dssmd can open the new ring, and a read must not wait until dssmd is available.
   if (to_ns(now.time_since_epoch()) < next_attempt_ns || !client.connection().is_up()) return false;
   next_attempt_ns = to_ns((now + kRestartPause).time_since_epoch());
-  auto newer = client.open_reader(stream->requested, stream->tag);
+  auto newer = client.open_reader(stream->requested, stream->tag, stream->history);
   if (!newer) return false;
   if (Result<void> usable = (*newer)->type.check_usable_as(stream->type); !usable) {
     next_attempt_ns = INT64_MAX;
@@ -128,6 +136,14 @@ bool ReaderState::restart() noexcept {
   }
   if (ready) client.notifiers().follow(*ready, {stream->ring, stream->superseded, cursor});
   return !same_samples;
+}
+
+[[gnu::cold]] void ReaderState::want_history() noexcept {
+  const MonoTime now = MonoClock::now();
+  if (to_ns(now.time_since_epoch()) < next_wish_ns) return;
+  next_wish_ns = to_ns((now + kHistoryPause).time_since_epoch());
+  const std::shared_ptr<OpenStream> on = stream_now();
+  on->client->want_history(*on);
 }
 
 std::shared_ptr<OpenStream> ReaderState::stream_now() const {
@@ -162,7 +178,7 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
   DSSM_CHECK(payload.size() == payload_bytes());
   const ReadStatus status = state_->ring.read(tid, payload, info);
   if (status == ReadStatus::ok) state_->set_cursor(tid);
-  return status;
+  return result(*state_, status);
 }
 
 [[gnu::hot]] ReadStatus RawReader::read_next(std::span<std::byte> payload,
@@ -174,6 +190,7 @@ ReadStatus RawReader::read_tid(Tid tid, std::span<std::byte> payload, SampleInfo
     ReadStatus status = state_->ring.read(wanted, payload, info);
     if (status == ReadStatus::arriving) {
       state_->awaited = wanted;
+      state_->want_history();
       status = ReadStatus::not_yet;
     }
     if (status == ReadStatus::not_yet) {
@@ -237,7 +254,7 @@ ReadStatus RawReader::read_nearest(Time t, std::span<std::byte> payload,
 }
 
 ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
-  return retry([&]() -> std::optional<ReadStatus> {
+  return result(*state_, retry([&]() -> std::optional<ReadStatus> {
     const ring::RingReader& ring = state_->ring;
     Tid before = kNoTid;
     const ReadStatus found = ring.find(t, before);
@@ -255,7 +272,7 @@ ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
     }
     out = seen;
     return ReadStatus::ok;
-  });
+  }));
 }
 
 Duration RawReader::clock_error(const SampleInfo& info) const noexcept {
@@ -292,7 +309,10 @@ JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_err
       JointSample& sample = samples[i];
       DSSM_CHECK(sample.payload.size() == sample.reader->payload_bytes());
       const ring::RingReader& ring = sample.reader->state_->ring;
-      if (ring.read(sample.info.tid, sample.payload, sample.info) == ReadStatus::ok) continue;
+      if (ring.read(sample.info.tid, sample.payload, sample.info) == ReadStatus::ok) {
+        zero_rest(sample.payload, sample.info);
+        continue;
+      }
       read = {ReadStatus::lapped, i, kUnknownClockError};
       return kOvertaken;
     }
@@ -307,11 +327,11 @@ Tid RawReader::newest_tid() const noexcept { return state_->ring.newest(); }
 Tid RawReader::oldest_tid() const noexcept { return state_->ring.oldest(); }
 
 ReadStatus RawReader::read_info(Tid tid, SampleInfo& info) const noexcept {
-  return state_->ring.stamp(tid, info);
+  return result(*state_, state_->ring.stamp(tid, info));
 }
 
 ReadStatus RawReader::find(Time t, SampleInfo& info) const noexcept {
-  return retry([&]() -> std::optional<ReadStatus> {
+  return result(*state_, retry([&]() -> std::optional<ReadStatus> {
     Tid found = kNoTid;
     const ReadStatus status = state_->ring.find(t, found);
     if (status != ReadStatus::ok) return status;
@@ -320,7 +340,7 @@ ReadStatus RawReader::find(Time t, SampleInfo& info) const noexcept {
     if (is_refused(state_->ring, seen)) return ReadStatus::clock_out_of_bounds;
     info = seen;
     return ReadStatus::ok;
-  });
+  }));
 }
 
 Tid RawReader::cursor() const noexcept { return state_->cursor; }
@@ -335,8 +355,8 @@ ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
   if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
   ring::RingReader::Place place{};
   const ReadStatus status = state_->ring.locate(tid, place, out.info_);
-  if (status != ReadStatus::ok) return status;
-  out.payload_ = {place.payload, payload_bytes()};
+  if (status != ReadStatus::ok) return result(*state_, status);
+  out.payload_ = {place.payload, out.info_.payload_bytes};
   out.sequence_ = place.sequence;
   state_->set_cursor(tid);
   return ReadStatus::ok;
@@ -359,8 +379,11 @@ ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
 WaitStatus RawReader::wait_for_sample(Tid tid, MonoTime deadline) noexcept {
   const std::shared_ptr<detail::OpenStream> stream = state_->stream_now();
   const ring::RingReader ring(*stream->ring->mapping);
-  return wait_until(*stream->ring->bell, deadline,
-                    [&] { return ring.is_settled(tid) || state_->restart_wakes(*stream); });
+  return wait_until(*stream->ring->bell, deadline, [&] {
+    if (ring.is_settled(tid)) return true;
+    if (tid <= ring.newest()) state_->want_history();
+    return state_->restart_wakes(*stream);
+  });
 }
 
 WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept {

@@ -85,8 +85,8 @@ void SampleCollectorState::collect() {
     } else {
       const Tid tid = info.tid + offset;
       slots.begin(tid);
-      slots.fill(tid, payload);
-      slots.publish(tid, info.time, info.clock_error);
+      slots.fill(tid, std::span(payload).first(info.payload_bytes));
+      slots.publish({tid, info.time, info.clock_error, info.payload_bytes});
     }
   }
 }

@@ -132,15 +132,15 @@ Result<RawWriter> Session::open_raw_writer(const StreamId& id, const TypeInfo* w
 }
 
 Result<RawReader> Session::open_raw_reader(const StreamId& id, const TypeInfo* wanted,
-                                           std::uint32_t tag) {
+                                           std::uint32_t tag, FetchHistory history) {
   const std::string what = quoted("open", id);
-  auto stream = DSSM_TRY(client_->open_reader(id, tag), what);
+  auto stream = DSSM_TRY(client_->open_reader(id, tag, history), what);
   if (wanted) DSSM_TRY(stream->type.check_usable_as(*wanted), what);
   return RawReader(std::make_unique<detail::ReaderState>(std::move(stream)));
 }
 
 Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadline,
-                                            const TypeInfo* wanted) {
+                                            const TypeInfo* wanted, FetchHistory history) {
   std::mutex mutex;
   std::condition_variable added;
   std::uint64_t times_added = 0;
@@ -155,7 +155,7 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
   };
   const Watch watching = DSSM_TRY(watch(on_event), quoted("wait for", id));
   for (std::uint64_t seen = 0;;) {
-    auto reader = open_raw_reader(id, wanted);
+    auto reader = open_raw_reader(id, wanted, 0, history);
     if (reader || !is_retryable(reader.error().code)) return reader;
     // Only for a missing stream is there an event when it can be opened.
     const bool has_event = reader.error().code == Errc::not_found;

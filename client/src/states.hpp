@@ -19,6 +19,10 @@ namespace dssm::detail {
 // How long a reader waits before it tries again to open the ring that superseded its own.
 inline constexpr Duration kRestartPause = std::chrono::milliseconds(200);
 
+// How long a program that repeats a read of a sample that is still to come does not ask for it
+// again.
+inline constexpr Duration kHistoryPause = std::chrono::milliseconds(50);
+
 // A time that is further from now than this is not of this PC's clock.
 inline constexpr Duration kMaxDelay = std::chrono::seconds(10);
 
@@ -46,6 +50,10 @@ struct ReaderState {
   // Whether a wait on `on` must end so that the reader can try to restart.
   bool restart_wakes(const OpenStream& on) const noexcept;
 
+  // What is read is still to come: dssmd shall fetch what is missing. To be repeated while that is
+  // so: the connection to its host, and dssmd, may begin anew meanwhile.
+  void want_history() noexcept;
+
   // read_next() continues after `tid`.
   void set_cursor(Tid tid) noexcept {
     cursor = tid;
@@ -54,8 +62,11 @@ struct ReaderState {
   }
   // Whether there is something to read that was not there: after the cursor; or, after read_next()
   // found that the next one is still arriving, that one.
-  bool has_news(const ring::RingReader& from) const noexcept {
-    return awaited == kNoTid ? from.newest() > cursor : from.is_settled(awaited);
+  bool has_news(const ring::RingReader& from) noexcept {
+    if (awaited == kNoTid) return from.newest() > cursor;
+    if (from.is_settled(awaited)) return true;
+    want_history();
+    return false;
   }
 
   // Changed only by restart(), in the thread that reads; stream_mutex is for one that waits.
@@ -70,6 +81,7 @@ struct ReaderState {
   std::uint64_t restarts = 0;
   std::optional<Error> restart_error;
   std::atomic<std::int64_t> next_attempt_ns = 0;  // monotonic: restart() sends no request before
+  std::atomic<std::int64_t> next_wish_ns = 0;     // monotonic: nor does want_history()
   std::shared_ptr<ReadyFd> ready;
 };
 

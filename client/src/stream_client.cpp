@@ -239,7 +239,7 @@ std::string StreamClient::what(const char* verb) const {
 }
 
 Error StreamClient::size_error(const char* verb, std::size_t bytes) const {
-  return Error{Errc::invalid_argument, fmt::format("{}: its samples have {} bytes, not {}",
+  return Error{Errc::invalid_argument, fmt::format("{}: its samples have at most {} bytes, not {}",
                                                    what(verb), stream_.type.payload_bytes, bytes)};
 }
 
@@ -271,7 +271,8 @@ Result<void> StreamClient::on_opened(StreamInfo stream, bool) {
   return {};
 }
 
-Result<void> StreamClient::on_subscribed_untrusted(Tid first, bool /*newest_first*/) {
+Result<void> StreamClient::on_subscribed_untrusted(Tid first, bool /*newest_first*/,
+                                                   Tid /*oldest*/) {
   return subscriber_->on_subscribed_untrusted(first);
 }
 
@@ -511,7 +512,7 @@ void StreamClient::start_publishing() {
 
 Result<void> StreamClient::post(std::span<const std::byte> payload, Time time,
                                 Duration clock_error) {
-  if (payload.size() != stream_.type.payload_bytes) {
+  if (payload.size() > stream_.type.payload_bytes) {
     return size_error("write", payload.size());
   }
   if (!publishing_.started) {

@@ -125,7 +125,7 @@ std::byte* Subscriber::detach_target() {
   }
   if (queue_.empty()) return std::nullopt;
   queue_.pop(payload, info);
-  copied_bytes_ += payload.size();
+  copied_bytes_ += info.payload_bytes;
   return ReadStatus::ok;
 }
 
@@ -152,8 +152,8 @@ void SampleQueue::push(const SampleInfo& info) noexcept {
 }
 
 void SampleQueue::pop(std::span<std::byte> payload, SampleInfo& info) noexcept {
-  std::memcpy(payload.data(), payloads_.data() + first_ * payload_bytes_, payload_bytes_);
   info = infos_[first_];
+  std::memcpy(payload.data(), payloads_.data() + first_ * payload_bytes_, info.payload_bytes);
   remove_oldest();
 }
 
@@ -174,9 +174,9 @@ void SampleQueue::grow() {
   std::vector<std::byte> payloads(capacity * payload_bytes_);
   std::vector<SampleInfo> infos(capacity);
   for (std::size_t n = 0; n < count_; ++n) {
-    std::memcpy(payloads.data() + n * payload_bytes_, payloads_.data() + index(n) * payload_bytes_,
-                payload_bytes_);
     infos[n] = infos_[index(n)];
+    std::memcpy(payloads.data() + n * payload_bytes_, payloads_.data() + index(n) * payload_bytes_,
+                infos[n].payload_bytes);
   }
   payloads_ = std::move(payloads);
   infos_ = std::move(infos);

@@ -26,8 +26,8 @@ namespace dssm::detail {
 // complete: a sample that has arrived in part may still be cut off or torn. A value; one thread.
 class SampleQueue {
  public:
-  // max_bytes: of all payloads but the one that is arriving; one sample is always kept, however
-  // large.
+  // max_bytes: of all payloads, each as long as the longest, but the one that is arriving; one
+  // sample is always kept, however large.
   SampleQueue(std::size_t payload_bytes, std::size_t max_bytes);
 
   bool empty() const noexcept { return count_ == 0; }

@@ -1,5 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 #include <dssm/writer.hpp>
+#include <utility>
 
 #include "client/src/states.hpp"
 
@@ -10,13 +11,13 @@ LoanedSample::LoanedSample(detail::WriterState* state) noexcept : state_(state) 
 }
 
 Tid LoanedSample::publish(Time time, Duration clock_error) noexcept {
-  if (payload_.empty()) return kNoTid;
-  payload_ = {};
-  return state_->ring.commit(time, state_->clock_error_for(time, clock_error));
+  if (!*this) return kNoTid;
+  const std::size_t bytes = std::exchange(payload_, {}).size();
+  return state_->ring.commit(bytes, time, state_->clock_error_for(time, clock_error));
 }
 
 void LoanedSample::abandon() noexcept {
-  if (payload_.empty()) return;
+  if (!*this) return;
   payload_ = {};
   state_->ring.cancel();
 }
@@ -29,7 +30,7 @@ RawWriter::~RawWriter() = default;
 
 [[gnu::hot]] Tid RawWriter::write(std::span<const std::byte> payload, Time time,
                                   Duration clock_error) noexcept {
-  if (payload.size() != state_->payload_bytes) return kNoTid;
+  if (payload.size() > state_->payload_bytes) return kNoTid;
   return state_->ring.write_with(payload, time,
                                  [&] { return state_->clock_error_for(time, clock_error); });
 }

@@ -127,7 +127,8 @@ Result<void> ChannelClient::on_subscribe_answer(const net::Frame& frame) {
   }
   reading_ = Reading::filling;
   return delegate_.on_subscribed_untrusted(frame.subscribed().first_tid(),
-                                           frame.subscribed().newest_first());
+                                           frame.subscribed().newest_first(),
+                                           frame.subscribed().oldest());
 }
 
 Result<void> ChannelClient::on_publish_answer(const net::Frame& frame) {

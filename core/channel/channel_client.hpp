@@ -108,8 +108,10 @@ class ChannelClient {
     // The stream is open; `stream` is checked, and has the name that was asked for.
     virtual Result<void> on_opened(StreamInfo stream, bool created) = 0;
     // Samples come from now on, beginning with `first`, for
-    // SampleCursor::on_subscribed_untrusted(). newest_first: as it was asked for.
-    virtual Result<void> on_subscribed_untrusted(Tid /*first*/, bool /*newest_first*/) {
+    // SampleCursor::on_subscribed_untrusted(). newest_first: as it was asked for. oldest: what the
+    // owner's ring holds.
+    virtual Result<void> on_subscribed_untrusted(Tid /*first*/, bool /*newest_first*/,
+                                                 Tid /*oldest*/) {
       return {};
     }
     // All samples that the owner had when it was asked have come.
@@ -140,7 +142,11 @@ class ChannelClient {
   Stream stream() const noexcept { return stream_; }
   Reading reading() const noexcept { return reading_; }
   Writing writing() const noexcept { return writing_; }
-  bool takes_samples() const noexcept { return reading_ >= Reading::filling; }
+  // Also of the subscription that the present request replaces.
+  bool takes_samples() const noexcept {
+    return reading_ >= Reading::filling ||
+           (reading_ == Reading::asked && before_asked_ >= Reading::filling);
+  }
   // Whether no request of these waits for its answer.
   bool is_settled() const noexcept {
     return stream_ == Stream::open && reading_ != Reading::asked && writing_ != Writing::asked;

@@ -22,7 +22,7 @@
 namespace dssm::ring {
 
 inline constexpr std::uint64_t kMagic = 0x474e49524d535344;  // "DSSMRING"
-inline constexpr std::uint32_t kLayoutVersion = 6;
+inline constexpr std::uint32_t kLayoutVersion = 7;
 inline constexpr std::size_t kPageBytes = 4096;
 inline constexpr std::size_t kLineBytes = 64;
 
@@ -124,7 +124,8 @@ static_assert(sizeof(RingHeader) == kPageBytes);
 //   off size field           unit  written by  order
 //     0    8 sequence        -     writer      2*tid+1 while being filled, 2*tid+2 when published;
 //                                            of a lost sample (mirrors) 2^63 + 2*tid+2
-//     8    8 tid             -     writer      inside the sequence bracket, as all below
+//     8    8 payload_bytes   bytes writer      of this sample; inside the sequence bracket, as all
+//                                              below
 //    16    8 time_ns         ns    writer      signed, since 1970, CLOCK_REALTIME of the writer
 //    24    8 clock_error_ns  ns    writer      >= 0; 2^63-1: unknown; 2^63-2: of another clock
 //    32    8 run_start       tid   writer      first sample of the run this one belongs to
@@ -135,7 +136,8 @@ static_assert(sizeof(RingHeader) == kPageBytes);
 //    64    - payload
 struct SlotHeader {
   std::atomic<std::uint64_t> sequence;
-  std::atomic<std::int64_t> tid, time_ns, clock_error_ns;
+  std::atomic<std::uint64_t> payload_bytes;
+  std::atomic<std::int64_t> time_ns, clock_error_ns;
   std::atomic<std::int64_t> run_start, run_parent, run_jump, run_level;
 };
 static_assert(offsetof(SlotHeader, time_ns) == 16 && offsetof(SlotHeader, run_level) == 56);

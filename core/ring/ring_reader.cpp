@@ -10,9 +10,11 @@ namespace dssm::ring {
 namespace {
 
 // The stamps of a slot. Acquire, so that the sequence is loaded again after all of them.
-SampleInfo load_info(const SlotHeader& slot, Tid tid) noexcept {
+//   room_bytes  for the payload: a hostile writer may state any length, and change it
+SampleInfo load_info(const SlotHeader& slot, Tid tid, std::uint64_t room_bytes) noexcept {
   SampleInfo info;
   info.tid = tid;
+  info.payload_bytes = std::min(slot.payload_bytes.load(std::memory_order_acquire), room_bytes);
   info.time = time_from_ns(slot.time_ns.load(std::memory_order_acquire));
   info.clock_error = Duration(slot.clock_error_ns.load(std::memory_order_acquire));
   return info;
@@ -59,7 +61,7 @@ ReadStatus RingReader::locate(Tid tid, Place& place, SampleInfo& info) const noe
   if (slot.sequence.load(std::memory_order_acquire) != published_sequence(tid)) {
     return status_of_absent(tid);
   }
-  const SampleInfo seen = load_info(slot, tid);
+  const SampleInfo seen = load_info(slot, tid, slots_.payload_bytes());
   if (slot.sequence.load(std::memory_order_relaxed) != published_sequence(tid)) {
     return status_of_absent(tid);
   }
@@ -82,8 +84,10 @@ bool RingReader::still_valid(const std::atomic<std::uint64_t>& sequence,
   SlotHeader& slot = slots_.slot(tid);
   const std::uint64_t published = published_sequence(tid);
   if (slot.sequence.load(std::memory_order_acquire) != published) return status_of_absent(tid);
-  const SampleInfo seen = load_info(slot, tid);
-  copy_out(payload.data(), SlotTable::payload(slot), slots_.payload_bytes());
+  const SampleInfo seen = load_info(slot, tid, payload.size());
+  // A small one in full, so that the copy need not wait until its length is loaded.
+  const std::size_t bytes = payload.size() < kLargeBytes ? payload.size() : seen.payload_bytes;
+  copy_out(payload.data(), SlotTable::payload(slot), bytes);
   fence_after_copying_out();
   if (slot.sequence.load(std::memory_order_relaxed) != published) return status_of_absent(tid);
   info = seen;

@@ -31,7 +31,8 @@ class RingReader {
   // The first sample from `tid` on that is not known to be lost; a tid after the newest: itself.
   Tid skip_lost(Tid tid) const noexcept;
 
-  // Copies sample `tid` into `payload` (payload_bytes long; unspecified unless ok).
+  // Copies sample `tid` into `payload`: at most the stream's payload_bytes long; a longer sample is
+  // cut. What follows info.payload_bytes in it, and all of it unless ok, is unspecified.
   //   returns  ok | not_yet | arriving | lost | too_old
   ReadStatus read(Tid tid, std::span<std::byte> payload, SampleInfo& info) const noexcept;
 
@@ -67,8 +68,8 @@ class RingReader {
   //   returns  ok | not_yet (empty) | arriving (it may be in the hole or before) | too_old | lapped
   ReadStatus find(Time t, Tid& tid) const noexcept;
 
-  // The payload of sample `tid` in place. It was that sample's if `sequence` still holds `expected`
-  // after the last access: see still_valid().
+  // The payload of sample `tid` in place, info.payload_bytes long. It was that sample's if
+  // `sequence` still holds `expected` after the last access: see still_valid().
   struct Place {
     const std::byte* payload;
     const std::atomic<std::uint64_t>* sequence;

@@ -60,11 +60,11 @@ void RingWriter::cancel() noexcept {
   unlock();
 }
 
-Tid RingWriter::commit(Time time, Duration clock_error) noexcept {
+Tid RingWriter::commit(std::size_t payload_bytes, Time time, Duration clock_error) noexcept {
   // No fence: glibc's memcpy ends its non-temporal stores with one, and a program that uses such
   // stores directly must end them with one, as before any other release.
   const Tid tid = newest() + 1;
-  slots_.publish(tid, time, clock_error);
+  slots_.publish({tid, time, clock_error, payload_bytes});
   loaned_rings.remove(&slots_.header());
   unlock();
   follow_up(tid);
@@ -94,7 +94,7 @@ RingWriter::Attempt RingWriter::try_publish(const PublishedSample& sample,
   const Tid tid = newest() + 1;
   slots_.begin(tid);
   slots_.fill(tid, payload);
-  slots_.publish(tid, time, clock_error);
+  slots_.publish({tid, time, clock_error, payload.size()});
   unlock();
   follow_up(tid);
   return tid;

@@ -32,8 +32,8 @@ class RingWriter {
   // doorbell: the stream's eventfd, written to while dssmd has armed it; -1: none. Not owned.
   RingWriter(const RingMapping& mapping, Bell& bell, int doorbell) noexcept;
 
-  // Writes one sample; payload.size() == payload_bytes. Returns its tid; kNoTid when this thread
-  // holds the lock already (a loan).
+  // Writes one sample of at most the stream's payload_bytes. Returns its tid; kNoTid when this
+  // thread holds the lock already (a loan).
   Tid write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
 
   // The same with a clock error that is still to be found: `clock_error()` is called once, with the
@@ -60,7 +60,7 @@ class RingWriter {
   // In place: begin() takes the lock and gives the next slot's payload (nullptr when this thread
   // holds it already); then exactly one of commit() and cancel(), in the same thread.
   std::byte* begin() noexcept;
-  Tid commit(Time time, Duration clock_error) noexcept;
+  Tid commit(std::size_t payload_bytes, Time time, Duration clock_error) noexcept;
   void cancel() noexcept;
 
   Tid newest() const noexcept { return slots_.newest(); }

@@ -23,14 +23,16 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
 }
 
 [[gnu::hot]] void SlotWriter::fill(Tid tid, std::span<const std::byte> payload) const noexcept {
-  copy_in(SlotTable::payload(slots_.slot(tid)), payload.data(), payload.size());
+  if (!payload.empty()) {
+    copy_in(SlotTable::payload(slots_.slot(tid)), payload.data(), payload.size());
+  }
   fence_after_filling(large_);
 }
 
-[[gnu::hot]] void SlotWriter::publish(Tid tid, Time time, Duration clock_error) const noexcept {
-  SlotHeader& slot = slots_.slot(tid);
+[[gnu::hot]] void SlotWriter::publish(const SampleInfo& info) const noexcept {
+  const Tid tid = info.tid;
   const Tid top = header_->top.load(std::memory_order_relaxed);
-  const std::int64_t time_ns = to_ns(time);
+  const std::int64_t time_ns = to_ns(info.time);
   Tid run_start = header_->run_start.load(std::memory_order_relaxed);
   RunLinks links;
   bool starts_run = tid == run_start;
@@ -47,25 +49,26 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
     // Before top: a reader that sees the new top also sees its run.
     header_->run_start.store(run_start, std::memory_order_release);
   }
-  store(slot, tid, time_ns, clock_error, run_start);
+  store(info, run_start);
   // Even: the sample is complete. Pairs with the first load of each read.
-  slot.sequence.store(published_sequence(tid), std::memory_order_release);
+  slots_.slot(tid).sequence.store(published_sequence(tid), std::memory_order_release);
   // Sequentially consistent, like the bell's loads that follow: either a sleeper that has just
   // announced itself sees this top, or the writer sees the announcement.
   header_->top.store(tid, std::memory_order_seq_cst);
 }
 
-void SlotWriter::store(SlotHeader& slot, Tid tid, std::int64_t time_ns, Duration clock_error,
-                       Tid run_start) const noexcept {
+void SlotWriter::store(const SampleInfo& info, Tid run_start) const noexcept {
+  SlotHeader& slot = slots_.slot(info.tid);
+  const std::int64_t time_ns = to_ns(info.time);
   // Release, each: a reader that sees one of these sees the odd sequence too; pairs with the
   // acquire loads of load_info() and load_field().
-  slot.tid.store(tid, std::memory_order_release);
+  slot.payload_bytes.store(info.payload_bytes, std::memory_order_release);
   slot.time_ns.store(time_ns, std::memory_order_release);
-  slot.clock_error_ns.store(to_ns(clock_error), std::memory_order_release);
+  slot.clock_error_ns.store(to_ns(info.clock_error), std::memory_order_release);
   slot.run_start.store(run_start, std::memory_order_release);
   // A search that sees this entry also sees the `top` that moved the entry's previous sample out of
   // the window; pairs with the fence in RingReader::find().
-  slots_.time_ns(tid).store(time_ns, std::memory_order_release);
+  slots_.time_ns(info.tid).store(time_ns, std::memory_order_release);
 }
 
 void SlotWriter::begin_run(Tid tid, const RunLinks& links) const noexcept {
@@ -110,7 +113,7 @@ void SlotWriter::lose_before_next(Tid tid, Time time) const noexcept {
   }
   for (Tid lost = top + 1; lost < tid; ++lost) {
     begin(lost);
-    store(slots_.slot(lost), lost, time_ns, kUnknownClockError, run);
+    store({lost, time, kUnknownClockError, 0}, run);
     slots_.slot(lost).sequence.store(lost_sequence(lost), std::memory_order_release);
   }
 }
@@ -135,10 +138,9 @@ void SlotWriter::skip_to(Tid tid, Tid from) const noexcept {
 }
 
 // No search looks at it before shrink_hole().
-void SlotWriter::publish_in_hole(Tid tid, Time time, Duration clock_error) const noexcept {
-  SlotHeader& slot = slots_.slot(tid);
-  store(slot, tid, to_ns(time), clock_error, tid);
-  slot.sequence.store(published_sequence(tid), std::memory_order_release);
+void SlotWriter::publish_in_hole(const SampleInfo& info) const noexcept {
+  store(info, info.tid);
+  slots_.slot(info.tid).sequence.store(published_sequence(info.tid), std::memory_order_release);
 }
 
 void SlotWriter::lose_in_hole(Tid first, Tid end) const noexcept {

@@ -26,13 +26,14 @@ class SlotWriter {
   // Marks the slot of sample `tid` as being filled; returns where its payload goes.
   std::byte* begin(Tid tid) const noexcept;
 
-  // Copies the payload of sample `tid` to the place that begin() returned.
+  // Copies the payload of sample `tid`, at most payload_bytes of the stream, to the place that
+  // begin() returned.
   void fill(Tid tid, std::span<const std::byte> payload) const noexcept;
 
-  // The payload is in place: makes it sample `tid`. A tid that does not follow the newest one (in
-  // such copies only) leaves a gap, and samples before the gap are no longer readable; unless
+  // The payload is in place: makes it sample `info.tid`. A tid that does not follow the newest one
+  // (in such copies only) leaves a gap, and samples before the gap are no longer readable; unless
   // lose_before_next() or skip_to() came before.
-  void publish(Tid tid, Time time, Duration clock_error) const noexcept;
+  void publish(const SampleInfo& info) const noexcept;
 
   // In mirrors: samples that are lost, or come later than newer ones. docs/ring-layout.md "Hole".
 
@@ -46,8 +47,8 @@ class SlotWriter {
   // they come or are lost.
   //   from  newest() + 1; in an empty ring any: none before it is readable
   void skip_to(Tid tid, Tid from) const noexcept;
-  // The payload is in place: makes it sample `tid`, which is in the hole.
-  void publish_in_hole(Tid tid, Time time, Duration clock_error) const noexcept;
+  // The payload is in place: makes it sample `info.tid`, which is in the hole.
+  void publish_in_hole(const SampleInfo& info) const noexcept;
   // Those of samples [first, end) that are in the hole and not here will never come.
   void lose_in_hole(Tid first, Tid end) const noexcept;
   // The hole ends where its last samples begin that are here or lost.
@@ -61,8 +62,7 @@ class SlotWriter {
   void prefetch_next(Tid tid) const noexcept;
 
  private:
-  void store(SlotHeader& slot, Tid tid, std::int64_t time_ns, Duration clock_error,
-             Tid run_start) const noexcept;
+  void store(const SampleInfo& info, Tid run_start) const noexcept;
   void begin_run(Tid tid, const RunLinks& links) const noexcept;
   Tid link(Tid tid, Tid previous_run) const noexcept;
   void join(Tid begin, Tid end, bool is_continued) const noexcept;

@@ -104,8 +104,8 @@ std::size_t plain_bytes(std::span<const std::byte> message) noexcept {
 IncomingSample incoming(std::uint64_t serial, std::int64_t tid, std::int64_t time_ns,
                         std::uint64_t clock_error_ns, std::size_t payload_bytes) {
   return {serial,
-          {tid, time_from_ns(time_ns), Duration(static_cast<std::int64_t>(clock_error_ns))},
-          payload_bytes};
+          {tid, time_from_ns(time_ns), Duration(static_cast<std::int64_t>(clock_error_ns)),
+           payload_bytes}};
 }
 
 }  // namespace
@@ -130,7 +130,7 @@ bool FrameDecoder::at_frame_end() const noexcept {
 }
 
 void FrameDecoder::move_payload(std::byte* place) noexcept {
-  const std::size_t come = sample_.payload_bytes - payload_left_;
+  const std::size_t come = sample_.info.payload_bytes - payload_left_;
   std::memcpy(place, place_ - come, come);
   counters_.copied_payload_bytes += come;
   place_ = place + come;
@@ -143,8 +143,8 @@ std::size_t FrameDecoder::longest_frame_bytes() const noexcept {
 
 [[gnu::hot]] Result<void> FrameDecoder::check_payload_bytes(std::uint64_t payload_bytes) const {
   if (payload_bytes_ == 0) return no_frame("a sample came where none is expected");
-  if (payload_bytes == payload_bytes_) return {};
-  return no_frame("a sample of {} bytes came; the stream's samples have {}", payload_bytes,
+  if (payload_bytes <= payload_bytes_) return {};
+  return no_frame("a sample of {} bytes came; the stream's samples have at most {}", payload_bytes,
                   payload_bytes_);
 }
 
@@ -212,12 +212,15 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
 
 // --- decoding
 
+// Without any input too: the last byte may have been received in place, a sample may have no bytes,
+// and a frame that was collected may have been held back.
+[[gnu::hot]] bool FrameDecoder::has_more(Bytes input) const noexcept {
+  return !input.empty() || (stage_ == Stage::payload && payload_left_ == 0) ||
+         (stage_ == Stage::whole && whole_left_ == 0);
+}
+
 [[gnu::hot]] Result<void> FrameDecoder::decode(Bytes& input) {
-  // Without any input too: the last byte may have been received in place, and a frame that was
-  // collected may have been held back.
-  bool continues = !input.empty() || (stage_ == Stage::payload && payload_left_ == 0) ||
-                   (stage_ == Stage::whole && whole_left_ == 0);
-  while (continues) {
+  while (has_more(input) && !held_) {
     Result<void> taken;
     switch (stage_) {
       case Stage::head:
@@ -234,7 +237,6 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
         break;
     }
     if (!taken) return taken;
-    continues = !input.empty() && !held_;
   }
   return {};
 }
@@ -262,7 +264,7 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
   Result<void> begun = begin_sample(place);
   if (!begun || refused_) return begun;
   place_ = place;
-  payload_left_ = sample_.payload_bytes;
+  payload_left_ = sample_.info.payload_bytes;
   trailer_bytes_ = trailer_left_ = head.trailer_bytes;
   stage_ = Stage::payload;
   input = input.subspan(head.bytes);

@@ -33,15 +33,14 @@ namespace dssm::wire {
 // A sample frame's fields before its payload.
 struct IncomingSample {
   std::uint64_t serial = 0;
-  SampleInfo info;  // tid >= 0, clock_error >= 0; the receiver checks the rest
-  std::size_t payload_bytes = 0;
+  SampleInfo info;  // tid >= 0, clock_error >= 0, payload_bytes; the receiver checks the rest
 };
 
 // Gets what the decoder has decoded; called from commit(). An error ends the decoding: the
 // connection is to be closed.
 class FrameDelegate {
  public:
-  // A sample begins. `out` is set to where its payload_bytes are stored, or nullptr to drop them.
+  // A sample begins. `out` is set to where its payload is stored, or nullptr to drop it.
   // The place stays valid until on_sample_end(), or as long as the decoder is used.
   virtual Result<void> on_sample_begin(const IncomingSample& sample, std::byte*& out) = 0;
   // Its payload is complete. torn: the sender marked it as void.
@@ -67,7 +66,7 @@ class FrameDecoder {
   FrameDecoder& operator=(const FrameDecoder&) = delete;
   ~FrameDecoder();
 
-  // From now on samples have exactly so many bytes; a sample of another size is an error.
+  // From now on samples have at most so many bytes; a longer sample is an error.
   // 0 (at first): samples are refused.
   void set_payload_bytes(std::size_t payload_bytes) noexcept;
 
@@ -78,7 +77,7 @@ class FrameDecoder {
 
   // `bytes` were received into spaces(), in the same thread. Calls the delegate for all that is
   // complete now.
-  //   fails  protocol (no frame, too long, wrong payload size ...), and what the delegate returned;
+  //   fails  protocol (no frame, too long ...), and what the delegate returned;
   //          the decoder is not usable afterwards
   Result<void> commit(std::size_t bytes);
 
@@ -130,6 +129,7 @@ class FrameDecoder {
   Result<void> parse_whole(Bytes message);
   Result<void> hand_out_slowly(net::Frame& frame, std::size_t frame_bytes);
   Result<void> check_payload_bytes(std::uint64_t payload_bytes) const;
+  bool has_more(Bytes input) const noexcept;
   std::size_t longest_frame_bytes() const noexcept;
 
   FrameDelegate& delegate_;

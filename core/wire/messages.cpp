@@ -26,11 +26,13 @@ MirrorInfo mirror_info(const proto::Mirror& message) {
           message.reconnects(),
           message.restarts(),
           message.newest(),
+          time_from_ns(message.newest_time_ns()),
           message.received_samples(),
           message.received_bytes(),
           message.error(),
           message.clock(),
           message.filling_samples(),
+          message.history_wanted(),
           message.recent_samples(),
           message.recent_lost_samples()};
 }

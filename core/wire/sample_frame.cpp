@@ -23,11 +23,12 @@ std::byte* write_fixed64(std::byte* out, std::byte tag, std::int64_t value) noex
 
 [[gnu::hot]] std::size_t encode_sample_header(std::array<std::byte, kMaxSampleHeaderBytes>& out,
                                               std::uint64_t serial, const SampleInfo& info,
-                                              std::size_t payload_bytes, Trailer trailer) noexcept {
+                                              Trailer trailer) noexcept {
   // All three stamps are written, also those that are 0 and that protobuf would leave out: so all
-  // headers of a stream have one length.
+  // headers of samples of one length have one length.
   const std::size_t sample_bytes = 3 * kFixed64FieldBytes;
-  std::uint64_t frame_bytes = 2 + sample_bytes + 1 + varint_bytes(payload_bytes) + payload_bytes;
+  std::uint64_t frame_bytes =
+      2 + sample_bytes + 1 + varint_bytes(info.payload_bytes) + info.payload_bytes;
   if (serial != 0) frame_bytes += 1 + varint_bytes(serial);
   if (trailer == Trailer::torn) frame_bytes += kTornTrailerBytes;
 
@@ -42,7 +43,7 @@ std::byte* write_fixed64(std::byte* out, std::byte tag, std::int64_t value) noex
   at = write_fixed64(at, kTimeTag, to_ns(info.time));
   at = write_fixed64(at, kClockErrorTag, to_ns(info.clock_error));
   *at++ = kPayloadTag;
-  at = write_varint(at, payload_bytes);
+  at = write_varint(at, info.payload_bytes);
   return static_cast<std::size_t>(at - out.data());
 }
 

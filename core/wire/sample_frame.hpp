@@ -33,10 +33,10 @@ inline constexpr std::size_t kTornTrailerBytes = 3;
 
 enum class Trailer : bool { none, torn };  // torn: kTornTrailerBytes follow the payload
 
-// Writes all that comes before the payload's bytes; returns how many bytes.
+// Writes all that comes before the payload's info.payload_bytes; returns how many bytes.
 std::size_t encode_sample_header(std::array<std::byte, kMaxSampleHeaderBytes>& out,
                                  std::uint64_t serial, const SampleInfo& info,
-                                 std::size_t payload_bytes, Trailer trailer) noexcept;
+                                 Trailer trailer) noexcept;
 
 // The torn trailer: the field `torn`, sent directly after the payload.
 std::array<std::byte, kTornTrailerBytes> torn_trailer(bool torn) noexcept;

@@ -24,7 +24,7 @@ Duration period_of(double rate_hz) {
 
 [[gnu::hot]] Tid newest_untrusted(const ring::RingReader& reader) noexcept {
   const Tid newest = reader.newest();
-  return newest <= channel::kMaxTid ? newest : kNoTid;
+  return newest >= 0 && newest <= channel::kMaxTid ? newest : kNoTid;
 }
 
 SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connection,
@@ -160,7 +160,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   }
   fills_ = next_ > newest;
   if (!fills_) {
-    if (newest > next_ && takes_long(newest - next_ + 1)) pass_over(newest, now);
+    if (newest > next_ && takes_long({next_, newest + 1})) pass_over(newest, now);
     return Next::ready;
   }
   // What was sent last still waits for the socket, and pump() with it.
@@ -173,8 +173,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   }
   if (back_fill_.count() == 0 && !passed_over_.empty()) {
     ring::TidRange& range = passed_over_.back();
-    const auto piece = static_cast<Tid>(kInOrderBytes / (payload_bytes_ + kHeaderBytes) + 1);
-    back_fill_ = {std::max(range.begin, range.end - piece), range.end};
+    back_fill_ = {std::min(first_within(kInOrderBytes, range), range.end - 1), range.end};
     range.end = back_fill_.begin;
     if (range.count() == 0) passed_over_.pop_back();
   }
@@ -192,11 +191,29 @@ Tid SamplePump::last_of_run() const noexcept {
   return fills_ ? back_fill_.end - 1 : std::min(newest_untrusted(reader_), last_);
 }
 
-bool SamplePump::takes_long(Tid count) const noexcept {
-  const std::size_t bytes = static_cast<std::size_t>(count) * (payload_bytes_ + kHeaderBytes);
-  if (bytes <= kInOrderBytes) return false;
+// The first of the newest samples of the range that together have at most so many bytes. Of many,
+// the length of the newest ones counts for all.
+Tid SamplePump::first_within(std::size_t bytes, ring::TidRange range) const noexcept {
+  const std::size_t most = payload_bytes_ + kHeaderBytes;
+  if (static_cast<std::size_t>(range.count()) * most <= bytes) return range.begin;
+  Tid first = range.end;
+  for (std::size_t sum = 0; first > range.begin; --first) {
+    SampleInfo info;
+    info.payload_bytes = payload_bytes_;
+    static_cast<void>(reader_.stamp(first - 1, info));
+    sum += info.payload_bytes + kHeaderBytes;
+    if (sum > bytes) break;
+    if (range.end - first == kSamplesPerTurn) {
+      return std::max(range.begin, range.end - static_cast<Tid>(bytes / (sum / kSamplesPerTurn)));
+    }
+  }
+  return first;
+}
+
+bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
+  if (first_within(kInOrderBytes, samples) == samples.begin) return false;
   const std::optional<std::uint64_t> carried = connection_.carried_per_s();
-  return !carried || bytes > bytes_in(kInOrderFor, *carried);
+  return !carried || first_within(bytes_in(kInOrderFor, *carried), samples) != samples.begin;
 }
 
 void SamplePump::pass_over(Tid next, MonoTime now) {

@@ -117,7 +117,8 @@ class SamplePump {
   // The sample that is sent, or is to be sent next.
   Tid& chosen() noexcept { return fills_ ? back_fill_.begin : next_; }
   Tid last_of_run() const noexcept;
-  bool takes_long(Tid count) const noexcept;
+  Tid first_within(std::size_t bytes, ring::TidRange range) const noexcept;
+  bool takes_long(ring::TidRange samples) const noexcept;
   void pass_over(Tid next, MonoTime now);
   void give_up_what_is_never_carried(MonoTime now);
   void limit_unsent(std::size_t bytes);

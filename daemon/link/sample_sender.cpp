@@ -2,11 +2,13 @@
 #include "daemon/link/sample_sender.hpp"
 
 #include <algorithm>
+#include <cstring>
 #include <optional>
 #include <utility>
 
 #include "core/base/check.hpp"
 #include "core/ring/copy.hpp"
+#include "core/wire/varint.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -15,6 +17,14 @@ using ring::RingReader;
 
 iovec part_of(const std::byte* bytes, std::size_t size) noexcept {
   return {const_cast<std::byte*>(bytes), size};  // the kernel only reads them
+}
+
+// The length of the frame at `begin`, which encode_sample_header() wrote.
+std::size_t frame_bytes_at(const std::byte* begin, const std::byte* end) noexcept {
+  const std::byte* at = begin;
+  std::uint64_t bytes = 0;
+  static_cast<void>(wire::read_varint(at, end, wire::kMaxLengthBytes, bytes));
+  return static_cast<std::size_t>(at - begin) + bytes;
 }
 
 }  // namespace
@@ -28,26 +38,29 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& co
 
 [[gnu::hot]] SendStatus SampleSender::send(Tid tid, std::uint64_t serial, bool more_follow) {
   DSSM_CHECK(!busy_);
-  const bool is_small = payload_bytes_ < kInPlaceBytes;
-  const bool may_copy = payload_bytes_ <= kMaxCopiedBytes;
+  if (payload_bytes_ < kInPlaceBytes) return send_copy(tid, serial);
+  SampleInfo info;
+  if (reader_.locate(tid, place_, info) != ReadStatus::ok) return SendStatus::not_in_ring;
+  const bool is_small = info.payload_bytes < kInPlaceBytes;
+  const bool may_copy = info.payload_bytes <= kMaxCopiedBytes;
   const bool copy_pays = is_small || !more_follow || !options_.may_tear;
-  return may_copy && copy_pays ? send_copy(tid, serial) : begin_in_place(tid, serial);
+  return may_copy && copy_pays ? send_copy(tid, serial) : begin_in_place(info, serial);
 }
 
 [[gnu::hot]] SendStatus SampleSender::send_copy(Tid tid, std::uint64_t serial) {
   std::byte staged[sizeof head_ + kMaxCopiedBytes];
   SampleInfo info;
-  std::byte* payload = staged + sizeof head_;
-  if (reader_.read(tid, {payload, payload_bytes_}, info) != ReadStatus::ok)
-    return SendStatus::not_in_ring;
+  const std::span<std::byte> payload(staged + sizeof head_,
+                                     std::min(payload_bytes_, kMaxCopiedBytes));
+  if (reader_.read(tid, payload, info) != ReadStatus::ok) return SendStatus::not_in_ring;
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
   const std::size_t header_bytes =
-      wire::encode_sample_header(header, serial, info, payload_bytes_, wire::Trailer::none);
+      wire::encode_sample_header(header, serial, info, wire::Trailer::none);
   // After the trailer of the sample before, if it is still here.
   const std::size_t kept_bytes = head_bytes_ - head_sent_;
   keep_head(std::span(header).first(header_bytes));
-  const std::size_t bytes = kept_bytes + header_bytes + payload_bytes_;
-  std::byte* begin = payload - header_bytes - kept_bytes;
+  const std::size_t bytes = kept_bytes + header_bytes + info.payload_bytes;
+  std::byte* begin = payload.data() - header_bytes - kept_bytes;
   std::copy_n(head_.begin() + head_sent_, kept_bytes + header_bytes, begin);
   head_bytes_ -= header_bytes;
   const iovec part = part_of(begin, bytes);
@@ -60,7 +73,7 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& co
   head_bytes_ = head_sent_ = 0;
   // Charged with the connection: there is at most one such rest.
   if (sent < bytes) connection_.queue_rest(RawBytes::copy_of({begin + sent, bytes - sent}));
-  counters_.copied_payload_bytes += payload_bytes_;
+  counters_.copied_payload_bytes += info.payload_bytes;
   ++counters_.samples;
   return SendStatus::sent;
 }
@@ -71,24 +84,30 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& co
   next = first;
   std::byte staged[kBatchBytes];
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
-  // All headers of one stream have the same length (sample_frame.cpp), and so have its frames.
-  const std::size_t header_bytes =
-      wire::encode_sample_header(header, 0, {}, payload_bytes_, wire::Trailer::none);
-  const std::size_t frame_bytes = header_bytes + payload_bytes_;
-  const auto room = static_cast<Tid>(kBatchBytes / frame_bytes);
-  const Tid end = last - first < room ? last + 1 : first + room;
+  // That of the longest samples. A shorter header is made for a shorter sample.
+  SampleInfo longest;
+  longest.payload_bytes = payload_bytes_;
+  const std::size_t most_header_bytes =
+      wire::encode_sample_header(header, 0, longest, wire::Trailer::none);
+  const std::size_t most_bytes = most_header_bytes + payload_bytes_;
   std::size_t bytes = 0;
-  for (; next < end; ++next, bytes += frame_bytes) {
+  for (; next <= last && bytes + most_bytes <= kBatchBytes; ++next) {
     SampleInfo info;
-    std::byte* payload = staged + bytes + header_bytes;
-    if (reader_.read(next, {payload, payload_bytes_}, info) != ReadStatus::ok) break;
-    wire::encode_sample_header(header, 0, info, payload_bytes_, wire::Trailer::none);
+    const std::span<std::byte> payload(staged + bytes + most_header_bytes, payload_bytes_);
+    if (reader_.read(next, payload, info) != ReadStatus::ok) break;
+    const std::size_t header_bytes =
+        wire::encode_sample_header(header, 0, info, wire::Trailer::none);
     std::copy_n(header.begin(), header_bytes, staged + bytes);
+    bytes += header_bytes;
+    if (header_bytes != most_header_bytes) {
+      std::memmove(staged + bytes, payload.data(), info.payload_bytes);
+    }
+    bytes += info.payload_bytes;
+    counters_.copied_payload_bytes += info.payload_bytes;
   }
   if (bytes == 0) return SendStatus::not_in_ring;
   const iovec part = part_of(staged, bytes);
   const std::size_t sent = connection_.send_now({&part, 1});
-  counters_.copied_payload_bytes += static_cast<std::uint64_t>(next - first) * payload_bytes_;
   if (sent == 0) {
     connection_.want_output();
     next = first;
@@ -99,9 +118,11 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& co
     if (options_.budget) share = options_.budget->try_take(bytes - sent);
     if (options_.budget && !share) {
       // Only what completes the frame that is begun; the others are still in the ring.
-      const std::size_t frames = (sent + frame_bytes - 1) / frame_bytes;
-      bytes = frames * frame_bytes;
-      next = first + static_cast<Tid>(frames);
+      std::size_t complete_bytes = 0;
+      for (next = first; complete_bytes < sent; ++next) {
+        complete_bytes += frame_bytes_at(staged + complete_bytes, staged + bytes);
+      }
+      bytes = complete_bytes;
     }
     if (sent < bytes) {
       connection_.queue_rest(RawBytes::copy_of({staged + sent, bytes - sent}),
@@ -119,15 +140,13 @@ void SampleSender::keep_head(std::span<const std::byte> bytes) noexcept {
   head_bytes_ += bytes.size();
 }
 
-SendStatus SampleSender::begin_in_place(Tid tid, std::uint64_t serial) {
-  SampleInfo info;
-  if (reader_.locate(tid, place_, info) != ReadStatus::ok) return SendStatus::not_in_ring;
+SendStatus SampleSender::begin_in_place(const SampleInfo& info, std::uint64_t serial) {
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
-  const std::size_t header_bytes =
-      wire::encode_sample_header(header, serial, info, payload_bytes_,
-                                 options_.may_tear ? wire::Trailer::torn : wire::Trailer::none);
+  const std::size_t header_bytes = wire::encode_sample_header(
+      header, serial, info, options_.may_tear ? wire::Trailer::torn : wire::Trailer::none);
   const std::size_t kept_bytes = head_bytes_;
   keep_head(std::span(header).first(header_bytes));
+  bytes_ = info.payload_bytes;
   offset_ = 0;
   busy_ = true;
   if (!options_.may_tear) {
@@ -156,7 +175,7 @@ SendStatus SampleSender::go_on() {
 }
 
 SendStatus SampleSender::send_slice() {
-  const std::size_t slice = std::min(payload_bytes_ - offset_, kSliceBytes);
+  const std::size_t slice = std::min(bytes_ - offset_, kSliceBytes);
   const std::size_t head = head_bytes_ - head_sent_;
   const iovec parts[] = {part_of(head_.data() + head_sent_, head),
                          part_of(place_.payload + offset_, slice)};
@@ -166,7 +185,7 @@ SendStatus SampleSender::send_slice() {
   offset_ += of_payload;
   counters_.in_place_payload_bytes += of_payload;
   if (sent == head + slice) {
-    if (offset_ < payload_bytes_) return SendStatus::unfinished;
+    if (offset_ < bytes_) return SendStatus::unfinished;
     head_bytes_ = head_sent_ = 0;
     return end_sample(RingReader::still_valid(*place_.sequence, place_.expected));
   }
@@ -183,7 +202,7 @@ SendStatus SampleSender::send_slice() {
 bool SampleSender::begin_copying() {
   const std::size_t head = head_bytes_ - head_sent_;
   const std::size_t bytes =
-      head + (payload_bytes_ - offset_) + (options_.may_tear ? wire::kTornTrailerBytes : 0);
+      head + (bytes_ - offset_) + (options_.may_tear ? wire::kTornTrailerBytes : 0);
   if (options_.budget) {
     std::optional<MemoryShare> share = options_.budget->try_take(bytes);
     if (!share) return false;
@@ -198,12 +217,12 @@ bool SampleSender::begin_copying() {
 }
 
 SendStatus SampleSender::copy_slice() {
-  const std::size_t slice = std::min(payload_bytes_ - offset_, kSliceBytes);
+  const std::size_t slice = std::min(bytes_ - offset_, kSliceBytes);
   ring::copy_out(aside_.data() + aside_bytes_, place_.payload + offset_, slice);
   aside_bytes_ += slice;
   offset_ += slice;
   counters_.copied_payload_bytes += slice;
-  return offset_ < payload_bytes_ ? SendStatus::unfinished : end_copying();
+  return offset_ < bytes_ ? SendStatus::unfinished : end_copying();
 }
 
 SendStatus SampleSender::end_copying() {

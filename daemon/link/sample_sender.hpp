@@ -73,6 +73,7 @@ class SampleSender {
   SampleSender(const SampleSender&) = delete;
   SampleSender& operator=(const SampleSender&) = delete;
 
+  // Whether the stream's samples may be so long that they are sent in place.
   bool sends_in_place() const noexcept { return payload_bytes_ >= kInPlaceBytes; }
 
   // Sends sample `tid`; `serial` as in Frame. After `blocked` or `unfinished` with busy(): go_on().
@@ -96,7 +97,7 @@ class SampleSender {
 
  private:
   SendStatus send_copy(Tid tid, std::uint64_t serial);
-  SendStatus begin_in_place(Tid tid, std::uint64_t serial);
+  SendStatus begin_in_place(const SampleInfo& info, std::uint64_t serial);
   SendStatus send_slice();
   bool begin_copying();
   SendStatus copy_slice();
@@ -116,7 +117,8 @@ class SampleSender {
 
   bool busy_ = false;
   ring::RingReader::Place place_{};
-  std::size_t offset_ = 0;  // bytes of the payload that are sent or copied
+  std::size_t bytes_ = 0;   // of the payload that are to be sent
+  std::size_t offset_ = 0;  // of these, sent or copied
   bool copying_ = false;
   RawBytes aside_;
   std::size_t aside_bytes_ = 0;  // filled so far

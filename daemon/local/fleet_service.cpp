@@ -105,8 +105,8 @@ net::Frame network_request(const StreamId& id, const local::Request& request) {
   net::Frame frame;
   proto::StreamId* named = nullptr;
   switch (request.body_case()) {
-    case local::Request::kInfo:
-      named = frame.mutable_info()->mutable_id();
+    case local::Request::kRemove:
+      named = frame.mutable_remove()->mutable_id();
       break;
     case local::Request::kGetProperty:
       named = frame.mutable_get_property()->mutable_id();
@@ -115,8 +115,8 @@ net::Frame network_request(const StreamId& id, const local::Request& request) {
       frame.mutable_set_property()->set_property(request.set_property().property());
       named = frame.mutable_set_property()->mutable_id();
       break;
-    default:
-      named = frame.mutable_remove()->mutable_id();
+    default:  // Info
+      named = frame.mutable_info()->mutable_id();
   }
   wire::to_message(id, *named);
   return frame;
@@ -173,20 +173,33 @@ Mirror* FleetService::mirror_without_owner(const StreamId& id) const {
   return !owner && owner.error().code == Errc::not_found ? mirror : nullptr;
 }
 
-void FleetService::open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) {
-  when_known(id, [this, id, then = std::move(then)]() mutable {
+void FleetService::open_reader(const StreamId& id, bool history,
+                               Then<std::shared_ptr<Stream>> then) {
+  when_known(id, [this, id, history, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (owner) {
-      return mirrors_.open(**owner, id, nullptr, [then = std::move(then)](Result<OpenedRing> ring) {
+      const StreamId named = owned_by(**owner, id);
+      const auto want = [&] {
+        Mirror* mirror = history ? mirrors_.find(named) : nullptr;
+        if (mirror) mirror->want_history(true);
+      };
+      want();  // so that open() waits for it
+      mirrors_.open(**owner, id, nullptr, [then = std::move(then)](Result<OpenedRing> ring) {
         if (!ring) return then(std::move(ring).error());
         then(std::move(ring->stream));
       });
+      return want();  // of a new mirror, which is not connected yet
     }
     if (Mirror* mirror = mirror_without_owner(id)) {
+      if (history) mirror->want_history(true);
       if (std::shared_ptr<Stream> stream = mirror->acquire()) return then(std::move(stream));
     }
     then(with_unavailable_peers(owner.error()));
   });
+}
+
+void FleetService::want_history(const StreamId& id, bool always) {
+  if (Mirror* mirror = mirrors_.find(id)) mirror->want_history(always);
 }
 
 void FleetService::open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) {

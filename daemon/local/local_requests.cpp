@@ -70,7 +70,7 @@ bool LocalRequests::is_elsewhere(const StreamId& id) const {
 }
 
 bool LocalRequests::waits_for_hosts(const local::Request& request) const {
-  if (!fleet_ || request.has_offer()) return false;
+  if (!fleet_ || request.has_offer() || request.has_want_history()) return false;
   if (request.has_ping_host() || request.has_list_clock_pairs()) return true;
   if (request.has_list()) return !request.list().own_only();
   const proto::StreamId* named = subject(request);
@@ -94,6 +94,13 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
       return offer(client, request.offer(), descriptors);
     case local::Request::kClose: {
       DSSM_TRY(opens_.remove(client->number, request.close().handle()));
+      Reply done;
+      done.response.mutable_done();
+      return done;
+    }
+    case local::Request::kWantHistory: {
+      const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.want_history().id()));
+      if (fleet_) fleet_->want_history(id, false);
       Reply done;
       done.response.mutable_done();
       return done;
@@ -149,6 +156,7 @@ Result<Reply> LocalRequests::offer(const Client& client, const local::Offer& req
   const std::shared_ptr<Stream> stream =
       DSSM_TRY(is_own ? registry_.adopt_untrusted(id, std::move(files))
                       : fleet_->adopt_untrusted(id, role, std::move(files)));
+  if (!is_own && request.history()) fleet_->want_history(id, true);
   return record_open({client, stream, role, request.tag(), request.any_host()});
 }
 
@@ -255,14 +263,15 @@ void LocalRequests::open_elsewhere(const Client& client, const StreamId& id,
           answer(opened(entry));
         });
   }
-  fleet_->open_reader(id, [this, entry, answer = std::move(answer)](
-                              Result<std::shared_ptr<Stream>> stream) mutable {
-    if (!stream) return answer(std::move(stream).error());
-    entry.stream = *std::move(stream);
-    Result<Reply> reply = opened(entry);
-    if (reply) reply->response.mutable_opened()->set_mirror(true);
-    answer(std::move(reply));
-  });
+  fleet_->open_reader(
+      id, request.history(),
+      [this, entry, answer = std::move(answer)](Result<std::shared_ptr<Stream>> stream) mutable {
+        if (!stream) return answer(std::move(stream).error());
+        entry.stream = *std::move(stream);
+        Result<Reply> reply = opened(entry);
+        if (reply) reply->response.mutable_opened()->set_mirror(true);
+        answer(std::move(reply));
+      });
 }
 
 void LocalRequests::list_all(Answer answer) {

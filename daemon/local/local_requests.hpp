@@ -60,9 +60,14 @@ class Fleet {
   // exactly one other host has one.
   virtual bool is_there(const StreamId& id) const = 0;
 
-  // The mirror of a stream, filled with its history. Kept while its Stream is in the OpenTable, and
+  // The mirror of a stream, with its newest sample. Kept while its Stream is in the OpenTable, and
   // some seconds longer.
-  virtual void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) = 0;
+  //   history  filled with all that its owner's ring holds
+  virtual void open_reader(const StreamId& id, bool history,
+                           Then<std::shared_ptr<Stream>> then) = 0;
+  // A program reads what is missing in the mirror of that stream; there may be none.
+  //   always  or wants it at once, now and later
+  virtual void want_history(const StreamId& id, bool always) = 0;
 
   // A ring of this host that is published into the other host's stream.
   //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist
@@ -110,7 +115,8 @@ class LocalRequests {
   using Answer = std::function<void(Result<Reply>)>;
 
   // Whether the response to `request` may have to wait for another host: it is a List of all hosts,
-  // a ListClockPairs, a PingHost, or about a stream of another host. Offers never wait.
+  // a ListClockPairs, a PingHost, or about a stream of another host. Offers and WantHistory never
+  // do.
   bool waits_for_hosts(const local::Request& request) const;
 
   // Serves a request that waits for other hosts,
@@ -122,7 +128,8 @@ class LocalRequests {
 
   // The stream that `request` names; nullptr: none.
   static const proto::StreamId* subject(const local::Request& request) noexcept {
-    return request.has_offer() ? &request.offer().id() : daemon::subject(request);
+    if (request.has_offer()) return &request.offer().id();
+    return request.has_want_history() ? &request.want_history().id() : daemon::subject(request);
   }
 
  private:

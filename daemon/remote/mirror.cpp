@@ -45,23 +45,40 @@ Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
   }
   is_removed_ = false;
   connection_.frames()->take_samples(theirs.type.payload_bytes, *this);
-  net::Subscribe request;
-  ring_->resume(newest_first_, request);
-  channel_.subscribe(request);
+  ++subscriptions_;
+  subscribe();
   set_pending_deadline(parts_.loop.deadline_in(kFillTimeout));
   if (!replaced_.empty()) fill_timer_.enable_in(kFillTimeout);
   return {};
 }
 
-Result<void> Mirror::on_subscribed_untrusted(Tid first, bool newest_first) {
-  DSSM_TRY(ring_->on_subscribed_untrusted(first, newest_first));
+void Mirror::subscribe() {
+  with_history_ = wants_history() || !newest_first_;
+  net::Subscribe request;
+  ring_->resume(newest_first_, with_history_, request);
+  channel_.subscribe(request);
+}
+
+Result<void> Mirror::on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest) {
+  DSSM_TRY(ring_->on_subscribed_untrusted(first, newest_first, oldest));
   log_new_gap();
   last_error_.reset();
-  ++subscriptions_;
+  if (!with_history_ && wants_history()) subscribe();
   return {};
 }
 
+bool Mirror::wants_history() const noexcept {
+  return history_wanted_ || history_always_ || parts_.mirror_history;
+}
+
+void Mirror::want_history(bool always) {
+  history_always_ |= always;
+  history_wanted_ = true;
+  if (!with_history_ && channel_.reading() >= ChannelClient::Reading::filling) subscribe();
+}
+
 Result<void> Mirror::on_caught_up() {
+  if (with_history_) history_wanted_ = false;
   ring_->wake();
   if (clear_error()) {
     parts_.logger.notice(
@@ -73,7 +90,7 @@ Result<void> Mirror::on_caught_up() {
         log_fields());
   }
   notify_replaced();
-  answer_pending(false);
+  if (!is_ending_) answer_pending(false);
   return {};
 }
 
@@ -86,7 +103,9 @@ Result<void> Mirror::on_gap_untrusted(Tid first, std::uint64_t count) {
 
 // The ring stays for its readers. A removed stream that is created again is found by the catalog,
 // or by asking the owner.
-Result<void> Mirror::on_refused(ChannelClient::Request, const Error& why) {
+Result<void> Mirror::on_refused(ChannelClient::Request request, const Error& why) {
+  // The subscription before goes on: the stream is being removed, and its last samples come.
+  if (request == ChannelClient::Request::subscribe && channel_.takes_samples()) return {};
   if (ring_ && why.code == Errc::not_found) ring_->end_filling();
   stop(why, why.code == Errc::not_found);
   return {};
@@ -118,8 +137,7 @@ void Mirror::on_stream_added() {
 
 // The channel may be earlier than the catalog, and the mirror live with the next ring.
 void Mirror::on_stream_removed(std::uint64_t incarnation) {
-  is_ending_ = channel_.reading() == ChannelClient::Reading::live &&
-               ring_->stream()->incarnation() == incarnation;
+  is_ending_ = channel_.takes_samples() && ring_->stream()->incarnation() == incarnation;
 }
 
 void Mirror::on_owner_clock(MirrorClock::Report report,
@@ -257,7 +275,9 @@ void Mirror::describe(proto::Mirror& out) const {
   if (last_error_) out.set_error(last_error_->message);
   out.set_clock(clock_.reason());
   if (!ring_) return;
+  out.set_newest_time_ns(to_ns(ring_->newest_time()));
   out.set_filling_samples(ring_->filling_samples());
+  out.set_history_wanted(with_history_ || wants_history());
   const MirrorRing::Recent recent = ring_->recent();
   out.set_recent_samples(recent.samples);
   out.set_recent_lost_samples(recent.lost);

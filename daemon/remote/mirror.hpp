@@ -1,10 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The copy of one stream of another host: one channel to its owner and one ring here, for any
-// number of programs that read it. The newest samples come first, then the owner's history, and
-// after a reconnect what is missing. A program that opens the stream gets the ring when all of that
-// is here, or after kFillTimeout. While the owner is away, those that read one sample after the
-// other wait before what is missing.
+// number of programs that read it. The newest sample comes first, and what is written from then on.
+// What was written before, or while there was no connection, is fetched when a program reads it or
+// asked for it with its open: want_history(). Until then it is the ring's hole. A program that
+// opens the stream gets the ring when what is fetched is here, or after kFillTimeout. While the
+// owner is away, those that read one sample after the other wait before what is missing.
 //
 //   ring      has the owner's type, depth, cycle and incarnation. When the owner's stream has
 //             another incarnation, the mirror makes a new ring, and readers of the old one are
@@ -13,9 +14,10 @@
 //             for its readers, and the mirror always retries
 //   end       when no program has used the ring for mirror_linger
 //
-// The states are drawn in remote_stream.hpp; `live` when the history is here. If there is a ring, a
-// program gets it at once while the channel is closed, opening or live. While it is subscribing and
-// filling, and after the catalog or the owner said that the stream was removed, its open() waits.
+// The states are drawn in remote_stream.hpp; `live` when what is fetched is here. If there is a
+// ring, a program gets it at once while the channel is closed, opening or live. While it is
+// subscribing and filling, and after the catalog or the owner said that the stream was removed, its
+// open() waits.
 #pragma once
 
 #include <cstdint>
@@ -32,11 +34,15 @@ namespace dssm::daemon {
 
 class Mirror final : public RemoteStream, private FrameConnection::SampleDelegate {
  public:
-  // How long an open() waits for the history. What has arrived by then can be read.
+  // How long an open() waits for what is fetched. What has arrived by then can be read.
   static constexpr Duration kFillTimeout = std::chrono::seconds(1);
   static constexpr bool kSeveralRings = false;
 
   Mirror(const ChannelParts& parts, StreamId id, RingQuota quota, std::function<void()> on_done);
+
+  // Fetches what is missing in the ring, also after a reconnect, until that has come once.
+  //   always  and from then on at once
+  void want_history(bool always);
 
   void describe(proto::Mirror& out) const;
   // The stream as its ring here shows it. False: there is none yet.
@@ -57,7 +63,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
 
   // ChannelClient::Delegate
   Result<void> on_opened(StreamInfo stream, bool created) override;
-  Result<void> on_subscribed_untrusted(Tid first, bool newest_first) override;
+  Result<void> on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest) override;
   Result<void> on_caught_up() override;
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count) override;
   Result<void> on_refused(channel::ChannelClient::Request request, const Error& why) override;
@@ -87,10 +93,14 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
     const std::uint64_t lost = ring_->gap_samples();
     if (lost != logged_gap_) log_gap(lost - std::exchange(logged_gap_, lost));
   }
+  bool wants_history() const noexcept;
+  void subscribe();
   bool is_filling() const noexcept;
   proto::Mirror::State shown_state() const noexcept;
 
   bool newest_first_ = false;  // the owner has that feature
+  bool history_wanted_ = false, history_always_ = false;
+  bool with_history_ = false;  // the present subscription
   bool is_ending_ = false;     // live, but the catalog knows that this ring was removed
   MirrorClock clock_;
   bool in_batch_ = false;  // samples have come, and on_batch_end() has not

@@ -54,28 +54,42 @@ void MirrorRing::end_filling() noexcept {
   wake();
 }
 
-void MirrorRing::resume(bool newest_first, net::Subscribe& out) {
+void MirrorRing::resume(bool newest_first, bool with_history, net::Subscribe& out) {
   if (!newest_first) end_filling();
+  with_history_ = with_history || !newest_first;
   lost_ahead_.clear();  // they will be sent, or reported again
+  if (slots_.newest() < 0 && cursor_.next() != kNoTid) cursor_.set_next(begins_at_);
   cursor_.resume(stream_->incarnation(), out);
   out.set_newest_first(newest_first);
   const ring::TidRange hole = reader_.hole();
-  if (hole.is_empty() || hole.end <= reader_.oldest()) return;
-  out.set_from_tid(std::max(hole.begin, reader_.oldest()));
-  out.set_held_from(hole.end);
+  const bool has_hole = !hole.is_empty() && hole.end > reader_.oldest();
+  if (!with_history_) {
+    out.set_from_newest(true);
+  } else if (has_hole) {
+    out.set_from_tid(std::max(hole.begin, reader_.oldest()));
+  } else {
+    return;
+  }
+  if (slots_.newest() < 0) return;
+  out.set_incarnation(stream_->incarnation());
+  out.set_held_from(has_hole ? hole.end : reader_.oldest());
   out.set_held_to(cursor_.next());
 }
 
-Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first) {
+Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest) {
   newest_first_ = newest_first;
   cursor_.set_thinned(newest_first);  // what is passed over comes later
   const Tid next = cursor_.next();
-  if (!newest_first || next == kNoTid) {
+  const bool is_whole = with_history_ || !newest_first;
+  const Tid begin = is_whole ? first : std::clamp<Tid>(oldest, 0, std::max<Tid>(first, 0));
+  if (!newest_first || next == kNoTid || slots_.newest() < 0) {
+    if (newest_first) cursor_.set_next(kNoTid);
     DSSM_TRY(cursor_.on_subscribed_untrusted(first));
-    begins_at_ = first;
+    begins_at_ = begin;
     return {};
   }
-  if (first > next) return on_gap_untrusted(next, static_cast<std::uint64_t>(first - next));
+  lose_late({reader_.hole().begin, std::min(begin, next)});  // the owner no longer holds these
+  if (begin > next) return on_gap_untrusted(next, static_cast<std::uint64_t>(begin - next));
   return {};  // continues in the hole
 }
 
@@ -94,7 +108,7 @@ void MirrorRing::lose_late(ring::TidRange range) noexcept {
   const Tid begin = std::max({range.begin, hole.begin, reader_.oldest()});
   const Tid end = std::min(range.end, hole.end);
   if (begin >= end) return;
-  for (Tid tid = begin; tid < end; ++tid) lost_late_ += is_missing(tid) ? 1U : 0U;
+  lost_late_ += count_missing({begin, end});
   slots_.lose_in_hole(begin, end);
   wake_pending_ = late_pending_ = true;
 }
@@ -115,10 +129,21 @@ void MirrorRing::count_what_leaves(Tid tid) noexcept {
   const ring::TidRange hole = reader_.hole();
   if (hole.is_empty()) return;
   const Tid oldest = tid - static_cast<Tid>(stream_->mapping().geometry().depth) + 2;
-  for (Tid gone = std::max(hole.begin, reader_.oldest()); gone < std::min(hole.end, oldest);
-       ++gone) {
-    lost_late_ += is_missing(gone) ? 1U : 0U;
-  }
+  lost_late_ += count_missing({std::max(hole.begin, reader_.oldest()), std::min(hole.end, oldest)});
+}
+
+// What nobody wants is not missing.
+std::uint64_t MirrorRing::count_missing(ring::TidRange range) const noexcept {
+  std::uint64_t missing = 0;
+  if (!with_history_) return missing;
+  for (Tid tid = range.begin; tid < range.end; ++tid) missing += is_missing(tid) ? 1U : 0U;
+  return missing;
+}
+
+Time MirrorRing::newest_time() const noexcept {
+  SampleInfo newest;
+  static_cast<void>(reader_.stamp(reader_.newest(), newest));
+  return newest.time;
 }
 
 std::uint64_t MirrorRing::filling_samples() const noexcept {
@@ -167,7 +192,7 @@ std::byte* MirrorRing::begin_late(const wire::IncomingSample& sample) noexcept {
   if (!cursor_.accepts(tid)) return cursor_.unexpected(tid);
   if (aside_) drop_aside();  // of one that was cut off
   const bool after_gap = tid != slots_.newest() + 1;
-  if (after_gap && would_overwrite_window(tid)) allocate_aside(sample.payload_bytes);
+  if (after_gap && would_overwrite_window(tid)) allocate_aside(sample.info.payload_bytes);
   return aside_ ? aside_.get() : slots_.begin(tid);
 }
 
@@ -190,24 +215,24 @@ void MirrorRing::drop_aside() noexcept {
   const bool is_late = newest_first_ && tid < cursor_.next();
   if (!torn && is_late) {
     if (is_dropped_) return;
-    slots_.publish_in_hole(tid, sample.info.time, sample.info.clock_error);
+    slots_.publish_in_hole(sample.info);
     wake_pending_ = late_pending_ = true;
     ++received_samples_;
-    received_bytes_ += sample.payload_bytes;
+    received_bytes_ += sample.info.payload_bytes;
   } else if (!torn) {
     if (newest_first_) count_what_leaves(tid);
     if (tid != slots_.newest() + 1) slots_.make_room(tid);
-    if (aside_) std::memcpy(slots_.begin(tid), aside_.get(), sample.payload_bytes);
+    if (aside_) std::memcpy(slots_.begin(tid), aside_.get(), sample.info.payload_bytes);
     if (newest_first_ && tid != slots_.newest() + 1) {
       publish_after_gap(sample.info);
     } else {
-      slots_.publish(tid, sample.info.time, sample.info.clock_error);
+      slots_.publish(sample.info);
     }
     lost_ahead_.clear();
     cursor_.on_sample(tid);
     wake_pending_ = true;
     ++received_samples_;
-    received_bytes_ += sample.payload_bytes;
+    received_bytes_ += sample.info.payload_bytes;
   }
   // A torn sample is missing: the next one counts it, by its own tid.
   if (aside_) drop_aside();
@@ -225,7 +250,7 @@ void MirrorRing::publish_after_gap(const SampleInfo& info) noexcept {
   } else if (begin < info.tid) {
     slots_.skip_to(info.tid, begin);
   }
-  slots_.publish(info.tid, info.time, info.clock_error);
+  slots_.publish(info);
   if (are_lost) return;
   for (const ring::TidRange& lost : lost_ahead_) {
     const Tid first = std::max(lost.begin, begin), end = std::min(lost.end, info.tid);

@@ -44,15 +44,18 @@ class MirrorRing {
 
   const std::shared_ptr<Stream>& stream() const noexcept { return stream_; }
 
-  // The request for the samples that are missing in the hole, and that follow on what is here; for
+  // The request for the samples of the hole (also those that are here: the newest of it excepted),
+  // and for those that follow on what is here; for
   // all, if the owner never sent where this ring begins. The newest first.
   //   newest_first  the owner has that feature; else what is missing in the hole will never come
-  void resume(bool newest_first, net::Subscribe& out);
+  //   with_history  false: only for the newest sample and those that follow. Those before are in
+  //                 the hole until resume() asks for them. Without newest_first always true
+  void resume(bool newest_first, bool with_history, net::Subscribe& out);
   // The owner will not send what is missing in the hole: it counts as lost.
   void end_filling() noexcept;
 
   // As in SampleCursor.
-  Result<void> on_subscribed_untrusted(Tid first, bool newest_first);
+  Result<void> on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest);
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
   // Where the payload of this sample goes, until end() or another begin_untrusted().
   //   fails  protocol: its tid may not come now
@@ -69,6 +72,7 @@ class MirrorRing {
   void wake() noexcept;
 
   Tid newest() const noexcept { return slots_.newest(); }
+  Time newest_time() const noexcept;  // of that sample; 0: none
   std::uint64_t gap_samples() const noexcept { return cursor_.lost() + lost_late_; }
   // The length of the hole, as far as it is in the window.
   std::uint64_t filling_samples() const noexcept;
@@ -91,6 +95,7 @@ class MirrorRing {
   bool is_missing(Tid tid) const noexcept;
   std::byte* begin_late(const wire::IncomingSample& sample) noexcept;
   void lose_late(ring::TidRange range) noexcept;
+  std::uint64_t count_missing(ring::TidRange range) const noexcept;
   void lose_ahead(ring::TidRange range);
   void count_what_leaves(Tid tid) noexcept;
   void publish_after_gap(const SampleInfo& info) noexcept;
@@ -105,6 +110,7 @@ class MirrorRing {
   ring::RingReader reader_;
   channel::SampleCursor cursor_;
   bool newest_first_ = false;               // the owner sends so
+  bool with_history_ = true;                // the present request
   Tid begins_at_ = 0;                       // an empty ring: earlier ones were never asked for
   std::vector<ring::TidRange> lost_ahead_;  // of those after the newest one here; rising
   bool is_dropped_ = false;             // the sample in the hole that arrives, which is not missing

@@ -68,6 +68,8 @@ struct ChannelParts {
   ClockAssessor* clock = nullptr;  // nullptr: the clock is not watched
   // How long a mirror stays after its last reader closed it. May change.
   Duration mirror_linger{};
+  // Whether mirrors fetch the owner's history before a program reads it. May change.
+  bool mirror_history = false;
   // Readers of this ring, a mirror's, shall reopen the stream: it has a new ring.
   std::function<void(const Stream&)> on_ring_replaced = {};
 };

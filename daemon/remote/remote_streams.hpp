@@ -32,8 +32,8 @@ class RemoteStreams final : private CatalogObserver {
   RemoteStreams& operator=(const RemoteStreams&) = delete;
   ~RemoteStreams() { catalog_.remove_observer(*this); }
 
-  // The ring for `id`, a stream of `host`: the one that is there, or a new one: a mirror filled
-  // with the owner's history, or a remote writer's after the owner agreed. The stream's id names
+  // The ring for `id`, a stream of `host`: the one that is there, or a new one: a mirror with
+  // the owner's newest sample, or a remote writer's after the owner agreed. The stream's id names
   // the owner's host. The ring is kept while the OpenTable has it, and a while longer.
   //   host   used during the call only
   //   plan   for remote writers: create the stream there unless it exists; nullptr: it must exist.

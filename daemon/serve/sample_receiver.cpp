@@ -75,9 +75,10 @@ Result<void> SampleReceiver::write() {
     note_done();
     return {};
   }
-  const ring::RingWriter::Attempt attempt =
-      writer_->writer().try_publish({publisher_, sample_.info.tid}, std::as_const(payload_).span(),
-                                    sample_.info.time, sample_.info.clock_error);
+  const ring::RingWriter::Attempt attempt = writer_->writer().try_publish(
+      {publisher_, sample_.info.tid},
+      std::as_const(payload_).span().first(sample_.info.payload_bytes), sample_.info.time,
+      sample_.info.clock_error);
   switch (attempt.outcome) {
     case Outcome::written:
       break;

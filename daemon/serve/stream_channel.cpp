@@ -102,6 +102,7 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
   subscribed.set_incarnation(stream().incarnation());
   subscribed.set_first_tid(first);
   subscribed.set_newest(newest);
+  subscribed.set_oldest(std::clamp<Tid>(reader_.oldest(), 0, newest + 1));
   SamplePump::Plan plan{first, newest, request.max_rate_hz(), false, {}};
   if (request.newest_first() && request.max_rate_hz() == 0) {
     plan.newest_first = true;
@@ -138,6 +139,8 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
     }
     case net::Subscribe::kFromOldest:
       return oldest;
+    case net::Subscribe::kFromNewest:
+      return std::max<Tid>(next - 1, 0);
     case net::Subscribe::kFromNow:
     case net::Subscribe::START_NOT_SET:
       break;

@@ -221,6 +221,13 @@ constexpr ConfigKey kKeys[] = {
      "how long the copy of another host's stream is kept after its last reader; default: 5 s",
      ValueForm::text, kChangesAtOnce<&Config::mirror_linger>,
      set_duration<&Config::mirror_linger, kMaxLingerNs>},
+    {"mirror_history", "WHEN",
+     "when the copy of another host's stream gets what was written before: when_read, or at_once; "
+     "default: when_read",
+     ValueForm::text, kChangesAtOnce<&Config::mirror_history>,
+     [](Config& c, std::string_view text) {
+       return take(c.mirror_history, parse_mirror_history(text));
+     }},
     {"clock_policy", "POLICY",
      "what to do with streams of hosts whose clocks may be too far from this one's: enforce (not "
      "open them, and answer reads by time with an error), mark (flag their samples) or off; "

@@ -120,6 +120,11 @@ Result<Duration> parse_duration(std::string_view text, Duration min, Duration ma
   return Duration(static_cast<std::int64_t>(ns));
 }
 
+Result<bool> parse_mirror_history(std::string_view text) {
+  if (text == "at_once" || text == "when_read") return text == "at_once";
+  return invalid(in_quotes(text) + " is neither \"when_read\" nor \"at_once\"");
+}
+
 Result<ClockPolicy> parse_clock_policy(std::string_view text) {
   for (const ClockPolicy policy : {ClockPolicy::enforce, ClockPolicy::mark, ClockPolicy::off}) {
     if (text == name_of(policy)) return policy;

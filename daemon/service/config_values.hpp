@@ -58,6 +58,9 @@ Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t min, std:
 // "0 ms", "1500 us", "500 ms", "2 s"; the unit must be there.
 Result<Duration> parse_duration(std::string_view text, Duration min, Duration max);
 
+// "at_once": true, "when_read": false.
+Result<bool> parse_mirror_history(std::string_view text);
+
 // "enforce", "mark", "off".
 Result<ClockPolicy> parse_clock_policy(std::string_view text);
 

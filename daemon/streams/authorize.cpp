@@ -46,6 +46,8 @@ std::optional<Action> action_of(const local::Request& request) noexcept {
       return Action::close;
     case local::Request::kOffer:
       return Action::offer;
+    case local::Request::kWantHistory:
+      return Action::open_for_reading;
     case local::Request::kOpenClock:
       return Action::open_clock;
     case local::Request::kOpenClockPage:

@@ -144,8 +144,10 @@ void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_
   {
     const auto other = hosts.start_other(*owner);
     Session session = Session::connect({.socket_path = other->socket_path()}).value();
-    RawReader reader =
-        session.await_raw_reader(StreamId{"camera", 0, "pc1"}, deadline_in(60s)).value();
+    RawReader reader = session
+                           .await_raw_reader(StreamId{"camera", 0, "pc1"}, deadline_in(60s),
+                                             nullptr, FetchHistory::at_once)
+                           .value();
     std::vector<std::byte> frame(kFrameBytes);
     const auto newest = [&]() -> std::optional<Time> {
       SampleInfo info;
@@ -230,8 +232,10 @@ void measure_beside(test::Network& network, const Hosts& hosts, int megabytes_pe
         session.await_raw_reader(StreamId{"encoder", 0, "pc1"}, deadline_in(60s)).value();
     one_way_times(encoder, 1s);
     const Figures alone = figures_of(one_way_times(encoder, kWatched));
-    RawReader camera =
-        session.await_raw_reader(StreamId{"camera", 0, "pc1"}, deadline_in(60s)).value();
+    RawReader camera = session
+                           .await_raw_reader(StreamId{"camera", 0, "pc1"}, deadline_in(60s),
+                                             nullptr, FetchHistory::at_once)
+                           .value();
     const auto filling = [&] { return session.stream_info(camera.id()).value().mirror.value(); };
     const std::uint64_t before = filling().received_bytes;
     const Figures beside = figures_of(one_way_times(encoder, kWatched));

@@ -171,11 +171,12 @@ inline net::Frame removed_frame() {
 
 // The bytes of a frame with a sample.
 //   torn  nullopt: without that field
-inline Bytes sample_bytes(const SampleInfo& info, std::span<const std::byte> payload,
+inline Bytes sample_bytes(SampleInfo info, std::span<const std::byte> payload,
                           std::uint64_t serial = 0, std::optional<bool> torn = {}) {
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
+  info.payload_bytes = payload.size();
   const std::size_t bytes = wire::encode_sample_header(
-      header, serial, info, payload.size(), torn ? wire::Trailer::torn : wire::Trailer::none);
+      header, serial, info, torn ? wire::Trailer::torn : wire::Trailer::none);
   Bytes frame(header.begin(), header.begin() + static_cast<std::ptrdiff_t>(bytes));
   frame.insert(frame.end(), payload.begin(), payload.end());
   if (torn) {

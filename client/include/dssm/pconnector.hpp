@@ -57,7 +57,7 @@ struct PConnectorOptions {
   // Samples that post() keeps until the owner acknowledges that they are written. Beyond either
   // limit the oldest are dropped and counted.
   std::uint64_t max_unsent_samples = 1024;
-  std::uint64_t max_unsent_bytes = 64U << 20;
+  std::uint64_t max_unsent_bytes = 64U << 20;  // each counts as long as the stream's longest
 };
 
 // Which samples a subscription delivers.
@@ -97,8 +97,9 @@ class PConnector {
 
   // --- reading: one round trip each
 
-  // `payload` is exactly payload_bytes() long; it is unspecified unless the result is ok. `info` is
-  // set only when the result is ok.
+  // `payload` is exactly payload_bytes() long. Its first info.payload_bytes are the sample; the
+  // rest, and all of it unless the result is ok, is unspecified. `info` is set only when the result
+  // is ok.
   //   returns  as RawReader's functions of these names
   //   fails    invalid_argument (size of `payload`), type_mismatch (the stream was recreated with
   //            another type)
@@ -141,7 +142,7 @@ class PConnector {
 
   // Samples of the subscription that were lost: the owner's ring no longer held them when they were
   // to be sent; or they arrived while a call waited for an answer, and more than 16 MiB of such
-  // samples were not read.
+  // samples were not read, where each counts as long as the stream's longest.
   std::uint64_t lost_samples() const noexcept;
   // How often the owner's ring was replaced by a new one.
   std::uint64_t restarts() const noexcept;

@@ -9,7 +9,8 @@
 //
 //   threads   one reader belongs to one thread at a time; any number of readers, in any processes,
 //             may read one stream beside its writers
-//   cost      reading takes no lock and makes no system call (docs/ring-layout.md)
+//   cost      reading takes no lock and makes no system call (docs/ring-layout.md); a read that
+//             returns `arriving` at most one, to have the sample fetched
 //   lifetime  a reader keeps its ring mapped, and stays usable after its Session is destroyed and
 //             while dssmd is unavailable
 //   moved     a moved-from reader may only be assigned to or destroyed
@@ -43,8 +44,8 @@ namespace dssm {
 //   threads   one thread at a time
 class BorrowedSample {
  public:
-  // The payload, aligned to 64 bytes; the 64 bytes after it are readable, too. It may change while
-  // it is read: untrusted until still_valid() returns true.
+  // The payload, info().payload_bytes long and aligned to 64 bytes; the 64 bytes after it are
+  // readable, too. It may change while it is read: untrusted until still_valid() returns true.
   std::span<const std::byte> payload() const noexcept { return payload_; }
   const SampleInfo& info() const noexcept { return info_; }
 
@@ -76,7 +77,8 @@ class RawReader {
 
   // --- reading by tid
 
-  // In all functions: `payload` is exactly payload_bytes() long, another length ends the program;
+  // In all functions: `payload` is exactly payload_bytes() long, another length ends the program.
+  // Its first info.payload_bytes are the sample; the rest, and all of it unless ok, is unspecified.
   // `restarted` is a further result of each that takes a payload or borrows.
   //
   // Of a stream of another host the newest samples come first. One that is still to come is
@@ -244,7 +246,7 @@ struct JointRead {
 //              clock
 //   returns    as read_at(), restarted included; clock_out_of_bounds also when a bound exceeds
 //              max_error. Unless ok, payloads and infos are unspecified, and cursors keep their
-//              values
+//              values. What follows a sample that is shorter than its stream's is 0
 //   threads    each reader belongs to the calling thread
 //   cost       as one read_at() per stream
 JointRead read_joint_at(Time t, std::span<JointSample> samples,
@@ -255,38 +257,40 @@ JointRead read_joint_at(Time t, std::span<JointSample> samples,
 inline constexpr std::size_t kMaxWaitAny = 128;  // FUTEX_WAITV_MAX of Linux
 WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
 
-// The same with a T in place of bytes. Everything not listed here is as in RawReader.
+// The same with a T in place of bytes: what a sample does not have, because a RawWriter wrote fewer
+// bytes, is 0. Everything not listed here is as in RawReader.
 template <Payload T>
 class Reader : public RawReader {
  public:
   explicit Reader(RawReader raw) noexcept : RawReader(std::move(raw)) {}
 
   ReadStatus read_newest(T& out, SampleInfo& info) noexcept {
-    return RawReader::read_newest(bytes(out), info);
+    return complete(RawReader::read_newest(bytes(out), info), out, info);
   }
   ReadStatus read_tid(Tid n, T& out, SampleInfo& info) noexcept {
-    return RawReader::read_tid(n, bytes(out), info);
+    return complete(RawReader::read_tid(n, bytes(out), info), out, info);
   }
   ReadStatus read_next(T& out, SampleInfo& info) noexcept {
-    return RawReader::read_next(bytes(out), info);
+    return complete(RawReader::read_next(bytes(out), info), out, info);
   }
   ReadStatus read_previous(T& out, SampleInfo& info) noexcept {
-    return RawReader::read_previous(bytes(out), info);
+    return complete(RawReader::read_previous(bytes(out), info), out, info);
   }
   ReadStatus read_at(Time t, T& out, SampleInfo& info) noexcept {
-    return RawReader::read_at(t, bytes(out), info);
+    return complete(RawReader::read_at(t, bytes(out), info), out, info);
   }
   ReadStatus read_at_or_after(Time t, T& out, SampleInfo& info) noexcept {
-    return RawReader::read_at_or_after(t, bytes(out), info);
+    return complete(RawReader::read_at_or_after(t, bytes(out), info), out, info);
   }
   ReadStatus read_nearest(Time t, T& out, SampleInfo& info) noexcept {
-    return RawReader::read_nearest(t, bytes(out), info);
+    return complete(RawReader::read_nearest(t, bytes(out), info), out, info);
   }
 
   // This reader's part of a read_joint_at(), which copies the sample to `out`.
   JointSample joint_sample(T& out) noexcept { return {this, bytes(out), {}}; }
 
-  // The borrowed payload as a T. Check still_valid() after the last use of what was read.
+  // The borrowed payload as a T, if it has all bytes of one. Check still_valid() after the last use
+  // of what was read.
   static const T& view(const BorrowedSample& sample) noexcept {
     return *reinterpret_cast<const T*>(sample.payload().data());
   }
@@ -294,6 +298,10 @@ class Reader : public RawReader {
  private:
   static std::span<std::byte> bytes(T& out) noexcept {
     return std::as_writable_bytes(std::span<T, 1>(&out, 1));
+  }
+  static ReadStatus complete(ReadStatus status, T& out, const SampleInfo& info) noexcept {
+    if (status == ReadStatus::ok) zero_rest(bytes(out), info);
+    return status;
   }
 };
 

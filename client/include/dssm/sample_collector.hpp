@@ -55,8 +55,9 @@ class SampleCollector {
 
   // --- reading
 
-  // `payload` is exactly payload_bytes() long, another length ends the program; it is unspecified
-  // unless the result is ok. `info` is set only when the result is ok.
+  // `payload` is exactly payload_bytes() long, another length ends the program. Its first
+  // info.payload_bytes are the sample; the rest, and all of it unless the result is ok, is
+  // unspecified. `info` is set only when the result is ok.
 
   // Copies the newest sample.
   //   returns  ok | not_yet (nothing has arrived) | lapped

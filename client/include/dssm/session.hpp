@@ -109,6 +109,13 @@ struct StreamEvent {
   StreamInfo stream;  // for removed: identity only
 };
 
+// When what was written to another host's stream before it was opened, or while the connection was
+// cut, is fetched. The newest samples come in any case.
+enum class FetchHistory : std::uint8_t {
+  when_read,  // with the first read of the past, or of the next sample in order, which is `arriving`
+  at_once,  // and the open returns when it is here, or after 1 s; without it while the host is away
+};
+
 // A handle; copies share one connection.
 class Session {
  public:
@@ -144,7 +151,8 @@ class Session {
   Result<RawWriter> open_raw_writer(const StreamId& id, const TypeInfo* wanted = nullptr,
                                     std::uint32_t tag = 0);
   Result<RawReader> open_raw_reader(const StreamId& id, const TypeInfo* wanted = nullptr,
-                                    std::uint32_t tag = 0);
+                                    std::uint32_t tag = 0,
+                                    FetchHistory history = FetchHistory::when_read);
 
   // Opens a stream for reading. Repeats, until `deadline`, what fails with an error that
   // is_retryable(): waits for the stream to be created, for its host to answer, and for the clocks
@@ -152,7 +160,8 @@ class Session {
   //   fails  as open_raw_reader(): at once with an error that is not retryable, at the deadline
   //          with the last one
   Result<RawReader> await_raw_reader(const StreamId& id, MonoTime deadline,
-                                     const TypeInfo* wanted = nullptr);
+                                     const TypeInfo* wanted = nullptr,
+                                     FetchHistory history = FetchHistory::when_read);
 
   // The same with a type; `name` is parsed by StreamId::parse(), whose errors they also return.
   // create() with a duration also returns those of History::for_life().
@@ -173,15 +182,18 @@ class Session {
     return typed<Writer<T>>(name, [&](const StreamId& id) { return open_raw_writer(id, &type); });
   }
   template <Payload T>
-  Result<Reader<T>> open_reader(std::string_view name) {
-    const TypeInfo type = type_of<T>();
-    return typed<Reader<T>>(name, [&](const StreamId& id) { return open_raw_reader(id, &type); });
-  }
-  template <Payload T>
-  Result<Reader<T>> await_reader(std::string_view name, MonoTime deadline = kNever) {
+  Result<Reader<T>> open_reader(std::string_view name,
+                                FetchHistory history = FetchHistory::when_read) {
     const TypeInfo type = type_of<T>();
     return typed<Reader<T>>(
-        name, [&](const StreamId& id) { return await_raw_reader(id, deadline, &type); });
+        name, [&](const StreamId& id) { return open_raw_reader(id, &type, 0, history); });
+  }
+  template <Payload T>
+  Result<Reader<T>> await_reader(std::string_view name, MonoTime deadline = kNever,
+                                 FetchHistory history = FetchHistory::when_read) {
+    const TypeInfo type = type_of<T>();
+    return typed<Reader<T>>(
+        name, [&](const StreamId& id) { return await_raw_reader(id, deadline, &type, history); });
   }
 
   // Removes a stream: it leaves the list at once and can be created again. Processes that have it

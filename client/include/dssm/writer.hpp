@@ -13,6 +13,7 @@
 //   moved     a moved-from writer may only be assigned to or destroyed
 #pragma once
 
+#include <algorithm>
 #include <cstddef>
 #include <dssm/describe.hpp>
 #include <dssm/sample.hpp>
@@ -38,12 +39,18 @@ class LoanedSample {
 
   // Whether there is a slot: false when this thread holds another LoanedSample of this stream, and
   // after publish() or abandon().
-  explicit operator bool() const noexcept { return !payload_.empty(); }
+  explicit operator bool() const noexcept { return payload_.data() != nullptr; }
 
   // The slot's payload: payload_bytes() long, aligned to 64 bytes, with unspecified content; empty
   // without a slot. At least 64 unused bytes follow it. Non-temporal stores into it need a store
   // fence (x86: sfence) before publish().
   std::span<std::byte> payload() const noexcept { return payload_; }
+
+  // Makes the sample shorter than the stream's: it is only the first `bytes` of payload(). More
+  // than it has change nothing.
+  void shorten(std::size_t bytes) noexcept {
+    payload_ = payload_.first(std::min(bytes, payload_.size()));
+  }
 
   // Makes the sample visible. Arguments as RawWriter::write().
   //   returns  its tid; kNoTid without a slot
@@ -66,14 +73,16 @@ class RawWriter {
   ~RawWriter();
 
   // Writes one sample.
-  //   payload      exactly payload_bytes() long
+  //   payload      at most payload_bytes() long: images that are compressed, lists and point clouds
+  //                differ in length. Only these bytes are copied, stored and sent; readers find
+  //                their number in SampleInfo::payload_bytes
   //   time         when it was measured; stored as given, also when it runs backwards
   //   clock_error  bound on the error of `time` [ns, >= 0], or
   //                kOwnClockError: `time` is of this PC's clock, whose bound at that time is
   //                stored; for a time more than 10 s from now kForeignClockError is stored, since
   //                it is a recording's
   //                kForeignClockError: `time` is of another clock
-  //   returns      its tid; kNoTid when the length is wrong or this thread holds a LoanedSample
+  //   returns      its tid; kNoTid when it is too long or this thread holds a LoanedSample
   Tid write(std::span<const std::byte> payload, Time time = WallClock::now(),
             Duration clock_error = kOwnClockError) noexcept;
 

@@ -85,7 +85,8 @@ SSM_sid openSSM(const char* stream_name, int stream_id, char open_mode) {
   if (!id) return remember_error("open : not a stream name or id"), nullptr;
   auto reader = process().request([&](dssm::Session& dssmd) {
     return dssmd.open_raw_reader(*id, nullptr,
-                                 dssm::ssm::kTagEdge | static_cast<unsigned char>(open_mode));
+                                 dssm::ssm::kTagEdge | static_cast<unsigned char>(open_mode),
+                                 dssm::FetchHistory::at_once);
   });
   if (!reader) return nullptr;
   return process().add(

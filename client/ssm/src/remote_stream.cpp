@@ -292,6 +292,7 @@ ReadStatus RemoteStream::read_from(const Source& source, const Request& request,
 SSM_tid RemoteStream::hand_over(ReadStatus status, const Request& request, const SampleInfo& info,
                                 void* data, double* time) {
   if (status != ReadStatus::ok) return error_of(status, request.which);
+  zero_rest(sample_, info);
   std::memcpy(data, sample_.data(), sample_.size());
   if (time) *time = seconds_from_time(info.time);
   return ssm_tid(info.tid);
@@ -350,6 +351,12 @@ SSM_tid RemoteStream::tid_at(double time) {
 bool RemoteStream::write(const void* data, std::size_t bytes, double time) {
   const Call call(*this);
   if (!call.has_stream()) return false;
+  if (bytes != sample_.size()) {
+    return report_once({Errc::type_mismatch,
+                        fmt::format("write {} : its samples have {} bytes, this program's type {}",
+                                    quoted_name(), sample_.size(), bytes)}),
+           false;
+  }
   const auto posted =
       connector_->post({static_cast<const std::byte*>(data), bytes}, time_from_seconds(time));
   if (!posted) return report_once(posted.error()), false;

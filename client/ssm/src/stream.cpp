@@ -103,7 +103,7 @@ End* Stream::end_of(std::atomic<End*>& place, ReentrantLock& lock, Open open) no
 
 RawReader* Stream::reader() noexcept {
   return end_of(reader_, read_lock_, [&](Session& session) {
-    return session.open_raw_reader(id_, nullptr, kTagHidden);
+    return session.open_raw_reader(id_, nullptr, kTagHidden, FetchHistory::at_once);
   });
 }
 
@@ -177,6 +177,7 @@ ReadStatus Stream::copy(Copy& out, Read read) noexcept {
       continue;
     }
     if (status != ReadStatus::ok) return status;
+    zero_rest(out.payload(), out.info);
     BorrowedSample place;  // to read the bytes after the slot, which belong to no sample
     status = open->borrow(out.info.tid, place);
     if (status == ReadStatus::restarted) on_restart(*open);

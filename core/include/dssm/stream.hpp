@@ -80,7 +80,7 @@ struct Field {
 // The type of a payload. An empty name means plain bytes and matches every name.
 struct TypeInfo {
   std::string name;
-  std::uint64_t payload_bytes = 0;
+  std::uint64_t payload_bytes = 0;  // of a sample, at most
   std::uint32_t alignment_bytes = 1;
   std::vector<Field> fields;  // may be empty: not described
 
@@ -140,11 +140,13 @@ struct MirrorInfo {
   std::uint64_t reconnects = 0;
   std::uint64_t restarts = 0;  // times the owner's ring was replaced by a new one
   Tid newest = kNoTid;         // newest sample in the mirror
+  Time newest_time{};          // its time; meaningless without one
   std::uint64_t received_samples = 0;
   std::uint64_t received_bytes = 0;  // of payloads
   std::string error;                 // why it is not live; empty when it is
   std::string clock;  // why the times of its samples are suspect; empty when they are not
-  std::uint64_t filling_samples = 0;  // of the part that is being filled; newer ones are here
+  std::uint64_t filling_samples = 0;  // of the part that is not complete; newer ones are here
+  bool history_wanted = false;        // that part is being filled, else when a program reads it
   // Of the last 3 s before the newest sample: how many were written, and how many of these are
   // lost.
   std::uint64_t recent_samples = 0;

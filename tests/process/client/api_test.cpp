@@ -173,6 +173,50 @@ TEST_F(Api, ReadsSlotsInPlace) {
   EXPECT_FALSE(borrowed.still_valid());
 }
 
+TEST_F(Api, ASampleMayBeShorterThanItsStreams) {
+  RawWriter writer = session.create_raw({"cloud", 0, ""}, {"", 12, 4, {}}, {8, 10ms}).value();
+  auto reader = session.open_raw_reader({"cloud", 0, ""}).value();
+  using Cloud = std::array<std::uint32_t, 3>;
+  auto typed = session.open_reader<Cloud>("cloud").value();
+  const Cloud full{1, 2, 3};
+  const auto bytes = std::as_bytes(std::span(full));
+  EXPECT_EQ(writer.write(bytes), 0);
+  EXPECT_EQ(writer.write(bytes.first(4)), 1);
+  {
+    LoanedSample loan = writer.loan();
+    std::copy_n(bytes.begin(), 8, loan.payload().begin());
+    loan.shorten(8);
+    loan.shorten(100);
+    EXPECT_EQ(loan.publish(time_of(0)), 2);
+  }
+  {
+    LoanedSample loan = writer.loan();
+    loan.shorten(0);
+    ASSERT_TRUE(loan);
+    EXPECT_EQ(loan.publish(time_of(0)), 3);
+  }
+  const std::vector<std::byte> too_long(13);
+  EXPECT_EQ(writer.write(too_long), kNoTid);
+  for (const auto& [tid, expected, length] :
+       {std::tuple{0, full, 12u}, std::tuple{1, Cloud{1}, 4u}, std::tuple{2, Cloud{1, 2}, 8u},
+        std::tuple{3, Cloud{}, 0u}}) {
+    SampleInfo info;
+    std::array<std::byte, 12> raw;
+    ASSERT_EQ(reader.read_tid(tid, raw, info), ReadStatus::ok);
+    EXPECT_EQ(info.payload_bytes, length);
+    Cloud out{7, 7, 7};
+    ASSERT_EQ(typed.read_tid(tid, out, info), ReadStatus::ok);
+    EXPECT_EQ(out, expected) << "what it does not have is 0";
+    BorrowedSample borrowed;
+    ASSERT_EQ(reader.borrow(tid, borrowed), ReadStatus::ok);
+    EXPECT_EQ(borrowed.payload().size(), length);
+  }
+  Cloud out{7, 7, 7};
+  std::array samples{typed.joint_sample(out)};
+  ASSERT_EQ(read_joint_at(WallClock::now(), samples).status, ReadStatus::ok);
+  EXPECT_EQ(out, Cloud{}) << "the newest one is empty";
+}
+
 TEST_F(Api, KeepsAnExistingRingWhenCreatedAgain) {
   auto first = make("odometry", {64, 10ms});
   write(first, 0);

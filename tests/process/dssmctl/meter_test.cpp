@@ -116,7 +116,7 @@ TEST_F(Meter, HzPrintsALastReportAtItsEnd) {
   EXPECT_EQ(as_json.status(), 0);
 }
 
-TEST_F(Meter, BwIsTheRateTimesThePayload) {
+TEST_F(Meter, BwIsTheRateTimesWhatTheSamplesHave) {
   auto wide = session_.create_raw({"wide", 0, ""}, {"", 4000, 1, {}}, depth_of(8)).value();
   const std::vector<std::byte> payload(4000);
   for (int i = 0; i < 5; ++i) wide.write(payload, at_ns(i * 20'000'000));
@@ -126,6 +126,11 @@ TEST_F(Meter, BwIsTheRateTimesThePayload) {
   EXPECT_DOUBLE_EQ(report["bytes_per_second"].get<double>(), 200'000);
   EXPECT_EQ(output({"bw", "wide", "-n", "1"}),
             "average: 200 kB/s\n\tpayload: 4000 bytes rate: 50.000 Hz window: 5\n");
+  for (int i = 5; i < 8; ++i) wide.write(std::span(payload).first(1000), at_ns(i * 20'000'000));
+  const Json shorter = first_report({"bw", "wide", "--window", "4"});
+  EXPECT_EQ(shorter["payload_bytes"], 4000) << "of the stream";
+  EXPECT_DOUBLE_EQ(shorter["mean_payload_bytes"].get<double>(), 1750);
+  EXPECT_DOUBLE_EQ(shorter["bytes_per_second"].get<double>(), 87'500);
 }
 
 TEST_F(Meter, DelayIsTheAgeOfSamplesWhenTheyArrive) {

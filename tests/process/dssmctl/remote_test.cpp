@@ -130,7 +130,11 @@ TEST_F(Remote, InfoShowsOwnerChannelsAndTheMirrorsState) {
   EXPECT_TRUE(json({"info", "s"})["mirror"].is_null());
   EXPECT_FALSE(contains(output({"info", "s"}), "mirror:"));
 
-  auto reader = session_.open_reader<double>("s").value();
+  const auto newest_only = session_.open_reader<double>("s").value();
+  EXPECT_EQ(json({"info", "s"})["mirror"]["history_wanted"], false);
+  EXPECT_TRUE(contains(output({"info", "s"}),
+                       "history:      9 samples are on its host only, until a program here"));
+  auto reader = session_.open_reader<double>("s", FetchHistory::at_once).value();
   const Json info = json({"info", "s"});
   EXPECT_EQ(info["host"], "pc2");
   EXPECT_EQ(info["channels"], 1);

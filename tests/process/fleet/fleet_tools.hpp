@@ -43,7 +43,7 @@ template <class T>
 Reader<T> open_filled(Session& session, const std::string& stream) {
   std::optional<Reader<T>> reader;
   await([&] {
-    Result<Reader<T>> opened = session.open_reader<T>(stream);
+    Result<Reader<T>> opened = session.open_reader<T>(stream, FetchHistory::at_once);
     if (opened) {
       reader = *std::move(opened);
     } else if (opened.error().code != Errc::unavailable && opened.error().code != Errc::not_found) {

@@ -34,6 +34,64 @@ TEST_F(TwoHosts, ReadTheHistoryFromBeforeTheReaderCame) {
   EXPECT_EQ(mirror("odometry").gap_samples, 0u);
 }
 
+TEST_F(TwoHosts, FetchTheHistoryWhenAProgramReadsIt) {
+  auto writer = here.create<Numbered>("odometry", History{1024, 1ms}).value();
+  for (int i = 0; i < 100; ++i) writer.write(numbered(i), time_from_ns(1000 * i), Duration(i));
+  auto reader = there.await_reader<Numbered>("odometry", kNever).value();
+  Numbered sample{};
+  SampleInfo info;
+  ASSERT_EQ(reader.read_newest(sample, info), ReadStatus::ok);
+  for (int i = 100; i < 103; ++i) {
+    writer.write(numbered(i), time_from_ns(1000 * i), Duration(i));
+    ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+    ASSERT_EQ(reader.read_next(sample, info), ReadStatus::ok);
+    EXPECT_EQ(info.tid, i);
+  }
+  EXPECT_EQ(mirror("odometry").state, MirrorState::live);
+  EXPECT_EQ(mirror("odometry").received_samples, 4u) << "no program reads the others";
+  EXPECT_EQ(mirror("odometry").filling_samples, 99u);
+  EXPECT_FALSE(mirror("odometry").history_wanted);
+  EXPECT_EQ(reader.oldest_tid(), 0);
+
+  EXPECT_EQ(reader.read_at(time_from_ns(50'000), sample, info), ReadStatus::arriving);
+  ASSERT_EQ(reader.wait_for_sample(50, kNever), WaitStatus::ready);
+  await([&] { return mirror("odometry").filling_samples == 0; });
+  ASSERT_EQ(reader.read_at(time_from_ns(50'000), sample, info), ReadStatus::ok);
+  EXPECT_EQ(sample.number, 50);
+  EXPECT_EQ(mirror("odometry").received_samples, 103u) << "each once";
+}
+
+TEST_F(TwoHosts, FetchTheHistoryForAnInOrderReaderThatSleeps) {
+  auto writer = here.create<Numbered>("odometry", History{1024, 1ms}).value();
+  for (int i = 0; i < 100; ++i) writer.write(numbered(i), time_from_ns(1000 * i), Duration(i));
+  auto reader = there.await_reader<Numbered>("odometry", kNever).value();
+  reader.seek(kNoTid);
+  Numbered sample{};
+  SampleInfo info;
+  for (int i = 0; i < 100;) {
+    const ReadStatus status = reader.read_next(sample, info);
+    if (status == ReadStatus::not_yet) {
+      ASSERT_EQ(reader.wait(kNever), WaitStatus::ready);
+      continue;
+    }
+    ASSERT_EQ(status, ReadStatus::ok);
+    ASSERT_EQ(sample.number, i++);
+  }
+  EXPECT_EQ(reader.lost_samples(), 0u);
+}
+
+TEST_F(TwoHosts, HaveTheHistoryAtOnceForAReaderThatAsksForIt) {
+  auto writer = here.create<Numbered>("odometry", History{1024, 1ms}).value();
+  for (int i = 0; i < 100; ++i) writer.write(numbered(i), time_from_ns(1000 * i), Duration(i));
+  const auto first = there.await_reader<Numbered>("odometry", kNever).value();  // is live
+  auto reader = there.open_reader<Numbered>("odometry", FetchHistory::at_once).value();
+  Numbered sample{};
+  SampleInfo info;
+  ASSERT_EQ(reader.wait_for_sample(0, kNever), WaitStatus::ready);
+  ASSERT_EQ(reader.read_tid(0, sample, info), ReadStatus::ok);
+  EXPECT_TRUE(mirror("odometry").history_wanted);
+}
+
 // Also where times run backwards, and while the stream is written.
 TEST_F(TwoHosts, AnswerReadsByTimeAsTheOwnerDoes) {
   const auto seed = std::random_device()();

@@ -268,7 +268,21 @@ TEST(PConnectorRequest, FailsAtOnceWhenTheAnswerIsGarbageAndTheNextOneWorks) {
   EXPECT_EQ(con.read_newest(sample.span(), sample.info).value(), ReadStatus::ok);
 }
 
-TEST(PConnectorRequest, RefusesSamplesOfAnotherSize) {
+TEST(PConnectorRequest, TakesASampleThatIsShorter) {
+  const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
+    peer.answer_open(8);
+    const auto request = peer.try_receive();
+    if (request) send_sample(peer, 5, "123", request->serial());
+    peer.await_end();
+  });
+  auto con = open(daemon).value();
+  TakenSample sample;
+  ASSERT_EQ(con.read_newest(sample.span(), sample.info).value(), ReadStatus::ok);
+  EXPECT_EQ(sample.info.payload_bytes, 3u);
+  EXPECT_EQ(std::memcmp(sample.span().data(), "123", 3), 0);
+}
+
+TEST(PConnectorRequest, RefusesSamplesThatAreTooLong) {
   const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
     peer.answer_open(8);
     const auto request = peer.try_receive();
@@ -378,8 +392,9 @@ TEST(PConnectorRequest, RefusesABufferOfAnotherSize) {
   SampleInfo info;
   EXPECT_EQ(con.read_newest(small, info).error().code, Errc::invalid_argument);
   EXPECT_EQ(con.read_next(small, info).error().code, Errc::invalid_argument);
-  EXPECT_EQ(con.post(small).error().code, Errc::invalid_argument);
-  EXPECT_EQ(con.write(small).error().code, Errc::invalid_argument);
+  const std::array<std::byte, 9> large{};
+  EXPECT_EQ(con.post(large).error().code, Errc::invalid_argument);
+  EXPECT_EQ(con.write(large).error().code, Errc::invalid_argument);
 }
 
 // --- subscriptions

@@ -115,7 +115,7 @@ class ScriptedHost : private FrameConnection::Observer, private FrameConnection:
     return {};
   }
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override {
-    published.push_back({sample.info, Bytes(sample.payload_bytes), sample.serial, false});
+    published.push_back({sample.info, Bytes(sample.info.payload_bytes), sample.serial, false});
     out = published.back().payload.data();
     return {};
   }

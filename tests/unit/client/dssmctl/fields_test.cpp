@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// Fields of all kinds by name, in full, shortened, and of samples that are shorter than their type.
 #include "client/dssmctl/fields.hpp"
 
 #include <gtest/gtest.h>
@@ -73,9 +75,12 @@ class FieldsOfEverything : public testing::Test {
     ADD_FAILURE() << "no field " << name;
     return fields_.front();
   }
-  std::span<const std::byte> payload() const { return std::as_bytes(std::span(&value_, 1)); }
+  std::span<const std::byte> payload() const {
+    return std::as_bytes(std::span(&value_, 1)).first(payload_bytes_);
+  }
 
   Everything value_ = example();
+  std::size_t payload_bytes_ = sizeof value_;
   std::vector<Field> fields_ = readable_fields_untrusted(type_of<Everything>());
 };
 
@@ -124,6 +129,23 @@ TEST_F(FieldsOfEverything, ShowBytesThatAreNoUtf8Harmlessly) {
   std::memcpy(value_.text, "\x1b\xff", 3);
   EXPECT_EQ(text("text"), "\"\\x1b\\xff\"");
   EXPECT_EQ(json("text"), "\"\\u001b\\ufffd\"");
+}
+
+TEST_F(FieldsOfEverything, AreWhatAShorterSampleHas) {
+  payload_bytes_ = offsetof(Everything, points[1]) + 7;  // not all of points[1].x
+  EXPECT_EQ(text("points.x"), "[10]");
+  EXPECT_EQ(json("points.x"), "[10.0]");
+  EXPECT_EQ(element_text(payload(), field("points.x"), 1), "");
+  EXPECT_EQ(text("point.x"), "1.5");
+  payload_bytes_ = offsetof(Everything, text) + 2;
+  EXPECT_EQ(text("text"), "\"a\\\"\"");
+  EXPECT_EQ(text("point.x"), "-");
+  EXPECT_EQ(json("point.x"), "null");
+  EXPECT_EQ(element_text(payload(), field("point.x"), 0), "");
+  payload_bytes_ = 0;
+  EXPECT_EQ(text("yes"), "-");
+  EXPECT_EQ(text("text"), "\"\"");
+  EXPECT_EQ(json("points.x"), "[]");
 }
 
 TEST_F(FieldsOfEverything, TakeAnyByteForABool) {

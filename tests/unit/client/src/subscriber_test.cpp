@@ -27,14 +27,16 @@ struct SubscriberTest : testing::Test {
   void gap(Tid first, std::uint64_t count) {
     ASSERT_TRUE(subscriber.on_gap_untrusted(first, count));
   }
+  // Some samples are shorter than the stream's.
+  static std::size_t bytes_of(Tid tid) { return tid % 3 == 1 ? 1 : sizeof tid; }
   // What became of it: true: it went somewhere.
   bool arrive(Tid tid, bool torn = false) {
     std::byte* out = nullptr;
-    const SampleInfo stamps{tid, time_from_ns(tid), Duration(1)};
+    const SampleInfo stamps{tid, time_from_ns(tid), Duration(1), bytes_of(tid)};
     const auto place = subscriber.on_sample_begin(stamps, out);
     EXPECT_TRUE(place);
     if (!*place) return false;
-    if (out) std::memcpy(out, &tid, sizeof tid);
+    if (out) std::memcpy(out, &tid, bytes_of(tid));
     subscriber.on_sample_end(stamps, torn);
     return true;
   }
@@ -42,7 +44,8 @@ struct SubscriberTest : testing::Test {
     ASSERT_TRUE(subscriber.has_buffered());
     ASSERT_EQ(subscriber.pop_buffered(target, info), ReadStatus::ok);
     EXPECT_EQ(info.tid, tid);
-    EXPECT_EQ(std::memcmp(target.data(), &tid, sizeof tid), 0);
+    EXPECT_EQ(info.payload_bytes, bytes_of(tid));
+    EXPECT_EQ(std::memcmp(target.data(), &tid, bytes_of(tid)), 0);
   }
   net::Subscribe request(std::uint64_t incarnation = 77) {
     net::Subscribe message;
@@ -208,7 +211,8 @@ TEST_F(SubscriberTest, PutsAsideTheSampleThatFillsTheTarget) {
   begin();
   subscriber.set_target(target.data());
   std::byte* out = nullptr;
-  ASSERT_TRUE(subscriber.on_sample_begin({3, {}, {}}, out));
+  const SampleInfo stamps{3, {}, {}, bytes_of(3)};
+  ASSERT_TRUE(subscriber.on_sample_begin(stamps, out));
   EXPECT_EQ(out, target.data());
   EXPECT_TRUE(subscriber.is_filling_target());
   out = subscriber.detach_target();
@@ -216,7 +220,7 @@ TEST_F(SubscriberTest, PutsAsideTheSampleThatFillsTheTarget) {
   subscriber.set_target(nullptr);
   const Tid tid = 3;
   std::memcpy(out, &tid, sizeof tid);
-  subscriber.on_sample_end({3, {}, {}}, false);
+  subscriber.on_sample_end(stamps, false);
   expect_kept(3);
 }
 
@@ -246,7 +250,7 @@ Payload payload_of(Tid tid) {
 void push(SampleQueue& queue, Tid tid) {
   const Payload payload = payload_of(tid);
   std::memcpy(queue.place(), payload.data(), payload.size());
-  queue.push({tid, time_from_ns(tid * 10), Duration(5)});
+  queue.push({tid, time_from_ns(tid * 10), Duration(5), payload.size()});
 }
 
 void expect_pop(SampleQueue& queue, Tid tid) {
@@ -314,7 +318,7 @@ TEST(SampleQueue, AnArrivingSampleStaysInPlaceWhileOthersAreTaken) {
   std::byte* const place = queue.place();
   expect_pop(queue, 0);
   std::memcpy(place, payload_of(2).data(), 8);
-  queue.push({2, time_from_ns(20), Duration(5)});
+  queue.push({2, time_from_ns(20), Duration(5), 8});
   expect_pop(queue, 1);
   expect_pop(queue, 2);
 }

@@ -40,7 +40,7 @@ struct ChannelClientTest : testing::Test, ChannelClient::Delegate {
     opened = std::move(stream);
     return {};
   }
-  Result<void> on_subscribed_untrusted(Tid tid, bool) override {
+  Result<void> on_subscribed_untrusted(Tid tid, bool, Tid) override {
     first = tid;
     return {};
   }
@@ -252,7 +252,7 @@ TEST_F(ChannelClientTest, IgnoresTheEventsOfASubscriptionThatIsBeingReplaced) {
   ASSERT_TRUE(answer_open());
   ASSERT_TRUE(answer_subscribe());
   client.subscribe({});
-  EXPECT_FALSE(client.takes_samples());
+  EXPECT_TRUE(client.takes_samples()) << "its last samples may still come";
   ASSERT_TRUE(receive(gap()));
   ASSERT_TRUE(receive(caught_up_frame()));
   EXPECT_TRUE(gaps.empty());

@@ -51,14 +51,14 @@ TEST(Layout, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(PublisherCursor, earlier_number_end), 32u);
   EXPECT_EQ(sizeof(SlotHeader), 64u);
   EXPECT_EQ(offsetof(SlotHeader, sequence), 0u);
-  EXPECT_EQ(offsetof(SlotHeader, tid), 8u);
+  EXPECT_EQ(offsetof(SlotHeader, payload_bytes), 8u);
   EXPECT_EQ(offsetof(SlotHeader, time_ns), 16u);
   EXPECT_EQ(offsetof(SlotHeader, clock_error_ns), 24u);
   EXPECT_EQ(offsetof(SlotHeader, run_start), 32u);
   EXPECT_EQ(offsetof(SlotHeader, run_parent), 40u);
   EXPECT_EQ(offsetof(SlotHeader, run_jump), 48u);
   EXPECT_EQ(offsetof(SlotHeader, run_level), 56u);
-  EXPECT_EQ(kLayoutVersion, 6u) << "raise it with every incompatible change, and fix this test";
+  EXPECT_EQ(kLayoutVersion, 7u) << "raise it with every incompatible change, and fix this test";
 }
 
 TEST(Layout, HasItsDocumentedVersion) {

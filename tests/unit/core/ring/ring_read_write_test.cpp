@@ -9,6 +9,7 @@
 #include <random>
 #include <thread>
 
+#include "core/ring/copy.hpp"
 #include "tests/unit/core/ring/test_ring.hpp"
 
 namespace dssm::ring {
@@ -76,7 +77,7 @@ TEST(RingWriter, KeepsGuardBytesAfterEachPayload) {
   for (Tid tid = 0; tid < 7; ++tid) {
     std::byte* slot = writer.begin();
     std::memset(slot, static_cast<int>(tid), 40 + kGuardBytes);  // the widespread overrun
-    writer.commit(time_from_ns(tid), 0ns);
+    writer.commit(40, time_from_ns(tid), 0ns);
   }
   std::byte out[40];
   SampleInfo info;
@@ -84,6 +85,56 @@ TEST(RingWriter, KeepsGuardBytesAfterEachPayload) {
     ASSERT_EQ(ring.reader().read(tid, out, info), ReadStatus::ok);
     EXPECT_EQ(out[39], static_cast<std::byte>(tid));
   }
+}
+
+TEST(RingWriter, KeepsTheLengthOfEachSample) {
+  for (const std::uint64_t bytes : {40, 100'000}) {
+    const TestRing ring(bytes, 8);
+    const RingReader reader = ring.reader();
+    RingWriter writer = ring.writer();
+    const std::uint64_t lengths[] = {bytes, 0, 1, bytes / 2, bytes - 1, bytes};
+    for (const std::uint64_t length : lengths) {
+      const Tid tid = reader.newest() + 1;
+      if (tid % 2 == 0) {
+        ASSERT_EQ(writer.write(payload_for(tid, length), time_from_ns(tid), 0ns), tid);
+      } else {
+        const std::vector<std::byte> payload = payload_for(tid, length);
+        std::copy(payload.begin(), payload.end(), writer.begin());
+        ASSERT_EQ(writer.commit(length, time_from_ns(tid), 0ns), tid);
+      }
+      std::vector<std::byte> out(bytes, std::byte{0xee});
+      SampleInfo info;
+      ASSERT_EQ(reader.read(tid, out, info), ReadStatus::ok);
+      ASSERT_EQ(info.payload_bytes, length);
+      std::vector<std::byte> expected = payload_for(tid, length);
+      if (bytes > kLargeBytes) {
+        expected.resize(bytes, std::byte{0xee});
+        EXPECT_EQ(out, expected) << "no byte after the sample is copied";
+      } else {
+        out.resize(length);
+        EXPECT_EQ(out, expected);
+      }
+      SampleInfo located;
+      RingReader::Place place;
+      ASSERT_EQ(reader.locate(tid, place, located), ReadStatus::ok);
+      EXPECT_EQ(located.payload_bytes, length);
+    }
+  }
+}
+
+TEST(RingReader, TakesNoLengthThatLeavesTheSlot) {
+  const TestRing ring(40, 4);
+  RingWriter writer = ring.writer();
+  writer.write(payload_for(0, 40), time_from_ns(0), 0ns);
+  SlotTable(*ring.mapping).slot(0).payload_bytes.store(~std::uint64_t{0});
+  std::vector<std::byte> out(40);
+  SampleInfo info;
+  ASSERT_EQ(ring.reader().read(0, out, info), ReadStatus::ok);
+  EXPECT_EQ(info.payload_bytes, 40u);
+  ASSERT_EQ(ring.reader().read(0, std::span(out).first(7), info), ReadStatus::ok);
+  EXPECT_EQ(info.payload_bytes, 7u);
+  ASSERT_EQ(ring.reader().stamp(0, info), ReadStatus::ok);
+  EXPECT_EQ(info.payload_bytes, 40u);
 }
 
 TEST(RingWriter, PublishesALoanOnlyOnCommit) {
@@ -99,7 +150,7 @@ TEST(RingWriter, PublishesALoanOnlyOnCommit) {
   EXPECT_EQ(reader.newest(), kNoTid);
   slot = writer.begin();
   std::memset(slot, 2, 8);
-  EXPECT_EQ(writer.commit(time_from_ns(9), 1ns), 0);
+  EXPECT_EQ(writer.commit(8, time_from_ns(9), 1ns), 0);
   std::byte out[8];
   SampleInfo info;
   ASSERT_EQ(reader.read(0, out, info), ReadStatus::ok);

@@ -18,7 +18,7 @@ namespace {
 void put(const SlotWriter& mirror, Tid tid, std::int64_t time_ns, std::size_t bytes) {
   const std::vector<std::byte> payload = payload_for(tid, bytes);
   copy_in(mirror.begin(tid), payload.data(), payload.size());
-  mirror.publish(tid, time_from_ns(time_ns), Duration(tid % 100));
+  mirror.publish({tid, time_from_ns(time_ns), Duration(tid % 100), bytes});
 }
 
 TEST(SlotWriter, BeginsWithAnyTid) {

@@ -160,7 +160,7 @@ class MirrorWithHole {
     } else if (newest > begin) {
       slots_.skip_to(newest, begin);
     }
-    slots_.publish(newest, time(newest), {});
+    slots_.publish({newest, time(newest), {}, 1});
     sample(newest) = Sample::here;
     if (loses && begin == 0) lose(0, newest);
   }
@@ -174,7 +174,7 @@ class MirrorWithHole {
       sample(tid) = Sample::here;
       if (tid < reader_.oldest()) continue;
       fill(tid);
-      slots_.publish_in_hole(tid, time(tid), {});
+      slots_.publish_in_hole({tid, time(tid), {}, 1});
     }
     slots_.shrink_hole();
   }
@@ -301,14 +301,14 @@ TEST(TimeSearch, TakesFewHopsThroughAHoleThatWasFilledInPieces) {
   Tid newest = kHoleEnd;
   const auto publish = [&](Tid tid, std::int64_t time_ns) {
     slots.begin(tid);
-    slots.publish(tid, time_from_ns(time_ns), {});
+    slots.publish({tid, time_from_ns(time_ns), {}, 1});
   };
   slots.skip_to(kHoleEnd, 0);
   publish(kHoleEnd, kHoleEnd * 10);
   for (Tid end = kHoleEnd; end > 0; end -= kPiece) {
     for (Tid tid = std::max<Tid>(end - kPiece, 0); tid < end; ++tid) {
       slots.begin(tid);
-      slots.publish_in_hole(tid, time_from_ns(tid * 10), {});
+      slots.publish_in_hole({tid, time_from_ns(tid * 10), {}, 1});
     }
     slots.shrink_hole();
     ++newest;

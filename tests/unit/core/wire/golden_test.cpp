@@ -384,8 +384,9 @@ TEST(Golden, MessagesAreReadAsEver) {
 TEST(Golden, SamplesAreWrittenAsEver) {
   for (const auto& [name, meaning] : samples()) {
     std::array<std::byte, kMaxSampleHeaderBytes> header;
-    const std::size_t bytes = encode_sample_header(header, meaning.serial, meaning.info,
-                                                   kPayload.size(), meaning.trailer);
+    SampleInfo info = meaning.info;
+    info.payload_bytes = kPayload.size();
+    const std::size_t bytes = encode_sample_header(header, meaning.serial, info, meaning.trailer);
     std::string frame(reinterpret_cast<const char*>(header.data()), bytes);
     frame += kPayload;
     if (meaning.trailer == Trailer::torn) {

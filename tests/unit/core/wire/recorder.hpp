@@ -36,7 +36,7 @@ class Recorder : public FrameDelegate {
       decoder->hold();
       return {};
     }
-    payload_.assign(sample.payload_bytes, '?');
+    payload_.assign(sample.info.payload_bytes, '?');
     out = drops_payloads ? nullptr : reinterpret_cast<std::byte*>(payload_.data());
     return {};
   }

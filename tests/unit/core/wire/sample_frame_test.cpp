@@ -17,16 +17,17 @@ namespace {
 const std::int64_t kTids[] = {0, 1, INT64_MAX};
 const std::int64_t kTimes[] = {INT64_MIN, -1, 0, 1'700'000'000'000'000'000, INT64_MAX};
 const std::uint64_t kSerials[] = {0, 1, 127, 128, 1'000'000, UINT64_MAX};
-const std::size_t kSizes[] = {1, 50, 127, 128, 20'000, 3 << 20};
+const std::size_t kSizes[] = {0, 1, 50, 127, 128, 20'000, 3 << 20};
 
 std::span<const std::byte> bytes_of(const std::string& text) {
   return std::as_bytes(std::span(text));
 }
 
-std::string written(std::uint64_t serial, const SampleInfo& info, const std::string& payload,
+std::string written(std::uint64_t serial, SampleInfo info, const std::string& payload,
                     Trailer trailer, bool torn) {
   std::array<std::byte, kMaxSampleHeaderBytes> header;
-  const std::size_t bytes = encode_sample_header(header, serial, info, payload.size(), trailer);
+  info.payload_bytes = payload.size();
+  const std::size_t bytes = encode_sample_header(header, serial, info, trailer);
   std::string frame(reinterpret_cast<const char*>(header.data()), bytes);
   frame += payload;
   if (trailer == Trailer::torn) {

@@ -46,7 +46,7 @@ class FrameConnectionTest : public testing::Test,
       link->pause();
       return {};
     }
-    payload.assign(sample.payload_bytes, std::byte{0});
+    payload.assign(sample.info.payload_bytes, std::byte{0});
     out = payload.data();
     return {};
   }

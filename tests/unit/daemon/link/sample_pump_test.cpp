@@ -40,7 +40,11 @@ class PumpRig final : private FrameConnection::Observer, private SamplePump::Obs
 
   Tid write() {
     const Tid tid = ring.reader().newest() + 1;
-    return ring.writer().write(ring::payload_for(tid, payload_bytes_), time_of(tid), Duration(5));
+    return ring.writer().write(payload_for(tid), time_of(tid), Duration(5));
+  }
+  std::vector<std::byte> payload_for(Tid tid) const {
+    const std::size_t bytes[] = {payload_bytes_, 0, payload_bytes_ / 3, payload_bytes_ - 1};
+    return ring::payload_for(tid, lengths_differ ? bytes[tid % 4] : payload_bytes_);
   }
   void write(int count) {
     for (int i = 0; i < count; ++i) write();
@@ -79,7 +83,7 @@ class PumpRig final : private FrameConnection::Observer, private SamplePump::Obs
       if (!item.has_sample() || item.torn()) continue;
       const Tid tid = item.sample().tid();
       EXPECT_EQ(item.sample().time_ns(), to_ns(time_of(tid)));
-      EXPECT_EQ(payload_of(item), ring::payload_for(tid, payload_bytes_)) << "sample " << tid;
+      EXPECT_EQ(payload_of(item), payload_for(tid)) << "sample " << tid;
       EXPECT_TRUE(next == kNoTid || thinned || newest_first || tid == next)
           << tid << ", not " << next;
       next = tid + 1;
@@ -102,7 +106,7 @@ class PumpRig final : private FrameConnection::Observer, private SamplePump::Obs
   SampleSender sender;
   std::optional<SamplePump> pump;
   std::map<Tid, Tid> gaps;
-  bool thinned = false, newest_first = false;
+  bool thinned = false, newest_first = false, lengths_differ = false;
   int caught_up = 0, ends = 0;
   int written_when_caught_up = 0;  // by a writer that does not wait for the pump
 
@@ -257,6 +261,7 @@ TEST_P(SamplePumpOfEachKind, SendsWholeSamplesWhereverTheSocketStops) {
         const std::size_t in_frame = room % (total / 3);
         if (in_frame > 45 && in_frame < total / 3 - 5 && room % (total / 16) != 0) continue;
         PumpRig rig(payload_bytes, 8, may_tear, budget);
+        rig.lengths_differ = room % 2 == 1;
         rig.write(3);
         rig.start({0, 2, 0});
         rig.peer.room = room;
@@ -278,6 +283,7 @@ TEST_P(SamplePumpOfEachKind, SendsAllWhenTheSocketTakesLittleAtATime) {
   const int rounds = GetParam() == kSmall ? 20 : 8;
   for (int round = 0; round < rounds; ++round) {
     PumpRig rig(GetParam(), 64, round % 2 == 0, round % 4 < 2 ? 1U << 30 : GetParam() + 200);
+    rig.lengths_differ = round % 3 > 0;
     rig.write(40);
     rig.start({0, 39, 0});
     rig.peer.room = 0;
@@ -304,6 +310,7 @@ TEST_P(SamplePumpOfEachKind, LosesNothingWithoutSayingSoWhenItIsLapped) {
   for (int round = 0; round < rounds; ++round) {
     PumpRig rig(GetParam(), 4 + random() % 8, round % 3 != 0,
                 round % 2 == 0 ? 1U << 30 : GetParam() + 200);
+    rig.lengths_differ = round % 4 > 1;
     rig.write(2);
     rig.start({0, 1, 0});
     rig.peer.max_send_bytes = 1 + random() % (2 * GetParam());

@@ -25,9 +25,12 @@ class FakeFleet final : public Fleet {
  public:
   void observe(Observer* who) override { observer = who; }
   bool is_there(const StreamId& id) const override { return there.contains(id.str()); }
-  void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) override {
-    asked.push_back("open_reader " + id.str());
+  void open_reader(const StreamId& id, bool history, Then<std::shared_ptr<Stream>> then) override {
+    asked.push_back("open_reader " + id.str() + (history ? " with history" : ""));
     reader_then = std::move(then);
+  }
+  void want_history(const StreamId& id, bool always) override {
+    asked.push_back("want_history " + id.str() + (always ? " always" : ""));
   }
   void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) override {
     asked.push_back("open_writer " + id.str() +
@@ -151,6 +154,18 @@ TEST_F(RemoteRequestsTest, OpensAMirrorWhenItIsThere) {
   close.mutable_close()->set_handle(answer.opened().handle());
   EXPECT_TRUE(client->ask(close).has_done());
   EXPECT_EQ(opens.counts(*ring).readers, 0u);
+}
+
+TEST_F(RemoteRequestsTest, PassesOnThatHistoryIsWanted) {
+  local::Request open = open_at("lidar", "pc2");
+  open.mutable_open()->set_history(true);
+  put(open);
+  local::Request want;
+  want.mutable_want_history()->mutable_id()->set_name("lidar");
+  want.mutable_want_history()->mutable_id()->set_host("pc2");
+  EXPECT_TRUE(client->ask(want).has_done());
+  EXPECT_EQ(fleet.asked,
+            (Asked{"open_reader lidar:0@pc2 with history", "want_history lidar:0@pc2"}));
 }
 
 TEST_F(RemoteRequestsTest, PrefersAnOwnStreamAndOpensOthersRemotely) {
@@ -440,11 +455,12 @@ TEST_F(RecoveringRequestsTest, GiveBackWhatBelongsToAnotherHost) {
   offer.mutable_offer()->mutable_id()->set_name("lidar");
   offer.mutable_offer()->mutable_id()->set_host("pc2");
   offer.mutable_offer()->set_any_host(true);
+  offer.mutable_offer()->set_history(true);
   client->offered.push_back(std::move(kept));
   const local::Response answer = client->ask(offer);
   EXPECT_TRUE(answer.has_opened()) << answer.failure().message();
   EXPECT_TRUE(client->last_descriptors.empty());
-  EXPECT_EQ(fleet.asked, Asked{"adopt reader lidar:0@pc2"});
+  EXPECT_EQ(fleet.asked, (Asked{"adopt reader lidar:0@pc2", "want_history lidar:0@pc2 always"}));
   ASSERT_EQ(opens.entries().size(), 1u);
   EXPECT_TRUE(opens.entries().begin()->second.any_host) << "as it was opened";
   EXPECT_TRUE(registry.streams().empty()) << "it is none of ours";

@@ -35,7 +35,7 @@ class MirrorRingTest : public testing::Test {
   ring::RingReader reader{stream->mapping()};
 
   static wire::IncomingSample incoming(Tid tid) {
-    return {0, {tid, time_from_ns(1000 + tid), Duration(tid)}, 24};
+    return {0, {tid, time_from_ns(1000 + tid), Duration(tid), 24}};
   }
   Result<void> take(Tid tid, bool torn = false) {
     const wire::IncomingSample sample = incoming(tid);
@@ -48,7 +48,7 @@ class MirrorRingTest : public testing::Test {
   // The sample that it asks the owner for; kNoTid: the oldest.
   Tid wanted() const {
     net::Subscribe request;
-    ring->resume(true, request);
+    ring->resume(true, true, request);
     return request.from_oldest() ? kNoTid : request.from_tid();
   }
   ReadStatus read(Tid tid) {
@@ -67,7 +67,7 @@ class MirrorRingTest : public testing::Test {
 
 TEST_F(MirrorRingTest, RepeatsTheOwnersTidsWhereverTheyBegin) {
   EXPECT_EQ(wanted(), kNoTid) << "nothing known: the oldest is wanted";
-  ASSERT_TRUE(ring->on_subscribed_untrusted(1000, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(1000, false, 0));
   for (Tid tid = 1000; tid < 1010; ++tid) ASSERT_TRUE(take(tid));
   EXPECT_EQ(reader.oldest(), 1000);
   EXPECT_EQ(reader.newest(), 1009);
@@ -79,7 +79,7 @@ TEST_F(MirrorRingTest, RepeatsTheOwnersTidsWhereverTheyBegin) {
 }
 
 TEST_F(MirrorRingTest, NeverShowsATornSampleAndCountsItOnce) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false, 0));
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(take(1, true));
   EXPECT_EQ(reader.newest(), 0);
@@ -91,7 +91,7 @@ TEST_F(MirrorRingTest, NeverShowsATornSampleAndCountsItOnce) {
 }
 
 TEST_F(MirrorRingTest, CountsATornSampleThatIsReportedAsAGapOnce) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false, 0));
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(take(1, true));
   ASSERT_TRUE(ring->on_gap_untrusted(1, 1));
@@ -100,7 +100,7 @@ TEST_F(MirrorRingTest, CountsATornSampleThatIsReportedAsAGapOnce) {
 }
 
 TEST_F(MirrorRingTest, CountsReportedAndUnreportedGapsAlike) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false, 0));
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(ring->on_gap_untrusted(1, 9));
   EXPECT_EQ(ring->gap_samples(), 9u) << "before anything comes behind it";
@@ -111,16 +111,16 @@ TEST_F(MirrorRingTest, CountsReportedAndUnreportedGapsAlike) {
 }
 
 TEST_F(MirrorRingTest, CountsWhatTheOwnerLostWhileTheLinkWasCut) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false, 0));
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(
-      ring->on_subscribed_untrusted(100, false));  // after a reconnect: the oldest it still has
+      ring->on_subscribed_untrusted(100, false, 0));  // after a reconnect: the oldest it still has
   ASSERT_TRUE(take(100));
   EXPECT_EQ(ring->gap_samples(), 99u);
 }
 
 TEST_F(MirrorRingTest, KeepsTheWindowWholeWhileASampleAfterAGapArrives) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false, 0));
   for (Tid tid = 0; tid < 20; ++tid) ASSERT_TRUE(take(tid));
   for (const Tid behind : {22, 28, 33, 35}) {  // their slots hold 6, 12, 17 and the newest
     const wire::IncomingSample sample = incoming(behind);
@@ -137,7 +137,7 @@ TEST_F(MirrorRingTest, KeepsTheWindowWholeWhileASampleAfterAGapArrives) {
 }
 
 TEST_F(MirrorRingTest, DoesNotTakeWhatWasCutOffForTheNextSample) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false, 0));
   for (Tid tid = 0; tid < 20; ++tid) ASSERT_TRUE(take(tid));
   const std::uint64_t used = budget.used();
   ASSERT_TRUE(ring->begin_untrusted(incoming(28)));  // aside; then the connection breaks
@@ -149,7 +149,7 @@ TEST_F(MirrorRingTest, DoesNotTakeWhatWasCutOffForTheNextSample) {
 }
 
 TEST_F(MirrorRingTest, ReceivesInPlaceWhenThereIsNoMemoryToSetAside) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false, 0));
   for (Tid tid = 0; tid < 20; ++tid) ASSERT_TRUE(take(tid));
   const MemoryShare rest = budget.take(budget.limit() - budget.used()).value();
   ASSERT_TRUE(take(28));
@@ -157,9 +157,9 @@ TEST_F(MirrorRingTest, ReceivesInPlaceWhenThereIsNoMemoryToSetAside) {
 }
 
 TEST_F(MirrorRingTest, RefusesTidsThatDoNotRise) {
-  EXPECT_FALSE(ring->on_subscribed_untrusted(-1, false));
-  EXPECT_FALSE(ring->on_subscribed_untrusted(channel::kMaxTid + 1, false));
-  ASSERT_TRUE(ring->on_subscribed_untrusted(5, false));
+  EXPECT_FALSE(ring->on_subscribed_untrusted(-1, false, 0));
+  EXPECT_FALSE(ring->on_subscribed_untrusted(channel::kMaxTid + 1, false, 0));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(5, false, 0));
   ASSERT_TRUE(take(5));
   EXPECT_EQ(take(5).error().code, Errc::protocol);
   EXPECT_EQ(take(4).error().code, Errc::protocol);
@@ -171,7 +171,7 @@ TEST_F(MirrorRingTest, RefusesTidsThatDoNotRise) {
 }
 
 TEST_F(MirrorRingTest, ContinuesAfterWhatAnEarlierDssmdReceived) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false, 0));
   for (Tid tid = 0; tid < 40; ++tid) ASSERT_TRUE(take(tid));
   ASSERT_TRUE(ring->begin_untrusted(incoming(40)));  // dies here
   ring = MirrorRing::open(stream, budget).value();
@@ -184,7 +184,7 @@ TEST_F(MirrorRingTest, ContinuesAfterWhatAnEarlierDssmdReceived) {
 
 TEST_F(MirrorRingTest, WakesSleepersOncePerBatch) {
   auto bell = stream->map_bell().value();
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, false, 0));
   const std::uint32_t announced = bell->announce();
   ASSERT_TRUE(take(0));
   ASSERT_TRUE(take(1));
@@ -200,9 +200,9 @@ TEST_F(MirrorRingTest, WakesSleepersOncePerBatch) {
 
 class NewestFirstTest : public MirrorRingTest {
  protected:
-  net::Subscribe request() const {
+  net::Subscribe request(bool with_history = true) const {
     net::Subscribe request;
-    ring->resume(true, request);
+    ring->resume(true, with_history, request);
     return request;
   }
   ReadStatus find(std::int64_t ns) const {
@@ -218,7 +218,7 @@ class NewestFirstTest : public MirrorRingTest {
 
 TEST_F(NewestFirstTest, TheNewestIsReadableBeforeThoseThatCameBeforeIt) {
   EXPECT_TRUE(request().newest_first());
-  ASSERT_TRUE(ring->on_subscribed_untrusted(2, true));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(2, true, 0));
   ASSERT_TRUE(take(9));
   EXPECT_EQ(reader.newest(), 9);
   EXPECT_EQ(reader.oldest(), 2);
@@ -242,7 +242,7 @@ TEST_F(NewestFirstTest, TheNewestIsReadableBeforeThoseThatCameBeforeIt) {
 }
 
 TEST_F(NewestFirstTest, AsksForTheHoleAfterACutAndAfterADssmdThatDied) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true, 0));
   for (const Tid tid : {0, 1, 8, 6, 7, 9}) ASSERT_TRUE(take(tid));
   ring->wake();
   for (const bool died : {false, true}) {
@@ -253,7 +253,7 @@ TEST_F(NewestFirstTest, AsksForTheHoleAfterACutAndAfterADssmdThatDied) {
     EXPECT_EQ(request().from_tid(), 2);
     EXPECT_EQ(request().held_from(), 6);
     EXPECT_EQ(request().held_to(), 10);
-    ASSERT_TRUE(ring->on_subscribed_untrusted(2, true));
+    ASSERT_TRUE(ring->on_subscribed_untrusted(2, true, 0));
   }
   ASSERT_TRUE(take(12));
   for (const Tid tid : {10, 11, 2, 3, 4, 5}) ASSERT_TRUE(take(tid));
@@ -263,8 +263,59 @@ TEST_F(NewestFirstTest, AsksForTheHoleAfterACutAndAfterADssmdThatDied) {
   EXPECT_EQ(request().from_tid(), 13);
 }
 
+TEST_F(NewestFirstTest, HistoryComesWhenItIsWanted) {
+  EXPECT_TRUE(request(false).from_newest());
+  ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 2));
+  for (const Tid tid : {9, 10}) ASSERT_TRUE(take(tid));
+  ring->wake();
+  EXPECT_EQ(reader.oldest(), 2);
+  EXPECT_EQ(read(9), ReadStatus::ok);
+  EXPECT_EQ(read(8), ReadStatus::arriving);
+  EXPECT_EQ(find(1008), ReadStatus::arriving);
+  // After a cut the newest one comes first again, and what was missed is history, too.
+  EXPECT_TRUE(request(false).from_newest());
+  EXPECT_EQ(request(false).held_from(), 9);
+  EXPECT_EQ(request(false).held_to(), 11);
+  ASSERT_TRUE(ring->on_subscribed_untrusted(13, true, 4));
+  ASSERT_TRUE(take(13));
+  EXPECT_EQ(read(12), ReadStatus::arriving);
+  EXPECT_EQ(request().from_tid(), 2);
+  EXPECT_EQ(request().held_from(), 13);
+  EXPECT_EQ(request().held_to(), 14);
+  EXPECT_EQ(read(3), ReadStatus::lost) << "the owner no longer holds it";
+  ASSERT_TRUE(ring->on_subscribed_untrusted(4, true, 4));
+  for (const Tid tid : {4, 5, 6, 7, 8, 9, 10, 11, 12}) ASSERT_TRUE(take(tid));
+  ring->wake();
+  EXPECT_TRUE(reader.hole().is_empty());
+  for (Tid tid = 4; tid <= 13; ++tid) EXPECT_EQ(found(1000 + tid), tid);
+  EXPECT_EQ(ring->gap_samples(), 0u) << "nobody wanted those that are lost";
+}
+
+TEST_F(NewestFirstTest, HistoryThatNobodyWantsIsNotMissed) {
+  EXPECT_TRUE(request(false).from_newest());
+  ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 0));
+  for (Tid tid = 9; tid < 60; ++tid) ASSERT_TRUE(take(tid));
+  ring->wake();
+  EXPECT_EQ(read(8), ReadStatus::too_old);
+  EXPECT_EQ(find(1008), ReadStatus::too_old) << "the hole has left the window";
+  EXPECT_EQ(ring->gap_samples(), 0u);
+  ring->end_filling();
+  EXPECT_EQ(ring->gap_samples(), 0u);
+}
+
+TEST_F(NewestFirstTest, HistoryMayBeWantedBeforeTheNewestOneHasCome) {
+  EXPECT_TRUE(request(false).from_newest());
+  ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 2));
+  EXPECT_EQ(request().from_tid(), 2);
+  ASSERT_TRUE(take(9));  // of the first subscription
+  ASSERT_TRUE(ring->on_subscribed_untrusted(2, true, 2));
+  for (const Tid tid : {9, 2, 3, 4, 5, 6, 7, 8}) ASSERT_TRUE(take(tid));
+  ring->wake();
+  for (Tid tid = 2; tid <= 9; ++tid) EXPECT_EQ(found(1000 + tid), tid);
+}
+
 TEST_F(NewestFirstTest, WhatTheOwnerLostIsNoLongerAwaited) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true, 0));
   for (const Tid tid : {0, 1, 8}) ASSERT_TRUE(take(tid));
   ASSERT_TRUE(ring->on_gap_untrusted(2, 3));
   EXPECT_EQ(ring->gap_samples(), 3u);
@@ -283,7 +334,7 @@ TEST_F(NewestFirstTest, WhatTheOwnerLostIsNoLongerAwaited) {
 }
 
 TEST_F(NewestFirstTest, WhatTheNetworkCannotCarryIsLostBetweenThoseThatAreHere) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true, 0));
   ASSERT_TRUE(take(0));
   for (const Tid newest : {3, 6, 9}) {
     ASSERT_TRUE(ring->on_gap_untrusted(newest - 2, 2));
@@ -315,9 +366,9 @@ TEST_F(NewestFirstTest, WhatTheNetworkCannotCarryIsLostBetweenThoseThatAreHere) 
 }
 
 TEST_F(NewestFirstTest, WhatTheOwnerNoLongerHasAfterACutIsLost) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true, 0));
   ASSERT_TRUE(take(0));
-  ASSERT_TRUE(ring->on_subscribed_untrusted(3, true));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(3, true, 0));
   ASSERT_TRUE(take(6));
   EXPECT_EQ(ring->gap_samples(), 2u);
   EXPECT_EQ(read(2), ReadStatus::lost);
@@ -325,7 +376,7 @@ TEST_F(NewestFirstTest, WhatTheOwnerNoLongerHasAfterACutIsLost) {
 }
 
 TEST_F(NewestFirstTest, DropsWhatHasNoPlaceAnyMore) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true, 0));
   for (const Tid tid : {3, 25}) ASSERT_TRUE(take(tid));
   for (const Tid late : {3, 1, 9}) ASSERT_TRUE(take(late));  // the window begins at 11
   EXPECT_EQ(read(25), ReadStatus::ok) << "9 has its slot";
@@ -338,7 +389,7 @@ TEST_F(NewestFirstTest, DropsWhatHasNoPlaceAnyMore) {
 }
 
 TEST_F(NewestFirstTest, ALossThatCannotBeIsBounded) {
-  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true, 0));
   ASSERT_TRUE(take(channel::kMaxTid));
   EXPECT_FALSE(ring->on_gap_untrusted(0, ~std::uint64_t{0}));
   ASSERT_TRUE(ring->on_gap_untrusted(0, channel::kMaxTid)) << "and it does not take for ever";

@@ -158,6 +158,7 @@ TEST_F(StreamChannelTest, BeginsASubscriptionWhereItIsAskedTo) {
   EXPECT_EQ(subscribe([](auto& s) { s.set_from_oldest(true); }),
             "subscribed:13 13 14 15 16 17 18 19 caught_up");
   EXPECT_EQ(subscribe([](auto& s) { s.set_from_now(true); }), "subscribed:20 caught_up");
+  EXPECT_EQ(subscribe([](auto& s) { s.set_from_newest(true); }), "subscribed:19 19 caught_up");
   EXPECT_EQ(subscribe([](auto&) {}), "subscribed:20 caught_up");
   EXPECT_EQ(subscribe([](auto& s) { s.set_from_tid(17); }), "subscribed:17 17 18 19 caught_up");
   EXPECT_EQ(subscribe([](auto& s) { s.set_from_tid(10); }),

@@ -49,6 +49,7 @@ max_connections = 20
 max_connections_per_host = 21
 max_peer_memory = "22 MiB"
 mirror_linger = "23 s"
+mirror_history = "at_once"
 )",
                                                     "dssmd.conf");
   ASSERT_TRUE(applied) << applied.error().message;
@@ -76,6 +77,7 @@ mirror_linger = "23 s"
   EXPECT_EQ(config.max_connections_per_host, 21u);
   EXPECT_EQ(config.max_peer_memory_bytes, 22u << 20);
   EXPECT_EQ(config.mirror_linger, std::chrono::seconds(23));
+  EXPECT_TRUE(config.mirror_history);
 }
 
 TEST(Config, TakesAnEmptyFile) { EXPECT_EQ(mistakes_in(""), ""); }

@@ -74,7 +74,7 @@ TEST_F(AuthorizeTest, RefusesEachRequestOfALocalProgram) {
     ++kinds;
     EXPECT_EQ(client.ask(request).failure().code(), "no_permission") << field;
   }
-  EXPECT_EQ(kinds, 18) << "the requests of local.proto besides Hello";
+  EXPECT_EQ(kinds, 19) << "the requests of local.proto besides Hello";
   EXPECT_EQ(client.ask(open_request("odometry", true)).failure().message(), "forbidden");
   EXPECT_EQ(last_action, Action::open_for_writing);
   EXPECT_EQ(last_stream.name, "odometry");
