@@ -23,8 +23,9 @@ struct OpenedStream {
 };
 
 // For verbs that run until a stop signal: catches stop signals, connects, opens `options.stream`
-// for reading, waiting up to `options.wait` for it, and does `work` with it. Success without `work`
-// when a stop signal came before; a failure to open names similar streams.
+// for reading, waiting up to `options.wait` for it, and does `work` with it. history: as in
+// Session. Success without `work` when a stop signal came before; a failure to open names similar
+// streams.
 Result<void> with_stream(const ReadingOptions& options, FetchHistory history,
                          const std::function<Result<void>(OpenedStream&)>& work);
 

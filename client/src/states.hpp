@@ -19,8 +19,7 @@ namespace dssm::detail {
 // How long a reader waits before it tries again to open the ring that superseded its own.
 inline constexpr Duration kRestartPause = std::chrono::milliseconds(200);
 
-// How long a program that repeats a read of a sample that is still to come does not ask for it
-// again.
+// A program that repeats a read of a sample that is still to come asks for it at most so often.
 inline constexpr Duration kHistoryPause = std::chrono::milliseconds(50);
 
 // A time that is further from now than this is not of this PC's clock.

@@ -53,6 +53,12 @@ Result<Reply> with_streams(Reply reply, std::vector<proto::Stream> streams) {
   return reply;
 }
 
+Reply done() {
+  Reply reply;
+  reply.response.mutable_done();
+  return reply;
+}
+
 }  // namespace
 
 LocalRequests::LocalRequests(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
@@ -94,16 +100,12 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
       return offer(client, request.offer(), descriptors);
     case local::Request::kClose: {
       DSSM_TRY(opens_.remove(client->number, request.close().handle()));
-      Reply done;
-      done.response.mutable_done();
-      return done;
+      return done();
     }
     case local::Request::kWantHistory: {
       const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.want_history().id()));
       if (fleet_) fleet_->want_history(id, false);
-      Reply done;
-      done.response.mutable_done();
-      return done;
+      return done();
     }
     case local::Request::kOpenClock:
       return open_clock(request.open_clock(), descriptors);

@@ -44,9 +44,9 @@ class MirrorRing {
 
   const std::shared_ptr<Stream>& stream() const noexcept { return stream_; }
 
-  // The request for the samples of the hole (also those that are here: the newest of it excepted),
-  // and for those that follow on what is here; for
-  // all, if the owner never sent where this ring begins. The newest first.
+  // The request for the samples of the hole, also for those in it that are here, and for those that
+  // follow on the newest one; for all, if the owner never sent where this ring begins. The newest
+  // first.
   //   newest_first  the owner has that feature; else what is missing in the hole will never come
   //   with_history  false: only for the newest sample and those that follow. Those before are in
   //                 the hole until resume() asks for them. Without newest_first always true

@@ -298,15 +298,19 @@ SSM_tid RemoteStream::hand_over(ReadStatus status, const Request& request, const
   return ssm_tid(info.tid);
 }
 
+// Whether the program's type is as long as the stream's; reports it if not.
+bool RemoteStream::has_size(const char* verb, std::size_t bytes) {
+  if (bytes == sample_.size()) return true;
+  report_once(
+      {Errc::type_mismatch, fmt::format("{} {} : its samples have {} bytes, this program's type {}",
+                                        verb, quoted_name(), sample_.size(), bytes)});
+  return false;
+}
+
 SSM_tid RemoteStream::read(const Request& request, void* data, std::size_t bytes, double* time) {
   const Call call(*this);
   if (!call.has_stream()) return SSM_ERROR_NO_DATA;
-  if (bytes != sample_.size()) {
-    report_once({Errc::type_mismatch,
-                 fmt::format("read {} : its samples have {} bytes, this program's type {}",
-                             quoted_name(), sample_.size(), bytes)});
-    return SSM_ERROR_NO_DATA;
-  }
+  if (!has_size("read", bytes)) return SSM_ERROR_NO_DATA;
   SampleInfo info;
   const auto report_skip = [&](Tid wanted, Tid got) {
     report_error(fmt::format("readNext : skipping {} TID: {} -> {}", quoted_name(), ssm_tid(wanted),
@@ -351,12 +355,7 @@ SSM_tid RemoteStream::tid_at(double time) {
 bool RemoteStream::write(const void* data, std::size_t bytes, double time) {
   const Call call(*this);
   if (!call.has_stream()) return false;
-  if (bytes != sample_.size()) {
-    return report_once({Errc::type_mismatch,
-                        fmt::format("write {} : its samples have {} bytes, this program's type {}",
-                                    quoted_name(), sample_.size(), bytes)}),
-           false;
-  }
+  if (!has_size("write", bytes)) return false;
   const auto posted =
       connector_->post({static_cast<const std::byte*>(data), bytes}, time_from_seconds(time));
   if (!posted) return report_once(posted.error()), false;

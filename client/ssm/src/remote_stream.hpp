@@ -80,6 +80,7 @@ class RemoteStream {
                        ReportSkip report_skip);
   Tid ask_newest();
   Tid ask_oldest();
+  bool has_size(const char* verb, std::size_t bytes);
   SSM_tid hand_over(ReadStatus status, const Request& request, const SampleInfo& info, void* data,
                     double* time);
 

@@ -268,13 +268,18 @@ TEST(PConnectorRequest, FailsAtOnceWhenTheAnswerIsGarbageAndTheNextOneWorks) {
   EXPECT_EQ(con.read_newest(sample.span(), sample.info).value(), ReadStatus::ok);
 }
 
-TEST(PConnectorRequest, TakesASampleThatIsShorter) {
-  const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
+// A dssmd whose stream has samples of 8 bytes, and that answers a read with that one.
+auto answers_with(const char* payload) {
+  return [payload](NetworkPeer& peer, int) {
     peer.answer_open(8);
     const auto request = peer.try_receive();
-    if (request) send_sample(peer, 5, "123", request->serial());
+    if (request) send_sample(peer, 5, payload, request->serial());
     peer.await_end();
-  });
+  };
+}
+
+TEST(PConnectorRequest, TakesASampleThatIsShorter) {
+  const ScriptedDaemon daemon(answers_with("123"));
   auto con = open(daemon).value();
   TakenSample sample;
   ASSERT_EQ(con.read_newest(sample.span(), sample.info).value(), ReadStatus::ok);
@@ -283,12 +288,7 @@ TEST(PConnectorRequest, TakesASampleThatIsShorter) {
 }
 
 TEST(PConnectorRequest, RefusesSamplesThatAreTooLong) {
-  const ScriptedDaemon daemon([&](NetworkPeer& peer, int) {
-    peer.answer_open(8);
-    const auto request = peer.try_receive();
-    if (request) send_sample(peer, 5, "123456789", request->serial());
-    peer.await_end();
-  });
+  const ScriptedDaemon daemon(answers_with("123456789"));
   auto con = open(daemon).value();
   TakenSample sample;
   const auto bad = con.read_newest(sample.span(), sample.info);
