@@ -129,6 +129,26 @@ void add_details(Json& json, const StreamInfo& stream) {
   json["mirror"] = stream.mirror ? mirror_json(*stream.mirror) : Json();
 }
 
+// Both times are of the owner's clock. A sample may be on its way, and the two were looked at one
+// after the other.
+Duration behind_owner(const StreamInfo& stream) {
+  constexpr Duration kOnItsWay = std::chrono::milliseconds(100);
+  if (!stream.mirror || stream.mirror->newest == kNoTid ||
+      stream.newest <= stream.mirror->newest) {
+    return {};
+  }
+  const Duration behind = saturating_sub(stream.newest_time, stream.mirror->newest_time);
+  return behind > 2 * stream.cycle + kOnItsWay ? behind : Duration();
+}
+
+std::string carried_text(const StreamInfo& stream) {
+  if (!stream.mirror || stream.mirror->recent_lost_samples == 0) return {};
+  const double share = 1 - static_cast<double>(stream.mirror->recent_lost_samples) /
+                               static_cast<double>(stream.mirror->recent_samples);
+  return fmt::format("carries {:.3g} of {:.3g} samples a second", share * stream.rate_hz,
+                     stream.rate_hz);
+}
+
 std::string_view role_name(Role role) { return role == Role::writer ? "writer" : "reader"; }
 
 }  // namespace dssm::ctl

@@ -29,6 +29,11 @@ Json stream_json(const StreamInfo& stream, Time now);
 // What `info` adds: fields, users, and how the mirror is doing.
 void add_details(Json& json, const StreamInfo& stream);
 
+// How much older the newest sample in its mirror is than its owner's; 0: the mirror is fresh.
+Duration behind_owner(const StreamInfo& stream);
+// "carries 11 of 30 samples a second", of the network to the mirror; empty: it carries all.
+std::string carried_text(const StreamInfo& stream);
+
 std::string_view role_name(Role role);
 
 }  // namespace dssm::ctl

@@ -596,6 +596,43 @@ Finding check_stream_names(const Facts& facts) {
           fmt::format("dssmctl info {}  # and so in programs", example)};
 }
 
+// The mirrors of this PC: whether what programs read here is what their owners have now.
+Finding check_mirrors(const Facts& facts) {
+  std::size_t mirrors = 0;
+  std::vector<std::string> behind;
+  std::string example;
+  for (const StreamInfo& stream : facts.streams) {
+    if (!stream.mirror) continue;
+    ++mirrors;
+    std::string what = carried_text(stream);
+    if (!what.empty()) {
+      what = "the network " + what;
+    } else if (const Duration late = behind_owner(stream); late > Duration()) {
+      what = duration_text(late) + " behind its owner";
+    }
+    if (what.empty()) continue;
+    if (example.empty()) example = stream.id.str();
+    behind.push_back(fmt::format("'{}': {}", stream.id.str(), what));
+  }
+  if (behind.empty()) {
+    return {"mirrors", Status::ok,
+            mirrors == 0 ? "no program here reads a stream of another host"
+                         : fmt::format("the network carries all samples of the {} streams of other "
+                                       "hosts that programs here read",
+                                       mirrors)};
+  }
+  std::string more;
+  if (behind.size() > kMaxNamed) {
+    more = fmt::format(", and {} more", behind.size() - kMaxNamed);
+    behind.resize(kMaxNamed);
+  }
+  return {"mirrors", Status::warn, fmt::format("{}{}", fmt::join(behind, ", "), more),
+          "these streams write more than the network to their hosts carries",
+          fmt::format("dssmctl info {}  # then write less or shorter samples, set max_rate for it "
+                      "here (key mirror_streams), or use a faster network",
+                      example)};
+}
+
 }  // namespace
 
 std::vector<Finding> findings_of(const Facts& facts) {
@@ -614,6 +651,7 @@ std::vector<Finding> findings_of(const Facts& facts) {
   check_fleet_clocks(facts, findings);
   findings.push_back(check_host_names(facts));
   findings.push_back(check_stream_names(facts));
+  findings.push_back(check_mirrors(facts));
   return findings;
 }
 

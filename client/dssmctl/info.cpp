@@ -53,19 +53,10 @@ void print_users(const StreamInfo& stream, Output& out) {
   table.print(out);
 }
 
-// How much older the newest sample here is than its owner's. Both times are of the owner's clock. A
-// sample may be on its way, and the two were looked at one after the other.
-Duration behind_owner(const StreamInfo& stream, const MirrorInfo& mirror) {
-  constexpr Duration kOnItsWay = std::chrono::milliseconds(100);
-  if (mirror.newest == kNoTid || stream.newest <= mirror.newest) return {};
-  const Duration behind = saturating_sub(stream.newest_time, mirror.newest_time);
-  return behind > 2 * stream.cycle + kOnItsWay ? behind : Duration();
-}
-
 // Of another host's stream: the copy that this PC keeps of it, while a program reads it here.
 void print_mirror(const StreamInfo& stream, const MirrorInfo& mirror, Output& out) {
   std::string state(name_of(mirror.state));
-  if (const Duration behind = behind_owner(stream, mirror); behind > Duration()) {
+  if (const Duration behind = behind_owner(stream); behind > Duration()) {
     const bool is_live = mirror.state == MirrorState::live;
     state =
         fmt::format("{}{} behind its owner", is_live ? "" : state + ", ", duration_text(behind));
@@ -80,12 +71,8 @@ void print_mirror(const StreamInfo& stream, const MirrorInfo& mirror, Output& ou
                              bytes_text(mirror.received_bytes), mirror.newest));
   if (!mirror.clock.empty()) add_line(out, "clock", escaped_message(mirror.clock));
   add_line(out, "missing", fmt::format("{} samples", mirror.gap_samples));
-  if (mirror.recent_lost_samples > 0) {
-    const double share = 1 - static_cast<double>(mirror.recent_lost_samples) /
-                                 static_cast<double>(mirror.recent_samples);
-    add_line(out, "network",
-             fmt::format("carries {:.3g} of {:.3g} samples a second; the others are missing",
-                         share * stream.rate_hz, stream.rate_hz));
+  if (const std::string carried = carried_text(stream); !carried.empty()) {
+    add_line(out, "network", carried + "; the others are missing");
   }
   if (mirror.filling_samples > 0 && !mirror.history_wanted) {
     add_line(out, "history",

@@ -29,10 +29,10 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
   fence_after_filling(large_);
 }
 
-[[gnu::hot]] void SlotWriter::publish(const SampleInfo& info) const noexcept {
-  const Tid tid = info.tid;
+[[gnu::hot]] void SlotWriter::publish(Tid tid, Time time, Duration clock_error,
+                                      std::uint64_t bytes) const noexcept {
   const Tid top = header_->top.load(std::memory_order_relaxed);
-  const std::int64_t time_ns = to_ns(info.time);
+  const std::int64_t time_ns = to_ns(time);
   Tid run_start = header_->run_start.load(std::memory_order_relaxed);
   RunLinks links;
   bool starts_run = tid == run_start;
@@ -49,7 +49,7 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
     // Before top: a reader that sees the new top also sees its run.
     header_->run_start.store(run_start, std::memory_order_release);
   }
-  store(info, run_start);
+  store({tid, time, clock_error, bytes}, run_start);
   // Even: the sample is complete. Pairs with the first load of each read.
   slots_.slot(tid).sequence.store(published_sequence(tid), std::memory_order_release);
   // Sequentially consistent, like the bell's loads that follow: either a sleeper that has just
@@ -57,7 +57,7 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
   header_->top.store(tid, std::memory_order_seq_cst);
 }
 
-void SlotWriter::store(const SampleInfo& info, Tid run_start) const noexcept {
+[[gnu::always_inline]] inline void SlotWriter::store(const SampleInfo& info, Tid run_start) const noexcept {
   SlotHeader& slot = slots_.slot(info.tid);
   const std::int64_t time_ns = to_ns(info.time);
   // Release, each: a reader that sees one of these sees the odd sequence too; pairs with the

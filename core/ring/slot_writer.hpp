@@ -33,7 +33,9 @@ class SlotWriter {
   // The payload is in place: makes it sample `info.tid`. A tid that does not follow the newest one
   // (in such copies only) leaves a gap, and samples before the gap are no longer readable; unless
   // lose_before_next() or skip_to() came before.
-  void publish(const SampleInfo& info) const noexcept;
+  void publish(const SampleInfo& info) const noexcept {
+    publish(info.tid, info.time, info.clock_error, info.payload_bytes);
+  }
 
   // In mirrors: samples that are lost, or come later than newer ones. docs/ring-layout.md "Hole".
 
@@ -62,6 +64,8 @@ class SlotWriter {
   void prefetch_next(Tid tid) const noexcept;
 
  private:
+  // Each by itself, because that way they stay in registers: 2 ns of each write.
+  void publish(Tid tid, Time time, Duration clock_error, std::uint64_t bytes) const noexcept;
   void store(const SampleInfo& info, Tid run_start) const noexcept;
   void begin_run(Tid tid, const RunLinks& links) const noexcept;
   Tid link(Tid tid, Tid previous_run) const noexcept;

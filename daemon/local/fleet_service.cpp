@@ -342,6 +342,11 @@ void FleetService::list(Then<std::vector<proto::Stream>> then) {
         if (stream) streams.push_back(*std::move(stream));
       }
     }
+    for (proto::Stream& stream : streams) {
+      const Result<StreamId> id = wire::stream_id_untrusted(stream.id());
+      const Mirror* mirror = id ? mirrors_.find(*id) : nullptr;
+      if (mirror) mirror->describe(*stream.mutable_mirror());
+    }
     then(std::move(streams));
   });
 }

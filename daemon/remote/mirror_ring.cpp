@@ -82,6 +82,7 @@ Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first, T
   const Tid next = cursor_.next();
   const bool is_whole = with_history_ || !newest_first;
   const Tid begin = is_whole ? first : std::clamp<Tid>(oldest, 0, std::max<Tid>(first, 0));
+  wanted_from_ = is_whole ? 0 : first;
   if (!newest_first || next == kNoTid || slots_.newest() < 0) {
     if (newest_first) cursor_.set_next(kNoTid);
     DSSM_TRY(cursor_.on_subscribed_untrusted(first));
@@ -135,8 +136,7 @@ void MirrorRing::count_what_leaves(Tid tid) noexcept {
 // What nobody wants is not missing.
 std::uint64_t MirrorRing::count_missing(ring::TidRange range) const noexcept {
   std::uint64_t missing = 0;
-  if (!with_history_) return missing;
-  for (Tid tid = range.begin; tid < range.end; ++tid) missing += is_missing(tid) ? 1U : 0U;
+  for (Tid tid = std::max(range.begin, wanted_from_); tid < range.end; ++tid) missing += is_missing(tid) ? 1U : 0U;
   return missing;
 }
 

@@ -111,6 +111,7 @@ class MirrorRing {
   channel::SampleCursor cursor_;
   bool newest_first_ = false;               // the owner sends so
   bool with_history_ = true;                // the present request
+  Tid wanted_from_ = 0;                     // earlier ones do not count as lost: not asked for
   Tid begins_at_ = 0;                       // an empty ring: earlier ones were never asked for
   std::vector<ring::TidRange> lost_ahead_;  // of those after the newest one here; rising
   bool is_dropped_ = false;             // the sample in the hole that arrives, which is not missing

@@ -412,5 +412,26 @@ TEST(Doctor, FindsStreamsOfOneNameAndNamesOnlySome) {
   EXPECT_TRUE(finding_of(facts, "stream names").text.ends_with(" and 96 more"));
 }
 
+TEST(Doctor, WarnsOfMirrorsThatTheNetworkCannotFill) {
+  Facts facts = healthy();
+  EXPECT_TRUE(finding_of(facts, "mirrors").text.starts_with("no program here"));
+  StreamInfo& stream = facts.streams[1];
+  stream.cycle = std::chrono::milliseconds(33);
+  stream.rate_hz = 30;
+  stream.newest = 1000;
+  stream.newest_time = time_from_ns(10'000'000'000);
+  stream.mirror.emplace();
+  stream.mirror->newest = 999;
+  stream.mirror->newest_time = time_from_ns(9'900'000'000);
+  EXPECT_FINDING(facts, "mirrors", Status::ok, "");
+  stream.mirror->newest_time = time_from_ns(8'000'000'000);
+  EXPECT_FINDING(facts, "mirrors", Status::warn, "dssmctl info odom:0@pc2");
+  EXPECT_EQ(finding_of(facts, "mirrors").text, "'odom:0@pc2': 2 s behind its owner");
+  stream.mirror->recent_samples = 90;
+  stream.mirror->recent_lost_samples = 57;
+  EXPECT_EQ(finding_of(facts, "mirrors").text,
+            "'odom:0@pc2': the network carries 11 of 30 samples a second");
+}
+
 }  // namespace
 }  // namespace dssm::ctl

@@ -303,6 +303,19 @@ TEST_F(NewestFirstTest, HistoryThatNobodyWantsIsNotMissed) {
   EXPECT_EQ(ring->gap_samples(), 0u);
 }
 
+TEST_F(NewestFirstTest, WhatIsPassedOverAndLostIsMissedAlsoWithoutHistory) {
+  EXPECT_TRUE(request(false).from_newest());
+  ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 2));
+  for (const Tid tid : {9, 12}) ASSERT_TRUE(take(tid));
+  ASSERT_TRUE(ring->on_gap_untrusted(10, 2));
+  ring->wake();
+  EXPECT_EQ(read(10), ReadStatus::lost);
+  EXPECT_EQ(ring->gap_samples(), 2u);
+  ASSERT_TRUE(take(15));
+  ring->end_filling();
+  EXPECT_EQ(ring->gap_samples(), 4u) << "also 13 and 14, but none before 9";
+}
+
 TEST_F(NewestFirstTest, HistoryMayBeWantedBeforeTheNewestOneHasCome) {
   EXPECT_TRUE(request(false).from_newest());
   ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 2));
