@@ -119,18 +119,30 @@ class TcpTransport final : public Transport {
   }
 
   std::optional<std::uint64_t> carried_per_s() const noexcept override {
-    tcp_info info{};
-    socklen_t length = sizeof info;
-    if (::getsockopt(socket_.get(), IPPROTO_TCP, TCP_INFO, &info, &length) != 0 ||
-        info.tcpi_delivery_rate == 0) {
-      return std::nullopt;
-    }
-    return info.tcpi_delivery_rate;
+    const std::optional<tcp_info> info = state();
+    if (!info || info->tcpi_delivery_rate == 0) return std::nullopt;
+    return info->tcpi_delivery_rate;
+  }
+  std::optional<Progress> progress() const noexcept override {
+    using std::chrono::microseconds;
+    const std::optional<tcp_info> info = state();
+    if (!info) return std::nullopt;
+    return Progress{info->tcpi_bytes_acked, microseconds(info->tcpi_min_rtt),
+                    microseconds(info->tcpi_busy_time), microseconds(info->tcpi_rwnd_limited)};
   }
 
   int fd() const noexcept override { return socket_.get(); }
 
  private:
+  std::optional<tcp_info> state() const noexcept {
+    tcp_info info{};
+    socklen_t length = sizeof info;
+    if (::getsockopt(socket_.get(), IPPROTO_TCP, TCP_INFO, &info, &length) != 0) {
+      return std::nullopt;
+    }
+    return info;
+  }
+
   Result<IoResult> receive_stamped(std::span<const iovec> spaces) {
     alignas(cmsghdr) std::array<char, CMSG_SPACE(sizeof(timespec))> control{};
     msghdr message = header(spaces);

@@ -56,6 +56,14 @@ struct IoResult {
 // Which end of the connection a transport is.
 enum class TransportEnd : unsigned char { connected, accepted };
 
+// What became of the bytes that were sent, since the connection began.
+struct Progress {
+  std::uint64_t acknowledged_bytes = 0;
+  Duration round_trip{};        // the least of late
+  Duration sending{};           // so long some were on their way or waited to be sent
+  Duration waiting_for_peer{};  // and so long of that the receiver took no more
+};
+
 // A resource with one owner; one thread at a time. Its functions never wait, except for
 // receive_waiting(); callers that want to wait poll fd().
 class Transport {
@@ -96,6 +104,9 @@ class Transport {
   // How many bytes a second the network has carried lately, while there was enough to send.
   // nullopt: not known.
   virtual std::optional<std::uint64_t> carried_per_s() const noexcept { return std::nullopt; }
+
+  // nullopt: not known.
+  virtual std::optional<Progress> progress() const noexcept { return std::nullopt; }
 
   // Readable or writable when receive() or send() can continue.
   virtual int fd() const noexcept = 0;

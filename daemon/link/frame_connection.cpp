@@ -262,11 +262,26 @@ bool FrameConnection::flush() {
 
 [[gnu::hot]] std::size_t FrameConnection::transmit(std::span<const iovec> parts) {
   const Result<wire::IoResult> sent = transport_->send(parts);
-  if (sent && sent->status != wire::IoStatus::end) return sent->bytes;
+  if (sent && sent->status != wire::IoStatus::end) {
+    sent_bytes_ += sent->bytes;
+    if (pace_) pace_->on_sent(sent->bytes);
+    return sent->bytes;
+  }
   last_error_ =
       sent ? Error{Errc::unavailable, "the other side closed the connection"} : sent.error();
   lose_output();
   return 0;
+}
+
+std::size_t FrameConnection::history_allowance() {
+  if (!pace_ || closed_) return HistoryPace::kUnlimited;
+  return pace_->allowance(loop_.now(), {this, sent_bytes_, *transport_});
+}
+
+void FrameConnection::on_history_sent(std::uint64_t since_sent_bytes, bool is_full) {
+  if (!pace_) return;
+  pace_->on_history(static_cast<std::size_t>(sent_bytes_ - since_sent_bytes));
+  if (is_full || !output_.queue.empty()) pace_->on_full();
 }
 
 // The peer may have sent its reason before it closed: that is still to be received, so receiving

@@ -22,6 +22,7 @@
 #include "core/wire/transport.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/memory_budget.hpp"
+#include "daemon/link/history_pace.hpp"
 
 namespace dssm::daemon {
 
@@ -101,6 +102,10 @@ class FrameConnection final : private wire::FrameDelegate {
   // which outlives the connection; when it is used up, the connection closes itself.
   void set_budget(MemoryBudget& budget) noexcept { budget_ = &budget; }
 
+  // What is sent counts there, and history follows it; it outlives the connection. Without it,
+  // history is sent as fast as the connection takes it.
+  void set_pace(HistoryPace& pace) noexcept { pace_ = &pace; }
+
   // Sends a frame, or queues the bytes that the socket does not take. Nothing after the end.
   void send(const net::Frame& frame);
 
@@ -120,6 +125,14 @@ class FrameConnection final : private wire::FrameDelegate {
   void set_mid_frame(bool mid_frame);
   // Asks for on_output_empty() when the socket takes bytes again, after send_now() took none.
   void want_output();
+
+  // How many bytes of history may be sent now. 0: none before history_due().
+  std::size_t history_allowance();
+  MonoTime history_due() const noexcept { return pace_ ? pace_->due() : MonoTime(); }
+  // What was sent since so many bytes had been sent is history.
+  //   is_full  the socket took less than was to be sent
+  void on_history_sent(std::uint64_t since_sent_bytes, bool is_full);
+  std::uint64_t sent_bytes() const noexcept { return sent_bytes_; }
 
   // --- flow and end
 
@@ -197,6 +210,8 @@ class FrameConnection final : private wire::FrameDelegate {
   SampleDelegate* samples_ = nullptr;
   const std::size_t max_queued_bytes_;
   MemoryBudget* budget_ = nullptr;
+  HistoryPace* pace_ = nullptr;
+  std::uint64_t sent_bytes_ = 0;
   wire::FrameDecoder decoder_;
   Output output_;
   Input input_;

@@ -9,6 +9,8 @@
 namespace dssm::daemon {
 namespace {
 
+constexpr SampleSender::Haste kAtOnce{SampleSender::kSliceBytes, true};
+
 // As many bytes as the network carries in that time, when it carries so many each second.
 std::size_t bytes_in(Duration time, std::uint64_t carried_per_s) noexcept {
   return static_cast<std::size_t>(std::chrono::duration<double>(time).count() *
@@ -51,8 +53,11 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
     Tid sent_up_to = chosen() + 1;
+    const std::uint64_t sent_before = connection_.sent_bytes();
     if (under_way_) {
-      status = sender_.go_on();
+      const SampleSender::Haste haste = only_under_way ? kAtOnce : haste_now();
+      if (haste.most_bytes == 0) return wait_for_pace();
+      status = sender_.go_on(haste);
       bytes += SampleSender::kSliceBytes;
     } else if (only_under_way) {
       break;
@@ -64,21 +69,30 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       if (!connection_.output_empty()) return PumpWait::output;
       if (next == Next::wait_for_sample) return PumpWait::sample;
       if (next == Next::wait_for_time) return PumpWait::time;
+      const SampleSender::Haste haste = haste_now();
+      if (haste.most_bytes == 0) {
+        sender_.end_run();
+        return wait_for_pace();
+      }
       const Tid last = last_of_run();
       observer_.before_samples();
       if (!connection_.output_empty()) return PumpWait::output;
       const Tid at = chosen();
       if (sender_.sends_in_place()) {
         sent_up_to = at + 1;
-        status = sender_.send(at, 0, at < last);
+        status = sender_.send(at, 0, at < last, haste);
         bytes += std::min(payload_bytes_, SampleSender::kSliceBytes);
       } else {
         // The writer continues meanwhile: the newest sample may not be the newest any more.
-        const Tid at_most = at + (thins() ? 1 : kSamplesPerTurn - samples) - 1;
+        const std::size_t fit = haste.most_bytes / (payload_bytes_ + kHeaderBytes);
+        const Tid at_most =
+            at + std::clamp<Tid>(static_cast<Tid>(fit), 1, thins() ? 1 : kSamplesPerTurn - samples) -
+            1;
         status = sender_.send_many(at, std::min(last, at_most), sent_up_to);
         bytes += static_cast<std::size_t>(sent_up_to - at) * payload_bytes_;
       }
     }
+    if (fills_) connection_.on_history_sent(sent_before, status == SendStatus::blocked);
     Tid& at = chosen();
     under_way_ = sender_.busy();
     switch (status) {
@@ -184,6 +198,17 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   sender_.end_run();
   observer_.on_end();
   return Next::end;
+}
+
+// Of the sample that is sent, or is to be sent next. New ones do not wait for the pace.
+[[gnu::hot]] SampleSender::Haste SamplePump::haste_now() {
+  if (!fills_ || next_ <= std::min(newest_untrusted(reader_), last_)) return kAtOnce;
+  return {connection_.history_allowance(), false};
+}
+
+PumpWait SamplePump::wait_for_pace() noexcept {
+  due_ = connection_.history_due();
+  return PumpWait::pace;
 }
 
 // Of those that are sent one after the other.

@@ -34,6 +34,7 @@ Tid newest_untrusted(const ring::RingReader& reader) noexcept;
 enum class PumpWait : std::uint8_t {
   sample,  // a sample newer than known()
   output,  // on_output_empty() of the connection
+  pace,    // a sample newer than known(), or due(): history has its pace
   turn,    // the next turn, after others had theirs
   time,    // due() comes
   ended,   // nothing: it has ended
@@ -116,6 +117,8 @@ class SamplePump {
   Next choose_newest_first(MonoTime now);
   // The sample that is sent, or is to be sent next.
   Tid& chosen() noexcept { return fills_ ? back_fill_.begin : next_; }
+  SampleSender::Haste haste_now();
+  PumpWait wait_for_pace() noexcept;
   Tid last_of_run() const noexcept;
   Tid first_within(std::size_t bytes, ring::TidRange range) const noexcept;
   bool takes_long(ring::TidRange samples) const noexcept;

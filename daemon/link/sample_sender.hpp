@@ -61,6 +61,12 @@ class SampleSender {
     MemoryBudget* budget = nullptr;  // charged for what is copied aside; outlives the sender
   };
 
+  // Of a payload that is sent in place.
+  struct Haste {
+    std::size_t most_bytes;  // at once
+    bool may_copy;           // else what the socket does not take waits in the slot, for the pace
+  };
+
   struct Counters {
     std::uint64_t samples = 0;
     std::uint64_t torn = 0;
@@ -78,7 +84,8 @@ class SampleSender {
 
   // Sends sample `tid`; `serial` as in Frame. After `blocked` or `unfinished` with busy(): go_on().
   //   more_follow  the next one is in the ring already
-  SendStatus send(Tid tid, std::uint64_t serial, bool more_follow);
+  SendStatus send(Tid tid, std::uint64_t serial, bool more_follow,
+                  const Haste& haste = {kSliceBytes, true});
 
   // Small payloads only: sends samples from `first` to at most `last`. Sets `next` to the tid after
   // the last one that is sent or queued; the status is about the sample `next`, when it is not
@@ -87,7 +94,7 @@ class SampleSender {
 
   // Whether a sample is begun and not complete; no other may be begun then.
   bool busy() const noexcept { return busy_; }
-  SendStatus go_on();
+  SendStatus go_on(const Haste& haste = {kSliceBytes, true});
 
   // After a run of samples, before returning to the loop or sending another frame: sends the bytes
   // that were kept to go out with the next sample.
@@ -97,8 +104,8 @@ class SampleSender {
 
  private:
   SendStatus send_copy(Tid tid, std::uint64_t serial);
-  SendStatus begin_in_place(const SampleInfo& info, std::uint64_t serial);
-  SendStatus send_slice();
+  SendStatus begin_in_place(const SampleInfo& info, std::uint64_t serial, const Haste& haste);
+  SendStatus send_slice(const Haste& haste);
   bool begin_copying();
   SendStatus copy_slice();
   SendStatus end_copying();

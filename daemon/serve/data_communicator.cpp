@@ -49,6 +49,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
           })),
       peer_timeout_(EventSource::timer(parts.loop, [this] { check_peer_timeout(); })) {
   link_.set_budget(place_.budget());
+  link_.set_pace(place_.pace());
   greeting_timeout_.enable_in(wire::kHelloTimeout);
 }
 

@@ -13,6 +13,7 @@
 
 #include "core/wire/address.hpp"
 #include "daemon/base/memory_budget.hpp"
+#include "daemon/link/history_pace.hpp"
 
 namespace dssm::daemon {
 
@@ -22,6 +23,7 @@ struct PeerAccount {
       : address(std::move(its_address)), budget(memory_bytes) {}
   std::string address;  // "10.0.0.2", without port
   MemoryBudget budget;
+  HistoryPace pace;
   std::uint64_t connections = 0;
 };
 
@@ -35,6 +37,7 @@ class PeerPlace {
   ~PeerPlace();
 
   MemoryBudget& budget() const noexcept { return account_->budget; }
+  HistoryPace& pace() const noexcept { return account_->pace; }
 
  private:
   friend class PeerTable;

@@ -153,8 +153,11 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
   const MonoTime now = pump_->thins() ? parts_.loop.now() : parts_.loop.coarse_now();
   feed_->forget(*this);
   Result<PumpWait> wait = pump_->pump(now, request_waits);
-  for (int checks = 0; wait && *wait == PumpWait::sample; ++checks) {
-    if (feed_->wait(*this, pump_->known())) return {};
+  for (int checks = 0; wait && (*wait == PumpWait::sample || *wait == PumpWait::pace); ++checks) {
+    if (feed_->wait(*this, pump_->known())) {
+      if (*wait == PumpWait::pace) due_.enable_in(pump_->due() - parts_.loop.now());
+      return {};
+    }
     // One came between the check and the arming of the doorbell.
     wait = checks < kMaxChecks ? pump_->pump(now) : Result(PumpWait::turn);
   }
@@ -162,6 +165,7 @@ Tid StreamChannel::first_tid(const net::Subscribe& request) const {
     return std::move(wait).error().context("send samples of '" + stream().id().str() + "'");
   switch (*wait) {
     case PumpWait::sample:
+    case PumpWait::pace:
       break;
     case PumpWait::time:
       due_.enable_in(pump_->due() - now);

@@ -60,6 +60,7 @@ class MemoryPeer {
   std::optional<Time> arrived;  // what dssmd gets as the time of its input, once it asks for it
   std::size_t sends = 0;        // that took bytes
   std::optional<std::uint64_t> carried_per_s;
+  std::optional<wire::Progress> progress;
   std::size_t unsent_limit = 0;  // that dssmd set
   bool closed = false;           // by dssmd
 
@@ -132,6 +133,7 @@ class MemoryTransport final : public wire::Transport {
   std::optional<std::uint64_t> carried_per_s() const noexcept override {
     return peer_.carried_per_s;
   }
+  std::optional<wire::Progress> progress() const noexcept override { return peer_.progress; }
 
   int fd() const noexcept override { return fd_.get(); }
 

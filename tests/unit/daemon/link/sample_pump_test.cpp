@@ -15,6 +15,7 @@ namespace dssm::daemon {
 namespace {
 
 using namespace test;
+using namespace std::chrono_literals;
 
 constexpr std::size_t kSmall = 40;
 constexpr std::size_t kMiddle = SampleSender::kInPlaceBytes;
@@ -27,8 +28,9 @@ Time time_of(Tid tid) { return time_from_ns(1'000'000 + tid * 1000); }
 class PumpRig final : private FrameConnection::Observer, private SamplePump::Observer {
  public:
   PumpRig(std::size_t payload_bytes, std::uint64_t depth, bool may_tear = true,
-          std::uint64_t budget_bytes = 1U << 30)
-      : ring(payload_bytes, depth),
+          std::uint64_t budget_bytes = 1U << 30, TimerQueue::Time time = TimerQueue::Time::real)
+      : loop(*EventLoop::open(time)),
+        ring(payload_bytes, depth),
         payload_bytes_(payload_bytes),
         budget(budget_bytes),
         link(loop, std::make_unique<MemoryTransport>(peer), *this, 1U << 20),
@@ -97,7 +99,7 @@ class PumpRig final : private FrameConnection::Observer, private SamplePump::Obs
     return torn;
   }
 
-  EventLoop loop = *EventLoop::open();
+  EventLoop loop;
   MemoryPeer peer;
   ring::TestRing ring;
   std::size_t payload_bytes_;
@@ -683,6 +685,82 @@ TEST_F(NewestFirst, TheEndOfAStreamComesAfterAllOfIt) {
   EXPECT_EQ(rig.run_on(), PumpWait::ended);
   EXPECT_EQ(rig.accepted().size(), 5u);
   EXPECT_EQ(rig.ends, 1);
+}
+
+// Three samples of 328 KB, and a network that was found to carry 1 MB/s.
+class PacedHistory : public testing::Test {
+ public:
+  PacedHistory() {
+    rig.newest_first = true;
+    rig.write(3);
+    rig.link.set_pace(pace);
+    rig.peer.progress.emplace();
+    MemoryTransport transport(rig.peer);
+    for (const Duration ms : {60ms, 50ms, 40ms, 30ms, 0ms}) {
+      rig.peer.progress->acknowledged_bytes = static_cast<std::uint64_t>((60ms - ms) / 1us);
+      pace.allowance(rig.loop.now() - ms, {this, 0, transport});
+    }
+    SamplePump::Plan plan{0, 2, 0};
+    plan.newest_first = true;
+    rig.start(plan);
+  }
+  void pass(Duration time) {
+    bool is_over = false;
+    EventSource timer = EventSource::timer(rig.loop, [&] { is_over = true; });
+    timer.enable_in(time);
+    run_until(rig.loop, [&] { return is_over; });
+  }
+
+  HistoryPace pace;
+  PumpRig rig{5 * kLarge, 8, true, 1U << 30, TimerQueue::Time::simulated};
+};
+
+TEST_F(PacedHistory, FollowsTheNewestSampleInPieces) {
+  EXPECT_EQ(rig.run_on(), PumpWait::pace);
+  EXPECT_EQ(rig.accepted(), (std::vector<Tid>{2})) << "at once";
+  EXPECT_GT(rig.pump->due(), rig.loop.now());
+  const std::size_t before = rig.peer.sent.size();
+  for (int i = 0; i < 100; ++i) {
+    pass(rig.pump->due() - rig.loop.now());
+    ASSERT_EQ(rig.run_on(), PumpWait::pace);
+  }
+  EXPECT_GT(rig.peer.sent.size() - before, 100 * HistoryPace::kMinPieceBytes / 2);
+  rig.write();
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  EXPECT_EQ(rig.accepted(), (std::vector<Tid>{2, 1, 0, 3}));
+}
+
+TEST_F(PacedHistory, LetsNewSamplesPassAtOnce) {
+  EXPECT_EQ(rig.run_on(), PumpWait::pace);
+  do {
+    pass(rig.pump->due() - rig.loop.now());
+    ASSERT_EQ(rig.run_on(), PumpWait::pace);
+  } while (!rig.sender.busy());
+  rig.write();
+  EXPECT_EQ(rig.run_on(), PumpWait::pace);
+  EXPECT_EQ(rig.accepted(), (std::vector<Tid>{2, 1, 3})) << "also what was under way";
+}
+
+TEST_F(PacedHistory, LetsAnotherUserOfTheConnectionSend) {
+  EXPECT_EQ(rig.run_on(), PumpWait::pace);
+  do {
+    pass(rig.pump->due() - rig.loop.now());
+    ASSERT_EQ(rig.run_on(), PumpWait::pace);
+  } while (!rig.sender.busy());
+  for (int turns = 0; turns < 2; ++turns) EXPECT_TRUE(rig.pump->pump(kStart, true));
+  EXPECT_FALSE(rig.sender.busy());
+}
+
+TEST_F(PacedHistory, WaitsInItsSlotForTheSocket) {
+  EXPECT_EQ(rig.run_on(), PumpWait::pace);
+  pass(1s);
+  rig.peer.room = 100;
+  EXPECT_EQ(rig.run(), PumpWait::output);
+  EXPECT_TRUE(rig.link.output_empty()) << "a copy would be sent at once";
+  rig.peer.room = MemoryPeer::kAll;
+  rig.write();
+  EXPECT_EQ(rig.run_on(), PumpWait::pace);
+  EXPECT_EQ(rig.accepted(), (std::vector<Tid>{2, 1, 3}));
 }
 
 TEST(NewestFirstSmall, AFewSmallSamplesKeepTheirOrder) {

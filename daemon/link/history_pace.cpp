@@ -1,0 +1,119 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/link/history_pace.hpp"
+
+#include <algorithm>
+#include <cmath>
+#include <optional>
+#include <utility>
+
+namespace dssm::daemon {
+namespace {
+
+double seconds(Duration duration) { return std::chrono::duration<double>(duration).count(); }
+
+}  // namespace
+
+std::size_t HistoryPace::allowance(MonoTime now, const Connection& connection) {
+  if (state_ == State::paced) refill(now);
+  if (!is_valid(now)) {
+    measure(now, connection);
+  } else if (state_ == State::measuring && now >= window_.end) {
+    end_window(now, connection);
+  }
+  if (state_ != State::paced) return kUnlimited;
+  const double missing = piece_bytes() - tokens_;
+  if (missing <= 0) return static_cast<std::size_t>(tokens_);
+  due_ = now + Duration(std::llround(std::ceil(missing / (kShare * bytes_per_s_) * 1e9)));
+  return 0;
+}
+
+void HistoryPace::on_history(std::size_t bytes) noexcept {
+  history_bytes_ += bytes;
+  tokens_ -= static_cast<double>(bytes);
+}
+
+// A connection that is full for a moment waits for a PC that is busy.
+bool HistoryPace::is_valid(MonoTime now) noexcept {
+  if (state_ == State::unknown || state_ == State::measuring) return state_ != State::unknown;
+  if (now - measured_ >= kValid) return false;
+  if (now - period_begin_ < kPeriod) return true;
+  const bool is_too_full = seconds(full_for_) > kTooFull * seconds(now - period_begin_);
+  period_begin_ = now;
+  full_for_ = {};
+  return !is_too_full;
+}
+
+// --- measuring
+
+void HistoryPace::measure(MonoTime now, const Connection& connection) {
+  const std::optional<wire::Progress> progress = connection.transport.progress();
+  windows_ = flat_windows_ = 0;
+  last_bytes_per_s_ = 0;
+  if (!progress) return set_rate(now, kFastBytesPerS);
+  state_ = State::measuring;
+  begin_window(now, connection, *progress);
+}
+
+void HistoryPace::begin_window(MonoTime now, const Connection& connection,
+                               const wire::Progress& progress) {
+  const Duration length = std::max(kWindow, progress.round_trip);
+  window_ = {connection.id,
+             now,
+             now + (is_last_window() ? kLastWindows : 1) * length,
+             sent_bytes_,
+             connection.sent_bytes,
+             progress};
+}
+
+void HistoryPace::end_window(MonoTime now, const Connection& connection) {
+  if (window_.connection != connection.id) {
+    // The other one sends no more history.
+    if (now - window_.end > window_.end - window_.begin) measure(now, connection);
+    return;
+  }
+  const std::optional<wire::Progress> progress = connection.transport.progress();
+  if (!progress) return set_rate(now, kFastBytesPerS);
+  const wire::Progress& before = window_.progress;
+  const std::uint64_t by_others_bytes =
+      sent_bytes_ - window_.sent_bytes - (connection.sent_bytes - window_.sent_by_it_bytes);
+  const std::uint64_t bytes =
+      progress->acknowledged_bytes - before.acknowledged_bytes + by_others_bytes;
+  const double bytes_per_s = static_cast<double>(bytes) / seconds(now - window_.begin);
+  const bool is_receivers = 2 * (progress->waiting_for_peer - before.waiting_for_peer) >
+                            progress->sending - before.sending;
+  if (is_last_window()) return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s);
+  flat_windows_ = bytes_per_s < kGrows * last_bytes_per_s_ ? flat_windows_ + 1 : 0;
+  last_bytes_per_s_ = bytes_per_s;
+  ++windows_;
+  begin_window(now, connection, *progress);
+}
+
+void HistoryPace::set_rate(MonoTime now, double bytes_per_s) noexcept {
+  state_ = bytes_per_s < kFastBytesPerS ? State::paced : State::unlimited;
+  measured_ = refilled_ = period_begin_ = now;
+  is_full_ = false;
+  full_for_ = {};
+  bytes_per_s_ = std::max(bytes_per_s, 1.0);
+  live_bytes_ = sent_bytes_ - std::min(history_bytes_, sent_bytes_);
+  // What was sent while measuring still waits in the network.
+  tokens_ = -bytes_per_s_ * seconds(kDrain);
+}
+
+// --- paced
+
+double HistoryPace::piece_bytes() const noexcept {
+  return std::max(bytes_per_s_ * seconds(kPiece), static_cast<double>(kMinPieceBytes));
+}
+
+void HistoryPace::refill(MonoTime now) noexcept {
+  const std::uint64_t live_bytes = sent_bytes_ - std::min(history_bytes_, sent_bytes_);
+  const double carried = bytes_per_s_ * seconds(now - refilled_);
+  const auto by_live = static_cast<double>(live_bytes - live_bytes_);
+  tokens_ += std::max(kShare * carried - by_live, kLeastShare * carried);
+  tokens_ = std::min(tokens_, 3 * piece_bytes());
+  if (std::exchange(is_full_, false)) full_for_ += now - refilled_;
+  live_bytes_ = live_bytes;
+  refilled_ = now;
+}
+
+}  // namespace dssm::daemon

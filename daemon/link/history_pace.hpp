@@ -1,0 +1,95 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// How fast history is sent to one other host, over all connections to it: less than the network
+// carries, so that no queue grows in it in which new samples of any stream would wait. The idea is
+// LEDBAT's (RFC 6817), but nothing is judged by round trips, which vary between busy PCs by more
+// than a queue adds:
+//
+//   measuring  history is sent as fast as the connection takes it. Short windows until two in a
+//              row carry no more than the one before: TCP is up to speed, and buffers that let the
+//              first bytes pass faster are full. What the other host acknowledges in one more,
+//              kLastWindows times as long, is what the network carries
+//   paced      history gets kShare of that, without what live samples take of it, but at least
+//              kLeastShare. Measured again after kValid, and when a connection has not taken what
+//              it was allowed to for kTooFull of kPeriod
+//   unlimited  the network is fast, or the receiver is what limits
+//
+// The host's connections share one, in the loop's thread.
+#pragma once
+
+#include <cstddef>
+#include <cstdint>
+#include <dssm/time.hpp>
+#include <limits>
+
+#include "core/wire/transport.hpp"
+
+namespace dssm::daemon {
+
+class HistoryPace {
+ public:
+  static constexpr double kShare = 0.85, kLeastShare = 0.05;
+  static constexpr Duration kWindow = std::chrono::milliseconds(5);  // or the round trip
+  static constexpr Duration kDrain = std::chrono::milliseconds(10);  // after it
+  static constexpr double kGrows = 1.25;  // a window that carries so much more than the one before
+  static constexpr int kMaxWindows = 100, kLastWindows = 3;
+  static constexpr Duration kValid = std::chrono::seconds(10);
+  static constexpr Duration kPeriod = std::chrono::seconds(1);
+  static constexpr double kTooFull = 0.3;
+  static constexpr double kFastBytesPerS = 200e6;  // from here on the network counts as fast
+  // What is sent at once: what the network carries in that time.
+  static constexpr Duration kPiece = std::chrono::milliseconds(1);
+  static constexpr std::size_t kMinPieceBytes = 4U << 10;
+  static constexpr std::size_t kUnlimited = std::numeric_limits<std::size_t>::max();
+
+  // One of the connections, as it is now.
+  struct Connection {
+    const void* id;
+    std::uint64_t sent_bytes;  // since it began
+    const wire::Transport& transport;
+  };
+
+  // How many bytes of history may be sent over that connection now. 0: none before due().
+  std::size_t allowance(MonoTime now, const Connection& connection);
+  MonoTime due() const noexcept { return due_; }
+
+  // Of any kind, over any of the connections.
+  void on_sent(std::size_t bytes) noexcept { sent_bytes_ += bytes; }
+  // So much of it was history.
+  void on_history(std::size_t bytes) noexcept;
+  // The connection took less of the history than it was allowed to.
+  void on_full() noexcept { is_full_ = true; }
+
+ private:
+  enum class State : std::uint8_t { unknown, measuring, paced, unlimited };
+  struct Window {
+    const void* connection = nullptr;
+    MonoTime begin{}, end{};
+    std::uint64_t sent_bytes = 0, sent_by_it_bytes = 0;
+    wire::Progress progress;
+  };
+
+  void measure(MonoTime now, const Connection& connection);
+  void begin_window(MonoTime now, const Connection& connection, const wire::Progress& progress);
+  bool is_last_window() const noexcept { return flat_windows_ == 2 || windows_ == kMaxWindows; }
+  void end_window(MonoTime now, const Connection& connection);
+  void set_rate(MonoTime now, double bytes_per_s) noexcept;
+  void refill(MonoTime now) noexcept;
+  bool is_valid(MonoTime now) noexcept;
+  double piece_bytes() const noexcept;
+
+  State state_ = State::unknown;
+  MonoTime measured_{};  // the state is of then
+  Window window_;
+  int windows_ = 0, flat_windows_ = 0;
+  double last_bytes_per_s_ = 0, bytes_per_s_ = 0;
+  double tokens_ = 0;  // bytes of history that may be sent; < 0 after more
+  MonoTime refilled_{}, due_{};
+  std::uint64_t sent_bytes_ = 0, history_bytes_ = 0;  // since the beginning
+  std::uint64_t live_bytes_ = 0;                      // at the last refill
+  bool is_full_ = false;                              // since then
+  MonoTime period_begin_{};
+  Duration full_for_{};  // in this period
+};
+
+}  // namespace dssm::daemon

@@ -1,0 +1,183 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// How much history is sent over simulated networks: little less than they carry, without a queue,
+// and without what other streams need.
+#include "daemon/link/history_pace.hpp"
+
+#include <gtest/gtest.h>
+
+#include <algorithm>
+
+namespace dssm::daemon {
+namespace {
+
+using namespace std::chrono_literals;
+
+constexpr Duration kTick = 1ms;
+constexpr double kBufferBytes = 256 << 10;  // of a connection, in the kernel
+
+double per_tick(double bytes_per_s) {
+  return bytes_per_s * std::chrono::duration<double>(kTick).count();
+}
+
+// A network of some rate with a queue before it, and one connection that always has history.
+class Network final : public wire::Transport {
+ public:
+  Network(HistoryPace& pace, double bytes_per_s) : bytes_per_s(bytes_per_s), pace_(pace) {}
+
+  // Some time passes. Returns the bytes of history that were sent each second of it.
+  double run(Duration how_long) {
+    double history = 0;
+    for (const MonoTime end = now + how_long; now < end; now += kTick) history += tick();
+    return history / std::chrono::duration<double>(how_long).count();
+  }
+
+  MonoTime now{1000s};
+  double bytes_per_s;
+  double live_bytes_per_s = 0;           // of other connections
+  double most_per_tick = kBufferBytes;   // of TCP that is not up to speed yet
+  double queued_bytes = 0;
+  bool is_receivers = false;  // what limits
+  Duration round_trip = 100us;
+  bool knows = true;
+
+  std::optional<wire::Progress> progress() const noexcept override {
+    if (!knows) return std::nullopt;
+    return wire::Progress{static_cast<std::uint64_t>(acknowledged_), round_trip, sending_,
+                          is_receivers ? sending_ : Duration()};
+  }
+
+ private:
+  double tick() {
+    const double live = per_tick(live_bytes_per_s);
+    pace_.on_sent(static_cast<std::size_t>(live));
+    const std::size_t allowed = pace_.allowance(now, {this, sent_bytes_, *this});
+    const double room = std::min(std::max(0.0, kBufferBytes - queued_bytes), most_per_tick);
+    const double history = std::floor(std::min(room, static_cast<double>(allowed)));
+    if (allowed == 0) EXPECT_GT(pace_.due(), now);
+    sent_bytes_ += static_cast<std::uint64_t>(history);
+    pace_.on_sent(static_cast<std::size_t>(history));
+    pace_.on_history(static_cast<std::size_t>(history));
+    if (allowed != HistoryPace::kUnlimited && history < static_cast<double>(allowed)) {
+      pace_.on_full();
+    }
+    queued_bytes += history;
+    const double carried = std::min(queued_bytes, std::max(0.0, per_tick(bytes_per_s) - live));
+    queued_bytes -= carried;
+    acknowledged_ += carried;
+    if (queued_bytes + carried > 0) sending_ += kTick;
+    return history;
+  }
+
+  Result<wire::IoResult> send(std::span<const iovec>) override { return wire::IoResult{}; }
+  Result<wire::IoResult> receive(std::span<const iovec>) override { return wire::IoResult{}; }
+  int fd() const noexcept override { return -1; }
+
+  HistoryPace& pace_;
+  std::uint64_t sent_bytes_ = 0;
+  double acknowledged_ = 0;
+  Duration sending_{};
+};
+
+class EachRate : public testing::TestWithParam<double> {};
+INSTANTIATE_TEST_SUITE_P(, EachRate, testing::Values(1e6, 10e6, 110e6));
+
+TEST_P(EachRate, IsAlmostFilledAndHasNoQueue) {
+  HistoryPace pace;
+  Network network(pace, GetParam());
+  network.run(2s);
+  EXPECT_LT(network.queued_bytes, HistoryPace::kMinPieceBytes + 3 * per_tick(GetParam()));
+  const double history = network.run(2s);
+  EXPECT_GE(history, 0.95 * HistoryPace::kShare * GetParam());
+  EXPECT_LE(history, HistoryPace::kShare * GetParam() * 1.01);
+}
+
+TEST_P(EachRate, LeavesWhatLiveSamplesTake) {
+  HistoryPace pace;
+  Network network(pace, GetParam());
+  network.run(2s);
+  network.live_bytes_per_s = GetParam() / 2;
+  EXPECT_NEAR(network.run(2s), (HistoryPace::kShare - 0.5) * GetParam(), 0.02 * GetParam());
+  network.live_bytes_per_s = 0.9 * GetParam();
+  EXPECT_NEAR(network.run(2s), HistoryPace::kLeastShare * GetParam(), 0.02 * GetParam())
+      << "those who read one sample after the other do not wait for ever";
+}
+
+TEST(HistoryPace, CountsLiveSamplesThatPassWhileItMeasures) {
+  HistoryPace pace;
+  Network network(pace, 50e6);
+  network.live_bytes_per_s = 20e6;
+  network.run(1s);
+  EXPECT_NEAR(network.run(2s), HistoryPace::kShare * 50e6 - 20e6, 2e6);
+}
+
+TEST(HistoryPace, WaitsUntilTcpIsUpToSpeed) {
+  HistoryPace pace;
+  Network network(pace, 100e6);
+  network.round_trip = 20ms;
+  for (double most = 1000; most < 1e6; most *= 2) {
+    network.most_per_tick = most;
+    network.run(network.round_trip);
+  }
+  network.run(1s);
+  EXPECT_GE(network.run(1s), 0.9 * HistoryPace::kShare * 100e6);
+}
+
+TEST(HistoryPace, LeavesFastNetworksAlone) {
+  HistoryPace pace;
+  Network network(pace, 1.25 * HistoryPace::kFastBytesPerS);
+  network.most_per_tick = per_tick(network.bytes_per_s);
+  EXPECT_GE(network.run(1s), 0.99 * network.bytes_per_s);
+}
+
+TEST(HistoryPace, LeavesSlowReceiversAlone) {
+  HistoryPace pace;
+  Network network(pace, 20e6);
+  network.is_receivers = true;
+  network.run(1s);
+  EXPECT_GE(network.run(1s), 0.99 * network.bytes_per_s) << "no other stream waits for it";
+}
+
+TEST(HistoryPace, IsNoneWhereNothingIsKnown) {
+  HistoryPace pace;
+  Network network(pace, 20e6);
+  network.knows = false;
+  network.run(1s);
+  EXPECT_GE(network.run(1s), 0.99 * network.bytes_per_s);
+}
+
+TEST(HistoryPace, FollowsANetworkThatBecomesSlowerOrFaster) {
+  HistoryPace pace;
+  Network network(pace, 40e6);
+  network.run(1s);
+  network.bytes_per_s = 10e6;
+  network.run(2 * HistoryPace::kPeriod);
+  EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 10e6, 1e6);
+  network.bytes_per_s = 40e6;
+  network.run(HistoryPace::kValid);
+  EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 40e6, 2e6);
+}
+
+TEST(HistoryPace, ForgivesAPause) {
+  HistoryPace pace;
+  Network network(pace, 40e6);
+  network.run(1s);
+  network.bytes_per_s = 0;
+  network.run(HistoryPace::kPeriod / 5);
+  network.bytes_per_s = 40e6;
+  network.run(HistoryPace::kPeriod);
+  EXPECT_LT(network.queued_bytes, 4 * per_tick(40e6));
+  EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 40e6, 1e6);
+}
+
+TEST(HistoryPace, IsMeasuredByAnotherConnectionWhenTheFirstOneHasNoMore) {
+  HistoryPace pace;
+  Network first(pace, 10e6), second(pace, 10e6);
+  first.run(5ms);
+  second.now = first.now;
+  second.run(1s);
+  EXPECT_NEAR(second.run(1s), HistoryPace::kShare * 10e6, 1e6);
+}
+
+}  // namespace
+}  // namespace dssm::daemon
