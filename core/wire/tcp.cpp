@@ -127,8 +127,13 @@ class TcpTransport final : public Transport {
     using std::chrono::microseconds;
     const std::optional<tcp_info> info = state();
     if (!info) return std::nullopt;
-    return Progress{info->tcpi_bytes_acked, microseconds(info->tcpi_min_rtt),
-                    microseconds(info->tcpi_busy_time), microseconds(info->tcpi_rwnd_limited)};
+    const std::uint64_t unacknowledged = std::uint64_t{info->tcpi_unacked} * info->tcpi_snd_mss;
+    return Progress{info->tcpi_delivered,
+                    info->tcpi_snd_mss,
+                    info->tcpi_notsent_bytes + unacknowledged,
+                    microseconds(info->tcpi_min_rtt),
+                    microseconds(info->tcpi_busy_time),
+                    microseconds(info->tcpi_rwnd_limited)};
   }
 
   int fd() const noexcept override { return socket_.get(); }

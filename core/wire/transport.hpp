@@ -56,10 +56,13 @@ struct IoResult {
 // Which end of the connection a transport is.
 enum class TransportEnd : unsigned char { connected, accepted };
 
-// What became of the bytes that were sent, since the connection began.
+// What became of the bytes that were sent.
 struct Progress {
-  std::uint64_t acknowledged_bytes = 0;
-  Duration round_trip{};        // the least of late
+  std::uint32_t delivered_packets = 0;  // since the connection began; may begin anew at 0
+  std::uint32_t packet_bytes = 0;
+  std::uint64_t waiting_bytes = 0;  // not sent, or not acknowledged
+  Duration round_trip{};            // the least of late
+  // Since the connection began:
   Duration sending{};           // so long some were on their way or waited to be sent
   Duration waiting_for_peer{};  // and so long of that the receiver took no more
 };

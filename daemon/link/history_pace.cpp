@@ -35,7 +35,7 @@ void HistoryPace::on_history(std::size_t bytes) noexcept {
 // A connection that is full for a moment waits for a PC that is busy.
 bool HistoryPace::is_valid(MonoTime now) noexcept {
   if (state_ == State::unknown || state_ == State::measuring) return state_ != State::unknown;
-  if (now - measured_ >= kValid) return false;
+  if (now >= valid_until_) return false;
   if (now - period_begin_ < kPeriod) return true;
   const bool is_too_full = seconds(full_for_) > kTooFull * seconds(now - period_begin_);
   period_begin_ = now;
@@ -47,9 +47,10 @@ bool HistoryPace::is_valid(MonoTime now) noexcept {
 
 void HistoryPace::measure(MonoTime now, const Connection& connection) {
   const std::optional<wire::Progress> progress = connection.transport.progress();
+  begun_ = now;
   windows_ = flat_windows_ = 0;
   last_bytes_per_s_ = 0;
-  if (!progress) return set_rate(now, kFastBytesPerS);
+  if (!progress) return set_rate(now, kFastBytesPerS, 0);
   state_ = State::measuring;
   begin_window(now, connection, *progress);
 }
@@ -72,31 +73,38 @@ void HistoryPace::end_window(MonoTime now, const Connection& connection) {
     return;
   }
   const std::optional<wire::Progress> progress = connection.transport.progress();
-  if (!progress) return set_rate(now, kFastBytesPerS);
+  if (!progress) return set_rate(now, kFastBytesPerS, 0);
   const wire::Progress& before = window_.progress;
   const std::uint64_t by_others_bytes =
       sent_bytes_ - window_.sent_bytes - (connection.sent_bytes - window_.sent_by_it_bytes);
-  const std::uint64_t bytes =
-      progress->acknowledged_bytes - before.acknowledged_bytes + by_others_bytes;
-  const double bytes_per_s = static_cast<double>(bytes) / seconds(now - window_.begin);
+  const std::uint32_t packets = progress->delivered_packets - before.delivered_packets;
+  const std::uint64_t bytes = std::uint64_t{packets} * progress->packet_bytes + by_others_bytes;
+  const Duration length = now - window_.begin;
+  const std::uint64_t enough = (is_last_window() ? kLastWindows : 1) * kWindowBytes;
+  if (bytes < enough && length < kMaxWindow) return;
+  const double bytes_per_s = static_cast<double>(bytes) / seconds(length);
   const bool is_receivers = 2 * (progress->waiting_for_peer - before.waiting_for_peer) >
                             progress->sending - before.sending;
-  if (is_last_window()) return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s);
+  if (is_last_window()) {
+    return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s, progress->waiting_bytes);
+  }
   flat_windows_ = bytes_per_s < kGrows * last_bytes_per_s_ ? flat_windows_ + 1 : 0;
   last_bytes_per_s_ = bytes_per_s;
   ++windows_;
   begin_window(now, connection, *progress);
 }
 
-void HistoryPace::set_rate(MonoTime now, double bytes_per_s) noexcept {
+void HistoryPace::set_rate(MonoTime now, double bytes_per_s,
+                           std::uint64_t waiting_bytes) noexcept {
   state_ = bytes_per_s < kFastBytesPerS ? State::paced : State::unlimited;
-  measured_ = refilled_ = period_begin_ = now;
+  valid_until_ = now + std::clamp(kValidTimes * (now - begun_), kMinValid, kMaxValid);
+  refilled_ = period_begin_ = now;
   is_full_ = false;
   full_for_ = {};
   bytes_per_s_ = std::max(bytes_per_s, 1.0);
   live_bytes_ = sent_bytes_ - std::min(history_bytes_, sent_bytes_);
-  // What was sent while measuring still waits in the network.
-  tokens_ = -bytes_per_s_ * seconds(kDrain);
+  // What was sent while measuring still waits, partly in the network.
+  tokens_ = -static_cast<double>(waiting_bytes);
 }
 
 // --- paced

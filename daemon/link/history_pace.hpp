@@ -7,10 +7,10 @@
 //
 //   measuring  history is sent as fast as the connection takes it. Short windows until two in a
 //              row carry no more than the one before: TCP is up to speed, and buffers that let the
-//              first bytes pass faster are full. What the other host acknowledges in one more,
+//              first bytes pass faster are full. What is delivered in one more,
 //              kLastWindows times as long, is what the network carries
 //   paced      history gets kShare of that, without what live samples take of it, but at least
-//              kLeastShare. Measured again after kValid, and when a connection has not taken what
+//              kLeastShare. Measured again after kMinValid or more, and when a connection has not taken what
 //              it was allowed to for kTooFull of kPeriod
 //   unlimited  the network is fast, or the receiver is what limits
 //
@@ -29,11 +29,16 @@ namespace dssm::daemon {
 class HistoryPace {
  public:
   static constexpr double kShare = 0.85, kLeastShare = 0.05;
-  static constexpr Duration kWindow = std::chrono::milliseconds(5);  // or the round trip
-  static constexpr Duration kDrain = std::chrono::milliseconds(10);  // after it
+  // At least, and at least the round trip, and until so much is acknowledged: TCP repairs losses in
+  // between. But not longer than kMaxWindow.
+  static constexpr Duration kWindow = std::chrono::milliseconds(5);
+  static constexpr std::uint64_t kWindowBytes = 64U << 10;
+  static constexpr Duration kMaxWindow = std::chrono::seconds(1);
   static constexpr double kGrows = 1.25;  // a window that carries so much more than the one before
   static constexpr int kMaxWindows = 100, kLastWindows = 3;
-  static constexpr Duration kValid = std::chrono::seconds(10);
+  // So many times as long as it took to measure.
+  static constexpr int kValidTimes = 200;
+  static constexpr Duration kMinValid = std::chrono::seconds(10), kMaxValid = std::chrono::minutes(1);
   static constexpr Duration kPeriod = std::chrono::seconds(1);
   static constexpr double kTooFull = 0.3;
   static constexpr double kFastBytesPerS = 200e6;  // from here on the network counts as fast
@@ -73,13 +78,14 @@ class HistoryPace {
   void begin_window(MonoTime now, const Connection& connection, const wire::Progress& progress);
   bool is_last_window() const noexcept { return flat_windows_ == 2 || windows_ == kMaxWindows; }
   void end_window(MonoTime now, const Connection& connection);
-  void set_rate(MonoTime now, double bytes_per_s) noexcept;
+  void set_rate(MonoTime now, double bytes_per_s, std::uint64_t waiting_bytes) noexcept;
   void refill(MonoTime now) noexcept;
   bool is_valid(MonoTime now) noexcept;
   double piece_bytes() const noexcept;
 
   State state_ = State::unknown;
-  MonoTime measured_{};  // the state is of then
+  MonoTime begun_{};        // when measuring was
+  MonoTime valid_until_{};  // what was found
   Window window_;
   int windows_ = 0, flat_windows_ = 0;
   double last_bytes_per_s_ = 0, bytes_per_s_ = 0;

@@ -190,6 +190,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     back_fill_ = {std::min(first_within(kInOrderBytes, range), range.end - 1), range.end};
     range.end = back_fill_.begin;
     if (range.count() == 0) passed_over_.pop_back();
+    limit_unsent_by_network();
   }
   if (back_fill_.count() > 0) return Next::ready;
   fills_ = false;
@@ -248,9 +249,7 @@ void SamplePump::pass_over(Tid next, MonoTime now) {
   back_fill_ = {};
   passed_over_.push_back({next_, next});
   next_ = next;
-  if (const std::optional<std::uint64_t> carried = connection_.carried_per_s()) {
-    limit_unsent(std::clamp(bytes_in(kUnsentFor, *carried), kMinUnsentBytes, kUnsentBytes));
-  }
+  limit_unsent_by_network();
   if (passed_over_since_ == 0) {
     behind_from_ = has_kept_up_ ? passed_over_.back().begin : next;  // history is no overload
   }
@@ -276,6 +275,12 @@ void SamplePump::give_up_what_is_never_carried(MonoTime now) {
     for (auto range = first; range != passed_over_.end(); ++range) lose(*range);
     passed_over_.erase(first, passed_over_.end());
     waiting_before_ = 0;
+  }
+}
+
+void SamplePump::limit_unsent_by_network() {
+  if (const std::optional<std::uint64_t> carried = connection_.carried_per_s()) {
+    limit_unsent(std::clamp(bytes_in(kUnsentFor, *carried), kMinUnsentBytes, kUnsentBytes));
   }
 }
 

@@ -125,6 +125,7 @@ class SamplePump {
   void pass_over(Tid next, MonoTime now);
   void give_up_what_is_never_carried(MonoTime now);
   void limit_unsent(std::size_t bytes);
+  void limit_unsent_by_network();
   void lose_passed_over(Tid before);
   void lose_up_to(Tid next);
   void lose(ring::TidRange range);

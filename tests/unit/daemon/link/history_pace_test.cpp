@@ -43,7 +43,12 @@ class Network final : public wire::Transport {
 
   std::optional<wire::Progress> progress() const noexcept override {
     if (!knows) return std::nullopt;
-    return wire::Progress{static_cast<std::uint64_t>(acknowledged_), round_trip, sending_,
+    constexpr std::uint32_t kPacketBytes = 1000;
+    return wire::Progress{static_cast<std::uint32_t>(delivered_bytes_ / kPacketBytes),
+                          kPacketBytes,
+                          static_cast<std::uint64_t>(queued_bytes),
+                          round_trip,
+                          sending_,
                           is_receivers ? sending_ : Duration()};
   }
 
@@ -64,7 +69,7 @@ class Network final : public wire::Transport {
     queued_bytes += history;
     const double carried = std::min(queued_bytes, std::max(0.0, per_tick(bytes_per_s) - live));
     queued_bytes -= carried;
-    acknowledged_ += carried;
+    delivered_bytes_ += carried;
     if (queued_bytes + carried > 0) sending_ += kTick;
     return history;
   }
@@ -75,7 +80,7 @@ class Network final : public wire::Transport {
 
   HistoryPace& pace_;
   std::uint64_t sent_bytes_ = 0;
-  double acknowledged_ = 0;
+  double delivered_bytes_ = 0;
   Duration sending_{};
 };
 
@@ -154,7 +159,7 @@ TEST(HistoryPace, FollowsANetworkThatBecomesSlowerOrFaster) {
   network.run(2 * HistoryPace::kPeriod);
   EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 10e6, 1e6);
   network.bytes_per_s = 40e6;
-  network.run(HistoryPace::kValid);
+  network.run(HistoryPace::kMinValid);
   EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 40e6, 2e6);
 }
 

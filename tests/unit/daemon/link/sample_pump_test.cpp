@@ -694,11 +694,11 @@ class PacedHistory : public testing::Test {
     rig.newest_first = true;
     rig.write(3);
     rig.link.set_pace(pace);
-    rig.peer.progress.emplace();
+    rig.peer.progress.emplace().packet_bytes = 1000;
     MemoryTransport transport(rig.peer);
-    for (const Duration ms : {60ms, 50ms, 40ms, 30ms, 0ms}) {
-      rig.peer.progress->acknowledged_bytes = static_cast<std::uint64_t>((60ms - ms) / 1us);
-      pace.allowance(rig.loop.now() - ms, {this, 0, transport});
+    for (const Duration ago : {410ms, 340ms, 270ms, 200ms, 0ms}) {
+      rig.peer.progress->delivered_packets = static_cast<std::uint32_t>((410ms - ago) / 1ms);
+      pace.allowance(rig.loop.now() - ago, {this, 0, transport});
     }
     SamplePump::Plan plan{0, 2, 0};
     plan.newest_first = true;
