@@ -184,14 +184,7 @@ struct OtherHosts {
         clock(loop, clock_options(config), std::move(page), own_clock, self.host_id, catalog,
               logger),
         resolver(loop),
-        parts{loop,
-              resolver,
-              registry,
-              logger,
-              self,
-              &clock,
-              config.mirror_linger,
-              config.mirror_history},
+        parts{loop, resolver, registry, logger, self, &clock, config.mirror_linger, config.mirrors},
         mirrors(parts, catalog),
         writers(parts, catalog),
         peers(loop, resolver, config.peers, self, catalog, logger),
@@ -324,10 +317,8 @@ class Dssmd {
     server_.set_max_clients(changed.max_clients);
     channels_.set_limits(peer_limits(changed));
     hosts_.parts.mirror_linger = changed.mirror_linger;
-    hosts_.parts.mirror_history = changed.mirror_history;
-    if (changed.mirror_history) {
-      hosts_.mirrors.for_each([](Mirror& mirror) { mirror.want_history(false); });
-    }
+    hosts_.parts.mirrors = changed.mirrors;
+    hosts_.mirrors.for_each([](Mirror& mirror) { mirror.on_new_demand(); });
     hosts_.peers.set_configured(changed.peers);
     hosts_.clock.set(changed.clocks, changed.max_drift);
   }

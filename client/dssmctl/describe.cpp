@@ -3,6 +3,8 @@
 
 #include <fmt/format.h>
 
+#include <cmath>
+
 #include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
@@ -28,6 +30,7 @@ Json mirror_json(const MirrorInfo& mirror) {
           {"history_wanted", mirror.history_wanted},
           {"recent_samples", mirror.recent_samples},
           {"recent_lost_samples", mirror.recent_lost_samples},
+          {"max_rate_hz", mirror.max_rate_hz > 0 ? Json(mirror.max_rate_hz) : Json()},
           {"reconnects", mirror.reconnects},
           {"restarts", mirror.restarts},
           {"clock", or_null(mirror.clock)},
@@ -133,16 +136,19 @@ void add_details(Json& json, const StreamInfo& stream) {
 // after the other.
 Duration behind_owner(const StreamInfo& stream) {
   constexpr Duration kOnItsWay = std::chrono::milliseconds(100);
-  if (!stream.mirror || stream.mirror->newest == kNoTid ||
-      stream.newest <= stream.mirror->newest) {
+  if (!stream.mirror || stream.mirror->newest == kNoTid || stream.newest <= stream.mirror->newest) {
     return {};
   }
   const Duration behind = saturating_sub(stream.newest_time, stream.mirror->newest_time);
-  return behind > 2 * stream.cycle + kOnItsWay ? behind : Duration();
+  const double rate_hz = stream.mirror->max_rate_hz;
+  const Duration between =
+      rate_hz > 0 ? std::max(stream.cycle, Duration(std::llround(1e9 / rate_hz))) : stream.cycle;
+  return behind > 2 * between + kOnItsWay ? behind : Duration();
 }
 
 std::string carried_text(const StreamInfo& stream) {
-  if (!stream.mirror || stream.mirror->recent_lost_samples == 0) return {};
+  const bool is_wanted = stream.mirror && stream.mirror->max_rate_hz > 0;
+  if (!stream.mirror || is_wanted || stream.mirror->recent_lost_samples == 0) return {};
   const double share = 1 - static_cast<double>(stream.mirror->recent_lost_samples) /
                                static_cast<double>(stream.mirror->recent_samples);
   return fmt::format("carries {:.3g} of {:.3g} samples a second", share * stream.rate_hz,

@@ -74,6 +74,12 @@ void print_mirror(const StreamInfo& stream, const MirrorInfo& mirror, Output& ou
   if (const std::string carried = carried_text(stream); !carried.empty()) {
     add_line(out, "network", carried + "; the others are missing");
   }
+  if (mirror.max_rate_hz > 0) {
+    add_line(
+        out, "takes",
+        fmt::format("at most {:g} samples a second (key mirror_streams); the others are missing",
+                    mirror.max_rate_hz));
+  }
   if (mirror.filling_samples > 0 && !mirror.history_wanted) {
     add_line(out, "history",
              fmt::format("{} samples are on its host only, until a program here reads them",

@@ -34,7 +34,8 @@ MirrorInfo mirror_info(const proto::Mirror& message) {
           message.filling_samples(),
           message.history_wanted(),
           message.recent_samples(),
-          message.recent_lost_samples()};
+          message.recent_lost_samples(),
+          message.max_rate_hz()};
 }
 
 }  // namespace

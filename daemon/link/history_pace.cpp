@@ -94,8 +94,7 @@ void HistoryPace::end_window(MonoTime now, const Connection& connection) {
   begin_window(now, connection, *progress);
 }
 
-void HistoryPace::set_rate(MonoTime now, double bytes_per_s,
-                           std::uint64_t waiting_bytes) noexcept {
+void HistoryPace::set_rate(MonoTime now, double bytes_per_s, std::uint64_t waiting_bytes) noexcept {
   state_ = bytes_per_s < kFastBytesPerS ? State::paced : State::unlimited;
   valid_until_ = now + std::clamp(kValidTimes * (now - begun_), kMinValid, kMaxValid);
   refilled_ = period_begin_ = now;

@@ -38,7 +38,8 @@ class HistoryPace {
   static constexpr int kMaxWindows = 100, kLastWindows = 3;
   // So many times as long as it took to measure.
   static constexpr int kValidTimes = 200;
-  static constexpr Duration kMinValid = std::chrono::seconds(10), kMaxValid = std::chrono::minutes(1);
+  static constexpr Duration kMinValid = std::chrono::seconds(10),
+                            kMaxValid = std::chrono::minutes(1);
   static constexpr Duration kPeriod = std::chrono::seconds(1);
   static constexpr double kTooFull = 0.3;
   static constexpr double kFastBytesPerS = 200e6;  // from here on the network counts as fast

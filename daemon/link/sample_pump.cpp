@@ -55,7 +55,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     Tid sent_up_to = chosen() + 1;
     const std::uint64_t sent_before = connection_.sent_bytes();
     if (under_way_) {
-      const SampleSender::Haste haste = only_under_way ? kAtOnce : haste_now();
+      const SampleSender::Haste haste = only_under_way ? kAtOnce : haste_now(now);
       if (haste.most_bytes == 0) return wait_for_pace();
       status = sender_.go_on(haste);
       bytes += SampleSender::kSliceBytes;
@@ -68,8 +68,11 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       // A frame that reports a gap, for example, may wait for the socket.
       if (!connection_.output_empty()) return PumpWait::output;
       if (next == Next::wait_for_sample) return PumpWait::sample;
-      if (next == Next::wait_for_time) return PumpWait::time;
-      const SampleSender::Haste haste = haste_now();
+      if (next == Next::wait_for_time) {
+        wake_at_ = due_;
+        return PumpWait::time;
+      }
+      const SampleSender::Haste haste = haste_now(now);
       if (haste.most_bytes == 0) {
         sender_.end_run();
         return wait_for_pace();
@@ -85,9 +88,10 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       } else {
         // The writer continues meanwhile: the newest sample may not be the newest any more.
         const std::size_t fit = haste.most_bytes / (payload_bytes_ + kHeaderBytes);
-        const Tid at_most =
-            at + std::clamp<Tid>(static_cast<Tid>(fit), 1, thins() ? 1 : kSamplesPerTurn - samples) -
-            1;
+        const Tid at_most = at +
+                            std::clamp<Tid>(static_cast<Tid>(fit), 1,
+                                            thins() && !fills_ ? 1 : kSamplesPerTurn - samples) -
+                            1;
         status = sender_.send_many(at, std::min(last, at_most), sent_up_to);
         bytes += static_cast<std::size_t>(sent_up_to - at) * payload_bytes_;
       }
@@ -107,7 +111,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       case SendStatus::not_in_ring:
         // Overwritten since choose_next(), or the slot holds invalid values.
         ++samples;
-        if (thins() || at < reader_.oldest()) break;
+        if ((thins() && !fills_) || at < reader_.oldest()) break;
         if (fills_) {
           lose({at, at + 1});
           back_fill_.begin = at + 1;
@@ -172,9 +176,13 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     sender_.end_run();
     observer_.on_caught_up();
   }
-  fills_ = next_ > newest;
+  fills_ = !has_due_sample(now, newest);
   if (!fills_) {
-    if (newest > next_ && takes_long({next_, newest + 1})) pass_over(newest, now);
+    if (thins()) {
+      if (newest > next_) lose_up_to(newest);
+    } else if (newest > next_ && takes_long({next_, newest + 1})) {
+      pass_over(newest, now);
+    }
     return Next::ready;
   }
   // What was sent last still waits for the socket, and pump() with it.
@@ -195,21 +203,28 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   if (back_fill_.count() > 0) return Next::ready;
   fills_ = false;
   limit_unsent(kUnsentBytes);
+  if (next_ <= newest) return Next::wait_for_time;
   if (next_ <= last_) return Next::wait_for_sample;
   sender_.end_run();
   observer_.on_end();
   return Next::end;
 }
 
+bool SamplePump::has_due_sample(MonoTime now, Tid newest) const noexcept {
+  return next_ <= newest && !(thins() && now < due_);
+}
+
 // Of the sample that is sent, or is to be sent next. New ones do not wait for the pace.
-[[gnu::hot]] SampleSender::Haste SamplePump::haste_now() {
-  if (!fills_ || next_ <= std::min(newest_untrusted(reader_), last_)) return kAtOnce;
+[[gnu::hot]] SampleSender::Haste SamplePump::haste_now(MonoTime now) {
+  if (!fills_ || has_due_sample(now, std::min(newest_untrusted(reader_), last_))) return kAtOnce;
   return {connection_.history_allowance(), false};
 }
 
 PumpWait SamplePump::wait_for_pace() noexcept {
-  due_ = connection_.history_due();
-  return PumpWait::pace;
+  wake_at_ = connection_.history_due();
+  if (next_ > std::min(newest_untrusted(reader_), last_)) return PumpWait::pace;
+  wake_at_ = std::min(wake_at_, due_);  // a sample waits for its time
+  return PumpWait::time;
 }
 
 // Of those that are sent one after the other.
@@ -314,7 +329,7 @@ void SamplePump::lose(ring::TidRange range) {
 }
 
 void SamplePump::after_sample(MonoTime now) {
-  if (!thins()) return;
+  if (!thins() || fills_) return;
   // From when it was due, so that the rate holds on the whole although timers come late.
   const Duration period = period_of(plan_.max_rate_hz);
   due_ = (now - due_ < period ? due_ : now) + period;

@@ -81,11 +81,11 @@ class SamplePump {
     Tid first = 0;  // >= 0; may lie before what the ring holds (a gap), or in the future
     Tid caught_up_at = kNoTid;
     // > 0: at most so many samples per second: the newest one at each time. What is left out is no
-    // gap. Above 1000 the loop's timers, which count milliseconds, make it less when samples come
+    // gap; with newest_first it is lost, and history comes as without a rate. Above 1000 the loop's timers, which count milliseconds, make it less when samples come
     // faster than that.
     double max_rate_hz = 0;
-    // Without max_rate_hz. Then no sample of `held` is sent, which the receiver has.
     bool newest_first = false;
+    // With newest_first: none of these is sent, the receiver has them.
     ring::TidRange held = {};
   };
 
@@ -108,7 +108,7 @@ class SamplePump {
 
   // The newest sample that was sent or lost; PumpWait::sample waits for a newer one.
   Tid known() const noexcept { return next_ - 1; }
-  MonoTime due() const noexcept { return due_; }
+  MonoTime due() const noexcept { return wake_at_; }
   std::uint64_t lost() const noexcept { return lost_; }
 
  private:
@@ -117,8 +117,9 @@ class SamplePump {
   Next choose_newest_first(MonoTime now);
   // The sample that is sent, or is to be sent next.
   Tid& chosen() noexcept { return fills_ ? back_fill_.begin : next_; }
-  SampleSender::Haste haste_now();
+  SampleSender::Haste haste_now(MonoTime now);
   PumpWait wait_for_pace() noexcept;
+  bool has_due_sample(MonoTime now, Tid newest) const noexcept;
   Tid last_of_run() const noexcept;
   Tid first_within(std::size_t bytes, ring::TidRange range) const noexcept;
   bool takes_long(ring::TidRange samples) const noexcept;
@@ -151,7 +152,8 @@ class SamplePump {
   std::size_t unsent_bytes_ = 0;  // the limit on what waits in the kernel
   bool under_way_ = false;        // the sender is busy with it
   bool caught_up_ = false;
-  MonoTime due_{};
+  MonoTime due_{};  // the next sample, with a rate
+  MonoTime wake_at_{};
   std::uint64_t lost_ = 0;
 };
 

@@ -56,6 +56,8 @@ void Mirror::subscribe() {
   with_history_ = wants_history() || !newest_first_;
   net::Subscribe request;
   ring_->resume(newest_first_, with_history_, request);
+  max_rate_hz_ = newest_first_ ? parts_.mirrors.demand_for(id_).max_rate_hz : 0;
+  request.set_max_rate_hz(max_rate_hz_);
   channel_.subscribe(request);
 }
 
@@ -68,13 +70,22 @@ Result<void> Mirror::on_subscribed_untrusted(Tid first, bool newest_first, Tid o
 }
 
 bool Mirror::wants_history() const noexcept {
-  return history_wanted_ || history_always_ || parts_.mirror_history;
+  return history_wanted_ || history_always_ || parts_.mirrors.demand_for(id_).history_at_once;
 }
 
 void Mirror::want_history(bool always) {
   history_always_ |= always;
   history_wanted_ = true;
   if (!with_history_ && channel_.reading() >= ChannelClient::Reading::filling) subscribe();
+}
+
+void Mirror::on_new_demand() {
+  const MirrorDemand demand = parts_.mirrors.demand_for(id_);
+  if (demand.history_at_once) want_history(false);
+  if (newest_first_ && demand.max_rate_hz != max_rate_hz_ &&
+      channel_.reading() >= ChannelClient::Reading::filling) {
+    subscribe();
+  }
 }
 
 Result<void> Mirror::on_caught_up() {
@@ -281,6 +292,7 @@ void Mirror::describe(proto::Mirror& out) const {
   const MirrorRing::Recent recent = ring_->recent();
   out.set_recent_samples(recent.samples);
   out.set_recent_lost_samples(recent.lost);
+  out.set_max_rate_hz(max_rate_hz_);
 }
 
 bool Mirror::describe_stream(proto::Stream& out) const {

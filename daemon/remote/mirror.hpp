@@ -43,6 +43,8 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   // Fetches what is missing in the ring, also after a reconnect, until that has come once.
   //   always  and from then on at once
   void want_history(bool always);
+  // ChannelParts::mirrors has changed.
+  void on_new_demand();
 
   void describe(proto::Mirror& out) const;
   // The stream as its ring here shows it. False: there is none yet.
@@ -91,7 +93,8 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   void assess_clock();
   void log_new_gap() {
     const std::uint64_t lost = ring_->gap_samples();
-    if (lost != logged_gap_) log_gap(lost - std::exchange(logged_gap_, lost));
+    const std::uint64_t before = std::exchange(logged_gap_, lost);
+    if (lost != before && max_rate_hz_ == 0) log_gap(lost - before);
   }
   bool wants_history() const noexcept;
   void subscribe();
@@ -100,7 +103,8 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
 
   bool newest_first_ = false;  // the owner has that feature
   bool history_wanted_ = false, history_always_ = false;
-  bool with_history_ = false;  // the present subscription
+  bool with_history_ = false;  // the present subscription, and
+  double max_rate_hz_ = 0;     // its rate; 0: all samples
   bool is_ending_ = false;     // live, but the catalog knows that this ring was removed
   MirrorClock clock_;
   bool in_batch_ = false;  // samples have come, and on_batch_end() has not

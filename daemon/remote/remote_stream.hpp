@@ -53,6 +53,7 @@
 #include "daemon/fleet/clock_assessor.hpp"
 #include "daemon/link/dialer.hpp"
 #include "daemon/link/resolver.hpp"
+#include "daemon/service/config_values.hpp"
 #include "daemon/streams/registry.hpp"
 #include "daemon/streams/stream.hpp"
 
@@ -68,8 +69,8 @@ struct ChannelParts {
   ClockAssessor* clock = nullptr;  // nullptr: the clock is not watched
   // How long a mirror stays after its last reader closed it. May change.
   Duration mirror_linger{};
-  // Whether mirrors fetch the owner's history before a program reads it. May change.
-  bool mirror_history = false;
+  // What mirrors ask of their owners. May change: Mirror::on_new_demand().
+  MirrorDemands mirrors = {};
   // Readers of this ring, a mirror's, shall reopen the stream: it has a new ring.
   std::function<void(const Stream&)> on_ring_replaced = {};
 };

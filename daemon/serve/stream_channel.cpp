@@ -104,7 +104,7 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
   subscribed.set_newest(newest);
   subscribed.set_oldest(std::clamp<Tid>(reader_.oldest(), 0, newest + 1));
   SamplePump::Plan plan{first, newest, request.max_rate_hz(), false, {}};
-  if (request.newest_first() && request.max_rate_hz() == 0) {
+  if (request.newest_first()) {
     plan.newest_first = true;
     if (request.incarnation() == stream().incarnation()) {
       plan.held = {request.held_from(), request.held_to()};

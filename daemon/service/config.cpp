@@ -224,10 +224,20 @@ constexpr ConfigKey kKeys[] = {
     {"mirror_history", "WHEN",
      "when the copy of another host's stream gets what was written before: when_read, or at_once; "
      "default: when_read",
-     ValueForm::text, kChangesAtOnce<&Config::mirror_history>,
+     ValueForm::text, kChangesAtOnce<&Config::mirrors>,
      [](Config& c, std::string_view text) {
-       return take(c.mirror_history, parse_mirror_history(text));
+       return take(c.mirrors.general.history_at_once, parse_mirror_history(text));
      }},
+    {"mirror_streams", "STREAM=WHAT",
+     "another time for some streams, or how many samples a second at most, e.g. 'map=at_once' or "
+     "'camera*=10 Hz'; may be repeated, the first that matches counts",
+     ValueForm::list, kChangesAtOnce<&Config::mirrors>,
+     [](Config& c, std::string_view text) -> Result<void> {
+       if (text.empty()) return {};
+       c.mirrors.exceptions.push_back(DSSM_TRY(parse_mirror_exception(text)));
+       return {};
+     },
+     [](Config& c) { c.mirrors.exceptions.clear(); }, "mirror-stream"},
     {"clock_policy", "POLICY",
      "what to do with streams of hosts whose clocks may be too far from this one's: enforce (not "
      "open them, and answer reads by time with an error), mark (flag their samples) or off; "

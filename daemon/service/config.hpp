@@ -58,7 +58,7 @@ struct Config {
   std::uint64_t max_connections_per_host = 128;
   std::uint64_t max_peer_memory_bytes = 96ULL << 20;
   Duration mirror_linger = std::chrono::seconds(5);
-  bool mirror_history = false;  // fetched at once, not when it is read
+  MirrorDemands mirrors;
 
   // Clocks.
   ClockPolicies clocks;

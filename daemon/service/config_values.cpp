@@ -25,6 +25,7 @@ constexpr Duration kMinClockLimit = std::chrono::microseconds(10);
 constexpr Duration kMaxClockLimit = std::chrono::seconds(10);
 constexpr std::size_t kMaxStreamPatternBytes = 63;
 constexpr std::uint64_t kMaxDriftPpm = 1000;
+constexpr std::uint64_t kMaxMirrorHz = 100'000;
 
 Error invalid(std::string why) { return Error{Errc::invalid_argument, std::move(why)}; }
 
@@ -56,15 +57,38 @@ Error out_of_range(std::string_view text, std::uint64_t min, std::uint64_t max,
   return invalid(fmt::format("{} is outside of {} to {}{}", in_quotes(text), min, max, unit));
 }
 
+bool matches(const std::string& pattern, const StreamId& id) {
+  const std::string full = fmt::format("{}:{}", id.name, id.id);
+  return !::fnmatch(pattern.c_str(), id.name.c_str(), 0) ||
+         !::fnmatch(pattern.c_str(), full.c_str(), 0);
+}
+
+// The pattern for streams before the last '='; returns what is wrong with it, or "".
+std::string take_pattern(std::string_view text, std::string& out) {
+  const std::size_t equals = text.rfind('=');
+  if (equals == text.npos) return "has no '='";
+  out = text.substr(0, equals);
+  if (out.empty()) return "names no stream";
+  if (out.size() > kMaxStreamPatternBytes) return "names a stream too long to be one";
+  if (out.find('\0') != std::string::npos) return "holds a zero byte";
+  return {};
+}
+
 }  // namespace
 
 ClockDemand ClockPolicies::demand_for(const StreamId& id) const {
-  const std::string full = fmt::format("{}:{}", id.name, id.id);
   for (const Exception& exception : exceptions) {
-    const char* pattern = exception.pattern.c_str();
-    if (::fnmatch(pattern, id.name.c_str(), 0) && ::fnmatch(pattern, full.c_str(), 0)) continue;
+    if (!matches(exception.pattern, id)) continue;
     return {exception.policy,
             exception.limit == Duration::zero() ? general.limit : exception.limit};
+  }
+  return general;
+}
+
+MirrorDemand MirrorDemands::demand_for(const StreamId& id) const {
+  for (const Exception& exception : exceptions) {
+    if (!matches(exception.pattern, id)) continue;
+    return {exception.history_at_once.value_or(general.history_at_once), exception.max_rate_hz};
   }
   return general;
 }
@@ -144,16 +168,10 @@ Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text) {
                              "\"gps=off\" or \"camera*=mark 5 ms\"",
                              in_quotes(text), why)};
   };
-  const std::size_t equals = text.rfind('=');
-  if (equals == text.npos) return wrong("has no '='");
   ClockPolicies::Exception exception;
-  exception.pattern = text.substr(0, equals);
-  if (exception.pattern.empty()) return wrong("names no stream");
-  if (exception.pattern.size() > kMaxStreamPatternBytes) {
-    return wrong("names a stream too long to be one");
-  }
-  if (exception.pattern.find('\0') != std::string::npos) return wrong("holds a zero byte");
-  const std::string_view demand = text.substr(equals + 1);
+  const std::string why = take_pattern(text, exception.pattern);
+  if (!why.empty()) return wrong(why);
+  const std::string_view demand = text.substr(exception.pattern.size() + 1);
   const std::size_t blank = std::min(demand.find(' '), demand.size());
   const Result<ClockPolicy> policy = parse_clock_policy(demand.substr(0, blank));
   if (!policy) return wrong("has a policy that is none: " + policy.error().message);
@@ -162,6 +180,36 @@ Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text) {
   const Result<Duration> limit = parse_clock_limit(demand.substr(blank + 1));
   if (!limit) return wrong("has a limit that is none: " + limit.error().message);
   exception.limit = *limit;
+  return exception;
+}
+
+Result<MirrorDemands::Exception> parse_mirror_exception(std::string_view text) {
+  const auto wrong = [&](const std::string& why) {
+    return Error{
+        Errc::invalid_argument,
+        fmt::format("{} {}; write \"STREAM=WHEN\", \"STREAM=RATE\" or \"STREAM=WHEN RATE\", "
+                    "such as \"map=at_once\" or \"camera*=10 Hz\"",
+                    in_quotes(text), why)};
+  };
+  MirrorDemands::Exception exception;
+  const std::string why = take_pattern(text, exception.pattern);
+  if (!why.empty()) return wrong(why);
+  std::string_view demand = text.substr(exception.pattern.size() + 1);
+  const std::size_t blank = std::min(demand.find(' '), demand.size());
+  if (const Result<bool> history = parse_mirror_history(demand.substr(0, blank))) {
+    exception.history_at_once = *history;
+    if (blank == demand.size()) return exception;
+    demand.remove_prefix(blank + 1);
+  }
+  const Result<Quantity> rate = parse_quantity(demand);
+  if (!rate) {
+    return wrong("states neither a rate nor when_read nor at_once: " + rate.error().message);
+  }
+  if (rate->unit != "Hz") return wrong("has a rate without the unit 'Hz'");
+  if (rate->number < 1 || rate->number > kMaxMirrorHz) {
+    return wrong(fmt::format("has a rate that is not from 1 to {} Hz", kMaxMirrorHz));
+  }
+  exception.max_rate_hz = static_cast<double>(rate->number);
   return exception;
 }
 

@@ -12,6 +12,7 @@
 #include <dssm/result.hpp>
 #include <dssm/stream.hpp>
 #include <dssm/time.hpp>
+#include <optional>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -49,6 +50,33 @@ struct ClockPolicies {
   friend bool operator==(const ClockPolicies& a, const ClockPolicies& b) = default;
 };
 
+// What mirrors ask of the owners of their streams: the configuration keys mirror_history and
+// mirror_streams.
+struct MirrorDemand {
+  bool history_at_once = false;  // else when a program reads it
+  double max_rate_hz = 0;        // 0: all samples
+
+  friend bool operator==(const MirrorDemand& a, const MirrorDemand& b) = default;
+};
+
+struct MirrorDemands {
+  // Another demand for some streams. The first that matches counts.
+  struct Exception {
+    std::string pattern;                  // as in ClockPolicies
+    std::optional<bool> history_at_once;  // nothing: as in general
+    double max_rate_hz = 0;
+
+    friend bool operator==(const Exception& a, const Exception& b) = default;
+  };
+
+  MirrorDemand general;
+  std::vector<Exception> exceptions;
+
+  MirrorDemand demand_for(const StreamId& id) const;
+
+  friend bool operator==(const MirrorDemands& a, const MirrorDemands& b) = default;
+};
+
 // A whole number from `min` to `max`.
 Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t min, std::uint64_t max);
 
@@ -69,6 +97,9 @@ Result<Duration> parse_clock_limit(std::string_view text);
 
 // "STREAM=POLICY", or "STREAM=POLICY LIMIT": "gps=off", "camera*=mark 5 ms".
 Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text);
+
+// "STREAM=WHEN", "STREAM=RATE" or "STREAM=WHEN RATE": "map=at_once", "camera*=10 Hz".
+Result<MirrorDemands::Exception> parse_mirror_exception(std::string_view text);
 
 // The drift of a clock: "50 ppm"; 1 to 1000. In billionths.
 Result<clock::PartsPerBillion> parse_drift(std::string_view text);

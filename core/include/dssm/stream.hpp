@@ -151,6 +151,9 @@ struct MirrorInfo {
   // lost.
   std::uint64_t recent_samples = 0;
   std::uint64_t recent_lost_samples = 0;
+  // So many samples a second it takes at most (dssmd's key mirror_streams), and those that it leaves
+  // out count as lost. 0: all.
+  double max_rate_hz = 0;
 };
 
 // The present state of a stream. For a stream of another host, pids and users are those of its

@@ -34,6 +34,39 @@ TEST_F(TwoHosts, ReadTheHistoryFromBeforeTheReaderCame) {
   EXPECT_EQ(mirror("odometry").gap_samples, 0u);
 }
 
+TEST_F(TwoHosts, TakeNoMoreThanTheRateThatIsSetForAStream) {
+  const DaemonProcess pc3({"--peer", pc1.address(), "--mirror-stream", "odo*=20 Hz"}, "pc3");
+  Session slow = connect(pc3);
+  await_state(slow, pc1, HostState::up);
+  auto writer = here.create<Numbered>("odometry", History{1024, 1ms}).value();
+  const auto write_to = [&](Tid last) {
+    for (Tid tid = writer.newest_tid() + 1; tid <= last; ++tid) {
+      writer.write(numbered(tid), time_from_ns(1000 * tid), Duration(1));
+    }
+  };
+  write_to(99);
+  auto reader = slow.await_reader<Numbered>("odometry", kNever).value();
+  Numbered sample{};
+  SampleInfo info;
+  for (const Tid last : {149, 199}) {
+    write_to(last);
+    await([&] { return reader.newest_tid() == last; });
+    ASSERT_EQ(reader.read_newest(sample, info), ReadStatus::ok);
+    EXPECT_EQ(sample.number, last);
+  }
+  const auto mirror = [&] {
+    return slow.stream_info({"odometry", 0, "pc1"}).value().mirror.value();
+  };
+  EXPECT_EQ(mirror().max_rate_hz, 20);
+  EXPECT_LE(mirror().received_samples, 5u) << "99, 149, 199, and one of each burst";
+  EXPECT_EQ(mirror().received_samples + mirror().gap_samples, 101u);
+  // History is history: whole, but for what was left out since.
+  EXPECT_EQ(reader.read_at(time_from_ns(50'000), sample, info), ReadStatus::arriving);
+  await([&] { return mirror().filling_samples == 0; });
+  for (Tid tid = 0; tid < 100; ++tid) EXPECT_EQ(reader.read_tid(tid, sample, info), ReadStatus::ok);
+  EXPECT_EQ(reader.read_tid(140, sample, info), ReadStatus::lost);
+}
+
 TEST_F(TwoHosts, FetchTheHistoryWhenAProgramReadsIt) {
   auto writer = here.create<Numbered>("odometry", History{1024, 1ms}).value();
   for (int i = 0; i < 100; ++i) writer.write(numbered(i), time_from_ns(1000 * i), Duration(i));

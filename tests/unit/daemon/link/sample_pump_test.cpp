@@ -502,7 +502,9 @@ TEST(SamplePump, SendsTheNewestAtEachTimeWhenItThins) {
   const auto at = [](int ms) { return kStart + std::chrono::milliseconds(ms); };
   for (int ms = 1; ms <= 100; ++ms) {  // a sample per millisecond
     rig.write();
-    EXPECT_EQ(rig.run(at(ms)) == PumpWait::time, rig.pump->due() > at(ms) && ms % 10 != 0);
+    const bool waits = rig.run(at(ms)) == PumpWait::time;
+    EXPECT_EQ(waits, ms % 10 != 0) << ms;
+    EXPECT_EQ(waits, waits && rig.pump->due() > at(ms)) << ms;
   }
   const std::vector<Tid> got = rig.accepted();
   EXPECT_EQ(got.size(), 11u) << "one at once, then 10 in 100 ms";
@@ -761,6 +763,40 @@ TEST_F(PacedHistory, WaitsInItsSlotForTheSocket) {
   rig.write();
   EXPECT_EQ(rig.run_on(), PumpWait::pace);
   EXPECT_EQ(rig.accepted(), (std::vector<Tid>{2, 1, 3}));
+}
+
+// --- with a rate, too
+
+class NewestFirstWithARate : public NewestFirst {
+ protected:
+  void start_at(double rate_hz, Tid first, Tid newest, ring::TidRange held = {}) {
+    SamplePump::Plan plan{first, newest, rate_hz};
+    plan.held = held;
+    start(plan);
+  }
+};
+
+TEST_F(NewestFirstWithARate, WhatIsLeftOutIsLostAndHistoryIsNot) {
+  rig.write(4);
+  start_at(10, 0, 3);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  EXPECT_EQ(rig.accepted(), (std::vector<Tid>{3})) << "nothing before the subscription's newest";
+  EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{0, 3}}));
+  rig.write(3);
+  EXPECT_EQ(rig.run_on(kStart + 99ms), PumpWait::time);
+  EXPECT_EQ(rig.pump->due(), kStart + 100ms);
+  EXPECT_EQ(rig.run_on(kStart + 100ms), PumpWait::sample);
+  EXPECT_EQ(rig.accepted(), (std::vector<Tid>{3, 6}));
+  EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{0, 3}, {4, 2}}));
+}
+
+TEST_F(NewestFirstWithARate, HistoryComesWhileASampleWaitsForItsTime) {
+  rig.write(8);
+  start_at(10, 0, 7, {4, 6});
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  EXPECT_EQ(rig.accepted(), (std::vector<Tid>{7, 3, 2, 1, 0}));
+  EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{6, 1}}));
+  EXPECT_EQ(rig.caught_up, 1);
 }
 
 TEST(NewestFirstSmall, AFewSmallSamplesKeepTheirOrder) {

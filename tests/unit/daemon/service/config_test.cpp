@@ -50,6 +50,7 @@ max_connections_per_host = 21
 max_peer_memory = "22 MiB"
 mirror_linger = "23 s"
 mirror_history = "at_once"
+mirror_streams = ["camera*=when_read 10 Hz", "map:2=at_once", "rear=5 Hz"]
 )",
                                                     "dssmd.conf");
   ASSERT_TRUE(applied) << applied.error().message;
@@ -77,7 +78,13 @@ mirror_history = "at_once"
   EXPECT_EQ(config.max_connections_per_host, 21u);
   EXPECT_EQ(config.max_peer_memory_bytes, 22u << 20);
   EXPECT_EQ(config.mirror_linger, std::chrono::seconds(23));
-  EXPECT_TRUE(config.mirror_history);
+  const auto demand_for = [&](const char* name, std::int32_t id) {
+    return config.mirrors.demand_for({name, id, "pc1"});
+  };
+  EXPECT_EQ(demand_for("camera3", 0), (MirrorDemand{false, 10}));
+  EXPECT_EQ(demand_for("map", 2), (MirrorDemand{true, 0}));
+  EXPECT_EQ(demand_for("map", 1), (MirrorDemand{true, 0}));
+  EXPECT_EQ(demand_for("rear", 0), (MirrorDemand{true, 5})) << "the time is as in general";
 }
 
 TEST(Config, TakesAnEmptyFile) { EXPECT_EQ(mistakes_in(""), ""); }
@@ -112,6 +119,22 @@ TEST(Config, NamesLineAndKeyOfWhatIsWrongInAList) {
             std::string::npos);
   EXPECT_NE(mistakes_in("peers = [\"pc2:0\"]\n").find("port 0"), std::string::npos);
   EXPECT_NE(mistakes_in("listen = [\"pc1\"]\n").find("'pc1' is a name"), std::string::npos);
+}
+
+TEST(Config, NamesWhatIsWrongInADemandOnMirrors) {
+  const auto mistake = [](const std::string& demand) {
+    return mistakes_in("mirror_streams = [\"" + demand + "\"]\n");
+  };
+  EXPECT_EQ(
+      mistake("camera=fast"),
+      "dssmd.conf:1: key 'mirror_streams': 'camera=fast' states neither a rate nor when_read "
+      "nor at_once: 'fast' does not begin with a whole number; write \"STREAM=WHEN\", "
+      "\"STREAM=RATE\" or \"STREAM=WHEN RATE\", such as \"map=at_once\" or \"camera*=10 Hz\"");
+  for (const char* wrong :
+       {"camera", "=10 Hz", "camera=", "camera=10", "camera=0 Hz", "camera=-1 Hz", "camera=10 ms",
+        "camera=at_once 10", "camera=10 Hz at_once", "camera=100001 Hz", "camera=at_once "}) {
+    EXPECT_NE(mistake(wrong), "") << wrong;
+  }
 }
 
 TEST(Config, DistinguishesNoNetworkFromNoSetting) {
