@@ -606,7 +606,7 @@ Finding check_mirrors(const Facts& facts) {
     ++mirrors;
     std::string what = carried_text(stream);
     if (!what.empty()) {
-      what = "the network " + what;
+      what = fmt::format("the network {}", what);
     } else if (const Duration late = behind_owner(stream); late > Duration()) {
       what = duration_text(late) + " behind its owner";
     }

@@ -57,7 +57,8 @@ SlotWriter::SlotWriter(const RingMapping& mapping) noexcept
   header_->top.store(tid, std::memory_order_seq_cst);
 }
 
-[[gnu::always_inline]] inline void SlotWriter::store(const SampleInfo& info, Tid run_start) const noexcept {
+[[gnu::always_inline]] inline void SlotWriter::store(const SampleInfo& info,
+                                                     Tid run_start) const noexcept {
   SlotHeader& slot = slots_.slot(info.tid);
   const std::int64_t time_ns = to_ns(info.time);
   // Release, each: a reader that sees one of these sees the odd sequence too; pairs with the

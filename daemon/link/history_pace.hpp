@@ -6,12 +6,12 @@
 // than a queue adds:
 //
 //   measuring  history is sent as fast as the connection takes it. Short windows until two in a
-//              row carry no more than the one before: TCP is up to speed, and buffers that let the
-//              first bytes pass faster are full. What is delivered in one more,
-//              kLastWindows times as long, is what the network carries
+//              row carry no more than the one before: TCP is up to speed, and buffers that let
+//              the first bytes pass faster are full. What is delivered in one more, kLastWindows
+//              times as long, is what the network carries
 //   paced      history gets kShare of that, without what live samples take of it, but at least
-//              kLeastShare. Measured again after kMinValid or more, and when a connection has not taken what
-//              it was allowed to for kTooFull of kPeriod
+//              kLeastShare. Measured again after kMinValid or more, and when a connection has not
+//              taken what it was allowed to for kTooFull of kPeriod
 //   unlimited  the network is fast, or the receiver is what limits
 //
 // The host's connections share one, in the loop's thread.

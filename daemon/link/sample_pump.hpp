@@ -81,8 +81,8 @@ class SamplePump {
     Tid first = 0;  // >= 0; may lie before what the ring holds (a gap), or in the future
     Tid caught_up_at = kNoTid;
     // > 0: at most so many samples per second: the newest one at each time. What is left out is no
-    // gap; with newest_first it is lost, and history comes as without a rate. Above 1000 the loop's timers, which count milliseconds, make it less when samples come
-    // faster than that.
+    // gap; with newest_first it is lost, and history comes as without a rate. Above 1000 the loop's
+    // timers, which count milliseconds, make it less when samples come faster than that.
     double max_rate_hz = 0;
     bool newest_first = false;
     // With newest_first: none of these is sent, the receiver has them.

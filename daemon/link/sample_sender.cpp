@@ -37,7 +37,7 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& co
       payload_bytes_(mapping.geometry().payload_bytes) {}
 
 [[gnu::hot]] SendStatus SampleSender::send(Tid tid, std::uint64_t serial, bool more_follow,
-                                            const Haste& haste) {
+                                           const Haste& haste) {
   DSSM_CHECK(!busy_);
   if (payload_bytes_ < kInPlaceBytes) return send_copy(tid, serial);
   SampleInfo info;
@@ -193,7 +193,8 @@ SendStatus SampleSender::send_slice(const Haste& haste) {
   }
   // The socket is full. A sample that is not begun, or is void already, is not copied aside.
   const bool begun = head_sent_ > 0;
-  if (begun && haste.may_copy && RingReader::still_valid(*place_.sequence, place_.expected) && begin_copying()) {
+  if (begun && haste.may_copy && RingReader::still_valid(*place_.sequence, place_.expected) &&
+      begin_copying()) {
     return copy_slice();
   }
   connection_.want_output();

@@ -6,6 +6,7 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <utility>
 
 #include "core/base/try.hpp"
@@ -53,7 +54,9 @@ Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
 }
 
 void Mirror::subscribe() {
-  with_history_ = wants_history() || !newest_first_;
+  // Which samples have a place in an empty ring that is shorter, only the newest one tells.
+  const bool is_known = !is_shorter_ || ring_->knows_newest();
+  with_history_ = (wants_history() && is_known) || !newest_first_;
   net::Subscribe request;
   ring_->resume(newest_first_, with_history_, request);
   max_rate_hz_ = newest_first_ ? parts_.mirrors.demand_for(id_).max_rate_hz : 0;
@@ -77,6 +80,13 @@ void Mirror::want_history(bool always) {
   history_always_ |= always;
   history_wanted_ = true;
   if (!with_history_ && channel_.reading() >= ChannelClient::Reading::filling) subscribe();
+}
+
+std::uint64_t Mirror::depth_for(const StreamInfo& theirs) const noexcept {
+  const Duration history = parts_.mirrors.demand_for(id_).max_history;
+  if (history == Duration() || theirs.cycle <= Duration()) return theirs.depth;
+  const auto slots = static_cast<std::uint64_t>((history - Duration(1)) / theirs.cycle) + 2;
+  return std::clamp(slots, kMinDepth, std::max(theirs.depth, kMinDepth));
 }
 
 void Mirror::on_new_demand() {
@@ -199,7 +209,8 @@ Result<void> Mirror::follow_untrusted(const StreamInfo& theirs) {
   if (ring_ && ring_->stream()->incarnation() == theirs.incarnation) {
     const Stream& ours = *ring_->stream();
     if (ours.type().payload_bytes == theirs.type.payload_bytes &&
-        ours.mapping().geometry().depth == theirs.depth) {
+        ours.mapping().geometry().depth <= theirs.depth) {
+      is_shorter_ = ours.mapping().geometry().depth < theirs.depth;
       return {};
     }
     return Error{
@@ -208,9 +219,11 @@ Result<void> Mirror::follow_untrusted(const StreamInfo& theirs) {
                     name_)};
   }
   const std::string context = "mirror '" + name_ + "'";
+  const std::uint64_t depth = depth_for(theirs);
+  is_shorter_ = depth < theirs.depth;
   std::shared_ptr<Stream> stream = DSSM_TRY(Stream::create({.id = id_,
                                                             .type = theirs.type,
-                                                            .depth = theirs.depth,
+                                                            .depth = depth,
                                                             .cycle = theirs.cycle,
                                                             .purpose = Purpose::mirror,
                                                             .incarnation = theirs.incarnation},

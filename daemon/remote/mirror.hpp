@@ -7,7 +7,8 @@
 // opens the stream gets the ring when what is fetched is here, or after kFillTimeout. While the
 // owner is away, those that read one sample after the other wait before what is missing.
 //
-//   ring      has the owner's type, depth, cycle and incarnation. When the owner's stream has
+//   ring      has the owner's type, cycle and incarnation, and its depth or, by the key
+//             mirror_streams, less. When the owner's stream has
 //             another incarnation, the mirror makes a new ring, and readers of the old one are
 //             notified as soon as the new one is filled
 //   error     while the owner is unavailable, or has removed the stream, the ring stays as it is
@@ -96,6 +97,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
     const std::uint64_t before = std::exchange(logged_gap_, lost);
     if (lost != before && max_rate_hz_ == 0) log_gap(lost - before);
   }
+  std::uint64_t depth_for(const StreamInfo& theirs) const noexcept;
   bool wants_history() const noexcept;
   void subscribe();
   bool is_filling() const noexcept;
@@ -105,6 +107,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   bool history_wanted_ = false, history_always_ = false;
   bool with_history_ = false;  // the present subscription, and
   double max_rate_hz_ = 0;     // its rate; 0: all samples
+  bool is_shorter_ = false;    // the ring, than the owner's
   bool is_ending_ = false;     // live, but the catalog knows that this ring was removed
   MirrorClock clock_;
   bool in_batch_ = false;  // samples have come, and on_batch_end() has not

@@ -81,7 +81,10 @@ Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first, T
   cursor_.set_thinned(newest_first);  // what is passed over comes later
   const Tid next = cursor_.next();
   const bool is_whole = with_history_ || !newest_first;
-  const Tid begin = is_whole ? first : std::clamp<Tid>(oldest, 0, std::max<Tid>(first, 0));
+  // What has no place in a ring that is shorter than the owner's is not awaited.
+  const Tid depth = static_cast<Tid>(stream_->mapping().geometry().depth);
+  const Tid held = std::max(oldest, first - depth + 2);
+  const Tid begin = is_whole ? first : std::clamp<Tid>(held, 0, std::max<Tid>(first, 0));
   wanted_from_ = is_whole ? 0 : first;
   if (!newest_first || next == kNoTid || slots_.newest() < 0) {
     if (newest_first) cursor_.set_next(kNoTid);
@@ -136,7 +139,8 @@ void MirrorRing::count_what_leaves(Tid tid) noexcept {
 // What nobody wants is not missing.
 std::uint64_t MirrorRing::count_missing(ring::TidRange range) const noexcept {
   std::uint64_t missing = 0;
-  for (Tid tid = std::max(range.begin, wanted_from_); tid < range.end; ++tid) missing += is_missing(tid) ? 1U : 0U;
+  for (Tid tid = std::max(range.begin, wanted_from_); tid < range.end; ++tid)
+    missing += is_missing(tid) ? 1U : 0U;
   return missing;
 }
 

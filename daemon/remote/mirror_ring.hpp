@@ -54,6 +54,9 @@ class MirrorRing {
   // The owner will not send what is missing in the hole: it counts as lost.
   void end_filling() noexcept;
 
+  // Whether the newest sample is here, or the owner has said which one it is.
+  bool knows_newest() const noexcept { return cursor_.next() != kNoTid; }
+
   // As in SampleCursor.
   Result<void> on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest);
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count);

@@ -229,8 +229,8 @@ constexpr ConfigKey kKeys[] = {
        return take(c.mirrors.general.history_at_once, parse_mirror_history(text));
      }},
     {"mirror_streams", "STREAM=WHAT",
-     "another time for some streams, or how many samples a second at most, e.g. 'map=at_once' or "
-     "'camera*=10 Hz'; may be repeated, the first that matches counts",
+     "for some streams another time, the highest rate, and how much history is kept here, e.g. "
+     "'map=at_once' or 'camera*=10 Hz, 2 s'; may be repeated, the first that matches counts",
      ValueForm::list, kChangesAtOnce<&Config::mirrors>,
      [](Config& c, std::string_view text) -> Result<void> {
        if (text.empty()) return {};

@@ -26,6 +26,8 @@ constexpr Duration kMaxClockLimit = std::chrono::seconds(10);
 constexpr std::size_t kMaxStreamPatternBytes = 63;
 constexpr std::uint64_t kMaxDriftPpm = 1000;
 constexpr std::uint64_t kMaxMirrorHz = 100'000;
+constexpr Duration kMinMirrorHistory = std::chrono::milliseconds(1);
+constexpr Duration kMaxMirrorHistory = std::chrono::hours(24);
 
 Error invalid(std::string why) { return Error{Errc::invalid_argument, std::move(why)}; }
 
@@ -63,6 +65,27 @@ bool matches(const std::string& pattern, const StreamId& id) {
          !::fnmatch(pattern.c_str(), full.c_str(), 0);
 }
 
+// One of those of a stream: "at_once", "10 Hz", "2 s".
+Result<void> take_demand(std::string_view text, MirrorDemands::Exception& out) {
+  if (const Result<bool> history = parse_mirror_history(text)) {
+    out.history_at_once = *history;
+    return {};
+  }
+  const Result<Quantity> quantity = parse_quantity(text);
+  if (!quantity) {
+    return invalid(in_quotes(text) + " is neither when_read nor at_once, nor a rate or a time");
+  }
+  if (quantity->unit != "Hz") {
+    out.max_history = DSSM_TRY(parse_duration(text, kMinMirrorHistory, kMaxMirrorHistory));
+    return {};
+  }
+  if (quantity->number < 1 || quantity->number > kMaxMirrorHz) {
+    return out_of_range(text, 1, kMaxMirrorHz, " Hz");
+  }
+  out.max_rate_hz = static_cast<double>(quantity->number);
+  return {};
+}
+
 // The pattern for streams before the last '='; returns what is wrong with it, or "".
 std::string take_pattern(std::string_view text, std::string& out) {
   const std::size_t equals = text.rfind('=');
@@ -88,7 +111,8 @@ ClockDemand ClockPolicies::demand_for(const StreamId& id) const {
 MirrorDemand MirrorDemands::demand_for(const StreamId& id) const {
   for (const Exception& exception : exceptions) {
     if (!matches(exception.pattern, id)) continue;
-    return {exception.history_at_once.value_or(general.history_at_once), exception.max_rate_hz};
+    return {exception.history_at_once.value_or(general.history_at_once), exception.max_rate_hz,
+            exception.max_history};
   }
   return general;
 }
@@ -187,29 +211,23 @@ Result<MirrorDemands::Exception> parse_mirror_exception(std::string_view text) {
   const auto wrong = [&](const std::string& why) {
     return Error{
         Errc::invalid_argument,
-        fmt::format("{} {}; write \"STREAM=WHEN\", \"STREAM=RATE\" or \"STREAM=WHEN RATE\", "
-                    "such as \"map=at_once\" or \"camera*=10 Hz\"",
+        fmt::format("{} {}; write \"STREAM=WHAT\" or \"STREAM=WHAT, WHAT\", such as "
+                    "\"map=at_once\", \"camera*=10 Hz\" or \"camera*=when_read, 10 Hz, 2 s\"",
                     in_quotes(text), why)};
   };
   MirrorDemands::Exception exception;
   const std::string why = take_pattern(text, exception.pattern);
   if (!why.empty()) return wrong(why);
-  std::string_view demand = text.substr(exception.pattern.size() + 1);
-  const std::size_t blank = std::min(demand.find(' '), demand.size());
-  if (const Result<bool> history = parse_mirror_history(demand.substr(0, blank))) {
-    exception.history_at_once = *history;
-    if (blank == demand.size()) return exception;
-    demand.remove_prefix(blank + 1);
+  std::string_view rest = text.substr(exception.pattern.size() + 1);
+  for (bool is_last = false; !is_last;) {
+    const std::size_t comma = rest.find(',');
+    is_last = comma == rest.npos;
+    std::string_view what = rest.substr(0, comma);
+    if (!is_last) rest.remove_prefix(comma + 1);
+    while (what.starts_with(' ')) what.remove_prefix(1);
+    const Result<void> taken = take_demand(what, exception);
+    if (!taken) return wrong("holds what is no demand: " + taken.error().message);
   }
-  const Result<Quantity> rate = parse_quantity(demand);
-  if (!rate) {
-    return wrong("states neither a rate nor when_read nor at_once: " + rate.error().message);
-  }
-  if (rate->unit != "Hz") return wrong("has a rate without the unit 'Hz'");
-  if (rate->number < 1 || rate->number > kMaxMirrorHz) {
-    return wrong(fmt::format("has a rate that is not from 1 to {} Hz", kMaxMirrorHz));
-  }
-  exception.max_rate_hz = static_cast<double>(rate->number);
   return exception;
 }
 

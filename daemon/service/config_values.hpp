@@ -55,6 +55,7 @@ struct ClockPolicies {
 struct MirrorDemand {
   bool history_at_once = false;  // else when a program reads it
   double max_rate_hz = 0;        // 0: all samples
+  Duration max_history{};        // that its ring holds; 0: as much as the owner's
 
   friend bool operator==(const MirrorDemand& a, const MirrorDemand& b) = default;
 };
@@ -65,6 +66,7 @@ struct MirrorDemands {
     std::string pattern;                  // as in ClockPolicies
     std::optional<bool> history_at_once;  // nothing: as in general
     double max_rate_hz = 0;
+    Duration max_history{};
 
     friend bool operator==(const Exception& a, const Exception& b) = default;
   };
@@ -98,7 +100,7 @@ Result<Duration> parse_clock_limit(std::string_view text);
 // "STREAM=POLICY", or "STREAM=POLICY LIMIT": "gps=off", "camera*=mark 5 ms".
 Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text);
 
-// "STREAM=WHEN", "STREAM=RATE" or "STREAM=WHEN RATE": "map=at_once", "camera*=10 Hz".
+// "STREAM=WHAT, WHAT": "map=at_once", "camera*=when_read, 10 Hz, 2 s".
 Result<MirrorDemands::Exception> parse_mirror_exception(std::string_view text);
 
 // The drift of a clock: "50 ppm"; 1 to 1000. In billionths.

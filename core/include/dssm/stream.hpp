@@ -151,8 +151,8 @@ struct MirrorInfo {
   // lost.
   std::uint64_t recent_samples = 0;
   std::uint64_t recent_lost_samples = 0;
-  // So many samples a second it takes at most (dssmd's key mirror_streams), and those that it leaves
-  // out count as lost. 0: all.
+  // So many samples a second it takes at most (dssmd's key mirror_streams), and those that it
+  // leaves out count as lost. 0: all.
   double max_rate_hz = 0;
 };
 

@@ -67,6 +67,43 @@ TEST_F(TwoHosts, TakeNoMoreThanTheRateThatIsSetForAStream) {
   EXPECT_EQ(reader.read_tid(140, sample, info), ReadStatus::lost);
 }
 
+TEST_F(TwoHosts, KeepNoMoreHistoryThanIsSetForAStream) {
+  const DaemonProcess pc3({"--peer", pc1.address(), "--mirror-stream", "odo*=100 ms",
+                           "--mirror-stream", "map=at_once, 5 ms"},
+                          "pc3");
+  Session small = connect(pc3);
+  await_state(small, pc1, HostState::up);
+  for (const char* name : {"odometry", "map"}) {
+    auto writer = here.create<Numbered>(name, History{1024, 1ms}).value();
+    const auto write_to = [&](Tid last) {
+      for (Tid tid = writer.newest_tid() + 1; tid <= last; ++tid) {
+        writer.write(numbered(tid), time_from_ns(1000 * tid), Duration(1));
+      }
+    };
+    write_to(999);
+    auto reader = small.await_reader<Numbered>(name, kNever).value();
+    const Tid held = name == std::string("map") ? 5 : 100;
+    EXPECT_EQ(reader.depth(), static_cast<std::uint64_t>(held) + 1);
+    Numbered sample{};
+    SampleInfo info;
+    const auto mirror = [&] { return small.stream_info({name, 0, "pc1"}).value().mirror.value(); };
+    for (const Tid last : {999, 1999}) {
+      write_to(last);
+      await([&] { return reader.newest_tid() == last; });
+      EXPECT_EQ(reader.oldest_tid(), last - held + 1);
+      // The first read of what is not here has it fetched.
+      static_cast<void>(reader.read_tid(reader.oldest_tid(), sample, info));
+      await([&] { return mirror().filling_samples == 0; });
+      for (Tid tid = reader.oldest_tid(); tid <= last; ++tid) {
+        ASSERT_EQ(reader.read_tid(tid, sample, info), ReadStatus::ok) << tid;
+        EXPECT_EQ(sample.number, tid);
+      }
+      EXPECT_EQ(reader.read_tid(last - held, sample, info), ReadStatus::too_old);
+    }
+    EXPECT_EQ(mirror().state, MirrorState::live);
+  }
+}
+
 TEST_F(TwoHosts, FetchTheHistoryWhenAProgramReadsIt) {
   auto writer = here.create<Numbered>("odometry", History{1024, 1ms}).value();
   for (int i = 0; i < 100; ++i) writer.write(numbered(i), time_from_ns(1000 * i), Duration(i));

@@ -426,7 +426,7 @@ TEST(Doctor, WarnsOfMirrorsThatTheNetworkCannotFill) {
   EXPECT_FINDING(facts, "mirrors", Status::ok, "");
   stream.mirror->newest_time = time_from_ns(8'000'000'000);
   EXPECT_FINDING(facts, "mirrors", Status::warn, "dssmctl info odom:0@pc2");
-  EXPECT_EQ(finding_of(facts, "mirrors").text, "'odom:0@pc2': 2 s behind its owner");
+  EXPECT_EQ(finding_of(facts, "mirrors").text, "'odom:0@pc2': 2.00 s behind its owner");
   stream.mirror->recent_samples = 90;
   stream.mirror->recent_lost_samples = 57;
   EXPECT_EQ(finding_of(facts, "mirrors").text,

@@ -50,7 +50,7 @@ max_connections_per_host = 21
 max_peer_memory = "22 MiB"
 mirror_linger = "23 s"
 mirror_history = "at_once"
-mirror_streams = ["camera*=when_read 10 Hz", "map:2=at_once", "rear=5 Hz"]
+mirror_streams = ["camera*=when_read, 10 Hz,500 ms", "map:2=at_once", "rear=5 Hz"]
 )",
                                                     "dssmd.conf");
   ASSERT_TRUE(applied) << applied.error().message;
@@ -81,10 +81,10 @@ mirror_streams = ["camera*=when_read 10 Hz", "map:2=at_once", "rear=5 Hz"]
   const auto demand_for = [&](const char* name, std::int32_t id) {
     return config.mirrors.demand_for({name, id, "pc1"});
   };
-  EXPECT_EQ(demand_for("camera3", 0), (MirrorDemand{false, 10}));
-  EXPECT_EQ(demand_for("map", 2), (MirrorDemand{true, 0}));
-  EXPECT_EQ(demand_for("map", 1), (MirrorDemand{true, 0}));
-  EXPECT_EQ(demand_for("rear", 0), (MirrorDemand{true, 5})) << "the time is as in general";
+  EXPECT_EQ(demand_for("camera3", 0), (MirrorDemand{false, 10, std::chrono::milliseconds(500)}));
+  EXPECT_EQ(demand_for("map", 2), (MirrorDemand{true, 0, {}}));
+  EXPECT_EQ(demand_for("map", 1), (MirrorDemand{true, 0, {}}));
+  EXPECT_EQ(demand_for("rear", 0), (MirrorDemand{true, 5, {}})) << "the time is as in general";
 }
 
 TEST(Config, TakesAnEmptyFile) { EXPECT_EQ(mistakes_in(""), ""); }
@@ -125,14 +125,15 @@ TEST(Config, NamesWhatIsWrongInADemandOnMirrors) {
   const auto mistake = [](const std::string& demand) {
     return mistakes_in("mirror_streams = [\"" + demand + "\"]\n");
   };
-  EXPECT_EQ(
-      mistake("camera=fast"),
-      "dssmd.conf:1: key 'mirror_streams': 'camera=fast' states neither a rate nor when_read "
-      "nor at_once: 'fast' does not begin with a whole number; write \"STREAM=WHEN\", "
-      "\"STREAM=RATE\" or \"STREAM=WHEN RATE\", such as \"map=at_once\" or \"camera*=10 Hz\"");
+  EXPECT_EQ(mistake("camera=fast"),
+            "dssmd.conf:1: key 'mirror_streams': 'camera=fast' holds what is no demand: 'fast' is "
+            "neither when_read nor at_once, nor a rate or a time; write \"STREAM=WHAT\" or "
+            "\"STREAM=WHAT, WHAT\", such as \"map=at_once\", \"camera*=10 Hz\" or "
+            "\"camera*=when_read, 10 Hz, 2 s\"");
   for (const char* wrong :
-       {"camera", "=10 Hz", "camera=", "camera=10", "camera=0 Hz", "camera=-1 Hz", "camera=10 ms",
-        "camera=at_once 10", "camera=10 Hz at_once", "camera=100001 Hz", "camera=at_once "}) {
+       {"camera", "=10 Hz", "camera=", "camera=10", "camera=0 Hz", "camera=-1 Hz", "camera=10 km",
+        "camera=at_once 10 Hz", "camera=100001 Hz", "camera=at_once,", "camera=0 ms",
+        "camera=90000 s"}) {
     EXPECT_NE(mistake(wrong), "") << wrong;
   }
 }
