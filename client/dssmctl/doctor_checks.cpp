@@ -628,7 +628,7 @@ Finding check_mirrors(const Facts& facts) {
   }
   return {"mirrors", Status::warn, fmt::format("{}{}", fmt::join(behind, ", "), more),
           "these streams write more than the network to their hosts carries",
-          fmt::format("dssmctl info {}  # then write less or shorter samples, set max_rate for it "
+          fmt::format("dssmctl info {}  # then write less or shorter samples, limit its rate "
                       "here (key mirror_streams), or use a faster network",
                       example)};
 }
