@@ -603,7 +603,7 @@ Finding check_mirrors(const Facts& facts) {
   std::string example;
   for (const StreamInfo& stream : facts.streams) {
     if (!stream.mirror) continue;
-    ++mirrors;
+    mirrors += stream.mirror->state == MirrorState::live && stream.mirror->max_rate_hz == 0 ? 1 : 0;
     std::string what = carried_text(stream);
     if (!what.empty()) {
       what = fmt::format("the network {}", what);
@@ -616,7 +616,7 @@ Finding check_mirrors(const Facts& facts) {
   }
   if (behind.empty()) {
     return {"mirrors", Status::ok,
-            mirrors == 0 ? "no program here reads a stream of another host"
+            mirrors == 0 ? "no stream of another host is read here without a rate"
                          : fmt::format("the network carries all samples of the {} streams of other "
                                        "hosts that programs here read",
                                        mirrors)};
@@ -627,7 +627,7 @@ Finding check_mirrors(const Facts& facts) {
     behind.resize(kMaxNamed);
   }
   return {"mirrors", Status::warn, fmt::format("{}{}", fmt::join(behind, ", "), more),
-          "these streams write more than the network to their hosts carries",
+          "they write more than the network to their hosts carries, or it was just interrupted",
           fmt::format("dssmctl info {}  # then write less or shorter samples, limit its rate "
                       "here (key mirror_streams), or use a faster network",
                       example)};

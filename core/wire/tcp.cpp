@@ -126,12 +126,13 @@ class TcpTransport final : public Transport {
   std::optional<Progress> progress() const noexcept override {
     using std::chrono::microseconds;
     const std::optional<tcp_info> info = state();
-    if (!info) return std::nullopt;
+    if (!info || info->tcpi_delivered == 0) return std::nullopt;  // an old kernel does not count
     const std::uint64_t unacknowledged = std::uint64_t{info->tcpi_unacked} * info->tcpi_snd_mss;
     return Progress{info->tcpi_delivered,
                     info->tcpi_snd_mss,
                     info->tcpi_notsent_bytes + unacknowledged,
                     microseconds(info->tcpi_min_rtt),
+                    microseconds(info->tcpi_rtt),
                     microseconds(info->tcpi_busy_time),
                     microseconds(info->tcpi_rwnd_limited)};
   }

@@ -60,8 +60,8 @@ enum class TransportEnd : unsigned char { connected, accepted };
 struct Progress {
   std::uint32_t delivered_packets = 0;  // since the connection began; may begin anew at 0
   std::uint32_t packet_bytes = 0;
-  std::uint64_t waiting_bytes = 0;  // not sent, or not acknowledged
-  Duration round_trip{};            // the least of late
+  std::uint64_t waiting_bytes = 0;          // not sent, or not acknowledged
+  Duration round_trip{}, round_trip_now{};  // the least of late; smoothed
   // Since the connection began:
   Duration sending{};           // so long some were on their way or waited to be sent
   Duration waiting_for_peer{};  // and so long of that the receiver took no more

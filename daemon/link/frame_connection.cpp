@@ -45,7 +45,9 @@ FrameConnection::FrameConnection(const EventLoop& loop, std::unique_ptr<wire::Tr
   readable_.enable();
 }
 
-FrameConnection::~FrameConnection() = default;
+FrameConnection::~FrameConnection() {
+  if (pace_) pace_->forget(this);
+}
 
 std::span<const std::byte> FrameConnection::Outgoing::unsent() const noexcept {
   const auto* text = std::get_if<std::string>(&bytes);
@@ -280,8 +282,12 @@ std::size_t FrameConnection::history_allowance() {
 
 void FrameConnection::on_history_sent(std::uint64_t since_sent_bytes, bool is_full) {
   if (!pace_) return;
-  pace_->on_history(static_cast<std::size_t>(sent_bytes_ - since_sent_bytes));
-  if (is_full || !output_.queue.empty()) pace_->on_full();
+  std::uint64_t bytes = sent_bytes_ - since_sent_bytes;
+  for (const Outgoing& waiting : output_.queue) {
+    if (!waiting.counted) bytes += waiting.unsent().size();
+  }
+  pace_->on_history(bytes);
+  if (is_full) pace_->on_full();
 }
 
 // The peer may have sent its reason before it closed: that is still to be received, so receiving
@@ -307,6 +313,7 @@ void FrameConnection::close_with(const Error& why) {
 void FrameConnection::close(const Error& why) {
   if (closed_) return;
   closed_ = true;
+  if (pace_) pace_->forget(this);
   last_error_ = why;
   readable_.disable();
   writable_.disable();

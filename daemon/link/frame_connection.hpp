@@ -129,8 +129,8 @@ class FrameConnection final : private wire::FrameDelegate {
   // How many bytes of history may be sent now. 0: none before history_due().
   std::size_t history_allowance();
   MonoTime history_due() const noexcept { return pace_ ? pace_->due() : MonoTime(); }
-  // What was sent since so many bytes had been sent is history.
-  //   is_full  the socket took less than was to be sent
+  // What was sent or queued (queue_rest()) since so many bytes had been sent is history.
+  //   is_full  the socket took less than history_allowance()
   void on_history_sent(std::uint64_t since_sent_bytes, bool is_full);
   std::uint64_t sent_bytes() const noexcept { return sent_bytes_; }
 

@@ -17,19 +17,24 @@ std::size_t HistoryPace::allowance(MonoTime now, const Connection& connection) {
   if (state_ == State::paced) refill(now);
   if (!is_valid(now)) {
     measure(now, connection);
-  } else if (state_ == State::measuring && now >= window_.end) {
-    end_window(now, connection);
+  } else if (state_ == State::measuring) {
+    go_on_measuring(now, connection);
   }
   if (state_ != State::paced) return kUnlimited;
   const double missing = piece_bytes() - tokens_;
   if (missing <= 0) return static_cast<std::size_t>(tokens_);
-  due_ = now + Duration(std::llround(std::ceil(missing / (kShare * bytes_per_s_) * 1e9)));
+  const double wait_s = std::min(missing / (kShare * bytes_per_s_), seconds(kPeriod));
+  due_ = now + Duration(std::llround(std::ceil(wait_s * 1e9)));
   return 0;
 }
 
 void HistoryPace::on_history(std::size_t bytes) noexcept {
   history_bytes_ += bytes;
   tokens_ -= static_cast<double>(bytes);
+}
+
+void HistoryPace::forget(const void* connection) noexcept {
+  if (state_ == State::measuring && window_.connection == connection) state_ = State::unknown;
 }
 
 // A connection that is full for a moment waits for a PC that is busy.
@@ -57,21 +62,21 @@ void HistoryPace::measure(MonoTime now, const Connection& connection) {
 
 void HistoryPace::begin_window(MonoTime now, const Connection& connection,
                                const wire::Progress& progress) {
-  const Duration length = std::max(kWindow, progress.round_trip);
-  window_ = {connection.id,
-             now,
-             now + (is_last_window() ? kLastWindows : 1) * length,
-             sent_bytes_,
-             connection.sent_bytes,
+  const Duration length = std::clamp(progress.round_trip, kWindow, kMaxWindow);
+  window_ = {connection.id, now,         now + (is_last_window() ? kLastWindows : 1) * length,
+             now,           sent_bytes_, connection.sent_bytes,
              progress};
 }
 
+void HistoryPace::go_on_measuring(MonoTime now, const Connection& connection) {
+  // It has no more history, or the network is interrupted.
+  if (now - window_.heard > kMaxWindow) return measure(now, connection);
+  if (window_.connection != connection.id) return;
+  window_.heard = now;
+  if (now >= window_.end) end_window(now, connection);
+}
+
 void HistoryPace::end_window(MonoTime now, const Connection& connection) {
-  if (window_.connection != connection.id) {
-    // The other one sends no more history.
-    if (now - window_.end > window_.end - window_.begin) measure(now, connection);
-    return;
-  }
   const std::optional<wire::Progress> progress = connection.transport.progress();
   if (!progress) return set_rate(now, kFastBytesPerS, 0);
   const wire::Progress& before = window_.progress;
@@ -82,15 +87,19 @@ void HistoryPace::end_window(MonoTime now, const Connection& connection) {
   const Duration length = now - window_.begin;
   const std::uint64_t enough = (is_last_window() ? kLastWindows : 1) * kWindowBytes;
   if (bytes < enough && length < kMaxWindow) return;
+  const Duration sending = progress->sending - before.sending;
+  if (++windows_ < kMaxWindows && sending + kCoarse < length / 2) {
+    return begin_window(now, connection, *progress);  // there was too little to send
+  }
   const double bytes_per_s = static_cast<double>(bytes) / seconds(length);
-  const bool is_receivers = 2 * (progress->waiting_for_peer - before.waiting_for_peer) >
-                            progress->sending - before.sending;
+  // Where packets wait in the network, that is what limits, although the receiver may be slow, too.
+  const bool is_receivers = 2 * (progress->waiting_for_peer - before.waiting_for_peer) > sending &&
+                            progress->round_trip_now < progress->round_trip + kQueued;
   if (is_last_window()) {
     return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s, progress->waiting_bytes);
   }
   flat_windows_ = bytes_per_s < kGrows * last_bytes_per_s_ ? flat_windows_ + 1 : 0;
   last_bytes_per_s_ = bytes_per_s;
-  ++windows_;
   begin_window(now, connection, *progress);
 }
 
@@ -101,7 +110,7 @@ void HistoryPace::set_rate(MonoTime now, double bytes_per_s, std::uint64_t waiti
   is_full_ = false;
   full_for_ = {};
   bytes_per_s_ = std::max(bytes_per_s, 1.0);
-  live_bytes_ = sent_bytes_ - std::min(history_bytes_, sent_bytes_);
+  live_bytes_ = std::max(live_bytes_, live_bytes());
   // What was sent while measuring still waits, partly in the network.
   tokens_ = -static_cast<double>(waiting_bytes);
 }
@@ -112,14 +121,19 @@ double HistoryPace::piece_bytes() const noexcept {
   return std::max(bytes_per_s_ * seconds(kPiece), static_cast<double>(kMinPieceBytes));
 }
 
+// History that waits to be sent counts already.
+std::uint64_t HistoryPace::live_bytes() const noexcept {
+  return sent_bytes_ - std::min(history_bytes_, sent_bytes_);
+}
+
 void HistoryPace::refill(MonoTime now) noexcept {
-  const std::uint64_t live_bytes = sent_bytes_ - std::min(history_bytes_, sent_bytes_);
+  const std::uint64_t live = std::max(live_bytes_, live_bytes());
   const double carried = bytes_per_s_ * seconds(now - refilled_);
-  const auto by_live = static_cast<double>(live_bytes - live_bytes_);
+  const auto by_live = static_cast<double>(live - live_bytes_);
   tokens_ += std::max(kShare * carried - by_live, kLeastShare * carried);
   tokens_ = std::min(tokens_, 3 * piece_bytes());
   if (std::exchange(is_full_, false)) full_for_ += now - refilled_;
-  live_bytes_ = live_bytes;
+  live_bytes_ = live;
   refilled_ = now;
 }
 

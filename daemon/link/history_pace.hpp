@@ -2,16 +2,17 @@
 //
 // How fast history is sent to one other host, over all connections to it: less than the network
 // carries, so that no queue grows in it in which new samples of any stream would wait. The idea is
-// LEDBAT's (RFC 6817), but nothing is judged by round trips, which vary between busy PCs by more
-// than a queue adds:
+// LEDBAT's (RFC 6817), but the rate does not follow round trips, which vary between busy PCs by
+// more than a queue adds. A new sample still waits behind the history sample that is begun on its
+// own connection, and while the network is measured:
 //
 //   measuring  history is sent as fast as the connection takes it. Short windows until two in a
 //              row carry no more than the one before: TCP is up to speed, and buffers that let
 //              the first bytes pass faster are full. What is delivered in one more, kLastWindows
 //              times as long, is what the network carries
 //   paced      history gets kShare of that, without what live samples take of it, but at least
-//              kLeastShare. Measured again after kMinValid or more, and when a connection has not
-//              taken what it was allowed to for kTooFull of kPeriod
+//              kLeastShare. Measured again after kMinValid to kMaxValid, and when a connection has
+//              not taken what it was allowed to for kTooFull of kPeriod
 //   unlimited  the network is fast, or the receiver is what limits
 //
 // The host's connections share one, in the loop's thread.
@@ -29,13 +30,17 @@ namespace dssm::daemon {
 class HistoryPace {
  public:
   static constexpr double kShare = 0.85, kLeastShare = 0.05;
-  // At least, and at least the round trip, and until so much is acknowledged: TCP repairs losses in
-  // between. But not longer than kMaxWindow.
+  // At least, and at least the round trip, and until so much is delivered: TCP repairs losses in
+  // between. But when kMaxWindow is over, without so much.
   static constexpr Duration kWindow = std::chrono::milliseconds(5);
   static constexpr std::uint64_t kWindowBytes = 64U << 10;
   static constexpr Duration kMaxWindow = std::chrono::seconds(1);
   static constexpr double kGrows = 1.25;  // a window that carries so much more than the one before
   static constexpr int kMaxWindows = 100, kLastWindows = 3;
+  // Times of TCP are that coarse; packets that take so much longer than the quickest wait in a
+  // queue.
+  static constexpr Duration kCoarse = std::chrono::milliseconds(10);
+  static constexpr Duration kQueued = std::chrono::milliseconds(5);
   // So many times as long as it took to measure.
   static constexpr int kValidTimes = 200;
   static constexpr Duration kMinValid = std::chrono::seconds(10),
@@ -61,27 +66,32 @@ class HistoryPace {
 
   // Of any kind, over any of the connections.
   void on_sent(std::size_t bytes) noexcept { sent_bytes_ += bytes; }
-  // So much of it was history.
+  // So much of what was sent, or will be because it is queued, is history.
   void on_history(std::size_t bytes) noexcept;
   // The connection took less of the history than it was allowed to.
   void on_full() noexcept { is_full_ = true; }
+  // The connection with that id has ended.
+  void forget(const void* connection) noexcept;
 
  private:
   enum class State : std::uint8_t { unknown, measuring, paced, unlimited };
   struct Window {
     const void* connection = nullptr;
     MonoTime begin{}, end{};
+    MonoTime heard{};  // when that connection had history last
     std::uint64_t sent_bytes = 0, sent_by_it_bytes = 0;
     wire::Progress progress;
   };
 
   void measure(MonoTime now, const Connection& connection);
+  void go_on_measuring(MonoTime now, const Connection& connection);
   void begin_window(MonoTime now, const Connection& connection, const wire::Progress& progress);
   bool is_last_window() const noexcept { return flat_windows_ == 2 || windows_ == kMaxWindows; }
   void end_window(MonoTime now, const Connection& connection);
   void set_rate(MonoTime now, double bytes_per_s, std::uint64_t waiting_bytes) noexcept;
   void refill(MonoTime now) noexcept;
   bool is_valid(MonoTime now) noexcept;
+  std::uint64_t live_bytes() const noexcept;
   double piece_bytes() const noexcept;
 
   State state_ = State::unknown;

@@ -53,9 +53,10 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
     Tid sent_up_to = chosen() + 1;
-    const std::uint64_t sent_before = connection_.sent_bytes();
+    SampleSender::Haste haste = kAtOnce;
+    std::uint64_t sent_before = connection_.sent_bytes();
     if (under_way_) {
-      const SampleSender::Haste haste = only_under_way ? kAtOnce : haste_now(now);
+      if (!only_under_way) haste = haste_now(now);
       if (haste.most_bytes == 0) return wait_for_pace();
       status = sender_.go_on(haste);
       bytes += SampleSender::kSliceBytes;
@@ -72,7 +73,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
         wake_at_ = due_;
         return PumpWait::time;
       }
-      const SampleSender::Haste haste = haste_now(now);
+      haste = haste_now(now);
       if (haste.most_bytes == 0) {
         sender_.end_run();
         return wait_for_pace();
@@ -80,6 +81,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       const Tid last = last_of_run();
       observer_.before_samples();
       if (!connection_.output_empty()) return PumpWait::output;
+      sent_before = connection_.sent_bytes();
       const Tid at = chosen();
       if (sender_.sends_in_place()) {
         sent_up_to = at + 1;
@@ -96,7 +98,10 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
         bytes += static_cast<std::size_t>(sent_up_to - at) * payload_bytes_;
       }
     }
-    if (fills_) connection_.on_history_sent(sent_before, status == SendStatus::blocked);
+    if (fills_) {
+      const bool is_full = status == SendStatus::blocked && !haste.may_copy;
+      connection_.on_history_sent(sent_before, is_full);
+    }
     Tid& at = chosen();
     under_way_ = sender_.busy();
     switch (status) {
@@ -179,7 +184,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   fills_ = !has_due_sample(now, newest);
   if (!fills_) {
     if (thins()) {
-      if (newest > next_) lose_up_to(newest);
+      leave_out(newest);
     } else if (newest > next_ && takes_long({next_, newest + 1})) {
       pass_over(newest, now);
     }
@@ -222,8 +227,10 @@ bool SamplePump::has_due_sample(MonoTime now, Tid newest) const noexcept {
 
 PumpWait SamplePump::wait_for_pace() noexcept {
   wake_at_ = connection_.history_due();
-  if (next_ > std::min(newest_untrusted(reader_), last_)) return PumpWait::pace;
-  wake_at_ = std::min(wake_at_, due_);  // a sample waits for its time
+  const Tid newest = newest_untrusted(reader_);
+  if (next_ > newest) return PumpWait::pace;
+  // One waits for its time, or comes after the last one.
+  if (next_ <= last_) wake_at_ = std::min(wake_at_, due_);
   return PumpWait::time;
 }
 
@@ -269,6 +276,17 @@ void SamplePump::pass_over(Tid next, MonoTime now) {
     behind_from_ = has_kept_up_ ? passed_over_.back().begin : next;  // history is no overload
   }
   give_up_what_is_never_carried(now);
+}
+
+// With a rate: those before sample `newest` are not sent, unless they are history.
+void SamplePump::leave_out(Tid newest) {
+  const Tid end = std::min(newest, plan_.caught_up_at + 1);
+  if (end > next_) {
+    if (back_fill_.count() > 0) passed_over_.push_back(std::exchange(back_fill_, {}));
+    passed_over_.push_back({next_, end});
+    next_ = end;
+  }
+  if (next_ < newest) lose_up_to(newest);
 }
 
 // How many samples wait that were passed over is measured again and again: when they become more,

@@ -81,8 +81,9 @@ class SamplePump {
     Tid first = 0;  // >= 0; may lie before what the ring holds (a gap), or in the future
     Tid caught_up_at = kNoTid;
     // > 0: at most so many samples per second: the newest one at each time. What is left out is no
-    // gap; with newest_first it is lost, and history comes as without a rate. Above 1000 the loop's
-    // timers, which count milliseconds, make it less when samples come faster than that.
+    // gap; with newest_first it is lost, but history, up to caught_up_at, comes as without a rate.
+    // Above 1000 the loop's timers, which count milliseconds, make it less when samples come faster
+    // than that.
     double max_rate_hz = 0;
     bool newest_first = false;
     // With newest_first: none of these is sent, the receiver has them.
@@ -124,6 +125,7 @@ class SamplePump {
   Tid first_within(std::size_t bytes, ring::TidRange range) const noexcept;
   bool takes_long(ring::TidRange samples) const noexcept;
   void pass_over(Tid next, MonoTime now);
+  void leave_out(Tid newest);
   void give_up_what_is_never_carried(MonoTime now);
   void limit_unsent(std::size_t bytes);
   void limit_unsent_by_network();

@@ -59,7 +59,7 @@ void Mirror::subscribe() {
   with_history_ = (wants_history() && is_known) || !newest_first_;
   net::Subscribe request;
   ring_->resume(newest_first_, with_history_, request);
-  max_rate_hz_ = newest_first_ ? parts_.mirrors.demand_for(id_).max_rate_hz : 0;
+  max_rate_hz_ = wanted_rate_hz();
   request.set_max_rate_hz(max_rate_hz_);
   channel_.subscribe(request);
 }
@@ -68,8 +68,12 @@ Result<void> Mirror::on_subscribed_untrusted(Tid first, bool newest_first, Tid o
   DSSM_TRY(ring_->on_subscribed_untrusted(first, newest_first, oldest));
   log_new_gap();
   last_error_.reset();
-  if (!with_history_ && wants_history()) subscribe();
+  if ((!with_history_ && wants_history()) || max_rate_hz_ != wanted_rate_hz()) subscribe();
   return {};
+}
+
+double Mirror::wanted_rate_hz() const noexcept {
+  return newest_first_ ? parts_.mirrors.demand_for(id_).max_rate_hz : 0;
 }
 
 bool Mirror::wants_history() const noexcept {
@@ -90,12 +94,9 @@ std::uint64_t Mirror::depth_for(const StreamInfo& theirs) const noexcept {
 }
 
 void Mirror::on_new_demand() {
-  const MirrorDemand demand = parts_.mirrors.demand_for(id_);
-  if (demand.history_at_once) want_history(false);
-  if (newest_first_ && demand.max_rate_hz != max_rate_hz_ &&
-      channel_.reading() >= ChannelClient::Reading::filling) {
-    subscribe();
-  }
+  if (parts_.mirrors.demand_for(id_).history_at_once) want_history(false);
+  const bool is_answered = channel_.reading() >= ChannelClient::Reading::filling;
+  if (is_answered && max_rate_hz_ != wanted_rate_hz()) subscribe();
 }
 
 Result<void> Mirror::on_caught_up() {

@@ -99,6 +99,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   }
   std::uint64_t depth_for(const StreamInfo& theirs) const noexcept;
   bool wants_history() const noexcept;
+  double wanted_rate_hz() const noexcept;
   void subscribe();
   bool is_filling() const noexcept;
   proto::Mirror::State shown_state() const noexcept;

@@ -83,7 +83,7 @@ Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first, T
   const bool is_whole = with_history_ || !newest_first;
   // What has no place in a ring that is shorter than the owner's is not awaited.
   const Tid depth = static_cast<Tid>(stream_->mapping().geometry().depth);
-  const Tid held = std::max(oldest, first - depth + 2);
+  const Tid held = std::max(oldest, std::max<Tid>(first, 0) - depth + 2);
   const Tid begin = is_whole ? first : std::clamp<Tid>(held, 0, std::max<Tid>(first, 0));
   wanted_from_ = is_whole ? 0 : first;
   if (!newest_first || next == kNoTid || slots_.newest() < 0) {

@@ -121,7 +121,7 @@ class StreamChannel final : private SamplePump::Observer,
   std::optional<std::uint64_t> clock_generation_;  // last sent, and with it:
   bool sent_other_clocks_ = false;
   Time sent_settled_from_{};
-  EventSource due_;  // for subscriptions with a highest rate
+  EventSource due_;  // for subscriptions with a highest rate, and for history's pace
 };
 
 }  // namespace dssm::daemon

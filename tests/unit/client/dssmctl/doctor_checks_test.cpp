@@ -414,13 +414,14 @@ TEST(Doctor, FindsStreamsOfOneNameAndNamesOnlySome) {
 
 TEST(Doctor, WarnsOfMirrorsThatTheNetworkCannotFill) {
   Facts facts = healthy();
-  EXPECT_TRUE(finding_of(facts, "mirrors").text.starts_with("no program here"));
+  EXPECT_TRUE(finding_of(facts, "mirrors").text.starts_with("no stream of another host"));
   StreamInfo& stream = facts.streams[1];
   stream.cycle = std::chrono::milliseconds(33);
   stream.rate_hz = 30;
   stream.newest = 1000;
   stream.newest_time = time_from_ns(10'000'000'000);
   stream.mirror.emplace();
+  stream.mirror->state = MirrorState::live;
   stream.mirror->newest = 999;
   stream.mirror->newest_time = time_from_ns(9'900'000'000);
   EXPECT_FINDING(facts, "mirrors", Status::ok, "");

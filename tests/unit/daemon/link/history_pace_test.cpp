@@ -38,16 +38,20 @@ class Network final : public wire::Transport {
   double most_per_tick = kBufferBytes;  // of TCP that is not up to speed yet
   double queued_bytes = 0;
   bool is_receivers = false;  // what limits
-  Duration round_trip = 100us;
+  Duration round_trip = 100us, queue_time{};
   bool knows = true;
+  bool has_history = true;
+  mutable int asked = 0;  // how often the pace looked
 
   std::optional<wire::Progress> progress() const noexcept override {
+    ++asked;
     if (!knows) return std::nullopt;
     constexpr std::uint32_t kPacketBytes = 1000;
     return wire::Progress{static_cast<std::uint32_t>(delivered_bytes_ / kPacketBytes),
                           kPacketBytes,
                           static_cast<std::uint64_t>(queued_bytes),
                           round_trip,
+                          round_trip + queue_time,
                           sending_,
                           is_receivers ? sending_ : Duration()};
   }
@@ -56,9 +60,11 @@ class Network final : public wire::Transport {
   double tick() {
     const double live = per_tick(live_bytes_per_s);
     pace_.on_sent(static_cast<std::size_t>(live));
-    const std::size_t allowed = pace_.allowance(now, {this, sent_bytes_, *this});
+    const std::size_t allowed =
+        has_history ? pace_.allowance(now, {this, sent_bytes_, *this}) : HistoryPace::kUnlimited;
     const double room = std::min(std::max(0.0, kBufferBytes - queued_bytes), most_per_tick);
-    const double history = std::floor(std::min(room, static_cast<double>(allowed)));
+    const double most = has_history ? std::min(room, static_cast<double>(allowed)) : 0;
+    const double history = std::floor(most);
     EXPECT_TRUE(allowed > 0 || pace_.due() > now);
     sent_bytes_ += static_cast<std::uint64_t>(history);
     pace_.on_sent(static_cast<std::size_t>(history));
@@ -132,7 +138,10 @@ TEST(HistoryPace, LeavesFastNetworksAlone) {
   HistoryPace pace;
   Network network(pace, 1.25 * HistoryPace::kFastBytesPerS);
   network.most_per_tick = per_tick(network.bytes_per_s);
+  network.run(100ms);
+  const int asked = network.asked;
   EXPECT_GE(network.run(1s), 0.99 * network.bytes_per_s);
+  EXPECT_EQ(network.asked, asked) << "it is measured";
 }
 
 TEST(HistoryPace, LeavesSlowReceiversAlone) {
@@ -140,7 +149,18 @@ TEST(HistoryPace, LeavesSlowReceiversAlone) {
   Network network(pace, 20e6);
   network.is_receivers = true;
   network.run(1s);
+  const int asked = network.asked;
   EXPECT_GE(network.run(1s), 0.99 * network.bytes_per_s) << "no other stream waits for it";
+  EXPECT_EQ(network.asked, asked) << "it is measured";
+}
+
+TEST(HistoryPace, TakesAFullNetworkForTheLimitAlsoWhereTheReceiverIsSlow) {
+  HistoryPace pace;
+  Network network(pace, 20e6);
+  network.is_receivers = true;
+  network.queue_time = 2 * HistoryPace::kQueued;
+  network.run(1s);
+  EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 20e6, 1e6);
 }
 
 TEST(HistoryPace, IsNoneWhereNothingIsKnown) {
@@ -148,6 +168,7 @@ TEST(HistoryPace, IsNoneWhereNothingIsKnown) {
   Network network(pace, 20e6);
   network.knows = false;
   network.run(1s);
+  EXPECT_EQ(network.asked, 1);
   EXPECT_GE(network.run(1s), 0.99 * network.bytes_per_s);
 }
 
@@ -175,13 +196,63 @@ TEST(HistoryPace, ForgivesAPause) {
   EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 40e6, 1e6);
 }
 
+// Two connections share a network that needs longer for a window than they wait for each other.
+TEST(HistoryPace, IsMeasuredByOneConnectionAtATime) {
+  HistoryPace pace;
+  Network first(pace, 0.5e6), second(pace, 0.5e6);
+  double history = 0;
+  for (int tick = 0; tick < 10'000; ++tick) {
+    const double sent = first.run(kTick) + second.run(kTick);
+    if (tick >= 8000) history += sent * std::chrono::duration<double>(kTick).count() / 2;
+  }
+  EXPECT_NEAR(history, HistoryPace::kShare * 1e6, 0.1e6);
+}
+
 TEST(HistoryPace, IsMeasuredByAnotherConnectionWhenTheFirstOneHasNoMore) {
   HistoryPace pace;
   Network first(pace, 10e6), second(pace, 10e6);
   first.run(5ms);
   second.now = first.now;
-  second.run(1s);
+  second.run(HistoryPace::kMaxWindow + 500ms);
   EXPECT_NEAR(second.run(1s), HistoryPace::kShare * 10e6, 1e6);
+}
+
+TEST(HistoryPace, IsMeasuredByAnotherConnectionWhenTheFirstOneEnds) {
+  HistoryPace pace;
+  Network first(pace, 10e6), second(pace, 10e6);
+  first.run(5ms);
+  pace.forget(&first);
+  second.now = first.now;
+  second.run(500ms);
+  EXPECT_NEAR(second.run(1s), HistoryPace::kShare * 10e6, 1e6);
+}
+
+// The time without history is no time in which the network carried little.
+TEST(HistoryPace, CountsOnlyTheTimeInWhichThereIsHistory) {
+  for (const Duration pause : {Duration(500ms), Duration(30s)}) {
+    for (const Duration first : {Duration(3ms), Duration(12ms), Duration(25ms), Duration(40ms)}) {
+      HistoryPace pace;
+      Network network(pace, 10e6);
+      network.run(first);
+      network.has_history = false;
+      network.run(pause);
+      network.has_history = true;
+      network.run(1s);
+      EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 10e6, 1e6) << first / 1ms;
+    }
+  }
+}
+
+TEST(HistoryPace, CountsHistoryOnceThatIsQueued) {
+  HistoryPace pace;
+  Network network(pace, 10e6);
+  network.run(2s);
+  network.has_history = false;
+  pace.on_history(2'000'000);  // waits to be sent
+  network.run(100ms);
+  pace.on_sent(2'000'000);
+  network.has_history = true;
+  EXPECT_NEAR(network.run(1s) + 2e6, HistoryPace::kShare * 11e6, 1e6);
 }
 
 }  // namespace
