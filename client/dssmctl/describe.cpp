@@ -30,6 +30,7 @@ Json mirror_json(const MirrorInfo& mirror) {
           {"history_wanted", mirror.history_wanted},
           {"recent_samples", mirror.recent_samples},
           {"recent_lost_samples", mirror.recent_lost_samples},
+          {"depth", mirror.depth > 0 ? Json(mirror.depth) : Json()},
           {"max_rate_hz", mirror.max_rate_hz > 0 ? Json(mirror.max_rate_hz) : Json()},
           {"reconnects", mirror.reconnects},
           {"restarts", mirror.restarts},
@@ -147,12 +148,19 @@ Duration behind_owner(const StreamInfo& stream) {
 }
 
 std::string carried_text(const StreamInfo& stream) {
-  const bool is_wanted = stream.mirror && stream.mirror->max_rate_hz > 0;
-  if (!stream.mirror || is_wanted || stream.mirror->recent_lost_samples == 0) return {};
+  if (!stream.mirror || stream.mirror->recent_lost_samples == 0) return {};
   const double share = 1 - static_cast<double>(stream.mirror->recent_lost_samples) /
                                static_cast<double>(stream.mirror->recent_samples);
-  return fmt::format("carries {:.3g} of {:.3g} samples a second", share * stream.rate_hz,
-                     stream.rate_hz);
+  const double carried_hz = share * stream.rate_hz;
+  const double max_rate_hz = stream.mirror->max_rate_hz;
+  if (max_rate_hz == 0) {
+    return fmt::format("carries {:.3g} of {:.3g} samples a second", carried_hz, stream.rate_hz);
+  }
+  constexpr double kClearly = 0.8;  // the rate is one of timers
+  const double wanted_hz = std::min(max_rate_hz, stream.rate_hz);
+  if (carried_hz >= kClearly * wanted_hz) return {};
+  return fmt::format("carries {:.3g} of the {:.3g} samples a second that are asked for", carried_hz,
+                     wanted_hz);
 }
 
 std::string_view role_name(Role role) { return role == Role::writer ? "writer" : "reader"; }

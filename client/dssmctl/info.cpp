@@ -74,6 +74,9 @@ void print_mirror(const StreamInfo& stream, const MirrorInfo& mirror, Output& ou
   if (const std::string carried = carried_text(stream); !carried.empty()) {
     add_line(out, "network", carried + "; the others are missing");
   }
+  if (mirror.depth > 0 && mirror.depth < stream.depth) {
+    add_line(out, "keeps", fmt::format("{} slots here (key mirror_streams)", mirror.depth));
+  }
   if (mirror.max_rate_hz > 0) {
     add_line(
         out, "takes",

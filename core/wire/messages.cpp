@@ -35,7 +35,8 @@ MirrorInfo mirror_info(const proto::Mirror& message) {
           message.history_wanted(),
           message.recent_samples(),
           message.recent_lost_samples(),
-          message.max_rate_hz()};
+          message.max_rate_hz(),
+          message.depth()};
 }
 
 }  // namespace

@@ -168,7 +168,7 @@ void FrameConnection::resume() {
 
 void FrameConnection::send(const net::Frame& frame) {
   if (closed_ || output_.lost) return;
-  Outgoing outgoing{wire::encode_frame(frame), 0, true, {}};
+  Outgoing outgoing{wire::encode_frame(frame), 0, true, {}, false};
   const std::size_t bytes = outgoing.unsent().size();
   if (output_.queue.empty() && !output_.mid_frame) {
     const iovec part = part_of(outgoing.unsent());
@@ -208,7 +208,7 @@ void FrameConnection::send(const net::Frame& frame) {
 
 void FrameConnection::queue_rest(RawBytes bytes, MemoryShare share) {
   if (closed_ || output_.lost) return;
-  Outgoing outgoing{std::move(bytes), 0, false, std::move(share)};
+  Outgoing outgoing{std::move(bytes), 0, false, std::move(share), false};
   if (!output_.mid_frame) return enqueue(std::move(outgoing));
   // The frame that it completes is sent in pieces: before the queue.
   output_.queue.push_front(std::move(outgoing));
@@ -283,8 +283,9 @@ std::size_t FrameConnection::history_allowance() {
 void FrameConnection::on_history_sent(std::uint64_t since_sent_bytes, bool is_full) {
   if (!pace_) return;
   std::uint64_t bytes = sent_bytes_ - since_sent_bytes;
-  for (const Outgoing& waiting : output_.queue) {
-    if (!waiting.counted) bytes += waiting.unsent().size();
+  for (Outgoing& waiting : output_.queue) {
+    if (waiting.counted || std::exchange(waiting.is_history, true)) continue;
+    bytes += waiting.unsent().size();
   }
   pace_->on_history(bytes);
   if (is_full) pace_->on_full();
@@ -294,10 +295,17 @@ void FrameConnection::on_history_sent(std::uint64_t since_sent_bytes, bool is_fu
 // continues until the end of the input.
 void FrameConnection::lose_output() {
   output_.lost = true;
-  output_.queue.clear();
+  drop_queue();
   output_.queued_bytes = 0;
   writable_.disable();
   if (input_.paused) close(last_error_);
+}
+
+void FrameConnection::drop_queue() {
+  for (const Outgoing& waiting : output_.queue) {
+    if (pace_ && waiting.is_history) pace_->on_history_dropped(waiting.unsent().size());
+  }
+  output_.queue.clear();
 }
 
 void FrameConnection::close_with(const Error& why) {
@@ -318,7 +326,7 @@ void FrameConnection::close(const Error& why) {
   readable_.disable();
   writable_.disable();
   next_turn_.disable();
-  output_.queue.clear();
+  drop_queue();
   input_.share = {};
   transport_.reset();
   ended_.enable_in(Duration::zero());

@@ -172,6 +172,7 @@ class FrameConnection final : private wire::FrameDelegate {
     std::size_t sent = 0;
     bool counted = false;  // against max_queued_bytes_
     MemoryShare share;
+    bool is_history = false;  // on_history_sent() has counted it
 
     std::span<const std::byte> unsent() const noexcept;
   };
@@ -202,6 +203,7 @@ class FrameConnection final : private wire::FrameDelegate {
   bool flush();
   void enqueue(Outgoing outgoing);
   void lose_output();
+  void drop_queue();
   void close(const Error& why);
 
   const EventLoop& loop_;

@@ -33,6 +33,11 @@ void HistoryPace::on_history(std::size_t bytes) noexcept {
   tokens_ -= static_cast<double>(bytes);
 }
 
+void HistoryPace::on_history_dropped(std::size_t bytes) noexcept {
+  history_bytes_ -= bytes;
+  tokens_ += static_cast<double>(bytes);
+}
+
 void HistoryPace::forget(const void* connection) noexcept {
   if (state_ == State::measuring && window_.connection == connection) state_ = State::unknown;
 }
@@ -88,8 +93,10 @@ void HistoryPace::end_window(MonoTime now, const Connection& connection) {
   const std::uint64_t enough = (is_last_window() ? kLastWindows : 1) * kWindowBytes;
   if (bytes < enough && length < kMaxWindow) return;
   const Duration sending = progress->sending - before.sending;
-  if (++windows_ < kMaxWindows && sending + kCoarse < length / 2) {
-    return begin_window(now, connection, *progress);  // there was too little to send
+  ++windows_;
+  if (sending + kCoarse < length / 2) {  // there was too little to send
+    if (windows_ < kMaxWindows) return begin_window(now, connection, *progress);
+    return set_rate(now, kFastBytesPerS, 0);
   }
   const double bytes_per_s = static_cast<double>(bytes) / seconds(length);
   // Where packets wait in the network, that is what limits, although the receiver may be slow, too.

@@ -68,6 +68,8 @@ class HistoryPace {
   void on_sent(std::size_t bytes) noexcept { sent_bytes_ += bytes; }
   // So much of what was sent, or will be because it is queued, is history.
   void on_history(std::size_t bytes) noexcept;
+  // It was queued, and will not be sent.
+  void on_history_dropped(std::size_t bytes) noexcept;
   // The connection took less of the history than it was allowed to.
   void on_full() noexcept { is_full_ = true; }
   // The connection with that id has ended.

@@ -61,7 +61,8 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       status = sender_.go_on(haste);
       bytes += SampleSender::kSliceBytes;
     } else if (only_under_way) {
-      break;
+      sender_.end_run();
+      return connection_.output_empty() ? PumpWait::turn : PumpWait::output;
     } else {
       const Next next = choose_next(now);
       if (next != Next::ready) sender_.end_run();

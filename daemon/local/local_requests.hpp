@@ -62,7 +62,7 @@ class Fleet {
 
   // The mirror of a stream, with its newest sample. Kept while its Stream is in the OpenTable, and
   // some seconds longer.
-  //   history  filled with all that its owner's ring holds
+  //   history  filled with what its owner's ring holds, as far as it has a place
   virtual void open_reader(const StreamId& id, bool history,
                            Then<std::shared_ptr<Stream>> then) = 0;
   // A program reads what is missing in the mirror of that stream; there may be none.

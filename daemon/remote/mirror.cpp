@@ -44,7 +44,7 @@ Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
     stop(followed.error(), false);
     return {};
   }
-  is_removed_ = false;
+  is_removed_ = is_subscribed_ = false;
   connection_.frames()->take_samples(theirs.type.payload_bytes, *this);
   ++subscriptions_;
   subscribe();
@@ -54,8 +54,8 @@ Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
 }
 
 void Mirror::subscribe() {
-  // Which samples have a place in an empty ring that is shorter, only the newest one tells.
-  const bool is_known = !is_shorter_ || ring_->knows_newest();
+  // Which samples have a place in a ring that is shorter, only the owner's newest one tells.
+  const bool is_known = !is_shorter_ || is_subscribed_;
   with_history_ = (wants_history() && is_known) || !newest_first_;
   net::Subscribe request;
   ring_->resume(newest_first_, with_history_, request);
@@ -66,6 +66,7 @@ void Mirror::subscribe() {
 
 Result<void> Mirror::on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest) {
   DSSM_TRY(ring_->on_subscribed_untrusted(first, newest_first, oldest));
+  is_subscribed_ = true;
   log_new_gap();
   last_error_.reset();
   if ((!with_history_ && wants_history()) || max_rate_hz_ != wanted_rate_hz()) subscribe();
@@ -84,6 +85,13 @@ void Mirror::want_history(bool always) {
   history_always_ |= always;
   history_wanted_ = true;
   if (!with_history_ && channel_.reading() >= ChannelClient::Reading::filling) subscribe();
+}
+
+std::string_view Mirror::gap_reason() const noexcept {
+  return is_shorter_
+             ? "the network did not carry them in time, or more were written meanwhile than "
+               "this PC keeps; keep more history here (key mirror_streams)"
+             : "";
 }
 
 std::uint64_t Mirror::depth_for(const StreamInfo& theirs) const noexcept {
@@ -300,6 +308,7 @@ void Mirror::describe(proto::Mirror& out) const {
   if (last_error_) out.set_error(last_error_->message);
   out.set_clock(clock_.reason());
   if (!ring_) return;
+  out.set_depth(ring_->stream()->mapping().geometry().depth);
   out.set_newest_time_ns(to_ns(ring_->newest_time()));
   out.set_filling_samples(ring_->filling_samples());
   out.set_history_wanted(with_history_ || wants_history());

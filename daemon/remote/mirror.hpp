@@ -95,8 +95,9 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   void log_new_gap() {
     const std::uint64_t lost = ring_->gap_samples();
     const std::uint64_t before = std::exchange(logged_gap_, lost);
-    if (lost != before && max_rate_hz_ == 0) log_gap(lost - before);
+    if (lost != before && max_rate_hz_ == 0) log_gap(lost - before, gap_reason());
   }
+  std::string_view gap_reason() const noexcept;
   std::uint64_t depth_for(const StreamInfo& theirs) const noexcept;
   bool wants_history() const noexcept;
   double wanted_rate_hz() const noexcept;
@@ -106,10 +107,11 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
 
   bool newest_first_ = false;  // the owner has that feature
   bool history_wanted_ = false, history_always_ = false;
-  bool with_history_ = false;  // the present subscription, and
-  double max_rate_hz_ = 0;     // its rate; 0: all samples
-  bool is_shorter_ = false;    // the ring, than the owner's
-  bool is_ending_ = false;     // live, but the catalog knows that this ring was removed
+  bool with_history_ = false;   // the present subscription, and
+  double max_rate_hz_ = 0;      // its rate; 0: all samples
+  bool is_shorter_ = false;     // the ring, than the owner's
+  bool is_subscribed_ = false;  // on this connection
+  bool is_ending_ = false;      // live, but the catalog knows that this ring was removed
   MirrorClock clock_;
   bool in_batch_ = false;  // samples have come, and on_batch_end() has not
   std::unique_ptr<MirrorRing> ring_;

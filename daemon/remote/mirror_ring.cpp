@@ -67,9 +67,9 @@ void MirrorRing::resume(bool newest_first, bool with_history, net::Subscribe& ou
     out.set_from_newest(true);
   } else if (has_hole) {
     out.set_from_tid(std::max(hole.begin, reader_.oldest()));
-  } else {
-    return;
   }
+  if (out.has_from_tid()) out.set_from_tid(std::max<Tid>(out.from_tid(), has_place_from_));
+  if (!has_hole && with_history_) return;
   if (slots_.newest() < 0) return;
   out.set_incarnation(stream_->incarnation());
   out.set_held_from(has_hole ? hole.end : reader_.oldest());
@@ -83,7 +83,8 @@ Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first, T
   const bool is_whole = with_history_ || !newest_first;
   // What has no place in a ring that is shorter than the owner's is not awaited.
   const Tid depth = static_cast<Tid>(stream_->mapping().geometry().depth);
-  const Tid held = std::max(oldest, std::max<Tid>(first, 0) - depth + 2);
+  if (!is_whole) has_place_from_ = std::clamp<Tid>(first, 0, channel::kMaxTid) - depth + 2;
+  const Tid held = std::max(oldest, has_place_from_);
   const Tid begin = is_whole ? first : std::clamp<Tid>(held, 0, std::max<Tid>(first, 0));
   wanted_from_ = is_whole ? 0 : first;
   if (!newest_first || next == kNoTid || slots_.newest() < 0) {
@@ -256,6 +257,8 @@ void MirrorRing::publish_after_gap(const SampleInfo& info) noexcept {
   }
   slots_.publish(info);
   if (are_lost) return;
+  const Tid depth = static_cast<Tid>(stream_->mapping().geometry().depth);
+  count_what_is_passed_over({std::max(begin, wanted_from_), info.tid - depth + 2});
   for (const ring::TidRange& lost : lost_ahead_) {
     const Tid first = std::max(lost.begin, begin), end = std::min(lost.end, info.tid);
     if (first >= end) continue;
@@ -263,6 +266,17 @@ void MirrorRing::publish_after_gap(const SampleInfo& info) noexcept {
     slots_.lose_in_hole(first, end);
     late_pending_ = true;
   }
+}
+
+// Samples that have no place any more when they come. Those that were reported as lost count there.
+void MirrorRing::count_what_is_passed_over(ring::TidRange range) noexcept {
+  if (range.begin >= range.end) return;
+  Tid samples = range.end - range.begin;
+  for (const ring::TidRange& lost : lost_ahead_) {
+    const Tid begin = std::max(lost.begin, range.begin), end = std::min(lost.end, range.end);
+    samples -= std::max<Tid>(end - begin, 0);
+  }
+  lost_late_ += static_cast<std::uint64_t>(samples);
 }
 
 [[gnu::hot]] void MirrorRing::wake() noexcept {

@@ -54,9 +54,6 @@ class MirrorRing {
   // The owner will not send what is missing in the hole: it counts as lost.
   void end_filling() noexcept;
 
-  // Whether the newest sample is here, or the owner has said which one it is.
-  bool knows_newest() const noexcept { return cursor_.next() != kNoTid; }
-
   // As in SampleCursor.
   Result<void> on_subscribed_untrusted(Tid first, bool newest_first, Tid oldest);
   Result<void> on_gap_untrusted(Tid first, std::uint64_t count);
@@ -102,6 +99,7 @@ class MirrorRing {
   void lose_ahead(ring::TidRange range);
   void count_what_leaves(Tid tid) noexcept;
   void publish_after_gap(const SampleInfo& info) noexcept;
+  void count_what_is_passed_over(ring::TidRange range) noexcept;
   void allocate_aside(std::size_t bytes);
   void drop_aside() noexcept;
 
@@ -115,6 +113,7 @@ class MirrorRing {
   bool newest_first_ = false;               // the owner sends so
   bool with_history_ = true;                // the present request
   Tid wanted_from_ = 0;                     // earlier ones do not count as lost: not asked for
+  Tid has_place_from_ = 0;                  // when the owner last said which one is its newest
   Tid begins_at_ = 0;                       // an empty ring: earlier ones were never asked for
   std::vector<ring::TidRange> lost_ahead_;  // of those after the newest one here; rising
   bool is_dropped_ = false;             // the sample in the hole that arrives, which is not missing

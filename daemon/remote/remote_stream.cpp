@@ -253,12 +253,12 @@ bool RemoteStream::clear_error() {
   return std::exchange(error_logged_, false);
 }
 
-void RemoteStream::log_gap(std::uint64_t samples) {
+void RemoteStream::log_gap(std::uint64_t samples, std::string_view reason) {
   gap_samples_ += samples;
   const auto unlogged = gap_lines_.admit(parts_.loop.now(), samples);
   if (!unlogged) return;
   parts_.logger.warning(fmt::format("stream '{}' lacks {} samples, {} in all: {}", name_, *unlogged,
-                                    gap_samples_, kind_.gap_reason),
+                                    gap_samples_, reason.empty() ? kind_.gap_reason : reason),
                         log_fields());
 }
 

@@ -244,7 +244,8 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   bool clear_error();
   // `samples` more will never be in the ring. At most one line in kGapLinePeriod: a connection that
   // is too slow for its stream loses samples all the time.
-  void log_gap(std::uint64_t samples);
+  //   reason  why, and what to do; empty: the one of this kind
+  void log_gap(std::uint64_t samples, std::string_view reason = {});
 
   const ChannelParts& parts_;
   const StreamId id_;

@@ -76,7 +76,8 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
   }
   waiting_ = std::move(frame);
   link_.pause();
-  // Otherwise work_now() serves it when what is in progress ends: soon, if that is history.
+  // Otherwise work_now() serves it when what is in progress ends. History does not keep its pace
+  // then.
   if (can_serve() || (channel_ && channel_->busy())) work_soon();
   return {};
 }

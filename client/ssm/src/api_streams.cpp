@@ -128,7 +128,9 @@ int getSSM_info(const char* stream_name, int stream_id, size_t* size, int* num, 
   if (!info) return -1;
   const std::uint64_t bytes = dssm::ssm::data_bytes(info->type);
   if (size) *size = bytes;
-  if (num) *num = static_cast<int>(info->depth);
+  // Of another host's stream, what can be read here.
+  const bool has_own = info->mirror && info->mirror->depth > 0;
+  if (num) *num = static_cast<int>(has_own ? info->mirror->depth : info->depth);
   if (cycle) *cycle = dssm::ssm::seconds_from_ns(dssm::to_ns(info->cycle));
   if (property_size) *property_size = info->property_bytes;
   return static_cast<int>(bytes);

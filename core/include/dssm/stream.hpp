@@ -135,8 +135,9 @@ std::string_view name_of(MirrorState state) noexcept;
 // The state of this PC's mirror of another host's stream.
 struct MirrorInfo {
   MirrorState state = MirrorState::unknown;
-  std::uint64_t gap_samples = 0;  // lost: the owner's ring no longer held them, or the network
-                                  // carried less than the stream has
+  // Lost: the owner's ring no longer held them, the network carried less than the stream has, more
+  // were written than a shorter ring here holds, or max_rate_hz left them out.
+  std::uint64_t gap_samples = 0;
   std::uint64_t reconnects = 0;
   std::uint64_t restarts = 0;  // times the owner's ring was replaced by a new one
   Tid newest = kNoTid;         // newest sample in the mirror
@@ -154,6 +155,7 @@ struct MirrorInfo {
   // So many samples a second it takes at most (dssmd's key mirror_streams), and those that it
   // leaves out count as lost. 0: all.
   double max_rate_hz = 0;
+  std::uint64_t depth = 0;  // of its ring; 0: there is none yet
 };
 
 // The present state of a stream. For a stream of another host, pids and users are those of its

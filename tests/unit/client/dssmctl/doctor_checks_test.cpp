@@ -432,6 +432,12 @@ TEST(Doctor, WarnsOfMirrorsThatTheNetworkCannotFill) {
   stream.mirror->recent_lost_samples = 57;
   EXPECT_EQ(finding_of(facts, "mirrors").text,
             "'odom:0@pc2': the network carries 11 of 30 samples a second");
+  stream.mirror->max_rate_hz = 10;
+  stream.mirror->newest_time = stream.newest_time;
+  EXPECT_FINDING(facts, "mirrors", Status::ok, "");
+  stream.mirror->recent_lost_samples = 75;
+  EXPECT_EQ(finding_of(facts, "mirrors").text,
+            "'odom:0@pc2': the network carries 5 of the 10 samples a second that are asked for");
 }
 
 }  // namespace

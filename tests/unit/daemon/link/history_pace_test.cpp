@@ -255,5 +255,15 @@ TEST(HistoryPace, CountsHistoryOnceThatIsQueued) {
   EXPECT_NEAR(network.run(1s) + 2e6, HistoryPace::kShare * 11e6, 1e6);
 }
 
+TEST(HistoryPace, CountsHistoryNoMoreThatWillNotBeSent) {
+  HistoryPace pace;
+  Network network(pace, 10e6);
+  network.run(2s);
+  pace.on_history(20'000'000);
+  EXPECT_EQ(network.run(100ms), 0);
+  pace.on_history_dropped(20'000'000);
+  EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 10e6, 1e6);
+}
+
 }  // namespace
 }  // namespace dssm::daemon

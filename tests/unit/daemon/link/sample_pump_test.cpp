@@ -750,8 +750,15 @@ TEST_F(PacedHistory, LetsAnotherUserOfTheConnectionSend) {
     pass(rig.pump->due() - rig.loop.now());
     ASSERT_EQ(rig.run_on(), PumpWait::pace);
   } while (!rig.sender.busy());
-  for (int turns = 0; turns < 2; ++turns) EXPECT_TRUE(rig.pump->pump(kStart, true));
+  rig.peer.room = 100;  // the rest is copied aside
+  for (int turns = 0; turns < 3 && rig.sender.busy(); ++turns) {
+    EXPECT_TRUE(rig.pump->pump(kStart, true));
+  }
   EXPECT_FALSE(rig.sender.busy());
+  EXPECT_EQ(*rig.pump->pump(kStart, true), PumpWait::output) << "not another turn";
+  rig.peer.room = MemoryPeer::kAll;
+  while (!rig.link.output_empty()) run_turns(rig.loop);
+  EXPECT_EQ(*rig.pump->pump(kStart, true), PumpWait::turn);
 }
 
 TEST_F(PacedHistory, WaitsOnlyForItsTimeWhenTheStreamWasRemoved) {

@@ -316,6 +316,34 @@ TEST_F(NewestFirstTest, WhatIsPassedOverAndLostIsMissedAlsoWithoutHistory) {
   EXPECT_EQ(ring->gap_samples(), 4u) << "also 13 and 14, but none before 9";
 }
 
+// The owner's ring holds more than this one.
+TEST_F(NewestFirstTest, WhatHasNoPlaceInAShorterRingIsNotAskedFor) {
+  EXPECT_TRUE(request(false).from_newest());
+  ASSERT_TRUE(ring->on_subscribed_untrusted(1000, true, 0));
+  EXPECT_EQ(request().from_tid(), 1000 - 14);
+  ASSERT_TRUE(take(1000));
+  ASSERT_TRUE(ring->on_subscribed_untrusted(1000 - 14, true, 0));
+  for (Tid tid = 1000 - 14; tid < 1000; ++tid) ASSERT_TRUE(take(tid));
+  ring->wake();
+  EXPECT_TRUE(reader.hole().is_empty());
+  EXPECT_EQ(ring->gap_samples(), 0u);
+  // After a cut.
+  EXPECT_TRUE(request(false).from_newest());
+  ASSERT_TRUE(ring->on_subscribed_untrusted(2000, true, 0));
+  EXPECT_EQ(request().from_tid(), 2000 - 14);
+  ASSERT_TRUE(take(2000));
+  EXPECT_EQ(ring->gap_samples(), 0u) << "nobody had asked for 1001 to 1985";
+}
+
+TEST_F(NewestFirstTest, WhatIsPassedOverAndHasNoPlaceAnyMoreIsMissed) {
+  ASSERT_TRUE(ring->on_subscribed_untrusted(0, true, 0));
+  ASSERT_TRUE(take(0));
+  ASSERT_TRUE(ring->on_gap_untrusted(10, 5));
+  ASSERT_TRUE(take(100));
+  EXPECT_EQ(ring->gap_samples(), 85u) << "1 to 85, 10 to 14 of them once";
+  EXPECT_EQ(reader.oldest(), 86);
+}
+
 TEST_F(NewestFirstTest, HistoryMayBeWantedBeforeTheNewestOneHasCome) {
   EXPECT_TRUE(request(false).from_newest());
   ASSERT_TRUE(ring->on_subscribed_untrusted(9, true, 2));
