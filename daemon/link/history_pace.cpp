@@ -58,7 +58,7 @@ bool HistoryPace::is_valid(MonoTime now) noexcept {
 void HistoryPace::measure(MonoTime now, const Connection& connection) {
   const std::optional<wire::Progress> progress = connection.transport.progress();
   begun_ = now;
-  windows_ = flat_windows_ = 0;
+  windows_ = flat_windows_ = void_windows_ = 0;
   last_bytes_per_s_ = 0;
   if (!progress) return set_rate(now, kFastBytesPerS, 0);
   state_ = State::measuring;
@@ -94,8 +94,10 @@ void HistoryPace::end_window(MonoTime now, const Connection& connection) {
   if (bytes < enough && length < kMaxWindow) return;
   const Duration sending = progress->sending - before.sending;
   ++windows_;
-  if (sending + kCoarse < length / 2) {  // there was too little to send
-    if (windows_ < kMaxWindows) return begin_window(now, connection, *progress);
+  // Otherwise this PC is what limits, or there is too little history.
+  const bool was_full = before.unsent_bytes > 0 && progress->unsent_bytes > 0;
+  if (!was_full || sending + kCoarse < length / 2) {
+    if (++void_windows_ < kMaxVoidWindows) return begin_window(now, connection, *progress);
     return set_rate(now, kFastBytesPerS, 0);
   }
   const double bytes_per_s = static_cast<double>(bytes) / seconds(length);

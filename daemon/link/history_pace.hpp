@@ -13,7 +13,7 @@
 //   paced      history gets kShare of that, without what live samples take of it, but at least
 //              kLeastShare. Measured again after kMinValid to kMaxValid, and when a connection has
 //              not taken what it was allowed to for kTooFull of kPeriod
-//   unlimited  the network is fast, or the receiver is what limits
+//   unlimited  the network is fast, or one of the two PCs is what limits
 //
 // The host's connections share one, in the loop's thread.
 #pragma once
@@ -37,6 +37,7 @@ class HistoryPace {
   static constexpr Duration kMaxWindow = std::chrono::seconds(1);
   static constexpr double kGrows = 1.25;  // a window that carries so much more than the one before
   static constexpr int kMaxWindows = 100, kLastWindows = 3;
+  static constexpr int kMaxVoidWindows = 20;  // in which the connection was not always full
   // Times of TCP are that coarse; packets that take so much longer than the quickest wait in a
   // queue.
   static constexpr Duration kCoarse = std::chrono::milliseconds(10);
@@ -100,7 +101,7 @@ class HistoryPace {
   MonoTime begun_{};        // when measuring was
   MonoTime valid_until_{};  // what was found
   Window window_;
-  int windows_ = 0, flat_windows_ = 0;
+  int windows_ = 0, flat_windows_ = 0, void_windows_ = 0;
   double last_bytes_per_s_ = 0, bytes_per_s_ = 0;
   double tokens_ = 0;  // bytes of history that may be sent; < 0 after more
   MonoTime refilled_{}, due_{};

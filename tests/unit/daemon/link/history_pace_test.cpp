@@ -38,6 +38,7 @@ class Network final : public wire::Transport {
   double most_per_tick = kBufferBytes;  // of TCP that is not up to speed yet
   double queued_bytes = 0;
   bool is_receivers = false;  // what limits
+  bool is_full = true;        // else it is this PC
   Duration round_trip = 100us, queue_time{};
   bool knows = true;
   bool has_history = true;
@@ -50,6 +51,7 @@ class Network final : public wire::Transport {
     return wire::Progress{static_cast<std::uint32_t>(delivered_bytes_ / kPacketBytes),
                           kPacketBytes,
                           static_cast<std::uint64_t>(queued_bytes),
+                          is_full ? static_cast<std::uint64_t>(queued_bytes) + 1 : 0,
                           round_trip,
                           round_trip + queue_time,
                           sending_,
@@ -151,6 +153,16 @@ TEST(HistoryPace, LeavesSlowReceiversAlone) {
   network.run(1s);
   const int asked = network.asked;
   EXPECT_GE(network.run(1s), 0.99 * network.bytes_per_s) << "no other stream waits for it";
+  EXPECT_EQ(network.asked, asked) << "it is measured";
+}
+
+TEST(HistoryPace, LeavesSlowSendersAlone) {
+  HistoryPace pace;
+  Network network(pace, 20e6);
+  network.is_full = false;
+  network.run(1s);
+  const int asked = network.asked;
+  EXPECT_GE(network.run(1s), 0.99 * network.bytes_per_s);
   EXPECT_EQ(network.asked, asked) << "it is measured";
 }
 

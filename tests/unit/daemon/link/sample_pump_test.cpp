@@ -697,6 +697,7 @@ class PacedHistory : public testing::Test {
     rig.write(3);
     rig.link.set_pace(pace);
     rig.peer.progress.emplace().packet_bytes = 1000;
+    rig.peer.progress->unsent_bytes = 1;
     MemoryTransport transport(rig.peer);
     for (const Duration ago : {410ms, 340ms, 270ms, 200ms, 0ms}) {
       rig.peer.progress->delivered_packets = static_cast<std::uint32_t>((410ms - ago) / 1ms);
