@@ -131,7 +131,6 @@ class TcpTransport final : public Transport {
     return Progress{info->tcpi_delivered,
                     info->tcpi_snd_mss,
                     info->tcpi_notsent_bytes + unacknowledged,
-                    info->tcpi_notsent_bytes,
                     microseconds(info->tcpi_min_rtt),
                     microseconds(info->tcpi_rtt),
                     microseconds(info->tcpi_busy_time),

@@ -61,7 +61,6 @@ struct Progress {
   std::uint32_t delivered_packets = 0;  // since the connection began; may begin anew at 0
   std::uint32_t packet_bytes = 0;
   std::uint64_t waiting_bytes = 0;          // not sent, or not acknowledged
-  std::uint64_t unsent_bytes = 0;           // of these; 0: there was too little to send
   Duration round_trip{}, round_trip_now{};  // the least of late; smoothed
   // Since the connection began:
   Duration sending{};           // so long some were on their way or waited to be sent

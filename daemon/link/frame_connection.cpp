@@ -288,7 +288,7 @@ void FrameConnection::on_history_sent(std::uint64_t since_sent_bytes, bool is_fu
     bytes += waiting.unsent().size();
   }
   pace_->on_history(bytes);
-  if (is_full) pace_->on_full();
+  if (is_full) pace_->on_full(this);
 }
 
 // The peer may have sent its reason before it closed: that is still to be received, so receiving

@@ -38,6 +38,11 @@ void HistoryPace::on_history_dropped(std::size_t bytes) noexcept {
   tokens_ += static_cast<double>(bytes);
 }
 
+void HistoryPace::on_full(const void* connection) noexcept {
+  is_full_ = true;
+  if (connection == window_.connection) window_.is_full = true;
+}
+
 void HistoryPace::forget(const void* connection) noexcept {
   if (state_ == State::measuring && window_.connection == connection) state_ = State::unknown;
 }
@@ -68,8 +73,14 @@ void HistoryPace::measure(MonoTime now, const Connection& connection) {
 void HistoryPace::begin_window(MonoTime now, const Connection& connection,
                                const wire::Progress& progress) {
   const Duration length = std::clamp(progress.round_trip, kWindow, kMaxWindow);
-  window_ = {connection.id, now,         now + (is_last_window() ? kLastWindows : 1) * length,
-             now,           sent_bytes_, connection.sent_bytes,
+  window_ = {connection.id,
+             now,
+             now + (is_last_window() ? kLastWindows : 1) * length,
+             now,
+             {},
+             false,
+             sent_bytes_,
+             connection.sent_bytes,
              progress};
 }
 
@@ -77,6 +88,9 @@ void HistoryPace::go_on_measuring(MonoTime now, const Connection& connection) {
   // It has no more history, or the network is interrupted.
   if (now - window_.heard > kMaxWindow) return measure(now, connection);
   if (window_.connection != connection.id) return;
+  if (std::exchange(window_.is_full, false)) {
+    window_.full_for += std::min(now - window_.heard, kMaxFull);
+  }
   window_.heard = now;
   if (now >= window_.end) end_window(now, connection);
 }
@@ -92,17 +106,16 @@ void HistoryPace::end_window(MonoTime now, const Connection& connection) {
   const Duration length = now - window_.begin;
   const std::uint64_t enough = (is_last_window() ? kLastWindows : 1) * kWindowBytes;
   if (bytes < enough && length < kMaxWindow) return;
-  const Duration sending = progress->sending - before.sending;
   ++windows_;
   // Otherwise this PC is what limits, or there is too little history.
-  const bool was_full = before.unsent_bytes > 0 && progress->unsent_bytes > 0;
-  if (!was_full || sending + kCoarse < length / 2) {
+  if (2 * window_.full_for < length) {
     if (++void_windows_ < kMaxVoidWindows) return begin_window(now, connection, *progress);
     return set_rate(now, kFastBytesPerS, 0);
   }
   const double bytes_per_s = static_cast<double>(bytes) / seconds(length);
   // Where packets wait in the network, that is what limits, although the receiver may be slow, too.
-  const bool is_receivers = 2 * (progress->waiting_for_peer - before.waiting_for_peer) > sending &&
+  const bool is_receivers = 2 * (progress->waiting_for_peer - before.waiting_for_peer) >
+                                progress->sending - before.sending &&
                             progress->round_trip_now < progress->round_trip + kQueued;
   if (is_last_window()) {
     return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s, progress->waiting_bytes);

@@ -37,10 +37,11 @@ class HistoryPace {
   static constexpr Duration kMaxWindow = std::chrono::seconds(1);
   static constexpr double kGrows = 1.25;  // a window that carries so much more than the one before
   static constexpr int kMaxWindows = 100, kLastWindows = 3;
-  static constexpr int kMaxVoidWindows = 20;  // in which the connection was not always full
-  // Times of TCP are that coarse; packets that take so much longer than the quickest wait in a
-  // queue.
-  static constexpr Duration kCoarse = std::chrono::milliseconds(10);
+  // In which the connection was not full half of the time. Once full it counts so for kMaxFull at
+  // most, until there is history again.
+  static constexpr int kMaxVoidWindows = 20;
+  static constexpr Duration kMaxFull = std::chrono::milliseconds(50);
+  // Packets that take so much longer than the quickest wait in a queue.
   static constexpr Duration kQueued = std::chrono::milliseconds(5);
   // So many times as long as it took to measure.
   static constexpr int kValidTimes = 200;
@@ -71,8 +72,8 @@ class HistoryPace {
   void on_history(std::size_t bytes) noexcept;
   // It was queued, and will not be sent.
   void on_history_dropped(std::size_t bytes) noexcept;
-  // The connection took less of the history than it was allowed to.
-  void on_full() noexcept { is_full_ = true; }
+  // The connection with that id took less of the history than it was allowed to.
+  void on_full(const void* connection) noexcept;
   // The connection with that id has ended.
   void forget(const void* connection) noexcept;
 
@@ -81,7 +82,9 @@ class HistoryPace {
   struct Window {
     const void* connection = nullptr;
     MonoTime begin{}, end{};
-    MonoTime heard{};  // when that connection had history last
+    MonoTime heard{};      // when that connection had history last
+    Duration full_for{};   // so long it took no more
+    bool is_full = false;  // since `heard`
     std::uint64_t sent_bytes = 0, sent_by_it_bytes = 0;
     wire::Progress progress;
   };

@@ -100,7 +100,8 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       }
     }
     if (fills_) {
-      const bool is_full = status == SendStatus::blocked && !haste.may_copy;
+      const bool is_full =
+          !haste.may_copy && (status == SendStatus::blocked || !connection_.output_empty());
       connection_.on_history_sent(sent_before, is_full);
     }
     Tid& at = chosen();

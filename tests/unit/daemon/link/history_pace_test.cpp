@@ -51,7 +51,6 @@ class Network final : public wire::Transport {
     return wire::Progress{static_cast<std::uint32_t>(delivered_bytes_ / kPacketBytes),
                           kPacketBytes,
                           static_cast<std::uint64_t>(queued_bytes),
-                          is_full ? static_cast<std::uint64_t>(queued_bytes) + 1 : 0,
                           round_trip,
                           round_trip + queue_time,
                           sending_,
@@ -71,8 +70,8 @@ class Network final : public wire::Transport {
     sent_bytes_ += static_cast<std::uint64_t>(history);
     pace_.on_sent(static_cast<std::size_t>(history));
     pace_.on_history(static_cast<std::size_t>(history));
-    if (allowed != HistoryPace::kUnlimited && history < static_cast<double>(allowed)) {
-      pace_.on_full();
+    if (is_full && has_history && history < static_cast<double>(allowed)) {
+      pace_.on_full(this);
     }
     queued_bytes += history;
     const double carried = std::min(queued_bytes, std::max(0.0, per_tick(bytes_per_s) - live));

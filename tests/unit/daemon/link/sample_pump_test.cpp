@@ -697,12 +697,11 @@ class PacedHistory : public testing::Test {
     rig.write(3);
     rig.link.set_pace(pace);
     rig.peer.progress.emplace().packet_bytes = 1000;
-    rig.peer.progress->unsent_bytes = 1;
     MemoryTransport transport(rig.peer);
-    for (const Duration ago : {410ms, 340ms, 270ms, 200ms, 0ms}) {
-      rig.peer.progress->delivered_packets = static_cast<std::uint32_t>((410ms - ago) / 1ms);
-      rig.peer.progress->sending = 410ms - ago;
-      pace.allowance(rig.loop.now() - ago, {this, 0, transport});
+    for (int ms = 0; ms <= 410; ms += 5) {
+      rig.peer.progress->delivered_packets = static_cast<std::uint32_t>(ms);
+      pace.allowance(rig.loop.now() + (ms - 410) * 1ms, {this, 0, transport});
+      pace.on_full(this);
     }
     SamplePump::Plan plan{0, 2, 0};
     plan.newest_first = true;
