@@ -205,7 +205,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     back_fill_ = {std::min(first_within(kInOrderBytes, range), range.end - 1), range.end};
     range.end = back_fill_.begin;
     if (range.count() == 0) passed_over_.pop_back();
-    limit_unsent_by_network();
+    if (has_pace()) limit_unsent_by_network();
   }
   if (back_fill_.count() > 0) return Next::ready;
   fills_ = false;
@@ -223,7 +223,9 @@ bool SamplePump::has_due_sample(MonoTime now, Tid newest) const noexcept {
 
 // Of the sample that is sent, or is to be sent next. New ones do not wait for the pace.
 [[gnu::hot]] SampleSender::Haste SamplePump::haste_now(MonoTime now) {
-  if (!fills_ || has_due_sample(now, std::min(newest_untrusted(reader_), last_))) return kAtOnce;
+  if (!fills_ || !has_pace() || has_due_sample(now, std::min(newest_untrusted(reader_), last_))) {
+    return kAtOnce;
+  }
   return {connection_.history_allowance(), false};
 }
 

@@ -119,6 +119,8 @@ class SamplePump {
   // The sample that is sent, or is to be sent next.
   Tid& chosen() noexcept { return fills_ ? back_fill_.begin : next_; }
   SampleSender::Haste haste_now(MonoTime now);
+  // The history of small samples is small, and those who read them in order wait for it.
+  bool has_pace() const noexcept { return sender_.sends_in_place(); }
   PumpWait wait_for_pace() noexcept;
   bool has_due_sample(MonoTime now, Tid newest) const noexcept;
   Tid last_of_run() const noexcept;
