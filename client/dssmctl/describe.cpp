@@ -156,7 +156,7 @@ std::string carried_text(const StreamInfo& stream) {
   if (max_rate_hz == 0) {
     return fmt::format("carries {:.3g} of {:.3g} samples a second", carried_hz, stream.rate_hz);
   }
-  constexpr double kClearly = 0.8;  // the rate is one of timers
+  constexpr double kClearly = 0.8;  // timers come late, so the rate is a little lower anyway
   const double wanted_hz = std::min(max_rate_hz, stream.rate_hz);
   if (carried_hz >= kClearly * wanted_hz) return {};
   return fmt::format("carries {:.3g} of the {:.3g} samples a second that are asked for", carried_hz,

@@ -616,7 +616,7 @@ Finding check_mirrors(const Facts& facts) {
   }
   if (behind.empty()) {
     return {"mirrors", Status::ok,
-            mirrors == 0 ? "no stream of another host is read here without a rate"
+            mirrors == 0 ? "no stream of another host is read here in full"
                          : fmt::format("the network carries all samples of the {} streams of other "
                                        "hosts that programs here read",
                                        mirrors)};

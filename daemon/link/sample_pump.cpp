@@ -9,7 +9,7 @@
 namespace dssm::daemon {
 namespace {
 
-constexpr SampleSender::Haste kAtOnce{SampleSender::kSliceBytes, true};
+constexpr SampleSender::SliceLimits kAtOnce{SampleSender::kSliceBytes, true};
 
 // As many bytes as the network carries in that time, when it carries so many each second.
 std::size_t bytes_in(Duration time, std::uint64_t carried_per_s) noexcept {
@@ -53,12 +53,12 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
     Tid sent_up_to = chosen() + 1;
-    SampleSender::Haste haste = kAtOnce;
+    SampleSender::SliceLimits limits = kAtOnce;
     std::uint64_t sent_before = connection_.sent_bytes();
     if (under_way_) {
-      if (!only_under_way) haste = haste_now(now);
-      if (haste.most_bytes == 0) return wait_for_pace();
-      status = sender_.go_on(haste);
+      if (!only_under_way) limits = limits_now(now);
+      if (limits.most_bytes == 0) return wait_for_pace();
+      status = sender_.go_on(limits);
       bytes += SampleSender::kSliceBytes;
     } else if (only_under_way) {
       sender_.end_run();
@@ -74,8 +74,8 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
         wake_at_ = due_;
         return PumpWait::time;
       }
-      haste = haste_now(now);
-      if (haste.most_bytes == 0) {
+      limits = limits_now(now);
+      if (limits.most_bytes == 0) {
         sender_.end_run();
         return wait_for_pace();
       }
@@ -86,11 +86,11 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       const Tid at = chosen();
       if (sender_.sends_in_place()) {
         sent_up_to = at + 1;
-        status = sender_.send(at, 0, at < last, haste);
+        status = sender_.send(at, 0, at < last, limits);
         bytes += std::min(payload_bytes_, SampleSender::kSliceBytes);
       } else {
         // The writer continues meanwhile: the newest sample may not be the newest any more.
-        const std::size_t fit = haste.most_bytes / (payload_bytes_ + kHeaderBytes);
+        const std::size_t fit = limits.most_bytes / (payload_bytes_ + kHeaderBytes);
         const Tid at_most = at +
                             std::clamp<Tid>(static_cast<Tid>(fit), 1,
                                             thins() && !fills_ ? 1 : kSamplesPerTurn - samples) -
@@ -101,7 +101,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     }
     if (fills_) {
       const bool is_full =
-          !haste.may_copy && (status == SendStatus::blocked || !connection_.output_empty());
+          !limits.may_copy && (status == SendStatus::blocked || !connection_.output_empty());
       connection_.on_history_sent(sent_before, is_full);
     }
     Tid& at = chosen();
@@ -222,7 +222,7 @@ bool SamplePump::has_due_sample(MonoTime now, Tid newest) const noexcept {
 }
 
 // Of the sample that is sent, or is to be sent next. New ones do not wait for the pace.
-[[gnu::hot]] SampleSender::Haste SamplePump::haste_now(MonoTime now) {
+[[gnu::hot]] SampleSender::SliceLimits SamplePump::limits_now(MonoTime now) {
   if (!fills_ || !has_pace() || has_due_sample(now, std::min(newest_untrusted(reader_), last_))) {
     return kAtOnce;
   }

@@ -118,7 +118,7 @@ class SamplePump {
   Next choose_newest_first(MonoTime now);
   // The sample that is sent, or is to be sent next.
   Tid& chosen() noexcept { return fills_ ? back_fill_.begin : next_; }
-  SampleSender::Haste haste_now(MonoTime now);
+  SampleSender::SliceLimits limits_now(MonoTime now);
   // The history of small samples is small, and those who read them in order wait for it.
   bool has_pace() const noexcept { return sender_.sends_in_place(); }
   PumpWait wait_for_pace() noexcept;

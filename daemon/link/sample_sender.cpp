@@ -37,7 +37,7 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& co
       payload_bytes_(mapping.geometry().payload_bytes) {}
 
 [[gnu::hot]] SendStatus SampleSender::send(Tid tid, std::uint64_t serial, bool more_follow,
-                                           const Haste& haste) {
+                                           const SliceLimits& limits) {
   DSSM_CHECK(!busy_);
   if (payload_bytes_ < kInPlaceBytes) return send_copy(tid, serial);
   SampleInfo info;
@@ -45,7 +45,7 @@ SampleSender::SampleSender(const ring::RingMapping& mapping, FrameConnection& co
   const bool is_small = info.payload_bytes < kInPlaceBytes;
   const bool may_copy = info.payload_bytes <= kMaxCopiedBytes;
   const bool copy_pays = is_small || !more_follow || !options_.may_tear;
-  return may_copy && copy_pays ? send_copy(tid, serial) : begin_in_place(info, serial, haste);
+  return may_copy && copy_pays ? send_copy(tid, serial) : begin_in_place(info, serial, limits);
 }
 
 [[gnu::hot]] SendStatus SampleSender::send_copy(Tid tid, std::uint64_t serial) {
@@ -142,7 +142,7 @@ void SampleSender::keep_head(std::span<const std::byte> bytes) noexcept {
 }
 
 SendStatus SampleSender::begin_in_place(const SampleInfo& info, std::uint64_t serial,
-                                        const Haste& haste) {
+                                        const SliceLimits& limits) {
   std::array<std::byte, wire::kMaxSampleHeaderBytes> header;
   const std::size_t header_bytes = wire::encode_sample_header(
       header, serial, info, options_.may_tear ? wire::Trailer::torn : wire::Trailer::none);
@@ -160,7 +160,7 @@ SendStatus SampleSender::begin_in_place(const SampleInfo& info, std::uint64_t se
     return copy_slice();
   }
   connection_.set_mid_frame(true);
-  const SendStatus status = send_slice(haste);
+  const SendStatus status = send_slice(limits);
   if (busy_ && head_sent_ <= kept_bytes && !copying_) {
     // No byte of this sample was sent: it is not begun.
     busy_ = false;
@@ -171,13 +171,13 @@ SendStatus SampleSender::begin_in_place(const SampleInfo& info, std::uint64_t se
   return status;
 }
 
-SendStatus SampleSender::go_on(const Haste& haste) {
+SendStatus SampleSender::go_on(const SliceLimits& limits) {
   DSSM_CHECK(busy_);
-  return copying_ ? copy_slice() : send_slice(haste);
+  return copying_ ? copy_slice() : send_slice(limits);
 }
 
-SendStatus SampleSender::send_slice(const Haste& haste) {
-  const std::size_t slice = std::min({bytes_ - offset_, haste.most_bytes, kSliceBytes});
+SendStatus SampleSender::send_slice(const SliceLimits& limits) {
+  const std::size_t slice = std::min({bytes_ - offset_, limits.most_bytes, kSliceBytes});
   const std::size_t head = head_bytes_ - head_sent_;
   const iovec parts[] = {part_of(head_.data() + head_sent_, head),
                          part_of(place_.payload + offset_, slice)};
@@ -193,7 +193,7 @@ SendStatus SampleSender::send_slice(const Haste& haste) {
   }
   // The socket is full. A sample that is not begun, or is void already, is not copied aside.
   const bool begun = head_sent_ > 0;
-  if (begun && haste.may_copy && RingReader::still_valid(*place_.sequence, place_.expected) &&
+  if (begun && limits.may_copy && RingReader::still_valid(*place_.sequence, place_.expected) &&
       begin_copying()) {
     return copy_slice();
   }

@@ -62,7 +62,7 @@ class SampleSender {
   };
 
   // Of a payload that is sent in place.
-  struct Haste {
+  struct SliceLimits {
     std::size_t most_bytes;  // at once
     bool may_copy;           // else what the socket does not take waits in the slot, for the pace
   };
@@ -85,7 +85,7 @@ class SampleSender {
   // Sends sample `tid`; `serial` as in Frame. After `blocked` or `unfinished` with busy(): go_on().
   //   more_follow  the next one is in the ring already
   SendStatus send(Tid tid, std::uint64_t serial, bool more_follow,
-                  const Haste& haste = {kSliceBytes, true});
+                  const SliceLimits& limits = {kSliceBytes, true});
 
   // Small payloads only: sends samples from `first` to at most `last`. Sets `next` to the tid after
   // the last one that is sent or queued; the status is about the sample `next`, when it is not
@@ -94,7 +94,7 @@ class SampleSender {
 
   // Whether a sample is begun and not complete; no other may be begun then.
   bool busy() const noexcept { return busy_; }
-  SendStatus go_on(const Haste& haste = {kSliceBytes, true});
+  SendStatus go_on(const SliceLimits& limits = {kSliceBytes, true});
 
   // After a run of samples, before returning to the loop or sending another frame: sends the bytes
   // that were kept to go out with the next sample.
@@ -104,8 +104,9 @@ class SampleSender {
 
  private:
   SendStatus send_copy(Tid tid, std::uint64_t serial);
-  SendStatus begin_in_place(const SampleInfo& info, std::uint64_t serial, const Haste& haste);
-  SendStatus send_slice(const Haste& haste);
+  SendStatus begin_in_place(const SampleInfo& info, std::uint64_t serial,
+                            const SliceLimits& limits);
+  SendStatus send_slice(const SliceLimits& limits);
   bool begin_copying();
   SendStatus copy_slice();
   SendStatus end_copying();

@@ -8,9 +8,9 @@
 // owner is away, those that read one sample after the other wait before what is missing.
 //
 //   ring      has the owner's type, cycle and incarnation, and its depth or, by the key
-//             mirror_streams, less. When the owner's stream has
-//             another incarnation, the mirror makes a new ring, and readers of the old one are
-//             notified as soon as the new one is filled
+//             mirror_streams, less. When the owner's stream has another incarnation, the mirror
+//             makes a new ring, and readers of the old one are notified as soon as the new one is
+//             filled
 //   error     while the owner is unavailable, or has removed the stream, the ring stays as it is
 //             for its readers, and the mirror always retries
 //   end       when no program has used the ring for mirror_linger

@@ -39,13 +39,16 @@ MirrorRing::MirrorRing(std::shared_ptr<Stream> stream,
   if (slots_.newest() >= 0) cursor_.set_next(slots_.newest() + 1);
 }
 
+Tid MirrorRing::depth() const noexcept {
+  return static_cast<Tid>(stream_->mapping().geometry().depth);
+}
+
 // After a gap, the slot of sample `tid` may be one that readers still read, and the payload may
 // take long to arrive.
 bool MirrorRing::would_overwrite_window(Tid tid) const noexcept {
   const Tid newest = slots_.newest();
   if (newest < 0) return false;
-  const Tid depth = static_cast<Tid>(stream_->mapping().geometry().depth);
-  const Tid same_slot = newest - (depth - (tid - newest) % depth) % depth;
+  const Tid same_slot = newest - (depth() - (tid - newest) % depth()) % depth();
   return same_slot >= reader_.oldest();
 }
 
@@ -82,8 +85,7 @@ Result<void> MirrorRing::on_subscribed_untrusted(Tid first, bool newest_first, T
   const Tid next = cursor_.next();
   const bool is_whole = with_history_ || !newest_first;
   // What has no place in a ring that is shorter than the owner's is not awaited.
-  const Tid depth = static_cast<Tid>(stream_->mapping().geometry().depth);
-  if (!is_whole) has_place_from_ = std::clamp<Tid>(first, 0, channel::kMaxTid) - depth + 2;
+  if (!is_whole) has_place_from_ = oldest_beside(std::clamp<Tid>(first, 0, channel::kMaxTid));
   const Tid held = std::max(oldest, has_place_from_);
   const Tid begin = is_whole ? first : std::clamp<Tid>(held, 0, std::max<Tid>(first, 0));
   wanted_from_ = is_whole ? 0 : first;
@@ -133,15 +135,16 @@ void MirrorRing::lose_ahead(ring::TidRange range) {
 void MirrorRing::count_what_leaves(Tid tid) noexcept {
   const ring::TidRange hole = reader_.hole();
   if (hole.is_empty()) return;
-  const Tid oldest = tid - static_cast<Tid>(stream_->mapping().geometry().depth) + 2;
-  lost_late_ += count_missing({std::max(hole.begin, reader_.oldest()), std::min(hole.end, oldest)});
+  lost_late_ += count_missing(
+      {std::max(hole.begin, reader_.oldest()), std::min(hole.end, oldest_beside(tid))});
 }
 
 // What nobody wants is not missing.
 std::uint64_t MirrorRing::count_missing(ring::TidRange range) const noexcept {
   std::uint64_t missing = 0;
-  for (Tid tid = std::max(range.begin, wanted_from_); tid < range.end; ++tid)
+  for (Tid tid = std::max(range.begin, wanted_from_); tid < range.end; ++tid) {
     missing += is_missing(tid) ? 1U : 0U;
+  }
   return missing;
 }
 
@@ -257,8 +260,7 @@ void MirrorRing::publish_after_gap(const SampleInfo& info) noexcept {
   }
   slots_.publish(info);
   if (are_lost) return;
-  const Tid depth = static_cast<Tid>(stream_->mapping().geometry().depth);
-  count_what_is_passed_over({std::max(begin, wanted_from_), info.tid - depth + 2});
+  count_what_is_passed_over({std::max(begin, wanted_from_), oldest_beside(info.tid)});
   for (const ring::TidRange& lost : lost_ahead_) {
     const Tid first = std::max(lost.begin, begin), end = std::min(lost.end, info.tid);
     if (first >= end) continue;

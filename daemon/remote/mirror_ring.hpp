@@ -92,6 +92,9 @@ class MirrorRing {
   MirrorRing(std::shared_ptr<Stream> stream, std::shared_ptr<const ring::RingMapping> mapping,
              std::shared_ptr<ring::Bell> bell, MemoryBudget& budget);
   bool would_overwrite_window(Tid tid) const noexcept;
+  Tid depth() const noexcept;
+  // Of the window, when `newest` is the newest sample.
+  Tid oldest_beside(Tid newest) const noexcept { return newest - depth() + 2; }
   bool is_missing(Tid tid) const noexcept;
   std::byte* begin_late(const wire::IncomingSample& sample) noexcept;
   void lose_late(ring::TidRange range) noexcept;
@@ -113,7 +116,7 @@ class MirrorRing {
   bool newest_first_ = false;               // the owner sends so
   bool with_history_ = true;                // the present request
   Tid wanted_from_ = 0;                     // earlier ones do not count as lost: not asked for
-  Tid has_place_from_ = 0;                  // when the owner last said which one is its newest
+  Tid has_place_from_ = 0;                  // beside the newest one that the owner named last
   Tid begins_at_ = 0;                       // an empty ring: earlier ones were never asked for
   std::vector<ring::TidRange> lost_ahead_;  // of those after the newest one here; rising
   bool is_dropped_ = false;             // the sample in the hole that arrives, which is not missing

@@ -85,6 +85,14 @@ Result<void> add_interface(Config& config, std::string_view text) {
   return {};
 }
 
+// For lists of what differs for some streams. One of none, "", adds nothing.
+template <auto member, auto parse>
+Result<void> add_exception(Config& config, std::string_view text) {
+  if (text.empty()) return {};
+  (config.*member).exceptions.push_back(DSSM_TRY(parse(text)));
+  return {};
+}
+
 // A name may resolve to any address, now or later; only "localhost" may not.
 bool stays_on_this_pc(const wire::Address& address) {
   if (address.host == "localhost") return true;
@@ -232,11 +240,7 @@ constexpr ConfigKey kKeys[] = {
      "for some streams another time, the highest rate, and how much history is kept here, e.g. "
      "'map=at_once' or 'camera*=10 Hz, 2 s'; may be repeated, the first that matches counts",
      ValueForm::list, kChangesAtOnce<&Config::mirrors>,
-     [](Config& c, std::string_view text) -> Result<void> {
-       if (text.empty()) return {};
-       c.mirrors.exceptions.push_back(DSSM_TRY(parse_mirror_exception(text)));
-       return {};
-     },
+     add_exception<&Config::mirrors, parse_mirror_exception>,
      [](Config& c) { c.mirrors.exceptions.clear(); }, "mirror-stream"},
     {"clock_policy", "POLICY",
      "what to do with streams of hosts whose clocks may be too far from this one's: enforce (not "
@@ -255,11 +259,7 @@ constexpr ConfigKey kKeys[] = {
      "another policy, and limit, for some streams, e.g. 'gps=off' or 'camera*=mark 5 ms'; may be "
      "repeated, the first that matches counts",
      ValueForm::list, kChangesAtOnce<&Config::clocks>,
-     [](Config& c, std::string_view text) -> Result<void> {
-       if (text.empty()) return {};
-       c.clocks.exceptions.push_back(DSSM_TRY(parse_clock_exception(text)));
-       return {};
-     },
+     add_exception<&Config::clocks, parse_clock_exception>,
      [](Config& c) { c.clocks.exceptions.clear(); }, "clock-stream"},
     {"max_drift", "PPM", "highest drift of this PC's free-running clock; default: 50 ppm",
      ValueForm::text, kChangesAtOnce<&Config::max_drift>, set_by<&Config::max_drift, parse_drift>},

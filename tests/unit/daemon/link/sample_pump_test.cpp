@@ -714,6 +714,15 @@ class PacedHistory : public testing::Test {
     run_until(rig.loop, [&] { return is_over; });
   }
 
+  // A sample of the history is sent in part.
+  void run_until_under_way() {
+    EXPECT_EQ(rig.run_on(), PumpWait::pace);
+    do {
+      pass(rig.pump->due() - rig.loop.now());
+      ASSERT_EQ(rig.run_on(), PumpWait::pace);
+    } while (!rig.sender.busy());
+  }
+
   HistoryPace pace;
   PumpRig rig{5 * kLarge, 8, true, 1U << 30, TimerQueue::Time::simulated};
 };
@@ -734,22 +743,14 @@ TEST_F(PacedHistory, FollowsTheNewestSampleInPieces) {
 }
 
 TEST_F(PacedHistory, LetsNewSamplesPassAtOnce) {
-  EXPECT_EQ(rig.run_on(), PumpWait::pace);
-  do {
-    pass(rig.pump->due() - rig.loop.now());
-    ASSERT_EQ(rig.run_on(), PumpWait::pace);
-  } while (!rig.sender.busy());
+  ASSERT_NO_FATAL_FAILURE(run_until_under_way());
   rig.write();
   EXPECT_EQ(rig.run_on(), PumpWait::pace);
   EXPECT_EQ(rig.accepted(), (std::vector<Tid>{2, 1, 3})) << "also what was under way";
 }
 
 TEST_F(PacedHistory, LetsAnotherUserOfTheConnectionSend) {
-  EXPECT_EQ(rig.run_on(), PumpWait::pace);
-  do {
-    pass(rig.pump->due() - rig.loop.now());
-    ASSERT_EQ(rig.run_on(), PumpWait::pace);
-  } while (!rig.sender.busy());
+  ASSERT_NO_FATAL_FAILURE(run_until_under_way());
   rig.peer.room = 100;  // the rest is copied aside
   for (int turns = 0; turns < 3 && rig.sender.busy(); ++turns) {
     EXPECT_TRUE(rig.pump->pump(kStart, true));
