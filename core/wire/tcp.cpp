@@ -5,8 +5,10 @@
 #include "core/wire/tcp.hpp"
 
 #include <fcntl.h>
+#include <linux/sockios.h>
 #include <linux/tcp.h>  // glibc's tcp_info has no rates
 #include <netinet/in.h>
+#include <sys/ioctl.h>
 #include <sys/time.h>
 
 #include <algorithm>
@@ -116,6 +118,12 @@ class TcpTransport final : public Transport {
     const auto most = static_cast<int>(bytes);
     static_cast<void>(
         ::setsockopt(socket_.get(), IPPROTO_TCP, TCP_NOTSENT_LOWAT, &most, sizeof most));
+  }
+
+  std::optional<std::size_t> unsent_bytes() const noexcept override {
+    int bytes = 0;
+    if (::ioctl(socket_.get(), SIOCOUTQNSD, &bytes) != 0) return std::nullopt;
+    return static_cast<std::size_t>(bytes);
   }
 
   std::optional<std::uint64_t> carried_per_s() const noexcept override {

@@ -104,6 +104,8 @@ class Transport {
   // the kernel can do that: what it has taken cannot be replaced by something newer. 0: the
   // system's usual limit.
   virtual void limit_unsent(std::size_t /*bytes*/) noexcept {}
+  // How many bytes that send() took are not on the network yet. nullopt: not known.
+  virtual std::optional<std::size_t> unsent_bytes() const noexcept { return std::nullopt; }
   // How many bytes a second the network has carried lately, while there was enough to send.
   // nullopt: not known.
   virtual std::optional<std::uint64_t> carried_per_s() const noexcept { return std::nullopt; }

@@ -33,14 +33,15 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
                        SampleSender& sender, Observer& observer, const Plan& plan)
     : reader_(mapping),
       payload_bytes_(mapping.geometry().payload_bytes),
+      depth_(static_cast<Tid>(mapping.geometry().depth)),
       connection_(connection),
       sender_(sender),
       observer_(observer),
       plan_(plan),
       next_(std::clamp<Tid>(plan.first, 0, channel::kMaxTid)),
       last_(channel::kMaxTid) {
-  unsent_bytes_ = plan.newest_first ? kUnsentBytes : 0;
-  connection_.limit_unsent(unsent_bytes_);
+  unsent_limit_ = unsent_base_ = plan.newest_first ? kUnsentBytes : 0;
+  connection_.limit_unsent(unsent_limit_);
   const Tid newest = newest_untrusted(reader_);
   const ring::TidRange held{std::max(plan.held.begin, next_), std::min(plan.held.end, newest + 1)};
   if (!plan.newest_first || held.end <= held.begin) return;
@@ -49,6 +50,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
 }
 
 [[gnu::hot]] Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
+  if (std::exchange(was_full_, false)) fit_unsent_limit();
   std::size_t bytes = 0;
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
@@ -62,13 +64,13 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       bytes += SampleSender::kSliceBytes;
     } else if (only_under_way) {
       sender_.end_run();
-      return connection_.output_empty() ? PumpWait::turn : PumpWait::output;
+      return connection_.output_empty() ? PumpWait::turn : wait_for_output();
     } else {
       const Next next = choose_next(now);
       if (next != Next::ready) sender_.end_run();
       if (next == Next::end) return PumpWait::ended;
       // A frame that reports a gap, for example, may wait for the socket.
-      if (!connection_.output_empty()) return PumpWait::output;
+      if (!connection_.output_empty()) return wait_for_output();
       if (next == Next::wait_for_sample) return PumpWait::sample;
       if (next == Next::wait_for_time) {
         wake_at_ = due_;
@@ -81,7 +83,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       }
       const Tid last = last_of_run();
       observer_.before_samples();
-      if (!connection_.output_empty()) return PumpWait::output;
+      if (!connection_.output_empty()) return wait_for_output();
       sent_before = connection_.sent_bytes();
       const Tid at = chosen();
       if (sender_.sends_in_place()) {
@@ -128,7 +130,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
         break;
       case SendStatus::blocked:
         sender_.end_run();
-        return PumpWait::output;
+        return wait_for_output();
       case SendStatus::unfinished:
         break;
       case SendStatus::no_memory:
@@ -229,6 +231,11 @@ bool SamplePump::has_due_sample(MonoTime now, Tid newest) const noexcept {
   return {connection_.history_allowance(), false};
 }
 
+PumpWait SamplePump::wait_for_output() noexcept {
+  was_full_ = plan_.newest_first;
+  return PumpWait::output;
+}
+
 PumpWait SamplePump::wait_for_pace() noexcept {
   wake_at_ = connection_.history_due();
   const Tid newest = newest_untrusted(reader_);
@@ -263,7 +270,7 @@ Tid SamplePump::first_within(std::size_t bytes, ring::TidRange range) const noex
 }
 
 bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
-  if (first_within(kInOrderBytes, samples) == samples.begin) return false;
+  if (first_within(std::max(kInOrderBytes, lasting_bytes_), samples) == samples.begin) return false;
   const std::optional<std::uint64_t> carried = connection_.carried_per_s();
   return !carried || first_within(bytes_in(kInOrderFor, *carried), samples) != samples.begin;
 }
@@ -304,15 +311,24 @@ void SamplePump::give_up_what_is_never_carried(MonoTime now) {
   ++passed_over_since_;
   const bool is_measured =
       passed_over_since_ >= kOverloadedSamples && now - behind_since_ >= kOverloadedAfter;
-  if (passed_over_since_ == 1 || (is_measured && waiting <= waiting_before_)) {
+  if (passed_over_since_ == 1 ||
+      (is_measured && (waiting <= waiting_before_ || is_kept_for_long(first->begin, now)))) {
     passed_over_since_ = 1;
     behind_since_ = now;
     waiting_before_ = waiting;
+    next_before_ = next_;
   } else if (is_measured) {
     for (auto range = first; range != passed_over_.end(); ++range) lose(*range);
     passed_over_.erase(first, passed_over_.end());
     waiting_before_ = 0;
   }
+}
+
+// Whether the ring still holds that sample after kKeptFor, when as many are written as lately.
+bool SamplePump::is_kept_for_long(Tid first, MonoTime now) const noexcept {
+  const std::chrono::duration<double> passed = now - behind_since_, kept = kKeptFor;
+  const double written_per_s = static_cast<double>(next_ - next_before_) / passed.count();
+  return static_cast<double>(first + depth_ - next_) > written_per_s * kept.count();
 }
 
 void SamplePump::limit_unsent_by_network() {
@@ -322,7 +338,20 @@ void SamplePump::limit_unsent_by_network() {
 }
 
 void SamplePump::limit_unsent(std::size_t bytes) {
-  if (std::exchange(unsent_bytes_, bytes) != bytes) connection_.limit_unsent(bytes);
+  unsent_base_ = bytes;
+  const std::size_t limit = std::max(bytes, lasting_bytes_);
+  if (std::exchange(unsent_limit_, limit) != limit) connection_.limit_unsent(limit);
+}
+
+// The connection was full, and takes bytes again.
+void SamplePump::fit_unsent_limit() {
+  const std::optional<std::size_t> unsent = connection_.unsent_bytes();
+  if (unsent == 0) {
+    lasting_bytes_ = std::min(2 * unsent_limit_, kMostUnsentBytes);
+  } else if (unsent > unsent_limit_ / 4) {
+    lasting_bytes_ -= lasting_bytes_ / 8;
+  }
+  limit_unsent(unsent_base_);
 }
 
 // Those before that sample will not be sent.

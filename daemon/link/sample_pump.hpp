@@ -50,13 +50,17 @@ class SamplePump {
   static constexpr Duration kInOrderFor = std::chrono::milliseconds(4);
   static constexpr std::size_t kHeaderBytes = 32;  // of a sample's frame, about
   // So much waits in the kernel, where nothing newer can take its place; less when the network
-  // needs longer than that for it. Half as much made sending slower on a fast link.
+  // needs longer than that for it. Half as much made sending slower on a fast link. On a busy PC it
+  // has to last until dssmd runs again: twice as much each time that nothing was left by then.
   static constexpr std::size_t kUnsentBytes = 128U << 10, kMinUnsentBytes = 16U << 10;
+  static constexpr std::size_t kMostUnsentBytes = 4U << 20;
   static constexpr Duration kUnsentFor = std::chrono::milliseconds(2);
   // When samples were passed over for so long and so often, and more of them wait than before, the
   // network carries less than is written. Once may be a pause of the network.
   static constexpr Duration kOverloadedAfter = std::chrono::seconds(3);
   static constexpr int kOverloadedSamples = 4;
+  // What the ring still holds for that long may come later: a PC may be busy only for some seconds.
+  static constexpr Duration kKeptFor = std::chrono::seconds(10);
   // Of what was passed over; the oldest one is lost when there is one more.
   static constexpr std::size_t kMaxPassedOver = 4096;
   static constexpr int kSamplesPerTurn = 1024;
@@ -121,6 +125,7 @@ class SamplePump {
   SampleSender::SliceLimits limits_now(MonoTime now);
   // The history of small samples is small, and those who read them in order wait for it.
   bool has_pace() const noexcept { return sender_.sends_in_place(); }
+  PumpWait wait_for_output() noexcept;
   PumpWait wait_for_pace() noexcept;
   bool has_due_sample(MonoTime now, Tid newest) const noexcept;
   Tid last_of_run() const noexcept;
@@ -129,7 +134,9 @@ class SamplePump {
   void pass_over(Tid next, MonoTime now);
   void leave_out(Tid newest);
   void give_up_what_is_never_carried(MonoTime now);
+  bool is_kept_for_long(Tid first, MonoTime now) const noexcept;
   void limit_unsent(std::size_t bytes);
+  void fit_unsent_limit();
   void limit_unsent_by_network();
   void lose_passed_over(Tid before);
   void lose_up_to(Tid next);
@@ -138,6 +145,7 @@ class SamplePump {
 
   ring::RingReader reader_;
   std::size_t payload_bytes_;
+  Tid depth_;
   FrameConnection& connection_;
   SampleSender& sender_;
   Observer& observer_;
@@ -152,9 +160,11 @@ class SamplePump {
   // when, which, and how many waited.
   int passed_over_since_ = 0;
   MonoTime behind_since_{};
-  Tid behind_from_ = 0, waiting_before_ = 0;
-  std::size_t unsent_bytes_ = 0;  // the limit on what waits in the kernel
-  bool under_way_ = false;        // the sender is busy with it
+  Tid behind_from_ = 0, waiting_before_ = 0, next_before_ = 0;
+  std::size_t unsent_limit_ = 0, unsent_base_ = 0;  // of what waits in the kernel
+  std::size_t lasting_bytes_ = 0;  // so much of it lasts until dssmd runs again; 0: any does
+  bool was_full_ = false;          // the connection, at the end of the last pump()
+  bool under_way_ = false;         // the sender is busy with it
   bool caught_up_ = false;
   MonoTime due_{};  // the next sample, with a rate
   MonoTime wake_at_{};

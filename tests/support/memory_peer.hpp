@@ -61,6 +61,7 @@ class MemoryPeer {
   std::size_t sends = 0;        // that took bytes
   std::optional<std::uint64_t> carried_per_s;
   std::optional<wire::Progress> progress;
+  std::optional<std::size_t> unsent_bytes;
   std::size_t unsent_limit = 0;  // that dssmd set
   bool closed = false;           // by dssmd
 
@@ -130,6 +131,7 @@ class MemoryTransport final : public wire::Transport {
     return stamps_ ? peer_.arrived : std::nullopt;
   }
   void limit_unsent(std::size_t bytes) noexcept override { peer_.unsent_limit = bytes; }
+  std::optional<std::size_t> unsent_bytes() const noexcept override { return peer_.unsent_bytes; }
   std::optional<std::uint64_t> carried_per_s() const noexcept override {
     return peer_.carried_per_s;
   }

@@ -554,7 +554,9 @@ class NewestFirst : public testing::Test {
     rig.start(plan);
   }
 
-  PumpRig rig{kLarge, 16};
+  explicit NewestFirst(std::uint64_t depth = 16) : rig{kLarge, depth} {}
+
+  PumpRig rig;
 };
 
 TEST_F(NewestFirst, ThoseBeforeItFollowTheNewestOfThemFirst) {
@@ -617,20 +619,30 @@ TEST_F(NewestFirst, WhatTheRingNoLongerHoldsIsReportedOldestFirst) {
   EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{0, 5}}));
 }
 
-TEST_F(NewestFirst, WhatTheNetworkNeverCarriesIsLostAtOnce) {
-  start({0, kNoTid, 0});
-  rig.write();
-  EXPECT_EQ(rig.run_on(), PumpWait::sample);
-  const std::size_t frame_bytes = rig.peer.sent.size();
-  rig.write();
-  rig.peer.room = frame_bytes / 2;
-  EXPECT_EQ(rig.run(), PumpWait::output);
-  const auto round = [&](int count) {
+// Three samples are written in each second, and the network carries one.
+class Overloaded : public NewestFirst {
+ protected:
+  explicit Overloaded(std::uint64_t depth = 16) : NewestFirst(depth) {
+    start({0, kNoTid, 0});
+    rig.write();
+    EXPECT_EQ(rig.run_on(), PumpWait::sample);
+    frame_bytes_ = rig.peer.sent.size();
+    rig.write();
+    rig.peer.room = frame_bytes_ / 2;
+    EXPECT_EQ(rig.run(), PumpWait::output);
+  }
+  void round(int count) {
     rig.write(3);  // while one is sent
-    rig.peer.room = frame_bytes;
+    rig.peer.room = frame_bytes_;
     run_turns(rig.loop);  // the rest of the one before
     EXPECT_EQ(rig.run(kStart + count * SamplePump::kOverloadedAfter / 3), PumpWait::output);
-  };
+  }
+
+ private:
+  std::size_t frame_bytes_ = 0;
+};
+
+TEST_F(Overloaded, WhatTheNetworkNeverCarriesIsLostAtOnce) {
   for (int i = 1; i < 4; ++i) round(i);
   EXPECT_EQ(rig.pump->lost(), 0u) << "it may be a pause";
   round(4);
@@ -641,6 +653,20 @@ TEST_F(NewestFirst, WhatTheNetworkNeverCarriesIsLostAtOnce) {
   EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.accepted(), (std::vector<Tid>{0, 1, 4, 7, 10, 13, 16}));
   EXPECT_EQ(rig.gaps, (std::map<Tid, Tid>{{2, 2}, {5, 2}, {8, 2}, {11, 2}, {14, 2}}));
+}
+
+class OverloadedWithALongHistory : public Overloaded {
+ protected:
+  OverloadedWithALongHistory() : Overloaded(64) {}
+};
+
+TEST_F(OverloadedWithALongHistory, NothingIsGivenUpThatTheRingHoldsForTenSeconds) {
+  int rounds = 0;
+  while (rig.pump->lost() == 0 && rounds < 30) round(++rounds);
+  // Sample 2 was passed over first: 34 later it has 30 to go, those of ten seconds. It is counted
+  // every third round.
+  EXPECT_EQ(rounds, 13);
+  EXPECT_EQ(rig.ring.reader().oldest(), 0) << "nothing was overwritten";
 }
 
 TEST_F(NewestFirst, WhatWaitedForAPauseOfTheNetworkIsSentLater) {
@@ -678,6 +704,30 @@ TEST_F(NewestFirst, LittleWaitsInTheKernelOfASlowNetwork) {
   EXPECT_EQ(rig.peer.unsent_limit, SamplePump::kUnsentBytes) << "it may be fast now";
   rig.start({0, 5, 0});
   EXPECT_EQ(rig.peer.unsent_limit, 0u) << "for samples in their order the system's is best";
+}
+
+// dssmd was late, and the network had nothing to carry meanwhile.
+TEST_F(NewestFirst, WhatWaitsInTheKernelLastsUntilDssmdRunsAgain) {
+  rig.peer.carried_per_s = 10'000'000;
+  rig.write(6);
+  start({0, 5, 0});
+  rig.peer.room = 1000;
+  EXPECT_EQ(rig.run(), PumpWait::output);
+  const auto after = [&](std::size_t unsent_bytes) {
+    rig.peer.unsent_bytes = unsent_bytes;
+    rig.peer.room = 1000;
+    EXPECT_EQ(rig.run(), PumpWait::output);
+    return rig.peer.unsent_limit;
+  };
+  EXPECT_EQ(after(5000), 20'000u);
+  EXPECT_EQ(after(0), 40'000u);
+  EXPECT_EQ(after(0), 80'000u);
+  EXPECT_EQ(after(20'000), 80'000u);
+  EXPECT_EQ(after(20'001), 70'000u);
+  for (int i = 0; i < 20; ++i) after(20'000);
+  EXPECT_EQ(after(20'000), 20'000u);
+  for (int i = 0; i < 20; ++i) after(0);
+  EXPECT_EQ(after(0), SamplePump::kMostUnsentBytes);
 }
 
 TEST_F(NewestFirst, TheEndOfAStreamComesAfterAllOfIt) {
