@@ -184,7 +184,8 @@ struct OtherHosts {
         clock(loop, clock_options(config), std::move(page), own_clock, self.host_id, catalog,
               logger),
         resolver(loop),
-        parts{loop, resolver, registry, logger, self, &clock, config.mirror_linger, config.mirrors},
+        parts{loop,           resolver,      registry, logger, self, &clock, config.mirror_linger,
+              config.mirrors, config.sending},
         mirrors(parts, catalog),
         writers(parts, catalog),
         peers(loop, resolver, config.peers, self, catalog, logger),
@@ -232,6 +233,7 @@ class Dssmd {
                                      sockets_.network);
                 }),
         count_(streams_.registry, status_) {
+    channels_.set_sending(config.sending);
     if (config.mdns) {
       discovery_.emplace(
           loop,
@@ -318,6 +320,8 @@ class Dssmd {
     channels_.set_limits(peer_limits(changed));
     hosts_.parts.mirror_linger = changed.mirror_linger;
     hosts_.parts.mirrors = changed.mirrors;
+    hosts_.parts.sending = changed.sending;
+    channels_.set_sending(changed.sending);
     hosts_.mirrors.for_each([](Mirror& mirror) { mirror.on_new_demand(); });
     hosts_.peers.set_configured(changed.peers);
     hosts_.clock.set(changed.clocks, changed.max_drift);

@@ -15,8 +15,13 @@ Json round_trip_json(Duration round_trip) {
 }
 
 std::string note(const HostInfo& host) {
-  return fmt::format("{}{}{}", host.insecure ? "insecure: nothing is encrypted" : "",
-                     host.insecure && !host.error.empty() ? "; " : "", escaped_message(host.error));
+  std::string text = host.insecure ? "insecure: nothing is encrypted" : "";
+  const auto add = [&](const std::string& more) { text += (text.empty() ? "" : "; ") + more; };
+  if (const std::uint64_t carried = host.carried_bytes_per_s; carried > 0) {
+    add("the network carries " + byte_rate_text(static_cast<double>(carried)) + " from there");
+  }
+  if (!host.error.empty()) add(escaped_message(host.error));
+  return text;
 }
 
 Json mirror_json(const MirrorInfo& mirror) {
@@ -60,6 +65,8 @@ Json host_json(const HostInfo& host) {
   json["version"] = or_null(host.version);
   json["round_trip_ns"] = round_trip_json(host.round_trip);
   json["least_round_trip_ns"] = round_trip_json(host.min_round_trip);
+  json["carried_bytes_per_s"] =
+      host.carried_bytes_per_s > 0 ? Json(host.carried_bytes_per_s) : Json();
   json["streams"] = host.streams;
   json["clock_bound_ns"] = bound_json(host.clock_bound());
   json["insecure"] = host.insecure;

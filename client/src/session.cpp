@@ -53,6 +53,7 @@ HostInfo host_info(const local::Host& message) {
   host.since = Duration(message.since_ns());
   host.round_trip = Duration(message.round_trip_ns());
   host.min_round_trip = Duration(message.least_round_trip_ns());
+  host.carried_bytes_per_s = message.carried_bytes_per_s();
   host.streams = message.streams();
   host.insecure = message.insecure();
   host.error = message.error();

@@ -27,7 +27,8 @@ constexpr int kBacklog = 128;  // connections that wait for accept(); more get n
 constexpr std::size_t kMaxParts = 16;
 
 void set_option(int socket, int level, int option, int value) noexcept {
-  // Fails only when `socket` is not a socket, and then every other call on it fails too.
+  // Fails only when `socket` is none of that level, or not a socket, and then every other call on
+  // it fails too.
   static_cast<void>(::setsockopt(socket, level, option, &value, sizeof value));
 }
 
@@ -118,6 +119,17 @@ class TcpTransport final : public Transport {
     const auto most = static_cast<int>(bytes);
     static_cast<void>(
         ::setsockopt(socket_.get(), IPPROTO_TCP, TCP_NOTSENT_LOWAT, &most, sizeof most));
+  }
+
+  void set_priority(Priority priority) noexcept override {
+    const auto is = [&](Priority one) { return priority == one; };
+    // IPTOS_CLASS_CS4 and CS1, TC_PRIO_INTERACTIVE and BULK. The first sets the second, too.
+    const int dscp = is(Priority::high) ? 0x80 : is(Priority::low) ? 0x20 : 0;
+    const int queue = is(Priority::high) ? 6 : is(Priority::low) ? 2 : 0;
+    // For a socket of the other family, it fails.
+    set_option(socket_.get(), IPPROTO_IP, IP_TOS, dscp);
+    set_option(socket_.get(), IPPROTO_IPV6, IPV6_TCLASS, dscp);
+    set_option(socket_.get(), SOL_SOCKET, SO_PRIORITY, queue);
   }
 
   std::optional<std::size_t> unsent_bytes() const noexcept override {

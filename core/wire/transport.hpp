@@ -56,6 +56,14 @@ struct IoResult {
 // Which end of the connection a transport is.
 enum class TransportEnd : unsigned char { connected, accepted };
 
+// How packets are treated where several wait: by this PC's queues (SO_PRIORITY), by Wi-Fi, and by
+// switches that look at it (DSCP, RFC 4594; RFC 8325 says how Wi-Fi maps it).
+enum class Priority : unsigned char {
+  high,    // CS4: video on Wi-Fi
+  normal,  // best effort
+  low,     // CS1: background
+};
+
 // What became of the bytes that were sent.
 struct Progress {
   std::uint32_t delivered_packets = 0;  // since the connection began; may begin anew at 0
@@ -104,6 +112,8 @@ class Transport {
   // the kernel can do that: what it has taken cannot be replaced by something newer. 0: the
   // system's usual limit.
   virtual void limit_unsent(std::size_t /*bytes*/) noexcept {}
+  // Of all that send() takes from now on, if the kernel can do that.
+  virtual void set_priority(Priority /*priority*/) noexcept {}
   // How many bytes that send() took are not on the network yet. nullopt: not known.
   virtual std::optional<std::size_t> unsent_bytes() const noexcept { return std::nullopt; }
   // How many bytes a second the network has carried lately, while there was enough to send.

@@ -115,6 +115,7 @@ void PeerReport::add_connection(const Peer& peer, local::Host& host) const {
   host.set_since_ns(to_ns(connection.in_this_state_for()));
   host.set_round_trip_ns(to_ns(connection.last_round_trip()));
   host.set_least_round_trip_ns(to_ns(connection.min_round_trip()));
+  host.set_carried_bytes_per_s(connection.carried_bytes_per_s());
   host.set_insecure(connection.crosses_network());
   if (connection.them()) {
     host.set_name(connection.them()->host);

@@ -90,6 +90,7 @@ void PeerConnection::on_down(const Error& error) {
   heartbeat_.disable();
   watching_ = false;
   round_trips_ = {};
+  carried_bytes_per_s_ = 0;
   enter(is_refusal(error) ? HostState::refused : HostState::down,
         reason_of(error, dialer_.reached()), error);
   const std::map<std::uint64_t, Waiting> unanswered = std::exchange(requests_.waiting, {});
@@ -187,6 +188,7 @@ void PeerConnection::on_pong(MonoTime asked, RawTime asked_raw, const Result<net
   const Duration took = loop_.now() - asked;
   const Duration min = round_trips_.min;
   round_trips_ = {took, min == Duration::zero() ? took : std::min(min, took)};
+  carried_bytes_per_s_ = answer->pong().carried_bytes_per_s();
   if (!answer->pong().has_clock()) return;
   wire::ClockReport clock = wire::clock_report_untrusted(answer->pong().clock(), asked);
   const FrameConnection* link = dialer_.connection();

@@ -97,6 +97,8 @@ class PeerConnection final : private Dialer::Observer {
   // Of the heartbeats of this connection; zero: not known.
   Duration last_round_trip() const noexcept { return round_trips_.last; }
   Duration min_round_trip() const noexcept { return round_trips_.min; }
+  // From there to here, as that host measured lately; 0: not known, or the network is fast.
+  std::uint64_t carried_bytes_per_s() const noexcept { return carried_bytes_per_s_; }
 
  private:
   // What state() and the like report.
@@ -139,6 +141,7 @@ class PeerConnection final : private Dialer::Observer {
   Status status_;
   std::optional<wire::Greeting> them_;
   RoundTrips round_trips_;
+  std::uint64_t carried_bytes_per_s_ = 0;
   bool watching_ = false;
   Requests requests_;
   EventSource heartbeat_;

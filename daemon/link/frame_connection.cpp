@@ -277,7 +277,9 @@ bool FrameConnection::flush() {
 
 std::size_t FrameConnection::history_allowance() {
   if (!pace_ || closed_) return HistoryPace::kUnlimited;
-  return pace_->allowance(loop_.now(), {this, sent_bytes_, *transport_});
+  const MonoTime now = loop_.now();
+  const std::size_t own = share_.allowance(now, pace_->carried_bytes_per_s(now));
+  return own == 0 ? 0 : std::min(own, pace_->allowance(now, {this, sent_bytes_, *transport_}));
 }
 
 void FrameConnection::on_history_sent(std::uint64_t since_sent_bytes, bool is_full) {
@@ -288,6 +290,7 @@ void FrameConnection::on_history_sent(std::uint64_t since_sent_bytes, bool is_fu
     bytes += waiting.unsent().size();
   }
   pace_->on_history(bytes);
+  share_.on_history(bytes);
   if (is_full) pace_->on_full(this);
 }
 

@@ -105,6 +105,12 @@ class FrameConnection final : private wire::FrameDelegate {
   // What is sent counts there, and history follows it; it outlives the connection. Without it,
   // history is sent as fast as the connection takes it.
   void set_pace(HistoryPace& pace) noexcept { pace_ = &pace; }
+  // Of what the network carries, this much at most is this connection's history.
+  void set_history_share(double share) noexcept { share_.set(share); }
+  // As wire::Transport.
+  void set_priority(wire::Priority priority) noexcept {
+    if (!closed_) transport_->set_priority(priority);
+  }
 
   // Sends a frame, or queues the bytes that the socket does not take. Nothing after the end.
   void send(const net::Frame& frame);
@@ -128,7 +134,9 @@ class FrameConnection final : private wire::FrameDelegate {
 
   // How many bytes of history may be sent now. 0: none before history_due().
   std::size_t history_allowance();
-  MonoTime history_due() const noexcept { return pace_ ? pace_->due() : MonoTime(); }
+  MonoTime history_due() const noexcept {
+    return pace_ ? std::max(pace_->due(), share_.due()) : MonoTime();
+  }
   // What was sent or queued (queue_rest()) since so many bytes had been sent is history.
   //   is_full  the socket took less than history_allowance()
   void on_history_sent(std::uint64_t since_sent_bytes, bool is_full);
@@ -216,6 +224,7 @@ class FrameConnection final : private wire::FrameDelegate {
   const std::size_t max_queued_bytes_;
   MemoryBudget* budget_ = nullptr;
   HistoryPace* pace_ = nullptr;
+  HistoryShare share_;
   std::uint64_t sent_bytes_ = 0;
   wire::FrameDecoder decoder_;
   Output output_;

@@ -159,4 +159,23 @@ void HistoryPace::refill(MonoTime now) noexcept {
   refilled_ = now;
 }
 
+// --- one connection's share
+
+std::size_t HistoryShare::allowance(MonoTime now, double carried_bytes_per_s) noexcept {
+  if (share_ == 1 || carried_bytes_per_s == 0) {
+    tokens_ = 0;  // what was sent without a limit does not count
+    refilled_ = now;
+    return HistoryPace::kUnlimited;
+  }
+  constexpr auto kPieceBytes = static_cast<double>(HistoryPace::kMinPieceBytes);
+  const double bytes_per_s = share_ * carried_bytes_per_s;
+  tokens_ = std::min(tokens_ + bytes_per_s * seconds(now - refilled_),
+                     std::max(3 * bytes_per_s * seconds(HistoryPace::kPiece), 2 * kPieceBytes));
+  refilled_ = now;
+  if (tokens_ >= kPieceBytes) return static_cast<std::size_t>(tokens_);
+  due_ = now + std::chrono::ceil<Duration>(
+                   std::chrono::duration<double>((kPieceBytes - tokens_) / bytes_per_s));
+  return 0;
+}
+
 }  // namespace dssm::daemon

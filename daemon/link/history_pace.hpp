@@ -65,6 +65,10 @@ class HistoryPace {
   // How many bytes of history may be sent over that connection now. 0: none before due().
   std::size_t allowance(MonoTime now, const Connection& connection);
   MonoTime due() const noexcept { return due_; }
+  // What the network carries, when that is what limits and was measured lately; else 0.
+  double carried_bytes_per_s(MonoTime now) const noexcept {
+    return state_ == State::paced && now < valid_until_ ? bytes_per_s_ : 0;
+  }
 
   // Of any kind, over any of the connections.
   void on_sent(std::size_t bytes) noexcept { sent_bytes_ += bytes; }
@@ -113,6 +117,25 @@ class HistoryPace {
   bool is_full_ = false;                              // since then
   MonoTime period_begin_{};
   Duration full_for_{};  // in this period
+};
+
+// At most so much of what the network carries is the history of one connection, when a pace is
+// known.
+class HistoryShare {
+ public:
+  // 0 < share <= 1
+  void set(double share) noexcept { share_ = share; }
+
+  // How many bytes of history may be sent now. 0: none before due().
+  std::size_t allowance(MonoTime now, double carried_bytes_per_s) noexcept;
+  MonoTime due() const noexcept { return due_; }
+
+  void on_history(std::size_t bytes) noexcept { tokens_ -= static_cast<double>(bytes); }
+
+ private:
+  double share_ = 1;
+  double tokens_ = 0;  // bytes that may be sent; < 0 after more
+  MonoTime refilled_{}, due_{};
 };
 
 }  // namespace dssm::daemon

@@ -40,7 +40,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       plan_(plan),
       next_(std::clamp<Tid>(plan.first, 0, channel::kMaxTid)),
       last_(channel::kMaxTid) {
-  unsent_limit_ = unsent_base_ = plan.newest_first ? kUnsentBytes : 0;
+  unsent_limit_ = unsent_base_ = decides_late() ? kUnsentBytes : 0;
   connection_.limit_unsent(unsent_limit_);
   const Tid newest = newest_untrusted(reader_);
   const ring::TidRange held{std::max(plan.held.begin, next_), std::min(plan.held.end, newest + 1)};
@@ -207,7 +207,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     back_fill_ = {std::min(first_within(kInOrderBytes, range), range.end - 1), range.end};
     range.end = back_fill_.begin;
     if (range.count() == 0) passed_over_.pop_back();
-    if (has_pace()) limit_unsent_by_network();
+    limit_unsent_by_network();
   }
   if (back_fill_.count() > 0) return Next::ready;
   fills_ = false;
@@ -232,7 +232,7 @@ bool SamplePump::has_due_sample(MonoTime now, Tid newest) const noexcept {
 }
 
 PumpWait SamplePump::wait_for_output() noexcept {
-  was_full_ = plan_.newest_first;
+  was_full_ = decides_late();
   return PumpWait::output;
 }
 
@@ -332,9 +332,9 @@ bool SamplePump::is_kept_for_long(Tid first, MonoTime now) const noexcept {
 }
 
 void SamplePump::limit_unsent_by_network() {
-  if (const std::optional<std::uint64_t> carried = connection_.carried_per_s()) {
-    limit_unsent(std::clamp(bytes_in(kUnsentFor, *carried), kMinUnsentBytes, kUnsentBytes));
-  }
+  const std::optional<std::uint64_t> carried = connection_.carried_per_s();
+  limit_unsent(carried ? std::clamp(bytes_in(kUnsentFor, *carried), kMinUnsentBytes, kUnsentBytes)
+                       : unsent_base_);
 }
 
 void SamplePump::limit_unsent(std::size_t bytes) {
@@ -351,7 +351,7 @@ void SamplePump::fit_unsent_limit() {
   } else if (unsent > unsent_limit_ / 4) {
     lasting_bytes_ -= lasting_bytes_ / 8;
   }
-  limit_unsent(unsent_base_);
+  thins() ? limit_unsent_by_network() : limit_unsent(unsent_base_);
 }
 
 // Those before that sample will not be sent.

@@ -71,6 +71,8 @@ struct ChannelParts {
   Duration mirror_linger{};
   // What mirrors ask of their owners. May change: Mirror::on_new_demand().
   MirrorDemands mirrors = {};
+  // How what is written here is sent to owners. May change, for connections from then on.
+  SendingDemands sending = {};
   // Readers of this ring, a mirror's, shall reopen the stream: it has a new ring.
   std::function<void(const Stream&)> on_ring_replaced = {};
 };

@@ -117,6 +117,8 @@ void RemoteWriter::start_publishing() {
   FrameConnection& connection = *connection_.frames();
   sender_.emplace(ring_->mapping(), connection,
                   SampleSender::Options{may_tear_, &parts_.registry.budget()});
+  connection.set_priority(
+      parts_.sending.demand_for(id_, ring_->mapping().geometry().payload_bytes).priority);
   SamplePump::Observer& observer = *this;
   pump_.emplace(ring_->mapping(), connection, *sender_, observer,
                 SamplePump::Plan{.first = ring_->next_untrusted()});

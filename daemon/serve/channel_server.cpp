@@ -66,7 +66,7 @@ void ChannelServer::keep(PeerPlace place, std::unique_ptr<wire::Transport> trans
                          const wire::SocketAddress& address) {
   auto communicator = std::make_unique<DataCommunicator>(
       DataCommunicator::Parts{parts_.loop, parts_.registry, parts_.opens, streams_, self_, logger_,
-                              *this, parts_.clock, parts_.authorizer},
+                              *this, parts_.clock, parts_.authorizer, sending_},
       std::move(place), std::move(transport), address.str());
   DataCommunicator* key = communicator.get();
   communicators_.emplace(key, std::move(communicator));

@@ -56,6 +56,8 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   void on_clock();
 
   void set_limits(const PeerTable::Limits& limits) { peers_.set_limits(limits); }
+  // For subscriptions from now on.
+  void set_sending(SendingDemands sending) { sending_ = std::move(sending); }
 
  private:
   Result<void> accept(UniqueFd& socket);
@@ -72,6 +74,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   RateLimitedLogger logger_;
   wire::Greeting self_;
   PeerTable peers_;
+  SendingDemands sending_;
   ServedStreams streams_;
   MonoTime checked_{};  // all streams
   std::map<DataCommunicator*, std::unique_ptr<DataCommunicator>> communicators_;

@@ -141,6 +141,8 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
     pong.set_serial(request.serial());
     wire::send_clock(parts_.self, *pong.mutable_pong()->mutable_clock());
     pong.mutable_pong()->set_received_ns(to_ns(received));
+    pong.mutable_pong()->set_carried_bytes_per_s(
+        static_cast<std::uint64_t>(place_.pace().carried_bytes_per_s(parts_.loop.coarse_now())));
     pong.mutable_pong()->set_raw_ns(to_ns(RawClock::now()));
     link_.send(pong);
     parts_.observer.on_heartbeat();
@@ -252,7 +254,7 @@ Result<void> DataCommunicator::go_on_opening() {
   const Opening opening = *std::exchange(opening_, std::nullopt);
   channel_ = std::make_unique<StreamChannel>(
       StreamChannel::Parts{parts_.loop, catalog_, link_, place_.budget(), *this, parts_.self,
-                           *them_, parts_.clock},
+                           *them_, parts_.clock, parts_.sending},
       parts_.streams.get(opening.stream), them_->has_feature(wire::kFeatureTorn));
   net::Frame answer;
   answer.set_serial(opening.serial);

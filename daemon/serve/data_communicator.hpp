@@ -88,6 +88,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     Observer& observer;
     ClockAssessor* clock;  // nullptr: the clock is not watched
     const Authorizer& authorizer;
+    const SendingDemands& sending;
   };
 
   // peer_address: for the log, "10.0.0.3:40000". All in `parts` outlive it.

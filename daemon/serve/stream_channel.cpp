@@ -95,6 +95,10 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
   if (!feed_) feed_ = DSSM_TRY(served_->feed());
   feed_->forget(*this);
   due_.disable();
+  const SendingDemand demand =
+      parts_.sending.demand_for(stream().id(), stream().type().payload_bytes);
+  parts_.link.set_priority(demand.priority);
+  parts_.link.set_history_share(demand.history_percent / 100.0);
   const Tid newest = newest_untrusted(reader_);
   const Tid first = first_tid(request);
   net::Frame frame = answer_to(serial);

@@ -17,6 +17,7 @@
 #include "daemon/link/sample_sender.hpp"
 #include "daemon/serve/sample_receiver.hpp"
 #include "daemon/serve/served_stream.hpp"
+#include "daemon/service/config_values.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 
 namespace dssm::daemon {
@@ -43,6 +44,7 @@ class StreamChannel final : private SamplePump::Observer,
     const wire::Greeting& self;
     const wire::Greeting& them;
     ClockAssessor* clock;  // nullptr: the clock is not watched
+    const SendingDemands& sending;
   };
 
   // may_tear: the client has the feature "torn". All in `parts` outlive it.

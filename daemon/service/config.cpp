@@ -242,6 +242,14 @@ constexpr ConfigKey kKeys[] = {
      ValueForm::list, kChangesAtOnce<&Config::mirrors>,
      add_exception<&Config::mirrors, parse_mirror_exception>,
      [](Config& c) { c.mirrors.exceptions.clear(); }, "mirror-stream"},
+    {"stream_priorities", "STREAM=PRIORITY",
+     "how samples of some streams are sent to other hosts: with high, normal or low priority, and "
+     "how much of the network their history takes at most, e.g. 'encoder*=high' or "
+     "'camera*=low 30%'; may be repeated, the first that matches counts; default: high for samples "
+     "below 16 KiB, else normal",
+     ValueForm::list, kChangesAtOnce<&Config::sending>,
+     add_exception<&Config::sending, parse_sending_exception>,
+     [](Config& c) { c.sending.exceptions.clear(); }, "stream-priority"},
     {"clock_policy", "POLICY",
      "what to do with streams of hosts whose clocks may be too far from this one's: enforce (not "
      "open them, and answer reads by time with an error), mark (flag their samples) or off; "

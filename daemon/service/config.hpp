@@ -59,6 +59,7 @@ struct Config {
   std::uint64_t max_peer_memory_bytes = 96ULL << 20;
   Duration mirror_linger = std::chrono::seconds(5);
   MirrorDemands mirrors;
+  SendingDemands sending;
 
   // Clocks.
   ClockPolicies clocks;

@@ -8,6 +8,8 @@
 #include <sys/types.h>
 #include <unistd.h>
 
+#include <algorithm>
+#include <array>
 #include <charconv>
 #include <string>
 #include <vector>
@@ -59,10 +61,21 @@ Error out_of_range(std::string_view text, std::uint64_t min, std::uint64_t max,
   return invalid(fmt::format("{} is outside of {} to {}{}", in_quotes(text), min, max, unit));
 }
 
+// By wire::Priority.
+constexpr std::array<std::string_view, 3> kPriorityNames = {"high", "normal", "low"};
+
 bool matches(const std::string& pattern, const StreamId& id) {
   const std::string full = fmt::format("{}:{}", id.name, id.id);
   return !::fnmatch(pattern.c_str(), id.name.c_str(), 0) ||
          !::fnmatch(pattern.c_str(), full.c_str(), 0);
+}
+
+template <class Exception>
+const Exception* first_for(const StreamId& id, const std::vector<Exception>& exceptions) {
+  const auto found =
+      std::find_if(exceptions.begin(), exceptions.end(),
+                   [&](const Exception& exception) { return matches(exception.pattern, id); });
+  return found != exceptions.end() ? &*found : nullptr;
 }
 
 // One of those of a stream: "at_once", "10 Hz", "2 s".
@@ -100,21 +113,21 @@ std::string take_pattern(std::string_view text, std::string& out) {
 }  // namespace
 
 ClockDemand ClockPolicies::demand_for(const StreamId& id) const {
-  for (const Exception& exception : exceptions) {
-    if (!matches(exception.pattern, id)) continue;
-    return {exception.policy,
-            exception.limit == Duration::zero() ? general.limit : exception.limit};
-  }
-  return general;
+  const Exception* found = first_for(id, exceptions);
+  if (!found) return general;
+  return {found->policy, found->limit == Duration::zero() ? general.limit : found->limit};
 }
 
 MirrorDemand MirrorDemands::demand_for(const StreamId& id) const {
-  for (const Exception& exception : exceptions) {
-    if (!matches(exception.pattern, id)) continue;
-    return {exception.history_at_once.value_or(general.history_at_once), exception.max_rate_hz,
-            exception.max_history};
-  }
-  return general;
+  const Exception* found = first_for(id, exceptions);
+  if (!found) return general;
+  return {found->history_at_once.value_or(general.history_at_once), found->max_rate_hz,
+          found->max_history};
+}
+
+SendingDemand SendingDemands::demand_for(const StreamId& id, std::uint64_t payload_bytes) const {
+  if (const Exception* found = first_for(id, exceptions)) return found->demand;
+  return {payload_bytes < kSmallBytes ? wire::Priority::high : wire::Priority::normal};
 }
 
 Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t min, std::uint64_t max) {
@@ -228,6 +241,36 @@ Result<MirrorDemands::Exception> parse_mirror_exception(std::string_view text) {
     const Result<void> taken = take_demand(what, exception);
     if (!taken) return wrong("holds what is no demand: " + taken.error().message);
   }
+  return exception;
+}
+
+Result<SendingDemands::Exception> parse_sending_exception(std::string_view text) {
+  const auto wrong = [&](const std::string& why) {
+    return Error{Errc::invalid_argument,
+                 fmt::format("{} {}; write \"STREAM=PRIORITY\" or \"STREAM=PRIORITY SHARE\", such "
+                             "as \"encoder*=high\" or \"camera*=low 30%\"",
+                             in_quotes(text), why)};
+  };
+  SendingDemands::Exception exception;
+  const std::string why = take_pattern(text, exception.pattern);
+  if (!why.empty()) return wrong(why);
+  const std::string_view demand = text.substr(exception.pattern.size() + 1);
+  const std::size_t blank = std::min(demand.find(' '), demand.size());
+  const std::string_view name = demand.substr(0, blank);
+  const auto priority = std::find(kPriorityNames.begin(), kPriorityNames.end(), name);
+  if (priority == kPriorityNames.end()) {
+    return wrong("has a priority that is none: " + in_quotes(name) +
+                 " is neither high, normal nor low");
+  }
+  exception.demand.priority =
+      static_cast<wire::Priority>(std::distance(kPriorityNames.begin(), priority));
+  if (blank == demand.size()) return exception;
+  const std::string_view text_of_share = demand.substr(blank + 1);
+  const Result<Quantity> share = parse_quantity(text_of_share);
+  if (!share || share->unit != "%" || share->number < 1 || share->number > 100) {
+    return wrong("has a share that is none: " + in_quotes(text_of_share) + " is not 1% to 100%");
+  }
+  exception.demand.history_percent = static_cast<int>(share->number);
   return exception;
 }
 

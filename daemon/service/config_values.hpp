@@ -18,6 +18,7 @@
 #include <vector>
 
 #include "core/clock/clock_bound.hpp"
+#include "core/wire/transport.hpp"
 #include "daemon/base/log.hpp"
 
 namespace dssm::daemon {
@@ -79,6 +80,32 @@ struct MirrorDemands {
   friend bool operator==(const MirrorDemands& a, const MirrorDemands& b) = default;
 };
 
+// How samples of streams are sent to other hosts: the configuration key stream_priorities.
+struct SendingDemand {
+  wire::Priority priority = wire::Priority::normal;
+  int history_percent = 100;  // of what the network carries, for history at most
+
+  friend bool operator==(const SendingDemand& a, const SendingDemand& b) = default;
+};
+
+struct SendingDemands {
+  struct Exception {
+    std::string pattern;  // as in ClockPolicies
+    SendingDemand demand;
+
+    friend bool operator==(const Exception& a, const Exception& b) = default;
+  };
+  // Shorter samples are small ones, by default with a high priority: they take little, and wait
+  // most for others.
+  static constexpr std::uint64_t kSmallBytes = 16U << 10;
+
+  std::vector<Exception> exceptions;
+
+  SendingDemand demand_for(const StreamId& id, std::uint64_t payload_bytes) const;
+
+  friend bool operator==(const SendingDemands& a, const SendingDemands& b) = default;
+};
+
 // A whole number from `min` to `max`.
 Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t min, std::uint64_t max);
 
@@ -102,6 +129,9 @@ Result<ClockPolicies::Exception> parse_clock_exception(std::string_view text);
 
 // "STREAM=WHAT, WHAT": "map=at_once", "camera*=when_read, 10 Hz, 2 s".
 Result<MirrorDemands::Exception> parse_mirror_exception(std::string_view text);
+
+// "STREAM=PRIORITY", or "STREAM=PRIORITY SHARE": "encoder*=high", "camera*=low 30%".
+Result<SendingDemands::Exception> parse_sending_exception(std::string_view text);
 
 // The drift of a clock: "50 ppm"; 1 to 1000. In billionths.
 Result<clock::PartsPerBillion> parse_drift(std::string_view text);

@@ -62,8 +62,9 @@ class MemoryPeer {
   std::optional<std::uint64_t> carried_per_s;
   std::optional<wire::Progress> progress;
   std::optional<std::size_t> unsent_bytes;
-  std::size_t unsent_limit = 0;  // that dssmd set
-  bool closed = false;           // by dssmd
+  std::optional<wire::Priority> priority;  // that dssmd set
+  std::size_t unsent_limit = 0;            // that dssmd set
+  bool closed = false;                     // by dssmd
 
  private:
   friend class MemoryTransport;
@@ -131,6 +132,7 @@ class MemoryTransport final : public wire::Transport {
     return stamps_ ? peer_.arrived : std::nullopt;
   }
   void limit_unsent(std::size_t bytes) noexcept override { peer_.unsent_limit = bytes; }
+  void set_priority(wire::Priority priority) noexcept override { peer_.priority = priority; }
   std::optional<std::size_t> unsent_bytes() const noexcept override { return peer_.unsent_bytes; }
   std::optional<std::uint64_t> carried_per_s() const noexcept override {
     return peer_.carried_per_s;

@@ -71,7 +71,9 @@ struct Subscription {
   Start start = Start::now;
   Tid tid = 0;
   Time time{};
-  double max_rate_hz = 0;  // > 0: at most so many per second, the newest each time; 0: all
+  // > 0: at most so many per second, the newest one each time, however little the network carries.
+  // 0: all, in their order: where the network carries less than is written, they come late.
+  double max_rate_hz = 0;
 };
 
 class PConnector {

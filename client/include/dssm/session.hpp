@@ -78,8 +78,11 @@ struct HostInfo {
   Duration since{};                      // how long it has been in this state
   Duration round_trip{};                 // of the last heartbeat (one a second); 0: none yet
   Duration min_round_trip{};             // of all heartbeats of this connection; 0: none yet
-  std::uint32_t streams = 0;             // that it owns
-  std::optional<ClockSnapshot> clock;    // aged to the present; empty: it reports none
+  // What the network carries from it to here, as it measured while it sent history within the last
+  // minute; 0: not known, or the network is not what limits.
+  std::uint64_t carried_bytes_per_s = 0;
+  std::uint32_t streams = 0;           // that it owns
+  std::optional<ClockSnapshot> clock;  // aged to the present; empty: it reports none
   std::string clock_reference;  // what its clock follows: a host's name or an address, or empty
   Duration clock_distance = kUnknownClockError;  // greatest distance from this PC's clock
   // Why the times of its samples are not good here, in a sentence, for people; empty: they are, or

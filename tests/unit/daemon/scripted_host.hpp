@@ -160,6 +160,7 @@ class ScriptedPeer final : public ScriptedHost {
   bool answers_heartbeat = true;
   Duration delay{};                                     // until a Ping is answered
   std::int64_t ping_received_ns = 0, pong_sent_ns = 0;  // what its Pongs say
+  std::uint64_t carried_bytes_per_s = 0;
   int pings = 0, watches = 0;
 
  private:
@@ -172,6 +173,7 @@ class ScriptedPeer final : public ScriptedHost {
       answer.mutable_pong()->mutable_clock()->set_anchor(std::string(16, 'r'));
       answer.mutable_pong()->set_received_ns(ping_received_ns);
       answer.mutable_pong()->set_raw_ns(pong_sent_ns);
+      answer.mutable_pong()->set_carried_bytes_per_s(carried_bytes_per_s);
       pongs_.push_back(answer);
       pong_timer_.enable_in(delay);
     } else if (request.has_watch()) {

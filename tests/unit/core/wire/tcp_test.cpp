@@ -142,6 +142,33 @@ TEST_P(TcpTransport, KnowsWhenBytesArrivedHoweverLateTheyAreReceived) {
   EXPECT_LE(*pair.server->arrived(), readable);
 }
 
+TEST_P(TcpTransport, SetsThePriorityOfItsPackets) {
+  const Pair pair = connect_pair(GetParam());
+  const int socket = pair.client->fd();
+  const bool is_ipv6 = GetParam()[0] == '[';
+  const auto expect = [&](Priority priority, int dscp, int queue) {
+    pair.client->set_priority(priority);
+    EXPECT_EQ(
+        is_ipv6 ? option(socket, IPPROTO_IPV6, IPV6_TCLASS) : option(socket, IPPROTO_IP, IP_TOS),
+        dscp << 2);
+    EXPECT_EQ(option(socket, SOL_SOCKET, SO_PRIORITY), queue);
+  };
+  expect(Priority::high, 32, 6);
+  expect(Priority::low, 8, 2);
+  expect(Priority::normal, 0, 0);
+}
+
+TEST_P(TcpTransport, KnowsWhatIsNotOnTheNetworkYet) {
+  const Pair pair = connect_pair(GetParam());
+  const std::optional<std::size_t> none = pair.client->unsent_bytes();
+  if (!none) GTEST_SKIP() << "no SIOCOUTQNSD here (qemu-user has none)";
+  EXPECT_EQ(*none, 0u);
+  const std::string much(1 << 20, 'x');
+  const iovec part = part_of(much);
+  while (pair.client->send({&part, 1})->status == IoStatus::ok) continue;  // nobody reads
+  EXPECT_GT(*pair.client->unsent_bytes(), 0u);
+}
+
 INSTANTIATE_TEST_SUITE_P(BothKinds, TcpTransport, testing::Values("127.0.0.1:0", "[::1]:0"));
 
 TEST(Tcp, NeverWaits) {

@@ -83,6 +83,18 @@ TEST_F(PeersTest, MeasureTheRoundTripAndTakeTheClock) {
   EXPECT_EQ(catalog.hosts().begin()->second.greeting.clock->clock.bound, Duration(1000));
 }
 
+TEST_F(PeersTest, SayWhatTheNetworkCarriesUntilTheConnectionEnds) {
+  one.carried_bytes_per_s = 12'000'000;
+  start({&one});
+  wait([&] { return host(0).carried_bytes_per_s() == 12'000'000; });
+  one.carried_bytes_per_s = 0;
+  wait([&] { return host(0).carried_bytes_per_s() == 0; });
+  one.carried_bytes_per_s = 1;
+  wait([&] { return host(0).carried_bytes_per_s() == 1; });
+  one.cut();
+  wait([&] { return host(0).carried_bytes_per_s() == 0; });
+}
+
 TEST_F(PeersTest, TakeAHostOutWhenItsConnectionBreaks) {
   one.streams = {"lidar"};
   start({&one});

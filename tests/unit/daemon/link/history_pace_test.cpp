@@ -32,6 +32,8 @@ class Network final : public wire::Transport {
     return history / std::chrono::duration<double>(how_long).count();
   }
 
+  double carried_bytes_per_s() const { return pace_.carried_bytes_per_s(now); }
+
   MonoTime now{1000s};
   double bytes_per_s;
   double live_bytes_per_s = 0;          // of other connections
@@ -115,6 +117,15 @@ TEST_P(EachRate, LeavesWhatLiveSamplesTake) {
       << "those who read one sample after the other do not wait for ever";
 }
 
+TEST_P(EachRate, IsKnownWhileItIsValid) {
+  HistoryPace pace;
+  EXPECT_EQ(pace.carried_bytes_per_s(MonoTime()), 0);
+  Network network(pace, GetParam());
+  network.run(2s);
+  EXPECT_NEAR(pace.carried_bytes_per_s(network.now), GetParam(), 0.1 * GetParam());
+  EXPECT_EQ(pace.carried_bytes_per_s(network.now + HistoryPace::kMaxValid), 0);
+}
+
 TEST(HistoryPace, CountsLiveSamplesThatPassWhileItMeasures) {
   HistoryPace pace;
   Network network(pace, 50e6);
@@ -139,6 +150,7 @@ TEST(HistoryPace, WaitsUntilTcpIsUpToSpeed) {
 void expect_left_alone(Network& network) {
   network.run(1s);
   const int asked = network.asked;
+  EXPECT_EQ(network.carried_bytes_per_s(), 0) << "of the network nothing is known";
   EXPECT_GE(network.run(1s), 0.99 * network.bytes_per_s) << "no other stream waits for it";
   EXPECT_EQ(network.asked, asked) << "it is measured";
 }
@@ -273,6 +285,35 @@ TEST(HistoryPace, CountsHistoryNoMoreThatWillNotBeSent) {
   EXPECT_EQ(network.run(100ms), 0);
   pace.on_history_dropped(20'000'000);
   EXPECT_NEAR(network.run(1s), HistoryPace::kShare * 10e6, 1e6);
+}
+
+class EachShare : public testing::TestWithParam<double> {};
+INSTANTIATE_TEST_SUITE_P(, EachShare, testing::Values(0.01, 0.3, 0.99));
+
+TEST_P(EachShare, IsWhatHistoryTakes) {
+  HistoryShare share;
+  share.set(GetParam());
+  MonoTime now{1000s};
+  EXPECT_EQ(share.allowance(now, 0), HistoryPace::kUnlimited);
+  share.on_history(100'000'000);
+  EXPECT_EQ(share.allowance(now, 0), HistoryPace::kUnlimited) << "and that does not count";
+  double sent = 0;
+  for (const MonoTime end = now + 10s; now < end;) {
+    const std::size_t allowed = share.allowance(now, 10e6);
+    sent += static_cast<double>(allowed);
+    share.on_history(allowed);
+    EXPECT_TRUE(allowed > 0 || share.due() > now);
+    now = std::max(share.due(), now + 100us);
+  }
+  EXPECT_NEAR(sent, GetParam() * 100e6, 0.01 * GetParam() * 100e6 + 30e3);
+}
+
+TEST(HistoryShare, LimitsNothingWhileTheNetworkIsNotKnown) {
+  HistoryShare share;
+  share.set(0.01);
+  EXPECT_EQ(share.allowance(MonoTime(1000s), 0), HistoryPace::kUnlimited);
+  share.set(1);
+  EXPECT_EQ(share.allowance(MonoTime(1000s), 1e6), HistoryPace::kUnlimited);
 }
 
 }  // namespace

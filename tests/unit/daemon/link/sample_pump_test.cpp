@@ -706,6 +706,19 @@ TEST_F(NewestFirst, LittleWaitsInTheKernelOfASlowNetwork) {
   EXPECT_EQ(rig.peer.unsent_limit, 0u) << "for samples in their order the system's is best";
 }
 
+TEST(SamplePump, KeepsLittleInTheKernelAlsoWithARate) {
+  PumpRig rig(kLarge, 16);
+  rig.thinned = true;
+  rig.peer.carried_per_s = 10'000'000;
+  rig.write(2);
+  rig.peer.room = 1000;
+  rig.start({0, 1, 1000});
+  EXPECT_EQ(rig.peer.unsent_limit, SamplePump::kUnsentBytes);
+  EXPECT_EQ(rig.run(), PumpWait::output);
+  EXPECT_EQ(rig.run(), PumpWait::output);
+  EXPECT_EQ(rig.peer.unsent_limit, 20'000u);
+}
+
 // dssmd was late, and the network had nothing to carry meanwhile.
 TEST_F(NewestFirst, WhatWaitsInTheKernelLastsUntilDssmdRunsAgain) {
   rig.peer.carried_per_s = 10'000'000;
@@ -790,6 +803,21 @@ TEST_F(PacedHistory, FollowsTheNewestSampleInPieces) {
   rig.write();
   EXPECT_EQ(rig.run_on(), PumpWait::sample);
   EXPECT_EQ(rig.accepted(), (std::vector<Tid>{2, 1, 0, 3}));
+}
+
+TEST_F(PacedHistory, TakesNoMoreThanItsShare) {
+  const auto bytes_in = [&](Duration time) {
+    const std::size_t before = rig.peer.sent.size();
+    const MonoTime end = rig.loop.now() + time;
+    while (rig.loop.now() < end && rig.run_on() == PumpWait::pace) {
+      pass(std::max<Duration>(rig.pump->due() - rig.loop.now(), 1ms));
+    }
+    return static_cast<double>(rig.peer.sent.size() - before);
+  };
+  bytes_in(100ms);  // the newest one
+  EXPECT_NEAR(bytes_in(250ms), 0.25 * HistoryPace::kShare * 1e6, 0.02e6);
+  rig.link.set_history_share(0.2);
+  EXPECT_NEAR(bytes_in(1s), 0.2 * 1e6, 0.03e6);
 }
 
 TEST_F(PacedHistory, LetsNewSamplesPassAtOnce) {

@@ -240,6 +240,16 @@ TEST_F(StreamChannelTest, ThinsAtTheSource) {
   EXPECT_TRUE(std::is_sorted(got.begin(), got.end()));
 }
 
+TEST_F(StreamChannelTest, SendsWithThePriorityThatTheStreamHasAtItsSubscription) {
+  const auto subscribed = [&] {
+    EXPECT_EQ(subscribe([](auto& s) { s.set_from_now(true); }), "subscribed:0 caught_up");
+    return *peer.priority;
+  };
+  EXPECT_EQ(subscribed(), wire::Priority::high) << "a small one";
+  rig.server.set_sending({{{"odo*", {wire::Priority::low, 30}}}});
+  EXPECT_EQ(subscribed(), wire::Priority::low);
+}
+
 TEST_F(StreamChannelTest, RefusesAnInvalidRate) {
   for (const double rate :
        {-1.0, std::numeric_limits<double>::quiet_NaN(), std::numeric_limits<double>::infinity()}) {

@@ -51,6 +51,7 @@ max_peer_memory = "22 MiB"
 mirror_linger = "23 s"
 mirror_history = "at_once"
 mirror_streams = ["camera*=when_read, 10 Hz,500 ms", "map:2=at_once", "rear=5 Hz"]
+stream_priorities = ["encoder=normal", "camera*=low 30%"]
 )",
                                                     "dssmd.conf");
   ASSERT_TRUE(applied) << applied.error().message;
@@ -85,6 +86,13 @@ mirror_streams = ["camera*=when_read, 10 Hz,500 ms", "map:2=at_once", "rear=5 Hz
   EXPECT_EQ(demand_for("map", 2), (MirrorDemand{true, 0, {}}));
   EXPECT_EQ(demand_for("map", 1), (MirrorDemand{true, 0, {}}));
   EXPECT_EQ(demand_for("rear", 0), (MirrorDemand{true, 5, {}})) << "the time is as in general";
+  const auto sending = [&](const std::string& name, std::uint64_t payload_bytes) {
+    return config.sending.demand_for({name, 0, "pc7"}, payload_bytes);
+  };
+  EXPECT_EQ(sending("encoder", 8), (SendingDemand{wire::Priority::normal, 100}));
+  EXPECT_EQ(sending("camera3", 8), (SendingDemand{wire::Priority::low, 30}));
+  EXPECT_EQ(sending("imu", 16383), (SendingDemand{wire::Priority::high, 100}));
+  EXPECT_EQ(sending("map", 16384), (SendingDemand{wire::Priority::normal, 100}));
 }
 
 TEST(Config, TakesAnEmptyFile) { EXPECT_EQ(mistakes_in(""), ""); }
@@ -119,6 +127,20 @@ TEST(Config, NamesLineAndKeyOfWhatIsWrongInAList) {
             std::string::npos);
   EXPECT_NE(mistakes_in("peers = [\"pc2:0\"]\n").find("port 0"), std::string::npos);
   EXPECT_NE(mistakes_in("listen = [\"pc1\"]\n").find("'pc1' is a name"), std::string::npos);
+}
+
+TEST(Config, NamesWhatIsWrongInAPriority) {
+  const auto mistake = [](const std::string& demand) {
+    return mistakes_in("stream_priorities = [\"" + demand + "\"]\n");
+  };
+  EXPECT_EQ(mistake("camera=urgent"),
+            "dssmd.conf:1: key 'stream_priorities': 'camera=urgent' has a priority that is none: "
+            "'urgent' is neither high, normal nor low; write \"STREAM=PRIORITY\" or "
+            "\"STREAM=PRIORITY SHARE\", such as \"encoder*=high\" or \"camera*=low 30%\"");
+  for (const char* wrong : {"camera", "=low", "camera=", "camera=low 0%", "camera=low 101%",
+                            "camera=low 30", "camera=low 30 ms", "camera=low  ", "camera=30%"}) {
+    EXPECT_NE(mistake(wrong), "") << wrong;
+  }
 }
 
 TEST(Config, NamesWhatIsWrongInADemandOnMirrors) {
