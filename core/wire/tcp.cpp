@@ -5,10 +5,8 @@
 #include "core/wire/tcp.hpp"
 
 #include <fcntl.h>
-#include <linux/sockios.h>
 #include <linux/tcp.h>  // glibc's tcp_info has no rates
 #include <netinet/in.h>
-#include <sys/ioctl.h>
 #include <sys/time.h>
 
 #include <algorithm>
@@ -132,17 +130,6 @@ class TcpTransport final : public Transport {
     set_option(socket_.get(), SOL_SOCKET, SO_PRIORITY, queue);
   }
 
-  std::optional<std::size_t> unsent_bytes() const noexcept override {
-    int bytes = 0;
-    if (::ioctl(socket_.get(), SIOCOUTQNSD, &bytes) != 0) return std::nullopt;
-    return static_cast<std::size_t>(bytes);
-  }
-
-  std::optional<std::uint64_t> carried_per_s() const noexcept override {
-    const std::optional<tcp_info> info = state();
-    if (!info || info->tcpi_delivery_rate == 0) return std::nullopt;
-    return info->tcpi_delivery_rate;
-  }
   std::optional<Progress> progress() const noexcept override {
     using std::chrono::microseconds;
     const std::optional<tcp_info> info = state();
@@ -151,6 +138,7 @@ class TcpTransport final : public Transport {
     return Progress{info->tcpi_delivered,
                     info->tcpi_snd_mss,
                     info->tcpi_notsent_bytes + unacknowledged,
+                    info->tcpi_delivery_rate,
                     microseconds(info->tcpi_min_rtt),
                     microseconds(info->tcpi_rtt),
                     microseconds(info->tcpi_busy_time),

@@ -68,7 +68,9 @@ enum class Priority : unsigned char {
 struct Progress {
   std::uint32_t delivered_packets = 0;  // since the connection began; may begin anew at 0
   std::uint32_t packet_bytes = 0;
-  std::uint64_t waiting_bytes = 0;          // not sent, or not acknowledged
+  std::uint64_t waiting_bytes = 0;  // not sent, or not acknowledged
+  // Lately, while there was enough to send; 0: not known.
+  std::uint64_t carried_bytes_per_s = 0;
   Duration round_trip{}, round_trip_now{};  // the least of late; smoothed
   // Since the connection began:
   Duration sending{};           // so long some were on their way or waited to be sent
@@ -114,12 +116,6 @@ class Transport {
   virtual void limit_unsent(std::size_t /*bytes*/) noexcept {}
   // Of all that send() takes from now on, if the kernel can do that.
   virtual void set_priority(Priority /*priority*/) noexcept {}
-  // How many bytes that send() took are not on the network yet. nullopt: not known.
-  virtual std::optional<std::size_t> unsent_bytes() const noexcept { return std::nullopt; }
-  // How many bytes a second the network has carried lately, while there was enough to send.
-  // nullopt: not known.
-  virtual std::optional<std::uint64_t> carried_per_s() const noexcept { return std::nullopt; }
-
   // nullopt: not known.
   virtual std::optional<Progress> progress() const noexcept { return std::nullopt; }
 

@@ -169,11 +169,8 @@ class FrameConnection final : private wire::FrameDelegate {
   void limit_unsent(std::size_t bytes) noexcept {
     if (!closed_) transport_->limit_unsent(bytes);
   }
-  std::optional<std::size_t> unsent_bytes() const noexcept {
-    return closed_ ? std::nullopt : transport_->unsent_bytes();
-  }
-  std::optional<std::uint64_t> carried_per_s() const noexcept {
-    return closed_ ? std::nullopt : transport_->carried_per_s();
+  std::optional<wire::Progress> progress() const noexcept {
+    return closed_ ? std::nullopt : transport_->progress();
   }
   const wire::DecoderCounters& counters() const noexcept { return decoder_.counters(); }
 

@@ -40,7 +40,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       plan_(plan),
       next_(std::clamp<Tid>(plan.first, 0, channel::kMaxTid)),
       last_(channel::kMaxTid) {
-  unsent_limit_ = unsent_base_ = decides_late() ? kUnsentBytes : 0;
+  unsent_limit_ = decides_late() ? kMinUnsentBytes : 0;
   connection_.limit_unsent(unsent_limit_);
   const Tid newest = newest_untrusted(reader_);
   const ring::TidRange held{std::max(plan.held.begin, next_), std::min(plan.held.end, newest + 1)};
@@ -207,11 +207,10 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     back_fill_ = {std::min(first_within(kInOrderBytes, range), range.end - 1), range.end};
     range.end = back_fill_.begin;
     if (range.count() == 0) passed_over_.pop_back();
-    limit_unsent_by_network();
+    limit_unsent(connection_.progress());
   }
   if (back_fill_.count() > 0) return Next::ready;
   fills_ = false;
-  limit_unsent(kUnsentBytes);
   if (next_ <= newest) return Next::wait_for_time;
   if (next_ <= last_) return Next::wait_for_sample;
   sender_.end_run();
@@ -270,9 +269,10 @@ Tid SamplePump::first_within(std::size_t bytes, ring::TidRange range) const noex
 }
 
 bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
-  if (first_within(std::max(kInOrderBytes, lasting_bytes_), samples) == samples.begin) return false;
-  const std::optional<std::uint64_t> carried = connection_.carried_per_s();
-  return !carried || first_within(bytes_in(kInOrderFor, *carried), samples) != samples.begin;
+  if (first_within(std::max(kInOrderBytes, unsent_limit_), samples) == samples.begin) return false;
+  const std::optional<wire::Progress> progress = connection_.progress();
+  return !progress || first_within(bytes_in(kInOrderFor, progress->carried_bytes_per_s), samples) !=
+                          samples.begin;
 }
 
 void SamplePump::pass_over(Tid next, MonoTime now) {
@@ -282,7 +282,7 @@ void SamplePump::pass_over(Tid next, MonoTime now) {
   back_fill_ = {};
   passed_over_.push_back({next_, next});
   next_ = next;
-  limit_unsent_by_network();
+  limit_unsent(connection_.progress());
   if (passed_over_since_ == 0) {
     behind_from_ = has_kept_up_ ? passed_over_.back().begin : next;  // history is no overload
   }
@@ -331,27 +331,25 @@ bool SamplePump::is_kept_for_long(Tid first, MonoTime now) const noexcept {
   return static_cast<double>(first + depth_ - next_) > written_per_s * kept.count();
 }
 
-void SamplePump::limit_unsent_by_network() {
-  const std::optional<std::uint64_t> carried = connection_.carried_per_s();
-  limit_unsent(carried ? std::clamp(bytes_in(kUnsentFor, *carried), kMinUnsentBytes, kUnsentBytes)
-                       : unsent_base_);
-}
-
-void SamplePump::limit_unsent(std::size_t bytes) {
-  unsent_base_ = bytes;
-  const std::size_t limit = std::max(bytes, lasting_bytes_);
+void SamplePump::limit_unsent(const std::optional<wire::Progress>& progress) {
+  const std::uint64_t carried = progress ? progress->carried_bytes_per_s : 0;
+  const std::size_t usual =
+      std::clamp(bytes_in(kUnsentFor, carried), kMinUnsentBytes, kUnsentBytes);
+  const std::size_t limit = std::min(
+      static_cast<std::size_t>(unsent_factor_ * static_cast<double>(usual)), kMostUnsentBytes);
   if (std::exchange(unsent_limit_, limit) != limit) connection_.limit_unsent(limit);
 }
 
 // The connection was full, and takes bytes again.
 void SamplePump::fit_unsent_limit() {
-  const std::optional<std::size_t> unsent = connection_.unsent_bytes();
-  if (unsent == 0) {
-    lasting_bytes_ = std::min(2 * unsent_limit_, kMostUnsentBytes);
-  } else if (unsent > unsent_limit_ / 4) {
-    lasting_bytes_ -= lasting_bytes_ / 8;
+  const std::optional<wire::Progress> progress = connection_.progress();
+  if (!progress) return;
+  if (progress->waiting_bytes == 0) {
+    unsent_factor_ = std::min(2 * unsent_factor_, double{kMostUnsentBytes / kMinUnsentBytes});
+  } else if (progress->waiting_bytes > unsent_limit_ / 4) {
+    unsent_factor_ = std::max(7 * unsent_factor_ / 8, 1.0);
   }
-  thins() ? limit_unsent_by_network() : limit_unsent(unsent_base_);
+  limit_unsent(progress);
 }
 
 // Those before that sample will not be sent.

@@ -51,7 +51,7 @@ class SamplePump {
   static constexpr std::size_t kHeaderBytes = 32;  // of a sample's frame, about
   // So much waits in the kernel, where nothing newer can take its place; less when the network
   // needs longer than that for it. Half as much made sending slower on a fast link. On a busy PC it
-  // has to last until dssmd runs again: twice as much each time that nothing was left by then.
+  // has to last until dssmd runs again: twice as much each time that all had arrived by then.
   static constexpr std::size_t kUnsentBytes = 128U << 10, kMinUnsentBytes = 16U << 10;
   static constexpr std::size_t kMostUnsentBytes = 4U << 20;
   static constexpr Duration kUnsentFor = std::chrono::milliseconds(2);
@@ -137,9 +137,8 @@ class SamplePump {
   void leave_out(Tid newest);
   void give_up_what_is_never_carried(MonoTime now);
   bool is_kept_for_long(Tid first, MonoTime now) const noexcept;
-  void limit_unsent(std::size_t bytes);
   void fit_unsent_limit();
-  void limit_unsent_by_network();
+  void limit_unsent(const std::optional<wire::Progress>& progress);
   void lose_passed_over(Tid before);
   void lose_up_to(Tid next);
   void lose(ring::TidRange range);
@@ -163,10 +162,10 @@ class SamplePump {
   int passed_over_since_ = 0;
   MonoTime behind_since_{};
   Tid behind_from_ = 0, waiting_before_ = 0, next_before_ = 0;
-  std::size_t unsent_limit_ = 0, unsent_base_ = 0;  // of what waits in the kernel
-  std::size_t lasting_bytes_ = 0;  // so much of it lasts until dssmd runs again; 0: any does
-  bool was_full_ = false;          // the connection, at the end of the last pump()
-  bool under_way_ = false;         // the sender is busy with it
+  std::size_t unsent_limit_ = 0;  // of what waits in the kernel
+  double unsent_factor_ = 1;      // so much more than usual lasts until dssmd runs again
+  bool was_full_ = false;         // the connection, at the end of the last pump()
+  bool under_way_ = false;        // the sender is busy with it
   bool caught_up_ = false;
   MonoTime due_{};  // the next sample, with a rate
   MonoTime wake_at_{};

@@ -59,9 +59,7 @@ class MemoryPeer {
   std::function<void()> after_send;
   std::optional<Time> arrived;  // what dssmd gets as the time of its input, once it asks for it
   std::size_t sends = 0;        // that took bytes
-  std::optional<std::uint64_t> carried_per_s;
   std::optional<wire::Progress> progress;
-  std::optional<std::size_t> unsent_bytes;
   std::optional<wire::Priority> priority;  // that dssmd set
   std::size_t unsent_limit = 0;            // that dssmd set
   bool closed = false;                     // by dssmd
@@ -133,10 +131,6 @@ class MemoryTransport final : public wire::Transport {
   }
   void limit_unsent(std::size_t bytes) noexcept override { peer_.unsent_limit = bytes; }
   void set_priority(wire::Priority priority) noexcept override { peer_.priority = priority; }
-  std::optional<std::size_t> unsent_bytes() const noexcept override { return peer_.unsent_bytes; }
-  std::optional<std::uint64_t> carried_per_s() const noexcept override {
-    return peer_.carried_per_s;
-  }
   std::optional<wire::Progress> progress() const noexcept override { return peer_.progress; }
 
   int fd() const noexcept override { return fd_.get(); }

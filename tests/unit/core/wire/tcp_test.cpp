@@ -158,17 +158,6 @@ TEST_P(TcpTransport, SetsThePriorityOfItsPackets) {
   expect(Priority::normal, 0, 0);
 }
 
-TEST_P(TcpTransport, KnowsWhatIsNotOnTheNetworkYet) {
-  const Pair pair = connect_pair(GetParam());
-  const std::optional<std::size_t> none = pair.client->unsent_bytes();
-  if (!none) GTEST_SKIP() << "no SIOCOUTQNSD here (qemu-user has none)";
-  EXPECT_EQ(*none, 0u);
-  const std::string much(1 << 20, 'x');
-  const iovec part = part_of(much);
-  while (pair.client->send({&part, 1})->status == IoStatus::ok) continue;  // nobody reads
-  EXPECT_GT(*pair.client->unsent_bytes(), 0u);
-}
-
 INSTANTIATE_TEST_SUITE_P(BothKinds, TcpTransport, testing::Values("127.0.0.1:0", "[::1]:0"));
 
 TEST(Tcp, NeverWaits) {

@@ -53,6 +53,7 @@ class Network final : public wire::Transport {
     return wire::Progress{static_cast<std::uint32_t>(delivered_bytes_ / kPacketBytes),
                           kPacketBytes,
                           static_cast<std::uint64_t>(queued_bytes),
+                          0,
                           round_trip,
                           round_trip + queue_time,
                           sending_,
