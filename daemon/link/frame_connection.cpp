@@ -282,6 +282,12 @@ std::size_t FrameConnection::history_allowance() {
   return own == 0 ? 0 : std::min(own, pace_->allowance(now, {this, sent_bytes_, *transport_}));
 }
 
+void FrameConnection::measure_live(bool is_full) {
+  if (!pace_ || closed_) return;
+  pace_->allowance(loop_.now(), {this, sent_bytes_, *transport_, false});
+  if (is_full) pace_->on_full(this, false);
+}
+
 void FrameConnection::on_history_sent(std::uint64_t since_sent_bytes, bool is_full) {
   if (!pace_) return;
   std::uint64_t bytes = sent_bytes_ - since_sent_bytes;

@@ -140,6 +140,9 @@ class FrameConnection final : private wire::FrameDelegate {
   // What was sent or queued (queue_rest()) since so many bytes had been sent is history.
   //   is_full  the socket took less than history_allowance()
   void on_history_sent(std::uint64_t since_sent_bytes, bool is_full);
+  // Large live samples tell what the network carries, too: when they fill the connection, and when
+  // it takes more again.
+  void measure_live(bool is_full);
   std::uint64_t sent_bytes() const noexcept { return sent_bytes_; }
 
   // --- flow and end

@@ -38,8 +38,8 @@ void HistoryPace::on_history_dropped(std::size_t bytes) noexcept {
   tokens_ += static_cast<double>(bytes);
 }
 
-void HistoryPace::on_full(const void* connection) noexcept {
-  is_full_ = true;
+void HistoryPace::on_full(const void* connection, bool is_history) noexcept {
+  is_full_ |= is_history;
   if (connection == window_.connection) window_.is_full = true;
 }
 
@@ -74,6 +74,7 @@ void HistoryPace::begin_window(MonoTime now, const Connection& connection,
                                const wire::Progress& progress) {
   const Duration length = std::clamp(progress.round_trip, kWindow, kMaxWindow);
   window_ = {connection.id,
+             connection.is_history,
              now,
              now + (is_last_window() ? kLastWindows : 1) * length,
              now,
@@ -87,42 +88,50 @@ void HistoryPace::begin_window(MonoTime now, const Connection& connection,
 void HistoryPace::go_on_measuring(MonoTime now, const Connection& connection) {
   // It has no more history, or the network is interrupted.
   if (now - window_.heard > kMaxWindow) return measure(now, connection);
-  if (window_.connection != connection.id) return;
-  if (std::exchange(window_.is_full, false)) {
-    window_.full_for += std::min(now - window_.heard, kMaxFull);
+  if (window_.connection != connection.id) {
+    if (connection.is_history && !window_.is_history) measure(now, connection);
+    return;
   }
-  window_.heard = now;
-  if (now >= window_.end) end_window(now, connection);
-}
-
-void HistoryPace::end_window(MonoTime now, const Connection& connection) {
+  window_.is_history |= connection.is_history;
   const std::optional<wire::Progress> progress = connection.transport.progress();
   if (!progress) return set_rate(now, kFastBytesPerS, 0);
+  if (std::exchange(window_.is_full, false)) {
+    const Duration since = now - window_.heard;
+    window_.full_for += progress->waiting_bytes > 0 ? since : std::min(since, kMaxFull);
+  }
+  window_.heard = now;
+  if (now >= window_.end) end_window(now, connection, *progress);
+}
+
+void HistoryPace::end_window(MonoTime now, const Connection& connection,
+                             const wire::Progress& progress) {
   const wire::Progress& before = window_.progress;
   const std::uint64_t by_others_bytes =
       sent_bytes_ - window_.sent_bytes - (connection.sent_bytes - window_.sent_by_it_bytes);
-  const std::uint32_t packets = progress->delivered_packets - before.delivered_packets;
-  const std::uint64_t bytes = std::uint64_t{packets} * progress->packet_bytes + by_others_bytes;
+  const std::uint32_t packets = progress.delivered_packets - before.delivered_packets;
+  const std::uint64_t bytes = std::uint64_t{packets} * progress.packet_bytes + by_others_bytes;
   const Duration length = now - window_.begin;
   const std::uint64_t enough = (is_last_window() ? kLastWindows : 1) * kWindowBytes;
   if (bytes < enough && length < kMaxWindow) return;
-  ++windows_;
   // Otherwise this PC is what limits, or there is too little history.
   if (2 * window_.full_for < length) {
-    if (++void_windows_ < kMaxVoidWindows) return begin_window(now, connection, *progress);
+    if (!connection.is_history || ++void_windows_ < kMaxVoidWindows) {
+      return begin_window(now, connection, progress);
+    }
     return set_rate(now, kFastBytesPerS, 0);
   }
+  ++windows_;
   const double bytes_per_s = static_cast<double>(bytes) / seconds(length);
   // Where packets wait in the network, that is what limits, although the receiver may be slow, too.
-  const bool is_receivers = 2 * (progress->waiting_for_peer - before.waiting_for_peer) >
-                                progress->sending - before.sending &&
-                            progress->round_trip_now < progress->round_trip + kQueued;
+  const bool is_receivers = 2 * (progress.waiting_for_peer - before.waiting_for_peer) >
+                                progress.sending - before.sending &&
+                            progress.round_trip_now < progress.round_trip + kQueued;
   if (is_last_window()) {
-    return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s, progress->waiting_bytes);
+    return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s, progress.waiting_bytes);
   }
   flat_windows_ = bytes_per_s < kGrows * last_bytes_per_s_ ? flat_windows_ + 1 : 0;
   last_bytes_per_s_ = bytes_per_s;
-  begin_window(now, connection, *progress);
+  begin_window(now, connection, progress);
 }
 
 void HistoryPace::set_rate(MonoTime now, double bytes_per_s, std::uint64_t waiting_bytes) noexcept {

@@ -230,8 +230,9 @@ bool SamplePump::has_due_sample(MonoTime now, Tid newest) const noexcept {
   return {connection_.history_allowance(), false};
 }
 
-PumpWait SamplePump::wait_for_output() noexcept {
+PumpWait SamplePump::wait_for_output() {
   was_full_ = decides_late();
+  if (measures_live()) connection_.measure_live(true);
   return PumpWait::output;
 }
 
@@ -342,6 +343,7 @@ void SamplePump::limit_unsent(const std::optional<wire::Progress>& progress) {
 
 // The connection was full, and takes bytes again.
 void SamplePump::fit_unsent_limit() {
+  if (measures_live()) connection_.measure_live(false);
   const std::optional<wire::Progress> progress = connection_.progress();
   if (!progress) return;
   if (progress->waiting_bytes == 0) {

@@ -127,7 +127,8 @@ class SamplePump {
   SampleSender::SliceLimits limits_now(MonoTime now);
   // The history of small samples is small, and those who read them in order wait for it.
   bool has_pace() const noexcept { return sender_.sends_in_place(); }
-  PumpWait wait_for_output() noexcept;
+  bool measures_live() const noexcept { return plan_.newest_first && has_pace() && !fills_; }
+  PumpWait wait_for_output();
   PumpWait wait_for_pace() noexcept;
   bool has_due_sample(MonoTime now, Tid newest) const noexcept;
   Tid last_of_run() const noexcept;
