@@ -124,7 +124,7 @@ class TcpTransport final : public Transport {
     // IPTOS_CLASS_CS4 and CS1, TC_PRIO_INTERACTIVE and BULK. The first sets the second, too.
     const int dscp = is(Priority::high) ? 0x80 : is(Priority::low) ? 0x20 : 0;
     const int queue = is(Priority::high) ? 6 : is(Priority::low) ? 2 : 0;
-    // For a socket of the other family, it fails.
+    // IPV6_TCLASS fails for a socket of IPv4.
     set_option(socket_.get(), IPPROTO_IP, IP_TOS, dscp);
     set_option(socket_.get(), IPPROTO_IPV6, IPV6_TCLASS, dscp);
     set_option(socket_.get(), SOL_SOCKET, SO_PRIORITY, queue);

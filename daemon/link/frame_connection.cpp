@@ -230,6 +230,12 @@ void FrameConnection::want_output() {
 }
 
 void FrameConnection::on_writable() {
+  if (limits_unsent_) {
+    const std::optional<wire::Progress> now = transport_->progress();
+    if (now && (!when_writable_ || now->waiting_bytes < when_writable_->waiting_bytes)) {
+      when_writable_ = now;
+    }
+  }
   if (!output_.mid_frame && !flush()) return;
   writable_.disable();
   observer_.on_output_empty();
@@ -280,12 +286,6 @@ std::size_t FrameConnection::history_allowance() {
   const MonoTime now = loop_.now();
   const std::size_t own = share_.allowance(now, pace_->carried_bytes_per_s(now));
   return own == 0 ? 0 : std::min(own, pace_->allowance(now, {this, sent_bytes_, *transport_}));
-}
-
-void FrameConnection::measure_live(bool is_full) {
-  if (!pace_ || closed_) return;
-  pace_->allowance(loop_.now(), {this, sent_bytes_, *transport_, false});
-  if (is_full) pace_->on_full(this, false);
 }
 
 void FrameConnection::on_history_sent(std::uint64_t since_sent_bytes, bool is_full) {

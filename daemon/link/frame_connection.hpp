@@ -16,6 +16,7 @@
 #include <optional>
 #include <span>
 #include <string>
+#include <utility>
 #include <variant>
 
 #include "core/wire/frame_decoder.hpp"
@@ -140,9 +141,6 @@ class FrameConnection final : private wire::FrameDelegate {
   // What was sent or queued (queue_rest()) since so many bytes had been sent is history.
   //   is_full  the socket took less than history_allowance()
   void on_history_sent(std::uint64_t since_sent_bytes, bool is_full);
-  // Large live samples tell what the network carries, too: when they fill the connection, and when
-  // it takes more again.
-  void measure_live(bool is_full);
   std::uint64_t sent_bytes() const noexcept { return sent_bytes_; }
 
   // --- flow and end
@@ -168,9 +166,14 @@ class FrameConnection final : private wire::FrameDelegate {
   std::optional<Time> arrived() const noexcept {
     return closed_ ? std::nullopt : transport_->arrived();
   }
-  // As wire::Transport.
+  // As wire::Transport. Unless it is 0, progress_when_writable() says how the connection was when it
+  // took bytes again, before it got some: of several times since the last call, when least waited.
   void limit_unsent(std::size_t bytes) noexcept {
     if (!closed_) transport_->limit_unsent(bytes);
+    limits_unsent_ = bytes > 0;
+  }
+  std::optional<wire::Progress> progress_when_writable() noexcept {
+    return std::exchange(when_writable_, std::nullopt);
   }
   std::optional<wire::Progress> progress() const noexcept {
     return closed_ ? std::nullopt : transport_->progress();
@@ -226,6 +229,8 @@ class FrameConnection final : private wire::FrameDelegate {
   HistoryPace* pace_ = nullptr;
   HistoryShare share_;
   std::uint64_t sent_bytes_ = 0;
+  bool limits_unsent_ = false;
+  std::optional<wire::Progress> when_writable_;
   wire::FrameDecoder decoder_;
   Output output_;
   Input input_;

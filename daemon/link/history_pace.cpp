@@ -38,8 +38,8 @@ void HistoryPace::on_history_dropped(std::size_t bytes) noexcept {
   tokens_ += static_cast<double>(bytes);
 }
 
-void HistoryPace::on_full(const void* connection, bool is_history) noexcept {
-  is_full_ |= is_history;
+void HistoryPace::on_full(const void* connection) noexcept {
+  is_full_ = true;
   if (connection == window_.connection) window_.is_full = true;
 }
 
@@ -74,7 +74,6 @@ void HistoryPace::begin_window(MonoTime now, const Connection& connection,
                                const wire::Progress& progress) {
   const Duration length = std::clamp(progress.round_trip, kWindow, kMaxWindow);
   window_ = {connection.id,
-             connection.is_history,
              now,
              now + (is_last_window() ? kLastWindows : 1) * length,
              now,
@@ -88,23 +87,16 @@ void HistoryPace::begin_window(MonoTime now, const Connection& connection,
 void HistoryPace::go_on_measuring(MonoTime now, const Connection& connection) {
   // It has no more history, or the network is interrupted.
   if (now - window_.heard > kMaxWindow) return measure(now, connection);
-  if (window_.connection != connection.id) {
-    if (connection.is_history && !window_.is_history) measure(now, connection);
-    return;
-  }
-  window_.is_history |= connection.is_history;
-  const std::optional<wire::Progress> progress = connection.transport.progress();
-  if (!progress) return set_rate(now, kFastBytesPerS, 0);
-  if (std::exchange(window_.is_full, false)) {
-    const Duration since = now - window_.heard;
-    window_.full_for += progress->waiting_bytes > 0 ? since : std::min(since, kMaxFull);
-  }
+  if (window_.connection != connection.id) return;
+  if (std::exchange(window_.is_full, false)) window_.full_for += now - window_.heard;
   window_.heard = now;
-  if (now >= window_.end) end_window(now, connection, *progress);
+  if (now >= window_.end) end_window(now, connection);
 }
 
-void HistoryPace::end_window(MonoTime now, const Connection& connection,
-                             const wire::Progress& progress) {
+void HistoryPace::end_window(MonoTime now, const Connection& connection) {
+  const std::optional<wire::Progress> after = connection.transport.progress();
+  if (!after) return set_rate(now, kFastBytesPerS, 0);
+  const wire::Progress& progress = *after;
   const wire::Progress& before = window_.progress;
   const std::uint64_t by_others_bytes =
       sent_bytes_ - window_.sent_bytes - (connection.sent_bytes - window_.sent_by_it_bytes);
@@ -114,10 +106,9 @@ void HistoryPace::end_window(MonoTime now, const Connection& connection,
   const std::uint64_t enough = (is_last_window() ? kLastWindows : 1) * kWindowBytes;
   if (bytes < enough && length < kMaxWindow) return;
   // Otherwise this PC is what limits, or there is too little history.
-  if (2 * window_.full_for < length) {
-    if (!connection.is_history || ++void_windows_ < kMaxVoidWindows) {
-      return begin_window(now, connection, progress);
-    }
+  const Duration carrying = progress.sending - before.sending + kKernelTick;
+  if (2 * std::min(window_.full_for, carrying) < length) {
+    if (++void_windows_ < kMaxVoidWindows) return begin_window(now, connection, progress);
     return set_rate(now, kFastBytesPerS, 0);
   }
   ++windows_;
@@ -171,6 +162,7 @@ void HistoryPace::refill(MonoTime now) noexcept {
 // --- one connection's share
 
 std::size_t HistoryShare::allowance(MonoTime now, double carried_bytes_per_s) noexcept {
+  due_ = now;
   if (share_ == 1 || carried_bytes_per_s == 0) {
     tokens_ = 0;  // what was sent without a limit does not count
     refilled_ = now;
@@ -182,8 +174,9 @@ std::size_t HistoryShare::allowance(MonoTime now, double carried_bytes_per_s) no
                      std::max(3 * bytes_per_s * seconds(HistoryPace::kPiece), 2 * kPieceBytes));
   refilled_ = now;
   if (tokens_ >= kPieceBytes) return static_cast<std::size_t>(tokens_);
-  due_ = now + std::chrono::ceil<Duration>(
-                   std::chrono::duration<double>((kPieceBytes - tokens_) / bytes_per_s));
+  const double wait_s =
+      std::min((kPieceBytes - tokens_) / bytes_per_s, seconds(HistoryPace::kPeriod));
+  due_ = now + std::chrono::ceil<Duration>(std::chrono::duration<double>(wait_s));
   return 0;
 }
 

@@ -9,8 +9,7 @@
 //   measuring  history is sent as fast as the connection takes it. Short windows until two in a
 //              row carry no more than the one before: TCP is up to speed, and buffers that let
 //              the first bytes pass faster are full. What is delivered in one more, kLastWindows
-//              times as long, is what the network carries. Large live samples that fill the
-//              connection are measured in the same way, so that history that follows has its pace
+//              times as long, is what the network carries
 //   paced      history gets kShare of that, without what live samples take of it, but at least
 //              kLeastShare. Measured again after kMinValid to kMaxValid, and when a connection has
 //              not taken what it was allowed to for kTooFull of kPeriod
@@ -38,10 +37,10 @@ class HistoryPace {
   static constexpr Duration kMaxWindow = std::chrono::seconds(1);
   static constexpr double kGrows = 1.25;  // a window that carries so much more than the one before
   static constexpr int kMaxWindows = 100, kLastWindows = 3;
-  // In which the connection was not full half of the time. Once full it counts so until it is asked
-  // for again, if not all has arrived by then; else for kMaxFull at most.
+  // In which the connection was not full half of the time. Once full it counts so until there is
+  // history again, but no longer than the kernel says that some had not arrived yet.
   static constexpr int kMaxVoidWindows = 20;
-  static constexpr Duration kMaxFull = std::chrono::milliseconds(50);
+  static constexpr Duration kKernelTick = std::chrono::milliseconds(10);  // to which it says so
   // Packets that take so much longer than the quickest wait in a queue.
   static constexpr Duration kQueued = std::chrono::milliseconds(5);
   // So many times as long as it took to measure.
@@ -61,11 +60,9 @@ class HistoryPace {
     const void* id;
     std::uint64_t sent_bytes;  // since it began
     const wire::Transport& transport;
-    bool is_history = true;  // what is sent next
   };
 
-  // How many bytes of history may be sent over that connection now. 0: none before due(). For what
-  // is no history it only measures.
+  // How many bytes of history may be sent over that connection now. 0: none before due().
   std::size_t allowance(MonoTime now, const Connection& connection);
   MonoTime due() const noexcept { return due_; }
   // What the network carries, when that is what limits and was measured lately; else 0.
@@ -79,9 +76,8 @@ class HistoryPace {
   void on_history(std::size_t bytes) noexcept;
   // It was queued, and will not be sent.
   void on_history_dropped(std::size_t bytes) noexcept;
-  // The connection with that id took less of the history than it was allowed to, or than there was
-  // of a live sample.
-  void on_full(const void* connection, bool is_history = true) noexcept;
+  // The connection with that id took less of the history than it was allowed to.
+  void on_full(const void* connection) noexcept;
   // The connection with that id has ended.
   void forget(const void* connection) noexcept;
 
@@ -89,7 +85,6 @@ class HistoryPace {
   enum class State : std::uint8_t { unknown, measuring, paced, unlimited };
   struct Window {
     const void* connection = nullptr;
-    bool is_history = false;  // was sent over it, not only live samples
     MonoTime begin{}, end{};
     MonoTime heard{};      // when that connection had history last
     Duration full_for{};   // so long it took no more
@@ -102,7 +97,7 @@ class HistoryPace {
   void go_on_measuring(MonoTime now, const Connection& connection);
   void begin_window(MonoTime now, const Connection& connection, const wire::Progress& progress);
   bool is_last_window() const noexcept { return flat_windows_ == 2 || windows_ == kMaxWindows; }
-  void end_window(MonoTime now, const Connection& connection, const wire::Progress& progress);
+  void end_window(MonoTime now, const Connection& connection);
   void set_rate(MonoTime now, double bytes_per_s, std::uint64_t waiting_bytes) noexcept;
   void refill(MonoTime now) noexcept;
   bool is_valid(MonoTime now) noexcept;

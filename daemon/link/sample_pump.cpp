@@ -50,7 +50,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
 }
 
 [[gnu::hot]] Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
-  if (std::exchange(was_full_, false)) fit_unsent_limit();
+  if (decides_late()) fit_unsent_limit();
   std::size_t bytes = 0;
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
@@ -64,13 +64,13 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       bytes += SampleSender::kSliceBytes;
     } else if (only_under_way) {
       sender_.end_run();
-      return connection_.output_empty() ? PumpWait::turn : wait_for_output();
+      return connection_.output_empty() ? PumpWait::turn : PumpWait::output;
     } else {
       const Next next = choose_next(now);
       if (next != Next::ready) sender_.end_run();
       if (next == Next::end) return PumpWait::ended;
       // A frame that reports a gap, for example, may wait for the socket.
-      if (!connection_.output_empty()) return wait_for_output();
+      if (!connection_.output_empty()) return PumpWait::output;
       if (next == Next::wait_for_sample) return PumpWait::sample;
       if (next == Next::wait_for_time) {
         wake_at_ = due_;
@@ -83,7 +83,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       }
       const Tid last = last_of_run();
       observer_.before_samples();
-      if (!connection_.output_empty()) return wait_for_output();
+      if (!connection_.output_empty()) return PumpWait::output;
       sent_before = connection_.sent_bytes();
       const Tid at = chosen();
       if (sender_.sends_in_place()) {
@@ -130,7 +130,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
         break;
       case SendStatus::blocked:
         sender_.end_run();
-        return wait_for_output();
+        return PumpWait::output;
       case SendStatus::unfinished:
         break;
       case SendStatus::no_memory:
@@ -201,6 +201,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   if (back_fill_.count() == 0 &&
       (passed_over_.empty() || passed_over_.back().end <= behind_from_)) {
     passed_over_since_ = 0;
+    gives_up_ = false;
   }
   if (back_fill_.count() == 0 && !passed_over_.empty()) {
     ring::TidRange& range = passed_over_.back();
@@ -228,12 +229,6 @@ bool SamplePump::has_due_sample(MonoTime now, Tid newest) const noexcept {
     return kAtOnce;
   }
   return {connection_.history_allowance(), false};
-}
-
-PumpWait SamplePump::wait_for_output() {
-  was_full_ = decides_late();
-  if (measures_live()) connection_.measure_live(true);
-  return PumpWait::output;
 }
 
 PumpWait SamplePump::wait_for_pace() noexcept {
@@ -277,7 +272,10 @@ bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
 }
 
 void SamplePump::pass_over(Tid next, MonoTime now) {
-  while (passed_over_.size() + 1 >= kMaxPassedOver) lose_passed_over(passed_over_.front().end);
+  while (passed_over_.size() + 1 >= kMaxPassedOver) {
+    passed_over_[1].begin = passed_over_.front().begin;
+    passed_over_.pop_front();
+  }
   // What is being filled in is older than that.
   if (back_fill_.count() > 0) passed_over_.push_back(back_fill_);
   back_fill_ = {};
@@ -285,6 +283,7 @@ void SamplePump::pass_over(Tid next, MonoTime now) {
   next_ = next;
   limit_unsent(connection_.progress());
   if (passed_over_since_ == 0) {
+    overloaded_since_ = now;
     behind_from_ = has_kept_up_ ? passed_over_.back().begin : next;  // history is no overload
   }
   give_up_what_is_never_carried(now);
@@ -313,7 +312,7 @@ void SamplePump::give_up_what_is_never_carried(MonoTime now) {
   const bool is_measured =
       passed_over_since_ >= kOverloadedSamples && now - behind_since_ >= kOverloadedAfter;
   if (passed_over_since_ == 1 ||
-      (is_measured && (waiting <= waiting_before_ || is_kept_for_long(first->begin, now)))) {
+      (is_measured && (waiting <= waiting_before_ || is_spared(first->begin, now)))) {
     passed_over_since_ = 1;
     behind_since_ = now;
     waiting_before_ = waiting;
@@ -322,11 +321,14 @@ void SamplePump::give_up_what_is_never_carried(MonoTime now) {
     for (auto range = first; range != passed_over_.end(); ++range) lose(*range);
     passed_over_.erase(first, passed_over_.end());
     waiting_before_ = 0;
+    gives_up_ = true;
   }
 }
 
-// Whether the ring still holds that sample after kKeptFor, when as many are written as lately.
-bool SamplePump::is_kept_for_long(Tid first, MonoTime now) const noexcept {
+// Whether samples from that one on are not given up yet: the ring still holds it after kKeptFor,
+// when as many are written as lately.
+bool SamplePump::is_spared(Tid first, MonoTime now) const noexcept {
+  if (gives_up_ || now - overloaded_since_ >= kSparedFor) return false;
   const std::chrono::duration<double> passed = now - behind_since_, kept = kKeptFor;
   const double written_per_s = static_cast<double>(next_ - next_before_) / passed.count();
   return static_cast<double>(first + depth_ - next_) > written_per_s * kept.count();
@@ -343,8 +345,7 @@ void SamplePump::limit_unsent(const std::optional<wire::Progress>& progress) {
 
 // The connection was full, and takes bytes again.
 void SamplePump::fit_unsent_limit() {
-  if (measures_live()) connection_.measure_live(false);
-  const std::optional<wire::Progress> progress = connection_.progress();
+  const std::optional<wire::Progress> progress = connection_.progress_when_writable();
   if (!progress) return;
   if (progress->waiting_bytes == 0) {
     unsent_factor_ = std::min(2 * unsent_factor_, double{kMostUnsentBytes / kMinUnsentBytes});

@@ -8,8 +8,8 @@
 //
 // With Plan::newest_first, a receiver that shows what is now does not wait for what was: samples
 // that wait for long are passed over, and sent when no newer ones wait, the newest of them first.
-// When the network carries fewer samples than are written, those would never be sent: after some
-// seconds they are reported as lost.
+// When the network carries fewer samples than are written, those would never be sent: they are
+// reported as lost after some seconds, or when the ring will soon hold them no more.
 //
 // Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
 #pragma once
@@ -59,9 +59,11 @@ class SamplePump {
   // network carries less than is written. Once may be a pause of the network.
   static constexpr Duration kOverloadedAfter = std::chrono::seconds(3);
   static constexpr int kOverloadedSamples = 4;
-  // What the ring still holds for that long may come later: a PC may be busy only for some seconds.
+  // What the ring still holds for that long may come later, within kSparedFor: a PC may be busy only
+  // for some seconds.
   static constexpr Duration kKeptFor = std::chrono::seconds(10);
-  // Of what was passed over; the oldest one is lost when there is one more.
+  static constexpr Duration kSparedFor = std::chrono::seconds(30);
+  // Ranges of what was passed over. When there are more, what is between the oldest two comes again.
   static constexpr std::size_t kMaxPassedOver = 4096;
   static constexpr int kSamplesPerTurn = 1024;
   static constexpr std::size_t kBytesPerTurn = 1U << 20;
@@ -127,8 +129,6 @@ class SamplePump {
   SampleSender::SliceLimits limits_now(MonoTime now);
   // The history of small samples is small, and those who read them in order wait for it.
   bool has_pace() const noexcept { return sender_.sends_in_place(); }
-  bool measures_live() const noexcept { return plan_.newest_first && has_pace() && !fills_; }
-  PumpWait wait_for_output();
   PumpWait wait_for_pace() noexcept;
   bool has_due_sample(MonoTime now, Tid newest) const noexcept;
   Tid last_of_run() const noexcept;
@@ -137,7 +137,7 @@ class SamplePump {
   void pass_over(Tid next, MonoTime now);
   void leave_out(Tid newest);
   void give_up_what_is_never_carried(MonoTime now);
-  bool is_kept_for_long(Tid first, MonoTime now) const noexcept;
+  bool is_spared(Tid first, MonoTime now) const noexcept;
   void fit_unsent_limit();
   void limit_unsent(const std::optional<wire::Progress>& progress);
   void lose_passed_over(Tid before);
@@ -161,11 +161,11 @@ class SamplePump {
   // How often samples were passed over since none of them waited, or since they were counted last:
   // when, which, and how many waited.
   int passed_over_since_ = 0;
-  MonoTime behind_since_{};
+  MonoTime behind_since_{}, overloaded_since_{};
+  bool gives_up_ = false;  // at once, because the network carries less than is written
   Tid behind_from_ = 0, waiting_before_ = 0, next_before_ = 0;
   std::size_t unsent_limit_ = 0;  // of what waits in the kernel
   double unsent_factor_ = 1;      // so much more than usual lasts until dssmd runs again
-  bool was_full_ = false;         // the connection, at the end of the last pump()
   bool under_way_ = false;        // the sender is busy with it
   bool caught_up_ = false;
   MonoTime due_{};  // the next sample, with a rate

@@ -325,6 +325,27 @@ TEST_F(Hosts, WithANetworkThatCarriesLessThanAStreamStayFresh) {
   EXPECT_GE(mirror().gap_samples, reader.lost_samples());
 }
 
+TEST_F(Hosts, WithASlowNetworkSayWhatItCarries) {
+  if (!make_fleet(2)) return;
+  const Result<void> slow = fleet->network().shape(2, "tbf rate 80mbit burst 256kb latency 10ms");
+  if (!slow) GTEST_SKIP() << slow.error().message;
+  const KnownStream known{{"camera", 0, "pc1"}, 1 << 20, 256, 5ms, 0ms, 1};
+  Session here = fleet->session(1), there = fleet->session(2);
+  RawWriter writer = make(here, known);
+  write_until(writer, known, 100);
+  const RawReader reader =
+      there.await_raw_reader(known.id, kNever, nullptr, FetchHistory::at_once).value();
+  std::uint64_t carried = 0;
+  await("pc1 knows it, and tells pc2", [&] {
+    for (const HostInfo& host : there.list_hosts().value()) {
+      if (host.name == "pc1") carried = host.carried_bytes_per_s;
+    }
+    return carried > 0;
+  });
+  EXPECT_GE(carried, 7'000'000u);
+  EXPECT_LE(carried, 11'000'000u);
+}
+
 TEST_F(Hosts, WithALongDelayLoseNothing) {
   if (!make_fleet(2)) return;
   for (int host = 1; host <= 2; ++host) {

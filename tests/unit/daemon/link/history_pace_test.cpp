@@ -44,7 +44,6 @@ class Network final : public wire::Transport {
   Duration round_trip = 100us, queue_time{};
   bool knows = true;
   bool has_history = true;
-  bool has_live = false;  // instead, large samples, which follow no pace
   mutable int asked = 0;  // how often the pace looked
 
   std::optional<wire::Progress> progress() const noexcept override {
@@ -65,28 +64,19 @@ class Network final : public wire::Transport {
   double tick() {
     const double live = per_tick(live_bytes_per_s);
     pace_.on_sent(static_cast<std::size_t>(live));
-    if (has_live && std::exchange(was_full_, false)) {
-      pace_.allowance(now, {this, sent_bytes_, *this, false});
-    }
-    const std::size_t allowed = has_history && !has_live
-                                    ? pace_.allowance(now, {this, sent_bytes_, *this})
-                                    : HistoryPace::kUnlimited;
+    const std::size_t allowed =
+        has_history ? pace_.allowance(now, {this, sent_bytes_, *this}) : HistoryPace::kUnlimited;
     const double room = std::min(std::max(0.0, kBufferBytes - queued_bytes), most_per_tick);
     const double most = has_history ? std::min(room, static_cast<double>(allowed)) : 0;
     const double history = std::floor(most);
     EXPECT_TRUE(allowed > 0 || pace_.due() > now);
     sent_bytes_ += static_cast<std::uint64_t>(history);
     pace_.on_sent(static_cast<std::size_t>(history));
-    if (!has_live) pace_.on_history(static_cast<std::size_t>(history));
-    if (is_full && has_history && !has_live && history < static_cast<double>(allowed)) {
+    pace_.on_history(static_cast<std::size_t>(history));
+    if (is_full && has_history && history < static_cast<double>(allowed)) {
       pace_.on_full(this);
     }
     queued_bytes += history;
-    if (has_live && history > 0 && history == room) {
-      was_full_ = true;
-      pace_.allowance(now, {this, sent_bytes_, *this, false});
-      pace_.on_full(this, false);
-    }
     const double carried = std::min(queued_bytes, std::max(0.0, per_tick(bytes_per_s) - live));
     queued_bytes -= carried;
     delivered_bytes_ += carried;
@@ -102,7 +92,6 @@ class Network final : public wire::Transport {
   std::uint64_t sent_bytes_ = 0;
   double delivered_bytes_ = 0;
   Duration sending_{};
-  bool was_full_ = false;
 };
 
 class EachRate : public testing::TestWithParam<double> {};
@@ -136,33 +125,6 @@ TEST_P(EachRate, IsKnownWhileItIsValid) {
   network.run(2s);
   EXPECT_NEAR(pace.carried_bytes_per_s(network.now), GetParam(), 0.1 * GetParam());
   EXPECT_EQ(pace.carried_bytes_per_s(network.now + HistoryPace::kMaxValid), 0);
-}
-
-TEST_P(EachRate, IsKnownFromLargeLiveSamples) {
-  HistoryPace pace;
-  Network network(pace, GetParam());
-  network.has_live = true;
-  network.run(2s);
-  network.has_live = false;
-  network.run(200ms);
-  EXPECT_NEAR(network.run(1s), HistoryPace::kShare * GetParam(), 0.05 * GetParam());
-}
-
-TEST(HistoryPace, LargeLiveSamplesThatLeaveRoomSayNothing) {
-  HistoryPace pace;
-  Network network(pace, 50e6);
-  network.has_live = true;
-  for (int frame = 0; frame < 100; ++frame) {  // each fills the buffer, which takes 4 ms
-    network.most_per_tick = kBufferBytes;
-    network.run(kTick);
-    network.most_per_tick = 0;
-    network.run(33ms);
-  }
-  EXPECT_EQ(network.carried_bytes_per_s(), 0);
-  Network other(pace, 50e6);
-  other.now = network.now;
-  other.run(1s);
-  EXPECT_GT(other.carried_bytes_per_s(), 0) << "history is not measured for lack of a turn";
 }
 
 TEST(HistoryPace, CountsLiveSamplesThatPassWhileItMeasures) {

@@ -667,6 +667,20 @@ TEST_F(OverloadedWithALongHistory, NothingIsGivenUpThatTheRingHoldsForTenSeconds
   // every third round.
   EXPECT_EQ(rounds, 13);
   EXPECT_EQ(rig.ring.reader().oldest(), 0) << "nothing was overwritten";
+  const std::uint64_t lost = rig.pump->lost();
+  round(++rounds);
+  EXPECT_EQ(rig.pump->lost(), lost + 2) << "from then on at once";
+}
+
+class OverloadedWithAVeryLongHistory : public Overloaded {
+ protected:
+  OverloadedWithAVeryLongHistory() : Overloaded(256) {}
+};
+
+TEST_F(OverloadedWithAVeryLongHistory, NothingIsSparedForEver) {
+  int rounds = 0;
+  while (rig.pump->lost() == 0 && rounds < 60) round(++rounds);
+  EXPECT_EQ(rounds, 31);
 }
 
 TEST_F(NewestFirst, WhatWaitedForAPauseOfTheNetworkIsSentLater) {
@@ -701,6 +715,8 @@ TEST_F(NewestFirst, LittleWaitsInTheKernelOfASlowNetwork) {
   EXPECT_EQ(rig.peer.unsent_limit, 20'000u);
   rig.peer.progress->carried_bytes_per_s = 1'000'000'000;
   rig.peer.progress->waiting_bytes = 1;
+  rig.peer.room = 1000;
+  run_turns(rig.loop);
   EXPECT_EQ(rig.run(), PumpWait::output);
   EXPECT_EQ(rig.peer.unsent_limit, SamplePump::kUnsentBytes);
   rig.start({0, 5, 0});
@@ -717,6 +733,8 @@ TEST(SamplePump, KeepsLittleInTheKernelAlsoWithARate) {
   rig.start({0, 1, 1000});
   EXPECT_EQ(rig.peer.unsent_limit, SamplePump::kMinUnsentBytes);
   EXPECT_EQ(rig.run(), PumpWait::output);
+  rig.peer.room = 1000;
+  run_turns(rig.loop);
   EXPECT_EQ(rig.run(), PumpWait::output);
   EXPECT_EQ(rig.peer.unsent_limit, 20'000u);
 }
@@ -728,9 +746,11 @@ TEST_F(NewestFirst, WhatWaitsInTheKernelLastsUntilDssmdRunsAgain) {
   start({0, 5, 0});
   rig.peer.room = 1000;
   EXPECT_EQ(rig.run(), PumpWait::output);
+  rig.peer.after_send = [&] { rig.peer.progress->waiting_bytes = 1'000'000; };
   const auto after = [&](std::size_t waiting_bytes) {
     rig.peer.progress->waiting_bytes = waiting_bytes;
     rig.peer.room = 1000;
+    run_turns(rig.loop);  // the rest of what was queued
     EXPECT_EQ(rig.run(), PumpWait::output);
     return rig.peer.unsent_limit;
   };
@@ -765,6 +785,7 @@ class PacedHistory : public testing::Test {
     MemoryTransport transport(rig.peer);
     for (int ms = 0; ms <= 410; ms += 5) {
       rig.peer.progress->delivered_packets = static_cast<std::uint32_t>(ms);
+      rig.peer.progress->sending = ms * 1ms;
       pace.allowance(rig.loop.now() + (ms - 410) * 1ms, {this, 0, transport});
       pace.on_full(this);
     }
