@@ -166,8 +166,9 @@ class FrameConnection final : private wire::FrameDelegate {
   std::optional<Time> arrived() const noexcept {
     return closed_ ? std::nullopt : transport_->arrived();
   }
-  // As wire::Transport. Unless it is 0, progress_when_writable() says how the connection was when it
-  // took bytes again, before it got some: of several times since the last call, when least waited.
+  // As wire::Transport. Unless it is 0, progress_when_writable() says how the connection was when
+  // it took bytes again, before it got some: of several times since the last call, when least
+  // waited.
   void limit_unsent(std::size_t bytes) noexcept {
     if (!closed_) transport_->limit_unsent(bytes);
     limits_unsent_ = bytes > 0;

@@ -33,7 +33,7 @@ class HistoryPace {
   // At least, and at least the round trip, and until so much is delivered: TCP repairs losses in
   // between. But when kMaxWindow is over, without so much.
   static constexpr Duration kWindow = std::chrono::milliseconds(5);
-  static constexpr std::uint64_t kWindowBytes = 64U << 10;
+  static constexpr std::uint64_t kWindowBytes = 32U << 10;
   static constexpr Duration kMaxWindow = std::chrono::seconds(1);
   static constexpr double kGrows = 1.25;  // a window that carries so much more than the one before
   static constexpr int kMaxWindows = 100, kLastWindows = 3;

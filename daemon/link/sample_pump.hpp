@@ -59,11 +59,12 @@ class SamplePump {
   // network carries less than is written. Once may be a pause of the network.
   static constexpr Duration kOverloadedAfter = std::chrono::seconds(3);
   static constexpr int kOverloadedSamples = 4;
-  // What the ring still holds for that long may come later, within kSparedFor: a PC may be busy only
-  // for some seconds.
+  // What the ring still holds for that long may come later, within kSparedFor: a PC may be busy
+  // only for some seconds.
   static constexpr Duration kKeptFor = std::chrono::seconds(10);
   static constexpr Duration kSparedFor = std::chrono::seconds(30);
-  // Ranges of what was passed over. When there are more, what is between the oldest two comes again.
+  // Ranges of what was passed over. When there are more, what is between the oldest two comes
+  // again.
   static constexpr std::size_t kMaxPassedOver = 4096;
   static constexpr int kSamplesPerTurn = 1024;
   static constexpr std::size_t kBytesPerTurn = 1U << 20;
