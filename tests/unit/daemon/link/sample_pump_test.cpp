@@ -783,10 +783,10 @@ class PacedHistory : public testing::Test {
     rig.link.set_pace(pace);
     rig.peer.progress.emplace().packet_bytes = 1000;
     MemoryTransport transport(rig.peer);
-    for (int ms = 0; ms <= 410; ms += 5) {
+    for (int ms = 0; ms <= 205; ms += 5) {
       rig.peer.progress->delivered_packets = static_cast<std::uint32_t>(ms);
       rig.peer.progress->sending = ms * 1ms;
-      pace.allowance(rig.loop.now() + (ms - 410) * 1ms, {this, 0, transport});
+      pace.allowance(rig.loop.now() + (ms - 205) * 1ms, {this, 0, transport});
       pace.on_full(this);
     }
     SamplePump::Plan plan{0, 2, 0};
