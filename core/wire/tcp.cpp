@@ -138,6 +138,7 @@ class TcpTransport final : public Transport {
     return Progress{info->tcpi_delivered,
                     info->tcpi_snd_mss,
                     info->tcpi_notsent_bytes + unacknowledged,
+                    info->tcpi_notsent_bytes,
                     info->tcpi_delivery_rate,
                     microseconds(info->tcpi_min_rtt),
                     microseconds(info->tcpi_rtt),

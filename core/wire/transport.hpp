@@ -69,6 +69,7 @@ struct Progress {
   std::uint32_t delivered_packets = 0;  // since the connection began; may begin anew at 0
   std::uint32_t packet_bytes = 0;
   std::uint64_t waiting_bytes = 0;  // not sent, or not acknowledged
+  std::uint64_t unsent_bytes = 0;   // of these, those that were not sent
   // Lately, while there was enough to send; 0: not known.
   std::uint64_t carried_bytes_per_s = 0;
   Duration round_trip{}, round_trip_now{};  // the least of late; smoothed

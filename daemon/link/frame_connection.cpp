@@ -232,7 +232,10 @@ void FrameConnection::want_output() {
 void FrameConnection::on_writable() {
   if (limits_unsent_) {
     const std::optional<wire::Progress> now = transport_->progress();
-    if (now && (!when_writable_ || now->waiting_bytes < when_writable_->waiting_bytes)) {
+    const auto left = [](const wire::Progress& progress) {
+      return std::pair(progress.unsent_bytes, progress.waiting_bytes);
+    };
+    if (now && (!when_writable_ || left(*now) < left(*when_writable_))) {
       when_writable_ = now;
     }
   }

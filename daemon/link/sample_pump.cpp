@@ -347,9 +347,12 @@ void SamplePump::limit_unsent(const std::optional<wire::Progress>& progress) {
 void SamplePump::fit_unsent_limit() {
   const std::optional<wire::Progress> progress = connection_.progress_when_writable();
   if (!progress) return;
-  if (progress->waiting_bytes == 0) {
+  // Where latencies are long, of small samples too little is on the way as long as some are: all of
+  // it was sent before dssmd ran. Of large ones it is enough: a slow network holds them in a queue.
+  const std::uint64_t left = has_pace() ? progress->waiting_bytes : progress->unsent_bytes;
+  if (left == 0) {
     unsent_factor_ = std::min(2 * unsent_factor_, double{kMostUnsentBytes / kMinUnsentBytes});
-  } else if (progress->waiting_bytes > unsent_limit_ / 4) {
+  } else if (left > unsent_limit_ / 4) {
     unsent_factor_ = std::max(7 * unsent_factor_ / 8, 1.0);
   }
   limit_unsent(progress);

@@ -51,7 +51,7 @@ class SamplePump {
   static constexpr std::size_t kHeaderBytes = 32;  // of a sample's frame, about
   // So much waits in the kernel, where nothing newer can take its place; less when the network
   // needs longer than that for it. Half as much made sending slower on a fast link. On a busy PC it
-  // has to last until dssmd runs again: twice as much each time that all had arrived by then.
+  // has to last until dssmd runs again: twice as much each time that nothing was left by then.
   static constexpr std::size_t kUnsentBytes = 128U << 10, kMinUnsentBytes = 16U << 10;
   static constexpr std::size_t kMostUnsentBytes = 4U << 20;
   static constexpr Duration kUnsentFor = std::chrono::milliseconds(2);

@@ -54,6 +54,7 @@ class Network final : public wire::Transport {
                           kPacketBytes,
                           static_cast<std::uint64_t>(queued_bytes),
                           0,
+                          0,
                           round_trip,
                           round_trip + queue_time,
                           sending_,

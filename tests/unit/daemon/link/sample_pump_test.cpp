@@ -723,6 +723,30 @@ TEST_F(NewestFirst, LittleWaitsInTheKernelOfASlowNetwork) {
   EXPECT_EQ(rig.peer.unsent_limit, 0u) << "for samples in their order the system's is best";
 }
 
+// Their acknowledgements may come late.
+TEST(SamplePump, SendsMoreSmallSamplesAtOnceWhenAllWereSentBeforeItRanAgain) {
+  PumpRig rig(kSmall, 4096);
+  rig.newest_first = true;
+  rig.peer.progress.emplace().waiting_bytes = 1'000'000;
+  rig.write(4000);
+  SamplePump::Plan plan{0, 3999, 0};
+  plan.newest_first = true;
+  rig.start(plan);
+  rig.peer.room = 100;
+  EXPECT_EQ(rig.run(), PumpWait::output);
+  const auto after = [&](std::size_t unsent_bytes) {
+    rig.peer.progress->unsent_bytes = unsent_bytes;
+    rig.peer.room = 100;
+    run_turns(rig.loop);
+    EXPECT_EQ(rig.run(), PumpWait::output);
+    return rig.peer.unsent_limit;
+  };
+  EXPECT_EQ(after(0), 2 * SamplePump::kMinUnsentBytes);
+  EXPECT_EQ(after(0), 4 * SamplePump::kMinUnsentBytes);
+  EXPECT_EQ(after(SamplePump::kMinUnsentBytes), 4 * SamplePump::kMinUnsentBytes);
+  EXPECT_LT(after(2 * SamplePump::kMinUnsentBytes), 4 * SamplePump::kMinUnsentBytes);
+}
+
 TEST(SamplePump, KeepsLittleInTheKernelAlsoWithARate) {
   PumpRig rig(kLarge, 16);
   rig.thinned = true;
