@@ -40,7 +40,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       plan_(plan),
       next_(std::clamp<Tid>(plan.first, 0, channel::kMaxTid)),
       last_(channel::kMaxTid) {
-  unsent_limit_ = decides_late() ? kMinUnsentBytes : 0;
+  unsent_limit_ = !decides_late() ? 0 : has_pace() ? kMinUnsentBytes : kUnsentBytes;
   connection_.limit_unsent(unsent_limit_);
   const Tid newest = newest_untrusted(reader_);
   const ring::TidRange held{std::max(plan.held.begin, next_), std::min(plan.held.end, newest + 1)};
@@ -265,7 +265,10 @@ Tid SamplePump::first_within(std::size_t bytes, ring::TidRange range) const noex
 }
 
 bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
-  if (first_within(std::max(kInOrderBytes, unsent_limit_), samples) == samples.begin) return false;
+  const std::size_t in_order =
+      std::min(static_cast<std::size_t>(unsent_factor_ * static_cast<double>(kInOrderBytes)),
+               kMostUnsentBytes);
+  if (first_within(in_order, samples) == samples.begin) return false;
   const std::optional<wire::Progress> progress = connection_.progress();
   return !progress || first_within(bytes_in(kInOrderFor, progress->carried_bytes_per_s), samples) !=
                           samples.begin;
@@ -336,8 +339,10 @@ bool SamplePump::is_spared(Tid first, MonoTime now) const noexcept {
 
 void SamplePump::limit_unsent(const std::optional<wire::Progress>& progress) {
   const std::uint64_t carried = progress ? progress->carried_bytes_per_s : 0;
+  // On busy PCs the rate that was seen is too low, and small samples are soon sent.
   const std::size_t usual =
-      std::clamp(bytes_in(kUnsentFor, carried), kMinUnsentBytes, kUnsentBytes);
+      has_pace() ? std::clamp(bytes_in(kUnsentFor, carried), kMinUnsentBytes, kUnsentBytes)
+                 : kUnsentBytes;
   const std::size_t limit = std::min(
       static_cast<std::size_t>(unsent_factor_ * static_cast<double>(usual)), kMostUnsentBytes);
   if (std::exchange(unsent_limit_, limit) != limit) connection_.limit_unsent(limit);

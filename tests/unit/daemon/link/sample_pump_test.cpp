@@ -741,10 +741,10 @@ TEST(SamplePump, SendsMoreSmallSamplesAtOnceWhenAllWereSentBeforeItRanAgain) {
     EXPECT_EQ(rig.run(), PumpWait::output);
     return rig.peer.unsent_limit;
   };
-  EXPECT_EQ(after(0), 2 * SamplePump::kMinUnsentBytes);
-  EXPECT_EQ(after(0), 4 * SamplePump::kMinUnsentBytes);
-  EXPECT_EQ(after(SamplePump::kMinUnsentBytes), 4 * SamplePump::kMinUnsentBytes);
-  EXPECT_LT(after(2 * SamplePump::kMinUnsentBytes), 4 * SamplePump::kMinUnsentBytes);
+  EXPECT_EQ(after(0), 2 * SamplePump::kUnsentBytes);
+  EXPECT_EQ(after(0), 4 * SamplePump::kUnsentBytes);
+  EXPECT_EQ(after(SamplePump::kUnsentBytes), 4 * SamplePump::kUnsentBytes);
+  EXPECT_LT(after(2 * SamplePump::kUnsentBytes), 4 * SamplePump::kUnsentBytes);
 }
 
 TEST(SamplePump, KeepsLittleInTheKernelAlsoWithARate) {
