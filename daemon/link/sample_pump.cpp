@@ -356,7 +356,7 @@ void SamplePump::fit_unsent_limit() {
   // it was sent before dssmd ran. Of large ones it is enough: a slow network holds them in a queue.
   const std::uint64_t left = has_pace() ? progress->waiting_bytes : progress->unsent_bytes;
   if (left == 0) {
-    unsent_factor_ = std::min(2 * unsent_factor_, double{kMostUnsentBytes / kMinUnsentBytes});
+    unsent_factor_ = std::min(2 * unsent_factor_, kMostUnsentFactor);
   } else if (left > unsent_limit_ / 4) {
     unsent_factor_ = std::max(7 * unsent_factor_ / 8, 1.0);
   }

@@ -54,6 +54,7 @@ class SamplePump {
   // has to last until dssmd runs again: twice as much each time that nothing was left by then.
   static constexpr std::size_t kUnsentBytes = 128U << 10, kMinUnsentBytes = 16U << 10;
   static constexpr std::size_t kMostUnsentBytes = 4U << 20;
+  static constexpr double kMostUnsentFactor = 256;
   static constexpr Duration kUnsentFor = std::chrono::milliseconds(2);
   // When samples were passed over for so long and so often, and more of them wait than before, the
   // network carries less than is written. Once may be a pause of the network.
