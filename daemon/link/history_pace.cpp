@@ -94,35 +94,34 @@ void HistoryPace::go_on_measuring(MonoTime now, const Connection& connection) {
 }
 
 void HistoryPace::end_window(MonoTime now, const Connection& connection) {
-  const std::optional<wire::Progress> after = connection.transport.progress();
-  if (!after) return set_rate(now, kFastBytesPerS, 0);
-  const wire::Progress& progress = *after;
+  const std::optional<wire::Progress> progress = connection.transport.progress();
+  if (!progress) return set_rate(now, kFastBytesPerS, 0);
   const wire::Progress& before = window_.progress;
   const std::uint64_t by_others_bytes =
       sent_bytes_ - window_.sent_bytes - (connection.sent_bytes - window_.sent_by_it_bytes);
-  const std::uint32_t packets = progress.delivered_packets - before.delivered_packets;
-  const std::uint64_t bytes = std::uint64_t{packets} * progress.packet_bytes + by_others_bytes;
+  const std::uint32_t packets = progress->delivered_packets - before.delivered_packets;
+  const std::uint64_t bytes = std::uint64_t{packets} * progress->packet_bytes + by_others_bytes;
   const Duration length = now - window_.begin;
   const std::uint64_t enough = (is_last_window() ? kLastWindows : 1) * kWindowBytes;
   if (bytes < enough && length < kMaxWindow) return;
   // Otherwise this PC is what limits, or there is too little history.
-  const Duration carrying = progress.sending - before.sending + kKernelTick;
+  const Duration carrying = progress->sending - before.sending + kKernelTick;
   if (2 * std::min(window_.full_for, carrying) < length) {
-    if (++void_windows_ < kMaxVoidWindows) return begin_window(now, connection, progress);
+    if (++void_windows_ < kMaxVoidWindows) return begin_window(now, connection, *progress);
     return set_rate(now, kFastBytesPerS, 0);
   }
   ++windows_;
   const double bytes_per_s = static_cast<double>(bytes) / seconds(length);
   // Where packets wait in the network, that is what limits, although the receiver may be slow, too.
-  const bool is_receivers = 2 * (progress.waiting_for_peer - before.waiting_for_peer) >
-                                progress.sending - before.sending &&
-                            progress.round_trip_now < progress.round_trip + kQueued;
+  const bool is_receivers = 2 * (progress->waiting_for_peer - before.waiting_for_peer) >
+                                progress->sending - before.sending &&
+                            progress->round_trip_now < progress->round_trip + kQueued;
   if (is_last_window()) {
-    return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s, progress.waiting_bytes);
+    return set_rate(now, is_receivers ? kFastBytesPerS : bytes_per_s, progress->waiting_bytes);
   }
   flat_windows_ = bytes_per_s < kGrows * last_bytes_per_s_ ? flat_windows_ + 1 : 0;
   last_bytes_per_s_ = bytes_per_s;
-  begin_window(now, connection, progress);
+  begin_window(now, connection, *progress);
 }
 
 void HistoryPace::set_rate(MonoTime now, double bytes_per_s, std::uint64_t waiting_bytes) noexcept {

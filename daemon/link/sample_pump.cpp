@@ -208,7 +208,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     back_fill_ = {std::min(first_within(kInOrderBytes, range), range.end - 1), range.end};
     range.end = back_fill_.begin;
     if (range.count() == 0) passed_over_.pop_back();
-    limit_unsent(connection_.progress());
+    if (has_pace()) limit_unsent(connection_.progress());
   }
   if (back_fill_.count() > 0) return Next::ready;
   fills_ = false;
@@ -284,7 +284,7 @@ void SamplePump::pass_over(Tid next, MonoTime now) {
   back_fill_ = {};
   passed_over_.push_back({next_, next});
   next_ = next;
-  limit_unsent(connection_.progress());
+  if (has_pace()) limit_unsent(connection_.progress());
   if (passed_over_since_ == 0) {
     overloaded_since_ = now;
     behind_from_ = has_kept_up_ ? passed_over_.back().begin : next;  // history is no overload
@@ -339,7 +339,7 @@ bool SamplePump::is_spared(Tid first, MonoTime now) const noexcept {
 
 void SamplePump::limit_unsent(const std::optional<wire::Progress>& progress) {
   const std::uint64_t carried = progress ? progress->carried_bytes_per_s : 0;
-  // On busy PCs the rate that was seen is too low, and small samples are soon sent.
+  // On a busy PC the measured rate is too low, and small samples need little time.
   const std::size_t usual =
       has_pace() ? std::clamp(bytes_in(kUnsentFor, carried), kMinUnsentBytes, kUnsentBytes)
                  : kUnsentBytes;
@@ -352,8 +352,9 @@ void SamplePump::limit_unsent(const std::optional<wire::Progress>& progress) {
 void SamplePump::fit_unsent_limit() {
   const std::optional<wire::Progress> progress = connection_.progress_when_writable();
   if (!progress) return;
-  // Where latencies are long, of small samples too little is on the way as long as some are: all of
-  // it was sent before dssmd ran. Of large ones it is enough: a slow network holds them in a queue.
+  // Small samples: when none is unsent, the connection could have carried more, also where
+  // acknowledgements come late. Large ones: a slow network still holds in its queue what was sent,
+  // so it must be acknowledged.
   const std::uint64_t left = has_pace() ? progress->waiting_bytes : progress->unsent_bytes;
   if (left == 0) {
     unsent_factor_ = std::min(2 * unsent_factor_, kMostUnsentFactor);

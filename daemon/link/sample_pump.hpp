@@ -124,7 +124,7 @@ class SamplePump {
   enum class Next : std::uint8_t { ready, wait_for_sample, wait_for_time, end };
   Next choose_next(MonoTime now);
   Next choose_newest_first(MonoTime now);
-  // Whether what is sent next may be another sample than seems now.
+  // Whether a newer sample may take the place of one that is not sent yet.
   bool decides_late() const noexcept { return plan_.newest_first || thins(); }
   // The sample that is sent, or is to be sent next.
   Tid& chosen() noexcept { return fills_ ? back_fill_.begin : next_; }
