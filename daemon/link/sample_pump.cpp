@@ -44,7 +44,9 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   connection_.limit_unsent(unsent_limit_);
   const Tid newest = newest_untrusted(reader_);
   const ring::TidRange held{std::max(plan.held.begin, next_), std::min(plan.held.end, newest + 1)};
-  if (!plan.newest_first || held.end <= held.begin) return;
+  const bool holds_some = plan.newest_first && held.end > held.begin;
+  backlog_from_ = holds_some ? next_ : newest + 1;
+  if (!holds_some) return;
   if (held.begin > next_) passed_over_.push_back({next_, held.begin});
   next_ = held.end;
 }
@@ -177,9 +179,8 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   if (next_ < oldest && next_ <= newest) {
     lose_up_to(std::min(oldest, newest + 1));
   }
-  const Tid lowest = !passed_over_.empty()    ? passed_over_.front().begin
-                     : back_fill_.count() > 0 ? back_fill_.begin
-                                              : next_;
+  Tid lowest = passed_over_.empty() ? next_ : passed_over_.front().begin;
+  if (back_fill_.count() > 0) lowest = std::min(lowest, back_fill_.begin);
   if (!caught_up_ && lowest > plan_.caught_up_at) {
     caught_up_ = true;
     sender_.end_run();
@@ -203,13 +204,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     passed_over_since_ = 0;
     gives_up_ = false;
   }
-  if (back_fill_.count() == 0 && !passed_over_.empty()) {
-    ring::TidRange& range = passed_over_.back();
-    back_fill_ = {std::min(first_within(kInOrderBytes, range), range.end - 1), range.end};
-    range.end = back_fill_.begin;
-    if (range.count() == 0) passed_over_.pop_back();
-    if (has_pace()) limit_unsent(connection_.progress());
-  }
+  if (back_fill_.count() == 0 && !passed_over_.empty()) choose_back_fill(newest);
   if (back_fill_.count() > 0) return Next::ready;
   fills_ = false;
   if (next_ <= newest) return Next::wait_for_time;
@@ -274,14 +269,48 @@ bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
                           samples.begin;
 }
 
+// One piece of what was passed over: the newest, or the oldest of the backlog when it is urgent.
+void SamplePump::choose_back_fill(Tid newest) {
+  auto range = passed_over_.end() - 1;
+  if (!has_pace() && !gives_up_) {
+    const auto oldest =
+        std::find_if(passed_over_.begin(), passed_over_.end(),
+                     [&](const ring::TidRange& some) { return some.begin >= backlog_from_; });
+    if (oldest != passed_over_.end() && newest - oldest->begin > depth_ / kUrgentPart) {
+      const auto most = static_cast<Tid>(kInOrderBytes / (payload_bytes_ + kHeaderBytes));
+      back_fill_ = {oldest->begin, std::min(oldest->begin + std::max<Tid>(most, 1), oldest->end)};
+      oldest->begin = back_fill_.end;
+      range = oldest;
+    }
+  }
+  if (back_fill_.count() == 0) {
+    back_fill_ = {std::min(first_within(kInOrderBytes, *range), range->end - 1), range->end};
+    range->end = back_fill_.begin;
+  }
+  if (range->count() == 0) passed_over_.erase(range);
+  if (has_pace()) limit_unsent(connection_.progress());
+}
+
+// The rest of the piece, to what waits.
+void SamplePump::return_back_fill() {
+  if (back_fill_.count() == 0) return;
+  const auto after =
+      std::find_if(passed_over_.begin(), passed_over_.end(),
+                   [&](const ring::TidRange& range) { return range.begin >= back_fill_.end; });
+  if (after != passed_over_.end() && after->begin == back_fill_.end) {
+    after->begin = back_fill_.begin;
+  } else {
+    passed_over_.insert(after, back_fill_);
+  }
+  back_fill_ = {};
+}
+
 void SamplePump::pass_over(Tid next, MonoTime now) {
   while (passed_over_.size() + 1 >= kMaxPassedOver) {
     passed_over_[1].begin = passed_over_.front().begin;
     passed_over_.pop_front();
   }
-  // What is being filled in is older than that.
-  if (back_fill_.count() > 0) passed_over_.push_back(back_fill_);
-  back_fill_ = {};
+  return_back_fill();
   passed_over_.push_back({next_, next});
   next_ = next;
   if (has_pace()) limit_unsent(connection_.progress());
@@ -296,7 +325,7 @@ void SamplePump::pass_over(Tid next, MonoTime now) {
 void SamplePump::leave_out(Tid newest) {
   const Tid end = std::min(newest, plan_.caught_up_at + 1);
   if (end > next_) {
-    if (back_fill_.count() > 0) passed_over_.push_back(std::exchange(back_fill_, {}));
+    return_back_fill();
     passed_over_.push_back({next_, end});
     next_ = end;
   }

@@ -7,9 +7,10 @@
 // channel.
 //
 // With Plan::newest_first, a receiver that shows what is now does not wait for what was: samples
-// that wait for long are passed over, and sent when no newer ones wait, the newest of them first.
-// When the network carries fewer samples than are written, those would never be sent: they are
-// reported as lost after some seconds, or when the ring will soon hold them no more.
+// that wait for long are passed over, and sent when no newer ones wait, the newest of them first;
+// but small ones that wait for very long go in their order. When the network carries fewer samples
+// than are written, those would never be sent: they are reported as lost after some seconds, or when
+// the ring will soon hold them no more.
 //
 // Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
 #pragma once
@@ -62,8 +63,12 @@ class SamplePump {
   static constexpr int kOverloadedSamples = 4;
   // What the ring still holds for that long may come later, within kSparedFor: a PC may be busy
   // only for some seconds.
-  static constexpr Duration kKeptFor = std::chrono::seconds(10);
+  static constexpr Duration kKeptFor = std::chrono::seconds(5);
   static constexpr Duration kSparedFor = std::chrono::seconds(30);
+  // Of a receiver that had samples before, small ones that wait go first and in their order when
+  // this part of the ring was written since. On a PC that is busy for long the oldest would
+  // otherwise leave the ring, however close it is to keeping up.
+  static constexpr Tid kUrgentPart = 4;
   // Ranges of what was passed over. When there are more, what is between the oldest two comes
   // again.
   static constexpr std::size_t kMaxPassedOver = 4096;
@@ -137,6 +142,8 @@ class SamplePump {
   Tid first_within(std::size_t bytes, ring::TidRange range) const noexcept;
   bool takes_long(ring::TidRange samples) const noexcept;
   void pass_over(Tid next, MonoTime now);
+  void choose_back_fill(Tid newest);
+  void return_back_fill();
   void leave_out(Tid newest);
   void give_up_what_is_never_carried(MonoTime now);
   bool is_spared(Tid first, MonoTime now) const noexcept;
@@ -157,7 +164,8 @@ class SamplePump {
   Tid next_;
   Tid last_;
   std::deque<ring::TidRange> passed_over_;  // and not sent yet; rising
-  ring::TidRange back_fill_;                // of these, what is sent next
+  ring::TidRange back_fill_;                // of these, what is sent next; no longer in it
+  Tid backlog_from_ = 0;                    // what waits before that is history
   bool fills_ = false;        // the sample that is sent is the first one of back_fill_
   bool has_kept_up_ = false;  // once, no newer sample waited
   // How often samples were passed over since none of them waited, or since they were counted last:

@@ -69,7 +69,9 @@ void MirrorRing::resume(bool newest_first, bool with_history, net::Subscribe& ou
   if (!with_history_) {
     out.set_from_newest(true);
   } else if (has_hole) {
-    out.set_from_tid(std::max(hole.begin, reader_.oldest()));
+    Tid from = std::max(hole.begin, reader_.oldest());
+    while (from < hole.end && !is_missing(from)) ++from;
+    out.set_from_tid(from);
   }
   if (out.has_from_tid()) out.set_from_tid(std::max<Tid>(out.from_tid(), has_place_from_));
   if (!has_hole && with_history_) return;

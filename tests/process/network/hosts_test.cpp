@@ -5,6 +5,7 @@
 #include <fcntl.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <thread>
 
 #include "tests/process/network/fleet.hpp"
@@ -332,18 +333,17 @@ TEST_F(Hosts, WithASlowNetworkSayWhatItCarries) {
   const KnownStream known{{"camera", 0, "pc1"}, 1 << 20, 256, 5ms, 0ms, 1};
   Session here = fleet->session(1), there = fleet->session(2);
   RawWriter writer = make(here, known);
-  write_until(writer, known, 100);
+  write_until(writer, known, 250);
   const RawReader reader =
       there.await_raw_reader(known.id, kNever, nullptr, FetchHistory::at_once).value();
-  std::uint64_t carried = 0;
+  // When a busy PC was late while it measured, what it found is measured again.
   await("pc1 knows it, and tells pc2", [&] {
-    for (const HostInfo& host : there.list_hosts().value()) {
-      if (host.name == "pc1") carried = host.carried_bytes_per_s;
-    }
-    return carried > 0;
+    const std::vector<HostInfo> hosts = there.list_hosts().value();
+    return std::any_of(hosts.begin(), hosts.end(), [](const HostInfo& host) {
+      const std::uint64_t carried = host.carried_bytes_per_s;
+      return host.name == "pc1" && carried >= 7'000'000 && carried <= 11'000'000;
+    });
   });
-  EXPECT_GE(carried, 7'000'000u);
-  EXPECT_LE(carried, 11'000'000u);
 }
 
 TEST_F(Hosts, WithALongDelayLoseNothing) {

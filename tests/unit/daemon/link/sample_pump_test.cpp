@@ -4,8 +4,10 @@
 // overwritten while it was sent, wherever the socket stops.
 #include "daemon/link/sample_pump.hpp"
 
+#include <algorithm>
 #include <map>
 #include <random>
+#include <set>
 
 #include "tests/support/memory_peer.hpp"
 #include "tests/unit/core/ring/test_ring.hpp"
@@ -660,12 +662,12 @@ class OverloadedWithALongHistory : public Overloaded {
   OverloadedWithALongHistory() : Overloaded(64) {}
 };
 
-TEST_F(OverloadedWithALongHistory, NothingIsGivenUpThatTheRingHoldsForTenSeconds) {
+TEST_F(OverloadedWithALongHistory, NothingIsGivenUpThatTheRingHoldsForFiveSeconds) {
   int rounds = 0;
   while (rig.pump->lost() == 0 && rounds < 30) round(++rounds);
-  // Sample 2 was passed over first: 34 later it has 30 to go, those of ten seconds. It is counted
+  // Sample 2 was passed over first: 49 later it has 15 to go, those of five seconds. It is counted
   // every third round.
-  EXPECT_EQ(rounds, 13);
+  EXPECT_EQ(rounds, 19);
   EXPECT_EQ(rig.ring.reader().oldest(), 0) << "nothing was overwritten";
   const std::uint64_t lost = rig.pump->lost();
   round(++rounds);
@@ -955,6 +957,84 @@ TEST(NewestFirstSmall, AFewSmallSamplesKeepTheirOrder) {
   const std::vector<Tid> accepted = rig.accepted();
   EXPECT_EQ(accepted[static_cast<std::size_t>(in_order)], 2 * in_order);
   EXPECT_EQ(accepted.back(), 2 * in_order - 1);
+}
+
+class ManySmall : public testing::Test {
+ protected:
+  static constexpr Tid kInOrder =
+      static_cast<Tid>(SamplePump::kInOrderBytes / (kSmall + SamplePump::kHeaderBytes));
+  static constexpr Tid kDepth = 16 * kInOrder, kUrgent = kDepth / SamplePump::kUrgentPart;
+
+  ManySmall() { rig.newest_first = true; }
+  void start(SamplePump::Plan plan) {
+    plan.newest_first = true;
+    rig.start(plan);
+  }
+  // The first samples of the pieces that were sent.
+  std::vector<Tid> pieces() {
+    std::vector<Tid> found;
+    Tid last = kNoTid - 1;
+    for (const Tid tid : rig.accepted()) {
+      if (tid != last + 1 || tid - found.back() == kInOrder) found.push_back(tid);
+      last = tid;
+    }
+    return found;
+  }
+
+  PumpRig rig{kSmall, kDepth};
+};
+
+TEST_F(ManySmall, WhatWaitedForAQuarterOfTheRingGoesFirstAndInItsOrder) {
+  start({});
+  rig.write(kUrgent + 2 * kInOrder + 1);
+  const Tid newest = kUrgent + 2 * kInOrder;
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  std::vector<Tid> expected{newest, 0, kInOrder};
+  for (Tid first = newest - kInOrder; first >= 2 * kInOrder; first -= kInOrder) {
+    expected.push_back(first);
+  }
+  EXPECT_EQ(pieces(), expected);
+  EXPECT_EQ(rig.accepted().size(), static_cast<std::size_t>(newest + 1));
+}
+
+TEST_F(ManySmall, NewerSamplesInterruptWhatGoesInItsOrder) {
+  start({});
+  rig.write(kUrgent + 2 * kInOrder + 1);
+  rig.peer.room = 3 * SamplePump::kInOrderBytes / 2;
+  PumpWait wait = PumpWait::turn;
+  while (wait == PumpWait::turn) wait = rig.run();
+  EXPECT_EQ(wait, PumpWait::output);
+  rig.write(2 * kInOrder);
+  const Tid newest = kUrgent + 4 * kInOrder;
+  rig.peer.room = MemoryPeer::kAll;
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  const std::vector<Tid> accepted = rig.accepted();
+  const auto then = std::find(accepted.begin(), accepted.end(), newest);
+  ASSERT_LT(accepted.end() - then, static_cast<std::ptrdiff_t>(accepted.size()));
+  EXPECT_LT(then[-1], 2 * kInOrder);
+  EXPECT_EQ(then[1], then[-1] + 1) << "goes on where it was";
+  EXPECT_EQ(std::set<Tid>(accepted.begin(), accepted.end()).size(), accepted.size());
+  EXPECT_EQ(accepted.size(), static_cast<std::size_t>(newest + 1));
+}
+
+TEST_F(ManySmall, HistoryComesNewestFirstForWhoHadNothingAndInItsOrderForWhoHad) {
+  const Tid newest = kDepth / 2;
+  rig.write(newest + 1);
+  start({0, newest, 0});
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  const std::vector<Tid> all = pieces();
+  ASSERT_GT(all.size(), 2u);
+  EXPECT_EQ(all[0], newest);
+  EXPECT_EQ(all[1], newest - kInOrder);
+  rig.peer.sent.clear();
+  SamplePump::Plan plan{0, newest, 0};
+  plan.held = {newest - 1, newest};
+  start(plan);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  const std::vector<Tid> rest = pieces();
+  ASSERT_GT(rest.size(), 2u);
+  EXPECT_EQ(rest[0], newest);
+  EXPECT_EQ(rest[1], 0);
 }
 
 }  // namespace

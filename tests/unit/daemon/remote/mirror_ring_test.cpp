@@ -216,6 +216,20 @@ class NewestFirstTest : public MirrorRingTest {
   }
 };
 
+TEST_F(NewestFirstTest, WhatIsHereAlreadyIsNotAskedForAgain) {
+  request();
+  ASSERT_TRUE(ring->on_subscribed_untrusted(2, true, 0));
+  ASSERT_TRUE(take(9));
+  for (const Tid tid : {2, 3, 5}) ASSERT_TRUE(take(tid));
+  ASSERT_TRUE(ring->on_gap_untrusted(4, 1));
+  ring->wake();
+  const net::Subscribe again = request();
+  EXPECT_EQ(again.from_tid(), 6);
+  EXPECT_EQ(again.held_from(), 9);
+  EXPECT_EQ(again.held_to(), 10);
+  EXPECT_EQ(read(3), ReadStatus::ok);
+}
+
 TEST_F(NewestFirstTest, TheNewestIsReadableBeforeThoseThatCameBeforeIt) {
   EXPECT_TRUE(request().newest_first());
   ASSERT_TRUE(ring->on_subscribed_untrusted(2, true, 0));
@@ -279,10 +293,10 @@ TEST_F(NewestFirstTest, HistoryComesWhenItIsWanted) {
   ASSERT_TRUE(ring->on_subscribed_untrusted(13, true, 4));
   ASSERT_TRUE(take(13));
   EXPECT_EQ(read(12), ReadStatus::arriving);
-  EXPECT_EQ(request().from_tid(), 2);
+  EXPECT_EQ(read(3), ReadStatus::lost) << "the owner no longer holds it";
+  EXPECT_EQ(request().from_tid(), 4);
   EXPECT_EQ(request().held_from(), 13);
   EXPECT_EQ(request().held_to(), 14);
-  EXPECT_EQ(read(3), ReadStatus::lost) << "the owner no longer holds it";
   ASSERT_TRUE(ring->on_subscribed_untrusted(4, true, 4));
   for (const Tid tid : {4, 5, 6, 7, 8, 9, 10, 11, 12}) ASSERT_TRUE(take(tid));
   ring->wake();
