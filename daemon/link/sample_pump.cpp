@@ -44,9 +44,8 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   connection_.limit_unsent(unsent_limit_);
   const Tid newest = newest_untrusted(reader_);
   const ring::TidRange held{std::max(plan.held.begin, next_), std::min(plan.held.end, newest + 1)};
-  const bool holds_some = plan.newest_first && held.end > held.begin;
-  backlog_from_ = holds_some ? next_ : newest + 1;
-  if (!holds_some) return;
+  if (plan.backlog_from == kNoTid) plan_.backlog_from = newest + 1;
+  if (!plan.newest_first || held.end <= held.begin) return;
   if (held.begin > next_) passed_over_.push_back({next_, held.begin});
   next_ = held.end;
 }
@@ -272,22 +271,24 @@ bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
 // One piece of what was passed over: the newest, or the oldest of the backlog when it is urgent.
 void SamplePump::choose_back_fill(Tid newest) {
   auto range = passed_over_.end() - 1;
-  if (!has_pace() && !gives_up_) {
-    const auto oldest =
-        std::find_if(passed_over_.begin(), passed_over_.end(),
-                     [&](const ring::TidRange& some) { return some.begin >= backlog_from_; });
-    if (oldest != passed_over_.end() && newest - oldest->begin > depth_ / kUrgentPart) {
+  const auto backlog =
+      std::find_if(passed_over_.begin(), passed_over_.end(),
+                   [&](const ring::TidRange& some) { return some.end > plan_.backlog_from; });
+  if (!has_pace() && !gives_up_ && backlog != passed_over_.end()) {
+    const Tid oldest = std::max(backlog->begin, plan_.backlog_from);
+    if (newest - oldest > depth_ / kUrgentPart) {
       const auto most = static_cast<Tid>(kInOrderBytes / (payload_bytes_ + kHeaderBytes));
-      back_fill_ = {oldest->begin, std::min(oldest->begin + std::max<Tid>(most, 1), oldest->end)};
-      oldest->begin = back_fill_.end;
-      range = oldest;
+      back_fill_ = {oldest, std::min(oldest + std::max<Tid>(most, 1), backlog->end)};
+      range = backlog;
     }
   }
   if (back_fill_.count() == 0) {
     back_fill_ = {std::min(first_within(kInOrderBytes, *range), range->end - 1), range->end};
-    range->end = back_fill_.begin;
   }
-  if (range->count() == 0) passed_over_.erase(range);
+  const ring::TidRange before{range->begin, back_fill_.begin}, after{back_fill_.end, range->end};
+  range = passed_over_.erase(range);
+  if (after.count() > 0) range = passed_over_.insert(range, after);
+  if (before.count() > 0) passed_over_.insert(range, before);
   if (has_pace()) limit_unsent(connection_.progress());
 }
 

@@ -9,8 +9,8 @@
 // With Plan::newest_first, a receiver that shows what is now does not wait for what was: samples
 // that wait for long are passed over, and sent when no newer ones wait, the newest of them first;
 // but small ones that wait for very long go in their order. When the network carries fewer samples
-// than are written, those would never be sent: they are reported as lost after some seconds, or when
-// the ring will soon hold them no more.
+// than are written, those would never be sent: they are reported as lost after some seconds, or
+// when the ring will soon hold them no more.
 //
 // Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
 #pragma once
@@ -65,9 +65,9 @@ class SamplePump {
   // only for some seconds.
   static constexpr Duration kKeptFor = std::chrono::seconds(5);
   static constexpr Duration kSparedFor = std::chrono::seconds(30);
-  // Of a receiver that had samples before, small ones that wait go first and in their order when
-  // this part of the ring was written since. On a PC that is busy for long the oldest would
-  // otherwise leave the ring, however close it is to keeping up.
+  // Small ones that wait and are no history go first and in their order when this part of the ring
+  // was written since. On a PC that is busy for long the oldest would otherwise leave the ring,
+  // however close it is to keeping up.
   static constexpr Tid kUrgentPart = 4;
   // Ranges of what was passed over. When there are more, what is between the oldest two comes
   // again.
@@ -101,6 +101,8 @@ class SamplePump {
     bool newest_first = false;
     // With newest_first: none of these is sent, the receiver has them.
     ring::TidRange held = {};
+    // With newest_first: earlier ones are history. kNoTid: all that is in the ring.
+    Tid backlog_from = kNoTid;
   };
 
   SamplePump(const ring::RingMapping& mapping, FrameConnection& connection, SampleSender& sender,
@@ -165,7 +167,6 @@ class SamplePump {
   Tid last_;
   std::deque<ring::TidRange> passed_over_;  // and not sent yet; rising
   ring::TidRange back_fill_;                // of these, what is sent next; no longer in it
-  Tid backlog_from_ = 0;                    // what waits before that is history
   bool fills_ = false;        // the sample that is sent is the first one of back_fill_
   bool has_kept_up_ = false;  // once, no newer sample waited
   // How often samples were passed over since none of them waited, or since they were counted last:

@@ -64,6 +64,7 @@ void MirrorRing::resume(bool newest_first, bool with_history, net::Subscribe& ou
   if (slots_.newest() < 0 && cursor_.next() != kNoTid) cursor_.set_next(begins_at_);
   cursor_.resume(stream_->incarnation(), out);
   out.set_newest_first(newest_first);
+  if (newest_first && slots_.newest() >= 0) out.set_backlog_from(backlog_from_);
   const ring::TidRange hole = reader_.hole();
   const bool has_hole = !hole.is_empty() && hole.end > reader_.oldest();
   if (!with_history_) {
@@ -251,6 +252,7 @@ void MirrorRing::drop_aside() noexcept {
 // Publishes a sample that does not follow on the newest one: those in between are lost, or come
 // later.
 void MirrorRing::publish_after_gap(const SampleInfo& info) noexcept {
+  if (slots_.newest() < 0) backlog_from_ = info.tid;
   const Tid begin = std::max<Tid>(slots_.newest() + 1, begins_at_);
   const bool are_lost = lost_ahead_.size() == 1 && lost_ahead_.front().begin <= begin &&
                         lost_ahead_.front().end >= info.tid;

@@ -113,11 +113,12 @@ class MirrorRing {
   ring::SlotWriter slots_;
   ring::RingReader reader_;
   channel::SampleCursor cursor_;
-  bool newest_first_ = false;               // the owner sends so
-  bool with_history_ = true;                // the present request
-  Tid wanted_from_ = 0;                     // earlier ones do not count as lost: not asked for
-  Tid has_place_from_ = 0;                  // beside the newest one that the owner named last
-  Tid begins_at_ = 0;                       // an empty ring: earlier ones were never asked for
+  bool newest_first_ = false;  // the owner sends so
+  bool with_history_ = true;   // the present request
+  Tid wanted_from_ = 0;        // earlier ones do not count as lost: not asked for
+  Tid has_place_from_ = 0;     // beside the newest one that the owner named last
+  Tid begins_at_ = 0;          // an empty ring: earlier ones were never asked for
+  Tid backlog_from_ = 0;       // earlier ones are history, written before it was filled
   std::vector<ring::TidRange> lost_ahead_;  // of those after the newest one here; rising
   bool is_dropped_ = false;             // the sample in the hole that arrives, which is not missing
   bool late_pending_ = false;           // the hole has become smaller since the last wake()

@@ -107,11 +107,12 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
   subscribed.set_first_tid(first);
   subscribed.set_newest(newest);
   subscribed.set_oldest(std::clamp<Tid>(reader_.oldest(), 0, newest + 1));
-  SamplePump::Plan plan{first, newest, request.max_rate_hz(), false, {}};
+  SamplePump::Plan plan{first, newest, request.max_rate_hz()};
   if (request.newest_first()) {
     plan.newest_first = true;
     if (request.incarnation() == stream().incarnation()) {
       plan.held = {request.held_from(), request.held_to()};
+      if (request.has_backlog_from()) plan.backlog_from = request.backlog_from();
     }
     subscribed.set_newest_first(true);
   }

@@ -157,6 +157,7 @@ const std::map<std::string, Fill>& messages() {
          subscribe.set_newest_first(true);
          subscribe.set_held_from(1600);
          subscribe.set_held_to(2001);
+         subscribe.set_backlog_from(1550);
        }},
       {"subscribed_newest_first",
        [](net::Frame& frame) {

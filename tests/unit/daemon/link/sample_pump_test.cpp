@@ -1017,7 +1017,7 @@ TEST_F(ManySmall, NewerSamplesInterruptWhatGoesInItsOrder) {
   EXPECT_EQ(accepted.size(), static_cast<std::size_t>(newest + 1));
 }
 
-TEST_F(ManySmall, HistoryComesNewestFirstForWhoHadNothingAndInItsOrderForWhoHad) {
+TEST_F(ManySmall, HistoryComesNewestFirstAndBacklogInItsOrder) {
   const Tid newest = kDepth / 2;
   rig.write(newest + 1);
   start({0, newest, 0});
@@ -1028,13 +1028,16 @@ TEST_F(ManySmall, HistoryComesNewestFirstForWhoHadNothingAndInItsOrderForWhoHad)
   EXPECT_EQ(all[1], newest - kInOrder);
   rig.peer.sent.clear();
   SamplePump::Plan plan{0, newest, 0};
-  plan.held = {newest - 1, newest};
+  plan.backlog_from = 2 * kInOrder;
   start(plan);
   EXPECT_EQ(rig.run_on(), PumpWait::sample);
   const std::vector<Tid> rest = pieces();
-  ASSERT_GT(rest.size(), 2u);
+  ASSERT_GT(rest.size(), 4u);
   EXPECT_EQ(rest[0], newest);
-  EXPECT_EQ(rest[1], 0);
+  EXPECT_EQ(rest[1], 2 * kInOrder);
+  EXPECT_EQ(rest[2], 3 * kInOrder);
+  EXPECT_EQ(rest.back(), 0);
+  EXPECT_EQ(rig.accepted().size(), static_cast<std::size_t>(newest + 1));
 }
 
 }  // namespace

@@ -227,7 +227,10 @@ TEST_F(NewestFirstTest, WhatIsHereAlreadyIsNotAskedForAgain) {
   EXPECT_EQ(again.from_tid(), 6);
   EXPECT_EQ(again.held_from(), 9);
   EXPECT_EQ(again.held_to(), 10);
+  EXPECT_EQ(again.backlog_from(), 9) << "those before were written when nobody was here";
   EXPECT_EQ(read(3), ReadStatus::ok);
+  ring = MirrorRing::open(stream, budget).value();
+  EXPECT_EQ(request().backlog_from(), 0) << "no longer known";
 }
 
 TEST_F(NewestFirstTest, TheNewestIsReadableBeforeThoseThatCameBeforeIt) {
