@@ -52,6 +52,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
 
 [[gnu::hot]] Result<PumpWait> SamplePump::pump(MonoTime now, bool only_under_way) {
   if (decides_late()) fit_unsent_limit();
+  has_filled_ = false;
   std::size_t bytes = 0;
   for (int samples = 0; samples < kSamplesPerTurn && bytes < kBytesPerTurn;) {
     SendStatus status = SendStatus::sent;
@@ -185,7 +186,8 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     sender_.end_run();
     observer_.on_caught_up();
   }
-  fills_ = !has_due_sample(now, newest);
+  const bool is_due = has_due_sample(now, newest);
+  fills_ = !is_due || (has_filled_ && (back_fill_.count() > 0 || !passed_over_.empty()));
   if (!fills_) {
     if (thins()) {
       leave_out(newest);
@@ -196,7 +198,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   }
   // What was sent last still waits for the socket, and pump() with it.
   if (!connection_.output_empty()) return Next::wait_for_sample;
-  has_kept_up_ = true;
+  has_kept_up_ |= !is_due;
   // Otherwise there is time between the samples, but not for all that waits.
   if (back_fill_.count() == 0 &&
       (passed_over_.empty() || passed_over_.back().end <= behind_from_)) {
@@ -204,7 +206,10 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     gives_up_ = false;
   }
   if (back_fill_.count() == 0 && !passed_over_.empty()) choose_back_fill(newest);
-  if (back_fill_.count() > 0) return Next::ready;
+  if (back_fill_.count() > 0) {
+    has_filled_ = !has_pace();
+    return Next::ready;
+  }
   fills_ = false;
   if (next_ <= newest) return Next::wait_for_time;
   if (next_ <= last_) return Next::wait_for_sample;
@@ -264,8 +269,9 @@ bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
                kMostUnsentBytes);
   if (first_within(in_order, samples) == samples.begin) return false;
   const std::optional<wire::Progress> progress = connection_.progress();
-  return !progress || first_within(bytes_in(kInOrderFor, progress->carried_bytes_per_s), samples) !=
-                          samples.begin;
+  if (!progress) return true;
+  const Duration time = has_pace() ? kInOrderFor : kSmallInOrderFor;
+  return first_within(bytes_in(time, progress->carried_bytes_per_s), samples) != samples.begin;
 }
 
 // One piece of what was passed over: the newest, or the oldest of the backlog when it is urgent.

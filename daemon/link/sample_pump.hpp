@@ -46,9 +46,11 @@ enum class PumpWait : std::uint8_t {
 class SamplePump {
  public:
   // With newest_first: so much is sent in the order of their tids all the same, and at least one
-  // sample; more when the network carries more in that time.
+  // sample; more when the network carries more in that time. Longer for small ones: on a busy PC
+  // hundreds of them wait often.
   static constexpr std::size_t kInOrderBytes = 64U << 10;
   static constexpr Duration kInOrderFor = std::chrono::milliseconds(4);
+  static constexpr Duration kSmallInOrderFor = std::chrono::milliseconds(20);
   static constexpr std::size_t kHeaderBytes = 32;  // of a sample's frame, about
   // So much waits in the kernel, where nothing newer can take its place; less when the network
   // needs longer than that for it. Half as much made sending slower on a fast link. On a busy PC it
@@ -167,7 +169,10 @@ class SamplePump {
   Tid last_;
   std::deque<ring::TidRange> passed_over_;  // and not sent yet; rising
   ring::TidRange back_fill_;                // of these, what is sent next; no longer in it
-  bool fills_ = false;        // the sample that is sent is the first one of back_fill_
+  bool fills_ = false;  // the sample that is sent is the first one of back_fill_
+  // Small samples were filled in in this turn: newer ones wait for the next one. Sent one by one
+  // in between, they would be as many packets as the rest together.
+  bool has_filled_ = false;
   bool has_kept_up_ = false;  // once, no newer sample waited
   // How often samples were passed over since none of them waited, or since they were counted last:
   // when, which, and how many waited.

@@ -1017,6 +1017,23 @@ TEST_F(ManySmall, NewerSamplesInterruptWhatGoesInItsOrder) {
   EXPECT_EQ(accepted.size(), static_cast<std::size_t>(newest + 1));
 }
 
+TEST_F(ManySmall, NewerSamplesWaitForTheNextTurn) {
+  start({});
+  rig.write(4 * kInOrder);
+  const Tid newest = 4 * kInOrder - 1;
+  int sends = 0;
+  rig.peer.after_send = [&] {
+    if (++sends > 1) rig.write();
+  };
+  EXPECT_EQ(rig.run(), PumpWait::turn);
+  const std::vector<Tid> turn = rig.accepted();
+  EXPECT_EQ(turn.front(), newest);
+  EXPECT_EQ(std::count_if(turn.begin(), turn.end(), [&](Tid tid) { return tid > newest; }), 0);
+  rig.peer.after_send = nullptr;
+  EXPECT_EQ(rig.run(), PumpWait::turn);
+  EXPECT_GT(rig.accepted()[turn.size()], newest) << "before what is left of the others";
+}
+
 TEST_F(ManySmall, HistoryComesNewestFirstAndBacklogInItsOrder) {
   const Tid newest = kDepth / 2;
   rig.write(newest + 1);
