@@ -200,7 +200,8 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   if (!connection_.output_empty()) return Next::wait_for_sample;
   has_kept_up_ |= !is_due;
   // Otherwise there is time between the samples, but not for all that waits.
-  if (back_fill_.count() == 0 &&
+  const bool is_known = gives_up_ && now - passed_over_at_ < kOverloadedAfter;
+  if (back_fill_.count() == 0 && !is_known &&
       (passed_over_.empty() || passed_over_.back().end <= behind_from_)) {
     passed_over_since_ = 0;
     gives_up_ = false;
@@ -313,12 +314,13 @@ void SamplePump::return_back_fill() {
 }
 
 void SamplePump::pass_over(Tid next, MonoTime now) {
-  while (passed_over_.size() + 1 >= kMaxPassedOver) {
-    passed_over_[1].begin = passed_over_.front().begin;
-    passed_over_.pop_front();
-  }
   return_back_fill();
-  passed_over_.push_back({next_, next});
+  if (passed_over_.size() < kMaxPassedOver) {
+    passed_over_.push_back({next_, next});
+  } else {
+    passed_over_.back().end = next;
+  }
+  passed_over_at_ = now;
   next_ = next;
   if (has_pace()) limit_unsent(connection_.progress());
   if (passed_over_since_ == 0) {
@@ -340,18 +342,22 @@ void SamplePump::leave_out(Tid newest) {
 }
 
 // How many samples wait that were passed over is measured again and again: when they become more,
-// the network carries less than is written.
+// the network carries less than is written. Small ones may wait for older ones, which count, too.
 void SamplePump::give_up_what_is_never_carried(MonoTime now) {
   const auto first =
       std::find_if(passed_over_.begin(), passed_over_.end(),
                    [&](const ring::TidRange& range) { return range.begin >= behind_from_; });
+  const Tid counted_from = has_pace() ? behind_from_ : plan_.backlog_from;
   Tid waiting = 0;
-  for (auto range = first; range != passed_over_.end(); ++range) waiting += range->count();
+  for (const ring::TidRange& range : passed_over_) {
+    waiting += std::max<Tid>(range.end - std::max(range.begin, counted_from), 0);
+  }
   ++passed_over_since_;
   const bool is_measured =
       passed_over_since_ >= kOverloadedSamples && now - behind_since_ >= kOverloadedAfter;
   if (passed_over_since_ == 1 ||
-      (is_measured && (waiting <= waiting_before_ || is_spared(first->begin, now)))) {
+      (is_measured && (waiting <= waiting_before_ || first == passed_over_.end() ||
+                       is_spared(first->begin, now)))) {
     passed_over_since_ = 1;
     behind_since_ = now;
     waiting_before_ = waiting;

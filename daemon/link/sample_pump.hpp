@@ -7,10 +7,10 @@
 // channel.
 //
 // With Plan::newest_first, a receiver that shows what is now does not wait for what was: samples
-// that wait for long are passed over, and sent when no newer ones wait, the newest of them first;
-// but small ones that wait for very long go in their order. When the network carries fewer samples
-// than are written, those would never be sent: they are reported as lost after some seconds, or
-// when the ring will soon hold them no more.
+// that wait for long are passed over, and sent when no newer ones wait, the newest of them first.
+// Small ones that wait for very long go in their order, and newer small ones wait until the turn is
+// over. When the network carries fewer samples than are written, what was passed over would never
+// be sent: it is reported as lost after some seconds, or when the ring will soon hold it no more.
 //
 // Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
 #pragma once
@@ -71,7 +71,7 @@ class SamplePump {
   // was written since. On a PC that is busy for long the oldest would otherwise leave the ring,
   // however close it is to keeping up.
   static constexpr Tid kUrgentPart = 4;
-  // Ranges of what was passed over. When there are more, what is between the oldest two comes
+  // Ranges of what was passed over. When there are more, what is between the newest two comes
   // again.
   static constexpr std::size_t kMaxPassedOver = 4096;
   static constexpr int kSamplesPerTurn = 1024;
@@ -177,7 +177,7 @@ class SamplePump {
   // How often samples were passed over since none of them waited, or since they were counted last:
   // when, which, and how many waited.
   int passed_over_since_ = 0;
-  MonoTime behind_since_{}, overloaded_since_{};
+  MonoTime behind_since_{}, overloaded_since_{}, passed_over_at_{};
   bool gives_up_ = false;  // at once, because the network carries less than is written
   Tid behind_from_ = 0, waiting_before_ = 0, next_before_ = 0;
   std::size_t unsent_limit_ = 0;  // of what waits in the kernel

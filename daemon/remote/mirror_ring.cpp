@@ -64,15 +64,15 @@ void MirrorRing::resume(bool newest_first, bool with_history, net::Subscribe& ou
   if (slots_.newest() < 0 && cursor_.next() != kNoTid) cursor_.set_next(begins_at_);
   cursor_.resume(stream_->incarnation(), out);
   out.set_newest_first(newest_first);
-  if (newest_first && slots_.newest() >= 0) out.set_backlog_from(backlog_from_);
   const ring::TidRange hole = reader_.hole();
   const bool has_hole = !hole.is_empty() && hole.end > reader_.oldest();
+  if (newest_first && slots_.newest() >= 0) {
+    out.set_backlog_from(has_hole ? first_missing(backlog_from_) : backlog_from_);
+  }
   if (!with_history_) {
     out.set_from_newest(true);
   } else if (has_hole) {
-    Tid from = std::max(hole.begin, reader_.oldest());
-    while (from < hole.end && !is_missing(from)) ++from;
-    out.set_from_tid(from);
+    out.set_from_tid(first_missing(0));
   }
   if (out.has_from_tid()) out.set_from_tid(std::max<Tid>(out.from_tid(), has_place_from_));
   if (!has_hole && with_history_) return;
@@ -180,6 +180,14 @@ MirrorRing::Recent MirrorRing::recent() const noexcept {
     recent.lost += status == ReadStatus::lost ? 1U : 0U;
   }
   return recent;
+}
+
+// Of the hole, from that sample on; without one, the end of the hole.
+Tid MirrorRing::first_missing(Tid from) const noexcept {
+  const ring::TidRange hole = reader_.hole();
+  Tid tid = std::max({from, hole.begin, reader_.oldest()});
+  while (tid < hole.end && !is_missing(tid)) ++tid;
+  return tid;
 }
 
 // Whether it is in the hole and the window, and has not come.

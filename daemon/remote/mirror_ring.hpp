@@ -44,9 +44,9 @@ class MirrorRing {
 
   const std::shared_ptr<Stream>& stream() const noexcept { return stream_; }
 
-  // The request for the samples of the hole, also for those in it that are here, and for those that
-  // follow on the newest one; for all, if the owner never sent where this ring begins. The newest
-  // first.
+  // The request for the samples of the hole from the first one that is missing, also for those in
+  // it that are here, and for those that follow on the newest one; for all, if the owner never sent
+  // where this ring begins. The newest first.
   //   newest_first  the owner has that feature; else what is missing in the hole will never come
   //   with_history  false: only for the newest sample and those that follow. Those before are in
   //                 the hole until resume() asks for them. Without newest_first always true
@@ -96,6 +96,7 @@ class MirrorRing {
   // Of the window, when `newest` is the newest sample.
   Tid oldest_beside(Tid newest) const noexcept { return newest - depth() + 2; }
   bool is_missing(Tid tid) const noexcept;
+  Tid first_missing(Tid from) const noexcept;
   std::byte* begin_late(const wire::IncomingSample& sample) noexcept;
   void lose_late(ring::TidRange range) noexcept;
   std::uint64_t count_missing(ring::TidRange range) const noexcept;

@@ -1034,6 +1034,75 @@ TEST_F(ManySmall, NewerSamplesWaitForTheNextTurn) {
   EXPECT_GT(rig.accepted()[turn.size()], newest) << "before what is left of the others";
 }
 
+TEST_F(ManySmall, WhatTheNetworkCarriesSoonKeepsItsOrder) {
+  const auto order_at = [&](std::uint64_t carried_bytes_per_s) {
+    rig.peer.progress.emplace().carried_bytes_per_s = carried_bytes_per_s;
+    rig.peer.sent.clear();
+    rig.write();
+    start({rig.ring.reader().newest(), kNoTid, 0});
+    rig.write(2 * kInOrder);
+    EXPECT_EQ(rig.run_on(), PumpWait::sample);
+    const std::vector<Tid> order = rig.accepted();
+    return std::is_sorted(order.begin(), order.end());
+  };
+  constexpr auto kBytes = 2 * kInOrder * (kSmall + SamplePump::kHeaderBytes);
+  constexpr std::uint64_t kPerSecond = std::chrono::seconds(1) / SamplePump::kSmallInOrderFor;
+  EXPECT_TRUE(order_at(kBytes * (kPerSecond + 1)));
+  EXPECT_FALSE(order_at(kBytes * (kPerSecond - 1)));
+}
+
+// A busy PC that lags by more each second, and then catches up: by 100 samples a second.
+class SmallBacklog : public ManySmall {
+ protected:
+  static constexpr std::size_t kFrameBytes = kSmall + SamplePump::kHeaderBytes;
+
+  void pass_second(int second, int written, std::size_t carried) {
+    rig.write(written);
+    rig.peer.room = carried * kFrameBytes;
+    PumpWait wait = PumpWait::turn;
+    for (int turns = 0; turns < 100 && wait != PumpWait::sample && rig.peer.room > 0; ++turns) {
+      run_turns(rig.loop);
+      wait = rig.run(kStart + second * 1s);
+    }
+  }
+};
+
+TEST_F(SmallBacklog, IsNotGivenUpWhileItBecomesLess) {
+  start({});
+  rig.write();
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  constexpr int kWritten = 2 * kInOrder;
+  rig.write(8 * kInOrder);  // in the pause
+  for (int second = 1; second < 40; ++second) pass_second(second, kWritten, kWritten + 100);
+  EXPECT_EQ(rig.pump->lost(), 0u);
+}
+
+TEST_F(SmallBacklog, IsGivenUpAtOnceWhenItOnlyBecomesMore) {
+  start({});
+  rig.write();
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  constexpr int kWritten = 2 * kInOrder;
+  int second = 0;
+  while (rig.pump->lost() == 0 && second < 40) pass_second(++second, kWritten, kInOrder);
+  EXPECT_LT(second, 16);
+  EXPECT_EQ(rig.ring.reader().oldest(), 0) << "nothing was overwritten";
+  for (int more = 0; more < 5; ++more) {
+    const std::uint64_t lost = rig.pump->lost();
+    pass_second(++second, kWritten, kInOrder);
+    EXPECT_GT(rig.pump->lost(), lost);
+  }
+}
+
+TEST_F(NewestFirst, LargeBacklogIsNeverUrgent) {
+  rig.write(12);
+  SamplePump::Plan plan{0, 11, 0};
+  plan.backlog_from = 0;
+  start(plan);
+  EXPECT_EQ(rig.run_on(), PumpWait::sample);
+  const std::vector<Tid> order = rig.accepted();
+  EXPECT_TRUE(std::is_sorted(order.rbegin(), order.rend()));
+}
+
 TEST_F(ManySmall, HistoryComesNewestFirstAndBacklogInItsOrder) {
   const Tid newest = kDepth / 2;
   rig.write(newest + 1);

@@ -228,9 +228,13 @@ TEST_F(NewestFirstTest, WhatIsHereAlreadyIsNotAskedForAgain) {
   EXPECT_EQ(again.held_from(), 9);
   EXPECT_EQ(again.held_to(), 10);
   EXPECT_EQ(again.backlog_from(), 9) << "those before were written when nobody was here";
+  ASSERT_TRUE(ring->on_subscribed_untrusted(6, true, 0));
+  for (const Tid tid : {10, 11, 14}) ASSERT_TRUE(take(tid));
+  EXPECT_EQ(request().from_tid(), 6);
+  EXPECT_EQ(request().backlog_from(), 12) << "what is missing of those since then";
   EXPECT_EQ(read(3), ReadStatus::ok);
   ring = MirrorRing::open(stream, budget).value();
-  EXPECT_EQ(request().backlog_from(), 0) << "no longer known";
+  EXPECT_EQ(request().backlog_from(), 6) << "no longer known: all that is missing";
 }
 
 TEST_F(NewestFirstTest, TheNewestIsReadableBeforeThoseThatCameBeforeIt) {

@@ -38,6 +38,7 @@ class Channel final : private FrameConnection::Observer, private SamplePump::Obs
     plan.first = first;
     plan.newest_first = true;
     plan.held = {request.held_from(), request.held_to()};
+    if (request.has_backlog_from()) plan.backlog_from = request.backlog_from();
     pump_.emplace(*owner.mapping, link_, sender_, static_cast<SamplePump::Observer&>(*this), plan);
   }
 
@@ -92,7 +93,7 @@ class Channel final : private FrameConnection::Observer, private SamplePump::Obs
 };
 
 class NewestFirstEndToEnd : public testing::TestWithParam<std::size_t> {};
-INSTANTIATE_TEST_SUITE_P(PayloadBytes, NewestFirstEndToEnd, testing::Values(40, 20'000, 65'537),
+INSTANTIATE_TEST_SUITE_P(PayloadBytes, NewestFirstEndToEnd, testing::Values(40, 8000, 20'000, 65'537),
                          testing::PrintToStringParamName());
 
 TEST_P(NewestFirstEndToEnd, EachSampleIsReceivedOrLostOnce) {
