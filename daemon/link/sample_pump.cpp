@@ -281,7 +281,7 @@ void SamplePump::choose_back_fill(Tid newest) {
   const auto backlog =
       std::find_if(passed_over_.begin(), passed_over_.end(),
                    [&](const ring::TidRange& some) { return some.end > plan_.backlog_from; });
-  if (!has_pace() && !gives_up_ && backlog != passed_over_.end()) {
+  if (!has_pace() && backlog != passed_over_.end()) {
     const Tid oldest = std::max(backlog->begin, plan_.backlog_from);
     if (newest - oldest > depth_ / kUrgentPart) {
       const auto most = static_cast<Tid>(kInOrderBytes / (payload_bytes_ + kHeaderBytes));

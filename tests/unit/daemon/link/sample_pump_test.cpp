@@ -1068,11 +1068,11 @@ class SmallBacklog : public ManySmall {
 };
 
 TEST_F(SmallBacklog, IsNotGivenUpWhileItBecomesLess) {
-  start({});
-  rig.write();
-  EXPECT_EQ(rig.run_on(), PumpWait::sample);
   constexpr int kWritten = 2 * kInOrder;
-  rig.write(8 * kInOrder);  // in the pause
+  rig.write(4 * kWritten);  // during a cut of 4 s
+  SamplePump::Plan plan{0, 4 * kWritten - 1, 0};
+  plan.backlog_from = 0;
+  start(plan);
   for (int second = 1; second < 40; ++second) pass_second(second, kWritten, kWritten + 100);
   EXPECT_EQ(rig.pump->lost(), 0u);
 }
