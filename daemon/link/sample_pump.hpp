@@ -46,8 +46,8 @@ enum class PumpWait : std::uint8_t {
 class SamplePump {
  public:
   // With newest_first: so much is sent in the order of their tids all the same, and at least one
-  // sample; more when the network carries more in that time. Longer for small ones: on a busy PC
-  // hundreds of them wait often.
+  // sample; more when the network carries more in that time. Small ones more, and all of them when
+  // nothing is unsent: on a busy PC hundreds wait often, and then the network is not what is late.
   static constexpr std::size_t kInOrderBytes = 64U << 10;
   static constexpr Duration kInOrderFor = std::chrono::milliseconds(4);
   static constexpr Duration kSmallInOrderFor = std::chrono::milliseconds(20);

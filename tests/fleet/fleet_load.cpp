@@ -4,12 +4,17 @@
 //
 //   fleet-load write RATE_HZ STREAM@HOST...   creates them and writes each at this rate
 //   fleet-load read RATE_HZ STREAM@HOST...    reads each from its oldest sample on
+//   fleet-load film RATE_HZ STREAM@HOST...    creates them and writes images into each, with the
+//                                             time of the clock
+//   fleet-load look RATE_HZ STREAM@HOST       reads the newest image 1,000 times a second
 //
 // Prints "ready" on stdout after the first sample of each stream, and for each byte on stdin the
-// number of samples written or read so far. Ends when stdin ends; readers first read all samples
-// written until then. The last line is JSON:
+// number of samples written or read so far; "look" prints the ages in us that it saw since the
+// byte before: "MEDIAN P99". Ends when stdin ends; readers first read all samples written until
+// then. The last line is JSON:
 //
-//   write  {"written": {STREAM: COUNT}}
+//   write  {"written": {STREAM: COUNT}}; film, too
+//   look   {}
 //   read   {"faults": TEXT, "streams": {STREAM: {"taken": N, "lost": N, "restarts": N}},
 //           "silences_ms": {STREAM: [N]}}
 //
@@ -28,6 +33,7 @@
 #include <nlohmann/json.hpp>
 #include <numeric>
 #include <thread>
+#include <utility>
 
 #include "tests/process/network/follower.hpp"
 
@@ -37,7 +43,8 @@ namespace {
 using namespace std::chrono_literals;
 
 constexpr std::uint64_t kPayloadBytes = 256;
-constexpr std::uint64_t kHistorySeconds = 20;
+constexpr std::uint64_t kImageBytes = 640 * 480 * 3;
+constexpr std::uint64_t kHistorySeconds = 20, kImageSeconds = 5;
 constexpr Duration kLeastSilence = 400ms;
 
 KnownStream known_stream(const std::string& name, std::uint64_t rate_hz) {
@@ -55,17 +62,17 @@ void print(const std::string& line) {
   std::fflush(stdout);
 }
 
-// Answers a request on stdin, if there is one, with moved(). Returns whether stdin has ended.
-bool stdin_ended(const std::function<std::uint64_t()>& moved) {
+// Answers a request on stdin, if there is one, with what it says. Returns whether stdin has ended.
+bool stdin_ended(const std::function<std::string()>& answer) {
   pollfd in{STDIN_FILENO, POLLIN, 0};
   if (::poll(&in, 1, 0) <= 0) return false;
   char request = 0;
   if (::read(STDIN_FILENO, &request, 1) != 1) return true;
-  print(std::to_string(moved()));
+  print(answer());
   return false;
 }
 
-void write(const std::vector<KnownStream>& streams) {
+void write(const std::vector<KnownStream>& streams, bool by_the_clock) {
   Session session = Session::connect().value();
   std::vector<RawWriter> writers;
   for (const KnownStream& known : streams) {
@@ -73,15 +80,18 @@ void write(const std::vector<KnownStream>& streams) {
   }
   // Greater with each writer of a stream, so that readers can distinguish their samples.
   const auto life = static_cast<std::uint64_t>(std::time(nullptr));
-  std::vector<std::byte> payload(kPayloadBytes);
+  std::vector<std::byte> payload(streams[0].payload_bytes);
   MonoTime due = MonoClock::now();
   Tid tid = 0;
-  const auto moved = [&] { return static_cast<std::uint64_t>(tid) * streams.size(); };
+  const auto moved = [&] {
+    return std::to_string(static_cast<std::uint64_t>(tid) * streams.size());
+  };
   for (; !stdin_ended(moved); ++tid, due += streams[0].cycle) {
     std::this_thread::sleep_until(due);
     for (std::size_t i = 0; i < streams.size(); ++i) {
       streams[i].fill(payload, life, tid);
-      const SampleInfo info = streams[i].info(tid);
+      SampleInfo info = streams[i].info(tid);
+      if (by_the_clock) info.time = WallClock::now();
       if (writers[i].write(payload, info.time, info.clock_error) != tid) {
         std::fprintf(stderr, "'%s' existed already\n", streams[i].id.str().c_str());
         std::exit(1);
@@ -135,9 +145,9 @@ void read(const std::vector<KnownStream>& streams) {
     return std::all_of(followers.begin(), followers.end(), condition);
   };
   const auto moved = [&] {
-    return std::accumulate(
+    return std::to_string(std::accumulate(
         followers.begin(), followers.end(), std::uint64_t{0},
-        [](std::uint64_t sum, const Follower& follower) { return sum + follower.taken(); });
+        [](std::uint64_t sum, const Follower& follower) { return sum + follower.taken(); }));
   };
   while (!all([](const Follower& follower) { return follower.taken() > 0; })) take();
   print("ready");
@@ -159,18 +169,59 @@ void read(const std::vector<KnownStream>& streams) {
   print(nlohmann::json{{"faults", text}, {"streams", found}, {"silences_ms", silent}}.dump());
 }
 
+void look(const KnownStream& known) {
+  Session session = Session::connect({.request_timeout = 60s}).value();
+  RawReader reader =
+      session.await_raw_reader(known.id, kNever, nullptr, FetchHistory::at_once).value();
+  std::vector<std::byte> payload(known.payload_bytes);
+  std::vector<std::int64_t> ages_us;
+  const auto answer = [&] {
+    std::sort(ages_us.begin(), ages_us.end());
+    const auto at = [&](std::size_t percent) {
+      return std::to_string(ages_us[(ages_us.size() - 1) * percent / 100]);
+    };
+    const std::string text = ages_us.empty() ? "" : at(50) + " " + at(99);
+    ages_us.clear();
+    return text;
+  };
+  SampleInfo info;
+  bool is_ready = false;
+  while (!stdin_ended(answer)) {
+    if (reader.read_newest(payload, info) == ReadStatus::ok) {
+      ages_us.push_back(
+          std::chrono::duration_cast<std::chrono::microseconds>(WallClock::now() - info.time)
+              .count());
+      if (!std::exchange(is_ready, true)) print("ready");
+    }
+    std::this_thread::sleep_for(1ms);
+  }
+  print("{}");
+}
+
 }  // namespace
 }  // namespace dssm::test
 
 int main(int argc, char** argv) {
   using namespace dssm::test;
   const std::string mode = argc > 3 ? argv[1] : "";
-  if (mode != "write" && mode != "read") {
-    std::fprintf(stderr, "usage: fleet-load write|read RATE_HZ STREAM@HOST...\n");
+  const bool with_images = mode == "film" || mode == "look";
+  if (mode != "write" && mode != "read" && !with_images) {
+    std::fprintf(stderr, "usage: fleet-load write|read|film|look RATE_HZ STREAM@HOST...\n");
     return 1;
   }
   const std::uint64_t rate_hz = std::strtoull(argv[2], nullptr, 10);
   std::vector<KnownStream> streams;
-  for (int i = 3; i < argc; ++i) streams.push_back(known_stream(argv[i], rate_hz));
-  mode == "write" ? write(streams) : read(streams);
+  for (int i = 3; i < argc; ++i) {
+    streams.push_back(known_stream(argv[i], rate_hz));
+    if (!with_images) continue;
+    streams.back().payload_bytes = kImageBytes;
+    streams.back().depth = kImageSeconds * rate_hz;
+  }
+  if (mode == "read") {
+    read(streams);
+  } else if (mode == "look") {
+    look(streams[0]);
+  } else {
+    write(streams, mode == "film");
+  }
 }

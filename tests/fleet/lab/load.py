@@ -38,6 +38,14 @@ class Load:
         self._process.stdin.flush()
         return int(self._line())
 
+    def ages_us(self) -> tuple[int, int]:
+        """The median and the 99th percentile of the newest image's age since the last call ("look")."""
+        assert self._process.stdin
+        self._process.stdin.write("?")
+        self._process.stdin.flush()
+        median, p99 = self._line().split()
+        return int(median), int(p99)
+
     def await_more(self, samples: int) -> None:
         """Waits until it has written or read `samples` more."""
         wanted = self.moved() + samples

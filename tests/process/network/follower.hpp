@@ -32,9 +32,9 @@ class Follower {
   RawReader& reader() { return std::get<RawReader>(source_); }
   PConnector& connector() { return std::get<PConnector>(source_); }
   const KnownStream& known() const { return known_; }
-  // The newest sample of the owner's ring has been taken.
   // The network carries less than the stream: what is lost may still be in the owner's ring.
   void expect_thinning() { is_thinned_ = true; }
+  // The newest sample of the owner's ring has been taken.
   bool has_all() const { return owner_ && last_ == owner_->newest_tid(); }
 
   Tid first() const { return first_; }  // the first available one of the last ring

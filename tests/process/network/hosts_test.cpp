@@ -323,7 +323,8 @@ TEST_F(Hosts, WithANetworkThatCarriesLessThanAStreamStayFresh) {
   EXPECT_GT(left_out, 0);
   EXPECT_GT(found_by_time, 0);
   EXPECT_EQ(reader.lost_samples(), static_cast<std::uint64_t>(left_out));
-  EXPECT_GE(mirror().gap_samples, reader.lost_samples());
+  // At first it waits for what is about to leave the ring; on a busy machine it is late for some.
+  EXPECT_GE(mirror().gap_samples + std::uint64_t{kMostBehind}, reader.lost_samples());
 }
 
 TEST_F(Hosts, WithASlowNetworkSayWhatItCarries) {

@@ -1035,8 +1035,9 @@ TEST_F(ManySmall, NewerSamplesWaitForTheNextTurn) {
 }
 
 TEST_F(ManySmall, WhatTheNetworkCarriesSoonKeepsItsOrder) {
-  const auto order_at = [&](std::uint64_t carried_bytes_per_s) {
+  const auto order_at = [&](std::uint64_t carried_bytes_per_s, std::uint64_t unsent_bytes = 1) {
     rig.peer.progress.emplace().carried_bytes_per_s = carried_bytes_per_s;
+    rig.peer.progress->unsent_bytes = unsent_bytes;
     rig.peer.sent.clear();
     rig.write();
     start({rig.ring.reader().newest(), kNoTid, 0});
@@ -1049,6 +1050,7 @@ TEST_F(ManySmall, WhatTheNetworkCarriesSoonKeepsItsOrder) {
   constexpr std::uint64_t kPerSecond = std::chrono::seconds(1) / SamplePump::kSmallInOrderFor;
   EXPECT_TRUE(order_at(kBytes * (kPerSecond + 1)));
   EXPECT_FALSE(order_at(kBytes * (kPerSecond - 1)));
+  EXPECT_TRUE(order_at(kBytes * (kPerSecond - 1), 0)) << "this PC was late";
 }
 
 // A busy PC that lags by more each second, and then catches up: by 100 samples a second.
