@@ -271,13 +271,13 @@ bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
   if (first_within(in_order, samples) == samples.begin) return false;
   const std::optional<wire::Progress> progress = connection_.progress();
   if (!progress) return true;
-  // All was sent: not the network is late, but this PC. In order they cost it least.
   if (!has_pace() && progress->unsent_bytes == 0) return false;
   const Duration time = has_pace() ? kInOrderFor : kSmallInOrderFor;
   return first_within(bytes_in(time, progress->carried_bytes_per_s), samples) != samples.begin;
 }
 
-// One piece of what was passed over: the newest, or the oldest of the backlog when it is urgent.
+// One piece of what was passed over: the newest, or the oldest of the backlog when that is urgent,
+// or when not the network is late.
 void SamplePump::choose_back_fill(Tid newest) {
   auto range = passed_over_.end() - 1;
   const auto backlog =
@@ -285,7 +285,9 @@ void SamplePump::choose_back_fill(Tid newest) {
                    [&](const ring::TidRange& some) { return some.end > plan_.backlog_from; });
   if (!has_pace() && backlog != passed_over_.end()) {
     const Tid oldest = std::max(backlog->begin, plan_.backlog_from);
-    if (newest - oldest > depth_ / kUrgentPart) {
+    const std::optional<wire::Progress> progress = connection_.progress();
+    const bool is_all_sent = progress && progress->unsent_bytes == 0;
+    if (is_all_sent || newest - oldest > depth_ / kUrgentPart) {
       const auto most = static_cast<Tid>(kInOrderBytes / (payload_bytes_ + kHeaderBytes));
       back_fill_ = {oldest, std::min(oldest + std::max<Tid>(most, 1), backlog->end)};
       range = backlog;

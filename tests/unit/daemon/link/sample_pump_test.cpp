@@ -997,6 +997,21 @@ TEST_F(ManySmall, WhatWaitedForAQuarterOfTheRingGoesFirstAndInItsOrder) {
   EXPECT_EQ(rig.accepted().size(), static_cast<std::size_t>(newest + 1));
 }
 
+TEST_F(ManySmall, BacklogKeepsItsOrderWhenThisPcIsWhatIsLate) {
+  rig.write(3 * kInOrder);
+  const Tid newest = 3 * kInOrder - 1;
+  SamplePump::Plan plan{0, newest, 0};
+  plan.held = {newest - 1, newest};
+  plan.backlog_from = 0;
+  for (const std::uint64_t unsent_bytes : {0, 1}) {
+    rig.peer.progress.emplace().unsent_bytes = unsent_bytes;
+    rig.peer.sent.clear();
+    start(plan);
+    EXPECT_EQ(rig.run_on(), PumpWait::sample);
+    EXPECT_EQ(rig.accepted()[1] == 0, unsent_bytes == 0);
+  }
+}
+
 TEST_F(ManySmall, NewerSamplesInterruptWhatGoesInItsOrder) {
   start({});
   rig.write(kUrgent + 2 * kInOrder + 1);
