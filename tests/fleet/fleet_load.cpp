@@ -43,7 +43,7 @@ namespace {
 using namespace std::chrono_literals;
 
 constexpr std::uint64_t kPayloadBytes = 256;
-constexpr std::uint64_t kImageBytes = 640 * 480 * 3;
+constexpr std::uint64_t kImageBytes = 640ULL * 480 * 3;
 constexpr std::uint64_t kHistorySeconds = 20, kImageSeconds = 5;
 constexpr Duration kLeastSilence = 400ms;
 
