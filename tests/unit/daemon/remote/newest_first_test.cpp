@@ -93,7 +93,8 @@ class Channel final : private FrameConnection::Observer, private SamplePump::Obs
 };
 
 class NewestFirstEndToEnd : public testing::TestWithParam<std::size_t> {};
-INSTANTIATE_TEST_SUITE_P(PayloadBytes, NewestFirstEndToEnd, testing::Values(40, 8000, 20'000, 65'537),
+INSTANTIATE_TEST_SUITE_P(PayloadBytes, NewestFirstEndToEnd,
+                         testing::Values(40, 8000, 20'000, 65'537),
                          testing::PrintToStringParamName());
 
 TEST_P(NewestFirstEndToEnd, EachSampleIsReceivedOrLostOnce) {
