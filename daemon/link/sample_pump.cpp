@@ -200,8 +200,8 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
   if (!connection_.output_empty()) return Next::wait_for_sample;
   has_kept_up_ |= !is_due;
   // Otherwise there is time between the samples, but not for all that waits.
-  const bool is_known = gives_up_ && now - passed_over_at_ < kOverloadedAfter;
-  if (back_fill_.count() == 0 && !is_known &&
+  const bool is_overload_known = gives_up_ && now - passed_over_at_ < kOverloadedAfter;
+  if (back_fill_.count() == 0 && !is_overload_known &&
       (passed_over_.empty() || passed_over_.back().end <= behind_from_)) {
     passed_over_since_ = 0;
     gives_up_ = false;
@@ -276,18 +276,23 @@ bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
   return first_within(bytes_in(time, progress->carried_bytes_per_s), samples) != samples.begin;
 }
 
-// One piece of what was passed over: the newest, or the oldest of the backlog when that is urgent,
-// or when not the network is late.
+// Whether the kernel has sent all that it got: then this PC is late, and not the network. A system
+// call.
+bool SamplePump::is_all_sent() const noexcept {
+  const std::optional<wire::Progress> progress = connection_.progress();
+  return progress && progress->unsent_bytes == 0;
+}
+
+// Takes one piece of what was passed over: the newest one; or the oldest one of a backlog of small
+// samples, when that is urgent or the network is not what is late.
 void SamplePump::choose_back_fill(Tid newest) {
   auto range = passed_over_.end() - 1;
-  const auto backlog =
-      std::find_if(passed_over_.begin(), passed_over_.end(),
-                   [&](const ring::TidRange& some) { return some.end > plan_.backlog_from; });
-  if (!has_pace() && backlog != passed_over_.end()) {
+  if (!has_pace() && range->end > plan_.backlog_from) {
+    const auto backlog =
+        std::find_if(passed_over_.begin(), passed_over_.end(),
+                     [&](const ring::TidRange& some) { return some.end > plan_.backlog_from; });
     const Tid oldest = std::max(backlog->begin, plan_.backlog_from);
-    const std::optional<wire::Progress> progress = connection_.progress();
-    const bool is_all_sent = progress && progress->unsent_bytes == 0;
-    if (is_all_sent || newest - oldest > depth_ / kUrgentPart) {
+    if (newest - oldest > depth_ / kUrgentPart || is_all_sent()) {
       const auto most = static_cast<Tid>(kInOrderBytes / (payload_bytes_ + kHeaderBytes));
       back_fill_ = {oldest, std::min(oldest + std::max<Tid>(most, 1), backlog->end)};
       range = backlog;
@@ -303,7 +308,7 @@ void SamplePump::choose_back_fill(Tid newest) {
   if (has_pace()) limit_unsent(connection_.progress());
 }
 
-// The rest of the piece, to what waits.
+// Puts the rest of the piece back to what waits.
 void SamplePump::return_back_fill() {
   if (back_fill_.count() == 0) return;
   const auto after =
@@ -346,7 +351,8 @@ void SamplePump::leave_out(Tid newest) {
 }
 
 // How many samples wait that were passed over is measured again and again: when they become more,
-// the network carries less than is written. Small ones may wait for older ones, which count, too.
+// the network carries less than is written. Of small ones the older ones count, too, because they
+// may go first.
 void SamplePump::give_up_what_is_never_carried(MonoTime now) {
   const auto first =
       std::find_if(passed_over_.begin(), passed_over_.end(),

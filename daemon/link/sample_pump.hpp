@@ -46,8 +46,8 @@ enum class PumpWait : std::uint8_t {
 class SamplePump {
  public:
   // With newest_first: so much is sent in the order of their tids all the same, and at least one
-  // sample; more when the network carries more in that time. Small ones more, and all of them when
-  // nothing is unsent: on a busy PC hundreds wait often, and then the network is not what is late.
+  // sample; more when the network carries more in that time. Of small samples all, when the kernel
+  // has sent everything: then hundreds wait because this PC is busy, and not for the network.
   static constexpr std::size_t kInOrderBytes = 64U << 10;
   static constexpr Duration kInOrderFor = std::chrono::milliseconds(4);
   static constexpr Duration kSmallInOrderFor = std::chrono::milliseconds(20);
@@ -67,9 +67,9 @@ class SamplePump {
   // only for some seconds.
   static constexpr Duration kKeptFor = std::chrono::seconds(5);
   static constexpr Duration kSparedFor = std::chrono::seconds(30);
-  // Small ones that wait and are no history go first and in their order when this part of the ring
-  // was written since. On a PC that is busy for long the oldest would otherwise leave the ring,
-  // however close it is to keeping up.
+  // Small samples that wait and are no history go first, in their order, when a quarter of the ring
+  // was written since. Otherwise the oldest of them would leave the ring on a PC that is busy for
+  // long, even if it is only a little too slow.
   static constexpr Tid kUrgentPart = 4;
   // Ranges of what was passed over. When there are more, what is between the newest two comes
   // again.
@@ -103,7 +103,7 @@ class SamplePump {
     bool newest_first = false;
     // With newest_first: none of these is sent, the receiver has them.
     ring::TidRange held = {};
-    // With newest_first: earlier ones are history. kNoTid: all that is in the ring.
+    // With newest_first: samples before this one are history. kNoTid: all that the ring holds now.
     Tid backlog_from = kNoTid;
   };
 
@@ -148,6 +148,7 @@ class SamplePump {
   void pass_over(Tid next, MonoTime now);
   void choose_back_fill(Tid newest);
   void return_back_fill();
+  bool is_all_sent() const noexcept;
   void leave_out(Tid newest);
   void give_up_what_is_never_carried(MonoTime now);
   bool is_spared(Tid first, MonoTime now) const noexcept;
@@ -168,10 +169,10 @@ class SamplePump {
   Tid next_;
   Tid last_;
   std::deque<ring::TidRange> passed_over_;  // and not sent yet; rising
-  ring::TidRange back_fill_;                // of these, what is sent next; no longer in it
+  ring::TidRange back_fill_;                // taken from these: what is sent next
   bool fills_ = false;  // the sample that is sent is the first one of back_fill_
-  // Small samples were filled in in this turn: newer ones wait for the next one. Sent one by one
-  // in between, they would be as many packets as the rest together.
+  // Small samples that were passed over were sent in this turn: newer ones wait for the next turn.
+  // Sent in between, a few at a time, they would be more packets than all the others.
   bool has_filled_ = false;
   bool has_kept_up_ = false;  // once, no newer sample waited
   // How often samples were passed over since none of them waited, or since they were counted last:

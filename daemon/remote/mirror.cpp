@@ -59,7 +59,7 @@ void Mirror::subscribe() {
   with_history_ = (wants_history() && is_known) || !newest_first_;
   net::Subscribe request;
   ring_->resume(newest_first_, with_history_, request);
-  // Old samples first would have no place here when they come.
+  // Here the oldest samples that are missing have no place: the newest of them first.
   if (is_shorter_ && request.has_backlog_from()) request.set_backlog_from(channel::kMaxTid);
   max_rate_hz_ = wanted_rate_hz();
   request.set_max_rate_hz(max_rate_hz_);

@@ -182,7 +182,7 @@ MirrorRing::Recent MirrorRing::recent() const noexcept {
   return recent;
 }
 
-// Of the hole, from that sample on; without one, the end of the hole.
+// The first sample of the hole, from `from` on, that is missing; if none is, the end of the hole.
 Tid MirrorRing::first_missing(Tid from) const noexcept {
   const ring::TidRange hole = reader_.hole();
   Tid tid = std::max({from, hole.begin, reader_.oldest()});

@@ -1068,7 +1068,7 @@ TEST_F(ManySmall, WhatTheNetworkCarriesSoonKeepsItsOrder) {
   EXPECT_TRUE(order_at(kBytes * (kPerSecond - 1), 0)) << "this PC was late";
 }
 
-// A busy PC that lags by more each second, and then catches up: by 100 samples a second.
+// In each second some samples are written, and the network takes some.
 class SmallBacklog : public ManySmall {
  protected:
   static constexpr std::size_t kFrameBytes = kSmall + SamplePump::kHeaderBytes;

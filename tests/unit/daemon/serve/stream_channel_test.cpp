@@ -111,29 +111,6 @@ class StreamChannelTest : public testing::Test {
   std::shared_ptr<Stream> stream;
 };
 
-TEST_F(StreamChannelTest, SendsFirstWhatTheReceiverMissedLongest) {
-  const auto blocks = rig.create("blocks", 8000, 64);
-  rig.write(*blocks, 40);
-  const auto order = [&](std::optional<Tid> backlog_from, std::uint64_t incarnation) {
-    MemoryPeer other;
-    rig.connect(other);
-    rig.open(other, "blocks");
-    net::Frame frame = with_serial(61);
-    net::Subscribe& subscribe = *frame.mutable_subscribe();
-    subscribe.set_newest_first(true);
-    subscribe.set_from_tid(0);
-    subscribe.set_incarnation(incarnation);
-    if (backlog_from) subscribe.set_backlog_from(*backlog_from);
-    other.put(frame);
-    rig.turns();
-    return words(other.take()).substr(0, 21);
-  };
-  const std::uint64_t incarnation = blocks->incarnation();
-  EXPECT_EQ(order(0, incarnation), "subscribed:0 39 0 1 2");
-  EXPECT_EQ(order(std::nullopt, incarnation), "subscribed:0 39 31 32");
-  EXPECT_EQ(order(0, incarnation + 1), "subscribed:0 39 31 32") << "those of another ring";
-}
-
 // --- reads
 
 TEST_F(StreamChannelTest, ReadsByTidTimeAndNewest) {
@@ -175,6 +152,29 @@ TEST_F(StreamChannelTest, ReportsItsRange) {
 }
 
 // --- subscriptions
+
+TEST_F(StreamChannelTest, SendsFirstWhatTheReceiverMissedLongest) {
+  const auto blocks = rig.create("blocks", 8000, 64);
+  rig.write(*blocks, 40);
+  const auto order = [&](std::optional<Tid> backlog_from, std::uint64_t incarnation) {
+    MemoryPeer other;
+    rig.connect(other);
+    rig.open(other, "blocks");
+    net::Frame frame = with_serial(61);
+    net::Subscribe& subscribe = *frame.mutable_subscribe();
+    subscribe.set_newest_first(true);
+    subscribe.set_from_tid(0);
+    subscribe.set_incarnation(incarnation);
+    if (backlog_from) subscribe.set_backlog_from(*backlog_from);
+    other.put(frame);
+    rig.turns();
+    return words(other.take()).substr(0, 21);
+  };
+  const std::uint64_t incarnation = blocks->incarnation();
+  EXPECT_EQ(order(0, incarnation), "subscribed:0 39 0 1 2");
+  EXPECT_EQ(order(std::nullopt, incarnation), "subscribed:0 39 31 32");
+  EXPECT_EQ(order(0, incarnation + 1), "subscribed:0 39 31 32") << "those of another ring";
+}
 
 TEST_F(StreamChannelTest, BeginsASubscriptionWhereItIsAskedTo) {
   rig.write(*stream, 20);
