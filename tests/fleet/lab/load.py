@@ -33,17 +33,11 @@ class Load:
 
     def moved(self) -> int:
         """The number of samples that it has written or read."""
-        assert self._process.stdin
-        self._process.stdin.write("?")
-        self._process.stdin.flush()
-        return int(self._line())
+        return int(self._ask())
 
     def ages_us(self) -> tuple[int, int]:
         """The median and the 99th percentile of the newest image's age since the last call ("look")."""
-        assert self._process.stdin
-        self._process.stdin.write("?")
-        self._process.stdin.flush()
-        median, p99 = self._line().split()
+        median, p99 = self._ask().split()
         return int(median), int(p99)
 
     def await_more(self, samples: int) -> None:
@@ -62,6 +56,12 @@ class Load:
             raise self._error(f"ended with {self._process.returncode}:\n{out}{err}")
         result: dict[str, Any] = json.loads(out.splitlines()[-1])
         return result
+
+    def _ask(self) -> str:
+        assert self._process.stdin
+        self._process.stdin.write("?")
+        self._process.stdin.flush()
+        return self._line()
 
     def _line(self) -> str:
         assert self._process.stdout

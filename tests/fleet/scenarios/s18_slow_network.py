@@ -1,8 +1,8 @@
 # SPDX-License-Identifier: Apache-2.0
 """On slow networks with a round trip of 20 ms another PC's camera is as fresh as the network allows
 
-After opening, later, and after a cut of 20 s: the newest image is about as old as it takes to send
-two images, which are more than the network carries.
+The camera writes more images than the network carries. After opening, later, and after a cut of 20 s
+the newest image on the other PC is at most about as old as the network needs to send two images.
 """
 
 import time
