@@ -331,10 +331,12 @@ TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {
   PeerConnection* link = peers->connection_to(one.host().greeting.host_id);
   ASSERT_TRUE(link);
   std::vector<std::string> got;
+  std::size_t known_hosts = 0;  // when the last answer came
   const auto ask = [&](const std::string& name) {
     net::Frame request;
     request.mutable_get_property()->mutable_id()->set_name(name);
-    link->ask(request, [&got, name](Result<net::Frame> answer) {
+    link->ask(request, [&, name](Result<net::Frame> answer) {
+      known_hosts = catalog.hosts().size();
       got.push_back(name + ": " +
                     (answer ? answer->property().property() : answer.error().message));
     });
@@ -353,6 +355,7 @@ TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {
   one.cut();
   wait([&] { return got.size() == 3; });
   EXPECT_EQ(got[2].find("c: the connection to host 'pc2' ended before it answered"), 0u) << got[2];
+  EXPECT_EQ(known_hosts, 0u) << "answered before the host was down";
   EXPECT_EQ(peers->connection_to(one.host().greeting.host_id), nullptr);
 }
 
