@@ -334,10 +334,10 @@ TEST_F(Hosts, WithASlowNetworkSayWhatItCarries) {
   if (!make_fleet(2)) return;
   const Result<void> slow = fleet->network().shape(2, "tbf rate 80mbit burst 256kb latency 10ms");
   if (!slow) GTEST_SKIP() << slow.error().message;
-  const KnownStream known{{"camera", 0, "pc1"}, 1 << 20, 256, 5ms, 0ms, 1};
+  const KnownStream known{{"camera", 0, "pc1"}, 1 << 20, 128, 5ms, 0ms, 1};
   Session here = fleet->session(1), there = fleet->session(2);
   RawWriter writer = make(here, known);
-  write_until(writer, known, 250);
+  write_until(writer, known, 100);  // of which the network carries nine a second
   const RawReader reader =
       there.await_raw_reader(known.id, kNever, nullptr, FetchHistory::at_once).value();
   // When a busy PC was late while it measured, what it found is measured again.
