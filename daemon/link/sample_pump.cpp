@@ -206,7 +206,7 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
     passed_over_since_ = 0;
     gives_up_ = false;
   }
-  if (back_fill_.count() == 0 && !passed_over_.empty()) choose_back_fill(newest);
+  if (back_fill_.count() == 0 && !passed_over_.empty()) choose_back_fill();
   if (back_fill_.count() > 0) {
     has_filled_ = !has_pace();
     return Next::ready;
@@ -276,30 +276,18 @@ bool SamplePump::takes_long(ring::TidRange samples) const noexcept {
   return first_within(bytes_in(time, progress->carried_bytes_per_s), samples) != samples.begin;
 }
 
-// Whether the kernel has sent all that it got: then this PC is late, and not the network. A system
-// call.
-bool SamplePump::is_all_sent() const noexcept {
-  const std::optional<wire::Progress> progress = connection_.progress();
-  return progress && progress->unsent_bytes == 0;
-}
-
-// Takes one piece of what was passed over: the newest one; or the oldest one of a backlog of small
-// samples, when that is urgent or the network is not what is late.
-void SamplePump::choose_back_fill(Tid newest) {
+// Takes one piece of what was passed over: the newest one, or of small samples that are no history
+// the oldest one. Newest first, these would leave the ring on a PC that is busy for long.
+void SamplePump::choose_back_fill() {
   auto range = passed_over_.end() - 1;
-  if (!has_pace() && range->end > plan_.backlog_from) {
-    const auto backlog =
-        std::find_if(passed_over_.begin(), passed_over_.end(),
-                     [&](const ring::TidRange& some) { return some.end > plan_.backlog_from; });
-    const Tid oldest = std::max(backlog->begin, plan_.backlog_from);
-    if (newest - oldest > depth_ / kUrgentPart || is_all_sent()) {
-      const auto most = static_cast<Tid>(kInOrderBytes / (payload_bytes_ + kHeaderBytes));
-      back_fill_ = {oldest, std::min(oldest + std::max<Tid>(most, 1), backlog->end)};
-      range = backlog;
-    }
-  }
-  if (back_fill_.count() == 0) {
+  if (has_pace() || range->end <= plan_.backlog_from) {
     back_fill_ = {std::min(first_within(kInOrderBytes, *range), range->end - 1), range->end};
+  } else {
+    range = std::find_if(passed_over_.begin(), passed_over_.end(),
+                         [&](const ring::TidRange& some) { return some.end > plan_.backlog_from; });
+    const Tid first = std::max(range->begin, plan_.backlog_from);
+    const auto most = static_cast<Tid>(kInOrderBytes / (payload_bytes_ + kHeaderBytes));
+    back_fill_ = {first, std::min(first + std::max<Tid>(most, 1), range->end)};
   }
   const ring::TidRange before{range->begin, back_fill_.begin}, after{back_fill_.end, range->end};
   range = passed_over_.erase(range);
@@ -333,7 +321,6 @@ void SamplePump::pass_over(Tid next, MonoTime now) {
   next_ = next;
   if (has_pace()) limit_unsent(connection_.progress());
   if (passed_over_since_ == 0) {
-    overloaded_since_ = now;
     behind_from_ = has_kept_up_ ? passed_over_.back().begin : next;  // history is no overload
   }
   give_up_what_is_never_carried(now);
@@ -352,7 +339,7 @@ void SamplePump::leave_out(Tid newest) {
 
 // How many samples wait that were passed over is measured again and again: when they become more,
 // the network carries less than is written. Of small ones the older ones count, too, because they
-// may go first.
+// go first.
 void SamplePump::give_up_what_is_never_carried(MonoTime now) {
   const auto first =
       std::find_if(passed_over_.begin(), passed_over_.end(),
@@ -380,13 +367,15 @@ void SamplePump::give_up_what_is_never_carried(MonoTime now) {
   }
 }
 
-// Whether samples from that one on are not given up yet: the ring still holds it after kKeptFor,
-// when as many are written as lately.
+// Whether samples from that one on are not given up yet: it was written within kSparedFor, and the
+// ring still holds it after kKeptFor, when as many are written as lately.
 bool SamplePump::is_spared(Tid first, MonoTime now) const noexcept {
-  if (gives_up_ || now - overloaded_since_ >= kSparedFor) return false;
-  const std::chrono::duration<double> passed = now - behind_since_, kept = kKeptFor;
+  if (gives_up_) return false;
+  const std::chrono::duration<double> passed = now - behind_since_, kept = kKeptFor,
+                                      spared = kSparedFor;
   const double written_per_s = static_cast<double>(next_ - next_before_) / passed.count();
-  return static_cast<double>(first + depth_ - next_) > written_per_s * kept.count();
+  return static_cast<double>(next_ - first) < written_per_s * spared.count() &&
+         static_cast<double>(first + depth_ - next_) > written_per_s * kept.count();
 }
 
 void SamplePump::limit_unsent(const std::optional<wire::Progress>& progress) {
@@ -418,16 +407,12 @@ void SamplePump::fit_unsent_limit() {
 
 // Those before that sample will not be sent.
 void SamplePump::lose_passed_over(Tid before) {
+  if (back_fill_.begin < before) return_back_fill();
   while (!passed_over_.empty() && passed_over_.front().begin < before) {
     ring::TidRange& front = passed_over_.front();
     const ring::TidRange lost{front.begin, std::min(front.end, before)};
     front.begin = lost.end;
     if (front.count() == 0) passed_over_.pop_front();
-    lose(lost);
-  }
-  if (back_fill_.count() > 0 && back_fill_.begin < before) {
-    const ring::TidRange lost{back_fill_.begin, std::min(back_fill_.end, before)};
-    back_fill_.begin = lost.end;
     lose(lost);
   }
 }

@@ -8,9 +8,10 @@
 //
 // With Plan::newest_first, a receiver that shows what is now does not wait for what was: samples
 // that wait for long are passed over, and sent when no newer ones wait, the newest of them first.
-// Small ones that wait for very long go in their order, and newer small ones wait until the turn is
-// over. When the network carries fewer samples than are written, what was passed over would never
-// be sent: it is reported as lost after some seconds, or when the ring will soon hold it no more.
+// Small ones that are no history go in their order, for those who read each of them, and newer
+// small ones wait until the turn is over. When the network carries fewer samples than are written,
+// what was passed over would never be sent: it is reported as lost after some seconds, or when the
+// ring will soon hold it no more.
 //
 // Work is cut into turns of about kBytesPerTurn or kSamplesPerTurn.
 #pragma once
@@ -63,14 +64,10 @@ class SamplePump {
   // network carries less than is written. Once may be a pause of the network.
   static constexpr Duration kOverloadedAfter = std::chrono::seconds(3);
   static constexpr int kOverloadedSamples = 4;
-  // What the ring still holds for that long may come later, within kSparedFor: a PC may be busy
-  // only for some seconds.
+  // What the ring still holds for that long, and was written within kSparedFor, may come later: a
+  // PC may be busy only for some seconds.
   static constexpr Duration kKeptFor = std::chrono::seconds(5);
   static constexpr Duration kSparedFor = std::chrono::seconds(30);
-  // Small samples that wait and are no history go first, in their order, when a quarter of the ring
-  // was written since. Otherwise the oldest of them would leave the ring on a PC that is busy for
-  // long, even if it is only a little too slow.
-  static constexpr Tid kUrgentPart = 4;
   // Ranges of what was passed over. When there are more, what is between the newest two comes
   // again.
   static constexpr std::size_t kMaxPassedOver = 4096;
@@ -146,9 +143,8 @@ class SamplePump {
   Tid first_within(std::size_t bytes, ring::TidRange range) const noexcept;
   bool takes_long(ring::TidRange samples) const noexcept;
   void pass_over(Tid next, MonoTime now);
-  void choose_back_fill(Tid newest);
+  void choose_back_fill();
   void return_back_fill();
-  bool is_all_sent() const noexcept;
   void leave_out(Tid newest);
   void give_up_what_is_never_carried(MonoTime now);
   bool is_spared(Tid first, MonoTime now) const noexcept;
@@ -178,7 +174,7 @@ class SamplePump {
   // How often samples were passed over since none of them waited, or since they were counted last:
   // when, which, and how many waited.
   int passed_over_since_ = 0;
-  MonoTime behind_since_{}, overloaded_since_{}, passed_over_at_{};
+  MonoTime behind_since_{}, passed_over_at_{};
   bool gives_up_ = false;  // at once, because the network carries less than is written
   Tid behind_from_ = 0, waiting_before_ = 0, next_before_ = 0;
   std::size_t unsent_limit_ = 0;  // of what waits in the kernel

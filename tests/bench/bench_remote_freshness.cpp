@@ -6,7 +6,8 @@
 //
 // The stream is a camera's, 640 x 480 x 3 bytes 30 times a second (27.6 MB/s), with a history of
 // 5 s. Then an encoder's stream, 64 bytes 1,000 times a second, alone, and beside a history of 1 GB
-// that fills the same link.
+// that fills the same link. Beside these, bare TCP: small messages, and a connection that sends as
+// much as 85 % of the link carries with both.
 //
 // The network namespaces of both hosts have one clock, so ages are exact. TCP's congestion control
 // is Debian's default, cubic.
@@ -31,7 +32,7 @@ namespace {
 constexpr std::size_t kFrameBytes = 640 * 480 * 3;
 constexpr Duration kPeriod = 33'333us;
 constexpr Duration kHistory = 5s;
-constexpr Duration kCut = 5s;      // longer than dssmd needs to take a host for down
+constexpr Duration kCut = 20s;     // much longer than the history
 constexpr Duration kWatched = 4s;  // after an event
 constexpr Duration kPoll = 1ms;
 
@@ -179,8 +180,95 @@ void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_
 constexpr std::size_t kEncoderBytes = 64;
 constexpr Duration kEncoderPeriod = 1ms;
 // Every network needs longer for 1 GB.
-Duration filling_time(int megabytes_per_s) { return megabytes_per_s == 1 ? 60s : 8s; }
+constexpr Duration kFillingTime = 8s;
+// Some tenths of a second measure what 1 MB/s is.
+Duration filling_time(int megabytes_per_s) { return megabytes_per_s == 1 ? 60s : kFillingTime; }
 constexpr std::uint64_t kManyFrames = (1U << 30) / kFrameBytes;
+
+[[noreturn]] void send_small(int socket) {
+  std::byte message[kEncoderBytes] = {};
+  for (MonoTime next = MonoClock::now();;) {
+    sleep_until(next += kEncoderPeriod);
+    const std::int64_t time = to_ns(WallClock::now());
+    std::memcpy(message, &time, sizeof time);
+    send_all(socket, message, sizeof message);
+  }
+}
+
+std::vector<double> raw_one_way_times(int socket, Duration how_long) {
+  std::vector<double> times;
+  for (const MonoTime end = MonoClock::now() + how_long; MonoClock::now() < end;) {
+    std::byte message[kEncoderBytes];
+    receive_all(socket, message, sizeof message);
+    std::int64_t time = 0;
+    std::memcpy(&time, message, sizeof time);
+    times.push_back(age_ns(time_from_ns(time)));
+  }
+  return times;
+}
+
+// As far apart in memory as a history's.
+constexpr std::size_t kRawFrames = 64;
+
+[[noreturn]] void send_frames(int socket, std::uint64_t bytes_per_s) {
+  if (::setsockopt(socket, SOL_SOCKET, SO_MAX_PACING_RATE, &bytes_per_s, sizeof bytes_per_s)) {
+    fail("SO_MAX_PACING_RATE");
+  }
+  const std::vector<std::byte> frames(kRawFrames * kFrameBytes, std::byte{1});
+  for (std::size_t at = 0;; at = (at + 1) % kRawFrames) {
+    send_all(socket, frames.data() + at * kFrameBytes, kFrameBytes);
+  }
+}
+
+[[noreturn]] void receive_frames(int socket) {
+  std::vector<std::byte> frames(kRawFrames * kFrameBytes);
+  for (std::size_t at = 0;; at = (at + 1) % kRawFrames) {
+    receive_all(socket, frames.data() + at * kFrameBytes, kFrameBytes);
+  }
+}
+
+void print_beside(const std::string& who, const std::string& what, const std::string& tail,
+                  const std::vector<double>& alone_ns, const std::vector<double>& beside_ns) {
+  const auto row = [](const std::string& name, const Figures& figures, const std::string& rest) {
+    print_row(name,
+              {figures.min / 1e6, figures.median / 1e6, figures.p99 / 1e6, figures.p999 / 1e6},
+              rest);
+  };
+  const auto middle_p99 = [](const std::vector<double>& ns) {
+    return figures_of(p99_of_parts(ns.data(), ns.data() + ns.size())).median;
+  };
+  const Figures alone = figures_of(alone_ns), beside = figures_of(beside_ns);
+  row(who + " alone" + tail, alone, "");
+  char rest[128];
+  std::snprintf(rest, sizeof rest, "%7.2f  of the p99; of ten parts' middle p99: %.2f",
+                beside.p99 / alone.p99, middle_p99(beside_ns) / middle_p99(alone_ns));
+  row(who + " beside " + what + tail, beside, rest);
+}
+
+void measure_raw_beside(const Hosts& hosts, int megabytes_per_s, const std::string& tail) {
+  const auto [small_out, small_in] = hosts.tcp_pair();
+  const auto [large_out, large_in] = hosts.tcp_pair();
+  const int out[] = {small_out, large_out}, in[] = {small_in, large_in};
+  // 85 % of the link are for both, with the headers of Ethernet, IP and TCP.
+  constexpr double kHeaderBytes = 66, kLargestPacket = 1514;
+  constexpr double kSmallPerS =
+      (kEncoderBytes + kHeaderBytes) * (std::chrono::seconds(1) / kEncoderPeriod);
+  const auto rate = static_cast<std::uint64_t>((0.85e6 * megabytes_per_s - kSmallPerS) *
+                                               (1 - kHeaderBytes / kLargestPacket));
+  const pid_t sends_small = in_child([&] { send_small(out[0]); });
+  ::close(out[0]);
+  raw_one_way_times(in[0], 1s);
+  const Duration filling_for = filling_time(megabytes_per_s);
+  const std::vector<double> alone = raw_one_way_times(in[0], filling_for);
+  const pid_t receives = in_child([&] { receive_frames(in[1]); });
+  const pid_t sends = in_child([&] { send_frames(out[1], rate); });
+  ::close(out[1]);
+  raw_one_way_times(in[0], 1s);
+  const std::vector<double> beside = raw_one_way_times(in[0], filling_for);
+  for (const pid_t child : {sends, receives, sends_small}) end_child(child);
+  for (const int fd : in) ::close(fd);
+  print_beside("  raw TCP", "more", tail, alone, beside);
+}
 
 [[noreturn]] void write_encoder_and_frames(const std::string& socket,
                                            std::atomic<bool>& is_filled) {
@@ -222,6 +310,8 @@ std::vector<double> one_way_times(RawReader& encoder, Duration how_long) {
 void measure_beside(test::Network& network, const Hosts& hosts, int megabytes_per_s) {
   const std::string rate = std::to_string(megabytes_per_s * 8) + "mbit";
   if (!network.shape(2, "tbf rate " + rate + " burst 256kb latency 10ms")) return;
+  const std::string tail = ", " + std::to_string(megabytes_per_s) + " MB/s [ms]";
+  measure_raw_beside(hosts, megabytes_per_s, tail);
   const auto owner = hosts.start_owner("error");
   const std::string socket = owner->socket_path();
   auto& is_filled = shared<std::atomic<bool>>();
@@ -234,24 +324,18 @@ void measure_beside(test::Network& network, const Hosts& hosts, int megabytes_pe
         session.await_raw_reader(StreamId{"encoder", 0, "pc1"}, deadline_in(60s)).value();
     one_way_times(encoder, 1s);
     const Duration filling_for = filling_time(megabytes_per_s);
-    const Figures alone = figures_of(one_way_times(encoder, filling_for));
+    const std::vector<double> alone = one_way_times(encoder, filling_for);
     RawReader camera = session
                            .await_raw_reader(StreamId{"camera", 0, "pc1"}, deadline_in(60s),
                                              nullptr, FetchHistory::at_once)
                            .value();
     const auto filling = [&] { return session.stream_info(camera.id()).value().mirror.value(); };
     const std::uint64_t before = filling().received_bytes;
-    const Figures beside = figures_of(one_way_times(encoder, filling_for));
+    const std::vector<double> beside = one_way_times(encoder, filling_for);
     const double carried = static_cast<double>(filling().received_bytes - before) /
                            std::chrono::duration<double>(filling_for).count() / 1e6;
-    const std::string tail = ", " + std::to_string(megabytes_per_s) + " MB/s [ms]";
-    print_row("  encoder alone" + tail,
-              {alone.min / 1e6, alone.median / 1e6, alone.p99 / 1e6, alone.p999 / 1e6});
-    char rest[96];
-    std::snprintf(rest, sizeof rest, "%7.2f  %.0f MB/s of history", beside.p99 / alone.p99,
-                  carried);
-    print_row("encoder beside a history" + tail,
-              {beside.min / 1e6, beside.median / 1e6, beside.p99 / 1e6, beside.p999 / 1e6}, rest);
+    print_beside("encoder", "a history", tail, alone, beside);
+    std::printf("%-44s %9.1f\n", "  the history [MB/s]", carried);
   }
   end_child(writer);
 }

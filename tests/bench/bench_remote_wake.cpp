@@ -132,19 +132,12 @@ std::int64_t round(Chain& chain, const std::vector<pid_t>& processes, Send send)
   return cpu_of(processes) - cpu_before;
 }
 
-// The median of ten ratios of p99s, each of a tenth of the rounds. An external disturbance slows
-// some 50 successive samples, which is the whole p99 of the affected side; here it affects only one
-// tenth.
+// The median of ten ratios of p99s, each of a tenth of the rounds.
 double middle_p99_ratio(const Chain& raw, const Chain& ours) {
-  constexpr int kParts = 10;
-  constexpr int kOfPart = kSamples * kRounds / kParts;
-  std::vector<double> ratios;
-  for (int begin = 0; begin < kSamples * kRounds; begin += kOfPart) {
-    const auto p99 = [&](const Chain& chain) {
-      return figures_of({chain.took_ns + begin, chain.took_ns + begin + kOfPart}).p99;
-    };
-    ratios.push_back(p99(ours) / p99(raw));
-  }
+  constexpr int kAll = kSamples * kRounds;
+  std::vector<double> ratios = p99_of_parts(ours.took_ns, ours.took_ns + kAll);
+  const std::vector<double> raws = p99_of_parts(raw.took_ns, raw.took_ns + kAll);
+  for (std::size_t part = 0; part < ratios.size(); ++part) ratios[part] /= raws[part];
   return figures_of(std::move(ratios)).median;
 }
 
