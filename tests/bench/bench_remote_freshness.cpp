@@ -9,6 +9,8 @@
 // that fills the same link. Beside these, bare TCP: small messages, and a connection that sends as
 // much as 85 % of the link carries with both.
 //
+// Arguments: "camera" or "encoder" for one of them; then the links in MB/s, if not all.
+//
 // The network namespaces of both hosts have one clock, so ages are exact. TCP's congestion control
 // is Debian's default, cubic.
 #include <atomic>
@@ -258,13 +260,12 @@ void measure_raw_beside(const Hosts& hosts, int megabytes_per_s, const std::stri
   const pid_t sends_small = in_child([&] { send_small(out[0]); });
   ::close(out[0]);
   raw_one_way_times(in[0], 1s);
-  const Duration filling_for = filling_time(megabytes_per_s);
-  const std::vector<double> alone = raw_one_way_times(in[0], filling_for);
+  const std::vector<double> alone = raw_one_way_times(in[0], kFillingTime);
   const pid_t receives = in_child([&] { receive_frames(in[1]); });
   const pid_t sends = in_child([&] { send_frames(out[1], rate); });
   ::close(out[1]);
   raw_one_way_times(in[0], 1s);
-  const std::vector<double> beside = raw_one_way_times(in[0], filling_for);
+  const std::vector<double> beside = raw_one_way_times(in[0], kFillingTime);
   for (const pid_t child : {sends, receives, sends_small}) end_child(child);
   for (const int fd : in) ::close(fd);
   print_beside("  raw TCP", "more", tail, alone, beside);
@@ -359,9 +360,19 @@ int main(int argc, char** argv) {
   const Hosts hosts(*std::move(network));
   use_cubic(hosts);
   print_head();
-  const bool only_beside = argc > 1 && std::string(argv[1]) == "beside";
-  for (const int megabytes_per_s : {1, 10, 60, 110}) {
-    if (!only_beside) measure_link(shaped, hosts, megabytes_per_s);
-    measure_beside(shaped, hosts, megabytes_per_s);
+  std::string which;
+  std::vector<int> links;
+  for (int i = 1; i < argc; ++i) {
+    const int link = std::atoi(argv[i]);
+    if (link > 0) {
+      links.push_back(link);
+    } else {
+      which = argv[i];
+    }
+  }
+  if (links.empty()) links = {1, 10, 60, 110};
+  for (const int megabytes_per_s : links) {
+    if (which != "encoder") measure_link(shaped, hosts, megabytes_per_s);
+    if (which != "camera") measure_beside(shaped, hosts, megabytes_per_s);
   }
 }
