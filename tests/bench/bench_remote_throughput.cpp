@@ -188,9 +188,10 @@ void bench_small(const Hosts& hosts, const std::string& address, Session& sessio
   print_row("PConnector, 64 B [samples/s]", figures_of(connector_rate), "         >= 1000000");
   print_receiver_copies(connector.counters(), kBytes);
   const std::int64_t start = now_ns();
-  RawReader reader = other.await_raw_reader(id, deadline_in(30s)).value();
-  const auto last = static_cast<Tid>(kCount) - 1;
-  while (reader.newest_tid() != last) static_cast<void>(reader.wait_for_tid(last, kNever));
+  RawReader reader =
+      other.await_raw_reader(id, deadline_in(30s), nullptr, FetchHistory::at_once).value();
+  while (reader.wait_for_sample(0, kNever) != WaitStatus::ready) {  // the newest ones come first
+  }
   mirror_rate.push_back(static_cast<double>(kCount) * 1e9 / static_cast<double>(now_ns() - start));
   if (reader.oldest_tid() != 0) fail("samples are missing");
   print_row("mirror from nothing, 64 B [samples/s]", figures_of(mirror_rate),
