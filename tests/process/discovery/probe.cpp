@@ -163,7 +163,8 @@ RawService::RawService(const AvahiHost& pc, const std::vector<std::string>& argu
   ::close(out[1]);
   pollfd fd{out[0], POLLIN, 0};
   char byte;
-  published_ = ::poll(&fd, 1, 30'000) > 0 && ::read(out[0], &byte, 1) == 1;
+  constexpr int kFarTooLongMs = std::chrono::milliseconds(kFarTooLong).count();
+  published_ = ::poll(&fd, 1, kFarTooLongMs) > 0 && ::read(out[0], &byte, 1) == 1;
   ::close(out[0]);
 }
 
