@@ -95,7 +95,7 @@ void PeerConnection::on_down(const Error& error) {
         reason_of(error, dialer_.reached()), error);
   const std::map<std::uint64_t, Waiting> unanswered = std::exchange(requests_.waiting, {});
   requests_.bytes = 0;
-  // First, so that who waited finds the host down, and can answer from what is known here.
+  // First, so that those who wait find the host down, and can answer from what is known here.
   observer_.on_peer_down(*this, error, attempt);
   for (const auto& [serial, waiting] : unanswered) {
     waiting.then(Error{Errc::unavailable,

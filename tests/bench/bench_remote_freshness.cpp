@@ -55,6 +55,10 @@ double age_ns(Time time) { return static_cast<double>((WallClock::now() - time).
   }
 }
 
+void print_ms(const std::string& name, const Figures& ns, const std::string& rest = "") {
+  print_row(name, {ns.min / 1e6, ns.median / 1e6, ns.p99 / 1e6, ns.p999 / 1e6}, rest);
+}
+
 // The ages that a program sees which reads the newest sample again and again.
 template <class NewestTime>
 std::vector<double> watch(Duration how_long, NewestTime newest_time) {
@@ -125,8 +129,7 @@ void print_ages(const std::string& name, const Figures& raw, const std::vector<d
   char rest[96];
   std::snprintf(rest, sizeof rest, "%7.2f  p99 <= %ld ms", figures.median / raw.median,
                 std::lround(target / 1e6));
-  print_row(name, {figures.min / 1e6, figures.median / 1e6, figures.p99 / 1e6, figures.p999 / 1e6},
-            rest);
+  print_ms(name, figures, rest);
 }
 
 void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_s) {
@@ -137,8 +140,7 @@ void measure_link(test::Network& network, const Hosts& hosts, int megabytes_per_
   }
   const std::string tail = ", " + std::to_string(megabytes_per_s) + " MB/s [ms]";
   const Figures raw = raw_ages(hosts);
-  print_row("  raw TCP, newest frame" + tail,
-            {raw.min / 1e6, raw.median / 1e6, raw.p99 / 1e6, raw.p999 / 1e6});
+  print_ms("  raw TCP, newest frame" + tail, raw);
   const auto owner = hosts.start_owner("error");
   const std::string socket = owner->socket_path();
   auto& is_filled = shared<std::atomic<bool>>();
@@ -231,20 +233,15 @@ constexpr std::size_t kRawFrames = 64;
 
 void print_beside(const std::string& who, const std::string& what, const std::string& tail,
                   const std::vector<double>& alone_ns, const std::vector<double>& beside_ns) {
-  const auto row = [](const std::string& name, const Figures& figures, const std::string& rest) {
-    print_row(name,
-              {figures.min / 1e6, figures.median / 1e6, figures.p99 / 1e6, figures.p999 / 1e6},
-              rest);
-  };
   const auto middle_p99 = [](const std::vector<double>& ns) {
     return figures_of(p99_of_parts(ns.data(), ns.data() + ns.size())).median;
   };
   const Figures alone = figures_of(alone_ns), beside = figures_of(beside_ns);
-  row(who + " alone" + tail, alone, "");
+  print_ms(who + " alone" + tail, alone);
   char rest[128];
   std::snprintf(rest, sizeof rest, "%7.2f  of the p99; of ten parts' middle p99: %.2f",
                 beside.p99 / alone.p99, middle_p99(beside_ns) / middle_p99(alone_ns));
-  row(who + " beside " + what + tail, beside, rest);
+  print_ms(who + " beside " + what + tail, beside, rest);
 }
 
 void measure_raw_beside(const Hosts& hosts, int megabytes_per_s, const std::string& tail) {
