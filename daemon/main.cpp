@@ -30,6 +30,7 @@
 #include "daemon/fleet/catalog.hpp"
 #include "daemon/fleet/mdns/discovery.hpp"
 #include "daemon/fleet/peers.hpp"
+#include "daemon/link/interface_watch.hpp"
 #include "daemon/link/network_listener.hpp"
 #include "daemon/link/resolver.hpp"
 #include "daemon/local/fleet_service.hpp"
@@ -189,6 +190,7 @@ struct OtherHosts {
         mirrors(parts, catalog),
         writers(parts, catalog),
         peers(loop, resolver, config.peers, self, catalog, logger),
+        interfaces(loop, [this] { peers.retry_now(); }),
         service(loop, {self, network.addresses(), config.insecure, &clock}, registry, catalog,
                 peers, mirrors, writers) {
     parts.on_ring_replaced = [this](const Stream& old) { service.on_ring_replaced(old); };
@@ -203,6 +205,8 @@ struct OtherHosts {
   RemoteStreams<Mirror> mirrors;
   RemoteStreams<RemoteWriter> writers;
   Peers peers;
+  // A cable that is plugged in again: a host that was away for long is tried only once a second.
+  InterfaceWatch interfaces;
   FleetService service;
 };
 

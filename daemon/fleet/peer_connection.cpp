@@ -65,6 +65,10 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const 
 void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) {
   configured_ = addresses.front();
   dialer_.set_addresses(addresses);
+  retry_now();
+}
+
+void PeerConnection::retry_now() {
   if (status_.state != HostState::up) dialer_.retry_now();
 }
 

@@ -78,6 +78,8 @@ class PeerConnection final : private Dialer::Observer {
 
   // Where to go from the next attempt on, which comes at once unless it is up.
   void set_addresses(const std::vector<wire::Address>& addresses);
+  // Tries now, unless it is up: it may have become available.
+  void retry_now();
 
   // --- about the peer
 

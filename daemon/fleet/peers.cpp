@@ -258,6 +258,12 @@ void Peers::set_configured(const std::vector<wire::Address>& peers) {
   reconcile_soon();
 }
 
+void Peers::retry_now() {
+  for (const Peer& peer : peers_) {
+    if (peer.connection) peer.connection->retry_now();
+  }
+}
+
 // --- connections begin and end
 
 void Peers::on_peer_up(PeerConnection& connection) {

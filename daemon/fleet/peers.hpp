@@ -74,6 +74,8 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   // Replaces the configured peers: new ones are dialed, those that are no longer configured are
   // dropped. To be called from the loop.
   void set_configured(const std::vector<wire::Address>& peers);
+  // This PC's network may have come back: all that are not up are tried now. From the loop.
+  void retry_now();
 
   // Called from the loop after changes, several of them together; {}: no callback.
   void on_change(std::function<void()> then) { on_change_ = std::move(then); }

@@ -29,6 +29,8 @@ Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, Obser
 void Dialer::retry_now() {
   plan_.reset_pause();
   if (state_ == State::pause) timer_.enable_in(Duration::zero());
+  // The kernel repeats a lost first packet only after a second.
+  if (state_ == State::connect) begin_round_soon();
 }
 
 void Dialer::restart(const Error& why) {

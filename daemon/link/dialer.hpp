@@ -60,7 +60,8 @@ class Dialer final : private FrameConnection::Observer {
   Dialer(const Dialer&) = delete;
   Dialer& operator=(const Dialer&) = delete;
 
-  // Ends the pause, if there is one: the other side has just become available.
+  // Ends the pause, or an attempt that waits for an answer, and begins the next one: the other side
+  // may just have become available.
   void retry_now();
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
   // the next attempt after the pause that is due. During a pause: nothing.

@@ -2,13 +2,9 @@
 #include "daemon/fleet/mdns/interface_filter.hpp"
 
 #include <fnmatch.h>
-#include <linux/netlink.h>
-#include <linux/rtnetlink.h>
 #include <net/if.h>
-#include <sys/socket.h>
 
 #include <algorithm>
-#include <cerrno>
 
 #include "core/base/text.hpp"
 #include "daemon/base/log.hpp"
@@ -49,27 +45,6 @@ std::string interface_name(int index) {
   char name[IF_NAMESIZE] = "";
   if (index <= 0 || !::if_indextoname(static_cast<unsigned>(index), name)) return {};
   return name;
-}
-
-InterfaceWatch::InterfaceWatch(const EventLoop& loop, std::function<void()> on_change)
-    : netlink_(::socket(AF_NETLINK, SOCK_RAW | SOCK_CLOEXEC | SOCK_NONBLOCK, NETLINK_ROUTE)) {
-  sockaddr_nl address{};
-  address.nl_family = AF_NETLINK;
-  address.nl_groups = RTMGRP_LINK;
-  // Without it (a sandbox that forbids netlink) the interfaces of the start are used.
-  if (!netlink_ || ::bind(netlink_.get(), reinterpret_cast<sockaddr*>(&address), sizeof address)) {
-    return;
-  }
-  source_ = EventSource::readable(loop, netlink_.get(), [this, then = std::move(on_change)] {
-    // The content of the messages does not matter, even if some are lost (ENOBUFS): the list of
-    // interfaces is read again.
-    char buffer[8192];
-    while (::recv(netlink_.get(), buffer, sizeof buffer, 0) >= 0 || errno == ENOBUFS ||
-           errno == EINTR) {
-    }
-    then();
-  });
-  source_.enable();
 }
 
 }  // namespace dssm::daemon

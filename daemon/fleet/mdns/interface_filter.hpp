@@ -3,13 +3,9 @@
 // Which network interfaces to use, by the patterns of the configuration.
 #pragma once
 
-#include <functional>
 #include <map>
 #include <string>
 #include <vector>
-
-#include "core/base/unique_fd.hpp"
-#include "daemon/base/event_loop.hpp"
 
 namespace dssm::daemon {
 
@@ -34,17 +30,5 @@ class InterfaceFilter {
 
 // The name of the interface with that index; empty: it is not there any more.
 std::string interface_name(int index);
-
-// Calls back when interfaces may have been added, removed or renamed.
-class InterfaceWatch {
- public:
-  InterfaceWatch(const EventLoop& loop, std::function<void()> on_change);
-  InterfaceWatch(const InterfaceWatch&) = delete;
-  InterfaceWatch& operator=(const InterfaceWatch&) = delete;
-
- private:
-  UniqueFd netlink_;
-  EventSource source_;
-};
 
 }  // namespace dssm::daemon

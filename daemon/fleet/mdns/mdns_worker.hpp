@@ -14,6 +14,7 @@
 #include "daemon/fleet/mdns/interface_filter.hpp"
 #include "daemon/fleet/mdns/mdns.hpp"
 #include "daemon/fleet/mdns/service_publisher.hpp"
+#include "daemon/link/interface_watch.hpp"
 
 namespace dssm::daemon {
 

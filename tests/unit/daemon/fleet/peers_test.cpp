@@ -323,6 +323,20 @@ TEST_F(PeersTest, DialAPeerAgainThatIsConfiguredAgain) {
   EXPECT_EQ(catalog.hosts().size(), 1u);
 }
 
+TEST_F(PeersTest, TryAtOnceWhenTheNetworkMayBeBack) {
+  start({&one});
+  wait_for_startup();
+  one.cut();
+  const auto run_without_timers = [&] {
+    for (int i = 0; i < 1000; ++i) event_base_loop(loop.base(), EVLOOP_ONCE | EVLOOP_NONBLOCK);
+  };
+  run_without_timers();
+  EXPECT_EQ(one.watches, 1) << "it pauses";
+  peers->retry_now();
+  run_without_timers();
+  EXPECT_EQ(one.watches, 2);
+}
+
 // --- requests
 
 TEST_F(PeersTest, CarryRequestsAndTheirAnswers) {

@@ -201,6 +201,22 @@ TEST_F(DialerTest, LeavesAnAddressThatDoesNotAnswerForNewOnesAtOnce) {
   EXPECT_TRUE(up) << "what is up stays";
 }
 
+TEST_F(DialerTest, WhenHurriedLeavesAnAttemptThatWaitsForAnAnswer) {
+  const SilentServer silent;
+  ScriptedHost owner(loop);
+  answers = {silent.address()};
+  dial({"pc2", 1});
+  wait([this] { return dialer->reached() == Dialer::Phase::connect; });
+  answers = wire::resolve_number(owner.address());
+  bool timed_out = false;
+  EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
+  timer.enable_in(channel::ConnectPlan::kConnectTimeout);
+  dialer->retry_now();
+  wait([&] { return up || timed_out; });
+  EXPECT_TRUE(up);
+  EXPECT_TRUE(downs.empty());
+}
+
 TEST_F(DialerTest, ReportsWhyNoAddressOfANameWorked) {
   answers = {closed_port(loop), closed_port(loop)};
   dial({"pc2", 1});
