@@ -30,6 +30,10 @@ Result<UniqueFd> create_sealed_memory(const std::string& name, std::uint64_t byt
   return fd;
 }
 
+std::size_t system_page_bytes() noexcept {
+  return static_cast<std::size_t>(::sysconf(_SC_PAGESIZE));
+}
+
 bool has_seals(int fd, int seals) noexcept {
   // Only memfds and files of a tmpfs answer, and the latter carry no such seals.
   const int found = ::fcntl(fd, F_GET_SEALS);
@@ -54,6 +58,21 @@ Result<SharedMapping> SharedMapping::map(int fd, std::size_t bytes, int protecti
   return mapping;
 }
 
+Result<SharedMapping> SharedMapping::map_before_private_page(int fd, std::size_t bytes) {
+  constexpr int kProtection = PROT_READ | PROT_WRITE;
+  SharedMapping mapping;
+  mapping.private_bytes_ = system_page_bytes();
+  void* const base = ::mmap(nullptr, bytes + mapping.private_bytes_, kProtection,
+                            MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+  if (base == MAP_FAILED) return os_error(fmt::format("map {} bytes", bytes));
+  mapping.base_ = static_cast<std::byte*>(base);
+  mapping.bytes_ = bytes;
+  if (::mmap(base, bytes, kProtection, MAP_SHARED | MAP_FIXED, fd, 0) == MAP_FAILED) {
+    return os_error(fmt::format("map {} bytes of a file", bytes));
+  }
+  return mapping;
+}
+
 Result<SharedMapping> SharedMapping::map_sealed_untrusted(int fd, std::size_t bytes,
                                                           std::string_view what) {
   struct stat file {};
@@ -67,7 +86,7 @@ Result<SharedMapping> SharedMapping::map_sealed_untrusted(int fd, std::size_t by
 }
 
 SharedMapping::~SharedMapping() {
-  if (base_) ::munmap(base_, bytes_);
+  if (base_) ::munmap(base_, bytes_ + private_bytes_);
 }
 
 }  // namespace dssm

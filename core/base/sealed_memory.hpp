@@ -28,6 +28,9 @@ inline constexpr int kSizeSeals = F_SEAL_SHRINK | F_SEAL_GROW | F_SEAL_SEAL;
 Result<UniqueFd> create_sealed_memory(const std::string& name, std::uint64_t bytes, mode_t mode,
                                       int seals = kSizeSeals);
 
+// What the system maps at once: 4 KiB, or up to 64 KiB on some ARM systems.
+std::size_t system_page_bytes() noexcept;
+
 // Whether `fd` is a memory file with all of `seals`.
 bool has_seals(int fd, int seals) noexcept;
 
@@ -51,17 +54,25 @@ class SharedMapping {
   static Result<SharedMapping> map_sealed_untrusted(int fd, std::size_t bytes,
                                                     std::string_view what);
 
+  // Maps the first `bytes` bytes, a multiple of system_page_bytes(), to read and write, and a page
+  // of this process's own, zeroed, from end() on. Does not keep `fd`.
+  static Result<SharedMapping> map_before_private_page(int fd, std::size_t bytes);
+
   SharedMapping() = default;
   SharedMapping(SharedMapping&& other) noexcept
-      : base_(std::exchange(other.base_, nullptr)), bytes_(other.bytes_) {}
+      : base_(std::exchange(other.base_, nullptr)),
+        bytes_(other.bytes_),
+        private_bytes_(other.private_bytes_) {}
   SharedMapping& operator=(SharedMapping&& other) noexcept {
     std::swap(base_, other.base_);
     std::swap(bytes_, other.bytes_);
+    std::swap(private_bytes_, other.private_bytes_);
     return *this;
   }
   ~SharedMapping();
 
   std::byte* base() const noexcept { return base_; }
+  std::byte* end() const noexcept { return base_ + bytes_; }
   template <class T>
   T& as() const noexcept {
     return *reinterpret_cast<T*>(base_);
@@ -70,6 +81,7 @@ class SharedMapping {
  private:
   std::byte* base_ = nullptr;
   std::size_t bytes_ = 0;
+  std::size_t private_bytes_ = 0;  // from end() on
 };
 
 }  // namespace dssm

@@ -4,19 +4,17 @@
 #include <fmt/core.h>
 
 #include "core/base/try.hpp"
-#include "core/ring/robust_lock.hpp"
 
 namespace dssm::clock {
 
 Result<UniqueFd> create_playback_clock() {
   const std::string what = "create the playback clock";
   UniqueFd fd =
-      DSSM_TRY(create_sealed_memory("dssm-playback-clock", sizeof(PlaybackPage), 0600), what);
+      DSSM_TRY(create_sealed_memory("dssm-playback-clock", system_page_bytes(), 0600), what);
   const SharedMapping mapping = DSSM_TRY(
-      SharedMapping::map_sealed_untrusted(fd.get(), sizeof(PlaybackPage), "playback clock"), what);
+      SharedMapping::map_sealed_untrusted(fd.get(), system_page_bytes(), "playback clock"), what);
   auto& page = mapping.as<PlaybackPage>();
   page.setting.store({});
-  ring::init_robust_lock(page.lock);
   page.layout_version = PlaybackPage::kLayoutVersion;
   page.magic = PlaybackPage::kMagic;
   return fd;
@@ -24,13 +22,14 @@ Result<UniqueFd> create_playback_clock() {
 
 Result<std::shared_ptr<PlaybackRecord>> PlaybackRecord::open_untrusted(int fd) {
   SharedMapping mapping =
-      DSSM_TRY(SharedMapping::map_sealed_untrusted(fd, sizeof(PlaybackPage), "playback clock"));
+      DSSM_TRY(SharedMapping::map_sealed_untrusted(fd, system_page_bytes(), "playback clock"));
   const auto& page = mapping.as<PlaybackPage>();
   if (page.magic != PlaybackPage::kMagic || page.layout_version != PlaybackPage::kLayoutVersion) {
     return Error{Errc::protocol, fmt::format("this is not a playback clock of layout version {}",
                                              PlaybackPage::kLayoutVersion)};
   }
-  return std::shared_ptr<PlaybackRecord>(new PlaybackRecord(std::move(mapping)));
+  ring::RobustLock lock = DSSM_TRY(ring::RobustLock::map(fd));
+  return std::shared_ptr<PlaybackRecord>(new PlaybackRecord(std::move(mapping), std::move(lock)));
 }
 
 PlaybackSetting PlaybackRecord::load() const noexcept {
@@ -38,12 +37,5 @@ PlaybackSetting PlaybackRecord::load() const noexcept {
   page().setting.load(setting);
   return setting;
 }
-
-bool PlaybackRecord::lock() noexcept {
-  // A holder that died left a complete setting: nothing to repair.
-  return ring::lock_robust(page().lock) != ring::LockResult::refused;
-}
-
-void PlaybackRecord::unlock() noexcept { pthread_mutex_unlock(&page().lock); }
 
 }  // namespace dssm::clock

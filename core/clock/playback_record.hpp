@@ -4,15 +4,15 @@
 // Any of them may replace it, one at a time, under a robust lock.
 #pragma once
 
-#include <pthread.h>
-
 #include <cstddef>
 #include <cstdint>
 #include <dssm/result.hpp>
 #include <memory>
+#include <utility>
 
 #include "core/base/sealed_memory.hpp"
 #include "core/base/shared_snapshot.hpp"
+#include "core/ring/robust_lock.hpp"
 
 namespace dssm::clock {
 
@@ -29,23 +29,18 @@ struct PlaybackSetting {
   }
 };
 
-// One page, little endian. The settings are at 64 and 96.
+// Little endian; in one page of the system. The settings are at 64 and 96, the lock is in the
+// page's last bytes (robust_lock.hpp).
 struct PlaybackPage {
   static constexpr std::uint64_t kMagic = 0x59414c504d535344;  // "DSSMPLAY"
-  static constexpr std::uint32_t kLayoutVersion = 2;
+  static constexpr std::uint32_t kLayoutVersion = 3;
   std::uint64_t magic;
   std::uint32_t layout_version;
   std::uint32_t reserved0;
   std::byte reserved1[40];
   SharedSnapshot<PlaybackSetting> setting;
-  union {
-    pthread_mutex_t lock;
-    std::byte lock_bytes[64];
-  };
-  std::byte reserved2[4096 - 192];
 };
-static_assert(offsetof(PlaybackPage, setting) == 56 && offsetof(PlaybackPage, lock) == 128);
-static_assert(sizeof(PlaybackPage) == 4096);
+static_assert(offsetof(PlaybackPage, setting) == 56 && sizeof(PlaybackPage) == 128);
 
 // Creates the segment (sealed memfd, mode 0600) with the default setting.
 Result<UniqueFd> create_playback_clock();
@@ -62,21 +57,23 @@ class PlaybackRecord {
   PlaybackSetting load() const noexcept;
 
   // Replaces the setting by change(setting), under the lock. False, and the setting unchanged, when
-  // a program has damaged the lock.
+  // it did not get the lock (RobustLock::kMaxWait).
   template <class Change>
   bool update(Change change) noexcept {
-    if (!lock()) return false;
+    const ring::LockResult result = lock_.lock();
+    if (result == ring::LockResult::busy || result == ring::LockResult::refused) return false;
+    // A holder that died left a complete setting: nothing to repair.
     page().setting.store(change(load()));
-    unlock();
+    lock_.unlock();
     return true;
   }
 
  private:
-  explicit PlaybackRecord(SharedMapping mapping) noexcept : mapping_(std::move(mapping)) {}
+  PlaybackRecord(SharedMapping mapping, ring::RobustLock lock) noexcept
+      : mapping_(std::move(mapping)), lock_(std::move(lock)) {}
   PlaybackPage& page() const noexcept { return mapping_.as<PlaybackPage>(); }
-  bool lock() noexcept;
-  void unlock() noexcept;
   SharedMapping mapping_;
+  ring::RobustLock lock_;
 };
 
 }  // namespace dssm::clock

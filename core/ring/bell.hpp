@@ -39,23 +39,13 @@ class Bell {
 
   // --- writers, after publishing
 
-  // Before: starts to fetch the line that notify() loads. A sleeper or dssmd wrote to it, so it
-  // comes from another processor, and can do so while the payload is copied.
+  // Before: starts to fetch the line that notify() loads. A sleeper wrote to it, so it comes
+  // from another processor, and can do so while the payload is copied.
   void prefetch() const noexcept { __builtin_prefetch(mapping_.base()); }
 
   // Wakes all sleepers; without any, one load of a line that is in this processor's cache.
   void notify() noexcept {
     if (page().word.load(std::memory_order_seq_cst) & kSleeper) notify_slow();
-  }
-
-  // Whether dssmd wants to be notified through the stream's eventfd.
-  bool doorbell_armed() const noexcept {
-    return page().doorbell_armed.load(std::memory_order_seq_cst) != 0;
-  }
-
-  // --- dssmd
-  void arm_doorbell(bool armed) noexcept {
-    page().doorbell_armed.store(armed ? 1 : 0, std::memory_order_seq_cst);
   }
 
   // --- sleepers

@@ -4,13 +4,12 @@
 // explains each byte; tests/unit/core/ring/ring_memory_test.cpp repeats its numbers.
 // Little endian. An incompatible change raises kLayoutVersion.
 //
-//   offset 0       RingHeader, one page; its first part is written once, before the descriptor is
+//   offset 0       RingHeader, one page of the system (zeros after the header where that is greater
+//                  than 4 KiB); its first part is written once, before the descriptor is
 //                  passed to any process
 //   times_offset   depth * 8 bytes: time_ns of sample tid at index tid % depth ("time index")
 //   slots_offset   depth slots: SlotHeader, payload, at least kGuardBytes of padding
 #pragma once
-
-#include <pthread.h>
 
 #include <atomic>
 #include <cstddef>
@@ -18,11 +17,12 @@
 
 #include "core/base/shared_snapshot.hpp"
 #include "core/ring/clock_assessment.hpp"
+#include "core/ring/robust_lock.hpp"
 
 namespace dssm::ring {
 
 inline constexpr std::uint64_t kMagic = 0x474e49524d535344;  // "DSSMRING"
-inline constexpr std::uint32_t kLayoutVersion = 7;
+inline constexpr std::uint32_t kLayoutVersion = 8;
 inline constexpr std::size_t kPageBytes = 4096;
 inline constexpr std::size_t kLineBytes = 64;
 
@@ -68,9 +68,9 @@ static_assert(sizeof(PublisherCursor) == 40);
 //    84     4 reserved         -      -           zero
 //    88    40 name             -      dssmd       zero-terminated
 //   128    64 host             -      dssmd       zero-terminated
-//   192   128 reserved         -      -           zero
-//   320    64 lock             -      writers     glibc's robust, process-shared pthread_mutex_t
-//   384    64 reserved         -      -           zero: keeps the lock's line from top's neighbour
+//   192   256 reserved         -      -           zero
+//   448     4 doorbell_armed   -      dssmd       seq_cst; not 0: writers also write to their eventfds
+//   452    60 reserved         -      -           zero
 //   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
 //   520     8 run_start        tid    writer      before top; see "Search by time"
 //   528     8 first            tid    dssmd       before top; see "Window"
@@ -79,7 +79,9 @@ static_assert(sizeof(PublisherCursor) == 40);
 //   552    88 reserved         -      -           zero
 //   640  2560 publishers       -      dssmd       before top: see publisher_cursors.hpp
 //  3200   200 clock            -      dssmd       see clock_assessment.hpp, shared_snapshot.hpp
-//  3400   696 reserved         -      -           zero
+//  3400   672 reserved         -      -           zero
+//  4072    24 lock             -      writers     see robust_lock.hpp. On a system with greater pages:
+//                                                 24 bytes before times_offset
 struct RingHeader {
   std::uint64_t magic;
   std::uint32_t layout_version;
@@ -96,12 +98,9 @@ struct RingHeader {
   std::uint32_t reserved0;
   char name[40];
   char host[64];
-  std::byte reserved1[128];
-  union {
-    pthread_mutex_t lock;
-    std::byte lock_bytes[64];
-  };
-  std::byte reserved2[128];
+  std::byte reserved1[256];
+  std::atomic<std::uint32_t> doorbell_armed;
+  std::byte reserved2[60];
   std::atomic<std::int64_t> top;
   std::atomic<std::int64_t> run_start;
   std::atomic<std::int64_t> first;
@@ -110,15 +109,16 @@ struct RingHeader {
   std::byte reserved3[88];
   PublisherCursor publishers[kMaxPublishers];
   SharedSnapshot<ClockAssessment> clock;
-  std::byte reserved4[696];
+  std::byte reserved4[672];
+  std::byte lock[kLockBytes];
 };
-static_assert(sizeof(pthread_mutex_t) <= 64);
 static_assert(offsetof(RingHeader, incarnation) == 64 && offsetof(RingHeader, name) == 88);
-static_assert(offsetof(RingHeader, host) == 128 && offsetof(RingHeader, lock) == 320);
+static_assert(offsetof(RingHeader, host) == 128 && offsetof(RingHeader, doorbell_armed) == 448);
 static_assert(offsetof(RingHeader, top) == 512 && offsetof(RingHeader, run_start) == 520);
 static_assert(offsetof(RingHeader, first) == 528 && offsetof(RingHeader, hole_begin) == 536);
 static_assert(offsetof(RingHeader, hole_end) == 544);
 static_assert(offsetof(RingHeader, publishers) == 640 && offsetof(RingHeader, clock) == 3200);
+static_assert(offsetof(RingHeader, lock) == 4072);
 static_assert(sizeof(RingHeader) == kPageBytes);
 
 //   off size field           unit  written by  order
@@ -145,13 +145,10 @@ static_assert(sizeof(SlotHeader) == kLineBytes);
 
 //   off  size field           written by           order
 //     0     4 word            writers, sleepers    seq_cst; bit 0: a thread sleeps; rest: a count
-//     4     4 doorbell_armed  dssmd                seq_cst; not 0: writers also write to the
-//                                                  stream's eventfd
-//     8  4088 reserved        -                    zero
+//     4  4092 reserved        -                    zero
 struct BellPage {
   std::atomic<std::uint32_t> word;
-  std::atomic<std::uint32_t> doorbell_armed;
-  std::byte reserved[kPageBytes - 8];
+  std::byte reserved[kPageBytes - 4];
 };
 static_assert(sizeof(BellPage) == kPageBytes);
 

@@ -12,7 +12,6 @@
 
 #include "core/base/try.hpp"
 #include "core/ring/layout.hpp"
-#include "core/ring/robust_lock.hpp"
 
 namespace dssm::ring {
 
@@ -38,7 +37,7 @@ Result<Geometry> Geometry::of(std::uint64_t payload_bytes, std::uint64_t depth) 
   geometry.payload_bytes = payload_bytes;
   geometry.depth = depth;
   geometry.slot_bytes = round_up(sizeof(SlotHeader) + payload_bytes + kGuardBytes, kLineBytes);
-  geometry.times_offset = sizeof(RingHeader);
+  geometry.times_offset = round_up(sizeof(RingHeader), system_page_bytes());
   geometry.slots_offset = geometry.times_offset + round_up(8 * depth, kPageBytes);
   geometry.total_bytes = round_up(geometry.slots_offset + depth * geometry.slot_bytes, kPageBytes);
   return geometry;  // at most 2^24 * (2^26 + 128) + ..., far below 2^63
@@ -75,7 +74,6 @@ Result<UniqueFd> create_ring(const RingIdentity& identity, const Geometry& geome
   header.stream_id = identity.id.id;
   identity.id.name.copy(header.name, sizeof header.name - 1);
   identity.id.host.copy(header.host, sizeof header.host - 1);
-  init_robust_lock(header.lock);
   header.top.store(kNoTid, std::memory_order_relaxed);
   header.run_start.store(0, std::memory_order_relaxed);
   header.first.store(0, std::memory_order_relaxed);
@@ -142,6 +140,7 @@ Result<std::shared_ptr<const RingMapping>> RingMapping::open_untrusted(int fd, A
     return not_a_ring("its alignment is not a power of two up to 64");
   }
   mapping->geometry_ = *geometry;
+  if (access == Access::read_write) mapping->writer_lock_ = DSSM_TRY(RobustLock::map(fd));
   return std::shared_ptr<const RingMapping>(std::move(mapping));
 }
 

@@ -15,6 +15,7 @@
 
 #include "core/base/sealed_memory.hpp"
 #include "core/ring/layout.hpp"
+#include "core/ring/robust_lock.hpp"
 
 namespace dssm::ring {
 
@@ -24,7 +25,7 @@ struct Geometry {
   std::uint64_t payload_bytes = 0;
   std::uint64_t depth = 0;
   std::uint64_t slot_bytes = 0;    // distance between slots, multiple of 64
-  std::uint64_t times_offset = 0;  // of the time index, from the mapping's start
+  std::uint64_t times_offset = 0;  // of the time index, from the mapping's start: one page
   std::uint64_t slots_offset = 0;  // of slot 0
   std::uint64_t total_bytes = 0;   // of the whole ring, multiple of the page size
 
@@ -74,10 +75,13 @@ class RingMapping {
   bool writable() const noexcept { return access_ == Access::read_write; }
   std::byte* base() const noexcept { return memory_.base(); }
   RingHeader& header() const noexcept { return memory_.as<RingHeader>(); }
+  // Of a mapping with write access.
+  const RobustLock& writer_lock() const noexcept { return writer_lock_; }
 
  private:
   RingMapping() = default;
   SharedMapping memory_;
+  RobustLock writer_lock_;
   Access access_ = Access::read_only;
   Geometry geometry_;
   RingIdentity identity_;

@@ -6,8 +6,6 @@
 #include <algorithm>
 #include <array>
 
-#include "core/ring/robust_lock.hpp"
-
 namespace dssm::ring {
 namespace {
 
@@ -33,20 +31,17 @@ struct LoanedRings {
 }  // namespace
 
 RingWriter::RingWriter(const RingMapping& mapping, Bell& bell, int doorbell) noexcept
-    : slots_(mapping), bell_(&bell), doorbell_(doorbell) {}
+    : slots_(mapping), lock_(&mapping.writer_lock()), bell_(&bell), doorbell_(doorbell) {}
 
 [[gnu::hot]] bool RingWriter::lock() noexcept {
-  RingHeader& header = slots_.header();
-  if (loaned_rings.count != 0 && loaned_rings.holds(&header)) return false;
-  return take(lock_robust(header.lock));
+  if (loaned_rings.count != 0 && loaned_rings.holds(&slots_.header())) return false;
+  return take(lock_->lock());
 }
 
 [[gnu::hot]] bool RingWriter::take(LockResult result) noexcept {
   if (result == LockResult::recovered) slots_.recover();
   return result == LockResult::locked || result == LockResult::recovered;
 }
-
-[[gnu::hot]] void RingWriter::unlock() noexcept { pthread_mutex_unlock(&slots_.header().lock); }
 
 std::byte* RingWriter::begin() noexcept {
   if (loaned_rings.count == loaned_rings.rings.size() || !lock()) return nullptr;
@@ -57,7 +52,7 @@ std::byte* RingWriter::begin() noexcept {
 void RingWriter::cancel() noexcept {
   // The slot keeps its odd sequence: it is outside the readable window.
   loaned_rings.remove(&slots_.header());
-  unlock();
+  lock_->unlock();
 }
 
 Tid RingWriter::commit(std::size_t payload_bytes, Time time, Duration clock_error) noexcept {
@@ -66,7 +61,7 @@ Tid RingWriter::commit(std::size_t payload_bytes, Time time, Duration clock_erro
   const Tid tid = newest() + 1;
   slots_.publish({tid, time, clock_error, payload_bytes});
   loaned_rings.remove(&slots_.header());
-  unlock();
+  lock_->unlock();
   follow_up(tid);
   return tid;
 }
@@ -80,11 +75,10 @@ Tid RingWriter::commit(std::size_t payload_bytes, Time time, Duration clock_erro
 RingWriter::Attempt RingWriter::try_publish(const PublishedSample& sample,
                                             std::span<const std::byte> payload, Time time,
                                             Duration clock_error) noexcept {
-  RingHeader& header = slots_.header();
-  const LockResult result = try_lock_robust(header.lock);
+  const LockResult result = lock_->try_lock();
   if (result == LockResult::busy) return {Attempt::Outcome::busy, kNoTid};
   if (!take(result)) return {Attempt::Outcome::refused, kNoTid};
-  PublisherCursors(header).advance(sample, newest() + 1);
+  PublisherCursors(slots_.header()).advance(sample, newest() + 1);
   return {Attempt::Outcome::written, write_locked(payload, time, clock_error)};
 }
 
@@ -95,7 +89,7 @@ RingWriter::Attempt RingWriter::try_publish(const PublishedSample& sample,
   slots_.begin(tid);
   slots_.fill(tid, payload);
   slots_.publish({tid, time, clock_error, payload.size()});
-  unlock();
+  lock_->unlock();
   follow_up(tid);
   return tid;
 }
@@ -103,9 +97,9 @@ RingWriter::Attempt RingWriter::try_publish(const PublishedSample& sample,
 // After a sample, outside of the lock: wakes sleepers and prepares for the next sample.
 [[gnu::hot]] void RingWriter::follow_up(Tid tid) noexcept {
   bell_->notify();
-  if (doorbell_ >= 0 && bell_->doorbell_armed()) {
+  if (doorbell_ >= 0 && slots_.header().doorbell_armed.load(std::memory_order_seq_cst) != 0) {
     const std::uint64_t one = 1;
-    // Non-blocking: fails only when the counter is full, and then dssmd is notified already.
+    // Never waits: nobody else has the descriptor but dssmd, and the counter does not get full.
     [[maybe_unused]] const ssize_t written = ::write(doorbell_, &one, sizeof one);
   }
   slots_.prefetch_next(tid);

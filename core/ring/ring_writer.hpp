@@ -29,11 +29,12 @@ namespace dssm::ring {
 // One per writing thread; the mapping (read-write) and the bell outlive it.
 class RingWriter {
  public:
-  // doorbell: the stream's eventfd, written to while dssmd has armed it; -1: none. Not owned.
+  // doorbell: this program's eventfd, written to while dssmd has armed the ring's doorbells; -1:
+  // none. Not owned.
   RingWriter(const RingMapping& mapping, Bell& bell, int doorbell) noexcept;
 
   // Writes one sample of at most the stream's payload_bytes. Returns its tid; kNoTid when this
-  // thread holds the lock already (a loan).
+  // thread holds the lock already (a loan), or did not get it (RobustLock::kMaxWait).
   Tid write(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
 
   // The same with a clock error that is still to be found: `clock_error()` is called once, with the
@@ -57,8 +58,8 @@ class RingWriter {
   Attempt try_publish(const PublishedSample& sample, std::span<const std::byte> payload, Time time,
                       Duration clock_error) noexcept;
 
-  // In place: begin() takes the lock and gives the next slot's payload (nullptr when this thread
-  // holds it already); then exactly one of commit() and cancel(), in the same thread.
+  // In place: begin() takes the lock and gives the next slot's payload (nullptr when write() would
+  // fail); then exactly one of commit() and cancel(), in the same thread.
   std::byte* begin() noexcept;
   Tid commit(std::size_t payload_bytes, Time time, Duration clock_error) noexcept;
   void cancel() noexcept;
@@ -68,11 +69,11 @@ class RingWriter {
  private:
   bool lock() noexcept;
   bool take(LockResult result) noexcept;
-  void unlock() noexcept;
   Tid write_locked(std::span<const std::byte> payload, Time time, Duration clock_error) noexcept;
   void follow_up(Tid tid) noexcept;
 
   SlotWriter slots_;
+  const RobustLock* lock_;
   Bell* bell_;
   int doorbell_;
 };

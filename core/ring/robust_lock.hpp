@@ -1,51 +1,71 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// A lock between processes that survives the death of its holder: glibc's robust, process-shared
-// mutex. The kernel marks it when a thread dies with the lock held, and the next call of
-// lock_robust() returns `recovered`. It is in shared memory and is never destroyed.
+// A lock between processes that survives the death of its holder, and that a program which writes
+// anything to it cannot use against the others.
 //
-// Not the error-checking kind: that one recognizes its holder by the thread id, and threads in two
-// containers may have the same one.
+// It is the kernel's robust futex (get_robust_list(2), Documentation/locking/robust-futex-ABI.rst):
+// a word in shared memory holds the holder's thread id, and the holder's thread has the word in a
+// list that the kernel walks when the thread ends. glibc's robust mutex does the same, but keeps
+// the list's pointers beside the word, so that whoever may write to the word can make the others
+// write to any address. Here the word is in the last bytes of a shared page, and the list's node in
+// a private page mapped behind it: where the kernel expects it, and out of reach of other
+// processes.
+//
+// A program that scribbles on the word can let two writers in at once, which damages samples of its
+// own stream, or keep all others out. They wait for a bounded time.
 #pragma once
 
-#include <pthread.h>
+#include <atomic>
+#include <cstddef>
+#include <cstdint>
+#include <dssm/result.hpp>
+#include <dssm/sample.hpp>
+#include <utility>
 
-#include <cerrno>
+#include "core/base/sealed_memory.hpp"
 
 namespace dssm::ring {
 
-inline void init_robust_lock(pthread_mutex_t& mutex) noexcept {
-  pthread_mutexattr_t attributes;
-  pthread_mutexattr_init(&attributes);
-  pthread_mutexattr_setpshared(&attributes, PTHREAD_PROCESS_SHARED);
-  pthread_mutexattr_setrobust(&attributes, PTHREAD_MUTEX_ROBUST);
-  pthread_mutex_init(&mutex, &attributes);
-  pthread_mutexattr_destroy(&attributes);
-}
+// Bytes at the end of a memory file's first page that belong to its lock. The size of a page is
+// the system's: the node has to be in another one.
+inline constexpr std::size_t kLockBytes = 24;
 
 enum class LockResult : unsigned char {
   locked,
   recovered,  // locked; the last holder died: repair what it left
-  busy,       // try_lock_robust() only: another thread holds it
-  refused,    // a program with write access has damaged the mutex
+  busy,       // another thread holds it
+  refused,    // a program with write access has damaged it
 };
 
-namespace detail {
-inline LockResult lock_result(pthread_mutex_t& mutex, int result) noexcept {
-  if (result == 0) return LockResult::locked;
-  if (result == EBUSY) return LockResult::busy;
-  if (result != EOWNERDEAD) return LockResult::refused;
-  pthread_mutex_consistent(&mutex);
-  return LockResult::recovered;
-}
-}  // namespace detail
+// A mapped lock. Thread-safe; of this process's threads as of all others, one holds it.
+class RobustLock {
+ public:
+  // How long lock() waits for one holder, and, after it did so in vain, until it got the lock
+  // again: a holder is stopped, or the word is damaged, and the caller has other work.
+  static constexpr Duration kMaxWait = std::chrono::seconds(2);
+  static constexpr Duration kMaxWaitAgain = std::chrono::milliseconds(10);
 
-inline LockResult lock_robust(pthread_mutex_t& mutex) noexcept {
-  return detail::lock_result(mutex, pthread_mutex_lock(&mutex));
-}
+  // Maps the lock of `fd`, a memory file of at least one page, sealed against shrinking. Does not
+  // keep `fd`.
+  static Result<RobustLock> map(int fd);
 
-inline LockResult try_lock_robust(pthread_mutex_t& mutex) noexcept {
-  return detail::lock_result(mutex, pthread_mutex_trylock(&mutex));
-}
+  RobustLock() = default;
+
+  // Waits for the lock. The thread must not hold it: that is waited for, too.
+  //   returns  `busy` when the wait was in vain
+  LockResult lock() const noexcept;
+  // Does not wait.
+  LockResult try_lock() const noexcept;
+  // By the thread that holds it.
+  void unlock() const noexcept;
+
+ private:
+  struct Private;
+  explicit RobustLock(SharedMapping mapping) noexcept : mapping_(std::move(mapping)) {}
+  std::atomic<std::uint32_t>& word() const noexcept;
+  Private& own() const noexcept;
+  LockResult take(bool may_wait) const noexcept;
+  SharedMapping mapping_;
+};
 
 }  // namespace dssm::ring

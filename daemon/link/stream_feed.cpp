@@ -11,13 +11,13 @@ namespace dssm::daemon {
 
 Result<std::shared_ptr<StreamFeed>> StreamFeed::open(const EventLoop& loop,
                                                      std::shared_ptr<Stream> stream) {
-  auto bell = DSSM_TRY(stream->map_bell(), "stream '" + stream->id().str() + "'");
-  return std::shared_ptr<StreamFeed>(new StreamFeed(loop, std::move(stream), std::move(bell)));
+  auto ring = DSSM_TRY(stream->map_for_writing(), "stream '" + stream->id().str() + "'");
+  return std::shared_ptr<StreamFeed>(new StreamFeed(loop, std::move(stream), std::move(ring)));
 }
 
 StreamFeed::StreamFeed(const EventLoop& loop, std::shared_ptr<Stream> stream,
-                       std::shared_ptr<ring::Bell> bell)
-    : loop_(loop), stream_(std::move(stream)), bell_(std::move(bell)), reader_(stream_->mapping()) {
+                       std::shared_ptr<const ring::RingMapping> ring)
+    : loop_(loop), stream_(std::move(stream)), ring_(std::move(ring)), reader_(*ring_) {
   stream_->observe_doorbells(this);
 }
 
@@ -27,14 +27,15 @@ StreamFeed::~StreamFeed() {
 }
 
 void StreamFeed::on_doorbell_added(int fd) {
-  doorbells_.push_back(EventSource::edge(loop_, fd, [this] { poll(); }));
-  doorbells_.back().enable();
+  EventSource& source = doorbells_[fd];
+  source = EventSource::edge(loop_, fd, [this] { poll(); });
+  source.enable();
 }
 
 [[gnu::hot]] void StreamFeed::arm(bool armed) noexcept {
   if (armed == armed_) return;
   armed_ = armed;
-  bell_->arm_doorbell(armed);
+  ring_->header().doorbell_armed.store(armed ? 1 : 0, std::memory_order_seq_cst);
 }
 
 [[gnu::hot]] bool StreamFeed::wait(Observer& observer, Tid known) {

@@ -11,10 +11,11 @@
 #pragma once
 
 #include <dssm/result.hpp>
+#include <map>
 #include <memory>
 #include <vector>
 
-#include "core/ring/bell.hpp"
+#include "core/ring/ring_memory.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/streams/stream.hpp"
@@ -57,20 +58,21 @@ class StreamFeed final : private DoorbellObserver {
   };
 
   StreamFeed(const EventLoop& loop, std::shared_ptr<Stream> stream,
-             std::shared_ptr<ring::Bell> bell);
+             std::shared_ptr<const ring::RingMapping> ring);
   void on_doorbell_added(int fd) override;
+  void on_doorbell_removed(int fd) override { doorbells_.erase(fd); }
   void arm(bool armed) noexcept;
 
   const EventLoop& loop_;
   std::shared_ptr<Stream> stream_;
-  std::shared_ptr<ring::Bell> bell_;
+  std::shared_ptr<const ring::RingMapping> ring_;  // read-write
   ring::RingReader reader_;
   bool armed_ = false;
   std::vector<Waiting> waiting_;
   // During poll(): those still to be notified; nullptr after forget().
   std::vector<Waiting> notifying_;
   bool polling_ = false, poll_again_ = false;
-  std::vector<EventSource> doorbells_;
+  std::map<int, EventSource> doorbells_;  // by descriptor
 };
 
 }  // namespace dssm::daemon

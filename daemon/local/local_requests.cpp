@@ -31,7 +31,7 @@ Result<OfferedFiles> offered_files(DescriptorQueue& queue, Role role) {
   if (offered.size() < 3) {
     return Error{Errc::protocol, "the request comes without its descriptors (ring, bell, meta)"};
   }
-  OfferedFiles files{std::move(offered[0]), std::move(offered[1]), std::move(offered[2]), {}};
+  OfferedFiles files{std::move(offered[0]), std::move(offered[1]), std::move(offered[2]), {}, 0};
   if (offered.size() > 3 && role == Role::writer) files.doorbell = std::move(offered[3]);
   return files;
 }
@@ -151,6 +151,7 @@ Result<Reply> LocalRequests::offer(const Client& client, const local::Offer& req
                                    DescriptorQueue& descriptors) {
   const Role role = role_of(request.for_writing());
   OfferedFiles files = DSSM_TRY(offered_files(descriptors, role));
+  files.client = client->number;
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.id()));
   DSSM_TRY(opens_.check_quota(*client));
   // An offer without a host is of this one: it may not know the stream after its restart.
@@ -331,7 +332,7 @@ Reply LocalRequests::record_open(const OpenEntry& entry) {
 //   fails  limit_exceeded (opens), os errors; then nothing is recorded
 Result<Reply> LocalRequests::opened(const OpenEntry& entry) {
   DSSM_TRY(opens_.check_quota(*entry.client));
-  std::vector<UniqueFd> descriptors = DSSM_TRY(entry.stream->descriptors_for(entry.role));
+  std::vector<UniqueFd> descriptors = DSSM_TRY(entry.stream->descriptors_for(entry.role, entry.client->number));
   Reply reply = record_open(entry);
   reply.descriptors = std::move(descriptors);
   return reply;

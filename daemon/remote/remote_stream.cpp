@@ -143,7 +143,7 @@ Result<std::shared_ptr<Stream>> RemoteStream::adopt_untrusted(OfferedFiles&& fil
     if (!ring->is_ring(files.ring.get())) {
       return Error{Errc::conflict, context + " has another ring here now; close it and reopen it"};
     }
-    ring->take_doorbell_untrusted(std::move(files.doorbell));
+    ring->take_doorbell_untrusted(files.client, std::move(files.doorbell));
     return acquire();
   }
   std::shared_ptr<Stream> offered =

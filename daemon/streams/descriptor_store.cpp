@@ -40,7 +40,7 @@ bool DescriptorStore::restore_untrusted(std::vector<NamedDescriptor> kept, bool 
   std::map<std::string, std::vector<UniqueFd>> groups;
   for (NamedDescriptor& one : kept) groups[one.name].push_back(std::move(one.fd));
   bool all_is_here =
-      (store_is_there || !groups.empty()) && kept.size() + Stream::kMaxKept <= max_descriptors_;
+      (store_is_there || !groups.empty()) && kept.size() + Stream::kKept <= max_descriptors_;
   for (auto& [name, fds] : groups) {
     switch (take_back(name, std::move(fds))) {
       case Taken::good:
@@ -67,7 +67,6 @@ DescriptorStore::Taken DescriptorStore::take_back(const std::string& name,
                                                   std::vector<UniqueFd> fds) {
   const std::size_t count = fds.size();
   OfferedFiles files;
-  std::vector<UniqueFd> doorbells;
   for (UniqueFd& fd : fds) {
     switch (kind_of_untrusted(fd.get())) {
       case DescriptorKind::ring:
@@ -79,11 +78,9 @@ DescriptorStore::Taken DescriptorStore::take_back(const std::string& name,
       case DescriptorKind::meta:
         files.meta = std::move(fd);
         break;
-      case DescriptorKind::doorbell:
-        doorbells.push_back(std::move(fd));
-        break;
       case DescriptorKind::playback_clock:
         return take_clock_back(std::move(fd));
+      case DescriptorKind::doorbell:
       case DescriptorKind::other:
         break;
     }
@@ -101,7 +98,6 @@ DescriptorStore::Taken DescriptorStore::take_back(const std::string& name,
   Result<std::shared_ptr<Stream>> stream = registry_.adopt_stored_untrusted(std::move(files));
   if (!stream && stream.error().code == Errc::not_found) return Taken::removed_stream;
   if (!stream) return drop(stream.error().message);
-  for (UniqueFd& doorbell : doorbells) (*stream)->take_doorbell_untrusted(std::move(doorbell));
   names_.insert(name);
   descriptors_ += count;
   entries_.emplace(stream->get(), Entry{name, count});

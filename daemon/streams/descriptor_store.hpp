@@ -5,12 +5,12 @@
 // program has what open is known from the programs, which reconnect and offer what they hold; an
 // offered ring that came from the store is joined.
 //
-// All descriptors of a stream (ring, bell, meta, doorbell) have one name of three characters; the
+// All descriptors of a stream (ring, bell, meta) have one name of three characters; the
 // clock's name is "#". The names of memory files distinguish them. Longer names would be easier to
 // read, but systemd passes all of them in one environment variable, and Linux starts no program
 // with a variable above 128 KiB: dssmd could never be started again.
 //
-// A doorbell that is made later is not kept: the writer that has it offers it back.
+// Doorbells are not kept: the writers that have them offer them back.
 #pragma once
 
 #include <cstddef>

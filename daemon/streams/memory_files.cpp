@@ -3,10 +3,8 @@
 
 #include <fcntl.h>
 #include <fmt/format.h>
-#include <linux/kcmp.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
-#include <sys/syscall.h>
 #include <unistd.h>
 
 #include <cerrno>
@@ -121,11 +119,6 @@ bool same_file(int fd, int other_fd) noexcept {
   }, other{};
   return ::fstat(fd, &one) == 0 && ::fstat(other_fd, &other) == 0 && one.st_dev == other.st_dev &&
          one.st_ino == other.st_ino;
-}
-
-bool same_open_file(int fd, int other_fd) noexcept {
-  const pid_t self = ::getpid();
-  return ::syscall(SYS_kcmp, self, self, KCMP_FILE, fd, other_fd) == 0;
 }
 
 Result<UniqueFd> duplicate(int fd) {

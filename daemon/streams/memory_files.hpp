@@ -27,10 +27,6 @@ DescriptorKind kind_of_untrusted(int fd);
 // Whether both are the same file.
 bool same_file(int fd, int other_fd) noexcept;
 
-// Whether both are descriptors of the same open file, as duplicates are: eventfds all share one
-// inode. Also false where kcmp(2) is filtered.
-bool same_open_file(int fd, int other_fd) noexcept;
-
 // A second descriptor of the same open file, close-on-exec.
 Result<UniqueFd> duplicate(int fd);
 

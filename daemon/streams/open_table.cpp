@@ -3,6 +3,9 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
+#include <utility>
+
 namespace dssm::daemon {
 
 Result<void> OpenTable::check_quota(const ClientIdentity& client) const {
@@ -49,13 +52,22 @@ void OpenTable::remove_all(ClientNumber client) {
 }
 
 void OpenTable::forget(OpenNumber number) {
-  const auto entry = entries_.find(number);
-  const auto of_stream = by_stream_.find(entry->second.stream.get());
+  const OpenEntry entry = std::move(entries_.extract(number).mapped());
+  const auto of_stream = by_stream_.find(entry.stream.get());
   of_stream->second.opens.erase(number);
   Counts& counts = of_stream->second.counts;
-  --(entry->second.role == Role::writer ? counts.writers : counts.readers);
+  --(entry.role == Role::writer ? counts.writers : counts.readers);
+  if (entry.role == Role::writer && !writes(of_stream->second, entry.client->number)) {
+    entry.stream->remove_doorbell(entry.client->number);
+  }
   if (of_stream->second.opens.empty()) by_stream_.erase(of_stream);
-  entries_.erase(entry);
+}
+
+bool OpenTable::writes(const OfStream& of_stream, ClientNumber client) const {
+  return std::any_of(of_stream.opens.begin(), of_stream.opens.end(), [&](OpenNumber number) {
+    const OpenEntry& entry = entries_.at(number);
+    return entry.role == Role::writer && entry.client->number == client;
+  });
 }
 
 OpenTable::Counts OpenTable::counts(const Stream& stream) const {

@@ -20,9 +20,6 @@
 
 namespace dssm::daemon {
 
-// A local connection in this run of dssmd; rises, never used twice.
-using ClientNumber = std::uint64_t;
-
 struct ClientIdentity : Identity {
   ClientNumber number = 0;
 };
@@ -86,6 +83,7 @@ class OpenTable {
     Counts counts;
   };
   void forget(OpenNumber number);
+  bool writes(const OfStream& of_stream, ClientNumber client) const;
 
   Limits limits_;
   OpenNumber next_ = 1;

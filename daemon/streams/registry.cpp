@@ -69,7 +69,7 @@ Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, Of
   const std::string context = "stream '" + own.str() + "'";
   if (const auto found = by_name_.find(Key{own.name, own.id}); found != by_name_.end()) {
     if (found->second->is_ring(files.ring.get())) {
-      found->second->take_doorbell_untrusted(std::move(files.doorbell));
+      found->second->take_doorbell_untrusted(files.client, std::move(files.doorbell));
       return found->second;
     }
     return Error{Errc::conflict, context +

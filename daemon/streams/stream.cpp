@@ -9,6 +9,7 @@
 
 #include <algorithm>
 #include <cerrno>
+#include <iterator>
 
 #include "core/base/sealed_memory.hpp"
 #include "core/base/try.hpp"
@@ -127,14 +128,11 @@ Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& b
   UniqueFd ring = DSSM_TRY(
       ring::create_ring({plan.id, incarnation, plan.cycle, plan.type.alignment_bytes}, geometry));
   UniqueFd bell = DSSM_TRY(ring::create_bell());
-  UniqueFd doorbell = DSSM_TRY(create_doorbell());
-  std::vector<UniqueFd> doorbells;
-  doorbells.push_back(std::move(doorbell));
   MetaFile meta = DSSM_TRY(MetaFile::create(meta_of(plan, {})));
   auto mapping = DSSM_TRY(ring::RingMapping::open_untrusted(ring.get(), ring::Access::read_only));
   return std::shared_ptr<Stream>(
-      new Stream(plan, Files{std::move(ring), std::move(bell), std::move(doorbells)},
-                 std::move(meta), std::move(mapping), std::move(share)));
+      new Stream(plan, Files{std::move(ring), std::move(bell)}, std::move(meta), std::move(mapping),
+                 std::move(share)));
 }
 
 Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, MemoryBudget& budget) {
@@ -151,10 +149,10 @@ Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, Memo
   // Always a new one: writers get a descriptor that does not depend on the client's.
   UniqueFd ring = DSSM_TRY(reopen_read_write(files.ring.get()));
   std::shared_ptr<Stream> stream(new Stream(std::move(plan),
-                                            Files{std::move(ring), std::move(files.bell), {}},
+                                            Files{std::move(ring), std::move(files.bell)},
                                             std::move(meta), std::move(mapping), std::move(share)));
   stream->property_share_ = std::move(property_share);
-  stream->take_doorbell_untrusted(std::move(files.doorbell));
+  stream->take_doorbell_untrusted(files.client, std::move(files.doorbell));
   return stream;
 }
 
@@ -173,24 +171,24 @@ StreamInfo Stream::info() const {
   return info;
 }
 
-Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role) {
-  if (role == Role::writer && files_.doorbells.empty()) {
-    add_doorbell(DSSM_TRY(create_doorbell()));
-  }
+Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role, ClientNumber client) {
   const bool writes = role == Role::writer;
   const int ring = files_.ring.get();
   std::vector<UniqueFd> descriptors;
   descriptors.push_back(DSSM_TRY(writes ? duplicate(ring) : reopen_read_only(ring)));
   descriptors.push_back(DSSM_TRY(duplicate(files_.bell.get())));
   descriptors.push_back(DSSM_TRY(reopen_read_only(meta_.fd())));
-  if (writes) descriptors.push_back(DSSM_TRY(duplicate(files_.doorbells.front().get())));
+  if (!writes) return descriptors;
+  auto doorbell = doorbell_of(client);
+  if (doorbell == doorbells_.end()) {
+    doorbell = add_doorbell(client, DSSM_TRY(create_doorbell()));
+  }
+  descriptors.push_back(DSSM_TRY(duplicate(doorbell->fd.get())));
   return descriptors;
 }
 
 std::vector<int> Stream::descriptors_to_keep() const {
-  std::vector<int> fds = {files_.ring.get(), files_.bell.get(), meta_.fd()};
-  for (const UniqueFd& doorbell : files_.doorbells) fds.push_back(doorbell.get());
-  return fds;
+  return {files_.ring.get(), files_.bell.get(), meta_.fd()};
 }
 
 Result<std::shared_ptr<const ring::RingMapping>> Stream::map_for_writing() const {
@@ -215,27 +213,37 @@ Result<void> Stream::reserve(std::uint64_t offset, std::uint64_t bytes) {
 
 bool Stream::is_ring(int fd) const noexcept { return same_file(fd, files_.ring.get()); }
 
-void Stream::take_doorbell_untrusted(UniqueFd doorbell) {
-  if (!doorbell || files_.doorbells.size() == kMaxDoorbells) return;
-  // Reading a blocking one could block dssmd.
-  const int flags = ::fcntl(doorbell.get(), F_GETFL);
-  if (kind_of_untrusted(doorbell.get()) != DescriptorKind::doorbell || !(flags & O_NONBLOCK))
+void Stream::take_doorbell_untrusted(ClientNumber client, UniqueFd doorbell) {
+  if (!doorbell || doorbell_of(client) != doorbells_.end() ||
+      kind_of_untrusted(doorbell.get()) != DescriptorKind::doorbell) {
     return;
-  for (const UniqueFd& known : files_.doorbells) {
-    if (same_open_file(known.get(), doorbell.get())) return;
   }
-  add_doorbell(std::move(doorbell));
+  add_doorbell(client, std::move(doorbell));
 }
 
-void Stream::add_doorbell(UniqueFd doorbell) {
-  files_.doorbells.push_back(std::move(doorbell));
-  if (doorbell_observer_) doorbell_observer_->on_doorbell_added(files_.doorbells.back().get());
+void Stream::remove_doorbell(ClientNumber client) {
+  const auto doorbell = doorbell_of(client);
+  if (doorbell == doorbells_.end()) return;
+  if (doorbell_observer_) doorbell_observer_->on_doorbell_removed(doorbell->fd.get());
+  doorbells_.erase(doorbell);
+}
+
+std::vector<Stream::Doorbell>::iterator Stream::doorbell_of(ClientNumber client) {
+  return std::find_if(doorbells_.begin(), doorbells_.end(),
+                      [&](const Doorbell& one) { return one.client == client; });
+}
+
+std::vector<Stream::Doorbell>::iterator Stream::add_doorbell(ClientNumber client,
+                                                             UniqueFd doorbell) {
+  doorbells_.push_back({client, std::move(doorbell)});
+  if (doorbell_observer_) doorbell_observer_->on_doorbell_added(doorbells_.back().fd.get());
+  return std::prev(doorbells_.end());
 }
 
 void Stream::observe_doorbells(DoorbellObserver* observer) {
   doorbell_observer_ = observer;
   if (!observer) return;
-  for (const UniqueFd& doorbell : files_.doorbells) observer->on_doorbell_added(doorbell.get());
+  for (const Doorbell& doorbell : doorbells_) observer->on_doorbell_added(doorbell.fd.get());
 }
 
 Result<void> Stream::mark_removed() {

@@ -29,16 +29,21 @@ namespace dssm::daemon {
 // A type's description may be this long, as dssm.local.Type: dssmd keeps it in its own memory.
 inline constexpr std::size_t kMaxTypeBytes = 64 << 10;
 
+// A local connection in this run of dssmd; rises, never used twice. 0: none.
+using ClientNumber = std::uint64_t;
+
 // What a client offers of a stream that it held through a restart of dssmd.
 struct OfferedFiles {
   UniqueFd ring, bell, meta;
   UniqueFd doorbell;  // may be missing
+  ClientNumber client = 0;
 };
 
-// Notified of a stream's doorbells: eventfds that its writers write to while the bell requests it.
+// Notified of a stream's doorbells: eventfds that its writers write to while the ring requests it.
 class DoorbellObserver {
  public:
-  virtual void on_doorbell_added(int fd) = 0;  // open as long as the stream exists
+  virtual void on_doorbell_added(int fd) = 0;  // open until it is removed
+  virtual void on_doorbell_removed(int fd) = 0;
 
  protected:
   ~DoorbellObserver() = default;
@@ -96,11 +101,13 @@ class Stream : public std::enable_shared_from_this<Stream> {
   // All but the users. Reads the newest stamps of the ring twice.
   StreamInfo info() const;
 
-  // Descriptors to hand out, in the order of local.proto's Opened; the caller's own. For writers a
-  // missing doorbell is made.
-  Result<std::vector<UniqueFd>> descriptors_for(Role role);
+  // Descriptors to hand out, in the order of local.proto's Opened; the caller's own. For a client
+  // that writes and has no doorbell, one is made.
+  Result<std::vector<UniqueFd>> descriptors_for(Role role, ClientNumber client = 0);
 
-  // All that restores this stream, at most kMaxKept; the stream keeps them open.
+  // All that restores this stream; the stream keeps them open. The doorbells are given back by
+  // those that have them.
+  static constexpr std::size_t kKept = 3;
   std::vector<int> descriptors_to_keep() const;
 
   // The ring for dssmd itself: for reading, for writing (mirrors), and its bell.
@@ -116,12 +123,15 @@ class Stream : public std::enable_shared_from_this<Stream> {
   // Whether `fd` is this stream's ring.
   bool is_ring(int fd) const noexcept;
 
-  // Adds the doorbell that a writer kept over a restart of dssmd: another one may have been made
-  // for another writer meanwhile. Drops it if it is not such an eventfd, or one more than
-  // kMaxDoorbells.
-  void take_doorbell_untrusted(UniqueFd doorbell);
-  static constexpr std::size_t kMaxDoorbells = 8;
-  static constexpr std::size_t kMaxKept = 3 + kMaxDoorbells;
+  // Each client that writes has a doorbell of its own. With one for all, a program could clear
+  // O_NONBLOCK, which belongs to all descriptors of a file, and fill the counter: the others would
+  // wait in write(2) for ever.
+
+  // Adds the doorbell that a client kept over a restart of dssmd. Drops it if it is no eventfd, or
+  // if the client has one.
+  void take_doorbell_untrusted(ClientNumber client, UniqueFd doorbell);
+  // The client has ended all its opens for writing.
+  void remove_doorbell(ClientNumber client);
 
   // Reports each doorbell, existing ones at once. At most one observer; nullptr: none.
   void observe_doorbells(DoorbellObserver* observer);
@@ -141,7 +151,10 @@ class Stream : public std::enable_shared_from_this<Stream> {
  private:
   struct Files {
     UniqueFd ring, bell;
-    std::vector<UniqueFd> doorbells;
+  };
+  struct Doorbell {
+    ClientNumber client;
+    UniqueFd fd;
   };
   Stream(Plan plan, Files files, MetaFile meta, std::shared_ptr<const ring::RingMapping> mapping,
          MemoryShare share)
@@ -150,10 +163,12 @@ class Stream : public std::enable_shared_from_this<Stream> {
         meta_(std::move(meta)),
         mapping_(std::move(mapping)),
         share_(std::move(share)) {}
-  void add_doorbell(UniqueFd doorbell);
+  std::vector<Doorbell>::iterator doorbell_of(ClientNumber client);
+  std::vector<Doorbell>::iterator add_doorbell(ClientNumber client, UniqueFd doorbell);
 
   Plan plan_;
   Files files_;
+  std::vector<Doorbell> doorbells_;
   MetaFile meta_;
   std::shared_ptr<const ring::RingMapping> mapping_;  // read-only
   MemoryShare share_, property_share_;                // of ring and type; of the property

@@ -1,13 +1,17 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Writing and reading samples of several sizes with the public API, compared with clock_gettime for
-// small ones, and with memcpy of the same size between the same buffers for large ones.
+// small ones, and with memcpy of the same size between the same buffers for large ones; and the
+// writers' lock beside the C library's.
+#include <pthread.h>
+
 #include <cstdlib>
 #include <cstring>
 #include <dssm/dssm.hpp>
 #include <filesystem>
 
 #include "core/clock/clock_page.hpp"
+#include "core/ring/robust_lock.hpp"
 #include "tests/bench/harness.hpp"
 #include "tests/support/daemon_process.hpp"
 
@@ -34,6 +38,27 @@ Stream make_stream(Session& session, const char* name, std::uint64_t bytes, std:
       session.create_raw(id, TypeInfo{"", bytes, 1, {}}, History{depth, 1ms}).value();
   RawReader reader = session.open_raw_reader(id).value();
   return {std::move(writer), std::move(reader)};
+}
+
+void locks() {
+  const UniqueFd fd = create_sealed_memory("bench-lock", system_page_bytes(), 0600).value();
+  const ring::RobustLock lock = ring::RobustLock::map(fd.get()).value();
+  pthread_mutexattr_t attributes;
+  ::pthread_mutexattr_init(&attributes);
+  ::pthread_mutexattr_setpshared(&attributes, PTHREAD_PROCESS_SHARED);
+  ::pthread_mutexattr_setrobust(&attributes, PTHREAD_MUTEX_ROBUST);
+  pthread_mutex_t mutex;
+  ::pthread_mutex_init(&mutex, &attributes);
+  const auto theirs = [&] {
+    ::pthread_mutex_lock(&mutex);
+    ::pthread_mutex_unlock(&mutex);
+  };
+  const auto ours = [&] {
+    static_cast<void>(lock.lock());
+    lock.unlock();
+  };
+  print_pair("robust mutex, lock and unlock", "writers' lock, lock and unlock",
+             measure(2000, 1000, theirs, ours), "<= 1.0");
 }
 
 void small(Session& session) {
@@ -161,6 +186,7 @@ int main() {
   test::DaemonProcess daemon;
   Session session = Session::connect({.socket_path = daemon.socket_path()}).value();
   print_head();
+  locks();
   small(session);
   stamped(session);
   large(session, 64 << 10, 32, 4000);

@@ -37,8 +37,8 @@ class LoanedSample {
   LoanedSample& operator=(const LoanedSample&) = delete;
   ~LoanedSample() { abandon(); }
 
-  // Whether there is a slot: false when this thread holds another LoanedSample of this stream, and
-  // after publish() or abandon().
+  // Whether there is a slot: false when this thread holds another LoanedSample of this stream, when
+  // another writer held the stream's lock for too long, and after publish() or abandon().
   explicit operator bool() const noexcept { return payload_.data() != nullptr; }
 
   // The slot's payload: payload_bytes() long, aligned to 64 bytes, with unspecified content; empty
@@ -82,11 +82,13 @@ class RawWriter {
   //                stored; for a time more than 10 s from now kForeignClockError is stored, since
   //                it is a recording's
   //                kForeignClockError: `time` is of another clock
-  //   returns      its tid; kNoTid when it is too long or this thread holds a LoanedSample
+  //   returns      its tid; kNoTid when it is too long, when this thread holds a LoanedSample, or
+  //                when another writer has held the stream's lock for 2 s (a program that is
+  //                stopped, or a loan that is kept); after that for 10 ms, until it was free once
   Tid write(std::span<const std::byte> payload, Time time = WallClock::now(),
             Duration clock_error = kOwnClockError) noexcept;
 
-  // The next slot, to be filled in place. Waits for other writers of this stream.
+  // The next slot, to be filled in place. Waits for other writers of this stream as write() does.
   LoanedSample loan() noexcept;
 
   // Replaces the stream's property (0 bytes: removes it): one request to dssmd.

@@ -19,7 +19,7 @@ namespace {
 
 using namespace std::chrono_literals;
 
-constexpr std::size_t kPerStream = 4;  // ring, bell, meta, doorbell
+constexpr std::size_t kPerStream = 3;  // ring, bell, meta
 
 ServiceManager::Options without_network() { return {.arguments = {"--listen", ""}}; }
 

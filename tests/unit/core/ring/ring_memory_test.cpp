@@ -36,7 +36,8 @@ TEST(Layout, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(RingHeader, stream_id), 80u);
   EXPECT_EQ(offsetof(RingHeader, name), 88u);
   EXPECT_EQ(offsetof(RingHeader, host), 128u);
-  EXPECT_EQ(offsetof(RingHeader, lock), 320u);
+  EXPECT_EQ(offsetof(RingHeader, doorbell_armed), 448u);
+  EXPECT_EQ(offsetof(RingHeader, lock), 4072u);
   EXPECT_EQ(offsetof(RingHeader, top), 512u);
   EXPECT_EQ(offsetof(RingHeader, run_start), 520u);
   EXPECT_EQ(offsetof(RingHeader, first), 528u);
@@ -58,7 +59,7 @@ TEST(Layout, HasItsDocumentedOffsets) {
   EXPECT_EQ(offsetof(SlotHeader, run_parent), 40u);
   EXPECT_EQ(offsetof(SlotHeader, run_jump), 48u);
   EXPECT_EQ(offsetof(SlotHeader, run_level), 56u);
-  EXPECT_EQ(kLayoutVersion, 7u) << "raise it with every incompatible change, and fix this test";
+  EXPECT_EQ(kLayoutVersion, 8u) << "raise it with every incompatible change, and fix this test";
 }
 
 TEST(Layout, HasItsDocumentedVersion) {

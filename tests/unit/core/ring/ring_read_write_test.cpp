@@ -291,12 +291,12 @@ TEST(RingWriter, RingsTheDoorbellOnlyWhileItIsArmed) {
   std::uint64_t count = 0;
   writer.write(payload_for(0, 8), {}, 0ns);
   EXPECT_EQ(::read(doorbell.get(), &count, 8), -1);
-  ring.bell->arm_doorbell(true);
+  ring.mapping->header().doorbell_armed = 1;
   writer.write(payload_for(1, 8), {}, 0ns);
   writer.write(payload_for(2, 8), {}, 0ns);
   ASSERT_EQ(::read(doorbell.get(), &count, 8), 8);
   EXPECT_EQ(count, 2u);
-  ring.bell->arm_doorbell(false);
+  ring.mapping->header().doorbell_armed = 0;
   writer.write(payload_for(3, 8), {}, 0ns);
   EXPECT_EQ(::read(doorbell.get(), &count, 8), -1);
 }

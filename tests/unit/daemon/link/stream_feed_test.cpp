@@ -4,9 +4,13 @@
 // does.
 #include "daemon/link/stream_feed.hpp"
 
+#include <fcntl.h>
 #include <gtest/gtest.h>
 #include <poll.h>
+#include <sys/eventfd.h>
 #include <unistd.h>
+
+#include <set>
 
 #include "core/ring/ring_writer.hpp"
 #include "tests/support/memory_peer.hpp"
@@ -32,6 +36,7 @@ class StreamFeedTest : public testing::Test, protected StreamFeed::Observer {
       return ring::RingWriter(*mapping, *bell, files.doorbell.get())
           .write(payload, {}, kUnknownClockError);
     }
+    bool is_armed() const { return mapping->header().doorbell_armed != 0; }
     // How often the doorbell was rung since this was asked last.
     std::uint64_t rings() const {
       std::uint64_t count = 0;
@@ -75,13 +80,13 @@ TEST_F(StreamFeedTest, ReportsAtOnceASampleThatIsThere) {
   Program program = writer();
   program.write();
   EXPECT_FALSE(feed->wait(*this, kNoTid));
-  EXPECT_FALSE(program.bell->doorbell_armed());
+  EXPECT_FALSE(program.is_armed());
   EXPECT_TRUE(feed->wait(*this, 0));
 }
 
 TEST_F(StreamFeedTest, LetsWritersRingOnlyWhileAnObserverWaits) {
   Program program = writer();
-  EXPECT_FALSE(program.bell->doorbell_armed());
+  EXPECT_FALSE(program.is_armed());
   program.write();
   EXPECT_EQ(program.rings(), 0u);
   ASSERT_TRUE(feed->wait(*this, 0));
@@ -130,7 +135,7 @@ TEST_F(StreamFeedTest, WatchesEveryDoorbellOfItsStream) {
   UniqueFd kept(::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC));
   Program second = writer();
   second.files.doorbell = copy_of(kept);
-  stream->take_doorbell_untrusted(std::move(kept));
+  stream->take_doorbell_untrusted(7, std::move(kept));
   for (Program* program : {&first, &second, &first, &second}) {
     const int before = notifications;
     ASSERT_TRUE(feed->wait(*this, ring::RingReader(stream->mapping()).newest()));
@@ -155,7 +160,7 @@ TEST_F(StreamFeedTest, RemovesAnObserverAlsoDuringANotification) {
   EXPECT_EQ(other.notifications, 0);
   ASSERT_TRUE(feed->wait(other, 0));
   feed->forget(other);
-  EXPECT_FALSE(program.bell->doorbell_armed());
+  EXPECT_FALSE(program.is_armed());
 }
 
 TEST_F(StreamFeedTest, ChecksTheRingWhenPolled) {
@@ -175,30 +180,46 @@ TEST_F(StreamFeedTest, ChecksTheRingWhenPolled) {
 TEST_F(StreamFeedTest, DisarmsWhenItGoes) {
   Program program = writer();
   ASSERT_TRUE(feed->wait(*this, kNoTid));
-  EXPECT_TRUE(program.bell->doorbell_armed());
+  EXPECT_TRUE(program.is_armed());
   feed.reset();
-  EXPECT_FALSE(program.bell->doorbell_armed());
+  EXPECT_FALSE(program.is_armed());
 }
 
-TEST(Doorbells, AreKeptApartAndLimited) {
+TEST(Doorbells, AreOfOneClientEach) {
   Registry registry("pc1", kLimits);
   const auto stream = registry.create({"odometry", 0, ""}, odometry_type(), kHistory, 1)->stream;
-  struct Counter final : DoorbellObserver {
-    void on_doorbell_added(int) override { ++count; }
-    std::size_t count = 0;
-  } counter;
-  stream->observe_doorbells(&counter);
-  EXPECT_EQ(counter.count, 1u) << "the one that it was made with";
+  struct Watch final : DoorbellObserver {
+    void on_doorbell_added(int fd) override { fds.insert(fd); }
+    void on_doorbell_removed(int fd) override { EXPECT_EQ(fds.erase(fd), 1u); }
+    std::set<int> fds;
+  } watch;
+  stream->observe_doorbells(&watch);
+  const auto doorbell_for = [&](ClientNumber client) {
+    return as_offer(stream->descriptors_for(Role::writer, client).value()).doorbell;
+  };
+  const auto rings = [](const UniqueFd& doorbell) {
+    std::uint64_t count = 0;
+    return ::read(doorbell.get(), &count, sizeof count) == sizeof count;
+  };
+  const UniqueFd one = doorbell_for(1), same = doorbell_for(1), two = doorbell_for(2);
+  EXPECT_EQ(watch.fds.size(), 2u);
+  ASSERT_EQ(::eventfd_write(one.get(), 1), 0);
+  EXPECT_FALSE(rings(two)) << "another program's";
+  EXPECT_TRUE(rings(same));
+
   const auto eventfd = [] { return UniqueFd(::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC)); };
-  const OfferedFiles own = as_offer(stream->descriptors_for(Role::writer).value());
-  stream->take_doorbell_untrusted(copy_of(own.doorbell));
-  EXPECT_EQ(counter.count, 1u) << "the same one again";
-  const UniqueFd other = eventfd();
-  stream->take_doorbell_untrusted(copy_of(other));
-  stream->take_doorbell_untrusted(copy_of(other));
-  EXPECT_EQ(counter.count, 2u);
-  for (int i = 0; i < 20; ++i) stream->take_doorbell_untrusted(eventfd());
-  EXPECT_EQ(counter.count, Stream::kMaxDoorbells);
+  stream->take_doorbell_untrusted(3, eventfd());
+  stream->take_doorbell_untrusted(3, eventfd());
+  EXPECT_EQ(watch.fds.size(), 3u) << "one per client";
+  int pipe_ends[2];
+  ASSERT_EQ(::pipe2(pipe_ends, O_CLOEXEC), 0);
+  const UniqueFd write_end(pipe_ends[1]);
+  stream->take_doorbell_untrusted(4, UniqueFd(pipe_ends[0]));
+  EXPECT_EQ(watch.fds.size(), 3u) << "no eventfd";
+
+  stream->remove_doorbell(2);
+  stream->remove_doorbell(2);
+  EXPECT_EQ(watch.fds.size(), 2u);
   stream->observe_doorbells(nullptr);
 }
 
