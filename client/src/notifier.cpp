@@ -75,6 +75,7 @@ void Notifier::run() {
   std::vector<std::shared_ptr<const SharedRing>> rings;  // what the bells belong to
   std::vector<ring::Bell*> bells;
   std::vector<std::uint32_t> announced;
+  ring::SleepTimes times(ring::SleepTimes::kMaxSleep);
   for (;;) {
     awake.clear(), rings.clear(), bells.clear(), announced.clear();
     // Announce before polling, so that no change in between is missed.
@@ -88,15 +89,18 @@ void Notifier::run() {
       }
     }
     bool changed = false;
+    Duration shortest_cycle = ring::SleepTimes::kMaxSleep;
     for (const auto& ready : awake) {
       rings.push_back(ready->ring());
       bells.push_back(rings.back()->bell.get());
       announced.push_back(bells.back()->announce());
+      shortest_cycle = std::min(shortest_cycle, rings.back()->mapping->identity().cycle);
       changed |= ready->poll();
     }
+    if (changed) times = ring::SleepTimes(shortest_cycle);
     if (changed) continue;
     // Rings of readers that are destroyed meanwhile stay mapped until the next wake-up.
-    [[maybe_unused]] const WaitStatus woken = ring::Bell::sleep_any(bells, announced, kNever);
+    [[maybe_unused]] const WaitStatus woken = ring::Bell::sleep_any(bells, announced, kNever, times.next());
   }
 }
 

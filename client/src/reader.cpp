@@ -21,13 +21,14 @@ namespace {
 // Waits until ready() or the deadline: check, announce, check again, sleep. Returns interrupted
 // only while not ready().
 template <class Ready>
-WaitStatus wait_until(ring::Bell& bell, MonoTime deadline, Ready ready) noexcept {
+WaitStatus wait_until(const detail::SharedRing& ring, MonoTime deadline, Ready ready) noexcept {
   if (ready()) return WaitStatus::ready;
   if (deadline != kNever && MonoClock::now() >= deadline) return WaitStatus::timeout;
+  ring::SleepTimes times(ring.mapping->identity().cycle);
   for (;;) {
-    const std::uint32_t announced = bell.announce();
+    const std::uint32_t announced = ring.bell->announce();
     if (ready()) return WaitStatus::ready;
-    const WaitStatus status = bell.sleep(announced, deadline);
+    const WaitStatus status = ring.bell->sleep(announced, deadline, times.next());
     if (ready()) return WaitStatus::ready;
     if (status != WaitStatus::ready) return status;
   }
@@ -365,21 +366,21 @@ ReadStatus RawReader::borrow(Tid tid, BorrowedSample& out) noexcept {
 [[gnu::hot]] WaitStatus RawReader::wait(MonoTime deadline) noexcept {
   const std::shared_ptr<detail::OpenStream> stream = state_->stream_now();
   const ring::RingReader ring(*stream->ring->mapping);
-  return wait_until(*stream->ring->bell, deadline,
+  return wait_until(*stream->ring, deadline,
                     [&] { return state_->has_news(ring) || state_->restart_wakes(*stream); });
 }
 
 [[gnu::hot]] WaitStatus RawReader::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
   const std::shared_ptr<detail::OpenStream> stream = state_->stream_now();
   const ring::RingReader ring(*stream->ring->mapping);
-  return wait_until(*stream->ring->bell, deadline,
+  return wait_until(*stream->ring, deadline,
                     [&] { return ring.newest() >= tid || state_->restart_wakes(*stream); });
 }
 
 WaitStatus RawReader::wait_for_sample(Tid tid, MonoTime deadline) noexcept {
   const std::shared_ptr<detail::OpenStream> stream = state_->stream_now();
   const ring::RingReader ring(*stream->ring->mapping);
-  return wait_until(*stream->ring->bell, deadline, [&] {
+  return wait_until(*stream->ring, deadline, [&] {
     if (ring.is_settled(tid)) return true;
     if (tid <= ring.newest()) state_->want_history();
     return state_->restart_wakes(*stream);
@@ -394,6 +395,11 @@ WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noex
              reader->state_->restart_wakes(*reader->state_->stream);
     });
   };
+  Duration shortest_cycle = ring::SleepTimes::kMaxSleep;
+  for (const RawReader* reader : readers) {
+    shortest_cycle = std::min(shortest_cycle, reader->cycle());
+  }
+  ring::SleepTimes times(shortest_cycle);
   std::array<ring::Bell*, kMaxWaitAny> bells;
   std::array<std::uint32_t, kMaxWaitAny> announced;
   if (ready()) return WaitStatus::ready;
@@ -405,7 +411,8 @@ WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noex
     }
     if (ready()) return WaitStatus::ready;
     const WaitStatus status =
-        ring::Bell::sleep_any(std::span(bells).first(readers.size()), announced, deadline);
+        ring::Bell::sleep_any(std::span(bells).first(readers.size()), announced, deadline,
+                              times.next());
     if (ready()) return WaitStatus::ready;
     if (status != WaitStatus::ready) return status;
   }

@@ -60,8 +60,7 @@ class PlaybackRecord {
   // it did not get the lock (RobustLock::kMaxWait).
   template <class Change>
   bool update(Change change) noexcept {
-    const ring::LockResult result = lock_.lock();
-    if (result == ring::LockResult::busy || result == ring::LockResult::refused) return false;
+    if (lock_.lock() == ring::LockResult::busy) return false;
     // A holder that died left a complete setting: nothing to repair.
     page().setting.store(change(load()));
     lock_.unlock();

@@ -28,13 +28,6 @@ struct WaitVector {
 constexpr long kFutexWaitvNumber = 449;  // on every architecture
 constexpr std::uint32_t kFutex32 = 2;    // FUTEX_32; shared, as FUTEX_PRIVATE_FLAG is not set
 
-constexpr timespec kMaxSleepTime = timespec_of(kMaxSleep);
-
-// When to return although no writer notified.
-MonoTime latest_return(MonoTime deadline) noexcept {
-  return std::min(deadline, deadline_in(kMaxSleep));
-}
-
 WaitStatus outcome(long result, int error, MonoTime deadline) noexcept {
   if (result >= 0 || error == EAGAIN) return WaitStatus::ready;
   if (error == EINTR) return WaitStatus::interrupted;
@@ -63,27 +56,28 @@ Result<std::shared_ptr<Bell>> Bell::open_untrusted(int fd) {
   }
 }
 
-[[gnu::hot]] WaitStatus Bell::sleep(std::uint32_t announced, MonoTime deadline) noexcept {
-  if (deadline == kNever) {  // kMaxSleep from now on, without asking when that is
+[[gnu::hot]] WaitStatus Bell::sleep(std::uint32_t announced, MonoTime deadline, Duration at_most) noexcept {
+  if (deadline == kNever) {  // without asking for the time
+    const timespec longest = timespec_of(at_most);
     const long result =
-        ::syscall(SYS_futex, &page().word, FUTEX_WAIT, announced, &kMaxSleepTime, nullptr, 0);
+        ::syscall(SYS_futex, &page().word, FUTEX_WAIT, announced, &longest, nullptr, 0);
     return outcome(result, errno, deadline);
   }
-  const timespec until = timespec_of(latest_return(deadline));
+  const timespec until = timespec_of(std::min(deadline, deadline_in(at_most)));
   const long result = ::syscall(SYS_futex, &page().word, FUTEX_WAIT_BITSET, announced, &until,
                                 nullptr, FUTEX_BITSET_MATCH_ANY);
   return outcome(result, errno, deadline);
 }
 
 WaitStatus Bell::sleep_any(std::span<Bell* const> bells, std::span<const std::uint32_t> announced,
-                           MonoTime deadline) noexcept {
+                           MonoTime deadline, Duration at_most) noexcept {
   std::array<WaitVector, kMaxBells> vectors;
   const std::size_t count = std::min(bells.size(), kMaxBells);
   for (std::size_t i = 0; i < count; ++i) {
     vectors[i] = {announced[i], reinterpret_cast<std::uintptr_t>(&bells[i]->page().word), kFutex32,
                   0};
   }
-  timespec until = timespec_of(latest_return(deadline));
+  timespec until = timespec_of(std::min(deadline, deadline_in(at_most)));
   const long result =
       ::syscall(kFutexWaitvNumber, vectors.data(), count, 0, &until, CLOCK_MONOTONIC);
   if (result >= 0 || errno != ENOSYS) return outcome(result, errno, deadline);

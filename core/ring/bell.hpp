@@ -2,8 +2,8 @@
 //
 // The bell: a word in shared memory through which a writer wakes the threads that wait for samples
 // of its stream. Readers cannot write to the ring, so the word is in a page of its own, which all
-// programs that use the stream map writable. A hostile reader can only disturb the wake-ups of this
-// stream, and sleepers check the ring every kMaxSleep in any case.
+// programs that use the stream map writable. A hostile reader can clear it, or take sleepers off the
+// kernel's queue (FUTEX_REQUEUE), so sleepers also check the ring by themselves (SleepTimes).
 //
 // Protocol (docs/ring-layout.md "Bell page"): bit 0 of `word` means that a thread sleeps, the other
 // bits count notifications. A sleeper sets bit 0, checks the ring again, and waits in the kernel
@@ -12,17 +12,35 @@
 // wake-up.
 #pragma once
 
+#include <algorithm>
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
 #include <memory>
 #include <span>
+#include <utility>
 
 #include "core/base/sealed_memory.hpp"
 #include "core/ring/layout.hpp"
 
 namespace dssm::ring {
 
-inline constexpr Duration kMaxSleep = std::chrono::seconds(1);
+// How long a thread that waits for samples sleeps before it checks the ring, whether or not a writer
+// woke it: two cycles of the stream, then twice as long each time. While samples come it is woken
+// before that, and without samples it soon sleeps kMaxSleep.
+class SleepTimes {
+ public:
+  static constexpr Duration kMaxSleep = std::chrono::seconds(1);
+  static constexpr Duration kMinSleep = std::chrono::milliseconds(2);
+
+  // cycle: of the stream, or the shortest of several
+  explicit SleepTimes(Duration cycle) noexcept
+      : next_(2 * std::clamp(cycle, kMinSleep / 2, kMaxSleep / 2)) {}
+
+  Duration next() noexcept { return std::exchange(next_, std::min(2 * next_, kMaxSleep)); }
+
+ private:
+  Duration next_;
+};
 
 // Creates the memory file of a bell page: size sealed, mode 0600.
 Result<UniqueFd> create_bell();
@@ -55,14 +73,16 @@ class Bell {
     return page().word.fetch_or(kSleeper, std::memory_order_seq_cst) | kSleeper;
   }
 
-  // Sleeps until the word differs from `announced`, or `deadline`. May also return `ready` without
-  // cause.
-  WaitStatus sleep(std::uint32_t announced, MonoTime deadline) noexcept;
+  // Sleeps until the word differs from `announced`, or `deadline`. Returns `ready` after `at_most`,
+  // and may do so without cause.
+  WaitStatus sleep(std::uint32_t announced, MonoTime deadline,
+                   Duration at_most = SleepTimes::kMaxSleep) noexcept;
 
   // Sleeps until one of several bells is notified; at most 128 of them. announced[i] belongs to
   // bells[i]. On a kernel without futex_waitv (before 5.16) it polls every millisecond instead.
   static WaitStatus sleep_any(std::span<Bell* const> bells,
-                              std::span<const std::uint32_t> announced, MonoTime deadline) noexcept;
+                              std::span<const std::uint32_t> announced, MonoTime deadline,
+                              Duration at_most = SleepTimes::kMaxSleep) noexcept;
 
  private:
   static constexpr std::uint32_t kSleeper = 1;

@@ -40,7 +40,7 @@ RingWriter::RingWriter(const RingMapping& mapping, Bell& bell, int doorbell) noe
 
 [[gnu::hot]] bool RingWriter::take(LockResult result) noexcept {
   if (result == LockResult::recovered) slots_.recover();
-  return result == LockResult::locked || result == LockResult::recovered;
+  return result != LockResult::busy;
 }
 
 std::byte* RingWriter::begin() noexcept {
@@ -72,14 +72,11 @@ Tid RingWriter::commit(std::size_t payload_bytes, Time time, Duration clock_erro
   return write_locked(payload, time, clock_error);
 }
 
-RingWriter::Attempt RingWriter::try_publish(const PublishedSample& sample,
-                                            std::span<const std::byte> payload, Time time,
-                                            Duration clock_error) noexcept {
-  const LockResult result = lock_->try_lock();
-  if (result == LockResult::busy) return {Attempt::Outcome::busy, kNoTid};
-  if (!take(result)) return {Attempt::Outcome::refused, kNoTid};
+Tid RingWriter::try_publish(const PublishedSample& sample, std::span<const std::byte> payload,
+                            Time time, Duration clock_error) noexcept {
+  if (!take(lock_->try_lock())) return kNoTid;
   PublisherCursors(slots_.header()).advance(sample, newest() + 1);
-  return {Attempt::Outcome::written, write_locked(payload, time, clock_error)};
+  return write_locked(payload, time, clock_error);
 }
 
 [[gnu::hot]] Tid RingWriter::write_locked(std::span<const std::byte> payload, Time time,

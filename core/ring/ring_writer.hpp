@@ -21,7 +21,6 @@
 #include "core/ring/bell.hpp"
 #include "core/ring/publisher_cursors.hpp"
 #include "core/ring/ring_memory.hpp"
-#include "core/ring/robust_lock.hpp"
 #include "core/ring/slot_writer.hpp"
 
 namespace dssm::ring {
@@ -47,16 +46,9 @@ class RingWriter {
 
   // Writes one sample for a publisher on another PC and advances its cursor (PublisherCursors).
   // Does not wait for another writer: dssmd's loop must not wait for a program.
-  struct Attempt {
-    enum class Outcome : unsigned char {
-      written,
-      busy,     // another writer has the lock: try again soon
-      refused,  // a program has damaged the lock
-    } outcome;
-    Tid tid;
-  };
-  Attempt try_publish(const PublishedSample& sample, std::span<const std::byte> payload, Time time,
-                      Duration clock_error) noexcept;
+  //   returns  its tid; kNoTid when another writer has the lock: try again soon
+  Tid try_publish(const PublishedSample& sample, std::span<const std::byte> payload, Time time,
+                  Duration clock_error) noexcept;
 
   // In place: begin() takes the lock and gives the next slot's payload (nullptr when write() would
   // fail); then exactly one of commit() and cancel(), in the same thread.

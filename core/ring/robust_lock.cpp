@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cerrno>
+#include <ctime>
 
 #include "core/base/time.hpp"
 #include "core/base/try.hpp"
@@ -25,6 +26,8 @@ static_assert(kLockBytes == kNodeAfterWord - sizeof(void*));
 
 // Sleepers look again after this time: whoever may map the word can take a sleeper off its queue.
 constexpr Duration kMaxSleepOnWord = std::chrono::milliseconds(20);
+
+constexpr Duration kClaimPause = std::chrono::microseconds(100);
 
 constexpr std::uintptr_t kFlag = 1;  // in a pointer to a node of glibc: its mutex inherits priority
 
@@ -80,8 +83,9 @@ LockResult take_word(std::atomic<std::uint32_t>& word, std::uint32_t id, std::ui
   }
 }
 
-void release_word(std::atomic<std::uint32_t>& word) noexcept {
-  if (word.exchange(0, std::memory_order_release) & FUTEX_WAITERS) {
+// state: 0, or FUTEX_OWNER_DIED
+void give_back(std::atomic<std::uint32_t>& word, std::uint32_t state) noexcept {
+  if (word.exchange(state, std::memory_order_release) & FUTEX_WAITERS) {
     ::syscall(SYS_futex, &word, FUTEX_WAKE, 1, nullptr, nullptr, 0);
   }
 }
@@ -148,21 +152,38 @@ RobustLock::Private& RobustLock::own() const noexcept {
   LockResult result = LockResult::locked;
   std::uint32_t found = 0;
   if (!word().compare_exchange_strong(found, self.id, std::memory_order_acquire)) {
-    const Duration patience = own.was_in_vain ? kMaxWaitAgain : kMaxWait;
-    result = take_word(word(), self.id, found, may_wait ? deadline_in(patience) : MonoTime::min());
-    if (may_wait) own.was_in_vain = result == LockResult::busy;
+    result = take_slowly(self.id, may_wait);
+  } else if (!own.claim(self.id)) {
+    give_back(word(), 0);
+    result = take_slowly(self.id, may_wait);
   }
-  if (result != LockResult::busy) {
-    if (own.claim(self.id)) {
-      own.link(*self.list);
-    } else {
-      release_word(word());
-      result = LockResult::refused;
-    }
-  }
+  if (result != LockResult::busy) own.link(*self.list);
   compiler_barrier();
   self.list->list_op_pending = nullptr;
   return result;
+}
+
+LockResult RobustLock::take_slowly(std::uint32_t id, bool may_wait) const noexcept {
+  Private& own = this->own();
+  const MonoTime deadline = may_wait
+                                ? deadline_in(own.was_in_vain ? kMaxWaitAgain : kMaxWait)
+                                : MonoTime::min();
+  for (;;) {
+    LockResult result =
+        take_word(word(), id, word().load(std::memory_order_relaxed), deadline);
+    if (result != LockResult::busy && !own.claim(id)) {
+      // The other thread is about to end, or another process has changed the word.
+      give_back(word(), result == LockResult::recovered ? FUTEX_OWNER_DIED : 0);
+      result = LockResult::busy;
+      if (MonoClock::now() < deadline) {
+        const timespec pause = timespec_of(kClaimPause);
+        ::nanosleep(&pause, nullptr);
+        continue;
+      }
+    }
+    if (may_wait) own.was_in_vain = result == LockResult::busy;
+    return result;
+  }
 }
 
 [[gnu::hot]] LockResult RobustLock::lock() const noexcept { return take(true); }
@@ -175,7 +196,7 @@ RobustLock::Private& RobustLock::own() const noexcept {
   compiler_barrier();
   own.unlink(list);
   own.holder.store(0, std::memory_order_release);
-  release_word(word());
+  give_back(word(), 0);
   compiler_barrier();
   list.list_op_pending = nullptr;
 }

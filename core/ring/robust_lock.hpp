@@ -34,7 +34,6 @@ enum class LockResult : unsigned char {
   locked,
   recovered,  // locked; the last holder died: repair what it left
   busy,       // another thread holds it
-  refused,    // a program with write access has damaged it
 };
 
 // A mapped lock. Thread-safe; of this process's threads as of all others, one holds it.
@@ -65,6 +64,7 @@ class RobustLock {
   std::atomic<std::uint32_t>& word() const noexcept;
   Private& own() const noexcept;
   LockResult take(bool may_wait) const noexcept;
+  LockResult take_slowly(std::uint32_t id, bool may_wait) const noexcept;
   SharedMapping mapping_;
 };
 

@@ -122,10 +122,12 @@ SamplePump::SamplePump(const ring::RingMapping& mapping, FrameConnection& connec
       case SendStatus::not_in_ring:
         // Overwritten since choose_next(), or the slot holds invalid values.
         ++samples;
-        if ((thins() && !fills_) || at < reader_.oldest()) break;
+        if (at < reader_.oldest()) break;
         if (fills_) {
           lose({at, at + 1});
           back_fill_.begin = at + 1;
+        } else if (thins() && !plan_.newest_first) {
+          next_ = at + 1;  // no gap: what is left out is not reported
         } else {
           lose_up_to(at + 1);
         }

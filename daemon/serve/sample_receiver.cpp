@@ -54,8 +54,11 @@ bool SampleReceiver::is_done_with(const wire::IncomingSample& sample) {
 
 Result<void> SampleReceiver::on_sample_end(const wire::IncomingSample& sample, bool torn) {
   sample_ = sample;
-  if (!dropping_ && !torn) return write();
-  note_done();
+  if (dropping_ || torn) {
+    note_done();
+  } else {
+    write();
+  }
   return {};
 }
 
@@ -67,42 +70,29 @@ void SampleReceiver::note_done() {
   }
 }
 
-Result<void> SampleReceiver::write() {
-  using Outcome = ring::RingWriter::Attempt::Outcome;
+void SampleReceiver::write() {
   // The publisher may have come back on another connection while this one was cut in the middle of
   // the sample, and have sent it there, and more.
-  if (is_done_with(sample_)) {
-    note_done();
-    return {};
-  }
-  const ring::RingWriter::Attempt attempt = writer_->writer().try_publish(
+  if (is_done_with(sample_)) return note_done();
+  const Tid tid = writer_->writer().try_publish(
       {publisher_, sample_.info.tid},
       std::as_const(payload_).span().first(sample_.info.payload_bytes), sample_.info.time,
       sample_.info.clock_error);
-  switch (attempt.outcome) {
-    case Outcome::written:
-      break;
-    case Outcome::busy:
-      waiting_ = true;
-      link_.pause();
-      retry_timer_.enable_in(retry_);
-      retry_ = std::min(2 * retry_, kMaxRetryPause);
-      return {};
-    case Outcome::refused:
-      return Error{Errc::system,
-                   "write to '" + stream_.stream().id().str() +
-                       "': a program has damaged the lock of its ring; remove the stream (dssmctl "
-                       "rm) and create it again"};
+  if (tid == kNoTid) {
+    waiting_ = true;
+    link_.pause();
+    retry_timer_.enable_in(retry_);
+    retry_ = std::min(2 * retry_, kMaxRetryPause);
+    return;
   }
   retry_ = kFirstRetry;
   written_ = true;
   note_done();
-  return {};
 }
 
 void SampleReceiver::try_again() {
   waiting_ = false;
-  if (Result<void> written = write(); !written) return link_.close_with(written.error());
+  write();
   if (waiting_) return;
   acknowledge();
   link_.resume();

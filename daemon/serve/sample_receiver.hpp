@@ -54,7 +54,7 @@ class SampleReceiver {
                  ServedStream& stream, std::shared_ptr<OwnWriter> writer, std::uint64_t publisher);
   bool is_done_with(const wire::IncomingSample& sample);
   void note_done();
-  Result<void> write();
+  void write();
   void try_again();
   void answer(std::uint64_t serial);
 

@@ -248,7 +248,7 @@ TEST(Bell, WakesASleeperForEachSample) {
   RingWriter writer = ring.writer();
   for (Tid tid = 0; tid < kCount; ++tid) {
     writer.write(payload_for(tid, 8), time_from_ns(tid), 0ns);
-    // Lock-step: a wake-up that were lost would stand out as a second of kMaxSleep each time.
+    // Lock-step: a wake-up that were lost would stand out as a second each time.
     while (seen.load() < tid) std::this_thread::yield();
   }
   sleeper.join();
@@ -271,9 +271,25 @@ TEST(Bell, SleepersCheckTheRingThoughNoWriterRings) {
   const TestRing ring(8, 4);
   for (const MonoTime deadline : {kNever, deadline_in(std::chrono::hours(1))}) {
     const MonoTime begin = MonoClock::now();
-    EXPECT_EQ(ring.bell->sleep(ring.bell->announce(), deadline), WaitStatus::ready);
-    EXPECT_GE(MonoClock::now() - begin, kMaxSleep);
+    EXPECT_EQ(ring.bell->sleep(ring.bell->announce(), deadline, 5ms), WaitStatus::ready);
+    EXPECT_GE(MonoClock::now() - begin, 5ms);
   }
+}
+
+TEST(SleepTimes, BeginWithTwoCyclesAndGrowToASecond) {
+  const auto times_of = [](Duration cycle) {
+    SleepTimes times(cycle);
+    std::vector<Duration> first;
+    for (int i = 0; i < 4; ++i) first.push_back(times.next());
+    return first;
+  };
+  using Times = std::vector<Duration>;
+  EXPECT_EQ(times_of(10ms), (Times{20ms, 40ms, 80ms, 160ms}));
+  EXPECT_EQ(times_of(200ms), (Times{400ms, 800ms, 1s, 1s}));
+  for (const Duration strange : {Duration::min(), Duration(0), Duration(1)}) {
+    EXPECT_EQ(times_of(strange), (Times{2ms, 4ms, 8ms, 16ms}));
+  }
+  EXPECT_EQ(times_of(Duration::max()), (Times{1s, 1s, 1s, 1s}));
 }
 
 TEST(Bell, SleepReturnsWhenItRangSinceTheAnnouncement) {

@@ -547,6 +547,24 @@ TEST(SamplePump, ReportsNoGapWhenAThinnedStreamLapsIt) {
   EXPECT_TRUE(rig.gaps.empty());
 }
 
+// A program with write access can make `top` name a slot that holds nothing.
+TEST(SamplePump, WaitsAlsoWhenTheNewestSampleIsNone) {
+  for (const bool newest_first : {false, true}) {
+    for (const double rate_hz : {0.0, 50.0}) {
+      SCOPED_TRACE(testing::Message() << "newest first " << newest_first << ", rate " << rate_hz);
+      PumpRig rig(kSmall, 8);
+      rig.newest_first = newest_first;
+      rig.write(3);
+      SamplePump::Plan plan{0, 2, rate_hz};
+      plan.newest_first = newest_first;
+      rig.start(plan);
+      EXPECT_EQ(rig.run_on(kStart), PumpWait::sample);
+      rig.ring.mapping->header().top = 5;
+      EXPECT_EQ(rig.run_on(kStart + 1s), PumpWait::sample);
+    }
+  }
+}
+
 // --- the newest first
 
 class NewestFirst : public testing::Test {
