@@ -100,7 +100,7 @@ void Notifier::run() {
     if (changed) times = ring::SleepTimes(shortest_cycle);
     if (changed) continue;
     // Rings of readers that are destroyed meanwhile stay mapped until the next wake-up.
-    [[maybe_unused]] const WaitStatus woken = ring::Bell::sleep_any(bells, announced, kNever, times.next());
+    [[maybe_unused]] const WaitStatus woken = ring::Bell::sleep_any(bells, announced, kNever, times.next(MonoClock::now()));
   }
 }
 

@@ -28,7 +28,7 @@ WaitStatus wait_until(const detail::SharedRing& ring, MonoTime deadline, Ready r
   for (;;) {
     const std::uint32_t announced = ring.bell->announce();
     if (ready()) return WaitStatus::ready;
-    const WaitStatus status = ring.bell->sleep(announced, deadline, times.next());
+    const WaitStatus status = ring.bell->sleep(announced, deadline, times.next(MonoClock::now()));
     if (ready()) return WaitStatus::ready;
     if (status != WaitStatus::ready) return status;
   }
@@ -412,7 +412,7 @@ WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noex
     if (ready()) return WaitStatus::ready;
     const WaitStatus status =
         ring::Bell::sleep_any(std::span(bells).first(readers.size()), announced, deadline,
-                              times.next());
+                              times.next(MonoClock::now()));
     if (ready()) return WaitStatus::ready;
     if (status != WaitStatus::ready) return status;
   }

@@ -17,7 +17,6 @@
 #include <dssm/sample.hpp>
 #include <memory>
 #include <span>
-#include <utility>
 
 #include "core/base/sealed_memory.hpp"
 #include "core/ring/layout.hpp"
@@ -25,8 +24,9 @@
 namespace dssm::ring {
 
 // How long a thread that waits for samples sleeps before it checks the ring, whether or not a writer
-// woke it: two cycles of the stream, then twice as long each time. While samples come it is woken
-// before that, and without samples it soon sleeps kMaxSleep.
+// woke it: two cycles of the stream, later as long as it has waited. While samples come it is woken
+// before that, and without samples it soon sleeps kMaxSleep. By the time, not by the number of
+// sleeps: who can suppress wake-ups can end sleeps early, too.
 class SleepTimes {
  public:
   static constexpr Duration kMaxSleep = std::chrono::seconds(1);
@@ -34,12 +34,16 @@ class SleepTimes {
 
   // cycle: of the stream, or the shortest of several
   explicit SleepTimes(Duration cycle) noexcept
-      : next_(2 * std::clamp(cycle, kMinSleep / 2, kMaxSleep / 2)) {}
+      : least_(2 * std::clamp(cycle, kMinSleep / 2, kMaxSleep / 2)) {}
 
-  Duration next() noexcept { return std::exchange(next_, std::min(2 * next_, kMaxSleep)); }
+  Duration next(MonoTime now) noexcept {
+    if (begin_ == MonoTime{}) begin_ = now;
+    return std::clamp<Duration>(now - begin_, least_, kMaxSleep);
+  }
 
  private:
-  Duration next_;
+  Duration least_;
+  MonoTime begin_{};
 };
 
 // Creates the memory file of a bell page: size sealed, mode 0600.

@@ -24,12 +24,8 @@ std::string encode_frame(const google::protobuf::MessageLite& message) {
 }
 
 std::span<std::byte> FrameBuffer::space() {
-  constexpr std::size_t kMinSpace = 4096, kKeptBytes = 64 << 10;
-  if (begin_ == end_) {
-    begin_ = end_ = 0;
-    if (buffer_.size() > kKeptBytes)
-      buffer_ = std::vector<std::byte>();  // a rare large frame does not keep its memory
-  }
+  constexpr std::size_t kMinSpace = 4096;
+  if (begin_ == end_) begin_ = end_ = 0;
   if (buffer_.size() - end_ < kMinSpace) {
     if (begin_ > 0) {
       std::memmove(buffer_.data(), buffer_.data() + begin_, end_ - begin_);
@@ -43,6 +39,10 @@ std::span<std::byte> FrameBuffer::space() {
 }
 
 Result<std::optional<std::span<const std::byte>>> FrameBuffer::next() {
+  if (begin_ == end_ && buffer_.size() > kKeptBytes) {
+    buffer_ = std::vector<std::byte>();  // a rare large frame does not keep its memory
+    begin_ = end_ = 0;
+  }
   const std::span<const std::byte> input = std::span(buffer_).subspan(begin_, end_ - begin_);
   const std::byte* at = input.data();
   const std::byte* const end = at + input.size();

@@ -33,6 +33,10 @@ class FrameBuffer {
   std::span<std::byte> space();
   void commit(std::size_t bytes) noexcept { end_ += bytes; }
 
+  // Memory that it takes. More than kKeptBytes only until next() finds nothing left.
+  static constexpr std::size_t kKeptBytes = 64U << 10;
+  std::size_t capacity() const noexcept { return buffer_.capacity(); }
+
   // The next whole frame's message, without its length; nullopt when more input is needed. The view
   // holds until the next call of any member. Fails with `protocol` on a length that is too large or
   // not a varint; nothing after it can be read.

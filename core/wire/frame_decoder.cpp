@@ -22,6 +22,7 @@
 #include "core/base/check.hpp"
 #include "core/base/try.hpp"
 #include "core/wire/network_protocol.hpp"
+#include "core/wire/request_size.hpp"
 #include "core/wire/sample_frame.hpp"
 #include "core/wire/varint.hpp"
 
@@ -49,47 +50,6 @@ Error no_frame(fmt::format_string<Values...> text, Values&&... values) {
 
 Error too_long(std::uint64_t bytes, std::size_t limit) {
   return no_frame("a frame of {} bytes is longer than the {} that are taken", bytes, limit);
-}
-
-bool is_bulk(std::uint64_t field) noexcept {
-  return field == net::Frame::kPayloadFieldNumber || field == net::Frame::kSetPropertyFieldNumber ||
-         field == net::Frame::kPropertyFieldNumber;
-}
-
-// How much of a frame is not the inside of a payload or a property. Such bytes may cost a hundred
-// times their size in memory when they are parsed (two bytes make an empty Stream in a list), and
-// two allocations each.
-std::size_t plain_bytes(std::span<const std::byte> message) noexcept {
-  const std::byte* at = message.data();
-  const std::byte* const end = at + message.size();
-  std::size_t bulk = 0;
-  while (at != end) {
-    std::uint64_t tag = 0, value = 0;
-    if (read_varint(at, end, kMaxLengthBytes, tag) != VarintStatus::ok) return message.size();
-    std::uint64_t content = 0;
-    switch (tag & 7) {
-      case 0:
-        if (read_varint(at, end, kMaxVarintBytes, value) != VarintStatus::ok) return message.size();
-        break;
-      case 1:
-        content = 8;
-        break;
-      case 2:
-        if (read_varint(at, end, kMaxLengthBytes, content) != VarintStatus::ok) {
-          return message.size();
-        }
-        if (is_bulk(tag >> 3)) bulk += content;
-        break;
-      case 5:
-        content = 4;
-        break;
-      default:
-        return message.size();  // groups: no message of ours has them
-    }
-    if (content > static_cast<std::uint64_t>(end - at)) return message.size();
-    at += content;
-  }
-  return message.size() - bulk;
 }
 
 [[gnu::hot]] Result<void> check_sample(std::int64_t tid, std::uint64_t clock_error_ns) {
@@ -354,6 +314,7 @@ Result<void> FrameDecoder::take_whole(Bytes& input) {
 }
 
 Result<void> FrameDecoder::parse_whole(Bytes message) {
+  if (requests_only_) DSSM_TRY(check_request_size_untrusted(message));
   if (message.size() > kMaxPlainBytes && plain_bytes(message) > kMaxPlainBytes) {
     return no_frame("a frame of {} bytes has more than {} that are neither payload nor property",
                     message.size(), kMaxPlainBytes);

@@ -66,6 +66,10 @@ class FrameDecoder {
   FrameDecoder& operator=(const FrameDecoder&) = delete;
   ~FrameDecoder();
 
+  // Frames without a payload have to be requests: much shorter ones are taken
+  // (check_request_size_untrusted()).
+  void take_requests_only() noexcept { requests_only_ = true; }
+
   // From now on samples have at most so many bytes; a longer sample is an error.
   // 0 (at first): samples are refused.
   void set_payload_bytes(std::size_t payload_bytes) noexcept;
@@ -134,6 +138,7 @@ class FrameDecoder {
 
   FrameDelegate& delegate_;
   std::size_t max_frame_bytes_;
+  bool requests_only_ = false;
   std::size_t payload_bytes_ = 0;
   DecoderCounters counters_;
   std::array<iovec, 2> spaces_{};

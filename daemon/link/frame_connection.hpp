@@ -103,6 +103,9 @@ class FrameConnection final : private wire::FrameDelegate {
   // which outlives the connection; when it is used up, the connection closes itself.
   void set_budget(MemoryBudget& budget) noexcept { budget_ = &budget; }
 
+  // The other end may only send requests and samples (FrameDecoder).
+  void take_requests_only() noexcept { decoder_.take_requests_only(); }
+
   // What is sent counts there, and history follows it; it outlives the connection. Without it,
   // history is sent as fast as the connection takes it.
   void set_pace(HistoryPace& pace) noexcept { pace_ = &pace; }

@@ -8,6 +8,7 @@
 
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
+#include "core/wire/request_size.hpp"
 #include "daemon/base/message_ids.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 
@@ -67,6 +68,9 @@ void LocalService::disconnect(ClientNumber number) {
 bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
                                       DescriptorQueue& descriptors) {
   Client& client = clients_.at(number);
+  if (Result<void> checked = wire::check_request_size_untrusted(frame); !checked) {
+    return refuse(client, 0, checked.error());
+  }
   local::Request request;
   if (!request.ParseFromArray(frame.data(), static_cast<int>(frame.size()))) {
     return refuse(client, 0,

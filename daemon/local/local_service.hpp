@@ -65,6 +65,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   //   identity  without the program's name
   ClientNumber connect(const Identity& identity, ClientOutput& output);
   void disconnect(ClientNumber number);
+  bool has_greeted(ClientNumber number) const { return clients_.at(number).greeted; }
   std::size_t clients() const noexcept { return clients_.size(); }
 
   // One frame of a client, without its length. The response goes to its output before this returns,

@@ -92,17 +92,24 @@ Listener::~Listener() {
 // --- one connection
 
 Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
-                       LocalService& service, Logger& logger, std::function<void()> on_closed)
+                       LocalService& service, MemoryBudget& input_budget, Logger& logger,
+                       std::function<void()> on_closed)
     : socket_(std::move(socket)),
       service_(service),
       logger_(logger),
       on_closed_(std::move(on_closed)),
       number_(service.connect(identity, *this)),
       input_(wire::kMaxLocalFrameBytes),
+      input_budget_(input_budget),
       readable_(EventSource::readable(loop, socket_.get(), [this] { on_readable(); })),
       writable_(EventSource::writable(loop, socket_.get(), [this] { on_writable(); })),
-      next_turn_(EventSource::timer(loop, [this] { serve_frames(); })) {
+      next_turn_(EventSource::timer(loop, [this] { serve_frames(); })),
+      greeting_timeout_(EventSource::timer(loop, [this] {
+        if (service_.has_greeted(number_)) return;
+        end_with({Errc::protocol, "a program connected and sent no Hello for 10 s"});
+      })) {
   readable_.enable();
+  greeting_timeout_.enable_in(kLocalHelloTimeout);
 }
 
 Connection::~Connection() {
@@ -116,7 +123,24 @@ void Connection::on_readable() {
   if (got->status == wire::IoStatus::would_block) return;
   if (got->status == wire::IoStatus::end) return close();
   input_.commit(got->bytes);
-  if (take_descriptors(std::move(descriptors))) serve_frames();
+  if (charge_input() && take_descriptors(std::move(descriptors))) serve_frames();
+}
+
+bool Connection::charge_input() {
+  const std::size_t bytes =
+      input_.capacity() > wire::FrameBuffer::kKeptBytes ? input_.capacity() : 0;
+  if (bytes == input_share_.bytes()) return true;
+  input_share_ = {};
+  std::optional<MemoryShare> share = input_budget_.try_take(bytes);
+  if (share) {
+    input_share_ = *std::move(share);
+    return true;
+  }
+  end_with({Errc::limit_exceeded,
+            fmt::format("no memory is left to receive a request of more than {} bytes: the programs "
+                        "of this PC have begun requests of {} bytes; try again later",
+                        bytes / 2, input_budget_.limit())});
+  return false;
 }
 
 bool Connection::take_descriptors(std::vector<UniqueFd> arrived) {
@@ -133,14 +157,16 @@ bool Connection::take_descriptors(std::vector<UniqueFd> arrived) {
 }
 
 void Connection::serve_frames() {
+  const MonoTime begin = MonoClock::now();
   for (int served = 0; is_open() && !is_paused(); ++served) {
-    if (served == kRequestsPerTurn) {
+    if (served == kRequestsPerTurn || (served > 0 && MonoClock::now() - begin > kMaxTurn)) {
       readable_.disable();
       return next_turn_.enable_in(Duration::zero());
     }
     const auto frame = input_.next();
     if (!frame) return end_with(frame.error());
     if (!*frame) {
+      charge_input();  // less than before
       readable_.enable();
       return;
     }
@@ -213,6 +239,7 @@ void Connection::close() {
   readable_.disable();
   writable_.disable();
   next_turn_.disable();
+  greeting_timeout_.disable();
   socket_.reset();
   output_.clear();
   arrived_.clear();
@@ -257,7 +284,8 @@ Result<void> Server::accept(UniqueFd& socket) {
   identity.gid = peer.gid;
   const std::uint64_t number = next_++;
   connections_.emplace(number, std::make_unique<Connection>(loop_, std::move(socket), identity,
-                                                            service_, logger_, [this, number] {
+                                                            service_, input_budget_, logger_,
+                                                            [this, number] {
                                                               ended_.push_back(number);
                                                               sweep_.enable_in(Duration::zero());
                                                             }));

@@ -26,6 +26,7 @@
 #include "daemon/base/acceptor.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/base/memory_budget.hpp"
 #include "daemon/local/local_service.hpp"
 
 namespace dssm::daemon {
@@ -71,8 +72,16 @@ inline constexpr std::size_t kMaxQueuedDescriptors = 256;
 // Descriptors that a client sent and that no request has taken yet; more are an error.
 inline constexpr std::size_t kMaxUnclaimedDescriptors = 64;
 
-// Requests of one client served in a row before others get their turn.
+// Requests of one client served in a row before others get their turn: so many, or as many as are
+// begun in that time.
 inline constexpr int kRequestsPerTurn = 16;
+inline constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
+
+// For the Hello of a program.
+inline constexpr Duration kLocalHelloTimeout = std::chrono::seconds(10);
+
+// Memory for the long requests that all clients have begun to send. A property may have 16 MiB.
+inline constexpr std::size_t kMaxInputBytes = 256U << 20;
 
 // One client's socket: cuts its bytes into frames for LocalService and sends the responses. It
 // never waits for the client. What the client does not receive is queued up to kMaxQueuedBytes,
@@ -82,7 +91,8 @@ class Connection final : public ClientOutput {
   // on_closed: called once, when the connection ended by itself; the connection must not be
   // destroyed within it.
   Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
-             LocalService& service, Logger& logger, std::function<void()> on_closed);
+             LocalService& service, MemoryBudget& input_budget, Logger& logger,
+             std::function<void()> on_closed);
   Connection(const Connection&) = delete;
   Connection& operator=(const Connection&) = delete;
   ~Connection();
@@ -99,6 +109,7 @@ class Connection final : public ClientOutput {
   void on_readable();
   void on_writable();
   void serve_frames();
+  bool charge_input();
   bool take_descriptors(std::vector<UniqueFd> arrived);
   bool send_some(Outgoing& outgoing);
   void end_with(const Error& error);
@@ -112,10 +123,12 @@ class Connection final : public ClientOutput {
   std::function<void()> on_closed_;
   ClientNumber number_;
   wire::FrameBuffer input_;
+  MemoryBudget& input_budget_;
+  MemoryShare input_share_;
   DescriptorQueue arrived_;
   std::deque<Outgoing> output_;
   std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
-  EventSource readable_, writable_, next_turn_;
+  EventSource readable_, writable_, next_turn_, greeting_timeout_;
 };
 
 // Accepts the programs of this PC, within max_clients, and owns their connections.
@@ -135,6 +148,7 @@ class Server {
   const EventLoop& loop_;
   std::uint64_t max_clients_;
   LocalService& service_;
+  MemoryBudget input_budget_{kMaxInputBytes};
   Logger& logger_;
   std::uint64_t next_ = 0;
   std::map<std::uint64_t, std::unique_ptr<Connection>> connections_;

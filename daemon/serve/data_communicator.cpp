@@ -7,6 +7,7 @@
 #include <utility>
 
 #include "core/base/try.hpp"
+#include "core/wire/request_size.hpp"
 #include "daemon/base/message_ids.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 
@@ -20,6 +21,12 @@ constexpr std::uint64_t kReserveSliceBytes = 4U << 20;  // about 1 ms
 
 bool opens_a_stream(const net::Frame& request) noexcept {
   return request.has_open() || request.has_create();
+}
+
+// The most memory that a parsed request takes: of what is no property, two bytes may take 200.
+std::size_t parsed_bytes(const net::Frame& request) {
+  const std::size_t bytes = request.ByteSizeLong();
+  return bytes + 100 * std::min(bytes, wire::kMaxRequestBytes);
 }
 
 // Whether only a control connection takes `request`. A channel takes requests for properties too:
@@ -49,6 +56,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
           })),
       peer_timeout_(EventSource::timer(parts.loop, [this] { check_peer_timeout(); })) {
   link_.set_budget(place_.budget());
+  link_.take_requests_only();
   link_.set_pace(place_.pace());
   greeting_timeout_.enable_in(wire::kHelloTimeout);
 }
@@ -70,11 +78,19 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
     their_failure_ = wire::failure(frame.failure());
     return {};
   }
-  if (served_ < kRequestsPerTurn && can_serve()) {
+  if (served_ < kRequestsPerTurn && served_for_ < kMaxTurn && can_serve()) {
     serve(frame);
     return {};
   }
-  waiting_ = std::move(frame);
+  std::optional<MemoryShare> share = place_.budget().try_take(parsed_bytes(frame));
+  if (!share) {
+    return Error{Errc::limit_exceeded,
+                 fmt::format("no memory is left to keep a request of {} bytes until its turn: "
+                             "max_peer_memory = {} bytes are used up; read the answers faster, use "
+                             "fewer connections, or raise that key",
+                             frame.ByteSizeLong(), place_.budget().limit())};
+  }
+  waiting_ = {std::move(frame), *std::move(share)};
   link_.pause();
   // Otherwise work_now() serves it when what is in progress ends. History does not keep its pace
   // then.
@@ -115,7 +131,9 @@ void DataCommunicator::become_control() {
 
 void DataCommunicator::serve(const net::Frame& request) {
   ++served_;
+  const MonoTime begin = MonoClock::now();
   if (Result<void> done = dispatch(request); !done) send_failure(request.serial(), done.error());
+  served_for_ += MonoClock::now() - begin;
 }
 
 Result<void> DataCommunicator::check_access(const net::Frame& request) const {
@@ -281,13 +299,14 @@ void DataCommunicator::on_output_empty() { work_now(); }
   if (!link_.is_open()) return;
   if (std::exchange(turn_is_due_, false)) next_turn_.disable();
   served_ = 0;
+  served_for_ = {};
   if (opening_) {
     const std::uint64_t serial = opening_->serial;
     if (Result<void> opened = go_on_opening(); !opened) send_failure(serial, opened.error());
   }
   if (waiting_ && can_serve()) {
-    const net::Frame request = *std::exchange(waiting_, std::nullopt);
-    serve(request);
+    const Waiting waiting = *std::exchange(waiting_, std::nullopt);
+    serve(waiting.request);
     link_.resume();
   }
   if (channel_) {

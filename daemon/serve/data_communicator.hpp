@@ -60,8 +60,10 @@ class StreamWatch {
 
 class DataCommunicator final : private FrameConnection::Observer, private StreamChannel::Observer {
  public:
-  // Requests of one connection served in a row before others get their turn.
+  // Requests of one connection served in a row before others get their turn: so many, or as many as
+  // are begun in that time.
   static constexpr int kRequestsPerTurn = 16;
+  static constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
   // Answers and events that may wait for one connection: the longest answer is a property.
   static constexpr std::size_t kMaxQueuedBytes = wire::kMaxNetworkFrameBytes + (1U << 20);
 
@@ -146,8 +148,13 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   std::optional<wire::Greeting> them_;  // after their Hello
   Identity identity_;                   // likewise
   Error their_failure_;                 // the peer's final failure; empty: none
-  std::optional<net::Frame> waiting_;   // a request whose turn has not come; the link is paused
-  int served_ = 0;                      // in this turn
+  struct Waiting {
+    net::Frame request;
+    MemoryShare share;
+  };
+  std::optional<Waiting> waiting_;  // a request whose turn has not come; the link is paused
+  int served_ = 0;           // in this turn
+  Duration served_for_ = {};  // likewise
   bool is_control_ = false;
   CatalogRequests catalog_;
   std::unique_ptr<StreamWatch> watch_;

@@ -279,17 +279,23 @@ TEST(Bell, SleepersCheckTheRingThoughNoWriterRings) {
 TEST(SleepTimes, BeginWithTwoCyclesAndGrowToASecond) {
   const auto times_of = [](Duration cycle) {
     SleepTimes times(cycle);
+    MonoTime now{1h};
     std::vector<Duration> first;
-    for (int i = 0; i < 4; ++i) first.push_back(times.next());
+    for (int i = 0; i < 4; ++i) now += first.emplace_back(times.next(now));
     return first;
   };
   using Times = std::vector<Duration>;
-  EXPECT_EQ(times_of(10ms), (Times{20ms, 40ms, 80ms, 160ms}));
-  EXPECT_EQ(times_of(200ms), (Times{400ms, 800ms, 1s, 1s}));
+  EXPECT_EQ(times_of(10ms), (Times{20ms, 20ms, 40ms, 80ms}));
+  EXPECT_EQ(times_of(200ms), (Times{400ms, 400ms, 800ms, 1s}));
   for (const Duration strange : {Duration::min(), Duration(0), Duration(1)}) {
-    EXPECT_EQ(times_of(strange), (Times{2ms, 4ms, 8ms, 16ms}));
+    EXPECT_EQ(times_of(strange), (Times{2ms, 2ms, 4ms, 8ms}));
   }
   EXPECT_EQ(times_of(Duration::max()), (Times{1s, 1s, 1s, 1s}));
+}
+
+TEST(SleepTimes, DoNotGrowWhenSleepsEndEarly) {
+  SleepTimes times(1ms);
+  for (int i = 0; i < 100; ++i) EXPECT_EQ(times.next(MonoTime{1h}), 2ms);
 }
 
 TEST(Bell, SleepReturnsWhenItRangSinceTheAnnouncement) {

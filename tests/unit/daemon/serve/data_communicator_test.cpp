@@ -428,6 +428,34 @@ TEST(ChannelServer, BoundsTheMemoryOfAHost) {
   rig.connect(peers[4], true, true, 3);  // others do not notice
 }
 
+TEST(DataCommunicator, ChargesARequestThatWaits) {
+  ServerRig rig({100, 100, 1U << 20});
+  MemoryPeer peer;
+  rig.connect(peer);
+  peer.room = 0;
+  peer.put(list_request(1));
+  net::Frame request;
+  request.set_serial(2);
+  request.mutable_set_property()->mutable_id()->set_name("odometry");
+  request.mutable_set_property()->set_property(std::string(400'000, 'x'));
+  peer.put(request);
+  rig.turns(20);
+  EXPECT_TRUE(peer.closed);
+  EXPECT_TRUE(rig.logger.contains("to keep a request of 400"));
+}
+
+TEST(DataCommunicator, ParsesNoRequestThatIsTooLong) {
+  ServerRig rig;
+  MemoryPeer peer;
+  rig.connect(peer);
+  net::Frame request;
+  request.set_serial(2);
+  for (int i = 0; i < 5000; ++i) request.mutable_create()->mutable_type()->add_fields();
+  *request.mutable_create()->mutable_type()->mutable_name() = std::string(10'000, 'x');
+  peer.put(request);
+  EXPECT_NE(final_failure(rig, peer).find("a type of 5000 fields"), std::string::npos);
+}
+
 TEST(ChannelServer, NotifiesConnectedPeersThatItStops) {
   MemoryPeer peer;
   {

@@ -1,0 +1,28 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What a message would cost, found before protobuf parses it: two bytes may make an object of a
+// hundred, with an allocation or two. So there are limits on the bytes that may do so, in both
+// protocols.
+#pragma once
+
+#include <cstddef>
+#include <dssm/result.hpp>
+#include <span>
+
+namespace dssm::wire {
+
+inline constexpr std::size_t kMaxRequestBytes = 16U << 10;  // without a property
+// The same of a Create: its type has up to kMaxFields fields. More of them are refused with an
+// answer, far more before they are parsed.
+inline constexpr std::size_t kMaxCreateBytes = 256U << 10;
+inline constexpr std::size_t kMaxParsedFields = 4096;
+
+// How much of a message of either protocol is not the inside of a payload or a property. The whole,
+// when it is no message.
+std::size_t plain_bytes(std::span<const std::byte> message) noexcept;
+
+// Whether a request may be parsed: about 1.5 ms at most.
+//   fails  protocol
+Result<void> check_request_size_untrusted(std::span<const std::byte> message);
+
+}  // namespace dssm::wire
