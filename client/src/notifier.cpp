@@ -42,7 +42,7 @@ void ReadyFd::clear() noexcept {
 }
 
 Result<std::unique_ptr<Notifier>> Notifier::start() {
-  const UniqueFd fd = DSSM_TRY(ring::create_bell());
+  const UniqueFd fd = DSSM_TRY(ring::create_bell("notifier"));
   std::unique_ptr<Notifier> notifier(new Notifier);
   notifier->control_ = DSSM_TRY(ring::Bell::open_untrusted(fd.get()));
   notifier->thread_ =
@@ -100,7 +100,8 @@ void Notifier::run() {
     if (changed) times = ring::SleepTimes(shortest_cycle);
     if (changed) continue;
     // Rings of readers that are destroyed meanwhile stay mapped until the next wake-up.
-    [[maybe_unused]] const WaitStatus woken = ring::Bell::sleep_any(bells, announced, kNever, times.next(MonoClock::now()));
+    [[maybe_unused]] const WaitStatus woken =
+        ring::Bell::sleep_any(bells, announced, kNever, times.next(MonoClock::now()));
   }
 }
 

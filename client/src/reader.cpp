@@ -410,9 +410,8 @@ WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noex
       announced[i] = bells[i]->announce();
     }
     if (ready()) return WaitStatus::ready;
-    const WaitStatus status =
-        ring::Bell::sleep_any(std::span(bells).first(readers.size()), announced, deadline,
-                              times.next(MonoClock::now()));
+    const WaitStatus status = ring::Bell::sleep_any(
+        std::span(bells).first(readers.size()), announced, deadline, times.next(MonoClock::now()));
     if (ready()) return WaitStatus::ready;
     if (status != WaitStatus::ready) return status;
   }

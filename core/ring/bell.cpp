@@ -36,7 +36,9 @@ WaitStatus outcome(long result, int error, MonoTime deadline) noexcept {
 
 }  // namespace
 
-Result<UniqueFd> create_bell() { return create_sealed_memory("dssm-bell", sizeof(BellPage), 0600); }
+Result<UniqueFd> create_bell(const std::string& label) {
+  return create_sealed_memory("dssm-bell:" + label, sizeof(BellPage), 0600);
+}
 
 Result<std::shared_ptr<Bell>> Bell::open_untrusted(int fd) {
   SharedMapping mapping =
@@ -56,7 +58,8 @@ Result<std::shared_ptr<Bell>> Bell::open_untrusted(int fd) {
   }
 }
 
-[[gnu::hot]] WaitStatus Bell::sleep(std::uint32_t announced, MonoTime deadline, Duration at_most) noexcept {
+[[gnu::hot]] WaitStatus Bell::sleep(std::uint32_t announced, MonoTime deadline,
+                                    Duration at_most) noexcept {
   if (deadline == kNever) {  // without asking for the time
     const timespec longest = timespec_of(at_most);
     const long result =

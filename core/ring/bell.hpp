@@ -2,8 +2,8 @@
 //
 // The bell: a word in shared memory through which a writer wakes the threads that wait for samples
 // of its stream. Readers cannot write to the ring, so the word is in a page of its own, which all
-// programs that use the stream map writable. A hostile reader can clear it, or take sleepers off the
-// kernel's queue (FUTEX_REQUEUE), so sleepers also check the ring by themselves (SleepTimes).
+// programs that use the stream map writable. A hostile reader can clear it, or take sleepers off
+// the kernel's queue (FUTEX_REQUEUE), so sleepers also check the ring by themselves (SleepTimes).
 //
 // Protocol (docs/ring-layout.md "Bell page"): bit 0 of `word` means that a thread sleeps, the other
 // bits count notifications. A sleeper sets bit 0, checks the ring again, and waits in the kernel
@@ -17,16 +17,17 @@
 #include <dssm/sample.hpp>
 #include <memory>
 #include <span>
+#include <string>
 
 #include "core/base/sealed_memory.hpp"
 #include "core/ring/layout.hpp"
 
 namespace dssm::ring {
 
-// How long a thread that waits for samples sleeps before it checks the ring, whether or not a writer
-// woke it: two cycles of the stream, later as long as it has waited. While samples come it is woken
-// before that, and without samples it soon sleeps kMaxSleep. By the time, not by the number of
-// sleeps: who can suppress wake-ups can end sleeps early, too.
+// How long a thread that waits for samples sleeps before it checks the ring, whether or not a
+// writer woke it: two cycles of the stream, later as long as it has waited. While samples come it
+// is woken before that, and without samples it soon sleeps kMaxSleep. By the time, not by the
+// number of sleeps: who can suppress wake-ups can end sleeps early, too.
 class SleepTimes {
  public:
   static constexpr Duration kMaxSleep = std::chrono::seconds(1);
@@ -47,7 +48,8 @@ class SleepTimes {
 };
 
 // Creates the memory file of a bell page: size sealed, mode 0600.
-Result<UniqueFd> create_bell();
+//   label  RingIdentity::label() of its ring
+Result<UniqueFd> create_bell(const std::string& label);
 
 // A mapped bell page. Shared by shared_ptr; thread-safe.
 class Bell {

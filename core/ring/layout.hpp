@@ -69,7 +69,7 @@ static_assert(sizeof(PublisherCursor) == 40);
 //    88    40 name             -      dssmd       zero-terminated
 //   128    64 host             -      dssmd       zero-terminated
 //   192   256 reserved         -      -           zero
-//   448     4 doorbell_armed   -      dssmd       seq_cst; not 0: writers also write to their eventfds
+//   448     4 doorbell_armed   -      dssmd       seq_cst; not 0: writers ring their doorbells
 //   452    60 reserved         -      -           zero
 //   512     8 top              tid    writer      seq_cst after the sample; -1: nothing written
 //   520     8 run_start        tid    writer      before top; see "Search by time"
@@ -80,8 +80,8 @@ static_assert(sizeof(PublisherCursor) == 40);
 //   640  2560 publishers       -      dssmd       before top: see publisher_cursors.hpp
 //  3200   200 clock            -      dssmd       see clock_assessment.hpp, shared_snapshot.hpp
 //  3400   672 reserved         -      -           zero
-//  4072    24 lock             -      writers     see robust_lock.hpp. On a system with greater pages:
-//                                                 24 bytes before times_offset
+//  4072    24 lock             -      writers     see robust_lock.hpp. On a system with greater
+//                                             pages 24 bytes before times_offset
 struct RingHeader {
   std::uint64_t magic;
   std::uint32_t layout_version;

@@ -55,10 +55,12 @@ std::string text_of(const char* field, std::size_t capacity) {
 
 }  // namespace
 
+std::string RingIdentity::label() const { return fmt::format("{}#{:x}", id.str(), incarnation); }
+
 Result<UniqueFd> create_ring(const RingIdentity& identity, const Geometry& geometry) {
   const std::string what = "create a ring for '" + identity.id.str() + "'";
   UniqueFd fd = DSSM_TRY(
-      create_sealed_memory("dssm-ring:" + identity.id.str(), geometry.total_bytes, 0400), what);
+      create_sealed_memory("dssm-ring:" + identity.label(), geometry.total_bytes, 0400), what);
   const SharedMapping mapping =
       DSSM_TRY(SharedMapping::map(fd.get(), sizeof(RingHeader), PROT_READ | PROT_WRITE), what);
   auto& header = mapping.as<RingHeader>();

@@ -42,6 +42,10 @@ struct RingIdentity {
   std::uint64_t incarnation = 0;  // random; differs between two rings of one name
   Duration cycle{};
   std::uint32_t alignment_bytes = 1;
+
+  // "odometry:0@pc1#57d6e9a3": in the names of a stream's memory files, which nobody can change. It
+  // tells which files belong together.
+  std::string label() const;
 };
 
 enum class Access : unsigned char { read_only, read_write };

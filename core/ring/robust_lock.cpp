@@ -165,12 +165,10 @@ RobustLock::Private& RobustLock::own() const noexcept {
 
 LockResult RobustLock::take_slowly(std::uint32_t id, bool may_wait) const noexcept {
   Private& own = this->own();
-  const MonoTime deadline = may_wait
-                                ? deadline_in(own.was_in_vain ? kMaxWaitAgain : kMaxWait)
-                                : MonoTime::min();
+  const MonoTime deadline =
+      may_wait ? deadline_in(own.was_in_vain ? kMaxWaitAgain : kMaxWait) : MonoTime::min();
   for (;;) {
-    LockResult result =
-        take_word(word(), id, word().load(std::memory_order_relaxed), deadline);
+    LockResult result = take_word(word(), id, word().load(std::memory_order_relaxed), deadline);
     if (result != LockResult::busy && !own.claim(id)) {
       // The other thread is about to end, or another process has changed the word.
       give_back(word(), result == LockResult::recovered ? FUTEX_OWNER_DIED : 0);

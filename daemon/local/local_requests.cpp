@@ -332,7 +332,8 @@ Reply LocalRequests::record_open(const OpenEntry& entry) {
 //   fails  limit_exceeded (opens), os errors; then nothing is recorded
 Result<Reply> LocalRequests::opened(const OpenEntry& entry) {
   DSSM_TRY(opens_.check_quota(*entry.client));
-  std::vector<UniqueFd> descriptors = DSSM_TRY(entry.stream->descriptors_for(entry.role, entry.client->number));
+  std::vector<UniqueFd> descriptors =
+      DSSM_TRY(entry.stream->descriptors_for(entry.role, entry.client->number));
   Reply reply = record_open(entry);
   reply.descriptors = std::move(descriptors);
   return reply;

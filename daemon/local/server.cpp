@@ -136,10 +136,11 @@ bool Connection::charge_input() {
     input_share_ = *std::move(share);
     return true;
   }
-  end_with({Errc::limit_exceeded,
-            fmt::format("no memory is left to receive a request of more than {} bytes: the programs "
-                        "of this PC have begun requests of {} bytes; try again later",
-                        bytes / 2, input_budget_.limit())});
+  end_with(
+      {Errc::limit_exceeded,
+       fmt::format("no memory is left to receive a request of more than {} bytes: the programs "
+                   "of this PC have begun requests of {} bytes; try again later",
+                   bytes / 2, input_budget_.limit())});
   return false;
 }
 
@@ -283,12 +284,12 @@ Result<void> Server::accept(UniqueFd& socket) {
   identity.uid = peer.uid;
   identity.gid = peer.gid;
   const std::uint64_t number = next_++;
-  connections_.emplace(number, std::make_unique<Connection>(loop_, std::move(socket), identity,
-                                                            service_, input_budget_, logger_,
-                                                            [this, number] {
-                                                              ended_.push_back(number);
-                                                              sweep_.enable_in(Duration::zero());
-                                                            }));
+  connections_.emplace(number,
+                       std::make_unique<Connection>(loop_, std::move(socket), identity, service_,
+                                                    input_budget_, logger_, [this, number] {
+                                                      ended_.push_back(number);
+                                                      sweep_.enable_in(Duration::zero());
+                                                    }));
   return {};
 }
 

@@ -153,8 +153,8 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     MemoryShare share;
   };
   std::optional<Waiting> waiting_;  // a request whose turn has not come; the link is paused
-  int served_ = 0;           // in this turn
-  Duration served_for_ = {};  // likewise
+  int served_ = 0;                  // in this turn
+  Duration served_for_ = {};        // likewise
   bool is_control_ = false;
   CatalogRequests catalog_;
   std::unique_ptr<StreamWatch> watch_;

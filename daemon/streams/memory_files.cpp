@@ -44,6 +44,14 @@ Result<void> write_all(int fd, std::string_view bytes, std::uint64_t offset) {
   return {};
 }
 
+// What /proc shows of a descriptor.
+std::string link_of(int fd) {
+  char link[512];  // a memory file's name has at most 249 bytes
+  const std::string path = "/proc/self/fd/" + std::to_string(fd);
+  const ssize_t bytes = ::readlink(path.c_str(), link, sizeof link);
+  return bytes < 0 ? std::string() : std::string(link, static_cast<std::size_t>(bytes));
+}
+
 // False when the file ends before.
 bool read_all(int fd, char* to, std::size_t bytes, std::uint64_t offset) noexcept {
   while (bytes > 0) {
@@ -101,16 +109,20 @@ Result<void> check_own_memory_file(int fd, int seals, std::string_view what) {
   return {};
 }
 
+std::string memory_file_name(int fd) {
+  constexpr std::string_view kBefore = "/memfd:", kAfter = " (deleted)";
+  const std::string link = link_of(fd);
+  if (!link.starts_with(kBefore) || !link.ends_with(kAfter)) return {};
+  return link.substr(kBefore.size(), link.size() - kBefore.size() - kAfter.size());
+}
+
 DescriptorKind kind_of_untrusted(int fd) {
-  char link[128] = {};  // cut off after the part that is compared
-  const std::string path = "/proc/self/fd/" + std::to_string(fd);
-  if (::readlink(path.c_str(), link, sizeof link - 1) < 0) return DescriptorKind::other;
-  const std::string_view name(link);
-  if (name.starts_with("/memfd:dssm-ring:")) return DescriptorKind::ring;
-  if (name.starts_with("/memfd:dssm-bell ")) return DescriptorKind::bell;
-  if (name.starts_with("/memfd:dssm-meta ")) return DescriptorKind::meta;
-  if (name.starts_with("/memfd:dssm-playback-clock ")) return DescriptorKind::playback_clock;
-  if (name == "anon_inode:[eventfd]") return DescriptorKind::doorbell;
+  const std::string name = memory_file_name(fd);
+  if (name.starts_with("dssm-ring:")) return DescriptorKind::ring;
+  if (name.starts_with("dssm-bell:")) return DescriptorKind::bell;
+  if (name.starts_with("dssm-meta:")) return DescriptorKind::meta;
+  if (name == "dssm-playback-clock") return DescriptorKind::playback_clock;
+  if (link_of(fd) == "anon_inode:[eventfd]") return DescriptorKind::doorbell;
   return DescriptorKind::other;
 }
 
@@ -129,8 +141,8 @@ Result<UniqueFd> duplicate(int fd) {
 
 // --- meta files
 
-Result<MetaFile> MetaFile::create(const local::StreamMeta& meta) {
-  MetaFile file(DSSM_TRY(create_sealed_memory("dssm-meta", 0, 0400, kMetaSeals)));
+Result<MetaFile> MetaFile::create(const local::StreamMeta& meta, const std::string& label) {
+  MetaFile file(DSSM_TRY(create_sealed_memory("dssm-meta:" + label, 0, 0400, kMetaSeals)));
   DSSM_TRY(file.write_header(MetaHeader{}));
   DSSM_TRY(file.replace(meta));
   return file;

@@ -7,6 +7,7 @@
 #include <cstddef>
 #include <cstdint>
 #include <dssm/result.hpp>
+#include <string>
 #include <string_view>
 
 #include "core/base/unique_fd.hpp"
@@ -19,6 +20,9 @@ namespace dssm::daemon {
 // "ring".
 //   fails  protocol (not a sealed memory file), no_permission (another user's)
 Result<void> check_own_memory_file(int fd, int seals, std::string_view what);
+
+// The name that a memory file was created with, which nobody can change; empty for other files.
+std::string memory_file_name(int fd);
 
 // What dssmd uses a descriptor for, by the name of its file alone: not checked.
 enum class DescriptorKind : unsigned char { other, ring, bell, meta, doorbell, playback_clock };
@@ -68,7 +72,8 @@ static_assert(offsetof(MetaHeader, offset_bytes) == 16 && sizeof(MetaHeader) == 
 class MetaFile {
  public:
   // Creates one that holds `meta`.
-  static Result<MetaFile> create(const local::StreamMeta& meta);
+  //   label  RingIdentity::label() of the stream's ring
+  static Result<MetaFile> create(const local::StreamMeta& meta, const std::string& label);
 
   // Opens one that an earlier run of dssmd created; `fd` may be for reading only. Fails with
   // `protocol` when it is not a meta file, no_permission when another user created it.

@@ -11,6 +11,7 @@
 #include <cerrno>
 #include <iterator>
 
+#include "core/base/quiet_thread.hpp"
 #include "core/base/sealed_memory.hpp"
 #include "core/base/try.hpp"
 #include "core/ring/bell.hpp"
@@ -96,6 +97,18 @@ Result<Stream::Plan> plan_untrusted(const local::StreamMeta& meta,
                       ring.incarnation};
 }
 
+// A program that may write to a ring can change what its header says, and offer the bell or the
+// meta file of another stream with it.
+Result<void> check_label_untrusted(const OfferedFiles& files, const std::string& label) {
+  if (memory_file_name(files.ring.get()) == "dssm-ring:" + label &&
+      memory_file_name(files.bell.get()) == "dssm-bell:" + label &&
+      memory_file_name(files.meta.get()) == "dssm-meta:" + label) {
+    return {};
+  }
+  return Error{Errc::protocol,
+               fmt::format("the offered ring, bell and meta file are not those of '{}'", label)};
+}
+
 void fill_figures(const ring::RingMapping& mapping, StreamInfo& info) {
   const ring::RingReader reader(mapping);
   SampleInfo last;
@@ -125,14 +138,13 @@ Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& b
   MemoryShare share = DSSM_TRY(take_share(budget, plan.type, geometry));
   const std::uint64_t incarnation =
       DSSM_TRY(plan.incarnation != 0 ? Result(plan.incarnation) : new_incarnation());
-  UniqueFd ring = DSSM_TRY(
-      ring::create_ring({plan.id, incarnation, plan.cycle, plan.type.alignment_bytes}, geometry));
-  UniqueFd bell = DSSM_TRY(ring::create_bell());
-  MetaFile meta = DSSM_TRY(MetaFile::create(meta_of(plan, {})));
+  const ring::RingIdentity identity{plan.id, incarnation, plan.cycle, plan.type.alignment_bytes};
+  UniqueFd ring = DSSM_TRY(ring::create_ring(identity, geometry));
+  UniqueFd bell = DSSM_TRY(ring::create_bell(identity.label()));
+  MetaFile meta = DSSM_TRY(MetaFile::create(meta_of(plan, {}), identity.label()));
   auto mapping = DSSM_TRY(ring::RingMapping::open_untrusted(ring.get(), ring::Access::read_only));
-  return std::shared_ptr<Stream>(
-      new Stream(plan, Files{std::move(ring), std::move(bell)}, std::move(meta), std::move(mapping),
-                 std::move(share)));
+  return std::shared_ptr<Stream>(new Stream(plan, Files{std::move(ring), std::move(bell)},
+                                            std::move(meta), std::move(mapping), std::move(share)));
 }
 
 Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, MemoryBudget& budget) {
@@ -141,6 +153,7 @@ Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, Memo
   auto mapping =
       DSSM_TRY(ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_only));
   DSSM_TRY(ring::Bell::open_untrusted(files.bell.get()));
+  DSSM_TRY(check_label_untrusted(files, mapping->identity().label()));
   MetaFile meta = DSSM_TRY(MetaFile::open_untrusted(std::move(files.meta)));
   const local::StreamMeta content = DSSM_TRY(meta.read_untrusted());
   Plan plan = DSSM_TRY(plan_untrusted(content, *mapping));
@@ -154,6 +167,17 @@ Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, Memo
   stream->property_share_ = std::move(property_share);
   stream->take_doorbell_untrusted(files.client, std::move(files.doorbell));
   return stream;
+}
+
+// Freeing gigabytes takes most of a second, which the loop must not wait for.
+Stream::~Stream() {
+  if (mapping_->geometry().total_bytes < kFreedElsewhereBytes) return;
+  Result<std::thread> thread = quiet_thread(
+      "free a ring", [ring = std::move(files_.ring), mapping = std::move(mapping_)]() mutable {
+        mapping.reset();
+        ring.reset();
+      });
+  if (thread) thread->detach();
 }
 
 StreamInfo Stream::info() const {

@@ -90,6 +90,9 @@ class Stream : public std::enable_shared_from_this<Stream> {
 
   Stream(const Stream&) = delete;
   Stream& operator=(const Stream&) = delete;
+  // The memory of a ring from kFreedElsewhereBytes on is freed by a thread of its own.
+  ~Stream();
+  static constexpr std::uint64_t kFreedElsewhereBytes = 16U << 20;
 
   const StreamId& id() const noexcept { return plan_.id; }
   const TypeInfo& type() const noexcept { return plan_.type; }

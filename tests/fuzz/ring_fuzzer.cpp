@@ -24,7 +24,7 @@ constexpr std::uint64_t kPayloadBytes = 24, kDepth = 8;
 
 void fill(const UniqueFd& ring) {
   const auto mapping = RingMapping::open_untrusted(ring.get(), Access::read_write);
-  const auto bell_fd = create_bell();
+  const auto bell_fd = create_bell("fuzz");
   if (!mapping || !bell_fd) std::abort();
   const auto bell = Bell::open_untrusted(bell_fd->get());
   if (!bell) std::abort();

@@ -77,9 +77,9 @@ TEST(HostileWriter, HangsNoOtherByItsDoorbell) {
   const int doorbell = opened.descriptors[3].get();
   ASSERT_EQ(::fcntl(doorbell, F_SETFL, 0), 0);
   ASSERT_EQ(::eventfd_write(doorbell, UINT64_MAX - 1), 0);
-  const auto ring = ring::RingMapping::open_untrusted(opened.descriptors[0].get(),
-                                                      ring::Access::read_write)
-                        .value();
+  const auto ring =
+      ring::RingMapping::open_untrusted(opened.descriptors[0].get(), ring::Access::read_write)
+          .value();
   ring->header().doorbell_armed = 1;
   for (int i = 0; i < 10; ++i) EXPECT_EQ(writer.write(i), i);
 }
@@ -92,9 +92,9 @@ TEST(HostileWriter, KeepsOthersOutForABoundedTime) {
   RawClient hostile(daemon.socket_path());
   const Answer opened = hostile.ask(open_request("odometry", true));
   ASSERT_EQ(opened.descriptors.size(), 4u);
-  const auto ring = ring::RingMapping::open_untrusted(opened.descriptors[0].get(),
-                                                      ring::Access::read_write)
-                        .value();
+  const auto ring =
+      ring::RingMapping::open_untrusted(opened.descriptors[0].get(), ring::Access::read_write)
+          .value();
   ASSERT_EQ(ring->writer_lock().lock(), ring::LockResult::locked);
   std::thread([&] { EXPECT_EQ(writer.write(1), kNoTid); }).join();
   ring->writer_lock().unlock();

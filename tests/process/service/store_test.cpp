@@ -82,7 +82,7 @@ TEST(DescriptorStore, DropsInvalidDescriptorsAndKeepsTheRest) {
   manager.put_into_store("null", UniqueFd(::open("/dev/null", O_RDWR | O_CLOEXEC)));
   manager.put_into_store("lone", fake_ring());
   manager.put_into_store("bell", UniqueFd(::eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK)));
-  for (const char* kind : {"dssm-ring:x:0@pc1", "dssm-bell", "dssm-meta"}) {
+  for (const char* kind : {"dssm-ring:x:0@pc1#1", "dssm-bell:x:0@pc1#1", "dssm-meta:x:0@pc1#1"}) {
     manager.put_into_store("empty",
                            UniqueFd(::memfd_create(kind, MFD_CLOEXEC | MFD_ALLOW_SEALING)));
   }

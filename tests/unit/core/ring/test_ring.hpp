@@ -22,7 +22,7 @@ struct TestRing {
   TestRing(std::uint64_t payload_bytes, std::uint64_t depth) {
     const RingIdentity identity{{"test", 0, "pc1"}, 42, std::chrono::milliseconds(1), 8};
     fd = create_ring(identity, Geometry::of(payload_bytes, depth).value()).value();
-    bell_fd = create_bell().value();
+    bell_fd = create_bell("test").value();
     mapping = RingMapping::open_untrusted(fd.get(), Access::read_write).value();
     bell = Bell::open_untrusted(bell_fd.get()).value();
   }

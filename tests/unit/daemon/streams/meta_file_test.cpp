@@ -63,7 +63,7 @@ Errc error_of(const std::string& content) {
 }
 
 TEST(MetaFile, GivesBackWhatItWasCreatedWith) {
-  const Result<MetaFile> file = MetaFile::create(meta_with("abc"));
+  const Result<MetaFile> file = MetaFile::create(meta_with("abc"), "test");
   ASSERT_TRUE(file) << file.error().message;
   const Result<local::StreamMeta> read = file->read_untrusted();
   ASSERT_TRUE(read) << read.error().message;
@@ -71,7 +71,7 @@ TEST(MetaFile, GivesBackWhatItWasCreatedWith) {
 }
 
 TEST(MetaFile, GivesTheNewestContentAfterManyReplacementsAndKeepsItsMemorySmall) {
-  Result<MetaFile> file = MetaFile::create(meta_with(""));
+  Result<MetaFile> file = MetaFile::create(meta_with(""), "test");
   ASSERT_TRUE(file);
   const auto seed = std::random_device()();
   SCOPED_TRACE("seed " + std::to_string(seed));
@@ -87,7 +87,7 @@ TEST(MetaFile, GivesTheNewestContentAfterManyReplacementsAndKeepsItsMemorySmall)
 }
 
 TEST(MetaFile, CannotBeWrittenThroughTheDescriptorThatClientsGet) {
-  const Result<MetaFile> file = MetaFile::create(meta_with(""));
+  const Result<MetaFile> file = MetaFile::create(meta_with(""), "test");
   ASSERT_TRUE(file);
   const Result<UniqueFd> for_clients = reopen_read_only(file->fd());
   ASSERT_TRUE(for_clients);
@@ -101,7 +101,7 @@ TEST(MetaFile, CannotBeWrittenThroughTheDescriptorThatClientsGet) {
 TEST(MetaFile, CanBeTakenBackFromADescriptorForReading) {
   std::vector<UniqueFd> kept;
   {
-    const Result<MetaFile> file = MetaFile::create(meta_with("kept"));
+    const Result<MetaFile> file = MetaFile::create(meta_with("kept"), "test");
     ASSERT_TRUE(file);
     Result<UniqueFd> for_clients = reopen_read_only(file->fd());
     ASSERT_TRUE(for_clients);
@@ -115,7 +115,7 @@ TEST(MetaFile, CanBeTakenBackFromADescriptorForReading) {
 }
 
 TEST(MetaFile, ReportsThatTheStreamWasRemovedOnceItIsMarked) {
-  Result<MetaFile> file = MetaFile::create(meta_with("x"));
+  Result<MetaFile> file = MetaFile::create(meta_with("x"), "test");
   ASSERT_TRUE(file);
   ASSERT_TRUE(file->mark_removed());
   const Result<local::StreamMeta> read = file->read_untrusted();
@@ -184,7 +184,7 @@ TEST(MetaFile, RefusesAFileOfAnotherUser) {
 // changes the file; at each stop the file is what a `kill -9` there would leave.
 TEST(MetaFile, HoldsTheOldOrTheNewContentWhereverItsWriterIsKilled) {
   const std::string old_property(5000, 'o'), new_property(9000, 'n');
-  Result<MetaFile> file = MetaFile::create(meta_with(old_property));
+  Result<MetaFile> file = MetaFile::create(meta_with(old_property), "test");
   ASSERT_TRUE(file);
   const pid_t child = ::fork();
   ASSERT_GE(child, 0);
@@ -216,7 +216,7 @@ TEST(MetaFile, HoldsTheOldOrTheNewContentWhereverItsWriterIsKilled) {
 
 // The same for a write that was cut short: any part of the new content, without the header.
 TEST(MetaFile, HoldsTheOldContentWhenOnlyAPartOfTheNewOneWasWritten) {
-  Result<MetaFile> file = MetaFile::create(meta_with("old"));
+  Result<MetaFile> file = MetaFile::create(meta_with("old"), "test");
   ASSERT_TRUE(file);
   const std::string next = meta_with(std::string(9000, 'n')).SerializeAsString();
   for (const std::size_t written : {std::size_t{1}, std::size_t{4096}, next.size()}) {

@@ -11,8 +11,11 @@
 #include <sys/stat.h>
 #include <unistd.h>
 
+#include <cstring>
 #include <optional>
 
+#include "core/base/sealed_memory.hpp"
+#include "core/base/time.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_writer.hpp"
 #include "tests/unit/daemon/daemon_fixtures.hpp"
@@ -175,6 +178,27 @@ TEST(Registry, LeavesNoDescriptorBehind) {
   EXPECT_EQ(count(), before + 3);
 }
 
+// Half a gigabyte: the thread that closes the last descriptor frees it.
+TEST(Stream, LetsAThreadFreeALongRing) {
+  Registry registry("pc1", {10, 4ULL << 30, 1 << 20});
+  const auto time_of = [](auto work) {
+    const MonoTime begin = MonoClock::now();
+    work();
+    return MonoClock::now() - begin;
+  };
+  auto stream =
+      registry
+          .create({"camera", 0, ""}, {"", 1 << 20, 1, {}}, {512, std::chrono::milliseconds(10)}, 1)
+          ->stream;
+  const std::uint64_t bytes = stream->info().memory_bytes;
+  UniqueFd same = create_sealed_memory("test-long", bytes, 0600).value();
+  ASSERT_EQ(::posix_fallocate(same.get(), 0, static_cast<off_t>(bytes)), 0);
+  const Duration freeing = time_of([&] { same.reset(); });
+  ASSERT_TRUE(stream->reserve(0, bytes));
+  ASSERT_TRUE(registry.remove({"camera", 0, ""}));
+  EXPECT_LT(time_of([&] { stream.reset(); }), freeing / 2);
+}
+
 // --- what is handed out
 
 TEST(Stream, HandsOutARingThatReadersCannotMapWritable) {
@@ -286,6 +310,27 @@ TEST_F(Adoption, BringsAStreamBackWithAllThatWasKnownOfIt) {
   EXPECT_TRUE(for_writer.doorbell);
   EXPECT_TRUE(ring::RingMapping::open_untrusted(for_writer.ring.get(), ring::Access::read_write));
   EXPECT_TRUE(registry_.set_property(kOdometry, "newer"));
+}
+
+TEST_F(Adoption, RefusesABellOrAMetaFileOfAnotherStream) {
+  for (UniqueFd OfferedFiles::*const file : {&OfferedFiles::bell, &OfferedFiles::meta}) {
+    OfferedFiles files = held(Role::writer), same_name = held(Role::writer);
+    files.*file = std::move(same_name.*file);
+    EXPECT_EQ(error_of(std::move(files)), Errc::protocol);
+  }
+}
+
+// Who may write to a ring could take the name of a stream that it may only read.
+TEST_F(Adoption, RefusesARingThatClaimsToBeAnother) {
+  OfferedFiles files = held(Role::writer, {"other", 0, ""});
+  OfferedFiles wanted = held(Role::reader);
+  const auto own =
+      ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_write).value();
+  const auto other =
+      ring::RingMapping::open_untrusted(wanted.ring.get(), ring::Access::read_only).value();
+  std::memcpy(own->base(), other->base(), offsetof(ring::RingHeader, doorbell_armed));
+  files.bell = std::move(wanted.bell), files.meta = std::move(wanted.meta);
+  EXPECT_EQ(error_of(std::move(files)), Errc::protocol);
 }
 
 TEST_F(Adoption, OnlyNotesTheSecondOfferOfTheSameRing) {
