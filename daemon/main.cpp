@@ -190,7 +190,7 @@ struct OtherHosts {
         mirrors(parts, catalog),
         writers(parts, catalog),
         peers(loop, resolver, config.peers, self, catalog, logger),
-        interfaces(loop, [this] { peers.retry_now(); }),
+        interfaces(loop, [this] { peers.on_network_changed(); }),
         service(loop, {self, network.addresses(), config.insecure, &clock}, registry, catalog,
                 peers, mirrors, writers) {
     parts.on_ring_replaced = [this](const Stream& old) { service.on_ring_replaced(old); };

@@ -25,6 +25,7 @@ bool ReadyFd::poll() noexcept {
   ring_.seen = newest;
   seen_hole_end_ = hole_end;
   notified_superseded_ = superseded;
+  times_ = times();
   const std::uint64_t one = 1;
   [[maybe_unused]] const ssize_t written = ::write(event_.get(), &one, sizeof one);
   return true;
@@ -34,6 +35,12 @@ void ReadyFd::follow(ReadyRing ring) {
   const std::lock_guard guard(mutex_);
   ring_ = std::move(ring);
   notified_superseded_ = false;
+  times_ = times();
+}
+
+Duration ReadyFd::next_sleep(MonoTime now) noexcept {
+  const std::lock_guard guard(mutex_);
+  return times_.next(now);
 }
 
 void ReadyFd::clear() noexcept {
@@ -75,7 +82,6 @@ void Notifier::run() {
   std::vector<std::shared_ptr<const SharedRing>> rings;  // what the bells belong to
   std::vector<ring::Bell*> bells;
   std::vector<std::uint32_t> announced;
-  ring::SleepTimes times(ring::SleepTimes::kMaxSleep);
   for (;;) {
     awake.clear(), rings.clear(), bells.clear(), announced.clear();
     // Announce before polling, so that no change in between is missed.
@@ -89,19 +95,18 @@ void Notifier::run() {
       }
     }
     bool changed = false;
-    Duration shortest_cycle = ring::SleepTimes::kMaxSleep;
+    Duration sleep = ring::SleepTimes::kMaxSleep;
     for (const auto& ready : awake) {
       rings.push_back(ready->ring());
       bells.push_back(rings.back()->bell.get());
       announced.push_back(bells.back()->announce());
-      shortest_cycle = std::min(shortest_cycle, rings.back()->mapping->identity().cycle);
       changed |= ready->poll();
+      sleep = std::min(sleep, ready->next_sleep(MonoClock::now()));
     }
-    if (changed) times = ring::SleepTimes(shortest_cycle);
     if (changed) continue;
     // Rings of readers that are destroyed meanwhile stay mapped until the next wake-up.
     [[maybe_unused]] const WaitStatus woken =
-        ring::Bell::sleep_any(bells, announced, kNever, times.next(MonoClock::now()));
+        ring::Bell::sleep_any(bells, announced, kNever, sleep);
   }
 }
 

@@ -29,7 +29,8 @@ struct ReadyRing {
 // part of a mirror's hole was filled, or when the ring was superseded. Thread-safe.
 class ReadyFd {
  public:
-  ReadyFd(ReadyRing ring, UniqueFd event) : ring_(std::move(ring)), event_(std::move(event)) {}
+  ReadyFd(ReadyRing ring, UniqueFd event)
+      : ring_(std::move(ring)), times_(times()), event_(std::move(event)) {}
 
   int fd() const noexcept { return event_.get(); }
   void clear() noexcept;
@@ -40,9 +41,12 @@ class ReadyFd {
   std::shared_ptr<const SharedRing> ring();
   bool poll() noexcept;  // signals fd() if the ring changed
   void follow(ReadyRing ring);
+  Duration next_sleep(MonoTime now) noexcept;  // until it is polled again
+  ring::SleepTimes times() const { return ring::SleepTimes(ring_.ring->mapping->identity().cycle); }
 
   std::mutex mutex_;  // guards what follows, but for event_
   ReadyRing ring_;
+  ring::SleepTimes times_;  // since it changed
   bool notified_superseded_ = false;
   Tid seen_hole_end_ = 0;  // when it changed, samples may have come that a reader waits for
   UniqueFd event_;

@@ -1,9 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/src/open_streams.hpp"
 
+#include <fcntl.h>
 #include <fmt/format.h>
 #include <sys/mman.h>
 #include <sys/stat.h>
+#include <unistd.h>
 
 #include <iterator>
 
@@ -68,7 +70,14 @@ Result<std::shared_ptr<const SharedRing>> RingCache::get(std::vector<UniqueFd> f
   const std::lock_guard guard(mutex_);
   std::erase_if(rings_, [](const auto& entry) { return entry.second.expired(); });
   if (auto known = rings_.find(key); known != rings_.end()) {
-    if (auto ring = known->second.lock()) return ring;
+    if (auto ring = known->second.lock()) {
+      // dssmd may have removed the doorbell of an open that has just ended, and made another one.
+      // All writers use the descriptor by its number.
+      if (writer && ::dup3(fds[3].get(), ring->doorbell_fd.get(), O_CLOEXEC) < 0) {
+        return os_error("replace a doorbell");
+      }
+      return ring;
+    }
   }
   auto mapping = DSSM_TRY(ring::RingMapping::open_untrusted(fds[0].get(), access));
   auto bell = DSSM_TRY(ring::Bell::open_untrusted(fds[1].get()));

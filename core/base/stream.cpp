@@ -167,6 +167,11 @@ Result<void> TypeInfo::check() const {
     return invalid("an alignment of {} bytes is not possible; it takes a power of two up to 64",
                    alignment_bytes);
   }
+  if (fields.size() > kMaxFields) {
+    return Error{Errc::limit_exceeded,
+                 fmt::format("a type with {} fields; at most {} are possible: describe fewer",
+                             fields.size(), kMaxFields)};
+  }
   for (const Field& field : fields) {
     const std::uint64_t bytes = scalar_bytes(field.kind);
     if (!is_utf8(field.name)) return invalid("field name '{}' is not UTF-8", field.name);

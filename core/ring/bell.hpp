@@ -26,7 +26,8 @@ namespace dssm::ring {
 
 // How long a thread that waits for samples sleeps before it checks the ring, whether or not a
 // writer woke it: two cycles of the stream, later as long as it has waited. While samples come it
-// is woken before that, and without samples it soon sleeps kMaxSleep. By the time, not by the
+// is woken before that (who waits for several streams, by the fastest of them), and without samples
+// it soon sleeps kMaxSleep. By the time, not by the
 // number of sleeps: who can suppress wake-ups can end sleeps early, too.
 class SleepTimes {
  public:

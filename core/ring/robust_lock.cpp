@@ -9,7 +9,6 @@
 #include <algorithm>
 #include <atomic>
 #include <cerrno>
-#include <ctime>
 
 #include "core/base/time.hpp"
 #include "core/base/try.hpp"
@@ -40,27 +39,58 @@ struct Thread {
 // Where the kernel knows no lists (qemu-user). Deaths go unnoticed there, as with glibc's mutexes.
 thread_local robust_list_head unknown_list{};
 
-[[gnu::cold]] void find_list() noexcept {
-  static const int registered =
-      ::pthread_atfork(nullptr, nullptr, [] { this_thread.list = nullptr; });
-  static_cast<void>(registered);  // fails without memory only: then children have a wrong id
-  std::size_t bytes = 0;
-  if (::syscall(SYS_get_robust_list, 0, &this_thread.list, &bytes) || !this_thread.list ||
-      this_thread.list->futex_offset != -static_cast<long>(kNodeAfterWord)) {
-    unknown_list.list.next = &unknown_list.list;
-    this_thread.list = &unknown_list;
-  }
-  this_thread.id = static_cast<std::uint32_t>(::gettid());
-}
-
-// Only the kernel sees the list besides its thread, and only when that thread ends.
+// Who sees the list besides its thread: its signal handlers, and the kernel when it ends.
 void compiler_barrier() noexcept { std::atomic_signal_fence(std::memory_order_seq_cst); }
 
+[[gnu::cold]] void find_list() noexcept {
+  robust_list_head* list = nullptr;
+  std::size_t bytes = 0;
+  if (::syscall(SYS_get_robust_list, 0, &list, &bytes) || !list ||
+      list->futex_offset != -static_cast<long>(kNodeAfterWord)) {
+    unknown_list.list.next = &unknown_list.list;
+    list = &unknown_list;
+  }
+  this_thread.id = static_cast<std::uint32_t>(::gettid());
+  compiler_barrier();  // a signal handler may come in between, and lock
+  this_thread.list = list;
+}
+
+// While it exists, the kernel looks at the word of this node, too, if the thread ends. A signal
+// handler may use another lock meanwhile.
+class Pending {
+ public:
+  Pending(robust_list_head& list, std::uintptr_t& node) noexcept
+      : list_(list), node_(reinterpret_cast<robust_list*>(&node)), before_(list.list_op_pending) {
+    resume();
+  }
+  Pending(const Pending&) = delete;
+  Pending& operator=(const Pending&) = delete;
+  ~Pending() { pause(); }
+
+  void pause() noexcept { set(before_); }
+  void resume() noexcept { set(node_); }
+
+ private:
+  void set(robust_list* pending) noexcept {
+    compiler_barrier();
+    list_.list_op_pending = pending;
+    compiler_barrier();
+  }
+  robust_list_head& list_;
+  robust_list* node_;
+  robust_list* before_;
+};
+
+void sleep_for(Duration time) noexcept {  // no cancellation point
+  const timespec pause = timespec_of(time);
+  ::syscall(SYS_clock_nanosleep, CLOCK_MONOTONIC, 0, &pause, nullptr);
+}
+
 // Takes the word for thread `id`; until then sleeps, at most until `deadline`.
-//   found  what the word was
-LockResult take_word(std::atomic<std::uint32_t>& word, std::uint32_t id, std::uint32_t found,
-                     MonoTime deadline) noexcept {
+LockResult take_word(std::atomic<std::uint32_t>& word, std::uint32_t id, MonoTime deadline,
+                     Pending& pending) noexcept {
   std::uint32_t waiters = 0;  // once this thread has slept: others may sleep still
+  std::uint32_t found = word.load(std::memory_order_relaxed);
   for (;;) {
     if ((found & FUTEX_TID_MASK) == 0) {
       if (word.compare_exchange_weak(found, id | (found & FUTEX_WAITERS) | waiters,
@@ -76,8 +106,12 @@ LockResult take_word(std::atomic<std::uint32_t>& word, std::uint32_t id, std::ui
       continue;
     }
     const timespec until = timespec_of(std::min(deadline, now + kMaxSleepOnWord));
+    // The holder may be a thread of another container with the same id: if this one ends while it
+    // sleeps, the kernel must not take it for the holder.
+    pending.pause();
     ::syscall(SYS_futex, &word, FUTEX_WAIT_BITSET, found | FUTEX_WAITERS, &until, nullptr,
               FUTEX_BITSET_MATCH_ANY);
+    pending.resume();
     waiters = FUTEX_WAITERS;
     found = word.load(std::memory_order_relaxed);
   }
@@ -104,7 +138,8 @@ struct RobustLock::Private {
   bool claim(std::uint32_t id) noexcept {
     std::uint32_t other = 0;
     if (holder.compare_exchange_strong(other, id, std::memory_order_acquire)) return true;
-    // A thread that ended with the lock, or one of the process that this one is a fork of.
+    // A thread that ended with the lock, or one of the process that this one is a fork of. Where
+    // its id is another thread's by now, the lock stays busy in this mapping.
     const bool is_gone = ::syscall(SYS_tgkill, ::getpid(), other, 0) != 0 && errno == ESRCH;
     return is_gone && holder.compare_exchange_strong(other, id, std::memory_order_acquire);
   }
@@ -112,9 +147,11 @@ struct RobustLock::Private {
   void link(robust_list_head& list) noexcept {
     next = reinterpret_cast<std::uintptr_t>(list.list.next);
     previous = reinterpret_cast<std::uintptr_t>(&list.list);
-    set_previous_of_next(list, reinterpret_cast<std::uintptr_t>(&next));
     compiler_barrier();
+    // First: a signal handler that locks in between sets the node before this one.
     list.list.next = reinterpret_cast<robust_list*>(&next);
+    compiler_barrier();
+    set_previous_of_next(list, reinterpret_cast<std::uintptr_t>(&next));
   }
 
   void unlink(robust_list_head& list) noexcept {
@@ -130,6 +167,9 @@ struct RobustLock::Private {
 };
 
 Result<RobustLock> RobustLock::map(int fd) {
+  // A child has another thread id, and a list of its own.
+  static const int failed = ::pthread_atfork(nullptr, nullptr, [] { this_thread = {}; });
+  if (failed) return os_error("prepare for a fork", failed);
   return RobustLock(
       DSSM_TRY(SharedMapping::map_before_private_page(fd, system_page_bytes()), "map a lock"));
 }
@@ -146,57 +186,46 @@ RobustLock::Private& RobustLock::own() const noexcept {
   if (!this_thread.list) find_list();
   const Thread self = this_thread;
   Private& own = this->own();
-  // While it is pending, the kernel looks at the word, too, if this thread ends.
-  self.list->list_op_pending = reinterpret_cast<robust_list*>(&own.next);
-  compiler_barrier();
+  Pending pending(*self.list, own.next);
   LockResult result = LockResult::locked;
   std::uint32_t found = 0;
-  if (!word().compare_exchange_strong(found, self.id, std::memory_order_acquire)) {
-    result = take_slowly(self.id, may_wait);
-  } else if (!own.claim(self.id)) {
-    give_back(word(), 0);
-    result = take_slowly(self.id, may_wait);
-  }
-  if (result != LockResult::busy) own.link(*self.list);
-  compiler_barrier();
-  self.list->list_op_pending = nullptr;
-  return result;
-}
-
-LockResult RobustLock::take_slowly(std::uint32_t id, bool may_wait) const noexcept {
-  Private& own = this->own();
-  const MonoTime deadline =
-      may_wait ? deadline_in(own.was_in_vain ? kMaxWaitAgain : kMaxWait) : MonoTime::min();
-  for (;;) {
-    LockResult result = take_word(word(), id, word().load(std::memory_order_relaxed), deadline);
-    if (result != LockResult::busy && !own.claim(id)) {
+  const bool has_word = word().compare_exchange_strong(found, self.id, std::memory_order_acquire);
+  if (!has_word || !own.claim(self.id)) {
+    if (has_word) give_back(word(), 0);
+    const Duration patience = own.was_in_vain ? kMaxWaitAgain : kMaxWait;
+    const MonoTime deadline = may_wait ? deadline_in(patience) : MonoTime::min();
+    while ((result = take_word(word(), self.id, deadline, pending)) != LockResult::busy &&
+           !own.claim(self.id)) {
       // The other thread is about to end, or another process has changed the word.
       give_back(word(), result == LockResult::recovered ? FUTEX_OWNER_DIED : 0);
       result = LockResult::busy;
-      if (MonoClock::now() < deadline) {
-        const timespec pause = timespec_of(kClaimPause);
-        ::nanosleep(&pause, nullptr);
-        continue;
-      }
+      if (MonoClock::now() >= deadline) break;
+      sleep_for(kClaimPause);
     }
-    if (may_wait) own.was_in_vain = result == LockResult::busy;
-    return result;
+    if (result == LockResult::busy) {
+      if (may_wait) own.was_in_vain.store(true, std::memory_order_relaxed);
+      return result;
+    }
   }
+  if (own.was_in_vain.load(std::memory_order_relaxed)) [[unlikely]] {
+    own.was_in_vain.store(false, std::memory_order_relaxed);
+  }
+  own.link(*self.list);
+  return result;
 }
 
 [[gnu::hot]] LockResult RobustLock::lock() const noexcept { return take(true); }
 [[gnu::hot]] LockResult RobustLock::try_lock() const noexcept { return take(false); }
 
 [[gnu::hot]] void RobustLock::unlock() const noexcept {
-  robust_list_head& list = *this_thread.list;
+  const Thread self = this_thread;
   Private& own = this->own();
-  list.list_op_pending = reinterpret_cast<robust_list*>(&own.next);
-  compiler_barrier();
-  own.unlink(list);
+  // A forked child does not hold what its parent's thread held.
+  if (own.holder.load(std::memory_order_relaxed) != self.id || !self.list) return;
+  Pending pending(*self.list, own.next);
+  own.unlink(*self.list);
   own.holder.store(0, std::memory_order_release);
   give_back(word(), 0);
-  compiler_barrier();
-  list.list_op_pending = nullptr;
 }
 
 }  // namespace dssm::ring

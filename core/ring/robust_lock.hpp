@@ -39,8 +39,9 @@ enum class LockResult : unsigned char {
 // A mapped lock. Thread-safe; of this process's threads as of all others, one holds it.
 class RobustLock {
  public:
-  // How long lock() waits for one holder, and, after it did so in vain, until it got the lock
-  // again: a holder is stopped, or the word is damaged, and the caller has other work.
+  // How long lock() waits in all; and how long after it did so in vain, until a thread of this
+  // mapping got the lock: a holder is stopped, or the word is damaged, and the caller has other
+  // work.
   static constexpr Duration kMaxWait = std::chrono::seconds(2);
   static constexpr Duration kMaxWaitAgain = std::chrono::milliseconds(10);
 
@@ -55,7 +56,7 @@ class RobustLock {
   LockResult lock() const noexcept;
   // Does not wait.
   LockResult try_lock() const noexcept;
-  // By the thread that holds it.
+  // By the thread that holds it; in others, a forked child among them, without effect.
   void unlock() const noexcept;
 
  private:
@@ -64,7 +65,6 @@ class RobustLock {
   std::atomic<std::uint32_t>& word() const noexcept;
   Private& own() const noexcept;
   LockResult take(bool may_wait) const noexcept;
-  LockResult take_slowly(std::uint32_t id, bool may_wait) const noexcept;
   SharedMapping mapping_;
 };
 

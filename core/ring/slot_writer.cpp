@@ -236,8 +236,7 @@ Tid SlotWriter::link(Tid tid, Tid run) const noexcept {
 
 // With the sample that it did not publish, the dead writer may have begun a run, crossed a gap, or
 // advanced a cursor. Of a hole that it was making greater the end is not known: samples before the
-// newest that are here become searchable with the next shrink_hole(). Samples that were lost with
-// the one that it did not publish may come now. The slot needs no repair: it is outside of the
+// newest that are here become searchable with the next shrink_hole(). The slot needs no repair: it is outside of the
 // window, and the next sample with that tid overwrites it.
 void SlotWriter::recover() const noexcept {
   const Tid top = header_->top.load(std::memory_order_relaxed);
@@ -249,8 +248,11 @@ void SlotWriter::recover() const noexcept {
   if (header_->hole_end.load(std::memory_order_relaxed) > top) {
     header_->hole_end.store(std::max<Tid>(top, 0), std::memory_order_release);
   }
-  for (Tid tid = top + 1; is_lost(tid); ++tid) begin(tid);
   PublisherCursors(*header_).recover();
+}
+
+void SlotWriter::unmark_lost() const noexcept {
+  for (Tid tid = newest() + 1; is_lost(tid); ++tid) begin(tid);
 }
 
 [[gnu::hot]] void SlotWriter::prefetch_next(Tid tid) const noexcept {

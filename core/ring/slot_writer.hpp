@@ -53,6 +53,8 @@ class SlotWriter {
   void publish_in_hole(const SampleInfo& info) const noexcept;
   // Those of samples [first, end) that are in the hole and not here will never come.
   void lose_in_hole(Tid first, Tid end) const noexcept;
+  // After recover(): samples that were lost with one that was not published may come now.
+  void unmark_lost() const noexcept;
   // The hole ends where its last samples begin that are here or lost.
   void shrink_hole() const noexcept;
 

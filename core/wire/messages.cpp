@@ -128,9 +128,9 @@ Result<StreamId> stream_id_untrusted(const proto::StreamId& message) {
 
 Result<TypeInfo> type_untrusted(const proto::Type& message) {
   if (static_cast<std::size_t>(message.fields_size()) > kMaxFields) {
-    return Error{Errc::limit_exceeded, "a type with " + std::to_string(message.fields_size()) +
-                                           " fields; at most " + std::to_string(kMaxFields) +
-                                           " are possible: describe fewer"};
+    return Error{Errc::limit_exceeded,
+                 fmt::format("a type with {} fields; at most {} are possible: describe fewer",
+                             message.fields_size(), kMaxFields)};
   }
   for (const proto::Field& field : message.fields()) {
     if (field.scalar() > 255) {

@@ -15,7 +15,6 @@
 namespace dssm::wire {
 
 inline constexpr std::size_t kMaxPropertyBytes = 16U << 20;
-inline constexpr std::size_t kMaxFields = 1024;
 inline constexpr std::size_t kMaxProgramBytes = 127;
 inline constexpr std::size_t kMaxSentenceBytes = 511;  // for people, of another host
 

@@ -3,6 +3,7 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <cstdint>
 
 #include "core/wire/varint.hpp"
@@ -21,14 +22,18 @@ static_assert(int{Frame::kCreateFieldNumber} == int{Request::kCreateFieldNumber}
 static_assert(int{Frame::kSetPropertyFieldNumber} == int{Request::kSetPropertyFieldNumber});
 
 // Calls visit(field number, content) for each field of a message, with an empty content unless it
-// has a length. False when the bytes are no message.
+// has a length; visit() returns false to stop. False then, and when the bytes are no message, or one
+// with groups, which no message of ours has.
 template <class Visit>
 bool for_each_field(Bytes message, Visit visit) noexcept {
   const std::byte* at = message.data();
   const std::byte* const end = at + message.size();
   while (at != end) {
     std::uint64_t tag = 0, value = 0, content = 0;
-    if (read_varint(at, end, kMaxLengthBytes, tag) != VarintStatus::ok) return false;
+    // protobuf takes the lower 32 bits of a longer tag.
+    if (read_varint(at, end, kMaxLengthBytes, tag) != VarintStatus::ok || tag > UINT32_MAX) {
+      return false;
+    }
     const bool has_length = (tag & 7) == 2;
     switch (tag & 7) {
       case 0:
@@ -44,33 +49,46 @@ bool for_each_field(Bytes message, Visit visit) noexcept {
         content = 4;
         break;
       default:
-        return false;  // groups: no message of ours has them
+        return false;
     }
     if (content > static_cast<std::uint64_t>(end - at)) return false;
-    visit(tag >> 3, has_length ? Bytes(at, static_cast<std::size_t>(content)) : Bytes());
+    if (!visit(tag >> 3, has_length ? Bytes(at, static_cast<std::size_t>(content)) : Bytes())) {
+      return false;
+    }
     at += content;
   }
   return true;
 }
 
-// The bytes of field `number`, all that there are together.
+// The bytes of field `number`, all that there are together; 0 when the bytes are no message.
 std::size_t field_bytes(Bytes message, std::uint64_t number) noexcept {
   std::size_t bytes = 0;
   const bool is_message = for_each_field(message, [&](std::uint64_t field, Bytes content) {
     if (field == number) bytes += content.size();
+    return true;
   });
   return is_message ? bytes : 0;
 }
 
-std::size_t count_type_fields(Bytes create) noexcept {
-  std::size_t count = 0;
-  for_each_field(create, [&](std::uint64_t field, Bytes type) {
-    if (field != proto::Create::kTypeFieldNumber) return;
-    for_each_field(type, [&](std::uint64_t inner, Bytes) {
-      count += inner == proto::Type::kFieldsFieldNumber;
+// What a request has of Creates.
+struct Creates {
+  std::size_t bytes = 0;
+  std::size_t type_fields = 0;
+};
+
+// False when the bytes are no message.
+bool measure_creates(Bytes request, Creates& found) noexcept {
+  return for_each_field(request, [&](std::uint64_t field, Bytes create) {
+    if (field != Frame::kCreateFieldNumber) return true;
+    found.bytes += create.size();
+    return for_each_field(create, [&](std::uint64_t of_create, Bytes type) {
+      if (of_create != proto::Create::kTypeFieldNumber) return true;
+      return for_each_field(type, [&](std::uint64_t of_type, Bytes) {
+        found.type_fields += of_type == proto::Type::kFieldsFieldNumber;
+        return true;
+      });
     });
   });
-  return count;
 }
 
 }  // namespace
@@ -85,32 +103,43 @@ std::size_t plain_bytes(Bytes message) noexcept {
     if (field == Frame::kPropertyFieldNumber) {
       bulk += field_bytes(content, proto::Property::kPropertyFieldNumber);
     }
+    return true;
   });
   return is_message ? message.size() - bulk : message.size();
 }
 
 Result<void> check_request_size_untrusted(Bytes message) {
-  if (message.size() <= kMaxRequestBytes) return {};
-  const std::size_t plain = plain_bytes(message);
+  const std::size_t plain = message.size() <= kMaxRequestBytes ? 0 : plain_bytes(message);
   if (plain <= kMaxRequestBytes) return {};
-  std::size_t creates = 0, fields = 0;
-  for_each_field(message, [&](std::uint64_t field, Bytes content) {
-    if (field != Frame::kCreateFieldNumber) return;
-    ++creates;
-    fields += count_type_fields(content);
-  });
-  const std::size_t most = creates > 0 ? kMaxCreateBytes : kMaxRequestBytes;
-  if (plain > most) {
-    return Error{Errc::protocol, fmt::format("a request of {} bytes has more than {} that are "
-                                             "neither payload nor property",
-                                             message.size(), most)};
+  Creates creates;
+  if (!measure_creates(message, creates)) {
+    return Error{
+        Errc::protocol,
+        fmt::format("a request of {} bytes is not a message of this protocol", message.size())};
   }
-  if (fields > kMaxParsedFields) {
-    return Error{Errc::protocol,
-                 fmt::format("a request describes a type of {} fields; at most {} are read", fields,
-                             kMaxParsedFields)};
+  const std::size_t others = plain - std::min(plain, creates.bytes);
+  if (others > kMaxRequestBytes || creates.bytes > kMaxCreateBytes) {
+    return Error{Errc::limit_exceeded,
+                 fmt::format("a request of {} bytes has {} that are neither payload nor property; "
+                             "at most {} are taken, and {} to create a stream",
+                             message.size(), plain, kMaxRequestBytes, kMaxCreateBytes)};
+  }
+  if (creates.type_fields > kMaxParsedFields) {
+    return Error{Errc::limit_exceeded,
+                 fmt::format("a request describes a type of {} fields; at most {} are read",
+                             creates.type_fields, kMaxParsedFields)};
   }
   return {};
+}
+
+std::uint64_t serial_untrusted(Bytes message) noexcept {
+  const std::byte* at = message.data();
+  std::uint64_t tag = 0, serial = 0;
+  const bool is_first =
+      read_varint(at, at + message.size(), 1, tag) == VarintStatus::ok &&
+      tag == Request::kSerialFieldNumber << 3 &&
+      read_varint(at, message.data() + message.size(), kMaxVarintBytes, serial) == VarintStatus::ok;
+  return is_first ? serial : 0;
 }
 
 }  // namespace dssm::wire

@@ -6,6 +6,7 @@
 #pragma once
 
 #include <cstddef>
+#include <cstdint>
 #include <dssm/result.hpp>
 #include <span>
 
@@ -21,8 +22,12 @@ inline constexpr std::size_t kMaxParsedFields = 4096;
 // when it is no message.
 std::size_t plain_bytes(std::span<const std::byte> message) noexcept;
 
-// Whether a request may be parsed: about 1.5 ms at most.
-//   fails  protocol
+// Whether a request may be parsed.
+//   fails  limit_exceeded, protocol (it is long, and no message)
 Result<void> check_request_size_untrusted(std::span<const std::byte> message);
+
+// The serial of a request that is not parsed; 0 when it does not begin with it, as protobuf writes
+// it.
+std::uint64_t serial_untrusted(std::span<const std::byte> message) noexcept;
 
 }  // namespace dssm::wire

@@ -65,11 +65,11 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const 
 void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) {
   configured_ = addresses.front();
   dialer_.set_addresses(addresses);
-  retry_now();
+  if (status_.state != HostState::up) dialer_.retry_now();
 }
 
-void PeerConnection::retry_now() {
-  if (status_.state != HostState::up) dialer_.retry_now();
+void PeerConnection::on_network_changed() {
+  if (status_.state != HostState::up) dialer_.on_network_changed();
 }
 
 void PeerConnection::enter(HostState state, HostReason reason, std::optional<Error> error) {

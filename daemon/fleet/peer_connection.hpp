@@ -79,7 +79,7 @@ class PeerConnection final : private Dialer::Observer {
   // Where to go from the next attempt on, which comes at once unless it is up.
   void set_addresses(const std::vector<wire::Address>& addresses);
   // Tries now, unless it is up: it may have become available.
-  void retry_now();
+  void on_network_changed();
 
   // --- about the peer
 

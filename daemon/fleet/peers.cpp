@@ -258,9 +258,9 @@ void Peers::set_configured(const std::vector<wire::Address>& peers) {
   reconcile_soon();
 }
 
-void Peers::retry_now() {
+void Peers::on_network_changed() {
   for (const Peer& peer : peers_) {
-    if (peer.connection) peer.connection->retry_now();
+    if (peer.connection) peer.connection->on_network_changed();
   }
 }
 

@@ -75,7 +75,7 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   // dropped. To be called from the loop.
   void set_configured(const std::vector<wire::Address>& peers);
   // This PC's network may have come back: all that are not up are tried now. From the loop.
-  void retry_now();
+  void on_network_changed();
 
   // Called from the loop after changes, several of them together; {}: no callback.
   void on_change(std::function<void()> then) { on_change_ = std::move(then); }

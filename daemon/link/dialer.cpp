@@ -29,8 +29,11 @@ Dialer::Dialer(const EventLoop& loop, Resolver& resolver, Options options, Obser
 void Dialer::retry_now() {
   plan_.reset_pause();
   if (state_ == State::pause) timer_.enable_in(Duration::zero());
-  // The kernel repeats a lost first packet only after a second.
-  if (state_ == State::connect) begin_round_soon();
+}
+
+void Dialer::on_network_changed() {
+  retry_now();
+  if (state_ == State::connect && loop_.now() - round_began_ >= kMinRound) begin_round_soon();
 }
 
 void Dialer::restart(const Error& why) {
@@ -95,6 +98,7 @@ void Dialer::begin_round() {
   connection_.reset();
   them_.reset();
   reason_.reset();
+  round_began_ = loop_.now();
   state_ = State::look_up;
   reached_ = Phase::look_up;
   std::vector<wire::SocketAddress> numbers;

@@ -60,9 +60,12 @@ class Dialer final : private FrameConnection::Observer {
   Dialer(const Dialer&) = delete;
   Dialer& operator=(const Dialer&) = delete;
 
-  // Ends the pause, or an attempt that waits for an answer, and begins the next one: the other side
-  // may just have become available.
+  // Ends the pause: the other side may just have become available.
   void retry_now();
+  // Ends the pause, or a round of attempts that began more than kMinRound ago, and begins the next
+  // one: the kernel repeats a lost first packet only after a second.
+  void on_network_changed();
+  static constexpr Duration kMinRound = std::chrono::milliseconds(500);
   // Gives up the connection or the attempt that is under way: on_down() follows from the loop, then
   // the next attempt after the pause that is due. During a pause: nothing.
   void restart(const Error& why);
@@ -111,6 +114,7 @@ class Dialer final : private FrameConnection::Observer {
   State state_ = State::pause;
   Phase reached_ = Phase::look_up;  // in this round, or in the last one
   channel::ConnectPlan plan_;
+  MonoTime round_began_{};
   Resolver::Ticket lookup_;
   UniqueFd socket_;  // while it connects
   // Until the next round: a FrameConnection must not be destroyed in its own callbacks.

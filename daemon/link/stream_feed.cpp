@@ -17,7 +17,11 @@ Result<std::shared_ptr<StreamFeed>> StreamFeed::open(const EventLoop& loop,
 
 StreamFeed::StreamFeed(const EventLoop& loop, std::shared_ptr<Stream> stream,
                        std::shared_ptr<const ring::RingMapping> ring)
-    : loop_(loop), stream_(std::move(stream)), ring_(std::move(ring)), reader_(*ring_) {
+    : loop_(loop),
+      stream_(std::move(stream)),
+      ring_(std::move(ring)),
+      reader_(*ring_),
+      poll_soon_(EventSource::timer(loop, [this] { poll(); })) {
   stream_->observe_doorbells(this);
 }
 
@@ -30,6 +34,12 @@ void StreamFeed::on_doorbell_added(int fd) {
   EventSource& source = doorbells_[fd];
   source = EventSource::edge(loop_, fd, [this] { poll(); });
   source.enable();
+}
+
+// It may have rung just before. Not at once: who removes it may be in the middle of something.
+void StreamFeed::on_doorbell_removed(int fd) {
+  doorbells_.erase(fd);
+  poll_soon_.enable_in(Duration::zero());
 }
 
 [[gnu::hot]] void StreamFeed::arm(bool armed) noexcept {

@@ -60,7 +60,7 @@ class StreamFeed final : private DoorbellObserver {
   StreamFeed(const EventLoop& loop, std::shared_ptr<Stream> stream,
              std::shared_ptr<const ring::RingMapping> ring);
   void on_doorbell_added(int fd) override;
-  void on_doorbell_removed(int fd) override { doorbells_.erase(fd); }
+  void on_doorbell_removed(int fd) override;
   void arm(bool armed) noexcept;
 
   const EventLoop& loop_;
@@ -73,6 +73,7 @@ class StreamFeed final : private DoorbellObserver {
   std::vector<Waiting> notifying_;
   bool polling_ = false, poll_again_ = false;
   std::map<int, EventSource> doorbells_;  // by descriptor
+  EventSource poll_soon_;
 };
 
 }  // namespace dssm::daemon

@@ -69,7 +69,10 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
                                       DescriptorQueue& descriptors) {
   Client& client = clients_.at(number);
   if (Result<void> checked = wire::check_request_size_untrusted(frame); !checked) {
-    return refuse(client, 0, checked.error());
+    const std::uint64_t serial = wire::serial_untrusted(frame);
+    if (serial == 0 || !client.greeted) return refuse(client, 0, checked.error());
+    send_failure(client, serial, checked.error());  // what follows the frame can be read
+    return true;
   }
   local::Request request;
   if (!request.ParseFromArray(frame.data(), static_cast<int>(frame.size()))) {

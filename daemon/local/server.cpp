@@ -104,9 +104,14 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
       readable_(EventSource::readable(loop, socket_.get(), [this] { on_readable(); })),
       writable_(EventSource::writable(loop, socket_.get(), [this] { on_writable(); })),
       next_turn_(EventSource::timer(loop, [this] { serve_frames(); })),
-      greeting_timeout_(EventSource::timer(loop, [this] {
-        if (service_.has_greeted(number_)) return;
-        end_with({Errc::protocol, "a program connected and sent no Hello for 10 s"});
+      greeting_timeout_(EventSource::timer(
+          loop,
+          [this] {
+            if (service_.has_greeted(number_)) return;
+            end_with({Errc::protocol, "a program connected and sent no Hello for 10 s"});
+          })),
+      request_timeout_(EventSource::timer(loop, [this] {
+        end_with({Errc::protocol, "a program began a long request and did not end it for 10 s"});
       })) {
   readable_.enable();
   greeting_timeout_.enable_in(kLocalHelloTimeout);
@@ -130,6 +135,11 @@ bool Connection::charge_input() {
   const std::size_t bytes =
       input_.capacity() > wire::FrameBuffer::kKeptBytes ? input_.capacity() : 0;
   if (bytes == input_share_.bytes()) return true;
+  if (bytes == 0) {
+    request_timeout_.disable();
+  } else if (input_share_.bytes() == 0) {
+    request_timeout_.enable_in(kLongRequestTimeout);
+  }
   input_share_ = {};
   std::optional<MemoryShare> share = input_budget_.try_take(bytes);
   if (share) {
@@ -241,6 +251,7 @@ void Connection::close() {
   writable_.disable();
   next_turn_.disable();
   greeting_timeout_.disable();
+  request_timeout_.disable();
   socket_.reset();
   output_.clear();
   arrived_.clear();

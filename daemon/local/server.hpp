@@ -80,8 +80,10 @@ inline constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
 // For the Hello of a program.
 inline constexpr Duration kLocalHelloTimeout = std::chrono::seconds(10);
 
-// Memory for the long requests that all clients have begun to send. A property may have 16 MiB.
+// Memory for the long requests that all clients have begun to send, and the time for one of them:
+// then the memory is free again. A property may have 16 MiB.
 inline constexpr std::size_t kMaxInputBytes = 256U << 20;
+inline constexpr Duration kLongRequestTimeout = std::chrono::seconds(10);
 
 // One client's socket: cuts its bytes into frames for LocalService and sends the responses. It
 // never waits for the client. What the client does not receive is queued up to kMaxQueuedBytes,
@@ -128,7 +130,7 @@ class Connection final : public ClientOutput {
   DescriptorQueue arrived_;
   std::deque<Outgoing> output_;
   std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
-  EventSource readable_, writable_, next_turn_, greeting_timeout_;
+  EventSource readable_, writable_, next_turn_, greeting_timeout_, request_timeout_;
 };
 
 // Accepts the programs of this PC, within max_clients, and owns their connections.

@@ -35,6 +35,7 @@ MirrorRing::MirrorRing(std::shared_ptr<Stream> stream,
       slots_(*mapping_),
       reader_(*mapping_) {
   slots_.recover();
+  slots_.unmark_lost();
   slots_.shrink_hole();
   if (slots_.newest() >= 0) cursor_.set_next(slots_.newest() + 1);
 }

@@ -7,7 +7,6 @@
 #include <utility>
 
 #include "core/base/try.hpp"
-#include "core/wire/request_size.hpp"
 #include "daemon/base/message_ids.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 
@@ -17,16 +16,20 @@ namespace {
 // What receivers take of a frame, less what frames a list.
 constexpr std::size_t kMaxPlainListBytes = wire::kMaxPlainBytes - (4U << 10);
 
+constexpr std::size_t kUnchargedBytes = 2U << 10;  // of a request that waits
+
 constexpr std::uint64_t kReserveSliceBytes = 4U << 20;  // about 1 ms
 
 bool opens_a_stream(const net::Frame& request) noexcept {
   return request.has_open() || request.has_create();
 }
 
-// The most memory that a parsed request takes: of what is no property, two bytes may take 200.
+// The most memory that a parsed request takes besides what is charged for each connection: of what
+// is no property, two bytes may take 200.
 std::size_t parsed_bytes(const net::Frame& request) {
-  const std::size_t bytes = request.ByteSizeLong();
-  return bytes + 100 * std::min(bytes, wire::kMaxRequestBytes);
+  const std::size_t bytes = request.ByteSizeLong(),
+                    property = request.set_property().property().size();
+  return bytes <= kUnchargedBytes ? 0 : property + 100 * (bytes - property);
 }
 
 // Whether only a control connection takes `request`. A channel takes requests for properties too:

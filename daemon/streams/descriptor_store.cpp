@@ -92,6 +92,12 @@ DescriptorStore::Taken DescriptorStore::take_back(const std::string& name,
                     {.message_id = message_id::kStoredDropped});
     return Taken::bad;
   };
+  if (files.ring) {
+    // After an update this is the reason, whatever else has another form.
+    const auto mapped =
+        ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_only);
+    if (!mapped) return drop(mapped.error().message);
+  }
   if (!files.ring || !files.bell || !files.meta) {
     return drop("it is not the ring, bell and meta file of a stream");
   }

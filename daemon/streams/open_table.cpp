@@ -3,7 +3,6 @@
 
 #include <fmt/format.h>
 
-#include <algorithm>
 #include <utility>
 
 namespace dssm::daemon {
@@ -31,6 +30,7 @@ OpenNumber OpenTable::add(OpenEntry entry) {
   OfStream& of_stream = by_stream_[entry.stream.get()];
   of_stream.opens.insert(number);
   ++(entry.role == Role::writer ? of_stream.counts.writers : of_stream.counts.readers);
+  if (entry.role == Role::writer) ++of_stream.writing[entry.client->number];
   entries_.emplace(number, std::move(entry));
   return number;
 }
@@ -57,17 +57,14 @@ void OpenTable::forget(OpenNumber number) {
   of_stream->second.opens.erase(number);
   Counts& counts = of_stream->second.counts;
   --(entry.role == Role::writer ? counts.writers : counts.readers);
-  if (entry.role == Role::writer && !writes(of_stream->second, entry.client->number)) {
-    entry.stream->remove_doorbell(entry.client->number);
+  if (entry.role == Role::writer) {
+    const auto writing = of_stream->second.writing.find(entry.client->number);
+    if (--writing->second == 0) {
+      of_stream->second.writing.erase(writing);
+      entry.stream->remove_doorbell(entry.client->number);
+    }
   }
   if (of_stream->second.opens.empty()) by_stream_.erase(of_stream);
-}
-
-bool OpenTable::writes(const OfStream& of_stream, ClientNumber client) const {
-  return std::any_of(of_stream.opens.begin(), of_stream.opens.end(), [&](OpenNumber number) {
-    const OpenEntry& entry = entries_.at(number);
-    return entry.role == Role::writer && entry.client->number == client;
-  });
 }
 
 OpenTable::Counts OpenTable::counts(const Stream& stream) const {

@@ -81,9 +81,9 @@ class OpenTable {
   struct OfStream {
     std::set<OpenNumber> opens;
     Counts counts;
+    std::unordered_map<ClientNumber, std::uint32_t> writing;  // how many opens
   };
   void forget(OpenNumber number);
-  bool writes(const OfStream& of_stream, ClientNumber client) const;
 
   Limits limits_;
   OpenNumber next_ = 1;

@@ -9,7 +9,6 @@
 
 #include <algorithm>
 #include <cerrno>
-#include <iterator>
 
 #include "core/base/quiet_thread.hpp"
 #include "core/base/sealed_memory.hpp"
@@ -203,11 +202,14 @@ Result<std::vector<UniqueFd>> Stream::descriptors_for(Role role, ClientNumber cl
   descriptors.push_back(DSSM_TRY(duplicate(files_.bell.get())));
   descriptors.push_back(DSSM_TRY(reopen_read_only(meta_.fd())));
   if (!writes) return descriptors;
-  auto doorbell = doorbell_of(client);
-  if (doorbell == doorbells_.end()) {
-    doorbell = add_doorbell(client, DSSM_TRY(create_doorbell()));
+  const auto doorbell = doorbell_of(client);
+  if (doorbell != doorbells_.end()) {
+    descriptors.push_back(DSSM_TRY(duplicate(doorbell->fd.get())));
+    return descriptors;
   }
-  descriptors.push_back(DSSM_TRY(duplicate(doorbell->fd.get())));
+  UniqueFd made = DSSM_TRY(create_doorbell());
+  descriptors.push_back(DSSM_TRY(duplicate(made.get())));
+  add_doorbell(client, std::move(made));
   return descriptors;
 }
 
@@ -238,10 +240,8 @@ Result<void> Stream::reserve(std::uint64_t offset, std::uint64_t bytes) {
 bool Stream::is_ring(int fd) const noexcept { return same_file(fd, files_.ring.get()); }
 
 void Stream::take_doorbell_untrusted(ClientNumber client, UniqueFd doorbell) {
-  if (!doorbell || doorbell_of(client) != doorbells_.end() ||
-      kind_of_untrusted(doorbell.get()) != DescriptorKind::doorbell) {
-    return;
-  }
+  if (!doorbell || kind_of_untrusted(doorbell.get()) != DescriptorKind::doorbell) return;
+  remove_doorbell(client);
   add_doorbell(client, std::move(doorbell));
 }
 
@@ -257,11 +257,9 @@ std::vector<Stream::Doorbell>::iterator Stream::doorbell_of(ClientNumber client)
                       [&](const Doorbell& one) { return one.client == client; });
 }
 
-std::vector<Stream::Doorbell>::iterator Stream::add_doorbell(ClientNumber client,
-                                                             UniqueFd doorbell) {
+void Stream::add_doorbell(ClientNumber client, UniqueFd doorbell) {
   doorbells_.push_back({client, std::move(doorbell)});
   if (doorbell_observer_) doorbell_observer_->on_doorbell_added(doorbells_.back().fd.get());
-  return std::prev(doorbells_.end());
 }
 
 void Stream::observe_doorbells(DoorbellObserver* observer) {

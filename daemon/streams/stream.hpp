@@ -130,8 +130,8 @@ class Stream : public std::enable_shared_from_this<Stream> {
   // O_NONBLOCK, which belongs to all descriptors of a file, and fill the counter: the others would
   // wait in write(2) for ever.
 
-  // Adds the doorbell that a client kept over a restart of dssmd. Drops it if it is no eventfd, or
-  // if the client has one.
+  // Takes the doorbell that a client kept over a restart of dssmd, in place of another one that it
+  // has here. Drops it if it is no eventfd.
   void take_doorbell_untrusted(ClientNumber client, UniqueFd doorbell);
   // The client has ended all its opens for writing.
   void remove_doorbell(ClientNumber client);
@@ -167,7 +167,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
         mapping_(std::move(mapping)),
         share_(std::move(share)) {}
   std::vector<Doorbell>::iterator doorbell_of(ClientNumber client);
-  std::vector<Doorbell>::iterator add_doorbell(ClientNumber client, UniqueFd doorbell);
+  void add_doorbell(ClientNumber client, UniqueFd doorbell);
 
   Plan plan_;
   Files files_;

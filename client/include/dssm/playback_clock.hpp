@@ -38,7 +38,8 @@ class PlaybackClock {
 
   // reset(), set_time() and set_offset() may change now_s() at once; set_speed() and set_paused()
   // do not. A robust lock serialises all setters: a process that is killed inside one leaves the
-  // old or the new setting.
+  // old or the new setting. One that is stopped there keeps the others waiting for 2 s; then they
+  // change nothing.
   void reset() noexcept;                  // offset 0, speed 1, not paused
   void set_time(double time_s) noexcept;  // SSM time becomes `time_s` now, paused or not
   void set_offset(double offset_s) noexcept;

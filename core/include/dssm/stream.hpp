@@ -21,6 +21,7 @@ namespace dssm {
 inline constexpr std::size_t kMaxNameBytes = 31;      // SSM programs hold names in 32 bytes
 inline constexpr std::size_t kMaxFullNameBytes = 63;  // a DNS-SD instance name, RFC 6763 4.1.1
 inline constexpr std::size_t kMaxTypeNameBytes = 127;
+inline constexpr std::size_t kMaxFields = 1024;  // of a type
 inline constexpr std::uint64_t kMaxPayloadBytes = 64ULL << 20;
 inline constexpr std::uint64_t kMinDepth = 2;
 inline constexpr std::uint64_t kMaxDepth = 1ULL << 24;

@@ -33,7 +33,7 @@ UniqueFd fake_ring() {
   return UniqueFd(::memfd_create("dssm-ring:a:0@pc1", MFD_CLOEXEC | MFD_ALLOW_SEALING));
 }
 
-TEST(DescriptorStore, HoldsFourDescriptorsOfAStreamUntilItIsRemoved) {
+TEST(DescriptorStore, HoldsTheDescriptorsOfAStreamUntilItIsRemoved) {
   ServiceManager manager(without_network());
   Session session = connect_to(manager.socket_path());
   for (const char* name : {"a", "b", "c"}) session.create<int>(name, kShort).value();

@@ -126,6 +126,17 @@ TEST(SlotWriter, RepairsWhatADeadDssmdLeft) {
   EXPECT_EQ(found, 23);
 }
 
+// A program that may write can mark any slots, and say that the lock's holder died.
+TEST(SlotWriter, DoesNotFollowMarksOfLostSamplesWhereThereAreNone) {
+  const TestRing ring(8, 13);
+  RingWriter writer = ring.writer();
+  writer.write(payload_for(0, 8), time_from_ns(1), Duration(0));
+  const SlotTable slots(*ring.mapping);
+  for (Tid tid = 1; tid < 12; ++tid) slots.slot(tid).sequence = lost_sequence(tid);
+  SlotWriter(*ring.mapping).recover();
+  for (Tid tid = 1; tid < 12; ++tid) EXPECT_EQ(slots.slot(tid).sequence, lost_sequence(tid));
+}
+
 TEST(SlotWriter, NeverGivesConcurrentReadersAnotherSample) {
   const TestRing ring(64, 17);
   const RingReader reader = ring.reader();

@@ -184,7 +184,10 @@ class MirrorWithHole {
     lose(first, first + below(random_, depth_));
   }
   void lose_what_is_gone() { lose(0, next() - depth_ + 1); }
-  void die_and_recover() { slots_.recover(); }
+  void die_and_recover() {
+    slots_.recover();
+    slots_.unmark_lost();
+  }
   bool is_complete() const {
     return std::find(samples_.begin(), samples_.end(), Sample::missing) == samples_.end();
   }

@@ -332,7 +332,7 @@ TEST_F(PeersTest, TryAtOnceWhenTheNetworkMayBeBack) {
   };
   run_without_timers();
   EXPECT_EQ(one.watches, 1) << "it pauses";
-  peers->retry_now();
+  peers->on_network_changed();
   run_without_timers();
   EXPECT_EQ(one.watches, 2);
 }

@@ -201,17 +201,23 @@ TEST_F(DialerTest, LeavesAnAddressThatDoesNotAnswerForNewOnesAtOnce) {
   EXPECT_TRUE(up) << "what is up stays";
 }
 
-TEST_F(DialerTest, WhenHurriedLeavesAnAttemptThatWaitsForAnAnswer) {
+TEST_F(DialerTest, LeavesAnAttemptThatWaitsForAnAnswerWhenTheNetworkChanged) {
   const SilentServer silent;
   ScriptedHost owner(loop);
   answers = {silent.address()};
   dial({"pc2", 1});
   wait([this] { return dialer->reached() == Dialer::Phase::connect; });
   answers = wire::resolve_number(owner.address());
+  dialer->on_network_changed();  // it has just begun
+  bool is_old = false;
+  EventSource timer = EventSource::timer(loop, [&] { is_old = true; });
+  timer.enable_in(Dialer::kMinRound);
+  wait([&] { return up || is_old; });
+  EXPECT_FALSE(up);
   bool timed_out = false;
-  EventSource timer = EventSource::timer(loop, [&] { timed_out = true; });
-  timer.enable_in(channel::ConnectPlan::kConnectTimeout);
-  dialer->retry_now();
+  EventSource timeout = EventSource::timer(loop, [&] { timed_out = true; });
+  timeout.enable_in(channel::ConnectPlan::kConnectTimeout - Dialer::kMinRound);
+  dialer->on_network_changed();
   wait([&] { return up || timed_out; });
   EXPECT_TRUE(up);
   EXPECT_TRUE(downs.empty());

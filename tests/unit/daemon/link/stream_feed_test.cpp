@@ -185,6 +185,16 @@ TEST_F(StreamFeedTest, DisarmsWhenItGoes) {
   EXPECT_FALSE(program.is_armed());
 }
 
+// The client's connection may end in the same turn of the loop in which its doorbell rang.
+TEST_F(StreamFeedTest, MissesNoSampleOfAClientThatIsGone) {
+  Program program(as_offer(stream->descriptors_for(Role::writer, 7).value()));
+  ASSERT_TRUE(feed->wait(*this, kNoTid));
+  program.write();
+  stream->remove_doorbell(7);
+  run_turns(loop, 3);
+  EXPECT_EQ(notifications, 1);
+}
+
 TEST(Doorbells, AreOfOneClientEach) {
   Registry registry("pc1", kLimits);
   const auto stream = registry.create({"odometry", 0, ""}, odometry_type(), kHistory, 1)->stream;
@@ -210,7 +220,7 @@ TEST(Doorbells, AreOfOneClientEach) {
   const auto eventfd = [] { return UniqueFd(::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC)); };
   stream->take_doorbell_untrusted(3, eventfd());
   stream->take_doorbell_untrusted(3, eventfd());
-  EXPECT_EQ(watch.fds.size(), 3u) << "one per client";
+  EXPECT_EQ(watch.fds.size(), 3u) << "one per client, the last one";
   int pipe_ends[2];
   ASSERT_EQ(::pipe2(pipe_ends, O_CLOEXEC), 0);
   const UniqueFd write_end(pipe_ends[1]);
