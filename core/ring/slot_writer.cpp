@@ -236,8 +236,8 @@ Tid SlotWriter::link(Tid tid, Tid run) const noexcept {
 
 // With the sample that it did not publish, the dead writer may have begun a run, crossed a gap, or
 // advanced a cursor. Of a hole that it was making greater the end is not known: samples before the
-// newest that are here become searchable with the next shrink_hole(). The slot needs no repair: it is outside of the
-// window, and the next sample with that tid overwrites it.
+// newest that are here become searchable with the next shrink_hole(). The slot needs no repair: it
+// is outside of the window, and the next sample with that tid overwrites it.
 void SlotWriter::recover() const noexcept {
   const Tid top = header_->top.load(std::memory_order_relaxed);
   const Tid run_start = top < 0 ? 0 : slots_.slot(top).run_start.load(std::memory_order_relaxed);

@@ -22,8 +22,8 @@ static_assert(int{Frame::kCreateFieldNumber} == int{Request::kCreateFieldNumber}
 static_assert(int{Frame::kSetPropertyFieldNumber} == int{Request::kSetPropertyFieldNumber});
 
 // Calls visit(field number, content) for each field of a message, with an empty content unless it
-// has a length; visit() returns false to stop. False then, and when the bytes are no message, or one
-// with groups, which no message of ours has.
+// has a length; visit() returns false to stop. False then, and when the bytes are no message, or
+// one with groups, which no message of ours has.
 template <class Visit>
 bool for_each_field(Bytes message, Visit visit) noexcept {
   const std::byte* at = message.data();

@@ -7,7 +7,8 @@
 //   signals   a signal handler must not write to a stream that its thread may be writing to: the
 //             lock would never be released
 //   cost      a copy; no system call unless a reader sleeps on the stream, a remote reader is
-//             subscribed, or another writer is inside (and in a thread's first write). A writer that is killed at any instruction does not block others
+//             subscribed, or another writer is inside (and in a thread's first write). A writer
+//             that is killed at any instruction does not block others
 //   lifetime  a writer keeps its ring mapped, and stays usable after its Session is destroyed and
 //             while dssmd is unavailable
 //   moved     a moved-from writer may only be assigned to or destroyed

@@ -430,8 +430,11 @@ TEST(ChannelServer, BoundsTheMemoryOfAHost) {
 
 TEST(DataCommunicator, ChargesARequestThatWaits) {
   ServerRig rig({100, 100, 1U << 20});
-  MemoryPeer peer;
+  MemoryPeer peer, other;
   rig.connect(peer);
+  const auto adopt_other = [&] {
+    return rig.server.adopt(std::make_unique<MemoryTransport>(other), address_of(2));
+  };
   peer.room = 0;
   peer.put(list_request(1));
   net::Frame request;
@@ -440,8 +443,12 @@ TEST(DataCommunicator, ChargesARequestThatWaits) {
   request.mutable_set_property()->set_property(std::string(400'000, 'x'));
   peer.put(request);
   rig.turns(20);
-  EXPECT_TRUE(peer.closed);
-  EXPECT_TRUE(rig.logger.contains("to keep a request of 400"));
+  const Result<void> refused = adopt_other();  // of the same host
+  ASSERT_FALSE(refused);
+  EXPECT_NE(refused.error().message.find("max_peer_memory"), std::string::npos);
+  peer.room = MemoryPeer::kAll;
+  rig.turns(20);
+  EXPECT_TRUE(adopt_other()) << "it is served";
 }
 
 TEST(DataCommunicator, ParsesNoRequestThatIsTooLong) {
