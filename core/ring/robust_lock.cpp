@@ -9,6 +9,7 @@
 #include <algorithm>
 #include <atomic>
 #include <cerrno>
+#include <cstddef>
 
 #include "core/base/time.hpp"
 #include "core/base/try.hpp"
@@ -59,8 +60,8 @@ void compiler_barrier() noexcept { std::atomic_signal_fence(std::memory_order_se
 // handler may use another lock meanwhile.
 class Pending {
  public:
-  Pending(robust_list_head& list, std::uintptr_t& node) noexcept
-      : list_(list), node_(reinterpret_cast<robust_list*>(&node)), before_(list.list_op_pending) {
+  Pending(robust_list_head& list, robust_list& node) noexcept
+      : list_(list), node_(&node), before_(list.list_op_pending) {
     resume();
   }
   Pending(const Pending&) = delete;
@@ -129,8 +130,8 @@ void give_back(std::atomic<std::uint32_t>& word, std::uint32_t state) noexcept {
 // In the page behind the word's.
 struct RobustLock::Private {
   // Only the holder among this process's threads uses the node.
-  std::uintptr_t previous;
-  std::uintptr_t next;
+  robust_list* previous;
+  robust_list node;
   std::atomic<std::uint32_t> holder;  // its thread id; 0: none
   std::atomic<bool> was_in_vain;      // the last wait
 
@@ -145,24 +146,28 @@ struct RobustLock::Private {
   }
 
   void link(robust_list_head& list) noexcept {
-    next = reinterpret_cast<std::uintptr_t>(list.list.next);
-    previous = reinterpret_cast<std::uintptr_t>(&list.list);
+    node.next = list.list.next;
+    previous = &list.list;
     compiler_barrier();
     // First: a signal handler that locks in between sets the node before this one.
-    list.list.next = reinterpret_cast<robust_list*>(&next);
+    list.list.next = &node;
     compiler_barrier();
-    set_previous_of_next(list, reinterpret_cast<std::uintptr_t>(&next));
+    set_previous_of_next(list, &node);
   }
 
   void unlink(robust_list_head& list) noexcept {
     set_previous_of_next(list, previous);
-    *reinterpret_cast<std::uintptr_t*>(previous & ~kFlag) = next;
+    without_flag(previous)->next = node.next;
   }
 
  private:
-  void set_previous_of_next(robust_list_head& list, std::uintptr_t value) noexcept {
-    const auto after = reinterpret_cast<robust_list*>(next & ~kFlag);
-    if (after != &list.list) reinterpret_cast<std::uintptr_t*>(after)[-1] = value;
+  static robust_list* without_flag(robust_list* some) noexcept {
+    return reinterpret_cast<robust_list*>(reinterpret_cast<std::byte*>(some) -
+                                          (reinterpret_cast<std::uintptr_t>(some) & kFlag));
+  }
+  void set_previous_of_next(robust_list_head& list, robust_list* value) noexcept {
+    robust_list* const after = without_flag(node.next);
+    if (after != &list.list) reinterpret_cast<robust_list**>(after)[-1] = value;
   }
 };
 
@@ -179,6 +184,7 @@ std::atomic<std::uint32_t>& RobustLock::word() const noexcept {
 }
 
 RobustLock::Private& RobustLock::own() const noexcept {
+  static_assert(offsetof(Private, node) == kNodeAfterWord - kLockBytes);
   return *reinterpret_cast<Private*>(mapping_.end());
 }
 
@@ -186,7 +192,7 @@ RobustLock::Private& RobustLock::own() const noexcept {
   if (!this_thread.list) find_list();
   const Thread self = this_thread;
   Private& own = this->own();
-  Pending pending(*self.list, own.next);
+  Pending pending(*self.list, own.node);
   LockResult result = LockResult::locked;
   std::uint32_t found = 0;
   const bool has_word = word().compare_exchange_strong(found, self.id, std::memory_order_acquire);
@@ -222,7 +228,7 @@ RobustLock::Private& RobustLock::own() const noexcept {
   Private& own = this->own();
   // A forked child does not hold what its parent's thread held.
   if (own.holder.load(std::memory_order_relaxed) != self.id || !self.list) return;
-  Pending pending(*self.list, own.next);
+  Pending pending(*self.list, own.node);
   own.unlink(*self.list);
   own.holder.store(0, std::memory_order_release);
   give_back(word(), 0);
