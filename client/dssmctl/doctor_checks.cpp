@@ -176,7 +176,7 @@ void check_descriptors(const Facts& facts, Findings& findings) {
                               facts.daemon.streams, taken)};
   if (taken + kOtherDescriptors > limit - limit / 5) {
     finding.warn("the limit on open files is too low for many more streams",
-                 "sudo systemctl edit dssmd  # [Service] LimitNOFILE=524288, then restart dssmd");
+                 "sudo systemctl edit dssmd  # [Service] LimitNOFILE=1048576, then restart dssmd");
   }
   findings.push_back(std::move(finding));
 }
