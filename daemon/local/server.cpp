@@ -177,8 +177,7 @@ void Connection::serve_frames() {
     const auto frame = input_.next();
     if (!frame) return end_with(frame.error());
     if (!*frame) {
-      charge_input();  // less than before
-      readable_.enable();
+      if (charge_input()) readable_.enable();
       return;
     }
     if (!service_.on_frame_untrusted(number_, **frame, arrived_)) return close();

@@ -66,39 +66,36 @@ TEST(HostileReader, DelaysNoOtherReader) {
   EXPECT_LT(MonoClock::now() - begin, kSamples * 250ms);
 }
 
+// An honest program and a hostile one that write to the same stream.
+class HostileWriter : public testing::Test {
+ protected:
+  void SetUp() override { ASSERT_EQ(opened_.descriptors.size(), 4u); }
+
+  DaemonProcess daemon_;
+  Session session_ = connect(daemon_);
+  Writer<int> honest_ = session_.create<int>("odometry", kShort).value();
+  RawClient hostile_{daemon_.socket_path()};
+  const Answer opened_ = hostile_.ask(open_request("odometry", true));
+  const std::shared_ptr<const ring::RingMapping> ring_ =
+      ring::RingMapping::open_untrusted(opened_.descriptors.at(0).get(), ring::Access::read_write)
+          .value();
+};
+
 // With the same eventfd for all writers, write(2) would never return.
-TEST(HostileWriter, HangsNoOtherByItsDoorbell) {
-  DaemonProcess daemon;
-  Session session = connect(daemon);
-  Writer<int> writer = session.create<int>("odometry", kShort).value();
-  RawClient hostile(daemon.socket_path());
-  const Answer opened = hostile.ask(open_request("odometry", true));
-  ASSERT_EQ(opened.descriptors.size(), 4u);
-  const int doorbell = opened.descriptors[3].get();
+TEST_F(HostileWriter, HangsNoOtherByItsDoorbell) {
+  const int doorbell = opened_.descriptors[3].get();
   ASSERT_EQ(::fcntl(doorbell, F_SETFL, 0), 0);
   ASSERT_EQ(::eventfd_write(doorbell, UINT64_MAX - 1), 0);
-  const auto ring =
-      ring::RingMapping::open_untrusted(opened.descriptors[0].get(), ring::Access::read_write)
-          .value();
-  ring->header().doorbell_armed = 1;
-  for (int i = 0; i < 10; ++i) EXPECT_EQ(writer.write(i), i);
+  ring_->header().doorbell_armed = 1;
+  for (int i = 0; i < 10; ++i) EXPECT_EQ(honest_.write(i), i);
 }
 
 // It holds the lock for ever.
-TEST(HostileWriter, KeepsOthersOutForABoundedTime) {
-  DaemonProcess daemon;
-  Session session = connect(daemon);
-  Writer<int> writer = session.create<int>("odometry", kShort).value();
-  RawClient hostile(daemon.socket_path());
-  const Answer opened = hostile.ask(open_request("odometry", true));
-  ASSERT_EQ(opened.descriptors.size(), 4u);
-  const auto ring =
-      ring::RingMapping::open_untrusted(opened.descriptors[0].get(), ring::Access::read_write)
-          .value();
-  ASSERT_EQ(ring->writer_lock().lock(), ring::LockResult::locked);
-  std::thread([&] { EXPECT_EQ(writer.write(1), kNoTid); }).join();
-  ring->writer_lock().unlock();
-  EXPECT_EQ(writer.write(1), 0);
+TEST_F(HostileWriter, KeepsOthersOutForABoundedTime) {
+  ASSERT_EQ(ring_->writer_lock().lock(), ring::LockResult::locked);
+  std::thread([&] { EXPECT_EQ(honest_.write(1), kNoTid); }).join();
+  ring_->writer_lock().unlock();
+  EXPECT_EQ(honest_.write(1), 0);
 }
 
 // Millions of empty fields in one request took 2.4 s and 700 MiB.
