@@ -24,11 +24,10 @@
 
 namespace dssm::ring {
 
-// How long a thread that waits for samples sleeps before it checks the ring, whether or not a
-// writer woke it: two cycles of the stream, later as long as it has waited. While samples come it
-// is woken before that (who waits for several streams, by the fastest of them), and without samples
-// it soon sleeps kMaxSleep. By the time, not by the
-// number of sleeps: who can suppress wake-ups can end sleeps early, too.
+// How long a thread that waits for samples sleeps before it checks the ring by itself: two cycles
+// of the stream at first, later as long as it has waited already, up to kMaxSleep. While samples
+// come, a writer wakes it before that. It depends on the time, not on the number of sleeps, because a
+// program that suppresses wake-ups can also end sleeps early.
 class SleepTimes {
  public:
   static constexpr Duration kMaxSleep = std::chrono::seconds(1);

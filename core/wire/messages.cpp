@@ -127,11 +127,6 @@ Result<StreamId> stream_id_untrusted(const proto::StreamId& message) {
 }
 
 Result<TypeInfo> type_untrusted(const proto::Type& message) {
-  if (static_cast<std::size_t>(message.fields_size()) > kMaxFields) {
-    return Error{Errc::limit_exceeded,
-                 fmt::format("a type with {} fields; at most {} are possible: describe fewer",
-                             message.fields_size(), kMaxFields)};
-  }
   for (const proto::Field& field : message.fields()) {
     if (field.scalar() > 255) {
       return Error{Errc::protocol, "field '" + field.name() + "' has the unknown kind " +
