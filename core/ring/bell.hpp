@@ -26,8 +26,8 @@ namespace dssm::ring {
 
 // How long a thread that waits for samples sleeps before it checks the ring by itself: two cycles
 // of the stream at first, later as long as it has waited already, up to kMaxSleep. While samples
-// come, a writer wakes it before that. It depends on the time, not on the number of sleeps, because a
-// program that suppresses wake-ups can also end sleeps early.
+// come, a writer wakes it before that. It depends on the time, not on the number of sleeps, because
+// a program that suppresses wake-ups can also end sleeps early.
 class SleepTimes {
  public:
   static constexpr Duration kMaxSleep = std::chrono::seconds(1);
