@@ -57,8 +57,8 @@ constexpr int kFailed = 1, kUsage = 2;
 constexpr Duration kRetryPause = std::chrono::milliseconds(250);
 
 // How this dssmd greets other hosts.
-wire::Greeting own_greeting(const std::string& name,
-                            std::shared_ptr<const wire::ClockReport> clock) {
+wire::Greeting own_greeting(const std::string& name, std::shared_ptr<const wire::ClockReport> clock,
+                            std::shared_ptr<const wire::OwnCredentials> credentials) {
   wire::Greeting self;
   self.host = name;
   self.host_id = wire::host_id_for(name);
@@ -68,6 +68,7 @@ wire::Greeting own_greeting(const std::string& name,
   self.features = {std::string(wire::kFeatureTorn), std::string(wire::kFeatureClock),
                    std::string(wire::kFeatureNewestFirst)};
   self.clock = std::move(clock);
+  self.credentials = std::move(credentials);
   return self;
 }
 
@@ -180,7 +181,8 @@ struct OtherHosts {
   OtherHosts(const Config& config, const EventLoop& loop, const NetworkListener& network,
              clock::ClockPageWriter page, Registry& registry, Logger& logger)
       : own_clock(std::make_shared<wire::ClockReport>()),
-        self(own_greeting(config.name, own_clock)),
+        credentials(std::make_shared<wire::OwnCredentials>(config.loaded_credentials)),
+        self(own_greeting(config.name, own_clock, credentials)),
         catalog(config.name),
         clock(loop, clock_options(config), std::move(page), own_clock, self.host_id, catalog,
               logger),
@@ -197,6 +199,7 @@ struct OtherHosts {
   }
 
   std::shared_ptr<wire::ClockReport> own_clock;
+  std::shared_ptr<wire::OwnCredentials> credentials;
   wire::Greeting self;
   Catalog catalog;
   FleetClock clock;
@@ -229,7 +232,7 @@ class Dssmd {
                &hosts_.service),
         server_(loop, sockets.listener, config.name, config.max_clients, local_, logger),
         channels_({loop, streams_.registry, streams_.opens, logger, &hosts_.clock,
-                   [this] { hosts_.clock.poll_if_due(); }},
+                   [this] { hosts_.clock.poll_if_due(); }, authorize, config.insecure},
                   hosts_.self, peer_limits(config)),
         status_(loop, manager,
                 [this] {
@@ -239,11 +242,11 @@ class Dssmd {
         count_(streams_.registry, status_) {
     channels_.set_sending(config.sending);
     if (config.mdns) {
-      discovery_.emplace(
-          loop,
-          Discovery::Options{hosts_.self, reach_of(sockets.network.addresses()), config.insecure,
-                             config.interfaces, config.avoid_interfaces},
-          streams_.registry, hosts_.peers, logger);
+      discovery_.emplace(loop,
+                         Discovery::Options{hosts_.self, reach_of(sockets.network.addresses()),
+                                            config.insecure || config.loaded_credentials,
+                                            config.interfaces, config.avoid_interfaces},
+                         streams_.registry, hosts_.peers, logger);
     }
     hosts_.peers.on_change([this] { status_.touch(); });
     hosts_.clock.on_new_generation([this] {
@@ -329,6 +332,27 @@ class Dssmd {
     hosts_.mirrors.for_each([](Mirror& mirror) { mirror.on_new_demand(); });
     hosts_.peers.set_configured(changed.peers);
     hosts_.clock.set(changed.clocks, changed.max_drift);
+    use(changed.loaded_credentials);
+  }
+
+  // Running connections go on if the new ones accept the other side, too.
+  void use(const std::shared_ptr<const wire::TlsCredentials>& credentials) {
+    // Whether there are any counts from the next start on.
+    if (!credentials || !hosts_.credentials->now) return;
+    hosts_.credentials->now = credentials;
+    channels_.on_new_credentials();
+    hosts_.peers.on_new_credentials();
+    hosts_.mirrors.for_each([](Mirror& mirror) { mirror.connection().on_new_credentials(); });
+    hosts_.writers.for_each([](RemoteWriter& writer) { writer.connection().on_new_credentials(); });
+    log_problem_of_credentials();
+  }
+
+  void log_problem_of_credentials() {
+    if (!hosts_.credentials->now) return;
+    const std::string problem = hosts_.credentials->now->own_problem();
+    if (problem.empty()) return;
+    logger_.warning("credentials: other hosts will refuse this one: " + problem,
+                    {.message_id = message_id::kPeerRefused});
   }
 
   void log_recovery() {
@@ -346,6 +370,7 @@ class Dssmd {
           "one can read and write all its streams",
           {.message_id = message_id::kInsecure});
     }
+    log_problem_of_credentials();
     logger_.notice(fmt::format("ready, host '{}', socket '{}', {}", config_.name,
                                sockets_.dir.socket_path(), sockets_.network.str()),
                    {.message_id = message_id::kReady});

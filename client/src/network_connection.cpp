@@ -40,11 +40,12 @@ void add(wire::DecoderCounters& sum, const wire::DecoderCounters& more) noexcept
 }  // namespace
 
 NetworkConnection::NetworkConnection(wire::FrameDelegate& delegate, std::string program,
-                                     Duration greeting_timeout)
+                                     Duration greeting_timeout, ClientCredentials credentials)
     : delegate_(delegate),
       program_(std::move(program)),
       greeting_timeout_(greeting_timeout),
-      instance_id_(wire::random_number()) {}
+      instance_id_(wire::random_number()),
+      credentials_(std::move(credentials)) {}
 
 Result<void> NetworkConnection::start(Result<std::vector<wire::SocketAddress>> addresses) {
   phase_ = Phase::connecting;
@@ -56,11 +57,12 @@ Result<void> NetworkConnection::start(Result<std::vector<wire::SocketAddress>> a
 void NetworkConnection::close() {
   if (phase_ == Phase::down) return;
   const MonoTime now = MonoClock::now();
-  step_at_ = now + plan_.end_round(now, phase_ == Phase::greeting);
+  step_at_ = now + plan_.end_round(now, phase_ == Phase::securing || phase_ == Phase::greeting);
   phase_ = Phase::down;
   if (decoder_) add(earlier_, decoder_->counters());
   decoder_.reset();
   transport_.reset();
+  handshake_.reset();
   connecting_.reset();
   queued_.clear();
   queued_from_ = 0;
@@ -91,8 +93,28 @@ Result<void> NetworkConnection::connect_next(Error why) {
   return plan_.next_address() ? connect() : fail(std::move(why));
 }
 
-Result<void> NetworkConnection::greet() {
-  transport_ = wire::make_transport(std::move(connecting_), wire::TransportEnd::connected);
+// The socket is connected.
+Result<void> NetworkConnection::begin() {
+  std::unique_ptr<wire::Transport> transport =
+      wire::make_transport(std::move(connecting_), wire::TransportEnd::connected);
+  step_at_ = deadline_in(greeting_timeout_);
+  const auto credentials = credentials_.for_address(plan_.address());
+  if (!credentials) return greet(std::move(transport));
+  phase_ = Phase::securing;
+  handshake_.emplace(credentials, std::move(transport), wire::TransportEnd::connected);
+  return secure();
+}
+
+Result<void> NetworkConnection::secure() {
+  const Result<bool> done = handshake_->go_on();
+  if (!done) return fail(Error(done.error()).context("dssmd at '" + address_ + "'"));
+  if (*done) return greet(handshake_->take_transport());
+  return MonoClock::now() < step_at_ ? Result<void>() : fail(no_answer_error());
+}
+
+Result<void> NetworkConnection::greet(std::unique_ptr<wire::Transport> transport) {
+  transport_ = std::move(transport);
+  handshake_.reset();
   wire::FrameDelegate& delegate = *this;
   decoder_ = std::make_unique<wire::FrameDecoder>(delegate, wire::kMaxNetworkFrameBytes);
   wire::Greeting self;
@@ -109,7 +131,6 @@ Result<void> NetworkConnection::greet() {
   net::Frame frame;
   wire::to_message(self, *frame.mutable_hello());
   phase_ = Phase::greeting;
-  step_at_ = deadline_in(greeting_timeout_);
   queue(frame);
   return send_queued();
 }
@@ -120,10 +141,11 @@ Result<void> NetworkConnection::greet() {
     pollfd ready{connecting_.get(), POLLOUT, 0};
     if (::poll(&ready, 1, 0) > 0) {
       Result<void> connected = wire::finish_connect(connecting_.get(), plan_.address());
-      return connected ? greet() : connect_next(std::move(connected).error());
+      return connected ? begin() : connect_next(std::move(connected).error());
     }
     return MonoClock::now() < step_at_ ? Result<void>() : connect_next(no_answer_error());
   }
+  if (phase_ == Phase::securing) return secure();
   if (has_queued()) DSSM_TRY(send_queued());
   if (MonoClock::now() < step_at_ || has_arrived()) return {};
   return fail(no_answer_error());
@@ -133,6 +155,7 @@ Error NetworkConnection::no_answer_error() const {
   switch (phase_) {
     case Phase::connecting:
       return {Errc::no_daemon, plan_.no_answer_text()};
+    case Phase::securing:
     case Phase::greeting:
       return {Errc::unavailable,
               "what listens at '" + address_ + "' does not greet; is it a dssmd?"};
@@ -145,7 +168,7 @@ Error NetworkConnection::no_answer_error() const {
 
 bool NetworkConnection::has_arrived() const noexcept {
   pollfd ready{fd(), POLLIN, 0};
-  return ::poll(&ready, 1, 0) > 0;
+  return has_buffered_input() || ::poll(&ready, 1, 0) > 0;
 }
 
 // --- frames
@@ -161,6 +184,9 @@ void NetworkConnection::queue(std::span<const std::byte> encoded) {
 }
 
 Result<void> NetworkConnection::send_queued() {
+  if (const Result<wire::IoStatus> flushed = transport_->flush(); !flushed) {
+    return fail(flushed.error());
+  }
   queued_from_ += DSSM_TRY(send_some(std::as_bytes(std::span(queued_)).subspan(queued_from_)));
   return {};
 }
@@ -213,7 +239,9 @@ Result<void> NetworkConnection::resume() {
 
 Result<void> NetworkConnection::on_frame(net::Frame& frame) {
   if (phase_ == Phase::up) return delegate_.on_frame(frame);
-  DSSM_TRY(wire::server_greeting_untrusted(frame, "dssmd at '" + address_ + "'"));
+  const std::string who = "dssmd at '" + address_ + "'";
+  const wire::Greeting them = DSSM_TRY(wire::server_greeting_untrusted(frame, who));
+  if (transport_->peer()) DSSM_TRY(wire::check_certified(them, *transport_->peer()), who);
   phase_ = Phase::up;
   plan_.on_up(MonoClock::now());
   step_at_ = kNever;
@@ -239,11 +267,13 @@ wire::DecoderCounters NetworkConnection::counters() const noexcept {
 // --- waiting
 
 int NetworkConnection::fd() const noexcept {
+  if (handshake_) return handshake_->fd();
   return transport_ ? transport_->fd() : connecting_.get();
 }
 
 short NetworkConnection::events(bool more_to_send) const noexcept {
   if (phase_ == Phase::connecting) return POLLOUT;
+  if (phase_ == Phase::securing) return handshake_->events();
   return static_cast<short>(POLLIN | (has_queued() || more_to_send ? POLLOUT : 0));
 }
 
@@ -273,6 +303,7 @@ int NetworkConnection::ready_fd(bool more_to_send, MonoTime at) noexcept {
       ::epoll_ctl(epoll_.get(), EPOLL_CTL_ADD, fd(), &event);
     }
   }
+  if (has_buffered_input()) at = MonoTime::min();
   itimerspec timer{};  // all 0: off
   if (at != kNever) timer.it_value = timespec_of(std::max(at, MonoTime(Duration(1))));
   ::timerfd_settime(timer_.get(), TFD_TIMER_ABSTIME, &timer, nullptr);

@@ -11,16 +11,19 @@
 #include <dssm/result.hpp>
 #include <dssm/time.hpp>
 #include <memory>
+#include <optional>
 #include <span>
 #include <string>
 #include <vector>
 
+#include "client/src/credentials.hpp"
 #include "client/src/spin_budget.hpp"
 #include "core/base/unique_fd.hpp"
 #include "core/channel/connect_plan.hpp"
 #include "core/wire/address.hpp"
 #include "core/wire/frame_decoder.hpp"
 #include "core/wire/network_protocol.hpp"
+#include "core/wire/tls.hpp"
 #include "core/wire/transport.hpp"
 
 namespace dssm::detail {
@@ -30,7 +33,8 @@ class NetworkConnection final : private wire::FrameDelegate {
  public:
   // What arrives after the greeting goes to `delegate`, during receive() and resume(). The greeting
   // may take `greeting_timeout`.
-  NetworkConnection(wire::FrameDelegate& delegate, std::string program, Duration greeting_timeout);
+  NetworkConnection(wire::FrameDelegate& delegate, std::string program, Duration greeting_timeout,
+                    ClientCredentials credentials);
   NetworkConnection(const NetworkConnection&) = delete;
   NetworkConnection& operator=(const NetworkConnection&) = delete;
 
@@ -57,7 +61,9 @@ class NetworkConnection final : private wire::FrameDelegate {
   // Queues a frame, for send_queued().
   void queue(const net::Frame& frame);
   void queue(std::span<const std::byte> encoded);
-  bool has_queued() const noexcept { return queued_from_ < queued_.size(); }
+  bool has_queued() const noexcept {
+    return queued_from_ < queued_.size() || (transport_ && transport_->has_unsent_output());
+  }
   Result<void> send_queued();
   // Sends bytes directly; returns how many. Nothing may be queued.
   Result<std::size_t> send_some(std::span<const std::byte> bytes);
@@ -80,6 +86,10 @@ class NetworkConnection final : private wire::FrameDelegate {
   // Of this connection and all before it.
   wire::DecoderCounters counters() const noexcept;
 
+  // Whether receive() has something at once that fd() does not show: to be checked before waiting.
+  bool has_buffered_input() const noexcept {
+    return transport_ && transport_->has_buffered_input();
+  }
   // Whether there is something to receive. To be checked before a timeout is declared: after a
   // stall of this program, the answer may have arrived long ago.
   bool has_arrived() const noexcept;
@@ -100,14 +110,16 @@ class NetworkConnection final : private wire::FrameDelegate {
   const std::string& address() const noexcept { return address_; }
 
  private:
-  enum class Phase : unsigned char { down, connecting, greeting, up };
+  enum class Phase : unsigned char { down, connecting, securing, greeting, up };
 
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   Result<void> on_frame(net::Frame& frame) override;
   Result<void> connect();
   Result<void> connect_next(Error why);
-  Result<void> greet();
+  Result<void> begin();
+  Result<void> secure();
+  Result<void> greet(std::unique_ptr<wire::Transport> transport);
   Result<wire::IoStatus> on_received(const Result<wire::IoResult>& received);
   bool make_epoll() noexcept;
   Error fail(Error why);
@@ -122,7 +134,9 @@ class NetworkConnection final : private wire::FrameDelegate {
   MonoTime step_at_ = MonoTime::min();
   channel::ConnectPlan plan_;
   std::string address_;
+  const ClientCredentials credentials_;
   UniqueFd connecting_;
+  std::optional<wire::TlsHandshake> handshake_;
   std::unique_ptr<wire::Transport> transport_;
   std::unique_ptr<wire::FrameDecoder> decoder_;
   wire::DecoderCounters earlier_;

@@ -47,9 +47,9 @@ Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
                                              const PConnectorOptions& options) {
   const MonoTime deadline = deadline_in(options.request_timeout);
   ListDelegate delegate;
-  NetworkConnection connection(delegate,
-                               options.program.empty() ? default_program() : options.program,
-                               options.request_timeout);
+  NetworkConnection connection(
+      delegate, options.program.empty() ? default_program() : options.program,
+      options.request_timeout, DSSM_TRY(load_credentials(options.credentials)));
   DSSM_TRY(connection.start(find_host(host)));
   for (bool asked = false; !delegate.streams;) {
     DSSM_TRY(connection.advance());
@@ -62,9 +62,13 @@ Result<std::vector<StreamInfo>> list_streams(const wire::Address& host,
     }
     if (connection.is_up() && connection.has_queued()) DSSM_TRY(connection.send_queued());
     const MonoTime now = MonoClock::now();
-    const timespec timeout = timespec_of(std::min(deadline, connection.next_step()) - now);
+    const timespec timeout = timespec_of(connection.has_buffered_input()
+                                             ? Duration::zero()
+                                             : std::min(deadline, connection.next_step()) - now);
     pollfd ready{connection.fd(), connection.events(false), 0};
-    if (::ppoll(&ready, 1, &timeout, nullptr) > 0) DSSM_TRY(connection.receive());
+    if (::ppoll(&ready, 1, &timeout, nullptr) > 0 || connection.has_buffered_input()) {
+      DSSM_TRY(connection.receive());
+    }
     // After what has arrived was looked at: this program may have been stalled.
     if (now >= deadline && !delegate.streams) return connection.no_answer_error();
   }

@@ -31,18 +31,20 @@ constexpr Duration kCloseTimeout = 1s;  // how long ~StreamClient sends posted s
 
 }  // namespace
 
-StreamClient::StreamClient(Goal goal, PConnectorOptions options)
+StreamClient::StreamClient(Goal goal, PConnectorOptions options, ClientCredentials credentials)
     : goal_(std::move(goal)),
       options_(std::move(options)),
       owner_pid_(::getpid()),
       connection_(*this, options_.program.empty() ? default_program() : options_.program,
                   // A busy dssmd may greet late.
-                  std::max(options_.request_timeout, wire::kHelloTimeout)) {
+                  std::max(options_.request_timeout, wire::kHelloTimeout), std::move(credentials)) {
   publishing_.publisher = wire::random_number();
 }
 
 Result<std::unique_ptr<StreamClient>> StreamClient::open(Goal goal, PConnectorOptions options) {
-  std::unique_ptr<StreamClient> client(new StreamClient(std::move(goal), std::move(options)));
+  ClientCredentials credentials = DSSM_TRY(load_credentials(options.credentials));
+  std::unique_ptr<StreamClient> client(
+      new StreamClient(std::move(goal), std::move(options), std::move(credentials)));
   const StreamId& id = client->goal_.id;
   const std::string& address =
       client->options_.address.empty() ? id.host : client->options_.address;
@@ -193,7 +195,7 @@ WaitStatus StreamClient::run(MonoTime deadline, bool interruptible, Done done) {
   for (;;) {
     advance(LookUp::yes);
     if (done()) return WaitStatus::ready;
-    if (sample_waits_) {
+    if (sample_waits_ || connection_.has_buffered_input()) {
       receive();
       continue;
     }

@@ -71,7 +71,7 @@ class StreamClient final : private wire::FrameDelegate, private channel::Channel
   PConnector::Counters counters() const noexcept;
 
  private:
-  StreamClient(Goal goal, PConnectorOptions options);
+  StreamClient(Goal goal, PConnectorOptions options, ClientCredentials credentials);
 
   enum class LookUp : bool { no, yes };  // whether host names may be looked up, which may wait
 

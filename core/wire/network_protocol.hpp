@@ -33,6 +33,8 @@ inline constexpr Duration kPeerTimeout = std::chrono::milliseconds(2800);
 // For the first Hello of a connection to be complete.
 inline constexpr Duration kHelloTimeout = std::chrono::seconds(3);
 
+struct OwnCredentials;  // tls_credentials.hpp
+
 // Who is at one end of a connection. A value.
 struct Greeting {
   std::string host;  // host's name, checked: 1 to 31 letters, digits and '-'
@@ -44,6 +46,9 @@ struct Greeting {
   // What it reports of its clock; nullptr: nothing. Our own is kept up to date by FleetClock, and
   // all copies of our greeting share it.
   std::shared_ptr<const ClockReport> clock;
+  // Of our own greeting: what proves it. All copies share it; a reload replaces what it holds.
+  // nullptr, or holding nullptr: connections are not encrypted.
+  std::shared_ptr<const OwnCredentials> credentials;
 
   bool has_feature(std::string_view feature) const noexcept;
   std::string str() const;  // "'mapper' on host 'pc3'", "dssmd of host 'pc2'"

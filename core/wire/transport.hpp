@@ -1,30 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Transport: moves the bytes of one connection. TCP today (tcp.hpp); tests use pairs of buffers.
+// Transport: moves the bytes of one connection: over TCP (tcp.hpp), encrypted (tls.hpp), in tests
+// between buffers.
 // Frames, limits and greeting are above it (FrameConnection in dssmd, NetworkConnection in libdssm)
 // and use nothing of the socket but fd(). Both ends get theirs from make_transport() in tcp.hpp.
-//
-// A TLS transport can implement this interface. It needs, beyond what TCP needs:
-//
-//   pending input  A TLS library may hold decrypted bytes while fd() is not readable. The callers
-//                  stop calling receive() when it returned less than the spaces hold, when their
-//                  turn is over, or while they are paused, and then wait for fd(). So either
-//                  receive() fills the spaces as long as it holds bytes, or a has_pending() is
-//                  added that they check before they wait.
-//   handshake      It runs inside send() and receive(): each may have to read and to write.
-//                  would_block then means "wait for the direction that the handshake needs": an
-//                  events() beside fd() gives it. The time limit of the greeting covers it.
-//                  TransportEnd says which side begins.
-//   retry          After would_block, send() may be called with other bytes than before: a final
-//                  failure replaces queued frames, and payloads that are sent from a ring's slot
-//                  may be overwritten. TLS libraries expect the same bytes again, so the transport
-//                  copies what it has begun to encrypt, and reports it as sent.
-//   identity       After the handshake it knows who the peer is. The function that decides whether
-//                  a request is allowed takes that in place of the name in `Hello`.
-//   ends           TLS closes with a message of its own: a connection that ends without it is an
-//                  error, not `end`.
-//   copies         In-place sending (daemon/link/sample_sender.hpp) saves a copy only where the
-//                  kernel copies; with TLS, "copied" is better for all sizes.
 #pragma once
 
 #include <poll.h>
@@ -52,6 +31,8 @@ struct IoResult {
   IoStatus status = IoStatus::ok;
   std::size_t bytes = 0;
 };
+
+struct CertifiedPeer;  // tls_credentials.hpp
 
 // Which end of the connection a transport is.
 enum class TransportEnd : unsigned char { connected, accepted };
@@ -104,6 +85,18 @@ class Transport {
     return receive(spaces);
   }
   static constexpr std::chrono::milliseconds kReceiveWait{10};
+
+  // Whether receive() has more at once, whatever fd() says: what was received and decrypted may
+  // not have fit into the spaces. Check it before waiting for fd().
+  virtual bool has_buffered_input() const noexcept { return false; }
+  // Whether bytes that send() took wait here for fd() to become writable; then call flush().
+  virtual bool has_unsent_output() const noexcept { return false; }
+  //   returns  ok (nothing waits here) | would_block | end
+  virtual Result<IoStatus> flush() { return IoStatus::ok; }
+
+  // Who the other side is, by its certificate. nullptr: the connection is not encrypted, and nobody
+  // knows. Valid as long as the transport.
+  virtual const CertifiedPeer* peer() const noexcept { return nullptr; }
 
   // From now on the kernel stamps the bytes that arrive, if it can, and arrived() returns that.
   virtual void stamp_arrivals() noexcept {}

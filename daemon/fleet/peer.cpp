@@ -116,7 +116,7 @@ void PeerReport::add_connection(const Peer& peer, local::Host& host) const {
   host.set_round_trip_ns(to_ns(connection.last_round_trip()));
   host.set_least_round_trip_ns(to_ns(connection.min_round_trip()));
   host.set_carried_bytes_per_s(connection.carried_bytes_per_s());
-  host.set_insecure(connection.crosses_network());
+  host.set_insecure(connection.is_insecure());
   if (connection.them()) {
     host.set_name(connection.them()->host);
     host.set_host_id(connection.them()->host_id.data(), connection.them()->host_id.size());

@@ -80,6 +80,7 @@ class PeerConnection final : private Dialer::Observer {
   void set_addresses(const std::vector<wire::Address>& addresses);
   // Tries now, unless it is up: it may have become available.
   void on_network_changed();
+  void on_new_credentials() { dialer_.on_new_credentials(); }
 
   // --- about the peer
 
@@ -94,7 +95,7 @@ class PeerConnection final : private Dialer::Observer {
   // As configured; of a found host: its first address.
   const wire::Address& configured() const noexcept { return configured_; }
   std::string address() const { return dialer_.address(); }  // connected to, else configured()
-  bool crosses_network() const noexcept { return dialer_.crosses_network(); }
+  bool is_insecure() const noexcept { return dialer_.is_insecure(); }
 
   // Of the heartbeats of this connection; zero: not known.
   Duration last_round_trip() const noexcept { return round_trips_.last; }

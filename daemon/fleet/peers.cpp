@@ -92,8 +92,8 @@ PeerConnection* Peers::connection_to(const wire::HostId& id) {
 
 // --- found hosts
 
-void Peers::expect_finder(bool insecure) {
-  insecure_ = insecure;
+void Peers::expect_finder(bool leaves_pc) {
+  leaves_pc_ = leaves_pc;
   mdns_.phase = MdnsPhase::waiting;
   finder_is_searching_ = true;
   startup_is_over_ = false;
@@ -162,7 +162,7 @@ void Peers::find_usable_addresses(Peer::Found& found, const Occupied& occupied) 
     obstacle = {HostReason::closed_there,
                 who +
                     " listens on its own loopback only; to share its streams set listen and "
-                    "insecure there, see docs/configuration.md"};
+                    "credentials there, see docs/security.md"};
   } else {
     obstacle = {HostReason::no_address,
                 who +
@@ -172,11 +172,11 @@ void Peers::find_usable_addresses(Peer::Found& found, const Occupied& occupied) 
   for (const wire::Address& address : host.addresses) {
     const std::vector<wire::SocketAddress> numbers = wire::resolve_number(address);
     if (numbers.empty()) continue;
-    if (!insecure_ && !numbers.front().is_loopback()) {
+    if (!leaves_pc_ && !numbers.front().is_loopback()) {
       obstacle = {HostReason::closed_here,
                   who +
-                      " is on another PC, and this dssmd connects to others only with insecure "
-                      "= true, see docs/configuration.md"};
+                      " is on another PC, and this dssmd has no credentials to connect to others, "
+                      "see docs/security.md"};
       continue;
     }
     const auto occupant = occupied.find(numbers.front().str());
@@ -261,6 +261,12 @@ void Peers::set_configured(const std::vector<wire::Address>& peers) {
 void Peers::on_network_changed() {
   for (const Peer& peer : peers_) {
     if (peer.connection) peer.connection->on_network_changed();
+  }
+}
+
+void Peers::on_new_credentials() {
+  for (const Peer& peer : peers_) {
+    if (peer.connection) peer.connection->on_new_credentials();
   }
 }
 

@@ -76,14 +76,15 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   void set_configured(const std::vector<wire::Address>& peers);
   // This PC's network may have come back: all that are not up are tried now. From the loop.
   void on_network_changed();
+  // The own credentials were replaced. From the loop.
+  void on_new_credentials();
 
   // Called from the loop after changes, several of them together; {}: no callback.
   void on_change(std::function<void()> then) { on_change_ = std::move(then); }
 
   // There is a finder, which will call the functions below. To be called before the loop runs.
-  //   insecure  found hosts may be reached over the network, unencrypted; else only those on this
-  //             PC's loopback
-  void expect_finder(bool insecure);
+  //   leaves_pc  found hosts may be reached over the network; else only those on this PC's loopback
+  void expect_finder(bool leaves_pc);
   void on_host_found(const FoundHost& host) override;
   void on_host_lost(const wire::HostId& id) override;
   void on_mdns_state(const MdnsInfo& state) override;
@@ -139,7 +140,7 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   Catalog& catalog_;
   RateLimitedLogger logger_;  // how often found hosts change is decided by their announcements
   std::list<Peer> peers_;     // the configured ones first
-  bool insecure_ = false;
+  bool leaves_pc_ = false;
   bool logged_too_many_ = false;
   std::uint64_t logged_duplicate_ = 0;  // instance id of the duplicate that the log names
   MdnsInfo mdns_;

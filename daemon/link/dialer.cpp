@@ -49,9 +49,11 @@ void Dialer::restart(const Error& why) {
       return connection_->close_with(why);
     case State::look_up:
     case State::connect:
+    case State::secure:
       lookup_.reset();
       connected_.disable();
       socket_.reset();
+      if (handshake_) handshake_->stop();
       reason_ = why;
       state_ = State::give_up;
       return timer_.enable_in(Duration::zero());
@@ -64,6 +66,13 @@ void Dialer::set_addresses(std::vector<wire::Address> addresses) {
   if (state_ == State::connect) begin_round_soon();
 }
 
+void Dialer::on_new_credentials() {
+  const FrameConnection* link = connection();
+  const auto credentials = wire::credentials_of(options_.self);
+  if (!link || !link->peer() || !credentials) return;
+  if (Result<void> checked = credentials->check(*link->peer()); !checked) restart(checked.error());
+}
+
 FrameConnection* Dialer::connection() noexcept {
   return state_ == State::up ? connection_.get() : nullptr;
 }
@@ -73,8 +82,8 @@ std::string Dialer::address() const {
                                                : options_.addresses.front().str();
 }
 
-bool Dialer::crosses_network() const noexcept {
-  return state_ == State::up && !plan_.address().is_loopback();
+bool Dialer::is_insecure() const noexcept {
+  return state_ == State::up && !connection_->peer() && !plan_.address().is_loopback();
 }
 
 // --- a round of attempts
@@ -96,6 +105,7 @@ std::string Dialer::peer_name() const {
 
 void Dialer::begin_round() {
   connection_.reset();
+  handshake_.reset();
   them_.reset();
   reason_.reset();
   round_began_ = loop_.now();
@@ -143,13 +153,27 @@ void Dialer::on_connected() {
     return timer_.enable_in(Duration::zero());
   }
   wire::set_channel_options(socket_.get());
-  state_ = State::greet;
   reached_ = Phase::greet;
+  if (const auto credentials = wire::credentials_of(options_.self)) {
+    state_ = State::secure;
+    timer_.disable();  // the handshake has its own
+    handshake_ = std::make_unique<Handshake>(
+        loop_, credentials, std::move(socket_), wire::TransportEnd::connected, false,
+        [this](Result<std::unique_ptr<wire::Transport>> secured) {
+          if (!secured) return fail(std::move(secured).error().context(peer_name()));
+          greet(*std::move(secured));
+        });
+    return;
+  }
+  greet(wire::make_transport(std::move(socket_), wire::TransportEnd::connected));
+}
+
+void Dialer::greet(std::unique_ptr<wire::Transport> transport) {
+  state_ = State::greet;
   timer_.enable_in(wire::kHelloTimeout);
   FrameConnection::Observer& observer = *this;
-  connection_ = std::make_unique<FrameConnection>(
-      loop_, wire::make_transport(std::move(socket_), wire::TransportEnd::connected), observer,
-      options_.max_queued_bytes);
+  connection_ = std::make_unique<FrameConnection>(loop_, std::move(transport), observer,
+                                                  options_.max_queued_bytes);
   net::Frame hello;
   wire::to_message(options_.self, *hello.mutable_hello());
   connection_->send(hello);
@@ -169,6 +193,7 @@ void Dialer::on_timer() {
       reason_ = Error{Errc::unavailable, peer_name() + " does not greet; is it a dssmd?"};
       return connection_->close_with(*reason_);
     case State::look_up:
+    case State::secure:
     case State::up:
       return;
   }
@@ -186,6 +211,10 @@ Result<void> Dialer::on_frame(net::Frame& frame) {
 
 Result<void> Dialer::greet_untrusted(const net::Frame& frame) {
   Result<wire::Greeting> greeting = wire::server_greeting_untrusted(frame, peer_name());
+  if (greeting && connection_->peer()) {
+    const Result<void> checked = wire::check_certified(*greeting, *connection_->peer());
+    if (!checked) greeting = checked.error();
+  }
   if (!greeting) {
     reason_ = std::move(greeting).error();
     return *reason_;
@@ -200,7 +229,8 @@ Result<void> Dialer::greet_untrusted(const net::Frame& frame) {
 }
 
 void Dialer::fail(const Error& why) {
-  const bool avoid_address = std::exchange(given_up_, false) || state_ == State::greet;
+  const bool avoid_address =
+      std::exchange(given_up_, false) || state_ == State::greet || state_ == State::secure;
   state_ = State::pause;
   timer_.enable_in(plan_.end_round(loop_.now(), avoid_address));
   observer_.on_down(why);

@@ -7,7 +7,7 @@
 //
 //           found             connected            Hello
 //   look_up ------> connect ------------> greet ----------> up
-//     ^    address |  ^  | next address
+//     ^    address |  ^  | next address     (with credentials: secure, then greet)
 //     |            |  +--+
 //     | timer      v no address is left, no greeting, connection closed, restart()
 //   pause <------------------------------------------------ every other state
@@ -24,6 +24,7 @@
 #include "core/wire/network_protocol.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/link/frame_connection.hpp"
+#include "daemon/link/handshake.hpp"
 #include "daemon/link/resolver.hpp"
 
 namespace dssm::daemon {
@@ -49,7 +50,7 @@ class Dialer final : private FrameConnection::Observer {
     // Best first, at least one: numbers, or one name, which is looked up again for each round of
     // attempts.
     std::vector<wire::Address> addresses;
-    wire::Greeting self;  // to send
+    wire::Greeting self;  // to send; its credentials are used
     std::size_t max_queued_bytes = 1U << 20;
     Duration round_time = Duration::max();  // as in ConnectPlan
   };
@@ -72,18 +73,22 @@ class Dialer final : private FrameConnection::Observer {
   // The addresses from the next round of attempts on. That begins at once when an attempt waits for
   // an answer; a connection that is up stays as it is.
   void set_addresses(std::vector<wire::Address> addresses);
+  // The own credentials were replaced: gives up a connection whose other side they do not accept.
+  void on_new_credentials();
 
   FrameConnection* connection() noexcept;  // nullptr unless up
   // For on_down(): how far the attempt or connection had come that ended.
   enum class Phase : unsigned char { look_up, connect, greet, up };
   Phase reached() const noexcept { return reached_; }
-  std::string address() const;            // connected to, else the first
-  bool crosses_network() const noexcept;  // connected to another address than loopback
+  std::string address() const;  // connected to, else the first
+  // Connected to another PC (as far as the address says so), and not encrypted.
+  bool is_insecure() const noexcept;
 
  private:
   enum class State : std::uint8_t {
     look_up,  // until the resolver answers
     connect,  // until the socket is connected, or the timer
+    secure,   // until the TLS handshake ended
     greet,    // until their Hello came, or the timer
     up,       // until the connection closes
     give_up,  // restart() was called: until the timer, at once
@@ -101,6 +106,7 @@ class Dialer final : private FrameConnection::Observer {
   void try_address();
   void try_next_address(const Error& why);
   void on_connected();
+  void greet(std::unique_ptr<wire::Transport> transport);
   void on_timer();
   Result<void> greet_untrusted(const net::Frame& frame);
   void fail(const Error& why);
@@ -117,6 +123,8 @@ class Dialer final : private FrameConnection::Observer {
   MonoTime round_began_{};
   Resolver::Ticket lookup_;
   UniqueFd socket_;  // while it connects
+  // Until the next round, as the connection below.
+  std::unique_ptr<Handshake> handshake_;
   // Until the next round: a FrameConnection must not be destroyed in its own callbacks.
   std::unique_ptr<FrameConnection> connection_;
   std::optional<wire::Greeting> them_;

@@ -43,6 +43,7 @@ FrameConnection::FrameConnection(const EventLoop& loop, std::unique_ptr<wire::Tr
       next_turn_(EventSource::timer(loop, [this] { continue_receiving(); })),
       ended_(EventSource::timer(loop, [this] { observer_.on_closed(last_error_); })) {
   readable_.enable();
+  continue_soon();  // with what came behind a handshake
 }
 
 FrameConnection::~FrameConnection() {
@@ -86,14 +87,25 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& de
     if (input_.paused || input_.decoder_held || got->bytes < free_bytes) break;
   }
   if (received > 0 && samples_) samples_->on_batch_end();
-  if (ended) close(end);
+  if (ended) return close(end);
+  // What TLS answers by itself.
+  if (!closed_ && transport_->has_unsent_output()) want_output();
+  continue_soon();
 }
 
-// Continues with the bytes that were received before a pause.
+// Continues with the bytes that were received before a pause, or that the transport holds.
 void FrameConnection::continue_receiving() {
   if (closed_ || input_.paused || !decode(0)) return;
   if (samples_) samples_->on_batch_end();
-  if (!closed_ && !input_.paused) receive_more();
+  if (closed_ || input_.paused) return;
+  if (!input_.decoder_held && transport_->has_buffered_input()) return on_readable();
+  receive_more();
+}
+
+// In the next turn, if there is something to continue with that the socket does not show.
+[[gnu::hot]] void FrameConnection::continue_soon() {
+  if (closed_ || input_.paused || !transport_->has_buffered_input()) return;
+  next_turn_.enable_in(Duration::zero());
 }
 
 // False when the connection closed meanwhile.
@@ -126,6 +138,7 @@ void FrameConnection::continue_receiving() {
 void FrameConnection::receive_more() {
   if (input_.decoder_held) return next_turn_.enable_in(Duration::zero());
   readable_.enable();
+  continue_soon();
 }
 
 // When a handler has closed the connection, an error stops the decoder.
@@ -239,9 +252,19 @@ void FrameConnection::on_writable() {
       when_writable_ = now;
     }
   }
+  if (!flush_transport()) return;
   if (!output_.mid_frame && !flush()) return;
+  if (closed_ || transport_->has_unsent_output()) return;
   writable_.disable();
   observer_.on_output_empty();
+}
+
+// False: what the transport holds could not all be sent.
+bool FrameConnection::flush_transport() {
+  const Result<wire::IoStatus> flushed = transport_->flush();
+  if (flushed && *flushed != wire::IoStatus::end) return *flushed == wire::IoStatus::ok;
+  on_output_end(flushed ? nullptr : &flushed.error());
+  return false;
 }
 
 // Sends the queue. True when it is empty.
@@ -276,12 +299,17 @@ bool FrameConnection::flush() {
   if (sent && sent->status != wire::IoStatus::end) {
     sent_bytes_ += sent->bytes;
     if (pace_) pace_->on_sent(sent->bytes);
+    if (transport_->has_unsent_output()) writable_.enable();
     return sent->bytes;
   }
-  last_error_ =
-      sent ? Error{Errc::unavailable, "the other side closed the connection"} : sent.error();
-  lose_output();
+  on_output_end(sent ? nullptr : &sent.error());
   return 0;
+}
+
+// why: none when the other side closed the connection.
+void FrameConnection::on_output_end(const Error* why) {
+  last_error_ = why ? *why : Error{Errc::unavailable, "the other side closed the connection"};
+  lose_output();
 }
 
 std::size_t FrameConnection::history_allowance() {

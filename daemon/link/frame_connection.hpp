@@ -183,6 +183,10 @@ class FrameConnection final : private wire::FrameDelegate {
     return closed_ ? std::nullopt : transport_->progress();
   }
   const wire::DecoderCounters& counters() const noexcept { return decoder_.counters(); }
+  // As wire::Transport; none after the end.
+  const wire::CertifiedPeer* peer() const noexcept {
+    return closed_ ? nullptr : transport_->peer();
+  }
 
  private:
   struct Outgoing {
@@ -214,11 +218,14 @@ class FrameConnection final : private wire::FrameDelegate {
   void on_readable();
   void on_writable();
   void continue_receiving();
+  void continue_soon();
   bool decode(std::size_t bytes);
   bool charge_input();
   void receive_more();
   std::size_t transmit(std::span<const iovec> parts);
+  bool flush_transport();
   bool flush();
+  void on_output_end(const Error* why);
   void enqueue(Outgoing outgoing);
   void lose_output();
   void drop_queue();

@@ -93,6 +93,9 @@ class OwnerConnection final : private Dialer::Observer {
   // The host that owns the stream, after the first connect().
   const std::optional<wire::HostId>& owner() const noexcept { return owner_; }
   const wire::Address& address() const noexcept { return address_; }
+  void on_new_credentials() {
+    if (dialer_) dialer_->on_new_credentials();
+  }
   FrameConnection* frames() noexcept { return dialer_ ? dialer_->connection() : nullptr; }
 
   // The owner answers at that address. Another host than before has taken over the name.

@@ -3,9 +3,12 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <utility>
 
+#include "core/base/text.hpp"
 #include "core/base/try.hpp"
+#include "core/wire/messages.hpp"
 #include "core/wire/tcp.hpp"
 #include "daemon/base/message_ids.hpp"
 
@@ -16,6 +19,12 @@ namespace {
 // killed after it wrote a sample and before it wrote to the doorbell.
 constexpr Duration kCheckPeriod = std::chrono::milliseconds(900);
 
+// Ports differ from connection to connection.
+std::string without_port(const wire::SocketAddress& address) {
+  const std::string text = address.str();
+  return text.substr(0, text.rfind(':'));
+}
+
 }  // namespace
 
 ChannelServer::ChannelServer(const Parts& parts, wire::Greeting self,
@@ -23,6 +32,7 @@ ChannelServer::ChannelServer(const Parts& parts, wire::Greeting self,
     : parts_(parts),
       logger_(parts.logger),
       self_(std::move(self)),
+      limits_(limits),
       peers_(limits),
       streams_(parts.loop),
       sweep_(EventSource::timer(parts.loop, [this] { sweep(); })),
@@ -45,19 +55,84 @@ void ChannelServer::serve(const NetworkListener& listener) {
 Result<void> ChannelServer::accept(UniqueFd& socket) {
   const Result<wire::SocketAddress> address = wire::peer_address(socket.get());
   if (!address) return {};  // the peer has closed it already
-  Result<PeerPlace> place = peers_.admit(*address);
-  if (!place) {
-    return std::move(place).error().context(
-        fmt::format("dssmd of host '{}' refuses '{}'", self_.host, address->str()));
+  if (wire::credentials_of(self_)) {
+    secure(std::move(socket), *address);
+    return {};
   }
+  Result<PeerPlace> place = peers_.admit(in_quotes(without_port(*address)));
+  if (!place) return std::move(place).error().context(refuses(*address));
   keep(*std::move(place), wire::make_transport(std::move(socket), wire::TransportEnd::accepted),
        *address);
   return {};
 }
 
+std::string ChannelServer::refuses(const wire::SocketAddress& address) const {
+  return fmt::format("dssmd of host '{}' refuses '{}'", self_.host, address.str());
+}
+
+// Anybody can begin handshakes. As many are under way as connections are allowed; the oldest is
+// given up for one more, because a handshake that goes on takes milliseconds.
+void ChannelServer::secure(UniqueFd socket, const wire::SocketAddress& address) {
+  const std::string where = without_port(address);
+  const auto oldest = [&](auto counts) {
+    const auto found = std::find_if(arrivals_.begin(), arrivals_.end(),
+                                    [&](const Arrival& one) { return !one.ended && counts(one); });
+    found->ended = true;
+    found->handshake->stop();
+  };
+  const auto count = [&](auto counts) {
+    return static_cast<std::uint64_t>(
+        std::count_if(arrivals_.begin(), arrivals_.end(),
+                      [&](const Arrival& one) { return !one.ended && counts(one); }));
+  };
+  const auto is_from_there = [&](const Arrival& one) { return one.address == where; };
+  const auto is_any = [](const Arrival&) { return true; };
+  if (count(is_from_there) >= limits_.max_connections_per_host) {
+    oldest(is_from_there);
+  } else if (count(is_any) >= limits_.max_connections) {
+    oldest(is_any);
+  }
+  Arrival& arrival = arrivals_.emplace_back(Arrival{where, nullptr, false});
+  const bool takes_plain = parts_.takes_plain || address.is_loopback();
+  arrival.handshake = std::make_unique<Handshake>(
+      parts_.loop, wire::credentials_of(self_), std::move(socket), wire::TransportEnd::accepted,
+      takes_plain, [this, &arrival, address](Result<std::unique_ptr<wire::Transport>> transport) {
+        on_secured(arrival, address, std::move(transport));
+      });
+}
+
+void ChannelServer::on_secured(Arrival& arrival, const wire::SocketAddress& address,
+                               Result<std::unique_ptr<wire::Transport>> transport) {
+  arrival.ended = true;
+  sweep_.enable_in(Duration::zero());
+  if (!transport) {
+    return logger_.warning(fmt::format("{}: {}", refuses(address), transport.error().message),
+                           {.peer = address.str(), .message_id = message_id::kPeerRefused});
+  }
+  const wire::CertifiedPeer* peer = (*transport)->peer();
+  Result<PeerPlace> place = peers_.admit(peer ? peer->str() : in_quotes(arrival.address));
+  if (!place) {
+    const Error error = std::move(place).error().context(refuses(address));
+    logger_.warning(error.message, {.peer = address.str(), .message_id = message_id::kPeerRefused});
+    const std::string frame = wire::final_failure(error);
+    const iovec part{const_cast<char*>(frame.data()), frame.size()};
+    static_cast<void>((*transport)->send({&part, 1}));  // as much as is taken at once
+    return;
+  }
+  keep(*std::move(place), *std::move(transport), address);
+}
+
+void ChannelServer::on_new_credentials() {
+  const auto credentials = wire::credentials_of(self_);
+  if (!credentials) return;
+  for (const auto& [key, communicator] : communicators_) {
+    communicator->on_new_credentials(*credentials);
+  }
+}
+
 Result<void> ChannelServer::adopt(std::unique_ptr<wire::Transport> transport,
                                   const wire::SocketAddress& address) {
-  PeerPlace place = DSSM_TRY(peers_.admit(address));
+  PeerPlace place = DSSM_TRY(peers_.admit(in_quotes(without_port(address))));
   keep(std::move(place), std::move(transport), address);
   return {};
 }
@@ -95,6 +170,7 @@ void ChannelServer::sweep() {
   for (DataCommunicator* communicator : std::exchange(ended_, {})) {
     communicators_.erase(communicator);
   }
+  std::erase_if(arrivals_, [](const Arrival& one) { return one.ended; });
 }
 
 void ChannelServer::on_stream_added(const Stream& stream) {

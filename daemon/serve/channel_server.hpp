@@ -5,8 +5,10 @@
 
 #include <cstdint>
 #include <dssm/result.hpp>
+#include <list>
 #include <map>
 #include <memory>
+#include <string>
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
@@ -14,6 +16,7 @@
 #include "daemon/base/acceptor.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
+#include "daemon/link/handshake.hpp"
 #include "daemon/link/network_listener.hpp"
 #include "daemon/serve/data_communicator.hpp"
 #include "daemon/serve/peer_table.hpp"
@@ -34,9 +37,11 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     ClockAssessor* clock = nullptr;           // nullptr: the clock is not watched
     std::function<void()> on_heartbeat = {};  // of another host, about once a second; may be empty
     Authorizer authorizer = authorize;
+    bool takes_plain = false;  // with credentials: from other PCs, too
   };
 
-  // self: how this dssmd greets. All in `parts` outlive it.
+  // self: how this dssmd greets; with its credentials, connections are encrypted. All in `parts`
+  // outlive it.
   ChannelServer(const Parts& parts, wire::Greeting self, const PeerTable::Limits& limits);
   ChannelServer(const ChannelServer&) = delete;
   ChannelServer& operator=(const ChannelServer&) = delete;
@@ -50,17 +55,34 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   Result<void> adopt(std::unique_ptr<wire::Transport> transport,
                      const wire::SocketAddress& address);
 
+  // The own credentials were replaced: ends connections of peers that they do not accept.
+  void on_new_credentials();
+
   // This host's clock has a new generation: notifies the hosts that are connected.
   void send_clock();
   // Assessments of clocks may have changed; at least once a second.
   void on_clock();
 
-  void set_limits(const PeerTable::Limits& limits) { peers_.set_limits(limits); }
+  void set_limits(const PeerTable::Limits& limits) {
+    limits_ = limits;
+    peers_.set_limits(limits);
+  }
   // For subscriptions from now on.
   void set_sending(SendingDemands sending) { sending_ = std::move(sending); }
 
  private:
+  // A connection whose TLS handshake is under way.
+  struct Arrival {
+    std::string address;  // without port
+    std::unique_ptr<Handshake> handshake;
+    bool ended = false;  // to be destroyed outside of its own callback
+  };
+
   Result<void> accept(UniqueFd& socket);
+  void secure(UniqueFd socket, const wire::SocketAddress& address);
+  void on_secured(Arrival& arrival, const wire::SocketAddress& address,
+                  Result<std::unique_ptr<wire::Transport>> transport);
+  std::string refuses(const wire::SocketAddress& address) const;
   void keep(PeerPlace place, std::unique_ptr<wire::Transport> transport,
             const wire::SocketAddress& address);
   void sweep();
@@ -73,7 +95,9 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   Parts parts_;
   RateLimitedLogger logger_;
   wire::Greeting self_;
+  PeerTable::Limits limits_;
   PeerTable peers_;
+  std::list<Arrival> arrivals_;  // the oldest first
   SendingDemands sending_;
   ServedStreams streams_;
   MonoTime checked_{};  // all streams

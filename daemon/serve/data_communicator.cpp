@@ -111,6 +111,11 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
     // With the names of both ends, which the peer logs.
     return std::move(them).error().context("dssmd of host '" + parts_.self.host + "' refuses");
   }
+  if (const wire::CertifiedPeer* peer = link_.peer()) {
+    DSSM_TRY(wire::check_certified(*them, *peer),
+             "dssmd of host '" + parts_.self.host + "' refuses");
+    identity_.certified = peer->str();
+  }
   them_ = *std::move(them);
   identity_.address = peer_address_;
   identity_.host = them_->host;
@@ -122,6 +127,12 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
   wire::to_message(parts_.self, *hello.mutable_hello());
   link_.send(hello);
   return {};
+}
+
+void DataCommunicator::on_new_credentials(const wire::TlsCredentials& credentials) {
+  const wire::CertifiedPeer* peer = link_.peer();
+  if (!peer) return;
+  if (Result<void> checked = credentials.check(*peer); !checked) close_with(checked.error());
 }
 
 bool DataCommunicator::can_serve() const noexcept {

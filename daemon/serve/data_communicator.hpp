@@ -16,6 +16,7 @@
 #include <string>
 
 #include "core/wire/network_protocol.hpp"
+#include "core/wire/tls_credentials.hpp"
 #include "core/wire/transport.hpp"
 #include "daemon/base/event_loop.hpp"
 #include "daemon/base/log.hpp"
@@ -105,6 +106,9 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
 
   // This host's clock has a new generation: notifies control connections with the feature.
   void send_clock();
+
+  // Closes when `credentials` do not accept the peer.
+  void on_new_credentials(const wire::TlsCredentials& credentials);
 
   // Sends a final failure, as far as the socket takes it at once.
   void close_with(const Error& why) { link_.close_with(why); }

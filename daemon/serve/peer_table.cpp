@@ -7,15 +7,6 @@
 #include <utility>
 
 namespace dssm::daemon {
-namespace {
-
-// The address alone: ports differ from connection to connection.
-std::string without_port(const wire::SocketAddress& address) {
-  std::string text = address.str();
-  return text.substr(0, text.rfind(':'));
-}
-
-}  // namespace
 
 PeerPlace::PeerPlace(PeerTable& table, PeerAccount& account, MemoryShare share)
     : table_(&table), account_(&account), share_(std::move(share)) {
@@ -35,41 +26,40 @@ PeerPlace::~PeerPlace() {
 
 void PeerTable::set_limits(const Limits& limits) {
   limits_ = limits;
-  for (const auto& [address, account] : accounts_) {
+  for (const auto& [peer, account] : accounts_) {
     account->budget.set_limit(limits.max_peer_memory_bytes);
   }
 }
 
-Result<PeerPlace> PeerTable::admit(const wire::SocketAddress& address) {
+Result<PeerPlace> PeerTable::admit(const std::string& peer) {
   if (connections_ >= limits_.max_connections) {
     return Error{Errc::limit_exceeded,
                  fmt::format("there are max_connections = {} connections from other hosts already; "
                              "close some or raise the key max_connections",
                              limits_.max_connections)};
   }
-  const std::string name = without_port(address);
-  const auto found = accounts_.find(name);
+  const auto found = accounts_.find(peer);
   if (found != accounts_.end() && found->second->connections >= limits_.max_connections_per_host) {
     return Error{Errc::limit_exceeded,
-                 fmt::format("there are max_connections_per_host = {} connections from '{}' "
+                 fmt::format("there are max_connections_per_host = {} connections from {} "
                              "already; close some or raise the key max_connections_per_host",
-                             limits_.max_connections_per_host, name)};
+                             limits_.max_connections_per_host, peer)};
   }
-  std::unique_ptr<PeerAccount>& account = accounts_[name];
-  if (!account) account = std::make_unique<PeerAccount>(name, limits_.max_peer_memory_bytes);
+  std::unique_ptr<PeerAccount>& account = accounts_[peer];
+  if (!account) account = std::make_unique<PeerAccount>(peer, limits_.max_peer_memory_bytes);
   std::optional<MemoryShare> share = account->budget.try_take(kConnectionBytes);
   if (share) return PeerPlace(*this, *account, *std::move(share));
   Error error{Errc::limit_exceeded,
-              fmt::format("the connections from '{}' have used up max_peer_memory = {} bytes; "
+              fmt::format("the connections from {} have used up max_peer_memory = {} bytes; "
                           "close some or raise the key max_peer_memory",
-                          name, limits_.max_peer_memory_bytes)};
-  if (account->connections == 0) accounts_.erase(name);
+                          peer, limits_.max_peer_memory_bytes)};
+  if (account->connections == 0) accounts_.erase(peer);
   return error;
 }
 
 void PeerTable::leave(PeerAccount& account) {
   --connections_;
-  if (--account.connections == 0) accounts_.erase(std::string(account.address));
+  if (--account.connections == 0) accounts_.erase(std::string(account.name));
 }
 
 }  // namespace dssm::daemon

@@ -1,8 +1,9 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The connections over the network, by address, and the memory that they use. Everything that a
-// peer can make grow (frames that wait for it, samples that are received from it, ...) is charged
-// to the account of its address, so that one peer cannot use up the memory of the others.
+// The connections over the network, by peer, and the memory that they use. Everything that a peer
+// can make grow (frames that wait for it, samples that are received from it, ...) is charged to its
+// account, so that one peer cannot use up the memory of the others. An address counts as a peer
+// unless a certificate says who is there.
 #pragma once
 
 #include <cstdint>
@@ -11,17 +12,16 @@
 #include <memory>
 #include <string>
 
-#include "core/wire/address.hpp"
 #include "daemon/base/memory_budget.hpp"
 #include "daemon/link/history_pace.hpp"
 
 namespace dssm::daemon {
 
-// One address, while there are connections from it.
+// One peer, while there are connections of it.
 struct PeerAccount {
-  PeerAccount(std::string its_address, std::uint64_t memory_bytes)
-      : address(std::move(its_address)), budget(memory_bytes) {}
-  std::string address;  // "10.0.0.2", without port
+  PeerAccount(std::string its_name, std::uint64_t memory_bytes)
+      : name(std::move(its_name)), budget(memory_bytes) {}
+  std::string name;  // "10.0.0.2", "host 'pc2'"
   MemoryBudget budget;
   HistoryPace pace;
   std::uint64_t connections = 0;
@@ -66,9 +66,10 @@ class PeerTable {
   // For new connections, and for the budgets of existing accounts.
   void set_limits(const Limits& limits);
 
-  // A place for one more connection from `address`.
+  // A place for one more connection of `peer`: its address without a port or, when its certificate
+  // says who it is, that.
   //   fails  limit_exceeded, naming the key
-  Result<PeerPlace> admit(const wire::SocketAddress& address);
+  Result<PeerPlace> admit(const std::string& peer);
 
  private:
   friend class PeerPlace;

@@ -101,7 +101,7 @@ bool stays_on_this_pc(const wire::Address& address) {
 }
 
 Result<void> check_secure(const Config& config) {
-  if (config.insecure) return {};
+  if (config.insecure || !config.credentials.empty()) return {};
   std::string addresses;
   const auto note = [&](std::string_view what, const std::vector<wire::Address>& list) {
     for (const wire::Address& address : list) {
@@ -118,9 +118,39 @@ Result<void> check_secure(const Config& config) {
   return Error{
       Errc::invalid_argument,
       addresses +
-          ": traffic to other PCs is unencrypted, and any host that reaches this one can read "
-          "and write all its streams; set insecure = true (--insecure) if you own that "
-          "network, or use loopback addresses only"};
+          ": without credentials, traffic to other PCs is unencrypted, and any host that reaches "
+          "this one can read and write all its streams; set credentials = \"FOLDER\" "
+          "(docs/security.md), or insecure = true (--insecure) if you own that network, or use "
+          "loopback addresses only"};
+}
+
+Result<void> take_name_of_machine(Config& config) {
+  char name[256] = {};
+  if (::gethostname(name, sizeof name - 1)) return os_error("ask for the machine's name");
+  const std::string_view first_label(name, ::strcspn(name, "."));
+  if (Result<void> checked = check_host_name(first_label); !checked) {
+    return Error{Errc::invalid_argument,
+                 "the machine's name cannot be the host's name: " + checked.error().message +
+                     "; choose one with --name or the key 'name'"};
+  }
+  config.name = first_label;
+  return {};
+}
+
+Result<void> load_credentials(Config& config) {
+  if (config.credentials.empty()) return {};
+  config.loaded_credentials = DSSM_TRY(wire::TlsCredentials::load(config.credentials));
+  const wire::CertifiedPeer& own = config.loaded_credentials->own();
+  const bool is_host = own.kind == wire::CertifiedPeer::Kind::host;
+  if (is_host && own.name == config.name && own.host_id == wire::host_id_for(config.name)) {
+    return {};
+  }
+  return Error{
+      Errc::invalid_argument,
+      fmt::format("credentials: the certificate in '{}' is of {}{}, and this is host '{}'; "
+                  "issue one for it (`dssmctl pki request`, docs/security.md)",
+                  config.credentials, own.str(),
+                  is_host && own.name == config.name ? " on another machine" : "", config.name)};
 }
 
 template <auto member>
@@ -197,9 +227,17 @@ constexpr ConfigKey kKeys[] = {
     {"peers", "HOST:PORT", "another host's dssmd to share streams with; may be repeated",
      ValueForm::list, kChangesAtOnce<&Config::peers>, add_peer, [](Config& c) { c.peers.clear(); },
      "peer"},
-    {"insecure", "", "allow addresses of other PCs; the traffic is not encrypted",
-     ValueForm::boolean, kChangesAtRestart<&Config::insecure>,
-     set_by<&Config::insecure, parse_boolean>},
+    {"credentials", "FOLDER",
+     "encrypt connections with other PCs, and accept only those with certificates of the same "
+     "authority; the files (ca.crt, own.crt, own.key, revoked.crl) are read again at a reload; '' "
+     "for none; default: none",
+     ValueForm::text, kChangesAtRestart<&Config::credentials>,
+     [](Config& c, std::string_view text) -> Result<void> {
+       c.credentials = text;
+       return {};
+     }},
+    {"insecure", "", "allow connections with other PCs that are not encrypted", ValueForm::boolean,
+     kChangesAtRestart<&Config::insecure>, set_by<&Config::insecure, parse_boolean>},
     {"mdns", "",
      "find other hosts, and announce this one and its streams, by mDNS; default: true "
      "(--mdns=false: do not)",
@@ -426,17 +464,8 @@ Result<void> apply_file(Config& config, const std::string& path) {
 
 Result<void> finish(Config& config) {
   DSSM_TRY(check_secure(config));
-  if (!config.name.empty()) return {};
-  char name[256] = {};
-  if (::gethostname(name, sizeof name - 1)) return os_error("ask for the machine's name");
-  const std::string_view first_label(name, ::strcspn(name, "."));
-  if (Result<void> checked = check_host_name(first_label); !checked) {
-    return Error{Errc::invalid_argument,
-                 "the machine's name cannot be the host's name: " + checked.error().message +
-                     "; choose one with --name or the key 'name'"};
-  }
-  config.name = first_label;
-  return {};
+  if (config.name.empty()) DSSM_TRY(take_name_of_machine(config));
+  return load_credentials(config);
 }
 
 }  // namespace dssm::daemon

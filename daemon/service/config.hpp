@@ -11,6 +11,7 @@
 #include <cstdint>
 #include <dssm/result.hpp>
 #include <dssm/time.hpp>
+#include <memory>
 #include <optional>
 #include <span>
 #include <string>
@@ -19,6 +20,7 @@
 
 #include "core/clock/clock_bound.hpp"
 #include "core/wire/address.hpp"
+#include "core/wire/tls_credentials.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/service/config_values.hpp"
 
@@ -49,6 +51,9 @@ struct Config {
   std::optional<std::vector<wire::Address>> listen;
   std::vector<wire::Address> peers;
   bool insecure = false;
+  std::string credentials;  // folder; empty: none
+  // Read from there by finish(); nullptr: none.
+  std::shared_ptr<const wire::TlsCredentials> loaded_credentials;
   // Discovery by mDNS. Names of network interfaces, or patterns as in fnmatch(3): those in
   // `interfaces`, all when that is empty, without those in `avoid_interfaces`.
   bool mdns = true;

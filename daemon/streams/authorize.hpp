@@ -5,7 +5,8 @@
 // is done for it.
 //
 //   Identity   who asks: of a local program as the kernel reports it (SO_PEERCRED), of a remote one
-//              its address and its greeting, which is not verified
+//              its address, its greeting and, when the connection is encrypted, whom its
+//              certificate names; the greeting is verified only against that
 //   Action     what is asked for; action_of() derives it from the request
 //
 // authorize() allows everything today: which clients can connect at all is decided by the
@@ -35,6 +36,7 @@ struct Identity {
   std::string address;  // "10.0.0.3:40000"; empty: a program of this PC
   std::string host;
   wire::HostId host_id{};
+  std::string certified;  // "host 'pc3'", "program 'viewer'"; empty: not encrypted
   // Of both: as it names itself; printable.
   std::string program;
 

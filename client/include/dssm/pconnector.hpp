@@ -52,6 +52,10 @@ struct PConnectorOptions {
   // a name up may take seconds, independent of request_timeout.
   std::string address = {};
   std::string program = {};  // shown on the other side; empty: this program's name
+  // Folder of the files that encrypted connections need (ca.crt, own.crt, own.key, revoked.crl;
+  // `dssmctl pki` makes them). Empty: $DSSM_CREDENTIALS; without that, for other PCs only,
+  // ~/.config/dssm/credentials if it exists. Without any of them connections are not encrypted.
+  std::string credentials = {};
   // How long a call waits for dssmd's greeting and answer.
   Duration request_timeout = std::chrono::seconds(5);
   // Samples that post() keeps until the owner acknowledges that they are written. Beyond either

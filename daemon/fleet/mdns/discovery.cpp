@@ -35,7 +35,7 @@ Discovery::Discovery(const EventLoop& loop, Options options, Registry& registry,
             {options_.self.host_id, options_.reach.port, options_.interfaces,
              options_.avoid_interfaces},
             peers, logger) {
-  peers.expect_finder(options_.insecure);
+  peers.expect_finder(options_.leaves_pc);
   registry_.add_observer(*this);
 }
 

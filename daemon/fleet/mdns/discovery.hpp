@@ -30,7 +30,7 @@ class Discovery final : private StreamObserver {
   struct Options {
     wire::Greeting self;
     Reach reach;
-    bool insecure = false;  // found hosts may be reached over the network
+    bool leaves_pc = false;  // found hosts may be reached over the network
     std::vector<std::string> interfaces, avoid_interfaces;
   };
 

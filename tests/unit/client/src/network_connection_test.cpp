@@ -49,7 +49,7 @@ struct NetworkConnectionTest : testing::Test {
   }
 
   NoUser delegate;
-  NetworkConnection link{delegate, "test", 20ms};
+  NetworkConnection link{delegate, "test", 20ms, {}};
   UniqueFd listener, connection;
 };
 

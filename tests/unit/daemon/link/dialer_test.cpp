@@ -125,7 +125,7 @@ TEST_F(DialerTest, GreetsAndHandsOverTheLink) {
   wait([this] { return up; });
   EXPECT_EQ(them->host, "pc2");
   EXPECT_EQ(them->host_id, owner.host().greeting.host_id);
-  EXPECT_FALSE(dialer->crosses_network());
+  EXPECT_FALSE(dialer->is_insecure());
   dialer->connection()->send(with_serial(5, ping_frame()));
   EXPECT_EQ(owner.receive().serial(), 5u);
   net::Frame pong;

@@ -28,17 +28,17 @@ TEST(RateLimitedLogger, PassesALimitedNumberOfLinesAndCountsTheOthers) {
 TEST(PeerTable, GivesEverythingBack) {
   PeerTable table({3, 2, 1U << 20});
   {
-    const PeerPlace first = *table.admit(address_of(2));
-    const PeerPlace second = *table.admit(address_of(2));
-    EXPECT_FALSE(table.admit(address_of(2))) << "two of one address";
-    EXPECT_EQ(&first.budget(), &second.budget()) << "one address, one account";
+    const PeerPlace first = *table.admit("pc2");
+    const PeerPlace second = *table.admit("pc2");
+    EXPECT_FALSE(table.admit("pc2")) << "two of one peer";
+    EXPECT_EQ(&first.budget(), &second.budget()) << "one peer, one account";
     EXPECT_EQ(first.budget().used(), 2 * PeerTable::kConnectionBytes);
-    const PeerPlace other = *table.admit(address_of(3));
+    const PeerPlace other = *table.admit("pc3");
     EXPECT_NE(&first.budget(), &other.budget());
-    EXPECT_FALSE(table.admit(address_of(4))) << "three in all";
+    EXPECT_FALSE(table.admit("pc4")) << "three in all";
   }
-  const PeerPlace again = *table.admit(address_of(2)), third = *table.admit(address_of(3)),
-                  fourth = *table.admit(address_of(4));
+  const PeerPlace again = *table.admit("pc2"), third = *table.admit("pc3"),
+                  fourth = *table.admit("pc4");
   EXPECT_EQ(again.budget().used(), PeerTable::kConnectionBytes);
 }
 

@@ -1,0 +1,50 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// A new connection of a dssmd with credentials, until it is known who is at the other end: TLS, by
+// the time limit of the greeting. At the accepting end it also recognizes connections without TLS:
+// those from this PC are passed on as they are, others are refused in plain text, so that their
+// programs can say why.
+#pragma once
+
+#include <dssm/result.hpp>
+#include <functional>
+#include <memory>
+#include <optional>
+
+#include "core/base/unique_fd.hpp"
+#include "core/wire/tls.hpp"
+#include "daemon/base/event_loop.hpp"
+
+namespace dssm::daemon {
+
+class Handshake {
+ public:
+  // Called once, from the loop; must not destroy the handshake.
+  using Then = std::function<void(Result<std::unique_ptr<wire::Transport>>)>;
+
+  // Starts at once; loop outlives it.
+  //   takes_plain  of the accepting end: connections without TLS are passed on
+  Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
+            UniqueFd socket, wire::TransportEnd end, bool takes_plain, Then then);
+  Handshake(const Handshake&) = delete;
+  Handshake& operator=(const Handshake&) = delete;
+
+  // From now on nothing happens, and the connection is closed.
+  void stop();
+
+ private:
+  void on_ready();
+  void recognize();
+  void go_on();
+  void finish(Result<std::unique_ptr<wire::Transport>> result);
+
+  const std::shared_ptr<const wire::TlsCredentials> credentials_;
+  const wire::TransportEnd end_;
+  const bool takes_plain_;
+  const Then then_;
+  UniqueFd socket_;  // until the first byte came
+  std::optional<wire::TlsHandshake> tls_;
+  EventSource readable_, writable_, timer_;
+};
+
+}  // namespace dssm::daemon

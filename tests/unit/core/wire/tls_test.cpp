@@ -1,0 +1,308 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// TLS between two ends of a socket pair, with authorities of its own. The other implementation of
+// TLS that it could be compared with is OpenSSL as well: what is tested here is what this project
+// adds, and that OpenSSL is asked to check what has to be checked.
+#include "core/wire/tls.hpp"
+
+#include <gtest/gtest.h>
+#include <poll.h>
+#include <sys/socket.h>
+
+#include <cstring>
+#include <fstream>
+#include <numeric>
+#include <random>
+#include <vector>
+
+#include "core/wire/tcp.hpp"
+#include "tests/support/authority.hpp"
+#include "tests/support/daemon_process.hpp"
+
+namespace dssm::wire {
+namespace {
+
+using test::Authority;
+using Credentials = std::shared_ptr<const TlsCredentials>;
+using Hours = std::chrono::hours;
+
+iovec part_of(std::vector<std::byte>& bytes, std::size_t from, std::size_t count) {
+  return {bytes.data() + from, count};
+}
+
+std::vector<std::byte> random_bytes(std::size_t count) {
+  std::mt19937 random(7);
+  std::vector<std::byte> bytes(count);
+  for (std::byte& byte : bytes) byte = static_cast<std::byte>(random());
+  return bytes;
+}
+
+class Tls : public testing::Test {
+ protected:
+  const std::filesystem::path dir = test::make_temp_dir();
+  Authority authority;
+  std::unique_ptr<Transport> client, server;
+  std::optional<Error> client_error, server_error;
+
+  ~Tls() override { std::filesystem::remove_all(dir); }
+
+  std::string folder(const std::string& name) const { return dir / name; }
+  Credentials make(const Authority::Subject& subject) { return make(subject, authority); }
+  Credentials make(const Authority::Subject& subject, Authority& by) {
+    by.issue(subject, folder(subject.name));
+    Result<Credentials> loaded = TlsCredentials::load(folder(subject.name));
+    EXPECT_TRUE(loaded) << loaded.error().message;
+    return *loaded;
+  }
+
+  // One end of the handshake, and what became of it.
+  static bool step(TlsHandshake& end, std::unique_ptr<Transport>& made,
+                   std::optional<Error>& error) {
+    if (made || error) return true;
+    const Result<bool> done = end.go_on();
+    if (!done) {
+      error = done.error();
+    } else if (*done) {
+      made = end.take_transport();
+    }
+    return made || error;
+  }
+
+  // As far as the two ends get. In TLS 1.3 the client is done before the server has looked at its
+  // certificate.
+  void connect(const Credentials& of_client, const Credentials& of_server, int buffer = 0) {
+    int ends[2];
+    ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
+    if (buffer > 0) {
+      for (const int end : ends) ::setsockopt(end, SOL_SOCKET, SO_SNDBUF, &buffer, sizeof buffer);
+    }
+    auto over = [](int fd, TransportEnd end) { return make_transport(UniqueFd(fd), end); };
+    TlsHandshake from(of_client, over(ends[0], TransportEnd::connected), TransportEnd::connected);
+    TlsHandshake to(of_server, over(ends[1], TransportEnd::accepted), TransportEnd::accepted);
+    for (bool both = false; !both;) {
+      const bool one = step(from, client, client_error);
+      both = step(to, server, server_error) && one;
+    }
+    // What refuses a client reaches it with its first receive.
+    if (client && server_error) client_error = receive_error(*client);
+  }
+
+  static std::optional<Error> receive_error(Transport& end) {
+    std::byte byte{};
+    const iovec space{&byte, 1};
+    const Result<IoResult> received = end.receive({&space, 1});
+    if (received) return std::nullopt;
+    return received.error();
+  }
+
+  void expect_refused(const std::string& by_server, const std::string& to_client) {
+    ASSERT_TRUE(server_error);
+    EXPECT_EQ(server_error->code, Errc::no_permission);
+    EXPECT_NE(server_error->message.find(by_server), std::string::npos) << server_error->message;
+    ASSERT_TRUE(client_error);
+    EXPECT_EQ(client_error->code, Errc::no_permission);
+    EXPECT_NE(client_error->message.find(to_client), std::string::npos) << client_error->message;
+  }
+};
+
+TEST_F(Tls, KnowsBothSides) {
+  connect(make(Authority::program("viewer")), make(Authority::host("pc2")));
+  ASSERT_TRUE(client && server);
+  EXPECT_EQ(server->peer()->str(), "program 'viewer'");
+  EXPECT_EQ(client->peer()->str(), "host 'pc2'");
+  EXPECT_EQ(client->peer()->host_id, host_id_for("pc2"));
+}
+
+// Any sizes of parts, spaces and socket buffers; the sender overwrites what it has sent at once.
+TEST_F(Tls, CarriesBytesAndNeedsTheirMemoryNoMore) {
+  connect(make(Authority::host("pc1")), make(Authority::host("pc2")), 20'000);
+  ASSERT_TRUE(client && server);
+  const std::vector<std::byte> all = random_bytes(3'000'000);
+  std::vector<std::byte> memory = all, received(all.size());
+  std::mt19937 random(1);
+  std::size_t sent = 0, got = 0;
+  bool was_held_back = false;
+  while (got < all.size()) {
+    if (sent < all.size()) {
+      const std::size_t lengths[] = {random() % 100, random() % 70'000, 0, random() % 20'000};
+      std::vector<iovec> parts;
+      for (std::size_t at = sent; const std::size_t length : lengths) {
+        const std::size_t count = std::min(length, all.size() - at);
+        parts.push_back(part_of(memory, at, count));
+        at += count;
+      }
+      const Result<IoResult> result = client->send(parts);
+      ASSERT_TRUE(result);
+      std::fill_n(memory.begin() + static_cast<std::ptrdiff_t>(sent), result->bytes, std::byte{});
+      sent += result->bytes;
+    } else {
+      ASSERT_TRUE(client->flush());
+    }
+    was_held_back = was_held_back || client->has_unsent_output();
+    do {
+      const std::size_t first = std::min<std::size_t>(1 + random() % 5'000, all.size() - got),
+                        second = std::min<std::size_t>(random() % 40'000, all.size() - got - first);
+      const iovec spaces[] = {part_of(received, got, first),
+                              part_of(received, got + first, second)};
+      const Result<IoResult> result = server->receive(spaces);
+      ASSERT_TRUE(result);
+      if (result->status == IoStatus::would_block) break;
+      ASSERT_EQ(result->status, IoStatus::ok);
+      got += result->bytes;
+    } while (got < all.size() && (random() % 2 == 0 || server->has_buffered_input()));
+  }
+  EXPECT_TRUE(received == all);
+  EXPECT_TRUE(was_held_back) << "the socket took everything: nothing was tested";
+  EXPECT_FALSE(client->has_unsent_output());
+}
+
+// What the kernel does not show any more.
+TEST_F(Tls, SaysThatItHoldsInput) {
+  connect(make(Authority::host("pc1")), make(Authority::host("pc2")));
+  std::string text = "0123456789", got;
+  const iovec part{text.data(), text.size()};
+  ASSERT_TRUE(client->send({&part, 1}));
+  for (bool first = true; first || server->has_buffered_input(); first = false) {
+    char byte = 0;
+    const iovec space{&byte, 1};
+    const Result<IoResult> received = server->receive({&space, 1});
+    ASSERT_TRUE(received);
+    got.append(&byte, received->bytes);
+  }
+  EXPECT_EQ(got, text);
+}
+
+TEST_F(Tls, NoticesTheEnd) {
+  connect(make(Authority::host("pc1")), make(Authority::host("pc2")));
+  client.reset();
+  std::byte byte{};
+  const iovec space{&byte, 1};
+  EXPECT_EQ(server->receive({&space, 1})->status, IoStatus::end);
+}
+
+TEST_F(Tls, RefusesAnExpiredCertificateOnBothSides) {
+  Authority::Subject old = Authority::host("pc1");
+  old.valid_from = Hours(-48), old.valid_until = Hours(-24);
+  connect(make(old), make(Authority::host("pc2")));
+  expect_refused("'pc1' is not accepted: certificate has expired", "certificate expired");
+  EXPECT_NE(server_error->message.find("this PC's clock says"), std::string::npos);
+}
+
+TEST_F(Tls, RefusesACertificateOfTheFuture) {
+  Authority::Subject coming = Authority::host("pc1");
+  coming.valid_from = Hours(24), coming.valid_until = Hours(48);
+  connect(make(coming), make(Authority::host("pc2")));
+  expect_refused("'pc1' is not accepted: certificate is not yet valid", "compare the clocks");
+}
+
+TEST_F(Tls, RefusesAnotherAuthority) {
+  Authority other;
+  connect(make(Authority::host("pc1"), other), make(Authority::host("pc2")));
+  // Here the client is the first to look.
+  ASSERT_TRUE(client_error && server_error);
+  EXPECT_NE(client_error->message.find("'pc2' is not accepted"), std::string::npos)
+      << client_error->message;
+  EXPECT_NE(client_error->message.find("another vehicle"), std::string::npos);
+  EXPECT_NE(server_error->message.find("one authority"), std::string::npos)
+      << server_error->message;
+}
+
+TEST_F(Tls, RefusesARevokedCertificate) {
+  const long serial = authority.issue(Authority::host("pc1"), folder("pc1"));
+  authority.issue(Authority::host("pc2"), folder("pc2"));
+  authority.write_revoked(serial, folder("pc2"));
+  connect(TlsCredentials::load(folder("pc1")).value(), TlsCredentials::load(folder("pc2")).value());
+  expect_refused("'pc1' is not accepted: certificate revoked", "certificate revoked");
+}
+
+TEST_F(Tls, RefusesAProgramThatPlaysAHost) {
+  connect(make(Authority::host("pc1")), make(Authority::program("viewer")));
+  ASSERT_TRUE(client_error);
+  EXPECT_NE(client_error->message.find("'viewer' is not accepted: unsuitable certificate purpose"),
+            std::string::npos)
+      << client_error->message;
+}
+
+TEST_F(Tls, RefusesACertificateThatNamesNobody) {
+  Authority::Subject nobody = Authority::host("pc1");
+  nobody.alternative_names = "DNS:pc1";
+  authority.issue(nobody, folder("pc1"));
+  const Result<Credentials> loaded = TlsCredentials::load(folder("pc1"));
+  ASSERT_FALSE(loaded);
+  EXPECT_NE(loaded.error().message.find("names neither a host"), std::string::npos)
+      << loaded.error().message;
+}
+
+TEST_F(Tls, SaysThatTheOtherSideSpeaksNoTls) {
+  int ends[2];
+  ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
+  TlsHandshake from(make(Authority::host("pc1")),
+                    make_transport(UniqueFd(ends[0]), TransportEnd::connected),
+                    TransportEnd::connected);
+  const UniqueFd other(ends[1]);
+  ASSERT_FALSE(from.go_on().value());
+  ASSERT_EQ(::send(other.get(), "what is this?", 13, 0), 13);
+  const Result<bool> done = from.go_on();
+  ASSERT_FALSE(done);
+  EXPECT_EQ(done.error().code, Errc::protocol);
+  EXPECT_NE(done.error().message.find("does not speak TLS"), std::string::npos)
+      << done.error().message;
+}
+
+// A reload, with connections that go on.
+TEST_F(Tls, ChecksAKnownPeerAgain) {
+  const long serial = authority.issue(Authority::host("pc1"), folder("pc1"));
+  connect(TlsCredentials::load(folder("pc1")).value(), make(Authority::host("pc2")));
+  ASSERT_TRUE(server);
+  EXPECT_TRUE(TlsCredentials::load(folder("pc2")).value()->check(*server->peer()));
+  authority.write_revoked(serial, folder("pc2"));
+  const Result<void> checked = TlsCredentials::load(folder("pc2")).value()->check(*server->peer());
+  ASSERT_FALSE(checked);
+  EXPECT_NE(checked.error().message.find("revoked"), std::string::npos) << checked.error().message;
+}
+
+TEST_F(Tls, ChecksWhoGreets) {
+  connect(make(Authority::program("viewer")), make(Authority::host("pc2")));
+  Greeting host;
+  host.host = "pc2", host.host_id = host_id_for("pc2"), host.program = "dssmd";
+  EXPECT_TRUE(check_certified(host, *client->peer()));
+  Greeting other = host;
+  other.host = "pc3";
+  EXPECT_FALSE(check_certified(other, *client->peer())) << "another name";
+  other = host;
+  other.host_id[3] ^= 1;
+  EXPECT_FALSE(check_certified(other, *client->peer())) << "another machine";
+  EXPECT_FALSE(check_certified(host, *server->peer())) << "a program that greets as dssmd";
+  host.program = "viewer";
+  EXPECT_TRUE(check_certified(host, *server->peer()));
+}
+
+TEST_F(Tls, NamesTheFileThatIsWrong) {
+  const std::string at = folder("pc1");
+  const auto error = [&] {
+    const Result<Credentials> loaded = TlsCredentials::load(at);
+    return loaded ? std::string() : loaded.error().message;
+  };
+  EXPECT_NE(error().find("'" + at + "/ca.crt': No such file"), std::string::npos) << error();
+  authority.issue(Authority::host("pc1"), at);
+  EXPECT_EQ(error(), "");
+  ::chmod((at + "/own.key").c_str(), 0644);
+  EXPECT_NE(error().find("every user can read '" + at + "/own.key'"), std::string::npos) << error();
+  ::chmod((at + "/own.key").c_str(), 0600);
+  authority.issue(Authority::host("pc3"), folder("pc3"));
+  std::filesystem::copy_file(folder("pc3") + "/own.key", at + "/own.key",
+                             std::filesystem::copy_options::overwrite_existing);
+  EXPECT_NE(error().find("is not the key of '" + at + "/own.crt'"), std::string::npos) << error();
+  std::ofstream(at + "/own.key") << "no key";
+  EXPECT_NE(error().find("holds no private key"), std::string::npos) << error();
+  authority.issue(Authority::host("pc1"), at);
+  Authority("other").issue(Authority::host("pc4"), folder("pc4"));
+  std::filesystem::copy_file(folder("pc4") + "/ca.crt", at + "/ca.crt",
+                             std::filesystem::copy_options::overwrite_existing);
+  EXPECT_NE(error().find("another vehicle"), std::string::npos) << error();
+  std::ofstream(at + "/revoked.crl") << "nothing";
+  EXPECT_NE(error().find("no revocation list"), std::string::npos) << error();
+}
+
+}  // namespace
+}  // namespace dssm::wire
