@@ -380,7 +380,7 @@ TEST_F(FoundHostsTest, AreShownButNotDialedWhenTheyAreClosed) {
   run_without_timers();
   EXPECT_EQ(host().state(), local::Host::CLOSED);
   EXPECT_EQ(host().reason(), local::Host::CLOSED_THERE);
-  EXPECT_NE(host().error().find("set listen and insecure there"), std::string::npos);
+  EXPECT_NE(host().error().find("set listen and credentials there"), std::string::npos);
   EXPECT_NE(peers->report().unavailable_peers().find("'pc2' (host 'pc2' listens"),
             std::string::npos)
       << peers->report().unavailable_peers();
@@ -415,7 +415,7 @@ TEST_F(FoundHostsTest, AreNotReachedInTheClearUnlessThatIsAllowed) {
   EXPECT_EQ(address_in_catalog(), at(*one)) << "a dssmd of this PC";
   EXPECT_EQ(host(0).state(), local::Host::CLOSED);
   EXPECT_EQ(host(0).reason(), local::Host::CLOSED_HERE);
-  EXPECT_NE(host(0).error().find("only with insecure = true"), std::string::npos);
+  EXPECT_NE(host(0).error().find("no credentials to connect to others"), std::string::npos);
 }
 
 TEST_F(FoundHostsTest, AreBoundedInNumberAndAddresses) {
