@@ -1,9 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/dssmctl/describe.hpp"
 
+#include <fmt/chrono.h>
 #include <fmt/format.h>
 
 #include <cmath>
+#include <ctime>
 
 #include "client/dssmctl/text.hpp"
 
@@ -73,6 +75,11 @@ Json host_json(const HostInfo& host) {
   json["reason"] = host.reason == HostReason::none ? Json() : Json(name_of(host.reason));
   json["error"] = or_null(host.error);
   return json;
+}
+
+std::string validity_text(const CredentialsInfo& credentials) {
+  const std::time_t until = to_ns(credentials.valid_until) / 1'000'000'000;
+  return fmt::format("valid until {:%Y-%m-%d}", fmt::gmtime(until));
 }
 
 std::vector<Table::Column> host_columns() {

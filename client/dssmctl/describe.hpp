@@ -12,7 +12,12 @@
 
 namespace dssm::ctl {
 
-// --- hosts, as `dssmctl hosts` shows them
+// --- hosts
+
+// "valid until 2028-11-25".
+std::string validity_text(const CredentialsInfo& credentials);
+
+// As `dssmctl hosts` shows them.
 
 std::vector<Table::Column> host_columns();
 std::vector<std::string> host_row(const HostInfo& host);  // a cell for each column

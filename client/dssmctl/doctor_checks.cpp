@@ -27,6 +27,7 @@ constexpr std::uint64_t kDescriptorsPerStream = 4;  // of dssmd
 // What dssmd has open beside its streams: its own, and a few programs and hosts. A guess.
 constexpr std::uint64_t kOtherDescriptors = 200;
 constexpr std::size_t kMaxNamed = 5;  // of streams in one text
+constexpr Duration kRenewBefore = std::chrono::hours(24 * 30);
 constexpr const char* kConfigFile = "/etc/dssm/dssmd.conf";
 constexpr const char* kDefaultGroup = "dssm";
 
@@ -365,10 +366,39 @@ void check_listening(const Facts& facts, Findings& findings) {
   if (closed && !own.empty()) finding.text += ", for programs of this PC only";
   if (closed && others) {
     finding.warn(
-        "other PCs cannot reach this one: the keys listen and insecure do not let them",
-        fmt::format("echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines "
-                    "in {}, then: sudo systemctl restart dssmd",
+        "other PCs cannot reach this one: the keys listen and credentials do not let them",
+        fmt::format("echo 'listen = [\"0.0.0.0:13776\"]' 'credentials = "
+                    "\"/etc/dssm/credentials\"'  # as two lines in {} (docs/security.md), then: "
+                    "sudo systemctl restart dssmd",
                     kConfigFile));
+  }
+  findings.push_back(std::move(finding));
+}
+
+// Nothing when no other PC can connect.
+void check_encryption(const Facts& facts, Findings& findings) {
+  const bool insecure = !facts.hosts.empty() && facts.hosts.front().insecure;
+  if (!facts.daemon.credentials) {
+    if (!insecure) return;
+    findings.push_back({"encryption", Status::warn, "nothing is encrypted (insecure = true)",
+                        "every host that reaches this one can read and write its streams",
+                        "dssmctl pki --help  # makes credentials, see docs/security.md"});
+    return;
+  }
+  const CredentialsInfo& own = *facts.daemon.credentials;
+  Finding finding{"encryption", Status::ok,
+                  fmt::format("with the certificate of {}, {}", own.name, validity_text(own))};
+  const std::string renew = "dssmctl pki renew NAME  # at the authority, then pki install here";
+  if (!own.problem.empty()) {
+    finding.status = Status::fail;
+    finding.cause = own.problem;
+    finding.command = renew;
+  } else if (own.valid_until - WallClock::now() < kRenewBefore) {
+    finding.warn("it ends soon", renew);
+  } else if (insecure) {
+    finding.warn(
+        "connections that are not encrypted are taken, too",
+        fmt::format("echo 'insecure = false'  # in {}, when all have credentials", kConfigFile));
   }
   findings.push_back(std::move(finding));
 }
@@ -646,6 +676,7 @@ std::vector<Finding> findings_of(const Facts& facts) {
   findings.push_back(check_clock(facts));
   if (facts.failed) return findings;
   check_listening(facts, findings);
+  check_encryption(facts, findings);
   findings.push_back(check_mdns(facts));
   check_hosts(facts, findings);
   check_fleet_clocks(facts, findings);

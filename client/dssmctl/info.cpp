@@ -118,6 +118,21 @@ void print_stream(const StreamInfo& stream, Output& out) {
   print_users(stream, out);
 }
 
+Json credentials_json(const DaemonInfo& daemon) {
+  if (!daemon.credentials) return {};
+  const CredentialsInfo& own = *daemon.credentials;
+  return {{"name", own.name},
+          {"valid_until_ns", to_ns(own.valid_until)},
+          {"problem", or_null(own.problem)}};
+}
+
+std::string credentials_text(const DaemonInfo& daemon) {
+  if (!daemon.credentials) return "none: connections are not encrypted";
+  const CredentialsInfo& own = *daemon.credentials;
+  if (!own.problem.empty()) return escaped_message(own.problem);
+  return fmt::format("{}, {}", escaped(own.name), validity_text(own));
+}
+
 Result<void> print_daemon(Session& session, const InfoOptions& options, Output& out) {
   const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
   const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
@@ -130,7 +145,8 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
                            {"pid", daemon.pid},
                            {"streams", daemon.streams},
                            {"memory_bytes", daemon.memory_bytes},
-                           {"memory_limit_bytes", daemon.memory_limit_bytes}}));
+                           {"memory_limit_bytes", daemon.memory_limit_bytes},
+                           {"credentials", credentials_json(daemon)}}));
     return {};
   }
   out.add(out.bold("dssmd " + escaped(daemon.version)) + "\n");
@@ -141,6 +157,7 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
   add_line(out, "memory",
            fmt::format("{} of {}", bytes_text(daemon.memory_bytes),
                        bytes_text(daemon.memory_limit_bytes)));
+  add_line(out, "credentials", credentials_text(daemon));
   return {};
 }
 

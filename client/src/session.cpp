@@ -290,6 +290,11 @@ Result<DaemonInfo> Session::daemon_info() {
   const auto response = DSSM_TRY(ask(*client_, std::move(request), "ask dssmd about itself"));
   const local::Daemon& daemon = response.daemon();
   const local::Mdns& mdns = daemon.mdns();
+  std::optional<CredentialsInfo> credentials;
+  if (daemon.has_credentials()) {
+    const local::Credentials& own = daemon.credentials();
+    credentials = {own.name(), time_from_ns(own.valid_until_ns()), own.problem()};
+  }
   return DaemonInfo{
       daemon.host(),
       daemon.version(),
@@ -298,7 +303,8 @@ Result<DaemonInfo> Session::daemon_info() {
       daemon.memory_bytes(),
       daemon.memory_limit_bytes(),
       {wire::enum_untrusted(mdns.phase(), MdnsPhase::running), mdns.error(), mdns.avahi_version(),
-       mdns.announced(), mdns.withheld(), mdns.own_host_seen(), mdns.hosts_heard()}};
+       mdns.announced(), mdns.withheld(), mdns.own_host_seen(), mdns.hosts_heard()},
+      std::move(credentials)};
 }
 
 bool Session::is_connected() const noexcept { return client_->connection().is_up(); }

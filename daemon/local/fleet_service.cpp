@@ -414,6 +414,16 @@ Result<UniqueFd> FleetService::clock_page() const {
   return Error{Errc::not_found, "this dssmd does not watch the clock"};
 }
 
+void FleetService::describe(local::Daemon& daemon) const {
+  *daemon.mutable_mdns() = mdns();
+  const auto credentials = wire::credentials_of(self_.greeting);
+  if (!credentials) return;
+  local::Credentials& own = *daemon.mutable_credentials();
+  own.set_name(credentials->own().str());
+  own.set_valid_until_ns(to_ns(credentials->own_valid_until()));
+  own.set_problem(credentials->own_problem());
+}
+
 local::Mdns FleetService::mdns() const {
   const MdnsInfo& state = peers_.mdns();
   local::Mdns mdns;

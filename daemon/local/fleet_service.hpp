@@ -68,7 +68,8 @@ class FleetService final : public Fleet, private CatalogObserver {
   void list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) override;
   std::vector<StreamInfo> known_streams() const override;
   std::vector<local::Host> hosts() const override;
-  local::Mdns mdns() const override;
+  void describe(local::Daemon& daemon) const override;
+  local::Mdns mdns() const;
   Result<UniqueFd> clock_page() const override;
   void ping(const std::string& host, Then<local::RoundTrip> then) override;
 

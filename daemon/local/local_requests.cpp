@@ -216,7 +216,7 @@ Reply LocalRequests::get_daemon() const {
   daemon.set_streams(registry_.streams().size());
   daemon.set_memory_bytes(registry_.budget().used());
   daemon.set_memory_limit_bytes(registry_.budget().limit());
-  if (fleet_) *daemon.mutable_mdns() = fleet_->mdns();
+  if (fleet_) fleet_->describe(daemon);
   return reply;
 }
 

@@ -94,7 +94,8 @@ class Fleet {
   virtual std::vector<StreamInfo> known_streams() const = 0;
 
   virtual std::vector<local::Host> hosts() const = 0;  // this one first
-  virtual local::Mdns mdns() const = 0;                // the state of mDNS
+  // Adds the state of mDNS and the credentials.
+  virtual void describe(local::Daemon& daemon) const = 0;
   // The page with the state of this PC's clock; not_found: it is not watched.
   virtual Result<UniqueFd> clock_page() const = 0;
   virtual void ping(const std::string& host, Then<local::RoundTrip> then) = 0;

@@ -73,7 +73,7 @@ class LateFleet final : public Fleet {
     return streams;
   }
   std::vector<local::Host> hosts() const override { return std::vector<local::Host>(2); }
-  local::Mdns mdns() const override { return {}; }
+  void describe(local::Daemon&) const override {}
   Result<UniqueFd> clock_page() const override { return Error{Errc::not_found, "no page here"}; }
   void ping(const std::string&, Then<local::RoundTrip> then) override {
     due_.push_back([then = std::move(then)] { then(local::RoundTrip()); });

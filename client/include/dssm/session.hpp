@@ -57,6 +57,13 @@ struct OpenInfo {
   Role role = Role::reader;
 };
 
+// What a host proves itself with to other PCs (docs/security.md).
+struct CredentialsInfo {
+  std::string name;     // whom the certificate names: "host 'pc1'"
+  Time valid_until{};
+  std::string problem;  // why other hosts refuse it, for people; empty: nothing is known
+};
+
 struct DaemonInfo {
   std::string host;
   std::string version;
@@ -65,6 +72,7 @@ struct DaemonInfo {
   std::uint64_t memory_bytes = 0;        // of all rings
   std::uint64_t memory_limit_bytes = 0;  // for all rings
   MdnsInfo mdns;
+  std::optional<CredentialsInfo> credentials;  // empty: connections are not encrypted
 };
 
 // A host of the fleet as this PC's dssmd sees it: this PC itself, each configured peer, and each

@@ -273,11 +273,26 @@ TEST(Doctor, WarnsOfLoopbackOnlyWhereThereAreOtherPcs) {
   facts.hosts[0].addresses = {"127.0.0.1:13776", "[::1]:13776"};
   EXPECT_FINDING(facts, "listening", Status::warn, "listen = ");
   facts.hosts[0].addresses.clear();
-  EXPECT_FINDING(facts, "listening", Status::warn, "insecure = true");
+  EXPECT_FINDING(facts, "listening", Status::warn, "credentials = ");
   facts.hosts[1].addresses = {"127.0.0.1:20000"};  // a second dssmd of this PC
   EXPECT_FINDING(facts, "listening", Status::ok, "");
   facts.hosts.pop_back();
   EXPECT_FINDING(facts, "listening", Status::ok, "");
+}
+
+TEST(Doctor, SaysWhetherConnectionsAreEncrypted) {
+  Facts facts = healthy();
+  for (const Finding& finding : findings_of(facts)) EXPECT_NE(finding.name, "encryption");
+  facts.hosts[0].insecure = true;
+  EXPECT_FINDING(facts, "encryption", Status::warn, "dssmctl pki");
+  facts.daemon.credentials = {"host 'pc1'", WallClock::now() + std::chrono::hours(24 * 31), ""};
+  EXPECT_FINDING(facts, "encryption", Status::warn, "insecure = false");
+  facts.hosts[0].insecure = false;
+  EXPECT_FINDING(facts, "encryption", Status::ok, "");
+  facts.daemon.credentials->valid_until = WallClock::now() + std::chrono::hours(24 * 29);
+  EXPECT_FINDING(facts, "encryption", Status::warn, "pki renew");
+  facts.daemon.credentials->problem = "expired";
+  EXPECT_FINDING(facts, "encryption", Status::fail, "pki renew");
 }
 
 TEST(Doctor, ReportsWhatAvahiLacks) {

@@ -78,11 +78,9 @@ class FakeFleet final : public Fleet {
     hosts[1].set_name("pc2");
     return hosts;
   }
-  local::Mdns mdns() const override {
-    local::Mdns mdns;
-    mdns.set_phase(local::Mdns::RUNNING);
-    mdns.set_hosts_heard(7);
-    return mdns;
+  void describe(local::Daemon& daemon) const override {
+    daemon.mutable_mdns()->set_phase(local::Mdns::RUNNING);
+    daemon.mutable_mdns()->set_hosts_heard(7);
   }
   Result<UniqueFd> clock_page() const override { return Error{Errc::not_found, "no page here"}; }
   void ping(const std::string& host, Then<local::RoundTrip> then) override {
