@@ -73,14 +73,14 @@ _dssmctl() {
     case ${words[i]} in
       --socket | --sort | --host | --at | --count | -n | -c | --field | --wait | --window | -w | \
         --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
-        --speed | --time)
+        --speed | --time | --ca | --credentials | --out | --name | --program | --days)
         ((++i))
         ;;
       -*) ;;
       *)
         case $verb in
           "") verb=${words[i]} ;;
-          property | playback) verb+=" ${words[i]}" ;;
+          property | playback | pki) verb+=" ${words[i]}" ;;
           *) ((++positional)) ;;
         esac
         ;;
@@ -88,7 +88,7 @@ _dssmctl() {
   done
 
   case $prev in
-    --socket)
+    --socket | --ca | --credentials | --out)
       _dssmctl_offer_files
       return
       ;;
@@ -102,7 +102,8 @@ _dssmctl() {
       return
       ;;
     --at | --count | -n | -c | --field | --wait | --window | -w | --interval | -i | --size | \
-      --depth | --life | --cycle | --type | --align | --offset | --speed | --time)
+      --depth | --life | --cycle | --type | --align | --offset | --speed | --time | --name | \
+      --program | --days)
       return # a value that only the person knows
       ;;
   esac
@@ -118,6 +119,11 @@ _dssmctl() {
     hz | bw | delay) options="--count --interval --wait --window" ;;
     create) options="--align --cycle --depth --life --size --type" ;;
     "playback set") options="--offset --speed --time" ;;
+    "pki init") options="--ca --name" ;;
+    "pki request") options="--credentials --host --out --program" ;;
+    "pki issue" | "pki renew") options="--ca --days --out" ;;
+    "pki revoke") options="--ca --out" ;;
+    "pki install") options="--credentials" ;;
   esac
   if [[ $cur == -* ]]; then
     mapfile -t COMPREPLY < <(compgen -W "$common $options" -- "$cur")
@@ -127,10 +133,15 @@ _dssmctl() {
   case $verb in
     "")
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw clock create delay doctor echo hosts hz info ls ping playback property rm" -- "$cur")
+        "bw clock create delay doctor echo hosts hz info ls ping pki playback property \
+          rm" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;
+    pki)
+      mapfile -t COMPREPLY < <(compgen -W "init install issue renew request revoke show" -- "$cur")
+      ;;
+    "pki issue" | "pki install" | "pki show") ((positional == 0)) && _dssmctl_offer_files ;;
     ping) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_ask hosts --names) ;;
     create) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_at_hosts) ;;
     rm) _dssmctl_offer < <(_dssmctl_streams) ;;

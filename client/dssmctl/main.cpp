@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl, the command-line tool: reads the command line, runs a verb, reports what went wrong. It
-// uses only <dssm/dssm.hpp>, so any program can do what it does.
+// dssmctl, the command-line tool: reads the command line, runs a verb, reports what went wrong. Of
+// DSSM it uses only <dssm/dssm.hpp>, so any program can do what it does; pki alone needs no dssmd.
 //
 // Exit status: 0 success, 1 failure, 2 wrong usage (what no dssmd could do).
 #include <fmt/format.h>

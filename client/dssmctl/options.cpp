@@ -20,6 +20,7 @@ namespace dssm::ctl {
 namespace {
 
 constexpr std::uint64_t kMaxWindow = 1'000'000;
+constexpr std::uint64_t kMaxDays = 36'500;  // of a certificate; the CA's own end limits it too
 
 // An option whose text is read by `read`: Result<void>(const std::string&).
 template <class Read>
@@ -319,6 +320,92 @@ void add_playback(CLI::App& app, Parsed& parsed) {
   add("reset", "back to real time").reset = true;
 }
 
+// Where the result goes that is PEM text.
+void add_out(CLI::App* verb, std::string& out) {
+  verb->add_option("--out", out, "the file to write to (default: standard output)")
+      ->type_name("FILE");
+}
+
+// One of the verbs that need the CA.
+template <class VerbOptions>
+VerbOptions& add_ca_verb(CLI::App* pki, Parsed& parsed, const char* name, const char* description) {
+  CLI::App* verb = pki->add_subcommand(name, description);
+  VerbOptions& options = add_options<VerbOptions>(verb, parsed);
+  verb->add_option("--ca", options.ca, "the CA's folder (default: /etc/dssm/ca)")->type_name("DIR");
+  return options;
+}
+
+void add_days(CLI::App* verb, std::int64_t& days) {
+  add_whole(verb, "--days", "N", "how long it is valid (default: 730)", days, 1, kMaxDays);
+}
+
+void add_credentials(CLI::App* verb, std::string& credentials) {
+  verb->add_option("--credentials", credentials,
+                   "the folder of key and certificates (default: /etc/dssm/credentials)")
+      ->type_name("DIR");
+}
+
+void add_pki_ca(CLI::App* pki, Parsed& parsed) {
+  auto& init = add_ca_verb<PkiInitOptions>(pki, parsed, "init", "make the CA of a vehicle");
+  pki->get_subcommand("init")
+      ->add_option("--name", init.vehicle, "the vehicle's name (default: that of this host)")
+      ->type_name("VEHICLE");
+
+  auto& issue = add_ca_verb<PkiIssueOptions>(pki, parsed, "issue",
+                                             "sign a request: print a bundle to install");
+  CLI::App* verb = pki->get_subcommand("issue");
+  verb->add_option("REQUEST", issue.request, "its file; -: standard input")
+      ->required()
+      ->type_name("");
+  add_days(verb, issue.days);
+  add_out(verb, issue.out);
+
+  auto& renew = add_ca_verb<PkiRenewOptions>(
+      pki, parsed, "renew", "issue again, for the same key: print a bundle to install");
+  verb = pki->get_subcommand("renew");
+  verb->add_option("NAME", renew.name, "host, program or serial number")->required()->type_name("");
+  add_days(verb, renew.days);
+  add_out(verb, renew.out);
+
+  auto& revoke = add_ca_verb<PkiRevokeOptions>(
+      pki, parsed, "revoke", "withdraw certificates: print a revocation list to install");
+  verb = pki->get_subcommand("revoke");
+  verb->add_option("NAME", revoke.name, "host, program or serial number")
+      ->required()
+      ->type_name("");
+  add_out(verb, revoke.out);
+}
+
+void add_pki(CLI::App& app, Parsed& parsed) {
+  CLI::App* pki = app.add_subcommand("pki", "make and install certificates for TLS");
+  pki->require_subcommand(1);
+  add_pki_ca(pki, parsed);
+
+  CLI::App* request = pki->add_subcommand("request", "make a key, and print a request to sign");
+  auto& asked = add_options<PkiRequestOptions>(request, parsed);
+  add_credentials(request, asked.credentials);
+  CLI::Option* host = request->add_option("--host", asked.host, "for a host (default: this one)")
+                          ->type_name("NAME");
+  request->add_option("--program", asked.program, "for programs on a PC without dssmd")
+      ->type_name("NAME")
+      ->excludes(host);
+  add_out(request, asked.out);
+
+  CLI::App* install = pki->add_subcommand("install", "check a bundle, and put it in place");
+  auto& installed = add_options<PkiInstallOptions>(install, parsed);
+  install->add_option("BUNDLE", installed.bundle, "its file; -: standard input")
+      ->required()
+      ->type_name("");
+  add_credentials(install, installed.credentials);
+
+  CLI::App* show = pki->add_subcommand("show", "what certificates there are, and their state");
+  auto& shown = add_options<PkiShowOptions>(show, parsed);
+  show->add_option("PATH", shown.path,
+                   "a folder of credentials or of a CA, or a PEM file; -: standard input (default: "
+                   "/etc/dssm/credentials)")
+      ->type_name("");
+}
+
 void add_all(CLI::App& app, Parsed& parsed) {
   // Global options may also follow the verb; verbs made after these lines inherit both.
   app.fallthrough();
@@ -344,6 +431,7 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_rm(app, parsed);
   add_property(app, parsed);
   add_playback(app, parsed);
+  add_pki(app, parsed);
 }
 
 // The innermost verb that was recognised; `app` itself when there was none.

@@ -109,10 +109,46 @@ struct PlaybackOptions : CommonOptions {
   std::optional<double> offset_s, speed, time_s;
 };
 
-using Options =
-    std::variant<LsOptions, HostsOptions, ClockOptions, DoctorOptions, PingOptions, InfoOptions,
-                 EchoOptions, HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions,
-                 PropertyGetOptions, PropertySetOptions, PlaybackOptions>;
+// Of dssmctl pki. Folders are those of a CA and of credentials; out: "-" or empty for standard
+// output, else a file.
+struct PkiCaOptions : CommonOptions {
+  std::string ca = "/etc/dssm/ca";
+  std::string out;
+};
+struct PkiInitOptions : PkiCaOptions {
+  std::optional<std::string> vehicle;  // none: the name of this host
+};
+struct PkiIssueOptions : PkiCaOptions {
+  std::string request;  // file
+  std::int64_t days = 730;
+};
+struct PkiRenewOptions : PkiCaOptions {
+  std::string name;
+  std::int64_t days = 730;
+};
+struct PkiRevokeOptions : PkiCaOptions {
+  std::string name;
+};
+
+inline constexpr const char* kCredentialsFolder = "/etc/dssm/credentials";
+struct PkiRequestOptions : CommonOptions {
+  std::string credentials = kCredentialsFolder;
+  std::optional<std::string> host, program;  // neither: this host
+  std::string out;
+};
+struct PkiInstallOptions : CommonOptions {
+  std::string bundle;  // file
+  std::string credentials = kCredentialsFolder;
+};
+struct PkiShowOptions : CommonOptions {
+  std::string path = kCredentialsFolder;
+};
+
+using Options = std::variant<LsOptions, HostsOptions, ClockOptions, DoctorOptions, PingOptions,
+                             InfoOptions, EchoOptions, HzOptions, BwOptions, DelayOptions,
+                             CreateOptions, RmOptions, PropertyGetOptions, PropertySetOptions,
+                             PlaybackOptions, PkiInitOptions, PkiRequestOptions, PkiIssueOptions,
+                             PkiInstallOptions, PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
@@ -124,8 +160,8 @@ struct CommandLine {
 
 CommandLine parse_command_line(int argc, const char* const* argv);
 
-// --- the verbs, one source per group of them. Each connects, works, and adds its output to `out`;
-// main() flushes and turns a failure into an exit status.
+// --- the verbs, one source per group of them. Each connects (those of pki do not), works, and adds
+// its output to `out`; main() flushes and turns a failure into an exit status.
 
 Result<void> run(const LsOptions& options, Output& out);
 Result<void> run(const HostsOptions& options, Output& out);
@@ -142,5 +178,12 @@ Result<void> run(const RmOptions& options, Output& out);
 Result<void> run(const PropertyGetOptions& options, Output& out);
 Result<void> run(const PropertySetOptions& options, Output& out);
 Result<void> run(const PlaybackOptions& options, Output& out);
+Result<void> run(const PkiInitOptions& options, Output& out);
+Result<void> run(const PkiRequestOptions& options, Output& out);
+Result<void> run(const PkiIssueOptions& options, Output& out);
+Result<void> run(const PkiInstallOptions& options, Output& out);
+Result<void> run(const PkiRenewOptions& options, Output& out);
+Result<void> run(const PkiRevokeOptions& options, Output& out);
+Result<void> run(const PkiShowOptions& options, Output& out);
 
 }  // namespace dssm::ctl

@@ -6,7 +6,6 @@
 // docs/clocks.md "Between two PCs".
 #pragma once
 
-#include <array>
 #include <cstdint>
 #include <dssm/clock_status.hpp>
 #include <dssm/time.hpp>
@@ -18,10 +17,9 @@
 #include "common.pb.h"
 #include "core/clock/clock_line.hpp"
 #include "core/wire/address.hpp"
+#include "core/wire/host_id.hpp"
 
 namespace dssm::wire {
-
-using HostId = std::array<std::uint8_t, 16>;
 
 // One clock of a sync chain.
 struct ClockLink {

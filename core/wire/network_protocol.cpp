@@ -4,24 +4,15 @@
 // shown in logs and tables, so they are short and hold no control characters.
 #include "core/wire/network_protocol.hpp"
 
-#include <fcntl.h>
 #include <sys/random.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <cstring>
 
-#include "core/base/sha256.hpp"
 #include "core/base/text.hpp"
-#include "core/base/unique_fd.hpp"
 
 namespace dssm::wire {
 namespace {
-
-// Makes the result differ from what other software hashes of the same machine id. Random, made
-// once; changing it changes the identity of every host.
-constexpr std::string_view kApplicationId = "677a14dda84aa85900164edec47f0e46";
-constexpr std::size_t kMachineIdBytes = 32;  // hexadecimal digits, machine-id(5)
 
 Error bad(const std::string& who, std::string_view why) {
   return Error{Errc::protocol, who + " greets with " + std::string(why)};
@@ -37,24 +28,6 @@ void fill_randomly(void* bytes, std::size_t size) {
   // For up to 256 bytes it neither fails nor fills fewer; early in the boot it waits for entropy.
   while (::getrandom(bytes, size, 0) != static_cast<ssize_t>(size)) {
   }
-}
-
-// 32 hexadecimal digits, or empty when this machine has no id (yet).
-std::string machine_id() {
-  const UniqueFd file(::open("/etc/machine-id", O_RDONLY | O_CLOEXEC));
-  std::string id(kMachineIdBytes, '\0');
-  if (!file || ::read(file.get(), id.data(), id.size()) != static_cast<ssize_t>(id.size())) {
-    return {};
-  }
-  const bool is_id = id.find_first_not_of("0123456789abcdef") == id.npos;
-  return is_id ? id : std::string();
-}
-
-// In place of a machine id, for as long as this process lives.
-std::string random_id() {
-  std::array<char, kMachineIdBytes> bytes{};
-  fill_randomly(bytes.data(), bytes.size());
-  return {bytes.begin(), bytes.end()};
 }
 
 }  // namespace
@@ -132,19 +105,6 @@ Result<Greeting> server_greeting_untrusted(const net::Frame& frame, const std::s
     return Error{Errc::protocol, who + " does not begin with Hello; is it a dssmd?"};
   }
   return greeting_untrusted(frame.hello(), who);
-}
-
-HostId host_id_for(std::string_view name) {
-  static const std::string machine = [] {
-    std::string id = machine_id();
-    return id.empty() ? random_id() : id;
-  }();
-  // The first two parts have a fixed length, so no two names give the same bytes. The machine id
-  // has 128 random bits: it cannot be found from the digest by trying.
-  const Sha256 digest = sha256(std::string(kApplicationId) + machine + std::string(name));
-  HostId id{};
-  std::copy_n(digest.begin(), id.size(), id.begin());
-  return id;
 }
 
 std::uint64_t random_number() {

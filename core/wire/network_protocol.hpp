@@ -12,6 +12,7 @@
 #include <vector>
 
 #include "core/wire/clock_report.hpp"
+#include "core/wire/host_id.hpp"
 #include "core/wire/messages.hpp"
 #include "network.pb.h"
 
@@ -71,11 +72,6 @@ Result<Greeting> server_greeting_untrusted(const net::Frame& frame, const std::s
 //   software  "0.3.0"; empty: not known
 Error other_protocol_version(const std::string& who, std::uint32_t theirs,
                              const std::string& software = {});
-
-// This PC's id for a dssmd that calls its host `name`: from the machine id (machine-id(5)), which
-// does not leave this PC, and the name, so that several dssmd with different names on one machine
-// are different hosts. Without a machine id it is random, and so different after each start.
-HostId host_id_for(std::string_view name);
 
 // Random and never 0.
 std::uint64_t random_number();

@@ -148,6 +148,12 @@ TEST(HostId, DoesNotRevealTheMachineId) {
   EXPECT_NE(host_id_for(""), raw);
 }
 
+TEST(HostId, IsLastingWhereThisMachineHasAnId) {
+  std::string machine;
+  std::getline(std::ifstream("/etc/machine-id"), machine);
+  EXPECT_EQ(has_lasting_host_id(), machine.size() == 32);
+}
+
 TEST(RandomNumber, IsNeverTwiceTheSame) {
   const std::uint64_t first = random_number();
   EXPECT_NE(first, 0u);
