@@ -340,6 +340,7 @@ class Dssmd {
     // Whether there are any counts from the next start on.
     if (!credentials || !hosts_.credentials->now) return;
     hosts_.credentials->now = credentials;
+    logger_.info("credentials of " + credentials->own().str() + " read again");
     channels_.on_new_credentials();
     hosts_.peers.on_new_credentials();
     hosts_.mirrors.for_each([](Mirror& mirror) { mirror.connection().on_new_credentials(); });

@@ -67,7 +67,12 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
 DataCommunicator::~DataCommunicator() = default;
 
 std::string DataCommunicator::peer() const {
-  return fmt::format("{} at '{}'", (them_ ? them_->str() : "a peer"), peer_address_);
+  // A host's certificate names what its greeting names; a program's does not.
+  const bool shows_certificate = them_ && them_->program != "dssmd" && !identity_.certified.empty();
+  return fmt::format(
+      "{}{} at '{}'", them_ ? them_->str() : "a peer",
+      shows_certificate ? ", with the certificate of " + identity_.certified + "," : "",
+      peer_address_);
 }
 
 // --- frames

@@ -142,7 +142,55 @@ std::vector<std::string> addresses_in(const std::string& text) {
   }
 }
 
+// The vehicle of a test program: its authority, and what that issued.
+class Vehicle {
+ public:
+  Vehicle() { pki({"init", "--ca", dir + "/ca", "--name", "test"}); }
+  Vehicle(const Vehicle&) = delete;
+  Vehicle& operator=(const Vehicle&) = delete;
+  ~Vehicle() {
+    if (::getpid() == made_by_) remove_tree(dir);
+  }
+
+  // kind: "--host", "--program"
+  std::string credentials_for(const std::string& kind, const std::string& name) const {
+    const std::string folder = dir + "/" + name, request = folder + ".csr",
+                      bundle = folder + ".pem";
+    if (::access((folder + "/own.crt").c_str(), F_OK) == 0) return folder;
+    pki({"request", kind, name, "--credentials", folder, "--out", request});
+    pki({"issue", request, "--ca", dir + "/ca", "--out", bundle});
+    pki({"install", bundle, "--credentials", folder});
+    return folder;
+  }
+
+  const std::string dir = make_temp_dir();
+
+ private:
+  const pid_t made_by_ = ::getpid();
+};
+
+const Vehicle& vehicle() {
+  static const Vehicle one;
+  return one;
+}
+
 }  // namespace
+
+void pki(std::vector<std::string> words) {
+  words.insert(words.begin(), {built("client/dssmctl/dssmctl"), "pki"});
+  const Finished finished = run(words);
+  if (finished.exit_status == 0) return;
+  std::fprintf(stderr, "test harness: dssmctl pki failed: %s\n", finished.err.c_str());
+  std::abort();
+}
+
+std::string credentials_for(const std::string& name) {
+  return vehicle().credentials_for("--host", name);
+}
+std::string credentials_for_program(const std::string& name) {
+  return vehicle().credentials_for("--program", name);
+}
+std::string authority_folder() { return vehicle().dir + "/ca"; }
 
 DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& host)
     : dir_(make_temp_dir()) {
@@ -153,6 +201,9 @@ DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& 
     return word.starts_with("--mdns");
   });
   if (!sets_mdns) argv_.emplace_back("--mdns=false");
+  if (std::getenv("DSSM_TEST_TLS")) {  // NOLINT(concurrency-mt-unsafe): nothing sets it
+    argv_.insert(argv_.end(), {"--credentials", credentials_for(host)});
+  }
   argv_.insert(argv_.end(), extra.begin(), extra.end());
   if (!listens(extra)) argv_.insert(argv_.end(), {"--listen", "127.0.0.1:0"});
   start();

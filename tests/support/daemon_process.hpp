@@ -36,12 +36,23 @@ int wait_for(pid_t pid);
 // tests run at once, programs need more than the default of 500 ms to offer their rings.
 inline const std::vector<std::string> kPatientRecovery = {"--recovery-grace", "3 s"};
 
+// A folder with credentials for the host `name` of one vehicle, which is that of the whole test
+// program; made by dssmctl, removed when the program ends.
+std::string credentials_for(const std::string& name);
+// The same for a program.
+std::string credentials_for_program(const std::string& name);
+// The folder of that vehicle's authority.
+std::string authority_folder();
+// Runs `dssmctl pki WORDS...`; ends the test program with a message if it fails.
+void pki(std::vector<std::string> words);
+
 class DaemonProcess {
  public:
   // Starts `dssmd --runtime-dir DIR --name HOST extra...` and waits until it is ready (sd_notify's
   // READY=1). Ends the test program with a message if dssmd does not start. Unless `extra` sets
   // them, dssmd listens for other hosts at a free port of 127.0.0.1, does not use mDNS, so that the
-  // network does not see the test, and finds no chronyd.
+  // network does not see the test, and finds no chronyd. With $DSSM_TEST_TLS its connections are
+  // encrypted.
   explicit DaemonProcess(std::vector<std::string> extra = {}, const std::string& host = "pc1");
   DaemonProcess(const DaemonProcess&) = delete;
   DaemonProcess& operator=(const DaemonProcess&) = delete;
