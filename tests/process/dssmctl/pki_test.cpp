@@ -29,6 +29,9 @@ bool has_openssl() { return run({"sh", "-c", "command -v openssl"}).exit_status 
 struct Pki : testing::Test {
   Pki() { must({"init", "--ca", ca_, "--name", "truck"}); }
   ~Pki() override { remove_tree(folder_); }
+  void SetUp() override {
+    if (contents("/etc/machine-id").empty()) GTEST_SKIP() << "this machine has no id";
+  }
 
   Finished pki(std::vector<std::string> words, const std::string& input = {}) {
     words.insert(words.begin(), {dssmctl_path(), "pki"});
@@ -201,6 +204,29 @@ TEST_F(Pki, InstallRefusesWhatDoesNotFit) {
   install(bundle);
   refused(install_here, "was not signed by the CA of this PC", contents(other_ca + "/revoked.crl"));
   refused({"install", "-", "--credentials", folder_ + "/none"}, folder_ + "/none", bundle);
+}
+
+TEST_F(Pki, InstallRefusesACertificateThatHasEnded) {
+  NEEDS_OPENSSL();
+  const std::string csr = folder_ + "/pc2.csr";
+  std::ofstream(csr) << request(host_);
+  const Finished made = run({"openssl", "x509", "-req", "-in", csr, "-CA", ca_ + "/ca.crt",
+                             "-CAkey", ca_ + "/ca.key", "-CAcreateserial", "-days", "-1"});
+  ASSERT_EQ(made.exit_status, 0) << made.err;
+  refused({"install", "-", "--credentials", host_}, "clock", made.out + contents(ca_ + "/ca.crt"));
+}
+
+TEST_F(Pki, ACaWorksOnlyWithTheListOfWhatItRevoked) {
+  const std::string csr = request(host_);
+  const std::string list = ca_ + "/revoked.crl";
+  const std::string other_ca = folder_ + "/ca2";
+  must({"init", "--ca", other_ca, "--name", "truck"});
+  std::ofstream(list) << contents(other_ca + "/revoked.crl");
+  refused({"issue", "-", "--ca", ca_}, "has not signed '" + list, csr);
+  std::filesystem::remove(list);
+  refused({"issue", "-", "--ca", ca_}, list, csr);
+  refused({"revoke", "pc2", "--ca", ca_}, list);
+  refused({"issue", "-", "--ca", folder_ + "/none"}, "dssmctl pki init", csr);
 }
 
 TEST_F(Pki, InstallKeepsTheNewerRevocationList) {
