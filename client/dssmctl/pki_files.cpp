@@ -3,7 +3,7 @@
 
 #include <fcntl.h>
 #include <fmt/format.h>
-#include <grp.h>
+#include <pwd.h>
 #include <stdlib.h>
 #include <sys/file.h>
 #include <sys/stat.h>
@@ -24,7 +24,7 @@ namespace {
 
 constexpr std::size_t kMaxTextBytes = 1U << 20;
 constexpr std::string_view kIssuedLine = "Issued ";
-constexpr const char* kDaemonGroup = "dssm";
+constexpr const char* kDaemonUser = "dssm";
 
 // errno's error, with what a person can do about it.
 Error file_error(const std::string& tried, int reason = errno) {
@@ -86,14 +86,12 @@ class TemporaryFile {
   std::string path_, tried_;
 };
 
-// Lets dssmd read the key: the group first, so that no other group may read it in between.
+// Lets dssmd read the key, and not its group: programs of that group are not the host.
 Result<void> give_to_daemon(const TemporaryFile& file) {
   if (::geteuid() != 0) return {};
-  const group* dssm = ::getgrnam(kDaemonGroup);  // NOLINT(concurrency-mt-unsafe): one thread
+  const passwd* dssm = ::getpwnam(kDaemonUser);  // NOLINT(concurrency-mt-unsafe): one thread
   if (!dssm) return {};
-  if (::fchown(file.fd(), 0, dssm->gr_gid) || ::fchmod(file.fd(), 0640) || ::fsync(file.fd())) {
-    return file_error(file.tried());
-  }
+  if (::fchown(file.fd(), dssm->pw_uid, 0) || ::fsync(file.fd())) return file_error(file.tried());
   return {};
 }
 

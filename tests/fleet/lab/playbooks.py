@@ -13,7 +13,7 @@ from lab.guest import Guest
 from lab.packages import ROOT
 
 FOLDER = ROOT / "ansible"
-VARIABLES = {"dssm_subnets": ["10.99.0.0/24"], "dssm_insecure": True}
+VARIABLES = {"dssm_subnets": ["10.99.0.0/24"], "dssm_tls": True}
 
 
 @dataclasses.dataclass

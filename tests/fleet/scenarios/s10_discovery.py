@@ -3,11 +3,13 @@
 
 import json
 
+from lab.certificates import certify
 from lab.guest import Guest
 from lab.lab import Lab, await_that
 from lab.load import Load
 
-SECOND = "--runtime-dir=/run/second --name second --listen 0.0.0.0:13800 --insecure"
+SECOND = ("--runtime-dir=/run/second --name second --listen 0.0.0.0:13800"
+          " --credentials /etc/dssm/second")
 
 
 def run(lab: Lab) -> None:
@@ -35,6 +37,7 @@ def avahi_dies(lab: Lab, guest: Guest) -> None:
 
 def second_dssmd(lab: Lab, guest: Guest) -> None:
     """A second dssmd on one PC is a separate host."""
+    certify(lab, guest, "second", "/etc/dssm/second")
     guest.ssh.run(f"systemd-run --unit=second-dssmd /usr/sbin/dssmd {SECOND}")
     writer = Load(guest, "write", ["other:0@second"], rate_hz=10,
                   prefix="env DSSM_SOCKET=/run/second/dssmd.sock").await_ready()
@@ -46,7 +49,7 @@ def second_dssmd(lab: Lab, guest: Guest) -> None:
 
 def one_name(lab: Lab, first: Guest, second: Guest) -> None:
     """Two PCs of one name are listed as two hosts."""
-    rename(second, first.name)
+    rename(lab, second, first.name)
     pc1 = lab["pc1"]
 
     def check() -> tuple[bool, object]:
@@ -55,12 +58,13 @@ def one_name(lab: Lab, first: Guest, second: Guest) -> None:
         return len({host["id"] for host in same}) == 2, hosts
 
     await_that(f"{pc1.name} lists two hosts of the name {first.name}", check)
-    rename(second, second.name)
+    rename(lab, second, second.name)
     lab.await_streams()
 
 
-def rename(guest: Guest, name: str) -> None:
+def rename(lab: Lab, guest: Guest, name: str) -> None:
     """Changes the name of a PC, both of the machine and of its dssmd."""
+    certify(lab, guest, name)
     configure = f"""sed -i 's/^name = .*/name = "{name}"/' /etc/dssm/dssmd.conf"""
     guest.ssh.run(f"systemctl stop dssmd && hostname {name} && {configure} &&"
                   " systemctl restart avahi-daemon && systemctl start dssmd")

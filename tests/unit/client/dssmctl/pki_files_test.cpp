@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/dssmctl/pki_files.hpp"
 
-#include <grp.h>
+#include <pwd.h>
 #include <gtest/gtest.h>
 #include <sys/file.h>
 #include <sys/stat.h>
@@ -65,11 +65,11 @@ TEST_F(PkiFiles, AKeyThatIsThereIsKept) {
 
 TEST_F(PkiFiles, AKeyIsReadableByItsOwnerAndDssmdOnly) {
   ASSERT_TRUE(create_key_file(path_, make_key().value()));
-  const group* dssm = ::geteuid() == 0 ? ::getgrnam("dssm") : nullptr;
-  EXPECT_EQ(mode_of(path_), dssm ? 0640U : 0600U);
+  const passwd* dssm = ::geteuid() == 0 ? ::getpwnam("dssm") : nullptr;
+  EXPECT_EQ(mode_of(path_), 0600U);
   struct stat status {};
   ::lstat(path_.c_str(), &status);
-  EXPECT_EQ(status.st_gid, dssm ? dssm->gr_gid : ::getegid());
+  EXPECT_EQ(status.st_uid, dssm ? dssm->pw_uid : ::geteuid());
 }
 
 TEST_F(PkiFiles, NothingThatIsThereIsFollowedOrReplacedByAKey) {
