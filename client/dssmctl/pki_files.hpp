@@ -41,8 +41,8 @@ Result<Key> read_key(const std::string& path);
 //   fails  conflict: the path is something else than a file, such as a device or a link
 Result<void> replace_file(const std::string& path, std::string_view text, mode_t mode);
 
-// Creates the file of a key unless there is one, with mode 0600. As root on a PC with the user dssm,
-// it belongs to that user, so that dssmd can read it.
+// Creates the file of a key unless there is one, with mode 0600. As root on a PC with the user
+// dssm, it belongs to that user, so that dssmd can read it.
 //   returns  whether it was created
 Result<bool> create_key_file(const std::string& path, const Key& key);
 

@@ -5,9 +5,9 @@
 // unknown peer reaches them.
 //
 // send() encrypts straight from the caller's memory, a ring's slot for example, and what it has
-// encrypted counts as sent: what the network does not take waits here (has_unsent_output()), at
-// most kMaxUnsent bytes. receive() fills the spaces as long as there is input; when they are full it
-// may hold more than fd() shows (has_buffered_input()).
+// encrypted counts as sent: what the network does not take, at most 64 KiB, waits here
+// (has_unsent_output()). receive() fills the spaces as long as there is input; when they are full
+// it may hold more than fd() shows (has_buffered_input()).
 //
 // The end of the connection without TLS's closing message is `end` all the same: processes are
 // killed and cables are cut, and frames have lengths.

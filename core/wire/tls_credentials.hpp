@@ -8,8 +8,8 @@
 //   own.key      its private key; nobody but the owner and the group may read it
 //   revoked.crl  certificates that are not believed any more; may be missing
 //
-// A certificate names a host, by its DSSM name (DNS:pc2) and its id (URI:urn:dssm:host-id:...), or a
-// program (URI:urn:dssm:program:viewer), each as a subject alternative name. Only hosts may be
+// A certificate names a host, by its DSSM name (DNS:pc2) and its id (URI:urn:dssm:host-id:...), or
+// a program (URI:urn:dssm:program:viewer), each as a subject alternative name. Only hosts may be
 // connected to (extended key usage serverAuth).
 #pragma once
 
@@ -40,8 +40,8 @@ struct CertifiedPeer {
   std::string str() const;  // "host 'pc2'", "program 'viewer'"
 };
 
-// Whether `greeting` is of whom the certificate names: a host greets with its name and id, a program
-// not as dssmd.
+// Whether `greeting` is of whom the certificate names: a host greets with its name and id, a
+// program not as dssmd.
 //   fails  no_permission, naming both
 Result<void> check_certified(const Greeting& greeting, const CertifiedPeer& peer);
 
@@ -49,8 +49,8 @@ Result<void> check_certified(const Greeting& greeting, const CertifiedPeer& peer
 class TlsCredentials {
  public:
   // Reads the files.
-  //   fails  naming the file and what to do: missing, unreadable, readable by everybody, no PEM, the
-  //          key or the certificate does not belong to the others
+  //   fails  naming the file and what to do: missing, unreadable, readable by everybody, no PEM,
+  //          the key or the certificate does not belong to the others
   static Result<std::shared_ptr<const TlsCredentials>> load(const std::string& folder);
   TlsCredentials(const TlsCredentials&) = delete;
   TlsCredentials& operator=(const TlsCredentials&) = delete;
