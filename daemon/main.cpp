@@ -332,13 +332,17 @@ class Dssmd {
     hosts_.mirrors.for_each([](Mirror& mirror) { mirror.on_new_demand(); });
     hosts_.peers.set_configured(changed.peers);
     hosts_.clock.set(changed.clocks, changed.max_drift);
-    use(changed.loaded_credentials);
+    use(changed);
   }
 
-  // Running connections go on if the new ones accept the other side, too.
-  void use(const std::shared_ptr<const wire::TlsCredentials>& credentials) {
-    // Whether there are any counts from the next start on.
-    if (!credentials || !hosts_.credentials->now) return;
+  // Running connections go on if the new ones accept the other side, too. Another folder and another
+  // name count from the next start on.
+  void use(const Config& changed) {
+    const auto& credentials = changed.loaded_credentials;
+    if (!credentials || changed.credentials != config_.credentials ||
+        changed.name != config_.name) {
+      return;
+    }
     hosts_.credentials->now = credentials;
     logger_.info("credentials of " + credentials->own().str() + " read again");
     channels_.on_new_credentials();

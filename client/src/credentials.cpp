@@ -3,6 +3,7 @@
 
 #include <unistd.h>
 
+#include <cerrno>
 #include <cstdlib>
 
 #include "core/base/try.hpp"
@@ -25,7 +26,9 @@ Result<ClientCredentials> load_credentials(const std::string& folder) {
   std::string config = environment("XDG_CONFIG_HOME");
   if (config.empty()) config = environment("HOME") + "/.config";
   const std::string usual = config + "/dssm/credentials";
-  if (::access((usual + "/own.crt").c_str(), F_OK) != 0) return ClientCredentials{};
+  if (::access(usual.c_str(), F_OK) != 0 && (errno == ENOENT || errno == ENOTDIR)) {
+    return ClientCredentials{};
+  }
   return ClientCredentials{DSSM_TRY(wire::TlsCredentials::load(usual)), false};
 }
 

@@ -179,7 +179,7 @@ void NetworkConnection::queue(const net::Frame& frame) {
 }
 
 void NetworkConnection::queue(std::span<const std::byte> encoded) {
-  if (!has_queued()) queued_.clear(), queued_from_ = 0;
+  if (queued_from_ == queued_.size()) queued_.clear(), queued_from_ = 0;
   queued_.append(reinterpret_cast<const char*>(encoded.data()), encoded.size());
 }
 
@@ -241,7 +241,9 @@ Result<void> NetworkConnection::on_frame(net::Frame& frame) {
   if (phase_ == Phase::up) return delegate_.on_frame(frame);
   const std::string who = "dssmd at '" + address_ + "'";
   const wire::Greeting them = DSSM_TRY(wire::server_greeting_untrusted(frame, who));
-  if (transport_->peer()) DSSM_TRY(wire::check_certified(them, *transport_->peer()), who);
+  if (transport_->peer()) {
+    DSSM_TRY(wire::check_certified(them, *transport_->peer(), wire::TransportEnd::connected), who);
+  }
   phase_ = Phase::up;
   plan_.on_up(MonoClock::now());
   step_at_ = kNever;

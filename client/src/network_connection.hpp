@@ -90,6 +90,10 @@ class NetworkConnection final : private wire::FrameDelegate {
   bool has_buffered_input() const noexcept {
     return transport_ && transport_->has_buffered_input();
   }
+  // Who the other side is, by its certificate; nullptr: it is not encrypted, or down.
+  const wire::CertifiedPeer* peer() const noexcept {
+    return transport_ ? transport_->peer() : nullptr;
+  }
   // Whether there is something to receive. To be checked before a timeout is declared: after a
   // stall of this program, the answer may have arrived long ago.
   bool has_arrived() const noexcept;

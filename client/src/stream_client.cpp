@@ -254,6 +254,12 @@ Result<void> StreamClient::on_frame(net::Frame& frame) {
 }
 
 Result<void> StreamClient::on_opened(StreamInfo stream, bool) {
+  // The answer names its host as it likes; the certificate does not.
+  const wire::CertifiedPeer* peer = connection_.peer();
+  if (peer && peer->name != stream.id.host) {
+    return Error{Errc::no_permission, peer->str() + " opened '" + stream.id.str() +
+                                          "', which is of another host than its certificate"};
+  }
   if (!subscriber_) {
     subscriber_ = std::make_unique<Subscriber>(stream.type.payload_bytes);
     outbox_ = std::make_unique<Outbox>(stream.type.payload_bytes, options_.max_unsent_samples,

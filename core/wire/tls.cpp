@@ -20,7 +20,6 @@
 #include <vector>
 
 #include "core/base/check.hpp"
-#include "core/base/text.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::wire {
@@ -30,6 +29,11 @@ constexpr std::size_t kRecordBytes = 16U << 10;  // of one TLS record, at most
 // What is encrypted before it is sent: several records in one system call. When the network is to
 // hold little that was not sent (limit_unsent()), one.
 constexpr std::size_t kBatchBytes = 4 * kRecordBytes;
+
+// A key of AES-GCM is good for 2^24.5 full records (RFC 8446, 5.5).
+constexpr std::uint64_t kRecordsPerKey = 1U << 23;
+// Messages of TLS itself without data between them; a handshake has six.
+constexpr unsigned kMaxMessages = 32;
 
 // The buffer for encrypted output, of the thread, so that connections with nothing to send have
 // none.
@@ -54,6 +58,8 @@ class TlsTransport final : public Transport {
     BIO_set_init(bio, 1);
     SSL_set_bio(session_, bio, bio);
     SSL_set_app_data(session_, this);
+    SSL_set_msg_callback(session_, on_message);
+    SSL_set_msg_callback_arg(session_, this);
     SSL_set_verify(session_, SSL_VERIFY_PEER | SSL_VERIFY_FAIL_IF_NO_PEER_CERT, on_verified);
     if (end == TransportEnd::accepted) {
       SSL_set_accept_state(session_);
@@ -62,16 +68,8 @@ class TlsTransport final : public Transport {
     }
   }
 
-  // Tells the other side that this is the end, as far as it takes it at once.
-  ~TlsTransport() override {
-    if (peer_ && !broken_ && output_.empty()) {
-      ERR_clear_error();
-      SSL_shutdown(session_);
-      static_cast<void>(flush());
-    }
-    SSL_free(session_);
-    ERR_clear_error();
-  }
+  // Without TLS's closing message: a child of fork() must not send it for its parent.
+  ~TlsTransport() override { SSL_free(session_); }
 
   Result<bool> go_on() {
     ERR_clear_error();
@@ -114,6 +112,7 @@ class TlsTransport final : public Transport {
   }
 
   [[gnu::hot]] Result<IoResult> receive(std::span<const iovec> spaces) override {
+    if (ended_with_) return *ended_with_;
     ERR_clear_error();
     is_input_taken_ = false;
     std::size_t received = 0;
@@ -125,6 +124,7 @@ class TlsTransport final : public Transport {
         if (done != 1) return stopped(done, received);
         filled += count;
         received += count;
+        messages_ = 0;
       }
     }
     has_more_input_ = true;
@@ -147,7 +147,6 @@ class TlsTransport final : public Transport {
     while (!output_.empty()) {
       const iovec rest{output_.data() + output_sent_, output_.size() - output_sent_};
       const Result<IoResult> sent = lower_->send({&rest, 1});
-      if (!sent || sent->status == IoStatus::end) broken_ = true;
       if (!sent) return sent.error();
       if (sent->status != IoStatus::ok) return sent->status;
       output_sent_ += sent->bytes;
@@ -208,15 +207,15 @@ class TlsTransport final : public Transport {
 
   Result<void> encrypt(std::span<const std::byte> record) {
     ERR_clear_error();
+    if (++records_ % kRecordsPerKey == 0) SSL_key_update(session_, SSL_KEY_UPDATE_NOT_REQUESTED);
     std::size_t written = 0;
     const int done = SSL_write_ex(session_, record.data(), record.size(), &written);
     if (done == 1) return {};
-    broken_ = true;
     if (std::optional<Error> failed = failure(done)) return *std::move(failed);
     return Error{Errc::unavailable, "encrypt for the other side: OpenSSL does not continue"};
   }
 
-  // What receive() returns when SSL_read_ex() took no bytes.
+  // What receive() returns when SSL_read_ex() gave no bytes.
   Result<IoResult> stopped(int done, std::size_t received) {
     has_more_input_ = false;
     const int reason = SSL_get_error(session_, done);
@@ -225,6 +224,7 @@ class TlsTransport final : public Transport {
     const Result<IoStatus> flushed = flush();
     if (received > 0) {
       // What ended it is reported by the next call.
+      ended_with_ = failed;
       has_more_input_ = failed || reason == SSL_ERROR_ZERO_RETURN || end_;
       return IoResult{IoStatus::ok, received};
     }
@@ -239,7 +239,6 @@ class TlsTransport final : public Transport {
   std::optional<Error> failure(int done) {
     const int kind = SSL_get_error(session_, done);
     if (kind == SSL_ERROR_WANT_READ || kind == SSL_ERROR_ZERO_RETURN) return std::nullopt;
-    broken_ = true;
     if (lower_error_) return lower_error_;
     if (!refusal_.empty()) return Error{Errc::no_permission, refusal_};
     if (end_) return std::nullopt;
@@ -297,11 +296,15 @@ class TlsTransport final : public Transport {
     auto* session =
         static_cast<SSL*>(X509_STORE_CTX_get_ex_data(check, SSL_get_ex_data_X509_STORE_CTX_idx()));
     auto* self = static_cast<TlsTransport*>(SSL_get_app_data(session));
-    std::array<char, 256> subject{};
-    X509_NAME_get_text_by_NID(X509_get_subject_name(X509_STORE_CTX_get0_cert(check)),
-                              NID_commonName, subject.data(), subject.size());
-    self->refusal_ = refusal_text(printable(subject.data()), X509_STORE_CTX_get_error(check));
+    self->refusal_ =
+        refusal_text(subject_of(X509_STORE_CTX_get0_cert(check)), X509_STORE_CTX_get_error(check));
     return 0;
+  }
+
+  // OpenSSL handles these without an end while they come, and each costs as much as a megabyte.
+  static void on_message(int is_sent, int, int type, const void*, std::size_t, SSL*, void* self) {
+    if (is_sent || type != SSL3_RT_HANDSHAKE) return;
+    ++static_cast<TlsTransport*>(self)->messages_;
   }
 
   static int on_write(BIO* bio, const char* bytes, std::size_t count, std::size_t* written) {
@@ -316,6 +319,10 @@ class TlsTransport final : public Transport {
   static int on_read(BIO* bio, char* bytes, std::size_t count, std::size_t* read) {
     auto& self = *static_cast<TlsTransport*>(BIO_get_data(bio));
     BIO_clear_retry_flags(bio);
+    if (self.messages_ > kMaxMessages) {
+      self.lower_error_ = Error{Errc::protocol, "the other side sends nothing but new keys"};
+      return 0;
+    }
     // The last receive took all that was there.
     if (std::exchange(self.is_input_taken_, false)) return BIO_set_retry_read(bio), 0;
     const iovec space{bytes, count};
@@ -363,9 +370,11 @@ class TlsTransport final : public Transport {
   std::size_t output_sent_ = 0;
   std::size_t batch_bytes_ = kBatchBytes;
   bool has_more_input_ = false;
-  bool is_input_taken_ = false;  // by the last call of lower_->receive()
-  bool end_ = false;             // of the input
-  bool broken_ = false;          // no more output
+  bool is_input_taken_ = false;      // by the last call of lower_->receive()
+  bool end_ = false;                 // of the input
+  std::uint64_t records_ = 0;        // sent
+  unsigned messages_ = 0;            // of TLS itself, since data came
+  std::optional<Error> ended_with_;  // after data that was received before
   std::optional<Error> lower_error_;
   std::string refusal_;  // of the other side's certificate
 };

@@ -23,8 +23,8 @@ namespace dssm::wire {
 
 class TlsTransport;
 
-// The first byte that a TLS client sends. No frame begins with the two bytes of its record header.
-inline constexpr unsigned char kTlsFirstByte = 0x16;
+// What a TLS client sends first. No frame begins like that: its second byte would be a field 0.
+inline constexpr unsigned char kTlsFirstBytes[] = {0x16, 0x03};
 
 // A resource with one owner; one thread. It never waits, and has no time limit of its own.
 class TlsHandshake {

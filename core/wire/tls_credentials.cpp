@@ -5,6 +5,7 @@
 #include <fmt/chrono.h>
 #include <fmt/format.h>
 #include <openssl/err.h>
+#include <openssl/pem.h>
 #include <openssl/ssl.h>
 #include <openssl/x509v3.h>
 #include <sys/stat.h>
@@ -12,6 +13,7 @@
 
 #include <algorithm>
 #include <array>
+#include <cerrno>
 #include <chrono>
 #include <ctime>
 #include <string_view>
@@ -41,8 +43,16 @@ using Bio = std::unique_ptr<BIO, Free<BIO_free>>;
 using Certificate = std::unique_ptr<X509, Free<X509_free>>;
 using Stack = std::unique_ptr<STACK_OF(X509), Free<free_stack>>;
 using Names = std::unique_ptr<GENERAL_NAMES, Free<free_names>>;
+using List = std::unique_ptr<X509_CRL, Free<X509_CRL_free>>;
 
 }  // namespace openssl
+
+std::string subject_of(const X509* certificate) {
+  std::array<char, 256> text{};
+  X509_NAME_get_text_by_NID(X509_get_subject_name(certificate), NID_commonName, text.data(),
+                            text.size());
+  return printable(text.data());
+}
 
 namespace {
 
@@ -60,12 +70,23 @@ constexpr const char* kSuites =
     "TLS_AES_128_GCM_SHA256:TLS_CHACHA20_POLY1305_SHA256:TLS_AES_256_GCM_SHA384";
 // Bytes that the kernel hands over in one call: four records.
 constexpr std::size_t kReadBytes = 68U << 10;
+constexpr long kMaxChainBytes = 16 << 10;  // of the other side's certificates
 
 Error openssl_error(const std::string& what) {
   const unsigned long code = ERR_peek_last_error();
   const char* reason = code ? ERR_reason_error_string(code) : nullptr;
   ERR_clear_error();
   return {Errc::invalid_argument, what + ": " + (reason ? reason : "OpenSSL fails")};
+}
+
+// OpenSSL would ask at the terminal.
+int no_pass_phrase(char*, int, int, void*) { return 0; }
+
+// Whether reading a PEM file ended at its end, and not at a block that is damaged.
+bool is_at_end() {
+  const bool at_end = ERR_GET_REASON(ERR_peek_last_error()) == PEM_R_NO_START_LINE;
+  if (at_end) ERR_clear_error();
+  return at_end;
 }
 
 struct File {
@@ -105,8 +126,9 @@ Result<std::vector<Certificate>> certificates_of(const File& file) {
   while (X509* next = PEM_read_bio_X509(bio.get(), nullptr, nullptr, nullptr)) {
     found.emplace_back(next);
   }
+  const bool is_whole = is_at_end();
   if (found.empty()) return openssl_error("'" + file.path + "' holds no certificate in PEM form");
-  ERR_clear_error();  // the end of the file counts as an error
+  if (!is_whole) return openssl_error("a certificate in '" + file.path + "' is damaged");
   return found;
 }
 
@@ -128,13 +150,6 @@ Result<HostId> parse_host_id(std::string_view digits) {
   }
   if (is_good) return id;
   return Error{Errc::invalid_argument, "a host id has 32 digits 0-9, a-f"};
-}
-
-std::string subject_of(const X509* certificate) {
-  std::array<char, 256> text{};
-  X509_NAME_get_text_by_NID(X509_get_subject_name(certificate), NID_commonName, text.data(),
-                            text.size());
-  return printable(text.data());
 }
 
 // Whom `certificate` names.
@@ -159,8 +174,8 @@ Result<CertifiedPeer> named_by(X509* certificate) {
   }
   if (!program.empty()) {
     if (!host_id.empty()) return bad("names a host and a program");
-    if (program.size() > kMaxProgramBytes || has_control(program)) {
-      return bad("names a program with more than 127 bytes or control characters");
+    if (program.size() > kMaxProgramBytes || has_control(program) || !is_utf8(program)) {
+      return bad("names a program with more than 127 bytes, or with control characters");
     }
     peer.name = program;
     return peer;
@@ -185,19 +200,33 @@ Time time_of(const ASN1_TIME* time) {
   return time_from_ns(static_cast<std::int64_t>(::timegm(&parts)) * 1'000'000'000);
 }
 
-Result<void> load_revoked(X509_STORE* store, const std::string& path) {
-  if (::access(path.c_str(), F_OK) != 0) return {};
+// From then on a list of each authority is needed.
+Result<void> load_revoked(X509_STORE* store, const std::vector<Certificate>& authorities,
+                          const std::string& path) {
+  struct stat status {};
+  if (::lstat(path.c_str(), &status) != 0 && errno == ENOENT) return {};
   const File file = DSSM_TRY(read_file(path));
   const Bio bio = reader(file);
-  bool has_some = false;
+  std::vector<openssl::List> lists;
   while (X509_CRL* next = PEM_read_bio_X509_CRL(bio.get(), nullptr, nullptr, nullptr)) {
-    X509_STORE_add_crl(store, next);
-    X509_CRL_free(next);
-    has_some = true;
+    lists.emplace_back(next);
   }
-  if (!has_some) return openssl_error("'" + path + "' holds no revocation list in PEM form");
-  ERR_clear_error();
-  X509_STORE_set_flags(store, X509_V_FLAG_CRL_CHECK);
+  const bool is_whole = is_at_end();
+  if (lists.empty()) return openssl_error("'" + path + "' holds no revocation list in PEM form");
+  if (!is_whole) return openssl_error("a revocation list in '" + path + "' is damaged");
+  for (const Certificate& authority : authorities) {
+    const auto count = std::count_if(lists.begin(), lists.end(), [&](const openssl::List& list) {
+      return X509_NAME_cmp(X509_CRL_get_issuer(list.get()),
+                           X509_get_subject_name(authority.get())) == 0;
+    });
+    if (count == 1) continue;
+    return Error{Errc::invalid_argument,
+                 fmt::format("'{}' holds {} revocation lists of '{}'; of each authority in ca.crt "
+                             "one is needed",
+                             path, count, subject_of(authority.get()))};
+  }
+  for (const openssl::List& list : lists) X509_STORE_add_crl(store, list.get());
+  X509_STORE_set_flags(store, X509_V_FLAG_CRL_CHECK | X509_V_FLAG_CRL_CHECK_ALL);
   return {};
 }
 
@@ -211,19 +240,21 @@ struct CertifiedPeer::Certificates {
 namespace {
 
 // X509_V_OK, or why `certificates` are not believed.
-int verify(SSL_CTX* context, const CertifiedPeer::Certificates& certificates) {
+//   use  "ssl_client", "ssl_server"; "default": any
+int verify(SSL_CTX* context, const CertifiedPeer::Certificates& certificates, const char* use) {
   const std::unique_ptr<X509_STORE_CTX, Free<X509_STORE_CTX_free>> check(X509_STORE_CTX_new());
   if (!check || X509_STORE_CTX_init(check.get(), SSL_CTX_get_cert_store(context),
                                     certificates.own.get(), certificates.others.get()) != 1) {
     return X509_V_ERR_OUT_OF_MEM;
   }
-  X509_STORE_CTX_set_default(check.get(), "ssl_client");
+  X509_STORE_CTX_set_default(check.get(), use);
   return X509_verify_cert(check.get()) == 1 ? X509_V_OK : X509_STORE_CTX_get_error(check.get());
 }
 
 bool is_temporary(int problem) noexcept {
   return problem == X509_V_ERR_CERT_HAS_EXPIRED || problem == X509_V_ERR_CERT_NOT_YET_VALID ||
-         problem == X509_V_ERR_CERT_REVOKED;
+         problem == X509_V_ERR_CERT_REVOKED || problem == X509_V_ERR_CRL_NOT_YET_VALID ||
+         problem == X509_V_ERR_CRL_HAS_EXPIRED;
 }
 
 }  // namespace
@@ -232,10 +263,11 @@ std::string CertifiedPeer::str() const {
   return fmt::format("{} '{}'", kind == Kind::host ? "host" : "program", name);
 }
 
-Result<void> check_certified(const Greeting& greeting, const CertifiedPeer& peer) {
+Result<void> check_certified(const Greeting& greeting, const CertifiedPeer& peer,
+                             TransportEnd end) {
   const bool is_host = peer.kind == CertifiedPeer::Kind::host;
   if (is_host ? greeting.host == peer.name && greeting.host_id == peer.host_id
-              : greeting.program != "dssmd") {
+              : greeting.program != "dssmd" && end == TransportEnd::accepted) {
     return {};
   }
   return Error{Errc::no_permission,
@@ -251,6 +283,8 @@ std::string refusal_text(const std::string& subject, int problem) {
   switch (problem) {
     case X509_V_ERR_CERT_NOT_YET_VALID:
     case X509_V_ERR_CERT_HAS_EXPIRED:
+    case X509_V_ERR_CRL_NOT_YET_VALID:
+    case X509_V_ERR_CRL_HAS_EXPIRED:
       return text + fmt::format(
                         "; this PC's clock says {:%Y-%m-%d %H:%M} UTC: is it right? "
                         "(`dssmctl pki renew` makes a new certificate)",
@@ -297,12 +331,15 @@ Result<std::shared_ptr<const TlsCredentials>> TlsCredentials::load(const std::st
 
 Result<void> TlsCredentials::read(const std::string& folder) {
   ERR_clear_error();
+  // A program may hold connections until after exit() has called OpenSSL's own clean-up.
+  OPENSSL_init_ssl(OPENSSL_INIT_NO_ATEXIT, nullptr);
   context_ = SSL_CTX_new(TLS_method());
   if (!context_) return openssl_error("set up TLS");
   SSL_CTX_set_min_proto_version(context_, TLS1_3_VERSION);
   SSL_CTX_set_ciphersuites(context_, kSuites);
   SSL_CTX_set_options(context_, SSL_OP_NO_TICKET);
   SSL_CTX_set_num_tickets(context_, 0);
+  SSL_CTX_set_max_cert_list(context_, kMaxChainBytes);
   SSL_CTX_set_session_cache_mode(context_, SSL_SESS_CACHE_OFF);
   SSL_CTX_set_mode(context_, SSL_MODE_RELEASE_BUFFERS);
   SSL_CTX_set_read_ahead(context_, 1);
@@ -310,10 +347,11 @@ Result<void> TlsCredentials::read(const std::string& folder) {
 
   const File ca = DSSM_TRY(read_file(folder + "/ca.crt"));
   X509_STORE* store = SSL_CTX_get_cert_store(context_);
-  for (const Certificate& one : DSSM_TRY(certificates_of(ca))) {
+  const std::vector<Certificate> authorities = DSSM_TRY(certificates_of(ca));
+  for (const Certificate& one : authorities) {
     if (X509_STORE_add_cert(store, one.get()) != 1) return openssl_error("take '" + ca.path + "'");
   }
-  DSSM_TRY(load_revoked(store, folder + "/revoked.crl"));
+  DSSM_TRY(load_revoked(store, authorities, folder + "/revoked.crl"));
 
   const File own = DSSM_TRY(read_file(folder + "/own.crt"));
   std::vector<Certificate> chain = DSSM_TRY(certificates_of(own));
@@ -326,14 +364,17 @@ Result<void> TlsCredentials::read(const std::string& folder) {
     }
   }
   const File key = DSSM_TRY(read_file(folder + "/own.key"));
-  if (key.mode & S_IROTH) {
-    return Error{Errc::no_permission, fmt::format("every user can read '{}'; `chmod o= {}`, and "
-                                                  "issue a new one if others may have read it",
+  if (key.mode & S_IRWXO) {
+    return Error{Errc::no_permission, fmt::format("every user can use '{}'; `chmod o= {}`, and "
+                                                  "make a new one if others may have read it",
                                                   key.path, key.path)};
   }
   const std::unique_ptr<EVP_PKEY, Free<EVP_PKEY_free>> private_key(
-      PEM_read_bio_PrivateKey(reader(key).get(), nullptr, nullptr, nullptr));
-  if (!private_key) return openssl_error("'" + key.path + "' holds no private key in PEM form");
+      PEM_read_bio_PrivateKey(reader(key).get(), nullptr, no_pass_phrase, nullptr));
+  if (!private_key) {
+    return openssl_error("'" + key.path +
+                         "' holds no private key in PEM form without a pass phrase");
+  }
   if (SSL_CTX_use_PrivateKey(context_, private_key.get()) != 1) {
     ERR_clear_error();
     return Error{Errc::invalid_argument, "'" + key.path + "' is not the key of '" + own.path + "'"};
@@ -347,20 +388,22 @@ Result<void> TlsCredentials::read(const std::string& folder) {
   }
   own_.certificates = std::make_shared<const CertifiedPeer::Certificates>(
       CertifiedPeer::Certificates{std::move(chain.front()), std::move(others)});
-  const int problem = verify(context_, *own_.certificates);
-  if (problem != X509_V_OK && !is_temporary(problem)) {
+  for (const char* use : {"ssl_client", "ssl_server"}) {
+    if (own_.kind == CertifiedPeer::Kind::program && std::string_view(use) == "ssl_server") break;
+    const int problem = verify(context_, *own_.certificates, use);
+    if (problem == X509_V_OK || is_temporary(problem)) continue;
     return Error{Errc::invalid_argument, "'" + own.path + "': " + refusal_text(own_.name, problem)};
   }
   return {};
 }
 
 std::string TlsCredentials::own_problem() const {
-  const int problem = verify(context_, *own_.certificates);
+  const int problem = verify(context_, *own_.certificates, "default");
   return problem == X509_V_OK ? std::string() : refusal_text(own_.name, problem);
 }
 
 Result<void> TlsCredentials::check(const CertifiedPeer& peer) const {
-  const int problem = verify(context_, *peer.certificates);
+  const int problem = verify(context_, *peer.certificates, "default");
   if (problem == X509_V_OK) return {};
   return Error{Errc::no_permission, refusal_text(peer.name, problem)};
 }

@@ -20,10 +20,12 @@
 
 #include "core/wire/messages.hpp"
 #include "core/wire/network_protocol.hpp"
+#include "core/wire/transport.hpp"
 
 // Of OpenSSL.
 struct ssl_ctx_st;
 struct ssl_st;
+struct x509_st;
 
 namespace dssm::wire {
 
@@ -41,9 +43,10 @@ struct CertifiedPeer {
 };
 
 // Whether `greeting` is of whom the certificate names: a host greets with its name and id, a
-// program not as dssmd.
+// program not as dssmd. Only hosts are connected to.
+//   end    this side's
 //   fails  no_permission, naming both
-Result<void> check_certified(const Greeting& greeting, const CertifiedPeer& peer);
+Result<void> check_certified(const Greeting& greeting, const CertifiedPeer& peer, TransportEnd end);
 
 // Never changes: a reload makes another one. Thread-safe.
 class TlsCredentials {
@@ -86,6 +89,8 @@ std::shared_ptr<const TlsCredentials> credentials_of(const Greeting& self);
 // For TlsTransport: the other side's verified certificate, after the handshake.
 //   fails  no_permission: it names neither a host nor a program
 Result<CertifiedPeer> certified_peer(ssl_st* session);
+// The common name in a certificate; printable.
+std::string subject_of(const x509_st* certificate);
 // How a certificate was refused, with a hint at the reason. problem: X509_V_ERR_...
 std::string refusal_text(const std::string& subject, int problem);
 

@@ -3,7 +3,7 @@
 // Transport: moves the bytes of one connection: over TCP (tcp.hpp), encrypted (tls.hpp), in tests
 // between buffers.
 // Frames, limits and greeting are above it (FrameConnection in dssmd, NetworkConnection in libdssm)
-// and use nothing of the socket but fd(). Both ends get theirs from make_transport() in tcp.hpp.
+// and use nothing of the socket but fd().
 #pragma once
 
 #include <poll.h>

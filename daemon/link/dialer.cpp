@@ -50,6 +50,7 @@ void Dialer::restart(const Error& why) {
     case State::look_up:
     case State::connect:
     case State::secure:
+      given_up_ = state_ == State::secure;
       lookup_.reset();
       connected_.disable();
       socket_.reset();
@@ -67,6 +68,9 @@ void Dialer::set_addresses(std::vector<wire::Address> addresses) {
 }
 
 void Dialer::on_new_credentials() {
+  if (state_ == State::secure || state_ == State::greet) {
+    return restart({Errc::unavailable, "the credentials of this host were replaced"});
+  }
   const FrameConnection* link = connection();
   const auto credentials = wire::credentials_of(options_.self);
   if (!link || !link->peer() || !credentials) return;
@@ -212,7 +216,8 @@ Result<void> Dialer::on_frame(net::Frame& frame) {
 Result<void> Dialer::greet_untrusted(const net::Frame& frame) {
   Result<wire::Greeting> greeting = wire::server_greeting_untrusted(frame, peer_name());
   if (greeting && connection_->peer()) {
-    const Result<void> checked = wire::check_certified(*greeting, *connection_->peer());
+    const Result<void> checked =
+        wire::check_certified(*greeting, *connection_->peer(), wire::TransportEnd::connected);
     if (!checked) greeting = checked.error();
   }
   if (!greeting) {

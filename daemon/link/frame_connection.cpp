@@ -98,8 +98,9 @@ void FrameConnection::continue_receiving() {
   if (closed_ || input_.paused || !decode(0)) return;
   if (samples_) samples_->on_batch_end();
   if (closed_ || input_.paused) return;
-  if (!input_.decoder_held && transport_->has_buffered_input()) return on_readable();
-  receive_more();
+  if (input_.decoder_held || !transport_->has_buffered_input()) return receive_more();
+  readable_.enable();  // it may have been paused
+  on_readable();
 }
 
 // In the next turn, if there is something to continue with that the socket does not show.

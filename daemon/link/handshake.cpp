@@ -4,6 +4,7 @@
 #include <poll.h>
 #include <sys/socket.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <utility>
 
@@ -37,11 +38,11 @@ void Handshake::on_ready() {
 }
 
 void Handshake::recognize() {
-  unsigned char first = 0;
-  const ssize_t count = ::recv(socket_.get(), &first, 1, MSG_PEEK | MSG_DONTWAIT);
+  unsigned char first[2] = {};
+  const ssize_t count = ::recv(socket_.get(), first, sizeof first, MSG_PEEK | MSG_DONTWAIT);
   if (count < 0 && (errno == EAGAIN || errno == EINTR)) return;
   if (count <= 0) return finish(Error{Errc::unavailable, "the other side closed the connection"});
-  if (first == wire::kTlsFirstByte) return go_on();
+  if (std::equal(first, first + count, wire::kTlsFirstBytes)) return go_on();
   if (takes_plain_) return finish(wire::make_transport(std::move(socket_), end_));
   const Error why{Errc::no_permission,
                   "dssmd of host '" + credentials_->own().name +

@@ -70,27 +70,23 @@ std::string ChannelServer::refuses(const wire::SocketAddress& address) const {
   return fmt::format("dssmd of host '{}' refuses '{}'", self_.host, address.str());
 }
 
-// Anybody can begin handshakes. As many are under way as connections are allowed; the oldest is
-// given up for one more, because a handshake that goes on takes milliseconds.
+// Anybody can begin handshakes. As many are under way as connections are allowed; for one more, the
+// oldest of the address with the most is given up: a handshake that goes on takes milliseconds.
 void ChannelServer::secure(UniqueFd socket, const wire::SocketAddress& address) {
   const std::string where = without_port(address);
-  const auto oldest = [&](auto counts) {
-    const auto found = std::find_if(arrivals_.begin(), arrivals_.end(),
-                                    [&](const Arrival& one) { return !one.ended && counts(one); });
-    found->ended = true;
-    found->handshake->stop();
+  std::map<std::string_view, std::uint64_t> counts;
+  for (const Arrival& one : arrivals_) ++counts[one.address];
+  const auto most =
+      std::max_element(counts.begin(), counts.end(),
+                       [](const auto& a, const auto& b) { return a.second < b.second; });
+  const auto give_up_oldest = [&](std::string_view of) {
+    arrivals_.erase(std::find_if(arrivals_.begin(), arrivals_.end(),
+                                 [&](const Arrival& one) { return one.address == of; }));
   };
-  const auto count = [&](auto counts) {
-    return static_cast<std::uint64_t>(
-        std::count_if(arrivals_.begin(), arrivals_.end(),
-                      [&](const Arrival& one) { return !one.ended && counts(one); }));
-  };
-  const auto is_from_there = [&](const Arrival& one) { return one.address == where; };
-  const auto is_any = [](const Arrival&) { return true; };
-  if (count(is_from_there) >= limits_.max_connections_per_host) {
-    oldest(is_from_there);
-  } else if (count(is_any) >= limits_.max_connections) {
-    oldest(is_any);
+  if (counts[where] >= limits_.max_connections_per_host) {
+    give_up_oldest(where);
+  } else if (arrivals_.size() >= limits_.max_connections) {
+    give_up_oldest(most->first);
   }
   Arrival& arrival = arrivals_.emplace_back(Arrival{where, nullptr, false});
   const bool takes_plain = parts_.takes_plain || address.is_loopback();
@@ -110,7 +106,8 @@ void ChannelServer::on_secured(Arrival& arrival, const wire::SocketAddress& addr
                            {.peer = address.str(), .message_id = message_id::kPeerRefused});
   }
   const wire::CertifiedPeer* peer = (*transport)->peer();
-  Result<PeerPlace> place = peers_.admit(peer ? peer->str() : in_quotes(arrival.address));
+  Result<PeerPlace> place =
+      peers_.admit(peer ? peer->str() : in_quotes(arrival.address), peer != nullptr);
   if (!place) {
     const Error error = std::move(place).error().context(refuses(address));
     logger_.warning(error.message, {.peer = address.str(), .message_id = message_id::kPeerRefused});
@@ -125,6 +122,7 @@ void ChannelServer::on_secured(Arrival& arrival, const wire::SocketAddress& addr
 void ChannelServer::on_new_credentials() {
   const auto credentials = wire::credentials_of(self_);
   if (!credentials) return;
+  arrivals_.clear();  // they would be accepted by the old ones; their hosts try again
   for (const auto& [key, communicator] : communicators_) {
     communicator->on_new_credentials(*credentials);
   }

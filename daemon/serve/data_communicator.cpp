@@ -117,7 +117,7 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
     return std::move(them).error().context("dssmd of host '" + parts_.self.host + "' refuses");
   }
   if (const wire::CertifiedPeer* peer = link_.peer()) {
-    DSSM_TRY(wire::check_certified(*them, *peer),
+    DSSM_TRY(wire::check_certified(*them, *peer, wire::TransportEnd::accepted),
              "dssmd of host '" + parts_.self.host + "' refuses");
     identity_.certified = peer->str();
   }

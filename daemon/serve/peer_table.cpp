@@ -31,7 +31,7 @@ void PeerTable::set_limits(const Limits& limits) {
   }
 }
 
-Result<PeerPlace> PeerTable::admit(const std::string& peer) {
+Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {
   if (connections_ >= limits_.max_connections) {
     return Error{Errc::limit_exceeded,
                  fmt::format("there are max_connections = {} connections from other hosts already; "
@@ -47,7 +47,8 @@ Result<PeerPlace> PeerTable::admit(const std::string& peer) {
   }
   std::unique_ptr<PeerAccount>& account = accounts_[peer];
   if (!account) account = std::make_unique<PeerAccount>(peer, limits_.max_peer_memory_bytes);
-  std::optional<MemoryShare> share = account->budget.try_take(kConnectionBytes);
+  std::optional<MemoryShare> share =
+      account->budget.try_take(kConnectionBytes + (encrypted ? kTlsBytes : 0));
   if (share) return PeerPlace(*this, *account, *std::move(share));
   Error error{Errc::limit_exceeded,
               fmt::format("the connections from {} have used up max_peer_memory = {} bytes; "

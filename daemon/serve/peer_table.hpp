@@ -50,8 +50,10 @@ class PeerPlace {
 class PeerTable {
  public:
   // Charged for each connection, whatever it does: its objects, and the input that the decoder
-  // keeps while the connection is paused.
+  // keeps while the connection is paused; when it is encrypted, besides, what TLS has received and
+  // not decrypted, what it has encrypted and not sent, and the certificates.
   static constexpr std::uint64_t kConnectionBytes = 320U << 10;
+  static constexpr std::uint64_t kTlsBytes = 224U << 10;
 
   struct Limits {
     std::uint64_t max_connections = 0;
@@ -69,7 +71,7 @@ class PeerTable {
   // A place for one more connection of `peer`: its address without a port or, when its certificate
   // says who it is, that.
   //   fails  limit_exceeded, naming the key
-  Result<PeerPlace> admit(const std::string& peer);
+  Result<PeerPlace> admit(const std::string& peer, bool encrypted = false);
 
  private:
   friend class PeerPlace;

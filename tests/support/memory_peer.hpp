@@ -34,7 +34,7 @@ class MemoryPeer {
   void put(Bytes bytes) {
     if (bytes.empty()) return;
     input_.push_back(std::move(bytes));
-    signal();
+    if (!hides_input) signal();
   }
   void put(const net::Frame& frame) { put(to_bytes(frame)); }
   // Input that dssmd has not received yet.
@@ -62,7 +62,8 @@ class MemoryPeer {
   std::optional<wire::Progress> progress;
   std::optional<wire::Priority> priority;  // that dssmd set
   std::size_t unsent_limit = 0;            // that dssmd set
-  bool closed = false;                     // by dssmd
+  bool hides_input = false;  // as a transport does that decrypts: fd() does not show it
+  bool closed = false;       // by dssmd
 
  private:
   friend class MemoryTransport;
@@ -125,6 +126,9 @@ class MemoryTransport final : public wire::Transport {
     return wire::IoResult{wire::IoStatus::ok, taken};
   }
 
+  bool has_buffered_input() const noexcept override {
+    return *alive_ && peer_.hides_input && !peer_.input_.empty();
+  }
   void stamp_arrivals() noexcept override { stamps_ = true; }
   std::optional<Time> arrived() const noexcept override {
     return stamps_ ? peer_.arrived : std::nullopt;

@@ -38,7 +38,7 @@ def avahi_dies(lab: Lab, guest: Guest) -> None:
 def second_dssmd(lab: Lab, guest: Guest) -> None:
     """A second dssmd on one PC is a separate host."""
     certify(lab, guest, "second", "/etc/dssm/second")
-    guest.ssh.run(f"systemd-run --unit=second-dssmd /usr/sbin/dssmd {SECOND}")
+    guest.ssh.run(f"systemd-run --unit=second-dssmd --property=Type=notify /usr/sbin/dssmd {SECOND}")
     writer = Load(guest, "write", ["other:0@second"], rate_hz=10,
                   prefix="env DSSM_SOCKET=/run/second/dssmd.sock").await_ready()
     lab.await_streams("other:0@second")

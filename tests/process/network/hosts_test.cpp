@@ -474,6 +474,24 @@ TEST_F(Hosts, ReportThatAPeerOfALaterVersionWasRefused) {
   EXPECT_NE(refused.error.find(dssmd_address(2)), std::string::npos) << refused.error;
 }
 
+TEST_F(Hosts, WithCredentialsTakeEncryptedConnectionsOnly) {
+  std::unique_ptr<Network> network = make_network(2);
+  if (!network) return;
+  std::optional<DaemonProcess> dssmd;
+  {
+    const Inside inside = network->inside(1);
+    dssmd.emplace(std::vector<std::string>{"--listen", dssmd_address(1), "--credentials",
+                                           credentials_for("pc1")});
+  }
+  const Inside inside = network->inside(2);
+  const auto plain = PConnector::list_streams({.address = dssmd_address(1)});
+  ASSERT_FALSE(plain);
+  EXPECT_NE(plain.error().message.find("'pc1' takes encrypted connections only"), std::string::npos)
+      << plain.error().message;
+  EXPECT_TRUE(PConnector::list_streams(
+      {.address = dssmd_address(1), .credentials = credentials_for_program("viewer")}));
+}
+
 TEST_F(Hosts, ListenForOtherPcsOnlyWithInsecure) {
   std::unique_ptr<Network> network = make_network(1);
   if (!network) return;

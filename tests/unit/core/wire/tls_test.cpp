@@ -233,6 +233,17 @@ TEST_F(Tls, RefusesACertificateThatNamesNobody) {
       << loaded.error().message;
 }
 
+// A host that cannot be connected to would not notice it.
+TEST_F(Tls, RefusesAnOwnCertificateThatIsGoodForOneDirectionOnly) {
+  Authority::Subject half = Authority::host("pc1");
+  half.extended_usage = "clientAuth";
+  authority.issue(half, folder("pc1"));
+  const Result<Credentials> loaded = TlsCredentials::load(folder("pc1"));
+  ASSERT_FALSE(loaded);
+  EXPECT_NE(loaded.error().message.find("unsuitable certificate purpose"), std::string::npos)
+      << loaded.error().message;
+}
+
 TEST_F(Tls, SaysThatTheOtherSideSpeaksNoTls) {
   int ends[2];
   ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
@@ -265,16 +276,21 @@ TEST_F(Tls, ChecksWhoGreets) {
   connect(make(Authority::program("viewer")), make(Authority::host("pc2")));
   Greeting host;
   host.host = "pc2", host.host_id = host_id_for("pc2"), host.program = "dssmd";
-  EXPECT_TRUE(check_certified(host, *client->peer()));
+  const auto is_believed = [](const Greeting& greeting, const Transport& transport,
+                              TransportEnd end) {
+    return check_certified(greeting, *transport.peer(), end).has_value();
+  };
+  EXPECT_TRUE(is_believed(host, *client, TransportEnd::connected));
   Greeting other = host;
   other.host = "pc3";
-  EXPECT_FALSE(check_certified(other, *client->peer())) << "another name";
+  EXPECT_FALSE(is_believed(other, *client, TransportEnd::connected)) << "another name";
   other = host;
   other.host_id[3] ^= 1;
-  EXPECT_FALSE(check_certified(other, *client->peer())) << "another machine";
-  EXPECT_FALSE(check_certified(host, *server->peer())) << "a program that greets as dssmd";
+  EXPECT_FALSE(is_believed(other, *client, TransportEnd::connected)) << "another machine";
+  EXPECT_FALSE(is_believed(host, *server, TransportEnd::accepted)) << "a program as dssmd";
   host.program = "viewer";
-  EXPECT_TRUE(check_certified(host, *server->peer()));
+  EXPECT_TRUE(is_believed(host, *server, TransportEnd::accepted));
+  EXPECT_FALSE(is_believed(host, *server, TransportEnd::connected)) << "a program that listens";
 }
 
 TEST_F(Tls, NamesTheFileThatIsWrong) {
@@ -287,7 +303,7 @@ TEST_F(Tls, NamesTheFileThatIsWrong) {
   authority.issue(Authority::host("pc1"), at);
   EXPECT_EQ(error(), "");
   ::chmod((at + "/own.key").c_str(), 0644);
-  EXPECT_NE(error().find("every user can read '" + at + "/own.key'"), std::string::npos) << error();
+  EXPECT_NE(error().find("every user can use '" + at + "/own.key'"), std::string::npos) << error();
   ::chmod((at + "/own.key").c_str(), 0600);
   authority.issue(Authority::host("pc3"), folder("pc3"));
   std::filesystem::copy_file(folder("pc3") + "/own.key", at + "/own.key",
@@ -300,6 +316,13 @@ TEST_F(Tls, NamesTheFileThatIsWrong) {
   std::filesystem::copy_file(folder("pc4") + "/ca.crt", at + "/ca.crt",
                              std::filesystem::copy_options::overwrite_existing);
   EXPECT_NE(error().find("another vehicle"), std::string::npos) << error();
+  authority.issue(Authority::host("pc1"), at);
+  Authority("another").write_revoked(1, at);
+  EXPECT_NE(error().find("holds 0 revocation lists of 'vehicle'"), std::string::npos) << error();
+  authority.write_revoked(99, at);
+  EXPECT_EQ(error(), "");
+  std::ofstream(at + "/revoked.crl", std::ios::app) << "-----BEGIN X509 CRL-----\nAAAA\n";
+  EXPECT_NE(error().find("is damaged"), std::string::npos) << error();
   std::ofstream(at + "/revoked.crl") << "nothing";
   EXPECT_NE(error().find("no revocation list"), std::string::npos) << error();
 }

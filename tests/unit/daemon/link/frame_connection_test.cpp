@@ -250,6 +250,26 @@ TEST_F(FrameConnectionTest, RefusesASampleWithoutADelegate) {
       << closed_with->message;
 }
 
+// A transport that decrypts holds input that the descriptor does not show.
+TEST_F(FrameConnectionTest, GoesOnAfterAPauseWithWhatTheTransportHeldAndWhatComesThen) {
+  handler = [this](const net::Frame& frame) -> Result<void> {
+    if (frame.serial() == 1) link->pause();
+    return {};
+  };
+  peer.put(ping(1));
+  peer.hides_input = true;
+  for (const std::uint64_t serial : {2U, 3U}) peer.put(ping(serial));
+  run_turns(loop, 4);
+  EXPECT_EQ(received_serials, Serials{1});
+  link->resume();
+  run_turns(loop, 4);
+  EXPECT_EQ(received_serials, (Serials{1, 2, 3}));
+  peer.hides_input = false;
+  peer.put(ping(4));
+  run_turns(loop, 4);
+  EXPECT_EQ(received_serials, (Serials{1, 2, 3, 4}));
+}
+
 TEST_F(FrameConnectionTest, BeginsASampleAgainThatCameInAPause) {
   hold_sample = true;
   peer.put(sample(7, kPayloadBytes, std::byte{5}));
