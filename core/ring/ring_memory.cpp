@@ -109,12 +109,11 @@ Result<std::shared_ptr<const RingMapping>> RingMapping::open_untrusted(int fd, A
   const int protection = access == Access::read_write ? PROT_READ | PROT_WRITE : PROT_READ;
   mapping->memory_ = DSSM_TRY(SharedMapping::map(fd, file_bytes, protection), "map a ring");
 
-  // One copy, which is checked and used; the original may change at any time.
-  struct Snapshot {
-    std::byte bytes[offsetof(RingHeader, reserved1)];
-  } snapshot;
-  std::memcpy(&snapshot, mapping->base(), sizeof snapshot);
-  const auto& header = *std::launder(reinterpret_cast<const RingHeader*>(&snapshot));
+  // One copy, which is checked and used; the original may change at any time. What follows the
+  // description belongs to the writers, and stays zero here.
+  alignas(RingHeader) std::byte snapshot[sizeof(RingHeader)] = {};
+  std::memcpy(snapshot, mapping->base(), offsetof(RingHeader, reserved1));
+  const auto& header = *std::launder(reinterpret_cast<const RingHeader*>(snapshot));
   if (header.magic != kMagic) return not_a_ring("it does not begin with \"DSSMRING\"");
   if (header.layout_version != kLayoutVersion) {
     return not_a_ring(fmt::format(

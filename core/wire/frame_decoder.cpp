@@ -319,6 +319,7 @@ Result<void> FrameDecoder::parse_whole(Bytes message) {
     return no_frame("a frame of {} bytes has more than {} that are neither payload nor property",
                     message.size(), kMaxPlainBytes);
   }
+  DSSM_TRY(check_elements_untrusted(message));
   net::Frame frame;
   if (!frame.ParseFromArray(message.data(), static_cast<int>(message.size()))) {
     return no_frame("a frame of {} bytes is not a message of this protocol", message.size());

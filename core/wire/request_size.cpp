@@ -91,6 +91,59 @@ bool measure_creates(Bytes request, Creates& found) noexcept {
   });
 }
 
+// Where a frame has what is repeated: numbers of fields, from the outside.
+using Path = std::span<const int>;
+using proto::ClockReport;
+using proto::Hello;
+using proto::Stream;
+using proto::Type;
+constexpr int kFeatures[] = {Frame::kHelloFieldNumber, Hello::kFeaturesFieldNumber};
+constexpr int kHelloChain[] = {Frame::kHelloFieldNumber, Hello::kClockFieldNumber,
+                               ClockReport::kChainFieldNumber};
+constexpr int kHelloAddresses[] = {Frame::kHelloFieldNumber, Hello::kClockFieldNumber,
+                                   ClockReport::kAddressesFieldNumber};
+constexpr int kPingChain[] = {Frame::kPingFieldNumber, net::Ping::kClockFieldNumber,
+                              ClockReport::kChainFieldNumber};
+constexpr int kPingAddresses[] = {Frame::kPingFieldNumber, net::Ping::kClockFieldNumber,
+                                  ClockReport::kAddressesFieldNumber};
+constexpr int kPongChain[] = {Frame::kPongFieldNumber, net::Pong::kClockFieldNumber,
+                              ClockReport::kChainFieldNumber};
+constexpr int kPongAddresses[] = {Frame::kPongFieldNumber, net::Pong::kClockFieldNumber,
+                                  ClockReport::kAddressesFieldNumber};
+constexpr int kCreateFields[] = {Frame::kCreateFieldNumber, proto::Create::kTypeFieldNumber,
+                                 Type::kFieldsFieldNumber};
+constexpr int kOpenedFields[] = {Frame::kOpenedFieldNumber, proto::Opened::kStreamFieldNumber,
+                                 Stream::kTypeFieldNumber, Type::kFieldsFieldNumber};
+constexpr int kOpenedUsers[] = {Frame::kOpenedFieldNumber, proto::Opened::kStreamFieldNumber,
+                                Stream::kUsersFieldNumber};
+constexpr int kEventFields[] = {Frame::kStreamEventFieldNumber,
+                                proto::StreamEvent::kStreamFieldNumber, Stream::kTypeFieldNumber,
+                                Type::kFieldsFieldNumber};
+constexpr int kEventUsers[] = {Frame::kStreamEventFieldNumber,
+                               proto::StreamEvent::kStreamFieldNumber, Stream::kUsersFieldNumber};
+constexpr int kStreams[] = {Frame::kStreamListFieldNumber, proto::StreamList::kStreamsFieldNumber};
+constexpr int kListFields[] = {Frame::kStreamListFieldNumber,
+                               proto::StreamList::kStreamsFieldNumber, Stream::kTypeFieldNumber,
+                               Type::kFieldsFieldNumber};
+constexpr int kListUsers[] = {Frame::kStreamListFieldNumber, proto::StreamList::kStreamsFieldNumber,
+                              Stream::kUsersFieldNumber};
+constexpr int kPairs[] = {Frame::kClockPairListFieldNumber,
+                          proto::ClockPairList::kPairsFieldNumber};
+constexpr Path kElements[] = {kFeatures,      kHelloChain,  kHelloAddresses, kPingChain,
+                              kPingAddresses, kPongChain,   kPongAddresses,  kCreateFields,
+                              kOpenedFields,  kOpenedUsers, kEventFields,    kEventUsers,
+                              kStreams,       kListFields,  kListUsers,      kPairs};
+
+// Adds what `message` has at `path`. False when that is more than `allowed`, or when the bytes are
+// no message.
+bool count_elements(Bytes message, Path path, std::size_t allowed, std::size_t& found) noexcept {
+  return for_each_field(message, [&](std::uint64_t field, Bytes content) {
+    if (field != static_cast<std::uint64_t>(path.front())) return true;
+    return path.size() > 1 ? count_elements(content, path.subspan(1), allowed, found)
+                           : ++found <= allowed;
+  });
+}
+
 }  // namespace
 
 std::size_t plain_bytes(Bytes message) noexcept {
@@ -130,6 +183,24 @@ Result<void> check_request_size_untrusted(Bytes message) {
                              creates.type_fields, kMaxParsedFields)};
   }
   return {};
+}
+
+Result<void> check_elements_untrusted(Bytes frame) {
+  const std::size_t allowed = kMaxFreeElements + frame.size() / kMinElementBytes;
+  if (frame.size() / 2 <= allowed) return {};  // an element has two bytes at least
+  std::size_t found = 0;
+  const bool may_be_parsed = for_each_field(frame, [&](std::uint64_t field, Bytes content) {
+    return std::all_of(std::begin(kElements), std::end(kElements), [&](Path path) {
+      return field != static_cast<std::uint64_t>(path.front()) ||
+             count_elements(content, path.subspan(1), allowed, found);
+    });
+  });
+  if (may_be_parsed) return {};
+  return Error{
+      Errc::protocol,
+      found > allowed
+          ? fmt::format("a frame of {} bytes has more than {} elements", frame.size(), allowed)
+          : fmt::format("a frame of {} bytes is not a message of this protocol", frame.size())};
 }
 
 std::uint64_t serial_untrusted(Bytes message) noexcept {

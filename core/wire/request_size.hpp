@@ -26,6 +26,14 @@ std::size_t plain_bytes(std::span<const std::byte> message) noexcept;
 //   fails  limit_exceeded, protocol (it is long, and no message)
 Result<void> check_request_size_untrusted(std::span<const std::byte> message);
 
+// Whether a frame of the network protocol may be parsed, as to its elements: what is repeated in
+// it, as the streams of a list. An element takes some hundred bytes of memory and may be two bytes
+// long; those of ours are longer, or few.
+inline constexpr std::size_t kMinElementBytes = 32;  // on average, of those above kMaxFreeElements
+inline constexpr std::size_t kMaxFreeElements = 4096;
+//   fails  protocol
+Result<void> check_elements_untrusted(std::span<const std::byte> frame);
+
 // The serial of a request that is not parsed; 0 when it does not begin with it, as protobuf writes
 // it.
 std::uint64_t serial_untrusted(std::span<const std::byte> message) noexcept;

@@ -4,6 +4,7 @@
 // registry, its rings and the answers, in a real event loop. A second peer watches and subscribes,
 // and a program writes, so that events, gaps and full sockets occur. An input's first three bytes
 // choose whether the peer has the feature "torn", how its bytes are split, and how much it reads.
+// Then comes a bomb (bomb.hpp), which is sent last.
 #include <netinet/in.h>
 
 #include <cstdlib>
@@ -11,6 +12,7 @@
 
 #include "core/ring/ring_writer.hpp"
 #include "daemon/serve/channel_server.hpp"
+#include "tests/fuzz/bomb.hpp"
 #include "tests/fuzz/fuzzer.hpp"
 #include "tests/support/log_recorder.hpp"
 #include "tests/support/memory_peer.hpp"
@@ -34,6 +36,9 @@ void run(std::span<const std::uint8_t> input) {
   if (input.size() < 3) return;
   const bool torn = input[0] & 1;
   const bool large = input[0] & 2;
+  const std::size_t cut = 1U + input[1], room = input[2] * 100U;
+  input = input.subspan(3);
+  const Bytes bomb = to_bytes(fuzz::bomb_from(input));
   Result<EventLoop> loop = EventLoop::open();
   if (!loop) std::abort();
   LogRecorder logger;
@@ -57,11 +62,12 @@ void run(std::span<const std::uint8_t> input) {
   watcher.put(hello_frame(greeting_of("pc1", "watcher")));
   watcher.put(with_serial(1, open_frame("a")));
   watcher.put(with_serial(2, subscribe_from_oldest_frame()));
-  fuzzed.max_receive_bytes = 1U + input[1];
+  fuzzed.max_receive_bytes = cut;
   const wire::Greeting greeting = greeting_of("pc1", "fuzzer");
   fuzzed.put(hello_frame(torn ? greeting : without_features(greeting)));
-  const auto bytes = std::as_bytes(input.subspan(3));
+  const auto bytes = std::as_bytes(input);
   fuzzed.put(Bytes(bytes.begin(), bytes.end()));
+  fuzzed.put(bomb);
   for (MemoryPeer* peer : {&watcher, &fuzzed}) {
     if (!server.adopt(std::make_unique<MemoryTransport>(*peer), nowhere())) std::abort();
   }
@@ -74,7 +80,7 @@ void run(std::span<const std::uint8_t> input) {
   };
   for (int i = 0; i < 2000 && !fuzzed.closed && fuzzed.has_input(); ++i) {
     program.write(payload, {}, Duration(1));
-    turn(input[2] * 100U);
+    turn(room);
   }
   fuzzed.drop_input();
   fuzzed.end();

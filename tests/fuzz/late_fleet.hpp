@@ -23,9 +23,10 @@ class LateFleet final : public Fleet {
   void observe(Observer* observer) override { observer_ = observer; }
   bool is_there(const StreamId& id) const override { return pc2_.knows(id); }
 
-  void open_reader(const StreamId& id, Then<std::shared_ptr<Stream>> then) override {
+  void open_reader(const StreamId& id, bool, Then<std::shared_ptr<Stream>> then) override {
     due_.push_back([this, id, then = std::move(then)] { then(ring(id)); });
   }
+  void want_history(const StreamId&, bool) override {}
   void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) override {
     if (plan) replace(id);
     due_.push_back([this, id, then = std::move(then)] {

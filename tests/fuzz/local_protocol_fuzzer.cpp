@@ -4,7 +4,8 @@
 // requests, the registry and its real memory files to the answers. A second client watches and has
 // a stream open, so that events and conflicts occur. Another host answers after the input, or after
 // the client has disconnected. An input's first two bytes choose whether dssmd is recovering, which
-// descriptors the client sends, and how its bytes are split.
+// descriptors the client sends, and how its bytes are split. Then comes a bomb (bomb.hpp), which is
+// sent last.
 #include <fcntl.h>
 
 #include <algorithm>
@@ -14,6 +15,7 @@
 #include "core/wire/frame.hpp"
 #include "core/wire/local_protocol.hpp"
 #include "daemon/local/local_service.hpp"
+#include "tests/fuzz/bomb.hpp"
 #include "tests/fuzz/fuzzer.hpp"
 #include "tests/fuzz/late_fleet.hpp"
 #include "tests/support/log_recorder.hpp"
@@ -83,6 +85,7 @@ void run(std::span<const std::uint8_t> input) {
   if (input.size() < 2) return;
   const unsigned control = input[0], cut = 1 + input[1];
   input = input.subspan(2);
+  const std::string bomb = fuzz::bomb_from(input);
   Daemon daemon(control & 1);
   Sink sink;
   const ClientNumber watcher = daemon.service.connect({}, sink);
@@ -94,24 +97,28 @@ void run(std::span<const std::uint8_t> input) {
   const ClientNumber client = daemon.service.connect({}, sink);
   put(daemon, client, hello());
 
-  wire::FrameBuffer buffer(1 << 16);
   DescriptorQueue arrived;
   if (control & 2) arrived.push_back(descriptors(control / 4));
   if (control & 4) arrived.push_back(descriptors(3));
+  wire::FrameBuffer buffer(wire::kMaxLocalFrameBytes);
   bool goes_on = true;
-  while (goes_on && !input.empty()) {
-    const auto space = buffer.space();
-    const std::size_t part = std::min({space.size(), input.size(), std::size_t{cut}});
-    std::memcpy(space.data(), input.data(), part);
-    buffer.commit(part);
-    input = input.subspan(part);
-    while (goes_on) {
-      const auto frame = buffer.next();
-      if (!frame) return;
-      if (!*frame) break;
-      goes_on = daemon.service.on_frame_untrusted(client, **frame, arrived);
+  const auto receive = [&](std::span<const std::byte> bytes, std::size_t at_most) {
+    while (goes_on && !bytes.empty()) {
+      const auto space = buffer.space();
+      const std::size_t part = std::min({space.size(), bytes.size(), at_most});
+      std::memcpy(space.data(), bytes.data(), part);
+      buffer.commit(part);
+      bytes = bytes.subspan(part);
+      while (goes_on) {
+        const auto frame = buffer.next();
+        goes_on = frame.has_value();
+        if (!frame || !*frame) break;
+        goes_on = daemon.service.on_frame_untrusted(client, **frame, arrived);
+      }
     }
-  }
+  };
+  receive(std::as_bytes(input), cut);
+  receive(std::as_bytes(std::span(bomb)), SIZE_MAX);
   daemon.service.end_recovery();
   if (cut & 1) daemon.fleet.answer();
   daemon.service.disconnect(client);

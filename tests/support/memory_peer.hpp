@@ -39,7 +39,10 @@ class MemoryPeer {
   void put(const net::Frame& frame) { put(to_bytes(frame)); }
   // Input that dssmd has not received yet.
   bool has_input() const { return !input_.empty(); }
-  void drop_input() { input_.clear(); }
+  void drop_input() {
+    input_.clear();
+    received_ = 0;
+  }
 
   // The peer ends the connection: what was put in is still received.
   void end() {
@@ -74,6 +77,7 @@ class MemoryPeer {
   }
 
   std::deque<Bytes> input_;
+  std::size_t received_ = 0;  // of the first of them
   bool ended_ = false;
   UniqueFd readable_{::eventfd(0, EFD_NONBLOCK | EFD_CLOEXEC)};
   std::shared_ptr<bool> alive_ = std::make_shared<bool>(true);
@@ -113,7 +117,7 @@ class MemoryTransport final : public wire::Transport {
       [[maybe_unused]] const ssize_t read = ::read(fd_.get(), &count, sizeof count);
       return wire::IoResult{wire::IoStatus::would_block, 0};
     }
-    Bytes& next = peer_.input_.front();
+    const auto next = std::span(peer_.input_.front()).subspan(peer_.received_);
     const std::size_t all = std::min(next.size(), peer_.max_receive_bytes);
     std::size_t taken = 0;
     for (const iovec& space : spaces) {
@@ -121,8 +125,11 @@ class MemoryTransport final : public wire::Transport {
       std::memcpy(space.iov_base, next.data() + taken, step);
       taken += step;
     }
-    next.erase(next.begin(), next.begin() + static_cast<std::ptrdiff_t>(taken));
-    if (next.empty()) peer_.input_.pop_front();
+    peer_.received_ += taken;
+    if (taken == next.size()) {
+      peer_.input_.pop_front();
+      peer_.received_ = 0;
+    }
     return wire::IoResult{wire::IoStatus::ok, taken};
   }
 

@@ -115,6 +115,56 @@ TYPED_TEST(RequestSize, FindsTheSerialOfWhatIsNotParsed) {
   EXPECT_EQ(serial_of("\x08"), 0u);
 }
 
+// --- elements
+
+std::string elements_refusal_of(const std::string& bytes) {
+  const Result<void> checked = check_elements_untrusted(std::as_bytes(std::span(bytes)));
+  return checked ? "" : checked.error().message;
+}
+
+// A host that another one connects to could stop that one's loop, for it reads more than requests.
+TEST(FrameElements, AreRefusedWhenTheyAreManyForTheirBytes) {
+  const std::string streams = message(30, empty_messages('\x0a', 100'000));
+  EXPECT_EQ(elements_refusal_of(streams), "a frame of 100005 bytes has more than 7221 elements");
+  const std::string type = message(2, empty_messages('\x22', 100'000));
+  EXPECT_NE(elements_refusal_of(message(7, type)), "") << "of a Create, which no client takes";
+  EXPECT_NE(elements_refusal_of(message(12, message(1, type))), "");
+  EXPECT_NE(elements_refusal_of(message(31, message(2, type))), "");
+  EXPECT_NE(elements_refusal_of(message(30, message(1, type))), "");
+  EXPECT_NE(elements_refusal_of(message(3, empty_messages('\x3a', 100'000))), "");
+  EXPECT_NE(elements_refusal_of(message(35, empty_messages('\x0a', 100'000))), "");
+  const std::string group("\x9b\x06\x9c\x06");
+  EXPECT_NE(elements_refusal_of(group + streams), "") << "a group ends the count";
+  EXPECT_NE(elements_refusal_of(message(12, message(1, group + type))), "");
+  std::string apart;  // protobuf merges them
+  for (int i = 0; i < 10'000; ++i) apart += message(30, empty_messages('\x0a', 2));
+  EXPECT_NE(elements_refusal_of(apart), "");
+}
+
+TEST(FrameElements, AreTakenAsTheLongestAnswersHaveThem) {
+  net::Frame list;
+  for (int i = 0; i < 15'000; ++i) {
+    proto::Stream& stream = *list.mutable_stream_list()->add_streams();
+    stream.mutable_id()->set_name("a");
+    stream.mutable_id()->set_id(i);
+    stream.mutable_id()->set_host("pc2");
+    stream.mutable_type()->set_payload_bytes(8);
+    stream.set_depth(16);
+    stream.set_cycle_ns(1'000'000);
+    stream.set_incarnation(UINT64_MAX);
+    stream.set_newest_time_ns(INT64_MAX);
+  }
+  EXPECT_EQ(elements_refusal_of(list.SerializeAsString()), "");
+  net::Frame opened;
+  proto::Stream& stream = *opened.mutable_opened()->mutable_stream();
+  for (std::size_t i = 0; i < kMaxFields; ++i) stream.mutable_type()->add_fields()->set_scalar(1);
+  for (int i = 0; i < 3000; ++i) stream.add_users()->set_pid(1);
+  EXPECT_EQ(elements_refusal_of(opened.SerializeAsString()), "");
+  net::Frame property;
+  property.mutable_property()->set_property(std::string(kMaxPropertyBytes, '\x9b'));
+  EXPECT_EQ(elements_refusal_of(property.SerializeAsString()), "");
+}
+
 TEST(RequestSizes, RefuseWhatIsNoMessage) {
   const std::string garbage(2 * kMaxRequestBytes, '\xff');
   EXPECT_NE(refusal_of(garbage), "");
