@@ -6,6 +6,7 @@
 #include <unistd.h>
 
 #include <algorithm>
+#include <dssm/pconnector.hpp>
 #include <thread>
 
 #include "tests/process/network/fleet.hpp"
