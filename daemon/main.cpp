@@ -335,8 +335,8 @@ class Dssmd {
     use(changed);
   }
 
-  // Running connections go on if the new ones accept the other side, too. Another folder and another
-  // name count from the next start on.
+  // Running connections go on if the new ones accept the other side, too. Another folder and
+  // another name count from the next start on.
   void use(const Config& changed) {
     const auto& credentials = changed.loaded_credentials;
     if (!credentials || changed.credentials != config_.credentials ||

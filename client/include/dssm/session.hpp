@@ -59,7 +59,7 @@ struct OpenInfo {
 
 // What a host proves itself with to other PCs (docs/security.md).
 struct CredentialsInfo {
-  std::string name;     // whom the certificate names: "host 'pc1'"
+  std::string name;  // whom the certificate names: "host 'pc1'"
   Time valid_until{};
   std::string problem;  // why other hosts refuse it, for people; empty: nothing is known
 };
