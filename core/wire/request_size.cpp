@@ -129,18 +129,38 @@ constexpr int kListUsers[] = {Frame::kStreamListFieldNumber, proto::StreamList::
                               Stream::kUsersFieldNumber};
 constexpr int kPairs[] = {Frame::kClockPairListFieldNumber,
                           proto::ClockPairList::kPairsFieldNumber};
-constexpr Path kElements[] = {kFeatures,      kHelloChain,  kHelloAddresses, kPingChain,
-                              kPingAddresses, kPongChain,   kPongAddresses,  kCreateFields,
-                              kOpenedFields,  kOpenedUsers, kEventFields,    kEventUsers,
-                              kStreams,       kListFields,  kListUsers,      kPairs};
+struct Repeated {
+  Path path;
+  std::size_t min_bytes = kMinElementBytes;  // of an element, on average
+};
+constexpr Repeated kRepeated[] = {
+    {kFeatures},
+    {kHelloChain},
+    {kHelloAddresses},
+    {kPingChain},
+    {kPingAddresses},
+    {kPongChain},
+    {kPongAddresses},
+    {kOpenedUsers},
+    {kEventUsers},
+    {kStreams},
+    {kListUsers},
+    {kPairs},
+    {kCreateFields, kMinFieldBytes},
+    {kOpenedFields, kMinFieldBytes},
+    {kEventFields, kMinFieldBytes},
+    {kListFields, kMinFieldBytes},
+};
 
-// Adds what `message` has at `path`. False when that is more than `allowed`, or when the bytes are
-// no message.
-bool count_elements(Bytes message, Path path, std::size_t allowed, std::size_t& found) noexcept {
+// Adds what the elements of `message` at `path` have at least. False when that is more than
+// `allowed`, or when the bytes are no message.
+bool add_elements(Bytes message, Path path, std::size_t each, std::size_t allowed,
+                  std::size_t& sum) noexcept {
   return for_each_field(message, [&](std::uint64_t field, Bytes content) {
     if (field != static_cast<std::uint64_t>(path.front())) return true;
-    return path.size() > 1 ? count_elements(content, path.subspan(1), allowed, found)
-                           : ++found <= allowed;
+    if (path.size() > 1) return add_elements(content, path.subspan(1), each, allowed, sum);
+    sum += each;
+    return sum <= allowed;
   });
 }
 
@@ -186,20 +206,23 @@ Result<void> check_request_size_untrusted(Bytes message) {
 }
 
 Result<void> check_elements_untrusted(Bytes frame) {
-  const std::size_t allowed = kMaxFreeElements + frame.size() / kMinElementBytes;
-  if (frame.size() / 2 <= allowed) return {};  // an element has two bytes at least
-  std::size_t found = 0;
+  const std::size_t allowed = kFreeElementBytes + frame.size();
+  // An element has two bytes at least.
+  if (frame.size() / 2 * kMinElementBytes <= allowed) return {};
+  std::size_t sum = 0;
   const bool may_be_parsed = for_each_field(frame, [&](std::uint64_t field, Bytes content) {
-    return std::all_of(std::begin(kElements), std::end(kElements), [&](Path path) {
-      return field != static_cast<std::uint64_t>(path.front()) ||
-             count_elements(content, path.subspan(1), allowed, found);
+    return std::all_of(std::begin(kRepeated), std::end(kRepeated), [&](const Repeated& one) {
+      return field != static_cast<std::uint64_t>(one.path.front()) ||
+             add_elements(content, one.path.subspan(1), one.min_bytes, allowed, sum);
     });
   });
   if (may_be_parsed) return {};
   return Error{
       Errc::protocol,
-      found > allowed
-          ? fmt::format("a frame of {} bytes has more than {} elements", frame.size(), allowed)
+      sum > allowed
+          ? fmt::format("a frame of {} bytes has more elements than messages of that "
+                        "length have",
+                        frame.size())
           : fmt::format("a frame of {} bytes is not a message of this protocol", frame.size())};
 }
 
