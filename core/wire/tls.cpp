@@ -15,6 +15,7 @@
 #include <array>
 #include <cerrno>
 #include <cstring>
+#include <memory>
 #include <optional>
 #include <utility>
 #include <vector>
@@ -32,6 +33,9 @@ constexpr std::size_t kBatchBytes = 4 * kRecordBytes;
 
 // A key of AES-GCM is good for 2^24.5 full records (RFC 8446, 5.5).
 constexpr std::uint64_t kRecordsPerKey = 1U << 23;
+// Records decrypted by one receive(): 1 MiB, or the turns of others would wait for one that sends
+// its bytes one by one.
+constexpr int kMaxReads = 64;
 // Messages of TLS itself without data between them; a handshake has six.
 constexpr unsigned kMaxMessages = 32;
 
@@ -116,6 +120,7 @@ class TlsTransport final : public Transport {
     ERR_clear_error();
     is_input_taken_ = false;
     std::size_t received = 0;
+    int reads = 0;
     for (const iovec& space : spaces) {
       for (std::size_t filled = 0; filled < space.iov_len;) {
         std::size_t count = 0;
@@ -125,6 +130,10 @@ class TlsTransport final : public Transport {
         filled += count;
         received += count;
         messages_ = 0;
+        if (++reads == kMaxReads) {
+          has_more_input_ = true;
+          return IoResult{IoStatus::ok, received};
+        }
       }
     }
     has_more_input_ = true;
@@ -194,15 +203,16 @@ class TlsTransport final : public Transport {
       in_part += want;
       return record;
     }
-    thread_local std::array<std::byte, kRecordBytes> collected;
+    using Record = std::array<std::byte, kRecordBytes>;
+    thread_local const auto collected = std::make_unique<Record>();
     for (std::size_t bytes = 0; bytes < want;) {
       while (in_part == part->iov_len) ++part, in_part = 0;
       const std::size_t step = std::min(rest().size(), want - bytes);
-      std::memcpy(collected.data() + bytes, rest().data(), step);
+      std::memcpy(collected->data() + bytes, rest().data(), step);
       bytes += step;
       in_part += step;
     }
-    return std::span(collected).first(want);
+    return std::span(*collected).first(want);
   }
 
   Result<void> encrypt(std::span<const std::byte> record) {
@@ -301,7 +311,7 @@ class TlsTransport final : public Transport {
     return 0;
   }
 
-  // OpenSSL handles these without an end while they come, and each costs as much as a megabyte.
+  // OpenSSL handles these without an end while they come.
   static void on_message(int is_sent, int, int type, const void*, std::size_t, SSL*, void* self) {
     if (is_sent || type != SSL3_RT_HANDSHAKE) return;
     ++static_cast<TlsTransport*>(self)->messages_;

@@ -6,8 +6,8 @@
 //
 // send() encrypts straight from the caller's memory, a ring's slot for example, and what it has
 // encrypted counts as sent: what the network does not take, at most 64 KiB, waits here
-// (has_unsent_output()). receive() fills the spaces as long as there is input; when they are full
-// it may hold more than fd() shows (has_buffered_input()).
+// (has_unsent_output()). receive() fills the spaces as long as there is input, at most 1 MiB; when
+// it stops before, it may hold more than fd() shows (has_buffered_input()).
 //
 // The end of the connection without TLS's closing message is `end` all the same: processes are
 // killed and cables are cut, and frames have lengths.

@@ -6,9 +6,11 @@
 #include "core/wire/tls.hpp"
 
 #include <gtest/gtest.h>
+#include <openssl/ssl.h>
 #include <poll.h>
 #include <sys/socket.h>
 
+#include <array>
 #include <cstring>
 #include <fstream>
 #include <numeric>
@@ -170,6 +172,65 @@ TEST_F(Tls, SaysThatItHoldsInput) {
     got.append(&byte, received->bytes);
   }
   EXPECT_EQ(got, text);
+}
+
+// Each costs as much as one with 16 KiB, and others wait for their turn.
+TEST_F(Tls, TakesABreakWithinManyShortRecords) {
+  connect(make(Authority::host("pc1")), make(Authority::host("pc2")));
+  constexpr std::size_t kCount = 200;
+  char byte = 'x';
+  const iovec part{&byte, 1};
+  for (std::size_t i = 0; i < kCount; ++i) ASSERT_EQ(client->send({&part, 1})->bytes, 1u);
+  std::array<char, 1000> memory{};
+  const iovec space{memory.data(), memory.size()};
+  std::size_t got = 0;
+  int calls = 0;
+  for (bool first = true; first || server->has_buffered_input(); first = false) {
+    got += server->receive({&space, 1})->bytes;
+    ++calls;
+  }
+  EXPECT_EQ(got, kCount);
+  EXPECT_GE(calls, 4);
+}
+
+// By OpenSSL itself, which sends what our transport does not.
+TEST_F(Tls, EndsAConnectionThatSendsNothingButNewKeys) {
+  make(Authority::host("pc1"));
+  int ends[2];
+  ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
+  const UniqueFd socket(ends[0]);
+  const std::unique_ptr<SSL_CTX, decltype(&SSL_CTX_free)> context(SSL_CTX_new(TLS_method()),
+                                                                  SSL_CTX_free);
+  SSL_CTX_use_certificate_file(context.get(), (folder("pc1") + "/own.crt").c_str(),
+                               SSL_FILETYPE_PEM);
+  SSL_CTX_use_PrivateKey_file(context.get(), (folder("pc1") + "/own.key").c_str(),
+                              SSL_FILETYPE_PEM);
+  const std::unique_ptr<SSL, decltype(&SSL_free)> session(SSL_new(context.get()), SSL_free);
+  SSL_set_fd(session.get(), socket.get());
+  SSL_set_connect_state(session.get());
+  TlsHandshake to(make(Authority::host("pc2")),
+                  make_transport(UniqueFd(ends[1]), TransportEnd::accepted),
+                  TransportEnd::accepted);
+  for (bool both = false; !both;) {
+    const bool one = SSL_do_handshake(session.get()) == 1;
+    both = step(to, server, server_error) && one;
+  }
+  ASSERT_TRUE(server);
+  for (int i = 0; i < 20; ++i) {
+    ASSERT_EQ(SSL_key_update(session.get(), SSL_KEY_UPDATE_NOT_REQUESTED), 1);
+    ASSERT_EQ(SSL_do_handshake(session.get()), 1);
+  }
+  EXPECT_FALSE(receive_error(*server)) << "some are allowed";
+  ASSERT_EQ(SSL_write(session.get(), "data", 4), 4);
+  EXPECT_FALSE(receive_error(*server));
+  for (int i = 0; i < 40; ++i) {
+    ASSERT_EQ(SSL_key_update(session.get(), SSL_KEY_UPDATE_NOT_REQUESTED), 1);
+    ASSERT_EQ(SSL_do_handshake(session.get()), 1);
+  }
+  std::optional<Error> error;
+  for (int i = 0; i < 10 && !error; ++i) error = receive_error(*server);
+  ASSERT_TRUE(error);
+  EXPECT_EQ(error->message, "the other side sends nothing but new keys");
 }
 
 TEST_F(Tls, NoticesTheEnd) {
