@@ -181,7 +181,8 @@ struct OtherHosts {
   OtherHosts(const Config& config, const EventLoop& loop, const NetworkListener& network,
              clock::ClockPageWriter page, Registry& registry, Logger& logger)
       : own_clock(std::make_shared<wire::ClockReport>()),
-        credentials(std::make_shared<wire::OwnCredentials>(config.loaded_credentials)),
+        credentials(std::make_shared<wire::OwnCredentials>(
+            wire::OwnCredentials{config.loaded_credentials})),
         self(own_greeting(config.name, own_clock, credentials)),
         catalog(config.name),
         clock(loop, clock_options(config), std::move(page), own_clock, self.host_id, catalog,
