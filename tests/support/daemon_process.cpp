@@ -201,7 +201,11 @@ DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& 
     return word.starts_with("--mdns");
   });
   if (!sets_mdns) argv_.emplace_back("--mdns=false");
-  if (std::getenv("DSSM_TEST_TLS")) {  // NOLINT(concurrency-mt-unsafe): nothing sets it
+  const bool has_own_credentials = std::any_of(extra.begin(), extra.end(), [](const auto& word) {
+    return word == "--credentials" || word == "--config";
+  });
+  // NOLINTNEXTLINE(concurrency-mt-unsafe): nothing sets it
+  if (std::getenv("DSSM_TEST_TLS") && !has_own_credentials) {
     argv_.insert(argv_.end(), {"--credentials", credentials_for(host)});
   }
   argv_.insert(argv_.end(), extra.begin(), extra.end());
