@@ -226,14 +226,15 @@ class Dssmd {
         manager_(manager),
         sockets_(sockets),
         logger_(logger),
+        rights_(config.rights),
         streams_(config, manager, logger),
         recovering_(restore(std::move(stored))),
         hosts_(config, loop, sockets.network, std::move(page), streams_.registry, logger),
-        local_(streams_.registry, streams_.opens, streams_.playback_clock, logger, recovering_,
-               &hosts_.service),
+        local_(streams_.registry, streams_.opens, streams_.playback_clock, rights_, logger,
+               recovering_, &hosts_.service),
         server_(loop, sockets.listener, config.name, config.max_clients, local_, logger),
-        channels_({loop, streams_.registry, streams_.opens, logger, &hosts_.clock,
-                   [this] { hosts_.clock.poll_if_due(); }, authorize, config.insecure},
+        channels_({loop, streams_.registry, streams_.opens, rights_, logger, &hosts_.clock,
+                   [this] { hosts_.clock.poll_if_due(); }, config.insecure},
                   hosts_.self, peer_limits(config)),
         status_(loop, manager,
                 [this] {
@@ -334,6 +335,11 @@ class Dssmd {
     hosts_.peers.set_configured(changed.peers);
     hosts_.clock.set(changed.clocks, changed.max_drift);
     use(changed);
+    if (changed.rights != rights_.lines()) {
+      rights_.set(changed.rights);
+      local_.on_new_rights();
+      channels_.on_new_rights();
+    }
   }
 
   // Running connections go on if the new ones accept the other side, too. Another folder and
@@ -387,6 +393,7 @@ class Dssmd {
   ServiceManager& manager_;
   const Sockets& sockets_;
   LeveledLogger& logger_;
+  Rights rights_;
   OwnStreams streams_;
   const bool recovering_;
   OtherHosts hosts_;

@@ -172,8 +172,12 @@ void OpenStreams::offer(NewConnection& connection, std::uint64_t key) {
     const auto entry = streams_.find(key);
     const bool is_open = entry != streams_.end();
     if (!opened) {
-      // Refused: its users keep this ring; readers continue with the ring that has its name now.
-      if (is_open && opened.error().code == Errc::conflict) entry->second->supersede();
+      // Refused: its users keep this ring; readers continue with the ring that has its name now, or
+      // get to know that they may not.
+      const Errc code = opened.error().code;
+      if (is_open && (code == Errc::conflict || code == Errc::no_permission)) {
+        entry->second->supersede();
+      }
     } else if (opened->has_opened()) {
       (is_open ? entry->second->handle_ : unused_handle) = opened->opened().handle();
     }

@@ -112,7 +112,14 @@ bool ReaderState::restart() noexcept {
   if (to_ns(now.time_since_epoch()) < next_attempt_ns || !client.connection().is_up()) return false;
   next_attempt_ns = to_ns((now + kRestartPause).time_since_epoch());
   auto newer = client.open_reader(stream->requested, stream->tag, stream->history);
-  if (!newer) return false;
+  if (!newer) {
+    if (newer.error().code == Errc::no_permission) {
+      next_attempt_ns = INT64_MAX;
+      restart_error =
+          std::move(newer).error().context("continue to read '" + stream->requested.str() + "'");
+    }
+    return false;
+  }
   if (Result<void> usable = (*newer)->type.check_usable_as(stream->type); !usable) {
     next_attempt_ns = INT64_MAX;
     restart_error = std::move(usable).error().context("continue with the new ring of '" +

@@ -11,6 +11,7 @@ namespace dssm::daemon::message_id {
 inline constexpr std::string_view kReady = "d2b6f171446b46fcb10bc6e779ecf04d";
 inline constexpr std::string_view kStopping = "d05ce614e0a64699b1f2416ba5ca513c";
 inline constexpr std::string_view kClientRefused = "c6801aea58fe472498f8d46ad3aa53cb";
+inline constexpr std::string_view kRequestRefused = "5e410ee07d5c49fd915f093528d92eb3";
 inline constexpr std::string_view kStreamCreated = "8637335716034850a755ed431ed47c14";
 inline constexpr std::string_view kStreamRemoved = "bdd6965dfe8a4d14a605fa127c652ae7";
 inline constexpr std::string_view kStreamAdopted = "a73f7306e3fa42bb87f7d49f265044f7";

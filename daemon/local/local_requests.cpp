@@ -7,6 +7,7 @@
 
 #include "core/base/try.hpp"
 #include "core/wire/clock_report.hpp"
+#include "daemon/service/config_values.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -62,10 +63,11 @@ Reply done() {
 }  // namespace
 
 LocalRequests::LocalRequests(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
-                             Fleet* fleet)
+                             const Rights& rights, Fleet* fleet)
     : registry_(registry),
       opens_(opens),
       clock_(clock),
+      rights_(rights),
       fleet_(fleet),
       catalog_(registry, opens, kMaxListBytes) {}
 
@@ -76,7 +78,9 @@ bool LocalRequests::is_elsewhere(const StreamId& id) const {
 }
 
 bool LocalRequests::waits_for_hosts(const local::Request& request) const {
-  if (!fleet_ || request.has_offer() || request.has_want_history()) return false;
+  if (!fleet_ || request.has_offer() || request.has_want_history() || request.has_list_rights()) {
+    return false;
+  }
   if (request.has_ping_host() || request.has_list_clock_pairs()) return true;
   if (request.has_list()) return !request.list().own_only();
   const proto::StreamId* named = subject(request);
@@ -110,7 +114,9 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
     case local::Request::kOpenClock:
       return open_clock(request.open_clock(), descriptors);
     case local::Request::kListOpens:
-      return list_opens();
+      return list_opens(client);
+    case local::Request::kListRights:
+      return list_rights(client, DSSM_TRY(wire::stream_id_untrusted(request.list_rights().id())));
     case local::Request::kGetDaemon:
       return get_daemon();
     case local::Request::kListHosts:
@@ -185,11 +191,26 @@ Result<Reply> LocalRequests::open_clock_page() const {
   return reply;
 }
 
-Reply LocalRequests::list_opens() const {
+// The rights of this host, also for streams of others: there its programs are its dssmd.
+Reply LocalRequests::list_rights(const Client& client, const StreamId& id) const {
+  Reply reply;
+  local::RightList& list = *reply.response.mutable_right_list();
+  list.set_restricted(!rights_.lines().empty());
+  list.set_own_verbs(rights_.verbs(*client, id).str());
+  for (const Right& right : rights_.lines()) {
+    if (!names_stream(right.streams, id)) continue;
+    local::Right& entry = *list.add_rights();
+    entry.set_verbs(right.verbs.str());
+    entry.set_line(right.line);
+  }
+  return reply;
+}
+
+Reply LocalRequests::list_opens(const Client& client) const {
   Reply reply;
   local::OpenList& list = *reply.response.mutable_open_list();
   for (const auto& [number, open] : opens_.entries()) {
-    if (open.stream->removed()) continue;
+    if (open.stream->removed() || !rights_.shows(*client, open.stream->id())) continue;
     local::OpenEntry& entry = *list.add_opens();
     wire::to_message(open.stream->id(), *entry.mutable_id());
     entry.set_creator_pid(open.stream->creator_pid());

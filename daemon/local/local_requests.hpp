@@ -19,6 +19,7 @@
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"
+#include "daemon/streams/rights.hpp"
 #include "daemon/streams/stream.hpp"
 #include "local.pb.h"
 
@@ -108,7 +109,8 @@ class LocalRequests {
  public:
   // What is given by reference outlives it.
   //   fleet  nullptr: there are no other hosts
-  LocalRequests(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock, Fleet* fleet);
+  LocalRequests(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
+                const Rights& rights, Fleet* fleet);
 
   using Client = std::shared_ptr<const ClientIdentity>;
   // Called once: later, or at once. If the client has disconnected by then, its opens are removed
@@ -116,8 +118,8 @@ class LocalRequests {
   using Answer = std::function<void(Result<Reply>)>;
 
   // Whether the response to `request` may have to wait for another host: it is a List of all hosts,
-  // a ListClockPairs, a PingHost, or about a stream of another host. Offers and WantHistory never
-  // do.
+  // a ListClockPairs, a PingHost, or about a stream of another host. Offers, WantHistory and
+  // ListRights never do.
   bool waits_for_hosts(const local::Request& request) const;
 
   // Serves a request that waits for other hosts,
@@ -130,6 +132,7 @@ class LocalRequests {
   // The stream that `request` names; nullptr: none.
   static const proto::StreamId* subject(const local::Request& request) noexcept {
     if (request.has_offer()) return &request.offer().id();
+    if (request.has_list_rights()) return &request.list_rights().id();
     return request.has_want_history() ? &request.want_history().id() : daemon::subject(request);
   }
 
@@ -141,7 +144,8 @@ class LocalRequests {
                       DescriptorQueue& descriptors);
   Result<Reply> open_clock(const local::OpenClock& request, DescriptorQueue& descriptors);
   Result<Reply> open_clock_page() const;
-  Reply list_opens() const;
+  Reply list_opens(const Client& client) const;
+  Reply list_rights(const Client& client, const StreamId& id) const;
   Reply list_hosts() const;
   Reply get_daemon() const;
 
@@ -159,6 +163,7 @@ class LocalRequests {
   Registry& registry_;
   OpenTable& opens_;
   PlaybackClockOwner& clock_;
+  const Rights& rights_;
   Fleet* const fleet_;
   CatalogRequests catalog_;
 };

@@ -28,14 +28,14 @@ local::Response failure_response(std::uint64_t serial, const Error& error) {
 }  // namespace
 
 LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
-                           Logger& logger, bool recovering, Fleet* fleet, Authorizer authorizer)
+                           const Rights& rights, Logger& logger, bool recovering, Fleet* fleet)
     : registry_(registry),
       opens_(opens),
       clock_(clock),
+      rights_(rights),
       logger_(logger),
-      requests_(registry, opens, clock, fleet),
+      requests_(registry, opens, clock, rights, fleet),
       fleet_(fleet),
-      authorizer_(std::move(authorizer)),
       recovering_(recovering) {
   registry_.add_observer(*this);
   if (fleet_) fleet_->observe(this);
@@ -100,14 +100,21 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
   return true;
 }
 
-Result<void> LocalService::check_access(const Client& client, const local::Request& request) const {
+Result<void> LocalService::check_access(const Client& client, const local::Request& request) {
   const std::optional<Action> action = action_of(request);
   if (!action) return unknown_request(registry_.host());
   StreamId stream;
   if (const proto::StreamId* named = LocalRequests::subject(request)) {
     stream = {named->name(), named->id(), named->host()};
   }
-  return authorizer_(*client.identity, *action, stream);
+  Result<void> checked = rights_.check(*client.identity, *action, stream);
+  if (!checked) {
+    logger_.warning("refuse a request: " + checked.error().message,
+                    {.stream = stream.str(),
+                     .peer = client.identity->str(),
+                     .message_id = message_id::kRequestRefused});
+  }
+  return checked;
 }
 
 bool LocalService::refuse(const Client& client, std::uint64_t serial, const Error& error) {
@@ -130,7 +137,7 @@ bool LocalService::greet(Client& client, std::uint64_t serial, const proto::Hell
                                                "the program " + client.identity->str(),
                                                hello.protocol_version()));
   }
-  if (Result<void> allowed = authorizer_(*client.identity, Action::greet, {}); !allowed) {
+  if (Result<void> allowed = rights_.check(*client.identity, Action::greet, {}); !allowed) {
     return refuse(client, serial, allowed.error());
   }
   client.greeted = true;
@@ -187,6 +194,9 @@ void LocalService::on_answer(ClientNumber number, std::uint64_t serial, Result<R
     return;
   }
   if (reply) {
+    if (reply->response.has_stream_list()) {
+      rights_.hide(*client->second.identity, *reply->response.mutable_stream_list());
+    }
     send(client->second, serial, *std::move(reply));
   } else {
     send_failure(client->second, serial, reply.error());
@@ -209,6 +219,15 @@ void LocalService::log_offer(const ClientIdentity& client, const local::Offer& o
 // which were not among them do not exist any more. All at once, unlike StreamWatch of other hosts:
 // the output of a program is bounded by kMaxQueuedBytes.
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
+  if (!send_events(number, added_events())) return;
+  Client& client = clients_.at(number);
+  client.watching = true;
+  Reply done;
+  done.response.mutable_done();
+  send(client, serial, std::move(done));
+}
+
+std::vector<proto::StreamEvent> LocalService::added_events() const {
   std::vector<proto::StreamEvent> events;
   for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
     events.push_back(added_event(*stream, opens_));
@@ -218,19 +237,25 @@ void LocalService::watch(ClientNumber number, std::uint64_t serial) {
       wire::to_message(stream, *events.emplace_back().mutable_stream());
     }
   }
-  for (proto::StreamEvent& event : events) {
+  return events;
+}
+
+bool LocalService::shows(const Client& client, const proto::StreamEvent& event) const {
+  const proto::StreamId& id = event.stream().id();
+  return rights_.shows(*client.identity, {id.name(), id.id(), id.host()});
+}
+
+// Those that the client may see. False when it is disconnected by then.
+bool LocalService::send_events(ClientNumber number, const std::vector<proto::StreamEvent>& events) {
+  for (const proto::StreamEvent& event : events) {
     const auto client = clients_.find(number);  // sending may end the connection
-    if (client == clients_.end()) return;
+    if (client == clients_.end()) return false;
+    if (!shows(client->second, event)) continue;
     Reply reply;
-    *reply.response.mutable_stream_event() = std::move(event);
+    *reply.response.mutable_stream_event() = event;
     send(client->second, 0, std::move(reply));
   }
-  const auto client = clients_.find(number);
-  if (client == clients_.end()) return;
-  client->second.watching = true;
-  Reply done;
-  done.response.mutable_done();
-  send(client->second, serial, std::move(done));
+  return clients_.contains(number);
 }
 
 void LocalService::list_clients(const Client& client, std::uint64_t serial) {
@@ -265,7 +290,8 @@ void LocalService::broadcast(const proto::StreamEvent& event) {
   *response.mutable_stream_event() = event;
   const std::string frame = wire::encode_frame(response);
   for (const ClientNumber number : watchers) {
-    if (const auto client = clients_.find(number); client != clients_.end()) {
+    const auto client = clients_.find(number);
+    if (client != clients_.end() && shows(client->second, event)) {
       client->second.output->send(frame, {});
     }
   }
@@ -329,6 +355,46 @@ void LocalService::notify_successors(const StreamId& id) {
 bool LocalService::is_gone(const Stream& stream) const {
   if (stream.id().host == registry_.host()) return stream.removed();
   return !fleet_ || !fleet_->is_there(stream.id());
+}
+
+// --- new rights
+
+void LocalService::on_new_rights() {
+  const std::map<OpenNumber, OpenEntry> opens = opens_.entries();  // sending may end opens
+  for (const auto& [number, open] : opens) {
+    const Action action =
+        open.role == Role::writer ? Action::open_for_writing : Action::open_for_reading;
+    const Result<void> checked = rights_.check(*open.client, action, open.stream->id());
+    if (checked) continue;
+    const bool is_own = open.stream->purpose() == Purpose::own;
+    logger_.warning(
+        fmt::format("end an open: {}{}", checked.error().message,
+                    is_own ? "; it keeps the memory that it has open until it ends" : ""),
+        {.stream = open.stream->id().str(),
+         .peer = open.client->str(),
+         .message_id = message_id::kRequestRefused});
+    if (open.role == Role::reader) notify_replaced({open.client->number, number, open.any_host});
+    static_cast<void>(opens_.remove(open.client->number, number));  // sending may have ended it
+  }
+  std::vector<ClientNumber> watchers;
+  for (const auto& [number, client] : clients_) {
+    if (client.watching) watchers.push_back(number);
+  }
+  const std::vector<proto::StreamEvent> events = added_events();
+  for (const ClientNumber number : watchers) {
+    // What a client knows already changes nothing, nor does the removal of what it does not know.
+    for (const proto::StreamEvent& event : events) {
+      const auto client = clients_.find(number);
+      if (client == clients_.end() || shows(client->second, event)) continue;
+      Reply reply;
+      proto::StreamEvent& removed = *reply.response.mutable_stream_event();
+      removed.set_removed(true);
+      *removed.mutable_stream()->mutable_id() = event.stream().id();
+      removed.mutable_stream()->set_incarnation(event.stream().incarnation());
+      send(client->second, 0, std::move(reply));
+    }
+    send_events(number, events);
+  }
 }
 
 // --- recovery

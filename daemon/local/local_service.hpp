@@ -4,9 +4,9 @@
 // StreamEvents to those that watch. Connection and Server carry the bytes; tests and fuzzers pass
 // frames directly.
 //
-// Each request passes the Authorizer (daemon/streams/authorize.hpp). Requests about streams of
-// other hosts go to the Fleet, which responds later; when the client has disconnected by then, the
-// response is dropped.
+// Each request passes Rights::check(), and lists and events show what the client may see. Requests
+// about streams of other hosts go to the Fleet, which responds later; when the client has
+// disconnected by then, the response is dropped.
 //
 // A ring can get a successor: a stream is created again under the name of a removed one, its owner
 // restarted without its rings, or another host has it now. Readers of the old ring get the event
@@ -31,10 +31,10 @@
 #include "core/base/unique_fd.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/local/local_requests.hpp"
-#include "daemon/streams/authorize.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"
+#include "daemon/streams/rights.hpp"
 
 namespace dssm::daemon {
 
@@ -55,8 +55,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
 
   // recovering: the dssmd before this one did not end properly.
   // fleet: outlives this; nullptr: there are no other hosts.
-  LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock, Logger& logger,
-               bool recovering, Fleet* fleet = nullptr, Authorizer authorizer = authorize);
+  LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
+               const Rights& rights, Logger& logger, bool recovering, Fleet* fleet = nullptr);
   LocalService(const LocalService&) = delete;
   LocalService& operator=(const LocalService&) = delete;
   ~LocalService();
@@ -73,6 +73,11 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   //   returns  false: the client does not keep to the protocol, the connection must end
   bool on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
                           DescriptorQueue& descriptors);
+
+  // The rights have changed: ends opens that are not allowed any more, so that mirrors and remote
+  // writers end, too; their readers reopen, and are told why they may not. Watches show what they
+  // may see now.
+  void on_new_rights();
 
   // The time to offer streams is over: deferred requests are answered.
   void end_recovery();
@@ -93,7 +98,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   };
 
   bool refuse(const Client& client, std::uint64_t serial, const Error& error);
-  Result<void> check_access(const Client& client, const local::Request& request) const;
+  Result<void> check_access(const Client& client, const local::Request& request);
   bool greet(Client& client, std::uint64_t serial, const proto::Hello& hello);
   void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
   LocalRequests::Answer await(ClientNumber number, std::uint64_t serial);
@@ -105,6 +110,9 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void send(const Client& client, std::uint64_t serial, Reply reply);
   void send_failure(const Client& client, std::uint64_t serial, const Error& error);
   void broadcast(const proto::StreamEvent& event);
+  std::vector<proto::StreamEvent> added_events() const;
+  bool shows(const Client& client, const proto::StreamEvent& event) const;
+  bool send_events(ClientNumber number, const std::vector<proto::StreamEvent>& events);
 
   bool must_wait(const local::Request& request) const;
   void defer(Client& client, const local::Request& request, std::size_t bytes);
@@ -122,10 +130,10 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   Registry& registry_;
   OpenTable& opens_;
   PlaybackClockOwner& clock_;
-  Logger& logger_;
+  const Rights& rights_;
+  RateLimitedLogger logger_;
   LocalRequests requests_;
   Fleet* fleet_;
-  const Authorizer authorizer_;
   bool recovering_;
   ClientNumber next_client_ = 1;
   std::map<ClientNumber, Client> clients_;

@@ -33,6 +33,22 @@ Result<bool> remove_stale(const std::string& path) {
   return true;
 }
 
+// The groups of the program on the other side, besides that of SO_PEERCRED; when the kernel does
+// not tell them (before Linux 4.13), none.
+std::vector<std::uint32_t> groups_of(int socket) {
+  static_assert(sizeof(gid_t) == sizeof(std::uint32_t));
+  std::vector<std::uint32_t> groups(64);
+  for (;;) {
+    auto bytes = static_cast<socklen_t>(groups.size() * sizeof(gid_t));
+    if (!::getsockopt(socket, SOL_SOCKET, SO_PEERGROUPS, groups.data(), &bytes)) {
+      groups.resize(bytes / sizeof(gid_t));
+      return groups;
+    }
+    if (errno != ERANGE) return {};
+    groups.resize(bytes / sizeof(gid_t));  // as many as there are
+  }
+}
+
 }  // namespace
 
 // --- the socket
@@ -293,6 +309,7 @@ Result<void> Server::accept(UniqueFd& socket) {
   identity.pid = peer.pid;
   identity.uid = peer.uid;
   identity.gid = peer.gid;
+  identity.groups = groups_of(socket.get());
   const std::uint64_t number = next_++;
   connections_.emplace(number,
                        std::make_unique<Connection>(loop_, std::move(socket), identity, service_,

@@ -139,10 +139,14 @@ void ChannelServer::keep(PeerPlace place, std::unique_ptr<wire::Transport> trans
                          const wire::SocketAddress& address) {
   auto communicator = std::make_unique<DataCommunicator>(
       DataCommunicator::Parts{parts_.loop, parts_.registry, parts_.opens, streams_, self_, logger_,
-                              *this, parts_.clock, parts_.authorizer, sending_},
+                              *this, parts_.clock, parts_.rights, sending_},
       std::move(place), std::move(transport), address.str());
   DataCommunicator* key = communicator.get();
   communicators_.emplace(key, std::move(communicator));
+}
+
+void ChannelServer::on_new_rights() {
+  for (const auto& [key, communicator] : communicators_) communicator->on_new_rights();
 }
 
 void ChannelServer::send_clock() {

@@ -21,9 +21,9 @@
 #include "daemon/serve/data_communicator.hpp"
 #include "daemon/serve/peer_table.hpp"
 #include "daemon/serve/served_stream.hpp"
-#include "daemon/streams/authorize.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
+#include "daemon/streams/rights.hpp"
 
 namespace dssm::daemon {
 
@@ -33,11 +33,11 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     const EventLoop& loop;
     Registry& registry;
     const OpenTable& opens;
+    const Rights& rights;
     Logger& logger;
     ClockAssessor* clock = nullptr;           // nullptr: the clock is not watched
     std::function<void()> on_heartbeat = {};  // of another host, about once a second; may be empty
-    Authorizer authorizer = authorize;
-    bool takes_plain = false;  // with credentials: from other PCs, too
+    bool takes_plain = false;                 // with credentials: from other PCs, too
   };
 
   // self: how this dssmd greets; with its credentials, connections are encrypted. All in `parts`
@@ -57,6 +57,9 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
 
   // The own credentials were replaced: ends connections of peers that they do not accept.
   void on_new_credentials();
+
+  // The rights have changed: ends channels that are not allowed any more.
+  void on_new_rights();
 
   // This host's clock has a new generation: notifies the hosts that are connected.
   void send_clock();

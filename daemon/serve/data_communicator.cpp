@@ -68,10 +68,10 @@ DataCommunicator::~DataCommunicator() = default;
 
 std::string DataCommunicator::peer() const {
   // A host's certificate names what its greeting names; a program's does not.
-  const bool shows_certificate = them_ && them_->program != "dssmd" && !identity_.certified.empty();
+  const bool shows_certificate = them_ && them_->program != "dssmd" && identity_.certified;
   return fmt::format(
       "{}{} at '{}'", them_ ? them_->str() : "a peer",
-      shows_certificate ? ", with the certificate of " + identity_.certified + "," : "",
+      shows_certificate ? ", with the certificate of " + identity_.certified->str() + "," : "",
       peer_address_);
 }
 
@@ -119,14 +119,14 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
   if (const wire::CertifiedPeer* peer = link_.peer()) {
     DSSM_TRY(wire::check_certified(*them, *peer, wire::TransportEnd::accepted),
              "dssmd of host '" + parts_.self.host + "' refuses");
-    identity_.certified = peer->str();
+    identity_.certified = *peer;
   }
   them_ = *std::move(them);
   identity_.address = peer_address_;
   identity_.host = them_->host;
   identity_.host_id = them_->host_id;
   identity_.program = them_->program;
-  DSSM_TRY(parts_.authorizer(identity_, Action::greet, {}));
+  DSSM_TRY(parts_.rights.check(identity_, Action::greet, {}));
   greeting_timeout_.disable();
   net::Frame hello;
   wire::to_message(parts_.self, *hello.mutable_hello());
@@ -138,6 +138,18 @@ void DataCommunicator::on_new_credentials(const wire::TlsCredentials& credential
   const wire::CertifiedPeer* peer = link_.peer();
   if (!peer) return;
   if (Result<void> checked = credentials.check(*peer); !checked) close_with(checked.error());
+}
+
+void DataCommunicator::on_new_rights() {
+  if (watch_) {
+    watch_->on_new_rights();
+    work_soon();
+  }
+  if (!channel_) return;
+  for (const Action action : allowed_) {
+    Result<void> checked = parts_.rights.check(identity_, action, channel_->stream().id());
+    if (!checked) return close_with(checked.error());
+  }
 }
 
 bool DataCommunicator::can_serve() const noexcept {
@@ -155,15 +167,25 @@ void DataCommunicator::serve(const net::Frame& request) {
   served_for_ += MonoClock::now() - begin;
 }
 
-Result<void> DataCommunicator::check_access(const net::Frame& request) const {
+// A channel's actions are decided about once, until the rights change.
+Result<void> DataCommunicator::check_access(const net::Frame& request) {
   const std::optional<Action> action = action_of(request);
   if (!action) return unknown_request(parts_.self.host);
-  if (channel_) return parts_.authorizer(identity_, *action, channel_->stream().id());
+  if (channel_ && allowed_.contains(*action)) return {};
   StreamId stream;
-  if (const proto::StreamId* named = subject(request)) {
+  if (channel_) {
+    stream = channel_->stream().id();
+  } else if (const proto::StreamId* named = subject(request)) {
     stream = {named->name(), named->id(), named->host()};
   }
-  return parts_.authorizer(identity_, *action, stream);
+  if (Result<void> checked = parts_.rights.check(identity_, *action, stream); !checked) {
+    parts_.logger.warning(
+        "refuse a request: " + checked.error().message,
+        {.stream = stream.str(), .peer = peer_address_, .message_id = message_id::kRequestRefused});
+    return checked;
+  }
+  if (channel_) allowed_.insert(*action);
+  return {};
 }
 
 Result<void> DataCommunicator::dispatch(const net::Frame& request) {
@@ -202,7 +224,10 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
 Result<void> DataCommunicator::serve_control(const net::Frame& request) {
   become_control();
   if (request.has_watch()) {
-    watch_ = std::make_unique<StreamWatch>(parts_.registry, parts_.opens, link_, request.serial());
+    watch_ = std::make_unique<StreamWatch>(
+        parts_.registry, parts_.opens, link_,
+        [this](const StreamId& stream) { return parts_.rights.shows(identity_, stream); },
+        request.serial());
     work_soon();
     return {};
   }
@@ -215,6 +240,7 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
     }
   } else {
     DSSM_TRY(catalog_.serve_untrusted(request, answer));
+    if (request.has_list()) parts_.rights.hide(identity_, *answer.mutable_stream_list());
   }
   link_.send(answer);
   return {};
@@ -411,9 +437,11 @@ void DataCommunicator::log_end(const Error& why) {
 // --- watching
 
 StreamWatch::StreamWatch(const Registry& registry, const OpenTable& opens, FrameConnection& link,
-                         std::uint64_t serial)
-    : opens_(opens),
+                         Shows shows, std::uint64_t serial)
+    : registry_(registry),
+      opens_(opens),
       link_(link),
+      shows_(std::move(shows)),
       serial_(serial),
       pending_(registry.streams().begin(), registry.streams().end()) {}
 
@@ -422,7 +450,7 @@ bool StreamWatch::work() {
     if (sent == kStreamsPerTurn) return true;
     const std::shared_ptr<const Stream> stream = pending_.front().lock();
     pending_.pop_front();
-    if (stream && !stream->removed()) send_added(*stream);
+    if (stream && !stream->removed() && shows_(stream->id())) send_added(*stream);
   }
   if (!pending_.empty() || serial_ == 0) return false;
   net::Frame done;
@@ -440,6 +468,7 @@ void StreamWatch::send_added(const Stream& stream) {
 }
 
 void StreamWatch::on_stream_added(const Stream& stream) {
+  if (!shows_(stream.id())) return;
   if (pending_.empty()) {
     send_added(stream);
   } else {
@@ -450,6 +479,18 @@ void StreamWatch::on_stream_added(const Stream& stream) {
 // Also for one whose addition was not sent yet: a receiver ignores the removal of an unknown
 // stream.
 void StreamWatch::on_stream_removed(const Stream& stream) {
+  if (shows_(stream.id())) send_removed(stream);
+}
+
+// All again, as fast as the peer receives them: what it knows already changes nothing.
+void StreamWatch::on_new_rights() {
+  pending_.assign(registry_.streams().begin(), registry_.streams().end());
+  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
+    if (!shows_(stream->id())) send_removed(*stream);
+  }
+}
+
+void StreamWatch::send_removed(const Stream& stream) {
   net::Frame frame;
   *frame.mutable_stream_event() = removed_event(stream.id(), stream.incarnation());
   link_.send(frame);

@@ -11,8 +11,10 @@
 
 #include <deque>
 #include <dssm/result.hpp>
+#include <functional>
 #include <memory>
 #include <optional>
+#include <set>
 #include <string>
 
 #include "core/wire/network_protocol.hpp"
@@ -24,10 +26,10 @@
 #include "daemon/serve/peer_table.hpp"
 #include "daemon/serve/served_stream.hpp"
 #include "daemon/serve/stream_channel.hpp"
-#include "daemon/streams/authorize.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
+#include "daemon/streams/rights.hpp"
 
 namespace dssm::daemon {
 
@@ -39,8 +41,9 @@ class StreamWatch {
   // Events sent in a row before others get their turn.
   static constexpr int kStreamsPerTurn = 64;
 
-  // All outlive it.
-  StreamWatch(const Registry& registry, const OpenTable& opens, FrameConnection& link,
+  // shows: what the peer may see. All outlive it.
+  using Shows = std::function<bool(const StreamId& stream)>;
+  StreamWatch(const Registry& registry, const OpenTable& opens, FrameConnection& link, Shows shows,
               std::uint64_t serial);
 
   // Sends events while the link takes them. True when others should have their turn and work() be
@@ -49,12 +52,17 @@ class StreamWatch {
 
   void on_stream_added(const Stream& stream);
   void on_stream_removed(const Stream& stream);
+  // The peer may see other streams than before.
+  void on_new_rights();
 
  private:
   void send_added(const Stream& stream);
+  void send_removed(const Stream& stream);
 
+  const Registry& registry_;
   const OpenTable& opens_;
   FrameConnection& link_;
+  Shows shows_;
   std::uint64_t serial_;  // of Watch; 0: answered
   std::deque<std::weak_ptr<const Stream>> pending_;
 };
@@ -90,7 +98,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     Logger& logger;
     Observer& observer;
     ClockAssessor* clock;  // nullptr: the clock is not watched
-    const Authorizer& authorizer;
+    const Rights& rights;
     const SendingDemands& sending;
   };
 
@@ -109,6 +117,9 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
 
   // Closes when `credentials` do not accept the peer.
   void on_new_credentials(const wire::TlsCredentials& credentials);
+
+  // Closes a channel on which something was allowed that is not any more.
+  void on_new_rights();
 
   // Sends a final failure, as far as the socket takes it at once.
   void close_with(const Error& why) { link_.close_with(why); }
@@ -132,7 +143,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   void become_control();
   bool can_serve() const noexcept;
   void serve(const net::Frame& request);
-  Result<void> check_access(const net::Frame& request) const;
+  Result<void> check_access(const net::Frame& request);
   Result<void> dispatch(const net::Frame& request);
   Result<void> serve_control(const net::Frame& request);
   Result<void> open(const net::Frame& request);
@@ -164,6 +175,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   std::unique_ptr<StreamWatch> watch_;
   std::optional<Opening> opening_;
   std::unique_ptr<StreamChannel> channel_;
+  std::set<Action> allowed_;  // on the channel
   bool turn_is_due_ = false;
   EventSource next_turn_, greeting_timeout_, peer_timeout_;
 };

@@ -64,17 +64,11 @@ Error out_of_range(std::string_view text, std::uint64_t min, std::uint64_t max,
 // By wire::Priority.
 constexpr std::array<std::string_view, 3> kPriorityNames = {"high", "normal", "low"};
 
-bool matches(const std::string& pattern, const StreamId& id) {
-  const std::string full = fmt::format("{}:{}", id.name, id.id);
-  return !::fnmatch(pattern.c_str(), id.name.c_str(), 0) ||
-         !::fnmatch(pattern.c_str(), full.c_str(), 0);
-}
-
 template <class Exception>
 const Exception* first_for(const StreamId& id, const std::vector<Exception>& exceptions) {
   const auto found =
       std::find_if(exceptions.begin(), exceptions.end(),
-                   [&](const Exception& exception) { return matches(exception.pattern, id); });
+                   [&](const Exception& exception) { return names_stream(exception.pattern, id); });
   return found != exceptions.end() ? &*found : nullptr;
 }
 
@@ -111,6 +105,12 @@ std::string take_pattern(std::string_view text, std::string& out) {
 }
 
 }  // namespace
+
+bool names_stream(const std::string& pattern, const StreamId& id) {
+  const std::string full = fmt::format("{}:{}", id.name, id.id);
+  return !::fnmatch(pattern.c_str(), id.name.c_str(), 0) ||
+         !::fnmatch(pattern.c_str(), full.c_str(), 0);
+}
 
 ClockDemand ClockPolicies::demand_for(const StreamId& id) const {
   const Exception* found = first_for(id, exceptions);

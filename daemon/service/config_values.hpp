@@ -23,6 +23,9 @@
 
 namespace dssm::daemon {
 
+// Whether `pattern`, as in fnmatch(3), is of the stream's name or of "NAME:ID".
+bool names_stream(const std::string& pattern, const StreamId& id);
+
 // Which clocks are good enough for which streams: the configuration keys clock_policy, clock_limit
 // and clock_streams.
 struct ClockDemand {
@@ -36,7 +39,7 @@ struct ClockDemand {
 struct ClockPolicies {
   // Another demand for some streams. The first that matches counts.
   struct Exception {
-    std::string pattern;  // of the stream's name, or "NAME:ID", as in fnmatch(3)
+    std::string pattern;  // as in names_stream()
     ClockPolicy policy = ClockPolicy::enforce;
     Duration limit{};  // 0: the general one
 
@@ -64,7 +67,7 @@ struct MirrorDemand {
 struct MirrorDemands {
   // Another demand for some streams. The first that matches counts.
   struct Exception {
-    std::string pattern;                  // as in ClockPolicies
+    std::string pattern;                  // as in names_stream()
     std::optional<bool> history_at_once;  // nothing: as in general
     double max_rate_hz = 0;
     Duration max_history{};
@@ -90,7 +93,7 @@ struct SendingDemand {
 
 struct SendingDemands {
   struct Exception {
-    std::string pattern;  // as in ClockPolicies
+    std::string pattern;  // as in names_stream()
     SendingDemand demand;
 
     friend bool operator==(const Exception& a, const Exception& b) = default;

@@ -15,7 +15,7 @@
 #include <unordered_map>
 #include <vector>
 
-#include "daemon/streams/authorize.hpp"
+#include "daemon/streams/action.hpp"
 #include "daemon/streams/stream.hpp"
 
 namespace dssm::daemon {

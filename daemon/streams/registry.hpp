@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The streams that this host owns, by name. One thread, no sockets: authorize() has allowed what is
+// The streams that this host owns, by name. One thread, no sockets: Rights have allowed what is
 // asked here.
 #pragma once
 

@@ -58,7 +58,9 @@ void run(std::span<const std::uint8_t> input) {
   const std::vector<std::byte> payload(payload_bytes);
 
   MemoryPeer watcher, fuzzed;
-  ChannelServer server({*loop, registry, opens, logger}, greeting_of("pc1"), {4, 4, 2U << 20});
+  const Rights rights;
+  ChannelServer server({*loop, registry, opens, rights, logger}, greeting_of("pc1"),
+                       {4, 4, 2U << 20});
   watcher.put(hello_frame(greeting_of("pc1", "watcher")));
   watcher.put(with_serial(1, open_frame("a")));
   watcher.put(with_serial(2, subscribe_from_oldest_frame()));

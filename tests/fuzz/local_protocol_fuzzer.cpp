@@ -36,11 +36,12 @@ struct Daemon {
       : registry("pc1",
                  {.max_streams = 8, .max_memory_bytes = 1 << 20, .max_property_bytes = 4096}),
         opens({.max_opens = 16, .max_opens_per_client = 8}),
-        service(registry, opens, clock, logger, recovering, &fleet) {}
+        service(registry, opens, clock, rights, logger, recovering, &fleet) {}
   LogRecorder logger;
   Registry registry;
   OpenTable opens;
   PlaybackClockOwner clock;
+  const Rights rights;
   LateFleet fleet;
   LocalService service;
 };

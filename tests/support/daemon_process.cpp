@@ -2,6 +2,7 @@
 #include "tests/support/daemon_process.hpp"
 
 #include <fcntl.h>
+#include <grp.h>
 #include <poll.h>
 #include <signal.h>
 #include <sys/prctl.h>
@@ -76,6 +77,13 @@ std::string make_temp_dir() {
 }
 
 void remove_tree(const std::string& path) { std::filesystem::remove_all(path); }
+
+void become_nobody(const std::vector<gid_t>& groups) {
+  if (::setgroups(groups.size(), groups.data()) || ::setresgid(kNobody, kNobody, kNobody) ||
+      ::setresuid(kNobody, kNobody, kNobody)) {
+    ::_exit(100);
+  }
+}
 
 int wait_for(pid_t pid) {
   int status = 0;

@@ -32,6 +32,11 @@ pid_t start(const std::vector<std::string>& argv, const std::vector<std::string>
             int out_fd = -1);
 int wait_for(pid_t pid);
 
+// For a child of a test that runs as root: makes it the user nobody, in these groups only; ends it
+// with status 100 when that fails.
+inline constexpr uid_t kNobody = 65534;
+void become_nobody(const std::vector<gid_t>& groups);
+
 // For a dssmd that is killed while programs wait to recreate its streams: on a machine where many
 // tests run at once, programs need more than the default of 500 ms to offer their rings.
 inline const std::vector<std::string> kPatientRecovery = {"--recovery-grace", "3 s"};

@@ -172,7 +172,9 @@ class RawReader {
   // How often the stream restarted while this reader read it.
   std::uint64_t restarts() const noexcept;
 
-  // Why this reader cannot use the stream's new ring (it has another type); empty otherwise.
+  // Why this reader cannot continue: the stream's new ring has another type, or this process may
+  // not read the stream any more (no_permission; it may still get samples of the ring that it has
+  // open). Empty otherwise.
   std::optional<Error> restart_error() const;
 
   // --- in place

@@ -15,8 +15,6 @@
 namespace dssm::test {
 namespace {
 
-constexpr uid_t kNobody = 65534;
-
 struct stat socket_file(const DaemonProcess& daemon) {
   struct stat file {};
   EXPECT_EQ(::stat(daemon.socket_path().c_str(), &file), 0);
@@ -27,10 +25,7 @@ struct stat socket_file(const DaemonProcess& daemon) {
 int connect_as_nobody(const std::string& path, const std::vector<gid_t>& groups) {
   const pid_t child = ::fork();
   if (child == 0) {
-    if (::setgroups(groups.size(), groups.data()) || ::setresgid(kNobody, kNobody, kNobody) ||
-        ::setresuid(kNobody, kNobody, kNobody)) {
-      ::_exit(100);
-    }
+    become_nobody(groups);
     const Result<UniqueFd> connected = wire::connect_unix(path);
     ::_exit(connected ? 0 : 1 + static_cast<int>(connected.error().code));
   }
@@ -74,10 +69,7 @@ TEST(Socket, GivesReadersARingThatCannotBeMadeWritable) {
   const int ring = opened.descriptors[0].get(), meta = opened.descriptors[2].get();
   const pid_t child = ::fork();  // another user who got the descriptors
   if (child == 0) {
-    if (::setgroups(0, nullptr) || ::setresgid(kNobody, kNobody, kNobody) ||
-        ::setresuid(kNobody, kNobody, kNobody)) {
-      ::_exit(100);
-    }
+    become_nobody({});
     for (const int fd : {ring, meta}) {
       if (::mmap(nullptr, 4096, PROT_READ | PROT_WRITE, MAP_SHARED, fd, 0) != MAP_FAILED) {
         ::_exit(1);

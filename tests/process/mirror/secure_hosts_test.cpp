@@ -37,6 +37,11 @@ class SecureHosts : public testing::Test {
       return {"--config", path};
     }
     void reload() const { ::kill(dssmd.pid(), SIGHUP); }
+    // One more line of the configuration, the last one.
+    void configure_also(const std::string& line) const {
+      std::ofstream(dir + "/dssmd.conf", std::ios::app) << line << "\n";
+      reload();
+    }
     // Puts what `dssmctl pki` made into the credentials.
     void install(const std::vector<std::string>& words) const {
       std::vector<std::string> all = words;
@@ -135,6 +140,47 @@ TEST_F(SecureHosts, TakeTheCertificateOfAnotherHostForNone) {
       << checked.err;
 }
 
+TEST_F(SecureHosts, GiveRightsToWhomACertificateNames) {
+  auto odometry = here.create<Numbered>("odometry", History{16, 1ms}).value();
+  auto camera = here.create<Numbered>("camera", History{16, 1ms}).value();
+  odometry.write(numbered(0), time_from_ns(0), 0ns);
+  pc1.configure_also("rights = [\"host:pc2 read,write odometry\", \"program:view* read camera\"]");
+  const Host pc2("pc2", pc1.dssmd.address());
+  Session there = connect(pc2.dssmd);
+  auto reader = open_filled<Numbered>(there, "odometry");
+  const std::vector<StreamInfo> shown = there.list_streams().value();
+  ASSERT_EQ(shown.size(), 1u);
+  EXPECT_EQ(shown[0].id.name, "odometry");
+  EXPECT_EQ(there.open_reader<Numbered>("camera@pc1").error().code, Errc::no_permission);
+  EXPECT_EQ(there.remove({"odometry", 0, "pc1"}).error().code, Errc::no_permission);
+  auto writer = there.open_writer<Numbered>("odometry").value();
+  writer.write(numbered(1), time_from_ns(1), 0ns);
+  await([&] { return reader.newest_tid() == 1; });
+
+  const PConnectorOptions viewer{.address = pc1.dssmd.address(),
+                                 .credentials = credentials_for_program("viewer")};
+  EXPECT_EQ(PConnector::list_streams(viewer).value().size(), 1u);
+  EXPECT_TRUE(PConnector::open({"camera", 0, ""}, viewer));
+  EXPECT_EQ(PConnector::open({"odometry", 0, ""}, viewer).error().code, Errc::no_permission);
+}
+
+TEST_F(SecureHosts, EndWhatIsNotAllowedAnyMore) {
+  auto odometry = here.create<Numbered>("odometry", History{16, 1ms}).value();
+  odometry.write(numbered(0), time_from_ns(0), 0ns);
+  const Host pc2("pc2", pc1.dssmd.address());
+  Session there = connect(pc2.dssmd);
+  auto reader = open_filled<Numbered>(there, "odometry");
+  pc1.configure_also("rights = [\"host:pc2 property odometry\"]");
+  await([&] { return here.stream_info({"odometry", 0, ""}).value().channels == 0; });
+  odometry.write(numbered(1), time_from_ns(1), 0ns);
+  // The mirror tries again for as long as it has a reader.
+  await([&] {
+    const MirrorInfo mirror = there.stream_info({"odometry", 0, "pc1"}).value().mirror.value();
+    return mirror.error.find("may not open stream 'odometry:0@pc1'") != std::string::npos;
+  });
+  EXPECT_EQ(reader.newest_tid(), 0);
+}
+
 TEST_F(SecureHosts, ServeAProgramWithACertificate) {
   auto writer = here.create<Numbered>("odometry", History{16, 1ms}).value();
   const PConnectorOptions options{.address = pc1.dssmd.address(),
@@ -147,7 +193,7 @@ TEST_F(SecureHosts, ServeAProgramWithACertificate) {
   for (int i = 0; i < 100; ++i) {
     writer.write(numbered(i), time_from_ns(i), 0ns);
     await([&] {
-      reader.wait(MonoClock::now() + 10ms);
+      static_cast<void>(reader.wait(MonoClock::now() + 10ms));
       return reader.read_next(payload, info).value() == ReadStatus::ok;
     });
     EXPECT_EQ(info.tid, i);

@@ -13,11 +13,12 @@ namespace {
 
 struct Daemon {
   explicit Daemon(bool recovering = false, const OpenTable::Limits& limits = {1000, 100})
-      : opens(limits), service(registry, opens, clock, logger, recovering) {}
+      : opens(limits), service(registry, opens, clock, rights, logger, recovering) {}
   LogRecorder logger;
   Registry registry{"pc1", kLimits};
   OpenTable opens;
   PlaybackClockOwner clock;
+  Rights rights;
   LocalService service;
 };
 

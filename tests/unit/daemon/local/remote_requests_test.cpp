@@ -113,12 +113,14 @@ class RemoteRequestsTest : public testing::Test {
   Registry registry{"pc1", kLimits};
   OpenTable opens{{.max_opens = 2000, .max_opens_per_client = 2000}};
   PlaybackClockOwner clock;
+  const Rights rights;
   FakeFleet fleet;
   std::unique_ptr<LocalService> service;
   std::unique_ptr<FakeClient> client;
 
   explicit RemoteRequestsTest(bool recovering = false)
-      : service(std::make_unique<LocalService>(registry, opens, clock, logger, recovering, &fleet)),
+      : service(std::make_unique<LocalService>(registry, opens, clock, rights, logger, recovering,
+                                               &fleet)),
         client(std::make_unique<FakeClient>(*service, 5)) {
     client->greet();
   }

@@ -80,9 +80,11 @@ class SecureServer : public testing::Test {
                     }};
   Registry registry{"pc1", kLimits};
   OpenTable opens{{100, 100}};
+  const Rights rights;
   LogRecorder logger;
   std::shared_ptr<wire::OwnCredentials> own = issue(Authority::host("pc1"));
-  ChannelServer server{{loop, registry, opens, logger}, with(own, "pc1"), {8, 4, 32U << 20}};
+  ChannelServer server{
+      {loop, registry, opens, rights, logger}, with(own, "pc1"), {8, 4, 32U << 20}};
   NetworkListener::Inherited none;
   NetworkListener network =
       NetworkListener::open(
@@ -121,7 +123,7 @@ TEST_F(SecureServer, BelievesTheCertificateAndNotTheGreeting) {
 }
 
 TEST_F(SecureServer, IsNotBelievedUnderAnotherName) {
-  ChannelServer liar({loop, registry, opens, logger}, with(own, "pc9"), {8, 4, 32U << 20});
+  ChannelServer liar({loop, registry, opens, rights, logger}, with(own, "pc9"), {8, 4, 32U << 20});
   network = NetworkListener::open(
                 std::vector<wire::Address>{wire::Address::parse("127.0.0.1:0", 0, true).value()},
                 none, logger)

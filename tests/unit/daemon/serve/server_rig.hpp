@@ -34,8 +34,8 @@ inline wire::SocketAddress address_of(std::uint32_t last_number) {
 class ServerRig {
  public:
   explicit ServerRig(const PeerTable::Limits& limits = {16, 8, 32U << 20},
-                     ClockAssessor* clock = nullptr, Authorizer authorizer = authorize)
-      : server({loop, registry, opens, logger, clock, {}, std::move(authorizer)},
+                     ClockAssessor* clock = nullptr, const Rights* rights = nullptr)
+      : server({loop, registry, opens, rights ? *rights : no_rights, logger, clock},
                greeting_with(own_clock), limits) {}
 
   // Connects; without `greet` it says nothing. The peer outlives the rig's use of it.
@@ -105,6 +105,7 @@ class ServerRig {
   EventLoop loop = *EventLoop::open(TimerQueue::Time::simulated);
   Registry registry{"pc1", kLimits};
   OpenTable opens{{100, 100}};
+  const Rights no_rights;  // everybody may do everything
   LogRecorder logger;
   ChannelServer server;
 };

@@ -52,6 +52,7 @@ mirror_linger = "23 s"
 mirror_history = "at_once"
 mirror_streams = ["camera*=when_read, 10 Hz,500 ms", "map:2=at_once", "rear=5 Hz"]
 stream_priorities = ["encoder=normal", "camera*=low 30%"]
+rights = ["local read *", "group:0 create,clock lidar*", "host:pc[23]  all  map:2"]
 )",
                                                     "dssmd.conf");
   ASSERT_TRUE(applied) << applied.error().message;
@@ -93,6 +94,51 @@ stream_priorities = ["encoder=normal", "camera*=low 30%"]
   EXPECT_EQ(sending("camera3", 8), (SendingDemand{wire::Priority::low, 30}));
   EXPECT_EQ(sending("imu", 16383), (SendingDemand{wire::Priority::high, 100}));
   EXPECT_EQ(sending("map", 16384), (SendingDemand{wire::Priority::normal, 100}));
+  ASSERT_EQ(config.rights.size(), 3u);
+  EXPECT_EQ(config.rights[2].streams, "map:2");
+}
+
+TEST(Config, TakesRights) {
+  const auto right = [](const char* text) { return parse_right(text).value(); };
+  Right parsed = right("everyone read,write lidar*");
+  EXPECT_EQ(parsed.who, Right::Who::everyone);
+  EXPECT_EQ(parsed.verbs.str(), "read,write");
+  EXPECT_EQ(parsed.streams, "lidar*");
+  EXPECT_EQ(parsed.line, "everyone read,write lidar*");
+  parsed = right("  user:root   create   map:2 ");
+  EXPECT_EQ(parsed.who, Right::Who::user);
+  EXPECT_EQ(parsed.number, 0u);
+  EXPECT_EQ(parsed.verbs.str(), "write,create");
+  EXPECT_EQ(parsed.streams, "map:2");
+  parsed = right("group:1000 all *");
+  EXPECT_EQ(parsed.who, Right::Who::group);
+  EXPECT_EQ(parsed.number, 1000u);
+  EXPECT_EQ(parsed.verbs, Verbs::all());
+  EXPECT_EQ(right("host:pc[23] read *").name_pattern, "pc[23]");
+  EXPECT_EQ(right("program:viewer read *").who, Right::Who::program);
+}
+
+TEST(Config, NamesWhatIsWrongInARight) {
+  const auto mistake = [](const std::string& line) {
+    return mistakes_in("rights = [\"" + line + "\"]\n");
+  };
+  EXPECT_EQ(mistake("local read"),
+            "dssmd.conf:1: key 'rights': 'local read' is no right; write \"WHO VERBS STREAMS\", "
+            "such as \"group:drivers read,write lidar*\" or \"host:pc2 all *\"");
+  EXPECT_EQ(mistake("alice read *"),
+            "dssmd.conf:1: key 'rights': 'alice read *': 'alice' is nobody: it is everyone, local, "
+            "user:NAME, group:NAME, host:NAME or program:NAME");
+  EXPECT_EQ(mistake("local read,record *"),
+            "dssmd.conf:1: key 'rights': 'local read,record *': 'record' is no verb: the verbs are "
+            "read, write, create, remove, property, clock and all");
+  EXPECT_EQ(mistake("user:no-such-user read *"),
+            "dssmd.conf:1: key 'rights': 'user:no-such-user read *': there is no user "
+            "'no-such-user'");
+  for (const char* wrong :
+       {"local read * *", "host: read *", "local:x read *", "group:no-such-group read *",
+        "local , *", "local read lidar@pc2", "user:4294967295 read *", "user:-1 read *"}) {
+    EXPECT_NE(mistake(wrong), "") << wrong;
+  }
 }
 
 TEST(Config, TakesAnEmptyFile) { EXPECT_EQ(mistakes_in(""), ""); }

@@ -1,5 +1,5 @@
 // SPDX-License-Identifier: Apache-2.0
-#include "daemon/streams/authorize.hpp"
+#include "daemon/streams/action.hpp"
 
 #include <fmt/format.h>
 
@@ -14,8 +14,6 @@ std::optional<Action> catalog_action(const Request& request) noexcept {
       return Action::greet;
     case Request::kCreate:
       return Action::create;
-    case Request::kOpen:
-      return request.open().for_writing() ? Action::open_for_writing : Action::open_for_reading;
     case Request::kRemove:
       return Action::remove;
     case Request::kSetProperty:
@@ -24,8 +22,9 @@ std::optional<Action> catalog_action(const Request& request) noexcept {
       return Action::get_property;
     case Request::kList:
     case Request::kWatch:
-    case Request::kInfo:
       return Action::list;
+    case Request::kInfo:
+      return Action::see;
     case Request::kListClockPairs:
       return Action::inspect;
     default:
@@ -44,8 +43,12 @@ std::optional<Action> action_of(const local::Request& request) noexcept {
   switch (request.body_case()) {
     case local::Request::kClose:
       return Action::close;
+    case local::Request::kOpen:
+      return request.open().for_writing() ? Action::open_for_writing : Action::open_for_reading;
     case local::Request::kOffer:
-      return Action::offer;
+      return request.offer().for_writing() ? Action::offer_for_writing : Action::offer_for_reading;
+    case local::Request::kListRights:
+      return Action::see;
     case local::Request::kWantHistory:
       return Action::open_for_reading;
     case local::Request::kOpenClock:
@@ -66,6 +69,8 @@ std::optional<Action> action_of(const local::Request& request) noexcept {
 
 std::optional<Action> action_of(const net::Frame& request) noexcept {
   switch (request.body_case()) {
+    case net::Frame::kOpen:
+      return Action::open_channel;
     case net::Frame::kSubscribe:
     case net::Frame::kRead:
     case net::Frame::kGetRange:
@@ -78,7 +83,5 @@ std::optional<Action> action_of(const net::Frame& request) noexcept {
       return catalog_action(request);
   }
 }
-
-Result<void> authorize(const Identity&, Action, const StreamId&) { return {}; }
 
 }  // namespace dssm::daemon

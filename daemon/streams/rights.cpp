@@ -1,0 +1,163 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "daemon/streams/rights.hpp"
+
+#include <fmt/format.h>
+#include <fnmatch.h>
+#include <unistd.h>
+
+#include <algorithm>
+#include <cstddef>
+#include <optional>
+#include <string_view>
+
+#include "daemon/service/config_values.hpp"
+
+namespace dssm::daemon {
+namespace {
+
+// What an action needs one of; empty: it is allowed to all.
+Verbs needed_for(Action action) noexcept {
+  Verbs verbs;
+  switch (action) {
+    case Action::create:
+      return Verb::create;
+    case Action::open_for_reading:
+    case Action::offer_for_reading:
+    case Action::read:
+    case Action::get_property:
+      return Verb::read;
+    case Action::open_for_writing:
+    case Action::offer_for_writing:
+    case Action::publish:
+      return Verb::write;
+    case Action::open_channel:
+      verbs |= Verb::read;
+      verbs |= Verb::write;
+      return verbs;
+    case Action::remove:
+      return Verb::remove;
+    case Action::set_property:
+      return Verb::property;
+    case Action::see:
+      for (const Verb verb :
+           {Verb::read, Verb::write, Verb::create, Verb::remove, Verb::property}) {
+        verbs |= verb;
+      }
+      return verbs;
+    case Action::open_clock:
+      return Verb::clock;
+    case Action::greet:
+    case Action::close:
+    case Action::list:
+    case Action::open_clock_page:
+    case Action::inspect:
+    case Action::ping:
+      return {};
+  }
+  return Verbs::all();
+}
+
+std::string_view words_for(Action action) noexcept {
+  switch (action) {
+    case Action::create:
+      return "create";
+    case Action::open_for_writing:
+    case Action::offer_for_writing:
+    case Action::publish:
+      return "write into";
+    case Action::remove:
+      return "remove";
+    case Action::set_property:
+      return "set the property of";
+    case Action::open_channel:
+      return "open";
+    case Action::see:
+      return "see";
+    default:
+      return "read";
+  }
+}
+
+bool is_certified(const Identity& identity, wire::CertifiedPeer::Kind kind,
+                  const std::string& pattern) {
+  return identity.certified && identity.certified->kind == kind &&
+         !::fnmatch(pattern.c_str(), identity.certified->name.c_str(), 0);
+}
+
+bool is_for(const Right& right, const Identity& identity) {
+  const bool is_local = identity.is_local();
+  switch (right.who) {
+    case Right::Who::everyone:
+      return true;
+    case Right::Who::local:
+      return is_local;
+    case Right::Who::user:
+      return is_local && identity.uid == right.number;
+    case Right::Who::group:
+      return is_local && (identity.gid == right.number ||
+                          std::find(identity.groups.begin(), identity.groups.end(), right.number) !=
+                              identity.groups.end());
+    case Right::Who::host:
+      return is_certified(identity, wire::CertifiedPeer::Kind::host, right.name_pattern);
+    case Right::Who::program:
+      return is_certified(identity, wire::CertifiedPeer::Kind::program, right.name_pattern);
+  }
+  return false;
+}
+
+// As a line names it.
+std::string who_of(const Identity& identity) {
+  if (identity.is_local()) return fmt::format("user:{}", identity.uid);
+  if (!identity.certified) return "everyone";
+  const bool is_host = identity.certified->kind == wire::CertifiedPeer::Kind::host;
+  return (is_host ? "host:" : "program:") + identity.certified->name;
+}
+
+bool may_do_everything(const Identity& identity) noexcept {
+  return identity.is_local() && (identity.uid == 0 || identity.uid == ::geteuid());
+}
+
+}  // namespace
+
+Verbs Rights::verbs(const Identity& identity, const StreamId& stream) const {
+  if (lines_.empty() || may_do_everything(identity)) return Verbs::all();
+  Verbs verbs;
+  for (const Right& line : lines_) {
+    if (!is_for(line, identity)) continue;
+    if (line.verbs.has(Verb::clock)) verbs |= Verb::clock;
+    if (names_stream(line.streams, stream)) verbs |= line.verbs;
+  }
+  return verbs;
+}
+
+Result<void> Rights::check(const Identity& identity, Action action, const StreamId& stream) const {
+  const Verbs needed = needed_for(action);
+  if (needed.empty() || verbs(identity, stream).has_any(needed)) return {};
+  const std::string line =
+      fmt::format("it takes a line such as \"{} {} {}\" (docs/security.md)", who_of(identity),
+                  Verbs(needed.first()).str(), action == Action::open_clock ? "*" : stream.name);
+  if (action == Action::open_clock) {
+    return Error{Errc::no_permission,
+                 fmt::format("{} may not use the playback clock: dssmd's key 'rights' does not "
+                             "allow it; {}",
+                             identity.str(), line)};
+  }
+  return Error{Errc::no_permission,
+               fmt::format("{} may not {} stream '{}': dssmd's key 'rights' does not allow it; {}",
+                           identity.str(), words_for(action), stream.str(), line)};
+}
+
+bool Rights::shows(const Identity& identity, const StreamId& stream) const {
+  return lines_.empty() || check(identity, Action::see, stream).has_value();
+}
+
+void Rights::hide(const Identity& identity, proto::StreamList& list) const {
+  auto& streams = *list.mutable_streams();
+  const auto hidden =
+      std::stable_partition(streams.begin(), streams.end(), [&](const proto::Stream& stream) {
+        return shows(identity, {stream.id().name(), stream.id().id(), stream.id().host()});
+      });
+  streams.erase(hidden, streams.end());
+}
+
+}  // namespace dssm::daemon
