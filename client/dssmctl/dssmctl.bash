@@ -134,7 +134,7 @@ _dssmctl() {
     "")
       mapfile -t COMPREPLY < <(compgen -W \
         "bw clock create delay doctor echo hosts hz info ls ping pki playback property \
-          rm" -- "$cur")
+          rights rm" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;
@@ -145,7 +145,7 @@ _dssmctl() {
     ping) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_ask hosts --names) ;;
     create) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_at_hosts) ;;
     rm) _dssmctl_offer < <(_dssmctl_streams) ;;
-    info | echo | hz | bw | delay)
+    info | echo | hz | bw | delay | rights)
       ((positional == 0)) && _dssmctl_offer < <(_dssmctl_streams)
       ;;
     "property get" | "property set")

@@ -285,6 +285,11 @@ void add_rm(CLI::App& app, Parsed& parsed) {
   rm->add_option("STREAM", options.streams, kStreamHelp)->required()->type_name("");
 }
 
+void add_rights(CLI::App& app, Parsed& parsed) {
+  CLI::App* rights = app.add_subcommand("rights", "show who may do what with a stream");
+  add_stream(rights, add_options<RightsOptions>(rights, parsed).stream);
+}
+
 void add_property(CLI::App& app, Parsed& parsed) {
   CLI::App* property = app.add_subcommand("property", "show or set a stream's property");
   property->require_subcommand(1);
@@ -429,6 +434,7 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_meter<DelayOptions>(app, parsed, "delay", "how old samples are when they arrive");
   add_create(app, parsed);
   add_rm(app, parsed);
+  add_rights(app, parsed);
   add_property(app, parsed);
   add_playback(app, parsed);
   add_pki(app, parsed);

@@ -95,6 +95,10 @@ struct RmOptions : CommonOptions {
   std::vector<std::string> streams;
 };
 
+struct RightsOptions : CommonOptions {
+  std::string stream;
+};
+
 struct PropertyOptions : CommonOptions {
   std::string stream;
   std::string file = "-";
@@ -144,11 +148,12 @@ struct PkiShowOptions : CommonOptions {
   std::string path = kCredentialsFolder;
 };
 
-using Options = std::variant<LsOptions, HostsOptions, ClockOptions, DoctorOptions, PingOptions,
-                             InfoOptions, EchoOptions, HzOptions, BwOptions, DelayOptions,
-                             CreateOptions, RmOptions, PropertyGetOptions, PropertySetOptions,
-                             PlaybackOptions, PkiInitOptions, PkiRequestOptions, PkiIssueOptions,
-                             PkiInstallOptions, PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
+using Options =
+    std::variant<LsOptions, HostsOptions, ClockOptions, DoctorOptions, PingOptions, InfoOptions,
+                 EchoOptions, HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions,
+                 RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
+                 PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
+                 PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
@@ -175,6 +180,7 @@ Result<void> run(const BwOptions& options, Output& out);
 Result<void> run(const DelayOptions& options, Output& out);
 Result<void> run(const CreateOptions& options, Output& out);
 Result<void> run(const RmOptions& options, Output& out);
+Result<void> run(const RightsOptions& options, Output& out);
 Result<void> run(const PropertyGetOptions& options, Output& out);
 Result<void> run(const PropertySetOptions& options, Output& out);
 Result<void> run(const PlaybackOptions& options, Output& out);

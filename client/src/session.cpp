@@ -197,6 +197,19 @@ Result<StreamInfo> Session::stream_info(const StreamId& id) {
   return wire::stream_info(response.stream_list().streams(0));
 }
 
+Result<StreamRights> Session::stream_rights(const StreamId& id) {
+  local::Request request;
+  wire::to_message(id, *request.mutable_list_rights()->mutable_id());
+  const auto response =
+      DSSM_TRY(ask(*client_, std::move(request), quoted("get the rights of", id)));
+  const local::RightList& list = response.right_list();
+  StreamRights rights{list.restricted(), list.own_verbs(), {}};
+  for (const local::Right& right : list.rights()) {
+    rights.lines.push_back({right.line(), right.verbs()});
+  }
+  return rights;
+}
+
 struct Session::Watch::State {
   std::shared_ptr<detail::Client> client;
   std::uint64_t key;

@@ -75,6 +75,17 @@ struct DaemonInfo {
   std::optional<CredentialsInfo> credentials;  // empty: connections are not encrypted
 };
 
+// Who may do what with a stream on this PC, by dssmd's configuration (docs/security.md "Rights").
+struct RightLine {
+  std::string line;   // as configured: "group:drivers read,write lidar*"
+  std::string verbs;  // what it allows: "read,write", "all"
+};
+struct StreamRights {
+  bool restricted = false;       // false: nothing is configured, so everybody may do everything
+  std::string own_verbs;         // what this process may do: "read,write", "all", "none"
+  std::vector<RightLine> lines;  // that concern the stream, in the order of the configuration
+};
+
 // A host of the fleet as this PC's dssmd sees it: this PC itself, each configured peer, and each
 // host found by mDNS.
 struct HostInfo {
@@ -223,6 +234,11 @@ class Session {
   // One stream, with the processes that have it open.
   //   fails  not_found, conflict (several hosts have a stream of that name)
   Result<StreamInfo> stream_info(const StreamId& id);
+
+  // Who may do what with the stream, which need not exist; this PC's rights, also for a stream of
+  // another host.
+  //   fails  no_permission (this process may do nothing with it)
+  Result<StreamRights> stream_rights(const StreamId& id);
 
   // Calls `on_event` for each existing stream, then for each one added or removed, until the watch
   // is destroyed. A stream that is recreated is reported as added again. The calls come from the
