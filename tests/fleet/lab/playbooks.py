@@ -13,7 +13,9 @@ from lab.guest import Guest
 from lab.packages import ROOT
 
 FOLDER = ROOT / "ansible"
-VARIABLES = {"dssm_subnets": ["10.99.0.0/24"], "dssm_tls": True}
+# What s20 tests; all other scenarios' streams have names that do not begin with x.
+RIGHTS = ["local all *", "host:* all [!x]*", "host:pc1 all x*", "host:pc[12] read x*"]
+VARIABLES = {"dssm_subnets": ["10.99.0.0/24"], "dssm_tls": True, "dssm_settings": {"rights": RIGHTS}}
 
 
 @dataclasses.dataclass
