@@ -7,6 +7,7 @@
 
 #include <algorithm>
 #include <cstring>
+#include <new>
 
 #include "core/wire/varint.hpp"
 
@@ -26,24 +27,30 @@ std::string encode_frame(const google::protobuf::MessageLite& message) {
 std::span<std::byte> FrameBuffer::space() {
   constexpr std::size_t kMinSpace = 4096;
   if (begin_ == end_) begin_ = end_ = 0;
-  if (buffer_.size() - end_ < kMinSpace) {
+  if (capacity_ - end_ < kMinSpace) {
     if (begin_ > 0) {
-      std::memmove(buffer_.data(), buffer_.data() + begin_, end_ - begin_);
+      std::memmove(buffer_.get(), buffer_.get() + begin_, end_ - begin_);
       end_ -= begin_;
       begin_ = 0;
     }
-    if (buffer_.size() - end_ < kMinSpace)
-      buffer_.resize(std::max(2 * buffer_.size(), end_ + kMinSpace));
+    if (capacity_ - end_ < kMinSpace) {
+      const std::size_t larger = std::max(2 * capacity_, end_ + kMinSpace);
+      auto* moved = static_cast<std::byte*>(std::realloc(buffer_.get(), larger));
+      if (!moved) throw std::bad_alloc();
+      static_cast<void>(buffer_.release());
+      buffer_.reset(moved);
+      capacity_ = larger;
+    }
   }
-  return std::span(buffer_).subspan(end_);
+  return {buffer_.get() + end_, capacity_ - end_};
 }
 
 Result<std::optional<std::span<const std::byte>>> FrameBuffer::next() {
-  if (begin_ == end_ && buffer_.size() > kKeptBytes) {
-    buffer_ = std::vector<std::byte>();  // a rare large frame does not keep its memory
-    begin_ = end_ = 0;
+  if (begin_ == end_ && capacity_ > kKeptBytes) {
+    buffer_.reset();  // a rare large frame does not keep its memory
+    capacity_ = begin_ = end_ = 0;
   }
-  const std::span<const std::byte> input = std::span(buffer_).subspan(begin_, end_ - begin_);
+  const std::span<const std::byte> input(buffer_.get() + begin_, end_ - begin_);
   const std::byte* at = input.data();
   const std::byte* const end = at + input.size();
   std::uint64_t length = 0;
@@ -63,7 +70,7 @@ Result<std::optional<std::span<const std::byte>>> FrameBuffer::next() {
     return std::optional<std::span<const std::byte>>();
   }
   const std::span<const std::byte> frame(at, length);
-  begin_ = static_cast<std::size_t>(frame.data() - buffer_.data()) + length;
+  begin_ = static_cast<std::size_t>(frame.data() - buffer_.get()) + length;
   return std::optional(frame);
 }
 

@@ -7,11 +7,12 @@
 
 #include <cstddef>
 #include <cstdint>
+#include <cstdlib>
 #include <dssm/result.hpp>
+#include <memory>
 #include <optional>
 #include <span>
 #include <string>
-#include <vector>
 
 namespace google::protobuf {
 class MessageLite;
@@ -35,7 +36,7 @@ class FrameBuffer {
 
   // Memory that it takes. More than kKeptBytes only until next() finds nothing left.
   static constexpr std::size_t kKeptBytes = 64U << 10;
-  std::size_t capacity() const noexcept { return buffer_.capacity(); }
+  std::size_t capacity() const noexcept { return capacity_; }
 
   // The next whole frame's message, without its length; nullopt when more input is needed. The view
   // holds until the next call of any member. Fails with `protocol` on a length that is too large or
@@ -43,8 +44,15 @@ class FrameBuffer {
   Result<std::optional<std::span<const std::byte>>> next();
 
  private:
+  // From malloc(): the kernel moves a large one without a copy when it grows, and what is not filled
+  // is not written to.
+  struct Free {
+    void operator()(std::byte* bytes) const noexcept { std::free(bytes); }
+  };
+
   std::size_t max_frame_bytes_;
-  std::vector<std::byte> buffer_;
+  std::unique_ptr<std::byte, Free> buffer_;
+  std::size_t capacity_ = 0;
   std::size_t begin_ = 0, end_ = 0;  // buffer_[begin_, end_) is input not yet returned
 };
 

@@ -33,6 +33,9 @@ Result<IoResult> send_some(int socket, std::span<const std::byte> bytes, std::sp
 // close-on-exec. Fails with `protocol` when the kernel dropped some of them.
 Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<UniqueFd>& fds);
 
+// A frame with the Response Property as far as the property itself, of that length, which follows.
+std::string encode_frame_before_property(std::uint64_t serial, std::size_t property_bytes);
+
 // Creates a Unix stream socket connected to `path`, close-on-exec and blocking.
 //   fails  no_daemon (no such socket, or no process listens), no_permission, invalid_argument (path
 //          is longer than the 107 bytes that an address takes)

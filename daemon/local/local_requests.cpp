@@ -94,14 +94,14 @@ bool LocalRequests::waits_for_hosts(const local::Request& request) const {
 // --- this host
 
 Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::Request& request,
-                                             DescriptorQueue& descriptors) {
+                                             const Attachments& attached) {
   switch (request.body_case()) {
     case local::Request::kCreate:
       return create(client, request.create());
     case local::Request::kOpen:
       return open(client, request.open());
     case local::Request::kOffer:
-      return offer(client, request.offer(), descriptors);
+      return offer(client, request.offer(), attached.descriptors);
     case local::Request::kClose: {
       DSSM_TRY(opens_.remove(client->number, request.close().handle()));
       return done();
@@ -111,8 +111,12 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
       if (fleet_) fleet_->want_history(id, false);
       return done();
     }
+    case local::Request::kGetProperty:
+      return get_property(request.get_property().id());
+    case local::Request::kSetProperty:
+      return set_property(request.set_property(), attached.property);
     case local::Request::kOpenClock:
-      return open_clock(request.open_clock(), descriptors);
+      return open_clock(request.open_clock(), attached.descriptors);
     case local::Request::kListOpens:
       return list_opens(client);
     case local::Request::kListRights:
@@ -189,6 +193,20 @@ Result<Reply> LocalRequests::open_clock_page() const {
   reply.response.mutable_clock_page();
   reply.descriptors.push_back(DSSM_TRY(fleet_->clock_page()));
   return reply;
+}
+
+Result<Reply> LocalRequests::get_property(const proto::StreamId& id) const {
+  Reply reply;
+  reply.property = DSSM_TRY(catalog_.property_untrusted(id));
+  reply.response.mutable_property();
+  return reply;
+}
+
+Result<Reply> LocalRequests::set_property(const proto::SetProperty& request,
+                                          std::string_view property) {
+  const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.id()));
+  DSSM_TRY(registry_.set_property(id, property.empty() ? request.property() : property));
+  return done();
 }
 
 // The rights of this host, also for streams of others: there its programs are its dssmd.

@@ -15,8 +15,17 @@
 namespace dssm::daemon {
 namespace {
 
+// A request that is longer, a SetProperty, is parsed without its property.
+constexpr std::size_t kMaxCopiedBytes = 64U << 10;
+
 // What one client may have deferred during recovery.
 constexpr std::size_t kMaxDeferredBytes = 1U << 20;
+
+// For a request that is kept or goes to another host.
+void take_back_property(local::Request& request, Attachments& attached) {
+  if (attached.property.empty()) return;
+  request.mutable_set_property()->set_property(std::string(std::exchange(attached.property, {})));
+}
 
 local::Response failure_response(std::uint64_t serial, const Error& error) {
   local::Response response;
@@ -75,7 +84,12 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
     return true;
   }
   local::Request request;
-  if (!request.ParseFromArray(frame.data(), static_cast<int>(frame.size()))) {
+  Attachments attached{descriptors, {}};
+  const bool is_parsed =
+      frame.size() > kMaxCopiedBytes
+          ? request.ParseFromString(wire::without_property_untrusted(frame, attached.property))
+          : request.ParseFromArray(frame.data(), static_cast<int>(frame.size()));
+  if (!is_parsed) {
     return refuse(client, 0,
                   {Errc::protocol, "the frame is not a request of DSSM's local protocol"});
   }
@@ -91,9 +105,11 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
   if (Result<void> allowed = check_access(client, request); !allowed) {
     send_failure(client, serial, allowed.error());
   } else if (must_wait(request)) {
+    take_back_property(request, attached);
     defer(client, request, frame.size());
   } else {
-    serve(number, request, descriptors);
+    if (requests_.waits_for_hosts(request)) take_back_property(request, attached);
+    serve(number, request, attached);
     // Only an offer can end a wait.
     if (recovering_ && (request.has_offer() || request.has_open_clock())) serve_deferred();
   }
@@ -152,7 +168,7 @@ bool LocalService::greet(Client& client, std::uint64_t serial, const proto::Hell
 }
 
 void LocalService::serve(ClientNumber number, const local::Request& request,
-                         DescriptorQueue& descriptors) {
+                         const Attachments& attached) {
   if (request.has_watch()) return watch(number, request.serial());
   if (request.has_list_clients()) return list_clients(clients_.at(number), request.serial());
   const auto identity = clients_.at(number).identity;
@@ -162,7 +178,7 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
     }
     return;
   }
-  Result<Reply> reply = requests_.serve_untrusted(identity, request, descriptors);
+  Result<Reply> reply = requests_.serve_untrusted(identity, request, attached);
   if (request.has_offer()) log_offer(*identity, request.offer(), reply);
   on_answer(number, request.serial(), std::move(reply));
 }
@@ -273,7 +289,14 @@ void LocalService::list_clients(const Client& client, std::uint64_t serial) {
 
 void LocalService::send(const Client& client, std::uint64_t serial, Reply reply) {
   reply.response.set_serial(serial);
-  client.output->send(wire::encode_frame(reply.response), std::move(reply.descriptors));
+  if (reply.property.empty()) {
+    client.output->send(wire::encode_frame(reply.response), std::move(reply.descriptors));
+    return;
+  }
+  const ClientNumber number = client.identity->number;  // sending may end the connection
+  client.output->send(wire::encode_frame_before_property(serial, reply.property.size()), {});
+  const auto still = clients_.find(number);
+  if (still != clients_.end()) still->second.output->send(std::move(reply.property), {});
 }
 
 void LocalService::send_failure(const Client& client, std::uint64_t serial, const Error& error) {
@@ -432,11 +455,12 @@ void LocalService::serve_deferred() {
   std::move(still_waiting, deferred_.end(), std::back_inserter(ready));
   deferred_.erase(still_waiting, deferred_.end());
   DescriptorQueue none;
+  const Attachments nothing{none, {}};
   for (const Deferred& deferred : ready) {
     const auto client = clients_.find(deferred.client);
     if (client == clients_.end()) continue;
     client->second.deferred_bytes -= deferred.bytes;
-    serve(deferred.client, deferred.request, none);
+    serve(deferred.client, deferred.request, nothing);
   }
 }
 

@@ -38,11 +38,11 @@
 
 namespace dssm::daemon {
 
-// Where a client's frames go. send() must not call back into LocalService, but for disconnect() of
-// that same client.
+// Where a client's frames go, whole or in parts. send() must not call back into LocalService, but
+// for disconnect() of that same client.
 class ClientOutput {
  public:
-  virtual void send(const std::string& frame, std::vector<UniqueFd> descriptors) = 0;
+  virtual void send(std::string bytes, std::vector<UniqueFd> descriptors) = 0;
 
  protected:
   ~ClientOutput() = default;
@@ -100,7 +100,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   bool refuse(const Client& client, std::uint64_t serial, const Error& error);
   Result<void> check_access(const Client& client, const local::Request& request);
   bool greet(Client& client, std::uint64_t serial, const proto::Hello& hello);
-  void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
+  void serve(ClientNumber number, const local::Request& request, const Attachments& attached);
   LocalRequests::Answer await(ClientNumber number, std::uint64_t serial);
   void on_answer(ClientNumber number, std::uint64_t serial, Result<Reply> reply);
   void log_offer(const ClientIdentity& client, const local::Offer& offer,

@@ -201,15 +201,15 @@ void Connection::serve_frames() {
   if (is_open()) readable_.disable();  // paused: on_writable() continues
 }
 
-void Connection::send(const std::string& frame, std::vector<UniqueFd> descriptors) {
+void Connection::send(std::string bytes, std::vector<UniqueFd> descriptors) {
   if (!is_open()) return;
-  Outgoing outgoing{frame, 0, std::move(descriptors)};
+  Outgoing outgoing{std::move(bytes), 0, std::move(descriptors)};
   if (output_.empty()) {
     if (!send_some(outgoing)) return;
-    if (outgoing.sent == outgoing.frame.size()) return;
+    if (outgoing.sent == outgoing.bytes.size()) return;
     writable_.enable();
   }
-  queued_bytes_ += outgoing.frame.size();
+  queued_bytes_ += outgoing.bytes.size();
   queued_descriptors_ += outgoing.descriptors.size();
   output_.push_back(std::move(outgoing));
   if (queued_bytes_ <= kMaxQueuedBytes) return;
@@ -224,7 +224,7 @@ void Connection::send(const std::string& frame, std::vector<UniqueFd> descriptor
 bool Connection::send_some(Outgoing& outgoing) {
   std::vector<int> fds;
   for (const UniqueFd& fd : outgoing.descriptors) fds.push_back(fd.get());
-  const auto rest = std::as_bytes(std::span(outgoing.frame)).subspan(outgoing.sent);
+  const auto rest = std::as_bytes(std::span(outgoing.bytes)).subspan(outgoing.sent);
   const Result<wire::IoResult> sent = wire::send_some(socket_.get(), rest, fds);
   if (!sent || sent->status == wire::IoStatus::end) {
     if (!sent) logger_.warning("close a connection: " + sent.error().message);
@@ -242,8 +242,8 @@ void Connection::on_writable() {
     const std::size_t descriptors = next.descriptors.size();
     if (!send_some(next)) return;
     queued_descriptors_ -= descriptors - next.descriptors.size();
-    if (next.sent < next.frame.size()) break;
-    queued_bytes_ -= next.frame.size();
+    if (next.sent < next.bytes.size()) break;
+    queued_bytes_ -= next.bytes.size();
     output_.pop_front();
   }
   if (output_.empty()) writable_.disable();

@@ -66,7 +66,9 @@ class Listener {
 // Bytes that wait for one client. A list of all streams has at most 16 MiB.
 inline constexpr std::size_t kMaxQueuedBytes = 64U << 20;
 
-// Descriptors that wait for one client; from this number on its requests wait, too.
+// Bytes and descriptors that wait for one client, from which on its requests wait, too: who asks
+// and never reads costs one answer.
+inline constexpr std::size_t kPausingBytes = 1U << 20;
 inline constexpr std::size_t kMaxQueuedDescriptors = 256;
 
 // Descriptors that a client sent and that no request has taken yet; more are an error.
@@ -99,11 +101,11 @@ class Connection final : public ClientOutput {
   Connection& operator=(const Connection&) = delete;
   ~Connection();
 
-  void send(const std::string& frame, std::vector<UniqueFd> descriptors) override;
+  void send(std::string bytes, std::vector<UniqueFd> descriptors) override;
 
  private:
   struct Outgoing {
-    std::string frame;
+    std::string bytes;
     std::size_t sent = 0;
     std::vector<UniqueFd> descriptors;
   };
@@ -117,7 +119,9 @@ class Connection final : public ClientOutput {
   void end_with(const Error& error);
   void close();
   bool is_open() const noexcept { return static_cast<bool>(socket_); }
-  bool is_paused() const noexcept { return queued_descriptors_ >= kMaxQueuedDescriptors; }
+  bool is_paused() const noexcept {
+    return queued_descriptors_ >= kMaxQueuedDescriptors || queued_bytes_ >= kPausingBytes;
+  }
 
   UniqueFd socket_;
   LocalService& service_;

@@ -25,8 +25,8 @@ void describe_users(const Stream& stream, const OpenTable& opens, proto::Stream&
 
 }  // namespace
 
-void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out) {
-  StreamInfo info = stream.info();
+void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out, bool with_fields) {
+  StreamInfo info = stream.info(with_fields);
   const OpenTable::Counts counts = opens.counts(stream);
   info.writers = counts.writers;
   info.readers = counts.readers;
@@ -76,17 +76,9 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
       DSSM_TRY(registry_.set_property(id, request.set_property().property()));
       response.mutable_done();
       return {};
-    case Request::kGetProperty: {
-      const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.find(id));
-      std::string property = DSSM_TRY(stream->property(), "stream '" + stream->id().str() + "'");
-      if (property.empty()) {
-        return Error{Errc::not_found,
-                     fmt::format("stream '{}' has no property set; `dssmctl property set` sets one",
-                                 stream->id().str())};
-      }
-      response.mutable_property()->set_property(std::move(property));
+    case Request::kGetProperty:
+      response.mutable_property()->set_property(DSSM_TRY(property_of(id)));
       return {};
-    }
     default:
       return unknown_request(registry_.host());
   }
@@ -96,6 +88,19 @@ template Result<void> CatalogRequests::serve_untrusted(const local::Request&, lo
                                                        const StreamId*);
 template Result<void> CatalogRequests::serve_untrusted(const net::Frame&, net::Frame&,
                                                        const StreamId*);
+
+Result<std::string> CatalogRequests::property_untrusted(const proto::StreamId& id) const {
+  return property_of(DSSM_TRY(wire::stream_id_untrusted(id)));
+}
+
+Result<std::string> CatalogRequests::property_of(const StreamId& id) const {
+  const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.find(id));
+  std::string property = DSSM_TRY(stream->property(), "stream '" + stream->id().str() + "'");
+  if (!property.empty()) return property;
+  return Error{Errc::not_found,
+               fmt::format("stream '{}' has no property set; `dssmctl property set` sets one",
+                           stream->id().str())};
+}
 
 Result<std::shared_ptr<Stream>> CatalogRequests::find_untrusted(const proto::StreamId& id) const {
   return registry_.find(DSSM_TRY(wire::stream_id_untrusted(id)));
@@ -108,14 +113,15 @@ Result<OpenedRing> CatalogRequests::create_untrusted(const proto::Create& reques
   return registry_.create(id, type, {request.depth(), Duration(request.cycle_ns())}, creator_pid);
 }
 
-// In the order of creation. Beyond max_list_bytes_ the fields of types are left out.
+// In the order of creation.
 Result<void> CatalogRequests::list(proto::StreamList& out) const {
-  std::size_t bytes = 0;
+  std::size_t fields = 0;
   for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
-    proto::Stream& entry = *out.add_streams();
-    describe(*stream, opens_, entry);
-    if (bytes + entry.ByteSizeLong() > max_list_bytes_) entry.mutable_type()->clear_fields();
-    bytes += entry.ByteSizeLong();
+    fields += stream->type().fields.size();
+  }
+  const bool with_fields = fields <= kMaxListedFields;
+  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
+    describe(*stream, opens_, *out.add_streams(), with_fields);
   }
   if (out.ByteSizeLong() <= max_list_bytes_) return {};
   return Error{Errc::limit_exceeded,

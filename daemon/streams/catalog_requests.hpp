@@ -22,7 +22,8 @@
 namespace dssm::daemon {
 
 // The stream as it is at this moment, with how many programs and channels use it.
-void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out);
+void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out,
+              bool with_fields = true);
 
 // The events that Watch is answered with, to programs and hosts alike.
 proto::StreamEvent added_event(const Stream& stream, const OpenTable& opens);
@@ -31,6 +32,9 @@ proto::StreamEvent removed_event(const StreamId& id, std::uint64_t incarnation =
 // Stateless.
 class CatalogRequests {
  public:
+  // With more fields of types in all, lists leave them out: others would wait too long.
+  static constexpr std::size_t kMaxListedFields = 1024;
+
   // max_list_bytes: of a StreamList that fits into a frame. Both references outlive this.
   CatalogRequests(Registry& registry, const OpenTable& opens, std::size_t max_list_bytes)
       : registry_(registry), opens_(opens), max_list_bytes_(max_list_bytes) {}
@@ -44,6 +48,9 @@ class CatalogRequests {
   Result<void> serve_untrusted(const Request& request, Response& response,
                                const StreamId* channel = nullptr);
 
+  // For GetProperty.
+  Result<std::string> property_untrusted(const proto::StreamId& id) const;
+
   // For Open and Create.
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
   //   creator_pid  of the program of this host; 0: another host creates it
@@ -51,6 +58,7 @@ class CatalogRequests {
 
  private:
   Result<void> list(proto::StreamList& out) const;
+  Result<std::string> property_of(const StreamId& id) const;
 
   Registry& registry_;
   const OpenTable& opens_;

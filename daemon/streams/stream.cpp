@@ -43,11 +43,10 @@ static_assert(static_cast<int>(Purpose::own) == local::StreamMeta::OWN &&
               static_cast<int>(Purpose::mirror) == local::StreamMeta::MIRROR &&
               static_cast<int>(Purpose::remote_writer) == local::StreamMeta::REMOTE_WRITER);
 
-local::StreamMeta meta_of(const Stream::Plan& plan, std::string_view property) {
+local::StreamMeta meta_of(const Stream::Plan& plan) {
   local::StreamMeta meta;
   wire::to_message(plan.id, *meta.mutable_id());
   wire::to_message(plan.type, *meta.mutable_type());
-  meta.set_property(std::string(property));
   meta.set_creator_pid(plan.creator_pid);
   meta.set_created_order(plan.created_order);
   meta.set_purpose(static_cast<local::StreamMeta::Purpose>(plan.purpose));
@@ -140,7 +139,7 @@ Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& b
   const ring::RingIdentity identity{plan.id, incarnation, plan.cycle, plan.type.alignment_bytes};
   UniqueFd ring = DSSM_TRY(ring::create_ring(identity, geometry));
   UniqueFd bell = DSSM_TRY(ring::create_bell(identity.label()));
-  MetaFile meta = DSSM_TRY(MetaFile::create(meta_of(plan, {}), identity.label()));
+  MetaFile meta = DSSM_TRY(MetaFile::create(meta_of(plan), identity.label()));
   auto mapping = DSSM_TRY(ring::RingMapping::open_untrusted(ring.get(), ring::Access::read_only));
   return std::shared_ptr<Stream>(new Stream(plan, Files{std::move(ring), std::move(bell)},
                                             std::move(meta), std::move(mapping), std::move(share)));
@@ -179,10 +178,14 @@ Stream::~Stream() {
   if (thread) thread->detach();
 }
 
-StreamInfo Stream::info() const {
+StreamInfo Stream::info(bool with_fields) const {
   StreamInfo info;
   info.id = plan_.id;
-  info.type = plan_.type;
+  if (with_fields) {
+    info.type = plan_.type;
+  } else {
+    info.type = {plan_.type.name, plan_.type.payload_bytes, plan_.type.alignment_bytes, {}};
+  }
   info.depth = plan_.depth;
   info.cycle = plan_.cycle;
   info.memory_bytes = mapping_->geometry().total_bytes;
@@ -276,14 +279,13 @@ Result<void> Stream::mark_removed() {
 
 Result<std::string> Stream::property() const {
   // Kept only in the meta file: dssmd's own memory stays small.
-  local::StreamMeta meta = DSSM_TRY(meta_.read_untrusted());
-  return std::move(*meta.mutable_property());
+  return meta_.read_property_untrusted();
 }
 
 Result<void> Stream::set_property(std::string_view property, MemoryBudget& budget) {
   // Old and new one exist side by side for a moment, so the new share is taken first.
   MemoryShare share = DSSM_TRY(budget.take(property.size()));
-  DSSM_TRY(meta_.replace(meta_of(plan_, property)));
+  DSSM_TRY(meta_.replace(meta_of(plan_), property));
   property_share_ = std::move(share);
   return {};
 }

@@ -102,7 +102,8 @@ class Stream : public std::enable_shared_from_this<Stream> {
   std::uint64_t incarnation() const noexcept { return mapping_->identity().incarnation; }
 
   // All but the users. Reads the newest stamps of the ring twice.
-  StreamInfo info() const;
+  //   with_fields  else the type comes without its fields
+  StreamInfo info(bool with_fields = true) const;
 
   // Descriptors to hand out, in the order of local.proto's Opened; the caller's own. For a client
   // that writes and has no doorbell, one is made.

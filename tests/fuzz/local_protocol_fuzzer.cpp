@@ -26,8 +26,8 @@ namespace {
 // Receives all output, and checks that it consists of frames that clients accept.
 class Sink final : public ClientOutput {
  public:
-  void send(const std::string& frame, std::vector<UniqueFd>) override {
-    if (frame.size() > wire::kMaxLocalFrameBytes + 10) std::abort();
+  void send(std::string bytes, std::vector<UniqueFd>) override {
+    if (bytes.size() > wire::kMaxLocalFrameBytes + 10) std::abort();
   }
 };
 

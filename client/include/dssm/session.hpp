@@ -225,7 +225,8 @@ class Session {
 
   // All streams: this PC's, then those of the other hosts in the order of host names; each host's
   // in the order of creation. A host that does not answer within 0.5 s is listed with the last
-  // known data of its streams; a host that is down is left out.
+  // known data of its streams; a host that is down is left out. Types come without their fields
+  // when there are many (more than 1024 on one host); stream_info() has them.
   Result<std::vector<StreamInfo>> list_streams();
 
   // This PC's streams only, in the order of creation.

@@ -238,23 +238,57 @@ TEST(LocalService, ListsProgramsInTheOrderTheyCame) {
   EXPECT_EQ(response.client_list().clients(1).uid(), 1000u);
 }
 
-TEST(LocalService, LeavesOutFieldsWhenAListGetsTooLongForAFrame) {
+TEST(LocalService, LeavesOutFieldsWhenAListHasManyOfThem) {
   Daemon daemon(false, {.max_opens = 1000, .max_opens_per_client = 1000});
   FakeClient client(daemon.service, 5);
   client.greet();
-  constexpr int kStreams = 300;  // with 60 KB of field names each: 18 MB
-  for (int i = 0; i < kStreams; ++i) {
-    local::Request request = create_request("s");
-    request.mutable_create()->mutable_id()->set_id(i);
-    request.mutable_create()->mutable_type()->mutable_fields(0)->set_name(std::string(60'000, 'f'));
-    const local::Response created = client.ask(request);
-    ASSERT_TRUE(created.has_opened()) << created.failure().message();
+  const auto create = [&](std::size_t from, std::size_t to) {
+    for (std::size_t i = from; i < to; ++i) {
+      local::Request request = create_request("s");
+      request.mutable_create()->mutable_id()->set_id(static_cast<std::int32_t>(i));
+      proto::Type& type = *request.mutable_create()->mutable_type();
+      for (const char* more : {"third", "fourth"}) {
+        proto::Field& field = *type.add_fields();
+        field = type.fields(0);
+        field.set_name(more);
+      }
+      const local::Response created = client.ask(request);
+      ASSERT_TRUE(created.has_opened()) << created.failure().message();
+    }
+  };
+  constexpr std::size_t kEnough = CatalogRequests::kMaxListedFields / 4;  // with four fields each
+  create(0, kEnough);
+  EXPECT_EQ(client.ask(list_request()).stream_list().streams(0).type().fields_size(), 4);
+  create(kEnough, kEnough + 1);
+  const local::Response list = client.ask(list_request());
+  ASSERT_EQ(list.stream_list().streams_size(), static_cast<int>(kEnough) + 1);
+  for (const proto::Stream& stream : list.stream_list().streams()) {
+    EXPECT_EQ(stream.type().fields_size(), 0);
+    EXPECT_EQ(stream.type().name(), "Odometry");
   }
-  const local::Response list = client.ask(list_request());  // fails on a frame that is too long
-  ASSERT_EQ(list.stream_list().streams_size(), kStreams);
-  EXPECT_EQ(list.stream_list().streams(0).type().fields_size(), 2);
-  EXPECT_EQ(list.stream_list().streams(kStreams - 1).type().fields_size(), 0);
-  EXPECT_EQ(list.stream_list().streams(kStreams - 1).type().name(), "Odometry");
+}
+
+TEST(LocalService, GivesBackLongPropertiesWithoutCopies) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  ASSERT_TRUE(client.ask(create_request("s")).has_opened());
+  for (const std::size_t bytes : {0U, 1U, 127U, 128U, 65'500U, 65'536U, 70'000U, 1U << 20}) {
+    std::string property(bytes, 'p');
+    for (std::size_t i = 0; i < bytes; i += 1000) property[i] = static_cast<char>(i / 1000);
+    local::Request request;
+    request.mutable_set_property()->mutable_id()->set_name("s");
+    request.mutable_set_property()->set_property(property);
+    const local::Response set = client.ask(request);
+    ASSERT_TRUE(set.has_done()) << bytes << " " << set.failure().message();
+    request.mutable_get_property()->mutable_id()->set_name("s");
+    const local::Response got = client.ask(request);
+    if (bytes == 0) {
+      EXPECT_EQ(got.failure().code(), "not_found");
+    } else {
+      EXPECT_TRUE(got.property().property() == property) << bytes;
+    }
+  }
 }
 
 TEST(LocalService, HandsOutOneAndTheSamePlaybackClock) {
