@@ -44,8 +44,7 @@ class FrameBuffer {
   Result<std::optional<std::span<const std::byte>>> next();
 
  private:
-  // From malloc(): the kernel moves a large one without a copy when it grows, and what is not filled
-  // is not written to.
+  // From malloc(): a large one grows without a copy, and what is not filled takes no memory.
   struct Free {
     void operator()(std::byte* bytes) const noexcept { std::free(bytes); }
   };

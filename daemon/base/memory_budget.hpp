@@ -14,6 +14,11 @@
 
 namespace dssm::daemon {
 
+// For a connection that ends because the system has no memory for what it asked.
+inline Error no_memory_left() {
+  return {Errc::no_memory, "dssmd has no memory left for this connection; try again later"};
+}
+
 class MemoryBudget;
 
 // A share of a budget; given back by the destructor. The budget outlives it.

@@ -5,6 +5,7 @@
 
 #include <algorithm>
 #include <array>
+#include <new>
 #include <optional>
 #include <utility>
 
@@ -38,12 +39,24 @@ FrameConnection::FrameConnection(const EventLoop& loop, std::unique_ptr<wire::Tr
       observer_(observer),
       max_queued_bytes_(max_queued_bytes),
       decoder_(*this, wire::kMaxNetworkFrameBytes),
-      readable_(EventSource::readable(loop, transport_->fd(), [this] { on_readable(); })),
-      writable_(EventSource::writable(loop, transport_->fd(), [this] { on_writable(); })),
-      next_turn_(EventSource::timer(loop, [this] { continue_receiving(); })),
+      readable_(EventSource::readable(loop, transport_->fd(),
+                                      [this] { guarded([this] { on_readable(); }); })),
+      writable_(EventSource::writable(loop, transport_->fd(),
+                                      [this] { guarded([this] { on_writable(); }); })),
+      next_turn_(EventSource::timer(loop, [this] { guarded([this] { continue_receiving(); }); })),
       ended_(EventSource::timer(loop, [this] { observer_.on_closed(last_error_); })) {
   readable_.enable();
   continue_soon();  // with what came behind a handshake
+}
+
+// An exception that leaves a callback would end dssmd.
+template <class Work>
+[[gnu::hot]] void FrameConnection::guarded(Work work) {
+  try {
+    work();
+  } catch (const std::bad_alloc&) {
+    close(no_memory_left());
+  }
 }
 
 FrameConnection::~FrameConnection() {

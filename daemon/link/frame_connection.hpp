@@ -6,7 +6,8 @@
 //
 // Bounds: at most max_queued_bytes wait to be sent, then the connection closes itself (a peer that
 // sends requests and never reads). Samples are not queued here: they stay in their ring until the
-// peer takes them (SamplePump). An error costs this connection only.
+// peer takes them (SamplePump). An error costs this connection only, and so does a failure to get
+// memory for what it receives or sends.
 #pragma once
 
 #include <algorithm>
@@ -215,6 +216,8 @@ class FrameConnection final : private wire::FrameDelegate {
   Result<void> on_sample_end(const wire::IncomingSample& sample, bool torn) override;
   Result<void> on_frame(net::Frame& frame) override;
 
+  template <class Work>
+  void guarded(Work work);
   void on_readable();
   void on_writable();
   void continue_receiving();

@@ -9,6 +9,7 @@
 
 #include <cerrno>
 #include <cstring>
+#include <new>
 #include <utility>
 
 #include "core/base/try.hpp"
@@ -117,9 +118,10 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
       number_(service.connect(identity, *this)),
       input_(wire::kMaxLocalFrameBytes),
       input_budget_(input_budget),
-      readable_(EventSource::readable(loop, socket_.get(), [this] { on_readable(); })),
+      readable_(EventSource::readable(loop, socket_.get(),
+                                      [this] { guarded([this] { on_readable(); }); })),
       writable_(EventSource::writable(loop, socket_.get(), [this] { on_writable(); })),
-      next_turn_(EventSource::timer(loop, [this] { serve_frames(); })),
+      next_turn_(EventSource::timer(loop, [this] { guarded([this] { serve_frames(); }); })),
       greeting_timeout_(EventSource::timer(
           loop,
           [this] {
@@ -135,6 +137,17 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
 
 Connection::~Connection() {
   if (is_open()) service_.disconnect(number_);
+}
+
+// An exception that leaves a callback would end dssmd.
+template <class Work>
+void Connection::guarded(Work work) {
+  try {
+    work();
+  } catch (const std::bad_alloc&) {
+    input_ = wire::FrameBuffer(wire::kMaxLocalFrameBytes);  // first, for the memory
+    end_with(no_memory_left());
+  }
 }
 
 void Connection::on_readable() {

@@ -110,6 +110,8 @@ class Connection final : public ClientOutput {
     std::vector<UniqueFd> descriptors;
   };
 
+  template <class Work>
+  void guarded(Work work);
   void on_readable();
   void on_writable();
   void serve_frames();

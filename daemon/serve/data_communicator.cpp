@@ -4,6 +4,7 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <new>
 #include <utility>
 
 #include "core/base/try.hpp"
@@ -51,7 +52,14 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
       peer_address_(std::move(peer_address)),
       link_(parts.loop, std::move(transport), *this, kMaxQueuedBytes),
       catalog_(parts.registry, parts.opens, kMaxPlainListBytes),
-      next_turn_(EventSource::timer(parts.loop, [this] { work_now(); })),
+      next_turn_(EventSource::timer(parts.loop,
+                                    [this] {
+                                      try {
+                                        work_now();
+                                      } catch (const std::bad_alloc&) {
+                                        link_.close_with(no_memory_left());
+                                      }
+                                    })),
       greeting_timeout_(EventSource::timer(
           parts.loop,
           [this] {

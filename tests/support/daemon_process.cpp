@@ -18,6 +18,7 @@
 #include <cstdlib>
 #include <cstring>
 #include <filesystem>
+#include <fstream>
 
 extern char** environ;
 
@@ -84,6 +85,17 @@ void become_nobody(const std::vector<gid_t>& groups) {
     ::_exit(100);
   }
 }
+
+MemoryLimit::MemoryLimit(pid_t pid, std::uint64_t more_bytes) : pid_(pid) {
+  std::ifstream statm("/proc/" + std::to_string(pid) + "/statm");
+  std::uint64_t pages = 0;
+  statm >> pages;
+  ::prlimit(pid, RLIMIT_AS, nullptr, &before_);
+  const rlimit limit{pages * static_cast<std::uint64_t>(::getpagesize()) + more_bytes,
+                     before_.rlim_max};
+  ::prlimit(pid, RLIMIT_AS, &limit, nullptr);
+}
+MemoryLimit::~MemoryLimit() { ::prlimit(pid_, RLIMIT_AS, &before_, nullptr); }
 
 int wait_for(pid_t pid) {
   int status = 0;

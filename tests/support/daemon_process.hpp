@@ -3,8 +3,10 @@
 // A dssmd for one test, with its own runtime folder and socket; ended by its pid.
 #pragma once
 
+#include <sys/resource.h>
 #include <sys/types.h>
 
+#include <cstdint>
 #include <string>
 #include <vector>
 
@@ -36,6 +38,25 @@ int wait_for(pid_t pid);
 // with status 100 when that fails.
 inline constexpr uid_t kNobody = 65534;
 void become_nobody(const std::vector<gid_t>& groups);
+
+// While it exists, the system gives the process no more than so much memory besides what it has.
+class MemoryLimit {
+ public:
+  MemoryLimit(pid_t pid, std::uint64_t more_bytes);
+  MemoryLimit(const MemoryLimit&) = delete;
+  MemoryLimit& operator=(const MemoryLimit&) = delete;
+  ~MemoryLimit();
+
+ private:
+  pid_t pid_;
+  rlimit before_{};
+};
+// Sanitizers need memory themselves, and keep for a while what was freed.
+#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
+inline constexpr bool kMemoryIsMeasurable = false;
+#else
+inline constexpr bool kMemoryIsMeasurable = true;
+#endif
 
 // For a dssmd that is killed while programs wait to recreate its streams: on a machine where many
 // tests run at once, programs need more than the default of 500 ms to offer their rings.

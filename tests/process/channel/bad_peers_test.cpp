@@ -21,13 +21,6 @@ namespace {
 
 constexpr std::uint64_t kMiB = 1U << 20;
 
-// Sanitizers keep for a while what was freed.
-#if defined(__SANITIZE_ADDRESS__) || defined(__SANITIZE_THREAD__)
-constexpr bool kMemoryIsMeasurable = false;
-#else
-constexpr bool kMemoryIsMeasurable = true;
-#endif
-
 class BadPeer : public testing::Test {
  protected:
   // Every test ends with good peers that are still served, and a dssmd without leftovers.
@@ -199,6 +192,76 @@ TEST_F(BadPeer, ThatRequestsWithoutPauseDoesNotDelayOthers) {
   for (int i = 0; i < 20; ++i) EXPECT_TRUE(good_.ask(list_frame()).has_stream_list());
   for (int i = 0; i < 50'000; ++i) ASSERT_TRUE(busy.try_receive());
   sending.join();
+}
+
+TEST_F(BadPeer, WhoseRequestFindsNoMemoryEndsItsConnectionOnly) {
+  if (!kMemoryIsMeasurable) GTEST_SKIP() << "a sanitizer needs memory itself";
+  ASSERT_TRUE(local_.ask(create_request("odometry")).response.has_opened());
+  net::Frame request;
+  request.mutable_set_property()->mutable_id()->set_name("odometry");
+  request.mutable_set_property()->set_property(std::string(16 * kMiB, 'p'));
+  {
+    const MemoryLimit limit(daemon_.pid(), 4 * kMiB);
+    NetworkPeer peer = NetworkPeer::greeted(daemon_.address());
+    EXPECT_FALSE(peer.ask(request).has_done());
+    EXPECT_TRUE(good_.ask(list_frame()).has_stream_list());
+  }
+  EXPECT_TRUE(good_.ask(request).has_done());
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("odometry");
+  EXPECT_TRUE(local_.ask(remove).response.has_done());
+  descriptors_ = idle_descriptors(daemon_.pid());
+}
+
+// A connection over `fd` that says nothing, half of a Hello, garbage, or a Hello and then garbage.
+void misuse(int fd, std::mt19937_64& random, const std::string& hello) {
+  std::string garbage(random() % 300, '\0');
+  for (char& byte : garbage) byte = static_cast<char>(random());
+  std::string bytes;
+  switch (random() % 4) {
+    case 0:
+      break;
+    case 1:
+      bytes = hello.substr(0, random() % hello.size());
+      break;
+    case 2:
+      bytes = garbage;
+      break;
+    default:
+      bytes = hello + garbage;
+  }
+  if (!bytes.empty()) static_cast<void>(::send(fd, bytes.data(), bytes.size(), MSG_NOSIGNAL));
+  if (random() % 2 == 0) {  // a reset instead of an end
+    const linger at_once{1, 0};
+    ::setsockopt(fd, SOL_SOCKET, SO_LINGER, &at_once, sizeof at_once);
+  }
+}
+
+TEST_F(BadPeer, TwentyThousandOfAllKindsLeaveNothingBehind) {
+  const std::uint64_t seed = std::random_device{}();
+  SCOPED_TRACE("seed " + std::to_string(seed));
+  std::mt19937_64 random(seed);
+  const std::string hello = wire::encode_frame(client_hello_frame());
+  local::Request greeting;
+  greeting.set_serial(1);
+  greeting.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
+  const std::string local_hello = wire::encode_frame(greeting);
+  std::uint64_t after_half = 0;
+  for (int i = 0; i < 10'000; ++i) {
+    if (i == 5'000) {
+      EXPECT_TRUE(eventually([&] { return open_descriptors(daemon_.pid()) == descriptors_; }));
+      after_half = private_memory(daemon_.pid());
+    }
+    const NetworkPeer peer(daemon_.address());
+    ASSERT_TRUE(peer.is_open());
+    misuse(peer.fd(), random, hello);
+    const Result<UniqueFd> program = wire::connect_unix(daemon_.socket_path());
+    ASSERT_TRUE(program) << program.error().message;
+    misuse(program->get(), random, local_hello);
+    if (i % 1000 == 0) EXPECT_TRUE(good_.ask(list_frame()).has_stream_list());
+  }
+  EXPECT_TRUE(eventually([&] { return open_descriptors(daemon_.pid()) == descriptors_; }));
+  if (kMemoryIsMeasurable) EXPECT_LT(private_memory(daemon_.pid()), after_half + 4 * kMiB);
 }
 
 TEST(BadPeers, AreCounted) {

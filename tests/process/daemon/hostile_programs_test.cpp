@@ -113,6 +113,23 @@ TEST(HostileProgram, CannotOccupyDssmdByOneLongRequest) {
   EXPECT_TRUE(hostile.ask(list_request()).response.has_stream_list()) << "it stays connected";
 }
 
+TEST(HostileProgram, WhoseRequestFindsNoMemoryEndsItsConnectionOnly) {
+  if (!kMemoryIsMeasurable) GTEST_SKIP() << "a sanitizer needs memory itself";
+  DaemonProcess daemon;
+  RawClient honest(daemon.socket_path());
+  honest.ask(create_request("odometry"));
+  local::Request request;
+  request.mutable_set_property()->mutable_id()->set_name("odometry");
+  request.mutable_set_property()->set_property(std::string(16U << 20, 'p'));
+  {
+    const MemoryLimit limit(daemon.pid(), 4U << 20);
+    RawClient hostile(daemon.socket_path());
+    EXPECT_FALSE(hostile.ask(request).response.has_done());
+    EXPECT_TRUE(honest.ask(list_request()).response.has_stream_list());
+  }
+  EXPECT_TRUE(honest.ask(request).response.has_done());
+}
+
 TEST(HostileProgram, ThatSendsNoHelloDoesNotKeepItsPlace) {
   DaemonProcess daemon;
   RawClient silent(daemon.socket_path(), false);
