@@ -245,6 +245,7 @@ class Dssmd {
                                      sockets_.network);
                 }),
         count_(streams_.registry, status_) {
+    local_.set_limits_source([this] { return limits(); });
     channels_.set_sending(config.sending);
     if (config.mdns) {
       discovery_.emplace(loop,
@@ -321,6 +322,16 @@ class Dssmd {
   void serve_network() {
     channels_.serve(sockets_.network);
     if (discovery_) discovery_->start_announcing();
+  }
+
+  // What `dssmctl info` shows.
+  LimitUses limits() const {
+    LimitUses all;
+    streams_.registry.add_limits(all);
+    streams_.opens.add_limits(all);
+    server_.add_limits(all);
+    channels_.add_limits(all);
+    return all;
   }
 
   // The keys that may change while dssmd runs.

@@ -21,6 +21,7 @@
 
 #include <cstddef>
 #include <dssm/result.hpp>
+#include <functional>
 #include <map>
 #include <memory>
 #include <optional>
@@ -60,6 +61,11 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   LocalService(const LocalService&) = delete;
   LocalService& operator=(const LocalService&) = delete;
   ~LocalService();
+
+  // What the response to GetDaemon lists; called from the loop. Until it is set, nothing.
+  void set_limits_source(std::function<LimitUses()> source) {
+    requests_.set_limits_source(std::move(source));
+  }
 
   // A client connected; `output` stays until disconnect().
   //   identity  without the program's name

@@ -7,6 +7,7 @@
 #include <sys/un.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cstring>
 #include <utility>
@@ -292,6 +293,20 @@ Server::Server(const EventLoop& loop, const Listener& listener, const std::strin
       acceptor_(loop, logger, "a program", host, message_id::kClientRefused,
                 [this](UniqueFd& socket) { return accept(socket); }) {
   acceptor_.listen(listener.fd());
+}
+
+void Server::add_limits(LimitUses& out) const {
+  std::uint64_t clients = 0, bytes = 0;
+  for (const auto& [uid, user] : users_) {
+    if (!user.is_limited) continue;
+    clients = std::max(clients, user.clients);
+    bytes = std::max(bytes, user.input_budget.used());
+  }
+  const std::uint64_t connected = connections_.size() - ended_.size();
+  out.push_back({"max_clients", connected, limits_.max_clients, "programs"});
+  out.push_back({"max_clients_per_user", clients, limits_.max_clients_per_user, "programs"});
+  out.push_back({"long requests", input_budget_.used(), input_budget_.limit(), "bytes"});
+  out.push_back({"long requests of one user", bytes, kMaxInputBytesPerUser, "bytes"});
 }
 
 Result<void> Server::accept(UniqueFd& socket) {

@@ -26,6 +26,7 @@
 #include "core/wire/frame.hpp"
 #include "daemon/base/acceptor.hpp"
 #include "daemon/base/event_loop.hpp"
+#include "daemon/base/limit_use.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/base/memory_budget.hpp"
 #include "daemon/local/local_service.hpp"
@@ -164,6 +165,7 @@ class Server {
   Server& operator=(const Server&) = delete;
 
   void set_limits(const Limits& limits) { limits_ = limits; }  // for new ones
+  void add_limits(LimitUses& out) const;
 
  private:
   Result<void> accept(UniqueFd& socket);

@@ -48,6 +48,18 @@ class UserLimits : public testing::Test {
     return client.receive().response.failure().message();
   }
 
+  // As GetDaemon shows it.
+  local::LimitUse limit(const std::string& name) {
+    local::Request request;
+    request.mutable_get_daemon();
+    const local::Response response = client_of_root().ask(request).response;
+    for (const local::LimitUse& one : response.daemon().limits()) {
+      if (one.name() == name) return one;
+    }
+    ADD_FAILURE() << "no limit is called " << name;
+    return {};
+  }
+
   std::string dir_ = make_temp_dir();
   std::string path_ = dir_ + "/dssmd.conf";
   std::optional<DaemonProcess> daemon_;
@@ -63,6 +75,9 @@ TEST_F(UserLimits, OnClientsAreNamedToOneUserAndDoNotConcernRoot) {
     std::vector<RawClient> others;
     for (int i = 0; i < 4; ++i) others.push_back(client_of_root());
     EXPECT_TRUE(others.back().ask(list_request()).response.has_stream_list());
+    EXPECT_EQ(limit("max_clients_per_user").used(), 2U);
+    // Two, four, and the one that asks.
+    EXPECT_TRUE(eventually([&] { return limit("max_clients").used() == 7; }));
   }
   EXPECT_TRUE(eventually([&] { return refusal().empty(); })) << "a place of one that has ended";
 }
@@ -78,16 +93,18 @@ TEST_F(UserLimits, OnClientsChangeAtAReload) {
 TEST_F(UserLimits, OnLongRequestsLeaveMemoryForOthers) {
   configure("");
   ASSERT_EQ(::kill(daemon_->pid(), SIGHUP), 0);
+  ASSERT_TRUE(eventually([&] { return limit("max_clients_per_user").limit() == 2048; }));
   ASSERT_TRUE(client_of_root().ask(create_request("map")).response.has_opened());
   // A request of 17 MiB without its last byte takes 32 MiB: dssmd's buffer doubles.
   std::string unfinished("\x80\x80\xc0\x08", 4);
   unfinished.resize(unfinished.size() + wire::kMaxLocalFrameBytes - 1, 'x');
   std::vector<RawClient> begun;
   for (int i = 0; i < 4; ++i) {
-    EXPECT_TRUE(eventually([&] { return refusal().empty(); }));
     begun.push_back(client_of_nobody());
     begun.back().send_bytes(unfinished);
   }
+  EXPECT_TRUE(eventually([&] { return limit("long requests of one user").used() == 128U << 20; }));
+  EXPECT_EQ(limit("long requests").used(), 128U << 20);
   RawClient next = client_of_nobody();
   next.send_bytes(unfinished);
   const Answer refused = next.receive();
