@@ -15,9 +15,6 @@
 namespace dssm::daemon {
 namespace {
 
-// What one client may have deferred during recovery.
-constexpr std::size_t kMaxDeferredBytes = 1U << 20;
-
 local::Response failure_response(std::uint64_t serial, const Error& error) {
   local::Response response;
   response.set_serial(serial);

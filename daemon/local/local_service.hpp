@@ -53,6 +53,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
  public:
   // Requests of one client that wait for other hosts.
   static constexpr std::size_t kMaxAwaited = 1024;
+  // What one client may have deferred during recovery.
+  static constexpr std::size_t kMaxDeferredBytes = 1U << 20;
 
   // recovering: the dssmd before this one did not end properly.
   // fleet: outlives this; nullptr: there are no other hosts.
