@@ -76,6 +76,9 @@ wire::Greeting own_greeting(const std::string& name, std::shared_ptr<const wire:
 Registry::Limits stream_limits(const Config& config) {
   return {config.max_streams, config.max_memory_bytes, config.max_property_bytes};
 }
+Server::Limits client_limits(const Config& config) {
+  return {config.max_clients, config.max_clients_per_user};
+}
 OpenTable::Limits open_limits(const Config& config) {
   return {config.max_opens, config.max_opens_per_client};
 }
@@ -232,7 +235,7 @@ class Dssmd {
         hosts_(config, loop, sockets.network, std::move(page), streams_.registry, logger),
         local_(streams_.registry, streams_.opens, streams_.playback_clock, rights_, logger,
                recovering_, &hosts_.service),
-        server_(loop, sockets.listener, config.name, config.max_clients, local_, logger),
+        server_(loop, sockets.listener, config.name, client_limits(config), local_, logger),
         channels_({loop, streams_.registry, streams_.opens, rights_, logger, &hosts_.clock,
                    [this] { hosts_.clock.poll_if_due(); }, config.insecure},
                   hosts_.self, peer_limits(config)),
@@ -242,6 +245,7 @@ class Dssmd {
                                      sockets_.network);
                 }),
         count_(streams_.registry, status_) {
+    local_.set_limits_source([this] { return limits(); });
     channels_.set_sending(config.sending);
     if (config.mdns) {
       discovery_.emplace(loop,
@@ -320,12 +324,22 @@ class Dssmd {
     if (discovery_) discovery_->start_announcing();
   }
 
+  // What `dssmctl info` shows.
+  LimitUses limits() const {
+    LimitUses all;
+    streams_.registry.add_limits(all);
+    streams_.opens.add_limits(all);
+    server_.add_limits(all);
+    channels_.add_limits(all);
+    return all;
+  }
+
   // The keys that may change while dssmd runs.
   void apply(const Config& changed) {
     logger_.set_level(changed.log_level);
     streams_.registry.set_limits(stream_limits(changed));
     streams_.opens.set_limits(open_limits(changed));
-    server_.set_max_clients(changed.max_clients);
+    server_.set_limits(client_limits(changed));
     channels_.set_limits(peer_limits(changed));
     hosts_.parts.mirror_linger = changed.mirror_linger;
     hosts_.parts.mirrors = changed.mirrors;

@@ -133,6 +133,29 @@ std::string credentials_text(const DaemonInfo& daemon) {
   return fmt::format("{}, {}", escaped(own.name), validity_text(own));
 }
 
+Json limits_json(const DaemonInfo& daemon) {
+  Json all = Json::array();
+  for (const LimitInfo& one : daemon.limits) {
+    all.push_back(
+        {{"name", one.name}, {"used", one.used}, {"limit", one.limit}, {"unit", one.unit}});
+  }
+  return all;
+}
+
+void print_limits(const DaemonInfo& daemon, Output& out) {
+  if (daemon.limits.empty()) return;
+  constexpr auto kRight = Table::Align::right;
+  Table table({{"LIMIT"}, {"USED", kRight}, {"OF", kRight}, {"UNIT"}});
+  for (const LimitInfo& one : daemon.limits) {
+    const bool is_bytes = one.unit == "bytes";
+    const auto text = [&](std::uint64_t n) { return is_bytes ? bytes_text(n) : std::to_string(n); };
+    table.add_row(
+        {escaped(one.name), text(one.used), text(one.limit), is_bytes ? "" : escaped(one.unit)});
+  }
+  out.add("\n");
+  table.print(out);
+}
+
 Result<void> print_daemon(Session& session, const InfoOptions& options, Output& out) {
   const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
   const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
@@ -146,7 +169,8 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
                            {"streams", daemon.streams},
                            {"memory_bytes", daemon.memory_bytes},
                            {"memory_limit_bytes", daemon.memory_limit_bytes},
-                           {"credentials", credentials_json(daemon)}}));
+                           {"credentials", credentials_json(daemon)},
+                           {"limits", limits_json(daemon)}}));
     return {};
   }
   out.add(out.bold("dssmd " + escaped(daemon.version)) + "\n");
@@ -158,6 +182,7 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
            fmt::format("{} of {}", bytes_text(daemon.memory_bytes),
                        bytes_text(daemon.memory_limit_bytes)));
   add_line(out, "credentials", credentials_text(daemon));
+  print_limits(daemon, out);
   return {};
 }
 

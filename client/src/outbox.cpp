@@ -16,10 +16,6 @@ namespace {
 
 constexpr std::int64_t kFirstCapacity = 16;
 
-// Only an owner that receives samples and acknowledges none causes so many; the oldest then count
-// as written.
-constexpr std::size_t kMaxUnackedRanges = 1024;
-
 // Of unsent bytes that are found at a time: more than one send takes, or a long frame.
 constexpr std::size_t kEnoughBytes = 256U << 10;
 

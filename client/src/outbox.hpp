@@ -27,6 +27,10 @@ namespace dssm::detail {
 // A value; one thread.
 class Outbox {
  public:
+  // Dropped samples that were sent, in ranges. Only an owner that receives samples and acknowledges
+  // none causes so many; the oldest then count as written.
+  static constexpr std::size_t kMaxUnackedRanges = 1024;
+
   // max_bytes: of all payloads, each as long as the longest; one sample is always kept, however
   // large.
   Outbox(std::size_t payload_bytes, std::uint64_t max_samples, std::uint64_t max_bytes);

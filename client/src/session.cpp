@@ -308,6 +308,10 @@ Result<DaemonInfo> Session::daemon_info() {
     const local::Credentials& own = daemon.credentials();
     credentials = {own.name(), time_from_ns(own.valid_until_ns()), own.problem()};
   }
+  std::vector<LimitInfo> limits;
+  for (const local::LimitUse& one : daemon.limits()) {
+    limits.push_back({one.name(), one.used(), one.limit(), one.unit()});
+  }
   return DaemonInfo{
       daemon.host(),
       daemon.version(),
@@ -317,7 +321,8 @@ Result<DaemonInfo> Session::daemon_info() {
       daemon.memory_limit_bytes(),
       {wire::enum_untrusted(mdns.phase(), MdnsPhase::running), mdns.error(), mdns.avahi_version(),
        mdns.announced(), mdns.withheld(), mdns.own_host_seen(), mdns.hosts_heard()},
-      std::move(credentials)};
+      std::move(credentials),
+      std::move(limits)};
 }
 
 bool Session::is_connected() const noexcept { return client_->connection().is_up(); }

@@ -9,14 +9,6 @@
 
 namespace dssm::detail {
 
-namespace {
-
-// Of samples that arrive while the program waits for an answer, which takes a round trip. Samples
-// beyond it count as lost.
-constexpr std::size_t kMaxBufferedBytes = 16U << 20;
-
-}  // namespace
-
 Subscriber::Subscriber(std::size_t payload_bytes) : queue_(payload_bytes, kMaxBufferedBytes) {}
 
 void Subscriber::begin(const Subscription& what) {

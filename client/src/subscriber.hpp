@@ -61,6 +61,10 @@ class SampleQueue {
 // A value; one thread.
 class Subscriber {
  public:
+  // Of samples that arrive while the program waits for an answer, which takes a round trip. Samples
+  // beyond it count as lost.
+  static constexpr std::size_t kMaxBufferedBytes = 16U << 20;
+
   explicit Subscriber(std::size_t payload_bytes);
 
   // A subscription as the program requested it; it replaces any other.

@@ -4,31 +4,54 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <optional>
 
 namespace dssm {
 
+namespace {
+
+// The character at the beginning of `text`, in UTF-8; nullopt: there is none. Its bytes are taken
+// from `text`, or one byte.
+std::optional<std::uint32_t> take_character(std::string_view& text) noexcept {
+  const auto lead = static_cast<std::uint8_t>(text.front());
+  text.remove_prefix(1);
+  if (lead < 0x80) return lead;
+  std::size_t more = 0;
+  std::uint32_t smallest = 0, value = 0;
+  if ((lead & 0xe0) == 0xc0) {
+    more = 1, smallest = 0x80, value = lead & 0x1fU;
+  } else if ((lead & 0xf0) == 0xe0) {
+    more = 2, smallest = 0x800, value = lead & 0x0fU;
+  } else if ((lead & 0xf8) == 0xf0) {
+    more = 3, smallest = 0x10000, value = lead & 0x07U;
+  } else {
+    return std::nullopt;
+  }
+  if (more > text.size()) return std::nullopt;
+  for (const char c : text.substr(0, more)) {
+    const auto byte = static_cast<std::uint8_t>(c);
+    if ((byte & 0xc0) != 0x80) return std::nullopt;
+    value = (value << 6) | (byte & 0x3fU);
+  }
+  if (value < smallest || value > 0x10ffff || (value >= 0xd800 && value <= 0xdfff)) {
+    return std::nullopt;
+  }
+  text.remove_prefix(more);
+  return value;
+}
+
+// Controls of C0 and C1, line and paragraph separators, and the marks that turn the direction of
+// writing (Unicode Standard Annex 9): with them a terminal shows another text than there is.
+constexpr bool changes_display(std::uint32_t c) noexcept {
+  return c < 0x20 || (c >= 0x7f && c < 0xa0) || c == 0x61c || c == 0x200e || c == 0x200f ||
+         (c >= 0x2028 && c <= 0x202e) || (c >= 0x2066 && c <= 0x2069);
+}
+
+}  // namespace
+
 bool is_utf8(std::string_view text) noexcept {
-  for (std::size_t i = 0; i < text.size();) {
-    const auto lead = static_cast<std::uint8_t>(text[i++]);
-    if (lead < 0x80) continue;
-    int more = 0;
-    std::uint32_t smallest = 0, value = 0;
-    if ((lead & 0xe0) == 0xc0) {
-      more = 1, smallest = 0x80, value = lead & 0x1fU;
-    } else if ((lead & 0xf0) == 0xe0) {
-      more = 2, smallest = 0x800, value = lead & 0x0fU;
-    } else if ((lead & 0xf8) == 0xf0) {
-      more = 3, smallest = 0x10000, value = lead & 0x07U;
-    } else {
-      return false;
-    }
-    for (; more > 0; --more) {
-      if (i == text.size()) return false;
-      const auto byte = static_cast<std::uint8_t>(text[i++]);
-      if ((byte & 0xc0) != 0x80) return false;
-      value = (value << 6) | (byte & 0x3fU);
-    }
-    if (value < smallest || value > 0x10ffff || (value >= 0xd800 && value <= 0xdfff)) return false;
+  while (!text.empty()) {
+    if (!take_character(text)) return false;
   }
   return true;
 }
@@ -38,8 +61,17 @@ bool has_control(std::string_view text) noexcept {
 }
 
 std::string printable(std::string_view text) {
-  std::string out(text);
-  std::replace_if(out.begin(), out.end(), is_control, '?');
+  std::string out;
+  out.reserve(text.size());
+  while (!text.empty()) {
+    const std::string_view from = text;
+    const std::optional<std::uint32_t> character = take_character(text);
+    if (!character || changes_display(*character)) {
+      out += '?';
+    } else {
+      out += from.substr(0, from.size() - text.size());
+    }
+  }
   return out;
 }
 

@@ -42,9 +42,9 @@ MirrorInfo mirror_info(const proto::Mirror& message) {
 }  // namespace
 
 std::string text_untrusted(const std::string& text, std::size_t max_bytes) {
-  std::string taken = printable(text.substr(0, max_bytes));
-  while (!is_utf8(taken)) taken.pop_back();
-  return taken;
+  std::string_view taken = std::string_view(text).substr(0, max_bytes);
+  while (!is_utf8(taken)) taken.remove_suffix(1);
+  return printable(taken);
 }
 
 void to_message(const StreamId& id, proto::StreamId& out) {

@@ -13,9 +13,6 @@
 namespace dssm::daemon {
 namespace {
 
-// Accepted in a row before existing connections get their turn.
-constexpr int kConnectionsPerTurn = 16;
-
 UniqueFd accept_at(int listener) {
   return UniqueFd(::accept4(listener, nullptr, nullptr, SOCK_CLOEXEC | SOCK_NONBLOCK));
 }

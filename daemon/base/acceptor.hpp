@@ -19,6 +19,9 @@ namespace dssm::daemon {
 
 class Acceptor {
  public:
+  // Accepted in a row before existing connections get their turn.
+  static constexpr int kConnectionsPerTurn = 16;
+
   // Serves an accepted socket, which is non-blocking; moves from `socket` only if it succeeds. An
   // error refuses the connection.
   using Accept = std::function<Result<void>(UniqueFd& socket)>;

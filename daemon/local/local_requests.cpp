@@ -255,6 +255,13 @@ Reply LocalRequests::get_daemon() const {
   daemon.set_streams(registry_.streams().size());
   daemon.set_memory_bytes(registry_.budget().used());
   daemon.set_memory_limit_bytes(registry_.budget().limit());
+  for (const LimitUse& one : limits_ ? limits_() : LimitUses()) {
+    local::LimitUse& entry = *daemon.add_limits();
+    entry.set_name(std::string(one.name));
+    entry.set_used(one.used);
+    entry.set_limit(one.limit);
+    entry.set_unit(std::string(one.unit));
+  }
   if (fleet_) fleet_->describe(daemon);
   return reply;
 }

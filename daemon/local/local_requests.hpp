@@ -16,6 +16,7 @@
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/local_protocol.hpp"
+#include "daemon/base/limit_use.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/playback_clock_owner.hpp"
@@ -120,6 +121,8 @@ class LocalRequests {
   LocalRequests(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
                 const Rights& rights, Fleet* fleet);
 
+  void set_limits_source(std::function<LimitUses()> source) { limits_ = std::move(source); }
+
   using Client = std::shared_ptr<const ClientIdentity>;
   // Called once: later, or at once. If the client has disconnected by then, its opens are removed
   // again.
@@ -176,6 +179,7 @@ class LocalRequests {
   const Rights& rights_;
   Fleet* const fleet_;
   CatalogRequests catalog_;
+  std::function<LimitUses()> limits_;  // may be empty
 };
 
 }  // namespace dssm::daemon

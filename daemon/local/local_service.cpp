@@ -18,9 +18,6 @@ namespace {
 // A request that is longer, a SetProperty, is parsed without its property.
 constexpr std::size_t kMaxCopiedBytes = 64U << 10;
 
-// What one client may have deferred during recovery.
-constexpr std::size_t kMaxDeferredBytes = 1U << 20;
-
 // For a request that is kept or goes to another host.
 void take_back_property(local::Request& request, Attachments& attached) {
   if (attached.property.empty()) return;

@@ -21,6 +21,7 @@
 
 #include <cstddef>
 #include <dssm/result.hpp>
+#include <functional>
 #include <map>
 #include <memory>
 #include <optional>
@@ -52,6 +53,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
  public:
   // Requests of one client that wait for other hosts.
   static constexpr std::size_t kMaxAwaited = 1024;
+  // What one client may have deferred during recovery.
+  static constexpr std::size_t kMaxDeferredBytes = 1U << 20;
 
   // recovering: the dssmd before this one did not end properly.
   // fleet: outlives this; nullptr: there are no other hosts.
@@ -60,6 +63,11 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   LocalService(const LocalService&) = delete;
   LocalService& operator=(const LocalService&) = delete;
   ~LocalService();
+
+  // What the response to GetDaemon lists; called from the loop. Until it is set, nothing.
+  void set_limits_source(std::function<LimitUses()> source) {
+    requests_.set_limits_source(std::move(source));
+  }
 
   // A client connected; `output` stays until disconnect().
   //   identity  without the program's name

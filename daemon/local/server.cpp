@@ -7,6 +7,7 @@
 #include <sys/un.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <cerrno>
 #include <cstring>
 #include <new>
@@ -109,8 +110,8 @@ Listener::~Listener() {
 // --- one connection
 
 Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
-                       LocalService& service, MemoryBudget& input_budget, Logger& logger,
-                       std::function<void()> on_closed)
+                       LocalService& service, MemoryBudget& input_budget, UserAccount& user,
+                       Logger& logger, std::function<void()> on_closed)
     : socket_(std::move(socket)),
       service_(service),
       logger_(logger),
@@ -118,6 +119,7 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
       number_(service.connect(identity, *this)),
       input_(wire::kMaxLocalFrameBytes),
       input_budget_(input_budget),
+      user_(user),
       readable_(EventSource::readable(loop, socket_.get(),
                                       [this] { guarded([this] { on_readable(); }); })),
       writable_(EventSource::writable(loop, socket_.get(), [this] { on_writable(); })),
@@ -170,16 +172,21 @@ bool Connection::charge_input() {
     request_timeout_.enable_in(kLongRequestTimeout);
   }
   input_share_ = {};
-  std::optional<MemoryShare> share = input_budget_.try_take(bytes);
-  if (share) {
-    input_share_ = *std::move(share);
+  users_input_share_ = {};
+  std::optional<MemoryShare> of_all = input_budget_.try_take(bytes);
+  std::optional<MemoryShare> of_user = user_.input_budget.try_take(bytes);
+  if (of_all && of_user) {
+    input_share_ = *std::move(of_all);
+    users_input_share_ = *std::move(of_user);
     return true;
   }
-  end_with(
-      {Errc::limit_exceeded,
-       fmt::format("no memory is left to receive a request of more than {} bytes: the programs "
-                   "of this PC have begun requests of {} bytes; try again later",
-                   bytes / 2, input_budget_.limit())});
+  const bool is_users = !of_user && user_.is_limited;
+  end_with({Errc::limit_exceeded,
+            fmt::format("no memory is left to receive a request of more than {} bytes: the "
+                        "programs of {} have begun requests that take up to {} bytes; try again "
+                        "later",
+                        bytes / 2, is_users ? fmt::format("user {}", user_.uid) : "this PC",
+                        (is_users ? user_.input_budget : input_budget_).limit())});
   return false;
 }
 
@@ -290,47 +297,75 @@ void Connection::close() {
 // --- all connections
 
 Server::Server(const EventLoop& loop, const Listener& listener, const std::string& host,
-               std::uint64_t max_clients, LocalService& service, Logger& logger)
+               const Limits& limits, LocalService& service, Logger& logger)
     : loop_(loop),
-      max_clients_(max_clients),
+      limits_(limits),
       service_(service),
       logger_(logger),
-      sweep_(EventSource::timer(loop,
-                                [this] {
-                                  for (const std::uint64_t number : std::exchange(ended_, {})) {
-                                    connections_.erase(number);
-                                  }
-                                })),
+      sweep_(EventSource::timer(loop, [this] { sweep(); })),
       acceptor_(loop, logger, "a program", host, message_id::kClientRefused,
                 [this](UniqueFd& socket) { return accept(socket); }) {
   acceptor_.listen(listener.fd());
 }
 
+void Server::add_limits(LimitUses& out) const {
+  std::uint64_t clients = 0, bytes = 0;
+  for (const auto& [uid, user] : users_) {
+    if (!user.is_limited) continue;
+    clients = std::max(clients, user.clients);
+    bytes = std::max(bytes, user.input_budget.used());
+  }
+  const std::uint64_t connected = connections_.size() - ended_.size();
+  out.push_back({"max_clients", connected, limits_.max_clients, "programs"});
+  out.push_back({"max_clients_per_user", clients, limits_.max_clients_per_user, "programs"});
+  out.push_back({"long requests", input_budget_.used(), input_budget_.limit(), "bytes"});
+  out.push_back({"long requests of one user", bytes, kMaxInputBytesPerUser, "bytes"});
+}
+
 Result<void> Server::accept(UniqueFd& socket) {
-  if (connections_.size() - ended_.size() >= max_clients_) {
+  if (connections_.size() - ended_.size() >= limits_.max_clients) {
     return Error{Errc::limit_exceeded,
                  fmt::format("max_clients = {} programs are connected already; end some or raise "
                              "the key max_clients",
-                             max_clients_)};
+                             limits_.max_clients)};
   }
   ucred peer{};
   socklen_t length = sizeof peer;
   if (::getsockopt(socket.get(), SOL_SOCKET, SO_PEERCRED, &peer, &length)) {
     return os_error("get the credentials of a program");
   }
+  UserAccount& user = users_.try_emplace(peer.uid, peer.uid).first->second;
+  if (user.is_limited && user.clients >= limits_.max_clients_per_user) {
+    return Error{Errc::limit_exceeded,
+                 fmt::format("max_clients_per_user = {} programs of user {} are connected already; "
+                             "end some or raise the key max_clients_per_user",
+                             limits_.max_clients_per_user, user.uid)};
+  }
   Identity identity;
   identity.pid = peer.pid;
   identity.uid = peer.uid;
   identity.gid = peer.gid;
   identity.groups = groups_of(socket.get());
+  keep(std::move(socket), identity, user);
+  return {};
+}
+
+void Server::keep(UniqueFd socket, const Identity& identity, UserAccount& user) {
   const std::uint64_t number = next_++;
+  const auto on_closed = [this, number, &user] {
+    --user.clients;
+    ended_.push_back(number);
+    sweep_.enable_in(Duration::zero());
+  };
   connections_.emplace(number,
                        std::make_unique<Connection>(loop_, std::move(socket), identity, service_,
-                                                    input_budget_, logger_, [this, number] {
-                                                      ended_.push_back(number);
-                                                      sweep_.enable_in(Duration::zero());
-                                                    }));
-  return {};
+                                                    input_budget_, user, logger_, on_closed));
+  ++user.clients;
+}
+
+void Server::sweep() {
+  for (const std::uint64_t number : std::exchange(ended_, {})) connections_.erase(number);
+  std::erase_if(users_, [](const auto& entry) { return entry.second.clients == 0; });
 }
 
 }  // namespace dssm::daemon

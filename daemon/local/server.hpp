@@ -9,6 +9,7 @@
 #pragma once
 
 #include <sys/types.h>
+#include <unistd.h>
 
 #include <cstddef>
 #include <cstdint>
@@ -25,6 +26,7 @@
 #include "core/wire/frame.hpp"
 #include "daemon/base/acceptor.hpp"
 #include "daemon/base/event_loop.hpp"
+#include "daemon/base/limit_use.hpp"
 #include "daemon/base/log.hpp"
 #include "daemon/base/memory_budget.hpp"
 #include "daemon/local/local_service.hpp"
@@ -82,20 +84,34 @@ inline constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
 // For the Hello of a program.
 inline constexpr Duration kLocalHelloTimeout = std::chrono::seconds(10);
 
-// Memory for the long requests that all clients have begun to send, and the time for one of them:
-// then the memory is free again. A property may have 16 MiB.
+// Memory for the long requests that all clients, and those of one user, have begun to send, and the
+// time for one of them: then the memory is free again. A property may have 16 MiB.
 inline constexpr std::size_t kMaxInputBytes = 256U << 20;
+inline constexpr std::size_t kMaxInputBytesPerUser = kMaxInputBytes / 2;
 inline constexpr Duration kLongRequestTimeout = std::chrono::seconds(10);
+
+// What one user's programs take, so that those of one cannot keep out those of others. root, and
+// the user of dssmd, could end dssmd anyway: they have no limits of their own.
+struct UserAccount {
+  explicit UserAccount(uid_t user)
+      : uid(user),
+        is_limited(user != 0 && user != ::geteuid()),
+        input_budget(is_limited ? kMaxInputBytesPerUser : kMaxInputBytes) {}
+  const uid_t uid;
+  const bool is_limited;
+  std::uint64_t clients = 0;
+  MemoryBudget input_budget;
+};
 
 // One client's socket: cuts its bytes into frames for LocalService and sends the responses. It
 // never waits for the client. What the client does not receive is queued up to kMaxQueuedBytes,
 // then the connection is closed; an error closes this connection only.
 class Connection final : public ClientOutput {
  public:
-  // on_closed: called once, when the connection ended by itself; the connection must not be
-  // destroyed within it.
+  // input_budget: of all clients. on_closed: called once, when the connection ended by itself; the
+  // connection must not be destroyed within it.
   Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
-             LocalService& service, MemoryBudget& input_budget, Logger& logger,
+             LocalService& service, MemoryBudget& input_budget, UserAccount& user, Logger& logger,
              std::function<void()> on_closed);
   Connection(const Connection&) = delete;
   Connection& operator=(const Connection&) = delete;
@@ -132,33 +148,43 @@ class Connection final : public ClientOutput {
   ClientNumber number_;
   wire::FrameBuffer input_;
   MemoryBudget& input_budget_;
-  MemoryShare input_share_;
+  UserAccount& user_;
+  MemoryShare input_share_, users_input_share_;
   DescriptorQueue arrived_;
   std::deque<Outgoing> output_;
   std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
   EventSource readable_, writable_, next_turn_, greeting_timeout_, request_timeout_;
 };
 
-// Accepts the programs of this PC, within max_clients, and owns their connections.
+// Accepts the programs of this PC, within the limits, and owns their connections.
 class Server {
  public:
+  struct Limits {
+    std::uint64_t max_clients = 0;
+    std::uint64_t max_clients_per_user = 0;
+  };
+
   // Serves from the construction on; everything given by reference outlives it.
   Server(const EventLoop& loop, const Listener& listener, const std::string& host,
-         std::uint64_t max_clients, LocalService& service, Logger& logger);
+         const Limits& limits, LocalService& service, Logger& logger);
   Server(const Server&) = delete;
   Server& operator=(const Server&) = delete;
 
-  void set_max_clients(std::uint64_t max_clients) { max_clients_ = max_clients; }  // for new ones
+  void set_limits(const Limits& limits) { limits_ = limits; }  // for new ones
+  void add_limits(LimitUses& out) const;
 
  private:
   Result<void> accept(UniqueFd& socket);
+  void keep(UniqueFd socket, const Identity& identity, UserAccount& user);
+  void sweep();
 
   const EventLoop& loop_;
-  std::uint64_t max_clients_;
+  Limits limits_;
   LocalService& service_;
   MemoryBudget input_budget_{kMaxInputBytes};
   Logger& logger_;
   std::uint64_t next_ = 0;
+  std::map<uid_t, UserAccount> users_;  // before the connections, which hold shares of the budgets
   std::map<std::uint64_t, std::unique_ptr<Connection>> connections_;
   std::vector<std::uint64_t> ended_;  // to be destroyed outside of their own callbacks
   EventSource sweep_;

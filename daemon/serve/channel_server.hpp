@@ -70,6 +70,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     limits_ = limits;
     peers_.set_limits(limits);
   }
+  void add_limits(LimitUses& out) const { peers_.add_limits(out); }
   // For subscriptions from now on.
   void set_sending(SendingDemands sending) { sending_ = std::move(sending); }
 

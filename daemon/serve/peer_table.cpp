@@ -3,6 +3,7 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <optional>
 #include <utility>
 
@@ -29,6 +30,18 @@ void PeerTable::set_limits(const Limits& limits) {
   for (const auto& [peer, account] : accounts_) {
     account->budget.set_limit(limits.max_peer_memory_bytes);
   }
+}
+
+void PeerTable::add_limits(LimitUses& out) const {
+  std::uint64_t connections = 0, bytes = 0;
+  for (const auto& [peer, account] : accounts_) {
+    connections = std::max(connections, account->connections);
+    bytes = std::max(bytes, account->budget.used());
+  }
+  out.push_back({"max_connections", connections_, limits_.max_connections, "connections"});
+  out.push_back(
+      {"max_connections_per_host", connections, limits_.max_connections_per_host, "connections"});
+  out.push_back({"max_peer_memory", bytes, limits_.max_peer_memory_bytes, "bytes"});
 }
 
 Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {

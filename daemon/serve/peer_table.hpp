@@ -12,6 +12,7 @@
 #include <memory>
 #include <string>
 
+#include "daemon/base/limit_use.hpp"
 #include "daemon/base/memory_budget.hpp"
 #include "daemon/link/history_pace.hpp"
 
@@ -67,6 +68,8 @@ class PeerTable {
 
   // For new connections, and for the budgets of existing accounts.
   void set_limits(const Limits& limits);
+
+  void add_limits(LimitUses& out) const;
 
   // A place for one more connection of `peer`: its address without a port or, when its certificate
   // says who it is, that.

@@ -199,6 +199,11 @@ constexpr ConfigKey kKeys[] = {
      kChangesAtOnce<&Config::log_level>, set_by<&Config::log_level, parse_log_level>},
     {"max_clients", "COUNT", "connections at once; default: 4096", ValueForm::integer,
      kChangesAtOnce<&Config::max_clients>, set_count<&Config::max_clients, kMaxClients>},
+    {"max_clients_per_user", "COUNT",
+     "connections of one user at once, but for root and dssmd's own user; default: half of "
+     "max_clients",
+     ValueForm::integer, kChangesAtOnce<&Config::max_clients_per_user>,
+     set_count<&Config::max_clients_per_user, kMaxClients>},
     {"max_streams", "COUNT", "streams at once; default: 4096", ValueForm::integer,
      kChangesAtOnce<&Config::max_streams>, set_count<&Config::max_streams, kMaxStreams>},
     {"max_memory", "BYTES",
@@ -472,6 +477,7 @@ Result<void> apply_file(Config& config, const std::string& path) {
 }
 
 Result<void> finish(Config& config) {
+  if (config.max_clients_per_user == 0) config.max_clients_per_user = (config.max_clients + 1) / 2;
   DSSM_TRY(check_secure(config));
   if (config.name.empty()) DSSM_TRY(take_name_of_machine(config));
   return load_credentials(config);

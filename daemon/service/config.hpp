@@ -41,6 +41,7 @@ struct Config {
   mode_t socket_mode = 0660;
   LogLevel log_level = LogLevel::info;
   std::uint64_t max_clients = 4096;
+  std::uint64_t max_clients_per_user = 0;  // 0: finish() makes it half of max_clients
   std::uint64_t max_streams = 4096;
   std::uint64_t max_memory_bytes = half_of_the_machines_memory();
   std::uint64_t max_opens = 65536;

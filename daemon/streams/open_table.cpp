@@ -3,9 +3,17 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <utility>
 
 namespace dssm::daemon {
+
+void OpenTable::add_limits(LimitUses& out) const {
+  std::size_t most = 0;
+  for (const auto& [client, opens] : by_client_) most = std::max(most, opens.size());
+  out.push_back({"max_opens", entries_.size(), limits_.max_opens, "opens"});
+  out.push_back({"max_opens_per_client", most, limits_.max_opens_per_client, "opens"});
+}
 
 Result<void> OpenTable::check_quota(const ClientIdentity& client) const {
   if (entries_.size() >= limits_.max_opens) {

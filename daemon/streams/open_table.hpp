@@ -15,6 +15,7 @@
 #include <unordered_map>
 #include <vector>
 
+#include "daemon/base/limit_use.hpp"
 #include "daemon/streams/action.hpp"
 #include "daemon/streams/stream.hpp"
 
@@ -48,6 +49,7 @@ class OpenTable {
   explicit OpenTable(const Limits& limits) : limits_(limits) {}
 
   void set_limits(const Limits& limits) { limits_ = limits; }  // for new opens
+  void add_limits(LimitUses& out) const;
 
   // Whether `client` may open one more. Fails with limit_exceeded, naming the key.
   Result<void> check_quota(const ClientIdentity& client) const;

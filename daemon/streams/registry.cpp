@@ -29,6 +29,11 @@ Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
                                     "'; create it first (`dssmctl ls` lists those that are there)"};
 }
 
+void Registry::add_limits(LimitUses& out) const {
+  out.push_back({"max_streams", in_order_.size() + other_rings_, limits_.max_streams, "streams"});
+  out.push_back({"max_memory", budget_.used(), budget_.limit(), "bytes"});
+}
+
 Result<void> Registry::check_quota() const {
   if (by_name_.size() + other_rings_ < limits_.max_streams) return {};
   return Error{

@@ -14,6 +14,7 @@
 #include <utility>
 #include <vector>
 
+#include "daemon/base/limit_use.hpp"
 #include "daemon/base/memory_budget.hpp"
 #include "daemon/streams/stream.hpp"
 
@@ -71,6 +72,8 @@ class Registry {
   // before; none is added or removed by an observer.
   void add_observer(StreamObserver& observer) { observers_.push_back(&observer); }
   void remove_observer(StreamObserver& observer) { std::erase(observers_, &observer); }
+
+  void add_limits(LimitUses& out) const;
 
   const std::string& host() const noexcept { return host_; }
   const MemoryBudget& budget() const noexcept { return budget_; }

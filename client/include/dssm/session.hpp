@@ -64,6 +64,14 @@ struct CredentialsInfo {
   std::string problem;  // why other hosts refuse it, for people; empty: nothing is known
 };
 
+// How much of one of dssmd's limits is used (docs/limits.md).
+struct LimitInfo {
+  std::string name;        // of the key, "max_streams", or of what is limited
+  std::uint64_t used = 0;  // of a limit for each user, program or host: by the one with the most
+  std::uint64_t limit = 0;
+  std::string unit;  // "bytes", "streams", "programs", ...
+};
+
 struct DaemonInfo {
   std::string host;
   std::string version;
@@ -73,6 +81,7 @@ struct DaemonInfo {
   std::uint64_t memory_limit_bytes = 0;  // for all rings
   MdnsInfo mdns;
   std::optional<CredentialsInfo> credentials;  // empty: connections are not encrypted
+  std::vector<LimitInfo> limits;               // empty: an older dssmd
 };
 
 // Who may do what with a stream on this PC, by dssmd's configuration (docs/security.md "Rights").

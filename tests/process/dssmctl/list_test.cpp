@@ -7,6 +7,7 @@
 #include <unistd.h>
 
 #include <array>
+#include <regex>
 
 #include "tests/process/dssmctl/ctl_test.hpp"
 
@@ -178,6 +179,37 @@ TEST_F(Info, DescribesTheDaemonWithoutAStream) {
   EXPECT_EQ(info["pid"], daemon_.pid());
   EXPECT_EQ(info["streams"], 1);
   EXPECT_NE(output({"info"}).find("pc1"), std::string::npos);
+}
+
+TEST_F(Info, ShowsHowMuchOfEachLimitIsUsed) {
+  auto pose = session_.create<Pose>("pose", depth_of(8)).value();
+  auto reader = session_.open_reader<Pose>("pose").value();
+  const Json info = json({"info"});
+  const auto limit = [&](const std::string& name) {
+    for (const Json& one : info["limits"]) {
+      if (one["name"] == name) return one;
+    }
+    return Json();
+  };
+  const auto counted = [](const char* name, int used, int of, const char* unit) {
+    return Json{{"name", name}, {"used", used}, {"limit", of}, {"unit", unit}};
+  };
+  EXPECT_EQ(limit("max_streams"), counted("max_streams", 1, 4096, "streams"));
+  EXPECT_EQ(limit("max_memory")["used"], info["memory_bytes"]);
+  EXPECT_EQ(limit("max_memory")["limit"], info["memory_limit_bytes"]);
+  EXPECT_EQ(limit("max_opens"), counted("max_opens", 2, 65536, "opens"));
+  EXPECT_EQ(limit("max_opens_per_client"), counted("max_opens_per_client", 2, 16384, "opens"));
+  // The test, and dssmctl itself.
+  EXPECT_EQ(limit("max_clients"), counted("max_clients", 2, 4096, "programs"));
+  EXPECT_EQ(limit("max_clients_per_user")["limit"], 2048);
+  EXPECT_EQ(limit("long requests"), counted("long requests", 0, 256 << 20, "bytes"));
+  EXPECT_EQ(limit("max_connections"), counted("max_connections", 0, 256, "connections"));
+  EXPECT_EQ(limit("max_peer_memory"), counted("max_peer_memory", 0, 96 << 20, "bytes"));
+  EXPECT_EQ(info["limits"].size(), 11U);
+  const std::string text = output({"info"});
+  EXPECT_TRUE(std::regex_search(text, std::regex("\nLIMIT +USED +OF +UNIT\n"))) << text;
+  EXPECT_TRUE(std::regex_search(text, std::regex("\nmax_streams +1 +4096 +streams\n"))) << text;
+  EXPECT_TRUE(std::regex_search(text, std::regex("\nlong requests +0 bytes +256.* MiB\n"))) << text;
 }
 
 }  // namespace

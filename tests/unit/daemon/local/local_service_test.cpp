@@ -348,6 +348,37 @@ TEST(LocalService, DescribesItself) {
   EXPECT_EQ(response.daemon().mdns().phase(), local::Mdns::OFF);  // without a network
 }
 
+TEST(LocalService, ListsTheLimitsOfAllParts) {
+  Daemon daemon;
+  daemon.service.set_limits_source([&] {
+    LimitUses all;
+    daemon.registry.add_limits(all);
+    daemon.opens.add_limits(all);
+    return all;
+  });
+  FakeClient client(daemon.service, 5), other(daemon.service, 6);
+  client.greet();
+  other.greet();
+  client.ask(create_request("odometry"));
+  client.ask(create_request("odometry"));
+  other.ask(create_request("odometry"));
+  local::Request request;
+  request.mutable_get_daemon();
+  std::string limits;
+  const local::Response response = client.ask(request);
+  for (const local::LimitUse& one : response.daemon().limits()) {
+    if (one.name() == "max_memory") {
+      EXPECT_EQ(one.used(), response.daemon().memory_bytes());
+      continue;
+    }
+    limits += one.name() + " " + std::to_string(one.used()) + " of " + std::to_string(one.limit()) +
+              " " + one.unit() + "\n";
+  }
+  EXPECT_EQ(limits,
+            "max_streams 1 of " + std::to_string(kLimits.max_streams) +
+                " streams\nmax_opens 3 of 1000 opens\nmax_opens_per_client 2 of 100 opens\n");
+}
+
 // --- recovery
 
 // A client's answer to a Create by an earlier dssmd: what it can offer now.

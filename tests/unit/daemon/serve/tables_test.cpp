@@ -42,5 +42,22 @@ TEST(PeerTable, GivesEverythingBack) {
   EXPECT_EQ(again.budget().used(), PeerTable::kConnectionBytes);
 }
 
+TEST(PeerTable, ShowsWhatThePeerWithTheMostUses) {
+  PeerTable table({5, 4, 1U << 20});
+  const PeerPlace one = *table.admit("pc2"), two = *table.admit("pc2"), other = *table.admit("pc3");
+  LimitUses limits;
+  table.add_limits(limits);
+  ASSERT_EQ(limits.size(), 3U);
+  EXPECT_EQ(limits[0].name, "max_connections");
+  EXPECT_EQ(limits[0].used, 3U);
+  EXPECT_EQ(limits[0].limit, 5U);
+  EXPECT_EQ(limits[1].name, "max_connections_per_host");
+  EXPECT_EQ(limits[1].used, 2U);
+  EXPECT_EQ(limits[1].limit, 4U);
+  EXPECT_EQ(limits[2].name, "max_peer_memory");
+  EXPECT_EQ(limits[2].used, 2 * PeerTable::kConnectionBytes);
+  EXPECT_EQ(limits[2].limit, 1U << 20);
+}
+
 }  // namespace
 }  // namespace dssm::daemon

@@ -33,6 +33,7 @@ socket_group = "root"
 socket_mode = "0600"
 log_level = "debug"
 max_clients = 10
+max_clients_per_user = 9
 max_streams = 11
 max_memory = "12 MiB"
 max_opens = 13
@@ -62,6 +63,7 @@ rights = ["local read *", "group:0 create,clock lidar*", "host:pc[23]  all  map:
   EXPECT_EQ(config.socket_mode, mode_t{0600});
   EXPECT_EQ(config.log_level, LogLevel::debug);
   EXPECT_EQ(config.max_clients, 10u);
+  EXPECT_EQ(config.max_clients_per_user, 9u);
   EXPECT_EQ(config.max_streams, 11u);
   EXPECT_EQ(config.max_memory_bytes, 12u << 20);
   EXPECT_EQ(config.max_opens, 13u);
@@ -318,6 +320,20 @@ TEST(Config, TakesTheDefaultFileOfTheProjectWithAllItsLinesInUse) {
   EXPECT_EQ(mistakes_in(text), "");
   EXPECT_EQ(mistakes_in(in_use), "");
   EXPECT_EQ(keys, config_keys().size()) << "each key once, commented out with its default";
+}
+
+TEST(Config, LetsOneUserHaveHalfOfTheClientsUnlessItIsSet) {
+  const auto per_user = [](std::uint64_t max_clients, std::uint64_t given) {
+    Config config;
+    config.name = "pc1";
+    config.max_clients = max_clients;
+    config.max_clients_per_user = given;
+    EXPECT_TRUE(finish(config));
+    return config.max_clients_per_user;
+  };
+  EXPECT_EQ(per_user(4096, 0), 2048u);
+  EXPECT_EQ(per_user(1, 0), 1u);
+  EXPECT_EQ(per_user(10, 9), 9u);
 }
 
 TEST(Config, GivesTheMachinesNameUpToTheFirstDotWhenNoneIsSet) {

@@ -54,6 +54,18 @@ TEST(Unit, KeepsAsManyDescriptorsAsTheDaemonSends) {
             (std::multiset<std::string>{std::to_string(DescriptorStore::kMaxDescriptors)}));
 }
 
+// The key max_memory is half of the machine's memory by default; a dssmd that keeps to it must not
+// be slowed down.
+TEST(Unit, SlowsDssmdDownBeforeItIsKilledForItsMemory) {
+  const auto percent = [unit = source("systemd/dssmd.service")](const std::string& name) {
+    const auto found = all_matches(unit, "\n" + name + "=([0-9]+)%\n");
+    EXPECT_EQ(found.size(), 1U) << name;
+    return found.empty() ? 0 : std::stoi(*found.begin());
+  };
+  EXPECT_LT(50, percent("MemoryHigh"));
+  EXPECT_LT(percent("MemoryHigh"), percent("MemoryMax"));
+}
+
 // Three characters and what stands between them, beside a few sockets' names.
 TEST(DescriptorNames, FitIntoTheOneVariableThatSystemdHandsThemOverIn) {
   constexpr std::size_t kMaxArgStrlen = 131'072;  // of Linux, with the end mark

@@ -1,0 +1,123 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What one user's programs may take of dssmd, with a real user: nobody.
+#include <gtest/gtest.h>
+#include <signal.h>
+#include <sys/stat.h>
+#include <unistd.h>
+
+#include <fstream>
+#include <optional>
+
+#include "tests/process/daemon/raw_client.hpp"
+
+namespace dssm::test {
+namespace {
+
+class UserLimits : public testing::Test {
+ protected:
+  void SetUp() override {
+    if (::geteuid() != 0) GTEST_SKIP() << "only root can become another user";
+    configure("max_clients_per_user = 2");
+    daemon_.emplace(
+        std::vector<std::string>{"--config", path_, "--socket-mode", "0666", "--listen", ""});
+    ASSERT_EQ(::chmod(daemon_->runtime_dir().c_str(), 0755), 0);
+  }
+  void TearDown() override {
+    daemon_.reset();
+    remove_tree(dir_);
+  }
+
+  void configure(const std::string& line) { std::ofstream(path_) << line << "\n"; }
+
+  // Connects as nobody: what counts is the user at that moment.
+  RawClient client_of_nobody(bool greet = true) {
+    EXPECT_EQ(::seteuid(kNobody), 0);
+    RawClient client(daemon_->socket_path(), greet);
+    EXPECT_EQ(::seteuid(0), 0);
+    return client;
+  }
+  RawClient client_of_root() { return RawClient(daemon_->socket_path()); }
+
+  // The failure that it gets at once; empty: it gets an answer.
+  std::string refusal() {
+    RawClient client = client_of_nobody(false);
+    local::Request hello;
+    hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
+    client.send(hello);
+    return client.receive().response.failure().message();
+  }
+
+  // As GetDaemon shows it.
+  local::LimitUse limit(const std::string& name) {
+    local::Request request;
+    request.mutable_get_daemon();
+    const local::Response response = client_of_root().ask(request).response;
+    for (const local::LimitUse& one : response.daemon().limits()) {
+      if (one.name() == name) return one;
+    }
+    ADD_FAILURE() << "no limit is called " << name;
+    return {};
+  }
+
+  std::string dir_ = make_temp_dir();
+  std::string path_ = dir_ + "/dssmd.conf";
+  std::optional<DaemonProcess> daemon_;
+};
+
+TEST_F(UserLimits, OnClientsAreNamedToOneUserAndDoNotConcernRoot) {
+  RawClient one = client_of_nobody();
+  {
+    RawClient two = client_of_nobody();
+    const std::string refused = refusal();
+    EXPECT_NE(refused.find("max_clients_per_user = 2 programs of user 65534"), std::string::npos)
+        << refused;
+    std::vector<RawClient> others;
+    for (int i = 0; i < 4; ++i) others.push_back(client_of_root());
+    EXPECT_TRUE(others.back().ask(list_request()).response.has_stream_list());
+    EXPECT_EQ(limit("max_clients_per_user").used(), 2U);
+    // Two, four, and the one that asks.
+    EXPECT_TRUE(eventually([&] { return limit("max_clients").used() == 7; }));
+  }
+  EXPECT_TRUE(eventually([&] { return refusal().empty(); })) << "a place of one that has ended";
+}
+
+TEST_F(UserLimits, OnClientsChangeAtAReload) {
+  RawClient one = client_of_nobody(), two = client_of_nobody();
+  EXPECT_NE(refusal(), "");
+  configure("max_clients_per_user = 3");
+  ASSERT_EQ(::kill(daemon_->pid(), SIGHUP), 0);
+  EXPECT_TRUE(eventually([&] { return refusal().empty(); }));
+}
+
+TEST_F(UserLimits, OnLongRequestsLeaveMemoryForOthers) {
+  configure("");
+  ASSERT_EQ(::kill(daemon_->pid(), SIGHUP), 0);
+  ASSERT_TRUE(eventually([&] { return limit("max_clients_per_user").limit() == 2048; }));
+  ASSERT_TRUE(client_of_root().ask(create_request("map")).response.has_opened());
+  // A request of 17 MiB without its last byte takes 32 MiB: dssmd's buffer doubles.
+  std::string unfinished("\x80\x80\xc0\x08", 4);
+  unfinished.resize(unfinished.size() + wire::kMaxLocalFrameBytes - 1, 'x');
+  std::vector<RawClient> begun;
+  for (int i = 0; i < 4; ++i) {
+    begun.push_back(client_of_nobody());
+    begun.back().send_bytes(unfinished);
+  }
+  EXPECT_TRUE(eventually([&] { return limit("long requests of one user").used() == 128U << 20; }));
+  EXPECT_EQ(limit("long requests").used(), 128U << 20);
+  RawClient next = client_of_nobody();
+  next.send_bytes(unfinished);
+  const Answer refused = next.receive();
+  EXPECT_EQ(refused.response.failure().code(), "limit_exceeded");
+  EXPECT_NE(refused.response.failure().message().find(
+                "programs of user 65534 have begun requests that take up to 134217728 bytes"),
+            std::string::npos)
+      << refused.response.failure().message();
+  local::Request property;
+  property.mutable_set_property()->mutable_id()->set_name("map");
+  property.mutable_set_property()->set_property(std::string(16U << 20, 'p'));
+  EXPECT_TRUE(client_of_root().ask(property).response.has_done());
+}
+
+}  // namespace
+}  // namespace dssm::test
