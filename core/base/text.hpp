@@ -26,8 +26,9 @@ constexpr bool is_letter_or_digit(char c) noexcept {
 
 bool has_control(std::string_view text) noexcept;
 
-// `text` with a '?' for each control character, each mark that changes the direction of writing, and
-// each byte that is no UTF-8: a name chosen by a client cannot forge lines of a log or a terminal.
+// `text` with a '?' for each control character, each mark that changes the direction of writing,
+// and each byte that is no UTF-8: a name chosen by a client cannot forge lines of a log or a
+// terminal.
 std::string printable(std::string_view text);
 
 // The same in single quotes, as messages show it.

@@ -280,7 +280,7 @@ void LocalRequests::ask_hosts_untrusted(const Client& client, const local::Reque
   if (request.has_open()) return open_elsewhere(client, id, request.open(), std::move(answer));
   fleet_->forward(id, request, [answer = std::move(answer)](Result<local::Response> response) {
     if (!response) return answer(std::move(response).error());
-    answer(Reply{*std::move(response), {}});
+    answer(Reply{*std::move(response), {}, {}});
   });
 }
 

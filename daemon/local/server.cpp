@@ -110,7 +110,7 @@ Listener::~Listener() {
 // --- one connection
 
 Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
-                       LocalService& service, MemoryBudget& input_budget, UserAccount& user,
+                       LocalService& service, MemoryBudget& messages, UserAccount& user,
                        Logger& logger, std::function<void()> on_closed)
     : socket_(std::move(socket)),
       service_(service),
@@ -118,7 +118,7 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
       on_closed_(std::move(on_closed)),
       number_(service.connect(identity, *this)),
       input_(wire::kMaxLocalFrameBytes),
-      input_budget_(input_budget),
+      messages_(messages),
       user_(user),
       readable_(EventSource::readable(loop, socket_.get(),
                                       [this] { guarded([this] { on_readable(); }); })),
@@ -162,31 +162,45 @@ void Connection::on_readable() {
   if (charge_input() && take_descriptors(std::move(descriptors))) serve_frames();
 }
 
+// False: so much is not left, and `share` has nothing.
+bool Connection::charge(std::size_t bytes, Share& share) {
+  if (bytes <= wire::FrameBuffer::kKeptBytes) bytes = 0;
+  if (bytes == share.of_all.bytes()) return true;
+  share = {};
+  std::optional<MemoryShare> of_all = messages_.try_take(bytes);
+  std::optional<MemoryShare> of_user = user_.messages.try_take(bytes);
+  if (!of_all || !of_user) return false;
+  share = {*std::move(of_all), *std::move(of_user)};
+  return true;
+}
+
+Error Connection::no_memory_for(std::string_view what) const {
+  const bool is_users = user_.is_limited && user_.messages.used() * 2 > user_.messages.limit();
+  return {Errc::limit_exceeded,
+          fmt::format("no memory is left to {}: long requests that programs of {} have begun, and "
+                      "answers that they have not received, take up to {} bytes; try again later",
+                      what, is_users ? fmt::format("user {}", user_.uid) : "this PC",
+                      (is_users ? user_.messages : messages_).limit())};
+}
+
 bool Connection::charge_input() {
-  const std::size_t bytes =
-      input_.capacity() > wire::FrameBuffer::kKeptBytes ? input_.capacity() : 0;
-  if (bytes == input_share_.bytes()) return true;
-  if (bytes == 0) {
-    request_timeout_.disable();
-  } else if (input_share_.bytes() == 0) {
-    request_timeout_.enable_in(kLongRequestTimeout);
-  }
-  input_share_ = {};
-  users_input_share_ = {};
-  std::optional<MemoryShare> of_all = input_budget_.try_take(bytes);
-  std::optional<MemoryShare> of_user = user_.input_budget.try_take(bytes);
-  if (of_all && of_user) {
-    input_share_ = *std::move(of_all);
-    users_input_share_ = *std::move(of_user);
-    return true;
-  }
-  const bool is_users = !of_user && user_.is_limited;
-  end_with({Errc::limit_exceeded,
-            fmt::format("no memory is left to receive a request of more than {} bytes: the "
-                        "programs of {} have begun requests that take up to {} bytes; try again "
-                        "later",
-                        bytes / 2, is_users ? fmt::format("user {}", user_.uid) : "this PC",
-                        (is_users ? user_.input_budget : input_budget_).limit())});
+  const bool was_long = input_share_.of_all.bytes() > 0;
+  const bool has_memory = charge(input_.capacity(), input_share_);
+  const bool is_long = input_share_.of_all.bytes() > 0;
+  if (!is_long) request_timeout_.disable();
+  if (is_long && !was_long) request_timeout_.enable_in(kLongRequestTimeout);
+  if (!has_memory) end_with(no_memory_for("receive a long request"));
+  return has_memory;
+}
+
+// Ends the connection when there is no memory for what waits for the program.
+bool Connection::charge_output() {
+  if (queued_bytes_ <= kMaxQueuedBytes && charge(queued_bytes_, output_share_)) return true;
+  logger_.warning(
+      fmt::format("close a connection: the program does not read, and {} bytes wait for it",
+                  queued_bytes_),
+      {.message_id = message_id::kClientRefused});
+  close();
   return false;
 }
 
@@ -232,12 +246,7 @@ void Connection::send(std::string bytes, std::vector<UniqueFd> descriptors) {
   queued_bytes_ += outgoing.bytes.size();
   queued_descriptors_ += outgoing.descriptors.size();
   output_.push_back(std::move(outgoing));
-  if (queued_bytes_ <= kMaxQueuedBytes) return;
-  logger_.warning(
-      fmt::format("close a connection: the program does not read, and {} bytes wait for it",
-                  queued_bytes_),
-      {.message_id = message_id::kClientRefused});
-  close();
+  charge_output();
 }
 
 // False when the connection ended over it.
@@ -267,6 +276,7 @@ void Connection::on_writable() {
     output_.pop_front();
   }
   if (output_.empty()) writable_.disable();
+  charge(queued_bytes_, output_share_);
   // Whole frames may be waiting in input_; for them the socket does not become readable.
   if (!is_paused()) next_turn_.enable_in(Duration::zero());
 }
@@ -290,6 +300,8 @@ void Connection::close() {
   socket_.reset();
   output_.clear();
   arrived_.clear();
+  input_share_ = {};
+  output_share_ = {};
   service_.disconnect(number_);
   on_closed_();
 }
@@ -313,13 +325,13 @@ void Server::add_limits(LimitUses& out) const {
   for (const auto& [uid, user] : users_) {
     if (!user.is_limited) continue;
     clients = std::max(clients, user.clients);
-    bytes = std::max(bytes, user.input_budget.used());
+    bytes = std::max(bytes, user.messages.used());
   }
   const std::uint64_t connected = connections_.size() - ended_.size();
   out.push_back({"max_clients", connected, limits_.max_clients, "programs"});
   out.push_back({"max_clients_per_user", clients, limits_.max_clients_per_user, "programs"});
-  out.push_back({"long requests", input_budget_.used(), input_budget_.limit(), "bytes"});
-  out.push_back({"long requests of one user", bytes, kMaxInputBytesPerUser, "bytes"});
+  out.push_back({"long messages", messages_.used(), messages_.limit(), "bytes"});
+  out.push_back({"long messages of one user", bytes, kMaxMessageBytesPerUser, "bytes"});
 }
 
 Result<void> Server::accept(UniqueFd& socket) {
@@ -357,9 +369,9 @@ void Server::keep(UniqueFd socket, const Identity& identity, UserAccount& user) 
     ended_.push_back(number);
     sweep_.enable_in(Duration::zero());
   };
-  connections_.emplace(number,
-                       std::make_unique<Connection>(loop_, std::move(socket), identity, service_,
-                                                    input_budget_, user, logger_, on_closed));
+  connections_.emplace(
+      number, std::make_unique<Connection>(loop_, std::move(socket), identity, service_, messages_,
+                                           user, logger_, on_closed));
   ++user.clients;
 }
 

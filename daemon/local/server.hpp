@@ -84,10 +84,11 @@ inline constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
 // For the Hello of a program.
 inline constexpr Duration kLocalHelloTimeout = std::chrono::seconds(10);
 
-// Memory for the long requests that all clients, and those of one user, have begun to send, and the
-// time for one of them: then the memory is free again. A property may have 16 MiB.
-inline constexpr std::size_t kMaxInputBytes = 256U << 20;
-inline constexpr std::size_t kMaxInputBytesPerUser = kMaxInputBytes / 2;
+// Memory for long messages of all clients, and of those of one user: requests that they have begun
+// to send, and what waits for them to be received. A property may have 16 MiB.
+inline constexpr std::size_t kMaxMessageBytes = 256U << 20;
+inline constexpr std::size_t kMaxMessageBytesPerUser = kMaxMessageBytes / 2;
+// For the rest of a long request: then its memory is free again.
 inline constexpr Duration kLongRequestTimeout = std::chrono::seconds(10);
 
 // What one user's programs take, so that those of one cannot keep out those of others. root, and
@@ -96,11 +97,11 @@ struct UserAccount {
   explicit UserAccount(uid_t user)
       : uid(user),
         is_limited(user != 0 && user != ::geteuid()),
-        input_budget(is_limited ? kMaxInputBytesPerUser : kMaxInputBytes) {}
+        messages(is_limited ? kMaxMessageBytesPerUser : kMaxMessageBytes) {}
   const uid_t uid;
   const bool is_limited;
   std::uint64_t clients = 0;
-  MemoryBudget input_budget;
+  MemoryBudget messages;  // memory for long ones
 };
 
 // One client's socket: cuts its bytes into frames for LocalService and sends the responses. It
@@ -108,10 +109,11 @@ struct UserAccount {
 // then the connection is closed; an error closes this connection only.
 class Connection final : public ClientOutput {
  public:
-  // input_budget: of all clients. on_closed: called once, when the connection ended by itself; the
-  // connection must not be destroyed within it.
+  //   messages   memory for long ones, of all clients
+  //   on_closed  called once, when the connection ended by itself; the connection must not be
+  //              destroyed within it
   Connection(const EventLoop& loop, UniqueFd socket, const Identity& identity,
-             LocalService& service, MemoryBudget& input_budget, UserAccount& user, Logger& logger,
+             LocalService& service, MemoryBudget& messages, UserAccount& user, Logger& logger,
              std::function<void()> on_closed);
   Connection(const Connection&) = delete;
   Connection& operator=(const Connection&) = delete;
@@ -131,7 +133,14 @@ class Connection final : public ClientOutput {
   void on_readable();
   void on_writable();
   void serve_frames();
+  // Memory for long messages, of all clients and of the user.
+  struct Share {
+    MemoryShare of_all, of_user;
+  };
+  bool charge(std::size_t bytes, Share& share);
   bool charge_input();
+  bool charge_output();
+  Error no_memory_for(std::string_view what) const;
   bool take_descriptors(std::vector<UniqueFd> arrived);
   bool send_some(Outgoing& outgoing);
   void end_with(const Error& error);
@@ -147,9 +156,9 @@ class Connection final : public ClientOutput {
   std::function<void()> on_closed_;
   ClientNumber number_;
   wire::FrameBuffer input_;
-  MemoryBudget& input_budget_;
+  MemoryBudget& messages_;
   UserAccount& user_;
-  MemoryShare input_share_, users_input_share_;
+  Share input_share_, output_share_;
   DescriptorQueue arrived_;
   std::deque<Outgoing> output_;
   std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
@@ -181,7 +190,7 @@ class Server {
   const EventLoop& loop_;
   Limits limits_;
   LocalService& service_;
-  MemoryBudget input_budget_{kMaxInputBytes};
+  MemoryBudget messages_{kMaxMessageBytes};
   Logger& logger_;
   std::uint64_t next_ = 0;
   std::map<uid_t, UserAccount> users_;  // before the connections, which hold shares of the budgets

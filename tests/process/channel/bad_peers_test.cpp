@@ -258,10 +258,14 @@ TEST_F(BadPeer, TwentyThousandOfAllKindsLeaveNothingBehind) {
     const Result<UniqueFd> program = wire::connect_unix(daemon_.socket_path());
     ASSERT_TRUE(program) << program.error().message;
     misuse(program->get(), random, local_hello);
-    if (i % 1000 == 0) EXPECT_TRUE(good_.ask(list_frame()).has_stream_list());
+    if (i % 1000 == 0) {
+      EXPECT_TRUE(good_.ask(list_frame()).has_stream_list());
+    }
   }
   EXPECT_TRUE(eventually([&] { return open_descriptors(daemon_.pid()) == descriptors_; }));
-  if (kMemoryIsMeasurable) EXPECT_LT(private_memory(daemon_.pid()), after_half + 4 * kMiB);
+  if (kMemoryIsMeasurable) {
+    EXPECT_LT(private_memory(daemon_.pid()), after_half + 4 * kMiB);
+  }
 }
 
 TEST(BadPeers, AreCounted) {

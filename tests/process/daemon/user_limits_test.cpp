@@ -103,20 +103,36 @@ TEST_F(UserLimits, OnLongRequestsLeaveMemoryForOthers) {
     begun.push_back(client_of_nobody());
     begun.back().send_bytes(unfinished);
   }
-  EXPECT_TRUE(eventually([&] { return limit("long requests of one user").used() == 128U << 20; }));
-  EXPECT_EQ(limit("long requests").used(), 128U << 20);
+  EXPECT_TRUE(eventually([&] { return limit("long messages of one user").used() == 128U << 20; }));
+  EXPECT_EQ(limit("long messages").used(), 128U << 20);
   RawClient next = client_of_nobody();
   next.send_bytes(unfinished);
   const Answer refused = next.receive();
   EXPECT_EQ(refused.response.failure().code(), "limit_exceeded");
   EXPECT_NE(refused.response.failure().message().find(
-                "programs of user 65534 have begun requests that take up to 134217728 bytes"),
+                "programs of user 65534 have begun, and answers that they have not received, take "
+                "up to 134217728 bytes"),
             std::string::npos)
       << refused.response.failure().message();
   local::Request property;
   property.mutable_set_property()->mutable_id()->set_name("map");
   property.mutable_set_property()->set_property(std::string(16U << 20, 'p'));
   EXPECT_TRUE(client_of_root().ask(property).response.has_done());
+}
+
+TEST_F(UserLimits, OnMemoryCountWhatIsNotReceived) {
+  ASSERT_TRUE(client_of_root().ask(create_request("map")).response.has_opened());
+  local::Request property;
+  property.mutable_set_property()->mutable_id()->set_name("map");
+  property.mutable_set_property()->set_property(std::string(16U << 20, 'p'));
+  ASSERT_TRUE(client_of_root().ask(property).response.has_done());
+  property.mutable_get_property()->mutable_id()->set_name("map");
+  {
+    RawClient silent = client_of_nobody();
+    silent.send(property);
+    EXPECT_TRUE(eventually([&] { return limit("long messages of one user").used() > 15U << 20; }));
+  }
+  EXPECT_TRUE(eventually([&] { return limit("long messages of one user").used() == 0; }));
 }
 
 }  // namespace

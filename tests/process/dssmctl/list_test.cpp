@@ -202,14 +202,14 @@ TEST_F(Info, ShowsHowMuchOfEachLimitIsUsed) {
   // The test, and dssmctl itself.
   EXPECT_EQ(limit("max_clients"), counted("max_clients", 2, 4096, "programs"));
   EXPECT_EQ(limit("max_clients_per_user")["limit"], 2048);
-  EXPECT_EQ(limit("long requests"), counted("long requests", 0, 256 << 20, "bytes"));
+  EXPECT_EQ(limit("long messages"), counted("long messages", 0, 256 << 20, "bytes"));
   EXPECT_EQ(limit("max_connections"), counted("max_connections", 0, 256, "connections"));
   EXPECT_EQ(limit("max_peer_memory"), counted("max_peer_memory", 0, 96 << 20, "bytes"));
   EXPECT_EQ(info["limits"].size(), 11U);
   const std::string text = output({"info"});
   EXPECT_TRUE(std::regex_search(text, std::regex("\nLIMIT +USED +OF +UNIT\n"))) << text;
   EXPECT_TRUE(std::regex_search(text, std::regex("\nmax_streams +1 +4096 +streams\n"))) << text;
-  EXPECT_TRUE(std::regex_search(text, std::regex("\nlong requests +0 bytes +256.* MiB\n"))) << text;
+  EXPECT_TRUE(std::regex_search(text, std::regex("\nlong messages +0 bytes +256.* MiB\n"))) << text;
 }
 
 }  // namespace

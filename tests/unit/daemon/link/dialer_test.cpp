@@ -214,12 +214,9 @@ TEST_F(DialerTest, LeavesAnAttemptThatWaitsForAnAnswerWhenTheNetworkChanged) {
   timer.enable_in(Dialer::kMinRound);
   wait([&] { return up || is_old; });
   EXPECT_FALSE(up);
-  bool timed_out = false;
-  EventSource timeout = EventSource::timer(loop, [&] { timed_out = true; });
-  timeout.enable_in(channel::ConnectPlan::kConnectTimeout - Dialer::kMinRound);
   dialer->on_network_changed();
-  wait([&] { return up || timed_out; });
-  EXPECT_TRUE(up);
+  // No timer runs here, so nothing times out. The name is resolved by a thread, in real time.
+  while (!up) event_base_loop(loop.base(), EVLOOP_ONCE);
   EXPECT_TRUE(downs.empty());
 }
 
