@@ -65,6 +65,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
           [this] {
             link_.close_with({Errc::protocol, peer() + " connected and sent no Hello for 3 s"});
           })),
+      idle_timeout_(EventSource::timer(parts.loop, [this] { check_idle(); })),
       peer_timeout_(EventSource::timer(parts.loop, [this] { check_peer_timeout(); })) {
   link_.set_budget(place_.budget());
   link_.take_requests_only();
@@ -136,6 +137,7 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
   identity_.program = them_->program;
   DSSM_TRY(parts_.rights.check(identity_, Action::greet, {}));
   greeting_timeout_.disable();
+  idle_timeout_.enable_in(kIdleTimeout);
   net::Frame hello;
   wire::to_message(parts_.self, *hello.mutable_hello());
   link_.send(hello);
@@ -203,6 +205,7 @@ Result<void> DataCommunicator::dispatch(const net::Frame& request) {
     RawTime received = RawClock::now();
     if (parts_.self.clock) received = parts_.self.clock->line.arrival(link_.arrived(), received);
     peer_timeout_.enable_in(wire::kPeerTimeout);
+    idle_timeout_.disable();
     if (parts_.clock) parts_.clock->clock_generation();  // so that the report is of now
     net::Frame pong;
     pong.set_serial(request.serial());
@@ -323,6 +326,7 @@ Result<void> DataCommunicator::go_on_opening() {
     }
   }
   const Opening opening = *std::exchange(opening_, std::nullopt);
+  idle_timeout_.disable();
   channel_ = std::make_unique<StreamChannel>(
       StreamChannel::Parts{parts_.loop, catalog_, link_, place_.budget(), *this, parts_.self,
                            *them_, parts_.clock, parts_.sending},
@@ -381,6 +385,18 @@ void DataCommunicator::check_peer_timeout() {
                                                    silent / std::chrono::milliseconds(1))});
 }
 
+void DataCommunicator::check_idle() {
+  const Duration silent = parts_.loop.now() - link_.last_heard();
+  const bool is_busy = opening_ || waiting_ || !link_.output_empty();
+  if (is_busy || silent < kIdleTimeout) {
+    return idle_timeout_.enable_in(is_busy ? kIdleTimeout : kIdleTimeout - silent);
+  }
+  link_.close_with({Errc::unavailable,
+                    fmt::format("{} has no channel, and sent neither heartbeats nor requests for "
+                                "{} s",
+                                peer(), kIdleTimeout / std::chrono::seconds(1))});
+}
+
 // --- what happens to streams
 
 void DataCommunicator::on_stream_added(const Stream& stream) {
@@ -397,6 +413,7 @@ void DataCommunicator::on_stream_removed(const Stream& stream) {
 void DataCommunicator::on_closed(const Error& why) {
   next_turn_.disable();
   greeting_timeout_.disable();
+  idle_timeout_.disable();
   peer_timeout_.disable();
   // Removes a ring whose memory is not fully reserved, unless a program or peer has opened it
   // meanwhile.

@@ -73,6 +73,9 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   // are begun in that time.
   static constexpr int kRequestsPerTurn = 16;
   static constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
+  // How long a connection may be silent that is neither a channel nor has heartbeats: with such ones
+  // anybody could take all places.
+  static constexpr Duration kIdleTimeout = std::chrono::seconds(10);
   // Answers and events that may wait for one connection: the longest answer is a property.
   static constexpr std::size_t kMaxQueuedBytes = wire::kMaxNetworkFrameBytes + (1U << 20);
 
@@ -153,6 +156,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   Result<bool> reserve_some();
   void send_failure(std::uint64_t serial, const Error& error);
   void check_peer_timeout();
+  void check_idle();
   std::string peer() const;
   void log_end(const Error& why);
 
@@ -177,7 +181,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   std::unique_ptr<StreamChannel> channel_;
   std::set<Action> allowed_;  // on the channel
   bool turn_is_due_ = false;
-  EventSource next_turn_, greeting_timeout_, peer_timeout_;
+  EventSource next_turn_, greeting_timeout_, idle_timeout_, peer_timeout_;
 };
 
 }  // namespace dssm::daemon

@@ -108,6 +108,7 @@ Values values_of_the_code() {
       DSSM_COUNT(kMaxStreams),
       DSSM_COUNT(kMaxConnections),
       DSSM_TIME(kLocalHelloTimeout),
+      DSSM_TIME(DataCommunicator::kIdleTimeout),
       DSSM_BYTES(kMaxMessageBytes),
       DSSM_BYTES(kMaxMessageBytesPerUser),
       DSSM_BYTES(kPausingBytes),

@@ -247,6 +247,29 @@ TEST(DataCommunicator, SaysWhenAPingArrivedAndWhenItWasAnswered) {
   EXPECT_LT(pong.received_ns(), to_ns(put + 10ms)) << "not when it was received from the kernel";
 }
 
+// One with a channel, or with heartbeats, stays.
+TEST(DataCommunicator, EndsConnectionsThatDoNothing) {
+  ServerRig rig;
+  rig.create("odometry");
+  MemoryPeer idle, lister, channel;
+  rig.connect(idle);
+  rig.connect(channel);
+  rig.open(channel, "odometry");
+  rig.connect(lister);
+  const MonoTime begin = rig.loop.now();
+  bool is_half = false;
+  EventSource half = EventSource::timer(rig.loop, [&] { is_half = true; });
+  half.enable_in(DataCommunicator::kIdleTimeout / 2);
+  run_until(rig.loop, [&] { return is_half; });
+  EXPECT_TRUE(rig.ask(lister, with_serial(1, list_frame())).has_stream_list());
+  run_until(rig.loop, [&] { return idle.closed; });
+  EXPECT_GE(rig.loop.now() - begin, DataCommunicator::kIdleTimeout);
+  EXPECT_FALSE(lister.closed) << "it asked for something meanwhile";
+  run_until(rig.loop, [&] { return lister.closed; });
+  EXPECT_GE(rig.loop.now() - begin, DataCommunicator::kIdleTimeout * 3 / 2);
+  EXPECT_FALSE(channel.closed);
+}
+
 TEST(DataCommunicator, WaitsForHelloUntilItsTimeout) {
   ServerRig rig;
   MemoryPeer silent, slow;
