@@ -350,9 +350,10 @@ class Dssmd {
     hosts_.clock.set(changed.clocks, changed.max_drift);
     use(changed);
     if (changed.rights != rights_.lines()) {
+      const Rights before(rights_.lines());
       rights_.set(changed.rights);
-      local_.on_new_rights();
-      channels_.on_new_rights();
+      local_.on_new_rights(before);
+      channels_.on_new_rights(before);
     }
   }
 

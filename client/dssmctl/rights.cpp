@@ -51,7 +51,7 @@ Result<void> run(const RightsOptions& options, Output& out) {
     return {};
   }
   if (!rights.restricted) {
-    out.add("everybody may do everything: dssmd's key 'rights' has no lines\n");
+    out.add("every program and host may do everything: dssmd's key 'rights' has no lines\n");
     return {};
   }
   if (rights.lines.empty()) {

@@ -114,7 +114,7 @@ bool ReaderState::restart() noexcept {
   auto newer = client.open_reader(stream->requested, stream->tag, stream->history);
   if (!newer) {
     if (newer.error().code == Errc::no_permission) {
-      next_attempt_ns = INT64_MAX;
+      next_attempt_ns = to_ns((now + kRefusedPause).time_since_epoch());
       restart_error =
           std::move(newer).error().context("continue to read '" + stream->requested.str() + "'");
     }
@@ -126,7 +126,13 @@ bool ReaderState::restart() noexcept {
                                                       (*newer)->id.str() + "'");
     return false;
   }
-  if ((*newer)->ring == stream->ring) return false;  // dssmd has no new ring yet
+  restart_error.reset();
+  if ((*newer)->ring == stream->ring) {
+    // dssmd has no new ring yet, or had ended the open of this one.
+    const std::lock_guard guard(stream_mutex);
+    stream = *std::move(newer);
+    return false;
+  }
   // A mirror that dssmd recreated has the same samples with the same tids: not a restart.
   const bool same_samples = (*newer)->ring->mapping->identity().incarnation ==
                             stream->ring->mapping->identity().incarnation;

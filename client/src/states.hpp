@@ -16,8 +16,10 @@
 
 namespace dssm::detail {
 
-// How long a reader waits before it tries again to open the ring that superseded its own.
+// How long a reader waits before it tries again to open the ring that superseded its own; longer
+// when it may not read the stream.
 inline constexpr Duration kRestartPause = std::chrono::milliseconds(200);
+inline constexpr Duration kRefusedPause = std::chrono::seconds(1);
 
 // A program that repeats a read of a sample that is still to come asks for it at most so often.
 inline constexpr Duration kHistoryPause = std::chrono::milliseconds(50);

@@ -245,10 +245,23 @@ std::string without_property_untrusted(Bytes message, std::string_view& property
     return text(message.data(), end);
   }
   property = {reinterpret_cast<const char*>(content.data()), content.size()};
-  // The lengths before `set` and `content` are replaced by shorter ones.
+  // The lengths before `set` and `content` are replaced by shorter ones, if each is as short as it
+  // can be.
   std::byte lengths[kMaxVarintBytes];
-  const std::byte* const before_set = set.data() - varint_bytes(set.size());
-  const std::byte* const before_content = content.data() - varint_bytes(content.size());
+  const auto length_of = [&](Bytes inside) {
+    const std::byte* const end_of_length = write_varint(lengths, inside.size());
+    const std::byte* const begin = inside.data() - (end_of_length - lengths);
+    return std::equal(begin, inside.data(), lengths) &&
+                   (begin[-1] & std::byte{0x80}) == std::byte{0}
+               ? begin
+               : nullptr;
+  };
+  const std::byte* const before_set = length_of(set);
+  const std::byte* const before_content = length_of(content);
+  if (!before_set || !before_content) {
+    property = {};
+    return text(message.data(), end);
+  }
   const std::size_t rest = set.size() - content.size() - varint_bytes(content.size()) + 1;
   std::string out = text(message.data(), before_set);
   out += text(lengths, write_varint(lengths, rest));

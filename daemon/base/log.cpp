@@ -116,8 +116,7 @@ void RateLimitedLogger::write(LogLevel level, std::string_view text,
   if (!lines) return;
   if (*lines == 1) return to_.write(level, text, fields);
   to_.write(level,
-            fmt::format("{} ({} lines about other hosts before this one were left out)", text,
-                        *lines - 1),
+            fmt::format("{} ({} such lines before this one were left out)", text, *lines - 1),
             fields);
 }
 

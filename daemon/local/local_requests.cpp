@@ -378,6 +378,11 @@ Reply LocalRequests::record_open(const OpenEntry& entry) {
 //   fails  limit_exceeded (opens), os errors; then nothing is recorded
 Result<Reply> LocalRequests::opened(const OpenEntry& entry) {
   DSSM_TRY(opens_.check_quota(*entry.client));
+  // Another host may have answered after a reload of the rights.
+  DSSM_TRY(rights_.check(
+      *entry.client,
+      entry.role == Role::writer ? Action::open_for_writing : Action::open_for_reading,
+      entry.stream->id()));
   std::vector<UniqueFd> descriptors =
       DSSM_TRY(entry.stream->descriptors_for(entry.role, entry.client->number));
   Reply reply = record_open(entry);

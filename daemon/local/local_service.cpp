@@ -20,8 +20,13 @@ constexpr std::size_t kMaxCopiedBytes = 64U << 10;
 
 // For a request that is kept or goes to another host.
 void take_back_property(local::Request& request, Attachments& attached) {
-  if (attached.property.empty()) return;
+  if (attached.property.empty() || !request.has_set_property()) return;
   request.mutable_set_property()->set_property(std::string(std::exchange(attached.property, {})));
+}
+
+StreamId id_of(const proto::StreamEvent& event) {
+  const proto::StreamId& id = event.stream().id();
+  return {id.name(), id.id(), id.host()};
 }
 
 local::Response failure_response(std::uint64_t serial, const Error& error) {
@@ -40,6 +45,7 @@ LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOw
       clock_(clock),
       rights_(rights),
       logger_(logger),
+      refusals_(logger),
       requests_(registry, opens, clock, rights, fleet),
       fleet_(fleet),
       recovering_(recovering) {
@@ -120,14 +126,32 @@ Result<void> LocalService::check_access(const Client& client, const local::Reque
   if (const proto::StreamId* named = LocalRequests::subject(request)) {
     stream = {named->name(), named->id(), named->host()};
   }
-  Result<void> checked = rights_.check(*client.identity, *action, stream);
+  // An existing stream is only opened; a program that could not get memory for its new stream
+  // removes it.
+  const bool is_opened = *action == Action::create && exists(stream);
+  if (*action == Action::remove && is_only_user(client, stream)) return {};
+  Result<void> checked =
+      rights_.check(*client.identity, is_opened ? Action::open_for_writing : *action, stream);
   if (!checked) {
-    logger_.warning("refuse a request: " + checked.error().message,
-                    {.stream = stream.str(),
-                     .peer = client.identity->str(),
-                     .message_id = message_id::kRequestRefused});
+    refusals_.warning("refuse a request: " + checked.error().message,
+                      {.stream = stream.str(),
+                       .peer = client.identity->str(),
+                       .message_id = message_id::kRequestRefused});
   }
   return checked;
+}
+
+bool LocalService::exists(const StreamId& id) const {
+  return registry_.knows(id) || (fleet_ && fleet_->is_there(id));
+}
+
+bool LocalService::is_only_user(const Client& client, const StreamId& id) const {
+  const Result<std::shared_ptr<Stream>> stream = registry_.find(id);
+  if (!stream) return false;
+  const OpenTable::Counts counts = opens_.counts(**stream);
+  return counts.writers == 1 && counts.readers == 0 && (*stream)->channels() == 0 &&
+         (*stream)->creator_pid() == client.identity->pid &&
+         opens_.is_writing(**stream, client.identity->number);
 }
 
 bool LocalService::refuse(const Client& client, std::uint64_t serial, const Error& error) {
@@ -232,7 +256,10 @@ void LocalService::log_offer(const ClientIdentity& client, const local::Offer& o
 // which were not among them do not exist any more. All at once, unlike StreamWatch of other hosts:
 // the output of a program is bounded by kMaxQueuedBytes.
 void LocalService::watch(ClientNumber number, std::uint64_t serial) {
-  if (!send_events(number, added_events())) return;
+  std::vector<proto::StreamEvent> events = added_events();
+  std::erase_if(
+      events, [&](const proto::StreamEvent& event) { return !shows(clients_.at(number), event); });
+  if (!send_events(number, events)) return;
   Client& client = clients_.at(number);
   client.watching = true;
   Reply done;
@@ -254,16 +281,14 @@ std::vector<proto::StreamEvent> LocalService::added_events() const {
 }
 
 bool LocalService::shows(const Client& client, const proto::StreamEvent& event) const {
-  const proto::StreamId& id = event.stream().id();
-  return rights_.shows(*client.identity, {id.name(), id.id(), id.host()});
+  return rights_.shows(*client.identity, id_of(event));
 }
 
-// Those that the client may see. False when it is disconnected by then.
+// False when the client is disconnected by then.
 bool LocalService::send_events(ClientNumber number, const std::vector<proto::StreamEvent>& events) {
   for (const proto::StreamEvent& event : events) {
     const auto client = clients_.find(number);  // sending may end the connection
     if (client == clients_.end()) return false;
-    if (!shows(client->second, event)) continue;
     Reply reply;
     *reply.response.mutable_stream_event() = event;
     send(client->second, 0, std::move(reply));
@@ -379,7 +404,7 @@ bool LocalService::is_gone(const Stream& stream) const {
 
 // --- new rights
 
-void LocalService::on_new_rights() {
+void LocalService::on_new_rights(const Rights& before) {
   const std::map<OpenNumber, OpenEntry> opens = opens_.entries();  // sending may end opens
   for (const auto& [number, open] : opens) {
     const Action action =
@@ -396,24 +421,20 @@ void LocalService::on_new_rights() {
     if (open.role == Role::reader) notify_replaced({open.client->number, number, open.any_host});
     static_cast<void>(opens_.remove(open.client->number, number));  // sending may have ended it
   }
-  std::vector<ClientNumber> watchers;
+  std::vector<ClientNumber> watchers;  // sending may end connections
   for (const auto& [number, client] : clients_) {
     if (client.watching) watchers.push_back(number);
   }
   const std::vector<proto::StreamEvent> events = added_events();
   for (const ClientNumber number : watchers) {
-    // What a client knows already changes nothing, nor does the removal of what it does not know.
+    std::vector<proto::StreamEvent> changes;
     for (const proto::StreamEvent& event : events) {
-      const auto client = clients_.find(number);
-      if (client == clients_.end() || shows(client->second, event)) continue;
-      Reply reply;
-      proto::StreamEvent& removed = *reply.response.mutable_stream_event();
-      removed.set_removed(true);
-      *removed.mutable_stream()->mutable_id() = event.stream().id();
-      removed.mutable_stream()->set_incarnation(event.stream().incarnation());
-      send(client->second, 0, std::move(reply));
+      const StreamId id = id_of(event);
+      const bool is_shown = shows(clients_.at(number), event);
+      if (is_shown == before.shows(*clients_.at(number).identity, id)) continue;
+      changes.push_back(is_shown ? event : removed_event(id, event.stream().incarnation()));
     }
-    send_events(number, events);
+    send_events(number, changes);
   }
 }
 

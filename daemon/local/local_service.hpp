@@ -82,10 +82,10 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   bool on_frame_untrusted(ClientNumber number, std::span<const std::byte> frame,
                           DescriptorQueue& descriptors);
 
-  // The rights have changed: ends opens that are not allowed any more, so that mirrors and remote
-  // writers end, too; their readers reopen, and are told why they may not. Watches show what they
-  // may see now.
-  void on_new_rights();
+  // The rights have changed: ends opens that are not allowed any more. Their readers reopen, and
+  // get the failure that says why they may not. Mirrors and remote writers end that no other
+  // program has open. Watches show what they may see now.
+  void on_new_rights(const Rights& before);
 
   // The time to offer streams is over: deferred requests are answered.
   void end_recovery();
@@ -107,6 +107,8 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
 
   bool refuse(const Client& client, std::uint64_t serial, const Error& error);
   Result<void> check_access(const Client& client, const local::Request& request);
+  bool exists(const StreamId& id) const;
+  bool is_only_user(const Client& client, const StreamId& id) const;
   bool greet(Client& client, std::uint64_t serial, const proto::Hello& hello);
   void serve(ClientNumber number, const local::Request& request, const Attachments& attached);
   LocalRequests::Answer await(ClientNumber number, std::uint64_t serial);
@@ -139,7 +141,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   OpenTable& opens_;
   PlaybackClockOwner& clock_;
   const Rights& rights_;
-  RateLimitedLogger logger_;
+  RateLimitedLogger logger_, refusals_;
   LocalRequests requests_;
   Fleet* fleet_;
   bool recovering_;

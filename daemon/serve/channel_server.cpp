@@ -145,8 +145,8 @@ void ChannelServer::keep(PeerPlace place, std::unique_ptr<wire::Transport> trans
   communicators_.emplace(key, std::move(communicator));
 }
 
-void ChannelServer::on_new_rights() {
-  for (const auto& [key, communicator] : communicators_) communicator->on_new_rights();
+void ChannelServer::on_new_rights(const Rights& before) {
+  for (const auto& [key, communicator] : communicators_) communicator->on_new_rights(before);
 }
 
 void ChannelServer::send_clock() {

@@ -58,8 +58,9 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   // The own credentials were replaced: ends connections of peers that they do not accept.
   void on_new_credentials();
 
-  // The rights have changed: ends channels that are not allowed any more.
-  void on_new_rights();
+  // The rights have changed: ends channels that are not allowed any more; watches show what their
+  // peers may see now.
+  void on_new_rights(const Rights& before);
 
   // This host's clock has a new generation: notifies the hosts that are connected.
   void send_clock();

@@ -150,9 +150,9 @@ void DataCommunicator::on_new_credentials(const wire::TlsCredentials& credential
   if (Result<void> checked = credentials.check(*peer); !checked) close_with(checked.error());
 }
 
-void DataCommunicator::on_new_rights() {
+void DataCommunicator::on_new_rights(const Rights& before) {
   if (watch_) {
-    watch_->on_new_rights();
+    watch_->on_new_rights([&](const StreamId& stream) { return before.shows(identity_, stream); });
     work_soon();
   }
   if (!channel_) return;
@@ -188,7 +188,9 @@ Result<void> DataCommunicator::check_access(const net::Frame& request) {
   } else if (const proto::StreamId* named = subject(request)) {
     stream = {named->name(), named->id(), named->host()};
   }
-  if (Result<void> checked = parts_.rights.check(identity_, *action, stream); !checked) {
+  const bool exists = *action == Action::create && parts_.registry.knows(stream);
+  Result<void> checked = parts_.rights.check(identity_, exists ? Action::publish : *action, stream);
+  if (!checked) {
     parts_.logger.warning(
         "refuse a request: " + checked.error().message,
         {.stream = stream.str(), .peer = peer_address_, .message_id = message_id::kRequestRefused});
@@ -507,11 +509,15 @@ void StreamWatch::on_stream_removed(const Stream& stream) {
   if (shows_(stream.id())) send_removed(stream);
 }
 
-// All again, as fast as the peer receives them: what it knows already changes nothing.
-void StreamWatch::on_new_rights() {
-  pending_.assign(registry_.streams().begin(), registry_.streams().end());
+void StreamWatch::on_new_rights(const Shows& showed) {
   for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
-    if (!shows_(stream->id())) send_removed(*stream);
+    const bool is_shown = shows_(stream->id());
+    if (is_shown == showed(stream->id())) continue;
+    if (is_shown) {
+      pending_.push_back(stream);
+    } else {
+      send_removed(*stream);
+    }
   }
 }
 

@@ -53,7 +53,8 @@ class StreamWatch {
   void on_stream_added(const Stream& stream);
   void on_stream_removed(const Stream& stream);
   // The peer may see other streams than before.
-  void on_new_rights();
+  //   showed  what it could see
+  void on_new_rights(const Shows& showed);
 
  private:
   void send_added(const Stream& stream);
@@ -73,8 +74,8 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   // are begun in that time.
   static constexpr int kRequestsPerTurn = 16;
   static constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
-  // How long a connection may be silent that is neither a channel nor has heartbeats: with such ones
-  // anybody could take all places.
+  // How long a connection may send nothing that is neither a channel nor has heartbeats: otherwise
+  // those that are forgotten, or meant to, would take all places.
   static constexpr Duration kIdleTimeout = std::chrono::seconds(10);
   // Answers and events that may wait for one connection: the longest answer is a property.
   static constexpr std::size_t kMaxQueuedBytes = wire::kMaxNetworkFrameBytes + (1U << 20);
@@ -121,8 +122,9 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   // Closes when `credentials` do not accept the peer.
   void on_new_credentials(const wire::TlsCredentials& credentials);
 
-  // Closes a channel on which something was allowed that is not any more.
-  void on_new_rights();
+  // Closes a channel on which something was allowed that is not any more; a watch shows what the
+  // peer may see now.
+  void on_new_rights(const Rights& before);
 
   // Sends a final failure, as far as the socket takes it at once.
   void close_with(const Error& why) { link_.close_with(why); }

@@ -50,8 +50,11 @@ void ServedStream::check() {
 }
 
 std::shared_ptr<ServedStream> ServedStreams::get(std::shared_ptr<Stream> stream) {
-  std::shared_ptr<ServedStream>& served = streams_[stream.get()];
-  if (!served) served = std::make_shared<ServedStream>(loop_, std::move(stream));
+  if (const auto found = streams_.find(stream.get()); found != streams_.end()) {
+    return found->second;
+  }
+  const auto served = std::make_shared<ServedStream>(loop_, stream);
+  streams_.emplace(stream.get(), served);
   return served;
 }
 

@@ -245,10 +245,11 @@ constexpr ConfigKey kKeys[] = {
      kChangesAtRestart<&Config::insecure>, set_by<&Config::insecure, parse_boolean>},
     {"rights", "WHO VERBS STREAMS",
      "who may do what with which streams, e.g. 'group:drivers read,write lidar*' or 'host:pc2 all "
-     "*'; may be repeated; what no line allows is refused; default: everybody may do everything",
+     "*'; may be repeated; what no line allows is refused; default: every program and host may do "
+     "everything",
      ValueForm::list, kChangesAtOnce<&Config::rights>,
      [](Config& c, std::string_view text) -> Result<void> {
-       if (!text.empty()) c.rights.push_back(DSSM_TRY(parse_right(text)));
+       c.rights.push_back(DSSM_TRY(parse_right(text)));
        return {};
      },
      [](Config& c) { c.rights.clear(); }, "right"},

@@ -56,7 +56,7 @@ struct Config {
   std::string credentials;  // folder; empty: none
   // Read from there by finish(); nullptr: none.
   std::shared_ptr<const wire::TlsCredentials> loaded_credentials;
-  std::vector<Right> rights;  // none given: everybody may do everything
+  std::vector<Right> rights;  // none given: every program and host may do everything
   // Discovery by mDNS. Names of network interfaces, or patterns as in fnmatch(3): those in
   // `interfaces`, all when that is empty, without those in `avoid_interfaces`.
   bool mdns = true;

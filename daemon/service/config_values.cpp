@@ -5,6 +5,7 @@
 #include <fnmatch.h>
 #include <grp.h>
 #include <net/if.h>
+#include <pwd.h>
 #include <sys/types.h>
 #include <unistd.h>
 
@@ -298,24 +299,42 @@ Result<mode_t> parse_mode(std::string_view text) {
   return mode;
 }
 
-Result<gid_t> parse_group(std::string_view name) {
+namespace {
+
+// The entry of `name` by getgrnam_r() or getpwnam_r(), in `space`; nullptr: there is none.
+template <class Entry>
+Result<const Entry*> find_entry(std::string_view what, std::string_view name, Entry& entry,
+                                std::vector<char>& space,
+                                int (*find)(const char*, Entry*, char*, std::size_t, Entry**)) {
   const std::string wanted(name);
-  std::vector<char> space(16384);  // enough for one entry of the group file without its members
+  space.resize(16384);  // enough for one entry without the members of a group
   for (;;) {
-    group entry{};
-    group* found = nullptr;
-    const int failed = ::getgrnam_r(wanted.c_str(), &entry, space.data(), space.size(), &found);
+    Entry* found = nullptr;
+    const int failed = find(wanted.c_str(), &entry, space.data(), space.size(), &found);
     if (failed == ERANGE && space.size() < (16U << 20)) {
       space.resize(space.size() * 2);
       continue;
     }
-    if (failed) return os_error("look for the group " + in_quotes(name), failed);
-    if (!found) {
-      return invalid(fmt::format("there is no group {}; create it with `groupadd --system {}`",
-                                 in_quotes(name), printable(name)));
-    }
-    return found->gr_gid;
+    if (failed) return os_error(fmt::format("find the {} {}", what, in_quotes(name)), failed);
+    return found;
   }
+}
+
+}  // namespace
+
+Result<gid_t> parse_group(std::string_view name) {
+  group entry{};
+  std::vector<char> space;
+  if (DSSM_TRY(find_entry("group", name, entry, space, &::getgrnam_r))) return entry.gr_gid;
+  return invalid(fmt::format("there is no group {}; create it with `groupadd --system {}`",
+                             in_quotes(name), printable(name)));
+}
+
+Result<uid_t> parse_user(std::string_view name) {
+  passwd entry{};
+  std::vector<char> space;
+  if (DSSM_TRY(find_entry("user", name, entry, space, &::getpwnam_r))) return entry.pw_uid;
+  return invalid(fmt::format("there is no user {}", in_quotes(name)));
 }
 
 Result<bool> parse_boolean(std::string_view text) {

@@ -142,8 +142,9 @@ Result<clock::PartsPerBillion> parse_drift(std::string_view text);
 // File permissions in octal, "0660"; only the nine ordinary bits, and the owner's write bit is set.
 Result<mode_t> parse_mode(std::string_view text);
 
-// The number of the group `name`, which must exist.
+// The number of the group or user `name`, which must exist.
 Result<gid_t> parse_group(std::string_view name);
+Result<uid_t> parse_user(std::string_view name);
 
 // true, false
 Result<bool> parse_boolean(std::string_view text);

@@ -3,7 +3,6 @@
 
 #include <fmt/format.h>
 #include <fmt/ranges.h>
-#include <pwd.h>
 
 #include <algorithm>
 #include <array>
@@ -11,7 +10,6 @@
 #include <limits>
 #include <optional>
 #include <utility>
-#include <vector>
 
 #include "core/base/text.hpp"
 #include "core/base/try.hpp"
@@ -25,7 +23,7 @@ constexpr std::array<std::string_view, 6> kVerbNames = {"read",   "write",    "c
                                                         "remove", "property", "clock"};
 constexpr std::size_t kMaxPatternBytes = 63;
 
-Error no_right(std::string why) { return {Errc::invalid_argument, std::move(why)}; }
+Error wrong_right(std::string why) { return {Errc::invalid_argument, std::move(why)}; }
 
 // The part of `text` before the next `separator`, which is taken from it.
 std::string_view take_part(std::string_view& text, char separator) {
@@ -50,22 +48,11 @@ std::optional<std::uint32_t> number_of(std::string_view text) {
   return static_cast<std::uint32_t>(*number);
 }
 
-Result<std::uint32_t> user_named(std::string_view text) {
-  const std::string name(text);
-  std::vector<char> space(16384);  // enough for an entry of the user file
-  passwd entry{};
-  passwd* found = nullptr;
-  const int failed = ::getpwnam_r(name.c_str(), &entry, space.data(), space.size(), &found);
-  if (failed) return os_error("look for the user " + in_quotes(text), failed);
-  if (!found) return no_right(fmt::format("there is no user {}", in_quotes(text)));
-  return found->pw_uid;
-}
-
 Result<void> take_who(std::string_view text, Right& out) {
   std::string_view name = text;
   const std::string_view kind = take_part(name, ':');
   if (kind == "everyone" || kind == "local") {
-    if (kind != text) return no_right(fmt::format("'{}' takes no name", kind));
+    if (kind != text) return wrong_right(fmt::format("'{}' takes no name", kind));
     out.who = kind == "local" ? Right::Who::local : Right::Who::everyone;
     return {};
   }
@@ -77,13 +64,13 @@ Result<void> take_who(std::string_view text, Right& out) {
   const auto* known = std::find_if(std::begin(kKinds), std::end(kKinds),
                                    [&](const auto& one) { return one.first == kind; });
   if (known == std::end(kKinds)) {
-    return no_right(
-        fmt::format("{} is nobody: it is everyone, local, user:NAME, group:NAME, host:NAME or "
+    return wrong_right(
+        fmt::format("{} is not known; write everyone, local, user:NAME, group:NAME, host:NAME or "
                     "program:NAME",
                     in_quotes(text)));
   }
-  if (name.empty()) return no_right(fmt::format("{} has no name", in_quotes(text)));
-  if (name.size() > kMaxPatternBytes) return no_right(in_quotes(text) + " has too long a name");
+  if (name.empty()) return wrong_right(fmt::format("{} has no name", in_quotes(text)));
+  if (name.size() > kMaxPatternBytes) return wrong_right(in_quotes(text) + " has too long a name");
   out.who = known->second;
   if (out.who == Right::Who::host || out.who == Right::Who::program) {
     out.name_pattern = name;
@@ -93,7 +80,7 @@ Result<void> take_who(std::string_view text, Right& out) {
     out.number = *number;
   } else {
     out.number =
-        out.who == Right::Who::user ? DSSM_TRY(user_named(name)) : DSSM_TRY(parse_group(name));
+        out.who == Right::Who::user ? DSSM_TRY(parse_user(name)) : DSSM_TRY(parse_group(name));
   }
   return {};
 }
@@ -108,8 +95,8 @@ Result<Verbs> parse_verbs(std::string_view text) {
     }
     const auto* found = std::find(kVerbNames.begin(), kVerbNames.end(), name);
     if (found == kVerbNames.end()) {
-      return no_right(fmt::format("{} is no verb: the verbs are {} and all", in_quotes(name),
-                                  fmt::join(kVerbNames, ", ")));
+      return wrong_right(fmt::format("{} is not a verb; the verbs are {} and all", in_quotes(name),
+                                     fmt::join(kVerbNames, ", ")));
     }
     const Verb verb = static_cast<Verb>(found - kVerbNames.begin());
     verbs |= verb;
@@ -120,10 +107,11 @@ Result<Verbs> parse_verbs(std::string_view text) {
 
 Result<void> take_streams(std::string_view text, Right& out) {
   if (text.size() > kMaxPatternBytes) {
-    return no_right(in_quotes(text) + " names a stream too long to be one");
+    return wrong_right(in_quotes(text) + " names a stream too long to be one");
   }
   if (text.find('@') != text.npos) {
-    return no_right(in_quotes(text) + " names a host; a right counts for the streams of all hosts");
+    return wrong_right(in_quotes(text) +
+                       " names a host; a right counts for the streams of all hosts");
   }
   out.streams = text;
   return {};
@@ -145,9 +133,9 @@ Result<Right> parse_right(std::string_view text) {
   std::string_view rest = text;
   const std::string_view who = take_word(rest), verbs = take_word(rest), streams = take_word(rest);
   if (streams.empty() || !rest.empty() || text.find('\0') != text.npos) {
-    return no_right(in_quotes(text) +
-                    " is no right; write \"WHO VERBS STREAMS\", such as "
-                    "\"group:drivers read,write lidar*\" or \"host:pc2 all *\"");
+    return wrong_right(in_quotes(text) +
+                       " is not a right; write \"WHO VERBS STREAMS\", such as "
+                       "\"group:drivers read,write lidar*\" or \"host:pc2 all *\"");
   }
   const std::string what = in_quotes(text);
   Right right;

@@ -34,13 +34,19 @@ Result<void> OpenTable::check_quota(const ClientIdentity& client) const {
 
 OpenNumber OpenTable::add(OpenEntry entry) {
   const OpenNumber number = next_++;
-  by_client_[entry.client->number].insert(number);
-  OfStream& of_stream = by_stream_[entry.stream.get()];
+  // First the entry, which the others refer to: each may find no memory.
+  const OpenEntry& added = entries_.emplace(number, std::move(entry)).first->second;
+  by_client_[added.client->number].insert(number);
+  OfStream& of_stream = by_stream_[added.stream.get()];
   of_stream.opens.insert(number);
-  ++(entry.role == Role::writer ? of_stream.counts.writers : of_stream.counts.readers);
-  if (entry.role == Role::writer) ++of_stream.writing[entry.client->number];
-  entries_.emplace(number, std::move(entry));
+  ++(added.role == Role::writer ? of_stream.counts.writers : of_stream.counts.readers);
+  if (added.role == Role::writer) ++of_stream.writing[added.client->number];
   return number;
+}
+
+bool OpenTable::is_writing(const Stream& stream, ClientNumber client) const {
+  const auto found = by_stream_.find(&stream);
+  return found != by_stream_.end() && found->second.writing.contains(client);
 }
 
 Result<void> OpenTable::remove(ClientNumber client, OpenNumber number) {

@@ -61,6 +61,7 @@ class OpenTable {
   void remove_all(ClientNumber client);
 
   Counts counts(const Stream& stream) const;
+  bool is_writing(const Stream& stream, ClientNumber client) const;
   std::vector<StreamUser> users(const Stream& stream) const;  // in the order of opening
 
   // The opens of `stream` for reading, in the order of opening.

@@ -136,6 +136,7 @@ Result<void> Registry::set_property(const StreamId& id, std::string_view propert
 }
 
 void Registry::add(std::shared_ptr<Stream> stream) {
+  in_order_.reserve(in_order_.size() + 1);  // before there is something to undo
   by_name_.emplace(Key{stream->id().name, stream->id().id}, stream);
   // Streams of an earlier run of dssmd come back in any order; each gets its old place in the list.
   const auto place = std::upper_bound(in_order_.begin(), in_order_.end(), stream->created_order(),

@@ -10,6 +10,7 @@
 #include <optional>
 #include <string_view>
 
+#include "core/base/text.hpp"
 #include "daemon/service/config_values.hpp"
 
 namespace dssm::daemon {
@@ -31,8 +32,7 @@ Verbs needed_for(Action action) noexcept {
     case Action::publish:
       return Verb::write;
     case Action::open_channel:
-      verbs |= Verb::read;
-      verbs |= Verb::write;
+      for (const Verb verb : {Verb::read, Verb::write, Verb::property}) verbs |= verb;
       return verbs;
     case Action::remove:
       return Verb::remove;
@@ -113,6 +113,10 @@ std::string who_of(const Identity& identity) {
   return (is_host ? "host:" : "program:") + identity.certified->name;
 }
 
+constexpr bool is_plain(char c) noexcept {
+  return is_letter_or_digit(c) || c == '_' || c == '-' || c == '.';
+}
+
 bool may_do_everything(const Identity& identity) noexcept {
   return identity.is_local() && (identity.uid == 0 || identity.uid == ::geteuid());
 }
@@ -133,22 +137,28 @@ Verbs Rights::verbs(const Identity& identity, const StreamId& stream) const {
 Result<void> Rights::check(const Identity& identity, Action action, const StreamId& stream) const {
   const Verbs needed = needed_for(action);
   if (needed.empty() || verbs(identity, stream).has_any(needed)) return {};
-  const std::string line =
-      fmt::format("it takes a line such as \"{} {} {}\" (docs/security.md)", who_of(identity),
-                  Verbs(needed.first()).str(), action == Action::open_clock ? "*" : stream.name);
-  if (action == Action::open_clock) {
+  std::string fix = "see docs/security.md \"Rights\"";
+  const bool is_clock = action == Action::open_clock;
+  // A name with other characters could be a pattern for more.
+  if (is_clock || (!stream.name.empty() && std::all_of(stream.name.begin(), stream.name.end(),
+                                                       [](char c) { return is_plain(c); }))) {
+    fix = fmt::format("it takes a line such as \"{} {} {}\" (docs/security.md)", who_of(identity),
+                      Verbs(needed.first()).str(), is_clock ? "*" : stream.name);
+  }
+  if (is_clock) {
     return Error{Errc::no_permission,
                  fmt::format("{} may not use the playback clock: dssmd's key 'rights' does not "
                              "allow it; {}",
-                             identity.str(), line)};
+                             identity.str(), fix)};
   }
   return Error{Errc::no_permission,
-               fmt::format("{} may not {} stream '{}': dssmd's key 'rights' does not allow it; {}",
-                           identity.str(), words_for(action), stream.str(), line)};
+               fmt::format("{} may not {} stream {}: dssmd's key 'rights' does not allow it; {}",
+                           identity.str(), words_for(action),
+                           in_quotes(stream.str().substr(0, kMaxFullNameBytes)), fix)};
 }
 
 bool Rights::shows(const Identity& identity, const StreamId& stream) const {
-  return lines_.empty() || check(identity, Action::see, stream).has_value();
+  return lines_.empty() || verbs(identity, stream).has_any(needed_for(Action::see));
 }
 
 void Rights::hide(const Identity& identity, proto::StreamList& list) const {

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // Who may do what: the lines of the configuration key `rights`, applied to who asks. Without lines
-// everybody may do everything. With lines, what none of them allows is refused; root and dssmd's
-// own user may do everything in any case, because they can change dssmd itself.
+// every program and host may do everything. With lines, what none of them allows is refused; root
+// and dssmd's own user may do everything in any case, because they can change dssmd itself.
 //
 //   Verb       allows
 //   read       samples and the property

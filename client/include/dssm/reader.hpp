@@ -174,7 +174,7 @@ class RawReader {
 
   // Why this reader cannot continue: the stream's new ring has another type, or this process may
   // not read the stream any more (no_permission; it may still get samples of the ring that it has
-  // open). Empty otherwise.
+  // open, and continues when it may again). Empty otherwise.
   std::optional<Error> restart_error() const;
 
   // --- in place

@@ -90,7 +90,8 @@ struct RightLine {
   std::string verbs;  // what it allows: "read,write", "all"
 };
 struct StreamRights {
-  bool restricted = false;       // false: nothing is configured, so everybody may do everything
+  bool restricted =
+      false;  // false: nothing is configured, so every program and host may do everything
   std::string own_verbs;         // what this process may do: "read,write", "all", "none"
   std::vector<RightLine> lines;  // that concern the stream, in the order of the configuration
 };

@@ -10,7 +10,8 @@ TEST(CtlRights, AreEverybodysWithoutConfiguration) {
   const DaemonProcess daemon;
   const Finished shown = run({dssmctl_path(), "rights", "lidar"}, {daemon.environment()});
   EXPECT_EQ(shown.exit_status, 0) << shown.err;
-  EXPECT_EQ(shown.out, "everybody may do everything: dssmd's key 'rights' has no lines\n");
+  EXPECT_EQ(shown.out,
+            "every program and host may do everything: dssmd's key 'rights' has no lines\n");
 }
 
 TEST(CtlRights, ShowTheLinesThatConcernAStream) {

@@ -170,7 +170,7 @@ TEST_F(SecureHosts, EndWhatIsNotAllowedAnyMore) {
   const Host pc2("pc2", pc1.dssmd.address());
   Session there = connect(pc2.dssmd);
   auto reader = open_filled<Numbered>(there, "odometry");
-  pc1.configure_also("rights = [\"host:pc2 property odometry\"]");
+  pc1.configure_also("rights = [\"host:pc2 remove odometry\"]");
   await([&] { return here.stream_info({"odometry", 0, ""}).value().channels == 0; });
   odometry.write(numbered(1), time_from_ns(1), 0ns);
   // The mirror tries again for as long as it has a reader.

@@ -183,5 +183,68 @@ TEST(RequestSizes, RefuseWhatIsNoMessage) {
   EXPECT_NE(refusal_of(garbage), "");
 }
 
+// --- without its property
+
+struct Split {
+  local::Request rest;
+  std::string property;
+};
+
+Split split(const std::string& bytes) {
+  std::string_view property;
+  Split out;
+  const std::string rest = without_property_untrusted(std::as_bytes(std::span(bytes)), property);
+  EXPECT_TRUE(out.rest.ParseFromString(rest));
+  out.property = property;
+  return out;
+}
+
+TEST(WithoutProperty, IsWhatElseTheRequestHas) {
+  for (const std::size_t size : {1U, 127U, 128U, 16'383U, 16'384U, 100'000U}) {
+    local::Request request;
+    request.set_serial(300);
+    request.mutable_set_property()->mutable_id()->set_name("map");
+    request.mutable_set_property()->set_property(std::string(size, 'p'));
+    const Split out = split(request.SerializeAsString());
+    EXPECT_EQ(out.property, std::string(size, 'p'));
+    EXPECT_EQ(out.rest.serial(), 300u);
+    EXPECT_EQ(out.rest.set_property().id().name(), "map");
+    EXPECT_EQ(out.rest.set_property().property(), "");
+  }
+}
+
+TEST(WithoutProperty, TakesFieldsInAnyOrder) {
+  proto::SetProperty id, property;
+  id.mutable_id()->set_name("map");
+  property.set_property(std::string(200, 'p'));
+  const std::string inside = property.SerializeAsString() + id.SerializeAsString();
+  std::string bytes("\xb2\x01", 2);  // field 22
+  bytes += std::string("\xd2\x01", 2) + inside + std::string("\x08\x05", 2);
+  ASSERT_EQ(inside.size(), 0xd2U);
+  const Split out = split(bytes);
+  EXPECT_EQ(out.property, std::string(200, 'p'));
+  EXPECT_EQ(out.rest.serial(), 5u);
+  EXPECT_EQ(out.rest.set_property().id().name(), "map");
+}
+
+TEST(WithoutProperty, IsTheWholeRequestWhenThereIsNoneOrNotOne) {
+  local::Request request;
+  request.set_serial(1);
+  request.mutable_create()->mutable_id()->set_name("map");
+  EXPECT_EQ(split(request.SerializeAsString()).rest.create().id().name(), "map");
+  request.mutable_set_property()->set_property("one");
+  const std::string one = request.SerializeAsString();
+  request.mutable_set_property()->set_property("two");
+  const Split out = split(one + request.SerializeAsString());
+  EXPECT_EQ(out.property, "");
+  EXPECT_EQ(out.rest.set_property().property(), "two") << "as protobuf merges them";
+  // A length of two bytes where one is enough.
+  const std::string padded(
+      "\xb2\x01\x85\x00\x12\x03"
+      "abc",
+      9);
+  EXPECT_EQ(split(padded).rest.set_property().property(), "abc");
+}
+
 }  // namespace
 }  // namespace dssm::wire

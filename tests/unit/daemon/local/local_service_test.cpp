@@ -268,7 +268,23 @@ TEST(LocalService, LeavesOutFieldsWhenAListHasManyOfThem) {
   }
 }
 
-TEST(LocalService, GivesBackLongPropertiesWithoutCopies) {
+TEST(LocalService, LeavesOutFieldsWhenTheyMakeAListTooLongForAFrame) {
+  Daemon daemon(false, {.max_opens = 1000, .max_opens_per_client = 1000});
+  FakeClient client(daemon.service, 5);
+  client.greet();
+  constexpr int kStreams = 300;  // with 60 KB of field names each: 18 MB
+  for (int i = 0; i < kStreams; ++i) {
+    local::Request request = create_request("s");
+    request.mutable_create()->mutable_id()->set_id(i);
+    request.mutable_create()->mutable_type()->mutable_fields(0)->set_name(std::string(60'000, 'f'));
+    ASSERT_TRUE(client.ask(request).has_opened());
+  }
+  const local::Response list = client.ask(list_request());  // fails on a frame that is too long
+  ASSERT_EQ(list.stream_list().streams_size(), kStreams);
+  EXPECT_EQ(list.stream_list().streams(0).type().fields_size(), 0);
+}
+
+TEST(LocalService, GivesBackLongProperties) {
   Daemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();

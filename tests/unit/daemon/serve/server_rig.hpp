@@ -105,7 +105,7 @@ class ServerRig {
   EventLoop loop = *EventLoop::open(TimerQueue::Time::simulated);
   Registry registry{"pc1", kLimits};
   OpenTable opens{{100, 100}};
-  const Rights no_rights;  // everybody may do everything
+  const Rights no_rights;  // every program and host may do everything
   LogRecorder logger;
   ChannelServer server;
 };

@@ -20,7 +20,7 @@ TEST(RateLimitedLogger, PassesALimitedNumberOfLinesAndCountsTheOthers) {
   now += RateLimitedLogger::kPeriod;
   logger.warning("later");
   EXPECT_EQ(to.warnings.back(), "later (" + std::to_string(RateLimitedLogger::kLinesPerPeriod) +
-                                    " lines about other hosts before this one were left out)");
+                                    " such lines before this one were left out)");
   logger.warning("and on");
   EXPECT_EQ(to.warnings.back(), "and on");
 }

@@ -125,19 +125,20 @@ TEST(Config, NamesWhatIsWrongInARight) {
     return mistakes_in("rights = [\"" + line + "\"]\n");
   };
   EXPECT_EQ(mistake("local read"),
-            "dssmd.conf:1: key 'rights': 'local read' is no right; write \"WHO VERBS STREAMS\", "
+            "dssmd.conf:1: key 'rights': 'local read' is not a right; write \"WHO VERBS STREAMS\", "
             "such as \"group:drivers read,write lidar*\" or \"host:pc2 all *\"");
   EXPECT_EQ(mistake("alice read *"),
-            "dssmd.conf:1: key 'rights': 'alice read *': 'alice' is nobody: it is everyone, local, "
-            "user:NAME, group:NAME, host:NAME or program:NAME");
-  EXPECT_EQ(mistake("local read,record *"),
-            "dssmd.conf:1: key 'rights': 'local read,record *': 'record' is no verb: the verbs are "
-            "read, write, create, remove, property, clock and all");
+            "dssmd.conf:1: key 'rights': 'alice read *': 'alice' is not known; write everyone, "
+            "local, user:NAME, group:NAME, host:NAME or program:NAME");
+  EXPECT_EQ(
+      mistake("local read,record *"),
+      "dssmd.conf:1: key 'rights': 'local read,record *': 'record' is not a verb; the verbs are "
+      "read, write, create, remove, property, clock and all");
   EXPECT_EQ(mistake("user:no-such-user read *"),
             "dssmd.conf:1: key 'rights': 'user:no-such-user read *': there is no user "
             "'no-such-user'");
   for (const char* wrong :
-       {"local read * *", "host: read *", "local:x read *", "group:no-such-group read *",
+       {"", "local read * *", "host: read *", "local:x read *", "group:no-such-group read *",
         "local , *", "local read lidar@pc2", "user:4294967295 read *", "user:-1 read *"}) {
     EXPECT_NE(mistake(wrong), "") << wrong;
   }

@@ -121,7 +121,8 @@ TEST(Rights, EachActionNeedsItsVerb) {
                                         Action::open_channel, Action::publish, Action::see}));
   EXPECT_EQ(allowed(Verb::create), with({Action::create, Action::see}));
   EXPECT_EQ(allowed(Verb::remove), with({Action::remove, Action::see}));
-  EXPECT_EQ(allowed(Verb::property), with({Action::set_property, Action::see}));
+  EXPECT_EQ(allowed(Verb::property),
+            with({Action::open_channel, Action::set_property, Action::see}));
   EXPECT_EQ(allowed(Verb::clock), with({Action::open_clock}));
 }
 
@@ -140,6 +141,10 @@ TEST(Rights, RefuseWithTheLineThatWouldAllowIt) {
             "'test' on host 'pc3' at '10.0.0.3:40000' may not read stream 'lidar:1': dssmd's key "
             "'rights' does not allow it; it takes a line such as \"host:pc3 read lidar\" "
             "(docs/security.md)");
+  EXPECT_EQ(rights.check(user(1000, 1000), Action::read, {"*", 0, ""}).error().message,
+            "'test' (pid 5, uid 1000) may not read stream '*:0': dssmd's key 'rights' does not "
+            "allow it; see docs/security.md \"Rights\"")
+      << "a line for this name would be one for all";
   EXPECT_EQ(refusal(user(1000, 1000), Action::open_clock),
             "'test' (pid 5, uid 1000) may not use the playback clock: dssmd's key 'rights' does "
             "not allow it; it takes a line such as \"user:1000 clock *\" (docs/security.md)");
@@ -159,8 +164,9 @@ class LocalRightsTest : public testing::Test {
 
   void SetUp() override { client.greet(); }
   void set(const std::vector<std::string>& texts) {
+    const Rights before(rights.lines());
     rights.set(lines(texts));
-    service.on_new_rights();
+    service.on_new_rights(before);
   }
   // What `client` has received: "+lidar" added, "-lidar" removed, "replaced 1".
   std::string events() {
@@ -205,7 +211,9 @@ TEST_F(LocalRightsTest, ListsAndEventsShowWhatTheAskerMaySee) {
   ASSERT_TRUE(registry.remove({"secret2", 0, ""}));
   EXPECT_EQ(events(), " +lidar2");
   set({"user:1000 read,create *2"});
-  EXPECT_EQ(events(), " -lidar -secret +lidar2");
+  EXPECT_EQ(events(), " -lidar") << "and no word of what it may never see";
+  set({"user:1000 read,create *"});
+  EXPECT_EQ(events(), " +lidar +secret");
 }
 
 TEST_F(LocalRightsTest, WhatIsNotAllowedIsRefusedAndLogged) {
@@ -216,6 +224,29 @@ TEST_F(LocalRightsTest, WhatIsNotAllowedIsRefusedAndLogged) {
   ASSERT_TRUE(registry.create({"lidar", 0, ""}, odometry_type(), {16, Duration(1)}, 1));
   EXPECT_TRUE(client.ask(daemon::open_request("lidar")).has_opened());
   EXPECT_EQ(client.ask(daemon::open_request("lidar", true)).failure().code(), "no_permission");
+}
+
+TEST_F(LocalRightsTest, AnExistingStreamTakesOnlyTheRightToWrite) {
+  ASSERT_TRUE(registry.create({"lidar", 0, ""}, odometry_type(), {16, Duration(1)}, 1));
+  set({"user:1000 write *"});
+  EXPECT_TRUE(client.ask(daemon::create_request("lidar")).has_opened());
+  EXPECT_EQ(client.ask(daemon::create_request("camera")).failure().code(), "no_permission");
+}
+
+// libdssm does so when there is no memory for the ring.
+TEST_F(LocalRightsTest, WhoCreatedAStreamMayRemoveItWhileNobodyElseHasItOpen) {
+  set({"user:1000 create *"});
+  local::Request remove;
+  remove.mutable_remove()->mutable_id()->set_name("lidar");
+  ASSERT_TRUE(client.ask(daemon::create_request("lidar")).has_opened());
+  {
+    FakeClient other(service, 6);
+    other.greet();
+    ASSERT_TRUE(other.ask(daemon::create_request("lidar")).has_opened());
+    EXPECT_EQ(client.ask(remove).failure().code(), "no_permission");
+    EXPECT_EQ(other.ask(remove).failure().code(), "no_permission");
+  }
+  EXPECT_TRUE(client.ask(remove).has_done());
 }
 
 TEST_F(LocalRightsTest, RefusalsAreLoggedAtABoundedRate) {
@@ -278,16 +309,16 @@ TEST(RemoteRights, ChannelsEndWhenTheyAreNotAllowedAnyMore) {
   rig.turns();
   ASSERT_EQ(control.take().size(), 3u);
 
+  const Rights before(rights.lines());
   rights.set(lines({"everyone write lidar"}));
-  rig.server.on_new_rights();
+  rig.server.on_new_rights(before);
   rig.turns();
   EXPECT_TRUE(reader.closed);
   EXPECT_FALSE(writer.closed);
   const std::vector<net::Frame> events = control.take();
-  ASSERT_EQ(events.size(), 2u);
+  ASSERT_EQ(events.size(), 1u);
   EXPECT_TRUE(events[0].stream_event().removed());
   EXPECT_EQ(events[0].stream_event().stream().id().name(), "camera");
-  EXPECT_EQ(events[1].stream_event().stream().id().name(), "lidar");
   request.mutable_list();
   EXPECT_EQ(rig.ask(control, with_serial(2, request)).stream_list().streams_size(), 1);
   request.mutable_read()->set_newest(true);
