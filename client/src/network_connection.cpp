@@ -101,7 +101,7 @@ Result<void> NetworkConnection::begin() {
   const auto credentials = credentials_.for_address(plan_.address());
   if (!credentials) return greet(std::move(transport));
   phase_ = Phase::securing;
-  handshake_.emplace(credentials, std::move(transport), wire::TransportEnd::connected);
+  handshake_.emplace(credentials, std::move(transport), wire::TransportEnd::connected, &ticket_);
   return secure();
 }
 

@@ -139,6 +139,7 @@ class NetworkConnection final : private wire::FrameDelegate {
   channel::ConnectPlan plan_;
   std::string address_;
   const ClientCredentials credentials_;
+  wire::TlsTicket ticket_;
   UniqueFd connecting_;
   std::optional<wire::TlsHandshake> handshake_;
   std::unique_ptr<wire::Transport> transport_;

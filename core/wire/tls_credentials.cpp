@@ -71,6 +71,8 @@ constexpr const char* kSuites =
 // Bytes that the kernel hands over in one call: four records.
 constexpr std::size_t kReadBytes = 68U << 10;
 constexpr long kMaxChainBytes = 16 << 10;  // of the other side's certificates
+// Sessions are resumed for so long after the full handshake, which proves who has the private keys.
+constexpr long kTicketSeconds = 24L * 60 * 60;
 
 Error openssl_error(const std::string& what) {
   const unsigned long code = ERR_peek_last_error();
@@ -257,6 +259,60 @@ bool is_temporary(int problem) noexcept {
          problem == X509_V_ERR_CRL_HAS_EXPIRED;
 }
 
+// --- tickets, which hold all that this side needs to resume a session; OpenSSL encrypts them with
+// keys that the context made at random, and puts in only the first certificate of the other side
+
+// Puts the others there, too: they are needed to verify the first one again.
+int put_others(SSL* session, void*) {
+  std::string der;
+  STACK_OF(X509)* others = SSL_get_peer_cert_chain(session);
+  for (int i = 0; i < sk_X509_num(others); ++i) {
+    unsigned char* bytes = nullptr;
+    const int count = i2d_X509(sk_X509_value(others, i), &bytes);
+    if (count < 0) return 0;
+    der.append(reinterpret_cast<const char*>(bytes), static_cast<std::size_t>(count));
+    OPENSSL_free(bytes);
+  }
+  return SSL_SESSION_set1_ticket_appdata(SSL_get_session(session), der.data(), der.size());
+}
+
+Stack others_in(SSL_SESSION* session) {
+  Stack others(sk_X509_new_null());
+  void* der = nullptr;
+  std::size_t count = 0;
+  SSL_SESSION_get0_ticket_appdata(session, &der, &count);
+  const auto* at = static_cast<const unsigned char*>(der);
+  const auto* const end = at + count;
+  while (at != end) {
+    X509* const next = d2i_X509(nullptr, &at, end - at);
+    if (!next) break;
+    sk_X509_push(others.get(), next);
+  }
+  return others;
+}
+
+Result<CertifiedPeer> peer_with(Certificate certificate, Stack others) {
+  CertifiedPeer peer = DSSM_TRY(named_by(certificate.get()));
+  peer.certificates = std::make_shared<const CertifiedPeer::Certificates>(
+      CertifiedPeer::Certificates{std::move(certificate), std::move(others)});
+  return peer;
+}
+
+// Whether the session of a ticket is resumed: while these credentials accept the other side's
+// certificate. Otherwise the handshake becomes a full one, which reports to both sides why not. No
+// new ticket replaces the one that is used, so that kTicketSeconds count from the full handshake.
+SSL_TICKET_RETURN on_ticket(SSL*, SSL_SESSION* session, const unsigned char*, std::size_t,
+                            SSL_TICKET_STATUS status, void* credentials) {
+  if (status != SSL_TICKET_SUCCESS && status != SSL_TICKET_SUCCESS_RENEW) {
+    return SSL_TICKET_RETURN_IGNORE_RENEW;
+  }
+  X509* const certificate = SSL_SESSION_get0_peer(session);
+  if (!certificate || X509_up_ref(certificate) != 1) return SSL_TICKET_RETURN_IGNORE_RENEW;
+  const Result<CertifiedPeer> peer = peer_with(Certificate(certificate), others_in(session));
+  const bool is_accepted = peer && static_cast<const TlsCredentials*>(credentials)->check(*peer);
+  return is_accepted ? SSL_TICKET_RETURN_USE : SSL_TICKET_RETURN_IGNORE_RENEW;
+}
+
 }  // namespace
 
 std::string CertifiedPeer::str() const {
@@ -307,12 +363,9 @@ std::shared_ptr<const TlsCredentials> credentials_of(const Greeting& self) {
 Result<CertifiedPeer> certified_peer(ssl_st* session) {
   Certificate certificate(SSL_get1_peer_certificate(session));
   if (!certificate) return Error{Errc::no_permission, "the other side shows no certificate"};
-  CertifiedPeer peer = DSSM_TRY(named_by(certificate.get()));
   STACK_OF(X509)* others = SSL_get_peer_cert_chain(session);
-  peer.certificates =
-      std::make_shared<const CertifiedPeer::Certificates>(CertifiedPeer::Certificates{
-          std::move(certificate), Stack(others ? X509_chain_up_ref(others) : nullptr)});
-  return peer;
+  return peer_with(std::move(certificate),
+                   others ? Stack(X509_chain_up_ref(others)) : others_in(SSL_get_session(session)));
 }
 
 TlsCredentials::~TlsCredentials() { SSL_CTX_free(context_); }
@@ -337,8 +390,11 @@ Result<void> TlsCredentials::read(const std::string& folder) {
   if (!context_) return openssl_error("set up TLS");
   SSL_CTX_set_min_proto_version(context_, TLS1_3_VERSION);
   SSL_CTX_set_ciphersuites(context_, kSuites);
-  SSL_CTX_set_options(context_, SSL_OP_NO_TICKET);
-  SSL_CTX_set_num_tickets(context_, 0);
+  constexpr unsigned char kSessionsOf[] = "dssmd";
+  SSL_CTX_set_session_id_context(context_, kSessionsOf, sizeof kSessionsOf);
+  SSL_CTX_set_num_tickets(context_, 1);
+  SSL_CTX_set_timeout(context_, kTicketSeconds);
+  SSL_CTX_set_session_ticket_cb(context_, put_others, on_ticket, this);
   SSL_CTX_set_max_cert_list(context_, kMaxChainBytes);
   SSL_CTX_set_session_cache_mode(context_, SSL_SESS_CACHE_OFF);
   SSL_CTX_set_mode(context_, SSL_MODE_RELEASE_BUFFERS);

@@ -24,6 +24,7 @@
 
 // Of OpenSSL.
 struct ssl_ctx_st;
+struct ssl_session_st;
 struct ssl_st;
 struct x509_st;
 
@@ -86,7 +87,8 @@ struct OwnCredentials {
 // Those of `self`; nullptr: its connections are not encrypted.
 std::shared_ptr<const TlsCredentials> credentials_of(const Greeting& self);
 
-// For TlsTransport: the other side's verified certificate, after the handshake.
+// For TlsTransport: the other side's verified certificate, after the handshake, also of a session
+// that was resumed.
 //   fails  no_permission: it names neither a host nor a program
 Result<CertifiedPeer> certified_peer(ssl_st* session);
 // The common name in a certificate; printable.

@@ -22,10 +22,15 @@ class Handshake {
   // Called once, from the loop; must not destroy the handshake.
   using Then = std::function<void(Result<std::unique_ptr<wire::Transport>>)>;
 
-  // Starts at once; loop outlives it.
-  //   takes_plain  of the accepting end: connections without TLS are passed on
+  // Both start at once; loop outlives them.
+  // The connecting end.
+  //   ticket  of the last connection there; outlives the handshake and the transport
   Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
-            UniqueFd socket, wire::TransportEnd end, bool takes_plain, Then then);
+            UniqueFd socket, wire::TlsTicket& ticket, Then then);
+  // The accepting end.
+  //   takes_plain  connections without TLS are passed on
+  Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
+            UniqueFd socket, bool takes_plain, Then then);
   Handshake(const Handshake&) = delete;
   Handshake& operator=(const Handshake&) = delete;
 
@@ -33,13 +38,15 @@ class Handshake {
   void stop();
 
  private:
+  Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
+            UniqueFd socket, wire::TlsTicket* ticket, bool takes_plain, Then then);
   void on_ready();
   void recognize();
   void go_on();
   void finish(Result<std::unique_ptr<wire::Transport>> result);
 
   const std::shared_ptr<const wire::TlsCredentials> credentials_;
-  const wire::TransportEnd end_;
+  wire::TlsTicket* const ticket_;  // nullptr: of the accepting end
   const bool takes_plain_;
   const Then then_;
   UniqueFd socket_;  // until the first byte came

@@ -91,8 +91,8 @@ void ChannelServer::secure(UniqueFd socket, const wire::SocketAddress& address) 
   Arrival& arrival = arrivals_.emplace_back(Arrival{where, nullptr, false});
   const bool takes_plain = parts_.takes_plain || address.is_loopback();
   arrival.handshake = std::make_unique<Handshake>(
-      parts_.loop, wire::credentials_of(self_), std::move(socket), wire::TransportEnd::accepted,
-      takes_plain, [this, &arrival, address](Result<std::unique_ptr<wire::Transport>> transport) {
+      parts_.loop, wire::credentials_of(self_), std::move(socket), takes_plain,
+      [this, &arrival, address](Result<std::unique_ptr<wire::Transport>> transport) {
         on_secured(arrival, address, std::move(transport));
       });
 }

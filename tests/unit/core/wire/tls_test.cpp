@@ -43,6 +43,7 @@ class Tls : public testing::Test {
  protected:
   const std::filesystem::path dir = test::make_temp_dir();
   Authority authority;
+  TlsTicket ticket;
   std::unique_ptr<Transport> client, server;
   std::optional<Error> client_error, server_error;
 
@@ -79,7 +80,8 @@ class Tls : public testing::Test {
       for (const int end : ends) ::setsockopt(end, SOL_SOCKET, SO_SNDBUF, &buffer, sizeof buffer);
     }
     auto over = [](int fd, TransportEnd end) { return make_transport(UniqueFd(fd), end); };
-    TlsHandshake from(of_client, over(ends[0], TransportEnd::connected), TransportEnd::connected);
+    TlsHandshake from(of_client, over(ends[0], TransportEnd::connected), TransportEnd::connected,
+                      &ticket);
     TlsHandshake to(of_server, over(ends[1], TransportEnd::accepted), TransportEnd::accepted);
     for (bool both = false; !both;) {
       const bool one = step(from, client, client_error);
@@ -87,6 +89,17 @@ class Tls : public testing::Test {
     }
     // What refuses a client reaches it with its first receive.
     if (client && server_error) client_error = receive_error(*client);
+  }
+
+  // A new connection after a cut. Whether it resumed the session: then the client knows the very
+  // certificate that the server showed before.
+  bool resumes(const Credentials& of_client, const Credentials& of_server) {
+    EXPECT_FALSE(receive_error(*client)) << "receives the ticket";
+    const auto before = client->peer()->certificates;
+    client.reset();
+    server.reset();
+    connect(of_client, of_server);
+    return client && client->peer()->certificates == before;
   }
 
   static std::optional<Error> receive_error(Transport& end) {
@@ -331,6 +344,77 @@ TEST_F(Tls, ChecksAKnownPeerAgain) {
   const Result<void> checked = TlsCredentials::load(folder("pc2")).value()->check(*server->peer());
   ASSERT_FALSE(checked);
   EXPECT_NE(checked.error().message.find("revoked"), std::string::npos) << checked.error().message;
+}
+
+TEST_F(Tls, ResumesTheSessionAfterACutAndKnowsBothSides) {
+  const Credentials viewer = make(Authority::program("viewer")), pc2 = make(Authority::host("pc2"));
+  connect(viewer, pc2);
+  for (int cut = 0; cut < 5; ++cut) {
+    ASSERT_TRUE(resumes(viewer, pc2)) << cut;
+    ASSERT_TRUE(server);
+    EXPECT_EQ(server->peer()->str(), "program 'viewer'");
+    EXPECT_EQ(client->peer()->str(), "host 'pc2'");
+    EXPECT_EQ(client->peer()->host_id, host_id_for("pc2"));
+    EXPECT_TRUE(pc2->check(*server->peer()));
+  }
+}
+
+TEST_F(Tls, ResumesASessionWithIntermediateAuthorities) {
+  Authority robots("robots", &authority);
+  const Credentials pc1 = make(Authority::host("pc1"), robots),
+                    pc2 = make(Authority::host("pc2"), robots);
+  connect(pc1, pc2);
+  ASSERT_TRUE(resumes(pc1, pc2));
+  EXPECT_EQ(server->peer()->str(), "host 'pc1'");
+  EXPECT_TRUE(pc2->check(*server->peer())) << "with all certificates that it needs";
+}
+
+TEST_F(Tls, ResumesNoSessionAfterAReload) {
+  const Credentials pc1 = make(Authority::host("pc1")), pc2 = make(Authority::host("pc2"));
+  connect(pc1, pc2);
+  const Credentials pc1_again = TlsCredentials::load(folder("pc1")).value(),
+                    pc2_again = TlsCredentials::load(folder("pc2")).value();
+  EXPECT_FALSE(resumes(pc1, pc2_again));
+  ASSERT_TRUE(client && server) << "but connects";
+  EXPECT_TRUE(resumes(pc1, pc2_again));
+  EXPECT_FALSE(resumes(pc1_again, pc2_again));
+  ASSERT_TRUE(client && server);
+  EXPECT_TRUE(resumes(pc1_again, pc2_again));
+}
+
+TEST_F(Tls, RefusesACertificateThatWasRevokedSinceTheSessionBegan) {
+  const long serial = authority.issue(Authority::host("pc1"), folder("pc1"));
+  const Credentials pc1 = TlsCredentials::load(folder("pc1")).value();
+  connect(pc1, make(Authority::host("pc2")));
+  authority.write_revoked(serial, folder("pc2"));
+  EXPECT_FALSE(resumes(pc1, TlsCredentials::load(folder("pc2")).value()));
+  expect_refused("'pc1' is not accepted: certificate revoked", "certificate revoked");
+}
+
+// With the same credentials, so that only the check of a ticket can notice it.
+TEST_F(Tls, RefusesACertificateThatEndsAfterTheSessionBegan) {
+  const Credentials pc2 = make(Authority::host("pc2"));
+  for (const bool of_client : {true, false}) {
+    Authority::Subject brief = Authority::host("pc1");
+    brief.valid_until = std::chrono::seconds(3);
+    const Credentials pc1 = make(brief);
+    const auto resumes_brief = [&] { return of_client ? resumes(pc1, pc2) : resumes(pc2, pc1); };
+    of_client ? connect(pc1, pc2) : connect(pc2, pc1);
+    ASSERT_TRUE(client && server);
+    ASSERT_TRUE(resumes_brief());
+    while (!server_error) EXPECT_TRUE(resumes_brief() || server_error);
+    if (of_client) {
+      expect_refused("'pc1' is not accepted: certificate has expired", "certificate expired");
+    } else {
+      ASSERT_TRUE(client_error);
+      EXPECT_NE(client_error->message.find("'pc1' is not accepted: certificate has expired"),
+                std::string::npos)
+          << client_error->message;
+    }
+    client.reset();
+    client_error.reset();
+    server_error.reset();
+  }
 }
 
 TEST_F(Tls, ChecksWhoGreets) {

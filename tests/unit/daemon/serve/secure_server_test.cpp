@@ -167,6 +167,18 @@ TEST_F(SecureServer, EndsConnectionsOfARevokedHostAtAReload) {
   EXPECT_TRUE(good.downs.empty());
 }
 
+TEST_F(SecureServer, ResumesTheSessionOfAHostThatConnectsAgain) {
+  Guest& guest = dial(with(issue(Authority::host("pc2")), "pc2"));
+  wait_until_up(guest);
+  const auto before = guest.dialer.connection()->peer()->certificates;
+  guest.dialer.restart({Errc::unavailable, "cut"});
+  wait_for_down(guest);
+  guest.downs.clear();
+  wait_until_up(guest);
+  EXPECT_EQ(guest.dialer.connection()->peer()->certificates, before) << "no new one was received";
+  EXPECT_EQ(guest.dialer.connection()->peer()->str(), "host 'pc1'");
+}
+
 TEST_F(SecureServer, IsLeftByAHostThatDoesNotAcceptItAnyMore) {
   auto credentials = issue(Authority::host("pc2"));
   Guest& guest = dial(with(credentials, "pc2"));
@@ -203,7 +215,7 @@ TEST_F(SecureServer, TellsAPlainProgramWhatIsMissing) {
   ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
   const UniqueFd program(ends[0]);
   std::optional<Error> refused;
-  Handshake handshake(loop, own->now, UniqueFd(ends[1]), wire::TransportEnd::accepted, false,
+  Handshake handshake(loop, own->now, UniqueFd(ends[1]), false,
                       [&](Result<std::unique_ptr<wire::Transport>> result) {
                         ASSERT_FALSE(result);
                         refused = result.error();
@@ -229,7 +241,8 @@ TEST_F(SecureServer, EndsAHandshakeThatDoesNotGoOn) {
   const UniqueFd other(ends[0]);
   bool ended = false;
   const MonoTime begin = loop.now();
-  Handshake handshake(loop, own->now, UniqueFd(ends[1]), wire::TransportEnd::connected, false,
+  wire::TlsTicket ticket;
+  Handshake handshake(loop, own->now, UniqueFd(ends[1]), ticket,
                       [&](const Result<std::unique_ptr<wire::Transport>>& result) {
                         ended = true;
                         EXPECT_FALSE(result);
