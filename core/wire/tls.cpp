@@ -325,14 +325,21 @@ class TlsTransport final : public Transport {
 
   // --- called by OpenSSL
 
-  // Notes whose certificate is refused, and why.
+  // Notes whose certificate is refused, and why. The other side gets an alert for the error.
   static int on_verified(int is_good, X509_STORE_CTX* check) {
-    if (is_good) return is_good;
+    if (is_good && X509_STORE_CTX_get_error_depth(check) > 0) return 1;  // of an authority
     auto* session =
         static_cast<SSL*>(X509_STORE_CTX_get_ex_data(check, SSL_get_ex_data_X509_STORE_CTX_idx()));
     auto* self = static_cast<TlsTransport*>(SSL_get_app_data(session));
-    self->refusal_ =
-        refusal_text(subject_of(X509_STORE_CTX_get0_cert(check)), X509_STORE_CTX_get_error(check));
+    X509* const certificate = X509_STORE_CTX_get0_cert(check);
+    if (is_good) {
+      const Result<CertifiedPeer> named = named_by(certificate);
+      if (named) return 1;
+      self->refusal_ = named.error().message;
+      X509_STORE_CTX_set_error(check, X509_V_ERR_INVALID_PURPOSE);  // "unsupported certificate"
+    } else {
+      self->refusal_ = refusal_text(subject_of(certificate), X509_STORE_CTX_get_error(check));
+    }
     return 0;
   }
 

@@ -154,7 +154,8 @@ Result<HostId> parse_host_id(std::string_view digits) {
   return Error{Errc::invalid_argument, "a host id has 32 digits 0-9, a-f"};
 }
 
-// Whom `certificate` names.
+}  // namespace
+
 Result<CertifiedPeer> named_by(X509* certificate) {
   const auto bad = [&](std::string_view what) {
     return Error{Errc::no_permission,
@@ -195,6 +196,8 @@ Result<CertifiedPeer> named_by(X509* certificate) {
   peer.host_id = *id;
   return peer;
 }
+
+namespace {
 
 Time time_of(const ASN1_TIME* time) {
   std::tm parts{};

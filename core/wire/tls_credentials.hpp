@@ -89,8 +89,11 @@ std::shared_ptr<const TlsCredentials> credentials_of(const Greeting& self);
 
 // For TlsTransport: the other side's verified certificate, after the handshake, also of a session
 // that was resumed.
-//   fails  no_permission: it names neither a host nor a program
+//   fails  no_permission
 Result<CertifiedPeer> certified_peer(ssl_st* session);
+// Whom a certificate names, whoever issued it; without `certificates`.
+//   fails  no_permission: it names neither a host nor a program
+Result<CertifiedPeer> named_by(x509_st* certificate);
 // The common name in a certificate; printable.
 std::string subject_of(const x509_st* certificate);
 // How a certificate was refused, with a hint at the reason. problem: X509_V_ERR_...

@@ -6,6 +6,7 @@
 #include "core/wire/tls.hpp"
 
 #include <gtest/gtest.h>
+#include <openssl/err.h>
 #include <openssl/ssl.h>
 #include <poll.h>
 #include <sys/socket.h>
@@ -110,6 +111,19 @@ class Tls : public testing::Test {
     return received.error();
   }
 
+  // The connecting end by OpenSSL itself, with the certificate in that folder.
+  using BareSession = std::unique_ptr<SSL, decltype(&SSL_free)>;
+  BareSession bare_client(const std::string& name, int socket) const {
+    SSL_CTX* const context = SSL_CTX_new(TLS_method());
+    SSL_CTX_use_certificate_file(context, (folder(name) + "/own.crt").c_str(), SSL_FILETYPE_PEM);
+    SSL_CTX_use_PrivateKey_file(context, (folder(name) + "/own.key").c_str(), SSL_FILETYPE_PEM);
+    BareSession session(SSL_new(context), SSL_free);
+    SSL_CTX_free(context);  // the session has it
+    SSL_set_fd(session.get(), socket);
+    SSL_set_connect_state(session.get());
+    return session;
+  }
+
   void expect_refused(const std::string& by_server, const std::string& to_client) {
     ASSERT_TRUE(server_error);
     EXPECT_EQ(server_error->code, Errc::no_permission);
@@ -212,15 +226,7 @@ TEST_F(Tls, EndsAConnectionThatSendsNothingButNewKeys) {
   int ends[2];
   ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
   const UniqueFd socket(ends[0]);
-  const std::unique_ptr<SSL_CTX, decltype(&SSL_CTX_free)> context(SSL_CTX_new(TLS_method()),
-                                                                  SSL_CTX_free);
-  SSL_CTX_use_certificate_file(context.get(), (folder("pc1") + "/own.crt").c_str(),
-                               SSL_FILETYPE_PEM);
-  SSL_CTX_use_PrivateKey_file(context.get(), (folder("pc1") + "/own.key").c_str(),
-                              SSL_FILETYPE_PEM);
-  const std::unique_ptr<SSL, decltype(&SSL_free)> session(SSL_new(context.get()), SSL_free);
-  SSL_set_fd(session.get(), socket.get());
-  SSL_set_connect_state(session.get());
+  const BareSession session = bare_client("pc1", socket.get());
   TlsHandshake to(make(Authority::host("pc2")),
                   make_transport(UniqueFd(ends[1]), TransportEnd::accepted),
                   TransportEnd::accepted);
@@ -305,6 +311,29 @@ TEST_F(Tls, RefusesACertificateThatNamesNobody) {
   ASSERT_FALSE(loaded);
   EXPECT_NE(loaded.error().message.find("names neither a host"), std::string::npos)
       << loaded.error().message;
+}
+
+// As the certificate of another vehicle's software, by the same authority.
+TEST_F(Tls, TellsTheOtherSideThatItsCertificateNamesNobody) {
+  Authority::Subject nobody = Authority::host("pc1");
+  nobody.alternative_names = "DNS:pc1";
+  authority.issue(nobody, folder("pc1"));
+  int ends[2];
+  ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
+  const UniqueFd socket(ends[0]);
+  const BareSession session = bare_client("pc1", socket.get());
+  TlsHandshake to(make(Authority::host("pc2")),
+                  make_transport(UniqueFd(ends[1]), TransportEnd::accepted),
+                  TransportEnd::accepted);
+  while (!step(to, server, server_error)) SSL_do_handshake(session.get());
+  ASSERT_TRUE(server_error);
+  EXPECT_EQ(server_error->code, Errc::no_permission);
+  EXPECT_NE(server_error->message.find("'pc1' names neither a host"), std::string::npos)
+      << server_error->message;
+  ERR_clear_error();  // of the other side
+  char byte = 0;
+  EXPECT_LE(SSL_read(session.get(), &byte, 1), 0);
+  EXPECT_EQ(ERR_GET_REASON(ERR_get_error()), SSL_R_SSLV3_ALERT_UNSUPPORTED_CERTIFICATE);
 }
 
 // A host that cannot be connected to would not notice it.
