@@ -3,10 +3,13 @@
 // Encrypted connections between a ChannelServer and the Dialers of other hosts, on loopback: who is
 // let in, who is not, and what both sides say about it.
 #include <gtest/gtest.h>
+#include <poll.h>
 #include <sys/socket.h>
 
+#include <algorithm>
 #include <filesystem>
 #include <list>
+#include <vector>
 
 #include "core/wire/tls.hpp"
 #include "daemon/link/dialer.hpp"
@@ -209,13 +212,66 @@ TEST_F(SecureServer, GivesUpTheOldestHandshakeForANewOne) {
   EXPECT_EQ(::recv(silent.back().get(), &byte, 1, MSG_DONTWAIT), -1) << "not the newest";
 }
 
+// Each address may have fewer than all.
+TEST_F(SecureServer, GivesUpAHandshakeOfTheAddressWithTheMost) {
+  const wire::SocketAddress at =
+      wire::resolve_number(wire::Address::parse(network.addresses().front()).value()).at(0);
+  std::vector<UniqueFd> silent;
+  const auto connect_from = [&](const char* number) {
+    const wire::SocketAddress from =
+        wire::resolve_number(wire::Address::parse(number, 0, true).value()).at(0);
+    silent.emplace_back(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
+    ASSERT_EQ(::bind(silent.back().get(), from.get(), from.length), 0);
+    ASSERT_EQ(::connect(silent.back().get(), at.get(), at.length), 0);
+  };
+  for (const char* number : {"127.0.0.2", "127.0.0.3", "127.0.0.4", "127.0.0.5", "127.0.0.6"}) {
+    connect_from(number);
+  }
+  for (int i = 0; i < 3; ++i) connect_from("127.0.0.7");
+  wait_until_up(dial(with(issue(Authority::host("pc2")), "pc2")));
+  std::vector<bool> closed;
+  for (const UniqueFd& one : silent) {
+    char byte = 0;
+    closed.push_back(::recv(one.get(), &byte, 1, MSG_DONTWAIT) == 0);
+  }
+  EXPECT_EQ(closed, (std::vector<bool>{0, 0, 0, 0, 0, 1, 0, 0}));
+}
+
+TEST_F(SecureServer, LeavesTheLoopToOtherWorkDuringAFloodOfHandshakes) {
+  HandshakeBudget budget(loop);
+  std::list<Handshake> handshakes;
+  std::vector<wire::TlsHandshake> flood;
+  const std::shared_ptr<const wire::TlsCredentials> credentials =
+      issue(Authority::host("pc2"))->now;
+  for (int i = 0; i < 30; ++i) {
+    int ends[2];
+    ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
+    const auto end = wire::TransportEnd::connected;
+    flood.emplace_back(credentials, wire::make_transport(UniqueFd(ends[0]), end), end);
+    ASSERT_FALSE(flood.back().go_on().value()) << "sends the first message";
+    handshakes.emplace_back(loop, own->now, UniqueFd(ends[1]), budget, false, [](const auto&) {});
+  }
+  const auto answered = [&] {
+    return std::count_if(flood.begin(), flood.end(), [](const wire::TlsHandshake& one) {
+      pollfd ready{one.fd(), POLLIN, 0};
+      return ::poll(&ready, 1, 0) == 1;
+    });
+  };
+  for (std::ptrdiff_t before = 0, now = 0; now < std::ssize(flood); before = now) {
+    run_turns(loop);
+    now = answered();
+    EXPECT_LE(now - before, HandshakeBudget::kPerTurn);
+  }
+}
+
 // From other PCs.
 TEST_F(SecureServer, TellsAPlainProgramWhatIsMissing) {
   int ends[2];
   ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
   const UniqueFd program(ends[0]);
   std::optional<Error> refused;
-  Handshake handshake(loop, own->now, UniqueFd(ends[1]), false,
+  HandshakeBudget budget(loop);
+  Handshake handshake(loop, own->now, UniqueFd(ends[1]), budget, false,
                       [&](Result<std::unique_ptr<wire::Transport>> result) {
                         ASSERT_FALSE(result);
                         refused = result.error();
