@@ -138,7 +138,7 @@ class NetworkConnection final : private wire::FrameDelegate {
   MonoTime step_at_ = MonoTime::min();
   channel::ConnectPlan plan_;
   std::string address_;
-  const ClientCredentials credentials_;
+  ClientCredentials credentials_;
   wire::TlsTicket ticket_;
   UniqueFd connecting_;
   std::optional<wire::TlsHandshake> handshake_;

@@ -91,6 +91,18 @@ bool is_at_end() {
   return at_end;
 }
 
+// Which files are in `folder`: another text when one was replaced, written, added or removed.
+std::string files_in(const std::string& folder) {
+  std::string files;
+  for (const char* name : {"/ca.crt", "/own.crt", "/own.key", "/revoked.crl"}) {
+    struct stat status {};
+    if (::stat((folder + name).c_str(), &status) != 0) status = {};
+    files += fmt::format("{}:{}:{}.{} ", status.st_dev, status.st_ino, status.st_mtim.tv_sec,
+                         status.st_mtim.tv_nsec);
+  }
+  return files;
+}
+
 struct File {
   std::string path, text;
   mode_t mode = 0;
@@ -371,6 +383,9 @@ Result<CertifiedPeer> certified_peer(ssl_st* session) {
                    others ? Stack(X509_chain_up_ref(others)) : others_in(SSL_get_session(session)));
 }
 
+TlsCredentials::TlsCredentials(const std::string& folder)
+    : folder_(folder), files_(files_in(folder)) {}
+
 TlsCredentials::~TlsCredentials() { SSL_CTX_free(context_); }
 
 Result<std::shared_ptr<const TlsCredentials>> TlsCredentials::load(const std::string& folder) {
@@ -379,13 +394,18 @@ Result<std::shared_ptr<const TlsCredentials>> TlsCredentials::load(const std::st
     error.message = "credentials: " + error.message + help;
     return error;
   };
-  const std::shared_ptr<TlsCredentials> made(new TlsCredentials);
-  Result<void> loaded = made->read(folder);
+  const std::shared_ptr<TlsCredentials> made(new TlsCredentials(folder));
+  Result<void> loaded = made->read();
   if (!loaded) return with_help(std::move(loaded).error());
   return std::shared_ptr<const TlsCredentials>(made);
 }
 
-Result<void> TlsCredentials::read(const std::string& folder) {
+Result<std::shared_ptr<const TlsCredentials>> TlsCredentials::load_if_changed() const {
+  if (files_in(folder_) == files_) return std::shared_ptr<const TlsCredentials>();
+  return load(folder_);
+}
+
+Result<void> TlsCredentials::read() {
   ERR_clear_error();
   // A program may hold connections until after exit() has called OpenSSL's own clean-up.
   OPENSSL_init_ssl(OPENSSL_INIT_NO_ATEXIT, nullptr);
@@ -404,15 +424,15 @@ Result<void> TlsCredentials::read(const std::string& folder) {
   SSL_CTX_set_read_ahead(context_, 1);
   SSL_CTX_set_default_read_buffer_len(context_, kReadBytes);
 
-  const File ca = DSSM_TRY(read_file(folder + "/ca.crt"));
+  const File ca = DSSM_TRY(read_file(folder_ + "/ca.crt"));
   X509_STORE* store = SSL_CTX_get_cert_store(context_);
   const std::vector<Certificate> authorities = DSSM_TRY(certificates_of(ca));
   for (const Certificate& one : authorities) {
     if (X509_STORE_add_cert(store, one.get()) != 1) return openssl_error("take '" + ca.path + "'");
   }
-  DSSM_TRY(load_revoked(store, authorities, folder + "/revoked.crl"));
+  DSSM_TRY(load_revoked(store, authorities, folder_ + "/revoked.crl"));
 
-  const File own = DSSM_TRY(read_file(folder + "/own.crt"));
+  const File own = DSSM_TRY(read_file(folder_ + "/own.crt"));
   std::vector<Certificate> chain = DSSM_TRY(certificates_of(own));
   if (SSL_CTX_use_certificate(context_, chain.front().get()) != 1) {
     return openssl_error("use '" + own.path + "'");
@@ -422,7 +442,7 @@ Result<void> TlsCredentials::read(const std::string& folder) {
       return openssl_error("use '" + own.path + "'");
     }
   }
-  const File key = DSSM_TRY(read_file(folder + "/own.key"));
+  const File key = DSSM_TRY(read_file(folder_ + "/own.key"));
   if (key.mode & S_IRWXO) {
     return Error{Errc::no_permission, fmt::format("every user can use '{}'; `chmod o= {}`, and "
                                                   "make a new one if others may have read it",

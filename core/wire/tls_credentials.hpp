@@ -60,6 +60,11 @@ class TlsCredentials {
   TlsCredentials& operator=(const TlsCredentials&) = delete;
   ~TlsCredentials();
 
+  // The same folder again, when a file there was replaced, written, added or removed since.
+  //   returns  nullptr: none was
+  //   fails    as load()
+  Result<std::shared_ptr<const TlsCredentials>> load_if_changed() const;
+
   // As what others know this side.
   const CertifiedPeer& own() const noexcept { return own_; }
   Time own_valid_until() const noexcept { return own_valid_until_; }
@@ -72,9 +77,11 @@ class TlsCredentials {
 
  private:
   friend class TlsTransport;
-  TlsCredentials() = default;
-  Result<void> read(const std::string& folder);
+  explicit TlsCredentials(const std::string& folder);
+  Result<void> read();
 
+  const std::string folder_;
+  const std::string files_;  // which files there were before they were read
   ssl_ctx_st* context_ = nullptr;
   CertifiedPeer own_;
   Time own_valid_until_{};

@@ -446,6 +446,21 @@ TEST_F(Tls, RefusesACertificateThatEndsAfterTheSessionBegan) {
   }
 }
 
+TEST_F(Tls, NoticesThatFilesHaveChanged) {
+  const Credentials first = make(Authority::host("pc1"));
+  EXPECT_EQ(first->load_if_changed().value(), nullptr);
+  authority.write_revoked(99, folder("pc1"));
+  const Credentials second = first->load_if_changed().value();
+  ASSERT_TRUE(second) << "a file was added";
+  authority.issue(Authority::host("pc1"), folder("new"));
+  std::filesystem::rename(folder("new") + "/own.crt", folder("pc1") + "/own.crt");
+  EXPECT_FALSE(second->load_if_changed()) << "with the key of the other certificate";
+  std::filesystem::rename(folder("new") + "/own.key", folder("pc1") + "/own.key");
+  const Credentials third = second->load_if_changed().value();
+  ASSERT_TRUE(third);
+  EXPECT_EQ(third->load_if_changed().value(), nullptr);
+}
+
 TEST_F(Tls, ChecksWhoGreets) {
   connect(make(Authority::program("viewer")), make(Authority::host("pc2")));
   Greeting host;
