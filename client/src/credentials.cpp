@@ -18,6 +18,11 @@ std::string environment(const char* name) {
 
 }  // namespace
 
+void ClientCredentials::refresh() {
+  if (!credentials) return;
+  if (auto loaded = credentials->load_if_changed(); loaded && *loaded) credentials = *loaded;
+}
+
 Result<ClientCredentials> load_credentials(const std::string& folder) {
   const std::string chosen = folder.empty() ? environment("DSSM_CREDENTIALS") : folder;
   if (!chosen.empty()) {

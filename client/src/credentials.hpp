@@ -17,6 +17,8 @@ struct ClientCredentials {
   std::shared_ptr<const wire::TlsCredentials> credentials;  // nullptr: none
   bool for_loopback = false;                                // also for connections to this PC
 
+  // Reads the files again if they have changed. While one is wrong, nothing changes.
+  void refresh();
   // For a connection to `address`; nullptr: it is not encrypted.
   std::shared_ptr<const wire::TlsCredentials> for_address(
       const wire::SocketAddress& address) const {

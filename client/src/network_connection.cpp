@@ -98,10 +98,11 @@ Result<void> NetworkConnection::begin() {
   std::unique_ptr<wire::Transport> transport =
       wire::make_transport(std::move(connecting_), wire::TransportEnd::connected);
   step_at_ = deadline_in(greeting_timeout_);
+  credentials_.refresh();
   const auto credentials = credentials_.for_address(plan_.address());
   if (!credentials) return greet(std::move(transport));
   phase_ = Phase::securing;
-  handshake_.emplace(credentials, std::move(transport), wire::TransportEnd::connected);
+  handshake_.emplace(credentials, std::move(transport), wire::TransportEnd::connected, &ticket_);
   return secure();
 }
 

@@ -138,7 +138,8 @@ class NetworkConnection final : private wire::FrameDelegate {
   MonoTime step_at_ = MonoTime::min();
   channel::ConnectPlan plan_;
   std::string address_;
-  const ClientCredentials credentials_;
+  ClientCredentials credentials_;
+  wire::TlsTicket ticket_;
   UniqueFd connecting_;
   std::optional<wire::TlsHandshake> handshake_;
   std::unique_ptr<wire::Transport> transport_;

@@ -194,9 +194,19 @@ std::optional<IpAddress> IpAddress::of(const SocketAddress& address) {
   }
 }
 
+bool IpAddress::is_ipv4() const noexcept {
+  return std::equal(kMappedIpv4.begin(), kMappedIpv4.end(), bytes.begin());
+}
+
+IpAddress IpAddress::network() const {
+  IpAddress network = *this;
+  if (!is_ipv4()) std::fill(network.bytes.begin() + 8, network.bytes.end(), std::uint8_t{});
+  return network;
+}
+
 std::string IpAddress::str() const {
   std::array<char, INET6_ADDRSTRLEN> text{};
-  const bool ipv4 = std::equal(kMappedIpv4.begin(), kMappedIpv4.end(), bytes.begin());
+  const bool ipv4 = is_ipv4();
   ::inet_ntop(ipv4 ? AF_INET : AF_INET6, &bytes[ipv4 ? kMappedIpv4.size() : 0], text.data(),
               text.size());
   return text.data();

@@ -50,6 +50,9 @@ struct IpAddress {
   static IpAddress of_ipv4(const void* four_bytes);
   // nullopt: it is neither IPv4 nor IPv6.
   static std::optional<IpAddress> of(const SocketAddress& address);
+  bool is_ipv4() const noexcept;
+  // Of an IPv6 address its /64, of which each device may use any address; IPv4: the address itself.
+  IpAddress network() const;
   std::string str() const;  // "10.0.0.1", "fd77::1"
 
   friend bool operator==(const IpAddress&, const IpAddress&) = default;

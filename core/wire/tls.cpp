@@ -51,9 +51,10 @@ std::vector<std::byte>& spare_output() {
 class TlsTransport final : public Transport {
  public:
   TlsTransport(std::shared_ptr<const TlsCredentials> credentials, std::unique_ptr<Transport> lower,
-               TransportEnd end)
+               TransportEnd end, TlsTicket* ticket)
       : credentials_(std::move(credentials)),
         lower_(std::move(lower)),
+        ticket_(ticket),
         session_(SSL_new(credentials_->context_)) {
     DSSM_CHECK(session_);
     BIO* bio = BIO_new(method());
@@ -69,11 +70,15 @@ class TlsTransport final : public Transport {
       SSL_set_accept_state(session_);
     } else {
       SSL_set_connect_state(session_);
+      if (is_ticket_good()) SSL_set_session(session_, ticket_->session_);
     }
   }
 
   // Without TLS's closing message: a child of fork() must not send it for its parent.
-  ~TlsTransport() override { SSL_free(session_); }
+  ~TlsTransport() override {
+    if (ticket_ && peer_) keep_ticket();
+    SSL_free(session_);
+  }
 
   Result<bool> go_on() {
     ERR_clear_error();
@@ -85,7 +90,10 @@ class TlsTransport final : public Transport {
     if (failed) return *failed;
     if (!flushed) return flushed.error();
     if (done != 1) return end_ ? Result<bool>(closed()) : false;
-    if (!peer_) peer_ = DSSM_TRY(certified_peer(session_));
+    if (!peer_) {
+      const bool is_known = ticket_ && SSL_session_reused(session_);
+      peer_ = is_known ? *ticket_->peer_ : DSSM_TRY(certified_peer(session_));
+    }
     has_more_input_ = true;  // maybe: OpenSSL receives what comes behind the handshake with it
     return output_.empty();
   }
@@ -188,6 +196,23 @@ class TlsTransport final : public Transport {
   int fd() const noexcept override { return lower_->fd(); }
 
  private:
+  // OpenSSL itself does not check certificates again. Otherwise a full handshake reports why they
+  // are refused.
+  bool is_ticket_good() const {
+    return ticket_ && ticket_->session_ && ticket_->credentials_.lock() == credentials_ &&
+           credentials_->check(*ticket_->peer_);
+  }
+
+  // The ticket may have come at any time, so it is taken at the end.
+  void keep_ticket() {
+    SSL_set_shutdown(session_, SSL_SENT_SHUTDOWN);  // or SSL_free() makes the session unusable
+    SSL_SESSION* const session = SSL_get1_session(session_);
+    if (!session || !SSL_SESSION_is_resumable(session)) return SSL_SESSION_free(session);
+    SSL_SESSION_free(std::exchange(ticket_->session_, session));
+    ticket_->credentials_ = credentials_;
+    ticket_->peer_ = peer_;
+  }
+
   // The next bytes for one record: from the caller's memory, or, when they are in several parts,
   // collected.
   std::span<const std::byte> next_record(std::span<const iovec>::iterator& part,
@@ -300,14 +325,21 @@ class TlsTransport final : public Transport {
 
   // --- called by OpenSSL
 
-  // Notes whose certificate is refused, and why.
+  // Notes whose certificate is refused, and why. The other side gets an alert for the error.
   static int on_verified(int is_good, X509_STORE_CTX* check) {
-    if (is_good) return is_good;
+    if (is_good && X509_STORE_CTX_get_error_depth(check) > 0) return 1;  // of an authority
     auto* session =
         static_cast<SSL*>(X509_STORE_CTX_get_ex_data(check, SSL_get_ex_data_X509_STORE_CTX_idx()));
     auto* self = static_cast<TlsTransport*>(SSL_get_app_data(session));
-    self->refusal_ =
-        refusal_text(subject_of(X509_STORE_CTX_get0_cert(check)), X509_STORE_CTX_get_error(check));
+    X509* const certificate = X509_STORE_CTX_get0_cert(check);
+    if (is_good) {
+      const Result<CertifiedPeer> named = named_by(certificate);
+      if (named) return 1;
+      self->refusal_ = named.error().message;
+      X509_STORE_CTX_set_error(check, X509_V_ERR_INVALID_PURPOSE);  // "unsupported certificate"
+    } else {
+      self->refusal_ = refusal_text(subject_of(certificate), X509_STORE_CTX_get_error(check));
+    }
     return 0;
   }
 
@@ -374,6 +406,7 @@ class TlsTransport final : public Transport {
 
   const std::shared_ptr<const TlsCredentials> credentials_;
   const std::unique_ptr<Transport> lower_;
+  TlsTicket* const ticket_;
   SSL* const session_;
   std::optional<CertifiedPeer> peer_;  // when the handshake is done
   std::vector<std::byte> output_;      // encrypted, not sent
@@ -389,9 +422,12 @@ class TlsTransport final : public Transport {
   std::string refusal_;  // of the other side's certificate
 };
 
+TlsTicket::~TlsTicket() { SSL_SESSION_free(session_); }
+
 TlsHandshake::TlsHandshake(std::shared_ptr<const TlsCredentials> credentials,
-                           std::unique_ptr<Transport> lower, TransportEnd end)
-    : transport_(std::make_unique<TlsTransport>(std::move(credentials), std::move(lower), end)) {}
+                           std::unique_ptr<Transport> lower, TransportEnd end, TlsTicket* ticket)
+    : transport_(
+          std::make_unique<TlsTransport>(std::move(credentials), std::move(lower), end, ticket)) {}
 TlsHandshake::TlsHandshake(TlsHandshake&&) noexcept = default;
 TlsHandshake& TlsHandshake::operator=(TlsHandshake&&) noexcept = default;
 TlsHandshake::~TlsHandshake() = default;

@@ -4,6 +4,9 @@
 // done it gives the transport, whose peer() is known. Frames begin after that, so nothing of an
 // unknown peer reaches them.
 //
+// The connecting end may resume the TLS session of an earlier connection (TlsTicket): then neither
+// side uses its private key, and no certificate is sent.
+//
 // send() encrypts straight from the caller's memory, a ring's slot for example, and what it has
 // encrypted counts as sent: what the network does not take, at most 64 KiB, waits here
 // (has_unsent_output()). receive() fills the spaces as long as there is input, at most 1 MiB; when
@@ -15,6 +18,7 @@
 
 #include <dssm/result.hpp>
 #include <memory>
+#include <optional>
 
 #include "core/wire/tls_credentials.hpp"
 #include "core/wire/transport.hpp"
@@ -26,11 +30,33 @@ class TlsTransport;
 // What a TLS client sends first. No frame begins like that: its second byte would be a field 0.
 inline constexpr unsigned char kTlsFirstBytes[] = {0x16, 0x03};
 
+// What the connecting end keeps of its last connection to a host, to resume the session: the
+// ticket, in which the other side has encrypted all that it needs for that, and who the other side
+// is. Empty until a connection ended. It is used only with the credentials that it was received
+// with, and while they accept the other side's certificate; the other side does the same. It needs
+// a few KiB; TLS limits a ticket to 64 KiB.
+//
+// A resource with one owner; one thread. Transports write to it until they are destroyed.
+class TlsTicket {
+ public:
+  TlsTicket() = default;
+  TlsTicket(const TlsTicket&) = delete;
+  TlsTicket& operator=(const TlsTicket&) = delete;
+  ~TlsTicket();
+
+ private:
+  friend class TlsTransport;
+  std::weak_ptr<const TlsCredentials> credentials_;
+  ssl_session_st* session_ = nullptr;
+  std::optional<CertifiedPeer> peer_;
+};
+
 // A resource with one owner; one thread. It never waits, and has no time limit of its own.
 class TlsHandshake {
  public:
+  // ticket: of the connecting end; outlives the transport. nullptr: no session is resumed.
   TlsHandshake(std::shared_ptr<const TlsCredentials> credentials, std::unique_ptr<Transport> lower,
-               TransportEnd end);
+               TransportEnd end, TlsTicket* ticket = nullptr);
   TlsHandshake(TlsHandshake&&) noexcept;
   TlsHandshake& operator=(TlsHandshake&&) noexcept;
   ~TlsHandshake();

@@ -71,6 +71,8 @@ constexpr const char* kSuites =
 // Bytes that the kernel hands over in one call: four records.
 constexpr std::size_t kReadBytes = 68U << 10;
 constexpr long kMaxChainBytes = 16 << 10;  // of the other side's certificates
+// Sessions are resumed for so long after the full handshake, which proves who has the private keys.
+constexpr long kTicketSeconds = 24L * 60 * 60;
 
 Error openssl_error(const std::string& what) {
   const unsigned long code = ERR_peek_last_error();
@@ -87,6 +89,18 @@ bool is_at_end() {
   const bool at_end = ERR_GET_REASON(ERR_peek_last_error()) == PEM_R_NO_START_LINE;
   if (at_end) ERR_clear_error();
   return at_end;
+}
+
+// Which files are in `folder`: another text when one was replaced, written, added or removed.
+std::string files_in(const std::string& folder) {
+  std::string files;
+  for (const char* name : {"/ca.crt", "/own.crt", "/own.key", "/revoked.crl"}) {
+    struct stat status {};
+    if (::stat((folder + name).c_str(), &status) != 0) status = {};
+    files += fmt::format("{}:{}:{}.{} ", status.st_dev, status.st_ino, status.st_mtim.tv_sec,
+                         status.st_mtim.tv_nsec);
+  }
+  return files;
 }
 
 struct File {
@@ -152,7 +166,8 @@ Result<HostId> parse_host_id(std::string_view digits) {
   return Error{Errc::invalid_argument, "a host id has 32 digits 0-9, a-f"};
 }
 
-// Whom `certificate` names.
+}  // namespace
+
 Result<CertifiedPeer> named_by(X509* certificate) {
   const auto bad = [&](std::string_view what) {
     return Error{Errc::no_permission,
@@ -193,6 +208,8 @@ Result<CertifiedPeer> named_by(X509* certificate) {
   peer.host_id = *id;
   return peer;
 }
+
+namespace {
 
 Time time_of(const ASN1_TIME* time) {
   std::tm parts{};
@@ -257,6 +274,60 @@ bool is_temporary(int problem) noexcept {
          problem == X509_V_ERR_CRL_HAS_EXPIRED;
 }
 
+// --- tickets, which hold all that this side needs to resume a session; OpenSSL encrypts them with
+// keys that the context made at random, and puts in only the first certificate of the other side
+
+// Puts the others there, too: they are needed to verify the first one again.
+int put_others(SSL* session, void*) {
+  std::string der;
+  STACK_OF(X509)* others = SSL_get_peer_cert_chain(session);
+  for (int i = 0; i < sk_X509_num(others); ++i) {
+    unsigned char* bytes = nullptr;
+    const int count = i2d_X509(sk_X509_value(others, i), &bytes);
+    if (count < 0) return 0;
+    der.append(reinterpret_cast<const char*>(bytes), static_cast<std::size_t>(count));
+    OPENSSL_free(bytes);
+  }
+  return SSL_SESSION_set1_ticket_appdata(SSL_get_session(session), der.data(), der.size());
+}
+
+Stack others_in(SSL_SESSION* session) {
+  Stack others(sk_X509_new_null());
+  void* der = nullptr;
+  std::size_t count = 0;
+  SSL_SESSION_get0_ticket_appdata(session, &der, &count);
+  const auto* at = static_cast<const unsigned char*>(der);
+  const auto* const end = at + count;
+  while (at != end) {
+    X509* const next = d2i_X509(nullptr, &at, end - at);
+    if (!next) break;
+    sk_X509_push(others.get(), next);
+  }
+  return others;
+}
+
+Result<CertifiedPeer> peer_with(Certificate certificate, Stack others) {
+  CertifiedPeer peer = DSSM_TRY(named_by(certificate.get()));
+  peer.certificates = std::make_shared<const CertifiedPeer::Certificates>(
+      CertifiedPeer::Certificates{std::move(certificate), std::move(others)});
+  return peer;
+}
+
+// Whether the session of a ticket is resumed: while these credentials accept the other side's
+// certificate. Otherwise the handshake becomes a full one, which reports to both sides why not. No
+// new ticket replaces the one that is used, so that kTicketSeconds count from the full handshake.
+SSL_TICKET_RETURN on_ticket(SSL*, SSL_SESSION* session, const unsigned char*, std::size_t,
+                            SSL_TICKET_STATUS status, void* credentials) {
+  if (status != SSL_TICKET_SUCCESS && status != SSL_TICKET_SUCCESS_RENEW) {
+    return SSL_TICKET_RETURN_IGNORE_RENEW;
+  }
+  X509* const certificate = SSL_SESSION_get0_peer(session);
+  if (!certificate || X509_up_ref(certificate) != 1) return SSL_TICKET_RETURN_IGNORE_RENEW;
+  const Result<CertifiedPeer> peer = peer_with(Certificate(certificate), others_in(session));
+  const bool is_accepted = peer && static_cast<const TlsCredentials*>(credentials)->check(*peer);
+  return is_accepted ? SSL_TICKET_RETURN_USE : SSL_TICKET_RETURN_IGNORE_RENEW;
+}
+
 }  // namespace
 
 std::string CertifiedPeer::str() const {
@@ -307,13 +378,13 @@ std::shared_ptr<const TlsCredentials> credentials_of(const Greeting& self) {
 Result<CertifiedPeer> certified_peer(ssl_st* session) {
   Certificate certificate(SSL_get1_peer_certificate(session));
   if (!certificate) return Error{Errc::no_permission, "the other side shows no certificate"};
-  CertifiedPeer peer = DSSM_TRY(named_by(certificate.get()));
   STACK_OF(X509)* others = SSL_get_peer_cert_chain(session);
-  peer.certificates =
-      std::make_shared<const CertifiedPeer::Certificates>(CertifiedPeer::Certificates{
-          std::move(certificate), Stack(others ? X509_chain_up_ref(others) : nullptr)});
-  return peer;
+  return peer_with(std::move(certificate),
+                   others ? Stack(X509_chain_up_ref(others)) : others_in(SSL_get_session(session)));
 }
+
+TlsCredentials::TlsCredentials(const std::string& folder)
+    : folder_(folder), files_(files_in(folder)) {}
 
 TlsCredentials::~TlsCredentials() { SSL_CTX_free(context_); }
 
@@ -323,13 +394,18 @@ Result<std::shared_ptr<const TlsCredentials>> TlsCredentials::load(const std::st
     error.message = "credentials: " + error.message + help;
     return error;
   };
-  const std::shared_ptr<TlsCredentials> made(new TlsCredentials);
-  Result<void> loaded = made->read(folder);
+  const std::shared_ptr<TlsCredentials> made(new TlsCredentials(folder));
+  Result<void> loaded = made->read();
   if (!loaded) return with_help(std::move(loaded).error());
   return std::shared_ptr<const TlsCredentials>(made);
 }
 
-Result<void> TlsCredentials::read(const std::string& folder) {
+Result<std::shared_ptr<const TlsCredentials>> TlsCredentials::load_if_changed() const {
+  if (files_in(folder_) == files_) return std::shared_ptr<const TlsCredentials>();
+  return load(folder_);
+}
+
+Result<void> TlsCredentials::read() {
   ERR_clear_error();
   // A program may hold connections until after exit() has called OpenSSL's own clean-up.
   OPENSSL_init_ssl(OPENSSL_INIT_NO_ATEXIT, nullptr);
@@ -337,23 +413,26 @@ Result<void> TlsCredentials::read(const std::string& folder) {
   if (!context_) return openssl_error("set up TLS");
   SSL_CTX_set_min_proto_version(context_, TLS1_3_VERSION);
   SSL_CTX_set_ciphersuites(context_, kSuites);
-  SSL_CTX_set_options(context_, SSL_OP_NO_TICKET);
-  SSL_CTX_set_num_tickets(context_, 0);
+  constexpr unsigned char kSessionsOf[] = "dssmd";
+  SSL_CTX_set_session_id_context(context_, kSessionsOf, sizeof kSessionsOf);
+  SSL_CTX_set_num_tickets(context_, 1);
+  SSL_CTX_set_timeout(context_, kTicketSeconds);
+  SSL_CTX_set_session_ticket_cb(context_, put_others, on_ticket, this);
   SSL_CTX_set_max_cert_list(context_, kMaxChainBytes);
   SSL_CTX_set_session_cache_mode(context_, SSL_SESS_CACHE_OFF);
   SSL_CTX_set_mode(context_, SSL_MODE_RELEASE_BUFFERS);
   SSL_CTX_set_read_ahead(context_, 1);
   SSL_CTX_set_default_read_buffer_len(context_, kReadBytes);
 
-  const File ca = DSSM_TRY(read_file(folder + "/ca.crt"));
+  const File ca = DSSM_TRY(read_file(folder_ + "/ca.crt"));
   X509_STORE* store = SSL_CTX_get_cert_store(context_);
   const std::vector<Certificate> authorities = DSSM_TRY(certificates_of(ca));
   for (const Certificate& one : authorities) {
     if (X509_STORE_add_cert(store, one.get()) != 1) return openssl_error("take '" + ca.path + "'");
   }
-  DSSM_TRY(load_revoked(store, authorities, folder + "/revoked.crl"));
+  DSSM_TRY(load_revoked(store, authorities, folder_ + "/revoked.crl"));
 
-  const File own = DSSM_TRY(read_file(folder + "/own.crt"));
+  const File own = DSSM_TRY(read_file(folder_ + "/own.crt"));
   std::vector<Certificate> chain = DSSM_TRY(certificates_of(own));
   if (SSL_CTX_use_certificate(context_, chain.front().get()) != 1) {
     return openssl_error("use '" + own.path + "'");
@@ -363,7 +442,7 @@ Result<void> TlsCredentials::read(const std::string& folder) {
       return openssl_error("use '" + own.path + "'");
     }
   }
-  const File key = DSSM_TRY(read_file(folder + "/own.key"));
+  const File key = DSSM_TRY(read_file(folder_ + "/own.key"));
   if (key.mode & S_IRWXO) {
     return Error{Errc::no_permission, fmt::format("every user can use '{}'; `chmod o= {}`, and "
                                                   "make a new one if others may have read it",

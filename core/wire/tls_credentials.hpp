@@ -24,6 +24,7 @@
 
 // Of OpenSSL.
 struct ssl_ctx_st;
+struct ssl_session_st;
 struct ssl_st;
 struct x509_st;
 
@@ -59,6 +60,11 @@ class TlsCredentials {
   TlsCredentials& operator=(const TlsCredentials&) = delete;
   ~TlsCredentials();
 
+  // The same folder again, when a file there was replaced, written, added or removed since.
+  //   returns  nullptr: none was
+  //   fails    as load()
+  Result<std::shared_ptr<const TlsCredentials>> load_if_changed() const;
+
   // As what others know this side.
   const CertifiedPeer& own() const noexcept { return own_; }
   Time own_valid_until() const noexcept { return own_valid_until_; }
@@ -71,9 +77,11 @@ class TlsCredentials {
 
  private:
   friend class TlsTransport;
-  TlsCredentials() = default;
-  Result<void> read(const std::string& folder);
+  explicit TlsCredentials(const std::string& folder);
+  Result<void> read();
 
+  const std::string folder_;
+  const std::string files_;  // which files there were before they were read
   ssl_ctx_st* context_ = nullptr;
   CertifiedPeer own_;
   Time own_valid_until_{};
@@ -86,9 +94,13 @@ struct OwnCredentials {
 // Those of `self`; nullptr: its connections are not encrypted.
 std::shared_ptr<const TlsCredentials> credentials_of(const Greeting& self);
 
-// For TlsTransport: the other side's verified certificate, after the handshake.
-//   fails  no_permission: it names neither a host nor a program
+// For TlsTransport: the other side's verified certificate, after the handshake, also of a session
+// that was resumed.
+//   fails  no_permission
 Result<CertifiedPeer> certified_peer(ssl_st* session);
+// Whom a certificate names, whoever issued it; without `certificates`.
+//   fails  no_permission: it names neither a host nor a program
+Result<CertifiedPeer> named_by(x509_st* certificate);
 // The common name in a certificate; printable.
 std::string subject_of(const x509_st* certificate);
 // How a certificate was refused, with a hint at the reason. problem: X509_V_ERR_...

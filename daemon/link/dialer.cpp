@@ -162,7 +162,7 @@ void Dialer::on_connected() {
     state_ = State::secure;
     timer_.disable();  // the handshake has its own
     handshake_ = std::make_unique<Handshake>(
-        loop_, credentials, std::move(socket_), wire::TransportEnd::connected, false,
+        loop_, credentials, std::move(socket_), ticket_,
         [this](Result<std::unique_ptr<wire::Transport>> secured) {
           if (!secured) return fail(std::move(secured).error().context(peer_name()));
           greet(*std::move(secured));

@@ -123,6 +123,7 @@ class Dialer final : private FrameConnection::Observer {
   MonoTime round_began_{};
   Resolver::Ticket lookup_;
   UniqueFd socket_;  // while it connects
+  wire::TlsTicket ticket_;
   // Until the next round, as the connection below.
   std::unique_ptr<Handshake> handshake_;
   // Until the next round: a FrameConnection must not be destroyed in its own callbacks.

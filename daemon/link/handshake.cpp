@@ -16,9 +16,23 @@
 namespace dssm::daemon {
 
 Handshake::Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
-                     UniqueFd socket, wire::TransportEnd end, bool takes_plain, Then then)
+                     UniqueFd socket, wire::TlsTicket& ticket, Then then)
+    : Handshake(loop, std::move(credentials), std::move(socket), &ticket, nullptr, false,
+                std::move(then)) {
+  writable_.enable();  // the connecting end begins
+}
+
+Handshake::Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
+                     UniqueFd socket, HandshakeBudget& budget, bool takes_plain, Then then)
+    : Handshake(loop, std::move(credentials), std::move(socket), nullptr, &budget, takes_plain,
+                std::move(then)) {}
+
+Handshake::Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
+                     UniqueFd socket, wire::TlsTicket* ticket, HandshakeBudget* budget,
+                     bool takes_plain, Then then)
     : credentials_(std::move(credentials)),
-      end_(end),
+      ticket_(ticket),
+      budget_(budget),
       takes_plain_(takes_plain),
       then_(std::move(then)),
       socket_(std::move(socket)),
@@ -29,11 +43,10 @@ Handshake::Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCrede
       })) {
   timer_.enable_in(wire::kHelloTimeout);
   readable_.enable();
-  if (end_ == wire::TransportEnd::connected) writable_.enable();  // the connecting end begins
 }
 
 void Handshake::on_ready() {
-  if (!tls_ && end_ == wire::TransportEnd::accepted) return recognize();
+  if (!tls_ && budget_) return recognize();
   go_on();
 }
 
@@ -43,7 +56,9 @@ void Handshake::recognize() {
   if (count < 0 && (errno == EAGAIN || errno == EINTR)) return;
   if (count <= 0) return finish(Error{Errc::unavailable, "the other side closed the connection"});
   if (std::equal(first, first + count, wire::kTlsFirstBytes)) return go_on();
-  if (takes_plain_) return finish(wire::make_transport(std::move(socket_), end_));
+  if (takes_plain_) {
+    return finish(wire::make_transport(std::move(socket_), wire::TransportEnd::accepted));
+  }
   const Error why{Errc::no_permission,
                   "dssmd of host '" + credentials_->own().name +
                       "' takes encrypted connections only; give this side credentials of the same "
@@ -55,7 +70,11 @@ void Handshake::recognize() {
 }
 
 void Handshake::go_on() {
-  if (!tls_) tls_.emplace(credentials_, wire::make_transport(std::move(socket_), end_), end_);
+  if (budget_ && !budget_->try_take()) return;  // the socket stays ready
+  if (!tls_) {
+    const auto end = budget_ ? wire::TransportEnd::accepted : wire::TransportEnd::connected;
+    tls_.emplace(credentials_, wire::make_transport(std::move(socket_), end), end, ticket_);
+  }
   const Result<bool> done = tls_->go_on();
   if (!done) return finish(done.error());
   if (*done) return finish(tls_->take_transport());

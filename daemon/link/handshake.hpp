@@ -17,15 +17,44 @@
 
 namespace dssm::daemon {
 
+// How many handshakes of the accepting end continue in one turn of the loop: each time may take
+// operations with private keys, 0.1 ms to some ms, and any number of handshakes may be due at once.
+// The others continue in later turns, those first that were ready first. loop outlives it.
+class HandshakeBudget {
+ public:
+  static constexpr int kPerTurn = 4;
+
+  explicit HandshakeBudget(const EventLoop& loop)
+      : next_turn_(EventSource::timer(loop, [this] { left_ = kPerTurn; })) {}
+  HandshakeBudget(const HandshakeBudget&) = delete;
+  HandshakeBudget& operator=(const HandshakeBudget&) = delete;
+
+  bool try_take() noexcept {
+    if (left_ == 0) return false;
+    if (left_-- == kPerTurn) next_turn_.enable_in(Duration::zero());
+    return true;
+  }
+
+ private:
+  int left_ = kPerTurn;
+  EventSource next_turn_;
+};
+
 class Handshake {
  public:
   // Called once, from the loop; must not destroy the handshake.
   using Then = std::function<void(Result<std::unique_ptr<wire::Transport>>)>;
 
-  // Starts at once; loop outlives it.
-  //   takes_plain  of the accepting end: connections without TLS are passed on
+  // Both start at once; loop outlives them.
+  // The connecting end.
+  //   ticket  of the last connection there; outlives the handshake and the transport
   Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
-            UniqueFd socket, wire::TransportEnd end, bool takes_plain, Then then);
+            UniqueFd socket, wire::TlsTicket& ticket, Then then);
+  // The accepting end.
+  //   budget       of all of them; outlives the handshake
+  //   takes_plain  connections without TLS are passed on
+  Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
+            UniqueFd socket, HandshakeBudget& budget, bool takes_plain, Then then);
   Handshake(const Handshake&) = delete;
   Handshake& operator=(const Handshake&) = delete;
 
@@ -33,13 +62,17 @@ class Handshake {
   void stop();
 
  private:
+  Handshake(const EventLoop& loop, std::shared_ptr<const wire::TlsCredentials> credentials,
+            UniqueFd socket, wire::TlsTicket* ticket, HandshakeBudget* budget, bool takes_plain,
+            Then then);
   void on_ready();
   void recognize();
   void go_on();
   void finish(Result<std::unique_ptr<wire::Transport>> result);
 
   const std::shared_ptr<const wire::TlsCredentials> credentials_;
-  const wire::TransportEnd end_;
+  wire::TlsTicket* const ticket_;  // of the connecting end
+  HandshakeBudget* const budget_;  // of the accepting end
   const bool takes_plain_;
   const Then then_;
   UniqueFd socket_;  // until the first byte came

@@ -4,6 +4,7 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <optional>
 #include <utility>
 
 #include "core/base/text.hpp"
@@ -25,6 +26,11 @@ std::string without_port(const wire::SocketAddress& address) {
   return text.substr(0, text.rfind(':'));
 }
 
+std::string network_of(const wire::SocketAddress& address) {
+  const std::optional<wire::IpAddress> ip = wire::IpAddress::of(address);
+  return ip ? ip->network().str() : std::string();
+}
+
 }  // namespace
 
 ChannelServer::ChannelServer(const Parts& parts, wire::Greeting self,
@@ -34,6 +40,7 @@ ChannelServer::ChannelServer(const Parts& parts, wire::Greeting self,
       self_(std::move(self)),
       limits_(limits),
       peers_(limits),
+      handshake_budget_(parts.loop),
       streams_(parts.loop),
       sweep_(EventSource::timer(parts.loop, [this] { sweep(); })),
       acceptor_(parts.loop, logger_, "a connection", self_.host, message_id::kPeerRefused,
@@ -71,28 +78,29 @@ std::string ChannelServer::refuses(const wire::SocketAddress& address) const {
 }
 
 // Anybody can begin handshakes. As many are under way as connections are allowed; for one more, the
-// oldest of the address with the most is given up: a handshake that goes on takes milliseconds.
+// oldest one is given up of the address with the most, in the network with the most: who has one
+// IPv6 address has all of its /64. A handshake that goes on takes milliseconds. There is no limit
+// per network, because all hosts of a vehicle may be in one.
 void ChannelServer::secure(UniqueFd socket, const wire::SocketAddress& address) {
-  const std::string where = without_port(address);
-  std::map<std::string_view, std::uint64_t> counts;
-  for (const Arrival& one : arrivals_) ++counts[one.address];
-  const auto most =
-      std::max_element(counts.begin(), counts.end(),
-                       [](const auto& a, const auto& b) { return a.second < b.second; });
-  const auto give_up_oldest = [&](std::string_view of) {
-    arrivals_.erase(std::find_if(arrivals_.begin(), arrivals_.end(),
-                                 [&](const Arrival& one) { return one.address == of; }));
+  const std::string where = without_port(address), network = network_of(address);
+  std::map<std::string_view, std::uint64_t> of_address, of_network;
+  for (const Arrival& one : arrivals_) ++of_address[one.address], ++of_network[one.network];
+  const auto crowd = [&](const Arrival& one) {
+    return std::pair(of_network[one.network], of_address[one.address]);
   };
-  if (counts[where] >= limits_.max_connections_per_host) {
-    give_up_oldest(where);
+  if (of_address[where] >= limits_.max_connections_per_host) {
+    arrivals_.erase(std::find_if(arrivals_.begin(), arrivals_.end(),
+                                 [&](const Arrival& one) { return one.address == where; }));
   } else if (arrivals_.size() >= limits_.max_connections) {
-    give_up_oldest(most->first);
+    arrivals_.erase(
+        std::max_element(arrivals_.begin(), arrivals_.end(),
+                         [&](const Arrival& a, const Arrival& b) { return crowd(a) < crowd(b); }));
   }
-  Arrival& arrival = arrivals_.emplace_back(Arrival{where, nullptr, false});
+  Arrival& arrival = arrivals_.emplace_back(Arrival{where, network, nullptr, false});
   const bool takes_plain = parts_.takes_plain || address.is_loopback();
   arrival.handshake = std::make_unique<Handshake>(
-      parts_.loop, wire::credentials_of(self_), std::move(socket), wire::TransportEnd::accepted,
-      takes_plain, [this, &arrival, address](Result<std::unique_ptr<wire::Transport>> transport) {
+      parts_.loop, wire::credentials_of(self_), std::move(socket), handshake_budget_, takes_plain,
+      [this, &arrival, address](Result<std::unique_ptr<wire::Transport>> transport) {
         on_secured(arrival, address, std::move(transport));
       });
 }

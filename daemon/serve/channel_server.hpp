@@ -79,6 +79,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   // A connection whose TLS handshake is under way.
   struct Arrival {
     std::string address;  // without port
+    std::string network;  // of that address
     std::unique_ptr<Handshake> handshake;
     bool ended = false;  // to be destroyed outside of its own callback
   };
@@ -102,6 +103,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   wire::Greeting self_;
   PeerTable::Limits limits_;
   PeerTable peers_;
+  HandshakeBudget handshake_budget_;
   std::list<Arrival> arrivals_;  // the oldest first
   SendingDemands sending_;
   ServedStreams streams_;

@@ -30,7 +30,7 @@ class Authority {
     std::string name;
     std::string alternative_names;  // as openssl.cnf(5) writes them: "DNS:pc2,URI:..."
     std::string extended_usage = "serverAuth,clientAuth";
-    Hours valid_from{-1}, valid_until{24};
+    std::chrono::seconds valid_from = Hours(-1), valid_until = Hours(24);
   };
 
   static Subject host(const std::string& name) {
@@ -40,11 +40,15 @@ class Authority {
     return {name, "URI:urn:dssm:program:" + name, "clientAuth"};
   }
 
-  explicit Authority(const std::string& name = "vehicle") : key_(make_key()) {
+  // above: the one that issued this one's certificate, which outlives it; nullptr: itself.
+  explicit Authority(const std::string& name = "vehicle", Authority* above = nullptr)
+      : key_(make_key()), above_(above) {
     certificate_ = make(name, key_.get(), Hours(-1000), Hours(1000));
     add(certificate_.get(), NID_basic_constraints, "critical,CA:TRUE");
     add(certificate_.get(), NID_key_usage, "critical,keyCertSign,cRLSign");
-    X509_sign(certificate_.get(), key_.get(), EVP_sha256());
+    const Authority& by = above ? *above : *this;
+    X509_set_issuer_name(certificate_.get(), X509_get_subject_name(by.certificate_.get()));
+    X509_sign(certificate_.get(), by.key_.get(), EVP_sha256());
   }
 
   // Writes ca.crt, own.crt and own.key into `folder`, which is made.
@@ -58,12 +62,16 @@ class Authority {
     add(made.get(), NID_subject_alt_name, subject.alternative_names);
     X509_set_issuer_name(made.get(), X509_get_subject_name(certificate_.get()));
     X509_sign(made.get(), key_.get(), EVP_sha256());
-    write(folder / "own.crt", [&](FILE* file) { PEM_write_X509(file, made.get()); });
+    write(folder / "own.crt", [&](FILE* file) {
+      PEM_write_X509(file, made.get());
+      if (above_) PEM_write_X509(file, certificate_.get());
+    });
     write(folder / "own.key", [&](FILE* file) {
       PEM_write_PrivateKey(file, key.get(), nullptr, nullptr, 0, nullptr, nullptr);
     });
     ::chmod((folder / "own.key").c_str(), 0600);
-    write(folder / "ca.crt", [&](FILE* file) { PEM_write_X509(file, certificate_.get()); });
+    const Certificate& root = above_ ? above_->certificate_ : certificate_;
+    write(folder / "ca.crt", [&](FILE* file) { PEM_write_X509(file, root.get()); });
     return serial_;
   }
 
@@ -94,12 +102,13 @@ class Authority {
 
   static Key make_key() { return {EVP_EC_gen("P-256"), EVP_PKEY_free}; }
 
-  Certificate make(const std::string& name, EVP_PKEY* key, Hours from, Hours until) {
+  Certificate make(const std::string& name, EVP_PKEY* key, std::chrono::seconds from,
+                   std::chrono::seconds until) {
     Certificate made{X509_new(), X509_free};
     X509_set_version(made.get(), X509_VERSION_3);
     ASN1_INTEGER_set(X509_get_serialNumber(made.get()), ++serial_);
-    X509_time_adj_ex(X509_getm_notBefore(made.get()), 0, from / std::chrono::seconds(1), nullptr);
-    X509_time_adj_ex(X509_getm_notAfter(made.get()), 0, until / std::chrono::seconds(1), nullptr);
+    X509_time_adj_ex(X509_getm_notBefore(made.get()), 0, from.count(), nullptr);
+    X509_time_adj_ex(X509_getm_notAfter(made.get()), 0, until.count(), nullptr);
     X509_NAME* subject = X509_get_subject_name(made.get());
     X509_NAME_add_entry_by_NID(subject, NID_commonName, MBSTRING_UTF8,
                                reinterpret_cast<const unsigned char*>(name.c_str()), -1, -1, 0);
@@ -123,6 +132,7 @@ class Authority {
   }
 
   Key key_;
+  Authority* above_;
   Certificate certificate_{nullptr, X509_free};
   long serial_ = 0;
 };

@@ -55,6 +55,7 @@ struct PConnectorOptions {
   // Folder of the files that encrypted connections need (ca.crt, own.crt, own.key, revoked.crl;
   // `dssmctl pki` makes them). Empty: $DSSM_CREDENTIALS; without that, for other PCs only,
   // ~/.config/dssm/credentials if it exists. Without any of them connections are not encrypted.
+  // Files that have changed are read again when a connection is made.
   std::string credentials = {};
   // How long a call waits for dssmd's greeting and answer.
   Duration request_timeout = std::chrono::seconds(5);

@@ -218,6 +218,35 @@ TEST_F(SecureHosts, ServeAProgramWithACertificate) {
   }
 }
 
+TEST_F(SecureHosts, ServeAProgramWhoseCertificateIsReplacedWhileItRuns) {
+  auto writer = here.create<Numbered>("odometry", History{16, 1ms}).value();
+  const std::string folder = make_temp_dir();
+  const auto install = [&](const std::string& program) {
+    std::filesystem::copy(credentials_for_program(program), folder,
+                          std::filesystem::copy_options::recursive |
+                              std::filesystem::copy_options::overwrite_existing);
+  };
+  install("lost-laptop");
+  PConnector reader =
+      PConnector::open({"odometry", 0, ""}, {.address = pc1.dssmd.address(), .credentials = folder})
+          .value();
+  reader.subscribe({}).value();
+  install("new-laptop");
+  pc1.install({"revoke", "lost-laptop"});
+  await([&] { return here.stream_info({"odometry", 0, ""}).value().channels == 0; });
+  std::vector<std::byte> payload(sizeof(Numbered));
+  SampleInfo info;
+  Tid tid = 0;
+  await([&] {
+    writer.write(numbered(tid), time_from_ns(tid), 0ns);
+    ++tid;
+    static_cast<void>(reader.wait(MonoClock::now() + 10ms));
+    const Result<ReadStatus> read = reader.read_next(payload, info);  // fails until it is connected
+    return read && *read == ReadStatus::ok;
+  });
+  remove_tree(folder);
+}
+
 TEST_F(SecureHosts, TellAProgramWhyItIsRefused) {
   const std::string folder = credentials_for_program("intruder");
   pc1.install({"revoke", "intruder"});

@@ -127,5 +127,15 @@ TEST(SocketAddress, KnowsLoopback) {
   EXPECT_FALSE(SocketAddress().is_loopback());
 }
 
+TEST(IpAddress, HasANetwork) {
+  const auto network = [](const char* text) {
+    return IpAddress::of(numbers(text)[0]).value().network().str();
+  };
+  EXPECT_EQ(network("2001:db8:1:2:3:4:5:6"), "2001:db8:1:2::");
+  EXPECT_EQ(network("2001:db8:1:3:3:4:5:6"), "2001:db8:1:3::");
+  EXPECT_EQ(network("10.0.0.2"), "10.0.0.2");
+  EXPECT_EQ(network("::ffff:10.0.0.2"), "10.0.0.2");
+}
+
 }  // namespace
 }  // namespace dssm::wire

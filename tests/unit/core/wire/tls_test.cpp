@@ -6,6 +6,7 @@
 #include "core/wire/tls.hpp"
 
 #include <gtest/gtest.h>
+#include <openssl/err.h>
 #include <openssl/ssl.h>
 #include <poll.h>
 #include <sys/socket.h>
@@ -43,6 +44,7 @@ class Tls : public testing::Test {
  protected:
   const std::filesystem::path dir = test::make_temp_dir();
   Authority authority;
+  TlsTicket ticket;
   std::unique_ptr<Transport> client, server;
   std::optional<Error> client_error, server_error;
 
@@ -79,7 +81,8 @@ class Tls : public testing::Test {
       for (const int end : ends) ::setsockopt(end, SOL_SOCKET, SO_SNDBUF, &buffer, sizeof buffer);
     }
     auto over = [](int fd, TransportEnd end) { return make_transport(UniqueFd(fd), end); };
-    TlsHandshake from(of_client, over(ends[0], TransportEnd::connected), TransportEnd::connected);
+    TlsHandshake from(of_client, over(ends[0], TransportEnd::connected), TransportEnd::connected,
+                      &ticket);
     TlsHandshake to(of_server, over(ends[1], TransportEnd::accepted), TransportEnd::accepted);
     for (bool both = false; !both;) {
       const bool one = step(from, client, client_error);
@@ -89,12 +92,36 @@ class Tls : public testing::Test {
     if (client && server_error) client_error = receive_error(*client);
   }
 
+  // A new connection after a cut. Whether it resumed the session: then the client knows the very
+  // certificate that the server showed before.
+  bool resumes(const Credentials& of_client, const Credentials& of_server) {
+    EXPECT_FALSE(receive_error(*client)) << "receives the ticket";
+    const auto before = client->peer()->certificates;
+    client.reset();
+    server.reset();
+    connect(of_client, of_server);
+    return client && client->peer()->certificates == before;
+  }
+
   static std::optional<Error> receive_error(Transport& end) {
     std::byte byte{};
     const iovec space{&byte, 1};
     const Result<IoResult> received = end.receive({&space, 1});
     if (received) return std::nullopt;
     return received.error();
+  }
+
+  // The connecting end by OpenSSL itself, with the certificate in that folder.
+  using BareSession = std::unique_ptr<SSL, decltype(&SSL_free)>;
+  BareSession bare_client(const std::string& name, int socket) const {
+    SSL_CTX* const context = SSL_CTX_new(TLS_method());
+    SSL_CTX_use_certificate_file(context, (folder(name) + "/own.crt").c_str(), SSL_FILETYPE_PEM);
+    SSL_CTX_use_PrivateKey_file(context, (folder(name) + "/own.key").c_str(), SSL_FILETYPE_PEM);
+    BareSession session(SSL_new(context), SSL_free);
+    SSL_CTX_free(context);  // the session has it
+    SSL_set_fd(session.get(), socket);
+    SSL_set_connect_state(session.get());
+    return session;
   }
 
   void expect_refused(const std::string& by_server, const std::string& to_client) {
@@ -199,15 +226,7 @@ TEST_F(Tls, EndsAConnectionThatSendsNothingButNewKeys) {
   int ends[2];
   ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
   const UniqueFd socket(ends[0]);
-  const std::unique_ptr<SSL_CTX, decltype(&SSL_CTX_free)> context(SSL_CTX_new(TLS_method()),
-                                                                  SSL_CTX_free);
-  SSL_CTX_use_certificate_file(context.get(), (folder("pc1") + "/own.crt").c_str(),
-                               SSL_FILETYPE_PEM);
-  SSL_CTX_use_PrivateKey_file(context.get(), (folder("pc1") + "/own.key").c_str(),
-                              SSL_FILETYPE_PEM);
-  const std::unique_ptr<SSL, decltype(&SSL_free)> session(SSL_new(context.get()), SSL_free);
-  SSL_set_fd(session.get(), socket.get());
-  SSL_set_connect_state(session.get());
+  const BareSession session = bare_client("pc1", socket.get());
   TlsHandshake to(make(Authority::host("pc2")),
                   make_transport(UniqueFd(ends[1]), TransportEnd::accepted),
                   TransportEnd::accepted);
@@ -294,6 +313,29 @@ TEST_F(Tls, RefusesACertificateThatNamesNobody) {
       << loaded.error().message;
 }
 
+// As the certificate of another vehicle's software, by the same authority.
+TEST_F(Tls, TellsTheOtherSideThatItsCertificateNamesNobody) {
+  Authority::Subject nobody = Authority::host("pc1");
+  nobody.alternative_names = "DNS:pc1";
+  authority.issue(nobody, folder("pc1"));
+  int ends[2];
+  ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
+  const UniqueFd socket(ends[0]);
+  const BareSession session = bare_client("pc1", socket.get());
+  TlsHandshake to(make(Authority::host("pc2")),
+                  make_transport(UniqueFd(ends[1]), TransportEnd::accepted),
+                  TransportEnd::accepted);
+  while (!step(to, server, server_error)) SSL_do_handshake(session.get());
+  ASSERT_TRUE(server_error);
+  EXPECT_EQ(server_error->code, Errc::no_permission);
+  EXPECT_NE(server_error->message.find("'pc1' names neither a host"), std::string::npos)
+      << server_error->message;
+  ERR_clear_error();  // of the other side
+  char byte = 0;
+  EXPECT_LE(SSL_read(session.get(), &byte, 1), 0);
+  EXPECT_EQ(ERR_GET_REASON(ERR_get_error()), SSL_R_SSLV3_ALERT_UNSUPPORTED_CERTIFICATE);
+}
+
 // A host that cannot be connected to would not notice it.
 TEST_F(Tls, RefusesAnOwnCertificateThatIsGoodForOneDirectionOnly) {
   Authority::Subject half = Authority::host("pc1");
@@ -331,6 +373,92 @@ TEST_F(Tls, ChecksAKnownPeerAgain) {
   const Result<void> checked = TlsCredentials::load(folder("pc2")).value()->check(*server->peer());
   ASSERT_FALSE(checked);
   EXPECT_NE(checked.error().message.find("revoked"), std::string::npos) << checked.error().message;
+}
+
+TEST_F(Tls, ResumesTheSessionAfterACutAndKnowsBothSides) {
+  const Credentials viewer = make(Authority::program("viewer")), pc2 = make(Authority::host("pc2"));
+  connect(viewer, pc2);
+  for (int cut = 0; cut < 5; ++cut) {
+    ASSERT_TRUE(resumes(viewer, pc2)) << cut;
+    ASSERT_TRUE(server);
+    EXPECT_EQ(server->peer()->str(), "program 'viewer'");
+    EXPECT_EQ(client->peer()->str(), "host 'pc2'");
+    EXPECT_EQ(client->peer()->host_id, host_id_for("pc2"));
+    EXPECT_TRUE(pc2->check(*server->peer()));
+  }
+}
+
+TEST_F(Tls, ResumesASessionWithIntermediateAuthorities) {
+  Authority robots("robots", &authority);
+  const Credentials pc1 = make(Authority::host("pc1"), robots),
+                    pc2 = make(Authority::host("pc2"), robots);
+  connect(pc1, pc2);
+  ASSERT_TRUE(resumes(pc1, pc2));
+  EXPECT_EQ(server->peer()->str(), "host 'pc1'");
+  EXPECT_TRUE(pc2->check(*server->peer())) << "with all certificates that it needs";
+}
+
+TEST_F(Tls, ResumesNoSessionAfterAReload) {
+  const Credentials pc1 = make(Authority::host("pc1")), pc2 = make(Authority::host("pc2"));
+  connect(pc1, pc2);
+  const Credentials pc1_again = TlsCredentials::load(folder("pc1")).value(),
+                    pc2_again = TlsCredentials::load(folder("pc2")).value();
+  EXPECT_FALSE(resumes(pc1, pc2_again));
+  ASSERT_TRUE(client && server) << "but connects";
+  EXPECT_TRUE(resumes(pc1, pc2_again));
+  EXPECT_FALSE(resumes(pc1_again, pc2_again));
+  ASSERT_TRUE(client && server);
+  EXPECT_TRUE(resumes(pc1_again, pc2_again));
+}
+
+TEST_F(Tls, RefusesACertificateThatWasRevokedSinceTheSessionBegan) {
+  const long serial = authority.issue(Authority::host("pc1"), folder("pc1"));
+  const Credentials pc1 = TlsCredentials::load(folder("pc1")).value();
+  connect(pc1, make(Authority::host("pc2")));
+  authority.write_revoked(serial, folder("pc2"));
+  EXPECT_FALSE(resumes(pc1, TlsCredentials::load(folder("pc2")).value()));
+  expect_refused("'pc1' is not accepted: certificate revoked", "certificate revoked");
+}
+
+// With the same credentials, so that only the check of a ticket can notice it.
+TEST_F(Tls, RefusesACertificateThatEndsAfterTheSessionBegan) {
+  const Credentials pc2 = make(Authority::host("pc2"));
+  for (const bool of_client : {true, false}) {
+    Authority::Subject brief = Authority::host("pc1");
+    brief.valid_until = std::chrono::seconds(3);
+    const Credentials pc1 = make(brief);
+    const auto resumes_brief = [&] { return of_client ? resumes(pc1, pc2) : resumes(pc2, pc1); };
+    of_client ? connect(pc1, pc2) : connect(pc2, pc1);
+    ASSERT_TRUE(client && server);
+    ASSERT_TRUE(resumes_brief());
+    while (!server_error) EXPECT_TRUE(resumes_brief() || server_error);
+    if (of_client) {
+      expect_refused("'pc1' is not accepted: certificate has expired", "certificate expired");
+    } else {
+      ASSERT_TRUE(client_error);
+      EXPECT_NE(client_error->message.find("'pc1' is not accepted: certificate has expired"),
+                std::string::npos)
+          << client_error->message;
+    }
+    client.reset();
+    client_error.reset();
+    server_error.reset();
+  }
+}
+
+TEST_F(Tls, NoticesThatFilesHaveChanged) {
+  const Credentials first = make(Authority::host("pc1"));
+  EXPECT_EQ(first->load_if_changed().value(), nullptr);
+  authority.write_revoked(99, folder("pc1"));
+  const Credentials second = first->load_if_changed().value();
+  ASSERT_TRUE(second) << "a file was added";
+  authority.issue(Authority::host("pc1"), folder("new"));
+  std::filesystem::rename(folder("new") + "/own.crt", folder("pc1") + "/own.crt");
+  EXPECT_FALSE(second->load_if_changed()) << "with the key of the other certificate";
+  std::filesystem::rename(folder("new") + "/own.key", folder("pc1") + "/own.key");
+  const Credentials third = second->load_if_changed().value();
+  ASSERT_TRUE(third);
+  EXPECT_EQ(third->load_if_changed().value(), nullptr);
 }
 
 TEST_F(Tls, ChecksWhoGreets) {

@@ -3,10 +3,13 @@
 // Encrypted connections between a ChannelServer and the Dialers of other hosts, on loopback: who is
 // let in, who is not, and what both sides say about it.
 #include <gtest/gtest.h>
+#include <poll.h>
 #include <sys/socket.h>
 
+#include <algorithm>
 #include <filesystem>
 #include <list>
+#include <vector>
 
 #include "core/wire/tls.hpp"
 #include "daemon/link/dialer.hpp"
@@ -167,6 +170,18 @@ TEST_F(SecureServer, EndsConnectionsOfARevokedHostAtAReload) {
   EXPECT_TRUE(good.downs.empty());
 }
 
+TEST_F(SecureServer, ResumesTheSessionOfAHostThatConnectsAgain) {
+  Guest& guest = dial(with(issue(Authority::host("pc2")), "pc2"));
+  wait_until_up(guest);
+  const auto before = guest.dialer.connection()->peer()->certificates;
+  guest.dialer.restart({Errc::unavailable, "cut"});
+  wait_for_down(guest);
+  guest.downs.clear();
+  wait_until_up(guest);
+  EXPECT_EQ(guest.dialer.connection()->peer()->certificates, before) << "no new one was received";
+  EXPECT_EQ(guest.dialer.connection()->peer()->str(), "host 'pc1'");
+}
+
 TEST_F(SecureServer, IsLeftByAHostThatDoesNotAcceptItAnyMore) {
   auto credentials = issue(Authority::host("pc2"));
   Guest& guest = dial(with(credentials, "pc2"));
@@ -197,13 +212,66 @@ TEST_F(SecureServer, GivesUpTheOldestHandshakeForANewOne) {
   EXPECT_EQ(::recv(silent.back().get(), &byte, 1, MSG_DONTWAIT), -1) << "not the newest";
 }
 
+// Each address may have fewer than all.
+TEST_F(SecureServer, GivesUpAHandshakeOfTheAddressWithTheMost) {
+  const wire::SocketAddress at =
+      wire::resolve_number(wire::Address::parse(network.addresses().front()).value()).at(0);
+  std::vector<UniqueFd> silent;
+  const auto connect_from = [&](const char* number) {
+    const wire::SocketAddress from =
+        wire::resolve_number(wire::Address::parse(number, 0, true).value()).at(0);
+    silent.emplace_back(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
+    ASSERT_EQ(::bind(silent.back().get(), from.get(), from.length), 0);
+    ASSERT_EQ(::connect(silent.back().get(), at.get(), at.length), 0);
+  };
+  for (const char* number : {"127.0.0.2", "127.0.0.3", "127.0.0.4", "127.0.0.5", "127.0.0.6"}) {
+    connect_from(number);
+  }
+  for (int i = 0; i < 3; ++i) connect_from("127.0.0.7");
+  wait_until_up(dial(with(issue(Authority::host("pc2")), "pc2")));
+  std::vector<bool> closed;
+  for (const UniqueFd& one : silent) {
+    char byte = 0;
+    closed.push_back(::recv(one.get(), &byte, 1, MSG_DONTWAIT) == 0);
+  }
+  EXPECT_EQ(closed, (std::vector<bool>{0, 0, 0, 0, 0, 1, 0, 0}));
+}
+
+TEST_F(SecureServer, LeavesTheLoopToOtherWorkDuringAFloodOfHandshakes) {
+  HandshakeBudget budget(loop);
+  std::list<Handshake> handshakes;
+  std::vector<wire::TlsHandshake> flood;
+  const std::shared_ptr<const wire::TlsCredentials> credentials =
+      issue(Authority::host("pc2"))->now;
+  for (int i = 0; i < 30; ++i) {
+    int ends[2];
+    ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
+    const auto end = wire::TransportEnd::connected;
+    flood.emplace_back(credentials, wire::make_transport(UniqueFd(ends[0]), end), end);
+    ASSERT_FALSE(flood.back().go_on().value()) << "sends the first message";
+    handshakes.emplace_back(loop, own->now, UniqueFd(ends[1]), budget, false, [](const auto&) {});
+  }
+  const auto answered = [&] {
+    return std::count_if(flood.begin(), flood.end(), [](const wire::TlsHandshake& one) {
+      pollfd ready{one.fd(), POLLIN, 0};
+      return ::poll(&ready, 1, 0) == 1;
+    });
+  };
+  for (std::ptrdiff_t before = 0, now = 0; now < std::ssize(flood); before = now) {
+    run_turns(loop);
+    now = answered();
+    EXPECT_LE(now - before, HandshakeBudget::kPerTurn);
+  }
+}
+
 // From other PCs.
 TEST_F(SecureServer, TellsAPlainProgramWhatIsMissing) {
   int ends[2];
   ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
   const UniqueFd program(ends[0]);
   std::optional<Error> refused;
-  Handshake handshake(loop, own->now, UniqueFd(ends[1]), wire::TransportEnd::accepted, false,
+  HandshakeBudget budget(loop);
+  Handshake handshake(loop, own->now, UniqueFd(ends[1]), budget, false,
                       [&](Result<std::unique_ptr<wire::Transport>> result) {
                         ASSERT_FALSE(result);
                         refused = result.error();
@@ -229,7 +297,8 @@ TEST_F(SecureServer, EndsAHandshakeThatDoesNotGoOn) {
   const UniqueFd other(ends[0]);
   bool ended = false;
   const MonoTime begin = loop.now();
-  Handshake handshake(loop, own->now, UniqueFd(ends[1]), wire::TransportEnd::connected, false,
+  wire::TlsTicket ticket;
+  Handshake handshake(loop, own->now, UniqueFd(ends[1]), ticket,
                       [&](const Result<std::unique_ptr<wire::Transport>>& result) {
                         ended = true;
                         EXPECT_FALSE(result);
