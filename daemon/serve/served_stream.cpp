@@ -49,11 +49,11 @@ void ServedStream::check() {
   if (const std::shared_ptr<StreamFeed> feed = feed_.lock()) feed->poll();
 }
 
-std::shared_ptr<ServedStream> ServedStreams::get(std::shared_ptr<Stream> stream) {
+std::shared_ptr<ServedStream> ServedStreams::get(const std::shared_ptr<Stream>& stream) {
   if (const auto found = streams_.find(stream.get()); found != streams_.end()) {
     return found->second;
   }
-  const auto served = std::make_shared<ServedStream>(loop_, stream);
+  auto served = std::make_shared<ServedStream>(loop_, stream);
   streams_.emplace(stream.get(), served);
   return served;
 }

@@ -76,7 +76,7 @@ class ServedStreams {
   ServedStreams(const ServedStreams&) = delete;
   ServedStreams& operator=(const ServedStreams&) = delete;
 
-  std::shared_ptr<ServedStream> get(std::shared_ptr<Stream> stream);
+  std::shared_ptr<ServedStream> get(const std::shared_ptr<Stream>& stream);
   void forget(const Stream& stream) { streams_.erase(&stream); }
   void check_all();
 

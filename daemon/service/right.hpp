@@ -20,6 +20,7 @@ class Verbs {
   static constexpr Verbs all() noexcept { return Verbs(0x3f); }
 
   constexpr Verbs() = default;
+  // NOLINTNEXTLINE(google-explicit-constructor): each verb is a set of one
   constexpr Verbs(Verb verb) noexcept : bits_(1U << static_cast<unsigned>(verb)) {}
   constexpr bool has(Verb verb) const noexcept { return (bits_ & Verbs(verb).bits_) != 0; }
   constexpr bool has_any(Verbs of) const noexcept { return (bits_ & of.bits_) != 0; }
