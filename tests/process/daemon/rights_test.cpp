@@ -142,12 +142,11 @@ TEST_F(RightsProcess, AStreamThatIsGivenBackNeedsThemToo) {
 }
 
 TEST_F(RightsProcess, AReaderIsToldThatItMayNotReadAnyMore) {
-  Session root = session();
-  Writer<double> writer = root.create<double>("lidar", {4, Duration(1)}).value();
   reload("local read *");
+  // Before this process has a session, whose thread the child would not have.
   as_nobody({}, [&](const Tell& tell) {
     Session own = session();
-    Reader<double> reader = own.open_reader<double>("lidar").value();
+    Reader<double> reader = own.await_reader<double>("lidar").value();
     tell("open");
     double sample = 0;
     SampleInfo info;
@@ -158,6 +157,8 @@ TEST_F(RightsProcess, AReaderIsToldThatItMayNotReadAnyMore) {
     tell(std::string(name_of(reader.restart_error()->code)));
     ::pause();
   });
+  Session root = session();
+  Writer<double> writer = root.create<double>("lidar", {4, Duration(1)}).value();
   ASSERT_EQ(heard(), "open");
   reload("local write *");
   EXPECT_EQ(heard(), "no_permission");
