@@ -55,7 +55,9 @@ Result<void> run(const RightsOptions& options, Output& out) {
     return {};
   }
   if (rights.lines.empty()) {
-    out.add("no line of dssmd's key 'rights' names this stream: only root may use it\n");
+    out.add(
+        "no line of dssmd's key 'rights' names this stream: only root and dssmd's own user may use "
+        "it\n");
   } else {
     Table table({{"WHO"}, {"MAY"}, {"LINE"}});
     for (const RightLine& right : rights.lines) {

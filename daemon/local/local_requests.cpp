@@ -195,9 +195,10 @@ Result<Reply> LocalRequests::open_clock_page() const {
   return reply;
 }
 
-Result<Reply> LocalRequests::get_property(const proto::StreamId& id) const {
+Result<Reply> LocalRequests::get_property(const proto::StreamId& named) const {
+  const StreamId id = DSSM_TRY(wire::stream_id_untrusted(named));
   Reply reply;
-  reply.property = DSSM_TRY(catalog_.property_untrusted(id));
+  reply.property = DSSM_TRY(catalog_.property_of(id));
   reply.response.mutable_property();
   return reply;
 }
@@ -209,7 +210,8 @@ Result<Reply> LocalRequests::set_property(const proto::SetProperty& request,
   return done();
 }
 
-// The rights of this host, also for streams of others: there its programs are its dssmd.
+// The rights of this host, also for a stream of another host: what that one allows to this host's
+// dssmd is in its own configuration.
 Reply LocalRequests::list_rights(const Client& client, const StreamId& id) const {
   Reply reply;
   local::RightList& list = *reply.response.mutable_right_list();

@@ -155,7 +155,7 @@ class LocalRequests {
                       DescriptorQueue& descriptors);
   Result<Reply> open_clock(const local::OpenClock& request, DescriptorQueue& descriptors);
   Result<Reply> open_clock_page() const;
-  Result<Reply> get_property(const proto::StreamId& id) const;
+  Result<Reply> get_property(const proto::StreamId& named) const;
   Result<Reply> set_property(const proto::SetProperty& request, std::string_view property);
   Reply list_opens(const Client& client) const;
   Reply list_rights(const Client& client, const StreamId& id) const;

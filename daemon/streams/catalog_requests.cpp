@@ -89,10 +89,6 @@ template Result<void> CatalogRequests::serve_untrusted(const local::Request&, lo
 template Result<void> CatalogRequests::serve_untrusted(const net::Frame&, net::Frame&,
                                                        const StreamId*);
 
-Result<std::string> CatalogRequests::property_untrusted(const proto::StreamId& id) const {
-  return property_of(DSSM_TRY(wire::stream_id_untrusted(id)));
-}
-
 Result<std::string> CatalogRequests::property_of(const StreamId& id) const {
   const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.find(id));
   std::string property = DSSM_TRY(stream->property(), "stream '" + stream->id().str() + "'");

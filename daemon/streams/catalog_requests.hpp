@@ -49,7 +49,8 @@ class CatalogRequests {
                                const StreamId* channel = nullptr);
 
   // For GetProperty.
-  Result<std::string> property_untrusted(const proto::StreamId& id) const;
+  //   fails  not_found: also when none is set
+  Result<std::string> property_of(const StreamId& id) const;
 
   // For Open and Create.
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
@@ -58,7 +59,6 @@ class CatalogRequests {
 
  private:
   Result<void> list(proto::StreamList& out) const;
-  Result<std::string> property_of(const StreamId& id) const;
 
   Registry& registry_;
   const OpenTable& opens_;

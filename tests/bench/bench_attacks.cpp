@@ -73,7 +73,7 @@ struct Shared {
 
 // --- attackers
 
-// A connection that cares for nothing: when the other side ends it, it begins anew.
+// A client that ignores all answers, and connects again when the other side has closed.
 class Hostile {
  public:
   static Hostile local(const std::string& socket) {
