@@ -32,7 +32,7 @@ class File {
 };
 
 // The greatest property; a read of /dev/zero fails instead of filling the memory.
-constexpr std::size_t kMaxPropertyBytes = 16U << 20;
+constexpr std::size_t kMaxPropertyBytes = 1U << 20;
 
 Result<std::vector<std::byte>> read_all(const std::string& path) {
   const bool standard = path == "-";

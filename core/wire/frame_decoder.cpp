@@ -315,10 +315,6 @@ Result<void> FrameDecoder::take_whole(Bytes& input) {
 
 Result<void> FrameDecoder::parse_whole(Bytes message) {
   if (requests_only_) DSSM_TRY(check_request_size_untrusted(message));
-  if (message.size() > kMaxPlainBytes && plain_bytes(message) > kMaxPlainBytes) {
-    return no_frame("a frame of {} bytes has more than {} that are neither payload nor property",
-                    message.size(), kMaxPlainBytes);
-  }
   DSSM_TRY(check_elements_untrusted(message));
   net::Frame frame;
   if (!frame.ParseFromArray(message.data(), static_cast<int>(message.size()))) {

@@ -7,8 +7,6 @@
 #include <cerrno>
 #include <cstring>
 
-#include "core/wire/varint.hpp"
-
 namespace dssm::wire {
 
 Result<IoResult> send_some(int socket, std::span<const std::byte> bytes, std::span<const int> fds) {
@@ -69,25 +67,6 @@ Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<U
   }
   if (received == 0) return IoResult{IoStatus::end, 0};
   return IoResult{IoStatus::ok, static_cast<std::size_t>(received)};
-}
-
-std::string encode_frame_before_property(std::uint64_t serial, std::size_t property_bytes) {
-  const auto head = [](int number, std::uint64_t bytes) {
-    std::byte out[2 * kMaxVarintBytes];
-    const std::byte* end =
-        write_varint(write_varint(out, static_cast<std::uint64_t>(number) << 3 | 2), bytes);
-    return std::string(reinterpret_cast<const char*>(out), static_cast<std::size_t>(end - out));
-  };
-  const std::string inner = head(proto::Property::kPropertyFieldNumber, property_bytes);
-  local::Response response;
-  response.set_serial(serial);
-  std::string message = response.SerializeAsString() +
-                        head(local::Response::kPropertyFieldNumber, inner.size() + property_bytes) +
-                        inner;
-  std::byte length[kMaxVarintBytes];
-  const std::byte* end = write_varint(length, message.size() + property_bytes);
-  message.insert(0, reinterpret_cast<const char*>(length), static_cast<std::size_t>(end - length));
-  return message;
 }
 
 Result<UniqueFd> connect_unix(const std::string& path) {

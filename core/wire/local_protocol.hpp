@@ -12,14 +12,15 @@
 
 #include "core/base/unique_fd.hpp"
 #include "core/wire/messages.hpp"
+#include "core/wire/request_size.hpp"
 #include "core/wire/transport.hpp"
 #include "local.pb.h"
 
 namespace dssm::wire {
 
 inline constexpr std::uint32_t kLocalProtocolVersion = 1;
-inline constexpr std::size_t kMaxLocalFrameBytes = 17U
-                                                   << 20;  // the largest property and its stream
+inline constexpr std::size_t kMaxLocalRequestBytes = kMaxPropertyBytes + kMaxRequestBytes;
+inline constexpr std::size_t kMaxLocalFrameBytes = 17U << 20;  // a list of all streams
 inline constexpr const char* kDefaultSocketPath = "/run/dssm/dssmd.sock";
 
 // More descriptors in one message are a protocol error of the sender. We never send more than 4.
@@ -32,9 +33,6 @@ Result<IoResult> send_some(int socket, std::span<const std::byte> bytes, std::sp
 // Receives up to space.size() bytes; descriptors that came along are appended to `fds`,
 // close-on-exec. Fails with `protocol` when the kernel dropped some of them.
 Result<IoResult> recv_some(int socket, std::span<std::byte> space, std::vector<UniqueFd>& fds);
-
-// A frame with the Response Property as far as the property itself, of that length, which follows.
-std::string encode_frame_before_property(std::uint64_t serial, std::size_t property_bytes);
 
 // Creates a Unix stream socket connected to `path`, close-on-exec and blocking.
 //   fails  no_daemon (no such socket, or no process listens), no_permission, invalid_argument (path

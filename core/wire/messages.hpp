@@ -14,7 +14,8 @@
 
 namespace dssm::wire {
 
-inline constexpr std::size_t kMaxPropertyBytes = 16U << 20;
+// A property is copied whole within one turn of dssmd's loop. What is longer is a sample.
+inline constexpr std::size_t kMaxPropertyBytes = 1U << 20;
 inline constexpr std::size_t kMaxProgramBytes = 127;
 inline constexpr std::size_t kMaxSentenceBytes = 511;  // for people, of another host
 

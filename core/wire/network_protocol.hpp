@@ -19,8 +19,8 @@
 namespace dssm::wire {
 
 inline constexpr std::uint32_t kNetworkProtocolVersion = 1;
-inline constexpr std::size_t kMaxNetworkFrameBytes = 17U << 20;  // without a payload
-inline constexpr std::size_t kMaxPlainBytes = 1U << 20;  // of a frame, without payload and property
+inline constexpr std::size_t kMaxNetworkFrameBytes =
+    kMaxPropertyBytes + (64U << 10);  // without a payload
 inline constexpr std::size_t kMaxFeatures = 32;
 inline constexpr std::size_t kMaxFeatureBytes = 63;
 inline constexpr std::string_view kFeatureTorn = "torn";  // network.proto, Frame.torn

@@ -226,51 +226,6 @@ Result<void> check_elements_untrusted(Bytes frame) {
           : fmt::format("a frame of {} bytes is not a message of this protocol", frame.size())};
 }
 
-std::string without_property_untrusted(Bytes message, std::string_view& property) {
-  Bytes set, content;
-  int sets = 0, contents = 0;
-  const auto find = [](Bytes in, int number, Bytes& found, int& count) {
-    return for_each_field(in, [&](std::uint64_t field, Bytes inside) {
-      if (field == static_cast<std::uint64_t>(number)) found = inside, ++count;
-      return true;
-    });
-  };
-  const auto text = [](const std::byte* begin, const std::byte* end) {
-    return std::string(reinterpret_cast<const char*>(begin), static_cast<std::size_t>(end - begin));
-  };
-  const std::byte* const end = message.data() + message.size();
-  // Twice the same field would have to be merged.
-  if (!find(message, Request::kSetPropertyFieldNumber, set, sets) || sets != 1 ||
-      !find(set, proto::SetProperty::kPropertyFieldNumber, content, contents) || contents != 1) {
-    return text(message.data(), end);
-  }
-  property = {reinterpret_cast<const char*>(content.data()), content.size()};
-  // The lengths before `set` and `content` are replaced by shorter ones, if each is as short as it
-  // can be.
-  std::byte lengths[kMaxVarintBytes];
-  const auto length_of = [&](Bytes inside) {
-    const std::byte* const end_of_length = write_varint(lengths, inside.size());
-    const std::byte* const begin = inside.data() - (end_of_length - lengths);
-    return std::equal(begin, inside.data(), lengths) &&
-                   (begin[-1] & std::byte{0x80}) == std::byte{0}
-               ? begin
-               : nullptr;
-  };
-  const std::byte* const before_set = length_of(set);
-  const std::byte* const before_content = length_of(content);
-  if (!before_set || !before_content) {
-    property = {};
-    return text(message.data(), end);
-  }
-  const std::size_t rest = set.size() - content.size() - varint_bytes(content.size()) + 1;
-  std::string out = text(message.data(), before_set);
-  out += text(lengths, write_varint(lengths, rest));
-  out += text(set.data(), before_content);
-  out += '\0';
-  out += text(content.data() + content.size(), end);
-  return out;
-}
-
 std::uint64_t serial_untrusted(Bytes message) noexcept {
   const std::byte* at = message.data();
   std::uint64_t tag = 0, serial = 0;

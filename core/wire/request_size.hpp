@@ -38,13 +38,6 @@ inline constexpr std::size_t kFreeElementBytes = 128U << 10;
 //   fails  protocol
 Result<void> check_elements_untrusted(std::span<const std::byte> frame);
 
-// Takes a SetProperty's property out of a request, so that a long one need not be copied to be
-// parsed.
-//   property  becomes the inside of `message`; stays empty when this is no such request
-//   returns   the message without it; when it has none, `message` itself
-std::string without_property_untrusted(std::span<const std::byte> message,
-                                       std::string_view& property);
-
 // The serial of a request that is not parsed; 0 when it does not begin with it, as protobuf writes
 // it.
 std::uint64_t serial_untrusted(std::span<const std::byte> message) noexcept;

@@ -24,7 +24,7 @@ class PeerConnection final : private Dialer::Observer {
  public:
   // Requests of one peer that wait for their answers.
   static constexpr std::size_t kMaxWaiting = 4096;
-  static constexpr std::size_t kMaxWaitingBytes = 40U << 20;  // two properties of the largest size
+  static constexpr std::size_t kMaxWaitingBytes = 3U << 20;  // two properties of the largest size
 
   // A found host that answers again is back within kFoundRoundTime + ConnectPlan::kMaxPause,
   // whichever of its addresses are dead; the design allows 3 s.

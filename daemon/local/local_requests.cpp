@@ -94,14 +94,14 @@ bool LocalRequests::waits_for_hosts(const local::Request& request) const {
 // --- this host
 
 Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::Request& request,
-                                             const Attachments& attached) {
+                                             DescriptorQueue& descriptors) {
   switch (request.body_case()) {
     case local::Request::kCreate:
       return create(client, request.create());
     case local::Request::kOpen:
       return open(client, request.open());
     case local::Request::kOffer:
-      return offer(client, request.offer(), attached.descriptors);
+      return offer(client, request.offer(), descriptors);
     case local::Request::kClose: {
       DSSM_TRY(opens_.remove(client->number, request.close().handle()));
       return done();
@@ -114,9 +114,9 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
     case local::Request::kGetProperty:
       return get_property(request.get_property().id());
     case local::Request::kSetProperty:
-      return set_property(request.set_property(), attached.property);
+      return set_property(request.set_property());
     case local::Request::kOpenClock:
-      return open_clock(request.open_clock(), attached.descriptors);
+      return open_clock(request.open_clock(), descriptors);
     case local::Request::kListOpens:
       return list_opens(client);
     case local::Request::kListRights:
@@ -198,15 +198,13 @@ Result<Reply> LocalRequests::open_clock_page() const {
 Result<Reply> LocalRequests::get_property(const proto::StreamId& named) const {
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(named));
   Reply reply;
-  reply.property = DSSM_TRY(catalog_.property_of(id));
-  reply.response.mutable_property();
+  reply.response.mutable_property()->set_property(DSSM_TRY(catalog_.property_of(id)));
   return reply;
 }
 
-Result<Reply> LocalRequests::set_property(const proto::SetProperty& request,
-                                          std::string_view property) {
+Result<Reply> LocalRequests::set_property(const proto::SetProperty& request) {
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.id()));
-  DSSM_TRY(registry_.set_property(id, property.empty() ? request.property() : property));
+  DSSM_TRY(registry_.set_property(id, request.property()));
   return done();
 }
 
@@ -282,7 +280,7 @@ void LocalRequests::ask_hosts_untrusted(const Client& client, const local::Reque
   if (request.has_open()) return open_elsewhere(client, id, request.open(), std::move(answer));
   fleet_->forward(id, request, [answer = std::move(answer)](Result<local::Response> response) {
     if (!response) return answer(std::move(response).error());
-    answer(Reply{*std::move(response), {}, {}});
+    answer(Reply{*std::move(response), {}});
   });
 }
 

@@ -11,7 +11,6 @@
 #include <functional>
 #include <memory>
 #include <string>
-#include <string_view>
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
@@ -31,18 +30,11 @@ namespace dssm::daemon {
 struct Reply {
   local::Response response;
   std::vector<UniqueFd> descriptors;
-  std::string property;  // of a Property: its message has none, so that it is not copied
 };
 
 // Descriptors that arrived, one element per message that brought some. A request that takes
 // descriptors takes the oldest element.
 using DescriptorQueue = std::deque<std::vector<UniqueFd>>;
-
-// What came with a request beside its message.
-struct Attachments {
-  DescriptorQueue& descriptors;
-  std::string_view property;  // of a long SetProperty: its message has none
-};
 
 // The other hosts, as local requests concern them (FleetService). Results come by a callback that
 // is called once: later from the loop, or at once from within the call; never after the Fleet is
@@ -138,7 +130,7 @@ class LocalRequests {
   // and any other.
   //   fails  with the failure that is the response
   Result<Reply> serve_untrusted(const Client& client, const local::Request& request,
-                                const Attachments& attached);
+                                DescriptorQueue& descriptors);
 
   // The stream that `request` names; nullptr: none.
   static const proto::StreamId* subject(const local::Request& request) noexcept {
@@ -156,7 +148,7 @@ class LocalRequests {
   Result<Reply> open_clock(const local::OpenClock& request, DescriptorQueue& descriptors);
   Result<Reply> open_clock_page() const;
   Result<Reply> get_property(const proto::StreamId& named) const;
-  Result<Reply> set_property(const proto::SetProperty& request, std::string_view property);
+  Result<Reply> set_property(const proto::SetProperty& request);
   Reply list_opens(const Client& client) const;
   Reply list_rights(const Client& client, const StreamId& id) const;
   Reply list_hosts() const;

@@ -15,15 +15,6 @@
 namespace dssm::daemon {
 namespace {
 
-// A request that is longer, a SetProperty, is parsed without its property.
-constexpr std::size_t kMaxCopiedBytes = 64U << 10;
-
-// For a request that is kept or goes to another host.
-void take_back_property(local::Request& request, Attachments& attached) {
-  if (attached.property.empty() || !request.has_set_property()) return;
-  request.mutable_set_property()->set_property(std::string(std::exchange(attached.property, {})));
-}
-
 StreamId id_of(const proto::StreamEvent& event) {
   const proto::StreamId& id = event.stream().id();
   return {id.name(), id.id(), id.host()};
@@ -87,12 +78,7 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
     return true;
   }
   local::Request request;
-  Attachments attached{descriptors, {}};
-  const bool is_parsed =
-      frame.size() > kMaxCopiedBytes
-          ? request.ParseFromString(wire::without_property_untrusted(frame, attached.property))
-          : request.ParseFromArray(frame.data(), static_cast<int>(frame.size()));
-  if (!is_parsed) {
+  if (!request.ParseFromArray(frame.data(), static_cast<int>(frame.size()))) {
     return refuse(client, 0,
                   {Errc::protocol, "the frame is not a request of DSSM's local protocol"});
   }
@@ -108,11 +94,9 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
   if (Result<void> allowed = check_access(client, request); !allowed) {
     send_failure(client, serial, allowed.error());
   } else if (must_wait(request)) {
-    take_back_property(request, attached);
     defer(client, request, frame.size());
   } else {
-    if (requests_.waits_for_hosts(request)) take_back_property(request, attached);
-    serve(number, request, attached);
+    serve(number, request, descriptors);
     // Only an offer can end a wait.
     if (recovering_ && (request.has_offer() || request.has_open_clock())) serve_deferred();
   }
@@ -189,7 +173,7 @@ bool LocalService::greet(Client& client, std::uint64_t serial, const proto::Hell
 }
 
 void LocalService::serve(ClientNumber number, const local::Request& request,
-                         const Attachments& attached) {
+                         DescriptorQueue& descriptors) {
   if (request.has_watch()) return watch(number, request.serial());
   if (request.has_list_clients()) return list_clients(clients_.at(number), request.serial());
   const auto identity = clients_.at(number).identity;
@@ -199,7 +183,7 @@ void LocalService::serve(ClientNumber number, const local::Request& request,
     }
     return;
   }
-  Result<Reply> reply = requests_.serve_untrusted(identity, request, attached);
+  Result<Reply> reply = requests_.serve_untrusted(identity, request, descriptors);
   if (request.has_offer()) log_offer(*identity, request.offer(), reply);
   on_answer(number, request.serial(), std::move(reply));
 }
@@ -311,14 +295,7 @@ void LocalService::list_clients(const Client& client, std::uint64_t serial) {
 
 void LocalService::send(const Client& client, std::uint64_t serial, Reply reply) {
   reply.response.set_serial(serial);
-  if (reply.property.empty()) {
-    client.output->send(wire::encode_frame(reply.response), std::move(reply.descriptors));
-    return;
-  }
-  const ClientNumber number = client.identity->number;  // sending may end the connection
-  client.output->send(wire::encode_frame_before_property(serial, reply.property.size()), {});
-  const auto still = clients_.find(number);
-  if (still != clients_.end()) still->second.output->send(std::move(reply.property), {});
+  client.output->send(wire::encode_frame(reply.response), std::move(reply.descriptors));
 }
 
 void LocalService::send_failure(const Client& client, std::uint64_t serial, const Error& error) {
@@ -473,12 +450,11 @@ void LocalService::serve_deferred() {
   std::move(still_waiting, deferred_.end(), std::back_inserter(ready));
   deferred_.erase(still_waiting, deferred_.end());
   DescriptorQueue none;
-  const Attachments nothing{none, {}};
   for (const Deferred& deferred : ready) {
     const auto client = clients_.find(deferred.client);
     if (client == clients_.end()) continue;
     client->second.deferred_bytes -= deferred.bytes;
-    serve(deferred.client, deferred.request, nothing);
+    serve(deferred.client, deferred.request, none);
   }
 }
 

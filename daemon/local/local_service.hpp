@@ -110,7 +110,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   bool exists(const StreamId& id) const;
   bool is_only_user(const Client& client, const StreamId& id) const;
   bool greet(Client& client, std::uint64_t serial, const proto::Hello& hello);
-  void serve(ClientNumber number, const local::Request& request, const Attachments& attached);
+  void serve(ClientNumber number, const local::Request& request, DescriptorQueue& descriptors);
   LocalRequests::Answer await(ClientNumber number, std::uint64_t serial);
   void on_answer(ClientNumber number, std::uint64_t serial, Result<Reply> reply);
   void log_offer(const ClientIdentity& client, const local::Offer& offer,

@@ -117,7 +117,7 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
       logger_(logger),
       on_closed_(std::move(on_closed)),
       number_(service.connect(identity, *this)),
-      input_(wire::kMaxLocalFrameBytes),
+      input_(wire::kMaxLocalRequestBytes),
       messages_(messages),
       user_(user),
       readable_(EventSource::readable(loop, socket_.get(),
@@ -147,7 +147,7 @@ void Connection::guarded(Work work) {
   try {
     work();
   } catch (const std::bad_alloc&) {
-    input_ = wire::FrameBuffer(wire::kMaxLocalFrameBytes);  // first, for the memory
+    input_ = wire::FrameBuffer(wire::kMaxLocalRequestBytes);  // first, for the memory
     end_with(no_memory_left());
   }
 }

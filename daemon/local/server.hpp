@@ -70,7 +70,7 @@ inline constexpr std::size_t kMaxQueuedBytes = 64U << 20;
 
 // Bytes and descriptors that wait for one client, from which on its requests wait, too: who asks
 // and never reads costs one answer.
-inline constexpr std::size_t kPausingBytes = 1U << 20;
+inline constexpr std::size_t kPausingBytes = 64U << 10;
 inline constexpr std::size_t kMaxQueuedDescriptors = 256;
 
 // Descriptors that a client sent and that no request has taken yet; more are an error.
@@ -85,7 +85,7 @@ inline constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
 inline constexpr Duration kLocalHelloTimeout = std::chrono::seconds(10);
 
 // Memory for long messages of all clients, and of those of one user: requests that they have begun
-// to send, and what waits for them to be received. A property may have 16 MiB.
+// to send, and what waits for them to be received: a list of all streams.
 inline constexpr std::size_t kMaxMessageBytes = 256U << 20;
 inline constexpr std::size_t kMaxMessageBytesPerUser = kMaxMessageBytes / 2;
 // For the rest of a long request: then its memory is free again.

@@ -15,7 +15,7 @@ namespace dssm::daemon {
 namespace {
 
 // What receivers take of a frame, less what frames a list.
-constexpr std::size_t kMaxPlainListBytes = wire::kMaxPlainBytes - (4U << 10);
+constexpr std::size_t kMaxListBytes = wire::kMaxNetworkFrameBytes - (4U << 10);
 
 constexpr std::size_t kUnchargedBytes = 2U << 10;  // of a request that waits
 
@@ -51,7 +51,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
       place_(std::move(place)),
       peer_address_(std::move(peer_address)),
       link_(parts.loop, std::move(transport), *this, kMaxQueuedBytes),
-      catalog_(parts.registry, parts.opens, kMaxPlainListBytes),
+      catalog_(parts.registry, parts.opens, kMaxListBytes),
       next_turn_(EventSource::timer(parts.loop,
                                     [this] {
                                       try {

@@ -216,7 +216,7 @@ constexpr ConfigKey kKeys[] = {
     {"max_opens_per_client", "COUNT", "open streams of one client; default: 16384",
      ValueForm::integer, kChangesAtOnce<&Config::max_opens_per_client>,
      set_count<&Config::max_opens_per_client, kMaxOpens>},
-    {"max_property", "BYTES", "size of one stream's property; default: 16 MiB",
+    {"max_property", "BYTES", "size of one stream's property; default: 1 MiB",
      ValueForm::integer_or_text, kChangesAtOnce<&Config::max_property_bytes>,
      set_bytes<&Config::max_property_bytes, 0, wire::kMaxPropertyBytes>},
     {"recovery_grace", "TIME",

@@ -24,7 +24,7 @@ void ignore_broken_pipes() noexcept;
 void silence_protobuf() noexcept;
 
 // Returns large freed blocks to the system at once. Otherwise the C library raises its threshold
-// after a few responses of 16 MiB and keeps such blocks, so peers could make dssmd's memory grow.
+// after a few long lists and keeps such blocks, so peers could make dssmd's memory grow.
 void return_large_memory() noexcept;
 
 // Blocks SIGINT, SIGTERM and SIGHUP while dssmd starts, so that one which is sent as soon as the

@@ -13,7 +13,6 @@
 #include "core/base/sealed_memory.hpp"
 #include "core/base/try.hpp"
 #include "core/wire/local_protocol.hpp"
-#include "core/wire/varint.hpp"
 
 namespace dssm::daemon {
 namespace {
@@ -22,7 +21,7 @@ constexpr int kMetaSeals = F_SEAL_SHRINK | F_SEAL_SEAL;
 constexpr std::uint64_t kPage = 4096;
 
 // No content that dssmd wrote is longer: it arrived in one frame, or in two that were shorter.
-constexpr std::uint64_t kMaxContentBytes = 2 * wire::kMaxLocalFrameBytes;
+constexpr std::uint64_t kMaxContentBytes = 2 * wire::kMaxLocalRequestBytes;
 
 constexpr std::uint64_t pages_up(std::uint64_t bytes) noexcept {
   return (bytes + kPage - 1) / kPage * kPage;
@@ -145,7 +144,7 @@ Result<UniqueFd> duplicate(int fd) {
 Result<MetaFile> MetaFile::create(const local::StreamMeta& meta, const std::string& label) {
   MetaFile file(DSSM_TRY(create_sealed_memory("dssm-meta:" + label, 0, 0400, kMetaSeals)));
   DSSM_TRY(file.write_header(MetaHeader{}));
-  DSSM_TRY(file.replace(meta, {}));
+  DSSM_TRY(file.replace(meta));
   return file;
 }
 
@@ -171,28 +170,9 @@ Result<local::StreamMeta> MetaFile::read_untrusted() const {
   return meta;
 }
 
-Result<std::string> MetaFile::read_property_untrusted() const {
-  if (!property_) {
-    local::StreamMeta meta = DSSM_TRY(read_untrusted());
-    return std::move(*meta.mutable_property());
-  }
-  std::string property(property_->length_bytes, '\0');
-  if (!read_all(fd_.get(), property.data(), property.size(), property_->offset_bytes)) {
-    return not_a_meta_file("its property cannot be read");
-  }
-  return property;
-}
-
-// The property is the last field of the message: it need not be copied to be written.
-Result<void> MetaFile::replace(const local::StreamMeta& meta, std::string_view property) {
-  std::string head = meta.SerializeAsString();
-  if (!property.empty()) {
-    std::byte tag[2 * wire::kMaxVarintBytes];
-    std::byte* end = wire::write_varint(tag, local::StreamMeta::kPropertyFieldNumber << 3 | 2);
-    end = wire::write_varint(end, property.size());
-    head.append(reinterpret_cast<const char*>(tag), static_cast<std::size_t>(end - tag));
-  }
-  const std::size_t bytes = head.size() + property.size();
+Result<void> MetaFile::replace(const local::StreamMeta& meta) {
+  const std::string content = meta.SerializeAsString();
+  const std::size_t bytes = content.size();
   if (bytes == 0 || bytes > kMaxContentBytes) {
     return Error{
         Errc::limit_exceeded,
@@ -206,11 +186,8 @@ Result<void> MetaFile::replace(const local::StreamMeta& meta, std::string_view p
   MetaHeader next;
   next.offset_bytes = fits_before ? kPage : current.offset_bytes + pages_up(current.length_bytes);
   next.length_bytes = bytes;
-  const Range range{next.offset_bytes + head.size(), property.size()};
-  DSSM_TRY(write_all(fd_.get(), head, next.offset_bytes));
-  DSSM_TRY(write_all(fd_.get(), property, range.offset_bytes));
+  DSSM_TRY(write_all(fd_.get(), content, next.offset_bytes));
   DSSM_TRY(write_header(next));
-  property_ = range;
   if (current.offset_bytes > 0) {
     // Only gives memory back; without it everything is as correct.
     ::fallocate(fd_.get(), FALLOC_FL_PUNCH_HOLE | FALLOC_FL_KEEP_SIZE,

@@ -7,7 +7,6 @@
 #include <cstddef>
 #include <cstdint>
 #include <dssm/result.hpp>
-#include <optional>
 #include <string>
 #include <string_view>
 
@@ -84,12 +83,8 @@ class MetaFile {
   // removed.
   Result<local::StreamMeta> read_untrusted() const;
 
-  // The property in the content, without parsing the rest; empty: none. Fails as read_untrusted().
-  Result<std::string> read_property_untrusted() const;
-
-  // Replaces the content, at once for all readers, by `meta`, which has no property, and
-  // `property`.
-  Result<void> replace(const local::StreamMeta& meta, std::string_view property);
+  // Replaces the content by `meta`, at once for all readers.
+  Result<void> replace(const local::StreamMeta& meta);
 
   // Marks the stream as removed for ever: no offer restores it.
   Result<void> mark_removed();
@@ -97,16 +92,10 @@ class MetaFile {
   int fd() const noexcept { return fd_.get(); }
 
  private:
-  // Where the property is in the file.
-  struct Range {
-    std::uint64_t offset_bytes = 0, length_bytes = 0;
-  };
-
   explicit MetaFile(UniqueFd fd) : fd_(std::move(fd)) {}
   Result<void> write_header(const MetaHeader& header);
 
   UniqueFd fd_;
-  std::optional<Range> property_;  // nothing: this dssmd has not written the content
 };
 
 }  // namespace dssm::daemon

@@ -122,7 +122,7 @@ Result<void> Registry::remove(const StreamId& id) {
   return {};
 }
 
-Result<void> Registry::set_property(const StreamId& id, std::string_view property) {
+Result<void> Registry::set_property(const StreamId& id, const std::string& property) {
   const std::shared_ptr<Stream> stream = DSSM_TRY(find(id));
   const std::string context = "stream '" + stream->id().str() + "'";
   if (property.size() > limits_.max_property_bytes) {

@@ -110,7 +110,7 @@ class Registry {
   Result<void> remove(const StreamId& id);
 
   //   fails  not_found, limit_exceeded
-  Result<void> set_property(const StreamId& id, std::string_view property);
+  Result<void> set_property(const StreamId& id, const std::string& property);
 
  private:
   using Key = std::pair<std::string, std::int32_t>;

@@ -279,13 +279,16 @@ Result<void> Stream::mark_removed() {
 
 Result<std::string> Stream::property() const {
   // Kept only in the meta file: dssmd's own memory stays small.
-  return meta_.read_property_untrusted();
+  local::StreamMeta content = DSSM_TRY(meta_.read_untrusted());
+  return std::move(*content.mutable_property());
 }
 
-Result<void> Stream::set_property(std::string_view property, MemoryBudget& budget) {
+Result<void> Stream::set_property(const std::string& property, MemoryBudget& budget) {
   // Old and new one exist side by side for a moment, so the new share is taken first.
   MemoryShare share = DSSM_TRY(budget.take(property.size()));
-  DSSM_TRY(meta_.replace(meta_of(plan_), property));
+  local::StreamMeta content = meta_of(plan_);
+  content.set_property(property);
+  DSSM_TRY(meta_.replace(content));
   property_share_ = std::move(share);
   return {};
 }

@@ -141,7 +141,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
   void observe_doorbells(DoorbellObserver* observer);
 
   Result<std::string> property() const;
-  Result<void> set_property(std::string_view property, MemoryBudget& budget);
+  Result<void> set_property(const std::string& property, MemoryBudget& budget);
 
   // How many connections from other hosts carry this stream now.
   std::uint32_t channels() const noexcept { return channels_; }

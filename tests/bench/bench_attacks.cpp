@@ -28,7 +28,6 @@ namespace {
 constexpr int kSamples = 5000;  // of an attack, one a millisecond
 constexpr int kStreams = 1000;  // besides the one that is measured
 constexpr int kFields = 200;    // of each
-constexpr std::size_t kPropertyBytes = 16U << 20;
 
 struct Shared {
   std::atomic<bool> ready{false};
@@ -157,7 +156,7 @@ std::string network_frame(const std::function<void(net::Frame&)>& fill) {
 template <class Request>
 void set_property(Request& request) {
   request.mutable_set_property()->mutable_id()->set_name("s0");
-  request.mutable_set_property()->set_property(std::string(kPropertyBytes, 'p'));
+  request.mutable_set_property()->set_property(std::string(wire::kMaxPropertyBytes, 'p'));
 }
 template <class Request>
 void get_property(Request& request) {
@@ -197,25 +196,25 @@ const std::vector<Attack>& attacks() {
            ::usleep(1000);
          }
        }},
-      {"a program sets a property of 16 MiB",
+      {"a program sets a property of 1 MiB",
        [](const std::string& socket, const std::string&) {
          const std::string frame = local_frame(set_property<local::Request>);
          Hostile hostile = Hostile::local(socket);
          for (;;) hostile.send(frame);
        }},
-      {"a program gets a property of 16 MiB",
+      {"a program gets a property of 1 MiB",
        [](const std::string& socket, const std::string&) {
          const std::string frame = local_frame(get_property<local::Request>);
          Hostile hostile = Hostile::local(socket);
          for (;;) {
            hostile.send(frame);
-           hostile.receive(kPropertyBytes);
+           hostile.receive(wire::kMaxPropertyBytes);
          }
        }},
-      {"a program sends 16 MiB of empty fields",
+      {"a program sends 1 MiB of empty fields",
        [](const std::string& socket, const std::string&) {
          std::string fields;
-         while (fields.size() < (16U << 20) - 100) fields += std::string("\x22\x00", 2);
+         while (fields.size() < (1U << 20) - 100) fields += std::string("\x22\x00", 2);
          const std::string frame = local_frame([&](local::Request& request) {
            request.mutable_create()->mutable_id()->set_name("bomb");
            request.mutable_create()->mutable_type()->MergeFromString(fields);
@@ -231,19 +230,19 @@ const std::vector<Attack>& attacks() {
            hostile.leave();
          }
        }},
-      {"a peer sets a property of 16 MiB",
+      {"a peer sets a property of 1 MiB",
        [](const std::string&, const std::string& address) {
          const std::string frame = network_frame(set_property<net::Frame>);
          Hostile hostile = Hostile::remote(address);
          for (;;) hostile.send(frame);
        }},
-      {"a peer gets a property of 16 MiB",
+      {"a peer gets a property of 1 MiB",
        [](const std::string&, const std::string& address) {
          const std::string frame = network_frame(get_property<net::Frame>);
          Hostile hostile = Hostile::remote(address);
          for (;;) {
            hostile.send(frame);
-           hostile.receive(kPropertyBytes);
+           hostile.receive(wire::kMaxPropertyBytes);
          }
        }},
       {"20 peers send 1 MiB of empty messages",
@@ -317,7 +316,7 @@ std::vector<RawWriter> long_streams(Session& session) {
     writers.push_back(
         session.create_raw({"s" + std::to_string(i), 0, ""}, type, History{2, 1s}).value());
   }
-  const std::string property(kPropertyBytes, 'p');
+  const std::string property(wire::kMaxPropertyBytes, 'p');
   session.set_property({"s1", 0, ""}, std::as_bytes(std::span(property))).value();
   return writers;
 }

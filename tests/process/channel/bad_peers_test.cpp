@@ -148,7 +148,7 @@ TEST_F(BadPeer, ThatNeverReadsStaysWithinItsHostsMemoryAndDelaysNoOther) {
     LocalWriter camera(writing, "camera", kMiB, 4), fast(writing, "fast", 64, 65536);
     local::Request set;
     set.mutable_set_property()->mutable_id()->set_name("camera");
-    set.mutable_set_property()->set_property(std::string(16 * kMiB, 'p'));
+    set.mutable_set_property()->set_property(std::string(wire::kMaxPropertyBytes, 'p'));
     EXPECT_TRUE(local_.ask(set).response.has_done());
 
     std::vector<NetworkPeer> bad;
@@ -199,9 +199,9 @@ TEST_F(BadPeer, WhoseRequestFindsNoMemoryEndsItsConnectionOnly) {
   ASSERT_TRUE(local_.ask(create_request("odometry")).response.has_opened());
   net::Frame request;
   request.mutable_set_property()->mutable_id()->set_name("odometry");
-  request.mutable_set_property()->set_property(std::string(16 * kMiB, 'p'));
+  request.mutable_set_property()->set_property(std::string(wire::kMaxPropertyBytes, 'p'));
   {
-    const MemoryLimit limit(daemon_.pid(), 4 * kMiB);
+    const MemoryLimit limit(daemon_.pid(), kMiB / 2);
     NetworkPeer peer = NetworkPeer::greeted(daemon_.address());
     EXPECT_FALSE(peer.ask(request).has_done());
     EXPECT_TRUE(good_.ask(list_frame()).has_stream_list());

@@ -131,7 +131,7 @@ TEST_F(BadClient, ThatKeepsSendingUnrequestedDescriptorsIsRefused) {
 TEST_F(BadClient, ThatDoesNotReadCostsOneAnswer) {
   local::Request set, get;
   set.mutable_set_property()->mutable_id()->set_name("large");
-  set.mutable_set_property()->set_property(std::string(8 << 20, 'p'));
+  set.mutable_set_property()->set_property(std::string(wire::kMaxPropertyBytes, 'p'));
   get.mutable_get_property()->mutable_id()->set_name("large");
   {
     RawClient owner(daemon_.socket_path());
@@ -149,10 +149,10 @@ TEST_F(BadClient, ThatDoesNotReadCostsOneAnswer) {
     }
     return std::uint64_t{0};
   };
-  EXPECT_TRUE(eventually([&] { return waiting_bytes() > 7U << 20; }));
-  EXPECT_LT(waiting_bytes(), 9U << 20);
+  EXPECT_TRUE(eventually([&] { return waiting_bytes() > wire::kMaxPropertyBytes / 2; }));
+  EXPECT_LT(waiting_bytes(), wire::kMaxPropertyBytes + (1U << 10));
   for (int i = 0; i < 12; ++i) {
-    EXPECT_EQ(silent.receive().response.property().property().size(), 8U << 20);
+    EXPECT_EQ(silent.receive().response.property().property().size(), wire::kMaxPropertyBytes);
   }
   local::Request remove;
   remove.mutable_remove()->mutable_id()->set_name("large");

@@ -103,7 +103,7 @@ TEST(HostileProgram, CannotOccupyDssmdByOneLongRequest) {
   DaemonProcess daemon;
   RawClient hostile(daemon.socket_path());
   std::string fields;
-  for (std::size_t i = 0; i < (1U << 20); ++i) fields += std::string("\x22\x00", 2);
+  for (std::size_t i = 0; i < (1U << 18); ++i) fields += std::string("\x22\x00", 2);
   local::Request request = create_request("bomb");
   ASSERT_TRUE(request.mutable_create()->mutable_type()->MergeFromString(fields));
   const Answer answer = hostile.ask(request);
@@ -120,9 +120,9 @@ TEST(HostileProgram, WhoseRequestFindsNoMemoryEndsItsConnectionOnly) {
   honest.ask(create_request("odometry"));
   local::Request request;
   request.mutable_set_property()->mutable_id()->set_name("odometry");
-  request.mutable_set_property()->set_property(std::string(16U << 20, 'p'));
+  request.mutable_set_property()->set_property(std::string(wire::kMaxPropertyBytes, 'p'));
   {
-    const MemoryLimit limit(daemon.pid(), 4U << 20);
+    const MemoryLimit limit(daemon.pid(), 512U << 10);
     RawClient hostile(daemon.socket_path());
     EXPECT_FALSE(hostile.ask(request).response.has_done());
     EXPECT_TRUE(honest.ask(list_request()).response.has_stream_list());

@@ -95,11 +95,12 @@ TEST_F(UserLimits, OnLongRequestsLeaveMemoryForOthers) {
   ASSERT_EQ(::kill(daemon_->pid(), SIGHUP), 0);
   ASSERT_TRUE(eventually([&] { return limit("max_clients_per_user").limit() == 2048; }));
   ASSERT_TRUE(client_of_root().ask(create_request("map")).response.has_opened());
-  // A request of 17 MiB without its last byte takes 32 MiB: dssmd's buffer doubles.
-  std::string unfinished("\x80\x80\xc0\x08", 4);
-  unfinished.resize(unfinished.size() + wire::kMaxLocalFrameBytes - 1, 'x');
+  // The longest request without its last byte takes 2 MiB: dssmd's buffer doubles.
+  std::string unfinished("\x80\x80\x41", 3);
+  static_assert(wire::kMaxLocalRequestBytes == 0x41U << 14);
+  unfinished.resize(unfinished.size() + wire::kMaxLocalRequestBytes - 1, 'x');
   std::vector<RawClient> begun;
-  for (int i = 0; i < 4; ++i) {
+  for (int i = 0; i < 64; ++i) {
     begun.push_back(client_of_nobody());
     begun.back().send_bytes(unfinished);
   }
@@ -116,7 +117,7 @@ TEST_F(UserLimits, OnLongRequestsLeaveMemoryForOthers) {
       << refused.response.failure().message();
   local::Request property;
   property.mutable_set_property()->mutable_id()->set_name("map");
-  property.mutable_set_property()->set_property(std::string(16U << 20, 'p'));
+  property.mutable_set_property()->set_property(std::string(wire::kMaxPropertyBytes, 'p'));
   EXPECT_TRUE(client_of_root().ask(property).response.has_done());
 }
 
@@ -124,13 +125,14 @@ TEST_F(UserLimits, OnMemoryCountWhatIsNotReceived) {
   ASSERT_TRUE(client_of_root().ask(create_request("map")).response.has_opened());
   local::Request property;
   property.mutable_set_property()->mutable_id()->set_name("map");
-  property.mutable_set_property()->set_property(std::string(16U << 20, 'p'));
+  property.mutable_set_property()->set_property(std::string(wire::kMaxPropertyBytes, 'p'));
   ASSERT_TRUE(client_of_root().ask(property).response.has_done());
   property.mutable_get_property()->mutable_id()->set_name("map");
   {
     RawClient silent = client_of_nobody();
     silent.send(property);
-    EXPECT_TRUE(eventually([&] { return limit("long messages of one user").used() > 15U << 20; }));
+    EXPECT_TRUE(eventually(
+        [&] { return limit("long messages of one user").used() > wire::kMaxPropertyBytes / 2; }));
   }
   EXPECT_TRUE(eventually([&] { return limit("long messages of one user").used() == 0; }));
 }
