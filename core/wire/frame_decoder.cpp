@@ -125,7 +125,7 @@ std::unique_ptr<FrameDecoder::InputBuffer>& FrameDecoder::thread_input() {
   const bool throws_away = stage_ == Stage::payload && !place_;
   const bool receives_in_place =
       payload_bytes_ >= kLargePayloadBytes && stage_ != Stage::whole && !throws_away;
-  std::size_t space = kInputBytes - head_bytes_;
+  std::size_t space = stage_ == Stage::whole ? kCollectedPerReceive : kInputBytes - head_bytes_;
   if (receives_in_place) {
     const std::size_t payload_space = in_payload() ? std::min(payload_left_, kMinSpace) : 0;
     space = std::max(kMinSpace - payload_space, kSpaceAfterPayload);
@@ -302,6 +302,9 @@ Result<void> FrameDecoder::begin_whole(Bytes& input, std::size_t length_bytes,
 
 Result<void> FrameDecoder::take_whole(Bytes& input) {
   const std::size_t bytes = std::min(input.size(), whole_left_);
+  if (whole_.capacity() - whole_.size() < bytes) {
+    whole_.reserve(std::min(whole_.size() + whole_left_, 2 * (whole_.size() + bytes)));
+  }
   whole_.insert(whole_.end(), input.begin(), input.begin() + static_cast<std::ptrdiff_t>(bytes));
   whole_left_ -= bytes;
   input = input.subspan(bytes);

@@ -60,6 +60,9 @@ struct DecoderCounters {
 
 class FrameDecoder {
  public:
+  // Of a frame that is collected: many peers may send long ones in the same turn.
+  static constexpr std::size_t kCollectedPerReceive = 64U << 10;
+
   // max_frame_bytes: of frames without a payload, before set_payload_bytes() also of all.
   FrameDecoder(FrameDelegate& delegate, std::size_t max_frame_bytes);
   FrameDecoder(const FrameDecoder&) = delete;

@@ -185,6 +185,8 @@ void EventSource::enable_in(Duration delay) noexcept {
     return timer_->start_in(delay);
   }
   timer_->stop();
+  // libevent would put one that is due at the end again: enabled in each turn, it would never run.
+  if (event_pending(event_.get(), EV_TIMEOUT, nullptr)) return;
   DSSM_CHECK(event_add(event_.get(), &kAtOnce) == 0);
 }
 

@@ -98,6 +98,7 @@ void FrameConnection::take_samples(std::size_t payload_bytes, SampleDelegate& de
     received += got->bytes;
     if (!decode(got->bytes)) return;
     if (input_.paused || input_.decoder_held || got->bytes < free_bytes) break;
+    if (decoder_.collected_bytes() > 0) break;  // many may send long frames in the same turn
   }
   if (received > 0 && samples_) samples_->on_batch_end();
   if (ended) return close(end);

@@ -70,6 +70,7 @@ Result<Listener> Listener::open(const std::string& path, std::optional<gid_t> gr
   if (inherited) {
     Listener listener(path, std::move(inherited));
     listener.inherited_ = true;
+    if (::listen(listener.fd(), kBacklog)) return os_error(what);  // systemd's is longer
     DSSM_TRY(listener.allow(group, mode));
     return listener;
   }
@@ -82,7 +83,7 @@ Result<Listener> Listener::open(const std::string& path, std::optional<gid_t> gr
   Listener listener(path, std::move(fd));
   listener.predecessor_died_ = stale;
   DSSM_TRY(listener.allow(group, mode));
-  if (::listen(listener.fd(), SOMAXCONN)) return os_error(what);
+  if (::listen(listener.fd(), kBacklog)) return os_error(what);
   return listener;
 }
 

@@ -76,6 +76,10 @@ inline constexpr std::size_t kMaxQueuedDescriptors = 256;
 // Descriptors that a client sent and that no request has taken yet; more are an error.
 inline constexpr std::size_t kMaxUnclaimedDescriptors = 64;
 
+// Connections that wait to be accepted; further programs wait in connect(). Few, so that programs
+// that come and go keep no other one waiting for long.
+inline constexpr int kBacklog = 128;
+
 // Requests of one client served in a row before others get their turn: so many, or as many as are
 // begun in that time.
 inline constexpr int kRequestsPerTurn = 16;

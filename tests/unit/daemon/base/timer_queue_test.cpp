@@ -177,6 +177,21 @@ TEST(EventLoopTimers, RunAfterWhatHasArrived) {
   EXPECT_EQ(order, "at");
 }
 
+TEST(EventLoopTimers, RunThoughSomethingWantsThemInEachTurn) {
+  EventLoop loop = EventLoop::open().value();
+  const UniqueFd always_readable(::eventfd(1, EFD_CLOEXEC));
+  int turns = 0;
+  bool has_run = false;
+  EventSource soon = EventSource::timer(loop, [&] { has_run = true, loop.stop(); });
+  EventSource busy = EventSource::readable(loop, always_readable.get(), [&] {
+    soon.enable_in(Duration::zero());
+    if (++turns == 100) loop.stop();
+  });
+  busy.enable();
+  ASSERT_TRUE(loop.run());
+  EXPECT_TRUE(has_run);
+}
+
 // With and without a delay, in libevent's loop.
 TEST(EventLoopTimers, ComeInTheNextTurnOrLater) {
   EventLoop loop = EventLoop::open().value();
