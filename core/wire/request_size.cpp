@@ -164,8 +164,8 @@ bool add_elements(Bytes message, Path path, std::size_t each, std::size_t allowe
   });
 }
 
-}  // namespace
-
+// How much of a message of either protocol is not the inside of a payload or a property. The whole,
+// when it is no message.
 std::size_t plain_bytes(Bytes message) noexcept {
   std::size_t bulk = 0;
   const bool is_message = for_each_field(message, [&](std::uint64_t field, Bytes content) {
@@ -180,6 +180,8 @@ std::size_t plain_bytes(Bytes message) noexcept {
   });
   return is_message ? message.size() - bulk : message.size();
 }
+
+}  // namespace
 
 Result<void> check_request_size_untrusted(Bytes message) {
   const std::size_t plain = message.size() <= kMaxRequestBytes ? 0 : plain_bytes(message);

@@ -20,10 +20,6 @@ inline constexpr std::size_t kMaxRequestBytes = 16U << 10;  // without a propert
 inline constexpr std::size_t kMaxCreateBytes = 256U << 10;
 inline constexpr std::size_t kMaxParsedFields = 4096;
 
-// How much of a message of either protocol is not the inside of a payload or a property. The whole,
-// when it is no message.
-std::size_t plain_bytes(std::span<const std::byte> message) noexcept;
-
 // Whether a request may be parsed.
 //   fails  limit_exceeded, protocol (it is long, and no message)
 Result<void> check_request_size_untrusted(std::span<const std::byte> message);

@@ -111,10 +111,6 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
       if (fleet_) fleet_->want_history(id, false);
       return done();
     }
-    case local::Request::kGetProperty:
-      return get_property(request.get_property().id());
-    case local::Request::kSetProperty:
-      return set_property(request.set_property());
     case local::Request::kOpenClock:
       return open_clock(request.open_clock(), descriptors);
     case local::Request::kListOpens:
@@ -193,19 +189,6 @@ Result<Reply> LocalRequests::open_clock_page() const {
   reply.response.mutable_clock_page();
   reply.descriptors.push_back(DSSM_TRY(fleet_->clock_page()));
   return reply;
-}
-
-Result<Reply> LocalRequests::get_property(const proto::StreamId& named) const {
-  const StreamId id = DSSM_TRY(wire::stream_id_untrusted(named));
-  Reply reply;
-  reply.response.mutable_property()->set_property(DSSM_TRY(catalog_.property_of(id)));
-  return reply;
-}
-
-Result<Reply> LocalRequests::set_property(const proto::SetProperty& request) {
-  const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.id()));
-  DSSM_TRY(registry_.set_property(id, request.property()));
-  return done();
 }
 
 // The rights of this host, also for a stream of another host: what that one allows to this host's

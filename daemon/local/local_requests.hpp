@@ -147,8 +147,6 @@ class LocalRequests {
                       DescriptorQueue& descriptors);
   Result<Reply> open_clock(const local::OpenClock& request, DescriptorQueue& descriptors);
   Result<Reply> open_clock_page() const;
-  Result<Reply> get_property(const proto::StreamId& named) const;
-  Result<Reply> set_property(const proto::SetProperty& request);
   Reply list_opens(const Client& client) const;
   Reply list_rights(const Client& client, const StreamId& id) const;
   Reply list_hosts() const;

@@ -48,10 +48,6 @@ class CatalogRequests {
   Result<void> serve_untrusted(const Request& request, Response& response,
                                const StreamId* channel = nullptr);
 
-  // For GetProperty.
-  //   fails  not_found: also when none is set
-  Result<std::string> property_of(const StreamId& id) const;
-
   // For Open and Create.
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
   //   creator_pid  of the program of this host; 0: another host creates it
@@ -59,6 +55,7 @@ class CatalogRequests {
 
  private:
   Result<void> list(proto::StreamList& out) const;
+  Result<std::string> property_of(const StreamId& id) const;
 
   Registry& registry_;
   const OpenTable& opens_;

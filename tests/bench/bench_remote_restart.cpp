@@ -90,7 +90,7 @@ int main() {
   const pid_t writer = in_child([&] { write(here); });
   const pid_t reader = in_child([&] { read(there, result); });
   std::printf("%-24s %8s %8s %8s   %8s %8s %8s   %6s\n", "ms without a sample; to start", "minimum",
-              "median", "p99", "minimum", "median", "p99", "ratio");
+              "median", "longest", "minimum", "median", "longest", "ratio");
   measure("dssmd restarted", result, owner, false);
   measure("dssmd killed, started", result, owner, true);
   std::printf("lost: %llu\n", static_cast<unsigned long long>(result.lost.load()));
