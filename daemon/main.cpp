@@ -222,7 +222,7 @@ class Dssmd {
  public:
   // What is given by reference outlives it.
   //   stored  descriptors that the service manager kept over a restart
-  Dssmd(const Config& config, EventLoop& loop, ServiceManager& manager, const Sockets& sockets,
+  Dssmd(const Config& config, EventLoop& loop, ServiceManager& manager, Sockets& sockets,
         clock::ClockPageWriter page, std::vector<NamedDescriptor> stored, LeveledLogger& logger)
       : config_(config),
         loop_(loop),
@@ -231,10 +231,9 @@ class Dssmd {
         logger_(logger),
         rights_(config.rights),
         streams_(config, manager, logger),
-        recovering_(restore(std::move(stored))),
         hosts_(config, loop, sockets.network, std::move(page), streams_.registry, logger),
         local_(streams_.registry, streams_.opens, streams_.playback_clock, rights_, logger,
-               recovering_, &hosts_.service),
+               &hosts_.service),
         server_(loop, sockets.listener, config.name, client_limits(config), local_, logger),
         channels_({loop, streams_.registry, streams_.opens, rights_, logger, &hosts_.clock,
                    [this] { hosts_.clock.poll_if_due(); }, config.insecure},
@@ -245,6 +244,7 @@ class Dssmd {
                                      sockets_.network);
                 }),
         count_(streams_.registry, status_) {
+    restore(std::move(stored));
     local_.set_limits_source([this] { return limits(); });
     channels_.set_sending(config.sending);
     if (config.mdns) {
@@ -276,16 +276,14 @@ class Dssmd {
   //   read_again  reads the configuration file again, after SIGHUP; none: there is no file
   //   signals     blocked until now
   Result<void> run(const Reloader::Read& read_again, BlockedSignals& signals) {
-    EventSource grace = EventSource::timer(loop_, [this] {
-      local_.end_recovery();
-      serve_network();
-    });
-    if (recovering_) {
+    EventSource grace = EventSource::timer(loop_, [this] { streams_.registry.end_recovery(); });
+    if (streams_.registry.recovering()) {
       grace.enable_in(config_.recovery_grace);
-      log_recovery();
-    } else {
-      serve_network();
+      logger_.notice("programs that hold streams of the dssmd before this one give them back",
+                     {.message_id = message_id::kRecovering});
     }
+    channels_.serve(sockets_.network);
+    if (discovery_) discovery_->start_announcing();
     EventSource stops[] = {EventSource::signal(loop_, SIGTERM, [this] { loop_.stop(); }),
                            EventSource::signal(loop_, SIGINT, [this] { loop_.stop(); })};
     for (EventSource& stop : stops) stop.enable();
@@ -304,24 +302,21 @@ class Dssmd {
     DSSM_TRY(loop_.run());
     manager_.stopping();
     logger_.notice("stopping", {.message_id = message_id::kStopping});
+    if (!streams_.registry.streams().empty()) sockets_.listener.leave_file();
     return {};
   }
 
  private:
-  // Brings back the streams that the service manager kept. True when programs may still hold
-  // others, which they need time to offer.
-  bool restore(std::vector<NamedDescriptor> stored) {
+  // Brings back the streams that the service manager kept. Programs may hold others, which they
+  // need time to offer.
+  void restore(std::vector<NamedDescriptor> stored) {
     const bool some_may_be_missing =
         streams_.store.restore_untrusted(std::move(stored), sockets_.network.has_kept());
     // With an inherited socket it is unknown whether a dssmd ran before this one.
-    return some_may_be_missing &&
-           (sockets_.listener.predecessor_died() || sockets_.listener.inherited()) &&
-           config_.recovery_grace > Duration::zero();
-  }
-
-  void serve_network() {
-    channels_.serve(sockets_.network);
-    if (discovery_) discovery_->start_announcing();
+    if (some_may_be_missing && (sockets_.listener.found_file() || sockets_.listener.inherited()) &&
+        config_.recovery_grace > Duration::zero()) {
+      streams_.registry.begin_recovery();
+    }
   }
 
   // What `dssmctl info` shows.
@@ -382,14 +377,6 @@ class Dssmd {
                     {.message_id = message_id::kPeerRefused});
   }
 
-  void log_recovery() {
-    logger_.notice(sockets_.listener.predecessor_died()
-                       ? "the dssmd before this one did not end properly; programs give their "
-                         "streams back"
-                       : "started without streams; programs that hold some give them back",
-                   {.message_id = message_id::kRecovering});
-  }
-
   void log_ready() {
     if (config_.insecure) {
       logger_.warning(
@@ -406,11 +393,10 @@ class Dssmd {
   const Config& config_;
   EventLoop& loop_;
   ServiceManager& manager_;
-  const Sockets& sockets_;
+  Sockets& sockets_;
   LeveledLogger& logger_;
   Rights rights_;
   OwnStreams streams_;
-  const bool recovering_;
   OtherHosts hosts_;
   LocalService local_;
   Server server_;
@@ -430,7 +416,7 @@ Result<void> run(const Config& config, const Reloader::Read& read_again, Leveled
   EventLoop loop = DSSM_TRY(EventLoop::open());
   ServiceManager manager(loop, ServiceManager::notify_socket());
   Inherited inherited = Inherited::sort(take_handed_over());
-  const Sockets sockets = DSSM_TRY(Sockets::open(config, inherited, manager, logger));
+  Sockets sockets = DSSM_TRY(Sockets::open(config, inherited, manager, logger));
   clock::ClockPageWriter page =
       DSSM_TRY(clock::ClockPageWriter::open(sockets.dir.clock_page_path()));
   Dssmd dssmd(config, loop, manager, sockets, std::move(page), std::move(inherited.others), logger);

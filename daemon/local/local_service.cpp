@@ -30,7 +30,7 @@ local::Response failure_response(std::uint64_t serial, const Error& error) {
 }  // namespace
 
 LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
-                           const Rights& rights, Logger& logger, bool recovering, Fleet* fleet)
+                           const Rights& rights, Logger& logger, Fleet* fleet)
     : registry_(registry),
       opens_(opens),
       clock_(clock),
@@ -38,8 +38,7 @@ LocalService::LocalService(Registry& registry, OpenTable& opens, PlaybackClockOw
       logger_(logger),
       refusals_(logger),
       requests_(registry, opens, clock, rights, fleet),
-      fleet_(fleet),
-      recovering_(recovering) {
+      fleet_(fleet) {
   registry_.add_observer(*this);
   if (fleet_) fleet_->observe(this);
 }
@@ -98,7 +97,7 @@ bool LocalService::on_frame_untrusted(ClientNumber number, std::span<const std::
   } else {
     serve(number, request, descriptors);
     // Only an offer can end a wait.
-    if (recovering_ && (request.has_offer() || request.has_open_clock())) serve_deferred();
+    if (request.has_offer() || request.has_open_clock()) serve_deferred();
   }
   return true;
 }
@@ -418,17 +417,14 @@ void LocalService::on_new_rights(const Rights& before) {
 // --- recovery
 
 bool LocalService::must_wait(const local::Request& request) const {
-  if (!recovering_ || request.has_offer()) return false;
+  if (!registry_.recovering() || request.has_offer()) return false;
   if (request.has_open_clock()) return !request.open_clock().offered() && !clock_.has_one();
   // Otherwise a Watch would leave out streams that are about to be offered.
   if (request.has_watch()) return true;
   const proto::StreamId* subject = LocalRequests::subject(request);
   if (!subject) return false;
-  // An invalid name is refused at once.
   const Result<StreamId> id = wire::stream_id_untrusted(*subject);
-  if (id && !id->host.empty() && id->host != registry_.host())
-    return false;  // no program here has it
-  return id && !registry_.knows(*id);
+  return id && registry_.may_come_back(*id);
 }
 
 void LocalService::defer(Client& client, const local::Request& request, std::size_t bytes) {
@@ -456,11 +452,6 @@ void LocalService::serve_deferred() {
     client->second.deferred_bytes -= deferred.bytes;
     serve(deferred.client, deferred.request, none);
   }
-}
-
-void LocalService::end_recovery() {
-  recovering_ = false;
-  serve_deferred();
 }
 
 }  // namespace dssm::daemon

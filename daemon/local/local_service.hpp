@@ -14,8 +14,8 @@
 // another host only for those that named none.
 //
 // After a crash of the dssmd before this one, programs that still hold streams reconnect and offer
-// them. Until end_recovery() a Watch, and a request about a stream that is not offered yet, is
-// deferred, not refused: otherwise a restarted writer could take the name of a ring that others
+// them. While the Registry recovers, a Watch, and a request about a stream that is not offered yet,
+// is deferred, not refused: otherwise a restarted writer could take the name of a ring that others
 // still use.
 #pragma once
 
@@ -56,10 +56,9 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   // What one client may have deferred during recovery.
   static constexpr std::size_t kMaxDeferredBytes = 1U << 20;
 
-  // recovering: the dssmd before this one did not end properly.
   // fleet: outlives this; nullptr: there are no other hosts.
   LocalService(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
-               const Rights& rights, Logger& logger, bool recovering, Fleet* fleet = nullptr);
+               const Rights& rights, Logger& logger, Fleet* fleet = nullptr);
   LocalService(const LocalService&) = delete;
   LocalService& operator=(const LocalService&) = delete;
   ~LocalService();
@@ -86,9 +85,6 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   // get the failure that says why they may not. Mirrors and remote writers end that no other
   // program has open. Watches show what they may see now.
   void on_new_rights(const Rights& before);
-
-  // The time to offer streams is over: deferred requests are answered.
-  void end_recovery();
 
  private:
   struct Client {
@@ -130,6 +126,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
 
   void on_stream_added(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
+  void on_recovered() override { serve_deferred(); }
   void on_remote_stream_added(const StreamInfo& stream) override;
   void on_remote_stream_removed(const StreamId& id) override;
   void on_ring_replaced(const Stream& stream) override;
@@ -144,7 +141,6 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   RateLimitedLogger logger_, refusals_;
   LocalRequests requests_;
   Fleet* fleet_;
-  bool recovering_;
   ClientNumber next_client_ = 1;
   std::map<ClientNumber, Client> clients_;
   std::vector<Deferred> deferred_;  // in the order of arrival

@@ -20,7 +20,7 @@
 namespace dssm::daemon {
 namespace {
 
-// Removes the socket of a dssmd that was killed. Returns whether there was one.
+// Removes the socket that an earlier dssmd left. Returns whether there was one.
 Result<bool> remove_stale(const std::string& path) {
   struct stat file {};
   if (::lstat(path.c_str(), &file)) {
@@ -81,7 +81,7 @@ Result<Listener> Listener::open(const std::string& path, std::optional<gid_t> gr
     return os_error(what);
   }
   Listener listener(path, std::move(fd));
-  listener.predecessor_died_ = stale;
+  listener.found_file_ = stale;
   DSSM_TRY(listener.allow(group, mode));
   if (::listen(listener.fd(), kBacklog)) return os_error(what);
   return listener;
@@ -105,7 +105,7 @@ Result<void> Listener::allow(std::optional<gid_t> group, mode_t mode) const {
 }
 
 Listener::~Listener() {
-  if (fd_ && !inherited_) ::unlink(path_.c_str());
+  if (fd_ && !inherited_ && !leaves_file_) ::unlink(path_.c_str());
 }
 
 // --- one connection

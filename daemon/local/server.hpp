@@ -34,9 +34,9 @@
 namespace dssm::daemon {
 
 // The listening socket. Its owner also holds the lock on the folder (RuntimeDir), so an existing
-// socket file is that of a dssmd that was killed, or of a socket that the service manager passed.
-// The latter is used as it is and not removed: programs that connect while no dssmd runs wait
-// there.
+// socket file is that of a dssmd that was killed, or of one that had streams and left the file for
+// its successor, or of a socket that the service manager passed. The latter is used as it is and
+// not removed: programs that connect while no dssmd runs wait there.
 class Listener {
  public:
   // Listens at `path` with that group (none: keep it) and mode; no program can connect before both
@@ -46,12 +46,14 @@ class Listener {
 
   Listener(Listener&&) = default;
   Listener& operator=(Listener&&) = delete;
-  ~Listener();  // removes the socket file, unless it was inherited
+  ~Listener();  // removes the socket file, unless it was inherited or leave_file() was called
 
   int fd() const noexcept { return fd_.get(); }
 
-  // A socket file was there: the dssmd before this one did not end properly.
-  bool predecessor_died() const noexcept { return predecessor_died_; }
+  // Programs may hold streams of this dssmd when it has ended: its successor finds the file.
+  void leave_file() noexcept { leaves_file_ = true; }
+  // A socket file was there: programs may hold streams of the dssmd before this one.
+  bool found_file() const noexcept { return found_file_; }
 
   // The service manager passed it. Then it is unknown whether a dssmd ran before.
   bool inherited() const noexcept { return inherited_; }
@@ -61,7 +63,7 @@ class Listener {
   Result<void> allow(std::optional<gid_t> group, mode_t mode) const;
   std::string path_;
   UniqueFd fd_;
-  bool predecessor_died_ = false;
+  bool found_file_ = false, leaves_file_ = false;
   bool inherited_ = false;
 };
 

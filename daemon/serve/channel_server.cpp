@@ -171,6 +171,10 @@ void ChannelServer::on_clock() {
   }
 }
 
+void ChannelServer::on_recovered() {
+  for (const auto& [key, communicator] : communicators_) communicator->on_recovered();
+}
+
 void ChannelServer::on_ended(DataCommunicator& communicator) {
   ended_.push_back(&communicator);
   sweep_.enable_in(Duration::zero());

@@ -47,8 +47,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   ChannelServer& operator=(const ChannelServer&) = delete;
   ~ChannelServer();  // connected peers get a final failure
 
-  // Accepts from now on. Until then connections wait: while the programs of this PC give streams
-  // back after a crash, no other host may take their names. `listener` outlives the server.
+  // Accepts from now on. `listener` outlives the server.
   void serve(const NetworkListener& listener);
 
   // For tests and fuzzers: a connection that is there already.
@@ -95,6 +94,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
 
   void on_stream_added(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
+  void on_recovered() override;
   void on_ended(DataCommunicator& communicator) override;
   void on_heartbeat() override;
 

@@ -42,6 +42,16 @@ bool is_control(const net::Frame& request) noexcept {
          (request.has_get_property() && request.get_property().has_id());
 }
 
+// Whether the answer would be another one when all streams have come back.
+bool must_wait_for_recovery(const net::Frame& request, const Registry& registry) {
+  if (!registry.recovering()) return false;
+  if (request.has_list()) return true;
+  const proto::StreamId* named = subject(request);
+  if (!named) return false;
+  const Result<StreamId> id = wire::stream_id_untrusted(*named);
+  return id && registry.may_come_back(*id);
+}
+
 }  // namespace
 
 DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
@@ -95,7 +105,7 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
     their_failure_ = wire::failure(frame.failure());
     return {};
   }
-  if (served_ < kRequestsPerTurn && served_for_ < kMaxTurn && can_serve()) {
+  if (served_ < kRequestsPerTurn && served_for_ < kMaxTurn && can_serve(frame)) {
     serve(frame);
     return {};
   }
@@ -111,7 +121,7 @@ Result<void> DataCommunicator::on_frame(net::Frame& frame) {
   link_.pause();
   // Otherwise work_now() serves it when what is in progress ends. History does not keep its pace
   // then.
-  if (can_serve() || (channel_ && channel_->busy())) work_soon();
+  if (can_serve(waiting_->request) || (channel_ && channel_->busy())) work_soon();
   return {};
 }
 
@@ -162,8 +172,9 @@ void DataCommunicator::on_new_rights(const Rights& before) {
   }
 }
 
-bool DataCommunicator::can_serve() const noexcept {
-  return link_.is_open() && link_.output_empty() && !opening_ && !(channel_ && channel_->busy());
+bool DataCommunicator::can_serve(const net::Frame& request) const {
+  if (!link_.is_open() || !link_.output_empty() || opening_) return false;
+  return channel_ ? !channel_->busy() : !must_wait_for_recovery(request, parts_.registry);
 }
 
 void DataCommunicator::become_control() {
@@ -363,7 +374,7 @@ void DataCommunicator::on_output_empty() { work_now(); }
     const std::uint64_t serial = opening_->serial;
     if (Result<void> opened = go_on_opening(); !opened) send_failure(serial, opened.error());
   }
-  if (waiting_ && can_serve()) {
+  if (waiting_ && can_serve(waiting_->request)) {
     const Waiting waiting = *std::exchange(waiting_, std::nullopt);
     serve(waiting.request);
     link_.resume();
@@ -373,7 +384,7 @@ void DataCommunicator::on_output_empty() { work_now(); }
     if (!worked) return link_.close_with(worked.error());
   }
   if (watch_ && watch_->work()) work_soon();
-  if (waiting_ && can_serve()) work_soon();
+  if (waiting_ && can_serve(waiting_->request)) work_soon();
 }
 
 void DataCommunicator::check_peer_timeout() {
@@ -403,11 +414,16 @@ void DataCommunicator::check_idle() {
 
 void DataCommunicator::on_stream_added(const Stream& stream) {
   if (watch_) watch_->on_stream_added(stream);
+  if (waiting_) work_soon();  // perhaps for this one
 }
 
 void DataCommunicator::on_stream_removed(const Stream& stream) {
   if (watch_) watch_->on_stream_removed(stream);
   if (channel_ && &channel_->stream() == &stream) channel_->on_removed();
+}
+
+void DataCommunicator::on_recovered() {
+  if (watch_ || waiting_) work_soon();
 }
 
 // --- the end
@@ -479,7 +495,7 @@ bool StreamWatch::work() {
     pending_.pop_front();
     if (stream && !stream->removed() && shows_(stream->id())) send_added(*stream);
   }
-  if (!pending_.empty() || serial_ == 0) return false;
+  if (!pending_.empty() || serial_ == 0 || registry_.recovering()) return false;
   net::Frame done;
   done.set_serial(serial_);
   done.mutable_done();

@@ -6,7 +6,8 @@
 // of them (CatalogRequests, StreamWatch) and about clocks.
 //
 // Backpressure: a request is served only while nothing waits to be sent; until then one waits here
-// and the others on the peer's side. So a peer that asks and never reads costs one answer.
+// and the others on the peer's side. So a peer that asks and never reads costs one answer. While
+// the Registry recovers, a request about a stream that may come back waits the same way.
 #pragma once
 
 #include <deque>
@@ -34,8 +35,9 @@
 namespace dssm::daemon {
 
 // One control connection that watches the streams of this host: first an event for each existing
-// stream, then the response to Watch, then changes. The first events are sent as fast as the peer
-// receives them, so that thousands of streams need no memory for a queue.
+// stream, then, when the Registry has recovered, the response to Watch, then changes. The first
+// events are sent as fast as the peer receives them, so that thousands of streams need no memory
+// for a queue.
 class StreamWatch {
  public:
   // Events sent in a row before others get their turn.
@@ -115,6 +117,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
 
   void on_stream_added(const Stream& stream);
   void on_stream_removed(const Stream& stream);
+  void on_recovered();
 
   // This host's clock has a new generation: notifies control connections with the feature.
   void send_clock();
@@ -146,7 +149,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
 
   Result<void> greet(const net::Frame& frame);
   void become_control();
-  bool can_serve() const noexcept;
+  bool can_serve(const net::Frame& request) const;
   void serve(const net::Frame& request);
   Result<void> check_access(const net::Frame& request);
   Result<void> dispatch(const net::Frame& request);

@@ -220,8 +220,8 @@ constexpr ConfigKey kKeys[] = {
      ValueForm::integer_or_text, kChangesAtOnce<&Config::max_property_bytes>,
      set_bytes<&Config::max_property_bytes, 0, wire::kMaxPropertyBytes>},
     {"recovery_grace", "TIME",
-     "how long after a crash programs may give their streams back before new ones take their "
-     "names; default: 500 ms",
+     "how long after a crash or restart programs may give their streams back before new ones "
+     "take their names; default: 500 ms",
      ValueForm::text, kChangesAtOnce<&Config::recovery_grace>,
      set_duration<&Config::recovery_grace, kMaxGraceNs>},
     {"listen", "ADDR:PORT",

@@ -29,6 +29,16 @@ Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
                                     "'; create it first (`dssmctl ls` lists those that are there)"};
 }
 
+void Registry::end_recovery() {
+  recovering_ = false;
+  for (StreamObserver* observer : observers_) observer->on_recovered();
+}
+
+bool Registry::may_come_back(const StreamId& id) const {
+  // An invalid name is refused at once, and another host's stream is not held by a program here.
+  return recovering_ && own_id(id) && !knows(id);
+}
+
 void Registry::add_limits(LimitUses& out) const {
   out.push_back({"max_streams", in_order_.size() + other_rings_, limits_.max_streams, "streams"});
   out.push_back({"max_memory", budget_.used(), budget_.limit(), "bytes"});

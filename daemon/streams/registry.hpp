@@ -25,6 +25,8 @@ class StreamObserver {
  public:
   virtual void on_stream_added(const Stream& stream) = 0;
   virtual void on_stream_removed(const Stream& stream) = 0;
+  // No stream of the dssmd before this one comes back any more.
+  virtual void on_recovered() {}
 
  protected:
   ~StreamObserver() = default;
@@ -76,6 +78,14 @@ class Registry {
   void add_limits(LimitUses& out) const;
 
   const std::string& host() const noexcept { return host_; }
+
+  // After a restart of dssmd, programs give the streams back that they hold. Until all have had the
+  // time, the names of those that are missing are neither refused nor given to others.
+  void begin_recovery() noexcept { recovering_ = true; }
+  void end_recovery();
+  bool recovering() const noexcept { return recovering_; }
+  // Whether a stream of that name is missing and may still come back: who asks has to wait.
+  bool may_come_back(const StreamId& id) const;
   const MemoryBudget& budget() const noexcept { return budget_; }
 
   // For rings that are not in the registry (mirrors, remote writers) but count like those that are.
@@ -120,6 +130,7 @@ class Registry {
   void add(std::shared_ptr<Stream> stream);
 
   std::string host_;
+  bool recovering_ = false;
   Limits limits_;
   MemoryBudget budget_;            // before the streams, which hold shares of it
   std::uint64_t other_rings_ = 0;  // that hold a RingQuota

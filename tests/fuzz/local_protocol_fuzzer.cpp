@@ -36,7 +36,9 @@ struct Daemon {
       : registry("pc1",
                  {.max_streams = 8, .max_memory_bytes = 1 << 20, .max_property_bytes = 4096}),
         opens({.max_opens = 16, .max_opens_per_client = 8}),
-        service(registry, opens, clock, rights, logger, recovering, &fleet) {}
+        service(registry, opens, clock, rights, logger, &fleet) {
+    if (recovering) registry.begin_recovery();
+  }
   LogRecorder logger;
   Registry registry;
   OpenTable opens;
@@ -120,7 +122,7 @@ void run(std::span<const std::uint8_t> input) {
   };
   receive(std::as_bytes(input), cut);
   receive(std::as_bytes(std::span(bomb)), SIZE_MAX);
-  daemon.service.end_recovery();
+  daemon.registry.end_recovery();
   if (cut & 1) daemon.fleet.answer();
   daemon.service.disconnect(client);
   daemon.fleet.answer();

@@ -234,22 +234,27 @@ TEST_F(Channel, WakesLocalReadersOfWhatIsPublished) {
   }
 }
 
-TEST_F(Channel, ContinuesWithTheRingThatAWriterKeptOverARestart) {
-  LocalWriter writer(local_, "kept", 64, 1024);
-  writer.write(10);
-  {
-    NetworkPeer peer = NetworkPeer::greeted(daemon_.address());
-    EXPECT_EQ(peer.open("kept").stream().newest(), 9);
+// After a kill and after a proper stop.
+TEST(ChannelAfterARestart, WaitsForTheRingThatAWriterKept) {
+  DaemonProcess daemon(kPatientRecovery);
+  RawClient before(daemon.socket_path());
+  LocalWriter writer(before, "kept", 64, 1024);
+  for (const bool is_killed : {true, false}) {
+    if (is_killed) {
+      daemon.kill_hard();
+    } else {
+      EXPECT_EQ(daemon.stop(), 0);
+    }
+    writer.write(5);
+    daemon.start();
+    NetworkPeer peer = NetworkPeer::greeted(daemon.address());
+    peer.send(with_serial(1, open_frame("kept")));
+    NetworkPeer other = NetworkPeer::greeted(daemon.address());  // so dssmd has the request
+    EXPECT_TRUE(other.ask(ping_frame()).has_pong()) << "nothing else waits";
+    RawClient again(daemon.socket_path());
+    writer.offer(again);
+    EXPECT_EQ(peer.receive().opened().stream().newest(), is_killed ? 4 : 9);
   }
-  daemon_.kill_hard();
-  writer.write(5);
-  daemon_.start();
-  // While programs give their streams back nobody else can take their names.
-  NetworkPeer early(daemon_.address());
-  early.send(client_hello_frame());
-  RawClient again(daemon_.socket_path());
-  EXPECT_EQ(again.ask(create_request("other")).response.has_opened(), true);
-  EXPECT_TRUE(early.receive().has_hello());
 }
 
 // --- many kinds of peers

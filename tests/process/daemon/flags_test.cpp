@@ -10,6 +10,7 @@
 
 #include <filesystem>
 #include <fstream>
+#include <set>
 
 #include "tests/process/daemon/raw_client.hpp"
 
@@ -122,16 +123,26 @@ TEST(Start, RunsBesideOthersInFoldersOfTheirOwn) {
   EXPECT_EQ(at_two.ask(list_request()).response.stream_list().streams(0).id().host(), "pc2");
 }
 
+std::set<std::string> files_in(const std::string& folder) {
+  std::set<std::string> names;
+  for (const auto& entry : std::filesystem::directory_iterator(folder)) {
+    names.insert(entry.path().filename());
+  }
+  return names;
+}
+
 TEST(Stop, LeavesNothingInTheFolderButWhatTheNextOneHasToKnowOfTheClock) {
+  DaemonProcess daemon;
+  EXPECT_EQ(daemon.stop(), 0);
+  EXPECT_EQ(files_in(daemon.runtime_dir()), std::set<std::string>{"clock"});
+}
+
+TEST(Stop, LeavesTheSocketWhenProgramsMayHoldStreams) {
   DaemonProcess daemon;
   RawClient client(daemon.socket_path());
   client.ask(create_request("odometry"));
   EXPECT_EQ(daemon.stop(), 0);
-  std::vector<std::string> left;
-  for (const auto& entry : std::filesystem::directory_iterator(daemon.runtime_dir())) {
-    left.push_back(entry.path().filename());
-  }
-  EXPECT_EQ(left, std::vector<std::string>{"clock"});
+  EXPECT_EQ(files_in(daemon.runtime_dir()), (std::set<std::string>{"clock", "dssmd.sock"}));
 }
 
 TEST(Stop, ComesByControlCAsWell) {

@@ -13,7 +13,9 @@ namespace {
 
 struct Daemon {
   explicit Daemon(bool recovering = false, const OpenTable::Limits& limits = {1000, 100})
-      : opens(limits), service(registry, opens, clock, rights, logger, recovering) {}
+      : opens(limits), service(registry, opens, clock, rights, logger) {
+    if (recovering) registry.begin_recovery();
+  }
   LogRecorder logger;
   Registry registry{"pc1", kLimits};
   OpenTable opens;
@@ -435,7 +437,7 @@ TEST(LocalService, DelaysRequestsForAStreamThatMayStillBeOffered) {
   EXPECT_TRUE(same_file(fresh.last_descriptors.at(0).get(), ring.get())) << "the old ring";
 }
 
-TEST(LocalService, AnswersBlockedSignalsWhenRecoveryEnds) {
+TEST(LocalService, AnswersWhatWaitsWhenRecoveryEnds) {
   Daemon daemon(true);
   FakeClient client(daemon.service, 6);
   client.greet();
@@ -443,7 +445,7 @@ TEST(LocalService, AnswersBlockedSignalsWhenRecoveryEnds) {
   create.set_serial(50), open.set_serial(51);
   ASSERT_TRUE(client.put(create) && client.put(open));
   EXPECT_TRUE(client.received.empty());
-  daemon.service.end_recovery();
+  daemon.registry.end_recovery();
   EXPECT_TRUE(client.next().opened().created());
   const local::Response refused = client.next();
   EXPECT_EQ(refused.serial(), 51u);
@@ -467,7 +469,7 @@ TEST(LocalService, ForgetsWhatAClientWaitedForWhenItLeaves) {
     create.set_serial(50);
     ASSERT_TRUE(client.put(create));
   }
-  daemon.service.end_recovery();
+  daemon.registry.end_recovery();
   EXPECT_TRUE(daemon.registry.streams().empty());
 }
 

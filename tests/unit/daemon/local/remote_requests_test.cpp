@@ -118,9 +118,8 @@ class RemoteRequestsTest : public testing::Test {
   std::unique_ptr<LocalService> service;
   std::unique_ptr<FakeClient> client;
 
-  explicit RemoteRequestsTest(bool recovering = false)
-      : service(std::make_unique<LocalService>(registry, opens, clock, rights, logger, recovering,
-                                               &fleet)),
+  RemoteRequestsTest()
+      : service(std::make_unique<LocalService>(registry, opens, clock, rights, logger, &fleet)),
         client(std::make_unique<FakeClient>(*service, 5)) {
     client->greet();
   }
@@ -431,14 +430,14 @@ TEST_F(RemoteRequestsTest, NotifiesReadersOfAnOwnStreamThatMovedToAnotherHost) {
 
 class RecoveringRequestsTest : public RemoteRequestsTest {
  protected:
-  RecoveringRequestsTest() : RemoteRequestsTest(true) {}
+  RecoveringRequestsTest() { registry.begin_recovery(); }
 };
 
 TEST_F(RecoveringRequestsTest, DoNotWaitWhenTheyNameAnotherHost) {
   put(open_at("lidar", "pc2"), 80);
   put(open_request("lidar"), 81);
   EXPECT_EQ(fleet.asked, Asked{"open_reader lidar:0@pc2"}) << "the other may be ours";
-  service->end_recovery();
+  registry.end_recovery();
   EXPECT_EQ(fleet.asked, (Asked{"open_reader lidar:0@pc2", "open_reader lidar:0"}));
 }
 

@@ -347,6 +347,64 @@ TEST(DataCommunicator, ReportsWhichLimitAStreamExceeds) {
   EXPECT_TRUE(rig.ask(peer, create_request(3, "good", 8, 8)).has_opened()) << "it may try again";
 }
 
+// --- while programs give streams back after a restart of dssmd
+
+TEST(Recovering, AStreamThatIsMissingIsWaitedFor) {
+  ServerRig rig;
+  rig.create("here");
+  rig.registry.begin_recovery();
+  MemoryPeer peer, other;
+  rig.connect(peer);
+  rig.connect(other);
+  peer.put(with_serial(1, open_frame("missing")));
+  rig.turns();
+  EXPECT_TRUE(peer.take().empty()) << "neither opened nor refused";
+  rig.open(other, "here");
+  rig.create("missing");  // as if a program gave it back
+  rig.turns();
+  const std::vector<net::Frame> answers = peer.take();
+  ASSERT_EQ(answers.size(), 1u);
+  EXPECT_TRUE(answers[0].has_opened()) << answers[0].failure().message();
+}
+
+TEST(Recovering, NoPeerTakesANameBeforeTheEnd) {
+  ServerRig rig;
+  rig.registry.begin_recovery();
+  MemoryPeer creating, opening;
+  rig.connect(creating);
+  rig.connect(opening);
+  creating.put(create_request(1, "new", 8, 4));
+  opening.put(with_serial(1, open_frame("other")));
+  rig.turns();
+  EXPECT_TRUE(creating.take().empty() && opening.take().empty());
+  rig.registry.end_recovery();
+  rig.turns();
+  EXPECT_TRUE(creating.take().at(0).opened().created());
+  EXPECT_EQ(opening.take().at(0).failure().code(), "not_found");
+}
+
+TEST(Recovering, ListsWaitAndWatchesDoNotEndTheirFirstEvents) {
+  ServerRig rig;
+  rig.create("a");
+  rig.registry.begin_recovery();
+  MemoryPeer listing, watching;
+  rig.connect(listing);
+  rig.connect(watching);
+  listing.put(list_request(1));
+  watching.put(with_serial(1, watch_frame()));
+  rig.turns();
+  EXPECT_TRUE(listing.take().empty());
+  EXPECT_EQ(watching.take().size(), 1u) << "the event of what is there";
+  EXPECT_TRUE(rig.ask(watching, with_serial(2, ping_frame())).has_pong());
+  rig.create("b");
+  rig.turns();
+  EXPECT_TRUE(watching.take().at(0).has_stream_event());
+  rig.registry.end_recovery();
+  rig.turns();
+  EXPECT_EQ(listing.take().at(0).stream_list().streams_size(), 2);
+  EXPECT_TRUE(watching.take().at(0).has_done());
+}
+
 // --- watching
 
 net::Frame watch_request(std::uint64_t serial) { return with_serial(serial, watch_frame()); }

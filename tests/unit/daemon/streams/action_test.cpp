@@ -69,7 +69,7 @@ TEST_F(ActionTest, RefusesEachRequestOfALocalProgram) {
   OpenTable opens{{100, 100}};
   PlaybackClockOwner clock;
   LogRecorder logger;
-  LocalService service(registry, opens, clock, rule, logger, false);
+  LocalService service(registry, opens, clock, rule, logger);
   FakeClient client(service, 5);
   client.greet();
   EXPECT_EQ(rule.last_action, Action::greet);

@@ -159,7 +159,7 @@ class LocalRightsTest : public testing::Test {
   OpenTable opens{{100, 100}};
   PlaybackClockOwner clock;
   Rights rights;
-  LocalService service{registry, opens, clock, rights, logger, false};
+  LocalService service{registry, opens, clock, rights, logger};
   FakeClient client{service, 5};  // uid 1000
 
   void SetUp() override { client.greet(); }
