@@ -277,8 +277,10 @@ class Dssmd {
   //   signals     blocked until now
   Result<void> run(const Reloader::Read& read_again, BlockedSignals& signals) {
     EventSource grace = EventSource::timer(loop_, [this] { streams_.registry.end_recovery(); });
-    if (streams_.registry.recovering()) {
+    if (streams_.registry.recovery() != Registry::Recovery::over) {
       grace.enable_in(config_.recovery_grace);
+    }
+    if (streams_.registry.may_miss_streams()) {
       logger_.notice("programs that hold streams of the dssmd before this one give them back",
                      {.message_id = message_id::kRecovering});
     }
@@ -313,9 +315,10 @@ class Dssmd {
     const bool some_may_be_missing =
         streams_.store.restore_untrusted(std::move(stored), sockets_.network.has_kept());
     // With an inherited socket it is unknown whether a dssmd ran before this one.
-    if (some_may_be_missing && (sockets_.listener.found_file() || sockets_.listener.inherited()) &&
+    if ((sockets_.listener.found_file() || sockets_.listener.inherited()) &&
         config_.recovery_grace > Duration::zero()) {
-      streams_.registry.begin_recovery();
+      streams_.registry.begin_recovery(some_may_be_missing ? Registry::Recovery::streams
+                                                           : Registry::Recovery::opens);
     }
   }
 

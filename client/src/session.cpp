@@ -113,14 +113,15 @@ Result<Session> Session::connect(SessionOptions options) {
 }
 
 Result<RawWriter> Session::create_raw(const StreamId& id, const TypeInfo& type,
-                                      const History& history, std::uint32_t tag) {
+                                      const History& history, const CreateOptions& options) {
   const std::string what = quoted("create", id);
   DSSM_TRY(id.check(), what);
   DSSM_TRY(type.check(), what);
   local::Request request;
   wire::to_message(id, type, history, *request.mutable_create());
-  request.mutable_create()->set_tag(tag);
-  auto stream = DSSM_TRY(client_->open(std::move(request), Role::writer, tag), what);
+  request.mutable_create()->set_tag(options.tag);
+  request.mutable_create()->set_keep_existing(options.keep_existing);
+  auto stream = DSSM_TRY(client_->open(std::move(request), Role::writer, options.tag), what);
   return RawWriter(std::make_unique<detail::WriterState>(std::move(stream)));
 }
 

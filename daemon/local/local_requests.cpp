@@ -135,7 +135,7 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
 
 Result<Reply> LocalRequests::create(const Client& client, const proto::Create& request) {
   DSSM_TRY(opens_.check_quota(*client));
-  const OpenedRing created = DSSM_TRY(catalog_.create_untrusted(request, client->pid));
+  const OpenedRing created = DSSM_TRY(catalog_.create_untrusted(request, *client, rights_));
   Result<Reply> reply =
       opened({client, created.stream, Role::writer, request.tag(), request.id().host().empty()});
   if (reply) {
@@ -272,7 +272,8 @@ void LocalRequests::create_elsewhere(const Client& client, const StreamId& id,
   const Result<TypeInfo> type = wire::type_untrusted(request.type());
   if (!type) return answer(type.error());
   if (Result<void> quota = opens_.check_quota(*client); !quota) return answer(quota.error());
-  const CreatePlan plan{*type, {request.depth(), Duration(request.cycle_ns())}};
+  const CreatePlan plan{
+      *type, {request.depth(), Duration(request.cycle_ns())}, request.keep_existing()};
   fleet_->open_writer(
       id, &plan,
       [this, client, tag = request.tag(), answer = std::move(answer)](Result<OpenedRing> writer) {

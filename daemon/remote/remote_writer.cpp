@@ -38,7 +38,7 @@ void RemoteWriter::open_at_owner() {
   if (const std::optional<CreatePlan>* wanted = first_pending()) {
     plan = *wanted;
   } else if (creates_ && !is_removed_) {
-    plan = CreatePlan{ring_->stream()->type(), history_};
+    plan = CreatePlan{ring_->stream()->type(), history_, true};
   }
   channel_.open(id_, plan ? &*plan : nullptr);
 }
@@ -147,7 +147,14 @@ void RemoteWriter::stop_publishing() noexcept {
 
 Result<void> RemoteWriter::check_open(const CreatePlan* plan) {
   if (!plan) return {};
-  DSSM_TRY(ring_->stream()->type().check_usable_as(plan->type), "stream '" + name_ + "'");
+  const std::string context = "stream '" + name_ + "'";
+  DSSM_TRY(ring_->stream()->type().check_usable_as(plan->type), context);
+  if (!plan->keep_existing && plan->history.depth > history_.depth) {
+    return Error{Errc::conflict,
+                 fmt::format("{}: its ring has {} slots, and this program asks for {}; another "
+                             "program of this PC writes it: end that one, or ask for less",
+                             context, history_.depth, plan->history.depth)};
+  }
   creates_ = true;
   return {};
 }

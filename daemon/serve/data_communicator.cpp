@@ -44,7 +44,7 @@ bool is_control(const net::Frame& request) noexcept {
 
 // Whether the answer would be another one when all streams have come back.
 bool must_wait_for_recovery(const net::Frame& request, const Registry& registry) {
-  if (!registry.recovering()) return false;
+  if (!registry.may_miss_streams()) return false;
   if (request.has_list()) return true;
   const proto::StreamId* named = subject(request);
   if (!named) return false;
@@ -301,7 +301,8 @@ Result<void> DataCommunicator::check_clock(const StreamId& id) const {
 Result<void> DataCommunicator::create(const net::Frame& request) {
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.create().id()));
   DSSM_TRY(check_clock(id));
-  const OpenedRing created = DSSM_TRY(catalog_.create_untrusted(request.create(), 0));
+  const OpenedRing created =
+      DSSM_TRY(catalog_.create_untrusted(request.create(), identity_, parts_.rights));
   opening_ = {request.serial(), created.stream, created.created};
   return go_on_opening();
 }
@@ -495,7 +496,7 @@ bool StreamWatch::work() {
     pending_.pop_front();
     if (stream && !stream->removed() && shows_(stream->id())) send_added(*stream);
   }
-  if (!pending_.empty() || serial_ == 0 || registry_.recovering()) return false;
+  if (!pending_.empty() || serial_ == 0 || registry_.may_miss_streams()) return false;
   net::Frame done;
   done.set_serial(serial_);
   done.mutable_done();

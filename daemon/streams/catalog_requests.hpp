@@ -18,6 +18,7 @@
 #include "common.pb.h"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
+#include "daemon/streams/rights.hpp"
 
 namespace dssm::daemon {
 
@@ -50,12 +51,15 @@ class CatalogRequests {
 
   // For Open and Create.
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
-  //   creator_pid  of the program of this host; 0: another host creates it
-  Result<OpenedRing> create_untrusted(const proto::Create& request, std::int32_t creator_pid);
+  //   who     asks; has the right to create the stream, or to write to the existing one
+  //   rights  decide whether `who` may replace an existing one
+  Result<OpenedRing> create_untrusted(const proto::Create& request, const Identity& who,
+                                      const Rights& rights);
 
  private:
   Result<void> list(proto::StreamList& out) const;
   Result<std::string> property_of(const StreamId& id) const;
+  Result<void> check_unused(const Stream& stream) const;
 
   Registry& registry_;
   const OpenTable& opens_;

@@ -30,13 +30,13 @@ Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
 }
 
 void Registry::end_recovery() {
-  recovering_ = false;
+  recovery_ = Recovery::over;
   for (StreamObserver* observer : observers_) observer->on_recovered();
 }
 
 bool Registry::may_come_back(const StreamId& id) const {
   // An invalid name is refused at once, and another host's stream is not held by a program here.
-  return recovering_ && own_id(id) && !knows(id);
+  return may_miss_streams() && own_id(id) && !knows(id);
 }
 
 void Registry::add_limits(LimitUses& out) const {
@@ -66,17 +66,32 @@ Result<OpenedRing> Registry::create(const StreamId& id, const TypeInfo& type,
     DSSM_TRY(found->second->type().check_usable_as(type), context);
     return OpenedRing{found->second, false};
   }
-  if (history.cycle <= Duration::zero()) {
-    return Error{Errc::invalid_argument,
-                 fmt::format("{}: its cycle is {} ns; give the expected time between two samples",
-                             context, to_ns(history.cycle))};
-  }
   DSSM_TRY(check_quota(), context);
-  std::shared_ptr<Stream> stream = DSSM_TRY(
-      Stream::create({own, type, history.depth, history.cycle, creator_pid, next_order_}, budget_),
-      context);
+  std::shared_ptr<Stream> stream = DSSM_TRY(make(own, type, history, creator_pid), context);
   add(stream);
   return OpenedRing{std::move(stream), true};
+}
+
+Result<std::shared_ptr<Stream>> Registry::replace(const StreamId& id, const TypeInfo& type,
+                                                  const History& history,
+                                                  std::int32_t creator_pid) {
+  const std::shared_ptr<Stream> old = DSSM_TRY(find(id));
+  std::shared_ptr<Stream> stream = DSSM_TRY(make(old->id(), type, history, creator_pid),
+                                            "replace stream '" + old->id().str() + "'");
+  DSSM_TRY(remove(old->id()));
+  add(stream);
+  return stream;
+}
+
+Result<std::shared_ptr<Stream>> Registry::make(const StreamId& own, const TypeInfo& type,
+                                               const History& history, std::int32_t creator_pid) {
+  if (history.cycle <= Duration::zero()) {
+    return Error{Errc::invalid_argument,
+                 fmt::format("its cycle is {} ns; give the expected time between two samples",
+                             to_ns(history.cycle))};
+  }
+  return Stream::create({own, type, history.depth, history.cycle, creator_pid, next_order_},
+                        budget_);
 }
 
 Result<std::shared_ptr<Stream>> Registry::adopt_untrusted(const StreamId& id, OfferedFiles files) {

@@ -79,11 +79,18 @@ class Registry {
 
   const std::string& host() const noexcept { return host_; }
 
-  // After a restart of dssmd, programs give the streams back that they hold. Until all have had the
-  // time, the names of those that are missing are neither refused nor given to others.
-  void begin_recovery() noexcept { recovering_ = true; }
+  // After a restart of dssmd, programs say again which streams they have open, and give those back
+  // that dssmd has not. Until all have had the time, the names of streams that are missing are
+  // neither refused nor given to others, and no ring is taken for unused.
+  enum class Recovery : std::uint8_t {
+    over,
+    opens,    // all streams are here
+    streams,  // some may be missing
+  };
+  void begin_recovery(Recovery from) noexcept { recovery_ = from; }
   void end_recovery();
-  bool recovering() const noexcept { return recovering_; }
+  Recovery recovery() const noexcept { return recovery_; }
+  bool may_miss_streams() const noexcept { return recovery_ == Recovery::streams; }
   // Whether a stream of that name is missing and may still come back: who asks has to wait.
   bool may_come_back(const StreamId& id) const;
   const MemoryBudget& budget() const noexcept { return budget_; }
@@ -106,6 +113,12 @@ class Registry {
   Result<OpenedRing> create(const StreamId& id, const TypeInfo& type, const History& history,
                             std::int32_t creator_pid);
 
+  // Creates a stream in place of the one of that name, which is removed when nothing can fail any
+  // more.
+  //   fails  not_found, invalid_argument, limit_exceeded, os errors; then the old one stays
+  Result<std::shared_ptr<Stream>> replace(const StreamId& id, const TypeInfo& type,
+                                          const History& history, std::int32_t creator_pid);
+
   // Takes back a stream that a client kept while no dssmd ran. Returns the registered stream when
   // it has the same ring.
   //   fails  conflict (another ring has that name), protocol, no_permission, limit_exceeded
@@ -126,11 +139,13 @@ class Registry {
   using Key = std::pair<std::string, std::int32_t>;
   Result<StreamId> own_id(StreamId id) const;
   Result<void> check_quota() const;
+  Result<std::shared_ptr<Stream>> make(const StreamId& own, const TypeInfo& type,
+                                       const History& history, std::int32_t creator_pid);
   Result<std::shared_ptr<Stream>> add_adopted(std::shared_ptr<Stream> stream);
   void add(std::shared_ptr<Stream> stream);
 
   std::string host_;
-  bool recovering_ = false;
+  Recovery recovery_ = Recovery::over;
   Limits limits_;
   MemoryBudget budget_;            // before the streams, which hold shares of it
   std::uint64_t other_rings_ = 0;  // that hold a RingQuota

@@ -248,6 +248,20 @@ TEST_F(Api, NamesBothTypesWhenTheyDoNotMatch) {
   EXPECT_EQ(bytes.code, Errc::type_mismatch);
 }
 
+TEST_F(Api, AProgramThatAsksForMoreHistoryThanThereIsGetsItOrAnError) {
+  const auto depth = [&](std::uint64_t asked, CreateOptions options = {}) {
+    return session.create<Odometry>("odometry", History{asked, 10ms}, options).value().depth();
+  };
+  EXPECT_EQ(depth(64), 64u);
+  EXPECT_EQ(depth(65), 65u) << "no program had the ring open";
+  const auto writer = session.create<Odometry>("odometry", History{65, 10ms}).value();
+  EXPECT_EQ(depth(10), 65u);
+  EXPECT_EQ(depth(66, {.keep_existing = true}), 65u);
+  const auto refused = session.create<Odometry>("odometry", History{66, 10ms});
+  ASSERT_FALSE(refused);
+  EXPECT_EQ(refused.error().code, Errc::conflict) << refused.error().message;
+}
+
 TEST_F(Api, ReportsWhatIsWrongWithARequest) {
   const auto expect = [](const auto& result, Errc code, const char* words) {
     ASSERT_FALSE(result) << "should have failed with: " << words;

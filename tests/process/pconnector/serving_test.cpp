@@ -85,7 +85,7 @@ TEST_F(PConnectorServing, KnowsTheStream) {
 }
 
 TEST_F(PConnectorServing, RefusesWithAReason) {
-  make();
+  const auto writer = make();
   const auto none = PConnector::open({"radar", 0, {}}, options());
   ASSERT_FALSE(none);
   EXPECT_EQ(none.error().code, Errc::not_found) << none.error().message;

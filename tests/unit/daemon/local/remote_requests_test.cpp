@@ -430,7 +430,7 @@ TEST_F(RemoteRequestsTest, NotifiesReadersOfAnOwnStreamThatMovedToAnotherHost) {
 
 class RecoveringRequestsTest : public RemoteRequestsTest {
  protected:
-  RecoveringRequestsTest() { registry.begin_recovery(); }
+  RecoveringRequestsTest() { registry.begin_recovery(Registry::Recovery::streams); }
 };
 
 TEST_F(RecoveringRequestsTest, DoNotWaitWhenTheyNameAnotherHost) {

@@ -299,9 +299,27 @@ TEST(DataCommunicator, CreatesAStreamThatNoProgramHereCreated) {
   EXPECT_EQ((*rig.registry.find({"new", 0, ""}))->creator_pid(), 0);
   rig.connect(other);
   EXPECT_EQ(rig.ask(other, create_request(1, "new", 17, 8)).failure().code(), "type_mismatch");
-  const net::Frame joined = rig.ask(other, create_request(2, "new", 16, 99));
+  const net::Frame joined = rig.ask(other, create_request(2, "new", 16, 8));
   ASSERT_TRUE(joined.has_opened());
   EXPECT_FALSE(joined.opened().created());
+}
+
+TEST(DataCommunicator, ReplacesAStreamThatNoPeerHasOpen) {
+  ServerRig rig;
+  rig.create("s", 16, 8);
+  MemoryPeer peer, other;
+  rig.connect(peer);
+  rig.connect(other);
+  rig.open(peer, "s");
+  const net::Frame refused = rig.ask(other, create_request(1, "s", 16, 99));
+  EXPECT_EQ(refused.failure().code(), "conflict");
+  EXPECT_NE(refused.failure().message().find("open in other hosts"), std::string::npos)
+      << refused.failure().message();
+  peer.end();
+  rig.turns();
+  const net::Frame replaced = rig.ask(other, create_request(2, "s", 16, 99));
+  EXPECT_TRUE(replaced.opened().created());
+  EXPECT_EQ(replaced.opened().stream().depth(), 99u);
 }
 
 TEST(DataCommunicator, TakesTheMemoryOfALongRingInTurns) {
@@ -352,7 +370,7 @@ TEST(DataCommunicator, ReportsWhichLimitAStreamExceeds) {
 TEST(Recovering, AStreamThatIsMissingIsWaitedFor) {
   ServerRig rig;
   rig.create("here");
-  rig.registry.begin_recovery();
+  rig.registry.begin_recovery(Registry::Recovery::streams);
   MemoryPeer peer, other;
   rig.connect(peer);
   rig.connect(other);
@@ -369,7 +387,7 @@ TEST(Recovering, AStreamThatIsMissingIsWaitedFor) {
 
 TEST(Recovering, NoPeerTakesANameBeforeTheEnd) {
   ServerRig rig;
-  rig.registry.begin_recovery();
+  rig.registry.begin_recovery(Registry::Recovery::streams);
   MemoryPeer creating, opening;
   rig.connect(creating);
   rig.connect(opening);
@@ -386,7 +404,7 @@ TEST(Recovering, NoPeerTakesANameBeforeTheEnd) {
 TEST(Recovering, ListsWaitAndWatchesDoNotEndTheirFirstEvents) {
   ServerRig rig;
   rig.create("a");
-  rig.registry.begin_recovery();
+  rig.registry.begin_recovery(Registry::Recovery::streams);
   MemoryPeer listing, watching;
   rig.connect(listing);
   rig.connect(watching);
