@@ -43,7 +43,7 @@ TEST_F(Create, KeepsAStreamThatIsThereAlready) {
   EXPECT_EQ(again["depth"], 10);
   EXPECT_EQ(session_.stream_info({"s", 0, ""}).value().incarnation, incarnation);
   EXPECT_EQ(output({"create", "s", "--size", "24", "--depth", "99"}),
-            "s:0@pc1: exists already, kept with 10 slots of 24 B, fewer than the 99 asked for; "
+            "s:0@pc1: exists already, kept with 10 slots of 24 bytes, fewer than the 99 asked for; "
             "remove it first to get those\n");
 }
 
