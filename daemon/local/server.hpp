@@ -9,7 +9,6 @@
 #pragma once
 
 #include <sys/types.h>
-#include <unistd.h>
 
 #include <cstddef>
 #include <cstdint>
@@ -95,12 +94,11 @@ inline constexpr std::size_t kMaxMessageBytesPerUser = kMaxMessageBytes / 2;
 // For the rest of a long request: then its memory is free again.
 inline constexpr Duration kLongRequestTimeout = std::chrono::seconds(10);
 
-// What one user's programs take, so that those of one cannot keep out those of others. root, and
-// the user of dssmd, could end dssmd anyway: they have no limits of their own.
+// What one user's programs take.
 struct UserAccount {
   explicit UserAccount(uid_t user)
       : uid(user),
-        is_limited(user != 0 && user != ::geteuid()),
+        is_limited(daemon::is_limited(user)),
         messages(is_limited ? kMaxMessageBytesPerUser : kMaxMessageBytes) {}
   const uid_t uid;
   const bool is_limited;

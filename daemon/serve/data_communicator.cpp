@@ -252,7 +252,7 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
       wire::to_message(pair, *list.add_pairs());
     }
   } else {
-    DSSM_TRY(catalog_.serve_untrusted(request, answer));
+    DSSM_TRY(catalog_.serve_untrusted(request, answer, identity_.account()));
     if (request.has_list()) parts_.rights.hide(identity_, *answer.mutable_stream_list());
   }
   link_.send(answer);
@@ -290,7 +290,8 @@ Result<void> DataCommunicator::check_clock(const StreamId& id) const {
 Result<void> DataCommunicator::create(const net::Frame& request) {
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.create().id()));
   DSSM_TRY(check_clock(id));
-  const OpenedRing created = DSSM_TRY(catalog_.create_untrusted(request.create(), 0));
+  const OpenedRing created =
+      DSSM_TRY(catalog_.create_untrusted(request.create(), 0, identity_.account()));
   opening_ = {request.serial(), created.stream, created.created};
   return go_on_opening();
 }
@@ -331,7 +332,7 @@ Result<void> DataCommunicator::go_on_opening() {
   idle_timeout_.disable();
   channel_ = std::make_unique<StreamChannel>(
       StreamChannel::Parts{parts_.loop, catalog_, link_, place_.budget(), *this, parts_.self,
-                           *them_, parts_.clock, parts_.sending},
+                           *them_, identity_.account(), parts_.clock, parts_.sending},
       parts_.streams.get(opening.stream), them_->has_feature(wire::kFeatureTorn));
   net::Frame answer;
   answer.set_serial(opening.serial);

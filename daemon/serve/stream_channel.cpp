@@ -387,7 +387,7 @@ Result<void> StreamChannel::assess_writer() {
 
 Result<void> StreamChannel::serve_property(const net::Frame& request) {
   net::Frame frame = answer_to(request.serial());
-  DSSM_TRY(parts_.catalog.serve_untrusted(request, frame, &stream().id()));
+  DSSM_TRY(parts_.catalog.serve_untrusted(request, frame, parts_.account, &stream().id()));
   parts_.link.send(frame);
   return {};
 }

@@ -55,7 +55,7 @@ Error unknown_request(const std::string& host) {
 
 template <class Request, class Response>
 Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& response,
-                                              const StreamId* channel) {
+                                              const std::string& account, const StreamId* channel) {
   if (request.has_list()) return list(*response.mutable_stream_list());
   const proto::StreamId* named = subject(request);
   if (!named) return unknown_request(registry_.host());
@@ -73,7 +73,7 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
       response.mutable_done();
       return {};
     case Request::kSetProperty:
-      DSSM_TRY(registry_.set_property(id, request.set_property().property()));
+      DSSM_TRY(registry_.set_property(id, request.set_property().property(), account));
       response.mutable_done();
       return {};
     case Request::kGetProperty:
@@ -85,9 +85,9 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
 }
 
 template Result<void> CatalogRequests::serve_untrusted(const local::Request&, local::Response&,
-                                                       const StreamId*);
+                                                       const std::string&, const StreamId*);
 template Result<void> CatalogRequests::serve_untrusted(const net::Frame&, net::Frame&,
-                                                       const StreamId*);
+                                                       const std::string&, const StreamId*);
 
 Result<std::string> CatalogRequests::property_of(const StreamId& id) const {
   const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.find(id));
@@ -103,10 +103,12 @@ Result<std::shared_ptr<Stream>> CatalogRequests::find_untrusted(const proto::Str
 }
 
 Result<OpenedRing> CatalogRequests::create_untrusted(const proto::Create& request,
-                                                     std::int32_t creator_pid) {
+                                                     std::int32_t creator_pid,
+                                                     const std::string& account) {
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.id()));
   const TypeInfo type = DSSM_TRY(wire::type_untrusted(request.type()));
-  return registry_.create(id, type, {request.depth(), Duration(request.cycle_ns())}, creator_pid);
+  return registry_.create(id, type, {request.depth(), Duration(request.cycle_ns())}, creator_pid,
+                          account);
 }
 
 // In the order of creation.

@@ -83,6 +83,7 @@ Values values_of_the_code() {
       {"max_memory", "half of the machine's memory"},
       {"max_opens", count(config.max_opens)},
       {"max_opens_per_client", count(config.max_opens_per_client)},
+      {"max_share", count(config.max_share_percent) + "%"},
       {"max_property", bytes(config.max_property_bytes)},
       {"max_connections", count(config.max_connections)},
       {"max_connections_per_host", count(config.max_connections_per_host)},

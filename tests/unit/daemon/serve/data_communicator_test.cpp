@@ -148,6 +148,27 @@ TEST(DataCommunicator, CountsChannelsInTheStreamsDescription) {
   EXPECT_EQ(rig.ask(control, list_request(2)).stream_list().streams(0).channels(), 1u);
 }
 
+TEST(DataCommunicator, ChargesWhatAPeerHasItKeepToThePeer) {
+  ServerRig rig;
+  MemoryPeer peer, control;
+  rig.connect(peer);
+  ASSERT_TRUE(rig.ask(peer, create_request(1, "a", 8, 4)).opened().created());
+  EXPECT_EQ(rig.registry.find({"a", 0, ""}).value()->account(), "'10.0.0.2'");
+  rig.create("b");
+  const std::uint64_t before = rig.registry.budgets().most_used();
+  EXPECT_GE(before, rig.registry.find({"a", 0, ""}).value()->info().memory_bytes);
+  rig.connect(control);
+  net::Frame property = with_serial(2, {});
+  property.mutable_set_property()->mutable_id()->set_name("b");
+  property.mutable_set_property()->set_property("12345");
+  ASSERT_TRUE(rig.ask(control, property).has_done());
+  EXPECT_EQ(rig.registry.budgets().most_used(), before + 5);
+  net::Frame on_channel = with_serial(3, {});
+  on_channel.mutable_set_property()->set_property("123");
+  ASSERT_TRUE(rig.ask(peer, on_channel).has_done());
+  EXPECT_EQ(rig.registry.budgets().most_used(), before + 8);
+}
+
 TEST(DataCommunicator, ServesASlowPeerOneRequestAtATime) {
   ServerRig rig;
   const auto stream = rig.create("large", 1000, 64);
