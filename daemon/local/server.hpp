@@ -19,6 +19,7 @@
 #include <memory>
 #include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
@@ -87,6 +88,10 @@ inline constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
 // For the Hello of a program.
 inline constexpr Duration kLocalHelloTimeout = std::chrono::seconds(10);
 
+// For a client to read something of what waits for it; after at most twice as long it is
+// disconnected. The library connects again, and gives its streams back.
+inline constexpr Duration kLocalOutputTimeout = std::chrono::seconds(10);
+
 // Memory for long messages of all clients, and of those of one user: requests that they have begun
 // to send, and what waits for them to be received: a list of all streams.
 inline constexpr std::size_t kMaxMessageBytes = 256U << 20;
@@ -145,6 +150,8 @@ class Connection final : public ClientOutput {
   Error no_memory_for(std::string_view what) const;
   bool take_descriptors(std::vector<UniqueFd> arrived);
   bool send_some(Outgoing& outgoing);
+  void watch_output();
+  void on_output_timeout();
   void end_with(const Error& error);
   void close();
   bool is_open() const noexcept { return static_cast<bool>(socket_); }
@@ -164,7 +171,12 @@ class Connection final : public ClientOutput {
   DescriptorQueue arrived_;
   std::deque<Outgoing> output_;
   std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
-  EventSource readable_, writable_, next_turn_, greeting_timeout_, request_timeout_;
+  std::uint64_t sent_bytes_ = 0;
+  // Bytes sent, and what of them the client has not read, when output was watched last.
+  using Progress = std::pair<std::uint64_t, int>;
+  Progress progress() const noexcept;
+  std::optional<Progress> watched_;  // none: nothing waits
+  EventSource readable_, writable_, next_turn_, greeting_timeout_, request_timeout_, output_timer_;
 };
 
 // Accepts the programs of this PC, within the limits, and owns their connections.

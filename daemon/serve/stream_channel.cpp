@@ -116,6 +116,7 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
     }
     subscribed.set_newest_first(true);
   }
+  parts_.link.set_output_timeout(Duration::zero());
   parts_.link.send(frame);
   pump_.emplace(stream().mapping(), parts_.link, sender_, static_cast<SamplePump::Observer&>(*this),
                 plan);

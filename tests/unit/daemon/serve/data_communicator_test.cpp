@@ -291,6 +291,51 @@ TEST(DataCommunicator, EndsConnectionsThatDoNothing) {
   EXPECT_FALSE(channel.closed);
 }
 
+TEST(DataCommunicator, EndsConnectionsThatDoNotReadTheirAnswers) {
+  ServerRig rig;
+  const auto stream = rig.create("large", 1000, 64);
+  rig.write(*stream, 20);
+  MemoryPeer silent, slow, slow_network, subscriber;
+  for (MemoryPeer* peer : {&silent, &slow, &slow_network, &subscriber}) {
+    rig.connect(*peer);
+    rig.open(*peer, "large");
+  }
+  subscriber.put(with_serial(1, subscribe_from_oldest_frame()));
+  rig.turns();
+  slow_network.progress.emplace().waiting_bytes = 1'000'000;
+  for (MemoryPeer* peer : {&silent, &slow, &slow_network, &subscriber}) {
+    peer->room = 0;
+    if (peer != &subscriber) peer->put(read_request(2, 15));
+  }
+  rig.write(*stream, 5);
+  rig.turns();
+  const MonoTime begin = rig.loop.now();
+  // As the test's peers are always writable, the loop is never idle: time goes on by hand.
+  const auto pass = [&](Duration time) {
+    bool is_over = false;
+    EventSource end = EventSource::timer(rig.loop, [&] { is_over = true; });
+    end.enable_in(time);
+    while (!is_over) {
+      rig.loop.timers().run_next();
+      rig.turns(2);
+    }
+  };
+  pass(DataCommunicator::kOutputTimeout / 2);
+  EXPECT_FALSE(silent.closed);
+  while (rig.loop.now() - begin < 3 * DataCommunicator::kOutputTimeout) {
+    slow.room = 10;
+    slow_network.progress->waiting_bytes -= 10;
+    pass(DataCommunicator::kOutputTimeout / 4);
+    if (rig.loop.now() - begin >= 2 * DataCommunicator::kOutputTimeout) {
+      EXPECT_TRUE(silent.closed);
+    }
+  }
+  EXPECT_FALSE(slow.closed);
+  EXPECT_FALSE(slow_network.closed) << "the kernel has less of it";
+  EXPECT_FALSE(subscriber.closed) << "perhaps it is stopped by a debugger";
+  EXPECT_TRUE(rig.logger.contains("the other side has read nothing for 10 s of what waits for it"));
+}
+
 TEST(DataCommunicator, WaitsForHelloUntilItsTimeout) {
   ServerRig rig;
   MemoryPeer silent, slow;
