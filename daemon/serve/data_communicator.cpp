@@ -138,6 +138,7 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
   identity_.program = them_->program;
   DSSM_TRY(parts_.rights.check(identity_, Action::greet, {}));
   greeting_timeout_.disable();
+  parts_.observer.on_greeted(*this);
   idle_timeout_.enable_in(kIdleTimeout);
   net::Frame hello;
   wire::to_message(parts_.self, *hello.mutable_hello());

@@ -88,6 +88,8 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
    public:
     // It ended; to be destroyed later, not from within this call.
     virtual void on_ended(DataCommunicator& communicator) = 0;
+    // The peer has sent its Hello.
+    virtual void on_greeted(DataCommunicator& /*communicator*/) {}
     // A heartbeat arrived.
     virtual void on_heartbeat() {}
 

@@ -44,8 +44,16 @@ void PeerTable::add_limits(LimitUses& out) const {
   out.push_back({"max_peer_memory", bytes, limits_.max_peer_memory_bytes, "bytes"});
 }
 
+bool PeerTable::is_full_for(const std::string& peer, bool encrypted) const {
+  const auto found = accounts_.find(peer);
+  if (found == accounts_.end()) return false;
+  const PeerAccount& account = *found->second;
+  return account.connections >= limits_.max_connections_per_host ||
+         account.budget.used() + bytes_of(encrypted) > account.budget.limit();
+}
+
 Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {
-  if (connections_ >= limits_.max_connections) {
+  if (is_full()) {
     return Error{Errc::limit_exceeded,
                  fmt::format("there are max_connections = {} connections from other hosts already; "
                              "close some or raise the key max_connections",
@@ -60,8 +68,7 @@ Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {
   }
   std::unique_ptr<PeerAccount>& account = accounts_[peer];
   if (!account) account = std::make_unique<PeerAccount>(peer, limits_.max_peer_memory_bytes);
-  std::optional<MemoryShare> share =
-      account->budget.try_take(kConnectionBytes + (encrypted ? kTlsBytes : 0));
+  std::optional<MemoryShare> share = account->budget.try_take(bytes_of(encrypted));
   if (share) return PeerPlace(*this, *account, *std::move(share));
   Error error{Errc::limit_exceeded,
               fmt::format("the connections from {} have used up max_peer_memory = {} bytes; "

@@ -71,6 +71,10 @@ class PeerTable {
 
   void add_limits(LimitUses& out) const;
 
+  // Whether admit() would fail: for all, and for this peer even when there are places.
+  bool is_full() const noexcept { return connections_ >= limits_.max_connections; }
+  bool is_full_for(const std::string& peer, bool encrypted) const;
+
   // A place for one more connection of `peer`: its address without a port or, when its certificate
   // says who it is, that.
   //   fails  limit_exceeded, naming the key
@@ -79,6 +83,9 @@ class PeerTable {
  private:
   friend class PeerPlace;
   void leave(PeerAccount& account);
+  static std::uint64_t bytes_of(bool encrypted) noexcept {
+    return kConnectionBytes + (encrypted ? kTlsBytes : 0);
+  }
   Limits limits_;
   std::uint64_t connections_ = 0;
   std::map<std::string, std::unique_ptr<PeerAccount>> accounts_;

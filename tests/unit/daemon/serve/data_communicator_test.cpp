@@ -506,6 +506,43 @@ TEST(ChannelServer, BoundsConnectionsInAllAndPerHost) {
   EXPECT_EQ(refused(peers[2], 2), "");
 }
 
+// Those who connect and say nothing keep nobody out.
+TEST(ChannelServer, GivesUpTheOldestSilentConnectionOfTheMostCrowdedNetwork) {
+  ServerRig rig({4, 3, 32U << 20});
+  MemoryPeer greeted, few, crowd[2], next[2];
+  rig.connect(greeted, true, true, 2);
+  rig.connect(few, false, true, 3);
+  rig.connect(crowd[0], false, true, 4);
+  rig.connect(crowd[1], false, true, 4);
+  rig.connect(next[0], true, true, 5);
+  EXPECT_TRUE(crowd[0].closed) << "the oldest of two";
+  EXPECT_NE(final_failure(rig, crowd[0]).find("it has sent no Hello"), std::string::npos);
+  EXPECT_TRUE(rig.logger.contains("give up a connection from '10.0.0.4'"));
+  EXPECT_FALSE(crowd[1].closed);
+  EXPECT_FALSE(few.closed);
+  rig.connect(next[1], true, true, 6);
+  EXPECT_TRUE(few.closed) << "the oldest of one each";
+  EXPECT_FALSE(greeted.closed);
+  EXPECT_FALSE(next[0].closed);
+  crowd[1].put(hello_frame(greeting_of("pc4", "test")));
+  rig.turns();
+  MemoryPeer late;
+  EXPECT_FALSE(rig.server.adopt(std::make_unique<MemoryTransport>(late), address_of(7)))
+      << "all have greeted";
+}
+
+TEST(ChannelServer, GivesUpASilentConnectionOfAHostWithTooMany) {
+  ServerRig rig({100, 2, 32U << 20});
+  MemoryPeer other, silent[2], next;
+  rig.connect(other, false, true, 3);
+  rig.connect(silent[0], false, true, 2);
+  rig.connect(silent[1], false, true, 2);
+  rig.connect(next, true, true, 2);
+  EXPECT_TRUE(silent[0].closed);
+  EXPECT_FALSE(silent[1].closed);
+  EXPECT_FALSE(other.closed) << "of another host";
+}
+
 TEST(ChannelServer, BoundsTheMemoryOfAHost) {
   ServerRig rig({100, 100, 1U << 20});
   MemoryPeer peers[5];
