@@ -240,7 +240,10 @@ class Dssmd {
                recovering_, &hosts_.service),
         server_(loop, sockets.listener, config.name, client_limits(config), local_, logger),
         channels_({loop, streams_.registry, streams_.opens, rights_, logger, &hosts_.clock,
-                   [this] { hosts_.clock.poll_if_due(); }, config.insecure},
+                   [this] { hosts_.clock.poll_if_due(); }, config.insecure,
+                   [this](const wire::SocketAddress& from, const wire::CertifiedPeer* certified) {
+                     return hosts_.peers.is_configured(from, certified);
+                   }},
                   hosts_.self, peer_limits(config)),
         status_(loop, manager,
                 [this] {

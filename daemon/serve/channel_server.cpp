@@ -168,19 +168,21 @@ Result<void> ChannelServer::keep(std::unique_ptr<wire::Transport>& transport,
   const std::string where = without_port(address);
   const wire::CertifiedPeer* certified = transport->peer();
   const std::string peer = certified ? certified->str() : in_quotes(where);
+  const bool is_configured = parts_.is_configured && parts_.is_configured(address, certified);
   const bool is_crowd = peers_.is_full_for(peer, certified);
-  if (is_crowd || peers_.is_full()) {
-    give_up_one(
-        [&](const Arrival& one) { return one.communicator && (!is_crowd || one.peer == peer); });
+  if (is_crowd || (peers_.is_full() && !is_configured)) {
+    give_up_one([&](const Arrival& one) {
+      return one.communicator && (is_crowd ? one.peer == peer : !one.is_configured);
+    });
   }
-  PeerPlace place = DSSM_TRY(peers_.admit(peer, certified), refuses(address));
+  PeerPlace place = DSSM_TRY(peers_.admit(peer, certified, is_configured), refuses(address));
   auto communicator = std::make_unique<DataCommunicator>(
       DataCommunicator::Parts{parts_.loop, parts_.registry, parts_.opens, streams_, self_, logger_,
                               *this, parts_.clock, parts_.rights, sending_},
       std::move(place), std::move(transport), address.str());
   DataCommunicator* key = communicator.get();
   communicators_.emplace(key, std::move(communicator));
-  arrivals_.push_back({where, network_of(address), nullptr, key, peer});
+  arrivals_.push_back({where, network_of(address), nullptr, key, peer, is_configured});
   return {};
 }
 

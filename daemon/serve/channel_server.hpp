@@ -38,6 +38,8 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     ClockAssessor* clock = nullptr;           // nullptr: the clock is not watched
     std::function<void()> on_heartbeat = {};  // of another host, about once a second; may be empty
     bool takes_plain = false;                 // with credentials: from other PCs, too
+    // Whether a connection comes from a configured peer (Peers::is_configured()); may be empty.
+    std::function<bool(const wire::SocketAddress&, const wire::CertifiedPeer*)> is_configured = {};
   };
 
   // self: how this dssmd greets; with its credentials, connections are encrypted. All in `parts`
@@ -84,6 +86,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     std::unique_ptr<Handshake> handshake = nullptr;
     DataCommunicator* communicator = nullptr;
     std::string peer = {};
+    bool is_configured = false;
     bool ended = false;  // to be destroyed outside of its own callback
   };
 

@@ -9,20 +9,21 @@
 
 namespace dssm::daemon {
 
-PeerPlace::PeerPlace(PeerTable& table, PeerAccount& account, MemoryShare share)
-    : table_(&table), account_(&account), share_(std::move(share)) {
-  ++table_->connections_;
+PeerPlace::PeerPlace(PeerTable& table, PeerAccount& account, MemoryShare share, bool is_configured)
+    : table_(&table), account_(&account), is_configured_(is_configured), share_(std::move(share)) {
+  if (!is_configured_) ++table_->connections_;
   ++account_->connections;
 }
 
 PeerPlace::PeerPlace(PeerPlace&& other) noexcept
     : table_(std::exchange(other.table_, nullptr)),
       account_(other.account_),
+      is_configured_(other.is_configured_),
       share_(std::move(other.share_)) {}
 
 PeerPlace::~PeerPlace() {
   share_ = {};  // before its budget goes
-  if (table_) table_->leave(*account_);
+  if (table_) table_->leave(*account_, is_configured_);
 }
 
 void PeerTable::set_limits(const Limits& limits) {
@@ -52,8 +53,8 @@ bool PeerTable::is_full_for(const std::string& peer, bool encrypted) const {
          account.budget.used() + bytes_of(encrypted) > account.budget.limit();
 }
 
-Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {
-  if (is_full()) {
+Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted, bool is_configured) {
+  if (!is_configured && is_full()) {
     return Error{Errc::limit_exceeded,
                  fmt::format("there are max_connections = {} connections from other hosts already; "
                              "close some or raise the key max_connections",
@@ -69,7 +70,7 @@ Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {
   std::unique_ptr<PeerAccount>& account = accounts_[peer];
   if (!account) account = std::make_unique<PeerAccount>(peer, limits_.max_peer_memory_bytes);
   std::optional<MemoryShare> share = account->budget.try_take(bytes_of(encrypted));
-  if (share) return PeerPlace(*this, *account, *std::move(share));
+  if (share) return PeerPlace(*this, *account, *std::move(share), is_configured);
   Error error{Errc::limit_exceeded,
               fmt::format("the connections from {} have used up max_peer_memory = {} bytes; "
                           "close some or raise the key max_peer_memory",
@@ -78,8 +79,8 @@ Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {
   return error;
 }
 
-void PeerTable::leave(PeerAccount& account) {
-  --connections_;
+void PeerTable::leave(PeerAccount& account, bool is_configured) {
+  if (!is_configured) --connections_;
   if (--account.connections == 0) accounts_.erase(std::string(account.name));
 }
 

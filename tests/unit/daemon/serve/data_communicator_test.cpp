@@ -531,6 +531,25 @@ TEST(ChannelServer, GivesUpTheOldestSilentConnectionOfTheMostCrowdedNetwork) {
       << "all have greeted";
 }
 
+TEST(ChannelServer, KeepsPlacesForConfiguredPeers) {
+  ServerRig rig({2, 2, 32U << 20});
+  rig.configured = address_of(3).str();
+  MemoryPeer silent, others[3], configured[3];
+  rig.connect(silent, false, true, 2);
+  rig.connect(others[0], true, true, 2);
+  rig.connect(configured[0], true, true, 3);
+  EXPECT_FALSE(silent.closed) << "its place is not needed";
+  rig.connect(configured[1], false, true, 3);
+  rig.connect(others[1], true, true, 4);
+  EXPECT_TRUE(silent.closed);
+  EXPECT_FALSE(configured[1].closed) << "has a place of its own";
+  EXPECT_FALSE(rig.server.adopt(std::make_unique<MemoryTransport>(others[2]), address_of(5)));
+  rig.connect(configured[2], true, true, 3);
+  EXPECT_TRUE(configured[1].closed) << "of the same host, which may have two";
+  EXPECT_FALSE(others[0].closed);
+  EXPECT_FALSE(others[1].closed);
+}
+
 TEST(ChannelServer, GivesUpASilentConnectionOfAHostWithTooMany) {
   ServerRig rig({100, 2, 32U << 20});
   MemoryPeer other, silent[2], next;
