@@ -74,13 +74,16 @@ wire::Greeting own_greeting(const std::string& name, std::shared_ptr<const wire:
 
 // The limits of the configuration, for each part.
 Registry::Limits stream_limits(const Config& config) {
-  return {config.max_streams, config.max_memory_bytes, config.max_property_bytes};
+  return {config.max_streams,
+          config.max_memory_bytes,
+          config.max_property_bytes,
+          {config.max_share_percent}};
 }
 Server::Limits client_limits(const Config& config) {
   return {config.max_clients, config.max_clients_per_user};
 }
 OpenTable::Limits open_limits(const Config& config) {
-  return {config.max_opens, config.max_opens_per_client};
+  return {config.max_opens, config.max_opens_per_client, {config.max_share_percent}};
 }
 PeerTable::Limits peer_limits(const Config& config) {
   return {config.max_connections, config.max_connections_per_host, config.max_peer_memory_bytes};
@@ -236,7 +239,10 @@ class Dssmd {
                &hosts_.service),
         server_(loop, sockets.listener, config.name, client_limits(config), local_, logger),
         channels_({loop, streams_.registry, streams_.opens, rights_, logger, &hosts_.clock,
-                   [this] { hosts_.clock.poll_if_due(); }, config.insecure},
+                   [this] { hosts_.clock.poll_if_due(); }, config.insecure,
+                   [this](const wire::SocketAddress& from, const wire::CertifiedPeer* certified) {
+                     return hosts_.peers.is_configured(from, certified);
+                   }},
                   hosts_.self, peer_limits(config)),
         status_(loop, manager,
                 [this] {

@@ -88,7 +88,7 @@ Result<void> RemoteWriter::follow(const StreamInfo& theirs) {
     return {};
   }
   const std::string context = "write to '" + name_ + "'";
-  auto ring = DSSM_TRY(OutgoingRing::make(theirs, parts_.registry.budget()), context);
+  auto ring = DSSM_TRY(OutgoingRing::make(theirs, parts_.registry.budgets(), account()), context);
   DSSM_TRY(use_ring(std::move(ring)), context);
   return {};
 }
@@ -115,8 +115,9 @@ void RemoteWriter::start_publishing() {
                          log_fields());
   }
   FrameConnection& connection = *connection_.frames();
-  sender_.emplace(ring_->mapping(), connection,
-                  SampleSender::Options{may_tear_, &parts_.registry.budget()});
+  sender_.emplace(
+      ring_->mapping(), connection,
+      SampleSender::Options{may_tear_, &parts_.registry.budgets().of(ring_->stream()->account())});
   connection.set_priority(
       parts_.sending.demand_for(id_, ring_->mapping().geometry().payload_bytes).priority);
   SamplePump::Observer& observer = *this;

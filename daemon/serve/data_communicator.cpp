@@ -80,6 +80,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
   link_.set_budget(place_.budget());
   link_.take_requests_only();
   link_.set_pace(place_.pace());
+  link_.set_output_timeout(kOutputTimeout);
   greeting_timeout_.enable_in(wire::kHelloTimeout);
 }
 
@@ -147,6 +148,7 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
   identity_.program = them_->program;
   DSSM_TRY(parts_.rights.check(identity_, Action::greet, {}));
   greeting_timeout_.disable();
+  parts_.observer.on_greeted(*this);
   idle_timeout_.enable_in(kIdleTimeout);
   net::Frame hello;
   wire::to_message(parts_.self, *hello.mutable_hello());
@@ -263,7 +265,7 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
       wire::to_message(pair, *list.add_pairs());
     }
   } else {
-    DSSM_TRY(catalog_.serve_untrusted(request, answer));
+    DSSM_TRY(catalog_.serve_untrusted(request, answer, identity_.account()));
     if (request.has_list()) parts_.rights.hide(identity_, *answer.mutable_stream_list());
   }
   link_.send(answer);
@@ -343,7 +345,7 @@ Result<void> DataCommunicator::go_on_opening() {
   idle_timeout_.disable();
   channel_ = std::make_unique<StreamChannel>(
       StreamChannel::Parts{parts_.loop, catalog_, link_, place_.budget(), *this, parts_.self,
-                           *them_, parts_.clock, parts_.sending},
+                           *them_, identity_.account(), parts_.clock, parts_.sending},
       parts_.streams.get(opening.stream), them_->has_feature(wire::kFeatureTorn));
   net::Frame answer;
   answer.set_serial(opening.serial);

@@ -63,7 +63,7 @@ Error unknown_request(const std::string& host) {
 
 template <class Request, class Response>
 Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& response,
-                                              const StreamId* channel) {
+                                              const std::string& account, const StreamId* channel) {
   if (request.has_list()) return list(*response.mutable_stream_list());
   const proto::StreamId* named = subject(request);
   if (!named) return unknown_request(registry_.host());
@@ -81,7 +81,7 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
       response.mutable_done();
       return {};
     case Request::kSetProperty:
-      DSSM_TRY(registry_.set_property(id, request.set_property().property()));
+      DSSM_TRY(registry_.set_property(id, request.set_property().property(), account));
       response.mutable_done();
       return {};
     case Request::kGetProperty:
@@ -93,9 +93,9 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
 }
 
 template Result<void> CatalogRequests::serve_untrusted(const local::Request&, local::Response&,
-                                                       const StreamId*);
+                                                       const std::string&, const StreamId*);
 template Result<void> CatalogRequests::serve_untrusted(const net::Frame&, net::Frame&,
-                                                       const StreamId*);
+                                                       const std::string&, const StreamId*);
 
 Result<std::string> CatalogRequests::property_of(const StreamId& id) const {
   const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.find(id));
@@ -125,14 +125,15 @@ Result<OpenedRing> CatalogRequests::create_untrusted(const proto::Create& reques
       if (replaceable) replaceable = rights.check(who, Action::create, id);
       if (replaceable) replaceable = rights.check(who, Action::remove, id);
       if (replaceable) {
-        return OpenedRing{DSSM_TRY(registry_.replace(id, type, history, who.pid)), true};
+        return OpenedRing{DSSM_TRY(registry_.replace(id, type, history, who.pid, who.account())),
+                          true};
       }
       Error error = std::move(fits).error().context(context);
       error.message += "; no new ring takes its place: " + replaceable.error().message;
       return error;
     }
   }
-  return registry_.create(id, type, history, who.pid);
+  return registry_.create(id, type, history, who.pid, who.account());
 }
 
 // Whether nothing would be taken away from anybody.

@@ -44,10 +44,11 @@ class CatalogRequests {
   //   Request   local::Request or net::Frame; Response: local::Response or net::Frame
   //   channel   the stream of the channel that the request came on, for properties; nullptr: the
   //             request names its stream
+  //   account   of the client, which is charged for a property
   //   fails     with the failure that is the response; protocol: any other request
   template <class Request, class Response>
   Result<void> serve_untrusted(const Request& request, Response& response,
-                               const StreamId* channel = nullptr);
+                               const std::string& account, const StreamId* channel = nullptr);
 
   // For Open and Create.
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
