@@ -91,7 +91,6 @@ template <class Choose>
                   const ReadStatus status = state.ring.read(chosen, payload, info);
                   if (status == ReadStatus::too_old || status == ReadStatus::lost)
                     return kOvertaken;
-                  if (status == ReadStatus::ok) state.set_cursor(chosen);
                   return status;
                 }));
 }
@@ -332,8 +331,6 @@ JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_err
     }
     return ReadStatus::ok;
   });
-  if (read.status != ReadStatus::ok) return read;
-  for (const JointSample& sample : samples) sample.reader->state_->set_cursor(sample.info.tid);
   return read;
 }
 

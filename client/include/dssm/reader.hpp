@@ -2,10 +2,11 @@
 //
 // Reading a stream. RawReader works on bytes; Reader<T> on a trivially copyable T.
 //
-// A reader has a cursor: the tid of the last sample it returned. read_next() and read_previous()
-// move relative to it, wait() waits for a sample after it. Each read_...() of a payload, and
-// borrow(), sets it when it returns `ok`; with any other result, cursor and arguments keep their
-// values.
+// A reader has a cursor: the tid of the last sample that it read by tid or in order. read_next()
+// and read_previous() move relative to it, wait() waits for a sample after it. read_newest(),
+// read_tid(), read_next(), read_previous() and borrow() set it when they return `ok`. Reads by time
+// leave it, so that a program can read the past while it follows the stream; seek(info.tid) goes to
+// what they returned. With a result other than `ok`, cursor and arguments keep their values.
 //
 //   threads   one reader belongs to one thread at a time; any number of readers, in any processes,
 //             may read one stream beside its writers
@@ -108,9 +109,9 @@ class RawReader {
 
   // --- reading by time
 
-  // All of these, find() and find_neighbours() included, return clock_out_of_bounds for a sample of
-  // another host whose time may be further from this PC's clock than dssmd's keys clock_policy and
-  // clock_limit allow. Reads by tid never do: use clock_in_bounds() there.
+  // None of these moves the cursor. All return clock_out_of_bounds for a sample of another host
+  // whose time may be further from this PC's clock than dssmd's keys clock_policy and clock_limit
+  // allow. Reads by tid never do: use clock_in_bounds() there.
   //
   // They are exact for every sequence of times, also one that runs backwards (docs/ring-layout.md
   // "Search by time"). "The newest sample" is the one with the greatest tid.
@@ -157,7 +158,7 @@ class RawReader {
   //   returns  as read_at()
   ReadStatus find(Time t, SampleInfo& info) const noexcept;
 
-  // The cursor: the tid of the last sample read; kNoTid on a new reader.
+  // The cursor: the tid of the last sample read by tid or in order; kNoTid on a new reader.
   Tid cursor() const noexcept;
 
   // Sets the cursor to `tid`, so that read_next() returns tid + 1; kNoTid: read_next() starts at
@@ -247,8 +248,8 @@ struct JointRead {
 //   max_error  >= 0: greatest bound accepted on the distance of a sample's time from this PC's
 //              clock
 //   returns    as read_at(), restarted included; clock_out_of_bounds also when a bound exceeds
-//              max_error. Unless ok, payloads and infos are unspecified, and cursors keep their
-//              values. What follows a sample that is shorter than its stream's is 0
+//              max_error. Unless ok, payloads and infos are unspecified. Cursors keep their values.
+//              What follows a sample that is shorter than its stream's is 0
 //   threads    each reader belongs to the calling thread
 //   cost       as one read_at() per stream
 JointRead read_joint_at(Time t, std::span<JointSample> samples,
