@@ -34,13 +34,9 @@ WaitStatus wait_until(const detail::SharedRing& ring, MonoTime deadline, Ready r
   }
 }
 
-// The closer one of two stamps, the earlier sample when both are equally close. Unsigned, because
-// the distance of two int64 may not fit into one.
+// The closer one of two stamps, the earlier sample when both are equally close.
 Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
-  const auto distance = [](Time early, Time late) {
-    return static_cast<std::uint64_t>(to_ns(late)) - static_cast<std::uint64_t>(to_ns(early));
-  };
-  return distance(t, after.time) < distance(before.time, t) ? after.tid : before.tid;
+  return distance_ns(t, after.time) < distance_ns(before.time, t) ? after.tid : before.tid;
 }
 
 // Assessments are valid for seconds, so a coarse clock is precise enough.
@@ -229,9 +225,17 @@ ReadStatus RawReader::read_previous(std::span<std::byte> payload, SampleInfo& in
   return status;
 }
 
-ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
-  return read_by_time(*state_, payload, info,
-                      [&](Tid& chosen) { return state_->ring.find(t, chosen); });
+ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
+                              Duration max_age) noexcept {
+  return read_by_time(*state_, payload, info, [&](Tid& chosen) -> std::optional<ReadStatus> {
+    const ReadStatus found = state_->ring.find(t, chosen);
+    if (found != ReadStatus::ok || max_age == kAnyAge) return found;
+    SampleInfo seen;
+    if (state_->ring.stamp(chosen, seen) != ReadStatus::ok) return kOvertaken;
+    if (!is_stale(t, seen.time, max_age)) return ReadStatus::ok;
+    // A clock that is wrong is the reason, where it is one: waiting does not help against that.
+    return is_refused(state_->ring, seen) ? ReadStatus::clock_out_of_bounds : ReadStatus::stale;
+  });
 }
 
 ReadStatus RawReader::read_at_or_after(Time t, std::span<std::byte> payload,
@@ -296,7 +300,8 @@ bool RawReader::clock_in_bounds(const SampleInfo& info) const noexcept {
   return state_->ring.clock().is_good(info, coarse_now());
 }
 
-JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_error) noexcept {
+JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_error,
+                        Duration max_age) noexcept {
   for (const JointSample& sample : samples) {
     detail::ReaderState& state = *sample.reader->state_;
     if (state.restart_due() && state.restart()) {
@@ -309,7 +314,10 @@ JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_err
     read = {ReadStatus::ok, 0, Duration::zero()};
     for (std::size_t i = 0; i < samples.size(); ++i) {
       const RawReader& reader = *samples[i].reader;
-      const ReadStatus status = reader.find(t, samples[i].info);
+      ReadStatus status = reader.find(t, samples[i].info);
+      if (status == ReadStatus::ok && is_stale(t, samples[i].info.time, max_age)) {
+        status = ReadStatus::stale;
+      }
       if (status != ReadStatus::ok) {
         read = {status, i, kUnknownClockError};
         return status;

@@ -112,7 +112,8 @@ class PConnector {
   //            another type)
   Result<ReadStatus> read_newest(std::span<std::byte> payload, SampleInfo& info);
   Result<ReadStatus> read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info);
-  Result<ReadStatus> read_at(Time t, std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
+                             Duration max_age = kAnyAge);
   // The newest sample if its tid is above `than`, else not_yet.
   Result<ReadStatus> read_newer(Tid than, std::span<std::byte> payload, SampleInfo& info);
 

@@ -118,9 +118,12 @@ class RawReader {
   //   cost     O(1) on a regular stream, else O(log depth)
 
   // Copies the newest sample with time <= `t` that is not lost; the newest sample of all for any
-  // `t` after it.
-  //   returns  ok | not_yet (nothing written) | too_old (all samples are later than `t`) | lapped
-  ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
+  // `t` after it, however old it is then, unless there is a `max_age`.
+  //   max_age  >= 0: of the sample at `t`, which is t - info.time
+  //   returns  ok | not_yet (nothing written) | too_old (all samples are later than `t`) | lapped |
+  //            stale (the sample is older than `max_age`)
+  ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
+                     Duration max_age = kAnyAge) noexcept;
 
   // Copies the first sample from which on all samples have time >= `t`: the first one with
   // time >= t on a stream whose times do not run backwards.
@@ -154,7 +157,7 @@ class RawReader {
   //   returns  ok | not_yet | too_old
   ReadStatus read_info(Tid tid, SampleInfo& info) const noexcept;
 
-  // The info of the sample that read_at() would copy. Keeps the cursor.
+  // The info of the sample that read_at() without `max_age` would copy. Keeps the cursor.
   //   returns  as read_at()
   ReadStatus find(Time t, SampleInfo& info) const noexcept;
 
@@ -221,8 +224,8 @@ class RawReader {
 
  private:
   friend class Session;
-  friend JointRead read_joint_at(Time t, std::span<JointSample> samples,
-                                 Duration max_error) noexcept;
+  friend JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_error,
+                                 Duration max_age) noexcept;
   friend WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
   explicit RawReader(std::unique_ptr<detail::ReaderState> state) noexcept;
   std::unique_ptr<detail::ReaderState> state_;
@@ -247,13 +250,15 @@ struct JointRead {
 // Copies from each stream the sample that read_at(t) copies: from all of them or from none.
 //   max_error  >= 0: greatest bound accepted on the distance of a sample's time from this PC's
 //              clock
+//   max_age    as in read_at(), of each sample
 //   returns    as read_at(), restarted included; clock_out_of_bounds also when a bound exceeds
 //              max_error. Unless ok, payloads and infos are unspecified. Cursors keep their values.
 //              What follows a sample that is shorter than its stream's is 0
 //   threads    each reader belongs to the calling thread
 //   cost       as one read_at() per stream
 JointRead read_joint_at(Time t, std::span<JointSample> samples,
-                        Duration max_error = kUnknownClockError) noexcept;
+                        Duration max_error = kUnknownClockError,
+                        Duration max_age = kAnyAge) noexcept;
 
 // Waits until wait() of one of `readers` would return `ready`, or until `deadline`. 1 to
 // kMaxWaitAny readers, all of the calling thread.
@@ -279,8 +284,8 @@ class Reader : public RawReader {
   ReadStatus read_previous(T& out, SampleInfo& info) noexcept {
     return complete(RawReader::read_previous(bytes(out), info), out, info);
   }
-  ReadStatus read_at(Time t, T& out, SampleInfo& info) noexcept {
-    return complete(RawReader::read_at(t, bytes(out), info), out, info);
+  ReadStatus read_at(Time t, T& out, SampleInfo& info, Duration max_age = kAnyAge) noexcept {
+    return complete(RawReader::read_at(t, bytes(out), info, max_age), out, info);
   }
   ReadStatus read_at_or_after(Time t, T& out, SampleInfo& info) noexcept {
     return complete(RawReader::read_at_or_after(t, bytes(out), info), out, info);
