@@ -189,16 +189,26 @@ class RawReader {
 
   // --- waiting
 
-  // Waits until there is a sample after the cursor, the stream has restarted, or the monotonic
-  // clock reaches `deadline` (kNever: no limit; a deadline in the past: only checks). After
-  // read_next() returned not_yet: until it has something else to return.
+  // Each of these waits until `deadline` of the monotonic clock (kNever: no limit; one in the past:
+  // only checks), which may be a std::chrono::steady_clock::time_point, or for `timeout`.
+
+  // Waits until there is a sample after the cursor, or the stream has restarted. After read_next()
+  // returned not_yet: until it has something else to return. A program that only reads by time,
+  // which does not move the cursor, waits for newest_tid() + 1 instead.
   WaitStatus wait(MonoTime deadline) noexcept;
+  WaitStatus wait(Duration timeout) noexcept { return wait(deadline_in(timeout)); }
 
   // The same for newest_tid() >= `tid`. One thread may call it while another one reads.
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
+  WaitStatus wait_for_tid(Tid tid, Duration timeout) noexcept {
+    return wait_for_tid(tid, deadline_in(timeout));
+  }
   // The same until sample `tid` is here or never will be: of a stream of another host it may be
   // `arriving` when newer ones are here.
   WaitStatus wait_for_sample(Tid tid, MonoTime deadline) noexcept;
+  WaitStatus wait_for_sample(Tid tid, Duration timeout) noexcept {
+    return wait_for_sample(tid, deadline_in(timeout));
+  }
 
   // A descriptor for poll(), epoll or an event library: readable when there may be samples newer
   // than at the last clear_ready(). On wake-up call clear_ready(), then read_next() until it
@@ -260,10 +270,13 @@ JointRead read_joint_at(Time t, std::span<JointSample> samples,
                         Duration max_error = kUnknownClockError,
                         Duration max_age = kAnyAge) noexcept;
 
-// Waits until wait() of one of `readers` would return `ready`, or until `deadline`. 1 to
-// kMaxWaitAny readers, all of the calling thread.
+// Waits until wait() of one of `readers` would return `ready`, until `deadline` or for `timeout`. 1
+// to kMaxWaitAny readers, all of the calling thread.
 inline constexpr std::size_t kMaxWaitAny = 128;  // FUTEX_WAITV_MAX of Linux
 WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
+inline WaitStatus wait_any(std::span<RawReader* const> readers, Duration timeout) noexcept {
+  return wait_any(readers, deadline_in(timeout));
+}
 
 // The same with a T in place of bytes: what a sample does not have, because a RawWriter wrote fewer
 // bytes, is 0. Everything not listed here is as in RawReader.
