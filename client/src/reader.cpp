@@ -91,6 +91,24 @@ template <class Choose>
                 }));
 }
 
+// The infos of the two samples around `t`.
+std::optional<ReadStatus> try_neighbours(const ring::RingReader& ring, Time t,
+                                         Neighbours& out) noexcept {
+  Tid before = kNoTid;
+  const ReadStatus found = ring.find(t, before);
+  if (found != ReadStatus::ok) return found;
+  const ReadStatus after = ring.stamp(ring.skip_lost(before + 1), out.after);
+  if (after == ReadStatus::not_yet) return after;
+  if (after != ReadStatus::ok) return kOvertaken;
+  if (ring.stamp(before, out.before) != ReadStatus::ok) return kOvertaken;
+  // A sample whose time runs backwards was written meanwhile: now it is the newest with time <= t.
+  if (out.after.time <= t) return kOvertaken;
+  if (is_refused(ring, out.before) || is_refused(ring, out.after)) {
+    return ReadStatus::clock_out_of_bounds;
+  }
+  return ReadStatus::ok;
+}
+
 }  // namespace
 
 bool BorrowedSample::still_valid() const noexcept {
@@ -270,25 +288,30 @@ ReadStatus RawReader::read_nearest(Time t, std::span<std::byte> payload,
   });
 }
 
-ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
+ReadStatus RawReader::read_neighbours(Time t, std::span<std::byte> before,
+                                      std::span<std::byte> after, Neighbours& infos) noexcept {
+  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
+  DSSM_CHECK(before.size() == payload_bytes() && after.size() == payload_bytes());
   return result(*state_, retry([&]() -> std::optional<ReadStatus> {
     const ring::RingReader& ring = state_->ring;
-    Tid before = kNoTid;
-    const ReadStatus found = ring.find(t, before);
-    if (found != ReadStatus::ok) return found;
     Neighbours seen;
-    const ReadStatus after = ring.stamp(ring.skip_lost(before + 1), seen.after);
-    if (after == ReadStatus::not_yet) return after;
-    if (after != ReadStatus::ok) return kOvertaken;
-    if (ring.stamp(before, seen.before) != ReadStatus::ok) return kOvertaken;
-    // A sample whose time runs backwards was written meanwhile: now it is the newest with time <=
-    // t.
-    if (seen.after.time <= t) return kOvertaken;
-    if (is_refused(ring, seen.before) || is_refused(ring, seen.after)) {
-      return ReadStatus::clock_out_of_bounds;
+    const std::optional<ReadStatus> found = try_neighbours(ring, t, seen);
+    if (found != ReadStatus::ok) return found;
+    if (ring.read(seen.before.tid, before, seen.before) != ReadStatus::ok ||
+        ring.read(seen.after.tid, after, seen.after) != ReadStatus::ok) {
+      return kOvertaken;
     }
-    out = seen;
+    infos = seen;
     return ReadStatus::ok;
+  }));
+}
+
+ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
+  return result(*state_, retry([&] {
+    Neighbours seen;
+    const std::optional<ReadStatus> found = try_neighbours(state_->ring, t, seen);
+    if (found == ReadStatus::ok) out = seen;
+    return found;
   }));
 }
 

@@ -12,6 +12,7 @@
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
 #include <dssm/sample_collector.hpp>
+#include <dssm/sample_or.hpp>
 #include <dssm/session.hpp>
 #include <dssm/stream.hpp>
 #include <dssm/time.hpp>

@@ -25,6 +25,7 @@
 #include <cstddef>
 #include <dssm/describe.hpp>
 #include <dssm/sample.hpp>
+#include <dssm/sample_or.hpp>
 #include <dssm/stream.hpp>
 #include <memory>
 #include <optional>
@@ -135,8 +136,14 @@ class RawReader {
   //   returns  ok | not_yet (nothing written) | lapped
   ReadStatus read_nearest(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
-  // The infos of the two neighbours of `t`; read_tid() reads their payloads. Keeps the cursor.
-  //   returns  ok | not_yet (no sample after `t` yet, or nothing written) | too_old | lapped
+  // Copies the two neighbours of `t`, for interpolation (dssm/interpolate.hpp).
+  //   before, after  as `payload`
+  //   returns        ok | not_yet (no sample after `t` yet, or nothing written) | too_old | lapped
+  ReadStatus read_neighbours(Time t, std::span<std::byte> before, std::span<std::byte> after,
+                             Neighbours& infos) noexcept;
+
+  // The infos of the two neighbours of `t`, without their payloads.
+  //   returns  as read_neighbours()
   ReadStatus find_neighbours(Time t, Neighbours& out) const noexcept;
 
   // The bound [ns, >= 0] on the distance of info.time from this PC's clock: info.clock_error plus
@@ -279,7 +286,8 @@ inline WaitStatus wait_any(std::span<RawReader* const> readers, Duration timeout
 }
 
 // The same with a T in place of bytes: what a sample does not have, because a RawWriter wrote fewer
-// bytes, is 0. Everything not listed here is as in RawReader.
+// bytes, is 0. Everything not listed here is as in RawReader. Each read comes in two forms: into
+// variables of the caller, and with the sample as its result (dssm/sample_or.hpp).
 template <Payload T>
 class Reader : public RawReader {
  public:
@@ -305,6 +313,39 @@ class Reader : public RawReader {
   }
   ReadStatus read_nearest(Time t, T& out, SampleInfo& info) noexcept {
     return complete(RawReader::read_nearest(t, bytes(out), info), out, info);
+  }
+
+  SampleOr<T> read_newest() noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_newest(out.value, out.info); });
+  }
+  SampleOr<T> read_tid(Tid n) noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_tid(n, out.value, out.info); });
+  }
+  SampleOr<T> read_next() noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_next(out.value, out.info); });
+  }
+  SampleOr<T> read_previous() noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_previous(out.value, out.info); });
+  }
+  SampleOr<T> read_at(Time t, Duration max_age = kAnyAge) noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_at(t, out.value, out.info, max_age); });
+  }
+  SampleOr<T> read_at_or_after(Time t) noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_at_or_after(t, out.value, out.info); });
+  }
+  SampleOr<T> read_nearest(Time t) noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_nearest(t, out.value, out.info); });
+  }
+  ReadOr<NeighbourSamples<T>> read_neighbours(Time t) noexcept {
+    return ReadOr<NeighbourSamples<T>>([&](NeighbourSamples<T>& out) {
+      Neighbours infos;
+      const ReadStatus status =
+          RawReader::read_neighbours(t, bytes(out.before.value), bytes(out.after.value), infos);
+      out.before.info = infos.before;
+      out.after.info = infos.after;
+      (void)complete(status, out.before.value, infos.before);
+      return complete(status, out.after.value, infos.after);
+    });
   }
 
   // This reader's part of a read_joint_at(), which copies the sample to `out`.
