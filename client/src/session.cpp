@@ -166,9 +166,7 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
     if (next == kNever) {
       added.wait(lock, [&] { return times_added > seen; });
     } else {
-      // steady_clock is CLOCK_MONOTONIC too, with the same origin.
-      const std::chrono::steady_clock::time_point until(next.time_since_epoch());
-      const bool changed = added.wait_until(lock, until, [&] { return times_added > seen; });
+      const bool changed = added.wait_until(lock, next, [&] { return times_added > seen; });
       if (!changed && next == deadline) return std::move(reader).error();
     }
     seen = times_added;

@@ -196,14 +196,19 @@ class Session {
                                     std::uint32_t tag = 0,
                                     FetchHistory history = FetchHistory::when_read);
 
-  // Opens a stream for reading. Repeats, until `deadline`, what fails with an error that
-  // is_retryable(): waits for the stream to be created, for its host to answer, and for the clocks
-  // of both PCs to be good enough.
+  // Opens a stream for reading. Repeats, until `deadline` or for `timeout`, what fails with an
+  // error that is_retryable(): waits for the stream to be created, for its host to answer, and for
+  // the clocks of both PCs to be good enough.
   //   fails  as open_raw_reader(): at once with an error that is not retryable, at the deadline
   //          with the last one
   Result<RawReader> await_raw_reader(const StreamId& id, MonoTime deadline,
                                      const TypeInfo* wanted = nullptr,
                                      FetchHistory history = FetchHistory::when_read);
+  Result<RawReader> await_raw_reader(const StreamId& id, Duration timeout,
+                                     const TypeInfo* wanted = nullptr,
+                                     FetchHistory history = FetchHistory::when_read) {
+    return await_raw_reader(id, deadline_in(timeout), wanted, history);
+  }
 
   // The same with a type; `name` is parsed by StreamId::parse(), whose errors they also return.
   // create() with a duration also returns those of History::for_life().
@@ -238,6 +243,11 @@ class Session {
     const TypeInfo type = type_of<T>();
     return typed<Reader<T>>(
         name, [&](const StreamId& id) { return await_raw_reader(id, deadline, &type, history); });
+  }
+  template <Payload T>
+  Result<Reader<T>> await_reader(std::string_view name, Duration timeout,
+                                 FetchHistory history = FetchHistory::when_read) {
+    return await_reader<T>(name, deadline_in(timeout), history);
   }
 
   // Removes a stream: it leaves the list at once and can be created again. Processes that have it
