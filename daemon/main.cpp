@@ -74,13 +74,16 @@ wire::Greeting own_greeting(const std::string& name, std::shared_ptr<const wire:
 
 // The limits of the configuration, for each part.
 Registry::Limits stream_limits(const Config& config) {
-  return {config.max_streams, config.max_memory_bytes, config.max_property_bytes};
+  return {config.max_streams,
+          config.max_memory_bytes,
+          config.max_property_bytes,
+          {config.max_share_percent}};
 }
 Server::Limits client_limits(const Config& config) {
   return {config.max_clients, config.max_clients_per_user};
 }
 OpenTable::Limits open_limits(const Config& config) {
-  return {config.max_opens, config.max_opens_per_client};
+  return {config.max_opens, config.max_opens_per_client, {config.max_share_percent}};
 }
 PeerTable::Limits peer_limits(const Config& config) {
   return {config.max_connections, config.max_connections_per_host, config.max_peer_memory_bytes};
@@ -236,7 +239,10 @@ class Dssmd {
                &hosts_.service),
         server_(loop, sockets.listener, config.name, client_limits(config), local_, logger),
         channels_({loop, streams_.registry, streams_.opens, rights_, logger, &hosts_.clock,
-                   [this] { hosts_.clock.poll_if_due(); }, config.insecure},
+                   [this] { hosts_.clock.poll_if_due(); }, config.insecure,
+                   [this](const wire::SocketAddress& from, const wire::CertifiedPeer* certified) {
+                     return hosts_.peers.is_configured(from, certified);
+                   }},
                   hosts_.self, peer_limits(config)),
         status_(loop, manager,
                 [this] {
@@ -277,8 +283,10 @@ class Dssmd {
   //   signals     blocked until now
   Result<void> run(const Reloader::Read& read_again, BlockedSignals& signals) {
     EventSource grace = EventSource::timer(loop_, [this] { streams_.registry.end_recovery(); });
-    if (streams_.registry.recovering()) {
+    if (streams_.registry.recovery() != Registry::Recovery::over) {
       grace.enable_in(config_.recovery_grace);
+    }
+    if (streams_.registry.may_miss_streams()) {
       logger_.notice("programs that hold streams of the dssmd before this one give them back",
                      {.message_id = message_id::kRecovering});
     }
@@ -313,9 +321,10 @@ class Dssmd {
     const bool some_may_be_missing =
         streams_.store.restore_untrusted(std::move(stored), sockets_.network.has_kept());
     // With an inherited socket it is unknown whether a dssmd ran before this one.
-    if (some_may_be_missing && (sockets_.listener.found_file() || sockets_.listener.inherited()) &&
+    if ((sockets_.listener.found_file() || sockets_.listener.inherited()) &&
         config_.recovery_grace > Duration::zero()) {
-      streams_.registry.begin_recovery();
+      streams_.registry.begin_recovery(some_may_be_missing ? Registry::Recovery::streams
+                                                           : Registry::Recovery::opens);
     }
   }
 

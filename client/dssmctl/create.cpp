@@ -47,7 +47,7 @@ Result<void> run(const CreateOptions& options, Output& out) {
     wanted.host = daemon.host;
   }
   const bool there = session.stream_info(wanted).has_value();
-  RawWriter writer = DSSM_TRY(session.create_raw(id, type, history));
+  RawWriter writer = DSSM_TRY(session.create_raw(id, type, history, {.keep_existing = true}));
   // Not the writer's own figures: for another host's stream those of a ring on the way there.
   const StreamInfo stream = DSSM_TRY(session.stream_info(writer.id()));
   if (options.json) {
@@ -57,9 +57,14 @@ Result<void> run(const CreateOptions& options, Output& out) {
                            {"depth", stream.depth},
                            {"cycle_ns", to_ns(stream.cycle)}}));
   } else {
-    out.add(fmt::format("{}: {} with {} slots of {}\n", escaped(stream.id.str()),
+    const std::string less =
+        stream.depth < history.depth
+            ? fmt::format(", fewer than the {} asked for; remove it first to get those",
+                          history.depth)
+            : "";
+    out.add(fmt::format("{}: {} with {} slots of {}{}\n", escaped(stream.id.str()),
                         there ? "exists already, kept" : "created", stream.depth,
-                        bytes_text(stream.type.payload_bytes)));
+                        bytes_text(stream.type.payload_bytes), less));
   }
   return {};
 }

@@ -153,8 +153,11 @@ Result<Time> moment(const RawReader& reader, const EchoOptions& options) {
 Result<void> begin(const EchoOptions& options, bool awaited, RawReader& reader, Echo& echo) {
   if (options.at) {
     const Time time = DSSM_TRY(moment(reader, options));
-    const ReadStatus status =
-        echo.print([&](auto payload, auto& info) { return reader.read_at(time, payload, info); });
+    const ReadStatus status = echo.print([&](auto payload, auto& info) {
+      const ReadStatus read = reader.read_at(time, payload, info);
+      if (read == ReadStatus::ok) reader.seek(info.tid);  // print_new() continues after it
+      return read;
+    });
     if (!echo.result()) return echo.result();
     if (status != ReadStatus::ok) {
       return failed_read(reader, "the sample at " + seconds_text(to_ns(time)), status);

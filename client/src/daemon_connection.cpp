@@ -124,9 +124,7 @@ bool DaemonConnection::is_up() const {
 
 Result<Answer> DaemonConnection::call(local::Request request, std::span<const int> fds) {
   const std::size_t fds_expected = fds_with_answer(request);
-  // steady_clock is CLOCK_MONOTONIC too, with the same origin.
-  const std::chrono::steady_clock::time_point deadline(
-      deadline_in(request_timeout_).time_since_epoch());
+  const MonoTime deadline = deadline_in(request_timeout_);
   const auto timed_out = [&](const char* reason) {
     return Error{Errc::unavailable,
                  fmt::format("dssmd at '{}' {}; check `systemctl status dssmd`, then try again",

@@ -34,13 +34,9 @@ WaitStatus wait_until(const detail::SharedRing& ring, MonoTime deadline, Ready r
   }
 }
 
-// The closer one of two stamps, the earlier sample when both are equally close. Unsigned, because
-// the distance of two int64 may not fit into one.
+// The closer one of two stamps, the earlier sample when both are equally close.
 Tid closer(Time t, const SampleInfo& before, const SampleInfo& after) noexcept {
-  const auto distance = [](Time early, Time late) {
-    return static_cast<std::uint64_t>(to_ns(late)) - static_cast<std::uint64_t>(to_ns(early));
-  };
-  return distance(t, after.time) < distance(before.time, t) ? after.tid : before.tid;
+  return distance_ns(t, after.time) < distance_ns(before.time, t) ? after.tid : before.tid;
 }
 
 // Assessments are valid for seconds, so a coarse clock is precise enough.
@@ -91,9 +87,26 @@ template <class Choose>
                   const ReadStatus status = state.ring.read(chosen, payload, info);
                   if (status == ReadStatus::too_old || status == ReadStatus::lost)
                     return kOvertaken;
-                  if (status == ReadStatus::ok) state.set_cursor(chosen);
                   return status;
                 }));
+}
+
+// The infos of the two samples around `t`.
+std::optional<ReadStatus> try_neighbours(const ring::RingReader& ring, Time t,
+                                         Neighbours& out) noexcept {
+  Tid before = kNoTid;
+  const ReadStatus found = ring.find(t, before);
+  if (found != ReadStatus::ok) return found;
+  const ReadStatus after = ring.stamp(ring.skip_lost(before + 1), out.after);
+  if (after == ReadStatus::not_yet) return after;
+  if (after != ReadStatus::ok) return kOvertaken;
+  if (ring.stamp(before, out.before) != ReadStatus::ok) return kOvertaken;
+  // A sample whose time runs backwards was written meanwhile: now it is the newest with time <= t.
+  if (out.after.time <= t) return kOvertaken;
+  if (is_refused(ring, out.before) || is_refused(ring, out.after)) {
+    return ReadStatus::clock_out_of_bounds;
+  }
+  return ReadStatus::ok;
 }
 
 }  // namespace
@@ -230,9 +243,17 @@ ReadStatus RawReader::read_previous(std::span<std::byte> payload, SampleInfo& in
   return status;
 }
 
-ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept {
-  return read_by_time(*state_, payload, info,
-                      [&](Tid& chosen) { return state_->ring.find(t, chosen); });
+ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
+                              Duration max_age) noexcept {
+  return read_by_time(*state_, payload, info, [&](Tid& chosen) -> std::optional<ReadStatus> {
+    const ReadStatus found = state_->ring.find(t, chosen);
+    if (found != ReadStatus::ok || max_age == kAnyAge) return found;
+    SampleInfo seen;
+    if (state_->ring.stamp(chosen, seen) != ReadStatus::ok) return kOvertaken;
+    if (!is_stale(t, seen.time, max_age)) return ReadStatus::ok;
+    // A clock that is wrong is the reason, where it is one: waiting does not help against that.
+    return is_refused(state_->ring, seen) ? ReadStatus::clock_out_of_bounds : ReadStatus::stale;
+  });
 }
 
 ReadStatus RawReader::read_at_or_after(Time t, std::span<std::byte> payload,
@@ -267,25 +288,30 @@ ReadStatus RawReader::read_nearest(Time t, std::span<std::byte> payload,
   });
 }
 
-ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
+ReadStatus RawReader::read_neighbours(Time t, std::span<std::byte> before,
+                                      std::span<std::byte> after, Neighbours& infos) noexcept {
+  if (state_->restart_due() && state_->restart()) return ReadStatus::restarted;
+  DSSM_CHECK(before.size() == payload_bytes() && after.size() == payload_bytes());
   return result(*state_, retry([&]() -> std::optional<ReadStatus> {
     const ring::RingReader& ring = state_->ring;
-    Tid before = kNoTid;
-    const ReadStatus found = ring.find(t, before);
-    if (found != ReadStatus::ok) return found;
     Neighbours seen;
-    const ReadStatus after = ring.stamp(ring.skip_lost(before + 1), seen.after);
-    if (after == ReadStatus::not_yet) return after;
-    if (after != ReadStatus::ok) return kOvertaken;
-    if (ring.stamp(before, seen.before) != ReadStatus::ok) return kOvertaken;
-    // A sample whose time runs backwards was written meanwhile: now it is the newest with time <=
-    // t.
-    if (seen.after.time <= t) return kOvertaken;
-    if (is_refused(ring, seen.before) || is_refused(ring, seen.after)) {
-      return ReadStatus::clock_out_of_bounds;
+    const std::optional<ReadStatus> found = try_neighbours(ring, t, seen);
+    if (found != ReadStatus::ok) return found;
+    if (ring.read(seen.before.tid, before, seen.before) != ReadStatus::ok ||
+        ring.read(seen.after.tid, after, seen.after) != ReadStatus::ok) {
+      return kOvertaken;
     }
-    out = seen;
+    infos = seen;
     return ReadStatus::ok;
+  }));
+}
+
+ReadStatus RawReader::find_neighbours(Time t, Neighbours& out) const noexcept {
+  return result(*state_, retry([&] {
+    Neighbours seen;
+    const std::optional<ReadStatus> found = try_neighbours(state_->ring, t, seen);
+    if (found == ReadStatus::ok) out = seen;
+    return found;
   }));
 }
 
@@ -297,7 +323,8 @@ bool RawReader::clock_in_bounds(const SampleInfo& info) const noexcept {
   return state_->ring.clock().is_good(info, coarse_now());
 }
 
-JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_error) noexcept {
+JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_error,
+                        Duration max_age) noexcept {
   for (const JointSample& sample : samples) {
     detail::ReaderState& state = *sample.reader->state_;
     if (state.restart_due() && state.restart()) {
@@ -310,7 +337,10 @@ JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_err
     read = {ReadStatus::ok, 0, Duration::zero()};
     for (std::size_t i = 0; i < samples.size(); ++i) {
       const RawReader& reader = *samples[i].reader;
-      const ReadStatus status = reader.find(t, samples[i].info);
+      ReadStatus status = reader.find(t, samples[i].info);
+      if (status == ReadStatus::ok && is_stale(t, samples[i].info.time, max_age)) {
+        status = ReadStatus::stale;
+      }
       if (status != ReadStatus::ok) {
         read = {status, i, kUnknownClockError};
         return status;
@@ -332,8 +362,6 @@ JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_err
     }
     return ReadStatus::ok;
   });
-  if (read.status != ReadStatus::ok) return read;
-  for (const JointSample& sample : samples) sample.reader->state_->set_cursor(sample.info.tid);
   return read;
 }
 

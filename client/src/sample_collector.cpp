@@ -137,14 +137,20 @@ ReadStatus SampleCollector::read_tid(Tid tid, std::span<std::byte> payload,
   return state_->reader(payload).read(tid, payload, info);
 }
 
-ReadStatus SampleCollector::read_at(Time t, std::span<std::byte> payload,
-                                    SampleInfo& info) const noexcept {
+ReadStatus SampleCollector::read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
+                                    Duration max_age) const noexcept {
   const ring::RingReader reader = state_->reader(payload);
   for (int attempt = 0; attempt < ring::RingReader::kMaxRetries; ++attempt) {
     Tid found = kNoTid;
     if (const ReadStatus status = reader.find(t, found); status != ReadStatus::ok) return status;
-    const ReadStatus status = reader.read(found, payload, info);
-    if (status != ReadStatus::too_old) return status;  // else it was overwritten meanwhile
+    SampleInfo seen;
+    const ReadStatus status = reader.read(found, payload, seen);
+    if (status == ReadStatus::too_old) continue;  // it was overwritten meanwhile
+    if (status == ReadStatus::ok) {
+      if (is_stale(t, seen.time, max_age)) return ReadStatus::stale;
+      info = seen;
+    }
+    return status;
   }
   return ReadStatus::lapped;
 }

@@ -113,14 +113,15 @@ Result<Session> Session::connect(SessionOptions options) {
 }
 
 Result<RawWriter> Session::create_raw(const StreamId& id, const TypeInfo& type,
-                                      const History& history, std::uint32_t tag) {
+                                      const History& history, const CreateOptions& options) {
   const std::string what = quoted("create", id);
   DSSM_TRY(id.check(), what);
   DSSM_TRY(type.check(), what);
   local::Request request;
   wire::to_message(id, type, history, *request.mutable_create());
-  request.mutable_create()->set_tag(tag);
-  auto stream = DSSM_TRY(client_->open(std::move(request), Role::writer, tag), what);
+  request.mutable_create()->set_tag(options.tag);
+  request.mutable_create()->set_keep_existing(options.keep_existing);
+  auto stream = DSSM_TRY(client_->open(std::move(request), Role::writer, options.tag), what);
   return RawWriter(std::make_unique<detail::WriterState>(std::move(stream)));
 }
 
@@ -165,9 +166,7 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
     if (next == kNever) {
       added.wait(lock, [&] { return times_added > seen; });
     } else {
-      // steady_clock is CLOCK_MONOTONIC too, with the same origin.
-      const std::chrono::steady_clock::time_point until(next.time_since_epoch());
-      const bool changed = added.wait_until(lock, until, [&] { return times_added > seen; });
+      const bool changed = added.wait_until(lock, next, [&] { return times_added > seen; });
       if (!changed && next == deadline) return std::move(reader).error();
     }
     seen = times_added;

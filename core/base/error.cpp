@@ -94,6 +94,8 @@ std::string_view name_of(ReadStatus status) noexcept {
       return "restarted";
     case ReadStatus::clock_out_of_bounds:
       return "clock_out_of_bounds";
+    case ReadStatus::stale:
+      return "stale";
   }
   return "lapped";
 }

@@ -3,6 +3,7 @@
 // Names, types and histories: parsing, checking, and the words for what is wrong with them.
 #include <fmt/format.h>
 
+#include <algorithm>
 #include <bit>
 #include <charconv>
 #include <dssm/stream.hpp>
@@ -16,6 +17,36 @@ namespace {
 template <class... Values>
 Error invalid(fmt::format_string<Values...> text, Values&&... values) {
   return Error{Errc::invalid_argument, fmt::format(text, std::forward<Values>(values)...)};
+}
+
+// Enough to recognize a type, short enough for a message.
+constexpr std::size_t kShownFields = 16;
+
+std::string text_of(const Field& field) {
+  const std::string count = field.count == 1 ? "" : fmt::format("[{}]", field.count);
+  // In an array of structs, where the elements are not side by side.
+  const std::string stride = field.count == 1 || field.stride_bytes == scalar_bytes(field.kind)
+                                 ? ""
+                                 : fmt::format(" every {}", field.stride_bytes);
+  return fmt::format("{} {}{} at {}{}", name_of(field.kind), field.name, count, field.offset_bytes,
+                     stride);
+}
+
+// Whether both are the same bytes under the same name.
+bool is_same(const Field& a, const Field& b) {
+  return a.name == b.name && a.kind == b.kind && a.offset_bytes == b.offset_bytes &&
+         a.count == b.count && (a.count == 1 || a.stride_bytes == b.stride_bytes);
+}
+
+// "field 2 is 'float64 y at 8' in the stream and 'float64 x at 8' in this program".
+std::string first_difference(const std::vector<Field>& ours, const std::vector<Field>& wanted) {
+  const auto text = [](const std::vector<Field>& fields, std::size_t at) {
+    return at < fields.size() ? "'" + text_of(fields[at]) + "'" : std::string("missing");
+  };
+  std::size_t at = 0;
+  while (at < ours.size() && at < wanted.size() && is_same(ours[at], wanted[at])) ++at;
+  return fmt::format("field {} is {} in the stream and {} in this program", at + 1, text(ours, at),
+                     text(wanted, at));
 }
 
 }  // namespace
@@ -141,16 +172,36 @@ std::string TypeInfo::str() const {
                       : fmt::format("'{}' ({}, aligned to {})", name, bytes, alignment_bytes);
 }
 
+std::string TypeInfo::description() const {
+  std::string text = str();
+  if (fields.empty()) return text;
+  text += " {";
+  for (std::size_t i = 0; i < std::min(fields.size(), kShownFields); ++i) {
+    text += " " + text_of(fields[i]) + ";";
+  }
+  if (fields.size() > kShownFields) {
+    text += fmt::format(" and {} more;", fields.size() - kShownFields);
+  }
+  return text + " }";
+}
+
 Result<void> TypeInfo::check_usable_as(const TypeInfo& wanted) const {
-  const bool names_differ = !name.empty() && !wanted.name.empty() && name != wanted.name;
-  // An untyped side knows no alignment worth comparing.
-  const bool alignments_differ =
-      !name.empty() && !wanted.name.empty() && alignment_bytes != wanted.alignment_bytes;
-  if (payload_bytes == wanted.payload_bytes && !names_differ && !alignments_differ) return {};
+  // An untyped side knows no name and no alignment worth comparing.
+  const bool both_named = !name.empty() && !wanted.name.empty();
+  const bool is_other_type =
+      payload_bytes != wanted.payload_bytes ||
+      (both_named && (name != wanted.name || alignment_bytes != wanted.alignment_bytes));
+  // Lists leave out the fields of many types.
+  const bool both_described = both_named && !fields.empty() && !wanted.fields.empty();
+  const bool fields_differ = !is_other_type && both_described &&
+                             !std::equal(fields.begin(), fields.end(), wanted.fields.begin(),
+                                         wanted.fields.end(), is_same);
+  if (!is_other_type && !fields_differ) return {};
   return Error{Errc::type_mismatch,
-               fmt::format("the stream carries {}, this program wants {}; compile both sides with "
-                           "the same definition of the type",
-                           str(), wanted.str())};
+               fmt::format("the stream carries {}, this program wants {}{}; compile both sides "
+                           "with the same definition of the type",
+                           description(), wanted.description(),
+                           fields_differ ? ": " + first_difference(fields, wanted.fields) : "")};
 }
 
 Result<void> TypeInfo::check() const {

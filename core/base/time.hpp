@@ -32,6 +32,19 @@ inline MonoTime coarse_now() noexcept {
   return MonoTime(Coarse::now().time_since_epoch());
 }
 
+// How long `early` is before `late`, in ns. Unsigned, because the distance of two int64 may not fit
+// into one.
+constexpr std::uint64_t distance_ns(Time early, Time late) noexcept {
+  return static_cast<std::uint64_t>(to_ns(late)) - static_cast<std::uint64_t>(to_ns(early));
+}
+
+// Whether a sample of `time` <= t is older at `t` than a read allows.
+constexpr bool is_stale(Time t, Time time, Duration max_age) noexcept {
+  return max_age != kAnyAge &&
+         distance_ns(time, t) >
+             static_cast<std::uint64_t>(std::max<std::int64_t>(to_ns(max_age), 0));
+}
+
 // a + b for bounds on an error, both >= 0; kUnknownClockError stays that.
 constexpr Duration sum(Duration a, Duration b) noexcept {
   return a > kUnknownClockError - b ? kUnknownClockError : a + b;

@@ -53,6 +53,7 @@ void ChannelClient::open(const StreamId& id, const CreatePlan* plan) {
   frame.set_serial(open_serial_);
   if (plan) {
     wire::to_message(id, plan->type, plan->history, *frame.mutable_create());
+    frame.mutable_create()->set_keep_existing(plan->keep_existing);
   } else {
     wire::to_message(id, *frame.mutable_open()->mutable_id());
   }

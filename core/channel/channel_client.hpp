@@ -90,6 +90,7 @@ class SampleCursor {
 struct CreatePlan {
   TypeInfo type;
   History history;
+  bool keep_existing = false;  // as in proto::Create
 };
 
 // A value; one thread. Its functions call the delegate, which may call open(), subscribe(),

@@ -35,6 +35,8 @@ class ConnectPlan {
 
   // Begins a round with address(). `addresses`: best first, at least one.
   void begin_round(std::vector<wire::SocketAddress> addresses);
+  // Those of this round, or of the last one; none before the first.
+  const std::vector<wire::SocketAddress>& addresses() const noexcept { return addresses_; }
   // What is tried now, or connected to; only after begin_round().
   const wire::SocketAddress& address() const noexcept { return addresses_[current_]; }
   // How long it may take to connect to it.

@@ -4,6 +4,9 @@
 // limits to a list; docs/limits.md lists all limits.
 #pragma once
 
+#include <sys/types.h>
+#include <unistd.h>
+
 #include <cstdint>
 #include <string_view>
 #include <vector>
@@ -18,5 +21,17 @@ struct LimitUse {
 };
 
 using LimitUses = std::vector<LimitUse>;
+
+// Whether there are limits for this user alone, so that one user's programs cannot keep out those
+// of others. root, and the user of dssmd, could end dssmd anyway.
+inline bool is_limited(uid_t user) noexcept { return user != 0 && user != ::geteuid(); }
+
+// How much of a limit of all one user, other host or remote program may take (key max_share).
+struct MaxShare {
+  std::uint64_t percent = 100;
+  std::uint64_t of(std::uint64_t limit) const noexcept {
+    return limit / 100 * percent + limit % 100 * percent / 100;
+  }
+};
 
 }  // namespace dssm::daemon

@@ -62,6 +62,13 @@ PeerConnection::PeerConnection(const EventLoop& loop, Resolver& resolver, const 
     : PeerConnection(loop, resolver, id, {addresses, self, kMaxOutputBytes, kFoundRoundTime},
                      observer) {}
 
+bool PeerConnection::is_at(const wire::IpAddress& address) const {
+  const std::vector<wire::SocketAddress>& found = dialer_.found_addresses();
+  return std::any_of(found.begin(), found.end(), [&](const wire::SocketAddress& one) {
+    return wire::IpAddress::of(one) == address;
+  });
+}
+
 void PeerConnection::set_addresses(const std::vector<wire::Address>& addresses) {
   configured_ = addresses.front();
   dialer_.set_addresses(addresses);

@@ -95,6 +95,8 @@ class PeerConnection final : private Dialer::Observer {
   // As configured; of a found host: its first address.
   const wire::Address& configured() const noexcept { return configured_; }
   std::string address() const { return dialer_.address(); }  // connected to, else configured()
+  // Whether the name or number leads to that address, of any port.
+  bool is_at(const wire::IpAddress& address) const;
   bool is_insecure() const noexcept { return dialer_.is_insecure(); }
 
   // Of the heartbeats of this connection; zero: not known.

@@ -85,6 +85,18 @@ bool Peers::is_up_as_configured(const wire::HostId& id) const {
   });
 }
 
+bool Peers::is_configured(const wire::SocketAddress& from,
+                          const wire::CertifiedPeer* certified) const {
+  const std::optional<wire::IpAddress> address = wire::IpAddress::of(from);
+  const bool is_host = certified && certified->kind == wire::CertifiedPeer::Kind::host;
+  return std::any_of(peers_.begin(), peers_.end(), [&](const Peer& peer) {
+    if (!peer.is_configured()) return false;
+    const std::optional<wire::Greeting>& them = peer.connection->them();
+    return (address && peer.connection->is_at(*address)) ||
+           (is_host && them && them->host_id == certified->host_id);
+  });
+}
+
 PeerConnection* Peers::connection_to(const wire::HostId& id) {
   const Peer* peer = in_use(id);
   return peer ? peer->connection.get() : nullptr;

@@ -91,6 +91,10 @@ class Peers final : public HostFinderObserver, private PeerConnection::Observer 
   // How the finder fares; off: there is none.
   const MdnsInfo& mdns() const noexcept { return mdns_; }
 
+  // Whether a connection comes from a configured peer: from its address, or with the certificate of
+  // the host that answers there, or did last.
+  bool is_configured(const wire::SocketAddress& from, const wire::CertifiedPeer* certified) const;
+
   // The connection to a host that is up; nullptr: there is none.
   PeerConnection* connection_to(const wire::HostId& id);
 

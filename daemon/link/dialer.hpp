@@ -81,6 +81,10 @@ class Dialer final : private FrameConnection::Observer {
   enum class Phase : unsigned char { look_up, connect, greet, up };
   Phase reached() const noexcept { return reached_; }
   std::string address() const;  // connected to, else the first
+  // What was found when they were looked up last; none yet: none.
+  const std::vector<wire::SocketAddress>& found_addresses() const noexcept {
+    return plan_.addresses();
+  }
   // Connected to another PC (as far as the address says so), and not encrypted.
   bool is_insecure() const noexcept;
 

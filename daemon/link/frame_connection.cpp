@@ -44,6 +44,7 @@ FrameConnection::FrameConnection(const EventLoop& loop, std::unique_ptr<wire::Tr
       writable_(EventSource::writable(loop, transport_->fd(),
                                       [this] { guarded([this] { on_writable(); }); })),
       next_turn_(EventSource::timer(loop, [this] { guarded([this] { continue_receiving(); }); })),
+      output_timer_(EventSource::timer(loop, [this] { on_output_timeout(); })),
       ended_(EventSource::timer(loop, [this] { observer_.on_closed(last_error_); })) {
   readable_.enable();
   continue_soon();  // with what came behind a handshake
@@ -240,12 +241,12 @@ void FrameConnection::queue_rest(RawBytes bytes, MemoryShare share) {
   if (!output_.mid_frame) return enqueue(std::move(outgoing));
   // The frame that it completes is sent in pieces: before the queue.
   output_.queue.push_front(std::move(outgoing));
-  writable_.enable();
+  await_output();
 }
 
 void FrameConnection::enqueue(Outgoing outgoing) {
   output_.queue.push_back(std::move(outgoing));
-  if (!output_.mid_frame) writable_.enable();
+  if (!output_.mid_frame) await_output();
 }
 
 void FrameConnection::set_mid_frame(bool mid_frame) {
@@ -253,8 +254,36 @@ void FrameConnection::set_mid_frame(bool mid_frame) {
   if (!mid_frame && !output_.queue.empty()) want_output();
 }
 
+// What the kernel has is not taken yet: on a slow network that may be all that moves for long.
+std::uint64_t FrameConnection::taken_bytes() const noexcept {
+  const std::optional<wire::Progress> progress = transport_->progress();
+  return sent_bytes_ - (progress ? progress->waiting_bytes : 0);
+}
+
+void FrameConnection::await_output() {
+  writable_.enable();
+  output_.awaited = true;
+  watch_output();
+}
+
+void FrameConnection::watch_output() {
+  if (output_timeout_ == Duration::zero() || output_.watched) return;
+  output_.watched = true;
+  output_.taken_bytes = taken_bytes();
+  output_timer_.enable_in(output_timeout_);
+}
+
+void FrameConnection::on_output_timeout() {
+  output_.watched = false;
+  if (output_timeout_ == Duration::zero() || !output_.awaited) return;
+  if (taken_bytes() != output_.taken_bytes) return watch_output();
+  close_with({Errc::limit_exceeded,
+              fmt::format("the other side has read nothing for {} s of what waits for it",
+                          output_timeout_ / std::chrono::seconds(1))});
+}
+
 void FrameConnection::want_output() {
-  if (!closed_ && !output_.lost) writable_.enable();
+  if (!closed_ && !output_.lost) await_output();
 }
 
 void FrameConnection::on_writable() {
@@ -271,6 +300,7 @@ void FrameConnection::on_writable() {
   if (!output_.mid_frame && !flush()) return;
   if (closed_ || transport_->has_unsent_output()) return;
   writable_.disable();
+  output_.awaited = false;
   observer_.on_output_empty();
 }
 
@@ -314,7 +344,7 @@ bool FrameConnection::flush() {
   if (sent && sent->status != wire::IoStatus::end) {
     sent_bytes_ += sent->bytes;
     if (pace_) pace_->on_sent(sent->bytes);
-    if (transport_->has_unsent_output()) writable_.enable();
+    if (transport_->has_unsent_output()) await_output();
     return sent->bytes;
   }
   on_output_end(sent ? nullptr : &sent.error());
@@ -353,6 +383,7 @@ void FrameConnection::lose_output() {
   drop_queue();
   output_.queued_bytes = 0;
   writable_.disable();
+  output_.awaited = false;
   if (input_.paused) close(last_error_);
 }
 
@@ -381,6 +412,7 @@ void FrameConnection::close(const Error& why) {
   readable_.disable();
   writable_.disable();
   next_turn_.disable();
+  output_timer_.disable();
   drop_queue();
   input_.share = {};
   transport_.reset();

@@ -107,6 +107,10 @@ class FrameConnection final : private wire::FrameDelegate {
   // The other end may only send requests and samples (FrameDecoder).
   void take_requests_only() noexcept { decoder_.take_requests_only(); }
 
+  // From now on the connection closes itself when the peer takes nothing of what waits for it for
+  // `timeout`, and at most twice as long. Zero: TCP decides (30 s, core/wire/tcp.hpp).
+  void set_output_timeout(Duration timeout) noexcept { output_timeout_ = timeout; }
+
   // What is sent counts there, and history follows it; it outlives the connection. Without it,
   // history is sent as fast as the connection takes it.
   void set_pace(HistoryPace& pace) noexcept { pace_ = &pace; }
@@ -209,7 +213,10 @@ class FrameConnection final : private wire::FrameDelegate {
     std::deque<Outgoing> queue;
     std::size_t queued_bytes = 0;
     bool mid_frame = false;
-    bool lost = false;  // the peer takes no more bytes; what it has sent is still to be received
+    bool lost = false;     // the peer takes no more bytes; what it has sent is still to be received
+    bool awaited = false;  // something waits until the socket takes bytes again
+    bool watched = false;  // on_output_timeout() will come; then more should have been taken than:
+    std::uint64_t taken_bytes = 0;
   };
 
   Result<void> on_sample_begin(const wire::IncomingSample& sample, std::byte*& out) override;
@@ -228,6 +235,10 @@ class FrameConnection final : private wire::FrameDelegate {
   std::size_t transmit(std::span<const iovec> parts);
   bool flush_transport();
   bool flush();
+  void await_output();
+  std::uint64_t taken_bytes() const noexcept;
+  void watch_output();
+  void on_output_timeout();
   void on_output_end(const Error* why);
   void enqueue(Outgoing outgoing);
   void lose_output();
@@ -242,6 +253,7 @@ class FrameConnection final : private wire::FrameDelegate {
   MemoryBudget* budget_ = nullptr;
   HistoryPace* pace_ = nullptr;
   HistoryShare share_;
+  Duration output_timeout_{};
   std::uint64_t sent_bytes_ = 0;
   bool limits_unsent_ = false;
   std::optional<wire::Progress> when_writable_;
@@ -251,7 +263,7 @@ class FrameConnection final : private wire::FrameDelegate {
   bool closed_ = false;
   Error last_error_;
   MonoTime last_heard_ = loop_.now();
-  EventSource readable_, writable_, next_turn_, ended_;
+  EventSource readable_, writable_, next_turn_, output_timer_, ended_;
 };
 
 }  // namespace dssm::daemon

@@ -173,9 +173,9 @@ Mirror* FleetService::mirror_without_owner(const StreamId& id) const {
   return !owner && owner.error().code == Errc::not_found ? mirror : nullptr;
 }
 
-void FleetService::open_reader(const StreamId& id, bool history,
+void FleetService::open_reader(const StreamId& id, bool history, const std::string& account,
                                Then<std::shared_ptr<Stream>> then) {
-  when_known(id, [this, id, history, then = std::move(then)]() mutable {
+  when_known(id, [this, id, history, account, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (owner) {
       const StreamId named = owned_by(**owner, id);
@@ -184,10 +184,13 @@ void FleetService::open_reader(const StreamId& id, bool history,
         if (mirror) mirror->want_history(true);
       };
       want();  // so that open() waits for it
-      mirrors_.open(**owner, id, nullptr, [then = std::move(then)](Result<OpenedRing> ring) {
-        if (!ring) return then(std::move(ring).error());
-        then(std::move(ring->stream));
-      });
+      mirrors_.open(
+          **owner, id, nullptr,
+          [then = std::move(then)](Result<OpenedRing> ring) {
+            if (!ring) return then(std::move(ring).error());
+            then(std::move(ring->stream));
+          },
+          account);
       return want();  // of a new mirror, which is not connected yet
     }
     if (Mirror* mirror = mirror_without_owner(id)) {
@@ -202,19 +205,21 @@ void FleetService::want_history(const StreamId& id, bool always) {
   if (Mirror* mirror = mirrors_.find(id)) mirror->want_history(always);
 }
 
-void FleetService::open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) {
+void FleetService::open_writer(const StreamId& id, const CreatePlan* plan,
+                               const std::string& account, Then<OpenedRing> then) {
   const std::optional<CreatePlan> kept = plan ? std::optional(*plan) : std::nullopt;
-  when_known(id, [this, id, kept, then = std::move(then)]() mutable {
+  when_known(id, [this, id, kept, account, then = std::move(then)]() mutable {
     const Result<const KnownHost*> owner = catalog_.find_owner(id);
     if (!owner) return then(with_unavailable_peers(owner.error()));
-    writers_.open(**owner, id, kept ? &*kept : nullptr, std::move(then));
+    writers_.open(**owner, id, kept ? &*kept : nullptr, std::move(then), account);
   });
 }
 
 Result<std::shared_ptr<Stream>> FleetService::adopt_untrusted(const StreamId& id, Role role,
-                                                              OfferedFiles files) {
-  return role == Role::writer ? writers_.adopt_untrusted(id, std::move(files))
-                              : mirrors_.adopt_untrusted(id, std::move(files));
+                                                              OfferedFiles files,
+                                                              const std::string& account) {
+  return role == Role::writer ? writers_.adopt_untrusted(id, std::move(files), account)
+                              : mirrors_.adopt_untrusted(id, std::move(files), account);
 }
 
 // --- about one stream

@@ -57,11 +57,13 @@ class FleetService final : public Fleet, private CatalogObserver {
   bool is_there(const StreamId& id) const override {
     return id.host.empty() ? catalog_.find_owner(id).has_value() : catalog_.has(id);
   }
-  void open_reader(const StreamId& id, bool history, Then<std::shared_ptr<Stream>> then) override;
+  void open_reader(const StreamId& id, bool history, const std::string& account,
+                   Then<std::shared_ptr<Stream>> then) override;
   void want_history(const StreamId& id, bool always) override;
-  void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) override;
-  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
-                                                  OfferedFiles files) override;
+  void open_writer(const StreamId& id, const CreatePlan* plan, const std::string& account,
+                   Then<OpenedRing> then) override;
+  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role, OfferedFiles files,
+                                                  const std::string& account) override;
   void forward(const StreamId& id, const local::Request& request,
                Then<local::Response> then) override;
   void list(Then<std::vector<proto::Stream>> then) override;

@@ -129,13 +129,13 @@ Result<Reply> LocalRequests::serve_untrusted(const Client& client, const local::
       break;
   }
   Reply reply;
-  DSSM_TRY(catalog_.serve_untrusted(request, reply.response));
+  DSSM_TRY(catalog_.serve_untrusted(request, reply.response, client->account()));
   return reply;
 }
 
 Result<Reply> LocalRequests::create(const Client& client, const proto::Create& request) {
   DSSM_TRY(opens_.check_quota(*client));
-  const OpenedRing created = DSSM_TRY(catalog_.create_untrusted(request, client->pid));
+  const OpenedRing created = DSSM_TRY(catalog_.create_untrusted(request, *client, rights_));
   Result<Reply> reply =
       opened({client, created.stream, Role::writer, request.tag(), request.id().host().empty()});
   if (reply) {
@@ -164,7 +164,7 @@ Result<Reply> LocalRequests::offer(const Client& client, const local::Offer& req
   const bool is_own = id.host.empty() || !is_elsewhere(id);
   const std::shared_ptr<Stream> stream =
       DSSM_TRY(is_own ? registry_.adopt_untrusted(id, std::move(files))
-                      : fleet_->adopt_untrusted(id, role, std::move(files)));
+                      : fleet_->adopt_untrusted(id, role, std::move(files), client->account()));
   if (!is_own && request.history()) fleet_->want_history(id, true);
   return record_open({client, stream, role, request.tag(), request.any_host()});
 }
@@ -272,9 +272,10 @@ void LocalRequests::create_elsewhere(const Client& client, const StreamId& id,
   const Result<TypeInfo> type = wire::type_untrusted(request.type());
   if (!type) return answer(type.error());
   if (Result<void> quota = opens_.check_quota(*client); !quota) return answer(quota.error());
-  const CreatePlan plan{*type, {request.depth(), Duration(request.cycle_ns())}};
+  const CreatePlan plan{
+      *type, {request.depth(), Duration(request.cycle_ns())}, request.keep_existing()};
   fleet_->open_writer(
-      id, &plan,
+      id, &plan, client->account(),
       [this, client, tag = request.tag(), answer = std::move(answer)](Result<OpenedRing> writer) {
         if (!writer) return answer(std::move(writer).error());
         Result<Reply> reply = opened({client, writer->stream, Role::writer, tag, false});
@@ -289,14 +290,15 @@ void LocalRequests::open_elsewhere(const Client& client, const StreamId& id,
   OpenEntry entry{client, nullptr, role_of(request.for_writing()), request.tag(), id.host.empty()};
   if (request.for_writing()) {
     return fleet_->open_writer(
-        id, nullptr, [this, entry, answer = std::move(answer)](Result<OpenedRing> writer) mutable {
+        id, nullptr, client->account(),
+        [this, entry, answer = std::move(answer)](Result<OpenedRing> writer) mutable {
           if (!writer) return answer(std::move(writer).error());
           entry.stream = writer->stream;
           answer(opened(entry));
         });
   }
   fleet_->open_reader(
-      id, request.history(),
+      id, request.history(), client->account(),
       [this, entry, answer = std::move(answer)](Result<std::shared_ptr<Stream>> stream) mutable {
         if (!stream) return answer(std::move(stream).error());
         entry.stream = *std::move(stream);
@@ -311,7 +313,7 @@ void LocalRequests::list_all(Answer answer) {
   const auto own = std::make_shared<Reply>();
   local::Request request;
   request.mutable_list();
-  if (Result<void> listed = catalog_.serve_untrusted(request, own->response); !listed) {
+  if (Result<void> listed = catalog_.serve_untrusted(request, own->response, {}); !listed) {
     return answer(std::move(listed).error());
   }
   fleet_->list([own, answer = std::move(answer)](Result<std::vector<proto::Stream>> streams) {

@@ -65,7 +65,8 @@ class Fleet {
   // The mirror of a stream, with its newest sample. Kept while its Stream is in the OpenTable, and
   // some seconds longer.
   //   history  filled with what its owner's ring holds, as far as it has a place
-  virtual void open_reader(const StreamId& id, bool history,
+  //   account  who is charged for a new mirror or remote writer, as Identity::account()
+  virtual void open_reader(const StreamId& id, bool history, const std::string& account,
                            Then<std::shared_ptr<Stream>> then) = 0;
   // A program reads what is missing in the mirror of that stream; there may be none.
   //   always  or wants it at once, now and later
@@ -73,11 +74,13 @@ class Fleet {
 
   // A ring of this host that is published into the other host's stream.
   //   plan  create the stream there unless it exists, `id` names the host; nullptr: it must exist
-  virtual void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) = 0;
+  virtual void open_writer(const StreamId& id, const CreatePlan* plan, const std::string& account,
+                           Then<OpenedRing> then) = 0;
 
   // Takes back a mirror's or remote writer's ring that a program held while no dssmd ran.
   virtual Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
-                                                          OfferedFiles files) = 0;
+                                                          OfferedFiles files,
+                                                          const std::string& account) = 0;
 
   // Has the owner of the stream `id` serve `request`: Info, GetProperty, SetProperty or Remove. The
   // response to Info has `mirror` when this host mirrors the stream.

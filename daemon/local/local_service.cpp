@@ -417,7 +417,7 @@ void LocalService::on_new_rights(const Rights& before) {
 // --- recovery
 
 bool LocalService::must_wait(const local::Request& request) const {
-  if (!registry_.recovering() || request.has_offer()) return false;
+  if (!registry_.may_miss_streams() || request.has_offer()) return false;
   if (request.has_open_clock()) return !request.open_clock().offered() && !clock_.has_one();
   // Otherwise a Watch would leave out streams that are about to be offered.
   if (request.has_watch()) return true;

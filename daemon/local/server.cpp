@@ -2,6 +2,8 @@
 #include "daemon/local/server.hpp"
 
 #include <fmt/format.h>
+#include <linux/sockios.h>
+#include <sys/ioctl.h>
 #include <sys/socket.h>
 #include <sys/stat.h>
 #include <sys/un.h>
@@ -131,9 +133,13 @@ Connection::Connection(const EventLoop& loop, UniqueFd socket, const Identity& i
             if (service_.has_greeted(number_)) return;
             end_with({Errc::protocol, "a program connected and sent no Hello for 10 s"});
           })),
-      request_timeout_(EventSource::timer(loop, [this] {
-        end_with({Errc::protocol, "a program began a long request and did not end it for 10 s"});
-      })) {
+      request_timeout_(EventSource::timer(
+          loop,
+          [this] {
+            end_with(
+                {Errc::protocol, "a program began a long request and did not end it for 10 s"});
+          })),
+      output_timer_(EventSource::timer(loop, [this] { on_output_timeout(); })) {
   readable_.enable();
   greeting_timeout_.enable_in(kLocalHelloTimeout);
 }
@@ -247,7 +253,28 @@ void Connection::send(std::string bytes, std::vector<UniqueFd> descriptors) {
   queued_bytes_ += outgoing.bytes.size();
   queued_descriptors_ += outgoing.descriptors.size();
   output_.push_back(std::move(outgoing));
-  charge_output();
+  if (charge_output() && !watched_) watch_output();
+}
+
+// What the client has read counts when it has read all of a packet, of up to 100 KiB.
+Connection::Progress Connection::progress() const noexcept {
+  int unread = 0;
+  ::ioctl(socket_.get(), SIOCOUTQ, &unread);
+  return {sent_bytes_, unread};
+}
+
+void Connection::watch_output() {
+  watched_ = progress();
+  output_timer_.enable_in(kLocalOutputTimeout);
+}
+
+void Connection::on_output_timeout() {
+  const std::optional<Progress> before = std::exchange(watched_, std::nullopt);
+  if (output_.empty()) return;
+  if (progress() != before) return watch_output();
+  end_with({Errc::limit_exceeded,
+            fmt::format("a program has read nothing for {} s of the {} bytes that wait for it",
+                        kLocalOutputTimeout / std::chrono::seconds(1), queued_bytes_)});
 }
 
 // False when the connection ended over it.
@@ -262,6 +289,7 @@ bool Connection::send_some(Outgoing& outgoing) {
     return false;
   }
   outgoing.sent += sent->bytes;
+  sent_bytes_ += sent->bytes;
   if (sent->bytes > 0) outgoing.descriptors.clear();  // they went with the first byte
   return true;
 }
@@ -298,6 +326,7 @@ void Connection::close() {
   next_turn_.disable();
   greeting_timeout_.disable();
   request_timeout_.disable();
+  output_timer_.disable();
   socket_.reset();
   output_.clear();
   arrived_.clear();

@@ -9,7 +9,6 @@
 #pragma once
 
 #include <sys/types.h>
-#include <unistd.h>
 
 #include <cstddef>
 #include <cstdint>
@@ -20,6 +19,7 @@
 #include <memory>
 #include <optional>
 #include <string>
+#include <utility>
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
@@ -90,6 +90,10 @@ inline constexpr Duration kMaxTurn = std::chrono::milliseconds(1);
 // For the Hello of a program.
 inline constexpr Duration kLocalHelloTimeout = std::chrono::seconds(10);
 
+// For a client to read something of what waits for it; after at most twice as long it is
+// disconnected. The library connects again, and gives its streams back.
+inline constexpr Duration kLocalOutputTimeout = std::chrono::seconds(10);
+
 // Memory for long messages of all clients, and of those of one user: requests that they have begun
 // to send, and what waits for them to be received: a list of all streams.
 inline constexpr std::size_t kMaxMessageBytes = 256U << 20;
@@ -97,12 +101,11 @@ inline constexpr std::size_t kMaxMessageBytesPerUser = kMaxMessageBytes / 2;
 // For the rest of a long request: then its memory is free again.
 inline constexpr Duration kLongRequestTimeout = std::chrono::seconds(10);
 
-// What one user's programs take, so that those of one cannot keep out those of others. root, and
-// the user of dssmd, could end dssmd anyway: they have no limits of their own.
+// What one user's programs take.
 struct UserAccount {
   explicit UserAccount(uid_t user)
       : uid(user),
-        is_limited(user != 0 && user != ::geteuid()),
+        is_limited(daemon::is_limited(user)),
         messages(is_limited ? kMaxMessageBytesPerUser : kMaxMessageBytes) {}
   const uid_t uid;
   const bool is_limited;
@@ -149,6 +152,8 @@ class Connection final : public ClientOutput {
   Error no_memory_for(std::string_view what) const;
   bool take_descriptors(std::vector<UniqueFd> arrived);
   bool send_some(Outgoing& outgoing);
+  void watch_output();
+  void on_output_timeout();
   void end_with(const Error& error);
   void close();
   bool is_open() const noexcept { return static_cast<bool>(socket_); }
@@ -168,7 +173,12 @@ class Connection final : public ClientOutput {
   DescriptorQueue arrived_;
   std::deque<Outgoing> output_;
   std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
-  EventSource readable_, writable_, next_turn_, greeting_timeout_, request_timeout_;
+  std::uint64_t sent_bytes_ = 0;
+  // Bytes sent, and what of them the client has not read, when output was watched last.
+  using Progress = std::pair<std::uint64_t, int>;
+  Progress progress() const noexcept;
+  std::optional<Progress> watched_;  // none: nothing waits
+  EventSource readable_, writable_, next_turn_, greeting_timeout_, request_timeout_, output_timer_;
 };
 
 // Accepts the programs of this PC, within the limits, and owns their connections.

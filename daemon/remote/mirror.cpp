@@ -236,16 +236,17 @@ Result<void> Mirror::follow_untrusted(const StreamInfo& theirs) {
                                                             .type = theirs.type,
                                                             .depth = depth,
                                                             .cycle = theirs.cycle,
+                                                            .account = account(),
                                                             .purpose = Purpose::mirror,
                                                             .incarnation = theirs.incarnation},
-                                                           parts_.registry.budget()),
+                                                           parts_.registry.budgets()),
                                             context);
-  replace_ring(DSSM_TRY(MirrorRing::open(std::move(stream), parts_.registry.budget()), context));
-  return {};
+  return DSSM_TRY(use_offered(std::move(stream)), context), Result<void>();
 }
 
 Result<void> Mirror::use_offered(std::shared_ptr<Stream> stream) {
-  replace_ring(DSSM_TRY(MirrorRing::open(std::move(stream), parts_.registry.budget())));
+  MemoryBudget& budget = parts_.registry.budgets().of(stream->account());
+  replace_ring(DSSM_TRY(MirrorRing::open(std::move(stream), budget)));
   return {};
 }
 

@@ -12,15 +12,17 @@
 namespace dssm::daemon {
 
 Result<std::unique_ptr<OutgoingRing>> OutgoingRing::make(const StreamInfo& theirs,
-                                                         MemoryBudget& budget) {
+                                                         MemoryBudgets& budgets,
+                                                         const std::string& account) {
   const std::uint64_t small = kMinRingBytes / std::max<std::uint64_t>(theirs.type.payload_bytes, 1);
   std::shared_ptr<Stream> stream =
       DSSM_TRY(Stream::create({.id = theirs.id,
                                .type = theirs.type,
                                .depth = std::max(theirs.depth, std::min(kMinSlots, small)),
                                .cycle = theirs.cycle,
+                               .account = account,
                                .purpose = Purpose::remote_writer},
-                              budget));
+                              budgets));
   std::unique_ptr<OutgoingRing> made = DSSM_TRY(open(std::move(stream)));
   // No program has the ring yet, and those that will get it receive its descriptors through the
   // kernel, which orders these stores before their loads.

@@ -30,7 +30,9 @@ class OutgoingRing {
   static constexpr std::uint64_t kMinRingBytes = 4U << 20;
 
   // A new one for `theirs`, as the owner described it.
-  static Result<std::unique_ptr<OutgoingRing>> make(const StreamInfo& theirs, MemoryBudget& budget);
+  static Result<std::unique_ptr<OutgoingRing>> make(const StreamInfo& theirs,
+                                                    MemoryBudgets& budgets,
+                                                    const std::string& account = {});
   // One that a program held.
   static Result<std::unique_ptr<OutgoingRing>> open(std::shared_ptr<Stream> stream);
   OutgoingRing(const OutgoingRing&) = delete;

@@ -147,7 +147,7 @@ Result<std::shared_ptr<Stream>> RemoteStream::adopt_untrusted(OfferedFiles&& fil
     return acquire();
   }
   std::shared_ptr<Stream> offered =
-      DSSM_TRY(Stream::adopt_untrusted(std::move(files), parts_.registry.budget()), context);
+      DSSM_TRY(Stream::adopt_untrusted(std::move(files), parts_.registry.budgets()), context);
   if (offered->id() != id_ || offered->purpose() != kind_.purpose) {
     return Error{Errc::protocol, fmt::format("{}: the offered ring belongs to '{}', or has "
                                              "another purpose",

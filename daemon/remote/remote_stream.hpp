@@ -252,6 +252,9 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   //   reason  why, and what to do; empty: the one of this kind
   void log_gap(std::uint64_t samples, std::string_view reason = {});
 
+  // Who is charged for its ring.
+  const std::string& account() const noexcept { return quota_.account(); }
+
   const ChannelParts& parts_;
   const StreamId id_;
   const std::string name_;           // for messages

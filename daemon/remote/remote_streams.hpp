@@ -39,11 +39,13 @@ class RemoteStreams final : private CatalogObserver {
   //   plan   for remote writers: create the stream there unless it exists; nullptr: it must exist.
   //          Used during the call only
   //   then   called once, from the loop or at once; not after this is destroyed
+  //   account  who is charged for a new ring, also when others use it later, as
+  //            Identity::account()
   //   fails  not_found, type_mismatch, unavailable (the owner does not answer), limit_exceeded,
   //          conflict (two hosts of that name), clock_out_of_bounds
   void open(const KnownHost& host, const StreamId& id, const CreatePlan* plan,
-            RemoteStream::Then then) {
-    const Result<Kind*> found = find_or_connect(host, id);
+            RemoteStream::Then then, const std::string& account = {}) {
+    const Result<Kind*> found = find_or_connect(host, id, account);
     if (!found) return then(found.error());
     (*found)->open(plan, std::move(then));
   }
@@ -52,10 +54,11 @@ class RemoteStreams final : private CatalogObserver {
   // which need not be in the catalog yet. Two offers of one ring are one entry. A stream may have
   // another ring by now: then it is a second remote writer, but a conflict for a mirror.
   //   fails  conflict, protocol, no_permission, limit_exceeded
-  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, OfferedFiles files) {
+  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, OfferedFiles files,
+                                                  const std::string& account = {}) {
     Key key = key_of(id);
     for (;; ++std::get<3>(key)) {
-      Kind& entry = *DSSM_TRY(find_or_make(key));
+      Kind& entry = *DSSM_TRY(find_or_make(key, account));
       // NOLINTNEXTLINE(bugprone-use-after-move): a conflict leaves the files as they are
       Result<std::shared_ptr<Stream>> stream = entry.adopt_untrusted(std::move(files));
       if (Kind::kSeveralRings && !stream && stream.error().code == Errc::conflict) continue;
@@ -93,9 +96,10 @@ class RemoteStreams final : private CatalogObserver {
   using Key = std::tuple<std::string, std::int32_t, std::string, std::uint64_t>;
   static Key key_of(const StreamId& id) { return {id.name, id.id, id.host, 0}; }
 
-  Result<Kind*> find_or_connect(const KnownHost& host, const StreamId& id) {
+  Result<Kind*> find_or_connect(const KnownHost& host, const StreamId& id,
+                                const std::string& account) {
     const StreamId full{id.name, id.id, host.greeting.host};
-    Kind* entry = DSSM_TRY(find_or_make(key_of(full)));
+    Kind* entry = DSSM_TRY(find_or_make(key_of(full), account));
     OwnerConnection& connection = entry->connection();
     if (connection.owner() && *connection.owner() != host.greeting.host_id &&
         catalog_.find(*connection.owner())) {
@@ -108,10 +112,10 @@ class RemoteStreams final : private CatalogObserver {
     return entry;
   }
 
-  Result<Kind*> find_or_make(const Key& key) {
+  Result<Kind*> find_or_make(const Key& key, const std::string& account) {
     if (const auto found = entries_.find(key); found != entries_.end()) return found->second.get();
     StreamId id{std::get<0>(key), std::get<1>(key), std::get<2>(key)};
-    RingQuota quota = DSSM_TRY(parts_.registry.acquire_quota(), "stream '" + id.str() + "'");
+    RingQuota quota = DSSM_TRY(parts_.registry.acquire_quota(account), "stream '" + id.str() + "'");
     // Destroyed soon, outside of all callbacks.
     auto entry = std::make_unique<Kind>(parts_, std::move(id), std::move(quota),
                                         [this] { sweep_.enable_in(Duration::zero()); });

@@ -38,7 +38,7 @@ void RemoteWriter::open_at_owner() {
   if (const std::optional<CreatePlan>* wanted = first_pending()) {
     plan = *wanted;
   } else if (creates_ && !is_removed_) {
-    plan = CreatePlan{ring_->stream()->type(), history_};
+    plan = CreatePlan{ring_->stream()->type(), history_, true};
   }
   channel_.open(id_, plan ? &*plan : nullptr);
 }
@@ -88,7 +88,7 @@ Result<void> RemoteWriter::follow(const StreamInfo& theirs) {
     return {};
   }
   const std::string context = "write to '" + name_ + "'";
-  auto ring = DSSM_TRY(OutgoingRing::make(theirs, parts_.registry.budget()), context);
+  auto ring = DSSM_TRY(OutgoingRing::make(theirs, parts_.registry.budgets(), account()), context);
   DSSM_TRY(use_ring(std::move(ring)), context);
   return {};
 }
@@ -115,8 +115,9 @@ void RemoteWriter::start_publishing() {
                          log_fields());
   }
   FrameConnection& connection = *connection_.frames();
-  sender_.emplace(ring_->mapping(), connection,
-                  SampleSender::Options{may_tear_, &parts_.registry.budget()});
+  sender_.emplace(
+      ring_->mapping(), connection,
+      SampleSender::Options{may_tear_, &parts_.registry.budgets().of(ring_->stream()->account())});
   connection.set_priority(
       parts_.sending.demand_for(id_, ring_->mapping().geometry().payload_bytes).priority);
   SamplePump::Observer& observer = *this;
@@ -147,7 +148,14 @@ void RemoteWriter::stop_publishing() noexcept {
 
 Result<void> RemoteWriter::check_open(const CreatePlan* plan) {
   if (!plan) return {};
-  DSSM_TRY(ring_->stream()->type().check_usable_as(plan->type), "stream '" + name_ + "'");
+  const std::string context = "stream '" + name_ + "'";
+  DSSM_TRY(ring_->stream()->type().check_usable_as(plan->type), context);
+  if (!plan->keep_existing && plan->history.depth > history_.depth) {
+    return Error{Errc::conflict,
+                 fmt::format("{}: its ring has {} slots, and this program asks for {}; another "
+                             "program of this PC writes it: end that one, or ask for less",
+                             context, history_.depth, plan->history.depth)};
+  }
   creates_ = true;
   return {};
 }

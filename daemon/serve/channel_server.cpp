@@ -66,10 +66,9 @@ Result<void> ChannelServer::accept(UniqueFd& socket) {
     secure(std::move(socket), *address);
     return {};
   }
-  Result<PeerPlace> place = peers_.admit(in_quotes(without_port(*address)));
-  if (!place) return std::move(place).error().context(refuses(*address));
-  keep(*std::move(place), wire::make_transport(std::move(socket), wire::TransportEnd::accepted),
-       *address);
+  auto transport = wire::make_transport(std::move(socket), wire::TransportEnd::accepted);
+  Result<void> kept = keep(transport, *address);
+  if (!kept) refuse(*transport, *address, kept.error());
   return {};
 }
 
@@ -77,26 +76,56 @@ std::string ChannelServer::refuses(const wire::SocketAddress& address) const {
   return fmt::format("dssmd of host '{}' refuses '{}'", self_.host, address.str());
 }
 
-// Anybody can begin handshakes. As many are under way as connections are allowed; for one more, the
-// oldest one is given up of the address with the most, in the network with the most: who has one
-// IPv6 address has all of its /64. A handshake that goes on takes milliseconds. There is no limit
-// per network, because all hosts of a vehicle may be in one.
-void ChannelServer::secure(UniqueFd socket, const wire::SocketAddress& address) {
-  const std::string where = without_port(address), network = network_of(address);
+void ChannelServer::refuse(wire::Transport& transport, const wire::SocketAddress& address,
+                           const Error& error) {
+  logger_.warning(error.message, {.peer = address.str(), .message_id = message_id::kPeerRefused});
+  const std::string frame = wire::final_failure(error);
+  const iovec part{const_cast<char*>(frame.data()), frame.size()};
+  static_cast<void>(transport.send({&part, 1}));  // as much as is taken at once
+}
+
+// Anybody can connect and say nothing. When there is no place for one more, one of those that have
+// not greeted, and `may_go`, is given up: the oldest of the address with the most, in the network
+// with the most: who has one IPv6 address has all of its /64. Who goes on greets within
+// milliseconds. There is no limit per network, because all hosts of a vehicle may be in one.
+void ChannelServer::give_up_one(const std::function<bool(const Arrival&)>& may_go) {
   std::map<std::string_view, std::uint64_t> of_address, of_network;
-  for (const Arrival& one : arrivals_) ++of_address[one.address], ++of_network[one.network];
-  const auto crowd = [&](const Arrival& one) {
-    return std::pair(of_network[one.network], of_address[one.address]);
-  };
-  if (of_address[where] >= limits_.max_connections_per_host) {
-    arrivals_.erase(std::find_if(arrivals_.begin(), arrivals_.end(),
-                                 [&](const Arrival& one) { return one.address == where; }));
-  } else if (arrivals_.size() >= limits_.max_connections) {
-    arrivals_.erase(
-        std::max_element(arrivals_.begin(), arrivals_.end(),
-                         [&](const Arrival& a, const Arrival& b) { return crowd(a) < crowd(b); }));
+  for (const Arrival& one : arrivals_) {
+    if (may_go(one)) ++of_address[one.address], ++of_network[one.network];
   }
-  Arrival& arrival = arrivals_.emplace_back(Arrival{where, network, nullptr, false});
+  const auto crowd = [&](const Arrival& one) {
+    return may_go(one) ? std::pair(of_network[one.network], of_address[one.address])
+                       : std::pair(std::uint64_t{0}, std::uint64_t{0});
+  };
+  const auto given_up =
+      std::max_element(arrivals_.begin(), arrivals_.end(),
+                       [&](const Arrival& a, const Arrival& b) { return crowd(a) < crowd(b); });
+  if (given_up == arrivals_.end() || !may_go(*given_up)) return;
+  if (DataCommunicator* communicator = given_up->communicator) {
+    const Error error{Errc::limit_exceeded,
+                      fmt::format("give up a connection from {}: it has sent no Hello, and others "
+                                  "need its place",
+                                  given_up->peer)};
+    logger_.warning(error.message, {.message_id = message_id::kPeerRefused});
+    communicator->close_with(error);
+    communicators_.erase(communicator);  // at once, for its place
+  }
+  arrivals_.erase(given_up);
+}
+
+// As many handshakes are under way as connections are allowed.
+void ChannelServer::secure(UniqueFd socket, const wire::SocketAddress& address) {
+  const std::string where = without_port(address);
+  std::uint64_t from_there = 0, all = 0;
+  for (const Arrival& one : arrivals_) {
+    if (one.handshake) ++all, from_there += one.address == where;
+  }
+  const bool is_crowd = from_there >= limits_.max_connections_per_host;
+  if (is_crowd || all >= limits_.max_connections) {
+    give_up_one(
+        [&](const Arrival& one) { return one.handshake && (!is_crowd || one.address == where); });
+  }
+  Arrival& arrival = arrivals_.emplace_back(Arrival{where, network_of(address)});
   const bool takes_plain = parts_.takes_plain || address.is_loopback();
   arrival.handshake = std::make_unique<Handshake>(
       parts_.loop, wire::credentials_of(self_), std::move(socket), handshake_budget_, takes_plain,
@@ -113,24 +142,16 @@ void ChannelServer::on_secured(Arrival& arrival, const wire::SocketAddress& addr
     return logger_.warning(fmt::format("{}: {}", refuses(address), transport.error().message),
                            {.peer = address.str(), .message_id = message_id::kPeerRefused});
   }
-  const wire::CertifiedPeer* peer = (*transport)->peer();
-  Result<PeerPlace> place =
-      peers_.admit(peer ? peer->str() : in_quotes(arrival.address), peer != nullptr);
-  if (!place) {
-    const Error error = std::move(place).error().context(refuses(address));
-    logger_.warning(error.message, {.peer = address.str(), .message_id = message_id::kPeerRefused});
-    const std::string frame = wire::final_failure(error);
-    const iovec part{const_cast<char*>(frame.data()), frame.size()};
-    static_cast<void>((*transport)->send({&part, 1}));  // as much as is taken at once
-    return;
+  if (Result<void> kept = keep(*transport, address); !kept) {
+    refuse(**transport, address, kept.error());
   }
-  keep(*std::move(place), *std::move(transport), address);
 }
 
 void ChannelServer::on_new_credentials() {
   const auto credentials = wire::credentials_of(self_);
   if (!credentials) return;
-  arrivals_.clear();  // they would be accepted by the old ones; their hosts try again
+  // They would be accepted by the old ones; their hosts try again.
+  std::erase_if(arrivals_, [](const Arrival& one) { return one.handshake != nullptr; });
   for (const auto& [key, communicator] : communicators_) {
     communicator->on_new_credentials(*credentials);
   }
@@ -138,19 +159,35 @@ void ChannelServer::on_new_credentials() {
 
 Result<void> ChannelServer::adopt(std::unique_ptr<wire::Transport> transport,
                                   const wire::SocketAddress& address) {
-  PeerPlace place = DSSM_TRY(peers_.admit(in_quotes(without_port(address))));
-  keep(std::move(place), std::move(transport), address);
-  return {};
+  return keep(transport, address);
 }
 
-void ChannelServer::keep(PeerPlace place, std::unique_ptr<wire::Transport> transport,
-                         const wire::SocketAddress& address) {
+// Moves from `transport` only if there is a place.
+Result<void> ChannelServer::keep(std::unique_ptr<wire::Transport>& transport,
+                                 const wire::SocketAddress& address) {
+  const std::string where = without_port(address);
+  const wire::CertifiedPeer* certified = transport->peer();
+  const std::string peer = certified ? certified->str() : in_quotes(where);
+  const bool is_configured = parts_.is_configured && parts_.is_configured(address, certified);
+  const bool is_crowd = peers_.is_full_for(peer, certified);
+  if (is_crowd || (peers_.is_full() && !is_configured)) {
+    give_up_one([&](const Arrival& one) {
+      return one.communicator && (is_crowd ? one.peer == peer : !one.is_configured);
+    });
+  }
+  PeerPlace place = DSSM_TRY(peers_.admit(peer, certified, is_configured), refuses(address));
   auto communicator = std::make_unique<DataCommunicator>(
       DataCommunicator::Parts{parts_.loop, parts_.registry, parts_.opens, streams_, self_, logger_,
                               *this, parts_.clock, parts_.rights, sending_},
       std::move(place), std::move(transport), address.str());
   DataCommunicator* key = communicator.get();
   communicators_.emplace(key, std::move(communicator));
+  arrivals_.push_back({where, network_of(address), nullptr, key, peer, is_configured});
+  return {};
+}
+
+void ChannelServer::forget_arrival(const DataCommunicator& communicator) {
+  std::erase_if(arrivals_, [&](const Arrival& one) { return one.communicator == &communicator; });
 }
 
 void ChannelServer::on_new_rights(const Rights& before) {
@@ -176,6 +213,7 @@ void ChannelServer::on_recovered() {
 }
 
 void ChannelServer::on_ended(DataCommunicator& communicator) {
+  forget_arrival(communicator);
   ended_.push_back(&communicator);
   sweep_.enable_in(Duration::zero());
 }

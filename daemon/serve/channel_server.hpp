@@ -38,6 +38,8 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     ClockAssessor* clock = nullptr;           // nullptr: the clock is not watched
     std::function<void()> on_heartbeat = {};  // of another host, about once a second; may be empty
     bool takes_plain = false;                 // with credentials: from other PCs, too
+    // Whether a connection comes from a configured peer (Peers::is_configured()); may be empty.
+    std::function<bool(const wire::SocketAddress&, const wire::CertifiedPeer*)> is_configured = {};
   };
 
   // self: how this dssmd greets; with its credentials, connections are encrypted. All in `parts`
@@ -75,11 +77,15 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   void set_sending(SendingDemands sending) { sending_ = std::move(sending); }
 
  private:
-  // A connection whose TLS handshake is under way.
+  // A connection of a peer that has not sent its Hello.
   struct Arrival {
     std::string address;  // without port
     std::string network;  // of that address
-    std::unique_ptr<Handshake> handshake;
+    // One of both: TLS is under way, or it has a place in the PeerTable, under the name `peer`.
+    std::unique_ptr<Handshake> handshake = nullptr;
+    DataCommunicator* communicator = nullptr;
+    std::string peer = {};
+    bool is_configured = false;
     bool ended = false;  // to be destroyed outside of its own callback
   };
 
@@ -88,14 +94,18 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
   void on_secured(Arrival& arrival, const wire::SocketAddress& address,
                   Result<std::unique_ptr<wire::Transport>> transport);
   std::string refuses(const wire::SocketAddress& address) const;
-  void keep(PeerPlace place, std::unique_ptr<wire::Transport> transport,
-            const wire::SocketAddress& address);
+  void refuse(wire::Transport& transport, const wire::SocketAddress& address, const Error& error);
+  Result<void> keep(std::unique_ptr<wire::Transport>& transport,
+                    const wire::SocketAddress& address);
+  void give_up_one(const std::function<bool(const Arrival&)>& may_go);
+  void forget_arrival(const DataCommunicator& communicator);
   void sweep();
 
   void on_stream_added(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
   void on_recovered() override;
   void on_ended(DataCommunicator& communicator) override;
+  void on_greeted(DataCommunicator& communicator) override { forget_arrival(communicator); }
   void on_heartbeat() override;
 
   Parts parts_;

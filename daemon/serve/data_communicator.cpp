@@ -44,7 +44,7 @@ bool is_control(const net::Frame& request) noexcept {
 
 // Whether the answer would be another one when all streams have come back.
 bool must_wait_for_recovery(const net::Frame& request, const Registry& registry) {
-  if (!registry.recovering()) return false;
+  if (!registry.may_miss_streams()) return false;
   if (request.has_list()) return true;
   const proto::StreamId* named = subject(request);
   if (!named) return false;
@@ -80,6 +80,7 @@ DataCommunicator::DataCommunicator(const Parts& parts, PeerPlace place,
   link_.set_budget(place_.budget());
   link_.take_requests_only();
   link_.set_pace(place_.pace());
+  link_.set_output_timeout(kOutputTimeout);
   greeting_timeout_.enable_in(wire::kHelloTimeout);
 }
 
@@ -147,6 +148,7 @@ Result<void> DataCommunicator::greet(const net::Frame& frame) {
   identity_.program = them_->program;
   DSSM_TRY(parts_.rights.check(identity_, Action::greet, {}));
   greeting_timeout_.disable();
+  parts_.observer.on_greeted(*this);
   idle_timeout_.enable_in(kIdleTimeout);
   net::Frame hello;
   wire::to_message(parts_.self, *hello.mutable_hello());
@@ -263,7 +265,7 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
       wire::to_message(pair, *list.add_pairs());
     }
   } else {
-    DSSM_TRY(catalog_.serve_untrusted(request, answer));
+    DSSM_TRY(catalog_.serve_untrusted(request, answer, identity_.account()));
     if (request.has_list()) parts_.rights.hide(identity_, *answer.mutable_stream_list());
   }
   link_.send(answer);
@@ -301,7 +303,8 @@ Result<void> DataCommunicator::check_clock(const StreamId& id) const {
 Result<void> DataCommunicator::create(const net::Frame& request) {
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.create().id()));
   DSSM_TRY(check_clock(id));
-  const OpenedRing created = DSSM_TRY(catalog_.create_untrusted(request.create(), 0));
+  const OpenedRing created =
+      DSSM_TRY(catalog_.create_untrusted(request.create(), identity_, parts_.rights));
   opening_ = {request.serial(), created.stream, created.created};
   return go_on_opening();
 }
@@ -342,7 +345,7 @@ Result<void> DataCommunicator::go_on_opening() {
   idle_timeout_.disable();
   channel_ = std::make_unique<StreamChannel>(
       StreamChannel::Parts{parts_.loop, catalog_, link_, place_.budget(), *this, parts_.self,
-                           *them_, parts_.clock, parts_.sending},
+                           *them_, identity_.account(), parts_.clock, parts_.sending},
       parts_.streams.get(opening.stream), them_->has_feature(wire::kFeatureTorn));
   net::Frame answer;
   answer.set_serial(opening.serial);
@@ -495,7 +498,7 @@ bool StreamWatch::work() {
     pending_.pop_front();
     if (stream && !stream->removed() && shows_(stream->id())) send_added(*stream);
   }
-  if (!pending_.empty() || serial_ == 0 || registry_.recovering()) return false;
+  if (!pending_.empty() || serial_ == 0 || registry_.may_miss_streams()) return false;
   net::Frame done;
   done.set_serial(serial_);
   done.mutable_done();

@@ -79,6 +79,9 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
   // How long a connection may send nothing that is neither a channel nor has heartbeats: otherwise
   // those that are forgotten, or meant to, would take all places.
   static constexpr Duration kIdleTimeout = std::chrono::seconds(10);
+  // How long a peer may read nothing of the answers and events that wait for it. It may of samples
+  // that it has subscribed to: a program may be stopped by a debugger.
+  static constexpr Duration kOutputTimeout = std::chrono::seconds(10);
   // Answers and events that may wait for one connection: the longest answer is a property.
   static constexpr std::size_t kMaxQueuedBytes = wire::kMaxNetworkFrameBytes + (1U << 20);
 
@@ -87,6 +90,8 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
    public:
     // It ended; to be destroyed later, not from within this call.
     virtual void on_ended(DataCommunicator& communicator) = 0;
+    // The peer has sent its Hello.
+    virtual void on_greeted(DataCommunicator& /*communicator*/) {}
     // A heartbeat arrived.
     virtual void on_heartbeat() {}
 

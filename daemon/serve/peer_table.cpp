@@ -9,20 +9,21 @@
 
 namespace dssm::daemon {
 
-PeerPlace::PeerPlace(PeerTable& table, PeerAccount& account, MemoryShare share)
-    : table_(&table), account_(&account), share_(std::move(share)) {
-  ++table_->connections_;
+PeerPlace::PeerPlace(PeerTable& table, PeerAccount& account, MemoryShare share, bool is_configured)
+    : table_(&table), account_(&account), is_configured_(is_configured), share_(std::move(share)) {
+  if (!is_configured_) ++table_->connections_;
   ++account_->connections;
 }
 
 PeerPlace::PeerPlace(PeerPlace&& other) noexcept
     : table_(std::exchange(other.table_, nullptr)),
       account_(other.account_),
+      is_configured_(other.is_configured_),
       share_(std::move(other.share_)) {}
 
 PeerPlace::~PeerPlace() {
   share_ = {};  // before its budget goes
-  if (table_) table_->leave(*account_);
+  if (table_) table_->leave(*account_, is_configured_);
 }
 
 void PeerTable::set_limits(const Limits& limits) {
@@ -44,8 +45,16 @@ void PeerTable::add_limits(LimitUses& out) const {
   out.push_back({"max_peer_memory", bytes, limits_.max_peer_memory_bytes, "bytes"});
 }
 
-Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {
-  if (connections_ >= limits_.max_connections) {
+bool PeerTable::is_full_for(const std::string& peer, bool encrypted) const {
+  const auto found = accounts_.find(peer);
+  if (found == accounts_.end()) return false;
+  const PeerAccount& account = *found->second;
+  return account.connections >= limits_.max_connections_per_host ||
+         account.budget.used() + bytes_of(encrypted) > account.budget.limit();
+}
+
+Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted, bool is_configured) {
+  if (!is_configured && is_full()) {
     return Error{Errc::limit_exceeded,
                  fmt::format("there are max_connections = {} connections from other hosts already; "
                              "close some or raise the key max_connections",
@@ -60,9 +69,8 @@ Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {
   }
   std::unique_ptr<PeerAccount>& account = accounts_[peer];
   if (!account) account = std::make_unique<PeerAccount>(peer, limits_.max_peer_memory_bytes);
-  std::optional<MemoryShare> share =
-      account->budget.try_take(kConnectionBytes + (encrypted ? kTlsBytes : 0));
-  if (share) return PeerPlace(*this, *account, *std::move(share));
+  std::optional<MemoryShare> share = account->budget.try_take(bytes_of(encrypted));
+  if (share) return PeerPlace(*this, *account, *std::move(share), is_configured);
   Error error{Errc::limit_exceeded,
               fmt::format("the connections from {} have used up max_peer_memory = {} bytes; "
                           "close some or raise the key max_peer_memory",
@@ -71,8 +79,8 @@ Result<PeerPlace> PeerTable::admit(const std::string& peer, bool encrypted) {
   return error;
 }
 
-void PeerTable::leave(PeerAccount& account) {
-  --connections_;
+void PeerTable::leave(PeerAccount& account, bool is_configured) {
+  if (!is_configured) --connections_;
   if (--account.connections == 0) accounts_.erase(std::string(account.name));
 }
 

@@ -42,9 +42,10 @@ class PeerPlace {
 
  private:
   friend class PeerTable;
-  PeerPlace(PeerTable& table, PeerAccount& account, MemoryShare share);
+  PeerPlace(PeerTable& table, PeerAccount& account, MemoryShare share, bool is_configured);
   PeerTable* table_;
   PeerAccount* account_;
+  bool is_configured_;
   MemoryShare share_;
 };
 
@@ -71,16 +72,26 @@ class PeerTable {
 
   void add_limits(LimitUses& out) const;
 
+  // Whether admit() would fail: for all but configured peers, and for this peer in any case.
+  bool is_full() const noexcept { return connections_ >= limits_.max_connections; }
+  bool is_full_for(const std::string& peer, bool encrypted) const;
+
   // A place for one more connection of `peer`: its address without a port or, when its certificate
   // says who it is, that.
+  //   is_configured  the host is in the configuration (key peers): it does not count for
+  //                  max_connections, so that others cannot keep it out
   //   fails  limit_exceeded, naming the key
-  Result<PeerPlace> admit(const std::string& peer, bool encrypted = false);
+  Result<PeerPlace> admit(const std::string& peer, bool encrypted = false,
+                          bool is_configured = false);
 
  private:
   friend class PeerPlace;
-  void leave(PeerAccount& account);
+  void leave(PeerAccount& account, bool is_configured);
+  static std::uint64_t bytes_of(bool encrypted) noexcept {
+    return kConnectionBytes + (encrypted ? kTlsBytes : 0);
+  }
   Limits limits_;
-  std::uint64_t connections_ = 0;
+  std::uint64_t connections_ = 0;  // without those of configured peers
   std::map<std::string, std::unique_ptr<PeerAccount>> accounts_;
 };
 

@@ -116,6 +116,7 @@ Result<void> StreamChannel::subscribe(std::uint64_t serial, const net::Subscribe
     }
     subscribed.set_newest_first(true);
   }
+  parts_.link.set_output_timeout(Duration::zero());
   parts_.link.send(frame);
   pump_.emplace(stream().mapping(), parts_.link, sender_, static_cast<SamplePump::Observer&>(*this),
                 plan);
@@ -387,7 +388,7 @@ Result<void> StreamChannel::assess_writer() {
 
 Result<void> StreamChannel::serve_property(const net::Frame& request) {
   net::Frame frame = answer_to(request.serial());
-  DSSM_TRY(parts_.catalog.serve_untrusted(request, frame, &stream().id()));
+  DSSM_TRY(parts_.catalog.serve_untrusted(request, frame, parts_.account, &stream().id()));
   parts_.link.send(frame);
   return {};
 }

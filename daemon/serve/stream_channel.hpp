@@ -43,6 +43,7 @@ class StreamChannel final : private SamplePump::Observer,
     Observer& observer;
     const wire::Greeting& self;
     const wire::Greeting& them;
+    std::string account;   // of the client
     ClockAssessor* clock;  // nullptr: the clock is not watched
     const SendingDemands& sending;
   };

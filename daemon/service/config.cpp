@@ -216,6 +216,11 @@ constexpr ConfigKey kKeys[] = {
     {"max_opens_per_client", "COUNT", "open streams of one client; default: 16384",
      ValueForm::integer, kChangesAtOnce<&Config::max_opens_per_client>,
      set_count<&Config::max_opens_per_client, kMaxOpens>},
+    {"max_share", "PERCENT",
+     "how much of max_streams and max_memory one user, other host or remote program may take, and "
+     "of max_opens one user, but for root and dssmd's own user; default: 75%",
+     ValueForm::text, kChangesAtOnce<&Config::max_share_percent>,
+     set_by<&Config::max_share_percent, parse_percent>},
     {"max_property", "BYTES", "size of one stream's property; default: 1 MiB",
      ValueForm::integer_or_text, kChangesAtOnce<&Config::max_property_bytes>,
      set_bytes<&Config::max_property_bytes, 0, wire::kMaxPropertyBytes>},

@@ -46,6 +46,7 @@ struct Config {
   std::uint64_t max_memory_bytes = half_of_the_machines_memory();
   std::uint64_t max_opens = 65536;
   std::uint64_t max_opens_per_client = 16384;
+  std::uint64_t max_share_percent = 75;  // of max_streams, max_memory and max_opens
   std::uint64_t max_property_bytes = 1ULL << 20;
   Duration recovery_grace = std::chrono::milliseconds(500);
 

@@ -267,12 +267,18 @@ Result<SendingDemands::Exception> parse_sending_exception(std::string_view text)
       static_cast<wire::Priority>(std::distance(kPriorityNames.begin(), priority));
   if (blank == demand.size()) return exception;
   const std::string_view text_of_share = demand.substr(blank + 1);
-  const Result<Quantity> share = parse_quantity(text_of_share);
-  if (!share || share->unit != "%" || share->number < 1 || share->number > 100) {
-    return wrong("has a share that is none: " + in_quotes(text_of_share) + " is not 1% to 100%");
-  }
-  exception.demand.history_percent = static_cast<int>(share->number);
+  const Result<std::uint64_t> share = parse_percent(text_of_share);
+  if (!share) return wrong("has a share that is none: " + share.error().message);
+  exception.demand.history_percent = static_cast<int>(*share);
   return exception;
+}
+
+Result<std::uint64_t> parse_percent(std::string_view text) {
+  const Result<Quantity> share = parse_quantity(text);
+  if (share && share->unit == "%" && share->number >= 1 && share->number <= 100) {
+    return share->number;
+  }
+  return invalid(in_quotes(text) + " is not 1% to 100%");
 }
 
 Result<clock::PartsPerBillion> parse_drift(std::string_view text) {

@@ -109,6 +109,9 @@ struct SendingDemands {
   friend bool operator==(const SendingDemands& a, const SendingDemands& b) = default;
 };
 
+// "1%" to "100%"
+Result<std::uint64_t> parse_percent(std::string_view text);
+
 // A whole number from `min` to `max`.
 Result<std::uint64_t> parse_count(std::string_view text, std::uint64_t min, std::uint64_t max);
 

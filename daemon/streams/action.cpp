@@ -3,6 +3,9 @@
 
 #include <fmt/format.h>
 
+#include "core/base/text.hpp"
+#include "daemon/base/limit_use.hpp"
+
 namespace dssm::daemon {
 namespace {
 
@@ -37,6 +40,11 @@ std::optional<Action> catalog_action(const Request& request) noexcept {
 std::string Identity::str() const {
   if (is_local()) return fmt::format("'{}' (pid {}, uid {})", program, pid, uid);
   return fmt::format("'{}' on host '{}' at '{}'", program, host, address);
+}
+
+std::string Identity::account() const {
+  if (is_local()) return is_limited(uid) ? fmt::format("user {}", uid) : std::string();
+  return certified ? certified->str() : in_quotes(address.substr(0, address.rfind(':')));
 }
 
 std::optional<Action> action_of(const local::Request& request) noexcept {

@@ -41,6 +41,9 @@ struct Identity {
   std::string program;
 
   bool is_local() const noexcept { return address.empty(); }
+  // Who is charged for what this client has dssmd keep (key max_share): "user 1000", "host 'pc2'",
+  // "'10.0.0.3'"; empty: a user without limits.
+  std::string account() const;
   std::string str()
       const;  // "'mapper' (pid 12, uid 1000)", "'mapper' on host 'pc3' at '10.0.0.3:40000'"
 };

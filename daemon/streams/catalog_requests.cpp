@@ -23,6 +23,14 @@ void describe_users(const Stream& stream, const OpenTable& opens, proto::Stream&
   }
 }
 
+Result<void> check_fits(const Stream& stream, const TypeInfo& type, const History& history) {
+  DSSM_TRY(stream.type().check_usable_as(type));
+  const std::uint64_t depth = stream.mapping().geometry().depth;
+  if (history.depth <= depth) return {};
+  return Error{Errc::conflict, fmt::format("its ring has {} slots, and this program asks for {}",
+                                           depth, history.depth)};
+}
+
 }  // namespace
 
 void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out, bool with_fields) {
@@ -55,7 +63,7 @@ Error unknown_request(const std::string& host) {
 
 template <class Request, class Response>
 Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& response,
-                                              const StreamId* channel) {
+                                              const std::string& account, const StreamId* channel) {
   if (request.has_list()) return list(*response.mutable_stream_list());
   const proto::StreamId* named = subject(request);
   if (!named) return unknown_request(registry_.host());
@@ -73,7 +81,7 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
       response.mutable_done();
       return {};
     case Request::kSetProperty:
-      DSSM_TRY(registry_.set_property(id, request.set_property().property()));
+      DSSM_TRY(registry_.set_property(id, request.set_property().property(), account));
       response.mutable_done();
       return {};
     case Request::kGetProperty:
@@ -85,9 +93,9 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
 }
 
 template Result<void> CatalogRequests::serve_untrusted(const local::Request&, local::Response&,
-                                                       const StreamId*);
+                                                       const std::string&, const StreamId*);
 template Result<void> CatalogRequests::serve_untrusted(const net::Frame&, net::Frame&,
-                                                       const StreamId*);
+                                                       const std::string&, const StreamId*);
 
 Result<std::string> CatalogRequests::property_of(const StreamId& id) const {
   const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.find(id));
@@ -103,10 +111,51 @@ Result<std::shared_ptr<Stream>> CatalogRequests::find_untrusted(const proto::Str
 }
 
 Result<OpenedRing> CatalogRequests::create_untrusted(const proto::Create& request,
-                                                     std::int32_t creator_pid) {
+                                                     const Identity& who, const Rights& rights) {
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(request.id()));
   const TypeInfo type = DSSM_TRY(wire::type_untrusted(request.type()));
-  return registry_.create(id, type, {request.depth(), Duration(request.cycle_ns())}, creator_pid);
+  const History history{request.depth(), Duration(request.cycle_ns())};
+  const Result<std::shared_ptr<Stream>> existing = registry_.find(id);
+  if (existing && !request.keep_existing()) {
+    const std::string context = "stream '" + (*existing)->id().str() + "'";
+    Result<void> fits = check_fits(**existing, type, history);
+    if (!fits) {
+      // While a program is being developed its type changes, and nobody wants the old ring.
+      Result<void> replaceable = check_unused(**existing);
+      if (replaceable) replaceable = rights.check(who, Action::create, id);
+      if (replaceable) replaceable = rights.check(who, Action::remove, id);
+      if (replaceable) {
+        return OpenedRing{DSSM_TRY(registry_.replace(id, type, history, who.pid, who.account())),
+                          true};
+      }
+      Error error = std::move(fits).error().context(context);
+      error.message += "; no new ring takes its place: " + replaceable.error().message;
+      return error;
+    }
+  }
+  return registry_.create(id, type, history, who.pid, who.account());
+}
+
+// Whether nothing would be taken away from anybody.
+//   fails  with the reason, for people
+Result<void> CatalogRequests::check_unused(const Stream& stream) const {
+  if (registry_.recovery() != Registry::Recovery::over) {
+    return Error{Errc::unavailable,
+                 "dssmd was restarted, and does not know yet who has the stream open; try again in "
+                 "a second"};
+  }
+  std::string users;
+  for (const StreamUser& user : opens_.users(stream)) {
+    users += fmt::format("{}'{}' (pid {})", users.empty() ? "" : ", ", user.program, user.pid);
+  }
+  if (stream.channels() > 0) users += users.empty() ? "other hosts" : " and other hosts";
+  if (users.empty()) return {};
+  return Error{
+      Errc::conflict,
+      fmt::format("the stream is open in {}; end these programs, or remove it (`dssmctl rm "
+                  "{}`): then its readers continue with the new ring, and its writers have "
+                  "to be restarted",
+                  users, stream.id().str())};
 }
 
 // In the order of creation.

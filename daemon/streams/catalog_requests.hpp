@@ -18,6 +18,7 @@
 #include "common.pb.h"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
+#include "daemon/streams/rights.hpp"
 
 namespace dssm::daemon {
 
@@ -43,19 +44,23 @@ class CatalogRequests {
   //   Request   local::Request or net::Frame; Response: local::Response or net::Frame
   //   channel   the stream of the channel that the request came on, for properties; nullptr: the
   //             request names its stream
+  //   account   of the client, which is charged for a property
   //   fails     with the failure that is the response; protocol: any other request
   template <class Request, class Response>
   Result<void> serve_untrusted(const Request& request, Response& response,
-                               const StreamId* channel = nullptr);
+                               const std::string& account, const StreamId* channel = nullptr);
 
   // For Open and Create.
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
-  //   creator_pid  of the program of this host; 0: another host creates it
-  Result<OpenedRing> create_untrusted(const proto::Create& request, std::int32_t creator_pid);
+  //   who     asks; has the right to create the stream, or to write to the existing one
+  //   rights  decide whether `who` may replace an existing one
+  Result<OpenedRing> create_untrusted(const proto::Create& request, const Identity& who,
+                                      const Rights& rights);
 
  private:
   Result<void> list(proto::StreamList& out) const;
   Result<std::string> property_of(const StreamId& id) const;
+  Result<void> check_unused(const Stream& stream) const;
 
   Registry& registry_;
   const OpenTable& opens_;

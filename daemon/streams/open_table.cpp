@@ -11,7 +11,11 @@ namespace dssm::daemon {
 void OpenTable::add_limits(LimitUses& out) const {
   std::size_t most = 0;
   for (const auto& [client, opens] : by_client_) most = std::max(most, opens.size());
+  std::size_t of_user = 0;
+  for (const auto& [user, opens] : by_user_) of_user = std::max(of_user, opens);
   out.push_back({"max_opens", entries_.size(), limits_.max_opens, "opens"});
+  out.push_back(
+      {"max_opens of one user", of_user, limits_.max_share.of(limits_.max_opens), "opens"});
   out.push_back({"max_opens_per_client", most, limits_.max_opens_per_client, "opens"});
 }
 
@@ -29,6 +33,14 @@ Result<void> OpenTable::check_quota(const ClientIdentity& client) const {
                              "or raise the key max_opens_per_client",
                              limits_.max_opens_per_client)};
   }
+  const auto of_user = by_user_.find(client.uid);
+  if (of_user != by_user_.end() && of_user->second >= limits_.max_share.of(limits_.max_opens)) {
+    return Error{Errc::limit_exceeded,
+                 fmt::format("programs of {} have {} streams open; close some or raise the key "
+                             "max_share: they may open {}% of max_opens = {}",
+                             client.account(), of_user->second, limits_.max_share.percent,
+                             limits_.max_opens)};
+  }
   return {};
 }
 
@@ -37,6 +49,7 @@ OpenNumber OpenTable::add(OpenEntry entry) {
   // First the entry, which the others refer to: each may find no memory.
   const OpenEntry& added = entries_.emplace(number, std::move(entry)).first->second;
   by_client_[added.client->number].insert(number);
+  if (is_limited(added.client->uid)) ++by_user_[added.client->uid];
   OfStream& of_stream = by_stream_[added.stream.get()];
   of_stream.opens.insert(number);
   ++(added.role == Role::writer ? of_stream.counts.writers : of_stream.counts.readers);
@@ -67,6 +80,8 @@ void OpenTable::remove_all(ClientNumber client) {
 
 void OpenTable::forget(OpenNumber number) {
   const OpenEntry entry = std::move(entries_.extract(number).mapped());
+  const auto of_user = by_user_.find(entry.client->uid);
+  if (of_user != by_user_.end() && --of_user->second == 0) by_user_.erase(of_user);
   const auto of_stream = by_stream_.find(entry.stream.get());
   of_stream->second.opens.erase(number);
   Counts& counts = of_stream->second.counts;

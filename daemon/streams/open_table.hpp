@@ -41,6 +41,7 @@ class OpenTable {
   struct Limits {
     std::uint64_t max_opens = 0;
     std::uint64_t max_opens_per_client = 0;
+    MaxShare max_share = {};  // of max_opens
   };
   struct Counts {
     std::uint32_t writers = 0, readers = 0;
@@ -92,6 +93,7 @@ class OpenTable {
   OpenNumber next_ = 1;
   std::map<OpenNumber, OpenEntry> entries_;
   std::unordered_map<ClientNumber, std::set<OpenNumber>> by_client_;
+  std::unordered_map<std::uint32_t, std::size_t> by_user_;  // how many; those with limits
   std::unordered_map<const Stream*, OfStream> by_stream_;
 };
 

@@ -32,23 +32,24 @@ class StreamObserver {
   ~StreamObserver() = default;
 };
 
+class Registry;
+
 // One ring's share of max_streams, for a ring that is not in the Registry: a mirror's, a remote
-// writer's. Held while the object exists.
+// writer's. Held while the object exists. The registry outlives it.
 class RingQuota {
  public:
-  RingQuota() = default;
-  explicit RingQuota(std::uint64_t& used) noexcept : used_(&used) { ++used; }  // outlives it
-  RingQuota(RingQuota&& other) noexcept : used_(std::exchange(other.used_, nullptr)) {}
-  RingQuota& operator=(RingQuota&& other) noexcept {
-    std::swap(used_, other.used_);
-    return *this;
-  }
-  ~RingQuota() {
-    if (used_) --*used_;
-  }
+  RingQuota(RingQuota&& other) noexcept
+      : registry_(std::exchange(other.registry_, nullptr)), account_(std::move(other.account_)) {}
+  RingQuota& operator=(RingQuota&&) = delete;
+  inline ~RingQuota();
+
+  const std::string& account() const noexcept { return account_; }  // that is charged
 
  private:
-  std::uint64_t* used_ = nullptr;
+  friend class Registry;
+  inline RingQuota(Registry& registry, std::string account);
+  Registry* registry_;
+  std::string account_;
 };
 
 class Registry {
@@ -57,17 +58,20 @@ class Registry {
     std::uint64_t max_streams = 0;
     std::uint64_t max_memory_bytes = 0;
     std::uint64_t max_property_bytes = 0;
+    MaxShare max_share = {};  // of the first two
   };
 
   Registry(std::string host, const Limits& limits)
-      : host_(std::move(host)), limits_(limits), budget_(limits.max_memory_bytes) {}
+      : host_(std::move(host)),
+        limits_(limits),
+        budgets_(limits.max_memory_bytes, limits.max_share) {}
   Registry(const Registry&) = delete;
   Registry& operator=(const Registry&) = delete;
 
   // For new streams; existing ones stay.
   void set_limits(const Limits& limits) {
     limits_ = limits;
-    budget_.set_limit(limits.max_memory_bytes);
+    budgets_.set_limit(limits.max_memory_bytes, limits.max_share);
   }
 
   // Notified in the order in which they were added. Each outlives the registry or is removed
@@ -79,19 +83,28 @@ class Registry {
 
   const std::string& host() const noexcept { return host_; }
 
-  // After a restart of dssmd, programs give the streams back that they hold. Until all have had the
-  // time, the names of those that are missing are neither refused nor given to others.
-  void begin_recovery() noexcept { recovering_ = true; }
+  // After a restart of dssmd, programs say again which streams they have open, and give those back
+  // that dssmd has not. Until all have had the time, the names of streams that are missing are
+  // neither refused nor given to others, and no ring is taken for unused.
+  enum class Recovery : std::uint8_t {
+    over,
+    opens,    // all streams are here
+    streams,  // some may be missing
+  };
+  void begin_recovery(Recovery from) noexcept { recovery_ = from; }
   void end_recovery();
-  bool recovering() const noexcept { return recovering_; }
+  Recovery recovery() const noexcept { return recovery_; }
+  bool may_miss_streams() const noexcept { return recovery_ == Recovery::streams; }
   // Whether a stream of that name is missing and may still come back: who asks has to wait.
   bool may_come_back(const StreamId& id) const;
-  const MemoryBudget& budget() const noexcept { return budget_; }
+  const MemoryBudget& budget() const noexcept { return budgets_.total(); }
 
   // For rings that are not in the registry (mirrors, remote writers) but count like those that are.
   // The registry outlives the quotas.
-  MemoryBudget& budget() noexcept { return budget_; }
-  Result<RingQuota> acquire_quota();  // fails with limit_exceeded, naming the key
+  //   account  who is charged, as Identity::account(); empty: no one but all
+  MemoryBudgets& budgets() noexcept { return budgets_; }
+  // Fails with limit_exceeded, naming the key.
+  Result<RingQuota> acquire_quota(const std::string& account = {});
 
   // In the order of creation.
   const std::vector<std::shared_ptr<Stream>>& streams() const noexcept { return in_order_; }
@@ -104,7 +117,14 @@ class Registry {
   // Creates a stream, or gives the one of that name when the type fits.
   //   fails  invalid_argument, type_mismatch, limit_exceeded, os errors
   Result<OpenedRing> create(const StreamId& id, const TypeInfo& type, const History& history,
-                            std::int32_t creator_pid);
+                            std::int32_t creator_pid, const std::string& account = {});
+
+  // Creates a stream in place of the one of that name, which is removed when nothing can fail any
+  // more.
+  //   fails  not_found, invalid_argument, limit_exceeded, os errors; then the old one stays
+  Result<std::shared_ptr<Stream>> replace(const StreamId& id, const TypeInfo& type,
+                                          const History& history, std::int32_t creator_pid,
+                                          const std::string& account);
 
   // Takes back a stream that a client kept while no dssmd ran. Returns the registered stream when
   // it has the same ring.
@@ -120,24 +140,41 @@ class Registry {
   Result<void> remove(const StreamId& id);
 
   //   fails  not_found, limit_exceeded
-  Result<void> set_property(const StreamId& id, const std::string& property);
+  Result<void> set_property(const StreamId& id, const std::string& property,
+                            const std::string& account = {});
 
  private:
+  friend class RingQuota;
   using Key = std::pair<std::string, std::int32_t>;
   Result<StreamId> own_id(StreamId id) const;
-  Result<void> check_quota() const;
+  Result<void> check_quota(const std::string& account) const;
+  void charge_stream(const std::string& account);
+  void release_stream(const std::string& account) noexcept;
+  Result<std::shared_ptr<Stream>> make(const StreamId& own, const TypeInfo& type,
+                                       const History& history, std::int32_t creator_pid,
+                                       const std::string& account);
   Result<std::shared_ptr<Stream>> add_adopted(std::shared_ptr<Stream> stream);
   void add(std::shared_ptr<Stream> stream);
 
   std::string host_;
-  bool recovering_ = false;
+  Recovery recovery_ = Recovery::over;
   Limits limits_;
-  MemoryBudget budget_;            // before the streams, which hold shares of it
-  std::uint64_t other_rings_ = 0;  // that hold a RingQuota
+  MemoryBudgets budgets_;      // before the streams, which hold shares of them
+  std::uint64_t charged_ = 0;  // streams, and rings that hold a RingQuota; and by account:
+  std::map<std::string, std::uint64_t> charged_to_;
   std::map<Key, std::shared_ptr<Stream>> by_name_;
   std::vector<std::shared_ptr<Stream>> in_order_;
   std::uint64_t next_order_ = 1;
   std::vector<StreamObserver*> observers_;
 };
+
+inline RingQuota::RingQuota(Registry& registry, std::string account)
+    : registry_(&registry), account_(std::move(account)) {
+  registry.charge_stream(account_);
+}
+
+inline RingQuota::~RingQuota() {
+  if (registry_) registry_->release_stream(account_);
+}
 
 }  // namespace dssm::daemon

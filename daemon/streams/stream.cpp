@@ -48,6 +48,7 @@ local::StreamMeta meta_of(const Stream::Plan& plan) {
   wire::to_message(plan.id, *meta.mutable_id());
   wire::to_message(plan.type, *meta.mutable_type());
   meta.set_creator_pid(plan.creator_pid);
+  meta.set_account(plan.account);
   meta.set_created_order(plan.created_order);
   meta.set_purpose(static_cast<local::StreamMeta::Purpose>(plan.purpose));
   return meta;
@@ -90,6 +91,7 @@ Result<Stream::Plan> plan_untrusted(const local::StreamMeta& meta,
                       mapping.geometry().depth,
                       ring.cycle,
                       meta.creator_pid(),
+                      wire::text_untrusted(meta.account(), wire::kMaxSentenceBytes),
                       meta.created_order(),
                       static_cast<Purpose>(meta.purpose()),
                       ring.incarnation};
@@ -131,9 +133,9 @@ void fill_figures(const ring::RingMapping& mapping, StreamInfo& info) {
 
 }  // namespace
 
-Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& budget) {
+Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudgets& budgets) {
   const ring::Geometry geometry = DSSM_TRY(ring::Geometry::of(plan.type.payload_bytes, plan.depth));
-  MemoryShare share = DSSM_TRY(take_share(budget, plan.type, geometry));
+  MemoryShare share = DSSM_TRY(take_share(budgets.of(plan.account), plan.type, geometry));
   const std::uint64_t incarnation =
       DSSM_TRY(plan.incarnation != 0 ? Result(plan.incarnation) : new_incarnation());
   const ring::RingIdentity identity{plan.id, incarnation, plan.cycle, plan.type.alignment_bytes};
@@ -145,7 +147,8 @@ Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudget& b
                                             std::move(meta), std::move(mapping), std::move(share)));
 }
 
-Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, MemoryBudget& budget) {
+Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files,
+                                                        MemoryBudgets& budgets) {
   DSSM_TRY(check_own_memory_file(files.ring.get(), kSizeSeals, "ring"));
   DSSM_TRY(check_own_memory_file(files.bell.get(), kSizeSeals, "bell"));
   auto mapping =
@@ -155,6 +158,7 @@ Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files, Memo
   MetaFile meta = DSSM_TRY(MetaFile::open_untrusted(std::move(files.meta)));
   const local::StreamMeta content = DSSM_TRY(meta.read_untrusted());
   Plan plan = DSSM_TRY(plan_untrusted(content, *mapping));
+  MemoryBudget& budget = budgets.of(plan.account);
   MemoryShare share = DSSM_TRY(take_share(budget, plan.type, mapping->geometry()));
   MemoryShare property_share = DSSM_TRY(budget.take(content.property().size()));
   // Always a new one: writers get a descriptor that does not depend on the client's.

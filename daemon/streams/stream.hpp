@@ -75,6 +75,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
     std::uint64_t depth = 0;
     Duration cycle{};
     std::int32_t creator_pid = 0;
+    std::string account = {};  // of the creator: who is charged, as Identity::account()
     std::uint64_t created_order = 0;
     Purpose purpose = Purpose::own;
     std::uint64_t incarnation = 0;  // a mirror's is its owner's; 0: a new one
@@ -82,11 +83,12 @@ class Stream : public std::enable_shared_from_this<Stream> {
 
   // Creates the memory files, none of whose memory is taken yet but for three pages: the client
   // that asked reserves the ring's.
-  static Result<std::shared_ptr<Stream>> create(const Plan& plan, MemoryBudget& budget);
+  static Result<std::shared_ptr<Stream>> create(const Plan& plan, MemoryBudgets& budgets);
 
   // Restores a stream from its memory files, after checking owner, seals, geometry, and that ring
   // and meta file agree. For clients' offers and DescriptorStore.
-  static Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles files, MemoryBudget& budget);
+  static Result<std::shared_ptr<Stream>> adopt_untrusted(OfferedFiles files,
+                                                         MemoryBudgets& budgets);
 
   Stream(const Stream&) = delete;
   Stream& operator=(const Stream&) = delete;
@@ -97,6 +99,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
   const StreamId& id() const noexcept { return plan_.id; }
   const TypeInfo& type() const noexcept { return plan_.type; }
   std::int32_t creator_pid() const noexcept { return plan_.creator_pid; }
+  const std::string& account() const noexcept { return plan_.account; }
   std::uint64_t created_order() const noexcept { return plan_.created_order; }
   Purpose purpose() const noexcept { return plan_.purpose; }
   std::uint64_t incarnation() const noexcept { return mapping_->identity().incarnation; }

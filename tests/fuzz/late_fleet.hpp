@@ -23,11 +23,13 @@ class LateFleet final : public Fleet {
   void observe(Observer* observer) override { observer_ = observer; }
   bool is_there(const StreamId& id) const override { return pc2_.knows(id); }
 
-  void open_reader(const StreamId& id, bool, Then<std::shared_ptr<Stream>> then) override {
+  void open_reader(const StreamId& id, bool, const std::string&,
+                   Then<std::shared_ptr<Stream>> then) override {
     due_.push_back([this, id, then = std::move(then)] { then(ring(id)); });
   }
   void want_history(const StreamId&, bool) override {}
-  void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) override {
+  void open_writer(const StreamId& id, const CreatePlan* plan, const std::string&,
+                   Then<OpenedRing> then) override {
     if (plan) replace(id);
     due_.push_back([this, id, then = std::move(then)] {
       const Result<std::shared_ptr<Stream>> stream = ring(id);
@@ -35,8 +37,8 @@ class LateFleet final : public Fleet {
       then(OpenedRing{*stream, false});
     });
   }
-  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role,
-                                                  OfferedFiles files) override {
+  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role, OfferedFiles files,
+                                                  const std::string&) override {
     return pc2_.adopt_untrusted(id, std::move(files));
   }
   void forward(const StreamId& id, const local::Request& request,

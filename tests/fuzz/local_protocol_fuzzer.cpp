@@ -37,7 +37,7 @@ struct Daemon {
                  {.max_streams = 8, .max_memory_bytes = 1 << 20, .max_property_bytes = 4096}),
         opens({.max_opens = 16, .max_opens_per_client = 8}),
         service(registry, opens, clock, rights, logger, &fleet) {
-    if (recovering) registry.begin_recovery();
+    if (recovering) registry.begin_recovery(Registry::Recovery::streams);
   }
   LogRecorder logger;
   Registry registry;

@@ -6,12 +6,14 @@
 #include <dssm/clock.hpp>
 #include <dssm/describe.hpp>
 #include <dssm/error.hpp>
+#include <dssm/interpolate.hpp>
 #include <dssm/pconnector.hpp>
 #include <dssm/playback_clock.hpp>
 #include <dssm/reader.hpp>
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
 #include <dssm/sample_collector.hpp>
+#include <dssm/sample_or.hpp>
 #include <dssm/session.hpp>
 #include <dssm/stream.hpp>
 #include <dssm/time.hpp>

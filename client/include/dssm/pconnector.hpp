@@ -112,7 +112,8 @@ class PConnector {
   //            another type)
   Result<ReadStatus> read_newest(std::span<std::byte> payload, SampleInfo& info);
   Result<ReadStatus> read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info);
-  Result<ReadStatus> read_at(Time t, std::span<std::byte> payload, SampleInfo& info);
+  Result<ReadStatus> read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
+                             Duration max_age = kAnyAge);
   // The newest sample if its tid is above `than`, else not_yet.
   Result<ReadStatus> read_newer(Tid than, std::span<std::byte> payload, SampleInfo& info);
 
@@ -140,12 +141,13 @@ class PConnector {
   //            is recreated), invalid_argument (no subscription, size of `payload`)
   Result<ReadStatus> read_next(std::span<std::byte> payload, SampleInfo& info);
 
-  // Waits until read_next() has a sample or an error that is not retryable to return, or until the
-  // monotonic clock reaches `deadline`. It also returns `ready` when a large sample has arrived in
-  // part: read_next() may then return not_yet. Without a subscription it returns timeout at once.
-  // While data arrive fast it polls instead of sleeping, for up to 30 us at a time: always at
-  // 2 GB/s, for at most 5 % of the time at 100 MB/s.
+  // Waits until read_next() has a sample or an error that is not retryable to return, until the
+  // monotonic clock reaches `deadline`, or for `timeout`. It also returns `ready` when a large
+  // sample has arrived in part: read_next() may then return not_yet. Without a subscription it
+  // returns timeout at once. While data arrive fast it polls instead of sleeping, for up to 30 us
+  // at a time: always at 2 GB/s, for at most 5 % of the time at 100 MB/s.
   WaitStatus wait(MonoTime deadline);
+  WaitStatus wait(Duration timeout) { return wait(deadline_in(timeout)); }
 
   // Samples of the subscription that were lost: the owner's ring no longer held them when they were
   // to be sent; or they arrived while a call waited for an answer, and more than 16 MiB of such
@@ -177,10 +179,12 @@ class PConnector {
   Result<void> post(std::span<const std::byte> payload, Time time = WallClock::now(),
                     Duration clock_error = kOwnClockError);
 
-  // Waits until the owner has acknowledged all posted samples, at most until `deadline`.
+  // Waits until the owner has acknowledged all posted samples, at most until `deadline` or for
+  // `timeout`.
   //   returns  the tid of the last one; kNoTid when nothing was posted
   //   fails    unavailable (not all acknowledged by then; they are kept and sent later)
   Result<Tid> flush(MonoTime deadline);
+  Result<Tid> flush(Duration timeout) { return flush(deadline_in(timeout)); }
 
   // Posted samples that were dropped because a limit of the options was reached.
   std::uint64_t dropped_samples() const noexcept;

@@ -2,10 +2,11 @@
 //
 // Reading a stream. RawReader works on bytes; Reader<T> on a trivially copyable T.
 //
-// A reader has a cursor: the tid of the last sample it returned. read_next() and read_previous()
-// move relative to it, wait() waits for a sample after it. Each read_...() of a payload, and
-// borrow(), sets it when it returns `ok`; with any other result, cursor and arguments keep their
-// values.
+// A reader has a cursor: the tid of the last sample that it read by tid or in order. read_next()
+// and read_previous() move relative to it, wait() waits for a sample after it. read_newest(),
+// read_tid(), read_next(), read_previous() and borrow() set it when they return `ok`. Reads by time
+// leave it, so that a program can read the past while it follows the stream; seek(info.tid) goes to
+// what they returned. With a result other than `ok`, cursor and arguments keep their values.
 //
 //   threads   one reader belongs to one thread at a time; any number of readers, in any processes,
 //             may read one stream beside its writers
@@ -24,6 +25,7 @@
 #include <cstddef>
 #include <dssm/describe.hpp>
 #include <dssm/sample.hpp>
+#include <dssm/sample_or.hpp>
 #include <dssm/stream.hpp>
 #include <memory>
 #include <optional>
@@ -108,18 +110,21 @@ class RawReader {
 
   // --- reading by time
 
-  // All of these, find() and find_neighbours() included, return clock_out_of_bounds for a sample of
-  // another host whose time may be further from this PC's clock than dssmd's keys clock_policy and
-  // clock_limit allow. Reads by tid never do: use clock_in_bounds() there.
+  // None of these moves the cursor. All return clock_out_of_bounds for a sample of another host
+  // whose time may be further from this PC's clock than dssmd's keys clock_policy and clock_limit
+  // allow. Reads by tid never do: use clock_in_bounds() there.
   //
   // They are exact for every sequence of times, also one that runs backwards (docs/ring-layout.md
   // "Search by time"). "The newest sample" is the one with the greatest tid.
   //   cost     O(1) on a regular stream, else O(log depth)
 
   // Copies the newest sample with time <= `t` that is not lost; the newest sample of all for any
-  // `t` after it.
-  //   returns  ok | not_yet (nothing written) | too_old (all samples are later than `t`) | lapped
-  ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
+  // `t` after it, however old it is then, unless there is a `max_age`.
+  //   max_age  >= 0: of the sample at `t`, which is t - info.time
+  //   returns  ok | not_yet (nothing written) | too_old (all samples are later than `t`) | lapped |
+  //            stale (the sample is older than `max_age`)
+  ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
+                     Duration max_age = kAnyAge) noexcept;
 
   // Copies the first sample from which on all samples have time >= `t`: the first one with
   // time >= t on a stream whose times do not run backwards.
@@ -131,8 +136,14 @@ class RawReader {
   //   returns  ok | not_yet (nothing written) | lapped
   ReadStatus read_nearest(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
 
-  // The infos of the two neighbours of `t`; read_tid() reads their payloads. Keeps the cursor.
-  //   returns  ok | not_yet (no sample after `t` yet, or nothing written) | too_old | lapped
+  // Copies the two neighbours of `t`, for interpolation (dssm/interpolate.hpp).
+  //   before, after  as `payload`
+  //   returns        ok | not_yet (no sample after `t` yet, or nothing written) | too_old | lapped
+  ReadStatus read_neighbours(Time t, std::span<std::byte> before, std::span<std::byte> after,
+                             Neighbours& infos) noexcept;
+
+  // The infos of the two neighbours of `t`, without their payloads.
+  //   returns  as read_neighbours()
   ReadStatus find_neighbours(Time t, Neighbours& out) const noexcept;
 
   // The bound [ns, >= 0] on the distance of info.time from this PC's clock: info.clock_error plus
@@ -153,11 +164,11 @@ class RawReader {
   //   returns  ok | not_yet | too_old
   ReadStatus read_info(Tid tid, SampleInfo& info) const noexcept;
 
-  // The info of the sample that read_at() would copy. Keeps the cursor.
+  // The info of the sample that read_at() without `max_age` would copy. Keeps the cursor.
   //   returns  as read_at()
   ReadStatus find(Time t, SampleInfo& info) const noexcept;
 
-  // The cursor: the tid of the last sample read; kNoTid on a new reader.
+  // The cursor: the tid of the last sample read by tid or in order; kNoTid on a new reader.
   Tid cursor() const noexcept;
 
   // Sets the cursor to `tid`, so that read_next() returns tid + 1; kNoTid: read_next() starts at
@@ -185,16 +196,26 @@ class RawReader {
 
   // --- waiting
 
-  // Waits until there is a sample after the cursor, the stream has restarted, or the monotonic
-  // clock reaches `deadline` (kNever: no limit; a deadline in the past: only checks). After
-  // read_next() returned not_yet: until it has something else to return.
+  // Each of these waits until `deadline` of the monotonic clock (kNever: no limit; one in the past:
+  // only checks), which may be a std::chrono::steady_clock::time_point, or for `timeout`.
+
+  // Waits until there is a sample after the cursor, or the stream has restarted. After read_next()
+  // returned not_yet: until it has something else to return. A program that only reads by time,
+  // which does not move the cursor, waits for newest_tid() + 1 instead.
   WaitStatus wait(MonoTime deadline) noexcept;
+  WaitStatus wait(Duration timeout) noexcept { return wait(deadline_in(timeout)); }
 
   // The same for newest_tid() >= `tid`. One thread may call it while another one reads.
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
+  WaitStatus wait_for_tid(Tid tid, Duration timeout) noexcept {
+    return wait_for_tid(tid, deadline_in(timeout));
+  }
   // The same until sample `tid` is here or never will be: of a stream of another host it may be
   // `arriving` when newer ones are here.
   WaitStatus wait_for_sample(Tid tid, MonoTime deadline) noexcept;
+  WaitStatus wait_for_sample(Tid tid, Duration timeout) noexcept {
+    return wait_for_sample(tid, deadline_in(timeout));
+  }
 
   // A descriptor for poll(), epoll or an event library: readable when there may be samples newer
   // than at the last clear_ready(). On wake-up call clear_ready(), then read_next() until it
@@ -220,8 +241,8 @@ class RawReader {
 
  private:
   friend class Session;
-  friend JointRead read_joint_at(Time t, std::span<JointSample> samples,
-                                 Duration max_error) noexcept;
+  friend JointRead read_joint_at(Time t, std::span<JointSample> samples, Duration max_error,
+                                 Duration max_age) noexcept;
   friend WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
   explicit RawReader(std::unique_ptr<detail::ReaderState> state) noexcept;
   std::unique_ptr<detail::ReaderState> state_;
@@ -246,21 +267,27 @@ struct JointRead {
 // Copies from each stream the sample that read_at(t) copies: from all of them or from none.
 //   max_error  >= 0: greatest bound accepted on the distance of a sample's time from this PC's
 //              clock
+//   max_age    as in read_at(), of each sample
 //   returns    as read_at(), restarted included; clock_out_of_bounds also when a bound exceeds
-//              max_error. Unless ok, payloads and infos are unspecified, and cursors keep their
-//              values. What follows a sample that is shorter than its stream's is 0
+//              max_error. Unless ok, payloads and infos are unspecified. Cursors keep their values.
+//              What follows a sample that is shorter than its stream's is 0
 //   threads    each reader belongs to the calling thread
 //   cost       as one read_at() per stream
 JointRead read_joint_at(Time t, std::span<JointSample> samples,
-                        Duration max_error = kUnknownClockError) noexcept;
+                        Duration max_error = kUnknownClockError,
+                        Duration max_age = kAnyAge) noexcept;
 
-// Waits until wait() of one of `readers` would return `ready`, or until `deadline`. 1 to
-// kMaxWaitAny readers, all of the calling thread.
+// Waits until wait() of one of `readers` would return `ready`, until `deadline` or for `timeout`. 1
+// to kMaxWaitAny readers, all of the calling thread.
 inline constexpr std::size_t kMaxWaitAny = 128;  // FUTEX_WAITV_MAX of Linux
 WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noexcept;
+inline WaitStatus wait_any(std::span<RawReader* const> readers, Duration timeout) noexcept {
+  return wait_any(readers, deadline_in(timeout));
+}
 
 // The same with a T in place of bytes: what a sample does not have, because a RawWriter wrote fewer
-// bytes, is 0. Everything not listed here is as in RawReader.
+// bytes, is 0. Everything not listed here is as in RawReader. Each read comes in two forms: into
+// variables of the caller, and with the sample as its result (dssm/sample_or.hpp).
 template <Payload T>
 class Reader : public RawReader {
  public:
@@ -278,14 +305,47 @@ class Reader : public RawReader {
   ReadStatus read_previous(T& out, SampleInfo& info) noexcept {
     return complete(RawReader::read_previous(bytes(out), info), out, info);
   }
-  ReadStatus read_at(Time t, T& out, SampleInfo& info) noexcept {
-    return complete(RawReader::read_at(t, bytes(out), info), out, info);
+  ReadStatus read_at(Time t, T& out, SampleInfo& info, Duration max_age = kAnyAge) noexcept {
+    return complete(RawReader::read_at(t, bytes(out), info, max_age), out, info);
   }
   ReadStatus read_at_or_after(Time t, T& out, SampleInfo& info) noexcept {
     return complete(RawReader::read_at_or_after(t, bytes(out), info), out, info);
   }
   ReadStatus read_nearest(Time t, T& out, SampleInfo& info) noexcept {
     return complete(RawReader::read_nearest(t, bytes(out), info), out, info);
+  }
+
+  SampleOr<T> read_newest() noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_newest(out.value, out.info); });
+  }
+  SampleOr<T> read_tid(Tid n) noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_tid(n, out.value, out.info); });
+  }
+  SampleOr<T> read_next() noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_next(out.value, out.info); });
+  }
+  SampleOr<T> read_previous() noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_previous(out.value, out.info); });
+  }
+  SampleOr<T> read_at(Time t, Duration max_age = kAnyAge) noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_at(t, out.value, out.info, max_age); });
+  }
+  SampleOr<T> read_at_or_after(Time t) noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_at_or_after(t, out.value, out.info); });
+  }
+  SampleOr<T> read_nearest(Time t) noexcept {
+    return SampleOr<T>([&](Sample<T>& out) { return read_nearest(t, out.value, out.info); });
+  }
+  ReadOr<NeighbourSamples<T>> read_neighbours(Time t) noexcept {
+    return ReadOr<NeighbourSamples<T>>([&](NeighbourSamples<T>& out) {
+      Neighbours infos;
+      const ReadStatus status =
+          RawReader::read_neighbours(t, bytes(out.before.value), bytes(out.after.value), infos);
+      out.before.info = infos.before;
+      out.after.info = infos.after;
+      (void)complete(status, out.before.value, infos.before);
+      return complete(status, out.after.value, infos.after);
+    });
   }
 
   // This reader's part of a read_joint_at(), which copies the sample to `out`.

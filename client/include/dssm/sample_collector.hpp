@@ -66,8 +66,11 @@ class SampleCollector {
   //   returns  ok | not_yet (tid > newest_tid()) | too_old (tid < oldest_tid())
   ReadStatus read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) const noexcept;
   // Copies the newest sample with time <= `t`.
-  //   returns  ok | not_yet (nothing has arrived) | too_old (all samples are later) | lapped
-  ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info) const noexcept;
+  //   max_age  >= 0: of the sample at `t`, which is t - info.time
+  //   returns  ok | not_yet (nothing has arrived) | too_old (all samples are later) | lapped |
+  //            stale (the sample is older than `max_age`)
+  ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
+                     Duration max_age = kAnyAge) const noexcept;
   // Copies the newest sample if its tid is above `than`.
   //   returns  ok | not_yet | lapped
   ReadStatus read_newer(Tid than, std::span<std::byte> payload, SampleInfo& info) const noexcept;

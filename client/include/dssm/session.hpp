@@ -148,6 +148,14 @@ enum class FetchHistory : std::uint8_t {
   at_once,  // and the open returns when it is here, or after 1 s; without it while the host is away
 };
 
+// How a stream is created.
+struct CreateOptions {
+  // An existing stream of that type keeps its ring, also with less history than is asked for; one
+  // of another type is never replaced.
+  bool keep_existing = false;
+  std::uint32_t tag = 0;  // stored with the open, see OpenInfo
+};
+
 // A handle; copies share one connection.
 class Session {
  public:
@@ -168,13 +176,15 @@ class Session {
   // stream of that name if there is one, else the only known stream of that name on another host.
   // create without a host creates on this PC. Local and remote streams are read and written alike.
 
-  // Creates the stream and opens it for writing. An existing stream with the same payload size
-  // keeps its ring and its history, and the writer continues its tids.
-  //   tag    stored with the open, see OpenInfo
-  //   fails  invalid_argument (name, sizes), type_mismatch (exists with another size or type),
-  //          limit_exceeded, no_memory, conflict (several hosts have a stream of that name)
+  // Creates the stream and opens it for writing. An existing stream of that type
+  // (TypeInfo::check_usable_as()) with at least that history keeps its ring, and the writer
+  // continues its tids; RawWriter::depth() and cycle() tell what it has. With another type, or with
+  // less history, its ring is replaced by a new one if no process has it open.
+  //   fails  invalid_argument (name, sizes), type_mismatch (exists with another type and is open),
+  //          conflict (exists with less history and is open; several hosts have a stream of that
+  //          name), limit_exceeded, no_memory
   Result<RawWriter> create_raw(const StreamId& id, const TypeInfo& type, const History& history,
-                               std::uint32_t tag = 0);
+                               const CreateOptions& options = {});
 
   // Opens an existing stream. With `wanted`, fails with type_mismatch unless
   // TypeInfo::check_usable_as(wanted).
@@ -186,27 +196,34 @@ class Session {
                                     std::uint32_t tag = 0,
                                     FetchHistory history = FetchHistory::when_read);
 
-  // Opens a stream for reading. Repeats, until `deadline`, what fails with an error that
-  // is_retryable(): waits for the stream to be created, for its host to answer, and for the clocks
-  // of both PCs to be good enough.
+  // Opens a stream for reading. Repeats, until `deadline` or for `timeout`, what fails with an
+  // error that is_retryable(): waits for the stream to be created, for its host to answer, and for
+  // the clocks of both PCs to be good enough.
   //   fails  as open_raw_reader(): at once with an error that is not retryable, at the deadline
   //          with the last one
   Result<RawReader> await_raw_reader(const StreamId& id, MonoTime deadline,
                                      const TypeInfo* wanted = nullptr,
                                      FetchHistory history = FetchHistory::when_read);
+  Result<RawReader> await_raw_reader(const StreamId& id, Duration timeout,
+                                     const TypeInfo* wanted = nullptr,
+                                     FetchHistory history = FetchHistory::when_read) {
+    return await_raw_reader(id, deadline_in(timeout), wanted, history);
+  }
 
   // The same with a type; `name` is parsed by StreamId::parse(), whose errors they also return.
   // create() with a duration also returns those of History::for_life().
   template <Payload T>
-  Result<Writer<T>> create(std::string_view name, const History& history) {
+  Result<Writer<T>> create(std::string_view name, const History& history,
+                           const CreateOptions& options = {}) {
     return typed<Writer<T>>(
-        name, [&](const StreamId& id) { return create_raw(id, type_of<T>(), history); });
+        name, [&](const StreamId& id) { return create_raw(id, type_of<T>(), history, options); });
   }
   template <Payload T>
-  Result<Writer<T>> create(std::string_view name, Duration life, Duration cycle) {
+  Result<Writer<T>> create(std::string_view name, Duration life, Duration cycle,
+                           const CreateOptions& options = {}) {
     Result<History> history = History::for_life(life, cycle);
     if (!history) return std::move(history).error();
-    return create<T>(name, *history);
+    return create<T>(name, *history, options);
   }
   template <Payload T>
   Result<Writer<T>> open_writer(std::string_view name) {
@@ -226,6 +243,11 @@ class Session {
     const TypeInfo type = type_of<T>();
     return typed<Reader<T>>(
         name, [&](const StreamId& id) { return await_raw_reader(id, deadline, &type, history); });
+  }
+  template <Payload T>
+  Result<Reader<T>> await_reader(std::string_view name, Duration timeout,
+                                 FetchHistory history = FetchHistory::when_read) {
+    return await_reader<T>(name, deadline_in(timeout), history);
   }
 
   // Removes a stream: it leaves the list at once and can be created again. Processes that have it

@@ -66,7 +66,7 @@ SSM_sid createSSM(const char* stream_name, int stream_id, size_t stream_size, ss
   auto writer = process().request([&](dssm::Session& dssmd) {
     return dssmd.create_raw(dssm::ssm::stream_id(stream_name, stream_id),
                             dssm::ssm::type_for(stream_size), dssm::ssm::history_of(life, cycle),
-                            dssm::ssm::kTagHidden);
+                            {.keep_existing = true, .tag = dssm::ssm::kTagHidden});
   });
   if (!writer) return dssm::ssm::report_failure(what, writer.error()), nullptr;
   const std::uint64_t bytes = dssm::ssm::data_bytes(writer->type());

@@ -39,7 +39,8 @@ Result<void> Broadcast::show(std::span<const std::byte> block) {
   Session* const local = DSSM_TRY(connect());
   if (!stream) {
     stream = DSSM_TRY(local->create_raw(kBroadcast, TypeInfo{{}, 1, 1, {}},
-                                        History{kMinDepth, std::chrono::seconds(1)}));
+                                        History{kMinDepth, std::chrono::seconds(1)},
+                                        {.keep_existing = true}));
   }
   return stream->set_property(block);
 }

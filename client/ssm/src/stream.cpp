@@ -249,15 +249,14 @@ ReadStatus Stream::skip_lost(Tid& tid) noexcept {
 }
 
 WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
-  return wait_for(tid, &RawReader::wait_for_tid, deadline);
+  return wait_for(tid, false, deadline);
 }
 
 WaitStatus Stream::wait_for_sample(Tid tid, MonoTime deadline) noexcept {
-  return wait_for(tid, &RawReader::wait_for_sample, deadline);
+  return wait_for(tid, true, deadline);
 }
 
-WaitStatus Stream::wait_for(Tid tid, WaitStatus (RawReader::*wait)(Tid, MonoTime),
-                            MonoTime deadline) noexcept {
+WaitStatus Stream::wait_for(Tid tid, bool exactly, MonoTime deadline) noexcept {
   RawReader* const open = reader();
   if (!open) {  // nothing to sleep on; the caller checks again
     const timespec sleep = timespec_of(deadline - MonoClock::now());
@@ -265,12 +264,12 @@ WaitStatus Stream::wait_for(Tid tid, WaitStatus (RawReader::*wait)(Tid, MonoTime
   }
   // Without the lock, so that other threads may read meanwhile: a wait for a given tid uses nothing
   // of the reader that reading changes.
-  const WaitStatus status = (open->*wait)(tid - offset(), deadline);
+  const WaitStatus status = exactly ? open->wait_for_sample(tid - offset(), deadline)
+                                    : open->wait_for_tid(tid - offset(), deadline);
   // A new ring ends the wait as well: let the caller check again, but not in a tight loop while the
   // new ring cannot be opened.
   const auto is_arriving = [&](Tid next) { return skip_lost(next) == ReadStatus::arriving; };
-  if (status == WaitStatus::ready &&
-      (newest() < tid || (wait == &RawReader::wait_for_sample && is_arriving(tid)))) {
+  if (status == WaitStatus::ready && (newest() < tid || (exactly && is_arriving(tid)))) {
     const timespec pause{0, 1'000'000};
     ::nanosleep(&pause, nullptr);
   }

@@ -92,8 +92,8 @@ class Stream {
   void reset_after_fork() noexcept;
 
  private:
-  WaitStatus wait_for(Tid tid, WaitStatus (RawReader::*wait)(Tid, MonoTime),
-                      MonoTime deadline) noexcept;
+  // `exactly`: until sample `tid` is settled, else until one of that tid or a later one is here.
+  WaitStatus wait_for(Tid tid, bool exactly, MonoTime deadline) noexcept;
   template <class End, class Open>
   End* end_of(std::atomic<End*>& place, ReentrantLock& lock, Open open) noexcept;
   RawReader* reader() noexcept;

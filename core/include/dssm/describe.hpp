@@ -69,6 +69,13 @@ consteval Scalar scalar_of() {
   }
 }
 
+// The number of macro arguments whose text this is: names, so no comma is inside of one.
+consteval std::size_t arguments_in(std::string_view text) {
+  std::size_t count = text.empty() ? 0 : 1;
+  for (const char c : text) count += c == ',';
+  return count;
+}
+
 template <class T>
 struct ArrayOf {
   using Element = std::remove_cv_t<T>;
@@ -132,14 +139,14 @@ TypeInfo type_of() {
 }  // namespace dssm
 #pragma GCC visibility pop
 
-// One step of a loop over macro arguments; 4^4 rescans allow 64 members and more.
+// A loop over macro arguments: each rescan of its text expands one more step, and these are 85.
 #define DSSM_DETAIL_PARENS ()
 #define DSSM_DETAIL_EXPAND(...) \
-  DSSM_DETAIL_EXPAND3(DSSM_DETAIL_EXPAND3(DSSM_DETAIL_EXPAND3(__VA_ARGS__)))
+  DSSM_DETAIL_EXPAND3(DSSM_DETAIL_EXPAND3(DSSM_DETAIL_EXPAND3(DSSM_DETAIL_EXPAND3(__VA_ARGS__))))
 #define DSSM_DETAIL_EXPAND3(...) \
-  DSSM_DETAIL_EXPAND2(DSSM_DETAIL_EXPAND2(DSSM_DETAIL_EXPAND2(__VA_ARGS__)))
+  DSSM_DETAIL_EXPAND2(DSSM_DETAIL_EXPAND2(DSSM_DETAIL_EXPAND2(DSSM_DETAIL_EXPAND2(__VA_ARGS__))))
 #define DSSM_DETAIL_EXPAND2(...) \
-  DSSM_DETAIL_EXPAND1(DSSM_DETAIL_EXPAND1(DSSM_DETAIL_EXPAND1(__VA_ARGS__)))
+  DSSM_DETAIL_EXPAND1(DSSM_DETAIL_EXPAND1(DSSM_DETAIL_EXPAND1(DSSM_DETAIL_EXPAND1(__VA_ARGS__))))
 #define DSSM_DETAIL_EXPAND1(...) __VA_ARGS__
 #define DSSM_DETAIL_FIELDS(...) __VA_OPT__(DSSM_DETAIL_EXPAND(DSSM_DETAIL_FIELD(__VA_ARGS__)))
 #define DSSM_DETAIL_FIELD(member, ...)                                                  \
@@ -148,10 +155,12 @@ TypeInfo type_of() {
   __VA_OPT__(DSSM_DETAIL_FIELD_AGAIN DSSM_DETAIL_PARENS(__VA_ARGS__))
 #define DSSM_DETAIL_FIELD_AGAIN() DSSM_DETAIL_FIELD
 
-#define DSSM_DESCRIBE(Type, ...)                                        \
-  [[maybe_unused]] inline ::dssm::TypeInfo dssm_describe(const Type*) { \
-    using DssmSelf = Type;                                              \
-    ::dssm::TypeInfo dssm_type{#Type, sizeof(Type), alignof(Type), {}}; \
-    DSSM_DETAIL_FIELDS(__VA_ARGS__)                                     \
-    return dssm_type;                                                   \
+#define DSSM_DESCRIBE(Type, ...)                                                              \
+  [[maybe_unused]] inline ::dssm::TypeInfo dssm_describe(const Type*) {                       \
+    static_assert(::dssm::detail::arguments_in(#__VA_ARGS__) <= 64,                           \
+                  "DSSM_DESCRIBE takes up to 64 members: group some in a struct of its own"); \
+    using DssmSelf = Type;                                                                    \
+    ::dssm::TypeInfo dssm_type{#Type, sizeof(Type), alignof(Type), {}};                       \
+    DSSM_DETAIL_FIELDS(__VA_ARGS__)                                                           \
+    return dssm_type;                                                                         \
   }

@@ -57,6 +57,16 @@ class [[nodiscard]] Result {
   const T& value() const& { return check(), **this; }
   T value() && { return check(), *std::move(*this); }
 
+  // The value, or `fallback` where there is an error.
+  template <class U>
+  T value_or(U&& fallback) const& {
+    return has_value() ? **this : static_cast<T>(std::forward<U>(fallback));
+  }
+  template <class U>
+  T value_or(U&& fallback) && {
+    return has_value() ? *std::move(*this) : static_cast<T>(std::forward<U>(fallback));
+  }
+
  private:
   void check() const {
     if (!has_value()) throw BadResult(error());

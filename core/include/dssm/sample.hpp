@@ -44,6 +44,7 @@ enum class [[nodiscard]] ReadStatus : std::uint8_t{
     arriving,  // of another host's stream: the sample is still there only, or it is not known yet
                // which one it is; from now on it is on its way
     lost,      // of another host's stream: the network could not carry it, and it will never come
+    stale,     // reads by time with a maximum age: the sample is older
 };
 
 // Outcomes of a wait.

@@ -88,9 +88,13 @@ struct TypeInfo {
   // "Odometry (40 bytes, aligned to 8)" or "40 bytes".
   std::string str() const;
 
-  // Whether a program that expects `wanted` may use this stream: same size, and same name and
-  // alignment where both have a name.
-  //   fails  type_mismatch, naming both types
+  // The same with the first fields: "'Odometry' (40 bytes, aligned to 8) { float64 x at 0; float64
+  // v[2] at 24; }".
+  std::string description() const;
+
+  // Whether a program that expects `wanted` may use this stream: same size, same name and alignment
+  // where both have a name, and the same fields where both are described.
+  //   fails  type_mismatch, with both descriptions and the first difference
   Result<void> check_usable_as(const TypeInfo& wanted) const;
 
   // Checks sizes, alignment (a power of two up to 64) and that each field lies inside the payload.

@@ -25,8 +25,7 @@ dssm::Result<std::optional<dssm::Reader<T>>> open_when_there(dssm::Session& sess
                                                              const char* stream,
                                                              Progress& progress) {
   for (bool reported = false; !stop_requested(); reported = true) {
-    dssm::Result<dssm::Reader<T>> reader =
-        session.await_reader<T>(stream, dssm::deadline_in(kSlice));
+    dssm::Result<dssm::Reader<T>> reader = session.await_reader<T>(stream, kSlice);
     if (reader) return std::optional<dssm::Reader<T>>(std::move(*reader));
     const dssm::Errc code = reader.error().code;
     if (code != dssm::Errc::not_found && code != dssm::Errc::unavailable) {
@@ -50,7 +49,7 @@ void seek_to_drive(dssm::Reader<T>& reader, bool late) {
     dssm::ReadStatus status = reader.read_tid(tid, sample, info);
     // From another PC the newest samples come first.
     while (status == dssm::ReadStatus::arriving && !stop_requested()) {
-      (void)reader.wait_for_sample(tid, dssm::deadline_in(kSlice));
+      (void)reader.wait_for_sample(tid, kSlice);
       status = reader.read_tid(tid, sample, info);
     }
     if (status == dssm::ReadStatus::lost) continue;

@@ -67,7 +67,7 @@ int main(int argc, char** argv) {
   dssm::SampleInfo info;
   while (!vehicle::stop_requested()) {
     if (lidar.read_next(scan, info) != dssm::ReadStatus::ok) {
-      (void)lidar.wait(dssm::deadline_in(vehicle::kSlice));
+      (void)lidar.wait(vehicle::kSlice);
       continue;
     }
     if (scan.is_end()) break;

@@ -80,7 +80,7 @@ int main(int argc, char** argv) {
                        " s and no end mark: the map shows the poses until then");
         break;
       }
-      (void)poses.wait(dssm::deadline_in(vehicle::kSlice));
+      (void)poses.wait(vehicle::kSlice);
       continue;
     }
     deadline = dssm::deadline_in(timeout);

@@ -3,7 +3,6 @@
 // "What did the encoder measure when this scan was taken?": the main purpose of DSSM.
 #pragma once
 
-#include <cstdint>
 #include <dssm/reader.hpp>
 #include <optional>
 
@@ -23,15 +22,9 @@ class OdometryAt {
   std::optional<Pose2> at(dssm::Time t);
 
  private:
-  std::optional<Pose2> between(dssm::Time t, const dssm::Neighbours& readings);
-  // Moves the reader to a restarted stream's new ring, which find_neighbours() does not do because
-  // it does not move the cursor. True if there was a restart.
-  bool follow_restart();
-
   dssm::Reader<Odometry> reader_;
   dssm::Duration deadline_;
   dssm::Tid newest_at_start_;
-  std::uint64_t restarts_ = 0;  // of the reader, handled so far
 };
 
 }  // namespace vehicle

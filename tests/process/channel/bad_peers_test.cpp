@@ -289,6 +289,28 @@ TEST(BadPeers, AreCounted) {
   EXPECT_TRUE(two.ask(list_frame()).has_stream_list());
 }
 
+TEST(BadPeers, ThatTakeAllPlacesKeepOutNoConfiguredPeer) {
+  const DaemonProcess daemon({"--max-connections", "2", "--peer", "127.0.0.1:1"});
+  const wire::SocketAddress at =
+      wire::resolve_number(wire::Address::parse(daemon.address()).value()).at(0);
+  const wire::SocketAddress from =
+      wire::resolve_number(wire::Address::parse("127.0.0.2:0", 0, true).value()).at(0);
+  const auto connect = [&] {
+    UniqueFd socket(::socket(AF_INET, SOCK_STREAM | SOCK_CLOEXEC, 0));
+    EXPECT_EQ(::bind(socket.get(), from.get(), from.length), 0);
+    EXPECT_EQ(::connect(socket.get(), at.get(), at.length), 0);
+    return NetworkPeer(std::move(socket));
+  };
+  NetworkPeer silent[] = {connect(), connect()};
+  NetworkPeer others[] = {connect(), connect()};
+  EXPECT_NE(silent[0].final_failure().find("it has sent no Hello"), std::string::npos);
+  for (NetworkPeer& other : others) EXPECT_FALSE(other.greet());
+  EXPECT_NE(connect().final_failure().find("max_connections = 2"), std::string::npos);
+  NetworkPeer configured = NetworkPeer::greeted(daemon.address());
+  EXPECT_TRUE(configured.ask(list_frame()).has_stream_list());
+  for (NetworkPeer& other : others) EXPECT_TRUE(other.ask(list_frame()).has_stream_list());
+}
+
 TEST(BadPeers, ThatComeAndGoDoNotFillTheLog) {
   const std::string dir = make_temp_dir();
   int ends[2];

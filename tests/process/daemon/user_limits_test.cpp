@@ -90,6 +90,32 @@ TEST_F(UserLimits, OnClientsChangeAtAReload) {
   EXPECT_TRUE(eventually([&] { return refusal().empty(); }));
 }
 
+// The share of each limit that one user may take.
+TEST_F(UserLimits, LeaveStreamsMemoryAndOpensToOthers) {
+  configure("max_streams = 4\nmax_opens = 8\nmax_memory = \"1 MiB\"\nmax_share = \"50%\"");
+  ASSERT_EQ(::kill(daemon_->pid(), SIGHUP), 0);
+  ASSERT_TRUE(eventually([&] { return limit("max_streams of one user or host").limit() == 2; }));
+  const auto create = [](RawClient& client, const std::string& name, std::uint64_t payload_bytes) {
+    local::Request request = create_request(name);
+    request.mutable_create()->mutable_type()->set_payload_bytes(payload_bytes);
+    request.mutable_create()->mutable_type()->clear_fields();
+    return client.ask(request).response.failure().message();
+  };
+  RawClient nobody = client_of_nobody(), root = client_of_root();
+  const auto contains = [](const std::string& text, const std::string& words) {
+    return text.find(words) != std::string::npos;
+  };
+  EXPECT_TRUE(contains(create(nobody, "large", 50'000),
+                       "are left of the 524288 that user 65534 may take of max_memory"));
+  EXPECT_EQ(create(nobody, "a", 8), "");
+  EXPECT_EQ(create(nobody, "b", 8), "");
+  EXPECT_TRUE(contains(create(nobody, "c", 8), "user 65534 has 2 streams already"));
+  for (int i = 0; i < 2; ++i) EXPECT_EQ(create(nobody, "a", 8), "") << "it exists";
+  EXPECT_TRUE(contains(create(nobody, "a", 8), "programs of user 65534 have 4 streams open"));
+  EXPECT_EQ(create(root, "c", 8), "");
+  EXPECT_EQ(create(root, "large", 50'000), "");
+}
+
 TEST_F(UserLimits, OnLongRequestsLeaveMemoryForOthers) {
   configure("");
   ASSERT_EQ(::kill(daemon_->pid(), SIGHUP), 0);

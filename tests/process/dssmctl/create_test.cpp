@@ -42,6 +42,9 @@ TEST_F(Create, KeepsAStreamThatIsThereAlready) {
   EXPECT_EQ(again["created"], false);
   EXPECT_EQ(again["depth"], 10);
   EXPECT_EQ(session_.stream_info({"s", 0, ""}).value().incarnation, incarnation);
+  EXPECT_EQ(output({"create", "s", "--size", "24", "--depth", "99"}),
+            "s:0@pc1: exists already, kept with 10 slots of 24 bytes, fewer than the 99 asked for; "
+            "remove it first to get those\n");
 }
 
 TEST_F(Create, RefusesAnotherSizeNamingBoth) {

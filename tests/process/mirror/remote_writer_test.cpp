@@ -44,6 +44,9 @@ TEST_F(RemoteWriter, ContinuesTheTidsOfAnExistingStream) {
   auto reader = here.open_reader<Numbered>("goal").value();
   ASSERT_EQ(reader.wait_for_tid(8, kNever), WaitStatus::ready);
   EXPECT_EQ(channels("goal"), 1u);
+  const auto longer = there.create<Numbered>("goal@pc1", History{kLong.depth + 1, kLong.cycle});
+  ASSERT_FALSE(longer);
+  EXPECT_EQ(longer.error().code, Errc::conflict) << longer.error().message;
 }
 
 TEST_F(RemoteWriter, IsReadOnItsOwnPcAsOnAnyOther) {

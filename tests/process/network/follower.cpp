@@ -45,8 +45,9 @@ void Follower::take(int most) {
         last_ = kNoTid;
         break;
       case ReadStatus::not_yet:
-      case ReadStatus::clock_out_of_bounds:  // not of reads by tid
-      case ReadStatus::lapped:               // repeatedly; the next call continues
+      case ReadStatus::clock_out_of_bounds:  // this one and the next are not of reads by tid
+      case ReadStatus::stale:
+      case ReadStatus::lapped:  // repeatedly; the next call continues
         return;
       case ReadStatus::too_old:
       case ReadStatus::arriving:

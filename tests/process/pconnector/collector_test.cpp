@@ -96,8 +96,10 @@ TEST_F(SampleCollection, ReadsAsALocalReaderDoes) {
     const ReadStatus by_tid = collector.read_tid(tid, sample.span(), info);
     ASSERT_EQ(by_tid, local.read_tid(tid, here, info_here));
     if (by_tid == ReadStatus::ok) expect_sample(tid, tid);
-    const ReadStatus by_time = collector.read_at(time, sample.span(), info);
-    ASSERT_EQ(by_time, local.read_at(time, here, info_here));
+    const Duration age =
+        i % 2 ? kAnyAge : Duration(static_cast<std::int64_t>(random() % 2'000'000));
+    const ReadStatus by_time = collector.read_at(time, sample.span(), info, age);
+    ASSERT_EQ(by_time, local.read_at(time, here, info_here, age));
     if (by_time == ReadStatus::ok) expect_sample(info_here.tid, info_here.tid);
     SampleInfo found;
     const bool is_there = local.find(time, found) == ReadStatus::ok;
@@ -105,6 +107,11 @@ TEST_F(SampleCollection, ReadsAsALocalReaderDoes) {
   }
   EXPECT_EQ(collector.newest_tid(), 199);
   EXPECT_EQ(collector.oldest_tid(), local.oldest_tid());
+  const Time late = time_at(199) + 1ms;
+  EXPECT_EQ(collector.read_at(late, sample.span(), info, 1ms), ReadStatus::ok);
+  info = {};
+  EXPECT_EQ(collector.read_at(late, sample.span(), info, 1ms - 1ns), ReadStatus::stale);
+  EXPECT_EQ(info.tid, kNoTid) << "set only when ok";
   EXPECT_EQ(collector.read_newer(198, sample.span(), info), ReadStatus::ok);
   expect_sample(199, 199);
   EXPECT_EQ(collector.read_newer(199, sample.span(), info), ReadStatus::not_yet);

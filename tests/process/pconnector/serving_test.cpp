@@ -85,7 +85,7 @@ TEST_F(PConnectorServing, KnowsTheStream) {
 }
 
 TEST_F(PConnectorServing, RefusesWithAReason) {
-  make();
+  const auto writer = make();
   const auto none = PConnector::open({"radar", 0, {}}, options());
   ASSERT_FALSE(none);
   EXPECT_EQ(none.error().code, Errc::not_found) << none.error().message;
@@ -121,9 +121,11 @@ TEST_F(PConnectorServing, ReadsAsALocalReaderDoes) {
     ASSERT_TRUE(by_tid) << by_tid.error().message;
     ASSERT_EQ(*by_tid, local.read_tid(tid, here, info_here));
     if (*by_tid == ReadStatus::ok) expect_is(there, info_there, tid);
-    const auto by_time = con.read_at(time, writable_bytes(there), info_there);
+    const Duration age =
+        i % 2 ? kAnyAge : Duration(static_cast<std::int64_t>(random() % 2'000'000));
+    const auto by_time = con.read_at(time, writable_bytes(there), info_there, age);
     ASSERT_TRUE(by_time) << by_time.error().message;
-    ASSERT_EQ(*by_time, local.read_at(time, here, info_here));
+    ASSERT_EQ(*by_time, local.read_at(time, here, info_here, age));
     if (*by_time == ReadStatus::ok) expect_is(there, info_there, info_here.tid);
     SampleInfo found;
     const bool is_there = local.find(time, found) == ReadStatus::ok;
@@ -131,6 +133,10 @@ TEST_F(PConnectorServing, ReadsAsALocalReaderDoes) {
   }
   EXPECT_EQ(con.newest_tid().value(), 199);
   EXPECT_EQ(con.oldest_tid().value(), local.oldest_tid());
+  info_there = {};
+  EXPECT_EQ(con.read_at(time_of(199) + 2ms, writable_bytes(there), info_there, 1ms).value(),
+            ReadStatus::stale);
+  EXPECT_EQ(info_there.tid, kNoTid) << "set only when ok";
   EXPECT_EQ(con.read_newer(198, writable_bytes(there), info_there).value(), ReadStatus::ok);
   EXPECT_EQ(info_there.tid, 199);
   EXPECT_EQ(con.read_newer(199, writable_bytes(there), info_there).value(), ReadStatus::not_yet);

@@ -6,6 +6,7 @@
 #include <signal.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <chrono>
 #include <cstdio>
 #include <cstdlib>
@@ -92,6 +93,21 @@ void expect_climate(const std::vector<std::string>& lines) {
   ASSERT_EQ(lines.size(), kEnough);
   const std::regex expected(R"(\d+: (19|20|21)\.\d\d degrees, [+-]0\.\d\d in a second\r\n)");
   for (const std::string& line : lines) EXPECT_TRUE(std::regex_match(line, expected)) << line;
+}
+
+TEST(Tutorials, InterpolateBetweenTwoSamples) {
+  const dssm::test::DaemonProcess daemon;
+  const std::vector<std::string> lines = lines_read("between", daemon, "writer", daemon);
+  ASSERT_EQ(lines.size(), kEnough);
+  for (const std::string& line : lines) {
+    double value = 0, before = 0, after = 0;
+    ASSERT_EQ(
+        std::sscanf(line.c_str(), "%lf degrees, between %lf and %lf", &value, &before, &after), 3)
+        << line;
+    EXPECT_LE(std::min(before, after), value) << line;
+    EXPECT_GE(std::max(before, after), value) << line;
+    EXPECT_NE(before, after) << line;
+  }
 }
 
 TEST_P(Tutorial, ProgramsShareTheStreamWithEachApi) {

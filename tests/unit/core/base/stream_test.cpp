@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// Names of streams, descriptions of types and what counts as the same type, lengths of histories.
 #include <gtest/gtest.h>
 
 #include <dssm/describe.hpp>
@@ -29,6 +31,17 @@ DSSM_DESCRIBE(Everything, pose, speed, corners, grid, gear, moving, name)
 struct Plain {
   int a;
 };
+
+struct Wide {
+  std::uint8_t m0, m1, m2, m3, m4, m5, m6, m7, m8, m9, m10, m11, m12, m13, m14, m15, m16, m17, m18,
+      m19, m20, m21, m22, m23, m24, m25, m26, m27, m28, m29, m30, m31, m32, m33, m34, m35, m36, m37,
+      m38, m39, m40, m41, m42, m43, m44, m45, m46, m47, m48, m49, m50, m51, m52, m53, m54, m55, m56,
+      m57, m58, m59, m60, m61, m62, m63;
+};
+DSSM_DESCRIBE(Wide, m0, m1, m2, m3, m4, m5, m6, m7, m8, m9, m10, m11, m12, m13, m14, m15, m16, m17,
+              m18, m19, m20, m21, m22, m23, m24, m25, m26, m27, m28, m29, m30, m31, m32, m33, m34,
+              m35, m36, m37, m38, m39, m40, m41, m42, m43, m44, m45, m46, m47, m48, m49, m50, m51,
+              m52, m53, m54, m55, m56, m57, m58, m59, m60, m61, m62, m63)
 
 namespace {
 
@@ -84,6 +97,12 @@ TEST(TypeInfo, DescribesNestedStructsArraysEnumsAndText) {
   EXPECT_TRUE(type.check());
 }
 
+TEST(TypeInfo, DescribesSixtyFourMembers) {
+  const TypeInfo type = type_of<Wide>();
+  ASSERT_EQ(type.fields.size(), 64u);
+  EXPECT_EQ(type.fields[63], (Field{"m63", Scalar::uint8, 63, 1, 1}));
+}
+
 TEST(TypeInfo, NamesUndescribedTypesAsTheCompilerSpellsThem) {
   EXPECT_EQ(type_of<Plain>().name, "dssm::Plain");
   EXPECT_TRUE(type_of<Plain>().fields.empty());
@@ -104,6 +123,35 @@ TEST(TypeInfo, NamesBothTypesWhenTheyDiffer) {
     EXPECT_NE(usable.error().message.find(odometry.str()), std::string::npos);
     EXPECT_NE(usable.error().message.find(wanted.str()), std::string::npos);
   }
+}
+
+TEST(TypeInfo, NamesTheFirstFieldThatDiffers) {
+  const Field x{"x", Scalar::float64, 0, 1, 8}, y{"y", Scalar::float64, 8, 1, 8};
+  const TypeInfo pose{"Pose", 16, 8, {x, y}};
+  const auto error = [&](const std::vector<Field>& fields) {
+    const Result<void> usable = pose.check_usable_as({"Pose", 16, 8, fields});
+    return usable ? "" : usable.error().message;
+  };
+  EXPECT_EQ(error({x, y}), "");
+  EXPECT_EQ(error({}), "") << "not described: unknown";
+  EXPECT_EQ(error({x, {"y", Scalar::float64, 8, 1, 0}}), "") << "one element has no stride";
+  EXPECT_EQ(error({{"y", Scalar::float64, 0, 1, 8}, {"x", Scalar::float64, 8, 1, 8}}),
+            "the stream carries 'Pose' (16 bytes, aligned to 8) { float64 x at 0; float64 y at 8; "
+            "}, this program wants 'Pose' (16 bytes, aligned to 8) { float64 y at 0; float64 x at "
+            "8; }: field 1 is 'float64 x at 0' in the stream and 'float64 y at 0' in this program; "
+            "compile both sides with the same definition of the type");
+  EXPECT_NE(error({x}).find("field 2 is 'float64 y at 8' in the stream and missing in"),
+            std::string::npos);
+  for (const Field& other :
+       {Field{"y", Scalar::int64, 8, 1, 8}, Field{"y", Scalar::float32, 8, 2, 4},
+        Field{"y", Scalar::float64, 0, 1, 8}}) {
+    EXPECT_NE(error({x, other}).find("field 2"), std::string::npos);
+  }
+}
+
+TEST(TypeInfo, ShowsTheFirstFieldsOfALongType) {
+  EXPECT_TRUE(type_of<Wide>().description().ends_with("uint8 m15 at 15; and 48 more; }"))
+      << type_of<Wide>().description();
 }
 
 TEST(TypeInfo, RefusesFieldsOutsideThePayload) {

@@ -234,6 +234,27 @@ TEST_F(PeersTest, KeepTwoHostsOfOneNameAndWarnAtBoth) {
   EXPECT_EQ(host(0).error(), "") << "there is only one now";
 }
 
+TEST_F(PeersTest, RecognizeConnectionsOfConfiguredPeers) {
+  start({&one});
+  wait_for_startup();
+  const auto address = [](const char* text) {
+    return wire::resolve_number(wire::Address::parse(text).value()).at(0);
+  };
+  EXPECT_TRUE(peers->is_configured(address("127.0.0.1:40000"), nullptr)) << "from any port";
+  EXPECT_TRUE(peers->is_configured(address("[::ffff:127.0.0.1]:40000"), nullptr));
+  EXPECT_FALSE(peers->is_configured(address("127.0.0.2:40000"), nullptr));
+  wire::CertifiedPeer certified{wire::CertifiedPeer::Kind::host, "pc2", one.host().greeting.host_id,
+                                nullptr};
+  EXPECT_TRUE(peers->is_configured(address("10.0.0.9:40000"), &certified));
+  certified.kind = wire::CertifiedPeer::Kind::program;
+  EXPECT_FALSE(peers->is_configured(address("10.0.0.9:40000"), &certified));
+  certified = {wire::CertifiedPeer::Kind::host, "pc3", {}, nullptr};
+  EXPECT_FALSE(peers->is_configured(address("10.0.0.9:40000"), &certified));
+  peers->set_configured({});
+  wait([&] { return peers->report().hosts().empty(); });
+  EXPECT_FALSE(peers->is_configured(address("127.0.0.1:40000"), nullptr));
+}
+
 TEST_F(PeersTest, KnowThemselves) {
   one.greet_as(self);
   start({&one});

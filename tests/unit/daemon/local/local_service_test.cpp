@@ -14,7 +14,7 @@ namespace {
 struct Daemon {
   explicit Daemon(bool recovering = false, const OpenTable::Limits& limits = {1000, 100})
       : opens(limits), service(registry, opens, clock, rights, logger) {
-    if (recovering) registry.begin_recovery();
+    if (recovering) registry.begin_recovery(Registry::Recovery::streams);
   }
   LogRecorder logger;
   Registry registry{"pc1", kLimits};
@@ -385,7 +385,7 @@ TEST(LocalService, ListsTheLimitsOfAllParts) {
   std::string limits;
   const local::Response response = client.ask(request);
   for (const local::LimitUse& one : response.daemon().limits()) {
-    if (one.name() == "max_memory") {
+    if (one.name().starts_with("max_memory")) {  // all of it is that of one user
       EXPECT_EQ(one.used(), response.daemon().memory_bytes());
       continue;
     }
@@ -393,8 +393,99 @@ TEST(LocalService, ListsTheLimitsOfAllParts) {
               " " + one.unit() + "\n";
   }
   EXPECT_EQ(limits,
-            "max_streams 1 of " + std::to_string(kLimits.max_streams) +
-                " streams\nmax_opens 3 of 1000 opens\nmax_opens_per_client 2 of 100 opens\n");
+            "max_streams 1 of 400 streams\n"
+            "max_streams of one user or host 1 of 400 streams\n"
+            "max_opens 3 of 1000 opens\n"
+            "max_opens of one user 3 of 1000 opens\n"
+            "max_opens_per_client 2 of 100 opens\n");
+}
+
+// --- a stream that exists already
+
+local::Request sized_request(const std::string& name, std::uint64_t payload_bytes,
+                             std::uint64_t depth) {
+  local::Request request = create_request(name);
+  wire::to_message(TypeInfo{"", payload_bytes, 1, {}}, *request.mutable_create()->mutable_type());
+  request.mutable_create()->set_depth(depth);
+  return request;
+}
+
+TEST(LocalService, ReplacesARingThatNoProgramHasOpen) {
+  Daemon daemon;
+  std::uint64_t before = 0;
+  const auto ask = [&](std::uint64_t bytes, std::uint64_t depth) {
+    FakeClient program(daemon.service, 5);
+    program.greet();
+    const proto::Opened opened = program.ask(sized_request("s", bytes, depth)).opened();
+    EXPECT_EQ(daemon.registry.streams().size(), 1u);
+    const Stream& stream = *daemon.registry.streams().front();
+    EXPECT_EQ(opened.created(), stream.incarnation() != before);
+    before = stream.incarnation();
+    return opened.created();
+  };
+  EXPECT_TRUE(ask(24, 16));
+  EXPECT_FALSE(ask(24, 16)) << "as it was";
+  EXPECT_FALSE(ask(24, 4)) << "it holds more than is asked for";
+  EXPECT_TRUE(ask(24, 17)) << "it holds less";
+  EXPECT_TRUE(ask(25, 17)) << "another type";
+}
+
+TEST(LocalService, LeavesTheRingWhenTheNewOneCannotBeMade) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 6);
+  client.greet();
+  ASSERT_TRUE(daemon.registry.create({"s", 0, ""}, {"", 24, 1, {}}, {16, Duration(1)}, 1));
+  const std::uint64_t before = daemon.registry.streams().front()->incarnation();
+  EXPECT_EQ(client.ask(sized_request("s", 25, 1)).failure().code(), "invalid_argument");
+  EXPECT_EQ(client.ask(sized_request("s", 25, kLimits.max_memory_bytes / 25)).failure().code(),
+            "limit_exceeded");
+  ASSERT_EQ(daemon.registry.streams().size(), 1u);
+  EXPECT_EQ(daemon.registry.streams().front()->incarnation(), before);
+}
+
+TEST(LocalService, NamesThoseThatHaveARingOpenThatDoesNotFit) {
+  Daemon daemon;
+  FakeClient user(daemon.service, 5), client(daemon.service, 6);
+  user.greet(), client.greet();
+  ASSERT_TRUE(user.ask(sized_request("s", 24, 16)).has_opened());
+  const proto::Failure type = client.ask(sized_request("s", 25, 16)).failure();
+  EXPECT_EQ(type.code(), "type_mismatch");
+  EXPECT_NE(type.message().find("the stream carries 24 bytes"), std::string::npos);
+  EXPECT_NE(type.message().find("open in 'test' (pid 5)"), std::string::npos) << type.message();
+  EXPECT_NE(type.message().find("dssmctl rm s:0@pc1"), std::string::npos) << type.message();
+  const proto::Failure history = client.ask(sized_request("s", 24, 17)).failure();
+  EXPECT_EQ(history.code(), "conflict");
+  EXPECT_NE(history.message().find("its ring has 16 slots, and this program asks for 17"),
+            std::string::npos)
+      << history.message();
+}
+
+TEST(LocalService, KeepsAnExistingRingOnRequest) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 6);
+  client.greet();
+  ASSERT_TRUE(daemon.registry.create({"s", 0, ""}, {"", 24, 1, {}}, {16, Duration(1)}, 1));
+  local::Request longer = sized_request("s", 24, 99), other = sized_request("s", 25, 16);
+  longer.mutable_create()->set_keep_existing(true);
+  other.mutable_create()->set_keep_existing(true);
+  EXPECT_EQ(client.ask(other).failure().code(), "type_mismatch");
+  const local::Response joined = client.ask(longer);
+  ASSERT_TRUE(joined.has_opened());
+  EXPECT_FALSE(joined.opened().created());
+}
+
+TEST(LocalService, ReplacesNothingWhileItDoesNotKnowWhoHasWhatOpen) {
+  Daemon daemon;
+  FakeClient client(daemon.service, 6);
+  client.greet();
+  ASSERT_TRUE(daemon.registry.create({"s", 0, ""}, {"", 24, 1, {}}, {16, Duration(1)}, 1));
+  daemon.registry.begin_recovery(Registry::Recovery::opens);
+  const proto::Failure refused = client.ask(sized_request("s", 25, 16)).failure();
+  EXPECT_EQ(refused.code(), "type_mismatch");
+  EXPECT_NE(refused.message().find("try again in a second"), std::string::npos);
+  EXPECT_TRUE(client.ask(sized_request("new", 25, 16)).has_opened()) << "nothing else waits";
+  daemon.registry.end_recovery();
+  EXPECT_TRUE(client.ask(sized_request("s", 25, 16)).opened().created());
 }
 
 // --- recovery

@@ -25,20 +25,22 @@ class FakeFleet final : public Fleet {
  public:
   void observe(Observer* who) override { observer = who; }
   bool is_there(const StreamId& id) const override { return there.contains(id.str()); }
-  void open_reader(const StreamId& id, bool history, Then<std::shared_ptr<Stream>> then) override {
+  void open_reader(const StreamId& id, bool history, const std::string&,
+                   Then<std::shared_ptr<Stream>> then) override {
     asked.push_back("open_reader " + id.str() + (history ? " with history" : ""));
     reader_then = std::move(then);
   }
   void want_history(const StreamId& id, bool always) override {
     asked.push_back("want_history " + id.str() + (always ? " always" : ""));
   }
-  void open_writer(const StreamId& id, const CreatePlan* plan, Then<OpenedRing> then) override {
+  void open_writer(const StreamId& id, const CreatePlan* plan, const std::string&,
+                   Then<OpenedRing> then) override {
     asked.push_back("open_writer " + id.str() +
                     (plan ? " depth " + std::to_string(plan->history.depth) : ""));
     writer_then = std::move(then);
   }
-  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role,
-                                                  OfferedFiles files) override {
+  Result<std::shared_ptr<Stream>> adopt_untrusted(const StreamId& id, Role role, OfferedFiles files,
+                                                  const std::string&) override {
     asked.push_back(std::string("adopt ") + (role == Role::writer ? "writer " : "reader ") +
                     id.str());
     return owner.adopt_untrusted(id, std::move(files));
@@ -430,7 +432,7 @@ TEST_F(RemoteRequestsTest, NotifiesReadersOfAnOwnStreamThatMovedToAnotherHost) {
 
 class RecoveringRequestsTest : public RemoteRequestsTest {
  protected:
-  RecoveringRequestsTest() { registry.begin_recovery(); }
+  RecoveringRequestsTest() { registry.begin_recovery(Registry::Recovery::streams); }
 };
 
 TEST_F(RecoveringRequestsTest, DoNotWaitWhenTheyNameAnotherHost) {

@@ -22,14 +22,15 @@ std::vector<std::byte> payload_of(Tid tid) {
 
 class MirrorRingTest : public testing::Test {
  protected:
-  MemoryBudget budget{1 << 20};
+  MemoryBudgets budgets{1 << 20, {}};
+  MemoryBudget& budget = budgets.total();
   std::shared_ptr<Stream> stream = Stream::create({.id = {"odometry", 0, "pc2"},
                                                    .type = odometry_type(),
                                                    .depth = kDepth,
                                                    .cycle = std::chrono::milliseconds(10),
                                                    .purpose = Purpose::mirror,
                                                    .incarnation = 7},
-                                                  budget)
+                                                  budgets)
                                        .value();
   std::unique_ptr<MirrorRing> ring = MirrorRing::open(stream, budget).value();
   ring::RingReader reader{stream->mapping()};

@@ -121,6 +121,26 @@ TEST_F(MirrorsTest, FailsWithAReasonWhenTheOwnerDoesNotAnswer) {
   wait_until_none();
 }
 
+TEST_F(MirrorsTest, AreChargedToWhoOpensThemFirst) {
+  registry.set_limits({.max_streams = 2, .max_memory_bytes = 1 << 20, .max_share = {50}});
+  Answer answer;
+  streams->open(
+      owner->host(), kOdometry, nullptr,
+      [&](Result<OpenedRing> result) { answer.emplace(std::move(result)); }, "user 1000");
+  serve(0);
+  owner->send_caught_up();
+  run_until(loop, [&] { return answer.has_value(); });
+  const std::shared_ptr<Stream> mirror = answer->value().stream;
+  EXPECT_EQ(mirror->account(), "user 1000");
+  EXPECT_EQ(registry.budgets().most_used(), registry.budget().used());
+  answer.reset();
+  streams->open(
+      owner->host(), {"other", 0, ""}, nullptr,
+      [&](Result<OpenedRing> result) { answer.emplace(std::move(result)); }, "user 1000");
+  EXPECT_NE(answer.value().error().message.find("max_share"), std::string::npos)
+      << answer->error().message;
+}
+
 TEST_F(MirrorsTest, ForwardsTheOwnersRefusal) {
   const auto answer = open();
   owner->fail(owner->receive(), Errc::not_found, "there is no stream 'odometry:0@pc2'");
@@ -390,7 +410,7 @@ TEST_F(MirrorsTest, RefusesAnOfferedRingWhenTheMirrorHasAnother) {
                                .cycle = 1ms,
                                .purpose = Purpose::mirror,
                                .incarnation = 7},
-                              registry.budget())
+                              registry.budgets())
                    .value();
   EXPECT_EQ(
       streams->adopt_untrusted(kOdometry, as_offer(other->descriptors_for(Role::reader).value()))

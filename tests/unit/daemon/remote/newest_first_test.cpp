@@ -108,16 +108,16 @@ TEST_P(NewestFirstEndToEnd, EachSampleIsReceivedOrLostOnce) {
     const EventLoop loop = *EventLoop::open();
     const ring::TestRing owner(payload_bytes, depth);
     ring::RingWriter writer = owner.writer();
-    MemoryBudget budget{1U << 30};
+    MemoryBudgets budgets{1U << 30, {}};
     const auto stream = Stream::create({.id = {"test", 0, "pc1"},
                                         .type = {"", payload_bytes, 1, {}},
                                         .depth = depth,
                                         .cycle = std::chrono::milliseconds(1),
                                         .purpose = Purpose::mirror,
                                         .incarnation = 42},
-                                       budget)
+                                       budgets)
                             .value();
-    const std::unique_ptr<MirrorRing> mirror = MirrorRing::open(stream, budget).value();
+    const std::unique_ptr<MirrorRing> mirror = MirrorRing::open(stream, budgets.total()).value();
     auto channel = std::make_unique<Channel>(loop, owner, *mirror);
     MonoTime now{std::chrono::seconds(1000)};
     Tid written = 0;

@@ -68,7 +68,7 @@ class RemoteStreamTest : public testing::Test {
                                         .depth = 16,
                                         .cycle = std::chrono::milliseconds(1),
                                         .purpose = purpose},
-                                       registry.budget())
+                                       registry.budgets())
                             .value();
     return streams->adopt_untrusted(kOdometry, as_offer(stream->descriptors_for(role).value()))
         .error();

@@ -148,6 +148,27 @@ TEST(DataCommunicator, CountsChannelsInTheStreamsDescription) {
   EXPECT_EQ(rig.ask(control, list_request(2)).stream_list().streams(0).channels(), 1u);
 }
 
+TEST(DataCommunicator, ChargesWhatAPeerHasItKeepToThePeer) {
+  ServerRig rig;
+  MemoryPeer peer, control;
+  rig.connect(peer);
+  ASSERT_TRUE(rig.ask(peer, create_request(1, "a", 8, 4)).opened().created());
+  EXPECT_EQ(rig.registry.find({"a", 0, ""}).value()->account(), "'10.0.0.2'");
+  rig.create("b");
+  const std::uint64_t before = rig.registry.budgets().most_used();
+  EXPECT_GE(before, rig.registry.find({"a", 0, ""}).value()->info().memory_bytes);
+  rig.connect(control);
+  net::Frame property = with_serial(2, {});
+  property.mutable_set_property()->mutable_id()->set_name("b");
+  property.mutable_set_property()->set_property("12345");
+  ASSERT_TRUE(rig.ask(control, property).has_done());
+  EXPECT_EQ(rig.registry.budgets().most_used(), before + 5);
+  net::Frame on_channel = with_serial(3, {});
+  on_channel.mutable_set_property()->set_property("123");
+  ASSERT_TRUE(rig.ask(peer, on_channel).has_done());
+  EXPECT_EQ(rig.registry.budgets().most_used(), before + 8);
+}
+
 TEST(DataCommunicator, ServesASlowPeerOneRequestAtATime) {
   ServerRig rig;
   const auto stream = rig.create("large", 1000, 64);
@@ -270,6 +291,51 @@ TEST(DataCommunicator, EndsConnectionsThatDoNothing) {
   EXPECT_FALSE(channel.closed);
 }
 
+TEST(DataCommunicator, EndsConnectionsThatDoNotReadTheirAnswers) {
+  ServerRig rig;
+  const auto stream = rig.create("large", 1000, 64);
+  rig.write(*stream, 20);
+  MemoryPeer silent, slow, slow_network, subscriber;
+  for (MemoryPeer* peer : {&silent, &slow, &slow_network, &subscriber}) {
+    rig.connect(*peer);
+    rig.open(*peer, "large");
+  }
+  subscriber.put(with_serial(1, subscribe_from_oldest_frame()));
+  rig.turns();
+  slow_network.progress.emplace().waiting_bytes = 1'000'000;
+  for (MemoryPeer* peer : {&silent, &slow, &slow_network, &subscriber}) {
+    peer->room = 0;
+    if (peer != &subscriber) peer->put(read_request(2, 15));
+  }
+  rig.write(*stream, 5);
+  rig.turns();
+  const MonoTime begin = rig.loop.now();
+  // As the test's peers are always writable, the loop is never idle: time goes on by hand.
+  const auto pass = [&](Duration time) {
+    bool is_over = false;
+    EventSource end = EventSource::timer(rig.loop, [&] { is_over = true; });
+    end.enable_in(time);
+    while (!is_over) {
+      rig.loop.timers().run_next();
+      rig.turns(2);
+    }
+  };
+  pass(DataCommunicator::kOutputTimeout / 2);
+  EXPECT_FALSE(silent.closed);
+  while (rig.loop.now() - begin < 3 * DataCommunicator::kOutputTimeout) {
+    slow.room = 10;
+    slow_network.progress->waiting_bytes -= 10;
+    pass(DataCommunicator::kOutputTimeout / 4);
+    if (rig.loop.now() - begin >= 2 * DataCommunicator::kOutputTimeout) {
+      EXPECT_TRUE(silent.closed);
+    }
+  }
+  EXPECT_FALSE(slow.closed);
+  EXPECT_FALSE(slow_network.closed) << "the kernel has less of it";
+  EXPECT_FALSE(subscriber.closed) << "perhaps it is stopped by a debugger";
+  EXPECT_TRUE(rig.logger.contains("the other side has read nothing for 10 s of what waits for it"));
+}
+
 TEST(DataCommunicator, WaitsForHelloUntilItsTimeout) {
   ServerRig rig;
   MemoryPeer silent, slow;
@@ -299,9 +365,27 @@ TEST(DataCommunicator, CreatesAStreamThatNoProgramHereCreated) {
   EXPECT_EQ((*rig.registry.find({"new", 0, ""}))->creator_pid(), 0);
   rig.connect(other);
   EXPECT_EQ(rig.ask(other, create_request(1, "new", 17, 8)).failure().code(), "type_mismatch");
-  const net::Frame joined = rig.ask(other, create_request(2, "new", 16, 99));
+  const net::Frame joined = rig.ask(other, create_request(2, "new", 16, 8));
   ASSERT_TRUE(joined.has_opened());
   EXPECT_FALSE(joined.opened().created());
+}
+
+TEST(DataCommunicator, ReplacesAStreamThatNoPeerHasOpen) {
+  ServerRig rig;
+  rig.create("s", 16, 8);
+  MemoryPeer peer, other;
+  rig.connect(peer);
+  rig.connect(other);
+  rig.open(peer, "s");
+  const net::Frame refused = rig.ask(other, create_request(1, "s", 16, 99));
+  EXPECT_EQ(refused.failure().code(), "conflict");
+  EXPECT_NE(refused.failure().message().find("open in other hosts"), std::string::npos)
+      << refused.failure().message();
+  peer.end();
+  rig.turns();
+  const net::Frame replaced = rig.ask(other, create_request(2, "s", 16, 99));
+  EXPECT_TRUE(replaced.opened().created());
+  EXPECT_EQ(replaced.opened().stream().depth(), 99u);
 }
 
 TEST(DataCommunicator, TakesTheMemoryOfALongRingInTurns) {
@@ -352,7 +436,7 @@ TEST(DataCommunicator, ReportsWhichLimitAStreamExceeds) {
 TEST(Recovering, AStreamThatIsMissingIsWaitedFor) {
   ServerRig rig;
   rig.create("here");
-  rig.registry.begin_recovery();
+  rig.registry.begin_recovery(Registry::Recovery::streams);
   MemoryPeer peer, other;
   rig.connect(peer);
   rig.connect(other);
@@ -369,7 +453,7 @@ TEST(Recovering, AStreamThatIsMissingIsWaitedFor) {
 
 TEST(Recovering, NoPeerTakesANameBeforeTheEnd) {
   ServerRig rig;
-  rig.registry.begin_recovery();
+  rig.registry.begin_recovery(Registry::Recovery::streams);
   MemoryPeer creating, opening;
   rig.connect(creating);
   rig.connect(opening);
@@ -386,7 +470,7 @@ TEST(Recovering, NoPeerTakesANameBeforeTheEnd) {
 TEST(Recovering, ListsWaitAndWatchesDoNotEndTheirFirstEvents) {
   ServerRig rig;
   rig.create("a");
-  rig.registry.begin_recovery();
+  rig.registry.begin_recovery(Registry::Recovery::streams);
   MemoryPeer listing, watching;
   rig.connect(listing);
   rig.connect(watching);
@@ -496,6 +580,62 @@ TEST(ChannelServer, BoundsConnectionsInAllAndPerHost) {
   peers[0].end();
   rig.turns();
   EXPECT_EQ(refused(peers[2], 2), "");
+}
+
+// Those who connect and say nothing keep nobody out.
+TEST(ChannelServer, GivesUpTheOldestSilentConnectionOfTheMostCrowdedNetwork) {
+  ServerRig rig({4, 3, 32U << 20});
+  MemoryPeer greeted, few, crowd[2], next[2];
+  rig.connect(greeted, true, true, 2);
+  rig.connect(few, false, true, 3);
+  rig.connect(crowd[0], false, true, 4);
+  rig.connect(crowd[1], false, true, 4);
+  rig.connect(next[0], true, true, 5);
+  EXPECT_TRUE(crowd[0].closed) << "the oldest of two";
+  EXPECT_NE(final_failure(rig, crowd[0]).find("it has sent no Hello"), std::string::npos);
+  EXPECT_TRUE(rig.logger.contains("give up a connection from '10.0.0.4'"));
+  EXPECT_FALSE(crowd[1].closed);
+  EXPECT_FALSE(few.closed);
+  rig.connect(next[1], true, true, 6);
+  EXPECT_TRUE(few.closed) << "the oldest of one each";
+  EXPECT_FALSE(greeted.closed);
+  EXPECT_FALSE(next[0].closed);
+  crowd[1].put(hello_frame(greeting_of("pc4", "test")));
+  rig.turns();
+  MemoryPeer late;
+  EXPECT_FALSE(rig.server.adopt(std::make_unique<MemoryTransport>(late), address_of(7)))
+      << "all have greeted";
+}
+
+TEST(ChannelServer, KeepsPlacesForConfiguredPeers) {
+  ServerRig rig({2, 2, 32U << 20});
+  rig.configured = address_of(3).str();
+  MemoryPeer silent, others[3], configured[3];
+  rig.connect(silent, false, true, 2);
+  rig.connect(others[0], true, true, 2);
+  rig.connect(configured[0], true, true, 3);
+  EXPECT_FALSE(silent.closed) << "its place is not needed";
+  rig.connect(configured[1], false, true, 3);
+  rig.connect(others[1], true, true, 4);
+  EXPECT_TRUE(silent.closed);
+  EXPECT_FALSE(configured[1].closed) << "has a place of its own";
+  EXPECT_FALSE(rig.server.adopt(std::make_unique<MemoryTransport>(others[2]), address_of(5)));
+  rig.connect(configured[2], true, true, 3);
+  EXPECT_TRUE(configured[1].closed) << "of the same host, which may have two";
+  EXPECT_FALSE(others[0].closed);
+  EXPECT_FALSE(others[1].closed);
+}
+
+TEST(ChannelServer, GivesUpASilentConnectionOfAHostWithTooMany) {
+  ServerRig rig({100, 2, 32U << 20});
+  MemoryPeer other, silent[2], next;
+  rig.connect(other, false, true, 3);
+  rig.connect(silent[0], false, true, 2);
+  rig.connect(silent[1], false, true, 2);
+  rig.connect(next, true, true, 2);
+  EXPECT_TRUE(silent[0].closed);
+  EXPECT_FALSE(silent[1].closed);
+  EXPECT_FALSE(other.closed) << "of another host";
 }
 
 TEST(ChannelServer, BoundsTheMemoryOfAHost) {

@@ -35,7 +35,17 @@ class ServerRig {
  public:
   explicit ServerRig(const PeerTable::Limits& limits = {16, 8, 32U << 20},
                      ClockAssessor* clock = nullptr, const Rights* rights = nullptr)
-      : server({loop, registry, opens, rights ? *rights : no_rights, logger, clock},
+      : server({loop,
+                registry,
+                opens,
+                rights ? *rights : no_rights,
+                logger,
+                clock,
+                {},
+                false,
+                [this](const wire::SocketAddress& from, const wire::CertifiedPeer*) {
+                  return from.str() == configured;
+                }},
                greeting_with(own_clock), limits) {}
 
   // Connects; without `greet` it says nothing. The peer outlives the rig's use of it.
@@ -100,6 +110,7 @@ class ServerRig {
     return greeting;
   }
 
+  std::string configured;  // address of a configured peer; empty: none
   // What it reports of its clock.
   const std::shared_ptr<wire::ClockReport> own_clock = std::make_shared<wire::ClockReport>();
   EventLoop loop = *EventLoop::open(TimerQueue::Time::simulated);

@@ -42,6 +42,23 @@ TEST(PeerTable, GivesEverythingBack) {
   EXPECT_EQ(again.budget().used(), PeerTable::kConnectionBytes);
 }
 
+TEST(PeerTable, DoesNotCountConfiguredPeers) {
+  PeerTable table({1, 2, 1U << 20});
+  {
+    const PeerPlace kept = *table.admit("pc2", false, true);
+    EXPECT_FALSE(table.is_full());
+    const PeerPlace other = *table.admit("pc3");
+    EXPECT_TRUE(table.is_full());
+    EXPECT_FALSE(table.admit("pc4"));
+    const PeerPlace second = *table.admit("pc2", false, true);
+    EXPECT_TRUE(table.is_full_for("pc2", false));
+    EXPECT_FALSE(table.admit("pc2", false, true)) << "two of one peer";
+  }
+  EXPECT_FALSE(table.is_full_for("pc2", false));
+  const PeerPlace again = *table.admit("pc4");
+  EXPECT_TRUE(table.is_full());
+}
+
 TEST(PeerTable, ShowsWhatThePeerWithTheMostUses) {
   PeerTable table({5, 4, 1U << 20});
   const PeerPlace one = *table.admit("pc2"), two = *table.admit("pc2"), other = *table.admit("pc3");

@@ -38,6 +38,7 @@ max_streams = 11
 max_memory = "12 MiB"
 max_opens = 13
 max_opens_per_client = 14
+max_share = "60%"
 max_property = 15
 recovery_grace = "16 ms"
 listen = ["127.0.0.1:17", "[::]:18", "::1"]
@@ -68,6 +69,7 @@ rights = ["local read *", "group:0 create,clock lidar*", "host:pc[23]  all  map:
   EXPECT_EQ(config.max_memory_bytes, 12u << 20);
   EXPECT_EQ(config.max_opens, 13u);
   EXPECT_EQ(config.max_opens_per_client, 14u);
+  EXPECT_EQ(config.max_share_percent, 60u);
   EXPECT_EQ(config.max_property_bytes, 15u);
   EXPECT_EQ(config.recovery_grace, std::chrono::milliseconds(16));
   const std::vector<wire::Address> listen = {{"127.0.0.1", 17}, {"::", 18}, {"::1", 13776}};

@@ -64,5 +64,30 @@ TEST_F(OpenTableTest, NamesTheLimitThatIsReached) {
             std::string::npos);
 }
 
+TEST_F(OpenTableTest, LeavesOpensToOtherUsers) {
+  table_.set_limits({.max_opens = 4, .max_opens_per_client = 4, .max_share = {50}});
+  const auto of_user = [](ClientNumber number, std::uint32_t uid) {
+    ClientIdentity identity = *client(number);
+    identity.uid = uid;
+    return std::make_shared<const ClientIdentity>(identity);
+  };
+  const auto a = stream("a");
+  table_.add({of_user(1, 4711), a, Role::reader, 0});
+  const OpenNumber second = table_.add({of_user(2, 4711), a, Role::reader, 0});
+  EXPECT_EQ(table_.check_quota(*of_user(2, 4711)).error().message,
+            "programs of user 4711 have 2 streams open; close some or raise the key max_share: "
+            "they may open 50% of max_opens = 4");
+  EXPECT_TRUE(table_.check_quota(*of_user(3, 4712)));
+  table_.add({client(4), a, Role::reader, 0});
+  EXPECT_TRUE(table_.check_quota(*client(4))) << "root";
+  LimitUses limits;
+  table_.add_limits(limits);
+  EXPECT_EQ(limits.at(1).name, "max_opens of one user");
+  EXPECT_EQ(limits.at(1).used, 2U);
+  EXPECT_EQ(limits.at(1).limit, 2U);
+  EXPECT_TRUE(table_.remove(2, second));
+  EXPECT_TRUE(table_.check_quota(*of_user(2, 4711)));
+}
+
 }  // namespace
 }  // namespace dssm::daemon

@@ -257,6 +257,84 @@ TEST(Stream, SurvivesNonsenseInARingItDoesNotTrust) {
   }
 }
 
+TEST(Registry, LeavesStreamsToOthersThanTheAccountWithMany) {
+  Registry registry("pc1", {.max_streams = 4, .max_memory_bytes = 1 << 30, .max_share = {50}});
+  const std::string user = "user 1000";
+  std::optional<RingQuota> mirror = registry.acquire_quota(user).value();
+  ASSERT_TRUE(registry.create({"a", 0, ""}, odometry_type(), kHistory, 1, user));
+  const auto third = registry.create({"b", 0, ""}, odometry_type(), kHistory, 1, user);
+  ASSERT_FALSE(third);
+  EXPECT_EQ(third.error().code, Errc::limit_exceeded);
+  EXPECT_NE(third.error().message.find(
+                "user 1000 has 2 streams already, counting those of other hosts; remove some "
+                "(dssmctl rm) or raise the key max_share: it may have 50% of max_streams = 4"),
+            std::string::npos)
+      << third.error().message;
+  EXPECT_FALSE(registry.acquire_quota(user));
+  LimitUses limits;
+  registry.add_limits(limits);
+  EXPECT_EQ(limits.at(1).name, "max_streams of one user or host");
+  EXPECT_EQ(limits.at(1).used, 2U);
+  EXPECT_EQ(limits.at(1).limit, 2U);
+  EXPECT_TRUE(registry.create({"b", 0, ""}, odometry_type(), kHistory, 1, "user 1001"));
+  EXPECT_TRUE(registry.create({"c", 0, ""}, odometry_type(), kHistory, 1)) << "no limit of its own";
+  EXPECT_FALSE(registry.create({"d", 0, ""}, odometry_type(), kHistory, 1)) << "all are taken";
+  ASSERT_TRUE(registry.remove({"c", 0, ""}));
+  ASSERT_TRUE(registry.remove({"a", 0, ""}));
+  EXPECT_TRUE(registry.create({"d", 0, ""}, odometry_type(), kHistory, 1, user));
+  mirror.reset();
+  EXPECT_TRUE(registry.acquire_quota(user));
+}
+
+TEST(Registry, LeavesMemoryToOthersThanTheAccountWithMuch) {
+  Registry registry("pc1", {.max_streams = 10,
+                            .max_memory_bytes = 1 << 20,
+                            .max_property_bytes = 1 << 20,
+                            .max_share = {50}});
+  const TypeInfo type{"", 100 << 10, 1, {}};
+  const History history{3, Duration(1)};
+  std::shared_ptr<Stream> held =
+      registry.create({"a", 0, ""}, type, history, 1, "user 1000")->stream;
+  const auto second = registry.create({"b", 0, ""}, type, history, 1, "user 1000");
+  ASSERT_FALSE(second);
+  EXPECT_EQ(second.error().code, Errc::limit_exceeded);
+  EXPECT_NE(second.error().message.find("are left of the 524288 that user 1000 may take of "
+                                        "max_memory"),
+            std::string::npos)
+      << second.error().message;
+  EXPECT_NE(second.error().message.find("max_share"), std::string::npos);
+  LimitUses limits;
+  registry.add_limits(limits);
+  EXPECT_EQ(limits.at(3).name, "max_memory of one user or host");
+  EXPECT_EQ(limits.at(3).used, registry.budget().used());
+  EXPECT_EQ(limits.at(3).limit, 1U << 19);
+  EXPECT_TRUE(registry.create({"b", 0, ""}, type, history, 1, "user 1001"));
+  const auto third = registry.create({"c", 0, ""}, type, {4, Duration(1)}, 1, "user 1002");
+  ASSERT_FALSE(third);
+  EXPECT_NE(third.error().message.find("max_memory = 1048576"), std::string::npos)
+      << third.error().message;
+  ASSERT_TRUE(registry.remove({"a", 0, ""}));
+  EXPECT_FALSE(registry.create({"c", 0, ""}, type, history, 1, "user 1000")) << "held";
+  held.reset();
+  EXPECT_TRUE(registry.create({"c", 0, ""}, type, history, 1, "user 1000"));
+}
+
+TEST(Registry, ChargesAPropertyToTheAccountThatSetsIt) {
+  Registry registry("pc1", {.max_streams = 10,
+                            .max_memory_bytes = 1 << 20,
+                            .max_property_bytes = 1 << 20,
+                            .max_share = {50}});
+  create(registry);
+  ASSERT_TRUE(registry.set_property(kOdometry, std::string(300'000, 'x'), "user 1000"));
+  EXPECT_EQ(registry.budgets().most_used(), 300'000U);
+  EXPECT_FALSE(registry.set_property(kOdometry, std::string(300'000, 'y'), "user 1000"))
+      << "both exist for a moment";
+  ASSERT_TRUE(registry.set_property(kOdometry, "", "user 1000"));
+  EXPECT_EQ(registry.budgets().most_used(), 0U);
+  ASSERT_TRUE(registry.set_property(kOdometry, "one", "user 1001")) << "the other one is forgotten";
+  EXPECT_EQ(registry.budgets().most_used(), 3U);
+}
+
 // --- property
 
 TEST(Registry, KeepsThePropertyOfAStreamAndChargesItsMemory) {
@@ -312,6 +390,22 @@ TEST_F(Adoption, BringsAStreamBackWithAllThatWasKnownOfIt) {
   EXPECT_TRUE(for_writer.doorbell);
   EXPECT_TRUE(ring::RingMapping::open_untrusted(for_writer.ring.get(), ring::Access::read_write));
   EXPECT_TRUE(registry_.set_property(kOdometry, "newer"));
+}
+
+TEST_F(Adoption, ChargesTheAccountThatCreatedTheStream) {
+  OfferedFiles files;
+  {
+    Registry before("pc1", kLimits);
+    files = kept_by(Role::reader,
+                    *before.create(kOdometry, odometry_type(), kHistory, 42, "user 1000")->stream);
+  }
+  const auto stream = registry_.adopt_untrusted(kOdometry, std::move(files));
+  ASSERT_TRUE(stream) << stream.error().message;
+  EXPECT_EQ((*stream)->account(), "user 1000");
+  EXPECT_EQ(registry_.budgets().most_used(), registry_.budget().used());
+  LimitUses limits;
+  registry_.add_limits(limits);
+  EXPECT_EQ(limits.at(1).used, 1U);
 }
 
 TEST_F(Adoption, RefusesABellOrAMetaFileOfAnotherStream) {

@@ -233,6 +233,20 @@ TEST_F(LocalRightsTest, AnExistingStreamTakesOnlyTheRightToWrite) {
   EXPECT_EQ(client.ask(daemon::create_request("camera")).failure().code(), "no_permission");
 }
 
+TEST_F(LocalRightsTest, AStreamIsReplacedByWhoMayCreateAndRemoveIt) {
+  local::Request longer = daemon::create_request("lidar");
+  longer.mutable_create()->set_depth(17);
+  ASSERT_TRUE(registry.create({"lidar", 0, ""}, odometry_type(), {16, Duration(1)}, 1));
+  for (const char* verbs : {"write", "write,create", "write,remove"}) {
+    set({std::string("user:1000 ") + verbs + " *"});
+    const proto::Failure refused = client.ask(longer).failure();
+    EXPECT_EQ(refused.code(), "conflict") << verbs;
+    EXPECT_NE(refused.message().find("uid 1000) may not"), std::string::npos) << refused.message();
+  }
+  set({"user:1000 write,create,remove *"});
+  EXPECT_TRUE(client.ask(longer).opened().created());
+}
+
 // libdssm does so when there is no memory for the ring.
 TEST_F(LocalRightsTest, WhoCreatedAStreamMayRemoveItWhileNobodyElseHasItOpen) {
   set({"user:1000 create *"});
