@@ -132,7 +132,7 @@ Result<ReadStatus> PConnector::read_tid(Tid tid, std::span<std::byte> payload, S
 Result<ReadStatus> PConnector::read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
                                        Duration max_age) {
   SampleInfo seen;
-  const Result<ReadStatus> status = state_->client->read({Which::time, to_ns(t)}, payload, seen);
+  Result<ReadStatus> status = state_->client->read({Which::time, to_ns(t)}, payload, seen);
   if (status && *status == ReadStatus::ok) {
     if (is_stale(t, seen.time, max_age)) return ReadStatus::stale;
     info = seen;
