@@ -78,7 +78,9 @@ def copy_files(folder):
 
 def check_links(folder):
     """Fails if a link leads nowhere."""
-    broken = set()
+    broken = {f"{os.path.relpath(page, folder)}: a link is shown as text"
+              for page in glob.glob(os.path.join(folder, "*.html"))
+              if "](<a " in read(page) and not page.endswith("_source.html")}
     names = {}  # of the places in a page
     for page, file, name in links(folder):
         if not os.path.isfile(file):

@@ -17,7 +17,8 @@
 #
 # Comments in function bodies stay as they are.
 #
-# In Markdown, pages and sections get names, and links lead to these names.
+# In Markdown, pages and sections get names, and links lead to these names. The pages of a folder are
+# listed in its README.md.
 import os
 import re
 import sys
@@ -57,8 +58,8 @@ def parent(path):
     return ""
 
 
-def target(path, link, section, subpages):
-    """Where a link of file `path` leads, in Doxygen's words.
+def linked(path, text, link, section, subpages):
+    """A link of file `path` in Doxygen's words.
 
     `subpages` are the pages below it in the site's tree, or None where a link adds none.
     """
@@ -66,15 +67,15 @@ def target(path, link, section, subpages):
     if os.path.isfile(os.path.join(ROOT, file, "README.md")):
         file = os.path.join(file, "README.md")
     if section:
-        return "@ref " + anchor(file, section)
-    if file.endswith(".md"):
-        if subpages is None or path != parent(file) or file in subpages:
-            return "@ref " + page(file)
-        subpages.add(file)
-        return "@subpage " + page(file)
+        return f"[{text}](@ref {anchor(file, section)})"
     if file == "client/include/dssm":
-        return "@ref dssm"
-    return "files/" + file  # build.py copies it
+        return f"[{text}](@ref dssm)"
+    if not file.endswith(".md"):
+        return f"[{text}](files/{file})"  # build.py copies it
+    if subpages is None or path != parent(file) or file in subpages:
+        return f"[{text}](@ref {page(file)})"
+    subpages.add(file)
+    return f'@subpage {page(file)} "{text}"'
 
 
 def markdown(path, lines):
@@ -89,7 +90,7 @@ def markdown(path, lines):
             continue
         # The first page has links to most others: only its lists are in the order of the tree.
         below = subpages if path != "README.md" or line.startswith(("* ", "| ")) else None
-        line = LINK.sub(lambda m: f"[{m[1]}]({target(path, m[2], m[3], below)})", line)
+        line = LINK.sub(lambda m: linked(path, m[1], m[2], m[3], below), line)
         line = re.sub(r"\*\*(\w+)\*\*(?=\w)", r"<b>\1</b>", line)  # Doxygen wants a blank after **
         heading = HEADING.match(line)
         if heading:
@@ -99,6 +100,11 @@ def markdown(path, lines):
             elif number == 0:  # its sections would be between the pages in the tree
                 line += " {#mainpage}"
         yield line
+    if path != "README.md" and os.path.basename(path) == "README.md":
+        folder = os.path.dirname(path)
+        siblings = {f"{folder}/{name}" for name in os.listdir(os.path.join(ROOT, folder)) if name.endswith(".md")}
+        yield ""
+        yield from (f"* @subpage {page(name)}" for name in sorted(siblings - subpages - {path}))
 
 
 # --- headers
