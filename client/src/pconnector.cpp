@@ -105,9 +105,8 @@ Result<PConnector> PConnector::create(const StreamId& id, const TypeInfo& type,
   const std::string what = detail::attempt("create", id, options);
   DSSM_TRY(id.check(), what);
   DSSM_TRY(type.check(), what);
-  auto client = DSSM_TRY(
-      detail::StreamClient::open({id, channel::CreatePlan{type, history}}, std::move(options)),
-      what);
+  const channel::CreatePlan plan{type, history, options.keep_existing};
+  auto client = DSSM_TRY(detail::StreamClient::open({id, plan}, std::move(options)), what);
   return PConnector(std::make_unique<detail::PConnectorState>(std::move(client)));
 }
 

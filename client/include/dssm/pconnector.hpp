@@ -57,6 +57,8 @@ struct PConnectorOptions {
   // ~/.config/dssm/credentials if it exists. Without any of them connections are not encrypted.
   // Files that have changed are read again when a connection is made.
   std::string credentials = {};
+  // For create(): as in CreateOptions.
+  bool keep_existing = false;
   // How long a call waits for dssmd's greeting and answer.
   Duration request_timeout = std::chrono::seconds(5);
   // Samples that post() keeps until the owner acknowledges that they are written. Beyond either
@@ -89,8 +91,9 @@ class PConnector {
   //           invalid_argument (address, name)
   static Result<PConnector> open(const StreamId& id, PConnectorOptions options = {},
                                  const TypeInfo* wanted = nullptr);
-  // The same; creates the stream there if it does not exist.
-  //   fails  also: limit_exceeded, no_memory, invalid_argument (type, history)
+  // The same; creates the stream there, or opens or replaces the existing one, as
+  // Session::create_raw() says.
+  //   fails  also: limit_exceeded, no_memory, conflict, invalid_argument (type, history)
   static Result<PConnector> create(const StreamId& id, const TypeInfo& type, const History& history,
                                    PConnectorOptions options = {});
 

@@ -154,7 +154,9 @@ bool RemoteStream::create(const std::string& address, const StreamId& id, const 
   if (!call) return false;
   open_.store(false);
   address_ = address;
-  return take(PConnector::create(id, type, history, options(address, type.payload_bytes)),
+  PConnectorOptions with = options(address, type.payload_bytes);
+  with.keep_existing = true;
+  return take(PConnector::create(id, type, history, std::move(with)),
               "create " + quoted(id.name, id.id));
 }
 
