@@ -8,6 +8,10 @@
 //   threads  any; now() and deadline_in() call clock_gettime() and are async-signal-safe
 #pragma once
 
+#if __cplusplus < 202002L
+#error "libdssm needs C++20: compile with -std=c++20 or a later standard"
+#endif
+
 #include <chrono>
 #include <cstdint>
 #include <ctime>
