@@ -245,9 +245,13 @@ ReadStatus RawReader::read_previous(std::span<std::byte> payload, SampleInfo& in
 
 ReadStatus RawReader::read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
                               Duration max_age) noexcept {
+  if (max_age == kAnyAge) {  // apart, so that a read without a maximum age costs nothing more
+    return read_by_time(*state_, payload, info,
+                        [&](Tid& chosen) { return state_->ring.find(t, chosen); });
+  }
   return read_by_time(*state_, payload, info, [&](Tid& chosen) -> std::optional<ReadStatus> {
     const ReadStatus found = state_->ring.find(t, chosen);
-    if (found != ReadStatus::ok || max_age == kAnyAge) return found;
+    if (found != ReadStatus::ok) return found;
     SampleInfo seen;
     if (state_->ring.stamp(chosen, seen) != ReadStatus::ok) return kOvertaken;
     if (!is_stale(t, seen.time, max_age)) return ReadStatus::ok;
