@@ -251,7 +251,7 @@ class Dssmd {
                 }),
         count_(streams_.registry, status_) {
     restore(std::move(stored));
-    local_.set_limits_source([this] { return limits(); });
+    local_.set_facts_source([this] { return facts(); });
     channels_.set_sending(config.sending);
     if (config.mdns) {
       discovery_.emplace(loop,
@@ -328,14 +328,14 @@ class Dssmd {
     }
   }
 
-  // What `dssmctl info` shows.
-  LimitUses limits() const {
-    LimitUses all;
-    streams_.registry.add_limits(all);
-    streams_.opens.add_limits(all);
-    server_.add_limits(all);
-    channels_.add_limits(all);
-    return all;
+  // What `dssmctl info` and `dssmctl doctor` show.
+  DaemonFacts facts() const {
+    DaemonFacts facts{.config_file = config_.file, .clock_policy = clock_policy_};
+    streams_.registry.add_limits(facts.limits);
+    streams_.opens.add_limits(facts.limits);
+    server_.add_limits(facts.limits);
+    channels_.add_limits(facts.limits);
+    return facts;
   }
 
   // The keys that may change while dssmd runs.
@@ -352,6 +352,7 @@ class Dssmd {
     hosts_.mirrors.for_each([](Mirror& mirror) { mirror.on_new_demand(); });
     hosts_.peers.set_configured(changed.peers);
     hosts_.clock.set(changed.clocks, changed.max_drift);
+    clock_policy_ = changed.clocks.general.policy;
     use(changed);
     if (changed.rights != rights_.lines()) {
       const Rights before(rights_.lines());
@@ -400,6 +401,7 @@ class Dssmd {
   }
 
   const Config& config_;
+  ClockPolicy clock_policy_ = config_.clocks.general.policy;
   EventLoop& loop_;
   ServiceManager& manager_;
   Sockets& sockets_;
@@ -469,7 +471,7 @@ int main(int argc, char** argv) {
   }
   const std::unique_ptr<LeveledLogger> logger = open_log(line->config.log_level);
   Reloader::Read read_again;
-  if (!line->config_path.empty()) {
+  if (!line->config.file.empty()) {
     read_again = [argc, argv]() -> Result<Config> {
       return DSSM_TRY(parse_command_line(argc, argv)).config;
     };

@@ -112,6 +112,9 @@ struct Finding {
   }
 };
 
+// The part of it about streams.
+void check_streams(const Facts& facts, std::vector<Finding>& findings);
+
 // In the order of a person's search: dssmd, this PC, the others. While dssmd does not answer, there
 // are no findings about what only it knows.
 std::vector<Finding> findings_of(const Facts& facts);

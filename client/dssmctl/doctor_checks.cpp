@@ -11,7 +11,6 @@
 
 #include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/doctor.hpp"
-#include "client/dssmctl/names.hpp"
 #include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
@@ -26,9 +25,12 @@ constexpr std::uint64_t kMinRunBytes = 16 * kMebibyte;
 constexpr std::uint64_t kDescriptorsPerStream = 4;  // of dssmd
 // What dssmd has open beside its streams: its own, and a few programs and hosts. A guess.
 constexpr std::uint64_t kOtherDescriptors = 200;
-constexpr std::size_t kMaxNamed = 5;  // of streams in one text
 constexpr Duration kRenewBefore = std::chrono::hours(24 * 30);
-constexpr const char* kConfigFile = "/etc/dssm/dssmd.conf";
+constexpr const char* kUsualConfigFile = "/etc/dssm/dssmd.conf";
+constexpr std::string_view kUsualPort = "13776";
+constexpr const char* kNotEncrypted =
+    "every PC in that network can then read and write all streams; with credentials "
+    "(docs/security.md) only those of the vehicle";
 constexpr const char* kDefaultGroup = "dssm";
 
 // Starts one of Debian's own services, in a container too.
@@ -37,12 +39,44 @@ std::string start_command(const Facts& facts, const std::string& service) {
                        : fmt::format("sudo service {} start", service);
 }
 
-// Gives a host another name; `where` says which.
-std::string rename_command(const std::string& where) {
+struct Setting {
+  std::string_view key;
+  std::string value;  // as in TOML
+  std::string flag;
+};
+
+// Gives the keys of a host's configuration file these values, and restarts its dssmd.
+std::string configure(const std::string& file, const std::vector<Setting>& settings) {
+  std::string insertions, deletions;
+  for (const Setting& one : settings) {
+    insertions += fmt::format(" -e '1i {} = {}'", one.key, one.value);
+    deletions += fmt::format(" -e '/^{} *=/d'", one.key);
+  }
   return fmt::format(
-      "echo 'name = \"pc2\"'  # another one on {}, as a line in {}; then: sudo systemctl restart "
+      "sudo sed -i{}{} {file} && dssmd --config {file} --check-config && sudo systemctl restart "
       "dssmd",
-      where, kConfigFile);
+      insertions, deletions, fmt::arg("file", file));
+}
+
+// The same on this PC, where dssmd may be started without a file. `note`: a comment for the user.
+std::string configure_here(const Facts& facts, const std::vector<Setting>& settings,
+                           const std::string& note) {
+  if (!facts.daemon.config_file.empty()) {
+    return configure(facts.daemon.config_file, settings) + (note.empty() ? "" : "  # " + note);
+  }
+  std::string flags;
+  for (const Setting& one : settings) flags += one.flag.empty() ? "" : " " + one.flag;
+  return fmt::format("kill {} && dssmd{} &  # with the other flags that it had{}", facts.daemon.pid,
+                     flags, note.empty() ? "" : "; " + note);
+}
+
+const char* config_file(const Facts& facts) {
+  return facts.daemon.config_file.empty() ? kUsualConfigFile : facts.daemon.config_file.c_str();
+}
+
+// Gives a host another name than `name`.
+std::string rename_command(const std::string& name) {
+  return configure(kUsualConfigFile, {{"name", fmt::format("\"{}-2\"", name), ""}});
 }
 
 // --- dssmd
@@ -56,7 +90,7 @@ Finding no_permission(const Facts& facts) {
   if (socket.process_in_group) {
     return found(
         fmt::format("the socket or its folder shuts out even its group '{}'", group),
-        fmt::format("ls -l {}  # see the key socket_mode in {}", socket.path, kConfigFile));
+        fmt::format("ls -l {}  # see the key socket_mode in {}", socket.path, kUsualConfigFile));
   }
   if (socket.user_in_group) {
     return found(fmt::format("user '{}' joined the group '{}', but not before this login",
@@ -86,7 +120,7 @@ Finding no_daemon(const Facts& facts) {
   }
   if (facts.service == "active") {
     return found("dssmd runs, but listens elsewhere (key runtime_dir)",
-                 fmt::format("grep runtime_dir {}  # then set $DSSM_SOCKET", kConfigFile));
+                 fmt::format("grep runtime_dir {}  # then set $DSSM_SOCKET", kUsualConfigFile));
   }
   return found("dssmd is not running",
                facts.systemd ? "sudo systemctl enable --now dssmd"
@@ -157,7 +191,7 @@ Finding check_memory(const Facts& facts) {
     finding.warn("streams with long histories; soon no further one can be created",
                  fmt::format("dssmctl ls --sort memory  # rm what is not needed, or raise "
                              "max_memory in {}",
-                             kConfigFile));
+                             config_file(facts)));
   } else if (machine.total_bytes > 0 && machine.available_bytes < left &&
              machine.available_bytes < machine.total_bytes / 20) {
     finding.text +=
@@ -177,7 +211,10 @@ void check_descriptors(const Facts& facts, Findings& findings) {
                               facts.daemon.streams, taken)};
   if (taken + kOtherDescriptors > limit - limit / 5) {
     finding.warn("the limit on open files is too low for many more streams",
-                 "sudo systemctl edit dssmd  # [Service] LimitNOFILE=1048576, then restart dssmd");
+                 "sudo mkdir -p /etc/systemd/system/dssmd.service.d && printf "
+                 "'[Service]\\nLimitNOFILE=1048576\\n' | sudo tee "
+                 "/etc/systemd/system/dssmd.service.d/files.conf && sudo systemctl daemon-reload "
+                 "&& sudo systemctl restart dssmd");
   }
   findings.push_back(std::move(finding));
 }
@@ -222,7 +259,8 @@ Finding check_chronyd(const Facts& facts) {
       break;
   }
   return {"clock", Status::warn, "chrony is not installed",
-          "nothing bounds the difference between this clock and the others",
+          "nothing bounds the difference between this clock and the others; with clock_policy = "
+          "\"enforce\", the default, their streams are not opened",
           "sudo apt install chrony"};
 }
 
@@ -291,6 +329,21 @@ std::string good_clock_text(const Facts& facts, const HostInfo& self) {
                      self.clock_reference);
 }
 
+// With the samples of other PCs, while this PC's clock is not good.
+std::string what_policy_does(const Facts& facts) {
+  const std::string& policy = facts.daemon.clock_policy;
+  if (policy == dssm::name_of(ClockPolicy::enforce)) {
+    return fmt::format(
+        "; until it is good, streams of other PCs are not opened here; with "
+        "clock_policy = \"mark\" in {} they are, and their times are marked as bad",
+        config_file(facts));
+  }
+  if (policy == dssm::name_of(ClockPolicy::mark)) {
+    return "; until it is good, the times of other PCs' samples are marked as bad";
+  }
+  return "";
+}
+
 // As dssmd uses it. It is an error when reads by time fail for it: a PC without others has none.
 Finding check_clock(const Facts& facts) {
   if (facts.failed || facts.hosts.empty() || !facts.hosts.front().clock) {
@@ -320,6 +373,7 @@ Finding check_clock(const Facts& facts) {
       clock.reason == ClockReason::no_chronyd) {
     advice = {"chrony is not installed", "sudo apt install chrony"};
   }
+  finding.text += what_policy_does(facts);
   const bool refused = std::any_of(facts.hosts.begin(), facts.hosts.end(),
                                    [](const HostInfo& host) { return host.clock_refused; });
   if (refused) {
@@ -356,21 +410,35 @@ std::string without_port(const std::string& address) {
   return address.substr(0, address.find(':'));
 }
 
+// "13776" of "10.0.0.2:13776".
+std::string port_of(const std::string& address) {
+  const std::size_t colon = address.rfind(':');
+  const bool has_port = colon != std::string::npos && address.find(']', colon) == std::string::npos;
+  return has_port ? address.substr(colon + 1) : std::string(kUsualPort);
+}
+
+// Lets others in, without encryption unless there are credentials.
+std::vector<Setting> listen_settings(const std::string& port, bool has_credentials) {
+  std::vector<Setting> settings{
+      {"listen", fmt::format("[\"0.0.0.0:{}\"]", port), fmt::format("--listen 0.0.0.0:{}", port)}};
+  if (!has_credentials) settings.push_back({"insecure", "true", "--insecure"});
+  return settings;
+}
+
 void check_listening(const Facts& facts, Findings& findings) {
   if (facts.hosts.empty()) return;
   const std::vector<std::string>& own = facts.hosts.front().addresses;
   const bool closed = std::all_of(own.begin(), own.end(), on_loopback);
   const bool others = std::any_of(facts.hosts.begin(), facts.hosts.end(), is_other_pc);
+  const bool has_credentials = facts.daemon.credentials.has_value();
+  const std::string port = own.empty() ? std::string(kUsualPort) : port_of(own.front());
   Finding finding{"listening", Status::ok,
                   own.empty() ? "nowhere for other hosts" : "at " + list_text(own)};
   if (closed && !own.empty()) finding.text += ", for programs of this PC only";
   if (closed && others) {
-    finding.warn(
-        "other PCs cannot reach this one: the keys listen and credentials do not let them",
-        fmt::format("echo 'listen = [\"0.0.0.0:13776\"]' 'credentials = "
-                    "\"/etc/dssm/credentials\"'  # as two lines in {} (docs/security.md), then: "
-                    "sudo systemctl restart dssmd",
-                    kConfigFile));
+    finding.warn("other PCs cannot reach this one: it listens for programs of this PC only",
+                 configure_here(facts, listen_settings(port, has_credentials),
+                                has_credentials ? "" : kNotEncrypted));
   }
   findings.push_back(std::move(finding));
 }
@@ -388,7 +456,8 @@ void check_encryption(const Facts& facts, Findings& findings) {
   const CredentialsInfo& own = *facts.daemon.credentials;
   Finding finding{"encryption", Status::ok,
                   fmt::format("with the certificate of {}, {}", own.name, validity_text(own))};
-  const std::string renew = "dssmctl pki renew NAME  # at the authority, then pki install here";
+  const std::string renew = fmt::format(
+      "dssmctl pki renew {}  # at the authority, then pki install here", facts.daemon.host);
   if (!own.problem.empty()) {
     finding.status = Status::fail;
     finding.cause = own.problem;
@@ -398,7 +467,8 @@ void check_encryption(const Facts& facts, Findings& findings) {
   } else if (insecure) {
     finding.warn(
         "connections that are not encrypted are taken, too",
-        fmt::format("echo 'insecure = false'  # in {}, when all have credentials", kConfigFile));
+        configure_here(facts, {{"insecure", "false", ""}},
+                       "without --insecure or insecure = true, when all have credentials"));
   }
   findings.push_back(std::move(finding));
 }
@@ -470,7 +540,8 @@ Finding host_down(const HostInfo& host) {
     default:
       return found(
           "it is off, the cable is out, or a firewall is in between",
-          fmt::format("ping {}  # it answers: open TCP port 13776 in its firewall", where));
+          fmt::format("ping -c 3 {}  # it answers: open TCP port {} in its firewall", where,
+                      host.addresses.empty() ? kUsualPort : port_of(host.addresses.front())));
   }
 }
 
@@ -481,11 +552,13 @@ Finding host_refused(const HostInfo& host) {
   switch (host.reason) {
     case HostReason::duplicate:
       return found("one PC's disk was copied to the other, or two dssmd of this PC have one name",
-                   rename_command("one of them") +
-                       "; on a copied PC also: sudo rm /etc/machine-id && sudo "
-                       "systemd-machine-id-setup");
+                   "sudo rm /etc/machine-id && sudo systemd-machine-id-setup && " +
+                       rename_command(host.name) +
+                       "  # on the copy; two dssmd of one PC need "
+                       "different names only");
     case HostReason::namesake:
-      return found("both hosts have the same name", rename_command("one of them"));
+      return found("both hosts have the same name",
+                   rename_command(host.name) + "  # on one of them");
     default:
       return found("the two do not fit together: versions, names or limits",
                    "dssmctl hosts  # shows the reason; install the same version of DSSM on both");
@@ -493,15 +566,15 @@ Finding host_refused(const HostInfo& host) {
 }
 
 // Found by mDNS, but the keys of one of both PCs do not allow the connection.
-Finding host_closed(const HostInfo& host) {
+Finding host_closed(const Facts& facts, const HostInfo& host) {
   const bool here = host.reason == HostReason::closed_here;
   return {"host " + name_of(host), Status::warn,
           "found by mDNS, but not connected to: " + host.error,
           here ? "the key insecure of this PC does not let its dssmd connect to others"
                : "its keys listen and insecure do not let others in",
-          fmt::format("echo 'listen = [\"0.0.0.0:13776\"]' 'insecure = true'  # as two lines in "
-                      "{}{}, then restart {} dssmd",
-                      here ? "" : "its ", kConfigFile, here ? "this" : "its")};
+          here ? configure_here(facts, {{"insecure", "true", "--insecure"}}, kNotEncrypted)
+               : configure(kUsualConfigFile, listen_settings(std::string(kUsualPort), false)) +
+                     "  # there"};
 }
 
 // What is wrong with this host mostly concerns another one too, and is reported there.
@@ -518,7 +591,7 @@ void check_own_host(const Facts& facts, const HostInfo& self, Findings& findings
 }
 
 // `also_up`: the same host is up at another address.
-Finding host_finding(const HostInfo& host, bool also_up) {
+Finding host_finding(const Facts& facts, const HostInfo& host, bool also_up) {
   const std::string name = "host " + name_of(host);
   const std::string addresses = list_text(host.addresses);
   if (host.state == HostState::up) {
@@ -535,7 +608,7 @@ Finding host_finding(const HostInfo& host, bool also_up) {
     return {name, Status::warn, "being connected to", "dssmd or the network has just come up",
             "dssmctl hosts"};
   }
-  return host.state == HostState::closed ? host_closed(host) : host_down(host);
+  return host.state == HostState::closed ? host_closed(facts, host) : host_down(host);
 }
 
 void check_hosts(const Facts& facts, Findings& findings) {
@@ -547,7 +620,7 @@ void check_hosts(const Facts& facts, Findings& findings) {
     if (host.state == HostState::self) {
       check_own_host(facts, host, findings);
     } else {
-      findings.push_back(host_finding(host, !host.id.empty() && up.contains(host.id)));
+      findings.push_back(host_finding(facts, host, !host.id.empty() && up.contains(host.id)));
     }
   }
 }
@@ -592,75 +665,17 @@ Finding check_host_names(const Facts& facts) {
     if (host.reason == HostReason::duplicate) ids[host.name].insert("duplicate");
   }
   std::vector<std::string> shared;
+  std::string first;
   for (const auto& [name, of_name] : ids) {
-    if (of_name.size() > 1) shared.push_back(fmt::format("'{}'", name));
+    if (of_name.size() == 1) continue;
+    if (first.empty()) first = name;
+    shared.push_back(fmt::format("'{}'", name));
   }
   if (shared.empty()) return {"host names", Status::ok, "each is there once"};
   return {"host names", Status::fail,
           fmt::format("several hosts are called {}", fmt::join(shared, ", ")),
-          "PCs were installed from one image, or two dssmd run on one PC", rename_command("each")};
-}
-
-Finding check_stream_names(const Facts& facts) {
-  const Duplicates duplicates(facts.streams);
-  if (duplicates.owners().empty()) {
-    return {"stream names", Status::ok,
-            fmt::format("each of the {} streams can be opened without its host's name",
-                        facts.streams.size())};
-  }
-  std::vector<std::string> named;
-  std::string example, more;
-  for (const auto& [key, hosts] : duplicates.owners()) {
-    if (named.size() == kMaxNamed) {
-      more = fmt::format(" and {} more", duplicates.owners().size() - kMaxNamed);
-      break;
-    }
-    const std::string name = fmt::format("{}:{}", key.first, key.second);
-    named.push_back(fmt::format("'{}' of {}", name, list_text(hosts)));
-    if (example.empty()) example = fmt::format("{}@{}", name, hosts.front());
-  }
-  return {"stream names", Status::warn,
-          fmt::format("several hosts have {}{}", fmt::join(named, ", "), more),
-          "the same program runs on several hosts; a name without a host opens only a host's own "
-          "stream",
-          fmt::format("dssmctl info {}  # and so in programs", example)};
-}
-
-// The mirrors of this PC: whether what programs read here is what their owners have now.
-Finding check_mirrors(const Facts& facts) {
-  std::size_t mirrors = 0;
-  std::vector<std::string> behind;
-  std::string example;
-  for (const StreamInfo& stream : facts.streams) {
-    if (!stream.mirror) continue;
-    mirrors += stream.mirror->state == MirrorState::live && stream.mirror->max_rate_hz == 0 ? 1 : 0;
-    std::string what = carried_text(stream);
-    if (!what.empty()) {
-      what = fmt::format("the network {}", what);
-    } else if (const Duration late = behind_owner(stream); late > Duration()) {
-      what = duration_text(late) + " behind its owner";
-    }
-    if (what.empty()) continue;
-    if (example.empty()) example = stream.id.str();
-    behind.push_back(fmt::format("'{}': {}", stream.id.str(), what));
-  }
-  if (behind.empty()) {
-    return {"mirrors", Status::ok,
-            mirrors == 0 ? "no stream of another host is read here in full"
-                         : fmt::format("the network carries all samples of the {} streams of other "
-                                       "hosts that programs here read",
-                                       mirrors)};
-  }
-  std::string more;
-  if (behind.size() > kMaxNamed) {
-    more = fmt::format(", and {} more", behind.size() - kMaxNamed);
-    behind.resize(kMaxNamed);
-  }
-  return {"mirrors", Status::warn, fmt::format("{}{}", fmt::join(behind, ", "), more),
-          "they write more than the network to their hosts carries, or it was just interrupted",
-          fmt::format("dssmctl info {}  # then write less or shorter samples, limit its rate "
-                      "here (key mirror_streams), or use a faster network",
-                      example)};
+          "PCs were installed from one image, or two dssmd run on one PC",
+          rename_command(first) + "  # on all but one of them, with different names"};
 }
 
 }  // namespace
@@ -681,8 +696,7 @@ std::vector<Finding> findings_of(const Facts& facts) {
   check_hosts(facts, findings);
   check_fleet_clocks(facts, findings);
   findings.push_back(check_host_names(facts));
-  findings.push_back(check_stream_names(facts));
-  findings.push_back(check_mirrors(facts));
+  check_streams(facts, findings);
   return findings;
 }
 

@@ -170,6 +170,8 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
                            {"memory_bytes", daemon.memory_bytes},
                            {"memory_limit_bytes", daemon.memory_limit_bytes},
                            {"credentials", credentials_json(daemon)},
+                           {"config_file", or_null(daemon.config_file)},
+                           {"clock_policy", or_null(daemon.clock_policy)},
                            {"limits", limits_json(daemon)}}));
     return {};
   }
@@ -182,6 +184,7 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
            fmt::format("{} of {}", bytes_text(daemon.memory_bytes),
                        bytes_text(daemon.memory_limit_bytes)));
   add_line(out, "credentials", credentials_text(daemon));
+  add_line(out, "configuration", or_dash(escaped(daemon.config_file)));
   print_limits(daemon, out);
   return {};
 }

@@ -129,7 +129,14 @@ Result<RawWriter> Session::open_raw_writer(const StreamId& id, const TypeInfo* w
                                            std::uint32_t tag) {
   const std::string what = quoted("open", id) + " for writing";
   auto stream = DSSM_TRY(client_->open_writer(id, tag), what);
-  if (wanted) DSSM_TRY(stream->type.check_usable_as(*wanted), what);
+  if (!wanted) return RawWriter(std::make_unique<detail::WriterState>(std::move(stream)));
+  DSSM_TRY(stream->type.check_usable_as(*wanted), what);
+  if (stream->type.is_less_described_than(*wanted)) {
+    const ring::RingMapping& ring = *stream->ring->mapping;
+    const History history{ring.geometry().depth, ring.identity().cycle};
+    // Creating what exists opens it, and takes a type along.
+    return create_raw(stream->id, *wanted, history, {.keep_existing = true, .tag = tag});
+  }
   return RawWriter(std::make_unique<detail::WriterState>(std::move(stream)));
 }
 
@@ -321,7 +328,9 @@ Result<DaemonInfo> Session::daemon_info() {
       {wire::enum_untrusted(mdns.phase(), MdnsPhase::running), mdns.error(), mdns.avahi_version(),
        mdns.announced(), mdns.withheld(), mdns.own_host_seen(), mdns.hosts_heard()},
       std::move(credentials),
-      std::move(limits)};
+      std::move(limits),
+      daemon.config_file(),
+      daemon.clock_policy()};
 }
 
 bool Session::is_connected() const noexcept { return client_->connection().is_up(); }

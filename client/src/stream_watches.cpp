@@ -68,8 +68,9 @@ void StreamWatches::on_event(const proto::StreamEvent& message) {
     if (known_.erase(name) == 0) return;
   } else {
     const auto [entry, is_new] = known_.try_emplace(name, event.stream);
-    if (!is_new && entry->second.incarnation == event.stream.incarnation) return;
-    entry->second = event.stream;
+    const std::uint64_t known_incarnation = std::exchange(entry->second, event.stream).incarnation;
+    // Or it has a description now.
+    if (!is_new && known_incarnation == event.stream.incarnation) return;
   }
   for (const auto& [key, callback] : watches_) callback(event);
 }

@@ -204,6 +204,10 @@ Result<void> TypeInfo::check_usable_as(const TypeInfo& wanted) const {
                            fields_differ ? ": " + first_difference(fields, wanted.fields) : "")};
 }
 
+bool TypeInfo::is_less_described_than(const TypeInfo& other) const noexcept {
+  return (name.empty() && !other.name.empty()) || (fields.empty() && !other.fields.empty());
+}
+
 Result<void> TypeInfo::check() const {
   if (name.size() > kMaxTypeNameBytes) {
     return invalid("type name '{}...' is {} bytes long; at most {} are possible",

@@ -238,7 +238,10 @@ Reply LocalRequests::get_daemon() const {
   daemon.set_streams(registry_.streams().size());
   daemon.set_memory_bytes(registry_.budget().used());
   daemon.set_memory_limit_bytes(registry_.budget().limit());
-  for (const LimitUse& one : limits_ ? limits_() : LimitUses()) {
+  const DaemonFacts facts = facts_ ? facts_() : DaemonFacts();
+  daemon.set_config_file(facts.config_file);
+  daemon.set_clock_policy(std::string(name_of(facts.clock_policy)));
+  for (const LimitUse& one : facts.limits) {
     local::LimitUse& entry = *daemon.add_limits();
     entry.set_name(std::string(one.name));
     entry.set_used(one.used);

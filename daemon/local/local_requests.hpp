@@ -109,6 +109,13 @@ class Fleet {
   ~Fleet() = default;
 };
 
+// What the response to GetDaemon says of the dssmd as a whole.
+struct DaemonFacts {
+  LimitUses limits;
+  std::string config_file;  // empty: it has none
+  ClockPolicy clock_policy = ClockPolicy::enforce;
+};
+
 class LocalRequests {
  public:
   // What is given by reference outlives it.
@@ -116,7 +123,7 @@ class LocalRequests {
   LocalRequests(Registry& registry, OpenTable& opens, PlaybackClockOwner& clock,
                 const Rights& rights, Fleet* fleet);
 
-  void set_limits_source(std::function<LimitUses()> source) { limits_ = std::move(source); }
+  void set_facts_source(std::function<DaemonFacts()> source) { facts_ = std::move(source); }
 
   using Client = std::shared_ptr<const ClientIdentity>;
   // Called once: later, or at once. If the client has disconnected by then, its opens are removed
@@ -172,7 +179,7 @@ class LocalRequests {
   const Rights& rights_;
   Fleet* const fleet_;
   CatalogRequests catalog_;
-  std::function<LimitUses()> limits_;  // may be empty
+  std::function<DaemonFacts()> facts_;  // may be empty
 };
 
 }  // namespace dssm::daemon

@@ -325,6 +325,10 @@ void LocalService::on_stream_added(const Stream& stream) {
   notify_successors(stream.id());
 }
 
+void LocalService::on_stream_described(const Stream& stream) {
+  broadcast(added_event(stream, opens_));
+}
+
 void LocalService::on_stream_removed(const Stream& stream) {
   const StreamId& id = stream.id();
   broadcast(removed_event(id, stream.incarnation()));

@@ -63,9 +63,9 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   LocalService& operator=(const LocalService&) = delete;
   ~LocalService();
 
-  // What the response to GetDaemon lists; called from the loop. Until it is set, nothing.
-  void set_limits_source(std::function<LimitUses()> source) {
-    requests_.set_limits_source(std::move(source));
+  // Of the response to GetDaemon; called from the loop. Until it is set, there are none.
+  void set_facts_source(std::function<DaemonFacts()> source) {
+    requests_.set_facts_source(std::move(source));
   }
 
   // A client connected; `output` stays until disconnect().
@@ -125,6 +125,7 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   void serve_deferred();
 
   void on_stream_added(const Stream& stream) override;
+  void on_stream_described(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
   void on_recovered() override { serve_deferred(); }
   void on_remote_stream_added(const StreamInfo& stream) override;

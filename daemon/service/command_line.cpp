@@ -23,8 +23,8 @@ Result<void> collect(CommandLine& line, const Flags& flags) {
   const auto note = [&](const std::string& mistake) {
     mistakes.append(mistakes.empty() ? "" : "\n").append(mistake);
   };
-  if (!line.config_path.empty()) {
-    if (Result<void> applied = apply_file(line.config, line.config_path); !applied) {
+  if (!line.config.file.empty()) {
+    if (Result<void> applied = apply_file(line.config, line.config.file); !applied) {
       note(applied.error().message);
     }
   }
@@ -81,7 +81,7 @@ Result<CommandLine> parse_command_line(int argc, const char* const* argv) {
         "configuration file, with '_' for '-' (--peer is the key 'peers'). See dssmd(8) and\n"
         "docs/configuration.md.");
     app.set_version_flag("--version", "dssmd " DSSM_VERSION);
-    app.add_option("--config", line.config_path, "configuration file (TOML)")->type_name("FILE");
+    app.add_option("--config", line.config.file, "configuration file (TOML)")->type_name("FILE");
     app.add_flag("--check-config", check, "only check the configuration: print OK or the mistakes");
     for (const ConfigKey& key : config_keys()) add_flag(app, key, flags);
     try {

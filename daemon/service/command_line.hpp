@@ -17,8 +17,7 @@ struct CommandLine {
   // What was asked for. `print`: show `text` and leave with success (--help, --version).
   enum class Action : std::uint8_t { run, check_config, print } action = Action::run;
   std::string text;
-  std::string config_path;  // empty: none given
-  Config config;            // from file and flags, complete; set unless `print`
+  Config config;  // from file and flags, complete; set unless `print`
 };
 
 // Fails with invalid_argument, one line per mistake.

@@ -35,6 +35,7 @@ inline constexpr std::uint64_t kMaxOpens = 100'000;
 inline constexpr std::uint64_t kMaxConnections = 32768;
 
 struct Config {
+  std::string file;  // that it was read from, besides flags; empty: none
   std::string name;  // of this host; empty until finish() puts the machine's name there
   std::string runtime_dir = "/run/dssm";
   std::optional<gid_t> socket_group;  // none: the group that dssmd runs in

@@ -93,7 +93,12 @@ Result<OpenedRing> Registry::create(const StreamId& id, const TypeInfo& type,
   const StreamId own = DSSM_TRY(own_id(id));
   const std::string context = "stream '" + own.str() + "'";
   if (const auto found = by_name_.find(Key{own.name, own.id}); found != by_name_.end()) {
-    DSSM_TRY(found->second->type().check_usable_as(type), context);
+    Stream& stream = *found->second;
+    DSSM_TRY(stream.type().check_usable_as(type), context);
+    if (stream.type().is_less_described_than(type)) {
+      DSSM_TRY(stream.describe_as(type, budgets_.of(stream.account())), context);
+      for (StreamObserver* observer : observers_) observer->on_stream_described(stream);
+    }
     return OpenedRing{found->second, false};
   }
   DSSM_TRY(check_quota(account), context);

@@ -25,6 +25,8 @@ class StreamObserver {
  public:
   virtual void on_stream_added(const Stream& stream) = 0;
   virtual void on_stream_removed(const Stream& stream) = 0;
+  // It has a description now.
+  virtual void on_stream_described(const Stream&) {}
   // No stream of the dssmd before this one comes back any more.
   virtual void on_recovered() {}
 
@@ -114,7 +116,8 @@ class Registry {
   Result<std::shared_ptr<Stream>> find(const StreamId& id) const;
   bool knows(const StreamId& id) const { return find(id).has_value(); }
 
-  // Creates a stream, or gives the one of that name when the type fits.
+  // Creates a stream, or gives the one of that name when the type fits, which takes what its
+  // description lacks from `type`.
   //   fails  invalid_argument, type_mismatch, limit_exceeded, os errors
   Result<OpenedRing> create(const StreamId& id, const TypeInfo& type, const History& history,
                             std::int32_t creator_pid, const std::string& account = {});

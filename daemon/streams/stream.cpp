@@ -54,9 +54,8 @@ local::StreamMeta meta_of(const Stream::Plan& plan) {
   return meta;
 }
 
-// Takes the memory of a ring and of its type's description from the budget.
-Result<MemoryShare> take_share(MemoryBudget& budget, const TypeInfo& type,
-                               const ring::Geometry& geometry) {
+// Takes the memory of a type's description from the budget.
+Result<MemoryShare> take_type_share(MemoryBudget& budget, const TypeInfo& type) {
   proto::Type message;
   wire::to_message(type, message);
   const std::size_t type_bytes = message.ByteSizeLong();
@@ -65,7 +64,7 @@ Result<MemoryShare> take_share(MemoryBudget& budget, const TypeInfo& type,
                                                    "most {} are taken: describe fewer fields",
                                                    type_bytes, kMaxTypeBytes)};
   }
-  return budget.take(geometry.total_bytes + type_bytes);
+  return budget.take(type_bytes);
 }
 
 // The plan that `meta` and the ring agree on.
@@ -74,8 +73,7 @@ Result<Stream::Plan> plan_untrusted(const local::StreamMeta& meta,
   const StreamId id = DSSM_TRY(wire::stream_id_untrusted(meta.id()));
   const TypeInfo type = DSSM_TRY(wire::type_untrusted(meta.type()));
   const ring::RingIdentity& ring = mapping.identity();
-  if (id != ring.id || type.payload_bytes != mapping.geometry().payload_bytes ||
-      type.alignment_bytes != ring.alignment_bytes) {
+  if (id != ring.id || type.payload_bytes != mapping.geometry().payload_bytes) {
     return Error{Errc::protocol, fmt::format("the offered meta file describes '{}' with {}, the "
                                              "offered ring is that of '{}' with {} bytes",
                                              id.str(), type.str(), ring.id.str(),
@@ -135,7 +133,9 @@ void fill_figures(const ring::RingMapping& mapping, StreamInfo& info) {
 
 Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudgets& budgets) {
   const ring::Geometry geometry = DSSM_TRY(ring::Geometry::of(plan.type.payload_bytes, plan.depth));
-  MemoryShare share = DSSM_TRY(take_share(budgets.of(plan.account), plan.type, geometry));
+  MemoryBudget& budget = budgets.of(plan.account);
+  MemoryShare type_share = DSSM_TRY(take_type_share(budget, plan.type));
+  MemoryShare ring_share = DSSM_TRY(budget.take(geometry.total_bytes));
   const std::uint64_t incarnation =
       DSSM_TRY(plan.incarnation != 0 ? Result(plan.incarnation) : new_incarnation());
   const ring::RingIdentity identity{plan.id, incarnation, plan.cycle, plan.type.alignment_bytes};
@@ -144,7 +144,8 @@ Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudgets& 
   MetaFile meta = DSSM_TRY(MetaFile::create(meta_of(plan), identity.label()));
   auto mapping = DSSM_TRY(ring::RingMapping::open_untrusted(ring.get(), ring::Access::read_only));
   return std::shared_ptr<Stream>(new Stream(plan, Files{std::move(ring), std::move(bell)},
-                                            std::move(meta), std::move(mapping), std::move(share)));
+                                            std::move(meta), std::move(mapping),
+                                            std::move(ring_share), std::move(type_share)));
 }
 
 Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files,
@@ -159,13 +160,14 @@ Result<std::shared_ptr<Stream>> Stream::adopt_untrusted(OfferedFiles files,
   const local::StreamMeta content = DSSM_TRY(meta.read_untrusted());
   Plan plan = DSSM_TRY(plan_untrusted(content, *mapping));
   MemoryBudget& budget = budgets.of(plan.account);
-  MemoryShare share = DSSM_TRY(take_share(budget, plan.type, mapping->geometry()));
+  MemoryShare type_share = DSSM_TRY(take_type_share(budget, plan.type));
+  MemoryShare ring_share = DSSM_TRY(budget.take(mapping->geometry().total_bytes));
   MemoryShare property_share = DSSM_TRY(budget.take(content.property().size()));
   // Always a new one: writers get a descriptor that does not depend on the client's.
   UniqueFd ring = DSSM_TRY(reopen_read_write(files.ring.get()));
-  std::shared_ptr<Stream> stream(new Stream(std::move(plan),
-                                            Files{std::move(ring), std::move(files.bell)},
-                                            std::move(meta), std::move(mapping), std::move(share)));
+  std::shared_ptr<Stream> stream(
+      new Stream(std::move(plan), Files{std::move(ring), std::move(files.bell)}, std::move(meta),
+                 std::move(mapping), std::move(ring_share), std::move(type_share)));
   stream->property_share_ = std::move(property_share);
   stream->take_doorbell_untrusted(files.client, std::move(files.doorbell));
   return stream;
@@ -180,6 +182,16 @@ Stream::~Stream() {
         ring.reset();
       });
   if (thread) thread->detach();
+}
+
+Result<void> Stream::describe_as(const TypeInfo& type, MemoryBudget& budget) {
+  MemoryShare share = DSSM_TRY(take_type_share(budget, type));
+  local::StreamMeta content = DSSM_TRY(meta_.read_untrusted());
+  wire::to_message(type, *content.mutable_type());
+  DSSM_TRY(meta_.replace(content));
+  plan_.type = type;
+  type_share_ = std::move(share);
+  return {};
 }
 
 StreamInfo Stream::info(bool with_fields) const {

@@ -98,6 +98,10 @@ class Stream : public std::enable_shared_from_this<Stream> {
 
   const StreamId& id() const noexcept { return plan_.id; }
   const TypeInfo& type() const noexcept { return plan_.type; }
+  // Takes name, alignment and fields of `type`, which type().check_usable_as() accepts. What
+  // programs have open keeps its description.
+  //   fails  limit_exceeded, os errors; then nothing has changed
+  Result<void> describe_as(const TypeInfo& type, MemoryBudget& budget);
   std::int32_t creator_pid() const noexcept { return plan_.creator_pid; }
   const std::string& account() const noexcept { return plan_.account; }
   std::uint64_t created_order() const noexcept { return plan_.created_order; }
@@ -164,12 +168,13 @@ class Stream : public std::enable_shared_from_this<Stream> {
     UniqueFd fd;
   };
   Stream(Plan plan, Files files, MetaFile meta, std::shared_ptr<const ring::RingMapping> mapping,
-         MemoryShare share)
+         MemoryShare ring_share, MemoryShare type_share)
       : plan_(std::move(plan)),
         files_(std::move(files)),
         meta_(std::move(meta)),
         mapping_(std::move(mapping)),
-        share_(std::move(share)) {}
+        ring_share_(std::move(ring_share)),
+        type_share_(std::move(type_share)) {}
   std::vector<Doorbell>::iterator doorbell_of(ClientNumber client);
   void add_doorbell(ClientNumber client, UniqueFd doorbell);
 
@@ -178,7 +183,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
   std::vector<Doorbell> doorbells_;
   MetaFile meta_;
   std::shared_ptr<const ring::RingMapping> mapping_;  // read-only
-  MemoryShare share_, property_share_;                // of ring and type; of the property
+  MemoryShare ring_share_, type_share_, property_share_;
   bool removed_ = false;
   std::uint32_t channels_ = 0;
   DoorbellObserver* doorbell_observer_ = nullptr;

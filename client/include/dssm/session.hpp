@@ -82,6 +82,8 @@ struct DaemonInfo {
   MdnsInfo mdns;
   std::optional<CredentialsInfo> credentials;  // empty: connections are not encrypted
   std::vector<LimitInfo> limits;               // empty: an older dssmd
+  std::string config_file;                     // empty: none, or an older dssmd
+  std::string clock_policy;                    // the value of that key; empty: an older dssmd
 };
 
 // Who may do what with a stream on this PC, by dssmd's configuration (docs/security.md "Rights").
@@ -187,7 +189,8 @@ class Session {
                                const CreateOptions& options = {});
 
   // Opens an existing stream. With `wanted`, fails with type_mismatch unless
-  // TypeInfo::check_usable_as(wanted).
+  // TypeInfo::check_usable_as(wanted); a stream of this PC that is written takes name, alignment and
+  // fields that its type lacks from `wanted`, as it does from create_raw().
   //   fails  not_found, type_mismatch, conflict (several hosts have a stream of that name),
   //          clock_out_of_bounds (reading another host's stream)
   Result<RawWriter> open_raw_writer(const StreamId& id, const TypeInfo* wanted = nullptr,

@@ -97,6 +97,10 @@ struct TypeInfo {
   //   fails  type_mismatch, with both descriptions and the first difference
   Result<void> check_usable_as(const TypeInfo& wanted) const;
 
+  // Whether `other`, which check_usable_as() accepts, has a name or fields that are missing here. A
+  // stream takes them from the next program that opens it for writing.
+  bool is_less_described_than(const TypeInfo& other) const noexcept;
+
   // Checks sizes, alignment (a power of two up to 64) and that each field lies inside the payload.
   //   fails  invalid_argument
   Result<void> check() const;

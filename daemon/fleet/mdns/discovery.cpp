@@ -48,6 +48,8 @@ void Discovery::start_announcing() {
 
 void Discovery::on_stream_added(const Stream&) { announce_soon(); }
 
+void Discovery::on_stream_described(const Stream&) { announce_soon(); }
+
 void Discovery::on_stream_removed(const Stream&) { announce_soon(); }
 
 void Discovery::announce_soon() {

@@ -47,6 +47,7 @@ class Discovery final : private StreamObserver {
 
  private:
   void on_stream_added(const Stream& stream) override;
+  void on_stream_described(const Stream& stream) override;
   void on_stream_removed(const Stream& stream) override;
   void announce_soon();
   void announce();

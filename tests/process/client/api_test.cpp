@@ -245,6 +245,26 @@ TEST_F(Api, NamesBothTypesWhenTheyDoNotMatch) {
   EXPECT_EQ(bytes.code, Errc::type_mismatch);
 }
 
+TEST_F(Api, AStreamWithoutADescriptionTakesThatOfTheNextWriter) {
+  const auto fields = [&](std::string_view name) {
+    return session.stream_info({std::string(name), 0, ""}).value().type.fields.size();
+  };
+  for (const std::string_view name : {"created", "opened"}) {
+    // As a program of SSM does.
+    auto plain = session.create_raw({std::string(name), 0, ""}, {"", 24, 1, {}}, {64, 10ms});
+    const std::vector<std::byte> bytes(24);
+    ASSERT_EQ(plain.value().write(bytes, time_of(0)), 0);
+    ASSERT_TRUE(session.open_reader<Odometry>(name));
+    EXPECT_EQ(fields(name), 0u) << "a reader may not describe it";
+    auto writer = name == "opened" ? session.open_writer<Odometry>(name)
+                                   : session.create<Odometry>(name, History{64, 10ms});
+    ASSERT_TRUE(writer) << writer.error().message;
+    EXPECT_EQ(fields(name), 3u);
+    write(*writer, 1);
+    EXPECT_EQ(session.open_writer<Turned>(name).error().code, Errc::type_mismatch);
+  }
+}
+
 TEST_F(Api, AProgramThatAsksForMoreHistoryThanThereIsGetsItOrAnError) {
   const auto depth = [&](std::uint64_t asked, CreateOptions options = {}) {
     return session.create<Odometry>("odometry", History{asked, 10ms}, options).value().depth();

@@ -3,8 +3,11 @@
 // The checks of dssmctl doctor: from a set of facts that differs from a healthy host's in one
 // thing, which finding follows, with which advice.
 #include <gtest/gtest.h>
+#include <unistd.h>
 
 #include <algorithm>
+#include <fstream>
+#include <sstream>
 
 #include "client/dssmctl/doctor.hpp"
 
@@ -270,14 +273,56 @@ TEST(Doctor, GivesAReferenceAdviceOfItsRole) {
 
 TEST(Doctor, WarnsOfLoopbackOnlyWhereThereAreOtherPcs) {
   Facts facts = healthy();
-  facts.hosts[0].addresses = {"127.0.0.1:13776", "[::1]:13776"};
-  EXPECT_FINDING(facts, "listening", Status::warn, "listen = ");
+  facts.hosts[0].addresses = {"127.0.0.1:4000", "[::1]:4000"};
+  EXPECT_FINDING(facts, "listening", Status::warn,
+                 "kill 42 && dssmd --listen 0.0.0.0:4000 --insec");
   facts.hosts[0].addresses.clear();
-  EXPECT_FINDING(facts, "listening", Status::warn, "credentials = ");
+  facts.daemon.config_file = "/etc/dssm/dssmd.conf";
+  EXPECT_FINDING(facts, "listening", Status::warn, "'1i listen = [\"0.0.0.0:13776\"]'");
+  EXPECT_FINDING(facts, "listening", Status::warn, "insecure = true");
+  facts.daemon.credentials.emplace();
+  EXPECT_EQ(finding_of(facts, "listening").command.find("insecure"), std::string::npos);
   facts.hosts[1].addresses = {"127.0.0.1:20000"};  // a second dssmd of this PC
   EXPECT_FINDING(facts, "listening", Status::ok, "");
   facts.hosts.pop_back();
   EXPECT_FINDING(facts, "listening", Status::ok, "");
+}
+
+TEST(Doctor, PrintsACommandThatSetsKeysOfTheConfiguration) {
+  const std::string file = testing::TempDir() + "doctor-" + std::to_string(::getpid()) + ".conf";
+  std::ofstream(file) << "listen = [\"127.0.0.1:4000\"]\n#insecure = false\nname = \"pc1\"\n";
+  Facts facts = healthy();
+  facts.hosts[0].addresses = {"127.0.0.1:4000"};
+  facts.daemon.config_file = file;
+  const std::string command = finding_of(facts, "listening").command;
+  ASSERT_TRUE(command.starts_with("sudo sed ")) << command;
+  const std::size_t second = command.find(" && ");
+  ASSERT_EQ(command.find("dssmd --config " + file + " --check-config && "), second + 4) << command;
+  const auto end =
+      run_program({"sh", "-c", command.substr(5, second - 5)}, std::chrono::minutes(1));
+  ASSERT_TRUE(end && end->exit_status == 0) << (end ? end->output : "no sh");
+  std::ostringstream text;
+  text << std::ifstream(file).rdbuf();
+  ::unlink(file.c_str());
+  EXPECT_EQ(text.str(),
+            "listen = [\"0.0.0.0:4000\"]\ninsecure = true\n#insecure = false\nname = \"pc1\"\n");
+}
+
+TEST(Doctor, SaysWhatTheClockPolicyDoesWithoutAGoodClock) {
+  Facts facts = with_clocks();
+  facts.hosts[0].clock =
+      clock_of(ClockStatus::out_of_bounds, ClockReason::no_chronyd, ClockBasis::nothing);
+  facts.clock.state = ClockFacts::State::no_chrony;
+  facts.daemon.config_file = "/etc/pc1.conf";
+  for (const auto& [policy, words] :
+       {std::pair("enforce", "not opened here; with clock_policy = \"mark\" in /etc/pc1.conf"),
+        std::pair("mark", "are marked as bad")}) {
+    facts.daemon.clock_policy = policy;
+    EXPECT_NE(finding_of(facts, "clock").text.find(words), std::string::npos)
+        << finding_of(facts, "clock").text;
+  }
+  facts.daemon.clock_policy = "off";
+  EXPECT_EQ(finding_of(facts, "clock").text.find("other PCs"), std::string::npos);
 }
 
 TEST(Doctor, SaysWhetherConnectionsAreEncrypted) {
@@ -286,11 +331,13 @@ TEST(Doctor, SaysWhetherConnectionsAreEncrypted) {
   facts.hosts[0].insecure = true;
   EXPECT_FINDING(facts, "encryption", Status::warn, "dssmctl pki");
   facts.daemon.credentials = {"host 'pc1'", WallClock::now() + std::chrono::hours(24 * 31), ""};
-  EXPECT_FINDING(facts, "encryption", Status::warn, "insecure = false");
+  EXPECT_FINDING(facts, "encryption", Status::warn, "without --insecure");
+  facts.daemon.config_file = "/etc/dssm/dssmd.conf";
+  EXPECT_FINDING(facts, "encryption", Status::warn, "'1i insecure = false'");
   facts.hosts[0].insecure = false;
   EXPECT_FINDING(facts, "encryption", Status::ok, "");
   facts.daemon.credentials->valid_until = WallClock::now() + std::chrono::hours(24 * 29);
-  EXPECT_FINDING(facts, "encryption", Status::warn, "pki renew");
+  EXPECT_FINDING(facts, "encryption", Status::warn, "pki renew pc1 ");
   facts.daemon.credentials->problem = "expired";
   EXPECT_FINDING(facts, "encryption", Status::fail, "pki renew");
 }
@@ -329,13 +376,12 @@ TEST(Doctor, ReportsOfEachHostWhyItIsNotUp) {
   };
   for (const Case& one : {
            Case{HostState::down, HostReason::connection_refused, "systemctl status dssmd"},
-           Case{HostState::down, HostReason::no_answer, "ping 10.0.0.2 "},
+           Case{HostState::down, HostReason::no_answer, "ping -c 3 10.0.0.2 "},
            Case{HostState::down, HostReason::no_greeting, "ss -ltnp"},
            Case{HostState::down, HostReason::name_not_found, "getent hosts 10.0.0.2 "},
            Case{HostState::refused, HostReason::not_accepted, "same version"},
-           Case{HostState::closed, HostReason::closed_there, "in its /etc/dssm/dssmd.conf"},
-           Case{HostState::closed, HostReason::closed_here,
-                "in /etc/dssm/dssmd.conf, then restart this"},
+           Case{HostState::closed, HostReason::closed_there, "listen = "},
+           Case{HostState::closed, HostReason::closed_here, "kill 42 && dssmd --insecure"},
            Case{HostState::connecting, HostReason::none, "dssmctl hosts"},
        }) {
     Facts facts = healthy();
@@ -344,8 +390,9 @@ TEST(Doctor, ReportsOfEachHostWhyItIsNotUp) {
     EXPECT_FINDING(facts, "host pc2", works ? Status::warn : Status::fail, one.command);
   }
   Facts facts = healthy();
-  facts.hosts[1] = host_at("", HostState::down, "[fe80::2%eth0]:13776", HostReason::no_answer);
-  EXPECT_FINDING(facts, "host [fe80::2%eth0]:13776", Status::fail, "ping fe80::2%eth0 ");
+  facts.hosts[1] = host_at("", HostState::down, "[fe80::2%eth0]:4000", HostReason::no_answer);
+  EXPECT_FINDING(facts, "host [fe80::2%eth0]:4000", Status::fail, "ping -c 3 fe80::2%eth0 ");
+  EXPECT_FINDING(facts, "host [fe80::2%eth0]:4000", Status::fail, "port 4000 ");
 }
 
 TEST(Doctor, NamesCommandsThatWorkWithoutSystemd) {
@@ -417,14 +464,43 @@ TEST(Doctor, FindsACopyOfThisHost) {
 TEST(Doctor, FindsStreamsOfOneNameAndNamesOnlySome) {
   Facts facts = healthy();
   facts.streams.push_back(stream_of("lidar", "pc2"));
-  EXPECT_FINDING(facts, "stream names", Status::warn, "lidar:0@pc1");
-  EXPECT_EQ(finding_of(facts, "stream names").text, "several hosts have 'lidar:0' of pc1, pc2");
+  EXPECT_FINDING(facts, "stream names", Status::warn, "dssmctl info 'lidar:0@pc1'");
+  EXPECT_EQ(finding_of(facts, "stream names").text,
+            "several hosts have one stream name: 'lidar:0' of pc1, pc2");
   for (int i = 0; i < 100; ++i) {
     for (const char* host : {"pc1", "pc2"}) {
       facts.streams.push_back(stream_of("x" + std::to_string(i), host));
     }
   }
   EXPECT_TRUE(finding_of(facts, "stream names").text.ends_with(" and 96 more"));
+}
+
+TEST(Doctor, FindsRingsThatKeepLessThanTheyWereCreatedFor) {
+  Facts facts = healthy();
+  StreamInfo& stream = facts.streams[0];
+  stream.id.name = "it's";
+  stream.depth = 101;
+  stream.cycle = std::chrono::milliseconds(10);
+  stream.rate_hz = 110;
+  EXPECT_FINDING(facts, "histories", Status::ok, "");
+  stream.rate_hz = 500;
+  EXPECT_FINDING(facts, "histories", Status::warn, "dssmctl hz 'it'\\''s:0@pc1'");
+  EXPECT_EQ(finding_of(facts, "histories").text,
+            "'it's:0@pc1' keeps 200 ms, not 1.00 s: 500.0 samples a second, not 100.0");
+}
+
+TEST(Doctor, FindsTypesOfOneNameThatDiffer) {
+  Facts facts = healthy();
+  facts.streams[0].type = {"Pose", 16, 8, {}};
+  facts.streams[1].type = {"Pose", 16, 8, {{"x", Scalar::float64, 0, 1, 0}}};
+  facts.streams.push_back(facts.streams[1]);
+  facts.streams.push_back(stream_of("bytes", "pc2"));
+  EXPECT_FINDING(facts, "types", Status::ok, "");
+  facts.streams[2].id.name = "other";
+  facts.streams[2].type.fields[0].name = "y";
+  EXPECT_FINDING(facts, "types", Status::warn, "dssmctl info 'other:0@pc2'");
+  EXPECT_EQ(finding_of(facts, "types").text,
+            "different types have one name: 'Pose' of 'odom:0@pc2' and of 'other:0@pc2'");
 }
 
 TEST(Doctor, WarnsOfMirrorsThatTheNetworkCannotFill) {
@@ -441,7 +517,7 @@ TEST(Doctor, WarnsOfMirrorsThatTheNetworkCannotFill) {
   stream.mirror->newest_time = time_from_ns(9'900'000'000);
   EXPECT_FINDING(facts, "mirrors", Status::ok, "");
   stream.mirror->newest_time = time_from_ns(8'000'000'000);
-  EXPECT_FINDING(facts, "mirrors", Status::warn, "dssmctl info odom:0@pc2");
+  EXPECT_FINDING(facts, "mirrors", Status::warn, "dssmctl info 'odom:0@pc2'");
   EXPECT_EQ(finding_of(facts, "mirrors").text, "'odom:0@pc2': 2.00 s behind its owner");
   stream.mirror->recent_samples = 90;
   stream.mirror->recent_lost_samples = 57;

@@ -212,11 +212,16 @@ TEST(LocalService, NotifiesWatchersOfExistingStreamsAndOfChanges) {
   EXPECT_EQ(there.serial(), 0u);
   EXPECT_EQ(there.stream_event().stream().id().name(), "a");
   EXPECT_TRUE(watcher.next().has_done()) << "the answer comes when all has been told";
-  client.ask(create_request("b"));
+  local::Request plain = create_request("b");
+  plain.mutable_create()->mutable_type()->clear_name();
+  plain.mutable_create()->mutable_type()->clear_fields();
+  client.ask(plain);
   const local::Response added = watcher.next();
   EXPECT_EQ(added.serial(), 0u);
   EXPECT_FALSE(added.stream_event().removed());
   EXPECT_EQ(added.stream_event().stream().id().name(), "b");
+  client.ask(create_request("b"));
+  EXPECT_NE(watcher.next().stream_event().stream().type().name(), "") << "it is described now";
   local::Request remove;
   remove.mutable_remove()->mutable_id()->set_name("a");
   client.ask(remove);
@@ -368,11 +373,11 @@ TEST(LocalService, DescribesItself) {
 
 TEST(LocalService, ListsTheLimitsOfAllParts) {
   Daemon daemon;
-  daemon.service.set_limits_source([&] {
-    LimitUses all;
-    daemon.registry.add_limits(all);
-    daemon.opens.add_limits(all);
-    return all;
+  daemon.service.set_facts_source([&] {
+    DaemonFacts facts{.config_file = "/etc/dssm/dssmd.conf", .clock_policy = ClockPolicy::mark};
+    daemon.registry.add_limits(facts.limits);
+    daemon.opens.add_limits(facts.limits);
+    return facts;
   });
   FakeClient client(daemon.service, 5), other(daemon.service, 6);
   client.greet();
@@ -392,6 +397,8 @@ TEST(LocalService, ListsTheLimitsOfAllParts) {
     limits += one.name() + " " + std::to_string(one.used()) + " of " + std::to_string(one.limit()) +
               " " + one.unit() + "\n";
   }
+  EXPECT_EQ(response.daemon().config_file(), "/etc/dssm/dssmd.conf");
+  EXPECT_EQ(response.daemon().clock_policy(), "mark");
   EXPECT_EQ(limits,
             "max_streams 1 of 400 streams\n"
             "max_streams of one user or host 1 of 400 streams\n"

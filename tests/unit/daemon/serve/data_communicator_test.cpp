@@ -520,6 +520,23 @@ TEST(StreamWatch, SendsWhatIsThereThenAnswersThenSendsChanges) {
   EXPECT_EQ(events(peer.take()), "+c -a +a ");
 }
 
+TEST(StreamWatch, SendsAStreamAgainThatIsDescribedNow) {
+  ServerRig rig;
+  const auto stream = rig.create("a");
+  TypeInfo type = stream->type();
+  type.name = "Odometry";
+  MemoryPeer peer;
+  rig.connect(peer);
+  peer.put(watch_request(1));
+  rig.turns();
+  peer.take();
+  ASSERT_TRUE(rig.registry.create({"a", 0, ""}, type, kHistory, 43));
+  rig.turns();
+  const std::vector<net::Frame> items = peer.take();
+  ASSERT_EQ(items.size(), 1u);
+  EXPECT_EQ(items[0].stream_event().stream().type().name(), "Odometry");
+}
+
 TEST(StreamWatch, NamesTheRingThatWasRemoved) {
   ServerRig rig;
   const std::uint64_t incarnation = rig.create("a")->incarnation();

@@ -116,6 +116,28 @@ TEST(Registry, RefusesDepthsAndCyclesThatCannotBe) {
   EXPECT_TRUE(registry.streams().empty());
 }
 
+TEST(Registry, TakesTheDescriptionThatAStreamHasNot) {
+  Registry registry("pc1", kLimits);
+  const TypeInfo plain{"", odometry_type().payload_bytes, 1, {}};
+  const auto stream = registry.create(kOdometry, plain, kHistory, 42)->stream;
+  const std::uint64_t before = registry.budget().used();
+  TypeInfo too_long = odometry_type();
+  too_long.fields[0].name = std::string(kMaxTypeBytes, 'x');
+  EXPECT_EQ(registry.create(kOdometry, too_long, kHistory, 43).error().code, Errc::limit_exceeded);
+  EXPECT_EQ(stream->type(), plain);
+
+  ASSERT_TRUE(registry.create(kOdometry, odometry_type(), kHistory, 43));
+  EXPECT_EQ(stream->type(), odometry_type());
+  EXPECT_GT(registry.budget().used(), before);
+  ASSERT_TRUE(registry.create(kOdometry, plain, kHistory, 44));
+  EXPECT_EQ(stream->type(), odometry_type());
+
+  Registry next("pc1", kLimits);  // after a restart
+  const auto again = next.adopt_untrusted(kOdometry, kept_by(Role::reader, *stream));
+  ASSERT_TRUE(again) << again.error().message;
+  EXPECT_EQ((*again)->type(), odometry_type());
+}
+
 TEST(Registry, RefusesATypeWhoseDescriptionIsTooLong) {
   Registry registry("pc1", kLimits);
   TypeInfo type = odometry_type();
@@ -570,6 +592,7 @@ TEST(Registry, NotifiesItsObserversOfAdditionsAndRemovals) {
   struct Recorder final : StreamObserver {
     void on_stream_added(const Stream& stream) override { text += "+" + stream.id().name; }
     void on_stream_removed(const Stream& stream) override { text += "-" + stream.id().name; }
+    void on_stream_described(const Stream& stream) override { text += "=" + stream.id().name; }
     std::string text;
   } recorder, other;
   Registry registry("pc1", kLimits);
@@ -577,11 +600,12 @@ TEST(Registry, NotifiesItsObserversOfAdditionsAndRemovals) {
   registry.add_observer(other);
   create(registry, {"a", 0, ""});
   create(registry, {"a", 0, ""});
+  ASSERT_TRUE(registry.create({"b", 0, ""}, {"", 24, 8, {}}, kHistory, 42));
   create(registry, {"b", 0, ""});
   registry.remove_observer(other);
   ASSERT_TRUE(registry.remove({"a", 0, ""}));
-  EXPECT_EQ(recorder.text, "+a+b-a");
-  EXPECT_EQ(other.text, "+a+b");
+  EXPECT_EQ(recorder.text, "+a+b=b-a");
+  EXPECT_EQ(other.text, "+a+b=b");
 }
 
 }  // namespace
