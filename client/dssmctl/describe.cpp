@@ -127,16 +127,32 @@ Json stream_json(const StreamInfo& stream, Time now) {
   return json;
 }
 
-void add_details(Json& json, const StreamInfo& stream) {
-  json["alignment_bytes"] = stream.type.alignment_bytes;
-  Json& fields = json["fields"] = Json::array();
-  for (const Field& field : stream.type.fields) {
+void print_fields(const TypeInfo& type, Output& out) {
+  constexpr auto kRight = Table::Align::right;
+  Table table({{"FIELD"}, {"KIND"}, {"OFFSET", kRight}, {"COUNT", kRight}, {"STRIDE", kRight}});
+  for (const Field& field : type.fields) {
+    table.add_row({escaped(field.name), std::string(name_of(field.kind)),
+                   std::to_string(field.offset_bytes), std::to_string(field.count),
+                   field.count > 1 ? std::to_string(field.stride_bytes) : "-"});
+  }
+  table.print(out);
+}
+
+Json fields_json(const TypeInfo& type) {
+  Json fields = Json::array();
+  for (const Field& field : type.fields) {
     fields.push_back({{"name", field.name},
                       {"kind", name_of(field.kind)},
                       {"offset_bytes", field.offset_bytes},
                       {"count", field.count},
                       {"stride_bytes", field.stride_bytes}});
   }
+  return fields;
+}
+
+void add_details(Json& json, const StreamInfo& stream) {
+  json["alignment_bytes"] = stream.type.alignment_bytes;
+  json["fields"] = fields_json(stream.type);
   Json& users = json["users"] = Json::array();
   for (const StreamUser& user : stream.users) {
     users.push_back({{"role", role_name(user.role)},

@@ -31,6 +31,10 @@ std::string status_text(const ClockSnapshot& clock);  // "out of bounds: stepped
 
 Json stream_json(const StreamInfo& stream, Time now);
 
+// The fields of a type: as a table, and as JSON.
+void print_fields(const TypeInfo& type, Output& out);
+Json fields_json(const TypeInfo& type);
+
 // What `info` adds: fields, users, and how the mirror is doing.
 void add_details(Json& json, const StreamInfo& stream);
 

@@ -567,14 +567,17 @@ Finding host_refused(const HostInfo& host) {
 
 // Found by mDNS, but the keys of one of both PCs do not allow the connection.
 Finding host_closed(const Facts& facts, const HostInfo& host) {
-  const bool here = host.reason == HostReason::closed_here;
-  return {"host " + name_of(host), Status::warn,
-          "found by mDNS, but not connected to: " + host.error,
-          here ? "the key insecure of this PC does not let its dssmd connect to others"
-               : "its keys listen and insecure do not let others in",
-          here ? configure_here(facts, {{"insecure", "true", "--insecure"}}, kNotEncrypted)
-               : configure(kUsualConfigFile, listen_settings(std::string(kUsualPort), false)) +
-                     "  # there"};
+  Finding finding{"host " + name_of(host), Status::ok,
+                  "found by mDNS, but not connected to: " + host.error};
+  if (host.reason == HostReason::closed_here) {
+    finding.warn("the key insecure of this PC does not let its dssmd connect to others",
+                 configure_here(facts, {{"insecure", "true", "--insecure"}}, kNotEncrypted));
+  } else {
+    finding.warn(
+        "its keys listen and insecure do not let others in",
+        configure(kUsualConfigFile, listen_settings(std::string(kUsualPort), false)) + "  # there");
+  }
+  return finding;
 }
 
 // What is wrong with this host mostly concerns another one too, and is reported there.

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The checks of dssmctl doctor that concern streams. Names are used as they came; doctor.cpp escapes
-// them when it prints.
+// The checks of dssmctl doctor that concern streams. Names are used as they came; doctor.cpp
+// escapes them when it prints.
 #include <fmt/format.h>
 
 #include <algorithm>

@@ -73,7 +73,7 @@ _dssmctl() {
     case ${words[i]} in
       --socket | --sort | --host | --at | --count | -n | -c | --field | --wait | --window | -w | \
         --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
-        --speed | --time | --ca | --credentials | --out | --name | --program | --days)
+        --speed | --time | --rate | -r | --ca | --credentials | --out | --name | --program | --days)
         ((++i))
         ;;
       -*) ;;
@@ -102,7 +102,7 @@ _dssmctl() {
       return
       ;;
     --at | --count | -n | -c | --field | --wait | --window | -w | --interval | -i | --size | \
-      --depth | --life | --cycle | --type | --align | --offset | --speed | --time | --name | \
+      --depth | --life | --cycle | --type | --align | --offset | --speed | --time | --rate | -r | --name | \
       --program | --days)
       return # a value that only the person knows
       ;;
@@ -116,6 +116,7 @@ _dssmctl() {
     clock) options="--matrix --table --wait --watch" ;;
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
+    pub) options="--count --rate --stdin --times" ;;
     hz | bw | delay) options="--count --interval --wait --window" ;;
     create) options="--align --cycle --depth --life --size --type" ;;
     "playback set") options="--offset --speed --time" ;;
@@ -133,8 +134,8 @@ _dssmctl() {
   case $verb in
     "")
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw clock create delay doctor echo hosts hz info ls ping pki playback property \
-          rights rm" -- "$cur")
+        "bw clock create delay doctor echo find hosts hz info ls ping pki playback property \
+          pub rights rm show" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;
@@ -145,7 +146,7 @@ _dssmctl() {
     ping) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_ask hosts --names) ;;
     create) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_at_hosts) ;;
     rm) _dssmctl_offer < <(_dssmctl_streams) ;;
-    info | echo | hz | bw | delay | rights)
+    info | echo | pub | hz | bw | delay | rights)
       ((positional == 0)) && _dssmctl_offer < <(_dssmctl_streams)
       ;;
     "property get" | "property set")

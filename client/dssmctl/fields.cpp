@@ -196,7 +196,10 @@ Json field_json(std::span<const std::byte> payload, const Field& field) {
 
 std::string element_text(std::span<const std::byte> payload, const Field& field, std::uint64_t i) {
   if (is_text(field)) return text_of(payload, field);
-  return i < elements_in(payload, field) ? bare_text(value_at(payload, field, i)) : "";
+  if (i >= elements_in(payload, field)) return "";
+  const Value value = value_at(payload, field, i);
+  const char* const c = std::get_if<char>(&value);
+  return c && *c == '\0' ? "" : bare_text(value);  // programs that read lines end at a zero byte
 }
 
 }  // namespace dssm::ctl

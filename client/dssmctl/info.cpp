@@ -28,19 +28,6 @@ void print_samples(const StreamInfo& stream, Output& out) {
   if (stream.rate_hz > 0) add_line(out, "rate", fmt::format("{:.3f} Hz", stream.rate_hz));
 }
 
-void print_fields(const StreamInfo& stream, Output& out) {
-  if (stream.type.fields.empty()) return;
-  constexpr auto kRight = Table::Align::right;
-  Table table({{"FIELD"}, {"KIND"}, {"OFFSET", kRight}, {"COUNT", kRight}, {"STRIDE", kRight}});
-  for (const Field& field : stream.type.fields) {
-    table.add_row({escaped(field.name), std::string(name_of(field.kind)),
-                   std::to_string(field.offset_bytes), std::to_string(field.count),
-                   field.count > 1 ? std::to_string(field.stride_bytes) : "-"});
-  }
-  out.add("\n");
-  table.print(out);
-}
-
 void print_users(const StreamInfo& stream, Output& out) {
   if (stream.users.empty()) return;
   constexpr auto kRight = Table::Align::right;
@@ -114,7 +101,10 @@ void print_stream(const StreamInfo& stream, Output& out) {
     add_line(out, "created by", fmt::format("pid {}", stream.creator_pid));
   }
   if (stream.mirror) print_mirror(stream, *stream.mirror, out);
-  print_fields(stream, out);
+  if (!stream.type.fields.empty()) {
+    out.add("\n");
+    print_fields(stream.type, out);
+  }
   print_users(stream, out);
 }
 

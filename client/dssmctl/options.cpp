@@ -233,6 +233,59 @@ void add_echo(CLI::App& app, Parsed& parsed) {
   add_wait(echo, options.wait);
 }
 
+void check_pub(PubOptions& options) {
+  require(options.from_stdin || !options.times,
+          "--times: only with --stdin, whose lines have them");
+  require(!options.from_stdin || options.assignments.empty(),
+          "--stdin: the fields come from standard input; omit FIELD=VALUE");
+  for (const std::string& assignment : options.assignments) {
+    require(assignment.find('=', 1) != std::string::npos,
+            fmt::format("'{}' is not FIELD=VALUE, as x=1.5", escaped(assignment)));
+  }
+  if (options.from_stdin || options.period) return;
+  require(!options.count, "--count: only with --rate or --stdin");
+  options.count = 1;
+}
+
+void add_pub(CLI::App& app, Parsed& parsed) {
+  CLI::App* pub = app.add_subcommand("pub", "write samples to a stream");
+  PubOptions& options = add_options<PubOptions>(pub, parsed, check_pub);
+  add_stream(pub, options.stream);
+  pub->add_option(
+         "FIELD=VALUE", options.assignments,
+         "what the sample holds, as x=1.5, pose.x=2, name=front or 'ranges=[1,2]'; 0 where "
+         "nothing is given")
+      ->type_name("");
+  add_parsed(pub, "-r,--rate", "HZ", "so many samples a second, until Ctrl-C or --count",
+             [&options](const std::string& text) -> Result<void> {
+               constexpr double kMaxRate = 1e6;
+               const double rate = DSSM_TRY(parse_real(text));
+               if (!(rate > 0 && rate <= kMaxRate)) {
+                 return Error{Errc::invalid_argument,
+                              fmt::format("'{}' is not a rate above 0 and up to 1000000", text)};
+               }
+               options.period =
+                   std::chrono::duration_cast<Duration>(std::chrono::duration<double>(1 / rate));
+               return {};
+             });
+  add_whole(pub, "-n,--count", "N", "end after N samples", options.count, 1);
+  pub->add_flag("--stdin", options.from_stdin,
+                "samples from standard input, as `echo` prints them with --json or --csv");
+  pub->add_flag("--times", options.times, "with the times in the input, not the present one");
+}
+
+void add_types(CLI::App& app, Parsed& parsed) {
+  CLI::App* find = app.add_subcommand("find", "list the streams of a type");
+  find->add_option("TYPE", add_options<FindOptions>(find, parsed).type,
+                   "its name, or a shell pattern, as 'Scan*'")
+      ->required()
+      ->type_name("");
+  CLI::App* show = app.add_subcommand("show", "show the fields of a type");
+  show->add_option("TYPE", add_options<ShowOptions>(show, parsed).type, "its name")
+      ->required()
+      ->type_name("");
+}
+
 template <class VerbOptions>
 void add_meter(CLI::App& app, Parsed& parsed, const std::string& name,
                const std::string& description) {
@@ -429,6 +482,8 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_ping(app, parsed);
   add_info(app, parsed);
   add_echo(app, parsed);
+  add_pub(app, parsed);
+  add_types(app, parsed);
   add_meter<HzOptions>(app, parsed, "hz", "how often samples come");
   add_meter<BwOptions>(app, parsed, "bw", "how many bytes come");
   add_meter<DelayOptions>(app, parsed, "delay", "how old samples are when they arrive");

@@ -73,6 +73,22 @@ struct EchoOptions : ReadingOptions {
   std::vector<std::string> fields;
 };
 
+struct PubOptions : CommonOptions {
+  std::string stream;
+  std::vector<std::string> assignments;  // FIELD=VALUE
+  std::optional<Duration> period;
+  std::optional<std::uint64_t> count;
+  bool from_stdin = false;
+  bool times = false;
+};
+
+struct FindOptions : CommonOptions {
+  std::string type;  // a shell pattern
+};
+struct ShowOptions : CommonOptions {
+  std::string type;
+};
+
 // Of hz, bw and delay.
 struct MeterOptions : ReadingOptions {
   std::uint64_t window = 10'000;
@@ -148,12 +164,12 @@ struct PkiShowOptions : CommonOptions {
   std::string path = kCredentialsFolder;
 };
 
-using Options =
-    std::variant<LsOptions, HostsOptions, ClockOptions, DoctorOptions, PingOptions, InfoOptions,
-                 EchoOptions, HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions,
-                 RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
-                 PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
-                 PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
+using Options = std::variant<LsOptions, HostsOptions, ClockOptions, DoctorOptions, PingOptions,
+                             InfoOptions, EchoOptions, PubOptions, FindOptions, ShowOptions,
+                             HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions,
+                             RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
+                             PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
+                             PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
@@ -175,6 +191,9 @@ Result<void> run(const DoctorOptions& options, Output& out);
 Result<void> run(const PingOptions& options, Output& out);
 Result<void> run(const InfoOptions& options, Output& out);
 Result<void> run(const EchoOptions& options, Output& out);
+Result<void> run(const PubOptions& options, Output& out);
+Result<void> run(const FindOptions& options, Output& out);
+Result<void> run(const ShowOptions& options, Output& out);
 Result<void> run(const HzOptions& options, Output& out);
 Result<void> run(const BwOptions& options, Output& out);
 Result<void> run(const DelayOptions& options, Output& out);

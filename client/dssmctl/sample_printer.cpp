@@ -19,6 +19,11 @@ constexpr std::size_t kShownBytes = 64;
 
 }  // namespace
 
+const std::vector<std::string>& info_columns() {
+  static const std::vector<std::string> columns{"tid", "time_ns", "clock_error_ns"};
+  return columns;
+}
+
 std::string csv_cell(std::string_view text) {
   if (text.find_first_of(",\"\r\n") == std::string_view::npos) return std::string(text);
   std::string out = "\"";
@@ -40,7 +45,7 @@ std::string SamplePrinter::cell(std::string_view text) const {
 
 void SamplePrinter::begin() {
   if (form_ != SampleForm::csv) return;
-  std::string line = "tid,time_ns,clock_error_ns";
+  std::string line = fmt::format("{}", fmt::join(info_columns(), ","));
   for (const Field& field : fields_) {
     if (field.count == 1 || is_text(field)) {
       line.append(",").append(cell(field.name));

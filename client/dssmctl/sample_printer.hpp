@@ -19,6 +19,9 @@ class Output;
 
 enum class SampleForm : unsigned char { text, json, csv };
 
+// The columns of CSV before those of the fields.
+const std::vector<std::string>& info_columns();
+
 // One cell of a CSV row: in quotes where it holds a comma, a quote or a line end.
 std::string csv_cell(std::string_view text);
 

@@ -189,8 +189,8 @@ class Session {
                                const CreateOptions& options = {});
 
   // Opens an existing stream. With `wanted`, fails with type_mismatch unless
-  // TypeInfo::check_usable_as(wanted); a stream of this PC that is written takes name, alignment and
-  // fields that its type lacks from `wanted`, as it does from create_raw().
+  // TypeInfo::check_usable_as(wanted); a stream of this PC that is written takes name, alignment
+  // and fields that its type lacks from `wanted`, as it does from create_raw().
   //   fails  not_found, type_mismatch, conflict (several hosts have a stream of that name),
   //          clock_out_of_bounds (reading another host's stream)
   Result<RawWriter> open_raw_writer(const StreamId& id, const TypeInfo* wanted = nullptr,
