@@ -330,7 +330,9 @@ class Dssmd {
 
   // What `dssmctl info` and `dssmctl doctor` show.
   DaemonFacts facts() const {
-    DaemonFacts facts{.config_file = config_.file, .clock_policy = clock_policy_};
+    DaemonFacts facts;
+    facts.config_file = config_.file;
+    facts.clock_policy = clock_policy_;
     streams_.registry.add_limits(facts.limits);
     streams_.opens.add_limits(facts.limits);
     server_.add_limits(facts.limits);

@@ -11,6 +11,7 @@
 
 #include "core/base/check.hpp"
 #include "core/base/quiet_thread.hpp"
+#include "core/base/time.hpp"
 #include "core/base/try.hpp"
 #include "core/ring/ring_memory.hpp"
 #include "core/ring/ring_reader.hpp"

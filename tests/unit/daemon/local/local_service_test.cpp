@@ -374,7 +374,9 @@ TEST(LocalService, DescribesItself) {
 TEST(LocalService, ListsTheLimitsOfAllParts) {
   Daemon daemon;
   daemon.service.set_facts_source([&] {
-    DaemonFacts facts{.config_file = "/etc/dssm/dssmd.conf", .clock_policy = ClockPolicy::mark};
+    DaemonFacts facts;
+    facts.config_file = "/etc/dssm/dssmd.conf";
+    facts.clock_policy = ClockPolicy::mark;
     daemon.registry.add_limits(facts.limits);
     daemon.opens.add_limits(facts.limits);
     return facts;
