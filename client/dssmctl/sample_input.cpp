@@ -173,6 +173,7 @@ Result<SampleInput::Place> SampleInput::place_of(const std::string& name) const 
                                                      members.front().name, members.front().count)};
   }
   std::vector<std::string_view> names;
+  names.reserve(members.size());
   for (const Field& member : members) names.push_back(member.name);
   return Error{Errc::invalid_argument, fmt::format("field '{}' has several members; set '{}'", name,
                                                    fmt::join(names, "', '"))};
