@@ -113,6 +113,8 @@ _dssmctl() {
     "") options="--version" ;;
     ls) options="--host --local --names --own --reverse --sort --watch" ;;
     hosts) options="--names" ;;
+    nodes) options="--host" ;;
+    graph) options="--out" ;;
     clock) options="--matrix --table --wait --watch" ;;
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
@@ -133,8 +135,8 @@ _dssmctl() {
   case $verb in
     "")
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw clock create delay doctor echo hosts hz info ls ping pki playback property \
-          rights rm" -- "$cur")
+        "bw clock create delay doctor echo graph hosts hz info ls nodes ping pki playback \
+          property rights rm" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;
