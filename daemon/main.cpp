@@ -66,7 +66,7 @@ wire::Greeting own_greeting(const std::string& name, std::shared_ptr<const wire:
   self.program = "dssmd";
   self.version = DSSM_VERSION;
   self.features = {std::string(wire::kFeatureTorn), std::string(wire::kFeatureClock),
-                   std::string(wire::kFeatureNewestFirst)};
+                   std::string(wire::kFeatureNewestFirst), std::string(wire::kFeatureUsers)};
   self.clock = std::move(clock);
   self.credentials = std::move(credentials);
   return self;
@@ -185,7 +185,8 @@ struct OwnStreams {
 // This host's clock, the other hosts, and the copies of their streams.
 struct OtherHosts {
   OtherHosts(const Config& config, const EventLoop& loop, const NetworkListener& network,
-             clock::ClockPageWriter page, Registry& registry, Logger& logger)
+             clock::ClockPageWriter page, Registry& registry, const OpenTable& opens,
+             Logger& logger)
       : own_clock(std::make_shared<wire::ClockReport>()),
         credentials(std::make_shared<wire::OwnCredentials>(
             wire::OwnCredentials{config.loaded_credentials})),
@@ -202,6 +203,7 @@ struct OtherHosts {
         interfaces(loop, [this] { peers.on_network_changed(); }),
         service(loop, {self, network.addresses(), config.insecure, &clock}, registry, catalog,
                 peers, mirrors, writers) {
+    parts.opens = &opens;
     parts.on_ring_replaced = [this](const Stream& old) { service.on_ring_replaced(old); };
   }
 
@@ -234,7 +236,8 @@ class Dssmd {
         logger_(logger),
         rights_(config.rights),
         streams_(config, manager, logger),
-        hosts_(config, loop, sockets.network, std::move(page), streams_.registry, logger),
+        hosts_(config, loop, sockets.network, std::move(page), streams_.registry, streams_.opens,
+               logger),
         local_(streams_.registry, streams_.opens, streams_.playback_clock, rights_, logger,
                &hosts_.service),
         server_(loop, sockets.listener, config.name, client_limits(config), local_, logger),

@@ -119,6 +119,8 @@ Json stream_json(const StreamInfo& stream, Time now) {
   json["newest_time_ns"] = when_written(to_ns(stream.newest_time));
   json["writers"] = stream.writers;
   json["readers"] = stream.readers;
+  json["remote_writers"] = stream.remote_writers;
+  json["remote_readers"] = stream.remote_readers;
   json["channels"] = stream.channels;
   json["memory_bytes"] = stream.memory_bytes;
   json["property_bytes"] = stream.property_bytes;
@@ -156,9 +158,11 @@ void add_details(Json& json, const StreamInfo& stream) {
   Json& users = json["users"] = Json::array();
   for (const StreamUser& user : stream.users) {
     users.push_back({{"role", role_name(user.role)},
-                     {"pid", user.pid},
-                     {"uid", user.uid},
-                     {"program", user.program}});
+                     {"host", or_null(user.host)},
+                     {"pid", user.pid > 0 ? Json(user.pid) : Json()},
+                     {"uid", user.uid ? Json(*user.uid) : Json()},
+                     {"program", or_null(user.program)},
+                     {"via", name_of(user.via)}});
   }
   json["mirror"] = stream.mirror ? mirror_json(*stream.mirror) : Json();
 }

@@ -113,6 +113,8 @@ _dssmctl() {
     "") options="--version" ;;
     ls) options="--host --local --names --own --reverse --sort --watch" ;;
     hosts) options="--names" ;;
+    nodes) options="--host" ;;
+    graph) options="--out" ;;
     clock) options="--matrix --table --wait --watch" ;;
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
@@ -134,8 +136,8 @@ _dssmctl() {
   case $verb in
     "")
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw clock create delay doctor echo find hosts hz info ls ping pki playback property \
-          pub rights rm show" -- "$cur")
+        "bw clock create delay doctor echo find graph hosts hz info ls nodes ping pki playback \
+          property pub rights rm show" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;

@@ -28,13 +28,20 @@ void print_samples(const StreamInfo& stream, Output& out) {
   if (stream.rate_hz > 0) add_line(out, "rate", fmt::format("{:.3f} Hz", stream.rate_hz));
 }
 
+// "3, 2 of them over the network"
+std::string count_text(std::uint32_t all, std::uint32_t remote) {
+  return fmt::format("{}{}", all,
+                     remote > 0 ? fmt::format(", {} of them over the network", remote) : "");
+}
+
 void print_users(const StreamInfo& stream, Output& out) {
   if (stream.users.empty()) return;
   constexpr auto kRight = Table::Align::right;
-  Table table({{"USED BY"}, {"ROLE"}, {"PID", kRight}, {"UID", kRight}});
+  Table table({{"USED BY"}, {"ROLE"}, {"HOST"}, {"PID", kRight}, {"UID", kRight}, {"VIA"}});
   for (const StreamUser& user : stream.users) {
-    table.add_row({escaped(user.program), std::string(role_name(user.role)),
-                   std::to_string(user.pid), std::to_string(user.uid)});
+    table.add_row({or_dash(escaped(user.program)), std::string(role_name(user.role)),
+                   or_dash(escaped(user.host)), user.pid > 0 ? std::to_string(user.pid) : "-",
+                   user.uid ? std::to_string(*user.uid) : "-", std::string(name_of(user.via))});
   }
   out.add("\n");
   table.print(out);
@@ -91,8 +98,8 @@ void print_stream(const StreamInfo& stream, Output& out) {
   add_line(out, "depth", fmt::format("{} slots", stream.depth));
   add_line(out, "cycle", duration_text(stream.cycle));
   print_samples(stream, out);
-  add_line(out, "writers", fmt::format("{} on its host", stream.writers));
-  add_line(out, "readers", fmt::format("{} on its host", stream.readers));
+  add_line(out, "writers", count_text(stream.writers, stream.remote_writers));
+  add_line(out, "readers", count_text(stream.readers, stream.remote_readers));
   add_line(out, "channels", fmt::format("{} to other hosts, for programs there", stream.channels));
   add_line(out, "memory", bytes_text(stream.memory_bytes));
   add_line(out, "property", stream.property_bytes ? bytes_text(stream.property_bytes) : "none");

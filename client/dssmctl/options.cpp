@@ -171,6 +171,42 @@ void add_hosts(CLI::App& app, Parsed& parsed) {
   add_names(hosts, options.names);
 }
 
+void add_nodes(CLI::App& app, Parsed& parsed) {
+  CLI::App* nodes =
+      app.add_subcommand("nodes", "list the processes, and what each reads and writes");
+  NodesOptions& options = add_options<NodesOptions>(nodes, parsed);
+  nodes
+      ->add_option("PATTERN", options.pattern,
+                   "only processes whose program's name this shell pattern fits, as 'map*'")
+      ->type_name("");
+  nodes
+      ->add_option("--host", options.hosts,
+                   "only processes on this host; may be given several times")
+      ->type_name("HOST")
+      ->allow_extra_args(false);  // one value per --host, so that PATTERN may follow
+}
+
+void add_graph(CLI::App& app, Parsed& parsed) {
+  CLI::App* graph =
+      app.add_subcommand("graph", "draw which processes read and write which streams");
+  GraphOptions& options = add_options<GraphOptions>(graph, parsed, [](const GraphOptions& all) {
+    require(all.out.empty() || !all.json, "--out and --json: choose one");
+  });
+  add_parsed(graph, "--out", "FILE",
+             "the file to write, which ends in .svg or .png (drawn by Graphviz) or .dot (default: "
+             "standard output, in Graphviz's language DOT)",
+             [&options](const std::string& text) -> Result<void> {
+               for (const char* format : {"dot", "svg", "png"}) {
+                 if (!text.ends_with(std::string(".") + format)) continue;
+                 options.out = text;
+                 options.format = format;
+                 return {};
+               }
+               return Error{Errc::invalid_argument,
+                            fmt::format("'{}' does not end in .svg, .png or .dot", escaped(text))};
+             });
+}
+
 void add_clock(CLI::App& app, Parsed& parsed) {
   CLI::App* clock = app.add_subcommand("clock", "how good the hosts' clocks are");
   ClockOptions& options = add_options<ClockOptions>(clock, parsed);
@@ -476,6 +512,8 @@ void add_all(CLI::App& app, Parsed& parsed) {
   app.add_flag("--json", parsed.common.json, "output for programs");
   add_ls(app, parsed);
   add_hosts(app, parsed);
+  add_nodes(app, parsed);
+  add_graph(app, parsed);
   add_clock(app, parsed);
   add_options<DoctorOptions>(
       app.add_subcommand("doctor", "check for what usually goes wrong, and how to fix it"), parsed);

@@ -38,6 +38,16 @@ struct HostsOptions : CommonOptions {
   bool names = false;
 };
 
+struct NodesOptions : CommonOptions {
+  std::string pattern;             // only processes whose program's name fits; empty: all
+  std::vector<std::string> hosts;  // only theirs; empty: of all
+};
+
+struct GraphOptions : CommonOptions {
+  std::string out;     // the file to write; empty: standard output
+  std::string format;  // of that file, by its name: "dot", "svg", "png"
+};
+
 struct ClockOptions : CommonOptions {
   bool watch = false;
   bool matrix = false;                 // a row per pair of hosts
@@ -164,12 +174,13 @@ struct PkiShowOptions : CommonOptions {
   std::string path = kCredentialsFolder;
 };
 
-using Options = std::variant<LsOptions, HostsOptions, ClockOptions, DoctorOptions, PingOptions,
-                             InfoOptions, EchoOptions, PubOptions, FindOptions, ShowOptions,
-                             HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions,
-                             RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
-                             PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
-                             PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
+using Options =
+    std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
+                 PingOptions, InfoOptions, EchoOptions, PubOptions, FindOptions, ShowOptions,
+                 HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions, RightsOptions,
+                 PropertyGetOptions, PropertySetOptions, PlaybackOptions, PkiInitOptions,
+                 PkiRequestOptions, PkiIssueOptions, PkiInstallOptions, PkiRenewOptions,
+                 PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
@@ -186,6 +197,8 @@ CommandLine parse_command_line(int argc, const char* const* argv);
 
 Result<void> run(const LsOptions& options, Output& out);
 Result<void> run(const HostsOptions& options, Output& out);
+Result<void> run(const NodesOptions& options, Output& out);
+Result<void> run(const GraphOptions& options, Output& out);
 Result<void> run(const ClockOptions& options, Output& out);
 Result<void> run(const DoctorOptions& options, Output& out);
 Result<void> run(const PingOptions& options, Output& out);

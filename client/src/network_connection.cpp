@@ -124,6 +124,7 @@ Result<void> NetworkConnection::greet(std::unique_ptr<wire::Transport> transport
   self.instance_id = instance_id_;
   self.program = program_;
   self.version = DSSM_VERSION;
+  self.pid = ::getpid();
   self.features = {std::string(wire::kFeatureTorn)};
   // This program does not watch the clock, but its kernel may be the host's.
   const auto clock = std::make_shared<wire::ClockReport>();

@@ -252,6 +252,24 @@ Result<std::vector<HostInfo>> Session::list_hosts() {
   return hosts;
 }
 
+Result<std::vector<NodeInfo>> Session::list_nodes() {
+  local::Request request;
+  request.mutable_list_nodes();
+  const auto response = DSSM_TRY(ask(*client_, std::move(request), "list the processes"));
+  std::vector<NodeInfo> nodes;
+  for (const proto::Node& message : response.node_list().nodes()) {
+    NodeInfo node{message.host(), message.pid(), {}, message.program(), {}, message.error()};
+    if (message.has_uid()) node.uid = message.uid();
+    for (const proto::NodeStream& use : message.streams()) {
+      node.streams.push_back({{use.id().name(), use.id().id(), use.id().host()},
+                              use.writer() ? Role::writer : Role::reader,
+                              wire::enum_untrusted(use.via(), StreamVia::connection)});
+    }
+    nodes.push_back(std::move(node));
+  }
+  return nodes;
+}
+
 Result<std::vector<ClockPair>> Session::list_clock_pairs() {
   local::Request request;
   request.mutable_list_clock_pairs();

@@ -146,6 +146,12 @@ std::string_view name_of(MirrorState state) noexcept {
   return name_in(kNames, state);
 }
 
+std::string_view name_of(StreamVia via) noexcept {
+  static constexpr std::array<std::string_view, 4> kNames = {"local", "mirror", "remote writer",
+                                                             "connection"};
+  return name_in(kNames, via);
+}
+
 std::string_view name_of(ClockBasis basis) noexcept {
   static constexpr std::array<std::string_view, 4> kNames = {"nothing", "root", "reference", "own"};
   return name_in(kNames, basis);

@@ -3,6 +3,8 @@
 
 #include <fmt/format.h>
 
+#include <algorithm>
+
 #include "core/base/text.hpp"
 #include "core/base/try.hpp"
 #include "core/wire/frame.hpp"
@@ -88,16 +90,21 @@ void to_message(const StreamInfo& info, proto::Stream& out) {
   out.set_newest(info.newest);
   out.set_newest_time_ns(to_ns(info.newest_time));
   out.set_rate_hz(info.rate_hz);
-  out.set_writers(info.writers);
-  out.set_readers(info.readers);
+  out.set_writers(info.writers - info.remote_writers);
+  out.set_readers(info.readers - info.remote_readers);
+  out.set_remote_writers(info.remote_writers);
+  out.set_remote_readers(info.remote_readers);
   out.set_channels(info.channels);
-  for (const StreamUser& user : info.users) {
-    proto::User& message = *out.add_users();
-    message.set_pid(user.pid);
-    message.set_uid(user.uid);
-    message.set_program(user.program);
-    message.set_writer(user.role == Role::writer);
-  }
+  for (const StreamUser& user : info.users) to_message(user, *out.add_users());
+}
+
+void to_message(const StreamUser& user, proto::User& out) {
+  out.set_pid(user.pid);
+  out.set_uid(user.uid.value_or(0));
+  out.set_program(user.program);
+  out.set_writer(user.role == Role::writer);
+  out.set_host(user.host);
+  out.set_via(static_cast<proto::Via>(user.via));
 }
 
 void to_message(const Error& error, proto::Failure& out) {
@@ -138,6 +145,17 @@ Result<TypeInfo> type_untrusted(const proto::Type& message) {
   return type;
 }
 
+StreamUser stream_user_untrusted(const proto::User& message) {
+  StreamUser user;
+  user.pid = std::max(message.pid(), 0);
+  user.program = text_untrusted(message.program(), kMaxProgramBytes);
+  user.role = message.writer() ? Role::writer : Role::reader;
+  user.via = enum_untrusted(message.via(), StreamVia::connection);
+  if (user.via != StreamVia::connection) user.uid = message.uid();
+  if (check_host_name(message.host())) user.host = message.host();
+  return user;
+}
+
 StreamInfo stream_info(const proto::Stream& message) {
   StreamInfo info;
   info.id = {message.id().name(), message.id().id(), message.id().host()};
@@ -152,12 +170,14 @@ StreamInfo stream_info(const proto::Stream& message) {
   info.newest = message.newest();
   info.newest_time = time_from_ns(message.newest_time_ns());
   info.rate_hz = message.rate_hz();
-  info.writers = message.writers();
-  info.readers = message.readers();
+  info.remote_writers = message.remote_writers();
+  info.remote_readers = message.remote_readers();
+  info.writers = message.writers() + info.remote_writers;
+  info.readers = message.readers() + info.remote_readers;
   info.channels = message.channels();
   for (const proto::User& user : message.users()) {
-    info.users.push_back(
-        {user.pid(), user.uid(), user.program(), user.writer() ? Role::writer : Role::reader});
+    info.users.push_back(stream_user_untrusted(user));
+    if (info.users.back().host.empty()) info.users.back().host = info.id.host;
   }
   if (message.has_mirror()) info.mirror = mirror_info(message.mirror());
   return info;

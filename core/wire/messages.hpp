@@ -34,6 +34,7 @@ void to_message(const StreamId& id, proto::StreamId& out);
 void to_message(const TypeInfo& type, proto::Type& out);
 // Without its mirror, which Mirror::describe() sets.
 void to_message(const StreamInfo& info, proto::Stream& out);
+void to_message(const StreamUser& user, proto::User& out);
 void to_message(const StreamId& id, const TypeInfo& type, const History& history,
                 proto::Create& out);
 void to_message(const Error& error, proto::Failure& out);
@@ -56,6 +57,7 @@ Error other_protocol_version(const ProtocolVersion& ours, const std::string& who
 Result<StreamId> stream_id_untrusted(const proto::StreamId& message);
 Result<TypeInfo> type_untrusted(const proto::Type& message);
 StreamInfo stream_info(const proto::Stream& message);
+StreamUser stream_user_untrusted(const proto::User& message);  // host: as it is there, or empty
 Error failure(const proto::Failure& message);
 
 }  // namespace dssm::wire

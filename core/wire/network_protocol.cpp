@@ -37,7 +37,7 @@ bool Greeting::has_feature(std::string_view feature) const noexcept {
 }
 
 std::string Greeting::str() const {
-  if (program == "dssmd") return "dssmd of host '" + host + "'";
+  if (is_dssmd()) return "dssmd of host '" + host + "'";
   return "'" + program + "' on host '" + host + "'";
 }
 
@@ -48,6 +48,7 @@ void to_message(const Greeting& greeting, proto::Hello& out) {
   out.set_instance_id(greeting.instance_id);
   out.set_program(greeting.program);
   out.set_version(greeting.version);
+  out.set_pid(greeting.pid);
   for (const std::string& feature : greeting.features) out.add_features(feature);
   if (greeting.clock) send_clock(greeting, *out.mutable_clock());
 }
@@ -93,6 +94,7 @@ Result<Greeting> greeting_untrusted(const proto::Hello& message, const std::stri
   greeting.instance_id = message.instance_id();
   greeting.program = message.program();
   greeting.version = message.version();
+  greeting.pid = std::max(message.pid(), 0);
   if (message.has_clock()) {
     greeting.clock = report_of(message.clock());
   }

@@ -26,6 +26,9 @@ inline constexpr std::size_t kMaxFeatureBytes = 63;
 inline constexpr std::string_view kFeatureTorn = "torn";  // network.proto, Frame.torn
 inline constexpr std::string_view kFeatureNewestFirst = "newest_first";  // Subscribe
 inline constexpr std::string_view kFeatureClock = "clock";  // network.proto, Pong as an event
+inline constexpr std::string_view kFeatureUsers = "users";  // network.proto, SetUsers
+
+inline constexpr std::size_t kMaxChannelUsers = 64;  // that SetUsers names
 
 // Heartbeats of control connections, and how long no bytes may arrive until the peer counts as dead
 // (design: within 3 s).
@@ -43,6 +46,7 @@ struct Greeting {
   std::uint64_t instance_id = 0;  // random; differs between two runs of one program
   std::string program;            // "dssmd", "mapper"
   std::string version;
+  std::int32_t pid = 0;  // of a program; 0: not known, or a dssmd
   std::vector<std::string> features;
   // What it reports of its clock; nullptr: nothing. Our own is kept up to date by FleetClock, and
   // all copies of our greeting share it.
@@ -52,6 +56,7 @@ struct Greeting {
   std::shared_ptr<const OwnCredentials> credentials;
 
   bool has_feature(std::string_view feature) const noexcept;
+  bool is_dssmd() const noexcept { return program == "dssmd"; }
   std::string str() const;  // "'mapper' on host 'pc3'", "dssmd of host 'pc2'"
 };
 

@@ -129,6 +129,10 @@ constexpr int kListUsers[] = {Frame::kStreamListFieldNumber, proto::StreamList::
                               Stream::kUsersFieldNumber};
 constexpr int kPairs[] = {Frame::kClockPairListFieldNumber,
                           proto::ClockPairList::kPairsFieldNumber};
+constexpr int kChannelUsers[] = {Frame::kSetUsersFieldNumber, net::SetUsers::kUsersFieldNumber};
+constexpr int kNodes[] = {Frame::kNodeListFieldNumber, proto::NodeList::kNodesFieldNumber};
+constexpr int kNodeStreams[] = {Frame::kNodeListFieldNumber, proto::NodeList::kNodesFieldNumber,
+                                proto::Node::kStreamsFieldNumber};
 struct Repeated {
   Path path;
   std::size_t min_bytes = kMinElementBytes;  // of an element, on average
@@ -146,6 +150,9 @@ constexpr Repeated kRepeated[] = {
     {kStreams},
     {kListUsers},
     {kPairs},
+    {kChannelUsers},
+    {kNodes, kMinNodeBytes},
+    {kNodeStreams, kMinFieldBytes},
     {kCreateFields, kMinFieldBytes},
     {kOpenedFields, kMinFieldBytes},
     {kEventFields, kMinFieldBytes},

@@ -26,9 +26,11 @@ Result<void> check_request_size_untrusted(std::span<const std::byte> message);
 
 // Whether a frame of the network protocol may be parsed, as to its elements: what is repeated in
 // it, as the streams of a list. An element takes some hundred bytes of memory and may be two bytes
-// long; those of ours are longer, or few: on average at least kMinFieldBytes for a type's field and
-// kMinElementBytes for another element, but for kFreeElementBytes in all.
+// long; those of ours are longer, or few: on average at least kMinFieldBytes for a type's field or
+// a node's stream, kMinNodeBytes for a node and kMinElementBytes for another element, but for
+// kFreeElementBytes in all.
 inline constexpr std::size_t kMinFieldBytes = 8;
+inline constexpr std::size_t kMinNodeBytes = 16;
 inline constexpr std::size_t kMinElementBytes = 32;
 inline constexpr std::size_t kFreeElementBytes = 128U << 10;
 //   fails  protocol

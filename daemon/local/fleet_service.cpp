@@ -25,7 +25,7 @@ Result<proto::Stream> stream_untrusted(const std::string& host, proto::Stream st
   DSSM_TRY(wire::stream_id_untrusted(stream.id()));
   DSSM_TRY(wire::type_untrusted(stream.type()));
   for (proto::User& user : *stream.mutable_users()) {
-    user.set_program(printable(user.program().substr(0, wire::kMaxProgramBytes)));
+    wire::to_message(wire::stream_user_untrusted(user), user);
   }
   stream.clear_mirror();  // this host reports that
   return stream;
@@ -44,6 +44,30 @@ struct ClockRow {
 Error has_not_answered(const std::string& host) {
   return {Errc::unavailable, fmt::format("host '{}' has not answered within {} ms", host,
                                          Fleet::kFreshTimeout / std::chrono::milliseconds(1))};
+}
+
+// Adds what `host` answered to ListNodes. It knows what its own processes use, and who uses its own
+// streams.
+Result<void> add_nodes_untrusted(const std::string& host, const Result<net::Frame>& answer,
+                                 NodeTable& nodes) {
+  if (!answer) return answer.error();
+  if (!answer->has_node_list()) return unexpected(host);
+  for (const proto::Node& node : answer->node_list().nodes()) {
+    if (!check_host_name(node.host())) continue;
+    StreamUser user;
+    user.host = node.host();
+    user.pid = std::max(node.pid(), 0);
+    if (node.has_uid()) user.uid = node.uid();
+    user.program = wire::text_untrusted(node.program(), wire::kMaxProgramBytes);
+    for (const proto::NodeStream& use : node.streams()) {
+      const Result<StreamId> id = wire::stream_id_untrusted(use.id());
+      if (!id || id->host.empty() || (user.host != host && id->host != host)) continue;
+      user.role = use.writer() ? Role::writer : Role::reader;
+      user.via = wire::enum_untrusted(use.via(), StreamVia::connection);
+      nodes.add(user, *id);
+    }
+  }
+  return {};
 }
 
 // The answer of `host` to ListClockPairs.
@@ -353,6 +377,24 @@ void FleetService::list(Then<std::vector<proto::Stream>> then) {
       if (mirror) mirror->describe(*stream.mutable_mirror());
     }
     then(std::move(streams));
+  });
+}
+
+void FleetService::list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) {
+  net::Frame request;
+  request.mutable_list_nodes();
+  ask_all(request, [this, nodes = std::move(nodes),
+                    then = std::move(then)](const Answers& answers) mutable {
+    for (const KnownHost* host : hosts_by_name()) {
+      const std::string& name = host->greeting.host;
+      const auto answer = answers.find(host->greeting.host_id);
+      const Result<void> added = answer == answers.end()
+                                     ? Result<void>(has_not_answered(name))
+                                     : add_nodes_untrusted(name, answer->second, nodes);
+      if (added) continue;
+      nodes.add_unknown(name, wire::text_untrusted(added.error().message, wire::kMaxSentenceBytes));
+    }
+    then(std::move(nodes));
   });
 }
 

@@ -68,6 +68,7 @@ class FleetService final : public Fleet, private CatalogObserver {
                Then<local::Response> then) override;
   void list(Then<std::vector<proto::Stream>> then) override;
   void list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) override;
+  void list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) override;
   std::vector<StreamInfo> known_streams() const override;
   std::vector<local::Host> hosts() const override;
   void describe(local::Daemon& daemon) const override;

@@ -81,7 +81,9 @@ bool LocalRequests::waits_for_hosts(const local::Request& request) const {
   if (!fleet_ || request.has_offer() || request.has_want_history() || request.has_list_rights()) {
     return false;
   }
-  if (request.has_ping_host() || request.has_list_clock_pairs()) return true;
+  if (request.has_ping_host() || request.has_list_clock_pairs() || request.has_list_nodes()) {
+    return true;
+  }
   if (request.has_list()) return !request.list().own_only();
   const proto::StreamId* named = subject(request);
   if (!named) return false;
@@ -257,6 +259,7 @@ Reply LocalRequests::get_daemon() const {
 void LocalRequests::ask_hosts_untrusted(const Client& client, const local::Request& request,
                                         Answer answer) {
   if (request.has_list()) return list_all(std::move(answer));
+  if (request.has_list_nodes()) return list_nodes(std::move(answer));
   if (request.has_list_clock_pairs()) return list_clock_pairs(std::move(answer));
   if (request.has_ping_host()) return ping(request.ping_host().host(), std::move(answer));
   const StreamId id = *wire::stream_id_untrusted(*subject(request));
@@ -322,6 +325,17 @@ void LocalRequests::list_all(Answer answer) {
   fleet_->list([own, answer = std::move(answer)](Result<std::vector<proto::Stream>> streams) {
     if (!streams) return answer(std::move(streams).error());
     answer(with_streams(std::move(*own), *std::move(streams)));
+  });
+}
+
+void LocalRequests::list_nodes(Answer answer) {
+  fleet_->list_nodes(catalog_.nodes(), [answer = std::move(answer)](const NodeTable& nodes) {
+    Reply reply;
+    proto::NodeList& list = *reply.response.mutable_node_list();
+    nodes.to_message(list);
+    if (list.ByteSizeLong() <= kMaxListBytes) return answer(std::move(reply));
+    answer(Error{Errc::limit_exceeded,
+                 "the list of all hosts' processes is longer than one message may be"});
   });
 }
 

@@ -95,6 +95,9 @@ class Fleet {
   // then owner. A host that does not answer within kFreshTimeout, or fails, has one entry, with the
   // error; so has each pair of which its reader states nothing.
   virtual void list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) = 0;
+  // What the hosts that are up report of the processes that have streams open, added to `nodes`; of
+  // one that does not answer within kFreshTimeout, or fails, the error.
+  virtual void list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) = 0;
   // What is in the catalog now, without a request to other hosts: for Watch.
   virtual std::vector<StreamInfo> known_streams() const = 0;
 
@@ -131,8 +134,8 @@ class LocalRequests {
   using Answer = std::function<void(Result<Reply>)>;
 
   // Whether the response to `request` may have to wait for another host: it is a List of all hosts,
-  // a ListClockPairs, a PingHost, or about a stream of another host. Offers, WantHistory and
-  // ListRights never do.
+  // a ListNodes, a ListClockPairs, a PingHost, or about a stream of another host. Offers,
+  // WantHistory and ListRights never do.
   bool waits_for_hosts(const local::Request& request) const;
 
   // Serves a request that waits for other hosts,
@@ -167,6 +170,7 @@ class LocalRequests {
   void open_elsewhere(const Client& client, const StreamId& id, const proto::Open& request,
                       Answer answer);
   void list_all(Answer answer);
+  void list_nodes(Answer answer);
   void list_clock_pairs(Answer answer);
   void ping(const std::string& host, Answer answer);
 

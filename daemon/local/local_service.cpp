@@ -132,7 +132,7 @@ bool LocalService::is_only_user(const Client& client, const StreamId& id) const 
   const Result<std::shared_ptr<Stream>> stream = registry_.find(id);
   if (!stream) return false;
   const OpenTable::Counts counts = opens_.counts(**stream);
-  return counts.writers == 1 && counts.readers == 0 && (*stream)->channels() == 0 &&
+  return counts.writers == 1 && counts.readers == 0 && (*stream)->channels().empty() &&
          (*stream)->creator_pid() == client.identity->pid &&
          opens_.is_writing(**stream, client.identity->number);
 }
@@ -216,6 +216,9 @@ void LocalService::on_answer(ClientNumber number, std::uint64_t serial, Result<R
   if (reply) {
     if (reply->response.has_stream_list()) {
       rights_.hide(*client->second.identity, *reply->response.mutable_stream_list());
+    }
+    if (reply->response.has_node_list()) {
+      rights_.hide(*client->second.identity, *reply->response.mutable_node_list());
     }
     send(client->second, serial, *std::move(reply));
   } else {

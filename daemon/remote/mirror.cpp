@@ -48,6 +48,7 @@ Result<void> Mirror::on_opened(StreamInfo theirs, bool) {
   connection_.frames()->take_samples(theirs.type.payload_bytes, *this);
   ++subscriptions_;
   subscribe();
+  begin_users();
   set_pending_deadline(parts_.loop.deadline_in(kFillTimeout));
   if (!replaced_.empty()) fill_timer_.enable_in(kFillTimeout);
   return {};

@@ -65,7 +65,30 @@ void OwnerConnection::on_down(const Error& why) {
 
 void RemoteStream::end_channel() {
   channel_.reset();
+  stated_users_.Clear();
+  users_serial_ = 0;
   on_channel_end();
+}
+
+// One at a time, so that a program that opens and closes without end costs one frame a round trip.
+void RemoteStream::send_users() {
+  const std::shared_ptr<Stream> ring = stream();
+  const bool is_open = channel_.stream() == channel::ChannelClient::Stream::open;
+  if (!wants_users_ || !is_open || !ring || users_serial_ != 0) return;
+  net::Frame frame;
+  net::SetUsers& request = *frame.mutable_set_users();
+  for (const StreamUser& user : parts_.opens->users(*ring)) {
+    const bool writes = user.role == Role::writer;
+    writes ? request.set_writers(request.writers() + 1)
+           : request.set_readers(request.readers() + 1);
+    if (static_cast<std::size_t>(request.users_size()) == wire::kMaxChannelUsers) continue;
+    wire::to_message(user, *request.add_users());
+  }
+  if (request.SerializeAsString() == stated_users_.SerializeAsString()) return;
+  stated_users_ = request;
+  users_serial_ = channel_.next_serial();
+  frame.set_serial(users_serial_);
+  send(frame);
 }
 
 void RemoteStream::on_down(const Error& why) {
@@ -82,6 +105,12 @@ Result<void> RemoteStream::on_ended(const Error& why) {
 
 // After stop() late answers may come.
 Result<void> RemoteStream::on_other_frame(net::Frame& frame) {
+  if (frame.serial() != 0 && frame.serial() == users_serial_) {
+    users_serial_ = 0;
+    wants_users_ = !frame.has_failure();
+    begin_users();  // others may use it by now
+    return {};
+  }
   const bool is_in_use = channel_.stream() != channel::ChannelClient::Stream::closed;
   if (frame.serial() == 0 || !is_in_use) return {};
   return channel::ChannelClient::unexpected("an answer that was not asked for");
@@ -107,7 +136,10 @@ RemoteStream::RemoteStream(const ChannelParts& parts, Kind kind, StreamId id, Ri
       quota_(std::move(quota)),
       on_done_(std::move(on_done)),
       pending_timer_(EventSource::timer(parts.loop, [this] { on_pending_timer(); })),
+      users_timer_(EventSource::timer(parts.loop, [this] { send_users(); })),
       use_count_([this] {
+        users_timer_.enable_in(Duration::zero());
+        if (use_count_.in_use()) return;
         unused_since_ = parts_.loop.now();
         on_unused();
       }),

@@ -54,6 +54,7 @@
 #include "daemon/link/dialer.hpp"
 #include "daemon/link/resolver.hpp"
 #include "daemon/service/config_values.hpp"
+#include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
 #include "daemon/streams/stream.hpp"
 
@@ -75,6 +76,8 @@ struct ChannelParts {
   SendingDemands sending = {};
   // Readers of this ring, a mirror's, shall reopen the stream: it has a new ring.
   std::function<void(const Stream&)> on_ring_replaced = {};
+  // Which programs use the rings, for the owners. nullptr: they are not notified.
+  const OpenTable* opens = nullptr;
 };
 
 // The connection of a mirror or a remote writer to the dssmd that owns its stream: follows the host
@@ -130,23 +133,26 @@ class OwnerConnection final : private Dialer::Observer {
 // that acquire() returned, as any other stream, and releases it by dropping it.
 class UseCount {
  public:
-  // on_unused: called when the last one is released, from inside any code that releases, so it may
+  // on_change: called when it is acquired or released, from inside any code that does so, so it may
   // only set a timer. Not called after the UseCount is destroyed; acquired streams may outlive it.
-  explicit UseCount(std::function<void()> on_unused)
-      : state_(std::make_shared<State>(State{std::move(on_unused)})) {}
+  explicit UseCount(std::function<void()> on_change)
+      : state_(std::make_shared<State>(State{std::move(on_change)})) {}
 
   std::shared_ptr<Stream> acquire(const std::shared_ptr<Stream>& stream) {
     ++state_->users;
+    state_->on_change();
     return {stream.get(), [stream, weak = std::weak_ptr<State>(state_)](Stream*) {
               const std::shared_ptr<State> state = weak.lock();
-              if (state && --state->users == 0) state->on_unused();
+              if (!state) return;
+              --state->users;
+              state->on_change();
             }};
   }
   bool in_use() const noexcept { return state_->users > 0; }
 
  private:
   struct State {
-    std::function<void()> on_unused;
+    std::function<void()> on_change;
     std::size_t users = 0;
   };
   std::shared_ptr<State> state_;
@@ -231,6 +237,11 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   Result<void> on_ended(const Error& why) override;
   Result<void> on_other_frame(net::Frame& frame) override;
 
+  // --- programs that use the ring
+
+  // The channel is open: notifies the owner of them, then and whenever they change.
+  void begin_users() { users_timer_.enable_in(Duration::zero()); }
+
   // --- programs that wait
 
   bool is_unused() const noexcept { return !use_count_.in_use() && pending_.empty(); }
@@ -264,7 +275,10 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
 
  private:
   // Dialer::Observer, of connection_
-  void on_up(FrameConnection&, const wire::Greeting& them) override { on_connected(them); }
+  void on_up(FrameConnection&, const wire::Greeting& them) override {
+    wants_users_ = parts_.opens && them.has_feature(wire::kFeatureUsers);
+    on_connected(them);
+  }
   Result<void> on_frame(net::Frame& frame) override { return channel_.on_frame(frame); }
   void on_down(const Error& why) override;
 
@@ -274,6 +288,7 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
     MonoTime deadline;
   };
   void end_channel();
+  void send_users();
   void log_stopped();
   Result<OpenedRing> opened(const CreatePlan* plan);
   void after_pending();
@@ -290,6 +305,10 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   std::vector<PendingOpen> pending_;
   EventSource pending_timer_;
   MonoTime unused_since_{};
+  bool wants_users_ = false;        // the owner has the feature "users"
+  net::SetUsers stated_users_;      // what it was notified of on this channel
+  std::uint64_t users_serial_ = 0;  // of the SetUsers that waits for its answer; 0: none
+  EventSource users_timer_;
   UseCount use_count_;
 
  protected:

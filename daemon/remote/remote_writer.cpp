@@ -52,6 +52,7 @@ Result<void> RemoteWriter::on_opened(StreamInfo theirs, bool created) {
   is_removed_ = false;
   answer_pending(created);
   channel_.publish(ring_->publisher());
+  begin_users();
   return {};
 }
 

@@ -37,7 +37,7 @@ std::size_t parsed_bytes(const net::Frame& request) {
 // there without a name.
 bool is_control(const net::Frame& request) noexcept {
   return request.has_list() || request.has_watch() || request.has_info() || request.has_remove() ||
-         request.has_list_clock_pairs() ||
+         request.has_list_clock_pairs() || request.has_list_nodes() ||
          (request.has_set_property() && request.set_property().has_id()) ||
          (request.has_get_property() && request.get_property().has_id());
 }
@@ -267,6 +267,7 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
   } else {
     DSSM_TRY(catalog_.serve_untrusted(request, answer, identity_.account()));
     if (request.has_list()) parts_.rights.hide(identity_, *answer.mutable_stream_list());
+    if (request.has_list_nodes()) parts_.rights.hide(identity_, *answer.mutable_node_list());
   }
   link_.send(answer);
   return {};
@@ -438,7 +439,7 @@ void DataCommunicator::on_closed(const Error& why) {
   peer_timeout_.disable();
   // Removes a ring whose memory is not fully reserved, unless a program or peer has opened it
   // meanwhile.
-  if (opening_ && opening_->created && opening_->stream->channels() == 0 &&
+  if (opening_ && opening_->created && opening_->stream->channels().empty() &&
       !opening_->stream->removed()) {
     const OpenTable::Counts counts = parts_.opens.counts(*opening_->stream);
     if (counts.writers + counts.readers == 0) {

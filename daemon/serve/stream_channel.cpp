@@ -35,13 +35,14 @@ StreamChannel::StreamChannel(const Parts& parts, std::shared_ptr<ServedStream> s
       reader_(stream().mapping()),
       sender_(stream().mapping(), parts_.link, {may_tear, &parts_.budget}),
       due_(EventSource::timer(parts_.loop, [this] { parts_.observer.work_now(); })) {
-  served_->stream().add_channel();
+  served_->stream().set_channel({.key = this});
+  set_program(false, false);
   parts_.link.take_samples(stream().type().payload_bytes, *this);
 }
 
 StreamChannel::~StreamChannel() {
   if (feed_) feed_->forget(*this);
-  served_->stream().remove_channel();
+  served_->stream().remove_channel(this);
 }
 
 Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
@@ -51,14 +52,20 @@ Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
   }
   switch (request.body_case()) {
     case net::Frame::kSubscribe:
+      set_program(true, writes_);
       return subscribe(request.serial(), request.subscribe());
     case net::Frame::kRead:
+      set_program(true, writes_);
       reading_ = {request.serial(), request.read(), 0};
       go_on_reading();
       return {};
     case net::Frame::kGetRange:
+      set_program(true, writes_);
       return get_range(request.serial(), request.get_range());
+    case net::Frame::kSetUsers:
+      return set_users(request.serial(), request.set_users());
     case net::Frame::kStartPublishing:
+      set_program(reads_, true);
       return start_publishing(request.serial(), request.start_publishing());
     case net::Frame::kSetProperty:
     case net::Frame::kGetProperty:
@@ -72,6 +79,63 @@ Result<void> StreamChannel::serve_untrusted(const net::Frame& request) {
                    "a channel takes no such request; it is for control connections, or of a newer "
                    "version than this dssmd (" DSSM_VERSION ")"};
   }
+}
+
+// --- who uses the stream over this channel
+
+// A program that is connected itself, as it reads and writes. One that has done neither is about to
+// read: a writer begins with StartPublishing.
+void StreamChannel::set_program(bool reads, bool writes) {
+  if (parts_.them.is_dssmd()) return;
+  const bool is_known = reads == reads_ && writes == writes_;
+  if (is_known && (reads || writes)) return;
+  reads_ = reads;
+  writes_ = writes;
+  Stream::Channel channel{.key = this};
+  StreamUser user{.pid = parts_.them.pid,
+                  .program = parts_.them.program,
+                  .role = Role::reader,
+                  .via = StreamVia::connection,
+                  .host = parts_.them.host};
+  if (reads || !writes) {
+    channel.users.push_back(user);
+    channel.readers = 1;
+  }
+  if (writes) {
+    user.role = Role::writer;
+    channel.users.push_back(std::move(user));
+    channel.writers = 1;
+  }
+  served_->stream().set_channel(std::move(channel));
+}
+
+// The programs of another host, as its dssmd states them.
+Result<void> StreamChannel::set_users(std::uint64_t serial, const net::SetUsers& request) {
+  if (!parts_.them.is_dssmd()) {
+    return Error{Errc::protocol, "only a dssmd states which programs use a channel"};
+  }
+  if (static_cast<std::size_t>(request.users_size()) > wire::kMaxChannelUsers) {
+    return Error{Errc::limit_exceeded,
+                 fmt::format("{} programs are named as the users of one channel; at most {} may be",
+                             request.users_size(), wire::kMaxChannelUsers)};
+  }
+  Stream::Channel channel{.key = this};
+  for (const proto::User& message : request.users()) {
+    StreamUser user = wire::stream_user_untrusted(message);
+    const bool writes = user.role == Role::writer;
+    user.via = writes ? StreamVia::remote_writer : StreamVia::mirror;
+    user.uid = message.uid();
+    user.host = parts_.them.host;
+    ++(writes ? channel.writers : channel.readers);
+    channel.users.push_back(std::move(user));
+  }
+  channel.writers = std::max(channel.writers, request.writers());
+  channel.readers = std::max(channel.readers, request.readers());
+  served_->stream().set_channel(std::move(channel));
+  net::Frame frame = answer_to(serial);
+  frame.mutable_done();
+  parts_.link.send(frame);
+  return {};
 }
 
 [[gnu::hot]] Result<void> StreamChannel::work(bool request_waits) {

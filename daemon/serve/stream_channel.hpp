@@ -92,6 +92,8 @@ class StreamChannel final : private SamplePump::Observer,
   Result<void> start_publishing(std::uint64_t serial, const net::StartPublishing& request);
   Result<void> assess_writer();
   Result<void> serve_property(const net::Frame& request);
+  Result<void> set_users(std::uint64_t serial, const net::SetUsers& request);
+  void set_program(bool reads, bool writes);
 
   void go_on_reading();
   SendStatus begin_reading();
@@ -121,6 +123,7 @@ class StreamChannel final : private SamplePump::Observer,
   std::unique_ptr<SampleReceiver> receiver_;
   std::optional<Reading> reading_;
   std::uint64_t lost_ = 0;
+  bool reads_ = false, writes_ = false;            // the client
   std::optional<std::uint64_t> clock_generation_;  // last sent, and with it:
   bool sent_other_clocks_ = false;
   Time sent_settled_from_{};

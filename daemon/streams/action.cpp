@@ -25,6 +25,7 @@ std::optional<Action> catalog_action(const Request& request) noexcept {
       return Action::get_property;
     case Request::kList:
     case Request::kWatch:
+    case Request::kListNodes:
       return Action::list;
     case Request::kInfo:
       return Action::see;
@@ -85,6 +86,8 @@ std::optional<Action> action_of(const net::Frame& request) noexcept {
       return Action::read;
     case net::Frame::kStartPublishing:
       return Action::publish;
+    case net::Frame::kSetUsers:
+      return Action::set_users;
     case net::Frame::kPing:
       return Action::ping;
     default:

@@ -63,11 +63,12 @@ enum class Action : std::uint8_t {
   set_property,
   get_property,
   see,              // of a stream: that it is there, what it is, and who may do what
-  list,             // and changes of the list; what the asker may not see is left out
+  list,             // and changes of it, and nodes; what the asker may not see is left out
   open_clock,       // the playback clock, for reading and writing
   open_clock_page,  // the state of this PC's clock
   inspect,          // clients, opens, hosts, pairs of clocks and dssmd itself
   ping,             // heartbeat; round trip to another host
+  set_users,        // over the network: which programs use the own end of a channel
 };
 
 // What `request` asks for; none: dssmd does not know it.

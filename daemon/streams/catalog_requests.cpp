@@ -14,12 +14,9 @@ namespace dssm::daemon {
 namespace {
 
 void describe_users(const Stream& stream, const OpenTable& opens, proto::Stream& out) {
-  for (const StreamUser& user : opens.users(stream)) {
-    proto::User& message = *out.add_users();
-    message.set_pid(user.pid);
-    message.set_uid(user.uid);
-    message.set_program(user.program);
-    message.set_writer(user.role == Role::writer);
+  for (const StreamUser& user : opens.users(stream)) wire::to_message(user, *out.add_users());
+  for (const Stream::Channel& channel : stream.channels()) {
+    for (const StreamUser& user : channel.users) wire::to_message(user, *out.add_users());
   }
 }
 
@@ -36,8 +33,8 @@ Result<void> check_fits(const Stream& stream, const TypeInfo& type, const Histor
 void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out, bool with_fields) {
   StreamInfo info = stream.info(with_fields);
   const OpenTable::Counts counts = opens.counts(stream);
-  info.writers = counts.writers;
-  info.readers = counts.readers;
+  info.writers += counts.writers;
+  info.readers += counts.readers;
   wire::to_message(info, out);
 }
 
@@ -65,6 +62,7 @@ template <class Request, class Response>
 Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& response,
                                               const std::string& account, const StreamId* channel) {
   if (request.has_list()) return list(*response.mutable_stream_list());
+  if (request.has_list_nodes()) return list_nodes(*response.mutable_node_list());
   const proto::StreamId* named = subject(request);
   if (!named) return unknown_request(registry_.host());
   const StreamId id = channel ? *channel : DSSM_TRY(wire::stream_id_untrusted(*named));
@@ -148,7 +146,13 @@ Result<void> CatalogRequests::check_unused(const Stream& stream) const {
   for (const StreamUser& user : opens_.users(stream)) {
     users += fmt::format("{}'{}' (pid {})", users.empty() ? "" : ", ", user.program, user.pid);
   }
-  if (stream.channels() > 0) users += users.empty() ? "other hosts" : " and other hosts";
+  for (const Stream::Channel& channel : stream.channels()) {
+    for (const StreamUser& user : channel.users) {
+      users += fmt::format("{}'{}' (pid {}) on host '{}'", users.empty() ? "" : ", ", user.program,
+                           user.pid, user.host);
+    }
+    if (channel.users.empty()) users += users.empty() ? "another host" : ", another host";
+  }
   if (users.empty()) return {};
   return Error{
       Errc::conflict,
@@ -156,6 +160,31 @@ Result<void> CatalogRequests::check_unused(const Stream& stream) const {
                   "{}`): then its readers continue with the new ring, and its writers have "
                   "to be restarted",
                   users, stream.id().str())};
+}
+
+NodeTable CatalogRequests::nodes() const {
+  NodeTable nodes(registry_.host());
+  for (const auto& [number, open] : opens_.entries()) {
+    if (open.stream->removed()) continue;
+    StreamUser user = OpenTable::user(open);
+    user.host = registry_.host();
+    nodes.add(user, open.stream->id());
+  }
+  for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
+    for (const Stream::Channel& channel : stream->channels()) {
+      for (const StreamUser& user : channel.users) nodes.add(user, stream->id());
+    }
+  }
+  return nodes;
+}
+
+Result<void> CatalogRequests::list_nodes(proto::NodeList& out) const {
+  nodes().to_message(out);
+  if (out.ByteSizeLong() <= max_list_bytes_) return {};
+  return Error{Errc::limit_exceeded,
+               fmt::format("the list of the {} processes of host '{}' is longer than one message "
+                           "may be; Info names those that use one stream",
+                           out.nodes_size(), registry_.host())};
 }
 
 // In the order of creation.

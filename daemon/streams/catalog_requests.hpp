@@ -16,6 +16,7 @@
 
 #include "catalog.pb.h"
 #include "common.pb.h"
+#include "daemon/streams/node_table.hpp"
 #include "daemon/streams/open_table.hpp"
 #include "daemon/streams/registry.hpp"
 #include "daemon/streams/rights.hpp"
@@ -40,7 +41,8 @@ class CatalogRequests {
   CatalogRequests(Registry& registry, const OpenTable& opens, std::size_t max_list_bytes)
       : registry_(registry), opens_(opens), max_list_bytes_(max_list_bytes) {}
 
-  // Serves List, Info, Remove, SetProperty and GetProperty, and fills in the response's body.
+  // Serves List, ListNodes, Info, Remove, SetProperty and GetProperty, and fills in the response's
+  // body.
   //   Request   local::Request or net::Frame; Response: local::Response or net::Frame
   //   channel   the stream of the channel that the request came on, for properties; nullptr: the
   //             request names its stream
@@ -49,6 +51,9 @@ class CatalogRequests {
   template <class Request, class Response>
   Result<void> serve_untrusted(const Request& request, Response& response,
                                const std::string& account, const StreamId* channel = nullptr);
+
+  // The processes that have streams open here or over channels to here.
+  NodeTable nodes() const;
 
   // For Open and Create.
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;
@@ -59,6 +64,7 @@ class CatalogRequests {
 
  private:
   Result<void> list(proto::StreamList& out) const;
+  Result<void> list_nodes(proto::NodeList& out) const;
   Result<std::string> property_of(const StreamId& id) const;
   Result<void> check_unused(const Stream& stream) const;
 

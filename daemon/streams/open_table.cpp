@@ -105,11 +105,15 @@ std::vector<StreamUser> OpenTable::users(const Stream& stream) const {
   std::vector<StreamUser> users;
   const auto found = by_stream_.find(&stream);
   if (found == by_stream_.end()) return users;
-  for (const OpenNumber number : found->second.opens) {
-    const OpenEntry& entry = entries_.at(number);
-    users.push_back({entry.client->pid, entry.client->uid, entry.client->program, entry.role});
-  }
+  for (const OpenNumber number : found->second.opens) users.push_back(user(entries_.at(number)));
   return users;
+}
+
+StreamUser OpenTable::user(const OpenEntry& entry) {
+  StreamUser user{entry.client->pid, entry.client->uid, entry.client->program, entry.role};
+  if (entry.stream->purpose() == Purpose::mirror) user.via = StreamVia::mirror;
+  if (entry.stream->purpose() == Purpose::remote_writer) user.via = StreamVia::remote_writer;
+  return user;
 }
 
 std::vector<OpenTable::Reading> OpenTable::readers_of(const Stream& stream) const {

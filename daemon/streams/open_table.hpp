@@ -64,6 +64,7 @@ class OpenTable {
   Counts counts(const Stream& stream) const;
   bool is_writing(const Stream& stream, ClientNumber client) const;
   std::vector<StreamUser> users(const Stream& stream) const;  // in the order of opening
+  static StreamUser user(const OpenEntry& entry);             // without the host, which is this one
 
   // The opens of `stream` for reading, in the order of opening.
   struct Reading {

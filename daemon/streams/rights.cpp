@@ -52,6 +52,7 @@ Verbs needed_for(Action action) noexcept {
     case Action::open_clock_page:
     case Action::inspect:
     case Action::ping:
+    case Action::set_users:
       return {};
   }
   return Verbs::all();
@@ -117,6 +118,16 @@ constexpr bool is_plain(char c) noexcept {
   return is_letter_or_digit(c) || c == '_' || c == '-' || c == '.';
 }
 
+// Takes from `streams`, messages with an `id`, what `identity` may not see.
+template <class Streams>
+void hide_streams(const Rights& rights, const Identity& identity, Streams& streams) {
+  const auto hidden =
+      std::stable_partition(streams.begin(), streams.end(), [&](const auto& stream) {
+        return rights.shows(identity, {stream.id().name(), stream.id().id(), stream.id().host()});
+      });
+  streams.erase(hidden, streams.end());
+}
+
 bool may_do_everything(const Identity& identity) noexcept {
   return identity.is_local() && (identity.uid == 0 || identity.uid == ::geteuid());
 }
@@ -162,12 +173,17 @@ bool Rights::shows(const Identity& identity, const StreamId& stream) const {
 }
 
 void Rights::hide(const Identity& identity, proto::StreamList& list) const {
-  auto& streams = *list.mutable_streams();
-  const auto hidden =
-      std::stable_partition(streams.begin(), streams.end(), [&](const proto::Stream& stream) {
-        return shows(identity, {stream.id().name(), stream.id().id(), stream.id().host()});
-      });
-  streams.erase(hidden, streams.end());
+  if (!lines_.empty()) hide_streams(*this, identity, *list.mutable_streams());
+}
+
+void Rights::hide(const Identity& identity, proto::NodeList& list) const {
+  if (lines_.empty()) return;
+  auto& nodes = *list.mutable_nodes();
+  for (proto::Node& node : nodes) hide_streams(*this, identity, *node.mutable_streams());
+  const auto hidden = std::stable_partition(nodes.begin(), nodes.end(), [](const auto& node) {
+    return !node.streams().empty() || !node.error().empty();
+  });
+  nodes.erase(hidden, nodes.end());
 }
 
 }  // namespace dssm::daemon

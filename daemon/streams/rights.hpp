@@ -47,9 +47,11 @@ class Rights {
   // What all lines for `identity` together allow with `stream`.
   Verbs verbs(const Identity& identity, const StreamId& stream) const;
 
-  // Whether lists show `stream` to `identity`; takes from `list` what they do not show.
+  // Whether lists show `stream` to `identity`; takes from `list` what they do not show, and
+  // processes that use nothing else.
   bool shows(const Identity& identity, const StreamId& stream) const;
   void hide(const Identity& identity, proto::StreamList& list) const;
+  void hide(const Identity& identity, proto::NodeList& list) const;
 
  private:
   std::vector<Right> lines_;

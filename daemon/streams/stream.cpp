@@ -208,7 +208,13 @@ StreamInfo Stream::info(bool with_fields) const {
   info.property_bytes = property_share_.bytes();
   info.incarnation = mapping_->identity().incarnation;
   info.creator_pid = plan_.creator_pid;
-  info.channels = channels_;
+  info.channels = static_cast<std::uint32_t>(channels_.size());
+  for (const Channel& channel : channels_) {
+    info.remote_writers += channel.writers;
+    info.remote_readers += channel.readers;
+  }
+  info.writers = info.remote_writers;
+  info.readers = info.remote_readers;
   fill_figures(*mapping_, info);
   return info;
 }
@@ -285,6 +291,20 @@ void Stream::observe_doorbells(DoorbellObserver* observer) {
   doorbell_observer_ = observer;
   if (!observer) return;
   for (const Doorbell& doorbell : doorbells_) observer->on_doorbell_added(doorbell.fd.get());
+}
+
+void Stream::set_channel(Channel channel) {
+  const auto known = std::find_if(channels_.begin(), channels_.end(),
+                                  [&](const Channel& one) { return one.key == channel.key; });
+  if (known == channels_.end()) {
+    channels_.push_back(std::move(channel));
+  } else {
+    *known = std::move(channel);
+  }
+}
+
+void Stream::remove_channel(const void* key) {
+  std::erase_if(channels_, [&](const Channel& one) { return one.key == key; });
 }
 
 Result<void> Stream::mark_removed() {

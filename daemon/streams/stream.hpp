@@ -108,7 +108,8 @@ class Stream : public std::enable_shared_from_this<Stream> {
   Purpose purpose() const noexcept { return plan_.purpose; }
   std::uint64_t incarnation() const noexcept { return mapping_->identity().incarnation; }
 
-  // All but the users. Reads the newest stamps of the ring twice.
+  // All but the users, and with the writers and readers of its channels only. Reads the newest
+  // stamps of the ring twice.
   //   with_fields  else the type comes without its fields
   StreamInfo info(bool with_fields = true) const;
 
@@ -150,10 +151,18 @@ class Stream : public std::enable_shared_from_this<Stream> {
   Result<std::string> property() const;
   Result<void> set_property(const std::string& property, MemoryBudget& budget);
 
-  // How many connections from other hosts carry this stream now.
-  std::uint32_t channels() const noexcept { return channels_; }
-  void add_channel() noexcept { ++channels_; }
-  void remove_channel() noexcept { --channels_; }
+  // The connections of other hosts and of remote programs that carry this stream now, in the order
+  // of opening.
+  struct Channel {
+    const void* key = nullptr;
+    // The programs that use the stream over it; more may be counted than are named.
+    std::vector<StreamUser> users = {};
+    std::uint32_t writers = 0, readers = 0;
+  };
+  const std::vector<Channel>& channels() const noexcept { return channels_; }
+  // Adds one, or replaces what is known of its users.
+  void set_channel(Channel channel);
+  void remove_channel(const void* key);
 
   // No later offer restores it.
   Result<void> mark_removed();
@@ -185,7 +194,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
   std::shared_ptr<const ring::RingMapping> mapping_;  // read-only
   MemoryShare ring_share_, type_share_, property_share_;
   bool removed_ = false;
-  std::uint32_t channels_ = 0;
+  std::vector<Channel> channels_;
   DoorbellObserver* doorbell_observer_ = nullptr;
 };
 

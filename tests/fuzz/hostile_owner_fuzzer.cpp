@@ -40,6 +40,7 @@ class HostileOwner {
     host_.greeting = greeting_of("pc2");
     host_.greeting.features.emplace_back(wire::kFeatureNewestFirst);
     host_.greeting.features.emplace_back(wire::kFeatureClock);
+    host_.greeting.features.emplace_back(wire::kFeatureUsers);
     host_.address =
         wire::Address::parse(wire::local_address(listening_.get()).value().str()).value();
   }
@@ -89,11 +90,15 @@ class HostileOwner {
 
 // This host. Which of the connections it has is up to the input.
 struct Host {
-  Host() { parts.self.features.emplace_back(wire::kFeatureNewestFirst); }
+  Host() {
+    parts.self.features.emplace_back(wire::kFeatureNewestFirst);
+    parts.opens = &opens;
+  }
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
   Resolver resolver{loop};
   Registry registry{"pc1",
                     {.max_streams = 8, .max_memory_bytes = 4U << 20, .max_property_bytes = 4096}};
+  OpenTable opens{{8, 8}};
   LogRecorder logger;
   Catalog catalog{"pc1"};
   ChannelParts parts{loop, resolver, registry, logger, greeting_of("pc1")};
@@ -214,6 +219,9 @@ class Control {
         break;
       case 3:
         request.mutable_list_clock_pairs();
+        break;
+      case 4:
+        request.mutable_list_nodes();
         break;
       default:
         request.mutable_get_property()->mutable_id()->set_name("a");

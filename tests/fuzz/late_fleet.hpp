@@ -70,6 +70,9 @@ class LateFleet final : public Fleet {
   void list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) override {
     due_.push_back([then = std::move(then)] { then({ClockPair()}); });
   }
+  void list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) override {
+    due_.push_back([nodes = std::move(nodes), then = std::move(then)] { then(nodes); });
+  }
   std::vector<StreamInfo> known_streams() const override {
     std::vector<StreamInfo> streams;
     for (const auto& stream : pc2_.streams()) streams.push_back(stream->info());

@@ -57,6 +57,23 @@ struct OpenInfo {
   Role role = Role::reader;
 };
 
+// One stream that a process has open.
+struct NodeStream {
+  StreamId stream;  // with its owner's host
+  Role role = Role::reader;
+  StreamVia via = StreamVia::local;
+};
+
+// A process that has streams open, on any host.
+struct NodeInfo {
+  std::string host;                  // where it runs
+  std::int32_t pid = 0;              // 0: not known (a program of an older version)
+  std::optional<std::uint32_t> uid;  // empty: not known
+  std::string program;
+  std::vector<NodeStream> streams;  // by name, readers first; each once
+  std::string error;  // why nothing is known of the processes of `host`, for people; empty: it is
+};
+
 // What a host proves itself with to other PCs (docs/security.md).
 struct CredentialsInfo {
   std::string name;  // whom the certificate names: "host 'pc1'"
@@ -267,7 +284,8 @@ class Session {
   // This PC's streams only, in the order of creation.
   Result<std::vector<StreamInfo>> list_own_streams();
 
-  // One stream, with the processes that have it open.
+  // One stream, with the processes that have it open on all hosts (up to 64 behind each connection
+  // of another host; StreamInfo counts all).
   //   fails  not_found, conflict (several hosts have a stream of that name)
   Result<StreamInfo> stream_info(const StreamId& id);
 
@@ -307,6 +325,14 @@ class Session {
   // This PC first, then the configured peers and the hosts found by mDNS, each with its present
   // state.
   Result<std::vector<HostInfo>> list_hosts();
+
+  // The processes of all hosts that have streams open, and those without a dssmd of their own that
+  // are connected to one of these hosts: this PC's first, then by host; each host's by program and
+  // pid.
+  // A host that does not answer within 0.5 s, or whose dssmd is too old, has one entry with an
+  // `error`. Streams that this process may not see are left out.
+  //   fails  limit_exceeded (more than a hundred thousand opens)
+  Result<std::vector<NodeInfo>> list_nodes();
 
   // What reads by time do with the samples of each host on each other one, and how far their clocks
   // may be apart: a pair for each two hosts that are up and each direction, sorted by reader, then

@@ -121,12 +121,25 @@ struct History {
 
 enum class Role : std::uint8_t { reader = 1, writer };
 
+// How a process has a stream open.
+enum class StreamVia : std::uint8_t {
+  local,          // on the stream's own host, by its shared memory
+  mirror,         // on another host, which keeps a copy of the ring
+  remote_writer,  // on another host, whose dssmd sends what it writes
+  connection,     // by a connection of its own to the owner's dssmd (PConnector, SSM's remote API)
+};
+
+// "local", "mirror", "remote writer", "connection"; static storage.
+std::string_view name_of(StreamVia via) noexcept;
+
 // A process that has a stream open.
 struct StreamUser {
-  std::int32_t pid = 0;
-  std::uint32_t uid = 0;
-  std::string program;
+  std::int32_t pid = 0;                   // 0: not known (a program of an older version)
+  std::optional<std::uint32_t> uid = {};  // empty: not known
+  std::string program = {};
   Role role = Role::reader;
+  StreamVia via = StreamVia::local;
+  std::string host = {};  // where it runs
 };
 
 enum class MirrorState : std::uint8_t {
@@ -167,8 +180,7 @@ struct MirrorInfo {
   std::uint64_t depth = 0;  // of its ring; 0: there is none yet
 };
 
-// The present state of a stream. For a stream of another host, pids and users are those of its
-// owner.
+// The present state of a stream. For a stream of another host, creator_pid is of its owner.
 struct StreamInfo {
   StreamId id;  // with its owner's host
   TypeInfo type;
@@ -182,8 +194,12 @@ struct StreamInfo {
   Tid newest = kNoTid;
   Time newest_time{};  // stamp of the newest sample; meaningless while newest is kNoTid
   double rate_hz = 0;  // from the stamps of the newest samples; 0 when unknown
+  // How many times it is open on all hosts, and of these over the network. Programs of other hosts
+  // are counted if their dssmd states them: an older one does not, and has a channel all the same.
   std::uint32_t writers = 0;
   std::uint32_t readers = 0;
+  std::uint32_t remote_writers = 0;
+  std::uint32_t remote_readers = 0;
   std::uint32_t channels = 0;        // connections from other hosts that carry it
   std::vector<StreamUser> users;     // from Session::stream_info() only
   std::optional<MirrorInfo> mirror;  // the same; of another host's stream that is read here

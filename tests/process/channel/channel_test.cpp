@@ -277,8 +277,10 @@ TEST_F(Channel, DescribesTheStreamsOfItsHost) {
   EXPECT_EQ(stream.newest(), 2);
   EXPECT_EQ(stream.writers(), 1u);
   EXPECT_EQ(stream.channels(), 1u);
-  ASSERT_EQ(stream.users_size(), 1);
+  EXPECT_EQ(stream.remote_readers(), 1u);
+  ASSERT_EQ(stream.users_size(), 2);
   EXPECT_EQ(stream.users(0).pid(), ::getpid());
+  EXPECT_EQ(stream.users(1).via(), proto::CONNECTION);
   control.send(with_serial(500, watch_frame()));
   EXPECT_EQ(control.receive().stream_event().stream().id().name(), "a");
   EXPECT_TRUE(control.receive().has_done());

@@ -151,9 +151,9 @@ TEST_F(Info, ShowsFieldsUsersAndSamples) {
   pose.write({}, at_ns(1'500'000'000));
   ASSERT_TRUE(pose.set_property_as(1.5));
   const std::string text = output({"info", "pose"});
-  for (const char* part :
-       {"pose:0@pc1\n", "'Pose' (16 bytes, aligned to 8)", "8 slots", "tid 0 to 0", "1.500000000",
-        "8 bytes", "float64", "float32", "the test", "writer", "1 on its host"}) {
+  for (const char* part : {"pose:0@pc1\n", "'Pose' (16 bytes, aligned to 8)", "8 slots",
+                           "tid 0 to 0", "1.500000000", "8 bytes", "float64", "float32", "the test",
+                           "writer", "writers:      1\n", "readers:      1\n", "VIA", "local"}) {
     EXPECT_NE(text.find(part), std::string::npos) << part << " in\n" << text;
   }
 

@@ -53,6 +53,24 @@ TEST(CommandLine, TakesOneFieldPerOption) {
   EXPECT_EQ(options.stream, "s");
 }
 
+TEST(CommandLine, TakesTheFormatOfAGraphFromTheNameOfItsFile) {
+  EXPECT_EQ(options_of<GraphOptions>({"graph"}).out, "");
+  const GraphOptions options = options_of<GraphOptions>({"graph", "--out", "a.dot.svg"});
+  EXPECT_EQ(options.out, "a.dot.svg");
+  EXPECT_EQ(options.format, "svg");
+  EXPECT_NE(
+      error_of({"graph", "--out", "a.txt"}).find("'a.txt' does not end in .svg, .png or .dot"),
+      std::string::npos);
+  EXPECT_NE(error_of({"graph", "--out", "a.svg", "--json"}).find("choose one"), std::string::npos);
+}
+
+TEST(CommandLine, TakesAPatternAfterTheHostsOfNodes) {
+  const NodesOptions options =
+      options_of<NodesOptions>({"nodes", "--host", "pc1", "--host", "pc2", "map*"});
+  EXPECT_EQ(options.hosts, (std::vector<std::string>{"pc1", "pc2"}));
+  EXPECT_EQ(options.pattern, "map*");
+}
+
 TEST(CommandLine, KnowsVerbsInsideVerbs) {
   const PlaybackOptions show = options_of<PlaybackOptions>({"playback"});
   EXPECT_EQ(show.verb_name, "playback");

@@ -310,6 +310,38 @@ const std::map<std::string, Fill>& messages() {
          pair.limit = Duration(1'500'000);
          to_message(pair, *frame.mutable_clock_pair_list()->add_pairs());
        }},
+      {"list_nodes",
+       [](net::Frame& frame) {
+         frame.set_serial(11);
+         frame.mutable_list_nodes();
+       }},
+      {"node_list",
+       [](net::Frame& frame) {
+         frame.set_serial(11);
+         proto::Node& node = *frame.mutable_node_list()->add_nodes();
+         node.set_host("pc2");
+         node.set_pid(4711);
+         node.set_uid(0);
+         node.set_program("mapper");
+         proto::NodeStream& use = *node.add_streams();
+         set_id(*use.mutable_id(), "pc1");
+         use.set_via(proto::MIRROR);
+         proto::Node& other = *frame.mutable_node_list()->add_nodes();
+         other.set_host("pc9");
+         other.set_program("viewer");
+         proto::NodeStream& written = *other.add_streams();
+         set_id(*written.mutable_id(), "pc2");
+         written.set_writer(true);
+         written.set_via(proto::CONNECTION);
+       }},
+      {"set_users",
+       [](net::Frame& frame) {
+         frame.set_serial(3);
+         StreamUser user{4711, 1000, "mapper"};
+         user.via = StreamVia::mirror;
+         to_message(user, *frame.mutable_set_users()->add_users());
+         frame.mutable_set_users()->set_readers(2);
+       }},
       {"stream_list",
        [](net::Frame& frame) {
          frame.set_serial(8);

@@ -65,6 +65,12 @@ TEST(Greeting, CrossesTheWire) {
   EXPECT_EQ(back->clock->setting_from, mapper().clock->setting_from);
   EXPECT_EQ(back->clock->settled_from, mapper().clock->settled_from);
   EXPECT_EQ(back->clock->corrected, mapper().clock->corrected);
+  EXPECT_EQ(back->pid, 0) << "an older program";
+  proto::Hello with_pid = hello();
+  with_pid.set_pid(4711);
+  EXPECT_EQ(greeting_untrusted(with_pid, "x")->pid, 4711);
+  with_pid.set_pid(-4711);
+  EXPECT_EQ(greeting_untrusted(with_pid, "x")->pid, 0);
   EXPECT_TRUE(back->has_feature(kFeatureTorn));
   EXPECT_FALSE(back->has_feature("tor"));
   EXPECT_EQ(back->str(), "'mapper' on host 'pc3'");

@@ -102,6 +102,102 @@ TEST_F(FleetServiceTest, ListsThisHostFirstAndWhatIsWrongWithIt) {
   EXPECT_EQ(shown.error(), fleet->hosts().at(1).error());
 }
 
+// --- nodes
+
+class NodesTest : public FleetServiceTest {
+ protected:
+  // Asks for all nodes, until each peer has the request.
+  void ask() {
+    run_until(loop, [this] { return catalog.hosts().size() == 2; });
+    NodeTable own("pc1");
+    own.add({5, 1000, "viewer", Role::reader, StreamVia::mirror, "pc1"}, {"lidar", 0, "pc2"});
+    fleet->list_nodes(std::move(own), [this](const NodeTable& all) {
+      nodes.emplace();
+      all.to_message(*nodes);
+    });
+    run_until(loop, [this] { return !peer.requests.empty() && !other.requests.empty(); });
+  }
+  static net::Frame answer(const ScriptedPeer& from) {
+    EXPECT_TRUE(from.requests.at(0).has_list_nodes());
+    net::Frame frame = answer_to(from.requests.at(0));
+    frame.mutable_node_list();
+    return frame;
+  }
+  // A node in the answer, with one stream.
+  static proto::Node& add(net::Frame& answer, const std::string& host, std::int32_t pid,
+                          const std::string& program, const StreamId& stream,
+                          proto::Via via = proto::LOCAL) {
+    proto::Node& node = *answer.mutable_node_list()->add_nodes();
+    node.set_host(host);
+    node.set_pid(pid);
+    node.set_program(program);
+    wire::to_message(stream, *node.add_streams()->mutable_id());
+    node.mutable_streams(0)->set_via(via);
+    return node;
+  }
+  // Each as "pc2 mapper 12: lidar:0@pc2", or "pc2: why it is not known".
+  std::vector<std::string> wait() {
+    run_until(loop, [this] { return nodes.has_value(); });
+    std::vector<std::string> texts;
+    for (const proto::Node& node : nodes->nodes()) {
+      std::string text = node.host();
+      if (!node.error().empty()) {
+        texts.push_back(text + ": " + node.error());
+        continue;
+      }
+      text += " " + node.program() + " " + std::to_string(node.pid()) + ":";
+      for (const proto::NodeStream& use : node.streams()) {
+        text += " " + StreamId{use.id().name(), use.id().id(), use.id().host()}.str();
+      }
+      texts.push_back(text);
+    }
+    return texts;
+  }
+
+  std::optional<proto::NodeList> nodes;
+};
+
+TEST_F(NodesTest, AreThoseOfAllHostsWithEachUseOnce) {
+  ask();
+  net::Frame from_peer = answer(peer), from_other = answer(other);
+  add(from_peer, "pc2", 12, "driver", {"lidar", 0, "pc2"});
+  add(from_peer, "pc1", 5, "viewer", {"lidar", 0, "pc2"}, proto::MIRROR);
+  add(from_peer, "laptop", 0, "plot", {"lidar", 0, "pc2"}, proto::CONNECTION);
+  add(from_other, "pc3", 12, "driver", {"radar", 0, "pc3"});
+  peer.send(from_peer);
+  other.send(from_other);
+  EXPECT_EQ(wait(),
+            (std::vector<std::string>{"pc1 viewer 5: lidar:0@pc2", "laptop plot 0: lidar:0@pc2",
+                                      "pc2 driver 12: lidar:0@pc2", "pc3 driver 12: radar:0@pc3"}));
+  EXPECT_EQ(nodes->nodes(0).uid(), 1000u);
+  EXPECT_FALSE(nodes->nodes(1).has_uid());
+}
+
+TEST_F(NodesTest, ShowThatAHostDoesNotAnswerOrDoesNotKnowTheRequest) {
+  ask();
+  other.fail(other.requests.at(0), Errc::protocol, "dssmd of host 'pc3' does not \x1b know this");
+  EXPECT_EQ(wait(), (std::vector<std::string>{"pc1 viewer 5: lidar:0@pc2",
+                                              "pc2: host 'pc2' has not answered within 500 ms",
+                                              "pc3: dssmd of host 'pc3' does not ? know this"}));
+}
+
+TEST_F(NodesTest, TakeNothingFromAPeerThatCannotBe) {
+  ask();
+  other.send(answer_to(other.requests.at(0)));
+  net::Frame frame = answer(peer);
+  add(frame, "", 1, "nowhere", {"a", 0, "pc2"});
+  add(frame, "pc\n3", 1, "nowhere", {"a", 0, "pc2"});
+  add(frame, "pc9", 1, "elsewhere", {"a", 0, "pc8"});  // neither its process nor its stream
+  add(frame, "pc2", 1, "nameless", {"", 0, "pc2"});
+  add(frame, "pc2", 1, "any", {"a", 0, ""});
+  add(frame, "pc2", -1, "odd\n" + std::string(200, 'x'), {"a", 0, "pc8"}).set_error("a lie");
+  peer.send(frame);
+  EXPECT_EQ(wait(), (std::vector<std::string>{
+                        "pc1 viewer 5: lidar:0@pc2",
+                        "pc2 odd?" + std::string(wire::kMaxProgramBytes - 4, 'x') + " 0: a:0@pc8",
+                        "pc3: host 'pc3' sent a response of another kind"}));
+}
+
 // --- pairs of clocks
 
 class ClockPairsTest : public FleetServiceTest {

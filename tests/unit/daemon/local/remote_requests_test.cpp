@@ -73,6 +73,11 @@ class FakeFleet final : public Fleet {
     asked.push_back("list_clock_pairs");
     then(pairs);
   }
+  void list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) override {
+    asked.push_back("list_nodes");
+    nodes.add({12, 1000, "mapper", Role::reader, StreamVia::local, "pc2"}, {"lidar", 0, "pc2"});
+    then(std::move(nodes));
+  }
   std::vector<StreamInfo> known_streams() const override { return known; }
   std::vector<local::Host> hosts() const override {
     std::vector<local::Host> hosts(2);
@@ -297,6 +302,22 @@ TEST_F(RemoteRequestsTest, ListsPairsOfClocks) {
   fleet.pairs.resize(40'000, fleet.pairs[0]);
   EXPECT_EQ(client->ask(request).failure().code(), "limit_exceeded");
   EXPECT_EQ(fleet.asked, (Asked{"list_clock_pairs", "list_clock_pairs"}));
+}
+
+TEST_F(RemoteRequestsTest, ListsTheProcessesOfAllHostsOwnOnesFirst) {
+  local::Request request;
+  request.mutable_list_nodes();
+  EXPECT_TRUE(client->ask(create_request("odometry")).has_opened());
+  const proto::NodeList list = client->ask(request).node_list();
+  ASSERT_EQ(list.nodes_size(), 2);
+  EXPECT_EQ(list.nodes(0).host(), "pc1");
+  EXPECT_EQ(list.nodes(0).program(), "test");
+  ASSERT_EQ(list.nodes(0).streams_size(), 1);
+  EXPECT_EQ(list.nodes(0).streams(0).id().host(), "pc1");
+  EXPECT_TRUE(list.nodes(0).streams(0).writer());
+  EXPECT_EQ(list.nodes(1).host(), "pc2");
+  EXPECT_EQ(list.nodes(1).program(), "mapper");
+  EXPECT_EQ(fleet.asked, Asked{"list_nodes"});
 }
 
 TEST_F(RemoteRequestsTest, ReportsHowOtherHostsAreFound) {

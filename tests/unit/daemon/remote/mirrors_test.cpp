@@ -89,6 +89,104 @@ TEST_F(MirrorsTest, FillsARingWithTheOwnersHistoryBeforeItAnswers) {
   EXPECT_EQ(state().newest(), 110);
 }
 
+// --- the owner learns who reads
+
+class MirrorUsersTest : public MirrorsTest {
+ protected:
+  explicit MirrorUsersTest(bool wanted = true) {
+    parts.opens = &opens;
+    parts.mirror_linger = 5s;
+    if (wanted) greeting.features.emplace_back(wire::kFeatureUsers);
+    owner->greet_as(greeting);
+  }
+  OpenNumber add(std::int32_t pid, std::shared_ptr<Stream> stream) {
+    ClientIdentity client;
+    client.pid = pid;
+    client.uid = 1000;
+    client.program = "mapper";
+    client.number = static_cast<ClientNumber>(pid);
+    const OpenNumber number = opens.add(
+        {std::make_shared<const ClientIdentity>(client), std::move(stream), Role::reader});
+    find();  // dssmd adds the entry in the same turn in which it gets the stream
+    return number;
+  }
+  // The pids in the next SetUsers, and how many readers there are.
+  std::vector<std::int64_t> stated() {
+    last = owner->receive();
+    EXPECT_TRUE(last.has_set_users()) << last.ShortDebugString();
+    std::vector<std::int64_t> numbers;
+    for (const proto::User& user : last.set_users().users()) numbers.push_back(user.pid());
+    numbers.push_back(last.set_users().readers());
+    return numbers;
+  }
+  void answer_done() {
+    net::Frame done = answer_to(last);
+    done.mutable_done();
+    owner->send(done);
+  }
+  void no_request() {
+    run_turns(loop, 16);
+    EXPECT_FALSE(owner->has_request());
+  }
+
+  OpenTable opens{{1000, 1000}};
+  wire::Greeting greeting = greeting_of("pc2");
+  net::Frame last;
+};
+using Numbers = std::vector<std::int64_t>;
+
+TEST_F(MirrorUsersTest, AreStatedWhenTheyChangeAndAfterAReconnect) {
+  const auto first = open();
+  serve(0);
+  no_request();
+  owner->send_caught_up();
+  const OpenNumber one = add(5, wait(first));
+  first->reset();  // the entry is the only one that holds the stream
+  EXPECT_EQ(stated(), (Numbers{5, 1}));
+  add(6, find());
+  no_request();
+  answer_done();
+  EXPECT_EQ(stated(), (Numbers{5, 6, 2})) << "what has changed before the answer comes after it";
+  answer_done();
+  find();
+  no_request();
+  EXPECT_TRUE(opens.remove(5, one));
+  EXPECT_EQ(stated(), (Numbers{6, 1}));
+
+  owner->cut();
+  catalog.host_up(greeting, owner->address());
+  serve(0);
+  EXPECT_EQ(stated(), (Numbers{6, 1}));
+  answer_done();
+  opens.remove_all(6);
+  EXPECT_EQ(stated(), (Numbers{0}));
+}
+
+TEST_F(MirrorUsersTest, AreNamedUpToALimitAndCountedAll) {
+  const std::shared_ptr<Stream> stream = opened(0);
+  const auto count = static_cast<std::int64_t>(wire::kMaxChannelUsers) + 3;
+  for (std::int32_t pid = 1; pid <= count; ++pid) add(pid, stream);
+  const Numbers numbers = stated();
+  EXPECT_EQ(numbers.size(), wire::kMaxChannelUsers + 1);
+  EXPECT_EQ(numbers.back(), count);
+}
+
+TEST_F(MirrorUsersTest, AreNotStatedAgainOnAChannelThatRefusesIt) {
+  add(5, opened(0));
+  stated();
+  owner->fail(last, Errc::protocol, "a channel takes no such request");
+  add(6, find());
+  no_request();
+}
+
+struct OlderOwnerTest : MirrorUsersTest {
+  OlderOwnerTest() : MirrorUsersTest(false) {}
+};
+TEST_F(OlderOwnerTest, IsNotNotifiedOfUsers) {
+  add(5, opened(0));
+  no_request();
+}
+
 TEST_F(MirrorsTest, SharesOneChannelAmongAllReaders) {
   const auto first = open(), second = open();
   serve(0);

@@ -133,6 +133,135 @@ TEST(DataCommunicator, StatesItsPairsOfClocksOnControlConnections) {
   EXPECT_EQ(rig.ask(channel, request).failure().code(), "protocol");
 }
 
+// --- who uses a stream over a channel
+
+// What Info says of the users of "a": "test on pc2 reads, connection".
+std::vector<std::string> users_of_a(ServerRig& rig, MemoryPeer& control) {
+  net::Frame info = with_serial(50);
+  info.mutable_info()->mutable_id()->set_name("a");
+  const proto::Stream stream = rig.ask(control, info).stream_list().streams(0);
+  std::vector<std::string> users;
+  std::uint32_t writers = 0;
+  for (const proto::User& user : stream.users()) {
+    writers += user.writer();
+    users.push_back(user.program() + " (" + std::to_string(user.pid()) + ") on " + user.host() +
+                    (user.writer() ? " writes, " : " reads, ") + proto::Via_Name(user.via()));
+  }
+  EXPECT_EQ(stream.remote_writers(), writers);
+  EXPECT_EQ(stream.remote_readers(), users.size() - writers);
+  EXPECT_EQ(stream.writers() + stream.readers(), 0u) << "those of its own host";
+  return users;
+}
+using Users = std::vector<std::string>;
+
+void greet(ServerRig& rig, MemoryPeer& peer, const wire::Greeting& greeting) {
+  rig.connect(peer, false);
+  peer.put(hello_frame(greeting));
+  rig.turns();
+  ASSERT_EQ(peer.take().size(), 1u);
+}
+
+TEST(DataCommunicator, NamesAProgramThatIsConnectedAndWhatItDoes) {
+  ServerRig rig;
+  rig.create("a");
+  MemoryPeer program, control;
+  rig.connect(control);
+  EXPECT_EQ(users_of_a(rig, control), Users());
+  wire::Greeting greeting = greeting_of("pc9", "viewer");
+  greeting.pid = 4711;
+  greet(rig, program, greeting);
+  EXPECT_EQ(users_of_a(rig, control), Users()) << "it has not opened it";
+  rig.open(program, "a");
+  const std::string viewer = "viewer (4711) on pc9 ";
+  EXPECT_EQ(users_of_a(rig, control), Users{viewer + "reads, CONNECTION"});
+  rig.ask(program, with_serial(1, start_publishing_frame(5)));
+  EXPECT_EQ(users_of_a(rig, control), Users{viewer + "writes, CONNECTION"})
+      << "it has not read anything";
+  rig.ask(program, with_serial(2, read_frame(0)));
+  EXPECT_EQ(users_of_a(rig, control),
+            (Users{viewer + "reads, CONNECTION", viewer + "writes, CONNECTION"}));
+  program.end();
+  rig.turns();
+  EXPECT_EQ(users_of_a(rig, control), Users());
+}
+
+TEST(DataCommunicator, NamesTheProgramsOfAnotherHostAsItsDssmdStatesThem) {
+  ServerRig rig;
+  rig.create("a");
+  MemoryPeer host, control, program;
+  rig.connect(control);
+  greet(rig, host, greeting_of("pc2"));
+  rig.open(host, "a");
+  EXPECT_EQ(users_of_a(rig, control), Users()) << "an older dssmd states none";
+  net::Frame request = with_serial(1);
+  proto::User& user = *request.mutable_set_users()->add_users();
+  user.set_pid(12);
+  user.set_program("map\nper");
+  user.set_host("pc7");
+  user.set_via(proto::CONNECTION);
+  proto::User& writer = *request.mutable_set_users()->add_users();
+  writer.set_pid(-3);
+  writer.set_writer(true);
+  EXPECT_TRUE(rig.ask(host, request).has_done());
+  EXPECT_EQ(users_of_a(rig, control),
+            (Users{"map?per (12) on pc2 reads, MIRROR", " (0) on pc2 writes, REMOTE_WRITER"}))
+      << "it speaks for its own programs only";
+  request.mutable_set_users()->clear_users();
+  request.mutable_set_users()->set_readers(70);
+  EXPECT_TRUE(rig.ask(host, request).has_done());
+  const proto::Stream listed = rig.ask(control, list_request(3)).stream_list().streams(0);
+  EXPECT_EQ(listed.remote_readers(), 70u) << "more than are named";
+  EXPECT_EQ(listed.remote_writers(), 0u);
+
+  for (std::size_t i = 0; i <= wire::kMaxChannelUsers; ++i)
+    request.mutable_set_users()->add_users();
+  EXPECT_EQ(rig.ask(host, request).failure().code(), "limit_exceeded");
+  rig.connect(program);
+  rig.open(program, "a");
+  request.mutable_set_users()->clear_users();
+  EXPECT_EQ(rig.ask(program, request).failure().code(), "protocol") << "it is not a dssmd";
+}
+
+TEST(DataCommunicator, ListsProcessesWithWhatThePeerMaySee) {
+  Rights rights;
+  ServerRig rig({16, 8, 32U << 20}, nullptr, &rights);
+  const auto client = [](std::int32_t pid, const std::string& program) {
+    ClientIdentity identity;
+    identity.pid = pid;
+    identity.uid = 1000;
+    identity.program = program;
+    identity.number = static_cast<ClientNumber>(pid);
+    return std::make_shared<const ClientIdentity>(identity);
+  };
+  const auto a = rig.create("a"), secret = rig.create("secret");
+  rig.opens.add({client(5, "mapper"), a, Role::reader});
+  rig.opens.add({client(5, "mapper"), a, Role::reader});
+  rig.opens.add({client(5, "mapper"), secret, Role::writer});
+  rig.opens.add({client(6, "spy"), secret, Role::reader});
+  MemoryPeer control, program;
+  rig.connect(program, true, true, 3);
+  rig.open(program, "a");
+  rig.connect(control);
+  net::Frame request = with_serial(1);
+  request.mutable_list_nodes();
+  const auto nodes = [&] {
+    std::vector<std::string> texts;
+    const net::Frame answer = rig.ask(control, request);
+    for (const proto::Node& node : answer.node_list().nodes()) {
+      std::string text = node.host() + " " + node.program() + (node.has_uid() ? " 1000:" : " -:");
+      for (const proto::NodeStream& use : node.streams()) {
+        text += " " + use.id().name() + "@" + use.id().host() + (use.writer() ? " w" : " r");
+      }
+      texts.push_back(text);
+    }
+    return texts;
+  };
+  EXPECT_EQ(nodes(), (Users{"pc1 mapper 1000: a@pc1 r secret@pc1 w", "pc1 spy 1000: secret@pc1 r",
+                            "pc3 test -: a@pc1 r"}));
+  rights.set({parse_right("everyone read a").value()});
+  EXPECT_EQ(nodes(), (Users{"pc1 mapper 1000: a@pc1 r", "pc3 test -: a@pc1 r"}));
+}
+
 TEST(DataCommunicator, CountsChannelsInTheStreamsDescription) {
   ServerRig rig;
   rig.create("a");
@@ -379,7 +508,8 @@ TEST(DataCommunicator, ReplacesAStreamThatNoPeerHasOpen) {
   rig.open(peer, "s");
   const net::Frame refused = rig.ask(other, create_request(1, "s", 16, 99));
   EXPECT_EQ(refused.failure().code(), "conflict");
-  EXPECT_NE(refused.failure().message().find("open in other hosts"), std::string::npos)
+  EXPECT_NE(refused.failure().message().find("open in 'test' (pid 0) on host 'pc2'"),
+            std::string::npos)
       << refused.failure().message();
   peer.end();
   rig.turns();

@@ -56,7 +56,7 @@ std::string verbs(const std::vector<std::string>& texts, const Identity& identit
 
 TEST(Rights, AllowEverythingWithoutLines) {
   const Rights none;
-  for (int action = 0; action <= static_cast<int>(Action::ping); ++action) {
+  for (int action = 0; action <= static_cast<int>(Action::set_users); ++action) {
     EXPECT_TRUE(none.check(user(1000, 1000), static_cast<Action>(action), {"lidar", 0, ""}));
     EXPECT_TRUE(none.check(remote(std::nullopt, "pc2"), static_cast<Action>(action), {}));
   }
@@ -100,7 +100,7 @@ TEST(Rights, EachActionNeedsItsVerb) {
     right.streams = "lidar";
     const Rights rights({right});
     std::vector<Action> actions;
-    for (int i = 0; i <= static_cast<int>(Action::ping); ++i) {
+    for (int i = 0; i <= static_cast<int>(Action::set_users); ++i) {
       const auto action = static_cast<Action>(i);
       if (rights.check(user(1000, 1000), action, {"lidar", 0, ""})) actions.push_back(action);
     }
@@ -108,7 +108,7 @@ TEST(Rights, EachActionNeedsItsVerb) {
   };
   const auto with = [](std::vector<Action> some) {
     for (const Action always : {Action::greet, Action::close, Action::list, Action::open_clock_page,
-                                Action::inspect, Action::ping}) {
+                                Action::inspect, Action::ping, Action::set_users}) {
       some.push_back(always);
     }
     std::sort(some.begin(), some.end());

@@ -1,0 +1,183 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// dssmctl graph: who gives samples to whom, as a drawing. Graphviz's dot(1) draws it; without --out
+// its input is what is printed.
+#include <fcntl.h>
+#include <fmt/format.h>
+#include <spawn.h>
+#include <sys/wait.h>
+#include <unistd.h>
+
+#include <cerrno>
+#include <fstream>
+#include <map>
+#include <utility>
+
+#include "client/dssmctl/describe.hpp"
+#include "client/dssmctl/names.hpp"
+#include "client/dssmctl/nodes.hpp"
+#include "client/dssmctl/open_stream.hpp"
+#include "client/dssmctl/options.hpp"
+#include "client/dssmctl/text.hpp"
+#include "core/base/text.hpp"
+#include "core/base/try.hpp"
+#include "core/base/unique_fd.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+// What is inside one host's frame, as lines of the DOT language.
+struct HostLines {
+  std::string lines;
+  std::string error;
+};
+
+// Puts the graph together. What has a name of its own there is called p0, p1 ... and s0, s1 ..., so
+// that only labels hold text of others.
+class Graph {
+ public:
+  void add_stream(const StreamId& id, double rate_hz) {
+    if (!streams_.emplace(id.str(), streams_.size()).second) return;
+    std::string label = dot_text(short_name(id));
+    if (rate_hz > 0) label += fmt::format("\\n{:.1f} Hz", rate_hz);
+    hosts_[id.host].lines +=
+        fmt::format("    s{} [shape=box, label=\"{}\"];\n", streams_.size() - 1, label);
+  }
+
+  void add_node(const NodeInfo& node) {
+    if (!node.error.empty()) {
+      hosts_[node.host].error = node.error;
+      return;
+    }
+    const std::string label =
+        dot_text(node.program) + (node.pid > 0 ? fmt::format("\\npid {}", node.pid) : "");
+    hosts_[node.host].lines +=
+        fmt::format("    p{} [shape=ellipse, label=\"{}\"];\n", nodes_, label);
+    for (const NodeStream& use : node.streams) {
+      add_stream(use.stream, 0);
+      const std::size_t stream = streams_.at(use.stream.str());
+      const char* style = use.via == StreamVia::local ? "" : " [style=dashed]";
+      edges_ += use.role == Role::writer ? fmt::format("  p{} -> s{}{};\n", nodes_, stream, style)
+                                         : fmt::format("  s{} -> p{}{};\n", stream, nodes_, style);
+    }
+    ++nodes_;
+  }
+
+  std::string text() const {
+    std::string text = "digraph dssm {\n  rankdir=LR;\n  node [fontname=\"sans-serif\"];\n";
+    text += "  graph [fontname=\"sans-serif\"];\n";
+    std::size_t number = 0;
+    for (const auto& [host, inside] : hosts_) {
+      const std::string note = inside.error.empty() ? "" : "\\nprocesses not known";
+      text += fmt::format("  subgraph cluster_{} {{\n    label=\"{}{}\";\n{}", number,
+                          dot_text(host), note, inside.lines);
+      // A frame without content is not drawn.
+      if (inside.lines.empty()) text += fmt::format("    h{} [style=invis];\n", number);
+      text += "  }\n";
+      ++number;
+    }
+    return text + edges_ + "}\n";
+  }
+
+ private:
+  std::map<std::string, HostLines> hosts_;
+  std::map<std::string, std::size_t> streams_;  // by full name
+  std::size_t nodes_ = 0;
+  std::string edges_;
+};
+
+Error cannot_write(const std::string& file, int error) {
+  return os_error("write '" + file + "'", error);
+}
+
+Result<void> write_file(const std::string& file, const std::string& text) {
+  std::ofstream out(file, std::ios::binary | std::ios::trunc);
+  out << text;
+  out.close();
+  return out ? Result<void>() : cannot_write(file, errno);
+}
+
+// Has dot(1) draw `text` into `file`; what it reports goes to standard error.
+Result<void> draw(const std::string& text, const std::string& format, const std::string& file) {
+  int ends[2];
+  if (::pipe2(ends, O_CLOEXEC)) return os_error("pipe2");
+  UniqueFd from(ends[0]), to(ends[1]);
+  std::string words[] = {"dot", "-T" + format, "-o", file};
+  char* argv[] = {words[0].data(), words[1].data(), words[2].data(), words[3].data(), nullptr};
+  posix_spawn_file_actions_t actions;
+  ::posix_spawn_file_actions_init(&actions);
+  ::posix_spawn_file_actions_adddup2(&actions, from.get(), STDIN_FILENO);
+  pid_t pid = -1;
+  const int failed = ::posix_spawnp(&pid, argv[0], &actions, nullptr, argv, environ);
+  ::posix_spawn_file_actions_destroy(&actions);
+  if (failed == ENOENT) {
+    return Error{Errc::not_found,
+                 fmt::format("draw '{}': there is no program 'dot' here; install Graphviz (`sudo "
+                             "apt install graphviz`), or write a .dot file and draw it elsewhere",
+                             file)};
+  }
+  if (failed) return os_error("run 'dot'", failed);
+  from = UniqueFd();
+  for (std::size_t done = 0; done < text.size();) {
+    const ssize_t wrote = ::write(to.get(), text.data() + done, text.size() - done);
+    if (wrote < 0 && errno != EINTR) break;  // it has ended
+    if (wrote > 0) done += static_cast<std::size_t>(wrote);
+  }
+  to = UniqueFd();
+  int status = 0;
+  while (::waitpid(pid, &status, 0) < 0 && errno == EINTR) {
+  }
+  if (WIFEXITED(status) && WEXITSTATUS(status) == 0) return {};
+  return Error{Errc::system,
+               fmt::format("draw '{}': 'dot' (Graphviz) failed; it says above why", file)};
+}
+
+}  // namespace
+
+std::string dot_text(std::string_view text) {
+  // Control characters are escaped as in all of dssmctl's output, and so is text that is not UTF-8,
+  // which dot would change.
+  const std::string shown = is_utf8(text) && !has_control(text) ? std::string(text) : escaped(text);
+  std::string label;
+  for (const char c : shown) {
+    if (c == '"' || c == '\\') {
+      label += '\\';
+      label += c;
+    } else if (c == '&') {
+      label += "&amp;";
+    } else {
+      label += c;
+    }
+  }
+  return label;
+}
+
+std::string dot_graph(const std::vector<NodeInfo>& nodes, const std::vector<StreamInfo>& streams) {
+  Graph graph;
+  for (const StreamInfo& stream : streams) graph.add_stream(stream.id, stream.rate_hz);
+  for (const NodeInfo& node : nodes) graph.add_node(node);
+  return graph.text();
+}
+
+Result<void> run(const GraphOptions& options, Output& out) {
+  Session session = DSSM_TRY(connect(options));
+  const std::vector<StreamInfo> streams = DSSM_TRY(session.list_streams());
+  const std::vector<NodeInfo> nodes = DSSM_TRY(session.list_nodes());
+  if (options.json) {
+    const Time now = WallClock::now();
+    Json all_nodes = Json::array(), all_streams = Json::array();
+    for (const NodeInfo& node : nodes) all_nodes.push_back(node_json(node));
+    for (const StreamInfo& stream : streams) all_streams.push_back(stream_json(stream, now));
+    out.add(json_document({{"nodes", std::move(all_nodes)}, {"streams", std::move(all_streams)}}));
+    return {};
+  }
+  const std::string text = dot_graph(nodes, streams);
+  if (options.out.empty()) {
+    out.add(text);
+    return {};
+  }
+  if (options.format == "dot") return write_file(options.out, text);
+  return draw(text, options.format, options.out);
+}
+
+}  // namespace dssm::ctl
