@@ -260,4 +260,21 @@ Result<History> History::for_life(Duration life, Duration cycle) {
   return History{static_cast<std::uint64_t>(slots), cycle};
 }
 
+Duration pause_length(std::span<const Duration> intervals, Duration cycle) noexcept {
+  Duration longest{}, second{};
+  for (const Duration interval : intervals) {
+    if (interval > longest) {
+      second = longest;
+      longest = interval;
+    } else {
+      second = std::max(second, interval);
+    }
+  }
+  const Duration usual = intervals.size() < 2 ? std::max(cycle, longest) : second;
+  constexpr int kIntervals = 5;
+  constexpr Duration kMinPause = std::chrono::seconds(1);
+  if (usual > Duration::max() / kIntervals) return Duration::max();
+  return std::max(kIntervals * usual, kMinPause);
+}
+
 }  // namespace dssm

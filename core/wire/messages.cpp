@@ -91,6 +91,8 @@ void to_message(const StreamInfo& info, proto::Stream& out) {
   out.set_writers(info.writers);
   out.set_readers(info.readers);
   out.set_channels(info.channels);
+  out.set_state(static_cast<proto::Stream::State>(info.state));
+  out.set_age_ns(to_ns(info.age));
   for (const StreamUser& user : info.users) {
     proto::User& message = *out.add_users();
     message.set_pid(user.pid);
@@ -155,6 +157,8 @@ StreamInfo stream_info(const proto::Stream& message) {
   info.writers = message.writers();
   info.readers = message.readers();
   info.channels = message.channels();
+  info.state = enum_untrusted(message.state(), StreamState::no_writer);
+  info.age = Duration(message.age_ns());
   for (const proto::User& user : message.users()) {
     info.users.push_back(
         {user.pid(), user.uid(), user.program(), user.writer() ? Role::writer : Role::reader});

@@ -38,6 +38,10 @@ void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out, 
   const OpenTable::Counts counts = opens.counts(stream);
   info.writers = counts.writers;
   info.readers = counts.readers;
+  // Other hosts and programs without a dssmd write through channels.
+  if (info.state == StreamState::stalled && counts.writers == 0 && stream.channels() == 0) {
+    info.state = StreamState::no_writer;
+  }
   wire::to_message(info, out);
 }
 
