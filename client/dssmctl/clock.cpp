@@ -50,21 +50,25 @@ std::string reads_cell(const HostInfo& host) {
   return fmt::format("{}: {}", reads, escaped_message(host.clock_reason));
 }
 
+// Whether its chronyd was read.
+bool is_read(const ClockSnapshot& clock) {
+  return clock.status != ClockStatus::unknown && clock.age > Duration::zero();
+}
+
 // A host whose clock is not known has dashes.
 std::vector<std::string> clock_row(const HostInfo& host) {
   if (!host.clock) {
     return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-", reads_cell(host)};
   }
   const ClockSnapshot& clock = *host.clock;
-  const bool is_read = clock.status != ClockStatus::unknown && clock.age > Duration::zero();
   return {escaped(host.name),
           status_text(clock),
           bound_text(host.clock_bound()),
           bound_text(host.clock_distance),
-          is_read ? duration_text(clock.offset) : "-",
+          is_read(clock) ? duration_text(clock.offset) : "-",
           reference_text(host),
           clock.update_interval > Duration::zero() ? duration_text(clock.update_interval) : "-",
-          is_read ? duration_text(clock.age) : "-",
+          is_read(clock) ? duration_text(clock.age) : "-",
           reads_cell(host)};
 }
 
@@ -79,11 +83,12 @@ Json clock_json(const HostInfo& host) {
   json["bound_ns"] = bound_json(host.clock_bound());
   json["distance_ns"] = bound_json(host.clock_distance);
   json["root_bound_ns"] = bound_json(clock.root_bound);
-  json["offset_ns"] = to_ns(clock.offset);
+  json["offset_ns"] = is_read(clock) ? Json(to_ns(clock.offset)) : Json();
   json["reference"] = or_null(host.clock_reference);
-  json["stratum"] = clock.stratum;
-  json["poll_ns"] = to_ns(clock.update_interval);
-  json["age_ns"] = to_ns(clock.age);
+  json["stratum"] = is_read(clock) ? Json(clock.stratum) : Json();
+  json["poll_ns"] =
+      clock.update_interval > Duration::zero() ? Json(to_ns(clock.update_interval)) : Json();
+  json["age_ns"] = is_read(clock) ? Json(to_ns(clock.age)) : Json();
   const char* const reads = reads_text(host);
   json["reads"] = reads ? Json(reads) : Json();
   json["reads_reason"] = or_null(host.clock_reason);
@@ -198,11 +203,12 @@ struct Readings {
 };
 
 Json statistics_json(const Statistics& statistics) {
+  const auto when_read = [&](auto value) { return statistics.count > 0 ? Json(value) : Json(); };
   return {{"readings", statistics.count},
-          {"average_ns", statistics.mean_ns},
-          {"max_ns", to_ns(statistics.max)},
-          {"min_ns", to_ns(statistics.min)},
-          {"std_dev_ns", statistics.std_dev_ns}};
+          {"average_ns", when_read(statistics.mean_ns)},
+          {"max_ns", when_read(to_ns(statistics.max))},
+          {"min_ns", when_read(to_ns(statistics.min))},
+          {"std_dev_ns", when_read(statistics.std_dev_ns)}};
 }
 
 void print_table(const std::map<std::string, Readings>& all, bool json, Output& out) {
@@ -227,9 +233,10 @@ void print_table(const std::map<std::string, Readings>& all, bool json, Output& 
     for (const auto& [what, window] :
          {std::pair("offset", &readings.offsets), std::pair("bound", &readings.bounds)}) {
       const Statistics found = window->statistics();
-      table.add_row({escaped(name), what, std::to_string(found.count), ns_text(found.mean_ns),
-                     duration_text(found.max), duration_text(found.min),
-                     ns_text(found.std_dev_ns)});
+      const auto cell = [&](std::string text) { return found.count > 0 ? text : "-"; };
+      table.add_row({escaped(name), what, std::to_string(found.count), cell(ns_text(found.mean_ns)),
+                     cell(duration_text(found.max)), cell(duration_text(found.min)),
+                     cell(ns_text(found.std_dev_ns))});
     }
   }
   table.print(out);

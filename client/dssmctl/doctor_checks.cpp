@@ -626,6 +626,33 @@ Finding check_stream_names(const Facts& facts) {
           fmt::format("dssmctl info {}  # and so in programs", example)};
 }
 
+// Streams that should have samples and do not, on all hosts.
+Finding check_streams(const Facts& facts) {
+  std::vector<std::string> named;
+  std::string example;
+  bool has_writer = false;
+  std::size_t silent = 0;
+  for (const StreamInfo& stream : facts.streams) {
+    if (!is_silent(stream)) continue;
+    const bool is_open = stream.state == StreamState::stalled;
+    if (example.empty() || (is_open && !has_writer)) example = stream.id.str();
+    has_writer |= is_open;
+    if (++silent > kMaxNamed) continue;
+    named.push_back(fmt::format("'{}' for {} ({})", stream.id.str(), age_text(stream),
+                                is_open ? "its writer is connected" : "no writer is connected"));
+  }
+  if (silent == 0) return {"streams", Status::ok, "none is stalled"};
+  const std::string more =
+      silent > kMaxNamed ? fmt::format(" and {} more", silent - kMaxNamed) : "";
+  return {"streams", Status::warn, fmt::format("no samples of {}{}", fmt::join(named, ", "), more),
+          has_writer ? "the sensor gives nothing, or the program that writes hangs"
+                     : "the programs that wrote them have ended",
+          has_writer ? fmt::format("dssmctl info {}  # shows the program that writes", example)
+                     : fmt::format("dssmctl info {}  # then start its program, or remove the "
+                                   "stream: dssmctl rm {}",
+                                   example, example)};
+}
+
 // The mirrors of this PC: whether what programs read here is what their owners have now.
 Finding check_mirrors(const Facts& facts) {
   std::size_t mirrors = 0;
@@ -682,6 +709,7 @@ std::vector<Finding> findings_of(const Facts& facts) {
   check_fleet_clocks(facts, findings);
   findings.push_back(check_host_names(facts));
   findings.push_back(check_stream_names(facts));
+  findings.push_back(check_streams(facts));
   findings.push_back(check_mirrors(facts));
   return findings;
 }

@@ -177,24 +177,25 @@ Result<void> begin(const EchoOptions& options, bool awaited, RawReader& reader, 
 
 Result<void> run(const EchoOptions& options, Output& out) {
   const FetchHistory history = options.at ? FetchHistory::at_once : FetchHistory::when_read;
-  return with_stream(options, history, [&](OpenedStream& opened) -> Result<void> {
-    RawReader& reader = opened.reader;
-    std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, options));
-    // Before the first sample is shown: after it the next ones must come too, whatever happens to
-    // dssmd.
-    Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
-    SamplePrinter printer(out, form_of(options), options.full, reader.id(), std::move(fields));
-    Echo echo(reader, printer, out, options);
-    printer.begin();
-    DSSM_TRY(begin(options, opened.awaited, reader, echo));
+  std::vector<OpenedStream> all = DSSM_TRY(open_streams(options, {options.stream}, history));
+  if (all.empty()) return {};
+  OpenedStream& opened = all.front();
+  RawReader& reader = opened.reader;
+  std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, options));
+  // Before the first sample is shown: after it the next ones must come too, whatever happens to
+  // dssmd.
+  Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
+  SamplePrinter printer(out, form_of(options), options.full, reader.id(), std::move(fields));
+  Echo echo(reader, printer, out, options);
+  printer.begin();
+  DSSM_TRY(begin(options, opened.awaited, reader, echo));
+  if (!echo.print_new()) return echo.result();
+  while (true) {
+    const Follower::Wake wake = follower.wait(kNever);
+    if (wake == Follower::Wake::stop) return {};
     if (!echo.print_new()) return echo.result();
-    while (true) {
-      const Follower::Wake wake = follower.wait(kNever);
-      if (wake == Follower::Wake::stop) return {};
-      if (!echo.print_new()) return echo.result();
-      if (wake == Follower::Wake::ended) return end_of(reader);
-    }
-  });
+    if (wake == Follower::Wake::ended) return end_of(reader);
+  }
 }
 
 }  // namespace dssm::ctl

@@ -19,13 +19,29 @@ void add_line(Output& out, const std::string& key, const Value& value) {
   out.add(fmt::format("{:<13} {}\n", key + ":", value));
 }
 
+// "stalled: no sample for 98.0 s, open for writing in 1 program".
+std::string silence_text(const StreamInfo& stream) {
+  return fmt::format("{}: no sample for {}{}", name_of(stream.state), age_text(stream),
+                     stream.state == StreamState::stalled && stream.writers > 0
+                         ? fmt::format(", but open for writing in {} program{}", stream.writers,
+                                       stream.writers == 1 ? "" : "s")
+                         : "");
+}
+
 void print_samples(const StreamInfo& stream, Output& out) {
-  if (stream.newest == kNoTid) return add_line(out, "samples", "none yet");
-  const Duration age = saturating_sub(WallClock::now(), stream.newest_time);
+  if (stream.newest == kNoTid) {
+    return add_line(out, "samples", stream.state == StreamState::empty ? "none yet" : "-");
+  }
   add_line(out, "samples", fmt::format("tid {} to {}", stream.oldest, stream.newest));
   add_line(out, "newest",
-           fmt::format("{} ({} ago)", seconds_text(to_ns(stream.newest_time)), duration_text(age)));
-  if (stream.rate_hz > 0) add_line(out, "rate", fmt::format("{:.3f} Hz", stream.rate_hz));
+           fmt::format("{}{}", seconds_text(to_ns(stream.newest_time)),
+                       is_age_known(stream) ? fmt::format(" ({} ago)", age_text(stream)) : ""));
+  if (is_silent(stream)) {
+    add_line(out, "state", silence_text(stream));
+  } else {
+    if (stream.state != StreamState::unknown) add_line(out, "state", name_of(stream.state));
+    if (stream.rate_hz > 0) add_line(out, "rate", fmt::format("{:.3f} Hz", stream.rate_hz));
+  }
 }
 
 void print_fields(const StreamInfo& stream, Output& out) {
@@ -104,9 +120,11 @@ void print_stream(const StreamInfo& stream, Output& out) {
   add_line(out, "depth", fmt::format("{} slots", stream.depth));
   add_line(out, "cycle", duration_text(stream.cycle));
   print_samples(stream, out);
-  add_line(out, "writers", fmt::format("{} on its host", stream.writers));
-  add_line(out, "readers", fmt::format("{} on its host", stream.readers));
-  add_line(out, "channels", fmt::format("{} to other hosts, for programs there", stream.channels));
+  add_line(out, "writers", fmt::format("{} on its host", count_text(stream, stream.writers)));
+  add_line(out, "readers", fmt::format("{} on its host", count_text(stream, stream.readers)));
+  add_line(
+      out, "channels",
+      fmt::format("{} to other hosts, for programs there", count_text(stream, stream.channels)));
   add_line(out, "memory", bytes_text(stream.memory_bytes));
   add_line(out, "property", stream.property_bytes ? bytes_text(stream.property_bytes) : "none");
   add_line(out, "incarnation", stream.incarnation);
@@ -196,7 +214,7 @@ Result<void> run(const InfoOptions& options, Output& out) {
   Result<StreamInfo> stream = session.stream_info(*id);
   if (!stream) return with_similar_names(std::move(stream).error(), session, *id);
   if (options.json) {
-    Json json = stream_json(*stream, WallClock::now());
+    Json json = stream_json(*stream);
     add_details(json, *stream);
     out.add(json_document(json));
   } else {

@@ -32,7 +32,7 @@ void sort_by(std::vector<StreamInfo>& streams, Key key) {
                    [&](const StreamInfo& a, const StreamInfo& b) { return key(a) < key(b); });
 }
 
-// Numbers rise; streams that were never written to come last in "age".
+// Numbers rise; streams whose age is not known come last in "age".
 void sort_streams(std::vector<StreamInfo>& streams, const std::string& key) {
   if (key == "name")
     return sort_by(streams, [](const auto& s) { return std::pair(s.id.name, s.id.id); });
@@ -42,26 +42,23 @@ void sort_streams(std::vector<StreamInfo>& streams, const std::string& key) {
   if (key == "size") return sort_by(streams, [](const auto& s) { return s.type.payload_bytes; });
   if (key == "depth") return sort_by(streams, [](const auto& s) { return s.depth; });
   if (key == "cycle") return sort_by(streams, [](const auto& s) { return s.cycle; });
-  if (key == "rate") return sort_by(streams, [](const auto& s) { return s.rate_hz; });
+  if (key == "rate") {
+    return sort_by(streams, [](const auto& s) { return is_silent(s) ? 0 : s.rate_hz; });
+  }
   if (key == "writers") return sort_by(streams, [](const auto& s) { return s.writers; });
   if (key == "readers") return sort_by(streams, [](const auto& s) { return s.readers; });
   if (key == "type") return sort_by(streams, [](const auto& s) { return s.type.name; });
   if (key == "memory") return sort_by(streams, [](const auto& s) { return s.memory_bytes; });
   if (key == "age") {
     return sort_by(streams, [](const auto& s) {
-      const bool never = s.newest == kNoTid;
-      return std::pair(never, never ? Time::max() : time_from_ns(~to_ns(s.newest_time)));
+      return std::pair(!is_age_known(s), is_age_known(s) ? s.age : Duration());
     });
   }
 }
 
-std::string rate_text(double rate_hz) {
-  return rate_hz > 0 ? fmt::format("{:.1f} Hz", rate_hz) : "-";
-}
-
 constexpr std::string_view kDuplicateMark = " *";
 
-std::vector<std::string> row(const StreamInfo& stream, bool duplicate, Time now) {
+std::vector<std::string> row(const StreamInfo& stream, bool duplicate) {
   return {
       escaped(stream.id.name).append(duplicate ? kDuplicateMark : ""),
       std::to_string(stream.id.id),
@@ -69,10 +66,11 @@ std::vector<std::string> row(const StreamInfo& stream, bool duplicate, Time now)
       std::to_string(stream.type.payload_bytes),
       std::to_string(stream.depth),
       duration_text(stream.cycle),
-      rate_text(stream.rate_hz),
-      stream.newest == kNoTid ? "-" : duration_text(saturating_sub(now, stream.newest_time)),
-      std::to_string(stream.writers),
-      std::to_string(stream.readers),
+      rate_text(stream),
+      age_text(stream),
+      state_cell(stream),
+      count_text(stream, stream.writers),
+      count_text(stream, stream.readers),
       or_dash(escaped(stream.type.name)),
   };
 }
@@ -90,11 +88,11 @@ struct Listing {
 
 // One document, but a line per stream: with a thousand of them neither a tree of values in memory
 // nor indentation is worth its time.
-void print_json(const Listing& listing, Time now, Output& out) {
+void print_json(const Listing& listing, Output& out) {
   out.add("{\"streams\":[");
   std::string_view separator = "\n";
   for (const StreamInfo& stream : listing.streams) {
-    Json json = stream_json(stream, now);
+    Json json = stream_json(stream);
     json["duplicate"] = listing.duplicates ? Json(listing.duplicate(stream)) : Json();
     out.add(separator);
     out.add(json_text(json));
@@ -103,7 +101,7 @@ void print_json(const Listing& listing, Time now, Output& out) {
   out.add("\n]}\n");
 }
 
-void print_table(const Listing& listing, Time now, Output& out) {
+void print_table(const Listing& listing, Output& out) {
   constexpr auto kRight = Table::Align::right;
   Table table({{"NAME"},
                {"ID", kRight},
@@ -113,6 +111,7 @@ void print_table(const Listing& listing, Time now, Output& out) {
                {"CYCLE", kRight},
                {"RATE", kRight},
                {"AGE", kRight},
+               {"STATE"},
                {"WRITERS", kRight},
                {"READERS", kRight},
                {"TYPE"}});
@@ -120,7 +119,7 @@ void print_table(const Listing& listing, Time now, Output& out) {
   for (const StreamInfo& stream : listing.streams) {
     const bool duplicate = listing.duplicate(stream);
     if (duplicate) marked = &stream;
-    table.add_row(row(stream, duplicate, now));
+    table.add_row(row(stream, duplicate));
   }
   table.print(out);
   if (marked) {
@@ -185,6 +184,14 @@ class EventQueue {
   std::vector<StreamEvent> events_;
 };
 
+// What does not change while the stream exists: an event has nothing else, or as it was long ago.
+StreamInfo identity_of(StreamInfo stream) {
+  stream.oldest = stream.newest = kNoTid;
+  stream.rate_hz = 0;
+  stream.state = StreamState::unknown;
+  return stream;
+}
+
 // Prints a line for each stream that comes or goes.
 class StreamLog {
  public:
@@ -207,7 +214,7 @@ class StreamLog {
   void print_added(const StreamInfo& stream) {
     if (json_) {
       Json json = {{"event", "added"}};
-      json.update(stream_json(stream, WallClock::now()));
+      json.update(stream_json(identity_of(stream)));
       return out_.add(json_line(json));
     }
     out_.add(fmt::format("+ {} {} bytes, depth {}, cycle {}{}{}\n", escaped(stream.id.str()),
@@ -274,8 +281,7 @@ Result<void> run(const LsOptions& options, Output& out) {
   if (!options.own) listing.duplicates.emplace(streams);
   std::erase_if(streams, [&](const StreamInfo& stream) { return !filter.takes(stream.id); });
   listing.streams = std::move(streams);
-  const Time now = WallClock::now();
-  options.json ? print_json(listing, now, out) : print_table(listing, now, out);
+  options.json ? print_json(listing, out) : print_table(listing, out);
   return {};
 }
 

@@ -20,14 +20,11 @@ bool may_come(const Error& error) {
 }
 
 // Without a reader and without an error after a stop signal.
-Result<std::optional<OpenedStream>> open_stream(const ReadingOptions& options,
-                                                FetchHistory history) {
-  Session session = DSSM_TRY(connect(options));
-  const StreamId id = DSSM_TRY(StreamId::parse(options.stream));
+Result<std::optional<OpenedStream>> open_stream(Session& session, const StreamId& id, Duration wait,
+                                                MonoTime deadline, FetchHistory history) {
   Result<RawReader> reader = session.open_raw_reader(id, nullptr, 0, history);
   if (reader) return std::optional(OpenedStream{session, std::move(*reader), false});
 
-  const MonoTime deadline = deadline_in(options.wait);
   while (may_come(reader.error()) && MonoClock::now() < deadline) {
     if (stop_requested()) return std::optional<OpenedStream>();
     reader = session.await_raw_reader(id, std::min(deadline, deadline_in(kStopCheckPeriod)),
@@ -35,7 +32,7 @@ Result<std::optional<OpenedStream>> open_stream(const ReadingOptions& options,
     if (reader) return std::optional(OpenedStream{session, std::move(*reader), true});
   }
   Error error = with_similar_names(std::move(reader).error(), session, id);
-  if (error.code == Errc::not_found && options.wait == Duration::zero()) {
+  if (error.code == Errc::not_found && wait == Duration::zero()) {
     error.message += "; --wait SECONDS waits for it";
   }
   return error;
@@ -50,11 +47,22 @@ Result<Session> connect(const CommonOptions& options) {
   return Session::connect(std::move(session_options));
 }
 
-Result<void> with_stream(const ReadingOptions& options, FetchHistory history,
-                         const std::function<Result<void>(OpenedStream&)>& work) {
+Result<std::vector<OpenedStream>> open_streams(const ReadingOptions& options,
+                                               const std::vector<std::string>& streams,
+                                               FetchHistory history) {
   catch_stop_signals();
-  std::optional<OpenedStream> opened = DSSM_TRY(open_stream(options, history));
-  return opened ? work(*opened) : Result<void>();
+  Session session = DSSM_TRY(connect(options));
+  std::vector<StreamId> ids;
+  for (const std::string& stream : streams) ids.push_back(DSSM_TRY(StreamId::parse(stream)));
+  const MonoTime deadline = deadline_in(options.wait);
+  std::vector<OpenedStream> opened;
+  for (const StreamId& id : ids) {
+    std::optional<OpenedStream> one =
+        DSSM_TRY(open_stream(session, id, options.wait, deadline, history));
+    if (!one) return std::vector<OpenedStream>();
+    opened.push_back(*std::move(one));
+  }
+  return opened;
 }
 
 Error with_similar_names(Error error, Session& session, const StreamId& wanted) {

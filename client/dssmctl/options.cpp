@@ -10,6 +10,7 @@
 
 #include <CLI/CLI.hpp>
 #include <bit>
+#include <dssm/reader.hpp>
 #include <limits>
 #include <memory>
 
@@ -237,8 +238,15 @@ template <class VerbOptions>
 void add_meter(CLI::App& app, Parsed& parsed, const std::string& name,
                const std::string& description) {
   CLI::App* meter = app.add_subcommand(name, description);
-  VerbOptions& options = add_options<VerbOptions>(meter, parsed);
-  add_stream(meter, options.stream);
+  VerbOptions& options = add_options<VerbOptions>(meter, parsed, [](const VerbOptions& all) {
+    require(all.streams.size() <= kMaxWaitAny,
+            fmt::format("at most {} streams at once", kMaxWaitAny));
+  });
+  meter
+      ->add_option("STREAM", options.streams,
+                   "one or several streams, as NAME, NAME:ID or NAME:ID@HOST")
+      ->required()
+      ->type_name("");
   add_whole(meter, "-w,--window", "N", "over the newest N samples (default: 10000)", options.window,
             2, kMaxWindow);
   add_whole(meter, "-n,--count", "N", "end after N reports", options.count, 1);

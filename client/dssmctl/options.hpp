@@ -59,12 +59,12 @@ struct InfoOptions : CommonOptions {
 
 // Of verbs that read a stream.
 struct ReadingOptions : CommonOptions {
-  std::string stream;
   Duration wait{};                     // how long for the stream to appear
   std::optional<std::uint64_t> count;  // of samples or reports
 };
 
 struct EchoOptions : ReadingOptions {
+  std::string stream;
   std::optional<Duration> at;
   bool at_counts_back = false;  // from the newest sample; `at` is then 0 or less
   bool last = false;
@@ -75,6 +75,7 @@ struct EchoOptions : ReadingOptions {
 
 // Of hz, bw and delay.
 struct MeterOptions : ReadingOptions {
+  std::vector<std::string> streams;
   std::uint64_t window = 10'000;
   Duration interval = std::chrono::seconds(1);
 };

@@ -136,11 +136,11 @@ std::string bytes_text(std::uint64_t bytes) {
 
 std::string byte_rate_text(double bytes_per_second) {
   double value = bytes_per_second;
-  for (const char* unit : {" B/s", " kB/s", " MB/s", " GB/s"}) {
+  for (const char* unit : {" B/s", " KiB/s", " MiB/s", " GiB/s"}) {
     if (std::fabs(value) < 999.5) return three_digits(value) + unit;
-    value /= 1000;
+    value /= 1024;
   }
-  return three_digits(value) + " TB/s";
+  return three_digits(value) + " TiB/s";
 }
 
 std::string hex_text(std::span<const std::byte> bytes) {

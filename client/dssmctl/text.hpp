@@ -48,7 +48,7 @@ std::string seconds_text(std::int64_t ns);
 // `value` with `decimals` digits after the point.
 std::string fixed_text(double value, int decimals);
 
-// "512 bytes", "1.5 MiB"; "1.50 MB/s" (decimal units, as networks count).
+// "512 bytes", "1.50 MiB"; "1.50 MiB/s". Everywhere in units of 1024.
 std::string bytes_text(std::uint64_t bytes);
 std::string byte_rate_text(double bytes_per_second);
 

@@ -59,6 +59,8 @@ TEST_F(Clock, IsTabulatedWithHowOftenItWasNotKnown) {
   EXPECT_EQ(table[0]["host"], "pc1");
   EXPECT_EQ(table[0]["offset"]["readings"], 0);
   EXPECT_EQ(table[0]["unknown"], 2);
+  EXPECT_TRUE(table[0]["offset"]["average_ns"].is_null());
+  EXPECT_TRUE(table[0]["bound"]["max_ns"].is_null());
 }
 
 TEST_F(Clock, IsRefreshedUntilItIsInterrupted) {

@@ -26,7 +26,7 @@ using Strings = std::vector<std::string>;
 
 TEST_F(Ls, ShowsOnlyTheHeaderWithoutStreams) {
   EXPECT_EQ(output({"ls"}),
-            "NAME  ID  HOST  SIZE  DEPTH  CYCLE  RATE  AGE  WRITERS  READERS  TYPE\n");
+            "NAME  ID  HOST  SIZE  DEPTH  CYCLE  RATE  AGE  STATE  WRITERS  READERS  TYPE\n");
   EXPECT_EQ(output({"ls", "--names"}), "");
   EXPECT_EQ(json({"ls"}), Json::parse(R"({"streams":[]})"));
 }
@@ -46,9 +46,9 @@ TEST_F(Ls, ShowsWhatIsKnownOfEachStreamInAlignedColumns) {
             (Strings{"pose", "3", "pc1", "16", "8", "10.0", "ms", "50.0"}));
   EXPECT_EQ(Strings(row.end() - 3, row.end()), (Strings{"1", "1", "Pose"}));
   const Strings other = words_of(lines[2]);
-  EXPECT_EQ(
-      Strings(other.begin(), other.begin() + 11),
-      (Strings{"a_rather_long_name", "0", "pc1", "100", "4", "10.0", "ms", "-", "-", "1", "0"}));
+  EXPECT_EQ(Strings(other.begin(), other.begin() + 11),
+            (Strings{"a_rather_long_name", "0", "pc1", "100", "4", "10.0", "ms", "-", "-", "empty",
+                     "1"}));
   // Numbers end where their column's title ends, texts begin where it begins.
   const std::size_t size_end = lines[0].find("SIZE") + 4;
   EXPECT_EQ(lines[1].substr(size_end - 2, 2), "16");
@@ -80,6 +80,7 @@ TEST_F(Ls, PrintsTheSameAsJsonWithUnits) {
   EXPECT_EQ(stream["newest_time_ns"], to_ns(last));
   EXPECT_GE(stream["age_ns"].get<std::int64_t>(), to_ns(before - last));
   EXPECT_LE(stream["age_ns"].get<std::int64_t>(), to_ns(WallClock::now() - last));
+  EXPECT_EQ(stream["state"], "live");
   EXPECT_EQ(stream["writers"], 1);
   EXPECT_EQ(stream["readers"], 0);
   EXPECT_EQ(stream["incarnation"], pose.incarnation());
@@ -91,13 +92,44 @@ TEST_F(Ls, PrintsTheSameAsJsonWithUnits) {
   }
 }
 
+TEST_F(Ls, ShowsStalledStreamsAndNoRateOfThem) {
+  std::optional pose = session_.create<Pose>("pose", depth_of(8)).value();
+  const Time last = WallClock::now() - std::chrono::seconds(6);
+  for (int i = 4; i >= 0; --i) pose->write({}, last - i * std::chrono::milliseconds(20));
+  const Json stalled = json({"ls"})["streams"][0];
+  EXPECT_EQ(stalled["state"], "stalled");
+  EXPECT_TRUE(stalled["rate_hz"].is_null());
+  EXPECT_GE(stalled["age_ns"], 6 * kSecond);
+  const Strings row = words_of(lines_of(output({"ls"}))[1]);
+  EXPECT_EQ(row[7], "-") << "RATE";
+  EXPECT_EQ(row[10], "stalled");
+  const std::string info = output({"info", "pose"});
+  EXPECT_TRUE(std::regex_search(
+      info, std::regex("\nstate: +stalled: no sample for .*, but open for writing in 1 program\n")))
+      << info;
+  EXPECT_FALSE(contains(info, "\nrate:")) << info;
+
+  pose.reset();
+  EXPECT_EQ(json({"ls"})["streams"][0]["state"], "no writer");
+  EXPECT_TRUE(contains(output({"info", "pose"}), "no writer: no sample for "));
+}
+
+TEST_F(Ls, KnowsNoAgeByTheStampsOfARecording) {
+  auto pose = session_.create<Pose>("pose", depth_of(8)).value();
+  for (int i = 0; i < 5; ++i) pose.write({}, at_ns(i * 20'000'000));
+  const Json stream = json({"ls"})["streams"][0];
+  EXPECT_TRUE(stream["state"].is_null());
+  EXPECT_TRUE(stream["age_ns"].is_null());
+  EXPECT_DOUBLE_EQ(stream["rate_hz"].get<double>(), 50);
+}
+
 TEST_F(Ls, SortsByWhatIsAskedAndByCreationOtherwise) {
   auto b = session_.create_raw({"b", 0, ""}, {"T2", 30, 1, {}}, depth_of(4)).value();
   auto a = session_.create_raw({"a", 1, ""}, {"T3", 10, 1, {}}, depth_of(8)).value();
   auto c = session_.create_raw({"c", 2, ""}, {"T1", 20, 1, {}}, depth_of(2)).value();
   const std::vector<std::byte> payload(10);
-  a.write(payload, at_ns(1));
-  c.write(std::vector<std::byte>(20), at_ns(2));
+  a.write(payload, WallClock::now());
+  c.write(std::vector<std::byte>(20), WallClock::now());
   EXPECT_EQ(output({"ls", "--names"}), "b\na:1\nc:2\n");
   EXPECT_EQ(output({"ls", "--names", "--sort", "name"}), "a:1\nb\nc:2\n");
   EXPECT_EQ(output({"ls", "--names", "--sort", "id", "-r"}), "c:2\na:1\nb\n");

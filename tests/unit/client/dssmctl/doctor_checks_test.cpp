@@ -427,6 +427,23 @@ TEST(Doctor, FindsStreamsOfOneNameAndNamesOnlySome) {
   EXPECT_TRUE(finding_of(facts, "stream names").text.ends_with(" and 96 more"));
 }
 
+TEST(Doctor, WarnsOfStalledStreamsAndNamesOneWithAWriterFirst) {
+  Facts facts = healthy();
+  ASSERT_EQ(facts.streams.size(), 2U);
+  EXPECT_FINDING(facts, "streams", Status::ok, "");
+  facts.streams[0].state = StreamState::no_writer;
+  facts.streams[0].age = std::chrono::seconds(98);
+  const std::string first = facts.streams[0].id.str(), second = facts.streams[1].id.str();
+  EXPECT_FINDING(facts, "streams", Status::warn, "dssmctl rm " + first);
+  EXPECT_EQ(finding_of(facts, "streams").text,
+            "no samples of '" + first + "' for 98.0 s (no writer is connected)");
+  facts.streams[1].state = StreamState::stalled;
+  facts.streams[1].age = std::chrono::seconds(3);
+  EXPECT_FINDING(facts, "streams", Status::warn, "dssmctl info " + second);
+  EXPECT_TRUE(finding_of(facts, "streams")
+                  .text.ends_with(", '" + second + "' for 3.00 s (its writer is connected)"));
+}
+
 TEST(Doctor, WarnsOfMirrorsThatTheNetworkCannotFill) {
   Facts facts = healthy();
   EXPECT_TRUE(finding_of(facts, "mirrors").text.starts_with("no stream of another host"));

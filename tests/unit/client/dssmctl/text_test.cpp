@@ -130,7 +130,7 @@ TEST(Text, WritesAmountsWithTheirUnits) {
   EXPECT_EQ(bytes_text(64ULL << 20), "64.0 MiB");
   EXPECT_EQ(bytes_text(3ULL << 40), "3.00 TiB");
   EXPECT_EQ(byte_rate_text(640), "640 B/s");
-  EXPECT_EQ(byte_rate_text(1.5e6), "1.50 MB/s");
+  EXPECT_EQ(byte_rate_text(1.5 * 1024 * 1024), "1.50 MiB/s");
 }
 
 TEST(Text, StaysAtTheEndsOfTimeWhereDifferencesOverflow) {
