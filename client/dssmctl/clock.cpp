@@ -95,23 +95,23 @@ Json clock_json(const HostInfo& host) {
   return json;
 }
 
-void print_clocks(const std::vector<HostInfo>& hosts, bool json, Output& out) {
-  if (json) {
+void print_clocks(const std::vector<HostInfo>& hosts, const ClockOptions& options, Output& out) {
+  if (options.json) {
     Json all = Json::array();
     for (const HostInfo& host : hosts) {
       if (is_there(host)) all.push_back(clock_json(host));
     }
-    return out.add(json_line({{"clocks", std::move(all)}}));
+    return out.add(json_output({{"clocks", std::move(all)}}, options.watch));
   }
   Table table({{"HOST"},
                {"STATUS"},
                {"BOUND", Table::Align::right},
                {"FROM HERE", Table::Align::right},
                {"OFFSET", Table::Align::right},
-               {"REFERENCE"},
-               {"POLL", Table::Align::right},
-               {"AGE", Table::Align::right},
-               {"READS"}});
+               {"REFERENCE", Table::Align::left, 3},
+               {"POLL", Table::Align::right, 1},
+               {"AGE", Table::Align::right, 2},
+               {"READS", Table::Align::left, 0, Table::Column::Fit::below}});
   for (const HostInfo& host : hosts) {
     if (is_there(host)) table.add_row(clock_row(host));
   }
@@ -156,43 +156,34 @@ Json pair_json(const ClockPair& pair) {
           {"error", or_null(pair.error)}};
 }
 
-void print_matrix(const std::vector<ClockPair>& pairs, bool json, Output& out) {
-  if (json) {
+void print_matrix(const std::vector<ClockPair>& pairs, const ClockOptions& options, Output& out) {
+  if (options.json) {
     Json all = Json::array();
     for (const ClockPair& pair : pairs) all.push_back(pair_json(pair));
-    return out.add(json_line({{"clock_pairs", std::move(all)}}));
+    return out.add(json_output({{"clock_pairs", std::move(all)}}, options.watch));
   }
   Table table({{"ON"},
                {"OF"},
                {"READS"},
                {"BOUND", Table::Align::right},
                {"OF LIMIT"},
-               {"LIMIT", Table::Align::right},
-               {"KNOWN BY"},
-               {"CHAIN", Table::Align::right},
-               {"MEASURED", Table::Align::right},
-               {"RTT", Table::Align::right},
-               {"REASON"}});
+               {"LIMIT", Table::Align::right, 4},
+               {"KNOWN BY", Table::Align::left, 5},
+               {"CHAIN", Table::Align::right, 2},
+               {"MEASURED", Table::Align::right, 3},
+               {"RTT", Table::Align::right, 1},
+               {"REASON", Table::Align::left, 0, Table::Column::Fit::below}});
   for (const ClockPair& pair : pairs) table.add_row(pair_row(pair));
   table.print(out);
 }
 
 Result<void> print_once(Session& session, const ClockOptions& options, Output& out) {
   if (options.matrix) {
-    print_matrix(DSSM_TRY(session.list_clock_pairs()), options.json, out);
+    print_matrix(DSSM_TRY(session.list_clock_pairs()), options, out);
   } else {
-    print_clocks(DSSM_TRY(session.list_hosts()), options.json, out);
+    print_clocks(DSSM_TRY(session.list_hosts()), options, out);
   }
   return {};
-}
-
-Result<void> watch_clocks(Session& session, const ClockOptions& options, Output& out) {
-  catch_stop_signals();
-  for (MonoTime next = MonoClock::now();; next += kReadingPeriod) {
-    DSSM_TRY(print_once(session, options, out));
-    if (!options.json) out.add("\n");
-    if (!out.flush() || !out.sleep_until(next + kReadingPeriod)) return {};
-  }
 }
 
 // What was read of one host.
@@ -278,7 +269,7 @@ Result<void> await_clock(Session& session, const ClockOptions& options, Output& 
     const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
     const HostInfo& self = hosts.front();
     if (self.clock && is_good(*self.clock)) {
-      print_clocks({self}, options.json, out);
+      print_clocks({self}, options, out);
       return {};
     }
     const MonoTime now = MonoClock::now();
@@ -299,8 +290,8 @@ Result<void> run(const ClockOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   if (options.wait) return await_clock(session, options, out);
   if (options.table) return tabulate_clocks(session, options, out);
-  if (options.watch) return watch_clocks(session, options, out);
-  return print_once(session, options, out);
+  return print_once_or_watch(options.watch, options.json, out,
+                             [&] { return print_once(session, options, out); });
 }
 
 }  // namespace dssm::ctl

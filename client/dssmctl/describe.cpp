@@ -88,8 +88,15 @@ std::string validity_text(const CredentialsInfo& credentials) {
 
 std::vector<Table::Column> host_columns() {
   constexpr auto kRight = Table::Align::right;
-  return {{"HOST"},        {"STATE"},           {"ADDRESS"},       {"FOUND BY"}, {"VERSION"},
-          {"RTT", kRight}, {"STREAMS", kRight}, {"CLOCK", kRight}, {"NOTE"}};
+  return {{"HOST"},
+          {"STATE"},
+          {"ADDRESS"},
+          {"FOUND BY", Table::Align::left, 1},
+          {"VERSION", Table::Align::left, 2},
+          {"RTT", kRight},
+          {"STREAMS", kRight},
+          {"CLOCK", kRight},
+          {"NOTE", Table::Align::left, 0, Table::Column::Fit::below}};
 }
 
 std::vector<std::string> host_row(const HostInfo& host) {

@@ -173,8 +173,7 @@ void check_descriptors(const Facts& facts, Findings& findings) {
   if (limit == 0) return;  // dssmd is in another container: not known here
   const std::uint64_t taken = facts.daemon.streams * kDescriptorsPerStream;
   Finding finding{"descriptors", Status::ok,
-                  fmt::format("dssmd may open {} files, its {} streams take about {}", limit,
-                              facts.daemon.streams, taken)};
+                  fmt::format("dssmd may open {} files; its streams take about {}", limit, taken)};
   if (taken + kOtherDescriptors > limit - limit / 5) {
     finding.warn("the limit on open files is too low for many more streams",
                  "sudo systemctl edit dssmd  # [Service] LimitNOFILE=1048576, then restart dssmd");
@@ -605,8 +604,8 @@ Finding check_stream_names(const Facts& facts) {
   const Duplicates duplicates(facts.streams);
   if (duplicates.owners().empty()) {
     return {"stream names", Status::ok,
-            fmt::format("each of the {} streams can be opened without its host's name",
-                        facts.streams.size())};
+            facts.streams.empty() ? "there are no streams"
+                                  : "each can be opened without its host's name"};
   }
   std::vector<std::string> named;
   std::string example, more;
@@ -616,11 +615,12 @@ Finding check_stream_names(const Facts& facts) {
       break;
     }
     const std::string name = fmt::format("{}:{}", key.first, key.second);
-    named.push_back(fmt::format("'{}' of {}", name, list_text(hosts)));
+    named.push_back(fmt::format("'{}' (on {})", name, list_text(hosts)));
     if (example.empty()) example = fmt::format("{}@{}", name, hosts.front());
   }
   return {"stream names", Status::warn,
-          fmt::format("several hosts have {}{}", fmt::join(named, ", "), more),
+          fmt::format("several hosts have a stream of the same name: {}{}", fmt::join(named, ", "),
+                      more),
           "the same program runs on several hosts; a name without a host opens only a host's own "
           "stream",
           fmt::format("dssmctl info {}  # and so in programs", example)};
@@ -674,9 +674,10 @@ Finding check_mirrors(const Facts& facts) {
   if (behind.empty()) {
     return {"mirrors", Status::ok,
             mirrors == 0 ? "no stream of another host is read here in full"
-                         : fmt::format("the network carries all samples of the {} streams of other "
-                                       "hosts that programs here read",
-                                       mirrors)};
+                         : fmt::format("the network carries all samples of {} of other hosts that "
+                                       "programs here read",
+                                       mirrors == 1 ? "the stream"
+                                                    : fmt::format("the {} streams", mirrors))};
   }
   std::string more;
   if (behind.size() > kMaxNamed) {

@@ -28,13 +28,13 @@ std::string silence_text(const StreamInfo& stream) {
                          : "");
 }
 
-void print_samples(const StreamInfo& stream, Output& out) {
+void print_samples(const StreamInfo& stream, bool iso, Output& out) {
   if (stream.newest == kNoTid) {
     return add_line(out, "samples", stream.state == StreamState::empty ? "none yet" : "-");
   }
   add_line(out, "samples", fmt::format("tid {} to {}", stream.oldest, stream.newest));
   add_line(out, "newest",
-           fmt::format("{}{}", seconds_text(to_ns(stream.newest_time)),
+           fmt::format("{}{}", time_text(stream.newest_time, iso),
                        is_age_known(stream) ? fmt::format(" ({} ago)", age_text(stream)) : ""));
   if (is_silent(stream)) {
     add_line(out, "state", silence_text(stream));
@@ -113,13 +113,13 @@ void print_mirror(const StreamInfo& stream, const MirrorInfo& mirror, Output& ou
   add_line(out, "restarts", mirror.restarts);
 }
 
-void print_stream(const StreamInfo& stream, Output& out) {
+void print_stream(const StreamInfo& stream, bool iso, Output& out) {
   out.add(out.bold(escaped(stream.id.str())) + "\n");
   add_line(out, "owner", "host " + escaped(stream.id.host));
   add_line(out, "type", escaped(stream.type.str()));
   add_line(out, "depth", fmt::format("{} slots", stream.depth));
   add_line(out, "cycle", duration_text(stream.cycle));
-  print_samples(stream, out);
+  print_samples(stream, iso, out);
   add_line(out, "writers", fmt::format("{} on its host", count_text(stream, stream.writers)));
   add_line(out, "readers", fmt::format("{} on its host", count_text(stream, stream.readers)));
   add_line(
@@ -180,15 +180,16 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
   const std::vector<std::string> addresses =
       hosts.empty() ? std::vector<std::string>() : hosts.front().addresses;
   if (options.json) {
-    out.add(json_document({{"host", daemon.host},
-                           {"addresses", addresses},
-                           {"version", daemon.version},
-                           {"pid", daemon.pid},
-                           {"streams", daemon.streams},
-                           {"memory_bytes", daemon.memory_bytes},
-                           {"memory_limit_bytes", daemon.memory_limit_bytes},
-                           {"credentials", credentials_json(daemon)},
-                           {"limits", limits_json(daemon)}}));
+    out.add(json_output({{"host", daemon.host},
+                         {"addresses", addresses},
+                         {"version", daemon.version},
+                         {"pid", daemon.pid},
+                         {"streams", daemon.streams},
+                         {"memory_bytes", daemon.memory_bytes},
+                         {"memory_limit_bytes", daemon.memory_limit_bytes},
+                         {"credentials", credentials_json(daemon)},
+                         {"limits", limits_json(daemon)}},
+                        options.watch));
     return {};
   }
   out.add(out.bold("dssmd " + escaped(daemon.version)) + "\n");
@@ -204,23 +205,29 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
   return {};
 }
 
+Result<void> print_stream_info(Session& session, const StreamId& id, const InfoOptions& options,
+                               Output& out) {
+  Result<StreamInfo> stream = session.stream_info(id);
+  if (!stream) return with_similar_names(std::move(stream).error(), session, id);
+  if (options.json) {
+    Json json = stream_json(*stream);
+    add_details(json, *stream);
+    out.add(json_output(json, options.watch));
+  } else {
+    print_stream(*stream, options.iso, out);
+  }
+  return {};
+}
+
 }  // namespace
 
 Result<void> run(const InfoOptions& options, Output& out) {
   std::optional<StreamId> id;
   if (!options.stream.empty()) id = DSSM_TRY(StreamId::parse(options.stream));
   Session session = DSSM_TRY(connect(options));
-  if (!id) return print_daemon(session, options, out);
-  Result<StreamInfo> stream = session.stream_info(*id);
-  if (!stream) return with_similar_names(std::move(stream).error(), session, *id);
-  if (options.json) {
-    Json json = stream_json(*stream);
-    add_details(json, *stream);
-    out.add(json_document(json));
-  } else {
-    print_stream(*stream, out);
-  }
-  return {};
+  return print_once_or_watch(options.watch, options.json, out, [&] {
+    return id ? print_stream_info(session, *id, options, out) : print_daemon(session, options, out);
+  });
 }
 
 }  // namespace dssm::ctl

@@ -58,9 +58,11 @@ void sort_streams(std::vector<StreamInfo>& streams, const std::string& key) {
 
 constexpr std::string_view kDuplicateMark = " *";
 
-std::vector<std::string> row(const StreamInfo& stream, bool duplicate) {
+// `with_id`: the id has a column of its own.
+std::vector<std::string> row(const StreamInfo& stream, bool duplicate, bool with_id) {
   return {
-      escaped(stream.id.name).append(duplicate ? kDuplicateMark : ""),
+      escaped(with_id ? stream.id.name : short_name(stream.id))
+          .append(duplicate ? kDuplicateMark : ""),
       std::to_string(stream.id.id),
       escaped(stream.id.host),
       std::to_string(stream.type.payload_bytes),
@@ -86,43 +88,56 @@ struct Listing {
   }
 };
 
-// One document, but a line per stream: with a thousand of them neither a tree of values in memory
-// nor indentation is worth its time.
+// A document as json_document() writes it, but without a tree of a thousand streams in memory.
 void print_json(const Listing& listing, Output& out) {
-  out.add("{\"streams\":[");
-  std::string_view separator = "\n";
+  if (listing.streams.empty()) return out.add(json_document({{"streams", Json::array()}}));
+  out.add("{\n  \"streams\": [\n");
+  std::string_view separator;
   for (const StreamInfo& stream : listing.streams) {
     Json json = stream_json(stream);
     json["duplicate"] = listing.duplicates ? Json(listing.duplicate(stream)) : Json();
     out.add(separator);
-    out.add(json_text(json));
+    std::string text = json_document(json);
+    text.pop_back();  // its line end
+    // Strings in JSON have no line ends.
+    for (std::size_t at = 0; at != text.npos; at = text.find('\n', at + 1)) {
+      text.insert(at == 0 ? 0 : at + 1, "    ");
+    }
+    out.add(text);
     separator = ",\n";
   }
-  out.add("\n]}\n");
+  out.add("\n  ]\n}\n");
 }
 
-void print_table(const Listing& listing, Output& out) {
-  constexpr auto kRight = Table::Align::right;
+Table table_of(const Listing& listing, bool with_id) {
+  constexpr auto kLeft = Table::Align::left, kRight = Table::Align::right;
   Table table({{"NAME"},
-               {"ID", kRight},
+               {"ID", kRight, 1},
                {"HOST"},
-               {"SIZE", kRight},
-               {"DEPTH", kRight},
-               {"CYCLE", kRight},
+               {"SIZE", kRight, 3},
+               {"DEPTH", kRight, 2},
+               {"CYCLE", kRight, 4},
                {"RATE", kRight},
                {"AGE", kRight},
                {"STATE"},
                {"WRITERS", kRight},
                {"READERS", kRight},
-               {"TYPE"}});
-  const StreamInfo* marked = nullptr;
+               {"TYPE", kLeft, 0, Table::Column::Fit::cut}});
   for (const StreamInfo& stream : listing.streams) {
-    const bool duplicate = listing.duplicate(stream);
-    if (duplicate) marked = &stream;
-    table.add_row(row(stream, duplicate));
+    table.add_row(row(stream, listing.duplicate(stream), with_id));
   }
+  return table;
+}
+
+void print_table(const Listing& listing, Output& out) {
+  Table table = table_of(listing, true);
+  // The column of ids is the first one to go.
+  if (!table.fits(out.columns())) table = table_of(listing, false);
   table.print(out);
-  if (marked) {
+  const auto marked =
+      std::find_if(listing.streams.rbegin(), listing.streams.rend(),
+                   [&](const StreamInfo& stream) { return listing.duplicate(stream); });
+  if (marked != listing.streams.rend()) {
     out.add(
         fmt::format("* several hosts have a stream of this name and id: say which one, as in {}\n",
                     escaped(marked->id.str())));
@@ -157,6 +172,18 @@ Result<void> check_hosts(Session& session, const std::vector<std::string>& wante
                              name, fmt::join(known, "', '"))};
   }
   return {};
+}
+
+// For standard error, so that standard output stays a table.
+std::string why_empty(const LsOptions& options, std::size_t all) {
+  if (all == 0) {
+    return options.own ? "this PC owns no streams"
+                       : "no streams; programs create them, or 'dssmctl create'";
+  }
+  const std::string others =
+      fmt::format("there {} {} other{}", all == 1 ? "is" : "are", all, all == 1 ? "" : "s");
+  if (options.pattern.empty()) return "no streams of these hosts; " + others;
+  return fmt::format("no streams that fit '{}'; {}", escaped(options.pattern), others);
 }
 
 // --- ls --watch
@@ -275,13 +302,22 @@ Result<void> run(const LsOptions& options, Output& out) {
   sort_streams(streams, options.sort);
   if (options.reverse) std::reverse(streams.begin(), streams.end());
 
+  const std::size_t all = streams.size();
   const StreamFilter filter(options.hosts, options.pattern);
   if (options.names) return print_names(session, streams, filter, out);
   Listing listing;
   if (!options.own) listing.duplicates.emplace(streams);
   std::erase_if(streams, [&](const StreamInfo& stream) { return !filter.takes(stream.id); });
   listing.streams = std::move(streams);
-  options.json ? print_json(listing, out) : print_table(listing, out);
+  if (options.json) {
+    print_json(listing, out);
+  } else {
+    print_table(listing, out);
+    if (listing.streams.empty()) {
+      out.flush();
+      print_error(fmt::format("dssmctl: ls: {}\n", why_empty(options, all)));
+    }
+  }
   return {};
 }
 

@@ -34,6 +34,7 @@ class StampReader {
 
   // Before a report.
   void update_state() {
+    state_.empty = reader_.newest_tid() == kNoTid;
     state_.age = saturating_sub(WallClock::now(), newest_time_);
     const Duration quiet = MonoClock::now() - newest_arrival_;
     state_.stalled = state_.seen > 0 && quiet >= pauses_.length() ? std::optional(quiet)
@@ -152,7 +153,7 @@ std::string note(const MeterState& state) {
   if (state.stalled) {
     add("no new samples for " + duration_text(*state.stalled));
   } else if (state.new_samples == 0) {
-    add(state.seen == 0 ? "no samples yet" : "no new samples");
+    add(state.empty ? "no samples yet" : "no new samples");
   }
   return text;
 }

@@ -31,6 +31,7 @@ struct MeterState {
   Duration age{};                   // of the newest sample seen; meaningless while seen is 0
   std::optional<Duration> paused;   // length of the newest pause that ended since the last report
   std::optional<Duration> stalled;  // no sample came for so long, which is longer than usual
+  bool empty = false;               // the stream has no samples
   bool final = false;               // the last one, not after an interval
 };
 

@@ -2,8 +2,10 @@
 #include "client/dssmctl/open_stream.hpp"
 
 #include <fmt/format.h>
+#include <sys/stat.h>
 
 #include <algorithm>
+#include <cstdlib>
 #include <utility>
 
 #include "client/dssmctl/names.hpp"
@@ -17,6 +19,12 @@ namespace {
 // What --wait waits for.
 bool may_come(const Error& error) {
   return error.code == Errc::not_found || error.code == Errc::unavailable;
+}
+
+std::string socket_path(const CommonOptions& options) {
+  if (!options.socket_path.empty()) return options.socket_path;
+  const char* path = std::getenv("DSSM_SOCKET");  // NOLINT(concurrency-mt-unsafe): one thread
+  return path ? path : "";
 }
 
 // Without a reader and without an error after a stop signal.
@@ -44,7 +52,18 @@ Result<Session> connect(const CommonOptions& options) {
   SessionOptions session_options;
   session_options.socket_path = options.socket_path;
   session_options.program = "dssmctl " + options.verb_name;
-  return Session::connect(std::move(session_options));
+  Result<Session> session = Session::connect(std::move(session_options));
+  const std::string path = socket_path(options);
+  struct stat file {};
+  if (session || session.error().code != Errc::no_daemon || ::stat(path.c_str(), &file) ||
+      S_ISSOCK(file.st_mode)) {
+    return session;
+  }
+  return Error{Errc::no_daemon,
+               fmt::format("connect to dssmd at '{}': this is a {}, not dssmd's socket; give the "
+                           "socket itself, such as {}",
+                           path, S_ISDIR(file.st_mode) ? "folder" : "file",
+                           S_ISDIR(file.st_mode) ? path + "/dssmd.sock" : "/run/dssm/dssmd.sock")};
 }
 
 Result<std::vector<OpenedStream>> open_streams(const ReadingOptions& options,
@@ -63,6 +82,12 @@ Result<std::vector<OpenedStream>> open_streams(const ReadingOptions& options,
     opened.push_back(*std::move(one));
   }
   return opened;
+}
+
+std::string full_name(Session& session, const StreamId& id) {
+  if (!id.host.empty()) return id.str();
+  const Result<StreamInfo> info = session.stream_info(id);
+  return info ? info->id.str() : id.str();
 }
 
 Error with_similar_names(Error error, Session& session, const StreamId& wanted) {

@@ -30,6 +30,9 @@ Result<std::vector<OpenedStream>> open_streams(const ReadingOptions& options,
                                                const std::vector<std::string>& streams,
                                                FetchHistory history);
 
+// The name of an existing stream with its host.
+std::string full_name(Session& session, const StreamId& id);
+
 // `error` with a hint at streams named like `wanted` when there is no such stream.
 Error with_similar_names(Error error, Session& session, const StreamId& wanted);
 

@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "client/dssmctl/output.hpp"
+#include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
 
@@ -22,6 +23,8 @@ struct CommonOptions {
   std::string verb_name;    // as typed, "property get": for messages
   std::string socket_path;  // empty: the default
   bool json = false;
+  bool iso = false;   // times for people as ISO 8601
+  bool wide = false;  // tables with all columns, however narrow the terminal is
 };
 
 struct LsOptions : CommonOptions {
@@ -36,6 +39,7 @@ struct LsOptions : CommonOptions {
 
 struct HostsOptions : CommonOptions {
   bool names = false;
+  bool watch = false;
 };
 
 struct ClockOptions : CommonOptions {
@@ -55,6 +59,7 @@ struct PingOptions : CommonOptions {
 
 struct InfoOptions : CommonOptions {
   std::string stream;  // empty: about dssmd itself
+  bool watch = false;
 };
 
 // Of verbs that read a stream.
@@ -65,8 +70,7 @@ struct ReadingOptions : CommonOptions {
 
 struct EchoOptions : ReadingOptions {
   std::string stream;
-  std::optional<Duration> at;
-  bool at_counts_back = false;  // from the newest sample; `at` is then 0 or less
+  std::optional<Moment> at;  // counts back from the newest sample
   bool last = false;
   bool csv = false;
   bool full = false;
@@ -111,7 +115,8 @@ struct PropertySetOptions : PropertyOptions {};
 struct PlaybackOptions : CommonOptions {
   std::optional<bool> paused;
   bool reset = false;
-  std::optional<double> offset_s, speed, time_s;
+  std::optional<double> offset_s, speed;
+  std::optional<Moment> time;  // counts back from now
 };
 
 // Of dssmctl pki. Folders are those of a CA and of credentials; out: "-" or empty for standard

@@ -418,7 +418,8 @@ TEST(Doctor, FindsStreamsOfOneNameAndNamesOnlySome) {
   Facts facts = healthy();
   facts.streams.push_back(stream_of("lidar", "pc2"));
   EXPECT_FINDING(facts, "stream names", Status::warn, "lidar:0@pc1");
-  EXPECT_EQ(finding_of(facts, "stream names").text, "several hosts have 'lidar:0' of pc1, pc2");
+  EXPECT_EQ(finding_of(facts, "stream names").text,
+            "several hosts have a stream of the same name: 'lidar:0' (on pc1, pc2)");
   for (int i = 0; i < 100; ++i) {
     for (const char* host : {"pc1", "pc2"}) {
       facts.streams.push_back(stream_of("x" + std::to_string(i), host));
