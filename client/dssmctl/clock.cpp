@@ -50,21 +50,25 @@ std::string reads_cell(const HostInfo& host) {
   return fmt::format("{}: {}", reads, escaped_message(host.clock_reason));
 }
 
+// Whether its chronyd was read.
+bool is_read(const ClockSnapshot& clock) {
+  return clock.status != ClockStatus::unknown && clock.age > Duration::zero();
+}
+
 // A host whose clock is not known has dashes.
 std::vector<std::string> clock_row(const HostInfo& host) {
   if (!host.clock) {
     return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-", reads_cell(host)};
   }
   const ClockSnapshot& clock = *host.clock;
-  const bool is_read = clock.status != ClockStatus::unknown && clock.age > Duration::zero();
   return {escaped(host.name),
           status_text(clock),
           bound_text(host.clock_bound()),
           bound_text(host.clock_distance),
-          is_read ? duration_text(clock.offset) : "-",
+          is_read(clock) ? duration_text(clock.offset) : "-",
           reference_text(host),
           clock.update_interval > Duration::zero() ? duration_text(clock.update_interval) : "-",
-          is_read ? duration_text(clock.age) : "-",
+          is_read(clock) ? duration_text(clock.age) : "-",
           reads_cell(host)};
 }
 
@@ -79,34 +83,35 @@ Json clock_json(const HostInfo& host) {
   json["bound_ns"] = bound_json(host.clock_bound());
   json["distance_ns"] = bound_json(host.clock_distance);
   json["root_bound_ns"] = bound_json(clock.root_bound);
-  json["offset_ns"] = to_ns(clock.offset);
+  json["offset_ns"] = is_read(clock) ? Json(to_ns(clock.offset)) : Json();
   json["reference"] = or_null(host.clock_reference);
-  json["stratum"] = clock.stratum;
-  json["poll_ns"] = to_ns(clock.update_interval);
-  json["age_ns"] = to_ns(clock.age);
+  json["stratum"] = is_read(clock) ? Json(clock.stratum) : Json();
+  json["poll_ns"] =
+      clock.update_interval > Duration::zero() ? Json(to_ns(clock.update_interval)) : Json();
+  json["age_ns"] = is_read(clock) ? Json(to_ns(clock.age)) : Json();
   const char* const reads = reads_text(host);
   json["reads"] = reads ? Json(reads) : Json();
   json["reads_reason"] = or_null(host.clock_reason);
   return json;
 }
 
-void print_clocks(const std::vector<HostInfo>& hosts, bool json, Output& out) {
-  if (json) {
+void print_clocks(const std::vector<HostInfo>& hosts, const ClockOptions& options, Output& out) {
+  if (options.json) {
     Json all = Json::array();
     for (const HostInfo& host : hosts) {
       if (is_there(host)) all.push_back(clock_json(host));
     }
-    return out.add(json_line({{"clocks", std::move(all)}}));
+    return out.add(json_output({{"clocks", std::move(all)}}, options.watch));
   }
   Table table({{"HOST"},
                {"STATUS"},
                {"BOUND", Table::Align::right},
                {"FROM HERE", Table::Align::right},
                {"OFFSET", Table::Align::right},
-               {"REFERENCE"},
-               {"POLL", Table::Align::right},
-               {"AGE", Table::Align::right},
-               {"READS"}});
+               {"REFERENCE", Table::Align::left, 3},
+               {"POLL", Table::Align::right, 1},
+               {"AGE", Table::Align::right, 2},
+               {"READS", Table::Align::left, 0, Table::Column::Fit::below}});
   for (const HostInfo& host : hosts) {
     if (is_there(host)) table.add_row(clock_row(host));
   }
@@ -151,43 +156,34 @@ Json pair_json(const ClockPair& pair) {
           {"error", or_null(pair.error)}};
 }
 
-void print_matrix(const std::vector<ClockPair>& pairs, bool json, Output& out) {
-  if (json) {
+void print_matrix(const std::vector<ClockPair>& pairs, const ClockOptions& options, Output& out) {
+  if (options.json) {
     Json all = Json::array();
     for (const ClockPair& pair : pairs) all.push_back(pair_json(pair));
-    return out.add(json_line({{"clock_pairs", std::move(all)}}));
+    return out.add(json_output({{"clock_pairs", std::move(all)}}, options.watch));
   }
   Table table({{"ON"},
                {"OF"},
                {"READS"},
                {"BOUND", Table::Align::right},
                {"OF LIMIT"},
-               {"LIMIT", Table::Align::right},
-               {"KNOWN BY"},
-               {"CHAIN", Table::Align::right},
-               {"MEASURED", Table::Align::right},
-               {"RTT", Table::Align::right},
-               {"REASON"}});
+               {"LIMIT", Table::Align::right, 4},
+               {"KNOWN BY", Table::Align::left, 5},
+               {"CHAIN", Table::Align::right, 2},
+               {"MEASURED", Table::Align::right, 3},
+               {"RTT", Table::Align::right, 1},
+               {"REASON", Table::Align::left, 0, Table::Column::Fit::below}});
   for (const ClockPair& pair : pairs) table.add_row(pair_row(pair));
   table.print(out);
 }
 
 Result<void> print_once(Session& session, const ClockOptions& options, Output& out) {
   if (options.matrix) {
-    print_matrix(DSSM_TRY(session.list_clock_pairs()), options.json, out);
+    print_matrix(DSSM_TRY(session.list_clock_pairs()), options, out);
   } else {
-    print_clocks(DSSM_TRY(session.list_hosts()), options.json, out);
+    print_clocks(DSSM_TRY(session.list_hosts()), options, out);
   }
   return {};
-}
-
-Result<void> watch_clocks(Session& session, const ClockOptions& options, Output& out) {
-  catch_stop_signals();
-  for (MonoTime next = MonoClock::now();; next += kReadingPeriod) {
-    DSSM_TRY(print_once(session, options, out));
-    if (!options.json) out.add("\n");
-    if (!out.flush() || !out.sleep_until(next + kReadingPeriod)) return {};
-  }
 }
 
 // What was read of one host.
@@ -198,11 +194,12 @@ struct Readings {
 };
 
 Json statistics_json(const Statistics& statistics) {
+  const auto when_read = [&](auto value) { return statistics.count > 0 ? Json(value) : Json(); };
   return {{"readings", statistics.count},
-          {"average_ns", statistics.mean_ns},
-          {"max_ns", to_ns(statistics.max)},
-          {"min_ns", to_ns(statistics.min)},
-          {"std_dev_ns", statistics.std_dev_ns}};
+          {"average_ns", when_read(statistics.mean_ns)},
+          {"max_ns", when_read(to_ns(statistics.max))},
+          {"min_ns", when_read(to_ns(statistics.min))},
+          {"std_dev_ns", when_read(statistics.std_dev_ns)}};
 }
 
 void print_table(const std::map<std::string, Readings>& all, bool json, Output& out) {
@@ -227,9 +224,10 @@ void print_table(const std::map<std::string, Readings>& all, bool json, Output& 
     for (const auto& [what, window] :
          {std::pair("offset", &readings.offsets), std::pair("bound", &readings.bounds)}) {
       const Statistics found = window->statistics();
-      table.add_row({escaped(name), what, std::to_string(found.count), ns_text(found.mean_ns),
-                     duration_text(found.max), duration_text(found.min),
-                     ns_text(found.std_dev_ns)});
+      const auto cell = [&](std::string text) { return found.count > 0 ? text : "-"; };
+      table.add_row({escaped(name), what, std::to_string(found.count), cell(ns_text(found.mean_ns)),
+                     cell(duration_text(found.max)), cell(duration_text(found.min)),
+                     cell(ns_text(found.std_dev_ns))});
     }
   }
   table.print(out);
@@ -271,7 +269,7 @@ Result<void> await_clock(Session& session, const ClockOptions& options, Output& 
     const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
     const HostInfo& self = hosts.front();
     if (self.clock && is_good(*self.clock)) {
-      print_clocks({self}, options.json, out);
+      print_clocks({self}, options, out);
       return {};
     }
     const MonoTime now = MonoClock::now();
@@ -292,8 +290,8 @@ Result<void> run(const ClockOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   if (options.wait) return await_clock(session, options, out);
   if (options.table) return tabulate_clocks(session, options, out);
-  if (options.watch) return watch_clocks(session, options, out);
-  return print_once(session, options, out);
+  return print_once_or_watch(options.watch, options.json, out,
+                             [&] { return print_once(session, options, out); });
 }
 
 }  // namespace dssm::ctl

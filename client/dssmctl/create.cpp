@@ -29,6 +29,16 @@ Result<History> history_of(const CreateOptions& options) {
   return History{options.depth, options.cycle.value_or(kDefaultCycle)};
 }
 
+// A library's error speaks to programs that were compiled with a type.
+Error with_advice(Error error, Session& session, const StreamId& id, const TypeInfo& type) {
+  if (error.code != Errc::type_mismatch) return error;
+  const Result<StreamInfo> existing = session.stream_info(id);
+  if (!existing) return error;
+  return {error.code, fmt::format("create '{}': it exists with samples of {}, not {}; keep it, or "
+                                  "remove it first: dssmctl rm {}",
+                                  id.str(), existing->type.str(), type.str(), id.str())};
+}
+
 }  // namespace
 
 Result<void> run(const CreateOptions& options, Output& out) {
@@ -47,7 +57,9 @@ Result<void> run(const CreateOptions& options, Output& out) {
     wanted.host = daemon.host;
   }
   const bool there = session.stream_info(wanted).has_value();
-  RawWriter writer = DSSM_TRY(session.create_raw(id, type, history, {.keep_existing = true}));
+  Result<RawWriter> created = session.create_raw(id, type, history, {.keep_existing = true});
+  if (!created) return with_advice(std::move(created).error(), session, wanted, type);
+  RawWriter writer = *std::move(created);
   // Not the writer's own figures: for another host's stream those of a ring on the way there.
   const StreamInfo stream = DSSM_TRY(session.stream_info(writer.id()));
   if (options.json) {
@@ -79,8 +91,10 @@ Result<void> run(const RmOptions& options, Output& out) {
   Json removed = Json::array();
   std::optional<Error> failure;
   for (const StreamId& id : ids) {
+    const std::string name = full_name(session, id);
     if (Result<void> result = session.remove(id); result) {
-      removed.push_back(id.str());
+      removed.push_back(name);
+      if (!options.json) out.add(fmt::format("{}: removed\n", escaped(name)));
     } else {
       Error error = with_similar_names(std::move(result).error(), session, id);
       if (failure) error.message.insert(0, failure->message + "; and ");

@@ -3,8 +3,6 @@
 // dssmctl delay: how old samples are when they arrive here, that is the time on this PC's clock
 // when this program was woken for a sample, minus the sample's stamp. For a stream of another host
 // these are two clocks, and the figure is as good as both together.
-#include "client/dssmctl/delay.hpp"
-
 #include <fmt/format.h>
 
 #include <algorithm>
@@ -16,75 +14,74 @@
 #include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
-
-void Clocks::add(const SampleInfo& info) {
-  const bool known = info.clock_error < kForeignClockError;
-  some_unknown_ |= !known;
-  if (known) known_errors_.add(info.clock_error);
-}
-
-void Clocks::update(const std::vector<HostInfo>& hosts, std::string_view owner) {
-  owner_bound_ = kUnknownClockError;  // nothing is known of the clock of a host that is not up
-  for (const HostInfo& host : hosts) {
-    if (host.state == HostState::self) {
-      two_clocks_ = host.name != owner;
-      own_bound_ = host.clock_bound();
-    } else if (host.state == HostState::up && host.name == owner) {
-      owner_bound_ = host.clock_bound();
-    }
-  }
-}
-
-Duration Clocks::delay_error() const {
-  if (!two_clocks_) return Duration::zero();
-  Duration stamps = known_errors_.statistics().max;
-  if (some_unknown_) stamps = std::max(stamps, owner_bound_);
-  return stamps > kUnknownClockError - own_bound_ ? kUnknownClockError : stamps + own_bound_;
-}
-
 namespace {
 
-void print_json(const MeterState& state, const Statistics& delays, const Clocks& clocks,
-                Output& out) {
-  Json json = report_json(state, "samples", delays.count);
-  add_statistics(json, "delay", delays);
-  json["delay_error_ns"] = bound_json(clocks.delay_error());
-  out.add(json_line(json));
-}
+class DelayMeter : public Meter {
+ public:
+  DelayMeter(const RawReader& reader, std::uint64_t window)
+      : reader_(reader), delays_(window), errors_(window) {}
 
-void print_text(const MeterState& state, const Statistics& delays, const Clocks& clocks,
-                Output& out) {
-  if (state.final) out.add(final_line(state));
-  if (!state.final && state.new_samples == 0) return out.add("no new samples\n");
-  if (delays.count == 0) return;
-  out.add(fmt::format("average delay: {:.9f} s\n{}", delays.mean_ns / 1e9,
-                      statistics_line(delays, delays.count)));
-  if (!clocks.are_two()) return;
-  const Duration error = clocks.delay_error();
-  out.add(error == kUnknownClockError
-              ? "\tclocks: unknown, so this may be off by any amount\n"
-              : fmt::format("\tclocks: at most {} apart\n", duration_text(error)));
-}
+  void on_sample(const SampleInfo& info, Time arrival) override {
+    delays_.add(saturating_sub(arrival, info.time));
+    errors_.add(reader_.clock_error(info));
+  }
+
+  void add_json(const MeterState&, Json& json) const override {
+    const Statistics delays = delays_.statistics();
+    json["samples"] = delays.count;
+    add_statistics(json, "delay", delays);
+    json["delay_error_ns"] = bound_json(error());
+  }
+
+  std::string text(const MeterState&) const override {
+    const Statistics delays = delays_.statistics();
+    if (delays.count == 0) return {};
+    return fmt::format("average delay: {}\n{}{}", ns_text(delays.mean_ns),
+                       statistics_line(delays, delays.count), clocks_line());
+  }
+
+  std::vector<std::string> cells(const MeterState&) const override {
+    const Statistics delays = delays_.statistics();
+    std::vector<std::string> cells = statistics_cells(delays);
+    cells.insert(cells.begin(), delays.count > 0 ? ns_text(delays.mean_ns) : "-");
+    cells.push_back(delays.count > 0 ? bound_text(error()) : "-");
+    cells.push_back(std::to_string(delays.count));
+    return cells;
+  }
+
+ private:
+  // Greatest error of a delay that the two clocks make; 0 for a stream of this PC.
+  Duration error() const {
+    return errors_.size() > 0 ? errors_.statistics().max : kUnknownClockError;
+  }
+
+  std::string clocks_line() const {
+    const Duration bound = error();
+    if (bound == Duration::zero()) return {};  // one clock
+    return bound == kUnknownClockError
+               ? "\tclocks: unknown, so this may be off by any amount\n"
+               : fmt::format("\tclocks: at most {} apart\n", duration_text(bound));
+  }
+
+  const RawReader& reader_;
+  Window delays_, errors_;
+};
 
 }  // namespace
 
 Result<void> run(const DelayOptions& options, Output& out) {
-  Window delays(options.window);
-  Clocks clocks(options.window);
-  Meter meter;
-  meter.on_sample = [&](const SampleInfo& info, Time arrival) {
-    delays.add(saturating_sub(arrival, info.time));
-    clocks.add(info);
-  };
-  meter.on_report = [&](const MeterState& state, Session& session) {
-    // While dssmd is unavailable the last bounds stay; the reports do not wait for it.
-    if (session.is_connected()) {
-      if (const auto hosts = session.list_hosts()) clocks.update(*hosts, state.stream.host);
-    }
-    const auto print = options.json ? print_json : print_text;
-    print(state, delays.statistics(), clocks, out);
-  };
-  return run_meter(options, out, meter);
+  constexpr auto kRight = Table::Align::right;
+  return run_meter(options, out,
+                   {false,
+                    {{"DELAY", kRight},
+                     {"MIN", kRight},
+                     {"MAX", kRight},
+                     {"STD DEV", kRight},
+                     {"CLOCKS", kRight},
+                     {"WINDOW", kRight}},
+                    [&](const RawReader& reader) {
+                      return std::make_unique<DelayMeter>(reader, options.window);
+                    }});
 }
 
 }  // namespace dssm::ctl

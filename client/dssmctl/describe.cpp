@@ -16,6 +16,10 @@ Json round_trip_json(Duration round_trip) {
   return round_trip > Duration::zero() ? Json(to_ns(round_trip)) : Json();
 }
 
+bool is_connected(const HostInfo& host) {
+  return host.state == HostState::self || host.state == HostState::up;
+}
+
 std::string note(const HostInfo& host) {
   std::string text = host.insecure ? "insecure: nothing is encrypted" : "";
   const auto add = [&](const std::string& more) { text += (text.empty() ? "" : "; ") + more; };
@@ -69,7 +73,7 @@ Json host_json(const HostInfo& host) {
   json["least_round_trip_ns"] = round_trip_json(host.min_round_trip);
   json["carried_bytes_per_s"] =
       host.carried_bytes_per_s > 0 ? Json(host.carried_bytes_per_s) : Json();
-  json["streams"] = host.streams;
+  json["streams"] = is_connected(host) ? Json(host.streams) : Json();
   json["clock_bound_ns"] = bound_json(host.clock_bound());
   json["insecure"] = host.insecure;
   json["reason"] = host.reason == HostReason::none ? Json() : Json(name_of(host.reason));
@@ -84,8 +88,15 @@ std::string validity_text(const CredentialsInfo& credentials) {
 
 std::vector<Table::Column> host_columns() {
   constexpr auto kRight = Table::Align::right;
-  return {{"HOST"},        {"STATE"},           {"ADDRESS"},       {"FOUND BY"}, {"VERSION"},
-          {"RTT", kRight}, {"STREAMS", kRight}, {"CLOCK", kRight}, {"NOTE"}};
+  return {{"HOST"},
+          {"STATE"},
+          {"ADDRESS"},
+          {"FOUND BY", Table::Align::left, 1},
+          {"VERSION", Table::Align::left, 2},
+          {"RTT", kRight},
+          {"STREAMS", kRight},
+          {"CLOCK", kRight},
+          {"NOTE", Table::Align::left, 0, Table::Column::Fit::below}};
 }
 
 std::vector<std::string> host_row(const HostInfo& host) {
@@ -95,12 +106,41 @@ std::vector<std::string> host_row(const HostInfo& host) {
           or_dash(list_text(host.found_by)),
           or_dash(escaped(host.version)),
           host.round_trip > Duration::zero() ? duration_text(host.round_trip) : "-",
-          std::to_string(host.streams),
+          is_connected(host) ? std::to_string(host.streams) : "-",
           bound_text(host.clock_bound()),
           note(host)};
 }
 
-Json stream_json(const StreamInfo& stream, Time now) {
+bool is_silent(const StreamInfo& stream) {
+  return stream.state == StreamState::stalled || stream.state == StreamState::no_writer;
+}
+
+bool is_age_known(const StreamInfo& stream) {
+  return stream.state == StreamState::live || is_silent(stream);
+}
+
+bool is_use_known(const StreamInfo& stream) {
+  if (stream.mirror && stream.mirror->state == MirrorState::owner_unavailable) return false;
+  return stream.state != StreamState::unknown || stream.newest != kNoTid;
+}
+
+std::string rate_text(const StreamInfo& stream) {
+  return stream.rate_hz > 0 && !is_silent(stream) ? fmt::format("{:.1f} Hz", stream.rate_hz) : "-";
+}
+
+std::string age_text(const StreamInfo& stream) {
+  return is_age_known(stream) ? duration_text(stream.age) : "-";
+}
+
+std::string state_cell(const StreamInfo& stream) {
+  return stream.state == StreamState::unknown ? "-" : std::string(name_of(stream.state));
+}
+
+std::string count_text(const StreamInfo& stream, std::uint32_t users) {
+  return is_use_known(stream) ? std::to_string(users) : "-";
+}
+
+Json stream_json(const StreamInfo& stream) {
   const bool written = stream.newest != kNoTid;
   const auto when_written = [&](std::int64_t value) { return written ? Json(value) : Json(); };
   Json json;
@@ -112,20 +152,23 @@ Json stream_json(const StreamInfo& stream, Time now) {
   json["payload_bytes"] = stream.type.payload_bytes;
   json["depth"] = stream.depth;
   json["cycle_ns"] = to_ns(stream.cycle);
-  json["rate_hz"] = stream.rate_hz > 0 ? Json(stream.rate_hz) : Json();
-  json["age_ns"] = when_written(to_ns(saturating_sub(now, stream.newest_time)));
+  const bool has_state = stream.state != StreamState::unknown;
+  json["state"] = has_state ? Json(name_of(stream.state)) : Json();
+  json["rate_hz"] = stream.rate_hz > 0 && !is_silent(stream) ? Json(stream.rate_hz) : Json();
+  json["age_ns"] = is_age_known(stream) ? Json(to_ns(stream.age)) : Json();
   json["oldest_tid"] = when_written(stream.oldest);
   json["newest_tid"] = when_written(stream.newest);
   json["newest_time_ns"] = when_written(to_ns(stream.newest_time));
-  json["writers"] = stream.writers;
-  json["readers"] = stream.readers;
-  json["remote_writers"] = stream.remote_writers;
-  json["remote_readers"] = stream.remote_readers;
-  json["channels"] = stream.channels;
+  const auto when_known = [&](std::uint32_t n) { return is_use_known(stream) ? Json(n) : Json(); };
+  json["writers"] = when_known(stream.writers);
+  json["readers"] = when_known(stream.readers);
+  json["remote_writers"] = when_known(stream.remote_writers);
+  json["remote_readers"] = when_known(stream.remote_readers);
+  json["channels"] = when_known(stream.channels);
   json["memory_bytes"] = stream.memory_bytes;
   json["property_bytes"] = stream.property_bytes;
   json["incarnation"] = stream.incarnation;
-  json["creator_pid"] = stream.creator_pid;
+  json["creator_pid"] = stream.creator_pid > 0 ? Json(stream.creator_pid) : Json();
   return json;
 }
 

@@ -29,7 +29,20 @@ std::string status_text(const ClockSnapshot& clock);  // "out of bounds: stepped
 
 // --- streams: the same keys in `ls` and `info`
 
-Json stream_json(const StreamInfo& stream, Time now);
+Json stream_json(const StreamInfo& stream);
+
+// Whether samples should come and do not.
+bool is_silent(const StreamInfo& stream);
+// Whether stream.age has a meaning.
+bool is_age_known(const StreamInfo& stream);
+// Whether the numbers of its users have one: dssmd may know only that there is such a stream.
+bool is_use_known(const StreamInfo& stream);
+
+// As tables show them; "-": not known, or of the rate that no samples come.
+std::string rate_text(const StreamInfo& stream);
+std::string age_text(const StreamInfo& stream);
+std::string state_cell(const StreamInfo& stream);
+std::string count_text(const StreamInfo& stream, std::uint32_t users);
 
 // The fields of a type: as a table, and as JSON.
 void print_fields(const TypeInfo& type, Output& out);

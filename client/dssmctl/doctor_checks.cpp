@@ -207,8 +207,7 @@ void check_descriptors(const Facts& facts, Findings& findings) {
   if (limit == 0) return;  // dssmd is in another container: not known here
   const std::uint64_t taken = facts.daemon.streams * kDescriptorsPerStream;
   Finding finding{"descriptors", Status::ok,
-                  fmt::format("dssmd may open {} files, its {} streams take about {}", limit,
-                              facts.daemon.streams, taken)};
+                  fmt::format("dssmd may open {} files; its streams take about {}", limit, taken)};
   if (taken + kOtherDescriptors > limit - limit / 5) {
     finding.warn("the limit on open files is too low for many more streams",
                  "sudo mkdir -p /etc/systemd/system/dssmd.service.d && printf "

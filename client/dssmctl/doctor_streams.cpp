@@ -42,21 +42,44 @@ Finding check_stream_names(const Facts& facts) {
   const Duplicates duplicates(facts.streams);
   if (duplicates.owners().empty()) {
     return {"stream names", Status::ok,
-            fmt::format("each of the {} streams can be opened without its host's name",
-                        facts.streams.size())};
+            facts.streams.empty() ? "there are no streams"
+                                  : "each can be opened without its host's name"};
   }
   std::vector<std::string> named;
   std::string example;
   for (const auto& [key, hosts] : duplicates.owners()) {
     const std::string name = fmt::format("{}:{}", key.first, key.second);
-    named.push_back(fmt::format("'{}' of {}", name, list_text(hosts)));
+    named.push_back(fmt::format("'{}' (on {})", name, list_text(hosts)));
     if (example.empty()) example = fmt::format("{}@{}", name, hosts.front());
   }
   return {"stream names", Status::warn,
-          "several hosts have one stream name: " + first_of(std::move(named)),
+          "several hosts have a stream of the same name: " + first_of(std::move(named)),
           "the same program runs on several hosts; a name without a host opens only a host's own "
           "stream",
           fmt::format("dssmctl info {}  # and so in programs", shell_word(example))};
+}
+
+// Streams that should have samples and do not, on all hosts.
+Finding check_stalled(const Facts& facts) {
+  std::vector<std::string> named;
+  std::string example;
+  bool has_writer = false;
+  for (const StreamInfo& stream : facts.streams) {
+    if (!is_silent(stream)) continue;
+    const bool is_open = stream.state == StreamState::stalled;
+    if (example.empty() || (is_open && !has_writer)) example = shell_word(stream.id.str());
+    has_writer |= is_open;
+    named.push_back(fmt::format("'{}' for {} ({})", stream.id.str(), age_text(stream),
+                                is_open ? "its writer is connected" : "no writer is connected"));
+  }
+  if (named.empty()) return {"streams", Status::ok, "none is stalled"};
+  return {"streams", Status::warn, "no samples of " + first_of(std::move(named)),
+          has_writer ? "the sensor gives nothing, or the program that writes hangs"
+                     : "the programs that wrote them have ended",
+          has_writer ? fmt::format("dssmctl info {}  # shows the program that writes", example)
+                     : fmt::format("dssmctl info {0}  # then start its program, or remove the "
+                                   "stream: dssmctl rm {0}",
+                                   example)};
 }
 
 // The mirrors of this PC: whether what programs read here is what their owners have now.
@@ -80,9 +103,10 @@ Finding check_mirrors(const Facts& facts) {
   if (behind.empty()) {
     return {"mirrors", Status::ok,
             mirrors == 0 ? "no stream of another host is read here in full"
-                         : fmt::format("the network carries all samples of the {} streams of other "
-                                       "hosts that programs here read",
-                                       mirrors)};
+                         : fmt::format("the network carries all samples of {} of other hosts that "
+                                       "programs here read",
+                                       mirrors == 1 ? "the stream"
+                                                    : fmt::format("the {} streams", mirrors))};
   }
   return {"mirrors", Status::warn, first_of(std::move(behind)),
           "they write more than the network to their hosts carries, or it was just interrupted",
@@ -145,6 +169,7 @@ Finding check_types(const Facts& facts) {
 
 void check_streams(const Facts& facts, std::vector<Finding>& findings) {
   findings.push_back(check_stream_names(facts));
+  findings.push_back(check_stalled(facts));
   findings.push_back(check_mirrors(facts));
   findings.push_back(check_histories(facts));
   findings.push_back(check_types(facts));

@@ -1,7 +1,7 @@
 # SPDX-License-Identifier: Apache-2.0
 #
 # bash completion for dssmctl(1): verbs, options, and the names of the streams and hosts that there
-# are, as `dssmctl ls --names` and `dssmctl hosts --names` tell them. Works with and without the
+# are, as `dssmctl ls --names` and `dssmctl hosts --names` print them. Works with and without the
 # bash-completion package, whose helper functions it does not need. A test compares the words below
 # with `dssmctl --help`.
 
@@ -26,6 +26,12 @@ _dssmctl_at_hosts() {
   while IFS= read -r host; do
     printf '%s\n' "${typed%%@*}@$host"
   done < <(_dssmctl_ask hosts --names)
+}
+
+# The fields of stream $1.
+_dssmctl_fields() {
+  _dssmctl_ask info --json "${1//\\/}" |
+    sed -n '/"fields": \[/,/^  \]/s/^ *"name": "\(.*\)",$/\1/p'
 }
 
 # Puts those lines of standard input into COMPREPLY that begin with what is being typed, quoted
@@ -67,21 +73,29 @@ _dssmctl() {
   cword=$((${#words[@]} - 1))
   local cur=${words[cword]} prev=${words[cword - 1]}
 
-  # The verb, and how many words that are no options stand between it and the cursor.
-  local verb="" positional=0
+  # The verb, how many words that are no options stand between it and the cursor, and the first one.
+  local verb="" positional=0 first=""
   for ((i = 1; i < cword; ++i)); do
     case ${words[i]} in
-      --socket | --sort | --host | --at | --count | -n | -c | --field | --wait | --window | -w | \
+      -r) # a value only where it is --rate
+        [[ $verb != pub ]] || ((++i))
+        ;;
+      -w) # a value only where it is --window
+        [[ $verb != hz && $verb != bw && $verb != delay ]] || ((++i))
+        ;;
+      --socket | --sort | --host | --at | --count | -n | -c | --field | --wait | --window | \
         --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
-        --speed | --time | --rate | -r | --ca | --credentials | --out | --name | --program | --days)
+        --speed | --time | --rate | --ca | --credentials | --out | --name | --program | --days)
         ((++i))
         ;;
       -*) ;;
       *)
         case $verb in
           "") verb=${words[i]} ;;
-          property | playback | pki) verb+=" ${words[i]}" ;;
-          *) ((++positional)) ;;
+          property | playback | pki | help) verb+=" ${words[i]}" ;;
+          *)
+            ((positional++)) || first=${words[i]}
+            ;;
         esac
         ;;
     esac
@@ -101,20 +115,25 @@ _dssmctl() {
       _dssmctl_offer < <(_dssmctl_ask hosts --names)
       return
       ;;
-    --at | --count | -n | -c | --field | --wait | --window | -w | --interval | -i | --size | \
-      --depth | --life | --cycle | --type | --align | --offset | --speed | --time | --rate | -r | --name | \
+    --field)
+      _dssmctl_offer < <(_dssmctl_fields "$first")
+      return
+      ;;
+    --at | --count | -n | -c | --wait | --window | --interval | -i | --size | --table | \
+      --depth | --life | --cycle | --type | --align | --offset | --speed | --time | --rate | --name | \
       --program | --days)
       return # a value that only the person knows
       ;;
   esac
 
-  local common="--help --json --socket" options=""
+  local common="--help --iso --json --socket --wide" options=""
   case $verb in
     "") options="--version" ;;
     ls) options="--host --local --names --own --reverse --sort --watch" ;;
-    hosts) options="--names" ;;
+    hosts) options="--names --watch" ;;
     nodes) options="--host" ;;
     graph) options="--out" ;;
+    info) options="--watch" ;;
     clock) options="--matrix --table --wait --watch" ;;
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
@@ -133,8 +152,8 @@ _dssmctl() {
     return
   fi
 
-  case $verb in
-    "")
+  case ${verb#help } in
+    "" | help)
       mapfile -t COMPREPLY < <(compgen -W \
         "bw clock create delay doctor echo find graph hosts hz info ls nodes ping pki playback \
           property pub rights rm show" -- "$cur")
@@ -147,8 +166,8 @@ _dssmctl() {
     "pki issue" | "pki install" | "pki show") ((positional == 0)) && _dssmctl_offer_files ;;
     ping) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_ask hosts --names) ;;
     create) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_at_hosts) ;;
-    rm) _dssmctl_offer < <(_dssmctl_streams) ;;
-    info | echo | pub | hz | bw | delay | rights)
+    rm | hz | bw | delay) _dssmctl_offer < <(_dssmctl_streams) ;;
+    info | echo | pub | rights)
       ((positional == 0)) && _dssmctl_offer < <(_dssmctl_streams)
       ;;
     "property get" | "property set")

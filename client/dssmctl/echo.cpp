@@ -103,7 +103,7 @@ class Echo {
   Result<void> result_;
 };
 
-Error failed_read(const RawReader& reader, const std::string& what, ReadStatus status) {
+Error failed_read(const RawReader& reader, const std::string& what, ReadStatus status, bool iso) {
   const auto error = [&](Errc code, std::string_view reason) {
     return Error{code, fmt::format("read {} of '{}': {}", what, reader.id().str(), reason)};
   };
@@ -112,7 +112,7 @@ Error failed_read(const RawReader& reader, const std::string& what, ReadStatus s
     case ReadStatus::too_old:
       if (reader.read_info(reader.oldest_tid(), oldest) == ReadStatus::ok) {
         return error(Errc::not_found, fmt::format("too old, the ring holds samples from {} on",
-                                                  seconds_text(to_ns(oldest.time))));
+                                                  time_text(oldest.time, iso)));
       }
       return error(Errc::not_found, "too old, the ring holds it no longer");
     case ReadStatus::arriving:
@@ -137,15 +137,15 @@ Error failed_read(const RawReader& reader, const std::string& what, ReadStatus s
 // The moment that --at means. It counts back from the newest sample, not from now, because the
 // stamps of a recording have nothing to do with the time on the wall.
 Result<Time> moment(const RawReader& reader, const EchoOptions& options) {
-  if (!options.at_counts_back) return Time(*options.at);
+  if (!options.at->back) return options.at->time;
   SampleInfo newest;
   ReadStatus status = ReadStatus::not_yet;
   do {  // the newest one may be overtaken between the two calls
     status = reader.read_info(reader.newest_tid(), newest);
   } while (status == ReadStatus::too_old && reader.newest_tid() != kNoTid);
   if (status != ReadStatus::ok)
-    return failed_read(reader, "the newest sample", ReadStatus::not_yet);
-  return saturating_add(newest.time, *options.at);
+    return failed_read(reader, "the newest sample", ReadStatus::not_yet, options.iso);
+  return saturating_add(newest.time, *options.at->back);
 }
 
 // Prints the sample that --at or --last asks for; without them puts the cursor before the first
@@ -160,13 +160,15 @@ Result<void> begin(const EchoOptions& options, bool awaited, RawReader& reader, 
     });
     if (!echo.result()) return echo.result();
     if (status != ReadStatus::ok) {
-      return failed_read(reader, "the sample at " + seconds_text(to_ns(time)), status);
+      return failed_read(reader, "the sample at " + time_text(time, options.iso), status,
+                         options.iso);
     }
   } else if (options.last) {
     const ReadStatus status =
         echo.print([&](auto payload, auto& info) { return reader.read_newest(payload, info); });
     if (!echo.result()) return echo.result();
-    if (status != ReadStatus::ok) return failed_read(reader, "the newest sample", status);
+    if (status != ReadStatus::ok)
+      return failed_read(reader, "the newest sample", status, options.iso);
   } else {
     reader.seek(awaited ? kNoTid : reader.newest_tid());
   }
@@ -177,24 +179,26 @@ Result<void> begin(const EchoOptions& options, bool awaited, RawReader& reader, 
 
 Result<void> run(const EchoOptions& options, Output& out) {
   const FetchHistory history = options.at ? FetchHistory::at_once : FetchHistory::when_read;
-  return with_stream(options, history, [&](OpenedStream& opened) -> Result<void> {
-    RawReader& reader = opened.reader;
-    std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, options));
-    // Before the first sample is shown: after it the next ones must come too, whatever happens to
-    // dssmd.
-    Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
-    SamplePrinter printer(out, form_of(options), options.full, reader.id(), std::move(fields));
-    Echo echo(reader, printer, out, options);
-    printer.begin();
-    DSSM_TRY(begin(options, opened.awaited, reader, echo));
+  std::vector<OpenedStream> all = DSSM_TRY(open_streams(options, {options.stream}, history));
+  if (all.empty()) return {};
+  OpenedStream& opened = all.front();
+  RawReader& reader = opened.reader;
+  std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, options));
+  // Before the first sample is shown: after it the next ones must come too, whatever happens to
+  // dssmd.
+  Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
+  SamplePrinter printer(out, {form_of(options), options.full, options.iso}, reader.id(),
+                        std::move(fields));
+  Echo echo(reader, printer, out, options);
+  printer.begin();
+  DSSM_TRY(begin(options, opened.awaited, reader, echo));
+  if (!echo.print_new()) return echo.result();
+  while (true) {
+    const Follower::Wake wake = follower.wait(kNever);
+    if (wake == Follower::Wake::stop) return {};
     if (!echo.print_new()) return echo.result();
-    while (true) {
-      const Follower::Wake wake = follower.wait(kNever);
-      if (wake == Follower::Wake::stop) return {};
-      if (!echo.print_new()) return echo.result();
-      if (wake == Follower::Wake::ended) return end_of(reader);
-    }
-  });
+    if (wake == Follower::Wake::ended) return end_of(reader);
+  }
 }
 
 }  // namespace dssm::ctl

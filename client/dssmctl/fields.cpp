@@ -165,9 +165,7 @@ std::string field_text(std::span<const std::byte> payload, const Field& field, s
     std::string text = text_of(payload, field);
     const std::size_t hidden = text.size() > shown ? text.size() - shown : 0;
     text.resize(text.size() - hidden);
-    std::string out = "\"";
-    for (const char c : text) out += c == '"' ? "\\\"" : escaped({&c, 1});
-    out += '"';
+    std::string out = double_quoted(text);
     if (hidden > 0) out += fmt::format(" ... {} more", hidden);
     return out;
   }

@@ -36,10 +36,11 @@ struct HostLines {
 // that only labels hold text of others.
 class Graph {
  public:
-  void add_stream(const StreamId& id, double rate_hz) {
+  // rate: "10.0 Hz", or "-" without one
+  void add_stream(const StreamId& id, const std::string& rate) {
     if (!streams_.emplace(id.str(), streams_.size()).second) return;
     std::string label = dot_text(short_name(id));
-    if (rate_hz > 0) label += fmt::format("\\n{:.1f} Hz", rate_hz);
+    if (rate != "-") label += "\\n" + rate;
     hosts_[id.host].lines +=
         fmt::format("    s{} [shape=box, label=\"{}\"];\n", streams_.size() - 1, label);
   }
@@ -54,7 +55,7 @@ class Graph {
     hosts_[node.host].lines +=
         fmt::format("    p{} [shape=ellipse, label=\"{}\"];\n", nodes_, label);
     for (const NodeStream& use : node.streams) {
-      add_stream(use.stream, 0);
+      add_stream(use.stream, "-");
       const std::size_t stream = streams_.at(use.stream.str());
       const char* style = use.via == StreamVia::local ? "" : " [style=dashed]";
       edges_ += use.role == Role::writer ? fmt::format("  p{} -> s{}{};\n", nodes_, stream, style)
@@ -154,7 +155,7 @@ std::string dot_text(std::string_view text) {
 
 std::string dot_graph(const std::vector<NodeInfo>& nodes, const std::vector<StreamInfo>& streams) {
   Graph graph;
-  for (const StreamInfo& stream : streams) graph.add_stream(stream.id, stream.rate_hz);
+  for (const StreamInfo& stream : streams) graph.add_stream(stream.id, rate_text(stream));
   for (const NodeInfo& node : nodes) graph.add_node(node);
   return graph.text();
 }
@@ -164,10 +165,9 @@ Result<void> run(const GraphOptions& options, Output& out) {
   const std::vector<StreamInfo> streams = DSSM_TRY(session.list_streams());
   const std::vector<NodeInfo> nodes = DSSM_TRY(session.list_nodes());
   if (options.json) {
-    const Time now = WallClock::now();
     Json all_nodes = Json::array(), all_streams = Json::array();
     for (const NodeInfo& node : nodes) all_nodes.push_back(node_json(node));
-    for (const StreamInfo& stream : streams) all_streams.push_back(stream_json(stream, now));
+    for (const StreamInfo& stream : streams) all_streams.push_back(stream_json(stream));
     out.add(json_document({{"nodes", std::move(all_nodes)}, {"streams", std::move(all_streams)}}));
     return {};
   }

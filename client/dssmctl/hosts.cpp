@@ -23,25 +23,28 @@ void print_names(const std::vector<HostInfo>& hosts, Output& out) {
   }
 }
 
-}  // namespace
-
-Result<void> run(const HostsOptions& options, Output& out) {
-  Session session = DSSM_TRY(connect(options));
+Result<void> print_hosts(Session& session, const HostsOptions& options, Output& out) {
   const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
   if (options.json) {
     Json all = Json::array();
     for (const HostInfo& host : hosts) all.push_back(host_json(host));
-    out.add(json_document({{"hosts", std::move(all)}}));
-    return {};
-  }
-  if (options.names) {
+    out.add(json_output({{"hosts", std::move(all)}}, options.watch));
+  } else if (options.names) {
     print_names(hosts, out);
-    return {};
+  } else {
+    Table table(host_columns());
+    for (const HostInfo& host : hosts) table.add_row(host_row(host));
+    table.print(out);
   }
-  Table table(host_columns());
-  for (const HostInfo& host : hosts) table.add_row(host_row(host));
-  table.print(out);
   return {};
+}
+
+}  // namespace
+
+Result<void> run(const HostsOptions& options, Output& out) {
+  Session session = DSSM_TRY(connect(options));
+  return print_once_or_watch(options.watch, options.json, out,
+                             [&] { return print_hosts(session, options, out); });
 }
 
 }  // namespace dssm::ctl

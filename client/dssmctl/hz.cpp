@@ -17,113 +17,138 @@
 namespace dssm::ctl {
 namespace {
 
-// The newest samples: the intervals between neighbouring ones, none across a gap, and how long they
-// are.
-class NewestSamples {
+// The newest samples: the intervals between neighbouring ones, none across a gap or a pause, and how
+// long they are.
+class RateMeter : public Meter {
  public:
-  explicit NewestSamples(std::uint64_t window) : intervals_(window - 1), window_(window) {}
+  explicit RateMeter(std::uint64_t window) : window_(window) {}
 
-  void on_sample(const SampleInfo& info) {
+  void on_sample(const SampleInfo& info, Time) override {
     if (previous_) intervals_.add(saturating_sub(info.time, *previous_));
     previous_ = info.time;
     payload_bytes_.push_back(info.payload_bytes);
     if (payload_bytes_.size() > window_) payload_bytes_.pop_front();
   }
-  void on_gap() { previous_.reset(); }
+  void on_gap() override { previous_.reset(); }
+  void on_pause() override {
+    intervals_ = Window(window_ - 1);
+    payload_bytes_.clear();
+    previous_.reset();
+  }
 
+ protected:
   Statistics intervals() const { return intervals_.statistics(); }
+  std::size_t window() const { return intervals_.size() + 1; }
+  // 0 when unknown: too few samples, stamps that do not move on, or none come.
+  double rate_hz(const MeterState& state) const {
+    const Statistics found = intervals();
+    const bool is_known = found.count > 0 && found.mean_ns > 0 && !is_silent(state);
+    return is_known ? 1e9 / found.mean_ns : 0;
+  }
   // 0 without samples.
   double mean_payload_bytes() const {
     const double sum = std::accumulate(payload_bytes_.begin(), payload_bytes_.end(), 0.0);
     return payload_bytes_.empty() ? 0 : sum / static_cast<double>(payload_bytes_.size());
   }
 
+  std::string rate_text(const MeterState& state) const {
+    const double rate = rate_hz(state);
+    return rate > 0 ? fmt::format("{:.3f} Hz", rate) : intervals_.size() > 0 ? "unknown" : "-";
+  }
+  static std::string too_few(const MeterState& state) {
+    return state.final ? "" : "one sample only, no rate yet\n";
+  }
+
+  void add_common_json(const MeterState& state, Json& json) const {
+    json["intervals"] = intervals_.size();
+    json["payload_bytes"] = state.payload_bytes;
+    json["rate_hz"] = rate_hz(state) > 0 ? Json(rate_hz(state)) : Json();
+  }
+
  private:
-  Window intervals_;
-  std::optional<Time> previous_;
+  // The last report is about the whole time.
+  static bool is_silent(const MeterState& state) { return state.stalled && !state.final; }
+
   std::uint64_t window_;
+  Window intervals_{window_ - 1};
+  std::optional<Time> previous_;
   std::deque<std::uint64_t> payload_bytes_;
 };
 
-// 0 when unknown: too few samples, or stamps that do not move on.
-double rate_hz(const Statistics& intervals) {
-  return intervals.count > 0 && intervals.mean_ns > 0 ? 1e9 / intervals.mean_ns : 0;
-}
+class HzMeter : public RateMeter {
+ public:
+  using RateMeter::RateMeter;
 
-std::string precise_rate_text(double rate) {
-  return rate > 0 ? fmt::format("{:.3f} Hz", rate) : "unknown";
-}
-
-// Whether there is something to measure; prints the reason when there is not.
-bool measurable(const MeterState& state, const Statistics& intervals, Output& out) {
-  if (state.final) out.add(final_line(state));
-  if (!state.final && state.new_samples == 0) {
-    out.add(state.seen == 0 ? "no samples yet\n" : "no new samples\n");
-    return false;
+  void add_json(const MeterState& state, Json& json) const override {
+    add_common_json(state, json);
+    add_statistics(json, "interval", intervals());
   }
-  if (intervals.count > 0) return true;
-  if (!state.final) out.add("one sample only, no rate yet\n");
-  return false;
-}
 
-Json common_json(const MeterState& state, const Statistics& intervals) {
-  Json json = report_json(state, "intervals", intervals.count);
-  json["payload_bytes"] = state.payload_bytes;
-  json["age_ns"] = state.seen > 0 ? Json(to_ns(state.age)) : Json();
-  json["rate_hz"] = rate_hz(intervals) > 0 ? Json(rate_hz(intervals)) : Json();
-  return json;
-}
-
-void print_hz(const MeterState& state, const NewestSamples& samples, bool as_json, Output& out) {
-  const Statistics intervals = samples.intervals();
-  if (as_json) {
-    Json json = common_json(state, intervals);
-    add_statistics(json, "interval", intervals);
-    return out.add(json_line(json));
+  std::string text(const MeterState& state) const override {
+    if (intervals().count == 0) return too_few(state);
+    return fmt::format("average rate: {}\n{}", rate_text(state),
+                       statistics_line(intervals(), window()));
   }
-  if (!measurable(state, intervals, out)) return;
-  out.add(fmt::format("average rate: {}\n{}", precise_rate_text(rate_hz(intervals)),
-                      statistics_line(intervals, intervals.count + 1)));
-}
 
-void print_bw(const MeterState& state, const NewestSamples& samples, bool as_json, Output& out) {
-  const Statistics intervals = samples.intervals();
-  const double rate = rate_hz(intervals);
-  const double bytes_per_second = rate * samples.mean_payload_bytes();
-  if (as_json) {
-    Json json = common_json(state, intervals);
-    json["mean_payload_bytes"] = state.seen > 0 ? Json(samples.mean_payload_bytes()) : Json();
-    json["bytes_per_second"] = rate > 0 ? Json(bytes_per_second) : Json();
-    return out.add(json_line(json));
+  std::vector<std::string> cells(const MeterState& state) const override {
+    std::vector<std::string> cells = statistics_cells(intervals());
+    cells.insert(cells.begin(), state.stalled && !state.final ? "-" : rate_text(state));
+    cells.push_back(std::to_string(window()));
+    return cells;
   }
-  if (!measurable(state, intervals, out)) return;
-  out.add(fmt::format("average: {}\n\tpayload: {} rate: {} window: {}\n",
-                      rate > 0 ? byte_rate_text(bytes_per_second) : "unknown",
-                      bytes_text(std::llround(samples.mean_payload_bytes())),
-                      precise_rate_text(rate), intervals.count + 1));
-}
+};
 
-template <class Print>
-Result<void> run_interval_meter(const MeterOptions& options, Output& out, Print print) {
-  NewestSamples samples(options.window);
-  Meter meter;
-  meter.from_history = true;
-  meter.on_sample = [&](const SampleInfo& info, Time) { samples.on_sample(info); };
-  meter.on_gap = [&] { samples.on_gap(); };
-  meter.on_report = [&](const MeterState& state, Session&) {
-    print(state, samples, options.json, out);
-  };
-  return run_meter(options, out, meter);
-}
+class BwMeter : public RateMeter {
+ public:
+  using RateMeter::RateMeter;
+
+  void add_json(const MeterState& state, Json& json) const override {
+    add_common_json(state, json);
+    json["mean_payload_bytes"] = state.seen > 0 ? Json(mean_payload_bytes()) : Json();
+    const double rate = rate_hz(state);
+    json["bytes_per_second"] = rate > 0 ? Json(rate * mean_payload_bytes()) : Json();
+  }
+
+  std::string text(const MeterState& state) const override {
+    if (intervals().count == 0) return too_few(state);
+    return fmt::format("average: {}\n\tpayload: {} rate: {} window: {}\n", bandwidth_text(state),
+                       bytes_text(std::llround(mean_payload_bytes())), rate_text(state), window());
+  }
+
+  std::vector<std::string> cells(const MeterState& state) const override {
+    return {bandwidth_text(state),
+            state.seen > 0 ? bytes_text(std::llround(mean_payload_bytes())) : "-",
+            state.stalled && !state.final ? "-" : rate_text(state), std::to_string(window())};
+  }
+
+ private:
+  std::string bandwidth_text(const MeterState& state) const {
+    const double rate = rate_hz(state);
+    return rate > 0 ? byte_rate_text(rate * mean_payload_bytes()) : "unknown";
+  }
+};
 
 }  // namespace
 
 Result<void> run(const HzOptions& options, Output& out) {
-  return run_interval_meter(options, out, print_hz);
+  constexpr auto kRight = Table::Align::right;
+  return run_meter(options, out,
+                   {true,
+                    {{"RATE", kRight},
+                     {"MIN", kRight},
+                     {"MAX", kRight},
+                     {"STD DEV", kRight},
+                     {"WINDOW", kRight}},
+                    [&](const RawReader&) { return std::make_unique<HzMeter>(options.window); }});
 }
 
 Result<void> run(const BwOptions& options, Output& out) {
-  return run_interval_meter(options, out, print_bw);
+  constexpr auto kRight = Table::Align::right;
+  return run_meter(
+      options, out,
+      {true,
+       {{"BANDWIDTH", kRight}, {"PAYLOAD", kRight}, {"RATE", kRight}, {"WINDOW", kRight}},
+       [&](const RawReader&) { return std::make_unique<BwMeter>(options.window); }});
 }
 
 }  // namespace dssm::ctl

@@ -19,18 +19,34 @@ void add_line(Output& out, const std::string& key, const Value& value) {
   out.add(fmt::format("{:<13} {}\n", key + ":", value));
 }
 
-void print_samples(const StreamInfo& stream, Output& out) {
-  if (stream.newest == kNoTid) return add_line(out, "samples", "none yet");
-  const Duration age = saturating_sub(WallClock::now(), stream.newest_time);
+// "stalled: no sample for 98.0 s, open for writing in 1 program".
+std::string silence_text(const StreamInfo& stream) {
+  return fmt::format("{}: no sample for {}{}", name_of(stream.state), age_text(stream),
+                     stream.state == StreamState::stalled && stream.writers > 0
+                         ? fmt::format(", but open for writing in {} program{}", stream.writers,
+                                       stream.writers == 1 ? "" : "s")
+                         : "");
+}
+
+void print_samples(const StreamInfo& stream, bool iso, Output& out) {
+  if (stream.newest == kNoTid) {
+    return add_line(out, "samples", stream.state == StreamState::empty ? "none yet" : "-");
+  }
   add_line(out, "samples", fmt::format("tid {} to {}", stream.oldest, stream.newest));
   add_line(out, "newest",
-           fmt::format("{} ({} ago)", seconds_text(to_ns(stream.newest_time)), duration_text(age)));
-  if (stream.rate_hz > 0) add_line(out, "rate", fmt::format("{:.3f} Hz", stream.rate_hz));
+           fmt::format("{}{}", time_text(stream.newest_time, iso),
+                       is_age_known(stream) ? fmt::format(" ({} ago)", age_text(stream)) : ""));
+  if (is_silent(stream)) {
+    add_line(out, "state", silence_text(stream));
+  } else {
+    if (stream.state != StreamState::unknown) add_line(out, "state", name_of(stream.state));
+    if (stream.rate_hz > 0) add_line(out, "rate", fmt::format("{:.3f} Hz", stream.rate_hz));
+  }
 }
 
 // "3, 2 of them over the network"
-std::string count_text(std::uint32_t all, std::uint32_t remote) {
-  return fmt::format("{}{}", all,
+std::string users_text(const StreamInfo& stream, std::uint32_t all, std::uint32_t remote) {
+  return fmt::format("{}{}", count_text(stream, all),
                      remote > 0 ? fmt::format(", {} of them over the network", remote) : "");
 }
 
@@ -91,16 +107,18 @@ void print_mirror(const StreamInfo& stream, const MirrorInfo& mirror, Output& ou
   add_line(out, "restarts", mirror.restarts);
 }
 
-void print_stream(const StreamInfo& stream, Output& out) {
+void print_stream(const StreamInfo& stream, bool iso, Output& out) {
   out.add(out.bold(escaped(stream.id.str())) + "\n");
   add_line(out, "owner", "host " + escaped(stream.id.host));
   add_line(out, "type", escaped(stream.type.str()));
   add_line(out, "depth", fmt::format("{} slots", stream.depth));
   add_line(out, "cycle", duration_text(stream.cycle));
-  print_samples(stream, out);
-  add_line(out, "writers", count_text(stream.writers, stream.remote_writers));
-  add_line(out, "readers", count_text(stream.readers, stream.remote_readers));
-  add_line(out, "channels", fmt::format("{} to other hosts, for programs there", stream.channels));
+  print_samples(stream, iso, out);
+  add_line(out, "writers", users_text(stream, stream.writers, stream.remote_writers));
+  add_line(out, "readers", users_text(stream, stream.readers, stream.remote_readers));
+  add_line(
+      out, "channels",
+      fmt::format("{} to other hosts, for programs there", count_text(stream, stream.channels)));
   add_line(out, "memory", bytes_text(stream.memory_bytes));
   add_line(out, "property", stream.property_bytes ? bytes_text(stream.property_bytes) : "none");
   add_line(out, "incarnation", stream.incarnation);
@@ -159,17 +177,18 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
   const std::vector<std::string> addresses =
       hosts.empty() ? std::vector<std::string>() : hosts.front().addresses;
   if (options.json) {
-    out.add(json_document({{"host", daemon.host},
-                           {"addresses", addresses},
-                           {"version", daemon.version},
-                           {"pid", daemon.pid},
-                           {"streams", daemon.streams},
-                           {"memory_bytes", daemon.memory_bytes},
-                           {"memory_limit_bytes", daemon.memory_limit_bytes},
-                           {"credentials", credentials_json(daemon)},
-                           {"config_file", or_null(daemon.config_file)},
-                           {"clock_policy", or_null(daemon.clock_policy)},
-                           {"limits", limits_json(daemon)}}));
+    out.add(json_output({{"host", daemon.host},
+                         {"addresses", addresses},
+                         {"version", daemon.version},
+                         {"pid", daemon.pid},
+                         {"streams", daemon.streams},
+                         {"memory_bytes", daemon.memory_bytes},
+                         {"memory_limit_bytes", daemon.memory_limit_bytes},
+                         {"credentials", credentials_json(daemon)},
+                         {"config_file", or_null(daemon.config_file)},
+                         {"clock_policy", or_null(daemon.clock_policy)},
+                         {"limits", limits_json(daemon)}},
+                        options.watch));
     return {};
   }
   out.add(out.bold("dssmd " + escaped(daemon.version)) + "\n");
@@ -186,23 +205,29 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
   return {};
 }
 
+Result<void> print_stream_info(Session& session, const StreamId& id, const InfoOptions& options,
+                               Output& out) {
+  Result<StreamInfo> stream = session.stream_info(id);
+  if (!stream) return with_similar_names(std::move(stream).error(), session, id);
+  if (options.json) {
+    Json json = stream_json(*stream);
+    add_details(json, *stream);
+    out.add(json_output(json, options.watch));
+  } else {
+    print_stream(*stream, options.iso, out);
+  }
+  return {};
+}
+
 }  // namespace
 
 Result<void> run(const InfoOptions& options, Output& out) {
   std::optional<StreamId> id;
   if (!options.stream.empty()) id = DSSM_TRY(StreamId::parse(options.stream));
   Session session = DSSM_TRY(connect(options));
-  if (!id) return print_daemon(session, options, out);
-  Result<StreamInfo> stream = session.stream_info(*id);
-  if (!stream) return with_similar_names(std::move(stream).error(), session, *id);
-  if (options.json) {
-    Json json = stream_json(*stream, WallClock::now());
-    add_details(json, *stream);
-    out.add(json_document(json));
-  } else {
-    print_stream(*stream, out);
-  }
-  return {};
+  return print_once_or_watch(options.watch, options.json, out, [&] {
+    return id ? print_stream_info(session, *id, options, out) : print_daemon(session, options, out);
+  });
 }
 
 }  // namespace dssm::ctl

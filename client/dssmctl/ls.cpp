@@ -32,7 +32,7 @@ void sort_by(std::vector<StreamInfo>& streams, Key key) {
                    [&](const StreamInfo& a, const StreamInfo& b) { return key(a) < key(b); });
 }
 
-// Numbers rise; streams that were never written to come last in "age".
+// Numbers rise; streams whose age is not known come last in "age".
 void sort_streams(std::vector<StreamInfo>& streams, const std::string& key) {
   if (key == "name")
     return sort_by(streams, [](const auto& s) { return std::pair(s.id.name, s.id.id); });
@@ -42,37 +42,37 @@ void sort_streams(std::vector<StreamInfo>& streams, const std::string& key) {
   if (key == "size") return sort_by(streams, [](const auto& s) { return s.type.payload_bytes; });
   if (key == "depth") return sort_by(streams, [](const auto& s) { return s.depth; });
   if (key == "cycle") return sort_by(streams, [](const auto& s) { return s.cycle; });
-  if (key == "rate") return sort_by(streams, [](const auto& s) { return s.rate_hz; });
+  if (key == "rate") {
+    return sort_by(streams, [](const auto& s) { return is_silent(s) ? 0 : s.rate_hz; });
+  }
   if (key == "writers") return sort_by(streams, [](const auto& s) { return s.writers; });
   if (key == "readers") return sort_by(streams, [](const auto& s) { return s.readers; });
   if (key == "type") return sort_by(streams, [](const auto& s) { return s.type.name; });
   if (key == "memory") return sort_by(streams, [](const auto& s) { return s.memory_bytes; });
   if (key == "age") {
     return sort_by(streams, [](const auto& s) {
-      const bool never = s.newest == kNoTid;
-      return std::pair(never, never ? Time::max() : time_from_ns(~to_ns(s.newest_time)));
+      return std::pair(!is_age_known(s), is_age_known(s) ? s.age : Duration());
     });
   }
 }
 
-std::string rate_text(double rate_hz) {
-  return rate_hz > 0 ? fmt::format("{:.1f} Hz", rate_hz) : "-";
-}
-
 constexpr std::string_view kDuplicateMark = " *";
 
-std::vector<std::string> row(const StreamInfo& stream, bool duplicate, Time now) {
+// `with_id`: the id has a column of its own.
+std::vector<std::string> row(const StreamInfo& stream, bool duplicate, bool with_id) {
   return {
-      escaped(stream.id.name).append(duplicate ? kDuplicateMark : ""),
+      escaped(with_id ? stream.id.name : short_name(stream.id))
+          .append(duplicate ? kDuplicateMark : ""),
       std::to_string(stream.id.id),
       escaped(stream.id.host),
       std::to_string(stream.type.payload_bytes),
       std::to_string(stream.depth),
       duration_text(stream.cycle),
-      rate_text(stream.rate_hz),
-      stream.newest == kNoTid ? "-" : duration_text(saturating_sub(now, stream.newest_time)),
-      std::to_string(stream.writers),
-      std::to_string(stream.readers),
+      rate_text(stream),
+      age_text(stream),
+      state_cell(stream),
+      count_text(stream, stream.writers),
+      count_text(stream, stream.readers),
       or_dash(escaped(stream.type.name)),
   };
 }
@@ -88,42 +88,56 @@ struct Listing {
   }
 };
 
-// One document, but a line per stream: with a thousand of them neither a tree of values in memory
-// nor indentation is worth its time.
-void print_json(const Listing& listing, Time now, Output& out) {
-  out.add("{\"streams\":[");
-  std::string_view separator = "\n";
+// A document as json_document() writes it, but without a tree of a thousand streams in memory.
+void print_json(const Listing& listing, Output& out) {
+  if (listing.streams.empty()) return out.add(json_document({{"streams", Json::array()}}));
+  out.add("{\n  \"streams\": [\n");
+  std::string_view separator;
   for (const StreamInfo& stream : listing.streams) {
-    Json json = stream_json(stream, now);
+    Json json = stream_json(stream);
     json["duplicate"] = listing.duplicates ? Json(listing.duplicate(stream)) : Json();
     out.add(separator);
-    out.add(json_text(json));
+    std::string text = json_document(json);
+    text.pop_back();  // its line end
+    // Strings in JSON have no line ends.
+    for (std::size_t at = 0; at != text.npos; at = text.find('\n', at + 1)) {
+      text.insert(at == 0 ? 0 : at + 1, "    ");
+    }
+    out.add(text);
     separator = ",\n";
   }
-  out.add("\n]}\n");
+  out.add("\n  ]\n}\n");
 }
 
-void print_table(const Listing& listing, Time now, Output& out) {
-  constexpr auto kRight = Table::Align::right;
+Table table_of(const Listing& listing, bool with_id) {
+  constexpr auto kLeft = Table::Align::left, kRight = Table::Align::right;
   Table table({{"NAME"},
-               {"ID", kRight},
+               {"ID", kRight, 1},
                {"HOST"},
-               {"SIZE", kRight},
-               {"DEPTH", kRight},
-               {"CYCLE", kRight},
+               {"SIZE", kRight, 3},
+               {"DEPTH", kRight, 2},
+               {"CYCLE", kRight, 4},
                {"RATE", kRight},
                {"AGE", kRight},
+               {"STATE"},
                {"WRITERS", kRight},
                {"READERS", kRight},
-               {"TYPE"}});
-  const StreamInfo* marked = nullptr;
+               {"TYPE", kLeft, 0, Table::Column::Fit::cut}});
   for (const StreamInfo& stream : listing.streams) {
-    const bool duplicate = listing.duplicate(stream);
-    if (duplicate) marked = &stream;
-    table.add_row(row(stream, duplicate, now));
+    table.add_row(row(stream, listing.duplicate(stream), with_id));
   }
+  return table;
+}
+
+void print_table(const Listing& listing, Output& out) {
+  Table table = table_of(listing, true);
+  // The column of ids is the first one to go.
+  if (!table.fits(out.columns())) table = table_of(listing, false);
   table.print(out);
-  if (marked) {
+  const auto marked =
+      std::find_if(listing.streams.rbegin(), listing.streams.rend(),
+                   [&](const StreamInfo& stream) { return listing.duplicate(stream); });
+  if (marked != listing.streams.rend()) {
     out.add(
         fmt::format("* several hosts have a stream of this name and id: say which one, as in {}\n",
                     escaped(marked->id.str())));
@@ -160,6 +174,18 @@ Result<void> check_hosts(Session& session, const std::vector<std::string>& wante
   return {};
 }
 
+// For standard error, so that standard output stays a table.
+std::string why_empty(const LsOptions& options, std::size_t all) {
+  if (all == 0) {
+    return options.own ? "this PC owns no streams"
+                       : "no streams; programs create them, or 'dssmctl create'";
+  }
+  const std::string others =
+      fmt::format("there {} {} other{}", all == 1 ? "is" : "are", all, all == 1 ? "" : "s");
+  if (options.pattern.empty()) return "no streams of these hosts; " + others;
+  return fmt::format("no streams that fit '{}'; {}", escaped(options.pattern), others);
+}
+
 // --- ls --watch
 
 // Events of the session's thread that this program has not shown yet. It grows only while our
@@ -185,6 +211,14 @@ class EventQueue {
   std::vector<StreamEvent> events_;
 };
 
+// What does not change while the stream exists: an event has nothing else, or as it was long ago.
+StreamInfo identity_of(StreamInfo stream) {
+  stream.oldest = stream.newest = kNoTid;
+  stream.rate_hz = 0;
+  stream.state = StreamState::unknown;
+  return stream;
+}
+
 // Prints a line for each stream that comes or goes.
 class StreamLog {
  public:
@@ -207,7 +241,7 @@ class StreamLog {
   void print_added(const StreamInfo& stream) {
     if (json_) {
       Json json = {{"event", "added"}};
-      json.update(stream_json(stream, WallClock::now()));
+      json.update(stream_json(identity_of(stream)));
       return out_.add(json_line(json));
     }
     out_.add(fmt::format("+ {} {} bytes, depth {}, cycle {}{}{}\n", escaped(stream.id.str()),
@@ -268,14 +302,22 @@ Result<void> run(const LsOptions& options, Output& out) {
   sort_streams(streams, options.sort);
   if (options.reverse) std::reverse(streams.begin(), streams.end());
 
+  const std::size_t all = streams.size();
   const StreamFilter filter(options.hosts, options.pattern);
   if (options.names) return print_names(session, streams, filter, out);
   Listing listing;
   if (!options.own) listing.duplicates.emplace(streams);
   std::erase_if(streams, [&](const StreamInfo& stream) { return !filter.takes(stream.id); });
   listing.streams = std::move(streams);
-  const Time now = WallClock::now();
-  options.json ? print_json(listing, now, out) : print_table(listing, now, out);
+  if (options.json) {
+    print_json(listing, out);
+  } else {
+    print_table(listing, out);
+    if (listing.streams.empty()) {
+      out.flush();
+      print_error(fmt::format("dssmctl: ls: {}\n", why_empty(options, all)));
+    }
+  }
   return {};
 }
 

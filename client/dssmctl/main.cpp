@@ -5,6 +5,7 @@
 //
 // Exit status: 0 success, 1 failure, 2 wrong usage (what no dssmd could do).
 #include <fmt/format.h>
+#include <locale.h>
 #include <signal.h>
 #include <unistd.h>
 
@@ -29,6 +30,8 @@ int report(const Error& error, const std::string& verb_name) {
 
 int main_program(int argc, char** argv) {
   ::signal(SIGPIPE, SIG_IGN);  // a closed pipe shows as EPIPE, see Output
+  ::setlocale(LC_CTYPE, "");   // NOLINT(concurrency-mt-unsafe): one thread
+  use_locale();
   Output out(STDOUT_FILENO);
   const CommandLine line = parse_command_line(argc, argv);
   if (!line.options) {
@@ -39,6 +42,7 @@ int main_program(int argc, char** argv) {
   }
   return std::visit(
       [&](const auto& options) {
+        if (options.wide) out.set_wide();
         const Result<void> result = run(options, out);
         out.flush();
         if (!result) return report(result.error(), options.verb_name);

@@ -5,6 +5,7 @@
 
 #include <algorithm>
 
+#include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/text.hpp"
 #include "core/base/try.hpp"
@@ -12,24 +13,43 @@
 namespace dssm::ctl {
 namespace {
 
+// So often a stream is checked whose next sample is still to come although newer ones are here.
+constexpr Duration kArrivingPeriod = std::chrono::milliseconds(10);
+
 // Reads the stamps of all samples after the reader's cursor, up to the newest one of this moment.
 class StampReader {
  public:
-  StampReader(RawReader& reader, const Meter& meter, MeterState& state)
-      : reader_(reader), meter_(meter), state_(state) {}
+  StampReader(RawReader& reader, Meter& meter, MeterState& state)
+      : reader_(reader), meter_(meter), state_(state), pauses_(reader.cycle()) {}
 
   void read_new() {
     read_ring();
     while (restarted()) {
       report_restart(reader_);
       state_.restarts = reader_.restarts();
-      if (meter_.on_gap) meter_.on_gap();
+      on_gap();
       read_ring();
     }
-    state_.age = saturating_sub(WallClock::now(), newest_time_);
   }
 
+  // Before a report.
+  void update_state() {
+    state_.empty = reader_.newest_tid() == kNoTid;
+    state_.age = saturating_sub(WallClock::now(), newest_time_);
+    const Duration quiet = MonoClock::now() - newest_arrival_;
+    state_.stalled = state_.seen > 0 && quiet >= pauses_.length() ? std::optional(quiet)
+                                                                  : std::optional<Duration>();
+  }
+
+  // The newest of the samples that were read came `age` ago.
+  void set_arrival(Duration age) { newest_arrival_ = MonoClock::now() - age; }
+
  private:
+  void on_gap() {
+    pauses_.on_gap();
+    meter_.on_gap();
+  }
+
   void read_ring() {
     const Time arrival = WallClock::now();
     const Tid newest = reader_.newest_tid();
@@ -41,17 +61,26 @@ class StampReader {
       if (status != ReadStatus::ok) {
         const Tid next = std::max(reader_.oldest_tid(), tid + 1);
         state_.lost += static_cast<std::uint64_t>(next - tid);
-        if (meter_.on_gap) meter_.on_gap();
+        on_gap();
         tid = next;
         continue;
       }
       ++tid;
-      ++state_.seen;
-      ++state_.new_samples;
-      newest_time_ = info.time;
-      meter_.on_sample(info, arrival);
+      on_sample(info, arrival);
     }
     reader_.seek(tid - 1);
+  }
+
+  void on_sample(const SampleInfo& info, Time arrival) {
+    ++state_.seen;
+    ++state_.new_samples;
+    newest_time_ = info.time;
+    newest_arrival_ = MonoClock::now();
+    if (const std::optional<Duration> pause = pauses_.on_sample(info.time)) {
+      state_.paused = pause;
+      meter_.on_pause();
+    }
+    meter_.on_sample(info, arrival);
   }
 
   // Continues with the stream's new ring, when there is one; reading stamps alone would not report
@@ -65,15 +94,17 @@ class StampReader {
   }
 
   RawReader& reader_;
-  const Meter& meter_;
+  Meter& meter_;
   MeterState& state_;
+  PauseDetector pauses_;
   Time newest_time_{};
+  MonoTime newest_arrival_{};
 };
 
 // The last sample not to count: before the newest `window` ones, or before what is to come.
-Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t window, bool awaited) {
+Tid start_before(const RawReader& reader, bool from_history, std::uint64_t window, bool awaited) {
   const Tid newest = reader.newest_tid();
-  if (!meter.from_history) return awaited ? kNoTid : newest;
+  if (!from_history) return awaited ? kNoTid : newest;
   const Tid start = std::max(newest - static_cast<Tid>(window), reader.oldest_tid() - 1);
   SampleInfo info;
   Tid tid = newest;
@@ -81,53 +112,225 @@ Tid start_before(const RawReader& reader, const Meter& meter, std::uint64_t wind
   return tid;
 }
 
-}  // namespace
+// A stream that is being measured. It stays where it is: its parts refer to each other.
+struct Measured {
+  Measured(OpenedStream stream, const MeterKind& kind)
+      : opened(std::move(stream)), meter(kind.make(opened.reader)) {
+    state.stream = opened.reader.id();
+    state.payload_bytes = opened.reader.payload_bytes();
+  }
+  Measured(const Measured&) = delete;
+  Measured& operator=(const Measured&) = delete;
 
-Result<void> run_meter(const MeterOptions& options, Output& out, const Meter& meter) {
-  const FetchHistory history = meter.from_history ? FetchHistory::at_once : FetchHistory::when_read;
-  return with_stream(options, history, [&](OpenedStream& opened) -> Result<void> {
+  Result<void> begin(const MeterOptions& options, const MeterKind& kind, Output& out) {
     RawReader& reader = opened.reader;
-    Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
-
-    MeterState state;
-    state.stream = reader.id();
-    state.payload_bytes = reader.payload_bytes();
-    StampReader stamps(reader, meter, state);
-    reader.seek(std::max(kNoTid, start_before(reader, meter, options.window, opened.awaited)));
-    if (meter.from_history) stamps.read_new();
-
-    std::uint64_t reports = 0;
-    MonoTime due = deadline_in(options.interval);
-    while (true) {
-      const bool early = meter.from_history && reports == 0 && state.seen >= 2;
-      if (early || MonoClock::now() >= due) {
-        meter.on_report(state, opened.session);
-        state.new_samples = 0;
-        if (!out.flush() || ++reports == options.count) return {};
-        due = deadline_in(options.interval);
-      }
-      const Follower::Wake wake = follower.wait(due);
-      stamps.read_new();
-      if (wake == Follower::Wake::stop || wake == Follower::Wake::ended) {
-        state.final = true;
-        meter.on_report(state, opened.session);
-        if (wake == Follower::Wake::ended) return end_of(reader);
-        return {};
-      }
+    follower.emplace(DSSM_TRY(Follower::open(opened.session, reader, out)));
+    reader.seek(
+        std::max(kNoTid, start_before(reader, kind.from_history, options.window, opened.awaited)));
+    if (!kind.from_history) return {};
+    const Result<StreamInfo> info = opened.session.stream_info(reader.id());
+    stamps.read_new();
+    if (info && info->newest == reader.cursor() && is_age_known(*info)) {
+      stamps.set_arrival(info->age);
     }
-  });
+    return {};
+  }
+
+  OpenedStream opened;
+  std::unique_ptr<Meter> meter;
+  MeterState state;
+  StampReader stamps{opened.reader, *meter, state};
+  std::optional<Follower> follower;
+  bool ended = false;
+};
+
+// "paused for 163 s, window restarted"; empty: nothing.
+std::string note(const MeterState& state) {
+  std::string text;
+  const auto add = [&](const std::string& part) { text += (text.empty() ? "" : "; ") + part; };
+  if (state.paused) add("paused for " + duration_text(*state.paused) + ", window restarted");
+  if (state.final) return text;
+  if (state.stalled) {
+    add("no new samples for " + duration_text(*state.stalled));
+  } else if (state.new_samples == 0) {
+    add(state.empty ? "no samples yet" : "no new samples");
+  }
+  return text;
 }
 
-Json report_json(const MeterState& state, const char* measured_key, std::uint64_t measured) {
-  Json json;
-  json["stream"] = state.stream.str();
-  json[measured_key] = measured;
-  json["new_samples"] = state.new_samples;
-  json["seen_samples"] = state.seen;
-  json["lost_samples"] = state.lost;
-  json["restarts"] = state.restarts;
-  json["final"] = state.final;
-  return json;
+// "--- odom:0@pc1: 12 samples, 0 lost ---", before a final report.
+std::string final_line(const MeterState& state) {
+  return fmt::format("--- {}: {} samples, {} lost{} ---\n", escaped(state.stream.str()), state.seen,
+                     state.lost,
+                     state.restarts > 0 ? fmt::format(", restarts: {}", state.restarts) : "");
+}
+
+class Meters {
+ public:
+  Meters(const MeterOptions& options, Output& out, const MeterKind& kind)
+      : options_(options), out_(out), kind_(kind) {}
+
+  Result<void> run() {
+    std::vector<OpenedStream> opened =
+        DSSM_TRY(open_streams(options_, options_.streams, history()));
+    if (opened.empty()) return {};
+    for (OpenedStream& stream : opened) {
+      all_.push_back(std::make_unique<Measured>(std::move(stream), kind_));
+      DSSM_TRY(all_.back()->begin(options_, kind_, out_));
+    }
+    std::uint64_t reports = 0;
+    MonoTime due = deadline_in(options_.interval);
+    while (true) {
+      if ((reports == 0 && is_early()) || MonoClock::now() >= due) {
+        report(false);
+        if (!out_.flush() || ++reports == options_.count) return {};
+        due = deadline_in(options_.interval);
+      }
+      if (!wait(due)) {
+        report(true);
+        return failure_;
+      }
+    }
+  }
+
+ private:
+  FetchHistory history() const {
+    return kind_.from_history ? FetchHistory::at_once : FetchHistory::when_read;
+  }
+
+  bool is_early() const {
+    return kind_.from_history && std::any_of(all_.begin(), all_.end(),
+                                             [](const auto& one) { return one->state.seen >= 2; });
+  }
+
+  // Waits until there is a sample, until `due`, or for a stop signal, and reads what is there.
+  // Returns whether to continue.
+  bool wait(MonoTime due) {
+    std::vector<RawReader*> idle;
+    MonoTime until = std::min(due, deadline_in(kStopCheckPeriod));
+    std::size_t alive = 0;
+    bool any = false;
+    for (const auto& one : all_) alive += one->ended ? 0 : 1;
+    for (const auto& one : all_) {
+      if (one->ended) continue;
+      const Follower::Wake wake = one->follower->wait(alive == 1 ? due : MonoTime());
+      one->stamps.read_new();
+      if (wake == Follower::Wake::stop) return false;
+      if (wake == Follower::Wake::ended) on_end(*one);
+      any |= wake != Follower::Wake::deadline;
+      const bool arriving = one->opened.reader.newest_tid() > one->opened.reader.cursor();
+      if (arriving) until = std::min(until, deadline_in(kArrivingPeriod));
+      if (!arriving) idle.push_back(&one->opened.reader);
+    }
+    if (std::all_of(all_.begin(), all_.end(), [](const auto& one) { return one->ended; })) {
+      return false;
+    }
+    if (any || alive == 1) return true;
+    if (idle.empty()) return out_.sleep_until(until);
+    static_cast<void>(wait_any(idle, until));
+    return true;
+  }
+
+  void on_end(Measured& one) {
+    one.ended = true;
+    Error error = end_of(one.opened.reader);
+    if (failure_) {
+      failure_ = std::move(error);
+    } else {
+      failure_ = Error{failure_.error().code, failure_.error().message + "; and " + error.message};
+    }
+  }
+
+  void report(bool final) {
+    for (const auto& one : all_) {
+      one->state.final = final;
+      one->stamps.update_state();
+    }
+    if (options_.json) {
+      for (const auto& one : all_) print_json(*one);
+    } else if (all_.size() == 1) {
+      print_block(*all_.front());
+    } else {
+      print_table(final);
+    }
+    for (const auto& one : all_) {
+      one->state.new_samples = 0;
+      one->state.paused.reset();
+    }
+  }
+
+  void print_json(const Measured& one) {
+    const MeterState& state = one.state;
+    Json json;
+    json["stream"] = state.stream.str();
+    json["new_samples"] = state.new_samples;
+    json["seen_samples"] = state.seen;
+    json["lost_samples"] = state.lost;
+    json["restarts"] = state.restarts;
+    json["age_ns"] = state.seen > 0 ? Json(to_ns(state.age)) : Json();
+    json["paused_ns"] = state.paused ? Json(to_ns(*state.paused)) : Json();
+    json["stalled_ns"] = state.stalled ? Json(to_ns(*state.stalled)) : Json();
+    json["final"] = state.final;
+    one.meter->add_json(state, json);
+    out_.add(json_line(json));
+  }
+
+  void print_block(const Measured& one) {
+    const MeterState& state = one.state;
+    if (state.final) out_.add(final_line(state));
+    if (const std::string line = note(state); !line.empty()) out_.add(line + "\n");
+    if (state.final || (state.new_samples > 0 && !state.stalled)) {
+      out_.add(one.meter->text(state));
+    }
+  }
+
+  void print_table(bool final) {
+    std::vector<Table::Column> columns = kind_.columns;
+    columns.insert(columns.begin(), {"STREAM"});
+    columns.push_back({"NOTE"});
+    Table table(std::move(columns));
+    for (const auto& one : all_) {
+      std::vector<std::string> row = one->meter->cells(one->state);
+      row.insert(row.begin(), escaped(one->state.stream.str()));
+      row.push_back(one->ended ? "it was removed" : note(one->state));
+      table.add_row(std::move(row));
+    }
+    if (final) {
+      for (const auto& one : all_) out_.add(final_line(one->state));
+    }
+    table.print(out_);
+    if (!final) out_.add("\n");
+  }
+
+  const MeterOptions& options_;
+  Output& out_;
+  const MeterKind& kind_;
+  std::vector<std::unique_ptr<Measured>> all_;
+  Result<void> failure_;  // of the streams that have ended
+};
+
+}  // namespace
+
+std::optional<Duration> PauseDetector::on_sample(Time time) {
+  constexpr std::size_t kIntervals = kRecentSamples - 1;
+  std::optional<Duration> pause;
+  if (previous_) {
+    const Duration interval = saturating_sub(time, *previous_);
+    // Before two intervals only the cycle is known, which may be far from the real one.
+    if (recent_.size() >= 2 && interval >= length()) pause = interval;
+    recent_.push_back(interval);
+    if (recent_.size() > kIntervals) recent_.pop_front();
+  }
+  previous_ = time;
+  return pause;
+}
+
+Duration PauseDetector::length() const {
+  return pause_length(std::vector<Duration>(recent_.begin(), recent_.end()), cycle_);
+}
+
+Result<void> run_meter(const MeterOptions& options, Output& out, const MeterKind& kind) {
+  return Meters(options, out, kind).run();
 }
 
 void add_statistics(Json& json, const std::string& name, const Statistics& statistics) {
@@ -141,15 +344,14 @@ void add_statistics(Json& json, const std::string& name, const Statistics& stati
 }
 
 std::string statistics_line(const Statistics& statistics, std::size_t window) {
-  return fmt::format("\tmin: {} s max: {} s std dev: {:.9f} s window: {}\n",
-                     seconds_text(to_ns(statistics.min)), seconds_text(to_ns(statistics.max)),
-                     statistics.std_dev_ns / 1e9, window);
+  return fmt::format("\tmin: {} max: {} std dev: {} window: {}\n", duration_text(statistics.min),
+                     duration_text(statistics.max), ns_text(statistics.std_dev_ns), window);
 }
 
-std::string final_line(const MeterState& state) {
-  return fmt::format("--- {}: {} samples, {} lost{} ---\n", escaped(state.stream.str()), state.seen,
-                     state.lost,
-                     state.restarts > 0 ? fmt::format(", restarts: {}", state.restarts) : "");
+std::vector<std::string> statistics_cells(const Statistics& statistics) {
+  if (statistics.count == 0) return {"-", "-", "-"};
+  return {duration_text(statistics.min), duration_text(statistics.max),
+          ns_text(statistics.std_dev_ns)};
 }
 
 }  // namespace dssm::ctl

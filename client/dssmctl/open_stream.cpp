@@ -2,8 +2,10 @@
 #include "client/dssmctl/open_stream.hpp"
 
 #include <fmt/format.h>
+#include <sys/stat.h>
 
 #include <algorithm>
+#include <cstdlib>
 #include <utility>
 
 #include "client/dssmctl/names.hpp"
@@ -19,15 +21,18 @@ bool may_come(const Error& error) {
   return error.code == Errc::not_found || error.code == Errc::unavailable;
 }
 
+std::string socket_path(const CommonOptions& options) {
+  if (!options.socket_path.empty()) return options.socket_path;
+  const char* path = std::getenv("DSSM_SOCKET");  // NOLINT(concurrency-mt-unsafe): one thread
+  return path ? path : "";
+}
+
 // Without a reader and without an error after a stop signal.
-Result<std::optional<OpenedStream>> open_stream(const ReadingOptions& options,
-                                                FetchHistory history) {
-  Session session = DSSM_TRY(connect(options));
-  const StreamId id = DSSM_TRY(StreamId::parse(options.stream));
+Result<std::optional<OpenedStream>> open_stream(Session& session, const StreamId& id, Duration wait,
+                                                MonoTime deadline, FetchHistory history) {
   Result<RawReader> reader = session.open_raw_reader(id, nullptr, 0, history);
   if (reader) return std::optional(OpenedStream{session, std::move(*reader), false});
 
-  const MonoTime deadline = deadline_in(options.wait);
   while (may_come(reader.error()) && MonoClock::now() < deadline) {
     if (stop_requested()) return std::optional<OpenedStream>();
     reader = session.await_raw_reader(id, std::min(deadline, deadline_in(kStopCheckPeriod)),
@@ -35,7 +40,7 @@ Result<std::optional<OpenedStream>> open_stream(const ReadingOptions& options,
     if (reader) return std::optional(OpenedStream{session, std::move(*reader), true});
   }
   Error error = with_similar_names(std::move(reader).error(), session, id);
-  if (error.code == Errc::not_found && options.wait == Duration::zero()) {
+  if (error.code == Errc::not_found && wait == Duration::zero()) {
     error.message += "; --wait SECONDS waits for it";
   }
   return error;
@@ -47,14 +52,42 @@ Result<Session> connect(const CommonOptions& options) {
   SessionOptions session_options;
   session_options.socket_path = options.socket_path;
   session_options.program = "dssmctl " + options.verb_name;
-  return Session::connect(std::move(session_options));
+  Result<Session> session = Session::connect(std::move(session_options));
+  const std::string path = socket_path(options);
+  struct stat file {};
+  if (session || session.error().code != Errc::no_daemon || ::stat(path.c_str(), &file) ||
+      S_ISSOCK(file.st_mode)) {
+    return session;
+  }
+  return Error{Errc::no_daemon,
+               fmt::format("connect to dssmd at '{}': this is a {}, not dssmd's socket; give the "
+                           "socket itself, such as {}",
+                           path, S_ISDIR(file.st_mode) ? "folder" : "file",
+                           S_ISDIR(file.st_mode) ? path + "/dssmd.sock" : "/run/dssm/dssmd.sock")};
 }
 
-Result<void> with_stream(const ReadingOptions& options, FetchHistory history,
-                         const std::function<Result<void>(OpenedStream&)>& work) {
+Result<std::vector<OpenedStream>> open_streams(const ReadingOptions& options,
+                                               const std::vector<std::string>& streams,
+                                               FetchHistory history) {
   catch_stop_signals();
-  std::optional<OpenedStream> opened = DSSM_TRY(open_stream(options, history));
-  return opened ? work(*opened) : Result<void>();
+  Session session = DSSM_TRY(connect(options));
+  std::vector<StreamId> ids;
+  for (const std::string& stream : streams) ids.push_back(DSSM_TRY(StreamId::parse(stream)));
+  const MonoTime deadline = deadline_in(options.wait);
+  std::vector<OpenedStream> opened;
+  for (const StreamId& id : ids) {
+    std::optional<OpenedStream> one =
+        DSSM_TRY(open_stream(session, id, options.wait, deadline, history));
+    if (!one) return std::vector<OpenedStream>();
+    opened.push_back(*std::move(one));
+  }
+  return opened;
+}
+
+std::string full_name(Session& session, const StreamId& id) {
+  if (!id.host.empty()) return id.str();
+  const Result<StreamInfo> info = session.stream_info(id);
+  return info ? info->id.str() : id.str();
 }
 
 Error with_similar_names(Error error, Session& session, const StreamId& wanted) {

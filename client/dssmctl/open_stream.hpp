@@ -6,8 +6,9 @@
 
 #include <atomic>
 #include <dssm/session.hpp>
-#include <functional>
 #include <memory>
+#include <string>
+#include <vector>
 
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
@@ -22,12 +23,15 @@ struct OpenedStream {
   bool awaited;  // it was not there at first: nothing of it was missed
 };
 
-// For verbs that run until a stop signal: catches stop signals, connects, opens `options.stream`
-// for reading, waiting up to `options.wait` for it, and does `work` with it. history: as in
-// Session. Success without `work` when a stop signal came before; a failure to open names similar
-// streams.
-Result<void> with_stream(const ReadingOptions& options, FetchHistory history,
-                         const std::function<Result<void>(OpenedStream&)>& work);
+// For verbs that run until a stop signal: catches stop signals, connects, and opens `streams` for
+// reading, waiting up to `options.wait` for all of them. history: as in Session. Returns none when
+// a stop signal came before; a failure to open names similar streams.
+Result<std::vector<OpenedStream>> open_streams(const ReadingOptions& options,
+                                               const std::vector<std::string>& streams,
+                                               FetchHistory history);
+
+// The name of an existing stream with its host.
+std::string full_name(Session& session, const StreamId& id);
 
 // `error` with a hint at streams named like `wanted` when there is no such stream.
 Error with_similar_names(Error error, Session& session, const StreamId& wanted);

@@ -9,10 +9,14 @@
 #include <fmt/format.h>
 
 #include <CLI/CLI.hpp>
+#include <algorithm>
+#include <array>
 #include <bit>
+#include <dssm/reader.hpp>
 #include <limits>
 #include <memory>
 
+#include "client/dssmctl/names.hpp"
 #include "client/dssmctl/text.hpp"
 #include "core/base/try.hpp"
 
@@ -54,8 +58,9 @@ template <class Target>
 CLI::Option* add_seconds(CLI::App* app, const std::string& name, const std::string& description,
                          Target& target, Range range) {
   return add_parsed(
-      app, name, "SECONDS", description, [&target, range](const std::string& text) -> Result<void> {
-        const Duration value = DSSM_TRY(parse_seconds(text));
+      app, name, "DURATION", description,
+      [&target, range](const std::string& text) -> Result<void> {
+        const Duration value = DSSM_TRY(parse_duration(text));
         if (range == Range::positive && value <= Duration::zero()) {
           return Error{Errc::invalid_argument, fmt::format("'{}' must be greater than zero", text)};
         }
@@ -67,6 +72,15 @@ CLI::Option* add_seconds(CLI::App* app, const std::string& name, const std::stri
       });
 }
 
+CLI::Option* add_moment(CLI::App* app, const std::string& name, const std::string& description,
+                        std::optional<Moment>& target) {
+  return add_parsed(app, name, "TIME", description,
+                    [&target](const std::string& text) -> Result<void> {
+                      target = DSSM_TRY(parse_moment(text, WallClock::now()));
+                      return {};
+                    });
+}
+
 CLI::Option* add_real(CLI::App* app, const std::string& name, const std::string& placeholder,
                       const std::string& description, std::optional<double>& target) {
   return add_parsed(app, name, placeholder, description,
@@ -75,6 +89,18 @@ CLI::Option* add_real(CLI::App* app, const std::string& name, const std::string&
                       return {};
                     });
 }
+
+// Help without what options exclude and need: the error says that.
+class HelpFormatter : public CLI::Formatter {
+ public:
+  std::string make_option_opts(const CLI::Option* option) const override {
+    if (option->get_type_size() == 0) return {};
+    std::string text = option->get_type_name().empty() ? "" : " " + option->get_type_name();
+    if (option->get_expected_max() == CLI::detail::expected_max_vector_size) text += " ...";
+    if (option->get_required()) text += " REQUIRED";
+    return text;
+  }
+};
 
 constexpr const char* kStreamHelp = "the stream, as NAME, NAME:ID or NAME:ID@HOST";
 
@@ -122,6 +148,16 @@ void add_interval(CLI::App* verb, const std::string& of, Duration& interval) {
               Range::positive);
 }
 
+void add_watch(CLI::App* verb, bool& watch) {
+  verb->add_flag("--watch", watch,
+                 "continue: on a terminal redrawn each second, else printed again when it changes");
+}
+
+// As --wide, which all verbs have; -w is taken in others.
+void add_wide(CLI::App* verb, Parsed& parsed) {
+  verb->add_flag("-w", parsed.common.wide, "as --wide");
+}
+
 void add_names(CLI::App* verb, bool& names) {
   verb->add_flag("--names", names, "only names, one per line, for programs");
 }
@@ -134,11 +170,12 @@ void check_ls(const LsOptions& options) {
 }
 
 std::string check_sort_key(std::string& key) {
-  for (const char* known : {"created", "name", "id", "host", "size", "depth", "cycle", "rate",
-                            "age", "writers", "readers", "type", "memory"}) {
-    if (key == known) return {};
-  }
-  return fmt::format("'{}' is not a key to sort by", escaped(key));
+  static constexpr std::array kKeys = {"created", "name",  "id",    "host", "size",
+                                       "depth",   "cycle", "rate",  "age",  "writers",
+                                       "readers", "type",  "memory"};
+  if (std::find(kKeys.begin(), kKeys.end(), key) != kKeys.end()) return {};
+  return fmt::format("'{}' is not a key to sort by; there are {}", escaped(key),
+                     fmt::join(kKeys, ", "));
 }
 
 void add_ls(CLI::App& app, Parsed& parsed) {
@@ -147,13 +184,16 @@ void add_ls(CLI::App& app, Parsed& parsed) {
   ls->add_option("PATTERN", options.pattern,
                  "only streams whose NAME or NAME:ID this shell pattern fits, as 'camera*'")
       ->type_name("");
-  CLI::Option* own = ls->add_flag("--own,--local", options.own, "only those of this host");
-  ls->add_option("--host", options.hosts, "only those of this host; may be given several times")
+  CLI::Option* own =
+      ls->add_flag("--own,--local", options.own, "only the streams that this PC owns");
+  ls->add_option("--host", options.hosts,
+                 "only the streams that HOST owns; may be given several times")
       ->type_name("HOST")
       ->allow_extra_args(false)  // one value per --host, so that PATTERN may follow
       ->excludes(own);
-  ls->add_flag("--watch", options.watch,
-               "continue: a line for each stream that is added or removed");
+  ls->add_flag(
+      "--watch", options.watch,
+      "a log: a line for each stream that is there, then for each that is added or removed");
   add_names(ls, options.names);
   ls->add_option("--sort", options.sort,
                  "created, name, id, host, size, depth, cycle, rate, age, writers, readers, type "
@@ -161,14 +201,18 @@ void add_ls(CLI::App& app, Parsed& parsed) {
       ->type_name("KEY")
       ->check(CLI::Validator(check_sort_key, ""));
   ls->add_flag("-r,--reverse", options.reverse, "in reverse order");
+  add_wide(ls, parsed);
 }
 
 void add_hosts(CLI::App& app, Parsed& parsed) {
   CLI::App* hosts = app.add_subcommand("hosts", "list the hosts, and how they are reached");
   HostsOptions& options = add_options<HostsOptions>(hosts, parsed, [](const HostsOptions& all) {
     require(!all.names || !all.json, "--names and --json: choose one");
+    require(!all.names || !all.watch, "--names and --watch: choose one");
   });
   add_names(hosts, options.names);
+  add_watch(hosts, options.watch);
+  add_wide(hosts, parsed);
 }
 
 void add_nodes(CLI::App& app, Parsed& parsed) {
@@ -210,7 +254,9 @@ void add_graph(CLI::App& app, Parsed& parsed) {
 void add_clock(CLI::App& app, Parsed& parsed) {
   CLI::App* clock = app.add_subcommand("clock", "how good the hosts' clocks are");
   ClockOptions& options = add_options<ClockOptions>(clock, parsed);
-  CLI::Option* watch = clock->add_flag("--watch", options.watch, "continue: all again each second");
+  add_watch(clock, options.watch);
+  add_wide(clock, parsed);
+  CLI::Option* watch = clock->get_option("--watch");
   CLI::Option* matrix =
       clock->add_flag("--matrix", options.matrix,
                       "a row for each pair of hosts: how far their clocks may be apart");
@@ -232,7 +278,7 @@ void add_ping(CLI::App& app, Parsed& parsed) {
   ping->add_option("HOST", options.host, "a name that `dssmctl hosts` shows")
       ->required()
       ->type_name("");
-  add_whole(ping, "-c,--count", "N", "end after N questions", options.count, 1);
+  add_whole(ping, "-n,-c,--count", "N", "end after N questions", options.count, 1);
   add_interval(ping, "questions", options.interval);
 }
 
@@ -240,6 +286,7 @@ void add_info(CLI::App& app, Parsed& parsed) {
   CLI::App* info = app.add_subcommand("info", "all about one stream, or about dssmd");
   InfoOptions& options = add_options<InfoOptions>(info, parsed);
   info->add_option("STREAM", options.stream, kStreamHelp)->type_name("");
+  add_watch(info, options.watch);
 }
 
 void add_echo(CLI::App& app, Parsed& parsed) {
@@ -249,14 +296,11 @@ void add_echo(CLI::App& app, Parsed& parsed) {
   });
   add_stream(echo, options.stream);
   CLI::Option* last = echo->add_flag("--last", options.last, "the newest sample, then end");
-  add_parsed(echo, "--at", "TIME",
-             "the newest sample at or before TIME, then end: seconds since 1970, or, with a minus "
-             "sign, seconds before the newest sample",
-             [&options](const std::string& text) -> Result<void> {
-               options.at = DSSM_TRY(parse_seconds(text));
-               options.at_counts_back = text.starts_with('-');  // also "-0"
-               return {};
-             })
+  add_moment(
+      echo, "--at",
+      "the newest sample at or before TIME, then end: seconds since 1970, ISO 8601, now, or, "
+      "with a minus sign, so long before the newest sample (-1.5, -500ms)",
+      options.at)
       ->excludes(last);
   add_whole(echo, "-n,--count", "N", "end after N samples (default: 1 with --at or --last)",
             options.count, 1);
@@ -326,8 +370,15 @@ template <class VerbOptions>
 void add_meter(CLI::App& app, Parsed& parsed, const std::string& name,
                const std::string& description) {
   CLI::App* meter = app.add_subcommand(name, description);
-  VerbOptions& options = add_options<VerbOptions>(meter, parsed);
-  add_stream(meter, options.stream);
+  VerbOptions& options = add_options<VerbOptions>(meter, parsed, [](const VerbOptions& all) {
+    require(all.streams.size() <= kMaxWaitAny,
+            fmt::format("at most {} streams at once", kMaxWaitAny));
+  });
+  meter
+      ->add_option("STREAM", options.streams,
+                   "one or several streams, as NAME, NAME:ID or NAME:ID@HOST")
+      ->required()
+      ->type_name("");
   add_whole(meter, "-w,--window", "N", "over the newest N samples (default: 10000)", options.window,
             2, kMaxWindow);
   add_whole(meter, "-n,--count", "N", "end after N reports", options.count, 1);
@@ -406,7 +457,9 @@ void add_playback(CLI::App& app, Parsed& parsed) {
       add_real(set, "--offset", "SECONDS", "its offset from speed * real time", changed.offset_s);
   add_real(set, "--speed", "X", "how fast it runs: 1 as real time, 0 not at all, -1 backwards",
            changed.speed);
-  add_real(set, "--time", "SECONDS", "its time now, in seconds since 1970", changed.time_s)
+  add_moment(set, "--time",
+             "its time now: seconds since 1970, ISO 8601, now, or so long before now (-3s)",
+             changed.time)
       ->excludes(offset);
   set->require_option(1, 0);
   add("pause", "stop the clock").paused = true;
@@ -503,13 +556,23 @@ void add_pki(CLI::App& app, Parsed& parsed) {
 void add_all(CLI::App& app, Parsed& parsed) {
   // Global options may also follow the verb; verbs made after these lines inherit both.
   app.fallthrough();
-  app.footer("--socket and --json may precede or follow the verb; more in dssmctl(1).");
+  const auto formatter = std::make_shared<HelpFormatter>();
+  formatter->label("SUBCOMMAND", "VERB");
+  app.formatter(formatter);
+  app.footer(
+      "--socket, --json, --iso and --wide may precede or follow the verb; 'dssmctl help VERB' "
+      "explains it, and dssmctl(1) all.");
   app.require_subcommand(1);
+  app.set_help_flag("-h,--help", "show this help and end");
   app.set_version_flag("--version", "dssmctl " DSSM_VERSION, "show the version and end");
   app.add_option("--socket", parsed.common.socket_path,
                  "where dssmd listens (default: $DSSM_SOCKET, else /run/dssm/dssmd.sock)")
       ->type_name("PATH");
   app.add_flag("--json", parsed.common.json, "output for programs");
+  app.add_flag("--iso", parsed.common.iso,
+               "times as ISO 8601 in UTC, not as seconds since 1970 (JSON has nanoseconds)");
+  app.add_flag("--wide", parsed.common.wide,
+               "tables with all columns, also where the terminal is narrower");
   add_ls(app, parsed);
   add_hosts(app, parsed);
   add_nodes(app, parsed);
@@ -549,6 +612,54 @@ std::string verb_name(const CLI::App& app) {
   return name;
 }
 
+std::vector<std::string> verbs_of(const CLI::App& app) {
+  std::vector<std::string> verbs;
+  for (const CLI::App* verb : app.get_subcommands({})) verbs.push_back(verb->get_name());
+  return verbs;
+}
+
+// What is called otherwise elsewhere: by people, ROS 2, or this program's earlier versions.
+constexpr std::pair<std::string_view, std::string_view> kOtherNames[] = {
+    {"list", "ls"},        {"topic", "ls"},         {"topics", "ls"},     {"streams", "ls"},
+    {"top", "ls --watch"}, {"watch", "ls --watch"}, {"cat", "echo"},      {"read", "echo"},
+    {"rate", "hz"},        {"bandwidth", "bw"},     {"latency", "delay"}, {"show", "info"},
+    {"describe", "info"},  {"stat", "info"},        {"type", "info"},     {"interface", "info"},
+    {"delete", "rm"},      {"remove", "rm"},        {"new", "create"},    {"status", "doctor"},
+    {"check", "doctor"},   {"wtf", "doctor"},       {"peers", "hosts"},   {"host", "hosts"},
+    {"time", "clock"},     {"version", "--version"}};
+
+// " (did you mean 'ls'?)", for a verb that there is not; `next` is the word after it.
+std::string verb_hint(const CLI::App& at, const std::string& word, const std::string& next) {
+  std::vector<std::string> verbs = verbs_of(at);
+  const auto has = [&](std::string_view name) {
+    return std::find(verbs.begin(), verbs.end(), name.substr(0, name.find(' '))) != verbs.end();
+  };
+  const auto hint = [](std::string_view name) {
+    return fmt::format(" (did you mean '{}'?)", name);
+  };
+  if (word == "topic" && has(next)) return hint(next);  // ros2 topic hz
+  for (const auto& [other, name] : kOtherNames) {
+    if (word == other && (has(name) || name.starts_with("--"))) return hint(name);
+  }
+  const std::vector<std::string> similar = similar_names(word, std::move(verbs));
+  return similar.empty() ? "" : hint(similar.front());
+}
+
+std::string no_verb(const CLI::App& at, const std::string& word, const std::string& next) {
+  return fmt::format("there is no verb '{}'{}", word, verb_hint(at, word, next));
+}
+
+// The words that are no options, nor --socket's value.
+std::vector<std::string> plain_words(const std::vector<const char*>& words) {
+  std::vector<std::string> plain;
+  for (std::size_t i = 1; i < words.size(); ++i) {
+    const std::string_view word = words[i];
+    if (word == "--socket") ++i;
+    if (!word.starts_with('-')) plain.emplace_back(word);
+  }
+  return plain;
+}
+
 CommandLine usage_error(const CLI::App& app, const std::string& error) {
   const std::string verb = verb_name(app);
   return {std::nullopt,
@@ -560,25 +671,43 @@ CommandLine usage_error(const CLI::App& app, const std::string& error) {
 }  // namespace
 
 CommandLine parse_command_line(int argc, const char* const* argv) {
+  // `help VERB` is `VERB --help`.
+  std::vector<const char*> words(argv, argv + argc);
+  if (argc > 1 && std::string_view(argv[1]) == "help") {
+    words.erase(words.begin() + 1);
+    words.push_back("--help");
+    argc = static_cast<int>(words.size());
+  }
   Parsed parsed;
   CLI::App app("Show and manage streams of sensor samples, on this PC and on others.", "dssmctl");
   add_all(app, parsed);
   if (argc < 2) return {std::nullopt, app.help(), false};
+  // CLI11 would take the next word for the verb.
+  const std::vector<std::string> plain = plain_words(words), verbs = verbs_of(app);
+  if (!plain.empty() && std::find(verbs.begin(), verbs.end(), plain.front()) == verbs.end()) {
+    return usage_error(app, no_verb(app, plain.front(), plain.size() > 1 ? plain[1] : ""));
+  }
   try {
-    app.parse(argc, argv);
+    app.parse(argc, words.data());
   } catch (const CLI::CallForHelp&) {
     return {std::nullopt, app.help(), true};
   } catch (const CLI::CallForVersion& version) {
     return {std::nullopt, version.what() + std::string("\n"), true};
   } catch (const CLI::ParseError& error) {
     const std::vector<std::string> rest = app.remaining(true);
-    if (rest.empty()) return usage_error(app, error.what());
+    if (rest.empty()) {
+      const bool lacks_verb =
+          innermost(app).get_require_subcommand_min() > 0 &&
+          innermost(app).get_subcommands().empty() &&
+          error.get_exit_code() == static_cast<int>(CLI::ExitCodes::RequiredError);
+      return usage_error(app, lacks_verb ? "a verb is missing" : error.what());
+    }
     const std::string word = fmt::format("'{}'", rest.front());
     if (rest.front().starts_with('-')) return usage_error(app, "there is no option " + word);
     if (innermost(app).get_subcommands({}).empty()) {
       return usage_error(app, word + " is one word too many");
     }
-    return usage_error(app, "there is no verb " + word);
+    return usage_error(app, no_verb(innermost(app), rest.front(), ""));
   }
   if (!parsed.options) return usage_error(app, "a verb is missing");  // CLI11 requires one
   std::visit([&](CommonOptions& options) { options.verb_name = verb_name(app); }, *parsed.options);

@@ -14,6 +14,7 @@
 #include <vector>
 
 #include "client/dssmctl/output.hpp"
+#include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
 
@@ -22,6 +23,8 @@ struct CommonOptions {
   std::string verb_name;    // as typed, "property get": for messages
   std::string socket_path;  // empty: the default
   bool json = false;
+  bool iso = false;   // times for people as ISO 8601
+  bool wide = false;  // tables with all columns, however narrow the terminal is
 };
 
 struct LsOptions : CommonOptions {
@@ -36,6 +39,7 @@ struct LsOptions : CommonOptions {
 
 struct HostsOptions : CommonOptions {
   bool names = false;
+  bool watch = false;
 };
 
 struct NodesOptions : CommonOptions {
@@ -65,18 +69,18 @@ struct PingOptions : CommonOptions {
 
 struct InfoOptions : CommonOptions {
   std::string stream;  // empty: about dssmd itself
+  bool watch = false;
 };
 
 // Of verbs that read a stream.
 struct ReadingOptions : CommonOptions {
-  std::string stream;
   Duration wait{};                     // how long for the stream to appear
   std::optional<std::uint64_t> count;  // of samples or reports
 };
 
 struct EchoOptions : ReadingOptions {
-  std::optional<Duration> at;
-  bool at_counts_back = false;  // from the newest sample; `at` is then 0 or less
+  std::string stream;
+  std::optional<Moment> at;  // counts back from the newest sample
   bool last = false;
   bool csv = false;
   bool full = false;
@@ -101,6 +105,7 @@ struct ShowOptions : CommonOptions {
 
 // Of hz, bw and delay.
 struct MeterOptions : ReadingOptions {
+  std::vector<std::string> streams;
   std::uint64_t window = 10'000;
   Duration interval = std::chrono::seconds(1);
 };
@@ -136,7 +141,8 @@ struct PropertySetOptions : PropertyOptions {};
 struct PlaybackOptions : CommonOptions {
   std::optional<bool> paused;
   bool reset = false;
-  std::optional<double> offset_s, speed, time_s;
+  std::optional<double> offset_s, speed;
+  std::optional<Moment> time;  // counts back from now
 };
 
 // Of dssmctl pki. Folders are those of a CA and of credentials; out: "-" or empty for standard

@@ -4,13 +4,19 @@
 #include <fmt/format.h>
 #include <poll.h>
 #include <signal.h>
+#include <sys/ioctl.h>
 #include <unistd.h>
 
 #include <algorithm>
 #include <atomic>
 #include <cerrno>
 #include <cstdlib>
+#include <limits>
 #include <thread>
+#include <utility>
+
+#include "client/dssmctl/text.hpp"
+#include "core/base/try.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -37,6 +43,13 @@ Output::Output(int fd) : fd_(fd), terminal_(::isatty(fd) == 1) {
   colour_ = terminal_ && (!no_color || !*no_color);
 }
 
+std::size_t Output::columns() const {
+  winsize size{};
+  const bool is_limited =
+      terminal_ && !wide_ && ::ioctl(fd_, TIOCGWINSZ, &size) == 0 && size.ws_col > 0;
+  return is_limited ? size.ws_col : std::numeric_limits<std::size_t>::max();
+}
+
 bool Output::flush() {
   std::string_view rest = pending_;
   while (!stopped_ && !rest.empty()) {
@@ -53,6 +66,48 @@ bool Output::flush() {
   }
   pending_.clear();
   return !stopped_;
+}
+
+bool Output::flush_changed(std::string_view end) {
+  if (pending_ == screen_) {
+    pending_.clear();
+    return !stopped_;
+  }
+  screen_ = pending_;
+  pending_ += end;
+  return flush();
+}
+
+bool Output::flush_screen() {
+  winsize size{};
+  const std::size_t rows = ::ioctl(fd_, TIOCGWINSZ, &size) == 0 && size.ws_row > 1
+                               ? size.ws_row - 1U
+                               : std::numeric_limits<std::size_t>::max();
+  // Line by line over the last ones: to clear the screen first would flicker.
+  std::string drawn = screen_.empty() ? "\x1b[2J\x1b[H" : "\x1b[H";
+  screen_ = std::exchange(pending_, {});
+  std::string_view rest = screen_;
+  for (std::size_t row = 0; row < rows && !rest.empty(); ++row) {
+    const std::size_t line = rest.find('\n');
+    drawn.append(rest.substr(0, line)).append("\x1b[K\n");
+    rest.remove_prefix(line == std::string_view::npos ? rest.size() : line + 1);
+  }
+  pending_ = drawn + "\x1b[J";
+  return flush();
+}
+
+Result<void> print_once_or_watch(bool watch, bool json, Output& out,
+                                 const std::function<Result<void>()>& print) {
+  constexpr Duration kPeriod = std::chrono::seconds(1);
+  if (!watch) return print();
+  catch_stop_signals();
+  for (MonoTime next = MonoClock::now();; next += kPeriod) {
+    DSSM_TRY(print());
+    const bool is_read = json             ? out.flush_changed("")
+                         : out.terminal() ? out.flush_screen()
+                                          : out.flush_changed("\n");
+    if (!is_read || !out.sleep_until(next + kPeriod)) return {};
+  }
 }
 
 bool Output::must_stop() {
@@ -80,33 +135,104 @@ void print_error(std::string_view text) {
   err.flush();
 }
 
-void Table::print(Output& out) const {
+std::vector<std::size_t> Table::widths() const {
   std::vector<std::size_t> widths;
   for (std::size_t i = 0; i < columns_.size(); ++i) {
-    std::size_t width = columns_[i].title.size();
-    for (const auto& row : rows_) width = std::max(width, row[i].size());
+    std::size_t width = columns_of(columns_[i].title);
+    for (const auto& row : rows_) width = std::max(width, columns_of(row[i]));
     widths.push_back(width);
   }
+  return widths;
+}
+
+namespace {
+
+constexpr std::size_t kBetween = 2;  // blanks
+
+// What is left of a table that has to fit.
+struct Layout {
+  std::vector<std::size_t> shown;   // indices of columns
+  std::vector<std::size_t> widths;  // of all columns
+  bool last_below = false;
+
+  std::size_t width() const {
+    std::size_t sum = 0;
+    for (const std::size_t i : shown) sum += widths[i] + kBetween;
+    return sum > 0 ? sum - kBetween : 0;
+  }
+};
+
+Layout layout_of(const std::vector<Table::Column>& columns, std::vector<std::size_t> widths,
+                 std::size_t available) {
+  using Fit = Table::Column::Fit;
+  Layout layout{{}, std::move(widths)};
+  for (std::size_t i = 0; i < columns.size(); ++i) layout.shown.push_back(i);
+  if (layout.width() > available && columns.back().fit == Fit::below) {
+    layout.shown.pop_back();
+    layout.last_below = true;
+  }
+  for (unsigned drop = 1; drop <= columns.size() && layout.width() > available; ++drop) {
+    std::erase_if(layout.shown, [&](std::size_t i) { return columns[i].drop == drop; });
+  }
+  for (const std::size_t i : layout.shown) {
+    if (layout.width() <= available || columns[i].fit != Fit::cut) continue;
+    const std::size_t excess = layout.width() - available;
+    const std::size_t least = std::min(layout.widths[i], columns_of(columns[i].title));
+    layout.widths[i] -= std::min(excess, layout.widths[i] - least);
+  }
+  return layout;
+}
+
+// `text` in lines of `columns` columns at most, broken at blanks, each after four blanks.
+std::string wrapped(std::string_view text, std::size_t columns) {
+  constexpr std::string_view kIndent = "    ";
+  std::string out, line;
+  while (!text.empty()) {
+    const std::size_t end = std::min(text.find(' '), text.size());
+    const std::string_view word = text.substr(0, end);
+    text.remove_prefix(std::min(end + 1, text.size()));
+    if (!line.empty() && kIndent.size() + columns_of(line) + 1 + columns_of(word) > columns) {
+      out.append(kIndent).append(line).append("\n");
+      line.clear();
+    }
+    line.append(line.empty() ? "" : " ").append(word);
+  }
+  if (!line.empty()) out.append(kIndent).append(line).append("\n");
+  return out;
+}
+
+}  // namespace
+
+bool Table::fits(std::size_t columns) const {
+  std::size_t sum = 0;
+  for (const std::size_t width : widths()) sum += width + kBetween;
+  return sum <= columns || sum - kBetween <= columns;
+}
+
+void Table::print(Output& out) const {
+  const Layout layout = layout_of(columns_, widths(), out.columns());
   std::string line;
-  const auto add_cell = [&](std::size_t i, const std::string& cell) {
-    const std::size_t blanks = widths[i] - cell.size();
-    if (i > 0) line += "  ";
+  const auto add_cell = [&](std::size_t i, std::string_view whole) {
+    const std::string cell = shortened(whole, layout.widths[i]);
+    const std::size_t blanks = layout.widths[i] - columns_of(cell);
+    if (i != layout.shown.front()) line.append(kBetween, ' ');
     if (columns_[i].align == Align::right) line.append(blanks, ' ');
     line += cell;
     if (columns_[i].align == Align::left) line.append(blanks, ' ');
   };
   const auto end_line = [&] { line.erase(line.find_last_not_of(' ') + 1); };
 
-  for (std::size_t i = 0; i < columns_.size(); ++i) add_cell(i, columns_[i].title);
+  for (const std::size_t i : layout.shown) add_cell(i, columns_[i].title);
   end_line();
   out.add(out.bold(line));
   out.add("\n");
   for (const auto& row : rows_) {
     line.clear();
-    for (std::size_t i = 0; i < columns_.size(); ++i) add_cell(i, row[i]);
+    for (const std::size_t i : layout.shown) add_cell(i, row[i]);
     end_line();
     out.add(line);
     out.add("\n");
+    if (layout.last_below && !row.back().empty()) out.add(wrapped(row.back(), out.columns()));
   }
 }
 

@@ -5,6 +5,7 @@
 
 #include <dssm/result.hpp>
 #include <dssm/time.hpp>
+#include <functional>
 #include <nlohmann/json.hpp>
 #include <string>
 #include <string_view>
@@ -33,6 +34,11 @@ class Output {
   // was closed, also while nothing is written.
   bool must_stop();
 
+  // For a text that is printed again and again. Writes all that is pending, with `end` after it,
+  // unless it is what was written so before; or, on a terminal, draws it over that.
+  bool flush_changed(std::string_view end);
+  bool flush_screen();
+
   // Sleeps until `due`. False: it must stop.
   bool sleep_until(MonoTime due);
 
@@ -40,6 +46,10 @@ class Output {
   const Result<void>& result() const { return result_; }
 
   bool terminal() const { return terminal_; }
+
+  // How many columns there are for tables; no limit without a terminal and after set_wide().
+  std::size_t columns() const;
+  void set_wide() { wide_ = true; }
 
   // `text` in bold on a terminal when $NO_COLOR is not set.
   std::string bold(std::string_view text) const;
@@ -50,22 +60,29 @@ class Output {
   int fd_;
   bool terminal_;
   bool colour_;
+  bool wide_ = false;
   bool stopped_ = false;
   std::string pending_;
+  std::string screen_;  // what flush_changed() or flush_screen() showed last
   Result<void> result_;
 };
 
 // Writes `text` to standard error, at once.
 void print_error(std::string_view text);
 
-// Rows of cells as aligned columns, two spaces apart, as wide as their contents. Cells are ASCII
-// (see text.hpp), so bytes are columns on the screen.
+// Rows of cells as aligned columns, two spaces apart, as wide as their contents. Cells are escaped
+// (see text.hpp). What is wider than a terminal is made to fit, as far as its columns allow it.
 class Table {
  public:
   enum class Align : unsigned char { left, right };
   struct Column {
     std::string title;
     Align align = Align::left;
+    // What to do when the table is too wide, in this order: a column that may be below (the last
+    // one only) has its cells in lines of their own, after their rows; columns are left out, from
+    // drop = 1 on; one that may be short is cut.
+    unsigned drop = 0;  // 0: never
+    enum class Fit : unsigned char { whole, below, cut } fit = Fit::whole;
   };
 
   explicit Table(std::vector<Column> columns) : columns_(std::move(columns)) {}
@@ -73,10 +90,14 @@ class Table {
   // One cell per column.
   void add_row(std::vector<std::string> cells) { rows_.push_back(std::move(cells)); }
 
+  // Whether it fits as it is.
+  bool fits(std::size_t columns) const;
+
   // Header (bold on a terminal) and rows, without blanks at the ends of lines.
   void print(Output& out) const;
 
  private:
+  std::vector<std::size_t> widths() const;
   std::vector<Column> columns_;
   std::vector<std::vector<std::string>> rows_;
 };
@@ -105,8 +126,18 @@ inline std::string json_document(const Json& json) {
   return json.dump(2, ' ', true, Json::error_handler_t::replace) + "\n";
 }
 
+// A line where several documents follow each other, so that programs can tell them apart.
+inline std::string json_output(const Json& json, bool one_of_several) {
+  return one_of_several ? json_line(json) : json_document(json);
+}
+
 // --- Ctrl-C, for verbs that run until then: SIGINT and SIGTERM end them with success, after their
 // final output. All other verbs end by these signals at once, as programs do.
+
+// Adds to `out` by `print` what a verb shows; with `watch` each second until Ctrl-C, when
+// it has changed, and on a terminal over the last one.
+Result<void> print_once_or_watch(bool watch, bool json, Output& out,
+                                 const std::function<Result<void>()>& print);
 
 // From now on SIGINT and SIGTERM only set a mark, and interrupt system calls.
 void catch_stop_signals();

@@ -4,6 +4,8 @@
 // programs that live in log time follow.
 #include <fmt/format.h>
 
+#include <cmath>
+
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
@@ -13,15 +15,18 @@
 namespace dssm::ctl {
 namespace {
 
-// Whether there was something to change.
-bool change(PlaybackClock& clock, const PlaybackOptions& options) {
+double seconds_of(const Moment& moment) {
+  const Time time = moment.back ? saturating_add(WallClock::now(), *moment.back) : moment.time;
+  return static_cast<double>(to_ns(time)) / 1e9;
+}
+
+void change(PlaybackClock& clock, const PlaybackOptions& options) {
   if (options.reset) clock.reset();
   if (options.paused) clock.set_paused(*options.paused);
   // Speed first: it moves the offset to keep the clock continuous.
   if (options.speed) clock.set_speed(*options.speed);
   if (options.offset_s) clock.set_offset(*options.offset_s);
-  if (options.time_s) clock.set_time(*options.time_s);
-  return options.reset || options.paused || options.speed || options.offset_s || options.time_s;
+  if (options.time) clock.set_time(seconds_of(*options.time));
 }
 
 void print(const PlaybackClock& clock, const PlaybackOptions& options, Output& out) {
@@ -33,7 +38,11 @@ void print(const PlaybackClock& clock, const PlaybackOptions& options, Output& o
                                   {"speed", setting.speed},
                                   {"paused", setting.paused}}));
   }
-  out.add(fmt::format("time:    {:.6f} s\noffset:  {:.6f} s\nspeed:   {:.3f}\npaused:  {}\n", now_s,
+  // The clock may show any number, but ISO 8601 has only some centuries.
+  const bool as_iso = options.iso && std::fabs(now_s) < 9.2e9;
+  const std::string time =
+      as_iso ? iso_text(time_from_ns(std::llround(now_s * 1e9))) : fmt::format("{:.6f} s", now_s);
+  out.add(fmt::format("time:    {}\noffset:  {:.6f} s\nspeed:   {:.3f}\npaused:  {}\n", time,
                       setting.offset_s, setting.speed, setting.paused ? "yes" : "no"));
 }
 
@@ -42,8 +51,8 @@ void print(const PlaybackClock& clock, const PlaybackOptions& options, Output& o
 Result<void> run(const PlaybackOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   PlaybackClock clock = DSSM_TRY(session.open_playback_clock());
-  const bool changed = change(clock, options);
-  if (!changed || options.json) print(clock, options, out);
+  change(clock, options);
+  print(clock, options, out);
   return {};
 }
 

@@ -78,7 +78,7 @@ Result<void> run(const PropertyGetOptions& options, Output& out) {
   const bool to_file = options.file != "-";
   if (to_file) DSSM_TRY(write_all(options.file, *property));
   if (options.json) {
-    Json json{{"stream", id.str()}, {"property_bytes", property->size()}};
+    Json json{{"stream", full_name(session, id)}, {"property_bytes", property->size()}};
     if (!to_file) json["property_hex"] = hex_text(*property);
     out.add(json_document(json));
   } else if (!to_file && out.terminal()) {
@@ -96,8 +96,13 @@ Result<void> run(const PropertySetOptions& options, Output& out) {
   if (Result<void> set = session.set_property(id, property); !set) {
     return with_similar_names(std::move(set).error(), session, id);
   }
+  const std::string name = full_name(session, id);
   if (options.json) {
-    out.add(json_document({{"stream", id.str()}, {"property_bytes", property.size()}}));
+    out.add(json_document({{"stream", name}, {"property_bytes", property.size()}}));
+  } else if (property.empty()) {
+    out.add(fmt::format("{}: property removed\n", escaped(name)));
+  } else {
+    out.add(fmt::format("{}: property of {} set\n", escaped(name), bytes_text(property.size())));
   }
   return {};
 }

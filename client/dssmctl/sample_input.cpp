@@ -18,6 +18,7 @@ namespace dssm::ctl {
 namespace {
 
 constexpr const char* kHexField = "payload_hex";
+constexpr std::size_t kInfoColumns = 3;  // of echo's CSV, before those of the fields
 
 Error does_not_fit(const std::string& name, std::string_view text, const std::string& wanted) {
   return {Errc::invalid_argument,
@@ -135,6 +136,20 @@ std::vector<std::string> cells_of(const std::string& record) {
     if (at >= record.size()) return cells;
     ++at;
   }
+}
+
+bool take(const std::string& text, std::int64_t& into) {
+  const char* const end = text.data() + text.size();
+  return std::from_chars(text.data(), end, into).ptr == end && !text.empty();
+}
+
+// As echo prints it: in nanoseconds since 1970, or as ISO 8601.
+Result<Time> time_of(const std::string& text, bool iso) {
+  std::int64_t time_ns = 0;
+  if (!iso && take(text, time_ns)) return time_from_ns(time_ns);
+  const Moment moment = DSSM_TRY(parse_moment(text, Time()));
+  if (!moment.back) return moment.time;
+  return Error{Errc::invalid_argument, fmt::format("'{}' is not a time as `echo` prints it", text)};
 }
 
 bool is_blank(const std::string& line) {
@@ -295,11 +310,10 @@ Result<void> SampleLines::read_json(const std::string& line, SampleInput& sample
 
 Result<void> SampleLines::read_header(const std::string& line) {
   std::vector<std::string> names = cells_of(line);
-  const std::vector<std::string>& known = info_columns();
-  info_columns_ =
-      names.size() >= known.size() && std::equal(known.begin(), known.end(), names.begin())
-          ? known.size()
-          : 0;
+  const bool is_from_echo = names.size() >= kInfoColumns && names[0] == "tid" &&
+                            (names[1] == "time_ns" || names[1] == "time") &&
+                            names[2] == "clock_error_ns";
+  info_columns_ = is_from_echo ? kInfoColumns : 0;
   const SampleInput sample(type_);
   for (std::size_t i = info_columns_; i < names.size(); ++i) {
     if (!sample.has(names[i]) && names[i] != kHexField) {
@@ -317,12 +331,8 @@ Result<void> SampleLines::read_row(const std::string& line, SampleInput& sample)
                                                      cells.size(), header_->size())};
   }
   if (info_columns_ > 0) {
-    std::int64_t time_ns = 0, error_ns = 0;
-    const auto take = [](const std::string& text, std::int64_t& into) {
-      const char* const end = text.data() + text.size();
-      return std::from_chars(text.data(), end, into).ptr == end && !text.empty();
-    };
-    if (take(cells[1], time_ns)) sample.time = time_from_ns(time_ns);
+    if (!cells[1].empty()) sample.time = DSSM_TRY(time_of(cells[1], (*header_)[1] == "time"));
+    std::int64_t error_ns = 0;
     sample.clock_error = take(cells[2], error_ns) ? Duration(error_ns) : kForeignClockError;
   }
   for (std::size_t i = info_columns_; i < cells.size(); ++i) {

@@ -19,11 +19,6 @@ constexpr std::size_t kShownBytes = 64;
 
 }  // namespace
 
-const std::vector<std::string>& info_columns() {
-  static const std::vector<std::string> columns{"tid", "time_ns", "clock_error_ns"};
-  return columns;
-}
-
 std::string csv_cell(std::string_view text) {
   if (text.find_first_of(",\"\r\n") == std::string_view::npos) return std::string(text);
   std::string out = "\"";
@@ -34,9 +29,8 @@ std::string csv_cell(std::string_view text) {
   return out + "\"";
 }
 
-SamplePrinter::SamplePrinter(Output& out, SampleForm form, bool full, StreamId stream,
-                             std::vector<Field> fields)
-    : out_(out), form_(form), full_(full), stream_(std::move(stream)), fields_(std::move(fields)) {}
+SamplePrinter::SamplePrinter(Output& out, Style style, StreamId stream, std::vector<Field> fields)
+    : out_(out), style_(style), stream_(std::move(stream)), fields_(std::move(fields)) {}
 
 // A terminal must not get control characters from a stream; a file gets the cell as it is.
 std::string SamplePrinter::cell(std::string_view text) const {
@@ -44,8 +38,8 @@ std::string SamplePrinter::cell(std::string_view text) const {
 }
 
 void SamplePrinter::begin() {
-  if (form_ != SampleForm::csv) return;
-  std::string line = fmt::format("{}", fmt::join(info_columns(), ","));
+  if (style_.form != SampleForm::csv) return;
+  std::string line = fmt::format("tid,{},clock_error_ns", style_.iso ? "time" : "time_ns");
   for (const Field& field : fields_) {
     if (field.count == 1 || is_text(field)) {
       line.append(",").append(cell(field.name));
@@ -61,7 +55,7 @@ void SamplePrinter::begin() {
 
 void SamplePrinter::sample(const SampleInfo& info, std::span<const std::byte> payload,
                            const Breaks& breaks) {
-  switch (form_) {
+  switch (style_.form) {
     case SampleForm::text:
       return text_sample(info, payload, breaks);
     case SampleForm::json:
@@ -78,13 +72,13 @@ void SamplePrinter::text_sample(const SampleInfo& info, std::span<const std::byt
     text += fmt::format("# {} samples were overwritten before they could be shown\n", breaks.lost);
   }
   text += fmt::format("tid: {}\ntime: {}\nclock_error: {}\n", info.tid,
-                      seconds_text(to_ns(info.time)), bound_text(info.clock_error));
-  const std::size_t shown = full_ ? std::numeric_limits<std::size_t>::max() : kShownElements;
+                      time_text(info.time, style_.iso), bound_text(info.clock_error));
+  const std::size_t shown = style_.full ? std::numeric_limits<std::size_t>::max() : kShownElements;
   for (const Field& field : fields_) {
     text += fmt::format("{}: {}\n", escaped(field.name), field_text(payload, field, shown));
   }
   if (fields_.empty()) {
-    const std::size_t end = full_ ? payload.size() : std::min(payload.size(), kShownBytes);
+    const std::size_t end = style_.full ? payload.size() : std::min(payload.size(), kShownBytes);
     text += fmt::format("payload: {}\n{}", bytes_text(payload.size()),
                         hex_dump(payload.first(end), "  "));
     if (end < payload.size()) {
@@ -114,7 +108,8 @@ void SamplePrinter::json_sample(const SampleInfo& info, std::span<const std::byt
 }
 
 void SamplePrinter::csv_sample(const SampleInfo& info, std::span<const std::byte> payload) {
-  std::string line = fmt::format("{},{},", info.tid, to_ns(info.time));
+  std::string line = fmt::format(
+      "{},{},", info.tid, style_.iso ? iso_text(info.time) : std::to_string(to_ns(info.time)));
   if (info.clock_error < kForeignClockError) line += std::to_string(to_ns(info.clock_error));
   for (const Field& field : fields_) {
     const std::uint64_t cells = is_text(field) ? 1 : field.count;

@@ -19,18 +19,18 @@ class Output;
 
 enum class SampleForm : unsigned char { text, json, csv };
 
-// The columns of CSV before those of the fields.
-const std::vector<std::string>& info_columns();
-
 // One cell of a CSV row: in quotes where it holds a comma, a quote or a line end.
 std::string csv_cell(std::string_view text);
 
 class SamplePrinter {
  public:
-  // `fields` passed readable_fields_untrusted(); none: the payload is shown as bytes. `full`: text
-  // leaves nothing out of long payloads.
-  SamplePrinter(Output& out, SampleForm form, bool full, StreamId stream,
-                std::vector<Field> fields);
+  struct Style {
+    SampleForm form = SampleForm::text;
+    bool full = false;  // text leaves nothing out of long payloads
+    bool iso = false;   // times in text and CSV as ISO 8601
+  };
+  // `fields` passed readable_fields_untrusted(); none: the payload is shown as bytes.
+  SamplePrinter(Output& out, Style style, StreamId stream, std::vector<Field> fields);
 
   // What precedes the first sample: CSV's header line.
   void begin();
@@ -53,8 +53,7 @@ class SamplePrinter {
   std::string cell(std::string_view text) const;
 
   Output& out_;
-  SampleForm form_;
-  bool full_;
+  Style style_;
   StreamId stream_;
   std::vector<Field> fields_;
 };

@@ -152,6 +152,12 @@ std::string_view name_of(StreamVia via) noexcept {
   return name_in(kNames, via);
 }
 
+std::string_view name_of(StreamState state) noexcept {
+  static constexpr std::array<std::string_view, 5> kNames = {"unknown", "empty", "live", "stalled",
+                                                             "no writer"};
+  return name_in(kNames, state);
+}
+
 std::string_view name_of(ClockBasis basis) noexcept {
   static constexpr std::array<std::string_view, 4> kNames = {"nothing", "root", "reference", "own"};
   return name_in(kNames, basis);

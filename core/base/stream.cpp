@@ -32,6 +32,17 @@ std::string text_of(const Field& field) {
                      stride);
 }
 
+// Exactly, in the greatest unit that makes a whole number of it: "36000 s", "1500 us".
+std::string text_of(Duration duration) {
+  constexpr std::pair<std::int64_t, const char*> kUnits[] = {
+      {1'000'000'000, "s"}, {1'000'000, "ms"}, {1'000, "us"}};
+  const std::int64_t ns = to_ns(duration);
+  for (const auto& [unit_ns, name] : kUnits) {
+    if (ns % unit_ns == 0) return fmt::format("{} {}", ns / unit_ns, name);
+  }
+  return fmt::format("{} ns", ns);
+}
+
 // Whether both are the same bytes under the same name.
 bool is_same(const Field& a, const Field& b) {
   return a.name == b.name && a.kind == b.kind && a.offset_bytes == b.offset_bytes &&
@@ -245,23 +256,40 @@ Result<void> TypeInfo::check() const {
 Result<History> History::for_life(Duration life, Duration cycle) {
   if (cycle <= Duration::zero()) {
     return invalid(
-        "a cycle of {} ns is not possible; it takes the time between two samples, more than 0",
-        to_ns(cycle));
+        "a cycle of {} is not possible; it takes the time between two samples, more than 0",
+        text_of(cycle));
   }
   if (life < cycle) {
     return invalid(
-        "a life of {} ns is shorter than the cycle of {} ns; keep at least one cycle of history",
-        to_ns(life), to_ns(cycle));
+        "a life of {} is shorter than the cycle of {}; keep at least one cycle of history",
+        text_of(life), text_of(cycle));
   }
   const double slots =
       1.2 * static_cast<double>(to_ns(life)) / static_cast<double>(to_ns(cycle)) + 1;
   if (slots > static_cast<double>(kMaxDepth)) {
     return Error{Errc::limit_exceeded,
-                 fmt::format("a life of {} ns at a cycle of {} ns needs more than {} slots; keep "
-                             "less history",
-                             to_ns(life), to_ns(cycle), kMaxDepth)};
+                 fmt::format("a life of {} at a cycle of {} needs more than {} slots; keep less "
+                             "history",
+                             text_of(life), text_of(cycle), kMaxDepth)};
   }
   return History{static_cast<std::uint64_t>(slots), cycle};
+}
+
+Duration pause_length(std::span<const Duration> intervals, Duration cycle) noexcept {
+  Duration longest{}, second{};
+  for (const Duration interval : intervals) {
+    if (interval > longest) {
+      second = longest;
+      longest = interval;
+    } else {
+      second = std::max(second, interval);
+    }
+  }
+  const Duration usual = intervals.size() < 2 ? std::max(cycle, longest) : second;
+  constexpr int kIntervals = 5;
+  constexpr Duration kMinPause = std::chrono::seconds(1);
+  if (usual > Duration::max() / kIntervals) return Duration::max();
+  return std::max(kIntervals * usual, kMinPause);
 }
 
 }  // namespace dssm

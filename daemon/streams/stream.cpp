@@ -13,6 +13,7 @@
 #include "core/base/quiet_thread.hpp"
 #include "core/base/sealed_memory.hpp"
 #include "core/base/try.hpp"
+#include "core/ring/activity.hpp"
 #include "core/ring/bell.hpp"
 #include "core/ring/ring_reader.hpp"
 #include "core/wire/local_protocol.hpp"
@@ -20,12 +21,6 @@
 
 namespace dssm::daemon {
 namespace {
-
-// The rate is taken over this many of the newest samples.
-constexpr Tid kRateSamples = 100;
-
-// Attempts to read the newest stamps while writers overtake this reader.
-constexpr int kMaxAttempts = 4;
 
 Result<std::uint64_t> new_incarnation() {
   std::uint64_t value = 0;
@@ -107,28 +102,6 @@ Result<void> check_label_untrusted(const OfferedFiles& files, const std::string&
                fmt::format("the offered ring, bell and meta file are not those of '{}'", label)};
 }
 
-void fill_figures(const ring::RingMapping& mapping, StreamInfo& info) {
-  const ring::RingReader reader(mapping);
-  SampleInfo last;
-  for (int attempt = 0; attempt < kMaxAttempts; ++attempt) {
-    const Tid newest = reader.newest();
-    if (newest < 0 || reader.stamp(newest, last) != ReadStatus::ok) continue;
-    info.newest = newest;
-    info.newest_time = last.time;
-    break;
-  }
-  if (info.newest < 0) return;
-  info.oldest = std::clamp<Tid>(reader.oldest(), 0, info.newest);
-  for (Tid back = std::min(kRateSamples - 1, info.newest - info.oldest); back > 0; back /= 2) {
-    SampleInfo first;
-    if (reader.stamp(info.newest - back, first) != ReadStatus::ok) continue;
-    std::int64_t span_ns = 0;  // the stamps may be anything: their distance need not fit
-    if (__builtin_sub_overflow(to_ns(last.time), to_ns(first.time), &span_ns)) return;
-    if (span_ns > 0) info.rate_hz = static_cast<double>(back) * 1e9 / static_cast<double>(span_ns);
-    return;
-  }
-}
-
 }  // namespace
 
 Result<std::shared_ptr<Stream>> Stream::create(const Plan& plan, MemoryBudgets& budgets) {
@@ -194,7 +167,7 @@ Result<void> Stream::describe_as(const TypeInfo& type, MemoryBudget& budget) {
   return {};
 }
 
-StreamInfo Stream::info(bool with_fields) const {
+StreamInfo Stream::info(bool with_fields, Time now) const {
   StreamInfo info;
   info.id = plan_.id;
   if (with_fields) {
@@ -215,7 +188,9 @@ StreamInfo Stream::info(bool with_fields) const {
   }
   info.writers = info.remote_writers;
   info.readers = info.remote_readers;
-  fill_figures(*mapping_, info);
+  ring::describe_activity(ring::RingReader(*mapping_), now, info);
+  // Only an owner knows whether it can still be written to, and whether its newest sample is here.
+  if (plan_.purpose != Purpose::own) info.state = StreamState::unknown;
   return info;
 }
 

@@ -108,10 +108,11 @@ class Stream : public std::enable_shared_from_this<Stream> {
   Purpose purpose() const noexcept { return plan_.purpose; }
   std::uint64_t incarnation() const noexcept { return mapping_->identity().incarnation; }
 
-  // All but the users, and with the writers and readers of its channels only. Reads the newest
-  // stamps of the ring twice.
+  // All but the users and whether programs of this host can write to it, and with the writers and
+  // readers of its channels only. Reads the newest stamps of the ring.
   //   with_fields  else the type comes without its fields
-  StreamInfo info(bool with_fields = true) const;
+  //   now          this PC's clock: the state and age are those of this moment
+  StreamInfo info(bool with_fields = true, Time now = WallClock::now()) const;
 
   // Descriptors to hand out, in the order of local.proto's Opened; the caller's own. For a client
   // that writes and has no doorbell, one is made.

@@ -10,6 +10,7 @@
 #include <dssm/result.hpp>
 #include <dssm/sample.hpp>
 #include <optional>
+#include <span>
 #include <string>
 #include <string_view>
 #include <vector>
@@ -180,6 +181,27 @@ struct MirrorInfo {
   std::uint64_t depth = 0;  // of its ring; 0: there is none yet
 };
 
+// How long an interval between two samples must be at least to count as a pause of the stream: five
+// times its usual interval, and a second at least. The usual interval is the longest but one of
+// `intervals`: a single pause that is over is not usual, but a stream that pauses often is
+// irregular. Programs often give a cycle that is far from the real one, so `cycle` counts with less
+// than two intervals only, if it is the longer one.
+//   intervals  between the stamps of the newest kRecentSamples samples, in any order
+Duration pause_length(std::span<const Duration> intervals, Duration cycle) noexcept;
+inline constexpr std::size_t kRecentSamples = 33;
+
+// Whether samples come, by the owner's clock. docs/glossary.md "stalled" has the exact definition.
+enum class StreamState : std::uint8_t {
+  unknown,  // the stamps are of another clock (a recording's), or the owner does not answer
+  empty,    // nothing was written yet
+  live,
+  stalled,    // the newest sample is as old as a pause is long: pause_length()
+  no_writer,  // as stalled, and neither a program nor another host can write to it now
+};
+
+// "live", "no writer" ...; static storage.
+std::string_view name_of(StreamState state) noexcept;
+
 // The present state of a stream. For a stream of another host, creator_pid is of its owner.
 struct StreamInfo {
   StreamId id;  // with its owner's host
@@ -193,7 +215,13 @@ struct StreamInfo {
   Tid oldest = kNoTid;  // oldest readable sample
   Tid newest = kNoTid;
   Time newest_time{};  // stamp of the newest sample; meaningless while newest is kNoTid
-  double rate_hz = 0;  // from the stamps of the newest samples; 0 when unknown
+  // From the stamps of the newest samples; 0 when unknown. Of a stream that is not live it is the
+  // one that it had.
+  double rate_hz = 0;
+  StreamState state = StreamState::unknown;
+  // How old the newest sample is, by the owner's clock; may be negative. Known when the state is
+  // live, stalled or no_writer.
+  Duration age{};
   // How many times it is open on all hosts, and of these over the network. Programs of other hosts
   // are counted if their dssmd states them: an older one does not, and has a channel all the same.
   std::uint32_t writers = 0;

@@ -56,7 +56,7 @@ TEST_F(Completion, OffersExactlyTheOptionsOfTheHelpText) {
   }
   for (Strings verb : verbs) {
     std::set<std::string> options = help_options(verb);
-    options.insert({"--json", "--socket"});
+    options.insert({"--iso", "--json", "--socket", "--wide"});
     Strings expected(options.begin(), options.end());
     verb.push_back("--");
     EXPECT_EQ(offered(verb), expected) << Json(verb);
@@ -71,10 +71,37 @@ TEST_F(Completion, OffersStreamNamesWhereAStreamBelongs) {
   }
   EXPECT_EQ(offered({"property", "get", "od"}), Strings{"odom"});
   EXPECT_EQ(offered({"echo", "--count", "3", "--csv", "od"}), Strings{"odom"});
-  EXPECT_EQ(offered({"echo", "odom", ""}), Strings{});        // takes one stream
-  EXPECT_EQ(offered({"rm", "odom", "od"}), Strings{"odom"});  // takes many
-  EXPECT_EQ(offered({"echo", "--count", ""}), Strings{});     // a number belongs here
+  EXPECT_EQ(offered({"echo", "odom", ""}), Strings{});    // takes one stream
+  for (const char* verb : {"rm", "hz", "bw", "delay"}) {  // take many
+    EXPECT_EQ(offered({verb, "odom", "od"}), Strings{"odom"}) << verb;
+  }
+  EXPECT_EQ(offered({"echo", "--count", ""}), Strings{});  // a number belongs here
   EXPECT_EQ(offered({"create", ""}), Strings{});
+}
+
+struct Place {
+  double x, y;
+};
+DSSM_DESCRIBE(Place, x, y)
+
+struct Robot {
+  Place pose;
+  float speed;
+};
+DSSM_DESCRIBE(Robot, pose, speed)
+
+TEST_F(Completion, OffersTheFieldsOfTheStream) {
+  auto robot = session_.create<Robot>("robot:1", depth_of(4)).value();
+  EXPECT_EQ(offered({"echo", "robot", ":", "1", "--field", ""}),
+            (Strings{"pose.x", "pose.y", "speed"}));
+  EXPECT_EQ(offered({"echo", "robot", ":", "1", "--csv", "--field", "p"}),
+            (Strings{"pose.x", "pose.y"}));
+  EXPECT_EQ(offered({"echo", "--field", ""}), Strings{}) << "of which stream?";
+}
+
+TEST_F(Completion, OffersVerbsToHelp) {
+  EXPECT_EQ(offered({"help", "ec"}), Strings{"echo"});
+  EXPECT_EQ(offered({"help", "property", ""}), (Strings{"get", "set"}));
 }
 
 TEST_F(Completion, CompletesAfterColonsAtWhichBashSplitsWords) {
@@ -129,6 +156,102 @@ TEST_F(Completion, OffersKeysToSortByAndFiles) {
   std::ofstream(daemon_.runtime_dir() + "/calibration") << "x";
   EXPECT_EQ(offered({"property", "set", "s", daemon_.runtime_dir() + "/cal"}),
             Strings{daemon_.runtime_dir() + "/calibration"});
+}
+
+// --- zsh and fish
+
+bool is_installed(const std::string& program) {
+  return run({"/bin/sh", "-c", "command -v " + program}).exit_status == 0;
+}
+
+// Ends a test of a shell that is not here.
+#define NEEDS(shell) \
+  if (!is_installed(shell)) GTEST_SKIP() << shell << " is not installed"
+
+class CompletionInOtherShells : public FleetTest {
+ protected:
+  // The same in zsh, whose own functions are replaced: they work in an interactive shell only.
+  Strings in_zsh(const Strings& words) {
+    const std::string script =
+        "compadd() { [[ $1 == -a ]] && print -rl -- ${(P)2} || print -rl -- $@ }; "
+        "_files() { print files }; script=$1; shift; words=(\"$@\"); CURRENT=$#words; source $script";
+    Strings argv = {"zsh",         "-f",  "-c",
+                    script,        "zsh", source_root() + "/client/dssmctl/_dssmctl",
+                    dssmctl_path()};
+    argv.insert(argv.end(), words.begin(), words.end());
+    return candidates(argv, words.back());
+  }
+
+  Strings in_fish(const Strings& words) {
+    std::string line = "dssmctl";
+    for (const std::string& word : words) line += " " + word;
+    return candidates({"fish", "--no-config", "-c",
+                       "source $argv[1]; set -x PATH (path dirname $argv[2]) $PATH; complete -C "
+                       "$argv[3] | string replace -r '\\t.*' ''",
+                       source_root() + "/client/dssmctl/dssmctl.fish", dssmctl_path(), line},
+                      words.back());
+  }
+
+  void create_streams() {
+    robot_.emplace(session_.create<Robot>("robot:1", depth_of(4)).value());
+    output({"create", "lidar@pc2", "--size", "4", "--depth", "4"});
+    await_streams(1);
+  }
+
+  // What both have to offer for `words`.
+  struct Offer {
+    Strings words, candidates;
+  };
+  const std::vector<Offer> offers_ = {
+      {{"ec"}, {"echo"}},
+      {{"property", ""}, {"get", "set"}},
+      {{"help", "ec"}, {"echo"}},
+      {{"echo", ""}, {"lidar", "robot:1"}},
+      {{"echo", "--count", "3", "l"}, {"lidar"}},
+      {{"echo", "robot:1", ""}, {}},
+      {{"hz", "robot:1", "l"}, {"lidar"}},
+      {{"echo", "robot:1", "--field", "p"}, {"pose.x", "pose.y"}},
+      {{"echo", "lidar@pc"}, {"lidar@pc1", "lidar@pc2", "lidar@pc3"}},
+      {{"ping", ""}, {"pc1", "pc2", "pc3"}},
+      {{"ls", "--host", "pc2"}, {"pc2"}},
+      {{"ls", "--sort", "r"}, {"rate", "readers"}},
+      {{"hosts", "--w"}, {"--watch", "--wide"}},
+      {{"--v"}, {"--version"}},
+      {{"hosts", "--v"}, {}},
+      {{"echo", "--count", ""}, {}},
+  };
+
+ private:
+  // The lines of the output that begin with `typed`, sorted.
+  Strings candidates(const Strings& argv, const std::string& typed) {
+    const Finished finished = run(argv, environment());
+    EXPECT_EQ(finished.err, "");
+    Strings lines = lines_of(finished.out);
+    std::erase_if(lines, [&](const std::string& line) { return !line.starts_with(typed); });
+    std::erase(lines, "");
+    std::sort(lines.begin(), lines.end());
+    return lines;
+  }
+
+  std::optional<Writer<Robot>> robot_;
+};
+
+TEST_F(CompletionInOtherShells, OffersInZshWhatItOffersInBash) {
+  NEEDS("zsh");
+  create_streams();
+  EXPECT_EQ(in_zsh({""}), help_verbs({}));
+  for (const Offer& offer : offers_) {
+    EXPECT_EQ(in_zsh(offer.words), offer.candidates) << Json(offer.words);
+  }
+}
+
+TEST_F(CompletionInOtherShells, OffersInFishWhatItOffersInBash) {
+  NEEDS("fish");
+  create_streams();
+  EXPECT_EQ(in_fish({""}), help_verbs({}));
+  for (const Offer& offer : offers_) {
+    EXPECT_EQ(in_fish(offer.words), offer.candidates) << Json(offer.words);
+  }
 }
 
 }  // namespace

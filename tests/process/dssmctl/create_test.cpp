@@ -53,6 +53,8 @@ TEST_F(Create, RefusesAnotherSizeNamingBoth) {
   EXPECT_EQ(finished.exit_status, 1);
   EXPECT_NE(finished.err.find("24 bytes"), std::string::npos) << finished.err;
   EXPECT_NE(finished.err.find("25 bytes"), std::string::npos) << finished.err;
+  EXPECT_TRUE(contains(finished.err, "dssmctl rm s:0@pc1")) << finished.err;
+  EXPECT_FALSE(contains(finished.err, "compile")) << finished.err;
 }
 
 TEST_F(Create, RefusesImpossibleNamesAndLivesAsWrongUsage) {
@@ -63,15 +65,18 @@ TEST_F(Create, RefusesImpossibleNamesAndLivesAsWrongUsage) {
     EXPECT_EQ(finished.exit_status, 2) << name;
     EXPECT_EQ(finished.err.find('\n'), finished.err.size() - 1) << finished.err;
   }
-  EXPECT_EQ(ctl({"create", "s", "--size", "4", "--life", "1", "--cycle", "2"}).exit_status, 2);
+  const Finished too_short = ctl({"create", "s", "--size", "4", "--life", "0.1", "--cycle", "2h"});
+  EXPECT_EQ(too_short.exit_status, 2);
+  EXPECT_TRUE(contains(too_short.err, "a life of 100 ms is shorter than the cycle of 7200 s"))
+      << too_short.err;
   EXPECT_EQ(session_.list_streams().value().size(), 0U);
 }
 
 TEST_F(Rm, RemovesStreams) {
   for (const char* name : {"a", "b", "c:1"})
     output({"create", name, "--size", "4", "--depth", "4"});
-  EXPECT_EQ(output({"rm", "a"}), "");
-  EXPECT_EQ(json({"rm", "b", "c:1"}), Json::parse(R"({"removed":["b:0","c:1"]})"));
+  EXPECT_EQ(output({"rm", "a"}), "a:0@pc1: removed\n");
+  EXPECT_EQ(json({"rm", "b", "c:1"}), Json::parse(R"({"removed":["b:0@pc1","c:1@pc1"]})"));
   EXPECT_EQ(session_.list_streams().value().size(), 0U);
 }
 

@@ -114,7 +114,7 @@ TEST_F(DoctorInAFleet, FindsStreamsOfOneName) {
   const Json document = Doctor::checked(ctl({"doctor", "--json"}));
   const Json names = Doctor::check(document, "stream names");
   EXPECT_EQ(names["status"], "warn");
-  EXPECT_TRUE(contains(names["text"], "'odom:0' of pc2, pc3")) << names;
+  EXPECT_TRUE(contains(names["text"], "'odom:0' (on pc2, pc3)")) << names;
   EXPECT_EQ(document["ok"], true);  // it works
 }
 

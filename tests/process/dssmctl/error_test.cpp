@@ -93,6 +93,13 @@ TEST_F(Errors, FindTheDaemonBySocketOption) {
   EXPECT_EQ(finished.exit_status, 0) << finished.err;
 }
 
+TEST_F(Errors, NoticeAFolderInPlaceOfASocket) {
+  const Finished finished = ctl({"--socket", daemon_.runtime_dir(), "ls"});
+  EXPECT_EQ(finished.exit_status, 1);
+  EXPECT_TRUE(contains(finished.err, "this is a folder, not dssmd's socket")) << finished.err;
+  EXPECT_TRUE(contains(finished.err, daemon_.runtime_dir() + "/dssmd.sock")) << finished.err;
+}
+
 TEST_F(Errors, ReportAFullDisk) {
   const Finished finished =
       run({"/bin/sh", "-c", "exec \"$@\" > /dev/full", "sh", dssmctl_path(), "ls"}, environment());

@@ -172,5 +172,24 @@ TEST_F(Ping, AnswersForThisHostAtOnce) {
   EXPECT_TRUE(output({"ping", "pc1", "-c", "1"}).starts_with("answer from pc1 (this PC): seq=1"));
 }
 
+TEST_F(Hosts, WatchPrintsThemAgainWhenTheyChange) {
+  Running watch(argv({"hosts", "--watch", "--json"}), environment());
+  const auto state_of_pc2 = [&] {
+    const Json hosts = Json::parse(watch.line())["hosts"];
+    for (const Json& host : hosts) {
+      if (host["host"] == "pc2") return host["state"].get<std::string>();
+    }
+    return std::string("missing");
+  };
+  while (state_of_pc2() != "up") {
+  }
+  pc2_.kill_hard();
+  while (state_of_pc2() != "down") {
+  }
+  watch.signal(SIGINT);
+  watch.rest();
+  EXPECT_EQ(watch.status(), 0);
+}
+
 }  // namespace
 }  // namespace dssm::test

@@ -42,7 +42,7 @@ TEST_F(Meter, HzPrintsTheNumbersForPeople) {
   write_at({1000, 1002, 1006, 1010, 1014, 1019, 1024, 1031, 1040});
   EXPECT_EQ(output({"hz", "s", "-n", "1"}),
             "average rate: 200.000 Hz\n"
-            "\tmin: 0.002000000 s max: 0.009000000 s std dev: 0.002000000 s window: 9\n");
+            "\tmin: 2.00 ms max: 9.00 ms std dev: 2.00 ms window: 9\n");
 }
 
 TEST_F(Meter, HzUsesTheNewestSamplesOfItsWindow) {
@@ -99,6 +99,73 @@ TEST_F(Meter, HzCountsNewSamplesAndTakesNoIntervalAcrossAGap) {
   EXPECT_EQ(report["interval_max_ns"], 10);
 }
 
+TEST_F(Meter, HzRestartsItsWindowAfterAPause) {
+  write_at({1000, 1100, 1200, 1300, 164300, 164400, 164500});
+  const Json report = first_report({"hz", "s"});
+  EXPECT_EQ(report["intervals"], 2);
+  EXPECT_DOUBLE_EQ(report["rate_hz"].get<double>(), 10);
+  EXPECT_EQ(report["paused_ns"], 163 * kSecond);
+  EXPECT_EQ(output({"hz", "s", "-n", "1"}),
+            "paused for 2m43s, window restarted\n"
+            "average rate: 10.000 Hz\n"
+            "\tmin: 100 ms max: 100 ms std dev: 0 ns window: 3\n");
+}
+
+TEST_F(Meter, HzHasNoRateOfAStreamThatIsStalled) {
+  const Time last = WallClock::now() - 6s;
+  for (int i = 4; i >= 0; --i) writer_.write(0, last - i * 20ms);
+  const Json report = first_report({"hz", "s"});
+  EXPECT_TRUE(report["rate_hz"].is_null());
+  EXPECT_GE(report["stalled_ns"], 6 * kSecond);
+  EXPECT_DOUBLE_EQ(report["interval_mean_ns"].get<double>(), 2e7);
+  const std::string text = output({"hz", "s", "-n", "1"});
+  EXPECT_TRUE(text.starts_with("no new samples for ")) << text;
+  EXPECT_FALSE(contains(text, "Hz")) << text;
+}
+
+TEST_F(Meter, SeveralStreamsHaveARowEach) {
+  auto other = session_.create<double>("other", depth_of(16)).value();
+  auto empty = session_.create<double>("empty", depth_of(16)).value();
+  write_at({1000, 1010});
+  for (int i = 0; i < 3; ++i) other.write(0, at_ns(i * 20'000'000));
+  EXPECT_EQ(output({"hz", "s", "other", "empty", "-n", "1"}),
+            "STREAM             RATE      MIN      MAX  STD DEV  WINDOW  NOTE\n"
+            "s:0@pc1      100.000 Hz  10.0 ms  10.0 ms     0 ns       2\n"
+            "other:0@pc1   50.000 Hz  20.0 ms  20.0 ms     0 ns       3\n"
+            "empty:0@pc1           -        -        -        -       1  no samples yet\n\n");
+  const auto lines = lines_of(output({"bw", "s", "other", "-n", "1", "--json"}));
+  ASSERT_EQ(lines.size(), 2U);
+  EXPECT_EQ(Json::parse(lines[0])["stream"], "s:0@pc1");
+  EXPECT_DOUBLE_EQ(Json::parse(lines[0])["bytes_per_second"].get<double>(), 800);
+  EXPECT_EQ(Json::parse(lines[1])["stream"], "other:0@pc1");
+  EXPECT_DOUBLE_EQ(Json::parse(lines[1])["bytes_per_second"].get<double>(), 400);
+}
+
+TEST_F(Meter, SeveralStreamsAreFollowedUntilTheLastOneEnds) {
+  auto other = session_.create<double>("other", depth_of(16)).value();
+  Running delay(argv({"delay", "s", "other", "--json", "--interval", "0.05"}), environment());
+  const auto write_both = [&] {
+    writer_.write(0);
+    other.write(0);
+  };
+  std::map<std::string, bool> seen;
+  while (!seen["s:0@pc1"] || !seen["other:0@pc1"]) {
+    const Json report = Json::parse(delay.line(write_both));
+    seen[report["stream"]] = report["samples"] > 0;
+  }
+  ASSERT_TRUE(session_.remove({"other", 0, ""}));
+  std::uint64_t before = 0, now = 0;  // samples of the other one
+  for (int i = 0; i < 6 || now == before; ++i) {
+    const Json report = Json::parse(delay.line([&] { writer_.write(0); }));
+    if (report["stream"] == "s:0@pc1") before = std::exchange(now, report["seen_samples"]);
+  }
+  ASSERT_TRUE(session_.remove({"s", 0, ""}));
+  const std::string rest = delay.rest();
+  EXPECT_TRUE(contains(rest, "'other:0@pc1': it was removed")) << rest;
+  EXPECT_TRUE(contains(rest, "; and follow 's:0@pc1': it was removed")) << rest;
+  EXPECT_EQ(delay.status(), 1);
+}
+
 TEST_F(Meter, HzPrintsALastReportAtItsEnd) {
   write_at({1000, 1010});
   Running hz(argv({"hz", "s", "--interval", "1000"}), environment());
@@ -125,7 +192,7 @@ TEST_F(Meter, BwIsTheRateTimesWhatTheSamplesHave) {
   EXPECT_DOUBLE_EQ(report["rate_hz"].get<double>(), 50);
   EXPECT_DOUBLE_EQ(report["bytes_per_second"].get<double>(), 200'000);
   EXPECT_EQ(output({"bw", "wide", "-n", "1"}),
-            "average: 200 kB/s\n\tpayload: 4000 bytes rate: 50.000 Hz window: 5\n");
+            "average: 195 KiB/s\n\tpayload: 4000 bytes rate: 50.000 Hz window: 5\n");
   for (int i = 5; i < 8; ++i) wide.write(std::span(payload).first(1000), at_ns(i * 20'000'000));
   const Json shorter = first_report({"bw", "wide", "--window", "4"});
   EXPECT_EQ(shorter["payload_bytes"], 4000) << "of the stream";

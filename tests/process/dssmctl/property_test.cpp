@@ -17,8 +17,10 @@ struct Property : CtlTest {
 TEST_F(Property, GivesBackTheBytesThatWereSet) {
   const Finished set = ctl({"property", "set", "s"}, bytes_);
   EXPECT_EQ(set.exit_status, 0) << set.err;
+  EXPECT_EQ(set.out, "s:0@pc1: property of 10 bytes set\n");
   EXPECT_EQ(output({"property", "get", "s"}), bytes_);
   const Json property = json({"property", "get", "s"});
+  EXPECT_EQ(property["stream"], "s:0@pc1");
   EXPECT_EQ(property["property_bytes"], 10);
   EXPECT_EQ(property["property_hex"], "0001ff2063616c69620a");
 }
@@ -65,12 +67,15 @@ TEST_F(Playback, ShowsAndTurnsTheClock) {
   EXPECT_EQ(json({"playback", "set", "--speed", "2", "--offset", "5"})["offset_s"], 5.0);
   EXPECT_EQ(clock.setting().speed, 2);
   EXPECT_EQ(clock.setting().offset_s, 5);
-  EXPECT_EQ(output({"playback", "pause"}), "");
+  EXPECT_TRUE(contains(output({"playback", "pause"}), "paused:  yes\n"));
   EXPECT_TRUE(clock.setting().paused);
   output({"playback", "set", "--time", "1000"});
   EXPECT_NEAR(clock.now_s(), 1000, 1e-6);
   const std::string text = output({"playback", "show"});
   EXPECT_NE(text.find("time:    1000.000000 s\n"), std::string::npos) << text;
+  EXPECT_TRUE(contains(output({"playback", "show", "--iso"}), "time:    1970-01-01T00:16:40.0"));
+  output({"playback", "set", "--time", "2026-11-27T08:00:00Z"});
+  EXPECT_NEAR(clock.now_s(), 1'795'766'400, 1e-3);
   EXPECT_NE(text.find("paused:  yes\n"), std::string::npos) << text;
   output({"playback", "resume"});
   EXPECT_FALSE(clock.setting().paused);

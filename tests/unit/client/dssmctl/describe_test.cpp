@@ -32,6 +32,26 @@ TEST(HostRow, EscapesWhatOthersSay) {
   }
 }
 
+TEST(HostRow, DoesNotKnowHowManyStreamsAHostHasThatIsDown) {
+  EXPECT_EQ(host_columns()[6].title, "STREAMS");
+  EXPECT_EQ(host_row(closed_host())[6], "-");
+  EXPECT_TRUE(host_json(closed_host())["streams"].is_null());
+}
+
+// As the catalog has it: the owner does not answer now.
+TEST(StreamJson, HasNullForWhatIsNotKnown) {
+  StreamInfo stream;
+  stream.id = {"odom", 0, "pc2"};
+  const Json json = stream_json(stream);
+  for (const char* key : {"state", "rate_hz", "age_ns", "newest_tid", "writers", "readers",
+                          "channels", "creator_pid"}) {
+    EXPECT_TRUE(json.contains(key) && json[key].is_null()) << key;
+  }
+  EXPECT_EQ(count_text(stream, stream.writers), "-");
+  stream.state = StreamState::empty;
+  EXPECT_EQ(stream_json(stream)["writers"], 0);
+}
+
 TEST(HostJson, PrintsTheSameAsJson) {
   const Json json = host_json(closed_host());
   EXPECT_EQ(json["host"], "pc2");

@@ -466,7 +466,7 @@ TEST(Doctor, FindsStreamsOfOneNameAndNamesOnlySome) {
   facts.streams.push_back(stream_of("lidar", "pc2"));
   EXPECT_FINDING(facts, "stream names", Status::warn, "dssmctl info 'lidar:0@pc1'");
   EXPECT_EQ(finding_of(facts, "stream names").text,
-            "several hosts have one stream name: 'lidar:0' of pc1, pc2");
+            "several hosts have a stream of the same name: 'lidar:0' (on pc1, pc2)");
   for (int i = 0; i < 100; ++i) {
     for (const char* host : {"pc1", "pc2"}) {
       facts.streams.push_back(stream_of("x" + std::to_string(i), host));
@@ -501,6 +501,23 @@ TEST(Doctor, FindsTypesOfOneNameThatDiffer) {
   EXPECT_FINDING(facts, "types", Status::warn, "dssmctl info 'other:0@pc2'");
   EXPECT_EQ(finding_of(facts, "types").text,
             "different types have one name: 'Pose' of 'odom:0@pc2' and of 'other:0@pc2'");
+}
+
+TEST(Doctor, WarnsOfStalledStreamsAndNamesOneWithAWriterFirst) {
+  Facts facts = healthy();
+  ASSERT_EQ(facts.streams.size(), 2U);
+  EXPECT_FINDING(facts, "streams", Status::ok, "");
+  facts.streams[0].state = StreamState::no_writer;
+  facts.streams[0].age = std::chrono::seconds(98);
+  const std::string first = facts.streams[0].id.str(), second = facts.streams[1].id.str();
+  EXPECT_FINDING(facts, "streams", Status::warn, "dssmctl rm '" + first);
+  EXPECT_EQ(finding_of(facts, "streams").text,
+            "no samples of '" + first + "' for 98.0 s (no writer is connected)");
+  facts.streams[1].state = StreamState::stalled;
+  facts.streams[1].age = std::chrono::seconds(3);
+  EXPECT_FINDING(facts, "streams", Status::warn, "dssmctl info '" + second);
+  EXPECT_TRUE(finding_of(facts, "streams")
+                  .text.ends_with(", '" + second + "' for 3.00 s (its writer is connected)"));
 }
 
 TEST(Doctor, WarnsOfMirrorsThatTheNetworkCannotFill) {

@@ -39,11 +39,10 @@ TEST(CommandLine, TakesGlobalOptionsOnBothSidesOfTheVerb) {
 }
 
 TEST(CommandLine, DistinguishesTimesBeforeTheNewestFromTimesSince1970) {
-  EXPECT_FALSE(options_of<EchoOptions>({"echo", "s", "--at", "1.5"}).at_counts_back);
-  const EchoOptions back = options_of<EchoOptions>({"echo", "s", "--at", "-1.5"});
-  EXPECT_TRUE(back.at_counts_back);
-  EXPECT_EQ(back.at, -1500ms);
-  EXPECT_TRUE(options_of<EchoOptions>({"echo", "s", "--at", "-0"}).at_counts_back);
+  EXPECT_EQ(options_of<EchoOptions>({"echo", "s", "--at", "1.5"}).at,
+            Moment{time_from_ns(1'500'000'000)});
+  EXPECT_EQ(options_of<EchoOptions>({"echo", "s", "--at", "-1.5"}).at->back, -1500ms);
+  EXPECT_FALSE(options_of<EchoOptions>({"echo", "s", "--at", "now"}).at->back);
 }
 
 TEST(CommandLine, TakesOneFieldPerOption) {
@@ -111,6 +110,7 @@ TEST(CommandLine, ReadsHowToPing) {
   EXPECT_EQ(options.count, 3U);
   EXPECT_EQ(options.interval, 500ms);
   EXPECT_EQ(options_of<PingOptions>({"ping", "pc2"}).interval, 1s);
+  EXPECT_EQ(options_of<PingOptions>({"ping", "pc2", "-n", "3", "-i", "20ms"}).count, 3U);
 }
 
 TEST(CommandLine, ReportsWhatIsWrongAndWhereHelpIs) {
@@ -118,7 +118,17 @@ TEST(CommandLine, ReportsWhatIsWrongAndWhereHelpIs) {
     std::vector<const char*> words;
     const char* error;
   } cases[] = {
-      {{"lss"}, "dssmctl: there is no verb 'lss'; see 'dssmctl --help'\n"},
+      {{"xyzzy"}, "dssmctl: there is no verb 'xyzzy'; see 'dssmctl --help'\n"},
+      {{"lss"}, "dssmctl: there is no verb 'lss' (did you mean 'ls'?); see 'dssmctl --help'\n"},
+      {{"list"}, "dssmctl: there is no verb 'list' (did you mean 'ls'?); see 'dssmctl --help'\n"},
+      {{"topic", "echo", "odom"},
+       "dssmctl: there is no verb 'topic' (did you mean 'echo'?); see 'dssmctl --help'\n"},
+      {{"version"},
+       "dssmctl: there is no verb 'version' (did you mean '--version'?); see 'dssmctl --help'\n"},
+      {{"help", "lss"},
+       "dssmctl: there is no verb 'lss' (did you mean 'ls'?); see 'dssmctl --help'\n"},
+      {{"--json"}, "dssmctl: a verb is missing; see 'dssmctl --help'\n"},
+      {{"property"}, "dssmctl: property: a verb is missing; see 'dssmctl property --help'\n"},
       {{"--wrong"}, "dssmctl: there is no option '--wrong'; see 'dssmctl --help'\n"},
       {{"ls", "--wrong"}, "dssmctl: ls: there is no option '--wrong'; see 'dssmctl ls --help'\n"},
       {{"ls", "o*", "odom"}, "dssmctl: ls: 'odom' is one word too many; see 'dssmctl ls --help'\n"},
@@ -126,7 +136,8 @@ TEST(CommandLine, ReportsWhatIsWrongAndWhereHelpIs) {
       {{"property", "del"},
        "dssmctl: property: there is no verb 'del'; see 'dssmctl property --help'\n"},
       {{"ls", "--sort", "x"},
-       "dssmctl: ls: --sort: 'x' is not a key to sort by; see 'dssmctl ls --help'\n"},
+       "dssmctl: ls: --sort: 'x' is not a key to sort by; there are created, name, id, host, size, "
+       "depth, cycle, rate, age, writers, readers, type, memory; see 'dssmctl ls --help'\n"},
       {{"create", "s", "--size", "0", "--depth", "2"},
        "dssmctl: create: --size: '0' is not a whole number from 1 to 67108864; see 'dssmctl create "
        "--help'\n"},
@@ -188,6 +199,13 @@ TEST(CommandLine, ShowsHelpAndVersionAsAnAnswer) {
     EXPECT_FALSE(line.options);
     EXPECT_TRUE(line.ok);
     EXPECT_TRUE(line.text.ends_with("\n"));
+  }
+  EXPECT_EQ(parse({"help"}).text, parse({"--help"}).text);
+  EXPECT_EQ(parse({"help", "echo"}).text, parse({"echo", "--help"}).text);
+  for (const char* verb : {"ls", "echo", "clock", "create"}) {
+    const std::string help = parse({verb, "--help"}).text;
+    EXPECT_EQ(help.find("Excludes"), std::string::npos) << help;
+    EXPECT_NE(help.find("show this help and end"), std::string::npos) << help;
   }
   EXPECT_EQ(parse({"--version"}).text, "dssmctl " DSSM_VERSION "\n");
 }

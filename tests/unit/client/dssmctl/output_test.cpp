@@ -1,7 +1,12 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/dssmctl/output.hpp"
 
+#include <fcntl.h>
 #include <gtest/gtest.h>
+#include <stdlib.h>
+#include <sys/ioctl.h>
+#include <termios.h>
+#include <unistd.h>
 
 #include "tests/unit/client/dssmctl/printed.hpp"
 
@@ -16,6 +21,93 @@ TEST(Table, AlignsColumnsToTheirContentsWithoutTrailingBlanks) {
             "NAME          N  TYPE\n"
             "a          1000  x\n"
             "long name     7\n");
+}
+
+// What `print(Output&)` prints on a terminal of so many columns and 4 rows.
+template <class Print>
+std::string on_terminal(unsigned short columns, Print print) {
+  const int master = ::posix_openpt(O_RDWR | O_NOCTTY | O_CLOEXEC);
+  EXPECT_EQ(::grantpt(master) | ::unlockpt(master), 0);
+  const int slave = ::open(::ptsname(master), O_RDWR | O_NOCTTY | O_CLOEXEC);
+  termios raw{};
+  ::tcgetattr(slave, &raw);
+  ::cfmakeraw(&raw);
+  ::tcsetattr(slave, TCSANOW, &raw);
+  const winsize size{4, columns, 0, 0};
+  EXPECT_EQ(::ioctl(slave, TIOCSWINSZ, &size), 0);
+  ::setenv("NO_COLOR", "1", 1);
+  Output out(slave);
+  ::unsetenv("NO_COLOR");
+  print(out);
+  out.flush();
+  std::string text(4096, '\0');
+  const ssize_t got = ::read(master, text.data(), text.size());
+  ::close(slave);
+  ::close(master);
+  text.resize(got > 0 ? static_cast<std::size_t>(got) : 0);
+  return text;
+}
+
+std::string on_terminal(unsigned short columns, const Table& table, bool wide = false) {
+  return on_terminal(columns, [&](Output& out) {
+    if (wide) out.set_wide();
+    table.print(out);
+  });
+}
+
+TEST(Output, DrawsAScreenOverTheLastOne) {
+  EXPECT_EQ(on_terminal(80,
+                        [](Output& out) {
+                          out.add("one\ntwo\n");
+                          EXPECT_TRUE(out.flush_screen());
+                          out.add("1\n2\n3\n4\n5\n");
+                          EXPECT_TRUE(out.flush_screen());
+                        }),
+            "\x1b[2J\x1b[Hone\x1b[K\ntwo\x1b[K\n\x1b[J"
+            "\x1b[H1\x1b[K\n2\x1b[K\n3\x1b[K\n\x1b[J")
+      << "what does not fit would scroll";
+}
+
+TEST(Output, WritesOnlyWhatHasChanged) {
+  EXPECT_EQ(printed([](Output& out) {
+              for (const char* text : {"a\n", "a\n", "b\n", "a\n"}) {
+                out.add(text);
+                EXPECT_TRUE(out.flush_changed("\n"));
+              }
+            }),
+            "a\n\nb\n\na\n\n");
+}
+
+Table table_to_fit() {
+  using Fit = Table::Column::Fit;
+  Table table({{"NAME"},
+               {"ID", Table::Align::right, 1},
+               {"SIZE", Table::Align::right, 2},
+               {"TYPE", Table::Align::left, 0, Fit::cut},
+               {"NOTE", Table::Align::left, 0, Fit::below}});
+  table.add_row({"odom", "0", "1000", "vehicle::Odometry", "the host is down"});
+  return table;
+}
+
+TEST(Table, FitsATerminalByWhatItsColumnsAllow) {
+  const std::string whole =
+      "NAME  ID  SIZE  TYPE               NOTE\n"
+      "odom   0  1000  vehicle::Odometry  the host is down\n";
+  EXPECT_EQ(on_terminal(51, table_to_fit()), whole);
+  EXPECT_EQ(on_terminal(20, table_to_fit(), true), whole);
+  EXPECT_EQ(on_terminal(50, table_to_fit()),
+            "NAME  ID  SIZE  TYPE\n"
+            "odom   0  1000  vehicle::Odometry\n"
+            "    the host is down\n");
+  EXPECT_EQ(on_terminal(32, table_to_fit()),
+            "NAME  SIZE  TYPE\n"
+            "odom  1000  vehicle::Odometry\n"
+            "    the host is down\n");
+  EXPECT_EQ(on_terminal(16, table_to_fit()),
+            "NAME  TYPE\n"
+            "odom  vehicle...\n"
+            "    the host is\n"
+            "    down\n");
 }
 
 TEST(Table, PrintsItsHeaderWithoutRows) {

@@ -61,9 +61,10 @@ std::vector<std::byte> extreme_payload() {
 }
 
 std::string echoed(const TypeInfo& type, std::span<const std::byte> payload, SampleForm form,
-                   Duration clock_error = Duration(7)) {
+                   Duration clock_error = Duration(7), bool iso = false) {
   return printed([&](Output& out) {
-    SamplePrinter printer(out, form, true, {"s", 0, "pc1"}, readable_fields_untrusted(type));
+    SamplePrinter printer(out, {.form = form, .full = true, .iso = iso}, {"s", 0, "pc1"},
+                          readable_fields_untrusted(type));
     printer.begin();
     for (int i = 0; i < 2; ++i) {
       printer.sample({5, time_from_ns(1'500'000'000 + i), clock_error}, payload, {});
@@ -77,17 +78,19 @@ TEST_P(SampleForms, ComeBackAsTheyWere) {
   const TypeInfo type = type_of_all_kinds();
   const std::vector<std::byte> payload = extreme_payload();
   ASSERT_FALSE(readable_fields_untrusted(type).empty());
-  std::istringstream text(echoed(type, payload, GetParam()));
-  SampleLines lines(type, text);
-  for (int i = 0; i < 2; ++i) {
-    const Result<std::optional<SampleInput>> sample = lines.next();
-    ASSERT_TRUE(sample) << sample.error().message;
-    ASSERT_TRUE(*sample);
-    EXPECT_TRUE(std::ranges::equal((*sample)->payload(), payload)) << text.str();
-    EXPECT_EQ((*sample)->time, time_from_ns(1'500'000'000 + i));
-    EXPECT_EQ((*sample)->clock_error, Duration(7));
+  for (const bool iso : {false, true}) {
+    std::istringstream text(echoed(type, payload, GetParam(), Duration(7), iso));
+    SampleLines lines(type, text);
+    for (int i = 0; i < 2; ++i) {
+      const Result<std::optional<SampleInput>> sample = lines.next();
+      ASSERT_TRUE(sample) << sample.error().message;
+      ASSERT_TRUE(*sample);
+      EXPECT_TRUE(std::ranges::equal((*sample)->payload(), payload)) << text.str();
+      EXPECT_EQ((*sample)->time, time_from_ns(1'500'000'000 + i));
+      EXPECT_EQ((*sample)->clock_error, Duration(7));
+    }
+    EXPECT_FALSE(lines.next().value());
   }
-  EXPECT_FALSE(lines.next().value());
 }
 
 TEST_P(SampleForms, ComeBackAsTheyWereWithoutADescription) {

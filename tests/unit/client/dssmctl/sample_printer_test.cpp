@@ -13,9 +13,9 @@ namespace {
 const StreamId kStream{"s", 1, "pc1"};
 
 std::string print(SampleForm form, std::vector<Field> fields, std::span<const std::byte> payload,
-                  SampleInfo info, bool full = false, std::uint64_t lost = 0) {
+                  SampleInfo info, bool full = false, std::uint64_t lost = 0, bool iso = false) {
   return printed([&](Output& out) {
-    SamplePrinter printer(out, form, full, kStream, std::move(fields));
+    SamplePrinter printer(out, {form, full, iso}, kStream, std::move(fields));
     printer.begin();
     printer.sample(info, payload, {lost, 3});
   });
@@ -44,6 +44,17 @@ TEST(SamplePrinter, PrintsCsvWithAColumnPerElement) {
   EXPECT_EQ(print(SampleForm::csv, fields, payload, info_of(Duration(3))),
             "tid,time_ns,clock_error_ns,\"odd,name\",v[0],v[1]\n"
             "7,1500000000,3,\"x,\"\"y\"\"\",1,2\n");
+}
+
+TEST(SamplePrinter, PrintsTimesAsIso8601) {
+  const auto printed_as = [](SampleForm form) {
+    return print(form, {}, {}, info_of(), false, 0, true);
+  };
+  EXPECT_EQ(printed_as(SampleForm::csv),
+            "tid,time,clock_error_ns,payload_hex\n7,1970-01-01T00:00:01.500000000Z,,\n");
+  EXPECT_NE(printed_as(SampleForm::text).find("time: 1970-01-01T00:00:01.500000000Z\n"),
+            std::string::npos);
+  EXPECT_NE(printed_as(SampleForm::json).find("\"time_ns\":1500000000"), std::string::npos);
 }
 
 TEST(SamplePrinter, LeavesAnUnknownClockErrorEmptyInCsvAndNullInJson) {

@@ -2,8 +2,10 @@
 #include "client/dssmctl/text.hpp"
 
 #include <gtest/gtest.h>
+#include <locale.h>
 
 #include <array>
+#include <cstdlib>
 #include <limits>
 
 namespace dssm::ctl {
@@ -17,6 +19,44 @@ TEST(Text, EscapesControlAndForeignBytesAsBashReadsThem) {
   EXPECT_EQ(escaped("\x1b[31m"), "\\x1b[31m");
   EXPECT_EQ(escaped("caf\xc3\xa9\x7f"), "caf\\xc3\\xa9\\x7f");
   EXPECT_EQ(escaped("a\\b"), "a\\\\b");
+}
+
+// Prints UTF-8 while it lives.
+struct Utf8Locale {
+  Utf8Locale() {
+    EXPECT_TRUE(::setlocale(LC_CTYPE, "C.UTF-8"));
+    use_locale();
+  }
+  ~Utf8Locale() {
+    ::setlocale(LC_CTYPE, "C");
+    use_locale();
+  }
+};
+
+TEST(Text, PrintsUtf8WhereTheLocaleHasIt) {
+  const Utf8Locale locale;
+  EXPECT_EQ(escaped("\u00fcber \u30ab\u30e1\u30e9"), "\u00fcber \u30ab\u30e1\u30e9");
+  EXPECT_EQ(columns_of("\u00fcber \u30ab\u30e1\u30e9"), 11U) << "wide characters take two";
+  EXPECT_EQ(double_quoted("a\"\u00e9\\"), "\"a\\\"\u00e9\\\\\"");
+  EXPECT_EQ(shortened("\u30ab\u30e1\u30e9", 4), "\u30ab\u2026");
+  EXPECT_EQ(shortened("abc", 3), "abc");
+}
+
+TEST(Text, EscapesWhatDeceivesAlsoWhereTheLocaleHasUtf8) {
+  const Utf8Locale locale;
+  const std::pair<const char*, const char*> cases[] = {
+      {"\u202egnp", "\\xe2\\x80\\xaegnp"},  // right-to-left override
+      {"a\u200bb", "a\\xe2\\x80\\x8bb"},    // zero-width space
+      {"e\u0301", "e\\xcc\\x81"},           // combining
+      {"\u00ad", "\\xc2\\xad"},             // soft hyphen
+      {"\xc2\x9b[31m", "\\xc2\\x9b[31m"},   // a control character of 8 bits
+      {"\x1b[31m", "\\x1b[31m"},
+      {"\xc3", "\\xc3"},                    // incomplete
+      {"\xc0\x8a", "\\xc0\\x8a"},           // overlong
+      {"\xed\xa0\x80", "\\xed\\xa0\\x80"},  // a surrogate
+      {"\xff\u00e9", "\\xff\u00e9"},
+  };
+  for (const auto& [bytes, text] : cases) EXPECT_EQ(escaped(bytes), text);
 }
 
 TEST(Text, EscapesMessagesIntoOneLineButKeepsTheirBackslashes) {
@@ -72,7 +112,7 @@ TEST(Text, WritesSecondsExactlyOverTheWholeRange) {
 }
 
 TEST(Text, ReadsSecondsExactly) {
-  const auto ns = [](std::string_view text) { return to_ns(parse_seconds(text).value()); };
+  const auto ns = [](std::string_view text) { return to_ns(parse_duration(text).value()); };
   EXPECT_EQ(ns("1700000000.123456789"), 1'700'000'000'123'456'789);
   EXPECT_EQ(ns("0.025"), 25'000'000);
   EXPECT_EQ(ns(".5"), 500'000'000);
@@ -84,18 +124,84 @@ TEST(Text, ReadsSecondsExactly) {
   EXPECT_EQ(ns("9223372036.854775807"), std::numeric_limits<std::int64_t>::max());
 }
 
-TEST(Text, RefusesWhatIsNoNumberOfSeconds) {
-  for (const char* text : {"", "-", ".", "1.2.3", "1s", " 1", "nan", "inf", "1e", "--1"}) {
-    const Result<Duration> result = parse_seconds(text);
+TEST(Text, ReadsDurationsWithUnits) {
+  EXPECT_EQ(parse_duration("25ns").value(), 25ns);
+  EXPECT_EQ(parse_duration("1.5us").value(), 1500ns);
+  EXPECT_EQ(parse_duration("-500ms").value(), -500ms);
+  EXPECT_EQ(parse_duration("3s").value(), 3s);
+  EXPECT_EQ(parse_duration("2min").value(), 120s);
+  EXPECT_EQ(parse_duration("1.5h").value(), 90min);
+  EXPECT_EQ(parse_duration("2d").value(), 48h);
+  EXPECT_EQ(parse_duration("1e3ms").value(), 1s);
+  EXPECT_EQ(parse_duration("36000000000000ns").value(), 10h);
+}
+
+TEST(Text, RefusesWhatIsNoDuration) {
+  for (const char* text :
+       {"", "-", ".", "1.2.3", "1x", "1 s", " 1", "nan", "inf", "1e", "--1", "s", "-ms"}) {
+    const Result<Duration> result = parse_duration(text);
     ASSERT_FALSE(result) << text;
     EXPECT_EQ(result.error().code, Errc::invalid_argument) << text;
-    EXPECT_NE(result.error().message.find("not a number of seconds"), std::string::npos) << text;
+    EXPECT_NE(result.error().message.find("not a duration"), std::string::npos) << text;
   }
-  for (const char* text : {"9223372036.854775808", "1e30", "99999999999999999999999"}) {
-    const Result<Duration> result = parse_seconds(text);
+  for (const char* text :
+       {"9223372036.854775808", "1e30", "99999999999999999999999", "200000d", "1e10h"}) {
+    const Result<Duration> result = parse_duration(text);
     ASSERT_FALSE(result) << text;
     EXPECT_NE(result.error().message.find("292 years"), std::string::npos) << text;
   }
+}
+
+// 2026-11-27T08:00:00Z
+constexpr std::int64_t kMorning = 1'795'766'400;
+constexpr Time kNow = time_from_ns(kMorning * 1'000'000'000);
+
+TEST(Text, ReadsMomentsInEveryForm) {
+  ::setenv("TZ", "JST-9", 1);
+  ::tzset();
+  const auto at = [](std::string_view text) {
+    const Result<Moment> moment = parse_moment(text, kNow);
+    EXPECT_TRUE(moment) << text << ": " << moment.error().message;
+    EXPECT_FALSE(moment->back) << text;
+    return to_ns(moment->time - kNow.time_since_epoch());
+  };
+  EXPECT_EQ(at("now"), 0);
+  EXPECT_EQ(at("1795766400.25"), 250'000'000);
+  EXPECT_EQ(at("2026-11-27T08:00:00Z"), 0);
+  EXPECT_EQ(at("2026-11-27 08:00Z"), 0);
+  EXPECT_EQ(at("2026-11-27T08:00:00.1234567891Z"), 123'456'789);
+  EXPECT_EQ(at("2026-11-27T09:30:00+01:30"), 0);
+  EXPECT_EQ(at("2026-11-27T05:00:00-0300"), 0);
+  EXPECT_EQ(at("2026-11-27T17:00:00"), 0) << "local time";
+  EXPECT_EQ(at("2026-11-27"), -17 * 3600'000'000'000) << "local midnight";
+  EXPECT_EQ(parse_moment("-3s", kNow)->back, -3s);
+  EXPECT_EQ(parse_moment("-500ms", kNow)->back, -500ms);
+  EXPECT_EQ(parse_moment("-1.5", kNow)->back, -1500ms);
+  EXPECT_EQ(parse_moment("-0", kNow)->back, 0s);
+  ::unsetenv("TZ");
+  ::tzset();
+}
+
+TEST(Text, RefusesWhatIsNoMoment) {
+  for (const char* text :
+       {"", "soon", "3s", "2026-13-01", "2026-02-30", "2026-1-1", "2026-11-27T", "2026-11-27T25:00",
+        "2026-11-27T08", "2026-11-27T08:00:61Z", "2026-11-27T08:00:00.Z", "2026-11-27T08:00:00ZZ",
+        "2026-11-27T08:00:00+9", "2026-11-27T08:00:00+25:00", "9999-01-01Z", "9999-01-01T00:00Z",
+        "99999999999"}) {
+    const Result<Moment> moment = parse_moment(text, kNow);
+    ASSERT_FALSE(moment) << text;
+    EXPECT_EQ(moment.error().code, Errc::invalid_argument) << text;
+    EXPECT_TRUE(moment.error().message.starts_with("'")) << moment.error().message;
+  }
+}
+
+TEST(Text, WritesMomentsAsTheyCanBeRead) {
+  EXPECT_EQ(iso_text(kNow), "2026-11-27T08:00:00.000000000Z");
+  EXPECT_EQ(iso_text(time_from_ns(-1)), "1969-12-31T23:59:59.999999999Z");
+  for (const Time time : {Time::min(), Time::max(), kNow + 123456789ns}) {
+    EXPECT_EQ(parse_moment(iso_text(time), kNow)->time, time) << iso_text(time);
+  }
+  EXPECT_EQ(time_text(kNow, false), "1795766400.000000000");
 }
 
 TEST(Text, ReadsWholeNumbersInTheirRangeOnly) {
@@ -130,7 +236,7 @@ TEST(Text, WritesAmountsWithTheirUnits) {
   EXPECT_EQ(bytes_text(64ULL << 20), "64.0 MiB");
   EXPECT_EQ(bytes_text(3ULL << 40), "3.00 TiB");
   EXPECT_EQ(byte_rate_text(640), "640 B/s");
-  EXPECT_EQ(byte_rate_text(1.5e6), "1.50 MB/s");
+  EXPECT_EQ(byte_rate_text(1.5 * 1024 * 1024), "1.50 MiB/s");
 }
 
 TEST(Text, StaysAtTheEndsOfTimeWhereDifferencesOverflow) {

@@ -358,6 +358,20 @@ const std::map<std::string, Fill>& messages() {
          user.set_program("urg");
          user.set_writer(true);
        }},
+      {"stream_list_stalled",
+       [](net::Frame& frame) {
+         frame.set_serial(8);
+         StreamInfo info;
+         info.id = {"lidar", 0, "pc2"};
+         info.state = StreamState::stalled;
+         info.age = std::chrono::seconds(98);
+         proto::Stream written;
+         to_message(info, written);
+         proto::Stream& stream = *frame.mutable_stream_list()->add_streams();
+         set_id(*stream.mutable_id(), "pc2");
+         stream.set_state(written.state());
+         stream.set_age_ns(written.age_ns());
+       }},
       {"stream_removed",
        [](net::Frame& frame) {
          frame.mutable_stream_event()->set_removed(true);

@@ -262,6 +262,21 @@ TEST(Stream, ReadsNewestOldestAndRateFromTheRing) {
   EXPECT_EQ(info.depth, 16u);
   EXPECT_EQ(info.cycle, std::chrono::milliseconds(10));
   EXPECT_EQ(info.creator_pid, 42);
+  const Time last = info.newest_time;
+  EXPECT_EQ(stream->info(true, last).state, StreamState::live);
+  EXPECT_EQ(stream->info(true, last + std::chrono::seconds(9)).state, StreamState::stalled);
+  EXPECT_EQ(stream->info(true, last + std::chrono::seconds(9)).age, std::chrono::seconds(9));
+}
+
+TEST(Stream, AsksNoMirrorWhetherItsOwnerWrites) {
+  MemoryBudgets budgets(1 << 30, {});
+  Stream::Plan plan;
+  plan.id = {"odometry", 0, "pc2"};
+  plan.type = odometry_type();
+  plan.depth = 16;
+  plan.cycle = std::chrono::milliseconds(10);
+  plan.purpose = Purpose::mirror;
+  EXPECT_EQ(Stream::create(plan, budgets).value()->info().state, StreamState::unknown);
 }
 
 TEST(Stream, SurvivesNonsenseInARingItDoesNotTrust) {

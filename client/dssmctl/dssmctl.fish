@@ -1,0 +1,108 @@
+# SPDX-License-Identifier: Apache-2.0
+#
+# fish completion for dssmctl(1). Verbs and options come from its help texts; names of streams and
+# hosts from `dssmctl ls --names` and `dssmctl hosts --names`, fields from `dssmctl info --json`.
+
+function __dssmctl_ask
+    set -l words (commandline -opc)
+    set -l socket
+    if set -l at (contains -i -- --socket $words)
+        set socket --socket $words[(math $at + 1)]
+    end
+    command $words[1] $socket $argv 2>/dev/null
+end
+
+# The names that open a stream; after an @ all hosts, too.
+function __dssmctl_streams
+    __dssmctl_ask ls --names
+    __dssmctl_at_hosts
+end
+
+function __dssmctl_at_hosts
+    set -l name (commandline -ct)
+    string match -q '*@*' -- $name; or return 0
+    __dssmctl_ask hosts --names | string replace -r '^' (string replace -r '@.*' '@' -- $name)
+end
+
+function __dssmctl_candidates
+    set -l words (commandline -opc)
+    set -l verb
+    set -l positional
+    set -l i 2
+    while test $i -le (count $words)
+        switch $words[$i]
+            case -w
+                # A value only where it is --window.
+                contains -- "$verb" hz bw delay; and set i (math $i + 1)
+            case -r
+                # A value only where it is --rate.
+                test "$verb" = pub; and set i (math $i + 1)
+            case --socket --sort --host --at --count -n -c --field --wait --window --interval -i \
+                --size --table --depth --life --cycle --type --align --offset --speed --time --rate --ca \
+                --credentials --out --name --program --days
+                set i (math $i + 1)
+            case '-*'
+            case '*'
+                if test (count $verb) -eq 0
+                    set verb $words[$i]
+                else if test (count $verb) -eq 1; and contains -- $verb property playback pki help
+                    set -a verb $words[$i]
+                else
+                    set -a positional $words[$i]
+                end
+        end
+        set i (math $i + 1)
+    end
+
+    switch $words[-1]
+        case --socket --ca --credentials --out
+            __fish_complete_path (commandline -ct)
+            return
+        case --host
+            __dssmctl_ask hosts --names
+            return
+        case --field
+            __dssmctl_ask info --json $positional[1] |
+                sed -n '/"fields": \[/,/^  \]/s/^ *"name": "\(.*\)",$/\1/p'
+            return
+        case --sort
+            printf '%s\n' created name id host size depth cycle rate age writers readers type memory
+            return
+        case --at --count -n -c --wait --window --interval -i --size --table --depth --life --cycle \
+            --type --align --offset --speed --time --rate --name --program --days
+            return
+    end
+
+    if string match -q -- '-*' (commandline -ct)
+        # The options of all verbs are in the help without one.
+        set -l options --version
+        set -q verb[1]; and set options (__dssmctl_ask $verb --help)
+        printf '%s\n' $options (__dssmctl_ask --help | string match -v '  --version*') |
+            sed -n 's/^ *\(-[a-z],\)*\(--[a-z-]*\).*/\2/p' | sort -u
+        return
+    end
+    switch "$verb"
+        case '' help property playback pki
+            __dssmctl_ask (string match -v help -- $verb) --help |
+                sed -n '/^Subcommands:/,$s/^  \([a-z]\{1,\}\)  *\(.*\)/\1\t\2/p'
+        case ping
+            test (count $positional) -eq 0; and __dssmctl_ask hosts --names
+        case create
+            test (count $positional) -eq 0; and __dssmctl_at_hosts
+        case hz bw delay rm
+            __dssmctl_streams
+        case info echo pub rights
+            test (count $positional) -eq 0; and __dssmctl_streams
+        case 'property get' 'property set'
+            switch (count $positional)
+                case 0
+                    __dssmctl_streams
+                case 1
+                    __fish_complete_path (commandline -ct)
+            end
+        case 'pki issue' 'pki install' 'pki show'
+            test (count $positional) -eq 0; and __fish_complete_path (commandline -ct)
+    end
+end
+
+complete -c dssmctl -f -a '(__dssmctl_candidates)'
