@@ -46,10 +46,12 @@ ORDER = [
 ONLY = {
     "client/include": ["core/include"],
     "client/ssm": ["core/include", "client/include", "core/base"],
-    # dssmctl: besides the public headers the names and ids of hosts, which certificates hold.
+    # dssmctl: besides the public headers the names of streams, and the names and ids of hosts, which
+    # certificates hold.
     "client/dssmctl": [
         "core/include",
         "client/include",
+        "core/base/names.hpp",
         "core/base/text.hpp",
         "core/base/try.hpp",
         "core/base/unique_fd.hpp",
