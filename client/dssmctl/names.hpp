@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Names of streams as a person types them: short ones that open the right stream, the one that was
-// perhaps meant, those that several hosts have, and patterns for them.
+// Names of streams as a person types them: short ones that open the right stream, those that
+// several hosts have, and patterns for them.
 #pragma once
 
 #include <cstdint>
@@ -12,19 +12,15 @@
 #include <utility>
 #include <vector>
 
-namespace dssm::ctl {
+#include "core/base/names.hpp"
 
-// "lidar", "lidar:1": the name without ":0" and without the host.
-std::string short_name(const StreamId& id);
+namespace dssm::ctl {
 
 // For each of `streams`, which are all that there are, the shortest name that opens it on the host
 // `own_host`: short_name() where that is enough. dssmd takes a name without a host for its own
 // stream, and refuses one that only several other hosts have; such names get "@pc2".
 std::vector<std::string> opening_names(const std::vector<StreamInfo>& streams,
                                        std::string_view own_host);
-
-// Those of `names` that a person may have meant by `wanted`, best first, each once, at most three.
-std::vector<std::string> similar_names(std::string_view wanted, std::vector<std::string> names);
 
 // Streams of several hosts that have the same name and id: without the host in its name such a
 // stream opens only on a host that owns one.

@@ -5,6 +5,7 @@
 #include <sys/eventfd.h>
 #include <unistd.h>
 
+#include <cstdio>
 #include <cstdlib>
 
 #include "client/src/program_name.hpp"
@@ -59,6 +60,8 @@ Client::Client(SessionOptions options)
       wish_fd_(::eventfd(0, EFD_CLOEXEC | EFD_NONBLOCK)) {}
 
 Client::~Client() {
+  opener_.reset();
+  if (executor_) executor_->close();
   if (!thread_.joinable()) return;
   if (::getpid() != owner_pid_) {  // the thread runs in the parent only
     thread_.detach();
@@ -148,6 +151,27 @@ void Client::run() {
       time = std::min(2 * time, kMaxReconnectPause);
     }
   }
+}
+
+// --- subscriptions
+
+Result<Opener*> Client::opener() {
+  const std::lock_guard guard(subscribing_mutex_);
+  if (!opener_) opener_ = DSSM_TRY(Opener::start(*this));
+  return opener_.get();
+}
+
+Result<std::shared_ptr<ExecutorState>> Client::executor() {
+  const std::lock_guard guard(subscribing_mutex_);
+  if (executor_) return executor_;
+  const auto executor = DSSM_TRY(ExecutorState::create());
+  DSSM_TRY(ExecutorState::start(executor));
+  return executor_ = executor;
+}
+
+void Client::notice(const std::string& text) const {
+  if (options_.on_notice) return options_.on_notice(text);
+  std::fprintf(stderr, "dssm: %s\n", text.c_str());
 }
 
 // --- streams

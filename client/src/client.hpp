@@ -8,6 +8,7 @@
 //   StreamWatches     Session::watch()
 //   RingCache         the rings that this process has mapped
 //   NotifierPool      RawReader::ready_fd()
+//   Opener            opens what Session::subscribe() awaits
 //
 // One thread reads the connection. When it ends, the thread reconnects until it succeeds, and
 // offers all rings before any other thread may use the new connection.
@@ -19,8 +20,10 @@
 #include <thread>
 
 #include "client/src/daemon_connection.hpp"
+#include "client/src/executor_state.hpp"
 #include "client/src/notifier.hpp"
 #include "client/src/open_streams.hpp"
+#include "client/src/opener.hpp"
 #include "client/src/stream_watches.hpp"
 #include "core/clock/clock_page.hpp"
 #include "core/clock/playback_record.hpp"
@@ -52,6 +55,12 @@ class Client : public std::enable_shared_from_this<Client> {
   DaemonConnection& connection() noexcept { return connection_; }
   StreamWatches& watches() noexcept { return watches_; }
   NotifierPool& notifiers() noexcept { return notifiers_; }
+  // Each is started by the first call.
+  Result<Opener*> opener();
+  Result<std::shared_ptr<ExecutorState>> executor();
+
+  // Gives a line for people to SessionOptions::on_notice.
+  void notice(const std::string& text) const;
 
  private:
   friend struct OpenStream;
@@ -75,6 +84,10 @@ class Client : public std::enable_shared_from_this<Client> {
   std::mutex playback_mutex_;  // guards these two, which are set once
   std::shared_ptr<clock::PlaybackRecord> playback_;
   UniqueFd playback_fd_;
+
+  std::mutex subscribing_mutex_;  // guards these two, which are set once
+  std::unique_ptr<Opener> opener_;
+  std::shared_ptr<ExecutorState> executor_;
 
   std::uint64_t connections_ = 0;  // of the thread, which counts them
   UniqueFd stop_fd_;               // eventfd: readable when the thread must end

@@ -4,6 +4,9 @@
 #include <sys/eventfd.h>
 #include <unistd.h>
 
+#include <algorithm>
+
+#include "client/src/states.hpp"
 #include "core/base/quiet_thread.hpp"
 #include "core/base/try.hpp"
 
@@ -18,14 +21,17 @@ bool ReadyFd::poll() noexcept {
   const std::lock_guard guard(mutex_);
   const ring::RingReader reader(*ring_.ring->mapping);
   const Tid newest = reader.newest(), hole_end = reader.hole().end;
-  const bool superseded = ring_.superseded->load(std::memory_order_acquire);
-  if (newest <= ring_.seen && hole_end == seen_hole_end_ && superseded == notified_superseded_) {
-    return false;
-  }
+  const MonoTime now = MonoClock::now();
+  const bool restarts = ring_.superseded->load(std::memory_order_acquire) && now >= next_restart_;
+  if (newest <= ring_.seen && hole_end == seen_hole_end_ && !restarts) return false;
   ring_.seen = newest;
   seen_hole_end_ = hole_end;
-  notified_superseded_ = superseded;
   times_ = times();
+  if (restarts) {
+    if (superseded_since_ == MonoTime{}) superseded_since_ = now;
+    next_restart_ = now + std::clamp<Duration>(now - superseded_since_, kRestartPause,
+                                               ring::SleepTimes::kMaxSleep);
+  }
   const std::uint64_t one = 1;
   [[maybe_unused]] const ssize_t written = ::write(event_.get(), &one, sizeof one);
   return true;
@@ -34,13 +40,16 @@ bool ReadyFd::poll() noexcept {
 void ReadyFd::follow(ReadyRing ring) {
   const std::lock_guard guard(mutex_);
   ring_ = std::move(ring);
-  notified_superseded_ = false;
+  superseded_since_ = next_restart_ = MonoTime{};
   times_ = times();
 }
 
 Duration ReadyFd::next_sleep(MonoTime now) noexcept {
   const std::lock_guard guard(mutex_);
-  return times_.next(now);
+  const Duration sleep = times_.next(now);
+  return superseded_since_ == MonoTime{}
+             ? sleep
+             : std::min(sleep, std::max(next_restart_ - now, Duration::zero()));
 }
 
 void ReadyFd::clear() noexcept {

@@ -26,7 +26,8 @@ struct ReadyRing {
 };
 
 // A reader's descriptor. Readable when the ring's newest tid rose since the last clear(), when a
-// part of a mirror's hole was filled, or when the ring was superseded. Thread-safe.
+// part of a mirror's hole was filled, or when the ring was superseded; then again and again, until
+// the reader has the new ring: an attempt to open it may come too early. Thread-safe.
 class ReadyFd {
  public:
   ReadyFd(ReadyRing ring, UniqueFd event)
@@ -46,8 +47,8 @@ class ReadyFd {
 
   std::mutex mutex_;  // guards what follows, but for event_
   ReadyRing ring_;
-  ring::SleepTimes times_;  // since it changed
-  bool notified_superseded_ = false;
+  ring::SleepTimes times_;                        // since it changed
+  MonoTime superseded_since_{}, next_restart_{};  // when that is signalled again
   Tid seen_hole_end_ = 0;  // when it changed, samples may have come that a reader waits for
   UniqueFd event_;
 };

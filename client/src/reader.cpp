@@ -142,8 +142,11 @@ bool ReaderState::restart() noexcept {
   restart_error.reset();
   if ((*newer)->ring == stream->ring) {
     // dssmd has no new ring yet, or had ended the open of this one.
-    const std::lock_guard guard(stream_mutex);
-    stream = *std::move(newer);
+    {
+      const std::lock_guard guard(stream_mutex);
+      stream = *std::move(newer);
+    }
+    if (ready) client.notifiers().follow(*ready, {stream->ring, stream->superseded, cursor});
     return false;
   }
   // A mirror that dssmd recreated has the same samples with the same tids: not a restart.

@@ -9,6 +9,7 @@
 
 #include "client/src/client.hpp"
 #include "client/src/states.hpp"
+#include "client/src/stream_wait.hpp"
 #include "core/base/text.hpp"
 #include "core/base/try.hpp"
 #include "core/wire/clock_report.hpp"
@@ -39,9 +40,6 @@ Result<std::vector<StreamInfo>> listed(detail::Client& client, bool own_only) {
   }
   return streams;
 }
-
-// Between attempts where no event of a stream announces success.
-constexpr Duration kRetryPause = std::chrono::milliseconds(500);
 
 HostInfo host_info(const local::Host& message) {
   HostInfo host;
@@ -152,31 +150,38 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
                                             const TypeInfo* wanted, FetchHistory history) {
   std::mutex mutex;
   std::condition_variable added;
-  std::uint64_t times_added = 0;
+  detail::StreamWait wait(id, MonoClock::now());  // guarded by the mutex
   const auto on_event = [&](const StreamEvent& event) {
-    if (event.kind != StreamEvent::Kind::added || event.stream.id.name != id.name ||
-        event.stream.id.id != id.id) {
-      return;
-    }
+    if (event.kind != StreamEvent::Kind::added || !wait.is_about(event.stream.id)) return;
     const std::lock_guard guard(mutex);
-    ++times_added;
+    wait.added();
     added.notify_one();
   };
   const Watch watching = DSSM_TRY(watch(on_event), quoted("wait for", id));
-  for (std::uint64_t seen = 0;;) {
+  std::unique_lock lock(mutex);
+  for (;;) {
+    wait.begin_attempt();
+    lock.unlock();
     auto reader = open_raw_reader(id, wanted, 0, history);
     if (reader || !is_retryable(reader.error().code)) return reader;
-    // Only for a missing stream is there an event when it can be opened.
-    const bool has_event = reader.error().code == Errc::not_found;
-    const MonoTime next = has_event ? deadline : std::min(deadline, deadline_in(kRetryPause));
-    std::unique_lock lock(mutex);
-    if (next == kNever) {
-      added.wait(lock, [&] { return times_added > seen; });
-    } else {
-      const bool changed = added.wait_until(lock, next, [&] { return times_added > seen; });
-      if (!changed && next == deadline) return std::move(reader).error();
+    lock.lock();
+    wait.failed(reader.error(), true, MonoClock::now());
+    for (MonoTime now = MonoClock::now(); now < wait.next_attempt(); now = MonoClock::now()) {
+      if (now >= deadline) return std::move(reader).error();
+      if (now >= wait.next_notice()) {
+        lock.unlock();
+        const std::vector<StreamId> known = client_->watches().known_ids();
+        client_->notice(wait.take_notice(now, known));
+        lock.lock();
+        continue;
+      }
+      const MonoTime next = std::min({deadline, wait.next_attempt(), wait.next_notice()});
+      if (next == kNever) {
+        added.wait(lock);
+      } else {
+        added.wait_until(lock, next);
+      }
     }
-    seen = times_added;
   }
 }
 

@@ -41,6 +41,14 @@ void StreamWatches::remove(std::uint64_t key) {
   watches_.erase(key);
 }
 
+std::vector<StreamId> StreamWatches::known_ids() {
+  const std::lock_guard guard(mutex_);
+  std::vector<StreamId> ids;
+  ids.reserve(known_.size());
+  for (const auto& [name, stream] : known_) ids.push_back(stream.id);
+  return ids;
+}
+
 void StreamWatches::on_connected() {
   {
     const std::lock_guard guard(mutex_);

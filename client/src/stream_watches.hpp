@@ -10,6 +10,7 @@
 #include <map>
 #include <mutex>
 #include <string>
+#include <vector>
 
 #include "client/src/daemon_connection.hpp"
 
@@ -24,6 +25,8 @@ class StreamWatches {
 
   Result<std::uint64_t> add(OnEvent on_event);
   void remove(std::uint64_t key);  // waits for a running callback
+  // The streams that exist; none without a watch.
+  std::vector<StreamId> known_ids();
 
   // --- for the thread that reads the connection
 

@@ -46,10 +46,12 @@ ORDER = [
 ONLY = {
     "client/include": ["core/include"],
     "client/ssm": ["core/include", "client/include", "core/base"],
-    # dssmctl: besides the public headers the names and ids of hosts, which certificates hold.
+    # dssmctl: besides the public headers the names of streams, and the names and ids of hosts, which
+    # certificates hold.
     "client/dssmctl": [
         "core/include",
         "client/include",
+        "core/base/names.hpp",
         "core/base/text.hpp",
         "core/base/try.hpp",
         "core/base/unique_fd.hpp",
@@ -64,6 +66,7 @@ SPLIT_RULER = re.compile(r"^\s*//(?! ---? ?\w).*---+$")
 # A path of the sources, without its ending where that is .hpp and .cpp; with * and {a,b}.
 SOURCE_PATH = re.compile(r"(?<![\w./-])(?:core|client|daemon|proto|tests|scripts)/[\w./{,}*-]*[\w}*/]")
 LINK = re.compile(r"\]\((?!\w+:)([^)#\s]+)")
+CODE_BLOCK = re.compile(r"^```.*?^```", re.MULTILINE | re.DOTALL)
 INCLUDE = re.compile(r'^\s*#\s*include\s+["<]([^">]+)[">]', re.MULTILINE)
 
 
@@ -179,7 +182,8 @@ def document_errors(root):
         with open(path, encoding="utf-8") as file:
             text = file.read()
         named = [os.path.join(root, name) for name in SOURCE_PATH.findall(text)]
-        linked = [os.path.join(os.path.dirname(path), name) for name in LINK.findall(text)]
+        prose = CODE_BLOCK.sub("", text)  # where a lambda looks like a link
+        linked = [os.path.join(os.path.dirname(path), name) for name in LINK.findall(prose)]
         for name in sorted({*named, *linked}):
             if not path_exists(name):
                 yield f"{os.path.relpath(path, root)}: there is no {os.path.relpath(name, root)}"

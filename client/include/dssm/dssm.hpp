@@ -6,6 +6,7 @@
 #include <dssm/clock.hpp>
 #include <dssm/describe.hpp>
 #include <dssm/error.hpp>
+#include <dssm/executor.hpp>
 #include <dssm/interpolate.hpp>
 #include <dssm/pconnector.hpp>
 #include <dssm/playback_clock.hpp>

@@ -23,6 +23,7 @@
 
 #include <atomic>
 #include <cstddef>
+#include <cstdint>
 #include <dssm/describe.hpp>
 #include <dssm/sample.hpp>
 #include <dssm/sample_or.hpp>
@@ -65,6 +66,13 @@ class BorrowedSample {
 struct Neighbours {
   SampleInfo before;  // newest sample with time <= t
   SampleInfo after;   // the one after it that is not lost; its time is > t
+};
+
+// When what was written to another host's stream before it was opened, or while the connection was
+// cut, is fetched. The newest samples come in any case.
+enum class FetchHistory : std::uint8_t {
+  when_read,  // with the first read of the past, or of the next sample in order, which is `arriving`
+  at_once,  // and the open returns when it is here, or after 1 s; without it while the host is away
 };
 
 class RawReader;

@@ -7,8 +7,8 @@
 // reconnects by itself and offers the rings that it still holds to the new dssmd. Calls that need
 // dssmd wait for it up to `request_timeout`.
 //
-//   threads  any thread may call any function. A session has one thread of its own, with all
-//            signals blocked
+//   threads  any thread may call any function. A session has one thread of its own, and up to three
+//            more from the first subscribe() on, all with all signals blocked
 //   fork     a child must connect a session of its own; using the parent's there is undefined
 //   moved    a moved-from session may only be assigned to or destroyed
 //   errors   each function names its own; unavailable (no answer in time) and protocol can come
@@ -16,6 +16,7 @@
 #pragma once
 
 #include <dssm/clock_status.hpp>
+#include <dssm/executor.hpp>
 #include <dssm/host_state.hpp>
 #include <dssm/playback_clock.hpp>
 #include <dssm/reader.hpp>
@@ -39,6 +40,12 @@ struct SessionOptions {
   std::string program = {};      // shown by dssmctl; empty: this program's name
   // How long a call waits for dssmd's answer, reconnecting included.
   Duration request_timeout = std::chrono::seconds(5);
+  // Gets lines for people: what await_reader() and subscribe() wait for, after 2 s and once for
+  // each reason, with names like the wanted one; and errors of subscriptions without on_error. The
+  // calls come from await_reader()'s caller and from threads of the session. It must not call the
+  // session. Empty: they are printed to standard error, as "dssm: ..."; a function that does
+  // nothing silences them.
+  std::function<void(const std::string&)> on_notice = {};
 };
 
 // A process connected to dssmd, in the order of connection.
@@ -160,13 +167,6 @@ struct StreamEvent {
   StreamInfo stream;  // for removed: identity only
 };
 
-// When what was written to another host's stream before it was opened, or while the connection was
-// cut, is fetched. The newest samples come in any case.
-enum class FetchHistory : std::uint8_t {
-  when_read,  // with the first read of the past, or of the next sample in order, which is `arriving`
-  at_once,  // and the open returns when it is here, or after 1 s; without it while the host is away
-};
-
 // How a stream is created.
 struct CreateOptions {
   // An existing stream of that type keeps its ring, also with less history than is asked for; one
@@ -218,7 +218,7 @@ class Session {
 
   // Opens a stream for reading. Repeats, until `deadline` or for `timeout`, what fails with an
   // error that is_retryable(): waits for the stream to be created, for its host to answer, and for
-  // the clocks of both PCs to be good enough.
+  // the clocks of both PCs to be good enough. SessionOptions::on_notice is informed.
   //   fails  as open_raw_reader(): at once with an error that is not retryable, at the deadline
   //          with the last one
   Result<RawReader> await_raw_reader(const StreamId& id, MonoTime deadline,
@@ -269,6 +269,26 @@ class Session {
                                  FetchHistory history = FetchHistory::when_read) {
     return await_reader<T>(name, deadline_in(timeout), history);
   }
+
+  // Calls `callback(const Sample<T>&)`, or `callback(const Sample<T>&, Reader<T>&)`, for each
+  // sample of the stream until the result is destroyed (dssm/executor.hpp). Of the reader, see
+  // RawCallback. Waits at most 0.5 s: a stream that cannot be opened by then, or that fails to open
+  // with an error that is_retryable(), is awaited in the background.
+  //   fails  as open_raw_reader() with errors that are not retryable, if known by then (later they
+  //          go to options.on_error); system (no thread left)
+  template <Payload T, SampleCallback<T> Callback>
+  Result<StreamCallback> subscribe(std::string_view name, Callback callback,
+                                   const SubscribeOptions& options = {}) {
+    auto call = std::make_unique<detail::TypedSampleCall<T, Callback>>(std::move(callback));
+    const TypeInfo type = type_of<T>();
+    return typed<StreamCallback>(name, [&](const StreamId& id) {
+      return subscribe_to(id, &type, std::move(call), options);
+    });
+  }
+  // The same with bytes, of any type or, with `wanted`, of that one.
+  Result<StreamCallback> subscribe_raw(const StreamId& id, RawCallback callback,
+                                       const SubscribeOptions& options = {},
+                                       const TypeInfo* wanted = nullptr);
 
   // Removes a stream: it leaves the list at once and can be created again. Processes that have it
   // open keep its ring until they close it.
@@ -361,6 +381,9 @@ class Session {
 
  private:
   explicit Session(std::shared_ptr<detail::Client> client) noexcept;
+  Result<StreamCallback> subscribe_to(const StreamId& id, const TypeInfo* wanted,
+                                      std::unique_ptr<detail::SampleCall> call,
+                                      SubscribeOptions options);
 
   template <class Typed, class Open>
   static Result<Typed> typed(std::string_view name, Open open) {

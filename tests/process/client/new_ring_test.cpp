@@ -172,6 +172,59 @@ TEST(NewRing, IsReportedDuringAReconnect) {
   }
 }
 
+// An attempt to open the new ring may come too early: within the pause after one that failed, or
+// while dssmd has none yet.
+TEST(NewRing, KeepsAPollableDescriptorReadableUntilItIsOpened) {
+  const DaemonProcess daemon;
+  Session writing = connect(daemon);
+  test::Relay relay(daemon.socket_path());
+  Session session = test::connect_to(relay.socket_path());
+  std::atomic<bool> notified = false;
+  relay.set_behind([&](const local::Response& response) {
+    if (!response.has_opened() || notified.exchange(true)) return std::string();
+    local::Response event;
+    event.mutable_replaced()->set_handle(response.opened().handle());
+    return wire::encode_frame(event);
+  });
+  Writer<double> writer = writing.create<double>("anew", History{16, 1ms}).value();
+  Reader<double> reader = session.open_reader<double>("anew").value();
+  pollfd event{reader.ready_fd().value(), POLLIN, 0};
+  double value = 0;
+  SampleInfo info;
+  for (std::optional<Writer<double>> again;;) {
+    ASSERT_EQ(::poll(&event, 1, -1), 1);
+    reader.clear_ready();
+    const ReadStatus status = reader.read_next(value, info);
+    if (status == ReadStatus::restarted) break;
+    ASSERT_EQ(status, ReadStatus::not_yet);
+    if (!again && relay.opens() == 2) again = recreate(writing);  // it has tried in vain
+  }
+  EXPECT_EQ(reader.restarts(), 1u);
+}
+
+// After an attempt that found that there is no new ring, nothing is to be signalled.
+TEST(NewRing, LeavesAPollableDescriptorQuietWhenThereIsNone) {
+  const DaemonProcess daemon;
+  test::Relay relay(daemon.socket_path());
+  Session session = test::connect_to(relay.socket_path());
+  std::atomic<bool> notified = false;
+  relay.set_behind([&](const local::Response& response) {
+    if (!response.has_opened() || notified.exchange(true)) return std::string();
+    local::Response event;
+    event.mutable_replaced()->set_handle(response.opened().handle());
+    return wire::encode_frame(event);
+  });
+  const Writer<double> writer = connect(daemon).create<double>("anew", History{16, 1ms}).value();
+  Reader<double> reader = session.open_reader<double>("anew").value();
+  pollfd event{reader.ready_fd().value(), POLLIN, 0};
+  double value = 0;
+  SampleInfo info;
+  ASSERT_EQ(::poll(&event, 1, -1), 1);
+  while (relay.opens() < 2) ASSERT_EQ(reader.read_next(value, info), ReadStatus::not_yet);
+  reader.clear_ready();
+  EXPECT_EQ(::poll(&event, 1, 1100), 0) << "it would be signalled once a second at least";
+}
+
 // A dssmd that died, and a writer that took the name before the reader's process was back: that
 // process holds a ring that nobody else knows.
 TEST(NewRing, IsFoundWhenTheNameWasTakenWhileDssmdWasDown) {

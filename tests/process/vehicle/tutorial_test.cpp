@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The programs of docs/tutorial.md, extracted from its text, exchange samples.
+// The programs of docs/tutorial.md, extracted from its text, and those of docs/examples/loops
+// exchange samples.
 #include <fcntl.h>
 #include <gtest/gtest.h>
 #include <signal.h>
@@ -22,7 +23,8 @@ namespace {
 constexpr std::size_t kEnough = 4;
 
 std::string program(const std::string& name) {
-  return dssm::test::built("tests/process/vehicle/tutorial_" + name);
+  const bool is_example = name.find('/') != std::string::npos;
+  return dssm::test::built(is_example ? name : "tests/process/vehicle/tutorial_" + name);
 }
 
 // A program whose output the test reads line by line. It writes to a terminal, because it would
@@ -123,6 +125,9 @@ TEST_P(Tutorial, ProgramsShareTheStreamBetweenTwoHosts) {
 
 INSTANTIATE_TEST_SUITE_P(AllPairs, Tutorial,
                          testing::Values(std::pair{"reader", "writer"},
+                                         std::pair{"callback", "writer"},
+                                         std::pair{"docs/examples/loops/poll_loop", "writer"},
+                                         std::pair{"docs/examples/loops/libevent_loop", "writer"},
                                          std::pair{"ssm_reader", "ssm_writer"},
                                          std::pair{"reader", "ssm_writer"},
                                          std::pair{"ssm_reader", "writer"}));

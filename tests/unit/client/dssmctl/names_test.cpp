@@ -28,34 +28,6 @@ TEST(OpeningNames, NameTheHostsWhenOnlyOthersHaveTheStream) {
   EXPECT_EQ(opening({{"cam", 2, "pc2"}, {"cam", 2, "pc3"}}), (Names{"cam:2@pc2", "cam:2@pc3"}));
 }
 
-TEST(SimilarNames, FindsTypingErrorsBestFirst) {
-  EXPECT_EQ(similar_names("lidr", {"odom", "lida", "lidar", "camera"}), (Names{"lida", "lidar"}));
-  EXPECT_EQ(similar_names("lidra", {"lidar"}), Names{});  // two edits of five are too many
-}
-
-TEST(SimilarNames, FindsPartsOfNames) {
-  EXPECT_EQ(similar_names("lidar", {"front_lidar", "imu"}), Names{"front_lidar"});
-  EXPECT_EQ(similar_names("front_lidar", {"lidar", "imu"}), Names{"lidar"});
-}
-
-TEST(SimilarNames, FindsAnotherId) {
-  EXPECT_EQ(similar_names("lidar:2", {"lidar:1", "imu"}), Names{"lidar:1"});
-}
-
-TEST(SimilarNames, NamesEachOnce) {
-  EXPECT_EQ(similar_names("lidr", {"lidar", "lidar"}), Names{"lidar"});
-}
-
-TEST(SimilarNames, NamesThreeAtMost) {
-  EXPECT_EQ(similar_names("cam", {"cam1", "cam2", "cam3", "cam4"}).size(), 3U);
-}
-
-TEST(SimilarNames, HasNoGuessForWhatIsNothingAlike) {
-  EXPECT_EQ(similar_names("zzz", {"odom", "lidar"}), Names{});
-  EXPECT_EQ(similar_names("x", {}), Names{});
-  EXPECT_EQ(similar_names(std::string(100'000, 'x'), {"odom"}), Names{});
-}
-
 bool fits(const std::string& pattern, const StreamId& id) {
   return StreamFilter({}, pattern).takes(id);
 }
