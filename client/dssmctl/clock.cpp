@@ -224,7 +224,7 @@ void print_table(const std::map<std::string, Readings>& all, bool json, Output& 
     for (const auto& [what, window] :
          {std::pair("offset", &readings.offsets), std::pair("bound", &readings.bounds)}) {
       const Statistics found = window->statistics();
-      const auto cell = [&](std::string text) { return found.count > 0 ? text : "-"; };
+      const auto cell = [&](const std::string& text) { return found.count > 0 ? text : "-"; };
       table.add_row({escaped(name), what, std::to_string(found.count), cell(ns_text(found.mean_ns)),
                      cell(duration_text(found.max)), cell(duration_text(found.min)),
                      cell(ns_text(found.std_dev_ns))});

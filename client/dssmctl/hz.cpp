@@ -17,8 +17,8 @@
 namespace dssm::ctl {
 namespace {
 
-// The newest samples: the intervals between neighbouring ones, none across a gap or a pause, and how
-// long they are.
+// The newest samples: the intervals between neighbouring ones, none across a gap or a pause, and
+// how long they are.
 class RateMeter : public Meter {
  public:
   explicit RateMeter(std::uint64_t window) : window_(window) {}

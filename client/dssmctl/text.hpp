@@ -79,8 +79,8 @@ inline std::string time_text(Time time, bool iso) {
 }
 
 // Reads a duration: seconds, "1.5", "-0.25", "1e-3", or with a unit (ns, us, ms, s, min, h, d):
-// "250ms". As nanoseconds, exact unless there is an exponent; digits finer than a nanosecond are cut
-// off. Fails with invalid_argument.
+// "250ms". As nanoseconds, exact unless there is an exponent; digits finer than a nanosecond are
+// cut off. Fails with invalid_argument.
 Result<Duration> parse_duration(std::string_view text);
 
 // What a person gives as a time.

@@ -62,6 +62,10 @@ Result<void> Catalog::stream_added(const wire::HostId& id, StreamInfo stream) {
   if (found == hosts_.end()) {
     return Error{Errc::not_found, "the host of stream '" + stream.id.str() + "' is not known"};
   }
+  // What changes with each sample is as it was when the stream was created.
+  stream.oldest = stream.newest = kNoTid;
+  stream.rate_hz = 0;
+  stream.state = StreamState::unknown;
   KnownHost& host = found->second;
   const auto old = host.streams.find(Key{stream.id.name, stream.id.id});
   const std::size_t old_bytes = old == host.streams.end() ? 0 : bytes_of(old->second);

@@ -400,10 +400,6 @@ Result<void> Peers::on_stream_event_untrusted(PeerConnection& connection,
   StreamInfo stream = wire::stream_info(event.stream());
   stream.id = std::move(id);
   stream.users.clear();
-  // The catalog keeps what does not change with each sample.
-  stream.oldest = stream.newest = kNoTid;
-  stream.rate_hz = 0;
-  stream.state = StreamState::unknown;
   return catalog_.stream_added(them.host_id, std::move(stream));
 }
 

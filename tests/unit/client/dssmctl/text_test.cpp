@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// Numbers, times and names as dssmctl reads and prints them.
 #include "client/dssmctl/text.hpp"
 
 #include <gtest/gtest.h>

@@ -53,6 +53,21 @@ class Recorder final : public CatalogObserver {
 
 using Told = std::vector<std::string>;
 
+TEST(Catalog, DoesNotKeepWhatChangesWithEachSample) {
+  Catalog catalog("pc1");
+  catalog.host_up(host("pc2", 2), at("10.0.0.2"));
+  StreamInfo info = stream("lidar", "pc2");
+  info.oldest = info.newest = 3;
+  info.rate_hz = 40;
+  info.state = StreamState::live;
+  ASSERT_TRUE(catalog.stream_added(id_of(2), info));
+  const StreamInfo& kept = catalog.hosts().begin()->second.streams.begin()->second;
+  EXPECT_EQ(kept.oldest, kNoTid);
+  EXPECT_EQ(kept.newest, kNoTid);
+  EXPECT_EQ(kept.rate_hz, 0);
+  EXPECT_EQ(kept.state, StreamState::unknown);
+}
+
 TEST(Catalog, ReportsAdditionsAndRemovalsInOrder) {
   Catalog catalog("pc1");
   Recorder recorder;
