@@ -72,6 +72,7 @@ Result<std::vector<OpenedStream>> open_streams(const ReadingOptions& options,
   catch_stop_signals();
   Session session = DSSM_TRY(connect(options));
   std::vector<StreamId> ids;
+  ids.reserve(streams.size());
   for (const std::string& stream : streams) ids.push_back(DSSM_TRY(StreamId::parse(stream)));
   const MonoTime deadline = deadline_in(options.wait);
   std::vector<OpenedStream> opened;

@@ -124,7 +124,7 @@ constexpr Unit kUnits[] = {{"ns", 1},
                            {"s", kNsPerSecond},
                            {"min", 60 * kNsPerSecond},
                            {"h", 3600 * kNsPerSecond},
-                           {"d", 24 * 3600 * kNsPerSecond}};
+                           {"d", kNsPerSecond * 24 * 3600}};
 
 // Takes the unit off the end of `text`, if there is one; seconds otherwise.
 Unit take_unit(std::string_view& text) {
@@ -240,7 +240,10 @@ std::string two_units(std::int64_t big, char big_unit, std::int64_t small, char 
 
 }  // namespace
 
-void use_locale() { prints_utf8 = std::string_view(::nl_langinfo(CODESET)) == "UTF-8"; }
+void use_locale() {
+  // NOLINTNEXTLINE(concurrency-mt-unsafe): called once, before there are threads
+  prints_utf8 = std::string_view(::nl_langinfo(CODESET)) == "UTF-8";
+}
 
 std::size_t columns_of(std::string_view text) {
   std::size_t columns = 0;

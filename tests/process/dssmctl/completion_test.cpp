@@ -174,7 +174,8 @@ class CompletionInOtherShells : public FleetTest {
   Strings in_zsh(const Strings& words) {
     const std::string script =
         "compadd() { [[ $1 == -a ]] && print -rl -- ${(P)2} || print -rl -- $@ }; "
-        "_files() { print files }; script=$1; shift; words=(\"$@\"); CURRENT=$#words; source $script";
+        "_files() { print files }; script=$1; shift; words=(\"$@\"); CURRENT=$#words; source "
+        "$script";
     Strings argv = {"zsh",         "-f",  "-c",
                     script,        "zsh", source_root() + "/client/dssmctl/_dssmctl",
                     dssmctl_path()};

@@ -1,4 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
+//
+// The command line: what each verb takes and refuses, and what the error says.
 #include "client/dssmctl/options.hpp"
 
 #include <gtest/gtest.h>
