@@ -18,6 +18,10 @@ namespace dssm::ctl {
 namespace {
 
 constexpr const char* kHexField = "payload_hex";
+// Of JSON; more would only serve to overflow the stack.
+constexpr int kMaxNesting = 32;
+// Of a CSV record, whose quoted cells may go over several lines: more than any sample takes.
+constexpr std::size_t kMaxRecordBytes = 256U << 20;
 constexpr std::size_t kInfoColumns = 3;  // of echo's CSV, before those of the fields
 
 Error does_not_fit(const std::string& name, std::string_view text, const std::string& wanted) {
@@ -106,8 +110,22 @@ std::string element_text_of(const Field& field, const Json& value) {
   return value.is_null() && is_float ? "nan" : json_text(value);
 }
 
+// Empty: `text` is not JSON, or nested too deeply.
+std::optional<Json> parse_json(const std::string& text) {
+  bool is_too_deep = false;
+  Json json = Json::parse(
+      text,
+      [&](int depth, Json::parse_event_t, Json&) {
+        is_too_deep |= depth > kMaxNesting;
+        return !is_too_deep;
+      },
+      false);
+  if (is_too_deep || json.is_discarded()) return std::nullopt;
+  return json;
+}
+
 // One cell of a CSV record from `at` on, which then stands at the comma after it or at the end.
-std::string take_cell(const std::string& record, std::size_t& at) {
+Result<std::string> take_cell(const std::string& record, std::size_t& at) {
   std::string cell;
   if (at == record.size() || record[at] != '"') {
     const std::size_t end = std::min(record.find(',', at), record.size());
@@ -117,22 +135,21 @@ std::string take_cell(const std::string& record, std::size_t& at) {
   }
   for (++at; at < record.size(); ++at) {
     if (record[at] == '"') {
-      if (at + 1 == record.size() || record[at + 1] != '"') {
-        ++at;
-        break;
-      }
       ++at;
+      if (at == record.size() || record[at] == ',') return cell;
+      if (record[at] != '"') break;
     }
     cell += record[at];
   }
-  return cell;
+  return Error{Errc::invalid_argument,
+               "a quote inside a quoted cell is written twice, and a comma comes after its end"};
 }
 
-std::vector<std::string> cells_of(const std::string& record) {
+Result<std::vector<std::string>> cells_of(const std::string& record) {
   std::vector<std::string> cells;
   std::size_t at = 0;
   while (true) {
-    cells.push_back(take_cell(record, at));
+    cells.push_back(DSSM_TRY(take_cell(record, at)));
     if (at >= record.size()) return cells;
     ++at;
   }
@@ -140,7 +157,17 @@ std::vector<std::string> cells_of(const std::string& record) {
 
 bool take(const std::string& text, std::int64_t& into) {
   const char* const end = text.data() + text.size();
-  return std::from_chars(text.data(), end, into).ptr == end && !text.empty();
+  const auto [stop, failed] = std::from_chars(text.data(), end, into);
+  return failed == std::errc() && stop == end;
+}
+
+// A bound on the error of a time; none where echo prints that it is unknown.
+Result<Duration> clock_error_of(const std::string& text) {
+  if (text.empty() || text == "null") return kForeignClockError;
+  std::int64_t error_ns = 0;
+  if (take(text, error_ns) && error_ns >= 0) return Duration(error_ns);
+  return Error{Errc::invalid_argument,
+               fmt::format("clock_error_ns cannot be '{}': it is in nanoseconds, 0 or more", text)};
 }
 
 // As echo prints it: in nanoseconds since 1970, or as ISO 8601.
@@ -214,13 +241,21 @@ Result<void> SampleInput::set_text(const std::string& name, const std::string& t
   if (fields_.empty() && name == kHexField) return set_hex(text);
   const Place place = DSSM_TRY(place_of(name));
   const bool is_structured = text.starts_with('[') || text.starts_with('"');
-  const Json json = is_structured ? Json::parse(text, nullptr, false) : Json();
-  if (is_structured && !json.is_discarded()) return set_json(name, json);
+  const std::optional<Json> json = is_structured ? parse_json(text) : std::nullopt;
+  if (json) return set_json(name, *json);
   if (place.element) return store_element(payload_, *place.field, *place.element, text);
   if (is_text(*place.field)) return store_text(payload_, *place.field, text);
   if (place.field->count == 1) return store_element(payload_, *place.field, 0, text);
   return does_not_fit(name, text,
                       fmt::format("a JSON array of up to {} values", place.field->count));
+}
+
+Result<void> SampleInput::set_cell(const std::string& name, const std::string& cell) {
+  const std::optional<Place> place = find(name);
+  if (place && !place->element && is_text(*place->field)) {
+    return store_text(payload_, *place->field, cell);  // also what looks like JSON
+  }
+  return set_text(name, cell);
 }
 
 Result<void> SampleInput::set_json(const std::string& name, const Json& value) {
@@ -255,14 +290,24 @@ Result<void> SampleInput::set_json(const std::string& name, const Json& value) {
 // --- lines
 
 // A record of CSV ends at a line end that is not in quotes.
-bool SampleLines::get_record(std::string& record) {
+Result<bool> SampleLines::get_record(std::string& record) {
   if (!std::getline(in_, record)) return false;
-  ++line_;
+  const std::uint64_t first = ++line_;
   if (record.starts_with('{')) return true;
+  const auto has_odd_quotes = [](const std::string& text) {
+    return std::count(text.begin(), text.end(), '"') % 2 != 0;
+  };
+  bool is_open = has_odd_quotes(record);
   std::string more;
-  while (std::count(record.begin(), record.end(), '"') % 2 != 0 && std::getline(in_, more)) {
+  while (is_open && std::getline(in_, more)) {
     ++line_;
+    is_open = !has_odd_quotes(more);
     record += "\n" + more;
+    if (record.size() > kMaxRecordBytes) break;
+  }
+  if (is_open) {
+    return Error{Errc::invalid_argument,
+                 fmt::format("line {}: a cell begins with a quote, and has no end", first)};
   }
   if (record.ends_with('\r')) record.pop_back();
   return true;
@@ -270,7 +315,7 @@ bool SampleLines::get_record(std::string& record) {
 
 Result<std::optional<SampleInput>> SampleLines::next() {
   std::string record;
-  while (get_record(record)) {
+  while (DSSM_TRY(get_record(record))) {
     if (is_blank(record)) continue;
     const std::string context = fmt::format("line {}", line_);
     if (!header_ && !record.starts_with('{')) {
@@ -285,10 +330,11 @@ Result<std::optional<SampleInput>> SampleLines::next() {
 }
 
 Result<void> SampleLines::read_json(const std::string& line, SampleInput& sample) const {
-  const Json json = Json::parse(line, nullptr, false);
-  if (!json.is_object()) {
+  const std::optional<Json> parsed = parse_json(line);
+  if (!parsed || !parsed->is_object()) {
     return Error{Errc::invalid_argument, "this is not a JSON object on one line, as {\"x\": 1}"};
   }
+  const Json& json = *parsed;
   // As `echo --json` prints it, or only the fields.
   const bool is_from_echo = json.contains("time_ns") && !sample.has("time_ns") &&
                             (json.contains("fields") || json.contains(kHexField));
@@ -296,20 +342,16 @@ Result<void> SampleLines::read_json(const std::string& line, SampleInput& sample
     for (const auto& [name, value] : json.items()) DSSM_TRY(sample.set_json(name, value));
     return {};
   }
-  const Json& time = json["time_ns"];
-  if (time.is_number_integer()) sample.time = time_from_ns(time.get<std::int64_t>());
+  sample.time = DSSM_TRY(time_of(json_text(json["time_ns"]), false));
   const auto error = json.find("clock_error_ns");
-  if (error != json.end()) {
-    sample.clock_error =
-        error->is_number_integer() ? Duration(error->get<std::int64_t>()) : kForeignClockError;
-  }
+  if (error != json.end()) sample.clock_error = DSSM_TRY(clock_error_of(json_text(*error)));
   if (json.contains(kHexField)) return sample.set_json(kHexField, json[kHexField]);
   for (const auto& [name, value] : json["fields"].items()) DSSM_TRY(sample.set_json(name, value));
   return {};
 }
 
 Result<void> SampleLines::read_header(const std::string& line) {
-  std::vector<std::string> names = cells_of(line);
+  std::vector<std::string> names = DSSM_TRY(cells_of(line));
   const bool is_from_echo = names.size() >= kInfoColumns && names[0] == "tid" &&
                             (names[1] == "time_ns" || names[1] == "time") &&
                             names[2] == "clock_error_ns";
@@ -325,18 +367,17 @@ Result<void> SampleLines::read_header(const std::string& line) {
 }
 
 Result<void> SampleLines::read_row(const std::string& line, SampleInput& sample) const {
-  const std::vector<std::string> cells = cells_of(line);
+  const std::vector<std::string> cells = DSSM_TRY(cells_of(line));
   if (cells.size() != header_->size()) {
     return Error{Errc::invalid_argument, fmt::format("{} cells, and the header line has {}",
                                                      cells.size(), header_->size())};
   }
   if (info_columns_ > 0) {
     if (!cells[1].empty()) sample.time = DSSM_TRY(time_of(cells[1], (*header_)[1] == "time"));
-    std::int64_t error_ns = 0;
-    sample.clock_error = take(cells[2], error_ns) ? Duration(error_ns) : kForeignClockError;
+    sample.clock_error = DSSM_TRY(clock_error_of(cells[2]));
   }
   for (std::size_t i = info_columns_; i < cells.size(); ++i) {
-    if (!cells[i].empty()) DSSM_TRY(sample.set_text((*header_)[i], cells[i]));
+    if (!cells[i].empty()) DSSM_TRY(sample.set_cell((*header_)[i], cells[i]));
   }
   return {};
 }

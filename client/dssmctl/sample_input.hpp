@@ -29,6 +29,8 @@ class SampleInput {
   //   fails invalid_argument, naming the field, the value and what is possible
   Result<void> set_text(const std::string& name, const std::string& text);
   Result<void> set_json(const std::string& name, const Json& value);
+  // The same from a cell of CSV, where text is as it is.
+  Result<void> set_cell(const std::string& name, const std::string& cell);
 
   std::span<const std::byte> payload() const { return payload_; }
 
@@ -68,7 +70,7 @@ class SampleLines {
   Result<void> read_json(const std::string& line, SampleInput& sample) const;
   Result<void> read_header(const std::string& line);
   Result<void> read_row(const std::string& line, SampleInput& sample) const;
-  bool get_record(std::string& record);
+  Result<bool> get_record(std::string& record);  // false: at the end
 
   TypeInfo type_;
   std::istream& in_;

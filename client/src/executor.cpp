@@ -52,7 +52,7 @@ class ExecutorState::Turn {
   Turn(ExecutorState& state, std::shared_ptr<CallbackState> callback)
       : state_(state), callback_(std::move(callback)) {
     const std::lock_guard guard(state_.mutex_);
-    if (callback_->ended) return;
+    if (callback_->ended || state_.closed_) return;
     state_.current_ = callback_.get();
     more_ = true;
   }
@@ -267,8 +267,18 @@ void ExecutorState::end(CallbackState& callback) noexcept {
   if (::getpid() != owner_pid_) return;
   std::unique_ptr<SampleCall> unused_call;
   std::function<void(const Error&)> unused_on_error;
+  std::deque<Added> unused_readers;
   std::unique_lock lock(mutex_);
   callback.ended = true;
+  // Nobody may call run_ready() any more, which would take it in.
+  for (auto one = added_.begin(); one != added_.end();) {
+    if (one->callback.get() != &callback) {
+      ++one;
+      continue;
+    }
+    unused_readers.push_back(std::move(*one));
+    one = added_.erase(one);
+  }
   forget(callback);
   if (current_ == &callback) {
     callback.ended_in_own_turn = runner_ == std::this_thread::get_id();
@@ -294,9 +304,9 @@ void ExecutorState::close() noexcept {
     if (thread_.joinable()) thread_.detach();
     return;
   }
-  closed_ = true;
-  wake();
   std::unique_lock lock(mutex_);
+  closed_ = true;  // no turn begins any more
+  wake();
   std::thread thread = std::move(thread_);
   lock.unlock();
   if (thread.get_id() == std::this_thread::get_id()) {
@@ -305,6 +315,9 @@ void ExecutorState::close() noexcept {
     thread.join();
   }
   lock.lock();
+  if (runner_ != std::this_thread::get_id()) {
+    turn_ended_.wait(lock, [this] { return current_ == nullptr; });
+  }
   std::deque<Added> added = std::move(added_);
   const auto open = open_;
   lock.unlock();

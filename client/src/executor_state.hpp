@@ -65,6 +65,7 @@ class ExecutorState {
   void end(CallbackState& callback) noexcept;
   void stop() noexcept;
   int fd() const noexcept { return epoll_.get(); }
+  bool is_closed() const noexcept { return closed_; }
 
   // Starts the thread, which shares this object.
   static Result<void> start(const std::shared_ptr<ExecutorState>& state);

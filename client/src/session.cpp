@@ -130,10 +130,15 @@ Result<RawWriter> Session::open_raw_writer(const StreamId& id, const TypeInfo* w
   if (!wanted) return RawWriter(std::make_unique<detail::WriterState>(std::move(stream)));
   DSSM_TRY(stream->type.check_usable_as(*wanted), what);
   if (stream->type.is_less_described_than(*wanted)) {
+    const Result<DaemonInfo> daemon = daemon_info();
     const ring::RingMapping& ring = *stream->ring->mapping;
     const History history{ring.geometry().depth, ring.identity().cycle};
-    // Creating what exists opens it, and takes a type along.
-    return create_raw(stream->id, *wanted, history, {.keep_existing = true, .tag = tag});
+    if (daemon && daemon->host == stream->id.host) {
+      // Creating what exists opens it, and takes a type along. Without, writing works as well.
+      Result<RawWriter> writer =
+          create_raw(stream->id, *wanted, history, {.keep_existing = true, .tag = tag});
+      if (writer) return writer;
+    }
   }
   return RawWriter(std::make_unique<detail::WriterState>(std::move(stream)));
 }

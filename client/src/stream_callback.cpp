@@ -111,9 +111,10 @@ Result<StreamCallback> Session::subscribe_to(const StreamId& id, const TypeInfo*
     };
   }
   auto request = std::make_shared<detail::Opener::Request>(id);
-  request->open = [session = *this, id, type = wanted ? std::optional(*wanted) : std::nullopt,
-                   which = options.which,
+  request->open = [session = *this, executor, id,
+                   type = wanted ? std::optional(*wanted) : std::nullopt, which = options.which,
                    history = options.history](bool was_missing) mutable -> Result<RawReader> {
+    if (executor->is_closed()) return Error{Errc::closed, "its executor was destroyed"};
     RawReader reader = DSSM_TRY(session.open_raw_reader(id, type ? &*type : nullptr, 0, history));
     DSSM_TRY(reader.ready_fd());
     DSSM_TRY(set_start(session, reader, which, was_missing));

@@ -426,8 +426,8 @@ void LocalService::on_new_rights(const Rights& before) {
 bool LocalService::must_wait(const local::Request& request) const {
   if (!registry_.may_miss_streams() || request.has_offer()) return false;
   if (request.has_open_clock()) return !request.open_clock().offered() && !clock_.has_one();
-  // Otherwise a Watch would leave out streams that are about to be offered.
-  if (request.has_watch()) return true;
+  // Otherwise they would leave out streams that are about to be offered.
+  if (request.has_watch() || request.has_list_nodes()) return true;
   const proto::StreamId* subject = LocalRequests::subject(request);
   if (!subject) return false;
   const Result<StreamId> id = wire::stream_id_untrusted(*subject);

@@ -45,7 +45,7 @@ bool is_control(const net::Frame& request) noexcept {
 // Whether the answer would be another one when all streams have come back.
 bool must_wait_for_recovery(const net::Frame& request, const Registry& registry) {
   if (!registry.may_miss_streams()) return false;
-  if (request.has_list()) return true;
+  if (request.has_list() || request.has_list_nodes()) return true;
   const proto::StreamId* named = subject(request);
   if (!named) return false;
   const Result<StreamId> id = wire::stream_id_untrusted(*named);

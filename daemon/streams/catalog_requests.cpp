@@ -13,10 +13,28 @@
 namespace dssm::daemon {
 namespace {
 
-void describe_users(const Stream& stream, const OpenTable& opens, proto::Stream& out) {
-  for (const StreamUser& user : opens.users(stream)) wire::to_message(user, *out.add_users());
+constexpr std::size_t kMaxNamedUsers = 10;  // in one sentence
+
+// Programs of this host, then those of others.
+std::vector<StreamUser> users_of(const Stream& stream, const OpenTable& opens) {
+  std::vector<StreamUser> users = opens.users(stream);
   for (const Stream::Channel& channel : stream.channels()) {
-    for (const StreamUser& user : channel.users) wire::to_message(user, *out.add_users());
+    users.insert(users.end(), channel.users.begin(), channel.users.end());
+  }
+  return users;
+}
+
+// As many as fit into a list of `max_bytes`: other hosts may name more.
+void describe_users(const std::vector<StreamUser>& users, std::size_t max_bytes,
+                    proto::Stream& out) {
+  constexpr std::size_t kFrame = 16;  // around a user in the list
+  std::size_t bytes = out.ByteSizeLong();
+  for (const StreamUser& user : users) {
+    proto::User message;
+    wire::to_message(user, message);
+    bytes += message.ByteSizeLong() + kFrame;
+    if (bytes > max_bytes) return;
+    *out.add_users() = std::move(message);
   }
 }
 
@@ -79,7 +97,7 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
       const std::shared_ptr<Stream> stream = DSSM_TRY(registry_.find(id));
       proto::Stream& out = *response.mutable_stream_list()->add_streams();
       describe(*stream, opens_, out);
-      describe_users(*stream, opens_, out);
+      describe_users(users_of(*stream, opens_), max_list_bytes_, out);
       return {};
     }
     case Request::kRemove:
@@ -150,27 +168,30 @@ Result<void> CatalogRequests::check_unused(const Stream& stream) const {
                  "dssmd was restarted, and does not know yet who has the stream open; try again in "
                  "a second"};
   }
-  std::string users;
-  for (const StreamUser& user : opens_.users(stream)) {
-    users += fmt::format("{}'{}' (pid {})", users.empty() ? "" : ", ", user.program, user.pid);
+  std::vector<std::string> names;
+  for (const StreamUser& user : users_of(stream, opens_)) {
+    const bool is_own = user.host.empty() || user.host == registry_.host();
+    names.push_back(fmt::format("'{}' (pid {}){}", user.program, user.pid,
+                                is_own ? "" : " on host '" + user.host + "'"));
   }
   for (const Stream::Channel& channel : stream.channels()) {
-    for (const StreamUser& user : channel.users) {
-      users += fmt::format("{}'{}' (pid {}) on host '{}'", users.empty() ? "" : ", ", user.program,
-                           user.pid, user.host);
-    }
-    if (channel.users.empty()) users += users.empty() ? "another host" : ", another host";
+    if (channel.users.empty()) names.emplace_back("another host");
   }
-  if (users.empty()) return {};
+  if (names.empty()) return {};
+  if (names.size() > kMaxNamedUsers) {
+    const std::size_t more = names.size() - kMaxNamedUsers;
+    names.resize(kMaxNamedUsers);
+    names.push_back(fmt::format("{} more", more));
+  }
   return Error{
       Errc::conflict,
       fmt::format("the stream is open in {}; end these programs, or remove it (`dssmctl rm "
                   "{}`): then its readers continue with the new ring, and its writers have "
                   "to be restarted",
-                  users, stream.id().str())};
+                  fmt::join(names, ", "), stream.id().str())};
 }
 
-NodeTable CatalogRequests::nodes() const {
+NodeTable CatalogRequests::nodes(bool of_channels) const {
   NodeTable nodes(registry_.host());
   for (const auto& [number, open] : opens_.entries()) {
     if (open.stream->removed()) continue;
@@ -178,6 +199,7 @@ NodeTable CatalogRequests::nodes() const {
     user.host = registry_.host();
     nodes.add(user, open.stream->id());
   }
+  if (!of_channels) return nodes;
   for (const std::shared_ptr<Stream>& stream : registry_.streams()) {
     for (const Stream::Channel& channel : stream->channels()) {
       for (const StreamUser& user : channel.users) nodes.add(user, stream->id());
@@ -188,6 +210,10 @@ NodeTable CatalogRequests::nodes() const {
 
 Result<void> CatalogRequests::list_nodes(proto::NodeList& out) const {
   nodes().to_message(out);
+  if (out.ByteSizeLong() <= max_list_bytes_) return {};
+  // Other hosts tell of their own processes themselves.
+  out.Clear();
+  nodes(false).to_message(out);
   if (out.ByteSizeLong() <= max_list_bytes_) return {};
   return Error{Errc::limit_exceeded,
                fmt::format("the list of the {} processes of host '{}' is longer than one message "

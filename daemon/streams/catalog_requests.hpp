@@ -52,8 +52,8 @@ class CatalogRequests {
   Result<void> serve_untrusted(const Request& request, Response& response,
                                const std::string& account, const StreamId* channel = nullptr);
 
-  // The processes that have streams open here or over channels to here.
-  NodeTable nodes() const;
+  // The processes that have streams open here or, with `of_channels`, over channels to here.
+  NodeTable nodes(bool of_channels = true) const;
 
   // For Open and Create.
   Result<std::shared_ptr<Stream>> find_untrusted(const proto::StreamId& id) const;

@@ -131,6 +131,35 @@ TEST(SampleLines, TakesNestedObjectsAndColumnsInAnyOrder) {
             "line 1: this is not a JSON object on one line, as {\"x\": 1}");
 }
 
+TEST(SampleLines, RefuseWhatCouldNotBePrinted) {
+  const TypeInfo type{
+      "P", 16, 8, {{"x", Scalar::float64, 0, 1, 0}, {"name", Scalar::character, 8, 8, 1}}};
+  const auto result = [&](const std::string& text) {
+    std::istringstream in(text);
+    const Result<std::optional<SampleInput>> sample = SampleLines(type, in).next();
+    return sample ? field_text((*sample)->payload(), type.fields[1], 9) : sample.error().message;
+  };
+  EXPECT_EQ(result("name\n\"\"\"a\"\"\"\n"), "\"\\\"a\\\"\"") << "text is not JSON";
+  EXPECT_EQ(result("name\n[1]\n"), "\"[1]\"");
+  EXPECT_EQ(
+      result("x,name\n\"1\"2,a\n"),
+      "line 2: a quote inside a quoted cell is written twice, and a comma comes after its end");
+  EXPECT_EQ(result("x,name\n1,a\n\"2,b\n3,c\n").find("line"), std::string::npos);
+  EXPECT_EQ(result("name\n\"a\nb\n"), "line 2: a cell begins with a quote, and has no end");
+  const std::string echoed = "tid,time_ns,clock_error_ns,name\n1,";
+  EXPECT_EQ(result(echoed + "99999999999999999999,1,a\n").find("line 2: "), 0u);
+  EXPECT_EQ(result(echoed + "1,-1,a\n"),
+            "line 2: clock_error_ns cannot be '-1': it is in nanoseconds, 0 or more");
+  EXPECT_EQ(result(echoed + "1,9223372036854775808,a\n").find("line 2: clock_error_ns"), 0u);
+  EXPECT_EQ(result("{\"time_ns\":1,\"clock_error_ns\":-5,\"fields\":{}}\n").find("line 1: clock"),
+            0u);
+  EXPECT_EQ(result("{\"time_ns\":18446744073709551615,\"fields\":{}}\n").find("line 1: "), 0u);
+  const std::string deep(100'000, '[');
+  EXPECT_EQ(result("{\"x\":" + deep + std::string(100'000, ']') + "}\n"),
+            "line 1: this is not a JSON object on one line, as {\"x\": 1}");
+  EXPECT_FALSE(SampleInput(type).set_text("x", deep));
+}
+
 TEST(SampleInput, SaysWhatAFieldTakes) {
   const TypeInfo type = type_of_all_kinds();
   const auto error = [&](const std::string& name, const std::string& text) {
