@@ -51,10 +51,9 @@ Result<void> run(const DoctorOptions& options, Output& out) {
   });
   options.json ? print_json(findings, failed == 0, out) : print_text(findings, out);
   if (failed == 0) return {};
-  return Error{
-      Errc::system,
-      fmt::format("{} of {} checks failed; run the commands beside them, then run doctor again",
-                  failed, findings.size())};
+  return Error{Errc::system,
+               fmt::format("{} of {} checks failed; run the commands shown, then run doctor again",
+                           failed, findings.size())};
 }
 
 }  // namespace dssm::ctl

@@ -111,8 +111,9 @@ Finding no_daemon(const Facts& facts) {
                  fmt::format("ls -l {}  # then correct --socket or $DSSM_SOCKET", socket.path));
   }
   if (socket.chosen) {
-    return found("no dssmd runs for the socket that --socket or $DSSM_SOCKET names",
-                 "unset DSSM_SOCKET  # for the usual one, or start that dssmd");
+    return found(
+        "no dssmd runs for the socket that --socket or $DSSM_SOCKET names",
+        "unset DSSM_SOCKET  # for the usual one, and leave out --socket; or start that dssmd");
   }
   if (facts.service == "failed") {
     return found("dssmd could not start or crashed",

@@ -75,7 +75,7 @@ Finding check_stalled(const Facts& facts) {
   if (named.empty()) return {"streams", Status::ok, "none is stalled"};
   return {"streams", Status::warn, "no samples of " + first_of(std::move(named)),
           has_writer ? "the sensor gives nothing, or the program that writes hangs"
-                     : "the programs that wrote them have ended",
+                     : "the program that wrote it has ended",
           has_writer ? fmt::format("dssmctl info {}  # shows the program that writes", example)
                      : fmt::format("dssmctl info {0}  # then start its program, or remove the "
                                    "stream: dssmctl rm {0}",
@@ -102,7 +102,7 @@ Finding check_mirrors(const Facts& facts) {
   }
   if (behind.empty()) {
     return {"mirrors", Status::ok,
-            mirrors == 0 ? "no stream of another host is read here in full"
+            mirrors == 0 ? "no stream of another host is read here"
                          : fmt::format("the network carries all samples of {} of other hosts that "
                                        "programs here read",
                                        mirrors == 1 ? "the stream"

@@ -200,7 +200,7 @@ Result<void> print_daemon(Session& session, const InfoOptions& options, Output& 
            fmt::format("{} of {}", bytes_text(daemon.memory_bytes),
                        bytes_text(daemon.memory_limit_bytes)));
   add_line(out, "credentials", credentials_text(daemon));
-  add_line(out, "configuration", or_dash(escaped(daemon.config_file)));
+  add_line(out, "config file", or_dash(escaped(daemon.config_file)));
   print_limits(daemon, out);
   return {};
 }

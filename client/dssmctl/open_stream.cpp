@@ -41,7 +41,7 @@ Result<std::optional<OpenedStream>> open_stream(Session& session, const StreamId
   }
   Error error = with_similar_names(std::move(reader).error(), session, id);
   if (error.code == Errc::not_found && wait == Duration::zero()) {
-    error.message += "; --wait SECONDS waits for it";
+    error.message += "; --wait 10s waits for it";
   }
   return error;
 }

@@ -318,6 +318,10 @@ void check_pub(PubOptions& options) {
           "--times: only with --stdin, whose lines have them");
   require(!options.from_stdin || options.assignments.empty(),
           "--stdin: the fields come from standard input; omit FIELD=VALUE");
+  // Zeros may be a command, too, but not one that is given by mistake.
+  require(
+      options.from_stdin || !options.assignments.empty(),
+      "give at least one FIELD=VALUE, as x=0, or --stdin; `dssmctl info STREAM` lists the fields");
   for (const std::string& assignment : options.assignments) {
     require(assignment.find('=', 1) != std::string::npos,
             fmt::format("'{}' is not FIELD=VALUE, as x=1.5", escaped(assignment)));
@@ -390,7 +394,7 @@ void add_create(CLI::App& app, Parsed& parsed) {
   CLI::App* create = app.add_subcommand("create", "create a stream");
   CreateOptions& options = add_options<CreateOptions>(create, parsed, [](const CreateOptions& all) {
     require(all.depth > 0 || all.life,
-            "how much history? give --depth N, or --life SECONDS and --cycle SECONDS");
+            "how much history? give --depth N, or --life DURATION and --cycle DURATION");
   });
   create->add_option("NAME", options.stream, "its name, as NAME, NAME:ID or NAME:ID@HOST")
       ->required()
@@ -620,13 +624,15 @@ std::vector<std::string> verbs_of(const CLI::App& app) {
 
 // What is called otherwise elsewhere: by people, ROS 2, or this program's earlier versions.
 constexpr std::pair<std::string_view, std::string_view> kOtherNames[] = {
-    {"list", "ls"},        {"topic", "ls"},         {"topics", "ls"},     {"streams", "ls"},
-    {"top", "ls --watch"}, {"watch", "ls --watch"}, {"cat", "echo"},      {"read", "echo"},
-    {"rate", "hz"},        {"bandwidth", "bw"},     {"latency", "delay"}, {"show", "info"},
-    {"describe", "info"},  {"stat", "info"},        {"type", "info"},     {"interface", "info"},
-    {"delete", "rm"},      {"remove", "rm"},        {"new", "create"},    {"status", "doctor"},
-    {"check", "doctor"},   {"wtf", "doctor"},       {"peers", "hosts"},   {"host", "hosts"},
-    {"time", "clock"},     {"version", "--version"}};
+    {"list", "ls"},          {"topic", "ls"},         {"topics", "ls"},
+    {"streams", "ls"},       {"top", "ls --watch"},   {"monitor", "ls --watch"},
+    {"watch", "ls --watch"}, {"cat", "echo"},         {"read", "echo"},
+    {"rate", "hz"},          {"bandwidth", "bw"},     {"latency", "delay"},
+    {"describe", "info"},    {"stat", "info"},        {"type", "info"},
+    {"interface", "show"},   {"delete", "rm"},        {"remove", "rm"},
+    {"new", "create"},       {"status", "doctor"},    {"check", "doctor"},
+    {"wtf", "doctor"},       {"peers", "hosts"},      {"host", "hosts"},
+    {"time", "clock"},       {"version", "--version"}};
 
 // " (did you mean 'ls'?)", for a verb that there is not; `next` is the word after it.
 std::string verb_hint(const CLI::App& at, const std::string& word, const std::string& next) {

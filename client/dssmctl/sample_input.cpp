@@ -39,7 +39,8 @@ Result<void> store_number(std::byte* place, const std::string& name, std::string
     return {};
   }
   if constexpr (std::is_floating_point_v<T>) {
-    return does_not_fit(name, text, "a number that a float of its size can hold");
+    return does_not_fit(name, text,
+                        std::is_same_v<T, float> ? "a number (float32)" : "a number (float64)");
   } else {
     return does_not_fit(name, text,
                         fmt::format("a whole number from {} to {}", std::numeric_limits<T>::min(),

@@ -33,7 +33,7 @@ std::string StreamWait::take_notice(MonoTime now, const std::vector<StreamId>& k
   const std::string tried = "open '" + id_.str() + "': ";
   if (reason.starts_with(tried)) reason.remove_prefix(tried.size());
   std::string text =
-      fmt::format("waiting for stream '{}' since {} s: {}", typed(id_),
+      fmt::format("has waited {1} s for stream '{0}': {2}", typed(id_),
                   std::chrono::duration_cast<std::chrono::seconds>(now - began_).count(), reason);
   if (last_error_.code != Errc::not_found) return text;
   std::vector<std::string> names;

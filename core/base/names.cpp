@@ -37,8 +37,9 @@ std::vector<std::string> similar_names(std::string_view wanted, std::vector<std:
   if (wanted.size() > kMaxCompared) return {};
   std::vector<std::pair<std::size_t, std::string>> ranked;
   for (std::string& name : names) {
-    const bool contains = wanted.size() >= 3 && (name.find(wanted) != std::string::npos ||
-                                                 wanted.find(name) != std::string_view::npos);
+    const bool contains =
+        wanted.size() >= 3 && (name.find(wanted) != std::string::npos ||
+                               (name.size() >= 3 && wanted.find(name) != std::string_view::npos));
     const std::size_t distance = edit_distance(wanted, name);
     if (contains || distance <= std::max<std::size_t>(1, wanted.size() / 3)) {
       ranked.emplace_back(distance, std::move(name));

@@ -26,7 +26,7 @@ Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
   const auto found = by_name_.find(Key{own.name, own.id});
   if (found != by_name_.end()) return found->second;
   return Error{Errc::not_found, "there is no stream '" + own.str() +
-                                    "'; create it first (`dssmctl ls` lists those that are there)"};
+                                    "' (`dssmctl ls` lists those that are there)"};
 }
 
 void Registry::end_recovery() {

@@ -29,7 +29,7 @@ struct Awaiting : testing::Test {
   test::Events<std::string> notices;
 };
 
-const std::string kBegin = "waiting for stream 'lidr' since ", kSimilar = "'lidar@pc1'";
+const std::string kBegin = "has waited ", kSimilar = "'lidar@pc1'";
 
 TEST_F(Awaiting, AReaderIsReportedOnceWithTheReasonAndSimilarNames) {
   create("lidar");

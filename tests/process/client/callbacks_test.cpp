@@ -184,7 +184,7 @@ TEST_F(Callbacks, ReportAReasonThatIsFoundLaterOnce) {
   for (std::size_t i = 1;; ++i) {  // it may have reported its wait before
     const std::string text = notices.await(i)[i - 1];
     if (text.starts_with("subscribe to 'late:0': open 'late:0': ")) break;
-    EXPECT_TRUE(text.starts_with("waiting for stream 'late'")) << text;
+    EXPECT_TRUE(text.starts_with("has waited ")) << text;
   }
   EXPECT_FALSE(first->is_open());
 }

@@ -26,7 +26,7 @@ TEST_F(Pub, WritesWhatTheCommandLineSays) {
   EXPECT_EQ(sample->value.x, 1.5);
   EXPECT_EQ(sample->value.y, -2);
   EXPECT_LT(WallClock::now() - sample->info.time, std::chrono::minutes(1));
-  EXPECT_EQ(json({"pub", "copy", "--rate", "1000", "--count", "3"})["newest_tid"], 3);
+  EXPECT_EQ(json({"pub", "copy", "x=0", "--rate", "1000", "--count", "3"})["newest_tid"], 3);
 }
 
 TEST_F(Pub, WritesAgainWhatEchoPrinted) {

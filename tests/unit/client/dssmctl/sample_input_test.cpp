@@ -177,7 +177,7 @@ TEST(SampleInput, SaysWhatAFieldTakes) {
             "-2147483648 to 2147483647");
   EXPECT_EQ(error("bool", "yes"), "field 'bool' cannot be 'yes': it takes true or false");
   EXPECT_EQ(error("float64", "1,5"),
-            "field 'float64' cannot be '1,5': it takes a number that a float of its size can hold");
+            "field 'float64' cannot be '1,5': it takes a number (float64)");
   EXPECT_NE(error("float32", "1e300"), "");
   EXPECT_EQ(error("char", "ab"), "field 'char' cannot be 'ab': it takes one byte");
   EXPECT_EQ(error("text", "123456789"),

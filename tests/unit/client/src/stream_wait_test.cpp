@@ -44,14 +44,14 @@ TEST_F(Waiting, ReportsEachReasonOnce) {
   wait.failed(kMissing, true, kBegin);
   EXPECT_EQ(wait.next_notice(), kBegin + StreamWait::kNoticeAfter);
   EXPECT_EQ(wait.take_notice(kBegin + 2500ms, kKnown),
-            "waiting for stream 'lidr' since 2 s: there is no stream 'lidr:0'; similar names: "
+            "has waited 2 s for stream 'lidr': there is no stream 'lidr:0'; similar names: "
             "'lidar@pc1', 'lidar@pc2'");
   wait.failed(kMissing, true, kBegin + 3s);
   EXPECT_EQ(wait.next_notice(), kNever);
   wait.failed(kClock, true, kBegin + 4s);
   EXPECT_EQ(wait.next_notice(), kBegin + StreamWait::kNoticeAfter);
   EXPECT_EQ(wait.take_notice(kBegin + 4s, kKnown),
-            "waiting for stream 'lidr' since 4 s: pc1's clock is unknown");
+            "has waited 4 s for stream 'lidr': pc1's clock is unknown");
   wait.failed(kMissing, true, kBegin + 5s);
   EXPECT_EQ(wait.next_notice(), kNever);
 }
@@ -60,7 +60,7 @@ TEST_F(Waiting, ComparesTheHostWhereOneIsWanted) {
   StreamWait other({"lidar", 0, "pc3"}, kBegin);
   other.failed({Errc::not_found, "there is no host 'pc3'"}, true, kBegin);
   EXPECT_EQ(other.take_notice(kBegin + 2s, kKnown),
-            "waiting for stream 'lidar@pc3' since 2 s: there is no host 'pc3'; similar names: "
+            "has waited 2 s for stream 'lidar@pc3': there is no host 'pc3'; similar names: "
             "'lidar@pc1', 'lidar@pc2'");
 }
 
