@@ -25,8 +25,8 @@ Result<std::shared_ptr<Stream>> Registry::find(const StreamId& id) const {
   const StreamId own = DSSM_TRY(own_id(id));
   const auto found = by_name_.find(Key{own.name, own.id});
   if (found != by_name_.end()) return found->second;
-  return Error{Errc::not_found, "there is no stream '" + own.str() +
-                                    "' (`dssmctl ls` lists those that are there)"};
+  return Error{Errc::not_found,
+               "there is no stream '" + own.str() + "' (`dssmctl ls` lists those that are there)"};
 }
 
 void Registry::end_recovery() {
