@@ -73,6 +73,7 @@ def by_hand(lab: Lab) -> None:
                         and b'"0102"' in done.stdout, done))
     for guest in (owner, reader):
         guest.ssh.run("dssmctl doctor")
+    for guest in (owner, reader):
         guest.ssh.run("apt-get purge --yes dssmd dssm-tools libdssm1")
         guest.ssh.run("rm -rf /root/debs /etc/dssm /etc/chrony/conf.d/dssm.conf && systemctl restart chrony")
 
