@@ -336,7 +336,8 @@ std::string what_policy_does(const Facts& facts) {
     return fmt::format(
         "; until it is good, streams of other PCs are not opened here; with "
         "clock_policy = \"mark\" in {} they are, and their times are marked as bad",
-        config_file(facts));
+        facts.daemon.config_file.empty() ? "a file for `dssmd --config`"
+                                         : facts.daemon.config_file);
   }
   if (policy == dssm::name_of(ClockPolicy::mark)) {
     return "; until it is good, the times of other PCs' samples are marked as bad";

@@ -270,7 +270,7 @@ void ExecutorState::end(CallbackState& callback) noexcept {
   std::deque<Added> unused_readers;
   std::unique_lock lock(mutex_);
   callback.ended = true;
-  // Nobody may call run_ready() any more, which would take it in.
+  // Perhaps the program never calls run_ready() again, which would take it in.
   for (auto one = added_.begin(); one != added_.end();) {
     if (one->callback.get() != &callback) {
       ++one;
