@@ -279,6 +279,11 @@ Result<void> watch_streams(Session& session, const LsOptions& options, const Str
 
 // --- both
 
+std::vector<std::string> patterns_of(const LsOptions& options) {
+  if (options.pattern.empty()) return {};
+  return {options.pattern};
+}
+
 // With --own the streams of this host, as with --host and its name.
 Result<StreamFilter> filter_of(Session& session, const LsOptions& options) {
   std::vector<std::string> hosts = options.hosts;
@@ -286,7 +291,7 @@ Result<StreamFilter> filter_of(Session& session, const LsOptions& options) {
     const DaemonInfo daemon = DSSM_TRY(session.daemon_info());
     hosts = {daemon.host};
   }
-  return StreamFilter(std::move(hosts), options.pattern);
+  return StreamFilter(std::move(hosts), patterns_of(options));
 }
 
 }  // namespace
@@ -303,7 +308,7 @@ Result<void> run(const LsOptions& options, Output& out) {
   if (options.reverse) std::reverse(streams.begin(), streams.end());
 
   const std::size_t all = streams.size();
-  const StreamFilter filter(options.hosts, options.pattern);
+  const StreamFilter filter(options.hosts, patterns_of(options));
   if (options.names) return print_names(session, streams, filter, out);
   Listing listing;
   if (!options.own) listing.duplicates.emplace(streams);

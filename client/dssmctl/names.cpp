@@ -7,6 +7,23 @@
 #include <algorithm>
 
 namespace dssm::ctl {
+namespace {
+
+bool is_named(const StreamId& id, const std::string& pattern) {
+  const auto fits = [&](const std::string& text) {
+    return ::fnmatch(pattern.c_str(), text.c_str(), 0) == 0;
+  };
+  // An id or host counts only where the pattern has that part: `*2` is about names, and not about
+  // all that pc2 has. A colon may also belong to a class of characters, [[:digit:]].
+  const bool has_id = pattern.find(':') != std::string::npos;
+  const std::string with_id = fmt::format("{}:{}", id.name, id.id);
+  if (pattern.find('@') != std::string::npos) {
+    return fits(id.name + "@" + id.host) || (has_id && fits(with_id + "@" + id.host));
+  }
+  return fits(id.name) || (has_id && fits(with_id));
+}
+
+}  // namespace
 
 std::vector<std::string> opening_names(const std::vector<StreamInfo>& streams,
                                        std::string_view own_host) {
@@ -32,18 +49,9 @@ bool StreamFilter::takes(const StreamId& id) const {
   if (!hosts_.empty() && std::find(hosts_.begin(), hosts_.end(), id.host) == hosts_.end()) {
     return false;
   }
-  if (pattern_.empty()) return true;
-  const auto fits = [&](const std::string& text) {
-    return ::fnmatch(pattern_.c_str(), text.c_str(), 0) == 0;
-  };
-  // An id or host counts only where the pattern has that part: `*2` is about names, and not about
-  // all that pc2 has. A colon may also belong to a class of characters, [[:digit:]].
-  const bool has_id = pattern_.find(':') != std::string::npos;
-  const std::string with_id = fmt::format("{}:{}", id.name, id.id);
-  if (pattern_.find('@') != std::string::npos) {
-    return fits(id.name + "@" + id.host) || (has_id && fits(with_id + "@" + id.host));
-  }
-  return fits(id.name) || (has_id && fits(with_id));
+  return patterns_.empty() ||
+         std::any_of(patterns_.begin(), patterns_.end(),
+                     [&](const std::string& pattern) { return is_named(id, pattern); });
 }
 
 }  // namespace dssm::ctl

@@ -40,20 +40,19 @@ class Duplicates {
   std::map<Key, std::vector<std::string>> owners_;
 };
 
-// Which streams `dssmctl ls` shows.
+// Which streams are listed or recorded.
 class StreamFilter {
  public:
-  //   hosts    only streams of these; empty: of all
-  //   pattern  a shell pattern (fnmatch(3)) for the name, or for NAME:ID, NAME@HOST or NAME:ID@HOST
-  //            where it has such a part; empty: all
-  StreamFilter(std::vector<std::string> hosts, std::string pattern)
-      : hosts_(std::move(hosts)), pattern_(std::move(pattern)) {}
+  //   hosts     only streams of these; empty: of all
+  //   patterns  shell patterns (fnmatch(3)), one of which fits the name, or NAME:ID, NAME@HOST or
+  //             NAME:ID@HOST where it has such a part; empty: all
+  StreamFilter(std::vector<std::string> hosts, std::vector<std::string> patterns)
+      : hosts_(std::move(hosts)), patterns_(std::move(patterns)) {}
 
   bool takes(const StreamId& id) const;
 
  private:
-  std::vector<std::string> hosts_;
-  std::string pattern_;
+  std::vector<std::string> hosts_, patterns_;
 };
 
 }  // namespace dssm::ctl

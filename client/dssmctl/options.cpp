@@ -358,6 +358,72 @@ void add_pub(CLI::App& app, Parsed& parsed) {
   pub->add_flag("--times", options.times, "with the times in the input, not the present one");
 }
 
+std::string check_compression(std::string& name) {
+  if (name == "lz4" || name == "zstd" || name == "none") return {};
+  return fmt::format("'{}' is not a compression; there are lz4, zstd and none", escaped(name));
+}
+
+void add_record_limits(CLI::App* record, RecordOptions& options) {
+  const auto add_bytes = [&](const char* name, const char* description, std::uint64_t& target) {
+    add_parsed(record, name, "SIZE", description,
+               [&target](const std::string& text) -> Result<void> {
+                 target = DSSM_TRY(parse_bytes(text, 1));
+                 return {};
+               });
+  };
+  add_bytes("--max-file-size", "begin another file at this size, as 500MiB or 2GiB",
+            options.max_file_bytes);
+  add_seconds(record, "--max-file-duration", "begin another file after so long",
+              options.max_file_duration, Range::positive);
+  add_bytes("--max-total-size", "delete the oldest of the files when all together are larger",
+            options.max_total_bytes);
+}
+
+void check_record(RecordOptions& options) {
+  require(!options.until || !options.until->back || *options.until->back == Duration::zero(),
+          "--until: a time to come, as seconds since 1970 or ISO 8601");
+  require(!options.follow || options.past,
+          "--follow: only with --past, without which it continues anyway");
+  require(options.max_total_bytes == 0 || options.max_file_bytes > 0 ||
+              options.max_file_duration > Duration::zero(),
+          "--max-total-size deletes whole files: give --max-file-size or --max-file-duration, too");
+}
+
+void add_record(CLI::App& app, Parsed& parsed) {
+  CLI::App* record = app.add_subcommand("record", "record streams of all hosts in an MCAP file");
+  RecordOptions& options = add_options<RecordOptions>(record, parsed, check_record);
+  record
+      ->add_option("PATTERN", options.patterns,
+                   "only streams whose NAME or NAME:ID one of these shell patterns fits (default: "
+                   "all, also those to come)")
+      ->type_name("");
+  // One value each, so that PATTERN may follow.
+  record
+      ->add_option("--host", options.hosts,
+                   "only the streams that HOST owns; may be given several times")
+      ->type_name("HOST")
+      ->allow_extra_args(false);
+  record
+      ->add_option("--type", options.types,
+                   "only streams whose type this shell pattern fits; may be given several times")
+      ->type_name("TYPE")
+      ->allow_extra_args(false);
+  record
+      ->add_option("-o,--output", options.file,
+                   "the file, or a folder for one (default: dssm_DATE-TIME.mcap)")
+      ->type_name("FILE");
+  add_seconds(record, "--past", "what the rings hold of so long before now, then end", options.past,
+              Range::positive);
+  record->add_flag("--follow", options.follow, "with --past: and continue until Ctrl-C");
+  CLI::Option* until = add_moment(record, "--until", "end at TIME", options.until);
+  add_seconds(record, "--for", "end after so long", options.duration, Range::positive)
+      ->excludes(until);
+  record->add_option("--compression", options.compression, "lz4, zstd or none (default: lz4)")
+      ->type_name("NAME")
+      ->check(CLI::Validator(check_compression, ""));
+  add_record_limits(record, options);
+}
+
 void add_types(CLI::App& app, Parsed& parsed) {
   CLI::App* find = app.add_subcommand("find", "list the streams of a type");
   find->add_option("TYPE", add_options<FindOptions>(find, parsed).type,
@@ -588,6 +654,7 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_info(app, parsed);
   add_echo(app, parsed);
   add_pub(app, parsed);
+  add_record(app, parsed);
   add_types(app, parsed);
   add_meter<HzOptions>(app, parsed, "hz", "how often samples come");
   add_meter<BwOptions>(app, parsed, "bw", "how many bytes come");

@@ -96,6 +96,17 @@ struct PubOptions : CommonOptions {
   bool times = false;
 };
 
+struct RecordOptions : CommonOptions {
+  std::vector<std::string> patterns, hosts, types;  // empty: all
+  std::string file;  // or a folder; empty: a name made of the time, in the working directory
+  std::optional<Duration> past, duration;
+  std::optional<Moment> until;
+  bool follow = false;
+  std::string compression = "lz4";
+  std::uint64_t max_file_bytes = 0, max_total_bytes = 0;  // 0: no limit
+  Duration max_file_duration{};                           // 0: no limit
+};
+
 struct FindOptions : CommonOptions {
   std::string type;  // a shell pattern
 };
@@ -182,11 +193,11 @@ struct PkiShowOptions : CommonOptions {
 
 using Options =
     std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
-                 PingOptions, InfoOptions, EchoOptions, PubOptions, FindOptions, ShowOptions,
-                 HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions, RightsOptions,
-                 PropertyGetOptions, PropertySetOptions, PlaybackOptions, PkiInitOptions,
-                 PkiRequestOptions, PkiIssueOptions, PkiInstallOptions, PkiRenewOptions,
-                 PkiRevokeOptions, PkiShowOptions>;
+                 PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, FindOptions,
+                 ShowOptions, HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions,
+                 RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
+                 PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
+                 PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
@@ -211,6 +222,7 @@ Result<void> run(const PingOptions& options, Output& out);
 Result<void> run(const InfoOptions& options, Output& out);
 Result<void> run(const EchoOptions& options, Output& out);
 Result<void> run(const PubOptions& options, Output& out);
+Result<void> run(const RecordOptions& options, Output& out);
 Result<void> run(const FindOptions& options, Output& out);
 Result<void> run(const ShowOptions& options, Output& out);
 Result<void> run(const HzOptions& options, Output& out);

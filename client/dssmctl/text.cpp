@@ -461,6 +461,21 @@ Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t min, std:
   return value;
 }
 
+Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t min) {
+  static constexpr std::pair<std::string_view, double> kUnits[] = {
+      {"KiB", 1ULL << 10}, {"MiB", 1ULL << 20}, {"GiB", 1ULL << 30}, {"TiB", 1ULL << 40}, {"", 1}};
+  constexpr double kMax = 1ULL << 62;
+  for (const auto& [unit, factor] : kUnits) {
+    if (!text.ends_with(unit)) continue;
+    const Result<double> number = parse_real(text.substr(0, text.size() - unit.size()));
+    if (!number || *number * factor > kMax || *number * factor < static_cast<double>(min)) break;
+    return static_cast<std::uint64_t>(*number * factor);
+  }
+  return bad(text, fmt::format("is not a size of at least {} bytes, as 500MiB: a number alone or "
+                               "with KiB, MiB, GiB or TiB",
+                               min));
+}
+
 Result<double> parse_real(std::string_view text) {
   double value = 0;
   std::string_view digits = text;

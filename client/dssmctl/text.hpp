@@ -101,6 +101,10 @@ Result<Moment> parse_moment(std::string_view text, Time now);
 // Reads a whole number from `min` to `max`. Fails with invalid_argument.
 Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t min, std::uint64_t max);
 
+// Reads a number of bytes, "1048576", or with a unit (KiB, MiB, GiB, TiB): "1.5GiB". At least `min`.
+// Fails with invalid_argument.
+Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t min);
+
 // Reads a finite number. Fails with invalid_argument.
 Result<double> parse_real(std::string_view text);
 

@@ -1,0 +1,273 @@
+// SPDX-License-Identifier: Apache-2.0
+#include "client/dssmctl/recorder.hpp"
+
+#include <fmt/format.h>
+#include <fnmatch.h>
+
+#include <algorithm>
+
+#include "client/dssmctl/text.hpp"
+#include "core/base/try.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+// Empty when there is none, or its host does not answer.
+std::vector<std::byte> property_of(const RawReader& reader) {
+  Result<std::vector<std::byte>> property = reader.property();
+  return property ? *std::move(property) : std::vector<std::byte>();
+}
+
+}  // namespace
+
+// --- opening
+
+Recorder::Opener::Opener(Session session, RecorderPlan plan)
+    : session_(std::move(session)), plan_(std::move(plan)), started_(WallClock::now()) {}
+
+Recorder::Opener::~Opener() {
+  watch_.reset();
+  {
+    const std::lock_guard lock(mutex_);
+    stopping_ = true;
+  }
+  changed_.notify_one();
+  if (thread_.joinable()) thread_.join();
+}
+
+Result<void> Recorder::Opener::begin() {
+  watch_ = DSSM_TRY(session_.watch([this](const StreamEvent& event) { on_event(event); }));
+  {
+    const std::lock_guard lock(mutex_);
+    is_beginning_ = false;
+  }
+  thread_ = std::thread([this] { run(); });
+  return {};
+}
+
+bool Recorder::Opener::wants(const StreamInfo& stream) const {
+  return plan_.filter.takes(stream.id) &&
+         (plan_.types.empty() ||
+          std::any_of(plan_.types.begin(), plan_.types.end(), [&](const std::string& type) {
+            return ::fnmatch(type.c_str(), stream.type.name.c_str(), 0) == 0;
+          }));
+}
+
+void Recorder::Opener::on_event(const StreamEvent& event) {
+  const std::string name = event.stream.id.str();
+  const std::lock_guard lock(mutex_);
+  const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
+  if (event.kind == StreamEvent::Kind::removed) {
+    untried_ -= static_cast<std::size_t>(
+        std::count_if(wanted_.begin(), wanted_.end(), [&](const Wanted& wanted) {
+          return is_it(wanted) && wanted.from_start && !wanted.reported;
+        }));
+    std::erase_if(wanted_, is_it);
+    return;
+  }
+  if (!wants(event.stream) || known_.contains(name) ||
+      std::any_of(wanted_.begin(), wanted_.end(), is_it)) {
+    return;
+  }
+  untried_ += is_beginning_;
+  wanted_.push_back({event.stream, MonoClock::now(), is_beginning_, false});
+  changed_.notify_one();
+}
+
+void Recorder::Opener::run() {
+  std::unique_lock lock(mutex_);
+  while (!stopping_) {
+    const auto next =
+        std::min_element(wanted_.begin(), wanted_.end(),
+                         [](const Wanted& a, const Wanted& b) { return a.due < b.due; });
+    if (next == wanted_.end()) {
+      changed_.wait(lock);
+      continue;
+    }
+    if (next->due > MonoClock::now()) {
+      changed_.wait_until(lock, next->due);
+      continue;
+    }
+    const Wanted wanted = *next;
+    lock.unlock();
+    Result<Opened> opened = open(wanted);
+    lock.lock();
+    // It may have been removed meanwhile.
+    const auto entry = std::find_if(wanted_.begin(), wanted_.end(), [&](const Wanted& other) {
+      return other.stream.id == wanted.stream.id;
+    });
+    if (entry == wanted_.end()) continue;
+    if (wanted.from_start && !wanted.reported) --untried_;
+    if (opened) {
+      known_.insert(wanted.stream.id.str());
+      wanted_.erase(entry);
+      opened_.push_back(*std::move(opened));
+      continue;
+    }
+    const Error& error = opened.error();
+    const bool is_to_retry = is_retryable(error.code);
+    if (!wanted.reported) {
+      notices_.push_back(fmt::format("'{}' is not recorded{}: {}", escaped(wanted.stream.id.str()),
+                                     is_to_retry ? " yet" : "", escaped_message(error.message)));
+    }
+    entry->reported = true;
+    entry->due = deadline_in(kRetryPeriod);
+    if (!is_to_retry) wanted_.erase(entry);
+  }
+}
+
+Result<Recorder::Opener::Opened> Recorder::Opener::open(const Wanted& wanted) const {
+  // A stream that comes later is new, or its host is: all of it is wanted.
+  const bool with_history = plan_.past || !wanted.from_start;
+  Session session = session_;
+  RawReader reader = DSSM_TRY(
+      session.open_raw_reader(wanted.stream.id, nullptr, 0,
+                              with_history ? FetchHistory::at_once : FetchHistory::when_read));
+  std::vector<std::byte> property = property_of(reader);
+  const Tid newest = reader.newest_tid();
+  Source source{std::move(reader), 0, kNoTid, newest, {}};
+  if (!with_history) {
+    source.reader.seek(newest);
+    source.last = newest;
+  } else {
+    source.reader.seek(kNoTid);
+    if (plan_.past && wanted.from_start) {
+      // The stamps of a recording that is being played are of another time than now.
+      SampleInfo info;
+      const bool is_of_now = wanted.stream.state != StreamState::unknown;
+      const bool is_known = source.reader.read_info(newest, info) == ReadStatus::ok;
+      source.from = saturating_add(is_of_now || !is_known ? started_ : info.time, -*plan_.past);
+    }
+  }
+  return Opened{std::move(source), std::move(property)};
+}
+
+std::vector<Recorder::Opener::Opened> Recorder::Opener::take_opened() {
+  const std::lock_guard lock(mutex_);
+  return std::exchange(opened_, {});
+}
+
+std::vector<std::string> Recorder::Opener::take_notices() {
+  const std::lock_guard lock(mutex_);
+  return std::exchange(notices_, {});
+}
+
+bool Recorder::Opener::has_tried_all() const {
+  const std::lock_guard lock(mutex_);
+  return untried_ == 0 && opened_.empty();
+}
+
+// --- recording
+
+Result<std::unique_ptr<Recorder>> Recorder::start(Session session, RecordingWriter file,
+                                                  RecorderPlan plan) {
+  std::unique_ptr<Recorder> recorder(
+      new Recorder(std::move(session), std::move(file), std::move(plan)));
+  DSSM_TRY(recorder->opener_.begin());
+  return recorder;
+}
+
+Result<void> Recorder::take() {
+  for (Opener::Opened& opened : opener_.take_opened()) DSSM_TRY(add(std::move(opened)));
+  filled_ = 0;
+  bool is_more = false;
+  for (Source& source : sources_) {
+    if (DSSM_TRY(take(source))) is_more = true;
+  }
+  next_take_ = is_more ? MonoClock::now() : deadline_in(next_period());
+  return {};
+}
+
+// Programs give a cycle that is far from the real one, so how much was new counts, too: quickly to a
+// shorter period, slowly to a longer one.
+Duration Recorder::next_period() {
+  const double factor = filled_ > 0 ? std::min(kFilled / filled_, kGrowth) : kGrowth;
+  Duration limit = kMaxPeriod;
+  for (const Source& source : sources_) {
+    const Duration life =
+        static_cast<std::int64_t>(source.reader.depth() - 1) * source.reader.cycle();
+    if (life > Duration::zero()) {
+      limit = std::min(limit, std::chrono::duration_cast<Duration>(kFilled * life));
+    }
+  }
+  period_ = std::clamp(std::chrono::duration_cast<Duration>(factor * period_), kMinPeriod,
+                       std::max(limit, kMinPeriod));
+  return period_;
+}
+
+Result<void> Recorder::add(Opener::Opened opened) {
+  DSSM_TRY(add_to_file(opened.source, std::move(opened.property)));
+  sources_.push_back(std::move(opened.source));
+  period_ = kMinPeriod;  // how quickly its ring fills is not known yet
+  return {};
+}
+
+Result<void> Recorder::add_to_file(Source& source, std::vector<std::byte> property) {
+  const RawReader& reader = source.reader;
+  source.number =
+      DSSM_TRY(file_.add_stream({reader.id(), reader.type(), reader.depth(), reader.cycle(),
+                                 reader.incarnation(), std::move(property)}));
+  return {};
+}
+
+Result<bool> Recorder::take(Source& source) {
+  std::uint64_t bytes = 0, samples = 0;
+  while (bytes < kTurnBytes) {
+    payload_.resize(source.reader.payload_bytes());
+    SampleInfo info;
+    const ReadStatus status = source.reader.read_next(payload_, info);
+    if (status == ReadStatus::restarted) {
+      DSSM_TRY(add_to_file(source, property_of(source.reader)));
+      source.last = kNoTid;
+      source.past_until = kNoTid;
+      source.from.reset();
+      continue;
+    }
+    if (status != ReadStatus::ok) break;
+    bytes += payload_.size();
+    ++samples;
+    if (source.from && info.time < *source.from) {
+      source.last = info.tid;
+      continue;
+    }
+    DSSM_TRY(write(source, info));
+  }
+  filled_ = std::max(filled_,
+                     static_cast<double>(samples) / static_cast<double>(source.reader.depth() - 1));
+  return bytes >= kTurnBytes;
+}
+
+Result<void> Recorder::write(Source& source, const SampleInfo& info) {
+  // What the ring no longer held when the first sample was taken was before the recording.
+  if (source.last != kNoTid && info.tid > source.last + 1) {
+    DSSM_TRY(file_.add_gap(source.number, source.last + 1,
+                           static_cast<std::uint64_t>(info.tid - source.last - 1)));
+  }
+  source.last = info.tid;
+  return file_.write(source.number, info, source.reader.clock_error(info),
+                     std::span(payload_).first(info.payload_bytes));
+}
+
+bool Recorder::has_past() const {
+  const auto is_taken = [](const Source& source) {
+    if (source.last >= source.past_until) return true;
+    SampleInfo info;
+    const ReadStatus status = source.reader.read_info(source.past_until, info);
+    return status == ReadStatus::lost || status == ReadStatus::too_old;
+  };
+  return opener_.has_tried_all() && std::all_of(sources_.begin(), sources_.end(), is_taken);
+}
+
+std::vector<std::string> Recorder::take_notices() { return opener_.take_notices(); }
+
+Result<void> Recorder::finish() {
+  DSSM_TRY(take());
+  // A program may have set it after its stream was opened here.
+  for (Source& source : sources_) {
+    const Result<std::vector<std::byte>> property = source.reader.property();
+    if (property) DSSM_TRY(file_.set_property(source.number, *property));
+  }
+  return file_.finish();
+}
+
+}  // namespace dssm::ctl
