@@ -85,7 +85,9 @@ _dssmctl() {
         ;;
       --socket | --sort | --host | --at | --count | -n | -c | --field | --wait | --window | \
         --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
-        --speed | --time | --rate | --ca | --credentials | --out | --name | --program | --days)
+        --speed | --time | --rate | --ca | --credentials | --out | --name | --program | --days | \
+        --output | -o | --past | --until | --for | --compression | --max-file-size | \
+        --max-file-duration | --max-total-size)
         ((++i))
         ;;
       -*) ;;
@@ -102,7 +104,7 @@ _dssmctl() {
   done
 
   case $prev in
-    --socket | --ca | --credentials | --out)
+    --socket | --ca | --credentials | --out | --output | -o)
       _dssmctl_offer_files
       return
       ;;
@@ -115,13 +117,18 @@ _dssmctl() {
       _dssmctl_offer < <(_dssmctl_ask hosts --names)
       return
       ;;
+    --compression)
+      mapfile -t COMPREPLY < <(compgen -W "lz4 none zstd" -- "$cur")
+      return
+      ;;
     --field)
       _dssmctl_offer < <(_dssmctl_fields "$first")
       return
       ;;
     --at | --count | -n | -c | --wait | --window | --interval | -i | --size | --table | \
       --depth | --life | --cycle | --type | --align | --offset | --speed | --time | --rate | --name | \
-      --program | --days)
+      --program | --days | --past | --until | --for | --max-file-size | --max-file-duration | \
+      --max-total-size)
       return # a value that only the person knows
       ;;
   esac
@@ -138,6 +145,10 @@ _dssmctl() {
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
     pub) options="--count --rate --stdin --times" ;;
+    record)
+      options="--compression --follow --for --host --max-file-duration --max-file-size \
+        --max-total-size --output --past --type --until"
+      ;;
     hz | bw | delay) options="--count --interval --wait --window" ;;
     create) options="--align --cycle --depth --life --size --type" ;;
     "playback set") options="--offset --speed --time" ;;
@@ -156,7 +167,7 @@ _dssmctl() {
     "" | help)
       mapfile -t COMPREPLY < <(compgen -W \
         "bw clock create delay doctor echo find graph hosts hz info ls nodes ping pki playback \
-          property pub rights rm show" -- "$cur")
+          property pub record rights rm show" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;
@@ -166,7 +177,7 @@ _dssmctl() {
     "pki issue" | "pki install" | "pki show") ((positional == 0)) && _dssmctl_offer_files ;;
     ping) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_ask hosts --names) ;;
     create) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_at_hosts) ;;
-    rm | hz | bw | delay) _dssmctl_offer < <(_dssmctl_streams) ;;
+    rm | hz | bw | delay | record) _dssmctl_offer < <(_dssmctl_streams) ;;
     info | echo | pub | rights)
       ((positional == 0)) && _dssmctl_offer < <(_dssmctl_streams)
       ;;

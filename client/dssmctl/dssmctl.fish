@@ -39,7 +39,8 @@ function __dssmctl_candidates
                 test "$verb" = pub; and set i (math $i + 1)
             case --socket --sort --host --at --count -n -c --field --wait --window --interval -i \
                 --size --table --depth --life --cycle --type --align --offset --speed --time --rate --ca \
-                --credentials --out --name --program --days
+                --credentials --out --name --program --days --output -o --past --until --for \
+                --compression --max-file-size --max-file-duration --max-total-size
                 set i (math $i + 1)
             case '-*'
             case '*'
@@ -55,7 +56,7 @@ function __dssmctl_candidates
     end
 
     switch $words[-1]
-        case --socket --ca --credentials --out
+        case --socket --ca --credentials --out --output -o
             __fish_complete_path (commandline -ct)
             return
         case --host
@@ -69,7 +70,11 @@ function __dssmctl_candidates
             printf '%s\n' created name id host size depth cycle rate age writers readers type memory
             return
         case --at --count -n -c --wait --window --interval -i --size --table --depth --life --cycle \
-            --type --align --offset --speed --time --rate --name --program --days
+            --type --align --offset --speed --time --rate --name --program --days --past --until --for \
+            --max-file-size --max-file-duration --max-total-size
+            return
+        case --compression
+            printf '%s\n' lz4 none zstd
             return
     end
 
@@ -89,7 +94,7 @@ function __dssmctl_candidates
             test (count $positional) -eq 0; and __dssmctl_ask hosts --names
         case create
             test (count $positional) -eq 0; and __dssmctl_at_hosts
-        case hz bw delay rm
+        case hz bw delay rm record
             __dssmctl_streams
         case info echo pub rights
             test (count $positional) -eq 0; and __dssmctl_streams

@@ -29,12 +29,12 @@ TEST(OpeningNames, NameTheHostsWhenOnlyOthersHaveTheStream) {
 }
 
 bool fits(const std::string& pattern, const StreamId& id) {
-  return StreamFilter({}, pattern).takes(id);
+  return StreamFilter({}, {pattern}).takes(id);
 }
 
 TEST(StreamFilter, FitsAPatternToTheNameOrTheNameWithItsId) {
   const StreamId camera{"camera_left", 3, "pc2"};
-  for (const char* pattern : {"", "*", "camera*", "camera_left", "c?mera_[lr]*", "camera_left:3",
+  for (const char* pattern : {"*", "camera*", "camera_left", "c?mera_[lr]*", "camera_left:3",
                               "camera*:*", "*:3", "camera_[[:alpha:]]*"}) {
     EXPECT_TRUE(fits(pattern, camera)) << pattern;
   }
@@ -54,11 +54,12 @@ TEST(StreamFilter, ChecksTheHostOnlyWhereThePatternHasOne) {
 }
 
 TEST(StreamFilter, TakesStreamsOfTheGivenHostsOnly) {
-  const StreamFilter filter({"pc2", "pc3"}, "l*");
+  const StreamFilter filter({"pc2", "pc3"}, {"c*", "l*"});
   EXPECT_TRUE(filter.takes({"lidar", 0, "pc2"}));
   EXPECT_TRUE(filter.takes({"lidar", 0, "pc3"}));
   EXPECT_FALSE(filter.takes({"lidar", 0, "pc1"}));
   EXPECT_FALSE(filter.takes({"odom", 0, "pc2"}));
+  EXPECT_TRUE(StreamFilter({}, {}).takes({"odom", 0, "pc2"}));
 }
 
 TEST(Duplicates, AreStreamsOfOneNameAndIdOnSeveralHosts) {

@@ -72,6 +72,30 @@ TEST(CommandLine, TakesAPatternAfterTheHostsOfNodes) {
   EXPECT_EQ(options.pattern, "map*");
 }
 
+TEST(CommandLine, TakesPatternsAfterTheOptionsOfRecord) {
+  const RecordOptions options = options_of<RecordOptions>(
+      {"record", "--host", "pc1", "-o", "f.mcap", "--past", "30s", "--max-file-size", "1.5GiB",
+       "--max-total-size", "2TiB", "l*", "camera:1"});
+  EXPECT_EQ(options.patterns, (std::vector<std::string>{"l*", "camera:1"}));
+  EXPECT_EQ(options.hosts, (std::vector<std::string>{"pc1"}));
+  EXPECT_EQ(options.file, "f.mcap");
+  EXPECT_EQ(options.past, 30s);
+  EXPECT_EQ(options.max_file_bytes, 3ULL << 29);
+  EXPECT_EQ(options.max_total_bytes, 2ULL << 40);
+}
+
+TEST(CommandLine, RefusesARecordingThatCannotBeMeant) {
+  const auto expect = [](const std::vector<const char*>& words, const char* error) {
+    EXPECT_NE(error_of(words).find(error), std::string::npos) << error_of(words);
+  };
+  expect({"record", "--follow"}, "only with --past");
+  expect({"record", "--max-total-size", "1GiB"}, "give --max-file-size or --max-file-duration");
+  expect({"record", "--max-file-size", "1GB"}, "'1GB' is not a size");
+  expect({"record", "--compression", "gzip"}, "there are lz4, zstd and none");
+  expect({"record", "--until", "-3s"}, "a time to come");
+  expect({"record", "--until", "now", "--for", "1s"}, "excludes");
+}
+
 TEST(CommandLine, KnowsVerbsInsideVerbs) {
   const PlaybackOptions show = options_of<PlaybackOptions>({"playback"});
   EXPECT_EQ(show.verb_name, "playback");
