@@ -29,7 +29,8 @@ ORDER = [
     ["core/channel"],
     ["client/include"],
     ["client/src"],
-    ["client/ssm", "client/dssmctl"],
+    ["client/ssm", "client/recording"],
+    ["client/dssmctl"],
     ["daemon/base"],
     ["daemon/service"],
     ["daemon/streams"],
@@ -46,6 +47,7 @@ ORDER = [
 ONLY = {
     "client/include": ["core/include"],
     "client/ssm": ["core/include", "client/include", "core/base"],
+    "client/recording": ["core/include", "client/include", "core/base"],
     # dssmctl: besides the public headers the names of streams, and the names and ids of hosts, which
     # certificates hold.
     "client/dssmctl": [
