@@ -384,9 +384,6 @@ void check_record(RecordOptions& options) {
           "--until: a time to come, as seconds since 1970 or ISO 8601");
   require(!options.follow || options.past,
           "--follow: only with --past, without which it continues anyway");
-  require(options.max_total_bytes == 0 || options.max_file_bytes > 0 ||
-              options.max_file_duration > Duration::zero(),
-          "--max-total-size deletes whole files: give --max-file-size or --max-file-duration, too");
 }
 
 void add_record(CLI::App& app, Parsed& parsed) {

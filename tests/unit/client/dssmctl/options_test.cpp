@@ -89,7 +89,6 @@ TEST(CommandLine, RefusesARecordingThatCannotBeMeant) {
     EXPECT_NE(error_of(words).find(error), std::string::npos) << error_of(words);
   };
   expect({"record", "--follow"}, "only with --past");
-  expect({"record", "--max-total-size", "1GiB"}, "give --max-file-size or --max-file-duration");
   expect({"record", "--max-file-size", "1GB"}, "'1GB' is not a size");
   expect({"record", "--compression", "gzip"}, "there are lz4, zstd and none");
   expect({"record", "--until", "-3s"}, "a time to come");
