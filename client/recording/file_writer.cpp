@@ -3,6 +3,7 @@
 
 #include <fcntl.h>
 #include <fmt/format.h>
+#include <sys/file.h>
 #include <sys/stat.h>
 #include <sys/uio.h>
 #include <unistd.h>
@@ -41,7 +42,9 @@ void encode_group(Buffer& out, Buffer& offsets, std::uint64_t start, Op op, cons
 
 std::vector<ChunkIndex> indexes_of(const std::vector<IndexedChunk>& chunks) {
   std::vector<ChunkIndex> indexes;
-  for (const IndexedChunk& chunk : chunks) indexes.push_back(chunk.index);
+  for (const IndexedChunk& chunk : chunks) {
+    if (!chunk.is_bare) indexes.push_back(chunk.index);
+  }
   return indexes;
 }
 
@@ -51,10 +54,10 @@ Statistics statistics_of(const Summary& summary) {
   statistics.channels = static_cast<std::uint32_t>(summary.channels.size());
   statistics.attachments = static_cast<std::uint32_t>(summary.attachments.size());
   statistics.metadata = static_cast<std::uint32_t>(summary.metadata.size());
-  statistics.chunks = static_cast<std::uint32_t>(summary.chunks.size());
   statistics.start_time = UINT64_MAX;
   for (const Channel& channel : summary.channels) statistics.channel_messages[channel.id] = 0;
   for (const IndexedChunk& chunk : summary.chunks) {
+    if (!chunk.is_bare) ++statistics.chunks;
     for (const Part& part : chunk.parts) {
       statistics.messages += part.samples;
       statistics.channel_messages[part.channel] += part.samples;
@@ -132,19 +135,21 @@ std::string property_name(const Channel& channel) {
 }
 
 void encode_end(Buffer& out, const Summary& summary, std::uint64_t data_bytes) {
-  Buffer index;
-  encode_index(index, summary.chunks);
   Summary complete = summary;
-  AttachmentIndex about;
-  about.offset = data_bytes;
-  about.log_time = statistics_of(summary).end_time;
-  about.data_bytes = index.size();
-  about.name = kIndexName;
-  about.media_type = kIndexMediaType;
-  const std::size_t before = out.size();
-  encode_attachment(out, about, index.span());
-  about.length = out.size() - before;
-  complete.attachments.push_back(about);
+  if (summary.has_index) {
+    Buffer index;
+    encode_index(index, summary.chunks);
+    AttachmentIndex about;
+    about.offset = data_bytes + out.size();
+    about.log_time = statistics_of(summary).end_time;
+    about.data_bytes = index.size();
+    about.name = kIndexName;
+    about.media_type = kIndexMediaType;
+    const std::size_t before = out.size();
+    encode_attachment(out, about, index.span());
+    about.length = out.size() - before;
+    complete.attachments.push_back(std::move(about));
+  }
   encode_data_end(out);
 
   const std::size_t summary_start = out.size();
@@ -182,6 +187,7 @@ Result<FileWriter> FileWriter::create(const std::filesystem::path& path,
     if (error == ENOENT) failed.code = Errc::not_found;
     return failed;
   }
+  (void)!::flock(file.fd_->get(), LOCK_EX | LOCK_NB);  // it is not to be repaired meanwhile
   file.head_.append(std::as_bytes(std::span(kMagic)));
   encode_header(file.head_, kProfile, "dssm " DSSM_VERSION);
   const std::size_t offset = file.head_.size();

@@ -42,6 +42,7 @@ struct Part {
   std::int64_t min_time_ns = INT64_MAX, max_time_ns = INT64_MIN;
   std::uint64_t payload_bytes = 0;
 
+  friend bool operator==(const Part&, const Part&) = default;
   void add(const SampleInfo& info) noexcept {
     if (samples++ == 0) first_tid = info.tid;
     last_tid = info.tid;
@@ -54,6 +55,7 @@ struct Part {
 struct IndexedChunk {
   ChunkIndex index;
   std::vector<Part> parts;
+  bool is_bare = false;  // another program's message records, which are in no chunk
 };
 
 // What the end of a file describes. Gathered while it is written, or by reading all of it.
@@ -63,6 +65,7 @@ struct Summary {
   std::vector<IndexedChunk> chunks;
   std::vector<AttachmentIndex> attachments;
   std::vector<MetadataIndex> metadata;
+  bool has_index = true;  // dssm.index, which only our files have
 
   std::uint64_t samples() const noexcept;
 };

@@ -18,4 +18,5 @@
 #include <dssm/session.hpp>
 #include <dssm/stream.hpp>
 #include <dssm/time.hpp>
+#include <dssm/typed_reads.hpp>
 #include <dssm/writer.hpp>

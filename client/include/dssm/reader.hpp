@@ -28,6 +28,7 @@
 #include <dssm/sample.hpp>
 #include <dssm/sample_or.hpp>
 #include <dssm/stream.hpp>
+#include <dssm/typed_reads.hpp>
 #include <memory>
 #include <optional>
 #include <span>
@@ -60,12 +61,6 @@ class BorrowedSample {
   std::span<const std::byte> payload_;
   SampleInfo info_;
   const std::atomic<std::uint64_t>* sequence_ = nullptr;  // of the slot; null: nothing borrowed
-};
-
-// The two samples around a time, for interpolation.
-struct Neighbours {
-  SampleInfo before;  // newest sample with time <= t
-  SampleInfo after;   // the one after it that is not lost; its time is > t
 };
 
 // When what was written to another host's stream before it was opened, or while the connection was
@@ -295,83 +290,19 @@ inline WaitStatus wait_any(std::span<RawReader* const> readers, Duration timeout
 
 // The same with a T in place of bytes: what a sample does not have, because a RawWriter wrote fewer
 // bytes, is 0. Everything not listed here is as in RawReader. Each read comes in two forms: into
-// variables of the caller, and with the sample as its result (dssm/sample_or.hpp).
+// variables of the caller, and with the sample as its result (dssm/typed_reads.hpp).
 template <Payload T>
-class Reader : public RawReader {
+class Reader : public TypedReads<T, RawReader> {
  public:
-  explicit Reader(RawReader raw) noexcept : RawReader(std::move(raw)) {}
-
-  ReadStatus read_newest(T& out, SampleInfo& info) noexcept {
-    return complete(RawReader::read_newest(bytes(out), info), out, info);
-  }
-  ReadStatus read_tid(Tid n, T& out, SampleInfo& info) noexcept {
-    return complete(RawReader::read_tid(n, bytes(out), info), out, info);
-  }
-  ReadStatus read_next(T& out, SampleInfo& info) noexcept {
-    return complete(RawReader::read_next(bytes(out), info), out, info);
-  }
-  ReadStatus read_previous(T& out, SampleInfo& info) noexcept {
-    return complete(RawReader::read_previous(bytes(out), info), out, info);
-  }
-  ReadStatus read_at(Time t, T& out, SampleInfo& info, Duration max_age = kAnyAge) noexcept {
-    return complete(RawReader::read_at(t, bytes(out), info, max_age), out, info);
-  }
-  ReadStatus read_at_or_after(Time t, T& out, SampleInfo& info) noexcept {
-    return complete(RawReader::read_at_or_after(t, bytes(out), info), out, info);
-  }
-  ReadStatus read_nearest(Time t, T& out, SampleInfo& info) noexcept {
-    return complete(RawReader::read_nearest(t, bytes(out), info), out, info);
-  }
-
-  SampleOr<T> read_newest() noexcept {
-    return SampleOr<T>([&](Sample<T>& out) { return read_newest(out.value, out.info); });
-  }
-  SampleOr<T> read_tid(Tid n) noexcept {
-    return SampleOr<T>([&](Sample<T>& out) { return read_tid(n, out.value, out.info); });
-  }
-  SampleOr<T> read_next() noexcept {
-    return SampleOr<T>([&](Sample<T>& out) { return read_next(out.value, out.info); });
-  }
-  SampleOr<T> read_previous() noexcept {
-    return SampleOr<T>([&](Sample<T>& out) { return read_previous(out.value, out.info); });
-  }
-  SampleOr<T> read_at(Time t, Duration max_age = kAnyAge) noexcept {
-    return SampleOr<T>([&](Sample<T>& out) { return read_at(t, out.value, out.info, max_age); });
-  }
-  SampleOr<T> read_at_or_after(Time t) noexcept {
-    return SampleOr<T>([&](Sample<T>& out) { return read_at_or_after(t, out.value, out.info); });
-  }
-  SampleOr<T> read_nearest(Time t) noexcept {
-    return SampleOr<T>([&](Sample<T>& out) { return read_nearest(t, out.value, out.info); });
-  }
-  ReadOr<NeighbourSamples<T>> read_neighbours(Time t) noexcept {
-    return ReadOr<NeighbourSamples<T>>([&](NeighbourSamples<T>& out) {
-      Neighbours infos;
-      const ReadStatus status =
-          RawReader::read_neighbours(t, bytes(out.before.value), bytes(out.after.value), infos);
-      out.before.info = infos.before;
-      out.after.info = infos.after;
-      (void)complete(status, out.before.value, infos.before);
-      return complete(status, out.after.value, infos.after);
-    });
-  }
+  explicit Reader(RawReader raw) noexcept : TypedReads<T, RawReader>(std::move(raw)) {}
 
   // This reader's part of a read_joint_at(), which copies the sample to `out`.
-  JointSample joint_sample(T& out) noexcept { return {this, bytes(out), {}}; }
+  JointSample joint_sample(T& out) noexcept { return {this, detail::bytes_of(out), {}}; }
 
   // The borrowed payload as a T, if it has all bytes of one. Check still_valid() after the last use
   // of what was read.
   static const T& view(const BorrowedSample& sample) noexcept {
     return *reinterpret_cast<const T*>(sample.payload().data());
-  }
-
- private:
-  static std::span<std::byte> bytes(T& out) noexcept {
-    return std::as_writable_bytes(std::span<T, 1>(&out, 1));
-  }
-  static ReadStatus complete(ReadStatus status, T& out, const SampleInfo& info) noexcept {
-    if (status == ReadStatus::ok) zero_rest(bytes(out), info);
-    return status;
   }
 };
 

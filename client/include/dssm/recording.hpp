@@ -13,14 +13,21 @@
 #include <cstddef>
 #include <cstdint>
 #include <dssm/reader.hpp>
+#include <dssm/typed_reads.hpp>
 #include <filesystem>
 #include <memory>
+#include <optional>
 #include <span>
+#include <string>
+#include <string_view>
 #include <vector>
 
 namespace dssm::recording {
 class Writer;
-}
+struct Content;
+struct CursorState;
+struct ReaderState;
+}  // namespace dssm::recording
 
 #pragma GCC visibility push(default)  // the library hides everything else
 namespace dssm {
@@ -118,6 +125,217 @@ class RecordingWriter {
   explicit RecordingWriter(std::unique_ptr<recording::Writer> writer) noexcept;
   std::unique_ptr<recording::Writer> writer_;
 };
+
+// --- reading
+
+// A stream in a recording, of one incarnation.
+struct RecordedStreamInfo : RecordedStream {  // with the last property that it had
+  std::uint64_t samples = 0;
+  std::uint64_t payload_bytes = 0;
+  std::uint64_t lost_samples = 0;  // of add_gap(), and those in damaged parts of the files
+  Tid first_tid = kNoTid, last_tid = kNoTid;
+  Time first_time{}, last_time{};  // the least and the greatest; meaningless without samples
+};
+
+// A sample as RecordingCursor returns it.
+struct RecordedSample {
+  std::size_t stream = 0;  // index in Recording::streams()
+  SampleInfo info;
+  // Bound on the distance of info.time from the recording PC's clock; kUnknownClockError: unknown.
+  Duration clock_error = kUnknownClockError;
+  std::span<const std::byte> payload;  // valid until the next call
+};
+
+// Goes through all samples of all streams, in the order in which they were recorded.
+//
+//   threads   one at a time
+//   lifetime  usable without its Recording
+//   moved     a moved-from cursor may only be assigned to or destroyed
+class RecordingCursor {
+ public:
+  RecordingCursor(RecordingCursor&&) noexcept;
+  RecordingCursor& operator=(RecordingCursor&&) noexcept;
+  ~RecordingCursor();
+
+  // The next sample; false after the last one.
+  bool next(RecordedSample& out) noexcept;
+
+  // Goes to the first sample, in the order of recording, with time >= `t`; before the first one for
+  // Time::min().
+  void seek(Time t) noexcept;
+
+ private:
+  friend class Recording;
+  explicit RecordingCursor(std::unique_ptr<recording::CursorState> state) noexcept;
+  std::unique_ptr<recording::CursorState> state_;
+};
+
+class RecordedRawReader;
+template <Payload T>
+class RecordedReader;
+
+// A recording that is open for reading: one file, or several that belong together. It has what was
+// in the files when it was opened, also when they are still written, or were cut off: up to the
+// last whole chunk.
+//
+//   threads   any; readers and cursors are independent of each other
+//   memory    some dozen bytes for each stream in each chunk, and up to 64 MiB (or two chunks) of
+//             samples
+class Recording {
+ public:
+  // Opens a file, or all files of a folder whose names end with ".mcap". MCAP files of other
+  // programs are recordings, too, as far as their topics are names of streams: with plain bytes,
+  // as they are in the messages, and tids that count them.
+  //   fails  not_found, protocol (not an MCAP file), conflict (two files have the same samples of a
+  //          stream), no_permission, system
+  static Result<Recording> open(const std::filesystem::path& path);
+  // The same with these files, in any order.
+  static Result<Recording> open(std::span<const std::filesystem::path> files);
+
+  // In the order in which they were added. A stream that restarted is in it several times.
+  //   lifetime  valid as long as a copy of this object is
+  const std::vector<RecordedStreamInfo>& streams() const noexcept;
+
+  // The files, in the order in which they were written.
+  const std::vector<std::filesystem::path>& files() const noexcept;
+
+  // What could not be read, a sentence each: damaged chunks, channels that are no streams, files
+  // without an end. More come when samples are read.
+  std::vector<std::string> warnings() const;
+
+  // A reader of all incarnations of a stream.
+  //   id       without a host: of the only host that has a stream of that name here
+  //   wanted   fails with type_mismatch unless TypeInfo::check_usable_as(wanted)
+  //   fails    not_found, type_mismatch, conflict (several hosts have a stream of that name, or its
+  //            incarnations have different types)
+  Result<RecordedRawReader> open_raw_reader(const StreamId& id,
+                                            const TypeInfo* wanted = nullptr) const;
+  // The same with a type; `name` is parsed by StreamId::parse(), whose errors it also returns.
+  template <Payload T>
+  Result<RecordedReader<T>> open_reader(std::string_view name) const;
+
+  // A cursor before the first sample.
+  RecordingCursor cursor() const;
+
+ private:
+  explicit Recording(std::shared_ptr<recording::Content> content) noexcept;
+  std::shared_ptr<recording::Content> content_;
+};
+
+// What repair_recording() did.
+struct RecordingRepair {
+  bool was_whole = false;           // nothing was done
+  std::uint64_t removed_bytes = 0;  // of an incomplete record at the end
+  std::uint64_t samples = 0;        // in the file
+};
+
+// Completes a file that was not finished, in place: removes what follows the last whole record, and
+// appends what finish() would. Recordings open without it, but take as long as it takes to read all
+// of the file; tools other than DSSM's may refuse such files.
+//   fails  as Recording::open(), and unavailable (it is still being written)
+Result<RecordingRepair> repair_recording(const std::filesystem::path& file);
+
+// Reads a stream in a recording as RawReader reads one in its ring. Everything is as there, except:
+//
+//   start      a new reader has its cursor before the first sample: read_next() returns that
+//   newest     is the last one of the recording; there is no waiting, and not_yet means the end
+//   lost       a result of read_tid() and read_info(): the sample was not recorded. The other reads
+//              pass over it, as they do over damaged parts of a file
+//   restarted  the reader goes from one incarnation to another, in both directions: read_next()
+//              after the last sample of one, read_previous() before the first, and read_newest()
+//              and reads by time, which search all, when they find the sample in another one. The
+//              call returns `restarted`, once; then the cursor is kNoTid, after read_previous()
+//              behind the last sample
+//   clocks     no read returns clock_out_of_bounds but read_joint_at()
+//
+//   threads  one at a time; others may use other readers of the recording
+//   cost     a lock, and the reading of a chunk where it is not in memory
+class RecordedRawReader {
+ public:
+  RecordedRawReader(RecordedRawReader&&) noexcept;
+  RecordedRawReader& operator=(RecordedRawReader&&) noexcept;
+  ~RecordedRawReader();
+
+  // By tid, in the incarnation that is being read. `payload` is exactly payload_bytes() long.
+  ReadStatus read_newest(std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_tid(Tid tid, std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_next(std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_previous(std::span<std::byte> payload, SampleInfo& info) noexcept;
+
+  // By time. Exact for every sequence of times, also one that runs backwards.
+  ReadStatus read_at(Time t, std::span<std::byte> payload, SampleInfo& info,
+                     Duration max_age = kAnyAge) noexcept;
+  ReadStatus read_at_or_after(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_nearest(Time t, std::span<std::byte> payload, SampleInfo& info) noexcept;
+  ReadStatus read_neighbours(Time t, std::span<std::byte> before, std::span<std::byte> after,
+                             Neighbours& infos) noexcept;
+
+  // Without payloads. These never return `restarted`: the sample may be of another incarnation.
+  ReadStatus read_info(Tid tid, SampleInfo& info) const noexcept;
+  ReadStatus find(Time t, SampleInfo& info) const noexcept;
+  ReadStatus find_neighbours(Time t, Neighbours& out) const noexcept;
+
+  // The bound [ns, >= 0] on the distance of info.time from the recording PC's clock at the time of
+  // the recording; kUnknownClockError: unknown. `info` comes from this reader.
+  Duration clock_error(const SampleInfo& info) const noexcept;
+
+  // Of the incarnation that is being read.
+  Tid newest_tid() const noexcept;
+  Tid oldest_tid() const noexcept;
+  Tid cursor() const noexcept;
+  void seek(Tid tid) noexcept;
+  const StreamId& id() const noexcept;
+  const TypeInfo& type() const noexcept;
+  std::uint64_t payload_bytes() const noexcept;
+  std::uint64_t depth() const noexcept;  // of the ring
+  Duration cycle() const noexcept;
+  std::uint64_t incarnation() const noexcept;
+  // The last one that it had.
+  //   fails  not_found (none)
+  Result<std::vector<std::byte>> property() const;
+
+  // Samples that read_next() skipped because they are not in the recording.
+  std::uint64_t lost_samples() const noexcept;
+  // How often a read returned `restarted`.
+  std::uint64_t restarts() const noexcept;
+
+ private:
+  friend class Recording;
+  explicit RecordedRawReader(std::unique_ptr<recording::ReaderState> state) noexcept;
+  std::unique_ptr<recording::ReaderState> state_;
+};
+
+// As JointSample and read_joint_at() of RawReader: from each stream the sample that read_at(t)
+// copies, from all or from none.
+struct RecordedJointSample {
+  RecordedRawReader* reader = nullptr;
+  std::span<std::byte> payload;  // exactly reader->payload_bytes() long
+  SampleInfo info{};
+};
+JointRead read_joint_at(Time t, std::span<RecordedJointSample> samples,
+                        Duration max_error = kUnknownClockError,
+                        Duration max_age = kAnyAge) noexcept;
+
+// The same with a T in place of bytes, as Reader<T> (dssm/typed_reads.hpp).
+template <Payload T>
+class RecordedReader : public TypedReads<T, RecordedRawReader> {
+ public:
+  explicit RecordedReader(RecordedRawReader raw) noexcept
+      : TypedReads<T, RecordedRawReader>(std::move(raw)) {}
+
+  // This reader's part of a read_joint_at(), which copies the sample to `out`.
+  RecordedJointSample joint_sample(T& out) noexcept { return {this, detail::bytes_of(out), {}}; }
+};
+
+template <Payload T>
+Result<RecordedReader<T>> Recording::open_reader(std::string_view name) const {
+  Result<StreamId> id = StreamId::parse(name);
+  if (!id) return std::move(id).error();
+  const TypeInfo type = type_of<T>();
+  Result<RecordedRawReader> raw = open_raw_reader(*id, &type);
+  if (!raw) return std::move(raw).error();
+  return RecordedReader<T>(*std::move(raw));
+}
 
 }  // namespace dssm
 #pragma GCC visibility pop
