@@ -1,12 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl info: all that is known about one stream; without a stream, about dssmd itself.
+// dssmctl info: all that is known about one stream or recording; without either, about dssmd itself.
 #include <fmt/format.h>
 
 #include "client/dssmctl/describe.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
+#include "client/dssmctl/recording_info.hpp"
 #include "client/dssmctl/text.hpp"
 #include "core/base/try.hpp"
 
@@ -222,6 +223,7 @@ Result<void> print_stream_info(Session& session, const StreamId& id, const InfoO
 }  // namespace
 
 Result<void> run(const InfoOptions& options, Output& out) {
+  if (is_recording(options.stream)) return print_recording(options.stream, options, out);
   std::optional<StreamId> id;
   if (!options.stream.empty()) id = DSSM_TRY(StreamId::parse(options.stream));
   Session session = DSSM_TRY(connect(options));

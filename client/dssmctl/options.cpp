@@ -17,6 +17,7 @@
 #include <memory>
 
 #include "client/dssmctl/names.hpp"
+#include "client/dssmctl/recording_info.hpp"
 #include "client/dssmctl/text.hpp"
 #include "core/base/try.hpp"
 
@@ -283,9 +284,13 @@ void add_ping(CLI::App& app, Parsed& parsed) {
 }
 
 void add_info(CLI::App& app, Parsed& parsed) {
-  CLI::App* info = app.add_subcommand("info", "all about one stream, or about dssmd");
-  InfoOptions& options = add_options<InfoOptions>(info, parsed);
-  info->add_option("STREAM", options.stream, kStreamHelp)->type_name("");
+  CLI::App* info = app.add_subcommand("info", "all about one stream or recording, or about dssmd");
+  InfoOptions& options = add_options<InfoOptions>(info, parsed, [](const InfoOptions& all) {
+    require(!all.watch || !is_recording(all.stream), "--watch: of a stream, not of a recording");
+  });
+  info->add_option("STREAM", options.stream,
+                   std::string(kStreamHelp) + "; or a recording: a file *.mcap, or a path with '/'")
+      ->type_name("");
   add_watch(info, options.watch);
 }
 

@@ -68,7 +68,7 @@ struct PingOptions : CommonOptions {
 };
 
 struct InfoOptions : CommonOptions {
-  std::string stream;  // empty: about dssmd itself
+  std::string stream;  // or a recording's path; empty: about dssmd itself
   bool watch = false;
 };
 

@@ -25,7 +25,7 @@ std::vector<std::byte> property_of(const RawReader& reader) {
 Recorder::Opener::Opener(Session session, RecorderPlan plan)
     : session_(std::move(session)), plan_(std::move(plan)), started_(WallClock::now()) {}
 
-Recorder::Opener::~Opener() {
+void Recorder::Opener::end() {
   watch_.reset();
   {
     const std::lock_guard lock(mutex_);
@@ -128,7 +128,7 @@ Result<Recorder::Opener::Opened> Recorder::Opener::open(const Wanted& wanted) co
   Source source{std::move(reader), 0, kNoTid, newest, {}};
   if (!with_history) {
     source.reader.seek(newest);
-    source.last = newest;
+    source.next = newest + 1;
   } else {
     source.reader.seek(kNoTid);
     if (plan_.past && wanted.from_start) {
@@ -218,7 +218,7 @@ Result<bool> Recorder::take(Source& source) {
     const ReadStatus status = source.reader.read_next(payload_, info);
     if (status == ReadStatus::restarted) {
       DSSM_TRY(add_to_file(source, property_of(source.reader)));
-      source.last = kNoTid;
+      source.next = 0;
       source.past_until = kNoTid;
       source.from.reset();
       continue;
@@ -227,7 +227,7 @@ Result<bool> Recorder::take(Source& source) {
     bytes += payload_.size();
     ++samples;
     if (source.from && info.time < *source.from) {
-      source.last = info.tid;
+      source.next = info.tid + 1;
       continue;
     }
     DSSM_TRY(write(source, info));
@@ -238,19 +238,18 @@ Result<bool> Recorder::take(Source& source) {
 }
 
 Result<void> Recorder::write(Source& source, const SampleInfo& info) {
-  // What the ring no longer held when the first sample was taken was before the recording.
-  if (source.last != kNoTid && info.tid > source.last + 1) {
-    DSSM_TRY(file_.add_gap(source.number, source.last + 1,
-                           static_cast<std::uint64_t>(info.tid - source.last - 1)));
+  if (source.next != kNoTid && info.tid > source.next) {
+    DSSM_TRY(file_.add_gap(source.number, source.next,
+                           static_cast<std::uint64_t>(info.tid - source.next)));
   }
-  source.last = info.tid;
+  source.next = info.tid + 1;
   return file_.write(source.number, info, source.reader.clock_error(info),
                      std::span(payload_).first(info.payload_bytes));
 }
 
 bool Recorder::has_past() const {
   const auto is_taken = [](const Source& source) {
-    if (source.last >= source.past_until) return true;
+    if (source.next > source.past_until) return true;
     SampleInfo info;
     const ReadStatus status = source.reader.read_info(source.past_until, info);
     return status == ReadStatus::lost || status == ReadStatus::too_old;
@@ -261,6 +260,7 @@ bool Recorder::has_past() const {
 std::vector<std::string> Recorder::take_notices() { return opener_.take_notices(); }
 
 Result<void> Recorder::finish() {
+  opener_.end();  // what is just being opened is taken, too
   DSSM_TRY(take());
   // A program may have set it after its stream was opened here.
   for (Source& source : sources_) {

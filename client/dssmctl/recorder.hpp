@@ -78,7 +78,7 @@ class Recorder {
   struct Source {
     RawReader reader;
     std::uint32_t number = 0;  // in the file
-    Tid last = kNoTid;         // that was recorded, or is known as lost
+    Tid next = kNoTid;  // what was before it is recorded, or known as lost; kNoTid: not known yet
     Tid past_until = kNoTid;   // the newest at its opening
     std::optional<Time> from;  // samples before that are not wanted
   };
@@ -89,10 +89,12 @@ class Recorder {
     Opener(Session session, RecorderPlan plan);
     Opener(const Opener&) = delete;
     Opener& operator=(const Opener&) = delete;
-    ~Opener();
+    ~Opener() { end(); }
 
     // All that exists, then all that comes.
     Result<void> begin();
+    // Opens nothing more, and waits for what is being opened.
+    void end();
 
     struct Opened {
       Source source;
