@@ -92,18 +92,19 @@ void Recorder::Opener::run() {
     lock.unlock();
     Result<Opened> opened = open(wanted);
     lock.lock();
-    // It may have been removed meanwhile.
+    // It may have been removed meanwhile, and created again.
     const auto entry = std::find_if(wanted_.begin(), wanted_.end(), [&](const Wanted& other) {
       return other.stream.id == wanted.stream.id;
     });
-    if (entry == wanted_.end()) continue;
-    if (wanted.from_start && !wanted.reported) --untried_;
-    if (opened) {
+    const bool is_wanted = entry != wanted_.end();
+    if (is_wanted && entry->from_start && !entry->reported) --untried_;
+    if (opened) {  // the reader has the samples of its ring, and follows a new one
       known_.insert(wanted.stream.id.str());
-      wanted_.erase(entry);
+      if (is_wanted) wanted_.erase(entry);
       opened_.push_back(*std::move(opened));
       continue;
     }
+    if (!is_wanted) continue;
     const Error& error = opened.error();
     const bool is_to_retry = is_retryable(error.code);
     if (!wanted.reported) {
@@ -127,8 +128,13 @@ Result<Recorder::Opener::Opened> Recorder::Opener::open(const Wanted& wanted) co
   const Tid newest = reader.newest_tid();
   Source source{std::move(reader), 0, kNoTid, newest, {}};
   if (!with_history) {
-    source.reader.seek(newest);
-    source.next = newest + 1;
+    // What was written since the recording began, if dssmd said what was there then.
+    const StreamInfo& then = wanted.stream;
+    const bool is_known = then.incarnation == source.reader.incarnation() &&
+                          (then.newest != kNoTid || then.state == StreamState::empty);
+    const Tid before = is_known ? std::min(then.newest, newest) : newest;
+    source.reader.seek(before);
+    source.next = before + 1;
   } else {
     source.reader.seek(kNoTid);
     if (plan_.past && wanted.from_start) {
