@@ -329,6 +329,7 @@ Result<void> FileWriter::finish() {
     if (!disk_full_ || summary_.chunks.empty()) break;
     drop_last_chunk();
   }
+  (void)!::flock(fd_->get(), LOCK_UN);
   if (failed) return *std::move(failed);
   return {};
 }

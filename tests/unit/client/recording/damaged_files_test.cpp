@@ -91,7 +91,7 @@ TEST_F(DamagedFiles, CutAtAnyByteLoseOnlyTheOpenChunk) {
       const std::vector<Recorded> samples = all_of(recording);
       ASSERT_TRUE(begins_with(written, samples));
       ASSERT_EQ(samples.size(), std::prev(chunks.upper_bound(length))->second);
-      if (length % 11 != 0 && length + 300 < whole.size()) continue;
+      if (length % 97 != 0) continue;  // each syncs
 
       const Result<RecordingRepair> repaired = repair_recording(path("cut.mcap"));
       if (!repaired) {  // there is nothing in it

@@ -105,6 +105,7 @@ inline std::string content_of(const std::filesystem::path& path) {
 }
 
 inline void write_file(const std::filesystem::path& path, std::string_view content) {
+  std::filesystem::remove(path);  // ext4 flushes a file that is truncated and written again
   std::ofstream(path, std::ios::binary)
       .write(content.data(), static_cast<std::streamsize>(content.size()));
 }
