@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// Readers of other authors read our files (mcap/read.cjs). They are npm packages: where they are not
-// installed, nor node, the test is skipped.
+// Readers of other authors read our files (mcap/read.cjs). They are npm packages: where these are
+// not installed, nor node, the test is skipped.
 #include <array>
 #include <cstdio>
 #include <cstdlib>
