@@ -54,7 +54,11 @@ bool Compressor::compress(std::span<const std::byte> bytes, Buffer& out) {
   }
   if (lz4_ != nullptr) {
     LZ4F_preferences_t preferences{};
-    preferences.frameInfo.blockSizeID = LZ4F_max4MB;
+    // The least one that is enough: a reader's memory is twice the size of a block.
+    preferences.frameInfo.blockSizeID = bytes.size() <= 64U << 10    ? LZ4F_max64KB
+                                        : bytes.size() <= 256U << 10 ? LZ4F_max256KB
+                                        : bytes.size() <= 1U << 20   ? LZ4F_max1MB
+                                                                     : LZ4F_max4MB;
     preferences.frameInfo.contentSize = bytes.size();
     preferences.autoFlush = 1;
     out.resize(LZ4F_compressFrameBound(bytes.size(), &preferences));
