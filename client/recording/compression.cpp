@@ -54,7 +54,11 @@ bool Compressor::compress(std::span<const std::byte> bytes, Buffer& out) {
   }
   if (lz4_ != nullptr) {
     LZ4F_preferences_t preferences{};
-    preferences.frameInfo.blockSizeID = LZ4F_max4MB;
+    // The least one that is enough: a reader's memory is twice the size of a block.
+    preferences.frameInfo.blockSizeID = bytes.size() <= 64U << 10    ? LZ4F_max64KB
+                                        : bytes.size() <= 256U << 10 ? LZ4F_max256KB
+                                        : bytes.size() <= 1U << 20   ? LZ4F_max1MB
+                                                                     : LZ4F_max4MB;
     preferences.frameInfo.contentSize = bytes.size();
     preferences.autoFlush = 1;
     out.resize(LZ4F_compressFrameBound(bytes.size(), &preferences));
@@ -80,6 +84,10 @@ bool Compressor::compress(std::span<const std::byte> bytes, Buffer& out) {
 
 Result<void> decompress(std::string_view compression, std::span<const std::byte> bytes,
                         std::uint64_t original_bytes, Buffer& out) {
+  // What a compression can make of a byte at most: a block of LZ4 lengthens a match by 255 with
+  // each, one of Zstandard has 4 bytes for 128 KiB. A chunk that claims more gets no memory.
+  const std::uint64_t most = compression == "zstd" ? 32768 : compression == "lz4" ? 255 : 1;
+  if (original_bytes / most > bytes.size()) return damaged("it claims to have too many bytes");
   out.clear();
   out.resize(original_bytes);
   std::size_t length = 0;

@@ -239,7 +239,6 @@ Result<void> FileWriter::write(std::initializer_list<std::span<const std::byte>>
 }
 
 Result<void> FileWriter::add_channel(const NewChannel& channel) {
-  if (has_channel_[channel.channel.id]) return {};
   head_.clear();
   const bool is_new = !has_schema_[channel.schema.id];
   if (is_new) encode(head_, channel.schema);
@@ -330,6 +329,7 @@ Result<void> FileWriter::finish() {
     if (!disk_full_ || summary_.chunks.empty()) break;
     drop_last_chunk();
   }
+  (void)!::flock(fd_->get(), LOCK_UN);
   if (failed) return *std::move(failed);
   return {};
 }

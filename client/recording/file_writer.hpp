@@ -132,7 +132,8 @@ class FileWriter {
   static Result<FileWriter> create(const std::filesystem::path& path, const std::string& recording,
                                    std::uint32_t number);
 
-  // A channel is written once; the same one again changes nothing.
+  bool has_channel(std::uint16_t id) const { return has_channel_[id]; }
+  // Of a channel that the file does not have, and of one that it has.
   //   fails  as append()
   Result<void> add_channel(const NewChannel& channel);
   Result<void> add_property(const Channel& channel, std::span<const std::byte> property);

@@ -4,9 +4,11 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <map>
 #include <numeric>
 #include <set>
 #include <span>
+#include <utility>
 
 #include "core/base/text.hpp"
 
@@ -59,14 +61,61 @@ std::string_view ros_name_of(Scalar kind) {
 
 // Of a field, without the names of the structs that it is in.
 struct Member {
-  std::string_view name;
+  std::string name;
   Scalar kind;
   std::uint64_t offset, count, stride;  // the offset in the message that holds it
+  // Of an array in an array of structs; the others are the structs' then.
+  std::uint64_t inner_count = 1, inner_stride = 0;
 
   std::uint64_t scalar() const { return scalar_bytes(kind); }
-  std::uint64_t end() const { return offset + (count - 1) * stride + scalar(); }
-  bool is_packed() const { return count == 1 || stride == scalar(); }
+  std::uint64_t first_end() const { return offset + (inner_count - 1) * inner_stride + scalar(); }
+  std::uint64_t end() const { return first_end() + (count - 1) * stride; }
+  bool is_packed() const { return inner_count == 1 && (count == 1 || stride == scalar()); }
 };
+
+// An array in an array of structs is a field for each struct, "points[0].tag", "points[1].tag" ...
+// Makes one of them, "points.tag".
+std::vector<Member> with_joined_arrays(std::vector<Member> members) {
+  std::map<std::string, std::size_t> by_name;
+  for (std::size_t i = 0; i < members.size(); ++i) by_name.emplace(members[i].name, i);
+  std::vector<bool> is_joined(members.size());
+  std::vector<Member> result;
+  for (std::size_t i = 0; i < members.size(); ++i) {
+    Member member = members[i];
+    const std::size_t at = member.name.find("[0].");
+    if (is_joined[i]) continue;
+    if (at != std::string::npos && at < member.name.find('.') && member.inner_count == 1) {
+      const std::string base = member.name.substr(0, at), rest = member.name.substr(at + 3);
+      std::vector<std::size_t> others;
+      while (true) {
+        const auto next = by_name.find(fmt::format("{}[{}]{}", base, others.size() + 1, rest));
+        if (next == by_name.end() || is_joined[next->second]) break;
+        const Member& other = members[next->second];
+        const std::uint64_t before = others.empty() ? member.offset : members[others.back()].offset;
+        const std::uint64_t stride =
+            others.empty() ? other.offset - before : members[others[0]].offset - member.offset;
+        if (other.kind != member.kind || other.count != member.count ||
+            other.stride != member.stride || other.offset <= before ||
+            other.offset - before != stride) {
+          break;
+        }
+        others.push_back(next->second);
+      }
+      if (!others.empty()) {
+        for (const std::size_t other : others) is_joined[other] = true;
+        member.name = base + rest;
+        member.inner_count = member.count;
+        member.inner_stride = member.stride;
+        member.count = others.size() + 1;
+        member.stride = members[others[0]].offset - member.offset;
+      }
+    }
+    result.push_back(std::move(member));
+  }
+  std::stable_sort(result.begin(), result.end(),
+                   [](const Member& one, const Member& two) { return one.offset < two.offset; });
+  return result;
+}
 
 class Generator {
  public:
@@ -110,16 +159,15 @@ class Generator {
   //   alignment  that each place has where it is
   std::string message(const std::string& name, std::vector<Member> members, std::uint64_t bytes,
                       std::uint64_t alignment, int depth) {
-    std::stable_sort(members.begin(), members.end(),
-                     [](const Member& a, const Member& b) { return a.offset < b.offset; });
+    members = with_joined_arrays(std::move(members));
     Message out;
     for (std::size_t i = 0; i < members.size();) {
-      const std::string_view first = members[i].name;
+      const std::string& first = members[i].name;
       const std::size_t dot = first.find('.');
       std::size_t end = i + 1;
       if (dot != first.npos) {
         while (end < members.size() &&
-               members[end].name.substr(0, dot + 1) == first.substr(0, dot + 1)) {
+               members[end].name.compare(0, dot + 1, first, 0, dot + 1) == 0) {
           ++end;
         }
       }
@@ -155,14 +203,15 @@ class Generator {
 
   // The fields of a struct, or of an array of structs: the bytes up to `limit` at most.
   void add_struct(Message& out, const std::string& parent, std::span<const Member> group,
-                  std::string_view name, std::uint64_t limit, std::uint64_t alignment, int depth) {
+                  const std::string& name, std::uint64_t limit, std::uint64_t alignment,
+                  int depth) {
     std::uint64_t base = group.front().offset, count = group.front().count;
     const std::uint64_t stride = group.front().stride;
     std::uint64_t end = 0, element_end = 0;
     bool is_array = count > 1;
     for (const Member& member : group) {
       is_array = is_array && member.count == count && member.stride == stride;
-      element_end = std::max(element_end, member.offset + member.scalar());
+      element_end = std::max(element_end, member.first_end());
       end = std::max(end, member.end());
     }
     is_array = is_array && element_end - base <= stride;
@@ -184,9 +233,12 @@ class Generator {
     }
     std::vector<Member> inner;
     for (Member member : group) {
-      member.name.remove_prefix(name.size() + 1);
+      member.name.erase(0, name.size() + 1);
       member.offset -= base;
-      if (is_array) member.count = 1;
+      if (is_array) {
+        member.count = std::exchange(member.inner_count, 1);
+        member.stride = member.inner_stride;
+      }
       inner.push_back(member);
     }
     alignment = std::gcd(base, alignment);

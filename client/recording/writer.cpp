@@ -353,7 +353,7 @@ Result<void> Writer::store(const Chunk& chunk) {
   }
   // Of a stream that had restarted before the file began, and is written to all the same.
   const auto add = [&](std::uint16_t channel) {
-    return current_.add_channel(disk_streams_[channel - 1U].channel);
+    return current_.has_channel(channel) ? Result<void>() : repeat(disk_streams_[channel - 1U]);
   };
   for (const auto& part : std::span(chunk.parts).first(chunk.used_parts)) {
     DSSM_TRY(add(part.part.channel));
@@ -398,12 +398,16 @@ Result<void> Writer::begin_file() {
   ++files_;
   file_start_ns_ = INT64_MAX;
   for (const DiskStream& stream : disk_streams_) {
-    if (stream.replaced) continue;
-    DSSM_TRY(current_.add_channel(stream.channel));
-    if (stream.property.empty()) continue;
-    DSSM_TRY(current_.add_property(stream.channel.channel, stream.property));
+    if (!stream.replaced) DSSM_TRY(repeat(stream));
   }
   return {};
+}
+
+// In a file that does not have the stream yet.
+Result<void> Writer::repeat(const DiskStream& stream) {
+  DSSM_TRY(current_.add_channel(stream.channel));
+  if (stream.property.empty()) return {};
+  return current_.add_property(stream.channel.channel, stream.property);
 }
 
 Result<void> Writer::finish_file() {

@@ -73,6 +73,7 @@ class Writer {
   void run_disk();
   Result<void> store(const Chunk& chunk);
   Result<void> begin_file();
+  Result<void> repeat(const DiskStream& stream);
   Result<void> finish_file();
   void delete_oldest();
   void fail(Error error);

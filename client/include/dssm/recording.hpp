@@ -2,7 +2,8 @@
 //
 // Recordings: streams in files that MCAP tools read, too (https://mcap.dev). docs/recording.md
 // describes what is in them beyond MCAP, and has examples. Link with libdssm-recording
-// (pkg-config dssm-recording) besides libdssm. No dssmd is needed.
+// and libdssm (pkg-config dssm-recording; in CMake dssm-recording::dssm-recording and dssm::dssm).
+// No dssmd is needed.
 //
 //   errors  invalid_argument (wrong use, or an option), not_found (no such file or stream),
 //           protocol (a file that is damaged or is not a recording), conflict (the file exists, or

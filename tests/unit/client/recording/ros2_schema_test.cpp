@@ -1,0 +1,168 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// By its schema, CDR must find each number of a payload where it is in memory.
+#include "client/recording/ros2_schema.hpp"
+
+#include <gtest/gtest.h>
+
+#include <dssm/describe.hpp>
+#include <map>
+#include <random>
+#include <regex>
+#include <set>
+#include <sstream>
+
+namespace dssm::recording {
+namespace {
+
+struct Point {
+  float x;
+  double y;
+  char tag[3];
+};
+DSSM_DESCRIBE(Point, x, y, tag)
+struct Flag {
+  bool on;
+  double since;
+};
+DSSM_DESCRIBE(Flag, on, since)
+struct Scan {
+  std::uint8_t kind;
+  double fooBar;
+  std::uint16_t n;
+  float range[3];
+  Flag flags[2];
+  Point origin;
+  Point points[2];
+  std::int64_t t;
+  bool ok;
+  std::int16_t last;
+};
+DSSM_DESCRIBE(Scan, kind, fooBar, n, range, flags, origin, points, t, ok, last)
+
+TEST(Ros2Schema, PadsAndRenames) {
+  const Ros2Schema schema = ros2_schema(type_of<Scan>());
+  EXPECT_EQ(schema.name, "dssm/msg/Scan");
+  const std::string line(80, '=');
+  EXPECT_EQ(schema.text,
+            "uint8 kind\n"
+            "uint8[7] pad\n"
+            "float64 foobar  # fooBar\n"
+            "uint16 n\n"
+            "uint8[2] pad2\n"
+            "float32[3] range\n"
+            "dssm/ScanFlags[2] flags\n"
+            "dssm/ScanOrigin origin\n"
+            "dssm/ScanPoints[2] points\n"
+            "int64 t\n"
+            "bool ok\n"
+            "uint8[1] pad3\n"
+            "int16 last\n" +
+                line +
+                "\nMSG: dssm/ScanFlags\n"
+                "bool on\n"
+                "uint8[7] pad\n"
+                "float64 since\n" +
+                line +
+                "\nMSG: dssm/ScanOrigin\n"
+                "float32 x\n"
+                "uint8[4] pad\n"
+                "float64 y\n"
+                "uint8[3] tag\n"
+                "uint8[5] pad2\n" +
+                line +
+                "\nMSG: dssm/ScanPoints\n"
+                "float32 x\n"
+                "uint8[4] pad\n"
+                "float64 y\n"
+                "uint8[3] tag\n"
+                "uint8[5] pad2\n");
+}
+
+TEST(Ros2Schema, HasSequenceOfBytesForUndescribedTypes) {
+  EXPECT_EQ(ros2_schema({"Blob", 40, 1, {}}).text, "uint8[] data\n");
+}
+
+// The numbers that CDR finds by a definition: (offset, size).
+class Cdr {
+ public:
+  explicit Cdr(const std::string& text) {
+    std::istringstream lines(text);
+    std::string message;
+    for (std::string line; std::getline(lines, line);) {
+      if (line.starts_with("===")) continue;
+      if (line.starts_with("#")) continue;
+      if (line.starts_with("MSG: ")) {
+        message = line.substr(5);
+        continue;
+      }
+      static const std::regex kLine(
+          R"(([a-z0-9]+|dssm/[A-Z][A-Za-z0-9]*)(\[(\d+)\])? ([a-z](_?[a-z0-9]+)*)(  # .*)?)");
+      std::smatch match;
+      EXPECT_TRUE(std::regex_match(line, match, kLine)) << line;
+      if (match.empty()) continue;
+      EXPECT_TRUE(names_[message].insert(match[4]).second) << line;
+      messages_[message].push_back({match[1], match[3].matched ? std::stoul(match[3]) : 1U});
+    }
+    run("");
+  }
+  std::set<std::pair<std::uint64_t, std::uint64_t>> numbers;
+  std::uint64_t end = 0;
+
+ private:
+  void run(const std::string& message) {
+    ASSERT_TRUE(messages_.contains(message)) << message;
+    for (const auto& [type, count] : messages_[message]) {
+      const std::size_t digits = type.find_first_of("123456789");
+      for (std::uint64_t i = 0; i < count; ++i) {
+        if (type.starts_with("dssm/")) {
+          run(type);
+          continue;
+        }
+        const std::uint64_t size = type == "bool" ? 1 : std::stoul(type.substr(digits)) / 8;
+        end = (end + size - 1) / size * size;
+        if (size > 1) numbers.insert({end, size});
+        end += size;
+      }
+    }
+  }
+  std::map<std::string, std::vector<std::pair<std::string, std::uint64_t>>> messages_;
+  std::map<std::string, std::set<std::string>> names_;
+};
+
+TEST(Ros2Schema, FindsEachNumberOfRandomTypesWhereItIs) {
+  std::mt19937 random(20);
+  const char* const names[] = {"a", "b", "a.b", "a.c", "a.b.d", "X", "f_", "a[0].e", "a[1].e", "1"};
+  std::size_t found_numbers = 0;
+  for (int i = 0; i < 5000; ++i) {
+    TypeInfo type{"Random type", 200, 8, {}};
+    std::set<std::pair<std::uint64_t, std::uint64_t>> numbers;
+    for (std::size_t n = random() % 8 + 1; n > 0; --n) {
+      Field field;
+      field.name = names[random() % std::size(names)];
+      field.kind = static_cast<Scalar>(1 + random() % 12);
+      const std::uint64_t size = scalar_bytes(field.kind);
+      field.offset_bytes = random() % 80;
+      if (random() % 4 != 0) field.offset_bytes &= ~(size - 1);
+      field.count = random() % 3 == 0 ? 1 + random() % 4 : 1;
+      field.stride_bytes = random() % 2 == 0 ? size : 8 * (1 + random() % 3);
+      if (field.count == 1) field.stride_bytes = size;
+      for (std::uint64_t k = 0; k < field.count; ++k) {
+        numbers.insert({field.offset_bytes + k * field.stride_bytes, size});
+      }
+      type.fields.push_back(field);
+    }
+    if (!type.check()) continue;
+    const std::string text = ros2_schema(type).text;
+    SCOPED_TRACE(type.description() + "\n" + text);
+    const Cdr cdr(text);
+    EXPECT_LE(cdr.end, type.payload_bytes);
+    for (const auto& number : cdr.numbers) EXPECT_TRUE(numbers.contains(number)) << number.first;
+    found_numbers += cdr.numbers.size();
+    if (testing::Test::HasFailure()) break;
+  }
+  EXPECT_GT(found_numbers, 5000U);
+}
+
+}  // namespace
+}  // namespace dssm::recording
