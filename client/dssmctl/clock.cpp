@@ -175,6 +175,7 @@ void print_matrix(const std::vector<ClockPair>& pairs, const ClockOptions& optio
                {"REASON", Table::Align::left, 0, Table::Column::Fit::below}});
   for (const ClockPair& pair : pairs) table.add_row(pair_row(pair));
   table.print(out);
+  if (pairs.empty()) out.add("no other host is up, so there is no pair; see `dssmctl hosts`\n");
 }
 
 Result<void> print_once(Session& session, const ClockOptions& options, Output& out) {
@@ -265,21 +266,21 @@ Result<void> tabulate_clocks(Session& session, const ClockOptions& options, Outp
 Result<void> await_clock(Session& session, const ClockOptions& options, Output& out) {
   catch_stop_signals();
   const MonoTime deadline = deadline_in(*options.wait);
-  for (;;) {
+  for (bool is_first = true;; is_first = false) {
     const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
     const HostInfo& self = hosts.front();
     if (self.clock && is_good(*self.clock)) {
       print_clocks({self}, options, out);
       return {};
     }
+    const Error bad = {
+        Errc::clock_out_of_bounds,
+        fmt::format("the clock of this host is {}; see `chronyc tracking` and `systemctl "
+                    "status chrony`",
+                    self.clock ? status_text(*self.clock) : "not watched")};
     const MonoTime now = MonoClock::now();
-    if (now >= deadline || stop_requested()) {
-      return Error{
-          Errc::clock_out_of_bounds,
-          fmt::format("the clock of this host is {}; see `chronyc tracking` and `systemctl "
-                      "status chrony`",
-                      self.clock ? status_text(*self.clock) : "not watched")};
-    }
+    if (now >= deadline || stop_requested()) return bad;
+    if (is_first) print_waiting(options, *options.wait, bad);
     std::this_thread::sleep_for(std::min(deadline - now, kStopCheckPeriod));
   }
 }

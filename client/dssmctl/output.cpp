@@ -232,7 +232,8 @@ void Table::print(Output& out) const {
     end_line();
     out.add(line);
     out.add("\n");
-    if (layout.last_below && !row.back().empty()) out.add(wrapped(row.back(), out.columns()));
+    const bool is_empty = row.back().empty() || row.back() == "-";
+    if (layout.last_below && !is_empty) out.add(wrapped(row.back(), out.columns()));
   }
 }
 

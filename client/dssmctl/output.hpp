@@ -79,7 +79,8 @@ class Table {
     std::string title;
     Align align = Align::left;
     // What to do when the table is too wide, in this order: a column that may be below (the last
-    // one only) has its cells in lines of their own, after their rows; columns are left out, from
+    // one only) has its cells in lines of their own, after their rows, but for those that are
+    // empty or "-"; columns are left out, from
     // drop = 1 on; one that may be short is cut.
     unsigned drop = 0;  // 0: never
     enum class Fit : unsigned char { whole, below, cut } fit = Fit::whole;

@@ -110,6 +110,23 @@ TEST(Table, FitsATerminalByWhatItsColumnsAllow) {
             "    down\n");
 }
 
+TEST(Table, HasNoLineBelowForAnEmptyCell) {
+  using Fit = Table::Column::Fit;
+  Table table({{"NAME"}, {"NOTE", Table::Align::left, 0, Fit::below}});
+  for (const char* note : {"-", "", "down"}) table.add_row({"odometry", note});
+  EXPECT_EQ(on_terminal(14, table),
+            "NAME      NOTE\n"
+            "odometry  -\n"
+            "odometry\n"
+            "odometry  down\n");
+  EXPECT_EQ(on_terminal(12, table),
+            "NAME\n"
+            "odometry\n"
+            "odometry\n"
+            "odometry\n"
+            "    down\n");
+}
+
 TEST(Table, PrintsItsHeaderWithoutRows) {
   EXPECT_EQ(printed([&](Output& out) { Table({{"NAME"}, {"N"}}).print(out); }), "NAME  N\n");
 }
