@@ -240,7 +240,7 @@ Result<MirrorDemands::Exception> parse_mirror_exception(std::string_view text) {
     if (!is_last) rest.remove_prefix(comma + 1);
     while (what.starts_with(' ')) what.remove_prefix(1);
     const Result<void> taken = take_demand(what, exception);
-    if (!taken) return wrong("holds what is not a demand: " + taken.error().message);
+    if (!taken) return wrong("is wrong: " + taken.error().message);
   }
   return exception;
 }
