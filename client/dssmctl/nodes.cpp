@@ -41,7 +41,7 @@ Json uses_json(const NodeInfo& node, Role role) {
 bool is_process(const NodeInfo& node) { return node.error.empty(); }
 
 // Why there are no processes to show; there are `all` that were not asked for.
-std::string why_empty(const NodesOptions& options, std::ptrdiff_t all) {
+std::string why_no_nodes(const NodesOptions& options, std::ptrdiff_t all) {
   if (all == 0) return "no process has a stream open";
   const std::string others =
       fmt::format("there {} {} other{}", all == 1 ? "is" : "are", all, all == 1 ? "" : "s");
@@ -135,7 +135,7 @@ Result<void> run(const NodesOptions& options, Output& out) {
     print_nodes(nodes, out);
     if (std::none_of(nodes.begin(), nodes.end(), is_process)) {
       out.flush();
-      print_error(fmt::format("dssmctl: nodes: {}\n", why_empty(options, all_nodes)));
+      print_error(fmt::format("dssmctl: nodes: {}\n", why_no_nodes(options, all_nodes)));
     }
     return {};
   }
