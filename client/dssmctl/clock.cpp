@@ -43,13 +43,6 @@ const char* reads_text(const HostInfo& host) {
   return reads_text(host.clock_reason, host.clock_refused);
 }
 
-std::string reads_cell(const HostInfo& host) {
-  const char* const reads = reads_text(host);
-  if (!reads) return "-";
-  if (host.clock_reason.empty()) return reads;
-  return fmt::format("{}: {}", reads, escaped_message(host.clock_reason));
-}
-
 // Whether its chronyd was read.
 bool is_read(const ClockSnapshot& clock) {
   return clock.status != ClockStatus::unknown && clock.age > Duration::zero();
@@ -57,8 +50,10 @@ bool is_read(const ClockSnapshot& clock) {
 
 // A host whose clock is not known has dashes.
 std::vector<std::string> clock_row(const HostInfo& host) {
+  const std::string reads = reads_text(host) ? reads_text(host) : "-";
+  const std::string reason = escaped_message(host.clock_reason);
   if (!host.clock) {
-    return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-", reads_cell(host)};
+    return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-", reads, reason};
   }
   const ClockSnapshot& clock = *host.clock;
   return {escaped(host.name),
@@ -69,7 +64,8 @@ std::vector<std::string> clock_row(const HostInfo& host) {
           reference_text(host),
           clock.update_interval > Duration::zero() ? duration_text(clock.update_interval) : "-",
           is_read(clock) ? duration_text(clock.age) : "-",
-          reads_cell(host)};
+          reads,
+          reason};
 }
 
 Json clock_json(const HostInfo& host) {
@@ -111,7 +107,8 @@ void print_clocks(const std::vector<HostInfo>& hosts, const ClockOptions& option
                {"REFERENCE", Table::Align::left, 3},
                {"POLL", Table::Align::right, 1},
                {"AGE", Table::Align::right, 2},
-               {"READS", Table::Align::left, 0, Table::Column::Fit::below}});
+               {"READS"},
+               {"REASON", Table::Align::left, 0, Table::Column::Fit::below}});
   for (const HostInfo& host : hosts) {
     if (is_there(host)) table.add_row(clock_row(host));
   }

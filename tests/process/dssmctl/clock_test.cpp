@@ -40,8 +40,9 @@ TEST_F(Clock, HasARowForEachHostThatIsThere) {
   ASSERT_EQ(lines.size(), 3U);
   EXPECT_EQ(words_of(lines[0]),
             (std::vector<std::string>{"HOST", "STATUS", "BOUND", "FROM", "HERE", "OFFSET",
-                                      "REFERENCE", "POLL", "AGE", "READS"}));
+                                      "REFERENCE", "POLL", "AGE", "READS", "REASON"}));
   EXPECT_TRUE(contains(lines[1], "no chronyd")) << lines[1];
+  EXPECT_EQ(words_of(lines[2]).back(), "good") << "and no reason against it";
 }
 
 TEST_F(Clock, HasNoMatrixWithoutAnotherHost) {
