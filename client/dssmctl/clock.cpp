@@ -43,13 +43,6 @@ const char* reads_text(const HostInfo& host) {
   return reads_text(host.clock_reason, host.clock_refused);
 }
 
-std::string reads_cell(const HostInfo& host) {
-  const char* const reads = reads_text(host);
-  if (!reads) return "-";
-  if (host.clock_reason.empty()) return reads;
-  return fmt::format("{}: {}", reads, escaped_message(host.clock_reason));
-}
-
 // Whether its chronyd was read.
 bool is_read(const ClockSnapshot& clock) {
   return clock.status != ClockStatus::unknown && clock.age > Duration::zero();
@@ -57,8 +50,10 @@ bool is_read(const ClockSnapshot& clock) {
 
 // A host whose clock is not known has dashes.
 std::vector<std::string> clock_row(const HostInfo& host) {
+  const std::string reads = reads_text(host) ? reads_text(host) : "-";
+  const std::string reason = escaped_message(host.clock_reason);
   if (!host.clock) {
-    return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-", reads_cell(host)};
+    return {escaped(host.name), "-", "unknown", "-", "-", "-", "-", "-", reads, reason};
   }
   const ClockSnapshot& clock = *host.clock;
   return {escaped(host.name),
@@ -69,7 +64,8 @@ std::vector<std::string> clock_row(const HostInfo& host) {
           reference_text(host),
           clock.update_interval > Duration::zero() ? duration_text(clock.update_interval) : "-",
           is_read(clock) ? duration_text(clock.age) : "-",
-          reads_cell(host)};
+          reads,
+          reason};
 }
 
 Json clock_json(const HostInfo& host) {
@@ -111,7 +107,8 @@ void print_clocks(const std::vector<HostInfo>& hosts, const ClockOptions& option
                {"REFERENCE", Table::Align::left, 3},
                {"POLL", Table::Align::right, 1},
                {"AGE", Table::Align::right, 2},
-               {"READS", Table::Align::left, 0, Table::Column::Fit::below}});
+               {"READS"},
+               {"REASON", Table::Align::left, 0, Table::Column::Fit::below}});
   for (const HostInfo& host : hosts) {
     if (is_there(host)) table.add_row(clock_row(host));
   }
@@ -175,6 +172,7 @@ void print_matrix(const std::vector<ClockPair>& pairs, const ClockOptions& optio
                {"REASON", Table::Align::left, 0, Table::Column::Fit::below}});
   for (const ClockPair& pair : pairs) table.add_row(pair_row(pair));
   table.print(out);
+  if (pairs.empty()) out.add("no other host is up, so there is no pair; see `dssmctl hosts`\n");
 }
 
 Result<void> print_once(Session& session, const ClockOptions& options, Output& out) {
@@ -265,21 +263,21 @@ Result<void> tabulate_clocks(Session& session, const ClockOptions& options, Outp
 Result<void> await_clock(Session& session, const ClockOptions& options, Output& out) {
   catch_stop_signals();
   const MonoTime deadline = deadline_in(*options.wait);
-  for (;;) {
+  for (bool is_first = true;; is_first = false) {
     const std::vector<HostInfo> hosts = DSSM_TRY(session.list_hosts());
     const HostInfo& self = hosts.front();
     if (self.clock && is_good(*self.clock)) {
       print_clocks({self}, options, out);
       return {};
     }
+    const Error bad = {
+        Errc::clock_out_of_bounds,
+        fmt::format("the clock of this host is {}; see `chronyc tracking` and `systemctl "
+                    "status chrony`",
+                    self.clock ? status_text(*self.clock) : "not watched")};
     const MonoTime now = MonoClock::now();
-    if (now >= deadline || stop_requested()) {
-      return Error{
-          Errc::clock_out_of_bounds,
-          fmt::format("the clock of this host is {}; see `chronyc tracking` and `systemctl "
-                      "status chrony`",
-                      self.clock ? status_text(*self.clock) : "not watched")};
-    }
+    if (now >= deadline || stop_requested()) return bad;
+    if (is_first) print_waiting(options, *options.wait, bad);
     std::this_thread::sleep_for(std::min(deadline - now, kStopCheckPeriod));
   }
 }

@@ -102,11 +102,11 @@ Finding check_mirrors(const Facts& facts) {
   }
   if (behind.empty()) {
     return {"mirrors", Status::ok,
-            mirrors == 0 ? "no stream of another host is read here"
-                         : fmt::format("the network carries all samples of {} of other hosts that "
-                                       "programs here read",
-                                       mirrors == 1 ? "the stream"
-                                                    : fmt::format("the {} streams", mirrors))};
+            mirrors == 0
+                ? "no stream of another host is read here"
+                : fmt::format("the network carries all that programs here read of {}",
+                              mirrors == 1 ? "a stream of another host"
+                                           : fmt::format("{} streams of other hosts", mirrors))};
   }
   return {"mirrors", Status::warn, first_of(std::move(behind)),
           "they write more than the network to their hosts carries, or it was just interrupted",

@@ -159,7 +159,11 @@ _dssmctl() {
     "pki install") options="--credentials" ;;
   esac
   if [[ $cur == -* ]]; then
-    mapfile -t COMPREPLY < <(compgen -W "$common $options" -- "$cur")
+    local option given=" ${words[*]:1:cword-1} " left=""
+    for option in $common $options; do # without those that are given and count only once
+      [[ $option != --host && $option != --field && $given == *" $option "* ]] || left+=" $option"
+    done
+    mapfile -t COMPREPLY < <(compgen -W "$left" -- "$cur")
     return
   fi
 

@@ -83,7 +83,11 @@ function __dssmctl_candidates
         set -l options --version
         set -q verb[1]; and set options (__dssmctl_ask $verb --help)
         printf '%s\n' $options (__dssmctl_ask --help | string match -v '  --version*') |
-            sed -n 's/^ *\(-[a-z],\)*\(--[a-z-]*\).*/\2/p' | sort -u
+            sed -n 's/^ *\(-[a-z],\)*\(--[a-z-]*\).*/\2/p' | sort -u | while read -l option
+                # Without those that are given and count only once.
+                contains -- $option $words; and not contains -- $option --host --field
+                or echo $option
+            end
         return
     end
     switch "$verb"

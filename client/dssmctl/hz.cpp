@@ -38,7 +38,8 @@ class RateMeter : public Meter {
 
  protected:
   Statistics intervals() const { return intervals_.statistics(); }
-  std::size_t window() const { return intervals_.size() + 1; }
+  // In samples.
+  std::size_t window() const { return payload_bytes_.empty() ? 0 : intervals_.size() + 1; }
   // 0 when unknown: too few samples, stamps that do not move on, or none come.
   double rate_hz(const MeterState& state) const {
     const Statistics found = intervals();
@@ -51,9 +52,10 @@ class RateMeter : public Meter {
     return payload_bytes_.empty() ? 0 : sum / static_cast<double>(payload_bytes_.size());
   }
 
-  std::string rate_text(const MeterState& state) const {
+  // `unknown`: the text where the rate is unknown.
+  std::string rate_text(const MeterState& state, const char* unknown) const {
     const double rate = rate_hz(state);
-    return rate > 0 ? fmt::format("{:.3f} Hz", rate) : intervals_.size() > 0 ? "unknown" : "-";
+    return rate > 0 ? fmt::format("{:.3f} Hz", rate) : unknown;
   }
   static std::string too_few(const MeterState& state) {
     return state.final ? "" : "one sample only, no rate yet\n";
@@ -86,13 +88,13 @@ class HzMeter : public RateMeter {
 
   std::string text(const MeterState& state) const override {
     if (intervals().count == 0) return too_few(state);
-    return fmt::format("average rate: {}\n{}", rate_text(state),
+    return fmt::format("average rate: {}\n{}", rate_text(state, "unknown"),
                        statistics_line(intervals(), window()));
   }
 
   std::vector<std::string> cells(const MeterState& state) const override {
     std::vector<std::string> cells = statistics_cells(intervals());
-    cells.insert(cells.begin(), state.stalled && !state.final ? "-" : rate_text(state));
+    cells.insert(cells.begin(), rate_text(state, "-"));
     cells.push_back(std::to_string(window()));
     return cells;
   }
@@ -111,20 +113,21 @@ class BwMeter : public RateMeter {
 
   std::string text(const MeterState& state) const override {
     if (intervals().count == 0) return too_few(state);
-    return fmt::format("average: {}\n\tpayload: {} rate: {} window: {}\n", bandwidth_text(state),
-                       bytes_text(std::llround(mean_payload_bytes())), rate_text(state), window());
+    return fmt::format(
+        "average: {}\n\tpayload: {} rate: {} window: {}\n", bandwidth_text(state, "unknown"),
+        bytes_text(std::llround(mean_payload_bytes())), rate_text(state, "unknown"), window());
   }
 
   std::vector<std::string> cells(const MeterState& state) const override {
-    return {bandwidth_text(state),
-            state.seen > 0 ? bytes_text(std::llround(mean_payload_bytes())) : "-",
-            state.stalled && !state.final ? "-" : rate_text(state), std::to_string(window())};
+    return {bandwidth_text(state, "-"),
+            window() > 0 ? bytes_text(std::llround(mean_payload_bytes())) : "-",
+            rate_text(state, "-"), std::to_string(window())};
   }
 
  private:
-  std::string bandwidth_text(const MeterState& state) const {
+  std::string bandwidth_text(const MeterState& state, const char* unknown) const {
     const double rate = rate_hz(state);
-    return rate > 0 ? byte_rate_text(rate * mean_payload_bytes()) : "unknown";
+    return rate > 0 ? byte_rate_text(rate * mean_payload_bytes()) : unknown;
   }
 };
 

@@ -37,13 +37,26 @@ Json uses_json(const NodeInfo& node, Role role) {
   return uses;
 }
 
+// Not a host that did not answer.
+bool is_process(const NodeInfo& node) { return node.error.empty(); }
+
+// Why there are no processes to show; there are `all` that were not asked for.
+std::string why_no_nodes(const NodesOptions& options, std::ptrdiff_t all) {
+  if (all == 0) return "no process has a stream open";
+  const std::string others =
+      fmt::format("there {} {} other{}", all == 1 ? "is" : "are", all, all == 1 ? "" : "s");
+  if (options.pattern.empty()) return "no process of these hosts has a stream open; " + others;
+  return fmt::format("no process whose program fits '{}' has a stream open; {}",
+                     escaped(options.pattern), others);
+}
+
 // A host that did not answer is shown whatever the name of the process.
 bool is_wanted(const NodesOptions& options, const NodeInfo& node) {
   const std::vector<std::string>& hosts = options.hosts;
   if (!hosts.empty() && std::find(hosts.begin(), hosts.end(), node.host) == hosts.end()) {
     return false;
   }
-  return options.pattern.empty() || !node.error.empty() ||
+  return options.pattern.empty() || !is_process(node) ||
          ::fnmatch(options.pattern.c_str(), node.program.c_str(), 0) == 0;
 }
 
@@ -76,7 +89,7 @@ std::string stream_name_on(std::string_view host, const StreamId& stream) {
 void print_nodes(const std::vector<NodeInfo>& nodes, Output& out) {
   Table table({{"HOST"}, {"PID", Table::Align::right}, {"PROGRAM"}, {"WRITES"}, {"READS"}});
   for (const NodeInfo& node : nodes) {
-    if (!node.error.empty()) continue;
+    if (!is_process(node)) continue;
     const std::vector<std::string> writes = names_of(node, Role::writer),
                                    reads = names_of(node, Role::reader);
     const auto name_in = [](const std::vector<std::string>& names, std::size_t row) {
@@ -95,7 +108,7 @@ void print_nodes(const std::vector<NodeInfo>& nodes, Output& out) {
   }
   table.print(out);
   for (const NodeInfo& node : nodes) {
-    if (node.error.empty()) continue;
+    if (is_process(node)) continue;
     out.add(fmt::format("{}: not known: {}\n", escaped(node.host), escaped_message(node.error)));
   }
 }
@@ -116,9 +129,14 @@ Result<void> run(const NodesOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   std::vector<NodeInfo> nodes = DSSM_TRY(session.list_nodes());
   DSSM_TRY(check_hosts(session, options, nodes));
+  const auto all_nodes = std::count_if(nodes.begin(), nodes.end(), is_process);
   std::erase_if(nodes, [&](const NodeInfo& node) { return !is_wanted(options, node); });
   if (!options.json) {
     print_nodes(nodes, out);
+    if (std::none_of(nodes.begin(), nodes.end(), is_process)) {
+      out.flush();
+      print_error(fmt::format("dssmctl: nodes: {}\n", why_no_nodes(options, all_nodes)));
+    }
     return {};
   }
   Json all = Json::array();

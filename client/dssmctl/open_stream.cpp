@@ -28,11 +28,15 @@ std::string socket_path(const CommonOptions& options) {
 }
 
 // Without a reader and without an error after a stop signal.
-Result<std::optional<OpenedStream>> open_stream(Session& session, const StreamId& id, Duration wait,
-                                                MonoTime deadline, FetchHistory history) {
+Result<std::optional<OpenedStream>> open_stream(Session& session, const StreamId& id,
+                                                const ReadingOptions& options, MonoTime deadline,
+                                                FetchHistory history) {
   Result<RawReader> reader = session.open_raw_reader(id, nullptr, 0, history);
   if (reader) return std::optional(OpenedStream{session, std::move(*reader), false});
 
+  if (may_come(reader.error()) && MonoClock::now() < deadline) {
+    print_waiting(options, options.wait, with_similar_names(reader.error(), session, id));
+  }
   while (may_come(reader.error()) && MonoClock::now() < deadline) {
     if (stop_requested()) return std::optional<OpenedStream>();
     reader = session.await_raw_reader(id, std::min(deadline, deadline_in(kStopCheckPeriod)),
@@ -40,7 +44,7 @@ Result<std::optional<OpenedStream>> open_stream(Session& session, const StreamId
     if (reader) return std::optional(OpenedStream{session, std::move(*reader), true});
   }
   Error error = with_similar_names(std::move(reader).error(), session, id);
-  if (error.code == Errc::not_found && wait == Duration::zero()) {
+  if (error.code == Errc::not_found && options.wait == Duration::zero()) {
     error.message += "; --wait 10s waits for it";
   }
   return error;
@@ -66,6 +70,11 @@ Result<Session> connect(const CommonOptions& options) {
                            S_ISDIR(file.st_mode) ? path + "/dssmd.sock" : "/run/dssm/dssmd.sock")};
 }
 
+void print_waiting(const CommonOptions& options, Duration wait, const Error& reason) {
+  print_error(fmt::format("dssmctl: {}: waits up to {}: {}\n", options.verb_name,
+                          duration_text(wait), escaped_message(reason.message)));
+}
+
 Result<std::vector<OpenedStream>> open_streams(const ReadingOptions& options,
                                                const std::vector<std::string>& streams,
                                                FetchHistory history) {
@@ -78,7 +87,7 @@ Result<std::vector<OpenedStream>> open_streams(const ReadingOptions& options,
   std::vector<OpenedStream> opened;
   for (const StreamId& id : ids) {
     std::optional<OpenedStream> one =
-        DSSM_TRY(open_stream(session, id, options.wait, deadline, history));
+        DSSM_TRY(open_stream(session, id, options, deadline, history));
     if (!one) return std::vector<OpenedStream>();
     opened.push_back(*std::move(one));
   }

@@ -17,6 +17,9 @@ namespace dssm::ctl {
 
 Result<Session> connect(const CommonOptions& options);
 
+// Reports on standard error that the verb waits for `wait` at most, and why.
+void print_waiting(const CommonOptions& options, Duration wait, const Error& reason);
+
 struct OpenedStream {
   Session session;
   RawReader reader;

@@ -470,9 +470,9 @@ void add_create(CLI::App& app, Parsed& parsed) {
   add_whole(create, "--size", "BYTES", "bytes per sample", options.payload_bytes, 1,
             kMaxPayloadBytes)
       ->required();
-  CLI::Option* depth =
-      add_whole(create, "--depth", "N", "slots in the ring", options.depth, kMinDepth, kMaxDepth);
-  CLI::Option* life = add_seconds(create, "--life", "history to keep, instead of --depth",
+  CLI::Option* depth = add_whole(create, "--depth", "N", "number of slots in the ring",
+                                 options.depth, kMinDepth, kMaxDepth);
+  CLI::Option* life = add_seconds(create, "--life", "how much history to keep, with --cycle",
                                   options.life, Range::positive);
   life->excludes(depth);
   CLI::Option* cycle = add_seconds(create, "--cycle", "expected time between two samples",
@@ -523,8 +523,12 @@ void add_playback(CLI::App& app, Parsed& parsed) {
   };
   add_options<PlaybackOptions>(playback, parsed);
   add("show", "show the clock");
-  PlaybackOptions& changed = add("set", "change the clock");
-  CLI::App* set = playback->get_subcommand("set");
+  CLI::App* set = playback->add_subcommand("set", "change the clock");
+  PlaybackOptions& changed =
+      add_options<PlaybackOptions>(set, parsed, [](const PlaybackOptions& all) {
+        require(all.offset_s || all.speed || all.time,
+                "what shall change? give --offset SECONDS, --speed X or --time TIME");
+      });
   CLI::Option* offset =
       add_real(set, "--offset", "SECONDS", "its offset from speed * real time", changed.offset_s);
   add_real(set, "--speed", "X", "how fast it runs: 1 as real time, 0 not at all, -1 backwards",
@@ -533,7 +537,6 @@ void add_playback(CLI::App& app, Parsed& parsed) {
              "its time now: seconds since 1970, ISO 8601, now, or so long before now (-3s)",
              changed.time)
       ->excludes(offset);
-  set->require_option(1, 0);
   add("pause", "stop the clock").paused = true;
   add("resume", "let it run again").paused = false;
   add("reset", "back to real time").reset = true;
@@ -691,37 +694,54 @@ std::vector<std::string> verbs_of(const CLI::App& app) {
   return verbs;
 }
 
-// What is called otherwise elsewhere: by people, ROS 2, or this program's earlier versions.
+// What is called otherwise elsewhere: by people, ROS 2, SSM, or this program's earlier versions.
+// Where two words name it, those of one word follow.
 constexpr std::pair<std::string_view, std::string_view> kOtherNames[] = {
-    {"list", "ls"},          {"topic", "ls"},         {"topics", "ls"},
-    {"streams", "ls"},       {"top", "ls --watch"},   {"monitor", "ls --watch"},
-    {"watch", "ls --watch"}, {"cat", "echo"},         {"read", "echo"},
-    {"rate", "hz"},          {"bandwidth", "bw"},     {"latency", "delay"},
-    {"describe", "info"},    {"stat", "info"},        {"type", "info"},
-    {"interface", "show"},   {"delete", "rm"},        {"remove", "rm"},
-    {"new", "create"},       {"status", "doctor"},    {"check", "doctor"},
-    {"wtf", "doctor"},       {"peers", "hosts"},      {"host", "hosts"},
-    {"time", "clock"},       {"version", "--version"}};
+    {"list", "ls"},          {"topic", "ls"},           {"topics", "ls"},
+    {"streams", "ls"},       {"top", "ls --watch"},     {"monitor", "ls --watch"},
+    {"watch", "ls --watch"}, {"cat", "echo"},           {"read", "echo"},
+    {"publish", "pub"},      {"write", "pub"},          {"rate", "hz"},
+    {"bandwidth", "bw"},     {"latency", "delay"},      {"describe", "info"},
+    {"stat", "info"},        {"type", "info"},          {"interface list", "find"},
+    {"interface", "show"},   {"delete", "rm"},          {"remove", "rm"},
+    {"new", "create"},       {"status", "doctor"},      {"check", "doctor"},
+    {"wtf", "doctor"},       {"peers", "hosts"},        {"host", "hosts"},
+    {"node", "nodes"},       {"processes", "nodes"},    {"ps", "nodes"},
+    {"param", "property"},   {"bag info", "info FILE"}, {"bag play", "play"},
+    {"bag", "record"},       {"rec", "record"},         {"logger", "record"},
+    {"replay", "play"},      {"player", "play"},        {"time", "clock"},
+    {"version", "--version"}};
 
-// " (did you mean 'ls'?)", for a verb that there is not; `next` is the word after it.
-std::string verb_hint(const CLI::App& at, const std::string& word, const std::string& next) {
-  std::vector<std::string> verbs = verbs_of(at);
-  const auto has = [&](std::string_view name) {
-    return std::find(verbs.begin(), verbs.end(), name.substr(0, name.find(' '))) != verbs.end();
-  };
-  const auto hint = [](std::string_view name) {
-    return fmt::format(" (did you mean '{}'?)", name);
-  };
-  if (word == "topic" && has(next)) return hint(next);  // ros2 topic hz
-  for (const auto& [other, name] : kOtherNames) {
-    if (word == other && (has(name) || name.starts_with("--"))) return hint(name);
+// "ls", for a verb that `app` has not; `next` is the word after it. Empty: nothing is like it.
+std::string meant_verb(const CLI::App& app, std::string_view word, std::string_view next) {
+  const std::vector<std::string> verbs = verbs_of(app);
+  // ros2 topic hz, ros2 topic list
+  if (word == "topic" && !next.empty()) {
+    if (std::find(verbs.begin(), verbs.end(), next) != verbs.end()) return std::string(next);
+    if (std::string meant = meant_verb(app, next, ""); !meant.empty()) return meant;
   }
-  const std::vector<std::string> similar = similar_names(word, std::move(verbs));
-  return similar.empty() ? "" : hint(similar.front());
+  const std::string both = fmt::format("{} {}", word, next);
+  for (const auto& [other, name] : kOtherNames) {
+    if (other == word || other == both) return std::string(name);
+  }
+  const std::vector<std::string> similar = similar_names(word, verbs);
+  return similar.empty() ? "" : similar.front();
 }
 
+// The error of a word that is not a verb of `at`.
 std::string no_verb(const CLI::App& at, const std::string& word, const std::string& next) {
-  return fmt::format("there is no verb '{}'{}", word, verb_hint(at, word, next));
+  std::string meant;
+  if (!at.get_parent()) {
+    if (word == "service" || word == "action") {
+      return fmt::format("there is no verb '{}' (DSSM has only streams, no {}s)", word, word);
+    }
+    meant = meant_verb(at, word, next);
+  } else if (std::vector<std::string> similar = similar_names(word, verbs_of(at));
+             !similar.empty()) {
+    meant = std::move(similar.front());
+  }
+  return fmt::format("there is no verb '{}'{}", word,
+                     meant.empty() ? "" : fmt::format(" (did you mean '{}'?)", meant));
 }
 
 // The words that are no options, nor --socket's value.

@@ -97,16 +97,15 @@ bool Output::flush_screen() {
 }
 
 Result<void> print_once_or_watch(bool watch, bool json, Output& out,
-                                 const std::function<Result<void>()>& print) {
-  constexpr Duration kPeriod = std::chrono::seconds(1);
+                                 const std::function<Result<void>()>& print, Duration period) {
   if (!watch) return print();
   catch_stop_signals();
-  for (MonoTime next = MonoClock::now();; next += kPeriod) {
+  for (MonoTime next = MonoClock::now();; next += period) {
     DSSM_TRY(print());
     const bool is_read = json             ? out.flush_changed("")
                          : out.terminal() ? out.flush_screen()
                                           : out.flush_changed("\n");
-    if (!is_read || !out.sleep_until(next + kPeriod)) return {};
+    if (!is_read || !out.sleep_until(next + period)) return {};
   }
 }
 
@@ -232,7 +231,8 @@ void Table::print(Output& out) const {
     end_line();
     out.add(line);
     out.add("\n");
-    if (layout.last_below && !row.back().empty()) out.add(wrapped(row.back(), out.columns()));
+    const bool is_empty = row.back().empty() || row.back() == "-";
+    if (layout.last_below && !is_empty) out.add(wrapped(row.back(), out.columns()));
   }
 }
 

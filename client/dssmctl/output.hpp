@@ -79,7 +79,8 @@ class Table {
     std::string title;
     Align align = Align::left;
     // What to do when the table is too wide, in this order: a column that may be below (the last
-    // one only) has its cells in lines of their own, after their rows; columns are left out, from
+    // one only) has its cells in lines of their own, after their rows, but for those that are
+    // empty or "-"; columns are left out, from
     // drop = 1 on; one that may be short is cut.
     unsigned drop = 0;  // 0: never
     enum class Fit : unsigned char { whole, below, cut } fit = Fit::whole;
@@ -134,10 +135,11 @@ inline std::string json_output(const Json& json, bool one_of_several) {
 // --- Ctrl-C, for verbs that run until then: SIGINT and SIGTERM end them with success, after their
 // final output. All other verbs end by these signals at once, as programs do.
 
-// Adds to `out` by `print` what a verb shows; with `watch` each second until Ctrl-C, when
+// Adds to `out` by `print` what a verb shows; with `watch` each `period` until Ctrl-C, when
 // it has changed, and on a terminal over the last one.
 Result<void> print_once_or_watch(bool watch, bool json, Output& out,
-                                 const std::function<Result<void>()>& print);
+                                 const std::function<Result<void>()>& print,
+                                 Duration period = std::chrono::seconds(1));
 
 // From now on SIGINT and SIGTERM only set a mark, and interrupt system calls.
 void catch_stop_signals();

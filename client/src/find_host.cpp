@@ -40,7 +40,7 @@ Result<std::uint16_t> default_port() {
   const auto [end, error] = std::from_chars(digits.data(), digits.data() + digits.size(), port);
   if (error != std::errc{} || end != digits.data() + digits.size() || port == 0) {
     return Error{Errc::invalid_argument, "$DSSM_PORT is '" + std::string(digits) +
-                                             "', which is no port: set it to 1 to 65535"};
+                                             "', which is not a port: set it to 1 to 65535"};
   }
   return port;
 }

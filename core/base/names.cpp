@@ -4,6 +4,7 @@
 #include <fmt/format.h>
 
 #include <algorithm>
+#include <numeric>
 #include <utility>
 
 namespace dssm {
@@ -12,18 +13,24 @@ namespace {
 // Longer names than the format allows are not worth comparing.
 constexpr std::size_t kMaxCompared = 2 * kMaxFullNameBytes;
 
-// Levenshtein's distance: single characters to insert, delete or replace.
+// The distance of Damerau and Levenshtein (optimal string alignment): single characters to insert,
+// delete or replace, and neighbouring ones to swap.
 std::size_t edit_distance(std::string_view a, std::string_view b) {
-  std::vector<std::size_t> row(b.size() + 1);
-  for (std::size_t j = 0; j <= b.size(); ++j) row[j] = j;
+  // Of the first i characters of `a` to the first j of `b`, in [j]: row for i + 1, above for i.
+  std::vector<std::size_t> row(b.size() + 1), above(row), two_above(row);
+  std::iota(above.begin(), above.end(), 0U);
   for (std::size_t i = 0; i < a.size(); ++i) {
-    std::size_t diagonal = std::exchange(row[0], i + 1);
+    row[0] = i + 1;
     for (std::size_t j = 0; j < b.size(); ++j) {
-      const std::size_t replaced = diagonal + (a[i] == b[j] ? 0 : 1);
-      diagonal = std::exchange(row[j + 1], std::min({replaced, row[j] + 1, row[j + 1] + 1}));
+      row[j + 1] = std::min({above[j] + (a[i] == b[j] ? 0 : 1), row[j] + 1, above[j + 1] + 1});
+      if (i > 0 && j > 0 && a[i] == b[j - 1] && a[i - 1] == b[j]) {
+        row[j + 1] = std::min(row[j + 1], two_above[j - 1] + 1);
+      }
     }
+    two_above.swap(above);
+    above.swap(row);
   }
-  return row[b.size()];
+  return above[b.size()];
 }
 
 }  // namespace

@@ -77,7 +77,7 @@ Result<StreamId> StreamId::parse(std::string_view text) {
     const auto [end, error] = std::from_chars(number.data(), number.data() + number.size(), id.id);
     if (error != std::errc() || end != number.data() + number.size() || number.empty()) {
       return invalid(
-          "stream name '{}': '{}' after ':' is no id; write name:id with an id from 0 to "
+          "stream name '{}': '{}' after ':' is not an id; write name:id with an id from 0 to "
           "2147483647",
           text, number);
     }

@@ -35,7 +35,9 @@ StreamChannel::StreamChannel(const Parts& parts, std::shared_ptr<ServedStream> s
       reader_(stream().mapping()),
       sender_(stream().mapping(), parts_.link, {may_tear, &parts_.budget}),
       due_(EventSource::timer(parts_.loop, [this] { parts_.observer.work_now(); })) {
-  served_->stream().set_channel({.key = this});
+  served_->stream().set_channel(
+      {.key = this,
+       .states_users = !parts_.them.is_dssmd() || parts_.them.has_feature(wire::kFeatureUsers)});
   set_program(false, false);
   parts_.link.take_samples(stream().type().payload_bytes, *this);
 }

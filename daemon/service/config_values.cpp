@@ -240,7 +240,7 @@ Result<MirrorDemands::Exception> parse_mirror_exception(std::string_view text) {
     if (!is_last) rest.remove_prefix(comma + 1);
     while (what.starts_with(' ')) what.remove_prefix(1);
     const Result<void> taken = take_demand(what, exception);
-    if (!taken) return wrong("holds what is no demand: " + taken.error().message);
+    if (!taken) return wrong("is wrong: " + taken.error().message);
   }
   return exception;
 }
@@ -295,7 +295,7 @@ Result<mode_t> parse_mode(std::string_view text) {
   const char* end = text.data() + text.size();
   const auto [rest, error] = std::from_chars(text.data(), end, mode, 8);
   if (error != std::errc() || rest != end || mode > 0777) {
-    return invalid(in_quotes(text) + " are no permissions; write them in octal, e.g. \"0660\"");
+    return invalid(in_quotes(text) + " are not permissions; write them in octal, e.g. \"0660\"");
   }
   if (!(mode & 0200)) {
     return invalid(in_quotes(text) +

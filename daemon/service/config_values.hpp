@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The values of configuration keys: from text, and what those of clock_policy, clock_limit and
-// clock_streams mean. Each failure is a reason alone ("'5x' is no number"), to which the caller
+// clock_streams mean. Each failure is a reason alone ("'5x' is not a number"), to which the caller
 // adds file, line and key.
 #pragma once
 

@@ -53,10 +53,7 @@ void describe(const Stream& stream, const OpenTable& opens, proto::Stream& out, 
   const OpenTable::Counts counts = opens.counts(stream);
   info.writers += counts.writers;
   info.readers += counts.readers;
-  // A channel whose users are not known may be another host's that writes.
-  const auto may_write = [](const Stream::Channel& channel) {
-    return channel.writers == 0 && channel.readers == 0;
-  };
+  const auto may_write = [](const Stream::Channel& channel) { return !channel.states_users; };
   if (info.state == StreamState::stalled && info.writers == 0 &&
       std::none_of(stream.channels().begin(), stream.channels().end(), may_write)) {
     info.state = StreamState::no_writer;

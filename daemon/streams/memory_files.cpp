@@ -28,7 +28,7 @@ constexpr std::uint64_t pages_up(std::uint64_t bytes) noexcept {
 }
 
 Error not_a_meta_file(const std::string& why) {
-  return Error{Errc::protocol, "this is no meta file that can be used: " + why};
+  return Error{Errc::protocol, "this is not a usable meta file: " + why};
 }
 
 Result<void> write_all(int fd, std::string_view bytes, std::uint64_t offset) {
@@ -166,7 +166,7 @@ Result<local::StreamMeta> MetaFile::read_untrusted() const {
     return not_a_meta_file("its content cannot be read");
   }
   local::StreamMeta meta;
-  if (!meta.ParseFromString(content)) return not_a_meta_file("its content is no StreamMeta");
+  if (!meta.ParseFromString(content)) return not_a_meta_file("its content is not a StreamMeta");
   return meta;
 }
 

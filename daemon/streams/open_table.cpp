@@ -13,10 +13,10 @@ void OpenTable::add_limits(LimitUses& out) const {
   for (const auto& [client, opens] : by_client_) most = std::max(most, opens.size());
   std::size_t of_user = 0;
   for (const auto& [user, opens] : by_user_) of_user = std::max(of_user, opens);
-  out.push_back({"max_opens", entries_.size(), limits_.max_opens, "opens"});
+  out.push_back({"max_opens", entries_.size(), limits_.max_opens, "open streams"});
   out.push_back(
-      {"max_opens of one user", of_user, limits_.max_share.of(limits_.max_opens), "opens"});
-  out.push_back({"max_opens_per_client", most, limits_.max_opens_per_client, "opens"});
+      {"max_opens of one user", of_user, limits_.max_share.of(limits_.max_opens), "open streams"});
+  out.push_back({"max_opens_per_client", most, limits_.max_opens_per_client, "open streams"});
 }
 
 Result<void> OpenTable::check_quota(const ClientIdentity& client) const {

@@ -159,6 +159,7 @@ class Stream : public std::enable_shared_from_this<Stream> {
     // The programs that use the stream over it; more may be counted than are named.
     std::vector<StreamUser> users = {};
     std::uint32_t writers = 0, readers = 0;
+    bool states_users = true;  // false: of an older dssmd, which may write unseen
   };
   const std::vector<Channel>& channels() const noexcept { return channels_; }
   // Adds one, or replaces what is known of its users.

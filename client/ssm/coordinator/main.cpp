@@ -72,7 +72,7 @@ std::optional<int> parse(int argc, char** argv, Options& options) {
     switch (::getopt_long(argc, argv, "vqh", known, nullptr)) {
       case -1:
         if (optind == argc) return std::nullopt;
-        std::fprintf(stderr, "ssm-coordinator: '%s' is no option; see --help\n", argv[optind]);
+        std::fprintf(stderr, "ssm-coordinator: '%s' is not an option; see --help\n", argv[optind]);
         return kUsage;
       case 'v':
         options.verbose = true;

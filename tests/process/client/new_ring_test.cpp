@@ -4,7 +4,9 @@
 #include <gtest/gtest.h>
 #include <poll.h>
 
+#include <atomic>
 #include <dssm/dssm.hpp>
+#include <memory>
 #include <thread>
 
 #include "core/wire/frame.hpp"
@@ -172,6 +174,17 @@ TEST(NewRing, IsReportedDuringAReconnect) {
   }
 }
 
+// Has the relay notify the first program that opens a stream that it has a new ring.
+void announce_new_ring(test::Relay& relay) {
+  const auto notified = std::make_shared<std::atomic<bool>>(false);
+  relay.set_behind([notified](const local::Response& response) {
+    if (!response.has_opened() || notified->exchange(true)) return std::string();
+    local::Response event;
+    event.mutable_replaced()->set_handle(response.opened().handle());
+    return wire::encode_frame(event);
+  });
+}
+
 // An attempt to open the new ring may come too early: within the pause after one that failed, or
 // while dssmd has none yet.
 TEST(NewRing, KeepsAPollableDescriptorReadableUntilItIsOpened) {
@@ -179,13 +192,7 @@ TEST(NewRing, KeepsAPollableDescriptorReadableUntilItIsOpened) {
   Session writing = connect(daemon);
   test::Relay relay(daemon.socket_path());
   Session session = test::connect_to(relay.socket_path());
-  std::atomic<bool> notified = false;
-  relay.set_behind([&](const local::Response& response) {
-    if (!response.has_opened() || notified.exchange(true)) return std::string();
-    local::Response event;
-    event.mutable_replaced()->set_handle(response.opened().handle());
-    return wire::encode_frame(event);
-  });
+  announce_new_ring(relay);
   Writer<double> writer = writing.create<double>("anew", History{16, 1ms}).value();
   Reader<double> reader = session.open_reader<double>("anew").value();
   pollfd event{reader.ready_fd().value(), POLLIN, 0};
@@ -207,13 +214,7 @@ TEST(NewRing, LeavesAPollableDescriptorQuietWhenThereIsNone) {
   const DaemonProcess daemon;
   test::Relay relay(daemon.socket_path());
   Session session = test::connect_to(relay.socket_path());
-  std::atomic<bool> notified = false;
-  relay.set_behind([&](const local::Response& response) {
-    if (!response.has_opened() || notified.exchange(true)) return std::string();
-    local::Response event;
-    event.mutable_replaced()->set_handle(response.opened().handle());
-    return wire::encode_frame(event);
-  });
+  announce_new_ring(relay);
   const Writer<double> writer = connect(daemon).create<double>("anew", History{16, 1ms}).value();
   Reader<double> reader = session.open_reader<double>("anew").value();
   pollfd event{reader.ready_fd().value(), POLLIN, 0};

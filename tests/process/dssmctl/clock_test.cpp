@@ -40,12 +40,29 @@ TEST_F(Clock, HasARowForEachHostThatIsThere) {
   ASSERT_EQ(lines.size(), 3U);
   EXPECT_EQ(words_of(lines[0]),
             (std::vector<std::string>{"HOST", "STATUS", "BOUND", "FROM", "HERE", "OFFSET",
-                                      "REFERENCE", "POLL", "AGE", "READS"}));
+                                      "REFERENCE", "POLL", "AGE", "READS", "REASON"}));
   EXPECT_TRUE(contains(lines[1], "no chronyd")) << lines[1];
+  EXPECT_EQ(words_of(lines[2]).back(), "good") << "and no reason against it";
+}
+
+TEST_F(Clock, HasNoMatrixWithoutAnotherHost) {
+  for (DaemonProcess* daemon : {&pc2_, &pc3_}) daemon->kill_hard();
+  for (const char* host : {"pc2", "pc3"}) await_state(host, HostState::down);
+  const Finished finished = ctl({"clock", "--matrix"});
+  EXPECT_EQ(finished.exit_status, 0);
+  const std::vector<std::string> lines = lines_of(finished.out);
+  ASSERT_EQ(lines.size(), 2U) << finished.out;
+  EXPECT_EQ(lines[1], "no other host is up, so there is no pair; see `dssmctl hosts`");
 }
 
 TEST_F(Clock, IsWaitedForAndReportsWhyItFailed) {
   clocks();
+  Running waiting({dssmctl_path(), "clock", "--wait", "1000"}, {daemon_.environment()});
+  EXPECT_TRUE(
+      waiting.line().starts_with("dssmctl: clock: waits up to 16m40s: the clock of this "
+                                 "host is unknown: no chronyd; see `chronyc"));
+  waiting.signal(SIGINT);
+  EXPECT_EQ(waiting.status(), 1);
   const Finished finished = ctl({"clock", "--wait", "0"});
   EXPECT_EQ(finished.exit_status, 1);
   EXPECT_EQ(finished.out, "");

@@ -63,6 +63,13 @@ TEST_F(Completion, OffersExactlyTheOptionsOfTheHelpText) {
   }
 }
 
+TEST_F(Completion, OffersAnOptionAgainOnlyWhereItMayBeGivenAgain) {
+  EXPECT_EQ(offered({"echo", "--count", "3", "--c"}), Strings{"--csv"});
+  EXPECT_EQ(offered({"echo", "--field", "speed", "--f"}), (Strings{"--field", "--full"}));
+  EXPECT_EQ(offered({"ls", "--host", "pc2", "--watch", "--h"}), (Strings{"--help", "--host"}));
+  EXPECT_EQ(offered({"--json", "ls", "--j"}), Strings{});
+}
+
 TEST_F(Completion, OffersStreamNamesWhereAStreamBelongs) {
   for (const char* name : {"lidar", "lidar:1", "odom"}) create(name);
   for (const char* verb : {"info", "echo", "hz", "bw", "delay", "rm"}) {
@@ -220,6 +227,10 @@ class CompletionInOtherShells : public FleetTest {
       {{"--v"}, {"--version"}},
       {{"hosts", "--v"}, {}},
       {{"echo", "--count", ""}, {}},
+      {{"echo", "--count", "3", "--c"}, {"--csv"}},
+      {{"echo", "--field", "speed", "--f"}, {"--field", "--full"}},
+      {{"ls", "--host", "pc2", "--watch", "--h"}, {"--help", "--host"}},
+      {{"ls", "--host", "pc2", "--watch", "--w"}, {"--wide"}},
   };
 
  private:

@@ -308,8 +308,9 @@ TEST_F(Info, ShowsHowMuchOfEachLimitIsUsed) {
   EXPECT_EQ(limit("max_streams"), counted("max_streams", 1, 4096, "streams"));
   EXPECT_EQ(limit("max_memory")["used"], info["memory_bytes"]);
   EXPECT_EQ(limit("max_memory")["limit"], info["memory_limit_bytes"]);
-  EXPECT_EQ(limit("max_opens"), counted("max_opens", 2, 65536, "opens"));
-  EXPECT_EQ(limit("max_opens_per_client"), counted("max_opens_per_client", 2, 16384, "opens"));
+  EXPECT_EQ(limit("max_opens"), counted("max_opens", 2, 65536, "open streams"));
+  EXPECT_EQ(limit("max_opens_per_client"),
+            counted("max_opens_per_client", 2, 16384, "open streams"));
   // The test, and dssmctl itself.
   EXPECT_EQ(limit("max_clients"), counted("max_clients", 2, 4096, "programs"));
   EXPECT_EQ(limit("max_clients_per_user")["limit"], 2048);

@@ -132,7 +132,11 @@ TEST_F(Meter, SeveralStreamsHaveARowEach) {
             "STREAM             RATE      MIN      MAX  STD DEV  WINDOW  NOTE\n"
             "s:0@pc1      100.000 Hz  10.0 ms  10.0 ms     0 ns       2\n"
             "other:0@pc1   50.000 Hz  20.0 ms  20.0 ms     0 ns       3\n"
-            "empty:0@pc1           -        -        -        -       1  no samples yet\n\n");
+            "empty:0@pc1           -        -        -        -       0  no samples yet\n\n");
+  EXPECT_EQ(output({"bw", "s", "empty", "-n", "1"}),
+            "STREAM       BANDWIDTH  PAYLOAD        RATE  WINDOW  NOTE\n"
+            "s:0@pc1        800 B/s  8 bytes  100.000 Hz       2\n"
+            "empty:0@pc1          -        -           -       0  no samples yet\n\n");
   const auto lines = lines_of(output({"bw", "s", "other", "-n", "1", "--json"}));
   ASSERT_EQ(lines.size(), 2U);
   EXPECT_EQ(Json::parse(lines[0])["stream"], "s:0@pc1");

@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl nodes and graph, and who uses a stream in ls and info.
+#include <signal.h>
 #include <sys/stat.h>
 #include <unistd.h>
 
@@ -59,6 +60,20 @@ TEST_F(Nodes, AreChosenByProgramAndHost) {
   EXPECT_EQ(on_pc2[0]["host"], "pc2");
   EXPECT_EQ(json({"nodes", "--host", "pc3"})["nodes"].size(), 0U)
       << "known, and nothing runs there";
+  const Finished none = ctl({"nodes", "the"});
+  EXPECT_EQ(none.exit_status, 0);
+  EXPECT_EQ(lines_of(none.out).size(), 1U) << "the header";
+  EXPECT_EQ(none.err,
+            "dssmctl: nodes: no process whose program fits 'the' has a stream open; there are 2 "
+            "others\n");
+  EXPECT_EQ(ctl({"nodes", "the", "--json"}).err, "");
+  EXPECT_EQ(ctl({"nodes", "--host", "pc3"}).err,
+            "dssmctl: nodes: no process of these hosts has a stream open; there are 2 others\n");
+  EXPECT_EQ(ctl({"nodes", "the*"}).err, "");
+  ::kill(pc3_.pid(), SIGSTOP);
+  const std::string silent = output({"nodes", "the*"});
+  ::kill(pc3_.pid(), SIGCONT);
+  EXPECT_TRUE(contains(silent, "pc3: not known: ")) << silent;
   const Finished unknown = ctl({"nodes", "--host", "pc9"});
   EXPECT_EQ(unknown.exit_status, 1);
   EXPECT_TRUE(contains(unknown.err, "known are 'pc1', 'pc2', 'pc3'")) << unknown.err;

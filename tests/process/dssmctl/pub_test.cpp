@@ -61,6 +61,12 @@ TEST_F(Pub, SaysWhichLineIsWrongAndKeepsThoseBefore) {
   EXPECT_TRUE(contains(missing.err, "is it 'copy'?")) << missing.err;
 }
 
+TEST_F(Pub, WritesNoFasterThanItIsTold) {
+  const Time before = WallClock::now();
+  output({"pub", "copy", "x=1", "--rate", "20", "--count", "3"});
+  EXPECT_GE(reader_.read_newest()->info.time - before, std::chrono::milliseconds(100));
+}
+
 TEST_F(Pub, WritesUntilCtrlC) {
   Running running(argv({"pub", "copy", "x=1", "--rate", "200"}), environment());
   ASSERT_EQ(reader_.wait_for_tid(3, kNever), WaitStatus::ready);

@@ -344,11 +344,12 @@ TEST_F(Hosts, WithASlowNetworkSayWhatItCarries) {
   const RawReader reader =
       there.await_raw_reader(known.id, kNever, nullptr, FetchHistory::at_once).value();
   std::uint64_t carried = 0;
-  EXPECT_TRUE(await("pc1 knows it, and tells pc2", [&] {
-    carried = host_info(there, "pc1").carried_bytes_per_s;
-    return carried >= 1'400'000 && carried <= 2'200'000;
-  })) << "last: "
-      << carried << " bytes per second";
+  EXPECT_TRUE(await("pc1 knows it, and tells pc2",
+                    [&] {
+                      carried = host_info(there, "pc1").carried_bytes_per_s;
+                      return carried >= 1'400'000 && carried <= 2'200'000;
+                    }))
+      << "last: " << carried << " bytes per second";
 }
 
 TEST_F(Hosts, WithALongDelayLoseNothing) {

@@ -7,6 +7,7 @@
 #include <signal.h>
 #include <unistd.h>
 
+#include <algorithm>
 #include <dssm/dssm.hpp>
 #include <thread>
 
@@ -186,6 +187,31 @@ TEST_F(SsmNewRing, LoopsOfOldProgramsContinue) {
   }
   std::string rest;
   EXPECT_EQ(piped.end(rest), 0) << rest;
+}
+
+TEST_F(SsmNewRing, RemoteProgramsAreListedAndCounted) {
+  write(1);
+  PipedProgram piped({program("remote_recreated-c++11"), folder, daemon.address()},
+                     daemon.environment());
+  write(5);
+  await(piped);
+  const std::vector<NodeInfo> nodes = session.list_nodes().value();
+  const auto node = std::find_if(nodes.begin(), nodes.end(), [&](const NodeInfo& one) {
+    return one.program == "remote_recreated-c++11";
+  });
+  ASSERT_NE(node, nodes.end());
+  EXPECT_GT(node->pid, 0);
+  ASSERT_EQ(node->streams.size(), 1U);
+  EXPECT_EQ(node->streams[0].stream, writer.id());
+  EXPECT_EQ(node->streams[0].role, Role::reader);
+  EXPECT_EQ(node->streams[0].via, StreamVia::connection);
+  const StreamInfo listed = session.list_streams().value().at(0);
+  EXPECT_EQ(listed.readers, 4U) << "three connections, and one that fills the buffer";
+  EXPECT_EQ(listed.remote_readers, 4U);
+  EXPECT_EQ(listed.writers, 1U) << "this test";
+  std::string rest;
+  EXPECT_EQ(piped.end(rest), 0) << rest;
+  test::await([&] { return session.list_streams().value().at(0).readers == 0; });
 }
 
 TEST_F(SsmNewRing, RemoteLoopsOfOldProgramsContinueOverRestartsOfDssmdToo) {

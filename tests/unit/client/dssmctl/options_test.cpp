@@ -158,6 +158,17 @@ TEST(CommandLine, ReportsWhatIsWrongAndWhereHelpIs) {
       {{"ls", "--wrong"}, "dssmctl: ls: there is no option '--wrong'; see 'dssmctl ls --help'\n"},
       {{"ls", "o*", "odom"}, "dssmctl: ls: 'odom' is one word too many; see 'dssmctl ls --help'\n"},
       {{"echo"}, "dssmctl: echo: STREAM is required; see 'dssmctl echo --help'\n"},
+      {{"playback", "set"},
+       "dssmctl: playback set: what shall change? give --offset SECONDS, --speed X or --time TIME; "
+       "see 'dssmctl playback set --help'\n"},
+      {{"property", "st"},
+       "dssmctl: property: there is no verb 'st' (did you mean 'set'?); see 'dssmctl property "
+       "--help'\n"},
+      {{"property", "list"},
+       "dssmctl: property: there is no verb 'list'; see 'dssmctl property --help'\n"},
+      {{"service", "call", "s"},
+       "dssmctl: there is no verb 'service' (DSSM has only streams, no services); see 'dssmctl "
+       "--help'\n"},
       {{"property", "del"},
        "dssmctl: property: there is no verb 'del'; see 'dssmctl property --help'\n"},
       {{"ls", "--sort", "x"},
@@ -168,6 +179,47 @@ TEST(CommandLine, ReportsWhatIsWrongAndWhereHelpIs) {
        "--help'\n"},
   };
   for (const auto& test : cases) EXPECT_EQ(error_of(test.words), test.error);
+}
+
+TEST(CommandLine, NamesTheVerbForTheCommandsOfRos2AndForTypingErrors) {
+  const struct {
+    std::vector<const char*> words;
+    const char* meant;
+  } cases[] = {
+      {{"topic"}, "ls"},
+      {{"topic", "list"}, "ls"},
+      {{"topic", "echo", "odom"}, "echo"},
+      {{"topic", "info", "odom"}, "info"},
+      {{"topic", "type", "odom"}, "info"},
+      {{"topic", "find", "Odom"}, "find"},
+      {{"topic", "hz", "odom"}, "hz"},
+      {{"topic", "bw", "odom"}, "bw"},
+      {{"topic", "delay", "odom"}, "delay"},
+      {{"topic", "pub", "odom"}, "pub"},
+      {{"topic", "ehco", "odom"}, "echo"},
+      {{"topic", "xyzzy"}, "ls"},
+      {{"--json", "topic", "hz", "odom"}, "hz"},
+      {{"type", "odom"}, "info"},
+      {{"node", "list"}, "nodes"},
+      {{"node", "info", "mapper"}, "nodes"},
+      {{"interface", "show", "Odom"}, "show"},
+      {{"interface", "list"}, "find"},
+      {{"param", "get", "odom"}, "property"},
+      {{"bag", "record"}, "record"},
+      {{"bag", "info", "a.mcap"}, "info FILE"},
+      {{"bag", "play", "a.mcap"}, "play"},
+      {{"bag"}, "record"},
+      {{"rec"}, "record"},
+      {{"ehco", "odom"}, "echo"},
+      {{"dealy", "odom"}, "delay"},
+      {{"hosst"}, "hosts"},
+      {{"pbu", "odom"}, "pub"},
+  };
+  for (const auto& test : cases) {
+    const std::string error = error_of(test.words);
+    EXPECT_NE(error.find("(did you mean '" + std::string(test.meant) + "'?)"), std::string::npos)
+        << error;
+  }
 }
 
 TEST(CommandLine, RefusesWhatDoesNotFitTogether) {

@@ -3,6 +3,7 @@
 
 #include <fcntl.h>
 #include <gtest/gtest.h>
+#include <signal.h>
 #include <stdlib.h>
 #include <sys/ioctl.h>
 #include <termios.h>
@@ -40,11 +41,13 @@ std::string on_terminal(unsigned short columns, Print print) {
   ::unsetenv("NO_COLOR");
   print(out);
   out.flush();
-  std::string text(4096, '\0');
-  const ssize_t got = ::read(master, text.data(), text.size());
   ::close(slave);
+  std::string text;
+  char part[4096];
+  for (ssize_t got = 0; (got = ::read(master, part, sizeof part)) > 0;) {  // then EIO
+    text.append(part, static_cast<std::size_t>(got));
+  }
   ::close(master);
-  text.resize(got > 0 ? static_cast<std::size_t>(got) : 0);
   return text;
 }
 
@@ -78,6 +81,30 @@ TEST(Output, WritesOnlyWhatHasChanged) {
             "a\n\nb\n\na\n\n");
 }
 
+TEST(Output, IsWatchedWithoutRepeatingWhatIsTheSame) {
+  ::signal(SIGPIPE, SIG_IGN);
+  for (const bool json : {true, false}) {
+    int ends[2];
+    ASSERT_EQ(::pipe2(ends, O_CLOEXEC), 0);
+    Output out(ends[1]);
+    const char* const texts[] = {"a\n", "a\n", "b\n", "b\n", "a\n", "a\n"};
+    std::size_t shown = 0;
+    std::string text(4096, '\0');
+    const auto print = [&]() -> Result<void> {
+      if (shown == std::size(texts)) {
+        text.resize(static_cast<std::size_t>(::read(ends[0], text.data(), text.size())));
+        ::close(ends[0]);  // which ends it
+        return {};
+      }
+      out.add(texts[shown++]);
+      return {};
+    };
+    EXPECT_TRUE(print_once_or_watch(true, json, out, print, Duration(1)));
+    EXPECT_EQ(text, json ? "a\nb\na\n" : "a\n\nb\n\na\n\n");
+    ::close(ends[1]);
+  }
+}
+
 Table table_to_fit() {
   using Fit = Table::Column::Fit;
   Table table({{"NAME"},
@@ -107,6 +134,23 @@ TEST(Table, FitsATerminalByWhatItsColumnsAllow) {
             "NAME  TYPE\n"
             "odom  vehicle...\n"
             "    the host is\n"
+            "    down\n");
+}
+
+TEST(Table, HasNoLineBelowForAnEmptyCell) {
+  using Fit = Table::Column::Fit;
+  Table table({{"NAME"}, {"NOTE", Table::Align::left, 0, Fit::below}});
+  for (const char* note : {"-", "", "down"}) table.add_row({"odometry", note});
+  EXPECT_EQ(on_terminal(14, table),
+            "NAME      NOTE\n"
+            "odometry  -\n"
+            "odometry\n"
+            "odometry  down\n");
+  EXPECT_EQ(on_terminal(12, table),
+            "NAME\n"
+            "odometry\n"
+            "odometry\n"
+            "odometry\n"
             "    down\n");
 }
 

@@ -10,7 +10,14 @@ using Names = std::vector<std::string>;
 
 TEST(SimilarNames, FindsTypingErrorsBestFirst) {
   EXPECT_EQ(similar_names("lidr", {"odom", "lida", "lidar", "camera"}), (Names{"lida", "lidar"}));
-  EXPECT_EQ(similar_names("lidra", {"lidar"}), Names{});  // two edits of five are too many
+  EXPECT_EQ(similar_names("ladir", {"lidar"}), Names{});  // two edits of five are too many
+}
+
+TEST(SimilarNames, CountsTwoSwappedNeighboursAsOneError) {
+  EXPECT_EQ(similar_names("ehco", {"echo", "hz"}), Names{"echo"});
+  EXPECT_EQ(similar_names("lidra", {"lidar"}), Names{"lidar"});
+  EXPECT_EQ(similar_names("lidrax", {"lidar"}), Names{"lidar"});  // and one to delete
+  EXPECT_EQ(similar_names("ilda", {"lidar"}), Names{});           // two errors of four
 }
 
 TEST(SimilarNames, FindsPartsOfNames) {

@@ -124,6 +124,13 @@ class Tls : public testing::Test {
     return session;
   }
 
+  // A certificate that names neither a host nor a program, in the folder of that name.
+  void issue_nameless(const std::string& name) {
+    Authority::Subject nameless = Authority::host(name);
+    nameless.alternative_names = "DNS:" + name;
+    authority.issue(nameless, folder(name));
+  }
+
   void expect_refused(const std::string& by_server, const std::string& to_client) {
     ASSERT_TRUE(server_error);
     EXPECT_EQ(server_error->code, Errc::no_permission);
@@ -303,10 +310,8 @@ TEST_F(Tls, RefusesAProgramThatPlaysAHost) {
       << client_error->message;
 }
 
-TEST_F(Tls, RefusesACertificateThatNamesNobody) {
-  Authority::Subject nobody = Authority::host("pc1");
-  nobody.alternative_names = "DNS:pc1";
-  authority.issue(nobody, folder("pc1"));
+TEST_F(Tls, RefusesANamelessCertificate) {
+  issue_nameless("pc1");
   const Result<Credentials> loaded = TlsCredentials::load(folder("pc1"));
   ASSERT_FALSE(loaded);
   EXPECT_NE(loaded.error().message.find("names neither a host"), std::string::npos)
@@ -314,10 +319,8 @@ TEST_F(Tls, RefusesACertificateThatNamesNobody) {
 }
 
 // As the certificate of another vehicle's software, by the same authority.
-TEST_F(Tls, TellsTheOtherSideThatItsCertificateNamesNobody) {
-  Authority::Subject nobody = Authority::host("pc1");
-  nobody.alternative_names = "DNS:pc1";
-  authority.issue(nobody, folder("pc1"));
+TEST_F(Tls, NotifiesTheOtherSideThatItsCertificateIsNameless) {
+  issue_nameless("pc1");
   int ends[2];
   ASSERT_EQ(::socketpair(AF_UNIX, SOCK_STREAM | SOCK_NONBLOCK | SOCK_CLOEXEC, 0, ends), 0);
   const UniqueFd socket(ends[0]);

@@ -17,6 +17,21 @@
 
 namespace dssm::daemon {
 
+// A LocalService with all that it works on. fleet: as in its constructor.
+struct LocalDaemon {
+  explicit LocalDaemon(bool recovering = false, const OpenTable::Limits& limits = {1000, 100},
+                       Fleet* fleet = nullptr)
+      : opens(limits), service(registry, opens, clock, rights, logger, fleet) {
+    if (recovering) registry.begin_recovery(Registry::Recovery::streams);
+  }
+  LogRecorder logger;
+  Registry registry{"pc1", kLimits};
+  OpenTable opens;
+  PlaybackClockOwner clock;
+  const Rights rights;
+  LocalService service;
+};
+
 // A client without a socket: what it is sent, decoded.
 class FakeClient final : public ClientOutput {
  public:

@@ -11,23 +11,10 @@
 namespace dssm::daemon {
 namespace {
 
-struct Daemon {
-  explicit Daemon(bool recovering = false, const OpenTable::Limits& limits = {1000, 100})
-      : opens(limits), service(registry, opens, clock, rights, logger) {
-    if (recovering) registry.begin_recovery(Registry::Recovery::streams);
-  }
-  LogRecorder logger;
-  Registry registry{"pc1", kLimits};
-  OpenTable opens;
-  PlaybackClockOwner clock;
-  Rights rights;
-  LocalService service;
-};
-
 // --- the rules
 
 TEST(LocalService, WelcomesAProgramThatSpeaksItsVersion) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   local::Request hello;
   hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
@@ -38,7 +25,7 @@ TEST(LocalService, WelcomesAProgramThatSpeaksItsVersion) {
 }
 
 TEST(LocalService, RefusesAVersionFromTheFutureAndNamesBoth) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   local::Request hello;
   hello.set_serial(9);
@@ -52,7 +39,7 @@ TEST(LocalService, RefusesAVersionFromTheFutureAndNamesBoth) {
 }
 
 TEST(LocalService, EndsAConnectionThatDoesNotBeginWithHello) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   local::Request list = list_request();
   list.set_serial(1);
@@ -61,7 +48,7 @@ TEST(LocalService, EndsAConnectionThatDoesNotBeginWithHello) {
 }
 
 TEST(LocalService, EndsAConnectionThatSendsGarbageOrNoSerial) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
   EXPECT_FALSE(client.put(list_request())) << "serial 0";
@@ -74,7 +61,7 @@ TEST(LocalService, EndsAConnectionThatSendsGarbageOrNoSerial) {
 }
 
 TEST(LocalService, AnswersAnUnknownRequestAndContinues) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
   local::Request unknown;  // a later version's request arrives as one without a body
@@ -83,7 +70,7 @@ TEST(LocalService, AnswersAnUnknownRequestAndContinues) {
 }
 
 TEST(LocalService, CutsTheProgramsNameToWhatPeopleCanRead) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   local::Request hello;
   hello.mutable_hello()->set_protocol_version(wire::kLocalProtocolVersion);
@@ -97,7 +84,7 @@ TEST(LocalService, CutsTheProgramsNameToWhatPeopleCanRead) {
 // --- requests
 
 TEST(LocalService, CreatesOpensListsAndClosesStreams) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient writer(daemon.service, 5), reader(daemon.service, 6);
   writer.greet(), reader.greet();
   const local::Response created = writer.ask(create_request("odometry"));
@@ -140,7 +127,7 @@ TEST(LocalService, CreatesOpensListsAndClosesStreams) {
 }
 
 TEST(LocalService, ReportsWhyAStreamCannotBeCreatedOrOpened) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
   EXPECT_EQ(client.ask(open_request("nowhere")).failure().code(), "not_found");
@@ -162,7 +149,7 @@ TEST(LocalService, ReportsWhyAStreamCannotBeCreatedOrOpened) {
 }
 
 TEST(LocalService, ForgetsTheOpensOfAClientThatLeavesAndKeepsItsStreams) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient watcher(daemon.service, 5);
   watcher.greet();
   {
@@ -177,7 +164,7 @@ TEST(LocalService, ForgetsTheOpensOfAClientThatLeavesAndKeepsItsStreams) {
 }
 
 TEST(LocalService, RefusesMoreOpensThanTheLimitBeforeItCreatesAnything) {
-  Daemon daemon(false, {.max_opens = 10, .max_opens_per_client = 1});
+  LocalDaemon daemon(false, {.max_opens = 10, .max_opens_per_client = 1});
   FakeClient client(daemon.service, 5);
   client.greet();
   client.ask(create_request("a"));
@@ -188,7 +175,7 @@ TEST(LocalService, RefusesMoreOpensThanTheLimitBeforeItCreatesAnything) {
 }
 
 TEST(LocalService, KeepsAndGivesProperties) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
   client.ask(create_request("odometry"));
@@ -202,7 +189,7 @@ TEST(LocalService, KeepsAndGivesProperties) {
 }
 
 TEST(LocalService, NotifiesWatchersOfExistingStreamsAndOfChanges) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5), watcher(daemon.service, 6);
   client.greet(), watcher.greet();
   client.ask(create_request("a"));
@@ -233,7 +220,7 @@ TEST(LocalService, NotifiesWatchersOfExistingStreamsAndOfChanges) {
 }
 
 TEST(LocalService, ListsProgramsInTheOrderTheyCame) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient one(daemon.service, 11), two(daemon.service, 12), silent(daemon.service, 13);
   two.greet(), one.greet();
   local::Request list;
@@ -246,7 +233,7 @@ TEST(LocalService, ListsProgramsInTheOrderTheyCame) {
 }
 
 TEST(LocalService, LeavesOutFieldsWhenAListHasManyOfThem) {
-  Daemon daemon(false, {.max_opens = 1000, .max_opens_per_client = 1000});
+  LocalDaemon daemon(false, {.max_opens = 1000, .max_opens_per_client = 1000});
   FakeClient client(daemon.service, 5);
   client.greet();
   const auto create = [&](std::size_t from, std::size_t to) {
@@ -276,7 +263,7 @@ TEST(LocalService, LeavesOutFieldsWhenAListHasManyOfThem) {
 }
 
 TEST(LocalService, LeavesOutFieldsWhenTheyMakeAListTooLongForAFrame) {
-  Daemon daemon(false, {.max_opens = 1000, .max_opens_per_client = 1000});
+  LocalDaemon daemon(false, {.max_opens = 1000, .max_opens_per_client = 1000});
   FakeClient client(daemon.service, 5);
   client.greet();
   constexpr int kStreams = 300;  // with 60 KB of field names each: 18 MB
@@ -292,7 +279,7 @@ TEST(LocalService, LeavesOutFieldsWhenTheyMakeAListTooLongForAFrame) {
 }
 
 TEST(LocalService, GivesBackLongProperties) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
   ASSERT_TRUE(client.ask(create_request("s")).has_opened());
@@ -315,7 +302,7 @@ TEST(LocalService, GivesBackLongProperties) {
 }
 
 TEST(LocalService, HandsOutOneAndTheSamePlaybackClock) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient one(daemon.service, 5), two(daemon.service, 6);
   one.greet(), two.greet();
   local::Request request;
@@ -330,10 +317,10 @@ TEST(LocalService, HandsOutOneAndTheSamePlaybackClock) {
 TEST(LocalService, TakesBackAPlaybackClockOnlyBeforeItHandedOneOut) {
   UniqueFd kept;
   {
-    Daemon before;
+    LocalDaemon before;
     kept = *before.clock.get();
   }
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
   local::Request offer;
@@ -345,7 +332,7 @@ TEST(LocalService, TakesBackAPlaybackClockOnlyBeforeItHandedOneOut) {
   EXPECT_TRUE(client.ask(offer).has_clock());
   EXPECT_TRUE(same_file(client.last_descriptors[0].get(), kept.get()));
 
-  Daemon in_use;
+  LocalDaemon in_use;
   FakeClient other(in_use.service, 6);
   other.greet();
   local::Request plain;
@@ -357,7 +344,7 @@ TEST(LocalService, TakesBackAPlaybackClockOnlyBeforeItHandedOneOut) {
 }
 
 TEST(LocalService, DescribesItself) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 5);
   client.greet();
   client.ask(create_request("odometry"));
@@ -372,7 +359,7 @@ TEST(LocalService, DescribesItself) {
 }
 
 TEST(LocalService, ListsTheLimitsOfAllParts) {
-  Daemon daemon;
+  LocalDaemon daemon;
   daemon.service.set_facts_source([&] {
     DaemonFacts facts;
     facts.config_file = "/etc/dssm/dssmd.conf";
@@ -404,9 +391,9 @@ TEST(LocalService, ListsTheLimitsOfAllParts) {
   EXPECT_EQ(limits,
             "max_streams 1 of 400 streams\n"
             "max_streams of one user or host 1 of 400 streams\n"
-            "max_opens 3 of 1000 opens\n"
-            "max_opens of one user 3 of 1000 opens\n"
-            "max_opens_per_client 2 of 100 opens\n");
+            "max_opens 3 of 1000 open streams\n"
+            "max_opens of one user 3 of 1000 open streams\n"
+            "max_opens_per_client 2 of 100 open streams\n");
 }
 
 // --- a stream that exists already
@@ -420,7 +407,7 @@ local::Request sized_request(const std::string& name, std::uint64_t payload_byte
 }
 
 TEST(LocalService, ReplacesARingThatNoProgramHasOpen) {
-  Daemon daemon;
+  LocalDaemon daemon;
   std::uint64_t before = 0;
   const auto ask = [&](std::uint64_t bytes, std::uint64_t depth) {
     FakeClient program(daemon.service, 5);
@@ -440,7 +427,7 @@ TEST(LocalService, ReplacesARingThatNoProgramHasOpen) {
 }
 
 TEST(LocalService, LeavesTheRingWhenTheNewOneCannotBeMade) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 6);
   client.greet();
   ASSERT_TRUE(daemon.registry.create({"s", 0, ""}, {"", 24, 1, {}}, {16, Duration(1)}, 1));
@@ -453,7 +440,7 @@ TEST(LocalService, LeavesTheRingWhenTheNewOneCannotBeMade) {
 }
 
 TEST(LocalService, NamesThoseThatHaveARingOpenThatDoesNotFit) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient user(daemon.service, 5), client(daemon.service, 6);
   user.greet(), client.greet();
   ASSERT_TRUE(user.ask(sized_request("s", 24, 16)).has_opened());
@@ -470,7 +457,7 @@ TEST(LocalService, NamesThoseThatHaveARingOpenThatDoesNotFit) {
 }
 
 TEST(LocalService, KeepsAnExistingRingOnRequest) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 6);
   client.greet();
   ASSERT_TRUE(daemon.registry.create({"s", 0, ""}, {"", 24, 1, {}}, {16, Duration(1)}, 1));
@@ -484,7 +471,7 @@ TEST(LocalService, KeepsAnExistingRingOnRequest) {
 }
 
 TEST(LocalService, ReplacesNothingWhileItDoesNotKnowWhoHasWhatOpen) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 6);
   client.greet();
   ASSERT_TRUE(daemon.registry.create({"s", 0, ""}, {"", 24, 1, {}}, {16, Duration(1)}, 1));
@@ -501,7 +488,7 @@ TEST(LocalService, ReplacesNothingWhileItDoesNotKnowWhoHasWhatOpen) {
 
 // A client's answer to a Create by an earlier dssmd: what it can offer now.
 std::vector<UniqueFd> descriptors_from_before(const std::string& name) {
-  Daemon before;
+  LocalDaemon before;
   FakeClient client(before.service, 5);
   client.greet();
   EXPECT_TRUE(client.ask(create_request(name)).has_opened());
@@ -518,7 +505,7 @@ local::Request offer_request(const std::string& name) {
 TEST(LocalService, DelaysRequestsForAStreamThatMayStillBeOffered) {
   std::vector<UniqueFd> kept = descriptors_from_before("odometry");
   const UniqueFd ring = copy_of(kept[0]);
-  Daemon daemon(true);
+  LocalDaemon daemon(true);
   FakeClient fresh(daemon.service, 6), old(daemon.service, 5);
   fresh.greet(), old.greet();
   local::Request create = create_request("odometry");
@@ -538,7 +525,7 @@ TEST(LocalService, DelaysRequestsForAStreamThatMayStillBeOffered) {
 }
 
 TEST(LocalService, AnswersWhatWaitsWhenRecoveryEnds) {
-  Daemon daemon(true);
+  LocalDaemon daemon(true);
   FakeClient client(daemon.service, 6);
   client.greet();
   local::Request create = create_request("odometry"), open = open_request("lidar");
@@ -554,14 +541,14 @@ TEST(LocalService, AnswersWhatWaitsWhenRecoveryEnds) {
 }
 
 TEST(LocalService, RefusesAtOnceWhatNoOfferCouldFix) {
-  Daemon daemon(true);
+  LocalDaemon daemon(true);
   FakeClient client(daemon.service, 6);
   client.greet();
   EXPECT_EQ(client.ask(create_request("a:b")).failure().code(), "invalid_argument");
 }
 
 TEST(LocalService, ForgetsWhatAClientWaitedForWhenItLeaves) {
-  Daemon daemon(true);
+  LocalDaemon daemon(true);
   {
     FakeClient client(daemon.service, 6);
     client.greet();
@@ -574,7 +561,7 @@ TEST(LocalService, ForgetsWhatAClientWaitedForWhenItLeaves) {
 }
 
 TEST(LocalService, BoundsWhatOneClientHasWaiting) {
-  Daemon daemon(true);
+  LocalDaemon daemon(true);
   FakeClient client(daemon.service, 6);
   client.greet();
   local::Request create = create_request("odometry");
@@ -589,10 +576,10 @@ TEST(LocalService, BoundsWhatOneClientHasWaiting) {
 TEST(LocalService, DelaysRequestsForAPlaybackClockThatMayStillBeOffered) {
   UniqueFd kept;
   {
-    Daemon before;
+    LocalDaemon before;
     kept = *before.clock.get();
   }
-  Daemon daemon(true);
+  LocalDaemon daemon(true);
   FakeClient fresh(daemon.service, 6), old(daemon.service, 5);
   fresh.greet(), old.greet();
   local::Request plain, offer;
@@ -608,7 +595,7 @@ TEST(LocalService, DelaysRequestsForAPlaybackClockThatMayStillBeOffered) {
 }
 
 TEST(LocalService, RefusesAnOfferWithoutItsDescriptors) {
-  Daemon daemon;
+  LocalDaemon daemon;
   FakeClient client(daemon.service, 6);
   client.greet();
   EXPECT_EQ(client.ask(offer_request("odometry")).failure().code(), "protocol");

@@ -114,20 +114,16 @@ class FakeFleet final : public Fleet {
 
 using Asked = std::vector<std::string>;
 
-class RemoteRequestsTest : public testing::Test {
+struct WithFleet {
+  FakeFleet fleet;  // used until the end of what is after it
+};
+
+class RemoteRequestsTest : public testing::Test, protected WithFleet, protected LocalDaemon {
  protected:
-  LogRecorder logger;
-  Registry registry{"pc1", kLimits};
-  OpenTable opens{{.max_opens = 2000, .max_opens_per_client = 2000}};
-  PlaybackClockOwner clock;
-  const Rights rights;
-  FakeFleet fleet;
-  std::unique_ptr<LocalService> service;
-  std::unique_ptr<FakeClient> client;
+  std::unique_ptr<FakeClient> client = std::make_unique<FakeClient>(service, 5);
 
   RemoteRequestsTest()
-      : service(std::make_unique<LocalService>(registry, opens, clock, rights, logger, &fleet)),
-        client(std::make_unique<FakeClient>(*service, 5)) {
+      : LocalDaemon(false, {.max_opens = 2000, .max_opens_per_client = 2000}, &fleet) {
     client->greet();
   }
 
@@ -387,7 +383,7 @@ TEST_F(RemoteRequestsTest, NotifiesReadersWhenAnOwnStreamIsRecreated) {
   remove.mutable_remove()->mutable_id()->set_name("odometry");
   EXPECT_TRUE(client->ask(remove).has_done());
   EXPECT_TRUE(client->received.empty()) << "there is no successor yet";
-  FakeClient writer(*service, 6);
+  FakeClient writer(service, 6);
   writer.greet().ask(create_request("odometry"));
   EXPECT_EQ(client->next().replaced().handle(), handle);
   EXPECT_TRUE(client->received.empty());
@@ -400,7 +396,7 @@ TEST_F(RemoteRequestsTest, NotifiesReadersWhenAnOwnStreamIsRecreated) {
 }
 
 TEST_F(RemoteRequestsTest, NotifiesReadersOfAStreamThatMovedToAnotherHost) {
-  FakeClient particular(*service, 6);
+  FakeClient particular(service, 6);
   particular.greet();
   const auto ring = fleet.ring("lidar");
   put(open_request("lidar"));

@@ -12,15 +12,15 @@
 
 #include "core/wire/frame.hpp"
 #include "tests/support/daemon_process.hpp"
-#include "tests/support/log_recorder.hpp"
-#include "tests/unit/daemon/daemon_fixtures.hpp"
+#include "tests/unit/daemon/local/fake_client.hpp"
 #include "tests/unit/daemon/run_loop.hpp"
 
 namespace dssm::daemon {
 namespace {
 
-class ServerTest : public testing::Test {
+class ServerTest : public testing::Test, protected LocalDaemon {
  protected:
+  ServerTest() : LocalDaemon(false, {100, 100}) {}
   ~ServerTest() override { std::filesystem::remove_all(dir); }
 
   // A program that has asked for a long property.
@@ -62,12 +62,6 @@ class ServerTest : public testing::Test {
   const std::filesystem::path dir = test::make_temp_dir();
   const std::string path = dir / "dssmd.sock";
   EventLoop loop = EventLoop::open(TimerQueue::Time::simulated).value();
-  LogRecorder logger;
-  Registry registry{"pc1", kLimits};
-  OpenTable opens{{100, 100}};
-  PlaybackClockOwner clock;
-  Rights rights;
-  LocalService service{registry, opens, clock, rights, logger};
   Listener listener = Listener::open(path, std::nullopt, 0600).value();
   Server server{loop, listener, "pc1", {10, 10}, service, logger};
 };

@@ -222,6 +222,40 @@ TEST(DataCommunicator, NamesTheProgramsOfAnotherHostAsItsDssmdStatesThem) {
   EXPECT_EQ(rig.ask(program, request).failure().code(), "protocol") << "it is not a dssmd";
 }
 
+TEST(DataCommunicator, SaysNoWriterOfAStreamThatAnotherHostOnlyReads) {
+  ServerRig rig;
+  const std::shared_ptr<Stream> stream = rig.create("a");
+  rig.write(*stream, 5, WallClock::now() - std::chrono::seconds(60));
+  MemoryPeer control, older, newer;
+  rig.connect(control);
+  const auto state = [&] {
+    return rig.ask(control, list_request(1)).stream_list().streams(0).state();
+  };
+  const auto no_writer = static_cast<std::uint32_t>(StreamState::no_writer);
+  const auto stalled = static_cast<std::uint32_t>(StreamState::stalled);
+  EXPECT_EQ(state(), no_writer);
+
+  wire::Greeting greeting = greeting_of("pc2");
+  greeting.features.emplace_back(wire::kFeatureUsers);
+  greet(rig, newer, greeting);
+  rig.open(newer, "a");
+  EXPECT_EQ(state(), no_writer) << "a mirror that no program uses now";
+  net::Frame users = with_serial(1);
+  users.mutable_set_users()->set_readers(1);
+  EXPECT_TRUE(rig.ask(newer, users).has_done());
+  EXPECT_EQ(state(), no_writer);
+  users.mutable_set_users()->set_writers(1);
+  EXPECT_TRUE(rig.ask(newer, users).has_done());
+  EXPECT_EQ(state(), stalled);
+  newer.end();
+  rig.turns();
+  EXPECT_EQ(state(), no_writer);
+
+  greet(rig, older, greeting_of("pc3"));
+  rig.open(older, "a");
+  EXPECT_EQ(state(), stalled) << "an older dssmd does not state who writes";
+}
+
 TEST(DataCommunicator, ListsProcessesWithWhatThePeerMaySee) {
   Rights rights;
   ServerRig rig({16, 8, 32U << 20}, nullptr, &rights);

@@ -74,8 +74,8 @@ class ServerRig {
     EXPECT_TRUE(created) << created.error().message;
     return created ? created->stream : nullptr;
   }
-  // As a program of this PC writes.
-  void write(Stream& stream, int count = 1) {
+  // As a program of this PC writes; the sample with tid 0 has the time `first`.
+  void write(Stream& stream, int count = 1, Time first = time_from_ns(1000)) {
     const OfferedFiles files = as_offer(stream.descriptors_for(Role::writer).value());
     const auto mapping =
         ring::RingMapping::open_untrusted(files.ring.get(), ring::Access::read_write).value();
@@ -83,7 +83,7 @@ class ServerRig {
     ring::RingWriter writer(*mapping, *bell, files.doorbell.get());
     for (int i = 0; i < count; ++i) {
       const Tid tid = writer.newest() + 1;
-      writer.write(payload_for(tid, stream.type().payload_bytes), time_from_ns(1000 + tid * 10),
+      writer.write(payload_for(tid, stream.type().payload_bytes), first + Duration(tid * 10),
                    Duration(3));
     }
   }

@@ -199,7 +199,7 @@ TEST(Config, NamesWhatIsWrongInADemandOnMirrors) {
     return mistakes_in("mirror_streams = [\"" + demand + "\"]\n");
   };
   EXPECT_EQ(mistake("camera=fast"),
-            "dssmd.conf:1: key 'mirror_streams': 'camera=fast' holds what is no demand: 'fast' is "
+            "dssmd.conf:1: key 'mirror_streams': 'camera=fast' is wrong: 'fast' is "
             "neither when_read nor at_once, nor a rate or a time; write \"STREAM=WHAT\" or "
             "\"STREAM=WHAT, WHAT\", such as \"map=at_once\", \"camera*=10 Hz\" or "
             "\"camera*=when_read, 10 Hz, 2 s\"");
