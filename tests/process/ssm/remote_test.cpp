@@ -74,7 +74,8 @@ TEST_F(SsmFleet, AnSsmProgramReadsAndWritesStreamsOfAnotherPcByTheirNames) {
   await_host(pc1, "pc2");
   const std::string folder = make_temp_dir();
   const Finished finished =
-      run({program("remote_names-gnu++98"), folder, "pc2"}, {pc1.environment()});
+      run({program("remote_names-gnu++98"), folder, "pc2", std::to_string(pc1.pid())},
+          {pc1.environment()});
   EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
   remove_tree(folder);
   EXPECT_TRUE(far.stream_info({"ours", 0, {}}));
