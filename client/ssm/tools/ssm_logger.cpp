@@ -89,8 +89,6 @@ class Recorder {
 
   // Opens the stream and creates the log.
   bool start() {
-    char placeholder = 0;  // of no size that matters: the stream's is known when it is there
-    stream_.setBuffer(&placeholder, 1, nullptr, 0);
     stream_.setVerbose(false);
     if (dssm_ssm_wait_stream(options_.stream_name, options_.stream_id, kMaxWaitSeconds) != 1) {
       if (!end_requested) {

@@ -139,7 +139,7 @@ class Track {
   }
 
   // The first record of the log becomes the next one.
-  void begin() { reverse_ = false, take(false); }
+  void begin() { reverse_ = false, has_next_ = log_.readTime(-kInfinity); }
 
   // Continues at `time`: writes the newest record before it at once, so that readers have one.
   bool seek(double time, bool reverse) {
@@ -214,7 +214,6 @@ class Player {
       if (is_at_end(now, reverse)) {
         if (!options_.loop) break;
         restart(reverse);
-        continue;
       }
       show_status(now);
       wait(now, reverse);
@@ -308,6 +307,7 @@ class Player {
     for (std::size_t end; (end = input_.find('\n')) != std::string::npos && !quit_;) {
       command(input_.substr(0, end));
       input_.erase(0, end + 1);
+      if (!options_.quiet && is_terminal_) std::fputs("\033[A\r\033[K", stdout);
       prompt();
     }
     if (input_.size() > sizeof text) input_.clear();  // no command is that long

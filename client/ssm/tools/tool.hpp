@@ -33,7 +33,7 @@ namespace dssm::ssm_tools {
 // Registers this program with dssmd; false, with a message, when there is none. libssm says why.
 inline bool connect() {
   if (initSSM()) return true;
-  print_error("cannot init ssm : is dssmd (or ssm-coordinator) running?");
+  print_error("cannot init ssm.");
   return false;
 }
 
@@ -99,13 +99,14 @@ inline std::optional<std::vector<StreamName>> list_streams() {
   return streams;
 }
 
-// Set by SIGINT, SIGTERM and SIGHUP after end_on_signals(), which interrupt sleeps. A second one
-// changes nothing: the program is already ending.
+// Set by what asks a program to end, after end_on_signals(); these signals interrupt sleeps. A second
+// one changes nothing: the program is already ending.
 inline volatile std::sig_atomic_t end_requested = 0;
 inline void end_on_signals() {
   struct sigaction action {};
   action.sa_handler = [](int) { end_requested = 1; };
-  for (const int signal : {SIGINT, SIGTERM, SIGHUP}) ::sigaction(signal, &action, nullptr);
+  for (const int signal : {SIGINT, SIGTERM, SIGHUP, SIGQUIT, SIGPIPE})
+    ::sigaction(signal, &action, nullptr);
 }
 
 }  // namespace dssm::ssm_tools
