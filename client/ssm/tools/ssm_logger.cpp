@@ -4,7 +4,8 @@
 //
 // The first sample in the log is the one after the newest at its start; of a stream without samples
 // it is the very first. Samples that the program was too slow for, or that the network lost, are
-// counted by their numbers and reported at the end. A second signal changes nothing.
+// counted by their numbers and reported at the end. After a signal it records what was written until
+// then; after a second one it ends at once.
 //
 // Exit status: 0; 255 for bad arguments, without dssmd, when the stream does not appear within 60 s,
 // and when the log cannot be written.
@@ -81,7 +82,7 @@ bool parse(int argc, char** argv, Options& options) {
   return false;
 }
 
-// One recording. The old one took what came after its first read.
+// One recording.
 class Recorder {
  public:
   explicit Recorder(const Options& options)
@@ -122,18 +123,17 @@ class Recorder {
     return true;
   }
 
-  // Until a signal, or the log cannot be written.
+  // Until a signal; false when the log cannot be written.
   bool record() {
     while (!end_requested) {
+      if (!record_next()) return false;
+    }
+    stream_.setBlocking(false);
+    for (const int last = getTID_top(stream_.getSSMId());
+         end_requested < 2 && is_before(stream_.timeId, last);) {
       const int before = stream_.timeId;
-      if (!read_next()) continue;
-      const int lost = (stream_.timeId - before - 1) & 0x7fffffff;
-      lost_ += lost;
-      if (lost > 0 && options_.verbose) {
-        std::fprintf(stderr, "%d samples before TID %d are lost\n", lost, stream_.timeId);
-      }
-      if (!log_.write(stream_.time)) return false;
-      ++recorded_;
+      if (!record_next()) return false;
+      if (stream_.timeId == before) break;
     }
     return true;
   }
@@ -153,6 +153,26 @@ class Recorder {
   }
 
  private:
+  // Tids are 31 bits of a counter without end.
+  static int distance(int from, int to) { return (to - from) & 0x7fffffff; }
+  static bool is_before(int tid, int last) {
+    return last >= 0 && tid != last && (tid < 0 || distance(tid, last) < 0x40000000);
+  }
+
+  // Records the next sample, if there is one; false when the log cannot be written.
+  bool record_next() {
+    const int before = stream_.timeId;
+    if (!read_next()) return true;
+    const int lost = distance(before + 1, stream_.timeId);
+    lost_ += lost;
+    if (lost > 0 && options_.verbose) {
+      std::fprintf(stderr, "%d samples before TID %d are lost\n", lost, stream_.timeId);
+    }
+    if (!log_.write(stream_.time)) return false;
+    ++recorded_;
+    return true;
+  }
+
   bool read_next() {
     // readNext() takes the newest of a stream of which nothing was read; here the first is wanted.
     if (stream_.timeId >= 0) return stream_.readNext();

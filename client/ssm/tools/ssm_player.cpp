@@ -226,7 +226,7 @@ class Player {
     for (const auto& track : tracks_) {
       if (!has_start_) {
         track->begin();
-      } else if (!track->seek(start_, false)) {
+      } else if (!track->seek(start_, options_.speed < 0)) {
         failed_ = true;
       }
     }

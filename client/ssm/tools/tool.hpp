@@ -99,12 +99,11 @@ inline std::optional<std::vector<StreamName>> list_streams() {
   return streams;
 }
 
-// Set by what asks a program to end, after end_on_signals(); these signals interrupt sleeps. A second
-// one changes nothing: the program is already ending.
+// How many signals have asked the program to end, after end_on_signals(); they interrupt sleeps.
 inline volatile std::sig_atomic_t end_requested = 0;
 inline void end_on_signals() {
   struct sigaction action {};
-  action.sa_handler = [](int) { end_requested = 1; };
+  action.sa_handler = [](int) { end_requested = end_requested + 1; };
   for (const int signal : {SIGINT, SIGTERM, SIGHUP, SIGQUIT, SIGPIPE})
     ::sigaction(signal, &action, nullptr);
 }
