@@ -31,7 +31,8 @@ bool contains(const std::vector<int>& pids, int pid) {
   return std::find(pids.begin(), pids.end(), pid) != pids.end();
 }
 
-// The mode of an open that is an edge. Readers that programs open by DSSM's own interface count too.
+// The mode of an open that is an edge. Readers that programs open by DSSM's own interface count,
+// too.
 std::optional<int> edge_mode(const dssm::OpenInfo& open) {
   if (open.tag & dssm::ssm::kTagEdge) return static_cast<int>(open.tag & 0xff);
   if (open.tag == 0 && open.role == dssm::Role::reader) return SSM_READ;

@@ -172,8 +172,8 @@ void scan_times(dssm_ssm_log& log, std::uint64_t count) {
   }
 }
 
-// The newest of the first `count` > 0 records with a time before `time`, else the first one. Each run
-// of rising times is searched by bisection, from the last run on.
+// The newest of the first `count` > 0 records with a time before `time`, else the first one. Each
+// run of rising times is searched by bisection, from the last run on.
 std::uint64_t newest_before(dssm_ssm_log& log, double time, std::uint64_t count) {
   if (std::isinf(time)) return time < 0 ? 0 : count - 1;  // beginning and end need no search
   scan_times(log, count);

@@ -4,11 +4,11 @@
 //
 // The first sample in the log is the one after the newest at its start; of a stream without samples
 // it is the very first. Samples that the program was too slow for, or that the network lost, are
-// counted by their numbers and reported at the end. After a signal it records what was written until
-// then; after a second one it ends at once.
+// counted by their numbers and reported at the end. After a signal it records what was written
+// until then; after a second one it ends at once.
 //
-// Exit status: 0; 255 for bad arguments, without dssmd, when the stream does not appear within 60 s,
-// and when the log cannot be written.
+// Exit status: 0; 255 for bad arguments, without dssmd, when the stream does not appear within
+// 60 s, and when the log cannot be written.
 #include <getopt.h>
 
 #include <ssm-log.hpp>
