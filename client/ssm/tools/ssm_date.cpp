@@ -83,7 +83,7 @@ std::optional<bool> parse_flag(const char* text) {
   return std::nullopt;
 }
 
-enum : int { kSleep = 256, kUsleep };
+enum : int { sleep_seconds = 256, sleep_microseconds };
 
 // Does what one option says; false when its value is wrong or nothing could be set.
 bool act(int option, const char* value) {
@@ -132,7 +132,7 @@ bool act(int option, const char* value) {
       return with_flag(settimeSSM_is_reverse);
     case 'G':
       return settimeSSM_is_reverse(!gettimeSSM_is_reverse()) != 0;
-    case kSleep:
+    case sleep_seconds:
       return with_number("a span", [](double s) { return std::fflush(stdout), sleepSSM(s) == 0; });
     default:
       return with_number("a span",
@@ -161,17 +161,17 @@ int main(int argc, char** argv) {
                           {"set-reverse", required_argument, nullptr, 'R'},
                           {"toggle-pause", no_argument, nullptr, 'g'},
                           {"toggle-reverse", no_argument, nullptr, 'G'},
-                          {"sleep", required_argument, nullptr, kSleep},
-                          {"usleep", required_argument, nullptr, kUsleep},
+                          {"sleep", required_argument, nullptr, sleep_seconds},
+                          {"usleep", required_argument, nullptr, sleep_microseconds},
                           {"quiet", no_argument, nullptr, 'q'},
                           {"verbose", no_argument, nullptr, 'v'},
                           {"help", no_argument, nullptr, 'h'},
                           {"long-help", no_argument, nullptr, 'H'},
                           {nullptr, 0, nullptr, 0}};
   bool is_connected = false, has_acted = false;
-  for (int option;
-       (option = ::getopt_long(argc, argv, "aAIdtT:uUxX:sSpP:rR:gGqvhH", known,  // NOLINT
-                               nullptr)) != -1;) {
+  constexpr const char* kShort = "aAIdtT:uUxX:sSpP:rR:gGqvhH";
+  // NOLINTNEXTLINE(concurrency-mt-unsafe): one thread
+  for (int option; (option = ::getopt_long(argc, argv, kShort, known, nullptr)) != -1;) {
     if (option == 'v') continue;
     if (option == 'q') {
       is_quiet = true;

@@ -52,6 +52,7 @@ bool parse(int argc, char** argv, Options& options) {
                           {"quiet", no_argument, nullptr, 'q'},
                           {"help", no_argument, nullptr, 'h'},
                           {nullptr, 0, nullptr, 0}};
+  // NOLINTNEXTLINE(concurrency-mt-unsafe): one thread
   for (int option; (option = ::getopt_long(argc, argv, "l:n:i:vqh", known, nullptr)) != -1;) {
     switch (option) {
       case 'l':

@@ -69,6 +69,7 @@ bool parse(int argc, char** argv, Options& options) {
                           {"quiet", no_argument, nullptr, 'q'},
                           {"help", no_argument, nullptr, 'h'},
                           {nullptr, 0, nullptr, 0}};
+  // NOLINTNEXTLINE(concurrency-mt-unsafe): one thread
   for (int option; (option = ::getopt_long(argc, argv, "x:s:e:S:E:lvqh", known, nullptr)) != -1;) {
     double* const number = option == 'x'   ? &options.speed
                            : option == 's' ? &options.start_offset

@@ -204,7 +204,8 @@ struct SsmLogger : SsmTools {
     std::ifstream file(log, std::ios::binary);
     std::string head;
     std::getline(file, head);
-    return (std::filesystem::file_size(log) - head.size() - 1 - sizeof kWheels) / 48;
+    const std::uint64_t property = std::stoul(head.substr(head.rfind(' ')));
+    return (std::filesystem::file_size(log) - head.size() - 1 - property) / 48;
   }
 };
 
