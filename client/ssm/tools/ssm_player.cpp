@@ -29,6 +29,7 @@ using namespace dssm::ssm_tools;
 namespace {
 
 constexpr double kInfinity = std::numeric_limits<double>::infinity();
+constexpr double kGreatest = std::numeric_limits<double>::max();
 
 void print_help() {
   std::fprintf(stderr,
@@ -129,7 +130,10 @@ class Track {
   // none.
   double next_time(bool reverse) {
     turn(reverse);
-    return has_next_ ? log_.time() : reverse ? -kInfinity : kInfinity;
+    // A log may hold any time, also an infinite one.
+    return has_next_ ? std::clamp(log_.time(), -kGreatest, kGreatest)
+           : reverse ? -kInfinity
+                     : kInfinity;
   }
 
   // Writes that record and takes the next one. False: the stream cannot be written.

@@ -9,6 +9,7 @@
 
 #include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/process/ssm/run_program.hpp"
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/session.hpp"
 
@@ -76,6 +77,20 @@ TEST_F(SsmFleet, AnSsmProgramReadsAndWritesStreamsOfAnotherPcByTheirNames) {
   EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
   remove_tree(folder);
   EXPECT_TRUE(far.stream_info({"ours", 0, {}}));
+}
+
+TEST_F(SsmFleet, AStreamThatAnotherPcWritesIsShownAsComingFromDssmd) {
+  await_host(pc1, "pc2");
+  auto far = connect(pc1), near = connect(pc2);
+  const auto writer =
+      far.create_raw({"back", 0, "pc2"}, {"", sizeof(Point), 1, {}}, History{100, 100ms}).value();
+  const auto reader = near.open_raw_reader({"back", 0, {}}).value();
+  const std::string edge = "\t" + std::to_string(pc2.pid()) + " -> " + std::to_string(::getpid()) +
+                           " [ label = \"back[0]\"];\n";
+  await([&] {
+    const Finished graph = run({built("client/ssm/ssm-graph")}, {pc2.environment()});
+    return graph.exit_status == 0 && graph.out.find(edge) != std::string::npos;
+  });
 }
 
 TEST(SsmBroadcast, EachHostSeesWhatAllShow) {
