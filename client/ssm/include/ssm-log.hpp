@@ -62,8 +62,8 @@ class SSMLogBase {
   }
   virtual ~SSMLogBase() { dssm_ssm_log_close(mLog); }
 
-  // The buffers of records and property, which stay the caller's. Without them open() takes any
-  // log: ask for its sizes, set buffers, and call readProperty().
+  // The buffers of records and property, which stay the caller's. open() takes any log: ask it for
+  // its sizes, set buffers, and call readProperty(). Nothing is read into a buffer of another size.
   void setBuffer(void* newData, size_t newDataSize, void* newProperty, size_t newPropertySize) {
     mData = newData;
     mDataSize = mDataCapacity = newDataSize;
@@ -74,28 +74,27 @@ class SSMLogBase {
   // The log's property into the buffer; false when there is none, or it has another size.
   bool readProperty() {
     return mLog && mProperty && mPropertySize > 0 &&
-           dssm_ssm_log_property(mLog, mProperty, mPropertySize) != 0;
+           dssm_ssm_log_property(mLog, mProperty, mPropertyCapacity) != 0;
   }
 
-  // Opens a log for reading, at its first record. False when there is no log of that name, or its
-  // records or its property have other sizes than the buffers. A log without a property leaves the
-  // buffer as it is; propertySize() is then 0.
+  // Opens a log for reading, at its first record, and reads its property if the buffer has its size.
+  // False when there is no log of that name, or, for an SSMLog, records or property have other sizes
+  // than its types. A log without a property leaves the buffer as it is; propertySize() is then 0.
   bool open(const char* fileName) {
     close();
     mLog = dssm_ssm_log_open(fileName);
     if (!mLog) return false;
     const dssm_ssm_log_head& head = *dssm_ssm_log_get_head(mLog);
-    if (mData && head.data_size != mDataCapacity) {
-      return refuse(fileName, "bytes per record", head.data_size, mDataCapacity);
-    }
     mDataSize = head.data_size;
-    mPropertySize = mProperty && ignoresProperty() ? 0 : head.property_size;
-    if (mProperty && mPropertySize > 0) {
-      if (mPropertySize != mPropertyCapacity) {
-        return refuse(fileName, "bytes of property", head.property_size, mPropertyCapacity);
-      }
-      if (!readProperty()) return close() && false;
+    mPropertySize = mUsesProperty ? head.property_size : 0;
+    const bool fits = mPropertySize == mPropertyCapacity;
+    if (mIsTyped && mDataSize != mDataCapacity) {
+      return refuse(fileName, "bytes per record", mDataSize, mDataCapacity);
     }
+    if (mIsTyped && mPropertySize > 0 && !fits) {
+      return refuse(fileName, "bytes of property", mPropertySize, mPropertyCapacity);
+    }
+    if (mProperty && mPropertySize > 0 && fits && !readProperty()) return close() && false;
     mStreamName = head.stream_name;
     mStreamId = head.stream_id;
     mBufferNum = head.buffer_num;
@@ -117,8 +116,8 @@ class SSMLogBase {
     head.stream_name = mStreamName.c_str();
     head.stream_id = streamId;
     head.buffer_num = bufferNum;
-    head.data_size = mDataSize;
-    head.property_size = mProperty ? mPropertySize : 0;
+    head.data_size = mDataCapacity;
+    head.property_size = mProperty ? mPropertyCapacity : 0;
     head.cycle = cycle;
     head.start_time = startTime;
     mLog = dssm_ssm_log_create(&head, mProperty, fileName);
@@ -136,14 +135,14 @@ class SSMLogBase {
 
   // Appends a record. After a failure all later ones fail, so that the log stays readable.
   virtual bool write(ssmTimeT writeTime = gettimeSSM()) {
-    if (!mLog || !dssm_ssm_log_write(mLog, writeTime, mData, mDataSize)) return false;
+    if (!mLog || !dssm_ssm_log_write(mLog, writeTime, mData, mDataCapacity)) return false;
     mTime = writeTime;
     return true;
   }
 
   // The next record; false at the end, and where the buffer has another size. The end moves while
   // the log is being written.
-  virtual bool read() { return mLog && dssm_ssm_log_read(mLog, &mTime, mData, mDataSize) != 0; }
+  virtual bool read() { return mLog && dssm_ssm_log_read(mLog, &mTime, mData, mDataCapacity) != 0; }
 
   // Moves by `diff` records; false, without a move, when there is no such place.
   bool seek(int diff) { return mLog && dssm_ssm_log_seek(mLog, diff) != 0; }
@@ -170,10 +169,6 @@ class SSMLogBase {
   const double& getCycle() const { return mCycle; }  // 0: less than half a microsecond
   const int& getBufferNum() const { return mBufferNum; }
 
- protected:
-  // Whether the program's type for the property says that it wants none.
-  virtual bool ignoresProperty() const { return false; }
-
  private:
   dssm_ssm_log* mLog;
   std::string mStreamName;
@@ -184,12 +179,15 @@ class SSMLogBase {
   size_t mDataSize, mDataCapacity;  // of the open log; of the buffer
   void* mProperty;
   size_t mPropertySize, mPropertyCapacity;
+  bool mIsTyped, mUsesProperty;  // an SSMLog; not one whose type says that it wants no property
 
   void init() {
     mLog = 0;
     mStreamId = mBufferNum = 0;
     mCycle = mStartTime = mTime = 0;
     setBuffer(0, 0, 0, 0);
+    mIsTyped = false;
+    mUsesProperty = true;
   }
 
   void assign(const SSMLogBase& other) {
@@ -208,6 +206,8 @@ class SSMLogBase {
     mProperty = other.mProperty;
     mPropertySize = other.mPropertySize;
     mPropertyCapacity = other.mPropertyCapacity;
+    mIsTyped = other.mIsTyped;
+    mUsesProperty = other.mUsesProperty;
   }
 
   bool refuse(const char* fileName, const char* what, size_t inFile, size_t inProgram) {
@@ -219,10 +219,14 @@ class SSMLogBase {
   }
 
  protected:
-  // For SSMLog: the buffers are those of this object, not of the one that it is a copy of.
-  void moveBuffer(void* newData, void* newProperty) {
-    mData = newData;
-    mProperty = newProperty;
+  // For SSMLog, whose buffers are those of this object, not of the one that it is a copy of.
+  void setTypedBuffer(void* newData, size_t newDataSize, void* newProperty, size_t newPropertySize,
+                      bool usesProperty) {
+    const size_t dataInLog = mDataSize, propertyInLog = mPropertySize;
+    setBuffer(newData, newDataSize, newProperty, newPropertySize);
+    if (mLog) mDataSize = dataInLog, mPropertySize = propertyInLog;
+    mIsTyped = true;
+    mUsesProperty = usesProperty;
   }
 };
 
@@ -236,12 +240,12 @@ class DSSMSSMLogMembers {
 };
 
 template <typename P>
-struct DSSMSSMIsNoProperty {
-  enum { value = 0 };
+struct DSSMSSMIsProperty {
+  enum { value = 1 };
 };
 template <>
-struct DSSMSSMIsNoProperty<SSMDummy> {
-  enum { value = 1 };
+struct DSSMSSMIsProperty<SSMDummy> {
+  enum { value = 0 };
 };
 
 template <typename D, typename P = SSMDummy>
@@ -249,14 +253,12 @@ class SSMLog : public SSMLogBase, private DSSMSSMLogMembers<D, P> {
   typedef DSSMSSMLogMembers<D, P> Members;
 
  public:
-  SSMLog() { setBuffer(&this->mLogData, sizeof(D), &this->mLogProperty, sizeof(P)); }
-  SSMLog(const SSMLog& other) : SSMLogBase(other), Members(other) {
-    moveBuffer(&this->mLogData, &this->mLogProperty);
-  }
+  SSMLog() { useOwnMembers(); }
+  SSMLog(const SSMLog& other) : SSMLogBase(other), Members(other) { useOwnMembers(); }
   SSMLog& operator=(const SSMLog& other) {
     SSMLogBase::operator=(other);
     Members::operator=(other);
-    moveBuffer(&this->mLogData, &this->mLogProperty);
+    useOwnMembers();
     return *this;
   }
   virtual ~SSMLog() {}
@@ -264,8 +266,11 @@ class SSMLog : public SSMLogBase, private DSSMSSMLogMembers<D, P> {
   D& data() { return this->mLogData; }  // always the same object
   P& property() { return this->mLogProperty; }
 
- protected:
-  virtual bool ignoresProperty() const { return DSSMSSMIsNoProperty<P>::value != 0; }
+ private:
+  void useOwnMembers() {
+    setTypedBuffer(&this->mLogData, sizeof(D), &this->mLogProperty, sizeof(P),
+                   DSSMSSMIsProperty<P>::value != 0);
+  }
 };
 
 #endif

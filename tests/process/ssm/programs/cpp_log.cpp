@@ -242,6 +242,15 @@ void sizes_in_a_file_are_not_trusted() {
   CHECK_TEXT(caught_stderr(), "4 bytes");
   base.setBuffer(data, 4, property, 32);
   CHECK(base.readProperty() && property[31] == 'p');
+  // The same object for a log of other sizes: it asks again.
+  save(path("other.log"), "odo 2 8 49 0.05 1.0 3\nppp" + bytes_of(1.0) + bytes_of(2.0));
+  CHECK(base.open(path("other.log").c_str()));
+  CHECK_EQUAL(base.dataSize(), 8);
+  CHECK_EQUAL(base.propertySize(), 3);
+  catch_stderr();
+  CHECK(!base.read() && !base.readProperty());
+  CHECK_TEXT(caught_stderr(), "8 bytes");
+  CHECK(base.open(path("foreign.log").c_str()));  // with buffers of its sizes, from before
   CHECK(base.read() && memcmp(data, bytes_of(78).data(), 4) == 0);
 }
 
