@@ -77,9 +77,10 @@ class SSMLogBase {
            dssm_ssm_log_property(mLog, mProperty, mPropertyCapacity) != 0;
   }
 
-  // Opens a log for reading, at its first record, and reads its property if the buffer has its size.
-  // False when there is no log of that name, or, for an SSMLog, records or property have other sizes
-  // than its types. A log without a property leaves the buffer as it is; propertySize() is then 0.
+  // Opens a log for reading, at its first record, and reads its property if the buffer has its
+  // size. False when there is no log of that name, or, for an SSMLog, records or property have
+  // other sizes than its types. A log without a property leaves the buffer as it is;
+  // propertySize() is then 0.
   bool open(const char* fileName) {
     close();
     mLog = dssm_ssm_log_open(fileName);
