@@ -33,11 +33,13 @@ extern "C" {
 int calcSSM_table(ssmTimeT life, ssmTimeT cycle);
 ssmTimeT calcSSM_life(int table_num, ssmTimeT cycle);
 
-/* Registered processes, in the order of initSSM, each counted once; -1 without dssmd. */
+/* Registered processes, in the order of initSSM, each counted once; then dssmd, while a process has a
+ * stream open that other PCs write. -1 without dssmd. */
 int getSSM_node_num(void);
 int getSSM_node_info(int n, int* node_num);
 
-/* Open streams: node1 created it, node2 opened it with the mode dir; -1 without dssmd. */
+/* Open streams: node1 created it (or, when that has ended, writes it), node2 opened it with the mode
+ * dir; -1 without dssmd. */
 int getSSM_edge_num(void);
 int getSSM_edge_info(int n, char* name, size_t name_size, int* id, int* node1, int* node2,
                      int* dir);

@@ -91,6 +91,7 @@ class SSMApiBase {
   ssmTimeT time;   // its time; 0 at first
 
   SSMApiBase() { init(); }
+  // Not explicit, as in SSM: NOLINTNEXTLINE(google-explicit-constructor)
   SSMApiBase(const char* newName, int newId = 0) { init(newName, newId); }
   SSMApiBase(const SSMApiBase& other) { assign(other); }
   SSMApiBase& operator=(const SSMApiBase& other) {
@@ -398,6 +399,7 @@ class SSMApi : public SSMApiBase, public DSSMSSMApiMembers<T, P> {
   using Members::property;  // P property
 
   SSMApi() { useOwnMembers(); }
+  // Not explicit, as in SSM: NOLINTNEXTLINE(google-explicit-constructor)
   SSMApi(const char* newName, int newId = 0) : SSMApiBase(newName, newId) { useOwnMembers(); }
   SSMApi(const SSMApi& other) : SSMApiBase(other), Members(other) { useOwnMembers(); }
   SSMApi& operator=(const SSMApi& other) {

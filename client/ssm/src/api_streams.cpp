@@ -5,8 +5,10 @@
 
 #include <algorithm>
 #include <atomic>
+#include <cmath>
 #include <cstring>
 #include <dssm/session.hpp>
+#include <limits>
 #include <optional>
 
 #include "../include/libssm.h"
@@ -52,8 +54,14 @@ extern "C" {
 
 int calcSSM_table(ssmTimeT life, ssmTimeT cycle) { return static_cast<int>(slots(life, cycle)); }
 
+// Up to a rounding (num - 1) * cycle / 1.2: as much more as it takes that calcSSM_table() gives the
+// same number back, or replayed streams would have a slot less than the recorded ones.
 ssmTimeT calcSSM_life(int table_num, ssmTimeT cycle) {
-  return (table_num - SSM_MARGIN) * cycle / SSM_BUFFER_MARGIN;
+  double life = (table_num - SSM_MARGIN) * cycle / SSM_BUFFER_MARGIN;
+  for (int step = 0; step < 4 && life > 0 && calcSSM_table(life, cycle) < table_num; ++step) {
+    life = std::nextafter(life, std::numeric_limits<double>::max());
+  }
+  return life;
 }
 
 SSM_sid createSSM(const char* stream_name, int stream_id, size_t stream_size, ssmTimeT life,

@@ -60,7 +60,7 @@ TEST(SsmHeaders, CompileWithoutWarningsInEveryDialectOfC) {
 
 TEST(SsmHeaders, CompileWithoutWarningsInEveryDialectOfCpp) {
   std::vector<std::string> headers = kCHeaders;
-  headers.insert(headers.end(), {"ssm.hpp", "ssmp.hpp"});
+  headers.insert(headers.end(), {"ssm.hpp", "ssmp.hpp", "ssm-log.hpp"});
   for (const char* dialect : {"gnu++98", "c++11", "c++14", "c++17", "c++20"}) {
     compile("c++", dialect, "cpp", headers);
   }
@@ -94,7 +94,7 @@ TEST(SsmHeaders, LiveBesideDssmsOwn) {
 TEST(SsmHeaders, TakeNoNamesThatProgramsUse) {
   const std::string folder = make_temp_dir();
   std::ofstream(folder + "/program.cpp")
-      << "#include <libssm.h>\n#include <ssm.hpp>\n#include <ssmp.hpp>\n"
+      << "#include <libssm.h>\n#include <ssm-log.hpp>\n#include <ssmp.hpp>\n"
          "#if __cplusplus >= 201103L\n#include <dssm.hpp>\n#endif\n"
          "static void ctrlC(int) {}\nbool gShutOff;\nvoid setSigInt() {}\n"
          "#ifdef PI\n#error PI\n#endif\nconst double PI = 3;\n"
@@ -128,7 +128,7 @@ TEST(SsmLibrary, ExportsTheDocumentedNamesAndNothingElse) {
   EXPECT_EQ(exported, documented);
   std::string headers;
   for (const char* header :
-       {"ssm.h", "ssm-time.h", "libssm.h", "ssm.hpp", "dssm-proxy-client.hpp"}) {
+       {"ssm.h", "ssm-time.h", "libssm.h", "ssm.hpp", "ssm-log.hpp", "dssm-proxy-client.hpp"}) {
     std::ifstream file(source("client/ssm/include/") + header);
     headers.append(std::istreambuf_iterator<char>(file), {});
   }

@@ -2,10 +2,7 @@
 //
 // Runs the programs of programs/ that meet other PCs: those of the remote interface, and SSM
 // programs that open another PC's stream by its name.
-#include <fcntl.h>
 #include <gtest/gtest.h>
-#include <signal.h>
-#include <unistd.h>
 
 #include <algorithm>
 #include <dssm/dssm.hpp>
@@ -13,6 +10,7 @@
 
 #include "tests/process/fleet/fleet_tools.hpp"
 #include "tests/process/ssm/run_program.hpp"
+#include "tests/support/await.hpp"
 #include "tests/support/daemon_process.hpp"
 #include "tests/support/session.hpp"
 
@@ -75,10 +73,25 @@ TEST_F(SsmFleet, AnSsmProgramReadsAndWritesStreamsOfAnotherPcByTheirNames) {
   await_host(pc1, "pc2");
   const std::string folder = make_temp_dir();
   const Finished finished =
-      run({program("remote_names-gnu++98"), folder, "pc2"}, {pc1.environment()});
+      run({program("remote_names-gnu++98"), folder, "pc2", std::to_string(pc1.pid())},
+          {pc1.environment()});
   EXPECT_EQ(finished.exit_status, 0) << finished.out << finished.err;
   remove_tree(folder);
   EXPECT_TRUE(far.stream_info({"ours", 0, {}}));
+}
+
+TEST_F(SsmFleet, AStreamThatAnotherPcWritesIsShownAsComingFromDssmd) {
+  await_host(pc1, "pc2");
+  auto far = connect(pc1), near = connect(pc2);
+  const auto writer =
+      far.create_raw({"back", 0, "pc2"}, {"", sizeof(Point), 1, {}}, History{100, 100ms}).value();
+  const auto reader = near.open_raw_reader({"back", 0, {}}).value();
+  const std::string edge = "\t" + std::to_string(pc2.pid()) + " -> " + std::to_string(::getpid()) +
+                           " [ label = \"back[0]\"];\n";
+  await([&] {
+    const Finished graph = run({built("client/ssm/ssm-graph")}, {pc2.environment()});
+    return graph.exit_status == 0 && graph.out.find(edge) != std::string::npos;
+  });
 }
 
 TEST(SsmBroadcast, EachHostSeesWhatAllShow) {
@@ -102,50 +115,6 @@ TEST(SsmBroadcast, EachHostSeesWhatAllShow) {
   EXPECT_EQ(two.exit_status, 0) << two.out << two.err;
   for (const std::string& folder : folders) remove_tree(folder);
 }
-
-// A program whose standard input and output are the test's.
-class PipedProgram {
- public:
-  PipedProgram(const std::vector<std::string>& argv, const std::string& environment) {
-    int in[2], out[2];
-    if (::pipe2(in, O_CLOEXEC) || ::pipe2(out, O_CLOEXEC)) std::abort();
-    // start() leaves stdin alone: the shell takes it from the pipe's path in /proc.
-    const std::string path = "/proc/" + std::to_string(::getpid()) + "/fd/" + std::to_string(in[0]);
-    std::string command = "exec";
-    for (const std::string& word : argv) command += " '" + word + "'";
-    pid_ = start({"sh", "-c", command + " <" + path}, {environment}, out[1]);
-    ::close(out[1]);
-    read_in_ = in[0];
-    to_ = in[1];
-    from_ = out[0];
-  }
-  PipedProgram(const PipedProgram&) = delete;
-  PipedProgram& operator=(const PipedProgram&) = delete;
-
-  void write_line(const std::string& line) const {
-    ASSERT_EQ(::write(to_, line.data(), line.size()), static_cast<ssize_t>(line.size()));
-  }
-  std::string line() const {
-    std::string text;
-    for (char c = 0; ::read(from_, &c, 1) == 1 && c != '\n';) text += c;
-    return text;
-  }
-  // Its exit status, and what else it said.
-  int end(std::string& rest) {
-    ::close(to_);
-    ::close(read_in_);
-    char buffer[4096];
-    for (ssize_t n; (n = ::read(from_, buffer, sizeof buffer)) > 0;) {
-      rest.append(buffer, static_cast<std::size_t>(n));
-    }
-    ::close(from_);
-    return wait_for(pid_);
-  }
-
- private:
-  pid_t pid_ = -1;
-  int read_in_ = -1, to_ = -1, from_ = -1;
-};
 
 struct SsmNewRing : testing::Test {
   DaemonProcess daemon{{"--log-level", "warning"}};

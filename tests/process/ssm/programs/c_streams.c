@@ -89,6 +89,18 @@ static void create_arguments(void) {
   CHECK(releaseSSM(&sid) == 1);
 }
 
+/* A replayed stream has as many slots as the recorded one; once every sixth had one less. */
+static void ring_sizes_come_back(void) {
+  static const double cycles[] = {0.001, 0.005, 0.0333, 0.05, 0.1, 1};
+  unsigned i;
+  int num;
+  for (i = 0; i < sizeof(cycles) / sizeof(cycles[0]); ++i) {
+    for (num = 2; num < 2000; ++num) {
+      CHECK_EQUAL(calcSSM_table(calcSSM_life(num, cycles[i]), cycles[i]), num);
+    }
+  }
+}
+
 static void ring_sizes(void) {
   static const struct {
     double life, cycle;
@@ -321,6 +333,7 @@ int main(int argc, char **argv) {
   CHECK(timecontrol != NULL);
   create_arguments();
   ring_sizes();
+  ring_sizes_come_back();
   create_again();
   size_zero();
   listing();

@@ -213,6 +213,51 @@ void edges_between_processes() {
   writer.release();
 }
 
+// Where the first edge of "edgy" comes from; 0: there is none.
+int source_of_edgy() {
+  char name[SSM_SNAME_MAX];
+  int from;
+  for (int i = 0; getSSM_edge_info(i, name, sizeof(name), NULL, &from, NULL, NULL); ++i) {
+    if (strcmp(name, "edgy") == 0) return from;
+  }
+  return 0;
+}
+
+int creator_with_heir(int (&created)[2], int (&end)[2]) {
+  SSMApi<Sample> writer("edgy", 8);
+  char byte = 0;
+  if (!initSSM() || !writer.create(1.0, 0.1) || write(created[1], "c", 1) != 1) return 1;
+  close(end[1]);
+  if (read(end[0], &byte, 1) != 0) return 2;  // until the parent closes it
+  return 0;
+}
+
+// The edge of a stream is that of its creator, then that of the process that goes on writing it.
+void edges_outlive_the_creator() {
+  int created[2], end[2];
+  if (pipe(created) != 0 || pipe(end) != 0) abort();
+  fflush(stdout);
+  const pid_t creator = fork();
+  if (creator == 0) _exit(creator_with_heir(created, end));
+  char byte = 0;
+  CHECK_EQUAL(read(created[0], &byte, 1), 1);
+  SSMApi<Sample> reader("edgy", 8), heir("edgy", 8);
+  CHECK(reader.open());
+  CHECK_EQUAL(source_of_edgy(), creator);
+  CHECK(heir.create(1.0, 0.1));
+  CHECK_EQUAL(source_of_edgy(), creator);
+  close(end[0]);
+  close(end[1]);
+  int status = 0;
+  waitpid(creator, &status, 0);
+  CHECK_EQUAL(status, 0);
+  while (getSSM_node_num() != 1) usleep(1000);
+  CHECK_EQUAL(source_of_edgy(), getpid());
+  heir.release();
+  while (source_of_edgy() != 0) usleep(1000);  // nobody writes it any more
+  reader.close();
+}
+
 int lines_with(const char* word) {
   std::ifstream maps("/proc/self/maps");
   std::string line;
@@ -264,6 +309,7 @@ int main(int argc, char** argv) {
   waiting_for_each_other();
   no_torn_reads();
   edges_between_processes();
+  edges_outlive_the_creator();
   cycles(100);
   cycles(10000);
   scripts_find_the_process();

@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // An SSM program that reads and writes streams of another PC without knowing more of it than its
-// name. Arguments: FOLDER HOST; the dssmd of this PC knows that host, which has a stream "far:3" of
-// ten samples and a property.
+// name. Arguments: FOLDER HOST PID; the dssmd of this PC, process PID, knows that host, which has a
+// stream "far:3" of ten samples and a property.
 #include <libssm.h>
 
 #include <ssm.hpp>
@@ -37,6 +37,16 @@ int main(int argc, char** argv) {
     CHECK(far.readTime(1004.5) && far.data.number == 4);
     CHECK(far.readBack(4) && far.data.number == 0);
     CHECK(std::string(far.getStreamName()) == names[i]);
+    // An edge as to any reader; here dssmd writes what comes from the other PC.
+    char edge_name[SSM_SNAME_MAX];
+    int edge_id = 0, source = 0, opener = 0, mode = 0, node = 0;
+    CHECK_EQUAL(getSSM_edge_num(), 1);
+    CHECK(getSSM_edge_info(0, edge_name, sizeof(edge_name), &edge_id, &source, &opener, &mode));
+    CHECK(strcmp(edge_name, "far") == 0 && edge_id == 3 && opener == getpid() && mode == SSM_READ);
+    CHECK_EQUAL(getSSM_node_num(), 2);
+    CHECK(getSSM_node_info(0, &node) && node == getpid());
+    CHECK(getSSM_node_info(1, &node) && node == source);
+    CHECK_EQUAL(source, atoi(argv[3]));
     size_t size = 0, property = 0;
     int num = 0;
     double cycle = 0;
@@ -45,7 +55,9 @@ int main(int argc, char** argv) {
     CHECK_EQUAL(num, 100);
     CHECK_EQUAL(property, sizeof(int));
     CHECK(far.close());
+    while (getSSM_edge_num() != 0) usleep(1000);
   }
+  CHECK_EQUAL(getSSM_node_num(), 1);
   CHECK_EQUAL(getSSM_num(), 0);  // lists what is of this PC
 
   // A stream of ours over there.
