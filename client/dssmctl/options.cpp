@@ -426,6 +426,46 @@ void add_record(CLI::App& app, Parsed& parsed) {
   add_record_limits(record, options);
 }
 
+void check_play(const PlayOptions& options) {
+  for (const std::string& mapping : options.mappings) {
+    const std::size_t equals = mapping.find('=', 1);
+    require(equals != std::string::npos && equals + 1 < mapping.size(),
+            fmt::format("'{}' is not STREAM=NAME, as odometry=odometry_old", escaped(mapping)));
+  }
+}
+
+void add_play(CLI::App& app, Parsed& parsed) {
+  CLI::App* play = app.add_subcommand("play", "write the samples of a recording to streams");
+  PlayOptions& options = add_options<PlayOptions>(play, parsed, check_play);
+  play->add_option("FILE", options.file, "the recording: a file, or the folder of its files")
+      ->required()
+      ->type_name("");
+  play->add_option("PATTERN", options.patterns,
+                   "only streams whose NAME or NAME:ID one of these shell patterns fits")
+      ->type_name("");
+  add_parsed(play, "-r,--rate", "X", "how fast: 2 is twice as fast (default: 1)",
+             [&options](const std::string& text) -> Result<void> {
+               constexpr double kMin = 1e-3, kMax = 1e6;
+               options.rate = DSSM_TRY(parse_real(text));
+               if (options.rate >= kMin && options.rate <= kMax) return {};
+               return Error{Errc::invalid_argument,
+                            fmt::format("'{}' is not a rate from 0.001 to 1000000", text)};
+             });
+  add_moment(play, "--from", "begin at TIME: seconds since 1970, ISO 8601, or before the end (-3s)",
+             options.from);
+  add_moment(play, "--to", "end at TIME", options.to);
+  play->add_flag("-l,--loop", options.loop, "again and again, until Ctrl-C");
+  play->add_option("--map", options.mappings,
+                   "STREAM, a shell pattern, is played as NAME; may be given several times")
+      ->type_name("STREAM=NAME")
+      ->allow_extra_args(false);
+  play->add_flag("--on-hosts", options.on_hosts,
+                 "on the hosts that the streams were on (default: all on this PC)");
+  play->add_flag("--now", options.now,
+                 "with the present times, not those of the recording; leaves the playback clock");
+  play->add_flag("--force", options.force, "also to streams that another program writes");
+}
+
 void add_types(CLI::App& app, Parsed& parsed) {
   CLI::App* find = app.add_subcommand("find", "list the streams of a type");
   find->add_option("TYPE", add_options<FindOptions>(find, parsed).type,
@@ -660,6 +700,7 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_echo(app, parsed);
   add_pub(app, parsed);
   add_record(app, parsed);
+  add_play(app, parsed);
   add_types(app, parsed);
   add_meter<HzOptions>(app, parsed, "hz", "how often samples come");
   add_meter<BwOptions>(app, parsed, "bw", "how many bytes come");

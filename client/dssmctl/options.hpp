@@ -107,6 +107,15 @@ struct RecordOptions : CommonOptions {
   Duration max_file_duration{};                           // 0: no limit
 };
 
+struct PlayOptions : CommonOptions {
+  std::string file;                   // or the folder of one recording
+  std::vector<std::string> patterns;  // of the recording's streams; empty: all
+  std::vector<std::string> mappings;  // PATTERN=NAME
+  double rate = 1;
+  std::optional<Moment> from, to;  // count back from the recording's end
+  bool loop = false, now = false, on_hosts = false, force = false;
+};
+
 struct FindOptions : CommonOptions {
   std::string type;  // a shell pattern
 };
@@ -193,9 +202,9 @@ struct PkiShowOptions : CommonOptions {
 
 using Options =
     std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
-                 PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, FindOptions,
-                 ShowOptions, HzOptions, BwOptions, DelayOptions, CreateOptions, RmOptions,
-                 RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
+                 PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, PlayOptions,
+                 FindOptions, ShowOptions, HzOptions, BwOptions, DelayOptions, CreateOptions,
+                 RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
                  PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
                  PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
@@ -223,6 +232,7 @@ Result<void> run(const InfoOptions& options, Output& out);
 Result<void> run(const EchoOptions& options, Output& out);
 Result<void> run(const PubOptions& options, Output& out);
 Result<void> run(const RecordOptions& options, Output& out);
+Result<void> run(const PlayOptions& options, Output& out);
 Result<void> run(const FindOptions& options, Output& out);
 Result<void> run(const ShowOptions& options, Output& out);
 Result<void> run(const HzOptions& options, Output& out);

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl record, and what info shows of a recording.
+// dssmctl record and play, and what info shows of a recording.
 #include <signal.h>
 
 #include <dssm/recording.hpp>
@@ -197,10 +197,131 @@ TEST_F(Record, SaysWhatIsWrong) {
   EXPECT_TRUE(contains(missing.err, "b.mcap")) << missing.err;
 }
 
+// --- play
+
+class Play : public Record {
+ protected:
+  // A recording of samples 0 to 99 of write_poses() in stream "pose", with a property.
+  void make_recording() {
+    auto writer = RecordingWriter::create(file_).value();
+    RecordedStream stream{{"pose", 0, "pc9"}, type_of<RecordedPose>(), 512, 1ms, 1, {}};
+    stream.property = {std::byte{7}};
+    const std::uint32_t number = writer.add_stream(stream).value();
+    for (std::int64_t i = 0; i < 100; ++i) {
+      const RecordedPose pose{0.5 * static_cast<double>(i), -1, i};
+      const SampleInfo info{i, at_ns(kSecond + i * 1'000'000), Duration(i), sizeof pose};
+      ASSERT_TRUE(writer.write(number, info, 1us, std::as_bytes(std::span(&pose, 1))));
+    }
+    ASSERT_TRUE(writer.finish());
+  }
+
+  void expect_played(const std::string& stream, std::int64_t first, std::int64_t last) {
+    auto reader = session_.open_reader<RecordedPose>(stream).value();
+    reader.seek(kNoTid);
+    for (std::int64_t i = first; i <= last; ++i) {
+      const auto sample = reader.read_next();
+      ASSERT_TRUE(sample) << i;
+      ASSERT_EQ(sample->value.number, i);
+      EXPECT_EQ(sample->info.time, at_ns(kSecond + i * 1'000'000));
+      EXPECT_EQ(sample->info.clock_error, Duration(i));
+    }
+    EXPECT_FALSE(reader.read_next());
+  }
+};
+
+TEST_F(Play, GivesBackWhatWasRecorded) {
+  make_recording();
+  EXPECT_EQ(output({"play", file_}), file_ + ": 100 samples of 1 stream played\n");
+  expect_played("pose@pc1", 0, 99);
+  const StreamInfo info = session_.stream_info({"pose", 0, ""}).value();
+  EXPECT_EQ(info.type, type_of<RecordedPose>());
+  EXPECT_EQ(info.depth, 512U);
+  EXPECT_EQ(info.cycle, 1ms);
+  EXPECT_EQ(session_.property(info.id).value(), std::vector<std::byte>{std::byte{7}});
+}
+
+TEST_F(Play, PlaysAPartUnderAnotherName) {
+  make_recording();
+  output({"play", file_, "--map", "po*=copy:2", "--from", "1.010", "--to", "-0.05"});
+  expect_played("copy:2", 10, 49);
+  const Finished nothing = ctl({"play", file_, "--from", "5"});
+  EXPECT_EQ(nothing.exit_status, 2);
+  EXPECT_TRUE(contains(nothing.err, "goes from 1.000000000 to 1.099000000")) << nothing.err;
+  EXPECT_TRUE(contains(ctl({"play", file_, "camera"}).err, "no stream of the recording fits"));
+}
+
+// By the clock, so that programs may follow or stop it.
+TEST_F(Play, IsPacedByThePlaybackClockAndResetsIt) {
+  make_recording();
+  auto clock = session_.open_playback_clock().value();
+  Running running(argv({"play", file_, "--rate", "0.001"}), environment());
+  await([&] { return clock.setting().speed == 0.001; });
+  EXPECT_LT(clock.now_s(), 1.099);
+  clock.set_speed(1e6);
+  EXPECT_TRUE(contains(running.rest(), "100 samples of 1 stream played"));
+  EXPECT_EQ(running.status(), 0);
+  expect_played("pose", 0, 99);
+  EXPECT_EQ(clock.setting().offset_s, 0);
+  EXPECT_EQ(clock.setting().speed, 1);
+
+  clock.set_paused(true);
+  Running stopped(argv({"play", file_, "--rate", "0.001", "--loop"}), environment());
+  await([&] { return clock.setting().speed == 0.001; });
+  stopped.signal(SIGTERM);
+  EXPECT_EQ(stopped.status(), 0);
+  EXPECT_EQ(clock.setting().speed, 1);
+  EXPECT_FALSE(clock.setting().paused);
+}
+
+TEST_F(Play, StampsWithThePresentTimesIfAsked) {
+  make_recording();
+  const Time before = WallClock::now();
+  output({"play", file_, "--now", "--rate", "2"});
+  auto reader = session_.open_reader<RecordedPose>("pose").value();
+  reader.seek(kNoTid);
+  const Time first = reader.read_next()->info.time;
+  EXPECT_GE(first, before);
+  EXPECT_LE(first, WallClock::now());
+  const auto last = reader.read_newest();
+  EXPECT_EQ(last->value.number, 99);
+  EXPECT_EQ(last->info.time - first, 49'500us);
+}
+
+TEST_F(Play, DoesNotWriteBesideAnotherProgram) {
+  make_recording();
+  auto pose = session_.create<RecordedPose>("pose", depth_of(512)).value();
+  const Finished refused = ctl({"play", file_});
+  EXPECT_EQ(refused.exit_status, 1);
+  EXPECT_TRUE(contains(refused.err, "is written by another program")) << refused.err;
+  EXPECT_EQ(pose.newest_tid(), kNoTid);
+  output({"play", file_, "--force"});
+  expect_played("pose", 0, 99);
+}
+
 class RecordFleet : public FleetTest {
  protected:
   TestFolder folder_;
 };
+
+TEST_F(RecordFleet, PlaysOnTheHostsOfTheStreams) {
+  const std::string file = folder_.file("a.mcap");
+  auto writer = RecordingWriter::create(file).value();
+  for (const char* host : {"pc2", "pc3"}) {
+    const auto number =
+        writer.add_stream({{"pose", 0, host}, type_of<RecordedPose>(), 64, 1ms, 1, {}}).value();
+    const RecordedPose pose{1, 2, 3};
+    ASSERT_TRUE(writer.write(number, {0, at_ns(kSecond), 1us, sizeof pose}, 1us,
+                             std::as_bytes(std::span(&pose, 1))));
+  }
+  ASSERT_TRUE(writer.finish());
+  EXPECT_TRUE(contains(ctl({"play", file}).err, "are both to be played as 'pose'"));
+  output({"play", file, "--on-hosts"});
+  for (Session* session : {&on_pc2_, &on_pc3_}) {
+    auto reader = session->open_reader<RecordedPose>("pose").value();
+    ASSERT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
+    EXPECT_EQ(reader.read_newest()->value.number, 3);
+  }
+}
 
 TEST_F(RecordFleet, TakesThePastOfAllHosts) {
   auto here = session_.create<RecordedPose>("here", depth_of(1024)).value();
