@@ -78,7 +78,7 @@ _dssmctl() {
   for ((i = 1; i < cword; ++i)); do
     case ${words[i]} in
       -r) # a value only where it is --rate
-        [[ $verb != pub ]] || ((++i))
+        [[ $verb != pub && $verb != play ]] || ((++i))
         ;;
       -w) # a value only where it is --window
         [[ $verb != hz && $verb != bw && $verb != delay ]] || ((++i))
@@ -87,7 +87,8 @@ _dssmctl() {
         --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
         --speed | --time | --rate | --ca | --credentials | --out | --name | --program | --days | \
         --output | -o | --past | --until | --for | --compression | --max-file-size | \
-        --max-file-duration | --max-total-size)
+        --max-file-duration | --max-total-size | --from | --to | --map | \
+        --repair)
         ((++i))
         ;;
       -*) ;;
@@ -104,7 +105,7 @@ _dssmctl() {
   done
 
   case $prev in
-    --socket | --ca | --credentials | --out | --output | -o)
+    --socket | --ca | --credentials | --out | --output | -o | --repair)
       _dssmctl_offer_files
       return
       ;;
@@ -128,7 +129,7 @@ _dssmctl() {
     --at | --count | -n | -c | --wait | --window | --interval | -i | --size | --table | \
       --depth | --life | --cycle | --type | --align | --offset | --speed | --time | --rate | --name | \
       --program | --days | --past | --until | --for | --max-file-size | --max-file-duration | \
-      --max-total-size)
+      --max-total-size | --from | --to | --map)
       return # a value that only the person knows
       ;;
   esac
@@ -145,9 +146,10 @@ _dssmctl() {
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
     pub) options="--count --rate --stdin --times" ;;
+    play) options="--force --from --loop --map --now --on-hosts --rate --to" ;;
     record)
       options="--compression --follow --for --host --max-file-duration --max-file-size \
-        --max-total-size --output --past --type --until"
+        --max-total-size --output --past --repair --type --until"
       ;;
     hz | bw | delay) options="--count --interval --wait --window" ;;
     create) options="--align --cycle --depth --life --size --type" ;;
@@ -170,8 +172,8 @@ _dssmctl() {
   case ${verb#help } in
     "" | help)
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw clock create delay doctor echo find graph hosts hz info ls nodes ping pki playback \
-          property pub record rights rm show" -- "$cur")
+        "bw clock create delay doctor echo find graph hosts hz info ls nodes ping pki play \
+          playback property pub record rights rm show" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;
@@ -179,6 +181,7 @@ _dssmctl() {
       mapfile -t COMPREPLY < <(compgen -W "init install issue renew request revoke show" -- "$cur")
       ;;
     "pki issue" | "pki install" | "pki show") ((positional == 0)) && _dssmctl_offer_files ;;
+    play) ((positional == 0)) && _dssmctl_offer_files ;;
     ping) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_ask hosts --names) ;;
     create) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_at_hosts) ;;
     rm | hz | bw | delay | record) _dssmctl_offer < <(_dssmctl_streams) ;;

@@ -36,11 +36,12 @@ function __dssmctl_candidates
                 contains -- "$verb" hz bw delay; and set i (math $i + 1)
             case -r
                 # A value only where it is --rate.
-                test "$verb" = pub; and set i (math $i + 1)
+                contains -- "$verb" pub play; and set i (math $i + 1)
             case --socket --sort --host --at --count -n -c --field --wait --window --interval -i \
                 --size --table --depth --life --cycle --type --align --offset --speed --time --rate --ca \
                 --credentials --out --name --program --days --output -o --past --until --for \
-                --compression --max-file-size --max-file-duration --max-total-size
+                --compression --max-file-size --max-file-duration --max-total-size --from --to --map \
+                --repair
                 set i (math $i + 1)
             case '-*'
             case '*'
@@ -56,7 +57,7 @@ function __dssmctl_candidates
     end
 
     switch $words[-1]
-        case --socket --ca --credentials --out --output -o
+        case --socket --ca --credentials --out --output -o --repair
             __fish_complete_path (commandline -ct)
             return
         case --host
@@ -71,7 +72,7 @@ function __dssmctl_candidates
             return
         case --at --count -n -c --wait --window --interval -i --size --table --depth --life --cycle \
             --type --align --offset --speed --time --rate --name --program --days --past --until --for \
-            --max-file-size --max-file-duration --max-total-size
+            --max-file-size --max-file-duration --max-total-size --from --to --map
             return
         case --compression
             printf '%s\n' lz4 none zstd
@@ -109,7 +110,7 @@ function __dssmctl_candidates
                 case 1
                     __fish_complete_path (commandline -ct)
             end
-        case 'pki issue' 'pki install' 'pki show'
+        case play 'pki issue' 'pki install' 'pki show'
             test (count $positional) -eq 0; and __fish_complete_path (commandline -ct)
     end
 end

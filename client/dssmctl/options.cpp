@@ -387,6 +387,8 @@ void add_record_limits(CLI::App* record, RecordOptions& options) {
 void check_record(RecordOptions& options) {
   require(!options.until || !options.until->back || *options.until->back == Duration::zero(),
           "--until: a time to come, as seconds since 1970 or ISO 8601");
+  require(options.repair.empty() || options.patterns.empty(),
+          "--repair takes one file, and nothing else");
   require(!options.follow || options.past,
           "--follow: only with --past, without which it continues anyway");
 }
@@ -424,6 +426,10 @@ void add_record(CLI::App& app, Parsed& parsed) {
       ->type_name("NAME")
       ->check(CLI::Validator(check_compression, ""));
   add_record_limits(record, options);
+  record
+      ->add_option("--repair", options.repair,
+                   "complete a recording that was not finished, in place; nothing is recorded")
+      ->type_name("FILE");
 }
 
 void check_play(const PlayOptions& options) {

@@ -98,7 +98,8 @@ struct PubOptions : CommonOptions {
 
 struct RecordOptions : CommonOptions {
   std::vector<std::string> patterns, hosts, types;  // empty: all
-  std::string file;  // or a folder; empty: a name made of the time, in the working directory
+  std::string file;    // or a folder; empty: a name made of the time, in the working directory
+  std::string repair;  // the file to repair, instead of recording
   std::optional<Duration> past, duration;
   std::optional<Moment> until;
   bool follow = false;

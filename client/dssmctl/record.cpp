@@ -149,6 +149,23 @@ class RecordingRun {
   bool is_line_open_ = false;
 };
 
+Result<void> repair(const RecordOptions& options, Output& out) {
+  const RecordingRepair repaired = DSSM_TRY(repair_recording(options.repair));
+  if (options.json) {
+    out.add(json_document({{"file", options.repair},
+                           {"was_whole", repaired.was_whole},
+                           {"removed_bytes", repaired.removed_bytes},
+                           {"samples", repaired.samples}}));
+    return {};
+  }
+  out.add(fmt::format(
+      "{}: {}, {}\n", escaped(options.repair), counted(repaired.samples, "sample", "samples"),
+      repaired.was_whole ? "the file was whole"
+                         : fmt::format("completed, {} of an incomplete record removed",
+                                       bytes_text(repaired.removed_bytes))));
+  return {};
+}
+
 Compression compression_of(const std::string& name) {
   return name == "none" ? Compression::none : name == "zstd" ? Compression::zstd : Compression::lz4;
 }
@@ -156,6 +173,7 @@ Compression compression_of(const std::string& name) {
 }  // namespace
 
 Result<void> run(const RecordOptions& options, Output& out) {
+  if (!options.repair.empty()) return repair(options, out);
   Session session = DSSM_TRY(connect(options));
   const std::filesystem::path file = file_of(options);
   RecordingOptions how;

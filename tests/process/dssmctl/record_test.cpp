@@ -172,6 +172,8 @@ TEST_F(Record, LeavesAFileThatOpensWhenItIsKilled) {
   RecordedReader<RecordedPose> reader = recorded(file_, "pose");
   expect_poses(reader, 0, 499);
   EXPECT_TRUE(contains(ctl({"info", file_}).err, "it has no end")) << ctl({"info", file_}).err;
+  EXPECT_TRUE(contains(output({"record", "--repair", file_}), "500 samples, completed"));
+  EXPECT_EQ(ctl({"info", file_}).err, "");
 }
 
 TEST_F(Record, EndsInTimeAndShowsNumbersForPrograms) {
