@@ -145,14 +145,14 @@ int getSSM_info(const char* stream_name, int stream_id, size_t* size, int* num, 
 }
 
 ssm_header* shm_get_address(SSM_sid sid) {
-  const dssm::ssm::SidUse use(sid);
-  if (!use) return nullptr;
+  const dssm::ssm::SidTurn turn(sid);
+  if (!turn) return nullptr;
   // Atomic stores: another thread may be reading what it got before.
-  ssm_header& header = use.kept();
-  std::atomic_ref(header.tid_top).store(dssm::ssm::ssm_tid(use->newest()));
-  std::atomic_ref(header.num).store(static_cast<int>(use->depth()));
-  std::atomic_ref(header.size).store(use->data_bytes());
-  std::atomic_ref(header.cycle).store(dssm::ssm::seconds_from_ns(dssm::to_ns(use->cycle())));
+  ssm_header& header = turn.kept();
+  std::atomic_ref(header.tid_top).store(dssm::ssm::ssm_tid(turn->newest(turn.alone())));
+  std::atomic_ref(header.num).store(static_cast<int>(turn->depth()));
+  std::atomic_ref(header.size).store(turn->data_bytes());
+  std::atomic_ref(header.cycle).store(dssm::ssm::seconds_from_ns(dssm::to_ns(turn->cycle())));
   return &header;
 }
 

@@ -81,9 +81,12 @@ inline std::int64_t ns_from_seconds(double seconds) noexcept {
   if (std::isnan(seconds)) return 0;
   if (seconds >= kEnd) return std::numeric_limits<std::int64_t>::max();
   if (seconds <= -kEnd) return std::numeric_limits<std::int64_t>::min();
-  // Apart, because seconds * 1e9 has no bits left for single nanoseconds.
-  const double whole = std::floor(seconds);
-  return static_cast<std::int64_t>(whole) * kSecond + std::llround((seconds - whole) * 1e9);
+  // Apart, because seconds * 1e9 has no bits left for single nanoseconds. Not by std::floor and
+  // std::llround, which are calls, in each read and write of a sample.
+  auto whole = static_cast<std::int64_t>(seconds);
+  if (static_cast<double>(whole) > seconds) --whole;
+  const double rest_ns = (seconds - static_cast<double>(whole)) * 1e9;
+  return whole * kSecond + static_cast<std::int64_t>(rest_ns + 0.5);
 }
 
 // The double nearest to that many nanoseconds.

@@ -29,8 +29,6 @@ static_assert(sizeof(SSM_sid) == 8, "a sid holds a place and a generation: 46 bi
 Process the_process;
 static_assert(std::is_trivially_destructible_v<Process>);
 
-thread_local int thread_id = 0;
-
 ssmtime shown_clock;  // what timecontrol points to
 
 template <class T>
@@ -67,12 +65,9 @@ Result<Session> connect_anywhere(std::string& path) {
 
 Process& process() noexcept { return the_process; }
 
-int this_thread_id() noexcept {
-  if (thread_id == 0) thread_id = ::gettid();
-  return thread_id;
-}
+constinit thread_local int kept_thread_id = 0;
 
-void forget_thread_id() noexcept { thread_id = 0; }
+int ask_thread_id() noexcept { return kept_thread_id = ::gettid(); }
 
 Process::Process() noexcept : sids_(wake_), clock_(wake_) { ::sem_init(&wake_, 0, 0); }
 
@@ -130,7 +125,7 @@ Result<void> Process::prepare_locked() {
 // Only what is safe between fork and exec, and what other threads of the parent may have held.
 void Process::after_fork_in_child() {
   Process& process = the_process;
-  forget_thread_id();
+  const int parents_thread = std::exchange(kept_thread_id, 0);
   new (&process.mutex_) std::mutex;
   ::sem_init(&process.wake_, 0, 0);
   ++process.generation_;
@@ -140,7 +135,8 @@ void Process::after_fork_in_child() {
   if (Registration* const parents = std::exchange(process.registration_, nullptr)) {
     parents->next = std::exchange(process.abandoned_, parents);
   }
-  process.sids_.visit_objects([](Stream& stream) { stream.reset_after_fork(); });
+  process.sids_.reset_after_fork(parents_thread, [](Stream& s) { s.reset_after_fork(); });
+  process.clock_.reset_after_fork(parents_thread);
 }
 
 // --- registration

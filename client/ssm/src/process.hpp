@@ -43,6 +43,9 @@ class SharedClock {
   void attach(PlaybackClock clock, std::uint64_t process_generation);
   void detach() noexcept;
   void reap(std::uint64_t process_generation) { clocks_.reap(process_generation); }
+  void reset_after_fork(int parents_thread) noexcept {
+    clocks_.reset_after_fork(parents_thread, [](PlaybackClock&) {});
+  }
 
   // The setting; offset 0, speed 1 without a clock.
   PlaybackClock::Setting setting() noexcept {
@@ -54,7 +57,7 @@ class SharedClock {
   template <class Change>
   std::optional<PlaybackClock::Setting> change(Change change) noexcept {
     while (const Clocks::Handle handle = current_.load()) {
-      const Clocks::Use use(clocks_, handle);
+      const Clocks::Turn use(clocks_, handle);
       if (!use) continue;  // detached meanwhile: current_ has changed before
       change(*use);
       const PlaybackClock::Setting setting = use->setting();
@@ -141,11 +144,21 @@ class Process {
 
 Process& process() noexcept;
 
-// A use of the sid's stream during a call.
+inline SidTable::Handle handle_of(SSM_sid sid) noexcept {
+  return reinterpret_cast<std::uintptr_t>(sid);
+}
+
+// The sid's stream during a call.
+class SidTurn : public SidTable::Turn {
+ public:
+  explicit SidTurn(SSM_sid sid, bool may_be_alone = true) noexcept
+      : Turn(process().sids(), handle_of(sid), may_be_alone) {}
+};
+
+// The same during a wait, in which other threads have their turns.
 class SidUse : public SidTable::Use {
  public:
-  explicit SidUse(SSM_sid sid) noexcept
-      : Use(process().sids(), reinterpret_cast<std::uintptr_t>(sid)) {}
+  explicit SidUse(SSM_sid sid) noexcept : Use(process().sids(), handle_of(sid)) {}
 };
 
 }  // namespace dssm::ssm

@@ -15,8 +15,12 @@
 namespace dssm::ssm {
 
 // The kernel's id of this thread, asked once per thread.
-int this_thread_id() noexcept;
-void forget_thread_id() noexcept;  // in a forked child
+extern constinit thread_local int kept_thread_id;
+int ask_thread_id() noexcept;  // and keeps it
+inline int this_thread_id() noexcept {
+  const int kept = kept_thread_id;
+  return kept != 0 ? kept : ask_thread_id();
+}
 
 // A lock that its holder may take again: a handler that interrupts its own thread in a read must
 // not block, as it did not in the old library, which had no lock there.
@@ -52,6 +56,22 @@ class ReentrantLock {
  private:
   std::atomic<int> owner_{0};
   int depth_ = 0;  // owner only
+};
+
+// Holds the lock, unless nothing needs it because this thread is alone with what it guards.
+class LockUnlessAlone {
+ public:
+  LockUnlessAlone(ReentrantLock& lock, bool alone) noexcept : lock_(alone ? nullptr : &lock) {
+    if (lock_) lock_->lock();
+  }
+  LockUnlessAlone(const LockUnlessAlone&) = delete;
+  LockUnlessAlone& operator=(const LockUnlessAlone&) = delete;
+  ~LockUnlessAlone() {
+    if (lock_) lock_->unlock();
+  }
+
+ private:
+  ReentrantLock* const lock_;
 };
 
 // Waits in a loop until something succeeds or the person presses Ctrl-C. Blocks signals except in

@@ -32,6 +32,9 @@ void free_copy(std::byte* copy, std::size_t payload_bytes) noexcept {
   if (copy) ::munmap(copy, payload_bytes + kGuardBytes);
 }
 
+// Samples up to here are read by way of the stack.
+constexpr std::size_t kSmallBytes = 1024;
+
 // A reader that the writer overtakes this often during one read cannot keep up.
 constexpr int kAttempts = 1000;
 
@@ -51,12 +54,12 @@ class Writing {
   explicit operator bool() const noexcept { return allowed_; }
 
  private:
-  static thread_local const Writing* innermost;
+  static constinit thread_local const Writing* innermost;
   const std::uint64_t ring_;
   const Writing* const outer_;
   bool allowed_ = true;
 };
-thread_local const Writing* Writing::innermost = nullptr;
+constinit thread_local const Writing* Writing::innermost = nullptr;
 
 }  // namespace
 
@@ -131,10 +134,10 @@ void Stream::follow_ring(RawReader& open) noexcept {
   if (open.borrow(kNoTid, nothing) == ReadStatus::restarted) on_restart(open);
 }
 
-Tid Stream::newest() noexcept {
+Tid Stream::newest(bool alone) noexcept {
   RawReader* const open = reader_.load(std::memory_order_acquire);
   if (!open) return writer_.load(std::memory_order_acquire)->newest_tid();
-  const std::lock_guard guard(read_lock_);
+  const LockUnlessAlone guard(read_lock_, alone);
   // A program that reads one sample after the other may not have read all of the old ring yet.
   const Tid read = read_.load(std::memory_order_relaxed);
   if (read == kNoTid || open->newest_tid() + offset() <= read) follow_ring(*open);
@@ -144,12 +147,12 @@ Tid Stream::newest() noexcept {
   return newest + offset();
 }
 
-Tid Stream::oldest() noexcept {
-  const Tid top = newest();
+Tid Stream::oldest(bool alone) noexcept {
+  const Tid top = newest(alone);
   if (top < 0) return kNoTid;
   const RawReader* const open = reader_.load(std::memory_order_acquire);
   if (!open) return std::max<Tid>(0, top - static_cast<Tid>(depth()) + 2);
-  const std::lock_guard guard(read_lock_);
+  const LockUnlessAlone guard(read_lock_, alone);
   const Tid oldest = open->oldest_tid();
   return oldest < 0 ? top : oldest + offset();  // a new ring, still empty: nothing before `top`
 }
@@ -165,136 +168,160 @@ Stream::Copy::~Copy() {
   free_copy(stream_.spare_.exchange(bytes_, std::memory_order_acq_rel), stream_.payload_bytes_);
 }
 
+// Repeats read(payload, info) while the stream restarts.
 template <class Read>
-ReadStatus Stream::copy(Copy& out, Read read) noexcept {
-  RawReader* const open = reader();
-  if (!open) return ReadStatus::not_yet;
-  const std::lock_guard guard(read_lock_);
+ReadStatus Stream::read_into(std::byte* payload, SampleInfo& info, RawReader& open,
+                             Read read) noexcept {
   for (int attempt = 0; attempt < kAttempts; ++attempt) {
-    ReadStatus status = read(*open);
+    const ReadStatus status = read(open, std::span(payload, payload_bytes_), info);
     if (status == ReadStatus::restarted) {
-      on_restart(*open);
-      continue;
+      on_restart(open);
+    } else {
+      if (status == ReadStatus::ok) zero_rest({payload, payload_bytes_}, info);
+      return status;
     }
-    if (status != ReadStatus::ok) return status;
-    zero_rest(out.payload(), out.info);
-    BorrowedSample place;  // to read the bytes after the slot, which belong to no sample
-    status = open->borrow(out.info.tid, place);
-    if (status == ReadStatus::restarted) on_restart(*open);
-    if (status != ReadStatus::ok) continue;
-    std::memcpy(out.bytes_ + payload_bytes_, place.payload().data() + payload_bytes_, kGuardBytes);
-    if (!place.still_valid()) continue;
-    out.info.tid += offset();
-    on_returned(out.info.tid);
-    read_.store(out.info.tid, std::memory_order_relaxed);
-    return ReadStatus::ok;
   }
   return ReadStatus::lapped;
 }
 
-ReadStatus Stream::latest(Copy& out) noexcept {
-  return copy(out, [&](RawReader& open) { return open.read_newest(out.payload(), out.info); });
+// The bytes after the slot of a sample, which belong to no sample.
+ReadStatus Stream::copy_guard(std::byte* copy, Tid ring_tid, RawReader& open) noexcept {
+  BorrowedSample place;
+  const ReadStatus status = open.borrow(ring_tid, place);
+  if (status == ReadStatus::restarted) on_restart(open);
+  if (status != ReadStatus::ok) return status;
+  std::memcpy(copy + payload_bytes_, place.payload().data() + payload_bytes_, kGuardBytes);
+  return place.still_valid() ? ReadStatus::ok : ReadStatus::lapped;
 }
 
-ReadStatus Stream::tid(Tid tid, Copy& out) noexcept {
-  return copy(out, [&](RawReader& open) {
-    const Tid wanted = tid - offset();
-    if (wanted < 0) return ReadStatus::too_old;
-    SampleInfo info;
-    if (open.read_info(wanted, info) == ReadStatus::lost) return ReadStatus::lost;
-    for (int attempt = 0; attempt < kAttempts; ++attempt) {
-      // Not by RawReader::read_tid(), which leaves the old ring at once.
-      open.seek(wanted - 1);
-      const ReadStatus status = open.read_next(out.payload(), out.info);
-      if (status != ReadStatus::ok || out.info.tid == wanted) return status;
-      if (wanted < open.oldest_tid()) return ReadStatus::too_old;
-      // A signal handler that reads too moved the cursor in between.
-    }
-    return ReadStatus::lapped;
-  });
-}
-
-ReadStatus Stream::at(Time t, Copy& out) noexcept {
-  return copy(out, [&](RawReader& open) { return open.read_at(t, out.payload(), out.info); });
-}
-
-ReadStatus Stream::find(Time t, SampleInfo& info) noexcept {
+template <class Read>
+ReadStatus Stream::read(Target out, SampleInfo& info, bool alone, Read read) noexcept {
   RawReader* const open = reader();
   if (!open) return ReadStatus::not_yet;
-  const std::lock_guard guard(read_lock_);
+  const LockUnlessAlone guard(read_lock_, alone);
+  ReadStatus status = ReadStatus::lapped;
+  if (out.copy_) {
+    for (int attempt = 0; attempt < kAttempts; ++attempt) {
+      status = read_into(out.copy_->bytes_, info, *open, read);
+      if (status != ReadStatus::ok) return status;
+      status = copy_guard(out.copy_->bytes_, info.tid, *open);
+      if (status == ReadStatus::ok) break;
+    }
+  } else if (payload_bytes_ > kSmallBytes) {
+    status = read_into(out.data_, info, *open, read);
+  } else {
+    std::byte payload[kSmallBytes];
+    status = read_into(payload, info, *open, read);
+    if (status == ReadStatus::ok) std::memcpy(out.data_, payload, data_bytes_);
+  }
+  if (status != ReadStatus::ok) return status;
+  info.tid += offset();
+  on_returned(info.tid);
+  read_.store(info.tid, std::memory_order_relaxed);
+  return ReadStatus::ok;
+}
+
+ReadStatus Stream::latest(Target out, SampleInfo& info, bool alone) noexcept {
+  return read(out, info, alone,
+              [](RawReader& open, std::span<std::byte> payload, SampleInfo& seen) {
+                return open.read_newest(payload, seen);
+              });
+}
+
+ReadStatus Stream::tid(Tid tid, Target out, SampleInfo& info, bool alone) noexcept {
+  return read(out, info, alone,
+              [&](RawReader& open, std::span<std::byte> payload, SampleInfo& seen) {
+                const Tid wanted = tid - offset();
+                if (wanted < 0) return ReadStatus::too_old;
+                SampleInfo stamp;
+                if (open.read_info(wanted, stamp) == ReadStatus::lost) return ReadStatus::lost;
+                for (int attempt = 0; attempt < kAttempts; ++attempt) {
+                  // Not by RawReader::read_tid(), which leaves the old ring at once.
+                  open.seek(wanted - 1);
+                  const ReadStatus status = open.read_next(payload, seen);
+                  if (status != ReadStatus::ok || seen.tid == wanted) return status;
+                  if (wanted < open.oldest_tid()) return ReadStatus::too_old;
+                  // A signal handler that reads too moved the cursor in between.
+                }
+                return ReadStatus::lapped;
+              });
+}
+
+ReadStatus Stream::at(Time t, Target out, SampleInfo& info, bool alone) noexcept {
+  return read(out, info, alone,
+              [t](RawReader& open, std::span<std::byte> payload, SampleInfo& seen) {
+                return open.read_at(t, payload, seen);
+              });
+}
+
+ReadStatus Stream::find(Time t, SampleInfo& info, bool alone) noexcept {
+  RawReader* const open = reader();
+  if (!open) return ReadStatus::not_yet;
+  const LockUnlessAlone guard(read_lock_, alone);
   follow_ring(*open);
   const ReadStatus status = open->find(t, info);
   if (status == ReadStatus::ok) on_returned(info.tid += offset());
   return status;
 }
 
-Duration Stream::clock_error(Tid tid) noexcept {
+Duration Stream::clock_error(Tid tid, bool alone) noexcept {
   RawReader* const open = reader();
   if (!open) return kUnknownClockError;
-  const std::lock_guard guard(read_lock_);
+  const LockUnlessAlone guard(read_lock_, alone);
   follow_ring(*open);
   SampleInfo info;
   return open->read_info(tid - offset(), info) == ReadStatus::ok ? open->clock_error(info)
                                                                  : kUnknownClockError;
 }
 
-ReadStatus Stream::skip_lost(Tid& tid) noexcept {
+ReadStatus Stream::skip_lost(Tid& tid, bool alone) noexcept {
   RawReader* const open = reader();
   if (!open) return ReadStatus::not_yet;
-  const std::lock_guard guard(read_lock_);
+  const LockUnlessAlone guard(read_lock_, alone);
   SampleInfo info;
   ReadStatus status = open->read_info(tid - offset(), info);
   for (; status == ReadStatus::lost; status = open->read_info(tid - offset(), info)) ++tid;
   return status;
 }
 
+// Without a lock: a wait for a given tid uses nothing of the reader that reading changes.
+template <class Wait>
+WaitStatus Stream::wait(MonoTime deadline, Wait wait) noexcept {
+  if (RawReader* const open = reader()) return wait(*open);
+  // Nothing to sleep on; the caller checks again.
+  const timespec sleep = timespec_of(deadline - MonoClock::now());
+  return ::nanosleep(&sleep, nullptr) == 0 ? WaitStatus::timeout : WaitStatus::interrupted;
+}
+
 WaitStatus Stream::wait_for_tid(Tid tid, MonoTime deadline) noexcept {
-  return wait_for(tid, false, deadline);
+  return wait(deadline,
+              [&](RawReader& open) { return open.wait_for_tid(tid - offset(), deadline); });
 }
 
 WaitStatus Stream::wait_for_sample(Tid tid, MonoTime deadline) noexcept {
-  return wait_for(tid, true, deadline);
-}
-
-WaitStatus Stream::wait_for(Tid tid, bool exactly, MonoTime deadline) noexcept {
-  RawReader* const open = reader();
-  if (!open) {  // nothing to sleep on; the caller checks again
-    const timespec sleep = timespec_of(deadline - MonoClock::now());
-    return ::nanosleep(&sleep, nullptr) == 0 ? WaitStatus::timeout : WaitStatus::interrupted;
-  }
-  // Without the lock, so that other threads may read meanwhile: a wait for a given tid uses nothing
-  // of the reader that reading changes.
-  const WaitStatus status = exactly ? open->wait_for_sample(tid - offset(), deadline)
-                                    : open->wait_for_tid(tid - offset(), deadline);
-  // A new ring ends the wait as well: let the caller check again, but not in a tight loop while the
-  // new ring cannot be opened.
-  const auto is_arriving = [&](Tid next) { return skip_lost(next) == ReadStatus::arriving; };
-  if (status == WaitStatus::ready && (newest() < tid || (exactly && is_arriving(tid)))) {
-    const timespec pause{0, 1'000'000};
-    ::nanosleep(&pause, nullptr);
-  }
-  return status;
+  return wait(deadline,
+              [&](RawReader& open) { return open.wait_for_sample(tid - offset(), deadline); });
 }
 
 // --- writing
 
-Tid Stream::write(const void* data, Time time) noexcept {
+Tid Stream::write(const void* data, Time time, bool alone) noexcept {
   RawWriter* const open = writer();
   if (!open) return kNoTid;
   static constexpr std::byte kNothing{};
   const auto* bytes = data_bytes_ > 0 ? static_cast<const std::byte*>(data) : &kNothing;
   const Writing writing(incarnation_);
   if (!writing) return kNoTid;
-  const std::lock_guard guard(write_lock_);
+  const LockUnlessAlone guard(write_lock_, alone);
   return open->write({bytes, payload_bytes_}, time);
 }
 
-Tid Stream::write_in_place(const std::function<void(std::byte*)>& fill, Time time) {
+Tid Stream::write_in_place(const std::function<void(std::byte*)>& fill, Time time, bool alone) {
   RawWriter* const open = writer();
   if (!open) return kNoTid;
   const Writing writing(incarnation_);
   if (!writing) return kNoTid;
-  const std::lock_guard guard(write_lock_);
+  const LockUnlessAlone guard(write_lock_, alone);
   LoanedSample loan = open->loan();
   if (!loan) return kNoTid;
   fill(loan.payload().data());

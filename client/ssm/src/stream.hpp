@@ -3,8 +3,9 @@
 // The stream of an open sid, with a reader and a writer. SSM's open modes do not restrict anything,
 // so the one that was not opened with the sid is opened at its first use.
 //
-// Reads use a private copy: a caller's buffer or callback gets a complete sample, and a read that
-// fails does not change the buffer.
+// Callbacks get a private copy, which is a complete sample. Others read into the caller's memory:
+// small samples by way of the stack, so that a read that fails does not change it; of large ones it
+// may hold parts when the writer overtook the read a thousand times.
 //
 // When the stream restarts (it was removed and recreated, or its owner lost its rings), the reader
 // continues with the new ring, and so do loops of old programs: for them tids keep rising, and the
@@ -13,7 +14,8 @@
 // ring first.
 //
 //   threads  all functions may be called from any thread, and from a signal handler once the reader
-//            and the writer are open
+//            and the writer are open. `alone`: no other thread is in such a function now, so that
+//            locks are not needed (SidTable::Turn)
 #pragma once
 
 #include <atomic>
@@ -46,9 +48,9 @@ class Stream {
   std::uint64_t depth() const noexcept { return depth_.load(std::memory_order_relaxed); }
   Duration cycle() const noexcept { return Duration(cycle_ns_.load(std::memory_order_relaxed)); }
 
-  // As in RawReader. Takes a lock that is held for a short time only.
-  Tid newest() noexcept;
-  Tid oldest() noexcept;
+  // As in RawReader.
+  Tid newest(bool alone) noexcept;
+  Tid oldest(bool alone) noexcept;
 
   // A copy of a sample and its stamps. The 64 bytes after its payload are those after the slot's:
   // callbacks of real programs write a few bytes too many, and read as many.
@@ -58,8 +60,7 @@ class Stream {
     Copy(const Copy&) = delete;
     Copy& operator=(const Copy&) = delete;
     ~Copy();
-    std::span<std::byte> payload() noexcept { return {bytes_, stream_.payload_bytes_}; }
-    SampleInfo info;
+    const std::byte* payload() const noexcept { return bytes_; }
 
    private:
     friend class Stream;
@@ -67,39 +68,55 @@ class Stream {
     std::byte* bytes_;
   };
 
+  // Where a read puts a sample: a Copy, or data_bytes() of the caller's memory.
+  class Target {
+   public:
+    explicit Target(Copy& copy) noexcept : copy_(&copy) {}
+    explicit Target(void* data) noexcept : data_(static_cast<std::byte*>(data)) {}
+
+   private:
+    friend class Stream;
+    Copy* copy_ = nullptr;
+    std::byte* data_ = nullptr;
+  };
+
   // As in RawReader; not_yet also when the reader cannot be opened.
-  ReadStatus latest(Copy& out) noexcept;
-  ReadStatus tid(Tid tid, Copy& out) noexcept;
-  ReadStatus at(Time t, Copy& out) noexcept;
-  ReadStatus find(Time t, SampleInfo& info) noexcept;
+  ReadStatus latest(Target out, SampleInfo& info, bool alone) noexcept;
+  ReadStatus tid(Tid tid, Target out, SampleInfo& info, bool alone) noexcept;
+  ReadStatus at(Time t, Target out, SampleInfo& info, bool alone) noexcept;
+  ReadStatus find(Time t, SampleInfo& info, bool alone) noexcept;
   // RawReader::clock_error() of sample `tid`; kUnknownClockError also when it is not held.
-  Duration clock_error(Tid tid) noexcept;
+  Duration clock_error(Tid tid, bool alone) noexcept;
   // Makes `tid` that of the first sample from there on that is not lost. Returns what
   // RawReader::read_info() says of it.
-  ReadStatus skip_lost(Tid& tid) noexcept;
+  ReadStatus skip_lost(Tid& tid, bool alone) noexcept;
+  // Other threads may read meanwhile. A new ring ends a wait as well.
   WaitStatus wait_for_tid(Tid tid, MonoTime deadline) noexcept;
   WaitStatus wait_for_sample(Tid tid, MonoTime deadline) noexcept;
 
   // Writes one sample; kNoTid when the writer cannot be opened or this thread is writing to the
   // stream already, in a callback or in the code that a signal handler interrupted.
-  Tid write(const void* data, Time time) noexcept;
+  Tid write(const void* data, Time time, bool alone) noexcept;
 
   // Lets `fill` write into the next slot and publishes it. An exception of `fill` passes through,
   // and the slot is not published.
-  Tid write_in_place(const std::function<void(std::byte*)>& fill, Time time);
+  Tid write_in_place(const std::function<void(std::byte*)>& fill, Time time, bool alone);
 
   // In a forked child: locks that other threads of the parent held are free.
   void reset_after_fork() noexcept;
 
  private:
-  // `exactly`: until sample `tid` is settled, else until one of that tid or a later one is here.
-  WaitStatus wait_for(Tid tid, bool exactly, MonoTime deadline) noexcept;
+  template <class Wait>
+  WaitStatus wait(MonoTime deadline, Wait wait) noexcept;
   template <class End, class Open>
   End* end_of(std::atomic<End*>& place, ReentrantLock& lock, Open open) noexcept;
   RawReader* reader() noexcept;
   RawWriter* writer() noexcept;
   template <class Read>
-  ReadStatus copy(Copy& out, Read read) noexcept;
+  ReadStatus read(Target out, SampleInfo& info, bool alone, Read read) noexcept;
+  template <class Read>
+  ReadStatus read_into(std::byte* payload, SampleInfo& info, RawReader& open, Read read) noexcept;
+  ReadStatus copy_guard(std::byte* copy, Tid ring_tid, RawReader& open) noexcept;
   void follow_ring(RawReader& open) noexcept;
   void on_restart(const RawReader& open) noexcept;
   void on_returned(Tid tid) noexcept;
