@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl info: all that is known about one stream or recording; without either, about dssmd itself.
+// dssmctl info: all that is known about one stream or recording; without either, about dssmd
+// itself.
 #include <fmt/format.h>
 
 #include "client/dssmctl/describe.hpp"

@@ -115,6 +115,21 @@ bool Output::must_stop() {
   return stopped_ || stop_requested();
 }
 
+void Output::redraw_line(const std::function<std::string()>& text) {
+  if (!terminal_ || MonoClock::now() < next_line_) return;
+  next_line_ = deadline_in(kLinePeriod);
+  clear_line();
+  add(text());
+  flush();
+  has_line_ = true;
+}
+
+void Output::clear_line() {
+  if (!std::exchange(has_line_, false)) return;
+  add("\r\x1b[K");
+  flush();
+}
+
 bool Output::sleep_until(MonoTime due) {
   while (!must_stop()) {
     const Duration rest = due - MonoClock::now();

@@ -39,6 +39,12 @@ class Output {
   bool flush_changed(std::string_view end);
   bool flush_screen();
 
+  // For a verb that goes on for long: on a terminal a line that the next call replaces, at most
+  // once a second, with what text() returns. clear_line() removes it before anything else is
+  // printed.
+  void redraw_line(const std::function<std::string()>& text);
+  void clear_line();
+
   // Sleeps until `due`. False: it must stop.
   bool sleep_until(MonoTime due);
 
@@ -56,6 +62,7 @@ class Output {
 
  private:
   static constexpr std::size_t kBatchBytes = 64U << 10;
+  static constexpr Duration kLinePeriod = std::chrono::seconds(1);
 
   int fd_;
   bool terminal_;
@@ -63,6 +70,8 @@ class Output {
   bool wide_ = false;
   bool stopped_ = false;
   std::string pending_;
+  bool has_line_ = false;
+  MonoTime next_line_ = deadline_in(kLinePeriod);
   std::string screen_;  // what flush_changed() or flush_screen() showed last
   Result<void> result_;
 };

@@ -21,19 +21,18 @@
 namespace dssm::ctl {
 namespace {
 
-constexpr Duration kProgressPeriod = std::chrono::seconds(1);
 // Samples are recorded some milliseconds late, so not quite in the order of their times.
-constexpr Duration kDisorder = std::chrono::seconds(1);
+constexpr Duration kPlayDisorder = std::chrono::seconds(1);
 
 double seconds_of(Time time) { return static_cast<double>(to_ns(time)) / 1e9; }
 
 // The part of the recording that is played.
-struct Range {
+struct PlayedPart {
   Time from = Time::max(), to = Time::min();
 };
 
-Result<Range> range_of(const Recording& recording, const PlayOptions& options) {
-  Range whole;
+Result<PlayedPart> played_part(const Recording& recording, const PlayOptions& options) {
+  PlayedPart whole;
   for (const RecordedStreamInfo& stream : recording.streams()) {
     if (stream.samples == 0) continue;
     whole.from = std::min(whole.from, stream.first_time);
@@ -46,7 +45,7 @@ Result<Range> range_of(const Recording& recording, const PlayOptions& options) {
     if (!wanted) return otherwise;
     return wanted->back ? saturating_add(whole.to, *wanted->back) : wanted->time;
   };
-  const Range range{moment(options.from, whole.from), moment(options.to, whole.to)};
+  const PlayedPart range{moment(options.from, whole.from), moment(options.to, whole.to)};
   if (range.from > whole.to || range.to < whole.from || range.from > range.to) {
     return Error{Errc::invalid_argument,
                  fmt::format("--from and --to: there is nothing between them; '{}' goes from {} to "
@@ -142,13 +141,13 @@ class Player {
     return {};
   }
 
-  Result<void> play(const Range& range, Pace& pace) {
+  Result<void> play(const PlayedPart& range, Pace& pace) {
     do {
       pace.start(range.from);
       RecordingCursor cursor = recording_.cursor();
       cursor.seek(range.from);
       for (RecordedSample sample; cursor.next(sample);) {
-        if (sample.info.time > saturating_add(range.to, kDisorder)) break;
+        if (sample.info.time > saturating_add(range.to, kPlayDisorder)) break;
         if (!writers_[sample.stream] || sample.info.time < range.from ||
             sample.info.time > range.to) {
           continue;
@@ -162,16 +161,16 @@ class Player {
   }
 
   void print_summary() {
-    clear_line();
+    out_.clear_line();
     const std::size_t streams = static_cast<std::size_t>(std::count_if(
         writers_.begin(), writers_.end(), [](const auto& writer) { return writer.has_value(); }));
     if (options_.json) {
       out_.add(
           json_document({{"file", options_.file}, {"streams", streams}, {"samples", played_}}));
     } else {
-      out_.add(fmt::format("{}: {} {} of {} {} played\n", escaped(options_.file), played_,
-                           played_ == 1 ? "sample" : "samples", streams,
-                           streams == 1 ? "stream" : "streams"));
+      out_.add(fmt::format("{}: {} of {} played\n", escaped(options_.file),
+                           counted(played_, "sample", "samples"),
+                           counted(streams, "stream", "streams")));
     }
   }
 
@@ -221,17 +220,11 @@ class Player {
   }
 
   void show(Time time) {
-    if (!out_.terminal() || options_.json || MonoClock::now() < next_show_) return;
-    next_show_ = deadline_in(kProgressPeriod);
-    clear_line();
-    out_.add(fmt::format("{}: {}, {} samples", escaped(options_.file),
-                         time_text(time, options_.iso), played_));
-    out_.flush();
-    is_line_open_ = true;
-  }
-
-  void clear_line() {
-    if (std::exchange(is_line_open_, false)) out_.add("\r\x1b[K");
+    if (options_.json) return;
+    out_.redraw_line([&] {
+      return fmt::format("{}: {}, {}", escaped(options_.file), time_text(time, options_.iso),
+                         counted(played_, "sample", "samples"));
+    });
   }
 
   const PlayOptions& options_;
@@ -241,8 +234,6 @@ class Player {
   std::vector<std::optional<RawWriter>> writers_;  // of each stream of the recording
   bool is_any_ = false;
   std::uint64_t played_ = 0;
-  MonoTime next_show_ = deadline_in(kProgressPeriod);
-  bool is_line_open_ = false;
 };
 
 }  // namespace
@@ -252,7 +243,7 @@ Result<void> run(const PlayOptions& options, Output& out) {
   for (const std::string& warning : recording.warnings()) {
     print_error(fmt::format("dssmctl: play: {}\n", escaped_message(warning)));
   }
-  const Range range = DSSM_TRY(range_of(recording, options));
+  const PlayedPart range = DSSM_TRY(played_part(recording, options));
   Session session = DSSM_TRY(connect(options));
   std::optional<PlaybackClock> clock;
   if (!options.now) clock = DSSM_TRY(session.open_playback_clock());

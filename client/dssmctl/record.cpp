@@ -17,7 +17,8 @@
 namespace dssm::ctl {
 namespace {
 
-constexpr Duration kProgressPeriod = std::chrono::seconds(1);
+// By then the streams that there are could have been opened.
+constexpr Duration kOpeningTime = std::chrono::seconds(1);
 // Another host that sends nothing more is not waited for longer than that.
 constexpr Duration kMaxPastWait = std::chrono::seconds(10);
 
@@ -39,10 +40,6 @@ std::filesystem::path file_of(const RecordOptions& options) {
     return std::filesystem::path(options.file) / file_name_of_now();
   }
   return options.file;
-}
-
-std::string counted(std::uint64_t number, std::string_view singular, std::string_view plural) {
-  return fmt::format("{} {}", number, number == 1 ? singular : plural);
 }
 
 std::string progress_text(const Recorder& recorder) {
@@ -73,7 +70,7 @@ class RecordingRun {
     } while (recorded && !is_over() && out_.sleep_until(std::min(recorder_.next_take(), end_)));
     const Result<void> finished = recorder_.finish();
     report_notices();
-    clear_line();
+    out_.clear_line();
     print_summary();
     return recorded ? finished : recorded;
   }
@@ -93,17 +90,13 @@ class RecordingRun {
 
   void report() {
     report_notices();
-    const MonoTime now = MonoClock::now();
-    if (now < next_report_) return;
-    next_report_ = now + kProgressPeriod;
-    if (recorder_.streams() == 0 && !std::exchange(has_waited_, true)) {
+    if (recorder_.streams() == 0 && !has_waited_ && MonoClock::now() - started_ > kOpeningTime) {
+      has_waited_ = true;
       notice("no stream fits; what comes is recorded");
     }
-    if (!out_.terminal() || options_.json) return;
-    clear_line();
-    out_.add(fmt::format("{}: {}", escaped(file_.string()), progress_text(recorder_)));
-    out_.flush();
-    is_line_open_ = true;
+    if (options_.json) return;
+    out_.redraw_line(
+        [&] { return fmt::format("{}: {}", escaped(file_.string()), progress_text(recorder_)); });
   }
 
   void report_notices() {
@@ -111,13 +104,8 @@ class RecordingRun {
   }
 
   void notice(const std::string& text) {
-    clear_line();
-    out_.flush();
+    out_.clear_line();
     print_error(fmt::format("dssmctl: record: {}\n", text));
-  }
-
-  void clear_line() {
-    if (std::exchange(is_line_open_, false)) out_.add("\r\x1b[K");
   }
 
   void print_summary() {
@@ -141,12 +129,9 @@ class RecordingRun {
   Recorder& recorder_;
   Output& out_;
   MonoTime end_;
-  // The first one when the streams that there are could have been opened.
-  MonoTime next_report_ = deadline_in(kProgressPeriod);
-  MonoTime past_moved_ = MonoClock::now();
+  MonoTime started_ = MonoClock::now(), past_moved_ = started_;
   std::uint64_t past_samples_ = 0;
   bool has_waited_ = false;
-  bool is_line_open_ = false;
 };
 
 Result<void> repair(const RecordOptions& options, Output& out) {

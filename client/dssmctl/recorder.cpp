@@ -184,8 +184,8 @@ Result<void> Recorder::take() {
   return {};
 }
 
-// Programs give a cycle that is far from the real one, so how much was new counts, too: quickly to a
-// shorter period, slowly to a longer one.
+// Programs give a cycle that is far from the real one, so how much was new counts, too: quickly to
+// a shorter period, slowly to a longer one.
 Duration Recorder::next_period() {
   const double factor = filled_ > 0 ? std::min(kFilled / filled_, kGrowth) : kGrowth;
   Duration limit = kMaxPeriod;

@@ -461,6 +461,10 @@ Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t min, std:
   return value;
 }
 
+std::string counted(std::uint64_t number, std::string_view singular, std::string_view plural) {
+  return fmt::format("{} {}", number, number == 1 ? singular : plural);
+}
+
 Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t min) {
   static constexpr std::pair<std::string_view, double> kUnits[] = {
       {"KiB", 1ULL << 10}, {"MiB", 1ULL << 20}, {"GiB", 1ULL << 30}, {"TiB", 1ULL << 40}, {"", 1}};

@@ -61,6 +61,9 @@ std::string seconds_text(std::int64_t ns);
 // `value` with `decimals` digits after the point.
 std::string fixed_text(double value, int decimals);
 
+// "1 sample", "2 samples".
+std::string counted(std::uint64_t number, std::string_view singular, std::string_view plural);
+
 // "512 bytes", "1.50 MiB"; "1.50 MiB/s". Everywhere in units of 1024.
 std::string bytes_text(std::uint64_t bytes);
 std::string byte_rate_text(double bytes_per_second);
@@ -101,8 +104,8 @@ Result<Moment> parse_moment(std::string_view text, Time now);
 // Reads a whole number from `min` to `max`. Fails with invalid_argument.
 Result<std::uint64_t> parse_whole(std::string_view text, std::uint64_t min, std::uint64_t max);
 
-// Reads a number of bytes, "1048576", or with a unit (KiB, MiB, GiB, TiB): "1.5GiB". At least `min`.
-// Fails with invalid_argument.
+// Reads a number of bytes, "1048576", or with a unit (KiB, MiB, GiB, TiB): "1.5GiB". At least
+// `min`. Fails with invalid_argument.
 Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t min);
 
 // Reads a finite number. Fails with invalid_argument.

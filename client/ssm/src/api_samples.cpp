@@ -31,8 +31,8 @@ bool is_to_come(ReadStatus status) noexcept {
   return status == ReadStatus::not_yet || status == ReadStatus::arriving;
 }
 
-// After a wait that did not bring the sample. A new ring ends a wait, too: not in a tight loop while
-// it cannot be opened.
+// After a wait that did not bring the sample. A new ring ends a wait, too: not in a tight loop
+// while it cannot be opened.
 void pause_after(dssm::WaitStatus waited) noexcept {
   if (waited != dssm::WaitStatus::ready) return;
   constexpr timespec kPause{0, 1'000'000};

@@ -17,7 +17,8 @@
 // call increments the use count and then checks that the place is open; the reaper finds "closed"
 // and then checks the use count. Both are seq_cst, so at least one of the two sees the other.
 //
-//   threads  Use, Turn and close() from any thread and from signal handlers; the rest under one lock
+//   threads  Use, Turn and close() from any thread and from signal handlers; the rest under one
+//            lock
 #pragma once
 
 #include <linux/membarrier.h>
