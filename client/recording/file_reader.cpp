@@ -236,7 +236,8 @@ bool FileReader::open_by_summary() {
     } else if (record.op == Op::chunk_index) {
       std::optional<ChunkIndex> index = decode_chunk_index(content);
       if (!index) return false;
-      chunks[index->offset] = *std::move(index);
+      const std::uint64_t offset = index->offset;
+      chunks[offset] = *std::move(index);
     } else if (record.op == Op::attachment_index) {
       AttachmentIndex about;
       about.offset = from.number<std::uint64_t>();

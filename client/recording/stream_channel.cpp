@@ -200,22 +200,22 @@ void encode_message(Buffer& out, std::uint16_t channel, const TypeInfo& type,
   if (!is_sequence(type) && payload.size() < type.payload_bytes) {
     std::memset(to, 0, type.payload_bytes - payload.size());
     to += type.payload_bytes - payload.size();
-    flags |= kHasPayloadBytes;
+    flags |= has_payload_bytes;
   }
-  if (info.clock_error != kUnknownClockError) flags |= kHasClockError;
-  if (clock_error != kUnknownClockError) flags |= kHasClockBound;
-  if (tid >> 32 != 0) flags |= kHasTidHigh;
-  if (info.time < Time{}) flags |= kHasEarlyTime;
+  if (info.clock_error != kUnknownClockError) flags |= has_clock_error;
+  if (clock_error != kUnknownClockError) flags |= has_clock_bound;
+  if (tid >> 32 != 0) flags |= has_tid_high;
+  if (info.time < Time{}) flags |= has_early_time;
   if (flags != 0) {
     to = put(to, static_cast<std::uint8_t>(flags));
     const auto add = [&](TrailerFlag flag, std::uint64_t value) {
       if ((flags & flag) != 0) to = put_varint(to, value);
     };
-    add(kHasClockError, static_cast<std::uint64_t>(to_ns(info.clock_error)));
-    add(kHasClockBound, static_cast<std::uint64_t>(to_ns(clock_error)));
-    add(kHasTidHigh, tid >> 32);
-    add(kHasPayloadBytes, payload.size());
-    add(kHasEarlyTime, static_cast<std::uint64_t>(to_ns(info.time)));
+    add(has_clock_error, static_cast<std::uint64_t>(to_ns(info.clock_error)));
+    add(has_clock_bound, static_cast<std::uint64_t>(to_ns(clock_error)));
+    add(has_tid_high, tid >> 32);
+    add(has_payload_bytes, payload.size());
+    add(has_early_time, static_cast<std::uint64_t>(to_ns(info.time)));
   }
   put(put(first, Op::message), static_cast<std::uint64_t>(to - first) - kRecordHeadBytes);
   out.resize(start + static_cast<std::size_t>(to - first));
@@ -236,14 +236,14 @@ std::optional<MessageSample> decode_message(const TypeInfo& type, std::uint32_t 
   const auto value = [&](TrailerFlag flag, std::uint64_t otherwise) {
     return (flags & flag) != 0 ? varint(from) : otherwise;
   };
-  sample.info.clock_error = duration_of(value(kHasClockError, INT64_MAX));
-  sample.clock_error = duration_of(value(kHasClockBound, INT64_MAX));
-  const std::uint64_t tid_high = value(kHasTidHigh, 0);
-  sample.info.payload_bytes = value(kHasPayloadBytes, sample.info.payload_bytes);
-  sample.info.time = time_from_ns(static_cast<std::int64_t>(value(kHasEarlyTime, log_time)));
+  sample.info.clock_error = duration_of(value(has_clock_error, INT64_MAX));
+  sample.clock_error = duration_of(value(has_clock_bound, INT64_MAX));
+  const std::uint64_t tid_high = value(has_tid_high, 0);
+  sample.info.payload_bytes = value(has_payload_bytes, sample.info.payload_bytes);
+  sample.info.time = time_from_ns(static_cast<std::int64_t>(value(has_early_time, log_time)));
   sample.info.tid = static_cast<Tid>(tid_high << 32 | sequence);
   if (!from.ok() || tid_high > INT32_MAX || sample.info.payload_bytes > type.payload_bytes ||
-      (log_time > INT64_MAX && (flags & kHasEarlyTime) == 0)) {
+      (log_time > INT64_MAX && (flags & has_early_time) == 0)) {
     return std::nullopt;
   }
   return sample;

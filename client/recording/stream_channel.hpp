@@ -28,11 +28,11 @@
 namespace dssm::recording {
 
 enum TrailerFlag : unsigned {
-  kHasClockError = 1,    // info.clock_error [ns]; without: unknown
-  kHasClockBound = 2,    // the bound against the recording PC's clock [ns]; without: unknown
-  kHasTidHigh = 4,       // the high 32 bits of the tid; without: 0
-  kHasPayloadBytes = 8,  // of a sample that is shorter than its type's payload_bytes
-  kHasEarlyTime = 16,    // time before 1970 [ns, two's complement]; without: log_time
+  has_clock_error = 1,    // info.clock_error [ns]; without: unknown
+  has_clock_bound = 2,    // the bound against the recording PC's clock [ns]; without: unknown
+  has_tid_high = 4,       // the high 32 bits of the tid; without: 0
+  has_payload_bytes = 8,  // of a sample that is shorter than its type's payload_bytes
+  has_early_time = 16,    // time before 1970 [ns, two's complement]; without: log_time
 };
 inline constexpr std::size_t kMaxTrailerBytes = 1 + 5 * 10;
 

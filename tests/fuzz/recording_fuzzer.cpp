@@ -19,7 +19,7 @@ namespace {
 
 // A chunk may become so long as it says, up to the largest sample and a margin.
 constexpr std::uint64_t kMaxChunkBytes = 72U << 20;
-// For a sixteenth of what LZ4's decoder takes, whatever is compressed: two blocks of 4 MiB.
+// So many bytes may take what LZ4's decoder takes, whatever is compressed: two blocks of 4 MiB.
 constexpr std::uint64_t kDecoderBytes = 512U << 10;
 
 void count_chunks(std::span<const std::uint8_t> input) {
@@ -30,7 +30,7 @@ void count_chunks(std::span<const std::uint8_t> input) {
     std::memcpy(&chunk_bytes, input.data() + at + kHeadBytes + 16, sizeof chunk_bytes);
     if (length > input.size() - at - kHeadBytes) return;
     const bool is_possible = chunk_bytes <= kMaxChunkBytes && chunk_bytes / 32768 <= length;
-    if (input[at] == 6 && is_possible) fuzz::count_bytes(chunk_bytes + kDecoderBytes);
+    if (input[at] == 6 && is_possible) fuzz::count_bytes(chunk_bytes);
     at += kHeadBytes + length;
   }
 }
@@ -79,6 +79,7 @@ std::vector<Seen> read_everything(const Recording& recording) {
 
 void fuzz::run_input(std::span<const std::uint8_t> input) {
   count_chunks(input);
+  fuzz::count_bytes(kDecoderBytes);
   const int fd = ::memfd_create("fuzz-recording", MFD_CLOEXEC);
   const auto size = static_cast<ssize_t>(input.size());
   if (fd < 0 || ::write(fd, input.data(), input.size()) != size) std::abort();
