@@ -35,9 +35,9 @@ struct Small {
 void small() {
   SSMApi<Small> writer("small", 0), reader("small", 0);
   check(writer.create(kDepth * 0.001, 0.001) && reader.open());
-  // As long between two samples as the calls take: stamps of now.
+  // Stamps of about now, in the steps that a double of today has.
   double time = gettimeSSM();
-  constexpr double kCycle = 1e-7;
+  constexpr double kCycle = 4.76837158203125e-7;  // 2^-21
   const auto write = [&] { check(writer.write(time += kCycle)); };
   for (int i = 0; i < 2 * kDepth; ++i) write();
   const auto row = [](const char* name, const char* target, const auto& ours) {

@@ -190,7 +190,8 @@ class SSMApiBase {
   }
 
   // Sample number `readId`, the newest one when negative. A false from any of the reads leaves
-  // data, timeId and time as they were.
+  // timeId and time as they were, and data of up to 1024 bytes. Longer data are unspecified then,
+  // because the writer may have overtaken the read while it copied.
   virtual bool read(SSM_tid readId = -1) {
     if (!fits("read")) return false;
     const SSM_tid tid = readSSM(ssmId, mData, &time, readId);

@@ -152,7 +152,8 @@ class HandleTable {
   class Turn {
    public:
     //   may_be_alone  false: only if this thread is already, in a turn that was interrupted
-    Turn(HandleTable& table, Handle handle, bool may_be_alone = true) noexcept
+    [[gnu::always_inline]] Turn(HandleTable& table, Handle handle,
+                                bool may_be_alone = true) noexcept
         : table_(table), place_(table.find(handle)) {
       if (!place_) return;
       alone_ = enter(may_be_alone);
@@ -212,7 +213,7 @@ class HandleTable {
     }
 
     // Ends that one thread is alone with the object. This turn counts as a use already.
-    void share() noexcept {
+    [[gnu::cold, gnu::noinline]] void share() noexcept {
       for (;;) {
         std::uint64_t sole = place_->sole.load(std::memory_order_acquire);
         if (sole == kShared) return;

@@ -210,7 +210,7 @@ ReadStatus Stream::read(Target out, SampleInfo& info, bool alone, Read read) noe
   } else if (payload_bytes_ > kSmallBytes) {
     status = read_into(out.data_, info, *open, read);
   } else {
-    std::byte payload[kSmallBytes];
+    alignas(64) std::byte payload[kSmallBytes];  // as slots are: no copy crosses a cache line
     status = read_into(payload, info, *open, read);
     if (status == ReadStatus::ok) std::memcpy(out.data_, payload, data_bytes_);
   }
