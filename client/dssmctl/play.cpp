@@ -251,7 +251,7 @@ Result<void> run(const PlayOptions& options, Output& out) {
   DSSM_TRY(player.prepare());
   catch_stop_signals();
   Pace pace(std::move(clock), options.rate);
-  const Result<void> played = player.play(range, pace);
+  Result<void> played = player.play(range, pace);
   player.print_summary();
   return played;
 }

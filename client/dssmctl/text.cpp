@@ -468,7 +468,7 @@ std::string counted(std::uint64_t number, std::string_view singular, std::string
 Result<std::uint64_t> parse_bytes(std::string_view text, std::uint64_t min) {
   static constexpr std::pair<std::string_view, double> kUnits[] = {
       {"KiB", 1ULL << 10}, {"MiB", 1ULL << 20}, {"GiB", 1ULL << 30}, {"TiB", 1ULL << 40}, {"", 1}};
-  constexpr double kMax = 1ULL << 62;
+  constexpr double kMax = 0x1p62;
   for (const auto& [unit, factor] : kUnits) {
     if (!text.ends_with(unit)) continue;
     const Result<double> number = parse_real(text.substr(0, text.size() - unit.size()));

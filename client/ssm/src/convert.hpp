@@ -86,6 +86,7 @@ inline std::int64_t ns_from_seconds(double seconds) noexcept {
   auto whole = static_cast<std::int64_t>(seconds);
   if (static_cast<double>(whole) > seconds) --whole;
   const double rest_ns = (seconds - static_cast<double>(whole)) * 1e9;
+  // NOLINTNEXTLINE(bugprone-incorrect-roundings): >= 0, and of many bits less than a double has
   return whole * kSecond + static_cast<std::int64_t>(rest_ns + 0.5);
 }
 
