@@ -289,7 +289,7 @@ void add_info(CLI::App& app, Parsed& parsed) {
     require(!all.watch || !is_recording(all.stream), "--watch: of a stream, not of a recording");
   });
   info->add_option("STREAM", options.stream,
-                   std::string(kStreamHelp) + "; or a recording: a file *.mcap, or a path with '/'")
+                   std::string(kStreamHelp) + "; or a recording: a file *.mcap, or a path")
       ->type_name("");
   add_watch(info, options.watch);
 }

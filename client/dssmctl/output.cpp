@@ -33,6 +33,10 @@ void catch_stop_signals() {
   action.sa_handler = on_signal;  // without SA_RESTART: waits end
   ::sigaction(SIGINT, &action, nullptr);
   ::sigaction(SIGTERM, &action, nullptr);
+  struct sigaction hangup {};  // the terminal was closed; ignored under nohup
+  if (::sigaction(SIGHUP, nullptr, &hangup) == 0 && hangup.sa_handler != SIG_IGN) {
+    ::sigaction(SIGHUP, &action, nullptr);
+  }
 }
 
 bool stop_requested() { return stop_mark.load(std::memory_order_relaxed); }

@@ -21,9 +21,6 @@
 namespace dssm::ctl {
 namespace {
 
-// Samples are recorded some milliseconds late, so not quite in the order of their times.
-constexpr Duration kPlayDisorder = std::chrono::seconds(1);
-
 double seconds_of(Time time) { return static_cast<double>(to_ns(time)) / 1e9; }
 
 // The part of the recording that is played.
@@ -120,6 +117,8 @@ class Player {
 
   // Creates the streams.
   Result<void> prepare() {
+    const DaemonInfo daemon = DSSM_TRY(session_.daemon_info());
+    own_host_ = daemon.host;
     const StreamFilter filter({}, options_.patterns);
     std::map<std::string, std::string> sources;  // by the name here
     for (const RecordedStreamInfo& stream : recording_.streams()) {
@@ -142,12 +141,14 @@ class Player {
   }
 
   Result<void> play(const PlayedPart& range, Pace& pace) {
+    std::uint64_t played_before = 0;
     do {
+      played_before = played_;
       pace.start(range.from);
       RecordingCursor cursor = recording_.cursor();
       cursor.seek(range.from);
       for (RecordedSample sample; cursor.next(sample);) {
-        if (sample.info.time > saturating_add(range.to, kPlayDisorder)) break;
+        // Samples of a slow host may have been recorded late: to the very end.
         if (!writers_[sample.stream] || sample.info.time < range.from ||
             sample.info.time > range.to) {
           continue;
@@ -156,7 +157,10 @@ class Player {
         if (!pace.await(sample.info.time, out_)) return {};
         DSSM_TRY(write(sample, pace));
       }
-    } while (options_.loop && !out_.must_stop());
+      if (played_ == played_before) {
+        return Error{Errc::not_found, "no sample of these streams is in that part"};
+      }
+    } while (options_.loop && pace.await(range.to, out_));
     return {};
   }
 
@@ -175,15 +179,16 @@ class Player {
   }
 
  private:
-  // Its name here; without a host it is a stream of this PC.
+  // Its name here, with a host.
   Result<StreamId> target_of(const StreamId& id) const {
     StreamId target = id;
-    if (!options_.on_hosts) target.host.clear();
+    if (!options_.on_hosts) target.host = own_host_;
     for (const std::string& mapping : options_.mappings) {
       const std::size_t equals = mapping.find('=');
-      if (StreamFilter({}, {mapping.substr(0, equals)}).takes(id)) {
-        return StreamId::parse(mapping.substr(equals + 1));
-      }
+      if (!StreamFilter({}, {mapping.substr(0, equals)}).takes(id)) continue;
+      target = DSSM_TRY(StreamId::parse(mapping.substr(equals + 1)));
+      if (target.host.empty()) target.host = own_host_;
+      break;
     }
     return target;
   }
@@ -231,6 +236,7 @@ class Player {
   Session session_;
   const Recording& recording_;
   Output& out_;
+  std::string own_host_;
   std::vector<std::optional<RawWriter>> writers_;  // of each stream of the recording
   bool is_any_ = false;
   std::uint64_t played_ = 0;

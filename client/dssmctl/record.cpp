@@ -81,8 +81,8 @@ class RecordingRun {
     if (now >= end_ || (options_.until && WallClock::now() >= options_.until->time)) return true;
     if (!options_.past || options_.duration || options_.until || options_.follow) return false;
     if (recorder_.has_past()) return true;
-    const std::uint64_t samples = recorder_.progress().samples;
-    if (std::exchange(past_samples_, samples) != samples) past_moved_ = now;
+    const std::uint64_t progress = recorder_.past_progress();
+    if (std::exchange(past_progress_, progress) != progress) past_moved_ = now;
     if (now - past_moved_ < kMaxPastWait) return false;
     notice("not all of the past has come; is another host slow or silent? See `dssmctl hosts`");
     return true;
@@ -130,7 +130,7 @@ class RecordingRun {
   Output& out_;
   MonoTime end_;
   MonoTime started_ = MonoClock::now(), past_moved_ = started_;
-  std::uint64_t past_samples_ = 0;
+  std::uint64_t past_progress_ = 0;
   bool has_waited_ = false;
 };
 

@@ -29,7 +29,7 @@ void Recorder::Opener::end() {
   watch_.reset();
   {
     const std::lock_guard lock(mutex_);
-    stopping_ = true;
+    if (!stop_at_) stop_at_ = deadline_in(kEndingTime);
   }
   changed_.notify_one();
   if (thread_.joinable()) thread_.join();
@@ -74,12 +74,32 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   changed_.notify_one();
 }
 
+std::vector<Recorder::Opener::Wanted>::iterator Recorder::Opener::next_wanted() {
+  auto next = wanted_.end();
+  for (auto wanted = wanted_.begin(); wanted != wanted_.end(); ++wanted) {
+    if (stop_at_ && (!wanted->from_start || wanted->reported)) continue;
+    if (next == wanted_.end() || wanted->due < next->due) next = wanted;
+  }
+  return next;
+}
+
+void Recorder::Opener::reopen(const StreamId& id, const Error& error) {
+  const std::lock_guard lock(mutex_);
+  notices_.push_back(
+      fmt::format("'{}' is opened again: {}", escaped(id.str()), escaped_message(error.message)));
+  known_.erase(id.str());
+  Wanted wanted;
+  wanted.stream.id = id;
+  wanted.due = MonoClock::now();
+  wanted_.push_back(std::move(wanted));
+  changed_.notify_one();
+}
+
 void Recorder::Opener::run() {
   std::unique_lock lock(mutex_);
-  while (!stopping_) {
-    const auto next =
-        std::min_element(wanted_.begin(), wanted_.end(),
-                         [](const Wanted& a, const Wanted& b) { return a.due < b.due; });
+  while (true) {
+    const auto next = next_wanted();
+    if (stop_at_ && (next == wanted_.end() || MonoClock::now() >= *stop_at_)) return;
     if (next == wanted_.end()) {
       changed_.wait(lock);
       continue;
@@ -176,9 +196,16 @@ Result<std::unique_ptr<Recorder>> Recorder::start(Session session, RecordingWrit
 Result<void> Recorder::take() {
   for (Opener::Opened& opened : opener_.take_opened()) DSSM_TRY(add(std::move(opened)));
   filled_ = 0;
+  check_readers();
+  std::optional<Time> until;
+  for (const Source& source : sources_) {
+    const std::optional<Time> time = next_past(source);
+    if (time && (!until || *time < *until)) until = time;
+  }
+  if (until) until = saturating_add(*until, kPastPart);
   bool is_more = false;
   for (Source& source : sources_) {
-    if (DSSM_TRY(take(source))) is_more = true;
+    if (DSSM_TRY(take(source, until))) is_more = true;
   }
   next_take_ = is_more ? MonoClock::now() : deadline_in(next_period());
   return {};
@@ -216,14 +243,38 @@ Result<void> Recorder::add_to_file(Source& source, std::vector<std::byte> proper
   return {};
 }
 
-Result<bool> Recorder::take(Source& source) {
+std::optional<Time> Recorder::next_past(const Source& source) {
+  if (source.next > source.past_until) return std::nullopt;
+  SampleInfo info;
+  const Tid next = std::max(source.reader.cursor() + 1, source.reader.oldest_tid());
+  if (source.reader.read_info(next, info) != ReadStatus::ok) return std::nullopt;
+  return info.time;
+}
+
+void Recorder::check_readers() {
+  const MonoTime now = MonoClock::now();
+  if (now < next_check_) return;
+  next_check_ = now + kCheckPeriod;
+  std::erase_if(sources_, [&](const Source& source) {
+    const std::optional<Error> error = source.reader.restart_error();
+    if (error) opener_.reopen(source.reader.id(), *error);
+    return error.has_value();
+  });
+}
+
+Result<bool> Recorder::take(Source& source, std::optional<Time> until) {
   std::uint64_t bytes = 0, samples = 0;
   while (bytes < kTurnBytes) {
+    if (until) {
+      const std::optional<Time> time = next_past(source);
+      if (time && *time > *until) return true;
+    }
     payload_.resize(source.reader.payload_bytes());
     SampleInfo info;
     const ReadStatus status = source.reader.read_next(payload_, info);
     if (status == ReadStatus::restarted) {
-      DSSM_TRY(add_to_file(source, property_of(source.reader)));
+      // Its property is asked for at the end: dssmd may take its time to answer.
+      DSSM_TRY(add_to_file(source, {}));
       source.next = 0;
       source.past_until = kNoTid;
       source.from.reset();
@@ -251,6 +302,14 @@ Result<void> Recorder::write(Source& source, const SampleInfo& info) {
   source.next = info.tid + 1;
   return file_.write(source.number, info, source.reader.clock_error(info),
                      std::span(payload_).first(info.payload_bytes));
+}
+
+std::uint64_t Recorder::past_progress() const {
+  std::uint64_t progress = sources_.size();
+  for (const Source& source : sources_) {
+    progress += static_cast<std::uint64_t>(std::min(source.next, source.past_until + 1) + 1);
+  }
+  return progress;
 }
 
 bool Recorder::has_past() const {

@@ -47,6 +47,9 @@ class Recorder {
   //   fails  as RecordingWriter::write(); what was recorded before stays
   Result<void> take();
 
+  // How much of `plan.past` is recorded: rises until has_past().
+  std::uint64_t past_progress() const;
+
   // When take() is to be called again.
   MonoTime next_take() const { return next_take_; }
 
@@ -71,6 +74,12 @@ class Recorder {
   static constexpr Duration kMinPeriod = std::chrono::milliseconds(1);
   static constexpr Duration kMaxPeriod = std::chrono::milliseconds(50);
   static constexpr Duration kRetryPeriod = std::chrono::seconds(1);
+  static constexpr Duration kEndingTime = std::chrono::seconds(1);
+  static constexpr Duration kCheckPeriod =
+      std::chrono::seconds(1);  // for readers that cannot go on
+  // The past is recorded in parts of this length, each of all streams, so that the recording is
+  // about in the order of times.
+  static constexpr Duration kPastPart = std::chrono::milliseconds(100);
   // What one stream may have taken before the others have their turn.
   static constexpr std::uint64_t kTurnBytes = 4U << 20;
 
@@ -93,8 +102,11 @@ class Recorder {
 
     // All that exists, then all that comes.
     Result<void> begin();
-    // Opens nothing more, and waits for what is being opened.
+    // Opens nothing more, but those that there were at begin(), for a second at most; waits for
+    // that.
     void end();
+    // Opens it again: its reader cannot go on, because of `error`.
+    void reopen(const StreamId& id, const Error& error);
 
     struct Opened {
       Source source;
@@ -111,6 +123,8 @@ class Recorder {
       bool from_start = false;  // it was there at begin()
       bool reported = false;
     };
+    // The one to try next; the end: none.
+    std::vector<Wanted>::iterator next_wanted();
     bool wants(const StreamInfo& stream) const;
     void on_event(const StreamEvent& event);
     void run();
@@ -128,7 +142,7 @@ class Recorder {
     std::size_t untried_ = 0;
     std::vector<Opened> opened_;
     std::vector<std::string> notices_;
-    bool stopping_ = false;
+    std::optional<MonoTime> stop_at_;
 
     std::thread thread_;
     std::optional<Session::Watch> watch_;  // the first to end: it calls on_event()
@@ -141,7 +155,12 @@ class Recorder {
   Result<void> add(Opener::Opened opened);
   Result<void> add_to_file(Source& source, std::vector<std::byte> property);
   // Whether there may be more at once.
-  Result<bool> take(Source& source);
+  //   until  not beyond samples of that time
+  Result<bool> take(Source& source, std::optional<Time> until);
+  // The time of the next sample of the past; empty: there is none, or it is not here.
+  static std::optional<Time> next_past(const Source& source);
+  // What cannot be read any more is opened again.
+  void check_readers();
   Result<void> write(Source& source, const SampleInfo& info);
 
   RecordingWriter file_;
@@ -150,7 +169,7 @@ class Recorder {
   std::vector<std::byte> payload_;
   double filled_ = 0;  // the greatest part of a ring that was new in this turn
   Duration period_ = kMinPeriod;
-  MonoTime next_take_{};
+  MonoTime next_take_{}, next_check_{};
 };
 
 }  // namespace dssm::ctl

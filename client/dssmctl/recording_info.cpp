@@ -119,7 +119,12 @@ void print_text(const Recording& recording, const Sum& sum, bool iso, Output& ou
 }  // namespace
 
 bool is_recording(const std::string& name) {
-  return name.find('/') != std::string::npos || name.ends_with(".mcap");
+  if (name.ends_with(".mcap")) return true;
+  for (const char* start : {"/", "./", "../"}) {
+    if (name.starts_with(start)) return true;
+  }
+  std::error_code ignored;  // names of streams may have slashes, too
+  return name.find('/') != std::string::npos && std::filesystem::exists(name, ignored);
 }
 
 Result<void> print_recording(const std::string& path, const InfoOptions& options, Output& out) {

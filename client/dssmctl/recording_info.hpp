@@ -10,8 +10,8 @@
 
 namespace dssm::ctl {
 
-// Whether a person means a recording and not a stream: a path with a slash, or a name that ends as
-// recordings do.
+// Whether a person means a recording and not a stream: a name that ends as recordings do, begins as
+// paths do, or has a slash and is there.
 bool is_recording(const std::string& name);
 
 // `path` is a file, or a folder with the files of one recording.

@@ -664,6 +664,11 @@ Result<RecordingRepair> FileReader::repair() {
   if (data_start_ == 0) {
     return Error{Errc::protocol, fmt::format("{}: it is empty; delete it", what)};
   }
+  // Whose writer may still be at work, and of whose channels some may be unknown here.
+  if (!is_ours_) {
+    return Error{Errc::invalid_argument,
+                 fmt::format("{}: another program's; `mcap recover` repairs it", what)};
+  }
   Buffer out;
   rebuild_message_indexes(out);
   encode_end(out, summary_, data_end_);

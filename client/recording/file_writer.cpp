@@ -80,6 +80,14 @@ std::uint64_t Summary::samples() const noexcept {
   return samples;
 }
 
+std::uint64_t Summary::payload_bytes() const noexcept {
+  std::uint64_t bytes = 0;
+  for (const IndexedChunk& chunk : chunks) {
+    for (const Part& part : chunk.parts) bytes += part.payload_bytes;
+  }
+  return bytes;
+}
+
 void Chunk::clear() noexcept {
   channels.clear();
   properties.clear();

@@ -68,6 +68,7 @@ struct Summary {
   bool has_index = true;  // dssm.index, which only our files have
 
   std::uint64_t samples() const noexcept;
+  std::uint64_t payload_bytes() const noexcept;
 };
 
 // The data of the attachment "dssm.index", and back: parts of the chunk at each offset. nullopt: it

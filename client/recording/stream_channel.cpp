@@ -231,7 +231,8 @@ std::optional<MessageSample> decode_message(const TypeInfo& type, std::uint32_t 
   if (is_sequence(type)) sample.info.payload_bytes = from.number<std::uint32_t>();
   if (sample.info.payload_bytes > type.payload_bytes) return std::nullopt;
   sample.payload_offset = data.size() - from.rest().size();
-  (void)from.take(sample.info.payload_bytes);
+  const std::uint64_t held_bytes = sample.info.payload_bytes;
+  (void)from.take(held_bytes);
   const std::uint8_t flags = from.rest().empty() ? std::uint8_t{0} : from.number<std::uint8_t>();
   const auto value = [&](TrailerFlag flag, std::uint64_t otherwise) {
     return (flags & flag) != 0 ? varint(from) : otherwise;
@@ -242,7 +243,7 @@ std::optional<MessageSample> decode_message(const TypeInfo& type, std::uint32_t 
   sample.info.payload_bytes = value(has_payload_bytes, sample.info.payload_bytes);
   sample.info.time = time_from_ns(static_cast<std::int64_t>(value(has_early_time, log_time)));
   sample.info.tid = static_cast<Tid>(tid_high << 32 | sequence);
-  if (!from.ok() || tid_high > INT32_MAX || sample.info.payload_bytes > type.payload_bytes ||
+  if (!from.ok() || tid_high > INT32_MAX || sample.info.payload_bytes > held_bytes ||
       (log_time > INT64_MAX && (flags & has_early_time) == 0)) {
     return std::nullopt;
   }

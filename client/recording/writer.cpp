@@ -284,6 +284,7 @@ Result<void> Writer::finish() {
   if (sync_thread_.joinable()) sync_thread_.join();
   const std::lock_guard lock(mutex_);
   if (error_) return *error_;
+  if (sync_error_) return *sync_error_;  // the kernel reports it once, and there it was
   return {};
 }
 
@@ -386,13 +387,16 @@ bool Writer::is_file_full(const Chunk& chunk) const {
 
 Result<void> Writer::begin_file() {
   DSSM_TRY(finish_file());
-  finished_files_.emplace_back(current_.path(), current_.bytes());
-  written_bytes_ += current_.bytes();
   while (true) {
     ++file_number_;
     Result<FileWriter> next = FileWriter::create(numbered(file_, file_number_), recording_, files_);
     if (!next && next.error().code == Errc::conflict) continue;  // of another recording
-    current_ = DSSM_TRY(std::move(next));
+    FileWriter created = DSSM_TRY(std::move(next));
+    finished_files_.emplace_back(current_.path(), current_.bytes());
+    written_bytes_ += current_.bytes();
+    written_samples_ += current_.summary().samples();
+    written_payload_bytes_ += current_.summary().payload_bytes();
+    current_ = std::move(created);
     break;
   }
   ++files_;
@@ -434,7 +438,11 @@ void Writer::delete_oldest() {
 void Writer::fail(Error error) {
   (void)finish_file();
   const std::lock_guard lock(mutex_);
+  // What was waiting, or was removed to make room, is not in a file.
   progress_.file_bytes = written_bytes_ + current_.bytes();
+  progress_.samples = written_samples_ + current_.summary().samples();
+  progress_.payload_bytes = written_payload_bytes_ + current_.summary().payload_bytes();
+  progress_.waiting_bytes = 0;
   error.message += fmt::format(
       "; nothing more is recorded. '{}' {}. {}", current_.path().string(),
       current_.is_whole() ? "is a whole file with what was written before"

@@ -111,8 +111,9 @@ class Writer {
   std::uint32_t file_number_ = 0;  // in its name
   std::vector<DiskStream> disk_streams_;
   std::deque<std::pair<std::filesystem::path, std::uint64_t>> finished_files_;
-  std::uint64_t written_bytes_ = 0;         // to all files but the current one
-  std::uint32_t files_ = 1;                 // begun
+  std::uint64_t written_bytes_ = 0;  // to all files but the current one
+  std::uint64_t written_samples_ = 0, written_payload_bytes_ = 0;  // the same
+  std::uint32_t files_ = 1;                                        // begun
   std::int64_t file_start_ns_ = INT64_MAX;  // least time of a sample in the current file
 
   std::thread disk_thread_, sync_thread_;

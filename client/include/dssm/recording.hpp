@@ -133,7 +133,7 @@ class RecordingWriter {
 struct RecordedStreamInfo : RecordedStream {  // with the last property that it had
   std::uint64_t samples = 0;
   std::uint64_t payload_bytes = 0;
-  std::uint64_t lost_samples = 0;  // of add_gap(), and those in damaged parts of the files
+  std::uint64_t lost_samples = 0;  // of add_gap()
   Tid first_tid = kNoTid, last_tid = kNoTid;
   Time first_time{}, last_time{};  // the least and the greatest; meaningless without samples
 };
@@ -233,7 +233,8 @@ struct RecordingRepair {
 // Completes a file that was not finished, in place: removes what follows the last whole record, and
 // appends what finish() would. Recordings open without it, but take as long as it takes to read all
 // of the file; tools other than DSSM's may refuse such files.
-//   fails  as Recording::open(), and unavailable (it is still being written)
+//   fails  as Recording::open(), unavailable (RecordingWriter is still writing it) and
+//          invalid_argument (another program's)
 Result<RecordingRepair> repair_recording(const std::filesystem::path& file);
 
 // Reads a stream in a recording as RawReader reads one in its ring. Everything is as there, except:

@@ -46,6 +46,7 @@ class HandleTable {
     std::atomic<std::uint32_t> uses{0};
     std::atomic<std::uint64_t> sole{0};    // the only thread that takes turns, kNobody or kShared
     std::atomic<std::uint32_t> inside{0};  // of that thread: kTrying, kInside + turns; it stores it
+    bool was_closed = false;               // of the reaper: before its barrier
     Object* object = nullptr;              // owned; does not change while open or in use
     std::uint64_t made_in = 0;             // process generation that opened it
     [[no_unique_address]] Kept kept{};
@@ -91,11 +92,16 @@ class HandleTable {
              place.made_in == process_generation;
     };
     bool is_any = false;
-    for_each([&](const Place& place) { is_any = is_any || may_be_reaped(place); });
+    for_each([&](Place& place) {
+      place.was_closed = may_be_reaped(place);
+      is_any = is_any || place.was_closed;
+    });
     if (!is_any) return;
     if (has_barrier_) barrier(MEMBARRIER_CMD_PRIVATE_EXPEDITED);
+    // Not those that are closed only now: who is inside of one may not be seen yet.
     for_each([&](Place& place) {
-      if (!may_be_reaped(place) || place.inside.load(std::memory_order_acquire) > 0) return;
+      if (!place.was_closed || !may_be_reaped(place)) return;
+      if (place.inside.load(std::memory_order_acquire) > 0) return;
       delete std::exchange(place.object, nullptr);
       place.next_free = std::exchange(free_, &place);
     });
@@ -200,8 +206,7 @@ class HandleTable {
         place_->inside.store(kInside, std::memory_order_relaxed);
         return true;
       }
-      // Also what this thread was about to try when a handler interrupted it: it will fail, too.
-      place_->inside.store(0, std::memory_order_release);
+      place_->inside.store(before_, std::memory_order_release);
       return false;
     }
 
@@ -212,11 +217,17 @@ class HandleTable {
       if ((place_->state.load(std::memory_order_relaxed) & kOpen) == 0) ::sem_post(&table_.wake_);
     }
 
-    // Ends that one thread is alone with the object. This turn counts as a use already.
+    // Ends that one thread is alone with the object. This turn counts as a use already. In a signal
+    // handler that interrupted its thread in enter(), before it was known whether that is alone,
+    // nothing has begun: the handler goes on, and locks like all others, who wait here meanwhile.
     [[gnu::cold, gnu::noinline]] void share() noexcept {
       for (;;) {
         std::uint64_t sole = place_->sole.load(std::memory_order_acquire);
         if (sole == kShared) return;
+        if ((sole & ~kEnding) == static_cast<std::uint64_t>(this_thread_id()) &&
+            place_->inside.load(std::memory_order_relaxed) == kTrying) {
+          return;
+        }
         if (sole == kNobody) {
           place_->sole.compare_exchange_strong(sole, kShared);
           continue;

@@ -141,6 +141,52 @@ TEST_F(Record, TakesStreamsThatComeLaterAndRestart) {
   expect_poses(reader, 0, 49);
 }
 
+TEST_F(Record, OpensAStreamAgainThatHasAnotherType) {
+  auto pose = std::optional(session_.create<RecordedPose>("pose", depth_of(64)).value());
+  Running running(argv({"record", "-o", file_}), environment());
+  await_reader(pose->id());
+  write_poses(*pose, 0, 9);
+  ASSERT_TRUE(session_.remove(pose->id()));
+  pose.reset();
+  auto number = session_.create<double>("pose", depth_of(64)).value();
+  for (int i = 0; i < 5; ++i) number.write(i);
+  await_reader(number.id());
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  const std::string text = running.rest();
+  EXPECT_TRUE(contains(text, "'pose:0@pc1' is opened again: ")) << text;
+  const Recording recording = Recording::open(file_).value();
+  ASSERT_EQ(recording.streams().size(), 2U) << text;
+  EXPECT_EQ(recording.streams()[0].samples, 10U);
+  EXPECT_EQ(recording.streams()[1].type, number.type());
+  EXPECT_EQ(recording.streams()[1].samples, 5U);
+}
+
+TEST_F(Record, OfThePastIsInTheOrderOfTimesOfAllStreams) {
+  auto first = session_.create<RecordedPose>("first", depth_of(1024)).value();
+  auto second = session_.create<RecordedPose>("second", depth_of(1024)).value();
+  const Time begin = WallClock::now() - 20s;
+  for (int i = 0; i < 1000; ++i) {
+    first.write({0, 0, i}, begin + i * 10ms);
+    second.write({0, 0, i}, begin + i * 10ms);
+  }
+  output({"record", "--past", "1h", "-o", file_});
+  const Recording recording = Recording::open(file_).value();
+  RecordingCursor cursor = recording.cursor();
+  Time newest{};
+  int samples = 0;
+  for (RecordedSample sample; cursor.next(sample); ++samples) {
+    EXPECT_GE(sample.info.time, newest - 200ms);
+    newest = std::max(newest, sample.info.time);
+  }
+  EXPECT_EQ(samples, 2000);
+}
+
+TEST_F(Record, InfoTakesNamesWithASlashForStreams) {
+  const auto pose = session_.create<RecordedPose>("robot/pose", depth_of(4)).value();
+  EXPECT_TRUE(contains(output({"info", "robot/pose"}), "robot/pose"));
+}
+
 // What a ring overwrites while the recorder stands still.
 TEST_F(Record, CountsWhatWasLostInTheFile) {
   auto pose = session_.create<RecordedPose>("pose", depth_of(16)).value();
@@ -257,7 +303,7 @@ TEST_F(Play, IsPacedByThePlaybackClockAndResetsIt) {
   make_recording();
   auto clock = session_.open_playback_clock().value();
   Running running(argv({"play", file_, "--rate", "0.001"}), environment());
-  await([&] { return clock.setting().speed == 0.001; });
+  await([&] { return clock.setting().speed == 0.001 && !clock.setting().paused; });
   EXPECT_LT(clock.now_s(), 1.099);
   clock.set_speed(1e6);
   EXPECT_TRUE(contains(running.rest(), "100 samples of 1 stream played"));
@@ -304,6 +350,22 @@ class RecordFleet : public FleetTest {
  protected:
   TestFolder folder_;
 };
+
+TEST_F(RecordFleet, PlaysHereWhatAnotherHostWritesNow) {
+  const std::string file = folder_.file("a.mcap");
+  auto there = on_pc2_.create<RecordedPose>("pose", depth_of(4)).value();
+  await_streams(1);
+  auto writer = RecordingWriter::create(file).value();
+  const auto number =
+      writer.add_stream({{"pose", 0, "pc2"}, type_of<RecordedPose>(), 64, 1ms, 1, {}}).value();
+  const RecordedPose pose{1, 2, 3};
+  ASSERT_TRUE(writer.write(number, {0, at_ns(kSecond), 1us, sizeof pose}, 1us,
+                           std::as_bytes(std::span(&pose, 1))));
+  ASSERT_TRUE(writer.finish());
+  output({"play", file});
+  EXPECT_EQ(session_.open_reader<RecordedPose>("pose@pc1").value().read_newest()->value.number, 3);
+  EXPECT_EQ(there.newest_tid(), kNoTid);
+}
 
 TEST_F(RecordFleet, PlaysOnTheHostsOfTheStreams) {
   const std::string file = folder_.file("a.mcap");

@@ -190,6 +190,34 @@ TEST_F(DamagedFiles, RefuseAChunkThatClaimsTooMuch) {
   EXPECT_NE(recording.warnings()[0].find("claims"), std::string::npos) << recording.warnings()[0];
 }
 
+// A message that says of its sample that it is longer than what it has.
+TEST_F(DamagedFiles, RefuseASampleThatIsLongerThanItsMessage) {
+  RecordingOptions options;
+  options.compression = Compression::none;
+  RecordingWriter writer = RecordingWriter::create(path("a.mcap"), options).value();
+  const std::uint32_t stream = writer.add_stream(plain_stream("a", 64)).value();
+  Recorded sample = sample_at(0, 10, 64);
+  sample.info.clock_error = sample.clock_error = kUnknownClockError;
+  // After a length of 1: the flag that a length follows, and 64.
+  sample.payload[1] = std::byte{8};
+  sample.payload[2] = std::byte{64};
+  write(writer, stream, sample);
+  ASSERT_TRUE(writer.finish());
+  std::string content = content_of(path("a.mcap"));
+  for (const FoundRecord& record : records_of(content)) {
+    if (record.op != Op::chunk) continue;
+    content.replace(record.start + kRecordHeadBytes + 24, 4, 4, '\0');  // its CRC: none
+    const std::string payload(reinterpret_cast<const char*>(sample.payload.data()), 64);
+    const std::size_t at = content.find(payload, record.start);
+    ASSERT_LT(at, record.end);
+    content[at - 4] = 1;
+  }
+  write_file(path("a.mcap"), content);
+  const Recording recording = open_recording(path("a.mcap"));
+  EXPECT_TRUE(all_of(recording).empty());
+  EXPECT_EQ(recording.warnings().size(), 1U);
+}
+
 TEST_F(DamagedFiles, AreNotRepairedWhileTheyAreWritten) {
   RecordingWriter writer = RecordingWriter::create(path("a.mcap")).value();
   EXPECT_EQ(repair_recording(path("a.mcap")).error().code, Errc::unavailable);
@@ -229,6 +257,8 @@ TEST_F(DamagedFiles, AreWholeAfterTheDiskWasFull) {
     EXPECT_EQ(recording.warnings(), std::vector<std::string>());
     const std::vector<Recorded> samples = all_of(recording);
     EXPECT_TRUE(begins_with(written, samples));
+    EXPECT_EQ(writer.progress().samples, samples.size());
+    EXPECT_EQ(writer.progress().payload_bytes, 24 * samples.size());
     if (limit > 3000) {
       EXPECT_GT(samples.size(), 90U);
     }
@@ -295,34 +325,34 @@ TEST_F(DamagedFiles, OfOtherProgramsAreReadAsFarAsTheirTopicsAreStreams) {
   file.append(records.span());
   const std::string content(reinterpret_cast<const char*>(file.data()), file.size());
 
-  for (const char* name : {"a.mcap", "repaired.mcap"}) {
-    write_file(path(name), content);
-    if (std::string_view(name) != "a.mcap") {
-      ASSERT_TRUE(repair_recording(path(name)));
-    }
-    const Recording recording = open_recording(path(name));
-    const auto warnings = recording.warnings();
-    EXPECT_TRUE(std::ranges::any_of(warnings, [](const std::string& warning) {
-      return warning.find("channel 4") != std::string::npos;
-    }));
-    ASSERT_EQ(recording.streams().size(), 2U);
-    EXPECT_EQ(recording.streams()[0].id.str(), "/scan:0");
-    EXPECT_EQ(recording.streams()[1].id.str(), "imu:2@pc9");
-    EXPECT_EQ(recording.streams()[0].type.payload_bytes, 13U);
-    RecordedRawReader reader = recording.open_raw_reader({"/scan", 0, ""}).value();
-    Bytes payload(13);
-    SampleInfo info;
-    std::string read;
-    while (reader.read_next(payload, info) == ReadStatus::ok) {
-      read += std::to_string(info.tid) + "=";
-      read.append(reinterpret_cast<const char*>(payload.data()), info.payload_bytes);
-      read += " ";
-    }
-    EXPECT_EQ(read, "0=one 1=two 2=four and more ");
-    ASSERT_EQ(reader.read_at(time_from_ns(11), payload, info), ReadStatus::ok);
-    EXPECT_EQ(info.tid, 2);  // times run backwards: the newest one with a time before
-    EXPECT_EQ(reader.clock_error(info), kUnknownClockError);
+  write_file(path("a.mcap"), content);
+  const Recording recording = open_recording(path("a.mcap"));
+  const auto warnings = recording.warnings();
+  EXPECT_TRUE(std::ranges::any_of(warnings, [](const std::string& warning) {
+    return warning.find("channel 4") != std::string::npos;
+  }));
+  ASSERT_EQ(recording.streams().size(), 2U);
+  EXPECT_EQ(recording.streams()[0].id.str(), "/scan:0");
+  EXPECT_EQ(recording.streams()[1].id.str(), "imu:2@pc9");
+  EXPECT_EQ(recording.streams()[0].type.payload_bytes, 13U);
+  RecordedRawReader reader = recording.open_raw_reader({"/scan", 0, ""}).value();
+  Bytes payload(13);
+  SampleInfo info;
+  std::string read;
+  while (reader.read_next(payload, info) == ReadStatus::ok) {
+    read += std::to_string(info.tid) + "=";
+    read.append(reinterpret_cast<const char*>(payload.data()), info.payload_bytes);
+    read += " ";
   }
+  EXPECT_EQ(read, "0=one 1=two 2=four and more ");
+  ASSERT_EQ(reader.read_at(time_from_ns(11), payload, info), ReadStatus::ok);
+  EXPECT_EQ(info.tid, 2);  // times run backwards: the newest one with a time before
+  EXPECT_EQ(reader.clock_error(info), kUnknownClockError);
+  // Its writer may still be at work, and not all of its channels are known here.
+  const auto repaired = repair_recording(path("a.mcap"));
+  ASSERT_FALSE(repaired);
+  EXPECT_EQ(repaired.error().code, Errc::invalid_argument);
+  EXPECT_EQ(content_of(path("a.mcap")), content);
 }
 
 }  // namespace
