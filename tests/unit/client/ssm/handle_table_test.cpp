@@ -37,14 +37,10 @@ using Table = HandleTable<Counter>;
 
 class Turns : public testing::Test {
  protected:
-  Turns() {
-    ::sem_init(&wake_, 0, 0);
-    handle_ = table_->add(std::make_unique<Counter>(destroyed_), 1);
-  }
+  Turns() : handle_(table_->add(std::make_unique<Counter>(destroyed_), 1)) {}
   ~Turns() override {
     table_->close(handle_);
     table_->reap(1);
-    ::sem_destroy(&wake_);
   }
 
   bool is_alone() {
@@ -52,10 +48,14 @@ class Turns : public testing::Test {
     return turn.alone();
   }
 
-  sem_t wake_{};
+  // As in libssm for the life of the process: a table never frees its places.
+  static inline sem_t wake_{};
+  static inline Table* const table_ = [] {
+    ::sem_init(&wake_, 0, 0);
+    return new Table(wake_);
+  }();
   int destroyed_ = 0;
-  std::unique_ptr<Table> table_ = std::make_unique<Table>(wake_);
-  Table::Handle handle_ = 0;
+  const Table::Handle handle_;
 };
 
 TEST_F(Turns, AreAloneUntilAnotherThreadComes) {
