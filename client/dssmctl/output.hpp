@@ -141,8 +141,8 @@ inline std::string json_output(const Json& json, bool one_of_several) {
   return one_of_several ? json_line(json) : json_document(json);
 }
 
-// --- Ctrl-C, for verbs that run until then: SIGINT, SIGTERM and SIGHUP end them with success, after
-// their final output. All other verbs end by these signals at once, as programs do.
+// --- Ctrl-C, for verbs that run until then: SIGINT, SIGTERM and SIGHUP end them with success,
+// after their final output. All other verbs end by these signals at once, as programs do.
 
 // Adds to `out` by `print` what a verb shows; with `watch` each `period` until Ctrl-C, when
 // it has changed, and on a terminal over the last one.
@@ -150,7 +150,8 @@ Result<void> print_once_or_watch(bool watch, bool json, Output& out,
                                  const std::function<Result<void>()>& print,
                                  Duration period = std::chrono::seconds(1));
 
-// From now on SIGINT, SIGTERM and SIGHUP (unless it is ignored) only set a mark, and interrupt system calls.
+// From now on SIGINT, SIGTERM and SIGHUP (unless that is ignored) only set a mark, and interrupt
+// system calls.
 void catch_stop_signals();
 
 bool stop_requested();
