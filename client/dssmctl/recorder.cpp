@@ -146,7 +146,7 @@ Result<Recorder::Opener::Opened> Recorder::Opener::open(const Wanted& wanted) co
                               with_history ? FetchHistory::at_once : FetchHistory::when_read));
   std::vector<std::byte> property = property_of(reader);
   const Tid newest = reader.newest_tid();
-  Source source{std::move(reader), 0, kNoTid, newest, {}};
+  Source source{std::move(reader), 0, kNoTid, with_history ? newest : kNoTid, {}};
   if (!with_history) {
     // What was written since the recording began, if dssmd said what was there then.
     const StreamInfo& then = wanted.stream;
@@ -203,11 +203,11 @@ Result<void> Recorder::take() {
     if (time && (!until || *time < *until)) until = time;
   }
   if (until) until = saturating_add(*until, kPastPart);
-  bool is_more = false;
+  is_more_ = false;
   for (Source& source : sources_) {
-    if (DSSM_TRY(take(source, until))) is_more = true;
+    if (DSSM_TRY(take(source, until))) is_more_ = true;
   }
-  next_take_ = is_more ? MonoClock::now() : deadline_in(next_period());
+  next_take_ = is_more_ ? MonoClock::now() : deadline_in(next_period());
   return {};
 }
 
@@ -325,8 +325,11 @@ bool Recorder::has_past() const {
 std::vector<std::string> Recorder::take_notices() { return opener_.take_notices(); }
 
 Result<void> Recorder::finish() {
-  opener_.end();  // what is just being opened is taken, too
-  DSSM_TRY(take());
+  opener_.end();                                  // what is just being opened is taken, too
+  const MonoTime end = deadline_in(kEndingTime);  // writers may be faster
+  do {
+    DSSM_TRY(take());
+  } while (is_more_ && MonoClock::now() < end);
   // A program may have set it after its stream was opened here.
   for (Source& source : sources_) {
     const Result<std::vector<std::byte>> property = source.reader.property();

@@ -88,7 +88,7 @@ class Recorder {
     RawReader reader;
     std::uint32_t number = 0;  // in the file
     Tid next = kNoTid;  // what was before it is recorded, or known as lost; kNoTid: not known yet
-    Tid past_until = kNoTid;   // the newest at its opening
+    Tid past_until = kNoTid;   // the newest at its opening, if history is wanted
     std::optional<Time> from;  // samples before that are not wanted
   };
 
@@ -169,6 +169,7 @@ class Recorder {
   std::vector<std::byte> payload_;
   double filled_ = 0;  // the greatest part of a ring that was new in this turn
   Duration period_ = kMinPeriod;
+  bool is_more_ = false;  // to be taken at once
   MonoTime next_take_{}, next_check_{};
 };
 
