@@ -18,7 +18,7 @@ namespace dssm::ctl {
 namespace {
 
 // By then the streams that there are could have been opened.
-constexpr Duration kOpeningTime = std::chrono::seconds(1);
+constexpr Duration kFirstNoticeTime = std::chrono::seconds(1);
 // Another host that sends nothing more is not waited for longer than that.
 constexpr Duration kMaxPastWait = std::chrono::seconds(10);
 
@@ -90,7 +90,7 @@ class RecordingRun {
 
   void report() {
     report_notices();
-    if (recorder_.streams() == 0 && !has_waited_ && MonoClock::now() - started_ > kOpeningTime) {
+    if (recorder_.streams() == 0 && !has_waited_ && MonoClock::now() - started_ > kFirstNoticeTime) {
       has_waited_ = true;
       notice("no stream fits; what comes is recorded");
     }

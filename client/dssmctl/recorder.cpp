@@ -187,14 +187,20 @@ bool Recorder::Opener::has_tried_all() const {
 
 Result<std::unique_ptr<Recorder>> Recorder::start(Session session, RecordingWriter file,
                                                   RecorderPlan plan) {
+  const MonoTime all_by = plan.past ? deadline_in(kOpeningTime) : MonoTime();
   std::unique_ptr<Recorder> recorder(
       new Recorder(std::move(session), std::move(file), std::move(plan)));
+  recorder->all_by_ = all_by;
   DSSM_TRY(recorder->opener_.begin());
   return recorder;
 }
 
 Result<void> Recorder::take() {
   for (Opener::Opened& opened : opener_.take_opened()) DSSM_TRY(add(std::move(opened)));
+  if (!opener_.has_tried_all() && MonoClock::now() < all_by_) {
+    next_take_ = deadline_in(kMinPeriod);
+    return {};
+  }
   filled_ = 0;
   check_readers();
   std::optional<Time> until;

@@ -75,6 +75,8 @@ class Recorder {
   static constexpr Duration kMaxPeriod = std::chrono::milliseconds(50);
   static constexpr Duration kRetryPeriod = std::chrono::seconds(1);
   static constexpr Duration kEndingTime = std::chrono::seconds(1);
+  // So long the past waits for streams to be opened.
+  static constexpr Duration kOpeningTime = std::chrono::seconds(1);
   static constexpr Duration kCheckPeriod =
       std::chrono::seconds(1);  // for readers that cannot go on
   // The past is recorded in parts of this length, each of all streams, so that the recording is
@@ -170,7 +172,7 @@ class Recorder {
   double filled_ = 0;  // the greatest part of a ring that was new in this turn
   Duration period_ = kMinPeriod;
   bool is_more_ = false;  // to be taken at once
-  MonoTime next_take_{}, next_check_{};
+  MonoTime all_by_{}, next_take_{}, next_check_{};
 };
 
 }  // namespace dssm::ctl

@@ -150,13 +150,15 @@ TEST_F(Record, OpensAStreamAgainThatHasAnotherType) {
   pose.reset();
   auto number = session_.create<double>("pose", depth_of(64)).value();
   for (int i = 0; i < 5; ++i) number.write(i);
-  await_reader(number.id());
+  const std::string notice = running.line();
+  EXPECT_TRUE(contains(notice, "'pose:0@pc1' is opened again: ")) << notice;
+  await([&] {
+    const Result<Recording> recording = Recording::open(file_);
+    return recording && recording->streams().size() == 2 && recording->streams()[1].samples == 5;
+  });
   running.signal(SIGINT);
   EXPECT_EQ(running.status(), 0);
-  const std::string text = running.rest();
-  EXPECT_TRUE(contains(text, "'pose:0@pc1' is opened again: ")) << text;
   const Recording recording = Recording::open(file_).value();
-  ASSERT_EQ(recording.streams().size(), 2U) << text;
   EXPECT_EQ(recording.streams()[0].samples, 10U);
   EXPECT_EQ(recording.streams()[1].type, number.type());
   EXPECT_EQ(recording.streams()[1].samples, 5U);
