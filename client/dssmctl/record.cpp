@@ -90,7 +90,8 @@ class RecordingRun {
 
   void report() {
     report_notices();
-    if (recorder_.streams() == 0 && !has_waited_ && MonoClock::now() - started_ > kFirstNoticeTime) {
+    if (recorder_.streams() == 0 && !has_waited_ &&
+        MonoClock::now() - started_ > kFirstNoticeTime) {
       has_waited_ = true;
       notice("no stream fits; what comes is recorded");
     }
