@@ -331,7 +331,8 @@ bool Recorder::has_past() const {
 std::vector<std::string> Recorder::take_notices() { return opener_.take_notices(); }
 
 Result<void> Recorder::finish() {
-  opener_.end();                                  // what is just being opened is taken, too
+  opener_.end();  // what is just being opened is taken, too
+  all_by_ = {};
   const MonoTime end = deadline_in(kEndingTime);  // writers may be faster
   do {
     DSSM_TRY(take());

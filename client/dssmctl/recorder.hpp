@@ -135,10 +135,10 @@ class Recorder {
     Session session_;
     RecorderPlan plan_;
     Time started_{};
-    bool is_beginning_ = true;  // used by the session's thread, after begin() has returned
 
     mutable std::mutex mutex_;
     std::condition_variable changed_;
+    bool is_beginning_ = true;  // begin() runs: what comes is there already
     std::vector<Wanted> wanted_;
     std::set<std::string> known_;  // names of what was opened: they restart by themselves
     std::size_t untried_ = 0;
@@ -172,7 +172,8 @@ class Recorder {
   double filled_ = 0;  // the greatest part of a ring that was new in this turn
   Duration period_ = kMinPeriod;
   bool is_more_ = false;  // to be taken at once
-  MonoTime all_by_{}, next_take_{}, next_check_{};
+  MonoTime all_by_{};     // until then the past waits for streams to be opened
+  MonoTime next_take_{}, next_check_{};
 };
 
 }  // namespace dssm::ctl

@@ -495,7 +495,7 @@ Result<void> FileReader::load_data(const IndexedChunk& chunk, Buffer& out) {
   const auto record = DSSM_TRY(read(index.offset, index.length));
   if (chunk.is_bare) return decompress("", record, record.size(), out);
   if (record.size() < kRecordHeadBytes || head_of(record).op != Op::chunk) {
-    return damaged("it is no chunk");
+    return damaged("it is not a chunk");
   }
   Decoder from(record.subspan(kRecordHeadBytes));
   const std::optional<ChunkHead> head = decode_chunk_head(from);

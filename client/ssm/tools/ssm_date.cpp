@@ -186,7 +186,7 @@ int main(int argc, char** argv) {
     has_acted = true;
   }
   if (optind < argc) {
-    print_error("'%s' is no option; see --help", argv[optind]);
+    print_error("'%s' is not an option; see --help", argv[optind]);
     return 1;
   }
   if (!has_acted) {

@@ -77,7 +77,7 @@ bool parse(int argc, char** argv, Options& options) {
         return print_help(), false;
     }
   }
-  if (optind < argc) return print_error("'%s' is no option; see --help", argv[optind]), false;
+  if (optind < argc) return print_error("'%s' is not an option; see --help", argv[optind]), false;
   if (options.log_name && options.stream_name) return true;
   print_error("give the log's name and the stream's: ssm-logger -l FILE -n NAME");
   return false;
