@@ -449,27 +449,38 @@ void add_play(CLI::App& app, Parsed& parsed) {
   play->add_option("PATTERN", options.patterns,
                    "only streams whose NAME or NAME:ID one of these shell patterns fits")
       ->type_name("");
-  add_parsed(play, "-r,--rate", "X", "how fast: 2 is twice as fast (default: 1)",
-             [&options](const std::string& text) -> Result<void> {
-               constexpr double kMin = 1e-3, kMax = 1e6;
-               options.rate = DSSM_TRY(parse_real(text));
-               if (options.rate >= kMin && options.rate <= kMax) return {};
-               return Error{Errc::invalid_argument,
-                            fmt::format("'{}' is not a rate from 0.001 to 1000000", text)};
-             });
+  CLI::Option* const rate =
+      add_parsed(play, "-r,--rate", "X", "how fast: 2 is twice as fast (default: 1)",
+                 [&options](const std::string& text) -> Result<void> {
+                   constexpr double kMin = 1e-3, kMax = 1e6;
+                   options.rate = DSSM_TRY(parse_real(text));
+                   if (options.rate >= kMin && options.rate <= kMax) return {};
+                   return Error{Errc::invalid_argument,
+                                fmt::format("'{}' is not a rate from 0.001 to 1000000", text)};
+                 });
   add_moment(play, "--from", "begin at TIME: seconds since 1970, ISO 8601, or before the end (-3s)",
              options.from);
   add_moment(play, "--to", "end at TIME", options.to);
-  play->add_flag("-l,--loop", options.loop, "again and again, until Ctrl-C");
+  CLI::Option* const loop =
+      play->add_flag("-l,--loop", options.loop, "again and again, until Ctrl-C");
   play->add_option("--map", options.mappings,
                    "STREAM, a shell pattern, is played as NAME; may be given several times")
       ->type_name("STREAM=NAME")
       ->allow_extra_args(false);
   play->add_flag("--on-hosts", options.on_hosts,
                  "on the hosts that the streams were on (default: all on this PC)");
-  play->add_flag("--now", options.now,
-                 "with the present times, not those of the recording; leaves the playback clock");
+  CLI::Option* const now = play->add_flag(
+      "--now", options.now,
+      "with the present times, not those of the recording; leaves the playback clock");
   play->add_flag("--force", options.force, "also to streams that another program writes");
+  play->add_option("--lockstep", options.lockstep,
+                   "start PROGRAM, and play as fast as it can take it, in the same order each "
+                   "time; may be given several times")
+      ->type_name("'PROGRAM ARGS'")
+      ->allow_extra_args(false)
+      ->excludes(rate)
+      ->excludes(loop)
+      ->excludes(now);
 }
 
 void add_types(CLI::App& app, Parsed& parsed) {

@@ -114,6 +114,7 @@ struct PlayOptions : CommonOptions {
   std::vector<std::string> mappings;  // PATTERN=NAME
   double rate = 1;
   std::optional<Moment> from, to;  // count back from the recording's end
+  std::vector<std::string> lockstep;  // commands; empty: by the clock
   bool loop = false, now = false, on_hosts = false, force = false;
 };
 

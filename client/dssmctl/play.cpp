@@ -2,7 +2,8 @@
 //
 // dssmctl play: a recording into streams, at the pace of the PC's playback clock. Programs that use
 // that clock live in the time of the recording, and `dssmctl playback` changes its speed or pauses
-// it meanwhile. With --now the stamps are those of now, and the clock is left alone.
+// it meanwhile. With --now the stamps are those of now, and the clock is left alone. With --lockstep
+// the clock stands at the time of each sample until the programs have done with it.
 #include <fmt/format.h>
 
 #include <algorithm>
@@ -11,6 +12,7 @@
 #include <map>
 #include <optional>
 
+#include "client/dssmctl/lockstep.hpp"
 #include "client/dssmctl/names.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
@@ -57,22 +59,26 @@ Result<PlayedPart> played_part(const Recording& recording, const PlayOptions& op
 class Pace {
  public:
   // With a clock: the samples' own times, by which it is turned. Without: times from now on.
-  Pace(std::optional<PlaybackClock> clock, double rate) : clock_(std::move(clock)), rate_(rate) {}
+  // With programs in lockstep: as fast as they can take it.
+  Pace(std::optional<PlaybackClock> clock, double rate, std::unique_ptr<Lockstep> lockstep)
+      : clock_(std::move(clock)), rate_(rate), lockstep_(std::move(lockstep)) {}
   Pace(const Pace&) = delete;
   Pace& operator=(const Pace&) = delete;
   ~Pace() {
     if (clock_) clock_->reset();
   }
 
-  // The recording begins now, at time `from`.
-  void start(Time from) {
+  // The recording begins now, at time `from`. False: it must stop.
+  Result<bool> start(Time from) {
     from_ = from;
     started_ = WallClock::now();
-    if (!clock_) return;
-    clock_->set_paused(true);
-    clock_->set_speed(rate_);
-    clock_->set_time(seconds_of(from));
-    clock_->set_paused(false);
+    if (clock_) {
+      clock_->set_paused(true);
+      clock_->set_speed(rate_);
+      clock_->set_time(seconds_of(from));
+      if (!lockstep_) clock_->set_paused(false);
+    }
+    return lockstep_ ? lockstep_->await_start() : true;
   }
 
   // The stamp that a sample with this time gets.
@@ -83,7 +89,10 @@ class Pace {
   }
 
   // Waits until a sample with this time is due. False: it must stop.
-  bool await(Time time, Output& out) const {
+  Result<bool> await(Time time, Output& out) {
+    if (lockstep_) {
+      return lockstep_->advance(time, [this](Time now) { clock_->set_time(seconds_of(now)); });
+    }
     while (!out.must_stop()) {
       const Duration rest = until(time);
       if (rest <= Duration::zero()) return true;
@@ -91,6 +100,12 @@ class Pace {
     }
     return false;
   }
+
+  // A sample was written. False: it must stop.
+  Result<bool> settle() { return lockstep_ ? lockstep_->settle() : true; }
+
+  // There is nothing more to come.
+  Result<void> finish() { return lockstep_ ? lockstep_->finish() : Result<void>{}; }
 
  private:
   // How long until then, if nobody changes the clock.
@@ -106,6 +121,7 @@ class Pace {
 
   std::optional<PlaybackClock> clock_;
   double rate_;
+  std::unique_ptr<Lockstep> lockstep_;
   Time from_{}, started_{};
 };
 
@@ -144,7 +160,7 @@ class Player {
     std::uint64_t played_before = 0;
     do {
       played_before = played_;
-      pace.start(range.from);
+      if (!DSSM_TRY(pace.start(range.from))) return {};
       RecordingCursor cursor = recording_.cursor();
       cursor.seek(range.from);
       for (RecordedSample sample; cursor.next(sample);) {
@@ -154,14 +170,15 @@ class Player {
           continue;
         }
         show(sample.info.time);
-        if (!pace.await(sample.info.time, out_)) return {};
+        if (!DSSM_TRY(pace.await(sample.info.time, out_))) return {};
         DSSM_TRY(write(sample, pace));
+        if (!DSSM_TRY(pace.settle())) return {};
       }
       if (played_ == played_before) {
         return Error{Errc::not_found, "no sample of these streams is in that part"};
       }
-    } while (options_.loop && pace.await(range.to, out_));
-    return {};
+    } while (options_.loop && DSSM_TRY(pace.await(range.to, out_)));
+    return pace.finish();
   }
 
   void print_summary() {
@@ -204,7 +221,7 @@ class Player {
     }
     const History history{std::max(stream.depth, kMinDepth), stream.cycle};
     RawWriter writer =
-        DSSM_TRY(session_.create_raw(id, stream.type, history, {.keep_existing = true}));
+        DSSM_TRY(session_.create_raw(id, stream.type, history, {.keep_existing = keeps_rings_}));
     if (!stream.property.empty()) DSSM_TRY(session_.set_property(writer.id(), stream.property));
     return writer;
   }
@@ -238,6 +255,8 @@ class Player {
   Output& out_;
   std::string own_host_;
   std::vector<std::optional<RawWriter>> writers_;  // of each stream of the recording
+  // In lockstep all is the same each time, also what the rings hold before.
+  const bool keeps_rings_ = options_.lockstep.empty();
   bool is_any_ = false;
   std::uint64_t played_ = 0;
 };
@@ -256,7 +275,11 @@ Result<void> run(const PlayOptions& options, Output& out) {
   Player player(options, std::move(session), recording, out);
   DSSM_TRY(player.prepare());
   catch_stop_signals();
-  Pace pace(std::move(clock), options.rate);
+  std::unique_ptr<Lockstep> lockstep;
+  if (!options.lockstep.empty()) {
+    lockstep = DSSM_TRY(Lockstep::start(options.lockstep, options.socket_path, range.from, out));
+  }
+  Pace pace(std::move(clock), options.rate, std::move(lockstep));
   Result<void> played = player.play(range, pace);
   player.print_summary();
   return played;

@@ -1,11 +1,15 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // The clocks of the public API: this PC's (clock::now()) and the playback clock.
+#include <algorithm>
+#include <cmath>
+#include <ctime>
 #include <dssm/clock.hpp>
 #include <dssm/playback_clock.hpp>
 
 #include "client/src/client.hpp"
 #include "client/src/states.hpp"
+#include "core/base/time.hpp"
 
 namespace dssm::clock {
 
@@ -36,6 +40,12 @@ double real_now_s() noexcept {
   return static_cast<double>(seconds) + static_cast<double>(ns - seconds * 1'000'000'000) * 1e-9;
 }
 
+// At least 1 ns, so that a sleep for it comes to an end behind what it waits for.
+Duration duration_of(double seconds) noexcept {
+  constexpr double kMax_s = 9e9;
+  return Duration(std::llround(std::clamp(seconds, 1e-9, kMax_s) * 1e9));
+}
+
 // The same setting with another rate, so that the clock reads the same now.
 clock::PlaybackSetting rebased(clock::PlaybackSetting setting, double time_s,
                                double real_s) noexcept {
@@ -55,6 +65,23 @@ PlaybackClock::Setting PlaybackClock::setting() const noexcept {
 }
 
 double PlaybackClock::now_s() const noexcept { return state_->record->load().at(real_now_s()); }
+
+WaitStatus PlaybackClock::sleep_until(double time_s) const noexcept {
+  constexpr double kMaxSleep_s = 0.01;
+  for (;;) {
+    const clock::PlaybackSetting setting = state_->record->load();
+    const double missing_s = time_s - setting.at(real_now_s());
+    const double speed = setting.speed;
+    if (speed < 0 ? missing_s >= 0 : missing_s <= 0) return WaitStatus::ready;
+    if (const auto slept = sleep_in_lockstep(duration_of(missing_s))) {
+      if (*slept == WaitStatus::interrupted) return *slept;
+      continue;
+    }
+    const double rest_s = setting.paused || speed == 0 ? kMaxSleep_s : missing_s / speed;
+    const timespec sleep = timespec_of(duration_of(std::min(rest_s, kMaxSleep_s)));
+    if (::nanosleep(&sleep, nullptr) != 0) return WaitStatus::interrupted;
+  }
+}
 
 void PlaybackClock::reset() noexcept {
   state_->record->update([](const clock::PlaybackSetting&) { return clock::PlaybackSetting{}; });

@@ -6,6 +6,7 @@
 
 #include <algorithm>
 
+#include "client/src/lockstep.hpp"
 #include "client/src/states.hpp"
 #include "core/base/quiet_thread.hpp"
 #include "core/base/try.hpp"
@@ -71,7 +72,7 @@ Notifier::~Notifier() {
     const std::lock_guard guard(mutex_);
     stopping_ = true;
   }
-  control_->notify();
+  wake();
   thread_.join();
 }
 
@@ -82,11 +83,18 @@ bool Notifier::add(const std::shared_ptr<ReadyFd>& ready) {
     if (watched_.size() == kMaxWatched) return false;
     watched_.push_back(ready);
   }
-  control_->notify();
+  wake();
   return true;
 }
 
+void Notifier::wake() noexcept {
+  wakes_.fetch_add(1);
+  control_->notify();
+  if (Lockstep* const lockstep = Lockstep::of_process()) lockstep->recheck();
+}
+
 void Notifier::run() {
+  Lockstep* const lockstep = Lockstep::of_process();
   std::vector<std::shared_ptr<ReadyFd>> awake;
   std::vector<std::shared_ptr<const SharedRing>> rings;  // what the bells belong to
   std::vector<ring::Bell*> bells;
@@ -96,6 +104,7 @@ void Notifier::run() {
     // Announce before polling, so that no change in between is missed.
     bells.push_back(control_.get());
     announced.push_back(control_->announce());
+    const std::uint32_t wakes = wakes_.load();
     {
       const std::lock_guard guard(mutex_);
       if (stopping_) return;
@@ -114,6 +123,12 @@ void Notifier::run() {
     }
     if (changed) continue;
     // Rings of readers that are destroyed meanwhile stay mapped until the next wake-up.
+    const auto has_changed = [&] {
+      return wakes_.load() != wakes ||
+             std::count_if(awake.begin(), awake.end(),
+                           [](const auto& ready) { return ready->poll(); }) > 0;
+    };
+    if (lockstep && lockstep->wait_until(kNever, has_changed)) continue;
     [[maybe_unused]] const WaitStatus woken =
         ring::Bell::sleep_any(bells, announced, kNever, sleep);
   }

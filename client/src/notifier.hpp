@@ -63,13 +63,15 @@ class Notifier {
 
   // False when it is full.
   bool add(const std::shared_ptr<ReadyFd>& ready);
-  void wake() noexcept { control_->notify(); }
+  // It checks its list and all rings.
+  void wake() noexcept;
 
  private:
   Notifier() = default;
   void run();
 
   std::shared_ptr<ring::Bell> control_;  // rung when the list changes
+  std::atomic<std::uint32_t> wakes_ = 0;
   std::mutex mutex_;
   std::vector<std::weak_ptr<ReadyFd>> watched_;
   bool stopping_ = false;

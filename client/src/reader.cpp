@@ -10,6 +10,7 @@
 #include <dssm/reader.hpp>
 
 #include "client/src/client.hpp"
+#include "client/src/lockstep.hpp"
 #include "client/src/states.hpp"
 #include "core/base/check.hpp"
 #include "core/base/time.hpp"
@@ -18,12 +19,20 @@
 namespace dssm {
 namespace {
 
+// Empty: this program is not run in lockstep.
+template <class Ready>
+std::optional<WaitStatus> wait_in_lockstep(MonoTime deadline, Ready& ready) noexcept {
+  detail::Lockstep* const lockstep = detail::Lockstep::of_process();
+  return lockstep ? lockstep->wait_until(deadline, std::ref(ready)) : std::nullopt;
+}
+
 // Waits until ready() or the deadline: check, announce, check again, sleep. Returns interrupted
 // only while not ready().
 template <class Ready>
 WaitStatus wait_until(const detail::SharedRing& ring, MonoTime deadline, Ready ready) noexcept {
   if (ready()) return WaitStatus::ready;
   if (deadline != kNever && MonoClock::now() >= deadline) return WaitStatus::timeout;
+  if (const auto waited = wait_in_lockstep(deadline, ready)) return *waited;
   ring::SleepTimes times(ring.mapping->identity().cycle);
   for (;;) {
     const std::uint32_t announced = ring.bell->announce();
@@ -452,6 +461,7 @@ WaitStatus wait_any(std::span<RawReader* const> readers, MonoTime deadline) noex
   std::array<std::uint32_t, kMaxWaitAny> announced;
   if (ready()) return WaitStatus::ready;
   if (deadline != kNever && MonoClock::now() >= deadline) return WaitStatus::timeout;
+  if (const auto waited = wait_in_lockstep(deadline, ready)) return *waited;
   for (;;) {
     for (std::size_t i = 0; i < readers.size(); ++i) {
       bells[i] = readers[i]->state_->stream->ring->bell.get();

@@ -8,6 +8,7 @@
 #include <dssm/session.hpp>
 
 #include "client/src/client.hpp"
+#include "client/src/lockstep.hpp"
 #include "client/src/states.hpp"
 #include "client/src/stream_wait.hpp"
 #include "core/base/text.hpp"
@@ -18,6 +19,9 @@ namespace dssm {
 namespace {
 
 using namespace std::chrono_literals;
+
+// Between attempts to open a stream that is missing, in lockstep.
+constexpr Duration kLockstepPause = 50ms;
 
 std::string quoted(const char* verb, const StreamId& id) {
   return fmt::format("{} '{}'", verb, id.str());
@@ -179,6 +183,14 @@ Result<RawReader> Session::await_raw_reader(const StreamId& id, MonoTime deadlin
         client_->notice(wait.take_notice(now, known));
         lock.lock();
         continue;
+      }
+      if (detail::Lockstep* const lockstep = detail::Lockstep::of_process()) {
+        // When an event arrives is not the same each time, the playback time is.
+        lock.unlock();
+        const auto never = [] { return false; };
+        const auto slept = lockstep->wait_until(std::min(deadline, now + kLockstepPause), never);
+        lock.lock();
+        if (slept) break;
       }
       const MonoTime next = std::min({deadline, wait.next_attempt(), wait.next_notice()});
       if (next == kNever) {

@@ -11,7 +11,10 @@
 //   errors   none: Session::open_playback_clock() reports what can fail
 #pragma once
 
+#include <dssm/sample.hpp>
+#include <dssm/time.hpp>
 #include <memory>
+#include <optional>
 
 namespace dssm::detail {
 struct PlaybackClockState;
@@ -36,6 +39,11 @@ class PlaybackClock {
   // SSM time now [s]: paused_at_s while paused, else speed * CLOCK_REALTIME + offset_s.
   double now_s() const noexcept;
 
+  // Waits until now_s() has reached `time_s`, in the direction in which the clock runs: while it is
+  // paused or stands still, that is not. Follows each change of the clock within 10 ms.
+  //   returns  ready | interrupted (a signal handler ran)
+  WaitStatus sleep_until(double time_s) const noexcept;
+
   // reset(), set_time() and set_offset() may change now_s() at once; set_speed() and set_paused()
   // do not. A robust lock serialises all setters: a process that is killed inside one leaves the
   // old or the new setting. One that is stopped there keeps the others waiting for 2 s; then they
@@ -51,6 +59,14 @@ class PlaybackClock {
   explicit PlaybackClock(std::shared_ptr<detail::PlaybackClockState> state) noexcept;
   std::shared_ptr<detail::PlaybackClockState> state_;
 };
+
+// For programs that sleep by the playback clock in another way than sleep_until(): `dssmctl play
+// --lockstep` runs a program in steps, in which the clock advances only while all of it waits.
+// Sleeps for `playback_time`.
+//   returns  timeout | interrupted (a signal handler ran); empty: the program is not run in steps,
+//            and nothing was done
+//   threads  any
+std::optional<WaitStatus> sleep_in_lockstep(Duration playback_time) noexcept;
 
 }  // namespace dssm
 #pragma GCC visibility pop

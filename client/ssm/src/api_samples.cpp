@@ -39,6 +39,26 @@ void pause_after(dssm::WaitStatus waited) noexcept {
   ::nanosleep(&kPause, nullptr);
 }
 
+// How long a call still waits. A wait that timed out counts as long as it was to be, not as long as
+// it was: in lockstep (dssm/playback_clock.hpp) it lasts that long by the playback clock only.
+class WaitBudget {
+ public:
+  explicit WaitBudget(dssm::Duration time) noexcept : left_(time) {}
+  bool is_spent() const noexcept { return left_ <= dssm::Duration::zero(); }
+
+  template <class Wait>
+  dssm::WaitStatus spend(Wait wait) noexcept {
+    const dssm::MonoTime begin = dssm::MonoClock::now();
+    const dssm::Duration part = std::min(left_, kCheckPause);
+    const dssm::WaitStatus waited = wait(begin + part);
+    left_ -= waited == dssm::WaitStatus::timeout ? part : dssm::MonoClock::now() - begin;
+    return waited;
+  }
+
+ private:
+  dssm::Duration left_;
+};
+
 SSM_tid error_of(ReadStatus status) noexcept {
   if (status == ReadStatus::clock_out_of_bounds) {
     remember_error(
@@ -155,14 +175,13 @@ int waitTID(SSM_sid sid, SSM_tid tid) {
   if (!use) return -1;
   if (tid < 0) return 1;
   const dssm::Tid wanted = ring_tid(tid, newest_of(sid));
-  const dssm::MonoTime deadline = dssm::deadline_in(kWait);
+  WaitBudget budget(kWait);
   for (auto waited = dssm::WaitStatus::timeout;;) {
     if (newest_of(sid) >= wanted) return 1;
     pause_after(waited);
     if (use.closed()) return -1;
-    const dssm::MonoTime now = dssm::MonoClock::now();
-    if (now >= deadline) return 0;
-    waited = use->wait_for_tid(wanted, std::min(deadline, now + kCheckPause));
+    if (budget.is_spent()) return 0;
+    waited = budget.spend([&](dssm::MonoTime until) { return use->wait_for_tid(wanted, until); });
   }
 }
 
@@ -170,7 +189,7 @@ SSM_tid dssm_ssm_next(SSM_sid sid, SSM_tid tid, int waits) {
   const SidUse use(sid);
   if (!use || tid < 0) return SSM_ERROR_NO_DATA;
   dssm::Tid next = ring_tid(tid, newest_of(sid));
-  const dssm::MonoTime deadline = dssm::deadline_in(waits ? kWait : dssm::Duration::zero());
+  WaitBudget budget(waits ? kWait : dssm::Duration::zero());
   const auto is_settled = [&] {
     const SidTurn turn(sid);
     return turn && turn->newest(turn.alone()) >= next &&
@@ -180,9 +199,8 @@ SSM_tid dssm_ssm_next(SSM_sid sid, SSM_tid tid, int waits) {
     if (is_settled()) return ssm_tid(next);
     pause_after(waited);
     if (use.closed()) return SSM_ERROR_NO_DATA;
-    const dssm::MonoTime now = dssm::MonoClock::now();
-    if (now >= deadline) return SSM_ERROR_FUTURE;
-    waited = use->wait_for_sample(next, std::min(deadline, now + kCheckPause));
+    if (budget.is_spent()) return SSM_ERROR_FUTURE;
+    waited = budget.spend([&](dssm::MonoTime until) { return use->wait_for_sample(next, until); });
   }
 }
 

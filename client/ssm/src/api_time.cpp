@@ -8,6 +8,7 @@
 #include <dssm/playback_clock.hpp>
 
 #include "../include/libssm.h"
+#include "convert.hpp"
 #include "process.hpp"
 
 using dssm::PlaybackClock;
@@ -32,6 +33,14 @@ double sleep_factor() noexcept {
 int sleep_scaled(double seconds, double& left) noexcept {
   if (!(seconds >= 0)) {  // NaN too
     errno = EINVAL;
+    return -1;
+  }
+  const double begin = gettimeSSM();
+  const dssm::Duration playback_time(dssm::ssm::ns_from_seconds(seconds));
+  if (const auto slept = dssm::sleep_in_lockstep(playback_time)) {
+    left = std::fmax(seconds - (gettimeSSM() - begin), 0);
+    if (*slept == dssm::WaitStatus::timeout) return 0;
+    errno = EINTR;
     return -1;
   }
   const double factor = sleep_factor();

@@ -80,6 +80,8 @@ class Interruptible {
  public:
   // Sleeps for `time`. False: a signal handler ran.
   bool pause(Duration time) noexcept {
+    // There signals stay blocked until its turn has come.
+    if (sleep_in_lockstep(time)) time = Duration::zero();
     const timespec sleep = timespec_of(time);
     return !(::ppoll(nullptr, 0, &sleep, &block_.before()) < 0 && errno == EINTR);
   }
