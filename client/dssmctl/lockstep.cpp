@@ -157,6 +157,8 @@ bool Lockstep::await_ends() {
     for (const auto& program : programs_) {
       if (program->runs && ::waitpid(program->process, &program->status, WNOHANG) != 0) {
         program->runs = false;
+        // What a shell has left: its programs in the background ignore SIGINT.
+        ::kill(-program->process, SIGTERM);
       }
       is_any |= program->runs;
     }

@@ -156,6 +156,22 @@ class Player {
     return {};
   }
 
+  // Says which other streams of this PC programs may find with samples of before.
+  Result<void> check_leftovers() {
+    for (const StreamInfo& stream : DSSM_TRY(session_.list_own_streams())) {
+      const bool is_played = std::any_of(writers_.begin(), writers_.end(), [&](const auto& writer) {
+        return writer && writer->id().name == stream.id.name && writer->id().id == stream.id.id;
+      });
+      if (is_played || stream.writers > 0 || stream.newest == kNoTid) continue;
+      const std::string name = escaped(short_name(stream.id));
+      print_error(
+          fmt::format("dssmctl: play: '{0}' has samples of an earlier run, which a program "
+                      "may read; `dssmctl rm {0}` removes it\n",
+                      name));
+    }
+    return {};
+  }
+
   Result<void> play(const PlayedPart& range, Pace& pace) {
     std::uint64_t played_before = 0;
     do {
@@ -219,9 +235,13 @@ class Player {
                                "or --force to write beside it",
                                escaped(existing->id.str()), escaped(short_name(id)))};
     }
+    // In lockstep all is the same each time, also what the ring holds at first.
+    if (is_first && existing && !options_.lockstep.empty()) {
+      DSSM_TRY(session_.remove(existing->id));
+    }
     const History history{std::max(stream.depth, kMinDepth), stream.cycle};
     RawWriter writer =
-        DSSM_TRY(session_.create_raw(id, stream.type, history, {.keep_existing = keeps_rings_}));
+        DSSM_TRY(session_.create_raw(id, stream.type, history, {.keep_existing = true}));
     if (!stream.property.empty()) DSSM_TRY(session_.set_property(writer.id(), stream.property));
     return writer;
   }
@@ -255,8 +275,6 @@ class Player {
   Output& out_;
   std::string own_host_;
   std::vector<std::optional<RawWriter>> writers_;  // of each stream of the recording
-  // In lockstep all is the same each time, also what the rings hold before.
-  const bool keeps_rings_ = options_.lockstep.empty();
   bool is_any_ = false;
   std::uint64_t played_ = 0;
 };
@@ -277,6 +295,7 @@ Result<void> run(const PlayOptions& options, Output& out) {
   catch_stop_signals();
   std::unique_ptr<Lockstep> lockstep;
   if (!options.lockstep.empty()) {
+    DSSM_TRY(player.check_leftovers());
     lockstep = DSSM_TRY(Lockstep::start(options.lockstep, options.socket_path, range.from, out));
   }
   Pace pace(std::move(clock), options.rate, std::move(lockstep));

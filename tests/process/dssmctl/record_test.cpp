@@ -4,9 +4,9 @@
 #include <signal.h>
 
 #include <dssm/recording.hpp>
-#include <filesystem>
 
 #include "tests/process/dssmctl/fleet_test.hpp"
+#include "tests/support/folder.hpp"
 
 namespace dssm::test {
 namespace {
@@ -18,24 +18,6 @@ struct RecordedPose {
   std::int64_t number;
 };
 DSSM_DESCRIBE(RecordedPose, x, y, number)
-
-// A folder of its own for files.
-class TestFolder {
- public:
-  std::string file(const std::string& name) const { return path_ / name; }
-  std::string path() const { return path_; }
-  TestFolder() {
-    std::string name = std::filesystem::temp_directory_path() / "dssm-record-XXXXXX";
-    if (!::mkdtemp(name.data())) std::abort();
-    path_ = name;
-  }
-  TestFolder(const TestFolder&) = delete;
-  TestFolder& operator=(const TestFolder&) = delete;
-  ~TestFolder() { std::filesystem::remove_all(path_); }
-
- private:
-  std::filesystem::path path_;
-};
 
 void write_poses(Writer<RecordedPose>& writer, std::int64_t first, std::int64_t last) {
   for (std::int64_t i = first; i <= last; ++i) {
