@@ -449,18 +449,21 @@ void add_play(CLI::App& app, Parsed& parsed) {
   play->add_option("PATTERN", options.patterns,
                    "only streams whose NAME or NAME:ID one of these shell patterns fits")
       ->type_name("");
-  CLI::Option* const rate =
-      add_parsed(play, "-r,--rate", "X", "how fast: 2 is twice as fast (default: 1)",
-                 [&options](const std::string& text) -> Result<void> {
-                   constexpr double kMin = 1e-3, kMax = 1e6;
-                   options.rate = DSSM_TRY(parse_real(text));
-                   if (options.rate >= kMin && options.rate <= kMax) return {};
-                   return Error{Errc::invalid_argument,
-                                fmt::format("'{}' is not a rate from 0.001 to 1000000", text)};
-                 });
+  CLI::Option* const rate = add_parsed(
+      play, "-r,--rate", "X", "how fast: 2 is twice as fast, -1 is backwards (default: 1)",
+      [&options](const std::string& text) -> Result<void> {
+        constexpr double kMin = 1e-3, kMax = 1e6;
+        options.rate = DSSM_TRY(parse_real(text));
+        if (std::fabs(options.rate) >= kMin && std::fabs(options.rate) <= kMax) return {};
+        return Error{
+            Errc::invalid_argument,
+            fmt::format("'{}' is not a rate from 0.001 to 1000000, or from -1000000 to -0.001",
+                        text)};
+      });
   add_moment(play, "--from", "begin at TIME: seconds since 1970, ISO 8601, or before the end (-3s)",
              options.from);
   add_moment(play, "--to", "end at TIME", options.to);
+  play->add_flag("-p,--start-paused", options.start_paused, "until Space is pressed");
   CLI::Option* const loop =
       play->add_flag("-l,--loop", options.loop, "again and again, until Ctrl-C");
   play->add_option("--map", options.mappings,

@@ -119,8 +119,8 @@ bool Output::must_stop() {
   return stopped_ || stop_requested();
 }
 
-void Output::redraw_line(const std::function<std::string()>& text) {
-  if (!terminal_ || MonoClock::now() < next_line_) return;
+void Output::redraw_line(const std::function<std::string()>& text, bool now) {
+  if (!terminal_ || (!now && MonoClock::now() < next_line_)) return;
   next_line_ = deadline_in(kLinePeriod);
   clear_line();
   add(text());

@@ -40,9 +40,9 @@ class Output {
   bool flush_screen();
 
   // For a verb that goes on for long: on a terminal a line that the next call replaces, at most
-  // once a second, with what text() returns. clear_line() removes it before anything else is
-  // printed.
-  void redraw_line(const std::function<std::string()>& text);
+  // once a second unless it is to be now, with what text() returns. clear_line() removes it before
+  // anything else is printed.
+  void redraw_line(const std::function<std::string()>& text, bool now = false);
   void clear_line();
 
   // Sleeps until `due`. False: it must stop.

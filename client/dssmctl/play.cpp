@@ -1,23 +1,30 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl play: a recording into streams, at the pace of the PC's playback clock. Programs that use
-// that clock live in the time of the recording, and `dssmctl playback` changes its speed or pauses
-// it meanwhile. With --now the stamps are those of now, and the clock is left alone. With --lockstep
-// the clock stands at the time of each sample until the programs have done with it.
+// that clock live in the time of the recording; keys, and `dssmctl playback` of another terminal,
+// change its speed and direction, pause it, and let it jump, and the player follows it. With --now
+// the stamps are those of now, and the clock is left alone. With --lockstep the clock stands at the
+// time of each sample until the programs have done with it.
 #include <fmt/format.h>
 
 #include <algorithm>
 #include <cmath>
 #include <dssm/recording.hpp>
+#include <functional>
 #include <map>
 #include <optional>
+#include <set>
+#include <string_view>
+#include <utility>
 
+#include "client/dssmctl/keyboard.hpp"
 #include "client/dssmctl/lockstep.hpp"
 #include "client/dssmctl/names.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
 #include "client/dssmctl/text.hpp"
+#include "client/dssmctl/timeline.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::ctl {
@@ -55,81 +62,65 @@ Result<PlayedPart> played_part(const Recording& recording, const PlayOptions& op
   return range;
 }
 
-// When samples are due.
-class Pace {
+// The samples of the recording that are played, in both directions. What next() returned can be
+// given back, so that it comes again if the direction stays.
+class Course {
  public:
-  // With a clock: the samples' own times, by which it is turned. Without: times from now on.
-  // With programs in lockstep: as fast as they can take it.
-  Pace(std::optional<PlaybackClock> clock, double rate, std::unique_ptr<Lockstep> lockstep)
-      : clock_(std::move(clock)), rate_(rate), lockstep_(std::move(lockstep)) {}
-  Pace(const Pace&) = delete;
-  Pace& operator=(const Pace&) = delete;
-  ~Pace() {
-    if (clock_) clock_->reset();
+  // wanted(): whether the stream with that index is played
+  Course(const Recording& recording, PlayedPart range, std::function<bool(std::size_t)> wanted)
+      : cursor_(recording.cursor()), range_(range), wanted_(std::move(wanted)) {}
+
+  // The next one in that direction; it stays the next one until taken(). nullptr: there is none.
+  const RecordedSample* peek(bool backwards) {
+    if (has_sample_ && backwards_ == backwards) return &sample_;
+    drop();
+    backwards_ = backwards;
+    do {
+      if (!(backwards ? cursor_.previous(sample_) : cursor_.next(sample_))) return nullptr;
+    } while (!wanted_(sample_.stream) || sample_.info.time < range_.from ||
+             sample_.info.time > range_.to);
+    has_sample_ = true;
+    return &sample_;
   }
+  void taken() { has_sample_ = false; }
 
-  // The recording begins now, at time `from`. False: it must stop.
-  Result<bool> start(Time from) {
-    from_ = from;
-    started_ = WallClock::now();
-    if (clock_) {
-      clock_->set_paused(true);
-      clock_->set_speed(rate_);
-      clock_->set_time(seconds_of(from));
-      if (!lockstep_) clock_->set_paused(false);
-    }
-    return lockstep_ ? lockstep_->await_start() : true;
+  // Between the samples before `time` and the others.
+  void seek(Time time) {
+    cursor_.seek(time);
+    has_sample_ = false;
   }
-
-  // The stamp that a sample with this time gets.
-  Time stamp(Time time) const {
-    if (clock_) return time;
-    const double since_ns = static_cast<double>(to_ns(saturating_sub(time, from_))) / rate_;
-    return saturating_add(started_, Duration(std::llround(since_ns)));
-  }
-
-  // Waits until a sample with this time is due. False: it must stop.
-  Result<bool> await(Time time, Output& out) {
-    if (lockstep_) {
-      return lockstep_->advance(time, [this](Time now) { clock_->set_time(seconds_of(now)); });
-    }
-    while (!out.must_stop()) {
-      const Duration rest = until(time);
-      if (rest <= Duration::zero()) return true;
-      if (!out.sleep_until(deadline_in(std::min(rest, kStopCheckPeriod)))) return false;
-    }
-    return false;
-  }
-
-  // A sample was written. False: it must stop.
-  Result<bool> settle() { return lockstep_ ? lockstep_->settle() : true; }
-
-  // There is nothing more to come.
-  Result<void> finish() { return lockstep_ ? lockstep_->finish() : Result<void>{}; }
 
  private:
-  // How long until then, if nobody changes the clock.
-  Duration until(Time time) const {
-    if (!clock_) return saturating_sub(stamp(time), WallClock::now());
-    const double missing_s = seconds_of(time) - clock_->now_s();
-    if (missing_s <= 0) return {};
-    const PlaybackClock::Setting setting = clock_->setting();
-    if (setting.paused || setting.speed <= 0) return kStopCheckPeriod;
-    return std::chrono::duration_cast<Duration>(
-        std::chrono::duration<double>(std::min(missing_s / setting.speed, 1.0)));
+  // The cursor goes back to where it was before what peek() returned.
+  void drop() {
+    if (!std::exchange(has_sample_, false)) return;
+    RecordedSample same;
+    (void)(backwards_ ? cursor_.next(same) : cursor_.previous(same));
   }
 
-  std::optional<PlaybackClock> clock_;
-  double rate_;
-  std::unique_ptr<Lockstep> lockstep_;
-  Time from_{}, started_{};
+  RecordingCursor cursor_;
+  PlayedPart range_;
+  std::function<bool(std::size_t)> wanted_;
+  RecordedSample sample_;
+  bool has_sample_ = false, backwards_ = false;
 };
+
+constexpr std::string_view kKeys =
+    "Space: pause   Right, Left: next, previous sample   Up, Down: faster, slower   R: backwards\n"
+    "PgUp, PgDn: 10 s back, on   Home: begin again   Q: end\n";
 
 // Where the streams of the recording go.
 class Player {
  public:
-  Player(const PlayOptions& options, Session session, const Recording& recording, Output& out)
-      : options_(options), session_(std::move(session)), recording_(recording), out_(out) {}
+  Player(const PlayOptions& options, Session session, const Recording& recording, PlayedPart range,
+         Output& out)
+      : options_(options),
+        session_(std::move(session)),
+        recording_(recording),
+        range_(range),
+        out_(out),
+        course_(recording, range,
+                [this](std::size_t stream) { return writers_[stream].has_value(); }) {}
 
   // Creates the streams.
   Result<void> prepare() {
@@ -172,29 +163,55 @@ class Player {
     return {};
   }
 
-  Result<void> play(const PlayedPart& range, Pace& pace) {
-    std::uint64_t played_before = 0;
-    do {
-      played_before = played_;
-      if (!DSSM_TRY(pace.start(range.from))) return {};
-      RecordingCursor cursor = recording_.cursor();
-      cursor.seek(range.from);
-      for (RecordedSample sample; cursor.next(sample);) {
-        // Samples of a slow host may have been recorded late: to the very end.
-        if (!writers_[sample.stream] || sample.info.time < range.from ||
-            sample.info.time > range.to) {
-          continue;
+  // As the timeline runs, until its end or Ctrl-C. Keys and other programs may change it.
+  Result<void> play_by(Timeline& timeline) {
+    if (keyboard_.is_there()) out_.add(kKeys);
+    timeline.set_speed(options_.rate);
+    jump(timeline, options_.rate < 0 ? range_.to : range_.from);
+    timeline.set_paused(options_.start_paused);
+    while (!out_.must_stop()) {
+      show(timeline);
+      if (timeline.has_jumped()) DSSM_TRY(follow_jump(timeline.now(), timeline));
+      const bool backwards = timeline.speed() < 0;
+      const RecordedSample* const next = course_.peek(backwards);
+      const Time end = backwards ? range_.from : range_.to;
+      const Duration rest = timeline.until(next ? next->info.time : end);
+      if (rest > Duration::zero()) {
+        const Duration sleep = std::min(rest, kStopCheckPeriod);
+        if (const auto key = keyboard_.wait(deadline_in(sleep))) {
+          if (*key == Key::q) break;
+          DSSM_TRY(follow(*key, timeline));
         }
-        show(sample.info.time);
-        if (!DSSM_TRY(pace.await(sample.info.time, out_))) return {};
-        DSSM_TRY(write(sample, pace));
-        if (!DSSM_TRY(pace.settle())) return {};
-      }
-      if (played_ == played_before) {
+      } else if (next) {
+        DSSM_TRY(write(*next, timeline.stamp(next->info.time)));
+        course_.taken();
+      } else if (played_ == 0) {
         return Error{Errc::not_found, "no sample of these streams is in that part"};
+      } else if (options_.loop) {
+        jump(timeline, backwards ? range_.to : range_.from);
+      } else {
+        break;
       }
-    } while (options_.loop && DSSM_TRY(pace.await(range.to, out_)));
-    return pace.finish();
+    }
+    return {};
+  }
+
+  // As fast as programs in lockstep can take it.
+  Result<void> play_by(Lockstep& lockstep, PlaybackClock& clock) {
+    const auto set_clock = [&](Time now) { clock.set_time(seconds_of(now)); };
+    clock.set_speed(1);
+    clock.set_paused(true);
+    set_clock(range_.from);
+    course_.seek(range_.from);
+    if (!DSSM_TRY(lockstep.await_start())) return {};
+    while (const RecordedSample* const next = course_.peek(false)) {
+      show(next->info.time);
+      if (!DSSM_TRY(lockstep.advance(next->info.time, set_clock))) return {};
+      DSSM_TRY(write(*next, next->info.time));
+      course_.taken();
+      if (!DSSM_TRY(lockstep.settle())) return {};
+    }
+    return lockstep.finish();
   }
 
   void print_summary() {
@@ -246,9 +263,8 @@ class Player {
     return writer;
   }
 
-  Result<void> write(const RecordedSample& sample, const Pace& pace) {
+  Result<void> write(const RecordedSample& sample, Time stamp) {
     RawWriter& writer = *writers_[sample.stream];
-    const Time stamp = pace.stamp(sample.info.time);
     const Tid tid = options_.now ? writer.write(sample.payload, stamp)
                                  : writer.write(sample.payload, stamp, sample.info.clock_error);
     if (tid == kNoTid) {
@@ -261,21 +277,128 @@ class Player {
     return {};
   }
 
-  void show(Time time) {
+  // --- by the timeline
+
+  void jump(Timeline& timeline, Time time) {
+    timeline.set_time(time);
+    course_.seek(time);
+    last_stepped_.reset();
+  }
+
+  // The time was set: programs get what the streams had then, as if all had been played until there.
+  Result<void> follow_jump(Time time, const Timeline& timeline) {
+    course_.seek(time);
+    last_stepped_.reset();
+    std::set<std::string> done;  // a stream that restarted is several
+    std::vector<std::byte> payload;
+    for (std::size_t i = 0; i < writers_.size(); ++i) {
+      if (!writers_[i] || !done.insert(recording_.streams()[i].id.str()).second) continue;
+      Result<RecordedRawReader> reader = recording_.open_raw_reader(recording_.streams()[i].id);
+      if (!reader) continue;  // its type has changed on the way
+      payload.resize(reader->payload_bytes());
+      SampleInfo info;
+      ReadStatus status = ReadStatus::restarted;
+      while (status == ReadStatus::restarted) {
+        status = reader->read_at(time - Duration(1), payload, info);
+      }
+      if (status != ReadStatus::ok || info.time < range_.from) continue;
+      DSSM_TRY(write({i, info, kUnknownClockError, std::span(payload).first(info.payload_bytes)},
+                     timeline.stamp(info.time)));
+    }
+    return {};
+  }
+
+  Result<void> jump_to(Timeline& timeline, Time time) {
+    time = std::clamp(time, range_.from, range_.to);
+    timeline.set_time(time);
+    return follow_jump(time, timeline);
+  }
+
+  Result<void> follow(Key key, Timeline& timeline) {
+    constexpr double kFaster = 1.1;  // as `ros2 bag play`
+    constexpr double kMinRate = 1e-3, kMaxRate = 1e6;
+    constexpr Duration kJump = std::chrono::seconds(10);
+    const auto set_rate = [&](double rate) {
+      timeline.set_speed(std::copysign(std::clamp(std::fabs(rate), kMinRate, kMaxRate), rate));
+    };
+    switch (key) {
+      case Key::space:
+        timeline.set_paused(!timeline.is_paused());
+        break;
+      case Key::right:
+        return step(timeline, false);
+      case Key::left:
+        return step(timeline, true);
+      case Key::up:
+        set_rate(timeline.speed() * kFaster);
+        break;
+      case Key::down:
+        set_rate(timeline.speed() / kFaster);
+        break;
+      case Key::r:
+        set_rate(-timeline.speed());
+        break;
+      case Key::page_up:
+        return jump_to(timeline, saturating_add(timeline.now(), -kJump));
+      case Key::page_down:
+        return jump_to(timeline, saturating_add(timeline.now(), kJump));
+      case Key::home:
+        return jump_to(timeline, range_.from);
+      case Key::q:
+        break;
+    }
+    shows_now_ = true;
+    return {};
+  }
+
+  // Pauses, and plays one sample.
+  Result<void> step(Timeline& timeline, bool backwards) {
+    timeline.set_paused(true);
+    const RecordedSample* next = course_.peek(backwards);
+    // After a step in the other direction it would be the one that was played last.
+    if (next && last_stepped_ && last_stepped_->first != backwards &&
+        last_stepped_->second == next->info.time) {
+      course_.taken();
+      next = course_.peek(backwards);
+    }
+    if (!next) return {};
+    const Time time = next->info.time;
+    timeline.set_time(time);
+    DSSM_TRY(write(*next, timeline.stamp(time)));
+    course_.taken();
+    last_stepped_ = {backwards, time};
+    shows_now_ = true;
+    return {};
+  }
+
+  // --- for people
+
+  void show(const Timeline& timeline) {
+    show(timeline.now(), timeline.is_paused()    ? ", paused"
+                         : timeline.speed() == 1 ? ""
+                                                 : fmt::format(", x{:.3g}", timeline.speed()));
+  }
+  void show(Time time, const std::string& state = {}) {
     if (options_.json) return;
-    out_.redraw_line([&] {
-      return fmt::format("{}: {}, {}", escaped(options_.file), time_text(time, options_.iso),
-                         counted(played_, "sample", "samples"));
-    });
+    const auto text = [&] {
+      return fmt::format("{}: {}, {}{}", escaped(options_.file), time_text(time, options_.iso),
+                         counted(played_, "sample", "samples"), state);
+    };
+    out_.redraw_line(text, std::exchange(shows_now_, false));
   }
 
   const PlayOptions& options_;
   Session session_;
   const Recording& recording_;
+  const PlayedPart range_;
   Output& out_;
+  Keyboard keyboard_;
   std::string own_host_;
   std::vector<std::optional<RawWriter>> writers_;  // of each stream of the recording
+  Course course_;
+  std::optional<std::pair<bool, Time>> last_stepped_;  // backwards, and to which time
   bool is_any_ = false;
+  bool shows_now_ = false;  // what a key has changed
   std::uint64_t played_ = 0;
 };
 
@@ -290,16 +413,20 @@ Result<void> run(const PlayOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   std::optional<PlaybackClock> clock;
   if (!options.now) clock = DSSM_TRY(session.open_playback_clock());
-  Player player(options, std::move(session), recording, out);
+  Player player(options, std::move(session), recording, range, out);
   DSSM_TRY(player.prepare());
   catch_stop_signals();
-  std::unique_ptr<Lockstep> lockstep;
-  if (!options.lockstep.empty()) {
+  Result<void> played;
+  if (options.lockstep.empty()) {
+    Timeline timeline(std::move(clock));
+    played = player.play_by(timeline);
+  } else {
     DSSM_TRY(player.check_leftovers());
-    lockstep = DSSM_TRY(Lockstep::start(options.lockstep, options.socket_path, range.from, out));
+    const auto lockstep =
+        DSSM_TRY(Lockstep::start(options.lockstep, options.socket_path, range.from, out));
+    played = player.play_by(*lockstep, *clock);
+    clock->reset();
   }
-  Pace pace(std::move(clock), options.rate, std::move(lockstep));
-  Result<void> played = player.play(range, pace);
   player.print_summary();
   return played;
 }

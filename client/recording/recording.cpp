@@ -409,12 +409,16 @@ struct ReaderState {
 
 struct CursorState {
   std::shared_ptr<Content> content;
-  std::uint32_t file = 0, chunk = 0;
-  std::size_t at = 0;  // of the next message in `loaded`
-  std::shared_ptr<const LoadedChunk> loaded;
+  std::uint32_t file = 0, chunk = 0;  // of the chunk after `loaded`
+  std::size_t at = 0;                 // of the next message in `loaded`
+  std::shared_ptr<const LoadedChunk>
+      loaded;                        // nullptr: before the first one, or after the last one
   std::int64_t from_ns = INT64_MIN;  // earlier ones are passed over, until one is not
 
   bool next_chunk();
+  bool previous_chunk();
+  bool find_next();
+  void get(const Message& message, RecordedSample& out) const;
 };
 
 // Goes to the next chunk; false after the last one.
@@ -435,6 +439,49 @@ bool CursorState::next_chunk() {
   }
   loaded = nullptr;
   return false;
+}
+
+// Goes behind the last message of the chunk before; false before the first one.
+bool CursorState::previous_chunk() {
+  if (loaded != nullptr) --chunk;
+  loaded = nullptr;
+  at = 0;
+  for (;;) {
+    while (chunk == 0) {
+      if (file == 0) return false;
+      chunk = static_cast<std::uint32_t>(content->files[--file]->chunks().size());
+    }
+    loaded = content->load(file, chunk - 1);
+    if (loaded == nullptr) {
+      --chunk;
+      continue;
+    }
+    at = loaded->messages.size();
+    return true;
+  }
+}
+
+// Goes before the next message; false after the last one.
+bool CursorState::find_next() {
+  for (;; ++at) {
+    while (loaded == nullptr || at == loaded->messages.size()) {
+      const std::lock_guard lock(content->mutex);
+      if (!next_chunk()) {
+        from_ns = INT64_MIN;
+        return false;
+      }
+    }
+    if (loaded->messages[at].time_ns >= from_ns) break;
+  }
+  from_ns = INT64_MIN;
+  return true;
+}
+
+void CursorState::get(const Message& message, RecordedSample& out) const {
+  out.stream = content->stream_of_channel[file].at(message.channel);
+  out.info = message.info();
+  out.clock_error = Duration(message.clock_bound_ns);
+  out.payload = loaded->payload(message);
 }
 
 }  // namespace dssm::recording
@@ -563,21 +610,19 @@ RecordingCursor& RecordingCursor::operator=(RecordingCursor&&) noexcept = defaul
 RecordingCursor::~RecordingCursor() = default;
 
 bool RecordingCursor::next(RecordedSample& out) noexcept {
-  while (true) {
-    if (state_->loaded == nullptr || state_->at == state_->loaded->messages.size()) {
-      const std::lock_guard lock(state_->content->mutex);
-      if (!state_->next_chunk()) return false;
-    }
-    const recording::Message& message = state_->loaded->messages[state_->at++];
-    if (message.time_ns < state_->from_ns) continue;
-    state_->from_ns = INT64_MIN;
-    const std::size_t file = state_->file;
-    out.stream = state_->content->stream_of_channel[file].at(message.channel);
-    out.info = message.info();
-    out.clock_error = Duration(message.clock_bound_ns);
-    out.payload = state_->loaded->payload(message);
-    return true;
+  if (!state_->find_next()) return false;
+  state_->get(state_->loaded->messages[state_->at++], out);
+  return true;
+}
+
+bool RecordingCursor::previous(RecordedSample& out) noexcept {
+  if (state_->from_ns != INT64_MIN) (void)state_->find_next();
+  while (state_->loaded == nullptr || state_->at == 0) {
+    const std::lock_guard lock(state_->content->mutex);
+    if (!state_->previous_chunk()) return false;
   }
+  state_->get(state_->loaded->messages[--state_->at], out);
+  return true;
 }
 
 void RecordingCursor::seek(Time t) noexcept {

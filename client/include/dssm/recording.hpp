@@ -161,6 +161,9 @@ class RecordingCursor {
   // The next sample; false after the last one.
   bool next(RecordedSample& out) noexcept;
 
+  // The sample before; false at the beginning. After next() it is that one again, and the reverse.
+  bool previous(RecordedSample& out) noexcept;
+
   // Goes to the first sample, in the order of recording, with time >= `t`; before the first one for
   // Time::min().
   void seek(Time t) noexcept;
