@@ -7,6 +7,7 @@
 
 #include <dssm/time.hpp>
 #include <optional>
+#include <string>
 
 namespace dssm::ctl {
 
@@ -28,7 +29,10 @@ class Keyboard {
   std::optional<Key> wait(MonoTime due);
 
  private:
+  std::optional<Key> take_key();  // out of typed_
+
   std::optional<termios> before_;  // how the terminal was
+  std::string typed_;              // and not taken yet
 };
 
 }  // namespace dssm::ctl

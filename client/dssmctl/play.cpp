@@ -165,9 +165,12 @@ class Player {
 
   // As the timeline runs, until its end or Ctrl-C. Keys and other programs may change it.
   Result<void> play_by(Timeline& timeline) {
-    if (keyboard_.is_there()) out_.add(kKeys);
+    if (keyboard_.is_there()) {
+      out_.add(kKeys);
+      shows_now_ = true;
+    }
     timeline.set_speed(options_.rate);
-    jump(timeline, options_.rate < 0 ? range_.to : range_.from);
+    begin(timeline, options_.rate < 0);
     timeline.set_paused(options_.start_paused);
     while (!out_.must_stop()) {
       show(timeline);
@@ -175,7 +178,8 @@ class Player {
       const bool backwards = timeline.speed() < 0;
       const RecordedSample* const next = course_.peek(backwards);
       const Time end = backwards ? range_.from : range_.to;
-      const Duration rest = timeline.until(next ? next->info.time : end);
+      const Duration rest =
+          timeline.is_paused() ? Duration::max() : timeline.until(next ? next->info.time : end);
       if (rest > Duration::zero()) {
         const Duration sleep = std::min(rest, kStopCheckPeriod);
         if (const auto key = keyboard_.wait(deadline_in(sleep))) {
@@ -188,7 +192,7 @@ class Player {
       } else if (played_ == 0) {
         return Error{Errc::not_found, "no sample of these streams is in that part"};
       } else if (options_.loop) {
-        jump(timeline, backwards ? range_.to : range_.from);
+        begin(timeline, backwards);
       } else {
         break;
       }
@@ -279,15 +283,15 @@ class Player {
 
   // --- by the timeline
 
-  void jump(Timeline& timeline, Time time) {
-    timeline.set_time(time);
-    course_.seek(time);
+  void begin(Timeline& timeline, bool backwards) {
+    timeline.set_time(backwards ? range_.to : range_.from);
+    course_.seek(backwards ? saturating_add(range_.to, Duration(1)) : range_.from);
     last_stepped_.reset();
   }
 
   // The time was set: programs get what the streams had then, as if all had been played until there.
   Result<void> follow_jump(Time time, const Timeline& timeline) {
-    course_.seek(time);
+    course_.seek(saturating_add(time, Duration(1)));
     last_stepped_.reset();
     std::set<std::string> done;  // a stream that restarted is several
     std::vector<std::byte> payload;
@@ -299,9 +303,9 @@ class Player {
       SampleInfo info;
       ReadStatus status = ReadStatus::restarted;
       while (status == ReadStatus::restarted) {
-        status = reader->read_at(time - Duration(1), payload, info);
+        status = reader->read_at(time, payload, info);
       }
-      if (status != ReadStatus::ok || info.time < range_.from) continue;
+      if (status != ReadStatus::ok || info.time < range_.from || info.time > range_.to) continue;
       DSSM_TRY(write({i, info, kUnknownClockError, std::span(payload).first(info.payload_bytes)},
                      timeline.stamp(info.time)));
     }

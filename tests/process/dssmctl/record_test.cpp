@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // dssmctl record and play, and what info shows of a recording.
+#include <pty.h>
 #include <signal.h>
 
 #include <dssm/recording.hpp>
@@ -328,6 +329,128 @@ TEST_F(Play, DoesNotWriteBesideAnotherProgram) {
   EXPECT_EQ(pose.newest_tid(), kNoTid);
   output({"play", file_, "--force"});
   expect_played("pose", 0, 99);
+}
+
+TEST_F(Play, PlaysBackwards) {
+  make_recording();
+  output({"play", file_, "--rate", "-1", "--from", "1.010", "--to", "1.020"});
+  auto reader = session_.open_reader<RecordedPose>("pose").value();
+  reader.seek(kNoTid);
+  for (std::int64_t i = 20; i >= 10; --i) {
+    const auto sample = reader.read_next();
+    ASSERT_TRUE(sample) << i;
+    EXPECT_EQ(sample->value.number, i);
+    EXPECT_EQ(sample->info.time, at_ns(kSecond + i * 1'000'000));
+  }
+  EXPECT_FALSE(reader.read_next());
+}
+
+// `dssmctl play` on a terminal of its own, in whose foreground it is.
+class PlayByKeys : public Play {
+ protected:
+  PlayByKeys() { make_recording(); }
+  ~PlayByKeys() override {
+    if (pid_ > 0) ::kill(pid_, SIGKILL), wait_for(pid_);
+    if (terminal_ >= 0) ::close(terminal_);
+  }
+
+  void play(std::vector<std::string> words) {
+    words.insert(words.begin(), {dssmctl_path(), "play", file_});
+    std::vector<char*> argv;
+    for (std::string& word : words) argv.push_back(word.data());
+    argv.push_back(nullptr);
+    std::string socket = environment().front();
+    pid_ = ::forkpty(&terminal_, nullptr, nullptr, nullptr);
+    if (pid_ == 0) {
+      ::putenv(socket.data());
+      ::execv(argv[0], argv.data());
+      ::_exit(127);
+    }
+    await([&] { return clock_.setting().paused; });
+    reader_ = session_.open_reader<RecordedPose>("pose").value();
+    reader_->seek(kNoTid);
+  }
+  void press(std::string_view key) {
+    ASSERT_EQ(::write(terminal_, key.data(), key.size()), static_cast<ssize_t>(key.size()));
+  }
+  // What it prints must be read, or it stands still.
+  std::string read_some() {
+    pollfd input{terminal_, POLLIN, 0};
+    std::string text;
+    char buffer[4096];
+    while (::poll(&input, 1, 0) > 0) {
+      const ssize_t got = ::read(terminal_, buffer, sizeof buffer);
+      if (got <= 0) break;
+      text.append(buffer, static_cast<std::size_t>(got));
+    }
+    shown_ += text;
+    return text;
+  }
+  void expect_next(std::int64_t number) {
+    for (;;) {
+      read_some();
+      const auto sample = reader_->read_next();
+      if (!sample) {
+        ASSERT_NE(reader_->wait(kWatchdog), WaitStatus::timeout) << number << shown_;
+        continue;
+      }
+      EXPECT_EQ(sample->value.number, number);
+      EXPECT_EQ(sample->info.time, at_ns(kSecond + number * 1'000'000));
+      return;
+    }
+  }
+
+  static constexpr std::string_view kRight = "\x1b[C", kLeft = "\x1b[D", kUp = "\x1b[A",
+                                    kPageDown = "\x1b[6~", kHome = "\x1b[H";
+  static constexpr Duration kWatchdog = 60s;
+  PlaybackClock clock_ = session_.open_playback_clock().value();
+  std::optional<Reader<RecordedPose>> reader_;
+  std::string shown_;
+  pid_t pid_ = -1;
+  int terminal_ = -1;
+};
+
+TEST_F(PlayByKeys, StepsInBothDirections) {
+  play({"--start-paused"});
+  for (const std::int64_t number : {0, 1, 2}) press(kRight), expect_next(number);
+  EXPECT_NEAR(clock_.now_s(), 1.002, 1e-6);
+  for (const std::int64_t number : {1, 0}) press(kLeft), expect_next(number);
+  press(kLeft);  // there is none
+  for (const std::int64_t number : {1, 2}) press(kRight), expect_next(number);
+  EXPECT_NEAR(clock_.now_s(), 1.002, 1e-6);
+  EXPECT_TRUE(contains(shown_, "Space: pause")) << shown_;
+  press("q");
+  EXPECT_EQ(wait_for(std::exchange(pid_, -1)), 0);
+  EXPECT_FALSE(clock_.setting().paused);
+}
+
+TEST_F(PlayByKeys, JumpsAndGivesWhatTheStreamsHadThen) {
+  play({"--start-paused"});
+  clock_.set_time(1.0505);  // as another program may do
+  expect_next(50);
+  press(kRight), expect_next(51);
+  press(kHome), expect_next(0);
+  press(kRight), expect_next(1);
+  press(kPageDown), expect_next(99);  // to the end, where it stays while it is paused
+  press(" ");
+  EXPECT_EQ(wait_for(std::exchange(pid_, -1)), 0);
+  EXPECT_FALSE(reader_->read_next());
+}
+
+TEST_F(PlayByKeys, ChangesSpeedAndDirection) {
+  play({"--start-paused", "--rate", "0.001"});
+  press(kUp);
+  await([&] { return std::fabs(clock_.setting().speed - 0.0011) < 1e-9; });
+  press("r");
+  await([&] { return std::fabs(clock_.setting().speed + 0.0011) < 1e-9; });
+  press("r");
+  for (const std::int64_t number : {0, 1, 2}) press(kRight), expect_next(number);
+  press("r");
+  press(" ");
+  await([&] { return !clock_.setting().paused; });
+  clock_.set_speed(-1000);
+  for (const std::int64_t number : {2, 1, 0}) expect_next(number);
+  EXPECT_EQ(wait_for(std::exchange(pid_, -1)), 0);
 }
 
 class RecordFleet : public FleetTest {

@@ -529,6 +529,29 @@ TEST_F(RecordingFiles, ReadByTimeAsAPlainModelDoes) {
       }
       EXPECT_FALSE(cursor.next(sample));
     }
+    // To and fro.
+    RecordingCursor cursor = recording.cursor();
+    std::size_t at = 0;  // of the next one
+    for (int i = 0; i < 300; ++i) {
+      RecordedSample sample;
+      if (any(0, 20) == 0) {
+        const Time t = time_from_ns(any(-1000, 2000));
+        cursor.seek(t);
+        at = static_cast<std::size_t>(
+            std::ranges::find_if(all, [&](const Recorded& each) { return each.info.time >= t; }) -
+            all.begin());
+      } else if (any(0, 1) == 0) {
+        ASSERT_EQ(cursor.next(sample), at < all.size());
+        if (at < all.size()) {
+          EXPECT_EQ(sample.info.tid, all[at++].info.tid);
+        }
+      } else {
+        ASSERT_EQ(cursor.previous(sample), at > 0);
+        if (at > 0) {
+          EXPECT_EQ(sample.info.tid, all[--at].info.tid);
+        }
+      }
+    }
   }
 }
 
