@@ -87,7 +87,7 @@ _dssmctl() {
         --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
         --speed | --time | --rate | --ca | --credentials | --out | --name | --program | --days | \
         --output | -o | --past | --until | --for | --compression | --max-file-size | \
-        --max-file-duration | --max-total-size | --from | --to | --map | \
+        --max-file-duration | --max-total-size | --from | --to | --map | --lockstep | \
         --repair)
         ((++i))
         ;;
@@ -146,7 +146,7 @@ _dssmctl() {
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
     pub) options="--count --rate --stdin --times" ;;
-    play) options="--force --from --loop --map --now --on-hosts --rate --to" ;;
+    play) options="--force --from --lockstep --loop --map --now --on-hosts --rate --start-paused --to" ;;
     record)
       options="--compression --follow --for --host --max-file-duration --max-file-size \
         --max-total-size --output --past --repair --type --until"

@@ -289,7 +289,7 @@ class Player {
     last_stepped_.reset();
   }
 
-  // The time was set: programs get what the streams had then, as if all had been played until there.
+  // The time was set: programs get what the streams had then, as if all had been played so far.
   Result<void> follow_jump(Time time, const Timeline& timeline) {
     course_.seek(saturating_add(time, Duration(1)));
     last_stepped_.reset();

@@ -48,15 +48,18 @@ ONLY = {
     "client/include": ["core/include"],
     "client/ssm": ["core/include", "client/include", "core/base"],
     "client/recording": ["core/include", "client/include", "core/base"],
-    # dssmctl: besides the public headers the names of streams, and the names and ids of hosts, which
-    # certificates hold.
+    # dssmctl: besides the public headers the names of streams, the names and ids of hosts, which
+    # certificates hold, and the memory that it shares with programs in lockstep.
     "client/dssmctl": [
         "core/include",
         "client/include",
         "core/base/names.hpp",
+        "core/base/sealed_memory.hpp",
         "core/base/text.hpp",
+        "core/base/time.hpp",
         "core/base/try.hpp",
         "core/base/unique_fd.hpp",
+        "core/clock/lockstep_page.hpp",
         "core/wire/host_id.hpp",
     ],
 }

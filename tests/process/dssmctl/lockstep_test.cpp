@@ -29,7 +29,7 @@ std::string text_of(const std::string& file) {
 
 class Lockstep : public CtlTest {
  protected:
-  // Stream "fast" with samples 0 to 999, one each millisecond, and "slow" with 0 to 99, one each 10.
+  // Stream "fast" with samples 0 to 999, one each millisecond, and "slow" with 0 to 99, each 10.
   Lockstep() {
     auto writer = RecordingWriter::create(file_).value();
     const TypeInfo type = type_of<Numbered>();
