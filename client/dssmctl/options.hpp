@@ -112,9 +112,9 @@ struct PlayOptions : CommonOptions {
   std::string file;                   // or the folder of one recording
   std::vector<std::string> patterns;  // of the recording's streams; empty: all
   std::vector<std::string> mappings;  // PATTERN=NAME
-  double rate = 1;  // negative: backwards
+  double rate = 1;                    // negative: backwards
   bool start_paused = false;
-  std::optional<Moment> from, to;  // count back from the recording's end
+  std::optional<Moment> from, to;     // count back from the recording's end
   std::vector<std::string> lockstep;  // commands; empty: by the clock
   bool loop = false, now = false, on_hosts = false, force = false;
 };
