@@ -245,7 +245,8 @@ class Dssmd {
                    [this] { hosts_.clock.poll_if_due(); }, config.insecure,
                    [this](const wire::SocketAddress& from, const wire::CertifiedPeer* certified) {
                      return hosts_.peers.is_configured(from, certified);
-                   }},
+                   },
+                   &streams_.playback_clock},
                   hosts_.self, peer_limits(config)),
         status_(loop, manager,
                 [this] {
@@ -264,6 +265,8 @@ class Dssmd {
                          streams_.registry, hosts_.peers, logger);
     }
     hosts_.peers.on_change([this] { status_.touch(); });
+    streams_.playback_clock.on_lease(
+        [this] { playback_lease_.enable_in(PlaybackClockOwner::kLease); });
     hosts_.clock.on_new_generation([this] {
       channels_.send_clock();
       status_.touch();
@@ -277,6 +280,7 @@ class Dssmd {
   Dssmd& operator=(const Dssmd&) = delete;
   ~Dssmd() {
     hosts_.peers.on_change({});
+    streams_.playback_clock.on_lease({});
     hosts_.clock.on_new_generation({});
     hosts_.clock.on_change({});
   }
@@ -329,6 +333,11 @@ class Dssmd {
       streams_.registry.begin_recovery(some_may_be_missing ? Registry::Recovery::streams
                                                            : Registry::Recovery::opens);
     }
+  }
+
+  void check_playback_lease() {
+    const MonoTime end = streams_.playback_clock.check_lease(loop_.now());
+    if (end != kNever) playback_lease_.enable_in(end - loop_.now());
   }
 
   // What `dssmctl info` and `dssmctl doctor` show.
@@ -418,6 +427,7 @@ class Dssmd {
   Server server_;
   ChannelServer channels_;
   StatusLine status_;
+  EventSource playback_lease_ = EventSource::timer(loop_, [this] { check_playback_lease(); });
   const StreamCount count_;
   std::optional<Discovery> discovery_;
 };

@@ -475,6 +475,8 @@ void add_play(CLI::App& app, Parsed& parsed) {
   CLI::Option* const now = play->add_flag(
       "--now", options.now,
       "with the present times, not those of the recording; leaves the playback clock");
+  play->add_flag("--this-host", options.this_host,
+                 "only this PC's playback clock, not those of all hosts");
   play->add_flag("--force", options.force, "also to streams that another program writes");
   play->add_option("--lockstep", options.lockstep,
                    "start PROGRAM, and play as fast as it can take it, in the same order each "

@@ -113,7 +113,7 @@ struct PlayOptions : CommonOptions {
   std::vector<std::string> patterns;  // of the recording's streams; empty: all
   std::vector<std::string> mappings;  // PATTERN=NAME
   double rate = 1;                    // negative: backwards
-  bool start_paused = false;
+  bool start_paused = false, this_host = false;
   std::optional<Moment> from, to;     // count back from the recording's end
   std::vector<std::string> lockstep;  // commands; empty: by the clock
   bool loop = false, now = false, on_hosts = false, force = false;

@@ -169,9 +169,7 @@ class Player {
       out_.add(kKeys);
       shows_now_ = true;
     }
-    timeline.set_speed(options_.rate);
-    begin(timeline, options_.rate < 0);
-    timeline.set_paused(options_.start_paused);
+    begin(timeline, options_.rate, options_.start_paused);
     while (!out_.must_stop()) {
       show(timeline);
       if (timeline.has_jumped()) DSSM_TRY(follow_jump(timeline.now(), timeline));
@@ -192,7 +190,7 @@ class Player {
       } else if (played_ == 0) {
         return Error{Errc::not_found, "no sample of these streams is in that part"};
       } else if (options_.loop) {
-        begin(timeline, backwards);
+        begin(timeline, timeline.speed(), timeline.is_paused());
       } else {
         break;
       }
@@ -283,10 +281,11 @@ class Player {
 
   // --- by the timeline
 
-  void begin(Timeline& timeline, bool backwards) {
-    timeline.set_time(backwards ? range_.to : range_.from);
+  void begin(Timeline& timeline, double rate, bool paused) {
+    const bool backwards = rate < 0;
     course_.seek(backwards ? saturating_add(range_.to, Duration(1)) : range_.from);
     last_stepped_.reset();
+    timeline.start(backwards ? range_.to : range_.from, rate, paused);
   }
 
   // The time was set: programs get what the streams had then, as if all had been played so far.
@@ -409,6 +408,9 @@ class Player {
 }  // namespace
 
 Result<void> run(const PlayOptions& options, Output& out) {
+  const auto print_notice = [](const std::string& text) {
+    print_error(fmt::format("dssmctl: play: {}\n", text));
+  };
   const Recording recording = DSSM_TRY(Recording::open(options.file));
   for (const std::string& warning : recording.warnings()) {
     print_error(fmt::format("dssmctl: play: {}\n", escaped_message(warning)));
@@ -417,12 +419,15 @@ Result<void> run(const PlayOptions& options, Output& out) {
   Session session = DSSM_TRY(connect(options));
   std::optional<PlaybackClock> clock;
   if (!options.now) clock = DSSM_TRY(session.open_playback_clock());
+  const Session sharing = session;
   Player player(options, std::move(session), recording, range, out);
   DSSM_TRY(player.prepare());
   catch_stop_signals();
   Result<void> played;
   if (options.lockstep.empty()) {
-    Timeline timeline(std::move(clock));
+    std::optional<SharedPlayback> others;
+    if (clock && !options.this_host) others.emplace(sharing, *clock, print_notice);
+    Timeline timeline(std::move(clock), others ? SharedPlayback::kLead : Duration::zero());
     played = player.play_by(timeline);
   } else {
     DSSM_TRY(player.check_leftovers());

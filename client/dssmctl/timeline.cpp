@@ -1,10 +1,13 @@
 // SPDX-License-Identifier: Apache-2.0
 #include "client/dssmctl/timeline.hpp"
 
+#include <fmt/format.h>
+
 #include <algorithm>
 #include <cmath>
+#include <random>
 
-#include "client/dssmctl/output.hpp"
+#include "client/dssmctl/text.hpp"
 
 namespace dssm::ctl {
 namespace {
@@ -23,18 +26,68 @@ double at(const PlaybackClock::Setting& setting, double real_s) {
 
 }  // namespace
 
-Timeline::Timeline(std::optional<PlaybackClock> clock) : clock_(std::move(clock)) {
-  set_paused(true);
+SharedPlayback::SharedPlayback(Session session, PlaybackClock clock,
+                               std::function<void(const std::string&)> on_failure)
+    : session_(std::move(session)),
+      clock_(std::move(clock)),
+      on_failure_(std::move(on_failure)),
+      driver_(std::random_device()() | 1U),
+      thread_([this] { run(); }) {}
+
+SharedPlayback::~SharedPlayback() {
+  ends_ = true;
+  thread_.join();
 }
+
+void SharedPlayback::run() {
+  PlaybackClock::Setting shared;
+  MonoTime next{};
+  for (; !ends_; std::this_thread::sleep_for(kCheckPeriod)) {
+    const PlaybackClock::Setting setting = clock_.next_setting();
+    if (setting == shared && MonoClock::now() < next) continue;
+    shared = setting;
+    next = deadline_in(kRenewPeriod);
+    share(false);
+  }
+  share(true);
+}
+
+void SharedPlayback::share(bool ends) {
+  const auto followers = session_.share_playback_clock(driver_, ends);
+  const auto report = [&](const std::string& host, const Error& error) {
+    if (ends || !reported_.insert(host).second) return;
+    on_failure_(host.empty() ? error.message
+                             : fmt::format("the playback clock of '{}' does not follow: {}",
+                                           escaped(host), escaped_message(error.message)));
+  };
+  if (!followers) return report({}, followers.error());
+  for (const PlaybackFollower& follower : *followers) {
+    if (follower.error) report(follower.host, *follower.error);
+  }
+}
+
+Timeline::Timeline(std::optional<PlaybackClock> clock, Duration lead)
+    : clock_(std::move(clock)), lead_(lead) {}
 
 Timeline::~Timeline() {
   if (clock_) clock_->reset();
 }
 
-void Timeline::known_from_now_on() {
-  if (!clock_) return;
-  known_ = clock_->setting();
-  known_real_s_ = seconds_of(WallClock::now());
+void Timeline::change(std::optional<Time> time, std::optional<double> speed,
+                      std::optional<bool> paused) {
+  if (clock_) {
+    const Time from = WallClock::now() + lead_;
+    clock_->change_at(from, time ? std::optional(seconds_of(*time)) : std::nullopt, speed, paused);
+    // What follows here works on what is then.
+    if (lead_ > Duration::zero()) std::this_thread::sleep_for(lead_);
+    known_ = clock_->setting();
+    known_real_s_ = seconds_of(WallClock::now());
+    return;
+  }
+  base_time_ = time.value_or(now());
+  base_real_ = WallClock::now();
+  speed_ = speed.value_or(speed_);
+  paused_ = paused.value_or(paused_);
 }
 
 Time Timeline::own_at(Time real) const {
@@ -48,38 +101,12 @@ Time Timeline::now() const {
   return time_from_ns(std::llround(std::clamp(clock_->now_s(), -kMax_s, kMax_s) * 1e9));
 }
 
-void Timeline::set_time(Time time) {
-  if (clock_) clock_->set_time(seconds_of(time));
-  base_real_ = WallClock::now();
-  base_time_ = time;
-  known_from_now_on();
-}
-
-void Timeline::set_speed(double speed) {
-  if (clock_) {
-    clock_->set_speed(speed);
-  } else {
-    set_time(now());
-  }
-  speed_ = speed;
-  known_from_now_on();
-}
-
-void Timeline::set_paused(bool paused) {
-  if (clock_) {
-    clock_->set_paused(paused);
-  } else {
-    set_time(now());
-  }
-  paused_ = paused;
-  known_from_now_on();
-}
-
 bool Timeline::has_jumped() {
   if (!clock_) return false;
   const Setting before = known_;
   const double before_s = known_real_s_;
-  known_from_now_on();
+  known_ = clock_->setting();
+  known_real_s_ = seconds_of(WallClock::now());
   // It was changed at some moment in between, from what it was to what it is.
   const double began = at(before, before_s), would_be = at(before, known_real_s_);
   const double speed = known_.paused ? 0 : known_.speed;

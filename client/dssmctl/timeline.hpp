@@ -5,16 +5,53 @@
 // samples that are stamped with the present times, a clock of this program alone.
 #pragma once
 
+#include <atomic>
 #include <dssm/playback_clock.hpp>
+#include <dssm/session.hpp>
 #include <dssm/time.hpp>
+#include <functional>
 #include <optional>
+#include <set>
+#include <string>
+#include <thread>
 
 namespace dssm::ctl {
 
+// Has the playback clocks of all other hosts follow this PC's, in a thread of its own: a host that
+// does not answer delays nothing.
+class SharedPlayback {
+ public:
+  // A change that shall come at the same moment on all hosts is made so long before.
+  static constexpr Duration kLead = std::chrono::milliseconds(50);
+
+  // on_failure: gets a sentence for each host that does not follow, once, from the thread
+  SharedPlayback(Session session, PlaybackClock clock,
+                 std::function<void(const std::string&)> on_failure);
+  SharedPlayback(const SharedPlayback&) = delete;
+  SharedPlayback& operator=(const SharedPlayback&) = delete;
+  ~SharedPlayback();  // the clocks of the other hosts show the real time again
+
+ private:
+  // A change that another program makes is found within this time.
+  static constexpr Duration kCheckPeriod = std::chrono::milliseconds(5);
+  static constexpr Duration kRenewPeriod = std::chrono::seconds(1);
+  void run();
+  void share(bool ends);
+
+  Session session_;
+  PlaybackClock clock_;
+  const std::function<void(const std::string&)> on_failure_;
+  const std::uint64_t driver_;
+  std::set<std::string> reported_;  // hosts
+  std::atomic<bool> ends_ = false;
+  std::thread thread_;
+};
+
 class Timeline {
  public:
-  // Stands still at 1970. Without `clock`: of this program.
-  explicit Timeline(std::optional<PlaybackClock> clock);
+  // To be started. Without `clock`: of this program.
+  //   lead  changes come so long after they are made, for other hosts that follow
+  explicit Timeline(std::optional<PlaybackClock> clock, Duration lead = {});
   Timeline(const Timeline&) = delete;
   Timeline& operator=(const Timeline&) = delete;
   ~Timeline();  // the playback clock shows the real time again
@@ -24,9 +61,11 @@ class Timeline {
   bool is_paused() const { return clock_ ? clock_->setting().paused : paused_; }
 
   // None of these is a jump for has_jumped().
-  void set_time(Time time);
-  void set_speed(double speed);
-  void set_paused(bool paused);
+  void set_time(Time time) { change(time, {}, {}); }
+  void set_speed(double speed) { change({}, speed, {}); }
+  void set_paused(bool paused) { change({}, {}, paused); }
+  // From then on, all at once.
+  void start(Time time, double speed, bool paused) { change(time, speed, paused); }
 
   // Whether another program has set the time since the last call: it is not what it would be if it
   // had run on. A change of speed alone is not a jump.
@@ -42,9 +81,10 @@ class Timeline {
  private:
   using Setting = PlaybackClock::Setting;
   Time own_at(Time real) const;
-  void known_from_now_on();
+  void change(std::optional<Time> time, std::optional<double> speed, std::optional<bool> paused);
 
   std::optional<PlaybackClock> clock_;
+  const Duration lead_;
   Setting known_;            // of clock_, at the last has_jumped() or change of ours
   double known_real_s_ = 0;  // when
   // Without clock_: at that real time it was so late.

@@ -46,12 +46,20 @@ Duration duration_of(double seconds) noexcept {
   return Duration(std::llround(std::clamp(seconds, 1e-9, kMax_s) * 1e9));
 }
 
-// The same setting with another rate, so that the clock reads the same now.
-clock::PlaybackSetting rebased(clock::PlaybackSetting setting, double time_s,
-                               double real_s) noexcept {
-  setting.offset_s = time_s - setting.speed * real_s;
-  setting.paused_at_s = time_s;
-  return setting;
+// The same run, but it reads `time_s` at `real_s`.
+clock::PlaybackRun rebased(clock::PlaybackRun run, double time_s, double real_s) noexcept {
+  run.offset_s = time_s - run.speed * real_s;
+  run.paused_at_s = time_s;
+  return run;
+}
+
+// From now on it runs as change(how it runs now, real time) says.
+template <class Change>
+void change_now(clock::PlaybackRecord& record, Change change) noexcept {
+  record.update([&](const clock::PlaybackSetting& setting) {
+    const double real_s = real_now_s();
+    return clock::PlaybackSetting{change(setting.run_at(real_s), real_s)};
+  });
 }
 
 }  // namespace
@@ -60,8 +68,15 @@ PlaybackClock::PlaybackClock(std::shared_ptr<detail::PlaybackClockState> state) 
     : state_(std::move(state)) {}
 
 PlaybackClock::Setting PlaybackClock::setting() const noexcept {
-  const clock::PlaybackSetting now = state_->record->load();
+  const clock::PlaybackSetting setting = state_->record->load();
+  // Without a change to come, and so without asking for the time, it is what it was set to.
+  const clock::PlaybackRun& now = setting.change_s > 0 ? setting.run_at(real_now_s()) : setting.run;
   return {now.offset_s, now.speed, now.paused != 0, now.paused_at_s};
+}
+
+PlaybackClock::Setting PlaybackClock::next_setting() const noexcept {
+  const clock::PlaybackRun run = state_->record->load().run;
+  return {run.offset_s, run.speed, run.paused != 0, run.paused_at_s};
 }
 
 double PlaybackClock::now_s() const noexcept { return state_->record->load().at(real_now_s()); }
@@ -69,52 +84,65 @@ double PlaybackClock::now_s() const noexcept { return state_->record->load().at(
 WaitStatus PlaybackClock::sleep_until(double time_s) const noexcept {
   constexpr double kMaxSleep_s = 0.01;
   for (;;) {
-    const clock::PlaybackSetting setting = state_->record->load();
-    const double missing_s = time_s - setting.at(real_now_s());
-    const double speed = setting.speed;
+    const double real_s = real_now_s();
+    const clock::PlaybackRun run = state_->record->load().run_at(real_s);
+    const double missing_s = time_s - run.at(real_s);
+    const double speed = run.speed;
     if (speed < 0 ? missing_s >= 0 : missing_s <= 0) return WaitStatus::ready;
     if (const auto slept = sleep_in_lockstep(duration_of(missing_s))) {
       if (*slept == WaitStatus::interrupted) return *slept;
       continue;
     }
-    const double rest_s = setting.paused || speed == 0 ? kMaxSleep_s : missing_s / speed;
+    const double rest_s = run.paused || speed == 0 ? kMaxSleep_s : missing_s / speed;
     const timespec sleep = timespec_of(duration_of(std::min(rest_s, kMaxSleep_s)));
     if (::nanosleep(&sleep, nullptr) != 0) return WaitStatus::interrupted;
   }
 }
 
 void PlaybackClock::reset() noexcept {
-  state_->record->update([](const clock::PlaybackSetting&) { return clock::PlaybackSetting{}; });
+  change_now(*state_->record, [](const auto&, double) { return clock::PlaybackRun{}; });
 }
 
 void PlaybackClock::set_time(double time_s) noexcept {
-  state_->record->update([&](const clock::PlaybackSetting& setting) {
-    return rebased(setting, time_s, real_now_s());
+  change_now(*state_->record, [&](const clock::PlaybackRun& run, double real_s) {
+    return rebased(run, time_s, real_s);
   });
 }
 
 void PlaybackClock::set_offset(double offset_s) noexcept {
-  state_->record->update([&](clock::PlaybackSetting setting) {
-    setting.offset_s = offset_s;
-    return setting;
+  change_now(*state_->record, [&](clock::PlaybackRun run, double) {
+    run.offset_s = offset_s;
+    return run;
   });
 }
 
 void PlaybackClock::set_speed(double speed) noexcept {
-  state_->record->update([&](clock::PlaybackSetting setting) {
-    const double real_s = real_now_s();
-    const double time_s = setting.at(real_s);
-    setting.speed = speed;
-    return rebased(setting, time_s, real_s);
+  change_now(*state_->record, [&](clock::PlaybackRun run, double real_s) {
+    const double time_s = run.at(real_s);
+    run.speed = speed;
+    return rebased(run, time_s, real_s);
   });
 }
 
 void PlaybackClock::set_paused(bool paused) noexcept {
-  state_->record->update([&](clock::PlaybackSetting setting) {
-    const double real_s = real_now_s();
-    const double time_s = setting.at(real_s);
-    setting.paused = paused;
-    return rebased(setting, time_s, real_s);
+  change_now(*state_->record, [&](clock::PlaybackRun run, double real_s) {
+    const double time_s = run.at(real_s);
+    run.paused = paused;
+    return rebased(run, time_s, real_s);
+  });
+}
+
+void PlaybackClock::change_at(Time from, std::optional<double> time_s, std::optional<double> speed,
+                              std::optional<bool> paused) noexcept {
+  state_->record->update([&](const clock::PlaybackSetting& setting) {
+    const double now_s = real_now_s();
+    const double from_s = std::max(static_cast<double>(to_ns(from)) * 1e-9, now_s);
+    const clock::PlaybackRun before = setting.run_at(now_s);
+    clock::PlaybackRun run = before;
+    run.speed = speed.value_or(run.speed);
+    run.paused = paused.value_or(run.paused != 0);
+    return clock::PlaybackSetting{rebased(run, time_s.value_or(before.at(from_s)), from_s), from_s,
+                                  before};
   });
 }
 

@@ -303,6 +303,21 @@ Result<std::vector<ClockPair>> Session::list_clock_pairs() {
   return pairs;
 }
 
+Result<std::vector<PlaybackFollower>> Session::share_playback_clock(std::uint64_t driver,
+                                                                    bool ends) {
+  local::Request request;
+  request.mutable_follow_playback()->set_driver(driver);
+  request.mutable_follow_playback()->set_ends(ends);
+  const auto response = DSSM_TRY(ask(*client_, std::move(request), "share the playback clock"));
+  std::vector<PlaybackFollower> followers;
+  for (const proto::PlaybackFollower& each : response.playback_followers().followers()) {
+    PlaybackFollower& follower = followers.emplace_back();
+    follower.host = each.host();
+    if (each.has_failure()) follower.error = wire::failure(each.failure());
+  }
+  return followers;
+}
+
 Result<RoundTrip> Session::ping(const std::string& host) {
   local::Request request;
   request.mutable_ping_host()->set_host(host);

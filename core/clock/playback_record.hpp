@@ -16,8 +16,8 @@
 
 namespace dssm::clock {
 
-// As it is in the segment.
-struct PlaybackSetting {
+// How the clock runs.
+struct PlaybackRun {
   double offset_s = 0;
   double speed = 1;
   std::uint64_t paused = 0;  // not 0: it is
@@ -29,18 +29,31 @@ struct PlaybackSetting {
   }
 };
 
-// Little endian; in one page of the system. The settings are at 64 and 96, the lock is in the
+// As it is in the segment: a change at a real time, which may be to come, so that several hosts
+// can make it at the same moment.
+struct PlaybackSetting {
+  PlaybackRun run;          // from change_s on
+  double change_s = 0;      // real time; 0: long ago
+  PlaybackRun before = {};  // until then
+
+  const PlaybackRun& run_at(double real_s) const noexcept {
+    return real_s < change_s ? before : run;
+  }
+  double at(double real_s) const noexcept { return run_at(real_s).at(real_s); }
+};
+
+// Little endian; in one page of the system. The settings are at 64 and 136, the lock is in the
 // page's last bytes (robust_lock.hpp).
 struct PlaybackPage {
   static constexpr std::uint64_t kMagic = 0x59414c504d535344;  // "DSSMPLAY"
-  static constexpr std::uint32_t kLayoutVersion = 3;
+  static constexpr std::uint32_t kLayoutVersion = 4;
   std::uint64_t magic;
   std::uint32_t layout_version;
   std::uint32_t reserved0;
   std::byte reserved1[40];
   SharedSnapshot<PlaybackSetting> setting;
 };
-static_assert(offsetof(PlaybackPage, setting) == 56 && sizeof(PlaybackPage) == 128);
+static_assert(offsetof(PlaybackPage, setting) == 56 && sizeof(PlaybackPage) == 208);
 
 // Creates the segment (sealed memfd, mode 0600) with the default setting.
 Result<UniqueFd> create_playback_clock();
@@ -60,16 +73,25 @@ class PlaybackRecord {
   // it did not get the lock (RobustLock::kMaxWait).
   template <class Change>
   bool update(Change change) noexcept {
-    if (lock_.lock() == ring::LockResult::busy) return false;
-    // A holder that died left a complete setting: nothing to repair.
-    page().setting.store(change(load()));
-    lock_.unlock();
-    return true;
+    return finish_update(lock_.lock(), change);
+  }
+  // The same without waiting for the lock.
+  template <class Change>
+  bool try_update(Change change) noexcept {
+    return finish_update(lock_.try_lock(), change);
   }
 
  private:
   PlaybackRecord(SharedMapping mapping, ring::RobustLock lock) noexcept
       : mapping_(std::move(mapping)), lock_(std::move(lock)) {}
+  template <class Change>
+  bool finish_update(ring::LockResult locked, Change change) noexcept {
+    if (locked == ring::LockResult::busy) return false;
+    // A holder that died left a complete setting: nothing to repair.
+    page().setting.store(change(load()));
+    lock_.unlock();
+    return true;
+  }
   PlaybackPage& page() const noexcept { return mapping_.as<PlaybackPage>(); }
   SharedMapping mapping_;
   ring::RobustLock lock_;

@@ -398,6 +398,26 @@ void FleetService::list_nodes(NodeTable nodes, std::function<void(NodeTable)> th
   });
 }
 
+void FleetService::follow_playback(const proto::FollowPlayback& follow,
+                                   Then<proto::PlaybackFollowers> then) {
+  net::Frame request;
+  *request.mutable_follow_playback() = follow;
+  ask_all(request, [this, then = std::move(then)](const Answers& answers) {
+    proto::PlaybackFollowers followers;
+    for (const KnownHost* host : hosts_by_name()) {
+      proto::PlaybackFollower& follower = *followers.add_followers();
+      follower.set_host(host->greeting.host);
+      const auto answer = answers.find(host->greeting.host_id);
+      if (answer == answers.end()) {
+        wire::to_message(has_not_answered(host->greeting.host), *follower.mutable_failure());
+      } else if (!answer->second) {
+        wire::to_message(answer->second.error(), *follower.mutable_failure());
+      }
+    }
+    then(std::move(followers));
+  });
+}
+
 void FleetService::list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) {
   net::Frame request;
   request.mutable_list_clock_pairs();

@@ -69,6 +69,8 @@ class FleetService final : public Fleet, private CatalogObserver {
   void list(Then<std::vector<proto::Stream>> then) override;
   void list_clock_pairs(std::function<void(std::vector<ClockPair>)> then) override;
   void list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) override;
+  void follow_playback(const proto::FollowPlayback& request,
+                       Then<proto::PlaybackFollowers> then) override;
   std::vector<StreamInfo> known_streams() const override;
   std::vector<local::Host> hosts() const override;
   void describe(local::Daemon& daemon) const override;

@@ -81,7 +81,8 @@ bool LocalRequests::waits_for_hosts(const local::Request& request) const {
   if (!fleet_ || request.has_offer() || request.has_want_history() || request.has_list_rights()) {
     return false;
   }
-  if (request.has_ping_host() || request.has_list_clock_pairs() || request.has_list_nodes()) {
+  if (request.has_ping_host() || request.has_list_clock_pairs() || request.has_list_nodes() ||
+      request.has_follow_playback()) {
     return true;
   }
   if (request.has_list()) return !request.list().own_only();
@@ -261,6 +262,9 @@ void LocalRequests::ask_hosts_untrusted(const Client& client, const local::Reque
   if (request.has_list()) return list_all(std::move(answer));
   if (request.has_list_nodes()) return list_nodes(std::move(answer));
   if (request.has_list_clock_pairs()) return list_clock_pairs(std::move(answer));
+  if (request.has_follow_playback()) {
+    return follow_playback(client, request.follow_playback(), std::move(answer));
+  }
   if (request.has_ping_host()) return ping(request.ping_host().host(), std::move(answer));
   const StreamId id = *wire::stream_id_untrusted(*subject(request));
   if (request.has_create()) {
@@ -347,6 +351,19 @@ void LocalRequests::list_clock_pairs(Answer answer) {
     if (list.ByteSizeLong() <= kMaxListBytes) return answer(std::move(reply));
     answer(Error{Errc::limit_exceeded,
                  "the list of all hosts' clocks is longer than one message may be"});
+  });
+}
+
+void LocalRequests::follow_playback(const Client& client, const proto::FollowPlayback& request,
+                                    const Answer& answer) {
+  Result<proto::FollowPlayback> lead = clock_.lead(
+      request, fmt::format("{}@{}", client->program, registry_.host()), MonoClock::now());
+  if (!lead) return answer(std::move(lead).error());
+  fleet_->follow_playback(*lead, [answer](Result<proto::PlaybackFollowers> followers) {
+    if (!followers) return answer(std::move(followers).error());
+    Reply reply;
+    *reply.response.mutable_playback_followers() = *std::move(followers);
+    answer(std::move(reply));
   });
 }
 

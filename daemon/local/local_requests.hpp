@@ -101,6 +101,11 @@ class Fleet {
   // What is in the catalog now, without a request to other hosts: for Watch.
   virtual std::vector<StreamInfo> known_streams() const = 0;
 
+  // Has all other hosts' playback clocks follow as `request` says, and waits kFreshTimeout for
+  // their answers.
+  virtual void follow_playback(const proto::FollowPlayback& request,
+                               Then<proto::PlaybackFollowers> then) = 0;
+
   virtual std::vector<local::Host> hosts() const = 0;  // this one first
   // Adds the state of mDNS and the credentials.
   virtual void describe(local::Daemon& daemon) const = 0;
@@ -172,6 +177,8 @@ class LocalRequests {
   void list_all(Answer answer);
   void list_nodes(Answer answer);
   void list_clock_pairs(Answer answer);
+  void follow_playback(const Client& client, const proto::FollowPlayback& request,
+                       const Answer& answer);
   void ping(const std::string& host, Answer answer);
 
   Result<Reply> opened(const OpenEntry& entry);

@@ -178,7 +178,7 @@ Result<void> ChannelServer::keep(std::unique_ptr<wire::Transport>& transport,
   PeerPlace place = DSSM_TRY(peers_.admit(peer, certified, is_configured), refuses(address));
   auto communicator = std::make_unique<DataCommunicator>(
       DataCommunicator::Parts{parts_.loop, parts_.registry, parts_.opens, streams_, self_, logger_,
-                              *this, parts_.clock, parts_.rights, sending_},
+                              *this, parts_.clock, parts_.rights, sending_, parts_.playback},
       std::move(place), std::move(transport), address.str());
   DataCommunicator* key = communicator.get();
   communicators_.emplace(key, std::move(communicator));

@@ -22,6 +22,7 @@
 #include "daemon/serve/peer_table.hpp"
 #include "daemon/serve/served_stream.hpp"
 #include "daemon/streams/open_table.hpp"
+#include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"
 #include "daemon/streams/rights.hpp"
 
@@ -40,6 +41,7 @@ class ChannelServer final : private StreamObserver, private DataCommunicator::Ob
     bool takes_plain = false;                 // with credentials: from other PCs, too
     // Whether a connection comes from a configured peer (Peers::is_configured()); may be empty.
     std::function<bool(const wire::SocketAddress&, const wire::CertifiedPeer*)> is_configured = {};
+    PlaybackClockOwner* playback = nullptr;  // nullptr: there is no playback clock
   };
 
   // self: how this dssmd greets; with its credentials, connections are encrypted. All in `parts`

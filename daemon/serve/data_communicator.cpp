@@ -38,6 +38,7 @@ std::size_t parsed_bytes(const net::Frame& request) {
 bool is_control(const net::Frame& request) noexcept {
   return request.has_list() || request.has_watch() || request.has_info() || request.has_remove() ||
          request.has_list_clock_pairs() || request.has_list_nodes() ||
+         request.has_follow_playback() ||
          (request.has_set_property() && request.set_property().has_id()) ||
          (request.has_get_property() && request.get_property().has_id());
 }
@@ -264,6 +265,10 @@ Result<void> DataCommunicator::serve_control(const net::Frame& request) {
     for (const ClockPair& pair : parts_.clock->clock_pairs()) {
       wire::to_message(pair, *list.add_pairs());
     }
+  } else if (request.has_follow_playback()) {
+    if (!parts_.playback) return unknown_request(parts_.self.host);
+    DSSM_TRY(parts_.playback->follow_untrusted(request.follow_playback(), parts_.loop.now()));
+    answer.mutable_done();
   } else {
     DSSM_TRY(catalog_.serve_untrusted(request, answer, identity_.account()));
     if (request.has_list()) parts_.rights.hide(identity_, *answer.mutable_stream_list());

@@ -29,6 +29,7 @@
 #include "daemon/serve/stream_channel.hpp"
 #include "daemon/streams/catalog_requests.hpp"
 #include "daemon/streams/open_table.hpp"
+#include "daemon/streams/playback_clock_owner.hpp"
 #include "daemon/streams/registry.hpp"
 #include "daemon/streams/rights.hpp"
 
@@ -111,6 +112,7 @@ class DataCommunicator final : private FrameConnection::Observer, private Stream
     ClockAssessor* clock;  // nullptr: the clock is not watched
     const Rights& rights;
     const SendingDemands& sending;
+    PlaybackClockOwner* playback;  // nullptr: none
   };
 
   // peer_address: for the log, "10.0.0.3:40000". All in `parts` outlive it.

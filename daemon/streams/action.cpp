@@ -31,6 +31,8 @@ std::optional<Action> catalog_action(const Request& request) noexcept {
       return Action::see;
     case Request::kListClockPairs:
       return Action::inspect;
+    case Request::kFollowPlayback:
+      return Action::open_clock;
     default:
       return std::nullopt;
   }

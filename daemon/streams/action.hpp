@@ -64,7 +64,7 @@ enum class Action : std::uint8_t {
   get_property,
   see,              // of a stream: that it is there, what it is, and who may do what
   list,             // and changes of it, and nodes; what the asker may not see is left out
-  open_clock,       // the playback clock, for reading and writing
+  open_clock,       // the playback clock, for reading and writing; and whom it follows
   open_clock_page,  // the state of this PC's clock
   inspect,          // clients, opens, hosts, pairs of clocks and dssmd itself
   ping,             // heartbeat; round trip to another host

@@ -73,6 +73,9 @@ class LateFleet final : public Fleet {
   void list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) override {
     due_.push_back([nodes = std::move(nodes), then = std::move(then)] { then(nodes); });
   }
+  void follow_playback(const proto::FollowPlayback&, Then<proto::PlaybackFollowers> then) override {
+    due_.push_back([then = std::move(then)] { then(proto::PlaybackFollowers()); });
+  }
   std::vector<StreamInfo> known_streams() const override {
     std::vector<StreamInfo> streams;
     for (const auto& stream : pc2_.streams()) streams.push_back(stream->info());

@@ -5,7 +5,8 @@
 // change it, and all see the change at once. Players of recordings set it; programs that work on
 // recorded times read it.
 //
-//   threads  any thread may call any function; setting() and now_s() are async-signal-safe
+//   threads  any thread may call any function; setting(), next_setting() and now_s() are
+//            async-signal-safe
 //   cost     setting() and now_s() take no lock; now_s() calls clock_gettime()
 //   moved    a moved-from object may only be assigned to or destroyed
 //   errors   none: Session::open_playback_clock() reports what can fail
@@ -31,10 +32,14 @@ class PlaybackClock {
     double speed = 1;  // negative: runs backwards; 0: stands still
     bool paused = false;
     double paused_at_s = 0;  // SSM time while paused
+    bool operator==(const Setting&) const = default;
   };
 
-  // The present setting, never a mix of two.
+  // The present setting, never a mix of two; asks for the time only after change_at().
   Setting setting() const noexcept;
+
+  // What it is after a change that is to come (change_at()); else setting().
+  Setting next_setting() const noexcept;
 
   // SSM time now [s]: paused_at_s while paused, else speed * CLOCK_REALTIME + offset_s.
   double now_s() const noexcept;
@@ -53,6 +58,12 @@ class PlaybackClock {
   void set_offset(double offset_s) noexcept;
   void set_speed(double speed) noexcept;
   void set_paused(bool paused) noexcept;
+
+  // The same at the real time `from`, which may be to come by some seconds at most: so several
+  // hosts can change it at the same moment (Session::share_playback_clock()). Until then it runs
+  // as it does now. Empty: unchanged. Replaces a change that is still to come.
+  void change_at(Time from, std::optional<double> time_s, std::optional<double> speed,
+                 std::optional<bool> paused) noexcept;
 
  private:
   friend class Session;

@@ -71,6 +71,12 @@ struct NodeStream {
   StreamVia via = StreamVia::local;
 };
 
+// Another host, whose playback clock is to follow.
+struct PlaybackFollower {
+  std::string host;
+  std::optional<Error> error;  // why it does not
+};
+
 // A process that has streams open, on any host.
 struct NodeInfo {
   std::string host;                  // where it runs
@@ -370,6 +376,19 @@ class Session {
 
   // The PC's shared playback clock. It stays usable after the Session is destroyed.
   Result<PlaybackClock> open_playback_clock();
+
+  // Has the playback clocks of all other hosts that are up follow this PC's, as it is now, for 5 s:
+  // for players of recordings, which repeat it each second, and at once after each change. With
+  // `ends` they show the real time again. A change that all are to make at the same moment is made
+  // by PlaybackClock::change_at() some 50 ms before.
+  //   driver   a number chosen at random, of this player alone; not 0. While the clocks follow one,
+  //            all others are refused
+  //   returns  all other hosts that are up, by name. The error of one that does not follow:
+  //            no_permission, conflict (it follows another driver), unavailable (no answer within
+  //            500 ms), protocol (its dssmd is too old), invalid_argument (its clock is wrong)
+  //   fails    conflict (this PC's clock follows another driver), no_permission
+  Result<std::vector<PlaybackFollower>> share_playback_clock(std::uint64_t driver,
+                                                             bool ends = false);
   // The processes connected to dssmd.
   Result<std::vector<ClientInfo>> list_clients();
   // All streams that processes have open.

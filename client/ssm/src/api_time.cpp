@@ -67,8 +67,8 @@ ssmTimeT gettimeSSM_real(void) {
 }
 
 ssmTimeT gettimeSSM(void) {
-  const PlaybackClock::Setting clock = setting();  // without one: offset 0, speed 1
-  return clock.paused ? clock.paused_at_s : clock.speed * gettimeSSM_real() + clock.offset_s;
+  const auto now = process().clock().now_s();
+  return now ? *now : gettimeSSM_real();
 }
 
 unsigned int sleepSSM(double sec) {

@@ -52,6 +52,15 @@ class SharedClock {
     return change([](PlaybackClock&) {}).value_or(PlaybackClock::Setting{});
   }
 
+  // Empty without a clock.
+  std::optional<double> now_s() noexcept {
+    while (const Clocks::Handle handle = current_.load()) {
+      const Clocks::Turn use(clocks_, handle);
+      if (use) return use->now_s();
+    }
+    return std::nullopt;
+  }
+
   // Calls change(clock) and shows the setting that follows through timecontrol; nothing without a
   // clock.
   template <class Change>

@@ -8,6 +8,7 @@
 
 #include <atomic>
 #include <cerrno>
+#include <dssm/playback_clock.hpp>
 
 #include "core/base/quiet_thread.hpp"
 #include "core/base/time.hpp"

@@ -366,7 +366,7 @@ class PlayByKeys : public Play {
       ::execv(argv[0], argv.data());
       ::_exit(127);
     }
-    await([&] { return clock_.setting().paused; });
+    await([&] { return clock_.setting().paused && clock_.now_s() < 2; });
     reader_ = session_.open_reader<RecordedPose>("pose").value();
     reader_->seek(kNoTid);
   }
@@ -492,6 +492,89 @@ TEST_F(RecordFleet, PlaysOnTheHostsOfTheStreams) {
     ASSERT_EQ(reader.wait_for_tid(0, kNever), WaitStatus::ready);
     EXPECT_EQ(reader.read_newest()->value.number, 3);
   }
+}
+
+// The playback clocks of all hosts while a recording is played.
+class PlayFleet : public RecordFleet {
+ protected:
+  PlaybackClock here_ = session_.open_playback_clock().value();
+  PlaybackClock there_ = on_pc2_.open_playback_clock().value();
+
+  // That both show the same, for as long as `condition` is not met.
+  void expect_equal_until(const std::function<bool()>& condition) {
+    await([&] {
+      const double before = here_.now_s(), other = there_.now_s(), after = here_.now_s();
+      EXPECT_GE(other, std::min(before, after) - 1e-6);
+      EXPECT_LE(other, std::max(before, after) + 1e-6);
+      return condition() || HasFailure();
+    });
+  }
+};
+
+TEST_F(PlayFleet, ClocksOfAllHostsChangeAtTheSameMoment) {
+  const auto change = [&](auto time_s, auto speed, auto paused) {
+    here_.change_at(WallClock::now() + 200ms, time_s, speed, paused);
+    const auto followers = session_.share_playback_clock(17).value();
+    ASSERT_EQ(followers.size(), 2U);
+    EXPECT_EQ(followers[0].host, "pc2");
+    EXPECT_FALSE(followers[0].error) << followers[0].error->message;
+    const auto next = here_.next_setting();
+    expect_equal_until([&] { return here_.setting() == next && there_.setting() == next; });
+  };
+  change(100.0, 1.0, false);
+  change(std::nullopt, 50.0, std::nullopt);
+  change(std::nullopt, -3.0, std::nullopt);
+  change(std::nullopt, std::nullopt, true);
+  change(7.0, 1000.0, false);
+  EXPECT_GT(there_.now_s(), 7);
+  EXPECT_EQ(on_pc3_.open_playback_clock().value().setting(), here_.setting());
+  EXPECT_TRUE(session_.share_playback_clock(17, true));
+  await([&] { return there_.setting() == PlaybackClock::Setting{}; });
+}
+
+TEST_F(PlayFleet, OneDriverAtATime) {
+  here_.set_speed(3);
+  ASSERT_TRUE(session_.share_playback_clock(1));
+  EXPECT_EQ(there_.setting().speed, 3);
+  EXPECT_EQ(session_.share_playback_clock(2).error().code, Errc::conflict);
+  const auto followers = on_pc3_.share_playback_clock(3);
+  ASSERT_FALSE(followers);
+  EXPECT_TRUE(contains(followers.error().message, "follows 'the test@pc1'"))
+      << followers.error().message;
+  ASSERT_TRUE(session_.share_playback_clock(1, true));
+  ASSERT_TRUE(session_.share_playback_clock(2));
+}
+
+TEST_F(PlayFleet, FollowsAPlayerAndForgetsOneThatIsGone) {
+  const std::string file = folder_.file("a.mcap");
+  auto writer = RecordingWriter::create(file).value();
+  const auto number =
+      writer.add_stream({{"pose", 0, "pc9"}, type_of<RecordedPose>(), 64, 1ms, 1, {}}).value();
+  for (std::int64_t i = 0; i < 2; ++i) {
+    const RecordedPose pose{1, 2, i};
+    ASSERT_TRUE(writer.write(number, {i, at_ns((1 + i) * kSecond), 1us, sizeof pose}, 1us,
+                             std::as_bytes(std::span(&pose, 1))));
+  }
+  ASSERT_TRUE(writer.finish());
+  {
+    Running running(argv({"play", file, "--rate", "0.001"}), environment());
+    await([&] { return there_.setting().speed == 0.001 && !there_.setting().paused; });
+    EXPECT_EQ(there_.setting(), here_.setting());
+    here_.set_speed(1e6);  // as another program may do
+    EXPECT_EQ(running.status(), 0);
+    await([&] { return there_.setting() == PlaybackClock::Setting{}; });
+  }
+  Running alone(argv({"play", file, "--rate", "0.001", "--this-host"}), environment());
+  await([&] { return here_.setting().speed == 0.001; });
+  EXPECT_EQ(there_.setting(), PlaybackClock::Setting{});
+  alone.signal(SIGINT);
+  EXPECT_EQ(alone.status(), 0);
+  Running killed(argv({"play", file, "--rate", "0.001"}), environment());
+  await([&] { return there_.setting().speed == 0.001; });
+  killed.signal(SIGKILL);
+  killed.status();
+  await([&] { return there_.setting() == PlaybackClock::Setting{}; });
+  await([&] { return here_.setting() == PlaybackClock::Setting{}; });
 }
 
 TEST_F(RecordFleet, TakesThePastOfAllHosts) {

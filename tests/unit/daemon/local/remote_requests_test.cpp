@@ -73,6 +73,13 @@ class FakeFleet final : public Fleet {
     asked.push_back("list_clock_pairs");
     then(pairs);
   }
+  void follow_playback(const proto::FollowPlayback& request,
+                       Then<proto::PlaybackFollowers> then) override {
+    asked.push_back("follow_playback of " + request.driver_name());
+    proto::PlaybackFollowers followers;
+    followers.add_followers()->set_host("pc2");
+    then(std::move(followers));
+  }
   void list_nodes(NodeTable nodes, std::function<void(NodeTable)> then) override {
     asked.push_back("list_nodes");
     nodes.add({12, 1000, "mapper", Role::reader, StreamVia::local, "pc2"}, {"lidar", 0, "pc2"});
