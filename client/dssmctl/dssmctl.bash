@@ -146,7 +146,7 @@ _dssmctl() {
     ping) options="--count --interval" ;;
     echo) options="--at --count --csv --field --full --last --wait" ;;
     pub) options="--count --rate --stdin --times" ;;
-    play) options="--force --from --lockstep --loop --map --now --on-hosts --rate --start-paused --to" ;;
+    play) options="--force --from --lockstep --loop --map --now --on-hosts --rate --start-paused --this-host --to" ;;
     record)
       options="--compression --follow --for --host --max-file-duration --max-file-size \
         --max-total-size --output --past --repair --type --until"

@@ -315,6 +315,20 @@ const std::map<std::string, Fill>& messages() {
          frame.set_serial(11);
          frame.mutable_list_nodes();
        }},
+      {"follow_playback",
+       [](net::Frame& frame) {
+         frame.set_serial(12);
+         proto::FollowPlayback& follow = *frame.mutable_follow_playback();
+         follow.set_driver(17);
+         follow.set_driver_name("play@pc1");
+         proto::Playback& playback = *follow.mutable_playback();
+         playback.mutable_run()->set_offset_s(100.5);
+         playback.mutable_run()->set_speed(2);
+         playback.set_change_s(1'700'000'000.25);
+         playback.mutable_before()->set_speed(1);
+         playback.mutable_before()->set_paused(true);
+         playback.mutable_before()->set_paused_at_s(7.25);
+       }},
       {"node_list",
        [](net::Frame& frame) {
          frame.set_serial(11);
