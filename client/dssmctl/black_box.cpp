@@ -97,8 +97,8 @@ class BlackBox {
   // failed: what ended it; null: it is complete.
   void end_incident(const Error* failed) {
     const Result<void> ended = recorder_.end();
-    const RecordingProgress progress = recorder_.progress();
-    written_bytes_ += progress.file_bytes;
+    make_room();
+    written_bytes_ += recorder_.progress().file_bytes;
     if (failed || !ended) {
       notice(escaped_message(failed ? failed->message : ended.error().message));
     }

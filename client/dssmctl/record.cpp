@@ -47,10 +47,13 @@ class RecordingRun {
     Result<void> recorded;
     do {
       recorded = recorder_.take();
-      if (recorded) recorded = folder_.make_room(recorder_.progress().file_bytes);
+      if (recorded && options_.quota_bytes > 0)
+        recorded = folder_.make_room(recorder_.progress().file_bytes);
       report();
     } while (recorded && !is_over() && out_.sleep_until(std::min(recorder_.next_take(), end_)));
-    const Result<void> finished = recorder_.finish();
+    Result<void> finished = recorder_.finish();
+    if (finished && options_.quota_bytes > 0)
+      finished = folder_.make_room(recorder_.progress().file_bytes);
     report_notices();
     out_.clear_line();
     print_summary();
@@ -178,6 +181,7 @@ Result<void> run(const RecordOptions& options, Output& out) {
 }
 
 Result<void> prepare(RecordingFolder& folder) {
+  DSSM_TRY(folder.make_room(0));
   const Result<std::filesystem::path> repaired = folder.repair_newest();
   if (!repaired || !repaired->empty()) {
     print_error(fmt::format("dssmctl: record: {}\n",
@@ -185,7 +189,7 @@ Result<void> prepare(RecordingFolder& folder) {
                                                    escaped(repaired->string()))
                                      : escaped_message(repaired.error().message)));
   }
-  return folder.make_room(0);
+  return {};
 }
 
 }  // namespace dssm::ctl

@@ -304,17 +304,25 @@ std::optional<Time> Recorder::next_past(const Source& source) {
   return info.time;
 }
 
+// A reader opens the new ring of a stream that restarted when it reads, which nothing else does while
+// there is no file.
+void Recorder::follow_restart(Source& source) {
+  RawReader& reader = source.reader;
+  const Tid cursor = reader.cursor();
+  BorrowedSample newest;
+  if (reader.borrow(reader.newest_tid(), newest) == ReadStatus::restarted) {
+    source.property = property_of(reader);
+  } else {
+    reader.seek(cursor);
+  }
+}
+
 void Recorder::check_readers() {
   const MonoTime now = MonoClock::now();
   if (now < next_check_) return;
   next_check_ = now + kCheckPeriod;
   std::erase_if(sources_, [&](Source& source) {
-    // A reader follows a stream that restarted when it reads: nothing else does meanwhile.
-    BorrowedSample newest;
-    if (!is_recording_ &&
-        source.reader.borrow(source.reader.newest_tid(), newest) == ReadStatus::restarted) {
-      source.property = property_of(source.reader);
-    }
+    if (!is_recording_) follow_restart(source);
     const std::optional<Error> error = source.reader.restart_error();
     if (error) opener_.reopen(source.reader.id(), *error);
     return error.has_value();

@@ -186,6 +186,7 @@ class Recorder {
   static std::optional<Time> next_past(const Source& source);
   // What cannot be read any more is opened again.
   void check_readers();
+  static void follow_restart(Source& source);
   Result<void> write(Source& source, const SampleInfo& info);
   // Takes what there is until now and completes the file.
   Result<void> complete();

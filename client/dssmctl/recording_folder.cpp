@@ -87,11 +87,12 @@ std::string incident_name(Time time, std::string_view trigger) {
 
 Result<void> RecordingFolder::make_room(std::uint64_t written_bytes) {
   const std::uint64_t part = quota_bytes_ / kPartsOfQuota;
-  if (quota_bytes_ == 0 || (checked_at_bytes_ && written_bytes < *checked_at_bytes_ + part)) {
+  if (checked_at_bytes_ && (quota_bytes_ == 0 || written_bytes < *checked_at_bytes_ + part)) {
     return {};
   }
   checked_at_bytes_ = written_bytes;
   const std::vector<RecordingFile> files = DSSM_TRY(files_of(folder_));
+  if (quota_bytes_ == 0) return {};
   std::uint64_t total = 0;
   for (const RecordingFile& file : files) total += file.bytes;
   for (std::size_t i = 0; i + 1 < files.size() && total > quota_bytes_ - 2 * part; ++i) {

@@ -31,7 +31,7 @@ class RecordingFolder {
 
   // Deletes the oldest recordings until the others leave some of the quota free, but never the
   // newest one, which may be open for writing. Does nothing while little was written since the last
-  // call.
+  // call; the first one finds out whether the folder can be read.
   //   written_bytes  to the folder since this object exists
   //   fails          not_found, no_permission, system (the folder cannot be read, or a file not be
   //                  deleted)
