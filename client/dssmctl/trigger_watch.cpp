@@ -104,7 +104,9 @@ Result<TriggerRule> TriggerRule::parse(std::string_view text) {
   const std::size_t at = rest.find(comparison->first);
   rule.compare = comparison->second;
   rule.target = trimmed(rest.substr(0, at));
-  if (parts_of(rule.target).empty()) return wrong("STREAM.FIELD is missing");
+  if (parts_of(rule.target).empty() || rule.target.find_first_of("<>=!") != rule.target.npos) {
+    return wrong("STREAM.FIELD is missing");
+  }
   if (rule.name.empty()) rule.name = rule.target;
   std::string_view low = trimmed(rest.substr(at + comparison->first.size()));
   std::string_view high = low;
