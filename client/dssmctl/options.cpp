@@ -819,20 +819,20 @@ std::vector<std::string> verbs_of(const CLI::App& app) {
 // What is called otherwise elsewhere: by people, ROS 2, SSM, or this program's earlier versions.
 // Where two words name it, those of one word follow.
 constexpr std::pair<std::string_view, std::string_view> kOtherNames[] = {
-    {"list", "ls"},          {"topic", "ls"},           {"topics", "ls"},
-    {"streams", "ls"},       {"top", "ls --watch"},     {"monitor", "ls --watch"},
-    {"watch", "ls --watch"}, {"cat", "echo"},           {"read", "echo"},
-    {"publish", "pub"},      {"write", "pub"},          {"rate", "hz"},
-    {"bandwidth", "bw"},     {"latency", "delay"},      {"describe", "info"},
-    {"stat", "info"},        {"type", "info"},          {"interface list", "find"},
-    {"interface", "show"},   {"delete", "rm"},          {"remove", "rm"},
-    {"new", "create"},       {"status", "doctor"},      {"check", "doctor"},
-    {"wtf", "doctor"},       {"peers", "hosts"},        {"host", "hosts"},
-    {"node", "nodes"},       {"processes", "nodes"},    {"ps", "nodes"},
-    {"param", "property"},   {"bag info", "info FILE"}, {"bag play", "play"},
-    {"bag", "record"},       {"rec", "record"},         {"logger", "record"},
-    {"replay", "play"},      {"player", "play"},        {"time", "clock"},
-    {"version", "--version"}};
+    {"list", "ls"},           {"topic", "ls"},           {"topics", "ls"},
+    {"streams", "ls"},        {"top", "ls --watch"},     {"monitor", "ls --watch"},
+    {"watch", "ls --watch"},  {"cat", "echo"},           {"read", "echo"},
+    {"publish", "pub"},       {"write", "pub"},          {"rate", "hz"},
+    {"bandwidth", "bw"},      {"latency", "delay"},      {"describe", "info"},
+    {"stat", "info"},         {"type", "info"},          {"interface list", "find"},
+    {"interface", "show"},    {"delete", "rm"},          {"remove", "rm"},
+    {"new", "create"},        {"status", "doctor"},      {"check", "doctor"},
+    {"wtf", "doctor"},        {"peers", "hosts"},        {"host", "hosts"},
+    {"node", "nodes"},        {"processes", "nodes"},    {"ps", "nodes"},
+    {"param", "property"},    {"bag info", "info FILE"}, {"bag play", "play"},
+    {"bag", "record"},        {"rec", "record"},         {"logger", "record"},
+    {"replay", "play"},       {"player", "play"},        {"time", "clock"},
+    {"version", "--version"}, {"incident", "trigger"}};
 
 // "ls", for a verb that `app` has not; `next` is the word after it. Empty: nothing is like it.
 std::string meant_verb(const CLI::App& app, std::string_view word, std::string_view next) {
@@ -947,6 +947,10 @@ CommandLine parse_command_line(int argc, const char* const* argv) {
           innermost(app).get_subcommands().empty() &&
           error.get_exit_code() == static_cast<int>(CLI::ExitCodes::RequiredError);
       return usage_error(app, lacks_verb ? "a verb is missing" : error.what());
+    }
+    if (std::find(configured.begin(), configured.end(), rest.front()) != configured.end()) {
+      return usage_error(app, fmt::format("the configuration has a key that is not an option: '{}'",
+                                          rest.front()));
     }
     const std::string word = fmt::format("'{}'", rest.front());
     if (rest.front().starts_with('-')) return usage_error(app, "there is no option " + word);
