@@ -304,8 +304,8 @@ std::optional<Time> Recorder::next_past(const Source& source) {
   return info.time;
 }
 
-// A reader opens the new ring of a stream that restarted when it reads, which nothing else does while
-// there is no file.
+// A reader opens the new ring of a stream that restarted when it reads, which nothing else does
+// while there is no file.
 void Recorder::follow_restart(Source& source) {
   RawReader& reader = source.reader;
   const Tid cursor = reader.cursor();

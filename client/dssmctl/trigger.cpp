@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl trigger: asks the black boxes of all hosts to record an incident, by a sample in the stream
-// kTriggerStream of each.
+// dssmctl trigger: asks the black boxes of all hosts to record an incident, by a sample in the
+// stream kTriggerStream of each.
 #include <fmt/format.h>
 
 #include <algorithm>

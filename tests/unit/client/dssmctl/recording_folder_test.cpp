@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The folder of a recorder: names, quota, and the file that a killed recorder left; and the file that
-// configures it.
+// The folder of a recorder: names, quota, and the file that a killed recorder left; and the file
+// that configures it.
 #include "client/dssmctl/recording_folder.hpp"
 
 #include <gtest/gtest.h>
