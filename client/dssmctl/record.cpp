@@ -47,13 +47,11 @@ class RecordingRun {
     Result<void> recorded;
     do {
       recorded = recorder_.take();
-      if (recorded && options_.quota_bytes > 0)
-        recorded = folder_.make_room(recorder_.progress().file_bytes);
+      if (recorded) recorded = keep_quota();
       report();
     } while (recorded && !is_over() && out_.sleep_until(std::min(recorder_.next_take(), end_)));
     Result<void> finished = recorder_.finish();
-    if (finished && options_.quota_bytes > 0)
-      finished = folder_.make_room(recorder_.progress().file_bytes);
+    if (finished) finished = keep_quota();
     report_notices();
     out_.clear_line();
     print_summary();
@@ -61,6 +59,11 @@ class RecordingRun {
   }
 
  private:
+  Result<void> keep_quota() {
+    if (options_.quota_bytes == 0) return {};
+    return folder_.make_room(recorder_.progress().file_bytes);
+  }
+
   bool is_over() {
     const MonoTime now = MonoClock::now();
     if (now >= end_ || (options_.until && WallClock::now() >= options_.until->time)) return true;

@@ -116,11 +116,13 @@ TEST_F(BlackBox, GoesOnForATriggerThatComesMeanwhileAndHasNoSampleTwice) {
   output({"trigger", "one"});
   const std::string file = quoted_file(running.line());
   output({"trigger", "one"});  // within --min-interval
+  const MonoTime second = MonoClock::now();
   output({"trigger", "two"});
   const std::string goes_on = running.line();
   EXPECT_TRUE(contains(goes_on, "trigger 'two' of host 'pc1'; '" + file + "' goes on")) << goes_on;
   write_power(power, 10, 19);
   EXPECT_TRUE(running.line().starts_with(file));
+  EXPECT_GE(MonoClock::now() - second, 2s);
   EXPECT_EQ(Recording::open(file).value().triggers().size(), 2U);
 
   write_power(power, 20, 29);
@@ -284,7 +286,7 @@ TEST_F(BlackBox, CompletesTheFileOfARecorderThatWasKilled) {
 
 TEST_F(BlackBox, WaitsForTheNextTriggerWhenTheDiskIsFull) {
   auto power = session_.create<Power>("power", depth_of(100'000)).value();
-  std::vector<std::string> words = recorder({"--after", "1ms", "--compression", "none"});
+  std::vector<std::string> words = recorder({"--after", "1h", "--compression", "none"});
   // No file may become longer, which is as a full disk is.
   words.insert(words.begin(), {"env", "--ignore-signal=XFSZ", "prlimit", "--fsize=300000"});
   Running running(words, environment());
@@ -300,6 +302,7 @@ TEST_F(BlackBox, WaitsForTheNextTriggerWhenTheDiskIsFull) {
   write_power(power, 20'000, 20'009);
   output({"trigger", "small"});
   const std::string next = quoted_file(running.line());
+  running.signal(SIGTERM);
   EXPECT_TRUE(running.line().starts_with(next));
   const std::vector<std::int64_t> numbers = numbers_in(next);
   EXPECT_EQ(std::vector(numbers.end() - 10, numbers.end()), range(20'000, 20'009));
