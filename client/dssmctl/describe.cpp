@@ -165,6 +165,8 @@ Json stream_json(const StreamInfo& stream) {
   json["remote_writers"] = when_known(stream.remote_writers);
   json["remote_readers"] = when_known(stream.remote_readers);
   json["channels"] = when_known(stream.channels);
+  json["crashed_writers"] = stream.crashed_writers;
+  json["last_crashed_writer"] = or_null(stream.last_crashed_writer);
   json["memory_bytes"] = stream.memory_bytes;
   json["property_bytes"] = stream.property_bytes;
   json["incarnation"] = stream.incarnation;

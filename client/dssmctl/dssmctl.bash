@@ -87,8 +87,8 @@ _dssmctl() {
         --interval | -i | --size | --table | --depth | --life | --cycle | --type | --align | --offset | \
         --speed | --time | --rate | --ca | --credentials | --out | --name | --program | --days | \
         --output | -o | --past | --until | --for | --compression | --max-file-size | \
-        --max-file-duration | --max-total-size | --from | --to | --map | --lockstep | \
-        --repair)
+        --max-file-duration | --max-total-size | --from | --to | --map | --lockstep | --before | \
+        --after | --trigger | --min-interval | --max-incident | --quota | --reason | --config | --repair)
         ((++i))
         ;;
       -*) ;;
@@ -105,7 +105,7 @@ _dssmctl() {
   done
 
   case $prev in
-    --socket | --ca | --credentials | --out | --output | -o | --repair)
+    --socket | --ca | --credentials | --out | --output | -o | --config | --repair)
       _dssmctl_offer_files
       return
       ;;
@@ -129,7 +129,8 @@ _dssmctl() {
     --at | --count | -n | -c | --wait | --window | --interval | -i | --size | --table | \
       --depth | --life | --cycle | --type | --align | --offset | --speed | --time | --rate | --name | \
       --program | --days | --past | --until | --for | --max-file-size | --max-file-duration | \
-      --max-total-size | --from | --to | --map)
+      --max-total-size | --from | --to | --map | --before | --after | --trigger | --min-interval | \
+      --max-incident | --quota | --reason)
       return # a value that only the person knows
       ;;
   esac
@@ -148,9 +149,11 @@ _dssmctl() {
     pub) options="--count --rate --stdin --times" ;;
     play) options="--force --from --lockstep --loop --map --now --on-hosts --rate --start-paused --this-host --to" ;;
     record)
-      options="--compression --follow --for --host --max-file-duration --max-file-size \
-        --max-total-size --output --past --repair --type --until"
+      options="--after --before --black-box --compression --config --follow --for --host \
+        --max-file-duration --max-file-size --max-incident --max-total-size --min-interval --output \
+        --past --quota --repair --trigger --type --until"
       ;;
+    trigger) options="--reason" ;;
     hz | bw | delay) options="--count --interval --wait --window" ;;
     create) options="--align --cycle --depth --life --size --type" ;;
     "playback set") options="--offset --speed --time" ;;
@@ -173,7 +176,7 @@ _dssmctl() {
     "" | help)
       mapfile -t COMPREPLY < <(compgen -W \
         "bw clock create delay doctor echo find graph hosts hz info ls nodes ping pki play \
-          playback property pub record rights rm show" -- "$cur")
+          playback property pub record rights rm show trigger" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
     playback) mapfile -t COMPREPLY < <(compgen -W "pause reset resume set show" -- "$cur") ;;

@@ -41,6 +41,7 @@ function __dssmctl_candidates
                 --size --table --depth --life --cycle --type --align --offset --speed --time --rate --ca \
                 --credentials --out --name --program --days --output -o --past --until --for \
                 --compression --max-file-size --max-file-duration --max-total-size --from --to --map \
+                --before --after --trigger --min-interval --max-incident --quota --reason --config \
                 --repair
                 set i (math $i + 1)
             case '-*'
@@ -57,7 +58,7 @@ function __dssmctl_candidates
     end
 
     switch $words[-1]
-        case --socket --ca --credentials --out --output -o --repair
+        case --socket --ca --credentials --out --output -o --config --repair
             __fish_complete_path (commandline -ct)
             return
         case --host
@@ -72,7 +73,8 @@ function __dssmctl_candidates
             return
         case --at --count -n -c --wait --window --interval -i --size --table --depth --life --cycle \
             --type --align --offset --speed --time --rate --name --program --days --past --until --for \
-            --max-file-size --max-file-duration --max-total-size --from --to --map
+            --max-file-size --max-file-duration --max-total-size --from --to --map --before --after \
+            --trigger --min-interval --max-incident --quota --reason
             return
         case --compression
             printf '%s\n' lz4 none zstd

@@ -200,4 +200,10 @@ std::string element_text(std::span<const std::byte> payload, const Field& field,
   return c && *c == '\0' ? "" : bare_text(value);  // programs that read lines end at a zero byte
 }
 
+std::optional<double> element_number(std::span<const std::byte> payload, const Field& field,
+                                     std::uint64_t i) {
+  if (i >= elements_in(payload, field)) return std::nullopt;
+  return std::visit([](auto v) { return static_cast<double>(v); }, value_at(payload, field, i));
+}
+
 }  // namespace dssm::ctl

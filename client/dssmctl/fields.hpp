@@ -7,6 +7,7 @@
 
 #include <cstddef>
 #include <dssm/stream.hpp>
+#include <optional>
 #include <span>
 #include <string>
 #include <vector>
@@ -42,5 +43,9 @@ Json field_json(std::span<const std::byte> payload, const Field& field);
 
 // One element as in field_text(), but text and characters bare; empty when there is none.
 std::string element_text(std::span<const std::byte> payload, const Field& field, std::uint64_t i);
+
+// One element as a number, a boolean as 0 or 1, a character by its code; none when there is none.
+std::optional<double> element_number(std::span<const std::byte> payload, const Field& field,
+                                     std::uint64_t i);
 
 }  // namespace dssm::ctl

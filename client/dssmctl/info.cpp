@@ -121,6 +121,12 @@ void print_stream(const StreamInfo& stream, bool iso, Output& out) {
   add_line(
       out, "channels",
       fmt::format("{} to other hosts, for programs there", count_text(stream, stream.channels)));
+  if (stream.crashed_writers > 0) {
+    add_line(out, "crashed",
+             fmt::format("{} ended without closing it, the last one was {}",
+                         counted(stream.crashed_writers, "writer", "writers"),
+                         escaped(stream.last_crashed_writer)));
+  }
   add_line(out, "memory", bytes_text(stream.memory_bytes));
   add_line(out, "property", stream.property_bytes ? bytes_text(stream.property_bytes) : "none");
   add_line(out, "incarnation", stream.incarnation);

@@ -16,9 +16,11 @@
 #include <limits>
 #include <memory>
 
+#include "client/dssmctl/config_words.hpp"
 #include "client/dssmctl/names.hpp"
 #include "client/dssmctl/recording_info.hpp"
 #include "client/dssmctl/text.hpp"
+#include "client/dssmctl/trigger_watch.hpp"
 #include "core/base/try.hpp"
 
 namespace dssm::ctl {
@@ -382,6 +384,50 @@ void add_record_limits(CLI::App* record, RecordOptions& options) {
               options.max_file_duration, Range::positive);
   add_bytes("--max-total-size", "delete the oldest of the files when all together are larger",
             options.max_total_bytes);
+  add_bytes("--quota",
+            "delete the oldest of all recordings in the folder of --output before they "
+            "are larger",
+            options.quota_bytes);
+}
+
+void add_black_box(CLI::App* record, RecordOptions& options) {
+  record->add_flag("--black-box", options.black_box,
+                   "record only around triggers: a file for each incident, in the folder of "
+                   "--output");
+  add_seconds(record, "--before",
+              "so long before a trigger, as far as the rings hold it (default: "
+              "30s)",
+              options.before, Range::not_negative);
+  add_seconds(record, "--after", "and so long after it (default: 10s)", options.after,
+              Range::not_negative);
+  record
+      ->add_option("--trigger", options.triggers,
+                   "what begins an incident, beside `dssmctl trigger`: 'STREAM.FIELD > 3.5', "
+                   "'stalled STREAM', 'crashed STREAM', 'clock HOST'; may be given several times")
+      ->type_name("CONDITION")
+      ->allow_extra_args(false);
+  add_seconds(record, "--min-interval", "the same trigger not again within that (default: 1min)",
+              options.min_interval, Range::not_negative);
+  add_seconds(record, "--max-incident", "triggers prolong an incident up to that (default: 5min)",
+              options.max_incident, Range::positive);
+}
+
+// Each is a file that other options do not fit.
+void check_black_box(const RecordOptions& options) {
+  if (!options.black_box) {
+    require(options.triggers.empty(), "--trigger: only with --black-box");
+    return;
+  }
+  require(!options.past && !options.duration && !options.until,
+          "--black-box: it goes on until Ctrl-C; leave out --past, --for and --until");
+  require(options.max_file_bytes == 0 && options.max_file_duration == Duration::zero() &&
+              options.max_total_bytes == 0,
+          "--black-box: each incident is one file; limit all with --quota, and one with "
+          "--max-incident");
+  for (const std::string& trigger : options.triggers) {
+    const Result<TriggerRule> rule = TriggerRule::parse(trigger);
+    require(rule.has_value(), rule ? "" : rule.error().message);
+  }
 }
 
 void check_record(RecordOptions& options) {
@@ -391,6 +437,9 @@ void check_record(RecordOptions& options) {
           "--repair takes one file, and nothing else");
   require(!options.follow || options.past,
           "--follow: only with --past, without which it continues anyway");
+  require(options.quota_bytes == 0 || options.max_file_bytes <= options.quota_bytes / 2,
+          "--max-file-size: at most half of --quota, because the newest file is not deleted");
+  check_black_box(options);
 }
 
 void add_record(CLI::App& app, Parsed& parsed) {
@@ -426,10 +475,35 @@ void add_record(CLI::App& app, Parsed& parsed) {
       ->type_name("NAME")
       ->check(CLI::Validator(check_compression, ""));
   add_record_limits(record, options);
+  add_black_box(record, options);
+  // parse_command_line() puts the file's words in its place.
+  record
+      ->add_option_function<std::string>(
+          "--config", [](const std::string&) {},
+          "a TOML file with these options as keys, such as max_file_size, and PATTERN as streams")
+      ->type_name("FILE");
   record
       ->add_option("--repair", options.repair,
                    "complete a recording that was not finished, in place; nothing is recorded")
       ->type_name("FILE");
+}
+
+void add_trigger(CLI::App& app, Parsed& parsed) {
+  CLI::App* trigger =
+      app.add_subcommand("trigger", "have the black boxes of all hosts record an incident");
+  TriggerOptions& options =
+      add_options<TriggerOptions>(trigger, parsed, [](const TriggerOptions& all) {
+        require(!all.name.empty() && all.name.size() < sizeof(TriggerRequest::name),
+                fmt::format("NAME has 1 to {} bytes", sizeof(TriggerRequest::name) - 1));
+        require(all.reason.size() < sizeof(TriggerRequest::reason),
+                fmt::format("--reason: at most {} bytes", sizeof(TriggerRequest::reason) - 1));
+      });
+  trigger
+      ->add_option("NAME", options.name, "what happened, in a word: it is part of the file's name")
+      ->required()
+      ->type_name("");
+  trigger->add_option("--reason", options.reason, "the same in a sentence, for people")
+      ->type_name("TEXT");
 }
 
 void check_play(const PlayOptions& options) {
@@ -722,6 +796,7 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_echo(app, parsed);
   add_pub(app, parsed);
   add_record(app, parsed);
+  add_trigger(app, parsed);
   add_play(app, parsed);
   add_types(app, parsed);
   add_meter<HzOptions>(app, parsed, "hz", "how often samples come");
@@ -760,20 +835,20 @@ std::vector<std::string> verbs_of(const CLI::App& app) {
 // What is called otherwise elsewhere: by people, ROS 2, SSM, or this program's earlier versions.
 // Where two words name it, those of one word follow.
 constexpr std::pair<std::string_view, std::string_view> kOtherNames[] = {
-    {"list", "ls"},          {"topic", "ls"},           {"topics", "ls"},
-    {"streams", "ls"},       {"top", "ls --watch"},     {"monitor", "ls --watch"},
-    {"watch", "ls --watch"}, {"cat", "echo"},           {"read", "echo"},
-    {"publish", "pub"},      {"write", "pub"},          {"rate", "hz"},
-    {"bandwidth", "bw"},     {"latency", "delay"},      {"describe", "info"},
-    {"stat", "info"},        {"type", "info"},          {"interface list", "find"},
-    {"interface", "show"},   {"delete", "rm"},          {"remove", "rm"},
-    {"new", "create"},       {"status", "doctor"},      {"check", "doctor"},
-    {"wtf", "doctor"},       {"peers", "hosts"},        {"host", "hosts"},
-    {"node", "nodes"},       {"processes", "nodes"},    {"ps", "nodes"},
-    {"param", "property"},   {"bag info", "info FILE"}, {"bag play", "play"},
-    {"bag", "record"},       {"rec", "record"},         {"logger", "record"},
-    {"replay", "play"},      {"player", "play"},        {"time", "clock"},
-    {"version", "--version"}};
+    {"list", "ls"},           {"topic", "ls"},           {"topics", "ls"},
+    {"streams", "ls"},        {"top", "ls --watch"},     {"monitor", "ls --watch"},
+    {"watch", "ls --watch"},  {"cat", "echo"},           {"read", "echo"},
+    {"publish", "pub"},       {"write", "pub"},          {"rate", "hz"},
+    {"bandwidth", "bw"},      {"latency", "delay"},      {"describe", "info"},
+    {"stat", "info"},         {"type", "info"},          {"interface list", "find"},
+    {"interface", "show"},    {"delete", "rm"},          {"remove", "rm"},
+    {"new", "create"},        {"status", "doctor"},      {"check", "doctor"},
+    {"wtf", "doctor"},        {"peers", "hosts"},        {"host", "hosts"},
+    {"node", "nodes"},        {"processes", "nodes"},    {"ps", "nodes"},
+    {"param", "property"},    {"bag info", "info FILE"}, {"bag play", "play"},
+    {"bag", "record"},        {"rec", "record"},         {"logger", "record"},
+    {"replay", "play"},       {"player", "play"},        {"time", "clock"},
+    {"version", "--version"}, {"incident", "trigger"}};
 
 // "ls", for a verb that `app` has not; `next` is the word after it. Empty: nothing is like it.
 std::string meant_verb(const CLI::App& app, std::string_view word, std::string_view next) {
@@ -826,6 +901,28 @@ CommandLine usage_error(const CLI::App& app, const std::string& error) {
           false};
 }
 
+// Replaces `--config FILE` of `record` by the words of that file, which `configured` keeps.
+Result<void> expand_config(std::vector<const char*>& words, std::vector<std::string>& configured) {
+  constexpr std::string_view kOption = "--config";
+  if (std::none_of(words.begin(), words.end(),
+                   [](const char* word) { return word == std::string_view("record"); })) {
+    return {};
+  }
+  for (auto word = words.begin(); word != words.end(); ++word) {
+    const std::string_view text = *word;
+    const bool is_joined = text.starts_with("--config=");
+    if (!is_joined && (text != kOption || word + 1 == words.end())) continue;
+    const std::string path(is_joined ? text.substr(kOption.size() + 1) : word[1]);
+    configured = DSSM_TRY(config_words(path));
+    word = words.erase(word, word + (is_joined ? 1 : 2));
+    std::vector<const char*> pointers;
+    for (const std::string& one : configured) pointers.push_back(one.c_str());
+    words.insert(word, pointers.begin(), pointers.end());
+    return {};
+  }
+  return {};
+}
+
 }  // namespace
 
 CommandLine parse_command_line(int argc, const char* const* argv) {
@@ -836,6 +933,13 @@ CommandLine parse_command_line(int argc, const char* const* argv) {
     words.push_back("--help");
     argc = static_cast<int>(words.size());
   }
+  // What --config names, in its place: what else the command line says is beside it.
+  std::vector<std::string> configured;
+  if (Result<void> read = expand_config(words, configured); !read) {
+    return {std::nullopt, fmt::format("dssmctl: {}\n", escaped_message(read.error().message)),
+            false};
+  }
+  argc = static_cast<int>(words.size());
   Parsed parsed;
   CLI::App app("Show and manage streams of sensor samples, on this PC and on others.", "dssmctl");
   add_all(app, parsed);
@@ -859,6 +963,10 @@ CommandLine parse_command_line(int argc, const char* const* argv) {
           innermost(app).get_subcommands().empty() &&
           error.get_exit_code() == static_cast<int>(CLI::ExitCodes::RequiredError);
       return usage_error(app, lacks_verb ? "a verb is missing" : error.what());
+    }
+    if (std::find(configured.begin(), configured.end(), rest.front()) != configured.end()) {
+      return usage_error(app, fmt::format("the configuration has a key that is not an option: '{}'",
+                                          rest.front()));
     }
     const std::string word = fmt::format("'{}'", rest.front());
     if (rest.front().starts_with('-')) return usage_error(app, "there is no option " + word);

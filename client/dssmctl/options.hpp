@@ -106,6 +106,16 @@ struct RecordOptions : CommonOptions {
   std::string compression = "lz4";
   std::uint64_t max_file_bytes = 0, max_total_bytes = 0;  // 0: no limit
   Duration max_file_duration{};                           // 0: no limit
+  std::uint64_t quota_bytes = 0;  // of all recordings in the folder; 0: none
+  // Of the black box.
+  bool black_box = false;
+  std::vector<std::string> triggers;  // as TriggerRule::parse() reads them
+  Duration before = std::chrono::seconds(30), after = std::chrono::seconds(10);
+  Duration min_interval = std::chrono::minutes(1), max_incident = std::chrono::minutes(5);
+};
+
+struct TriggerOptions : CommonOptions {
+  std::string name, reason;
 };
 
 struct PlayOptions : CommonOptions {
@@ -205,11 +215,11 @@ struct PkiShowOptions : CommonOptions {
 
 using Options =
     std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
-                 PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, PlayOptions,
-                 FindOptions, ShowOptions, HzOptions, BwOptions, DelayOptions, CreateOptions,
-                 RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
-                 PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
-                 PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
+                 PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, TriggerOptions,
+                 PlayOptions, FindOptions, ShowOptions, HzOptions, BwOptions, DelayOptions,
+                 CreateOptions, RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions,
+                 PlaybackOptions, PkiInitOptions, PkiRequestOptions, PkiIssueOptions,
+                 PkiInstallOptions, PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
@@ -235,6 +245,7 @@ Result<void> run(const InfoOptions& options, Output& out);
 Result<void> run(const EchoOptions& options, Output& out);
 Result<void> run(const PubOptions& options, Output& out);
 Result<void> run(const RecordOptions& options, Output& out);
+Result<void> run(const TriggerOptions& options, Output& out);
 Result<void> run(const PlayOptions& options, Output& out);
 Result<void> run(const FindOptions& options, Output& out);
 Result<void> run(const ShowOptions& options, Output& out);

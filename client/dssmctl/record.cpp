@@ -4,13 +4,14 @@
 #include <fmt/format.h>
 
 #include <algorithm>
-#include <ctime>
 #include <filesystem>
 
+#include "client/dssmctl/black_box.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
 #include "client/dssmctl/recorder.hpp"
+#include "client/dssmctl/recording_folder.hpp"
 #include "client/dssmctl/text.hpp"
 #include "core/base/try.hpp"
 
@@ -19,45 +20,25 @@ namespace {
 
 // By then the streams that there are could have been opened.
 constexpr Duration kFirstNoticeTime = std::chrono::seconds(1);
-// Another host that sends nothing more is not waited for longer than that.
-constexpr Duration kMaxPastWait = std::chrono::seconds(10);
-
-// As ROS 2 names its recordings: "dssm_2026_11_27-12_30_00.mcap".
-std::string file_name_of_now() {
-  const std::time_t now = std::time(nullptr);
-  std::tm local{};
-  ::localtime_r(&now, &local);
-  char text[64];
-  const std::size_t length =
-      std::strftime(text, sizeof text, "dssm_%Y_%m_%d-%H_%M_%S.mcap", &local);
-  return {text, length};
-}
-
 std::filesystem::path file_of(const RecordOptions& options) {
-  if (options.file.empty()) return file_name_of_now();
+  const std::string name = recording_name(WallClock::now());
+  if (options.file.empty()) return name;
   std::error_code ignored;
   if (std::filesystem::is_directory(options.file, ignored)) {
-    return std::filesystem::path(options.file) / file_name_of_now();
+    return std::filesystem::path(options.file) / name;
   }
   return options.file;
-}
-
-std::string progress_text(const Recorder& recorder) {
-  const RecordingProgress progress = recorder.progress();
-  return fmt::format("{} of {}, {}, {} lost", counted(progress.samples, "sample", "samples"),
-                     counted(recorder.streams(), "stream", "streams"),
-                     bytes_text(progress.file_bytes + progress.waiting_bytes),
-                     progress.lost_samples);
 }
 
 // Records until it is to end, and says how it goes: on a terminal in a line that is redrawn.
 class RecordingRun {
  public:
   RecordingRun(const RecordOptions& options, std::filesystem::path file, Recorder& recorder,
-               Output& out)
+               RecordingFolder& folder, Output& out)
       : options_(options),
         file_(std::move(file)),
         recorder_(recorder),
+        folder_(folder),
         out_(out),
         end_(options.duration ? deadline_in(*options.duration) : kNever) {}
 
@@ -66,9 +47,11 @@ class RecordingRun {
     Result<void> recorded;
     do {
       recorded = recorder_.take();
+      if (recorded) recorded = keep_quota();
       report();
     } while (recorded && !is_over() && out_.sleep_until(std::min(recorder_.next_take(), end_)));
-    const Result<void> finished = recorder_.finish();
+    Result<void> finished = recorder_.finish();
+    if (finished) finished = keep_quota();
     report_notices();
     out_.clear_line();
     print_summary();
@@ -76,14 +59,17 @@ class RecordingRun {
   }
 
  private:
+  Result<void> keep_quota() {
+    if (options_.quota_bytes == 0) return {};
+    return folder_.make_room(recorder_.progress().file_bytes);
+  }
+
   bool is_over() {
     const MonoTime now = MonoClock::now();
     if (now >= end_ || (options_.until && WallClock::now() >= options_.until->time)) return true;
     if (!options_.past || options_.duration || options_.until || options_.follow) return false;
     if (recorder_.has_past()) return true;
-    const std::uint64_t progress = recorder_.past_progress();
-    if (std::exchange(past_progress_, progress) != progress) past_moved_ = now;
-    if (now - past_moved_ < kMaxPastWait) return false;
+    if (!recorder_.is_past_late()) return false;
     notice("not all of the past has come; is another host slow or silent? See `dssmctl hosts`");
     return true;
   }
@@ -112,13 +98,7 @@ class RecordingRun {
   void print_summary() {
     const RecordingProgress progress = recorder_.progress();
     if (options_.json) {
-      out_.add(json_document({{"file", file_.string()},
-                              {"files", progress.files},
-                              {"streams", recorder_.streams()},
-                              {"samples", progress.samples},
-                              {"payload_bytes", progress.payload_bytes},
-                              {"file_bytes", progress.file_bytes},
-                              {"lost_samples", progress.lost_samples}}));
+      out_.add(json_document(recording_json(file_, recorder_)));
     } else {
       out_.add(fmt::format("{}: {}{}\n", escaped(file_.string()), progress_text(recorder_),
                            progress.files > 1 ? fmt::format(", in {} files", progress.files) : ""));
@@ -128,10 +108,10 @@ class RecordingRun {
   const RecordOptions& options_;
   std::filesystem::path file_;
   Recorder& recorder_;
+  RecordingFolder& folder_;
   Output& out_;
   MonoTime end_;
-  MonoTime started_ = MonoClock::now(), past_moved_ = started_;
-  std::uint64_t past_progress_ = 0;
+  MonoTime started_ = MonoClock::now();
   bool has_waited_ = false;
 };
 
@@ -158,21 +138,61 @@ Compression compression_of(const std::string& name) {
 
 }  // namespace
 
+std::string progress_text(const Recorder& recorder) {
+  const RecordingProgress progress = recorder.progress();
+  return fmt::format("{} of {}, {}, {} lost", counted(progress.samples, "sample", "samples"),
+                     counted(recorder.streams(), "stream", "streams"),
+                     bytes_text(progress.file_bytes + progress.waiting_bytes),
+                     progress.lost_samples);
+}
+
+Json recording_json(const std::filesystem::path& file, const Recorder& recorder) {
+  const RecordingProgress progress = recorder.progress();
+  return {{"file", file.string()},
+          {"files", progress.files},
+          {"streams", recorder.streams()},
+          {"samples", progress.samples},
+          {"payload_bytes", progress.payload_bytes},
+          {"file_bytes", progress.file_bytes},
+          {"lost_samples", progress.lost_samples}};
+}
+
 Result<void> run(const RecordOptions& options, Output& out) {
   if (!options.repair.empty()) return repair(options, out);
   Session session = DSSM_TRY(connect(options));
-  const std::filesystem::path file = file_of(options);
   RecordingOptions how;
   how.compression = compression_of(options.compression);
+  RecorderPlan plan{StreamFilter(options.hosts, options.patterns), options.types, options.past,
+                    options.black_box};
+  if (options.black_box) return run_black_box(options, std::move(session), plan, how, out);
+
+  const std::filesystem::path file = file_of(options);
   how.max_file_bytes = options.max_file_bytes;
   how.max_file_duration = options.max_file_duration;
   how.max_total_bytes = options.max_total_bytes;
+  // The newest file is never deleted, so it must not take much of the quota.
+  if (options.quota_bytes > 0 && how.max_file_bytes == 0) {
+    how.max_file_bytes = std::max<std::uint64_t>(options.quota_bytes / 8, 1);
+  }
+  RecordingFolder folder(file.has_parent_path() ? file.parent_path() : ".", options.quota_bytes);
+  if (options.quota_bytes > 0) DSSM_TRY(prepare(folder));
   RecordingWriter writer = DSSM_TRY(RecordingWriter::create(file, how));
   catch_stop_signals();
-  const std::unique_ptr<Recorder> recorder = DSSM_TRY(Recorder::start(
-      std::move(session), std::move(writer),
-      {StreamFilter(options.hosts, options.patterns), options.types, options.past}));
-  return RecordingRun(options, file, *recorder, out).run();
+  const std::unique_ptr<Recorder> recorder =
+      DSSM_TRY(Recorder::start(std::move(session), std::move(writer), std::move(plan)));
+  return RecordingRun(options, file, *recorder, folder, out).run();
+}
+
+Result<void> prepare(RecordingFolder& folder) {
+  DSSM_TRY(folder.make_room(0));
+  const Result<std::filesystem::path> repaired = folder.repair_newest();
+  if (!repaired || !repaired->empty()) {
+    print_error(fmt::format("dssmctl: record: {}\n",
+                            repaired ? fmt::format("'{}' was not finished, and is completed",
+                                                   escaped(repaired->string()))
+                                     : escaped_message(repaired.error().message)));
+  }
+  return {};
 }
 
 }  // namespace dssm::ctl

@@ -22,6 +22,13 @@ std::vector<std::byte> property_of(const RawReader& reader) {
 
 // --- opening
 
+// The time `past` before `now`, by the stamps of the stream.
+Time Recorder::past_of(const Source& source, Time now, Duration past) {
+  SampleInfo info;
+  const bool is_known = source.reader.read_info(source.reader.newest_tid(), info) == ReadStatus::ok;
+  return saturating_add(source.is_of_now || !is_known ? now : info.time, -past);
+}
+
 Recorder::Opener::Opener(Session session, RecorderPlan plan)
     : session_(std::move(session)), plan_(std::move(plan)), started_(WallClock::now()) {}
 
@@ -110,7 +117,7 @@ void Recorder::Opener::run() {
     }
     const Wanted wanted = *next;
     lock.unlock();
-    Result<Opened> opened = open(wanted);
+    Result<Source> opened = open(wanted);
     lock.lock();
     // It may have been removed meanwhile, and created again.
     const auto entry = std::find_if(wanted_.begin(), wanted_.end(), [&](const Wanted& other) {
@@ -137,16 +144,18 @@ void Recorder::Opener::run() {
   }
 }
 
-Result<Recorder::Opener::Opened> Recorder::Opener::open(const Wanted& wanted) const {
+Result<Recorder::Source> Recorder::Opener::open(const Wanted& wanted) const {
   // A stream that comes later is new, or its host is: all of it is wanted.
-  const bool with_history = plan_.past || !wanted.from_start;
+  const bool with_history = plan_.past || plan_.on_demand || !wanted.from_start;
   Session session = session_;
   RawReader reader = DSSM_TRY(
       session.open_raw_reader(wanted.stream.id, nullptr, 0,
                               with_history ? FetchHistory::at_once : FetchHistory::when_read));
-  std::vector<std::byte> property = property_of(reader);
-  const Tid newest = reader.newest_tid();
-  Source source{std::move(reader), 0, kNoTid, with_history ? newest : kNoTid, {}};
+  Source source{std::move(reader), 0, kNoTid, kNoTid, {}, true, {}};
+  source.property = property_of(source.reader);
+  const Tid newest = source.reader.newest_tid();
+  // The stamps of a recording that is being played are of another time than now.
+  source.is_of_now = wanted.stream.state != StreamState::unknown;
   if (!with_history) {
     // What was written since the recording began, if dssmd said what was there then.
     const StreamInfo& then = wanted.stream;
@@ -157,18 +166,13 @@ Result<Recorder::Opener::Opened> Recorder::Opener::open(const Wanted& wanted) co
     source.next = before + 1;
   } else {
     source.reader.seek(kNoTid);
-    if (plan_.past && wanted.from_start) {
-      // The stamps of a recording that is being played are of another time than now.
-      SampleInfo info;
-      const bool is_of_now = wanted.stream.state != StreamState::unknown;
-      const bool is_known = source.reader.read_info(newest, info) == ReadStatus::ok;
-      source.from = saturating_add(is_of_now || !is_known ? started_ : info.time, -*plan_.past);
-    }
+    source.past_until = newest;
+    if (plan_.past && wanted.from_start) source.from = past_of(source, started_, *plan_.past);
   }
-  return Opened{std::move(source), std::move(property)};
+  return source;
 }
 
-std::vector<Recorder::Opener::Opened> Recorder::Opener::take_opened() {
+std::vector<Recorder::Source> Recorder::Opener::take_opened() {
   const std::lock_guard lock(mutex_);
   return std::exchange(opened_, {});
 }
@@ -185,18 +189,60 @@ bool Recorder::Opener::has_tried_all() const {
 
 // --- recording
 
-Result<std::unique_ptr<Recorder>> Recorder::start(Session session, RecordingWriter file,
+Result<std::unique_ptr<Recorder>> Recorder::start(Session session,
+                                                  std::optional<RecordingWriter> file,
                                                   RecorderPlan plan) {
   const MonoTime all_by = plan.past ? deadline_in(kOpeningTime) : MonoTime();
-  std::unique_ptr<Recorder> recorder(
-      new Recorder(std::move(session), std::move(file), std::move(plan)));
+  std::unique_ptr<Recorder> recorder(new Recorder(std::move(session), std::move(file), plan));
   recorder->all_by_ = all_by;
   DSSM_TRY(recorder->opener_.begin());
   return recorder;
 }
 
+Result<void> Recorder::begin(RecordingWriter file, Duration before) {
+  file_ = std::move(file);
+  is_recording_ = true;
+  wanted_from_ = WallClock::now();
+  before_ = before;
+  past_moved_ = MonoClock::now();
+  period_ = kMinPeriod;
+  for (Source& source : sources_) {
+    want_past(source);
+    if (Result<void> added = add_to_file(source); !added) {
+      is_recording_ = false;
+      return added;
+    }
+  }
+  return {};
+}
+
+// Of what its ring holds, the samples from wanted_from_ on that no file has.
+void Recorder::want_past(Source& source) const {
+  RawReader& reader = source.reader;
+  source.from = past_of(source, wanted_from_, before_);
+  source.next = kNoTid;
+  SampleInfo info;
+  // To skip samples costs a copy of each.
+  if (reader.find(*source.from, info) == ReadStatus::ok && info.tid - 1 > reader.cursor()) {
+    reader.seek(info.tid - 1);
+  }
+  const Tid newest = reader.newest_tid();
+  source.past_until = newest > reader.cursor() ? newest : kNoTid;
+}
+
+Result<void> Recorder::end() {
+  const Result<void> completed = complete();
+  is_recording_ = false;
+  return completed;
+}
+
 Result<void> Recorder::take() {
-  for (Opener::Opened& opened : opener_.take_opened()) DSSM_TRY(add(std::move(opened)));
+  for (Source& opened : opener_.take_opened()) DSSM_TRY(add(std::move(opened)));
+  if (!is_recording_) {
+    check_readers();
+    next_take_ = deadline_in(kMaxPeriod);
+    return {};
+  }
   if (!opener_.has_tried_all() && MonoClock::now() < all_by_) {
     next_take_ = deadline_in(kMinPeriod);
     return {};
@@ -234,18 +280,19 @@ Duration Recorder::next_period() {
   return period_;
 }
 
-Result<void> Recorder::add(Opener::Opened opened) {
-  DSSM_TRY(add_to_file(opened.source, std::move(opened.property)));
-  sources_.push_back(std::move(opened.source));
+Result<void> Recorder::add(Source source) {
+  if (is_recording_ && is_on_demand_) want_past(source);
+  if (is_recording_) DSSM_TRY(add_to_file(source));
+  sources_.push_back(std::move(source));
   period_ = kMinPeriod;  // how quickly its ring fills is not known yet
   return {};
 }
 
-Result<void> Recorder::add_to_file(Source& source, std::vector<std::byte> property) {
+Result<void> Recorder::add_to_file(Source& source) {
   const RawReader& reader = source.reader;
   source.number =
-      DSSM_TRY(file_.add_stream({reader.id(), reader.type(), reader.depth(), reader.cycle(),
-                                 reader.incarnation(), std::move(property)}));
+      DSSM_TRY(file_->add_stream({reader.id(), reader.type(), reader.depth(), reader.cycle(),
+                                  reader.incarnation(), source.property}));
   return {};
 }
 
@@ -257,11 +304,25 @@ std::optional<Time> Recorder::next_past(const Source& source) {
   return info.time;
 }
 
+// A reader opens the new ring of a stream that restarted when it reads, which nothing else does
+// while there is no file.
+void Recorder::follow_restart(Source& source) {
+  RawReader& reader = source.reader;
+  const Tid cursor = reader.cursor();
+  BorrowedSample newest;
+  if (reader.borrow(reader.newest_tid(), newest) == ReadStatus::restarted) {
+    source.property = property_of(reader);
+  } else {
+    reader.seek(cursor);
+  }
+}
+
 void Recorder::check_readers() {
   const MonoTime now = MonoClock::now();
   if (now < next_check_) return;
   next_check_ = now + kCheckPeriod;
-  std::erase_if(sources_, [&](const Source& source) {
+  std::erase_if(sources_, [&](Source& source) {
+    if (!is_recording_) follow_restart(source);
     const std::optional<Error> error = source.reader.restart_error();
     if (error) opener_.reopen(source.reader.id(), *error);
     return error.has_value();
@@ -280,7 +341,8 @@ Result<bool> Recorder::take(Source& source, std::optional<Time> until) {
     const ReadStatus status = source.reader.read_next(payload_, info);
     if (status == ReadStatus::restarted) {
       // Its property is asked for at the end: dssmd may take its time to answer.
-      DSSM_TRY(add_to_file(source, {}));
+      source.property.clear();
+      DSSM_TRY(add_to_file(source));
       source.next = 0;
       source.past_until = kNoTid;
       source.from.reset();
@@ -302,20 +364,22 @@ Result<bool> Recorder::take(Source& source, std::optional<Time> until) {
 
 Result<void> Recorder::write(Source& source, const SampleInfo& info) {
   if (source.next != kNoTid && info.tid > source.next) {
-    DSSM_TRY(file_.add_gap(source.number, source.next,
-                           static_cast<std::uint64_t>(info.tid - source.next)));
+    DSSM_TRY(file_->add_gap(source.number, source.next,
+                            static_cast<std::uint64_t>(info.tid - source.next)));
   }
   source.next = info.tid + 1;
-  return file_.write(source.number, info, source.reader.clock_error(info),
-                     std::span(payload_).first(info.payload_bytes));
+  return file_->write(source.number, info, source.reader.clock_error(info),
+                      std::span(payload_).first(info.payload_bytes));
 }
 
-std::uint64_t Recorder::past_progress() const {
+bool Recorder::is_past_late() {
   std::uint64_t progress = sources_.size();
   for (const Source& source : sources_) {
     progress += static_cast<std::uint64_t>(std::min(source.next, source.past_until + 1) + 1);
   }
-  return progress;
+  const MonoTime now = MonoClock::now();
+  if (std::exchange(past_progress_, progress) != progress) past_moved_ = now;
+  return now - past_moved_ >= kMaxPastWait;
 }
 
 bool Recorder::has_past() const {
@@ -330,19 +394,29 @@ bool Recorder::has_past() const {
 
 std::vector<std::string> Recorder::take_notices() { return opener_.take_notices(); }
 
+Result<void> Recorder::complete() {
+  const MonoTime end = deadline_in(kEndingTime);
+  Result<void> taken;
+  do {
+    taken = take();
+  } while (taken && is_more_ && MonoClock::now() < end);  // writers may be faster
+  // A program may have set it after its stream was opened here.
+  for (Source& source : sources_) {
+    // A host that is lost must not keep the next file waiting.
+    if (!taken || (is_on_demand_ && MonoClock::now() >= end)) break;
+    Result<std::vector<std::byte>> property = source.reader.property();
+    if (!property) continue;
+    source.property = *std::move(property);
+    taken = file_->set_property(source.number, source.property);
+  }
+  const Result<void> finished = file_->finish();
+  return taken ? finished : taken;
+}
+
 Result<void> Recorder::finish() {
   opener_.end();  // what is just being opened is taken, too
   all_by_ = {};
-  const MonoTime end = deadline_in(kEndingTime);  // writers may be faster
-  do {
-    DSSM_TRY(take());
-  } while (is_more_ && MonoClock::now() < end);
-  // A program may have set it after its stream was opened here.
-  for (Source& source : sources_) {
-    const Result<std::vector<std::byte>> property = source.reader.property();
-    if (property) DSSM_TRY(file_.set_property(source.number, *property));
-  }
-  return file_.finish();
+  return complete();
 }
 
 }  // namespace dssm::ctl

@@ -32,33 +32,51 @@ struct RecorderPlan {
   std::vector<std::string> types;  // shell patterns, one of which its type's name fits; empty: all
   // From so long before now: what the rings hold still. Empty: from now on.
   std::optional<Duration> past;
+  // Nothing is recorded before begin(); until then streams are only kept open, with what their
+  // rings hold, also of other hosts.
+  bool on_demand = false;
 };
 
 class Recorder {
  public:
   // `session` is used by a thread until the recorder is destroyed.
-  static Result<std::unique_ptr<Recorder>> start(Session session, RecordingWriter file,
+  //   file  empty if and only if `plan.on_demand`
+  static Result<std::unique_ptr<Recorder>> start(Session session,
+                                                 std::optional<RecordingWriter> file,
                                                  RecorderPlan plan);
   Recorder(const Recorder&) = delete;
   Recorder& operator=(const Recorder&) = delete;
   ~Recorder() = default;
 
+  // On demand: from now on records in `file`, first what the rings hold of so long before now and
+  // the file before has not.
+  //   fails  as RecordingWriter::add_stream(); then there is no file
+  Result<void> begin(RecordingWriter file, Duration before);
+  // Completes that file, with what has come until now, or after a failure with what it has. Streams
+  // stay open for the next one.
+  //   fails  as RecordingWriter::finish()
+  Result<void> end();
+  bool is_recording() const { return is_recording_; }
+
   // Records what has come since the last call.
   //   fails  as RecordingWriter::write(); what was recorded before stays
   Result<void> take();
 
-  // How much of `plan.past` is recorded: rises until has_past().
-  std::uint64_t past_progress() const;
+  // What the file has.
+  Result<void> add_trigger(const RecordedTrigger& trigger) { return file_->add_trigger(trigger); }
 
   // When take() is to be called again.
   MonoTime next_take() const { return next_take_; }
 
-  // Whether there is nothing more of `plan.past` to come: all streams that there were at the start
-  // are recorded up to their newest sample of then, or could not be opened.
+  // Whether there is nothing more of the past to come, of `plan.past` or begin(): all streams that
+  // there were are recorded up to their newest sample of then, or could not be opened.
   bool has_past() const;
+  // Whether nothing of it came for so long that another host must be slow or silent.
+  bool is_past_late();
 
   std::size_t streams() const { return sources_.size(); }
-  RecordingProgress progress() const { return file_.progress(); }
+  // Of the file, or of the last one; there was one.
+  RecordingProgress progress() const { return file_->progress(); }
   // Why streams are not recorded, for people; each only once.
   std::vector<std::string> take_notices();
 
@@ -77,6 +95,8 @@ class Recorder {
   static constexpr Duration kEndingTime = std::chrono::seconds(1);
   // So long the past waits for streams to be opened.
   static constexpr Duration kOpeningTime = std::chrono::seconds(1);
+  // Another host that sends nothing more is not waited for longer than that.
+  static constexpr Duration kMaxPastWait = std::chrono::seconds(10);
   static constexpr Duration kCheckPeriod =
       std::chrono::seconds(1);  // for readers that cannot go on
   // The past is recorded in parts of this length, each of all streams, so that the recording is
@@ -90,9 +110,12 @@ class Recorder {
     RawReader reader;
     std::uint32_t number = 0;  // in the file
     Tid next = kNoTid;  // what was before it is recorded, or known as lost; kNoTid: not known yet
-    Tid past_until = kNoTid;   // the newest at its opening, if history is wanted
-    std::optional<Time> from;  // samples before that are not wanted
+    Tid past_until = kNoTid;          // the newest at its opening, if history is wanted
+    std::optional<Time> from;         // samples before that are not wanted
+    bool is_of_now = true;            // its stamps are of this time, and not of one that is played
+    std::vector<std::byte> property;  // when it was asked for last
   };
+  static Time past_of(const Source& source, Time now, Duration past);
 
   // Opens streams and fetches properties. What the thread and take() share is behind a lock.
   class Opener {
@@ -110,11 +133,7 @@ class Recorder {
     // Opens it again: its reader cannot go on, because of `error`.
     void reopen(const StreamId& id, const Error& error);
 
-    struct Opened {
-      Source source;
-      std::vector<std::byte> property;
-    };
-    std::vector<Opened> take_opened();
+    std::vector<Source> take_opened();
     std::vector<std::string> take_notices();
     bool has_tried_all() const;  // of the streams that there were at begin()
 
@@ -130,7 +149,7 @@ class Recorder {
     bool wants(const StreamInfo& stream) const;
     void on_event(const StreamEvent& event);
     void run();
-    Result<Opened> open(const Wanted& wanted) const;
+    Result<Source> open(const Wanted& wanted) const;
 
     Session session_;
     RecorderPlan plan_;
@@ -142,7 +161,7 @@ class Recorder {
     std::vector<Wanted> wanted_;
     std::set<std::string> known_;  // names of what was opened: they restart by themselves
     std::size_t untried_ = 0;
-    std::vector<Opened> opened_;
+    std::vector<Source> opened_;
     std::vector<std::string> notices_;
     std::optional<MonoTime> stop_at_;
 
@@ -150,12 +169,16 @@ class Recorder {
     std::optional<Session::Watch> watch_;  // the first to end: it calls on_event()
   };
 
-  Recorder(Session session, RecordingWriter file, RecorderPlan plan)
-      : file_(std::move(file)), opener_(std::move(session), std::move(plan)) {}
+  Recorder(Session session, std::optional<RecordingWriter> file, const RecorderPlan& plan)
+      : is_on_demand_(plan.on_demand),
+        is_recording_(!plan.on_demand),
+        file_(std::move(file)),
+        opener_(std::move(session), plan) {}
 
   Duration next_period();
-  Result<void> add(Opener::Opened opened);
-  Result<void> add_to_file(Source& source, std::vector<std::byte> property);
+  Result<void> add(Source source);
+  Result<void> add_to_file(Source& source);
+  void want_past(Source& source) const;
   // Whether there may be more at once.
   //   until  not beyond samples of that time
   Result<bool> take(Source& source, std::optional<Time> until);
@@ -163,9 +186,16 @@ class Recorder {
   static std::optional<Time> next_past(const Source& source);
   // What cannot be read any more is opened again.
   void check_readers();
+  static void follow_restart(Source& source);
   Result<void> write(Source& source, const SampleInfo& info);
+  // Takes what there is until now and completes the file.
+  Result<void> complete();
 
-  RecordingWriter file_;
+  const bool is_on_demand_;
+  bool is_recording_;  // in file_, which is not finished
+  std::optional<RecordingWriter> file_;
+  Time wanted_from_{};  // on demand: of the file's samples
+  Duration before_{};   // the same, before begin()
   Opener opener_;
   std::vector<Source> sources_;
   std::vector<std::byte> payload_;
@@ -174,6 +204,8 @@ class Recorder {
   bool is_more_ = false;  // to be taken at once
   MonoTime all_by_{};     // until then the past waits for streams to be opened
   MonoTime next_take_{}, next_check_{};
+  std::uint64_t past_progress_ = 0;  // is_past_late(): how much of the past is recorded
+  MonoTime past_moved_ = MonoClock::now();
 };
 
 }  // namespace dssm::ctl

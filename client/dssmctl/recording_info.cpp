@@ -71,9 +71,15 @@ Json json_of(const RecordedStreamInfo& stream) {
 }
 
 void print_json(const Recording& recording, const Sum& sum, Output& out) {
-  Json files = Json::array(), streams = Json::array();
+  Json files = Json::array(), streams = Json::array(), triggers = Json::array();
   for (const std::filesystem::path& file : recording.files()) files.push_back(file.string());
   for (const RecordedStreamInfo& stream : recording.streams()) streams.push_back(json_of(stream));
+  for (const RecordedTrigger& trigger : recording.triggers()) {
+    triggers.push_back({{"name", trigger.name},
+                        {"reason", or_null(trigger.reason)},
+                        {"host", or_null(trigger.host)},
+                        {"time_ns", to_ns(trigger.time)}});
+  }
   const bool has_samples = sum.samples > 0;
   out.add(json_document({{"files", files},
                          {"file_bytes", sum.file_bytes},
@@ -82,6 +88,7 @@ void print_json(const Recording& recording, const Sum& sum, Output& out) {
                          {"samples", sum.samples},
                          {"samples_bytes", sum.payload_bytes},
                          {"lost_samples", sum.lost_samples},
+                         {"triggers", triggers},
                          {"streams", streams},
                          {"warnings", recording.warnings()}}));
 }
@@ -99,6 +106,11 @@ void print_text(const Recording& recording, const Sum& sum, bool iso, Output& ou
   line("to", sum.samples > 0 ? time_text(sum.last_time, iso) : "-");
   line("samples", fmt::format("{}, {}, {} lost", sum.samples, bytes_text(sum.payload_bytes),
                               sum.lost_samples));
+  for (const RecordedTrigger& trigger : recording.triggers()) {
+    line("trigger", fmt::format("{} at {}, host {}{}", escaped(trigger.name),
+                                time_text(trigger.time, iso), or_dash(escaped(trigger.host)),
+                                trigger.reason.empty() ? "" : ": " + escaped(trigger.reason)));
+  }
   constexpr auto kRight = Table::Align::right;
   Table table({{"STREAM"},
                {"SAMPLES", kRight},

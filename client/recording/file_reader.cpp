@@ -458,6 +458,12 @@ void FileReader::add_metadata(const MetadataIndex& about, std::span<const std::b
     recording_ = entry("recording");
     const std::string_view number = entry("file");
     (void)std::from_chars(number.data(), number.data() + number.size(), number_);
+  } else if (name == kTriggerName) {
+    std::int64_t time_ns = 0;
+    const std::string_view time = entry("time_ns");
+    (void)std::from_chars(time.data(), time.data() + time.size(), time_ns);
+    triggers_.push_back({std::string(entry("name")), std::string(entry("reason")),
+                         std::string(entry("host")), time_from_ns(time_ns)});
   } else if (name == kGapName) {
     std::uint64_t lost = 0;
     for (std::string_view rest = entry("gaps"); !rest.empty();) {

@@ -86,6 +86,7 @@ class FileReader {
   bool is_whole() const noexcept { return is_whole_; }                  // it has its end
   std::map<std::uint16_t, FileChannel>& channels() noexcept { return channels_; }
   std::vector<IndexedChunk>& chunks() noexcept { return summary_.chunks; }
+  const std::vector<RecordedTrigger>& triggers() const noexcept { return triggers_; }
   std::vector<std::string>& warnings() noexcept { return warnings_; }
 
   // Reads a chunk of chunks().
@@ -125,6 +126,7 @@ class FileReader {
   std::uint32_t number_ = 0;
   Summary summary_;
   std::map<std::uint16_t, FileChannel> channels_;
+  std::vector<RecordedTrigger> triggers_;
   std::vector<std::string> warnings_;
   Buffer window_;  // what read() read last
   std::uint64_t window_offset_ = 0;

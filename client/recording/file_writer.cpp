@@ -92,6 +92,7 @@ void Chunk::clear() noexcept {
   channels.clear();
   properties.clear();
   gaps.clear();
+  triggers.clear();
   messages.clear();
   used_parts = 0;
   start_time = UINT64_MAX;
@@ -305,23 +306,32 @@ Result<void> FileWriter::append(const Chunk& chunk, Compressor& compressor) {
     }
     index.index_length = tail_.size();
   }
-  std::vector<MetadataIndex> gaps;
+  std::vector<MetadataIndex> metadata;
+  const auto add_metadata = [&](std::string_view name,
+                                const std::map<std::string, std::string>& entries) {
+    const std::size_t offset = tail_.size();
+    encode_metadata(tail_, name, entries);
+    metadata.push_back({bytes_ + head_.size() + records.size() + offset, tail_.size() - offset,
+                        std::string(name)});
+  };
   for (const Gaps& gap : chunk.gaps) {
     const auto channel = std::ranges::find(summary_.channels, gap.channel, &Channel::id);
     std::string text;
     for (const auto& [first, count] : gap.gaps) text += fmt::format("{}+{} ", first, count);
     text.pop_back();
-    const std::size_t offset = tail_.size();
-    encode_metadata(tail_, kGapName,
-                    {{"topic", channel->topic},
-                     {"incarnation", channel->metadata.at("incarnation")},
-                     {"gaps", text}});
-    gaps.push_back({bytes_ + head_.size() + records.size() + offset, tail_.size() - offset,
-                    std::string(kGapName)});
+    add_metadata(kGapName, {{"topic", channel->topic},
+                            {"incarnation", channel->metadata.at("incarnation")},
+                            {"gaps", text}});
+  }
+  for (const RecordedTrigger& trigger : chunk.triggers) {
+    add_metadata(kTriggerName, {{"name", trigger.name},
+                                {"reason", trigger.reason},
+                                {"host", trigger.host},
+                                {"time_ns", std::to_string(to_ns(trigger.time))}});
   }
   DSSM_TRY(write({head_.span(), records, tail_.span()}));
   if (!chunk.messages.span().empty()) summary_.chunks.push_back(std::move(indexed));
-  summary_.metadata.insert(summary_.metadata.end(), gaps.begin(), gaps.end());
+  summary_.metadata.insert(summary_.metadata.end(), metadata.begin(), metadata.end());
   return {};
 }
 

@@ -5,7 +5,7 @@
 //
 //   Magic, Header, Metadata "dssm.recording"
 //   for each chunk: new Schemas, Channels and properties (Attachments); Chunk; its MessageIndexes;
-//     Metadata "dssm.gap"
+//     Metadata "dssm.gap" and "dssm.trigger"
 //   Attachment "dssm.index", DataEnd, summary, Footer, Magic
 //
 //   threads  one at a time; fd() may be synced by another one
@@ -29,6 +29,7 @@ namespace dssm::recording {
 inline constexpr std::string_view kProfile = "dssm";
 inline constexpr std::string_view kRecordingName = "dssm.recording";  // a metadata record
 inline constexpr std::string_view kGapName = "dssm.gap";              // metadata records
+inline constexpr std::string_view kTriggerName = "dssm.trigger";      // metadata records
 inline constexpr std::string_view kIndexName = "dssm.index";          // an attachment
 inline constexpr std::string_view kPropertyName = "dssm.property";    // attachments, with more
 inline constexpr std::string_view kIndexMediaType = "application/x-dssm-index";
@@ -106,6 +107,7 @@ struct Chunk {
   std::vector<NewChannel> channels;
   std::vector<NewProperty> properties;
   std::vector<Gaps> gaps;
+  std::vector<RecordedTrigger> triggers;
 
   Buffer messages;
   // One for each channel that is in it; the first `used_parts`, the others keep their memory.
@@ -119,7 +121,8 @@ struct Chunk {
   std::uint64_t payload_bytes = 0;
 
   bool is_empty() const noexcept {
-    return messages.size() == 0 && channels.empty() && properties.empty() && gaps.empty();
+    return messages.size() == 0 && channels.empty() && properties.empty() && gaps.empty() &&
+           triggers.empty();
   }
   // Keeps the memory.
   void clear() noexcept;
@@ -139,7 +142,7 @@ class FileWriter {
   Result<void> add_channel(const NewChannel& channel);
   Result<void> add_property(const Channel& channel, std::span<const std::byte> property);
 
-  // Appends the messages and gaps of `chunk`, whose channels were added.
+  // Appends the messages, gaps and triggers of `chunk`, whose channels were added.
   //   fails  no_memory (a full disk), system, no_permission. The file is as before then
   Result<void> append(const Chunk& chunk, Compressor& compressor);
 

@@ -67,6 +67,7 @@ struct Content {
   std::vector<Life> lives;  // of the same numbers
   std::vector<Group> groups;
   std::vector<std::map<std::uint16_t, std::size_t>> stream_of_channel;  // by file
+  std::vector<RecordedTrigger> triggers;
   std::vector<std::string> warnings;
 
   struct Cached {
@@ -106,6 +107,7 @@ Result<void> Content::add(std::uint32_t number) {
   paths.push_back(file.path());
   warnings.insert(warnings.end(), file.warnings().begin(), file.warnings().end());
   file.warnings().clear();
+  triggers.insert(triggers.end(), file.triggers().begin(), file.triggers().end());
   std::map<std::uint16_t, std::size_t>& numbers = stream_of_channel.emplace_back();
   for (auto& [id, channel] : file.channels()) {
     if (channel.is_left_out) continue;
@@ -181,6 +183,7 @@ Result<void> Content::add(std::uint32_t number) {
 }
 
 void Content::finish() {
+  std::ranges::stable_sort(triggers, {}, &RecordedTrigger::time);
   for (Life& life : lives) index_times(life, life.parts.size());
   // Of another program's channels nothing tells how long messages may be: all of one topic have the
   // longest one's length.
@@ -544,6 +547,10 @@ const std::vector<RecordedStreamInfo>& Recording::streams() const noexcept {
 
 const std::vector<std::filesystem::path>& Recording::files() const noexcept {
   return content_->paths;
+}
+
+const std::vector<RecordedTrigger>& Recording::triggers() const noexcept {
+  return content_->triggers;
 }
 
 std::vector<std::string> Recording::warnings() const {

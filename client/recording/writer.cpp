@@ -94,9 +94,14 @@ Writer::Writer(const std::filesystem::path& file, const RecordingOptions& option
 
 Writer::~Writer() { (void)finish(); }
 
-Result<void> Writer::check(std::uint32_t stream) const {
+Result<void> Writer::check() const {
   if (error_) return *error_;
   if (finished_) return invalid("recording '{}' is finished", file_.string());
+  return {};
+}
+
+Result<void> Writer::check(std::uint32_t stream) const {
+  DSSM_TRY(check());
   if (stream >= streams_.size()) {
     return invalid("recording '{}' has no stream number {}; add_stream() returns the numbers",
                    file_.string(), stream);
@@ -112,8 +117,7 @@ Result<std::uint32_t> Writer::add_stream(const RecordedStream& stream) {
   const std::unique_lock lock(mutex_);
   const std::pair key(topic_of(stream.id), stream.incarnation);
   if (const auto known = numbers_.find(key); known != numbers_.end()) return known->second;
-  if (error_) return *error_;
-  if (finished_) return invalid("recording '{}' is finished", file_.string());
+  DSSM_TRY(check());
   if (streams_.size() == kMaxStreams) {
     return Error{Errc::limit_exceeded,
                  fmt::format("{}: recording '{}' has {} streams, and restarts of them; more are "
@@ -261,6 +265,14 @@ Result<void> Writer::set_property(std::uint32_t number, std::span<const std::byt
   begin_chunk();
   open_->properties.push_back(
       {static_cast<std::uint16_t>(number + 1), {property.begin(), property.end()}});
+  return {};
+}
+
+Result<void> Writer::add_trigger(const RecordedTrigger& trigger) {
+  const std::lock_guard lock(mutex_);
+  DSSM_TRY(check());
+  begin_chunk();
+  open_->triggers.push_back(trigger);
   return {};
 }
 
@@ -506,6 +518,10 @@ Result<void> RecordingWriter::add_gap(std::uint32_t stream, Tid first, std::uint
 Result<void> RecordingWriter::set_property(std::uint32_t stream,
                                            std::span<const std::byte> property) {
   return writer_->set_property(stream, property);
+}
+
+Result<void> RecordingWriter::add_trigger(const RecordedTrigger& trigger) {
+  return writer_->add_trigger(trigger);
 }
 
 RecordingProgress RecordingWriter::progress() const { return writer_->progress(); }

@@ -38,6 +38,7 @@ class Writer {
                      std::span<const std::byte> payload);
   Result<void> add_gap(std::uint32_t stream, Tid first, std::uint64_t count);
   Result<void> set_property(std::uint32_t stream, std::span<const std::byte> property);
+  Result<void> add_trigger(const RecordedTrigger& trigger);
   RecordingProgress progress() const;
   Result<void> finish();
 
@@ -62,6 +63,7 @@ class Writer {
 
   // --- with mutex_ held
   // The reason why nothing more is written, if there is one.
+  Result<void> check() const;
   Result<void> check(std::uint32_t stream) const;
   void take_open_chunk();
   void close_chunk(std::unique_lock<std::mutex>& lock);

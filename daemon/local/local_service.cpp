@@ -57,10 +57,10 @@ ClientNumber LocalService::connect(const Identity& identity, ClientOutput& outpu
   return number;
 }
 
-void LocalService::disconnect(ClientNumber number) {
+void LocalService::disconnect(ClientNumber number, bool by_client) {
   const auto client = clients_.extract(number);
   if (!client) return;
-  opens_.remove_all(number);
+  opens_.remove_all(number, by_client);
   std::erase_if(deferred_, [number](const Deferred& one) { return one.client == number; });
   if (client.mapped().greeted) {
     logger_.debug("client disconnected", {.peer = client.mapped().identity->str()});
@@ -210,7 +210,7 @@ void LocalService::on_answer(ClientNumber number, std::uint64_t serial, Result<R
   const auto client = clients_.find(number);
   if (client == clients_.end()) {
     // It disconnected meanwhile, perhaps because of the events of this request.
-    opens_.remove_all(number);
+    opens_.remove_all(number, false);
     return;
   }
   if (reply) {

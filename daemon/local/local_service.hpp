@@ -71,7 +71,9 @@ class LocalService final : private StreamObserver, private Fleet::Observer {
   // A client connected; `output` stays until disconnect().
   //   identity  without the program's name
   ClientNumber connect(const Identity& identity, ClientOutput& output);
-  void disconnect(ClientNumber number);
+  //   by_client  the client ended the connection, or ended itself: what it had not closed before,
+  //              it did not close. Otherwise dssmd ended it, and the client may connect again
+  void disconnect(ClientNumber number, bool by_client = false);
   bool has_greeted(ClientNumber number) const { return clients_.at(number).greeted; }
   std::size_t clients() const noexcept { return clients_.size(); }
 

@@ -164,7 +164,7 @@ void Connection::on_readable() {
   const Result<wire::IoResult> got = wire::recv_some(socket_.get(), input_.space(), descriptors);
   if (!got) return end_with(got.error());
   if (got->status == wire::IoStatus::would_block) return;
-  if (got->status == wire::IoStatus::end) return close();
+  if (got->status == wire::IoStatus::end) return close(true);
   input_.commit(got->bytes);
   if (charge_input() && take_descriptors(std::move(descriptors))) serve_frames();
 }
@@ -243,7 +243,7 @@ void Connection::serve_frames() {
 }
 
 void Connection::send(std::string bytes, std::vector<UniqueFd> descriptors) {
-  if (!is_open()) return;
+  if (!is_open() || !has_reader_) return;
   Outgoing outgoing{std::move(bytes), 0, std::move(descriptors)};
   if (output_.empty()) {
     if (!send_some(outgoing)) return;
@@ -283,15 +283,31 @@ bool Connection::send_some(Outgoing& outgoing) {
   for (const UniqueFd& fd : outgoing.descriptors) fds.push_back(fd.get());
   const auto rest = std::as_bytes(std::span(outgoing.bytes)).subspan(outgoing.sent);
   const Result<wire::IoResult> sent = wire::send_some(socket_.get(), rest, fds);
-  if (!sent || sent->status == wire::IoStatus::end) {
-    if (!sent) logger_.warning("close a connection: " + sent.error().message);
+  if (!sent) {
+    logger_.warning("close a connection: " + sent.error().message);
     close();
+    return false;
+  }
+  if (sent->status == wire::IoStatus::end) {
+    stop_output();
     return false;
   }
   outgoing.sent += sent->bytes;
   sent_bytes_ += sent->bytes;
   if (sent->bytes > 0) outgoing.descriptors.clear();  // they went with the first byte
   return true;
+}
+
+// The client has ended, or does not read any more. What it sent before is still served, because it
+// says which streams it closed; then its end comes.
+void Connection::stop_output() {
+  has_reader_ = false;
+  writable_.disable();
+  output_timer_.disable();
+  output_.clear();
+  queued_bytes_ = queued_descriptors_ = 0;
+  output_share_ = {};
+  next_turn_.enable_in(Duration::zero());
 }
 
 void Connection::on_writable() {
@@ -319,7 +335,7 @@ void Connection::end_with(const Error& error) {
   close();
 }
 
-void Connection::close() {
+void Connection::close(bool by_client) {
   if (!is_open()) return;
   readable_.disable();
   writable_.disable();
@@ -332,7 +348,7 @@ void Connection::close() {
   arrived_.clear();
   input_share_ = {};
   output_share_ = {};
-  service_.disconnect(number_);
+  service_.disconnect(number_, by_client);
   on_closed_();
 }
 

@@ -152,10 +152,11 @@ class Connection final : public ClientOutput {
   Error no_memory_for(std::string_view what) const;
   bool take_descriptors(std::vector<UniqueFd> arrived);
   bool send_some(Outgoing& outgoing);
+  void stop_output();
   void watch_output();
   void on_output_timeout();
   void end_with(const Error& error);
-  void close();
+  void close(bool by_client = false);
   bool is_open() const noexcept { return static_cast<bool>(socket_); }
   bool is_paused() const noexcept {
     return queued_descriptors_ >= kMaxQueuedDescriptors || queued_bytes_ >= kPausingBytes;
@@ -174,6 +175,7 @@ class Connection final : public ClientOutput {
   std::deque<Outgoing> output_;
   std::size_t queued_bytes_ = 0, queued_descriptors_ = 0;
   std::uint64_t sent_bytes_ = 0;
+  bool has_reader_ = true;  // the client may receive what is sent
   // Bytes sent, and what of them the client has not read, when output was watched last.
   using Progress = std::pair<std::uint64_t, int>;
   Progress progress() const noexcept;

@@ -72,10 +72,19 @@ Result<void> OpenTable::remove(ClientNumber client, OpenNumber number) {
   return {};
 }
 
-void OpenTable::remove_all(ClientNumber client) {
+void OpenTable::remove_all(ClientNumber client, bool crashed) {
   const auto own = by_client_.extract(client);
   if (!own) return;
-  for (const OpenNumber number : own.mapped()) forget(number);
+  std::set<Stream*> written;
+  for (const OpenNumber number : own.mapped()) {
+    const OpenEntry& entry = entries_.at(number);
+    // A stream that it has open twice counts it once.
+    if (crashed && entry.role == Role::writer && written.insert(entry.stream.get()).second) {
+      entry.stream->add_crashed_writer(
+          fmt::format("{} (pid {})", entry.client->program, entry.client->pid));
+    }
+    forget(number);
+  }
 }
 
 void OpenTable::forget(OpenNumber number) {

@@ -59,7 +59,8 @@ class OpenTable {
 
   // Fails with not_found unless `number` is an open of `client`.
   Result<void> remove(ClientNumber client, OpenNumber number);
-  void remove_all(ClientNumber client);
+  //   crashed  the client ended without closing them: the streams that it wrote count it
+  void remove_all(ClientNumber client, bool crashed);
 
   Counts counts(const Stream& stream) const;
   bool is_writing(const Stream& stream, ClientNumber client) const;

@@ -182,6 +182,8 @@ StreamInfo Stream::info(bool with_fields, Time now) const {
   info.incarnation = mapping_->identity().incarnation;
   info.creator_pid = plan_.creator_pid;
   info.channels = static_cast<std::uint32_t>(channels_.size());
+  info.crashed_writers = crashed_writers_;
+  info.last_crashed_writer = last_crashed_writer_;
   for (const Channel& channel : channels_) {
     info.remote_writers += channel.writers;
     info.remote_readers += channel.readers;

@@ -15,6 +15,7 @@
 #include <memory>
 #include <string>
 #include <string_view>
+#include <utility>
 #include <vector>
 
 #include "core/base/unique_fd.hpp"
@@ -166,6 +167,12 @@ class Stream : public std::enable_shared_from_this<Stream> {
   void set_channel(Channel channel);
   void remove_channel(const void* key);
 
+  // A program that wrote it has ended without closing it.
+  void add_crashed_writer(std::string program) {
+    ++crashed_writers_;
+    last_crashed_writer_ = std::move(program);
+  }
+
   // No later offer restores it.
   Result<void> mark_removed();
   bool removed() const noexcept { return removed_; }
@@ -197,6 +204,8 @@ class Stream : public std::enable_shared_from_this<Stream> {
   MemoryShare ring_share_, type_share_, property_share_;
   bool removed_ = false;
   std::vector<Channel> channels_;
+  std::uint32_t crashed_writers_ = 0;
+  std::string last_crashed_writer_;
   DoorbellObserver* doorbell_observer_ = nullptr;
 };
 

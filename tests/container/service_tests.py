@@ -1,5 +1,5 @@
 # SPDX-License-Identifier: Apache-2.0
-"""dssmd.service and dssmd.socket under a real systemd."""
+"""dssmd.service, dssmd.socket and dssm-record.service under a real systemd."""
 
 import pathlib
 import socket
@@ -71,6 +71,8 @@ class ServiceTests:
             ("a stopped dssmd stays stopped, without its socket, although clients connect", self.stop),
             ("a dssmd that is stopped right after a crash stays stopped", self.stop_after_crash),
             ("a mistake in the configuration stops service and socket", self.mistake),
+            ("the recorder records incidents, also after a restart of dssmd", self.record),
+            ("a mistake in the recorder's configuration stops it", self.record_mistake),
             ("after a boot dssmd runs, and its socket was started first", self.boot),
             ("removing dssmd leaves neither service nor socket", self.remove),
         ]
@@ -159,6 +161,43 @@ class ServiceTests:
         file.write_text(right)
         self.container.run("systemctl", "start", "dssmd")
         assert self.states() == ("active", "active"), self.states()
+
+    def await_incident(self, name: str) -> pathlib.Path:
+        """Triggers an incident, and waits until its file is there."""
+        wait_until(lambda: self.container.attempt("dssmctl", "trigger", name).returncode == 0,
+                   "no black box waits for triggers")
+        folder = self.container.path("/var/lib/dssm-record")
+        wait_until(lambda: list(folder.glob(f"incident_*_{name}.mcap")), f"no incident '{name}'")
+        return next(folder.glob(f"incident_*_{name}.mcap"))
+
+    def record(self) -> None:
+        """Test."""
+        assert self.show("dssm-record.service", "UnitFileState") == "disabled"
+        assert self.show("dssm-record.service", "ActiveState") == "inactive"
+        self.container.run("systemctl", "enable", "--now", "dssm-record")
+        file = self.await_incident("before")
+        owner = self.container.run("stat", "--format=%a %U %G", f"/var/lib/dssm-record/{file.name}")
+        assert owner == "640 dssm-record dssm", owner
+        recorder = self.show("dssm-record.service", "MainPID")
+        self.container.run("systemctl", "restart", "dssmd")
+        self.await_incident("after")
+        assert self.show("dssm-record.service", "MainPID") == recorder
+        self.container.run("systemctl", "kill", "--signal=KILL", "dssm-record")
+        wait_until(lambda: self.show("dssm-record.service", "MainPID") not in ("0", recorder),
+                   "it is not started again")
+        self.await_incident("last")
+
+    def record_mistake(self) -> None:
+        """Test."""
+        file = self.container.path("/etc/dssm/record.conf")
+        right = file.read_text()
+        file.write_text("no_such_key = 1\n")
+        self.container.attempt("systemctl", "restart", "dssm-record")
+        wait_until(lambda: self.show("dssm-record.service", "ActiveState") == "failed",
+                   "it does not fail")
+        assert self.show("dssm-record.service", "ExecMainStatus") == "2"
+        file.write_text(right)
+        self.container.run("systemctl", "disable", "dssm-record")
 
     def boot(self) -> None:
         """Test."""

@@ -3,6 +3,7 @@
 
 #include <fcntl.h>
 #include <grp.h>
+#include <netinet/in.h>
 #include <poll.h>
 #include <signal.h>
 #include <sys/prctl.h>
@@ -78,6 +79,20 @@ std::string make_temp_dir() {
 }
 
 void remove_tree(const std::string& path) { std::filesystem::remove_all(path); }
+
+std::uint16_t free_udp_port() {
+  const int socket = ::socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0);
+  sockaddr_in address{};
+  address.sin_family = AF_INET;
+  address.sin_addr.s_addr = htonl(INADDR_LOOPBACK);
+  socklen_t length = sizeof address;
+  auto* const any = reinterpret_cast<sockaddr*>(&address);
+  if (socket < 0 || ::bind(socket, any, length) || ::getsockname(socket, any, &length)) {
+    fail("find a free port");
+  }
+  ::close(socket);
+  return ntohs(address.sin_port);
+}
 
 void become_nobody(const std::vector<gid_t>& groups) {
   if (::setgroups(groups.size(), groups.data()) || ::setresgid(kNobody, kNobody, kNobody) ||
@@ -216,7 +231,9 @@ DaemonProcess::DaemonProcess(std::vector<std::string> extra, const std::string& 
     : dir_(make_temp_dir()) {
   argv_ = {built("daemon/dssmd"), "--runtime-dir", dir_, "--name", host};
   // An unused port: tests must not depend on a chronyd of this machine.
-  argv_.insert(argv_.end(), {"--chronyd", "127.0.0.1:1"});
+  if (std::find(extra.begin(), extra.end(), "--chronyd") == extra.end()) {
+    argv_.insert(argv_.end(), {"--chronyd", "127.0.0.1:1"});
+  }
   const bool sets_mdns = std::any_of(extra.begin(), extra.end(), [](const std::string& word) {
     return word.starts_with("--mdns");
   });

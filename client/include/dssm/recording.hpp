@@ -46,6 +46,17 @@ struct RecordedStream {
   std::vector<std::byte> property;  // empty: none
 };
 
+// Why something was recorded: an event for which a recorder waited (docs/recording.md "The black
+// box").
+struct RecordedTrigger {
+  std::string name;    // of the trigger
+  std::string reason;  // in a sentence, for people; may be empty
+  std::string host;    // where it happened or was requested
+  Time time{};
+
+  friend bool operator==(const RecordedTrigger&, const RecordedTrigger&) = default;
+};
+
 struct RecordingOptions {
   Compression compression = Compression::lz4;
   // A chunk is closed, compressed and written at this size or age, whichever is first. A larger
@@ -115,6 +126,10 @@ class RecordingWriter {
   // From here on the stream has that property (empty: none).
   //   fails  as write()
   Result<void> set_property(std::uint32_t stream, std::span<const std::byte> property);
+
+  // Adds what made the recorder write. Samples need not have been added before.
+  //   fails  as write()
+  Result<void> add_trigger(const RecordedTrigger& trigger);
 
   RecordingProgress progress() const;
 
@@ -202,6 +217,10 @@ class Recording {
 
   // The files, in the order in which they were written.
   const std::vector<std::filesystem::path>& files() const noexcept;
+
+  // What made the recorder write, in the order of times. Empty: it did not wait for anything.
+  //   lifetime  as streams()
+  const std::vector<RecordedTrigger>& triggers() const noexcept;
 
   // What could not be read, a sentence each: damaged chunks, channels that are no streams, files
   // without an end. More come when samples are read.

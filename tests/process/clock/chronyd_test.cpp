@@ -35,14 +35,6 @@ std::string program(const std::string& name) {
   return "";
 }
 
-// A UDP port of loopback that is free at this moment.
-std::uint16_t free_port() {
-  const auto any = wire::resolve_number(wire::Address::parse("127.0.0.1:0", 0, true).value()).at(0);
-  const UniqueFd socket(::socket(AF_INET, SOCK_DGRAM | SOCK_CLOEXEC, 0));
-  EXPECT_EQ(::bind(socket.get(), any.get(), any.length), 0);
-  return wire::Address::parse(wire::local_address(socket.get()).value().str()).value().port;
-}
-
 // What `chronyc -c tracking` prints of the parts that are compared.
 struct Printed {
   std::string reference_id, source, updated;
@@ -107,7 +99,7 @@ class Chronyd {
 
  private:
   const std::string dir_;
-  const std::uint16_t port_ = free_port();
+  const std::uint16_t port_ = test::free_udp_port();
   pid_t pid_ = -1;
 };
 
@@ -172,7 +164,7 @@ void expect_printed(Duration ours, double a, double b) {
 }
 
 TEST_F(ChronydTest, ReportsWhatChronycPrints) {
-  const std::uint16_t ntp_port = free_port();
+  const std::uint16_t ntp_port = test::free_udp_port();
   const Chronyd reference("local stratum 10\nallow 127.0.0.1\nbindaddress 127.0.0.1\nport " +
                           std::to_string(ntp_port) + "\n");
   const Chronyd chronyd("server 127.0.0.1 port " + std::to_string(ntp_port) +

@@ -92,6 +92,43 @@ TEST(KilledClient, DoesNotDisturbWatchers) {
   }
 }
 
+// How many writers of the stream ended without closing it, when there is none any more.
+std::uint32_t crashed_writers(RawClient& client, const std::string& name) {
+  local::Request info;
+  info.mutable_info()->mutable_id()->set_name(name);
+  proto::Stream stream;
+  EXPECT_TRUE(eventually([&] {
+    stream = client.ask(info).response.stream_list().streams(0);
+    return stream.writers() == 0;
+  }));
+  return stream.crashed_writers();
+}
+
+// dssmd may notice that a program takes no more answers before it has read all that it sent.
+TEST(KilledClient, CountsAsCrashedOnlyForStreamsThatItDidNotClose) {
+  constexpr std::size_t kStreams = 40;
+  DaemonProcess daemon({"--log-level", "error"});
+  RawClient observer(daemon.socket_path());
+  RawClient program(daemon.socket_path());
+  std::string closes;
+  for (std::size_t i = 0; i <= kStreams; ++i) {
+    const Answer opened = program.ask(create_request(numbered("stream", i)));
+    if (i == kStreams) break;
+    local::Request close;
+    close.set_serial(1000 + i);
+    close.mutable_close()->set_handle(opened.response.opened().handle());
+    closes += wire::encode_frame(close);
+  }
+  ::kill(daemon.pid(), SIGSTOP);
+  program.send_bytes(closes);
+  program.close();
+  ::kill(daemon.pid(), SIGCONT);
+  for (std::size_t i = 0; i < kStreams; ++i) {
+    EXPECT_EQ(crashed_writers(observer, numbered("stream", i)), 0u) << i;
+  }
+  EXPECT_EQ(crashed_writers(observer, numbered("stream", kStreams)), 1u);
+}
+
 TEST(OpensAndCloses, TenThousandOfThemLeakNothing) {
   DaemonProcess daemon({"--log-level", "error"});
   RawClient client(daemon.socket_path());

@@ -5,6 +5,8 @@
 #include <signal.h>
 
 #include <dssm/recording.hpp>
+#include <filesystem>
+#include <fstream>
 
 #include "tests/process/dssmctl/fleet_test.hpp"
 #include "tests/support/folder.hpp"
@@ -165,6 +167,63 @@ TEST_F(Record, OfThePastIsInTheOrderOfTimesOfAllStreams) {
     newest = std::max(newest, sample.info.time);
   }
   EXPECT_EQ(samples, 2000);
+}
+
+TEST_F(Record, TakesOnlyStreamsOfATypeIfAsked) {
+  auto pose = session_.create<RecordedPose>("pose", depth_of(64)).value();
+  auto number = session_.create<double>("number", depth_of(64)).value();
+  Running running(argv({"record", "--type", "*Pose", "-o", file_}), environment());
+  await_reader(pose.id());
+  // It comes later than one that is not recorded.
+  auto later = session_.create<double>("later", depth_of(64)).value();
+  auto other = session_.create<RecordedPose>("other", depth_of(64)).value();
+  await_reader(other.id());
+  number.write(1);
+  later.write(1);
+  write_poses(pose, 0, 9);
+  write_poses(other, 0, 9);
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  const std::string text = running.rest();
+  EXPECT_TRUE(contains(text, ": 20 samples of 2 streams, ")) << text;
+}
+
+TEST_F(Record, KeepsTheQuotaOfItsFolder) {
+  constexpr std::uint64_t kBytes = 100'000;  // of a sample
+  constexpr std::uintmax_t kQuota = 8'000'000;
+  auto blob =
+      session_.create_raw({"blob", 0, ""}, TypeInfo{"", kBytes, 1, {}}, depth_of(256)).value();
+  for (int day = 10; day < 20; ++day) {
+    const std::string file = folder_.file("dssm_2026_11_" + std::to_string(day) + "-12_00_00.mcap");
+    std::ofstream(file) << std::string(kQuota / 10, 'x');
+    std::filesystem::last_write_time(
+        file, std::filesystem::file_time_type::clock::now() - 1h * (30 - day));
+  }
+  const auto total = [&] {
+    std::uintmax_t bytes = 0;
+    for (const auto& entry : std::filesystem::directory_iterator(folder_.path())) {
+      bytes += entry.file_size();
+    }
+    return bytes;
+  };
+  const auto exists = [&](int day) {
+    return std::filesystem::exists(
+        folder_.file("dssm_2026_11_" + std::to_string(day) + "-12_00_00.mcap"));
+  };
+  Running running(
+      argv({"record", "--compression", "none", "--quota", "8000000", "-o", folder_.path()}),
+      environment());
+  await_reader(blob.id());
+  EXPECT_TRUE(!exists(10) && exists(11));  // before anything is recorded
+  const std::vector<std::byte> payload(kBytes);
+  for (int i = 0; i < 200; ++i) blob.write(payload);
+  await([&] { return !exists(19); });  // while it records
+  running.signal(SIGINT);
+  EXPECT_EQ(running.status(), 0);
+  EXPECT_TRUE(contains(running.rest(), ": 200 samples of 1 stream"));
+  EXPECT_LE(total(), kQuota);
+  EXPECT_GE(total(), kQuota / 2);
+  EXPECT_EQ(Recording::open(folder_.path()).value().streams()[0].last_tid, 199);
 }
 
 TEST_F(Record, InfoTakesNamesWithASlashForStreams) {

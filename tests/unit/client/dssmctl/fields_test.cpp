@@ -148,6 +148,15 @@ TEST_F(FieldsOfEverything, AreWhatAShorterSampleHas) {
   EXPECT_EQ(json("points.x"), "[]");
 }
 
+TEST_F(FieldsOfEverything, AreNumbersForConditions) {
+  EXPECT_EQ(element_number(payload(), field("yes"), 0), 1);
+  EXPECT_EQ(element_number(payload(), field("point.x"), 0), 1.5);
+  EXPECT_EQ(element_number(payload(), field("points.x"), 0), 10);
+  EXPECT_EQ(element_number(payload(), field("points.x"), 1000), std::nullopt);
+  payload_bytes_ = offsetof(Everything, points[1]) + 7;  // not all of points[1].x
+  EXPECT_EQ(element_number(payload(), field("points.x"), 1), std::nullopt);
+}
+
 TEST_F(FieldsOfEverything, TakeAnyByteForABool) {
   std::memset(&value_.yes, 0x40, 1);
   EXPECT_EQ(text("yes"), "true");

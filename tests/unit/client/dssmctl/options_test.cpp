@@ -287,5 +287,30 @@ TEST(CommandLine, ShowsHelpAndVersionAsAnAnswer) {
   EXPECT_EQ(parse({"--version"}).text, "dssmctl " DSSM_VERSION "\n");
 }
 
+TEST(CommandLine, TakesWhatABlackBoxNeeds) {
+  const RecordOptions options =
+      options_of<RecordOptions>({"record", "--black-box", "--trigger", "a.b > 1", "--trigger",
+                                 "stalled", "--before", "1min", "--quota", "20GiB", "lidar"});
+  EXPECT_EQ(options.triggers, (std::vector<std::string>{"a.b > 1", "stalled"}));
+  EXPECT_EQ(options.patterns, std::vector<std::string>{"lidar"});
+  EXPECT_EQ(options.before, 1min);
+  EXPECT_EQ(options.after, 10s);
+  EXPECT_EQ(options.quota_bytes, 20ULL << 30);
+  for (const std::vector<const char*>& words :
+       {std::vector{"record", "--trigger", "stalled"},
+        {"record", "--black-box", "--trigger", "stalls"},
+        {"record", "--black-box", "--past", "1s"},
+        {"record", "--black-box", "--max-total-size", "1GiB"},
+        {"record", "--quota", "1MiB", "--max-file-size", "1MiB"},
+        {"record", "--config", "/does/not/exist"},
+        {"record", "--config"},
+        {"trigger"},
+        {"trigger", ""}}) {
+    EXPECT_NE(error_of(words), "") << words[1];
+  }
+  EXPECT_EQ(error_of({"trigger", std::string(64, 'a').c_str()}),
+            "dssmctl: trigger: NAME has 1 to 63 bytes; see 'dssmctl trigger --help'\n");
+}
+
 }  // namespace
 }  // namespace dssm::ctl

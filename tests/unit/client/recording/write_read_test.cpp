@@ -78,7 +78,12 @@ TEST_P(WriteRead, KeepsAllThatStreamsAndSamplesHave) {
   ASSERT_TRUE(writer.add_gap(1, 7, 2));
   ASSERT_TRUE(writer.add_gap(1, 9, 3));
   ASSERT_TRUE(writer.add_gap(2, 0, 1ULL << 40));
+  const RecordedTrigger late{"b", "", "", time_from_ns(-3)},
+      early{"a", "x\n\"y\"", "pc2", Time::min()};
+  ASSERT_TRUE(writer.add_trigger(late));
+  ASSERT_TRUE(writer.add_trigger(early));
   ASSERT_TRUE(writer.finish());
+  EXPECT_EQ(writer.add_trigger(late).error().code, Errc::invalid_argument);
   ASSERT_TRUE(writer.finish());  // changes nothing
   EXPECT_EQ(writer.progress().samples, 301U);
   EXPECT_EQ(writer.progress().waiting_bytes, 0U);
@@ -88,6 +93,7 @@ TEST_P(WriteRead, KeepsAllThatStreamsAndSamplesHave) {
   const Recording recording = open_recording(path("a.mcap"));
   EXPECT_EQ(recording.warnings(), std::vector<std::string>());
   EXPECT_EQ(all_of(recording), written);
+  EXPECT_EQ(recording.triggers(), (std::vector{early, late}));
   const RecordedStream added[] = {described, plain, empty, large};
   ASSERT_EQ(recording.streams().size(), 4U);
   for (std::size_t i = 0; i < 4; ++i) {

@@ -44,12 +44,30 @@ TEST_F(OpenTableTest, ForgetsAllOfAClientThatLeft) {
   table_.add({client(1), a, Role::writer, 0});
   table_.add({client(1), a, Role::reader, 0});
   table_.add({client(2), a, Role::reader, 0});
-  table_.remove_all(1);
+  table_.remove_all(1, false);
   EXPECT_EQ(table_.entries().size(), 1u);
   EXPECT_EQ(table_.counts(*a).writers, 0u);
   EXPECT_EQ(table_.counts(*a).readers, 1u);
-  table_.remove_all(1);
+  table_.remove_all(1, false);
   EXPECT_EQ(table_.entries().size(), 1u);
+}
+
+TEST_F(OpenTableTest, CountsWritersThatCrashedOnceForEachStreamThatTheyWrote) {
+  const auto a = stream("a"), b = stream("b"), c = stream("c");
+  table_.set_limits({.max_opens = 9, .max_opens_per_client = 9});
+  table_.add({client(1), a, Role::writer, 0});
+  table_.add({client(1), a, Role::writer, 0});
+  table_.add({client(1), b, Role::reader, 0});
+  const OpenNumber closed = table_.add({client(1), c, Role::writer, 0});
+  table_.add({client(2), a, Role::writer, 0});
+  ASSERT_TRUE(table_.remove(1, closed));
+  table_.remove_all(1, true);
+  EXPECT_EQ(a->info().crashed_writers, 1u);
+  EXPECT_EQ(a->info().last_crashed_writer, client(1)->program + " (pid 1001)");
+  EXPECT_EQ(b->info().crashed_writers, 0u);
+  EXPECT_EQ(c->info().crashed_writers, 0u);
+  table_.remove_all(2, false);
+  EXPECT_EQ(a->info().crashed_writers, 1u);
 }
 
 TEST_F(OpenTableTest, NamesTheLimitThatIsReached) {

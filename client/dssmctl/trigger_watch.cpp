@@ -1,0 +1,430 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// See trigger_watch.hpp. Requests to dssmd, which may take as long as another host does not answer,
+// come from the thread of the watch; samples come from the session's thread. Both use the judge
+// under one lock, and neither calls the session with it.
+#include "client/dssmctl/trigger_watch.hpp"
+
+#include <fmt/format.h>
+#include <fnmatch.h>
+#include <string.h>
+
+#include <algorithm>
+#include <array>
+
+#include "client/dssmctl/describe.hpp"
+#include "client/dssmctl/fields.hpp"
+#include "client/dssmctl/names.hpp"
+#include "client/dssmctl/text.hpp"
+#include "core/base/try.hpp"
+
+namespace dssm::ctl {
+namespace {
+
+using Kind = TriggerRule::Kind;
+using Compare = TriggerRule::Compare;
+
+// The longer ones first: "<=" is not "<".
+constexpr std::pair<std::string_view, Compare> kComparisons[] = {
+    {"<=", Compare::less_or_equal}, {">=", Compare::greater_or_equal},
+    {"==", Compare::equal},         {"!=", Compare::not_equal},
+    {"<", Compare::less},           {">", Compare::greater},
+    {" inside ", Compare::inside},  {" outside ", Compare::outside}};
+
+std::string_view trimmed(std::string_view text) {
+  const std::size_t begin = text.find_first_not_of(" \t");
+  if (begin == text.npos) return {};
+  return text.substr(begin, text.find_last_not_of(" \t") - begin + 1);
+}
+
+bool is_about(const std::string& pattern, const StreamId& stream) {
+  return stream.name != kTriggerStream && StreamFilter({}, {pattern}).takes(stream);
+}
+
+// The parts of STREAM.FIELD, where names of streams and of fields may have dots, too: for each of
+// its dots what is before and after it.
+std::vector<std::pair<std::string, std::string>> parts_of(const std::string& target) {
+  std::vector<std::pair<std::string, std::string>> parts;
+  for (std::size_t dot = target.find('.'); dot != target.npos; dot = target.find('.', dot + 1)) {
+    if (dot > 0 && dot + 1 < target.size()) {
+      parts.emplace_back(target.substr(0, dot), target.substr(dot + 1));
+    }
+  }
+  return parts;
+}
+
+bool is_there(const HostInfo& host) {
+  return host.state == HostState::up || host.state == HostState::self;
+}
+
+template <std::size_t N>
+std::string text_untrusted(const char (&text)[N]) {
+  return {text, ::strnlen(text, N)};
+}
+
+}  // namespace
+
+// --- rules
+
+Result<TriggerRule> TriggerRule::parse(std::string_view text) {
+  TriggerRule rule;
+  const auto wrong = [&](const std::string& what) {
+    return Error{
+        Errc::invalid_argument,
+        fmt::format("trigger '{}': {}; it is 'STREAM.FIELD < NUMBER' (or <=, >, >=, ==, "
+                    "!=), 'STREAM.FIELD inside LOW..HIGH' (or outside), 'stalled STREAM', "
+                    "'crashed STREAM' or 'clock HOST', after 'NAME: ' if it is to have one",
+                    escaped(text), what)};
+  };
+  std::string_view rest = trimmed(text);
+  if (const std::size_t colon = rest.find(": "); colon != rest.npos) {
+    rule.name = trimmed(rest.substr(0, colon));
+    rest = trimmed(rest.substr(colon + 2));
+    if (rule.name.empty()) return wrong("its name is empty");
+  }
+  const auto comparison = std::ranges::find_if(
+      kComparisons, [&](const auto& one) { return rest.find(one.first) != rest.npos; });
+  if (comparison == std::end(kComparisons)) {
+    const std::size_t space = rest.find(' ');
+    const std::string_view word = rest.substr(0, space);
+    if (space != rest.npos) rule.target = trimmed(rest.substr(space));
+    if (word == "stalled") {
+      rule.kind = Kind::stalled;
+    } else if (word == "crashed") {
+      rule.kind = Kind::crashed;
+    } else if (word == "clock") {
+      rule.kind = Kind::clock;
+    } else {
+      return wrong("there is no such condition");
+    }
+    if (rule.target.find(' ') != rule.target.npos) return wrong("it has one word too many");
+    if (rule.name.empty()) rule.name = word;
+    return rule;
+  }
+  const std::size_t at = rest.find(comparison->first);
+  rule.compare = comparison->second;
+  rule.target = trimmed(rest.substr(0, at));
+  if (parts_of(rule.target).empty() || rule.target.find_first_of("<>=!") != rule.target.npos) {
+    return wrong("STREAM.FIELD is missing");
+  }
+  if (rule.name.empty()) rule.name = rule.target;
+  std::string_view low = trimmed(rest.substr(at + comparison->first.size()));
+  std::string_view high = low;
+  if (rule.compare == Compare::inside || rule.compare == Compare::outside) {
+    const std::size_t dots = low.find("..");
+    if (dots == low.npos) return wrong("the range LOW..HIGH is missing");
+    high = trimmed(low.substr(dots + 2));
+    low = trimmed(low.substr(0, dots));
+  }
+  const Result<double> from = parse_real(low), to = parse_real(high);
+  if (!from) return wrong(from.error().message);
+  if (!to) return wrong(to.error().message);
+  rule.low = *from;
+  rule.high = *to;
+  if (rule.low > rule.high) return wrong("the first number of the range is greater");
+  return rule;
+}
+
+bool TriggerRule::holds_for(double value) const {
+  switch (compare) {
+    case Compare::less:
+      return value < low;
+    case Compare::less_or_equal:
+      return value <= low;
+    case Compare::greater:
+      return value > low;
+    case Compare::greater_or_equal:
+      return value >= low;
+    case Compare::equal:
+      return value == low;
+    case Compare::not_equal:
+      return value != low;
+    case Compare::inside:
+      return value >= low && value <= high;
+    case Compare::outside:
+      return !(value >= low && value <= high);  // NaN is outside
+  }
+  return false;
+}
+
+// --- what fires
+
+bool TriggerJudge::has_rule_on(const StreamId& stream) const {
+  return std::any_of(rules_.begin(), rules_.end(), [&](const TriggerRule& rule) {
+    if (rule.kind != Kind::field) return false;
+    const auto parts = parts_of(rule.target);
+    return std::any_of(parts.begin(), parts.end(),
+                       [&](const auto& part) { return is_about(part.first, stream); });
+  });
+}
+
+std::vector<TriggerJudge::Check> TriggerJudge::checks_of(const StreamId& stream,
+                                                         const std::vector<Field>& fields) const {
+  std::vector<Check> checks;
+  for (std::size_t rule = 0; rule < rules_.size(); ++rule) {
+    if (rules_[rule].kind != Kind::field) continue;
+    for (const auto& [pattern, wanted] : parts_of(rules_[rule].target)) {
+      if (!is_about(pattern, stream)) continue;
+      for (const Field& field : fields) {
+        std::optional<std::uint64_t> element;
+        if (wanted.starts_with(field.name + "[") && wanted.ends_with(']')) {
+          const std::size_t begin = field.name.size() + 1;
+          const Result<std::uint64_t> number =
+              parse_whole(std::string_view(wanted).substr(begin, wanted.size() - begin - 1), 0,
+                          field.count - 1);
+          if (!number) continue;
+          element = *number;
+        } else if (wanted != field.name) {
+          continue;
+        }
+        checks.push_back({rule, field, element, false});
+      }
+    }
+  }
+  return checks;
+}
+
+void TriggerJudge::on_sample(const StreamId& stream, const SampleInfo& info,
+                             std::span<const std::byte> payload, std::vector<Check>& checks) {
+  for (Check& check : checks) {
+    const TriggerRule& rule = rules_[check.rule];
+    std::optional<double> found;
+    const std::uint64_t first = check.element.value_or(0);
+    const std::uint64_t end = check.element ? first + 1 : check.field.count;
+    for (std::uint64_t i = first; i < end && !found; ++i) {
+      const std::optional<double> value = element_number(payload, check.field, i);
+      if (value && rule.holds_for(*value)) found = value;
+    }
+    if (found && !check.held) {
+      fire({rule.name, fmt::format("{} of '{}' is {}", check.field.name, stream.str(), *found),
+            stream.host, info.time});
+    }
+    check.held = found.has_value();
+  }
+}
+
+void TriggerJudge::on_request(const TriggerRequest& request, Time time) {
+  const std::string name = text_untrusted(request.name);
+  fire({name.empty() ? "request" : name, text_untrusted(request.reason),
+        text_untrusted(request.host), time});
+}
+
+void TriggerJudge::on_lists(const std::vector<StreamInfo>& streams,
+                            const std::vector<HostInfo>& hosts, Time now) {
+  std::set<std::string> listed;
+  for (const StreamInfo& stream : streams) {
+    const std::string name = stream.id.str();
+    listed.insert(name);
+    const auto [at, is_new] = streams_.try_emplace(name);
+    Known& known = at->second;
+    // What happened before it was seen is unknown.
+    if (is_new || known.incarnation != stream.incarnation) {
+      known = {stream.id, stream.incarnation, stream.crashed_writers, false};
+    }
+    for (const TriggerRule& rule : rules_) check_stream(rule, stream, known, now);
+    known.crashed_writers = stream.crashed_writers;
+    known.live = stream.state == StreamState::live || (known.live && !is_silent(stream));
+  }
+  // A host that is lost takes its streams from the list.
+  for (auto entry = streams_.begin(); entry != streams_.end();) {
+    auto& [name, known] = *entry;
+    if (listed.contains(name)) {
+      ++entry;
+      continue;
+    }
+    const bool is_removed = std::any_of(hosts.begin(), hosts.end(), [&](const HostInfo& host) {
+      return host.name == known.id.host && is_there(host);
+    });
+    for (const TriggerRule& rule : rules_) {
+      if (is_removed || !known.live || rule.kind != Kind::stalled) continue;
+      if (!is_about(rule.target, known.id)) continue;
+      fire({rule.name, fmt::format("'{}' is lost: its host does not answer", name), known.id.host,
+            now});
+    }
+    known.live = false;
+    entry = is_removed ? streams_.erase(entry) : std::next(entry);
+  }
+  check_clocks(hosts, now);
+}
+
+void TriggerJudge::check_stream(const TriggerRule& rule, const StreamInfo& stream,
+                                const Known& before, Time now) {
+  if (!is_about(rule.target, stream.id)) return;
+  if (rule.kind == Kind::stalled && stream.state == StreamState::stalled && before.live) {
+    fire({rule.name,
+          fmt::format("'{}' is stalled: no sample for {}", stream.id.str(), age_text(stream)),
+          stream.id.host, now});
+  }
+  if (rule.kind == Kind::crashed && stream.crashed_writers > before.crashed_writers) {
+    fire({rule.name,
+          fmt::format("{} ended without closing '{}'", stream.last_crashed_writer, stream.id.str()),
+          stream.id.host, now});
+  }
+}
+
+// The clock of a host that was good and is not. One that was not there before is unknown at first.
+void TriggerJudge::check_clocks(const std::vector<HostInfo>& hosts, Time now) {
+  std::map<std::string, bool> good;
+  for (const HostInfo& host : hosts) {
+    if (!is_there(host)) continue;
+    const bool is_own = host.state == HostState::self;
+    const bool is_good_now =
+        is_own ? !host.clock || is_good(*host.clock) : host.clock_reason.empty();
+    good[host.name] = is_good_now;
+    const auto before = good_clocks_.find(host.name);
+    if (is_good_now || before == good_clocks_.end() || !before->second) continue;
+    for (const TriggerRule& rule : rules_) {
+      if (rule.kind != Kind::clock || ::fnmatch(rule.target.c_str(), host.name.c_str(), 0) != 0) {
+        continue;
+      }
+      fire({rule.name,
+            fmt::format("the clock of host '{}' is not good: {}", host.name,
+                        is_own ? status_text(*host.clock) : host.clock_reason),
+            host.name, now});
+    }
+  }
+  good_clocks_ = std::move(good);
+}
+
+void TriggerJudge::fire(RecordedTrigger trigger) {
+  const MonoTime now = MonoClock::now();
+  if (fired_at_.size() >= kMaxNames) {
+    std::erase_if(fired_at_,
+                  [&](const auto& entry) { return now - entry.second >= min_interval_; });
+    if (fired_at_.size() >= kMaxNames) return;
+  }
+  const auto [last, is_new] = fired_at_.try_emplace(trigger.name, now);
+  if (!is_new && now - last->second < min_interval_) return;
+  last->second = now;
+  fired_.push_back(std::move(trigger));
+}
+
+// --- watching
+
+Result<std::unique_ptr<TriggerWatch>> TriggerWatch::start(Session session,
+                                                          std::vector<TriggerRule> rules,
+                                                          Duration min_interval) {
+  std::unique_ptr<TriggerWatch> watch(
+      new TriggerWatch(std::move(session), std::move(rules), min_interval));
+  watch->thread_ = std::thread([raw = watch.get()] { raw->run(); });
+  return watch;
+}
+
+TriggerWatch::~TriggerWatch() {
+  {
+    const std::lock_guard lock(mutex_);
+    stop_ = true;
+  }
+  stopped_.notify_one();
+  if (thread_.joinable()) thread_.join();
+}
+
+std::vector<RecordedTrigger> TriggerWatch::take_fired() {
+  const std::lock_guard lock(mutex_);
+  return judge_.take();
+}
+
+std::vector<std::string> TriggerWatch::take_notices() {
+  const std::lock_guard lock(mutex_);
+  return std::exchange(notices_, {});
+}
+
+void TriggerWatch::notice(const std::string& text) {
+  const std::lock_guard lock(mutex_);
+  if (noticed_.insert(text).second) notices_.push_back(text);
+}
+
+void TriggerWatch::run() {
+  const auto is_stopped = [&] {
+    const std::lock_guard lock(mutex_);
+    return stop_;
+  };
+  while (!is_stopped()) {
+    if (!requests_) subscribe_requests();
+    check_lists();
+    std::unique_lock lock(mutex_);
+    stopped_.wait_for(lock, kPeriod, [&] { return stop_; });
+  }
+  // Before the lock that their callbacks use.
+  requests_.reset();
+  fields_.clear();
+}
+
+void TriggerWatch::subscribe_requests() {
+  const auto report = [this](const Error& error) {
+    notice(fmt::format("`dssmctl trigger` does not reach this recorder: {}",
+                       escaped_message(error.message)));
+  };
+  // It is only opened for reading then: requests come from others.
+  const Result<Writer<TriggerRequest>> created = session_.create<TriggerRequest>(
+      kTriggerStream, History{64, kPeriod}, {.keep_existing = true});
+  if (!created) return report(created.error());
+  SubscribeOptions options;
+  options.which = WhichSamples::each_from_oldest;
+  options.on_error = report;
+  Result<StreamCallback> requests = session_.subscribe<TriggerRequest>(
+      created->id().str(),
+      [this](const Sample<TriggerRequest>& sample) {
+        if (sample.time() < started_) return;  // of a recorder that was here before
+        const std::lock_guard lock(mutex_);
+        judge_.on_request(sample.value, sample.time());
+      },
+      options);
+  if (!requests) return report(requests.error());
+  requests_ = *std::move(requests);
+}
+
+void TriggerWatch::check_lists() {
+  const Result<std::vector<StreamInfo>> streams = session_.list_streams();
+  const Result<std::vector<HostInfo>> hosts = session_.list_hosts();
+  // While dssmd restarts, nothing is known, and nothing has changed.
+  if (!streams || !hosts) return;
+  {
+    const std::lock_guard lock(mutex_);
+    judge_.on_lists(*streams, *hosts, WallClock::now());
+  }
+  subscribe_fields(*streams);
+}
+
+void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
+  std::set<std::pair<std::string, std::uint64_t>> listed;
+  for (const StreamInfo& stream : streams) {
+    if (!judge_.has_rule_on(stream.id)) continue;
+    const std::pair key(stream.id.str(), stream.incarnation);
+    listed.insert(key);
+    if (fields_.contains(key)) continue;
+    TypeInfo type = stream.type;
+    if (type.fields.empty()) {  // lists leave out the fields of many types
+      const Result<StreamInfo> info = session_.stream_info(stream.id);
+      if (!info) continue;
+      type = info->type;
+    }
+    std::vector<TriggerJudge::Check> checks =
+        judge_.checks_of(stream.id, readable_fields_untrusted(type));
+    std::optional<StreamCallback>& subscription = fields_[key];
+    if (checks.empty()) {
+      notice(fmt::format("no trigger on '{}': it has no such field", escaped(stream.id.str())));
+      continue;
+    }
+    SubscribeOptions options;
+    options.on_error = [this, name = stream.id.str()](const Error& error) {
+      notice(fmt::format("no trigger on '{}': {}", escaped(name), escaped_message(error.message)));
+    };
+    Result<StreamCallback> subscribed = session_.subscribe_raw(
+        stream.id,
+        [this, checks = std::move(checks)](std::span<const std::byte> payload,
+                                           const SampleInfo& info, RawReader& reader) mutable {
+          const std::lock_guard lock(mutex_);
+          judge_.on_sample(reader.id(), info, payload, checks);
+        },
+        options, &type);
+    if (subscribed) {
+      subscription = *std::move(subscribed);
+    } else {
+      options.on_error(subscribed.error());
+    }
+  }
+  std::erase_if(fields_, [&](const auto& entry) { return !listed.contains(entry.first); });
+}
+
+}  // namespace dssm::ctl

@@ -1,0 +1,168 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// What a black box waits for: conditions on streams and hosts, and requests of `dssmctl trigger`.
+//
+//   TriggerRule   a condition as a person writes it
+//   TriggerJudge  decides from samples and lists what fires; without a session, for tests
+//   TriggerWatch  feeds a judge: lists streams and hosts each second, and reads each sample of the
+//                 streams on whose fields there is a condition
+//
+// A trigger fires when its condition begins to hold, for each stream or host by itself, and not
+// again within the minimum interval, so that a value at its limit does not fill the disk.
+#pragma once
+
+#include <condition_variable>
+#include <cstdint>
+#include <dssm/describe.hpp>
+#include <dssm/recording.hpp>
+#include <dssm/session.hpp>
+#include <map>
+#include <memory>
+#include <mutex>
+#include <optional>
+#include <set>
+#include <span>
+#include <string>
+#include <string_view>
+#include <thread>
+#include <tuple>
+#include <utility>
+#include <vector>
+
+namespace dssm::ctl {
+
+// A sample of the stream kTriggerStream, which each black box has on its host: who writes one there
+// asks for an incident. Texts end at their first zero byte.
+struct TriggerRequest {
+  char name[64];
+  char host[32];  // where it was requested
+  char reason[416];
+};
+DSSM_DESCRIBE(TriggerRequest, name, host, reason)
+inline constexpr const char* kTriggerStream = "dssm_trigger";
+
+struct TriggerRule {
+  enum class Kind : unsigned char { field, stalled, crashed, clock };
+  enum class Compare : unsigned char {
+    less,
+    less_or_equal,
+    greater,
+    greater_or_equal,
+    equal,
+    not_equal,
+    inside,
+    outside
+  };
+
+  std::string name;  // of the trigger
+  Kind kind = Kind::field;
+  std::string target = "*";  // pattern of streams, or of hosts; of a field: STREAM.FIELD
+  // Of a field: inside and outside of low .. high, or compared with low.
+  Compare compare = Compare::less;
+  double low = 0, high = 0;
+
+  // Reads "[NAME: ]CONDITION", where the condition is one of
+  //   STREAM.FIELD < NUMBER (also <= > >= == !=), STREAM.FIELD inside LOW..HIGH (also outside),
+  //   stalled [STREAM], crashed [STREAM], clock [HOST]
+  // STREAM and HOST are shell patterns. Without a name, it is the first word of the condition.
+  //   fails  invalid_argument
+  static Result<TriggerRule> parse(std::string_view text);
+
+  bool holds_for(double value) const;
+};
+
+// One thread at a time.
+class TriggerJudge {
+ public:
+  TriggerJudge(std::vector<TriggerRule> rules, Duration min_interval)
+      : rules_(std::move(rules)), min_interval_(min_interval) {}
+
+  // A field of a stream on which there is a condition.
+  struct Check {
+    std::size_t rule = 0;
+    Field field;
+    std::optional<std::uint64_t> element;  // empty: any of them
+    bool held = false;                     // for the last sample
+  };
+  // Those of a stream; without `fields` its type is not described.
+  std::vector<Check> checks_of(const StreamId& stream, const std::vector<Field>& fields) const;
+  bool has_rule_on(const StreamId& stream) const;  // on a field, if it has that
+
+  void on_sample(const StreamId& stream, const SampleInfo& info, std::span<const std::byte> payload,
+                 std::vector<Check>& checks);
+  // `streams` and `hosts` as Session lists them.
+  void on_lists(const std::vector<StreamInfo>& streams, const std::vector<HostInfo>& hosts,
+                Time now);
+  void on_request(const TriggerRequest& request, Time time);
+
+  // What fired since the last call.
+  std::vector<RecordedTrigger> take() { return std::exchange(fired_, {}); }
+
+ private:
+  void fire(RecordedTrigger trigger);
+  // What the last lists had of a stream.
+  struct Known {
+    StreamId id;
+    std::uint64_t incarnation = 0;
+    std::uint32_t crashed_writers = 0;
+    bool live = false;  // it had samples, and was not reported as stalled
+  };
+  void check_stream(const TriggerRule& rule, const StreamInfo& stream, const Known& before,
+                    Time now);
+  void check_clocks(const std::vector<HostInfo>& hosts, Time now);
+
+  // Names that requests bring are kept to a limit.
+  static constexpr std::size_t kMaxNames = 1024;
+
+  std::vector<TriggerRule> rules_;
+  Duration min_interval_;
+  std::vector<RecordedTrigger> fired_;
+  std::map<std::string, MonoTime> fired_at_;  // by the trigger's name
+  std::map<std::string, Known> streams_;      // by name with host
+  std::map<std::string, bool> good_clocks_;   // of hosts that were up
+};
+
+class TriggerWatch {
+ public:
+  // Begins. Creates kTriggerStream on this host.
+  //   fails  system (no thread left)
+  static Result<std::unique_ptr<TriggerWatch>> start(Session session,
+                                                     std::vector<TriggerRule> rules,
+                                                     Duration min_interval);
+  TriggerWatch(const TriggerWatch&) = delete;
+  TriggerWatch& operator=(const TriggerWatch&) = delete;
+  ~TriggerWatch();
+
+  std::vector<RecordedTrigger> take_fired();
+  // What does not work, for people; each only once.
+  std::vector<std::string> take_notices();
+
+ private:
+  TriggerWatch(Session session, std::vector<TriggerRule> rules, Duration min_interval)
+      : session_(std::move(session)), judge_(std::move(rules), min_interval) {}
+  void run();
+  void subscribe_requests();
+  void check_lists();
+  void subscribe_fields(const std::vector<StreamInfo>& streams);
+  void notice(const std::string& text);
+
+  static constexpr Duration kPeriod = std::chrono::seconds(1);
+
+  Session session_;
+  const Time started_ = WallClock::now();
+
+  std::mutex mutex_;
+  std::condition_variable stopped_;
+  bool stop_ = false;
+  TriggerJudge judge_;
+  std::vector<std::string> notices_;
+  std::set<std::string> noticed_;
+
+  // --- of the thread
+  std::optional<StreamCallback> requests_;
+  // By name with host and incarnation; without a value: it has no field with a condition.
+  std::map<std::pair<std::string, std::uint64_t>, std::optional<StreamCallback>> fields_;
+  std::thread thread_;
+};
+
+}  // namespace dssm::ctl
