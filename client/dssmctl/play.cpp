@@ -30,8 +30,6 @@
 namespace dssm::ctl {
 namespace {
 
-double seconds_of(Time time) { return static_cast<double>(to_ns(time)) / 1e9; }
-
 // The part of the recording that is played.
 struct PlayedPart {
   Time from = Time::max(), to = Time::min();

@@ -12,8 +12,6 @@
 namespace dssm::ctl {
 namespace {
 
-double seconds_of(Time time) { return static_cast<double>(to_ns(time)) / 1e9; }
-
 Duration scaled(Duration duration, double factor) {
   constexpr double kMax_ns = 9e18;
   return Duration(

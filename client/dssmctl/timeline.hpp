@@ -17,6 +17,9 @@
 
 namespace dssm::ctl {
 
+// As PlaybackClock takes times.
+inline double seconds_of(Time time) { return static_cast<double>(to_ns(time)) / 1e9; }
+
 // Has the playback clocks of all other hosts follow this PC's, in a thread of its own: a host that
 // does not answer delays nothing.
 class SharedPlayback {
