@@ -57,9 +57,10 @@ bool is_there(const HostInfo& host) {
   return host.state == HostState::up || host.state == HostState::self;
 }
 
+// Printable: it comes into files, whose texts are UTF-8, and into the journal.
 template <std::size_t N>
 std::string text_untrusted(const char (&text)[N]) {
-  return {text, ::strnlen(text, N)};
+  return escaped({text, ::strnlen(text, N)});
 }
 
 }  // namespace
@@ -196,7 +197,8 @@ void TriggerEvaluator::on_sample(const StreamId& stream, const SampleInfo& info,
       if (value && rule.holds_for(*value)) found = value;
     }
     if (found && !check.held) {
-      fire({rule.name, fmt::format("{} of '{}' is {}", check.field.name, stream.str(), *found),
+      fire({rule.name,
+            fmt::format("{} of '{}' is {}", escaped(check.field.name), stream.str(), *found),
             stream.host, info.time});
     }
     check.held = found.has_value();
@@ -372,6 +374,7 @@ void TriggerWatch::subscribe_requests() {
       options);
   if (!requests) return report(requests.error());
   requests_ = *std::move(requests);
+  request_stream_ = created->id();
 }
 
 void TriggerWatch::check_lists() {
@@ -384,6 +387,10 @@ void TriggerWatch::check_lists() {
     evaluator_.on_lists(*streams, *hosts, WallClock::now());
   }
   subscribe_fields(*streams);
+  // `dssmctl rm` removes it, too; then it is created again.
+  if (std::ranges::find(*streams, request_stream_, &StreamInfo::id) == streams->end()) {
+    requests_.reset();
+  }
 }
 
 void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {

@@ -160,6 +160,7 @@ class TriggerWatch {
 
   // --- of the thread
   std::optional<StreamCallback> requests_;
+  StreamId request_stream_;
   // By name with host and incarnation; without a value: it has no field with a condition.
   std::map<std::pair<std::string, std::uint64_t>, std::optional<StreamCallback>> fields_;
   std::thread thread_;

@@ -327,6 +327,24 @@ TEST_F(BlackBox, StaysWhileDssmdIsRestarted) {
   EXPECT_EQ(numbers_in(file), range(0, 9));
 }
 
+TEST_F(BlackBox, ClosesStreamsThatAreRemovedButNotTheOneOfRequests) {
+  auto power = std::optional(session_.create<Power>("power", depth_of(64)).value());
+  Running running(recorder({"--before", "0", "--after", "1ms"}), environment());
+  await_armed(power->id());
+  const StreamId id = power->id();
+  power.reset();
+  ASSERT_TRUE(session_.remove(id));
+  await([&] {
+    const std::vector<OpenInfo> opens = session_.list_opens().value();
+    return std::ranges::none_of(opens, [&](const OpenInfo& open) { return open.stream == id; });
+  });
+  power = session_.create<Power>("power", depth_of(64)).value();
+  ASSERT_TRUE(session_.remove({"dssm_trigger", 0, ""}));
+  await_armed(id);
+  output({"trigger", "a"});
+  EXPECT_TRUE(running.line().ends_with("_a.mcap'"));
+}
+
 TEST_F(BlackBox, KeepsTheQuotaOverRestartsAndLeavesOtherFilesAlone) {
   auto power = std::optional(session_.create<Power>("power", depth_of(20'000)).value());
   std::ofstream(folder_.file("mine.mcap")) << std::string(100'000, 'x');

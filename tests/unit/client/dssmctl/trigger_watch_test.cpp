@@ -258,13 +258,15 @@ TEST(TriggerEvaluator, TakesTextsOfRequestsUpToTheirEnds) {
   std::fill(std::begin(request.name), std::end(request.name), 'n');
   std::fill(std::begin(request.reason), std::end(request.reason), 'r');
   evaluator.on_request(request, time_from_ns(7));
-  evaluator.on_request(TriggerRequest{}, time_from_ns(8));
+  evaluator.on_request(TriggerRequest{"a\n\xff", "", ""}, time_from_ns(8));
+  evaluator.on_request(TriggerRequest{}, time_from_ns(9));
   const std::vector<RecordedTrigger> fired = evaluator.take();
-  ASSERT_EQ(fired.size(), 2U);
+  ASSERT_EQ(fired.size(), 3U);
   EXPECT_EQ(fired[0].name, std::string(sizeof request.name, 'n'));
   EXPECT_EQ(fired[0].reason, std::string(sizeof request.reason, 'r'));
   EXPECT_EQ(fired[0].time, time_from_ns(7));
-  EXPECT_EQ(fired[1].name, "request");
+  EXPECT_EQ(fired[1].name, "a\\n\\xff");
+  EXPECT_EQ(fired[2].name, "request");
 }
 
 TEST(TriggerEvaluator, DoesNotRememberNamesWithoutALimit) {
