@@ -24,7 +24,7 @@ class BlackBox {
         folder_(folder),
         out_(out) {}
 
-  // Until a stop signal; then the incident that goes on ends, too.
+  // Until a stop signal; an incident that is being recorded ends then, too.
   void run() {
     do {
       for (const RecordedTrigger& trigger : watch_.take_fired()) on_trigger(trigger);
@@ -46,7 +46,7 @@ class BlackBox {
         fmt::format("trigger '{}' of host '{}'{}", escaped(trigger.name), escaped(trigger.host),
                     trigger.reason.empty() ? "" : ": " + escaped_message(trigger.reason));
     if (recorder_.is_recording()) {
-      notice(fmt::format("{}; '{}' goes on", text, escaped(file_.string())));
+      notice(fmt::format("{}; '{}' continues", text, escaped(file_.string())));
       end_ = std::min(deadline_in(options_.after), last_end_);
       (void)recorder_.add_trigger(trigger);  // take() fails in the same way
       return;
@@ -131,7 +131,7 @@ class BlackBox {
   TriggerWatch& watch_;
   RecordingFolder& folder_;
   Output& out_;
-  std::filesystem::path file_;       // of the incident that goes on
+  std::filesystem::path file_;       // of the incident that is being recorded, or of the last one
   MonoTime end_{}, last_end_{};      // of it
   std::uint64_t written_bytes_ = 0;  // by incidents that have ended
 };

@@ -1,6 +1,6 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl record --black-box, and what it shares with a recording that goes on all the time.
+// dssmctl record --black-box, and what it shares with a continuous recording.
 #pragma once
 
 #include <dssm/recording.hpp>

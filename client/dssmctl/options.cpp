@@ -419,7 +419,7 @@ void check_black_box(const RecordOptions& options) {
     return;
   }
   require(!options.past && !options.duration && !options.until,
-          "--black-box: it goes on until Ctrl-C; leave out --past, --for and --until");
+          "--black-box: it continues until Ctrl-C; leave out --past, --for and --until");
   require(options.max_file_bytes == 0 && options.max_file_duration == Duration::zero() &&
               options.max_total_bytes == 0,
           "--black-box: each incident is one file; limit all with --quota, and one with "

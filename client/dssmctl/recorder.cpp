@@ -64,7 +64,9 @@ void Recorder::Opener::on_event(const StreamEvent& event) {
   const std::string name = event.stream.id.str();
   const std::lock_guard lock(mutex_);
   const auto is_it = [&](const Wanted& wanted) { return wanted.stream.id == event.stream.id; };
+  std::erase_if(removed_, [&](const auto& entry) { return entry.first == event.stream.id; });
   if (event.kind == StreamEvent::Kind::removed) {
+    if (known_.contains(name)) removed_.emplace_back(event.stream.id, MonoClock::now());
     untried_ -= static_cast<std::size_t>(
         std::count_if(wanted_.begin(), wanted_.end(), [&](const Wanted& wanted) {
           return is_it(wanted) && wanted.from_start && !wanted.reported;
@@ -88,6 +90,18 @@ std::vector<Recorder::Opener::Wanted>::iterator Recorder::Opener::next_wanted() 
     if (next == wanted_.end() || wanted->due < next->due) next = wanted;
   }
   return next;
+}
+
+std::vector<StreamId> Recorder::Opener::take_removed(Duration age) {
+  const std::lock_guard lock(mutex_);
+  std::vector<StreamId> old;
+  std::erase_if(removed_, [&](const auto& entry) {
+    if (MonoClock::now() - entry.second < age) return false;
+    old.push_back(entry.first);
+    known_.erase(entry.first.str());
+    return true;
+  });
+  return old;
 }
 
 void Recorder::Opener::reopen(const StreamId& id, const Error& error) {
@@ -321,6 +335,12 @@ void Recorder::check_readers() {
   const MonoTime now = MonoClock::now();
   if (now < next_check_) return;
   next_check_ = now + kCheckPeriod;
+  // Their rings would take memory for ever.
+  if (!is_recording_) {
+    for (const StreamId& removed : opener_.take_removed(keep_removed_)) {
+      std::erase_if(sources_, [&](const Source& one) { return one.reader.id() == removed; });
+    }
+  }
   std::erase_if(sources_, [&](Source& source) {
     if (!is_recording_) follow_restart(source);
     const std::optional<Error> error = source.reader.restart_error();

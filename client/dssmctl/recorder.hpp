@@ -35,6 +35,8 @@ struct RecorderPlan {
   // Nothing is recorded before begin(); until then streams are only kept open, with what their
   // rings hold, also of other hosts.
   bool on_demand = false;
+  // On demand: streams that were removed, or left with their host, stay open for so long.
+  Duration keep_removed = std::chrono::seconds(3);
 };
 
 class Recorder {
@@ -130,6 +132,8 @@ class Recorder {
     // Opens nothing more, but those that there were at begin(), for a second at most; waits for
     // that.
     void end();
+    // Streams that were removed for so long; they are opened again if they come again.
+    std::vector<StreamId> take_removed(Duration age);
     // Opens it again: its reader cannot go on, because of `error`.
     void reopen(const StreamId& id, const Error& error);
 
@@ -160,6 +164,7 @@ class Recorder {
     bool is_beginning_ = true;  // begin() runs: what comes is there already
     std::vector<Wanted> wanted_;
     std::set<std::string> known_;  // names of what was opened: they restart by themselves
+    std::vector<std::pair<StreamId, MonoTime>> removed_;  // of these, and when
     std::size_t untried_ = 0;
     std::vector<Source> opened_;
     std::vector<std::string> notices_;
@@ -171,6 +176,7 @@ class Recorder {
 
   Recorder(Session session, std::optional<RecordingWriter> file, const RecorderPlan& plan)
       : is_on_demand_(plan.on_demand),
+        keep_removed_(plan.keep_removed),
         is_recording_(!plan.on_demand),
         file_(std::move(file)),
         opener_(std::move(session), plan) {}
@@ -192,6 +198,7 @@ class Recorder {
   Result<void> complete();
 
   const bool is_on_demand_;
+  const Duration keep_removed_;
   bool is_recording_;  // in file_, which is not finished
   std::optional<RecordingWriter> file_;
   Time wanted_from_{};  // on demand: of the file's samples

@@ -1,7 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
 // See trigger_watch.hpp. Requests to dssmd, which may take as long as another host does not answer,
-// come from the thread of the watch; samples come from the session's thread. Both use the judge
+// come from the thread of the watch; samples come from the session's thread. Both use the evaluator
 // under one lock, and neither calls the session with it.
 #include "client/dssmctl/trigger_watch.hpp"
 
@@ -57,9 +57,10 @@ bool is_there(const HostInfo& host) {
   return host.state == HostState::up || host.state == HostState::self;
 }
 
+// Printable: it comes into files, whose texts are UTF-8, and into the journal.
 template <std::size_t N>
 std::string text_untrusted(const char (&text)[N]) {
-  return {text, ::strnlen(text, N)};
+  return escaped({text, ::strnlen(text, N)});
 }
 
 }  // namespace
@@ -149,7 +150,7 @@ bool TriggerRule::holds_for(double value) const {
 
 // --- what fires
 
-bool TriggerJudge::has_rule_on(const StreamId& stream) const {
+bool TriggerEvaluator::has_rule_on(const StreamId& stream) const {
   return std::any_of(rules_.begin(), rules_.end(), [&](const TriggerRule& rule) {
     if (rule.kind != Kind::field) return false;
     const auto parts = parts_of(rule.target);
@@ -158,8 +159,8 @@ bool TriggerJudge::has_rule_on(const StreamId& stream) const {
   });
 }
 
-std::vector<TriggerJudge::Check> TriggerJudge::checks_of(const StreamId& stream,
-                                                         const std::vector<Field>& fields) const {
+std::vector<TriggerEvaluator::Check> TriggerEvaluator::checks_of(
+    const StreamId& stream, const std::vector<Field>& fields) const {
   std::vector<Check> checks;
   for (std::size_t rule = 0; rule < rules_.size(); ++rule) {
     if (rules_[rule].kind != Kind::field) continue;
@@ -184,8 +185,8 @@ std::vector<TriggerJudge::Check> TriggerJudge::checks_of(const StreamId& stream,
   return checks;
 }
 
-void TriggerJudge::on_sample(const StreamId& stream, const SampleInfo& info,
-                             std::span<const std::byte> payload, std::vector<Check>& checks) {
+void TriggerEvaluator::on_sample(const StreamId& stream, const SampleInfo& info,
+                                 std::span<const std::byte> payload, std::vector<Check>& checks) {
   for (Check& check : checks) {
     const TriggerRule& rule = rules_[check.rule];
     std::optional<double> found;
@@ -196,21 +197,22 @@ void TriggerJudge::on_sample(const StreamId& stream, const SampleInfo& info,
       if (value && rule.holds_for(*value)) found = value;
     }
     if (found && !check.held) {
-      fire({rule.name, fmt::format("{} of '{}' is {}", check.field.name, stream.str(), *found),
+      fire({rule.name,
+            fmt::format("{} of '{}' is {}", escaped(check.field.name), stream.str(), *found),
             stream.host, info.time});
     }
     check.held = found.has_value();
   }
 }
 
-void TriggerJudge::on_request(const TriggerRequest& request, Time time) {
+void TriggerEvaluator::on_request(const TriggerRequest& request, Time time) {
   const std::string name = text_untrusted(request.name);
   fire({name.empty() ? "request" : name, text_untrusted(request.reason),
         text_untrusted(request.host), time});
 }
 
-void TriggerJudge::on_lists(const std::vector<StreamInfo>& streams,
-                            const std::vector<HostInfo>& hosts, Time now) {
+void TriggerEvaluator::on_lists(const std::vector<StreamInfo>& streams,
+                                const std::vector<HostInfo>& hosts, Time now) {
   std::set<std::string> listed;
   for (const StreamInfo& stream : streams) {
     const std::string name = stream.id.str();
@@ -247,8 +249,8 @@ void TriggerJudge::on_lists(const std::vector<StreamInfo>& streams,
   check_clocks(hosts, now);
 }
 
-void TriggerJudge::check_stream(const TriggerRule& rule, const StreamInfo& stream,
-                                const Known& before, Time now) {
+void TriggerEvaluator::check_stream(const TriggerRule& rule, const StreamInfo& stream,
+                                    const Known& before, Time now) {
   if (!is_about(rule.target, stream.id)) return;
   if (rule.kind == Kind::stalled && stream.state == StreamState::stalled && before.live) {
     fire({rule.name,
@@ -263,7 +265,7 @@ void TriggerJudge::check_stream(const TriggerRule& rule, const StreamInfo& strea
 }
 
 // The clock of a host that was good and is not. One that was not there before is unknown at first.
-void TriggerJudge::check_clocks(const std::vector<HostInfo>& hosts, Time now) {
+void TriggerEvaluator::check_clocks(const std::vector<HostInfo>& hosts, Time now) {
   std::map<std::string, bool> good;
   for (const HostInfo& host : hosts) {
     if (!is_there(host)) continue;
@@ -286,7 +288,7 @@ void TriggerJudge::check_clocks(const std::vector<HostInfo>& hosts, Time now) {
   good_clocks_ = std::move(good);
 }
 
-void TriggerJudge::fire(RecordedTrigger trigger) {
+void TriggerEvaluator::fire(RecordedTrigger trigger) {
   const MonoTime now = MonoClock::now();
   if (fired_at_.size() >= kMaxNames) {
     std::erase_if(fired_at_,
@@ -321,7 +323,7 @@ TriggerWatch::~TriggerWatch() {
 
 std::vector<RecordedTrigger> TriggerWatch::take_fired() {
   const std::lock_guard lock(mutex_);
-  return judge_.take();
+  return evaluator_.take();
 }
 
 std::vector<std::string> TriggerWatch::take_notices() {
@@ -367,11 +369,12 @@ void TriggerWatch::subscribe_requests() {
       [this](const Sample<TriggerRequest>& sample) {
         if (sample.time() < started_) return;  // of a recorder that was here before
         const std::lock_guard lock(mutex_);
-        judge_.on_request(sample.value, sample.time());
+        evaluator_.on_request(sample.value, sample.time());
       },
       options);
   if (!requests) return report(requests.error());
   requests_ = *std::move(requests);
+  request_stream_ = created->id();
 }
 
 void TriggerWatch::check_lists() {
@@ -381,15 +384,19 @@ void TriggerWatch::check_lists() {
   if (!streams || !hosts) return;
   {
     const std::lock_guard lock(mutex_);
-    judge_.on_lists(*streams, *hosts, WallClock::now());
+    evaluator_.on_lists(*streams, *hosts, WallClock::now());
   }
   subscribe_fields(*streams);
+  // `dssmctl rm` removes it, too; then it is created again.
+  if (std::ranges::find(*streams, request_stream_, &StreamInfo::id) == streams->end()) {
+    requests_.reset();
+  }
 }
 
 void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
   std::set<std::pair<std::string, std::uint64_t>> listed;
   for (const StreamInfo& stream : streams) {
-    if (!judge_.has_rule_on(stream.id)) continue;
+    if (!evaluator_.has_rule_on(stream.id)) continue;
     const std::pair key(stream.id.str(), stream.incarnation);
     listed.insert(key);
     if (fields_.contains(key)) continue;
@@ -399,8 +406,8 @@ void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
       if (!info) continue;
       type = info->type;
     }
-    std::vector<TriggerJudge::Check> checks =
-        judge_.checks_of(stream.id, readable_fields_untrusted(type));
+    std::vector<TriggerEvaluator::Check> checks =
+        evaluator_.checks_of(stream.id, readable_fields_untrusted(type));
     std::optional<StreamCallback>& subscription = fields_[key];
     if (checks.empty()) {
       notice(fmt::format("no trigger on '{}': it has no such field", escaped(stream.id.str())));
@@ -415,7 +422,7 @@ void TriggerWatch::subscribe_fields(const std::vector<StreamInfo>& streams) {
         [this, checks = std::move(checks)](std::span<const std::byte> payload,
                                            const SampleInfo& info, RawReader& reader) mutable {
           const std::lock_guard lock(mutex_);
-          judge_.on_sample(reader.id(), info, payload, checks);
+          evaluator_.on_sample(reader.id(), info, payload, checks);
         },
         options, &type);
     if (subscribed) {

@@ -3,9 +3,9 @@
 // What a black box waits for: conditions on streams and hosts, and requests of `dssmctl trigger`.
 //
 //   TriggerRule   a condition as a person writes it
-//   TriggerJudge  decides from samples and lists what fires; without a session, for tests
-//   TriggerWatch  feeds a judge: lists streams and hosts each second, and reads each sample of the
-//                 streams on whose fields there is a condition
+//   TriggerEvaluator  decides from samples and lists what fires; without a session, for tests
+//   TriggerWatch  feeds an evaluator: lists streams and hosts each second, and reads each sample of
+//                 the streams on whose fields there is a condition
 //
 // A trigger fires when its condition begins to hold, for each stream or host by itself, and not
 // again within the minimum interval, so that a value at its limit does not fill the disk.
@@ -72,9 +72,9 @@ struct TriggerRule {
 };
 
 // One thread at a time.
-class TriggerJudge {
+class TriggerEvaluator {
  public:
-  TriggerJudge(std::vector<TriggerRule> rules, Duration min_interval)
+  TriggerEvaluator(std::vector<TriggerRule> rules, Duration min_interval)
       : rules_(std::move(rules)), min_interval_(min_interval) {}
 
   // A field of a stream on which there is a condition.
@@ -139,7 +139,7 @@ class TriggerWatch {
 
  private:
   TriggerWatch(Session session, std::vector<TriggerRule> rules, Duration min_interval)
-      : session_(std::move(session)), judge_(std::move(rules), min_interval) {}
+      : session_(std::move(session)), evaluator_(std::move(rules), min_interval) {}
   void run();
   void subscribe_requests();
   void check_lists();
@@ -154,12 +154,13 @@ class TriggerWatch {
   std::mutex mutex_;
   std::condition_variable stopped_;
   bool stop_ = false;
-  TriggerJudge judge_;
+  TriggerEvaluator evaluator_;
   std::vector<std::string> notices_;
   std::set<std::string> noticed_;
 
   // --- of the thread
   std::optional<StreamCallback> requests_;
+  StreamId request_stream_;
   // By name with host and incarnation; without a value: it has no field with a condition.
   std::map<std::pair<std::string, std::uint64_t>, std::optional<StreamCallback>> fields_;
   std::thread thread_;

@@ -15,6 +15,7 @@ from collections.abc import Callable
 
 from apt_source import AptSource, make_key
 from container import HERE, TIMEOUT_S, Container
+from service_tests import wait_until
 from tree import field, repack
 
 ANSIBLE = HERE.parent.parent / "ansible"
@@ -252,6 +253,7 @@ class IsolatedTests:
         return [
             ("the role deploys an isolated PC without nftables", self.deploy),
             ("a PC with dssm_insecure: false listens only at loopback", self.listen),
+            ("the role runs the recorder only where it is configured", self.record),
         ]
 
     def deploy(self) -> None:
@@ -259,6 +261,19 @@ class IsolatedTests:
         assert self.playbooks.run("site.yml") > 0
         assert "pc1" in self.container.run("dssmctl", "hosts")
         assert not self.container.path("/etc/nftables.d").exists()
+
+    def record(self) -> None:
+        """Test."""
+        packages = ["libdssm1", "dssmd", "dssm-tools", "dssm-record"]
+        settings = {"black_box": True, "quota": "1GiB", "trigger": ["high: a.b > 1"]}
+        assert self.playbooks.run("site.yml", dssm_packages=packages, dssm_record=settings) > 0
+        wait_until(lambda: self.container.attempt("dssmctl", "trigger", "test").returncode == 0,
+                   "no black box waits for triggers")
+        assert self.playbooks.run("site.yml", dssm_packages=packages, dssm_record=settings) == 0
+        assert self.playbooks.run("site.yml", dssm_packages=packages) > 0
+        unit = self.container.run("systemctl", "show", "--property=ActiveState,UnitFileState",
+                                  "dssm-record")
+        assert unit.split() == ["ActiveState=inactive", "UnitFileState=disabled"], unit
 
     def listen(self) -> None:
         """Test."""

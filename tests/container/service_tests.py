@@ -163,17 +163,18 @@ class ServiceTests:
         assert self.states() == ("active", "active"), self.states()
 
     def await_incident(self, name: str) -> pathlib.Path:
-        """Triggers an incident, and waits until its file is there."""
-        wait_until(lambda: self.container.attempt("dssmctl", "trigger", name).returncode == 0,
-                   "no black box waits for triggers")
+        """Triggers an incident until its file is there: one that has not ended would only be prolonged."""
         folder = self.container.path("/var/lib/dssm-record")
-        wait_until(lambda: list(folder.glob(f"incident_*_{name}.mcap")), f"no incident '{name}'")
-        return next(folder.glob(f"incident_*_{name}.mcap"))
+        wait_until(lambda: self.container.attempt("dssmctl", "trigger", name).returncode == 0
+                   and list(folder.glob(f"incident_*_{name}*.mcap")), f"no incident '{name}'")
+        return next(folder.glob(f"incident_*_{name}*.mcap"))
 
     def record(self) -> None:
         """Test."""
         assert self.show("dssm-record.service", "UnitFileState") == "disabled"
         assert self.show("dssm-record.service", "ActiveState") == "inactive"
+        with self.container.path("/etc/dssm/record.conf").open("a") as file:
+            file.write('after = "1ms"\nmin_interval = "0s"\n')
         self.container.run("systemctl", "enable", "--now", "dssm-record")
         file = self.await_incident("before")
         owner = self.container.run("stat", "--format=%a %U %G", f"/var/lib/dssm-record/{file.name}")

@@ -46,7 +46,7 @@ std::vector<std::int64_t> range(std::int64_t first, std::int64_t last) {
   return numbers;
 }
 
-// The file in "... records 'FILE'" and in "'FILE' goes on".
+// The file in "... records 'FILE'" and in "'FILE' continues".
 std::string quoted_file(const std::string& line) {
   const std::size_t begin = line.rfind(" '/");
   EXPECT_NE(begin, line.npos) << line;
@@ -108,7 +108,7 @@ TEST_F(BlackBox, KeepsWhatWasBeforeAndAfterARequest) {
   EXPECT_EQ(running.status(), 0);
 }
 
-TEST_F(BlackBox, GoesOnForATriggerThatComesMeanwhileAndHasNoSampleTwice) {
+TEST_F(BlackBox, IsProlongedByATriggerAndHasNoSampleTwice) {
   auto power = session_.create<Power>("power", depth_of(4096)).value();
   Running running(recorder({"--after", "3s"}), environment());
   await_armed(power.id());
@@ -123,8 +123,9 @@ TEST_F(BlackBox, GoesOnForATriggerThatComesMeanwhileAndHasNoSampleTwice) {
   });
   const MonoTime second = MonoClock::now();
   output({"trigger", "two"});
-  const std::string goes_on = running.line();
-  EXPECT_TRUE(contains(goes_on, "trigger 'two' of host 'pc1'; '" + file + "' goes on")) << goes_on;
+  const std::string continues = running.line();
+  EXPECT_TRUE(contains(continues, "trigger 'two' of host 'pc1'; '" + file + "' continues"))
+      << continues;
   write_power(power, 10, 19);
   EXPECT_TRUE(running.line().starts_with(file));
   EXPECT_GE(MonoClock::now() - second, 3s);
@@ -213,7 +214,7 @@ TEST_F(BlackBox, IsTriggeredByAProgramThatEndsWithoutClosing) {
   EXPECT_EQ(json({"info", "power"})["crashed_writers"], 1);
 }
 
-// dssmd of this test follows a chronyd of its own, which follows nobody and leaves the clock alone.
+// dssmd of this test follows a chronyd of its own, without sources, which leaves the clock alone.
 class BlackBoxWithClock : public testing::Test {
  protected:
   void SetUp() override {
@@ -326,6 +327,24 @@ TEST_F(BlackBox, StaysWhileDssmdIsRestarted) {
   EXPECT_EQ(numbers_in(file), range(0, 9));
 }
 
+TEST_F(BlackBox, ClosesStreamsThatAreRemovedButNotTheOneOfRequests) {
+  auto power = std::optional(session_.create<Power>("power", depth_of(64)).value());
+  Running running(recorder({"--before", "0", "--after", "1ms"}), environment());
+  await_armed(power->id());
+  const StreamId id = power->id();
+  power.reset();
+  ASSERT_TRUE(session_.remove(id));
+  await([&] {
+    const std::vector<OpenInfo> opens = session_.list_opens().value();
+    return std::ranges::none_of(opens, [&](const OpenInfo& open) { return open.stream == id; });
+  });
+  power = session_.create<Power>("power", depth_of(64)).value();
+  ASSERT_TRUE(session_.remove({"dssm_trigger", 0, ""}));
+  await_armed(id);
+  output({"trigger", "a"});
+  EXPECT_TRUE(running.line().ends_with("_a.mcap'"));
+}
+
 TEST_F(BlackBox, KeepsTheQuotaOverRestartsAndLeavesOtherFilesAlone) {
   auto power = std::optional(session_.create<Power>("power", depth_of(20'000)).value());
   std::ofstream(folder_.file("mine.mcap")) << std::string(100'000, 'x');
@@ -359,10 +378,9 @@ TEST_F(BlackBox, KeepsTheQuotaOverRestartsAndLeavesOtherFilesAlone) {
 }
 
 TEST_F(BlackBox, SaysWhatIsWrong) {
-  const Finished nobody = ctl({"trigger", "a"});
-  EXPECT_EQ(nobody.exit_status, 1);
-  EXPECT_TRUE(contains(nobody.err, "no host has a black box that waits for triggers"))
-      << nobody.err;
+  const Finished none = ctl({"trigger", "a"});
+  EXPECT_EQ(none.exit_status, 1);
+  EXPECT_TRUE(contains(none.err, "no host has a black box that waits for triggers")) << none.err;
   const Finished folder = ctl({"record", "--black-box", "-o", folder_.file("no")});
   EXPECT_EQ(folder.exit_status, 1);
   EXPECT_TRUE(contains(folder.err, folder_.file("no") + "'")) << folder.err;

@@ -82,22 +82,22 @@ const StreamId kWheel{"wheel.left", 1, "pc2"};
 class Fields {
  public:
   explicit Fields(std::vector<TriggerRule> rules, Duration min_interval = Duration::zero())
-      : judge_(std::move(rules), min_interval),
-        checks_(judge_.checks_of(kWheel, type_of<Wheel>().fields)) {}
+      : evaluator_(std::move(rules), min_interval),
+        checks_(evaluator_.checks_of(kWheel, type_of<Wheel>().fields)) {}
   std::vector<RecordedTrigger> write(const Wheel& wheel) {
-    judge_.on_sample(kWheel, {0, time_from_ns(++time_ns_), Duration(), sizeof wheel},
-                     std::as_bytes(std::span(&wheel, 1)), checks_);
-    return judge_.take();
+    evaluator_.on_sample(kWheel, {0, time_from_ns(++time_ns_), Duration(), sizeof wheel},
+                         std::as_bytes(std::span(&wheel, 1)), checks_);
+    return evaluator_.take();
   }
   std::size_t checks() const { return checks_.size(); }
 
  private:
-  TriggerJudge judge_;
-  std::vector<TriggerJudge::Check> checks_;
+  TriggerEvaluator evaluator_;
+  std::vector<TriggerEvaluator::Check> checks_;
   std::int64_t time_ns_ = 0;
 };
 
-TEST(TriggerJudge, FiresWhenAFieldGoesOverItsLimitAndNotWhileItStays) {
+TEST(TriggerEvaluator, FiresWhenAFieldGoesOverItsLimitAndNotWhileItStays) {
   Fields fields({rule("fast: wheel.left.speed > 3.5")});
   ASSERT_EQ(fields.checks(), 1U);
   EXPECT_TRUE(fields.write({3.5, {}}).empty());
@@ -110,21 +110,21 @@ TEST(TriggerJudge, FiresWhenAFieldGoesOverItsLimitAndNotWhileItStays) {
   EXPECT_EQ(fields.write({4, {}}).size(), 1U);
 }
 
-TEST(TriggerJudge, DoesNotFireAgainWithinTheMinimumInterval) {
+TEST(TriggerEvaluator, DoesNotFireAgainWithinTheMinimumInterval) {
   Fields fields({rule("fast: wheel*.speed > 1"), rule("other: wheel*.speed > 1")}, 1h);
   EXPECT_EQ(fields.write({2, {}}).size(), 2U) << "each trigger has its own";
   EXPECT_TRUE(fields.write({0, {}}).empty());
   EXPECT_TRUE(fields.write({2, {}}).empty());
 }
 
-TEST(TriggerJudge, ChecksAllElementsOfAnArrayOrTheNamedOne) {
+TEST(TriggerEvaluator, ChecksAllElementsOfAnArrayOrTheNamedOne) {
   EXPECT_EQ(Fields({rule("wheel.left.ticks == 7")}).write({0, {1, 2, 7}}).size(), 1U);
   EXPECT_EQ(Fields({rule("wheel.left.ticks[1] == 7")}).write({0, {7, 2, 7}}).size(), 0U);
   EXPECT_EQ(Fields({rule("wheel.left.ticks[1] == 7")}).write({0, {0, 7, 0}}).size(), 1U);
   EXPECT_EQ(Fields({rule("wheel.left.ticks[3] == 0")}).checks(), 0U);
 }
 
-TEST(TriggerJudge, FindsTheFieldBehindAnyDotOfTheName) {
+TEST(TriggerEvaluator, FindsTheFieldBehindAnyDotOfTheName) {
   for (const char* text :
        {"wheel.left:1.speed > 1", "wheel*.speed > 1", "wheel.left@pc2.speed > 1"}) {
     EXPECT_EQ(Fields({rule(text)}).checks(), 1U) << text;
@@ -157,19 +157,19 @@ HostInfo host(const std::string& name, HostState state, const std::string& clock
 
 class Lists {
  public:
-  explicit Lists(const std::string& text) : judge_({rule(text)}, Duration::zero()) {}
+  explicit Lists(const std::string& text) : evaluator_({rule(text)}, Duration::zero()) {}
   std::vector<RecordedTrigger> show(const std::vector<StreamInfo>& streams,
                                     const std::vector<HostInfo>& hosts = {
                                         host("pc1", HostState::self)}) {
-    judge_.on_lists(streams, hosts, time_from_ns(5));
-    return judge_.take();
+    evaluator_.on_lists(streams, hosts, time_from_ns(5));
+    return evaluator_.take();
   }
 
  private:
-  TriggerJudge judge_;
+  TriggerEvaluator evaluator_;
 };
 
-TEST(TriggerJudge, FiresWhenALiveStreamStalls) {
+TEST(TriggerEvaluator, FiresWhenALiveStreamStalls) {
   Lists lists("stalled a");
   EXPECT_TRUE(lists.show({stream("a", StreamState::stalled)}).empty()) << "since when is unknown";
   EXPECT_TRUE(lists.show({stream("a", StreamState::live), stream("b", StreamState::live)}).empty());
@@ -187,7 +187,7 @@ TEST(TriggerJudge, FiresWhenALiveStreamStalls) {
   EXPECT_EQ(lists.show({stream("a", StreamState::stalled)}).size(), 1U);
 }
 
-TEST(TriggerJudge, FiresWhenALiveStreamLeavesWithItsHostButNotWhenItIsRemoved) {
+TEST(TriggerEvaluator, FiresWhenALiveStreamLeavesWithItsHostButNotWhenItIsRemoved) {
   const auto there = [](HostState state) {
     return std::vector{host("pc1", HostState::self), host("pc2", state)};
   };
@@ -199,7 +199,7 @@ TEST(TriggerJudge, FiresWhenALiveStreamLeavesWithItsHostButNotWhenItIsRemoved) {
   EXPECT_TRUE(lists.show({}, there(HostState::down)).empty());
 }
 
-TEST(TriggerJudge, FiresForEachWriterThatCrashesAndNotForThoseOfBefore) {
+TEST(TriggerEvaluator, FiresForEachWriterThatCrashesAndNotForThoseOfBefore) {
   Lists lists("crashed a*");
   EXPECT_TRUE(lists.show({stream("a", StreamState::live, 3)}).empty());
   const auto fired =
@@ -213,7 +213,7 @@ TEST(TriggerJudge, FiresForEachWriterThatCrashesAndNotForThoseOfBefore) {
   EXPECT_TRUE(lists.show({stream("a", StreamState::live, 2, 2)}).empty()) << "another ring";
 }
 
-TEST(TriggerJudge, RemembersTheCrashesOfAHostThatWasAway) {
+TEST(TriggerEvaluator, RemembersTheCrashesOfAHostThatWasAway) {
   Lists lists("crashed");
   const std::vector away{host("pc2", HostState::down)}, here{host("pc2", HostState::up)};
   lists.show({stream("a", StreamState::live, 3, 1, "pc2")}, here);
@@ -223,7 +223,7 @@ TEST(TriggerJudge, RemembersTheCrashesOfAHostThatWasAway) {
   EXPECT_EQ(lists.show({stream("a", StreamState::live, 4, 1, "pc2")}, here).size(), 1U);
 }
 
-TEST(TriggerJudge, FiresWhenAGoodClockGetsBad) {
+TEST(TriggerEvaluator, FiresWhenAGoodClockGetsBad) {
   Lists lists("clock pc*");
   const auto with = [](HostState state, const std::string& reason) {
     return std::vector{host("pc1", HostState::self), host("pc2", state, reason),
@@ -240,7 +240,7 @@ TEST(TriggerJudge, FiresWhenAGoodClockGetsBad) {
   EXPECT_TRUE(lists.show({}, with(HostState::up, "not known yet")).empty()) << "it just connected";
 }
 
-TEST(TriggerJudge, FiresForTheClockOfThisPc) {
+TEST(TriggerEvaluator, FiresForTheClockOfThisPc) {
   Lists lists("clock");
   HostInfo own = host("pc1", HostState::self);
   own.clock = ClockSnapshot{};
@@ -252,29 +252,31 @@ TEST(TriggerJudge, FiresForTheClockOfThisPc) {
   EXPECT_EQ(lists.show({}, {own}).size(), 1U);
 }
 
-TEST(TriggerJudge, TakesTextsOfRequestsUpToTheirEnds) {
-  TriggerJudge judge({}, Duration::zero());
+TEST(TriggerEvaluator, TakesTextsOfRequestsUpToTheirEnds) {
+  TriggerEvaluator evaluator({}, Duration::zero());
   TriggerRequest request{};
   std::fill(std::begin(request.name), std::end(request.name), 'n');
   std::fill(std::begin(request.reason), std::end(request.reason), 'r');
-  judge.on_request(request, time_from_ns(7));
-  judge.on_request(TriggerRequest{}, time_from_ns(8));
-  const std::vector<RecordedTrigger> fired = judge.take();
-  ASSERT_EQ(fired.size(), 2U);
+  evaluator.on_request(request, time_from_ns(7));
+  evaluator.on_request(TriggerRequest{"a\n\xff", "", ""}, time_from_ns(8));
+  evaluator.on_request(TriggerRequest{}, time_from_ns(9));
+  const std::vector<RecordedTrigger> fired = evaluator.take();
+  ASSERT_EQ(fired.size(), 3U);
   EXPECT_EQ(fired[0].name, std::string(sizeof request.name, 'n'));
   EXPECT_EQ(fired[0].reason, std::string(sizeof request.reason, 'r'));
   EXPECT_EQ(fired[0].time, time_from_ns(7));
-  EXPECT_EQ(fired[1].name, "request");
+  EXPECT_EQ(fired[1].name, "a\\n\\xff");
+  EXPECT_EQ(fired[2].name, "request");
 }
 
-TEST(TriggerJudge, DoesNotRememberNamesWithoutALimit) {
-  TriggerJudge judge({}, 1h);
+TEST(TriggerEvaluator, DoesNotRememberNamesWithoutALimit) {
+  TriggerEvaluator evaluator({}, 1h);
   std::size_t fired = 0;
   for (int i = 0; i < 3000; ++i) {
     TriggerRequest request{};
     std::to_string(i).copy(request.name, sizeof request.name - 1);
-    judge.on_request(request, time_from_ns(7));
-    fired += judge.take().size();
+    evaluator.on_request(request, time_from_ns(7));
+    fired += evaluator.take().size();
   }
   EXPECT_EQ(fired, 1024U);
 }
