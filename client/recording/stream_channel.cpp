@@ -49,12 +49,15 @@ std::optional<std::string> unescaped(std::string_view text) {
   return name;
 }
 
-// "float64 0 1 8 x\n": kind, offset, count, stride, name.
+// "float64 0 1 8 x\n": kind, offset, count, stride, name. Of a bit field the kind is followed by its
+// first bit and the number of its bits: "uint32:5:3".
 std::string text_of(const std::vector<Field>& fields) {
   std::string text;
   for (const Field& field : fields) {
-    text += fmt::format("{} {} {} {} {}\n", name_of(field.kind), field.offset_bytes, field.count,
-                        field.stride_bytes, escaped(field.name));
+    const std::string bits =
+        field.bits == 0 ? "" : fmt::format(":{}:{}", field.first_bit, field.bits);
+    text += fmt::format("{}{} {} {} {} {}\n", name_of(field.kind), bits, field.offset_bytes,
+                        field.count, field.stride_bytes, escaped(field.name));
   }
   return text;
 }
@@ -76,8 +79,13 @@ std::optional<std::string_view> take_until(std::string_view& text, char separato
 
 std::optional<Field> field_of(std::string_view line) {
   Field field;
-  const auto kind = take_until(line, ' ');
+  std::optional<std::string_view> kind = take_until(line, ' ');
   if (!kind) return std::nullopt;
+  if (std::string_view bits = *kind; const auto name = take_until(bits, ':')) {
+    const auto first = take_until(bits, ':');
+    if (!first || !parse(*first, field.first_bit) || !parse(bits, field.bits)) return std::nullopt;
+    kind = name;
+  }
   bool known = false;
   for (int i = static_cast<int>(Scalar::boolean); i <= static_cast<int>(Scalar::float64); ++i) {
     if (name_of(static_cast<Scalar>(i)) != *kind) continue;
