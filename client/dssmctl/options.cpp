@@ -543,6 +543,30 @@ void add_rm(CLI::App& app, Parsed& parsed) {
   rm->add_option("STREAM", options.streams, kStreamHelp)->required()->type_name("");
 }
 
+void add_describe(CLI::App& app, Parsed& parsed) {
+  CLI::App* describe =
+      app.add_subcommand("describe", "give a stream the fields of a program's type");
+  DescribeOptions& options = add_options<DescribeOptions>(describe, parsed);
+  CLI::Option* stream = describe->add_option("STREAM", options.stream,
+                                             std::string(kStreamHelp) +
+                                                 "; none: all streams that are not described");
+  stream->type_name("");
+  describe
+      ->add_option("--from", options.from,
+                   "a program, library, object file or separate debug file with debug information "
+                   "(-g); default: the programs that have the stream open")
+      ->type_name("FILE")
+      ->needs(stream);
+  describe
+      ->add_option("--type", options.type,
+                   "the type there; default: the one that the stream names, or that fits")
+      ->type_name("TYPE")
+      ->needs(stream);
+  describe
+      ->add_flag("--force", options.force, "replace the type and fields that the stream has")
+      ->needs(stream);
+}
+
 void add_rights(CLI::App& app, Parsed& parsed) {
   CLI::App* rights = app.add_subcommand("rights", "show who may do what with a stream");
   add_stream(rights, add_options<RightsOptions>(rights, parsed).stream);
@@ -712,6 +736,7 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_meter<BwOptions>(app, parsed, "bw", "how many bytes come");
   add_meter<DelayOptions>(app, parsed, "delay", "how old samples are when they arrive");
   add_create(app, parsed);
+  add_describe(app, parsed);
   add_rm(app, parsed);
   add_rights(app, parsed);
   add_property(app, parsed);

@@ -143,6 +143,13 @@ struct CreateOptions : CommonOptions {
   std::string type;
 };
 
+struct DescribeOptions : CommonOptions {
+  std::string stream;  // empty: all that are not described
+  std::string from;    // a file; empty: the programs that have the stream open
+  std::string type;    // empty: the stream's, or one that fits
+  bool force = false;  // replaces what the stream has
+};
+
 struct RmOptions : CommonOptions {
   std::vector<std::string> streams;
 };
@@ -205,7 +212,7 @@ using Options =
     std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
                  PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, PlayOptions,
                  FindOptions, ShowOptions, HzOptions, BwOptions, DelayOptions, CreateOptions,
-                 RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
+                 DescribeOptions, RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions, PlaybackOptions,
                  PkiInitOptions, PkiRequestOptions, PkiIssueOptions, PkiInstallOptions,
                  PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
@@ -240,6 +247,7 @@ Result<void> run(const HzOptions& options, Output& out);
 Result<void> run(const BwOptions& options, Output& out);
 Result<void> run(const DelayOptions& options, Output& out);
 Result<void> run(const CreateOptions& options, Output& out);
+Result<void> run(const DescribeOptions& options, Output& out);
 Result<void> run(const RmOptions& options, Output& out);
 Result<void> run(const RightsOptions& options, Output& out);
 Result<void> run(const PropertyGetOptions& options, Output& out);
