@@ -243,7 +243,8 @@ class FieldLister {
       case DW_TAG_enumeration_type: {
         align(std::bit_floor(bytes), offset);
         const std::optional<Scalar> kind = scalar(*die, bytes);
-        if (!kind) return leave_out(name, fmt::format("{} of {}", name_of(*die), bytes_text(bytes)));
+        if (!kind)
+          return leave_out(name, fmt::format("{} of {}", name_of(*die), bytes_text(bytes)));
         return push(out, {name, *kind, offset, 1, bytes});
       }
       case DW_TAG_array_type:
@@ -372,7 +373,8 @@ class FieldLister {
     const Scalar none{};
     const Scalar kind = die ? scalar(*die, type_bytes).value_or(none) : none;
     const std::optional<std::uint64_t> first = first_bit(member, bits, type_bytes);
-    if (kind == none || !first || bits == 0 || bits > 64) return leave_out(name, "a damaged bit field");
+    if (kind == none || !first || bits == 0 || bits > 64)
+      return leave_out(name, "a damaged bit field");
     align(type_bytes, offset);
     // The smallest integer that has them all, inside the struct.
     const std::uint64_t needed = (*first % 8 + bits + 7) / 8;
@@ -380,9 +382,9 @@ class FieldLister {
     if (bytes > 8 || bytes > record_bytes) return leave_out(name, "a bit field in nine bytes");
     const std::uint64_t place = std::min(*first / 8, record_bytes - bytes);
     const bool is_bool = kind == Scalar::boolean && bytes == 1;
-    push(out, {name, is_bool ? Scalar::boolean : integer(bytes, is_signed(kind)), offset + place, 1,
-               bytes, static_cast<std::uint8_t>(bits),
-               static_cast<std::uint8_t>(*first - 8 * place)});
+    push(out,
+         {name, is_bool ? Scalar::boolean : integer(bytes, is_signed(kind)), offset + place, 1,
+          bytes, static_cast<std::uint8_t>(bits), static_cast<std::uint8_t>(*first - 8 * place)});
   }
 
   // In its struct, from the least significant bit of its first byte on.
@@ -507,7 +509,8 @@ class TypeFinder {
   void add_stream_type(Dwarf_Die& record) {
     for_each_child(record, steps_, [&](Dwarf_Die& child) {
       if (::dwarf_tag(&child) != DW_TAG_template_type_parameter) return true;
-      if (std::optional<Dwarf_Die> type = reference(child, DW_AT_type); type && type_name_.empty()) {
+      if (std::optional<Dwarf_Die> type = reference(child, DW_AT_type);
+          type && type_name_.empty()) {
         std::optional<Dwarf_Die> die = peeled(type);
         const bool is_number = die && !is_record(::dwarf_tag(&*die));
         if (Candidate* one = die ? add(*die, is_number ? name_of(*type) : "") : nullptr) {
@@ -702,10 +705,10 @@ Result<DebugType> choose_type(std::vector<DebugType> types, const StreamInfo& st
     const TypeInfo first = types.front().type;
     std::erase_if(types, [&](const DebugType& one) { return one.type.payload_bytes != bytes; });
     if (types.empty()) {
-      return failed(Errc::type_mismatch,
-                    fmt::format("'{}' has {} there, and the stream's samples have {}",
-                                escaped(type_name), bytes_text(first.payload_bytes),
-                                bytes_text(bytes)));
+      return failed(
+          Errc::type_mismatch,
+          fmt::format("'{}' has {} there, and the stream's samples have {}", escaped(type_name),
+                      bytes_text(first.payload_bytes), bytes_text(bytes)));
     }
   } else {
     const auto keep_if_any = [&](const auto& is_wanted) {
@@ -717,9 +720,8 @@ Result<DebugType> choose_type(std::vector<DebugType> types, const StreamInfo& st
     });
     keep_if_any([](const DebugType& one) { return one.is_stream_type; });
     if (types.size() > 1) {
-      keep_if_any([&](const DebugType& one) {
-        return is_named_alike(one.type.name, stream.id.name);
-      });
+      keep_if_any(
+          [&](const DebugType& one) { return is_named_alike(one.type.name, stream.id.name); });
     }
     if (types.empty()) {
       return failed(Errc::not_found,
@@ -729,8 +731,8 @@ Result<DebugType> choose_type(std::vector<DebugType> types, const StreamInfo& st
     }
   }
   if (types.size() > 1) {
-    return failed(Errc::conflict, fmt::format("several types fit: {}; choose one with --type",
-                                              names_of(types)));
+    return failed(Errc::conflict,
+                  fmt::format("several types fit: {}; choose one with --type", names_of(types)));
   }
   return std::move(types.front());
 }

@@ -176,10 +176,9 @@ void print_fields(const TypeInfo& type, Output& out) {
   constexpr auto kRight = Table::Align::right;
   Table table({{"FIELD"}, {"KIND"}, {"OFFSET", kRight}, {"COUNT", kRight}, {"STRIDE", kRight}});
   for (const Field& field : type.fields) {
-    const std::string bits =
-        field.bits == 0 ? ""
-                        : fmt::format(" bit {} to {}", field.first_bit,
-                                      field.first_bit + field.bits - 1);
+    const std::string bits = field.bits == 0 ? ""
+                                             : fmt::format(" bit {} to {}", field.first_bit,
+                                                           field.first_bit + field.bits - 1);
     table.add_row({escaped(field.name), std::string(name_of(field.kind)) + bits,
                    std::to_string(field.offset_bytes), std::to_string(field.count),
                    field.count > 1 ? std::to_string(field.stride_bytes) : "-"});

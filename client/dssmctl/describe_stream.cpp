@@ -56,10 +56,9 @@ Result<ProgramType> first_type(const std::vector<StreamUser>& programs, const St
     const std::string source = fmt::format("'{}' (pid {})", escaped(program.program), program.pid);
     Result<DebugType> found = type_in(file_of(program), stream, type_name);
     if (found) return ProgramType{*std::move(found), source};
-    error.code = found.error().code;
     reasons += fmt::format("{}{}: {}", reasons.empty() ? "" : "; ", source, found.error().message);
   }
-  if (!reasons.empty()) error.message = std::move(reasons);
+  if (!reasons.empty()) error.message = reasons + "; --from takes the type from another file";
   return error;
 }
 
@@ -95,10 +94,10 @@ Result<ProgramType> describe_stream(Session& session, const StreamInfo& stream,
   }
   TypeInfo& described = type.found.type;
   if (described.fields.empty()) {
-    return Error{Errc::invalid_argument,
-                 fmt::format("describe '{}': '{}' has no field that can be described: {}",
-                             stream.id.str(), escaped(type.found.full_name),
-                             list_text(type.found.left_out))};
+    return Error{
+        Errc::invalid_argument,
+        fmt::format("describe '{}': '{}' has no field that can be described: {}", stream.id.str(),
+                    escaped(type.found.full_name), list_text(type.found.left_out))};
   }
   if (!stream.type.name.empty() && !options.force) {
     described.name = stream.type.name;
@@ -169,9 +168,8 @@ std::optional<ProgramType> obvious_type_of_programs(Session& session, const Stre
            (file.st_uid != 0 && file.st_uid != ::geteuid());
   });
   Result<ProgramType> type = first_type(*programs, *stream, "");
-  const bool is_obvious =
-      type && (type->found.is_stream_type || !stream->type.name.empty() ||
-               is_named_alike(type->found.type.name, stream->id.name));
+  const bool is_obvious = type && (type->found.is_stream_type || !stream->type.name.empty() ||
+                                   is_named_alike(type->found.type.name, stream->id.name));
   if (!is_obvious || type->found.type.fields.empty()) return std::nullopt;
   return *std::move(type);
 }

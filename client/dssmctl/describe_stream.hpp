@@ -20,8 +20,7 @@ struct ProgramType {
 // The type that `stream`, as Session::stream_info() returned it, has in the first of the programs
 // on this PC that have it open and whose files can be read: writers first.
 //   type_name  empty: as choose_type()
-//   fails      as debug_types_untrusted() and choose_type(), with the reason for each program;
-//              not_found (no program of this PC has it open)
+//   fails      not_found, with the reason for each program
 Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
                                      const std::string& type_name);
 

@@ -547,9 +547,9 @@ void add_describe(CLI::App& app, Parsed& parsed) {
   CLI::App* describe =
       app.add_subcommand("describe", "give a stream the fields of a program's type");
   DescribeOptions& options = add_options<DescribeOptions>(describe, parsed);
-  CLI::Option* stream = describe->add_option("STREAM", options.stream,
-                                             std::string(kStreamHelp) +
-                                                 "; none: all streams that are not described");
+  CLI::Option* stream =
+      describe->add_option("STREAM", options.stream,
+                           std::string(kStreamHelp) + "; none: all streams that are not described");
   stream->type_name("");
   describe
       ->add_option("--from", options.from,
@@ -562,8 +562,7 @@ void add_describe(CLI::App& app, Parsed& parsed) {
                    "the type there; default: the one that the stream names, or that fits")
       ->type_name("TYPE")
       ->needs(stream);
-  describe
-      ->add_flag("--force", options.force, "replace the type and fields that the stream has")
+  describe->add_flag("--force", options.force, "replace the type and fields that the stream has")
       ->needs(stream);
 }
 

@@ -73,11 +73,11 @@ TEST_P(TypesOfProgram, HaveTheFieldsThatTheCompilerLaysOut) {
   const auto float64 = [](const char* name, std::size_t offset) {
     return Field{name, Scalar::float64, offset, 1, 8};
   };
-  const TypeInfo expected{"Spur_Odometry",
-                          40,
-                          8,
-                          {float64("x", 0), float64("y", 8), float64("theta", 16), float64("v", 24),
-                           float64("w", 32)}};
+  const TypeInfo expected{
+      "Spur_Odometry",
+      40,
+      8,
+      {float64("x", 0), float64("y", 8), float64("theta", 16), float64("v", 24), float64("w", 32)}};
   EXPECT_EQ(odometry.type, expected) << odometry.type.description();
   EXPECT_TRUE(odometry.left_out.empty());
 
@@ -113,7 +113,8 @@ TEST_P(TypesOfProgram, HaveTheFieldsThatTheCompilerLaysOut) {
   expect("value.as_bytes", Scalar::uint8, offsetof(E, value), 4);
   expect("first", Scalar::int16, offsetof(E, first));
   expect("second", Scalar::uint16, offsetof(E, second));
-  EXPECT_THAT(all.left_out, ElementsAre("next (a pointer)", HasSubstr("precise (long double of 16")));
+  EXPECT_THAT(all.left_out,
+              ElementsAre("next (a pointer)", HasSubstr("precise (long double of 16")));
 }
 
 // The value that a bit field of a sample has by its description.
@@ -124,9 +125,9 @@ std::int64_t value_of(const Field& field, const void* sample) {
   const bool is_signed = field.kind <= Scalar::int64 && field.kind != Scalar::boolean &&
                          (static_cast<int>(field.kind) - static_cast<int>(Scalar::int8)) % 2 == 0;
   const auto bits = static_cast<std::int64_t>(element << (64 - field.first_bit - field.bits));
-  return is_signed ? bits >> (64 - field.bits)
-                   : static_cast<std::int64_t>(static_cast<std::uint64_t>(bits) >>
-                                               (64 - field.bits));
+  return is_signed
+             ? bits >> (64 - field.bits)
+             : static_cast<std::int64_t>(static_cast<std::uint64_t>(bits) >> (64 - field.bits));
 }
 
 TEST_P(TypesOfProgram, SayWhereBitFieldsAre) {
@@ -141,11 +142,16 @@ TEST_P(TypesOfProgram, SayWhereBitFieldsAre) {
       EXPECT_EQ(value_of(field, memory), value) << name;
     }
   };
-  expect_alone("low", [](Everything& e) { e.low = 5; }, 5, 3);
-  expect_alone("high", [](Everything& e) { e.high = 77; }, 77, 7);
-  expect_alone("negative", [](Everything& e) { e.negative = -9; }, -9, 5);
-  expect_alone("bit", [](Everything& e) { e.bit = true; }, 1, 1);
-  expect_alone("wide", [](Everything& e) { e.wide = 0x8123456789; }, 0x8123456789, 40);
+  expect_alone(
+      "low", [](Everything& e) { e.low = 5; }, 5, 3);
+  expect_alone(
+      "high", [](Everything& e) { e.high = 77; }, 77, 7);
+  expect_alone(
+      "negative", [](Everything& e) { e.negative = -9; }, -9, 5);
+  expect_alone(
+      "bit", [](Everything& e) { e.bit = true; }, 1, 1);
+  expect_alone(
+      "wide", [](Everything& e) { e.wide = 0x8123456789; }, 0x8123456789, 40);
   EXPECT_EQ(field_of(all, "bit").kind, Scalar::boolean);
 
   const DebugType packed = type_in(program(GetParam()), "Packed");
