@@ -13,6 +13,7 @@
 #include <array>
 #include <bit>
 #include <dssm/reader.hpp>
+#include <filesystem>
 #include <limits>
 #include <memory>
 
@@ -289,7 +290,7 @@ void add_info(CLI::App& app, Parsed& parsed) {
     require(!all.watch || !is_recording(all.stream), "--watch: of a stream, not of a recording");
   });
   info->add_option("STREAM", options.stream,
-                   std::string(kStreamHelp) + "; or a recording: a file *.mcap, or a path")
+                   std::string(kStreamHelp) + "; or a recording: a file *.mcap or *.log, or a path")
       ->type_name("");
   add_watch(info, options.watch);
 }
@@ -432,7 +433,12 @@ void add_record(CLI::App& app, Parsed& parsed) {
       ->type_name("FILE");
 }
 
-void check_play(const PlayOptions& options) {
+void check_play(PlayOptions& options) {
+  const auto patterns =
+      std::stable_partition(options.patterns.begin(), options.patterns.end(),
+                            [](const std::string& word) { return is_recording(word); });
+  options.more_files.assign(options.patterns.begin(), patterns);
+  options.patterns.erase(options.patterns.begin(), patterns);
   for (const std::string& mapping : options.mappings) {
     const std::size_t equals = mapping.find('=', 1);
     require(equals != std::string::npos && equals + 1 < mapping.size(),
@@ -443,11 +449,13 @@ void check_play(const PlayOptions& options) {
 void add_play(CLI::App& app, Parsed& parsed) {
   CLI::App* play = app.add_subcommand("play", "write the samples of a recording to streams");
   PlayOptions& options = add_options<PlayOptions>(play, parsed, check_play);
-  play->add_option("FILE", options.file, "the recording: a file, or the folder of its files")
+  play->add_option("FILE", options.file,
+                   "the recording: a file, or the folder of its files; or a log of SSM")
       ->required()
       ->type_name("");
   play->add_option("PATTERN", options.patterns,
-                   "only streams whose NAME or NAME:ID one of these shell patterns fits")
+                   "more files (*.mcap, *.log, or a path), and: only streams whose NAME or NAME:ID "
+                   "one of these shell patterns fits")
       ->type_name("");
   add_parsed(play, "-r,--rate", "X", "how fast: 2 is twice as fast (default: 1)",
              [&options](const std::string& text) -> Result<void> {
@@ -470,6 +478,44 @@ void add_play(CLI::App& app, Parsed& parsed) {
   play->add_flag("--now", options.now,
                  "with the present times, not those of the recording; leaves the playback clock");
   play->add_flag("--force", options.force, "also to streams that another program writes");
+}
+
+void check_convert(ConvertOptions& options) {
+  require(!options.more_files.empty(),
+          "convert what to what? give IN OUT, as a.log b.log all.mcap");
+  options.out = options.more_files.back();
+  options.more_files.pop_back();
+  const std::filesystem::path out = options.out;
+  require(out.extension() == ".mcap" || out.extension() == ".log" || !out.has_extension() ||
+              options.out.ends_with('/'),
+          fmt::format("'{}' is neither a file *.mcap or *.log nor a folder", escaped(options.out)));
+}
+
+void add_convert(CLI::App& app, Parsed& parsed) {
+  CLI::App* convert =
+      app.add_subcommand("convert", "convert logs of SSM to recordings, and recordings to logs");
+  ConvertOptions& options = add_options<ConvertOptions>(convert, parsed, check_convert);
+  convert->add_option("IN", options.file, "a file *.log or *.mcap, or a folder of them")
+      ->required()
+      ->type_name("");
+  convert
+      ->add_option("OUT", options.more_files,
+                   "more files to read, and at last what to write: a file *.mcap, a file *.log (of "
+                   "one stream), or a folder for a log of each stream")
+      ->required()
+      ->type_name("");
+  convert
+      ->add_option(
+          "--stream", options.patterns,
+          "only streams whose NAME or NAME:ID this shell pattern fits; may be given several "
+          "times")
+      ->type_name("PATTERN")
+      ->allow_extra_args(false);
+  convert
+      ->add_option("--compression", options.compression,
+                   "of MCAP: lz4, zstd or none (default: lz4)")
+      ->type_name("NAME")
+      ->check(CLI::Validator(check_compression, ""));
 }
 
 void add_types(CLI::App& app, Parsed& parsed) {
@@ -730,6 +776,7 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_pub(app, parsed);
   add_record(app, parsed);
   add_play(app, parsed);
+  add_convert(app, parsed);
   add_types(app, parsed);
   add_meter<HzOptions>(app, parsed, "hz", "how often samples come");
   add_meter<BwOptions>(app, parsed, "bw", "how many bytes come");

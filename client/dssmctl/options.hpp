@@ -109,12 +109,21 @@ struct RecordOptions : CommonOptions {
 };
 
 struct PlayOptions : CommonOptions {
-  std::string file;                   // or the folder of one recording
+  std::string file;  // or the folder of one recording
+  std::vector<std::string> more_files;
   std::vector<std::string> patterns;  // of the recording's streams; empty: all
   std::vector<std::string> mappings;  // PATTERN=NAME
   double rate = 1;
   std::optional<Moment> from, to;  // count back from the recording's end
   bool loop = false, now = false, on_hosts = false, force = false;
+};
+
+struct ConvertOptions : CommonOptions {
+  std::string file;  // or a folder
+  std::vector<std::string> more_files;
+  std::string out;                    // *.mcap, *.log, or a folder for logs
+  std::vector<std::string> patterns;  // of streams; empty: all
+  std::string compression = "lz4";
 };
 
 struct FindOptions : CommonOptions {
@@ -208,13 +217,13 @@ struct PkiShowOptions : CommonOptions {
   std::string path = kCredentialsFolder;
 };
 
-using Options =
-    std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
-                 PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, PlayOptions,
-                 FindOptions, ShowOptions, HzOptions, BwOptions, DelayOptions, CreateOptions,
-                 DescribeOptions, RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions,
-                 PlaybackOptions, PkiInitOptions, PkiRequestOptions, PkiIssueOptions,
-                 PkiInstallOptions, PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
+using Options = std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions,
+                             DoctorOptions, PingOptions, InfoOptions, EchoOptions, PubOptions,
+                             RecordOptions, PlayOptions, ConvertOptions, FindOptions, ShowOptions,
+                             HzOptions, BwOptions, DelayOptions, CreateOptions, DescribeOptions,
+                             RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions,
+                             PlaybackOptions, PkiInitOptions, PkiRequestOptions, PkiIssueOptions,
+                             PkiInstallOptions, PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
 // Either options to work with, or a text that ends the program at once: help and version on
 // standard output, an error on standard error.
@@ -241,6 +250,7 @@ Result<void> run(const EchoOptions& options, Output& out);
 Result<void> run(const PubOptions& options, Output& out);
 Result<void> run(const RecordOptions& options, Output& out);
 Result<void> run(const PlayOptions& options, Output& out);
+Result<void> run(const ConvertOptions& options, Output& out);
 Result<void> run(const FindOptions& options, Output& out);
 Result<void> run(const ShowOptions& options, Output& out);
 Result<void> run(const HzOptions& options, Output& out);

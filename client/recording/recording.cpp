@@ -27,6 +27,11 @@ constexpr std::uint64_t kCacheBytes = 64U << 20;
 constexpr std::size_t kMinCachedChunks = 2;
 constexpr std::size_t kMaxLateWarnings = 100;  // found while samples are read
 
+// The recording that a file is part of: all of them have one name.
+std::string recording_of(const FileReader& file) {
+  return file.recording().empty() ? file.path().string() : file.recording();
+}
+
 }  // namespace
 
 struct IndexPart {
@@ -407,20 +412,43 @@ struct ReaderState {
   }
 };
 
-struct CursorState {
-  std::shared_ptr<Content> content;
-  std::uint32_t file = 0, chunk = 0;
+// Of one recording; its samples come in the order in which they were recorded.
+struct Track {
+  std::uint32_t file = 0, end_file = 0, chunk = 0;
   std::size_t at = 0;  // of the next message in `loaded`
-  std::shared_ptr<const LoadedChunk> loaded;
+  std::shared_ptr<const LoadedChunk> loaded = nullptr;
   std::int64_t from_ns = INT64_MIN;  // earlier ones are passed over, until one is not
 
-  bool next_chunk();
+  bool next_chunk(Content* content);
+  // The next message; nullptr after the last one.
+  const Message* next(Content* content);
 };
 
+// Several recordings, as the logs of several streams, are merged by time.
+struct CursorState {
+  std::shared_ptr<Content> content;
+  std::vector<Track> tracks;
+
+  void seek(std::int64_t t_ns);
+  Track* next();  // the one whose next message is the next of all; nullptr: there is none
+};
+
+void CursorState::seek(std::int64_t t_ns) {
+  tracks.clear();
+  const auto& files = content->files;
+  for (std::uint32_t file = 0; file < files.size(); ++file) {
+    if (file == 0 || recording_of(*files[file]) != recording_of(*files[file - 1])) {
+      tracks.push_back({.file = file, .from_ns = t_ns});
+    }
+    tracks.back().end_file = file + 1;
+  }
+}
+
 // Goes to the next chunk; false after the last one.
-bool CursorState::next_chunk() {
+bool Track::next_chunk(Content* content) {
+  const std::lock_guard lock(content->mutex);
   at = 0;
-  while (file < content->files.size()) {
+  while (file < end_file) {
     const std::vector<IndexedChunk>& chunks = content->files[file]->chunks();
     if (chunk == chunks.size()) {
       ++file;
@@ -437,6 +465,32 @@ bool CursorState::next_chunk() {
   return false;
 }
 
+const Message* Track::next(Content* content) {
+  while (true) {
+    while (loaded == nullptr || at == loaded->messages.size()) {
+      if (!next_chunk(content)) return nullptr;
+    }
+    const Message& message = loaded->messages[at];
+    if (message.time_ns >= from_ns) {
+      from_ns = INT64_MIN;
+      return &message;
+    }
+    ++at;
+  }
+}
+
+Track* CursorState::next() {
+  Track* first = nullptr;
+  std::int64_t first_ns = 0;
+  for (Track& track : tracks) {
+    const Message* message = track.next(content.get());
+    if (message == nullptr || (first != nullptr && message->time_ns >= first_ns)) continue;
+    first = &track;
+    first_ns = message->time_ns;
+  }
+  return first;
+}
+
 }  // namespace dssm::recording
 
 namespace dssm {
@@ -451,15 +505,18 @@ Recording::Recording(std::shared_ptr<Content> content) noexcept : content_(std::
 Result<Recording> Recording::open(const std::filesystem::path& path) {
   std::error_code error;
   if (!std::filesystem::is_directory(path, error)) return open(std::span(&path, 1));
-  std::vector<std::filesystem::path> files;
+  std::vector<std::filesystem::path> files, logs;
   for (std::filesystem::directory_iterator each(path, error), end; !error && each != end;
        each.increment(error)) {
     if (each->path().extension() == ".mcap") files.push_back(each->path());
+    if (each->path().extension() == ".log") logs.push_back(each->path());
   }
   if (error) return os_error(fmt::format("open folder '{}'", path.string()), error.value());
+  if (files.empty()) files = std::move(logs);
   if (files.empty()) {
     return Error{Errc::not_found,
-                 fmt::format("open recording '{}': the folder has no file *.mcap", path.string())};
+                 fmt::format("open recording '{}': the folder has no file *.mcap, and no *.log",
+                             path.string())};
   }
   return open(files);
 }
@@ -472,17 +529,15 @@ Result<Recording> Recording::open(std::span<const std::filesystem::path> files) 
   }
   // Files of one recording by their numbers, recordings by their first sample.
   std::map<std::string, std::int64_t> starts;
-  const auto name_of = [](const auto& file) {
-    return file->recording().empty() ? file->path().string() : file->recording();
-  };
   for (const auto& file : content->files) {
-    std::int64_t& start = starts.try_emplace(name_of(file), INT64_MAX).first->second;
+    std::int64_t& start =
+        starts.try_emplace(recording::recording_of(*file), INT64_MAX).first->second;
     for (const auto& chunk : file->chunks()) {
       for (const auto& part : chunk.parts) start = std::min(start, part.min_time_ns);
     }
   }
   const auto key = [&](const auto& file) {
-    const std::string name = name_of(file);
+    const std::string name = recording::recording_of(*file);
     return std::tuple(starts[name], name, file->number(), file->path());
   };
   std::ranges::sort(content->files, [&](const auto& a, const auto& b) { return key(a) < key(b); });
@@ -547,6 +602,7 @@ Result<RecordedRawReader> Recording::open_raw_reader(const StreamId& id,
 RecordingCursor Recording::cursor() const {
   auto state = std::make_unique<recording::CursorState>();
   state->content = content_;
+  state->seek(INT64_MIN);
   return RecordingCursor(std::move(state));
 }
 
@@ -563,26 +619,17 @@ RecordingCursor& RecordingCursor::operator=(RecordingCursor&&) noexcept = defaul
 RecordingCursor::~RecordingCursor() = default;
 
 bool RecordingCursor::next(RecordedSample& out) noexcept {
-  while (true) {
-    if (state_->loaded == nullptr || state_->at == state_->loaded->messages.size()) {
-      const std::lock_guard lock(state_->content->mutex);
-      if (!state_->next_chunk()) return false;
-    }
-    const recording::Message& message = state_->loaded->messages[state_->at++];
-    if (message.time_ns < state_->from_ns) continue;
-    state_->from_ns = INT64_MIN;
-    const std::size_t file = state_->file;
-    out.stream = state_->content->stream_of_channel[file].at(message.channel);
-    out.info = message.info();
-    out.clock_error = Duration(message.clock_bound_ns);
-    out.payload = state_->loaded->payload(message);
-    return true;
-  }
+  recording::Track* const track = state_->next();
+  if (track == nullptr) return false;
+  const recording::Message& message = track->loaded->messages[track->at++];
+  out.stream = state_->content->stream_of_channel[track->file].at(message.channel);
+  out.info = message.info();
+  out.clock_error = Duration(message.clock_bound_ns);
+  out.payload = track->loaded->payload(message);
+  return true;
 }
 
-void RecordingCursor::seek(Time t) noexcept {
-  *state_ = {state_->content, 0, 0, 0, nullptr, to_ns(t)};
-}
+void RecordingCursor::seek(Time t) noexcept { state_->seek(to_ns(t)); }
 
 // --- RecordedRawReader
 

@@ -134,7 +134,8 @@ Channel channel_of(const RecordedStream& stream) {
   Channel channel;
   channel.topic = topic_of(stream.id);
   channel.message_encoding = "cdr";
-  channel.metadata = {
+  channel.metadata = stream.metadata;
+  const std::map<std::string, std::string> own = {
       {std::string(kVersionKey), std::string(kVersion)},
       {"name", stream.id.name},
       {"id", std::to_string(stream.id.id)},
@@ -147,6 +148,7 @@ Channel channel_of(const RecordedStream& stream) {
       {"alignment_bytes", std::to_string(stream.type.alignment_bytes)},
       {"fields", text_of(stream.type.fields)},
   };
+  for (const auto& [key, value] : own) channel.metadata[key] = value;
   return channel;
 }
 
@@ -180,6 +182,10 @@ Result<std::optional<RecordedStream>> stream_of(const Channel& channel) {
     std::optional<Field> field = line ? field_of(*line) : std::nullopt;
     if (!field) return bad_channel(channel, "the fields in its metadata are wrong");
     stream.type.fields.push_back(*std::move(field));
+  }
+  const Channel known = channel_of(stream);
+  for (const auto& [key, value] : metadata) {
+    if (!known.metadata.contains(key)) stream.metadata[key] = value;
   }
   const std::string what = fmt::format("channel {} ('{}')", channel.id, channel.topic);
   for (Result<void> checked : {stream.id.check(), stream.type.check()}) {

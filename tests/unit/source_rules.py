@@ -48,12 +48,13 @@ ONLY = {
     "client/include": ["core/include"],
     "client/ssm": ["core/include", "client/include", "core/base"],
     "client/recording": ["core/include", "client/include", "core/base"],
-    # dssmctl: besides the public headers the names of streams, and the names and ids of hosts, which
-    # certificates hold.
+    # dssmctl: besides the public headers the names of streams, the names and ids of hosts, which
+    # certificates hold, and the format of SSM's logs.
     "client/dssmctl": [
         "core/include",
         "client/include",
         "core/base/names.hpp",
+        "core/base/ssm_log.hpp",
         "core/base/text.hpp",
         "core/base/try.hpp",
         "core/base/unique_fd.hpp",
