@@ -669,8 +669,14 @@ Result<RecordingRepair> FileReader::repair() {
   RecordingRepair report;
   report.was_whole = is_whole_;
   report.samples = summary_.samples();
-  if (is_whole_) return report;
   const std::string what = fmt::format("repair recording '{}'", path_.string());
+  if (log_) {
+    return Error{Errc::invalid_argument,
+                 fmt::format("{}: it is a log of SSM, which needs no repair: a part of a record at "
+                             "its end does not count",
+                             what)};
+  }
+  if (is_whole_) return report;
   if (data_start_ == 0) {
     return Error{Errc::protocol, fmt::format("{}: it is empty; delete it", what)};
   }

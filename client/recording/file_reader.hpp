@@ -125,7 +125,7 @@ class FileReader {
   std::uint64_t data_start_ = 0;  // after the header
   std::uint64_t data_end_ = 0;    // after the last whole record of the data
   bool is_whole_ = false;
-  bool is_ours_ = false;  // by its profile
+  bool is_ours_ = false;           // by its profile
   std::optional<SsmLogHead> log_;  // of a log of SSM
   std::string recording_;
   std::uint32_t number_ = 0;

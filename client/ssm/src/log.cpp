@@ -107,7 +107,7 @@ Result<void> read_head(dssm_ssm_log& log) {
   }
   const dssm::SsmLogHead head = DSSM_TRY(dssm::ssm_log_head_untrusted(text, bytes));
   log.stream_name = head.stream_name;
-  log.head = {log.stream_name.c_str(), head.stream_id, head.buffer_num, head.data_bytes,
+  log.head = {log.stream_name.c_str(), head.stream_id, head.buffer_num,  head.data_bytes,
               head.property_bytes,     head.cycle_s,   head.start_time_s};
   log.data_at = head.records_at();
   return {};
@@ -208,9 +208,9 @@ dssm_ssm_log* dssm_ssm_log_create(const dssm_ssm_log_head* head, const void* pro
   log->stream_name = name;
   log->head = *head;
   log->head.stream_name = log->stream_name.c_str();
-  const std::string line = dssm::ssm_log_line({log->stream_name, head->stream_id,
-                                               head->buffer_num, head->data_size,
-                                               head->property_size, head->cycle, head->start_time});
+  const std::string line =
+      dssm::ssm_log_line({log->stream_name, head->stream_id, head->buffer_num, head->data_size,
+                          head->property_size, head->cycle, head->start_time});
   log->data_at = line.size() + head->property_size;
   if (write_all(*log, line.data(), line.size()) && write_all(*log, property, head->property_size)) {
     return log;
