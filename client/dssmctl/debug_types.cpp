@@ -1,14 +1,14 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// From DWARF to TypeInfo, with libdw. The file is not trusted: it may have been made to mislead, and
-// its entries may refer to each other in circles. So each walk has a limit on its steps and depth,
-// no function of libdw is used that follows references until they end (dwarf_peel_type,
+// From DWARF to TypeInfo, with libdw. The file is not trusted: it may have been made to mislead,
+// and its entries may refer to each other in circles. So each walk has a limit on its steps and
+// depth, no function of libdw is used that follows references until they end (dwarf_peel_type,
 // dwarf_aggregate_size), and what comes out passes TypeInfo::check().
 //
-// A first walk over all entries collects the candidates, by size or name, with all names that a type
-// has: its own, and those of typedefs ("typedef struct { ... } Odometry" has no other one). Then the
-// fields of these are listed. A program has a copy of a type for each of its sources; copies that
-// are equal are one type.
+// A first walk over all entries collects the candidates, by size or name, with all names that a
+// type has: its own, and those of typedefs ("typedef struct { ... } Odometry" has no other one).
+// Then the fields of these are listed. A program has a copy of a type for each of its sources;
+// copies that are equal are one type.
 #include "client/dssmctl/debug_types.hpp"
 
 #include <dwarf.h>

@@ -25,8 +25,8 @@ Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
                                      const std::string& type_name);
 
 // The same for a user who did not ask for it: nothing unless there is no doubt, by the name of the
-// type or because it is the T of an SSMApi<T, P>, and only of programs whose files are root's or the
-// user's own.
+// type or because it is the T of an SSMApi<T, P>, and only of programs whose files are root's or
+// the user's own.
 std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id);
 
 }  // namespace dssm::ctl

@@ -49,8 +49,8 @@ std::optional<std::string> unescaped(std::string_view text) {
   return name;
 }
 
-// "float64 0 1 8 x\n": kind, offset, count, stride, name. Of a bit field the kind is followed by its
-// first bit and the number of its bits: "uint32:5:3".
+// "float64 0 1 8 x\n": kind, offset, count, stride, name. Of a bit field the kind is followed by
+// its first bit and the number of its bits: "uint32:5:3".
 std::string text_of(const std::vector<Field>& fields) {
   std::string text;
   for (const Field& field : fields) {

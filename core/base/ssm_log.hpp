@@ -1,8 +1,8 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// The format of SSM's logs, which libssm, recordings and `dssmctl convert` share: a line of text, the
-// property, and records of 8 bytes of time (a double of seconds since 1970) and the data, without
-// padding. A part of a record at the end does not count.
+// The format of SSM's logs, which libssm, recordings and `dssmctl convert` share: a line of text,
+// the property, and records of 8 bytes of time (a double of seconds since 1970) and the data,
+// without padding. A part of a record at the end does not count.
 #pragma once
 
 #include <cstddef>

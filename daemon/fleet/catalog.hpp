@@ -70,8 +70,9 @@ class Catalog {
   void host_up(const wire::Greeting& greeting, const wire::Address& address);
   // It does not answer any more: its streams leave the catalog.
   void host_down(const wire::HostId& id, const Error& error);
-  // A stream is there, has a new ring, or is described. Its id names the owner's host. Descriptions of fields are
-  // left out when a host has too many of them; what changes with each sample is not kept.
+  // A stream is there, has a new ring, or is described. Its id names the owner's host. Descriptions
+  // of fields are left out when a host has too many of them; what changes with each sample is not
+  // kept.
   //   fails  limit_exceeded (this host has too many streams), not_found (no such host)
   Result<void> stream_added(const wire::HostId& id, StreamInfo stream);
   void stream_removed(const wire::HostId& id, const StreamId& stream);

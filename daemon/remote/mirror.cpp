@@ -247,8 +247,8 @@ Result<void> Mirror::follow_untrusted(const StreamInfo& theirs) {
   return DSSM_TRY(use_offered(std::move(stream)), context), Result<void>();
 }
 
-// The owner's stream may be described while this host mirrors it. Lists leave out the fields of many
-// types.
+// The owner's stream may be described while this host mirrors it. Lists leave out the fields of
+// many types.
 void Mirror::describe_as_untrusted(const StreamInfo& theirs) {
   if (!ring_ || ring_->stream()->incarnation() != theirs.incarnation) return;
   Stream& ours = *ring_->stream();

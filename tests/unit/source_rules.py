@@ -54,6 +54,7 @@ ONLY = {
         "core/include",
         "client/include",
         "core/base/names.hpp",
+        "core/base/seconds.hpp",
         "core/base/ssm_log.hpp",
         "core/base/text.hpp",
         "core/base/try.hpp",

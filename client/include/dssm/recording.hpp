@@ -193,8 +193,8 @@ class Recording {
   // programs are recordings, too, as far as their topics are names of streams: with plain bytes,
   // as they are in the messages, and tids that count them. So are logs of SSM (docs/ssm.md "Logs"),
   // each with one stream; of a folder without *.mcap those whose names end with ".log".
-  //   fails  not_found, protocol (not an MCAP file and no log), conflict (two files have the same samples of a
-  //          stream), no_permission, system
+  //   fails  not_found, protocol (not an MCAP file and no log), conflict (two files have the same
+  //          samples of a stream), no_permission, system
   static Result<Recording> open(const std::filesystem::path& path);
   // The same with these files, in any order.
   static Result<Recording> open(std::span<const std::filesystem::path> files);

@@ -345,8 +345,8 @@ class Session {
   // exists; what programs have open keeps its description until they open it again. Takes the right
   // to set properties.
   //   replace  also the name and fields that it has
-  //   fails    not_found, invalid_argument (TypeInfo::check()), type_mismatch (another size; without
-  //            `replace` also another name or other fields), limit_exceeded, no_permission
+  //   fails    not_found, invalid_argument (TypeInfo::check()), type_mismatch (another size;
+  //            without `replace` also another name or other fields), limit_exceeded, no_permission
   Result<void> describe(const StreamId& id, const TypeInfo& type, bool replace = false);
 
   // --- other hosts
