@@ -170,6 +170,7 @@ TEST_F(SsmLogs, ThatAreNoneAreRefusedWithTheReason) {
 TEST_F(SsmLogs, KeepTheirFirstLineInMcap) {
   RecordedStream stream = plain_stream("s", 24);
   stream.id.host.clear();
+  stream.type.fields = {{"m", Scalar::int16, 2, 1, 2, 3, 5}, {"n%", Scalar::uint8, 0, 1, 1}};
   stream.metadata = {{"ssm_log", "s 0 24 16 0.01 5 0"}, {"depth", "not mine"}, {"mounted", "left"}};
   RecordingWriter writer = RecordingWriter::create(path("a.mcap")).value();
   const auto number = writer.add_stream(stream);
@@ -179,6 +180,7 @@ TEST_F(SsmLogs, KeepTheirFirstLineInMcap) {
   const auto read = Recording::open(path("a.mcap")).value();
   const RecordedStreamInfo& info = read.streams().at(0);
   EXPECT_EQ(info.id, stream.id) << "its host is not known";
+  EXPECT_EQ(info.type, stream.type) << "with its bit fields";
   EXPECT_EQ(info.depth, 16U);
   EXPECT_EQ(info.metadata, (std::map<std::string, std::string>{{"ssm_log", "s 0 24 16 0.01 5 0"},
                                                                {"mounted", "left"}}));
