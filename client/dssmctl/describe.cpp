@@ -178,7 +178,10 @@ void print_fields(const TypeInfo& type, Output& out) {
   constexpr auto kRight = Table::Align::right;
   Table table({{"FIELD"}, {"KIND"}, {"OFFSET", kRight}, {"COUNT", kRight}, {"STRIDE", kRight}});
   for (const Field& field : type.fields) {
-    table.add_row({escaped(field.name), std::string(name_of(field.kind)),
+    const std::string bits = field.bits == 0 ? ""
+                                             : fmt::format(" bit {} to {}", field.first_bit,
+                                                           field.first_bit + field.bits - 1);
+    table.add_row({escaped(field.name), std::string(name_of(field.kind)) + bits,
                    std::to_string(field.offset_bytes), std::to_string(field.count),
                    field.count > 1 ? std::to_string(field.stride_bytes) : "-"});
   }
@@ -193,6 +196,9 @@ Json fields_json(const TypeInfo& type) {
                       {"offset_bytes", field.offset_bytes},
                       {"count", field.count},
                       {"stride_bytes", field.stride_bytes}});
+    if (field.bits == 0) continue;
+    fields.back()["first_bit"] = field.first_bit;
+    fields.back()["bits"] = field.bits;
   }
   return fields;
 }

@@ -88,7 +88,8 @@ _dssmctl() {
         --speed | --time | --rate | --ca | --credentials | --out | --name | --program | --days | \
         --output | -o | --past | --until | --for | --compression | --max-file-size | \
         --max-file-duration | --max-total-size | --from | --to | --map | --lockstep | --before | \
-        --after | --trigger | --min-interval | --max-incident | --quota | --reason | --config | --repair)
+        --after | --trigger | --min-interval | --max-incident | --quota | --reason | --config | --repair | \
+        --stream)
         ((++i))
         ;;
       -*) ;;
@@ -104,6 +105,10 @@ _dssmctl() {
     esac
   done
 
+  if [[ $verb == describe && $prev == --from ]]; then
+    _dssmctl_offer_files
+    return
+  fi
   case $prev in
     --socket | --ca | --credentials | --out | --output | -o | --config | --repair)
       _dssmctl_offer_files
@@ -114,6 +119,7 @@ _dssmctl() {
         readers type memory" -- "$cur")
       return
       ;;
+    --stream) return ;; # of a recording
     --host)
       _dssmctl_offer < <(_dssmctl_ask hosts --names)
       return
@@ -155,6 +161,8 @@ _dssmctl() {
       ;;
     trigger) options="--reason" ;;
     hz | bw | delay) options="--count --interval --wait --window" ;;
+    convert) options="--compression --stream" ;;
+    describe) options="--force --from --type" ;;
     create) options="--align --cycle --depth --life --size --type" ;;
     "playback set") options="--offset --speed --time" ;;
     "pki init") options="--ca --name" ;;
@@ -175,7 +183,7 @@ _dssmctl() {
   case ${verb#help } in
     "" | help)
       mapfile -t COMPREPLY < <(compgen -W \
-        "bw clock create delay doctor echo find graph hosts hz info ls nodes ping pki play \
+        "bw clock convert create delay describe doctor echo find graph hosts hz info ls nodes ping pki play \
           playback property pub record rights rm show trigger" -- "$cur")
       ;;
     property) mapfile -t COMPREPLY < <(compgen -W "get set" -- "$cur") ;;
@@ -185,10 +193,11 @@ _dssmctl() {
       ;;
     "pki issue" | "pki install" | "pki show") ((positional == 0)) && _dssmctl_offer_files ;;
     play) ((positional == 0)) && _dssmctl_offer_files ;;
+    convert) _dssmctl_offer_files ;;
     ping) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_ask hosts --names) ;;
     create) ((positional == 0)) && _dssmctl_offer < <(_dssmctl_at_hosts) ;;
     rm | hz | bw | delay | record) _dssmctl_offer < <(_dssmctl_streams) ;;
-    info | echo | pub | rights)
+    info | echo | pub | rights | describe)
       ((positional == 0)) && _dssmctl_offer < <(_dssmctl_streams)
       ;;
     "property get" | "property set")

@@ -42,7 +42,7 @@ function __dssmctl_candidates
                 --credentials --out --name --program --days --output -o --past --until --for \
                 --compression --max-file-size --max-file-duration --max-total-size --from --to --map \
                 --before --after --trigger --min-interval --max-incident --quota --reason --config \
-                --repair
+                --lockstep --repair --stream
                 set i (math $i + 1)
             case '-*'
             case '*'
@@ -57,7 +57,13 @@ function __dssmctl_candidates
         set i (math $i + 1)
     end
 
+    if test "$verb" = describe -a "$words[-1]" = --from
+        __fish_complete_path (commandline -ct)
+        return
+    end
     switch $words[-1]
+        case --stream # of a recording
+            return
         case --socket --ca --credentials --out --output -o --config --repair
             __fish_complete_path (commandline -ct)
             return
@@ -103,7 +109,7 @@ function __dssmctl_candidates
             test (count $positional) -eq 0; and __dssmctl_at_hosts
         case hz bw delay rm record
             __dssmctl_streams
-        case info echo pub rights
+        case info echo pub rights describe
             test (count $positional) -eq 0; and __dssmctl_streams
         case 'property get' 'property set'
             switch (count $positional)
@@ -112,6 +118,8 @@ function __dssmctl_candidates
                 case 1
                     __fish_complete_path (commandline -ct)
             end
+        case convert
+            __fish_complete_path (commandline -ct)
         case play 'pki issue' 'pki install' 'pki show'
             test (count $positional) -eq 0; and __fish_complete_path (commandline -ct)
     end

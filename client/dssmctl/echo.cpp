@@ -6,6 +6,7 @@
 
 #include <limits>
 
+#include "client/dssmctl/describe_stream.hpp"
 #include "client/dssmctl/fields.hpp"
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
@@ -22,17 +23,36 @@ SampleForm form_of(const EchoOptions& options) {
   return options.csv ? SampleForm::csv : SampleForm::text;
 }
 
-// The fields to show of the reader's stream as it is now.
-Result<std::vector<Field>> wanted_fields(const RawReader& reader, const EchoOptions& options) {
-  return DSSM_TRY(select_fields(readable_fields_untrusted(reader.type()), options.fields),
-                  fmt::format("show '{}'", reader.id().str()));
+// The fields to show of the reader's stream as it is now: as it is described, else those of
+// `obvious`, the type that its programs have.
+Result<std::vector<Field>> wanted_fields(const RawReader& reader, const TypeInfo& obvious,
+                                         const EchoOptions& options) {
+  const TypeInfo& own = reader.type();
+  const bool is_obvious = own.fields.empty() && own.payload_bytes == obvious.payload_bytes;
+  return DSSM_TRY(
+      select_fields(readable_fields_untrusted(is_obvious ? obvious : own), options.fields),
+      fmt::format("show '{}'", reader.id().str()));
+}
+
+// Of a stream that is not described: the type that its programs have, if there is no doubt.
+TypeInfo obvious_type(Session& session, const RawReader& reader) {
+  if (!reader.type().fields.empty()) return {};
+  const auto type = obvious_type_of_programs(session, reader.id());
+  if (!type) return {};
+  print_error(fmt::format("'{}' is shown as {} of {}; `dssmctl describe {}` shows it so everywhere",
+                          escaped(reader.id().str()), escaped(type->found.type.str()), type->source,
+                          escaped(reader.id().str())));
+  return type->found.type;
 }
 
 // Prints the samples after the reader's cursor, in order.
 class Echo {
  public:
-  Echo(RawReader& reader, SamplePrinter& printer, Output& out, const EchoOptions& options)
+  // obvious: as for wanted_fields()
+  Echo(RawReader& reader, TypeInfo obvious, SamplePrinter& printer, Output& out,
+       const EchoOptions& options)
       : reader_(reader),
+        obvious_(std::move(obvious)),
         printer_(printer),
         out_(out),
         options_(options),
@@ -82,7 +102,7 @@ class Echo {
   void reopen() {
     out_.flush();  // so that the lines come in order where both outputs go to one place
     report_restart(reader_);
-    Result<std::vector<Field>> fields = wanted_fields(reader_, options_);
+    Result<std::vector<Field>> fields = wanted_fields(reader_, obvious_, options_);
     if (!fields) {
       result_ = std::move(fields).error();
     } else if (*fields != printer_.fields()) {
@@ -94,6 +114,7 @@ class Echo {
   }
 
   RawReader& reader_;
+  const TypeInfo obvious_;
   SamplePrinter& printer_;
   Output& out_;
   const EchoOptions& options_;
@@ -183,13 +204,14 @@ Result<void> run(const EchoOptions& options, Output& out) {
   if (all.empty()) return {};
   OpenedStream& opened = all.front();
   RawReader& reader = opened.reader;
-  std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, options));
+  TypeInfo obvious = obvious_type(opened.session, reader);
+  std::vector<Field> fields = DSSM_TRY(wanted_fields(reader, obvious, options));
   // Before the first sample is shown: after it the next ones must come too, whatever happens to
   // dssmd.
   Follower follower = DSSM_TRY(Follower::open(opened.session, reader, out));
   SamplePrinter printer(out, {form_of(options), options.full, options.iso}, reader.id(),
                         std::move(fields));
-  Echo echo(reader, printer, out, options);
+  Echo echo(reader, std::move(obvious), printer, out, options);
   printer.begin();
   DSSM_TRY(begin(options, opened.awaited, reader, echo));
   if (!echo.print_new()) return echo.result();

@@ -26,29 +26,41 @@ T load(const std::byte* place) {
   return value;
 }
 
+// A whole number, or the bits of it that are the field.
+template <class T>
+Value whole(const std::byte* place, const Field& field) {
+  using Wide = std::conditional_t<std::is_signed_v<T>, std::int64_t, std::uint64_t>;
+  const T element = load<T>(place);
+  if (field.bits == 0) return Wide{element};
+  const auto bits = std::uint64_t{static_cast<std::make_unsigned_t<T>>(element)};
+  // Shifts of signed numbers repeat the sign.
+  return static_cast<Wide>(bits << (64 - field.first_bit - field.bits)) >> (64 - field.bits);
+}
+
 Value value_at(std::span<const std::byte> payload, const Field& field, std::uint64_t i) {
   const std::byte* place = payload.data() + field.offset_bytes + i * field.stride_bytes;
   switch (field.kind) {
     case Scalar::boolean:
-      return load<std::uint8_t>(place) != 0;  // 2 in a bool is undefined to load
+      // 2 in a bool is undefined to load.
+      return std::get<std::uint64_t>(whole<std::uint8_t>(place, field)) != 0;
     case Scalar::character:
       return load<char>(place);
     case Scalar::int8:
-      return std::int64_t{load<std::int8_t>(place)};
+      return whole<std::int8_t>(place, field);
     case Scalar::uint8:
-      return std::uint64_t{load<std::uint8_t>(place)};
+      return whole<std::uint8_t>(place, field);
     case Scalar::int16:
-      return std::int64_t{load<std::int16_t>(place)};
+      return whole<std::int16_t>(place, field);
     case Scalar::uint16:
-      return std::uint64_t{load<std::uint16_t>(place)};
+      return whole<std::uint16_t>(place, field);
     case Scalar::int32:
-      return std::int64_t{load<std::int32_t>(place)};
+      return whole<std::int32_t>(place, field);
     case Scalar::uint32:
-      return std::uint64_t{load<std::uint32_t>(place)};
+      return whole<std::uint32_t>(place, field);
     case Scalar::int64:
-      return load<std::int64_t>(place);
+      return whole<std::int64_t>(place, field);
     case Scalar::uint64:
-      return load<std::uint64_t>(place);
+      return whole<std::uint64_t>(place, field);
     case Scalar::float32:
       return load<float>(place);
     case Scalar::float64:
@@ -104,6 +116,7 @@ bool fits_untrusted(const Field& field, std::uint64_t payload_bytes) {
   if (field.kind < Scalar::boolean || field.kind > Scalar::float64) return false;
   const std::uint64_t element_bytes = scalar_bytes(field.kind);
   if (field.count == 0 || field.offset_bytes > payload_bytes) return false;
+  if (field.bits > 0 && field.first_bit + field.bits > 8 * element_bytes) return false;
   const std::uint64_t rest = payload_bytes - field.offset_bytes;
   if (element_bytes > rest) return false;
   if (field.count == 1) return true;

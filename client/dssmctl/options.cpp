@@ -13,6 +13,7 @@
 #include <array>
 #include <bit>
 #include <dssm/reader.hpp>
+#include <filesystem>
 #include <limits>
 #include <memory>
 
@@ -291,7 +292,7 @@ void add_info(CLI::App& app, Parsed& parsed) {
     require(!all.watch || !is_recording(all.stream), "--watch: of a stream, not of a recording");
   });
   info->add_option("STREAM", options.stream,
-                   std::string(kStreamHelp) + "; or a recording: a file *.mcap, or a path")
+                   std::string(kStreamHelp) + "; or a recording: a file *.mcap or *.log, or a path")
       ->type_name("");
   add_watch(info, options.watch);
 }
@@ -506,7 +507,12 @@ void add_trigger(CLI::App& app, Parsed& parsed) {
       ->type_name("TEXT");
 }
 
-void check_play(const PlayOptions& options) {
+void check_play(PlayOptions& options) {
+  const auto patterns =
+      std::stable_partition(options.patterns.begin(), options.patterns.end(),
+                            [](const std::string& word) { return is_recording(word); });
+  options.more_files.assign(options.patterns.begin(), patterns);
+  options.patterns.erase(options.patterns.begin(), patterns);
   for (const std::string& mapping : options.mappings) {
     const std::size_t equals = mapping.find('=', 1);
     require(equals != std::string::npos && equals + 1 < mapping.size(),
@@ -517,11 +523,13 @@ void check_play(const PlayOptions& options) {
 void add_play(CLI::App& app, Parsed& parsed) {
   CLI::App* play = app.add_subcommand("play", "write the samples of a recording to streams");
   PlayOptions& options = add_options<PlayOptions>(play, parsed, check_play);
-  play->add_option("FILE", options.file, "the recording: a file, or the folder of its files")
+  play->add_option("FILE", options.file,
+                   "the recording: a file, or the folder of its files; or a log of SSM")
       ->required()
       ->type_name("");
   play->add_option("PATTERN", options.patterns,
-                   "only streams whose NAME or NAME:ID one of these shell patterns fits")
+                   "more files (*.mcap, *.log, or a path), and: only streams whose NAME or NAME:ID "
+                   "one of these shell patterns fits")
       ->type_name("");
   CLI::Option* const rate = add_parsed(
       play, "-r,--rate", "X", "how fast: 2 is twice as fast, -1 is backwards (default: 1)",
@@ -560,6 +568,44 @@ void add_play(CLI::App& app, Parsed& parsed) {
       ->excludes(rate)
       ->excludes(loop)
       ->excludes(now);
+}
+
+void check_convert(ConvertOptions& options) {
+  require(!options.more_files.empty(),
+          "convert what to what? give IN OUT, as a.log b.log all.mcap");
+  options.out = options.more_files.back();
+  options.more_files.pop_back();
+  const std::filesystem::path out = options.out;
+  require(out.extension() == ".mcap" || out.extension() == ".log" || !out.has_extension() ||
+              options.out.ends_with('/'),
+          fmt::format("'{}' is neither a file *.mcap or *.log nor a folder", escaped(options.out)));
+}
+
+void add_convert(CLI::App& app, Parsed& parsed) {
+  CLI::App* convert =
+      app.add_subcommand("convert", "convert logs of SSM to recordings, and recordings to logs");
+  ConvertOptions& options = add_options<ConvertOptions>(convert, parsed, check_convert);
+  convert->add_option("IN", options.file, "a file *.log or *.mcap, or a folder of them")
+      ->required()
+      ->type_name("");
+  convert
+      ->add_option("OUT", options.more_files,
+                   "more files to read, and at last what to write: a file *.mcap, a file *.log (of "
+                   "one stream), or a folder for a log of each stream")
+      ->required()
+      ->type_name("");
+  convert
+      ->add_option(
+          "--stream", options.patterns,
+          "only streams whose NAME or NAME:ID this shell pattern fits; may be given several "
+          "times")
+      ->type_name("PATTERN")
+      ->allow_extra_args(false);
+  convert
+      ->add_option("--compression", options.compression,
+                   "of MCAP: lz4, zstd or none (default: lz4)")
+      ->type_name("NAME")
+      ->check(CLI::Validator(check_compression, ""));
 }
 
 void add_types(CLI::App& app, Parsed& parsed) {
@@ -631,6 +677,29 @@ void add_rm(CLI::App& app, Parsed& parsed) {
   CLI::App* rm = app.add_subcommand("rm", "remove streams");
   RmOptions& options = add_options<RmOptions>(rm, parsed);
   rm->add_option("STREAM", options.streams, kStreamHelp)->required()->type_name("");
+}
+
+void add_describe(CLI::App& app, Parsed& parsed) {
+  CLI::App* describe =
+      app.add_subcommand("describe", "give a stream the fields of a program's type");
+  DescribeOptions& options = add_options<DescribeOptions>(describe, parsed);
+  CLI::Option* stream =
+      describe->add_option("STREAM", options.stream,
+                           std::string(kStreamHelp) + "; none: all streams that are not described");
+  stream->type_name("");
+  describe
+      ->add_option("--from", options.from,
+                   "a program, library, object file or separate debug file with debug information "
+                   "(-g); default: the programs that have the stream open")
+      ->type_name("FILE")
+      ->needs(stream);
+  describe
+      ->add_option("--type", options.type,
+                   "the type there; default: the one that the stream names, or that fits")
+      ->type_name("TYPE")
+      ->needs(stream);
+  describe->add_flag("--force", options.force, "replace the type and fields that the stream has")
+      ->needs(stream);
 }
 
 void add_rights(CLI::App& app, Parsed& parsed) {
@@ -798,11 +867,13 @@ void add_all(CLI::App& app, Parsed& parsed) {
   add_record(app, parsed);
   add_trigger(app, parsed);
   add_play(app, parsed);
+  add_convert(app, parsed);
   add_types(app, parsed);
   add_meter<HzOptions>(app, parsed, "hz", "how often samples come");
   add_meter<BwOptions>(app, parsed, "bw", "how many bytes come");
   add_meter<DelayOptions>(app, parsed, "delay", "how old samples are when they arrive");
   add_create(app, parsed);
+  add_describe(app, parsed);
   add_rm(app, parsed);
   add_rights(app, parsed);
   add_property(app, parsed);

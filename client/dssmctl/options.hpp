@@ -119,7 +119,8 @@ struct TriggerOptions : CommonOptions {
 };
 
 struct PlayOptions : CommonOptions {
-  std::string file;                   // or the folder of one recording
+  std::string file;  // or the folder of one recording
+  std::vector<std::string> more_files;
   std::vector<std::string> patterns;  // of the recording's streams; empty: all
   std::vector<std::string> mappings;  // PATTERN=NAME
   double rate = 1;                    // negative: backwards
@@ -127,6 +128,14 @@ struct PlayOptions : CommonOptions {
   std::optional<Moment> from, to;     // count back from the recording's end
   std::vector<std::string> lockstep;  // commands; empty: by the clock
   bool loop = false, now = false, on_hosts = false, force = false;
+};
+
+struct ConvertOptions : CommonOptions {
+  std::string file;  // or a folder
+  std::vector<std::string> more_files;
+  std::string out;                    // *.mcap, *.log, or a folder for logs
+  std::vector<std::string> patterns;  // of streams; empty: all
+  std::string compression = "lz4";
 };
 
 struct FindOptions : CommonOptions {
@@ -153,6 +162,13 @@ struct CreateOptions : CommonOptions {
   std::uint64_t depth = 0;            // 0: `life` and `cycle` are given
   std::optional<Duration> life, cycle;
   std::string type;
+};
+
+struct DescribeOptions : CommonOptions {
+  std::string stream;  // empty: all that are not described
+  std::string from;    // a file; empty: the programs that have the stream open
+  std::string type;    // empty: the stream's, or one that fits
+  bool force = false;  // replaces what the stream has
 };
 
 struct RmOptions : CommonOptions {
@@ -216,8 +232,8 @@ struct PkiShowOptions : CommonOptions {
 using Options =
     std::variant<LsOptions, HostsOptions, NodesOptions, GraphOptions, ClockOptions, DoctorOptions,
                  PingOptions, InfoOptions, EchoOptions, PubOptions, RecordOptions, TriggerOptions,
-                 PlayOptions, FindOptions, ShowOptions, HzOptions, BwOptions, DelayOptions,
-                 CreateOptions, RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions,
+                 PlayOptions, ConvertOptions, FindOptions, ShowOptions, HzOptions, BwOptions, DelayOptions,
+                 CreateOptions, DescribeOptions, RmOptions, RightsOptions, PropertyGetOptions, PropertySetOptions,
                  PlaybackOptions, PkiInitOptions, PkiRequestOptions, PkiIssueOptions,
                  PkiInstallOptions, PkiRenewOptions, PkiRevokeOptions, PkiShowOptions>;
 
@@ -247,12 +263,14 @@ Result<void> run(const PubOptions& options, Output& out);
 Result<void> run(const RecordOptions& options, Output& out);
 Result<void> run(const TriggerOptions& options, Output& out);
 Result<void> run(const PlayOptions& options, Output& out);
+Result<void> run(const ConvertOptions& options, Output& out);
 Result<void> run(const FindOptions& options, Output& out);
 Result<void> run(const ShowOptions& options, Output& out);
 Result<void> run(const HzOptions& options, Output& out);
 Result<void> run(const BwOptions& options, Output& out);
 Result<void> run(const DelayOptions& options, Output& out);
 Result<void> run(const CreateOptions& options, Output& out);
+Result<void> run(const DescribeOptions& options, Output& out);
 Result<void> run(const RmOptions& options, Output& out);
 Result<void> run(const RightsOptions& options, Output& out);
 Result<void> run(const PropertyGetOptions& options, Output& out);

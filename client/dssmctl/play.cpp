@@ -23,6 +23,7 @@
 #include "client/dssmctl/open_stream.hpp"
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
+#include "client/dssmctl/recording_info.hpp"
 #include "client/dssmctl/text.hpp"
 #include "client/dssmctl/timeline.hpp"
 #include "core/base/try.hpp"
@@ -409,7 +410,7 @@ Result<void> run(const PlayOptions& options, Output& out) {
   const auto print_notice = [](const std::string& text) {
     print_error(fmt::format("dssmctl: play: {}\n", text));
   };
-  const Recording recording = DSSM_TRY(Recording::open(options.file));
+  const Recording recording = DSSM_TRY(open_recording(options.file, options.more_files));
   for (const std::string& warning : recording.warnings()) {
     print_error(fmt::format("dssmctl: play: {}\n", escaped_message(warning)));
   }

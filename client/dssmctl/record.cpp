@@ -12,6 +12,7 @@
 #include "client/dssmctl/output.hpp"
 #include "client/dssmctl/recorder.hpp"
 #include "client/dssmctl/recording_folder.hpp"
+#include "client/dssmctl/recording_info.hpp"
 #include "client/dssmctl/text.hpp"
 #include "core/base/try.hpp"
 
@@ -130,10 +131,6 @@ Result<void> repair(const RecordOptions& options, Output& out) {
                          : fmt::format("completed, {} of an incomplete record removed",
                                        bytes_text(repaired.removed_bytes))));
   return {};
-}
-
-Compression compression_of(const std::string& name) {
-  return name == "none" ? Compression::none : name == "zstd" ? Compression::zstd : Compression::lz4;
 }
 
 }  // namespace

@@ -131,12 +131,23 @@ void print_text(const Recording& recording, const Sum& sum, bool iso, Output& ou
 }  // namespace
 
 bool is_recording(const std::string& name) {
-  if (name.ends_with(".mcap")) return true;
+  if (name.ends_with(".mcap") || name.ends_with(".log")) return true;
   for (const char* start : {"/", "./", "../"}) {
     if (name.starts_with(start)) return true;
   }
   std::error_code ignored;  // names of streams may have slashes, too
   return name.find('/') != std::string::npos && std::filesystem::exists(name, ignored);
+}
+
+Result<Recording> open_recording(const std::string& file, const std::vector<std::string>& more) {
+  if (more.empty()) return Recording::open(file);
+  std::vector<std::filesystem::path> files = {file};
+  files.insert(files.end(), more.begin(), more.end());
+  return Recording::open(files);
+}
+
+Compression compression_of(const std::string& name) {
+  return name == "none" ? Compression::none : name == "zstd" ? Compression::zstd : Compression::lz4;
 }
 
 Result<void> print_recording(const std::string& path, const InfoOptions& options, Output& out) {

@@ -1,9 +1,11 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// dssmctl info FILE: what a recording holds.
+// Recordings as several verbs open them; dssmctl info FILE: what a recording holds.
 #pragma once
 
+#include <dssm/recording.hpp>
 #include <string>
+#include <vector>
 
 #include "client/dssmctl/options.hpp"
 #include "client/dssmctl/output.hpp"
@@ -13,6 +15,12 @@ namespace dssm::ctl {
 // Whether a person means a recording and not a stream: a name that ends as recordings do, begins as
 // paths do, or has a slash and is there.
 bool is_recording(const std::string& name);
+
+// A recording of several files, or of one file or folder: when `more` is empty.
+Result<Recording> open_recording(const std::string& file, const std::vector<std::string>& more);
+
+// Of the option --compression.
+Compression compression_of(const std::string& name);
 
 // `path` is a file, or a folder with the files of one recording.
 Result<void> print_recording(const std::string& path, const InfoOptions& options, Output& out);

@@ -61,10 +61,7 @@ Result<void> store_character(std::byte* place, const std::string& name, std::str
   return {};
 }
 
-// Element `i` of a field, which lies inside the payload.
-Result<void> store_element(std::span<std::byte> payload, const Field& field, std::uint64_t i,
-                           std::string_view text) {
-  std::byte* place = payload.data() + field.offset_bytes + i * field.stride_bytes;
+Result<void> store_scalar(std::byte* place, const Field& field, std::string_view text) {
   switch (field.kind) {
     case Scalar::boolean:
       return store_boolean(place, field.name, text);
@@ -92,6 +89,36 @@ Result<void> store_element(std::span<std::byte> payload, const Field& field, std
       return store_number<double>(place, field.name, text);
   }
   return {};  // not reached: readable_fields_untrusted() passes only known kinds
+}
+
+// Into the bits of a bit field; the others of its element stay as they are.
+Result<void> store_bits(std::byte* place, const Field& field, std::string_view text) {
+  const std::size_t bytes = scalar_bytes(field.kind);
+  std::uint64_t value = 0, element = 0;  // little endian: the lower bytes are those of the element
+  DSSM_TRY(store_scalar(reinterpret_cast<std::byte*>(&value), field, text));
+  const bool is_signed = field.kind == Scalar::int8 || field.kind == Scalar::int16 ||
+                         field.kind == Scalar::int32 || field.kind == Scalar::int64;
+  const std::uint64_t max = ~std::uint64_t{0} >> (64 - field.bits) >> (is_signed ? 1 : 0);
+  const auto unused = static_cast<unsigned>(64 - 8 * bytes);
+  const std::int64_t with_sign = static_cast<std::int64_t>(value << unused) >> unused;
+  const bool is_negative = is_signed && with_sign < 0;
+  if ((is_negative ? ~static_cast<std::uint64_t>(with_sign) : value) > max) {
+    return does_not_fit(field.name, text,
+                        fmt::format("a whole number from {} to {}",
+                                    is_signed ? -static_cast<std::int64_t>(max) - 1 : 0, max));
+  }
+  const std::uint64_t mask = (~std::uint64_t{0} >> (64 - field.bits)) << field.first_bit;
+  std::memcpy(&element, place, bytes);
+  element = (element & ~mask) | ((value << field.first_bit) & mask);
+  std::memcpy(place, &element, bytes);
+  return {};
+}
+
+// Element `i` of a field, which lies inside the payload.
+Result<void> store_element(std::span<std::byte> payload, const Field& field, std::uint64_t i,
+                           std::string_view text) {
+  std::byte* place = payload.data() + field.offset_bytes + i * field.stride_bytes;
+  return field.bits == 0 ? store_scalar(place, field, text) : store_bits(place, field, text);
 }
 
 Result<void> store_text(std::span<std::byte> payload, const Field& field, std::string_view text) {

@@ -87,7 +87,7 @@ Result<void> run(const ShowOptions& options, Output& out) {
     if (&one != &definitions.front()) out.add("\n");
     out.add(fmt::format("{}: {}\n", out.bold(escaped(one.type.str())), list_text(one.streams)));
     if (one.type.fields.empty()) {
-      out.add("its fields are not described (DSSM_DESCRIBE)\n");
+      out.add("its fields are not described (DSSM_DESCRIBE, or `dssmctl describe`)\n");
     } else {
       print_fields(one.type, out);
     }

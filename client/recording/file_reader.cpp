@@ -166,17 +166,27 @@ Result<std::unique_ptr<FileReader>> FileReader::open(const std::filesystem::path
   }
   file->bytes_ = static_cast<std::uint64_t>(about.st_size);
   DSSM_TRY(file->begin(), what);
+  if (file->log_) {
+    file->scan_log();
+    return file;
+  }
   if (file->data_start_ == 0 || file->open_by_summary()) return file;
   file->scan();
   return file;
 }
 
-// Magic and header. One that was cut off within them holds nothing.
+// Magic and header, or the head of a log. An MCAP file that was cut off within them holds nothing.
 Result<void> FileReader::begin() {
   const std::uint64_t known = std::min<std::uint64_t>(bytes_, kMagic.size());
   const auto magic = DSSM_TRY(read(0, known));
   if (!std::ranges::equal(magic, std::as_bytes(std::span(kMagic)).first(known))) {
-    return Error{Errc::protocol, "it is not an MCAP file"};
+    const auto begin = DSSM_TRY(read(0, std::min<std::uint64_t>(bytes_, kMaxSsmLogLineBytes)));
+    const std::string text(reinterpret_cast<const char*>(begin.data()), begin.size());
+    if (Result<void> log = begin_log(text); !log) {
+      return Error{Errc::protocol, fmt::format("it is not an MCAP file, and as a log of SSM: {}",
+                                               printable(log.error().message))};
+    }
+    return {};
   }
   if (bytes_ < kMagic.size() + kRecordHeadBytes) {
     warn("it is empty: its writer was ended before it had written anything");
@@ -608,7 +618,7 @@ void FileReader::decode_messages(LoadedChunk& chunk, const IndexedChunk* announc
 Result<std::shared_ptr<const LoadedChunk>> FileReader::load(const IndexedChunk& chunk) {
   const auto loaded = std::make_shared<LoadedChunk>();
   DSSM_TRY(load_data(chunk, loaded->data), fmt::format("'{}'", path_.string()));
-  decode_messages(*loaded, &chunk);
+  log_ ? decode_records(*loaded, chunk) : decode_messages(*loaded, &chunk);
   const bool is_as_announced =
       loaded->channels.size() == chunk.parts.size() &&
       std::ranges::all_of(chunk.parts, [&](const Part& part) {
@@ -665,8 +675,14 @@ Result<RecordingRepair> FileReader::repair() {
   RecordingRepair report;
   report.was_whole = is_whole_;
   report.samples = summary_.samples();
-  if (is_whole_) return report;
   const std::string what = fmt::format("repair recording '{}'", path_.string());
+  if (log_) {
+    return Error{Errc::invalid_argument,
+                 fmt::format("{}: it is a log of SSM, which needs no repair: a part of a record at "
+                             "its end does not count",
+                             what)};
+  }
+  if (is_whole_) return report;
   if (data_start_ == 0) {
     return Error{Errc::protocol, fmt::format("{}: it is empty; delete it", what)};
   }

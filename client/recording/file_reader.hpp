@@ -1,6 +1,7 @@
 // SPDX-License-Identifier: Apache-2.0
 //
-// One MCAP file that is read: what is in it, and its chunks. A whole file of ours is opened by its
+// One MCAP file, or a log of SSM (ssm_log_reader.cpp), that is read: what is in it, and its chunks.
+// A whole file of ours is opened by its
 // summary and the attachment "dssm.index"; all others are read from begin to end, up to the first
 // record that is not whole. Nothing in a file is trusted: lengths are checked against the file's,
 // chunks are decompressed up to kMaxChunkBytes, and each must have the CRC and the samples that
@@ -20,6 +21,7 @@
 
 #include "client/recording/file_writer.hpp"
 #include "client/recording/records.hpp"
+#include "core/base/ssm_log.hpp"
 #include "core/base/unique_fd.hpp"
 
 namespace dssm::recording {
@@ -99,6 +101,9 @@ class FileReader {
  private:
   FileReader() = default;
   Result<void> begin();
+  Result<void> begin_log(std::string_view begin);
+  void scan_log();
+  void decode_records(LoadedChunk& chunk, const IndexedChunk& about) const;
   bool open_by_summary();
   void scan();
   void scan_record(Op op, std::uint64_t offset, std::span<const std::byte> content);
@@ -121,7 +126,8 @@ class FileReader {
   std::uint64_t data_start_ = 0;  // after the header
   std::uint64_t data_end_ = 0;    // after the last whole record of the data
   bool is_whole_ = false;
-  bool is_ours_ = false;  // by its profile
+  bool is_ours_ = false;           // by its profile
+  std::optional<SsmLogHead> log_;  // of a log of SSM
   std::string recording_;
   std::uint32_t number_ = 0;
   Summary summary_;

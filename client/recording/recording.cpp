@@ -27,6 +27,11 @@ constexpr std::uint64_t kCacheBytes = 64U << 20;
 constexpr std::size_t kMinCachedChunks = 2;
 constexpr std::size_t kMaxLateWarnings = 100;  // found while samples are read
 
+// The recording that a file is part of: all of them have one name.
+std::string recording_of(const FileReader& file) {
+  return file.recording().empty() ? file.path().string() : file.recording();
+}
+
 }  // namespace
 
 struct IndexPart {
@@ -410,24 +415,50 @@ struct ReaderState {
   }
 };
 
-struct CursorState {
-  std::shared_ptr<Content> content;
+// Of one recording; its samples come in the order in which they were recorded.
+struct Track {
+  std::uint32_t first_file = 0, end_file = 0;
   std::uint32_t file = 0, chunk = 0;  // of the chunk after `loaded`
   std::size_t at = 0;                 // of the next message in `loaded`
-  std::shared_ptr<const LoadedChunk>
-      loaded;                        // nullptr: before the first one, or after the last one
+  // nullptr: before the first one, or after the last one
+  std::shared_ptr<const LoadedChunk> loaded = nullptr;
   std::int64_t from_ns = INT64_MIN;  // earlier ones are passed over, until one is not
 
-  bool next_chunk();
-  bool previous_chunk();
-  bool find_next();
-  void get(const Message& message, RecordedSample& out) const;
+  bool next_chunk(Content* content);
+  bool previous_chunk(Content* content);
+  // The next message, at `at`, and the one before, at `at` - 1; nullptr: there is none.
+  const Message* next(Content* content);
+  const Message* previous(Content* content);
 };
 
+// Several recordings, as the logs of several streams, are merged by time.
+struct CursorState {
+  std::shared_ptr<Content> content;
+  std::vector<Track> tracks;
+
+  void seek(std::int64_t t_ns);
+  // The one whose next or previous message is the next or previous of all; nullptr: there is none.
+  Track* next();
+  Track* previous();
+  void get(const Track& track, std::size_t at, RecordedSample& out) const;
+};
+
+void CursorState::seek(std::int64_t t_ns) {
+  tracks.clear();
+  const auto& files = content->files;
+  for (std::uint32_t file = 0; file < files.size(); ++file) {
+    if (file == 0 || recording_of(*files[file]) != recording_of(*files[file - 1])) {
+      tracks.push_back({.first_file = file, .file = file, .from_ns = t_ns});
+    }
+    tracks.back().end_file = file + 1;
+  }
+}
+
 // Goes to the next chunk; false after the last one.
-bool CursorState::next_chunk() {
+bool Track::next_chunk(Content* content) {
+  const std::lock_guard lock(content->mutex);
   at = 0;
-  while (file < content->files.size()) {
+  while (file < end_file) {
     const std::vector<IndexedChunk>& chunks = content->files[file]->chunks();
     if (chunk == chunks.size()) {
       ++file;
@@ -445,13 +476,14 @@ bool CursorState::next_chunk() {
 }
 
 // Goes behind the last message of the chunk before; false before the first one.
-bool CursorState::previous_chunk() {
+bool Track::previous_chunk(Content* content) {
+  const std::lock_guard lock(content->mutex);
   if (loaded != nullptr) --chunk;
   loaded = nullptr;
   at = 0;
   for (;;) {
     while (chunk == 0) {
-      if (file == 0) return false;
+      if (file == first_file) return false;
       chunk = static_cast<std::uint32_t>(content->files[--file]->chunks().size());
     }
     loaded = content->load(file, chunk - 1);
@@ -464,27 +496,57 @@ bool CursorState::previous_chunk() {
   }
 }
 
-// Goes before the next message; false after the last one.
-bool CursorState::find_next() {
+const Message* Track::next(Content* content) {
   for (;; ++at) {
     while (loaded == nullptr || at == loaded->messages.size()) {
-      const std::lock_guard lock(content->mutex);
-      if (!next_chunk()) {
-        from_ns = INT64_MIN;
-        return false;
-      }
+      if (next_chunk(content)) continue;
+      from_ns = INT64_MIN;
+      return nullptr;
     }
     if (loaded->messages[at].time_ns >= from_ns) break;
   }
   from_ns = INT64_MIN;
-  return true;
+  return &loaded->messages[at];
 }
 
-void CursorState::get(const Message& message, RecordedSample& out) const {
-  out.stream = content->stream_of_channel[file].at(message.channel);
+const Message* Track::previous(Content* content) {
+  if (from_ns != INT64_MIN) next(content);
+  while (loaded == nullptr || at == 0) {
+    if (!previous_chunk(content)) return nullptr;
+  }
+  return &loaded->messages[at - 1];
+}
+
+Track* CursorState::next() {
+  Track* first = nullptr;
+  std::int64_t first_ns = 0;
+  for (Track& track : tracks) {
+    const Message* message = track.next(content.get());
+    if (message == nullptr || (first != nullptr && message->time_ns >= first_ns)) continue;
+    first = &track;
+    first_ns = message->time_ns;
+  }
+  return first;
+}
+
+Track* CursorState::previous() {
+  Track* last = nullptr;
+  std::int64_t last_ns = 0;
+  for (Track& track : tracks) {
+    const Message* message = track.previous(content.get());
+    if (message == nullptr || (last != nullptr && message->time_ns < last_ns)) continue;
+    last = &track;
+    last_ns = message->time_ns;
+  }
+  return last;
+}
+
+void CursorState::get(const Track& track, std::size_t at, RecordedSample& out) const {
+  const Message& message = track.loaded->messages[at];
+  out.stream = content->stream_of_channel[track.file].at(message.channel);
   out.info = message.info();
   out.clock_error = Duration(message.clock_bound_ns);
-  out.payload = loaded->payload(message);
+  out.payload = track.loaded->payload(message);
 }
 
 }  // namespace dssm::recording
@@ -501,15 +563,18 @@ Recording::Recording(std::shared_ptr<Content> content) noexcept : content_(std::
 Result<Recording> Recording::open(const std::filesystem::path& path) {
   std::error_code error;
   if (!std::filesystem::is_directory(path, error)) return open(std::span(&path, 1));
-  std::vector<std::filesystem::path> files;
+  std::vector<std::filesystem::path> files, logs;
   for (std::filesystem::directory_iterator each(path, error), end; !error && each != end;
        each.increment(error)) {
     if (each->path().extension() == ".mcap") files.push_back(each->path());
+    if (each->path().extension() == ".log") logs.push_back(each->path());
   }
   if (error) return os_error(fmt::format("open folder '{}'", path.string()), error.value());
+  if (files.empty()) files = std::move(logs);
   if (files.empty()) {
     return Error{Errc::not_found,
-                 fmt::format("open recording '{}': the folder has no file *.mcap", path.string())};
+                 fmt::format("open recording '{}': the folder has no file *.mcap, and no *.log",
+                             path.string())};
   }
   return open(files);
 }
@@ -522,17 +587,15 @@ Result<Recording> Recording::open(std::span<const std::filesystem::path> files) 
   }
   // Files of one recording by their numbers, recordings by their first sample.
   std::map<std::string, std::int64_t> starts;
-  const auto name_of = [](const auto& file) {
-    return file->recording().empty() ? file->path().string() : file->recording();
-  };
   for (const auto& file : content->files) {
-    std::int64_t& start = starts.try_emplace(name_of(file), INT64_MAX).first->second;
+    std::int64_t& start =
+        starts.try_emplace(recording::recording_of(*file), INT64_MAX).first->second;
     for (const auto& chunk : file->chunks()) {
       for (const auto& part : chunk.parts) start = std::min(start, part.min_time_ns);
     }
   }
   const auto key = [&](const auto& file) {
-    const std::string name = name_of(file);
+    const std::string name = recording::recording_of(*file);
     return std::tuple(starts[name], name, file->number(), file->path());
   };
   std::ranges::sort(content->files, [&](const auto& a, const auto& b) { return key(a) < key(b); });
@@ -601,6 +664,7 @@ Result<RecordedRawReader> Recording::open_raw_reader(const StreamId& id,
 RecordingCursor Recording::cursor() const {
   auto state = std::make_unique<recording::CursorState>();
   state->content = content_;
+  state->seek(INT64_MIN);
   return RecordingCursor(std::move(state));
 }
 
@@ -617,24 +681,20 @@ RecordingCursor& RecordingCursor::operator=(RecordingCursor&&) noexcept = defaul
 RecordingCursor::~RecordingCursor() = default;
 
 bool RecordingCursor::next(RecordedSample& out) noexcept {
-  if (!state_->find_next()) return false;
-  state_->get(state_->loaded->messages[state_->at++], out);
+  recording::Track* const track = state_->next();
+  if (track == nullptr) return false;
+  state_->get(*track, track->at++, out);
   return true;
 }
 
 bool RecordingCursor::previous(RecordedSample& out) noexcept {
-  if (state_->from_ns != INT64_MIN) (void)state_->find_next();
-  while (state_->loaded == nullptr || state_->at == 0) {
-    const std::lock_guard lock(state_->content->mutex);
-    if (!state_->previous_chunk()) return false;
-  }
-  state_->get(state_->loaded->messages[--state_->at], out);
+  recording::Track* const track = state_->previous();
+  if (track == nullptr) return false;
+  state_->get(*track, --track->at, out);
   return true;
 }
 
-void RecordingCursor::seek(Time t) noexcept {
-  *state_ = {state_->content, 0, 0, 0, nullptr, to_ns(t)};
-}
+void RecordingCursor::seek(Time t) noexcept { state_->seek(to_ns(t)); }
 
 // --- RecordedRawReader
 

@@ -66,11 +66,14 @@ struct Member {
   std::uint64_t offset, count, stride;  // the offset in the message that holds it
   // Of an array in an array of structs; the others are the structs' then.
   std::uint64_t inner_count = 1, inner_stride = 0;
+  bool is_bit_field = false;  // it has only some of its bits
 
   std::uint64_t scalar() const { return scalar_bytes(kind); }
   std::uint64_t first_end() const { return offset + (inner_count - 1) * inner_stride + scalar(); }
   std::uint64_t end() const { return first_end() + (count - 1) * stride; }
-  bool is_packed() const { return inner_count == 1 && (count == 1 || stride == scalar()); }
+  bool is_packed() const {
+    return !is_bit_field && inner_count == 1 && (count == 1 || stride == scalar());
+  }
 };
 
 // An array in an array of structs is a field for each struct, "points[0].tag", "points[1].tag" ...
@@ -122,8 +125,8 @@ class Generator {
   std::string run(const TypeInfo& type) {
     std::vector<Member> members;
     for (const Field& field : type.fields) {
-      members.push_back(
-          {field.name, field.kind, field.offset_bytes, field.count, field.stride_bytes});
+      members.push_back({field.name, field.kind, field.offset_bytes, field.count,
+                         field.stride_bytes, 1, 0, field.bits > 0});
     }
     const std::string name = type_name(type.name);
     types_.insert(name);

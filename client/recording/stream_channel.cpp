@@ -49,12 +49,15 @@ std::optional<std::string> unescaped(std::string_view text) {
   return name;
 }
 
-// "float64 0 1 8 x\n": kind, offset, count, stride, name.
+// "float64 0 1 8 x\n": kind, offset, count, stride, name. Of a bit field the kind is followed by
+// its first bit and the number of its bits: "uint32:5:3".
 std::string text_of(const std::vector<Field>& fields) {
   std::string text;
   for (const Field& field : fields) {
-    text += fmt::format("{} {} {} {} {}\n", name_of(field.kind), field.offset_bytes, field.count,
-                        field.stride_bytes, escaped(field.name));
+    const std::string bits =
+        field.bits == 0 ? "" : fmt::format(":{}:{}", field.first_bit, field.bits);
+    text += fmt::format("{}{} {} {} {} {}\n", name_of(field.kind), bits, field.offset_bytes,
+                        field.count, field.stride_bytes, escaped(field.name));
   }
   return text;
 }
@@ -76,8 +79,13 @@ std::optional<std::string_view> take_until(std::string_view& text, char separato
 
 std::optional<Field> field_of(std::string_view line) {
   Field field;
-  const auto kind = take_until(line, ' ');
+  std::optional<std::string_view> kind = take_until(line, ' ');
   if (!kind) return std::nullopt;
+  if (std::string_view bits = *kind; const auto name = take_until(bits, ':')) {
+    const auto first = take_until(bits, ':');
+    if (!first || !parse(*first, field.first_bit) || !parse(bits, field.bits)) return std::nullopt;
+    kind = name;
+  }
   bool known = false;
   for (int i = static_cast<int>(Scalar::boolean); i <= static_cast<int>(Scalar::float64); ++i) {
     if (name_of(static_cast<Scalar>(i)) != *kind) continue;
@@ -126,7 +134,8 @@ Channel channel_of(const RecordedStream& stream) {
   Channel channel;
   channel.topic = topic_of(stream.id);
   channel.message_encoding = "cdr";
-  channel.metadata = {
+  channel.metadata = stream.metadata;
+  const std::map<std::string, std::string> own = {
       {std::string(kVersionKey), std::string(kVersion)},
       {"name", stream.id.name},
       {"id", std::to_string(stream.id.id)},
@@ -139,6 +148,7 @@ Channel channel_of(const RecordedStream& stream) {
       {"alignment_bytes", std::to_string(stream.type.alignment_bytes)},
       {"fields", text_of(stream.type.fields)},
   };
+  for (const auto& [key, value] : own) channel.metadata[key] = value;
   return channel;
 }
 
@@ -172,6 +182,10 @@ Result<std::optional<RecordedStream>> stream_of(const Channel& channel) {
     std::optional<Field> field = line ? field_of(*line) : std::nullopt;
     if (!field) return bad_channel(channel, "the fields in its metadata are wrong");
     stream.type.fields.push_back(*std::move(field));
+  }
+  const Channel known = channel_of(stream);
+  for (const auto& [key, value] : metadata) {
+    if (!known.metadata.contains(key)) stream.metadata[key] = value;
   }
   const std::string what = fmt::format("channel {} ('{}')", channel.id, channel.topic);
   for (Result<void> checked : {stream.id.check(), stream.type.check()}) {

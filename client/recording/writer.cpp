@@ -113,7 +113,6 @@ Result<std::uint32_t> Writer::add_stream(const RecordedStream& stream) {
   const std::string what = "record stream '" + stream.id.str() + "'";
   DSSM_TRY(stream.id.check(), what);
   DSSM_TRY(stream.type.check(), what);
-  if (stream.id.host.empty()) return invalid("{}: its host is missing", what);
   const std::unique_lock lock(mutex_);
   const std::pair key(topic_of(stream.id), stream.incarnation);
   if (const auto known = numbers_.find(key); known != numbers_.end()) return known->second;

@@ -263,6 +263,18 @@ Result<std::vector<std::byte>> Session::property(const StreamId& id) {
   return detail::get_property(*client_, id);
 }
 
+Result<void> Session::describe(const StreamId& id, const TypeInfo& type, bool replace) {
+  const std::string what = quoted("describe", id);
+  DSSM_TRY(type.check(), what);
+  local::Request request;
+  proto::Describe& describe = *request.mutable_describe();
+  wire::to_message(id, *describe.mutable_id());
+  wire::to_message(type, *describe.mutable_type());
+  describe.set_replace(replace);
+  DSSM_TRY(ask(*client_, std::move(request), what));
+  return {};
+}
+
 Result<std::vector<HostInfo>> Session::list_hosts() {
   local::Request request;
   request.mutable_list_hosts();

@@ -22,14 +22,18 @@ Error invalid(fmt::format_string<Values...> text, Values&&... values) {
 // Enough to recognize a type, short enough for a message.
 constexpr std::size_t kShownFields = 16;
 
+unsigned last_bit(const Field& field) { return field.first_bit + field.bits - 1U; }
+
 std::string text_of(const Field& field) {
   const std::string count = field.count == 1 ? "" : fmt::format("[{}]", field.count);
   // In an array of structs, where the elements are not side by side.
   const std::string stride = field.count == 1 || field.stride_bytes == scalar_bytes(field.kind)
                                  ? ""
                                  : fmt::format(" every {}", field.stride_bytes);
-  return fmt::format("{} {}{} at {}{}", name_of(field.kind), field.name, count, field.offset_bytes,
-                     stride);
+  const std::string bits =
+      field.bits == 0 ? "" : fmt::format(" bit {} to {}", field.first_bit, last_bit(field));
+  return fmt::format("{} {}{} at {}{}{}", name_of(field.kind), field.name, count,
+                     field.offset_bytes, bits, stride);
 }
 
 // Exactly, in the greatest unit that makes a whole number of it: "36000 s", "1500 us".
@@ -46,7 +50,8 @@ std::string text_of(Duration duration) {
 // Whether both are the same bytes under the same name.
 bool is_same(const Field& a, const Field& b) {
   return a.name == b.name && a.kind == b.kind && a.offset_bytes == b.offset_bytes &&
-         a.count == b.count && (a.count == 1 || a.stride_bytes == b.stride_bytes);
+         a.count == b.count && (a.count == 1 || a.stride_bytes == b.stride_bytes) &&
+         a.bits == b.bits && a.first_bit == b.first_bit;
 }
 
 // "field 2 is 'float64 y at 8' in the stream and 'float64 x at 8' in this program".
@@ -248,6 +253,11 @@ Result<void> TypeInfo::check() const {
       return invalid(
           "field '{}' of type {} does not lie inside the payload; check its DSSM_DESCRIBE line",
           field.name, str());
+    }
+    const bool is_float = field.kind == Scalar::float32 || field.kind == Scalar::float64;
+    if (field.bits > 0 && (is_float || last_bit(field) >= 8 * bytes)) {
+      return invalid("field '{}' of type {} is not a bit field that its element can hold: {}",
+                     field.name, str(), text_of(field));
     }
   }
   return {};

@@ -16,8 +16,10 @@ namespace {
 TypeInfo type_info(const proto::Type& message) {
   TypeInfo type{message.name(), message.payload_bytes(), message.alignment_bytes(), {}};
   for (const proto::Field& field : message.fields()) {
+    const auto small = [](std::uint32_t n) { return static_cast<std::uint8_t>(std::min(n, 255U)); };
     type.fields.push_back({field.name(), static_cast<Scalar>(field.scalar()), field.offset_bytes(),
-                           field.count(), field.stride_bytes()});
+                           field.count(), field.stride_bytes(), small(field.bits()),
+                           small(field.first_bit())});
   }
   return type;
 }
@@ -66,6 +68,8 @@ void to_message(const TypeInfo& type, proto::Type& out) {
     message.set_offset_bytes(field.offset_bytes);
     message.set_count(field.count);
     message.set_stride_bytes(field.stride_bytes);
+    message.set_bits(field.bits);
+    message.set_first_bit(field.first_bit);
   }
 }
 

@@ -19,6 +19,7 @@ using Request = local::Request;
 
 // Both protocols number what they have in common alike.
 static_assert(int{Frame::kCreateFieldNumber} == int{Request::kCreateFieldNumber});
+static_assert(int{Frame::kDescribeFieldNumber} == int{Request::kDescribeFieldNumber});
 static_assert(int{Frame::kSetPropertyFieldNumber} == int{Request::kSetPropertyFieldNumber});
 
 // Calls visit(field number, content) for each field of a message, with an empty content unless it
@@ -70,19 +71,20 @@ std::size_t field_bytes(Bytes message, std::uint64_t number) noexcept {
   return is_message ? bytes : 0;
 }
 
-// What a request has of Creates.
-struct Creates {
+// What a request has of Creates and Describes, which have a type alike.
+static_assert(int{proto::Create::kTypeFieldNumber} == int{proto::Describe::kTypeFieldNumber});
+struct Types {
   std::size_t bytes = 0;
   std::size_t type_fields = 0;
 };
 
 // False when the bytes are no message.
-bool measure_creates(Bytes request, Creates& found) noexcept {
-  return for_each_field(request, [&](std::uint64_t field, Bytes create) {
-    if (field != Frame::kCreateFieldNumber) return true;
-    found.bytes += create.size();
-    return for_each_field(create, [&](std::uint64_t of_create, Bytes type) {
-      if (of_create != proto::Create::kTypeFieldNumber) return true;
+bool measure_types(Bytes request, Types& found) noexcept {
+  return for_each_field(request, [&](std::uint64_t field, Bytes about) {
+    if (field != Frame::kCreateFieldNumber && field != Frame::kDescribeFieldNumber) return true;
+    found.bytes += about.size();
+    return for_each_field(about, [&](std::uint64_t number, Bytes type) {
+      if (number != proto::Create::kTypeFieldNumber) return true;
       return for_each_field(type, [&](std::uint64_t of_type, Bytes) {
         found.type_fields += of_type == proto::Type::kFieldsFieldNumber;
         return true;
@@ -112,6 +114,8 @@ constexpr int kPongAddresses[] = {Frame::kPongFieldNumber, net::Pong::kClockFiel
                                   ClockReport::kAddressesFieldNumber};
 constexpr int kCreateFields[] = {Frame::kCreateFieldNumber, proto::Create::kTypeFieldNumber,
                                  Type::kFieldsFieldNumber};
+constexpr int kDescribeFields[] = {Frame::kDescribeFieldNumber, proto::Describe::kTypeFieldNumber,
+                                   Type::kFieldsFieldNumber};
 constexpr int kOpenedFields[] = {Frame::kOpenedFieldNumber, proto::Opened::kStreamFieldNumber,
                                  Stream::kTypeFieldNumber, Type::kFieldsFieldNumber};
 constexpr int kOpenedUsers[] = {Frame::kOpenedFieldNumber, proto::Opened::kStreamFieldNumber,
@@ -154,6 +158,7 @@ constexpr Repeated kRepeated[] = {
     {kNodes, kMinNodeBytes},
     {kNodeStreams, kMinFieldBytes},
     {kCreateFields, kMinFieldBytes},
+    {kDescribeFields, kMinFieldBytes},
     {kOpenedFields, kMinFieldBytes},
     {kEventFields, kMinFieldBytes},
     {kListFields, kMinFieldBytes},
@@ -193,23 +198,23 @@ std::size_t plain_bytes(Bytes message) noexcept {
 Result<void> check_request_size_untrusted(Bytes message) {
   const std::size_t plain = message.size() <= kMaxRequestBytes ? 0 : plain_bytes(message);
   if (plain <= kMaxRequestBytes) return {};
-  Creates creates;
-  if (!measure_creates(message, creates)) {
+  Types types;
+  if (!measure_types(message, types)) {
     return Error{
         Errc::protocol,
         fmt::format("a request of {} bytes is not a message of this protocol", message.size())};
   }
-  const std::size_t others = plain - std::min(plain, creates.bytes);
-  if (others > kMaxRequestBytes || creates.bytes > kMaxCreateBytes) {
+  const std::size_t others = plain - std::min(plain, types.bytes);
+  if (others > kMaxRequestBytes || types.bytes > kMaxCreateBytes) {
     return Error{Errc::limit_exceeded,
                  fmt::format("a request of {} bytes has {} that are neither payload nor property; "
-                             "at most {} are taken, and {} to create a stream",
+                             "at most {} are taken, and {} to create or describe a stream",
                              message.size(), plain, kMaxRequestBytes, kMaxCreateBytes)};
   }
-  if (creates.type_fields > kMaxParsedFields) {
+  if (types.type_fields > kMaxParsedFields) {
     return Error{Errc::limit_exceeded,
                  fmt::format("a request describes a type of {} fields; at most {} are read",
-                             creates.type_fields, kMaxParsedFields)};
+                             types.type_fields, kMaxParsedFields)};
   }
   return {};
 }

@@ -15,8 +15,8 @@
 namespace dssm::wire {
 
 inline constexpr std::size_t kMaxRequestBytes = 16U << 10;  // without a property
-// The same of a Create: its type has up to kMaxFields fields. More of them are refused with an
-// answer, far more before they are parsed.
+// The same of a Create or Describe: its type has up to kMaxFields fields. More of them are refused
+// with an answer, far more before they are parsed.
 inline constexpr std::size_t kMaxCreateBytes = 256U << 10;
 inline constexpr std::size_t kMaxParsedFields = 4096;
 

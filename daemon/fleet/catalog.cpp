@@ -78,10 +78,12 @@ Result<void> Catalog::stream_added(const wire::HostId& id, StreamInfo stream) {
   const std::size_t others_bytes = host.stream_bytes - old_bytes;
   if (others_bytes + bytes_of(stream) > kMaxBytesPerHost) stream.type.fields = {};
   host.stream_bytes = others_bytes + bytes_of(stream);
-  const bool same_ring = old != host.streams.end() && old->second.incarnation == stream.incarnation;
+  const bool is_known = old != host.streams.end() &&
+                        old->second.incarnation == stream.incarnation &&
+                        old->second.type == stream.type;
   StreamInfo& entry = host.streams[Key{stream.id.name, stream.id.id}];
   entry = std::move(stream);
-  if (same_ring) return {};
+  if (is_known) return {};
   notify([&](CatalogObserver& observer) { observer.on_remote_stream_added(host, entry); });
   return {};
 }

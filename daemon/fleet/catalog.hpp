@@ -43,7 +43,8 @@ class CatalogObserver {
   virtual void on_host_up(const KnownHost&) {}
   virtual void on_host_down(const KnownHost&, const Error&) {}  // after its streams are removed
   virtual void on_host_clock(const KnownHost&) {}               // it reported its clock
-  virtual void on_remote_stream_added(const KnownHost&, const StreamInfo&) {}  // or a new ring
+  // Also: it has a new ring, or its ring is described now.
+  virtual void on_remote_stream_added(const KnownHost&, const StreamInfo&) {}
   virtual void on_remote_stream_removed(const KnownHost&, const StreamInfo&) {}
 
  protected:
@@ -69,8 +70,9 @@ class Catalog {
   void host_up(const wire::Greeting& greeting, const wire::Address& address);
   // It does not answer any more: its streams leave the catalog.
   void host_down(const wire::HostId& id, const Error& error);
-  // A stream is there, or has a new ring. Its id names the owner's host. Descriptions of fields are
-  // left out when a host has too many of them; what changes with each sample is not kept.
+  // A stream is there, has a new ring, or is described. Its id names the owner's host. Descriptions
+  // of fields are left out when a host has too many of them; what changes with each sample is not
+  // kept.
   //   fails  limit_exceeded (this host has too many streams), not_found (no such host)
   Result<void> stream_added(const wire::HostId& id, StreamInfo stream);
   void stream_removed(const wire::HostId& id, const StreamId& stream);

@@ -197,6 +197,7 @@ std::uint64_t type_hash(const TypeInfo& type) {
     text += fmt::format("{}{} {}{}{}{}", word(field.name.size()), field.name,
                         word(static_cast<unsigned>(field.kind)), word(field.offset_bytes),
                         word(field.count), word(field.stride_bytes));
+    if (field.bits > 0) text += word(unsigned{field.bits}) + word(unsigned{field.first_bit});
   }
   const Sha256 digest = sha256(text);
   std::uint64_t hash = 0;

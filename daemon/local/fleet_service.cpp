@@ -139,6 +139,10 @@ net::Frame network_request(const StreamId& id, const local::Request& request) {
       frame.mutable_set_property()->set_property(request.set_property().property());
       named = frame.mutable_set_property()->mutable_id();
       break;
+    case local::Request::kDescribe:
+      *frame.mutable_describe() = request.describe();
+      named = frame.mutable_describe()->mutable_id();
+      break;
     default:  // Info
       named = frame.mutable_info()->mutable_id();
   }

@@ -82,8 +82,8 @@ class Fleet {
                                                           OfferedFiles files,
                                                           const std::string& account) = 0;
 
-  // Has the owner of the stream `id` serve `request`: Info, GetProperty, SetProperty or Remove. The
-  // response to Info has `mirror` when this host mirrors the stream.
+  // Has the owner of the stream `id` serve `request`: Info, GetProperty, SetProperty, Describe or
+  // Remove. The response to Info has `mirror` when this host mirrors the stream.
   virtual void forward(const StreamId& id, const local::Request& request,
                        Then<local::Response> then) = 0;
 

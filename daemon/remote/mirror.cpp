@@ -163,9 +163,10 @@ void Mirror::on_channel_end() {
 
 // --- what the catalog knows
 
-void Mirror::on_stream_added() {
+void Mirror::on_stream_added(const StreamInfo& theirs) {
   is_ending_ = false;
-  RemoteStream::on_stream_added();
+  describe_as_untrusted(theirs);
+  RemoteStream::on_stream_added(theirs);
 }
 
 // The channel may be earlier than the catalog, and the mirror live with the next ring.
@@ -223,6 +224,7 @@ Result<void> Mirror::follow_untrusted(const StreamInfo& theirs) {
     if (ours.type().payload_bytes == theirs.type.payload_bytes &&
         ours.mapping().geometry().depth <= theirs.depth) {
       is_shorter_ = ours.mapping().geometry().depth < theirs.depth;
+      describe_as_untrusted(theirs);
       return {};
     }
     return Error{
@@ -243,6 +245,20 @@ Result<void> Mirror::follow_untrusted(const StreamInfo& theirs) {
                                                            parts_.registry.budgets()),
                                             context);
   return DSSM_TRY(use_offered(std::move(stream)), context), Result<void>();
+}
+
+// The owner's stream may be described while this host mirrors it. Lists leave out the fields of
+// many types.
+void Mirror::describe_as_untrusted(const StreamInfo& theirs) {
+  if (!ring_ || ring_->stream()->incarnation() != theirs.incarnation) return;
+  Stream& ours = *ring_->stream();
+  if (theirs.type.fields.empty() || theirs.type == ours.type() ||
+      theirs.type.payload_bytes != ours.type().payload_bytes) {
+    return;
+  }
+  const Result<void> described =
+      ours.describe_as(theirs.type, parts_.registry.budgets().of(ours.account()));
+  if (!described) parts_.logger.warning(described.error().message);
 }
 
 Result<void> Mirror::use_offered(std::shared_ptr<Stream> stream) {

@@ -51,7 +51,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
   // The stream as its ring here shows it. False: there is none yet.
   bool describe_stream(proto::Stream& out) const;
 
-  void on_stream_added() override;
+  void on_stream_added(const StreamInfo& theirs) override;
   void on_stream_removed(std::uint64_t incarnation) override;
   void on_owner_clock(MirrorClock::Report report) override {
     on_owner_clock(std::move(report), std::nullopt);
@@ -87,6 +87,7 @@ class Mirror final : public RemoteStream, private FrameConnection::SampleDelegat
 
   // The ring
   Result<void> follow_untrusted(const StreamInfo& theirs);
+  void describe_as_untrusted(const StreamInfo& theirs);
   void replace_ring(std::unique_ptr<MirrorRing> ring);
   void notify_replaced();
   void on_owner_clock(MirrorClock::Report report,

@@ -189,7 +189,7 @@ Result<std::shared_ptr<Stream>> RemoteStream::adopt_untrusted(OfferedFiles&& fil
   return acquire();
 }
 
-void RemoteStream::on_stream_added() {
+void RemoteStream::on_stream_added(const StreamInfo&) {
   if (is_removed_) connection_.reopen();
 }
 

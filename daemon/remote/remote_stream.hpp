@@ -189,7 +189,7 @@ class RemoteStream : private Dialer::Observer, protected channel::ChannelClient:
   // --- what the catalog knows of the owner
 
   // It has such a stream, or a new ring of it.
-  virtual void on_stream_added();
+  virtual void on_stream_added(const StreamInfo& theirs);
   // It has removed the ring of that incarnation. The channel reports this too, after the last
   // samples.
   virtual void on_stream_removed(std::uint64_t /*incarnation*/) {}

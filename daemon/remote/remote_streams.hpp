@@ -155,7 +155,7 @@ class RemoteStreams final : private CatalogObserver {
     for_each_of(host, [&](Kind& entry) { entry.on_owner_clock(host.greeting.clock); });
   }
   void on_remote_stream_added(const KnownHost& host, const StreamInfo& stream) override {
-    for_each_ring_of(host, stream, [](Kind& entry) { entry.on_stream_added(); });
+    for_each_ring_of(host, stream, [&](Kind& entry) { entry.on_stream_added(stream); });
   }
   // So that a program that was notified of the removal does not get the old ring afterwards. Not
   // when the host itself is down: its stream may still exist.

@@ -37,7 +37,7 @@ std::size_t parsed_bytes(const net::Frame& request) {
 // there without a name.
 bool is_control(const net::Frame& request) noexcept {
   return request.has_list() || request.has_watch() || request.has_info() || request.has_remove() ||
-         request.has_list_clock_pairs() || request.has_list_nodes() ||
+         request.has_list_clock_pairs() || request.has_list_nodes() || request.has_describe() ||
          request.has_follow_playback() ||
          (request.has_set_property() && request.set_property().has_id()) ||
          (request.has_get_property() && request.get_property().has_id());

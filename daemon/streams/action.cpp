@@ -23,6 +23,8 @@ std::optional<Action> catalog_action(const Request& request) noexcept {
       return Action::set_property;
     case Request::kGetProperty:
       return Action::get_property;
+    case Request::kDescribe:
+      return Action::describe;
     case Request::kList:
     case Request::kWatch:
     case Request::kListNodes:

@@ -62,6 +62,7 @@ enum class Action : std::uint8_t {
   remove,
   set_property,
   get_property,
+  describe,         // the type of a stream
   see,              // of a stream: that it is there, what it is, and who may do what
   list,             // and changes of it, and nodes; what the asker may not see is left out
   open_clock,       // the playback clock, for reading and writing; and whom it follows

@@ -108,6 +108,12 @@ Result<void> CatalogRequests::serve_untrusted(const Request& request, Response& 
     case Request::kGetProperty:
       response.mutable_property()->set_property(DSSM_TRY(property_of(id)));
       return {};
+    case Request::kDescribe: {
+      const TypeInfo type = DSSM_TRY(wire::type_untrusted(request.describe().type()));
+      DSSM_TRY(registry_.describe(id, type, request.describe().replace()));
+      response.mutable_done();
+      return {};
+    }
     default:
       return unknown_request(registry_.host());
   }

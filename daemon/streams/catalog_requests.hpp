@@ -41,8 +41,8 @@ class CatalogRequests {
   CatalogRequests(Registry& registry, const OpenTable& opens, std::size_t max_list_bytes)
       : registry_(registry), opens_(opens), max_list_bytes_(max_list_bytes) {}
 
-  // Serves List, ListNodes, Info, Remove, SetProperty and GetProperty, and fills in the response's
-  // body.
+  // Serves List, ListNodes, Info, Remove, SetProperty, GetProperty and Describe, and fills in the
+  // response's body.
   //   Request   local::Request or net::Frame; Response: local::Response or net::Frame
   //   channel   the stream of the channel that the request came on, for properties; nullptr: the
   //             request names its stream
@@ -89,6 +89,8 @@ const proto::StreamId* subject(const Request& request) noexcept {
       return &request.set_property().id();
     case Request::kGetProperty:
       return &request.get_property().id();
+    case Request::kDescribe:
+      return &request.describe().id();
     default:
       return nullptr;
   }

@@ -96,8 +96,7 @@ Result<OpenedRing> Registry::create(const StreamId& id, const TypeInfo& type,
     Stream& stream = *found->second;
     DSSM_TRY(stream.type().check_usable_as(type), context);
     if (stream.type().is_less_described_than(type)) {
-      DSSM_TRY(stream.describe_as(type, budgets_.of(stream.account())), context);
-      for (StreamObserver* observer : observers_) observer->on_stream_described(stream);
+      DSSM_TRY(describe_as(stream, type), context);
     }
     return OpenedRing{found->second, false};
   }
@@ -184,6 +183,23 @@ Result<void> Registry::remove(const StreamId& id) {
   in_order_.erase(std::find(in_order_.begin(), in_order_.end(), stream));
   release_stream(stream->account());
   for (StreamObserver* observer : observers_) observer->on_stream_removed(*stream);
+  return {};
+}
+
+Result<void> Registry::describe(const StreamId& id, const TypeInfo& type, bool replace) {
+  const std::shared_ptr<Stream> stream = DSSM_TRY(find(id));
+  const std::string context = "describe stream '" + stream->id().str() + "'";
+  TypeInfo known = stream->type();
+  if (replace) known = {"", known.payload_bytes, known.alignment_bytes, {}};
+  DSSM_TRY(known.check_usable_as(type), context);
+  if (!known.is_less_described_than(type)) return {};
+  DSSM_TRY(describe_as(*stream, type), context);
+  return {};
+}
+
+Result<void> Registry::describe_as(Stream& stream, const TypeInfo& type) {
+  DSSM_TRY(stream.describe_as(type, budgets_.of(stream.account())));
+  for (StreamObserver* observer : observers_) observer->on_stream_described(stream);
   return {};
 }
 

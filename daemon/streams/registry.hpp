@@ -142,6 +142,11 @@ class Registry {
   //   fails  not_found
   Result<void> remove(const StreamId& id);
 
+  // Gives a stream the name and fields of `type`, as far as it has none.
+  //   replace  also those that it has: only the size must be that of the stream
+  //   fails    not_found, type_mismatch, limit_exceeded, os errors
+  Result<void> describe(const StreamId& id, const TypeInfo& type, bool replace);
+
   //   fails  not_found, limit_exceeded
   Result<void> set_property(const StreamId& id, const std::string& property,
                             const std::string& account = {});
@@ -156,6 +161,7 @@ class Registry {
   Result<std::shared_ptr<Stream>> make(const StreamId& own, const TypeInfo& type,
                                        const History& history, std::int32_t creator_pid,
                                        const std::string& account);
+  Result<void> describe_as(Stream& stream, const TypeInfo& type);
   Result<std::shared_ptr<Stream>> add_adopted(std::shared_ptr<Stream> stream);
   void add(std::shared_ptr<Stream> stream);
 

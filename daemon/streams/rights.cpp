@@ -37,6 +37,7 @@ Verbs needed_for(Action action) noexcept {
     case Action::remove:
       return Verb::remove;
     case Action::set_property:
+    case Action::describe:
       return Verb::property;
     case Action::see:
       for (const Verb verb :
@@ -70,6 +71,8 @@ std::string_view words_for(Action action) noexcept {
       return "remove";
     case Action::set_property:
       return "set the property of";
+    case Action::describe:
+      return "describe";
     case Action::open_channel:
       return "open";
     case Action::see:

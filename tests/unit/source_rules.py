@@ -49,12 +49,15 @@ ONLY = {
     "client/ssm": ["core/include", "client/include", "core/base"],
     "client/recording": ["core/include", "client/include", "core/base"],
     # dssmctl: besides the public headers the names of streams, the names and ids of hosts, which
-    # certificates hold, and the memory that it shares with programs in lockstep.
+    # certificates hold, the format of SSM's logs, and the memory that it shares with programs in
+    # lockstep.
     "client/dssmctl": [
         "core/include",
         "client/include",
         "core/base/names.hpp",
         "core/base/sealed_memory.hpp",
+        "core/base/seconds.hpp",
+        "core/base/ssm_log.hpp",
         "core/base/text.hpp",
         "core/base/time.hpp",
         "core/base/try.hpp",

@@ -16,6 +16,7 @@
 #include <dssm/reader.hpp>
 #include <dssm/typed_reads.hpp>
 #include <filesystem>
+#include <map>
 #include <memory>
 #include <optional>
 #include <span>
@@ -38,12 +39,15 @@ enum class Compression : std::uint8_t { none, lz4, zstd };
 
 // What a recording holds of a stream besides its samples.
 struct RecordedStream {
-  StreamId id;  // with its owner's host
+  StreamId id;  // with its owner's host; without one, that is not known
   TypeInfo type;
   std::uint64_t depth = 0;
   Duration cycle{};
   std::uint64_t incarnation = 0;    // a stream that restarts is added again, with another one
   std::vector<std::byte> property;  // empty: none
+  // What else its channel has as metadata, which is kept. Of a log of SSM: "ssm_log", its first
+  // line.
+  std::map<std::string, std::string> metadata = {};
 };
 
 // Why something was recorded: an event for which a recorder waited (docs/recording.md "The black
@@ -103,7 +107,7 @@ class RecordingWriter {
 
   // The number of the stream in this recording, for the other calls. The same stream (id and
   // incarnation) again: the same number; what else `stream` has is ignored then.
-  //   fails  invalid_argument (no host, or a name or type that is not allowed), limit_exceeded
+  //   fails  invalid_argument (a name or type that is not allowed), limit_exceeded
   //          (more than 65,535 streams), and as write()
   Result<std::uint32_t> add_stream(const RecordedStream& stream);
 
@@ -162,7 +166,8 @@ struct RecordedSample {
   std::span<const std::byte> payload;  // valid until the next call
 };
 
-// Goes through all samples of all streams, in the order in which they were recorded.
+// Goes through all samples of all streams, in the order in which they were recorded. Several
+// recordings that are opened together, as logs of SSM, are merged by time.
 //
 //   threads   one at a time
 //   lifetime  usable without its Recording
@@ -176,7 +181,8 @@ class RecordingCursor {
   // The next sample; false after the last one.
   bool next(RecordedSample& out) noexcept;
 
-  // The sample before; false at the beginning. After next() it is that one again, and the reverse.
+  // The sample before; false at the beginning. After next() it is that one again, and the reverse;
+  // of several recordings only if their samples are in the order of times.
   bool previous(RecordedSample& out) noexcept;
 
   // Goes to the first sample, in the order of recording, with time >= `t`; before the first one for
@@ -204,9 +210,10 @@ class Recording {
  public:
   // Opens a file, or all files of a folder whose names end with ".mcap". MCAP files of other
   // programs are recordings, too, as far as their topics are names of streams: with plain bytes,
-  // as they are in the messages, and tids that count them.
-  //   fails  not_found, protocol (not an MCAP file), conflict (two files have the same samples of a
-  //          stream), no_permission, system
+  // as they are in the messages, and tids that count them. So are logs of SSM (docs/ssm.md "Logs"),
+  // each with one stream; of a folder without *.mcap those whose names end with ".log".
+  //   fails  not_found, protocol (not an MCAP file and no log), conflict (two files have the same
+  //          samples of a stream), no_permission, system
   static Result<Recording> open(const std::filesystem::path& path);
   // The same with these files, in any order.
   static Result<Recording> open(std::span<const std::filesystem::path> files);

@@ -346,6 +346,15 @@ class Session {
   Result<void> set_property(const StreamId& id, std::span<const std::byte> property);
   Result<std::vector<std::byte>> property(const StreamId& id);
 
+  // Gives a stream, which need not be open, the name, alignment and fields of `type`, as far as it
+  // has none: for streams of programs that do not describe their types. It keeps them as long as it
+  // exists; what programs have open keeps its description until they open it again. Takes the right
+  // to set properties.
+  //   replace  also the name and fields that it has
+  //   fails    not_found, invalid_argument (TypeInfo::check()), type_mismatch (another size;
+  //            without `replace` also another name or other fields), limit_exceeded, no_permission
+  Result<void> describe(const StreamId& id, const TypeInfo& type, bool replace = false);
+
   // --- other hosts
 
   // This PC first, then the configured peers and the hosts found by mDNS, each with its present

@@ -139,7 +139,7 @@ int getSSM_info(const char* stream_name, int stream_id, size_t* size, int* num, 
   // Of another host's stream, what can be read here.
   const bool has_own = info->mirror && info->mirror->depth > 0;
   if (num) *num = static_cast<int>(has_own ? info->mirror->depth : info->depth);
-  if (cycle) *cycle = dssm::ssm::seconds_from_ns(dssm::to_ns(info->cycle));
+  if (cycle) *cycle = dssm::seconds_from_ns(dssm::to_ns(info->cycle));
   if (property_size) *property_size = info->property_bytes;
   return static_cast<int>(bytes);
 }
@@ -152,7 +152,7 @@ ssm_header* shm_get_address(SSM_sid sid) {
   std::atomic_ref(header.tid_top).store(dssm::ssm::ssm_tid(turn->newest(turn.alone())));
   std::atomic_ref(header.num).store(static_cast<int>(turn->depth()));
   std::atomic_ref(header.size).store(turn->data_bytes());
-  std::atomic_ref(header.cycle).store(dssm::ssm::seconds_from_ns(dssm::to_ns(turn->cycle())));
+  std::atomic_ref(header.cycle).store(dssm::seconds_from_ns(dssm::to_ns(turn->cycle())));
   return &header;
 }
 
@@ -201,7 +201,7 @@ int dssm_ssm_wait_stream(const char* stream_name, int stream_id, double timeout)
   const auto id = find_id(stream_name, stream_id);
   if (!id) return -2;
   const dssm::MonoTime deadline =
-      timeout > 0 ? dssm::deadline_in(dssm::Duration(dssm::ssm::ns_from_seconds(timeout)))
+      timeout > 0 ? dssm::deadline_in(dssm::Duration(dssm::ns_from_seconds(timeout)))
                   : dssm::kNever;
   constexpr dssm::Duration kCheckPause = std::chrono::milliseconds(100);
   dssm::ssm::Interruptible signals;

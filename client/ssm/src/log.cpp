@@ -15,7 +15,6 @@
 #include <algorithm>
 #include <atomic>
 #include <cerrno>
-#include <charconv>
 #include <cmath>
 #include <cstdio>
 #include <cstring>
@@ -25,8 +24,11 @@
 #include <vector>
 
 #include "../include/ssm-log.hpp"
+#include "core/base/ssm_log.hpp"
+#include "core/base/try.hpp"
 #include "messages.hpp"
 
+using dssm::Result;
 using dssm::ssm::report_error;
 
 struct dssm_ssm_log {
@@ -55,9 +57,7 @@ struct dssm_ssm_log {
 
 namespace {
 
-constexpr std::size_t kMaxHeadBytes = 4096;
 constexpr std::size_t kScanBytes = 1 << 20;
-constexpr std::uint64_t kMaxSize = std::numeric_limits<int>::max();  // SSM's sizes are ints
 
 void report(const dssm_ssm_log& log, std::string_view what) {
   report_error(fmt::format("log '{}' : {}", log.file_name, what));
@@ -97,50 +97,19 @@ std::uint64_t records(const dssm_ssm_log& log) {
   return bytes < log.data_at ? 0 : (bytes - log.data_at) / log.record_bytes();
 }
 
-// --- the first line
-
-// The next word of `text`, which is removed from it; words are separated by any blanks.
-std::string_view next_word(std::string_view& text) {
-  constexpr std::string_view kBlanks = " \t\r\v\f";
-  text.remove_prefix(std::min(text.find_first_not_of(kBlanks), text.size()));
-  const std::string_view word = text.substr(0, text.find_first_of(kBlanks));
-  text.remove_prefix(word.size());
-  return word;
-}
-
-template <class Number>
-bool parse(std::string_view word, Number& number) {
-  const auto [end, error] = std::from_chars(word.data(), word.data() + word.size(), number);
-  return error == std::errc() && end == word.data() + word.size() && !word.empty();
-}
-
-// Fills log.head from the file. What is wrong with it; empty: nothing.
-std::string read_head(dssm_ssm_log& log) {
+// Fills log.head from the file.
+//   fails  with what is wrong with it
+Result<void> read_head(dssm_ssm_log& log) {
   const std::uint64_t bytes = file_bytes(log);
-  std::string text(std::min<std::uint64_t>(bytes, kMaxHeadBytes), '\0');
-  if (!read_at(log, 0, {{text.data(), text.size()}})) return "cannot be read";
-  const std::size_t end = text.find('\n');
-  if (end == std::string::npos) return "has no first line of text";
-  text.resize(end);
-  std::string_view rest = text;
-  log.stream_name = next_word(rest);
-  std::uint64_t data_size = 0, property_size = 0;
-  const bool parsed =
-      parse(next_word(rest), log.head.stream_id) && parse(next_word(rest), data_size) &&
-      parse(next_word(rest), log.head.buffer_num) && parse(next_word(rest), log.head.cycle) &&
-      parse(next_word(rest), log.head.start_time) && parse(next_word(rest), property_size) &&
-      next_word(rest).empty();
-  if (!parsed || !std::isfinite(log.head.cycle) || !std::isfinite(log.head.start_time)) {
-    return "has a first line that is not NAME ID SIZE NUM CYCLE START PROPERTY_SIZE";
+  std::string text(std::min<std::uint64_t>(bytes, dssm::kMaxSsmLogLineBytes), '\0');
+  if (!read_at(log, 0, {{text.data(), text.size()}})) {
+    return dssm::Error{dssm::Errc::system, "it cannot be read"};
   }
-  if (data_size > kMaxSize || property_size > kMaxSize) {
-    return fmt::format("has sizes beyond {} bytes", kMaxSize);
-  }
-  log.data_at = end + 1 + property_size;
-  if (log.data_at > bytes) return "ends inside its property";
-  log.head.data_size = data_size;
-  log.head.property_size = property_size;
-  log.head.stream_name = log.stream_name.c_str();
+  const dssm::SsmLogHead head = DSSM_TRY(dssm::ssm_log_head_untrusted(text, bytes));
+  log.stream_name = head.stream_name;
+  log.head = {log.stream_name.c_str(), head.stream_id, head.buffer_num,  head.data_bytes,
+              head.property_bytes,     head.cycle_s,   head.start_time_s};
+  log.data_at = head.records_at();
   return {};
 }
 
@@ -216,9 +185,9 @@ dssm_ssm_log* dssm_ssm_log_open(const char* file_name) {
   std::FILE* const file = std::fopen(file_name, "rbe");
   if (!file) return report_os_error("cannot open log file", file_name, errno), nullptr;
   auto* const log = new dssm_ssm_log(file, file_name);
-  const std::string wrong = read_head(*log);
-  if (wrong.empty()) return log;
-  report_error(fmt::format("'{}' is NOT ssm-log file : it {}", file_name, wrong));
+  const Result<void> head = read_head(*log);
+  if (head) return log;
+  report_error(fmt::format("'{}' is NOT ssm-log file : {}", file_name, head.error().message));
   dssm_ssm_log_close(log);
   return nullptr;
 }
@@ -226,7 +195,7 @@ dssm_ssm_log* dssm_ssm_log_open(const char* file_name) {
 dssm_ssm_log* dssm_ssm_log_create(const dssm_ssm_log_head* head, const void* property,
                                   const char* file_name) {
   const std::string_view name = head->stream_name;
-  if (!file_name || name.empty() || name.find_first_of(" \t\r\v\f\n") != name.npos) {
+  if (!file_name || !dssm::is_ssm_log_name(name)) {
     report_error(
         fmt::format("cannot create log file '{}' of stream '{}' : the names of both must "
                     "be given, and a log holds no stream name with blanks",
@@ -239,10 +208,9 @@ dssm_ssm_log* dssm_ssm_log_create(const dssm_ssm_log_head* head, const void* pro
   log->stream_name = name;
   log->head = *head;
   log->head.stream_name = log->stream_name.c_str();
-  // Not by fprintf, whose decimal point is that of the program's locale.
   const std::string line =
-      fmt::format("{} {} {} {} {:.6f} {:.6f} {}\n", name, head->stream_id, head->data_size,
-                  head->buffer_num, head->cycle, head->start_time, head->property_size);
+      dssm::ssm_log_line({log->stream_name, head->stream_id, head->buffer_num, head->data_size,
+                          head->property_size, head->cycle, head->start_time});
   log->data_at = line.size() + head->property_size;
   if (write_all(*log, line.data(), line.size()) && write_all(*log, property, head->property_size)) {
     return log;

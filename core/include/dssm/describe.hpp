@@ -105,10 +105,10 @@ void append_field(std::vector<Field>& fields, const std::string& name, std::uint
     for (const Field& field : inner.fields) {
       if (kCount == 1) {
         fields.push_back({name + "." + field.name, field.kind, offset_bytes + field.offset_bytes,
-                          field.count, field.stride_bytes});
+                          field.count, field.stride_bytes, field.bits, field.first_bit});
       } else if (field.count == 1) {
         fields.push_back({name + "." + field.name, field.kind, offset_bytes + field.offset_bytes,
-                          kCount, sizeof(Element)});
+                          kCount, sizeof(Element), field.bits, field.first_bit});
       } else {  // arrays inside an array of structs have two strides: one field per struct
         for (std::uint64_t i = 0; i < kCount; ++i) {
           fields.push_back({name + "[" + std::to_string(i) + "]." + field.name, field.kind,

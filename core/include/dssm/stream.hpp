@@ -75,6 +75,10 @@ struct Field {
   std::uint64_t offset_bytes = 0;
   std::uint64_t count = 1;
   std::uint64_t stride_bytes = 0;  // distance between elements; meaningful when count > 1
+  // Of a bit field: how many bits of the element it is, and the first of them, counted from the
+  // least significant bit on. 0 bits: the whole element.
+  std::uint8_t bits = 0;
+  std::uint8_t first_bit = 0;
 
   friend bool operator==(const Field&, const Field&) = default;
 };

@@ -321,5 +321,21 @@ TEST_F(Remote, FollowersContinueWithTheRingOfARecreatedStream) {
   EXPECT_EQ(report["lost_samples"], 0);
 }
 
+TEST_F(Remote, DescribedStreamsAreSeenByAllHosts) {
+  RawWriter writer = on_pc2_.create_raw({"odom", 0, ""}, {"", 8, 8, {}}, depth_of(4)).value();
+  const double x = 1.5;
+  writer.write(std::as_bytes(std::span(&x, 1)), at_ns(kSecond));
+  await_streams(1);
+  auto mirrored = session_.open_raw_reader({"odom", 0, "pc2"}).value();
+  ASSERT_TRUE(mirrored.type().fields.empty());
+
+  const TypeInfo type{"Odometry", 8, 8, {{"x", Scalar::float64, 0, 1, 8}}};
+  ASSERT_TRUE(session_.describe({"odom", 0, "pc2"}, type));
+  EXPECT_EQ(on_pc2_.stream_info({"odom", 0, ""})->type, type);
+  await([&] { return session_.open_raw_reader({"odom", 0, "pc2"})->type() == type; });
+  EXPECT_EQ(on_pc3_.describe({"odom", 0, "pc2"}, type).error().code, Errc::not_found)
+      << "pc3 does not know pc2";
+}
+
 }  // namespace
 }  // namespace dssm::test

@@ -222,5 +222,34 @@ TEST(ReadableFields, TakesArraysThatFillThePayload) {
   EXPECT_EQ(readable_fields_untrusted(type).size(), 2U);
 }
 
+struct Bits {
+  std::uint32_t low : 3;
+  std::int32_t negative : 5;
+  std::uint64_t wide : 40;
+};
+
+TEST(Fields, OfBitsAreTheirNumbers) {
+  Bits bits{};
+  bits.low = 5;
+  bits.negative = -9;
+  bits.wide = 0xfedcba9876;
+  const auto payload = std::as_bytes(std::span(&bits, 1));
+  const auto text = [&](const Field& field) {
+    const TypeInfo type{"Bits", sizeof bits, 8, {field}};
+    const std::vector<Field> readable = readable_fields_untrusted(type);
+    return readable.empty() ? "refused" : field_text(payload, readable.front(), 10);
+  };
+  EXPECT_EQ(text({"low", Scalar::uint8, 0, 1, 1, 3, 0}), "5");
+  EXPECT_EQ(text({"negative", Scalar::int8, 0, 1, 1, 5, 3}), "-9");
+  EXPECT_EQ(text({"wide", Scalar::uint64, 0, 1, 8, 40, 8}), "1094624909430");
+  EXPECT_EQ(text({"all", Scalar::uint64, 0, 1, 8, 64, 0}),
+            text({"all", Scalar::uint64, 0, 1, 8, 0, 0}));
+  EXPECT_EQ(text({"bit", Scalar::boolean, 0, 1, 1, 1, 2}), "true");
+  EXPECT_EQ(text({"bit", Scalar::boolean, 0, 1, 1, 1, 1}), "false");
+  EXPECT_EQ(text({"beyond", Scalar::uint8, 0, 1, 1, 3, 6}), "refused");
+  EXPECT_FALSE((TypeInfo{"Bits", 8, 8, {{"beyond", Scalar::uint8, 0, 1, 1, 3, 6}}}).check());
+  EXPECT_FALSE((TypeInfo{"Bits", 8, 8, {{"float", Scalar::float32, 0, 1, 4, 3, 0}}}).check());
+}
+
 }  // namespace
 }  // namespace dssm::ctl

@@ -193,5 +193,36 @@ TEST(SampleInput, SaysWhatAFieldTakes) {
   EXPECT_EQ(error("v[0]", "-3"), "");
 }
 
+TEST(SampleInput, SetsOnlyTheBitsOfABitField) {
+  const TypeInfo type{"Bits",
+                      8,
+                      8,
+                      {{"low", Scalar::uint8, 0, 1, 1, 3, 0},
+                       {"negative", Scalar::int8, 0, 1, 1, 5, 3},
+                       {"bit", Scalar::boolean, 1, 1, 1, 1, 7},
+                       {"all", Scalar::uint64, 0, 1, 8, 64, 0}}};
+  SampleInput sample(type);
+  ASSERT_TRUE(sample.set_text("all", "18446744073709551615"));
+  ASSERT_TRUE(sample.set_text("low", "5"));
+  ASSERT_TRUE(sample.set_text("negative", "-16"));
+  ASSERT_TRUE(sample.set_text("bit", "false"));
+  const auto value = [&](std::size_t field) {
+    return field_text(sample.payload(), type.fields[field], 10);
+  };
+  EXPECT_EQ(value(0), "5");
+  EXPECT_EQ(value(1), "-16");
+  EXPECT_EQ(value(2), "false");
+  EXPECT_EQ(value(3), "18446744073709518725") << "the others are as they were";
+  const auto refusal = [&](const char* name, const char* text) {
+    const Result<void> set = sample.set_text(name, text);
+    return set ? "taken" : set.error().message;
+  };
+  EXPECT_EQ(refusal("low", "8"), "field 'low' cannot be '8': it takes a whole number from 0 to 7");
+  EXPECT_EQ(refusal("negative", "16"),
+            "field 'negative' cannot be '16': it takes a whole number from -16 to 15");
+  EXPECT_EQ(refusal("negative", "-17"),
+            "field 'negative' cannot be '-17': it takes a whole number from -16 to 15");
+}
+
 }  // namespace
 }  // namespace dssm::ctl

@@ -164,5 +164,19 @@ TEST(Ros2Schema, FindsEachNumberOfRandomTypesWhereItIs) {
   EXPECT_GT(found_numbers, 5000U);
 }
 
+TEST(Ros2Schema, HasTheBytesOfBitFields) {
+  const TypeInfo type{"Bits",
+                      4,
+                      4,
+                      {{"low", Scalar::uint8, 0, 1, 1, 3, 0},
+                       {"high", Scalar::uint16, 0, 1, 2, 7, 3},
+                       {"end", Scalar::uint16, 2, 1, 2}}};
+  EXPECT_EQ(ros2_schema(type).text,
+            "uint8[1] low  # low\n"
+            "# high: in the same bytes as another field\n"
+            "uint8[1] pad\n"
+            "uint16 end\n");
+}
+
 }  // namespace
 }  // namespace dssm::recording

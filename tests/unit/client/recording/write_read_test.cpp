@@ -376,7 +376,7 @@ TEST_F(RecordingFiles, RefuseWrongUse) {
 
   RecordingWriter writer = RecordingWriter::create(path("a.mcap")).value();
   RecordedStream stream = plain_stream("s", 24);
-  stream.id.host.clear();
+  stream.id.name = "a:b";
   EXPECT_EQ(writer.add_stream(stream).error().code, Errc::invalid_argument);
   stream = plain_stream("s", 0);
   EXPECT_EQ(writer.add_stream(stream).error().code, Errc::invalid_argument);

@@ -252,6 +252,14 @@ const std::map<std::string, Fill>& messages() {
          set_id(*frame.mutable_set_property()->mutable_id(), "");
          frame.mutable_set_property()->set_property("\x01\x02\x03\x04");
        }},
+      {"describe",
+       [](net::Frame& frame) {
+         frame.set_serial(6);
+         set_id(*frame.mutable_describe()->mutable_id(), "");
+         const TypeInfo type{"Scan", 4, 4, {{"m", Scalar::uint32, 0, 1, 4, 3, 5}}};
+         to_message(type, *frame.mutable_describe()->mutable_type());
+         frame.mutable_describe()->set_replace(true);
+       }},
       {"get_property",
        [](net::Frame& frame) {
          frame.set_serial(6);

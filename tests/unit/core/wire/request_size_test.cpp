@@ -58,6 +58,9 @@ TYPED_TEST(RequestSize, TakesTheLargestType) {
     request.mutable_create()->mutable_type()->add_fields()->set_name(std::string(40, 'x'));
   }
   EXPECT_EQ(refusal_of(request), "");
+  const proto::Type type = request.create().type();
+  *request.mutable_describe()->mutable_type() = type;
+  EXPECT_EQ(refusal_of(request), "") << "described instead";
 }
 
 TYPED_TEST(RequestSize, RefusesManyFields) {

@@ -82,7 +82,7 @@ TEST_F(ActionTest, RefusesEachRequestOfALocalProgram) {
     ++kinds;
     EXPECT_EQ(client.ask(request).failure().code(), "no_permission") << field;
   }
-  EXPECT_EQ(kinds, 22) << "the requests of local.proto besides Hello";
+  EXPECT_EQ(kinds, 23) << "the requests of local.proto besides Hello";
   EXPECT_EQ(client.ask(open_request("odometry", true)).failure().message(), "forbidden");
   EXPECT_EQ(rule.last_action, Action::open_for_writing);
   EXPECT_EQ(rule.last_stream.name, "odometry");
@@ -108,7 +108,7 @@ TEST_F(ActionTest, RefusesEachRequestOfAnotherHost) {
   rig.connect(channel);
   rig.open(channel, "odometry");
   rule.forbids = true;
-  constexpr int kKinds = 17;  // the requests of network.proto besides Hello
+  constexpr int kKinds = 18;  // the requests of network.proto besides Hello
   EXPECT_EQ(refused([&](const net::Frame& frame) { return rig.ask(control, frame); }), kKinds);
   EXPECT_EQ(refused([&](const net::Frame& frame) { return rig.ask(channel, frame); }), kKinds);
   EXPECT_EQ(rule.last_stream.str(), "odometry:0@pc1") << "the stream of the channel";

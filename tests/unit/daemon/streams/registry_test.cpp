@@ -372,6 +372,38 @@ TEST(Registry, ChargesAPropertyToTheAccountThatSetsIt) {
   EXPECT_EQ(registry.budgets().most_used(), 3U);
 }
 
+// --- descriptions
+
+TEST(Registry, DescribesAStreamOnRequestButKeepsWhatItsProgramsSay) {
+  Registry registry("pc1", kLimits);
+  ASSERT_TRUE(registry.create(kOdometry, {"", 8, 1, {}}, {10, Duration(1'000'000)}, 1));
+  struct Described final : StreamObserver {
+    int times = 0;
+    void on_stream_added(const Stream&) override {}
+    void on_stream_removed(const Stream&) override {}
+    void on_stream_described(const Stream&) override { ++times; }
+  } observer;
+  registry.add_observer(observer);
+  const TypeInfo pose{
+      "Pose", 8, 4, {{"x", Scalar::float32, 0}, {"flags", Scalar::uint8, 4, 1, 1, 3, 2}}};
+  const TypeInfo twist{"Twist", 8, 8, {{"v", Scalar::float64, 0}}};
+  const TypeInfo longer{"Pose", 16, 8, {{"x", Scalar::float64, 0}}};
+  EXPECT_EQ(registry.describe(kOdometry, longer, true).error().code, Errc::type_mismatch);
+  ASSERT_TRUE(registry.describe(kOdometry, pose, false));
+  EXPECT_EQ((*registry.find(kOdometry))->type(), pose);
+  EXPECT_EQ(observer.times, 1);
+
+  EXPECT_EQ(registry.describe(kOdometry, twist, false).error().code, Errc::type_mismatch);
+  EXPECT_EQ((*registry.find(kOdometry))->type(), pose);
+  ASSERT_TRUE(registry.describe(kOdometry, twist, true));
+  EXPECT_EQ((*registry.find(kOdometry))->type(), twist);
+  EXPECT_EQ((*registry.find(kOdometry))->info().type, twist);
+  EXPECT_TRUE(registry.describe(kOdometry, twist, false)) << "nothing to do";
+  EXPECT_EQ(observer.times, 2);
+  EXPECT_EQ(registry.describe({"other", 0, ""}, pose, false).error().code, Errc::not_found);
+  registry.remove_observer(observer);
+}
+
 // --- property
 
 TEST(Registry, KeepsThePropertyOfAStreamAndChargesItsMemory) {

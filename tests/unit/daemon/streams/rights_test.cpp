@@ -122,7 +122,7 @@ TEST(Rights, EachActionNeedsItsVerb) {
   EXPECT_EQ(allowed(Verb::create), with({Action::create, Action::see}));
   EXPECT_EQ(allowed(Verb::remove), with({Action::remove, Action::see}));
   EXPECT_EQ(allowed(Verb::property),
-            with({Action::open_channel, Action::set_property, Action::see}));
+            with({Action::open_channel, Action::set_property, Action::describe, Action::see}));
   EXPECT_EQ(allowed(Verb::clock), with({Action::open_clock}));
 }
 

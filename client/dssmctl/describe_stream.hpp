@@ -1,0 +1,32 @@
+// SPDX-License-Identifier: Apache-2.0
+//
+// The type of a stream whose programs do not describe it, from the debug information of those
+// programs: for `dssmctl describe`, and for what `echo` shows.
+#pragma once
+
+#include <dssm/session.hpp>
+#include <optional>
+#include <string>
+
+#include "client/dssmctl/debug_types.hpp"
+
+namespace dssm::ctl {
+
+struct ProgramType {
+  DebugType found;
+  std::string source;  // "'odometry' (pid 12)"
+};
+
+// The type that `stream`, as Session::stream_info() returned it, has in the first of the programs
+// on this PC that have it open and whose files can be read: writers first.
+//   type_name  empty: as choose_type()
+//   fails      not_found, with the reason for each program
+Result<ProgramType> type_of_programs(Session& session, const StreamInfo& stream,
+                                     const std::string& type_name);
+
+// The same for a user who did not ask for it: nothing unless there is no doubt, by the name of the
+// type or because it is the T of an SSMApi<T, P>, and only of programs whose files are root's or
+// the user's own.
+std::optional<ProgramType> obvious_type_of_programs(Session& session, const StreamId& id);
+
+}  // namespace dssm::ctl
