@@ -110,6 +110,9 @@ TEST_F(McapTools, ReadWhatWasRecorded) {
       }
       expected += "]}\n";
     }
+    ASSERT_TRUE(writer.add_trigger({"tilt", "a \"reason\"", "pc1", time_from_ns(7)}));
+    expected += R"(trigger {"host":"pc1","name":"tilt","reason":"a \"reason\"","time_ns":"7"})"
+                "\n";
     ASSERT_TRUE(writer.finish());
     if (compression == Compression::lz4) {  // the same with the end from a repair
       std::filesystem::resize_file(file, std::filesystem::file_size(file) - 100);

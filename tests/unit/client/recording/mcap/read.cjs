@@ -15,7 +15,11 @@ function check(condition, what) {
   if (!condition) throw new Error(what);
 }
 
-// One line for each message in `bytes`.
+function trigger(record) {
+  return `trigger ${JSON.stringify(Object.fromEntries([...record.metadata].sort()))}`;
+}
+
+// One line for each message in `bytes`, and for each trigger.
 function readStream(bytes, decompressHandlers, wants) {
   const reader = new McapStreamReader({ decompressHandlers, validateCrcs: true });
   reader.append(bytes);
@@ -25,6 +29,7 @@ function readStream(bytes, decompressHandlers, wants) {
   for (let record; (record = reader.nextRecord()); ) {
     if (record.type === "Schema") schemas.set(record.id, record);
     if (record.type === "Channel") channels.set(record.id, record);
+    if (record.type === "Metadata" && record.name === "dssm.trigger") lines.push(trigger(record));
     if (record.type !== "Message") continue;
     const channel = channels.get(record.channelId);
     if (!channel.decoder) {
@@ -45,7 +50,7 @@ function readStream(bytes, decompressHandlers, wants) {
   return lines;
 }
 
-async function readIndexed(bytes, decompressHandlers) {
+async function readIndexed(bytes, decompressHandlers, lines) {
   const readable = {
     size: async () => BigInt(bytes.length),
     read: async (offset, length) =>
@@ -61,7 +66,10 @@ async function readIndexed(bytes, decompressHandlers) {
   }
   check(reader.statistics.messageCount === count, "messages of the statistics");
   for await (const attachment of reader.readAttachments()) void attachment;
-  for await (const metadata of reader.readMetadata()) void metadata;
+  for await (const record of reader.readMetadata({ name: "dssm.trigger" })) {
+    check(lines.includes(trigger(record)), "another trigger by the index");
+    ++count;
+  }
   return count;
 }
 
@@ -70,7 +78,7 @@ async function main(files) {
   for (const file of files) {
     const bytes = new Uint8Array(fs.readFileSync(file));
     const lines = readStream(bytes, decompressHandlers, { whole: true });
-    const indexed = await readIndexed(bytes, decompressHandlers);
+    const indexed = await readIndexed(bytes, decompressHandlers, lines);
     check(indexed === BigInt(lines.length), `${file}: ${indexed} of ${lines.length} by the index`);
     let before = 0;
     for (let length = 8; length < bytes.length; length += 97) {
