@@ -36,7 +36,7 @@ int sleep_scaled(double seconds, double& left) noexcept {
     return -1;
   }
   const double begin = gettimeSSM();
-  const dssm::Duration playback_time(dssm::ssm::ns_from_seconds(seconds));
+  const dssm::Duration playback_time(dssm::ns_from_seconds(seconds));
   if (const auto slept = dssm::sleep_in_lockstep(playback_time)) {
     left = std::fmax(seconds - (gettimeSSM() - begin), 0);
     if (*slept == dssm::WaitStatus::timeout) return 0;
