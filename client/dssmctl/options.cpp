@@ -986,8 +986,8 @@ Result<void> expand_config(std::vector<const char*>& words, std::vector<std::str
     const std::string path(is_joined ? text.substr(kOption.size() + 1) : word[1]);
     configured = DSSM_TRY(config_words(path));
     word = words.erase(word, word + (is_joined ? 1 : 2));
-    std::vector<const char*> pointers;
-    for (const std::string& one : configured) pointers.push_back(one.c_str());
+    std::vector<const char*> pointers(configured.size());
+    std::ranges::transform(configured, pointers.begin(), &std::string::c_str);
     words.insert(word, pointers.begin(), pointers.end());
     return {};
   }
@@ -1002,7 +1002,6 @@ CommandLine parse_command_line(int argc, const char* const* argv) {
   if (argc > 1 && std::string_view(argv[1]) == "help") {
     words.erase(words.begin() + 1);
     words.push_back("--help");
-    argc = static_cast<int>(words.size());
   }
   // What --config names, in its place: what else the command line says is beside it.
   std::vector<std::string> configured;
@@ -1010,7 +1009,6 @@ CommandLine parse_command_line(int argc, const char* const* argv) {
     return {std::nullopt, fmt::format("dssmctl: {}\n", escaped_message(read.error().message)),
             false};
   }
-  argc = static_cast<int>(words.size());
   Parsed parsed;
   CLI::App app("Show and manage streams of sensor samples, on this PC and on others.", "dssmctl");
   add_all(app, parsed);
@@ -1021,7 +1019,7 @@ CommandLine parse_command_line(int argc, const char* const* argv) {
     return usage_error(app, no_verb(app, plain.front(), plain.size() > 1 ? plain[1] : ""));
   }
   try {
-    app.parse(argc, words.data());
+    app.parse(static_cast<int>(words.size()), words.data());
   } catch (const CLI::CallForHelp&) {
     return {std::nullopt, app.help(), true};
   } catch (const CLI::CallForVersion& version) {

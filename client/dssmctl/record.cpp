@@ -177,7 +177,7 @@ Result<void> run(const RecordOptions& options, Output& out) {
   RecordingWriter writer = DSSM_TRY(RecordingWriter::create(file, how));
   catch_stop_signals();
   const std::unique_ptr<Recorder> recorder =
-      DSSM_TRY(Recorder::start(std::move(session), std::move(writer), std::move(plan)));
+      DSSM_TRY(Recorder::start(std::move(session), std::move(writer), plan));
   return RecordingRun(options, file, *recorder, folder, out).run();
 }
 

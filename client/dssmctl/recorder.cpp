@@ -205,7 +205,7 @@ bool Recorder::Opener::has_tried_all() const {
 
 Result<std::unique_ptr<Recorder>> Recorder::start(Session session,
                                                   std::optional<RecordingWriter> file,
-                                                  RecorderPlan plan) {
+                                                  const RecorderPlan& plan) {
   const MonoTime all_by = plan.past ? deadline_in(kOpeningTime) : MonoTime();
   std::unique_ptr<Recorder> recorder(new Recorder(std::move(session), std::move(file), plan));
   recorder->all_by_ = all_by;
@@ -245,7 +245,7 @@ void Recorder::want_past(Source& source) const {
 }
 
 Result<void> Recorder::end() {
-  const Result<void> completed = complete();
+  Result<void> completed = complete();
   is_recording_ = false;
   return completed;
 }
@@ -429,7 +429,7 @@ Result<void> Recorder::complete() {
     source.property = *std::move(property);
     taken = file_->set_property(source.number, source.property);
   }
-  const Result<void> finished = file_->finish();
+  Result<void> finished = file_->finish();
   return taken ? finished : taken;
 }
 

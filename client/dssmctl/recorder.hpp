@@ -45,7 +45,7 @@ class Recorder {
   //   file  empty if and only if `plan.on_demand`
   static Result<std::unique_ptr<Recorder>> start(Session session,
                                                  std::optional<RecordingWriter> file,
-                                                 RecorderPlan plan);
+                                                 const RecorderPlan& plan);
   Recorder(const Recorder&) = delete;
   Recorder& operator=(const Recorder&) = delete;
   ~Recorder() = default;

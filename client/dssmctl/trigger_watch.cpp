@@ -229,7 +229,8 @@ void TriggerEvaluator::on_lists(const std::vector<StreamInfo>& streams,
   }
   // A host that is lost takes its streams from the list.
   for (auto entry = streams_.begin(); entry != streams_.end();) {
-    auto& [name, known] = *entry;
+    const std::string& name = entry->first;
+    Known& known = entry->second;
     if (listed.contains(name)) {
       ++entry;
       continue;

@@ -187,6 +187,10 @@ class ServiceTests:
         wait_until(lambda: self.show("dssm-record.service", "MainPID") not in ("0", recorder),
                    "it is not started again")
         self.await_incident("last")
+        recorder = self.show("dssm-record.service", "MainPID")
+        deb = next(deb.name for deb in self.debs if deb.name.startswith("dssm-record_"))
+        self.container.run("apt-get", "install", "--yes", "--reinstall", f"/debs/{deb}")
+        assert self.show("dssm-record.service", "MainPID") not in ("0", recorder)
 
     def record_mistake(self) -> None:
         """Test."""
@@ -211,5 +215,7 @@ class ServiceTests:
 
     def remove(self) -> None:
         """Test."""
-        self.container.run("apt-get", "purge", "--yes", "dssmd")
+        self.container.run("systemctl", "start", "dssm-record")
+        self.container.run("apt-get", "purge", "--yes", "dssmd")  # and with it what needs it
+        assert self.show("dssm-record.service", "ActiveState") == "inactive"
         wait_until(lambda: self.states() == ("inactive", "inactive"), f"their states are {self.states()}")
